@@ -1,0 +1,486 @@
+"""The task: follow a tool velocity with the driven joints. Pure functions, thin Gymnasium classes.
+
+`transition` moves the machine without randomness; `observe`, `reward` and `terminated` look at it;
+`step` composes them and draws noise and goals. The same functions with a batch of one are the single
+environment, with a plant instead of nets the evaluation, and `observe` and `to_command` the hardware.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import ArrayLike, NDArray
+
+from brokk_min.actuator import (
+    ActuatorNet,
+    PlantState,
+    load_net,
+    plant_reset,
+    plant_step,
+    push_angle,
+    push_command,
+    rest_history,
+)
+from brokk_min.kinematics import lowest_point, tool_state, tool_velocity
+from brokk_min.machine import (
+    BROKK_170,
+    PWM_MAX,
+    Machine,
+    estimate_velocity,
+    limit_command,
+    read_encoder,
+)
+
+Array = NDArray[np.floating[Any]]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class TaskConfig:
+    """What an episode is. Paper: Sec. 3.4; the numbers are assumed unless they name the paper."""
+
+    episode_s: float = 20.0
+    """Length of an episode [s]; its end is a truncation, never a termination."""
+    hold_min_s: float = 0.5
+    """Shortest time for which a velocity goal holds [s]."""
+    hold_max_s: float = 5.0
+    """Longest time for which a velocity goal holds [s]."""
+    zero_goals: float = 0.15
+    """Share of goals that ask the tool to stand still."""
+    axis_goals: float = 0.4
+    """Share of goals along x, y or z; the others point anywhere."""
+    noise: float = 0.05
+    """Largest observation noise, in standard deviations of each observation (paper: 5 %)."""
+    redraw_ground: bool = True
+    """Redraw start poses in the ground; False is the paper's rule: end the episode without reward."""
+
+
+@dataclass(frozen=True)
+class State:
+    """One or many machines at work; arrays (..., n) unless noted. Changed with `replace` only."""
+
+    q: Array  # true angle [rad]
+    q_dot: Array  # true mean velocity over the last tick [rad/s]
+    history: Array  # measured angle, estimated velocity, sent command: (..., n, 3, H), float32
+    v_goal: Array  # wanted tool velocity [m/s], (..., 3)
+    goal_ticks: NDArray[np.int64]  # ticks until a new goal, (...)
+    ticks: NDArray[np.int64]  # ticks since the reset, (...)
+    plant: PlantState | None = None  # None: the nets move the machine
+
+
+# --- what the policy sees and says: one copy for training, evaluation and hardware ------------------
+
+
+class Measured(NamedTuple):
+    """An observation in physical units, for controllers that are no nets."""
+
+    v_goal: Array  # wanted tool velocity [m/s], (..., 3)
+    v_tool: Array  # measured tool velocity [m/s], (..., 3)
+    q: Array  # measured angles of all joints [rad], (..., n)
+    q_dot: Array  # estimated velocities of the driven joints [rad/s], (..., n_driven)
+
+
+def observation_scale(machine: Machine) -> tuple[Array, Array]:
+    """Mean and standard deviation by which observations are standardised, float32 (obs,) both.
+
+    Nominal values from the machine (as if every quantity were uniform over its range), so that they
+    are the same in training and on the machine. Paper: Sec. 3.4 (normalisation)
+    """
+    driven, rest = machine.driven, machine.locked
+    low, high = machine.column("q_min"), machine.column("q_max")
+    middle, spread = (low + high) / 2, (high - low) / 12**0.5
+    ones = np.ones(machine.history)
+    speed = np.full(3, machine.tool_speed / 3**0.5)
+    command = machine.pwm_limit / PWM_MAX / 3**0.5
+    means, scales = [np.zeros(6), middle[rest]], [speed, speed, spread[rest]]
+    for joint in driven:
+        means += [middle[joint] * ones, 0 * ones, 0 * ones]
+        q_dot = machine.column("q_dot_max")[joint] / 3**0.5
+        scales += [spread[joint] * ones, q_dot * ones, command * ones]
+    return np.concatenate(means).astype(np.float32), np.concatenate(scales).astype(np.float32)
+
+
+def observe(machine: Machine, history: Array, v_goal: ArrayLike) -> Array:
+    """What the policy sees, standardised: goal and tool velocity, locked angles, driven histories.
+
+    Paper: Sec. 3.4 (present and target tool velocity, inputs of the actuator nets)
+
+    Args:
+        machine: n joints.
+        history: measured samples, shape (..., n, 3, H).
+        v_goal: wanted tool velocity [m/s], base frame, shape (..., 3).
+
+    Returns:
+        Shape (..., 6 + locked + 3 H n_driven), float32, about zero mean and unit deviation.
+    """
+    v_tool = tool_velocity(machine, history[..., 0, -1], history[..., 1, -1])
+    driven = history[..., machine.driven, :, :]
+    parts = [
+        np.broadcast_to(v_goal, v_tool.shape),
+        v_tool,
+        history[..., machine.locked, 0, -1],
+        driven.reshape(*driven.shape[:-3], -1),
+    ]
+    mean, scale = _scales(machine)
+    standard: Array = (np.concatenate(parts, axis=-1, dtype=np.float32) - mean) / scale
+    return standard
+
+
+def _scales(machine: Machine) -> tuple[Array, Array]:
+    """`observation_scale`, computed once a machine."""
+    if "scales" not in machine.__dict__:
+        machine.__dict__["scales"] = observation_scale(machine)
+    scales: tuple[Array, Array] = machine.__dict__["scales"]
+    return scales
+
+
+def measured(machine: Machine, observation: Array) -> Measured:
+    """Undo `observe`: the newest measurements in physical units, from observations (..., obs)."""
+    mean, scale = _scales(machine)
+    values = observation * scale + mean
+    rest, history = machine.locked, machine.history
+    driven = values[..., 6 + len(rest) :].reshape(*values.shape[:-1], -1, 3, history)
+    q = np.empty((*values.shape[:-1], machine.n), values.dtype)
+    q[..., rest], q[..., machine.driven] = values[..., 6 : 6 + len(rest)], driven[..., 0, -1]
+    return Measured(values[..., :3], values[..., 3:6], q, driven[..., 1, -1])
+
+
+def to_command(machine: Machine, action: ArrayLike) -> Array:
+    """Commands for all joints from the policy's actions: limited, in whole PWM counts.
+
+    Paper: Sec. 3.4 (PWM out) and Sec. 3.1 (65 %)
+
+    Args:
+        machine: n joints.
+        action: for the driven joints, 1 = the command limit; clipped to [-1, 1]. (..., n_driven)
+
+    Returns:
+        u in [-1, 1] of full command, shape (..., n); locked joints get 0.
+
+    Raises:
+        ValueError: a wrong shape or a value that is no number.
+
+    Example:
+        >>> to_command(BROKK_170, [1.0, -0.5, 0.0, 2.0]) * 127
+        array([ 80.,   0., -40.,   0.,  80.])
+    """
+    action = np.asarray(action)
+    if action.shape[-1:] != machine.driven.shape:
+        raise ValueError(f"action: expected (..., {len(machine.driven)}), got {action.shape}")
+    if not np.isfinite(action).all():
+        raise ValueError(f"action: expected finite numbers, got {action[~np.isfinite(action)][0]}")
+    u = np.zeros((*action.shape[:-1], machine.n), action.dtype)
+    u[..., machine.driven] = np.clip(action, -1.0, 1.0) * (machine.pwm_limit / PWM_MAX)
+    return limit_command(machine, u)
+
+
+# --- the episode ------------------------------------------------------------------------------------
+
+
+def rest_state(machine: Machine, q: ArrayLike, v_goal: ArrayLike, plant: bool) -> State:
+    """Machines at rest at angles `q` [rad] (..., n) with goals (..., 3) [m/s] that never change."""
+    q = np.array(q, np.float32)
+    history = rest_history(read_encoder(machine, q), machine.history)
+    goals = np.broadcast_to(np.asarray(v_goal, np.float32), (*q.shape[:-1], 3))
+    never = np.full(q.shape[:-1], np.iinfo(np.int64).max)
+    ticks = np.zeros(q.shape[:-1], np.int64)
+    return State(q, np.zeros_like(q), history, goals, never, ticks, plant_reset(machine, q) if plant else None)
+
+
+def transition(machine: Machine, net: ActuatorNet | None, state: State, u: Array) -> State:
+    """One tick under the command `u` (..., n), by the nets, or by the plant where the state has one.
+
+    Paper: Sec. 3.4 (actuator nets in the simulation), Table 1
+    """
+    history = push_command(state.history, u)
+    q, plant = state.q, None
+    if state.plant is not None:
+        plant = plant_step(machine, state.plant, u)
+        q = plant.q.astype(np.float32)
+    elif net is not None:
+        driven = machine.driven
+        predicted = net.predict(history[..., driven, :, :])
+        q = q.copy()
+        q[..., driven] = np.clip(
+            q[..., driven] + predicted / np.float32(machine.rate),
+            machine.column("q_min")[driven].astype(np.float32),
+            machine.column("q_max")[driven].astype(np.float32),
+        )
+    else:
+        raise ValueError("net: expected nets for a state without a plant, got None")
+
+    def velocity(angles: Array) -> Array:
+        return estimate_velocity(angles, machine.velocity_samples, machine.dt)
+
+    return replace(
+        state,
+        q=q,
+        q_dot=(q - state.q) * np.float32(machine.rate),
+        history=push_angle(history, read_encoder(machine, q), velocity),
+        goal_ticks=state.goal_ticks - 1,
+        ticks=state.ticks + 1,
+        plant=plant,
+    )
+
+
+def reward(v_goal: Array, v_tool: Array) -> Array:
+    """1 / (1 + |v_goal - v_tool|), in (0, 1]. Paper: eq2
+
+    Args:
+        v_goal: wanted tool velocity [m/s], shape (..., 3).
+        v_tool: true tool velocity [m/s], shape (..., 3).
+
+    Example:
+        >>> reward(np.array([0.3, 0.4, 0.0]), np.zeros(3))
+        np.float64(0.6666666666666666)
+    """
+    difference = v_goal - v_tool
+    result: Array = 1 / (1 + np.sqrt(np.sum(difference * difference, axis=-1)))
+    return result
+
+
+def terminated(machine: Machine, lowest: Array) -> Bools:
+    """Does the arm reach into the ground? `lowest` [m] (...) of `tool_state`. Paper: Sec. 3.4"""
+    return np.asarray(lowest < machine.ground)
+
+
+def draw_pose(machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int) -> Array:
+    """Random angles within the joints' ranges [rad] (num, n), off the ground if so configured.
+
+    Raises:
+        ValueError: a machine whose arm is in the ground in every pose drawn.
+    """
+    low, high = machine.column("q_min"), machine.column("q_max")
+    q = rng.uniform(low, high, (num, machine.n))
+    for _ in range(1000 * config.redraw_ground):
+        bad = terminated(machine, lowest_point(machine, q))
+        if not bad.any():
+            return q
+        q[bad] = rng.uniform(low, high, (int(bad.sum()), machine.n))
+    if config.redraw_ground:
+        raise ValueError(f"{machine.name}: expected a pose above the ground, got none in 1000 draws")
+    return q
+
+
+def draw_goal(machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int) -> Array:
+    """Random tool velocities [m/s] (num, 3): zero, along an axis, or anywhere; up to tool_speed."""
+    direction = rng.standard_normal((num, 3))
+    axis = np.vstack([np.eye(3), -np.eye(3)])[rng.integers(0, 6, num)]
+    kind = rng.random((num, 1))
+    direction = np.where(kind < config.zero_goals + config.axis_goals, axis, direction)
+    direction = np.where(kind < config.zero_goals, 0.0, direction)
+    length = np.maximum(np.linalg.norm(direction, axis=-1, keepdims=True), 1e-12)
+    return direction / length * rng.uniform(0, machine.tool_speed, (num, 1))
+
+
+def _draw_hold(machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int) -> NDArray[np.int64]:
+    seconds = rng.uniform(config.hold_min_s, config.hold_max_s, num)
+    return np.maximum(1, np.rint(seconds * machine.rate)).astype(np.int64)
+
+
+def reset(
+    machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int, plant: bool
+) -> State:
+    """`num` machines at rest in random poses with random goals; leading shape (num,)."""
+    pose, goal = draw_pose(machine, config, rng, num), draw_goal(machine, config, rng, num)
+    state = rest_state(machine, pose, goal, plant)
+    return replace(state, goal_ticks=_draw_hold(machine, config, rng, num))
+
+
+def noisy(observation: Array, config: TaskConfig, rng: np.random.Generator) -> Array:
+    """Observations with fresh uniform noise of `config.noise`. Paper: Sec. 3.4 (5 %)"""
+    draws = rng.random(observation.shape, np.float32)
+    return observation + np.float32(2 * config.noise) * (draws - np.float32(0.5))
+
+
+class Outcome(NamedTuple):
+    """What one `step` yields, beside the state; arrays (num,) except `observation` (num, obs)."""
+
+    observation: Array
+    reward: Array
+    terminated: Bools
+    truncated: Bools
+    velocity_error: Array  # |v_goal - v_tool| [m/s]
+
+
+def step(
+    machine: Machine,
+    config: TaskConfig,
+    net: ActuatorNet | None,
+    state: State,
+    action: ArrayLike,
+    rng: np.random.Generator,
+) -> tuple[State, Outcome]:
+    """One tick of `num` environments, without resets: `action` (num, n_driven) in [-1, 1].
+
+    The reward is for the goal that held during the tick; a new goal is drawn after it. On a tick
+    that ends in the ground the reward is zero.
+    """
+    state = transition(machine, net, state, to_command(machine, action))
+    _, v_tool, lowest = tool_state(machine, state.q, state.q_dot)
+    rewards = reward(state.v_goal, v_tool)
+    end = terminated(machine, lowest)
+    error = 1 / rewards - 1
+    due = np.flatnonzero(state.goal_ticks <= 0)
+    if len(due):
+        goals, holds = state.v_goal.copy(), state.goal_ticks.copy()
+        goals[due] = draw_goal(machine, config, rng, len(due))
+        holds[due] = _draw_hold(machine, config, rng, len(due))
+        state = replace(state, v_goal=goals, goal_ticks=holds)
+    observation = noisy(observe(machine, state.history, state.v_goal), config, rng)
+    truncated = (state.ticks >= round(config.episode_s * machine.rate)) & ~end
+    return state, Outcome(observation, np.where(end, 0.0, rewards), end, truncated, error)
+
+
+def merge(old: State, new: State, rows: NDArray[np.intp]) -> State:
+    """`old` with its rows `rows` replaced by the states `new`, one each."""
+
+    def put(a: Any, b: Any) -> Any:
+        a = a.copy()
+        a[rows] = b
+        return a
+
+    names = ("q", "q_dot", "history", "v_goal", "goal_ticks", "ticks")
+    arrays = {name: put(getattr(old, name), getattr(new, name)) for name in names}
+    plant = None
+    if old.plant is not None and new.plant is not None:
+        fields = [put(a, b) for a, b in zip(old.plant[:-1], new.plant[:-1], strict=True)]
+        pending = tuple(map(put, old.plant.pending, new.plant.pending))
+        plant = PlantState(*fields, pending)
+    return State(**arrays, plant=plant)
+
+
+# --- Gymnasium --------------------------------------------------------------------------------------
+
+
+def open_actuator(machine: Machine, actuator: ActuatorNet | Path | str | None) -> ActuatorNet | None:
+    """Nets of the machine's driven joints from an object or a file; None or "analytic": the plant.
+
+    Raises:
+        ValueError: nets that do not fit the machine, naming what was wanted and found.
+    """
+    if actuator is None or actuator == "analytic":
+        return None
+    net = actuator if isinstance(actuator, ActuatorNet) else load_net(Path(actuator))
+    wanted = {
+        "rate": machine.rate,
+        "history": machine.history,
+        "velocity_samples": machine.velocity_samples,
+        "velocity_logged": False,  # a bus carries angles only
+    }
+    found = {name: getattr(net, name) for name in wanted}
+    if found != wanted:
+        raise ValueError(f"actuator: expected nets for {machine.name} with {wanted}, got {found}")
+    return net.select([machine.names[i] for i in machine.driven])
+
+
+class TaskVectorEnv(VectorEnv[Array, Array, Array]):
+    """Many machines that follow random tool velocities; an ended episode starts anew in the same step.
+
+    Observation: Box, see `observe`. Action: Box [-1, 1] a driven joint, 1 = the command limit.
+    Reward: `reward`. `info["final_obs"]` holds the last observation of an ended episode where
+    `info["_final_obs"]` is set; `info["velocity_error"]` is |v_goal - v_tool| [m/s].
+
+    Args:
+        num_envs: how many.
+        actuator: nets (object or file) or "analytic" for the plant.
+        machine: what moves.
+        config: what an episode is.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        actuator: ActuatorNet | Path | str | None = "analytic",
+        machine: Machine = BROKK_170,
+        config: TaskConfig | None = None,
+    ) -> None:
+        self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
+        self.num_envs, self.machine, self.config = num_envs, machine, config or TaskConfig()
+        self.net = open_actuator(machine, actuator)
+        self.single_observation_space, self.single_action_space = _spaces(machine)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.state: State | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Draw new episodes for all environments."""
+        super().reset(seed=seed)
+        self.state = reset(self.machine, self.config, self.np_random, self.num_envs, self.net is None)
+        return self._observation(self.state), {}
+
+    def _observation(self, state: State) -> Array:
+        return noisy(observe(self.machine, state.history, state.v_goal), self.config, self.np_random)
+
+    def step(self, actions: Array) -> tuple[Array, Array, Bools, Bools, dict[str, Any]]:
+        """One tick of all environments: actions (num_envs, n_driven)."""
+        if self.state is None:
+            raise ValueError("step: expected a reset before the first step, got none")
+        self.state, out = step(self.machine, self.config, self.net, self.state, actions, self.np_random)
+        observation, info = out.observation, {"velocity_error": out.velocity_error}
+        ended = out.terminated | out.truncated
+        rows = np.flatnonzero(ended)
+        if len(rows):
+            fresh = reset(self.machine, self.config, self.np_random, len(rows), self.net is None)
+            self.state = merge(self.state, fresh, rows)
+            info |= {"final_obs": observation, "_final_obs": ended}
+            observation = observation.copy()
+            observation[rows] = self._observation(fresh)
+        return observation, out.reward, out.terminated, out.truncated, info
+
+
+class TaskEnv(gymnasium.Env[Array, Array]):
+    """One machine that follows random tool velocities: `TaskVectorEnv`'s functions, batch of one."""
+
+    metadata = {"render_modes": []}
+
+    def __init__(
+        self,
+        actuator: ActuatorNet | Path | str | None = "analytic",
+        machine: Machine = BROKK_170,
+        config: TaskConfig | None = None,
+    ) -> None:
+        self.machine, self.config = machine, config or TaskConfig()
+        self.net = open_actuator(machine, actuator)
+        self.observation_space, self.action_space = _spaces(machine)
+        self.state: State | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Draw a new episode."""
+        super().reset(seed=seed)
+        self.state = reset(self.machine, self.config, self.np_random, 1, self.net is None)
+        observation = observe(self.machine, self.state.history, self.state.v_goal)
+        return noisy(observation, self.config, self.np_random)[0], {}
+
+    def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """One tick: action (n_driven,)."""
+        if self.state is None:
+            raise ValueError("step: expected a reset before the first step, got none")
+        action = np.asarray(action)[None]
+        self.state, out = step(self.machine, self.config, self.net, self.state, action, self.np_random)
+        info = {"velocity_error": float(out.velocity_error[0])}
+        flags = bool(out.terminated[0]), bool(out.truncated[0])
+        return out.observation[0], float(out.reward[0]), *flags, info
+
+
+def _spaces(machine: Machine) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
+    size = 6 + len(machine.locked) + 3 * machine.history * len(machine.driven)
+    action = gymnasium.spaces.Box(-1.0, 1.0, (len(machine.driven),), np.float32)
+    return gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32), action
+
+
+gymnasium.register(
+    "brokk_min/Brokk170-v0",
+    entry_point="brokk_min.env:TaskEnv",
+    vector_entry_point="brokk_min.env:TaskVectorEnv",
+)

@@ -1,0 +1,345 @@
+"""A machine as one frozen value: geometry, limits, valves, cylinders, encoders, CAN ids.
+
+Porting to another machine means writing another `Machine`; nothing else in the package knows a
+Brokk. Every number carries its unit (in the class) and its source (in the value):
+`paper`, `maker`, `assumed` or `tuned`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+SOURCES = ("paper", "maker", "assumed", "tuned")
+PWM_MAX = 127  # counts of full command; paper: [0,127] is positive, [255,128] negative
+
+
+def _number(unit: str, default: Any = dataclasses.MISSING) -> Any:
+    """A dataclass field that carries its unit."""
+    return dataclasses.field(default=default, metadata={"unit": unit})
+
+
+@dataclass(frozen=True)
+class Joint:
+    """One revolute joint: its standard DH row Rz(q + theta) Tz(d) Tx(a) Rx(alpha), range and drive.
+
+    A cylinder spans a triangle: sides `cylinder_base` and `cylinder_rod` meet at the pivot under
+    the angle `cylinder_angle + q`. A base of 0 means a slew drive with constant lever arm `rod`.
+    """
+
+    name: str
+    driven: bool  # does the controller move it? (a locked joint is set by the operator)
+    a: float = _number("m")
+    alpha: float = _number("rad")
+    d: float = _number("m")
+    theta: float = _number("rad")
+    q_min: float = _number("rad")
+    q_max: float = _number("rad")
+    cylinder_base: float = _number("m")
+    cylinder_rod: float = _number("m")
+    cylinder_angle: float = _number("rad")
+    cylinder_area: float = _number("m^2")
+    speed_positive: float = _number("m/s")  # of the cylinder at full command
+    speed_negative: float = _number("m/s")
+    q_dot_max: float = _number("rad/s")  # fastest motion at the command limit, as logs show it
+    encoder_node: int = _number("CANopen node id")
+
+
+@dataclass(frozen=True)
+class Machine:
+    """Everything that distinguishes one machine from another; validated on creation.
+
+    Raises:
+        ValueError: a field is out of its range, with its name, what is allowed and what came.
+
+    Example:
+        >>> BROKK_170.n, [joint.name for joint in BROKK_170.joints if joint.driven]
+        (5, ['q1', 'q3', 'q4', 'q5'])
+    """
+
+    name: str
+    joints: tuple[Joint, ...]
+    sources: Mapping[str, str]  # field name of Machine or Joint -> one of SOURCES
+    rate: float = _number("Hz")  # control and logging rate
+    pwm_limit: int = _number("counts of 127")  # largest command that may leave the program
+    dead_zone: float = _number("of full command")
+    delay: float = _number("s")
+    spool_time: float = _number("s")
+    cylinder_time: float = _number("s")
+    ready_up_time: float = _number("s")
+    ready_down_time: float = _number("s")
+    ready_threshold: float = _number("1")
+    spool_idle: float = _number("of full stroke")
+    pump_flow: float = _number("m^3/s")
+    plant_dt: float = _number("s")  # explicit Euler step of the analytic plant
+    encoder_bits: int = _number("bits a turn")
+    velocity_samples: int = _number("samples")  # window of the causal velocity estimator
+    history: int = _number("samples")  # of q, q_dot and u that the nets and the policy see
+    tool_speed: float = _number("m/s")  # largest tool speed an operator may ask for
+    ground: float = _number("m")  # height of the ground in the base frame
+    valve_frame_id: int = _number("CAN id")
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be a machine, naming field, wanted and got."""
+        if not self.joints:
+            raise ValueError("joints: expected at least one Joint, got none")
+        names = [joint.name for joint in self.joints]
+        if len(set(names)) != len(names):
+            raise ValueError(f"joints: expected different names, got {names}")
+        if not any(joint.driven for joint in self.joints):
+            raise ValueError("joints: expected at least one driven joint, got none")
+        for owner, where in [(self, ""), *((joint, joint.name + ".") for joint in self.joints)]:
+            for field in dataclasses.fields(owner):
+                if "unit" in field.metadata:
+                    self._check_number(owner, field.name, where + field.name)
+        object.__setattr__(self, "sources", MappingProxyType(dict(self.sources)))
+
+    def _check_number(self, owner: Machine | Joint, field: str, label: str) -> None:
+        value = getattr(owner, field)
+        if not (isinstance(value, int | float) and np.isfinite(value)):
+            raise ValueError(f"{label}: expected a finite number, got {value!r}")
+        if self.sources.get(field) not in SOURCES:
+            got = self.sources.get(field)
+            raise ValueError(f"sources[{field!r}]: expected one of {SOURCES}, got {got!r}")
+        low, high = _RANGES.get(field, (-np.inf, np.inf))
+        if not low <= value <= high:
+            raise ValueError(f"{label}: expected {low} to {high}, got {value!r}")
+        if field == "q_max" and isinstance(owner, Joint):
+            if not owner.q_min < value:
+                raise ValueError(f"{label}: expected above q_min = {owner.q_min}, got {value!r}")
+            angles = (owner.cylinder_angle + owner.q_min, owner.cylinder_angle + value)
+            if owner.cylinder_base > 0 and not 0 < angles[0] < angles[1] < np.pi:
+                raise ValueError(
+                    f"{owner.name}.cylinder_angle: expected the triangle's angle within (0, pi) "
+                    f"over the joint's range, got {angles[0]:.3f} to {angles[1]:.3f}"
+                )
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return len(self.joints)
+
+    @property
+    def dt(self) -> float:
+        """Control period [s]."""
+        return 1.0 / self.rate
+
+    @property
+    def encoder_step(self) -> float:
+        """Angle of one encoder count [rad]."""
+        return float(2 * np.pi / 2**self.encoder_bits)
+
+    @cached_property
+    def driven(self) -> NDArray[np.intp]:
+        """Indices of the driven joints, shape (n_driven,)."""
+        return np.flatnonzero([joint.driven for joint in self.joints])
+
+    @cached_property
+    def locked(self) -> NDArray[np.intp]:
+        """Indices of the joints that the operator sets and the controller leaves alone."""
+        return np.flatnonzero([not joint.driven for joint in self.joints])
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Joint names in the order of every array of the package."""
+        return tuple(joint.name for joint in self.joints)
+
+    @cached_property
+    def _columns(self) -> dict[str, NDArray[np.float64]]:
+        fields = [f.name for f in dataclasses.fields(Joint) if "unit" in f.metadata]
+        columns = {name: np.array([getattr(j, name) for j in self.joints], float) for name in fields}
+        for column in columns.values():
+            column.setflags(write=False)
+        return columns
+
+    def column(self, field: str) -> NDArray[np.float64]:
+        """One numeric `Joint` field over all joints, shape (n,), read-only.
+
+        Example:
+            >>> BROKK_170.column("a")
+            array([0.25, 1.15, 1.25, 1.15, 1.2 ])
+        """
+        return self._columns[field]
+
+
+_RANGES: dict[str, tuple[float, float]] = {
+    "cylinder_base": (0, np.inf),
+    "cylinder_rod": (1e-6, np.inf),
+    "cylinder_area": (1e-9, np.inf),
+    "speed_positive": (1e-9, np.inf),
+    "speed_negative": (1e-9, np.inf),
+    "q_dot_max": (1e-9, np.inf),
+    "encoder_node": (1, 127),
+    "rate": (1e-3, np.inf),
+    "pwm_limit": (1, PWM_MAX),
+    "dead_zone": (0, 0.99),
+    "delay": (0, np.inf),
+    "spool_time": (1e-6, np.inf),
+    "cylinder_time": (1e-6, np.inf),
+    "ready_up_time": (1e-6, np.inf),
+    "ready_down_time": (1e-6, np.inf),
+    "ready_threshold": (0, 0.999),
+    "spool_idle": (0, 1),
+    "pump_flow": (1e-9, np.inf),
+    "plant_dt": (1e-6, 1),
+    "encoder_bits": (1, 32),
+    "velocity_samples": (2, 100),
+    "history": (2, 1000),
+    "tool_speed": (1e-9, np.inf),
+    "valve_frame_id": (0, 0x7FF),
+}
+
+
+def limit_command(machine: Machine, u: ArrayLike) -> NDArray[np.floating]:
+    """The command that reaches the valve: whole PWM counts, within the limit.
+
+    Paper: Sec. 3.1 (65 %)
+
+    Args:
+        machine: whose `pwm_limit` holds.
+        u: wanted command in [-1, 1] of full, shape (...); beyond the limit it is clipped.
+
+    Returns:
+        Multiples of 1/127 within +-pwm_limit/127, shape and float type of `u`.
+
+    Example:
+        >>> limit_command(BROKK_170, [-1.0, 0.1]) * 127
+        array([-80.,  13.])
+    """
+    u = np.asarray(u)
+    counts = np.clip(np.rint(u * PWM_MAX), -machine.pwm_limit, machine.pwm_limit)
+    limited: NDArray[np.floating] = (counts / PWM_MAX).astype(u.dtype)
+    return limited
+
+
+def encode_pwm(u: ArrayLike) -> NDArray[np.uint8]:
+    """Byte on the bus for a signed command: m >= 0 -> m, m < 0 -> 255 - |m|.
+
+    Paper: Sec. 3.2 (the pairs 80/175 and 50/205 sum to 255)
+
+    Args:
+        u: command in [-1, 1], shape (...), rounded to counts of 1/127.
+
+    Raises:
+        ValueError: a command outside [-1, 1] or not a number.
+
+    Example:
+        >>> encode_pwm(np.array([80, -80, 50, -50, 0]) / 127).tolist()
+        [80, 175, 50, 205, 0]
+    """
+    u = np.asarray(u, float)
+    if not np.all(np.abs(u) <= 1):
+        raise ValueError(f"u: expected within [-1, 1], got {u[~(np.abs(u) <= 1)].flat[0]}")
+    counts = np.rint(u * PWM_MAX).astype(int)
+    return np.where(counts < 0, 255 + counts, counts).astype(np.uint8)
+
+
+def decode_pwm(u_byte: ArrayLike) -> NDArray[np.float64]:
+    """Signed command in [-1, 1] for a byte; 0 and 255 both mean idle. Shape (...).
+
+    Paper: Sec. 3.2
+
+    Example:
+        >>> decode_pwm([80, 175, 0, 255]) * 127
+        array([ 80., -80.,   0.,   0.])
+    """
+    u_byte = np.asarray(u_byte, np.uint8).astype(int)
+    counts = np.where(u_byte > PWM_MAX, u_byte - 255, u_byte)
+    return np.asarray(counts / PWM_MAX, float)
+
+
+def read_encoder(machine: Machine, q: ArrayLike) -> NDArray[np.floating]:
+    """What the encoders report for true angles `q` [rad]: whole counts, same shape and float type.
+
+    Example:
+        >>> read_encoder(BROKK_170, [0.0, 0.001, 1.0]) / BROKK_170.encoder_step
+        array([  0.,   1., 652.])
+    """
+    q = np.asarray(q)
+    counts: NDArray[np.floating] = np.rint(q / machine.encoder_step)
+    return (counts * machine.encoder_step).astype(q.dtype)
+
+
+def estimate_velocity(q: ArrayLike, samples: int, dt: float) -> NDArray[np.floating]:
+    """Causal velocity: slope of the straight line fitted to the newest `samples` angles.
+
+    The one estimator of the package: logs, environment and hardware all call it. A difference over
+    one tick of a 12-bit encoder comes in steps of 0.031 rad/s at 20 Hz; four samples have a third
+    of its noise and lag by 1.5 ticks.
+
+    Args:
+        q: angles [rad], newest last, at least `samples` of them, shape (..., >= samples).
+        samples: window length, at least 2.
+        dt: sampling period [s].
+
+    Returns:
+        Velocity [rad/s], shape (...).
+
+    Example:
+        >>> estimate_velocity([0.0, 0.1, 0.2, 0.3], samples=4, dt=0.05).round(6)
+        np.float64(2.0)
+    """
+    q = np.asarray(q)
+    if samples < 2 or q.shape[-1] < samples:
+        raise ValueError(f"q: expected at least {max(2, samples)} samples, got {q.shape}")
+    lags = np.arange(samples) - (samples - 1) / 2
+    weights = (lags / (lags @ lags * dt)).astype(q.dtype)
+    velocity: NDArray[np.floating] = q[..., -samples:] @ weights
+    return velocity
+
+
+def _brokk_170() -> Machine:
+    """The machine of the paper: ranges and links are plausible, not the maker's data."""
+    pi = float(np.pi)
+    #         name driven  a     alpha   d     theta         q_min  q_max
+    rows = [
+        ("q1", True, 0.25, pi / 2, 0.95, 0.0, -2.14, 2.14),
+        ("q2", False, 1.15, 0.0, 0.0, 0.0, 0.0, 1.4),
+        ("q3", True, 1.25, 0.0, 0.0, 0.0, -0.3, 1.6),
+        ("q4", True, 1.15, 0.0, 0.0, -pi, 0.6, 2.9),
+        ("q5", True, 1.20, 0.0, 0.0, -3 * pi / 4, 0.0, 2.0),
+    ]
+    #   base  rod   angle  area    speed+  speed-  fastest node
+    drives = [
+        (0.00, 0.15, 0.00, 0.0040, 0.0498, 0.0498, 0.20, 1),
+        (1.00, 0.35, 0.45, 0.0100, 0.0588, 0.0802, 0.22, 2),
+        (0.90, 0.30, 0.80, 0.0090, 0.0453, 0.0825, 0.28, 3),
+        (0.80, 0.25, -0.30, 0.0060, 0.0370, 0.0662, 0.38, 4),
+        (0.60, 0.20, 0.40, 0.0040, 0.0425, 0.0833, 0.47, 5),
+    ]
+    joints = tuple(Joint(*row, *drive) for row, drive in zip(rows, drives, strict=True))
+    paper = dict.fromkeys(["rate", "pwm_limit", "dead_zone", "history"], "paper")
+    every = [f.name for c in (Joint, Machine) for f in dataclasses.fields(c) if "unit" in f.metadata]
+    return Machine(
+        name="brokk170",
+        joints=joints,
+        sources=dict.fromkeys(every, "assumed") | paper | {"velocity_samples": "tuned"},
+        rate=20.0,
+        pwm_limit=80,
+        dead_zone=0.07,
+        delay=0.040,
+        spool_time=0.030,
+        cylinder_time=0.030,
+        ready_up_time=0.15,
+        ready_down_time=0.40,
+        ready_threshold=0.80,
+        spool_idle=0.01,
+        pump_flow=0.00155,
+        plant_dt=0.005,
+        encoder_bits=12,
+        velocity_samples=4,
+        history=13,
+        tool_speed=0.3,
+        ground=0.0,
+        valve_frame_id=0x210,
+    )
+
+
+BROKK_170 = _brokk_170()

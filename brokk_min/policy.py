@@ -1,0 +1,103 @@
+"""A trained policy as a file and a function; NumPy alone, so that it runs wherever the machine is."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brokk_min.actuator import load_header
+from brokk_min.env import observation_scale
+from brokk_min.logs import load_arrays, whole_file
+from brokk_min.machine import Machine
+
+Array = NDArray[np.floating[Any]]
+FORMAT = 1  # of policy files
+
+
+@dataclass(frozen=True)
+class Policy:
+    """The actor: standardised observation in, mean action out. Paper: Sec. 3.5 (256-128-64, ELU)"""
+
+    contract: Mapping[str, Any]  # what training and machine must agree on, see `contract`
+    training: Mapping[str, Any]  # seed and settings that made it
+    mean: Array  # (obs,) normalisation that `observe` applied
+    scale: Array  # (obs,)
+    weights: tuple[Array, ...]  # w, b of each layer, w (inputs, outputs)
+
+    def act(self, observation: Array) -> Array:
+        """Actions (..., n_driven) for observations (..., obs) of `observe`; `to_command` clips them.
+
+        Raises:
+            ValueError: a wrong shape or an observation that is no number.
+        """
+        x = np.asarray(observation, np.float32)
+        if x.shape[-1:] != self.mean.shape:
+            raise ValueError(f"observation: expected (..., {len(self.mean)}), got {x.shape}")
+        if not np.isfinite(x).all():
+            raise ValueError("observation: expected finite numbers, got nan or inf")
+        layers = list(zip(self.weights[::2], self.weights[1::2], strict=True))
+        for w, b in layers[:-1]:
+            x = x @ w + b
+            x = np.where(x > 0, x, np.expm1(np.minimum(x, 0)))  # ELU
+        w, b = layers[-1]
+        action: Array = x @ w + b
+        return action
+
+
+def contract(machine: Machine) -> dict[str, Any]:
+    """What training and deployment must agree on; kept in the file and checked by `load_policy`."""
+    return {
+        "machine": machine.name,
+        "joints": list(machine.names),
+        "driven": [machine.names[i] for i in machine.driven],
+        "history": machine.history,
+        "rate": machine.rate,
+        "velocity_samples": machine.velocity_samples,
+        "pwm_limit": machine.pwm_limit,
+    }
+
+
+def save_policy(path: Path, policy: Policy) -> None:
+    """Write a policy as one `.npz`: weights and normalisation plus a JSON header."""
+    header = {
+        "format": FORMAT,
+        "kind": "policy",
+        "contract": dict(policy.contract),
+        "training": dict(policy.training),
+    }
+    arrays = {f"weight_{i}": weight for i, weight in enumerate(policy.weights)}
+    with whole_file(path) as file:
+        np.savez(file, header=np.array(json.dumps(header)), mean=policy.mean, scale=policy.scale, **arrays)
+
+
+def load_policy(path: Path, machine: Machine) -> Policy:
+    """Read a policy for `machine`.
+
+    Raises:
+        ValueError: no policy file, or one for another machine, joint order, history, rate or scale;
+            with what was wanted and what was found.
+    """
+    arrays = load_arrays(path)
+    header = load_header(path, arrays, "policy", FORMAT)
+    wanted, found = contract(machine), header.get("contract", {})
+    for name, value in wanted.items():
+        if found.get(name) != value:
+            raise ValueError(f"{path}: {name}: expected {value!r}, got {found.get(name)!r}")
+    try:
+        weights = tuple(arrays[f"weight_{i}"] for i in range(8))
+        policy = Policy(found, header["training"], arrays["mean"], arrays["scale"], weights)
+        action = policy.act(policy.mean)
+    except (KeyError, ValueError) as error:
+        raise ValueError(f"{path}: expected a complete policy, got {error!r}") from error
+    if action.shape != machine.driven.shape or not np.isfinite(action).all():
+        raise ValueError(f"{path}: weights: expected {len(machine.driven)} actions, got {action}")
+    for name, value in zip(("mean", "scale"), observation_scale(machine), strict=True):
+        if not np.array_equal(arrays[name], value):
+            raise ValueError(f"{path}: {name}: expected the machine's normalisation, got another")
+    return policy

@@ -1,0 +1,391 @@
+"""Proximal Policy Optimization in one file, to be read from top to bottom.
+
+Paper: Sec. 3.5. Clipped objective, generalised advantage estimation, 256 environments at once. An
+episode that runs out of time is not an episode that failed: at a truncation the return goes on with
+the value of the episode's own last observation (`next_values`), at a termination it stops.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+from tqdm import tqdm
+
+from brokk_min.actuator import ActuatorNet, load_header
+from brokk_min.env import State, TaskConfig, TaskVectorEnv, observation_scale
+from brokk_min.logs import load_arrays, whole_file
+from brokk_min.machine import Machine
+from brokk_min.policy import Policy, contract, save_policy
+
+Tensor = torch.Tensor
+FORMAT = 1  # of checkpoints
+STATE = ("q", "q_dot", "history", "v_goal", "goal_ticks", "ticks")
+
+
+@dataclass(frozen=True)
+class PPOConfig:
+    """Settings of the learner; those that the paper names are marked."""
+
+    total_steps: int = 6_000_000
+    """Environment steps in all."""
+    num_envs: int = 256
+    """Environments side by side (paper: 256)."""
+    horizon: int = 32
+    """Ticks of every environment between two updates."""
+    epochs: int = 4
+    """Passes over the collected steps in each update."""
+    minibatch_size: int = 2048
+    """Steps in one gradient."""
+    learning_rate: float = 1e-3
+    """Of Adam at the start; falls linearly to zero at the end."""
+    gamma: float = 0.97
+    """Discount a tick: 0.97 looks 33 ticks (1.7 s) ahead."""
+    gae_lambda: float = 0.95
+    """Weight of longer returns in the advantage."""
+    clip: float = 0.2
+    """Largest change of a probability ratio that still earns."""
+    entropy: float = 0.0
+    """Bonus for the entropy of the action distribution."""
+    max_grad_norm: float = 1.0
+    """Gradients are scaled down to this norm."""
+    log_std: float = -0.7
+    """Logarithm of the actions' standard deviation at the start."""
+    checkpoint_every: int = 40
+    """Updates between two checkpoints."""
+    threads: int = 2
+    """Threads of torch; sums, and so the last bits, depend on it."""
+
+
+# --- the algorithm, in functions that can be tested one by one --------------------------------------
+
+
+def mlp(inputs: int, outputs: int, gain: float) -> nn.Sequential:
+    """256-128-64 with ELU and a linear output, orthogonal start. Paper: Sec. 3.5"""
+    sizes, layers = [inputs, 256, 128, 64], []
+    for rows, columns in zip(sizes[:-1], sizes[1:], strict=True):
+        layers += [_orthogonal(nn.Linear(rows, columns), 2**0.5), nn.ELU()]
+    return nn.Sequential(*layers, _orthogonal(nn.Linear(sizes[-1], outputs), gain))
+
+
+def _orthogonal(layer: nn.Linear, gain: float) -> nn.Linear:
+    nn.init.orthogonal_(layer.weight, gain)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+class Agent(nn.Module):
+    """Actor and critic, two separate nets, and the logarithm of the actions' deviation."""
+
+    def __init__(self, observations: int, actions: int, log_std: float) -> None:
+        super().__init__()
+        self.actor = mlp(observations, actions, 0.01)
+        self.critic = mlp(observations, 1, 1.0)
+        self.log_std = nn.Parameter(torch.full((actions,), log_std))
+
+    def value(self, observation: Tensor) -> Tensor:
+        """Value (...) of observations (..., obs), in units of the mean reward: return * (1 - gamma)."""
+        value: Tensor = self.critic(observation)[..., 0]
+        return value
+
+
+def log_probability(action: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
+    """Log-density (...) of actions (..., a) under independent normals."""
+    z = (action - mean) * torch.exp(-log_std)
+    return -0.5 * (z * z).sum(-1) - log_std.sum() - 0.5 * action.shape[-1] * np.log(2 * np.pi)
+
+
+def gae(
+    rewards: Tensor, values: Tensor, next_values: Tensor, ended: Tensor, gamma: float, gae_lambda: float
+) -> Tensor:
+    """Generalised advantage estimates, all arguments and the result of shape (T, N).
+
+    Args:
+        rewards: reward of tick t.
+        values: value of the observation before tick t.
+        next_values: value of the observation after tick t: 0 where the episode terminated, that of its
+            own last observation where it was truncated.
+        ended: 1 where the episode terminated or was truncated at tick t.
+        gamma: discount.
+        gae_lambda: weight of longer returns.
+
+    Example:
+        >>> one = torch.ones(2, 1)
+        >>> gae(one, 0 * one, 0 * one, 0 * one, 0.5, 1.0).ravel().tolist()
+        [1.5, 1.0]
+    """
+    delta = rewards + gamma * next_values - values
+    advantages, later = torch.empty_like(delta), torch.zeros_like(delta[0])
+    for t in range(len(delta) - 1, -1, -1):
+        later = delta[t] + gamma * gae_lambda * (1 - ended[t]) * later
+        advantages[t] = later
+    return advantages
+
+
+def policy_loss(new: Tensor, old: Tensor, advantages: Tensor, clip: float) -> Tensor:
+    """Clipped surrogate loss from log-probabilities and advantages, all (B,); the mean over B."""
+    ratio = torch.exp(new - old)
+    clipped = torch.clamp(ratio, 1 - clip, 1 + clip)
+    return -torch.min(ratio * advantages, clipped * advantages).mean()
+
+
+def normalise(advantages: Tensor) -> Tensor:
+    """Advantages (B,) with zero mean and unit deviation."""
+    return (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+
+
+# --- training ---------------------------------------------------------------------------------------
+
+
+class Training:
+    """Everything that changes while a policy is trained, so that it can be saved and taken up again."""
+
+    def __init__(self, env: TaskVectorEnv, config: PPOConfig, seed: int) -> None:
+        self.env, self.config, self.seed = env, config, seed
+        torch.set_num_threads(config.threads)
+        self.generator = torch.Generator().manual_seed(seed)
+        with torch.random.fork_rng():
+            torch.manual_seed(seed)
+            shapes = env.single_observation_space.shape, env.single_action_space.shape
+            self.agent = Agent(shapes[0][0], shapes[1][0], config.log_std)  # type: ignore[index]
+        self.optimizer = torch.optim.Adam(self.agent.parameters(), lr=config.learning_rate, fused=True)
+        self.updates = 0
+        self.observation = torch.from_numpy(env.reset(seed=seed)[0])
+
+    @property
+    def steps(self) -> int:
+        """Environment steps so far."""
+        return self.updates * self.config.horizon * self.config.num_envs
+
+    def update(self) -> dict[str, float]:
+        """Collect `horizon` ticks, learn from them; scalars under the names of CleanRL."""
+        c = self.config
+        left = max(0.0, 1 - self.steps / c.total_steps)
+        self.optimizer.param_groups[0]["lr"] = c.learning_rate * left
+        batch, scalars = self._collect()
+        losses = self._learn(batch)
+        self.updates += 1
+        scalars |= {"charts/learning_rate": c.learning_rate * left} | losses
+        for name, value in scalars.items():
+            if not np.isfinite(value):
+                raise ValueError(f"{name}: expected a finite number at step {self.steps}, got {value}")
+        return scalars
+
+    @torch.no_grad()
+    def _collect(self) -> tuple[dict[str, Tensor], dict[str, float]]:
+        c, agent = self.config, self.agent
+        shape = (c.horizon, c.num_envs)
+        observations = torch.empty(*shape, self.observation.shape[-1])
+        actions = torch.empty(*shape, len(agent.log_std))
+        rewards, ended, tails = (torch.zeros(shape) for _ in range(3))
+        errors, std = [], torch.exp(agent.log_std)
+        for t in range(c.horizon):
+            observations[t] = self.observation
+            mean = agent.actor(self.observation)
+            actions[t] = mean + std * torch.randn(mean.shape, generator=self.generator)
+            following, reward, terminated, truncated, info = self.env.step(actions[t].numpy())
+            rewards[t] = torch.from_numpy(reward) * (1 - c.gamma)
+            ended[t] = torch.from_numpy(terminated | truncated).float()
+            if truncated.any():
+                last = torch.from_numpy(info["final_obs"][truncated])
+                tails[t, torch.from_numpy(truncated)] = agent.value(last)
+            self.observation = torch.from_numpy(following)
+            errors.append(info["velocity_error"].mean())
+        values = agent.value(observations)
+        following_values = torch.cat([values[1:], agent.value(self.observation)[None]])
+        next_values = torch.where(ended > 0, tails, following_values)
+        advantages = gae(rewards, values, next_values, ended, c.gamma, c.gae_lambda)
+        batch = {
+            "observation": observations,
+            "action": actions,
+            "log_probability": log_probability(actions, agent.actor(observations), agent.log_std),
+            "advantage": advantages,
+            "return": advantages + values,
+        }
+        returns = batch["return"]
+        scalars = {
+            "charts/reward": float(rewards.mean()) / (1 - c.gamma),
+            "charts/velocity_error": float(np.mean(errors)),
+            "losses/explained_variance": float(1 - advantages.var() / (returns.var() + 1e-12)),
+        }
+        return {name: tensor.flatten(0, 1) for name, tensor in batch.items()}, scalars
+
+    def _learn(self, batch: dict[str, Tensor]) -> dict[str, float]:
+        c, agent = self.config, self.agent
+        size, total = len(batch["return"]), torch.zeros(5)
+        for _ in range(c.epochs):
+            for rows in torch.randperm(size, generator=self.generator).split(c.minibatch_size):
+                part = {name: tensor[rows] for name, tensor in batch.items()}
+                new = log_probability(part["action"], agent.actor(part["observation"]), agent.log_std)
+                old, advantages = part["log_probability"], normalise(part["advantage"])
+                loss = policy_loss(new, old, advantages, c.clip)
+                value_loss = ((agent.value(part["observation"]) - part["return"]) ** 2).mean()
+                entropy = agent.log_std.sum() + 0.5 * len(agent.log_std) * np.log(2 * np.pi * np.e)
+                self.optimizer.zero_grad()
+                (loss + value_loss - c.entropy * entropy).backward()  # type: ignore[no-untyped-call]
+                nn.utils.clip_grad_norm_(agent.parameters(), c.max_grad_norm)
+                self.optimizer.step()
+                with torch.no_grad():
+                    change = new - old
+                    kl = (torch.exp(change) - 1 - change).mean()
+                    clipped = (torch.abs(torch.exp(change) - 1) > c.clip).float().mean()
+                    total += torch.stack([loss, value_loss, entropy, kl, clipped]) * len(rows)
+        names = ("policy_loss", "value_loss", "entropy", "approx_kl", "clipfrac")
+        means = (total / (size * c.epochs)).tolist()
+        return {f"losses/{name}": value for name, value in zip(names, means, strict=True)}
+
+    def policy(self, training: dict[str, Any]) -> Policy:
+        """The actor as it stands, for the machine it was trained for."""
+        layers = [layer for layer in self.agent.actor if isinstance(layer, nn.Linear)]
+        weights = [(layer.weight.detach().numpy().T.copy(), layer.bias.detach().numpy()) for layer in layers]
+        mean, scale = observation_scale(self.env.machine)
+        flat = tuple(array for pair in weights for array in pair)
+        return Policy(contract(self.env.machine), training, mean, scale, flat)
+
+    # --- checkpoints: all of the above as arrays, nothing pickled
+
+    def save(self, path: Path, identity: dict[str, Any]) -> None:
+        """Write a checkpoint from which `load` continues to the same bits."""
+        state = self.env.state
+        if state is None:
+            raise ValueError("state: expected a reset environment, got None")
+        header = {
+            "format": FORMAT,
+            "kind": "checkpoint",
+            "identity": identity,
+            "updates": self.updates,
+            "random": self.env.np_random.bit_generator.state,
+        }
+        arrays = {f"env_{name}": getattr(state, name) for name in STATE}
+        arrays |= {"observation": self.observation.numpy(), "generator": self.generator.get_state().numpy()}
+        moments = self.optimizer.state
+        for i, parameter in enumerate(self.agent.parameters()):
+            arrays[f"parameter_{i}"] = parameter.detach().numpy()
+            for name, value in moments[parameter].items():
+                arrays[f"{name}_{i}"] = value.numpy()
+        with whole_file(path) as file:
+            np.savez(file, header=np.array(json.dumps(header)), **arrays)
+
+    def load(self, path: Path, identity: dict[str, Any]) -> None:
+        """Take up a checkpoint of the same training.
+
+        Raises:
+            ValueError: a file that is no checkpoint, or one of another training, with the difference.
+        """
+        arrays = load_arrays(path)
+        header = load_header(path, arrays, "checkpoint", FORMAT)
+        for name, wanted in identity.items():
+            if (found := header["identity"].get(name)) != wanted:
+                raise ValueError(f"{path}: {name}: expected {wanted}, got {found}")
+        tensors = {name: torch.from_numpy(a) for name, a in arrays.items() if name != "header"}
+        self.updates, self.observation = header["updates"], tensors["observation"]
+        self.env.state = State(**{name: arrays[f"env_{name}"] for name in STATE})
+        self.env.np_random.bit_generator.state = header["random"]
+        self.generator.set_state(tensors["generator"])
+        moments = self.optimizer.state
+        with torch.no_grad():
+            for i, parameter in enumerate(self.agent.parameters()):
+                parameter.copy_(tensors[f"parameter_{i}"])
+                names = ("step", "exp_avg", "exp_avg_sq")
+                moments[parameter] = {name: tensors[f"{name}_{i}"] for name in names}
+
+
+def fingerprint(net: ActuatorNet) -> str:
+    """Hash of the nets' weights: which simulation a policy was trained in."""
+    digest = hashlib.sha256()
+    for weight in net.weights:
+        digest.update(np.ascontiguousarray(weight).tobytes())
+    return digest.hexdigest()[:16]
+
+
+def train(
+    machine: Machine,
+    net: ActuatorNet,
+    task: TaskConfig,
+    config: PPOConfig,
+    seed: int,
+    out: Path,
+    resume: bool = False,
+    tensorboard: Path | None = None,
+) -> Policy:
+    """Train a policy on the nets and write it to `out`, its learning curve beside it as `.csv`.
+
+    Args:
+        machine: what moves.
+        net: nets of its driven joints; the only thing known of its hydraulics.
+        task: episodes.
+        config: settings of the learner.
+        seed: of everything random; the same seed gives the same bits on the same machine.
+        out: policy file; `<out>.checkpoint` and `<out>.csv` stand beside it.
+        resume: take up the checkpoint if there is one; the end is the same as without the break.
+        tensorboard: folder for the same scalars as in the CSV (needs the extra `tensorboard`).
+
+    Raises:
+        ValueError: a checkpoint of another training, or a loss that is no number (the last
+            checkpoint stays).
+    """
+    env = TaskVectorEnv(config.num_envs, net, machine, task)
+    training = Training(env, config, seed)
+    identity = {
+        "machine": machine.name,
+        "actuator": fingerprint(net),
+        "seed": seed,
+        "task": asdict(task),
+        "settings": asdict(config),
+    }
+    checkpoint, curve = Path(f"{out}.checkpoint"), Path(f"{out}.csv")
+    if resume and checkpoint.exists():
+        training.load(checkpoint, identity)
+    rows = _read_curve(curve, training.steps) if training.updates else []
+    writer = _tensorboard(tensorboard)
+    start = time.perf_counter()
+    first = training.steps
+    with tqdm(total=config.total_steps, initial=first, desc="train", unit="step", disable=None) as bar:
+        while training.steps < config.total_steps:
+            scalars = training.update()
+            speed = (training.steps - first) / (time.perf_counter() - start)
+            rows.append({"global_step": training.steps} | scalars | {"charts/SPS": round(speed)})
+            for name, value in list(rows[-1].items())[1:]:
+                writer and writer.add_scalar(name, value, training.steps)
+            bar.update(training.steps - bar.n)
+            bar.set_postfix_str(
+                f"reward {scalars['charts/reward']:.3f}, error {scalars['charts/velocity_error']:.3f} m/s"
+            )
+            if training.updates % config.checkpoint_every == 0:
+                _write_curve(curve, rows)
+                training.save(checkpoint, identity)
+    _write_curve(curve, rows)
+    policy = training.policy(identity)
+    save_policy(out, policy)
+    checkpoint.unlink(missing_ok=True)
+    return policy
+
+
+def _read_curve(path: Path, steps: int) -> list[dict[str, Any]]:
+    with open(path, newline="") as file:
+        return [row for row in csv.DictReader(file) if int(row["global_step"]) <= steps]
+
+
+def _write_curve(path: Path, rows: list[dict[str, Any]]) -> None:
+    with whole_file(path, "w") as file:
+        writer = csv.DictWriter(file, rows[0].keys(), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def _tensorboard(folder: Path | None) -> Any:
+    if folder is None:
+        return None
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        raise ValueError("tensorboard: expected the extra `brokk_min[tensorboard]`, got none") from error
+    return SummaryWriter(str(folder))  # type: ignore[no-untyped-call]
