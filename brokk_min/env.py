@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import gymnasium
 import numpy as np
@@ -354,6 +354,64 @@ def merge(old: State, new: State, rows: NDArray[np.intp]) -> State:
         pending = tuple(map(put, old.plant.pending, new.plant.pending))
         plant = PlantState(*fields, pending)
     return State(**arrays, plant=plant)
+
+
+# --- a controller on given goals --------------------------------------------------------------------
+
+
+class Controller(Protocol):
+    """What can drive: a memory at rest for `num` machines, and commands from observations."""
+
+    def start(self, num: int) -> Any:
+        """Memory of `num` controllers that have just been switched on."""
+
+    def __call__(self, observation: Array, memory: Any) -> tuple[Array, Any]:
+        """Commands u (num, n) for observations (num, obs) of `observe`, and the next memory."""
+
+
+class Trace(NamedTuple):
+    """What happened, tick by tick: arrays (T, num, ...); entry t is the end of tick t."""
+
+    q: Array  # true angle [rad], n
+    q_dot: Array  # true mean velocity over the tick [rad/s], n
+    q_measured: Array  # encoder angle when the command was computed [rad], n
+    u: Array  # command during the tick, n
+    p_tool: Array  # true tool position [m], 3
+    v_tool: Array  # true tool velocity [m/s], 3
+    reward: Array
+
+
+def rollout(
+    machine: Machine,
+    controller: Controller,
+    start: ArrayLike,
+    goals: Array,
+    config: TaskConfig,
+    rng: np.random.Generator,
+    net: ActuatorNet | None = None,
+) -> Trace:
+    """Let one controller follow given goals from rest: on the plant, or on nets.
+
+    Args:
+        machine: n joints.
+        controller: sees noisy observations, the same for every kind.
+        start: angles [rad], (num, n).
+        goals: wanted tool velocity during each tick [m/s], (T, num, 3).
+        config: its `noise` holds; no episode ends.
+        rng: of the noise.
+        net: nets of the driven joints; None: the analytic plant.
+    """
+    state = rest_state(machine, start, goals[0], plant=net is None)
+    memory = controller.start(len(state.q))
+    trace = []
+    for goal in goals:
+        observation = noisy(observe(machine, state.history, goal), config, rng)
+        u, memory = controller(observation, memory)
+        q_measured = state.history[..., 0, -1]
+        state = transition(machine, net, state, u)
+        p_tool, v_tool, _ = tool_state(machine, state.q, state.q_dot)
+        trace.append((state.q, state.q_dot, q_measured, u, p_tool, v_tool, reward(goal, v_tool)))
+    return Trace(*map(np.array, zip(*trace, strict=True)))
 
 
 # --- Gymnasium --------------------------------------------------------------------------------------

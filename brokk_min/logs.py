@@ -134,7 +134,7 @@ def read_log(
     return Log(tuple(joints), tuple(recordings), bool(logged))
 
 
-def _read_csv(path: Path) -> dict[str, NDArray[Any]]:
+def _read_csv(path: Path, text: Sequence[str] = ("run",)) -> dict[str, NDArray[Any]]:
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
             rows = list(csv.reader(file))
@@ -151,7 +151,7 @@ def _read_csv(path: Path) -> dict[str, NDArray[Any]]:
             raise ValueError(f"{path}: row {number}: expected {len(header)} cells, got {len(row)}")
     cells = zip(*rows[1:], strict=True)
     return {
-        name: np.array(column) if name == "run" else _numbers(path, name, column)
+        name: np.array(column) if name in text else _numbers(path, name, column)
         for name, column in zip(header, cells, strict=True)
     }
 
@@ -273,3 +273,20 @@ def velocity_of(q: Floats, samples: int) -> Floats:
     padded = np.concatenate([np.repeat(q[:1], samples - 1, axis=0), q])
     windows = np.lib.stride_tricks.sliding_window_view(padded, samples, axis=0)
     return np.asarray(estimate_velocity(windows, samples, 1 / RATE), float)
+
+
+def read_table(path: Path, columns: Sequence[str], text: Sequence[str] = ()) -> dict[str, NDArray[Any]]:
+    """Named columns of a small CSV: finite numbers, or text where so named.
+
+    Raises:
+        ValueError: with file, row and column of the first thing that is wrong.
+    """
+    table = _read_csv(Path(path), text)
+    for name in columns:
+        if name not in table:
+            raise ValueError(f"{path}: row 1: expected a column {name}, got {list(table)}")
+        if name not in text and not (good := np.isfinite(table[name])).all():
+            row = int(np.argmin(good))
+            where = f"{path}: row {row + 2}, column {name}"
+            raise ValueError(f"{where}: expected a finite number, got {table[name][row]}")
+    return table

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brokk_min.actuator import load_header
-from brokk_min.env import observation_scale
+from brokk_min.env import observation_scale, to_command
 from brokk_min.logs import load_arrays, whole_file
 from brokk_min.machine import Machine
 
@@ -48,6 +48,21 @@ class Policy:
         w, b = layers[-1]
         action: Array = x @ w + b
         return action
+
+
+@dataclass(frozen=True)
+class PolicyController:
+    """A policy as an `env.Controller`; it needs no memory, the observation carries its own."""
+
+    machine: Machine
+    policy: Policy
+
+    def start(self, num: int) -> None:
+        """Nothing to remember."""
+
+    def __call__(self, observation: Array, memory: None) -> tuple[Array, None]:
+        """Commands u (..., n) for observations (..., obs)."""
+        return to_command(self.machine, self.policy.act(observation)), None
 
 
 def contract(machine: Machine) -> dict[str, Any]:
