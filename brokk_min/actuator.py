@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -102,7 +102,7 @@ def plant_step(machine: Machine, state: PlantState, u: ArrayLike) -> PlantState:
         rate = np.where(target > ready, m.ready_up_time, m.ready_down_time)
         q_next = q + dt * speed / lever_arm(m, q)
         speed = speed + dt * (demand * supply - speed) / m.cylinder_time
-        spool, ready = spool + dt * (opening - spool) / m.spool_time, ready + dt * (target - ready) / rate
+        spool, ready = (spool + dt * (opening - spool) / m.spool_time, ready + dt * (target - ready) / rate)
         q = np.clip(q_next, q_min, q_max)
         outward = ((q >= q_max) & (speed > 0)) | ((q <= q_min) & (speed < 0))
         speed = np.where(outward, 0.0, speed)
@@ -183,14 +183,20 @@ def collect(
     wanted = max(machine.history + 2, round(hours * 3600 * machine.rate))
     rows = int(np.clip(wanted // 1200, 1, 100))
     joint = np.repeat(np.arange(machine.n), rows)
-    legs = _Legs(machine, EXCITATIONS[excitation], excitation == "rich", joint, rng, round(leg_s * machine.rate))
+    legs = _Legs(
+        machine, EXCITATIONS[excitation], excitation == "rich", joint, rng, round(leg_s * machine.rate)
+    )
     state = plant_reset(machine, np.tile(legs.home, (len(joint), 1)))
-    us, qs, leg, counted = [], [], [], np.zeros(len(joint), int)
+    us: list[Array] = []
+    qs: list[Array] = []
+    leg: list[Any] = []
+    counted = np.zeros(len(joint), int)
     with tqdm(total=wanted, desc=f"record ({excitation})", unit="tick", disable=None) as bar:
         while counted.min() < -(-wanted // rows):
             q = read_encoder(machine, state.q)
             u = limit_command(machine, legs.command(q))
-            us.append(u), qs.append(q), leg.append(legs.number.copy())
+            for tape, value in ((us, u), (qs, q), (leg, legs.number.copy())):
+                tape.append(value)
             counted += legs.number % 2 == 0
             state = plant_step(machine, state, u)
             bar.update(rows * min(1, counted.min() - bar.n // rows))
@@ -209,7 +215,7 @@ class _Legs:
         rng: np.random.Generator,
         ticks: int,
     ) -> None:
-        self.machine, self.make, self.random_start, self.joint = machine, command, random_start, joint
+        self.machine, self.make, self.random_start, self.joint = (machine, command, random_start, joint)
         self.rng, self.ticks, self.each = rng, ticks, np.arange(len(joint))
         self.q_min, self.q_max = machine.column("q_min"), machine.column("q_max")
         self.home = (self.q_min + self.q_max) / 2
@@ -402,18 +408,37 @@ class ActuatorNet:
 _NET_ARRAYS = ("input_mean", "input_scale", "output_low", "output_high", "q_low", "q_high")
 
 
-def save_net(path: Path, net: ActuatorNet) -> None:
-    """Write nets as one `.npz`: weights plus a JSON header."""
-    header = {
-        name: value
-        for name, value in net.__dict__.items()
-        if name not in (*_NET_ARRAYS, "weights", "folded")
-    }
+def net_arrays(net: ActuatorNet) -> dict[str, NDArray[Any]]:
+    """Nets as named arrays, a JSON header among them: what a file holds."""
+    plain = {f.name: getattr(net, f.name) for f in fields(net) if f.name not in (*_NET_ARRAYS, "weights")}
+    text = json.dumps({"format": FORMAT, "kind": "actuator net", **plain})
     arrays = {name: getattr(net, name) for name in _NET_ARRAYS}
     arrays |= {f"weight_{i}": weight for i, weight in enumerate(net.weights)}
-    text = json.dumps({"format": FORMAT, "kind": "actuator net", **header})
+    return {"header": np.array(text), **arrays}
+
+
+def net_from_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> ActuatorNet:
+    """Nets from `net_arrays`; `path` is for the messages.
+
+    Raises:
+        ValueError: another format, or arrays that do not fit the header.
+    """
+    header = load_header(path, arrays, "actuator net", FORMAT)
+    try:
+        header["joints"] = tuple(header["joints"])
+        weights = tuple(arrays[f"weight_{i}"] for i in range(6))
+        header |= {name: arrays[name] for name in _NET_ARRAYS}
+        net = ActuatorNet(**header, weights=weights)
+        net.predict(np.zeros((1, len(net.joints), 3, net.history), np.float32))
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: expected a complete actuator net, got {error!r}") from error
+    return net
+
+
+def save_net(path: Path, net: ActuatorNet) -> None:
+    """Write nets as one `.npz`: weights plus a JSON header."""
     with whole_file(path) as file:
-        np.savez(file, header=np.array(text), **arrays)
+        np.savez(file, **net_arrays(net))  # type: ignore[arg-type]
 
 
 def load_net(path: Path) -> ActuatorNet:
@@ -422,16 +447,7 @@ def load_net(path: Path) -> ActuatorNet:
     Raises:
         ValueError: no such file, another format, or arrays that do not fit the header.
     """
-    arrays = load_arrays(path)
-    header = load_header(path, arrays, "actuator net", FORMAT)
-    try:
-        header["joints"] = tuple(header["joints"])
-        weights = tuple(arrays[f"weight_{i}"] for i in range(6))
-        net = ActuatorNet(**header, **{name: arrays[name] for name in _NET_ARRAYS}, weights=weights)
-        net.predict(np.zeros((1, len(net.joints), 3, net.history), np.float32))
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: expected a complete actuator net, got {error!r}") from error
-    return net
+    return net_from_arrays(path, load_arrays(path))
 
 
 def load_header(path: Path, arrays: dict[str, Any], kind: str, version: int) -> dict[str, Any]:
@@ -464,9 +480,7 @@ class FitConfig:
     """Samples of angle, velocity and command that the nets see (paper: 13)."""
 
 
-def fit(
-    log: Log, config: FitConfig, seed: int, velocity_samples: int, machine: str = ""
-) -> ActuatorNet:
+def fit(log: Log, config: FitConfig, seed: int, velocity_samples: int, machine: str = "") -> ActuatorNet:
     """Fit one net a joint to the one-step targets of a log. Paper: Sec. 3.2 (MSE, Adam)
 
     Args:
@@ -512,8 +526,8 @@ def fit(
         x = (x - centre) / width
         if config.noise:
             x[..., config.history : 2 * config.history] += config.noise * (
-                torch.randn(n, config.batch_size, config.history, generator=generator)+
-                torch.randn(n, config.batch_size, 1, generator=generator)
+                torch.randn(n, config.batch_size, config.history, generator=generator)
+                + torch.randn(n, config.batch_size, 1, generator=generator)
             )
         for i in (0, 2):
             x = torch.relu(torch.baddbmm(weights[i + 1][:, None], x, weights[i]))
@@ -521,7 +535,7 @@ def fit(
         wanted = ((targets[at] - floor) / span).float()
         loss = ((y - wanted) ** 2).mean(dim=1).sum()
         optimizer.zero_grad()
-        loss.backward()
+        torch.autograd.backward(loss)
         optimizer.step()
         schedule.step()
     return ActuatorNet(
@@ -600,7 +614,8 @@ def free_run(
     rows = starts[:, None] + np.arange(1 - net.history, 1)
     history = np.stack([recording.q[rows], recording.q_dot[rows], recording.u[rows - 1]])
     history = history.transpose(1, 3, 0, 2).astype(np.float32)  # (s, n, 3, H)
-    q, trace = recording.q[starts], []
+    q: Array = recording.q[starts]
+    trace = []
     for k in range(ticks):
         history, q = net.step(history, q, recording.u[starts + k])
         trace.append((q, history[..., 1, -1]))
@@ -621,10 +636,14 @@ def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
         raise ValueError(f"joints: expected {list(net.joints)}, got {list(log.joints)}")
     lengths = [len(r.q) for r in log.recordings]
     offsets = np.cumsum([0, *lengths])
-    whole = Recording("", *(np.concatenate([getattr(r, k) for r in log.recordings]) for k in Recording._fields[1:]))
+    whole = Recording(
+        "", *(np.concatenate([getattr(r, k) for r in log.recordings]) for k in Recording._fields[1:])
+    )
 
     def segments(ticks: int) -> NDArray[np.intp]:
-        pieces = [o + np.arange(net.history, n - ticks, ticks) for o, n in zip(offsets, lengths, strict=False)]
+        pieces = [
+            o + np.arange(net.history, n - ticks, ticks) for o, n in zip(offsets, lengths, strict=False)
+        ]
         return np.concatenate(pieces).astype(int)
 
     joints: dict[str, Any] = {name: {"free_run": {}} for name in log.joints}
@@ -678,7 +697,8 @@ def task_log(machine: Machine, runs: int, seconds: float, rng: np.random.Generat
         left = np.where(left <= 0, rng.uniform(0.5, 5.0, shape), left) - machine.dt
         command = command + smoothing * (level - command)
         u = limit_command(machine, command + noise * rng.standard_normal(shape) * (level != 0))
-        us.append(u), qs.append(read_encoder(machine, state.q))
+        us.append(u)
+        qs.append(read_encoder(machine, state.q))
         state = plant_step(machine, state, u)
     zero = np.zeros((len(us), machine.n))
     tapes = zip(np.array(us).swapaxes(0, 1), np.array(qs).swapaxes(0, 1), strict=True)

@@ -27,15 +27,8 @@ from brokk_min.actuator import (
     push_command,
     rest_history,
 )
-from brokk_min.kinematics import lowest_point, tool_state, tool_velocity
-from brokk_min.machine import (
-    BROKK_170,
-    PWM_MAX,
-    Machine,
-    estimate_velocity,
-    limit_command,
-    read_encoder,
-)
+from brokk_min.kinematics import lowest_point, tool_position, tool_state
+from brokk_min.machine import BROKK_170, PWM_MAX, Machine, estimate_velocity, limit_command, read_encoder
 
 Array = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]
@@ -56,7 +49,7 @@ class TaskConfig:
     axis_goals: float = 0.4
     """Share of goals along x, y or z; the others point anywhere."""
     noise: float = 0.05
-    """Largest observation noise, in standard deviations of each observation (paper: 5 %)."""
+    """Largest noise of measured angles and velocities, in standard deviations (paper: 5 %)."""
     redraw_ground: bool = True
     """Redraw start poses in the ground; False is the paper's rule: end the episode without reward."""
 
@@ -78,7 +71,7 @@ class State:
 
 
 class Measured(NamedTuple):
-    """An observation in physical units, for controllers that are no nets."""
+    """An observation in physical units and the base frame, for controllers that are no nets."""
 
     v_goal: Array  # wanted tool velocity [m/s], (..., 3)
     v_tool: Array  # measured tool velocity [m/s], (..., 3)
@@ -92,24 +85,24 @@ def observation_scale(machine: Machine) -> tuple[Array, Array]:
     Nominal values from the machine (as if every quantity were uniform over its range), so that they
     are the same in training and on the machine. Paper: Sec. 3.4 (normalisation)
     """
-    driven, rest = machine.driven, machine.locked
-    low, high = machine.column("q_min"), machine.column("q_max")
-    middle, spread = (low + high) / 2, (high - low) / 12**0.5
+    driven, rest, spread = machine.driven, machine.locked, _spread(machine)
+    middle = (machine.column("q_min") + machine.column("q_max")) / 2
     ones = np.ones(machine.history)
     speed = np.full(3, machine.tool_speed / 3**0.5)
     command = machine.pwm_limit / PWM_MAX / 3**0.5
-    means, scales = [np.zeros(6), middle[rest]], [speed, speed, spread[rest]]
+    means, scales = [np.zeros(6), middle[rest]], [speed, speed, spread[rest, 0, 0]]
     for joint in driven:
         means += [middle[joint] * ones, 0 * ones, 0 * ones]
-        q_dot = machine.column("q_dot_max")[joint] / 3**0.5
-        scales += [spread[joint] * ones, q_dot * ones, command * ones]
+        scales += [spread[joint, 0] * ones, spread[joint, 1] * ones, command * ones]
     return np.concatenate(means).astype(np.float32), np.concatenate(scales).astype(np.float32)
 
 
 def observe(machine: Machine, history: Array, v_goal: ArrayLike) -> Array:
     """What the policy sees, standardised: goal and tool velocity, locked angles, driven histories.
 
-    Paper: Sec. 3.4 (present and target tool velocity, inputs of the actuator nets)
+    Velocities are given along the tool's heading: outward from the z axis, sideways, up. What a slewing
+    arm has to do then does not depend on where it points. Paper: Sec. 3.4 (present and target tool
+    velocity, inputs of the actuator nets)
 
     Args:
         machine: n joints.
@@ -119,17 +112,26 @@ def observe(machine: Machine, history: Array, v_goal: ArrayLike) -> Array:
     Returns:
         Shape (..., 6 + locked + 3 H n_driven), float32, about zero mean and unit deviation.
     """
-    v_tool = tool_velocity(machine, history[..., 0, -1], history[..., 1, -1])
+    p_tool, v_tool, _ = tool_state(machine, history[..., 0, -1], history[..., 1, -1])
     driven = history[..., machine.driven, :, :]
     parts = [
-        np.broadcast_to(v_goal, v_tool.shape),
-        v_tool,
+        _turn(p_tool, np.broadcast_to(v_goal, v_tool.shape), 1),
+        _turn(p_tool, v_tool, 1),
         history[..., machine.locked, 0, -1],
         driven.reshape(*driven.shape[:-3], -1),
     ]
     mean, scale = _scales(machine)
     standard: Array = (np.concatenate(parts, axis=-1, dtype=np.float32) - mean) / scale
     return standard
+
+
+def _turn(p_tool: Array, vector: Array, sign: int) -> Array:
+    """`vector` (..., 3) from the base frame into the tool's heading (sign 1), or back (-1)."""
+    x, y = p_tool[..., 0], p_tool[..., 1]
+    radius = np.maximum(np.hypot(x, y), 1e-6)
+    c, s = x / radius, sign * y / radius
+    turned = (c * vector[..., 0] + s * vector[..., 1], c * vector[..., 1] - s * vector[..., 0])
+    return np.stack([*turned, vector[..., 2]], axis=-1)
 
 
 def _scales(machine: Machine) -> tuple[Array, Array]:
@@ -148,7 +150,9 @@ def measured(machine: Machine, observation: Array) -> Measured:
     driven = values[..., 6 + len(rest) :].reshape(*values.shape[:-1], -1, 3, history)
     q = np.empty((*values.shape[:-1], machine.n), values.dtype)
     q[..., rest], q[..., machine.driven] = values[..., 6 : 6 + len(rest)], driven[..., 0, -1]
-    return Measured(values[..., :3], values[..., 3:6], q, driven[..., 1, -1])
+    p_tool = tool_position(machine, q)
+    v_goal, v_tool = (_turn(p_tool, values[..., i : i + 3], -1) for i in (0, 3))
+    return Measured(v_goal, v_tool, q, driven[..., 1, -1])
 
 
 def to_command(machine: Machine, action: ArrayLike) -> Array:
@@ -190,7 +194,9 @@ def rest_state(machine: Machine, q: ArrayLike, v_goal: ArrayLike, plant: bool) -
     goals = np.broadcast_to(np.asarray(v_goal, np.float32), (*q.shape[:-1], 3))
     never = np.full(q.shape[:-1], np.iinfo(np.int64).max)
     ticks = np.zeros(q.shape[:-1], np.int64)
-    return State(q, np.zeros_like(q), history, goals, never, ticks, plant_reset(machine, q) if plant else None)
+    return State(
+        q, np.zeros_like(q), history, goals, never, ticks, plant_reset(machine, q) if plant else None
+    )
 
 
 def transition(machine: Machine, net: ActuatorNet | None, state: State, u: Array) -> State:
@@ -284,19 +290,37 @@ def _draw_hold(machine: Machine, config: TaskConfig, rng: np.random.Generator, n
     return np.maximum(1, np.rint(seconds * machine.rate)).astype(np.int64)
 
 
-def reset(
-    machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int, plant: bool
-) -> State:
+def reset(machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int, plant: bool) -> State:
     """`num` machines at rest in random poses with random goals; leading shape (num,)."""
     pose, goal = draw_pose(machine, config, rng, num), draw_goal(machine, config, rng, num)
     state = rest_state(machine, pose, goal, plant)
     return replace(state, goal_ticks=_draw_hold(machine, config, rng, num))
 
 
-def noisy(observation: Array, config: TaskConfig, rng: np.random.Generator) -> Array:
-    """Observations with fresh uniform noise of `config.noise`. Paper: Sec. 3.4 (5 %)"""
-    draws = rng.random(observation.shape, np.float32)
-    return observation + np.float32(2 * config.noise) * (draws - np.float32(0.5))
+def noisy(machine: Machine, history: Array, config: TaskConfig, rng: np.random.Generator) -> Array:
+    """Measured angles and velocities (..., n, 3, H) with fresh uniform noise; commands are known exactly.
+
+    Paper: Sec. 3.4 (5 % of each quantity's standard deviation)
+    """
+    if config.noise == 0:
+        return history
+    result = history.copy()
+    size = (*history.shape[:-2], 2, history.shape[-1])
+    draws = rng.random(size, np.float32) - np.float32(0.5)
+    result[..., :2, :] += np.float32(2 * config.noise) * _spread(machine) * draws
+    return result
+
+
+def _spread(machine: Machine) -> Array:
+    """Nominal standard deviation of angle [rad] and velocity [rad/s] of each joint, (n, 2, 1)."""
+    angle = (machine.column("q_max") - machine.column("q_min")) / 12**0.5
+    velocity = machine.column("q_dot_max") / 3**0.5
+    return np.stack([angle, velocity], axis=-1)[..., None].astype(np.float32)
+
+
+def look(machine: Machine, config: TaskConfig, state: State, rng: np.random.Generator) -> Array:
+    """The noisy observation of a state, (..., obs)."""
+    return observe(machine, noisy(machine, state.history, config, rng), state.v_goal)
 
 
 class Outcome(NamedTuple):
@@ -333,7 +357,7 @@ def step(
         goals[due] = draw_goal(machine, config, rng, len(due))
         holds[due] = _draw_hold(machine, config, rng, len(due))
         state = replace(state, v_goal=goals, goal_ticks=holds)
-    observation = noisy(observe(machine, state.history, state.v_goal), config, rng)
+    observation = look(machine, config, state, rng)
     truncated = (state.ticks >= round(config.episode_s * machine.rate)) & ~end
     return state, Outcome(observation, np.where(end, 0.0, rewards), end, truncated, error)
 
@@ -352,7 +376,7 @@ def merge(old: State, new: State, rows: NDArray[np.intp]) -> State:
     if old.plant is not None and new.plant is not None:
         fields = [put(a, b) for a, b in zip(old.plant[:-1], new.plant[:-1], strict=True)]
         pending = tuple(map(put, old.plant.pending, new.plant.pending))
-        plant = PlantState(*fields, pending)
+        plant = PlantState(fields[0], fields[1], fields[2], fields[3], pending)
     return State(**arrays, plant=plant)
 
 
@@ -405,7 +429,7 @@ def rollout(
     memory = controller.start(len(state.q))
     trace = []
     for goal in goals:
-        observation = noisy(observe(machine, state.history, goal), config, rng)
+        observation = observe(machine, noisy(machine, state.history, config, rng), goal)
         u, memory = controller(observation, memory)
         q_measured = state.history[..., 0, -1]
         state = transition(machine, net, state, u)
@@ -417,15 +441,12 @@ def rollout(
 # --- Gymnasium --------------------------------------------------------------------------------------
 
 
-def open_actuator(machine: Machine, actuator: ActuatorNet | Path | str | None) -> ActuatorNet | None:
-    """Nets of the machine's driven joints from an object or a file; None or "analytic": the plant.
+def fitting_nets(machine: Machine, net: ActuatorNet) -> ActuatorNet:
+    """The nets of the machine's driven joints.
 
     Raises:
         ValueError: nets that do not fit the machine, naming what was wanted and found.
     """
-    if actuator is None or actuator == "analytic":
-        return None
-    net = actuator if isinstance(actuator, ActuatorNet) else load_net(Path(actuator))
     wanted = {
         "rate": machine.rate,
         "history": machine.history,
@@ -438,7 +459,14 @@ def open_actuator(machine: Machine, actuator: ActuatorNet | Path | str | None) -
     return net.select([machine.names[i] for i in machine.driven])
 
 
-class TaskVectorEnv(VectorEnv[Array, Array, Array]):
+def _open(machine: Machine, actuator: ActuatorNet | Path | str) -> ActuatorNet | None:
+    if isinstance(actuator, str) and actuator == "analytic":
+        return None
+    net = actuator if isinstance(actuator, ActuatorNet) else load_net(Path(actuator))
+    return fitting_nets(machine, net)
+
+
+class TaskVectorEnv(VectorEnv[Array, Array, Any]):
     """Many machines that follow random tool velocities; an ended episode starts anew in the same step.
 
     Observation: Box, see `observe`. Action: Box [-1, 1] a driven joint, 1 = the command limit.
@@ -455,13 +483,13 @@ class TaskVectorEnv(VectorEnv[Array, Array, Array]):
     def __init__(
         self,
         num_envs: int = 1,
-        actuator: ActuatorNet | Path | str | None = "analytic",
+        actuator: ActuatorNet | Path | str = "analytic",
         machine: Machine = BROKK_170,
         config: TaskConfig | None = None,
     ) -> None:
         self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
         self.num_envs, self.machine, self.config = num_envs, machine, config or TaskConfig()
-        self.net = open_actuator(machine, actuator)
+        self.net = _open(machine, actuator)
         self.single_observation_space, self.single_action_space = _spaces(machine)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -473,17 +501,15 @@ class TaskVectorEnv(VectorEnv[Array, Array, Array]):
         """Draw new episodes for all environments."""
         super().reset(seed=seed)
         self.state = reset(self.machine, self.config, self.np_random, self.num_envs, self.net is None)
-        return self._observation(self.state), {}
-
-    def _observation(self, state: State) -> Array:
-        return noisy(observe(self.machine, state.history, state.v_goal), self.config, self.np_random)
+        return look(self.machine, self.config, self.state, self.np_random), {}
 
     def step(self, actions: Array) -> tuple[Array, Array, Bools, Bools, dict[str, Any]]:
         """One tick of all environments: actions (num_envs, n_driven)."""
         if self.state is None:
             raise ValueError("step: expected a reset before the first step, got none")
         self.state, out = step(self.machine, self.config, self.net, self.state, actions, self.np_random)
-        observation, info = out.observation, {"velocity_error": out.velocity_error}
+        observation = out.observation
+        info: dict[str, Any] = {"velocity_error": out.velocity_error}
         ended = out.terminated | out.truncated
         rows = np.flatnonzero(ended)
         if len(rows):
@@ -491,23 +517,22 @@ class TaskVectorEnv(VectorEnv[Array, Array, Array]):
             self.state = merge(self.state, fresh, rows)
             info |= {"final_obs": observation, "_final_obs": ended}
             observation = observation.copy()
-            observation[rows] = self._observation(fresh)
+            observation[rows] = look(self.machine, self.config, fresh, self.np_random)
         return observation, out.reward, out.terminated, out.truncated, info
 
 
 class TaskEnv(gymnasium.Env[Array, Array]):
     """One machine that follows random tool velocities: `TaskVectorEnv`'s functions, batch of one."""
 
-    metadata = {"render_modes": []}
-
     def __init__(
         self,
-        actuator: ActuatorNet | Path | str | None = "analytic",
+        actuator: ActuatorNet | Path | str = "analytic",
         machine: Machine = BROKK_170,
         config: TaskConfig | None = None,
     ) -> None:
+        self.metadata = {"render_modes": []}
         self.machine, self.config = machine, config or TaskConfig()
-        self.net = open_actuator(machine, actuator)
+        self.net = _open(machine, actuator)
         self.observation_space, self.action_space = _spaces(machine)
         self.state: State | None = None
 
@@ -517,8 +542,7 @@ class TaskEnv(gymnasium.Env[Array, Array]):
         """Draw a new episode."""
         super().reset(seed=seed)
         self.state = reset(self.machine, self.config, self.np_random, 1, self.net is None)
-        observation = observe(self.machine, self.state.history, self.state.v_goal)
-        return noisy(observation, self.config, self.np_random)[0], {}
+        return look(self.machine, self.config, self.state, self.np_random)[0], {}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """One tick: action (n_driven,)."""
@@ -531,7 +555,7 @@ class TaskEnv(gymnasium.Env[Array, Array]):
         return out.observation[0], float(out.reward[0]), *flags, info
 
 
-def _spaces(machine: Machine) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
+def _spaces(machine: Machine) -> tuple[Any, Any]:
     size = 6 + len(machine.locked) + 3 * machine.history * len(machine.driven)
     action = gymnasium.spaces.Box(-1.0, 1.0, (len(machine.driven),), np.float32)
     return gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32), action

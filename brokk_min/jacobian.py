@@ -263,6 +263,6 @@ def tune(
             polish=False,
             vectorized=True,
             updating="deferred",
-            callback=lambda intermediate_result: bar.update() and None,
+            callback=lambda intermediate_result: bool(bar.update()) and False,
         )
     return replace(controller, gains=unpack_gains(result.x, joints))

@@ -100,7 +100,7 @@ def tool_position(machine: Machine, q: ArrayLike) -> Array:
 
 def _columns(chain: Chain) -> list[Array]:
     """Jacobian columns z_(i-1) x (p_tool - p_(i-1)) of all joints, each (3, ...)."""
-    result = []
+    result: list[Array] = []
     for z, p in zip(chain.z[:-1], chain.p[:-1], strict=True):
         arm = chain.p[-1] - p
         column = np.empty_like(arm)

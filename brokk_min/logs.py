@@ -103,9 +103,7 @@ def write_log(path: Path, log: Log) -> None:
         raise ValueError(f"{path}: expected a name ending in .csv or .npz, got {path.suffix!r}")
 
 
-def read_log(
-    paths: Sequence[Path], velocity_samples: int, joints: Sequence[str] | None = None
-) -> Log:
+def read_log(paths: Sequence[Path], velocity_samples: int, joints: Sequence[str] | None = None) -> Log:
     """Read tables of one machine, check them, and bring them to `RATE`.
 
     Command held, angle interpolated (DESIGN: resampled to 20 Hz). Without q_dot columns the causal
@@ -242,11 +240,7 @@ def _recordings(
 
 
 def _resample(
-    name: str,
-    table: dict[str, Floats],
-    joints: Sequence[str],
-    has_velocity: bool,
-    velocity_samples: int,
+    name: str, table: dict[str, Floats], joints: Sequence[str], has_velocity: bool, velocity_samples: int
 ) -> Recording:
     time = table["time"]
     grid = time[0] + np.arange(int((time[-1] - time[0]) * RATE + 1e-6) + 1) / RATE

@@ -95,7 +95,9 @@ class Machine:
             raise ValueError(f"joints: expected different names, got {names}")
         if not any(joint.driven for joint in self.joints):
             raise ValueError("joints: expected at least one driven joint, got none")
-        for owner, where in [(self, ""), *((joint, joint.name + ".") for joint in self.joints)]:
+        owners: list[tuple[Machine | Joint, str]] = [(self, "")]
+        owners += [(joint, joint.name + ".") for joint in self.joints]
+        for owner, where in owners:
             for field in dataclasses.fields(owner):
                 if "unit" in field.metadata:
                     self._check_number(owner, field.name, where + field.name)

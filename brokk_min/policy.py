@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min.actuator import load_header
-from brokk_min.env import observation_scale, to_command
+from brokk_min.actuator import ActuatorNet, load_header, net_arrays, net_from_arrays
+from brokk_min.env import fitting_nets, observation_scale, to_command
 from brokk_min.logs import load_arrays, whole_file
 from brokk_min.machine import Machine
 
@@ -29,6 +29,7 @@ class Policy:
     mean: Array  # (obs,) normalisation that `observe` applied
     scale: Array  # (obs,)
     weights: tuple[Array, ...]  # w, b of each layer, w (inputs, outputs)
+    net: ActuatorNet  # the simulation it was trained in, kept with it
 
     def act(self, observation: Array) -> Array:
         """Actions (..., n_driven) for observations (..., obs) of `observe`; `to_command` clips them.
@@ -36,7 +37,7 @@ class Policy:
         Raises:
             ValueError: a wrong shape or an observation that is no number.
         """
-        x = np.asarray(observation, np.float32)
+        x: Array = np.asarray(observation, np.float32)
         if x.shape[-1:] != self.mean.shape:
             raise ValueError(f"observation: expected (..., {len(self.mean)}), got {x.shape}")
         if not np.isfinite(x).all():
@@ -79,16 +80,18 @@ def contract(machine: Machine) -> dict[str, Any]:
 
 
 def save_policy(path: Path, policy: Policy) -> None:
-    """Write a policy as one `.npz`: weights and normalisation plus a JSON header."""
+    """Write a policy as one `.npz`: weights, normalisation and its nets, plus a JSON header."""
     header = {
         "format": FORMAT,
         "kind": "policy",
         "contract": dict(policy.contract),
         "training": dict(policy.training),
     }
-    arrays = {f"weight_{i}": weight for i, weight in enumerate(policy.weights)}
+    arrays = {"header": np.array(json.dumps(header)), "mean": policy.mean, "scale": policy.scale}
+    arrays |= {f"weight_{i}": weight for i, weight in enumerate(policy.weights)}
+    arrays |= {f"net_{name}": array for name, array in net_arrays(policy.net).items()}
     with whole_file(path) as file:
-        np.savez(file, header=np.array(json.dumps(header)), mean=policy.mean, scale=policy.scale, **arrays)
+        np.savez(file, **arrays)  # type: ignore[arg-type]
 
 
 def load_policy(path: Path, machine: Machine) -> Policy:
@@ -106,7 +109,9 @@ def load_policy(path: Path, machine: Machine) -> Policy:
             raise ValueError(f"{path}: {name}: expected {value!r}, got {found.get(name)!r}")
     try:
         weights = tuple(arrays[f"weight_{i}"] for i in range(8))
-        policy = Policy(found, header["training"], arrays["mean"], arrays["scale"], weights)
+        net = {name[4:]: array for name, array in arrays.items() if name.startswith("net_")}
+        fitted = fitting_nets(machine, net_from_arrays(path, net))
+        policy = Policy(found, header["training"], arrays["mean"], arrays["scale"], weights, fitted)
         action = policy.act(policy.mean)
     except (KeyError, ValueError) as error:
         raise ValueError(f"{path}: expected a complete policy, got {error!r}") from error

@@ -12,6 +12,7 @@ import hashlib
 import json
 import time
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +72,7 @@ class PPOConfig:
 def mlp(inputs: int, outputs: int, gain: float) -> nn.Sequential:
     """256-128-64 with ELU and a linear output, orthogonal start. Paper: Sec. 3.5"""
     sizes, layers = [inputs, 256, 128, 64], []
-    for rows, columns in zip(sizes[:-1], sizes[1:], strict=True):
+    for rows, columns in pairwise(sizes):
         layers += [_orthogonal(nn.Linear(rows, columns), 2**0.5), nn.ELU()]
     return nn.Sequential(*layers, _orthogonal(nn.Linear(sizes[-1], outputs), gain))
 
@@ -222,7 +223,8 @@ class Training:
         c, agent = self.config, self.agent
         size, total = len(batch["return"]), torch.zeros(5)
         for _ in range(c.epochs):
-            for rows in torch.randperm(size, generator=self.generator).split(c.minibatch_size):
+            order = torch.randperm(size, generator=self.generator)
+            for rows in torch.split(order, c.minibatch_size):
                 part = {name: tensor[rows] for name, tensor in batch.items()}
                 new = log_probability(part["action"], agent.actor(part["observation"]), agent.log_std)
                 old, advantages = part["log_probability"], normalise(part["advantage"])
@@ -230,7 +232,7 @@ class Training:
                 value_loss = ((agent.value(part["observation"]) - part["return"]) ** 2).mean()
                 entropy = agent.log_std.sum() + 0.5 * len(agent.log_std) * np.log(2 * np.pi * np.e)
                 self.optimizer.zero_grad()
-                (loss + value_loss - c.entropy * entropy).backward()  # type: ignore[no-untyped-call]
+                torch.autograd.backward(loss + value_loss - c.entropy * entropy)
                 nn.utils.clip_grad_norm_(agent.parameters(), c.max_grad_norm)
                 self.optimizer.step()
                 with torch.no_grad():
@@ -248,7 +250,9 @@ class Training:
         weights = [(layer.weight.detach().numpy().T.copy(), layer.bias.detach().numpy()) for layer in layers]
         mean, scale = observation_scale(self.env.machine)
         flat = tuple(array for pair in weights for array in pair)
-        return Policy(contract(self.env.machine), training, mean, scale, flat)
+        if self.env.net is None:
+            raise ValueError("actuator: expected a policy trained on nets, got the analytic plant")
+        return Policy(contract(self.env.machine), training, mean, scale, flat, self.env.net)
 
     # --- checkpoints: all of the above as arrays, nothing pickled
 
@@ -287,7 +291,8 @@ class Training:
                 raise ValueError(f"{path}: {name}: expected {wanted}, got {found}")
         tensors = {name: torch.from_numpy(a) for name, a in arrays.items() if name != "header"}
         self.updates, self.observation = header["updates"], tensors["observation"]
-        self.env.state = State(**{name: arrays[f"env_{name}"] for name in STATE})
+        state: dict[str, Any] = {name: arrays[f"env_{name}"] for name in STATE}
+        self.env.state = State(**state)
         self.env.np_random.bit_generator.state = header["random"]
         self.generator.set_state(tensors["generator"])
         moments = self.optimizer.state
@@ -354,7 +359,8 @@ def train(
             speed = (training.steps - first) / (time.perf_counter() - start)
             rows.append({"global_step": training.steps} | scalars | {"charts/SPS": round(speed)})
             for name, value in list(rows[-1].items())[1:]:
-                writer and writer.add_scalar(name, value, training.steps)
+                if writer:
+                    writer.add_scalar(name, value, training.steps)
             bar.update(training.steps - bar.n)
             bar.set_postfix_str(
                 f"reward {scalars['charts/reward']:.3f}, error {scalars['charts/velocity_error']:.3f} m/s"
@@ -388,4 +394,4 @@ def _tensorboard(folder: Path | None) -> Any:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError as error:
         raise ValueError("tensorboard: expected the extra `brokk_min[tensorboard]`, got none") from error
-    return SummaryWriter(str(folder))  # type: ignore[no-untyped-call]
+    return SummaryWriter(str(folder))

@@ -1,0 +1,37 @@
+# Two commands: `make reproduce` runs the whole chain, `make test` passes the tests.
+# Both set up a virtual environment in .venv on first use and need no network after that.
+PYTHON ?= python3.11
+OUT ?= results
+RUN := .venv/bin/python -m
+QUICK ?=
+
+.PHONY: reproduce test lint bench clean
+.DELETE_ON_ERROR:
+
+reproduce: .venv/installed
+	$(RUN) brokk_min reproduce --out "$(OUT)" $(if $(QUICK),--quick)
+
+test: .venv/installed-dev lint
+	$(RUN) pytest
+
+lint: .venv/installed-dev
+	$(RUN) ruff check .
+	$(RUN) ruff format --check .
+	$(RUN) mypy
+
+bench: .venv/installed-dev
+	$(RUN) benchmarks.rollout
+
+.venv/bin/python:
+	$(PYTHON) -m venv .venv
+
+.venv/installed: pyproject.toml constraints.txt | .venv/bin/python
+	$(RUN) pip install --quiet -c constraints.txt -e .
+	touch .venv/installed
+
+.venv/installed-dev: pyproject.toml constraints.txt | .venv/bin/python
+	$(RUN) pip install --quiet -c constraints.txt -e ".[dev]"
+	touch .venv/installed .venv/installed-dev
+
+clean:
+	rm -rf .venv results .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -1,0 +1,250 @@
+"""The command line: `brokk-min COMMAND --help`. Exits 0 done, 1 failed, 2 wrong use."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import tyro
+
+from brokk_min import experiments
+from brokk_min.actuator import FitConfig, collect, fit, load_net, save_net, score
+from brokk_min.env import Controller, TaskConfig, fitting_nets
+from brokk_min.logs import Log, read_log, write_log
+from brokk_min.machine import BROKK_170
+from brokk_min.policy import PolicyController, load_policy
+from brokk_min.ppo import PPOConfig, train
+
+MACHINES = {BROKK_170.name: BROKK_170}
+Name = Literal["brokk170"]
+
+
+class WrongUse(ValueError):
+    """Options that cannot be meant; exit status 2."""
+
+
+@dataclass
+class Collect:
+    """Record the machine (the analytic plant) under excitation."""
+
+    out: Path
+    """Log to write, .csv or .npz."""
+    hours: float = 1.0
+    """Driving time for each actuator [h]."""
+    excitation: Literal["sine", "rich"] = "rich"
+    """The paper's sines, or sines, steps, holds and pauses over a wide band."""
+    machine: Name = "brokk170"
+    """Which machine."""
+    seed: int = 0
+    """Of everything random."""
+
+    def run(self) -> None:
+        """Write the log."""
+        machine = MACHINES[self.machine]
+        if not 0 < self.hours <= 100:
+            raise WrongUse(f"--hours: expected above 0 and up to 100, got {self.hours}")
+        if self.out.suffix not in (".csv", ".npz"):
+            raise WrongUse(f"--out: expected a name ending in .csv or .npz, got {self.out}")
+        log = collect(machine, self.hours, self.excitation, np.random.default_rng(self.seed))
+        write_log(self.out, log)
+        print(f"{self.out}: {len(log.recordings)} recordings of {', '.join(log.joints)}")
+
+
+@dataclass
+class Fit:
+    """Fit one net a joint to the log of any machine and score it on recordings it never saw."""
+
+    logs: tyro.conf.Positional[tuple[Path, ...]]
+    """Logs of one machine, .csv or .npz."""
+    out: Path
+    """Nets to write, .npz."""
+    test: tuple[Path, ...] = ()
+    """Logs to score on; without them every tenth recording of LOGS is held out."""
+    json: Path | None = None
+    """Also write the scores here."""
+    velocity_samples: int = BROKK_170.velocity_samples
+    """Window of the velocity estimator [samples at 20 Hz]."""
+    settings: tyro.conf.OmitArgPrefixes[FitConfig] = field(default_factory=FitConfig)
+    """How the nets are fitted."""
+    seed: int = 0
+    """Of everything random."""
+
+    def run(self) -> None:
+        """Fit, score, write."""
+        if not self.logs:
+            raise WrongUse("LOGS: expected at least one log, got none")
+        if self.settings.history < 2 or self.settings.steps < 1 or self.velocity_samples < 2:
+            raise WrongUse(
+                "expected --history and --velocity-samples of 2 or more and --steps of 1 or more, "
+                f"got {self.settings.history}, {self.velocity_samples}, {self.settings.steps}"
+            )
+        log = read_log(self.logs, self.velocity_samples)
+        if self.test:
+            test = read_log(self.test, self.velocity_samples, log.joints)
+        else:
+            log, test = _hold_out(log)
+        net = fit(log, self.settings, self.seed, self.velocity_samples, ",".join(p.stem for p in self.logs))
+        joints = score(net, test)
+        save_net(self.out, net)
+        meta: dict[str, Any] = {"logs": [str(p) for p in self.logs], "test": [str(p) for p in self.test]}
+        meta |= {"seed": self.seed, "rate": net.rate, "history": net.history}
+        if self.json:
+            experiments.write_json(self.json, {"meta": meta, "joints": joints})
+        print(f"{'joint':12} one step  same as last  free run of 1, 5, 10, 30 s [rad/s]")
+        for name, s in joints.items():
+            free = ", ".join(f"{run['velocity_rmse']:.4f}" for run in s["free_run"].values())
+            print(f"{name:12} {s['one_step_rmse']:8.4f}  {s['persistence_rmse']:12.4f}  {free}")
+
+
+def _hold_out(log: Log) -> tuple[Log, Log]:
+    """Every tenth recording for the test, whole; a log with one recording cannot be split."""
+    held = set(range(0, len(log.recordings), 10)) if len(log.recordings) > 1 else set()
+    if not held:
+        raise ValueError("LOGS: expected two or more recordings, or --test, to score on; got one")
+    parts = [[r for i, r in enumerate(log.recordings) if (i in held) == side] for side in (False, True)]
+    return log._replace(recordings=tuple(parts[0])), log._replace(recordings=tuple(parts[1]))
+
+
+@dataclass
+class Train:
+    """Train a policy on nets with PPO."""
+
+    actuator: Path
+    """Nets that `fit` wrote."""
+    out: Path
+    """Policy to write, .npz."""
+    resume: bool = False
+    """Take up OUT.checkpoint; the end is the same as without the break."""
+    tensorboard: Path | None = None
+    """Folder for TensorBoard (extra `tensorboard`)."""
+    machine: Name = "brokk170"
+    """Which machine."""
+    settings: tyro.conf.OmitArgPrefixes[PPOConfig] = field(default_factory=PPOConfig)
+    """The learner."""
+    task: tyro.conf.OmitArgPrefixes[TaskConfig] = field(default_factory=TaskConfig)
+    """What an episode is."""
+    seed: int = 0
+    """Of everything random."""
+
+    def run(self) -> None:
+        """Train and write the policy."""
+        for name in ("total_steps", "num_envs", "horizon", "epochs", "minibatch_size", "threads"):
+            if (got := getattr(self.settings, name)) < 1:
+                raise WrongUse(f"--{name.replace('_', '-')}: expected 1 or more, got {got}")
+        machine = MACHINES[self.machine]
+        net = fitting_nets(machine, load_net(self.actuator))
+        if not self.out.parent.is_dir():
+            raise WrongUse(f"--out: expected an existing directory, got {self.out.parent}")
+        train(machine, net, self.task, self.settings, self.seed, self.out, self.resume, self.tensorboard)
+        print(f"{self.out}: trained for {self.settings.total_steps} steps; curve in {self.out}.csv")
+
+
+@dataclass
+class Evaluate:
+    """Policy and tuned baselines on the same sequences and starts."""
+
+    policy: Path
+    """Policy that `train` wrote."""
+    commands: Path | None = None
+    """Velocity sequences, CSV: sequence,time,vx,vy,vz [s, m/s]."""
+    starts: Path | None = None
+    """Start poses, CSV: one column a joint [rad]."""
+    plant: Literal["analytic", "net"] = "analytic"
+    """What moves: the analytic plant or the nets."""
+    json: Path | None = None
+    """Also write all runs here."""
+    gains: Path | None = None
+    """Tuned gains that `reproduce` wrote; by default gains.json beside POLICY, else they are tuned."""
+    machine: Name = "brokk170"
+    """Which machine."""
+    seed: int = 0
+    """Of noise, starts and tuning."""
+
+    def run(self) -> None:
+        """Evaluate and print the means."""
+        machine = MACHINES[self.machine]
+        policy = load_policy(self.policy, machine)
+        sequences = experiments.axis_sequences(machine)
+        if self.commands:
+            sequences = experiments.read_commands(self.commands, machine)
+        effort = experiments.Effort()
+        if self.starts:
+            starts = experiments.read_starts(self.starts, machine)
+        else:
+            rng = np.random.default_rng(self.seed + 2)
+            starts = experiments.draw_starts(machine, sequences, effort.starts, rng)
+        controllers: dict[str, Controller] = {"rl": PolicyController(machine, policy)}
+        gains = self.gains or self.policy.with_name("gains.json")
+        if self.gains or gains.exists():
+            controllers |= experiments.read_gains(gains, machine, policy.net)
+        else:
+            controllers |= experiments.tuned_baselines(machine, policy.net, effort, self.seed)
+        moves = policy.net if self.plant == "net" else None
+        runs, _ = experiments.task_space(machine, controllers, sequences, starts, self.seed, moves)
+        if self.json:
+            meta: dict[str, Any] = experiments.meta(machine, self.seed) | {"plant": self.plant}
+            experiments.write_json(self.json, {"meta": meta, "runs": runs})
+        for name, rows in experiments.summary(runs).items():
+            print(f"{name:20} " + ", ".join(f"{k} {v:.4f}" for k, v in rows["all"].items()))
+
+
+@dataclass
+class Reproduce:
+    """The whole chain: logs, nets, policy, baselines, comparison, report.html and results.json."""
+
+    out: Path = Path("results")
+    """Folder for everything."""
+    quick: bool = False
+    """The same, smaller: to see that it runs, not to judge the policy."""
+    machine: Name = "brokk170"
+    """Which machine."""
+    seed: int = 0
+    """Of everything random."""
+
+    def run(self) -> None:
+        """Run the chain and print the means."""
+        effort = experiments.QUICK if self.quick else experiments.Effort()
+        results = experiments.reproduce(MACHINES[self.machine], self.out, effort, self.seed)
+        for name, rows in results["task_space"]["summary"].items():
+            errors = ", ".join(f"{s} {row['velocity_error_mean']:.4f}" for s, row in rows.items())
+            print(f"{name:20} mean velocity error [m/s]: {errors}")
+        print(f"{self.out / 'report.html'}\n{self.out / 'results.json'}")
+
+
+COMMANDS: dict[str, Any] = {
+    "collect": Collect,
+    "fit": Fit,
+    "train": Train,
+    "evaluate": Evaluate,
+    "reproduce": Reproduce,
+}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command; errors are one line on stderr."""
+    command = tyro.extras.subcommand_cli_from_dict(
+        COMMANDS,
+        prog="brokk-min",
+        description=__doc__,
+        args=arguments,
+        config=(tyro.conf.FlagCreatePairsOff,),
+    )
+    try:
+        command.run()
+    except WrongUse as error:
+        print(f"brokk-min: {error}", file=sys.stderr)
+        return 2
+    except (ValueError, OSError) as error:
+        print(f"brokk-min: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("brokk-min: stopped", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,98 @@
+"""Hypothesis strategies: machines that are no Brokk, and their poses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+
+from brokk_min.machine import BROKK_170, Joint, Machine
+
+SHAPES = [(), (1,), (4,), (2, 3)]  # leading axes
+
+
+def reals(low: float, high: float) -> st.SearchStrategy[float]:
+    """Floats without subnormals, both ends allowed."""
+    return st.floats(low, high, allow_subnormal=False)
+
+
+@st.composite
+def joints(draw: st.DrawFn, index: int, driven: bool) -> Joint:
+    """Any DH row, any range, a slew drive or a cylinder whose triangle closes over the range."""
+    q_min = draw(reals(-2.5, 1.5))
+    width = draw(reals(0.3, 2.2))
+    slew = draw(st.booleans())
+    start = draw(reals(0.25, np.pi - 0.25 - width))  # the triangle's angle at q_min
+    return Joint(
+        name=f"joint {index}",
+        driven=driven,
+        a=draw(reals(-1.5, 1.5)),
+        alpha=draw(st.one_of(st.sampled_from([0.0, np.pi / 2, -np.pi / 2]), reals(-3.0, 3.0))),
+        d=draw(reals(-1.0, 1.0)),
+        theta=draw(reals(-np.pi, np.pi)),
+        q_min=q_min,
+        q_max=q_min + width,
+        cylinder_base=0.0 if slew else draw(reals(0.5, 1.2)),
+        cylinder_rod=draw(reals(0.1, 0.4)),
+        cylinder_angle=0.0 if slew else start - q_min,
+        cylinder_area=draw(reals(0.002, 0.02)),
+        speed_positive=draw(reals(0.01, 0.2)),
+        speed_negative=draw(reals(0.01, 0.2)),
+        q_dot_max=draw(reals(0.1, 1.0)),
+        encoder_node=index + 1,
+    )
+
+
+@st.composite
+def machines(draw: st.DrawFn, min_joints: int = 2, max_joints: int = 6) -> Machine:
+    """Machines of 2 to 6 joints, some of them locked, with valves and a pump of their own."""
+    n = draw(st.integers(min_joints, max_joints))
+    driven = draw(st.lists(st.booleans(), min_size=n, max_size=n).filter(any))
+    return replace(
+        BROKK_170,
+        name="drawn",
+        joints=tuple(draw(joints(i, drives)) for i, drives in enumerate(driven)),
+        rate=draw(st.sampled_from([10.0, 20.0, 25.0, 50.0])),
+        pwm_limit=draw(st.integers(20, 127)),
+        dead_zone=draw(reals(0.0, 0.3)),
+        delay=draw(st.sampled_from([0.0, 0.005, 0.04, 0.1, 0.13])),
+        spool_time=draw(reals(0.01, 0.1)),
+        cylinder_time=draw(reals(0.01, 0.1)),
+        ready_up_time=draw(reals(0.02, 0.3)),
+        ready_down_time=draw(reals(0.02, 0.6)),
+        ready_threshold=draw(reals(0.0, 0.9)),
+        pump_flow=draw(reals(0.0002, 0.003)),
+        encoder_bits=draw(st.integers(8, 20)),
+    )
+
+
+def poses(machine: Machine, shape: tuple[int, ...] = ()) -> st.SearchStrategy[np.ndarray]:
+    """Angles (*shape, n) within the machine's range, ends included, in a read-only array."""
+    low, high = machine.column("q_min"), machine.column("q_max")
+
+    def angles(fraction: np.ndarray) -> np.ndarray:
+        q = np.clip(low + (high - low) * fraction, low, high)
+        q.setflags(write=False)
+        return q
+
+    return npst.arrays(np.float64, (*shape, machine.n), elements=reals(0.0, 1.0)).map(angles)
+
+
+@st.composite
+def posed(draw: st.DrawFn, shapes: list[tuple[int, ...]] = SHAPES) -> tuple[Machine, np.ndarray]:
+    """A machine and angles with some leading axes."""
+    machine = draw(machines())
+    return machine, draw(poses(machine, draw(st.sampled_from(shapes))))
+
+
+@st.composite
+def moving(
+    draw: st.DrawFn, shapes: list[tuple[int, ...]] = SHAPES
+) -> tuple[Machine, np.ndarray, np.ndarray]:
+    """A machine, angles, and angular velocities of the same shape; both arrays read-only."""
+    machine, q = draw(posed(shapes))
+    q_dot = draw(npst.arrays(np.float64, q.shape, elements=reals(-1.0, 1.0)))
+    q_dot.setflags(write=False)
+    return machine, q, q_dot

@@ -1,0 +1,775 @@
+"""The task: rewards and observations by hand, episodes against replays, refusals."""
+
+from __future__ import annotations
+
+import warnings
+from collections import deque
+from dataclasses import fields, replace
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from helpers_machines import (
+    RowRandom,
+    obedient_net,
+    obedient_velocity,
+    random_machine,
+    small_net,
+)
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy import stats
+
+from brokk_min import env as task
+from brokk_min.actuator import plant_reset, plant_step, save_net
+from brokk_min.env import TaskConfig, TaskEnv, TaskVectorEnv
+from brokk_min.jacobian import Gains, JacobianController
+from brokk_min.machine import BROKK_170, estimate_velocity, read_encoder
+
+POSE = np.array([1.5, 0.5, 0.58, 1.71, 1.24])  # the paper's q_s
+FINE = replace(BROKK_170, encoder_bits=32)  # so fine that float32 rounding cannot flip a count
+LOW = replace(BROKK_170, ground=-100.0)  # no pose is in the ground
+OLD, NEW = slice(7, 19), slice(8, 20)  # q1's angles in the observation, oldest to newest
+QUIET = TaskConfig(noise=0.0)
+MACHINES = [random_machine(np.random.default_rng(seed), 2 + seed % 5) for seed in range(10)]
+
+
+def closed_form(q):
+    """Tool position [m] of the Brokk by the design's closed form, and the heights of the link ends."""
+    q1, e2 = q[..., 0], q[..., 1]
+    e3 = e2 + q[..., 2]
+    e4 = e3 + q[..., 3] - np.pi
+    e5 = e4 + q[..., 4] - 3 * np.pi / 4
+    r, z, heights = 0.25, 0.95, [0.95 + 0 * q1]
+    for length, e in zip((1.15, 1.25, 1.15, 1.20), (e2, e3, e4, e5), strict=True):
+        r, z = r + length * np.cos(e), z + length * np.sin(e)
+        heights.append(z)
+    return np.stack([r * np.cos(q1), r * np.sin(q1), z], -1), np.min(heights, axis=0)
+
+
+def flat(state):
+    """All arrays of a state, the plant's included."""
+    found = [getattr(state, f.name) for f in fields(state) if f.name != "plant"]
+    if state.plant is not None:
+        found += [*state.plant[:-1], *state.plant.pending]
+    return found
+
+
+def same(a, b, rows=slice(None)):
+    return all(np.array_equal(x[rows], y[rows]) for x, y in zip(flat(a), flat(b), strict=True))
+
+
+# --- the reward --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("v_goal", "v_tool", "wanted"),
+    [
+        ((0.3, 0.4, 0.0), (0.0, 0.0, 0.0), 1 / 1.5),
+        ((0.0, 0.0, 0.0), (0.0, 0.0, -0.25), 0.8),
+        ((0.1, 0.2, 0.3), (1.1, -1.8, 2.3), 0.25),  # error (1, 2, 2) has length 3
+        ((0.1, -0.2, 0.3), (0.1, -0.2, 0.3), 1.0),
+    ],
+)
+def test_reward_by_hand(v_goal, v_tool, wanted):
+    assert task.reward(np.array(v_goal), np.array(v_tool)) == pytest.approx(wanted, abs=1e-12)
+
+
+vectors = arrays(float, (7, 3), elements=st.floats(-10, 10, width=32))
+
+
+@settings(deadline=None, max_examples=50)
+@given(vectors, vectors, st.floats(1.01, 5))
+def test_reward_is_bounded_symmetric_and_falls_with_the_error(v_goal, v_tool, factor):
+    reward = task.reward(v_goal, v_tool)
+    assert ((reward > 0) & (reward <= 1)).all()
+    assert np.array_equal(reward, task.reward(v_tool, v_goal))
+    further = task.reward(v_goal, v_goal + factor * (v_tool - v_goal))
+    apart = np.linalg.norm(v_goal - v_tool, axis=-1) > 1e-6
+    assert (further[apart] < reward[apart]).all()
+    np.testing.assert_allclose(1 / reward - 1, np.linalg.norm(v_goal - v_tool, axis=-1), atol=1e-9)
+
+
+def test_ground_is_below_not_at():
+    low = np.array([-1e-6, 0.0, 1e-6]) + BROKK_170.ground
+    assert task.terminated(BROKK_170, low).tolist() == [True, False, False]
+    raised = replace(BROKK_170, ground=0.5)
+    assert task.terminated(raised, np.array([0.49, 0.51])).tolist() == [True, False]
+
+
+# --- commands ----------------------------------------------------------------------------------------
+
+
+def test_to_command_by_hand():
+    action = [0.5, -3.0, 0.006, 0.007]  # 40; clipped to -80; 0.48 and 0.56 of a count
+    counts = task.to_command(BROKK_170, action) * 127
+    np.testing.assert_allclose(counts, [40, 0, -80, 0, 1], atol=1e-9)
+    assert counts[1] == 0  # q2 is the operator's
+
+
+@pytest.mark.parametrize("machine", MACHINES, ids=lambda m: m.name)
+def test_to_command_sends_whole_counts_in_the_order_of_the_joints(machine):
+    rng = np.random.default_rng(1)
+    action = rng.uniform(-2, 2, (50, len(machine.driven))).astype(np.float32)
+    counts = task.to_command(machine, action) * 127
+    np.testing.assert_allclose(counts, np.rint(counts), atol=1e-4)
+    assert np.abs(counts).max() <= machine.pwm_limit + 1e-4
+    wanted = np.zeros_like(counts)
+    for column, joint in enumerate(machine.driven):
+        wanted[:, joint] = np.clip(action[:, column], -1, 1) * machine.pwm_limit
+    assert np.abs(counts - wanted).max() <= 0.5 + 1e-4
+    assert not counts[:, machine.locked].any()
+
+
+def test_to_command_takes_whole_numbers_like_floats():
+    assert np.array_equal(
+        task.to_command(BROKK_170, [1, 0, -1, 0]), task.to_command(BROKK_170, [1.0, 0.0, -1.0, 0.0])
+    )
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_to_command_refuses_what_is_no_number(bad):
+    with pytest.raises(ValueError, match=f"action: expected finite numbers, got {bad}"):
+        task.to_command(BROKK_170, [[0.0, bad, 0.0, 0.0]])
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (3,), (5,), (4, 1)])
+def test_to_command_refuses_wrong_shapes(shape):
+    with pytest.raises(ValueError, match=r"action: expected \(\.\.\., 4\), got \("):
+        task.to_command(BROKK_170, np.zeros(shape))
+
+
+# --- observations ------------------------------------------------------------------------------------
+
+
+def told_history():
+    """A Brokk history (5, 3, 13) in which every number tells where it stands."""
+    history = np.zeros((5, 3, 13))
+    lags = np.arange(13)
+    for joint in range(5):
+        history[joint, 0] = POSE[joint] + 0.01 * (lags - 12)
+        history[joint, 1] = 0.02 * joint + 0.001 * lags
+        history[joint, 2] = -0.1 * joint + 0.002 * lags
+    return history
+
+
+def test_observation_by_hand():
+    seen = task.observe(BROKK_170, told_history(), [0.3, -0.15, 0.0])
+    assert seen.shape == (163,)  # 6 + q2 + 4 joints x 39
+    assert seen.dtype == np.float32
+    np.testing.assert_allclose(seen[:3], [3**0.5, -(3**0.5) / 2, 0], rtol=1e-6)
+    assert seen[6] == pytest.approx((0.5 - 0.7) / (1.4 / 12**0.5), rel=1e-6)
+    spread, lags = 12**0.5, np.arange(13)
+    q1, q3 = seen[7:46].reshape(3, 13), seen[46:85].reshape(3, 13)
+    q5 = seen[124:163].reshape(3, 13)
+    np.testing.assert_allclose(q1[0], (1.5 + 0.01 * (lags - 12)) / (4.28 / spread), rtol=1e-5)
+    np.testing.assert_allclose(q1[1], 0.001 * lags / (0.20 / 3**0.5), rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(q1[2], 0.002 * lags / (80 / 127 / 3**0.5), rtol=1e-5, atol=1e-7)
+    angle = (0.58 + 0.01 * (lags - 12) - 0.65) / (1.9 / spread)
+    np.testing.assert_allclose(q3[0], angle, rtol=1e-4)
+    np.testing.assert_allclose(q3[2], (-0.2 + 0.002 * lags) * 127 * 3**0.5 / 80, rtol=1e-5)
+    np.testing.assert_allclose(q5[1], (0.08 + 0.001 * lags) * 3**0.5 / 0.47, rtol=1e-5)
+    assert (np.diff(q1[0]) > 0).all()  # oldest first
+
+
+def test_observed_tool_velocity_is_the_derivative_of_the_closed_form():
+    history, step = told_history(), 1e-6
+    q, q_dot = history[:, 0, -1], history[:, 1, -1]
+    v_tool = (closed_form(q + step * q_dot)[0] - closed_form(q - step * q_dot)[0]) / (2 * step)
+    seen = task.observe(BROKK_170, history, np.zeros(3))
+    np.testing.assert_allclose(seen[3:6] * 0.3 / 3**0.5, v_tool, atol=1e-6)
+    assert q_dot[1] != 0  # a moving q2 counts as well
+
+
+@pytest.mark.parametrize("machine", MACHINES, ids=lambda m: m.name)
+def test_measured_undoes_observe(machine):
+    rng = np.random.default_rng(2)
+    history = rng.normal(0, 0.5, (2, 3, machine.n, 3, machine.history))
+    v_goal = rng.normal(0, 0.3, (2, 3, 3))
+    seen = task.observe(machine, history, v_goal)
+    size = 6 + len(machine.locked) + 3 * machine.history * len(machine.driven)
+    assert seen.shape == (2, 3, size)
+    back = task.measured(machine, seen)
+    np.testing.assert_allclose(back.v_goal, v_goal, atol=1e-6)
+    np.testing.assert_allclose(back.q, history[..., 0, -1], atol=1e-5)
+    np.testing.assert_allclose(back.q_dot, history[..., machine.driven, 1, -1], atol=1e-5)
+    alone = task.measured(machine, task.observe(machine, history[1, 2], v_goal[1, 2]))
+    for whole, single in zip(back, alone, strict=True):
+        np.testing.assert_allclose(whole[1, 2], single, atol=1e-5)
+
+
+@pytest.mark.parametrize("machine", [BROKK_170, *MACHINES], ids=lambda m: m.name)
+def test_scale_belongs_to_uniform_values_over_the_ranges(machine):
+    """Observations of uniform histories have mean 0 and deviation 1: an oracle by sampling."""
+    rng, num = np.random.default_rng(3), 4000
+    history = np.zeros((num, machine.n, 3, machine.history))
+    bounds = machine.column("q_min")[:, None], machine.column("q_max")[:, None]
+    limit, fastest = machine.pwm_limit / 127, machine.column("q_dot_max")[:, None]
+    shape = (num, machine.n, machine.history)
+    history[:, :, 0] = rng.uniform(*bounds, shape)
+    history[:, :, 1] = rng.uniform(-fastest, fastest, shape)
+    history[:, :, 2] = rng.uniform(-limit, limit, shape)
+    v_goal = rng.uniform(-machine.tool_speed, machine.tool_speed, (num, 3))
+    seen = np.delete(task.observe(machine, history, v_goal), [3, 4, 5], axis=-1)
+    assert np.abs(seen.mean(axis=0)).max() < 0.1
+    assert np.abs(seen.std(axis=0) - 1).max() < 0.05
+
+
+def test_noise_is_uniform_within_five_percent_and_fresh():
+    clean = np.linspace(-2, 2, 163, dtype=np.float32) * np.ones((300, 1), np.float32)
+    rng = np.random.default_rng(4)
+    noise = task.noisy(clean, TaskConfig(), rng) - clean
+    assert noise.dtype == np.float32
+    assert 0.0499 < np.abs(noise).max() < 0.05 + 1e-6
+    assert stats.kstest(noise.ravel(), stats.uniform(-0.05, 0.1).cdf).pvalue > 1e-3
+    assert np.abs(np.corrcoef(noise[:, :5].T) - np.eye(5)).max() < 0.25
+    assert not np.array_equal(noise, task.noisy(clean, TaskConfig(), rng) - clean)
+    assert np.array_equal(task.noisy(clean, QUIET, rng), clean)
+
+
+# --- poses and goals ---------------------------------------------------------------------------------
+
+
+def test_redrawn_poses_are_off_the_ground_and_the_papers_are_not():
+    low, high = BROKK_170.column("q_min"), BROKK_170.column("q_max")
+    free = task.draw_pose(BROKK_170, TaskConfig(), np.random.default_rng(5), 2000)
+    raw = task.draw_pose(BROKK_170, TaskConfig(redraw_ground=False), np.random.default_rng(5), 2000)
+    assert (closed_form(free)[1] >= 0).all()
+    buried = closed_form(raw)[1] < 0
+    assert 0.02 < buried.mean() < 0.9
+    for q in (free, raw):
+        assert ((q >= low) & (q <= high)).all()
+    assert np.array_equal(free[~buried], raw[~buried])  # only the bad ones are drawn again
+    assert stats.kstest((raw[:, 0] + 2.14) / 4.28, "uniform").pvalue > 1e-3
+
+
+def test_a_machine_that_is_always_buried_is_refused():
+    with pytest.raises(ValueError, match="brokk170: expected a pose above the ground, got none"):
+        machine = replace(BROKK_170, ground=50.0)
+        task.draw_pose(machine, TaskConfig(), np.random.default_rng(0), 3)
+
+
+def test_goals_have_the_configured_shares_speeds_and_directions():
+    config = TaskConfig(zero_goals=0.2, axis_goals=0.5)
+    goals = task.draw_goal(BROKK_170, config, np.random.default_rng(6), 20_000)
+    speed, moves = np.linalg.norm(goals, axis=-1), np.count_nonzero(goals, axis=-1)
+    assert np.mean(moves == 0) == pytest.approx(0.2, abs=0.02)
+    assert np.mean(moves == 1) == pytest.approx(0.5, abs=0.02)
+    assert np.mean(moves == 3) == pytest.approx(0.3, abs=0.02)
+    assert speed.max() <= 0.3 + 1e-12
+    assert stats.kstest(speed[moves > 0] / 0.3, "uniform").pvalue > 1e-3
+    along = np.sign(goals[moves == 1])
+    shares = [np.mean((along == axis).all(-1)) for axis in (*np.eye(3), *-np.eye(3))]
+    np.testing.assert_allclose(shares, 1 / 6, atol=0.02)
+    anywhere = goals[moves == 3] / speed[moves == 3, None]
+    np.testing.assert_allclose(anywhere.mean(axis=0), 0, atol=0.03)
+    np.testing.assert_allclose(anywhere.T @ anywhere / len(anywhere), np.eye(3) / 3, atol=0.03)
+
+
+def test_the_locked_joint_differs_between_resets():
+    env = TaskVectorEnv(64)
+    env.reset(seed=0)
+    first = env.state.q[:, 1].copy()
+    env.reset()
+    assert len(np.unique(first)) > 60
+    assert len(np.unique(np.concatenate([first, env.state.q[:, 1]]))) > 120
+    assert first.min() < 0.2 < 1.2 < first.max()
+
+
+def test_a_reset_is_at_rest_and_tells_its_pose():
+    env = TaskVectorEnv(5, config=QUIET)
+    seen, _ = env.reset(seed=1)
+    body = seen[:, 7:].reshape(5, 4, 3, 13)
+    assert (body[:, :, 0] == body[:, :, :1, 0]).all()
+    assert not body[:, :, 1:].any()
+    found = task.measured(BROKK_170, seen)
+    np.testing.assert_allclose(found.q, env.state.q, atol=BROKK_170.encoder_step / 2 + 1e-6)
+    np.testing.assert_allclose(found.v_goal, env.state.v_goal, atol=1e-6)
+
+
+def test_goals_are_redrawn_within_an_episode_and_rewards_are_for_the_old_goal():
+    config = TaskConfig(hold_min_s=0.2, hold_max_s=0.5, zero_goals=0.0, episode_s=60.0, noise=0.0)
+    env = TaskVectorEnv(4, machine=LOW, config=config)
+    seen, _ = env.reset(seed=2)
+    goals, rng = [env.state.v_goal], np.random.default_rng(0)
+    for _ in range(200):
+        before = env.state.v_goal
+        shown = task.measured(LOW, seen).v_goal
+        np.testing.assert_allclose(shown, before, atol=1e-6)  # the policy saw the goal it is paid for
+        seen, reward, *_, info = env.step(rng.uniform(-1, 1, (4, 4)).astype(np.float32))
+        state, step = env.state, 1e-6
+        towards = step * state.q_dot.astype(float)
+        v_tool = (closed_form(state.q + towards)[0] - closed_form(state.q - towards)[0]) / (2 * step)
+        error = np.linalg.norm(before - v_tool, axis=-1)
+        np.testing.assert_allclose(reward, 1 / (1 + error), atol=1e-5)
+        np.testing.assert_allclose(info["velocity_error"], error, atol=1e-5)
+        goals.append(state.v_goal)
+    for row in range(4):
+        changes = np.flatnonzero(np.any(np.diff([g[row] for g in goals], axis=0) != 0, axis=-1))
+        held = np.diff(changes)
+        assert len(held) > 15
+        assert held.min() >= 4  # 0.2 s
+        assert held.max() <= 10  # 0.5 s
+        assert changes[0] + 1 <= 10
+
+
+# --- one tick ----------------------------------------------------------------------------------------
+
+
+def test_transition_on_nets_by_hand():
+    """With nets that obey the command, one tick moves each driven joint by velocity x 50 ms."""
+    u = np.array([40, 0, -80, 13, 0]) / 127
+    state = task.rest_state(BROKK_170, POSE, np.zeros(3), plant=False)
+    after = task.transition(BROKK_170, obedient_net(BROKK_170), state, u)
+    move = np.zeros(5)
+    move[[0, 2, 3, 4]] = obedient_velocity(BROKK_170, u[[0, 2, 3, 4]])
+    assert move[0] == pytest.approx(0.24 * np.tanh(1.5 * 40 / 127), rel=1e-9)
+    np.testing.assert_allclose(after.q, POSE + 0.05 * move, atol=1e-6)
+    np.testing.assert_allclose(after.q_dot, move, atol=1e-5)
+    assert np.array_equal(after.history[:, 2, -1], u.astype(np.float32))
+    assert not after.history[:, 2, :-1].any()
+    counts = np.rint((POSE + 0.05 * move) / BROKK_170.encoder_step)
+    np.testing.assert_allclose(after.history[:, 0, -1] / BROKK_170.encoder_step, counts, atol=1e-3)
+    before = np.rint(POSE / BROKK_170.encoder_step)
+    slope = 0.3 * (counts - before) * BROKK_170.encoder_step / 0.05  # weights -3, -1, 1, 3 over 10
+    np.testing.assert_allclose(after.history[:, 1, -1], slope, atol=1e-5)
+
+
+def test_nets_in_the_loop_agree_with_plain_loops():
+    """An oracle with deques, `polyfit` and one matrix product a joint, over 60 ticks."""
+    machine, rng = FINE, np.random.default_rng(7)
+    net = small_net(machine, rng)
+    state = task.rest_state(machine, POSE, np.zeros(3), plant=False)
+    q = POSE.copy()
+    tape = {j: [deque([v] * 13, 13) for v in (q[j], 0.0, 0.0)] for j in (0, 2, 3, 4)}
+    for _ in range(60):
+        u = task.to_command(machine, rng.uniform(-1, 1, 4))
+        state = task.transition(machine, net, state, u)
+        for row, (j, (angles, rates, commands)) in enumerate(tape.items()):
+            commands.append(u[j])
+            x = (np.concatenate([angles, rates, commands]) - net.input_mean[row]) / net.input_scale[row]
+            w1, b1, w2, b2, w3, b3 = (weight[row].astype(float) for weight in net.weights)
+            x = np.maximum(0, np.maximum(0, x @ w1 + b1) @ w2 + b2) @ w3 + b3
+            low, high = float(net.output_low[row]), float(net.output_high[row])
+            velocity = low + (high - low) / (1 + np.exp(-x[0]))
+            joint = machine.joints[j]
+            q[j] = min(max(q[j] + 0.05 * velocity, joint.q_min), joint.q_max)
+            angles.append(q[j])
+            rates.append(np.polyfit(np.arange(4) * 0.05, list(angles)[-4:], 1)[0])
+    np.testing.assert_allclose(state.q, q, atol=1e-4)
+    np.testing.assert_allclose(state.history[0, 1], tape[0][1], atol=1e-3)
+    assert np.abs(q - POSE)[[0, 2, 3, 4]].min() > 1e-2  # they all moved
+
+
+@pytest.mark.parametrize("machine", [BROKK_170, *MACHINES[:5]], ids=lambda m: m.name)
+def test_the_plant_in_the_environment_is_the_plant(machine):
+    rng = np.random.default_rng(8)
+    env = TaskVectorEnv(6, machine=replace(machine, ground=-100.0), config=QUIET)
+    env.reset(seed=3)
+    plant = plant_reset(machine, env.state.q)
+    angles = [read_encoder(machine, env.state.q)] * machine.history
+    for _ in range(50):
+        action = rng.uniform(-1, 1, (6, len(machine.driven)))
+        before = plant.q
+        plant = plant_step(machine, plant, task.to_command(machine, action))
+        env.step(action)
+        angles.append(read_encoder(machine, plant.q.astype(np.float32)))
+        np.testing.assert_allclose(env.state.q, plant.q, atol=1e-6)
+        np.testing.assert_allclose(env.state.q_dot, (plant.q - before) * 20, atol=2e-5)
+    seen = np.stack(angles[-machine.history :], axis=-1)
+    assert np.array_equal(env.state.history[:, :, 0], seen)
+    slope = estimate_velocity(seen, machine.velocity_samples, 0.05)
+    np.testing.assert_allclose(env.state.history[:, :, 1, -1], slope, atol=1e-5)
+    assert np.abs(plant.q - angles[0])[:, machine.driven].max() > 0.02
+
+
+@pytest.mark.parametrize("plant", [True, False])
+def test_transition_is_pure(plant):
+    machine = BROKK_170
+    rng = np.random.default_rng(9)
+    net = None if plant else small_net(machine, rng)
+    state = task.reset(machine, TaskConfig(), rng, 4, plant)
+    for _ in range(5):
+        state = task.transition(machine, net, state, task.to_command(machine, np.ones((4, 4))))
+    u = task.to_command(machine, rng.uniform(-1, 1, (4, 4)))
+    copies = [a.copy() for a in flat(state)]
+    for array in (*flat(state), u):
+        array.setflags(write=False)
+    once, twice = (task.transition(machine, net, state, u) for _ in range(2))
+    assert same(once, twice)
+    assert all(np.array_equal(a, b) for a, b in zip(copies, flat(state), strict=True))
+    assert not np.array_equal(once.q, state.q)
+    assert np.array_equal(once.ticks, state.ticks + 1)
+    assert np.array_equal(once.goal_ticks, state.goal_ticks - 1)
+
+
+def test_transition_refuses_nets_that_are_missing():
+    state = task.rest_state(BROKK_170, POSE, np.zeros(3), plant=False)
+    with pytest.raises(ValueError, match="net: expected nets for a state without a plant, got None"):
+        task.transition(BROKK_170, None, state, np.zeros(5))
+
+
+@pytest.mark.parametrize("plant", [True, False])
+@pytest.mark.parametrize("machine", [BROKK_170, *MACHINES[:4]], ids=lambda m: m.name)
+def test_joint_limits_hold(machine, plant):
+    net = None if plant else obedient_net(machine)
+    low, high = machine.column("q_min"), machine.column("q_max")
+    signs = np.where(np.arange(2)[:, None] == 0, 1.0, -1.0) * np.ones((2, len(machine.driven)))
+    state = task.rest_state(machine, np.stack([(low + high) / 2] * 2), np.zeros(3), plant)
+    u = task.to_command(machine, signs)
+    for _ in range(800):
+        state = task.transition(machine, net, state, u)
+        assert ((state.q >= low - 1e-6) & (state.q <= high + 1e-6)).all()
+    driven = machine.driven
+    np.testing.assert_allclose(state.q[0, driven], high[driven], atol=1e-6)
+    np.testing.assert_allclose(state.q[1, driven], low[driven], atol=1e-6)
+    assert not state.q_dot.any()
+
+
+# --- many and one ------------------------------------------------------------------------------------
+
+LIFE = TaskConfig(episode_s=1.5, hold_min_s=0.4, hold_max_s=0.4, redraw_ground=False)
+
+
+@pytest.mark.parametrize("kind", ["plant", "nets"])
+def test_many_environments_equal_single_ones(kind):
+    """The same draws, three episodes long: goals, noise, resets and final observations included."""
+    machine = LOW if kind == "plant" else replace(LOW, encoder_bits=32)
+    net = "analytic" if kind == "plant" else small_net(machine, np.random.default_rng(10))
+    many = TaskVectorEnv(5, net, machine, LIFE)
+    many.np_random = RowRandom([np.random.default_rng(100 + i) for i in range(5)])
+    sync = SyncVectorEnv(
+        [lambda: TaskEnv(net, machine, LIFE)] * 5, autoreset_mode=AutoresetMode.SAME_STEP
+    )
+    for i, single in enumerate(sync.envs):
+        single.np_random = np.random.default_rng(100 + i)
+    seen, others = many.reset()[0], sync.reset()[0]
+    np.testing.assert_allclose(seen, others, atol=1e-6)
+    actions, ends = np.random.default_rng(11), 0
+    tolerance = {"atol": 1e-6 if kind == "plant" else 2e-5}
+    for _ in range(95):
+        action = actions.uniform(-1.2, 1.2, (5, 4)).astype(np.float32)
+        seen, reward, terminated, truncated, info = many.step(action)
+        others, rewards, terminations, truncations, infos = sync.step(action)
+        np.testing.assert_allclose(seen, others, **tolerance)
+        np.testing.assert_allclose(reward, rewards, atol=1e-6)
+        assert np.array_equal(terminated, terminations)
+        assert np.array_equal(truncated, truncations)
+        assert ("final_obs" in info) == ("final_obs" in infos)
+        if "final_obs" in info:
+            ends += 1
+            assert np.array_equal(info["_final_obs"], infos["_final_obs"])
+            np.testing.assert_allclose(info["final_obs"], np.stack(infos["final_obs"]), **tolerance)
+        angles = np.concatenate([single.state.q for single in sync.envs])
+        np.testing.assert_allclose(many.state.q, angles, atol=1e-6)
+    assert ends == 3
+
+
+@pytest.mark.parametrize("kind", ["plant", "nets"])
+def test_nothing_leaks_between_environments(kind):
+    machine, config = LOW, TaskConfig(episode_s=1.0, hold_min_s=60, hold_max_s=60)
+    net = None if kind == "plant" else small_net(machine, np.random.default_rng(12))
+    left = right = task.reset(machine, config, np.random.default_rng(13), 6, net is None)
+    other = task.reset(machine, config, np.random.default_rng(14), 1, net is None)
+    right = task.merge(right, other, np.array([2]))
+    assert not np.array_equal(left.q[2], right.q[2])
+    rows, draws = [0, 1, 3, 4, 5], np.random.default_rng(15)
+    rngs = [np.random.default_rng(16) for _ in range(2)]
+    for _ in range(30):
+        action = draws.uniform(-1, 1, (6, 4)).astype(np.float32)
+        changed = action.copy()
+        changed[2] = -changed[2]
+        left, a = task.step(machine, config, net, left, action, rngs[0])
+        right, b = task.step(machine, config, net, right, changed, rngs[1])
+        assert same(left, right, rows)
+        assert all(np.array_equal(x[rows], y[rows]) for x, y in zip(a, b, strict=True))
+        assert not np.array_equal(a.observation[2], b.observation[2])
+
+
+def test_merge_replaces_whole_rows_and_nothing_else():
+    rng, machine = np.random.default_rng(17), BROKK_170
+    old, new = (task.reset(machine, TaskConfig(), rng, num, True) for num in (5, 2))
+    for _ in range(8):
+        old = task.transition(machine, None, old, task.to_command(machine, np.ones((5, 4))))
+    copies = [a.copy() for a in flat(old)]
+    merged = task.merge(old, new, np.array([4, 1]))
+    assert same(merged, old, [0, 2, 3])
+    for found, wanted in zip(flat(merged), flat(new), strict=True):
+        assert np.array_equal(found[[4, 1]], wanted)
+    assert all(np.array_equal(a, b) for a, b in zip(copies, flat(old), strict=True))
+
+
+# --- ends of episodes --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("actuator", ["plant", "nets"])
+def test_final_obs_is_the_end_of_the_old_episode(actuator):
+    """A twin whose episodes are longer goes on: its observation is the short one's `final_obs`."""
+    net = "analytic" if actuator == "plant" else obedient_net(LOW)
+    short, long = (
+        TaskVectorEnv(4, net, LOW, TaskConfig(episode_s=seconds)) for seconds in (1.0, 9.0)
+    )
+    a, b = short.reset(seed=5)[0], long.reset(seed=5)[0]
+    draws = np.random.default_rng(18)
+    for tick in range(1, 21):
+        assert np.array_equal(a, b)
+        action = draws.uniform(-1, 1, (4, 4)).astype(np.float32)
+        a, reward, terminated, truncated, info = short.step(action)
+        b, wanted, *_, other = long.step(action)
+        assert np.array_equal(reward, wanted)  # the last tick is paid like any other
+        assert not terminated.any()
+        assert truncated.all() == (tick == 20)
+        assert ("final_obs" in info) == (tick == 20)
+        assert "final_obs" not in other
+    assert info["_final_obs"].tolist() == [True] * 4
+    assert np.array_equal(info["final_obs"], b)
+    assert (np.abs(a - info["final_obs"])[:, OLD].max(axis=1) > 1e-3).all()
+    fresh = task.measured(LOW, a)
+    np.testing.assert_allclose(fresh.q, short.state.q, atol=0.1)
+    assert short.state.ticks.tolist() == [0] * 4
+
+
+def test_only_the_ended_rows_start_anew():
+    env = TaskVectorEnv(3, machine=LOW, config=replace(QUIET, episode_s=1.0))
+    env.reset(seed=6)
+    env.state = replace(env.state, ticks=np.array([0, 19, 5]))
+    before = env.state
+    seen, _, _, truncated, info = env.step(np.ones((3, 4), np.float32))
+    assert truncated.tolist() == info["_final_obs"].tolist() == [False, True, False]
+    assert env.state.ticks.tolist() == [1, 0, 6]
+    np.testing.assert_allclose(env.state.q[[0, 2]], before.q[[0, 2]], atol=0.01)
+    assert np.array_equal(seen[[0, 2]], info["final_obs"][[0, 2]])
+    newest = task.measured(LOW, info["final_obs"]).q[1]
+    np.testing.assert_allclose(newest, before.q[1], atol=0.01)
+    np.testing.assert_allclose(task.measured(LOW, seen).q[1], env.state.q[1], atol=2e-3)
+
+
+def test_poses_in_the_ground_end_at_once_without_reward():
+    env = TaskVectorEnv(400, config=TaskConfig(redraw_ground=False))
+    env.reset(seed=7)
+    buried = closed_form(env.state.q.astype(float))[1] < 0
+    assert 8 < buried.sum() < 392
+    _, reward, terminated, truncated, info = env.step(np.zeros((400, 4), np.float32))
+    assert np.array_equal(terminated, buried)
+    assert not truncated.any()
+    assert not reward[buried].any()
+    assert (reward[~buried] > 0).all()
+    assert np.array_equal(info["_final_obs"], buried)
+    assert (env.state.ticks == ~buried).all()
+
+
+def test_redrawn_poses_never_end_at_once():
+    env = TaskVectorEnv(1000, config=TaskConfig(redraw_ground=True))
+    for seed in range(3):
+        env.reset(seed=seed)
+        _, reward, terminated, truncated, _ = env.step(np.zeros((1000, 4), np.float32))
+        assert not (terminated | truncated).any()
+        assert (reward > 0).all()
+
+
+def test_ground_and_time_limit_are_never_both():
+    """In the tick in which the time runs out, a buried arm counts as terminated alone."""
+    env = TaskVectorEnv(400, config=TaskConfig(redraw_ground=False, episode_s=0.05))
+    env.reset(seed=8)
+    for _ in range(3):
+        buried = closed_form(env.state.q.astype(float))[1] < 0
+        _, reward, terminated, truncated, _ = env.step(np.zeros((400, 4), np.float32))
+        assert np.array_equal(terminated, buried)
+        assert np.array_equal(truncated, ~buried)
+        assert np.array_equal(reward == 0, buried)
+
+
+def test_an_arm_that_is_driven_into_the_ground_terminates():
+    machine, config = BROKK_170, TaskConfig(noise=0.0)
+    down = np.array([0.0, -1.0, 0.0, 0.0])
+    env = TaskEnv(obedient_net(machine), machine, config)
+    env.reset(seed=9)
+    env.state = task.rest_state(machine, POSE[None], np.zeros((1, 3)), plant=False)
+    heights = []
+    for _ in range(300):
+        _, reward, terminated, truncated, info = env.step(down)
+        heights.append(float(closed_form(env.state.q.astype(float))[1][0]))
+        assert terminated == (heights[-1] < 0)
+        assert not truncated
+        if terminated:
+            break
+    assert len(heights) > 5
+    assert terminated
+    assert reward == 0
+    assert info["velocity_error"] > 0
+
+
+# --- Gymnasium ---------------------------------------------------------------------------------------
+
+
+def test_gymnasium_and_stable_baselines_accept_the_environment():
+    from gymnasium.utils.env_checker import check_env
+    from stable_baselines3.common.env_checker import check_env as check_sb3
+
+    env = gymnasium.make("brokk_min/Brokk170-v0")
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*Box observation space.*infinity.*")
+        check_env(env.unwrapped, skip_render_check=True)
+    check_sb3(env.unwrapped)
+    assert env.observation_space.shape == (163,)
+    assert env.action_space.low.tolist() == [-1] * 4
+
+
+def test_make_vec_gives_the_vector_class():
+    env = gymnasium.make_vec("brokk_min/Brokk170-v0", num_envs=256)
+    assert isinstance(env.unwrapped, TaskVectorEnv)
+    assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    seen, _ = env.reset(seed=0)
+    assert env.observation_space.contains(seen)
+    seen, reward, terminated, truncated, info = env.step(env.action_space.sample())
+    assert env.observation_space.contains(seen)
+    assert reward.shape == terminated.shape == truncated.shape == info["velocity_error"].shape == (256,)
+    assert len(np.unique(seen[:, 7])) > 250  # they start apart
+
+
+@pytest.mark.parametrize("make", [lambda: TaskVectorEnv(3), TaskEnv], ids=["vector", "single"])
+def test_seeds_reproduce_and_differ(make):
+    def run(seed):
+        env = make()
+        tape, draws = [env.reset(seed=seed)[0]], np.random.default_rng(0)
+        for _ in range(30):
+            action = draws.uniform(-1, 1, env.action_space.shape).astype(np.float32)
+            tape.append(env.step(action)[0])
+        return np.array(tape)
+
+    assert np.array_equal(run(3), run(3))
+    assert not np.allclose(run(3)[0], run(4)[0], atol=0.2)
+
+
+@pytest.mark.parametrize("make", [lambda: TaskVectorEnv(2), TaskEnv], ids=["vector", "single"])
+def test_a_step_before_the_reset_is_refused(make):
+    with pytest.raises(ValueError, match="step: expected a reset before the first step, got none"):
+        make().step(np.zeros((2, 4), np.float32))
+
+
+@pytest.mark.parametrize("shape", [(2, 5), (2,), (2, 3)])
+def test_the_environment_refuses_wrong_actions(shape):
+    env = TaskVectorEnv(2)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"action: expected \(\.\.\., 4\), got \(2"):
+        env.step(np.zeros(shape, np.float32))
+
+
+@pytest.mark.parametrize("machine", MACHINES, ids=lambda m: f"{m.name}-{len(m.driven)}")
+def test_random_machines_run(machine):
+    """Environment and Jacobian controller on two to six joints, on the plant and on nets."""
+    for actuator in ("analytic", small_net(machine, np.random.default_rng(0))):
+        env = TaskVectorEnv(4, actuator, machine, TaskConfig(episode_s=1.0))
+        seen, _ = env.reset(seed=0)
+        ends = 0
+        for _ in range(45):
+            seen, reward, terminated, truncated, _ = env.step(env.action_space.sample())
+            assert env.observation_space.contains(seen)
+            assert ((reward > 0) & (reward <= 1)).all()
+            assert not terminated.any()
+            ends += truncated.sum()
+        assert ends == 8
+    zero = np.zeros(len(machine.driven))
+    controller = JacobianController(machine, Gains(zero + 1, zero + 1, zero, np.array(0.2)), 0.1, 0.1)
+    start = (machine.column("q_min") + machine.column("q_max")) / 2 * np.ones((3, 1))
+    goals = np.full((30, 3, 3), 0.05)
+    trace = task.rollout(machine, controller, start, goals, TaskConfig(), np.random.default_rng(0))
+    assert np.isfinite(trace.v_tool).all()
+    assert np.abs(trace.u).max() <= machine.pwm_limit / 127 + 1e-9
+    assert not trace.u[..., machine.locked].any()
+    assert np.abs(trace.q - start).max() > 1e-3
+
+
+# --- nets that do not fit ----------------------------------------------------------------------------
+
+
+def nets_of(actuator):
+    return TaskVectorEnv(1, actuator, BROKK_170).net
+
+
+def test_nets_that_do_not_fit_are_refused():
+    net = small_net(BROKK_170, np.random.default_rng(0))
+    for change in ({"rate": 10.0}, {"velocity_samples": 3}, {"velocity_logged": True}):
+        ((name, value),) = change.items()
+        message = f"actuator: expected nets for brokk170 with .*'{name}': .*, got .*'{name}': {value}"
+        with pytest.raises(ValueError, match=message):
+            nets_of(replace(net, **change))
+    with pytest.raises(ValueError, match="actuator: expected .*'history': 13.*'history': 7"):
+        nets_of(small_net(replace(BROKK_170, history=7), np.random.default_rng(0)))
+    names = ("q1", "q3", "q4")
+    with pytest.raises(ValueError, match=r"joints: expected nets for \['q1', .*'q5'\], got \['q1'"):
+        nets_of(net.select(names))
+
+
+def test_nets_of_another_machine_with_the_same_joints_are_refused():
+    net = replace(small_net(BROKK_170, np.random.default_rng(0)), machine="brokk500")
+    with pytest.raises(ValueError, match="brokk170.*brokk500"):
+        nets_of(net)
+
+
+def test_nets_are_found_by_name_and_read_from_files(tmp_path):
+    rng = np.random.default_rng(1)
+    ordered = small_net(BROKK_170, rng)
+    mixed = ordered.select(("q5", "q1", "q4", "q3"))
+    save_net(tmp_path / "net.npz", mixed)
+    for actuator in (mixed, tmp_path / "net.npz", str(tmp_path / "net.npz")):
+        found = nets_of(actuator)
+        assert found.joints == ("q1", "q3", "q4", "q5")
+        history = rng.normal(size=(3, 4, 3, 13)).astype(np.float32)
+        assert np.array_equal(found.predict(history), ordered.predict(history))
+    with pytest.raises(ValueError, match=r"none\.npz: expected a readable \.npz file"):
+        nets_of(tmp_path / "none.npz")
+
+
+# --- rollouts ----------------------------------------------------------------------------------------
+
+
+class Recorder:
+    """Sends a tape of commands and keeps what it saw."""
+
+    def __init__(self, tape):
+        self.tape, self.seen = tape, []
+
+    def start(self, num):
+        return 0
+
+    def __call__(self, observation, memory):
+        self.seen.append(observation)
+        return self.tape[memory], memory + 1
+
+
+def test_rollout_tells_what_happened_when():
+    machine, rng = BROKK_170, np.random.default_rng(19)
+    tape = task.to_command(machine, rng.uniform(-1, 1, (40, 2, 4)))
+    goals = np.repeat(rng.uniform(-0.3, 0.3, (4, 2, 3)), 10, axis=0)
+    start = np.stack([POSE, POSE + 0.1])
+    spy = Recorder(tape)
+    trace = task.rollout(machine, spy, start, goals, QUIET, np.random.default_rng(0))
+    plant, q = plant_reset(machine, start.astype(np.float32)), start
+    for t in range(40):
+        seen = task.measured(machine, spy.seen[t])
+        np.testing.assert_allclose(seen.v_goal, goals[t], atol=1e-6)
+        np.testing.assert_allclose(trace.q_measured[t], q, atol=machine.encoder_step / 2 + 1e-6)
+        np.testing.assert_allclose(seen.q, trace.q_measured[t], atol=1e-5)
+        plant = plant_step(machine, plant, tape[t])
+        np.testing.assert_allclose(trace.q[t], plant.q, atol=1e-6)
+        np.testing.assert_allclose(trace.q_dot[t], (plant.q - q) * 20, atol=2e-5)
+        np.testing.assert_allclose(trace.p_tool[t], closed_form(plant.q)[0], atol=1e-5)
+        error = np.linalg.norm(goals[t] - trace.v_tool[t], axis=-1)
+        np.testing.assert_allclose(trace.reward[t], 1 / (1 + error), atol=1e-6)
+        q = plant.q
+    assert np.array_equal(trace.u, tape)
+    np.testing.assert_allclose(np.diff(trace.p_tool, axis=0)[20:] * 20, trace.v_tool[21:], atol=0.01)
+
+
+def test_rollout_noise_reaches_the_controller_and_is_reproducible():
+    tape = np.zeros((30, 1, 5))
+    seen = {}
+    for name, config, seed in (("a", TaskConfig(), 1), ("b", TaskConfig(), 1), ("c", QUIET, 1)):
+        spy = Recorder(tape)
+        task.rollout(BROKK_170, spy, POSE[None], tape[..., :3], config, np.random.default_rng(seed))
+        seen[name] = np.array(spy.seen)
+    assert np.array_equal(seen["a"], seen["b"])
+    assert 0.045 < np.abs(seen["a"] - seen["c"]).max() <= 0.05 + 1e-6

@@ -1,0 +1,284 @@
+"""Kinematics against a closed form, matrix exponentials, Pinocchio and finite differences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given
+from scipy.linalg import expm
+from strategies import moving, posed, poses
+
+from brokk_min.kinematics import (
+    frames,
+    jacobian,
+    lowest_point,
+    tool_position,
+    tool_state,
+    tool_velocity,
+)
+from brokk_min.machine import BROKK_170, Machine
+
+START = np.array([1.5, 0.5, 0.58, 1.71, 1.24])  # q_s of the paper
+LINKS = (1.15, 1.25, 1.15, 1.20)
+
+
+def closed_form(q: np.ndarray) -> np.ndarray:
+    """DESIGN section 4, link by link: points (5, ..., 3) at the ends of all links."""
+    q1, q2, q3, q4, q5 = np.moveaxis(q, -1, 0)
+    e2 = q2
+    e3 = e2 + q3
+    e4 = e3 + q4 - np.pi
+    e5 = e4 + q5 - 3 * np.pi / 4
+    r, z = 0.25 + 0 * q1, 0.95 + 0 * q1
+    points = [np.stack([r * np.cos(q1), r * np.sin(q1), z], axis=-1)]
+    for length, elevation in zip(LINKS, (e2, e3, e4, e5), strict=True):
+        r, z = r + length * np.cos(elevation), z + length * np.sin(elevation)
+        points.append(np.stack([r * np.cos(q1), r * np.sin(q1), z], axis=-1))
+    return np.array(points)
+
+
+# --- by hand --------------------------------------------------------------------------------------
+
+
+def test_the_start_pose_of_the_paper():
+    x, y, z = tool_position(BROKK_170, START)
+    assert np.hypot(x, y) == pytest.approx(3.05, abs=0.005)
+    assert z == pytest.approx(1.01, abs=0.005)
+    assert np.arctan2(y, x) == pytest.approx(1.5)
+
+
+def test_the_arm_stretched_out():
+    straight = np.array([0.0, 0.0, 0.0, np.pi, 3 * np.pi / 4])
+    np.testing.assert_allclose(tool_position(BROKK_170, straight), [5.0, 0, 0.95], atol=1e-12)
+    upright = straight + [np.pi / 2, np.pi / 2, 0, 0, 0]
+    np.testing.assert_allclose(tool_position(BROKK_170, upright), [0, 0.25, 5.7], atol=1e-12)
+    # 1 rad/s of slew moves the tool at 5 m/s sideways; 1 rad/s of q5 lifts it at 1.2 m/s
+    wanted = [[0, 0, 0, 0], [5, 0, 0, 0], [0, 3.6, 2.35, 1.2]]
+    np.testing.assert_allclose(jacobian(BROKK_170, straight), wanted, atol=1e-12)
+    # the locked joint, moved by the operator, carries the tool too: 4.75 m
+    velocity = tool_velocity(BROKK_170, straight, np.array([0, 1.0, 0, 0, 0]))
+    np.testing.assert_allclose(velocity, [0, 0, 4.75], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("bend", "lowest"),
+    [
+        ([0, 0, 0, 0, 0], 0.95),  # all flat
+        ([0, 0, 0, 0, -np.pi / 2], 0.95 - 1.2),  # tool down
+        ([0, 0, 0, -np.pi / 2, np.pi], 0.95 - 1.15),  # a V: its corner is lowest, not the tool
+        ([0, 0, -np.pi / 2, np.pi / 2, 0], 0.95 - 1.25),
+        ([0, -np.pi / 2, np.pi, 0, 0], 0.95 - 1.15),
+        ([0, np.pi / 2, 0, 0, 0], 0.95),  # upright: the pivot is lowest
+    ],
+)
+def test_lowest_point_by_hand(bend, lowest):
+    q = np.array([0.0, 0.0, 0.0, np.pi, 3 * np.pi / 4]) + bend
+    assert lowest_point(BROKK_170, q) == pytest.approx(lowest, abs=1e-12)
+
+
+# --- independent oracles --------------------------------------------------------------------------
+
+
+@given(poses(BROKK_170, (20,)))
+def test_closed_form_of_the_brokk(q):
+    points = closed_form(q)
+    np.testing.assert_allclose(tool_position(BROKK_170, q), points[-1], atol=1e-12)
+    origins = np.moveaxis(frames(BROKK_170, q)[..., 1:, :3, 3], -2, 0)
+    np.testing.assert_allclose(origins, points, atol=1e-12)
+    np.testing.assert_allclose(lowest_point(BROKK_170, q), points[..., 2].min(axis=0), atol=1e-12)
+
+
+def twist(angular: np.ndarray, linear: np.ndarray) -> np.ndarray:
+    x, y, z = angular
+    matrix = np.zeros((4, 4))
+    matrix[:3, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
+    matrix[:3, 3] = linear
+    return matrix
+
+
+def product_of_exponentials(machine: Machine, q: np.ndarray) -> np.ndarray:
+    """Frames (n + 1, 4, 4) of one pose: spatial screws at the zero pose, exponentials, home."""
+    x, z = np.eye(3)[0], np.eye(3)[2]
+    home, moved = np.eye(4), np.eye(4)
+    result = [np.eye(4)]
+    for joint, angle in zip(machine.joints, q, strict=True):
+        axis, point = home[:3, :3] @ z, home[:3, 3]
+        moved = moved @ expm(twist(axis, np.cross(point, axis)) * angle)
+        home = home @ expm(twist(z * joint.theta, z * joint.d))
+        home = home @ expm(twist(x * joint.alpha, x * joint.a))
+        result.append(moved @ home)
+    return np.array(result)
+
+
+@given(posed(shapes=[()]))
+def test_frames_are_the_product_of_exponentials(machine_and_pose):
+    machine, q = machine_and_pose
+    wanted = product_of_exponentials(machine, q)
+    np.testing.assert_allclose(frames(machine, q), wanted, atol=1e-10)
+    np.testing.assert_allclose(tool_position(machine, q), wanted[-1, :3, 3], atol=1e-10)
+    lowest = wanted[1:, 2, 3].min()
+    np.testing.assert_allclose(lowest_point(machine, q), lowest, atol=1e-10)
+
+
+def pinocchio_brokk() -> pin.Model:
+    """The arm from its description, not from the DH rows: axes to the right lift the links."""
+    model = pin.Model()
+    up, right = np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0])
+    rows = [
+        ("q1", up, (0.0, 0.0, 0.0), 0.0),
+        ("q2", right, (0.25, 0.0, 0.95), 0.0),
+        ("q3", right, (1.15, 0.0, 0.0), 0.0),
+        ("q4", right, (1.25, 0.0, 0.0), -np.pi),
+        ("q5", right, (1.15, 0.0, 0.0), -3 * np.pi / 4),
+    ]
+    parent = 0
+    for name, axis, place, offset in rows:
+        turn = pin.AngleAxis(offset, right).toRotationMatrix()
+        at = pin.SE3(turn, np.array(place))
+        parent = model.addJoint(parent, pin.JointModelRevoluteUnaligned(axis), at, name)
+    tip = pin.SE3(np.eye(3), np.array([1.2, 0.0, 0.0]))
+    model.addFrame(pin.Frame("tool", parent, tip, pin.FrameType.OP_FRAME))
+    return model
+
+
+@given(poses(BROKK_170), poses(BROKK_170))
+def test_the_brokk_in_pinocchio(q, other):
+    model = pinocchio_brokk()
+    data, tool = model.createData(), model.getFrameId("tool")
+    q_dot = np.array(other - q)
+    pin.framesForwardKinematics(model, data, q)
+    np.testing.assert_allclose(tool_position(BROKK_170, q), data.oMf[tool].translation, atol=1e-12)
+    # DH frame i sits at the end of link i, Pinocchio's joint i + 1 at its start
+    pivots = [data.oMi[i].translation for i in range(2, 6)]
+    np.testing.assert_allclose(frames(BROKK_170, q)[1:5, :3, 3], pivots, atol=1e-12)
+    full = pin.computeFrameJacobian(model, data, q, tool, pin.LOCAL_WORLD_ALIGNED)[:3]
+    np.testing.assert_allclose(jacobian(BROKK_170, q), full[:, [0, 2, 3, 4]], atol=1e-12)
+    pin.forwardKinematics(model, data, q, q_dot)
+    velocity = pin.getFrameVelocity(model, data, tool, pin.LOCAL_WORLD_ALIGNED).linear
+    np.testing.assert_allclose(tool_velocity(BROKK_170, q, q_dot), velocity, atol=1e-12)
+
+
+@given(posed(shapes=[(), (3,)]))
+def test_jacobian_is_the_derivative_of_the_tool_position(machine_and_pose):
+    machine, q = machine_and_pose
+    step = 1e-6
+    J = jacobian(machine, q)
+    assert J.shape == (*q.shape[:-1], 3, len(machine.driven))
+    for column, joint in enumerate(machine.driven):
+        nudge = step * np.eye(machine.n)[joint]
+        ahead, behind = tool_position(machine, q + nudge), tool_position(machine, q - nudge)
+        slope = (ahead - behind) / (2 * step)
+        np.testing.assert_allclose(J[..., column], slope, atol=1e-7)
+
+
+# --- properties -----------------------------------------------------------------------------------
+
+
+@given(moving())
+def test_tool_velocity_is_the_derivative_along_the_motion(case):
+    machine, q, q_dot = case
+    step = 1e-6
+    ahead, behind = (tool_position(machine, q + s * step * q_dot) for s in (1, -1))
+    position, velocity, lowest = tool_state(machine, q, q_dot)
+    np.testing.assert_allclose(velocity, (ahead - behind) / (2 * step), atol=1e-7)
+    np.testing.assert_array_equal(velocity, tool_velocity(machine, q, q_dot))
+    np.testing.assert_allclose(position, tool_position(machine, q), atol=1e-14)
+    np.testing.assert_allclose(lowest, lowest_point(machine, q), atol=1e-14)
+
+
+@given(moving())
+def test_driven_joints_move_the_tool_through_the_jacobian_and_locked_ones_add_to_it(case):
+    machine, q, q_dot = case
+    still = q_dot.copy()
+    still[..., machine.locked] = 0.0
+    through = np.einsum("...ij,...j->...i", jacobian(machine, q), q_dot[..., machine.driven])
+    np.testing.assert_allclose(tool_velocity(machine, q, still), through, atol=1e-12)
+    freed = tuple(replace(joint, driven=True) for joint in machine.joints)
+    every = jacobian(replace(machine, joints=freed), q)
+    whole = np.einsum("...ij,...j->...i", every, q_dot)
+    np.testing.assert_allclose(tool_velocity(machine, q, q_dot), whole, atol=1e-12)
+
+
+@given(moving(shapes=[(1,), (4,), (2, 3)]))
+def test_a_batch_is_the_same_as_its_poses_one_by_one(case):
+    machine, q, q_dot = case
+    for function in (frames, tool_position, jacobian, lowest_point):
+        batch = function(machine, q)
+        for index in np.ndindex(q.shape[:-1]):
+            np.testing.assert_allclose(batch[index], function(machine, q[index]), atol=1e-14)
+    batch = tool_velocity(machine, q, q_dot)
+    for index in np.ndindex(q.shape[:-1]):
+        alone = tool_velocity(machine, q[index], q_dot[index])
+        np.testing.assert_allclose(batch[index], alone, atol=1e-14)
+
+
+def test_an_empty_batch_has_empty_results():
+    q = np.zeros((0, 5))
+    assert frames(BROKK_170, q).shape == (0, 6, 4, 4)
+    assert jacobian(BROKK_170, q).shape == (0, 3, 4)
+    assert lowest_point(BROKK_170, q).shape == (0,)
+
+
+@given(posed())
+def test_every_frame_is_a_rotation_and_a_place_and_the_base_stays(machine_and_pose):
+    machine, q = machine_and_pose
+    result = frames(machine, q)
+    R = result[..., :3, :3]
+    unit = np.broadcast_to(np.eye(3), R.shape)
+    np.testing.assert_allclose(np.swapaxes(R, -1, -2) @ R, unit, atol=1e-13)
+    np.testing.assert_allclose(np.linalg.det(R), 1.0, atol=1e-13)
+    bottom = np.broadcast_to([0.0, 0, 0, 1], result[..., 3, :].shape)
+    np.testing.assert_array_equal(result[..., 3, :], bottom)
+    np.testing.assert_array_equal(result[..., 0, :, :], np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4)))
+
+
+@given(moving())
+def test_single_precision_stays_single_and_close(case):
+    machine, q, q_dot = case
+    small, small_dot = q.astype(np.float32), q_dot.astype(np.float32)
+    for function in (frames, tool_position, jacobian, lowest_point):
+        result = function(machine, small)
+        assert result.dtype == np.float32, function.__name__
+        np.testing.assert_allclose(result, function(machine, q), atol=2e-5)
+    results = tool_state(machine, small, small_dot)
+    assert [value.dtype for value in results] == [np.float32] * 3
+    for result, exact in zip(results, tool_state(machine, q, q_dot), strict=True):
+        np.testing.assert_allclose(result, exact, atol=5e-5)
+
+
+def test_single_precision_stays_single_for_link_lengths_out_of_an_array():
+    """A team's table of links is often an array, whose numbers are np.float64 and win over float32."""
+    table = np.array([[joint.a, joint.d] for joint in BROKK_170.joints])
+    joints = zip(BROKK_170.joints, table, strict=True)
+    machine = replace(BROKK_170, joints=tuple(replace(j, a=a, d=d) for j, (a, d) in joints))
+    assert tool_position(machine, START.astype(np.float32)).dtype == np.float32
+    assert jacobian(machine, START.astype(np.float32)).dtype == np.float32
+
+
+def test_whole_angles_and_lists_are_angles():
+    whole = tool_position(BROKK_170, [1, 0, 1, 2, 1])
+    np.testing.assert_array_equal(whole, tool_position(BROKK_170, np.array([1.0, 0, 1, 2, 1])))
+
+
+# --- refusals -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", [(), (4,), (6,), (5, 4), (5, 1), (0,)])
+@pytest.mark.parametrize("function", [frames, tool_position, jacobian, lowest_point])
+def test_angles_of_another_machine_are_refused(function, shape):
+    with pytest.raises(ValueError) as caught:
+        function(BROKK_170, np.zeros(shape))
+    assert str(caught.value) == f"q: expected (..., 5), got {shape}"
+
+
+@pytest.mark.parametrize("function", [tool_state, tool_velocity])
+def test_velocities_of_another_machine_are_refused_by_their_own_name(function):
+    with pytest.raises(ValueError) as caught:
+        function(BROKK_170, np.zeros((2, 5)), np.zeros((2, 4)))
+    assert str(caught.value) == "q_dot: expected (..., 5), got (2, 4)"
+    with pytest.raises(ValueError) as caught:
+        function(BROKK_170, np.zeros((2, 4)), np.zeros((2, 5)))
+    assert str(caught.value) == "q: expected (..., 5), got (2, 4)"
