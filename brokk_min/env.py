@@ -175,6 +175,7 @@ def to_command(machine: Machine, action: ArrayLike) -> Array:
         array([ 80.,   0., -40.,   0.,  80.])
     """
     action = np.asarray(action)
+    action = action if np.issubdtype(action.dtype, np.floating) else action.astype(float)
     if action.shape[-1:] != machine.driven.shape:
         raise ValueError(f"action: expected (..., {len(machine.driven)}), got {action.shape}")
     if not np.isfinite(action).all():
@@ -448,6 +449,7 @@ def fitting_nets(machine: Machine, net: ActuatorNet) -> ActuatorNet:
         ValueError: nets that do not fit the machine, naming what was wanted and found.
     """
     wanted = {
+        "machine": machine.name,
         "rate": machine.rate,
         "history": machine.history,
         "velocity_samples": machine.velocity_samples,

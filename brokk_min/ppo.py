@@ -21,7 +21,7 @@ import torch
 from torch import nn
 from tqdm import tqdm
 
-from brokk_min.actuator import ActuatorNet, load_header
+from brokk_min.actuator import ActuatorNet, load_header, net_arrays
 from brokk_min.env import State, TaskConfig, TaskVectorEnv, observation_scale
 from brokk_min.logs import load_arrays, whole_file
 from brokk_min.machine import Machine
@@ -247,7 +247,7 @@ class Training:
     def policy(self, training: dict[str, Any]) -> Policy:
         """The actor as it stands, for the machine it was trained for."""
         layers = [layer for layer in self.agent.actor if isinstance(layer, nn.Linear)]
-        weights = [(layer.weight.detach().numpy().T.copy(), layer.bias.detach().numpy()) for layer in layers]
+        weights = [(layer.weight.detach().numpy().T.copy(), layer.bias.detach().numpy().copy()) for layer in layers]
         mean, scale = observation_scale(self.env.machine)
         flat = tuple(array for pair in weights for array in pair)
         if self.env.net is None:
@@ -304,10 +304,10 @@ class Training:
 
 
 def fingerprint(net: ActuatorNet) -> str:
-    """Hash of the nets' weights: which simulation a policy was trained in."""
+    """Hash of the nets, header and all: which simulation a policy was trained in."""
     digest = hashlib.sha256()
-    for weight in net.weights:
-        digest.update(np.ascontiguousarray(weight).tobytes())
+    for name, array in net_arrays(net).items():
+        digest.update(name.encode() + np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()[:16]
 
 
@@ -376,8 +376,11 @@ def train(
 
 
 def _read_curve(path: Path, steps: int) -> list[dict[str, Any]]:
-    with open(path, newline="") as file:
-        return [row for row in csv.DictReader(file) if int(row["global_step"]) <= steps]
+    try:
+        with open(path, newline="") as file:
+            return [row for row in csv.DictReader(file) if int(row["global_step"]) <= steps]
+    except (OSError, KeyError, ValueError) as error:
+        raise ValueError(f"{path}: expected the curve beside the checkpoint, got {error!r}") from error
 
 
 def _write_curve(path: Path, rows: list[dict[str, Any]]) -> None:

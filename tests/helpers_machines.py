@@ -56,7 +56,9 @@ def random_machine(rng: np.random.Generator, n: int) -> Machine:
     )
 
 
-def small_net(machine: Machine, rng: np.random.Generator, joints: tuple[str, ...] = ()) -> ActuatorNet:
+def small_net(
+    machine: Machine, rng: np.random.Generator, joints: tuple[str, ...] = ()
+) -> ActuatorNet:
     """Nets with random weights for `joints` (none: the driven ones): all inputs matter."""
     joints = joints or tuple(machine.names[i] for i in machine.driven)
     index = [machine.names.index(name) for name in joints]
@@ -102,11 +104,7 @@ def obedient_net(machine: Machine) -> ActuatorNet:
     weights[4][:, 0, 0], weights[5][:, 0] = GAIN, -2.0 * GAIN
     scale, mean = np.ones_like(net.input_scale), np.zeros_like(net.input_mean)
     return replace(
-        net,
-        weights=tuple(weights),
-        input_mean=mean,
-        input_scale=scale,
-        output_low=-net.output_high,
+        net, weights=tuple(weights), input_mean=mean, input_scale=scale, output_low=-net.output_high
     )
 
 

@@ -10,13 +10,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from helpers_machines import (
-    RowRandom,
-    obedient_net,
-    obedient_velocity,
-    random_machine,
-    small_net,
-)
+from helpers_machines import RowRandom, obedient_net, obedient_velocity, random_machine, small_net
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -37,7 +31,7 @@ MACHINES = [random_machine(np.random.default_rng(seed), 2 + seed % 5) for seed i
 
 
 def closed_form(q):
-    """Tool position [m] of the Brokk by the design's closed form, and the heights of the link ends."""
+    """Tool position [m] of the Brokk in closed form, and the height of its lowest link end."""
     q1, e2 = q[..., 0], q[..., 1]
     e3 = e2 + q[..., 2]
     e4 = e3 + q[..., 3] - np.pi
@@ -61,7 +55,7 @@ def same(a, b, rows=slice(None)):
     return all(np.array_equal(x[rows], y[rows]) for x, y in zip(flat(a), flat(b), strict=True))
 
 
-# --- the reward --------------------------------------------------------------------------------------
+# --- the reward -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -99,7 +93,7 @@ def test_ground_is_below_not_at():
     assert task.terminated(raised, np.array([0.49, 0.51])).tolist() == [True, False]
 
 
-# --- commands ----------------------------------------------------------------------------------------
+# --- commands -------------------------------------------------------------------------------------
 
 
 def test_to_command_by_hand():
@@ -141,7 +135,7 @@ def test_to_command_refuses_wrong_shapes(shape):
         task.to_command(BROKK_170, np.zeros(shape))
 
 
-# --- observations ------------------------------------------------------------------------------------
+# --- observations ---------------------------------------------------------------------------------
 
 
 def told_history():
@@ -156,10 +150,11 @@ def told_history():
 
 
 def test_observation_by_hand():
-    seen = task.observe(BROKK_170, told_history(), [0.3, -0.15, 0.0])
+    outward, sideways = np.array([np.cos(1.5), np.sin(1.5)]), np.array([-np.sin(1.5), np.cos(1.5)])
+    seen = task.observe(BROKK_170, told_history(), [*(0.3 * outward - 0.1 * sideways), -0.15])
     assert seen.shape == (163,)  # 6 + q2 + 4 joints x 39
     assert seen.dtype == np.float32
-    np.testing.assert_allclose(seen[:3], [3**0.5, -(3**0.5) / 2, 0], rtol=1e-6)
+    np.testing.assert_allclose(seen[:3], 3**0.5 * np.array([1, -1 / 3, -0.5]), rtol=1e-5)
     assert seen[6] == pytest.approx((0.5 - 0.7) / (1.4 / 12**0.5), rel=1e-6)
     spread, lags = 12**0.5, np.arange(13)
     q1, q3 = seen[7:46].reshape(3, 13), seen[46:85].reshape(3, 13)
@@ -175,12 +170,32 @@ def test_observation_by_hand():
 
 
 def test_observed_tool_velocity_is_the_derivative_of_the_closed_form():
+    """Seen along the heading: the derivatives of radius, heading times radius, and height."""
     history, step = told_history(), 1e-6
     q, q_dot = history[:, 0, -1], history[:, 1, -1]
-    v_tool = (closed_form(q + step * q_dot)[0] - closed_form(q - step * q_dot)[0]) / (2 * step)
+    after, before = (closed_form(q + sign * step * q_dot)[0] for sign in (1, -1))
+    radius = np.hypot(*closed_form(q)[0][:2])
+    outward = (np.hypot(*after[:2]) - np.hypot(*before[:2])) / (2 * step)
+    sideways = (
+        radius * (np.arctan2(after[1], after[0]) - np.arctan2(before[1], before[0])) / (2 * step)
+    )
+    upward = (after[2] - before[2]) / (2 * step)
     seen = task.observe(BROKK_170, history, np.zeros(3))
-    np.testing.assert_allclose(seen[3:6] * 0.3 / 3**0.5, v_tool, atol=1e-6)
+    np.testing.assert_allclose(seen[3:6] * 0.3 / 3**0.5, [outward, sideways, upward], atol=1e-6)
     assert q_dot[1] != 0  # a moving q2 counts as well
+
+
+def test_a_turned_arm_sees_the_same():
+    """Turning arm and goal about the slew axis changes q1's angles alone."""
+    history, turned = told_history(), told_history()
+    turned[0, 0] -= 2.5
+    c, s = np.cos(-2.5), np.sin(-2.5)
+    one = task.observe(BROKK_170, history, [0.2, -0.1, 0.05])
+    other = task.observe(BROKK_170, turned, [0.2 * c + 0.1 * s, 0.2 * s - 0.1 * c, 0.05])
+    angles = np.zeros(163, bool)
+    angles[7:20] = True
+    np.testing.assert_allclose(other[~angles], one[~angles], atol=1e-5)
+    np.testing.assert_allclose(other[angles] - one[angles], -2.5 * 12**0.5 / 4.28, rtol=1e-5)
 
 
 @pytest.mark.parametrize("machine", MACHINES, ids=lambda m: m.name)
@@ -217,19 +232,47 @@ def test_scale_belongs_to_uniform_values_over_the_ranges(machine):
     assert np.abs(seen.std(axis=0) - 1).max() < 0.05
 
 
-def test_noise_is_uniform_within_five_percent_and_fresh():
-    clean = np.linspace(-2, 2, 163, dtype=np.float32) * np.ones((300, 1), np.float32)
+@pytest.mark.parametrize("machine", [BROKK_170, MACHINES[0]], ids=lambda m: m.name)
+def test_noise_is_uniform_within_five_percent_and_fresh(machine):
+    """On angles and velocities, in units of their spread over the ranges; commands are exact."""
     rng = np.random.default_rng(4)
-    noise = task.noisy(clean, TaskConfig(), rng) - clean
+    clean = rng.normal(size=(400, machine.n, 3, machine.history)).astype(np.float32)
+    kept = clean.copy()
+    noise = task.noisy(machine, clean, TaskConfig(), rng) - clean
     assert noise.dtype == np.float32
-    assert 0.0499 < np.abs(noise).max() < 0.05 + 1e-6
-    assert stats.kstest(noise.ravel(), stats.uniform(-0.05, 0.1).cdf).pvalue > 1e-3
-    assert np.abs(np.corrcoef(noise[:, :5].T) - np.eye(5)).max() < 0.25
-    assert not np.array_equal(noise, task.noisy(clean, TaskConfig(), rng) - clean)
-    assert np.array_equal(task.noisy(clean, QUIET, rng), clean)
+    assert np.array_equal(clean, kept)
+    assert not noise[:, :, 2].any()
+    spread = (machine.column("q_max") - machine.column("q_min")) / 12**0.5
+    fastest = machine.column("q_dot_max") / 3**0.5
+    noise = noise[:, :, :2] / np.stack([spread, fastest], -1)[..., None]
+    for joint in range(machine.n):
+        for channel in range(2):
+            draws = noise[:, joint, channel]
+            assert 0.049 < np.abs(draws).max() < 0.05 + 1e-5
+            assert stats.kstest(draws.ravel(), stats.uniform(-0.05, 0.1).cdf).pvalue > 1e-4
+    flat_noise = noise.reshape(400, -1)
+    assert np.abs(np.corrcoef(flat_noise.T) - np.eye(flat_noise.shape[1])).max() < 0.3
+    again = task.noisy(machine, clean, TaskConfig(), rng)
+    assert not np.array_equal(
+        again[:, :, :2], task.noisy(machine, clean, TaskConfig(), rng)[:, :, :2]
+    )
+    assert np.array_equal(task.noisy(machine, clean, QUIET, rng), clean)
 
 
-# --- poses and goals ---------------------------------------------------------------------------------
+def test_the_observation_of_an_environment_is_noisy_within_five_percent():
+    env = TaskVectorEnv(300)
+    seen, _ = env.reset(seed=0)
+    for _ in range(3):
+        error = seen - task.observe(BROKK_170, env.state.history, env.state.v_goal)
+        body = error[:, 7:].reshape(300, 4, 3, 13)
+        assert 0.049 < np.abs(error[:, 6]).max() < 0.05 + 1e-5  # the locked joint is measured too
+        assert 0.0499 < np.abs(body[:, :, :2]).max() < 0.05 + 1e-5
+        assert not body[:, :, 2].any()
+        assert 0 < np.abs(error[:, 3:6]).mean() < 1  # tool velocity follows from what is measured
+        seen = env.step(env.action_space.sample())[0]
+
+
+# --- poses and goals ------------------------------------------------------------------------------
 
 
 def test_redrawn_poses_are_off_the_ground_and_the_papers_are_not():
@@ -297,11 +340,15 @@ def test_goals_are_redrawn_within_an_episode_and_rewards_are_for_the_old_goal():
     for _ in range(200):
         before = env.state.v_goal
         shown = task.measured(LOW, seen).v_goal
-        np.testing.assert_allclose(shown, before, atol=1e-6)  # the policy saw the goal it is paid for
+        np.testing.assert_allclose(
+            shown, before, atol=1e-6
+        )  # the policy saw the goal it is paid for
         seen, reward, *_, info = env.step(rng.uniform(-1, 1, (4, 4)).astype(np.float32))
         state, step = env.state, 1e-6
         towards = step * state.q_dot.astype(float)
-        v_tool = (closed_form(state.q + towards)[0] - closed_form(state.q - towards)[0]) / (2 * step)
+        v_tool = (closed_form(state.q + towards)[0] - closed_form(state.q - towards)[0]) / (
+            2 * step
+        )
         error = np.linalg.norm(before - v_tool, axis=-1)
         np.testing.assert_allclose(reward, 1 / (1 + error), atol=1e-5)
         np.testing.assert_allclose(info["velocity_error"], error, atol=1e-5)
@@ -315,7 +362,7 @@ def test_goals_are_redrawn_within_an_episode_and_rewards_are_for_the_old_goal():
         assert changes[0] + 1 <= 10
 
 
-# --- one tick ----------------------------------------------------------------------------------------
+# --- one tick -------------------------------------------------------------------------------------
 
 
 def test_transition_on_nets_by_hand():
@@ -349,7 +396,9 @@ def test_nets_in_the_loop_agree_with_plain_loops():
         state = task.transition(machine, net, state, u)
         for row, (j, (angles, rates, commands)) in enumerate(tape.items()):
             commands.append(u[j])
-            x = (np.concatenate([angles, rates, commands]) - net.input_mean[row]) / net.input_scale[row]
+            x = (np.concatenate([angles, rates, commands]) - net.input_mean[row]) / net.input_scale[
+                row
+            ]
             w1, b1, w2, b2, w3, b3 = (weight[row].astype(float) for weight in net.weights)
             x = np.maximum(0, np.maximum(0, x @ w1 + b1) @ w2 + b2) @ w3 + b3
             low, high = float(net.output_low[row]), float(net.output_high[row])
@@ -407,12 +456,14 @@ def test_transition_is_pure(plant):
 
 def test_transition_refuses_nets_that_are_missing():
     state = task.rest_state(BROKK_170, POSE, np.zeros(3), plant=False)
-    with pytest.raises(ValueError, match="net: expected nets for a state without a plant, got None"):
+    with pytest.raises(
+        ValueError, match="net: expected nets for a state without a plant, got None"
+    ):
         task.transition(BROKK_170, None, state, np.zeros(5))
 
 
 @pytest.mark.parametrize("plant", [True, False])
-@pytest.mark.parametrize("machine", [BROKK_170, *MACHINES[:4]], ids=lambda m: m.name)
+@pytest.mark.parametrize("machine", [BROKK_170, *MACHINES[1:3]], ids=lambda m: m.name)
 def test_joint_limits_hold(machine, plant):
     net = None if plant else obedient_net(machine)
     low, high = machine.column("q_min"), machine.column("q_max")
@@ -428,7 +479,7 @@ def test_joint_limits_hold(machine, plant):
     assert not state.q_dot.any()
 
 
-# --- many and one ------------------------------------------------------------------------------------
+# --- many and one ---------------------------------------------------------------------------------
 
 LIFE = TaskConfig(episode_s=1.5, hold_min_s=0.4, hold_max_s=0.4, redraw_ground=False)
 
@@ -448,20 +499,23 @@ def test_many_environments_equal_single_ones(kind):
     seen, others = many.reset()[0], sync.reset()[0]
     np.testing.assert_allclose(seen, others, atol=1e-6)
     actions, ends = np.random.default_rng(11), 0
-    tolerance = {"atol": 1e-6 if kind == "plant" else 2e-5}
+    # angles in float32, differenced over a tick: one bit of the nets' sums is 1e-5 rad/s
+    tolerance, paid = (1e-6, 1e-6) if kind == "plant" else (1e-4, 2e-5)
     for _ in range(95):
         action = actions.uniform(-1.2, 1.2, (5, 4)).astype(np.float32)
         seen, reward, terminated, truncated, info = many.step(action)
         others, rewards, terminations, truncations, infos = sync.step(action)
-        np.testing.assert_allclose(seen, others, **tolerance)
-        np.testing.assert_allclose(reward, rewards, atol=1e-6)
+        np.testing.assert_allclose(seen, others, atol=tolerance)
+        np.testing.assert_allclose(reward, rewards, atol=paid)
         assert np.array_equal(terminated, terminations)
         assert np.array_equal(truncated, truncations)
         assert ("final_obs" in info) == ("final_obs" in infos)
         if "final_obs" in info:
             ends += 1
             assert np.array_equal(info["_final_obs"], infos["_final_obs"])
-            np.testing.assert_allclose(info["final_obs"], np.stack(infos["final_obs"]), **tolerance)
+            np.testing.assert_allclose(
+                info["final_obs"], np.stack(infos["final_obs"]), atol=tolerance
+            )
         angles = np.concatenate([single.state.q for single in sync.envs])
         np.testing.assert_allclose(many.state.q, angles, atol=1e-6)
     assert ends == 3
@@ -501,7 +555,7 @@ def test_merge_replaces_whole_rows_and_nothing_else():
     assert all(np.array_equal(a, b) for a, b in zip(copies, flat(old), strict=True))
 
 
-# --- ends of episodes --------------------------------------------------------------------------------
+# --- ends of episodes -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("actuator", ["plant", "nets"])
@@ -601,7 +655,7 @@ def test_an_arm_that_is_driven_into_the_ground_terminates():
     assert info["velocity_error"] > 0
 
 
-# --- Gymnasium ---------------------------------------------------------------------------------------
+# --- Gymnasium ------------------------------------------------------------------------------------
 
 
 def test_gymnasium_and_stable_baselines_accept_the_environment():
@@ -625,7 +679,13 @@ def test_make_vec_gives_the_vector_class():
     assert env.observation_space.contains(seen)
     seen, reward, terminated, truncated, info = env.step(env.action_space.sample())
     assert env.observation_space.contains(seen)
-    assert reward.shape == terminated.shape == truncated.shape == info["velocity_error"].shape == (256,)
+    assert (
+        reward.shape
+        == terminated.shape
+        == truncated.shape
+        == info["velocity_error"].shape
+        == (256,)
+    )
     assert len(np.unique(seen[:, 7])) > 250  # they start apart
 
 
@@ -672,7 +732,9 @@ def test_random_machines_run(machine):
             ends += truncated.sum()
         assert ends == 8
     zero = np.zeros(len(machine.driven))
-    controller = JacobianController(machine, Gains(zero + 1, zero + 1, zero, np.array(0.2)), 0.1, 0.1)
+    controller = JacobianController(
+        machine, Gains(zero + 1, zero + 1, zero, np.array(0.2)), 0.1, 0.1
+    )
     start = (machine.column("q_min") + machine.column("q_max")) / 2 * np.ones((3, 1))
     goals = np.full((30, 3, 3), 0.05)
     trace = task.rollout(machine, controller, start, goals, TaskConfig(), np.random.default_rng(0))
@@ -682,7 +744,7 @@ def test_random_machines_run(machine):
     assert np.abs(trace.q - start).max() > 1e-3
 
 
-# --- nets that do not fit ----------------------------------------------------------------------------
+# --- nets that do not fit -------------------------------------------------------------------------
 
 
 def nets_of(actuator):
@@ -693,10 +755,12 @@ def test_nets_that_do_not_fit_are_refused():
     net = small_net(BROKK_170, np.random.default_rng(0))
     for change in ({"rate": 10.0}, {"velocity_samples": 3}, {"velocity_logged": True}):
         ((name, value),) = change.items()
-        message = f"actuator: expected nets for brokk170 with .*'{name}': .*, got .*'{name}': {value}"
+        message = (
+            f"actuator: expected nets for brokk170 with .*'{name}': .*, got .*'{name}': {value}"
+        )
         with pytest.raises(ValueError, match=message):
             nets_of(replace(net, **change))
-    with pytest.raises(ValueError, match="actuator: expected .*'history': 13.*'history': 7"):
+    with pytest.raises(ValueError, match=r"actuator: expected .*'history': 13.*'history': 7"):
         nets_of(small_net(replace(BROKK_170, history=7), np.random.default_rng(0)))
     names = ("q1", "q3", "q4")
     with pytest.raises(ValueError, match=r"joints: expected nets for \['q1', .*'q5'\], got \['q1'"):
@@ -705,7 +769,7 @@ def test_nets_that_do_not_fit_are_refused():
 
 def test_nets_of_another_machine_with_the_same_joints_are_refused():
     net = replace(small_net(BROKK_170, np.random.default_rng(0)), machine="brokk500")
-    with pytest.raises(ValueError, match="brokk170.*brokk500"):
+    with pytest.raises(ValueError, match=r"brokk170.*brokk500"):
         nets_of(net)
 
 
@@ -723,7 +787,7 @@ def test_nets_are_found_by_name_and_read_from_files(tmp_path):
         nets_of(tmp_path / "none.npz")
 
 
-# --- rollouts ----------------------------------------------------------------------------------------
+# --- rollouts -------------------------------------------------------------------------------------
 
 
 class Recorder:
@@ -761,7 +825,9 @@ def test_rollout_tells_what_happened_when():
         np.testing.assert_allclose(trace.reward[t], 1 / (1 + error), atol=1e-6)
         q = plant.q
     assert np.array_equal(trace.u, tape)
-    np.testing.assert_allclose(np.diff(trace.p_tool, axis=0)[20:] * 20, trace.v_tool[21:], atol=0.01)
+    np.testing.assert_allclose(
+        np.diff(trace.p_tool, axis=0)[20:] * 20, trace.v_tool[21:], atol=0.01
+    )
 
 
 def test_rollout_noise_reaches_the_controller_and_is_reproducible():
@@ -769,7 +835,8 @@ def test_rollout_noise_reaches_the_controller_and_is_reproducible():
     seen = {}
     for name, config, seed in (("a", TaskConfig(), 1), ("b", TaskConfig(), 1), ("c", QUIET, 1)):
         spy = Recorder(tape)
-        task.rollout(BROKK_170, spy, POSE[None], tape[..., :3], config, np.random.default_rng(seed))
+        rng = np.random.default_rng(seed)
+        task.rollout(BROKK_170, spy, POSE[None], tape[..., :3], config, rng)
         seen[name] = np.array(spy.seen)
     assert np.array_equal(seen["a"], seen["b"])
-    assert 0.045 < np.abs(seen["a"] - seen["c"]).max() <= 0.05 + 1e-6
+    assert 0.045 < np.abs(seen["a"] - seen["c"])[..., 6:].max() <= 0.05 + 1e-5

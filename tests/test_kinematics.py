@@ -11,14 +11,7 @@ from hypothesis import given
 from scipy.linalg import expm
 from strategies import moving, posed, poses
 
-from brokk_min.kinematics import (
-    frames,
-    jacobian,
-    lowest_point,
-    tool_position,
-    tool_state,
-    tool_velocity,
-)
+from brokk_min.kinematics import frames, jacobian, lowest_point, tool_position, tool_state, tool_velocity
 from brokk_min.machine import BROKK_170, Machine
 
 START = np.array([1.5, 0.5, 0.58, 1.71, 1.24])  # q_s of the paper
@@ -53,7 +46,7 @@ def test_the_start_pose_of_the_paper():
 def test_the_arm_stretched_out():
     straight = np.array([0.0, 0.0, 0.0, np.pi, 3 * np.pi / 4])
     np.testing.assert_allclose(tool_position(BROKK_170, straight), [5.0, 0, 0.95], atol=1e-12)
-    upright = straight + [np.pi / 2, np.pi / 2, 0, 0, 0]
+    upright = np.add(straight, [np.pi / 2, np.pi / 2, 0, 0, 0])
     np.testing.assert_allclose(tool_position(BROKK_170, upright), [0, 0.25, 5.7], atol=1e-12)
     # 1 rad/s of slew moves the tool at 5 m/s sideways; 1 rad/s of q5 lifts it at 1.2 m/s
     wanted = [[0, 0, 0, 0], [5, 0, 0, 0], [0, 3.6, 2.35, 1.2]]
@@ -101,14 +94,17 @@ def twist(angular: np.ndarray, linear: np.ndarray) -> np.ndarray:
 
 def product_of_exponentials(machine: Machine, q: np.ndarray) -> np.ndarray:
     """Frames (n + 1, 4, 4) of one pose: spatial screws at the zero pose, exponentials, home."""
-    x, z = np.eye(3)[0], np.eye(3)[2]
-    home, moved = np.eye(4), np.eye(4)
-    result = [np.eye(4)]
-    for joint, angle in zip(machine.joints, q, strict=True):
-        axis, point = home[:3, :3] @ z, home[:3, 3]
-        moved = moved @ expm(twist(axis, np.cross(point, axis)) * angle)
-        home = home @ expm(twist(z * joint.theta, z * joint.d))
-        home = home @ expm(twist(x * joint.alpha, x * joint.a))
+    x, _, z = np.eye(3)
+    along_z = expm(np.array([twist(z * j.theta, z * j.d) for j in machine.joints]))
+    along_x = expm(np.array([twist(x * j.alpha, x * j.a) for j in machine.joints]))
+    homes = [np.eye(4)]
+    for first, second in zip(along_z, along_x, strict=True):
+        homes.append(homes[-1] @ first @ second)
+    axes, points = [h[:3, :3] @ z for h in homes[:-1]], [h[:3, 3] for h in homes[:-1]]
+    screws = [twist(w, np.cross(p, w)) for w, p in zip(axes, points, strict=True)]
+    moved, result = np.eye(4), [np.eye(4)]
+    for turn, home in zip(expm(np.array(screws) * q[:, None, None]), homes[1:], strict=True):
+        moved = moved @ turn
         result.append(moved @ home)
     return np.array(result)
 

@@ -244,7 +244,9 @@ def test_a_file_without_a_header_is_refused(saved):
 def test_a_pickle_is_refused_and_not_run(tmp_path):
     path = tmp_path / "policy.npz"
     np.savez(path, header=np.array({"kind": "policy"}, dtype=object))
-    with pytest.raises(ValueError, match=r"policy\.npz: expected a readable \.npz file, got .*pickle"):
+    with pytest.raises(
+        ValueError, match=r"policy\.npz: expected a readable \.npz file, got .*pickle"
+    ):
         load_policy(path, BROKK_170)
 
 
@@ -259,7 +261,7 @@ def test_act_refuses_wrong_shapes(policy, shape):
         policy.act(np.zeros(shape))
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_act_refuses_what_is_no_number(policy, bad):
     observation = np.zeros((2, 163))
     observation[1, 40] = bad

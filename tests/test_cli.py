@@ -1,0 +1,143 @@
+"""The command line as a user meets it: help, a foreign log, refusals in one line, exit statuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from brokk_min.__main__ import COMMANDS, main
+from brokk_min.logs import read_log
+
+
+def run(*arguments: object) -> int:
+    """Exit status of one command; tyro leaves by SystemExit on wrong use and help."""
+    try:
+        return main([str(a) for a in arguments])
+    except SystemExit as stop:
+        return int(stop.code or 0)
+
+
+@pytest.mark.parametrize("command", list(COMMANDS))
+def test_each_command_has_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(command, "--help") == 0
+    assert "--seed" in capsys.readouterr().out
+
+
+def test_the_designs_options_exist(capsys: pytest.CaptureFixture[str]) -> None:
+    wanted = {
+        "collect": ["--out", "--hours", "--excitation", "--machine"],
+        "fit": ["--out", "--test", "--json", "--history"],
+        "train": ["--actuator", "--out", "--total-steps", "--num-envs", "--resume"],
+        "evaluate": ["--policy", "--commands", "--starts", "--plant", "--json"],
+        "reproduce": ["--out", "--quick"],
+    }
+    for command, options in wanted.items():
+        run(command, "--help")
+        text = capsys.readouterr().out
+        assert not [o for o in options if o not in text], command
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "message"),
+    [
+        (["collect", "--out", "x.csv", "--hours", "0"], 2, "--hours"),
+        (["collect", "--out", "x.txt"], 2, "--out"),
+        (["collect"], 2, "--out"),
+        (["nonsense"], 2, "nonsense"),
+        (["fit", "--out", "n.npz"], 2, "LOGS"),
+        (["fit", "missing.csv", "--out", "n.npz"], 1, "missing.csv"),
+        (["train", "--actuator", "missing.npz", "--out", "p.npz"], 1, "missing.npz"),
+        (["train", "--actuator", "missing.npz", "--out", "p.npz", "--num-envs", "0"], 2, "--num-envs"),
+        (["evaluate", "--policy", "missing.npz"], 1, "missing.npz"),
+    ],
+)
+def test_refusals_are_short_and_have_their_status(
+    arguments: list[str],
+    status: int,
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(*arguments) == status
+    said = capsys.readouterr()
+    assert message in said.err + said.out
+    assert "Traceback" not in said.err
+    assert not list(tmp_path.iterdir())
+
+
+def foreign_log(path: Path, seed: int, runs: int) -> None:
+    """Another machine at 100 Hz with jitter: first-order joints, other names, angles only."""
+    rng = np.random.default_rng(seed)
+    lines = ["run,time,u_boom,u_arm,q_boom,q_arm"]
+    for r in range(runs):
+        q, v, u, t = np.array([0.3, -0.2]), np.zeros(2), np.zeros(2), 10.0 * r
+        for k in range(2500):
+            if k % 60 == 0:
+                u = rng.uniform(-1, 1, 2)
+            step = 0.01 + rng.uniform(-0.003, 0.003)
+            v += step * (np.array([0.4, 0.7]) * u - v) / 0.15
+            q = q + step * v
+            lines.append(f"take {r},{t:.4f},{u[0]:.3f},{u[1]:.3f},{q[0]:.5f},{q[1]:.5f}")
+            t += step
+    path.write_text("\n".join(lines) + "\n")
+
+
+def test_fit_takes_a_foreign_log_and_beats_the_last_value(tmp_path: Path) -> None:
+    foreign_log(tmp_path / "log.csv", 0, 6)
+    foreign_log(tmp_path / "test.csv", 1, 2)
+    assert (
+        run(
+            "fit", tmp_path / "log.csv", "--out", tmp_path / "n.npz", "--test", tmp_path / "test.csv",
+            "--json", tmp_path / "f.json", "--steps", 1500,
+        )
+        == 0
+    )  # fmt: skip
+    scores = json.loads((tmp_path / "f.json").read_text())["joints"]
+    assert list(scores) == ["boom", "arm"]
+    for joint in scores.values():
+        assert joint["one_step_rmse"] < 0.5 * joint["persistence_rmse"]
+        assert set(joint["free_run"]) == {"1", "5", "10"}  # 25 s recordings hold no 30 s run
+        assert joint["free_run"]["10"]["velocity_rmse"] < 0.05
+
+
+def test_a_bad_log_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "log.csv"
+    foreign_log(path, 0, 1)
+    lines = path.read_text().splitlines()
+    lines[16] = lines[16].replace("take 0,", "take 0,x", 1)
+    path.write_text("\n".join(lines))
+    assert run("fit", path, "--out", tmp_path / "n.npz", "--json", tmp_path / "f.json") == 1
+    assert "row 17, column time: expected a number" in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == ["log.csv"]
+
+
+def test_collect_fit_train_resume_evaluate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log, net, policy = (tmp_path / name for name in ("log.csv", "net.npz", "policy.npz"))
+    assert run("collect", "--out", log, "--hours", 0.02, "--excitation", "sine") == 0
+    assert read_log([log], 4).joints == ("q1", "q2", "q3", "q4", "q5")
+    assert run("fit", log, "--out", net, "--steps", 50) == 0
+    small = ["--total-steps", 2048, "--num-envs", 16, "--horizon", 16, "--minibatch-size", 128]
+    assert run("train", "--actuator", net, "--out", policy, "--resume", *small) == 0
+    assert (tmp_path / "policy.npz.csv").read_text().startswith("global_step,charts/")
+    commands, starts = tmp_path / "c.csv", tmp_path / "s.csv"
+    commands.write_text("sequence,time,vx,vy,vz\nup,0,0,0,0.1\nup,1,0,0,0\n")
+    starts.write_text("q1,q2,q3,q4,q5\n0,0.5,0.58,1.71,1.24\n")
+    gains = {k: [0.5] * 4 for k in ("kp", "ki", "kd")} | {"feedback": 0.1}
+    names = ("jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff")
+    table = {"meta": {"machine": "brokk170"}, "gains": dict.fromkeys(names, gains)}
+    (tmp_path / "gains.json").write_text(json.dumps(table))
+    for plant in ("analytic", "net"):
+        where = tmp_path / f"{plant}.json"
+        options = ["--commands", commands, "--starts", starts, "--plant", plant, "--json", where]
+        assert run("evaluate", "--policy", policy, *options) == 0
+        runs = json.loads(where.read_text())["runs"]
+        assert [r["controller"] for r in runs] == ["rl", *names]
+        assert {(r["sequence"], r["start"]) for r in runs} == {("up", 0)}
+    capsys.readouterr()
+    assert run("evaluate", "--policy", net) == 1
+    assert "policy" in capsys.readouterr().err

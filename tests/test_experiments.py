@@ -1,0 +1,184 @@
+"""The comparison: figures worked by hand, honest sequences and starts, the chain's repeatability."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from benchmarks.rollout import random_net
+
+from brokk_min import experiments
+from brokk_min.env import TaskConfig, Trace, rollout
+from brokk_min.kinematics import lowest_point, tool_position
+from brokk_min.machine import BROKK_170
+
+TINY = experiments.Effort(hours=0.02, fit_steps=60, train_steps=8192, generations=1, tuning_runs=2, starts=2)
+
+
+def test_line_distance_of_a_hand_worked_drift() -> None:
+    # along x with 0.3 m to the side after the second tick; the stop and the way back keep the line
+    goals = np.array([[0.2, 0, 0], [0.2, 0, 0], [0, 0, 0], [-0.1, 0, 0]])
+    p = np.array([[1.0, 0, 0], [2.0, 0.3, 0.4], [2.0, 0.3, 0.0], [1.0, 0.0, 0.1]])
+    distance = experiments.line_distance(p, goals, np.zeros(3))
+    assert distance == pytest.approx([0.0, 0.5, 0.3, 0.1])
+
+
+def test_line_distance_starts_a_new_line_when_the_direction_turns() -> None:
+    goals = np.array([[0.2, 0, 0], [0, 0.2, 0]])
+    p = np.array([[1.0, 0.1, 0], [1.2, 5.0, 0]])  # second line through (1, 0.1) along y
+    assert experiments.line_distance(p, goals, np.zeros(3)) == pytest.approx([0.1, 0.2])
+
+
+def test_line_distance_before_the_first_motion_is_from_the_start() -> None:
+    goals = np.array([[0.0, 0, 0], [0, 0, 0.1]])
+    p = np.array([[0.0, 0.3, 0.4], [0.1, 0.0, 7.0]])
+    assert experiments.line_distance(p, goals, np.zeros(3)) == pytest.approx([0.5, 0.1])
+
+
+def test_metrics_by_hand() -> None:
+    v = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.3, 0, 0]])[:, None]
+    u = np.array([[0.0, 0.5], [0.2, 0.5], [0.2, -0.5]])[:, None]
+    p = np.cumsum(v, axis=0) * 0.05
+    zero = np.zeros((3, 1, 5))
+    trace = Trace(zero, zero, zero, u, p, v, np.array([[1.0], [0.5], [0.75]]))
+    goals = np.tile([0.1, 0.0, 0.0], (3, 1))
+    row = experiments.metrics(BROKK_170, trace, 0, goals, np.zeros(3))
+    assert row["velocity_error_mean"] == pytest.approx((0.1 + 0.0 + 0.2) / 3)
+    assert row["velocity_rmse"] == pytest.approx(np.sqrt((0.01 + 0.04) / 3))
+    assert row["valve_travel"] == pytest.approx(0.5 + 0.2 + 1.0)  # from rest, then tick by tick
+    assert row["jerk_rms"] == pytest.approx(0.1 * 400)  # second difference 0.1 m/s at 20 Hz
+    assert row["reward_mean"] == pytest.approx(0.75)
+    assert row["off_axis_drift_max"] == pytest.approx(0.0)
+
+
+def test_starts_are_feasible_off_the_ground_and_not_the_tuning_starts() -> None:
+    sequences = experiments.axis_sequences(BROKK_170)
+    starts = experiments.draw_starts(BROKK_170, sequences, 6, np.random.default_rng(2))
+    assert (lowest_point(BROKK_170, starts) > 0.1).all()
+    tuning, goals = experiments.tuning_goals(BROKK_170, 4, 6.0, 1000)
+    assert np.abs(tuning[:, None] - starts[None]).max(-1).min() > 1e-3
+    scored = {tuple(row) for s in sequences for row in s.goals if row.any()}
+    moving = goals[np.linalg.norm(goals, axis=-1) > 0]
+    assert not any(tuple(row) in scored for row in moving)
+
+
+def test_feasible_refuses_a_path_out_of_reach() -> None:
+    start = np.array([[0.0, 0.5, 0.58, 1.71, 1.24]])
+    outward = np.tile([0.2, 0.0, 0.0], (400, 1, 1))  # 4 m further out than 3.05 m: beyond 5 m
+    still = np.zeros((400, 1, 3))
+    assert not experiments.feasible(BROKK_170, start, outward)[0]
+    assert experiments.feasible(BROKK_170, start, still)[0]
+
+
+def test_axis_sequences_move_along_one_axis_and_turn_round() -> None:
+    for i, sequence in enumerate(experiments.axis_sequences(BROKK_170)):
+        others = np.delete(sequence.goals, i, axis=1)
+        assert not others.any()
+        assert {round(v, 3) for v in sequence.goals[:, i]} == {0.0, 0.2, -0.2, 0.1, -0.1}
+        assert sequence.goals.sum() == pytest.approx(0.0)
+
+
+class _Perfect:
+    """A controller that does nothing, for machines that should stand still."""
+
+    def start(self, num: int) -> None:
+        return None
+
+    def __call__(self, observation: np.ndarray, memory: None) -> tuple[np.ndarray, None]:
+        return np.zeros((len(observation), BROKK_170.n)), None
+
+
+def test_an_idle_controller_stands_still_and_errs_by_the_goal() -> None:
+    start = np.array([[1.5, 0.5, 0.58, 1.71, 1.24]])
+    goals = np.tile([0.0, 0.0, 0.2], (20, 1, 1))
+    trace = rollout(BROKK_170, _Perfect(), start, goals, TaskConfig(), np.random.default_rng(0))
+    row = experiments.metrics(BROKK_170, trace, 0, goals[:, 0], tool_position(BROKK_170, start[0]))
+    assert row["velocity_error_mean"] == pytest.approx(0.2, abs=1e-6)
+    assert row["reward_mean"] == pytest.approx(1 / 1.2, abs=1e-6)
+    assert row["valve_travel"] == 0
+
+
+def test_commands_are_held_until_the_next_row(tmp_path: Path) -> None:
+    path = tmp_path / "c.csv"
+    path.write_text("sequence,time,vx,vy,vz\na,0,0.1,0,0\na,0.5,0,0,0.2\na,1,0,0,0\nb,2,0,0,0\nb,2.1,0,0,0\n")
+    first, second = experiments.read_commands(path, BROKK_170)
+    assert (first.name, len(first.goals), second.name, len(second.goals)) == ("a", 20, "b", 2)
+    assert (first.goals[:10] == [0.1, 0, 0]).all() and (first.goals[10:] == [0, 0, 0.2]).all()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("sequence,time,vx,vy\na,0,0,0\n", "row 1: expected a column vz"),
+        ("sequence,time,vx,vy,vz\na,0,0,0,fast\na,1,0,0,0\n", "row 2, column vz: expected a number"),
+        ("sequence,time,vx,vy,vz\na,0,0,0,nan\na,1,0,0,0\n", "row 2, column vz: expected a finite"),
+        ("sequence,time,vx,vy,vz\na,1,0,0,0\na,0,0,0,0\n", "sequence a: expected two or more rows"),
+        ("sequence,time,vx,vy,vz\na,1,0,0,0\n", "sequence a: expected two or more rows"),
+        ("", "expected a header"),
+    ],
+)
+def test_bad_commands_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "c.csv"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message) as error:
+        experiments.read_commands(path, BROKK_170)
+    assert str(path) in str(error.value)
+
+
+def test_starts_outside_the_joints_ranges_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "s.csv"
+    path.write_text("q1,q2,q3,q4,q5\n0,0.5,0.5,1.7,1.2\n0,0.5,0.5,1.7,2.2\n")
+    with pytest.raises(ValueError, match=r"row 3, column q5: expected 0.0 to 2.0 rad, got 2.2"):
+        experiments.read_starts(path, BROKK_170)
+
+
+def test_gains_of_another_machine_are_refused(tmp_path: Path) -> None:
+    net = random_net(np.random.default_rng(0)).select(["q1", "q3", "q4", "q5"])
+    path = tmp_path / "gains.json"
+    path.write_text(json.dumps({"meta": {"machine": "digger"}, "gains": {}}))
+    with pytest.raises(ValueError, match="expected gains for brokk170.*digger"):
+        experiments.read_gains(path, BROKK_170, net)
+
+
+@pytest.fixture(scope="module")
+def twice(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    folders = tmp_path_factory.mktemp("a b"), tmp_path_factory.mktemp("second")  # a space in the path
+    for folder in folders:
+        experiments.reproduce(BROKK_170, folder, TINY, 3)
+    return folders
+
+
+def test_the_chain_gives_the_same_bits_twice(twice: tuple[Path, Path]) -> None:
+    for name in ("log.npz", "net.npz", "policy.npz", "gains.json", "results.json"):
+        assert (twice[0] / name).read_bytes() == (twice[1] / name).read_bytes(), name
+
+
+def test_results_hold_every_run_with_its_figures(twice: tuple[Path, Path]) -> None:
+    results = json.loads((twice[0] / "results.json").read_text())
+    runs = results["task_space"]["runs"]
+    names = {"rl", "jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff"}
+    keys = {(r["controller"], r["sequence"], r["start"]) for r in runs}
+    assert keys == {(c, s, i) for c in names for s in "xyz" for i in range(2)}
+    assert all(r["velocity_rmse"] >= r["velocity_error_mean"] > 0 for r in runs)
+    assert all(0 < r["reward_mean"] < 1 for r in runs)
+    rl = [r["velocity_error_mean"] for r in runs if r["controller"] == "rl"]
+    assert results["task_space"]["summary"]["rl"]["all"]["velocity_error_mean"] == pytest.approx(np.mean(rl))
+
+
+def test_the_report_is_one_file_with_its_figures(twice: tuple[Path, Path]) -> None:
+    text = (twice[0] / "report.html").read_text()
+    assert len(re.findall(r"src='data:image/png;base64,", text)) == 7
+    assert not re.findall(r"(?:src|href)='(?!data:)", text) and "http" not in text
+    assert "not a real Brokk 170" in text
+
+
+def test_gains_read_back_give_the_same_controller(twice: tuple[Path, Path]) -> None:
+    from brokk_min.policy import load_policy
+
+    net = load_policy(twice[0] / "policy.npz", BROKK_170).net
+    read = experiments.read_gains(twice[0] / "gains.json", BROKK_170, net)
+    written = json.loads((twice[0] / "results.json").read_text())["gains"]
+    assert experiments.plain_gains(read) == written

@@ -1,0 +1,595 @@
+"""PPO: each function against another way to compute it, training bit for bit, and its refusals."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from types import SimpleNamespace
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from helpers_machines import obedient_net, small_net
+from torch import nn
+
+from brokk_min import ppo
+from brokk_min.env import TaskConfig, TaskVectorEnv
+from brokk_min.machine import BROKK_170
+from brokk_min.policy import load_policy
+from brokk_min.ppo import Agent, PPOConfig, Training, gae, train
+
+TINY = PPOConfig(
+    num_envs=8,
+    horizon=8,
+    epochs=2,
+    minibatch_size=32,
+    total_steps=4 * 64,
+    checkpoint_every=2,
+    threads=1,
+)
+TASK = TaskConfig(episode_s=0.6)  # 12 ticks: time runs out within the first updates
+NET = small_net(BROKK_170, np.random.default_rng(0))
+
+# --- advantages -----------------------------------------------------------------------------------
+
+
+def episodes(seed, ticks=12, num=6):
+    """Random rewards and values in which episodes end both ways, some at the very last tick."""
+    rng = np.random.default_rng(seed)
+    terminated = rng.random((ticks, num)) < 0.15
+    truncated = (rng.random((ticks, num)) < 0.15) & ~terminated
+    terminated[-1, 0], truncated[-1, 0] = True, False
+    terminated[-1, 1], truncated[-1, 1] = False, True
+    return SimpleNamespace(
+        rewards=rng.normal(size=(ticks, num)),
+        values=rng.normal(size=(ticks + 1, num)),  # of what the policy acts on; the last: after all
+        final=rng.normal(size=(ticks, num)),  # of an episode's own last observation
+        terminated=terminated,
+        truncated=truncated,
+    )
+
+
+def lambda_return_advantages(e, gamma, lam):
+    """Forward, quadratic: all n-step returns under the weights (1 - lambda) lambda^(n-1)."""
+    ticks, num = e.rewards.shape
+    advantages = np.zeros((ticks, num))
+    for i in range(num):
+        for t in range(ticks):
+            total, collected, weight = 0.0, 0.0, 1.0
+            for n, k in enumerate(range(t, ticks), 1):
+                collected += gamma ** (n - 1) * e.rewards[k, i]
+                if e.terminated[k, i]:
+                    rest = 0.0
+                elif e.truncated[k, i]:
+                    rest = e.final[k, i]
+                else:
+                    rest = e.values[k + 1, i]
+                n_step = collected + gamma**n * rest
+                if e.terminated[k, i] or e.truncated[k, i] or k == ticks - 1:
+                    total += weight * n_step
+                    break
+                total += (1 - lam) * weight * n_step
+                weight *= lam
+            advantages[t, i] = total - e.values[t, i]
+    return advantages
+
+
+def right_arguments(e):
+    following = np.where(e.terminated, 0.0, np.where(e.truncated, e.final, e.values[1:]))
+    return {
+        "rewards": e.rewards,
+        "values": e.values[:-1],
+        "next_values": following,
+        "ended": (e.terminated | e.truncated).astype(float),
+    }
+
+
+def advantages_of(arguments, gamma, lam):
+    tensors = {name: torch.tensor(array) for name, array in arguments.items()}
+    return gae(**tensors, gamma=gamma, gae_lambda=lam).numpy()
+
+
+@pytest.mark.parametrize("gamma", [0.0, 0.9, 1.0])
+@pytest.mark.parametrize("lam", [0.0, 0.7, 1.0])
+@pytest.mark.parametrize("seed", range(4))
+def test_gae_is_the_mean_of_n_step_returns(gamma, lam, seed):
+    e = episodes(seed)
+    found = advantages_of(right_arguments(e), gamma, lam)
+    np.testing.assert_allclose(found, lambda_return_advantages(e, gamma, lam), atol=1e-10)
+
+
+def test_gae_by_hand():
+    """Three ticks, gamma 0.5, lambda 0.5: going on; truncated in the middle; terminated there."""
+    rewards = torch.tensor([[1.0, 1.0, 1.0], [2.0, 2.0, 2.0], [4.0, 4.0, 4.0]])
+    values = torch.tensor([[2.0, 2.0, 2.0], [1.0, 1.0, 1.0], [3.0, 3.0, 3.0]])
+    following = torch.tensor([[1.0, 1.0, 1.0], [3.0, 6.0, 0.0], [2.0, 2.0, 2.0]])
+    ended = torch.tensor([[0.0, 0.0, 0.0], [0.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
+    # deltas: -0.5; 2.5 / 4 / 1; 2.  Then A_t = delta_t + 0.25 (1 - ended) A_(t+1)
+    wanted = [[-0.5 + 0.25 * 3.0, -0.5 + 0.25 * 4.0, -0.5 + 0.25 * 1.0], [3.0, 4.0, 1.0], [2.0] * 3]
+    assert gae(rewards, values, following, ended, 0.5, 0.5).tolist() == wanted
+
+
+def no_bootstrap_at_truncation(e):
+    return right_arguments(e) | {
+        "next_values": np.where(e.terminated | e.truncated, 0.0, e.values[1:])
+    }
+
+
+def value_of_the_reset_observation(e):
+    return right_arguments(e) | {"next_values": np.where(e.terminated, 0.0, e.values[1:])}
+
+
+def value_before_the_step(e):
+    wrong = np.where(e.truncated, e.values[:-1], right_arguments(e)["next_values"])
+    return right_arguments(e) | {"next_values": wrong}
+
+
+def bootstrap_at_termination(e):
+    return right_arguments(e) | {"next_values": np.where(e.truncated, e.final, e.values[1:])}
+
+
+def truncation_runs_on(e):
+    return right_arguments(e) | {"ended": e.terminated.astype(float)}
+
+
+def termination_runs_on(e):
+    return right_arguments(e) | {"ended": e.truncated.astype(float)}
+
+
+def ends_a_tick_late(e):
+    ended = right_arguments(e)["ended"]
+    return right_arguments(e) | {"ended": np.concatenate([0 * ended[:1], ended[:-1]])}
+
+
+@pytest.mark.parametrize(
+    "planted",
+    [
+        no_bootstrap_at_truncation,
+        value_of_the_reset_observation,
+        value_before_the_step,
+        bootstrap_at_termination,
+        truncation_runs_on,
+        termination_runs_on,
+        ends_a_tick_late,
+    ],
+    ids=lambda f: f.__name__,
+)
+def test_the_oracle_sees_planted_errors(planted):
+    """The comparison above would fail for each of the usual mistakes."""
+    e = episodes(0)
+    wanted = lambda_return_advantages(e, 0.9, 0.7)
+    assert np.abs(advantages_of(planted(e), 0.9, 0.7) - wanted).max() > 0.05
+
+
+# --- probabilities and losses ---------------------------------------------------------------------
+
+
+def test_log_probability_is_that_of_torch():
+    generator = torch.Generator().manual_seed(0)
+    action, mean = (2 * torch.randn(7, 5, 4, generator=generator) for _ in range(2))
+    log_std = torch.randn(4, generator=generator)
+    wanted = torch.distributions.Normal(mean, log_std.exp()).log_prob(action).sum(-1)
+    torch.testing.assert_close(ppo.log_probability(action, mean, log_std), wanted)
+
+
+def test_log_probability_by_hand():
+    found = ppo.log_probability(torch.tensor([1.0, 3.0]), torch.ones(2), torch.zeros(2))
+    assert float(found) == pytest.approx(-2.0 - np.log(2 * np.pi))
+    half = ppo.log_probability(
+        torch.tensor([2.0]), torch.tensor([1.0]), torch.log(torch.tensor([0.5]))
+    )
+    assert float(half) == pytest.approx(-2.0 + np.log(2) - 0.5 * np.log(2 * np.pi))
+
+
+@pytest.mark.parametrize(
+    ("ratio", "advantage", "loss", "slope"),
+    [
+        (1.5, 2.0, -2.4, 0.0),  # has gained enough: the clip at 1.2 holds, no push
+        (1.5, -2.0, 3.0, 3.0),  # a bad action made likelier: full push back
+        (0.5, 2.0, -1.0, -1.0),  # a good action made rarer: full push
+        (0.5, -2.0, 1.6, 0.0),  # rare enough: the clip at 0.8 holds
+        (1.1, 2.0, -2.2, -2.2),
+        (0.9, -2.0, 1.8, 1.8),
+    ],
+)
+def test_policy_loss_by_hand(ratio, advantage, loss, slope):
+    new = torch.tensor([np.log(ratio) - 0.7], dtype=torch.float64, requires_grad=True)
+    old = torch.tensor([-0.7], dtype=torch.float64)
+    found = ppo.policy_loss(new, old, torch.tensor([advantage], dtype=torch.float64), 0.2)
+    found.backward()
+    assert found.item() == pytest.approx(loss)
+    assert float(new.grad) == pytest.approx(slope, abs=1e-12)
+
+
+def test_policy_loss_is_the_mean():
+    new, old = torch.log(torch.tensor([1.5, 0.5, 1.0, 1.0])), torch.zeros(4)
+    found = ppo.policy_loss(new, old, torch.tensor([1.0, 1.0, 4.0, -1.0]), 0.2)
+    assert float(found) == pytest.approx(-(1.2 + 0.5 + 4.0 - 1.0) / 4)
+
+
+def test_normalise():
+    np.testing.assert_allclose(ppo.normalise(torch.tensor([1.0, 2.0, 3.0])), [-1, 0, 1], atol=1e-6)
+    wild = 50 + 7 * torch.randn(999, generator=torch.Generator().manual_seed(1))
+    flat = ppo.normalise(wild)
+    assert abs(float(flat.mean())) < 1e-5
+    assert float(flat.std()) == pytest.approx(1, abs=1e-5)
+    assert torch.equal(torch.argsort(flat), torch.argsort(wild))
+    assert torch.isfinite(ppo.normalise(torch.full((5,), 3.0))).all()
+
+
+def test_the_nets_are_those_of_the_paper():
+    agent = Agent(163, 4, -0.5)
+    for part, outputs in ((agent.actor, 4), (agent.critic, 1)):
+        kinds = [type(layer) for layer in part]
+        assert kinds == [nn.Linear, nn.ELU] * 3 + [nn.Linear]
+        sizes = [(layer.in_features, layer.out_features) for layer in part[::2]]
+        assert sizes == [(163, 256), (256, 128), (128, 64), (64, outputs)]
+        assert all(layer.alpha == 1.0 for layer in part[1::2])
+        assert not any(layer.bias.any() for layer in part[::2])
+    shared = set(map(id, agent.actor.parameters())) & set(map(id, agent.critic.parameters()))
+    assert not shared
+    w = agent.actor[0].weight.detach()  # orthogonal columns of length sqrt(2)
+    torch.testing.assert_close(w.T @ w, 2 * torch.eye(163), atol=1e-4, rtol=0)
+    assert agent.log_std.tolist() == [-0.5] * 4
+    x = torch.randn(3, 163, generator=torch.Generator().manual_seed(0))
+    assert agent.actor(x).abs().max() < 0.2  # hardly moves at first
+    torch.testing.assert_close(agent.value(x), agent.critic(x).squeeze(-1))
+
+
+# --- what is collected ----------------------------------------------------------------------------
+
+
+class Script:
+    """An environment that plays a tape: each observation is one number."""
+
+    def __init__(self, e):
+        self.e, self.tick = e, 0
+        self.single_observation_space = gymnasium.spaces.Box(-9, 9, (1,), np.float32)
+        self.single_action_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+
+    def reset(self, seed=None):
+        return self.e.values[0][:, None].astype(np.float32), {}
+
+    def step(self, actions):
+        e, t = self.e, self.tick
+        self.tick += 1
+        ended = e.terminated[t] | e.truncated[t]
+        seen = e.values[t + 1][:, None].astype(np.float32)
+        info = {"velocity_error": np.zeros(len(seen))}
+        if ended.any():
+            final = np.where(ended, e.final[t], e.values[t + 1])[:, None]
+            info |= {"final_obs": final.astype(np.float32), "_final_obs": ended}
+        return seen, e.rewards[t], e.terminated[t], e.truncated[t], info
+
+
+class Echo(nn.Module):
+    """A critic whose value is the observation."""
+
+    def forward(self, x):
+        return x
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_collected_advantages_use_the_right_last_observations(seed):
+    """A critic that echoes a scripted environment: values, and so advantages, are known."""
+    e = episodes(seed)
+    config = replace(TINY, num_envs=6, horizon=12, gamma=0.9, gae_lambda=0.7)
+    training = Training(Script(e), config, seed=0)
+    training.agent.critic = Echo()
+    batch, _ = training._collect()
+    scaled = SimpleNamespace(**vars(e))
+    scaled.rewards = (1 - 0.9) * e.rewards  # values are in units of the mean reward
+    wanted = lambda_return_advantages(scaled, 0.9, 0.7)
+    np.testing.assert_allclose(batch["advantage"].view(12, 6), wanted, atol=1e-5)
+    np.testing.assert_allclose(batch["return"].view(12, 6), wanted + e.values[:-1], atol=1e-5)
+    np.testing.assert_allclose(batch["observation"].view(12, 6), e.values[:-1], atol=1e-6)
+    np.testing.assert_allclose(training.observation[:, 0], e.values[-1], atol=1e-6)
+
+
+def test_the_critic_is_asked_about_final_observations_of_truncations():
+    """In the real environment: a spy on the critic sees `final_obs` where time ran out."""
+    training = Training(TaskVectorEnv(8, NET, BROKK_170, TASK), replace(TINY, horizon=13), seed=1)
+    asked, given = [], []
+    value, step = training.agent.value, training.env.step
+    training.agent.value = lambda x: (asked.append(x.clone()), value(x))[1]
+
+    def spy(actions):
+        result = step(actions)
+        if "final_obs" in result[-1]:
+            given.append(torch.from_numpy(result[-1]["final_obs"][result[3]].copy()))
+        return result
+
+    training.env.step = spy
+    training._collect()
+    rows = torch.cat([x.reshape(-1, x.shape[-1]) for x in asked])
+    assert sum(map(len, given)) >= 8
+    for final in torch.cat(given):
+        assert (rows == final).all(-1).any()
+
+
+def test_without_a_learning_rate_nothing_changes():
+    """Old and new probabilities then agree: what is stored is what the policy did."""
+    training = Training(TaskVectorEnv(8, NET, BROKK_170, TASK), replace(TINY, learning_rate=0.0), 2)
+    before = [p.detach().clone() for p in training.agent.parameters()]
+    scalars = training.update()
+    assert all(map(torch.equal, before, training.agent.parameters()))
+    assert scalars["losses/approx_kl"] == pytest.approx(0, abs=1e-5)
+    assert scalars["losses/clipfrac"] == 0
+    assert scalars["losses/policy_loss"] == pytest.approx(0, abs=1e-4)
+    entropy = 4 * (TINY.log_std + 0.5 * np.log(2 * np.pi * np.e))
+    assert scalars["losses/entropy"] == pytest.approx(entropy, rel=1e-5)
+
+
+def test_the_learning_rate_falls_in_a_line():
+    training = Training(TaskVectorEnv(8, NET, BROKK_170, TASK), TINY, 2)
+    rates = [training.update()["charts/learning_rate"] for _ in range(4)]
+    np.testing.assert_allclose(np.array(rates) / TINY.learning_rate, [1, 0.75, 0.5, 0.25])
+    assert training.steps == TINY.total_steps
+
+
+class Bandit:
+    """One tick an episode: the reward falls with the distance of the action from a target."""
+
+    target = np.array([0.6, -0.4], np.float32)
+
+    def __init__(self, num):
+        self.num = num
+        self.single_observation_space = gymnasium.spaces.Box(-9, 9, (3,), np.float32)
+        self.single_action_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+
+    def reset(self, seed=None):
+        return np.ones((self.num, 3), np.float32), {}
+
+    def step(self, actions):
+        error = np.linalg.norm(actions - self.target, axis=-1)
+        ends, never = np.ones(self.num, bool), np.zeros(self.num, bool)
+        seen = np.ones((self.num, 3), np.float32)
+        info = {"velocity_error": error, "final_obs": seen, "_final_obs": ends}
+        return seen, 1 / (1 + error), ends, never, info
+
+
+def test_a_bandit_is_learned():
+    config = PPOConfig(
+        num_envs=64,
+        horizon=8,
+        epochs=4,
+        minibatch_size=128,
+        total_steps=30 * 512,
+        learning_rate=1e-3,
+        log_std=-0.7,
+        threads=1,
+    )
+    training = Training(Bandit(64), config, seed=0)
+    scalars = [training.update() for _ in range(30)]
+    with torch.no_grad():
+        mean = training.agent.actor(torch.ones(3)).numpy()
+        value = float(training.agent.value(torch.ones(3)))
+    np.testing.assert_allclose(mean, Bandit.target, atol=0.1)
+    late = np.mean([s["charts/reward"] for s in scalars[-5:]])
+    assert late > scalars[0]["charts/reward"] + 0.1
+    # every episode ends after one tick: the value is that tick's reward, scaled
+    assert value == pytest.approx(late * (1 - config.gamma), abs=0.01)
+
+
+def test_the_task_is_learned_a_little():
+    """On nets that obey at once, some thousand steps already beat the start."""
+    config = replace(
+        TINY,
+        num_envs=64,
+        horizon=16,
+        epochs=4,
+        minibatch_size=256,
+        total_steps=25 * 1024,
+        gamma=0.5,
+        learning_rate=2e-3,
+        log_std=-2.0,
+    )
+    env = TaskVectorEnv(64, obedient_net(BROKK_170), BROKK_170, TaskConfig(episode_s=5.0))
+    training = Training(env, config, seed=0)
+    errors = [training.update()["charts/velocity_error"] for _ in range(25)]
+    assert np.mean(errors[-4:]) < 0.85 * np.mean(errors[:2]), errors
+
+
+# --- the same bits --------------------------------------------------------------------------------
+
+
+def weights_of(training):
+    return [p.detach().clone() for p in training.agent.parameters()]
+
+
+def learner(seed=3, config=TINY):
+    return Training(TaskVectorEnv(config.num_envs, NET, BROKK_170, TASK), config, seed)
+
+
+def test_the_same_seed_gives_the_same_bits_whatever_torch_drew_before():
+    runs = []
+    for noise in (1, 2):
+        torch.manual_seed(noise)
+        np.random.seed(noise)  # noqa: NPY002
+        training = learner()
+        curve = [training.update() for _ in range(2)]
+        runs.append((weights_of(training), curve, torch.rand(1)))
+    assert all(map(torch.equal, runs[0][0], runs[1][0]))
+    assert runs[0][1] == runs[1][1]
+    assert runs[0][2] != runs[1][2]  # and leaves torch's own generator alone
+    other = learner(seed=4)
+    other.update()
+    assert not torch.equal(runs[0][0][0], weights_of(other)[0])
+
+
+def test_a_checkpoint_goes_on_to_the_same_bits(tmp_path):
+    straight, first, second = learner(), learner(), learner(seed=3)
+    straight_curve = [straight.update() for _ in range(4)]
+    curve = [first.update() for _ in range(2)]
+    first.save(tmp_path / "c", {"seed": 3})
+    second.update()  # whatever state it is in, loading replaces it
+    second.load(tmp_path / "c", {"seed": 3})
+    assert second.steps == 128
+    curve += [second.update() for _ in range(2)]
+    assert all(map(torch.equal, weights_of(straight), weights_of(second)))
+    assert curve == straight_curve
+    assert torch.equal(straight.observation, second.observation)
+    assert np.array_equal(straight.env.state.q, second.env.state.q)
+    first.update(), first.update()  # saving disturbs nothing
+    assert all(map(torch.equal, weights_of(straight), weights_of(first)))
+
+
+def stop_after(monkeypatch, updates, error=KeyboardInterrupt):
+    original, count = Training.update, [0]
+
+    def update(self):
+        count[0] += 1
+        if count[0] > updates:
+            raise error
+        return original(self)
+
+    monkeypatch.setattr(Training, "update", update)
+
+
+def run(path, resume=False, seed=5, config=TINY, net=NET, task=TASK):
+    return train(BROKK_170, net, task, config, seed, path, resume)
+
+
+def table(path):
+    with open(f"{path}.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    return [{k: v for k, v in row.items() if k != "charts/SPS"} for row in rows]
+
+
+@pytest.mark.parametrize("updates", [0, 1, 2, 3])
+def test_a_killed_training_is_taken_up_to_the_same_bytes(tmp_path, monkeypatch, updates):
+    run(tmp_path / "straight.npz")
+    with monkeypatch.context() as patch:
+        stop_after(patch, updates)
+        with pytest.raises(KeyboardInterrupt):
+            run(tmp_path / "killed.npz")
+    assert not (tmp_path / "killed.npz").exists()
+    assert (tmp_path / "killed.npz.checkpoint").exists() == (updates >= 2)
+    run(tmp_path / "killed.npz", resume=True)
+    straight, killed = tmp_path / "straight.npz", tmp_path / "killed.npz"
+    assert straight.read_bytes() == killed.read_bytes()
+    assert table(straight) == table(killed)
+    assert not (tmp_path / "killed.npz.checkpoint").exists()
+    assert sorted(p.name for p in tmp_path.iterdir() if "killed" in p.name) == [
+        "killed.npz",
+        "killed.npz.csv",
+    ]
+
+
+def test_what_train_writes_can_be_driven_and_read(tmp_path):
+    policy = run(tmp_path / "p.npz")
+    again = load_policy(tmp_path / "p.npz", BROKK_170)
+    assert all(map(np.array_equal, policy.weights, again.weights))
+    assert again.training["seed"] == 5
+    assert again.training["settings"]["horizon"] == 8
+    assert again.training["task"]["episode_s"] == 0.6
+    with open(tmp_path / "p.npz.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["global_step"]) for row in rows] == [64, 128, 192, 256]
+    wanted = {"global_step", "charts/reward", "charts/velocity_error", "charts/learning_rate"}
+    wanted |= {"charts/SPS", "losses/policy_loss", "losses/value_loss", "losses/entropy"}
+    wanted |= {"losses/approx_kl", "losses/clipfrac", "losses/explained_variance"}
+    assert wanted <= set(rows[0])
+    assert all(0 < float(row["charts/reward"]) <= 1 for row in rows)
+    assert all(np.isfinite(float(value)) for row in rows for value in row.values())
+
+
+@pytest.fixture
+def killed(tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        stop_after(patch, 3)
+        with pytest.raises(KeyboardInterrupt):
+            run(tmp_path / "p.npz")
+    return tmp_path / "p.npz"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seed": 6}, r"seed: expected 6, got 5"),
+        ({"config": replace(TINY, gamma=0.5)}, r"settings: expected .*'gamma': 0\.5.*got .*gamma"),
+        ({"task": TaskConfig(episode_s=0.7)}, r"task: expected .*0\.7.*, got .*0\.6"),
+        (
+            {"net": small_net(BROKK_170, np.random.default_rng(1))},
+            r"actuator: expected \w+, got \w+",
+        ),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
+)
+def test_a_checkpoint_of_another_training_is_refused(killed, change, message):
+    kept = killed.with_name("p.npz.checkpoint").read_bytes()
+    with pytest.raises(ValueError, match=r"p\.npz\.checkpoint: " + message):
+        run(killed, resume=True, **change)
+    assert killed.with_name("p.npz.checkpoint").read_bytes() == kept
+
+
+def test_a_net_that_differs_in_its_scales_alone_is_another_training(killed):
+    """Weights are not all of a net: other output bounds are another simulation."""
+    with pytest.raises(ValueError, match="actuator: expected"):
+        run(killed, resume=True, net=replace(NET, output_high=2 * NET.output_high))
+
+
+def test_a_broken_checkpoint_is_refused(killed):
+    checkpoint = killed.with_name("p.npz.checkpoint")
+    data = checkpoint.read_bytes()
+    checkpoint.write_bytes(data[: len(data) // 2])
+    with pytest.raises(ValueError, match=r"checkpoint: expected a readable \.npz file, got"):
+        run(killed, resume=True)
+
+
+def test_a_policy_is_no_checkpoint(tmp_path):
+    run(tmp_path / "p.npz")
+    (tmp_path / "q.npz.checkpoint").write_bytes((tmp_path / "p.npz").read_bytes())
+    message = r"q\.npz\.checkpoint: expected \(checkpoint, format \d+\), got \('policy'"
+    with pytest.raises(ValueError, match=message):
+        run(tmp_path / "q.npz", resume=True)
+
+
+def test_a_lost_learning_curve_is_no_traceback(killed):
+    """The curve beside the checkpoint is gone: go on without it, or say what is wanted."""
+    killed.with_name("p.npz.csv").unlink()
+    try:
+        run(killed, resume=True)
+    except ValueError as error:
+        assert "p.npz.csv" in str(error)
+    else:
+        assert table(killed)[-1]["global_step"] == "256"
+
+
+def test_without_resume_a_checkpoint_is_not_taken_up(killed, tmp_path):
+    run(killed, resume=False)
+    run(tmp_path / "fresh.npz")
+    assert killed.read_bytes() == (tmp_path / "fresh.npz").read_bytes()
+    assert table(killed) == table(tmp_path / "fresh.npz")
+
+
+def test_a_loss_that_is_no_number_stops_and_keeps_the_checkpoint(tmp_path, monkeypatch):
+    original, calls = ppo.policy_loss, [0]
+
+    def poisoned(*arguments):
+        calls[0] += 1
+        return original(*arguments) * (np.nan if calls[0] == 3 * 4 + 1 else 1.0)  # the 4th update
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ppo, "policy_loss", poisoned)
+        message = r"losses/\w+: expected a finite number at step \d+, got nan"
+        with pytest.raises(ValueError, match=message):
+            run(tmp_path / "p.npz")
+    assert not (tmp_path / "p.npz").exists()
+    run(tmp_path / "p.npz", resume=True)  # from update 2, before the accident
+    run(tmp_path / "straight.npz")
+    assert (tmp_path / "p.npz").read_bytes() == (tmp_path / "straight.npz").read_bytes()
+
+
+def test_a_plant_is_not_what_policies_are_trained_on():
+    """A checkpoint or policy of the analytic plant would say nothing of the simulation."""
+    training = Training(TaskVectorEnv(8, "analytic", BROKK_170, TASK), TINY, 0)
+    with pytest.raises(ValueError, match="actuator: expected a policy trained on nets, got"):
+        training.policy({})
+
+
+def test_a_net_for_another_machine_is_refused(tmp_path):
+    other = small_net(replace(BROKK_170, history=9), np.random.default_rng(0))
+    with pytest.raises(ValueError, match=r"actuator: expected nets for brokk170.*'history': 9"):
+        run(tmp_path / "p.npz", net=other)
