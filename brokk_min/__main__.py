@@ -86,7 +86,8 @@ class Fit:
             test = read_log(self.test, self.velocity_samples, log.joints)
         else:
             log, test = _hold_out(log)
-        net = fit(log, self.settings, self.seed, self.velocity_samples, ",".join(p.stem for p in self.logs))
+        known = [machine.name for machine in MACHINES.values() if machine.names == log.joints]
+        net = fit(log, self.settings, self.seed, self.velocity_samples, "".join(known))
         joints = score(net, test)
         save_net(self.out, net)
         meta: dict[str, Any] = {"logs": [str(p) for p in self.logs], "test": [str(p) for p in self.test]}

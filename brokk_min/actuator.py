@@ -178,6 +178,8 @@ def collect(
     """
     if excitation not in EXCITATIONS:
         raise ValueError(f"excitation: expected one of {list(EXCITATIONS)}, got {excitation!r}")
+    if machine.rate != RATE:
+        raise ValueError(f"rate: expected {RATE:g} Hz as in every log, got {machine.rate:g} Hz")
     if not 0 < hours < np.inf:
         raise ValueError(f"hours: expected above 0, got {hours}")
     wanted = max(machine.history + 2, round(hours * 3600 * machine.rate))
@@ -429,7 +431,12 @@ def net_from_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> ActuatorNet:
         weights = tuple(arrays[f"weight_{i}"] for i in range(6))
         header |= {name: arrays[name] for name in _NET_ARRAYS}
         net = ActuatorNet(**header, weights=weights)
-        net.predict(np.zeros((1, len(net.joints), 3, net.history), np.float32))
+        n, inputs, hidden = len(net.joints), 3 * net.history, weights[0].shape[-1]
+        wanted = [(n, inputs, hidden), (n, hidden), (n, hidden, hidden), (n, hidden), (n, hidden, 1), (n, 1)]
+        wanted += [(n, inputs), (n, inputs), (n,), (n,), (n,), (n,)]
+        found = [array.shape for array in (*weights, *(arrays[name] for name in _NET_ARRAYS))]
+        if found != wanted:
+            raise ValueError(f"shapes {found} instead of {wanted}")
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: expected a complete actuator net, got {error!r}") from error
     return net
@@ -454,7 +461,7 @@ def load_header(path: Path, arrays: dict[str, Any], kind: str, version: int) -> 
     """The JSON header of a file of ours, checked for kind and format version, without those two."""
     try:
         header = dict(json.loads(str(arrays["header"])))
-    except (KeyError, ValueError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: expected a file with a JSON header, got {error!r}") from error
     got = header.pop("kind", None), header.pop("format", None)
     if got != (kind, version):
@@ -626,7 +633,7 @@ def free_run(
 def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
     """One-step, persistence and free-run errors of nets on recordings, as in the fit JSON.
 
-    Free runs start every `horizon` seconds of each recording. `position_error_median` is the median
+    Each joint is scored on the recordings in which it is commanded or moves. Free runs start every `horizon` seconds of each recording. `position_error_median` is the median
     over segments of |angle error| at their end; `velocity_rmse` is over all their samples.
 
     Raises:
@@ -640,35 +647,42 @@ def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
         "", *(np.concatenate([getattr(r, k) for r in log.recordings]) for k in Recording._fields[1:])
     )
 
-    def segments(ticks: int) -> NDArray[np.intp]:
-        pieces = [
-            o + np.arange(net.history, n - ticks, ticks) for o, n in zip(offsets, lengths, strict=False)
-        ]
-        return np.concatenate(pieces).astype(int)
+    moves = np.array([np.ptp(r.u, axis=0) + np.ptp(r.q, axis=0) > 0 for r in log.recordings])
+
+    def segments(ticks: int) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+        """Starts (s,) of segments, and in which of them each joint moves (s, n)."""
+        pieces = [np.arange(net.history, length - ticks, ticks) for length in lengths]
+        where = np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces])
+        return np.concatenate(pieces).astype(int) + offsets[where], moves[where]
 
     joints: dict[str, Any] = {name: {"free_run": {}} for name in log.joints}
-    starts = segments(1)
-    if not len(starts):
-        raise ValueError(f"log: expected a recording above {net.history + 1} samples, got {lengths}")
+    starts, used = segments(1)
+    if not used.any(axis=0).all():
+        raise ValueError(
+            f"log: expected for each joint a recording above {net.history + 1} samples in which it moves, "
+            f"got recordings of {lengths} samples"
+        )
     chunks = np.array_split(starts, -(-len(starts) // 8192))
     one = np.concatenate([free_run(net, whole, chunk, 1)[1][0] for chunk in chunks])
     for j, name in enumerate(log.joints):
-        truth, last = whole.q_dot[starts + 1, j], whole.q_dot[starts, j]
-        joints[name]["one_step_rmse"] = _rms(one[:, j] - truth)
+        mine = used[:, j]
+        truth, last = whole.q_dot[starts + 1, j][mine], whole.q_dot[starts, j][mine]
+        joints[name]["one_step_rmse"] = _rms(one[mine, j] - truth)
         joints[name]["persistence_rmse"] = _rms(last - truth)
     for horizon in HORIZONS:
         ticks = round(horizon * net.rate)
-        starts = segments(ticks)
+        starts, used = segments(ticks)
         if not len(starts):
             continue
         angles, velocities = free_run(net, whole, starts, ticks)
         later = starts + np.arange(1, ticks + 1)[:, None]
         q_error, v_error = angles - whole.q[later], velocities - whole.q_dot[later]
         for j, name in enumerate(log.joints):
-            joints[name]["free_run"][str(horizon)] = {
-                "velocity_rmse": _rms(v_error[..., j]),
-                "position_error_median": float(np.median(np.abs(q_error[-1, :, j]))),
-            }
+            if (mine := used[:, j]).any():
+                joints[name]["free_run"][str(horizon)] = {
+                    "velocity_rmse": _rms(v_error[:, mine, j]),
+                    "position_error_median": float(np.median(np.abs(q_error[-1, mine, j]))),
+                }
     return joints
 
 
@@ -677,7 +691,9 @@ def _rms(error: Array) -> float:
 
 
 def task_log(machine: Machine, runs: int, seconds: float, rng: np.random.Generator) -> Log:
-    """Recordings under commands like a policy's: all joints at once, reversals, small corrections.
+    """Recordings under commands like a policy's: reversals, small corrections, driven joints together.
+
+    In every fifth recording the locked joints move instead: the machine lets them move only alone.
 
     Smoothed random levels held for 0.5 to 5 s, towards the nearer end of the range less often, so
     that the joints stay off their stops. For scoring only; no net is fitted to them.
@@ -687,6 +703,8 @@ def task_log(machine: Machine, runs: int, seconds: float, rng: np.random.Generat
     state = plant_reset(machine, rng.uniform(0.8 * q_min + 0.2 * q_max, 0.2 * q_min + 0.8 * q_max, shape))
     level, command, left = np.zeros(shape), np.zeros(shape), np.zeros(shape)
     smoothing, noise = rng.uniform(0.05, 0.6, shape), rng.uniform(0, 0.06, shape)
+    locked_turn = (np.arange(runs) % 5 == 4)[:, None]
+    moving = np.isin(np.arange(machine.n), machine.locked) == locked_turn
     us, qs = [], []
     for _ in range(round(seconds * machine.rate)):
         fraction = (state.q - q_min) / (q_max - q_min)
@@ -696,7 +714,8 @@ def task_log(machine: Machine, runs: int, seconds: float, rng: np.random.Generat
         level = np.where((left <= 0) | (near & (level * (2 * up - 1) > 0)), drawn, level)
         left = np.where(left <= 0, rng.uniform(0.5, 5.0, shape), left) - machine.dt
         command = command + smoothing * (level - command)
-        u = limit_command(machine, command + noise * rng.standard_normal(shape) * (level != 0))
+        jitter = noise * rng.standard_normal(shape) * (level != 0)
+        u = limit_command(machine, moving * (command + jitter))
         us.append(u)
         qs.append(read_encoder(machine, state.q))
         state = plant_step(machine, state, u)

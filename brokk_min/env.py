@@ -28,7 +28,15 @@ from brokk_min.actuator import (
     rest_history,
 )
 from brokk_min.kinematics import lowest_point, tool_position, tool_state
-from brokk_min.machine import BROKK_170, PWM_MAX, Machine, estimate_velocity, limit_command, read_encoder
+from brokk_min.machine import (
+    BROKK_170,
+    PWM_MAX,
+    Machine,
+    as_floats,
+    estimate_velocity,
+    limit_command,
+    read_encoder,
+)
 
 Array = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]
@@ -49,7 +57,7 @@ class TaskConfig:
     axis_goals: float = 0.4
     """Share of goals along x, y or z; the others point anywhere."""
     noise: float = 0.05
-    """Largest noise of measured angles and velocities, in standard deviations (paper: 5 %)."""
+    """Largest noise of the measured part of an observation, in standard deviations (paper: 5 %)."""
     redraw_ground: bool = True
     """Redraw start poses in the ground; False is the paper's rule: end the episode without reward."""
 
@@ -174,8 +182,7 @@ def to_command(machine: Machine, action: ArrayLike) -> Array:
         >>> to_command(BROKK_170, [1.0, -0.5, 0.0, 2.0]) * 127
         array([ 80.,   0., -40.,   0.,  80.])
     """
-    action = np.asarray(action)
-    action = action if np.issubdtype(action.dtype, np.floating) else action.astype(float)
+    action = as_floats(action)
     if action.shape[-1:] != machine.driven.shape:
         raise ValueError(f"action: expected (..., {len(machine.driven)}), got {action.shape}")
     if not np.isfinite(action).all():
@@ -298,18 +305,23 @@ def reset(machine: Machine, config: TaskConfig, rng: np.random.Generator, num: i
     return replace(state, goal_ticks=_draw_hold(machine, config, rng, num))
 
 
-def noisy(machine: Machine, history: Array, config: TaskConfig, rng: np.random.Generator) -> Array:
-    """Measured angles and velocities (..., n, 3, H) with fresh uniform noise; commands are known exactly.
+def noisy(machine: Machine, observation: Array, config: TaskConfig, rng: np.random.Generator) -> Array:
+    """Observations (..., obs) with fresh uniform noise on everything measured: not on goal and commands.
 
-    Paper: Sec. 3.4 (5 % of each quantity's standard deviation)
+    Paper: Sec. 3.4 (5 % of each standardised quantity)
     """
-    if config.noise == 0:
-        return history
-    result = history.copy()
-    size = (*history.shape[:-2], 2, history.shape[-1])
-    draws = rng.random(size, np.float32) - np.float32(0.5)
-    result[..., :2, :] += np.float32(2 * config.noise) * _spread(machine) * draws
-    return result
+    draws = rng.random(observation.shape, np.float32) - np.float32(0.5)
+    return observation + np.float32(2 * config.noise) * _is_measured(machine) * draws
+
+
+def _is_measured(machine: Machine) -> Array:
+    """1 where an observation comes from a sensor, 0 for the goal and the sent commands, (obs,)."""
+    if "is_measured" not in machine.__dict__:
+        rows = np.repeat(np.tile([1, 1, 0], len(machine.driven)), machine.history)
+        parts = [np.zeros(3), np.ones(3 + len(machine.locked)), rows]
+        machine.__dict__["is_measured"] = np.concatenate(parts).astype(np.float32)
+    mask: Array = machine.__dict__["is_measured"]
+    return mask
 
 
 def _spread(machine: Machine) -> Array:
@@ -321,7 +333,7 @@ def _spread(machine: Machine) -> Array:
 
 def look(machine: Machine, config: TaskConfig, state: State, rng: np.random.Generator) -> Array:
     """The noisy observation of a state, (..., obs)."""
-    return observe(machine, noisy(machine, state.history, config, rng), state.v_goal)
+    return noisy(machine, observe(machine, state.history, state.v_goal), config, rng)
 
 
 class Outcome(NamedTuple):
@@ -430,7 +442,7 @@ def rollout(
     memory = controller.start(len(state.q))
     trace = []
     for goal in goals:
-        observation = observe(machine, noisy(machine, state.history, config, rng), goal)
+        observation = noisy(machine, observe(machine, state.history, goal), config, rng)
         u, memory = controller(observation, memory)
         q_measured = state.history[..., 0, -1]
         state = transition(machine, net, state, u)

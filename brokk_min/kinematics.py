@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brokk_min.machine import Machine
+from brokk_min.machine import Machine, as_floats
 
 Array = NDArray[np.floating[Any]]
 
@@ -28,10 +28,10 @@ class Chain(NamedTuple):
 
 
 def _angles(machine: Machine, q: ArrayLike, name: str = "q") -> Array:
-    angles = np.asarray(q)
+    angles = as_floats(q)
     if angles.ndim < 1 or angles.shape[-1] != machine.n:
         raise ValueError(f"{name}: expected (..., {machine.n}), got {angles.shape}")
-    return angles if np.issubdtype(angles.dtype, np.floating) else angles.astype(float)
+    return angles
 
 
 def _first(values: Array) -> Array:
@@ -49,7 +49,7 @@ def _chain(machine: Machine, q: ArrayLike) -> Chain:
     turned = angles + theta.reshape(-1, *[1] * (angles.ndim - 1))
     for joint, c, s in zip(machine.joints, np.cos(turned), np.sin(turned), strict=True):
         x, y = c * x + s * y, c * y - s * x
-        p = p + joint.a * x + joint.d * z
+        p = p + float(joint.a) * x + float(joint.d) * z
         if joint.alpha != 0.0:  # parallel axes, the common case, need no second rotation
             c_alpha, s_alpha = float(np.cos(joint.alpha)), float(np.sin(joint.alpha))
             y, z = c_alpha * y + s_alpha * z, c_alpha * z - s_alpha * y

@@ -12,6 +12,7 @@ import csv
 import os
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -65,6 +66,20 @@ def whole_file(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
         raise
 
 
+# what zipfile and NumPy raise on damaged files, besides OSError and ValueError
+_DAMAGE = (
+    OSError,
+    ValueError,
+    EOFError,
+    KeyError,
+    AttributeError,
+    TypeError,
+    RuntimeError,
+    zlib.error,
+    zipfile.BadZipFile,
+)
+
+
 def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """All arrays of an `.npz` file; nothing in it is executed.
 
@@ -74,13 +89,15 @@ def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
     try:
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, KeyError, AttributeError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: expected a readable .npz file, got {error}") from error
+    except _DAMAGE as error:
+        raise ValueError(f"{path}: expected a readable .npz file, got {error!r}") from error
 
 
 def write_log(path: Path, log: Log) -> None:
     """Write recordings as one table, `.csv` or `.npz` by the name; read it with `read_log`."""
     path = Path(path)
+    if not log.recordings:
+        raise ValueError(f"{path}: expected at least one recording to write, got none")
     names = [recording.name for recording in log.recordings]
     lengths = [len(recording.u) for recording in log.recordings]
     columns: dict[str, NDArray[Any]] = {
@@ -96,9 +113,10 @@ def write_log(path: Path, log: Log) -> None:
             np.savez_compressed(file, **columns)  # type: ignore[arg-type]
     elif path.suffix == ".csv":
         with whole_file(path, "w") as file:
-            file.write(",".join(columns) + "\n")
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(columns)
             numbers = [np.char.mod("%.7g", column) for column in list(columns.values())[1:]]
-            file.writelines(",".join(row) + "\n" for row in zip(columns["run"], *numbers, strict=True))
+            writer.writerows(zip(columns["run"], *numbers, strict=True))
     else:
         raise ValueError(f"{path}: expected a name ending in .csv or .npz, got {path.suffix!r}")
 
@@ -120,7 +138,7 @@ def read_log(paths: Sequence[Path], velocity_samples: int, joints: Sequence[str]
     recordings: list[Recording] = []
     logged: bool | None = None
     for path in map(Path, paths):
-        columns = _read_csv(path) if path.suffix == ".csv" else _read_npz(path)
+        columns = _read_csv(path, _is_number) if path.suffix.lower() == ".csv" else _read_npz(path)
         joints = tuple(joints) if joints is not None else _joints(path, columns)
         has_velocity = _check_columns(path, columns, joints)
         if logged not in (None, has_velocity):
@@ -132,12 +150,18 @@ def read_log(paths: Sequence[Path], velocity_samples: int, joints: Sequence[str]
     return Log(tuple(joints), tuple(recordings), bool(logged))
 
 
-def _read_csv(path: Path, text: Sequence[str] = ("run",)) -> dict[str, NDArray[Any]]:
+def _is_number(column: str) -> bool:
+    return column == "time" or column.startswith(("u_", "q_"))
+
+
+def _read_csv(path: Path, is_number: Callable[[str], bool]) -> dict[str, NDArray[Any]]:
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
             rows = list(csv.reader(file))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{path}: expected a readable CSV table, got {error}") from error
+    while rows and not rows[-1]:  # blank lines at the end
+        rows.pop()
     if len(rows) < 2:
         raise ValueError(f"{path}: expected a header and at least one row, got {len(rows)} rows")
     header = [name.strip() for name in rows[0]]
@@ -149,7 +173,7 @@ def _read_csv(path: Path, text: Sequence[str] = ("run",)) -> dict[str, NDArray[A
             raise ValueError(f"{path}: row {number}: expected {len(header)} cells, got {len(row)}")
     cells = zip(*rows[1:], strict=True)
     return {
-        name: np.array(column) if name in text else _numbers(path, name, column)
+        name: np.array(column) if not is_number(name) else _numbers(path, name, column)
         for name, column in zip(header, cells, strict=True)
     }
 
@@ -220,15 +244,16 @@ def _recordings(
         run, rows = runs[index], groups[index]
         step = np.diff(columns["time"][rows])
         if not (step > 0).all():
-            row = int(rows[np.argmin(step > 0) + 1])
+            last = int(np.argmin(step > 0))
+            before, after = columns["time"][rows[last : last + 2]]
             raise ValueError(
-                f"{path}: row {row + 2}, column time: expected later than "
-                f"{columns['time'][row - 1]} within run {run!r}, got {columns['time'][row]}"
+                f"{path}: row {rows[last + 1] + 2}, column time: expected later than {before} "
+                f"within run {str(run)!r}, got {after}"
             )
         if len(step) and np.median(step) > 1.05 / RATE:
             raise ValueError(
                 f"{path}: row {rows[0] + 2}, column time: expected {RATE:g} Hz or more in run "
-                f"{run!r}, got {1 / np.median(step):.3g} Hz"
+                f"{str(run)!r}, got {1 / np.median(step):.3g} Hz"
             )
         if str(run).endswith(RETURN):
             continue
@@ -275,7 +300,7 @@ def read_table(path: Path, columns: Sequence[str], text: Sequence[str] = ()) -> 
     Raises:
         ValueError: with file, row and column of the first thing that is wrong.
     """
-    table = _read_csv(Path(path), text)
+    table = _read_csv(Path(path), lambda name: name in columns and name not in text)
     for name in columns:
         if name not in table:
             raise ValueError(f"{path}: row 1: expected a column {name}, got {list(table)}")

@@ -11,7 +11,6 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -66,7 +65,9 @@ class Machine:
 
     name: str
     joints: tuple[Joint, ...]
-    sources: Mapping[str, str]  # field name of Machine or Joint -> one of SOURCES
+    sources: Mapping[str, str] = dataclasses.field(
+        hash=False
+    )  # field name of Machine or Joint -> one of SOURCES
     rate: float = _number("Hz")  # control and logging rate
     pwm_limit: int = _number("counts of 127")  # largest command that may leave the program
     dead_zone: float = _number("of full command")
@@ -101,12 +102,20 @@ class Machine:
             for field in dataclasses.fields(owner):
                 if "unit" in field.metadata:
                     self._check_number(owner, field.name, where + field.name)
-        object.__setattr__(self, "sources", MappingProxyType(dict(self.sources)))
+        nodes = [joint.encoder_node for joint in self.joints]
+        if len(set(nodes)) != len(nodes):
+            raise ValueError(f"joints: expected different encoder nodes, got {nodes}")
+        steps = self.dt / self.plant_dt
+        if abs(steps - round(steps)) > 1e-6 or steps < 0.5:
+            raise ValueError(f"plant_dt: expected 1/rate = {self.dt} to be a multiple, got {self.plant_dt}")
 
     def _check_number(self, owner: Machine | Joint, field: str, label: str) -> None:
         value = getattr(owner, field)
-        if not (isinstance(value, int | float) and np.isfinite(value)):
+        whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+        if not ((whole or isinstance(value, float | np.floating)) and np.isfinite(value)):
             raise ValueError(f"{label}: expected a finite number, got {value!r}")
+        if field in _WHOLE and not whole:
+            raise ValueError(f"{label}: expected a whole number, got {value!r}")
         if self.sources.get(field) not in SOURCES:
             got = self.sources.get(field)
             raise ValueError(f"sources[{field!r}]: expected one of {SOURCES}, got {got!r}")
@@ -171,6 +180,7 @@ class Machine:
         return self._columns[field]
 
 
+_WHOLE = {"encoder_node", "pwm_limit", "encoder_bits", "velocity_samples", "history", "valve_frame_id"}
 _RANGES: dict[str, tuple[float, float]] = {
     "cylinder_base": (0, np.inf),
     "cylinder_rod": (1e-6, np.inf),
@@ -199,6 +209,12 @@ _RANGES: dict[str, tuple[float, float]] = {
 }
 
 
+def as_floats(values: ArrayLike) -> NDArray[np.floating]:
+    """An array of floats; its float type is kept, whole numbers become float64."""
+    array = np.asarray(values)
+    return array if np.issubdtype(array.dtype, np.floating) else array.astype(float)
+
+
 def limit_command(machine: Machine, u: ArrayLike) -> NDArray[np.floating]:
     """The command that reaches the valve: whole PWM counts, within the limit.
 
@@ -215,7 +231,7 @@ def limit_command(machine: Machine, u: ArrayLike) -> NDArray[np.floating]:
         >>> limit_command(BROKK_170, [-1.0, 0.1]) * 127
         array([-80.,  13.])
     """
-    u = np.asarray(u)
+    u = as_floats(u)
     counts = np.clip(np.rint(u * PWM_MAX), -machine.pwm_limit, machine.pwm_limit)
     limited: NDArray[np.floating] = (counts / PWM_MAX).astype(u.dtype)
     return limited
@@ -252,7 +268,9 @@ def decode_pwm(u_byte: ArrayLike) -> NDArray[np.float64]:
         >>> decode_pwm([80, 175, 0, 255]) * 127
         array([ 80., -80.,   0.,   0.])
     """
-    u_byte = np.asarray(u_byte, np.uint8).astype(int)
+    u_byte = np.asarray(u_byte).astype(int)
+    if not np.all((u_byte >= 0) & (u_byte <= 255)):
+        raise ValueError(f"u_byte: expected 0 to 255, got {u_byte[(u_byte < 0) | (u_byte > 255)].flat[0]}")
     counts = np.where(u_byte > PWM_MAX, u_byte - 255, u_byte)
     return np.asarray(counts / PWM_MAX, float)
 
@@ -264,7 +282,7 @@ def read_encoder(machine: Machine, q: ArrayLike) -> NDArray[np.floating]:
         >>> read_encoder(BROKK_170, [0.0, 0.001, 1.0]) / BROKK_170.encoder_step
         array([  0.,   1., 652.])
     """
-    q = np.asarray(q)
+    q = as_floats(q)
     counts: NDArray[np.floating] = np.rint(q / machine.encoder_step)
     return (counts * machine.encoder_step).astype(q.dtype)
 
@@ -288,7 +306,7 @@ def estimate_velocity(q: ArrayLike, samples: int, dt: float) -> NDArray[np.float
         >>> estimate_velocity([0.0, 0.1, 0.2, 0.3], samples=4, dt=0.05).round(6)
         np.float64(2.0)
     """
-    q = np.asarray(q)
+    q = as_floats(q)
     if samples < 2 or q.shape[-1] < samples:
         raise ValueError(f"q: expected at least {max(2, samples)} samples, got {q.shape}")
     lags = np.arange(samples) - (samples - 1) / 2
@@ -333,7 +351,7 @@ def _brokk_170() -> Machine:
         ready_down_time=0.40,
         ready_threshold=0.80,
         spool_idle=0.01,
-        pump_flow=0.00155,
+        pump_flow=0.00105,
         plant_dt=0.005,
         encoder_bits=12,
         velocity_samples=4,

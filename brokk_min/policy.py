@@ -76,6 +76,7 @@ def contract(machine: Machine) -> dict[str, Any]:
         "rate": machine.rate,
         "velocity_samples": machine.velocity_samples,
         "pwm_limit": machine.pwm_limit,
+        "geometry": [[j.a, j.alpha, j.d, j.theta, j.q_min, j.q_max] for j in machine.joints],
     }
 
 

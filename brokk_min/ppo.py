@@ -36,20 +36,20 @@ STATE = ("q", "q_dot", "history", "v_goal", "goal_ticks", "ticks")
 class PPOConfig:
     """Settings of the learner; those that the paper names are marked."""
 
-    total_steps: int = 6_000_000
+    total_steps: int = 4_000_000
     """Environment steps in all."""
     num_envs: int = 256
     """Environments side by side (paper: 256)."""
-    horizon: int = 32
+    horizon: int = 16
     """Ticks of every environment between two updates."""
     epochs: int = 4
     """Passes over the collected steps in each update."""
-    minibatch_size: int = 2048
+    minibatch_size: int = 1024
     """Steps in one gradient."""
     learning_rate: float = 1e-3
     """Of Adam at the start; falls linearly to zero at the end."""
-    gamma: float = 0.97
-    """Discount a tick: 0.97 looks 33 ticks (1.7 s) ahead."""
+    gamma: float = 0.85
+    """Discount a tick: 0.85 looks 7 ticks (0.33 s) ahead, about the machine's response time."""
     gae_lambda: float = 0.95
     """Weight of longer returns in the advantage."""
     clip: float = 0.2
@@ -58,9 +58,9 @@ class PPOConfig:
     """Bonus for the entropy of the action distribution."""
     max_grad_norm: float = 1.0
     """Gradients are scaled down to this norm."""
-    log_std: float = -0.7
+    log_std: float = -1.2
     """Logarithm of the actions' standard deviation at the start."""
-    checkpoint_every: int = 40
+    checkpoint_every: int = 100
     """Updates between two checkpoints."""
     threads: int = 2
     """Threads of torch; sums, and so the last bits, depend on it."""
@@ -247,7 +247,9 @@ class Training:
     def policy(self, training: dict[str, Any]) -> Policy:
         """The actor as it stands, for the machine it was trained for."""
         layers = [layer for layer in self.agent.actor if isinstance(layer, nn.Linear)]
-        weights = [(layer.weight.detach().numpy().T.copy(), layer.bias.detach().numpy().copy()) for layer in layers]
+        weights = [
+            (layer.weight.detach().numpy().T.copy(), layer.bias.detach().numpy().copy()) for layer in layers
+        ]
         mean, scale = observation_scale(self.env.machine)
         flat = tuple(array for pair in weights for array in pair)
         if self.env.net is None:

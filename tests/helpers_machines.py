@@ -56,9 +56,7 @@ def random_machine(rng: np.random.Generator, n: int) -> Machine:
     )
 
 
-def small_net(
-    machine: Machine, rng: np.random.Generator, joints: tuple[str, ...] = ()
-) -> ActuatorNet:
+def small_net(machine: Machine, rng: np.random.Generator, joints: tuple[str, ...] = ()) -> ActuatorNet:
     """Nets with random weights for `joints` (none: the driven ones): all inputs matter."""
     joints = joints or tuple(machine.names[i] for i in machine.driven)
     index = [machine.names.index(name) for name in joints]

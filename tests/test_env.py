@@ -176,9 +176,7 @@ def test_observed_tool_velocity_is_the_derivative_of_the_closed_form():
     after, before = (closed_form(q + sign * step * q_dot)[0] for sign in (1, -1))
     radius = np.hypot(*closed_form(q)[0][:2])
     outward = (np.hypot(*after[:2]) - np.hypot(*before[:2])) / (2 * step)
-    sideways = (
-        radius * (np.arctan2(after[1], after[0]) - np.arctan2(before[1], before[0])) / (2 * step)
-    )
+    sideways = radius * (np.arctan2(after[1], after[0]) - np.arctan2(before[1], before[0])) / (2 * step)
     upward = (after[2] - before[2]) / (2 * step)
     seen = task.observe(BROKK_170, history, np.zeros(3))
     np.testing.assert_allclose(seen[3:6] * 0.3 / 3**0.5, [outward, sideways, upward], atol=1e-6)
@@ -253,9 +251,7 @@ def test_noise_is_uniform_within_five_percent_and_fresh(machine):
     flat_noise = noise.reshape(400, -1)
     assert np.abs(np.corrcoef(flat_noise.T) - np.eye(flat_noise.shape[1])).max() < 0.3
     again = task.noisy(machine, clean, TaskConfig(), rng)
-    assert not np.array_equal(
-        again[:, :, :2], task.noisy(machine, clean, TaskConfig(), rng)[:, :, :2]
-    )
+    assert not np.array_equal(again[:, :, :2], task.noisy(machine, clean, TaskConfig(), rng)[:, :, :2])
     assert np.array_equal(task.noisy(machine, clean, QUIET, rng), clean)
 
 
@@ -340,15 +336,11 @@ def test_goals_are_redrawn_within_an_episode_and_rewards_are_for_the_old_goal():
     for _ in range(200):
         before = env.state.v_goal
         shown = task.measured(LOW, seen).v_goal
-        np.testing.assert_allclose(
-            shown, before, atol=1e-6
-        )  # the policy saw the goal it is paid for
+        np.testing.assert_allclose(shown, before, atol=1e-6)  # the policy saw the goal it is paid for
         seen, reward, *_, info = env.step(rng.uniform(-1, 1, (4, 4)).astype(np.float32))
         state, step = env.state, 1e-6
         towards = step * state.q_dot.astype(float)
-        v_tool = (closed_form(state.q + towards)[0] - closed_form(state.q - towards)[0]) / (
-            2 * step
-        )
+        v_tool = (closed_form(state.q + towards)[0] - closed_form(state.q - towards)[0]) / (2 * step)
         error = np.linalg.norm(before - v_tool, axis=-1)
         np.testing.assert_allclose(reward, 1 / (1 + error), atol=1e-5)
         np.testing.assert_allclose(info["velocity_error"], error, atol=1e-5)
@@ -396,9 +388,7 @@ def test_nets_in_the_loop_agree_with_plain_loops():
         state = task.transition(machine, net, state, u)
         for row, (j, (angles, rates, commands)) in enumerate(tape.items()):
             commands.append(u[j])
-            x = (np.concatenate([angles, rates, commands]) - net.input_mean[row]) / net.input_scale[
-                row
-            ]
+            x = (np.concatenate([angles, rates, commands]) - net.input_mean[row]) / net.input_scale[row]
             w1, b1, w2, b2, w3, b3 = (weight[row].astype(float) for weight in net.weights)
             x = np.maximum(0, np.maximum(0, x @ w1 + b1) @ w2 + b2) @ w3 + b3
             low, high = float(net.output_low[row]), float(net.output_high[row])
@@ -456,9 +446,7 @@ def test_transition_is_pure(plant):
 
 def test_transition_refuses_nets_that_are_missing():
     state = task.rest_state(BROKK_170, POSE, np.zeros(3), plant=False)
-    with pytest.raises(
-        ValueError, match="net: expected nets for a state without a plant, got None"
-    ):
+    with pytest.raises(ValueError, match="net: expected nets for a state without a plant, got None"):
         task.transition(BROKK_170, None, state, np.zeros(5))
 
 
@@ -491,9 +479,7 @@ def test_many_environments_equal_single_ones(kind):
     net = "analytic" if kind == "plant" else small_net(machine, np.random.default_rng(10))
     many = TaskVectorEnv(5, net, machine, LIFE)
     many.np_random = RowRandom([np.random.default_rng(100 + i) for i in range(5)])
-    sync = SyncVectorEnv(
-        [lambda: TaskEnv(net, machine, LIFE)] * 5, autoreset_mode=AutoresetMode.SAME_STEP
-    )
+    sync = SyncVectorEnv([lambda: TaskEnv(net, machine, LIFE)] * 5, autoreset_mode=AutoresetMode.SAME_STEP)
     for i, single in enumerate(sync.envs):
         single.np_random = np.random.default_rng(100 + i)
     seen, others = many.reset()[0], sync.reset()[0]
@@ -513,9 +499,7 @@ def test_many_environments_equal_single_ones(kind):
         if "final_obs" in info:
             ends += 1
             assert np.array_equal(info["_final_obs"], infos["_final_obs"])
-            np.testing.assert_allclose(
-                info["final_obs"], np.stack(infos["final_obs"]), atol=tolerance
-            )
+            np.testing.assert_allclose(info["final_obs"], np.stack(infos["final_obs"]), atol=tolerance)
         angles = np.concatenate([single.state.q for single in sync.envs])
         np.testing.assert_allclose(many.state.q, angles, atol=1e-6)
     assert ends == 3
@@ -562,9 +546,7 @@ def test_merge_replaces_whole_rows_and_nothing_else():
 def test_final_obs_is_the_end_of_the_old_episode(actuator):
     """A twin whose episodes are longer goes on: its observation is the short one's `final_obs`."""
     net = "analytic" if actuator == "plant" else obedient_net(LOW)
-    short, long = (
-        TaskVectorEnv(4, net, LOW, TaskConfig(episode_s=seconds)) for seconds in (1.0, 9.0)
-    )
+    short, long = (TaskVectorEnv(4, net, LOW, TaskConfig(episode_s=seconds)) for seconds in (1.0, 9.0))
     a, b = short.reset(seed=5)[0], long.reset(seed=5)[0]
     draws = np.random.default_rng(18)
     for tick in range(1, 21):
@@ -679,13 +661,7 @@ def test_make_vec_gives_the_vector_class():
     assert env.observation_space.contains(seen)
     seen, reward, terminated, truncated, info = env.step(env.action_space.sample())
     assert env.observation_space.contains(seen)
-    assert (
-        reward.shape
-        == terminated.shape
-        == truncated.shape
-        == info["velocity_error"].shape
-        == (256,)
-    )
+    assert reward.shape == terminated.shape == truncated.shape == info["velocity_error"].shape == (256,)
     assert len(np.unique(seen[:, 7])) > 250  # they start apart
 
 
@@ -732,9 +708,7 @@ def test_random_machines_run(machine):
             ends += truncated.sum()
         assert ends == 8
     zero = np.zeros(len(machine.driven))
-    controller = JacobianController(
-        machine, Gains(zero + 1, zero + 1, zero, np.array(0.2)), 0.1, 0.1
-    )
+    controller = JacobianController(machine, Gains(zero + 1, zero + 1, zero, np.array(0.2)), 0.1, 0.1)
     start = (machine.column("q_min") + machine.column("q_max")) / 2 * np.ones((3, 1))
     goals = np.full((30, 3, 3), 0.05)
     trace = task.rollout(machine, controller, start, goals, TaskConfig(), np.random.default_rng(0))
@@ -755,9 +729,7 @@ def test_nets_that_do_not_fit_are_refused():
     net = small_net(BROKK_170, np.random.default_rng(0))
     for change in ({"rate": 10.0}, {"velocity_samples": 3}, {"velocity_logged": True}):
         ((name, value),) = change.items()
-        message = (
-            f"actuator: expected nets for brokk170 with .*'{name}': .*, got .*'{name}': {value}"
-        )
+        message = f"actuator: expected nets for brokk170 with .*'{name}': .*, got .*'{name}': {value}"
         with pytest.raises(ValueError, match=message):
             nets_of(replace(net, **change))
     with pytest.raises(ValueError, match=r"actuator: expected .*'history': 13.*'history': 7"):
@@ -825,9 +797,7 @@ def test_rollout_tells_what_happened_when():
         np.testing.assert_allclose(trace.reward[t], 1 / (1 + error), atol=1e-6)
         q = plant.q
     assert np.array_equal(trace.u, tape)
-    np.testing.assert_allclose(
-        np.diff(trace.p_tool, axis=0)[20:] * 20, trace.v_tool[21:], atol=0.01
-    )
+    np.testing.assert_allclose(np.diff(trace.p_tool, axis=0)[20:] * 20, trace.v_tool[21:], atol=0.01)
 
 
 def test_rollout_noise_reaches_the_controller_and_is_reproducible():

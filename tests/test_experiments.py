@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks.rollout import random_net
 
+from benchmarks.rollout import random_net
 from brokk_min import experiments
 from brokk_min.env import TaskConfig, Trace, rollout
 from brokk_min.kinematics import lowest_point, tool_position

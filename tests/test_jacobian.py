@@ -340,9 +340,7 @@ def test_commands_stay_within_the_limit_anywhere():
     for machine in (BROKK_170, *MACHINES):
         c = controller(0.3, machine=machine, kp=3.0, ki=9.0, kd=0.2, feedback=1.0)
         low, high = machine.column("q_min"), machine.column("q_max")
-        q = np.where(
-            rng.random((50, machine.n)) < 0.3, high, rng.uniform(low, high, (50, machine.n))
-        )
+        q = np.where(rng.random((50, machine.n)) < 0.3, high, rng.uniform(low, high, (50, machine.n)))
         memory = c.start(50)
         for _ in range(5):
             seen = at_rest(q, rng.normal(0, 1, (50, 3)), machine)
@@ -382,12 +380,7 @@ def test_the_map_interpolates_between_angles():
     q, u = np.array([[0.0, 1.0]]), np.array([-1.0, 0.0, 1.0])
     velocity = np.array([[[-1.0, 0.0, 1.0], [-2.0, 0.0, 2.0]]])
     steady = classic.SteadyMap(q, u, velocity)
-    for angle, speed, wanted in [
-        (0.0, 0.5, 0.5),
-        (1.0, 0.5, 0.25),
-        (0.5, 0.75, 0.5),
-        (2.0, -1, -0.5),
-    ]:
+    for angle, speed, wanted in [(0.0, 0.5, 0.5), (1.0, 0.5, 0.25), (0.5, 0.75, 0.5), (2.0, -1, -0.5)]:
         found = steady.command(np.array([angle]), np.array([speed]))
         np.testing.assert_allclose(found, [wanted], atol=1e-9)
 
@@ -445,9 +438,7 @@ def test_tune_finds_the_minimum_of_a_bowl_and_is_deterministic():
 
     found = classic.tune(start, bowl, seed=0, generations=60, label="bowl")
     for name, value in wanted.items():
-        assert float(np.squeeze(getattr(found.gains, name))) == pytest.approx(
-            value, abs=0.02 * width[name]
-        )
+        assert float(np.squeeze(getattr(found.gains, name))) == pytest.approx(value, abs=0.02 * width[name])
     again = classic.tune(start, bowl, seed=0, generations=60, label="bowl")
     other = classic.tune(start, bowl, seed=1, generations=60, label="bowl")
     assert all(map(np.array_equal, found.gains, again.gains))
@@ -468,9 +459,7 @@ def test_gains_are_unpacked_in_order():
 def test_candidates_side_by_side_are_the_single_controllers():
     """Gains with a leading axis of candidates drive as each candidate would alone."""
     rng = np.random.default_rng(7)
-    many = classic.unpack_gains(
-        rng.uniform(0, 1, (3, 13)) * ([2] * 4 + [8] * 4 + [0.2] * 4 + [1]), 4
-    )
+    many = classic.unpack_gains(rng.uniform(0, 1, (3, 13)) * ([2] * 4 + [8] * 4 + [0.2] * 4 + [1]), 4)
     goals = np.repeat(rng.uniform(-0.2, 0.2, (2, 3, 3)), 10, axis=0)
     goals[:] = goals[:, :1]
     c = replace(controller(0.5), gains=many)

@@ -244,9 +244,7 @@ def test_a_file_without_a_header_is_refused(saved):
 def test_a_pickle_is_refused_and_not_run(tmp_path):
     path = tmp_path / "policy.npz"
     np.savez(path, header=np.array({"kind": "policy"}, dtype=object))
-    with pytest.raises(
-        ValueError, match=r"policy\.npz: expected a readable \.npz file, got .*pickle"
-    ):
+    with pytest.raises(ValueError, match=r"policy\.npz: expected a readable \.npz file, got .*pickle"):
         load_policy(path, BROKK_170)
 
 

@@ -20,13 +20,7 @@ from brokk_min.policy import load_policy
 from brokk_min.ppo import Agent, PPOConfig, Training, gae, train
 
 TINY = PPOConfig(
-    num_envs=8,
-    horizon=8,
-    epochs=2,
-    minibatch_size=32,
-    total_steps=4 * 64,
-    checkpoint_every=2,
-    threads=1,
+    num_envs=8, horizon=8, epochs=2, minibatch_size=32, total_steps=4 * 64, checkpoint_every=2, threads=1
 )
 TASK = TaskConfig(episode_s=0.6)  # 12 ticks: time runs out within the first updates
 NET = small_net(BROKK_170, np.random.default_rng(0))
@@ -111,9 +105,7 @@ def test_gae_by_hand():
 
 
 def no_bootstrap_at_truncation(e):
-    return right_arguments(e) | {
-        "next_values": np.where(e.terminated | e.truncated, 0.0, e.values[1:])
-    }
+    return right_arguments(e) | {"next_values": np.where(e.terminated | e.truncated, 0.0, e.values[1:])}
 
 
 def value_of_the_reset_observation(e):
@@ -176,9 +168,7 @@ def test_log_probability_is_that_of_torch():
 def test_log_probability_by_hand():
     found = ppo.log_probability(torch.tensor([1.0, 3.0]), torch.ones(2), torch.zeros(2))
     assert float(found) == pytest.approx(-2.0 - np.log(2 * np.pi))
-    half = ppo.log_probability(
-        torch.tensor([2.0]), torch.tensor([1.0]), torch.log(torch.tensor([0.5]))
-    )
+    half = ppo.log_probability(torch.tensor([2.0]), torch.tensor([1.0]), torch.log(torch.tensor([0.5])))
     assert float(half) == pytest.approx(-2.0 + np.log(2) - 0.5 * np.log(2 * np.pi))
 
 
@@ -510,10 +500,7 @@ def killed(tmp_path, monkeypatch):
         ({"seed": 6}, r"seed: expected 6, got 5"),
         ({"config": replace(TINY, gamma=0.5)}, r"settings: expected .*'gamma': 0\.5.*got .*gamma"),
         ({"task": TaskConfig(episode_s=0.7)}, r"task: expected .*0\.7.*, got .*0\.6"),
-        (
-            {"net": small_net(BROKK_170, np.random.default_rng(1))},
-            r"actuator: expected \w+, got \w+",
-        ),
+        ({"net": small_net(BROKK_170, np.random.default_rng(1))}, r"actuator: expected \w+, got \w+"),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )
