@@ -633,8 +633,9 @@ def free_run(
 def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
     """One-step, persistence and free-run errors of nets on recordings, as in the fit JSON.
 
-    Each joint is scored on the recordings in which it is commanded or moves. Free runs start every `horizon` seconds of each recording. `position_error_median` is the median
-    over segments of |angle error| at their end; `velocity_rmse` is over all their samples.
+    Each joint is scored on the recordings in which it is commanded or moves. Free runs start every
+    `horizon` seconds of each recording; `velocity_rmse` is over all their samples,
+    `position_error_median` is the median over segments of |angle error| at their end.
 
     Raises:
         ValueError: joints that do not match, or no recording long enough for one step.
@@ -648,6 +649,7 @@ def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
     )
 
     moves = np.array([np.ptp(r.u, axis=0) + np.ptp(r.q, axis=0) > 0 for r in log.recordings])
+    moves |= ~moves.any(axis=0)  # a joint that rests everywhere is scored at rest
 
     def segments(ticks: int) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
         """Starts (s,) of segments, and in which of them each joint moves (s, n)."""
@@ -657,11 +659,8 @@ def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
 
     joints: dict[str, Any] = {name: {"free_run": {}} for name in log.joints}
     starts, used = segments(1)
-    if not used.any(axis=0).all():
-        raise ValueError(
-            f"log: expected for each joint a recording above {net.history + 1} samples in which it moves, "
-            f"got recordings of {lengths} samples"
-        )
+    if not len(starts):
+        raise ValueError(f"log: expected a recording above {net.history + 1} samples, got {lengths[:9]}")
     chunks = np.array_split(starts, -(-len(starts) // 8192))
     one = np.concatenate([free_run(net, whole, chunk, 1)[1][0] for chunk in chunks])
     for j, name in enumerate(log.joints):

@@ -58,6 +58,8 @@ class TaskConfig:
     """Share of goals along x, y or z; the others point anywhere."""
     noise: float = 0.05
     """Largest noise of the measured part of an observation, in standard deviations (paper: 5 %)."""
+    valve_cost: float = 0.02
+    """Reward lost for each change of a command by its limit, mean of the driven joints (paper: 0)."""
     redraw_ground: bool = True
     """Redraw start poses in the ground; False is the paper's rule: end the episode without reward."""
 
@@ -356,14 +358,16 @@ def step(
 ) -> tuple[State, Outcome]:
     """One tick of `num` environments, without resets: `action` (num, n_driven) in [-1, 1].
 
-    The reward is for the goal that held during the tick; a new goal is drawn after it. On a tick
-    that ends in the ground the reward is zero.
+    The reward is `reward` for the goal that held during the tick less `valve_cost`; a new goal is drawn
+    after it. On a tick that ends in the ground the reward is zero.
     """
-    state = transition(machine, net, state, to_command(machine, action))
+    before, state = state, transition(machine, net, state, to_command(machine, action))
     _, v_tool, lowest = tool_state(machine, state.q, state.q_dot)
     rewards = reward(state.v_goal, v_tool)
     end = terminated(machine, lowest)
     error = 1 / rewards - 1
+    if config.valve_cost:
+        rewards = rewards - np.float32(config.valve_cost) * _travel(machine, before, state)
     due = np.flatnonzero(state.goal_ticks <= 0)
     if len(due):
         goals, holds = state.v_goal.copy(), state.goal_ticks.copy()
@@ -373,6 +377,12 @@ def step(
     observation = look(machine, config, state, rng)
     truncated = (state.ticks >= round(config.episode_s * machine.rate)) & ~end
     return state, Outcome(observation, np.where(end, 0.0, rewards), end, truncated, error)
+
+
+def _travel(machine: Machine, before: State, after: State) -> Array:
+    """Mean change of the driven joints' commands in one tick, in units of the command limit, (num,)."""
+    newest = [s.history[..., machine.driven, 2, -1] for s in (before, after)]
+    return np.abs(newest[1] - newest[0]).mean(axis=-1) * np.float32(PWM_MAX / machine.pwm_limit)
 
 
 def merge(old: State, new: State, rows: NDArray[np.intp]) -> State:

@@ -102,6 +102,7 @@ class Machine:
             for field in dataclasses.fields(owner):
                 if "unit" in field.metadata:
                     self._check_number(owner, field.name, where + field.name)
+        object.__setattr__(self, "sources", dict(self.sources))  # a copy of its own
         nodes = [joint.encoder_node for joint in self.joints]
         if len(set(nodes)) != len(nodes):
             raise ValueError(f"joints: expected different encoder nodes, got {nodes}")

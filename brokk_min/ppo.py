@@ -47,7 +47,9 @@ class PPOConfig:
     minibatch_size: int = 1024
     """Steps in one gradient."""
     learning_rate: float = 1e-3
-    """Of Adam at the start; falls linearly to zero at the end."""
+    """Of Adam at the start and at most; follows `target_kl` and falls linearly to zero at the end."""
+    target_kl: float = 0.01
+    """Change of the policy in one update at which the learning rate stays as it is (as in rl_games)."""
     gamma: float = 0.85
     """Discount a tick: 0.85 looks 7 ticks (0.33 s) ahead, about the machine's response time."""
     gae_lambda: float = 0.95
@@ -158,7 +160,7 @@ class Training:
             shapes = env.single_observation_space.shape, env.single_action_space.shape
             self.agent = Agent(shapes[0][0], shapes[1][0], config.log_std)  # type: ignore[index]
         self.optimizer = torch.optim.Adam(self.agent.parameters(), lr=config.learning_rate, fused=True)
-        self.updates = 0
+        self.updates, self.learning_rate = 0, config.learning_rate
         self.observation = torch.from_numpy(env.reset(seed=seed)[0])
 
     @property
@@ -169,12 +171,15 @@ class Training:
     def update(self) -> dict[str, float]:
         """Collect `horizon` ticks, learn from them; scalars under the names of CleanRL."""
         c = self.config
-        left = max(0.0, 1 - self.steps / c.total_steps)
-        self.optimizer.param_groups[0]["lr"] = c.learning_rate * left
+        rate = self.learning_rate * max(0.0, 1 - self.steps / c.total_steps)
+        self.optimizer.param_groups[0]["lr"] = rate
         batch, scalars = self._collect()
         losses = self._learn(batch)
         self.updates += 1
-        scalars |= {"charts/learning_rate": c.learning_rate * left} | losses
+        change = losses["losses/approx_kl"] / c.target_kl
+        factor = 1 / 1.2 if change > 1.5 else 1.2 if change < 0.7 else 1.0
+        self.learning_rate = min(self.learning_rate * factor, c.learning_rate)
+        scalars |= {"charts/learning_rate": rate} | losses
         for name, value in scalars.items():
             if not np.isfinite(value):
                 raise ValueError(f"{name}: expected a finite number at step {self.steps}, got {value}")
@@ -268,6 +273,7 @@ class Training:
             "kind": "checkpoint",
             "identity": identity,
             "updates": self.updates,
+            "learning_rate": self.learning_rate,
             "random": self.env.np_random.bit_generator.state,
         }
         arrays = {f"env_{name}": getattr(state, name) for name in STATE}
@@ -293,6 +299,7 @@ class Training:
                 raise ValueError(f"{path}: {name}: expected {wanted}, got {found}")
         tensors = {name: torch.from_numpy(a) for name, a in arrays.items() if name != "header"}
         self.updates, self.observation = header["updates"], tensors["observation"]
+        self.learning_rate = header["learning_rate"]
         state: dict[str, Any] = {name: arrays[f"env_{name}"] for name in STATE}
         self.env.state = State(**state)
         self.env.np_random.bit_generator.state = header["random"]

@@ -139,7 +139,7 @@ def test_gains_of_another_machine_are_refused(tmp_path: Path) -> None:
     net = random_net(np.random.default_rng(0)).select(["q1", "q3", "q4", "q5"])
     path = tmp_path / "gains.json"
     path.write_text(json.dumps({"meta": {"machine": "digger"}, "gains": {}}))
-    with pytest.raises(ValueError, match="expected gains for brokk170.*digger"):
+    with pytest.raises(ValueError, match=r"expected gains for brokk170.*digger"):
         experiments.read_gains(path, BROKK_170, net)
 
 

@@ -317,7 +317,7 @@ BAD_CSV = {
     "backward time": (GOOD.replace("0.15", "0.02"), ["row 5", "column time", "later than 0.1", "0.02"]),
     "command in percent": (GOOD.replace("0.2", "63"), ["row 3", "column u_a", "[-1, 1]", "63"]),
     "command below -1": (GOOD.replace("0.4", "-1.01"), ["row 5", "column u_a", "[-1, 1]", "-1.01"]),
-    "wrong delimiter": (GOOD.replace(",", ";"), ["column run;time;u_a;q_a", "'x;0.00;0.1;1.0'"]),
+    "wrong delimiter": (GOOD.replace(",", ";"), ["row 1", "u_<joint>", "run;time;u_a;q_a"]),
     "truncated row": (GOOD[:-9], ["row 5", "expected 4 cells", "got 2"]),
     "long row": (GOOD.replace("0.3,1.2", "0.3,1.2,9"), ["row 4", "expected 4 cells", "got 5"]),
     "column twice": (GOOD.replace("q_a", "u_a", 1), ["row 1", "once", "['u_a']"]),

@@ -311,11 +311,20 @@ def test_without_a_learning_rate_nothing_changes():
     assert scalars["losses/entropy"] == pytest.approx(entropy, rel=1e-5)
 
 
-def test_the_learning_rate_falls_in_a_line():
-    training = Training(TaskVectorEnv(8, NET, BROKK_170, TASK), TINY, 2)
+def learning_rates(target_kl):
+    config = replace(TINY, target_kl=target_kl)
+    training = Training(TaskVectorEnv(8, NET, BROKK_170, TASK), config, 2)
     rates = [training.update()["charts/learning_rate"] for _ in range(4)]
-    np.testing.assert_allclose(np.array(rates) / TINY.learning_rate, [1, 0.75, 0.5, 0.25])
     assert training.steps == TINY.total_steps
+    return np.array(rates) / TINY.learning_rate
+
+
+def test_the_learning_rate_falls_in_a_line_while_the_policy_changes_little():
+    np.testing.assert_allclose(learning_rates(1e6), [1, 0.75, 0.5, 0.25])
+
+
+def test_the_learning_rate_is_lowered_while_the_policy_changes_too_much():
+    np.testing.assert_allclose(learning_rates(1e-9) * 1.2 ** np.arange(4), [1, 0.75, 0.5, 0.25])
 
 
 class Bandit:
@@ -373,6 +382,7 @@ def test_the_task_is_learned_a_little():
         total_steps=25 * 1024,
         gamma=0.5,
         learning_rate=2e-3,
+        target_kl=1.0,
         log_std=-2.0,
     )
     env = TaskVectorEnv(64, obedient_net(BROKK_170), BROKK_170, TaskConfig(episode_s=5.0))
