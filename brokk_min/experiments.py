@@ -166,8 +166,8 @@ class Effort:
 
     hours: float = 1.0
     fit_steps: int = 4000
-    train_steps: int = 3_000_000
-    generations: int = 25
+    train_steps: int = 5_000_000
+    generations: int = 12
     tuning_runs: int = 12
     starts: int = 16
 

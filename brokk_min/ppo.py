@@ -36,7 +36,7 @@ STATE = ("q", "q_dot", "history", "v_goal", "goal_ticks", "ticks")
 class PPOConfig:
     """Settings of the learner; those that the paper names are marked."""
 
-    total_steps: int = 4_000_000
+    total_steps: int = 5_000_000
     """Environment steps in all."""
     num_envs: int = 256
     """Environments side by side (paper: 256)."""
