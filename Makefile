@@ -1,7 +1,7 @@
 # Two commands: `make reproduce` runs the whole chain, `make test` passes the tests.
 # Both set up a virtual environment in .venv on first use and need no network after that.
 PYTHON ?= python3.11
-OUT ?= results
+OUT ?= $(if $(QUICK),results-quick,results)
 RUN := .venv/bin/python -m
 QUICK ?=
 

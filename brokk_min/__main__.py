@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,6 +27,54 @@ class WrongUse(ValueError):
     """Options that cannot be meant; exit status 2."""
 
 
+# What each option may be; both ends included.
+ALLOWED: dict[str, tuple[float, float]] = {
+    "seed": (0, 2**31 - 1),
+    "hours": (1e-4, 100),
+    "velocity_samples": (2, 100),
+    "history": (2, 1000),
+    "steps": (1, 10**7),
+    "batch_size": (1, 10**6),
+    "hidden": (1, 4096),
+    "learning_rate": (1e-9, 1),
+    "noise": (0, 10),
+    "total_steps": (1, 10**12),
+    "num_envs": (1, 10**6),
+    "horizon": (1, 10**5),
+    "epochs": (1, 1000),
+    "minibatch_size": (2, 10**7),
+    "gamma": (0, 0.9999),
+    "gae_lambda": (0, 1),
+    "target_kl": (1e-9, 1e9),
+    "clip": (1e-6, 1e3),
+    "entropy": (0, 1e3),
+    "max_grad_norm": (1e-9, 1e9),
+    "log_std": (-10, 3),
+    "min_log_std": (-10, 3),
+    "checkpoint_every": (1, 10**9),
+    "threads": (1, 1024),
+    "episode_s": (0.05, 1e6),
+    "hold_min_s": (0, 1e6),
+    "hold_max_s": (0, 1e6),
+    "zero_goals": (0, 1),
+    "axis_goals": (0, 1),
+    "valve_cost": (0, 10),
+}
+
+
+def check(command: Any, outputs: tuple[Path | None, ...] = ()) -> None:
+    """Refuse options that cannot be meant and outputs that cannot be written, before any work."""
+    for owner in (command, *(getattr(command, n) for n in ("settings", "task") if hasattr(command, n))):
+        for name, value in vars(owner).items():
+            low, high = ALLOWED.get(name, (None, None))
+            if low is not None and high is not None and not low <= value <= high:
+                option = name.replace("_", "-")
+                raise WrongUse(f"--{option}: expected {low} to {high}, got {value}")
+    for path in outputs:
+        if path and (path.is_dir() or not os.access(path.parent, os.W_OK)):
+            raise WrongUse(f"{path}: expected a file in an existing, writable directory")
+
+
 @dataclass
 class Collect:
     """Record the machine (the analytic plant) under excitation."""
@@ -44,8 +93,7 @@ class Collect:
     def run(self) -> None:
         """Write the log."""
         machine = MACHINES[self.machine]
-        if not 0 < self.hours <= 100:
-            raise WrongUse(f"--hours: expected above 0 and up to 100, got {self.hours}")
+        check(self, (self.out,))
         if self.out.suffix not in (".csv", ".npz"):
             raise WrongUse(f"--out: expected a name ending in .csv or .npz, got {self.out}")
         log = collect(machine, self.hours, self.excitation, np.random.default_rng(self.seed))
@@ -76,11 +124,9 @@ class Fit:
         """Fit, score, write."""
         if not self.logs:
             raise WrongUse("LOGS: expected at least one log, got none")
-        if self.settings.history < 2 or self.settings.steps < 1 or self.velocity_samples < 2:
-            raise WrongUse(
-                "expected --history and --velocity-samples of 2 or more and --steps of 1 or more, "
-                f"got {self.settings.history}, {self.velocity_samples}, {self.settings.steps}"
-            )
+        check(self, (self.out, self.json))
+        if self.velocity_samples > self.settings.history:
+            raise WrongUse(f"--velocity-samples: expected at most --history, got {self.velocity_samples}")
         log = read_log(self.logs, self.velocity_samples)
         if self.test:
             test = read_log(self.test, self.velocity_samples, log.joints)
@@ -88,8 +134,8 @@ class Fit:
             log, test = _hold_out(log)
         known = [machine.name for machine in MACHINES.values() if machine.names == log.joints]
         net = fit(log, self.settings, self.seed, self.velocity_samples, "".join(known))
-        joints = score(net, test)
         save_net(self.out, net)
+        joints = score(net, test)
         meta: dict[str, Any] = {"logs": [str(p) for p in self.logs], "test": [str(p) for p in self.test]}
         meta |= {"seed": self.seed, "rate": net.rate, "history": net.history}
         if self.json:
@@ -132,13 +178,11 @@ class Train:
 
     def run(self) -> None:
         """Train and write the policy."""
-        for name in ("total_steps", "num_envs", "horizon", "epochs", "minibatch_size", "threads"):
-            if (got := getattr(self.settings, name)) < 1:
-                raise WrongUse(f"--{name.replace('_', '-')}: expected 1 or more, got {got}")
+        check(self, (self.out,))
+        if self.task.hold_min_s > self.task.hold_max_s:
+            raise WrongUse(f"--hold-max-s: expected --hold-min-s or more, got {self.task.hold_max_s}")
         machine = MACHINES[self.machine]
         net = fitting_nets(machine, load_net(self.actuator))
-        if not self.out.parent.is_dir():
-            raise WrongUse(f"--out: expected an existing directory, got {self.out.parent}")
         train(machine, net, self.task, self.settings, self.seed, self.out, self.resume, self.tensorboard)
         print(f"{self.out}: trained for {self.settings.total_steps} steps; curve in {self.out}.csv")
 
@@ -166,6 +210,7 @@ class Evaluate:
 
     def run(self) -> None:
         """Evaluate and print the means."""
+        check(self, (self.json,))
         machine = MACHINES[self.machine]
         policy = load_policy(self.policy, machine)
         sequences = experiments.axis_sequences(machine)
@@ -181,6 +226,7 @@ class Evaluate:
         gains = self.gains or self.policy.with_name("gains.json")
         if self.gains or gains.exists():
             controllers |= experiments.read_gains(gains, machine, policy.net)
+            print(f"gains of the baselines: {gains}", file=sys.stderr)
         else:
             controllers |= experiments.tuned_baselines(machine, policy.net, effort, self.seed)
         moves = policy.net if self.plant == "net" else None
@@ -207,6 +253,7 @@ class Reproduce:
 
     def run(self) -> None:
         """Run the chain and print the means."""
+        check(self)
         effort = experiments.QUICK if self.quick else experiments.Effort()
         results = experiments.reproduce(MACHINES[self.machine], self.out, effort, self.seed)
         for name, rows in results["task_space"]["summary"].items():

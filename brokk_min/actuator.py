@@ -74,7 +74,7 @@ def plant_step(machine: Machine, state: PlantState, u: ArrayLike) -> PlantState:
 
     Spool with dead zone, readiness of an idle valve, shared pump flow, cylinder speed, lever arm.
 
-    Paper: eq1 and Sec. 3.1 (range, direction, coupling, past movement)
+    Paper: eq1 and Sec. 3.2 (range, direction, coupling, past movement)
 
     Args:
         machine: parameters of the plant.
@@ -118,7 +118,7 @@ def plant_velocity(machine: Machine, state: PlantState) -> Array:
 
 
 def sine_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Array:
-    """One sine of random amplitude (dead zone to limit) and frequency, (ticks,). Paper: Sec. 3.2."""
+    """One sine of random amplitude (dead zone to limit) and frequency, (ticks,). Paper: Sec. 3.3."""
     amplitude = rng.uniform(machine.dead_zone, machine.pwm_limit / 127)
     frequency, phase = rng.uniform(0.02, 0.5), rng.uniform(0, 2 * np.pi)
     return amplitude * np.sin(2 * np.pi * frequency * machine.dt * np.arange(ticks) + phase)
@@ -164,7 +164,7 @@ def collect(
     `..._return`, dropped by `read_log`) and rests before the next leg. The sine excitation of the
     paper starts every leg at home (mid range), the rich one at random angles.
 
-    Paper: Sec. 3.2
+    Paper: Sec. 3.3
 
     Args:
         machine: what to record.
@@ -326,7 +326,7 @@ def push_angle(history: Array, q: ArrayLike, velocity: Callable[[Array], Array])
 class ActuatorNet:
     """One small net a joint, run in NumPy: history in, mean velocity over the coming tick out.
 
-    Paper: Table 1 and Sec. 3.2 (39 inputs, two hidden layers of 32, ReLU, sigmoid output)
+    Paper: Table 1 and Sec. 3.3 (39 inputs, two hidden layers of 32, ReLU, sigmoid output)
 
     Weights are stacked over joints: (n, 3 H, 32), (n, 32), (n, 32, 32), (n, 32), (n, 32, 1), (n, 1).
     """
@@ -437,7 +437,7 @@ def net_from_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> ActuatorNet:
         found = [array.shape for array in (*weights, *(arrays[name] for name in _NET_ARRAYS))]
         if found != wanted:
             raise ValueError(f"shapes {found} instead of {wanted}")
-    except (KeyError, TypeError, ValueError) as error:
+    except (IndexError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: expected a complete actuator net, got {error!r}") from error
     return net
 
@@ -488,7 +488,7 @@ class FitConfig:
 
 
 def fit(log: Log, config: FitConfig, seed: int, velocity_samples: int, machine: str = "") -> ActuatorNet:
-    """Fit one net a joint to the one-step targets of a log. Paper: Sec. 3.2 (MSE, Adam)
+    """Fit one net a joint to the one-step targets of a log. Paper: Sec. 3.3 (MSE, Adam)
 
     Args:
         log: training recordings.
@@ -545,6 +545,8 @@ def fit(log: Log, config: FitConfig, seed: int, velocity_samples: int, machine: 
         torch.autograd.backward(loss)
         optimizer.step()
         schedule.step()
+    if not all(torch.isfinite(weight).all() for weight in weights):
+        raise ValueError("weights: expected finite numbers at the end of the fit, got nan or inf")
     return ActuatorNet(
         joints=log.joints,
         history=config.history,

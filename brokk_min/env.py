@@ -46,7 +46,7 @@ Bools = NDArray[np.bool_]
 class TaskConfig:
     """What an episode is. Paper: Sec. 3.4; the numbers are assumed unless they name the paper."""
 
-    episode_s: float = 20.0
+    episode_s: float = 8.0
     """Length of an episode [s]; its end is a truncation, never a termination."""
     hold_min_s: float = 0.5
     """Shortest time for which a velocity goal holds [s]."""
@@ -168,7 +168,7 @@ def measured(machine: Machine, observation: Array) -> Measured:
 def to_command(machine: Machine, action: ArrayLike) -> Array:
     """Commands for all joints from the policy's actions: limited, in whole PWM counts.
 
-    Paper: Sec. 3.4 (PWM out) and Sec. 3.1 (65 %)
+    Paper: Sec. 3.4 (PWM out) and Sec. 3.2 (65 %)
 
     Args:
         machine: n joints.
@@ -494,8 +494,8 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
     """Many machines that follow random tool velocities; an ended episode starts anew in the same step.
 
     Observation: Box, see `observe`. Action: Box [-1, 1] a driven joint, 1 = the command limit.
-    Reward: `reward`. `info["final_obs"]` holds the last observation of an ended episode where
-    `info["_final_obs"]` is set; `info["velocity_error"]` is |v_goal - v_tool| [m/s].
+    Reward: `reward` less `valve_cost`, see `step`. `info["final_obs"]` holds the last observation of an
+    ended episode where `info["_final_obs"]` is set; `info["velocity_error"]` is |v_goal - v_tool| [m/s].
 
     Args:
         num_envs: how many.

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import matplotlib
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet, FitConfig, collect, fit, free_run, save_net, score, task_log
 from brokk_min.env import Controller, TaskConfig, Trace, draw_goal, draw_pose, rollout
@@ -55,7 +56,7 @@ class Commands(NamedTuple):
 
 
 def axis_sequences(machine: Machine) -> list[Commands]:
-    """One sequence along x, one along y, one along z. Paper: Fig. 7"""
+    """One sequence along x, one along y, one along z. Paper: Fig. 6"""
     profile = np.concatenate([np.full(round(s * machine.rate), v) for s, v in PATTERN])
     return [Commands(name, np.outer(profile, np.eye(3)[i])) for i, name in enumerate(AXES)]
 
@@ -72,6 +73,8 @@ def read_commands(path: Path, machine: Machine) -> list[Commands]:
         time = table["time"][rows] - table["time"][rows[0]]
         if len(rows) < 2 or not (np.diff(time) > 0).all():
             raise ValueError(f"{path}: sequence {name}: expected two or more rows with rising time")
+        if round(time[-1] * machine.rate) < 1 or name == "all":
+            raise ValueError(f"{path}: sequence {name}: expected a tick or more and another name than all")
         at = np.searchsorted(time, np.arange(round(time[-1] * machine.rate)) / machine.rate + 1e-6, "right")
         goals = np.stack([table[c][rows][at - 1] for c in ("vx", "vy", "vz")], axis=1)
         result.append(Commands(str(name), goals))
@@ -101,7 +104,8 @@ def feasible(machine: Machine, start: Array, goals: Array) -> NDArray[np.bool_]:
     """Can ideal actuators follow `goals` (T, num, 3) from `start` (num, n)? Shape (num,).
 
     Integrates lightly damped resolved rates with joint-limit weights: the tool must stay within 20 mm
-    of its path, joints 0.05 rad off their limits and below their speed, the arm 0.1 m off the ground.
+    of its path, joints 0.05 rad off their limits and below 0.9 of their
+    fastest speed (of the faster direction), the arm 0.1 m off the ground.
     """
     q, driven = np.array(start, float), machine.driven
     low, high = machine.column("q_min")[driven] + 0.05, machine.column("q_max")[driven] - 0.05
@@ -144,7 +148,7 @@ def tuning_goals(machine: Machine, runs: int, seconds: float, seed: int) -> tupl
     rng, ticks = np.random.default_rng(seed), round(seconds * machine.rate)
     starts: list[Array] = []
     goals: list[Array] = []
-    while len(starts) < runs:
+    for _ in range(60):
         pose = draw_pose(machine, TaskConfig(), rng, 200)
         holds = rng.uniform(1, 4, (200, ticks))
         changes = np.cumsum(holds, axis=1) * machine.rate
@@ -154,7 +158,9 @@ def tuning_goals(machine: Machine, runs: int, seconds: float, seed: int) -> tupl
         good = feasible(machine, pose, goal)
         starts += list(pose[good])
         goals += list(goal[:, good].swapaxes(0, 1))
-    return np.array(starts[:runs]), np.array(goals[:runs]).swapaxes(0, 1)
+        if len(starts) >= runs:
+            return np.array(starts[:runs]), np.array(goals[:runs]).swapaxes(0, 1)
+    raise ValueError(f"tuning: expected {runs} feasible runs for {machine.name}, got {len(starts)}")
 
 
 # --- controllers ------------------------------------------------------------------------------------
@@ -293,7 +299,7 @@ def task_space(
     seed: int,
     net: ActuatorNet | None = None,
 ) -> tuple[list[dict[str, Any]], dict[tuple[str, str], Trace]]:
-    """Every controller on the same sequences, starts and noise. Paper: Sec. 4.2, Fig. 7
+    """Every controller on the same sequences, starts and noise. Paper: Sec. 4.2, Fig. 6
 
     Returns:
         One row of `metrics` a controller, sequence and start; and the traces, starts as one batch.
@@ -301,7 +307,7 @@ def task_space(
     runs, traces = [], {}
     first = tool_state(machine, starts, 0 * starts)[0]
     for name, controller in controllers.items():
-        for sequence in sequences:
+        for sequence in tqdm(sequences, desc=f"evaluate {name}", unit="sequence", disable=None):
             goals = np.repeat(sequence.goals[:, None], len(starts), axis=1)
             rng = np.random.default_rng(seed)
             trace = rollout(machine, controller, starts, goals, TaskConfig(), rng, net)
@@ -370,7 +376,7 @@ def _png(figure: Any) -> str:
 def plot_sequence(
     machine: Machine, traces: Mapping[tuple[str, str], Trace], sequence: Commands, start: Array, run: int
 ) -> Any:
-    """Tool position and velocity along x, y, z of all controllers in one run. Paper: Fig. 7"""
+    """Tool position and velocity along x, y, z of all controllers in one run. Paper: Fig. 6"""
     figure, axes = _figure(2, 3)
     clock = np.arange(1, len(sequence.goals) + 1) * machine.dt
     first = tool_state(machine, start, 0 * start)[0]
@@ -399,7 +405,7 @@ def plot_sequence(
 def plot_joint_rates(
     machine: Machine, traces: Mapping[tuple[str, str], Trace], sequence: Commands, run: int
 ) -> Any:
-    """Velocity of the driven joints of all controllers in one run. Paper: Fig. 7d"""
+    """Velocity of the driven joints of all controllers in one run. Paper: Fig. 6d"""
     figure, axes = _figure(1, len(machine.driven))
     clock = np.arange(1, len(sequence.goals) + 1) * machine.dt
     for ax, joint in zip(axes[0], machine.driven, strict=True):
@@ -464,7 +470,7 @@ def plot_learning(curve: Path) -> Any:
 def write_json(path: Path, value: Any) -> None:
     """Write JSON whole, floats as they are."""
     with whole_file(path, "w") as file:
-        json.dump(value, file, indent=1)
+        json.dump(value, file, indent=1, allow_nan=False)
         file.write("\n")
 
 
@@ -531,9 +537,13 @@ def reproduce(machine: Machine, out: Path, effort: Effort, seed: int) -> dict[st
     out.mkdir(parents=True, exist_ok=True)
     clock, last = {}, time.perf_counter()
 
+    stages = tqdm(total=6, desc="stages done", unit="stage", position=1, disable=None)
+
     def lap(name: str) -> None:
         nonlocal last
         clock[name], last = time.perf_counter() - last, time.perf_counter()
+        stages.set_postfix_str(name)
+        stages.update()
 
     write_log(out / "log.npz", collect(machine, effort.hours, "rich", np.random.default_rng(seed)))
     test = task_log(machine, 20, 40.0, np.random.default_rng(seed + 1))
@@ -552,7 +562,7 @@ def reproduce(machine: Machine, out: Path, effort: Effort, seed: int) -> dict[st
     lap("fit")
     driven = net.select([machine.names[i] for i in machine.driven])
     config = PPOConfig(total_steps=effort.train_steps)
-    policy = train(machine, driven, TaskConfig(), config, seed, out / "policy.npz")
+    policy = train(machine, driven, TaskConfig(), config, seed, out / "policy.npz", resume=True)
     lap("train")
     baselines = tuned_baselines(machine, driven, effort, seed)
     lap("tune")
@@ -580,6 +590,7 @@ def reproduce(machine: Machine, out: Path, effort: Effort, seed: int) -> dict[st
     figures["Joint velocities during x motion"] = plot_joint_rates(machine, traces, sequences[0], 0)
     images = {title: _png(figure) for title, figure in figures.items()}
     lap("draw")
+    stages.close()
     write_json(out / "timing.json", clock)
     write_report(out / "report.html", results, images, clock)
     return results

@@ -219,7 +219,7 @@ def as_floats(values: ArrayLike) -> NDArray[np.floating]:
 def limit_command(machine: Machine, u: ArrayLike) -> NDArray[np.floating]:
     """The command that reaches the valve: whole PWM counts, within the limit.
 
-    Paper: Sec. 3.1 (65 %)
+    Paper: Sec. 3.2 (65 %)
 
     Args:
         machine: whose `pwm_limit` holds.

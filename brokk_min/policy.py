@@ -1,4 +1,4 @@
-"""A trained policy as a file and a function; NumPy alone, so that it runs wherever the machine is."""
+"""A trained policy as a file and a function; no torch, so that it runs wherever the machine is."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FORMAT = 1  # of policy files
 
 @dataclass(frozen=True)
 class Policy:
-    """The actor: standardised observation in, mean action out. Paper: Sec. 3.5 (256-128-64, ELU)"""
+    """The actor: standardised observation in, mean action out. Paper: Sec. 3.4 (256-128-64, ELU)"""
 
     contract: Mapping[str, Any]  # what training and machine must agree on, see `contract`
     training: Mapping[str, Any]  # seed and settings that made it

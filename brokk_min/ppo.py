@@ -1,6 +1,6 @@
 """Proximal Policy Optimization in one file, to be read from top to bottom.
 
-Paper: Sec. 3.5. Clipped objective, generalised advantage estimation, 256 environments at once. An
+Paper: Sec. 3.4. Clipped objective, generalised advantage estimation, 256 environments at once. An
 episode that runs out of time is not an episode that failed: at a truncation the return goes on with
 the value of the episode's own last observation (`next_values`), at a termination it stops.
 """
@@ -10,6 +10,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
+import sys
 import time
 from dataclasses import asdict, dataclass
 from itertools import pairwise
@@ -62,6 +63,8 @@ class PPOConfig:
     """Gradients are scaled down to this norm."""
     log_std: float = -1.2
     """Logarithm of the actions' standard deviation at the start."""
+    min_log_std: float = -1.7
+    """The deviation never shrinks below this: the last bias is found by looking around."""
     checkpoint_every: int = 100
     """Updates between two checkpoints."""
     threads: int = 2
@@ -72,7 +75,7 @@ class PPOConfig:
 
 
 def mlp(inputs: int, outputs: int, gain: float) -> nn.Sequential:
-    """256-128-64 with ELU and a linear output, orthogonal start. Paper: Sec. 3.5"""
+    """256-128-64 with ELU and a linear output, orthogonal start. Paper: Sec. 3.4"""
     sizes, layers = [inputs, 256, 128, 64], []
     for rows, columns in pairwise(sizes):
         layers += [_orthogonal(nn.Linear(rows, columns), 2**0.5), nn.ELU()]
@@ -142,7 +145,7 @@ def policy_loss(new: Tensor, old: Tensor, advantages: Tensor, clip: float) -> Te
 
 def normalise(advantages: Tensor) -> Tensor:
     """Advantages (B,) with zero mean and unit deviation."""
-    return (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+    return (advantages - advantages.mean()) / (advantages.std(unbiased=False) + 1e-8)
 
 
 # --- training ---------------------------------------------------------------------------------------
@@ -161,6 +164,8 @@ class Training:
             self.agent = Agent(shapes[0][0], shapes[1][0], config.log_std)  # type: ignore[index]
         self.optimizer = torch.optim.Adam(self.agent.parameters(), lr=config.learning_rate, fused=True)
         self.updates, self.learning_rate = 0, config.learning_rate
+        self.returns, self.lengths = (np.zeros(config.num_envs) for _ in range(2))  # of running episodes
+        self.episodes: tuple[float, ...] = (0.0, 0.0)  # mean return and length of the last that ended
         self.observation = torch.from_numpy(env.reset(seed=seed)[0])
 
     @property
@@ -193,6 +198,7 @@ class Training:
         actions = torch.empty(*shape, len(agent.log_std))
         rewards, ended, tails = (torch.zeros(shape) for _ in range(3))
         errors, std = [], torch.exp(agent.log_std)
+        finished: list[tuple[float, float]] = []
         for t in range(c.horizon):
             observations[t] = self.observation
             mean = agent.actor(self.observation)
@@ -205,6 +211,10 @@ class Training:
                 tails[t, torch.from_numpy(truncated)] = agent.value(last)
             self.observation = torch.from_numpy(following)
             errors.append(info["velocity_error"].mean())
+            self.returns, self.lengths = self.returns + reward, self.lengths + 1
+            over = terminated | truncated
+            finished += list(zip(self.returns[over], self.lengths[over], strict=True))
+            self.returns, self.lengths = (np.where(over, 0, x) for x in (self.returns, self.lengths))
         values = agent.value(observations)
         following_values = torch.cat([values[1:], agent.value(self.observation)[None]])
         next_values = torch.where(ended > 0, tails, following_values)
@@ -217,7 +227,11 @@ class Training:
             "return": advantages + values,
         }
         returns = batch["return"]
+        if finished:  # few episodes end in one update: the last ones stand until then
+            self.episodes = tuple(map(float, np.mean(finished, axis=0)))
         scalars = {
+            "charts/episodic_return": self.episodes[0],
+            "charts/episodic_length": self.episodes[1],
             "charts/reward": float(rewards.mean()) / (1 - c.gamma),
             "charts/velocity_error": float(np.mean(errors)),
             "losses/explained_variance": float(1 - advantages.var() / (returns.var() + 1e-12)),
@@ -241,6 +255,7 @@ class Training:
                 nn.utils.clip_grad_norm_(agent.parameters(), c.max_grad_norm)
                 self.optimizer.step()
                 with torch.no_grad():
+                    agent.log_std.clamp_(min=c.min_log_std)
                     change = new - old
                     kl = (torch.exp(change) - 1 - change).mean()
                     clipped = (torch.abs(torch.exp(change) - 1) > c.clip).float().mean()
@@ -274,10 +289,12 @@ class Training:
             "identity": identity,
             "updates": self.updates,
             "learning_rate": self.learning_rate,
+            "episodes": self.episodes,
             "random": self.env.np_random.bit_generator.state,
         }
         arrays = {f"env_{name}": getattr(state, name) for name in STATE}
         arrays |= {"observation": self.observation.numpy(), "generator": self.generator.get_state().numpy()}
+        arrays |= {"returns": self.returns, "lengths": self.lengths}
         moments = self.optimizer.state
         for i, parameter in enumerate(self.agent.parameters()):
             arrays[f"parameter_{i}"] = parameter.detach().numpy()
@@ -294,12 +311,14 @@ class Training:
         """
         arrays = load_arrays(path)
         header = load_header(path, arrays, "checkpoint", FORMAT)
+        known = header.get("identity", {})
         for name, wanted in identity.items():
-            if (found := header["identity"].get(name)) != wanted:
+            if (found := known.get(name)) != wanted:
                 raise ValueError(f"{path}: {name}: expected {wanted}, got {found}")
         tensors = {name: torch.from_numpy(a) for name, a in arrays.items() if name != "header"}
         self.updates, self.observation = header["updates"], tensors["observation"]
-        self.learning_rate = header["learning_rate"]
+        self.learning_rate, self.episodes = header["learning_rate"], tuple(header["episodes"])
+        self.returns, self.lengths = arrays["returns"], arrays["lengths"]
         state: dict[str, Any] = {name: arrays[f"env_{name}"] for name in STATE}
         self.env.state = State(**state)
         self.env.np_random.bit_generator.state = header["random"]
@@ -358,6 +377,10 @@ def train(
     checkpoint, curve = Path(f"{out}.checkpoint"), Path(f"{out}.csv")
     if resume and checkpoint.exists():
         training.load(checkpoint, identity)
+    elif resume:
+        tqdm.write(f"{checkpoint}: no checkpoint, training starts from the beginning", file=sys.stderr)
+    elif checkpoint.exists():
+        raise ValueError(f"{checkpoint}: expected --resume or no checkpoint, got one of a broken training")
     rows = _read_curve(curve, training.steps) if training.updates else []
     writer = _tensorboard(tensorboard)
     start = time.perf_counter()
@@ -377,6 +400,8 @@ def train(
             if training.updates % config.checkpoint_every == 0:
                 _write_curve(curve, rows)
                 training.save(checkpoint, identity)
+    if writer:
+        writer.close()
     _write_curve(curve, rows)
     policy = training.policy(identity)
     save_policy(out, policy)

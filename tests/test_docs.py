@@ -61,7 +61,9 @@ def test_every_row_has_a_status_and_a_test_that_exists() -> None:
 
 
 def test_deviations_that_rows_name_are_listed() -> None:
-    named = set(re.findall(r"\b([DA]\d+)\b", " ".join(" ".join(r) for r in rows("Equations, tables, figures"))))
+    named = set(
+        re.findall(r"\b([DA]\d+)\b", " ".join(" ".join(r) for r in rows("Equations, tables, figures")))
+    )
     listed = set(re.findall(r"^- \*\*([DA]\d+)", PAPER, re.M))
     assert named <= listed
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import gymnasium
@@ -554,11 +555,11 @@ def test_a_lost_learning_curve_is_no_traceback(killed):
         assert table(killed)[-1]["global_step"] == "256"
 
 
-def test_without_resume_a_checkpoint_is_not_taken_up(killed, tmp_path):
-    run(killed, resume=False)
-    run(tmp_path / "fresh.npz")
-    assert killed.read_bytes() == (tmp_path / "fresh.npz").read_bytes()
-    assert table(killed) == table(tmp_path / "fresh.npz")
+def test_without_resume_a_checkpoint_is_not_overwritten(killed):
+    before = Path(f"{killed}.checkpoint").read_bytes()
+    with pytest.raises(ValueError, match=r"checkpoint: expected --resume or no checkpoint, got one"):
+        run(killed, resume=False)
+    assert Path(f"{killed}.checkpoint").read_bytes() == before and not killed.exists()
 
 
 def test_a_loss_that_is_no_number_stops_and_keeps_the_checkpoint(tmp_path, monkeypatch):
