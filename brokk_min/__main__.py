@@ -50,7 +50,6 @@ ALLOWED: dict[str, tuple[float, float]] = {
     "entropy": (0, 1e3),
     "max_grad_norm": (1e-9, 1e9),
     "log_std": (-10, 3),
-    "min_log_std": (-10, 3),
     "checkpoint_every": (1, 10**9),
     "threads": (1, 1024),
     "episode_s": (0.05, 1e6),

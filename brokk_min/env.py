@@ -46,7 +46,7 @@ Bools = NDArray[np.bool_]
 class TaskConfig:
     """What an episode is. Paper: Sec. 3.4; the numbers are assumed unless they name the paper."""
 
-    episode_s: float = 8.0
+    episode_s: float = 20.0
     """Length of an episode [s]; its end is a truncation, never a termination."""
     hold_min_s: float = 0.5
     """Shortest time for which a velocity goal holds [s]."""

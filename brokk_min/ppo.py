@@ -63,8 +63,6 @@ class PPOConfig:
     """Gradients are scaled down to this norm."""
     log_std: float = -1.2
     """Logarithm of the actions' standard deviation at the start."""
-    min_log_std: float = -1.7
-    """The deviation never shrinks below this: the last bias is found by looking around."""
     checkpoint_every: int = 100
     """Updates between two checkpoints."""
     threads: int = 2
@@ -145,7 +143,7 @@ def policy_loss(new: Tensor, old: Tensor, advantages: Tensor, clip: float) -> Te
 
 def normalise(advantages: Tensor) -> Tensor:
     """Advantages (B,) with zero mean and unit deviation."""
-    return (advantages - advantages.mean()) / (advantages.std(unbiased=False) + 1e-8)
+    return (advantages - advantages.mean()) / (advantages.std() + 1e-8)
 
 
 # --- training ---------------------------------------------------------------------------------------
@@ -255,7 +253,6 @@ class Training:
                 nn.utils.clip_grad_norm_(agent.parameters(), c.max_grad_norm)
                 self.optimizer.step()
                 with torch.no_grad():
-                    agent.log_std.clamp_(min=c.min_log_std)
                     change = new - old
                     kl = (torch.exp(change) - 1 - change).mean()
                     clipped = (torch.abs(torch.exp(change) - 1) > c.clip).float().mean()

@@ -88,7 +88,7 @@ def foreign_log(path: Path, seed: int, runs: int) -> None:
 
 
 def test_fit_takes_a_foreign_log_and_beats_the_last_value(tmp_path: Path) -> None:
-    foreign_log(tmp_path / "log.csv", 0, 6)
+    foreign_log(tmp_path / "log.csv", 0, 24)
     foreign_log(tmp_path / "test.csv", 1, 2)
     assert (
         run(
