@@ -447,7 +447,7 @@ def plot_bars(table: Mapping[str, Mapping[str, Mapping[str, float]]], sequences:
             ax.bar(places, values, width, color=COLOURS.get(name, "grey"), label=name)
         ax.set_xticks(np.arange(len(sequences)) + 0.4 - width / 2, sequences)
         ax.set_ylabel(label)
-    axes[0, 0].legend(fontsize=7)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncol=5, fontsize=8)
     return figure
 
 
