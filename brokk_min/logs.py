@@ -201,7 +201,7 @@ def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
         if column.dtype.kind not in wanted:
             kind = "text" if name == "run" else "numbers"
             raise ValueError(f"{path}: column {name}: expected {kind}, got {column.dtype}")
-    return columns
+    return {name: c if name == "run" else c.astype(float) for name, c in columns.items()}
 
 
 def _joints(path: Path, columns: dict[str, NDArray[Any]]) -> tuple[str, ...]:
