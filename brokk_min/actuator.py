@@ -60,7 +60,7 @@ def lever_arm(machine: Machine, q: ArrayLike) -> Array:
     Example:
         >>> from brokk_min.machine import BROKK_170
         >>> lever_arm(BROKK_170, [0.0, 0.5, 0.5, 1.7, 1.0]).round(3)
-    array([0.15 , 0.337, 0.299, 0.247, 0.197])
+        array([0.15 , 0.337, 0.299, 0.247, 0.197])
     """
     base, rod = machine.column("cylinder_base"), machine.column("cylinder_rod")
     angle = np.asarray(q) + machine.column("cylinder_angle")
