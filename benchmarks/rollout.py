@@ -40,7 +40,7 @@ def random_net(rng: np.random.Generator) -> ActuatorNet:
         weights.append(rng.normal(0, rows**-0.5, (m.n, rows, columns)).astype(np.float32))
         weights.append(np.zeros((m.n, columns), np.float32))
     one = np.ones((m.n, 3 * h), np.float32)
-    speed = m.column("q_dot_max").astype(np.float32)
+    speed = m.q_dot_max.astype(np.float32)
     low, high = m.column("q_min").astype(np.float32), m.column("q_max").astype(np.float32)
     return ActuatorNet(
         m.names, h, m.rate, m.velocity_samples, False, "random", 0, {}, 0 * one, one, -speed, speed,

@@ -114,6 +114,23 @@ def plant_velocity(machine: Machine, state: PlantState) -> Array:
     return state.speed / lever_arm(machine, state.q)
 
 
+def speed_limits(machine: Machine, q: ArrayLike) -> tuple[Array, Array]:
+    """Steady joint velocities [rad/s] of the plant at the two command limits, (..., n) each.
+
+    Args:
+        machine: n joints.
+        q: angles [rad], (..., n), on which the lever arms depend.
+
+    Returns:
+        Fastest negative and fastest positive velocity of a joint that moves alone. Paper: eq1
+    """
+    opening = (machine.pwm_limit / 127 - machine.dead_zone) / (1 - machine.dead_zone)
+    arm = lever_arm(machine, q)
+    speeds = -machine.column("speed_negative"), machine.column("speed_positive")
+    down, up = (opening * speed / arm for speed in speeds)
+    return down, up
+
+
 # --- excitation: how the machine is made to show what it does -------------------------------------
 
 

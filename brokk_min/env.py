@@ -329,7 +329,7 @@ def _is_measured(machine: Machine) -> Array:
 def _spread(machine: Machine) -> Array:
     """Nominal standard deviation of angle [rad] and velocity [rad/s] of each joint, (n, 2, 1)."""
     angle = (machine.column("q_max") - machine.column("q_min")) / 12**0.5
-    velocity = machine.column("q_dot_max") / 3**0.5
+    velocity = machine.q_dot_max / 3**0.5
     return np.stack([angle, velocity], axis=-1)[..., None].astype(np.float32)
 
 

@@ -22,7 +22,17 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from brokk_min.actuator import ActuatorNet, FitConfig, collect, fit, free_run, save_net, score, task_log
+from brokk_min.actuator import (
+    ActuatorNet,
+    FitConfig,
+    collect,
+    fit,
+    free_run,
+    save_net,
+    score,
+    speed_limits,
+    task_log,
+)
 from brokk_min.env import Controller, TaskConfig, Trace, draw_goal, draw_pose, rollout
 from brokk_min.jacobian import (
     Gains,
@@ -104,8 +114,8 @@ def feasible(machine: Machine, start: Array, goals: Array) -> NDArray[np.bool_]:
     """Can ideal actuators follow `goals` (T, num, 3) from `start` (num, n)? Shape (num,).
 
     Integrates lightly damped resolved rates with joint-limit weights: the tool must stay within 20 mm
-    of its path, joints 0.05 rad off their limits and below 0.9 of their
-    fastest speed (of the faster direction), the arm 0.1 m off the ground.
+    of its path, joints 0.05 rad off their limits and below 0.9 of their steady speed at the command
+    limit in that direction at that angle, the arm 0.1 m off the ground.
     """
     q, driven = np.array(start, float), machine.driven
     low, high = machine.column("q_min")[driven] + 0.05, machine.column("q_max")[driven] - 0.05
@@ -119,7 +129,8 @@ def feasible(machine: Machine, start: Array, goals: Array) -> NDArray[np.bool_]:
         rates[:, driven] = (inverse @ (goal + (wanted - p))[..., None])[..., 0]
         q, wanted = q + rates * machine.dt, wanted + goal * machine.dt
         inside = ((q[:, driven] > low) & (q[:, driven] < high)).all(-1)
-        slow = (np.abs(rates) <= 0.9 * machine.column("q_dot_max")).all(-1)
+        down, up = speed_limits(machine, q)
+        slow = ((rates > 0.9 * down) & (rates < 0.9 * up))[:, driven].all(-1)
         near = np.linalg.norm(wanted - p, axis=-1) < 0.02
         good &= inside & slow & near & (lowest > machine.ground + 0.1)
     return good

@@ -192,7 +192,8 @@ class JacobianController:
         inverse = dls(J, W, nakamura_damping(manipulability(J), self.w0, self.k))
         feedback = self.gains.feedback[..., None] * (seen.v_goal - seen.v_tool)
         rate = (inverse @ (seen.v_goal + feedback)[..., None])[..., 0]
-        excess = np.max(np.abs(rate) / m.column("q_dot_max")[driven], axis=-1, keepdims=True)
+        fastest = np.where(rate > 0, m.column("q_dot_up")[driven], m.column("q_dot_down")[driven])
+        excess = np.max(np.abs(rate) / fastest, axis=-1, keepdims=True)
         return rate / np.maximum(1.0, excess), seen.q_dot  # slower, but in the same direction
 
     def __call__(self, observation: Array, memory: Memory) -> tuple[Array, Memory]:

@@ -47,7 +47,8 @@ class Joint:
     cylinder_area: float = _number("m^2")
     speed_positive: float = _number("m/s")  # of the cylinder at full command
     speed_negative: float = _number("m/s")
-    q_dot_max: float = _number("rad/s")  # fastest motion at the command limit, as logs show it
+    q_dot_up: float = _number("rad/s")  # fastest positive motion at the command limit, as logs show it
+    q_dot_down: float = _number("rad/s")  # fastest negative motion, a positive number
     encoder_node: int = _number("CANopen node id")
 
 
@@ -164,6 +165,11 @@ class Machine:
         return tuple(joint.name for joint in self.joints)
 
     @cached_property
+    def q_dot_max(self) -> NDArray[np.float64]:
+        """Fastest motion of each joint at the command limit, of the faster direction [rad/s], (n,)."""
+        return np.maximum(self.column("q_dot_up"), self.column("q_dot_down"))
+
+    @cached_property
     def _columns(self) -> dict[str, NDArray[np.float64]]:
         fields = [f.name for f in dataclasses.fields(Joint) if "unit" in f.metadata]
         columns = {name: np.array([getattr(j, name) for j in self.joints], float) for name in fields}
@@ -188,7 +194,8 @@ _RANGES: dict[str, tuple[float, float]] = {
     "cylinder_area": (1e-9, np.inf),
     "speed_positive": (1e-9, np.inf),
     "speed_negative": (1e-9, np.inf),
-    "q_dot_max": (1e-9, np.inf),
+    "q_dot_up": (1e-9, np.inf),
+    "q_dot_down": (1e-9, np.inf),
     "encoder_node": (1, 127),
     "rate": (1e-3, np.inf),
     "pwm_limit": (1, PWM_MAX),
@@ -327,15 +334,16 @@ def _brokk_170() -> Machine:
         ("q4", True, 1.15, 0.0, 0.0, -pi, 0.6, 2.9),
         ("q5", True, 1.20, 0.0, 0.0, -3 * pi / 4, 0.0, 2.0),
     ]
-    #   base  rod   angle  area    speed+  speed-  fastest node
+    #   base  rod   angle  area    speed+  speed-  up    down
     drives = [
-        (0.00, 0.15, 0.00, 0.0040, 0.0498, 0.0498, 0.20, 1),
-        (1.00, 0.35, 0.45, 0.0100, 0.0588, 0.0802, 0.22, 2),
-        (0.90, 0.30, 0.80, 0.0090, 0.0453, 0.0825, 0.28, 3),
-        (0.80, 0.25, -0.30, 0.0060, 0.0370, 0.0662, 0.38, 4),
-        (0.60, 0.20, 0.40, 0.0040, 0.0425, 0.0833, 0.47, 5),
+        (0.00, 0.15, 0.00, 0.0040, 0.0498, 0.0498, 0.20, 0.20),
+        (1.00, 0.35, 0.45, 0.0100, 0.0588, 0.0802, 0.15, 0.22),
+        (0.90, 0.30, 0.80, 0.0090, 0.0453, 0.0825, 0.17, 0.28),
+        (0.80, 0.25, -0.30, 0.0060, 0.0370, 0.0662, 0.22, 0.38),
+        (0.60, 0.20, 0.40, 0.0040, 0.0425, 0.0833, 0.24, 0.47),
     ]
-    joints = tuple(Joint(*row, *drive) for row, drive in zip(rows, drives, strict=True))
+    pairs = enumerate(zip(rows, drives, strict=True), 1)
+    joints = tuple(Joint(*row, *drive, node) for node, (row, drive) in pairs)
     paper = dict.fromkeys(["rate", "pwm_limit", "dead_zone", "history"], "paper")
     every = [f.name for c in (Joint, Machine) for f in dataclasses.fields(c) if "unit" in f.metadata]
     return Machine(

@@ -37,7 +37,8 @@ def random_machine(rng: np.random.Generator, n: int) -> Machine:
                 cylinder_area=0.005,
                 speed_positive=speed[0],
                 speed_negative=speed[1],
-                q_dot_max=rng.uniform(0.1, 0.8),
+                q_dot_up=rng.uniform(0.1, 0.8),
+                q_dot_down=rng.uniform(0.1, 0.8),
                 encoder_node=i + 1,
             )
         )
@@ -62,7 +63,7 @@ def small_net(machine: Machine, rng: np.random.Generator, joints: tuple[str, ...
     index = [machine.names.index(name) for name in joints]
     n, inputs = len(joints), 3 * machine.history
     middle = (machine.column("q_min") + machine.column("q_max"))[index] / 2
-    fastest = machine.column("q_dot_max")[index]
+    fastest = machine.q_dot_max[index]
     mean, scale = np.zeros((n, 3, machine.history)), np.ones((n, 3, machine.history))
     mean[:, 0], scale[:, 0] = middle[:, None], 0.5
     scale[:, 1], scale[:, 2] = 0.2, 0.4
@@ -108,7 +109,7 @@ def obedient_net(machine: Machine) -> ActuatorNet:
 
 def obedient_velocity(machine: Machine, u: np.ndarray) -> np.ndarray:
     """What `obedient_net` says for commands `u` (..., n_driven), worked out by hand."""
-    fastest = 1.2 * machine.column("q_dot_max")[machine.driven]
+    fastest = 1.2 * machine.q_dot_max[machine.driven]
     return fastest * (2 / (1 + np.exp(-GAIN * np.asarray(u, float))) - 1)
 
 

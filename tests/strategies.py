@@ -40,7 +40,8 @@ def joints(draw: st.DrawFn, index: int, driven: bool) -> Joint:
         cylinder_area=draw(reals(0.002, 0.02)),
         speed_positive=draw(reals(0.01, 0.2)),
         speed_negative=draw(reals(0.01, 0.2)),
-        q_dot_max=draw(reals(0.1, 1.0)),
+        q_dot_up=draw(reals(0.1, 1.0)),
+        q_dot_down=draw(reals(0.1, 1.0)),
         encoder_node=index + 1,
     )
 

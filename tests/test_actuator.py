@@ -32,6 +32,7 @@ from brokk_min.actuator import (
     rest_history,
     save_net,
     score,
+    speed_limits,
     task_log,
 )
 from brokk_min.logs import Log, Recording, read_log, velocity_of, write_log
@@ -360,7 +361,7 @@ def test_ways_back_are_marked_and_lead_home(collected):
 
 
 def test_legs_end_at_a_limit_or_when_their_time_is_over(collected):
-    log, tick = collected["rich"], 0.05 * BROKK_170.column("q_dot_max") + 0.01
+    log, tick = collected["rich"], 0.05 * BROKK_170.q_dot_max + 0.01
     low, high = BROKK_170.column("q_min") + tick, BROKK_170.column("q_max") - tick
     ended = [r for r in log.recordings if not r.name.endswith("_return")]
     last = {r.name[:5]: r.name for r in ended}  # a joint and tape: its last leg is cut when done
@@ -837,3 +838,17 @@ def test_scores_need_the_same_joints_and_one_step_at_least():
     with pytest.raises(ValueError, match=r"above 14 samples, got \[14, 5\]"):
         score(net, Log(("a",), (line("x", 0.0, 0.1, 14), line("y", 0.0, 0.1, 5))))
     score(net, Log(("a",), (line("x", 0.0, 0.1, 15),)))
+
+
+def test_speed_limits_are_where_the_plant_settles_at_the_command_limit():
+    q = np.array([[0.1, 0.4, 0.6, 1.5, 0.9], [-1.0, 1.0, 0.2, 2.2, 1.4]])
+    for sign, limit in zip((-1, 1), speed_limits(BROKK_170, q), strict=True):
+        for joint in range(5):
+            state, u = plant_reset(BROKK_170, q), np.zeros((2, 5))
+            u[:, joint] = sign * 80 / 127
+            for _ in range(14):
+                state = plant_step(BROKK_170, state, u)
+            now = speed_limits(BROKK_170, state.q)[int(sign > 0)][:, joint]
+            velocity = plant_velocity(BROKK_170, state)[:, joint]
+            np.testing.assert_allclose(velocity, now, rtol=0.03)
+            assert (sign * limit[:, joint] > 0.05).all()

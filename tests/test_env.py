@@ -219,7 +219,7 @@ def test_scale_belongs_to_uniform_values_over_the_ranges(machine):
     rng, num = np.random.default_rng(3), 4000
     history = np.zeros((num, machine.n, 3, machine.history))
     bounds = machine.column("q_min")[:, None], machine.column("q_max")[:, None]
-    limit, fastest = machine.pwm_limit / 127, machine.column("q_dot_max")[:, None]
+    limit, fastest = machine.pwm_limit / 127, machine.q_dot_max[:, None]
     shape = (num, machine.n, machine.history)
     history[:, :, 0] = rng.uniform(*bounds, shape)
     history[:, :, 1] = rng.uniform(-fastest, fastest, shape)

@@ -158,7 +158,7 @@ def swapped():
         (replace(BROKK_170, pwm_limit=60), r"pwm_limit: expected 60, got 80"),
         (change_joint(2, q_max=1.5), r"geometry: expected .*1\.5.*got .*1\.6"),
         (change_joint(2, a=1.5), r"geometry: expected .*1\.5.*got .*1\.25"),
-        (change_joint(2, q_dot_max=0.5), r"scale: expected the machine's normalisation, got another"),
+        (change_joint(2, q_dot_down=0.5), r"scale: expected the machine's normalisation, got another"),
         (replace(BROKK_170, tool_speed=0.4), r"scale: expected the machine's normalisation"),
     ],
     ids=lambda value: value.split(":")[0] if isinstance(value, str) else "",
