@@ -20,9 +20,24 @@ SOURCES = ("paper", "maker", "assumed", "tuned")
 PWM_MAX = 127  # counts of full command; paper: [0,127] is positive, [255,128] negative
 
 
-def _number(unit: str, default: Any = dataclasses.MISSING) -> Any:
-    """A dataclass field that carries its unit."""
-    return dataclasses.field(default=default, metadata={"unit": unit})
+def _number(unit: str, low: float = -np.inf, high: float = np.inf) -> Any:
+    """A dataclass field with its unit and its range, both ends included; `int` means whole."""
+    return dataclasses.field(metadata={"unit": unit, "low": low, "high": high})
+
+
+def _numbers(owner: Machine | Joint | type[Joint] | type[Machine]) -> list[dataclasses.Field[Any]]:
+    return [field for field in dataclasses.fields(owner) if "unit" in field.metadata]
+
+
+def _check_number(field: dataclasses.Field[Any], label: str, value: Any) -> None:
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not ((whole or isinstance(value, float | np.floating)) and np.isfinite(value)):
+        raise ValueError(f"{label}: expected a finite number, got {value!r}")
+    if field.type == "int" and not whole:
+        raise ValueError(f"{label}: expected a whole number, got {value!r}")
+    low, high = field.metadata["low"], field.metadata["high"]
+    if not low <= value <= high:
+        raise ValueError(f"{label}: expected {low} to {high}, got {value!r}")
 
 
 @dataclass(frozen=True)
@@ -41,15 +56,26 @@ class Joint:
     theta: float = _number("rad")
     q_min: float = _number("rad")
     q_max: float = _number("rad")
-    cylinder_base: float = _number("m")
-    cylinder_rod: float = _number("m")
+    cylinder_base: float = _number("m", 0)
+    cylinder_rod: float = _number("m", 1e-6)
     cylinder_angle: float = _number("rad")
-    cylinder_area: float = _number("m^2")
-    speed_positive: float = _number("m/s")  # of the cylinder at full command
-    speed_negative: float = _number("m/s")
-    q_dot_up: float = _number("rad/s")  # fastest positive motion at the command limit, as logs show it
-    q_dot_down: float = _number("rad/s")  # fastest negative motion, a positive number
-    encoder_node: int = _number("CANopen node id")
+    cylinder_area: float = _number("m^2", 1e-9)
+    speed_positive: float = _number("m/s", 1e-9)  # of the cylinder at full command
+    speed_negative: float = _number("m/s", 1e-9)
+    q_dot_up: float = _number("rad/s", 1e-9)  # fastest positive motion at the command limit, as logs show it
+    q_dot_down: float = _number("rad/s", 1e-9)  # fastest negative motion, a positive number
+    encoder_node: int = _number("CANopen node id", 1, 127)
+
+    def check_range(self) -> None:
+        """Refuse an empty range, and one over which the cylinder's triangle does not stay open."""
+        if not self.q_min < self.q_max:
+            raise ValueError(f"{self.name}.q_max: expected above q_min = {self.q_min}, got {self.q_max!r}")
+        low, high = self.cylinder_angle + self.q_min, self.cylinder_angle + self.q_max
+        if self.cylinder_base > 0 and not 0 < low < high < np.pi:
+            raise ValueError(
+                f"{self.name}.cylinder_angle: expected the triangle's angle within (0, pi) "
+                f"over the joint's range, got {low:.3f} to {high:.3f}"
+            )
 
 
 @dataclass(frozen=True)
@@ -69,70 +95,46 @@ class Machine:
     sources: Mapping[str, str] = dataclasses.field(
         hash=False
     )  # field name of Machine or Joint -> one of SOURCES
-    rate: float = _number("Hz")  # control and logging rate
-    pwm_limit: int = _number("counts of 127")  # largest command that may leave the program
-    dead_zone: float = _number("of full command")
-    delay: float = _number("s")
-    spool_time: float = _number("s")
-    cylinder_time: float = _number("s")
-    ready_up_time: float = _number("s")
-    ready_down_time: float = _number("s")
-    ready_threshold: float = _number("1")
-    spool_idle: float = _number("of full stroke")
-    pump_flow: float = _number("m^3/s")
-    plant_dt: float = _number("s")  # explicit Euler step of the analytic plant
-    encoder_bits: int = _number("bits a turn")
-    velocity_samples: int = _number("samples")  # window of the causal velocity estimator
-    history: int = _number("samples")  # of q, q_dot and u that the nets and the policy see
-    tool_speed: float = _number("m/s")  # largest tool speed an operator may ask for
+    rate: float = _number("Hz", 1e-3)  # control and logging rate
+    pwm_limit: int = _number("counts of 127", 1, PWM_MAX)  # largest command that may leave the program
+    dead_zone: float = _number("of full command", 0, 0.99)
+    delay: float = _number("s", 0)
+    spool_time: float = _number("s", 1e-6)
+    cylinder_time: float = _number("s", 1e-6)
+    ready_up_time: float = _number("s", 1e-6)
+    ready_down_time: float = _number("s", 1e-6)
+    ready_threshold: float = _number("1", 0, 0.999)
+    spool_idle: float = _number("of full stroke", 0, 1)
+    pump_flow: float = _number("m^3/s", 1e-9)
+    plant_dt: float = _number("s", 1e-6, 1)  # explicit Euler step of the analytic plant
+    encoder_bits: int = _number("bits a turn", 1, 32)
+    velocity_samples: int = _number("samples", 2, 100)  # window of the causal velocity estimator
+    history: int = _number("samples", 2, 1000)  # of q, q_dot and u that the nets and the policy see
+    tool_speed: float = _number("m/s", 1e-9)  # largest tool speed an operator may ask for
     ground: float = _number("m")  # height of the ground in the base frame
-    valve_frame_id: int = _number("CAN id")
+    valve_frame_id: int = _number("CAN id", 0, 0x7FF)
 
     def __post_init__(self) -> None:
         """Refuse what cannot be a machine, naming field, wanted and got."""
-        if not self.joints:
-            raise ValueError("joints: expected at least one Joint, got none")
-        names = [joint.name for joint in self.joints]
-        if len(set(names)) != len(names):
-            raise ValueError(f"joints: expected different names, got {names}")
         if not any(joint.driven for joint in self.joints):
             raise ValueError("joints: expected at least one driven joint, got none")
-        owners: list[tuple[Machine | Joint, str]] = [(self, "")]
-        owners += [(joint, joint.name + ".") for joint in self.joints]
-        for owner, where in owners:
-            for field in dataclasses.fields(owner):
-                if "unit" in field.metadata:
-                    self._check_number(owner, field.name, where + field.name)
         object.__setattr__(self, "sources", dict(self.sources))  # a copy of its own
+        owners: list[tuple[Machine | Joint, str]] = [(self, "")]
+        owners += [(joint, f"{joint.name}.") for joint in self.joints]
+        for owner, where in owners:
+            for field in _numbers(owner):
+                _check_number(field, where + field.name, getattr(owner, field.name))
+                if (source := self.sources.get(field.name)) not in SOURCES:
+                    raise ValueError(f"sources[{field.name!r}]: expected one of {SOURCES}, got {source!r}")
+        for joint in self.joints:
+            joint.check_range()
         nodes = [joint.encoder_node for joint in self.joints]
-        if len(set(nodes)) != len(nodes):
-            raise ValueError(f"joints: expected different encoder nodes, got {nodes}")
+        for what, values in (("names", [*self.names]), ("encoder nodes", nodes)):
+            if len(set(values)) != len(values):
+                raise ValueError(f"joints: expected different {what}, got {values}")
         steps = self.dt / self.plant_dt
         if abs(steps - round(steps)) > 1e-6 or steps < 0.5:
             raise ValueError(f"plant_dt: expected 1/rate = {self.dt} to be a multiple, got {self.plant_dt}")
-
-    def _check_number(self, owner: Machine | Joint, field: str, label: str) -> None:
-        value = getattr(owner, field)
-        whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-        if not ((whole or isinstance(value, float | np.floating)) and np.isfinite(value)):
-            raise ValueError(f"{label}: expected a finite number, got {value!r}")
-        if field in _WHOLE and not whole:
-            raise ValueError(f"{label}: expected a whole number, got {value!r}")
-        if self.sources.get(field) not in SOURCES:
-            got = self.sources.get(field)
-            raise ValueError(f"sources[{field!r}]: expected one of {SOURCES}, got {got!r}")
-        low, high = _RANGES.get(field, (-np.inf, np.inf))
-        if not low <= value <= high:
-            raise ValueError(f"{label}: expected {low} to {high}, got {value!r}")
-        if field == "q_max" and isinstance(owner, Joint):
-            if not owner.q_min < value:
-                raise ValueError(f"{label}: expected above q_min = {owner.q_min}, got {value!r}")
-            angles = (owner.cylinder_angle + owner.q_min, owner.cylinder_angle + value)
-            if owner.cylinder_base > 0 and not 0 < angles[0] < angles[1] < np.pi:
-                raise ValueError(
-                    f"{owner.name}.cylinder_angle: expected the triangle's angle within (0, pi) "
-                    f"over the joint's range, got {angles[0]:.3f} to {angles[1]:.3f}"
-                )
 
     @property
     def n(self) -> int:
@@ -171,8 +173,9 @@ class Machine:
 
     @cached_property
     def _columns(self) -> dict[str, NDArray[np.float64]]:
-        fields = [f.name for f in dataclasses.fields(Joint) if "unit" in f.metadata]
-        columns = {name: np.array([getattr(j, name) for j in self.joints], float) for name in fields}
+        columns = {
+            f.name: np.array([getattr(j, f.name) for j in self.joints], float) for f in _numbers(Joint)
+        }
         for column in columns.values():
             column.setflags(write=False)
         return columns
@@ -187,36 +190,6 @@ class Machine:
         return self._columns[field]
 
 
-_WHOLE = {"encoder_node", "pwm_limit", "encoder_bits", "velocity_samples", "history", "valve_frame_id"}
-_RANGES: dict[str, tuple[float, float]] = {
-    "cylinder_base": (0, np.inf),
-    "cylinder_rod": (1e-6, np.inf),
-    "cylinder_area": (1e-9, np.inf),
-    "speed_positive": (1e-9, np.inf),
-    "speed_negative": (1e-9, np.inf),
-    "q_dot_up": (1e-9, np.inf),
-    "q_dot_down": (1e-9, np.inf),
-    "encoder_node": (1, 127),
-    "rate": (1e-3, np.inf),
-    "pwm_limit": (1, PWM_MAX),
-    "dead_zone": (0, 0.99),
-    "delay": (0, np.inf),
-    "spool_time": (1e-6, np.inf),
-    "cylinder_time": (1e-6, np.inf),
-    "ready_up_time": (1e-6, np.inf),
-    "ready_down_time": (1e-6, np.inf),
-    "ready_threshold": (0, 0.999),
-    "spool_idle": (0, 1),
-    "pump_flow": (1e-9, np.inf),
-    "plant_dt": (1e-6, 1),
-    "encoder_bits": (1, 32),
-    "velocity_samples": (2, 100),
-    "history": (2, 1000),
-    "tool_speed": (1e-9, np.inf),
-    "valve_frame_id": (0, 0x7FF),
-}
-
-
 def as_floats(values: ArrayLike) -> NDArray[np.floating]:
     """An array of floats; its float type is kept, whole numbers become float64."""
     array = np.asarray(values)
@@ -224,16 +197,9 @@ def as_floats(values: ArrayLike) -> NDArray[np.floating]:
 
 
 def limit_command(machine: Machine, u: ArrayLike) -> NDArray[np.floating]:
-    """The command that reaches the valve: whole PWM counts, within the limit.
+    """The command [-1, 1] that reaches the valve: whole PWM counts, clipped to +-pwm_limit/127.
 
-    Paper: Sec. 3.2 (65 %)
-
-    Args:
-        machine: whose `pwm_limit` holds.
-        u: wanted command in [-1, 1] of full, shape (...); beyond the limit it is clipped.
-
-    Returns:
-        Multiples of 1/127 within +-pwm_limit/127, shape and float type of `u`.
+    Shape and float type of `u`. Paper: Sec. 3.2 (65 %)
 
     Example:
         >>> limit_command(BROKK_170, [-1.0, 0.1]) * 127
@@ -246,12 +212,9 @@ def limit_command(machine: Machine, u: ArrayLike) -> NDArray[np.floating]:
 
 
 def encode_pwm(u: ArrayLike) -> NDArray[np.uint8]:
-    """Byte on the bus for a signed command: m >= 0 -> m, m < 0 -> 255 - |m|.
+    """Byte on the bus for a command `u` in [-1, 1] (...): m >= 0 -> m, m < 0 -> 255 - |m|.
 
     Paper: Sec. 3.2 (the pairs 80/175 and 50/205 sum to 255)
-
-    Args:
-        u: command in [-1, 1], shape (...), rounded to counts of 1/127.
 
     Raises:
         ValueError: a command outside [-1, 1] or not a number.
@@ -296,19 +259,11 @@ def read_encoder(machine: Machine, q: ArrayLike) -> NDArray[np.floating]:
 
 
 def estimate_velocity(q: ArrayLike, samples: int, dt: float) -> NDArray[np.floating]:
-    """Causal velocity: slope of the straight line fitted to the newest `samples` angles.
+    """Causal velocity [rad/s] (...): slope of the line through the newest `samples` angles `q` (..., T).
 
     The one estimator of the package: logs, environment and hardware all call it. A difference over
     one tick of a 12-bit encoder comes in steps of 0.031 rad/s at 20 Hz; four samples have a third
     of its noise and lag by 1.5 ticks.
-
-    Args:
-        q: angles [rad], newest last, at least `samples` of them, shape (..., >= samples).
-        samples: window length, at least 2.
-        dt: sampling period [s].
-
-    Returns:
-        Velocity [rad/s], shape (...).
 
     Example:
         >>> estimate_velocity([0.0, 0.1, 0.2, 0.3], samples=4, dt=0.05).round(6)
@@ -345,7 +300,7 @@ def _brokk_170() -> Machine:
     pairs = enumerate(zip(rows, drives, strict=True), 1)
     joints = tuple(Joint(*row, *drive, node) for node, (row, drive) in pairs)
     paper = dict.fromkeys(["rate", "pwm_limit", "dead_zone", "history"], "paper")
-    every = [f.name for c in (Joint, Machine) for f in dataclasses.fields(c) if "unit" in f.metadata]
+    every = [field.name for owner in (Joint, Machine) for field in _numbers(owner)]
     return Machine(
         name="brokk170",
         joints=joints,
