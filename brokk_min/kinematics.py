@@ -1,9 +1,9 @@
 """Hand-written Denavit-Hartenberg kinematics: frames, tool position, Jacobian, tool velocity.
 
-One forward pass (`_chain`) serves everything. It keeps a frame as four separate arrays (axes x, y,
-z and origin p, each with the 3 coordinates first), because whole-array arithmetic on such columns
-is several times faster than stacks of 4x4 products. Positions are in the base frame: z up, origin on
-the ground under the slew axis. The float type of `q` is kept.
+One forward pass (`_chain`) serves everything. It keeps a frame as four arrays (axes x, y, z and origin
+p, the 3 coordinates first): arithmetic on whole coordinates is several times faster than stacks of 4x4
+products. All results are in the base frame, z up, origin on the ground under the slew axis; angles `q`
+[rad] are (..., n) and keep their float type.
 """
 
 from __future__ import annotations
@@ -27,21 +27,17 @@ class Chain(NamedTuple):
     p: list[Array]
 
 
-def _angles(machine: Machine, q: ArrayLike, name: str = "q") -> Array:
+def _joints_first(machine: Machine, q: ArrayLike, name: str = "q") -> Array:
+    """Checked angles or rates as (n, ...), contiguous: each joint's arithmetic then runs at full speed."""
     angles = as_floats(q)
     if angles.ndim < 1 or angles.shape[-1] != machine.n:
         raise ValueError(f"{name}: expected (..., {machine.n}), got {angles.shape}")
-    return angles
-
-
-def _first(values: Array) -> Array:
-    """The last axis first, contiguous: arithmetic on whole coordinates then runs at full speed."""
-    return np.ascontiguousarray(np.moveaxis(values, -1, 0))
+    return np.ascontiguousarray(np.moveaxis(angles, -1, 0))
 
 
 def _chain(machine: Machine, q: ArrayLike) -> Chain:
     """All frames of the arm by the DH rows, T_i = T_(i-1) Rz(q + theta) Tz(d) Tx(a) Rx(alpha)."""
-    angles = _first(_angles(machine, q))
+    angles = _joints_first(machine, q)
     x, y, z = np.eye(3, dtype=angles.dtype).reshape(3, 3, *[1] * (angles.ndim - 1))
     p = np.zeros_like(x)  # the base: shape (3, 1, ...), spread over the batch by the arithmetic
     chain = Chain([x], [y], [z], [p])
@@ -59,16 +55,9 @@ def _chain(machine: Machine, q: ArrayLike) -> Chain:
 
 
 def frames(machine: Machine, q: ArrayLike) -> Array:
-    """Homogeneous frames of the base, of each link's end and (last) of the tool.
+    """Homogeneous frames [1, m] of the base, each link's end and (last) the tool, (..., n + 1, 4, 4).
 
     Paper: Fig. 1
-
-    Args:
-        machine: n joints.
-        q: joint angles [rad], shape (..., n).
-
-    Returns:
-        Shape (..., n + 1, 4, 4) in the base frame [1, m].
 
     Example:
         >>> from brokk_min.machine import BROKK_170
@@ -85,9 +74,7 @@ def frames(machine: Machine, q: ArrayLike) -> Array:
 
 
 def tool_position(machine: Machine, q: ArrayLike) -> Array:
-    """Position of the tool tip [m] in the base frame for angles `q` [rad] (..., n); shape (..., 3).
-
-    Paper: Fig. 1
+    """Position of the tool tip [m], (..., 3). Paper: Fig. 1
 
     Example:
         >>> from brokk_min.machine import BROKK_170
@@ -112,16 +99,7 @@ def _columns(chain: Chain) -> list[Array]:
 
 
 def jacobian(machine: Machine, q: ArrayLike) -> Array:
-    """Geometric Jacobian of the tool position by the driven joints.
-
-    Paper: eq3 (J)
-
-    Args:
-        machine: n joints, n_driven of them driven.
-        q: joint angles [rad], shape (..., n).
-
-    Returns:
-        d(tool position)/d(driven angles) [m/rad], shape (..., 3, n_driven), base frame.
+    """d(tool position)/d(driven angles) [m/rad], (..., 3, n_driven). Paper: eq3 (J)
 
     Example:
         >>> from brokk_min.machine import BROKK_170
@@ -139,19 +117,18 @@ def tool_state(machine: Machine, q: ArrayLike, q_dot: ArrayLike) -> tuple[Array,
 
     Args:
         machine: n joints.
-        q: joint angles [rad], shape (..., n).
-        q_dot: joint velocities [rad/s], shape (..., n), of all joints, locked ones included.
+        q: angles [rad], (..., n).
+        q_dot: velocities [rad/s] of all joints, locked ones included, (..., n).
 
     Returns:
-        Tool position [m] (..., 3), tool velocity [m/s] (..., 3), and the height [m] (...) of the
-        lowest end of a link, all in the base frame. Links are taken as straight between frames.
+        Tool position [m] (..., 3), tool velocity [m/s] (..., 3), height [m] (...) of the lowest frame.
 
     Example:
         >>> from brokk_min.machine import BROKK_170
         >>> tool_state(BROKK_170, np.zeros(5), np.eye(5)[0])[1].round(2) + 0.0
         array([0.  , 2.35, 0.  ])
     """
-    rates = _first(_angles(machine, q_dot, "q_dot"))
+    rates = _joints_first(machine, q_dot, "q_dot")
     chain = _chain(machine, q)
     velocity = np.zeros_like(chain.p[-1])
     for column, rate in zip(_columns(chain), rates, strict=True):
@@ -160,18 +137,12 @@ def tool_state(machine: Machine, q: ArrayLike, q_dot: ArrayLike) -> tuple[Array,
 
 
 def tool_velocity(machine: Machine, q: ArrayLike, q_dot: ArrayLike) -> Array:
-    """Velocity of the tool tip [m/s] (..., 3), the second value of `tool_state`.
-
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> tool_velocity(BROKK_170, np.zeros((2, 5)), np.zeros((2, 5))).shape
-        (2, 3)
-    """
+    """Velocity of the tool tip [m/s] (..., 3): the second value of `tool_state`."""
     return tool_state(machine, q, q_dot)[1]
 
 
 def lowest_point(machine: Machine, q: ArrayLike) -> Array:
-    """Height [m] of the lowest link end above the base frame's origin, shape (...).
+    """Height [m] of the lowest end of a link, (...); links are straight between their frames.
 
     Example:
         >>> from brokk_min.machine import BROKK_170

@@ -92,9 +92,7 @@ class Machine:
 
     name: str
     joints: tuple[Joint, ...]
-    sources: Mapping[str, str] = dataclasses.field(
-        hash=False
-    )  # field name of Machine or Joint -> one of SOURCES
+    sources: Mapping[str, str] = dataclasses.field(hash=False)  # name of a number -> one of SOURCES
     rate: float = _number("Hz", 1e-3)  # control and logging rate
     pwm_limit: int = _number("counts of 127", 1, PWM_MAX)  # largest command that may leave the program
     dead_zone: float = _number("of full command", 0, 0.99)
