@@ -11,9 +11,7 @@ from __future__ import annotations
 import csv
 import os
 import tempfile
-import zipfile
-import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -24,6 +22,7 @@ from numpy.typing import NDArray
 from brokk_min.machine import estimate_velocity
 
 Floats = NDArray[np.float64]
+Table = dict[str, list[Any]]  # cells by column; row 2 of the file is cell 0
 RATE = 20.0  # Hz, paper: everything runs at 20 Hz
 MAX_GAP = 0.25  # s, assumed: a longer hole in the time stamps starts a new recording
 RETURN = "_return"
@@ -66,20 +65,6 @@ def whole_file(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
         raise
 
 
-# what zipfile and NumPy raise on damaged files, besides OSError and ValueError
-_DAMAGE = (
-    OSError,
-    ValueError,
-    EOFError,
-    KeyError,
-    AttributeError,
-    TypeError,
-    RuntimeError,
-    zlib.error,
-    zipfile.BadZipFile,
-)
-
-
 def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """All arrays of an `.npz` file; nothing in it is executed.
 
@@ -89,7 +74,7 @@ def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
     try:
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
-    except _DAMAGE as error:
+    except Exception as error:  # zipfile, zlib and NumPy raise anything on damaged files
         raise ValueError(f"{path}: expected a readable .npz file, got {error!r}") from error
 
 
@@ -124,162 +109,98 @@ def write_log(path: Path, log: Log) -> None:
 def read_log(paths: Sequence[Path], velocity_samples: int, joints: Sequence[str] | None = None) -> Log:
     """Read tables of one machine, check them, and bring them to `RATE`.
 
-    Command held, angle interpolated (DESIGN: resampled to 20 Hz). Without q_dot columns the causal
-    estimator supplies velocities. Recordings are cut at gaps longer than `MAX_GAP`.
+    Command held, angle interpolated (DESIGN: resampled to 20 Hz). A gap longer than `MAX_GAP` cuts a
+    recording in two. Without q_dot columns the causal estimator supplies velocities: a recording is
+    taken to start at rest; what follows a gap is not, and loses the rows that would need samples of it.
 
     Args:
-        paths: tables with the same columns.
+        paths: tables of the same joints.
         velocity_samples: window of `estimate_velocity`.
-        joints: names that must be there, in the wanted order; None: those of the first file.
+        joints: names that must be there, in the wanted order; None: all, in the order of the first file.
 
     Raises:
         ValueError: with file, row (1 is the header) and column of the first thing that is wrong.
     """
-    recordings: list[Recording] = []
-    logged: bool | None = None
+    names, recordings, logged = tuple(joints or ()), list[Recording](), set[bool]()
     for path in map(Path, paths):
-        columns = _read_csv(path, _is_number) if path.suffix.lower() == ".csv" else _read_npz(path)
-        joints = tuple(joints) if joints is not None else _joints(path, columns)
-        has_velocity = _check_columns(path, columns, joints)
-        if logged not in (None, has_velocity):
+        table = _read_csv(path) if path.suffix.lower() == ".csv" else _read_npz(path)
+        found = _joints(path, table) if joints is None else names
+        names = names or found
+        if set(found) != set(names):
+            raise ValueError(f"{path}: row 1: expected joints {list(names)}, got {list(found)}")
+        has_velocity = any(f"q_dot_{joint}" in table for joint in names)
+        logged.add(has_velocity)
+        if len(logged) > 1:
             raise ValueError(f"{path}: expected q_dot columns in all files or none, got a mixture")
-        logged = has_velocity
-        recordings += _recordings(path, columns, joints, has_velocity, velocity_samples)
-    if not recordings or joints is None:
+        recordings += _recordings(path, table, names, has_velocity, velocity_samples)
+    if not recordings:
         raise ValueError(f"{', '.join(map(str, paths))}: expected at least one recording, got none")
-    return Log(tuple(joints), tuple(recordings), bool(logged))
+    return Log(names, tuple(recordings), True in logged)
 
 
-def _is_number(column: str) -> bool:
-    return column == "time" or column.startswith(("u_", "q_"))
-
-
-def _read_csv(path: Path, is_number: Callable[[str], bool]) -> dict[str, NDArray[Any]]:
-    try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.reader(file))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"{path}: expected a readable CSV table, got {error}") from error
-    while rows and not rows[-1]:  # blank lines at the end
-        rows.pop()
-    if len(rows) < 2:
-        raise ValueError(f"{path}: expected a header and at least one row, got {len(rows)} rows")
-    header = [name.strip() for name in rows[0]]
-    if len(set(header)) != len(header):
-        twice = sorted({name for name in header if header.count(name) > 1})
-        raise ValueError(f"{path}: row 1: expected each column once, got {twice} more than once")
-    for number, row in enumerate(rows[1:], 2):
-        if len(row) != len(header):
-            raise ValueError(f"{path}: row {number}: expected {len(header)} cells, got {len(row)}")
-    cells = zip(*rows[1:], strict=True)
-    return {
-        name: np.array(column) if not is_number(name) else _numbers(path, name, column)
-        for name, column in zip(header, cells, strict=True)
-    }
-
-
-def _numbers(path: Path, name: str, cells: Sequence[str]) -> Floats:
-    try:
-        return np.array(list(map(float, cells)))
-    except ValueError:
-        for number, cell in enumerate(cells, 2):
-            try:
-                float(cell)
-            except ValueError:
-                where = f"{path}: row {number}, column {name}"
-                raise ValueError(f"{where}: expected a number, got {cell!r}") from None
-        raise
-
-
-def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
-    columns = load_arrays(path)
-    shapes = {name: column.shape for name, column in columns.items()}
-    if len(set(shapes.values())) != 1 or len(next(iter(shapes.values()))) != 1:
-        raise ValueError(f"{path}: expected columns of one length, got {shapes}")
-    for name, column in columns.items():
-        wanted = "U" if name == "run" else "iuf"
-        if column.dtype.kind not in wanted:
-            kind = "text" if name == "run" else "numbers"
-            raise ValueError(f"{path}: column {name}: expected {kind}, got {column.dtype}")
-    return {name: c if name == "run" else c.astype(float) for name, c in columns.items()}
-
-
-def _joints(path: Path, columns: dict[str, NDArray[Any]]) -> tuple[str, ...]:
-    names = tuple(name[2:] for name in columns if name.startswith("u_"))
-    if not names:
-        raise ValueError(f"{path}: row 1: expected columns u_<joint>, got {list(columns)}")
-    return names
-
-
-def _check_columns(path: Path, columns: dict[str, NDArray[Any]], joints: Sequence[str]) -> bool:
-    """Check names and values; True if the table has velocities."""
-    velocities = [f"q_dot_{joint}" for joint in joints]
-    has_velocity = any(name in columns for name in velocities)
-    wanted = ["run", "time", *(f"u_{j}" for j in joints), *(f"q_{j}" for j in joints)]
-    for name in wanted + velocities * has_velocity:
-        if name not in columns:
-            raise ValueError(f"{path}: row 1: expected a column {name}, got {list(columns)}")
-        if name != "run":
-            bound = 1.0 + 1e-6 if name.startswith("u_") else np.inf
-            good = np.isfinite(columns[name]) & (np.abs(columns[name]) <= bound)
-            if not good.all():
-                row = int(np.argmin(good))
-                what = "a command in [-1, 1]" if name.startswith("u_") else "a finite number"
-                where = f"{path}: row {row + 2}, column {name}"
-                raise ValueError(f"{where}: expected {what}, got {columns[name][row]}")
-    return has_velocity
+def _joints(path: Path, table: Table) -> tuple[str, ...]:
+    """Joints of a table by its u columns; an angle or a velocity without a command is refused."""
+    joints = tuple(name[2:] for name in table if name.startswith("u_"))
+    if not joints:
+        raise ValueError(f"{path}: row 1: expected columns u_<joint>, got {list(table)}")
+    known = {kind + joint for kind in ("q_", "q_dot_") for joint in joints}
+    for name in table:
+        if name.startswith("q_") and name not in known:
+            missing = "u_" + name.removeprefix("q_").removeprefix("dot_")
+            raise ValueError(f"{path}: row 1: expected a column {missing} beside {name}, got {list(table)}")
+    return joints
 
 
 def _recordings(
-    path: Path,
-    columns: dict[str, NDArray[Any]],
-    joints: Sequence[str],
-    has_velocity: bool,
-    velocity_samples: int,
-) -> list[Recording]:
-    result = []
-    runs, first, inverse = np.unique(columns["run"], return_index=True, return_inverse=True)
-    groups = np.split(np.argsort(inverse, kind="stable"), np.cumsum(np.bincount(inverse))[:-1])
-    for index in np.argsort(first):
-        run, rows = runs[index], groups[index]
-        step = np.diff(columns["time"][rows])
-        if not (step > 0).all():
-            last = int(np.argmin(step > 0))
-            before, after = columns["time"][rows[last : last + 2]]
-            raise ValueError(
-                f"{path}: row {rows[last + 1] + 2}, column time: expected later than {before} "
-                f"within run {str(run)!r}, got {after}"
-            )
-        if len(step) and np.median(step) > 1.05 / RATE:
-            raise ValueError(
-                f"{path}: row {rows[0] + 2}, column time: expected {RATE:g} Hz or more in run "
-                f"{str(run)!r}, got {1 / np.median(step):.3g} Hz"
-            )
-        if str(run).endswith(RETURN):
-            continue
-        for part, piece in enumerate(np.split(rows, np.flatnonzero(step > MAX_GAP) + 1)):
-            table = {name: column[piece] for name, column in columns.items() if name != "run"}
-            name = str(run) + (f"#{part + 1}" if part else "")
-            result.append(_resample(name, table, joints, has_velocity, velocity_samples))
-    return result
+    path: Path, table: Table, joints: Sequence[str], logged: bool, samples: int
+) -> Iterator[Recording]:
+    """The checked recordings of one table at `RATE`, in the order in which they begin."""
+    time = _numbers(path, table, "time")
+    columns = {
+        kind: np.stack([_numbers(path, table, f"{kind}_{joint}", bound) for joint in joints], axis=1)
+        for kind, bound in (("u", 1.0), ("q", np.inf), ("q_dot", np.inf))[: 3 if logged else 2]
+    }
+    runs: dict[str, list[int]] = {}
+    for row, run in enumerate(_cells(path, table, "run")):
+        runs.setdefault(run, []).append(row)
+    for run, rows in runs.items():
+        gaps = _gaps(path, run, rows, time[rows])
+        for part, piece in enumerate(np.split(rows, gaps) if not run.endswith(RETURN) else ()):
+            arrays = _resample(time[piece], {k: c[piece] for k, c in columns.items()}, samples)
+            unknown = samples - 1 if part and not logged else 0  # rows that need samples of the gap
+            if len(arrays[0]) > unknown:
+                name = f"{run}#{part + 1}" if part else run
+                yield Recording(name, *(array[unknown:] for array in arrays))
 
 
-def _resample(
-    name: str, table: dict[str, Floats], joints: Sequence[str], has_velocity: bool, velocity_samples: int
-) -> Recording:
-    time = table["time"]
+def _gaps(path: Path, run: str, rows: Sequence[int], time: Floats) -> NDArray[np.intp]:
+    """Where a recording is to be cut; time stamps that do not rise fast enough are refused."""
+    step = np.diff(time)
+    if not (step > 0).all():
+        late = int(np.argmin(step > 0)) + 1
+        raise ValueError(
+            f"{path}: row {rows[late] + 2}, column time: expected later than {time[late - 1]} "
+            f"within run {run!r}, got {time[late]}"
+        )
+    if len(step) and np.median(step) > 1.05 / RATE:
+        raise ValueError(
+            f"{path}: row {rows[0] + 2}, column time: expected {RATE:g} Hz or more in run "
+            f"{run!r}, got {1 / np.median(step):.3g} Hz"
+        )
+    return np.flatnonzero(step > MAX_GAP) + 1
+
+
+def _resample(time: Floats, columns: dict[str, Floats], samples: int) -> tuple[Floats, ...]:
+    """u held, q and q_dot interpolated at `RATE`; q_dot estimated where the log has none."""
     grid = time[0] + np.arange(int((time[-1] - time[0]) * RATE + 1e-6) + 1) / RATE
     held = np.searchsorted(time, grid + 1e-6, side="right") - 1
 
-    def column(kind: str, sample: Callable[[Floats], Floats]) -> Floats:
-        return np.stack([sample(table[f"{kind}_{joint}"]) for joint in joints], axis=1)
+    def between(values: Floats) -> Floats:
+        return np.stack([np.interp(grid, time, column) for column in values.T], axis=1)
 
-    def interpolate(values: Floats) -> Floats:
-        return np.interp(grid, time, values)
-
-    q = column("q", interpolate)
-    q_dot = column("q_dot", interpolate) if has_velocity else velocity_of(q, velocity_samples)
-    return Recording(name, column("u", lambda values: values[held]), q, q_dot)
+    q = between(columns["q"])
+    q_dot = between(columns["q_dot"]) if "q_dot" in columns else velocity_of(q, samples)
+    return columns["u"][held], q, q_dot
 
 
 def velocity_of(q: Floats, samples: int) -> Floats:
@@ -300,12 +221,64 @@ def read_table(path: Path, columns: Sequence[str], text: Sequence[str] = ()) -> 
     Raises:
         ValueError: with file, row and column of the first thing that is wrong.
     """
-    table = _read_csv(Path(path), lambda name: name in columns and name not in text)
-    for name in columns:
-        if name not in table:
-            raise ValueError(f"{path}: row 1: expected a column {name}, got {list(table)}")
-        if name not in text and not (good := np.isfinite(table[name])).all():
-            row = int(np.argmin(good))
-            where = f"{path}: row {row + 2}, column {name}"
-            raise ValueError(f"{where}: expected a finite number, got {table[name][row]}")
-    return table
+    table = _read_csv(Path(path))
+    return {
+        name: np.array(_cells(path, table, name)) if name in text else _numbers(path, table, name)
+        for name in columns
+    }
+
+
+def _read_csv(path: Path) -> Table:
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.reader(file))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{path}: expected a readable CSV table, got {error}") from error
+    while rows and not rows[-1]:  # blank lines at the end
+        rows.pop()
+    if len(rows) < 2:
+        raise ValueError(f"{path}: expected a header and at least one row, got {len(rows)} rows")
+    header = [name.strip() for name in rows[0]]
+    if twice := sorted({name for name in header if header.count(name) > 1}):
+        raise ValueError(f"{path}: row 1: expected each column once, got {twice} more than once")
+    for number, row in enumerate(rows[1:], 2):
+        if len(row) != len(header):
+            raise ValueError(f"{path}: row {number}: expected {len(header)} cells, got {len(row)}")
+    return dict(zip(header, map(list, zip(*rows[1:], strict=True)), strict=True))
+
+
+def _read_npz(path: Path) -> Table:
+    columns = load_arrays(path)
+    shapes = {name: column.shape for name, column in columns.items()}
+    if len(set(shapes.values())) != 1 or len(next(iter(shapes.values()))) != 1:
+        raise ValueError(f"{path}: expected columns of one length, got {shapes}")
+    for name, column in columns.items():
+        wanted, kind = ("text", "U") if name == "run" else ("numbers", "iuf")
+        if column.dtype.kind not in kind:
+            raise ValueError(f"{path}: column {name}: expected {wanted}, got {column.dtype}")
+    return {name: column.tolist() for name, column in columns.items()}
+
+
+def _cells(path: Path, table: Table, name: str) -> list[Any]:
+    if name not in table:
+        raise ValueError(f"{path}: row 1: expected a column {name}, got {list(table)}")
+    return table[name]
+
+
+def _numbers(path: Path, table: Table, name: str, bound: float = np.inf) -> Floats:
+    """One column as finite numbers within +-bound; the first cell that is none is named."""
+    cells = _cells(path, table, name)
+    numbers = np.array([_number(cell) for cell in cells])
+    good = np.isfinite(numbers) & (np.abs(numbers) <= bound + 1e-6)
+    if not good.all():
+        row = int(np.argmin(good))
+        wanted = "a finite number" if bound == np.inf else f"a number in [-{bound:g}, {bound:g}]"
+        raise ValueError(f"{path}: row {row + 2}, column {name}: expected {wanted}, got {cells[row]!r}")
+    return numbers
+
+
+def _number(cell: str | float) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        return float("nan")

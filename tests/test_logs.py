@@ -236,10 +236,32 @@ def test_gaps_cut_a_recording(tmp_path):
     columns = table("x", time)
     first, second = read_log([write(tmp_path / "log.npz", columns)], 4).recordings
     assert first.name == "x" and second.name != "x" and second.name.startswith("x")
-    np.testing.assert_allclose(second.q[:, 0], columns["q_a"][60:], atol=1e-9)
-    np.testing.assert_allclose(second.q_dot[0], 0.0)  # nothing is known of before the gap
-    assert len(first.q) == 60 + 3
+    np.testing.assert_allclose(second.q[:, 0], columns["q_a"][63:], atol=1e-9)
+    assert len(first.q) == len(first.q_dot) == 60 + 3
     np.testing.assert_allclose(first.u[29:33, 0], columns["u_a"][29])  # held over the hole
+
+
+@pytest.mark.parametrize("samples", [2, 4, 7])
+def test_a_joint_in_motion_behind_a_gap_is_never_taken_to_rest(tmp_path, samples):
+    time = np.arange(90) / 20
+    time[60:] += 1.0
+    columns = table("x", time, 0, ("a",)) | {"q_a": 0.3 * time, "u_a": np.arange(90) / 90}
+    first, second = read_log([write(tmp_path / "log.npz", columns)], samples).recordings
+    np.testing.assert_allclose(second.q_dot, 0.3, atol=1e-9)
+    np.testing.assert_allclose(second.u[:, 0], columns["u_a"][59 + samples :])
+    assert first.q_dot[0, 0] == 0.0  # a recording is taken to start at rest
+    logged = columns | {"q_dot_a": np.full(90, 0.3)}
+    _, whole = read_log([write(tmp_path / "log.npz", logged)], samples).recordings
+    assert len(whole.q) == 30  # nothing is unknown
+
+
+def test_too_little_between_two_gaps_is_left_out(tmp_path):
+    time = np.arange(40) / 20
+    time[20:] += 1.0
+    time[23:] += 1.0
+    path = write(tmp_path / "log.csv", table("x", time))
+    assert [len(r.q) for r in read_log([path], 4).recordings] == [20, 14]
+    assert [len(r.q) for r in read_log([path], 3).recordings] == [20, 1, 15]
 
 
 def test_interleaved_recordings_are_told_apart(tmp_path):
@@ -305,13 +327,18 @@ BAD_CSV = {
     ),
     "no time": (GOOD.replace("time", "t"), ["row 1", "a column time", "['run', 't', 'u_a', 'q_a']"]),
     "no command": (GOOD.replace("u_a", "a"), ["row 1", "u_<joint>", "['run', 'time', 'a', 'q_a']"]),
-    "no angle": (GOOD.replace("q_a", "q_b"), ["row 1", "a column q_a", "'q_b'"]),
+    "no angle": (GOOD.replace("q_a", "angle"), ["row 1", "a column q_a", "'angle'"]),
+    "angle of another joint": (GOOD.replace("q_a", "q_b"), ["row 1", "a column u_b beside q_b", "'u_a'"]),
+    "velocity of another joint": (
+        "run,time,u_a,q_a,q_dot_b\nx,0,0,0,0\nx,0.05,0,0,0\n",
+        ["row 1", "a column u_b beside q_dot_b"],
+    ),
     "text in a cell": (GOOD.replace("0.3", "off"), ["row 4", "column u_a", "number", "'off'"]),
     "empty cell": (GOOD.replace("1.1", ""), ["row 3", "column q_a", "number", "''"]),
     "decimal comma": (GOOD.replace("1.2", "1,2"), ["row 4", "expected 4 cells", "got 5"]),
     "NaN angle": (GOOD.replace("1.3", "nan"), ["row 5", "column q_a", "finite", "nan"]),
     "infinite angle": (GOOD.replace("1.0", "-inf"), ["row 2", "column q_a", "finite", "-inf"]),
-    "NaN time": (GOOD.replace("0.10", "NaN"), ["row 4", "column time", "finite", "nan"]),
+    "NaN time": (GOOD.replace("0.10", "NaN"), ["row 4", "column time", "finite", "NaN"]),
     "NaN command": (GOOD.replace("0.3", "nan"), ["row 4", "column u_a", "[-1, 1]", "nan"]),
     "repeated time": (GOOD.replace("0.10", "0.05"), ["row 4", "column time", "later than 0.05", "'x'"]),
     "backward time": (GOOD.replace("0.15", "0.02"), ["row 5", "column time", "later than 0.1", "0.02"]),
@@ -370,6 +397,26 @@ def test_a_joint_that_is_not_logged_is_refused(tmp_path):
     with pytest.raises(ValueError, match="expected a column u_boom") as caught:
         read_log([path], 4, joints=["a", "boom"])
     assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".npz"])
+@pytest.mark.parametrize("kind", ["q", "q_dot"])
+def test_a_joint_without_a_command_is_refused_unless_others_were_asked_for(tmp_path, suffix, kind):
+    columns = table("x", np.arange(30) / 20) | {"q_dot_a": np.zeros(30), "q_dot_b": np.zeros(30)}
+    path = write(tmp_path / f"log{suffix}", columns | {f"{kind}_boom": np.zeros(30)})
+    with pytest.raises(ValueError, match=f"row 1: expected a column u_boom beside {kind}_boom") as caught:
+        read_log([path], 4)
+    assert str(path) in str(caught.value)
+    assert read_log([path], 4, joints=["b"]).joints == ("b",)
+
+
+def test_a_joint_more_in_a_later_file_is_refused(tmp_path):
+    time = np.arange(30) / 20
+    paths = [write(tmp_path / f"{len(j)}.csv", table("x", time, 0, j)) for j in (("a",), ("a", "b"))]
+    with pytest.raises(ValueError, match=r"expected joints \['a'\], got \['a', 'b'\]") as caught:
+        read_log(paths, 4)
+    assert str(paths[1]) in str(caught.value)
+    assert read_log(paths, 4, joints=["a"]).joints == ("a",)
 
 
 def npz(**columns: np.ndarray) -> bytes:
