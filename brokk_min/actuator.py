@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,12 +17,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
-from brokk_min.logs import RATE, RETURN, Log, Recording, load_arrays, whole_file
-from brokk_min.machine import Machine, estimate_velocity, limit_command, read_encoder
+from brokk_min.logs import RATE, RETURN, Log, Recording, load_arrays, velocity_of, whole_file
+from brokk_min.machine import PWM_MAX, Machine, estimate_velocity, limit_command, read_encoder
 
 Array = NDArray[np.floating[Any]]
 FORMAT = 1  # of net files
 HORIZONS = (1, 5, 10, 30)  # s, of the free-run scores
+MAX_RETURN = 300.0  # s, assumed: a way back to the start that takes longer is broken off
 
 
 class PlantState(NamedTuple):
@@ -44,12 +46,8 @@ def plant_reset(machine: Machine, q: ArrayLike) -> PlantState:
     """
     q = np.array(q, float)
     zero = np.zeros_like(q)
-    ticks = -(-round(machine.delay / machine.plant_dt) // _substeps(machine))
-    return PlantState(q, zero, zero, zero, (zero,) * ticks)
-
-
-def _substeps(machine: Machine) -> int:
-    return max(1, round(machine.dt / machine.plant_dt))
+    ticks = np.ceil(round(machine.delay / machine.plant_dt) / round(machine.dt / machine.plant_dt))
+    return PlantState(q, zero, zero, zero, (zero,) * int(ticks))
 
 
 def lever_arm(machine: Machine, q: ArrayLike) -> Array:
@@ -70,26 +68,19 @@ def lever_arm(machine: Machine, q: ArrayLike) -> Array:
 
 
 def plant_step(machine: Machine, state: PlantState, u: ArrayLike) -> PlantState:
-    """One tick of the analytic plant under the held command `u`, by explicit Euler steps.
+    """One tick of the analytic plant under the held command `u` [-1, 1] (..., n), by explicit Euler steps.
 
-    Spool with dead zone, readiness of an idle valve, shared pump flow, cylinder speed, lever arm.
+    Spool with dead zone, readiness of an idle valve, shared pump flow, cylinder speed, lever arm. A
+    command reaches the valve after `machine.delay`.
 
     Paper: eq1 and Sec. 3.2 (range, direction, coupling, past movement)
-
-    Args:
-        machine: parameters of the plant.
-        state: before the tick, arrays (..., n).
-        u: command in [-1, 1] of full, shape (..., n), reaching the valve after `machine.delay`.
-
-    Returns:
-        The state 1/rate seconds later.
     """
     m, dt = machine, machine.plant_dt
     q, speed, spool, ready, _ = state
     commands = (np.array(u, float), *state.pending)  # a copy: it outlives the call
     up, down = m.column("speed_positive"), m.column("speed_negative")
     q_min, q_max, area = m.column("q_min"), m.column("q_max"), m.column("cylinder_area")
-    steps, lag = _substeps(m), round(m.delay / dt)
+    steps, lag = round(m.dt / dt), round(m.delay / dt)
     for i in range(steps):
         a = commands[-((i - lag) // steps)]
         opening = np.sign(a) * np.maximum(0.0, (np.abs(a) - m.dead_zone) / (1 - m.dead_zone))
@@ -115,16 +106,12 @@ def plant_velocity(machine: Machine, state: PlantState) -> Array:
 
 
 def speed_limits(machine: Machine, q: ArrayLike) -> tuple[Array, Array]:
-    """Steady joint velocities [rad/s] of the plant at the two command limits, (..., n) each.
-
-    Args:
-        machine: n joints.
-        q: angles [rad], (..., n), on which the lever arms depend.
+    """Steady velocities [rad/s] (..., n) of joints that move alone at angles `q`, at the command limits.
 
     Returns:
-        Fastest negative and fastest positive velocity of a joint that moves alone. Paper: eq1
+        Fastest negative and fastest positive velocity. Paper: eq1
     """
-    opening = (machine.pwm_limit / 127 - machine.dead_zone) / (1 - machine.dead_zone)
+    opening = (machine.pwm_limit / PWM_MAX - machine.dead_zone) / (1 - machine.dead_zone)
     arm = lever_arm(machine, q)
     speeds = -machine.column("speed_negative"), machine.column("speed_positive")
     down, up = (opening * speed / arm for speed in speeds)
@@ -136,14 +123,14 @@ def speed_limits(machine: Machine, q: ArrayLike) -> tuple[Array, Array]:
 
 def sine_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Array:
     """One sine of random amplitude (dead zone to limit) and frequency, (ticks,). Paper: Sec. 3.3."""
-    amplitude = rng.uniform(machine.dead_zone, machine.pwm_limit / 127)
+    amplitude = rng.uniform(machine.dead_zone, machine.pwm_limit / PWM_MAX)
     frequency, phase = rng.uniform(0.02, 0.5), rng.uniform(0, 2 * np.pi)
     return amplitude * np.sin(2 * np.pi * frequency * machine.dt * np.arange(ticks) + phase)
 
 
 def rich_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Array:
     """Sines over a wide band, held steps, fast random holds and pauses, small noise, (ticks,)."""
-    limit = machine.pwm_limit / 127
+    limit = machine.pwm_limit / PWM_MAX
     parts: list[Array] = []
     while sum(map(len, parts)) < ticks:
         length = int(rng.uniform(0.5, 4.0) / machine.dt)
@@ -168,30 +155,42 @@ def rich_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Arra
     return np.concatenate(parts)[:ticks]
 
 
-Command = Callable[[np.random.Generator, Machine, int], Array]
-EXCITATIONS: dict[str, Command] = {"sine": sine_command, "rich": rich_command}
+EXCITATIONS: dict[str, Callable[[np.random.Generator, Machine, int], Array]] = {
+    "sine": sine_command,
+    "rich": rich_command,
+}
+
+
+class _Recorder:
+    """The plant as a log sees it: commands in, encoder angles out, (rows, n) each tick, all kept."""
+
+    def __init__(self, machine: Machine, q: Array) -> None:
+        self.machine, self.state = machine, plant_reset(machine, q)
+        self.u: list[Array] = []
+        self.q = [read_encoder(machine, q)]  # one more than commands: the newest angle is not logged yet
+
+    def play(self, u: Array) -> None:
+        """One tick under the wanted commands `u`."""
+        self.u.append(limit_command(self.machine, u))
+        self.state = plant_step(self.machine, self.state, self.u[-1])
+        self.q.append(read_encoder(self.machine, self.state.q))
+
+    def recording(self, name: str, row: int, start: int = 0, end: int | None = None) -> Recording:
+        """Ticks `start` to `end` of one row, with estimated velocities."""
+        end = len(self.u) if end is None else end
+        u, q = (np.array([tick[row] for tick in tape[start:end]]) for tape in (self.u, self.q))
+        return Recording(name, u, q, velocity_of(q, self.machine.velocity_samples))
 
 
 def collect(
     machine: Machine, hours: float, excitation: str, rng: np.random.Generator, leg_s: float = 30.0
 ) -> Log:
-    """Record the analytic plant, one actuator at a time, `hours` for each, returns not counted.
+    """Record the analytic plant, one actuator at a time, `hours` for each, ways back not counted.
 
-    A leg ends at the joint's limit or after `leg_s`; the joint then returns (recordings named
-    `..._return`, dropped by `read_log`) and rests before the next leg. The sine excitation of the
-    paper starts every leg at home (mid range), the rich one at random angles.
-
-    Paper: Sec. 3.3
-
-    Args:
-        machine: what to record.
-        hours: driving time for each actuator [h].
-        excitation: a key of `EXCITATIONS`.
-        rng: draws commands and starts.
-        leg_s: longest leg [s].
-
-    Returns:
-        Angles as the encoders read them, commands in whole PWM counts.
+    A recording starts with `history` samples of an idle valve, then drives until the joint meets its limit
+    or for `leg_s`. The way back to its start, and the rest there until the valve is idle, is named
+    `..._return` and dropped by `read_log`. The paper's sines start at home (mid range), rich excitation
+    at random angles. Paper: Sec. 3.3
     """
     if excitation not in EXCITATIONS:
         raise ValueError(f"excitation: expected one of {list(EXCITATIONS)}, got {excitation!r}")
@@ -199,97 +198,54 @@ def collect(
         raise ValueError(f"rate: expected {RATE:g} Hz as in every log, got {machine.rate:g} Hz")
     if not 0 < hours < np.inf:
         raise ValueError(f"hours: expected above 0, got {hours}")
-    wanted = max(machine.history + 2, round(hours * 3600 * machine.rate))
-    rows = int(np.clip(wanted // 1200, 1, 100))
-    joint = np.repeat(np.arange(machine.n), rows)
-    legs = _Legs(
-        machine, EXCITATIONS[excitation], excitation == "rich", joint, rng, round(leg_s * machine.rate)
-    )
-    state = plant_reset(machine, np.tile(legs.home, (len(joint), 1)))
-    us: list[Array] = []
-    qs: list[Array] = []
-    leg: list[Any] = []
-    counted = np.zeros(len(joint), int)
-    with tqdm(total=wanted, desc=f"record ({excitation})", unit="tick", disable=None) as bar:
-        while counted.min() < -(-wanted // rows):
-            q = read_encoder(machine, state.q)
-            u = limit_command(machine, legs.command(q))
-            for tape, value in ((us, u), (qs, q), (leg, legs.number.copy())):
-                tape.append(value)
-            counted += legs.number % 2 == 0
-            state = plant_step(machine, state, u)
-            bar.update(rows * min(1, counted.min() - bar.n // rows))
-    return _cut(machine, joint, np.array(us), np.array(qs), np.array(leg), -(-wanted // rows))
+    wanted = max(machine.history + 2, round(hours * 3600 * machine.rate))  # samples of each joint
+    side_by_side = int(np.clip(wanted // 300, 1, 100))
+    counted = np.zeros(machine.n, int)
+    recordings: list[list[Recording]] = [[] for _ in machine.joints]
+    with tqdm(total=wanted * machine.n, desc=f"record ({excitation})", unit="sample", disable=None) as bar:
+        while counted.min() < wanted:
+            joint = np.repeat(np.flatnonzero(counted < wanted), side_by_side)
+            tape, back, home = _drive_legs(machine, joint, excitation, rng, round(leg_s * machine.rate))
+            for row, j in enumerate(joint):
+                if leg := min(back[row], wanted - counted[j]):
+                    name = f"{machine.names[j]}_{len(recordings[j]) // 2:03d}"
+                    recordings[j].append(tape.recording(name, row, 0, leg))
+                    recordings[j].append(tape.recording(name + RETURN, row, back[row], home[row]))
+                    counted[j] += leg
+                    bar.update(leg)
+    return Log(machine.names, tuple(r for of_joint in recordings for r in of_joint))
 
 
-class _Legs:
-    """Bookkeeping of many parallel recordings: even leg numbers drive, odd ones return."""
+def _drive_legs(
+    machine: Machine, joint: NDArray[np.intp], excitation: str, rng: np.random.Generator, ticks: int
+) -> tuple[_Recorder, NDArray[np.intp], NDArray[np.intp]]:
+    """Drive joint `joint[k]` of row k until it meets its limit or `ticks` are over, then back to its start.
 
-    def __init__(
-        self,
-        machine: Machine,
-        command: Command,
-        random_start: bool,
-        joint: NDArray[np.intp],
-        rng: np.random.Generator,
-        ticks: int,
-    ) -> None:
-        self.machine, self.make, self.random_start, self.joint = (machine, command, random_start, joint)
-        self.rng, self.ticks, self.each = rng, ticks, np.arange(len(joint))
-        self.q_min, self.q_max = machine.column("q_min"), machine.column("q_max")
-        self.home = (self.q_min + self.q_max) / 2
-        self.number, self.tick = np.zeros(len(joint), int), np.zeros(len(joint), int)
-        self.tape = np.stack([command(rng, machine, ticks) for _ in joint])
-        self.goal = self.home[joint].copy()
-        self.rest = np.zeros(len(joint), int)
-
-    def command(self, q: Array) -> Array:
-        """Commands (rows, n) for measured angles (rows, n); moves the legs on."""
-        machine, joint = self.machine, self.joint
-        angle, step = q[self.each, joint], 2 * machine.encoder_step
-        driving = self.number % 2 == 0
-        at_limit = (angle < self.q_min[joint] + step) | (angle > self.q_max[joint] - step)
-        ended = driving & ((self.tick >= self.ticks) | (at_limit & (self.tick > machine.rate)))
-        arrived = ~driving & (self.rest > machine.rate)
-        for row in np.flatnonzero(ended):
-            j = joint[row]
-            low, high = self.q_min[j], self.q_max[j]
-            self.goal[row] = self.rng.uniform(low, high) if self.random_start else self.home[j]
-        for row in np.flatnonzero(arrived):
-            self.tape[row] = self.make(self.rng, machine, self.ticks)
-        self.number += ended | arrived
-        self.tick[ended | arrived], self.rest[ended | arrived] = 0, 0
-        driving = self.number % 2 == 0
-        error = self.goal - angle
-        near = np.abs(error) < np.maximum(0.06, step)
-        self.rest = np.where(~driving & (near | (self.rest > 0)), self.rest + 1, 0)
-        back = np.where(self.rest > 0, 0.0, np.sign(error) * 0.35)
+    Returns:
+        What was recorded, and the ticks (rows,) at which the ways back begin and end.
+    """
+    low, high, row = machine.column("q_min"), machine.column("q_max"), np.arange(len(joint))
+    q = np.tile((low + high) / 2, (len(row), 1))
+    low, high = low[joint], high[joint]
+    if excitation == "rich":
+        q[row, joint] = rng.uniform(low, high)
+    start, near = q[row, joint], 2 * machine.encoder_step
+    commands = np.zeros((len(row), machine.history + ticks))
+    commands[:, machine.history :] = [EXCITATIONS[excitation](rng, machine, ticks) for _ in row]
+    slow = (machine.dead_zone + machine.pwm_limit / PWM_MAX) / 2
+    rest = round(5 * machine.ready_down_time * machine.rate)  # ticks until a valve is idle again
+    tape, back, rested = _Recorder(machine, q), np.full(len(row), commands.shape[1]), np.zeros(len(row), int)
+    while rested.min() < rest and len(tape.u) < commands.shape[1] + MAX_RETURN * machine.rate:
+        tick, angle = len(tape.u), tape.q[-1][row, joint]
+        at_limit = (angle < low + near) | (angle > high - near)
+        back[at_limit & (machine.history + machine.rate < tick) & (tick < back)] = tick
+        arrived = (np.abs(angle - start) < max(0.06, near)) | (rested > 0)
+        rested += arrived & (tick >= back)
+        homeward = np.where(arrived, 0.0, slow * np.sign(start - angle))
         u = np.zeros_like(q)
-        tape = self.tape[self.each, np.minimum(self.tick, self.ticks - 1)]
-        u[self.each, joint] = np.where(driving, tape, back)
-        self.tick += 1
-        return u
-
-
-def _cut(
-    machine: Machine, joint: NDArray[np.intp], u: Array, q: Array, leg: NDArray[np.int_], wanted: int
-) -> Log:
-    """Cut tapes (ticks, rows, n) into named recordings, `wanted` driving ticks a row."""
-    recordings = []
-    for row, j in enumerate(joint):
-        driven = 0
-        for number in range(leg[-1, row] + 1):
-            ticks = np.flatnonzero(leg[:, row] == number)
-            if number % 2 == 0:
-                ticks = ticks[: wanted - driven]
-                driven += len(ticks)
-            name = f"{machine.names[j]}_{row % (len(joint) // machine.n):02d}_{number // 2:03d}"
-            zero = np.zeros((len(ticks), machine.n))
-            piece = Recording(name + RETURN * (number % 2), u[ticks, row], q[ticks, row], zero)
-            recordings.append(piece)
-            if driven == wanted:
-                break
-    return Log(machine.names, tuple(recordings))
+        u[row, joint] = np.where(tick < back, commands[:, min(tick, commands.shape[1] - 1)], homeward)
+        tape.play(u)
+    return tape, back, len(tape.u) - rested + rest
 
 
 # --- history: what the nets, the policy and the hardware remember of the last 13 samples -----------
@@ -370,8 +326,7 @@ class ActuatorNet:
         Raises:
             ValueError: a joint without a net.
         """
-        missing = [name for name in joints if name not in self.joints]
-        if missing:
+        if not set(joints) <= set(self.joints):
             raise ValueError(f"joints: expected nets for {list(joints)}, got {list(self.joints)}")
         index = [self.joints.index(name) for name in joints]
         arrays = {name: getattr(self, name)[index] for name in _NET_ARRAYS}
@@ -379,13 +334,9 @@ class ActuatorNet:
         return replace(self, joints=tuple(joints), weights=weights, **arrays)
 
     def predict(self, history: Array) -> Array:
-        """Mean velocity over the coming tick [rad/s], so that q(t+dt) = q(t) + dt * velocity.
+        """Mean velocity over the coming tick [rad/s] (..., n), so that q(t+dt) = q(t) + dt * velocity.
 
-        Args:
-            history: shape (..., n, 3, H) after `push_command`.
-
-        Returns:
-            Shape (..., n).
+        `history` is what `push_command` left, (..., n, 3, H).
         """
         n, inputs = len(self.joints), 3 * self.history
         if history.shape[-3:] != (n, 3, self.history):
@@ -399,29 +350,29 @@ class ActuatorNet:
         velocity: Array = (low + (high - low) * fraction).T
         return velocity.reshape(history.shape[:-2])
 
-    @property
+    @cached_property
     def _folded(self) -> tuple[Array, ...]:
-        """Weights with the input normalisation folded into the first layer, computed once."""
-        if "folded" not in self.__dict__:
-            w1, b1, w2, b2, w3, b3 = self.weights
-            scaled = w1 / self.input_scale[..., None]
-            shift = b1 - np.einsum("ni,nih->nh", self.input_mean, scaled)
-            self.__dict__["folded"] = (scaled, shift[:, None], w2, b2[:, None], w3, b3[:, None])
-        folded: tuple[Array, ...] = self.__dict__["folded"]
-        return folded
-
-    def velocity(self, predicted: Array) -> Callable[[Array], Array]:
-        """How the nets' input velocity follows from angles (or, trained on q_dot, from `predicted`)."""
-        if self.velocity_logged:
-            return lambda angles: predicted
-        return lambda angles: estimate_velocity(angles, self.velocity_samples, 1 / self.rate)
+        """Weights with the normalisation of the inputs folded into the first layer."""
+        w1, b1, w2, b2, w3, b3 = self.weights
+        scaled = w1 / self.input_scale[..., None]
+        shift = b1 - np.einsum("ni,nih->nh", self.input_mean, scaled)
+        return scaled, shift[:, None], w2, b2[:, None], w3, b3[:, None]
 
     def step(self, history: Array, q: Array, u: ArrayLike) -> tuple[Array, Array]:
-        """One tick of the simulation: history (..., n, 3, H), angle and command (..., n) -> the next."""
+        """One tick of the simulation: history (..., n, 3, H), angle and command (..., n) -> the next.
+
+        No joint goes further than it went in training.
+        """
         history = push_command(history, u)
         predicted = self.predict(history)
         q = np.clip(q + predicted / self.rate, np.minimum(q, self.q_low), np.maximum(q, self.q_high))
-        return push_angle(history, q, self.velocity(predicted)), q
+
+        def velocity(angles: Array) -> Array:
+            if self.velocity_logged:
+                return predicted
+            return estimate_velocity(angles, self.velocity_samples, 1 / self.rate)
+
+        return push_angle(history, q, velocity), q
 
 
 _NET_ARRAYS = ("input_mean", "input_scale", "output_low", "output_high", "q_low", "q_high")
@@ -519,17 +470,27 @@ def fit(log: Log, config: FitConfig, seed: int, velocity_samples: int, machine: 
     """
     import torch
 
-    data, target, ends = _windows(log, config.history)
-    mean, scale = _statistics(data, ends, config.history)
-    low, high = np.array([[f(target[e]) for e in ends] for f in (np.min, np.max)])
-    margin = 0.05 * (high - low)
-    low, high = low - margin, high + margin
+    tape, n, history = _end_to_end(log), len(log.joints), config.history
+    every = tape.starts(history - 1, 1, 1)
+    ends = [every[moves] for moves in tape.moves[every].T]  # of each joint's windows
+    for name, end, target in zip(log.joints, ends, tape.target.T, strict=True):
+        if not len(end) or np.ptp(target[end]) == 0:
+            raise ValueError(
+                f"joint {name}: expected a recording of {history + 1} samples or more in which it "
+                "moves, got none"
+            )
+    data = np.stack([tape.whole.q.T, tape.whole.q_dot.T, tape.whole.u.T])  # (3, n, N)
+    mean = np.array([data[:, j, end].mean(axis=1) for j, end in enumerate(ends)])
+    scale = np.array([data[:, j, end].std(axis=1) for j, end in enumerate(ends)])
+    scale = np.where(scale > 1e-9, scale, 1.0)  # a channel that never changes
+    mean, scale = np.repeat(mean, history, axis=1), np.repeat(scale, history, axis=1)  # (n, 3 H)
+    low, high = np.array([[f(tape.target[end, j]) for j, end in enumerate(ends)] for f in (np.min, np.max)])
+    low, high = low - 0.05 * (high - low), high + 0.05 * (high - low)
 
     generator = torch.Generator().manual_seed(seed)
-    n, inputs, hidden = len(log.joints), 3 * config.history, config.hidden
-    sizes = [(inputs, hidden), (hidden, hidden), (hidden, 1)]
+    inputs, hidden = 3 * history, config.hidden
     weights: list[torch.Tensor] = []
-    for rows, columns in sizes:
+    for rows, columns in [(inputs, hidden), (hidden, hidden), (hidden, 1)]:
         bound = (6 / rows) ** 0.5  # He's uniform bound for ReLU
         weights.append((torch.rand(n, rows, columns, generator=generator) * 2 - 1) * bound)
         weights.append(torch.zeros(n, columns))
@@ -538,86 +499,77 @@ def fit(log: Log, config: FitConfig, seed: int, velocity_samples: int, machine: 
     optimizer = torch.optim.Adam(weights, lr=config.learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.steps)
 
-    series, targets = torch.tensor(data, dtype=torch.float32), torch.tensor(target)
-    lags = torch.arange(1 - config.history, 1)
+    series = torch.tensor(data, dtype=torch.float32).flatten(1)  # (3, n N): joint after joint
+    fractions = torch.tensor((tape.target - low) / (high - low), dtype=torch.float32).T.flatten()
     centre, width = torch.tensor(mean)[:, None].float(), torch.tensor(scale)[:, None].float()
-    floor, span = torch.tensor(low)[:, None], torch.tensor(high - low)[:, None]
-    choices = [torch.tensor(e) for e in ends]
+    choices, lags = [torch.tensor(end) for end in ends], torch.arange(1 - history, 1)
+    first = torch.arange(n)[:, None] * len(tape.target)
     for _ in tqdm(range(config.steps), desc="fit nets", unit="step", disable=None):
         picks = [torch.randint(len(c), (config.batch_size,), generator=generator) for c in choices]
-        at = torch.stack([c[pick] for c, pick in zip(choices, picks, strict=True)])
+        at = torch.stack([c[pick] for c, pick in zip(choices, picks, strict=True)]) + first
         x = series[:, at[..., None] + lags].permute(1, 2, 0, 3).reshape(n, -1, inputs)
         x = (x - centre) / width
         if config.noise:
-            x[..., config.history : 2 * config.history] += config.noise * (
-                torch.randn(n, config.batch_size, config.history, generator=generator)
+            x[..., history : 2 * history] += config.noise * (
+                torch.randn(n, config.batch_size, history, generator=generator)
                 + torch.randn(n, config.batch_size, 1, generator=generator)
             )
         for i in (0, 2):
             x = torch.relu(torch.baddbmm(weights[i + 1][:, None], x, weights[i]))
         y = torch.sigmoid(torch.baddbmm(weights[5][:, None], x, weights[4]))[..., 0]
-        wanted = ((targets[at] - floor) / span).float()
-        loss = ((y - wanted) ** 2).mean(dim=1).sum()
+        loss = ((y - fractions[at]) ** 2).mean(dim=1).sum()
         optimizer.zero_grad()
         torch.autograd.backward(loss)
         optimizer.step()
         schedule.step()
     if not all(torch.isfinite(weight).all() for weight in weights):
         raise ValueError("weights: expected finite numbers at the end of the fit, got nan or inf")
+    arrays = {"input_mean": mean, "input_scale": scale, "output_low": low, "output_high": high}
+    arrays |= {"q_low": tape.whole.q.min(axis=0), "q_high": tape.whole.q.max(axis=0)}
     return ActuatorNet(
         joints=log.joints,
-        history=config.history,
+        history=history,
         rate=RATE,
         velocity_samples=velocity_samples,
         velocity_logged=log.velocity_logged,
         machine=machine,
         seed=seed,
         settings=asdict(config),
-        input_mean=mean.astype(np.float32),
-        input_scale=scale.astype(np.float32),
-        output_low=low.astype(np.float32),
-        output_high=high.astype(np.float32),
-        q_low=np.min([r.q.min(axis=0) for r in log.recordings], axis=0).astype(np.float32),
-        q_high=np.max([r.q.max(axis=0) for r in log.recordings], axis=0).astype(np.float32),
         weights=tuple(weight.detach().numpy() for weight in weights),
+        **{name: array.astype(np.float32) for name, array in arrays.items()},
     )
 
 
-def _windows(log: Log, history: int) -> tuple[Array, Array, list[NDArray[np.intp]]]:
-    """Series (3, N) of all joints end to end, targets (N,), and where each joint's windows end.
+class _Tape(NamedTuple):
+    """The recordings of a log end to end, N samples in all; windows must not cross their seams."""
 
-    Windows never cross recordings, and only recordings in which the joint moves are used. Nothing is
-    copied `history` times: training gathers windows from the series batch by batch.
+    whole: Recording
+    target: Array  # (N, n), see `_end_to_end`
+    moves: NDArray[np.bool_]  # (N, n): in a recording in which the joint moves or is commanded
+    lengths: list[int]  # of the recordings
+
+    def starts(self, before: int, after: int, step: int) -> NDArray[np.intp]:
+        """Every `step`-th sample of each recording with `before` samples before and `after` after it."""
+        seams = np.cumsum([0, *self.lengths])
+        pieces = zip(seams, self.lengths, strict=False)
+        return np.concatenate([seam + np.arange(before, length - after, step) for seam, length in pieces])
+
+
+def _end_to_end(log: Log) -> _Tape:
+    """Join recordings, with what a net is to say at each sample.
+
+    That is the mean velocity [rad/s] over the coming tick, (q(t+dt) - q(t)) / dt, from encoder angles;
+    where the log has velocities of its own, q_dot(t+dt). The last sample of a recording has none.
     """
-    series: list[Array] = []
-    targets: list[Array] = []
-    ends: list[NDArray[np.intp]] = []
-    offset = 0
-    for j, name in enumerate(log.joints):
-        found: list[NDArray[np.intp]] = [np.empty(0, int)]
-        for r in log.recordings:
-            if len(r.q) < history + 1 or np.ptp(r.q[:, j]) == 0 == np.ptp(r.u[:, j]):
-                continue
-            following = r.q_dot[1:, j] if log.velocity_logged else np.diff(r.q[:, j]) * RATE
-            series.append(np.stack([r.q[:, j], r.q_dot[:, j], r.u[:, j]]))
-            targets.append(np.append(following, 0.0))
-            found.append(offset + np.arange(history - 1, len(r.q) - 1))
-            offset += len(r.q)
-        ends.append(np.concatenate(found))
-        if not len(ends[-1]) or np.ptp(np.concatenate(targets)[ends[-1]]) == 0:
-            raise ValueError(
-                f"joint {name}: expected a recording of {history + 1} samples or more in which it "
-                "moves, got none"
-            )
-    return np.concatenate(series, axis=1), np.concatenate(targets), ends
-
-
-def _statistics(data: Array, ends: list[NDArray[np.intp]], history: int) -> tuple[Array, Array]:
-    """Mean and scale of each input (n, 3 H), the same for all samples of a channel."""
-    mean = np.array([data[:, e].mean(axis=1) for e in ends])
-    scale = np.array([data[:, e].std(axis=1) for e in ends])
-    scale = np.where(scale > 1e-9, scale, 1.0)  # a channel that never changes
-    return np.repeat(mean, history, axis=1), np.repeat(scale, history, axis=1)
+    kinds = ([getattr(r, kind) for r in log.recordings] for kind in Recording._fields[1:])
+    whole = Recording("", *(np.concatenate(arrays) for arrays in kinds))
+    if log.velocity_logged:
+        target = np.roll(whole.q_dot, -1, axis=0)
+    else:
+        target = np.diff(whole.q, axis=0, append=0) * RATE
+    lengths = [len(r.q) for r in log.recordings]
+    moves = [np.ptp(r.u, axis=0) + np.ptp(r.q, axis=0) > 0 for r in log.recordings]
+    return _Tape(whole, target, np.repeat(moves, lengths, axis=0), lengths)
 
 
 # --- scores ---------------------------------------------------------------------------------------
@@ -652,56 +604,55 @@ def free_run(
 def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
     """One-step, persistence and free-run errors of nets on recordings, as in the fit JSON.
 
-    Each joint is scored on the recordings in which it is commanded or moves. Free runs start every
-    `horizon` seconds of each recording; `velocity_rmse` is over all their samples,
-    `position_error_median` is the median over segments of |angle error| at their end.
+    Each joint is scored on the recordings in which it is commanded or moves. `one_step_rmse` is the error
+    of the next tick's prediction from the recorded history against what the nets are fitted to: the mean
+    velocity over that tick by the encoders, or the next velocity of a log that has velocities.
+    `persistence_rmse` is the error of the newest velocity in that history against the same target.
+
+    Free runs start every `horizon` seconds of each recording; `velocity_rmse` is over all their samples,
+    between velocities as the history shows them (estimated or logged), `position_error_median` is the
+    median over segments of |angle error| at their end.
 
     Raises:
-        ValueError: joints that do not match, or no recording long enough for one step.
+        ValueError: joints or velocities of another kind than the nets', or no recording long enough.
     """
     if log.joints != net.joints:
         raise ValueError(f"joints: expected {list(net.joints)}, got {list(log.joints)}")
-    lengths = [len(r.q) for r in log.recordings]
-    offsets = np.cumsum([0, *lengths])
-    whole = Recording(
-        "", *(np.concatenate([getattr(r, k) for r in log.recordings]) for k in Recording._fields[1:])
-    )
-
-    moves = np.array([np.ptp(r.u, axis=0) + np.ptp(r.q, axis=0) > 0 for r in log.recordings])
-    moves |= ~moves.any(axis=0)  # a joint that rests everywhere is scored at rest
-
-    def segments(ticks: int) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-        """Starts (s,) of segments, and in which of them each joint moves (s, n)."""
-        pieces = [np.arange(net.history, length - ticks, ticks) for length in lengths]
-        where = np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces])
-        return np.concatenate(pieces).astype(int) + offsets[where], moves[where]
-
-    joints: dict[str, Any] = {name: {"free_run": {}} for name in log.joints}
-    starts, used = segments(1)
-    if not len(starts):
-        raise ValueError(f"log: expected a recording above {net.history + 1} samples, got {lengths[:9]}")
-    chunks = np.array_split(starts, -(-len(starts) // 8192))
-    one = np.concatenate([free_run(net, whole, chunk, 1)[1][0] for chunk in chunks])
-    for j, name in enumerate(log.joints):
-        mine = used[:, j]
-        truth, last = whole.q_dot[starts + 1, j][mine], whole.q_dot[starts, j][mine]
-        joints[name]["one_step_rmse"] = _rms(one[mine, j] - truth)
-        joints[name]["persistence_rmse"] = _rms(last - truth)
-    for horizon in HORIZONS:
+    if log.velocity_logged != net.velocity_logged:
+        raise ValueError(f"velocity_logged: expected {net.velocity_logged}, got {log.velocity_logged}")
+    tape = _end_to_end(log)
+    if not len(tape.starts(net.history, 1, 1)):
+        got = tape.lengths[:9]
+        raise ValueError(f"log: expected a recording above {net.history + 1} samples, got {got}")
+    moves = tape.moves | ~tape.moves.any(axis=0)  # a joint that rests everywhere is scored at rest
+    result: dict[str, Any] = {name: {"free_run": {}} for name in log.joints}
+    for horizon in tqdm((1 / net.rate, *HORIZONS), desc="score nets", unit="horizon", disable=None):
         ticks = round(horizon * net.rate)
-        starts, used = segments(ticks)
+        starts = tape.starts(net.history, ticks, ticks)
         if not len(starts):
             continue
-        angles, velocities = free_run(net, whole, starts, ticks)
+        chunks = np.array_split(starts, -(-len(starts) // 8192))  # bounds the memory
+        runs = [free_run(net, tape.whole, chunk, ticks) for chunk in chunks]
+        angles, velocities = (np.concatenate(run, axis=1) for run in zip(*runs, strict=True))
         later = starts + np.arange(1, ticks + 1)[:, None]
-        q_error, v_error = angles - whole.q[later], velocities - whole.q_dot[later]
+        q_error, v_error = angles - tape.whole.q[later], velocities - tape.whole.q_dot[later]
         for j, name in enumerate(log.joints):
-            if (mine := used[:, j]).any():
-                joints[name]["free_run"][str(horizon)] = {
+            mine = moves[starts, j]
+            if not mine.any():
+                continue
+            if ticks == 1:
+                error = v_error if net.velocity_logged else q_error * net.rate
+                same = tape.whole.q_dot[starts, j] - tape.target[starts, j]
+                result[name] |= {
+                    "one_step_rmse": _rms(error[0, mine, j]),
+                    "persistence_rmse": _rms(same[mine]),
+                }
+            else:
+                result[name]["free_run"][str(horizon)] = {
                     "velocity_rmse": _rms(v_error[:, mine, j]),
                     "position_error_median": float(np.median(np.abs(q_error[-1, mine, j]))),
                 }
-    return joints
+    return result
 
 
 def _rms(error: Array) -> float:
@@ -712,20 +663,19 @@ def task_log(machine: Machine, runs: int, seconds: float, rng: np.random.Generat
     """Recordings under commands like a policy's: reversals, small corrections, driven joints together.
 
     In every fifth recording the locked joints move instead: the machine lets them move only alone.
-
     Smoothed random levels held for 0.5 to 5 s, towards the nearer end of the range less often, so
     that the joints stay off their stops. For scoring only; no net is fitted to them.
     """
     q_min, q_max = machine.column("q_min"), machine.column("q_max")
-    shape, limit = (runs, machine.n), machine.pwm_limit / 127
-    state = plant_reset(machine, rng.uniform(0.8 * q_min + 0.2 * q_max, 0.2 * q_min + 0.8 * q_max, shape))
+    shape, limit = (runs, machine.n), machine.pwm_limit / PWM_MAX
+    start = rng.uniform(0.8 * q_min + 0.2 * q_max, 0.2 * q_min + 0.8 * q_max, shape)
     level, command, left = np.zeros(shape), np.zeros(shape), np.zeros(shape)
     smoothing, noise = rng.uniform(0.05, 0.6, shape), rng.uniform(0, 0.06, shape)
     locked_turn = (np.arange(runs) % 5 == 4)[:, None]
     moving = np.isin(np.arange(machine.n), machine.locked) == locked_turn
-    us, qs = [], []
+    tape = _Recorder(machine, start)
     for _ in range(round(seconds * machine.rate)):
-        fraction = (state.q - q_min) / (q_max - q_min)
+        fraction = (tape.q[-1] - q_min) / (q_max - q_min)
         up = rng.random(shape) > np.clip(1.5 * fraction - 0.25, 0, 1)
         drawn = np.where(up, 1, -1) * rng.uniform(0, limit, shape) * (rng.random(shape) < 0.85)
         near = np.where(up, fraction > 0.9, fraction < 0.1)
@@ -733,10 +683,5 @@ def task_log(machine: Machine, runs: int, seconds: float, rng: np.random.Generat
         left = np.where(left <= 0, rng.uniform(0.5, 5.0, shape), left) - machine.dt
         command = command + smoothing * (level - command)
         jitter = noise * rng.standard_normal(shape) * (level != 0)
-        u = limit_command(machine, moving * (command + jitter))
-        us.append(u)
-        qs.append(read_encoder(machine, state.q))
-        state = plant_step(machine, state, u)
-    zero = np.zeros((len(us), machine.n))
-    tapes = zip(np.array(us).swapaxes(0, 1), np.array(qs).swapaxes(0, 1), strict=True)
-    return Log(machine.names, tuple(Recording(f"task_{i:02d}", u, q, zero) for i, (u, q) in enumerate(tapes)))
+        tape.play(moving * (command + jitter))
+    return Log(machine.names, tuple(tape.recording(f"task_{i:02d}", i) for i in range(runs)))

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from strategies import machines, poses, reals
 
+from brokk_min import actuator
 from brokk_min.actuator import (
     EXCITATIONS,
     ActuatorNet,
@@ -340,7 +341,8 @@ def test_every_actuator_is_driven_as_long_as_asked_within_the_limits(collected, 
         np.testing.assert_allclose(angles, np.rint(angles), atol=1e-6)
         if not r.name.endswith("_return"):
             driven[name] += len(r.u)
-            assert len(r.u) <= 601
+            assert len(r.u) <= 613  # 13 samples at rest and 30 s
+        np.testing.assert_array_equal(r.q_dot, velocity_of(r.q, 4))
     for name, ticks in driven.items():
         assert 3600 <= ticks <= 3605, name  # 0.05 h at 20 Hz
 
@@ -364,13 +366,59 @@ def test_legs_end_at_a_limit_or_when_their_time_is_over(collected):
     log, tick = collected["rich"], 0.05 * BROKK_170.q_dot_max + 0.01
     low, high = BROKK_170.column("q_min") + tick, BROKK_170.column("q_max") - tick
     ended = [r for r in log.recordings if not r.name.endswith("_return")]
-    last = {r.name[:5]: r.name for r in ended}  # a joint and tape: its last leg is cut when done
+    last = {r.name[:2]: r.name for r in ended}  # of each joint: cut when the time is over
     for r in ended:
         if r.name in last.values():
             continue
         mine = next(i for i, joint in enumerate(log.joints) if r.name.startswith(joint))
         edge = r.q[-2:, mine]
-        assert len(r.q) >= 600 or edge.min() < low[mine] or edge.max() > high[mine], r.name
+        assert len(r.q) == 613 or edge.min() < low[mine] or edge.max() > high[mine], r.name
+        assert 33 < len(r.q) <= 613, r.name  # a second of driving at least
+
+
+def legs_of(log: Log) -> list[tuple[int, Recording, Recording]]:
+    """Joint, leg and way back of each pair but the last of each joint, whose leg is cut."""
+    named = {r.name: r for r in log.recordings}
+    last = {r.name[:2]: r.name.removesuffix("_return") for r in log.recordings}
+    pairs = [(r, named[r.name + "_return"]) for r in log.recordings if r.name + "_return" in named]
+    return [(log.joints.index(r.name[:2]), r, b) for r, b in pairs if r.name not in last.values()]
+
+
+@pytest.mark.parametrize("kind", ["sine", "rich"])
+def test_a_leg_begins_at_true_idle_and_the_rest_before_it_belongs_to_it(collected, kind):
+    """The first window of every leg is 13 samples at rest, then the first command."""
+    for r in collected[kind].recordings:
+        if not r.name.endswith("_return"):
+            assert not r.u[:13].any() and not np.ptp(r.q[:14], axis=0).any(), r.name
+            assert not np.abs(r.q_dot[:14]).max() > 1e-12, r.name
+    legs = legs_of(collected[kind])
+    assert len(legs) > 20
+    starts = [np.abs(leg.u[13:16, joint]).max() > BROKK_170.dead_zone for joint, leg, _ in legs]
+    assert np.mean(starts) > 0.5  # the others begin with a pause or near a sine's zero
+
+
+@pytest.mark.parametrize("kind", ["sine", "rich"])
+def test_a_way_back_goes_on_where_the_leg_ended_and_rests_at_its_start_until_idle(collected, kind):
+    for joint, leg, back in legs_of(collected[kind]):
+        assert np.abs(back.q[0] - leg.q[-1]).max() < 0.03, leg.name  # a tick at full speed
+        assert abs(back.q[-1, joint] - leg.q[0, joint]) < 0.1, leg.name
+        assert not back.u[-40:].any() and len(back.u) >= 40, leg.name  # 2 s, 5 times 0.4 s
+
+
+def test_ways_back_are_driven_halfway_between_dead_zone_and_limit():
+    for limit, counts in ((80, 44), (40, 24), (120, 64)):  # (0.07 + limit / 127) / 2
+        machine = replace(BROKK_170, pwm_limit=limit)
+        log = collect(machine, 0.004, "rich", np.random.default_rng(0))
+        back = np.concatenate([r.u for r in log.recordings if r.name.endswith("_return")])
+        assert set(np.rint(np.abs(back) * 127).ravel().tolist()) == {0, counts}
+
+
+def test_a_joint_too_slow_to_come_back_does_not_keep_the_recording_waiting(monkeypatch):
+    monkeypatch.setattr(actuator, "MAX_RETURN", 1.0)
+    log = collect(BROKK_170, 0.004, "sine", np.random.default_rng(0))
+    assert max(len(r.q) for r in log.recordings if r.name.endswith("_return")) <= 600 + 20
+    driven = sum(len(r.q) for r in log.recordings if not r.name.endswith("_return"))
+    assert driven == 5 * 288
 
 
 def test_rich_recordings_hold_pauses_and_sine_recordings_none(collected):
@@ -379,7 +427,7 @@ def test_rich_recordings_hold_pauses_and_sine_recordings_none(collected):
         for r in log.recordings:
             if r.name.endswith("_return"):
                 continue
-            moved = np.flatnonzero(np.concatenate([[1], r.u.any(axis=1), [1]]))
+            moved = np.flatnonzero(np.concatenate([[1], r.u[13:].any(axis=1), [1]]))
             longest = max(longest, int(np.diff(moved).max()) - 1)
         return longest
 
@@ -390,11 +438,13 @@ def test_rich_recordings_hold_pauses_and_sine_recordings_none(collected):
 def test_recorded_angles_are_those_before_the_command_beside_them(collected):
     """A replay of the commands through the plant gives the recorded angles, tick by tick."""
     home = (BROKK_170.column("q_min") + BROKK_170.column("q_max")) / 2
-    for log in collected.values():
+    for kind, log in collected.items():
         first = next(r for r in log.recordings if r.name.startswith("q5"))
-        state = plant_reset(BROKK_170, home)
+        start, tolerance = (home, 0.0) if kind == "sine" else (first.q[0], 2.0)  # known to a count
+        state = plant_reset(BROKK_170, np.where(np.arange(5) == Q5, start, home))
         for u, q in zip(first.u, first.q, strict=True):
-            np.testing.assert_array_equal(read_encoder(BROKK_170, state.q), q)
+            counts = (read_encoder(BROKK_170, state.q) - q) / BROKK_170.encoder_step
+            assert np.abs(counts).max() <= tolerance + 1e-6
             state = plant_step(BROKK_170, state, u)
 
 
@@ -786,12 +836,30 @@ def test_scores_of_a_net_that_says_one_velocity_by_hand():
         assert exact["position_error_median"] == pytest.approx(0.0, abs=1e-5)
 
 
-def test_one_step_through_the_estimator_by_hand():
-    """One angle 0.1 rad/s * 50 ms off weighs 1.5 / 5 / 50 ms in a slope of four: 0.03 rad/s."""
-    q = 0.1 * np.arange(60)[:, None] / 20
+def test_one_step_is_against_what_the_nets_are_fitted_to_by_hand():
+    """q = 0.1 t^2: in the tick from t it moves at 0.2 t + 0.005 rad/s, whatever an estimator says."""
+    time = np.arange(60)[:, None] / 20
+    q = 0.1 * time**2
     recording = Recording("x", np.zeros((60, 1)), q, velocity_of(q, 4))
-    result = score(constant_net([0.2], False, ("a",)), Log(("a",), (recording,)))
-    assert result["a"]["one_step_rmse"] == pytest.approx(0.03, abs=1e-5)
+    log = Log(("a",), (recording, recording._replace(name="y", q=q + 9.0)))
+    result = score(constant_net([0.2], False, ("a",)), log)["a"]
+    at = time[13:59]  # samples with 13 before and one after them
+    wanted = np.sqrt(np.mean((0.2 - (0.2 * at + 0.005)) ** 2))
+    assert result["one_step_rmse"] == pytest.approx(wanted, abs=1e-5)
+    # the slope through four samples lags by 1.5 ticks, and the target leads by half a tick: 0.2 * 2 / 20
+    assert result["persistence_rmse"] == pytest.approx(0.02, abs=1e-6)
+
+
+def test_scores_compare_velocities_of_one_kind():
+    with pytest.raises(ValueError, match="velocity_logged: expected True, got False"):
+        score(constant_net([0.2], True, ("a",)), Log(("a",), (line("x", 0.0, 0.1, 40),)))
+
+
+def test_scoring_shows_its_progress(monkeypatch):
+    shown = []
+    monkeypatch.setattr(actuator, "tqdm", lambda work, **options: shown.append(options) or work)
+    score(constant_net([0.2], False, ("a",)), Log(("a",), (line("x", 0.0, 0.1, 40),)))
+    assert shown and all(options["disable"] is None for options in shown)  # None: on terminals only
 
 
 def test_persistence_by_hand_and_segments_within_recordings():
