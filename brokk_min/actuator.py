@@ -1,7 +1,7 @@
 """The hydraulic actuators twice: the analytic plant that plays the machine, and the nets that learn it.
 
-The plant is known only to this file's `Plant`, to the tests and to the evaluation; the learner sees logs
-alone. Both are driven the same way, one tick of 1/rate seconds at a time.
+The plant's equations are known to `plant_step`, the tests and the evaluation; the learner sees logs alone.
+Both are driven the same way, one tick of 1/rate seconds at a time.
 """
 
 from __future__ import annotations
@@ -37,13 +37,7 @@ class PlantState(NamedTuple):
 
 
 def plant_reset(machine: Machine, q: ArrayLike) -> PlantState:
-    """The plant at rest at angles `q` [rad] (..., n).
-
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> plant_reset(BROKK_170, np.zeros((3, 5))).spool.shape
-        (3, 5)
-    """
+    """The plant at rest at angles `q` [rad] (..., n)."""
     q = np.array(q, float)
     zero = np.zeros_like(q)
     ticks = np.ceil(round(machine.delay / machine.plant_dt) / round(machine.dt / machine.plant_dt))
@@ -51,9 +45,7 @@ def plant_reset(machine: Machine, q: ArrayLike) -> PlantState:
 
 
 def lever_arm(machine: Machine, q: ArrayLike) -> Array:
-    """Distance from pivot to cylinder axis [m] at angles `q` [rad] (..., n).
-
-    Paper: eq1 (r)
+    """Distance from pivot to cylinder axis [m] at angles `q` [rad] (..., n). Paper: eq1 (r)
 
     Example:
         >>> from brokk_min.machine import BROKK_170
@@ -106,10 +98,9 @@ def plant_velocity(machine: Machine, state: PlantState) -> Array:
 
 
 def speed_limits(machine: Machine, q: ArrayLike) -> tuple[Array, Array]:
-    """Steady velocities [rad/s] (..., n) of joints that move alone at angles `q`, at the command limits.
+    """Fastest negative and positive velocity [rad/s] (..., n) that a joint alone can hold at angles `q`.
 
-    Returns:
-        Fastest negative and fastest positive velocity. Paper: eq1
+    At the command limit. Paper: eq1
     """
     opening = (machine.pwm_limit / PWM_MAX - machine.dead_zone) / (1 - machine.dead_zone)
     arm = lever_arm(machine, q)
@@ -155,10 +146,7 @@ def rich_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Arra
     return np.concatenate(parts)[:ticks]
 
 
-EXCITATIONS: dict[str, Callable[[np.random.Generator, Machine, int], Array]] = {
-    "sine": sine_command,
-    "rich": rich_command,
-}
+EXCITATIONS = {"sine": sine_command, "rich": rich_command}
 
 
 class _Recorder:
@@ -205,12 +193,12 @@ def collect(
     with tqdm(total=wanted * machine.n, desc=f"record ({excitation})", unit="sample", disable=None) as bar:
         while counted.min() < wanted:
             joint = np.repeat(np.flatnonzero(counted < wanted), side_by_side)
-            tape, back, home = _drive_legs(machine, joint, excitation, rng, round(leg_s * machine.rate))
+            recorder, back, home = _drive_legs(machine, joint, excitation, rng, round(leg_s * machine.rate))
             for row, j in enumerate(joint):
                 if leg := min(back[row], wanted - counted[j]):
                     name = f"{machine.names[j]}_{len(recordings[j]) // 2:03d}"
-                    recordings[j].append(tape.recording(name, row, 0, leg))
-                    recordings[j].append(tape.recording(name + RETURN, row, back[row], home[row]))
+                    recordings[j].append(recorder.recording(name, row, 0, leg))
+                    recordings[j].append(recorder.recording(name + RETURN, row, back[row], home[row]))
                     counted[j] += leg
                     bar.update(leg)
     return Log(machine.names, tuple(r for of_joint in recordings for r in of_joint))
@@ -229,23 +217,25 @@ def _drive_legs(
     low, high = low[joint], high[joint]
     if excitation == "rich":
         q[row, joint] = rng.uniform(low, high)
-    start, near = q[row, joint], 2 * machine.encoder_step
-    commands = np.zeros((len(row), machine.history + ticks))
+    start, near, length = q[row, joint], 2 * machine.encoder_step, machine.history + ticks
+    commands = np.zeros((len(row), length))
     commands[:, machine.history :] = [EXCITATIONS[excitation](rng, machine, ticks) for _ in row]
     slow = (machine.dead_zone + machine.pwm_limit / PWM_MAX) / 2
     rest = round(5 * machine.ready_down_time * machine.rate)  # ticks until a valve is idle again
-    tape, back, rested = _Recorder(machine, q), np.full(len(row), commands.shape[1]), np.zeros(len(row), int)
-    while rested.min() < rest and len(tape.u) < commands.shape[1] + MAX_RETURN * machine.rate:
-        tick, angle = len(tape.u), tape.q[-1][row, joint]
+    back = np.full(len(row), length)  # tick at which each way back begins
+    rested = np.zeros(len(row), int)  # ticks at rest after it
+    recorder = _Recorder(machine, q)
+    while rested.min() < rest and len(recorder.u) < length + MAX_RETURN * machine.rate:
+        tick, angle = len(recorder.u), recorder.q[-1][row, joint]
         at_limit = (angle < low + near) | (angle > high - near)
         back[at_limit & (machine.history + machine.rate < tick) & (tick < back)] = tick
         arrived = (np.abs(angle - start) < max(0.06, near)) | (rested > 0)
         rested += arrived & (tick >= back)
         homeward = np.where(arrived, 0.0, slow * np.sign(start - angle))
         u = np.zeros_like(q)
-        u[row, joint] = np.where(tick < back, commands[:, min(tick, commands.shape[1] - 1)], homeward)
-        tape.play(u)
-    return tape, back, len(tape.u) - rested + rest
+        u[row, joint] = np.where(tick < back, commands[:, min(tick, length - 1)], homeward)
+        recorder.play(u)
+    return recorder, back, len(recorder.u) - rested + rest
 
 
 # --- history: what the nets, the policy and the hardware remember of the last 13 samples -----------
@@ -278,12 +268,9 @@ def push_command(history: Array, u: ArrayLike) -> Array:
 
 
 def push_angle(history: Array, q: ArrayLike, velocity: Callable[[Array], Array]) -> Array:
-    """History (..., n, 3, H) with the next measured angle `q` (..., n) and its velocity appended.
+    """History (..., n, 3, H) of `push_command` with the next measured angle `q` (..., n) appended.
 
-    Args:
-        history: as `push_command` left it.
-        q: measured angle [rad].
-        velocity: turns the new angle row (..., n, H) into the newest velocity (..., n) [rad/s].
+    `velocity` turns the angles in the history (..., n, H) into the newest velocity (..., n) [rad/s].
     """
     result = history.copy()
     result[..., :2, :-1] = history[..., :2, 1:]
@@ -388,11 +375,7 @@ def net_arrays(net: ActuatorNet) -> dict[str, NDArray[Any]]:
 
 
 def net_from_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> ActuatorNet:
-    """Nets from `net_arrays`; `path` is for the messages.
-
-    Raises:
-        ValueError: another format, or arrays that do not fit the header.
-    """
+    """Nets from `net_arrays`; ValueError, naming `path`, for another format or arrays that do not fit."""
     header = load_header(path, arrays, "actuator net", FORMAT)
     try:
         header["joints"] = tuple(header["joints"])
@@ -417,11 +400,7 @@ def save_net(path: Path, net: ActuatorNet) -> None:
 
 
 def load_net(path: Path) -> ActuatorNet:
-    """Read nets that `save_net` wrote.
-
-    Raises:
-        ValueError: no such file, another format, or arrays that do not fit the header.
-    """
+    """Read nets that `save_net` wrote; ValueError as in `net_from_arrays`."""
     return net_from_arrays(path, load_arrays(path))
 
 
@@ -458,33 +437,30 @@ class FitConfig:
 def fit(log: Log, config: FitConfig, seed: int, velocity_samples: int, machine: str = "") -> ActuatorNet:
     """Fit one net a joint to the one-step targets of a log. Paper: Sec. 3.3 (MSE, Adam)
 
-    Args:
-        log: training recordings.
-        config: settings.
-        seed: of weights and batches; the same seed gives the same bits on the same machine.
-        velocity_samples: window of the estimator that supplied the velocities of `log`.
-        machine: name kept in the file.
+    The same `seed` gives the same bits on the same machine. `velocity_samples` is the window of the estimator
+    that supplied the velocities of `log`, `machine` a name for the file.
 
     Raises:
         ValueError: a joint that never moves long enough to be learned.
     """
     import torch
 
-    tape, n, history = _end_to_end(log), len(log.joints), config.history
-    every = tape.starts(history - 1, 1, 1)
-    ends = [every[moves] for moves in tape.moves[every].T]  # of each joint's windows
-    for name, end, target in zip(log.joints, ends, tape.target.T, strict=True):
+    samples, n, history = _end_to_end(log), len(log.joints), config.history
+    every = samples.starts(history - 1, 1, 1)
+    ends = [every[moves] for moves in samples.moves[every].T]  # of each joint's windows
+    for name, end, target in zip(log.joints, ends, samples.target.T, strict=True):
         if not len(end) or np.ptp(target[end]) == 0:
             raise ValueError(
                 f"joint {name}: expected a recording of {history + 1} samples or more in which it "
                 "moves, got none"
             )
-    data = np.stack([tape.whole.q.T, tape.whole.q_dot.T, tape.whole.u.T])  # (3, n, N)
+    data = np.stack([samples.whole.q.T, samples.whole.q_dot.T, samples.whole.u.T])  # (3, n, N)
     mean = np.array([data[:, j, end].mean(axis=1) for j, end in enumerate(ends)])
     scale = np.array([data[:, j, end].std(axis=1) for j, end in enumerate(ends)])
     scale = np.where(scale > 1e-9, scale, 1.0)  # a channel that never changes
     mean, scale = np.repeat(mean, history, axis=1), np.repeat(scale, history, axis=1)  # (n, 3 H)
-    low, high = np.array([[f(tape.target[end, j]) for j, end in enumerate(ends)] for f in (np.min, np.max)])
+    low = np.array([samples.target[end, j].min() for j, end in enumerate(ends)])
+    high = np.array([samples.target[end, j].max() for j, end in enumerate(ends)])
     low, high = low - 0.05 * (high - low), high + 0.05 * (high - low)
 
     generator = torch.Generator().manual_seed(seed)
@@ -500,10 +476,10 @@ def fit(log: Log, config: FitConfig, seed: int, velocity_samples: int, machine: 
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.steps)
 
     series = torch.tensor(data, dtype=torch.float32).flatten(1)  # (3, n N): joint after joint
-    fractions = torch.tensor((tape.target - low) / (high - low), dtype=torch.float32).T.flatten()
+    fractions = torch.tensor((samples.target - low) / (high - low), dtype=torch.float32).T.flatten()
     centre, width = torch.tensor(mean)[:, None].float(), torch.tensor(scale)[:, None].float()
     choices, lags = [torch.tensor(end) for end in ends], torch.arange(1 - history, 1)
-    first = torch.arange(n)[:, None] * len(tape.target)
+    first = torch.arange(n)[:, None] * len(samples.target)
     for _ in tqdm(range(config.steps), desc="fit nets", unit="step", disable=None):
         picks = [torch.randint(len(c), (config.batch_size,), generator=generator) for c in choices]
         at = torch.stack([c[pick] for c, pick in zip(choices, picks, strict=True)]) + first
@@ -525,7 +501,7 @@ def fit(log: Log, config: FitConfig, seed: int, velocity_samples: int, machine: 
     if not all(torch.isfinite(weight).all() for weight in weights):
         raise ValueError("weights: expected finite numbers at the end of the fit, got nan or inf")
     arrays = {"input_mean": mean, "input_scale": scale, "output_low": low, "output_high": high}
-    arrays |= {"q_low": tape.whole.q.min(axis=0), "q_high": tape.whole.q.max(axis=0)}
+    arrays |= {"q_low": samples.whole.q.min(axis=0), "q_high": samples.whole.q.max(axis=0)}
     return ActuatorNet(
         joints=log.joints,
         history=history,
@@ -540,7 +516,7 @@ def fit(log: Log, config: FitConfig, seed: int, velocity_samples: int, machine: 
     )
 
 
-class _Tape(NamedTuple):
+class _Samples(NamedTuple):
     """The recordings of a log end to end, N samples in all; windows must not cross their seams."""
 
     whole: Recording
@@ -555,7 +531,7 @@ class _Tape(NamedTuple):
         return np.concatenate([seam + np.arange(before, length - after, step) for seam, length in pieces])
 
 
-def _end_to_end(log: Log) -> _Tape:
+def _end_to_end(log: Log) -> _Samples:
     """Join recordings, with what a net is to say at each sample.
 
     That is the mean velocity [rad/s] over the coming tick, (q(t+dt) - q(t)) / dt, from encoder angles;
@@ -569,7 +545,7 @@ def _end_to_end(log: Log) -> _Tape:
         target = np.diff(whole.q, axis=0, append=0) * RATE
     lengths = [len(r.q) for r in log.recordings]
     moves = [np.ptp(r.u, axis=0) + np.ptp(r.q, axis=0) > 0 for r in log.recordings]
-    return _Tape(whole, target, np.repeat(moves, lengths, axis=0), lengths)
+    return _Samples(whole, target, np.repeat(moves, lengths, axis=0), lengths)
 
 
 # --- scores ---------------------------------------------------------------------------------------
@@ -580,14 +556,10 @@ def free_run(
 ) -> tuple[Array, Array]:
     """Run the nets on their own predictions under the recorded commands.
 
-    Args:
-        net: n joints.
-        recording: its joints in the order of the net.
-        starts: sample at which each segment starts, at least H, shape (s,).
-        ticks: length of a segment.
+    Each segment of `ticks` begins at one of the samples `starts` (s,), with H samples or more before it.
 
     Returns:
-        Angle [rad] and velocity [rad/s] at the `ticks` samples after each start, (ticks, s, n) both.
+        Angle [rad] and velocity [rad/s] after each tick, (ticks, s, n) both.
     """
     rows = starts[:, None] + np.arange(1 - net.history, 1)
     history = np.stack([recording.q[rows], recording.q_dot[rows], recording.u[rows - 1]])
@@ -620,29 +592,29 @@ def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
         raise ValueError(f"joints: expected {list(net.joints)}, got {list(log.joints)}")
     if log.velocity_logged != net.velocity_logged:
         raise ValueError(f"velocity_logged: expected {net.velocity_logged}, got {log.velocity_logged}")
-    tape = _end_to_end(log)
-    if not len(tape.starts(net.history, 1, 1)):
-        got = tape.lengths[:9]
+    samples = _end_to_end(log)
+    if not len(samples.starts(net.history, 1, 1)):
+        got = samples.lengths[:9]
         raise ValueError(f"log: expected a recording above {net.history + 1} samples, got {got}")
-    moves = tape.moves | ~tape.moves.any(axis=0)  # a joint that rests everywhere is scored at rest
+    moves = samples.moves | ~samples.moves.any(axis=0)  # a joint that rests everywhere is scored at rest
     result: dict[str, Any] = {name: {"free_run": {}} for name in log.joints}
     for horizon in tqdm((1 / net.rate, *HORIZONS), desc="score nets", unit="horizon", disable=None):
         ticks = round(horizon * net.rate)
-        starts = tape.starts(net.history, ticks, ticks)
+        starts = samples.starts(net.history, ticks, ticks)
         if not len(starts):
             continue
         chunks = np.array_split(starts, -(-len(starts) // 8192))  # bounds the memory
-        runs = [free_run(net, tape.whole, chunk, ticks) for chunk in chunks]
+        runs = [free_run(net, samples.whole, chunk, ticks) for chunk in chunks]
         angles, velocities = (np.concatenate(run, axis=1) for run in zip(*runs, strict=True))
         later = starts + np.arange(1, ticks + 1)[:, None]
-        q_error, v_error = angles - tape.whole.q[later], velocities - tape.whole.q_dot[later]
+        q_error, v_error = angles - samples.whole.q[later], velocities - samples.whole.q_dot[later]
         for j, name in enumerate(log.joints):
             mine = moves[starts, j]
             if not mine.any():
                 continue
             if ticks == 1:
                 error = v_error if net.velocity_logged else q_error * net.rate
-                same = tape.whole.q_dot[starts, j] - tape.target[starts, j]
+                same = samples.whole.q_dot[starts, j] - samples.target[starts, j]
                 result[name] |= {
                     "one_step_rmse": _rms(error[0, mine, j]),
                     "persistence_rmse": _rms(same[mine]),
@@ -673,9 +645,9 @@ def task_log(machine: Machine, runs: int, seconds: float, rng: np.random.Generat
     smoothing, noise = rng.uniform(0.05, 0.6, shape), rng.uniform(0, 0.06, shape)
     locked_turn = (np.arange(runs) % 5 == 4)[:, None]
     moving = np.isin(np.arange(machine.n), machine.locked) == locked_turn
-    tape = _Recorder(machine, start)
+    recorder = _Recorder(machine, start)
     for _ in range(round(seconds * machine.rate)):
-        fraction = (tape.q[-1] - q_min) / (q_max - q_min)
+        fraction = (recorder.q[-1] - q_min) / (q_max - q_min)
         up = rng.random(shape) > np.clip(1.5 * fraction - 0.25, 0, 1)
         drawn = np.where(up, 1, -1) * rng.uniform(0, limit, shape) * (rng.random(shape) < 0.85)
         near = np.where(up, fraction > 0.9, fraction < 0.1)
@@ -683,5 +655,5 @@ def task_log(machine: Machine, runs: int, seconds: float, rng: np.random.Generat
         left = np.where(left <= 0, rng.uniform(0.5, 5.0, shape), left) - machine.dt
         command = command + smoothing * (level - command)
         jitter = noise * rng.standard_normal(shape) * (level != 0)
-        tape.play(moving * (command + jitter))
-    return Log(machine.names, tuple(tape.recording(f"task_{i:02d}", i) for i in range(runs)))
+        recorder.play(moving * (command + jitter))
+    return Log(machine.names, tuple(recorder.recording(f"task_{i:02d}", i) for i in range(runs)))

@@ -55,15 +55,7 @@ def _chain(machine: Machine, q: ArrayLike) -> Chain:
 
 
 def frames(machine: Machine, q: ArrayLike) -> Array:
-    """Homogeneous frames [1, m] of the base, each link's end and (last) the tool, (..., n + 1, 4, 4).
-
-    Paper: Fig. 1
-
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> frames(BROKK_170, np.zeros(5)).shape
-        (6, 4, 4)
-    """
+    """Frames [1, m] of the base, each link's end and (last) the tool, (..., n + 1, 4, 4). Paper: Fig. 1"""
     chain = _chain(machine, q)
     shape = chain.p[-1].shape
     columns = np.stack([[np.broadcast_to(a, shape) for a in axis] for axis in chain])
@@ -99,29 +91,16 @@ def _columns(chain: Chain) -> list[Array]:
 
 
 def jacobian(machine: Machine, q: ArrayLike) -> Array:
-    """d(tool position)/d(driven angles) [m/rad], (..., 3, n_driven). Paper: eq3 (J)
-
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> jacobian(BROKK_170, np.zeros((7, 5))).shape
-        (7, 3, 4)
-    """
+    """d(tool position)/d(driven angles) [m/rad], (..., 3, n_driven). Paper: eq3 (J)"""
     columns = _columns(_chain(machine, q))
     return np.moveaxis(np.stack([columns[i] for i in machine.driven]), (0, 1), (-1, -2))
 
 
 def tool_state(machine: Machine, q: ArrayLike, q_dot: ArrayLike) -> tuple[Array, Array, Array]:
-    """Tool position, tool velocity and lowest point in one forward pass.
+    """Tool position [m] (..., 3), its velocity [m/s] (..., 3) and the lowest point [m] (...) in one pass.
 
-    Paper: Sec. 3.4 ("through forward kinematics")
-
-    Args:
-        machine: n joints.
-        q: angles [rad], (..., n).
-        q_dot: velocities [rad/s] of all joints, locked ones included, (..., n).
-
-    Returns:
-        Tool position [m] (..., 3), tool velocity [m/s] (..., 3), height [m] (...) of the lowest frame.
+    `q_dot` [rad/s] (..., n) is of all joints, locked ones included. Paper: Sec. 3.4 ("through forward
+    kinematics")
 
     Example:
         >>> from brokk_min.machine import BROKK_170

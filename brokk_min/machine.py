@@ -80,10 +80,10 @@ class Joint:
 
 @dataclass(frozen=True)
 class Machine:
-    """Everything that distinguishes one machine from another; validated on creation.
+    """Everything that distinguishes one machine from another.
 
     Raises:
-        ValueError: a field is out of its range, with its name, what is allowed and what came.
+        ValueError: on creation, for a field out of its range: its name, what is allowed and what came.
 
     Example:
         >>> BROKK_170.n, [joint.name for joint in BROKK_170.joints if joint.driven]
