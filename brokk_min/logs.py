@@ -272,7 +272,7 @@ def _numbers(path: Path, table: Table, name: str, bound: float = np.inf) -> Floa
     good = np.isfinite(numbers) & (np.abs(numbers) <= bound + 1e-6)
     if not good.all():
         row = int(np.argmin(good))
-        wanted = "a finite number" if bound == np.inf else f"a number in [-{bound:g}, {bound:g}]"
+        wanted = "a number that is finite" if bound == np.inf else f"a number in [-{bound:g}, {bound:g}]"
         raise ValueError(f"{path}: row {row + 2}, column {name}: expected {wanted}, got {cells[row]!r}")
     return numbers
 
