@@ -267,18 +267,15 @@ def _cells(path: Path, table: Table, name: str) -> list[Any]:
 
 def _numbers(path: Path, table: Table, name: str, bound: float = np.inf) -> Floats:
     """One column as finite numbers within +-bound; the first cell that is none is named."""
-    cells = _cells(path, table, name)
-    numbers = np.array([_number(cell) for cell in cells])
-    good = np.isfinite(numbers) & (np.abs(numbers) <= bound + 1e-6)
-    if not good.all():
-        row = int(np.argmin(good))
-        wanted = "a number that is finite" if bound == np.inf else f"a number in [-{bound:g}, {bound:g}]"
-        raise ValueError(f"{path}: row {row + 2}, column {name}: expected {wanted}, got {cells[row]!r}")
-    return numbers
-
-
-def _number(cell: str | float) -> float:
-    try:
-        return float(cell)
-    except ValueError:
-        return float("nan")
+    allowed = "a finite number" if bound == np.inf else f"a number in [-{bound:g}, {bound:g}]"
+    largest = min(bound + 1e-6, np.finfo(float).max)
+    numbers = []
+    for row, cell in enumerate(_cells(path, table, name), 2):
+        try:
+            number, wanted = float(cell), allowed
+        except ValueError:
+            number, wanted = np.nan, "a number"
+        if not abs(number) <= largest:
+            raise ValueError(f"{path}: row {row}, column {name}: expected {wanted}, got {cell!r}")
+        numbers.append(number)
+    return np.array(numbers)
