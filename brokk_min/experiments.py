@@ -173,7 +173,7 @@ class Effort:
     hours: float = 1.0
     fit_steps: int = 4000
     train_steps: int = 5_000_000
-    generations: int = 60
+    generations: int = 45
     tuning_runs: int = 12
     starts: int = 16
 
@@ -445,11 +445,8 @@ def write_json(path: Path, value: Any) -> None:
         file.write("\n")
 
 
-Rows = Mapping[str, Mapping[str, Any]]  # a table: its first column and, by title, the others
-
-
-def write_report(path: Path, parts: Sequence[tuple[str, str, Any]], clock: Mapping[str, float]) -> None:
-    """One self-contained page: a title, a sentence, and a table (`Rows`) or a figure, part by part."""
+def write_report(path: Path, parts: Sequence[tuple[Any, ...]], clock: Mapping[str, float]) -> None:
+    """One page by itself; a part is a title, a sentence, and tables {row: {column: cell}} or figures."""
     page = [
         f"<!doctype html><meta charset=utf-8><title>brokk_min report</title><style>{STYLE}</style>",
         "<h1>Task space control with reinforcement learning: what was measured</h1>",
@@ -457,14 +454,14 @@ def write_report(path: Path, parts: Sequence[tuple[str, str, Any]], clock: Mappi
         "fitted to its logs and never saw its equations.</p>",
         "<p>Seconds spent: " + ", ".join(f"{k} {v:.0f}" for k, v in clock.items()) + ".</p>",
     ]
-    for title, sentence, content in tqdm(parts, desc="draw", unit="part", disable=None):
-        shown = _table(content) if isinstance(content, Mapping) else _image(title, content)
-        page.append(f"<h2>{html.escape(title)}</h2><p>{html.escape(sentence)}</p>{shown}")
+    for title, sentence, *contents in tqdm(parts, desc="draw", unit="part", disable=None):
+        page.append(f"<h2>{html.escape(title)}</h2><p>{html.escape(sentence)}</p>")
+        page += [_table(c) if isinstance(c, Mapping) else _image(title, c) for c in contents]
     with logs.whole_file(path, "w") as file:
         file.write("\n".join(page) + "\n")
 
 
-def _table(rows: Rows) -> str:
+def _table(rows: Mapping[str, Mapping[str, Any]]) -> str:
     def line(tag: str, cells: Sequence[Any]) -> str:
         texts = (f"{c:.4g}" if isinstance(c, float) else html.escape(str(c)) for c in cells)
         return "<tr>" + "".join(f"<{tag}>{text}</{tag}>" for text in texts) + "</tr>"
@@ -481,42 +478,18 @@ def _image(title: str, figure: Any) -> str:
     return f"<img alt='{html.escape(title)}' src='data:image/png;base64,{image}'>"
 
 
-def report_parts(results: Mapping[str, Any], figures: Mapping[str, Any]) -> list[tuple[str, str, Any]]:
-    """Tables and figures in the paper's order, with a sentence each."""
-    means = results["task_space"]["summary"]
-    nets = {
-        joint: {"one_step_rmse": s["one_step_rmse"], "persistence_rmse": s["persistence_rmse"]}
-        | s["free_run"].get("10", {})
-        for joint, s in results["actuator"]["test"].items()
-    }
-    tuning = {
-        name: {
-            "first [m/s]": t["cost"][0],
-            "last [m/s]": t["cost"][-1],
-            "at bounds": ", ".join(t["at_bound"]),
-        }
-        for name, t in results["tuning"].items()
-    }
+def report_tables(results: Mapping[str, Any]) -> tuple[dict[str, dict[str, Any]], ...]:
+    """Errors of the nets, tuning of the baselines, means of all figures, velocity error by sequence."""
+    nets, tuning, means = {}, {}, results["task_space"]["summary"]
+    for joint, s in results["actuator"]["test"].items():
+        nets[joint] = {key: s[key] for key in ("one_step_rmse", "persistence_rmse")}
+        nets[joint] |= s["free_run"].get("10", {})
+    for name, t in results["tuning"].items():
+        bounds = ", ".join(t["at_bound"]) or "none"
+        tuning[name] = {"first": t["cost"][0], "last": t["cost"][-1], "gains at a bound": bounds}
+    everything = {name: rows["all"] for name, rows in means.items()}
     errors = {n: {s: row["velocity_error_mean"] for s, row in rows.items()} for n, rows in means.items()}
-    return [
-        ("Actuator nets", "Unseen recordings: one step, same as last, free runs of 10 s [rad/s, rad].", nets),
-        ("Nets run freely", "One such recording: commands in, angles out.", figures["free run"]),
-        ("Learning curve", "The policy while it explores, on the nets.", figures["learning"]),
-        (
-            "Tuning of the baselines",
-            "Velocity error of the best gains after the first and last generation.",
-            tuning,
-        ),
-        *((f"Motion along {a}", "From the first start; one scale in each row.", figures[a]) for a in AXES),
-        ("Joint velocities", "Motion along x from the first start.", figures["joints"]),
-        (
-            "Task space control",
-            "Means over all sequences and starts.",
-            {n: r["all"] for n, r in means.items()},
-        ),
-        ("Velocity error by sequence", "Mean |v_goal - v_tool| [m/s] over all starts.", errors),
-        ("Velocity error and drift", "Means over all starts.", plot_bars(means, [*AXES, "all"])),
-    ]
+    return nets, tuning, everything, errors
 
 
 # --- the whole chain --------------------------------------------------------------------------------
@@ -539,16 +512,11 @@ def reproduce(machine: Machine, out: Path, effort: Effort, seed: int) -> dict[st
         stages.set_postfix_str(name)
         stages.update()
 
-    logs.write_log(
-        out / "log.npz", actuator.collect(machine, effort.hours, "rich", np.random.default_rng(seed))
-    )
-    logs.write_log(
-        out / "log_test.npz", actuator.task_log(machine, 20, 40.0, np.random.default_rng(seed + 1))
-    )
+    files, rng = (out / "log.npz", out / "log_test.npz"), np.random.default_rng
+    logs.write_log(files[0], actuator.collect(machine, effort.hours, "rich", rng(seed)))
+    logs.write_log(files[1], actuator.task_log(machine, 20, 40.0, rng(seed + 1)))
     lap("record")
-    log, test = (
-        logs.read_log([out / name], machine.velocity_samples) for name in ("log.npz", "log_test.npz")
-    )
+    log, test = (logs.read_log([file], machine.velocity_samples) for file in files)
     config = actuator.FitConfig(steps=effort.fit_steps, history=machine.history)
     net = actuator.fit(log, config, seed, machine.velocity_samples, machine.name)
     actuator.save_net(out / "net.npz", net)
@@ -560,7 +528,7 @@ def reproduce(machine: Machine, out: Path, effort: Effort, seed: int) -> dict[st
     tuned, how = tuned_baselines(machine, driven, effort, seed)
     lap("tune")
     sequences = axis_sequences(machine)
-    starts = draw_starts(machine, sequences, effort.starts, np.random.default_rng(seed + 2))
+    starts = draw_starts(machine, sequences, effort.starts, rng(seed + 2))
     rl = PolicyController(machine, policy)
     runs, traces = task_space(machine, {"rl": rl, **tuned}, sequences, starts, seed)
     simulated, _ = task_space(machine, {"rl": rl}, sequences, starts, seed, driven)
@@ -576,13 +544,21 @@ def reproduce(machine: Machine, out: Path, effort: Effort, seed: int) -> dict[st
     }
     write_json(out / "results.json", results)
     write_json(out / "gains.json", {"meta": results["meta"], "gains": results["gains"]})
-    figures = {
-        "free run": plot_free_run(net, test),
-        "learning": plot_learning(out / "policy.npz.csv"),
-        "joints": plot_joint_rates(machine, traces, sequences[0], 0),
-    }
-    figures |= {s.name: plot_sequence(machine, traces, s, starts[0], 0) for s in sequences}
-    write_report(out / "report.html", report_parts(results, figures), clock)
+    nets, tuning, means, errors = report_tables(results)
+    motion = [plot_sequence(machine, traces, sequence, starts[0], 0) for sequence in sequences]
+    rates = plot_joint_rates(machine, traces, sequences[0], 0)
+    bars = plot_bars(results["task_space"]["summary"], [*AXES, "all"])
+    parts = (
+        ("Actuator nets", "One step and free runs of 10 s on unseen recordings [rad/s, rad].", nets),
+        ("Nets run freely", "One of these recordings.", plot_free_run(net, test)),
+        ("Learning curve", "The exploring policy, on the nets.", plot_learning(out / "policy.npz.csv")),
+        ("Tuning of the baselines", "Least velocity error after a generation, on the machine.", tuning),
+        ("Task space control", "Motion along x, y and z from the first start, one scale a row.", *motion),
+        ("Joint velocities", "Motion along x from the first start.", rates),
+        ("Figures of merit", "Means over all sequences and starts [m/s, m, m/s^3, full strokes].", means),
+        ("Velocity error and drift by sequence", "Means over all starts [m/s, m].", errors, bars),
+    )
+    write_report(out / "report.html", parts, clock)
     lap("draw")
     stages.close()
     write_json(out / "timing.json", clock)

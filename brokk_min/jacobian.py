@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import differential_evolution
 from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet
@@ -171,6 +170,12 @@ def steady_map(machine: Machine, net: ActuatorNet, angles: int = 9, commands: in
     return SteadyMap(q[:, 0].T, u, rising)
 
 
+def valve_opening(machine: Machine, u: ArrayLike) -> Array:
+    """Opening in [-1, 1] beyond the dead zone under a command `u`, same shape. Paper: Sec. 3.2"""
+    beyond: Array = np.maximum(0.0, np.abs(u) - machine.dead_zone) / (1 - machine.dead_zone)
+    return np.sign(u) * beyond
+
+
 @dataclass(frozen=True)
 class JacobianController:
     """Observation in, command out: resolved rates (eq3), then a PID a joint.
@@ -219,16 +224,13 @@ class JacobianController:
         slope = 0.7 * memory.slope + 0.3 * (error - memory.error) * m.rate
         opening = g["kp"] * error + memory.integral + g["kd"] * slope
         if self.feedforward is not None:
-            steady = self.feedforward.command(seen.q[..., m.driven], rate)
-            opening += np.sign(steady) * np.maximum(0, (np.abs(steady) - m.dead_zone) / (1 - m.dead_zone))
-        room = (m.pwm_limit / PWM_MAX - m.dead_zone) / (1 - m.dead_zone)
+            opening += valve_opening(m, self.feedforward.command(seen.q[..., m.driven], rate))
+        room = valve_opening(m, m.pwm_limit / PWM_MAX)
         winding = (np.abs(opening) >= room) & (np.sign(opening) == np.sign(error))
         integral = memory.integral + np.where(winding, 0.0, g["ki"] * error * m.dt)
         moving = np.linalg.norm(seen.v_goal, axis=-1, keepdims=True) > 1e-6
         size = np.maximum(np.abs(opening), moving * g["ready"])
-        size = np.where(
-            size < 0.5 / PWM_MAX, 0.0, m.dead_zone + (1 - m.dead_zone) * size
-        )  # half a count: idle
+        size = (size >= 0.5 / PWM_MAX) * (m.dead_zone + (1 - m.dead_zone) * size)  # below half a count: idle
         u = np.zeros((*opening.shape[:-1], m.n))
         u[..., m.driven] = np.sign(opening) * size
         return limit_command(m, u), Memory(integral, error, slope, rate)
@@ -244,9 +246,10 @@ def tune(
     generations: int,
     label: str,
 ) -> tuple[JacobianController, list[float]]:
-    """The controller with the gains of least cost, and that cost after each generation.
+    """The controller with the gains of least cost, and the least cost after each generation.
 
-    Differential evolution of 24 candidates that are at first scattered about the controller's own gains.
+    Cross-entropy search: 32 candidates a generation from a normal distribution, at first about the
+    controller's own gains, then about the mean of the best 8.
 
     Args:
         controller: whose gains are to be found.
@@ -256,30 +259,21 @@ def tune(
         label: shown at the progress bar.
     """
     low, high = gain_bounds(controller.machine)
-    scatter = 0.15 * (high - low) * np.random.default_rng(seed).standard_normal((24, len(low)))
-    scatter[0] = 0.0
-    costs: list[float] = []
-    with tqdm(total=generations, desc=f"tune {label}", unit="generation", disable=None) as bar:
-
-        def note(intermediate_result: Any) -> None:  # SciPy asks for this name
-            costs.append(float(intermediate_result.fun))
-            bar.update()
-
-        result = differential_evolution(
-            lambda vectors: cost(replace(controller, gains=vectors.T)),
-            np.stack([low, high], axis=1),
-            init=np.clip(controller.gains + scatter, low, high),
-            maxiter=generations,
-            mutation=(0.3, 0.8),
-            recombination=0.9,
-            seed=seed,
-            tol=0,
-            polish=False,
-            vectorized=True,
-            updating="deferred",
-            callback=note,
-        )
-    return replace(controller, gains=result.x), costs
+    rng, mean, spread = np.random.default_rng(seed), controller.gains, 0.15 * (high - low)
+    gains = np.clip(mean + spread * rng.standard_normal((32, len(low))), low, high)
+    gains[0] = mean
+    best, costs = mean, [np.inf]
+    for _ in tqdm(range(generations), desc=f"tune {label}", unit="generation", disable=None):
+        found = cost(replace(controller, gains=gains))
+        order = np.argsort(found)
+        if found[order[0]] < costs[-1]:
+            best = gains[order[0]]
+        costs.append(min(costs[-1], float(found[order[0]])))
+        elite = gains[order[:8]]
+        spread = 0.5 * spread + 0.5 * np.sqrt(np.mean((elite - mean) ** 2, axis=0))  # wide while it travels
+        mean = elite.mean(axis=0)
+        gains = np.clip(mean + spread * rng.standard_normal(gains.shape), low, high)
+    return replace(controller, gains=best), costs[1:]
 
 
 def gain_bounds(machine: Machine) -> tuple[Array, Array]:
