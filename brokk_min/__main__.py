@@ -166,7 +166,7 @@ class Evaluate(Command):
     starts: Path | None = None  # Start poses, CSV: one column a joint [rad].
     plant: Literal["analytic", "net"] = "analytic"  # What moves: the analytic plant or the nets.
     json: Path | None = None  # Also write all runs here.
-    gains: Path | None = None  # By default gains.json beside POLICY; without it they are tuned.
+    gains: Path | None = None  # Tuned gains; by default gains.json beside POLICY.
 
     def run(self) -> None:
         """Evaluate and print the means."""

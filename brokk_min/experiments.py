@@ -428,6 +428,7 @@ def plot_bars(table: Mapping[str, Mapping[str, Mapping[str, float]]], sequences:
         ax.set_xticks(np.arange(len(sequences)), sequences)
         ax.set_ylabel(label)
         ax.grid(alpha=0.3, axis="y")
+        ax.set_axisbelow(True)
     return _with_legend(figure, axes[0])
 
 

@@ -200,10 +200,7 @@ class JacobianController:
         return Memory(zero, zero, zero, zero)
 
     def rates(self, seen: Measured, last: Array) -> Array:
-        """Wanted rates of the driven joints [rad/s] (..., n_driven); `last` are those of last tick.
-
-        Paper: eq3
-        """
+        """Wanted rates of the driven joints [rad/s], (..., n_driven); `last`: a tick ago. Paper: eq3"""
         m, driven = self.machine, self.machine.driven
         J, towards = jacobian(m, seen.q), np.zeros_like(seen.q)
         towards[..., driven] = last
