@@ -1,12 +1,11 @@
 """The command line: `brokk-min COMMAND --help`. Exits 0 done, 1 failed, 2 wrong use."""
 
-from __future__ import annotations
-
 import os
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -17,127 +16,104 @@ from brokk_min.env import Controller, TaskConfig, fitting_nets
 from brokk_min.logs import Log, read_log, write_log
 from brokk_min.machine import BROKK_170
 from brokk_min.policy import PolicyController, load_policy
-from brokk_min.ppo import PPOConfig, train
 
-MACHINES = {BROKK_170.name: BROKK_170}
-Name = Literal["brokk170"]
+MACHINES = {machine.name: machine for machine in (BROKK_170,)}
+Name = Annotated[str, tyro.conf.arg(metavar="{" + ",".join(MACHINES) + "}")]
 
 
 class WrongUse(ValueError):
     """Options that cannot be meant; exit status 2."""
 
 
-# What each option may be; both ends included.
-ALLOWED: dict[str, tuple[float, float]] = {
-    "seed": (0, 2**31 - 1),
-    "hours": (1e-4, 100),
-    "velocity_samples": (2, 100),
-    "history": (2, 1000),
-    "steps": (1, 10**7),
-    "batch_size": (1, 10**6),
-    "hidden": (1, 4096),
-    "learning_rate": (1e-9, 1),
-    "noise": (0, 10),
-    "total_steps": (1, 10**12),
-    "num_envs": (1, 10**6),
-    "horizon": (1, 10**5),
-    "epochs": (1, 1000),
-    "minibatch_size": (2, 10**7),
-    "gamma": (0, 0.9999),
-    "gae_lambda": (0, 1),
-    "target_kl": (1e-9, 1e9),
-    "clip": (1e-6, 1e3),
-    "entropy": (0, 1e3),
-    "max_grad_norm": (1e-9, 1e9),
-    "log_std": (-10, 3),
-    "checkpoint_every": (1, 10**9),
-    "threads": (1, 1024),
-    "episode_s": (0.05, 1e6),
-    "hold_min_s": (0, 1e6),
-    "hold_max_s": (0, 1e6),
-    "zero_goals": (0, 1),
-    "axis_goals": (0, 1),
-    "valve_cost": (0, 10),
-}
+# What options of these names may be, both ends included.
+ALLOWED: tuple[tuple[float, float, str], ...] = (
+    (0, 2**31 - 1, "seed"),
+    (0, 1, "zero_goals axis_goals gae_lambda"),
+    (0, 0.9999, "gamma"),
+    (0, 1000, "noise valve_cost entropy"),
+    (0, 1e6, "hold_min_s hold_max_s"),
+    (1, 1e6, "batch_size hidden num_envs horizon epochs threads"),
+    (1, 1e12, "steps total_steps checkpoint_every"),
+    (2, 1e7, "velocity_samples history minibatch_size"),
+    (-10, 3, "log_std"),
+    (1e-9, 1, "learning_rate"),
+    (1e-9, 1e9, "target_kl max_grad_norm clip"),
+    (1e-4, 100, "hours"),
+    (0.05, 1e6, "episode_s"),
+)
 
 
-def check(command: Any, outputs: tuple[Path | None, ...] = ()) -> None:
+def check(command: Any, *outputs: Path | None) -> None:
     """Refuse options that cannot be meant and outputs that cannot be written, before any work."""
-    for owner in (command, *(getattr(command, n) for n in ("settings", "task") if hasattr(command, n))):
-        for name, value in vars(owner).items():
-            low, high = ALLOWED.get(name, (None, None))
-            if low is not None and high is not None and not low <= value <= high:
+    given = {**vars(getattr(command, "settings", None) or command), **vars(command)}
+    given |= vars(command.task) if hasattr(command, "task") else {}
+    for low, high, names in ALLOWED:
+        for name in names.split():
+            if name in given and not low <= given[name] <= high:
                 option = name.replace("_", "-")
-                raise WrongUse(f"--{option}: expected {low} to {high}, got {value}")
+                raise WrongUse(f"--{option}: expected {low} to {high}, got {given[name]}")
+    if given.get("machine", BROKK_170.name) not in MACHINES:
+        raise WrongUse(f"--machine: expected one of {list(MACHINES)}, got {given['machine']}")
     for path in outputs:
         if path and (path.is_dir() or not os.access(path.parent, os.W_OK)):
             raise WrongUse(f"{path}: expected a file in an existing, writable directory")
 
 
-@dataclass
-class Collect:
+@dataclass(kw_only=True)
+class Command:
+    """What most commands share."""
+
+    machine: Name = BROKK_170.name  # Which machine.
+    seed: int = 0  # Of everything random.
+
+
+@dataclass(kw_only=True)
+class Collect(Command):
     """Record the machine (the analytic plant) under excitation."""
 
-    out: Path
-    """Log to write, .csv or .npz."""
-    hours: float = 1.0
-    """Driving time for each actuator [h]."""
-    excitation: Literal["sine", "rich"] = "rich"
-    """The paper's sines, or sines, steps, holds and pauses over a wide band."""
-    machine: Name = "brokk170"
-    """Which machine."""
-    seed: int = 0
-    """Of everything random."""
+    out: Path  # Log to write, .csv or .npz.
+    hours: float = 1.0  # Driving time for each actuator [h].
+    excitation: Literal["sine", "rich"] = "rich"  # The paper's sines, or steps and holds too.
 
     def run(self) -> None:
         """Write the log."""
-        machine = MACHINES[self.machine]
-        check(self, (self.out,))
+        check(self, self.out)
         if self.out.suffix not in (".csv", ".npz"):
             raise WrongUse(f"--out: expected a name ending in .csv or .npz, got {self.out}")
-        log = collect(machine, self.hours, self.excitation, np.random.default_rng(self.seed))
+        rng = np.random.default_rng(self.seed)
+        log = collect(MACHINES[self.machine], self.hours, self.excitation, rng)
         write_log(self.out, log)
         print(f"{self.out}: {len(log.recordings)} recordings of {', '.join(log.joints)}")
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Fit:
     """Fit one net a joint to the log of any machine and score it on recordings it never saw."""
 
-    logs: tyro.conf.Positional[tuple[Path, ...]]
-    """Logs of one machine, .csv or .npz."""
-    out: Path
-    """Nets to write, .npz."""
-    test: tuple[Path, ...] = ()
-    """Logs to score on; without them every tenth recording of LOGS is held out."""
-    json: Path | None = None
-    """Also write the scores here."""
-    velocity_samples: int = BROKK_170.velocity_samples
-    """Window of the velocity estimator [samples at 20 Hz]."""
-    settings: tyro.conf.OmitArgPrefixes[FitConfig] = field(default_factory=FitConfig)
-    """How the nets are fitted."""
-    seed: int = 0
-    """Of everything random."""
+    logs: tyro.conf.Positional[tuple[Path, ...]]  # Logs of one machine, .csv or .npz.
+    out: Path  # Nets to write, .npz.
+    test: tuple[Path, ...] = ()  # Logs to score on; without them every tenth recording of LOGS is held out.
+    json: Path | None = None  # Also write the scores here.
+    velocity_samples: int = BROKK_170.velocity_samples  # Window of the velocity estimator at 20 Hz.
+    settings: tyro.conf.OmitArgPrefixes[FitConfig] = field(default_factory=FitConfig)  # The fit.
+    seed: int = 0  # Of everything random.
 
     def run(self) -> None:
         """Fit, score, write."""
         if not self.logs:
             raise WrongUse("LOGS: expected at least one log, got none")
-        check(self, (self.out, self.json))
+        check(self, self.out, self.json)
         if self.velocity_samples > self.settings.history:
             raise WrongUse(f"--velocity-samples: expected at most --history, got {self.velocity_samples}")
         log = read_log(self.logs, self.velocity_samples)
-        if self.test:
-            test = read_log(self.test, self.velocity_samples, log.joints)
-        else:
-            log, test = _hold_out(log)
+        log, test = (log, read_log(self.test, self.velocity_samples, log.joints)) if self.test else split(log)
         known = [machine.name for machine in MACHINES.values() if machine.names == log.joints]
         net = fit(log, self.settings, self.seed, self.velocity_samples, "".join(known))
         save_net(self.out, net)
         joints = score(net, test)
-        meta: dict[str, Any] = {"logs": [str(p) for p in self.logs], "test": [str(p) for p in self.test]}
-        meta |= {"seed": self.seed, "rate": net.rate, "history": net.history}
         if self.json:
+            meta: dict[str, Any] = {"seed": self.seed, "rate": net.rate, "history": net.history}
+            meta |= {"logs": [str(p) for p in self.logs], "test": [str(p) for p in self.test]}
             experiments.write_json(self.json, {"meta": meta, "joints": joints})
         print(f"{'joint':12} one step  same as last  free run of 1, 5, 10, 30 s [rad/s]")
         for name, s in joints.items():
@@ -145,110 +121,91 @@ class Fit:
             print(f"{name:12} {s['one_step_rmse']:8.4f}  {s['persistence_rmse']:12.4f}  {free}")
 
 
-def _hold_out(log: Log) -> tuple[Log, Log]:
-    """Every tenth recording for the test, whole; a log with one recording cannot be split."""
-    held = set(range(0, len(log.recordings), 10)) if len(log.recordings) > 1 else set()
-    if not held:
+def split(log: Log) -> tuple[Log, Log]:
+    """Recordings to fit to, and every tenth, whole, to score on; a single one cannot be split."""
+    if len(log.recordings) < 2:
         raise ValueError("LOGS: expected two or more recordings, or --test, to score on; got one")
-    parts = [[r for i, r in enumerate(log.recordings) if (i in held) == side] for side in (False, True)]
-    return log._replace(recordings=tuple(parts[0])), log._replace(recordings=tuple(parts[1]))
+    kept = tuple(recording for i, recording in enumerate(log.recordings) if i % 10)
+    return log._replace(recordings=kept), log._replace(recordings=log.recordings[::10])
 
 
-@dataclass
-class Train:
-    """Train a policy on nets with PPO."""
+def train_command() -> Any:
+    """The command `train`; made on demand, because its settings live beside torch."""
+    from brokk_min.ppo import PPOConfig, train
 
-    actuator: Path
-    """Nets that `fit` wrote."""
-    out: Path
-    """Policy to write, .npz."""
-    resume: bool = False
-    """Take up OUT.checkpoint; the end is the same as without the break."""
-    tensorboard: Path | None = None
-    """Folder for TensorBoard (extra `tensorboard`)."""
-    machine: Name = "brokk170"
-    """Which machine."""
-    settings: tyro.conf.OmitArgPrefixes[PPOConfig] = field(default_factory=PPOConfig)
-    """The learner."""
-    task: tyro.conf.OmitArgPrefixes[TaskConfig] = field(default_factory=TaskConfig)
-    """What an episode is."""
-    seed: int = 0
-    """Of everything random."""
+    @dataclass(kw_only=True)
+    class Train(Command):
+        """Train a policy on nets with PPO."""
 
-    def run(self) -> None:
-        """Train and write the policy."""
-        check(self, (self.out,))
-        if self.task.hold_min_s > self.task.hold_max_s:
-            raise WrongUse(f"--hold-max-s: expected --hold-min-s or more, got {self.task.hold_max_s}")
-        machine = MACHINES[self.machine]
-        net = fitting_nets(machine, load_net(self.actuator))
-        train(machine, net, self.task, self.settings, self.seed, self.out, self.resume, self.tensorboard)
-        print(f"{self.out}: trained for {self.settings.total_steps} steps; curve in {self.out}.csv")
+        actuator: Path  # Nets that `fit` wrote.
+        out: Path  # Policy to write, .npz.
+        resume: bool = False  # Take up OUT.checkpoint; the end is the same as without the break.
+        tensorboard: Path | None = None  # Folder for TensorBoard (extra `tensorboard`).
+        settings: tyro.conf.OmitArgPrefixes[PPOConfig] = field(default_factory=PPOConfig)  # The learner.
+        task: tyro.conf.OmitArgPrefixes[TaskConfig] = field(default_factory=TaskConfig)  # What an episode is.
+
+        def run(self) -> None:
+            """Train and write the policy."""
+            check(self, self.out)
+            if self.task.hold_min_s > self.task.hold_max_s:
+                raise WrongUse(f"--hold-max-s: expected --hold-min-s or more, got {self.task.hold_max_s}")
+            machine = MACHINES[self.machine]
+            net = fitting_nets(machine, load_net(self.actuator))
+            train(machine, net, self.task, self.settings, self.seed, self.out, self.resume, self.tensorboard)
+            print(f"{self.out}: trained for {self.settings.total_steps} steps; curve in {self.out}.csv")
+
+    return Train
 
 
-@dataclass
-class Evaluate:
+@dataclass(kw_only=True)
+class Evaluate(Command):
     """Policy and tuned baselines on the same sequences and starts."""
 
-    policy: Path
-    """Policy that `train` wrote."""
-    commands: Path | None = None
-    """Velocity sequences, CSV: sequence,time,vx,vy,vz [s, m/s]."""
-    starts: Path | None = None
-    """Start poses, CSV: one column a joint [rad]."""
-    plant: Literal["analytic", "net"] = "analytic"
-    """What moves: the analytic plant or the nets."""
-    json: Path | None = None
-    """Also write all runs here."""
-    gains: Path | None = None
-    """Tuned gains that `reproduce` wrote; by default gains.json beside POLICY, else they are tuned."""
-    machine: Name = "brokk170"
-    """Which machine."""
-    seed: int = 0
-    """Of noise, starts and tuning."""
+    policy: Path  # Policy that `train` wrote.
+    commands: Path | None = None  # Velocity sequences, CSV: sequence,time,vx,vy,vz [s, m/s].
+    starts: Path | None = None  # Start poses, CSV: one column a joint [rad].
+    plant: Literal["analytic", "net"] = "analytic"  # What moves: the analytic plant or the nets.
+    json: Path | None = None  # Also write all runs here.
+    gains: Path | None = None  # Tuned gains; by default gains.json beside POLICY.
 
     def run(self) -> None:
         """Evaluate and print the means."""
-        check(self, (self.json,))
-        machine = MACHINES[self.machine]
+        check(self, self.json)
+        machine, effort = MACHINES[self.machine], experiments.Effort()
         policy = load_policy(self.policy, machine)
         sequences = experiments.axis_sequences(machine)
         if self.commands:
             sequences = experiments.read_commands(self.commands, machine)
-        effort = experiments.Effort()
         if self.starts:
             starts = experiments.read_starts(self.starts, machine)
         else:
             rng = np.random.default_rng(self.seed + 2)
             starts = experiments.draw_starts(machine, sequences, effort.starts, rng)
         controllers: dict[str, Controller] = {"rl": PolicyController(machine, policy)}
-        gains = self.gains or self.policy.with_name("gains.json")
-        if self.gains or gains.exists():
+        beside = self.policy.with_name("gains.json")
+        gains = self.gains or (beside if beside.exists() else "tuned now")
+        print(f"gains of the baselines: {gains}", file=sys.stderr)
+        if isinstance(gains, Path):
             controllers |= experiments.read_gains(gains, machine, policy.net)
-            print(f"gains of the baselines: {gains}", file=sys.stderr)
         else:
-            controllers |= experiments.tuned_baselines(machine, policy.net, effort, self.seed)
+            controllers |= experiments.tuned_baselines(machine, policy.net, effort, self.seed)[0]
         moves = policy.net if self.plant == "net" else None
         runs, _ = experiments.task_space(machine, controllers, sequences, starts, self.seed, moves)
         if self.json:
-            meta: dict[str, Any] = experiments.meta(machine, self.seed) | {"plant": self.plant}
+            meta = experiments.meta(machine, self.seed)
+            meta |= {"policy": str(self.policy), "gains": str(gains), "plant": self.plant}
+            meta |= {"commands": str(self.commands or "x, y, z"), "starts": str(self.starts or "drawn")}
             experiments.write_json(self.json, {"meta": meta, "runs": runs})
         for name, rows in experiments.summary(runs).items():
             print(f"{name:20} " + ", ".join(f"{k} {v:.4f}" for k, v in rows["all"].items()))
 
 
-@dataclass
-class Reproduce:
+@dataclass(kw_only=True)
+class Reproduce(Command):
     """The whole chain: logs, nets, policy, baselines, comparison, report.html and results.json."""
 
-    out: Path = Path("results")
-    """Folder for everything."""
-    quick: bool = False
-    """The same, smaller: to see that it runs, not to judge the policy."""
-    machine: Name = "brokk170"
-    """Which machine."""
-    seed: int = 0
-    """Of everything random."""
+    out: Path = Path("results")  # Folder for everything.
+    quick: bool = False  # The same, smaller: to see that it runs, not to judge the policy.
 
     def run(self) -> None:
         """Run the chain and print the means."""
@@ -261,19 +218,21 @@ class Reproduce:
         print(f"{self.out / 'report.html'}\n{self.out / 'results.json'}")
 
 
-COMMANDS: dict[str, Any] = {
-    "collect": Collect,
-    "fit": Fit,
-    "train": Train,
-    "evaluate": Evaluate,
-    "reproduce": Reproduce,
+COMMANDS: dict[str, Callable[[], Any]] = {
+    "collect": lambda: Collect,
+    "fit": lambda: Fit,
+    "train": train_command,
+    "evaluate": lambda: Evaluate,
+    "reproduce": lambda: Reproduce,
 }
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; errors are one line on stderr."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    named = [name for name in COMMANDS if name in arguments[:1]] or list(COMMANDS)
     command = tyro.extras.subcommand_cli_from_dict(
-        COMMANDS,
+        {name: COMMANDS[name]() for name in named},
         prog="brokk-min",
         description=__doc__,
         args=arguments,

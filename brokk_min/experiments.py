@@ -7,45 +7,23 @@ Sequences and starts that score are never used for tuning; `tuning_goals` makes 
 from __future__ import annotations
 
 import base64
-import csv
 import html
 import io
 import json
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from brokk_min.actuator import (
-    ActuatorNet,
-    FitConfig,
-    collect,
-    fit,
-    free_run,
-    save_net,
-    score,
-    speed_limits,
-    task_log,
-)
-from brokk_min.env import Controller, TaskConfig, Trace, draw_goal, draw_pose, rollout
-from brokk_min.jacobian import (
-    Gains,
-    JacobianController,
-    dls,
-    limit_weights,
-    manipulability_threshold,
-    steady_map,
-    tune,
-    unpack_gains,
-)
-from brokk_min.kinematics import jacobian, tool_state
-from brokk_min.logs import Log, Recording, read_log, read_table, velocity_of, whole_file, write_log
+from brokk_min import __version__, actuator, jacobian, kinematics, logs
+from brokk_min.env import Controller, TaskConfig, Trace, draw_pose, reset, rollout, terminated
+from brokk_min.jacobian import JacobianController
 from brokk_min.machine import Machine
 from brokk_min.policy import PolicyController
 
@@ -53,9 +31,11 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 Array = NDArray[np.floating[Any]]
+Net = actuator.ActuatorNet
+Traces = Mapping[tuple[str, str], Trace]  # by controller and sequence, starts as one batch
 AXES = "xyz"
-# One axis of the paper's experiment: seconds and velocity [m/s] (assumed), with changes of direction.
-PATTERN = ((1, 0.0), (4, 0.2), (1, 0.0), (4, -0.2), (1, 0.0), (3, 0.1), (3, -0.1), (1, 0.0))
+# One axis of the paper's experiment: seconds and share of tool_speed (assumed), with changes of direction.
+PATTERN = ((1, 0.0), (4, 2 / 3), (1, 0.0), (4, -2 / 3), (1, 0.0), (3, 1 / 3), (3, -1 / 3), (1, 0.0))
 
 
 class Commands(NamedTuple):
@@ -67,7 +47,8 @@ class Commands(NamedTuple):
 
 def axis_sequences(machine: Machine) -> list[Commands]:
     """One sequence along x, one along y, one along z. Paper: Fig. 6"""
-    profile = np.concatenate([np.full(round(s * machine.rate), v) for s, v in PATTERN])
+    seconds, shares = np.array(PATTERN).T
+    profile = machine.tool_speed * np.repeat(shares, np.rint(seconds * machine.rate).astype(int))
     return [Commands(name, np.outer(profile, np.eye(3)[i])) for i, name in enumerate(AXES)]
 
 
@@ -76,7 +57,7 @@ def read_commands(path: Path, machine: Machine) -> list[Commands]:
 
     The last row of a sequence marks its end.
     """
-    table = read_table(path, ["sequence", "time", "vx", "vy", "vz"], text=("sequence",))
+    table = logs.read_table(path, ["sequence", "time", "vx", "vy", "vz"], text=("sequence",))
     result = []
     for name in dict.fromkeys(table["sequence"]):
         rows = np.flatnonzero(table["sequence"] == name)
@@ -95,83 +76,91 @@ def read_starts(path: Path, machine: Machine) -> Array:
     """Start poses of a CSV with one column a joint [rad], shape (starts, n).
 
     Raises:
-        ValueError: an angle outside its joint's range, with file, row and column.
+        ValueError: an angle outside its joint's range or a pose in the ground, with file and row.
     """
-    table = read_table(path, list(machine.names))
+    table = logs.read_table(path, list(machine.names))
     starts = np.stack([table[name] for name in machine.names], axis=1)
     low, high = machine.column("q_min"), machine.column("q_max")
-    bad = np.argwhere((starts < low) | (starts > high))
-    if len(bad):
-        row, joint = bad[0]
-        raise ValueError(
-            f"{path}: row {row + 2}, column {machine.names[joint]}: expected {low[joint]} to "
-            f"{high[joint]} rad, got {starts[row, joint]}"
-        )
+    for row, joint in np.argwhere((starts < low) | (starts > high)):
+        wanted = f"column {machine.names[joint]}: expected {low[joint]} to {high[joint]} rad"
+        raise ValueError(f"{path}: row {row + 2}, {wanted}, got {starts[row, joint]}")
+    lowest = kinematics.lowest_point(machine, starts)
+    for row in np.flatnonzero(terminated(machine, lowest)):
+        wanted = f"expected the whole arm above {machine.ground} m"
+        raise ValueError(f"{path}: row {row + 2}: {wanted}, got {lowest[row]:.3f} m")
     return starts
 
 
 def feasible(machine: Machine, start: Array, goals: Array) -> NDArray[np.bool_]:
     """Can ideal actuators follow `goals` (T, num, 3) from `start` (num, n)? Shape (num,).
 
-    Integrates lightly damped resolved rates with joint-limit weights: the tool must stay within 20 mm
-    of its path, joints 0.05 rad off their limits and below 0.9 of their steady speed at the command
-    limit in that direction at that angle, the arm 0.1 m off the ground.
+    Integrates lightly damped resolved rates with joint-limit weights. Margins, all assumed: the tool stays
+    within 20 mm of its path (no singularity is crossed), joints 0.05 rad off their limits and below 0.9 of
+    `speed_limits` (a tracking controller needs room to correct), the arm 0.1 m off the ground.
     """
     q, driven = np.array(start, float), machine.driven
     low, high = machine.column("q_min")[driven] + 0.05, machine.column("q_max")[driven] - 0.05
-    wanted, lowest = tool_state(machine, q, 0 * q)[::2]
+    wanted, lowest = kinematics.tool_state(machine, q, 0 * q)[::2]
     good, rates = lowest > machine.ground + 0.1, np.zeros_like(q)
     for goal in goals:
-        p, _, lowest = tool_state(machine, q, rates)
-        J = jacobian(machine, q)
-        inverse = dls(J, limit_weights(machine, q, rates)[:, driven], np.full(len(q), 1e-4))
+        p, _, lowest = kinematics.tool_state(machine, q, rates)
+        J = kinematics.jacobian(machine, q)
+        inverse = jacobian.dls(J, jacobian.limit_weights(machine, q, rates)[:, driven], np.full(len(q), 1e-4))
         rates = np.zeros_like(q)
         rates[:, driven] = (inverse @ (goal + (wanted - p))[..., None])[..., 0]
         q, wanted = q + rates * machine.dt, wanted + goal * machine.dt
         inside = ((q[:, driven] > low) & (q[:, driven] < high)).all(-1)
-        down, up = speed_limits(machine, q)
+        down, up = actuator.speed_limits(machine, q)
         slow = ((rates > 0.9 * down) & (rates < 0.9 * up))[:, driven].all(-1)
         near = np.linalg.norm(wanted - p, axis=-1) < 0.02
         good &= inside & slow & near & (lowest > machine.ground + 0.1)
     return good
 
 
-def draw_starts(machine: Machine, sequences: Sequence[Commands], num: int, rng: np.random.Generator) -> Array:
-    """Random poses from which ideal actuators could follow all sequences, (num, n) [rad].
+def _feasible_draws(
+    machine: Machine, num: int, label: str, draw: Callable[[], tuple[Array, list[Array]]]
+) -> tuple[Array, Array]:
+    """First `num` poses (num, n), and goals (T, num, 3), of those drawn whose goals are all `feasible`."""
+    poses: list[Array] = []
+    first: list[Array] = []
+    with tqdm(total=num, desc=label, unit="start", disable=None) as bar:
+        for _ in range(60):
+            pose, goals = draw()
+            keep = np.arange(len(pose))
+            for goal in goals:
+                keep = keep[feasible(machine, pose[keep], goal[:, keep])]
+            poses += list(pose[keep])
+            first += list(goals[0].swapaxes(0, 1)[keep])
+            bar.update(min(num, len(poses)) - bar.n)
+            if len(poses) >= num:
+                return np.array(poses[:num]), np.array(first[:num]).swapaxes(0, 1)
+    raise ValueError(f"{label}: expected {num} feasible poses for {machine.name}, got {len(poses)}")
 
-    Raises:
-        ValueError: too few such poses.
-    """
-    found: list[Array] = []
-    for _ in range(60):
-        q = draw_pose(machine, TaskConfig(), rng, 400)
-        for sequence in sequences:
-            if len(q):
-                q = q[feasible(machine, q, np.repeat(sequence.goals[:, None], len(q), axis=1))]
-        found += list(q)
-        if len(found) >= num:
-            return np.array(found[:num])
-    raise ValueError(f"starts: expected {num} feasible poses for {machine.name}, got {len(found)}")
+
+def draw_starts(machine: Machine, sequences: Sequence[Commands], num: int, rng: np.random.Generator) -> Array:
+    """Random poses (num, n) [rad] from which all sequences are `feasible`; ValueError: too few such poses."""
+    goals = [np.repeat(sequence.goals[:, None], 400, axis=1) for sequence in sequences]
+
+    def draw() -> tuple[Array, list[Array]]:
+        return draw_pose(machine, TaskConfig(), rng, 400), goals
+
+    return _feasible_draws(machine, num, "draw starts", draw)[0]
 
 
 def tuning_goals(machine: Machine, runs: int, seconds: float, seed: int) -> tuple[Array, Array]:
-    """Feasible starts (runs, n) and goals (T, runs, 3) drawn like the policy's: for tuning only."""
-    rng, ticks = np.random.default_rng(seed), round(seconds * machine.rate)
-    starts: list[Array] = []
-    goals: list[Array] = []
-    for _ in range(60):
-        pose = draw_pose(machine, TaskConfig(), rng, 200)
-        holds = rng.uniform(1, 4, (200, ticks))
-        changes = np.cumsum(holds, axis=1) * machine.rate
-        index = np.array([np.searchsorted(row, np.arange(ticks), "right") for row in changes])
-        drawn = draw_goal(machine, TaskConfig(), rng, 200 * ticks).reshape(200, ticks, 3)
-        goal = np.take_along_axis(drawn, index[..., None], axis=1).swapaxes(0, 1)
-        good = feasible(machine, pose, goal)
-        starts += list(pose[good])
-        goals += list(goal[:, good].swapaxes(0, 1))
-        if len(starts) >= runs:
-            return np.array(starts[:runs]), np.array(goals[:runs]).swapaxes(0, 1)
-    raise ValueError(f"tuning: expected {runs} feasible runs for {machine.name}, got {len(starts)}")
+    """Feasible starts (runs, n) and goals (T, runs, 3), drawn as the policy's by `reset`: for tuning only."""
+    rng, config, ticks = np.random.default_rng(seed), TaskConfig(), round(seconds * machine.rate)
+    holds = int(np.ceil(seconds / config.hold_min_s))  # that many are always long enough
+
+    def draw() -> tuple[Array, list[Array]]:
+        drawn = reset(machine, config, rng, 200 * holds, plant=False)
+        goals = [
+            np.repeat(drawn.v_goal[i : i + holds], drawn.goal_ticks[i : i + holds], axis=0)[:ticks]
+            for i in range(0, 200 * holds, holds)
+        ]
+        return drawn.q[::holds].astype(float), [np.stack(goals, axis=1)]
+
+    return _feasible_draws(machine, runs, "draw tuning runs", draw)
 
 
 # --- controllers ------------------------------------------------------------------------------------
@@ -184,81 +173,74 @@ class Effort:
     hours: float = 1.0
     fit_steps: int = 4000
     train_steps: int = 5_000_000
-    generations: int = 12
+    generations: int = 45
     tuning_runs: int = 12
     starts: int = 16
 
 
-QUICK = Effort(0.1, 700, 200_000, 2, 4, 4)
+QUICK = Effort(0.1, 700, 200_000, 4, 4, 4)
+
+
+def baselines(machine: Machine, net: Net) -> dict[str, JacobianController]:
+    """The paper's two baselines and one with feed-forward, with gains set by hand. Paper: Sec. 4.2"""
+    w0 = jacobian.manipulability_threshold(machine)
+    pid = jacobian.join_gains(machine, {"kp": 1.0, "ki": 8.0, "kd": 0.05, "feedback": 0.4, "ready": 0.015})
+    mild = jacobian.join_gains(machine, {"kp": 0.2, "ki": 0.5, "kd": 0.02, "feedback": 0.1, "ready": 0.015})
+    steady = jacobian.steady_map(machine, net)
+    return {
+        "jacobian_pid_k0.1": JacobianController(machine, pid, 0.1, w0),
+        "jacobian_pid_k0.05": JacobianController(machine, pid, 0.05, w0),
+        "jacobian_pid_ff": JacobianController(machine, mild, 0.1, w0, steady),
+    }
 
 
 def tuned_baselines(
-    machine: Machine, net: ActuatorNet, effort: Effort, seed: int
-) -> dict[str, JacobianController]:
-    """The paper's two baselines and one with feed-forward, each tuned on the machine itself.
+    machine: Machine, net: Net, effort: Effort, seed: int
+) -> tuple[dict[str, JacobianController], dict[str, dict[str, Any]]]:
+    """The baselines, each tuned on the machine itself, and how their tuning went, for JSON.
 
     The cost is the figure that is scored, mean |v_goal - v_tool|, on `tuning_goals`. Tuning on the
-    machine favours the baselines: the policy never sees it. Paper: Sec. 4.2
+    machine favours the baselines: the policy never sees it.
     """
     start, goals = tuning_goals(machine, effort.tuning_runs, 12.0, seed + 1000)
 
-    def cost(controller: JacobianController, candidates: int) -> Array:
-        runs = len(start)
-        gains = type(controller.gains)(*(np.repeat(g, runs, axis=0) for g in controller.gains))
-        trace = rollout(
-            machine,
-            replace(controller, gains=gains),
-            np.tile(start, (candidates, 1)),
-            np.tile(goals, (1, candidates, 1)),
-            TaskConfig(),
-            np.random.default_rng(seed),
-        )
-        error = np.linalg.norm(np.tile(goals, (1, candidates, 1)) - trace.v_tool, axis=-1)
+    def cost(controller: JacobianController) -> Array:
+        candidates, runs = len(controller.gains), len(start)
+        batch = replace(controller, gains=np.repeat(controller.gains, runs, axis=0))
+        wanted, rng = np.tile(goals, (1, candidates, 1)), np.random.default_rng(seed)
+        trace = rollout(machine, batch, np.tile(start, (candidates, 1)), wanted, TaskConfig(), rng)
+        error = np.linalg.norm(wanted - trace.v_tool, axis=-1)
         return error.mean(0).reshape(candidates, runs).mean(1)
 
-    plain = _untuned(machine, net)
-    return {name: tune(c, cost, seed, effort.generations, name) for name, c in plain.items()}
+    tuned, how = {}, {}
+    for name, controller in baselines(machine, net).items():
+        tuned[name], costs = jacobian.tune(controller, cost, seed, effort.generations, name)
+        how[name] = {"seed": seed, "cost": costs, "at_bound": jacobian.gains_at_bound(tuned[name])}
+    return tuned, how
 
 
-def _untuned(machine: Machine, net: ActuatorNet) -> dict[str, JacobianController]:
-    w0 = manipulability_threshold(machine)
-    zero = unpack_gains(np.zeros(3 * len(machine.driven) + 1), len(machine.driven))
-    return {
-        "jacobian_pid_k0.1": JacobianController(machine, zero, 0.1, w0),
-        "jacobian_pid_k0.05": JacobianController(machine, zero, 0.05, w0),
-        "jacobian_pid_ff": JacobianController(machine, zero, 0.1, w0, steady_map(machine, net)),
-    }
+def plain_gains(controllers: Mapping[str, JacobianController]) -> dict[str, dict[str, list[float]]]:
+    """Gains of each baseline by name, for JSON."""
+    named = {name: jacobian.split_gains(c.gains) for name, c in controllers.items()}
+    return {name: {key: gain.tolist() for key, gain in gains.items()} for name, gains in named.items()}
 
 
-def plain_gains(baselines: Mapping[str, JacobianController]) -> dict[str, dict[str, Any]]:
-    """Gains of each baseline as lists, for JSON."""
-    return {
-        name: {key: np.asarray(value).tolist() for key, value in c.gains._asdict().items()}
-        for name, c in baselines.items()
-    }
-
-
-def read_gains(path: Path, machine: Machine, net: ActuatorNet) -> dict[str, JacobianController]:
+def read_gains(path: Path, machine: Machine, net: Net) -> dict[str, JacobianController]:
     """The baselines with gains that `reproduce` wrote.
 
     Raises:
         ValueError: no such file, or gains of other controllers, joints or another machine.
     """
-    plain = _untuned(machine, net)
+    result = baselines(machine, net)
     try:
         table = json.loads(path.read_text())
         if table["meta"]["machine"] != machine.name:
             raise ValueError(f"gains of {table['meta']['machine']}")
-        gains = {
-            name: Gains(*(np.array(table["gains"][name][key], float) for key in Gains._fields))
-            for name in plain
-        }
-        shapes = {g.kp.shape for g in gains.values()}
-        if shapes != {machine.driven.shape}:
-            raise ValueError(f"gains of shape {shapes}")
+        for name, controller in result.items():
+            result[name] = replace(controller, gains=jacobian.join_gains(machine, table["gains"][name]))
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: expected gains for {machine.name}, got {error!r}") from error
-    return {name: replace(controller, gains=gains[name]) for name, controller in plain.items()}
+    return result
 
 
 # --- the comparison -----------------------------------------------------------------------------------
@@ -308,15 +290,15 @@ def task_space(
     sequences: Sequence[Commands],
     starts: Array,
     seed: int,
-    net: ActuatorNet | None = None,
-) -> tuple[list[dict[str, Any]], dict[tuple[str, str], Trace]]:
+    net: Net | None = None,
+) -> tuple[list[dict[str, Any]], Traces]:
     """Every controller on the same sequences, starts and noise. Paper: Sec. 4.2, Fig. 6
 
     Returns:
-        One row of `metrics` a controller, sequence and start; and the traces, starts as one batch.
+        One row of `metrics` a controller, sequence and start; and the traces.
     """
     runs, traces = [], {}
-    first = tool_state(machine, starts, 0 * starts)[0]
+    first = kinematics.tool_position(machine, starts)
     for name, controller in controllers.items():
         for sequence in tqdm(sequences, desc=f"evaluate {name}", unit="sequence", disable=None):
             goals = np.repeat(sequence.goals[:, None], len(starts), axis=1)
@@ -331,211 +313,187 @@ def task_space(
 
 def summary(runs: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
     """Mean of each figure by controller and sequence, and over all of them together ("all")."""
-    result: dict[str, dict[str, dict[str, float]]] = {}
-    for controller in dict.fromkeys(run["controller"] for run in runs):
-        mine = [run for run in runs if run["controller"] == controller]
-        names = [*dict.fromkeys(run["sequence"] for run in mine), "all"]
-        result[controller] = {
-            name: {
-                key: float(np.mean([r[key] for r in mine if name in (r["sequence"], "all")]))
-                for key in list(mine[0])[3:]
-            }
-            for name in names
-        }
-    return result
+
+    def means(controller: str, sequence: str) -> dict[str, float]:
+        mine = [r for r in runs if r["controller"] == controller and sequence in (r["sequence"], "all")]
+        return {key: float(np.mean([run[key] for run in mine])) for key in list(mine[0])[3:]}
+
+    controllers, sequences = (dict.fromkeys(run[key] for run in runs) for key in ("controller", "sequence"))
+    return {c: {s: means(c, s) for s in (*sequences, "all")} for c in controllers}
 
 
-def driven_log(machine: Machine, traces: Mapping[Any, Trace]) -> Log:
-    """What encoders and valves said during evaluated runs, as recordings for `score`."""
+def driven_log(machine: Machine, traces: Traces, controller: str) -> logs.Log:
+    """What encoders and valves said during one controller's runs, as recordings for `score`."""
     recordings = []
     for (name, sequence), trace in traces.items():
-        for i in range(trace.q.shape[1]):
-            q = trace.q_measured[:, i].astype(float)
-            velocity = velocity_of(q, machine.velocity_samples)
-            u = trace.u[:, i].astype(float)
-            recordings.append(Recording(f"{name}_{sequence}_{i:02d}", u, q, velocity))
-    return Log(machine.names, tuple(recordings))
+        for i in range(trace.q.shape[1] * (name == controller)):
+            u, q = trace.u[:, i].astype(float), trace.q_measured[:, i].astype(float)
+            velocity = logs.velocity_of(q, machine.velocity_samples)
+            recordings.append(logs.Recording(f"{name}_{sequence}_{i:02d}", u, q, velocity))
+    return logs.Log(machine.names, tuple(recordings))
 
 
 # --- figures: one style, units on every axis, colours that differ in brightness too ------------------
 
-COLOURS = {
-    "wanted": "black",
-    "rl": "#0072b2",
-    "jacobian_pid_k0.1": "#d55e00",
-    "jacobian_pid_k0.05": "#e69f00",
-    "jacobian_pid_ff": "#009e73",
+STYLES: dict[str, dict[str, Any]] = {
+    "wanted": {"color": "black", "linestyle": "--"},
+    "machine": {"color": "black"},
+    "nets": {"color": "#0072b2", "linestyle": "--"},
+    "rl": {"color": "#0072b2"},
+    "jacobian_pid_k0.1": {"color": "#d55e00"},
+    "jacobian_pid_k0.05": {"color": "#e69f00"},
+    "jacobian_pid_ff": {"color": "#009e73"},
 }
 
 
-def _figure(rows: int, columns: int, height: float = 2.4) -> tuple[Any, Any]:
-    figure, axes = plt.subplots(
-        rows, columns, figsize=(4.2 * columns, height * rows), squeeze=False, layout="constrained"
-    )
-    for ax in axes.flat:
-        ax.grid(alpha=0.3)
-    return figure, axes
+Row = tuple[Sequence[str], Mapping[str, Array]]  # labels of k y axes, and curves (T, k) by name
 
 
-def _png(figure: Any) -> str:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, dpi=110, metadata={"Software": None})
-    plt.close(figure)
-    return base64.b64encode(buffer.getvalue()).decode()
+def plot_lines(x: Array, xlabel: str, rows: Sequence[Row], one_scale: bool = False) -> Any:
+    """Rows of line plots over the same x under one legend; `one_scale`: one y axis in each row."""
+    share: Literal["row", "none"] = "row" if one_scale else "none"
+    high, wide = len(rows), len(rows[0][0])
+    figure = plt.figure(figsize=(4.0 * wide + 0.4, 2.3 * high + 0.4), layout="constrained")
+    grid = figure.subplots(high, wide, squeeze=False, sharey=share)
+    for axes, (labels, curves) in zip(grid, rows, strict=True):
+        for i, (ax, label) in enumerate(zip(axes, labels, strict=True)):
+            for name, y in curves.items():
+                ax.plot(x, y[:, i], label=name, linewidth=1.1, **STYLES[name])
+            ax.set_ylabel(label)
+            ax.grid(alpha=0.3)
+    for ax in grid[-1]:
+        ax.set_xlabel(xlabel)
+    return _with_legend(figure, grid[0, 0])
 
 
-def plot_sequence(
-    machine: Machine, traces: Mapping[tuple[str, str], Trace], sequence: Commands, start: Array, run: int
-) -> Any:
+def _with_legend(figure: Any, ax: Any) -> Any:
+    figure.legend(*ax.get_legend_handles_labels(), loc="outside upper center", ncol=5, fontsize=8)
+    return figure
+
+
+def _during(traces: Traces, sequence: Commands) -> dict[str, Trace]:
+    return {name: trace for (name, other), trace in traces.items() if other == sequence.name}
+
+
+def plot_sequence(machine: Machine, traces: Traces, sequence: Commands, start: Array, run: int) -> Any:
     """Tool position and velocity along x, y, z of all controllers in one run. Paper: Fig. 6"""
-    figure, axes = _figure(2, 3)
-    clock = np.arange(1, len(sequence.goals) + 1) * machine.dt
-    first = tool_state(machine, start, 0 * start)[0]
-    wanted = np.cumsum(sequence.goals, axis=0) * machine.dt
-    names = [name for name, other in traces if other == sequence.name]
-    for i, axis in enumerate(AXES):
-        axes[0, i].plot(clock, wanted[:, i], "--", color="black", label="wanted")
-        axes[1, i].plot(clock, sequence.goals[:, i], "--", color="black", label="wanted")
-        for name in names:
-            trace = traces[name, sequence.name]
-            style = {"color": COLOURS.get(name, "grey"), "lw": 1.1, "label": name}
-            axes[0, i].plot(clock, trace.p_tool[:, run, i] - first[i], **style)
-            axes[1, i].plot(clock, trace.v_tool[:, run, i], **style)
-        axes[0, i].set_ylabel(f"{axis} - {axis}(0) [m]")
-        axes[1, i].set_ylabel(f"velocity {axis} [m/s]")
-        axes[1, i].set_xlabel("time [s]")
-    limits = [ax.get_ylim() for ax in axes[0]], [ax.get_ylim() for ax in axes[1]]
-    for row, spans in zip(axes, limits, strict=True):  # the same scale side by side
-        for ax in row:
-            ax.set_ylim(min(a for a, _ in spans), max(b for _, b in spans))
-    axes[0, 0].legend(fontsize=7)
-    figure.suptitle(f"sequence {sequence.name}, start {run}")
-    return figure
+    first = kinematics.tool_position(machine, start)
+    p, v = {"wanted": np.cumsum(sequence.goals, axis=0) * machine.dt}, {"wanted": sequence.goals}
+    for name, trace in _during(traces, sequence).items():
+        p[name], v[name] = trace.p_tool[:, run] - first, trace.v_tool[:, run]
+    rows = [([f"{a} - {a}(0) [m]" for a in AXES], p), ([f"velocity {a} [m/s]" for a in AXES], v)]
+    return plot_lines(machine.dt * np.arange(1, len(sequence.goals) + 1), "time [s]", rows, one_scale=True)
 
 
-def plot_joint_rates(
-    machine: Machine, traces: Mapping[tuple[str, str], Trace], sequence: Commands, run: int
-) -> Any:
+def plot_joint_rates(machine: Machine, traces: Traces, sequence: Commands, run: int) -> Any:
     """Velocity of the driven joints of all controllers in one run. Paper: Fig. 6d"""
-    figure, axes = _figure(1, len(machine.driven))
-    clock = np.arange(1, len(sequence.goals) + 1) * machine.dt
-    for ax, joint in zip(axes[0], machine.driven, strict=True):
-        for (name, other), trace in traces.items():
-            if other == sequence.name:
-                ax.plot(clock, trace.q_dot[:, run, joint], lw=1, color=COLOURS.get(name, "grey"), label=name)
-        ax.set(xlabel="time [s]", ylabel=f"velocity {machine.names[joint]} [rad/s]")
-    axes[0, 0].legend(fontsize=7)
-    return figure
+    labels = [f"velocity {machine.names[i]} [rad/s]" for i in machine.driven]
+    rates = {name: t.q_dot[:, run, machine.driven] for name, t in _during(traces, sequence).items()}
+    return plot_lines(machine.dt * np.arange(1, len(sequence.goals) + 1), "time [s]", [(labels, rates)])
 
 
-def plot_free_run(net: ActuatorNet, log: Log, seconds: float = 30.0) -> Any:
+def plot_free_run(net: Net, log: logs.Log, seconds: float = 30.0) -> Any:
     """Recorded and free-running angle and velocity of every joint in one unseen recording."""
     recording = log.recordings[0]
     ticks = min(round(seconds * net.rate), len(recording.q) - net.history - 1)
-    start = np.array([net.history])
-    q, q_dot = (a[:, 0] for a in free_run(net, recording, start, ticks))
-    later, clock = net.history + 1 + np.arange(ticks), np.arange(1, ticks + 1) / net.rate
-    figure, axes = _figure(2, len(net.joints), 2.0)
-    for j, name in enumerate(net.joints):
-        for row, mine, truth in ((0, q, recording.q), (1, q_dot, recording.q_dot)):
-            axes[row, j].plot(clock, truth[later, j], color="black", lw=1, label="machine")
-            axes[row, j].plot(clock, mine[:, j], "--", color=COLOURS["rl"], lw=1, label="nets")
-        axes[0, j].set_ylabel(f"{name} [rad]")
-        axes[1, j].set(ylabel=f"velocity {name} [rad/s]", xlabel="time [s]")
-    axes[0, 0].legend(fontsize=7)
-    return figure
-
-
-def plot_bars(table: Mapping[str, Mapping[str, Mapping[str, float]]], sequences: Sequence[str]) -> Any:
-    """Mean velocity error and largest drift of each controller on each sequence."""
-    figure, axes = _figure(1, 2, 3.0)
-    keys = (("velocity_error_mean", "mean velocity error [m/s]"), ("off_axis_drift_max", "largest drift [m]"))
-    width = 0.8 / len(table)
-    for ax, (key, label) in zip(axes[0], keys, strict=True):
-        for i, (name, rows) in enumerate(table.items()):
-            places = np.arange(len(sequences)) + i * width
-            values = [rows[s][key] for s in sequences]
-            ax.bar(places, values, width, color=COLOURS.get(name, "grey"), label=name)
-        ax.set_xticks(np.arange(len(sequences)) + 0.4 - width / 2, sequences)
-        ax.set_ylabel(label)
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncol=5, fontsize=8)
-    return figure
+    q, q_dot = actuator.free_run(net, recording, np.array([net.history]), ticks)
+    later = slice(net.history + 1, net.history + 1 + ticks)
+    rows = [
+        ([f"{joint} [rad]" for joint in net.joints], {"machine": recording.q[later], "nets": q[:, 0]}),
+        (
+            [f"{joint} [rad/s]" for joint in net.joints],
+            {"machine": recording.q_dot[later], "nets": q_dot[:, 0]},
+        ),
+    ]
+    return plot_lines(np.arange(1, ticks + 1) / net.rate, "time [s]", rows)
 
 
 def plot_learning(curve: Path) -> Any:
     """Mean reward and velocity error of the exploring policy over environment steps."""
-    with open(curve, newline="") as file:
-        rows = list(csv.DictReader(file))
-    steps = [int(row["global_step"]) / 1e6 for row in rows]
-    figure, axes = _figure(1, 2)
-    names = (("charts/reward", "reward a step [1]"), ("charts/velocity_error", "velocity error [m/s]"))
-    for ax, (name, label) in zip(axes[0], names, strict=True):
-        ax.plot(steps, [float(row[name]) for row in rows], color=COLOURS["rl"], lw=1)
-        ax.set(xlabel="environment steps [million]", ylabel=label)
-    return figure
+    table = logs.read_table(curve, ["global_step", "charts/reward", "charts/velocity_error"])
+    curves = {"rl": np.stack([table["charts/reward"], table["charts/velocity_error"]], axis=1)}
+    row = (["reward a step [1]", "velocity error [m/s]"], curves)
+    return plot_lines(table["global_step"] / 1e6, "environment steps [million]", [row])
 
 
-# --- the whole chain --------------------------------------------------------------------------------
+def plot_bars(table: Mapping[str, Mapping[str, Mapping[str, float]]], sequences: Sequence[str]) -> Any:
+    """Mean velocity error and largest drift of each controller on each sequence."""
+    figure, axes = plt.subplots(1, 2, figsize=(8.4, 3.0), layout="constrained")
+    keys = (("velocity_error_mean", "mean velocity error [m/s]"), ("off_axis_drift_max", "largest drift [m]"))
+    width = 0.8 / len(table)
+    for ax, (key, label) in zip(axes, keys, strict=True):
+        for i, (name, rows) in enumerate(table.items()):
+            places = np.arange(len(sequences)) + (i - (len(table) - 1) / 2) * width
+            ax.bar(places, [rows[s][key] for s in sequences], width, label=name, color=STYLES[name]["color"])
+        ax.set_xticks(np.arange(len(sequences)), sequences)
+        ax.set_ylabel(label)
+        ax.grid(alpha=0.3, axis="y")
+        ax.set_axisbelow(True)
+    return _with_legend(figure, axes[0])
+
+
+# --- the report -------------------------------------------------------------------------------------
+
+STYLE = """body{font:15px/1.45 sans-serif;max-width:1100px;margin:2em auto;padding:0 1em}
+table{border-collapse:collapse;margin:1em 0}td,th{border:1px solid #bbb;padding:.25em .6em;text-align:right}
+td:first-child,th:first-child{text-align:left}img{max-width:100%}"""
 
 
 def write_json(path: Path, value: Any) -> None:
     """Write JSON whole, floats as they are."""
-    with whole_file(path, "w") as file:
+    with logs.whole_file(path, "w") as file:
         json.dump(value, file, indent=1, allow_nan=False)
         file.write("\n")
 
 
-def write_report(
-    path: Path, results: Mapping[str, Any], figures: Mapping[str, str], clock: Mapping[str, float]
-) -> None:
-    """One self-contained page: tables and figures in the paper's order."""
-    table = results["task_space"]["summary"]
-    keys = list(next(iter(table.values()))["all"])
-    parts = [
-        "<!doctype html><meta charset=utf-8><title>brokk_min report</title><style>"
-        "body{font:15px/1.45 sans-serif;max-width:1100px;margin:2em auto;padding:0 1em}"
-        "table{border-collapse:collapse;margin:1em 0}td,th{border:1px solid #bbb;padding:.25em .6em;"
-        "text-align:right}td:first-child,th:first-child{text-align:left}img{max-width:100%}</style>",
+def write_report(path: Path, parts: Sequence[tuple[Any, ...]], clock: Mapping[str, float]) -> None:
+    """One page by itself; a part is a title, a sentence, and tables {row: {column: cell}} or figures."""
+    page = [
+        f"<!doctype html><meta charset=utf-8><title>brokk_min report</title><style>{STYLE}</style>",
         "<h1>Task space control with reinforcement learning: what was measured</h1>",
         "<p>The machine here is an analytic plant, not a real Brokk 170. The policy was trained on nets "
         "fitted to its logs and never saw its equations.</p>",
         "<p>Seconds spent: " + ", ".join(f"{k} {v:.0f}" for k, v in clock.items()) + ".</p>",
-        "<h2>Actuator nets on unseen recordings</h2>",
-        _html_table(
-            [
-                "joint",
-                "one step [rad/s]",
-                "same as last [rad/s]",
-                "free run 10 s [rad/s]",
-                "angle after 10 s [rad]",
-            ],
-            [
-                [joint, s["one_step_rmse"], s["persistence_rmse"], *s["free_run"].get("10", {"": 0}).values()]
-                for joint, s in results["actuator"]["test"].items()
-            ],
-        ),
-        "<h2>Task space control</h2>",
-        "<p>Means over all sequences and starts.</p>",
-        _html_table(["controller", *keys], [[n, *rows["all"].values()] for n, rows in table.items()]),
-        "<p>Mean velocity error [m/s] by sequence.</p>",
-        _html_table(
-            ["controller", *next(iter(table.values()))],
-            [[n, *(r["velocity_error_mean"] for r in rows.values())] for n, rows in table.items()],
-        ),
     ]
-    for title, image in figures.items():
-        alt = html.escape(title)
-        parts.append(f"<h3>{alt}</h3><img alt='{alt}' src='data:image/png;base64,{image}'>")
-    with whole_file(path, "w") as file:
-        file.write("\n".join(parts) + "\n")
+    for title, sentence, *contents in tqdm(parts, desc="draw", unit="part", disable=None):
+        page.append(f"<h2>{html.escape(title)}</h2><p>{html.escape(sentence)}</p>")
+        page += [_table(c) if isinstance(c, Mapping) else _image(title, c) for c in contents]
+    with logs.whole_file(path, "w") as file:
+        file.write("\n".join(page) + "\n")
 
 
-def _html_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    def line(cells: Sequence[Any], tag: str) -> str:
+def _table(rows: Mapping[str, Mapping[str, Any]]) -> str:
+    def line(tag: str, cells: Sequence[Any]) -> str:
         texts = (f"{c:.4g}" if isinstance(c, float) else html.escape(str(c)) for c in cells)
-        return "<tr>" + "".join(f"<{tag}>{t}</{tag}>" for t in texts) + "</tr>"
+        return "<tr>" + "".join(f"<{tag}>{text}</{tag}>" for text in texts) + "</tr>"
 
-    return f"<table>{line(head, 'th')}{''.join(line(row, 'td') for row in rows)}</table>"
+    head = line("th", ["", *next(iter(rows.values()))])
+    return f"<table>{head}{''.join(line('td', [name, *row.values()]) for name, row in rows.items())}</table>"
+
+
+def _image(title: str, figure: Any) -> str:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, dpi=110, metadata={"Software": None})
+    plt.close(figure)
+    image = base64.b64encode(buffer.getvalue()).decode()
+    return f"<img alt='{html.escape(title)}' src='data:image/png;base64,{image}'>"
+
+
+def report_tables(results: Mapping[str, Any]) -> tuple[dict[str, dict[str, Any]], ...]:
+    """Errors of the nets, tuning of the baselines, means of all figures, velocity error by sequence."""
+    nets, tuning, means = {}, {}, results["task_space"]["summary"]
+    for joint, s in results["actuator"]["test"].items():
+        nets[joint] = {key: s[key] for key in ("one_step_rmse", "persistence_rmse")}
+        nets[joint] |= s["free_run"].get("10", {})
+    for name, t in results["tuning"].items():
+        bounds = ", ".join(t["at_bound"]) or "none"
+        tuning[name] = {"first": t["cost"][0], "last": t["cost"][-1], "gains at a bound": bounds}
+    everything = {name: rows["all"] for name, rows in means.items()}
+    errors = {n: {s: row["velocity_error_mean"] for s, row in rows.items()} for n, rows in means.items()}
+    return nets, tuning, everything, errors
+
+
+# --- the whole chain --------------------------------------------------------------------------------
 
 
 def reproduce(machine: Machine, out: Path, effort: Effort, seed: int) -> dict[str, Any]:
@@ -547,7 +505,6 @@ def reproduce(machine: Machine, out: Path, effort: Effort, seed: int) -> dict[st
 
     out.mkdir(parents=True, exist_ok=True)
     clock, last = {}, time.perf_counter()
-
     stages = tqdm(total=6, desc="stages done", unit="stage", position=1, disable=None)
 
     def lap(name: str) -> None:
@@ -556,59 +513,59 @@ def reproduce(machine: Machine, out: Path, effort: Effort, seed: int) -> dict[st
         stages.set_postfix_str(name)
         stages.update()
 
-    write_log(out / "log.npz", collect(machine, effort.hours, "rich", np.random.default_rng(seed)))
-    test = task_log(machine, 20, 40.0, np.random.default_rng(seed + 1))
-    write_log(out / "log_test.npz", test)
+    files, rng = (out / "log.npz", out / "log_test.npz"), np.random.default_rng
+    logs.write_log(files[0], actuator.collect(machine, effort.hours, "rich", rng(seed)))
+    logs.write_log(files[1], actuator.task_log(machine, 20, 40.0, rng(seed + 1)))
     lap("record")
-    log = read_log([out / "log.npz"], machine.velocity_samples)
-    test = read_log([out / "log_test.npz"], machine.velocity_samples)
-    net = fit(
-        log,
-        FitConfig(steps=effort.fit_steps, history=machine.history),
-        seed,
-        machine.velocity_samples,
-        machine.name,
-    )
-    save_net(out / "net.npz", net)
+    log, test = (logs.read_log([file], machine.velocity_samples) for file in files)
+    config = actuator.FitConfig(steps=effort.fit_steps, history=machine.history)
+    net = actuator.fit(log, config, seed, machine.velocity_samples, machine.name)
+    actuator.save_net(out / "net.npz", net)
     lap("fit")
     driven = net.select([machine.names[i] for i in machine.driven])
-    config = PPOConfig(total_steps=effort.train_steps)
-    policy = train(machine, driven, TaskConfig(), config, seed, out / "policy.npz", resume=True)
+    learner = PPOConfig(total_steps=effort.train_steps)
+    policy = train(machine, driven, TaskConfig(), learner, seed, out / "policy.npz", resume=True)
     lap("train")
-    baselines = tuned_baselines(machine, driven, effort, seed)
+    tuned, how = tuned_baselines(machine, driven, effort, seed)
     lap("tune")
     sequences = axis_sequences(machine)
-    starts = draw_starts(machine, sequences, effort.starts, np.random.default_rng(seed + 2))
-    controllers: dict[str, Controller] = {"rl": PolicyController(machine, policy), **baselines}
-    runs, traces = task_space(machine, controllers, sequences, starts, seed)
-    simulated, _ = task_space(machine, {"rl": controllers["rl"]}, sequences, starts, seed, driven)
-    rl_log = driven_log(machine, {key: trace for key, trace in traces.items() if key[0] == "rl"})
+    starts = draw_starts(machine, sequences, effort.starts, rng(seed + 2))
+    rl = PolicyController(machine, policy)
+    runs, traces = task_space(machine, {"rl": rl, **tuned}, sequences, starts, seed)
+    simulated, _ = task_space(machine, {"rl": rl}, sequences, starts, seed, driven)
+    driven_by_policy = actuator.score(net, driven_log(machine, traces, "rl"))
     lap("evaluate")
     results = {
-        "meta": meta(machine, seed) | {"effort": effort.__dict__},
-        "actuator": {"test": score(net, test), "driven_by_policy": score(net, rl_log)},
+        "meta": meta(machine, seed) | {"effort": asdict(effort)},
+        "actuator": {"test": actuator.score(net, test), "driven_by_policy": driven_by_policy},
         "task_space": {"runs": runs, "summary": summary(runs), "rl_on_nets": summary(simulated)["rl"]},
-        "gains": plain_gains(baselines),
+        "gains": plain_gains(tuned),
+        "tuning": how,
         "starts": starts.tolist(),
     }
     write_json(out / "results.json", results)
     write_json(out / "gains.json", {"meta": results["meta"], "gains": results["gains"]})
-    figures = {"Nets run freely on an unseen recording": plot_free_run(net, test)}
-    figures["Learning curve"] = plot_learning(out / "policy.npz.csv")
-    figures["Velocity error and drift"] = plot_bars(results["task_space"]["summary"], [*AXES, "all"])
-    for sequence in sequences:
-        figures[f"Motion along {sequence.name}"] = plot_sequence(machine, traces, sequence, starts[0], 0)
-    figures["Joint velocities during x motion"] = plot_joint_rates(machine, traces, sequences[0], 0)
-    images = {title: _png(figure) for title, figure in figures.items()}
+    nets, tuning, means, errors = report_tables(results)
+    motion = [plot_sequence(machine, traces, sequence, starts[0], 0) for sequence in sequences]
+    rates = plot_joint_rates(machine, traces, sequences[0], 0)
+    bars = plot_bars(results["task_space"]["summary"], [*AXES, "all"])
+    parts = (
+        ("Actuator nets", "One step and free runs of 10 s on unseen recordings [rad/s, rad].", nets),
+        ("Nets run freely", "One of these recordings.", plot_free_run(net, test)),
+        ("Learning curve", "The exploring policy, on the nets.", plot_learning(out / "policy.npz.csv")),
+        ("Tuning of the baselines", "Least velocity error after a generation, on the machine.", tuning),
+        ("Task space control", "Motion along x, y and z from the first start, one scale a row.", *motion),
+        ("Joint velocities", "Motion along x from the first start.", rates),
+        ("Figures of merit", "Means over all sequences and starts [m/s, m, m/s^3, full strokes].", means),
+        ("Velocity error and drift by sequence", "Means over all starts [m/s, m].", errors, bars),
+    )
+    write_report(out / "report.html", parts, clock)
     lap("draw")
     stages.close()
     write_json(out / "timing.json", clock)
-    write_report(out / "report.html", results, images, clock)
     return results
 
 
 def meta(machine: Machine, seed: int) -> dict[str, Any]:
     """What every JSON of ours says of itself."""
-    from brokk_min import __version__
-
     return {"brokk_min": __version__, "machine": machine.name, "seed": seed, "units": "m, m/s, s, rad"}

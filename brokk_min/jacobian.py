@@ -6,17 +6,16 @@ eq4), `JacobianController` turns them into commands, `tune` finds its gains on t
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import differential_evolution
 from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet
-from brokk_min.env import measured
+from brokk_min.env import Measured, measured
 from brokk_min.kinematics import jacobian
 from brokk_min.machine import PWM_MAX, Machine, limit_command
 
@@ -24,50 +23,39 @@ Array = NDArray[np.floating[Any]]
 
 
 def dls(J: ArrayLike, W: ArrayLike, damping: ArrayLike, as_printed: bool = False) -> Array:
-    """Weighted damped pseudo-inverse W^-1 J^T (J W^-1 J^T + lambda^2 I)^-1.
+    """Weighted damped pseudo-inverse W^-1 J^T (J W^-1 J^T + lambda^2 I)^-1, (..., n, 3).
 
     It minimises |J q_dot - v|^2 + lambda^2 q_dot^T W q_dot. The paper prints J W J^T inside the
-    bracket; that form is the minimiser only for W = I and is kept as `as_printed`.
-
-    Paper: eq4
+    bracket; that form is the minimiser only for W = I and is kept as `as_printed`. Paper: eq4
 
     Args:
-        J: Jacobian [m/rad], shape (..., 3, n).
-        W: diagonal of the weight matrix, shape (..., n), positive.
-        damping: lambda^2, shape (...).
+        J: Jacobian [m/rad], (..., 3, n).
+        W: diagonal of the weight matrix, (..., n), positive.
+        damping: lambda^2, (...).
         as_printed: use the paper's printed form.
-
-    Returns:
-        Shape (..., n, 3).
     """
     J, W = np.asarray(J), np.asarray(W)
-    Jt = np.swapaxes(J, -1, -2)
-    inner = W if as_printed else 1 / W
-    square = (J * inner[..., None, :]) @ Jt + np.asarray(damping)[..., None, None] * np.eye(3)
+    inner = (W if as_printed else 1 / W)[..., None, :]
+    square = (J * inner) @ np.swapaxes(J, -1, -2) + np.asarray(damping)[..., None, None] * np.eye(3)
     return np.swapaxes(np.linalg.solve(square, J / W[..., None, :]), -1, -2)
 
 
 def limit_gradient(machine: Machine, q: ArrayLike) -> Array:
-    """Gradient of Chan and Dubey's joint-limit function by each angle, shape (..., n) of `q` [rad].
+    """Slope by each angle `q` [rad] of Chan and Dubey's joint-limit function, (..., n).
 
-    Sum over joints of (q_max - q_min)^2 / (4 (q_max - q) (q - q_min)). Paper: Sec. 4.2 (W)
+    The function is the sum over joints of (q_max - q_min)^2 / (4 (q_max - q) (q - q_min)).
     """
     low, high = machine.column("q_min"), machine.column("q_max")
-    edge = 1e-3 * (high - low)
+    edge = 1e-3 * (high - low)  # finite at the limits and beyond
     q = np.clip(q, low + edge, high - edge)
     gradient: Array = (high - low) ** 2 * (2 * q - high - low) / (4 * ((high - q) * (q - low)) ** 2)
     return gradient
 
 
 def limit_weights(machine: Machine, q: ArrayLike, q_dot: ArrayLike) -> Array:
-    """Diagonal of W for all joints (..., n): 1 + |gradient| while nearing a limit, otherwise 1.
+    """Diagonal of W for all joints, (..., n): 1 + |gradient| while nearing a limit, otherwise 1.
 
-    Paper: Sec. 4.2 (W, Chan and Dubey)
-
-    Args:
-        machine: n joints.
-        q: angles [rad], (..., n).
-        q_dot: rates whose sign tells the direction, (..., n).
+    `q` are angles [rad], `q_dot` rates whose sign tells the direction. Paper: Sec. 4.2 (W)
     """
     gradient = limit_gradient(machine, q)
     return np.where(gradient * np.asarray(q_dot) > 0, 1 + np.abs(gradient), 1.0)
@@ -80,9 +68,7 @@ def manipulability(J: ArrayLike) -> Array:
 
 
 def nakamura_damping(w: ArrayLike, w0: float, k: float) -> Array:
-    """lambda^2 = k (1 - w/w0)^2 below the manipulability `w0`, otherwise 0.
-
-    Paper: Sec. 4.2 (k = 0.1 and 0.05)
+    """lambda^2 = k (1 - w/w0)^2 below the manipulability `w0`, otherwise 0. Paper: Sec. 4.2 (lambda)
 
     Example:
         >>> nakamura_damping([0.0, 0.5, 1.0, 2.0], 1.0, 0.1)
@@ -100,14 +86,41 @@ def manipulability_threshold(machine: Machine) -> float:
 
 # --- from joint rates to valves ---------------------------------------------------------------------
 
+# Ranges that `tune` searches (assumed); of the first three each driven joint has its own.
+GAINS = {
+    "kp": (0.0, 4.0),  # valve opening per rad/s
+    "ki": (0.0, 12.0),  # valve opening per rad
+    "kd": (0.0, 0.3),  # valve opening per rad/s^2
+    "feedback": (0.0, 1.0),  # K = feedback * I of eq3
+    "ready": (0.0, 0.04),  # least valve opening while the tool is to move
+}
 
-class Gains(NamedTuple):
-    """PID gains of the driven joints, (..., n_driven) each, and the feedback K = feedback * I (...)."""
 
-    kp: Array  # valve opening per rad/s
-    ki: Array  # valve opening per rad
-    kd: Array  # valve opening per rad/s^2
-    feedback: Array  # K of eq3, 1
+def split_gains(gains: ArrayLike) -> dict[str, Array]:
+    """Gains by name, (..., n_driven) or (..., 1) each, from vectors (..., 3 n_driven + 2).
+
+    Example:
+        >>> {name: gain.tolist() for name, gain in split_gains([1, 2, 3, 4, 5, 6, 7, 8]).items()}
+        {'kp': [1, 2], 'ki': [3, 4], 'kd': [5, 6], 'feedback': [7], 'ready': [8]}
+    """
+    gains = np.asarray(gains)
+    joints = (gains.shape[-1] - 2) // 3
+    parts = np.split(gains, [joints, 2 * joints, 3 * joints, 3 * joints + 1], axis=-1)
+    return dict(zip(GAINS, parts, strict=True))
+
+
+def join_gains(machine: Machine, named: Mapping[str, ArrayLike]) -> Array:
+    """`split_gains` turned round for a single vector; one number stands for all joints.
+
+    Raises:
+        ValueError: another number of gains, or not finite ones.
+    """
+    sizes = [len(machine.driven)] * 3 + [1, 1]
+    pairs = zip(GAINS, sizes, strict=True)
+    gains = np.concatenate([np.broadcast_to(np.asarray(named[name], float), size) for name, size in pairs])
+    if not np.isfinite(gains).all():
+        raise ValueError(f"gains: expected finite numbers, got {gains}")
+    return gains
 
 
 class Memory(NamedTuple):
@@ -123,7 +136,7 @@ class Memory(NamedTuple):
 class SteadyMap:
     """Steady joint velocity over angle and command as the nets know it; inverted for feed-forward."""
 
-    q: Array  # (n_driven, a) angles [rad]
+    q: Array  # (n_driven, a) angles [rad], evenly spaced
     u: Array  # (c,) commands
     velocity: Array  # (n_driven, a, c) [rad/s], rising along c
 
@@ -134,29 +147,33 @@ class SteadyMap:
         row = np.clip(place.astype(int), 0, self.q.shape[1] - 2)
         part = np.clip(place - row, 0, 1)[..., None]
         curve = (1 - part) * self.velocity[j, row] + part * self.velocity[j, row + 1]
-        last = np.clip((curve <= q_dot[..., None]).sum(-1), 1, len(self.u) - 1)
-        low = np.take_along_axis(curve, last[..., None] - 1, -1)[..., 0]
-        high = np.take_along_axis(curve, last[..., None], -1)[..., 0]
-        fraction = np.clip((q_dot - low) / np.maximum(high - low, 1e-6), 0, 1)
-        command: Array = self.u[last - 1] + fraction * (self.u[last] - self.u[last - 1])
+        last = np.clip((curve <= q_dot[..., None]).sum(-1), 1, len(self.u) - 1)[..., None]
+        low, high = (np.take_along_axis(curve, last - i, -1) for i in (1, 0))
+        share = np.clip((q_dot[..., None] - low) / np.maximum(high - low, 1e-6), 0, 1)
+        command: Array = (self.u[last - 1] + share * (self.u[last] - self.u[last - 1]))[..., 0]
         return command
 
 
 def steady_map(machine: Machine, net: ActuatorNet, angles: int = 9, commands: int = 41) -> SteadyMap:
     """Ask the nets how fast each driven joint moves steadily under each command at each angle."""
     low, high = machine.column("q_min")[machine.driven], machine.column("q_max")[machine.driven]
-    q = np.linspace(low, high, angles, axis=-1)  # (n, a)
+    q = np.linspace(low, high, angles)[:, None]  # (a, 1, n)
     u = np.linspace(-1, 1, commands) * machine.pwm_limit / PWM_MAX
-    at = np.broadcast_to(q[:, :, None], (len(low), angles, commands)).transpose(1, 2, 0)
     history = np.zeros((angles, commands, len(low), 3, net.history), np.float32)
     history[..., 2, :] = u[:, None, None]
-    velocity, lags = np.zeros(at.shape), np.arange(1 - net.history, 1) / net.rate
+    velocity, lags = np.zeros((angles, commands, len(low))), np.arange(1 - net.history, 1) / net.rate
     for _ in range(60):  # fixed point: a history that moves as fast as the nets say it does
-        history[..., 0, :] = at[..., None] + velocity[..., None] * lags
+        history[..., 0, :] = q[..., None] + velocity[..., None] * lags
         history[..., 1, :] = velocity[..., None]
         velocity = 0.5 * velocity + 0.5 * net.predict(history)
     rising = np.maximum.accumulate(velocity.transpose(2, 0, 1), axis=-1)
-    return SteadyMap(q, u, rising)
+    return SteadyMap(q[:, 0].T, u, rising)
+
+
+def valve_opening(machine: Machine, u: ArrayLike) -> Array:
+    """Opening in [-1, 1] beyond the dead zone under a command `u`, same shape. Paper: Sec. 3.2"""
+    beyond: Array = np.maximum(0.0, np.abs(u) - machine.dead_zone) / (1 - machine.dead_zone)
+    return np.sign(u) * beyond
 
 
 @dataclass(frozen=True)
@@ -167,11 +184,12 @@ class JacobianController:
 
     The PID acts on the valve opening beyond the dead zone; the dead zone is added after it, and the
     integral stops where the command saturates. With `feedforward`, the steady command of the nets
-    for the wanted rate is added.
+    for the wanted rate is added. While the tool is to move, no valve goes below the opening `ready`:
+    one that has gone idle answers late (paper Sec. 3.2).
     """
 
     machine: Machine
-    gains: Gains
+    gains: Array  # see `GAINS`: (3 n_driven + 2,), or a row for each machine that is driven
     k: float  # of Nakamura's damping
     w0: float  # manipulability below which damping sets in
     feedforward: SteadyMap | None = None
@@ -181,89 +199,89 @@ class JacobianController:
         zero = np.zeros((num, len(self.machine.driven)))
         return Memory(zero, zero, zero, zero)
 
-    def rates(self, observation: Array, last: Array) -> tuple[Array, Array]:
-        """Wanted and measured rates of the driven joints [rad/s] (..., n_driven). Paper: eq3"""
+    def rates(self, seen: Measured, last: Array) -> Array:
+        """Wanted rates of the driven joints [rad/s], (..., n_driven); `last`: a tick ago. Paper: eq3"""
         m, driven = self.machine, self.machine.driven
-        seen = measured(m, observation.astype(float))
-        J = jacobian(m, seen.q)
-        towards = np.zeros_like(seen.q)
+        J, towards = jacobian(m, seen.q), np.zeros_like(seen.q)
         towards[..., driven] = last
         W = limit_weights(m, seen.q, towards)[..., driven]
         inverse = dls(J, W, nakamura_damping(manipulability(J), self.w0, self.k))
-        feedback = self.gains.feedback[..., None] * (seen.v_goal - seen.v_tool)
+        feedback = split_gains(self.gains)["feedback"] * (seen.v_goal - seen.v_tool)
         rate = (inverse @ (seen.v_goal + feedback)[..., None])[..., 0]
         fastest = np.where(rate > 0, m.column("q_dot_up")[driven], m.column("q_dot_down")[driven])
         excess = np.max(np.abs(rate) / fastest, axis=-1, keepdims=True)
-        return rate / np.maximum(1.0, excess), seen.q_dot  # slower, but in the same direction
+        return rate / np.maximum(1.0, excess)  # slower, but in the same direction
 
     def __call__(self, observation: Array, memory: Memory) -> tuple[Array, Memory]:
         """Commands u (..., n) for observations (..., obs) of `env.observe`, and the next memory."""
-        m, g = self.machine, self.gains
-        rate, q_dot = self.rates(observation, memory.rate)
-        error = rate - q_dot
+        m, g = self.machine, split_gains(self.gains)
+        seen = measured(m, observation.astype(float))
+        rate = self.rates(seen, memory.rate)
+        error = rate - seen.q_dot
         slope = 0.7 * memory.slope + 0.3 * (error - memory.error) * m.rate
-        opening = g.kp * error + memory.integral + g.kd * slope
+        opening = g["kp"] * error + memory.integral + g["kd"] * slope
         if self.feedforward is not None:
-            q = measured(m, observation).q[..., m.driven]
-            steady = self.feedforward.command(q, rate)
-            opening += np.sign(steady) * np.maximum(0, (np.abs(steady) - m.dead_zone) / (1 - m.dead_zone))
-        room = (m.pwm_limit / PWM_MAX - m.dead_zone) / (1 - m.dead_zone)
+            opening += valve_opening(m, self.feedforward.command(seen.q[..., m.driven], rate))
+        room = valve_opening(m, m.pwm_limit / PWM_MAX)
         winding = (np.abs(opening) >= room) & (np.sign(opening) == np.sign(error))
-        integral = memory.integral + np.where(winding, 0.0, g.ki * error * m.dt)
-        small = np.abs(opening) < 0.5 / PWM_MAX  # less than half a count: idle, not dead zone plus noise
+        integral = memory.integral + np.where(winding, 0.0, g["ki"] * error * m.dt)
+        moving = np.linalg.norm(seen.v_goal, axis=-1, keepdims=True) > 1e-6
+        size = np.maximum(np.abs(opening), moving * g["ready"])
+        size = (size >= 0.5 / PWM_MAX) * (m.dead_zone + (1 - m.dead_zone) * size)  # below half a count: idle
         u = np.zeros((*opening.shape[:-1], m.n))
-        u[..., m.driven] = np.where(
-            small, 0.0, np.sign(opening) * (m.dead_zone + (1 - m.dead_zone) * np.abs(opening))
-        )
+        u[..., m.driven] = np.sign(opening) * size
         return limit_command(m, u), Memory(integral, error, slope, rate)
 
 
 # --- tuning -----------------------------------------------------------------------------------------
 
-BOUNDS = {"kp": (0.0, 4.0), "ki": (0.0, 12.0), "kd": (0.0, 0.3), "feedback": (0.0, 1.0)}  # assumed
-
-
-def unpack_gains(vector: ArrayLike, joints: int) -> Gains:
-    """Gains from vectors (..., 3 joints + 1) of the optimiser."""
-    vector = np.asarray(vector)
-    kp, ki, kd = (vector[..., i * joints : (i + 1) * joints] for i in range(3))
-    return Gains(kp, ki, kd, vector[..., -1])
-
 
 def tune(
     controller: JacobianController,
-    cost: Callable[[JacobianController, int], Array],
+    cost: Callable[[JacobianController], Array],
     seed: int,
     generations: int,
     label: str,
-) -> JacobianController:
-    """The controller with the gains of least cost, by SciPy's differential evolution.
+) -> tuple[JacobianController, list[float]]:
+    """The controller with the gains of least cost, and the least cost after each generation.
+
+    Cross-entropy search: 32 candidates a generation from a normal distribution, at first about the
+    controller's own gains, then about the mean of the best 8.
 
     Args:
         controller: whose gains are to be found.
-        cost: cost (candidates,) of a controller whose gains have a leading axis of candidates.
+        cost: cost (candidates,) of a controller with a row of gains for each candidate.
         seed: of the search.
         generations: of the search.
         label: shown at the progress bar.
     """
-    joints = len(controller.machine.driven)
-    bounds = [BOUNDS[name] for name in ("kp", "ki", "kd") for _ in range(joints)] + [BOUNDS["feedback"]]
+    low, high = gain_bounds(controller.machine)
+    rng, mean, spread = np.random.default_rng(seed), controller.gains, 0.15 * (high - low)
+    gains = np.clip(mean + spread * rng.standard_normal((32, len(low))), low, high)
+    gains[0] = mean
+    best, costs = mean, [np.inf]
+    for _ in tqdm(range(generations), desc=f"tune {label}", unit="generation", disable=None):
+        found = cost(replace(controller, gains=gains))
+        order = np.argsort(found)
+        if found[order[0]] < costs[-1]:
+            best = gains[order[0]]
+        costs.append(min(costs[-1], float(found[order[0]])))
+        elite = gains[order[:8]]
+        spread = 0.5 * spread + 0.5 * np.sqrt(np.mean((elite - mean) ** 2, axis=0))  # wide while it travels
+        mean = elite.mean(axis=0)
+        gains = np.clip(mean + spread * rng.standard_normal(gains.shape), low, high)
+    return replace(controller, gains=best), costs[1:]
 
-    def objective(vectors: Array) -> Array:
-        gains = unpack_gains(vectors.T, joints)
-        return cost(replace(controller, gains=gains), vectors.shape[1])
 
-    with tqdm(total=generations, desc=f"tune {label}", unit="generation", disable=None) as bar:
-        result = differential_evolution(
-            objective,
-            bounds,
-            maxiter=generations,
-            popsize=4,
-            seed=seed,
-            tol=0,
-            polish=False,
-            vectorized=True,
-            updating="deferred",
-            callback=lambda intermediate_result: bool(bar.update()) and False,
-        )
-    return replace(controller, gains=unpack_gains(result.x, joints))
+def gain_bounds(machine: Machine) -> tuple[Array, Array]:
+    """Smallest and largest gains of `GAINS` as vectors."""
+    low, high = ({name: ends[i] for name, ends in GAINS.items()} for i in (0, 1))
+    return join_gains(machine, low), join_gains(machine, high)
+
+
+def gains_at_bound(controller: JacobianController) -> list[str]:
+    """Gains within 1 % of an end of their range: there the range decided, not the cost."""
+    m, (low, high) = controller.machine, gain_bounds(controller.machine)
+    names = [f"{kind} {m.names[i]}" for kind in ("kp", "ki", "kd") for i in m.driven] + ["feedback", "ready"]
+    share = (controller.gains - low) / (high - low)
+    return [name for name, s in zip(names, share, strict=True) if not 0.01 < s < 0.99]

@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from benchmarks.rollout import random_net
+from brokk_min import experiments
 from brokk_min.__main__ import COMMANDS, main
 from brokk_min.logs import read_log
 
@@ -46,6 +52,7 @@ def test_the_designs_options_exist(capsys: pytest.CaptureFixture[str]) -> None:
         (["collect", "--out", "x.csv", "--hours", "0"], 2, "--hours"),
         (["collect", "--out", "x.txt"], 2, "--out"),
         (["collect"], 2, "--out"),
+        (["collect", "--out", "x.csv", "--machine", "digger"], 2, "brokk170"),
         (["nonsense"], 2, "nonsense"),
         (["fit", "--out", "n.npz"], 2, "LOGS"),
         (["fit", "missing.csv", "--out", "n.npz"], 1, "missing.csv"),
@@ -127,7 +134,7 @@ def test_collect_fit_train_resume_evaluate(tmp_path: Path, capsys: pytest.Captur
     commands, starts = tmp_path / "c.csv", tmp_path / "s.csv"
     commands.write_text("sequence,time,vx,vy,vz\nup,0,0,0,0.1\nup,1,0,0,0\n")
     starts.write_text("q1,q2,q3,q4,q5\n0,0.5,0.58,1.71,1.24\n")
-    gains = {k: [0.5] * 4 for k in ("kp", "ki", "kd")} | {"feedback": 0.1}
+    gains = {k: [0.5] * 4 for k in ("kp", "ki", "kd")} | {"feedback": [0.1], "ready": [0.01]}
     names = ("jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff")
     table = {"meta": {"machine": "brokk170"}, "gains": dict.fromkeys(names, gains)}
     (tmp_path / "gains.json").write_text(json.dumps(table))
@@ -135,9 +142,39 @@ def test_collect_fit_train_resume_evaluate(tmp_path: Path, capsys: pytest.Captur
         where = tmp_path / f"{plant}.json"
         options = ["--commands", commands, "--starts", starts, "--plant", plant, "--json", where]
         assert run("evaluate", "--policy", policy, *options) == 0
-        runs = json.loads(where.read_text())["runs"]
+        written = json.loads(where.read_text())
+        runs, meta = written["runs"], written["meta"]
+        files = {"policy": policy, "commands": commands, "starts": starts, "gains": tmp_path / "gains.json"}
+        assert {name: meta[name] for name in files} == {name: str(file) for name, file in files.items()}
+        assert (meta["plant"], meta["machine"], meta["seed"]) == (plant, "brokk170", 0)
         assert [r["controller"] for r in runs] == ["rl", *names]
         assert {(r["sequence"], r["start"]) for r in runs} == {("up", 0)}
+    starts.write_text("q1,q2,q3,q4,q5\n0,0,-0.3,2.5,1.2\n")
     capsys.readouterr()
+    assert run("evaluate", "--policy", policy, "--starts", starts) == 1
+    assert "s.csv: row 2: expected the whole arm above" in capsys.readouterr().err
     assert run("evaluate", "--policy", net) == 1
     assert "policy" in capsys.readouterr().err
+
+
+def test_without_gains_the_baselines_are_tuned_and_that_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    net = random_net(np.random.default_rng(0)).select(["q1", "q3", "q4", "q5"])
+    policy = SimpleNamespace(net=replace(net, machine="brokk170"), act=lambda seen: np.zeros((len(seen), 4)))
+    monkeypatch.setattr("brokk_min.__main__.load_policy", lambda *_: policy)
+    quick = experiments.Effort(generations=1, tuning_runs=1, starts=1)
+    monkeypatch.setattr("brokk_min.experiments.Effort", lambda: quick)
+    where = tmp_path / "e.json"
+    assert run("evaluate", "--policy", tmp_path / "p.npz", "--json", where) == 0
+    assert "gains of the baselines: tuned now" in capsys.readouterr().err
+    meta = json.loads(where.read_text())["meta"]
+    assert (meta["gains"], meta["commands"], meta["starts"]) == ("tuned now", "x, y, z", "drawn")
+
+
+@pytest.mark.parametrize("command", [name for name in COMMANDS if name != "train"])
+def test_only_training_imports_torch(command: str) -> None:
+    code = "import sys; from brokk_min.__main__ import main\ntry: main(sys.argv[1:])\n"
+    code += "finally: print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code, command, "--help"], capture_output=True, text=True)
+    assert done.stdout.endswith("False\n"), done.stderr

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from benchmarks.rollout import random_net
-from brokk_min import experiments
+from brokk_min import experiments, jacobian
+from brokk_min.actuator import ActuatorNet
 from brokk_min.env import TaskConfig, Trace, rollout
 from brokk_min.kinematics import lowest_point, tool_position
 from brokk_min.machine import BROKK_170
@@ -73,11 +75,14 @@ def test_feasible_refuses_a_path_out_of_reach() -> None:
     assert experiments.feasible(BROKK_170, start, still)[0]
 
 
-def test_axis_sequences_move_along_one_axis_and_turn_round() -> None:
-    for i, sequence in enumerate(experiments.axis_sequences(BROKK_170)):
+@pytest.mark.parametrize("tool_speed", [0.3, 0.6])
+def test_axis_sequences_move_along_one_axis_and_turn_round(tool_speed: float) -> None:
+    """At two thirds and one third of the speed that an operator may ask for: 0.2 and 0.1 of 0.3 m/s."""
+    machine, fast = replace(BROKK_170, tool_speed=tool_speed), round(tool_speed * 2 / 3, 3)
+    for i, sequence in enumerate(experiments.axis_sequences(machine)):
         others = np.delete(sequence.goals, i, axis=1)
         assert not others.any()
-        assert {round(v, 3) for v in sequence.goals[:, i]} == {0.0, 0.2, -0.2, 0.1, -0.1}
+        assert {round(v, 3) for v in sequence.goals[:, i]} == {0.0, fast, -fast, fast / 2, -fast / 2}
         assert sequence.goals.sum() == pytest.approx(0.0)
 
 
@@ -135,11 +140,51 @@ def test_starts_outside_the_joints_ranges_are_refused(tmp_path: Path) -> None:
         experiments.read_starts(path, BROKK_170)
 
 
+def test_starts_in_the_ground_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "s.csv"
+    path.write_text("q1,q2,q3,q4,q5\n0,0.5,0.5,1.7,1.2\n0,0,-0.3,2.5,1.2\n")
+    with pytest.raises(ValueError, match=r"s.csv: row 3: expected the whole arm above 0.0 m, got -"):
+        experiments.read_starts(path, BROKK_170)
+
+
+def test_tuning_runs_are_drawn_like_the_policys_episodes() -> None:
+    config = TaskConfig()
+    starts, goals = experiments.tuning_goals(BROKK_170, 8, 12.0, 7)
+    assert starts.shape == (8, 5) and goals.shape == (240, 8, 3)
+    assert np.linalg.norm(goals, axis=-1).max() <= BROKK_170.tool_speed + 1e-6
+    holds = []
+    for run in goals.swapaxes(0, 1):
+        changes = np.flatnonzero(np.abs(np.diff(run, axis=0)).max(axis=1)) + 1
+        holds += list(np.diff([0, *changes]))  # the last hold is cut short
+    assert min(holds) >= config.hold_min_s * 20
+    assert max(holds) > 40 and np.mean(holds) < config.hold_max_s * 20
+    again = experiments.tuning_goals(BROKK_170, 8, 12.0, 7)
+    assert np.array_equal(starts, again[0]) and np.array_equal(goals, again[1])
+
+
+def net_of_driven_joints() -> ActuatorNet:
+    return random_net(np.random.default_rng(0)).select(["q1", "q3", "q4", "q5"])
+
+
 def test_gains_of_another_machine_are_refused(tmp_path: Path) -> None:
-    net = random_net(np.random.default_rng(0)).select(["q1", "q3", "q4", "q5"])
     path = tmp_path / "gains.json"
     path.write_text(json.dumps({"meta": {"machine": "digger"}, "gains": {}}))
     with pytest.raises(ValueError, match=r"expected gains for brokk170.*digger"):
+        experiments.read_gains(path, BROKK_170, net_of_driven_joints())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [({"kp": [1, 2]}, "shape"), ({"ki": [1, 2, 3, float("nan")]}, "finite"), ({"kd": "fast"}, "fast")],
+)
+def test_damaged_gains_are_refused(tmp_path: Path, change: dict[str, object], message: str) -> None:
+    net, path = net_of_driven_joints(), tmp_path / "gains.json"
+    table = experiments.plain_gains(experiments.baselines(BROKK_170, net))
+    path.write_text(json.dumps({"meta": {"machine": "brokk170"}, "gains": table}))
+    assert experiments.plain_gains(experiments.read_gains(path, BROKK_170, net)) == table
+    table["jacobian_pid_ff"] |= change
+    path.write_text(json.dumps({"meta": {"machine": "brokk170"}, "gains": table}))
+    with pytest.raises(ValueError, match=rf"gains.json: expected gains for brokk170.*{message}"):
         experiments.read_gains(path, BROKK_170, net)
 
 
@@ -166,6 +211,17 @@ def test_results_hold_every_run_with_its_figures(twice: tuple[Path, Path]) -> No
     assert all(0 < r["reward_mean"] < 1 for r in runs)
     rl = [r["velocity_error_mean"] for r in runs if r["controller"] == "rl"]
     assert results["task_space"]["summary"]["rl"]["all"]["velocity_error_mean"] == pytest.approx(np.mean(rl))
+
+
+def test_results_tell_how_the_baselines_were_tuned(twice: tuple[Path, Path]) -> None:
+    results = json.loads((twice[0] / "results.json").read_text())
+    assert set(results["tuning"]) == set(results["gains"])
+    for name, how in results["tuning"].items():
+        assert how["seed"] == 3 and len(how["cost"]) == TINY.generations
+        assert 0 < how["cost"][-1] <= how["cost"][0] < 0.3
+        spans = jacobian.GAINS.items()
+        ends = [k for k, (low, high) in spans for g in results["gains"][name][k] if g in (low, high)]
+        assert len([g for g in how["at_bound"] if g.split()[0] in ends]) >= len(ends)
 
 
 def test_the_report_is_one_file_with_its_figures(twice: tuple[Path, Path]) -> None:

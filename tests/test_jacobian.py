@@ -10,8 +10,8 @@ from helpers_machines import obedient_net, obedient_velocity, random_machine
 from scipy.optimize import minimize
 
 from brokk_min import jacobian as classic
-from brokk_min.env import TaskConfig, observe, rollout
-from brokk_min.jacobian import Gains, JacobianController, Memory
+from brokk_min.env import TaskConfig, measured, observe, rollout
+from brokk_min.jacobian import JacobianController, Memory
 from brokk_min.kinematics import jacobian
 from brokk_min.machine import BROKK_170
 
@@ -190,10 +190,6 @@ def test_manipulability_vanishes_where_the_arm_is_straight():
 # --- the controller -------------------------------------------------------------------------------
 
 
-def gains(kp=0.0, ki=0.0, kd=0.0, feedback=0.0, n=4):
-    return Gains(np.full(n, kp), np.full(n, ki), np.full(n, kd), np.array(feedback))
-
-
 def at_rest(q, v_goal, machine=BROKK_170, q_dot=None):
     """Observation without noise of machines at angles `q`, moving at `q_dot`."""
     q = np.asarray(q, float)
@@ -205,8 +201,12 @@ def at_rest(q, v_goal, machine=BROKK_170, q_dot=None):
 
 
 def controller(w0=1e-6, k=0.1, machine=BROKK_170, **values):
-    n = len(machine.driven)
-    return JacobianController(machine, gains(n=n, **values), k, w0)
+    gains = classic.join_gains(machine, dict.fromkeys(classic.GAINS, 0.0) | values)
+    return JacobianController(machine, gains, k, w0)
+
+
+def rates(c, seen, last):
+    return c.rates(measured(c.machine, seen.astype(float)), last)
 
 
 GOAL = np.array([0.04, -0.03, 0.05])
@@ -228,22 +228,21 @@ def test_rates_are_eq3():
 
     best = minimize(cost, np.zeros(4), tol=1e-12).x
     towards_driven = towards[[0, 2, 3, 4]][None]
-    rate, measured = controller(w0, feedback=0.3).rates(seen, towards_driven)
+    rate = rates(controller(w0, feedback=0.3), seen, towards_driven)
     np.testing.assert_allclose(rate[0], best, atol=1e-5)
-    np.testing.assert_allclose(measured[0], q_dot[[0, 2, 3, 4]], atol=1e-6)
-    other, _ = controller(w0, feedback=0.3).rates(seen, -towards_driven)
+    other = rates(controller(w0, feedback=0.3), seen, -towards_driven)
     assert np.abs(other - rate).max() > 1e-3  # the last direction decides the weights
 
 
 @pytest.mark.parametrize("pose", [POSE, STRETCHED], ids=["paper", "stretched"])
 def test_the_rate_clip_slows_down_in_the_same_direction(pose):
     c, last = controller(w0=0.5, k=0.05), np.zeros((1, 4))
-    small, _ = c.rates(at_rest(pose, 0.01 * GOAL)[None], last)
+    small = rates(c, at_rest(pose, 0.01 * GOAL)[None], last)
     up, down = (BROKK_170.column(f"q_dot_{way}")[[0, 2, 3, 4]] for way in ("up", "down"))
     fastest = np.where(small > 0, up, down)
     assert (np.abs(small) < fastest).all()
     for scale in (0.02, 0.5, 5.0, 500.0):
-        rate, _ = c.rates(at_rest(pose, scale * GOAL)[None], last)
+        rate = rates(c, at_rest(pose, scale * GOAL)[None], last)
         assert (np.abs(rate) <= fastest * (1 + 1e-9)).all()
         unclipped = small * scale / 0.01
         share = np.max(np.abs(unclipped) / fastest)
@@ -320,6 +319,22 @@ def test_the_integral_stops_while_the_valve_is_fully_open():
     for _ in range(10):  # and comes out of the stop at once when the goal turns round
         u, back = stuck(at_rest(POSE, -5 * GOAL)[None], back)
     assert (np.abs(back.integral) < np.abs(memory.integral)).all()
+
+
+def test_no_valve_goes_idle_while_the_tool_is_to_move():
+    """Moving along z, the slew valve is held at the opening `ready`; without a goal all valves close."""
+    c = controller(kp=1e-3, ready=0.03)
+    wanted = round(127 * (0.07 + 0.93 * 0.03))
+    u, _ = c(at_rest(POSE, [0.0, 0.01, 0.1])[None], c.start(1))
+    assert np.abs(np.rint(u[0] * 127)).tolist() == [wanted, 0, wanted, wanted, wanted]
+    rate = rates(c, at_rest(POSE, [0.0, 0.01, 0.1])[None], np.zeros((1, 4)))
+    assert (np.sign(u[0, BROKK_170.driven]) == np.sign(rate[0])).all()
+    still, _ = c(at_rest(POSE, np.zeros(3))[None], c.start(1))
+    assert not still.any()
+    far, _ = controller(kp=1.5, ready=0.03)(at_rest(POSE, GOAL)[None], c.start(1))
+    same, _ = controller(kp=1.5)(at_rest(POSE, GOAL)[None], c.start(1))
+    beyond = np.abs(same) > wanted / 127
+    assert beyond.any() and (far[beyond] == same[beyond]).all()  # a least opening, not one more
 
 
 def test_controllers_of_a_batch_do_not_meet():
@@ -428,46 +443,73 @@ def single_joint():
 def test_tune_finds_the_minimum_of_a_bowl_and_is_deterministic():
     machine = single_joint()
     start, sizes = controller(machine=machine), []
-    wanted = {"kp": 1.0, "ki": 7.0, "kd": 0.12, "feedback": 0.4}
-    width = {name: high - low for name, (low, high) in classic.BOUNDS.items()}
+    wanted = {"kp": 1.0, "ki": 7.0, "kd": 0.12, "feedback": 0.4, "ready": 0.03}
+    width = {name: high - low for name, (low, high) in classic.GAINS.items()}
 
-    def bowl(candidate, num):
-        g = candidate.gains
-        sizes.append(num)
-        columns = {name: np.reshape(getattr(g, name), (num, -1))[:, 0] for name in wanted}
-        return sum(((columns[n] - wanted[n]) / width[n]) ** 2 for n in wanted)
+    def bowl(candidates):
+        g = classic.split_gains(candidates.gains)
+        sizes.append(len(candidates.gains))
+        return sum(((g[n][:, 0] - wanted[n]) / width[n]) ** 2 for n in wanted)
 
-    found = classic.tune(start, bowl, seed=0, generations=60, label="bowl")
-    for name, value in wanted.items():
-        assert float(np.squeeze(getattr(found.gains, name))) == pytest.approx(value, abs=0.02 * width[name])
-    again = classic.tune(start, bowl, seed=0, generations=60, label="bowl")
-    other = classic.tune(start, bowl, seed=1, generations=60, label="bowl")
-    assert all(map(np.array_equal, found.gains, again.gains))
-    assert not all(map(np.array_equal, found.gains, other.gains))
+    found, costs = classic.tune(start, bowl, seed=0, generations=60, label="bowl")
+    for name, gain in classic.split_gains(found.gains).items():
+        assert gain.item() == pytest.approx(wanted[name], abs=0.02 * width[name])
+    again, _ = classic.tune(start, bowl, seed=0, generations=60, label="bowl")
+    other, _ = classic.tune(start, bowl, seed=1, generations=60, label="bowl")
+    assert np.array_equal(found.gains, again.gains)
+    assert not np.array_equal(found.gains, other.gains)
     assert found.k == start.k
-    assert not start.gains.kp.any()
+    assert not start.gains.any()
     assert min(sizes) > 1  # whole generations at once
+    assert len(costs) == 60 and (np.diff(costs) <= 0).all()
+    assert costs[-1] == bowl(replace(found, gains=found.gains[None]))[0] < 0.01 * costs[0]
 
 
-def test_gains_are_unpacked_in_order():
-    found = classic.unpack_gains(np.arange(26).reshape(2, 13), 4)
-    assert found.kp.tolist() == [[0, 1, 2, 3], [13, 14, 15, 16]]
-    assert found.ki[0].tolist() == [4, 5, 6, 7]
-    assert found.kd[1].tolist() == [21, 22, 23, 24]
-    assert found.feedback.tolist() == [12, 25]
+def test_tune_is_never_worse_than_the_gains_it_starts_with():
+    start = controller(machine=single_joint(), kp=1.0, ki=7.0, kd=0.12, feedback=0.4, ready=0.03)
+
+    def far(candidates):
+        return np.abs(candidates.gains - start.gains).sum(axis=1)
+
+    found, costs = classic.tune(start, far, seed=0, generations=1, label="start")
+    assert costs == [0.0] and np.array_equal(found.gains, start.gains)
+
+
+def test_gains_are_split_in_order_and_joined_again():
+    vectors = np.arange(28).reshape(2, 14)
+    found = classic.split_gains(vectors)
+    assert found["kp"].tolist() == [[0, 1, 2, 3], [14, 15, 16, 17]]
+    assert found["ki"][0].tolist() == [4, 5, 6, 7]
+    assert found["kd"][1].tolist() == [22, 23, 24, 25]
+    assert found["feedback"].tolist() == [[12], [26]]
+    assert found["ready"].tolist() == [[13], [27]]
+    one = classic.split_gains(vectors[1])
+    assert classic.join_gains(BROKK_170, one).tolist() == vectors[1].tolist()
+    for name in ("kp", "ready"):
+        with pytest.raises(ValueError):
+            classic.join_gains(BROKK_170, one | {name: [1.0, 2.0]})
+        with pytest.raises(ValueError, match="finite"):
+            classic.join_gains(BROKK_170, one | {name: np.nan})
+
+
+def test_gains_at_the_ends_of_their_ranges_are_named():
+    gains = classic.join_gains(BROKK_170, {"kp": 2.0, "ki": 6.0, "kd": 0.1, "feedback": 0.5, "ready": 0.0})
+    gains[1], gains[4], gains[7] = 3.97, 0.11, 11.8  # of 4 and 12: within 1 %, within 1 %, not
+    found = classic.gains_at_bound(JacobianController(BROKK_170, gains, 0.1, 1.0))
+    assert found == ["kp q3", "ki q1", "ready"]
 
 
 def test_candidates_side_by_side_are_the_single_controllers():
     """Gains with a leading axis of candidates drive as each candidate would alone."""
     rng = np.random.default_rng(7)
-    many = classic.unpack_gains(rng.uniform(0, 1, (3, 13)) * ([2] * 4 + [8] * 4 + [0.2] * 4 + [1]), 4)
+    many = rng.uniform(0, 1, (3, 14)) * ([2] * 4 + [8] * 4 + [0.2] * 4 + [1, 0.02])
     goals = np.repeat(rng.uniform(-0.2, 0.2, (2, 3, 3)), 10, axis=0)
     goals[:] = goals[:, :1]
     c = replace(controller(0.5), gains=many)
     quiet = TaskConfig(noise=0.0)
     whole = rollout(BROKK_170, c, np.stack([POSE] * 3), goals, quiet, rng)
     for i in range(3):
-        one = replace(c, gains=Gains(*(g[i] for g in many)))
+        one = replace(c, gains=many[i])
         alone = rollout(BROKK_170, one, POSE[None], goals[:, :1], quiet, rng)
         np.testing.assert_allclose(whole.u[:, i], alone.u[:, 0], atol=1e-9)
         np.testing.assert_allclose(whole.q[:, i], alone.q[:, 0], atol=1e-6)
