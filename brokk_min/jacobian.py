@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import OptimizeResult, differential_evolution
 from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet
@@ -245,8 +246,7 @@ def tune(
 ) -> tuple[JacobianController, list[float]]:
     """The controller with the gains of least cost, and the least cost after each generation.
 
-    Cross-entropy search: 32 candidates a generation from a normal distribution, at first about the
-    controller's own gains, then about the mean of the best 8.
+    SciPy's differential evolution with 32 candidates, the first of them about the controller's own gains.
 
     Args:
         controller: whose gains are to be found.
@@ -256,21 +256,34 @@ def tune(
         label: shown at the progress bar.
     """
     low, high = gain_bounds(controller.machine)
-    rng, mean, spread = np.random.default_rng(seed), controller.gains, 0.15 * (high - low)
-    gains = np.clip(mean + spread * rng.standard_normal((32, len(low))), low, high)
-    gains[0] = mean
-    best, costs = mean, [np.inf]
-    for _ in tqdm(range(generations), desc=f"tune {label}", unit="generation", disable=None):
-        found = cost(replace(controller, gains=gains))
-        order = np.argsort(found)
-        if found[order[0]] < costs[-1]:
-            best = gains[order[0]]
-        costs.append(min(costs[-1], float(found[order[0]])))
-        elite = gains[order[:8]]
-        spread = 0.5 * spread + 0.5 * np.sqrt(np.mean((elite - mean) ** 2, axis=0))  # wide while it travels
-        mean = elite.mean(axis=0)
-        gains = np.clip(mean + spread * rng.standard_normal(gains.shape), low, high)
-    return replace(controller, gains=best), costs[1:]
+    first = np.random.default_rng(seed).normal(controller.gains, 0.15 * (high - low), (32, len(low)))
+    first[0] = controller.gains
+    costs: list[float] = []
+
+    def objective(vectors: Array) -> Array:
+        return cost(replace(controller, gains=vectors.T))
+
+    with tqdm(total=generations, desc=f"tune {label}", unit="generation", disable=None) as bar:
+
+        def note(intermediate_result: OptimizeResult) -> None:
+            costs.append(float(intermediate_result.fun))
+            bar.update()
+
+        result = differential_evolution(
+            objective,
+            list(zip(low, high, strict=True)),
+            init=np.clip(first, low, high),
+            maxiter=generations,
+            mutation=(0.3, 0.7),
+            recombination=0.9,
+            tol=0,
+            polish=False,
+            rng=seed,
+            vectorized=True,
+            updating="deferred",
+            callback=note,
+        )
+    return replace(controller, gains=result.x), costs
 
 
 def gain_bounds(machine: Machine) -> tuple[Array, Array]:
