@@ -120,13 +120,13 @@ def sine_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Arra
 
 
 def rich_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Array:
-    """Sines over a wide band, held steps, fast random holds and pauses, small noise, (ticks,)."""
+    """Sines over a wide band, steps, fast random holds, stop and go out of rests; small noise, (ticks,)."""
     limit = machine.pwm_limit / PWM_MAX
     parts: list[Array] = []
     while sum(map(len, parts)) < ticks:
         length = int(rng.uniform(0.5, 4.0) / machine.dt)
         time = machine.dt * np.arange(length)
-        kind = rng.choice(["sine", "step", "holds", "pause"], p=[0.3, 0.3, 0.25, 0.15])
+        kind = rng.choice(["sine", "step", "holds", "go"], p=[0.25, 0.15, 0.25, 0.35])
         amplitude = rng.uniform(machine.dead_zone, limit)
         if kind == "sine":
             frequency = np.exp(rng.uniform(np.log(0.05), np.log(4.0)))
@@ -138,9 +138,15 @@ def rich_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Arra
         elif kind == "holds":
             hold = int(rng.integers(1, 8))
             part = np.repeat(rng.uniform(-limit, limit, length // hold + 1), hold)[:length]
-        else:
-            part = np.zeros(length)
-        if kind != "pause" and rng.random() < 0.5:
+        else:  # out of rests, in half of the cases with a restless hand within the dead zone
+            part = rng.choice([0, 1]) * rng.uniform(0, machine.dead_zone) * rng.uniform(-1, 1, length)
+            at = 0
+            while at < length:
+                at += int(rng.uniform(0.05, 1.0) / machine.dt)
+                move = int(rng.uniform(0.1, 1.0) / machine.dt)
+                part[at : at + move] = rng.uniform(-limit, limit)
+                at += move
+        if kind != "go" and rng.random() < 0.5:
             part = part + rng.uniform(0, 0.08) * rng.standard_normal(length)
         parts.append(part)
     return np.concatenate(parts)[:ticks]
@@ -420,9 +426,9 @@ def load_header(path: Path, arrays: dict[str, Any], kind: str, version: int) -> 
 class FitConfig:
     """How the nets are fitted."""
 
-    steps: int = 4000
+    steps: int = 10000
     """Adam steps."""
-    batch_size: int = 512
+    batch_size: int = 1024
     """Windows a joint in each step."""
     learning_rate: float = 4e-3
     """Of Adam at the start; falls to zero along a cosine."""

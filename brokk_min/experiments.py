@@ -171,7 +171,7 @@ class Effort:
     """How much is spent; the quick chain has the same parts, smaller."""
 
     hours: float = 1.0
-    fit_steps: int = 4000
+    fit_steps: int = 10000
     train_steps: int = 5_000_000
     generations: int = 45
     tuning_runs: int = 12
