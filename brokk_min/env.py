@@ -7,7 +7,7 @@ environment, with a plant instead of nets the evaluation, and `observe` and `to_
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -27,7 +27,7 @@ from brokk_min.actuator import (
     push_command,
     rest_history,
 )
-from brokk_min.kinematics import lowest_point, tool_position, tool_state
+from brokk_min.kinematics import joint_rates, lowest_point, tool_position, tool_state, tool_velocity
 from brokk_min.machine import (
     BROKK_170,
     PWM_MAX,
@@ -38,6 +38,7 @@ from brokk_min.machine import (
     read_encoder,
 )
 
+LAG_TIME, LAG_SPEED = 2.0, 0.07  # s and a share of tool_speed, tuned: see `push_lag`
 Array = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]
 
@@ -50,7 +51,7 @@ class TaskConfig:
     """Length of an episode [s]; its end is a truncation, never a termination."""
     hold_min_s: float = 0.5
     """Shortest time for which a velocity goal holds [s]."""
-    hold_max_s: float = 5.0
+    hold_max_s: float = 3.0
     """Longest time for which a velocity goal holds [s]."""
     zero_goals: float = 0.15
     """Share of goals that ask the tool to stand still."""
@@ -58,7 +59,7 @@ class TaskConfig:
     """Share of goals along x, y or z; the others point anywhere."""
     noise: float = 0.05
     """Largest noise of the measured part of an observation, in standard deviations (paper: 5 %)."""
-    valve_cost: float = 0.02
+    valve_cost: float = 0.01
     """Reward lost for each change of a command by its limit, mean of the driven joints (paper: 0)."""
     redraw_ground: bool = True
     """Redraw start poses in the ground; False is the paper's rule: end the episode without reward."""
@@ -74,6 +75,7 @@ class State:
     v_goal: Array  # wanted tool velocity [m/s], (..., 3)
     goal_ticks: NDArray[np.int64]  # ticks until a new goal, (...)
     ticks: NDArray[np.int64]  # ticks since the reset, (...)
+    lag: Array  # see `push_lag` [m], (..., 3)
     plant: PlantState | None = None  # None: the nets move the machine
 
 
@@ -89,50 +91,103 @@ class Measured(NamedTuple):
     q_dot: Array  # estimated velocities of the driven joints [rad/s], (..., n_driven)
 
 
+class _Layout(NamedTuple):
+    """How a machine's observation is standardised, float32 (obs,) each; see `observation_scale`."""
+
+    mean: Array
+    scale: Array
+    sensed: Array  # noise of 1 on what sensors say, in units of the observation; 0 for the rest
+
+
+def _layout(machine: Machine) -> _Layout:
+    """Worked out once a machine, kept with it."""
+    if "layout" not in machine.__dict__:
+        driven, rest, samples = machine.driven, machine.locked, machine.history
+        middle = (machine.column("q_min") + machine.column("q_max")) / 2
+        angle, rate = _spread(machine)
+        speed, command = machine.tool_speed / 3**0.5, machine.pwm_limit / PWM_MAX / 3**0.5
+        three, each, zero = np.ones(3), np.ones(samples), np.zeros(len(driven))
+        # mean, standard deviation, weight, 1 if a sensor says it
+        blocks: list[tuple[Array, Array, float, int]] = [
+            (0 * three, speed * three, 1.4, 0),
+            (0 * three, speed * three, 1.4, 1),
+            (middle[rest], angle[rest], 1.4, 1),
+        ]
+        for joint in driven:
+            blocks += [
+                (middle[joint] * each, angle[joint] * each, samples**-0.5, 1),
+                (0 * each, rate[joint] * each, samples**-0.5, 1),
+                (0 * each, command * each, samples**-0.5, 0),
+            ]
+        blocks += [(zero, rate[driven], 4.2, 0), (zero, 0.1 * rate[driven], 4.2, 0)]
+        means, scales, noises = zip(*((m, d / w, w * s + 0 * m) for m, d, w, s in blocks), strict=True)
+        mean, scale, sensed = (np.concatenate(a).astype(np.float32) for a in (means, scales, noises))
+        machine.__dict__["layout"] = _Layout(mean, scale, sensed)
+    layout: _Layout = machine.__dict__["layout"]
+    return layout
+
+
+def _spread(machine: Machine) -> tuple[Array, Array]:
+    """Nominal standard deviation of the angle [rad] and the velocity [rad/s] of each joint, (n,) both."""
+    return (machine.column("q_max") - machine.column("q_min")) / 12**0.5, machine.q_dot_max / 3**0.5
+
+
 def observation_scale(machine: Machine) -> tuple[Array, Array]:
-    """Mean and standard deviation by which observations are standardised, float32 (obs,) both.
+    """Mean and scale by which observations are standardised, float32 (obs,) both.
 
-    Nominal values from the machine (as if every quantity were uniform over its range), so that they
-    are the same in training and on the machine. Paper: Sec. 3.4 (normalisation)
+    Nominal values from the machine (as if every quantity were uniform over its range), so that they are
+    the same in training and on the machine. A quantity that is shown by H samples weighs H^-0.5 in each,
+    as much as one number; tool velocities weigh more and wanted rates most, because a net learns first
+    what is large at its input. Paper: Sec. 3.4 (normalisation)
     """
-    driven, rest, spread = machine.driven, machine.locked, _spread(machine)
-    middle = (machine.column("q_min") + machine.column("q_max")) / 2
-    ones = np.ones(machine.history)
-    speed = np.full(3, machine.tool_speed / 3**0.5)
-    command = machine.pwm_limit / PWM_MAX / 3**0.5
-    means, scales = [np.zeros(6), middle[rest]], [speed, speed, spread[rest, 0, 0]]
-    for joint in driven:
-        means += [middle[joint] * ones, 0 * ones, 0 * ones]
-        scales += [spread[joint, 0] * ones, spread[joint, 1] * ones, command * ones]
-    return np.concatenate(means).astype(np.float32), np.concatenate(scales).astype(np.float32)
+    return _layout(machine)[:2]
 
 
-def observe(machine: Machine, history: Array, v_goal: ArrayLike) -> Array:
-    """What the policy sees, standardised: goal and tool velocity, locked angles, driven histories.
+def observe(
+    machine: Machine, history: Array, v_goal: ArrayLike, lag: Array, noise: Array | float = 0.0
+) -> Array:
+    """What the policy sees: goal and tool velocity, locked angles, driven histories, wanted joint rates.
 
     Velocities are given along the tool's heading: outward from the z axis, sideways, up. What a slewing
-    arm has to do then does not depend on where it points. Paper: Sec. 3.4 (present and target tool
-    velocity, inputs of the actuator nets)
+    arm has to do then does not depend on where it points. Wanted rates are the joint rates that would
+    give the goal velocity, and those that would make up for `lag` (both by `joint_rates`).
+
+    Paper: Sec. 3.4 (present and target tool velocity, inputs of the actuator nets); the rates are ours
 
     Args:
         machine: n joints.
         history: measured samples, shape (..., n, 3, H).
         v_goal: wanted tool velocity [m/s], base frame, shape (..., 3).
+        lag: of `push_lag` [m], base frame, shape (..., 3).
+        noise: of what sensors say, in standard deviations, shape (..., obs) or a number.
 
     Returns:
-        Shape (..., 6 + locked + 3 H n_driven), float32, about zero mean and unit deviation.
+        Shape (..., 6 + locked + (3 H + 2) n_driven), float32.
     """
     p_tool, v_tool, _ = tool_state(machine, history[..., 0, -1], history[..., 1, -1])
+    v_goal = np.broadcast_to(np.asarray(v_goal, np.float32), v_tool.shape)
     driven = history[..., machine.driven, :, :]
-    parts = [
-        _turn(p_tool, np.broadcast_to(v_goal, v_tool.shape), 1),
-        _turn(p_tool, v_tool, 1),
-        history[..., machine.locked, 0, -1],
-        driven.reshape(*driven.shape[:-3], -1),
-    ]
-    mean, scale = _scales(machine)
-    standard: Array = (np.concatenate(parts, axis=-1, dtype=np.float32) - mean) / scale
-    return standard
+    mean, scale, sensed = _layout(machine)
+    size = len(mean) - 2 * len(machine.driven)  # without the rates
+    seen = np.empty((*v_tool.shape[:-1], len(mean)), np.float32)
+    seen[..., :3], seen[..., 3:6] = _turn(p_tool, v_goal, 1), _turn(p_tool, v_tool, 1)
+    seen[..., 6 : 6 + len(machine.locked)] = history[..., machine.locked, 0, -1]
+    seen[..., 6 + len(machine.locked) : size] = driven.reshape(*driven.shape[:-3], -1)
+    seen += noise * sensed * scale
+    q = _angles(machine, seen)
+    seen[..., size:] = np.concatenate([joint_rates(machine, q, v) for v in (v_goal, lag)], axis=-1)
+    seen -= mean
+    seen /= scale
+    return seen
+
+
+def _angles(machine: Machine, values: Array) -> Array:
+    """Newest angles of all joints (..., n) in observations (..., obs) in physical units."""
+    first, q = 6 + len(machine.locked), np.empty((*values.shape[:-1], machine.n), values.dtype)
+    q[..., machine.locked] = values[..., 6:first]
+    newest = first + machine.history * (1 + 3 * np.arange(len(machine.driven))) - 1
+    q[..., machine.driven] = values[..., newest]
+    return q
 
 
 def _turn(p_tool: Array, vector: Array, sign: int) -> Array:
@@ -144,25 +199,34 @@ def _turn(p_tool: Array, vector: Array, sign: int) -> Array:
     return np.stack([*turned, vector[..., 2]], axis=-1)
 
 
-def _scales(machine: Machine) -> tuple[Array, Array]:
-    """`observation_scale`, computed once a machine."""
-    if "scales" not in machine.__dict__:
-        machine.__dict__["scales"] = observation_scale(machine)
-    scales: tuple[Array, Array] = machine.__dict__["scales"]
-    return scales
-
-
 def measured(machine: Machine, observation: Array) -> Measured:
     """Undo `observe`: the newest measurements in physical units, from observations (..., obs)."""
-    mean, scale = _scales(machine)
+    mean, scale, _ = _layout(machine)
     values = observation * scale + mean
-    rest, history = machine.locked, machine.history
-    driven = values[..., 6 + len(rest) :].reshape(*values.shape[:-1], -1, 3, history)
-    q = np.empty((*values.shape[:-1], machine.n), values.dtype)
-    q[..., rest], q[..., machine.driven] = values[..., 6 : 6 + len(rest)], driven[..., 0, -1]
+    q = _angles(machine, values)
     p_tool = tool_position(machine, q)
     v_goal, v_tool = (_turn(p_tool, values[..., i : i + 3], -1) for i in (0, 3))
-    return Measured(v_goal, v_tool, q, driven[..., 1, -1])
+    newest = 6 + len(machine.locked) + machine.history * (2 + 3 * np.arange(len(machine.driven))) - 1
+    return Measured(v_goal, v_tool, q, values[..., newest])
+
+
+def push_lag(machine: Machine, history: Array, v_goal: Array, lag: Array) -> Array:
+    """How far the tool stays behind [m] (..., 3): the leaky integral of the velocity error, a tick on.
+
+    It tells a lasting error from a passing one. Errors count up to `LAG_SPEED` of the machine's tool
+    speed, so that the wait for a valve to wake does not fill it, and are forgotten within `LAG_TIME`.
+
+    Args:
+        machine: n joints.
+        history: measured samples after the tick, (..., n, 3, H).
+        v_goal: what was wanted during the tick [m/s], (..., 3).
+        lag: before the tick, (..., 3).
+    """
+    error = v_goal - tool_velocity(machine, history[..., 0, -1], history[..., 1, -1])
+    size = np.sqrt(np.sum(error * error, axis=-1, keepdims=True))
+    limit = np.float32(LAG_SPEED * machine.tool_speed)
+    counted = lag + error * (limit / np.maximum(size, limit)) * np.float32(machine.dt)
+    return counted * np.float32(np.exp(-machine.dt / LAG_TIME))
 
 
 def to_command(machine: Machine, action: ArrayLike) -> Array:
@@ -199,14 +263,13 @@ def to_command(machine: Machine, action: ArrayLike) -> Array:
 
 def rest_state(machine: Machine, q: ArrayLike, v_goal: ArrayLike, plant: bool) -> State:
     """Machines at rest at angles `q` [rad] (..., n) with goals (..., 3) [m/s] that never change."""
-    q = np.array(q, np.float32)
-    history = rest_history(read_encoder(machine, q), machine.history)
+    q = np.array(q, float)
+    history = rest_history(read_encoder(machine, q).astype(np.float32), machine.history)
     goals = np.broadcast_to(np.asarray(v_goal, np.float32), (*q.shape[:-1], 3))
     never = np.full(q.shape[:-1], np.iinfo(np.int64).max)
     ticks = np.zeros(q.shape[:-1], np.int64)
-    return State(
-        q, np.zeros_like(q), history, goals, never, ticks, plant_reset(machine, q) if plant else None
-    )
+    plant_state = plant_reset(machine, q) if plant else None
+    return State(q, np.zeros_like(q), history, goals, never, ticks, np.zeros_like(goals), plant_state)
 
 
 def transition(machine: Machine, net: ActuatorNet | None, state: State, u: Array) -> State:
@@ -218,29 +281,27 @@ def transition(machine: Machine, net: ActuatorNet | None, state: State, u: Array
     q, plant = state.q, None
     if state.plant is not None:
         plant = plant_step(machine, state.plant, u)
-        q = plant.q.astype(np.float32)
+        q = plant.q
     elif net is not None:
-        driven = machine.driven
-        predicted = net.predict(history[..., driven, :, :])
+        driven, low, high = machine.driven, machine.column("q_min"), machine.column("q_max")
+        moved = q[..., driven] + net.predict(history[..., driven, :, :]) * machine.dt
         q = q.copy()
-        q[..., driven] = np.clip(
-            q[..., driven] + predicted / np.float32(machine.rate),
-            machine.column("q_min")[driven].astype(np.float32),
-            machine.column("q_max")[driven].astype(np.float32),
-        )
+        q[..., driven] = np.clip(moved, low[driven], high[driven])
     else:
         raise ValueError("net: expected nets for a state without a plant, got None")
 
     def velocity(angles: Array) -> Array:
         return estimate_velocity(angles, machine.velocity_samples, machine.dt)
 
+    history = push_angle(history, read_encoder(machine, q), velocity)
     return replace(
         state,
         q=q,
-        q_dot=(q - state.q) * np.float32(machine.rate),
-        history=push_angle(history, read_encoder(machine, q), velocity),
+        q_dot=(q - state.q) * machine.rate,
+        history=history,
         goal_ticks=state.goal_ticks - 1,
         ticks=state.ticks + 1,
+        lag=push_lag(machine, history, state.v_goal, state.lag),
         plant=plant,
     )
 
@@ -307,35 +368,11 @@ def reset(machine: Machine, config: TaskConfig, rng: np.random.Generator, num: i
     return replace(state, goal_ticks=_draw_hold(machine, config, rng, num))
 
 
-def noisy(machine: Machine, observation: Array, config: TaskConfig, rng: np.random.Generator) -> Array:
-    """Observations (..., obs) with fresh uniform noise on everything measured: not on goal and commands.
-
-    Paper: Sec. 3.4 (5 % of each standardised quantity)
-    """
-    draws = rng.random(observation.shape, np.float32) - np.float32(0.5)
-    return observation + np.float32(2 * config.noise) * _is_measured(machine) * draws
-
-
-def _is_measured(machine: Machine) -> Array:
-    """1 where an observation comes from a sensor, 0 for the goal and the sent commands, (obs,)."""
-    if "is_measured" not in machine.__dict__:
-        rows = np.repeat(np.tile([1, 1, 0], len(machine.driven)), machine.history)
-        parts = [np.zeros(3), np.ones(3 + len(machine.locked)), rows]
-        machine.__dict__["is_measured"] = np.concatenate(parts).astype(np.float32)
-    mask: Array = machine.__dict__["is_measured"]
-    return mask
-
-
-def _spread(machine: Machine) -> Array:
-    """Nominal standard deviation of angle [rad] and velocity [rad/s] of each joint, (n, 2, 1)."""
-    angle = (machine.column("q_max") - machine.column("q_min")) / 12**0.5
-    velocity = machine.q_dot_max / 3**0.5
-    return np.stack([angle, velocity], axis=-1)[..., None].astype(np.float32)
-
-
 def look(machine: Machine, config: TaskConfig, state: State, rng: np.random.Generator) -> Array:
-    """The noisy observation of a state, (..., obs)."""
-    return noisy(machine, observe(machine, state.history, state.v_goal), config, rng)
+    """The observation of a state, (..., obs), with fresh uniform noise. Paper: Sec. 3.4 (5 %)"""
+    draws = rng.random((*state.q.shape[:-1], len(_layout(machine).mean)), np.float32) - np.float32(0.5)
+    noise = np.float32(2 * config.noise) * draws
+    return observe(machine, state.history, state.v_goal, state.lag, noise)
 
 
 class Outcome(NamedTuple):
@@ -362,7 +399,7 @@ def step(
     after it. On a tick that ends in the ground the reward is zero.
     """
     before, state = state, transition(machine, net, state, to_command(machine, action))
-    _, v_tool, lowest = tool_state(machine, state.q, state.q_dot)
+    _, v_tool, lowest = tool_state(machine, state.q.astype(np.float32), state.q_dot.astype(np.float32))
     rewards = reward(state.v_goal, v_tool)
     end = terminated(machine, lowest)
     error = 1 / rewards - 1
@@ -393,13 +430,14 @@ def merge(old: State, new: State, rows: NDArray[np.intp]) -> State:
         a[rows] = b
         return a
 
-    names = ("q", "q_dot", "history", "v_goal", "goal_ticks", "ticks")
-    arrays = {name: put(getattr(old, name), getattr(new, name)) for name in names}
+    arrays = {f.name: put(getattr(old, f.name), getattr(new, f.name)) for f in fields(State)[:-1]}
     plant = None
     if old.plant is not None and new.plant is not None:
-        fields = [put(a, b) for a, b in zip(old.plant[:-1], new.plant[:-1], strict=True)]
         pending = tuple(map(put, old.plant.pending, new.plant.pending))
-        plant = PlantState(fields[0], fields[1], fields[2], fields[3], pending)
+        plant = new.plant._replace(
+            **{k: put(getattr(old.plant, k), getattr(new.plant, k)) for k in PlantState._fields[:-1]},
+            pending=pending,
+        )
     return State(**arrays, plant=plant)
 
 
@@ -452,7 +490,8 @@ def rollout(
     memory = controller.start(len(state.q))
     trace = []
     for goal in goals:
-        observation = noisy(machine, observe(machine, state.history, goal), config, rng)
+        state = replace(state, v_goal=np.broadcast_to(goal.astype(np.float32), state.lag.shape))
+        observation = look(machine, config, state, rng)
         u, memory = controller(observation, memory)
         q_measured = state.history[..., 0, -1]
         state = transition(machine, net, state, u)
@@ -580,7 +619,7 @@ class TaskEnv(gymnasium.Env[Array, Array]):
 
 
 def _spaces(machine: Machine) -> tuple[Any, Any]:
-    size = 6 + len(machine.locked) + 3 * machine.history * len(machine.driven)
+    size = len(_layout(machine).mean)
     action = gymnasium.spaces.Box(-1.0, 1.0, (len(machine.driven),), np.float32)
     return gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32), action
 
