@@ -11,13 +11,16 @@ from typing import Any, Literal
 import numpy as np
 import tyro
 
-from brokk_min import experiments
+from brokk_min import experiments, hw
 from brokk_min.actuator import FitConfig, collect, fit, load_net, save_net, score
+from brokk_min.bus import open_line, read_frames
 from brokk_min.env import Controller, TaskConfig, fitting_nets
+from brokk_min.export import export_onnx
 from brokk_min.logs import Log, read_log, write_log
 from brokk_min.machine import BROKK_170
 from brokk_min.policy import PolicyController, load_policy
 from brokk_min.ppo import PPOConfig, train
+from brokk_min.simulator import simulate
 
 MACHINES = {BROKK_170.name: BROKK_170}
 Name = Literal["brokk170"]
@@ -261,12 +264,148 @@ class Reproduce:
         print(f"{self.out / 'report.html'}\n{self.out / 'results.json'}")
 
 
+@dataclass
+class Simulate:
+    """Put a simulated machine on a CAN bus: encoders, valve controller, the analytic plant behind them."""
+
+    interface: str
+    """python-can's name of the bus, udp_multicast for a try without hardware."""
+    channel: str
+    """Channel of the interface, for udp_multicast 239.74.163.2."""
+    start: tuple[float, ...] = (1.5, 0.5, 0.58, 1.71, 1.24)
+    """Angles at the start [rad]."""
+    record: Path | None = None
+    """Also log command in force and true angles at every step of the plant here, .csv."""
+    machine: Name = "brokk170"
+    """Which machine."""
+    seed: int = 0
+    """Nothing is random here."""
+
+    def run(self) -> None:
+        """Run until SIGINT or SIGTERM."""
+        check(self, (self.record,))
+        print(f"{self.machine} on {self.interface} {self.channel}; Ctrl-C ends it", flush=True)
+        simulate(MACHINES[self.machine], self.start, self.interface, self.channel, self.record)
+
+
+@dataclass
+class Drive:
+    """Drive a machine on a CAN bus at 20 Hz; not a safety function, see docs/hardware.md."""
+
+    policy: Path
+    """Policy that `train` wrote."""
+    interface: str = ""
+    """python-can's name of the bus: socketcan, udp_multicast, ..."""
+    channel: str = ""
+    """Channel of the interface: can0, 239.74.163.2, ..."""
+    command: str = "joystick"
+    """joystick, or velocity sequences, CSV: sequence,time,vx,vy,vz [s, m/s]; all of them, one by one."""
+    controller: Literal["rl", "jacobian"] = "rl"
+    """The policy, or the paper's baseline (k = 0.1)."""
+    gains: Path | None = None
+    """Tuned gains of the baseline that `reproduce` wrote; by default gains.json beside POLICY."""
+    axes: tuple[int, int, int] = (1, 0, 4)
+    """Axes of the joystick for x, y and z."""
+    button: int = 5
+    """Button of the joystick that must be held."""
+    log: Path | None = None
+    """Also log every frame here, candump format."""
+    replay: Path | None = None
+    """No bus: run on this log and compare the valve frames with those in it."""
+    machine: Name = "brokk170"
+    """Which machine."""
+    seed: int = 0
+    """Nothing is random here."""
+
+    def run(self) -> None:
+        """Drive until the sequences or the operator end it, or compare a log."""
+        check(self, (self.log,))
+        if not self.replay and not (self.interface and self.channel):
+            raise WrongUse("--interface, --channel: expected a CAN bus, or --replay, got none")
+        machine = MACHINES[self.machine]
+        policy = load_policy(self.policy, machine)
+        controller: Controller = PolicyController(machine, policy)
+        if self.controller == "jacobian":
+            gains = self.gains or self.policy.with_name("gains.json")
+            controller = experiments.read_gains(gains, machine, policy.net)["jacobian_pid_k0.1"]
+        if self.replay:
+            frames = read_frames(self.replay)
+            same, sent = hw.compare(machine, frames, hw.replay(machine, controller, frames))
+            print(f"{self.replay}: {same} of {sent} valve frames are the same")
+            if same < sent:
+                raise ValueError(f"{self.replay}: expected the frames of the log, got {sent - same} others")
+            return
+        if self.command == "joystick":
+            operator: hw.Joystick | hw.Script = hw.Joystick(machine, self.axes, self.button)
+        else:
+            sequences = experiments.read_commands(Path(self.command), machine)
+            operator = hw.Script(machine, np.concatenate([s.goals for s in sequences]))
+        with open_line(self.interface, self.channel, self.log) as line:
+            drive = hw.Drive(machine, controller, line, operator)
+            drive.begin()
+            drive.run(_show)
+        if isinstance(operator, hw.Script) and not operator.done:
+            raise ValueError(f"drive: expected to play all sequences, got {drive.reason or 'a stop'}")
+
+
+def _show(text: str) -> None:
+    """Keep one line of a terminal up to date; elsewhere write a line each time."""
+    print(
+        f"\r{text:<110}" if sys.stdout.isatty() else text, end="" if sys.stdout.isatty() else "\n", flush=True
+    )
+
+
+@dataclass
+class Convert:
+    """Turn a log of `drive` into one that `fit` reads: a recording for each stretch driven without a gap."""
+
+    log: tyro.conf.Positional[Path]
+    """Log that `drive --log` or candump wrote."""
+    out: Path
+    """Log to write, .csv or .npz."""
+    machine: Name = "brokk170"
+    """Which machine."""
+    seed: int = 0
+    """Nothing is random here."""
+
+    def run(self) -> None:
+        """Write the log."""
+        check(self, (self.out,))
+        log = hw.driven_log(MACHINES[self.machine], read_frames(self.log))
+        write_log(self.out, log)
+        print(f"{self.out}: {len(log.recordings)} recordings of {', '.join(log.joints)}")
+
+
+@dataclass
+class Export:
+    """Write a policy as one ONNX file, to be run elsewhere."""
+
+    policy: Path
+    """Policy that `train` wrote."""
+    out: Path
+    """File to write, .onnx."""
+    machine: Name = "brokk170"
+    """Which machine."""
+    seed: int = 0
+    """Nothing is random here."""
+
+    def run(self) -> None:
+        """Write the file."""
+        check(self, (self.out,))
+        export_onnx(self.out, load_policy(self.policy, MACHINES[self.machine]))
+        print(f"{self.out}: observation (batch, obs) in, action (batch, driven joints) out")
+
+
 COMMANDS: dict[str, Any] = {
     "collect": Collect,
     "fit": Fit,
     "train": Train,
     "evaluate": Evaluate,
     "reproduce": Reproduce,
+    "machine": Simulate,
+    "drive": Drive,
+    "convert": Convert,
+    "export": Export,
 }
 
 

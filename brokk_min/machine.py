@@ -50,6 +50,8 @@ class Joint:
     q_dot_up: float = _number("rad/s")  # fastest positive motion at the command limit, as logs show it
     q_dot_down: float = _number("rad/s")  # fastest negative motion, a positive number
     encoder_node: int = _number("CANopen node id")
+    encoder_zero: int = _number("counts", 0)  # what the encoder says at q = 0
+    encoder_sign: int = _number("1", 1)  # -1: it counts down while q rises
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,7 @@ class Machine:
     tool_speed: float = _number("m/s")  # largest tool speed an operator may ask for
     ground: float = _number("m")  # height of the ground in the base frame
     valve_frame_id: int = _number("CAN id")
+    controller_node: int = _number("CANopen node id")  # of the valve controller
 
     def __post_init__(self) -> None:
         """Refuse what cannot be a machine, naming field, wanted and got."""
@@ -107,6 +110,8 @@ class Machine:
         nodes = [joint.encoder_node for joint in self.joints]
         if len(set(nodes)) != len(nodes):
             raise ValueError(f"joints: expected different encoder nodes, got {nodes}")
+        if self.controller_node in nodes:
+            raise ValueError(f"controller_node: expected none of {nodes}, got {self.controller_node}")
         steps = self.dt / self.plant_dt
         if abs(steps - round(steps)) > 1e-6 or steps < 0.5:
             raise ValueError(f"plant_dt: expected 1/rate = {self.dt} to be a multiple, got {self.plant_dt}")
@@ -124,6 +129,8 @@ class Machine:
         low, high = _RANGES.get(field, (-np.inf, np.inf))
         if not low <= value <= high:
             raise ValueError(f"{label}: expected {low} to {high}, got {value!r}")
+        if field == "encoder_sign" and value == 0:
+            raise ValueError(f"{label}: expected -1 or 1, got 0")
         if field == "q_max" and isinstance(owner, Joint):
             if not owner.q_min < value:
                 raise ValueError(f"{label}: expected above q_min = {owner.q_min}, got {value!r}")
@@ -187,7 +194,8 @@ class Machine:
         return self._columns[field]
 
 
-_WHOLE = {"encoder_node", "pwm_limit", "encoder_bits", "velocity_samples", "history", "valve_frame_id"}
+_WHOLE = {"encoder_node", "encoder_zero", "encoder_sign", "pwm_limit", "encoder_bits"}
+_WHOLE |= {"velocity_samples", "history", "valve_frame_id", "controller_node"}
 _RANGES: dict[str, tuple[float, float]] = {
     "cylinder_base": (0, np.inf),
     "cylinder_rod": (1e-6, np.inf),
@@ -197,6 +205,8 @@ _RANGES: dict[str, tuple[float, float]] = {
     "q_dot_up": (1e-9, np.inf),
     "q_dot_down": (1e-9, np.inf),
     "encoder_node": (1, 127),
+    "encoder_sign": (-1, 1),
+    "controller_node": (1, 127),
     "rate": (1e-3, np.inf),
     "pwm_limit": (1, PWM_MAX),
     "dead_zone": (0, 0.99),
@@ -368,6 +378,7 @@ def _brokk_170() -> Machine:
         tool_speed=0.3,
         ground=0.0,
         valve_frame_id=0x210,
+        controller_node=0x10,
     )
 
 
