@@ -70,7 +70,7 @@ def checksum(frame: ArrayLike) -> Array:
         '0x4b'
     """
     frame = np.asarray(frame, np.uint8)
-    crc: Array = np.full(frame.shape[:-1], 0xFF, np.uint8)
+    crc: Array = np.array(0xFF, np.uint8)
     for i in range(frame.shape[-1]):
         crc = _CRC[crc ^ frame[..., i]]
     return crc ^ np.uint8(0xFF)
@@ -161,15 +161,14 @@ def gate(machine: Machine, state: GateState, inputs: GateInputs, now: ArrayLike)
     now, last = np.asarray(now), state.sent[..., -1]
     wrong = gate_wrong(machine, state, inputs, now)
     edge = inputs.enable & ~state.enable & inputs.centred
-    driving = (wrong == 0) & inputs.enable & (state.driving | edge)
-    fault = np.where(driving, 0, np.where(state.driving & (wrong > 0), wrong, state.fault))
+    driving = inputs.enable & (state.driving | edge) & np.logical_not(wrong)
+    fault = np.where(driving, 0, np.where(state.driving, wrong, state.fault))
 
     q = inputs.counts * machine.encoder_step
-    m = np.clip(inputs.m, np.minimum(last, 0) - SLEW, np.maximum(last, 0) + SLEW)
-    outward = (m > 0) & (q >= machine.column("q_max") - LIMIT_MARGIN)
-    outward |= (m < 0) & (q <= machine.column("q_min") + LIMIT_MARGIN)
+    up = np.where(q < machine.column("q_max") - LIMIT_MARGIN, np.maximum(last, 0) + SLEW, 0)
+    down = np.where(q > machine.column("q_min") + LIMIT_MARGIN, np.minimum(last, 0) - SLEW, 0)
     moving = state.driving & driving  # the tick that arms is still neutral
-    m = np.where(moving[..., None] & ~outward, m, 0).astype(int)
+    m = np.where(moving[..., None], np.clip(inputs.m, down, up), 0).astype(int)
 
     counter = (state.counter + 1) % 256
     trusted = inputs.alive & ~inputs.error  # a lost device or an exception is no release of the switch
@@ -215,7 +214,7 @@ def gate_wrong(machine: Machine, state: GateState, inputs: GateInputs, now: Arra
     bad[..., 10, :n] = np.abs(inputs.counts - then[..., -1]) > fastest
     bad[..., 11, :n] = frozen
     bad[..., 12, :n] = ~(np.abs(inputs.m) <= limit)  # also if it is no number
-    bad = bad.reshape(*now.shape, -1)
+    bad = bad.reshape(*now.shape, len(FAULTS) * (n + 1))
     return np.where(bad.any(axis=-1), 1 + bad.argmax(axis=-1), 0)
 
 
