@@ -24,7 +24,7 @@ SLEW = 40  # counts of 127 a tick by which a command may grow
 LIMIT_MARGIN = 0.02  # rad before a joint's limit from which no command goes outward
 RANGE_MARGIN = 0.05  # rad beyond a joint's limit, then the encoder is wrong
 JUMP_FACTOR, JUMP_COUNTS = 2.0, 4  # times the fastest motion, plus counts: a larger step is a jump
-STILL, MOVED = 3, 6  # frozen: ticks without a change, after as many with this many counts of motion
+STILL, MOVED = 2, 4  # frozen: ticks without a change, after as many with this many counts of motion
 MEMORY = 14  # ticks kept, and of hard pushing without motion
 
 

@@ -38,7 +38,7 @@ from brokk_min.logs import Log, Recording, velocity_of
 from brokk_min.machine import PWM_MAX, Machine, decode_pwm, estimate_velocity
 
 Array = NDArray[Any]
-WINDOW = 0.025  # s after SYNC in which the encoders must answer (assumed)
+WINDOW = 0.020  # s after SYNC in which the encoders must answer (assumed)
 MAX_FRAMES = 2000  # read in a row; more than a bus can carry in a tick
 
 
@@ -126,6 +126,7 @@ class Joystick:
             raise ValueError("joystick: expected one, got none")
         self.pygame, self.speed, self.axes, self.button = pygame, machine.tool_speed, axes, button
         self.stick: Any = pygame.joystick.Joystick(0)
+        self.instance = self.stick.get_instance_id()
         found = self.stick.get_numaxes(), self.stick.get_numbuttons()
         if max(axes) >= found[0] or button >= found[1]:
             raise ValueError(
@@ -135,10 +136,11 @@ class Joystick:
     def __call__(self, driving: bool, ready: bool) -> Wish:
         """The wish of this tick. A device that is gone reads zero on all axes, so its removal is told."""
         for event in self.pygame.event.get():
-            if event.type == self.pygame.JOYDEVICEREMOVED and not self.stick.get_init():
-                self.stick = None
+            if event.type == self.pygame.JOYDEVICEREMOVED and event.instance_id == self.instance:
+                self.stick, self.instance = None, -1
             elif event.type == self.pygame.JOYDEVICEADDED and self.stick is None:
                 self.stick = self.pygame.joystick.Joystick(event.device_index)
+                self.instance = self.stick.get_instance_id()
         if self.stick is None:
             return Wish(alive=False)
         v = -shape_axis([self.stick.get_axis(i) for i in self.axes]) * self.speed
@@ -180,7 +182,7 @@ class Drive:
         self.nodes, self.gate, self.wish = Nodes(machine), gate_start(machine), Wish()
         self.memory = controller.start(1)
         self.history: Array | None = None
-        self.problem = self.reason = ""  # the last exception; what stopped it, in words
+        self.problem = self.remark = self.reason = ""  # exception of this tick, the last one, what is wrong
         self.signals: list[int] = []
         self.ticks, self.skipped, self.lateness, self.deadline = 0, 0, 0.0, 0.0
 
@@ -222,8 +224,8 @@ class Drive:
         now = line.note(self.wish.pack())
         self._speak(self._gate(wanted, now))
         with self._caught():
-            if not self.gate.driving and (self.nodes.nmt != OPERATIONAL).any():
-                line.send(NMT, bytes([1, 0]))  # nodes that have fallen back; the valves may not move now
+            if not (self.wish.enable or self.gate.driving) and (self.nodes.nmt != OPERATIONAL).any():
+                line.send(NMT, bytes([1, 0]))  # nodes that fell back; not while the operator holds the switch
             line.flush()
         return not self.wish.stop
 
@@ -316,7 +318,8 @@ class Drive:
             self.history = push_command(self.history, self.gate.sent[..., -1] / PWM_MAX)
         stopped, wrong = (fault_name(self.machine, int(f)) for f in (self.gate.fault, self.gate.wrong))
         self.reason = f"fault: {stopped}" if stopped else wrong
-        self.reason += f" ({self.problem})" if self.problem else ""
+        self.remark = "" if self.gate.driving else self.problem or self.remark
+        self.reason += f" ({self.remark})" if self.remark else ""
         nodes.frames[:], self.problem = 0, ""
         return frame.tobytes()
 

@@ -43,8 +43,8 @@ WATCHDOG = 0.150  # s without valid valve frame, then the valves go neutral (ass
 class SimulatedMachine:
     """CiA 406 encoders and a valve controller on one bus, the analytic plant behind them.
 
-    The plant moves by its own clock. The valves go neutral and stay so until an NMT start if no valid
-    valve frame comes for `WATCHDOG`, or one with a wrong counter, checksum or length.
+    The plant moves by its own clock. The valves go neutral if no valid valve frame comes for `WATCHDOG`, or
+    one with a wrong counter, checksum or length; they stay so until an NMT start and then a neutral frame.
 
     Args:
         machine: what moves.
@@ -66,7 +66,8 @@ class SimulatedMachine:
         self.start, self.steps, self.beats = now, 0, 0
         self.encoders = [joint.encoder_node for joint in machine.joints]
         self.nmt = dict.fromkeys([*self.encoders, machine.controller_node], PRE_OPERATIONAL)
-        self.valid, self.counter, self.enabled = now, -1, False
+        self.valid, self.counter = now, -1
+        self.enabled = False  # by a neutral frame with the enable byte set, until the byte is cleared
         known = {BEAT_OBJECT: round(1e3 * BEAT), SYNC_OBJECT: 1, RESOLUTION_OBJECT: 2**machine.encoder_bits}
         known |= {(0x1000, 0): 406}
         self.objects = {(node, *where): value for node in self.encoders for where, value in known.items()}
@@ -127,8 +128,9 @@ class SimulatedMachine:
         if not in_turn:
             self._trip()
         elif self.nmt[self.machine.controller_node] == OPERATIONAL:
-            self.enabled = data[7] == 1
-            self.u = decode_pwm(data[: self.machine.n]) * self.enabled
+            u = decode_pwm(data[: self.machine.n])
+            self.enabled = data[7] == 1 and (self.enabled or not u.any())
+            self.u = u * self.enabled
 
     def _neutral(self) -> None:
         self.u, self.enabled = np.zeros(self.machine.n), False

@@ -169,9 +169,9 @@ def plain_wrong(machine: Machine, s: GateState, i: GateInputs, now: float) -> in
         note(10, j, abs(c - old[13]) > fastest)
         for sign in (1, -1):
             hard = [sign * m >= 40 for m in sent]
-            same = c == old[13] == old[12] == old[11]
-            was_moving = abs(old[11] - old[8]) >= 6
-            note(11, j, same and ((was_moving and all(hard[9:])) or all(hard)))
+            same = c == old[13] == old[12]
+            was_moving = abs(old[12] - old[10]) >= 4
+            note(11, j, same and ((was_moving and all(hard[10:])) or all(hard)))
         limit = 80 if joint.driven else 0
         note(12, j, not -limit <= i.m[j] <= limit)
     return min((1 + kind * 6 + node for kind, node in found), default=0)
