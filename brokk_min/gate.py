@@ -90,7 +90,6 @@ def valve_frame(m: ArrayLike, counter: ArrayLike, enable: ArrayLike) -> Array:
 
 FAULTS = (  # in the order in which they are named when several come at once
     "error",
-    "stop asked for",
     "tick late, or the clock was set",
     "operator's device lost",
     "never seen",
@@ -102,6 +101,7 @@ FAULTS = (  # in the order in which they are named when several come at once
     "jumped",
     "frozen, or the joint does not move",
     "no valid command",
+    "stop asked for",
 )
 
 
@@ -202,18 +202,18 @@ def gate_wrong(machine: Machine, state: GateState, inputs: GateInputs, now: Arra
 
     bad = np.zeros((*now.shape, len(FAULTS), n + 1), bool)
     bad[..., 0, 0] = inputs.error
-    bad[..., 1, 0] = inputs.stop
-    bad[..., 2, 0] = np.abs(now - state.time - machine.dt) > machine.dt / 2
-    bad[..., 3, 0] = ~inputs.alive
-    bad[..., 4, :] = np.isneginf(inputs.beat)
-    bad[..., 5, :] = now[..., None] - inputs.beat > BEAT_LOST
-    bad[..., 6, :] = inputs.nmt != OPERATIONAL
-    bad[..., 7, :n] = inputs.frames < 1
-    bad[..., 8, :n] = inputs.frames > 1
-    bad[..., 9, :n] = (q < low) | (q > high)
-    bad[..., 10, :n] = np.abs(inputs.counts - then[..., -1]) > fastest
-    bad[..., 11, :n] = frozen
-    bad[..., 12, :n] = ~(np.abs(inputs.m) <= limit)  # also if it is no number
+    bad[..., 1, 0] = np.abs(now - state.time - machine.dt) > machine.dt / 2
+    bad[..., 2, 0] = ~inputs.alive
+    bad[..., 3, :] = np.isneginf(inputs.beat)
+    bad[..., 4, :] = now[..., None] - inputs.beat > BEAT_LOST
+    bad[..., 5, :] = inputs.nmt != OPERATIONAL
+    bad[..., 6, :n] = inputs.frames < 1
+    bad[..., 7, :n] = inputs.frames > 1
+    bad[..., 8, :n] = (q < low) | (q > high)
+    bad[..., 9, :n] = np.abs(inputs.counts - then[..., -1]) > fastest
+    bad[..., 10, :n] = frozen
+    bad[..., 11, :n] = ~(np.abs(inputs.m) <= limit)  # also if it is no number
+    bad[..., 12, 0] = inputs.stop
     bad = bad.reshape(*now.shape, len(FAULTS) * (n + 1))
     return np.where(bad.any(axis=-1), 1 + bad.argmax(axis=-1), 0)
 
@@ -223,11 +223,11 @@ def fault_name(machine: Machine, fault: int) -> str:
 
     Example:
         >>> from brokk_min.machine import BROKK_170
-        >>> fault_name(BROKK_170, 1 + 5 * 6 + 5), fault_name(BROKK_170, 1), fault_name(BROKK_170, 0)
+        >>> fault_name(BROKK_170, 1 + 4 * 6 + 5), fault_name(BROKK_170, 1), fault_name(BROKK_170, 0)
         ('valve controller: heartbeat lost', 'error', '')
     """
     if not fault:
         return ""
     kind, node = divmod(fault - 1, machine.n + 1)
     names = [*machine.names, "valve controller"]
-    return FAULTS[kind] if kind < 4 else f"{names[node]}: {FAULTS[kind]}"
+    return f"{names[node]}: {FAULTS[kind]}" if 3 <= kind <= 11 else FAULTS[kind]

@@ -111,10 +111,10 @@ def test_encoders_can_be_mounted_anyhow() -> None:
 
 def test_fault_names() -> None:
     names = [fault_name(BROKK_170, code) for code in range(len(FAULTS) * 6 + 1)]
-    assert names[0] == "" and names[1] == "error" and names[1 + 3 * 6] == "operator's device lost"
-    assert names[1 + 4 * 6] == "q1: never seen" and names[1 + 4 * 6 + 5] == "valve controller: never seen"
-    assert names[1 + 11 * 6 + 2] == "q3: frozen, or the joint does not move"
-    assert names[-1] == "valve controller: no valid command"
+    assert names[0] == "" and names[1] == "error" and names[1 + 2 * 6] == "operator's device lost"
+    assert names[1 + 3 * 6] == "q1: never seen" and names[1 + 3 * 6 + 5] == "valve controller: never seen"
+    assert names[1 + 10 * 6 + 2] == "q3: frozen, or the joint does not move"
+    assert names[1 + 11 * 6 + 4] == "q5: no valid command" and names[1 + 12 * 6] == "stop asked for"
 
 
 # --- a plain rewriting ------------------------------------------------------------------------------
@@ -153,27 +153,27 @@ def plain_wrong(machine: Machine, s: GateState, i: GateInputs, now: float) -> in
         found.extend([(kind, node)] if wrong else [])
 
     note(0, 0, i.error)
-    note(1, 0, i.stop)
-    note(2, 0, not 0.5 * DT <= now - s.time <= 1.5 * DT)
-    note(3, 0, not i.alive)
+    note(12, 0, i.stop)
+    note(1, 0, not 0.5 * DT <= now - s.time <= 1.5 * DT)
+    note(2, 0, not i.alive)
     for node in range(6):
-        note(4, node, i.beat[node] == -np.inf)
-        note(5, node, now - i.beat[node] > 0.110)
-        note(6, node, i.nmt[node] != 5)
+        note(3, node, i.beat[node] == -np.inf)
+        note(4, node, now - i.beat[node] > 0.110)
+        note(5, node, i.nmt[node] != 5)
     for j, joint in enumerate(machine.joints):
         c, old, sent = int(i.counts[j]), s.counts[j].tolist(), s.sent[j].tolist()
-        note(7, j, i.frames[j] == 0)
-        note(8, j, i.frames[j] >= 2)
-        note(9, j, not joint.q_min - 0.05 <= c * STEP <= joint.q_max + 0.05)
+        note(6, j, i.frames[j] == 0)
+        note(7, j, i.frames[j] >= 2)
+        note(8, j, not joint.q_min - 0.05 <= c * STEP <= joint.q_max + 0.05)
         fastest = 2 * max(joint.q_dot_up, joint.q_dot_down) * DT / STEP + 4
-        note(10, j, abs(c - old[13]) > fastest)
+        note(9, j, abs(c - old[13]) > fastest)
         for sign in (1, -1):
             hard = [sign * m >= 40 for m in sent]
             same = c == old[13] == old[12]
             was_moving = abs(old[12] - old[10]) >= 4
-            note(11, j, same and ((was_moving and all(hard[10:])) or all(hard)))
+            note(10, j, same and ((was_moving and all(hard[10:])) or all(hard)))
         limit = 80 if joint.driven else 0
-        note(12, j, not -limit <= i.m[j] <= limit)
+        note(11, j, not -limit <= i.m[j] <= limit)
     return min((1 + kind * 6 + node for kind, node in found), default=0)
 
 
@@ -442,8 +442,9 @@ def changes(node: ast.AST) -> Iterator[ast.AST]:
         for other in SWAPS.get(type(node.op), []):
             yield replace_field(node, op=other())
     elif isinstance(node, ast.Compare):
-        for other in SWAPS.get(type(node.ops[0]), []):
-            yield replace_field(node, ops=[other()])
+        for k, op in enumerate(node.ops):
+            for other in SWAPS.get(type(op), []):
+                yield replace_field(node, ops=[*node.ops[:k], other(), *node.ops[k + 1 :]])
     elif isinstance(node, ast.UnaryOp):
         yield node.operand
     elif isinstance(node, ast.Constant) and isinstance(node.value, bool):
