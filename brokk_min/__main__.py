@@ -61,6 +61,7 @@ ALLOWED: dict[str, tuple[float, float]] = {
     "zero_goals": (0, 1),
     "axis_goals": (0, 1),
     "valve_cost": (0, 10),
+    "counts": (1, 127),
 }
 
 
@@ -292,7 +293,7 @@ class Simulate:
 class Drive:
     """Drive a machine on a CAN bus at 20 Hz; not a safety function, see docs/hardware.md."""
 
-    policy: Path
+    policy: Path | None = None
     """Policy that `train` wrote."""
     interface: str = ""
     """python-can's name of the bus: socketcan, udp_multicast, ..."""
@@ -300,8 +301,12 @@ class Drive:
     """Channel of the interface: can0, 239.74.163.2, ..."""
     command: str = "joystick"
     """joystick, or velocity sequences, CSV: sequence,time,vx,vy,vz [s, m/s]; all of them, one by one."""
-    controller: Literal["rl", "jacobian"] = "rl"
-    """The policy, or the paper's baseline (k = 0.1)."""
+    controller: Literal["rl", "jacobian", "jog"] = "rl"
+    """The policy, the paper's baseline (k = 0.1), or one joint alone, for bringing up."""
+    joint: str = "q1"
+    """Joint that jogs, forward and backward with x."""
+    counts: int = 12
+    """Its command, of 127."""
     gains: Path | None = None
     """Tuned gains of the baseline that `reproduce` wrote; by default gains.json beside POLICY."""
     axes: tuple[int, int, int] = (1, 0, 4)
@@ -322,12 +327,7 @@ class Drive:
         check(self, (self.log,))
         if not self.replay and not (self.interface and self.channel):
             raise WrongUse("--interface, --channel: expected a CAN bus, or --replay, got none")
-        machine = MACHINES[self.machine]
-        policy = load_policy(self.policy, machine)
-        controller: Controller = PolicyController(machine, policy)
-        if self.controller == "jacobian":
-            gains = self.gains or self.policy.with_name("gains.json")
-            controller = experiments.read_gains(gains, machine, policy.net)["jacobian_pid_k0.1"]
+        machine, controller = MACHINES[self.machine], self._controller()
         if self.replay:
             frames = read_frames(self.replay)
             same, sent = hw.compare(machine, frames, hw.replay(machine, controller, frames))
@@ -347,12 +347,25 @@ class Drive:
         if isinstance(operator, hw.Script) and not operator.done:
             raise ValueError(f"drive: expected to play all sequences, got {drive.reason or 'a stop'}")
 
+    def _controller(self) -> Controller:
+        machine = MACHINES[self.machine]
+        if self.controller == "jog":
+            if self.joint not in machine.names:
+                raise WrongUse(f"--joint: expected one of {', '.join(machine.names)}, got {self.joint}")
+            return hw.Jog(machine, self.joint, self.counts)
+        if not self.policy:
+            raise WrongUse("--policy: expected a policy that `train` wrote, got none")
+        policy = load_policy(self.policy, machine)
+        if self.controller == "rl":
+            return PolicyController(machine, policy)
+        gains = self.gains or self.policy.with_name("gains.json")
+        return experiments.read_gains(gains, machine, policy.net)["jacobian_pid_k0.1"]
+
 
 def _show(text: str) -> None:
     """Keep one line of a terminal up to date; elsewhere write a line each time."""
-    print(
-        f"\r{text:<110}" if sys.stdout.isatty() else text, end="" if sys.stdout.isatty() else "\n", flush=True
-    )
+    terminal = sys.stdout.isatty()
+    print(f"\r{text}\033[K" if terminal else text, end="" if terminal else "\n", flush=True)
 
 
 @dataclass

@@ -7,10 +7,12 @@ Nothing here is a safety function: a real machine keeps its hard-wired emergency
 
 from __future__ import annotations
 
+import gc
 import os
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,7 +33,7 @@ from brokk_min.bus import (
     sdo,
     stop_signals,
 )
-from brokk_min.env import Controller, observe
+from brokk_min.env import Controller, measured, observe
 from brokk_min.gate import OPERATIONAL, GateInputs, encoder_counts, fault_name, gate, gate_start
 from brokk_min.kinematics import tool_state
 from brokk_min.logs import Log, Recording, velocity_of
@@ -148,6 +150,25 @@ class Joystick:
         return Wish((x, y, z), enable=bool(self.stick.get_button(self.button)))
 
 
+@dataclass(frozen=True)
+class Jog:
+    """A controller for bringing up: a small command on one joint, its sign that of the wanted x velocity."""
+
+    machine: Machine
+    joint: str
+    counts: int  # of 127
+
+    def start(self, num: int) -> None:
+        """Nothing to remember."""
+
+    def __call__(self, observation: Array, memory: None) -> tuple[Array, None]:
+        """Commands u (..., n) for observations (..., obs)."""
+        v_goal = measured(self.machine, observation).v_goal[..., :1]
+        asked = np.sign(v_goal) * (np.abs(v_goal) > 0.1 * self.machine.tool_speed)
+        chosen = np.array([name == self.joint for name in self.machine.names])
+        return asked * chosen * self.counts / PWM_MAX, None
+
+
 def shape_axis(axis: ArrayLike, dead: float = 0.12, expo: float = 0.6) -> Array:
     """Deflection in [-1, 1] with a dead zone, and flatter near the middle: (1 - expo) s + expo s^3.
 
@@ -216,6 +237,7 @@ class Drive:
             self.wish = unpack_wish(wish.pack())  # as the log has it, so that a replay gets the same
         with self._caught():
             line.send(SYNC, b"")
+            self._rehearse()
             self._listen(line.now() + WINDOW, until_complete=True)
             wanted = self._control()
         self.wish = self.wish._replace(
@@ -231,6 +253,7 @@ class Drive:
 
     def run(self, show: Callable[[str], object] = lambda text: None) -> None:
         """Tick until the operator, SIGINT or SIGTERM stops it; the last frame is neutral whatever happens."""
+        gc.freeze()  # what is there now stays: no long collection in the middle of a tick
         try:
             with stop_signals() as self.signals:
                 while self.tick():
@@ -242,14 +265,15 @@ class Drive:
             raise
 
     def status(self) -> str:
-        """One line: state, tool velocity wanted and measured, lateness, faults."""
+        """One line: state, tool velocity wanted and measured [m/s], angles [rad], lateness, faults."""
         state = "driving" if self.gate.driving else "waiting" if self.gate.wrong else "ready"
-        v: Array = np.zeros(3)
+        q, v = np.full(self.machine.n, np.nan), np.full(3, np.nan)
         if self.history is not None:
-            v = tool_state(self.machine, self.history[0, :, 0, -1], self.history[0, :, 1, -1])[1]
-        wanted, measured = (" ".join(f"{x:+.3f}" for x in a) for a in (self.wish.v_goal, v))
+            q, q_dot = self.history[0, :, 0, -1], self.history[0, :, 1, -1]
+            v = tool_state(self.machine, q, q_dot)[1]
+        want, have, pose = (" ".join(f"{x:+.2f}" for x in a) for a in (self.wish.v_goal, v, q))
         late = f"late {1e3 * self.lateness:.1f} ms, skipped {self.skipped}"
-        return f"{state:8}v wanted {wanted}  measured {measured} m/s  {late}  {self.reason}"
+        return f"{state:7} v wanted {want} is {have} q {pose} {late} {self.reason}"
 
     @contextmanager
     def _caught(self) -> Iterator[None]:
@@ -293,15 +317,25 @@ class Drive:
             self.history = push_angle(
                 self.history, q, lambda angles: estimate_velocity(angles, m.velocity_samples, m.dt)
             )
-        v_goal = np.array([self.wish.v_goal], np.float32)
-        memory = self.memory if self.gate.driving else self.controller.start(1)
-        u, self.memory = self.controller(observe(m, self.history, v_goal), memory)
+        if not self.gate.driving:
+            self.memory = self.controller.start(1)
+        u, self.memory = self._ask()
         return np.asarray(np.rint(u[0] * PWM_MAX), float)
 
-    def _gate(self, wanted: Array, now: float) -> bytes:
-        """Pass the gate; forget what this tick heard and remember what it sent."""
+    def _ask(self) -> tuple[Array, Any]:
+        """The controller's command u (1, n) and next memory for what is known."""
+        v_goal = np.array([self.wish.v_goal], np.float32)
+        return self.controller(observe(self.machine, np.asarray(self.history), v_goal), self.memory)
+
+    def _rehearse(self) -> None:
+        """Compute a tick for nothing while the encoders answer: 45 ms of sleep have cooled the caches."""
+        if self.history is not None:
+            u, _ = self._ask()
+            gate(self.machine, self.gate, self._inputs(u[0]), self.line.now())
+
+    def _inputs(self, wanted: Array) -> GateInputs:
         nodes, wish = self.nodes, self.wish
-        inputs = GateInputs(
+        return GateInputs(
             m=wanted,
             counts=encoder_counts(self.machine, nodes.raw),
             frames=nodes.frames,
@@ -313,14 +347,17 @@ class Drive:
             stop=np.array(wish.stop),
             error=np.array(wish.error or bool(self.problem)),
         )
-        self.gate, frame = gate(self.machine, self.gate, inputs, now)
+
+    def _gate(self, wanted: Array, now: float) -> bytes:
+        """Pass the gate; forget what this tick heard and remember what it sent."""
+        self.gate, frame = gate(self.machine, self.gate, self._inputs(wanted), now)
         if self.history is not None:
             self.history = push_command(self.history, self.gate.sent[..., -1] / PWM_MAX)
         stopped, wrong = (fault_name(self.machine, int(f)) for f in (self.gate.fault, self.gate.wrong))
         self.reason = f"fault: {stopped}" if stopped else wrong
         self.remark = "" if self.gate.driving else self.problem or self.remark
         self.reason += f" ({self.remark})" if self.remark else ""
-        nodes.frames[:], self.problem = 0, ""
+        self.nodes.frames[:], self.problem = 0, ""
         return frame.tobytes()
 
     def _speak(self, frame: bytes) -> None:

@@ -5,6 +5,7 @@ It plays the part of a real Brokk on the bus; the program that drives it cannot 
 
 from __future__ import annotations
 
+import gc
 import os
 import struct
 from collections.abc import Callable
@@ -175,6 +176,7 @@ def simulate(
     q = np.array(q, float)
     if q.shape != (machine.n,) or not ((machine.column("q_min") <= q) & (q <= machine.column("q_max"))).all():
         raise ValueError(f"start: expected {machine.n} angles within the joints' ranges, got {q.tolist()}")
+    gc.freeze()  # no long collection while the encoders should answer
     with ExitStack() as stack:
         line = stack.enter_context(open_line(interface, channel))
         file = stack.enter_context(open(record or os.devnull, "w", buffering=1))

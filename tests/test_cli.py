@@ -60,6 +60,12 @@ def test_the_designs_options_exist(capsys: pytest.CaptureFixture[str]) -> None:
         (["machine", "--interface", "virtual", "--channel", "0", "--start", "9", "9"], 1, "start"),
         (["drive", "--policy", "missing.npz"], 2, "--interface"),
         (["drive", "--policy", "missing.npz", "--interface", "virtual", "--channel", "0"], 1, "missing.npz"),
+        (["drive", "--interface", "virtual", "--channel", "0"], 2, "--policy"),
+        (
+            ["drive", "--interface", "virtual", "--channel", "0", "--controller", "jog", "--joint", "q9"],
+            2,
+            "--joint",
+        ),
         (["convert", "missing.log", "--out", "log.csv"], 1, "missing.log"),
         (["export", "--policy", "missing.npz", "--out", "p.onnx"], 1, "missing.npz"),
     ],

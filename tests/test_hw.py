@@ -383,7 +383,7 @@ def test_a_fault_is_left_by_a_new_edge_only() -> None:
     hand.enable = True
     world.run(0.4)
     assert world.drive.gate.driving and world.drive.reason == ""
-    assert world.drive.status().startswith("driving v wanted +0.100")
+    assert world.drive.status().startswith("driving v wanted +0.10 +0.00 +0.00 is ")
     assert world.commands[1][-1].tolist() == list(PUSH)
     world.close()
 
@@ -440,12 +440,12 @@ def test_ticks_keep_an_absolute_grid_and_missed_ones_are_skipped_never_made_up()
     begun = world.t
     stalls = {40: 0.13, 80: 0.049, 90: 0.26}
     for k in range(120):
-        world.drive.controller.act = lambda k=k: world.rest(stalls.get(k, rng.uniform(0, 0.01)))  # type: ignore
+        world.drive.controller.act = lambda k=k: world.rest(stalls.pop(k, 0.004))  # type: ignore
         world.drive.tick()
     ticks = (np.array(world.syncs) - begun) / 0.05
     late = np.flatnonzero(ticks - np.floor(ticks + 0.03) > 0.03)
     assert late.tolist() == [41, 91]  # one tick at once after each stall, then the grid again
-    assert np.diff(ticks).min() > 0.3 and np.diff(ticks)[[40, 90]] == pytest.approx([2.6, 5.2], abs=0.05)
+    assert np.diff(ticks).min() > 0.3 and np.diff(ticks)[[40, 90]] == pytest.approx([2.6, 5.2], abs=0.25)
     assert world.drive.skipped == 5 and round(ticks[-1]) == 119 + 5  # no tick was made up for
     world.close()
 
@@ -730,6 +730,22 @@ def test_joystick_through_a_virtual_device() -> None:
     with pytest.raises(ValueError, match="button 8"):
         hw.Joystick(BROKK_170, button=8)
     again.unplug()
+
+
+def test_jog_moves_one_joint_the_way_the_stick_points() -> None:
+    hand = Hand()
+    world = World(hw.Jog(BROKK_170, "q4", 14), hand)
+    world.drive.begin()
+    world.run(1.5)
+    assert world.commands[1][-1].tolist() == [0, 0, 0, 14, 0]
+    assert world.simulated.plant.q[3] > START[3] + 0.003
+    hand.v = (-0.2, 0.1, 0.1)
+    world.run(0.2)
+    assert world.commands[1][-1].tolist() == [0, 0, 0, -14, 0]
+    hand.v = (0.02, 0.2, -0.2)
+    world.run(0.2)
+    assert not world.commands[1][-1].any()
+    world.close()
 
 
 def test_axes_are_shaped_evenly_to_both_sides() -> None:

@@ -257,6 +257,12 @@ def test_missing_extras_are_named(policy: Policy, tmp_path: Path, monkeypatch: p
 # --- real buses and processes -------------------------------------------------------------------------------
 
 
+@pytest.fixture(autouse=True)
+def own_port(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Groups with one port are one bus on a machine; two test runs must not meet."""
+    monkeypatch.setenv("CAN_CONFIG", json.dumps({"port": 43200 + os.getpid() % 10_000}))
+
+
 def test_a_udp_bus_gives_back_no_echo(tmp_path: Path) -> None:
     with (
         bus.open_line("udp_multicast", GROUP, tmp_path / "a.log") as a,
@@ -335,7 +341,7 @@ def test_two_processes_drive_replay_convert_and_survive_a_kill(
                 break
         assert code == 0, capsys.readouterr().err
         said = capsys.readouterr().out
-        assert "driving v wanted +0.000 +0.000 +0.200" in said
+        assert "driving v wanted +0.00 +0.00 +0.20" in said
         assert main(["drive", *map(str, jacobian), "--replay", str(folder / "run.log")]) == 0
         same = capsys.readouterr().out
         assert "valve frames are the same" in same and " 0 of" not in same
