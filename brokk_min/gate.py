@@ -25,6 +25,7 @@ LIMIT_MARGIN = 0.02  # rad before a joint's limit from which no command goes out
 RANGE_MARGIN = 0.05  # rad beyond a joint's limit, then the encoder is wrong
 JUMP_FACTOR, JUMP_COUNTS = 2.0, 4  # times the fastest motion, plus counts: a larger step is a jump
 STILL, MOVED = 2, 4  # frozen: ticks without a change, after as many with this many counts of motion
+HARD = 40  # counts of 127: a command that must move a joint
 MEMORY = 14  # ticks kept, and of hard pushing without motion
 
 
@@ -195,7 +196,7 @@ def gate_wrong(machine: Machine, state: GateState, inputs: GateInputs, now: Arra
     q, then, sent = inputs.counts * step, state.counts, state.sent
 
     # pushed hard the same way, long enough for a joint that moved or rested to move on: it must move
-    hard = sent * np.sign(sent[..., -1:]) >= machine.pwm_limit / 2
+    hard = sent * np.sign(sent[..., -1:]) >= HARD
     still = (then[..., -STILL:] == inputs.counts[..., None]).all(axis=-1)
     moved = np.abs(then[..., -STILL] - then[..., -2 * STILL]) >= MOVED
     frozen = still & ((hard[..., -STILL - 2 :].all(axis=-1) & moved) | hard.all(axis=-1))
