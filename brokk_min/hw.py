@@ -205,7 +205,8 @@ class Drive:
         self.history: Array | None = None
         self.problem = self.remark = self.reason = ""  # exception of this tick, the last one, what is wrong
         self.signals: list[int] = []
-        self.ticks, self.skipped, self.lateness, self.deadline = 0, 0, 0.0, 0.0
+        self.ticks, self.skipped, self.lateness = 0, 0, 0.0
+        self.begun, self.number = 0.0, 0  # the grid of deadlines, and where on it we are
 
     def begin(self) -> None:
         """Check and set up the encoders, start all nodes, and the clock.
@@ -223,7 +224,12 @@ class Drive:
             sdo(self.line, joint.encoder_node, BEAT_OBJECT, round(1e3 * BEAT), size=2)
             sdo(self.line, joint.encoder_node, SYNC_OBJECT, 1, size=1)  # a position after every SYNC
         self.line.send(NMT, bytes([1, 0]))
-        self.deadline = self.line.now()
+        self.begun = self.line.now()
+
+    @property
+    def deadline(self) -> float:
+        """When the next tick is due [s]; not a sum of periods, which would drift by rounding."""
+        return self.begun + self.number * self.machine.dt
 
     def tick(self) -> bool:
         """Wait for the deadline, then one tick; False if it was the last."""
@@ -296,12 +302,16 @@ class Drive:
 
     def _next_deadline(self) -> None:
         """The next deadline in the future on the same grid; a new grid if the clock went backwards."""
-        self.lateness = self.line.now() - self.deadline
-        missed = int(self.lateness // self.machine.dt)
-        if missed < 0:
-            self.deadline, missed = self.line.now(), 0
-        self.ticks, self.skipped = self.ticks + 1, self.skipped + missed
-        self.deadline += (1 + missed) * self.machine.dt
+        now = self.line.now()
+        self.lateness = now - self.deadline
+        missed = max(0, int(self.lateness // self.machine.dt))
+        if self.lateness < -0.5 * self.machine.dt:
+            self.begun, self.number = now, 0
+        self.ticks, self.skipped, self.number = (
+            self.ticks + 1,
+            self.skipped + missed,
+            self.number + 1 + missed,
+        )
 
     def _control(self) -> Array:
         """What the controller wants [counts of 127], (n,)."""

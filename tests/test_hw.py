@@ -449,6 +449,16 @@ def test_ticks_keep_an_absolute_grid_and_missed_ones_are_skipped_never_made_up()
     world.close()
 
 
+def test_the_grid_does_not_drift_by_rounding() -> None:
+    """A day of ticks on a clock that shows the time of day, whose last bit is 0.2 us."""
+    drive = World(Push(0, 0, 0, 0, 0), Hand()).drive
+    drive.begun = 1.8e9
+    drive.line.now = lambda: round(drive.deadline, 6) - 1e-6  # type: ignore[method-assign]
+    for _ in range(20 * 86_400 // 10):
+        drive._next_deadline()
+    assert drive.deadline - 1.8e9 == pytest.approx(8640.0, abs=1e-6) and drive.skipped == 0
+
+
 class ClockBus:
     """A bus that is silent and, meanwhile, sets the time of day back by an hour."""
 
