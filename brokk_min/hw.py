@@ -234,9 +234,10 @@ class Drive:
     def tick(self) -> bool:
         """Wait for the deadline, then one tick; False if it was the last."""
         line, wanted, self.wish = self.line, np.zeros(self.machine.n), self.wish._replace(error=False)
+        end = min(self.deadline, line.now() + self.machine.dt)  # the clock may have gone backwards
         with self._caught():
-            self._listen(self.deadline)
-        line.rest(max(0.0, min(self.machine.dt, self.deadline - line.now())))  # a broken bus does not wait
+            self._listen(end)
+        line.rest(max(0.0, end - line.now()))  # a broken bus does not wait
         self._next_deadline()
         with self._caught():
             wish = self.operator(bool(self.gate.driving), bool(self.gate.wrong == 0))

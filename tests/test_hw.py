@@ -270,7 +270,7 @@ FAULTS: dict[str, tuple[Callable[[Fault], object], str]] = {
         lambda f: setattr(f.world, "offset", 3600.0),
         "tick late, or the clock was set",
     ),
-    "clock stepped back": (lambda f: setattr(f.world, "offset", -0.5), ""),
+    "clock stepped back": (lambda f: setattr(f.world, "offset", -3600.0), "tick late, or the clock was set"),
     "late tick": (lambda f: stall(f, 0.08), "tick late"),
     "hang": (lambda f: stall(f, 0.8), "tick late"),
     "policy returns NaN": (lambda f: f.push.m.__setitem__(2, np.nan), "q3: no valid command"),
