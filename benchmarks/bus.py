@@ -59,7 +59,7 @@ def figures(frames: list[Frame]) -> dict[str, Any]:
     begin = next(k for k, f in enumerate(frames) if f.id == 0x210)
     frames = frames[begin:]
     syncs = np.array([f.time for f in frames if f.id == 0x080])
-    ticks = np.rint((syncs - syncs[0]) / 0.05)
+    ticks = np.floor((syncs - syncs[0]) / 0.05 + 0.1)  # up to 45 ms late is late, not the next tick
     late = 1e3 * (syncs - syncs[0] - ticks * 0.05)
     latency, positions, newest = [], 0, 0.0
     for frame in frames:
@@ -103,7 +103,7 @@ def main(options: Options) -> None:
             time.sleep(10)
             command = [*run, "drive", "--policy", policy, *BUS, "--command", commands, "--log", log]
             code = subprocess.run(command, stdout=subprocess.DEVNULL).returncode
-            frames = read_frames(log)
+            frames = list(read_frames(log))
         finally:
             for process in (machine, *burners):
                 process.kill()

@@ -329,7 +329,7 @@ class Drive:
             raise WrongUse("--interface, --channel: expected a CAN bus, or --replay, got none")
         machine, controller = MACHINES[self.machine], self._controller()
         if self.replay:
-            frames = read_frames(self.replay)
+            frames = list(read_frames(self.replay))
             same, sent = hw.compare(machine, frames, hw.replay(machine, controller, frames))
             print(f"{self.replay}: {same} of {sent} valve frames are the same")
             if same < sent:

@@ -169,17 +169,16 @@ def stop_signals() -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
-def read_frames(path: Path) -> list[Frame]:
-    """All frames of a candump log.
+def read_frames(path: Path) -> Iterator[Frame]:
+    """The frames of a candump log, one by one: a day of driving has millions.
 
     Raises:
         ValueError: no such log, or a line that is no frame.
     """
     try:
         with _can().CanutilsLogReader(path) as reader:
-            return [
-                Frame(m.timestamp, _plain_id(m), bytes(m.data), not m.is_rx, str(m.channel)) for m in reader
-            ]
+            for m in reader:
+                yield Frame(m.timestamp, _plain_id(m), bytes(m.data), not m.is_rx, str(m.channel))
     except (OSError, ValueError, IndexError) as error:
         raise ValueError(f"{path}: expected a candump log, got {error!r}") from error
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import gc
 import os
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -114,6 +114,7 @@ class Joystick:
     """
 
     def __init__(self, machine: Machine, axes: Sequence[int] = (1, 0, 4), button: int = 5) -> None:
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # events need a window, or this
         os.environ.setdefault("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")
         try:
@@ -438,7 +439,7 @@ def replay(machine: Machine, controller: Controller, frames: Sequence[Frame]) ->
     Raises:
         ValueError: another program made the log.
     """
-    tape = Tape(frames)
+    tape = Tape(list(frames))
     drive = Drive(machine, controller, tape, tape.wish)
     drive.begin()
     while tape.more:
@@ -456,7 +457,7 @@ def compare(machine: Machine, frames: Sequence[Frame], sent: Sequence[Frame]) ->
     return sum(a == b for a, b in zip(old, new)), max(len(old), len(new))
 
 
-def driven_log(machine: Machine, frames: Sequence[Frame]) -> Log:
+def driven_log(machine: Machine, frames: Iterable[Frame]) -> Log:
     """What encoders said and valves got while driving, as recordings for `fit`; a gap starts a new one.
 
     Raises:

@@ -451,12 +451,14 @@ def test_ticks_keep_an_absolute_grid_and_missed_ones_are_skipped_never_made_up()
 
 def test_the_grid_does_not_drift_by_rounding() -> None:
     """A day of ticks on a clock that shows the time of day, whose last bit is 0.2 us."""
-    drive = World(Push(0, 0, 0, 0, 0), Hand()).drive
+    world = World(Push(0, 0, 0, 0, 0), Hand())
+    drive = world.drive
     drive.begun = 1.8e9
     drive.line.now = lambda: round(drive.deadline, 6) - 1e-6  # type: ignore[method-assign]
     for _ in range(20 * 86_400 // 10):
         drive._next_deadline()
     assert drive.deadline - 1.8e9 == pytest.approx(8640.0, abs=1e-6) and drive.skipped == 0
+    world.close()
 
 
 class ClockBus:
@@ -585,7 +587,7 @@ def drive_logged(path: Path, seconds: float = 4.0) -> World:
 
 def test_a_recorded_log_replays_to_the_same_bytes(tmp_path: Path) -> None:
     drive_logged(tmp_path / "run.log")
-    frames = bus.read_frames(tmp_path / "run.log")
+    frames = list(bus.read_frames(tmp_path / "run.log"))
     again = hw.replay(BROKK_170, BASELINE, frames)
     sent = [f for f in frames if f.sent and f.channel != "operator"]
     assert [(f.id, f.data) for f in again] == [(f.id, f.data) for f in sent]
@@ -621,12 +623,12 @@ def test_a_log_of_a_drive_reads_back_as_a_log_of_the_machine(tmp_path: Path) -> 
         inside = np.searchsorted(times, moments + 0.03)
         np.testing.assert_allclose(m[inside], recording.u * 127, atol=1e-6)  # the command that came next
     with pytest.raises(ValueError, match="expected more than 14 ticks of driving in a row, got none"):
-        hw.driven_log(BROKK_170, bus.read_frames(tmp_path / "run.log")[:200])
+        hw.driven_log(BROKK_170, list(bus.read_frames(tmp_path / "run.log"))[:200])
 
 
 def test_a_gap_in_a_log_starts_a_new_recording(tmp_path: Path) -> None:
     drive_logged(tmp_path / "run.log", seconds=6.0)
-    frames = bus.read_frames(tmp_path / "run.log")
+    frames = list(bus.read_frames(tmp_path / "run.log"))
     middle = frames[0].time + 1.6
     holed = [f for f in frames if not middle < f.time < middle + 0.12]
     lengths = [len(r.q) for r in hw.driven_log(BROKK_170, holed).recordings]
@@ -638,14 +640,14 @@ def test_logs_that_are_none_are_refused(tmp_path: Path) -> None:
     for text in ("nonsense\n", "(1.0) can0 12#zz\n", "(x) can0 123#00 R\n"):
         (tmp_path / "bad.log").write_text(text)
         with pytest.raises(ValueError, match=r"bad\.log: expected a candump log, got"):
-            bus.read_frames(tmp_path / "bad.log")
+            list(bus.read_frames(tmp_path / "bad.log"))
 
 
 def test_a_plain_candump_log_is_read_too(tmp_path: Path) -> None:
     (tmp_path / "can.log").write_text(
         "(1.000000) can0 123#0102\n(2.000000) can0 12345678#\n(3.0) can0 080#\n"
     )
-    found = bus.read_frames(tmp_path / "can.log")
+    found = list(bus.read_frames(tmp_path / "can.log"))
     assert [(f.id, f.data, f.sent, f.channel) for f in found] == [
         (0x123, b"\x01\x02", False, "can0"), (-1, b"", False, "can0"), (0x80, b"", False, "can0"),
     ]  # fmt: skip
