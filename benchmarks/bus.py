@@ -61,12 +61,15 @@ def figures(frames: list[Frame]) -> dict[str, Any]:
     syncs = np.array([f.time for f in frames if f.id == 0x080])
     ticks = np.floor((syncs - syncs[0]) / 0.05 + 0.1)  # up to 45 ms late is late, not the next tick
     late = 1e3 * (syncs - syncs[0] - ticks * 0.05)
-    latency, positions, newest = [], 0, 0.0
+    latency, answer, positions, newest, sync = [], [], 0, 0.0, 0.0
     for frame in frames:
+        if frame.id == 0x080:
+            sync = frame.time
         if 0x181 <= frame.id <= 0x185:
             positions, newest = positions + 1, frame.time
-        elif frame.id == 0x210 and newest:
+        elif frame.id == 0x210 and sync:
             latency.append(1e3 * (frame.time - newest))
+            answer.append(1e3 * (frame.time - sync))
     counters = np.array([f.data[5] for f in frames if f.id == 0x210])
 
     def spread(values: Any) -> dict[str, float]:
@@ -81,6 +84,7 @@ def figures(frames: list[Frame]) -> dict[str, Any]:
         "ended_by_itself": frames[-1].data[-1:] == b"\x00",
         "lateness": spread(late),
         "last_position_to_valve_frame": spread(latency),
+        "sync_to_valve_frame": spread(answer),
         "drift": round(float(np.median(late[-100:]) - np.median(late[:100])), 3),
     }
 

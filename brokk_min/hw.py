@@ -306,14 +306,14 @@ class Drive:
         """The next deadline in the future on the same grid; a new grid if the clock went backwards."""
         now = self.line.now()
         self.lateness = now - self.deadline
-        missed = max(0, int(self.lateness // self.machine.dt))
         if self.lateness < -0.5 * self.machine.dt:
             self.begun, self.number = now, 0
-        self.ticks, self.skipped, self.number = (
-            self.ticks + 1,
-            self.skipped + missed,
-            self.number + 1 + missed,
-        )
+        missed = max(0, int(self.lateness // self.machine.dt))
+        if missed:
+            self.history = None  # its samples are a tick apart
+        self.skipped += missed
+        self.number += 1 + missed
+        self.ticks += 1
 
     def _control(self) -> Array:
         """What the controller wants [counts of 127], (n,)."""
