@@ -132,7 +132,7 @@ def _can() -> Any:
     try:
         import can
     except ImportError as error:
-        raise ValueError(f"CAN: expected python-can (pip install 'brokk_min[hw]'), got {error}") from error
+        raise ValueError(f"CAN: expected python-can (extra brokk_min[hw]), got {error}") from error
     return can
 
 

@@ -20,7 +20,7 @@ def export_onnx(path: Path, policy: Policy) -> None:
     try:
         from onnx import TensorProto, checker, helper, numpy_helper
     except ImportError as error:
-        raise ValueError(f"export: expected onnx (pip install 'brokk_min[export]'), got {error}") from error
+        raise ValueError(f"export: expected onnx (extra brokk_min[export]), got {error}") from error
     layers = len(policy.weights) // 2
     arrays = {f"{'wb'[i % 2]}{i // 2}": weight for i, weight in enumerate(policy.weights)}
     nodes = []

@@ -127,7 +127,9 @@ def test_our_loop_drives_five_canopen_encoders() -> None:
         assert [n.get_data(0x1017, 0) for n in nodes] == [b"\x32\x00"] * 5
         assert [n.get_data(0x1800, 2) for n in nodes] == [b"\x01"] * 5
         end = time.monotonic() + 20
-        while not drive.gate.driving and time.monotonic() < end:
+        while not drive.gate.driving and time.monotonic() < end:  # a late answer wants another edge
+            hand.enable = False if hand.enable is None and hand.pressed else None
+            drive.tick()
             drive.tick()
         assert drive.gate.driving, drive.reason
         assert {n.nmt.state for n in nodes} == {"OPERATIONAL"}
