@@ -120,9 +120,7 @@ class Joystick:
         try:
             import pygame
         except ImportError as error:
-            raise ValueError(
-                f"joystick: expected pygame (pip install 'brokk_min[play]'), got {error}"
-            ) from error
+            raise ValueError(f"joystick: expected pygame (extra brokk_min[play]), got {error}") from error
         pygame.display.init()
         pygame.joystick.init()
         if not pygame.joystick.get_count():
