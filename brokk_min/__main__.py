@@ -10,12 +10,15 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from brokk_min import experiments
+from brokk_min import experiments, hw
 from brokk_min.actuator import FitConfig, collect, fit, load_net, save_net, score
+from brokk_min.bus import open_line, read_frames
 from brokk_min.env import Controller, TaskConfig, fitting_nets
+from brokk_min.export import export_onnx
 from brokk_min.logs import Log, read_log, write_log
 from brokk_min.machine import BROKK_170
 from brokk_min.policy import PolicyController, load_policy
+from brokk_min.simulator import simulate
 
 MACHINES = {machine.name: machine for machine in (BROKK_170,)}
 Name = Annotated[str, tyro.conf.arg(metavar="{" + ",".join(MACHINES) + "}")]
@@ -39,6 +42,7 @@ ALLOWED: tuple[tuple[float, float, str], ...] = (
     (1e-9, 1, "learning_rate"),
     (1e-9, 1e9, "target_kl max_grad_norm clip"),
     (1e-4, 100, "hours"),
+    (1, 127, "counts"),
     (0.05, 1e6, "episode_s"),
 )
 
@@ -218,12 +222,128 @@ class Reproduce(Command):
         print(f"{self.out / 'report.html'}\n{self.out / 'results.json'}")
 
 
+@dataclass(kw_only=True)
+class Simulate(Command):
+    """Put a simulated machine on a CAN bus: encoders, valve controller, the analytic plant behind them."""
+
+    interface: str  # python-can's name of the bus, udp_multicast for a try without hardware.
+    channel: str  # Channel of the interface, for udp_multicast 239.74.163.2.
+    start: tuple[float, ...] = (1.5, 0.5, 0.58, 1.71, 1.24)  # Angles at the start [rad].
+    record: Path | None = None
+    """Also log command in force and true angles at every step of the plant here, .csv."""
+
+    def run(self) -> None:
+        """Run until SIGINT or SIGTERM."""
+        check(self, self.record)
+        print(f"{self.machine} on {self.interface} {self.channel}; Ctrl-C ends it", flush=True)
+        simulate(MACHINES[self.machine], self.start, self.interface, self.channel, self.record)
+
+
+@dataclass(kw_only=True)
+class Drive(Command):
+    """Drive a machine on a CAN bus at 20 Hz; not a safety function, see docs/hardware.md."""
+
+    policy: Path | None = None  # Policy that `train` wrote.
+    interface: str = ""  # python-can's name of the bus: socketcan, udp_multicast, ...
+    channel: str = ""  # Channel of the interface: can0, 239.74.163.2, ...
+    command: str = "joystick"
+    """joystick, or velocity sequences, CSV: sequence,time,vx,vy,vz [s, m/s]; all of them, one by one."""
+    controller: Literal["rl", "jacobian", "jog"] = "rl"
+    """The policy, the paper's baseline (k = 0.1), or one joint alone, for bringing up."""
+    joint: str = "q1"  # Joint that jogs, forward and backward with x.
+    counts: int = 12  # Its command, of 127.
+    gains: Path | None = None
+    """Tuned gains of the baseline that `reproduce` wrote; by default gains.json beside POLICY."""
+    axes: tuple[int, int, int] = (1, 0, 4)  # Axes of the joystick for x, y and z.
+    button: int = 5  # Button of the joystick that must be held.
+    log: Path | None = None  # Also log every frame here, candump format.
+    replay: Path | None = None  # No bus: run on this log and compare the valve frames with those in it.
+
+    def run(self) -> None:
+        """Drive until the sequences or the operator end it, or compare a log."""
+        check(self, self.log)
+        if not self.replay and not (self.interface and self.channel):
+            raise WrongUse("--interface, --channel: expected a CAN bus, or --replay, got none")
+        machine, controller = MACHINES[self.machine], self._controller()
+        if self.replay:
+            frames = list(read_frames(self.replay))
+            same, sent = hw.compare(machine, frames, hw.replay(machine, controller, frames))
+            print(f"{self.replay}: {same} of {sent} valve frames are the same")
+            if same < sent:
+                raise ValueError(f"{self.replay}: expected the frames of the log, got {sent - same} others")
+            return
+        if self.command == "joystick":
+            operator: hw.Joystick | hw.Script = hw.Joystick(machine, self.axes, self.button)
+        else:
+            sequences = experiments.read_commands(Path(self.command), machine)
+            operator = hw.Script(machine, np.concatenate([s.goals for s in sequences]))
+        with open_line(self.interface, self.channel, self.log) as line:
+            drive = hw.Drive(machine, controller, line, operator)
+            drive.begin()
+            drive.run(_show)
+        if isinstance(operator, hw.Script) and not operator.done:
+            raise ValueError(f"drive: expected to play all sequences, got {drive.reason or 'a stop'}")
+
+    def _controller(self) -> Controller:
+        machine = MACHINES[self.machine]
+        if self.controller == "jog":
+            if self.joint not in machine.names:
+                raise WrongUse(f"--joint: expected one of {', '.join(machine.names)}, got {self.joint}")
+            return hw.Jog(machine, self.joint, self.counts)
+        if not self.policy:
+            raise WrongUse("--policy: expected a policy that `train` wrote, got none")
+        policy = load_policy(self.policy, machine)
+        if self.controller == "rl":
+            return PolicyController(machine, policy)
+        gains = self.gains or self.policy.with_name("gains.json")
+        return experiments.read_gains(gains, machine, policy.net)["jacobian_pid_k0.1"]
+
+
+def _show(text: str) -> None:
+    """Keep one line of a terminal up to date; elsewhere write a line each time."""
+    terminal = sys.stdout.isatty()
+    print(f"\r{text}\033[K" if terminal else text, end="" if terminal else "\n", flush=True)
+
+
+@dataclass(kw_only=True)
+class Convert(Command):
+    """Turn a log of `drive` into one that `fit` reads: a recording for each stretch driven without a gap."""
+
+    log: tyro.conf.Positional[Path]  # Log that `drive --log` or candump wrote.
+    out: Path  # Log to write, .csv or .npz.
+
+    def run(self) -> None:
+        """Write the log."""
+        check(self, self.out)
+        log = hw.driven_log(MACHINES[self.machine], read_frames(self.log))
+        write_log(self.out, log)
+        print(f"{self.out}: {len(log.recordings)} recordings of {', '.join(log.joints)}")
+
+
+@dataclass(kw_only=True)
+class Export(Command):
+    """Write a policy as one ONNX file, to be run elsewhere."""
+
+    policy: Path  # Policy that `train` wrote.
+    out: Path  # File to write, .onnx.
+
+    def run(self) -> None:
+        """Write the file."""
+        check(self, self.out)
+        export_onnx(self.out, load_policy(self.policy, MACHINES[self.machine]))
+        print(f"{self.out}: observation (batch, obs) in, action (batch, driven joints) out")
+
+
 COMMANDS: dict[str, Callable[[], Any]] = {
     "collect": lambda: Collect,
     "fit": lambda: Fit,
     "train": train_command,
     "evaluate": lambda: Evaluate,
     "reproduce": lambda: Reproduce,
+    "machine": lambda: Simulate,
+    "drive": lambda: Drive,
+    "convert": lambda: Convert,
+    "export": lambda: Export,
 }
 
 

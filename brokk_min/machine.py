@@ -20,9 +20,9 @@ SOURCES = ("paper", "maker", "assumed", "tuned")
 PWM_MAX = 127  # counts of full command; paper: [0,127] is positive, [255,128] negative
 
 
-def _number(unit: str, low: float = -np.inf, high: float = np.inf) -> Any:
+def _number(unit: str, low: float = -np.inf, high: float = np.inf, default: Any = dataclasses.MISSING) -> Any:
     """A dataclass field with its unit and its range, both ends included; `int` means whole."""
-    return dataclasses.field(metadata={"unit": unit, "low": low, "high": high})
+    return dataclasses.field(default=default, metadata={"unit": unit, "low": low, "high": high})
 
 
 def _numbers(owner: Machine | Joint | type[Joint] | type[Machine]) -> list[dataclasses.Field[Any]]:
@@ -65,9 +65,13 @@ class Joint:
     q_dot_up: float = _number("rad/s", 1e-9)  # fastest positive motion at the command limit, as logs show it
     q_dot_down: float = _number("rad/s", 1e-9)  # fastest negative motion, a positive number
     encoder_node: int = _number("CANopen node id", 1, 127)
+    encoder_zero: int = _number("counts", default=0)  # what the encoder says at q = 0
+    encoder_sign: int = _number("1", -1, 1, default=1)  # -1: it counts down while q rises
 
     def check_range(self) -> None:
-        """Refuse an empty range, and one over which the cylinder's triangle does not stay open."""
+        """Refuse an empty range, one over which the cylinder's triangle does not stay open, no sign."""
+        if self.encoder_sign == 0:
+            raise ValueError(f"{self.name}.encoder_sign: expected -1 or 1, got 0")
         if not self.q_min < self.q_max:
             raise ValueError(f"{self.name}.q_max: expected above q_min = {self.q_min}, got {self.q_max!r}")
         low, high = self.cylinder_angle + self.q_min, self.cylinder_angle + self.q_max
@@ -111,6 +115,7 @@ class Machine:
     tool_speed: float = _number("m/s", 1e-9)  # largest tool speed an operator may ask for
     ground: float = _number("m")  # height of the ground in the base frame
     valve_frame_id: int = _number("CAN id", 0, 0x7FF)
+    controller_node: int = _number("CANopen node id", 1, 127)  # of the valve controller
 
     def __post_init__(self) -> None:
         """Refuse what cannot be a machine, naming field, wanted and got."""
@@ -130,6 +135,8 @@ class Machine:
         for what, values in (("names", [*self.names]), ("encoder nodes", nodes)):
             if len(set(values)) != len(values):
                 raise ValueError(f"joints: expected different {what}, got {values}")
+        if self.controller_node in nodes:
+            raise ValueError(f"controller_node: expected none of {nodes}, got {self.controller_node}")
         steps = self.dt / self.plant_dt
         if abs(steps - round(steps)) > 1e-6 or steps < 0.5:
             raise ValueError(f"plant_dt: expected 1/rate = {self.dt} to be a multiple, got {self.plant_dt}")
@@ -321,6 +328,7 @@ def _brokk_170() -> Machine:
         tool_speed=0.3,
         ground=0.0,
         valve_frame_id=0x210,
+        controller_node=0x10,
     )
 
 

@@ -39,6 +39,10 @@ def test_the_designs_options_exist(capsys: pytest.CaptureFixture[str]) -> None:
         "train": ["--actuator", "--out", "--total-steps", "--num-envs", "--resume"],
         "evaluate": ["--policy", "--commands", "--starts", "--plant", "--json"],
         "reproduce": ["--out", "--quick"],
+        "machine": ["--interface", "--channel", "--record"],
+        "drive": ["--policy", "--interface", "--channel", "--command", "--controller", "--log", "--replay"],
+        "convert": ["--out"],
+        "export": ["--policy", "--out"],
     }
     for command, options in wanted.items():
         run(command, "--help")
@@ -59,6 +63,18 @@ def test_the_designs_options_exist(capsys: pytest.CaptureFixture[str]) -> None:
         (["train", "--actuator", "missing.npz", "--out", "p.npz"], 1, "missing.npz"),
         (["train", "--actuator", "missing.npz", "--out", "p.npz", "--num-envs", "0"], 2, "--num-envs"),
         (["evaluate", "--policy", "missing.npz"], 1, "missing.npz"),
+        (["machine", "--interface", "nonsense", "--channel", "0"], 1, "nonsense"),
+        (["machine", "--interface", "virtual", "--channel", "0", "--start", "9", "9"], 1, "start"),
+        (["drive", "--policy", "missing.npz"], 2, "--interface"),
+        (["drive", "--policy", "missing.npz", "--interface", "virtual", "--channel", "0"], 1, "missing.npz"),
+        (["drive", "--interface", "virtual", "--channel", "0"], 2, "--policy"),
+        (
+            ["drive", "--interface", "virtual", "--channel", "0", "--controller", "jog", "--joint", "q9"],
+            2,
+            "--joint",
+        ),
+        (["convert", "missing.log", "--out", "log.csv"], 1, "missing.log"),
+        (["export", "--policy", "missing.npz", "--out", "p.onnx"], 1, "missing.npz"),
     ],
 )
 def test_refusals_are_short_and_have_their_status(

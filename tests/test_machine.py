@@ -69,6 +69,9 @@ BAD = [
     (with_joint(4, q_dot_down=-1.0), ["q5.q_dot_down", "got -1.0"]),
     (with_joint(4, encoder_node=0), ["q5.encoder_node", "1 to 127", "got 0"]),
     (with_joint(4, encoder_node=128), ["q5.encoder_node", "1 to 127", "got 128"]),
+    (with_joint(4, encoder_zero=0.5), ["q5.encoder_zero", "whole number", "got 0.5"]),
+    (with_joint(4, encoder_sign=0), ["q5.encoder_sign", "-1 or 1", "got 0"]),
+    (with_joint(4, encoder_sign=2), ["q5.encoder_sign", "-1 to 1", "got 2"]),
     ({"rate": 0.0}, ["rate", "got 0.0"]),
     ({"rate": -20.0}, ["rate", "got -20.0"]),
     ({"pwm_limit": 0}, ["pwm_limit", "1 to 127", "got 0"]),
@@ -92,6 +95,8 @@ BAD = [
     ({"ground": NAN}, ["ground", "finite", "nan"]),
     ({"valve_frame_id": -1}, ["valve_frame_id", "0 to 2047", "got -1"]),
     ({"valve_frame_id": 0x800}, ["valve_frame_id", "0 to 2047", "got 2048"]),
+    ({"controller_node": 128}, ["controller_node", "1 to 127", "got 128"]),
+    ({"controller_node": 3}, ["controller_node", "none of [1, 2, 3, 4, 5]", "got 3"]),
 ]
 
 

@@ -1,0 +1,44 @@
+"""A policy as an ONNX file, for those who run it elsewhere."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from brokk_min.logs import whole_file
+from brokk_min.policy import Policy
+
+
+def export_onnx(path: Path, policy: Policy) -> None:
+    """Write a policy as one self-contained ONNX file: `observation` (batch, obs) in, `action` out.
+
+    Raises:
+        ValueError: the package onnx is not there.
+    """
+    try:
+        from onnx import TensorProto, checker, helper, numpy_helper
+    except ImportError as error:
+        raise ValueError(f"export: expected onnx (extra brokk_min[export]), got {error}") from error
+    layers = len(policy.weights) // 2
+    arrays = {f"{'wb'[i % 2]}{i // 2}": weight for i, weight in enumerate(policy.weights)}
+    nodes = []
+    for i in range(layers):
+        source = "observation" if i == 0 else f"y{i - 1}"
+        target = "action" if i == layers - 1 else f"x{i}"
+        nodes.append(helper.make_node("Gemm", [source, f"w{i}", f"b{i}"], [target]))
+        if i < layers - 1:
+            nodes.append(helper.make_node("Elu", [target], [f"y{i}"]))
+    sizes = {"observation": len(policy.mean), "action": policy.weights[-1].shape[-1]}
+    info = helper.make_tensor_value_info
+    ends = [info(name, TensorProto.FLOAT, ["batch", size]) for name, size in sizes.items()]
+    values = [numpy_helper.from_array(array.astype(np.float32), name) for name, array in arrays.items()]
+    graph = helper.make_graph(nodes, "policy", ends[:1], ends[1:], values)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    contract = {key: json.dumps(value) for key, value in policy.contract.items()}
+    scales = {"mean": json.dumps(policy.mean.tolist()), "scale": json.dumps(policy.scale.tolist())}
+    helper.set_model_props(model, contract | scales)
+    checker.check_model(model, full_check=True)
+    with whole_file(path) as file:
+        file.write(model.SerializeToString())
