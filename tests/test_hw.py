@@ -24,7 +24,7 @@ from brokk_min import bus, hw
 from brokk_min.env import TaskConfig, reward, rollout
 from brokk_min.experiments import axis_sequences
 from brokk_min.gate import encoder_raw, valve_frame
-from brokk_min.jacobian import Gains, JacobianController, manipulability_threshold
+from brokk_min.jacobian import JacobianController, join_gains, manipulability_threshold
 from brokk_min.kinematics import tool_state
 from brokk_min.logs import read_log, write_log
 from brokk_min.machine import BROKK_170
@@ -32,7 +32,7 @@ from brokk_min.machine import BROKK_170
 PUSH = (60, 0, 60, 60, 60)
 BASELINE = JacobianController(
     BROKK_170,
-    Gains(np.full(4, 1.0), np.full(4, 3.0), np.zeros(4), np.array(0.3)),
+    join_gains(BROKK_170, {"kp": 1.0, "ki": 3.0, "kd": 0.0, "feedback": 0.3, "ready": 0.0}),
     0.1,
     manipulability_threshold(BROKK_170),
 )

@@ -54,7 +54,7 @@ def policy() -> Policy:
 @pytest.fixture
 def folder(policy: Policy, tmp_path: Path) -> Path:
     save_policy(tmp_path / "policy.npz", policy)
-    gains = {k: [1.0] * 4 for k in ("kp", "ki", "kd")} | {"kd": [0.0] * 4, "feedback": 0.1}
+    gains = {k: [1.0] * 4 for k in ("kp", "ki", "kd")} | {"kd": [0.0] * 4, "feedback": 0.1, "ready": 0.0}
     names = ("jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff")
     table = {"meta": {"machine": "brokk170"}, "gains": dict.fromkeys(names, gains)}
     (tmp_path / "gains.json").write_text(json.dumps(table))
