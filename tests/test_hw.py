@@ -21,11 +21,11 @@ import pytest
 from helpers_bus import START, Hand, Out, Push, World
 
 from brokk_min import bus, hw
-from brokk_min.env import TaskConfig, reward, rollout
+from brokk_min.env import TaskConfig, measured, observation_scale, reward, rollout, to_command
 from brokk_min.experiments import axis_sequences
 from brokk_min.gate import encoder_raw, valve_frame
 from brokk_min.jacobian import JacobianController, join_gains, manipulability_threshold
-from brokk_min.kinematics import tool_state
+from brokk_min.kinematics import joint_rates, tool_state
 from brokk_min.logs import read_log, write_log
 from brokk_min.machine import BROKK_170
 
@@ -78,6 +78,41 @@ def test_reward_over_the_bus_is_that_of_evaluate(sequence: Any) -> None:
     )  # fmt: skip
     assert over_bus == pytest.approx(trace.reward.mean(), rel=0.01)
     assert trace.reward.mean() < 0.99  # there was something to lose
+
+
+class Listener:
+    """Drives by the wanted rates alone and keeps what it was told."""
+
+    def __init__(self) -> None:
+        self.told: list[np.ndarray] = []
+
+    def start(self, num: int) -> None:
+        self.told.clear()
+
+    def __call__(self, observation: np.ndarray, memory: None) -> tuple[np.ndarray, None]:
+        self.told.append(observation[0].astype(float))
+        return to_command(BROKK_170, 0.2 * observation[..., -8:-4]), memory
+
+
+def test_the_policy_is_told_how_far_the_tool_stays_behind() -> None:
+    """The observation's last block against a sum over its own goals and velocities."""
+    sequence = axis_sequences(BROKK_170)[0]
+    listener, script = Listener(), hw.Script(BROKK_170, sequence.goals[:200])
+    world = World(listener, script)
+    world.drive.begin()
+    while world.drive.tick():
+        pass
+    world.close()
+    scale = observation_scale(BROKK_170)[1].astype(float)
+    lag, checked = np.zeros(3), 0
+    seen = [measured(BROKK_170, told) for told in listener.told[::2]]  # all ticks but the first are rehearsed
+    for told, before, now in zip(listener.told[2::2], seen, seen[1:], strict=False):
+        error = before.v_goal - now.v_tool
+        error *= min(1.0, 0.021 / max(np.linalg.norm(error), 1e-9))
+        lag = (lag + error / 20) * np.exp(-1 / 40)
+        np.testing.assert_allclose(told[-4:] * scale[-4:], joint_rates(BROKK_170, now.q, lag), atol=1e-4)
+        checked += np.linalg.norm(lag) > 0.005
+    assert checked > 100
 
 
 def test_it_is_silent_until_armed_and_moves_a_tick_later() -> None:
