@@ -169,7 +169,7 @@ def observe(
     driven = history[..., machine.driven, :, :]
     mean, scale, sensed = _layout(machine)
     size = len(mean) - 2 * len(machine.driven)  # without the rates
-    seen = np.empty((*v_tool.shape[:-1], len(mean)), np.float32)
+    seen = np.zeros((*v_tool.shape[:-1], len(mean)), np.float32)
     seen[..., :3], seen[..., 3:6] = _turn(p_tool, v_goal, 1), _turn(p_tool, v_tool, 1)
     seen[..., 6 : 6 + len(machine.locked)] = history[..., machine.locked, 0, -1]
     seen[..., 6 + len(machine.locked) : size] = driven.reshape(*driven.shape[:-3], -1)

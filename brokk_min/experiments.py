@@ -172,7 +172,7 @@ class Effort:
 
     hours: float = 1.0
     fit_steps: int = 10000
-    train_steps: int = 5_000_000
+    train_steps: int = 6_000_000
     generations: int = 45
     tuning_runs: int = 12
     starts: int = 16

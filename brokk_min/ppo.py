@@ -37,15 +37,15 @@ STATE = [f.name for f in fields(State) if f.name != "plant"]
 class PPOConfig:
     """Settings of the learner; those that the paper names are marked."""
 
-    total_steps: int = 5_000_000
+    total_steps: int = 6_000_000
     """Environment steps in all."""
     num_envs: int = 256
     """Environments side by side (paper: 256)."""
-    horizon: int = 16
+    horizon: int = 32
     """Ticks of every environment between two updates."""
     epochs: int = 4
     """Passes over the collected steps in each update."""
-    minibatch_size: int = 1024
+    minibatch_size: int = 2048
     """Steps in one gradient."""
     learning_rate: float = 1e-3
     """Of Adam at the start and at most; follows `target_kl` and falls linearly to zero at the end."""
@@ -63,7 +63,7 @@ class PPOConfig:
     """Gradients are scaled down to this norm."""
     log_std: float = -1.2
     """Logarithm of the actions' standard deviation at the start."""
-    checkpoint_every: int = 100
+    checkpoint_every: int = 50
     """Updates between two checkpoints."""
     threads: int = 2
     """Threads of torch; sums, and so the last bits, depend on it."""
