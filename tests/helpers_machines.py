@@ -1,4 +1,4 @@
-"""Random machines, cheap actuator nets and scripted randomness for the tests of the task."""
+"""Random machines, cheap actuator nets, scripted randomness and an oracle for the tests of the task."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from brokk_min.actuator import ActuatorNet
+from brokk_min.kinematics import jacobian
 from brokk_min.machine import BROKK_170, Joint, Machine
 
 GAIN = 3.0  # of `obedient_net`
@@ -111,6 +112,15 @@ def obedient_velocity(machine: Machine, u: np.ndarray) -> np.ndarray:
     """What `obedient_net` says for commands `u` (..., n_driven), worked out by hand."""
     fastest = 1.2 * machine.q_dot_max[machine.driven]
     return fastest * (2 / (1 + np.exp(-GAIN * np.asarray(u, float))) - 1)
+
+
+def damped_rates(machine: Machine, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Oracle of `joint_rates`: NumPy solves (J^T J + lambda^2 I) x = J^T v, lambda 6 % of the length."""
+    J = jacobian(machine, np.asarray(q, float))
+    damping = (0.06 * np.hypot(machine.column("a"), machine.column("d")).sum()) ** 2
+    Jt = np.swapaxes(J, -1, -2)
+    normal = Jt @ J + damping * np.eye(J.shape[-1])
+    return np.linalg.solve(normal, (Jt @ np.asarray(v, float)[..., None]))[..., 0]
 
 
 class RowRandom:

@@ -10,7 +10,14 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from helpers_machines import RowRandom, obedient_net, obedient_velocity, random_machine, small_net
+from helpers_machines import (
+    RowRandom,
+    damped_rates,
+    obedient_net,
+    obedient_velocity,
+    random_machine,
+    small_net,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -19,7 +26,8 @@ from scipy import stats
 from brokk_min import env as task
 from brokk_min.actuator import plant_reset, plant_step, save_net
 from brokk_min.env import TaskConfig, TaskEnv, TaskVectorEnv
-from brokk_min.jacobian import Gains, JacobianController
+from brokk_min.jacobian import GAINS, JacobianController, join_gains
+from brokk_min.kinematics import joint_rates, tool_position
 from brokk_min.machine import BROKK_170, estimate_velocity, read_encoder
 
 POSE = np.array([1.5, 0.5, 0.58, 1.71, 1.24])  # the paper's q_s
@@ -149,16 +157,28 @@ def told_history():
     return history
 
 
+STILL = np.zeros(3)  # no lag, no goal
+
+
+def parts(machine, seen):
+    """Observations cut up: goal (3), tool velocity (3), locked angles, histories (n, 3, H), two rates."""
+    rest, driven, samples = len(machine.locked), len(machine.driven), machine.history
+    cuts = np.cumsum([3, 3, rest, 3 * samples * driven, driven])
+    assert seen.shape[-1] == cuts[-1] + driven
+    goal, tool, angles, body, rates, late = np.split(seen, cuts, axis=-1)
+    return goal, tool, angles, body.reshape(*body.shape[:-1], driven, 3, samples), rates, late
+
+
 def test_observation_by_hand():
     outward, sideways = np.array([np.cos(1.5), np.sin(1.5)]), np.array([-np.sin(1.5), np.cos(1.5)])
-    seen = task.observe(BROKK_170, told_history(), [*(0.3 * outward - 0.1 * sideways), -0.15])
-    assert seen.shape == (163,)  # 6 + q2 + 4 joints x 39
+    v_goal, lag = np.array([*(0.3 * outward - 0.1 * sideways), -0.15]), np.array([0.02, -0.01, 0.03])
+    seen = task.observe(BROKK_170, told_history(), v_goal, lag)
+    assert seen.shape == (171,)  # 6 + q2 + 4 joints x 39 + 2 x 4 rates
     assert seen.dtype == np.float32
-    np.testing.assert_allclose(seen[:3], 3**0.5 * np.array([1, -1 / 3, -0.5]), rtol=1e-5)
-    assert seen[6] == pytest.approx((0.5 - 0.7) / (1.4 / 12**0.5), rel=1e-6)
+    np.testing.assert_allclose(seen[:3], 1.4 * 3**0.5 * np.array([1, -1 / 3, -0.5]), rtol=1e-5)
+    assert seen[6] == pytest.approx(1.4 * (0.5 - 0.7) / (1.4 / 12**0.5), rel=1e-6)
     spread, lags = 12**0.5, np.arange(13)
-    q1, q3 = seen[7:46].reshape(3, 13), seen[46:85].reshape(3, 13)
-    q5 = seen[124:163].reshape(3, 13)
+    q1, q3, q5 = (13**0.5 * seen[i : i + 39].reshape(3, 13) for i in (7, 46, 124))  # each weighs 13^-0.5
     np.testing.assert_allclose(q1[0], (1.5 + 0.01 * (lags - 12)) / (4.28 / spread), rtol=1e-5)
     np.testing.assert_allclose(q1[1], 0.001 * lags / (0.20 / 3**0.5), rtol=1e-5, atol=1e-7)
     np.testing.assert_allclose(q1[2], 0.002 * lags / (80 / 127 / 3**0.5), rtol=1e-5, atol=1e-7)
@@ -167,6 +187,11 @@ def test_observation_by_hand():
     np.testing.assert_allclose(q3[2], (-0.2 + 0.002 * lags) * 127 * 3**0.5 / 80, rtol=1e-5)
     np.testing.assert_allclose(q5[1], (0.08 + 0.001 * lags) * 3**0.5 / 0.47, rtol=1e-5)
     assert (np.diff(q1[0]) > 0).all()  # oldest first
+    fastest = np.array([0.20, 0.28, 0.38, 0.47]) / 3**0.5
+    for found, v, nominal in ((seen[163:167], v_goal, fastest), (seen[167:], lag, 0.1 * fastest)):
+        wanted = damped_rates(BROKK_170, POSE, v) / nominal * 4.2
+        np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-4)
+        assert np.abs(wanted).min() > 0.02  # the four numbers are four
 
 
 def test_observed_tool_velocity_is_the_derivative_of_the_closed_form():
@@ -178,44 +203,81 @@ def test_observed_tool_velocity_is_the_derivative_of_the_closed_form():
     outward = (np.hypot(*after[:2]) - np.hypot(*before[:2])) / (2 * step)
     sideways = radius * (np.arctan2(after[1], after[0]) - np.arctan2(before[1], before[0])) / (2 * step)
     upward = (after[2] - before[2]) / (2 * step)
-    seen = task.observe(BROKK_170, history, np.zeros(3))
-    np.testing.assert_allclose(seen[3:6] * 0.3 / 3**0.5, [outward, sideways, upward], atol=1e-6)
+    seen = task.observe(BROKK_170, history, STILL, STILL)
+    np.testing.assert_allclose(seen[3:6] / 1.4 * 0.3 / 3**0.5, [outward, sideways, upward], atol=1e-6)
     assert q_dot[1] != 0  # a moving q2 counts as well
 
 
 def test_a_turned_arm_sees_the_same():
-    """Turning arm and goal about the slew axis changes q1's angles alone."""
+    """Turning arm, goal and lag about the slew axis changes q1's angles alone."""
     history, turned = told_history(), told_history()
     turned[0, 0] -= 2.5
     c, s = np.cos(-2.5), np.sin(-2.5)
-    one = task.observe(BROKK_170, history, [0.2, -0.1, 0.05])
-    other = task.observe(BROKK_170, turned, [0.2 * c + 0.1 * s, 0.2 * s - 0.1 * c, 0.05])
-    angles = np.zeros(163, bool)
+    one = task.observe(BROKK_170, history, [0.2, -0.1, 0.05], np.array([0.02, 0.01, -0.03]))
+    late = np.array([0.02 * c - 0.01 * s, 0.02 * s + 0.01 * c, -0.03])
+    other = task.observe(BROKK_170, turned, [0.2 * c + 0.1 * s, 0.2 * s - 0.1 * c, 0.05], late)
+    angles = np.zeros(171, bool)
     angles[7:20] = True
-    np.testing.assert_allclose(other[~angles], one[~angles], atol=1e-5)
-    np.testing.assert_allclose(other[angles] - one[angles], -2.5 * 12**0.5 / 4.28, rtol=1e-5)
+    np.testing.assert_allclose(other[~angles], one[~angles], atol=2e-5)
+    np.testing.assert_allclose(other[angles] - one[angles], -2.5 * (12 / 13) ** 0.5 / 4.28, rtol=1e-5)
+
+
+def random_sight(machine, rng, shape):
+    """History, goal and lag of machines that move anyhow, read-only."""
+    low, high = machine.column("q_min")[:, None], machine.column("q_max")[:, None]
+    history = rng.normal(0, 0.3, (*shape, machine.n, 3, machine.history))
+    history[..., 0, :] = rng.uniform(low, high, (*shape, machine.n, machine.history))
+    v_goal, lag = rng.normal(0, 0.3, (*shape, 3)), rng.normal(0, 0.03, (*shape, 3))
+    for array in (history, v_goal, lag):
+        array.setflags(write=False)
+    return history, v_goal, lag
 
 
 @pytest.mark.parametrize("machine", MACHINES, ids=lambda m: m.name)
 def test_measured_undoes_observe(machine):
-    rng = np.random.default_rng(2)
-    history = rng.normal(0, 0.5, (2, 3, machine.n, 3, machine.history))
-    v_goal = rng.normal(0, 0.3, (2, 3, 3))
-    seen = task.observe(machine, history, v_goal)
-    size = 6 + len(machine.locked) + 3 * machine.history * len(machine.driven)
+    history, v_goal, lag = random_sight(machine, np.random.default_rng(2), (2, 3))
+    seen = task.observe(machine, history, v_goal, lag)
+    size = 6 + len(machine.locked) + (3 * machine.history + 2) * len(machine.driven)
     assert seen.shape == (2, 3, size)
     back = task.measured(machine, seen)
     np.testing.assert_allclose(back.v_goal, v_goal, atol=1e-6)
     np.testing.assert_allclose(back.q, history[..., 0, -1], atol=1e-5)
     np.testing.assert_allclose(back.q_dot, history[..., machine.driven, 1, -1], atol=1e-5)
-    alone = task.measured(machine, task.observe(machine, history[1, 2], v_goal[1, 2]))
+    still = np.zeros((2, 3, machine.n, 3, machine.history))
+    still[..., 0, :], still[..., machine.driven, 1, :] = history[..., 0, :], 0.1
+    v_tool = task.measured(machine, task.observe(machine, still, v_goal, lag)).v_tool
+    step = 1e-6 * still[..., 1, -1]
+    ahead, behind = (tool_position(machine, still[..., 0, -1] + sign * step) for sign in (1, -1))
+    np.testing.assert_allclose(v_tool, (ahead - behind) / 2e-6, atol=1e-5)
+    alone = task.measured(machine, task.observe(machine, history[1, 2], v_goal[1, 2], lag[1, 2]))
     for whole, single in zip(back, alone, strict=True):
         np.testing.assert_allclose(whole[1, 2], single, atol=1e-5)
 
 
 @pytest.mark.parametrize("machine", [BROKK_170, *MACHINES], ids=lambda m: m.name)
+def test_wanted_rates_are_damped_least_squares_at_the_angles_that_are_shown(machine):
+    """Noise or not: who reads the angles in an observation finds the rates that belong to them."""
+    rng = np.random.default_rng(20)
+    history, v_goal, lag = random_sight(machine, rng, (50,))
+    nominal = machine.q_dot_max[machine.driven] / 3**0.5 / 4.2
+    clean = task.observe(machine, history, v_goal, lag)
+    for noise in (0.0, rng.uniform(-0.5, 0.5, clean.shape).astype(np.float32)):
+        seen = task.observe(machine, history, v_goal, lag, noise)
+        q = task.measured(machine, seen.astype(float)).q
+        off = np.abs(q - history[..., 0, -1]).max()
+        assert off > 0.05 if np.any(noise) else off < 1e-5
+        for found, v, scale in zip(
+            parts(machine, seen)[-2:], (v_goal, lag), (nominal, 0.1 * nominal), strict=True
+        ):
+            size = np.linalg.norm(damped_rates(machine, q, v), axis=-1).max()
+            np.testing.assert_allclose(found * scale, damped_rates(machine, q, v), atol=1e-3 * size)
+            np.testing.assert_allclose(found * scale, joint_rates(machine, q, v), atol=1e-4 * size)
+    assert np.abs(seen - clean)[:, -2 * len(machine.driven) :].max() > 0.01  # the noise did change them
+
+
+@pytest.mark.parametrize("machine", [BROKK_170, *MACHINES], ids=lambda m: m.name)
 def test_scale_belongs_to_uniform_values_over_the_ranges(machine):
-    """Observations of uniform histories have mean 0 and deviation 1: an oracle by sampling."""
+    """Observations of uniform histories have mean 0 and their weight as deviation: an oracle by sampling."""
     rng, num = np.random.default_rng(3), 4000
     history = np.zeros((num, machine.n, 3, machine.history))
     bounds = machine.column("q_min")[:, None], machine.column("q_max")[:, None]
@@ -225,44 +287,151 @@ def test_scale_belongs_to_uniform_values_over_the_ranges(machine):
     history[:, :, 1] = rng.uniform(-fastest, fastest, shape)
     history[:, :, 2] = rng.uniform(-limit, limit, shape)
     v_goal = rng.uniform(-machine.tool_speed, machine.tool_speed, (num, 3))
-    seen = np.delete(task.observe(machine, history, v_goal), [3, 4, 5], axis=-1)
-    assert np.abs(seen.mean(axis=0)).max() < 0.1
-    assert np.abs(seen.std(axis=0) - 1).max() < 0.05
+    goal, _, angles, body, *_ = parts(machine, task.observe(machine, history, v_goal, 0 * v_goal))
+    for values, weight in ((goal, 1.4), (angles, 1.4), (body, machine.history**-0.5)):
+        assert np.abs(values.mean(axis=0)).max(initial=0) < 0.1 * weight
+        assert np.abs(values.std(axis=0) / weight - 1).max(initial=0) < 0.05
+    mean, scale = task.observation_scale(machine)
+    assert mean.dtype == scale.dtype == np.float32
+    assert not parts(machine, mean)[-1].any() and not parts(machine, mean)[-2].any()
+    rates, late = parts(machine, scale)[-2:]
+    np.testing.assert_allclose(4.2 * rates, machine.q_dot_max[machine.driven] / 3**0.5, rtol=1e-6)
+    np.testing.assert_allclose(rates, 10 * late, rtol=1e-6)
 
 
 @pytest.mark.parametrize("machine", [BROKK_170, MACHINES[0]], ids=lambda m: m.name)
-def test_noise_is_uniform_within_five_percent_and_fresh_on_what_is_measured(machine):
+def test_noise_is_uniform_within_five_percent_and_fresh_on_what_is_sensed(machine):
     """On tool velocity, angles and velocities in standard deviations; goal and commands are exact."""
-    rng = np.random.default_rng(4)
-    locked, driven = len(machine.locked), len(machine.driven)
-    size = 6 + locked + 3 * machine.history * driven
-    clean = rng.normal(size=(400, size)).astype(np.float32)
-    kept = clean.copy()
-    noise = task.noisy(machine, clean, TaskConfig(), rng) - clean
-    assert noise.dtype == np.float32
-    assert np.array_equal(clean, kept)
-    body = noise[:, 6 + locked :].reshape(400, driven, 3, machine.history)
-    assert not noise[:, :3].any() and not body[:, :, 2].any()
-    for draws in (noise[:, 3 : 6 + locked], body[:, :, 0], body[:, :, 1]):
-        assert 0.049 < np.abs(draws).max() < 0.05 + 1e-5
-        assert stats.kstest(draws.ravel(), stats.uniform(-0.05, 0.1).cdf).pvalue > 1e-4
-    flat_noise = np.delete(noise, np.flatnonzero(~noise.any(axis=0)), axis=1)
-    assert np.abs(np.corrcoef(flat_noise.T) - np.eye(flat_noise.shape[1])).max() < 0.3
-    again = task.noisy(machine, clean, TaskConfig(), rng)
-    assert not np.array_equal(again, task.noisy(machine, clean, TaskConfig(), rng))
-    assert np.array_equal(task.noisy(machine, clean, QUIET, rng), clean)
+    rng, num = np.random.default_rng(4), 400
+    history, v_goal, lag = random_sight(machine, rng, (num,))
+    state = replace(
+        task.rest_state(machine, history[..., 0, -1], v_goal, plant=False), history=history, lag=lag
+    )
+    clean = task.observe(machine, history, v_goal, lag)
+    seen = task.look(machine, TaskConfig(), state, rng)
+    assert seen.dtype == np.float32
+    goal, tool, angles, body, *_ = parts(machine, seen - clean)
+    assert not goal.any() and not body[:, :, 2].any()
+    sensed = []
+    for error, weight in ((tool, 1.4), (angles, 1.4), (body[:, :, :2], machine.history**-0.5)):
+        draws = error.reshape(num, -1) / weight
+        if draws.size:  # MACHINES[0] has no locked joint
+            assert 0.0495 < np.abs(draws).max() < 0.05 + 1e-5
+            assert stats.kstest(draws.ravel(), stats.uniform(-0.05, 0.1).cdf).pvalue > 1e-4
+        sensed.append(draws)
+    draws = np.concatenate(sensed, axis=1)
+    assert draws.shape[1] == 3 + len(machine.locked) + 2 * machine.history * len(machine.driven)
+    assert np.abs(np.corrcoef(draws.T) - np.eye(draws.shape[1])).max() < 0.3
+    assert not np.array_equal(seen, task.look(machine, TaskConfig(), state, rng))
+    assert np.array_equal(task.look(machine, QUIET, state, rng), clean)
 
 
 def test_the_observation_of_an_environment_is_noisy_within_five_percent():
     env = TaskVectorEnv(300)
     seen, _ = env.reset(seed=0)
     for _ in range(3):
-        error = seen - task.observe(BROKK_170, env.state.history, env.state.v_goal)
-        body = error[:, 7:].reshape(300, 4, 3, 13)
-        assert not error[:, :3].any() and not body[:, :, 2].any()
-        assert 0.049 < np.abs(error[:, 3:7]).max() < 0.05 + 1e-5
-        assert 0.0499 < np.abs(body[:, :, :2]).max() < 0.05 + 1e-5
+        state = env.state
+        error = seen - task.observe(BROKK_170, state.history, state.v_goal, state.lag)
+        goal, tool, angles, body, *_ = parts(BROKK_170, error)
+        assert not goal.any() and not body[:, :, 2].any()
+        for noise in (tool / 1.4, angles / 1.4, body[:, :, :2] * 13**0.5):
+            assert 0.049 < np.abs(noise).max() < 0.05 + 2e-5
         seen = env.step(env.action_space.sample())[0]
+
+
+# --- the lag --------------------------------------------------------------------------------------
+
+
+def standing(num=1):
+    """Histories (num, 5, 3, 13) of machines that stand still."""
+    history = np.zeros((num, 5, 3, 13), np.float32)
+    history[:, :, 0] = POSE[:, None]
+    return history
+
+
+def test_lag_by_hand():
+    """Errors of 0.012 m/s count in full, larger ones than 0.021 m/s (7 % of 0.3) as that, 50 ms each."""
+    forget = np.exp(-0.025)
+    goals = np.array([[0.012, 0, 0], [0, -0.2, 0], [0.3, 0, 0.4], [0, 0, 0.021]], np.float32)
+    wanted = np.array([[0.012, 0, 0], [0, -0.021, 0], [0.0126, 0, 0.0168], [0, 0, 0.021]]) * 0.05 * forget
+    lag = task.push_lag(BROKK_170, standing(4), goals, np.zeros((4, 3), np.float32))
+    np.testing.assert_allclose(lag, wanted, rtol=1e-5, atol=1e-10)
+    assert lag.dtype == np.float32
+    again = task.push_lag(BROKK_170, standing(4), goals[::-1], lag)
+    np.testing.assert_allclose(again, (wanted + wanted[::-1] / forget) * forget, rtol=1e-5, atol=1e-10)
+
+
+def test_the_tool_velocity_counts_against_the_goal():
+    history = told_history()
+    q, q_dot = history[:, 0, -1], history[:, 1, -1]
+    ahead, behind = (closed_form(q + sign * 1e-6 * q_dot)[0] for sign in (1, -1))
+    v_tool = (ahead - behind) / 2e-6
+    assert np.linalg.norm(v_tool) > 0.1
+    lag = np.array([0.01, 0.02, -0.03])
+    kept = task.push_lag(BROKK_170, history, v_tool, lag)
+    np.testing.assert_allclose(kept, lag * np.exp(-0.025), atol=1e-8)  # no error: forgotten, nothing more
+    error = np.array([0.01, 0.0, -0.005])
+    after = task.push_lag(BROKK_170, history, v_tool + error, lag)
+    np.testing.assert_allclose(after, (lag + 0.05 * error) * np.exp(-0.025), atol=1e-8)
+
+
+def test_a_lasting_error_fills_the_lag_and_it_is_forgotten_within_two_seconds():
+    small, history = np.array([[0.008, -0.004, 0.001]]), standing()
+    lag, sums = np.zeros((1, 3)), []
+    for tick in range(1, 1001):
+        lag = task.push_lag(BROKK_170, history, small, lag)
+        sums.append(small * 0.05 * np.exp(-0.025 * np.arange(1, tick + 1)).sum())
+        np.testing.assert_allclose(lag, sums[-1], rtol=1e-6)
+    np.testing.assert_allclose(lag, 1.975 * small, rtol=1e-3)  # error x dt / (e^0.025 - 1), about x 2 s
+    for _ in range(40):
+        lag = task.push_lag(BROKK_170, history, np.zeros((1, 3)), lag)
+    np.testing.assert_allclose(lag, sums[-1] / np.e, rtol=1e-5)
+
+
+@pytest.mark.parametrize("machine", MACHINES[:4], ids=lambda m: m.name)
+def test_the_lag_is_bounded_and_points_along_the_error(machine):
+    machine = replace(machine, rate=40.0)
+    rng, limit = np.random.default_rng(21), 0.07 * machine.tool_speed
+    history = np.zeros((30, machine.n, 3, machine.history))
+    history[:, :, 0] = machine.column("q_min")[:, None]
+    error = rng.standard_normal((30, 3)) * 10.0 ** rng.uniform(-3, 2, (30, 1)) * limit
+    size = np.linalg.norm(error, axis=-1, keepdims=True)
+    lag = task.push_lag(machine, history, error, np.zeros((30, 3)))
+    counted = error / size * np.minimum(size, limit) * 0.025 * np.exp(-0.0125)
+    np.testing.assert_allclose(lag, counted, rtol=1e-5)
+    assert (size < limit).sum() > 5 and (size > limit).sum() > 5
+
+
+@pytest.mark.parametrize("kind", ["plant", "nets"])
+def test_the_lag_of_an_environment_follows_what_the_policy_saw(kind):
+    """Re-made from observations alone, over ends of episodes and new goals; and shown as joint rates."""
+    config = TaskConfig(noise=0.0, episode_s=1.5, hold_min_s=0.3, hold_max_s=0.9)
+    net = "analytic" if kind == "plant" else small_net(LOW, np.random.default_rng(22))
+    env, draws = TaskVectorEnv(4, net, LOW, config), np.random.default_rng(23)
+    before = task.measured(LOW, env.reset(seed=11)[0])
+    assert not env.state.lag.any()
+    env.state = replace(env.state, ticks=np.array([0, 10, 0, 20]))  # they do not end together
+    lag, ends, nominal = np.zeros((4, 3)), 0, 0.1 * LOW.q_dot_max[LOW.driven] / 3**0.5 / 4.2
+    for _ in range(70):
+        seen, *_, info = env.step(draws.uniform(-1, 1, (4, 4)).astype(np.float32))
+        last, over = info.get("final_obs", seen), info.get("_final_obs", np.zeros(4, bool))
+        error = before.v_goal - task.measured(LOW, last).v_tool
+        error *= np.minimum(1, 0.021 / np.maximum(np.linalg.norm(error, axis=-1, keepdims=True), 1e-12))
+        lag = (lag + 0.05 * error) * np.exp(-0.025)
+        if over.any():  # the last observation still shows the lag of the old episode
+            shown = parts(LOW, last)[-1][over] * nominal
+            wanted = damped_rates(LOW, task.measured(LOW, last).q[over], lag[over])
+            np.testing.assert_allclose(shown, wanted, atol=1e-5)
+            assert np.abs(shown).max() > 1e-4
+        lag[over], ends = 0.0, ends + over.sum()
+        np.testing.assert_allclose(env.state.lag, lag, atol=1e-6)
+        assert not env.state.lag[over].any() and not parts(LOW, seen)[-1][over].any()
+        before = task.measured(LOW, seen)
+        np.testing.assert_allclose(
+            parts(LOW, seen)[-1] * nominal, damped_rates(LOW, before.q, lag), atol=1e-5
+        )
+    assert ends == 9
+    assert np.abs(lag).max() > 0.002
 
 
 # --- poses and goals ------------------------------------------------------------------------------
@@ -317,9 +486,9 @@ def test_the_locked_joint_differs_between_resets():
 def test_a_reset_is_at_rest_and_tells_its_pose():
     env = TaskVectorEnv(5, config=QUIET)
     seen, _ = env.reset(seed=1)
-    body = seen[:, 7:].reshape(5, 4, 3, 13)
+    body, _, late = parts(BROKK_170, seen)[3:]
     assert (body[:, :, 0] == body[:, :, :1, 0]).all()
-    assert not body[:, :, 1:].any()
+    assert not body[:, :, 1:].any() and not late.any() and not env.state.lag.any()
     found = task.measured(BROKK_170, seen)
     np.testing.assert_allclose(found.q, env.state.q, atol=BROKK_170.encoder_step / 2 + 1e-6)
     np.testing.assert_allclose(found.v_goal, env.state.v_goal, atol=1e-6)
@@ -340,7 +509,7 @@ def test_goals_are_redrawn_within_an_episode_and_rewards_are_for_the_old_goal():
         seen, reward, *_, info = env.step(rng.uniform(-1, 1, (4, 4)).astype(np.float32))
         travel = np.abs(env.state.history[:, LOW.driven, 2, -1] - sent).mean(-1) * 127 / 80
         state, step = env.state, 1e-6
-        towards = step * state.q_dot.astype(float)
+        towards = step * state.q_dot
         v_tool = (closed_form(state.q + towards)[0] - closed_form(state.q - towards)[0]) / (2 * step)
         error = np.linalg.norm(before - v_tool, axis=-1)
         np.testing.assert_allclose(reward, 1 / (1 + error) - 0.02 * travel, atol=1e-5)
@@ -366,8 +535,9 @@ def test_transition_on_nets_by_hand():
     move = np.zeros(5)
     move[[0, 2, 3, 4]] = obedient_velocity(BROKK_170, u[[0, 2, 3, 4]])
     assert move[0] == pytest.approx(0.24 * np.tanh(1.5 * 40 / 127), rel=1e-9)
-    np.testing.assert_allclose(after.q, POSE + 0.05 * move, atol=1e-6)
-    np.testing.assert_allclose(after.q_dot, move, atol=1e-5)
+    np.testing.assert_allclose(after.q, POSE + 0.05 * move, atol=1e-8)
+    np.testing.assert_allclose(after.q_dot, move, atol=2e-7)
+    assert after.q.dtype == after.q_dot.dtype == np.float64
     assert np.array_equal(after.history[:, 2, -1], u.astype(np.float32))
     assert not after.history[:, 2, :-1].any()
     counts = np.rint((POSE + 0.05 * move) / BROKK_170.encoder_step)
@@ -415,11 +585,11 @@ def test_the_plant_in_the_environment_is_the_plant(machine):
         before = plant.q
         plant = plant_step(machine, plant, task.to_command(machine, action))
         env.step(action)
-        angles.append(read_encoder(machine, plant.q.astype(np.float32)))
-        np.testing.assert_allclose(env.state.q, plant.q, atol=1e-6)
-        np.testing.assert_allclose(env.state.q_dot, (plant.q - before) * 20, atol=2e-5)
+        angles.append(read_encoder(machine, plant.q))
+        assert np.array_equal(env.state.q, plant.q)
+        np.testing.assert_allclose(env.state.q_dot, (plant.q - before) * 20, atol=1e-12)
     seen = np.stack(angles[-machine.history :], axis=-1)
-    assert np.array_equal(env.state.history[:, :, 0], seen)
+    assert np.array_equal(env.state.history[:, :, 0], seen.astype(np.float32))
     slope = estimate_velocity(seen, machine.velocity_samples, 0.05)
     np.testing.assert_allclose(env.state.history[:, :, 1, -1], slope, atol=1e-5)
     assert np.abs(plant.q - angles[0])[:, machine.driven].max() > 0.02
@@ -476,7 +646,7 @@ LIFE = TaskConfig(episode_s=1.5, hold_min_s=0.4, hold_max_s=0.4, redraw_ground=F
 @pytest.mark.parametrize("kind", ["plant", "nets"])
 def test_many_environments_equal_single_ones(kind):
     """The same draws, three episodes long: goals, noise, resets and final observations included."""
-    machine = LOW if kind == "plant" else replace(LOW, encoder_bits=32)
+    machine = LOW
     net = "analytic" if kind == "plant" else small_net(machine, np.random.default_rng(10))
     many = TaskVectorEnv(5, net, machine, LIFE)
     many.np_random = RowRandom([np.random.default_rng(100 + i) for i in range(5)])
@@ -486,23 +656,23 @@ def test_many_environments_equal_single_ones(kind):
     seen, others = many.reset()[0], sync.reset()[0]
     np.testing.assert_allclose(seen, others, atol=1e-6)
     actions, ends = np.random.default_rng(11), 0
-    # angles in float32, differenced over a tick: one bit of the nets' sums is 1e-5 rad/s
-    tolerance, paid = (1e-6, 1e-6) if kind == "plant" else (1e-4, 2e-5)
     for _ in range(95):
         action = actions.uniform(-1.2, 1.2, (5, 4)).astype(np.float32)
         seen, reward, terminated, truncated, info = many.step(action)
         others, rewards, terminations, truncations, infos = sync.step(action)
-        np.testing.assert_allclose(seen, others, atol=tolerance)
-        np.testing.assert_allclose(reward, rewards, atol=paid)
+        np.testing.assert_allclose(seen, others, atol=1e-6)
+        np.testing.assert_allclose(reward, rewards, atol=1e-6)
         assert np.array_equal(terminated, terminations)
         assert np.array_equal(truncated, truncations)
         assert ("final_obs" in info) == ("final_obs" in infos)
         if "final_obs" in info:
             ends += 1
             assert np.array_equal(info["_final_obs"], infos["_final_obs"])
-            np.testing.assert_allclose(info["final_obs"], np.stack(infos["final_obs"]), atol=tolerance)
+            np.testing.assert_allclose(info["final_obs"], np.stack(infos["final_obs"]), atol=1e-6)
         angles = np.concatenate([single.state.q for single in sync.envs])
-        np.testing.assert_allclose(many.state.q, angles, atol=1e-6)
+        np.testing.assert_allclose(many.state.q, angles, atol=1e-7)
+        lags = np.concatenate([single.state.lag for single in sync.envs])
+        np.testing.assert_allclose(many.state.lag, lags, atol=1e-8)
     assert ends == 3
 
 
@@ -525,6 +695,8 @@ def test_nothing_leaks_between_environments(kind):
         assert same(left, right, rows)
         assert all(np.array_equal(x[rows], y[rows]) for x, y in zip(a, b, strict=True))
         assert not np.array_equal(a.observation[2], b.observation[2])
+    assert not np.array_equal(left.lag[2], right.lag[2])
+    assert np.abs(left.lag).max(axis=-1).min() > 0
 
 
 def test_merge_replaces_whole_rows_and_nothing_else():
@@ -532,6 +704,7 @@ def test_merge_replaces_whole_rows_and_nothing_else():
     old, new = (task.reset(machine, TaskConfig(), rng, num, True) for num in (5, 2))
     for _ in range(8):
         old = task.transition(machine, None, old, task.to_command(machine, np.ones((5, 4))))
+    assert old.lag.any(axis=-1).all() and not new.lag.any()
     copies = [a.copy() for a in flat(old)]
     merged = task.merge(old, new, np.array([4, 1]))
     assert same(merged, old, [0, 2, 3])
@@ -586,7 +759,7 @@ def test_only_the_ended_rows_start_anew():
 def test_poses_in_the_ground_end_at_once_without_reward():
     env = TaskVectorEnv(400, config=TaskConfig(redraw_ground=False))
     env.reset(seed=7)
-    buried = closed_form(env.state.q.astype(float))[1] < 0
+    buried = closed_form(env.state.q)[1] < 0
     assert 8 < buried.sum() < 392
     _, reward, terminated, truncated, info = env.step(np.zeros((400, 4), np.float32))
     assert np.array_equal(terminated, buried)
@@ -611,7 +784,7 @@ def test_ground_and_time_limit_are_never_both():
     env = TaskVectorEnv(400, config=TaskConfig(redraw_ground=False, episode_s=0.05))
     env.reset(seed=8)
     for _ in range(3):
-        buried = closed_form(env.state.q.astype(float))[1] < 0
+        buried = closed_form(env.state.q)[1] < 0
         _, reward, terminated, truncated, _ = env.step(np.zeros((400, 4), np.float32))
         assert np.array_equal(terminated, buried)
         assert np.array_equal(truncated, ~buried)
@@ -627,7 +800,7 @@ def test_an_arm_that_is_driven_into_the_ground_terminates():
     heights = []
     for _ in range(300):
         _, reward, terminated, truncated, info = env.step(down)
-        heights.append(float(closed_form(env.state.q.astype(float))[1][0]))
+        heights.append(float(closed_form(env.state.q)[1][0]))
         assert terminated == (heights[-1] < 0)
         assert not truncated
         if terminated:
@@ -650,7 +823,7 @@ def test_gymnasium_and_stable_baselines_accept_the_environment():
         warnings.filterwarnings("ignore", message=".*Box observation space.*infinity.*")
         check_env(env.unwrapped, skip_render_check=True)
     check_sb3(env.unwrapped)
-    assert env.observation_space.shape == (163,)
+    assert env.observation_space.shape == (171,)
     assert env.action_space.low.tolist() == [-1] * 4
 
 
@@ -708,8 +881,8 @@ def test_random_machines_run(machine):
             assert not terminated.any()
             ends += truncated.sum()
         assert ends == 8
-    zero = np.zeros(len(machine.driven))
-    controller = JacobianController(machine, Gains(zero + 1, zero + 1, zero, np.array(0.2)), 0.1, 0.1)
+    gains = join_gains(machine, dict.fromkeys(GAINS, 0.0) | {"kp": 1.0, "ki": 1.0, "feedback": 0.2})
+    controller = JacobianController(machine, gains, 0.1, 0.1)
     start = (machine.column("q_min") + machine.column("q_max")) / 2 * np.ones((3, 1))
     goals = np.full((30, 3, 3), 0.05)
     trace = task.rollout(machine, controller, start, goals, TaskConfig(), np.random.default_rng(0))
@@ -784,18 +957,18 @@ def test_rollout_tells_what_happened_when():
     start = np.stack([POSE, POSE + 0.1])
     spy = Recorder(tape)
     trace = task.rollout(machine, spy, start, goals, QUIET, np.random.default_rng(0))
-    plant, q = plant_reset(machine, start.astype(np.float32)), start
+    plant, q = plant_reset(machine, start), start
     for t in range(40):
         seen = task.measured(machine, spy.seen[t])
         np.testing.assert_allclose(seen.v_goal, goals[t], atol=1e-6)
         np.testing.assert_allclose(trace.q_measured[t], q, atol=machine.encoder_step / 2 + 1e-6)
         np.testing.assert_allclose(seen.q, trace.q_measured[t], atol=1e-5)
         plant = plant_step(machine, plant, tape[t])
-        np.testing.assert_allclose(trace.q[t], plant.q, atol=1e-6)
-        np.testing.assert_allclose(trace.q_dot[t], (plant.q - q) * 20, atol=2e-5)
-        np.testing.assert_allclose(trace.p_tool[t], closed_form(plant.q)[0], atol=1e-5)
+        np.testing.assert_allclose(trace.q[t], plant.q, atol=1e-12)
+        np.testing.assert_allclose(trace.q_dot[t], (plant.q - q) * 20, atol=1e-10)
+        np.testing.assert_allclose(trace.p_tool[t], closed_form(plant.q)[0], atol=1e-12)
         error = np.linalg.norm(goals[t] - trace.v_tool[t], axis=-1)
-        np.testing.assert_allclose(trace.reward[t], 1 / (1 + error), atol=1e-6)
+        np.testing.assert_allclose(trace.reward[t], 1 / (1 + error), atol=1e-12)
         q = plant.q
     assert np.array_equal(trace.u, tape)
     np.testing.assert_allclose(np.diff(trace.p_tool, axis=0)[20:] * 20, trace.v_tool[21:], atol=0.01)
@@ -810,4 +983,5 @@ def test_rollout_noise_reaches_the_controller_and_is_reproducible():
         task.rollout(BROKK_170, spy, POSE[None], tape[..., :3], config, rng)
         seen[name] = np.array(spy.seen)
     assert np.array_equal(seen["a"], seen["b"])
-    assert 0.045 < np.abs(seen["a"] - seen["c"])[..., 6:].max() <= 0.05 + 1e-5
+    tool = parts(BROKK_170, seen["a"] - seen["c"])[1] / 1.4
+    assert 0.045 < np.abs(tool).max() <= 0.05 + 1e-5

@@ -197,7 +197,7 @@ def at_rest(q, v_goal, machine=BROKK_170, q_dot=None):
     history[..., 0, :] = q[..., None]
     if q_dot is not None:
         history[..., 1, :] = np.asarray(q_dot)[..., None]
-    return observe(machine, history, np.asarray(v_goal, float))
+    return observe(machine, history, np.asarray(v_goal, float), np.zeros(3))
 
 
 def controller(w0=1e-6, k=0.1, machine=BROKK_170, **values):

@@ -7,11 +7,22 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
-from hypothesis import given
+from helpers_machines import damped_rates
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
 from scipy.linalg import expm
-from strategies import moving, posed, poses
+from strategies import moving, posed, poses, reals
 
-from brokk_min.kinematics import frames, jacobian, lowest_point, tool_position, tool_state, tool_velocity
+from brokk_min.kinematics import (
+    frames,
+    jacobian,
+    joint_rates,
+    lowest_point,
+    tool_position,
+    tool_state,
+    tool_velocity,
+)
 from brokk_min.machine import BROKK_170, Machine
 
 START = np.array([1.5, 0.5, 0.58, 1.71, 1.24])  # q_s of the paper
@@ -168,6 +179,108 @@ def test_jacobian_is_the_derivative_of_the_tool_position(machine_and_pose):
         ahead, behind = tool_position(machine, q + nudge), tool_position(machine, q - nudge)
         slope = (ahead - behind) / (2 * step)
         np.testing.assert_allclose(J[..., column], slope, atol=1e-7)
+
+
+# --- wanted joint rates ---------------------------------------------------------------------------
+
+speeds = npst.arrays(np.float64, 3, elements=reals(-1.0, 1.0))
+
+
+def arm_length(machine: Machine) -> float:
+    return float(np.hypot(machine.column("a"), machine.column("d")).sum())
+
+
+def test_joint_rates_of_the_stretched_arm_by_hand():
+    """Along the arm nothing can be done; sideways the slew and upward the others share, by their lever."""
+    straight = np.array([0.0, 0.0, 0.0, np.pi, 3 * np.pi / 4])
+    square = (0.06 * (np.hypot(0.25, 0.95) + 1.15 + 1.25 + 1.15 + 1.2)) ** 2
+    assert square == pytest.approx(0.11830, abs=1e-5)
+    wanted = [0.5 * 5 / (25 + square), *(0.3 * np.array([3.6, 2.35, 1.2]) / (19.9225 + square))]
+    found = joint_rates(BROKK_170, straight, np.array([0.1, 0.5, 0.3]))
+    np.testing.assert_allclose(found, wanted, rtol=1e-6)
+    np.testing.assert_allclose(joint_rates(BROKK_170, straight, [0.1, 0, 0]), 0, atol=1e-15)
+
+
+@given(posed(), speeds)
+def test_joint_rates_solve_the_normal_equations(machine_and_pose, v):
+    machine, q = machine_and_pose
+    assume(arm_length(machine) > 1)  # short arms: see below
+    v = np.broadcast_to(v, (*q.shape[:-1], 3))
+    wanted, damping = damped_rates(machine, q, v), 0.06 * arm_length(machine)
+    found = joint_rates(machine, q, v)
+    assert found.shape == (*q.shape[:-1], len(machine.driven)) and found.dtype == np.float64
+    most = np.linalg.norm(v, axis=-1).max() / (2 * damping)  # no pose asks for more, see below
+    np.testing.assert_allclose(found, wanted, atol=1e-6 / damping**2 * most + 1e-12)
+    single = joint_rates(machine, q.astype(np.float32), v.astype(np.float32))
+    assert single.dtype == np.float32
+    np.testing.assert_allclose(single, wanted, atol=1e-3 * most + 1e-12)
+
+
+@given(poses(BROKK_170, (20,)), speeds)
+def test_single_precision_is_enough_for_the_rates_of_the_brokk(q, v):
+    v = np.broadcast_to(v, (20, 3))
+    single = joint_rates(BROKK_170, q.astype(np.float32), v.astype(np.float32))
+    np.testing.assert_allclose(single, joint_rates(BROKK_170, q, v), atol=1e-5)
+
+
+@given(posed(shapes=[()]), speeds, st.randoms(use_true_random=False))
+def test_joint_rates_are_the_least_cost(machine_and_pose, v, random):
+    """|J x - v|^2 + lambda^2 |x|^2 grows by its own quadratic part however the rates are changed."""
+    machine, q = machine_and_pose
+    assume(arm_length(machine) > 1)
+    J, square = jacobian(machine, q), (0.06 * arm_length(machine)) ** 2
+
+    def cost(x: np.ndarray) -> float:
+        return float(np.sum((J @ x - v) ** 2) + square * np.sum(x**2))
+
+    best = joint_rates(machine, q, v)
+    for _ in range(5):
+        change = np.array([random.uniform(-1, 1) for _ in best])
+        more = np.sum((J @ change) ** 2) + square * np.sum(change**2)
+        slope = 2e-6 * np.abs(best @ change)  # what 1e-6 more of damping leaves
+        assert cost(best + change) - cost(best) == pytest.approx(more, abs=slope + 1e-10)
+
+
+@given(posed(), speeds)
+def test_joint_rates_are_bounded_and_move_the_tool_no_faster_than_wanted(machine_and_pose, v):
+    """At most |v| / (2 lambda), however near a singularity; and never against what is wanted."""
+    machine, q = machine_and_pose
+    assume(arm_length(machine) > 1)
+    v = np.broadcast_to(v, (*q.shape[:-1], 3))
+    rates, speed = joint_rates(machine, q, v), np.linalg.norm(v, axis=-1)
+    assert (np.linalg.norm(rates, axis=-1) <= speed / (0.12 * arm_length(machine)) + 1e-12).all()
+    moved = np.einsum("...ij,...j->...i", jacobian(machine, q), rates)
+    assert (np.linalg.norm(moved, axis=-1) <= speed + 1e-12).all()
+    assert (np.einsum("...i,...i->...", moved, v) >= -1e-12).all()
+
+
+def test_joint_rates_near_a_singularity_stay_small_and_follow_elsewhere():
+    """Bending the stretched arm by a milliradian: undamped, q3 to q5 would race; damped, they rest."""
+    bent = np.array([0.0, 0.0, 0.001, np.pi, 3 * np.pi / 4 + 0.001])
+    outward = np.array([0.1, 0.0, 0.0])
+    assert np.abs(np.linalg.pinv(jacobian(BROKK_170, bent)) @ outward).max() > 10
+    assert np.abs(joint_rates(BROKK_170, bent, outward)).max() < 0.005
+    J = jacobian(BROKK_170, START)
+    for v in 0.3 * np.eye(3):
+        assert np.linalg.norm(J @ joint_rates(BROKK_170, START, v) - v) < 0.06 * 0.3
+
+
+def test_an_arm_without_length_has_no_rates():
+    joints = tuple(replace(joint, a=0.0, d=0.0) for joint in BROKK_170.joints)
+    for q in (START, START.astype(np.float32)):
+        rates = joint_rates(replace(BROKK_170, joints=joints), q, np.ones(3))
+        assert rates.tolist() == [0.0] * 4
+
+
+@given(moving(shapes=[(1,), (4,), (2, 3)]), speeds)
+def test_joint_rates_of_a_batch_are_those_of_its_poses_one_by_one(case, v):
+    machine, q, _ = case
+    wishes = v * np.linspace(0.5, 1, q[..., 0].size).reshape(*q.shape[:-1], 1)
+    batch, same = joint_rates(machine, q, wishes), joint_rates(machine, q, v)
+    for index in np.ndindex(q.shape[:-1]):
+        alone = joint_rates(machine, q[index], wishes[index])
+        np.testing.assert_allclose(batch[index], alone, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(same[index], joint_rates(machine, q[index], v), rtol=1e-9, atol=1e-9)
 
 
 # --- properties -----------------------------------------------------------------------------------

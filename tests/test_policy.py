@@ -82,14 +82,14 @@ def test_act_is_the_actor_of_torch(seed):
 
 def test_a_policy_stays_as_it_was_while_training_goes_on():
     training, policy = trained()
-    observation = np.ones(163, np.float32)
+    observation = np.ones(171, np.float32)
     before = policy.act(observation)
     training.update()
     assert np.array_equal(policy.act(observation), before)
 
 
 def test_act_stands_large_observations(policy):
-    action = policy.act(np.array([[1e4], [-1e4]]) * np.ones(163))
+    action = policy.act(np.array([[1e4], [-1e4]]) * np.ones(171))
     assert np.isfinite(action).all()
 
 
@@ -102,7 +102,7 @@ def test_a_file_keeps_every_bit(policy, saved):
         assert found.tobytes() == np.ascontiguousarray(wanted).tobytes()
     assert dict(again.contract) == dict(policy.contract)
     assert dict(again.training) == {"seed": 0, "settings": {"gamma": 0.5}}
-    observation = np.random.default_rng(0).normal(size=(64, 163)).astype(np.float32)
+    observation = np.random.default_rng(0).normal(size=(64, 171)).astype(np.float32)
     assert np.array_equal(again.act(observation), policy.act(observation))
     history = np.random.default_rng(0).normal(size=(2, 4, 3, 13)).astype(np.float32)
     assert np.array_equal(again.net.predict(history), policy.net.predict(history))
@@ -114,7 +114,7 @@ def test_two_files_of_one_policy_are_the_same_bytes(policy, saved, tmp_path):
 
 
 def test_the_controller_sends_what_the_policy_says(policy):
-    observation = np.random.default_rng(1).normal(size=(5, 163)).astype(np.float32)
+    observation = np.random.default_rng(1).normal(size=(5, 171)).astype(np.float32)
     controller = PolicyController(BROKK_170, policy)
     u, memory = controller(observation, controller.start(5))
     assert np.array_equal(u, to_command(BROKK_170, policy.act(observation)))
@@ -125,7 +125,7 @@ def test_the_controller_sends_what_the_policy_says(policy):
 def test_a_policy_runs_without_torch_and_scipy(saved):
     code = (
         "import sys, numpy as np, brokk_min.policy as p; from brokk_min.machine import BROKK_170;"
-        f"p.load_policy({str(saved)!r}, BROKK_170).act(np.zeros(163));"
+        f"p.load_policy({str(saved)!r}, BROKK_170).act(np.zeros(171));"
         "print([name for name in ('torch', 'scipy', 'matplotlib') if name in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -255,15 +255,15 @@ def test_no_file_is_refused(tmp_path):
         load_policy(tmp_path / "none.npz", BROKK_170)
 
 
-@pytest.mark.parametrize("shape", [(), (162,), (163, 1), (3, 164)])
+@pytest.mark.parametrize("shape", [(), (170,), (171, 1), (3, 172)])
 def test_act_refuses_wrong_shapes(policy, shape):
-    with pytest.raises(ValueError, match=r"observation: expected \(\.\.\., 163\), got \("):
+    with pytest.raises(ValueError, match=r"observation: expected \(\.\.\., 171\), got \("):
         policy.act(np.zeros(shape))
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_act_refuses_what_is_no_number(policy, bad):
-    observation = np.zeros((2, 163))
+    observation = np.zeros((2, 171))
     observation[1, 40] = bad
     with pytest.raises(ValueError, match="observation: expected finite numbers, got"):
         policy.act(observation)

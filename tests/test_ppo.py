@@ -210,20 +210,20 @@ def test_normalise():
 
 
 def test_the_nets_are_those_of_the_paper():
-    agent = Agent(163, 4, -0.5)
+    agent = Agent(171, 4, -0.5)
     for part, outputs in ((agent.actor, 4), (agent.critic, 1)):
         kinds = [type(layer) for layer in part]
         assert kinds == [nn.Linear, nn.ELU] * 3 + [nn.Linear]
         sizes = [(layer.in_features, layer.out_features) for layer in part[::2]]
-        assert sizes == [(163, 256), (256, 128), (128, 64), (64, outputs)]
+        assert sizes == [(171, 256), (256, 128), (128, 64), (64, outputs)]
         assert all(layer.alpha == 1.0 for layer in part[1::2])
         assert not any(layer.bias.any() for layer in part[::2])
     shared = set(map(id, agent.actor.parameters())) & set(map(id, agent.critic.parameters()))
     assert not shared
     w = agent.actor[0].weight.detach()  # orthogonal columns of length sqrt(2)
-    torch.testing.assert_close(w.T @ w, 2 * torch.eye(163), atol=1e-4, rtol=0)
+    torch.testing.assert_close(w.T @ w, 2 * torch.eye(171), atol=1e-4, rtol=0)
     assert agent.log_std.tolist() == [-0.5] * 4
-    x = torch.randn(3, 163, generator=torch.Generator().manual_seed(0))
+    x = torch.randn(3, 171, generator=torch.Generator().manual_seed(0))
     assert agent.actor(x).abs().max() < 0.2  # hardly moves at first
     torch.testing.assert_close(agent.value(x), agent.critic(x).squeeze(-1))
 
@@ -432,8 +432,21 @@ def test_a_checkpoint_goes_on_to_the_same_bits(tmp_path):
     assert curve == straight_curve
     assert torch.equal(straight.observation, second.observation)
     assert np.array_equal(straight.env.state.q, second.env.state.q)
+    assert np.array_equal(straight.env.state.lag, second.env.state.lag)
     first.update(), first.update()  # saving disturbs nothing
     assert all(map(torch.equal, weights_of(straight), weights_of(first)))
+
+
+def test_a_checkpoint_keeps_the_whole_state_of_the_environments(tmp_path):
+    first, second = learner(), learner(seed=4)
+    first.update()
+    first.save(tmp_path / "c", {})
+    second.load(tmp_path / "c", {})
+    assert first.env.state.lag.any(axis=-1).all()  # no episode ended yet: every tool lags behind
+    for name in ("q", "q_dot", "history", "v_goal", "goal_ticks", "ticks", "lag"):
+        saved, loaded = (getattr(training.env.state, name) for training in (first, second))
+        assert np.array_equal(saved, loaded), name
+        assert saved.dtype == loaded.dtype, name
 
 
 def stop_after(monkeypatch, updates, error=KeyboardInterrupt):
