@@ -123,8 +123,9 @@ def tool_velocity(machine: Machine, q: ArrayLike, q_dot: ArrayLike) -> Array:
 def joint_rates(machine: Machine, q: ArrayLike, v: ArrayLike) -> Array:
     """Rates of the driven joints [rad/s] (..., n_driven) that move the tool at `v` [m/s] (..., 3), damped.
 
-    J^T (J J^T + lambda^2 I)^-1 v with lambda = 6 % of the arm's length: the tool would lag behind `v` by a few
-    percent in the middle of the workspace and by more near singularities, where the rates stay bounded. Written out for whole batches, without a matrix a pose.
+    J^T (J J^T + lambda^2 I)^-1 v with lambda = 6 % of the arm's length: the tool would stay a few percent
+    below `v` in the middle of the workspace and more near singularities, where the rates stay bounded.
+    Written out for whole batches, without a matrix a pose.
 
     Example:
         >>> from brokk_min.machine import BROKK_170
