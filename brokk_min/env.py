@@ -170,12 +170,14 @@ def observe(
     mean, scale, sensed = _layout(machine)
     size = len(mean) - 2 * len(machine.driven)  # without the rates
     seen = np.zeros((*v_tool.shape[:-1], len(mean)), np.float32)
-    seen[..., :3], seen[..., 3:6] = _turn(p_tool, v_goal, 1), _turn(p_tool, v_tool, 1)
+    both = _turn(p_tool[..., None, :], np.stack([v_goal, v_tool], axis=-2), 1)
+    seen[..., :6] = both.reshape(*both.shape[:-2], 6)
     seen[..., 6 : 6 + len(machine.locked)] = history[..., machine.locked, 0, -1]
     seen[..., 6 + len(machine.locked) : size] = driven.reshape(*driven.shape[:-3], -1)
     seen += noise * sensed * scale
     q = _angles(machine, seen)
-    seen[..., size:] = np.concatenate([joint_rates(machine, q, v) for v in (v_goal, lag)], axis=-1)
+    rates = joint_rates(machine, q[..., None, :], np.stack([v_goal, lag], axis=-2))
+    seen[..., size:] = rates.reshape(*rates.shape[:-2], -1)
     seen -= mean
     seen /= scale
     return seen

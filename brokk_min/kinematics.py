@@ -139,14 +139,17 @@ def joint_rates(machine: Machine, q: ArrayLike, v: ArrayLike) -> Array:
     x, y, z = np.moveaxis(np.asarray(v, columns[0].dtype), -1, 0)
 
     def product(i: int, j: int) -> Array:
-        return damping * (i == j) + np.sum([column[i] * column[j] for column in columns], axis=0)
+        total = columns[0][i] * columns[0][j]
+        for column in columns[1:]:
+            total = total + column[i] * column[j]
+        return total + damping if i == j else total
 
     xx, yy, zz, xy, xz, yz = (product(*ij) for ij in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)))
     a, b, c = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy  # cofactors of the first row
     d, e, f = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
     determinant = xx * a + xy * b + xz * c
     solved = [(a * x + b * y + c * z), (b * x + d * y + e * z), (c * x + e * y + f * z)]
-    rates = [sum(s * axis for s, axis in zip(solved, column, strict=True)) for column in columns]
+    rates = [solved[0] * column[0] + solved[1] * column[1] + solved[2] * column[2] for column in columns]
     return np.stack(rates, axis=-1) / determinant[..., None]
 
 
