@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -48,8 +48,7 @@ def random_policy(rng: np.random.Generator) -> Policy:
     weights: list[Any] = []
     for rows, columns in pairwise([len(mean), 256, 128, 64, len(BROKK_170.driven)]):
         weights += [rng.normal(0, rows**-0.5, (rows, columns)), np.zeros(columns)]
-    net = replace(random_net(rng), machine=BROKK_170.name)
-    net = net.select([BROKK_170.names[i] for i in BROKK_170.driven])
+    net = random_net(rng).select([BROKK_170.names[i] for i in BROKK_170.driven])
     arrays = tuple(weight.astype(np.float32) for weight in weights)
     return Policy(contract(BROKK_170), {}, mean, scale, arrays, net)
 

@@ -43,7 +43,7 @@ def random_net(rng: np.random.Generator) -> ActuatorNet:
     speed = m.q_dot_max.astype(np.float32)
     low, high = m.column("q_min").astype(np.float32), m.column("q_max").astype(np.float32)
     return ActuatorNet(
-        m.names, h, m.rate, m.velocity_samples, False, "random", 0, {}, 0 * one, one, -speed, speed,
+        m.names, h, m.rate, m.velocity_samples, False, m.name, 0, {}, 0 * one, one, -speed, speed,
         low, high, tuple(weights),
     )  # fmt: skip
 

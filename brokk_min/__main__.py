@@ -1,6 +1,7 @@
 """The command line: `brokk-min COMMAND --help`. Exits 0 done, 1 failed, 2 wrong use."""
 
 import os
+import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -280,15 +281,19 @@ class Drive(Command):
         with open_line(self.interface, self.channel, self.log) as line:
             drive = hw.Drive(machine, controller, line, operator)
             drive.begin()
-            drive.run(_show)
+            try:
+                drive.run(_show)
+            finally:
+                print(end="\n" if sys.stdout.isatty() else "")
         if isinstance(operator, hw.Script) and not operator.done:
             raise ValueError(f"drive: expected to play all sequences, got {drive.reason or 'a stop'}")
 
     def _controller(self) -> Controller:
         machine = MACHINES[self.machine]
         if self.controller == "jog":
-            if self.joint not in machine.names:
-                raise WrongUse(f"--joint: expected one of {', '.join(machine.names)}, got {self.joint}")
+            driven = [machine.names[i] for i in machine.driven]
+            if self.joint not in driven:
+                raise WrongUse(f"--joint: expected one that may be driven, {driven}, got {self.joint}")
             return hw.Jog(machine, self.joint, self.counts)
         if not self.policy:
             raise WrongUse("--policy: expected a policy that `train` wrote, got none")
@@ -300,9 +305,11 @@ class Drive(Command):
 
 
 def _show(text: str) -> None:
-    """Keep one line of a terminal up to date; elsewhere write a line each time."""
-    terminal = sys.stdout.isatty()
-    print(f"\r{text}\033[K" if terminal else text, end="" if terminal else "\n", flush=True)
+    """Keep one line of a terminal up to date, cut to its width; elsewhere write a line each time."""
+    if sys.stdout.isatty():
+        print(f"\r{text[: shutil.get_terminal_size().columns - 1]}\033[K", end="", flush=True)
+    else:
+        print(text, flush=True)
 
 
 @dataclass(kw_only=True)

@@ -141,7 +141,7 @@ def open_line(interface: str, channel: str, log: Path | None = None) -> Iterator
     """A bus by python-can's names, closed at the end of the block; `log` grows while it runs.
 
     Raises:
-        ValueError: python-can is not there, or finds no such bus.
+        ValueError: python-can is not there, finds no such bus, or fails in the block.
     """
     can = _can()
     try:
@@ -152,6 +152,8 @@ def open_line(interface: str, channel: str, log: Path | None = None) -> Iterator
     line = Line(bus, can.CanutilsLogWriter(log) if log else None, name, echo=interface == "udp_multicast")
     try:
         yield line
+    except can.CanError as error:
+        raise ValueError(f"{interface} {channel}: expected a CAN bus that works, got {error!r}") from error
     finally:
         line.close()
 
@@ -172,11 +174,15 @@ def stop_signals() -> Iterator[list[int]]:
 def read_frames(path: Path) -> Iterator[Frame]:
     """The frames of a candump log, one by one: a day of driving has millions.
 
+    A last line without its newline is left out: the program that wrote it was killed.
+
     Raises:
         ValueError: no such log, or a line that is no frame.
     """
+    can = _can()
     try:
-        with _can().CanutilsLogReader(path) as reader:
+        with open(path, encoding="utf-8") as file, can.CanutilsLogReader(file) as reader:
+            reader.file = (line for line in file if line.endswith("\n"))
             for m in reader:
                 yield Frame(m.timestamp, _plain_id(m), bytes(m.data), not m.is_rx, str(m.channel))
     except (OSError, ValueError, IndexError) as error:

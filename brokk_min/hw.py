@@ -243,6 +243,7 @@ class Drive:
         with self._caught():
             wish = self.operator(bool(self.gate.driving), bool(self.gate.wrong == 0))
             self.wish = unpack_wish(wish.pack())  # as the log has it, so that a replay gets the same
+        self.nodes.frames *= 2  # a position from before its SYNC is as wrong as a doubled one
         with self._caught():
             line.send(SYNC, b"")
             self._rehearse()
@@ -273,7 +274,7 @@ class Drive:
             raise
 
     def status(self) -> str:
-        """One line: state, tool velocity wanted and measured [m/s], angles [rad], lateness, faults."""
+        """One line: state, faults, tool velocity wanted and measured [m/s], angles [rad], lateness."""
         state = "driving" if self.gate.driving else "waiting" if self.gate.wrong else "ready"
         q, v = np.full(self.machine.n, np.nan), np.full(3, np.nan)
         if self.history is not None:
@@ -281,7 +282,8 @@ class Drive:
             v = tool_state(self.machine, q, q_dot)[1]
         want, have, pose = (" ".join(f"{x:+.2f}" for x in a) for a in (self.wish.v_goal, v, q))
         late = f"late {1e3 * self.lateness:.1f} ms, skipped {self.skipped}"
-        return f"{state:7} v wanted {want} is {have} q {pose} {late} {self.reason}"
+        reason = f" {self.reason}" if self.reason else ""
+        return f"{state:7}{reason} v wanted {want} is {have} q {pose} {late}"
 
     @contextmanager
     def _caught(self) -> Iterator[None]:

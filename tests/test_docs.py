@@ -5,6 +5,8 @@ from __future__ import annotations
 import doctest
 import importlib
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -72,3 +74,9 @@ def test_docstrings_name_the_equations_that_have_rows() -> None:
     text = "".join(p.read_text() for p in (ROOT / "brokk_min").glob("*.py"))
     tagged = set(re.findall(r"Paper: (eq\d|Table \d)", text))
     assert tagged == {row[0] for row in rows("Equations, tables, figures") if row[0][:2] in ("eq", "Ta")}
+
+
+def test_the_benchmark_of_rollouts_runs() -> None:
+    command = [sys.executable, "-m", "benchmarks.rollout", "--num-envs", "4", "--ticks", "2"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0 and "steps" in done.stdout, done.stderr

@@ -58,13 +58,11 @@ def test_reward_over_the_bus_is_that_of_evaluate(sequence: Any) -> None:
     """Within 1 %, with 2 ms of bus and machine between SYNC and valve frame."""
     script = hw.Script(BROKK_170, sequence.goals)
     world = World(BASELINE, script)
-    busy = Push()
     world.drive.operator = lambda driving, ready: (world.rest(0.002), script(driving, ready))[1]
     world.drive.begin()
     while world.drive.tick():
         pass
     world.close()
-    del busy
     assert script.done
     ticks = len(sequence.goals)
     begins = np.array(world.syncs[-ticks - 1 :])
@@ -186,6 +184,22 @@ def reorder(f: Fault, node: int) -> None:
     f.up(only(0x180 + node, act))
 
 
+def late(f: Fault, can_id: int, delay: float) -> None:
+    """Constantly late positions, and an operator who presses again and again."""
+    held: list[tuple[float, bytes]] = []
+
+    def noise() -> Out:
+        due = [data for then, data in held if then <= f.world.t]
+        held[:] = [item for item in held if item[0] > f.world.t]
+        return [(can_id, data) for data in due]
+
+    def press() -> None:
+        f.hand.enable = bool(f.world.drive.gate.driving or not f.hand.enable)
+
+    f.up(only(can_id, lambda data: (held.append((f.world.t + delay, data)), list[bytes]())[1]))
+    f.world.noise, f.hand.act = noise, press
+
+
 def once(act: Callable[[bytes], list[bytes]]) -> Callable[[bytes], list[bytes]]:
     done: list[int] = []
     return lambda data: [data] if done else (done.append(1), act(data))[1]
@@ -202,11 +216,13 @@ def raises(error: Exception) -> Callable[..., Any]:
     return act
 
 
-def flood(f: Fault, foreign: bool = False) -> None:
+def flood(f: Fault, foreign: bool = False) -> tuple[set[tuple[int, int]], int]:
+    """2,000 frames a second; the pairs of identifier and length that came, and how many there are."""
     rng = np.random.default_rng(0)
     ours = {0, 0x80, 0x210, *(base + n for base in (0x180, 0x580, 0x600, 0x700) for n in (1, 2, 3, 4, 5, 16))}
     ids = rng.permutation([i for i in range(2048) if not foreign or i not in ours])
-    state = {"k": 0, "t": f.world.t}
+    state, seen = {"k": 0, "t": f.world.t}, set[tuple[int, int]]()
+    assert len(ids) % 3  # no factor in common with the nine lengths: each pair has its turn
 
     def noise() -> Out:
         out = []
@@ -214,9 +230,11 @@ def flood(f: Fault, foreign: bool = False) -> None:
             state["t"] += 0.0005
             k = state["k"] = int(state["k"]) + 1
             out.append((int(ids[k % len(ids)]), rng.bytes(k % 9)))
+            seen.add((out[-1][0], len(out[-1][1])))
         return out
 
     f.world.noise = noise
+    return seen, 9 * len(ids)
 
 
 def second_master(f: Fault) -> None:
@@ -338,6 +356,10 @@ for node in range(1, 6):
         ),
     }
     if node != 2:  # the operator moves q2, no command of ours
+        FAULTS[f"{name} late by 30 ms, after re-arm too"] = (
+            lambda f, i=tpdo: late(f, i, 0.030),
+            f"{name}: silent",
+        )
         FAULTS[f"{name} frozen"] = (lambda f, n=node: freeze(f, n), f"{name}: frozen")
 
 
@@ -382,11 +404,24 @@ def test_a_program_that_is_killed_leaves_the_valves_neutral_and_latched() -> Non
     world.close()
 
 
+def test_no_frame_of_any_identifier_and_length_opens_the_valves_again() -> None:
+    world = World(Push(*PUSH), Hand())
+    world.drive.begin()
+    world.run(1.2)
+    begun = world.t
+    seen, pairs = flood(Fault(world, Hand(), Push()))
+    world.run(9.3)
+    assert len(seen) == pairs == 2048 * 9
+    times, m = world.commands
+    assert m[times <= begun].any() and not m[times > begun + 0.175].any()
+    world.close()
+
+
 def test_foreign_traffic_alone_does_no_harm_and_data_stay_fresh() -> None:
     """2,000 foreign frames a second, no filters: python-can's would let the data grow old."""
     world = World(Push(*PUSH), Hand())
     world.drive.begin()
-    flood(Fault(world, Hand(), Push()), foreign=True)
+    seen, pairs = flood(Fault(world, Hand(), Push()), foreign=True)
     ages: list[float] = []
     hear = world.drive.nodes.hear
 
@@ -397,9 +432,9 @@ def test_foreign_traffic_alone_does_no_harm_and_data_stay_fresh() -> None:
             ages.append(abs(shown - world.simulated.plant.q[2]))
 
     world.drive.nodes.hear = listen  # type: ignore[method-assign]
-    world.run(3.0)
+    world.run(9.3)
     assert world.drive.gate.driving and world.drive.reason == "" and world.drive.skipped == 0
-    assert len(ages) > 55 and max(ages) < 0.6 * BROKK_170.encoder_step + 1e-3
+    assert len(seen) == pairs > 18_000 and len(ages) > 175 and max(ages) < 0.6 * BROKK_170.encoder_step + 1e-3
     world.close()
 
 
@@ -676,6 +711,14 @@ def test_logs_that_are_none_are_refused(tmp_path: Path) -> None:
         (tmp_path / "bad.log").write_text(text)
         with pytest.raises(ValueError, match=r"bad\.log: expected a candump log, got"):
             list(bus.read_frames(tmp_path / "bad.log"))
+
+
+def test_a_log_that_was_cut_is_read_up_to_its_last_whole_line(tmp_path: Path) -> None:
+    text = "(1.000000) can0 123#0102 R\n(2.000000) can0 080#AABB T\n"
+    for size in range(len(text) + 1):
+        (tmp_path / "cut.log").write_text(text[:size])
+        times = [f.time for f in bus.read_frames(tmp_path / "cut.log")]
+        assert times == [1.0, 2.0][: text[:size].count("\n")]
 
 
 def test_a_plain_candump_log_is_read_too(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+import io
 import json
 import os
 import signal
@@ -22,11 +23,12 @@ import canopen
 import numpy as np
 import pytest
 from canopen.objectdictionary import ObjectDictionary, ODArray, ODRecord, ODVariable, datatypes
-from helpers_bus import START, Hand, Push
+from helpers_bus import START, Hand, Push, World
 from helpers_machines import small_net
 
 from brokk_min import bus, hw, simulator
 from brokk_min.__main__ import main
+from brokk_min.actuator import load_net
 from brokk_min.env import observation_scale
 from brokk_min.export import export_onnx
 from brokk_min.gate import encoder_raw
@@ -373,6 +375,8 @@ def test_two_processes_drive_replay_convert_and_survive_a_kill(
             eventually(lambda: np.any(rows(folder / "plant.csv")[moved:, 1:]), 60)
             drive.send_signal(signal.SIGKILL)
             drive.wait()
+        # The watchdog closes 150 ms after the last valid frame. Up to 0.5 s are let pass, as the record is
+        # of another process: on a loaded machine it may have written, and read the bus, some time ago.
         killed = rows(folder / "plant.csv")[-1, 0]
         eventually(lambda: rows(folder / "plant.csv")[-1, 0] > killed + 0.8, 60)
         table = rows(folder / "plant.csv")
@@ -380,6 +384,89 @@ def test_two_processes_drive_replay_convert_and_survive_a_kill(
         machine.send_signal(signal.SIGTERM)
         assert machine.wait(30) == 0
     assert list(bus.read_frames(folder / "run.log"))  # what a killed program left can be read
+
+
+def test_a_day_of_driving_goes_into_the_nets_beside_the_earlier_log(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Convert, then fit; alone the log has no motion of the locked joint to learn from."""
+    start = (1.8, *START[1:])
+    log = can.CanutilsLogWriter(tmp_path / "run.log", channel="can0")
+    world = World(Push(60, 0, 60, -60, 60), Hand(), log=log, start=start)
+    world.drive.begin()
+    world.run(4.0)
+    world.close()
+    log.stop()
+    whole, drive, net = (str(tmp_path / name) for name in ("log.csv", "drive.csv", "net.npz"))
+    assert main(["collect", "--hours", "0.01", "--out", whole]) == 0
+    assert main(["convert", str(tmp_path / "run.log"), "--out", drive]) == 0
+    small = ["--steps", "30", "--batch-size", "32", "--out", net, "--test", whole]
+    assert main(["fit", drive, *small]) == 1
+    assert "joint q2: expected a recording of 14 samples or more in which it moves" in capsys.readouterr().err
+    assert main(["fit", whole, drive, *small]) == 0
+    logs = [read_log([Path(path)], BROKK_170.velocity_samples).recordings for path in (whole, drive)]
+    q = np.concatenate([recording.q for recordings in logs for recording in recordings])
+    found = load_net(Path(net))
+    assert found.machine == "brokk170" and found.joints == BROKK_170.names
+    np.testing.assert_allclose(found.q_low, q.min(axis=0), atol=1e-6)
+    np.testing.assert_allclose(found.q_high, q.max(axis=0), atol=1e-6)
+    assert found.q_high[0] > max(r.q[:, 0].max() for r in logs[0]) + 0.05  # where only the drive has been
+    (driven,) = logs[1]
+    np.testing.assert_allclose(driven.q[0], start, atol=0.002)
+    assert (np.diff(driven.q[-20:], axis=0)[:, 3] <= 0).all() and driven.u[-1, 3] == pytest.approx(-60 / 127)
+
+
+def test_a_bus_that_fails_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    """Before the loop, which takes it for a fault, nobody else catches it."""
+    where = ["--interface", "virtual", "--channel", "broken"]
+    with pytest.MonkeyPatch.context() as patch:
+
+        def send(self: Any, message: can.Message, timeout: float | None = None) -> None:
+            raise can.CanOperationError("no buffer space")
+
+        patch.setattr("can.interfaces.virtual.VirtualBus.send", send)
+        assert main(["machine", *where]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("brokk-min: virtual broken: expected a CAN bus that works, got CanOperationError")
+    assert error.count("\n") == 1
+
+
+def test_a_locked_joint_does_not_jog(capsys: pytest.CaptureFixture[str]) -> None:
+    where = ["--interface", "virtual", "--channel", "empty"]
+    assert main(["drive", *where, "--controller", "jog", "--joint", "q2"]) == 2
+    wanted = "--joint: expected one that may be driven, ['q1', 'q3', 'q4', 'q5'], got q2"
+    assert wanted in capsys.readouterr().err
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_the_status_stays_one_line_of_a_terminal(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It must not wrap, the reason comes before what may be cut, and the prompt begins a new line."""
+    where = ["--interface", "virtual", "--channel", "status"]
+    monkeypatch.setenv("COLUMNS", "60")
+    with served("status") as machine:
+        receive = machine.receive
+        machine.receive = lambda frame: [] if frame.id == 0x80 else receive(frame)  # type: ignore[method-assign]
+        command = [
+            "drive",
+            "--policy",
+            str(folder / "policy.npz"),
+            *where,
+            "--command",
+            str(folder / "c.csv"),
+        ]
+        with monkeypatch.context() as patch:
+            patch.setattr("sys.stdout", screen := Terminal())
+            assert main(command) == 1
+    *shown, last = screen.getvalue().split("\r")[1:]
+    assert len(shown) > 10 and last.endswith("\033[K\n")
+    for line in shown:
+        text = line.removesuffix("\033[K")
+        assert len(text) == 59 and "\n" not in line
+    assert "waiting q1: silent v wanted" in last
 
 
 def test_a_drive_that_cannot_go_on_says_so(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
