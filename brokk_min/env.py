@@ -165,7 +165,7 @@ def observe(
         Shape (..., 6 + locked + (3 H + 2) n_driven), float32.
     """
     p_tool, v_tool, _ = tool_state(machine, history[..., 0, -1], history[..., 1, -1])
-    v_goal = np.broadcast_to(np.asarray(v_goal, np.float32), v_tool.shape)
+    v_goal, lag = (np.broadcast_to(np.asarray(v, np.float32), v_tool.shape) for v in (v_goal, lag))
     driven = history[..., machine.driven, :, :]
     mean, scale, sensed = _layout(machine)
     size = len(mean) - 2 * len(machine.driven)  # without the rates
