@@ -686,10 +686,12 @@ def test_a_log_of_a_drive_reads_back_as_a_log_of_the_machine(tmp_path: Path) -> 
     for recording, copy in zip(log.recordings, read.recordings, strict=True):
         np.testing.assert_allclose(copy.q, recording.q, atol=1e-6)
         np.testing.assert_allclose(copy.u, recording.u, atol=1e-6)
-        row = np.array([np.abs(q - r).max(1) for r in recording.q[-1:]]).argmin()
-        first = np.abs(begins - times[row]).argmin() - len(recording.q) + 1
-        moments = begins[first : first + len(recording.q)]
-        np.testing.assert_allclose(q[np.searchsorted(times, moments) - 1], recording.q, atol=0.0012)
+        # where in the drive it is: at some SYNC, which may fall on the border of two of the plant's steps
+        starts = range(len(begins) - len(recording.q) + 1)
+        steps = np.searchsorted(times, [begins[k : k + len(recording.q)] for k in starts])
+        off = np.min([np.abs(q[steps - k] - recording.q).max(2) for k in (1, 2)], axis=0).max(1)
+        assert off.min() < 0.51 * BROKK_170.encoder_step
+        moments = begins[off.argmin() :][: len(recording.q)]
         inside = np.searchsorted(times, moments + 0.03)
         np.testing.assert_allclose(m[inside], recording.u * 127, atol=1e-6)  # the command that came next
     with pytest.raises(ValueError, match="expected more than 14 ticks of driving in a row, got none"):
