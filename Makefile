@@ -34,4 +34,4 @@ bench: .venv/installed-dev
 	touch .venv/installed .venv/installed-dev
 
 clean:
-	rm -rf .venv results .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv results results-quick .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -231,6 +231,17 @@ def push_lag(machine: Machine, history: Array, v_goal: Array, lag: Array) -> Arr
     return counted * np.float32(np.exp(-machine.dt / LAG_TIME))
 
 
+def push_measured(
+    machine: Machine, history: Array, q: Array, v_goal: Array, lag: Array
+) -> tuple[Array, Array]:
+    """History and lag a tick on, after the encoders said `q` [rad] (..., n): in simulation and hardware.
+
+    `history` is what `push_command` left, `v_goal` [m/s] (..., 3) what was wanted during the tick.
+    """
+    history = push_angle(history, q, lambda a: estimate_velocity(a, machine.velocity_samples, machine.dt))
+    return history, push_lag(machine, history, v_goal, lag)
+
+
 def to_command(machine: Machine, action: ArrayLike) -> Array:
     """Commands for all joints from the policy's actions: limited, in whole PWM counts.
 
@@ -292,10 +303,7 @@ def transition(machine: Machine, net: ActuatorNet | None, state: State, u: Array
     else:
         raise ValueError("net: expected nets for a state without a plant, got None")
 
-    def velocity(angles: Array) -> Array:
-        return estimate_velocity(angles, machine.velocity_samples, machine.dt)
-
-    history = push_angle(history, read_encoder(machine, q), velocity)
+    history, lag = push_measured(machine, history, read_encoder(machine, q), state.v_goal, state.lag)
     return replace(
         state,
         q=q,
@@ -303,7 +311,7 @@ def transition(machine: Machine, net: ActuatorNet | None, state: State, u: Array
         history=history,
         goal_ticks=state.goal_ticks - 1,
         ticks=state.ticks + 1,
-        lag=push_lag(machine, history, state.v_goal, state.lag),
+        lag=lag,
         plant=plant,
     )
 

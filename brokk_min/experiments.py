@@ -171,8 +171,8 @@ class Effort:
     """How much is spent; the quick chain has the same parts, smaller."""
 
     hours: float = 1.0
-    fit_steps: int = 10000
-    train_steps: int = 6_000_000
+    fit_steps: int = actuator.FitConfig.steps
+    train_steps: int = 6_000_000  # `PPOConfig`'s, without importing torch
     generations: int = 45
     tuning_runs: int = 12
     starts: int = 16

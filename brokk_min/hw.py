@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brokk_min.actuator import push_angle, push_command, rest_history
+from brokk_min.actuator import push_command, rest_history
 from brokk_min.bus import (
     BEAT,
     BEAT_OBJECT,
@@ -33,11 +33,11 @@ from brokk_min.bus import (
     sdo,
     stop_signals,
 )
-from brokk_min.env import Controller, measured, observe, push_lag
+from brokk_min.env import Controller, measured, observe, push_measured
 from brokk_min.gate import OPERATIONAL, GateInputs, encoder_counts, fault_name, gate, gate_start
 from brokk_min.kinematics import tool_state
 from brokk_min.logs import Log, Recording, velocity_of
-from brokk_min.machine import PWM_MAX, Machine, decode_pwm, estimate_velocity
+from brokk_min.machine import PWM_MAX, Machine, decode_pwm
 
 Array = NDArray[Any]
 WINDOW = 0.020  # s after SYNC in which the encoders must answer (assumed)
@@ -328,10 +328,7 @@ class Drive:
         if self.history is None:
             self.history, self.lag = rest_history(q, m.history), np.zeros((1, 3), np.float32)
         else:
-            self.history = push_angle(
-                self.history, q, lambda angles: estimate_velocity(angles, m.velocity_samples, m.dt)
-            )
-            self.lag = push_lag(m, self.history, self.asked, self.lag)
+            self.history, self.lag = push_measured(m, self.history, q, self.asked, self.lag)
         if not self.gate.driving:
             self.memory, self.lag = self.controller.start(1), np.zeros((1, 3), np.float32)
         u, self.memory = self._ask()

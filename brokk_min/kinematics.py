@@ -125,7 +125,7 @@ def joint_rates(machine: Machine, q: ArrayLike, v: ArrayLike) -> Array:
 
     J^T (J J^T + lambda^2 I)^-1 v with lambda = 6 % of the arm's length: the tool would stay a few percent
     below `v` in the middle of the workspace and more near singularities, where the rates stay bounded.
-    Written out for whole batches, without a matrix a pose.
+    The least squares of `jacobian.dls` with W = 1, written out for whole batches without a matrix a pose.
 
     Example:
         >>> from brokk_min.machine import BROKK_170

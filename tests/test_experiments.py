@@ -238,3 +238,11 @@ def test_gains_read_back_give_the_same_controller(twice: tuple[Path, Path]) -> N
     read = experiments.read_gains(twice[0] / "gains.json", BROKK_170, net)
     written = json.loads((twice[0] / "results.json").read_text())["gains"]
     assert experiments.plain_gains(read) == written
+
+
+def test_the_whole_chain_spends_what_fit_and_train_do_by_default():
+    from brokk_min.actuator import FitConfig
+    from brokk_min.ppo import PPOConfig
+
+    effort = experiments.Effort()
+    assert (effort.fit_steps, effort.train_steps) == (FitConfig().steps, PPOConfig().total_steps)
