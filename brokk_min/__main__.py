@@ -19,6 +19,7 @@ from brokk_min.export import export_onnx
 from brokk_min.logs import Log, read_log, write_log
 from brokk_min.machine import BROKK_170
 from brokk_min.policy import PolicyController, load_policy
+from brokk_min.sequences import axis_sequences, draw_starts, read_commands, read_starts
 from brokk_min.simulator import simulate
 
 MACHINES = {machine.name: machine for machine in (BROKK_170,)}
@@ -178,14 +179,14 @@ class Evaluate(Command):
         check(self, self.json)
         machine, effort = MACHINES[self.machine], experiments.Effort()
         policy = load_policy(self.policy, machine)
-        sequences = experiments.axis_sequences(machine)
+        sequences = axis_sequences(machine)
         if self.commands:
-            sequences = experiments.read_commands(self.commands, machine)
+            sequences = read_commands(self.commands, machine)
         if self.starts:
-            starts = experiments.read_starts(self.starts, machine)
+            starts = read_starts(self.starts, machine)
         else:
             rng = np.random.default_rng(self.seed + 2)
-            starts = experiments.draw_starts(machine, sequences, effort.starts, rng)
+            starts = draw_starts(machine, sequences, effort.starts, rng)
         controllers: dict[str, Controller] = {"rl": PolicyController(machine, policy)}
         beside = self.policy.with_name("gains.json")
         gains = self.gains or (beside if beside.exists() else "tuned now")
@@ -276,7 +277,7 @@ class Drive(Command):
         if self.command == "joystick":
             operator: hw.Joystick | hw.Script = hw.Joystick(machine, self.axes, self.button)
         else:
-            sequences = experiments.read_commands(Path(self.command), machine)
+            sequences = read_commands(Path(self.command), machine)
             operator = hw.Script(machine, np.concatenate([s.goals for s in sequences]))
         with open_line(self.interface, self.channel, self.log) as line:
             drive = hw.Drive(machine, controller, line, operator)

@@ -1,167 +1,31 @@
-"""The paper's experiment as numbers, figures and a report; the only module that plots.
+"""The paper's experiment as numbers, and the whole chain.
 
 `task_space` runs every controller on the same starts and velocity sequences on the same machine.
-Sequences and starts that score are never used for tuning; `tuning_goals` makes the others.
 """
 
 from __future__ import annotations
 
-import base64
-import html
-import io
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
-import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from brokk_min import __version__, actuator, jacobian, kinematics, logs
-from brokk_min.env import Controller, TaskConfig, Trace, draw_pose, reset, rollout, terminated
+from brokk_min import __version__, actuator, figures, jacobian, kinematics, logs
+from brokk_min.env import Controller, TaskConfig, Trace, rollout
+from brokk_min.figures import Traces
 from brokk_min.jacobian import JacobianController
 from brokk_min.machine import Machine
 from brokk_min.policy import PolicyController
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
+from brokk_min.sequences import AXES, Commands, axis_sequences, draw_starts, tuning_goals
 
 Array = NDArray[np.floating[Any]]
 Net = actuator.ActuatorNet
-Traces = Mapping[tuple[str, str], Trace]  # by controller and sequence, starts as one batch
-AXES = "xyz"
-# One axis of the paper's experiment: seconds and share of tool_speed (assumed), with changes of direction.
-PATTERN = ((1, 0.0), (4, 2 / 3), (1, 0.0), (4, -2 / 3), (1, 0.0), (3, 1 / 3), (3, -1 / 3), (1, 0.0))
-
-
-class Commands(NamedTuple):
-    """A named sequence of wanted tool velocities [m/s] at the control rate, (T, 3)."""
-
-    name: str
-    goals: Array
-
-
-def axis_sequences(machine: Machine) -> list[Commands]:
-    """One sequence along x, one along y, one along z. Paper: Fig. 6"""
-    seconds, shares = np.array(PATTERN).T
-    profile = machine.tool_speed * np.repeat(shares, np.rint(seconds * machine.rate).astype(int))
-    return [Commands(name, np.outer(profile, np.eye(3)[i])) for i, name in enumerate(AXES)]
-
-
-def read_commands(path: Path, machine: Machine) -> list[Commands]:
-    """Sequences of a CSV `sequence,time,vx,vy,vz` [s, m/s], each value held until the next row.
-
-    The last row of a sequence marks its end.
-    """
-    table = logs.read_table(path, ["sequence", "time", "vx", "vy", "vz"], text=("sequence",))
-    result = []
-    for name in dict.fromkeys(table["sequence"]):
-        rows = np.flatnonzero(table["sequence"] == name)
-        time = table["time"][rows] - table["time"][rows[0]]
-        if len(rows) < 2 or not (np.diff(time) > 0).all():
-            raise ValueError(f"{path}: sequence {name}: expected two or more rows with rising time")
-        if round(time[-1] * machine.rate) < 1 or name == "all":
-            raise ValueError(f"{path}: sequence {name}: expected a tick or more and another name than all")
-        at = np.searchsorted(time, np.arange(round(time[-1] * machine.rate)) / machine.rate + 1e-6, "right")
-        goals = np.stack([table[c][rows][at - 1] for c in ("vx", "vy", "vz")], axis=1)
-        result.append(Commands(str(name), goals))
-    return result
-
-
-def read_starts(path: Path, machine: Machine) -> Array:
-    """Start poses of a CSV with one column a joint [rad], shape (starts, n).
-
-    Raises:
-        ValueError: an angle outside its joint's range or a pose in the ground, with file and row.
-    """
-    table = logs.read_table(path, list(machine.names))
-    starts = np.stack([table[name] for name in machine.names], axis=1)
-    low, high = machine.column("q_min"), machine.column("q_max")
-    for row, joint in np.argwhere((starts < low) | (starts > high)):
-        wanted = f"column {machine.names[joint]}: expected {low[joint]} to {high[joint]} rad"
-        raise ValueError(f"{path}: row {row + 2}, {wanted}, got {starts[row, joint]}")
-    lowest = kinematics.lowest_point(machine, starts)
-    for row in np.flatnonzero(terminated(machine, lowest)):
-        wanted = f"expected the whole arm above {machine.ground} m"
-        raise ValueError(f"{path}: row {row + 2}: {wanted}, got {lowest[row]:.3f} m")
-    return starts
-
-
-def feasible(machine: Machine, start: Array, goals: Array) -> NDArray[np.bool_]:
-    """Can ideal actuators follow `goals` (T, num, 3) from `start` (num, n)? Shape (num,).
-
-    Integrates lightly damped resolved rates with joint-limit weights. Margins, all assumed: the tool stays
-    within 20 mm of its path (no singularity is crossed), joints 0.05 rad off their limits and below 0.9 of
-    `speed_limits` (a tracking controller needs room to correct), the arm 0.1 m off the ground.
-    """
-    q, driven = np.array(start, float), machine.driven
-    low, high = machine.column("q_min")[driven] + 0.05, machine.column("q_max")[driven] - 0.05
-    wanted, lowest = kinematics.tool_state(machine, q, 0 * q)[::2]
-    good, rates = lowest > machine.ground + 0.1, np.zeros_like(q)
-    for goal in goals:
-        p, _, lowest = kinematics.tool_state(machine, q, rates)
-        J = kinematics.jacobian(machine, q)
-        inverse = jacobian.dls(J, jacobian.limit_weights(machine, q, rates)[:, driven], np.full(len(q), 1e-4))
-        rates = np.zeros_like(q)
-        rates[:, driven] = (inverse @ (goal + (wanted - p))[..., None])[..., 0]
-        q, wanted = q + rates * machine.dt, wanted + goal * machine.dt
-        inside = ((q[:, driven] > low) & (q[:, driven] < high)).all(-1)
-        down, up = actuator.speed_limits(machine, q)
-        slow = ((rates > 0.9 * down) & (rates < 0.9 * up))[:, driven].all(-1)
-        near = np.linalg.norm(wanted - p, axis=-1) < 0.02
-        good &= inside & slow & near & (lowest > machine.ground + 0.1)
-    return good
-
-
-def _feasible_draws(
-    machine: Machine, num: int, label: str, draw: Callable[[], tuple[Array, list[Array]]]
-) -> tuple[Array, Array]:
-    """First `num` poses (num, n), and goals (T, num, 3), of those drawn whose goals are all `feasible`."""
-    poses: list[Array] = []
-    first: list[Array] = []
-    with tqdm(total=num, desc=label, unit="start", disable=None) as bar:
-        for _ in range(60):
-            pose, goals = draw()
-            keep = np.arange(len(pose))
-            for goal in goals:
-                keep = keep[feasible(machine, pose[keep], goal[:, keep])]
-            poses += list(pose[keep])
-            first += list(goals[0].swapaxes(0, 1)[keep])
-            bar.update(min(num, len(poses)) - bar.n)
-            if len(poses) >= num:
-                return np.array(poses[:num]), np.array(first[:num]).swapaxes(0, 1)
-    raise ValueError(f"{label}: expected {num} feasible poses for {machine.name}, got {len(poses)}")
-
-
-def draw_starts(machine: Machine, sequences: Sequence[Commands], num: int, rng: np.random.Generator) -> Array:
-    """Random poses (num, n) [rad] from which all sequences are `feasible`; ValueError: too few such poses."""
-    goals = [np.repeat(sequence.goals[:, None], 400, axis=1) for sequence in sequences]
-
-    def draw() -> tuple[Array, list[Array]]:
-        return draw_pose(machine, TaskConfig(), rng, 400), goals
-
-    return _feasible_draws(machine, num, "draw starts", draw)[0]
-
-
-def tuning_goals(machine: Machine, runs: int, seconds: float, seed: int) -> tuple[Array, Array]:
-    """Feasible starts (runs, n) and goals (T, runs, 3), drawn as the policy's by `reset`: for tuning only."""
-    rng, config, ticks = np.random.default_rng(seed), TaskConfig(), round(seconds * machine.rate)
-    holds = int(np.ceil(seconds / config.hold_min_s))  # that many are always long enough
-
-    def draw() -> tuple[Array, list[Array]]:
-        drawn = reset(machine, config, rng, 200 * holds, plant=False)
-        goals = [
-            np.repeat(drawn.v_goal[i : i + holds], drawn.goal_ticks[i : i + holds], axis=0)[:ticks]
-            for i in range(0, 200 * holds, holds)
-        ]
-        return drawn.q[::holds].astype(float), [np.stack(goals, axis=1)]
-
-    return _feasible_draws(machine, runs, "draw tuning runs", draw)
-
 
 # --- controllers ------------------------------------------------------------------------------------
 
@@ -333,152 +197,6 @@ def driven_log(machine: Machine, traces: Traces, controller: str) -> logs.Log:
     return logs.Log(machine.names, tuple(recordings))
 
 
-# --- figures: one style, units on every axis, colours that differ in brightness too ------------------
-
-STYLES: dict[str, dict[str, Any]] = {
-    "wanted": {"color": "black", "linestyle": "--"},
-    "machine": {"color": "black"},
-    "nets": {"color": "#0072b2", "linestyle": "--"},
-    "rl": {"color": "#0072b2"},
-    "jacobian_pid_k0.1": {"color": "#d55e00"},
-    "jacobian_pid_k0.05": {"color": "#e69f00"},
-    "jacobian_pid_ff": {"color": "#009e73"},
-}
-
-
-Row = tuple[Sequence[str], Mapping[str, Array]]  # labels of k y axes, and curves (T, k) by name
-
-
-def plot_lines(x: Array, xlabel: str, rows: Sequence[Row], one_scale: bool = False) -> Any:
-    """Rows of line plots over the same x under one legend; `one_scale`: one y axis in each row."""
-    share: Literal["row", "none"] = "row" if one_scale else "none"
-    high, wide = len(rows), len(rows[0][0])
-    figure = plt.figure(figsize=(4.0 * wide + 0.4, 2.3 * high + 0.4), layout="constrained")
-    grid = figure.subplots(high, wide, squeeze=False, sharey=share)
-    for axes, (labels, curves) in zip(grid, rows, strict=True):
-        for i, (ax, label) in enumerate(zip(axes, labels, strict=True)):
-            for name, y in curves.items():
-                ax.plot(x, y[:, i], label=name, linewidth=1.1, **STYLES[name])
-            ax.set_ylabel(label)
-            ax.grid(alpha=0.3)
-    for ax in grid[-1]:
-        ax.set_xlabel(xlabel)
-    return _with_legend(figure, grid[0, 0])
-
-
-def _with_legend(figure: Any, ax: Any) -> Any:
-    figure.legend(*ax.get_legend_handles_labels(), loc="outside upper center", ncol=5, fontsize=8)
-    return figure
-
-
-def _during(traces: Traces, sequence: Commands) -> dict[str, Trace]:
-    return {name: trace for (name, other), trace in traces.items() if other == sequence.name}
-
-
-def plot_sequence(machine: Machine, traces: Traces, sequence: Commands, start: Array, run: int) -> Any:
-    """Tool position and velocity along x, y, z of all controllers in one run. Paper: Fig. 6"""
-    first = kinematics.tool_position(machine, start)
-    p, v = {"wanted": np.cumsum(sequence.goals, axis=0) * machine.dt}, {"wanted": sequence.goals}
-    for name, trace in _during(traces, sequence).items():
-        p[name], v[name] = trace.p_tool[:, run] - first, trace.v_tool[:, run]
-    rows = [([f"{a} - {a}(0) [m]" for a in AXES], p), ([f"velocity {a} [m/s]" for a in AXES], v)]
-    return plot_lines(machine.dt * np.arange(1, len(sequence.goals) + 1), "time [s]", rows, one_scale=True)
-
-
-def plot_joint_rates(machine: Machine, traces: Traces, sequence: Commands, run: int) -> Any:
-    """Velocity of the driven joints of all controllers in one run. Paper: Fig. 6d"""
-    labels = [f"velocity {machine.names[i]} [rad/s]" for i in machine.driven]
-    rates = {name: t.q_dot[:, run, machine.driven] for name, t in _during(traces, sequence).items()}
-    return plot_lines(machine.dt * np.arange(1, len(sequence.goals) + 1), "time [s]", [(labels, rates)])
-
-
-def plot_free_run(net: Net, log: logs.Log, seconds: float = 30.0) -> Any:
-    """Recorded and free-running angle and velocity of every joint in one unseen recording."""
-    recording = log.recordings[0]
-    ticks = min(round(seconds * net.rate), len(recording.q) - net.history - 1)
-    q, q_dot = actuator.free_run(net, recording, np.array([net.history]), ticks)
-    later = slice(net.history + 1, net.history + 1 + ticks)
-    rows = [
-        ([f"{joint} [rad]" for joint in net.joints], {"machine": recording.q[later], "nets": q[:, 0]}),
-        (
-            [f"{joint} [rad/s]" for joint in net.joints],
-            {"machine": recording.q_dot[later], "nets": q_dot[:, 0]},
-        ),
-    ]
-    return plot_lines(np.arange(1, ticks + 1) / net.rate, "time [s]", rows)
-
-
-def plot_learning(curve: Path) -> Any:
-    """Mean reward and velocity error of the exploring policy over environment steps."""
-    table = logs.read_table(curve, ["global_step", "charts/reward", "charts/velocity_error"])
-    curves = {"rl": np.stack([table["charts/reward"], table["charts/velocity_error"]], axis=1)}
-    row = (["reward a step [1]", "velocity error [m/s]"], curves)
-    return plot_lines(table["global_step"] / 1e6, "environment steps [million]", [row])
-
-
-def plot_bars(table: Mapping[str, Mapping[str, Mapping[str, float]]], sequences: Sequence[str]) -> Any:
-    """Mean velocity error and largest drift of each controller on each sequence."""
-    figure, axes = plt.subplots(1, 2, figsize=(8.4, 3.0), layout="constrained")
-    keys = (("velocity_error_mean", "mean velocity error [m/s]"), ("off_axis_drift_max", "largest drift [m]"))
-    width = 0.8 / len(table)
-    for ax, (key, label) in zip(axes, keys, strict=True):
-        for i, (name, rows) in enumerate(table.items()):
-            places = np.arange(len(sequences)) + (i - (len(table) - 1) / 2) * width
-            ax.bar(places, [rows[s][key] for s in sequences], width, label=name, color=STYLES[name]["color"])
-        ax.set_xticks(np.arange(len(sequences)), sequences)
-        ax.set_ylabel(label)
-        ax.grid(alpha=0.3, axis="y")
-        ax.set_axisbelow(True)
-    return _with_legend(figure, axes[0])
-
-
-# --- the report -------------------------------------------------------------------------------------
-
-STYLE = """body{font:15px/1.45 sans-serif;max-width:1100px;margin:2em auto;padding:0 1em}
-table{border-collapse:collapse;margin:1em 0}td,th{border:1px solid #bbb;padding:.25em .6em;text-align:right}
-td:first-child,th:first-child{text-align:left}img{max-width:100%}"""
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write JSON whole, floats as they are."""
-    with logs.whole_file(path, "w") as file:
-        json.dump(value, file, indent=1, allow_nan=False)
-        file.write("\n")
-
-
-def write_report(path: Path, parts: Sequence[tuple[Any, ...]], clock: Mapping[str, float]) -> None:
-    """One page by itself; a part is a title, a sentence, and tables {row: {column: cell}} or figures."""
-    page = [
-        f"<!doctype html><meta charset=utf-8><title>brokk_min report</title><style>{STYLE}</style>",
-        "<h1>Task space control with reinforcement learning: what was measured</h1>",
-        "<p>The machine here is an analytic plant, not a real Brokk 170. The policy was trained on nets "
-        "fitted to its logs and never saw its equations.</p>",
-        "<p>Seconds spent: " + ", ".join(f"{k} {v:.0f}" for k, v in clock.items()) + ".</p>",
-    ]
-    for title, sentence, *contents in tqdm(parts, desc="draw", unit="part", disable=None):
-        page.append(f"<h2>{html.escape(title)}</h2><p>{html.escape(sentence)}</p>")
-        page += [_table(c) if isinstance(c, Mapping) else _image(title, c) for c in contents]
-    with logs.whole_file(path, "w") as file:
-        file.write("\n".join(page) + "\n")
-
-
-def _table(rows: Mapping[str, Mapping[str, Any]]) -> str:
-    def line(tag: str, cells: Sequence[Any]) -> str:
-        texts = (f"{c:.4g}" if isinstance(c, float) else html.escape(str(c)) for c in cells)
-        return "<tr>" + "".join(f"<{tag}>{text}</{tag}>" for text in texts) + "</tr>"
-
-    head = line("th", ["", *next(iter(rows.values()))])
-    return f"<table>{head}{''.join(line('td', [name, *row.values()]) for name, row in rows.items())}</table>"
-
-
-def _image(title: str, figure: Any) -> str:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, dpi=110, metadata={"Software": None})
-    plt.close(figure)
-    image = base64.b64encode(buffer.getvalue()).decode()
-    return f"<img alt='{html.escape(title)}' src='data:image/png;base64,{image}'>"
-
-
 def report_tables(results: Mapping[str, Any]) -> tuple[dict[str, dict[str, Any]], ...]:
     """Errors of the nets, tuning of the baselines, means of all figures, velocity error by sequence."""
     nets, tuning, means = {}, {}, results["task_space"]["summary"]
@@ -491,6 +209,13 @@ def report_tables(results: Mapping[str, Any]) -> tuple[dict[str, dict[str, Any]]
     everything = {name: rows["all"] for name, rows in means.items()}
     errors = {n: {s: row["velocity_error_mean"] for s, row in rows.items()} for n, rows in means.items()}
     return nets, tuning, everything, errors
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write JSON whole, floats as they are."""
+    with logs.whole_file(path, "w") as file:
+        json.dump(value, file, indent=1, allow_nan=False)
+        file.write("\n")
 
 
 # --- the whole chain --------------------------------------------------------------------------------
@@ -546,20 +271,24 @@ def reproduce(machine: Machine, out: Path, effort: Effort, seed: int) -> dict[st
     write_json(out / "results.json", results)
     write_json(out / "gains.json", {"meta": results["meta"], "gains": results["gains"]})
     nets, tuning, means, errors = report_tables(results)
-    motion = [plot_sequence(machine, traces, sequence, starts[0], 0) for sequence in sequences]
-    rates = plot_joint_rates(machine, traces, sequences[0], 0)
-    bars = plot_bars(results["task_space"]["summary"], [*AXES, "all"])
+    motion = [figures.plot_sequence(machine, traces, sequence, starts[0], 0) for sequence in sequences]
+    rates = figures.plot_joint_rates(machine, traces, sequences[0], 0)
+    bars = figures.plot_bars(results["task_space"]["summary"], [*AXES, "all"])
     parts = (
         ("Actuator nets", "One step and free runs of 10 s on unseen recordings [rad/s, rad].", nets),
-        ("Nets run freely", "One of these recordings.", plot_free_run(net, test)),
-        ("Learning curve", "The exploring policy, on the nets.", plot_learning(out / "policy.npz.csv")),
+        ("Nets run freely", "One of these recordings.", figures.plot_free_run(net, test)),
+        (
+            "Learning curve",
+            "The exploring policy, on the nets.",
+            figures.plot_learning(out / "policy.npz.csv"),
+        ),
         ("Tuning of the baselines", "Least velocity error after a generation, on the machine.", tuning),
         ("Task space control", "Motion along x, y and z from the first start, one scale a row.", *motion),
         ("Joint velocities", "Motion along x from the first start.", rates),
         ("Figures of merit", "Means over all sequences and starts [m/s, m, m/s^3, full strokes].", means),
         ("Velocity error and drift by sequence", "Means over all starts [m/s, m].", errors, bars),
     )
-    write_report(out / "report.html", parts, clock)
+    figures.write_report(out / "report.html", parts, clock)
     lap("draw")
     stages.close()
     write_json(out / "timing.json", clock)

@@ -1,0 +1,165 @@
+"""Figures and the report page; the only module that plots. One style, units on every axis.
+
+Colours differ in brightness too, for paper and for the colour-blind.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import matplotlib
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from brokk_min import actuator, kinematics, logs
+from brokk_min.env import Trace
+from brokk_min.machine import Machine
+from brokk_min.sequences import AXES, Commands
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+Array = NDArray[np.floating[Any]]
+Traces = Mapping[tuple[str, str], Trace]  # by controller and sequence, starts as one batch
+
+STYLES: dict[str, dict[str, Any]] = {
+    "wanted": {"color": "black", "linestyle": "--"},
+    "machine": {"color": "black"},
+    "nets": {"color": "#0072b2", "linestyle": "--"},
+    "rl": {"color": "#0072b2"},
+    "jacobian_pid_k0.1": {"color": "#d55e00"},
+    "jacobian_pid_k0.05": {"color": "#e69f00"},
+    "jacobian_pid_ff": {"color": "#009e73"},
+}
+
+
+Row = tuple[Sequence[str], Mapping[str, Array]]  # labels of k y axes, and curves (T, k) by name
+
+
+def plot_lines(x: Array, xlabel: str, rows: Sequence[Row], one_scale: bool = False) -> Any:
+    """Rows of line plots over the same x under one legend; `one_scale`: one y axis in each row."""
+    share: Literal["row", "none"] = "row" if one_scale else "none"
+    high, wide = len(rows), len(rows[0][0])
+    figure = plt.figure(figsize=(4.0 * wide + 0.4, 2.3 * high + 0.4), layout="constrained")
+    grid = figure.subplots(high, wide, squeeze=False, sharey=share)
+    for axes, (labels, curves) in zip(grid, rows, strict=True):
+        for i, (ax, label) in enumerate(zip(axes, labels, strict=True)):
+            for name, y in curves.items():
+                ax.plot(x, y[:, i], label=name, linewidth=1.1, **STYLES[name])
+            ax.set_ylabel(label)
+            ax.grid(alpha=0.3)
+    for ax in grid[-1]:
+        ax.set_xlabel(xlabel)
+    return _with_legend(figure, grid[0, 0])
+
+
+def _with_legend(figure: Any, ax: Any) -> Any:
+    figure.legend(*ax.get_legend_handles_labels(), loc="outside upper center", ncol=5, fontsize=8)
+    return figure
+
+
+def _during(traces: Traces, sequence: Commands) -> dict[str, Trace]:
+    return {name: trace for (name, other), trace in traces.items() if other == sequence.name}
+
+
+def plot_sequence(machine: Machine, traces: Traces, sequence: Commands, start: Array, run: int) -> Any:
+    """Tool position and velocity along x, y, z of all controllers in one run. Paper: Fig. 6"""
+    first = kinematics.tool_position(machine, start)
+    p, v = {"wanted": np.cumsum(sequence.goals, axis=0) * machine.dt}, {"wanted": sequence.goals}
+    for name, trace in _during(traces, sequence).items():
+        p[name], v[name] = trace.p_tool[:, run] - first, trace.v_tool[:, run]
+    rows = [([f"{a} - {a}(0) [m]" for a in AXES], p), ([f"velocity {a} [m/s]" for a in AXES], v)]
+    return plot_lines(machine.dt * np.arange(1, len(sequence.goals) + 1), "time [s]", rows, one_scale=True)
+
+
+def plot_joint_rates(machine: Machine, traces: Traces, sequence: Commands, run: int) -> Any:
+    """Velocity of the driven joints of all controllers in one run. Paper: Fig. 6d"""
+    labels = [f"velocity {machine.names[i]} [rad/s]" for i in machine.driven]
+    rates = {name: t.q_dot[:, run, machine.driven] for name, t in _during(traces, sequence).items()}
+    return plot_lines(machine.dt * np.arange(1, len(sequence.goals) + 1), "time [s]", [(labels, rates)])
+
+
+def plot_free_run(net: actuator.ActuatorNet, log: logs.Log, seconds: float = 30.0) -> Any:
+    """Recorded and free-running angle and velocity of every joint in one unseen recording."""
+    recording = log.recordings[0]
+    ticks = min(round(seconds * net.rate), len(recording.q) - net.history - 1)
+    q, q_dot = actuator.free_run(net, recording, np.array([net.history]), ticks)
+    later = slice(net.history + 1, net.history + 1 + ticks)
+    rows = [
+        ([f"{joint} [rad]" for joint in net.joints], {"machine": recording.q[later], "nets": q[:, 0]}),
+        (
+            [f"{joint} [rad/s]" for joint in net.joints],
+            {"machine": recording.q_dot[later], "nets": q_dot[:, 0]},
+        ),
+    ]
+    return plot_lines(np.arange(1, ticks + 1) / net.rate, "time [s]", rows)
+
+
+def plot_learning(curve: Path) -> Any:
+    """Mean reward and velocity error of the exploring policy over environment steps."""
+    table = logs.read_table(curve, ["global_step", "charts/reward", "charts/velocity_error"])
+    curves = {"rl": np.stack([table["charts/reward"], table["charts/velocity_error"]], axis=1)}
+    row = (["reward a step [1]", "velocity error [m/s]"], curves)
+    return plot_lines(table["global_step"] / 1e6, "environment steps [million]", [row])
+
+
+def plot_bars(table: Mapping[str, Mapping[str, Mapping[str, float]]], sequences: Sequence[str]) -> Any:
+    """Mean velocity error and largest drift of each controller on each sequence."""
+    figure, axes = plt.subplots(1, 2, figsize=(8.4, 3.0), layout="constrained")
+    keys = (("velocity_error_mean", "mean velocity error [m/s]"), ("off_axis_drift_max", "largest drift [m]"))
+    width = 0.8 / len(table)
+    for ax, (key, label) in zip(axes, keys, strict=True):
+        for i, (name, rows) in enumerate(table.items()):
+            places = np.arange(len(sequences)) + (i - (len(table) - 1) / 2) * width
+            ax.bar(places, [rows[s][key] for s in sequences], width, label=name, color=STYLES[name]["color"])
+        ax.set_xticks(np.arange(len(sequences)), sequences)
+        ax.set_ylabel(label)
+        ax.grid(alpha=0.3, axis="y")
+        ax.set_axisbelow(True)
+    return _with_legend(figure, axes[0])
+
+
+# --- the report -------------------------------------------------------------------------------------
+
+STYLE = """body{font:15px/1.45 sans-serif;max-width:1100px;margin:2em auto;padding:0 1em}
+table{border-collapse:collapse;margin:1em 0}td,th{border:1px solid #bbb;padding:.25em .6em;text-align:right}
+td:first-child,th:first-child{text-align:left}img{max-width:100%}"""
+
+
+def write_report(path: Path, parts: Sequence[tuple[Any, ...]], clock: Mapping[str, float]) -> None:
+    """One page by itself; a part is a title, a sentence, and tables {row: {column: cell}} or figures."""
+    page = [
+        f"<!doctype html><meta charset=utf-8><title>brokk_min report</title><style>{STYLE}</style>",
+        "<h1>Task space control with reinforcement learning: what was measured</h1>",
+        "<p>The machine here is an analytic plant, not a real Brokk 170. The policy was trained on nets "
+        "fitted to its logs and never saw its equations.</p>",
+        "<p>Seconds spent: " + ", ".join(f"{k} {v:.0f}" for k, v in clock.items()) + ".</p>",
+    ]
+    for title, sentence, *contents in tqdm(parts, desc="draw", unit="part", disable=None):
+        page.append(f"<h2>{html.escape(title)}</h2><p>{html.escape(sentence)}</p>")
+        page += [_table(c) if isinstance(c, Mapping) else _image(title, c) for c in contents]
+    with logs.whole_file(path, "w") as file:
+        file.write("\n".join(page) + "\n")
+
+
+def _table(rows: Mapping[str, Mapping[str, Any]]) -> str:
+    def line(tag: str, cells: Sequence[Any]) -> str:
+        texts = (f"{c:.4g}" if isinstance(c, float) else html.escape(str(c)) for c in cells)
+        return "<tr>" + "".join(f"<{tag}>{text}</{tag}>" for text in texts) + "</tr>"
+
+    head = line("th", ["", *next(iter(rows.values()))])
+    return f"<table>{head}{''.join(line('td', [name, *row.values()]) for name, row in rows.items())}</table>"
+
+
+def _image(title: str, figure: Any) -> str:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, dpi=110, metadata={"Software": None})
+    plt.close(figure)
+    image = base64.b64encode(buffer.getvalue()).decode()
+    return f"<img alt='{html.escape(title)}' src='data:image/png;base64,{image}'>"
