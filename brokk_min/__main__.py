@@ -4,7 +4,7 @@ import os
 import shutil
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,7 +12,7 @@ import numpy as np
 import tyro
 
 from brokk_min import experiments, figures, hw, preliminary
-from brokk_min.actuator import FitConfig, collect, fit, load_net, save_net
+from brokk_min.actuator import PAPER_RECIPE, FitConfig, collect, fit, load_net, save_net
 from brokk_min.bus import open_line, read_frames
 from brokk_min.env import Controller, TaskConfig, fitting_nets
 from brokk_min.export import export_onnx
@@ -35,9 +35,9 @@ ALLOWED: tuple[tuple[float, float, str], ...] = (
     (0, 2**31 - 1, "seed"),
     (0, 1, "zero_goals axis_goals gae_lambda"),
     (0, 0.9999, "gamma"),
-    (0, 1000, "noise valve_cost entropy"),
+    (0, 1000, "noise rest_weight valve_cost entropy"),
     (0, 1e6, "hold_min_s hold_max_s"),
-    (1, 1e6, "batch_size hidden num_envs horizon epochs threads"),
+    (1, 1e6, "batch_size hidden num_envs horizon epochs threads rollout"),
     (1, 1e12, "steps total_steps checkpoint_every"),
     (2, 1e7, "velocity_samples history minibatch_size"),
     (-10, 3, "log_std"),
@@ -102,6 +102,7 @@ class Fit:
     json: Path | None = None  # Also write the scores here.
     figure: Path | None = None  # Also draw free runs of the worst and the median recording here, .png.
     velocity_samples: int = BROKK_170.velocity_samples  # Window of the velocity estimator at 20 Hz.
+    paper: bool = False  # The paper's own recipe: errors of one step alone, no noise, all samples alike.
     settings: tyro.conf.OmitArgPrefixes[FitConfig] = field(default_factory=FitConfig)  # The fit.
     seed: int = 0  # Of everything random.
 
@@ -116,7 +117,8 @@ class Fit:
         log, test = (log, read_log(self.test, self.velocity_samples, log.joints)) if self.test else split(log)
         known = [machine for machine in MACHINES.values() if machine.names == log.joints]
         names = "".join(machine.name for machine in known)
-        net = fit(log, self.settings, self.seed, self.velocity_samples, names)
+        settings = replace(self.settings, **PAPER_RECIPE) if self.paper else self.settings
+        net = fit(log, settings, self.seed, self.velocity_samples, names)
         save_net(self.out, net)
         verdict = preliminary.judge(net, log, test, known[0] if known else None)
         if self.json:

@@ -442,19 +442,28 @@ class FitConfig:
     """Units in each of the two hidden layers (paper: 32)."""
     history: int = 13
     """Samples of angle, velocity and command that the nets see (paper: 13)."""
+    rollout: int = 8
+    """Ticks that the nets run freely in the last fifth of the steps, which learn from that (paper: 1)."""
+    rest_weight: float = 10.0
+    """Weight of windows in which the joint has stood still (paper: 1)."""
+
+
+PAPER_RECIPE: dict[str, Any] = {"noise": 0.0, "rollout": 1, "rest_weight": 1.0}  # Sec. 3.3
 
 
 def fit(log: Log, config: FitConfig, seed: int, velocity_samples: int, machine: str = "") -> ActuatorNet:
-    """Fit one net a joint to the one-step targets of a log. Paper: Sec. 3.3 (MSE, Adam)
+    """Fit one net a joint to a log. Paper: Sec. 3.3 (MSE, Adam)
 
-    The same `seed` gives the same bits on the same machine. `velocity_samples` is the window of the estimator
-    that supplied the velocities of `log`, `machine` a name for the file.
+    One-step errors first, then short free runs, in which a bias adds up while the noise of encoders does
+    not. The same `seed` gives the same bits on the same machine. `velocity_samples` is the window of the
+    estimator that supplied the velocities of `log`, `machine` a name for the file.
 
     Raises:
         ValueError: a joint that never moves long enough to be learned.
     """
-    training = training_set(log, config.history)
-    weights = _train(training, config, seed)
+    training = training_set(log, config.history, config.rollout)
+    estimator = None if log.velocity_logged else velocity_samples
+    weights = _train(training, config, seed, estimator)
     return ActuatorNet(
         joints=log.joints,
         history=config.history,
@@ -469,11 +478,11 @@ def fit(log: Log, config: FitConfig, seed: int, velocity_samples: int, machine: 
     )
 
 
-def _train(training: TrainingSet, config: FitConfig, seed: int) -> tuple[Array, ...]:
-    """Weights of all nets, one Adam step for all of them at a time."""
+def _train(training: TrainingSet, config: FitConfig, seed: int, estimator: int | None) -> tuple[Array, ...]:
+    """Weights of all nets, one Adam step for all of them at a time; `estimator` as in `_rollout_loss`."""
     import torch
 
-    n, inputs, history, hidden = *training.input_mean.shape, config.history, config.hidden
+    n, inputs, hidden = *training.input_mean.shape, config.hidden
     generator = torch.Generator().manual_seed(seed)
     weights: list[torch.Tensor] = []
     for rows, columns in [(inputs, hidden), (hidden, hidden), (hidden, 1)]:
@@ -485,34 +494,75 @@ def _train(training: TrainingSet, config: FitConfig, seed: int) -> tuple[Array, 
     optimizer = torch.optim.Adam(weights, lr=config.learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.steps)
 
-    series = torch.tensor(training.series, dtype=torch.float32).flatten(1)  # (3, n N): joint after joint
     target = (training.target - training.output_low) / (training.output_high - training.output_low)
-    fractions = torch.tensor(target, dtype=torch.float32).T.flatten()
-    centre = torch.tensor(training.input_mean)[:, None].float()
-    width = torch.tensor(training.input_scale)[:, None].float()
-    choices, lags = [torch.tensor(end) for end in training.ends], torch.arange(1 - history, 1)
+    arrays = (training.series, target.T, 1 + (config.rest_weight - 1) * training.rests.T)
+    tapes = [torch.tensor(array, dtype=torch.float32).flatten(-2) for array in arrays]  # joint after joint
     first = torch.arange(n)[:, None] * len(training.target)
-    for _ in tqdm(range(config.steps), desc="fit nets", unit="step", disable=None):
-        picks = [torch.randint(len(c), (config.batch_size,), generator=generator) for c in choices]
-        at = torch.stack([c[pick] for c, pick in zip(choices, picks, strict=True)]) + first
-        x = series[:, at[..., None] + lags].permute(1, 2, 0, 3).reshape(n, -1, inputs)
-        x = (x - centre) / width
-        if config.noise:
-            x[..., history : 2 * history] += config.noise * (
-                torch.randn(n, config.batch_size, history, generator=generator)
-                + torch.randn(n, config.batch_size, 1, generator=generator)
-            )
-        for i in (0, 2):
-            x = torch.relu(torch.baddbmm(weights[i + 1][:, None], x, weights[i]))
-        y = torch.sigmoid(torch.baddbmm(weights[5][:, None], x, weights[4]))[..., 0]
-        loss = ((y - fractions[at]) ** 2).mean(dim=1).sum()
+    for step in tqdm(range(config.steps), desc="fit nets", unit="step", disable=None):
+        far = step >= 0.8 * config.steps and all(map(len, training.far_ends))
+        ends, batch = (
+            (training.far_ends, config.batch_size // 4) if far else (training.ends, config.batch_size)
+        )
+        picks = [torch.randint(len(end), (max(batch, 1),), generator=generator) for end in ends]
+        at = torch.tensor(np.stack([end[pick] for end, pick in zip(ends, picks, strict=True)])) + first
+        ticks = config.rollout if far else 1
+        loss = _rollout_loss(training, config, weights, tapes, at, ticks, estimator, generator)
         optimizer.zero_grad()
-        torch.autograd.backward(loss)
+        loss.backward()
         optimizer.step()
         schedule.step()
     if not all(torch.isfinite(weight).all() for weight in weights):
         raise ValueError("weights: expected finite numbers at the end of the fit, got nan or inf")
     return tuple(weight.detach().numpy() for weight in weights)
+
+
+def _rollout_loss(
+    training: TrainingSet,
+    config: FitConfig,
+    weights: list[Any],
+    tapes: list[Any],
+    at: Any,
+    ticks: int,
+    estimator: int | None,
+    generator: Any,
+) -> Any:
+    """Weighted mean square of how far free runs from the windows that end `at` (n, batch) are off.
+
+    After each tick, in units of the outputs' range and ticks: the error of the outputs so far, added up.
+
+    Args:
+        tapes: inputs (3, n N), wanted outputs (n N,) and weights (n N,), joint after joint.
+        estimator: samples of the velocity estimator; None: velocities are the nets' own outputs.
+    """
+    import torch
+
+    series, target, weight = tapes
+    n, history = len(at), config.history
+    mean, scale, low, high = (torch.tensor(array).float() for array in training[3:7])
+    mean, scale = mean.reshape(n, 1, 3, history), scale.reshape(n, 1, 3, history)
+    window = series[:, at[..., None] + torch.arange(1 - history, ticks)]  # (3, n, batch, H + ticks - 1)
+    q, q_dot, u = window[0, ..., :history], window[1, ..., :history], window[2]
+    if config.noise:
+        shape = (*at.shape, history)
+        noise = torch.randn(*shape, generator=generator) + torch.randn(*shape[:2], 1, generator=generator)
+        q_dot = q_dot + config.noise * scale[:, :, 1] * noise
+    off, loss = torch.zeros(()), torch.zeros(())
+    for k in range(ticks):
+        x = (torch.stack([q, q_dot, u[..., k : k + history]], dim=2) - mean) / scale
+        x = x.flatten(2)
+        for i in (0, 2):
+            x = torch.relu(torch.baddbmm(weights[i + 1][:, None], x, weights[i]))
+        y = torch.sigmoid(torch.baddbmm(weights[5][:, None], x, weights[4]))[..., 0]
+        off = off + y - target[at + k]
+        loss = loss + (weight[at] * off**2).mean(dim=1).sum() / ticks
+        if k + 1 < ticks:
+            velocity = (low[:, None] + (high - low)[:, None] * y)[..., None]
+            q = torch.cat([q[..., 1:], q[..., -1:] + velocity / RATE], dim=-1)
+            if estimator:
+                slope = torch.tensor(estimate_velocity(np.eye(estimator), estimator, 1 / RATE)).float()
+                velocity = (q[..., -estimator:] * slope).sum(dim=-1, keepdim=True)
+            q_dot = torch.cat([q_dot[..., 1:], velocity], dim=-1)
+    return loss
 
 
 class TrainingSet(NamedTuple):
@@ -527,17 +577,19 @@ class TrainingSet(NamedTuple):
     output_high: Array  # (n,) rad/s
     q_low: Array  # (n,) rad
     q_high: Array  # (n,) rad
+    far_ends: list[NDArray[np.intp]]  # as `ends`, with `rollout` samples after them
+    rests: NDArray[np.bool_]  # (N, n): stood still for `history` samples
 
 
-def training_set(log: Log, history: int) -> TrainingSet:
+def training_set(log: Log, history: int, rollout: int = 1) -> TrainingSet:
     """Windows of the recordings in which a joint moves; its statistics are of those alone.
 
     Raises:
         ValueError: a joint that never moves long enough to be learned.
     """
     samples = end_to_end(log)
-    every = samples.starts(history - 1, 1, 1)
-    ends = [every[moves] for moves in samples.moves[every].T]
+    every, far = (samples.starts(history - 1, ahead, 1) for ahead in (1, rollout))
+    ends, far_ends = ([at[moves] for moves in samples.moves[at].T] for at in (every, far))
     for name, end, target in zip(log.joints, ends, samples.target.T, strict=True):
         if not len(end) or np.ptp(target[end]) == 0:
             raise ValueError(
@@ -553,7 +605,11 @@ def training_set(log: Log, history: int) -> TrainingSet:
     low, high = low - 0.05 * (high - low), high + 0.05 * (high - low)
     mean, scale = np.repeat(mean, history, axis=1), np.repeat(scale, history, axis=1)
     q = samples.whole.q
-    return TrainingSet(series, samples.target, ends, mean, scale, low, high, q.min(axis=0), q.max(axis=0))
+    still = np.cumsum(np.diff(q, axis=0, prepend=q[:1] - 1.0) != 0, axis=0)  # changes of the angle so far
+    rests = still == still[np.maximum(np.arange(len(q)) - history + 1, 0)]
+    return TrainingSet(
+        series, samples.target, ends, mean, scale, low, high, q.min(axis=0), q.max(axis=0), far_ends, rests
+    )
 
 
 class Samples(NamedTuple):
