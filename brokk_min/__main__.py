@@ -4,15 +4,15 @@ import os
 import shutil
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
 
-from brokk_min import experiments, hw
-from brokk_min.actuator import FitConfig, collect, fit, load_net, save_net, score
+from brokk_min import experiments, figures, hw, preliminary
+from brokk_min.actuator import PAPER_RECIPE, FitConfig, collect, fit, load_net, save_net
 from brokk_min.bus import open_line, read_frames
 from brokk_min.env import Controller, TaskConfig, fitting_nets
 from brokk_min.export import export_onnx
@@ -35,9 +35,9 @@ ALLOWED: tuple[tuple[float, float, str], ...] = (
     (0, 2**31 - 1, "seed"),
     (0, 1, "zero_goals axis_goals gae_lambda"),
     (0, 0.9999, "gamma"),
-    (0, 1000, "noise valve_cost entropy"),
+    (0, 1000, "noise rest_weight valve_cost entropy"),
     (0, 1e6, "hold_min_s hold_max_s"),
-    (1, 1e6, "batch_size hidden num_envs horizon epochs threads"),
+    (1, 1e6, "batch_size hidden num_envs horizon epochs threads rollout"),
     (1, 1e12, "steps total_steps checkpoint_every"),
     (2, 1e7, "velocity_samples history minibatch_size"),
     (-10, 3, "log_std"),
@@ -100,31 +100,47 @@ class Fit:
     out: Path  # Nets to write, .npz.
     test: tuple[Path, ...] = ()  # Logs to score on; without them every tenth recording of LOGS is held out.
     json: Path | None = None  # Also write the scores here.
+    figure: Path | None = None  # Also draw free runs of the worst and the median recording here, .png.
     velocity_samples: int = BROKK_170.velocity_samples  # Window of the velocity estimator at 20 Hz.
+    paper: bool = False  # The paper's own recipe: errors of one step alone, no noise, all samples alike.
     settings: tyro.conf.OmitArgPrefixes[FitConfig] = field(default_factory=FitConfig)  # The fit.
     seed: int = 0  # Of everything random.
 
     def run(self) -> None:
-        """Fit, score, write."""
+        """Fit, judge, write."""
         if not self.logs:
             raise WrongUse("LOGS: expected at least one log, got none")
-        check(self, self.out, self.json)
+        check(self, self.out, self.json, self.figure)
         if self.velocity_samples > self.settings.history:
             raise WrongUse(f"--velocity-samples: expected at most --history, got {self.velocity_samples}")
         log = read_log(self.logs, self.velocity_samples)
         log, test = (log, read_log(self.test, self.velocity_samples, log.joints)) if self.test else split(log)
-        known = [machine.name for machine in MACHINES.values() if machine.names == log.joints]
-        net = fit(log, self.settings, self.seed, self.velocity_samples, "".join(known))
+        known = [machine for machine in MACHINES.values() if machine.names == log.joints]
+        names = "".join(machine.name for machine in known)
+        settings = replace(self.settings, **PAPER_RECIPE) if self.paper else self.settings
+        net = fit(log, settings, self.seed, self.velocity_samples, names)
         save_net(self.out, net)
-        joints = score(net, test)
+        verdict = preliminary.judge(net, log, test, known[0] if known else None)
         if self.json:
             meta: dict[str, Any] = {"seed": self.seed, "rate": net.rate, "history": net.history}
             meta |= {"logs": [str(p) for p in self.logs], "test": [str(p) for p in self.test]}
-            experiments.write_json(self.json, {"meta": meta, "joints": joints})
-        print(f"{'joint':12} one step  same as last  free run of 1, 5, 10, 30 s [rad/s]")
-        for name, s in joints.items():
-            free = ", ".join(f"{run['velocity_rmse']:.4f}" for run in s["free_run"].values())
-            print(f"{name:12} {s['one_step_rmse']:8.4f}  {s['persistence_rmse']:12.4f}  {free}")
+            experiments.write_json(self.json, {"meta": meta, **verdict})
+        if self.figure:
+            figures.save(self.figure, figures.plot_worst_and_median(net, test))
+        _print_verdict(verdict)
+
+
+def _print_verdict(verdict: dict[str, Any]) -> None:
+    """Scores of the nets, of the linear model below them, and what speaks against the nets."""
+    row = "{:12} {:>9} {:>13}  {:30} {}"
+    print(row.format("joint", "one step", "same as last", "free run of 1, 5, 10, 30 s", "creep [rad/s]"))
+    for name, s in verdict["joints"].items():
+        for label, scores in ((name, s), ("  linear", s["linear"])):
+            free = ", ".join(f"{run['velocity_rmse']:.4f}" for run in scores["free_run"].values())
+            steps = (f"{scores[key]:.4f}" for key in ("one_step_rmse", "persistence_rmse"))
+            print(row.format(label, *steps, free, f"{s['creep']:.5f}" if label == name else ""))
+    for warning in verdict["warnings"]:
+        print(f"warning: {warning}")
 
 
 def split(log: Log) -> tuple[Log, Log]:
@@ -222,6 +238,29 @@ class Reproduce(Command):
             errors = ", ".join(f"{s} {row['velocity_error_mean']:.4f}" for s, row in rows.items())
             print(f"{name:20} mean velocity error [m/s]: {errors}")
         print(f"{self.out / 'report.html'}\n{self.out / 'results.json'}")
+
+
+@dataclass(kw_only=True)
+class Preliminary(Command):
+    """The paper's preliminary tests and its sim-to-real experiment, machine and nets side by side."""
+
+    actuator: Path  # Nets that `fit` wrote.
+    out: Path = Path("preliminary")  # Folder for figures and preliminary.json.
+
+    def run(self) -> None:
+        """Measure, draw, write."""
+        check(self)
+        machine, net = MACHINES[self.machine], load_net(self.actuator)
+        numbers = preliminary.run(machine, net, self.seed)
+        self.out.mkdir(parents=True, exist_ok=True)
+        for name, figure in preliminary.plots(machine, net, self.seed).items():
+            figures.save(self.out / f"{name}.png", figure)
+            print(self.out / f"{name}.png")
+        meta = experiments.meta(machine, self.seed) | {"actuator": str(self.actuator)}
+        experiments.write_json(self.out / "preliminary.json", {"meta": meta, **numbers})
+        print(self.out / "preliminary.json")
+        tool = numbers["sim_to_real"]["tool"]["position_error_mean"]
+        print(f"tool, nets beside machine over 30 s: {tool:.4f} m apart in the mean")
 
 
 @dataclass(kw_only=True)
@@ -345,6 +384,7 @@ class Export(Command):
 COMMANDS: dict[str, Callable[[], Any]] = {
     "collect": lambda: Collect,
     "fit": lambda: Fit,
+    "preliminary": lambda: Preliminary,
     "train": train_command,
     "evaluate": lambda: Evaluate,
     "reproduce": lambda: Reproduce,
