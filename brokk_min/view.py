@@ -418,6 +418,36 @@ def _canvas(size: tuple[int, int]) -> Any:
     return need_pygame().Surface(size, depth=32)
 
 
+class Window:
+    """A window for shapes.
+
+    Raises:
+        ValueError: no pygame, or no display.
+    """
+
+    def __init__(self, size: tuple[int, int], title: str) -> None:
+        self.pygame = pygame = need_pygame()
+        try:
+            pygame.display.init()
+            self.surface = pygame.display.set_mode(size)
+        except pygame.error as error:
+            raise ValueError(
+                f"window: expected a display (SDL_VIDEODRIVER=dummy: none), got {error}"
+            ) from error
+        pygame.display.set_caption(title)
+        self.size, self.clock = size, pygame.time.Clock()
+
+    def show(self, shapes: Sequence[Shape], fps: float) -> None:
+        """Show shapes, not before 1 / `fps` after the last ones."""
+        paint(self.surface, shapes)
+        self.pygame.display.flip()
+        self.clock.tick(fps)
+
+    def close(self) -> None:
+        """Close the window; what else uses pygame goes on."""
+        self.pygame.display.quit()
+
+
 def picture(shapes: Sequence[Shape], size: tuple[int, int]) -> NDArray[np.uint8]:
     """Shapes as an image (height, width, 3); needs no display."""
     surface = need_pygame().Surface(size, depth=32)

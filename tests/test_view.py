@@ -5,15 +5,20 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import RecordVideo, RenderCollection
 from helpers_machines import random_machine
 from hypothesis import given
 from hypothesis import strategies as st
 from strategies import moving
 
 from brokk_min import view
+from brokk_min.env import TaskConfig, TaskEnv
 from brokk_min.jacobian import manipulability
 from brokk_min.kinematics import frames, jacobian, tool_position
 from brokk_min.machine import BROKK_170, Machine
@@ -210,3 +215,86 @@ def test_pygame_is_asked_for_in_one_sentence(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setitem(sys.modules, "pygame", None)
     with pytest.raises(ValueError, match=r"expected pygame \(extra brokk_min\[play\]\)"):
         picture([], SIZE)
+
+
+# --- Gymnasium ----------------------------------------------------------------------------------------
+
+
+def test_gymnasium_renders_what_happens() -> None:
+    env = gymnasium.make("brokk_min/Brokk170-v0", render_mode="rgb_array")
+    check_env(env.unwrapped)
+    env = RenderCollection(env, pop_frames=False)
+    env.reset(seed=1)
+    for _ in range(12):
+        env.step(np.array([1.0, 0.0, 0.0, 1.0], np.float32))
+    images = env.render()
+    assert isinstance(images, list) and len(images) == 13
+    inner = env.unwrapped
+    assert isinstance(inner, TaskEnv) and inner.state is not None
+    state, trail = inner.state, np.array(inner.pictures.trails[0])
+    shown = scene(state.q[0], q_dot=state.q_dot[0], v_goal=state.v_goal[0], trail=trail, title="brokk170")
+    shown = shown._replace(u=state.history[0, :, 2, -1])
+    np.testing.assert_array_equal(images[-1], picture(draw(BROKK_170, [shown], SIZE), SIZE))
+    assert len(shown.trail) == 13 and (images[-1] != images[0]).any()
+    np.testing.assert_allclose(shown.trail[-1], tool_position(BROKK_170, inner.state.q[0]))
+    env.reset(seed=2)
+    assert len(inner.pictures.trails[0]) == 1  # a new episode leaves no trail of the old one
+    env.close()
+
+
+def test_gymnasium_shows_a_window(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    env = gymnasium.make("brokk_min/Brokk170-v0", render_mode="human")
+    env.reset(seed=1)
+    env.step(np.zeros(4, np.float32))
+    window = env.unwrapped.pictures.window  # type: ignore[attr-defined]
+    assert window.surface.get_size() == SIZE and env.render() is None
+    blue = view.COLOURS["rl"]
+    image = window.pygame.surfarray.array3d(window.surface)
+    assert (image == blue).all(axis=-1).sum() > 1000
+    env.close()
+    assert not window.pygame.display.get_init()
+
+
+def test_many_environments_render_one_frame_each() -> None:
+    envs = gymnasium.make_vec(
+        "brokk_min/Brokk170-v0", num_envs=2, config=TaskConfig(episode_s=0.2), render_mode="rgb_array"
+    )
+    envs.reset(seed=0)
+    for _ in range(6):
+        envs.step(np.zeros((2, 4), np.float32))
+    images = envs.render()
+    assert isinstance(images, tuple) and [image.shape for image in images] == [(600, 960, 3)] * 2
+    assert (images[0] != images[1]).any()
+    trails = envs.unwrapped.pictures.trails  # type: ignore[attr-defined]
+    assert [len(trail) for trail in trails.values()] == [3, 3]  # one of the reset in step 4, then two
+
+
+def test_a_video_is_recorded(tmp_path: Path) -> None:
+    pytest.importorskip("moviepy")
+    env = RecordVideo(
+        gymnasium.make("brokk_min/Brokk170-v0", render_mode="rgb_array"), str(tmp_path), video_length=5
+    )
+    env.reset(seed=1)
+    for _ in range(6):
+        env.step(np.zeros(4, np.float32))
+    env.close()
+    assert next(tmp_path.glob("*.mp4")).stat().st_size > 1000
+
+
+def test_rendering_refuses_what_it_cannot_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ValueError, match=r"render_mode: expected one of .* got 'ansi'"):
+        TaskEnv(render_mode="ansi")
+    with pytest.raises(ValueError, match="render: expected a render_mode and a reset before"):
+        TaskEnv(render_mode="rgb_array").render()
+    env = TaskEnv(render_mode="rgb_array")
+    env.reset(seed=0)
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    with pytest.raises(ValueError, match=r"expected pygame \(extra brokk_min\[play\]\)"):
+        env.render()
+
+
+def test_a_window_needs_a_display(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "nonsense")
+    with pytest.raises(ValueError, match="window: expected a display"):
+        view.Window(SIZE, "none")
