@@ -24,7 +24,8 @@ Colour = tuple[int, int, int]
 # all assumed
 NEAR_LIMIT = 0.05  # of a joint's range: nearer to its end is a warning
 NEAR_SINGULAR = 0.06  # of the arm's length [1/rad]: the tool hardly moves some way below it, see `weakest`
-ARROW = 0.18  # of the reach: an arrow of the machine's tool speed
+ARROW = 0.2  # of a view's smaller side: an arrow of the machine's tool speed
+ZOOM = 0.06  # of the reach: what is seen around the path of a scene that zooms
 
 PAPER, INK, MUTED, GRID, TRACK = (
     (250, 250, 247),
@@ -72,9 +73,17 @@ class Text(NamedTuple):
     anchor: float = 0.0
 
 
-ABOVE = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])  # right and up as seen from above
-Shape = Line | Polygon | Circle | Text
 Box = tuple[float, float, float, float]  # left, top, width, height [px]
+
+
+class Clip(NamedTuple):
+    """What follows is seen within this box only, but for text."""
+
+    box: Box
+
+
+ABOVE = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])  # right and up as seen from above
+Shape = Line | Polygon | Circle | Text | Clip
 
 
 class Scene(NamedTuple):
@@ -91,6 +100,7 @@ class Scene(NamedTuple):
     mood: str = ""  # of `MOODS`, colour of the status
     colour: Colour = COLOURS["rl"]
     notes: Sequence[str] = ()
+    zoom: bool = False  # show the surroundings of the path
 
 
 class Camera(NamedTuple):
@@ -152,10 +162,19 @@ def _side_axes(p_tool: Array) -> Array:
     return axes
 
 
-def cameras(machine: Machine, p_tool: Array, side: Box, top: Box) -> tuple[Camera, Camera]:
-    """From the side, in the vertical plane of the tool, and from above with x up and y to the left."""
+def cameras(
+    machine: Machine, p_tool: Array, side: Box, top: Box, path: Array | None = None
+) -> tuple[Camera, Camera]:
+    """From the side, in the vertical plane of the tool, and from above with x up and y to the left.
+
+    They hold all that the arm can reach, or what lies around `path` [m] (K, 3).
+    """
     e, found = extent(machine), []
     for box, (low, high), axes in ((side, e.side, _side_axes(p_tool)), (top, e.top, ABOVE)):
+        if path is not None:
+            middle = (path.min(0) + path.max(0)) / 2
+            radius = np.linalg.norm(path - middle, axis=1).max() + ZOOM * e.reach
+            low, high = axes @ middle - radius, axes @ middle + radius
         left, upper, width, height = box
         soil = 0.07 * height
         scale = 0.92 * float(min(width / (high - low)[0], (height - 2 * soil) / (high - low)[1]))
@@ -238,9 +257,9 @@ def _views(machine: Machine, scene: Scene, side: Box, top: Box) -> list[Shape]:
     p_tool, v_tool, _ = tool_state(machine, scene.q, scene.q_dot)
     low, weak = near_limit(machine, scene.q), near_singular(machine, scene.q)
     shapes: list[Shape] = []
-    eyes = cameras(machine, p_tool, side, top)
+    eyes = cameras(machine, p_tool, side, top, scene.path if scene.zoom and len(scene.path) else None)
     for camera, box, label in zip(eyes, (side, top), ("side", "top"), strict=True):
-        shapes += _backdrop(machine, camera, box, label)
+        shapes += [Clip(box), *_backdrop(machine, camera, box, label)]
         for points, colour, width in ((scene.path, PATH, 3), (scene.trail, _pale(scene.colour), 2)):
             if len(points) > 1:
                 shapes.append(Line(camera.project(points), colour, width))
@@ -249,8 +268,8 @@ def _views(machine: Machine, scene: Scene, side: Box, top: Box) -> list[Shape]:
         if weak:
             shapes.append(Line(_ring(tip, 15.0), WARNING, 2))
         for v, colour in ((v_tool, MEASURED), (scene.v_goal, WANTED)):
-            seconds = ARROW * extent(machine).reach / machine.tool_speed
-            shapes += _arrow(tip, camera.project(p_tool + seconds * np.asarray(v)), colour)
+            pixels = ARROW * min(box[2:]) / machine.tool_speed * (camera.axes @ v) * (1, -1)
+            shapes += _arrow(tip, tip + pixels, colour)
     words = [f"{machine.names[i]} near its limit" for i in np.flatnonzero(low)]
     words += ["near a singularity"] * weak
     x, y = side[0] + side[2] - 14, side[1] + 14
@@ -258,14 +277,15 @@ def _views(machine: Machine, scene: Scene, side: Box, top: Box) -> list[Shape]:
         Text((x, y), "measured", 11, MEASURED, 1.0),
         Text((x - 64, y), "wanted velocity", 11, WANTED, 1.0),
     ]
-    return shapes + [Text((x, y + 20 + 18 * i), word, 13, WARNING, 1.0) for i, word in enumerate(words)]
+    shapes += [Text((x, y + 20 + 18 * i), word, 13, WARNING, 1.0) for i, word in enumerate(words)]
+    return [*shapes, Clip((0.0, 0.0, 1e4, 1e4))]
 
 
 def _backdrop(machine: Machine, camera: Camera, box: Box, label: str) -> list[Shape]:
     """Grid of 1 m (10 m for large machines), the ground, and what the view is."""
     left, upper, width, height = box
     right, lower, ox, oy = left + width, upper + height, float(camera.origin[0]), float(camera.origin[1])
-    step = camera.scale * next(m for m in 10.0 ** np.arange(20) if m * camera.scale > 12)
+    step = camera.scale * next(m for m in 10.0 ** np.arange(-1, 20) if m * camera.scale > 12)
     shapes: list[Shape] = []
     for x in ox + step * np.arange(np.ceil((left - ox) / step), (right - ox) // step + 1):
         shapes.append(Line(np.array([[x, upper + 1], [x, lower]]), GRID))
@@ -398,6 +418,7 @@ def _font(size: int) -> Any:
 def paint(surface: Any, shapes: Sequence[Shape]) -> None:
     """Shapes on a pygame surface, edges smoothed: drawn twice as large and scaled down; text lies on top."""
     pygame, twice = need_pygame(), _canvas((2 * surface.get_width(), 2 * surface.get_height()))
+    twice.set_clip(None)
     twice.fill(PAPER)
     for shape in shapes:
         match shape:
@@ -407,6 +428,8 @@ def paint(surface: Any, shapes: Sequence[Shape]) -> None:
                 pygame.draw.polygon(twice, colour, (2 * points).tolist())
             case Circle(centre, radius, colour):
                 pygame.draw.circle(twice, colour, (2 * centre).tolist(), 2 * radius)
+            case Clip(box):
+                twice.set_clip([round(2 * edge) for edge in box])
     pygame.transform.smoothscale(twice, surface.get_size(), surface)
     for at, text, size, colour, anchor in (shape for shape in shapes if isinstance(shape, Text)):
         word = _word(text, size, colour)
