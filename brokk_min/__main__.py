@@ -12,13 +12,13 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from brokk_min import experiments, hw, play
+from brokk_min import experiments, hw, play, remote, replay, view
 from brokk_min.actuator import FitConfig, collect, fit, load_net, save_net, score
 from brokk_min.bus import open_line, read_frames
 from brokk_min.env import Controller, TaskConfig, fitting_nets
 from brokk_min.export import export_onnx
-from brokk_min.logs import Log, read_log, write_log
 from brokk_min.kinematics import tool_position
+from brokk_min.logs import Log, read_log, write_log
 from brokk_min.machine import BROKK_170, Machine
 from brokk_min.policy import PolicyController, load_policy
 from brokk_min.sequences import axis_sequences, draw_starts, read_commands, read_starts
@@ -356,7 +356,7 @@ class Play(Command):
     drive: bool = False  # Drive the machine on the bus; without it, nothing is sent there.
     attempts: Path = Path("attempts.csv")  # Table of the traced lines, kept.
     log: Path | None = None  # Also log every frame here, candump format.
-    start: tuple[float, ...] = play.START  # Angles of the simulated machine at the start [rad].
+    start: tuple[float, ...] = remote.START  # Angles of the simulated machine at the start [rad].
 
     def run(self) -> None:
         """Open the window until it is closed."""
@@ -365,7 +365,7 @@ class Play(Command):
             raise WrongUse("--interface, --channel: expected both or, without --drive, none")
         machine, where = (
             MACHINES[self.machine],
-            play.Where(self.interface, self.channel, self.log, self.start),
+            remote.Where(self.interface, self.channel, self.log, self.start),
         )
         if self.interface and not self.drive:
             play.watch(machine, where)
@@ -383,7 +383,7 @@ class Play(Command):
 
 @dataclass(kw_only=True)
 class Replay(Command):
-    """Watch recorded runs side by side: logs of `drive`, or runs of `evaluate` and `reproduce`, driven again."""
+    """Watch recorded runs side by side: logs of `drive`, or runs of `evaluate`, driven again."""
 
     logs: tyro.conf.Positional[tuple[Path, ...]]  # One or two candump logs, or one JSON of results.
     out: Path | None = None  # Write a film, .gif or .mp4, instead of opening a window.
@@ -401,16 +401,16 @@ class Replay(Command):
         if self.logs[0].suffix == ".json":
             machine, runs = self._driven_again(self.logs[0])
         else:
-            machine, colours = MACHINES[self.machine], list(play.view.COLOURS.values())
+            machine, colours = MACHINES[self.machine], list(view.COLOURS.values())
             pairs = zip(self.logs, colours, strict=False)
-            runs = [play.run_of_log(machine, log, colour) for log, colour in pairs]
+            runs = [replay.run_of_log(machine, log, colour) for log, colour in pairs]
         if self.out:
-            play.write_film(self.out, machine, runs, self.size, self.fps)
+            replay.write_film(self.out, machine, runs, self.size, self.fps)
         else:
-            play.show_film(machine, runs, self.size)
+            replay.show_film(machine, runs, self.size)
 
-    def _driven_again(self, path: Path) -> tuple[Machine, list[play.Run]]:
-        """The runs of a results file: simulated anew from what it says of itself, and compared with its rows."""
+    def _driven_again(self, path: Path) -> tuple[Machine, list[replay.Run]]:
+        """Runs of a results file, simulated anew from what it says of itself and compared with its rows."""
         try:
             file = json.loads(path.read_text())
             beside = {"policy": str(path.with_name("policy.npz")), "gains": str(path.with_name("gains.json"))}
@@ -447,7 +447,7 @@ class Replay(Command):
                 raise ValueError(f"{path}: expected the run {row}, got {same or 'none'}: another program?")
         first = tool_position(machine, starts[self.start])
         return machine, [
-            play.run_of_trace(machine, name, traces[name, sequence.name], self.start, sequence.goals, first)
+            replay.run_of_trace(machine, name, traces[name, sequence.name], self.start, sequence.goals, first)
             for name in chosen
         ]
 
