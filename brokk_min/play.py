@@ -95,10 +95,9 @@ class Hands:
         wanted = self._wanted(levers)
         if len(self.deflection) != len(wanted):
             self.deflection = np.zeros(len(wanted))
-        rising = np.clip(self.deflection + np.clip(wanted - self.deflection, -1, 1) * seconds / RISE, -1, 1)
-        near = np.abs(wanted - self.deflection) <= seconds / RISE
-        self.deflection = np.where(wanted * self.deflection < 0, 0.0, np.where(near, wanted, rising))
-        self.deflection = np.where(wanted == 0, 0.0, self.deflection)  # let go: neutral at once
+        step, from_ = seconds / RISE, np.where(wanted * self.deflection < 0, 0.0, self.deflection)
+        moved = from_ + np.clip(wanted - from_, -step, step)
+        self.deflection = np.where(wanted == 0, 0.0, moved)  # let go: neutral at once
         pressed = self.focus and (self.pygame.K_SPACE in self.held or self._pad_button())
         if pressed and not self.enable and wanted.any():
             self.blocked = True
