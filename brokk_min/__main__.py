@@ -1,5 +1,6 @@
 """The command line: `brokk-min COMMAND --help`. Exits 0 done, 1 failed, 2 wrong use."""
 
+import json
 import os
 import shutil
 import sys
@@ -11,13 +12,14 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from brokk_min import experiments, figures, hw, preliminary
+from brokk_min import experiments, figures, hw, play, preliminary, remote, replay, view
 from brokk_min.actuator import PAPER_RECIPE, FitConfig, collect, fit, load_net, save_net
 from brokk_min.bus import open_line, read_frames
 from brokk_min.env import Controller, TaskConfig, fitting_nets
 from brokk_min.export import export_onnx
+from brokk_min.kinematics import tool_position
 from brokk_min.logs import Log, read_log, write_log
-from brokk_min.machine import BROKK_170
+from brokk_min.machine import BROKK_170, Machine
 from brokk_min.policy import PolicyController, load_policy
 from brokk_min.sequences import axis_sequences, draw_starts, read_commands, read_starts
 from brokk_min.simulator import simulate
@@ -46,6 +48,7 @@ ALLOWED: tuple[tuple[float, float, str], ...] = (
     (1e-4, 100, "hours"),
     (1, 127, "counts"),
     (0.05, 1e6, "episode_s"),
+    (0.1, 100, "fps"),
 )
 
 
@@ -381,6 +384,113 @@ class Export(Command):
         print(f"{self.out}: observation (batch, obs) in, action (batch, driven joints) out")
 
 
+@dataclass(kw_only=True)
+class Play(Command):
+    """Drive with keyboard or gamepad in a window, and trace lines; see docs/play.md."""
+
+    policy: Path | None = None  # Policy that `train` wrote; without one there are levers only.
+    gains: Path | None = None  # Tuned gains of the Jacobian controller; by default gains.json beside POLICY.
+    interface: str = ""  # python-can's name of a bus; without one a simulated machine stands behind.
+    channel: str = ""  # Channel of the interface.
+    drive: bool = False  # Drive the machine on the bus; without it, nothing is sent there.
+    attempts: Path = Path("attempts.csv")  # Table of the traced lines, kept.
+    log: Path | None = None  # Also log every frame here, candump format.
+    start: tuple[float, ...] = remote.START  # Angles of the simulated machine at the start [rad].
+
+    def run(self) -> None:
+        """Open the window until it is closed."""
+        check(self, self.attempts, self.log)
+        if bool(self.interface) != bool(self.channel) or (self.drive and not self.interface):
+            raise WrongUse("--interface, --channel: expected both or, without --drive, none")
+        machine, where = (
+            MACHINES[self.machine],
+            remote.Where(self.interface, self.channel, self.log, self.start),
+        )
+        if self.interface and not self.drive:
+            play.watch(machine, where)
+            return
+        controllers: dict[str, Controller] = {}
+        if self.policy:
+            policy, beside = load_policy(self.policy, machine), self.policy.with_name("gains.json")
+            gains = self.gains or (beside if beside.exists() else None)
+            known = experiments.read_gains(gains, machine, policy.net) if gains else None
+            known = known or experiments.baselines(machine, policy.net)
+            controllers = {"rl": PolicyController(machine, policy), "jacobian": known["jacobian_pid_k0.1"]}
+            print(f"gains of the Jacobian controller: {gains or 'set by hand'}", file=sys.stderr)
+        play.play(machine, controllers, where, self.attempts)
+
+
+@dataclass(kw_only=True)
+class Replay(Command):
+    """Watch recorded runs side by side: logs of `drive`, or runs of `evaluate`, driven again."""
+
+    logs: tyro.conf.Positional[tuple[Path, ...]]  # One or two candump logs, or one JSON of results.
+    out: Path | None = None  # Write a film, .gif or .mp4, instead of opening a window.
+    fps: float = 10.0  # Pictures a second of the film.
+    size: tuple[int, int] = (960, 540)  # Of the picture [px].
+    controllers: tuple[str, ...] = ("rl", "jacobian_pid_k0.1")  # Whose runs of the results.
+    sequence: str = ""  # Which sequence of the results; by default the first.
+    start: int = 0  # Which start of the results.
+
+    def run(self) -> None:
+        """Open the window until it is closed, or write the film."""
+        check(self, self.out)
+        if not 1 <= len(self.logs) <= 2:
+            raise WrongUse(f"LOGS: expected one or two, got {len(self.logs)}")
+        if self.logs[0].suffix == ".json":
+            machine, runs = self._driven_again(self.logs[0])
+        else:
+            machine, colours = MACHINES[self.machine], list(view.COLOURS.values())
+            pairs = zip(self.logs, colours, strict=False)
+            runs = [replay.run_of_log(machine, log, colour) for log, colour in pairs]
+        if self.out:
+            replay.write_film(self.out, machine, runs, self.size, self.fps)
+        else:
+            replay.show_film(machine, runs, self.size)
+
+    def _driven_again(self, path: Path) -> tuple[Machine, list[replay.Run]]:
+        """Runs of a results file, simulated anew from what it says of itself and compared with its rows."""
+        try:
+            file = json.loads(path.read_text())
+            beside = {"policy": str(path.with_name("policy.npz")), "gains": str(path.with_name("gains.json"))}
+            told = beside | {"plant": "analytic", "commands": "x, y, z", "starts": "drawn"} | file["meta"]
+            rows = file.get("task_space", file)["runs"]
+            machine, seed = MACHINES[told["machine"]], int(told["seed"])
+            starts = np.array(file["starts"]) if "starts" in file else None
+        except (OSError, KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{path}: expected results of `evaluate`, got {error!r}") from error
+        policy, sequences = load_policy(Path(told["policy"]), machine), axis_sequences(machine)
+        if told["commands"] != "x, y, z":
+            sequences = read_commands(Path(told["commands"]), machine)
+        if told["starts"] != "drawn":
+            starts = read_starts(Path(told["starts"]), machine)
+        elif starts is None:
+            rng = np.random.default_rng(seed + 2)
+            starts = draw_starts(machine, sequences, experiments.Effort().starts, rng)
+        known: dict[str, Controller] = {"rl": PolicyController(machine, policy)}
+        if set(self.controllers) - {"rl"}:
+            known |= experiments.read_gains(Path(told["gains"]), machine, policy.net)
+        named = {s.name: s for s in sequences}
+        sequence = named.get(self.sequence or sequences[0].name)
+        if sequence is None or set(self.controllers) - set(known) or not 0 <= self.start < len(starts):
+            raise WrongUse(
+                f"--sequence, --controllers, --start: expected some of {list(named)}, of {list(known)} "
+                f"and below {len(starts)}, got {self.sequence}, {list(self.controllers)}, {self.start}"
+            )
+        chosen = {name: known[name] for name in self.controllers}
+        net = policy.net if told["plant"] == "net" else None
+        again, traces = experiments.task_space(machine, chosen, [sequence], starts, seed, net)
+        for row in (r for r in again if r["start"] == self.start):
+            same = [r for r in rows if all(r[k] == row[k] for k in ("controller", "sequence", "start"))]
+            if not same or not np.isclose(same[0]["velocity_rmse"], row["velocity_rmse"], rtol=1e-3):
+                raise ValueError(f"{path}: expected the run {row}, got {same or 'none'}: another program?")
+        first = tool_position(machine, starts[self.start])
+        return machine, [
+            replay.run_of_trace(machine, name, traces[name, sequence.name], self.start, sequence.goals, first)
+            for name in chosen
+        ]
+
+
 COMMANDS: dict[str, Callable[[], Any]] = {
     "collect": lambda: Collect,
     "fit": lambda: Fit,
@@ -392,6 +502,8 @@ COMMANDS: dict[str, Callable[[], Any]] = {
     "drive": lambda: Drive,
     "convert": lambda: Convert,
     "export": lambda: Export,
+    "play": lambda: Play,
+    "replay": lambda: Replay,
 }
 
 

@@ -545,6 +545,54 @@ def _open(machine: Machine, actuator: ActuatorNet | Path | str) -> ActuatorNet |
     return fitting_nets(machine, net)
 
 
+class _Pictures:
+    """Frames for Gymnasium: trails of the tools since the last reset of each, and a window for `human`."""
+
+    SIZE = (960, 600)
+
+    def __init__(self, machine: Machine, mode: str | None, modes: list[str]) -> None:
+        if mode is not None and mode not in modes:
+            raise ValueError(f"render_mode: expected one of {modes}, got {mode!r}")
+        self.machine, self.mode = machine, mode
+        self.window: Any = None
+        self.trails: dict[int, list[Array]] = {}
+
+    def follow(self, state: State, fresh: ArrayLike) -> None:
+        """After a reset or a step; `fresh` are the rows that begin anew."""
+        if self.mode is not None:
+            self.trails |= {row: [] for row in np.asarray(fresh).tolist()}
+            for row, p_tool in enumerate(tool_position(self.machine, state.q)):
+                self.trails[row].append(p_tool)
+        if self.mode == "human":
+            self.take(state)
+
+    def take(self, state: State | None) -> list[NDArray[np.uint8]]:
+        """A frame (600, 960, 3) of each row, or the first row on the screen. Needs the extra `play`."""
+        from brokk_min import view  # pictures cost nothing where nobody looks
+
+        if state is None or self.mode is None:
+            raise ValueError(f"render: expected a render_mode and a reset before, got {self.mode}")
+        drawn = []
+        for row, trail in self.trails.items():
+            u, goal = state.history[row, :, 2, -1], state.v_goal[row]
+            scene = view.Scene(
+                state.q[row], state.q_dot[row], u, goal, np.array(trail), title=self.machine.name
+            )
+            drawn.append(view.draw(self.machine, [scene], self.SIZE))
+        if self.mode == "human":
+            self.window = self.window or view.Window(self.SIZE, self.machine.name)
+            self.window.pygame.event.pump()
+            self.window.show(drawn[0], self.machine.rate)
+            return []
+        return [view.picture(shapes, self.SIZE) for shapes in drawn]
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self.window is not None:
+            self.window.close()
+            self.window = None
+
+
 class TaskVectorEnv(VectorEnv[Array, Array, Any]):
     """Many machines that follow random tool velocities; an ended episode starts anew in the same step.
 
@@ -557,6 +605,7 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         actuator: nets (object or file) or "analytic" for the plant.
         machine: what moves.
         config: what an episode is.
+        render_mode: None or "rgb_array": `render` gives a frame of each environment.
     """
 
     def __init__(
@@ -565,8 +614,12 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         actuator: ActuatorNet | Path | str = "analytic",
         machine: Machine = BROKK_170,
         config: TaskConfig | None = None,
+        render_mode: str | None = None,
     ) -> None:
-        self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": round(machine.rate)}
+        self.metadata["autoreset_mode"] = AutoresetMode.SAME_STEP
+        self.pictures = _Pictures(machine, render_mode, self.metadata["render_modes"])
+        self.render_mode = render_mode
         self.num_envs, self.machine, self.config = num_envs, machine, config or TaskConfig()
         self.net = _open(machine, actuator)
         self.single_observation_space, self.single_action_space = _spaces(machine)
@@ -580,6 +633,7 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         """Draw new episodes for all environments."""
         super().reset(seed=seed)
         self.state = reset(self.machine, self.config, self.np_random, self.num_envs, self.net is None)
+        self.pictures.follow(self.state, range(self.num_envs))
         return look(self.machine, self.config, self.state, self.np_random), {}
 
     def step(self, actions: Array) -> tuple[Array, Array, Bools, Bools, dict[str, Any]]:
@@ -597,19 +651,32 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
             info |= {"final_obs": observation, "_final_obs": ended}
             observation = observation.copy()
             observation[rows] = look(self.machine, self.config, fresh, self.np_random)
+        self.pictures.follow(self.state, rows)
         return observation, out.reward, out.terminated, out.truncated, info
+
+    def render(self) -> tuple[NDArray[np.uint8], ...]:
+        """A frame (600, 960, 3) of each environment."""
+        return tuple(self.pictures.take(self.state))
 
 
 class TaskEnv(gymnasium.Env[Array, Array]):
-    """One machine that follows random tool velocities: `TaskVectorEnv`'s functions, batch of one."""
+    """One machine that follows random tool velocities: `TaskVectorEnv`'s functions, batch of one.
+
+    With `render_mode` "human" each step shows itself in a window; with "rgb_array" `render` gives a frame.
+    """
+
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 20}  # noqa: RUF012, as Gymnasium has it
 
     def __init__(
         self,
         actuator: ActuatorNet | Path | str = "analytic",
         machine: Machine = BROKK_170,
         config: TaskConfig | None = None,
+        render_mode: str | None = None,
     ) -> None:
-        self.metadata = {"render_modes": []}
+        self.metadata = TaskEnv.metadata | {"render_fps": round(machine.rate)}
+        self.pictures = _Pictures(machine, render_mode, self.metadata["render_modes"])
+        self.render_mode = render_mode
         self.machine, self.config = machine, config or TaskConfig()
         self.net = _open(machine, actuator)
         self.observation_space, self.action_space = _spaces(machine)
@@ -621,6 +688,7 @@ class TaskEnv(gymnasium.Env[Array, Array]):
         """Draw a new episode."""
         super().reset(seed=seed)
         self.state = reset(self.machine, self.config, self.np_random, 1, self.net is None)
+        self.pictures.follow(self.state, [0])
         return look(self.machine, self.config, self.state, self.np_random)[0], {}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
@@ -631,7 +699,16 @@ class TaskEnv(gymnasium.Env[Array, Array]):
         self.state, out = step(self.machine, self.config, self.net, self.state, action, self.np_random)
         info = {"velocity_error": float(out.velocity_error[0])}
         flags = bool(out.terminated[0]), bool(out.truncated[0])
+        self.pictures.follow(self.state, [])
         return out.observation[0], float(out.reward[0]), *flags, info
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """The present picture (600, 960, 3), or None: it is on the screen."""
+        return next(iter(self.pictures.take(self.state)), None)
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        self.pictures.close()
 
 
 def _spaces(machine: Machine) -> tuple[Any, Any]:
