@@ -308,8 +308,9 @@ def test_figure_6_runs_every_controller_and_shows_its_panels() -> None:
             np.testing.assert_array_equal(lines["wanted"], short[0].goals[:, axis])
     rates = figures.plot_joint_rates(BROKK_170, traces, short[2], 0)
     assert [ax.get_ylabel() for ax in rates.axes] == [f"velocity q{i} [rad/s]" for i in (1, 3, 4, 5)]
-    line = next(line for line in rates.axes[1].lines if line.get_label() == "rl")
-    np.testing.assert_array_equal(line.get_ydata(), traces["rl", "z"].q_dot[:, 0, 2])
+    for ax, joint in zip(rates.axes, (0, 2, 3, 4), strict=True):
+        line = next(line for line in ax.lines if line.get_label() == "rl")
+        np.testing.assert_array_equal(line.get_ydata(), traces["rl", "z"].q_dot[:, 0, joint])
     plt.close("all")
 
 
