@@ -21,6 +21,15 @@ LOW, HIGH = M.column("q_min"), M.column("q_max")
 GAINS = {"kp": 1.0, "ki": 8.0, "kd": 0.05, "feedback": 0.4, "ready": 0.015}
 
 
+def a1() -> dict[str, float]:
+    """Share of poses off the ground in which Nakamura's damping acts; and of those beyond 2.5 m."""
+    q = np.random.default_rng(0).uniform(LOW, HIGH, (20_000, M.n))
+    p, _, lowest = kinematics.tool_state(M, q, 0 * q)
+    damped = jacobian.manipulability(kinematics.jacobian(M, q)) < jacobian.manipulability_threshold(M)
+    off, far = ~terminated(M, lowest), np.hypot(p[:, 0], p[:, 1]) > 2.5
+    return {"all": float(damped[off].mean()), "far": float(damped[off & far].mean())}
+
+
 def d1() -> dict[str, float]:
     """Share of the wanted tool velocity that both forms of eq4 miss, over random poses and directions."""
     rng = np.random.default_rng(0)
@@ -95,7 +104,7 @@ def a11() -> dict[str, float]:
     return {"open": error(GAINS, 0.05), "idle": error(GAINS | {"ready": 0.0}, 0.05)}
 
 
-ENTRIES: tuple[Callable[[], dict[str, float]], ...] = (d1, d3, d6, a6, a7, a9, a11)
+ENTRIES: tuple[Callable[[], dict[str, float]], ...] = (a1, d1, d3, d6, a6, a7, a9, a11)
 
 
 def main() -> None:
