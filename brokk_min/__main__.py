@@ -2,6 +2,7 @@
 
 import json
 import os
+import runpy
 import shutil
 import sys
 from collections.abc import Callable
@@ -25,7 +26,7 @@ from brokk_min.sequences import axis_sequences, draw_starts, read_commands, read
 from brokk_min.simulator import simulate
 
 MACHINES = {machine.name: machine for machine in (BROKK_170,)}
-Name = Annotated[str, tyro.conf.arg(metavar="{" + ",".join(MACHINES) + "}")]
+Name = Annotated[str, tyro.conf.arg(metavar="{" + ",".join(MACHINES) + "}|FILE.py:NAME")]
 
 
 class WrongUse(ValueError):
@@ -61,18 +62,33 @@ def check(command: Any, *outputs: Path | None) -> None:
             if name in given and not low <= given[name] <= high:
                 option = name.replace("_", "-")
                 raise WrongUse(f"--{option}: expected {low} to {high}, got {given[name]}")
-    if given.get("machine", BROKK_170.name) not in MACHINES:
-        raise WrongUse(f"--machine: expected one of {list(MACHINES)}, got {given['machine']}")
+    name = given.get("machine") or BROKK_170.name
+    if name not in MACHINES:
+        MACHINES[name] = machine_from(name)
     for path in outputs:
         if path and (path.is_dir() or not os.access(path.parent, os.W_OK)):
             raise WrongUse(f"{path}: expected a file in an existing, writable directory")
+
+
+def machine_from(name: str) -> Machine:
+    """The machine `FILE.py:NAME`: it runs the file, as `python FILE.py` would."""
+    path, _, symbol = name.rpartition(":")
+    if not path.endswith(".py"):
+        raise WrongUse(f"--machine: expected one of {list(MACHINES)} or FILE.py:NAME, got {name}")
+    try:
+        machine = runpy.run_path(path).get(symbol)
+    except Exception as error:  # whatever the file does
+        raise ValueError(f"--machine: expected {path} to run, got {error!r}") from error
+    if not isinstance(machine, Machine):
+        raise WrongUse(f"--machine: expected a Machine {symbol} in {path}, got {machine!r}")
+    return machine
 
 
 @dataclass(kw_only=True)
 class Command:
     """What most commands share."""
 
-    machine: Name = BROKK_170.name  # Which machine.
+    machine: Name = BROKK_170.name  # Which machine; FILE.py:NAME runs that file, so name only one you trust.
     seed: int = 0  # Of everything random.
 
 
@@ -104,6 +120,7 @@ class Fit:
     test: tuple[Path, ...] = ()  # Logs to score on; without them every tenth recording of LOGS is held out.
     json: Path | None = None  # Also write the scores here.
     figure: Path | None = None  # Also draw free runs of the worst and the median recording here, .png.
+    machine: Name = ""  # Whose nets these are; by default the machine that has the joints of LOGS.
     velocity_samples: int = BROKK_170.velocity_samples  # Window of the velocity estimator at 20 Hz.
     paper: bool = False  # The paper's own recipe: errors of one step alone, no noise, all samples alike.
     settings: tyro.conf.OmitArgPrefixes[FitConfig] = field(default_factory=FitConfig)  # The fit.
@@ -118,10 +135,13 @@ class Fit:
             raise WrongUse(f"--velocity-samples: expected at most --history, got {self.velocity_samples}")
         log = read_log(self.logs, self.velocity_samples)
         log, test = (log, read_log(self.test, self.velocity_samples, log.joints)) if self.test else split(log)
-        known = [machine for machine in MACHINES.values() if machine.names == log.joints]
-        names = "".join(machine.name for machine in known)
+        chosen = [MACHINES[self.machine]] if self.machine else MACHINES.values()
+        known = [machine for machine in chosen if machine.names == log.joints]
+        if self.machine and not known:
+            raise ValueError(f"LOGS: expected joints of --machine {self.machine}, got {list(log.joints)}")
+        name = known[0].name if len({machine.name for machine in known}) == 1 else ""
         settings = replace(self.settings, **PAPER_RECIPE) if self.paper else self.settings
-        net = fit(log, settings, self.seed, self.velocity_samples, names)
+        net = fit(log, settings, self.seed, self.velocity_samples, name)
         save_net(self.out, net)
         verdict = preliminary.judge(net, log, test, known[0] if known else None)
         if self.json:

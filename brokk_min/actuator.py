@@ -270,7 +270,7 @@ def rest_history(q: ArrayLike, samples: int) -> Array:
 
 
 def push_command(history: Array, u: ArrayLike) -> Array:
-    """History (..., n, 3, H) with the command `u` (..., n) of this tick appended: the nets' input."""
+    """History (..., n, 3, H) and the command `u` (..., n) of this tick: the nets' input. Paper: Table 1"""
     result = history.copy()
     result[..., 2, :-1] = history[..., 2, 1:]
     result[..., 2, -1] = u

@@ -167,7 +167,7 @@ def observe(
     arm has to do then does not depend on where it points. Wanted rates are the joint rates that would
     give the goal velocity, and those that would make up for `lag` (both by `joint_rates`).
 
-    Paper: Sec. 3.4 (present and target tool velocity, inputs of the actuator nets); the rates are ours
+    Paper: Sec. 3.4 (present and target tool velocity, the actuator nets' inputs), Fig. 3; rates are ours
 
     Args:
         machine: n joints.
@@ -251,7 +251,7 @@ def push_measured(
 def to_command(machine: Machine, action: ArrayLike) -> Array:
     """Commands for all joints from the policy's actions: limited, in whole PWM counts.
 
-    Paper: Sec. 3.4 (PWM out) and Sec. 3.2 (65 %)
+    Paper: Sec. 3.4 (PWM out), Sec. 3.2 (65 %), Fig. 3
 
     Args:
         machine: n joints.
@@ -491,7 +491,7 @@ def rollout(
     rng: np.random.Generator,
     net: ActuatorNet | None = None,
 ) -> Trace:
-    """Let one controller follow given goals from rest: on the plant, or on nets.
+    """Let one controller follow given goals from rest: on the plant, or on nets. Paper: Fig. 3
 
     Args:
         machine: n joints.
@@ -594,7 +594,7 @@ class _Pictures:
 
 
 class TaskVectorEnv(VectorEnv[Array, Array, Any]):
-    """Many machines that follow random tool velocities; an ended episode starts anew in the same step.
+    """Many machines following random tool velocities; an ended episode starts anew at once. Paper: Fig. 4
 
     Observation: Box, see `observe`. Action: Box [-1, 1] a driven joint, 1 = the command limit.
     Reward: `reward` less `valve_cost`, see `step`. `info["final_obs"]` holds the last observation of an

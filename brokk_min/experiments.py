@@ -187,7 +187,7 @@ def summary(runs: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, 
 
 
 def driven_log(machine: Machine, traces: Traces, controller: str) -> logs.Log:
-    """What encoders and valves said during one controller's runs, as recordings for `score`."""
+    """What encoders and valves said in one controller's runs, as recordings for `score`. Paper: Sec. 4.1"""
     recordings = []
     for (name, sequence), trace in traces.items():
         for i in range(trace.q.shape[1] * (name == controller)):

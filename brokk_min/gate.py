@@ -143,7 +143,7 @@ def gate_start(machine: Machine, shape: tuple[int, ...] = ()) -> GateState:
 
 
 def gate(machine: Machine, state: GateState, inputs: GateInputs, now: ArrayLike) -> tuple[GateState, Array]:
-    """Every command passes here: the next state and the valve frame, from state, inputs and time alone.
+    """Every command passes here: next state and valve frame from state, inputs and time alone. Paper: Sec. 2
 
     It is silent until armed, by a fresh edge of the dead-man switch with centred stick while nothing is
     wrong. Driving, it lets no command out that grows faster than `SLEW`, goes outward at a joint limit or

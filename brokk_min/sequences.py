@@ -123,7 +123,7 @@ def _feasible_draws(
 
 
 def draw_starts(machine: Machine, sequences: Sequence[Commands], num: int, rng: np.random.Generator) -> Array:
-    """Random poses (num, n) [rad] from which all sequences are `feasible`; ValueError: too few such poses."""
+    """Random poses (num, n) [rad] where all sequences are `feasible`; else ValueError. Paper: Fig. 6a"""
     goals = [np.repeat(sequence.goals[:, None], 400, axis=1) for sequence in sequences]
 
     def draw() -> tuple[Array, list[Array]]:

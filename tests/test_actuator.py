@@ -920,3 +920,21 @@ def test_speed_limits_are_where_the_plant_settles_at_the_command_limit():
             velocity = plant_velocity(BROKK_170, state)[:, joint]
             np.testing.assert_allclose(velocity, now, rtol=0.03)
             assert (sign * limit[:, joint] > 0.05).all()
+
+
+# --- what planted errors had passed ---------------------------------------------------------------
+
+
+def test_lever_arm_of_q5_at_an_acute_angle_by_hand():
+    # sides 0.6 and 0.2 under 60 degrees: third side sqrt(0.28), height 0.6 * 0.2 * sin 60 degrees / it
+    arm = lever_arm(BROKK_170, np.full(5, np.pi / 3 - 0.4))
+    assert arm[Q5] == pytest.approx(0.19640, abs=1e-5)
+
+
+def test_the_first_count_that_moves_anything_is_eleven():
+    """8.9 counts of dead zone, and the next 1.2 open the spool too little (1 %) to wake an idle valve."""
+    for sign in (1, -1):
+        _, velocities, _ = record(BROKK_170, MIDDLE, np.full((100, 5), sign * 10 / 127))
+        assert not velocities.any()
+        _, velocities, _ = record(BROKK_170, MIDDLE, np.full((100, 5), sign * 11 / 127))
+        assert np.all(sign * velocities[-1] > 1e-4)

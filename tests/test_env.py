@@ -985,3 +985,35 @@ def test_rollout_noise_reaches_the_controller_and_is_reproducible():
     assert np.array_equal(seen["a"], seen["b"])
     tool = parts(BROKK_170, seen["a"] - seen["c"])[1] / 1.4
     assert 0.045 < np.abs(tool).max() <= 0.05 + 1e-5
+
+
+# --- nothing is written to ------------------------------------------------------------------------
+
+
+def sealed(values):
+    """The same arrays, read-only."""
+    for array in values:
+        array.setflags(write=False)
+    return values
+
+
+@pytest.mark.parametrize("plant", [True, False])
+@pytest.mark.parametrize("machine", [BROKK_170, *MACHINES[:4]], ids=lambda m: m.name)
+def test_arrays_that_go_in_are_never_written_to(machine, plant):
+    """States, observations and actions are read-only here: a write in place would raise."""
+    rng = np.random.default_rng(31)
+    net = None if plant else small_net(machine, rng)
+    state = task.reset(machine, TaskConfig(hold_min_s=0.05, hold_max_s=0.1), rng, 6, plant)
+    controller = JacobianController(machine, join_gains(machine, dict.fromkeys(GAINS, 0.1)), 0.1, 1.0)
+    memory = controller.start(6)
+    for _ in range(4):
+        sealed(flat(state))
+        (action,) = sealed([rng.uniform(-1, 1, (6, len(machine.driven))).astype(np.float32)])
+        fresh = task.reset(machine, TaskConfig(), rng, 2, plant)
+        sealed(flat(fresh))
+        after, outcome = task.step(machine, TaskConfig(), net, state, action, rng)
+        sealed(outcome)
+        task.merge(state, fresh, np.array([1, 4]))
+        sealed(task.measured(machine, outcome.observation))
+        _, memory = controller(outcome.observation, type(memory)(*sealed(list(memory))))
+        state = after

@@ -897,3 +897,8 @@ def test_more_frames_than_a_bus_can_carry_are_a_fault() -> None:
     world.run(0.2)
     assert "expected fewer than 2000 frames" in world.drive.reason and not world.drive.gate.driving
     world.close()
+
+
+def test_wishes_are_rounded_not_cut() -> None:
+    wish = hw.unpack_wish(hw.Wish((0.00019, -0.00019, 0.00011)).pack())
+    assert wish.v_goal == (0.0002, -0.0002, 0.0001)

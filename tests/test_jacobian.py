@@ -513,3 +513,11 @@ def test_candidates_side_by_side_are_the_single_controllers():
         alone = rollout(BROKK_170, one, POSE[None], goals[:, :1], quiet, rng)
         np.testing.assert_allclose(whole.u[:, i], alone.u[:, 0], atol=1e-9)
         np.testing.assert_allclose(whole.q[:, i], alone.q[:, 0], atol=1e-6)
+
+
+def test_the_map_keeps_the_joints_apart():
+    """Halfway between its angles the first joint moves at 1.5 rad/s under full command, the second at 4.5."""
+    velocity = np.array([[[-1.0, 0.0, 1.0], [-2.0, 0.0, 2.0]], [[-3.0, 0.0, 3.0], [-6.0, 0.0, 6.0]]])
+    steady = classic.SteadyMap(np.array([[0.0, 1.0], [0.0, 1.0]]), np.array([-1.0, 0.0, 1.0]), velocity)
+    found = steady.command(np.array([0.5, 0.5]), np.array([0.75, 0.75]))
+    np.testing.assert_allclose(found, [0.75 / 1.5, 0.75 / 4.5], atol=1e-9)

@@ -98,3 +98,13 @@ def test_tuning_runs_are_drawn_like_the_policys_episodes() -> None:
     assert max(holds) > 40 and np.mean(holds) < config.hold_max_s * 20
     again = sequences.tuning_goals(BROKK_170, 8, 12.0, 7)
     assert np.array_equal(starts, again[0]) and np.array_equal(goals, again[1])
+
+
+def test_feasible_refuses_a_tool_that_stays_behind() -> None:
+    """Stretched out straight no joint can move the tool outward: all stand, slow and inside their ranges."""
+    wide = [replace(j, cylinder_base=0.0, q_min=-3.0, q_max=4.0) for j in BROKK_170.joints]
+    machine = replace(BROKK_170, joints=tuple(wide))
+    start = np.array([[0.0, 0.5, 0.1, np.pi, 3 * np.pi / 4]])
+    outward = np.array([np.cos(0.6), 0.0, np.sin(0.6)]) / 5  # along the links behind q2
+    assert sequences.feasible(machine, start, np.zeros((5, 1, 3)))[0]
+    assert not sequences.feasible(machine, start, np.tile(outward, (5, 1, 1)))[0]
