@@ -45,6 +45,7 @@ from brokk_min.machine import (
     read_encoder,
 )
 
+GROUND_MARGIN = 0.3  # m above the ground below which no goal asks the arm to sink, assumed
 LAG_TIME, LAG_SPEED = 2.0, 0.07  # s and a share of tool_speed, tuned: see `push_lag`
 Array = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]
@@ -68,6 +69,8 @@ class TaskConfig:
     """Largest noise of the measured part of an observation, in standard deviations (paper: 5 %)."""
     valve_cost: float = 0.01
     """Reward lost for each change of a command by its limit, mean of the driven joints (paper: 0)."""
+    group: int = 1
+    """Neighbouring environments that share start poses and goals, for learners that compare them."""
     redraw_ground: bool = True
     """Redraw start poses in the ground; False is the paper's rule: end the episode without reward."""
 
@@ -380,8 +383,14 @@ def _draw_hold(machine: Machine, config: TaskConfig, rng: np.random.Generator, n
 def reset(machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int, plant: bool) -> State:
     """`num` machines at rest in random poses with random goals; leading shape (num,)."""
     pose, goal = draw_pose(machine, config, rng, num), draw_goal(machine, config, rng, num)
-    state = rest_state(machine, pose, goal, plant)
-    return replace(state, goal_ticks=_draw_hold(machine, config, rng, num))
+    first = _first_of_group(config, num)
+    state = rest_state(machine, pose[first], goal[first], plant)
+    return replace(state, goal_ticks=_draw_hold(machine, config, rng, num)[first])
+
+
+def _first_of_group(config: TaskConfig, num: int) -> NDArray[np.intp]:
+    """Which environment's pose and goals each of `num` has, (num,)."""
+    return np.arange(num) // config.group * config.group
 
 
 def look(machine: Machine, config: TaskConfig, state: State, rng: np.random.Generator) -> Array:
@@ -411,8 +420,9 @@ def step(
 ) -> tuple[State, Outcome]:
     """One tick of `num` environments, without resets: `action` (num, n_driven) in [-1, 1].
 
-    The reward is `reward` for the goal that held during the tick less `valve_cost`; a new goal is drawn
-    after it. On a tick that ends in the ground the reward is zero.
+    The reward is `reward` for the goal that held during the tick less `valve_cost`; where it is over, or
+    asks an arm close to the ground to sink, a new one is drawn after it. On a tick that ends in the ground
+    the reward is zero.
     """
     before, state = state, transition(machine, net, state, to_command(machine, action))
     _, v_tool, lowest = tool_state(machine, state.q.astype(np.float32), state.q_dot.astype(np.float32))
@@ -421,15 +431,25 @@ def step(
     error = 1 / rewards - 1
     if config.valve_cost:
         rewards = rewards - np.float32(config.valve_cost) * _travel(machine, before, state)
-    due = np.flatnonzero(state.goal_ticks <= 0)
-    if len(due):
-        goals, holds = state.v_goal.copy(), state.goal_ticks.copy()
-        goals[due] = draw_goal(machine, config, rng, len(due))
-        holds[due] = _draw_hold(machine, config, rng, len(due))
-        state = replace(state, v_goal=goals, goal_ticks=holds)
+    state = _next_goals(machine, config, state, lowest, rng)
     observation = look(machine, config, state, rng)
     truncated = (state.ticks >= round(config.episode_s * machine.rate)) & ~end
     return state, Outcome(observation, np.where(end, 0.0, rewards), end, truncated, error)
+
+
+def _next_goals(
+    machine: Machine, config: TaskConfig, state: State, lowest: Array, rng: np.random.Generator
+) -> State:
+    low = lowest < machine.ground + GROUND_MARGIN
+    due = np.flatnonzero((state.goal_ticks <= 0) | (low & (state.v_goal[..., 2] < 0)))
+    if not len(due):
+        return state
+    goals, holds = state.v_goal.copy(), state.goal_ticks.copy()
+    goals[due] = draw_goal(machine, config, rng, len(due))
+    goals[due, 2] = np.where(low[due], np.abs(goals[due, 2]), goals[due, 2])
+    holds[due] = _draw_hold(machine, config, rng, len(due))
+    first = _first_of_group(config, len(goals))
+    return replace(state, v_goal=goals[first], goal_ticks=holds[first])
 
 
 def _travel(machine: Machine, before: State, after: State) -> Array:
