@@ -363,6 +363,19 @@ def fingerprint(net: ActuatorNet) -> str:
     return digest.hexdigest()[:16]
 
 
+def identity_of(
+    machine: Machine, net: ActuatorNet, task: TaskConfig, config: PPOConfig, seed: int
+) -> dict[str, Any]:
+    """All that decides the outcome of a training; kept in checkpoints and policies."""
+    return {
+        "machine": machine.name,
+        "actuator": fingerprint(net),
+        "seed": seed,
+        "task": asdict(task),
+        "settings": asdict(config),
+    }
+
+
 def train(
     machine: Machine,
     net: ActuatorNet,
@@ -392,13 +405,7 @@ def train(
     """
     env = TaskVectorEnv(config.num_envs, net, machine, task)
     training = Training(env, config, seed)
-    identity = {
-        "machine": machine.name,
-        "actuator": fingerprint(net),
-        "seed": seed,
-        "task": asdict(task),
-        "settings": asdict(config),
-    }
+    identity = identity_of(machine, net, task, config, seed)
     checkpoint, curve = Path(f"{out}.checkpoint"), Path(f"{out}.csv")
     if resume and checkpoint.exists():
         training.load(checkpoint, identity)
