@@ -27,7 +27,14 @@ from brokk_min.actuator import (
     push_command,
     rest_history,
 )
-from brokk_min.kinematics import joint_rates, lowest_point, tool_position, tool_state, tool_velocity
+from brokk_min.kinematics import (
+    damped_rates,
+    lowest_point,
+    tool_jacobian,
+    tool_position,
+    tool_state,
+    tool_velocity,
+)
 from brokk_min.machine import (
     BROKK_170,
     PWM_MAX,
@@ -96,7 +103,9 @@ class _Layout(NamedTuple):
 
     mean: Array
     scale: Array
-    sensed: Array  # noise of 1 on what sensors say, in units of the observation; 0 for the rest
+    sensed: Array  # what noise of 1 does to what sensors say, in physical units; 0 for the rest
+    angles: NDArray[np.intp]  # where the newest angles of all joints stand, (n,)
+    told: NDArray[np.intp]  # what a flattened history (n * 3 * H) gives: locked angles, driven histories
 
 
 def _layout(machine: Machine) -> _Layout:
@@ -122,7 +131,13 @@ def _layout(machine: Machine) -> _Layout:
         blocks += [(zero, rate[driven], 4.2, 0), (zero, 0.1 * rate[driven], 4.2, 0)]
         means, scales, noises = zip(*((m, d / w, w * s + 0 * m) for m, d, w, s in blocks), strict=True)
         mean, scale, sensed = (np.concatenate(a).astype(np.float32) for a in (means, scales, noises))
-        machine.__dict__["layout"] = _Layout(mean, scale, sensed)
+        body = 6 + len(rest)
+        angles = np.zeros(machine.n, int)
+        angles[rest] = np.arange(6, body)
+        angles[driven] = body + samples * (1 + 3 * np.arange(len(driven))) - 1
+        place = np.arange(machine.n * 3 * samples).reshape(machine.n, 3, samples)
+        told = np.concatenate([place[rest, 0, -1], place[driven].ravel()])
+        machine.__dict__["layout"] = _Layout(mean, scale, sensed * scale, angles, told)
     layout: _Layout = machine.__dict__["layout"]
     return layout
 
@@ -164,32 +179,22 @@ def observe(
     Returns:
         Shape (..., 6 + locked + (3 H + 2) n_driven), float32.
     """
-    p_tool, v_tool, _ = tool_state(machine, history[..., 0, -1], history[..., 1, -1])
-    v_goal, lag = (np.broadcast_to(np.asarray(v, np.float32), v_tool.shape) for v in (v_goal, lag))
-    driven = history[..., machine.driven, :, :]
-    mean, scale, sensed = _layout(machine)
-    size = len(mean) - 2 * len(machine.driven)  # without the rates
-    seen = np.zeros((*v_tool.shape[:-1], len(mean)), np.float32)
-    both = _turn(p_tool[..., None, :], np.stack([v_goal, v_tool], axis=-2), 1)
-    seen[..., :6] = both.reshape(*both.shape[:-2], 6)
-    seen[..., 6 : 6 + len(machine.locked)] = history[..., machine.locked, 0, -1]
-    seen[..., 6 + len(machine.locked) : size] = driven.reshape(*driven.shape[:-3], -1)
-    seen += noise * sensed * scale
-    q = _angles(machine, seen)
-    rates = joint_rates(machine, q[..., None, :], np.stack([v_goal, lag], axis=-2))
-    seen[..., size:] = rates.reshape(*rates.shape[:-2], -1)
+    mean, scale, sensed, angles, told = _layout(machine)
+    q, batch = history[..., 0, -1], history.shape[:-3]
+    seen = np.zeros((*batch, len(mean)), np.float32)
+    seen[..., 6 : 6 + len(told)] = history.reshape(*batch, -1)[..., told]
+    seen += noise * sensed
+    # the arm where it is and where it is seen, in one pass: few large steps are faster than many small ones
+    p_tool, J = tool_jacobian(machine, np.stack([q, seen[..., angles]], axis=-2))
+    given = np.empty((*batch, 3, 3), np.float32)
+    given[..., 0, :], given[..., 2, :] = v_goal, lag
+    given[..., 1, :] = (J[..., 0, :, :] * history[..., None, :, 1, -1]).sum(axis=-1)
+    seen[..., :6] += _turn(p_tool[..., :1, :], given[..., :2, :], 1).reshape(*batch, 6)
+    rates = damped_rates(machine, J[..., 1:, :, machine.driven], given[..., ::2, :])
+    seen[..., 6 + len(told) :] = rates.reshape(*batch, -1)
     seen -= mean
     seen /= scale
     return seen
-
-
-def _angles(machine: Machine, values: Array) -> Array:
-    """Newest angles of all joints (..., n) in observations (..., obs) in physical units."""
-    first, q = 6 + len(machine.locked), np.empty((*values.shape[:-1], machine.n), values.dtype)
-    q[..., machine.locked] = values[..., 6:first]
-    newest = first + machine.history * (1 + 3 * np.arange(len(machine.driven))) - 1
-    q[..., machine.driven] = values[..., newest]
-    return q
 
 
 def _turn(p_tool: Array, vector: Array, sign: int) -> Array:
@@ -197,19 +202,20 @@ def _turn(p_tool: Array, vector: Array, sign: int) -> Array:
     x, y = p_tool[..., 0], p_tool[..., 1]
     radius = np.maximum(np.hypot(x, y), 1e-6)
     c, s = x / radius, sign * y / radius
-    turned = (c * vector[..., 0] + s * vector[..., 1], c * vector[..., 1] - s * vector[..., 0])
-    return np.stack([*turned, vector[..., 2]], axis=-1)
+    turned = vector.copy()
+    turned[..., 0] = c * vector[..., 0] + s * vector[..., 1]
+    turned[..., 1] = c * vector[..., 1] - s * vector[..., 0]
+    return turned
 
 
 def measured(machine: Machine, observation: Array) -> Measured:
     """Undo `observe`: the newest measurements in physical units, from observations (..., obs)."""
-    mean, scale, _ = _layout(machine)
+    mean, scale, _, angles, _ = _layout(machine)
     values = observation * scale + mean
-    q = _angles(machine, values)
+    q = values[..., angles]
     p_tool = tool_position(machine, q)
     v_goal, v_tool = (_turn(p_tool, values[..., i : i + 3], -1) for i in (0, 3))
-    newest = 6 + len(machine.locked) + machine.history * (2 + 3 * np.arange(len(machine.driven))) - 1
-    return Measured(v_goal, v_tool, q, values[..., newest])
+    return Measured(v_goal, v_tool, q, values[..., angles[machine.driven] + machine.history])
 
 
 def push_lag(machine: Machine, history: Array, v_goal: Array, lag: Array) -> Array:
