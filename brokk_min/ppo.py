@@ -23,7 +23,7 @@ from torch import nn
 from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet, load_header, net_arrays
-from brokk_min.env import State, TaskConfig, TaskVectorEnv, observation_scale
+from brokk_min.env import State, TaskConfig, TaskVectorEnv, observation_scale, paper_view
 from brokk_min.logs import load_arrays, whole_file
 from brokk_min.machine import Machine
 from brokk_min.policy import Policy, contract, save_policy
@@ -288,6 +288,8 @@ class Training:
         weights = [
             (layer.weight.detach().numpy().T.copy(), layer.bias.detach().numpy().copy()) for layer in layers
         ]
+        if self.env.config.paper:
+            weights[0] = (weights[0][0] * paper_view(self.env.machine)[:, None], weights[0][1])
         mean, scale = observation_scale(self.env.machine)
         flat = tuple(array for pair in weights for array in pair)
         if self.env.net is None:

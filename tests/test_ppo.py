@@ -26,7 +26,7 @@ from torch import nn
 from brokk_min import logs, ppo
 from brokk_min.__main__ import main
 from brokk_min.actuator import save_net
-from brokk_min.env import TaskConfig, TaskVectorEnv
+from brokk_min.env import TaskConfig, TaskVectorEnv, look
 from brokk_min.machine import BROKK_170
 from brokk_min.policy import load_policy
 from brokk_min.ppo import Agent, PPOConfig, Training, gae, train
@@ -911,6 +911,27 @@ def test_a_plant_is_not_what_policies_are_trained_on():
     training = Training(TaskVectorEnv(8, "analytic", BROKK_170, TASK), TINY, 0)
     with pytest.raises(ValueError, match="actuator: expected a policy trained on nets, got"):
         training.policy({})
+
+
+def test_a_policy_of_the_papers_observation_runs_on_every_observation(tmp_path):
+    """Trained on a part of what `observe` gives, it acts the same on all of it, after a file too."""
+    task = replace(TASK, paper=True)
+    run(tmp_path / "p.npz", task=task)
+    policy = load_policy(tmp_path / "p.npz", BROKK_170)
+    assert policy.training["task"]["paper"] is True
+    training = Training(TaskVectorEnv(8, NET, BROKK_170, task), TINY, 3)
+    for _ in range(3):
+        training.update()
+    policy, seen = training.policy({}), training.observation
+    full = look(BROKK_170, TASK, training.env.state, np.random.default_rng(7))
+    part = look(BROKK_170, task, training.env.state, np.random.default_rng(7))
+    with torch.no_grad():
+        wanted = training.agent.actor(torch.from_numpy(part)).numpy()
+    assert np.abs(wanted).max() > 1e-3 and part.shape == full.shape == seen.shape
+    np.testing.assert_allclose(policy.act(full), wanted, atol=1e-6)
+    rates = full.copy()
+    rates[:, -8:] += 1.0
+    assert np.array_equal(policy.act(rates), policy.act(full))  # blind to them
 
 
 def test_a_net_for_another_machine_is_refused(tmp_path):
