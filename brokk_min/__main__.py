@@ -48,6 +48,8 @@ ALLOWED: tuple[tuple[float, float, str], ...] = (
     (1e-9, 1e9, "target_kl max_grad_norm clip"),
     (1e-4, 100, "hours"),
     (1, 127, "counts"),
+    (1, 10000, "seeds"),
+    (1, 1000, "poses"),
     (0.05, 1e6, "episode_s"),
     (0.1, 100, "fps"),
 )
@@ -62,6 +64,8 @@ def check(command: Any, *outputs: Path | None) -> None:
             if name in given and not low <= given[name] <= high:
                 option = name.replace("_", "-")
                 raise WrongUse(f"--{option}: expected {low} to {high}, got {given[name]}")
+    if given.get("hold_min_s", 0) > given.get("hold_max_s", 0):
+        raise WrongUse(f"--hold-max-s: expected --hold-min-s or more, got {given['hold_max_s']}")
     name = given.get("machine") or BROKK_170.name
     if name not in MACHINES:
         MACHINES[name] = machine_from(name)
@@ -192,14 +196,43 @@ def train_command() -> Any:
         def run(self) -> None:
             """Train and write the policy."""
             check(self, self.out)
-            if self.task.hold_min_s > self.task.hold_max_s:
-                raise WrongUse(f"--hold-max-s: expected --hold-min-s or more, got {self.task.hold_max_s}")
             machine = MACHINES[self.machine]
             net = fitting_nets(machine, load_net(self.actuator))
             train(machine, net, self.task, self.settings, self.seed, self.out, self.resume, self.tensorboard)
             print(f"{self.out}: trained for {self.settings.total_steps} steps; curve in {self.out}.csv")
 
     return Train
+
+
+def sweep_command() -> Any:
+    """The command `sweep`; made on demand as `train`."""
+    from brokk_min.ppo import PPOConfig
+    from brokk_min.sweep import show, sweep
+
+    @dataclass(kw_only=True)
+    class Sweep(Command):
+        """Train and evaluate many seeds on all cores or a cluster; finished seeds are not run again."""
+
+        actuator: Path  # Nets that `fit` wrote.
+        out: Path  # Folder for a policy, a curve and figures of each seed, and sweep.json.
+        seeds: int = 10  # How many, from --seed on.
+        poses: int = 16  # Start poses for each of the three scored sequences.
+        scheduler: str | None = None  # tcp://... of a dask scheduler (extra `sweep`); OUT must be shared.
+        gains: Path | None = None  # Tuned gains that `reproduce` wrote: baselines beside.
+        settings: tyro.conf.OmitArgPrefixes[PPOConfig] = field(default_factory=PPOConfig)
+        """The learner; each seed runs on one thread, whatever --threads says."""
+        task: tyro.conf.OmitArgPrefixes[TaskConfig] = field(default_factory=TaskConfig)  # What an episode is.
+
+        def run(self) -> None:
+            """Sweep and print the table."""
+            check(self)
+            machine = MACHINES[self.machine]
+            net = fitting_nets(machine, load_net(self.actuator))
+            seeds = range(self.seed, self.seed + self.seeds)
+            of, how = self.settings, (self.poses, self.scheduler, self.gains)
+            print(show(sweep(machine, net, self.task, of, seeds, self.out, *how)))
+
+    return Sweep
 
 
 @dataclass(kw_only=True)
@@ -516,6 +549,7 @@ COMMANDS: dict[str, Callable[[], Any]] = {
     "fit": lambda: Fit,
     "preliminary": lambda: Preliminary,
     "train": train_command,
+    "sweep": sweep_command,
     "evaluate": lambda: Evaluate,
     "reproduce": lambda: Reproduce,
     "machine": lambda: Simulate,

@@ -73,6 +73,8 @@ class TaskConfig:
     """Neighbouring environments that share start poses and goals, for learners that compare them."""
     redraw_ground: bool = True
     """Redraw start poses in the ground; False is the paper's rule: end the episode without reward."""
+    paper: bool = False
+    """Observation (no wanted rates, no weights) and reward (no valve cost) as the paper has them."""
 
 
 @dataclass(frozen=True)
@@ -108,6 +110,7 @@ class _Layout(NamedTuple):
     scale: Array
     sensed: Array  # what noise of 1 does to what sensors say, in physical units; 0 for the rest
     angles: NDArray[np.intp]  # where the newest angles of all joints stand, (n,)
+    paper: Array  # factors that make it the paper's: weights undone, wanted rates blanked
     told: NDArray[np.intp]  # what a flattened history (n * 3 * H) gives: locked angles, driven histories
 
 
@@ -132,15 +135,16 @@ def _layout(machine: Machine) -> _Layout:
                 (0 * each, command * each, samples**-0.5, 0),
             ]
         blocks += [(zero, rate[driven], 4.2, 0), (zero, 0.1 * rate[driven], 4.2, 0)]
-        means, scales, noises = zip(*((m, d / w, w * s + 0 * m) for m, d, w, s in blocks), strict=True)
-        mean, scale, sensed = (np.concatenate(a).astype(np.float32) for a in (means, scales, noises))
+        columns = zip(*((m, d / w, w * s + 0 * m, 1 / w + 0 * m) for m, d, w, s in blocks), strict=True)
+        mean, scale, sensed, paper = (np.concatenate(a).astype(np.float32) for a in columns)
+        paper[-2 * len(driven) :] = 0
         body = 6 + len(rest)
         angles = np.zeros(machine.n, int)
         angles[rest] = np.arange(6, body)
         angles[driven] = body + samples * (1 + 3 * np.arange(len(driven))) - 1
         place = np.arange(machine.n * 3 * samples).reshape(machine.n, 3, samples)
         told = np.concatenate([place[rest, 0, -1], place[driven].ravel()])
-        machine.__dict__["layout"] = _Layout(mean, scale, sensed * scale, angles, told)
+        machine.__dict__["layout"] = _Layout(mean, scale, sensed * scale, angles, paper, told)
     layout: _Layout = machine.__dict__["layout"]
     return layout
 
@@ -159,6 +163,15 @@ def observation_scale(machine: Machine) -> tuple[Array, Array]:
     what is large at its input. Paper: Sec. 3.4 (normalisation)
     """
     return _layout(machine)[:2]
+
+
+def paper_view(machine: Machine) -> Array:
+    """Factors (obs,) that leave of an observation what the paper's agent sees. Paper: Sec. 3.4
+
+    Weights of `observation_scale` are undone, wanted rates blanked: a policy trained on that runs on every
+    observation of `observe` once the factors stand in its first layer.
+    """
+    return _layout(machine).paper
 
 
 def observe(
@@ -182,7 +195,7 @@ def observe(
     Returns:
         Shape (..., 6 + locked + (3 H + 2) n_driven), float32.
     """
-    mean, scale, sensed, angles, told = _layout(machine)
+    mean, scale, sensed, angles, _, told = _layout(machine)
     q, batch = history[..., 0, -1], history.shape[:-3]
     seen = np.zeros((*batch, len(mean)), np.float32)
     seen[..., 6 : 6 + len(told)] = history.reshape(*batch, -1)[..., told]
@@ -213,7 +226,7 @@ def _turn(p_tool: Array, vector: Array, sign: int) -> Array:
 
 def measured(machine: Machine, observation: Array) -> Measured:
     """Undo `observe`: the newest measurements in physical units, from observations (..., obs)."""
-    mean, scale, _, angles, _ = _layout(machine)
+    mean, scale, _, angles, *_ = _layout(machine)
     values = observation * scale + mean
     q = values[..., angles]
     p_tool = tool_position(machine, q)
@@ -397,7 +410,8 @@ def look(machine: Machine, config: TaskConfig, state: State, rng: np.random.Gene
     """The observation of a state, (..., obs), with fresh uniform noise. Paper: Sec. 3.4 (5 %)"""
     draws = rng.random((*state.q.shape[:-1], len(_layout(machine).mean)), np.float32) - np.float32(0.5)
     noise = np.float32(2 * config.noise) * draws
-    return observe(machine, state.history, state.v_goal, state.lag, noise)
+    seen = observe(machine, state.history, state.v_goal, state.lag, noise)
+    return seen * paper_view(machine) if config.paper else seen
 
 
 class Outcome(NamedTuple):
@@ -429,7 +443,7 @@ def step(
     rewards = reward(state.v_goal, v_tool)
     end = terminated(machine, lowest)
     error = 1 / rewards - 1
-    if config.valve_cost:
+    if config.valve_cost and not config.paper:
         rewards = rewards - np.float32(config.valve_cost) * _travel(machine, before, state)
     state = _next_goals(machine, config, state, lowest, rng)
     observation = look(machine, config, state, rng)

@@ -37,6 +37,7 @@ def test_the_designs_options_exist(capsys: pytest.CaptureFixture[str]) -> None:
         "collect": ["--out", "--hours", "--excitation", "--machine"],
         "fit": ["--out", "--test", "--json", "--history"],
         "train": ["--actuator", "--out", "--total-steps", "--num-envs", "--resume"],
+        "sweep": ["--actuator", "--out", "--seeds", "--scheduler", "--gains", "--total-steps"],
         "evaluate": ["--policy", "--commands", "--starts", "--plant", "--json"],
         "reproduce": ["--out", "--quick"],
         "machine": ["--interface", "--channel", "--record"],
@@ -62,6 +63,8 @@ def test_the_designs_options_exist(capsys: pytest.CaptureFixture[str]) -> None:
         (["fit", "missing.csv", "--out", "n.npz"], 1, "missing.csv"),
         (["train", "--actuator", "missing.npz", "--out", "p.npz"], 1, "missing.npz"),
         (["train", "--actuator", "missing.npz", "--out", "p.npz", "--num-envs", "0"], 2, "--num-envs"),
+        (["sweep", "--actuator", "missing.npz", "--out", "s"], 1, "missing.npz"),
+        (["sweep", "--actuator", "missing.npz", "--out", "s", "--seeds", "0"], 2, "--seeds"),
         (["evaluate", "--policy", "missing.npz"], 1, "missing.npz"),
         (["machine", "--interface", "nonsense", "--channel", "0"], 1, "nonsense"),
         (["machine", "--interface", "virtual", "--channel", "0", "--start", "9", "9"], 1, "start"),
@@ -188,7 +191,7 @@ def test_without_gains_the_baselines_are_tuned_and_that_is_said(
     assert (meta["gains"], meta["commands"], meta["starts"]) == ("tuned now", "x, y, z", "drawn")
 
 
-@pytest.mark.parametrize("command", [name for name in COMMANDS if name != "train"])
+@pytest.mark.parametrize("command", [name for name in COMMANDS if name not in ("train", "sweep")])
 def test_only_training_imports_torch(command: str) -> None:
     code = "import sys; from brokk_min.__main__ import main\ntry: main(sys.argv[1:])\n"
     code += "finally: print('torch' in sys.modules)"
