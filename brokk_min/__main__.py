@@ -35,7 +35,7 @@ ALLOWED: tuple[tuple[float, float, str], ...] = (
     (0, 2**31 - 1, "seed"),
     (0, 1, "zero_goals axis_goals gae_lambda"),
     (0, 0.9999, "gamma"),
-    (0, 1000, "noise rest_weight valve_cost entropy"),
+    (0, 1000, "noise valve_cost entropy"),
     (0, 1e6, "hold_min_s hold_max_s"),
     (1, 1e6, "batch_size hidden num_envs horizon epochs threads rollout"),
     (1, 1e12, "steps total_steps checkpoint_every"),
@@ -102,7 +102,7 @@ class Fit:
     json: Path | None = None  # Also write the scores here.
     figure: Path | None = None  # Also draw free runs of the worst and the median recording here, .png.
     velocity_samples: int = BROKK_170.velocity_samples  # Window of the velocity estimator at 20 Hz.
-    paper: bool = False  # The paper's own recipe: errors of one step alone, no noise, all samples alike.
+    paper: bool = False  # The paper's own recipe: errors of one step alone, no noise.
     settings: tyro.conf.OmitArgPrefixes[FitConfig] = field(default_factory=FitConfig)  # The fit.
     seed: int = 0  # Of everything random.
 
