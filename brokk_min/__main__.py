@@ -119,8 +119,8 @@ class Fit:
         names = "".join(machine.name for machine in known)
         settings = replace(self.settings, **PAPER_RECIPE) if self.paper else self.settings
         net = fit(log, settings, self.seed, self.velocity_samples, names)
-        save_net(self.out, net)
         verdict = preliminary.judge(net, log, test, known[0] if known else None)
+        save_net(self.out, net)
         if self.json:
             meta: dict[str, Any] = {"seed": self.seed, "rate": net.rate, "history": net.history}
             meta |= {"logs": [str(p) for p in self.logs], "test": [str(p) for p in self.test]}
@@ -137,7 +137,7 @@ def _print_verdict(verdict: dict[str, Any]) -> None:
     for name, s in verdict["joints"].items():
         for label, scores in ((name, s), ("  linear", s["linear"])):
             free = ", ".join(f"{run['velocity_rmse']:.4f}" for run in scores["free_run"].values())
-            steps = (f"{scores[key]:.4f}" for key in ("one_step_rmse", "persistence_rmse"))
+            steps = (f"{scores.get(key, np.nan):.4f}" for key in ("one_step_rmse", "persistence_rmse"))
             print(row.format(label, *steps, free, f"{s['creep']:.5f}" if label == name else ""))
     for warning in verdict["warnings"]:
         print(f"warning: {warning}")

@@ -776,7 +776,7 @@ def run_errors(
 def recording_errors(net: ActuatorNet, log: Log, seconds: float) -> Array:
     """Velocity RMSE [rad/s] (recordings, n) of one free run of up to `seconds` from the start of each.
 
-    nan: a joint that rests in a recording, or a recording of `history` + 1 samples or fewer.
+    nan: a joint that rests in this recording but not in all, or `history` + 1 samples or fewer.
     """
     samples, lengths = end_to_end(log), np.array([len(r.q) for r in log.recordings])
     ticks = np.minimum(lengths - net.history - 1, round(seconds * net.rate))  # of each run
@@ -790,7 +790,8 @@ def recording_errors(net: ActuatorNet, log: Log, seconds: float) -> Array:
     error = velocities - whole.q_dot[starts + np.arange(1, most + 1)[:, None]]
     scored = (np.arange(most)[:, None] < ticks[long])[..., None]
     rms = np.sqrt(np.sum(np.where(scored, error, 0.0) ** 2, axis=0) / ticks[long, None])
-    result[long] = np.where(samples.moves[starts], rms, np.nan)
+    moves = samples.moves | ~samples.moves.any(axis=0)  # a joint that rests everywhere is scored at rest
+    result[long] = np.where(moves[starts], rms, np.nan)
     return result
 
 

@@ -143,6 +143,26 @@ def test_the_papers_recipe_is_one_switch(tmp_path: Path) -> None:
     assert all(set(joint) == keys for joint in verdict["joints"].values())
 
 
+def test_a_test_log_in_which_a_joint_rests_or_moves_too_shortly_is_judged(tmp_path: Path) -> None:
+    foreign_log(tmp_path / "log.csv", 0, 2)
+    rest = [f"still,{k / 20},0,0,0.1,0.2" for k in range(200)]
+    header = "run,time,u_boom,u_arm,q_boom,q_arm"
+    short = [f"short,{k / 20},0.5,0,{k / 100},0.2" for k in range(8)]
+    for i, lines in enumerate((rest, rest + short)):
+        (tmp_path / "test.csv").write_text("\n".join([header, *lines]) + "\n")
+        files = [
+            "--test",
+            tmp_path / "test.csv",
+            "--json",
+            tmp_path / f"{i}.json",
+            "--figure",
+            tmp_path / "f.png",
+        ]
+        assert run("fit", tmp_path / "log.csv", "--out", tmp_path / "n.npz", *files, "--steps", 3) == 0
+    assert json.loads((tmp_path / "0.json").read_text())["joints"]["boom"]["free_run"]["5"]
+    assert not json.loads((tmp_path / "1.json").read_text())["joints"]["boom"]["free_run"]
+
+
 def test_a_bad_log_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "log.csv"
     foreign_log(path, 0, 1)
