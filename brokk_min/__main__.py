@@ -1,22 +1,24 @@
 """The command line: `brokk-min COMMAND --help`. Exits 0 done, 1 failed, 2 wrong use."""
 
+import json
 import os
 import runpy
 import shutil
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
 
-from brokk_min import experiments, hw
-from brokk_min.actuator import FitConfig, collect, fit, load_net, save_net, score
+from brokk_min import experiments, figures, hw, play, preliminary, remote, replay, view
+from brokk_min.actuator import PAPER_RECIPE, FitConfig, collect, fit, load_net, save_net
 from brokk_min.bus import open_line, read_frames
 from brokk_min.env import Controller, TaskConfig, fitting_nets
 from brokk_min.export import export_onnx
+from brokk_min.kinematics import tool_position
 from brokk_min.logs import Log, read_log, write_log
 from brokk_min.machine import BROKK_170, Machine
 from brokk_min.policy import PolicyController, load_policy
@@ -36,9 +38,9 @@ ALLOWED: tuple[tuple[float, float, str], ...] = (
     (0, 2**31 - 1, "seed"),
     (0, 1, "zero_goals axis_goals gae_lambda"),
     (0, 0.9999, "gamma"),
-    (0, 1000, "noise valve_cost entropy"),
+    (0, 1000, "noise rest_weight valve_cost entropy"),
     (0, 1e6, "hold_min_s hold_max_s"),
-    (1, 1e6, "batch_size hidden num_envs horizon epochs threads"),
+    (1, 1e6, "batch_size hidden num_envs group horizon epochs threads rollout"),
     (1, 1e12, "steps total_steps checkpoint_every"),
     (2, 1e7, "velocity_samples history minibatch_size"),
     (-10, 3, "log_std"),
@@ -47,6 +49,7 @@ ALLOWED: tuple[tuple[float, float, str], ...] = (
     (1e-4, 100, "hours"),
     (1, 127, "counts"),
     (0.05, 1e6, "episode_s"),
+    (0.1, 100, "fps"),
 )
 
 
@@ -116,36 +119,51 @@ class Fit:
     out: Path  # Nets to write, .npz.
     test: tuple[Path, ...] = ()  # Logs to score on; without them every tenth recording of LOGS is held out.
     json: Path | None = None  # Also write the scores here.
+    figure: Path | None = None  # Also draw free runs of the worst and the median recording here, .png.
     machine: Name = ""  # Whose nets these are; by default the machine that has the joints of LOGS.
     velocity_samples: int = BROKK_170.velocity_samples  # Window of the velocity estimator at 20 Hz.
+    paper: bool = False  # The paper's own recipe: errors of one step alone, no noise, all samples alike.
     settings: tyro.conf.OmitArgPrefixes[FitConfig] = field(default_factory=FitConfig)  # The fit.
     seed: int = 0  # Of everything random.
 
     def run(self) -> None:
-        """Fit, score, write."""
+        """Fit, judge, write."""
         if not self.logs:
             raise WrongUse("LOGS: expected at least one log, got none")
-        check(self, self.out, self.json)
+        check(self, self.out, self.json, self.figure)
         if self.velocity_samples > self.settings.history:
             raise WrongUse(f"--velocity-samples: expected at most --history, got {self.velocity_samples}")
         log = read_log(self.logs, self.velocity_samples)
         log, test = (log, read_log(self.test, self.velocity_samples, log.joints)) if self.test else split(log)
         chosen = [MACHINES[self.machine]] if self.machine else MACHINES.values()
-        known = [machine.name for machine in chosen if machine.names == log.joints]
+        known = [machine for machine in chosen if machine.names == log.joints]
         if self.machine and not known:
             raise ValueError(f"LOGS: expected joints of --machine {self.machine}, got {list(log.joints)}")
-        name = known[0] if len(set(known)) == 1 else ""
-        net = fit(log, self.settings, self.seed, self.velocity_samples, name)
+        name = known[0].name if len({machine.name for machine in known}) == 1 else ""
+        settings = replace(self.settings, **PAPER_RECIPE) if self.paper else self.settings
+        net = fit(log, settings, self.seed, self.velocity_samples, name)
         save_net(self.out, net)
-        joints = score(net, test)
+        verdict = preliminary.judge(net, log, test, known[0] if known else None)
         if self.json:
             meta: dict[str, Any] = {"seed": self.seed, "rate": net.rate, "history": net.history}
             meta |= {"logs": [str(p) for p in self.logs], "test": [str(p) for p in self.test]}
-            experiments.write_json(self.json, {"meta": meta, "joints": joints})
-        print(f"{'joint':12} one step  same as last  free run of 1, 5, 10, 30 s [rad/s]")
-        for name, s in joints.items():
-            free = ", ".join(f"{run['velocity_rmse']:.4f}" for run in s["free_run"].values())
-            print(f"{name:12} {s['one_step_rmse']:8.4f}  {s['persistence_rmse']:12.4f}  {free}")
+            experiments.write_json(self.json, {"meta": meta, **verdict})
+        if self.figure:
+            figures.save(self.figure, figures.plot_worst_and_median(net, test))
+        _print_verdict(verdict)
+
+
+def _print_verdict(verdict: dict[str, Any]) -> None:
+    """Scores of the nets, of the linear model below them, and what speaks against the nets."""
+    row = "{:12} {:>9} {:>13}  {:30} {}"
+    print(row.format("joint", "one step", "same as last", "free run of 1, 5, 10, 30 s", "creep [rad/s]"))
+    for name, s in verdict["joints"].items():
+        for label, scores in ((name, s), ("  linear", s["linear"])):
+            free = ", ".join(f"{run['velocity_rmse']:.4f}" for run in scores["free_run"].values())
+            steps = (f"{scores[key]:.4f}" for key in ("one_step_rmse", "persistence_rmse"))
+            print(row.format(label, *steps, free, f"{s['creep']:.5f}" if label == name else ""))
+    for warning in verdict["warnings"]:
+        print(f"warning: {warning}")
 
 
 def split(log: Log) -> tuple[Log, Log]:
@@ -158,7 +176,7 @@ def split(log: Log) -> tuple[Log, Log]:
 
 def train_command() -> Any:
     """The command `train`; made on demand, because its settings live beside torch."""
-    from brokk_min.ppo import PPOConfig, train
+    from brokk_min.ppo import TASK, PPOConfig, train
 
     @dataclass(kw_only=True)
     class Train(Command):
@@ -169,7 +187,7 @@ def train_command() -> Any:
         resume: bool = False  # Take up OUT.checkpoint; the end is the same as without the break.
         tensorboard: Path | None = None  # Folder for TensorBoard (extra `tensorboard`).
         settings: tyro.conf.OmitArgPrefixes[PPOConfig] = field(default_factory=PPOConfig)  # The learner.
-        task: tyro.conf.OmitArgPrefixes[TaskConfig] = field(default_factory=TaskConfig)  # What an episode is.
+        task: tyro.conf.OmitArgPrefixes[TaskConfig] = TASK  # What an episode is.
 
         def run(self) -> None:
             """Train and write the policy."""
@@ -243,6 +261,29 @@ class Reproduce(Command):
             errors = ", ".join(f"{s} {row['velocity_error_mean']:.4f}" for s, row in rows.items())
             print(f"{name:20} mean velocity error [m/s]: {errors}")
         print(f"{self.out / 'report.html'}\n{self.out / 'results.json'}")
+
+
+@dataclass(kw_only=True)
+class Preliminary(Command):
+    """The paper's preliminary tests and its sim-to-real experiment, machine and nets side by side."""
+
+    actuator: Path  # Nets that `fit` wrote.
+    out: Path = Path("preliminary")  # Folder for figures and preliminary.json.
+
+    def run(self) -> None:
+        """Measure, draw, write."""
+        check(self)
+        machine, net = MACHINES[self.machine], load_net(self.actuator)
+        numbers = preliminary.run(machine, net, self.seed)
+        self.out.mkdir(parents=True, exist_ok=True)
+        for name, figure in preliminary.plots(machine, net, self.seed).items():
+            figures.save(self.out / f"{name}.png", figure)
+            print(self.out / f"{name}.png")
+        meta = experiments.meta(machine, self.seed) | {"actuator": str(self.actuator)}
+        experiments.write_json(self.out / "preliminary.json", {"meta": meta, **numbers})
+        print(self.out / "preliminary.json")
+        tool = numbers["sim_to_real"]["tool"]["position_error_mean"]
+        print(f"tool, nets beside machine over 30 s: {tool:.4f} m apart in the mean")
 
 
 @dataclass(kw_only=True)
@@ -363,9 +404,117 @@ class Export(Command):
         print(f"{self.out}: observation (batch, obs) in, action (batch, driven joints) out")
 
 
+@dataclass(kw_only=True)
+class Play(Command):
+    """Drive with keyboard or gamepad in a window, and trace lines; see docs/play.md."""
+
+    policy: Path | None = None  # Policy that `train` wrote; without one there are levers only.
+    gains: Path | None = None  # Tuned gains of the Jacobian controller; by default gains.json beside POLICY.
+    interface: str = ""  # python-can's name of a bus; without one a simulated machine stands behind.
+    channel: str = ""  # Channel of the interface.
+    drive: bool = False  # Drive the machine on the bus; without it, nothing is sent there.
+    attempts: Path = Path("attempts.csv")  # Table of the traced lines, kept.
+    log: Path | None = None  # Also log every frame here, candump format.
+    start: tuple[float, ...] = remote.START  # Angles of the simulated machine at the start [rad].
+
+    def run(self) -> None:
+        """Open the window until it is closed."""
+        check(self, self.attempts, self.log)
+        if bool(self.interface) != bool(self.channel) or (self.drive and not self.interface):
+            raise WrongUse("--interface, --channel: expected both or, without --drive, none")
+        machine, where = (
+            MACHINES[self.machine],
+            remote.Where(self.interface, self.channel, self.log, self.start),
+        )
+        if self.interface and not self.drive:
+            play.watch(machine, where)
+            return
+        controllers: dict[str, Controller] = {}
+        if self.policy:
+            policy, beside = load_policy(self.policy, machine), self.policy.with_name("gains.json")
+            gains = self.gains or (beside if beside.exists() else None)
+            known = experiments.read_gains(gains, machine, policy.net) if gains else None
+            known = known or experiments.baselines(machine, policy.net)
+            controllers = {"rl": PolicyController(machine, policy), "jacobian": known["jacobian_pid_k0.1"]}
+            print(f"gains of the Jacobian controller: {gains or 'set by hand'}", file=sys.stderr)
+        play.play(machine, controllers, where, self.attempts)
+
+
+@dataclass(kw_only=True)
+class Replay(Command):
+    """Watch recorded runs side by side: logs of `drive`, or runs of `evaluate`, driven again."""
+
+    logs: tyro.conf.Positional[tuple[Path, ...]]  # One or two candump logs, or one JSON of results.
+    out: Path | None = None  # Write a film, .gif or .mp4, instead of opening a window.
+    fps: float = 10.0  # Pictures a second of the film.
+    size: tuple[int, int] = (960, 540)  # Of the picture [px].
+    controllers: tuple[str, ...] = ("rl", "jacobian_pid_k0.1")  # Whose runs of the results.
+    sequence: str = ""  # Which sequence of the results; by default the first.
+    start: int = 0  # Which start of the results.
+
+    def run(self) -> None:
+        """Open the window until it is closed, or write the film."""
+        check(self, self.out)
+        if not 1 <= len(self.logs) <= 2:
+            raise WrongUse(f"LOGS: expected one or two, got {len(self.logs)}")
+        if self.logs[0].suffix == ".json":
+            machine, runs = self._driven_again(self.logs[0])
+        else:
+            machine, colours = MACHINES[self.machine], list(view.COLOURS.values())
+            pairs = zip(self.logs, colours, strict=False)
+            runs = [replay.run_of_log(machine, log, colour) for log, colour in pairs]
+        if self.out:
+            replay.write_film(self.out, machine, runs, self.size, self.fps)
+        else:
+            replay.show_film(machine, runs, self.size)
+
+    def _driven_again(self, path: Path) -> tuple[Machine, list[replay.Run]]:
+        """Runs of a results file, simulated anew from what it says of itself and compared with its rows."""
+        try:
+            file = json.loads(path.read_text())
+            beside = {"policy": str(path.with_name("policy.npz")), "gains": str(path.with_name("gains.json"))}
+            told = beside | {"plant": "analytic", "commands": "x, y, z", "starts": "drawn"} | file["meta"]
+            rows = file.get("task_space", file)["runs"]
+            machine, seed = MACHINES[told["machine"]], int(told["seed"])
+            starts = np.array(file["starts"]) if "starts" in file else None
+        except (OSError, KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{path}: expected results of `evaluate`, got {error!r}") from error
+        policy, sequences = load_policy(Path(told["policy"]), machine), axis_sequences(machine)
+        if told["commands"] != "x, y, z":
+            sequences = read_commands(Path(told["commands"]), machine)
+        if told["starts"] != "drawn":
+            starts = read_starts(Path(told["starts"]), machine)
+        elif starts is None:
+            rng = np.random.default_rng(seed + 2)
+            starts = draw_starts(machine, sequences, experiments.Effort().starts, rng)
+        known: dict[str, Controller] = {"rl": PolicyController(machine, policy)}
+        if set(self.controllers) - {"rl"}:
+            known |= experiments.read_gains(Path(told["gains"]), machine, policy.net)
+        named = {s.name: s for s in sequences}
+        sequence = named.get(self.sequence or sequences[0].name)
+        if sequence is None or set(self.controllers) - set(known) or not 0 <= self.start < len(starts):
+            raise WrongUse(
+                f"--sequence, --controllers, --start: expected some of {list(named)}, of {list(known)} "
+                f"and below {len(starts)}, got {self.sequence}, {list(self.controllers)}, {self.start}"
+            )
+        chosen = {name: known[name] for name in self.controllers}
+        net = policy.net if told["plant"] == "net" else None
+        again, traces = experiments.task_space(machine, chosen, [sequence], starts, seed, net)
+        for row in (r for r in again if r["start"] == self.start):
+            same = [r for r in rows if all(r[k] == row[k] for k in ("controller", "sequence", "start"))]
+            if not same or not np.isclose(same[0]["velocity_rmse"], row["velocity_rmse"], rtol=1e-3):
+                raise ValueError(f"{path}: expected the run {row}, got {same or 'none'}: another program?")
+        first = tool_position(machine, starts[self.start])
+        return machine, [
+            replay.run_of_trace(machine, name, traces[name, sequence.name], self.start, sequence.goals, first)
+            for name in chosen
+        ]
+
+
 COMMANDS: dict[str, Callable[[], Any]] = {
     "collect": lambda: Collect,
     "fit": lambda: Fit,
+    "preliminary": lambda: Preliminary,
     "train": train_command,
     "evaluate": lambda: Evaluate,
     "reproduce": lambda: Reproduce,
@@ -373,6 +522,8 @@ COMMANDS: dict[str, Callable[[], Any]] = {
     "drive": lambda: Drive,
     "convert": lambda: Convert,
     "export": lambda: Export,
+    "play": lambda: Play,
+    "replay": lambda: Replay,
 }
 
 

@@ -27,7 +27,14 @@ from brokk_min.actuator import (
     push_command,
     rest_history,
 )
-from brokk_min.kinematics import joint_rates, lowest_point, tool_position, tool_state, tool_velocity
+from brokk_min.kinematics import (
+    damped_rates,
+    lowest_point,
+    tool_jacobian,
+    tool_position,
+    tool_state,
+    tool_velocity,
+)
 from brokk_min.machine import (
     BROKK_170,
     PWM_MAX,
@@ -38,6 +45,7 @@ from brokk_min.machine import (
     read_encoder,
 )
 
+GROUND_MARGIN = 0.3  # m above the ground below which no goal asks the arm to sink, assumed
 LAG_TIME, LAG_SPEED = 2.0, 0.07  # s and a share of tool_speed, tuned: see `push_lag`
 Array = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]
@@ -61,6 +69,8 @@ class TaskConfig:
     """Largest noise of the measured part of an observation, in standard deviations (paper: 5 %)."""
     valve_cost: float = 0.01
     """Reward lost for each change of a command by its limit, mean of the driven joints (paper: 0)."""
+    group: int = 1
+    """Neighbouring environments that share start poses and goals, for learners that compare them."""
     redraw_ground: bool = True
     """Redraw start poses in the ground; False is the paper's rule: end the episode without reward."""
 
@@ -96,7 +106,9 @@ class _Layout(NamedTuple):
 
     mean: Array
     scale: Array
-    sensed: Array  # noise of 1 on what sensors say, in units of the observation; 0 for the rest
+    sensed: Array  # what noise of 1 does to what sensors say, in physical units; 0 for the rest
+    angles: NDArray[np.intp]  # where the newest angles of all joints stand, (n,)
+    told: NDArray[np.intp]  # what a flattened history (n * 3 * H) gives: locked angles, driven histories
 
 
 def _layout(machine: Machine) -> _Layout:
@@ -122,7 +134,13 @@ def _layout(machine: Machine) -> _Layout:
         blocks += [(zero, rate[driven], 4.2, 0), (zero, 0.1 * rate[driven], 4.2, 0)]
         means, scales, noises = zip(*((m, d / w, w * s + 0 * m) for m, d, w, s in blocks), strict=True)
         mean, scale, sensed = (np.concatenate(a).astype(np.float32) for a in (means, scales, noises))
-        machine.__dict__["layout"] = _Layout(mean, scale, sensed)
+        body = 6 + len(rest)
+        angles = np.zeros(machine.n, int)
+        angles[rest] = np.arange(6, body)
+        angles[driven] = body + samples * (1 + 3 * np.arange(len(driven))) - 1
+        place = np.arange(machine.n * 3 * samples).reshape(machine.n, 3, samples)
+        told = np.concatenate([place[rest, 0, -1], place[driven].ravel()])
+        machine.__dict__["layout"] = _Layout(mean, scale, sensed * scale, angles, told)
     layout: _Layout = machine.__dict__["layout"]
     return layout
 
@@ -164,32 +182,22 @@ def observe(
     Returns:
         Shape (..., 6 + locked + (3 H + 2) n_driven), float32.
     """
-    p_tool, v_tool, _ = tool_state(machine, history[..., 0, -1], history[..., 1, -1])
-    v_goal, lag = (np.broadcast_to(np.asarray(v, np.float32), v_tool.shape) for v in (v_goal, lag))
-    driven = history[..., machine.driven, :, :]
-    mean, scale, sensed = _layout(machine)
-    size = len(mean) - 2 * len(machine.driven)  # without the rates
-    seen = np.zeros((*v_tool.shape[:-1], len(mean)), np.float32)
-    both = _turn(p_tool[..., None, :], np.stack([v_goal, v_tool], axis=-2), 1)
-    seen[..., :6] = both.reshape(*both.shape[:-2], 6)
-    seen[..., 6 : 6 + len(machine.locked)] = history[..., machine.locked, 0, -1]
-    seen[..., 6 + len(machine.locked) : size] = driven.reshape(*driven.shape[:-3], -1)
-    seen += noise * sensed * scale
-    q = _angles(machine, seen)
-    rates = joint_rates(machine, q[..., None, :], np.stack([v_goal, lag], axis=-2))
-    seen[..., size:] = rates.reshape(*rates.shape[:-2], -1)
+    mean, scale, sensed, angles, told = _layout(machine)
+    q, batch = history[..., 0, -1], history.shape[:-3]
+    seen = np.zeros((*batch, len(mean)), np.float32)
+    seen[..., 6 : 6 + len(told)] = history.reshape(*batch, -1)[..., told]
+    seen += noise * sensed
+    # the arm where it is and where it is seen, in one pass: few large steps are faster than many small ones
+    p_tool, J = tool_jacobian(machine, np.stack([q, seen[..., angles]], axis=-2))
+    given = np.empty((*batch, 3, 3), np.float32)
+    given[..., 0, :], given[..., 2, :] = v_goal, lag
+    given[..., 1, :] = (J[..., 0, :, :] * history[..., None, :, 1, -1]).sum(axis=-1)
+    seen[..., :6] += _turn(p_tool[..., :1, :], given[..., :2, :], 1).reshape(*batch, 6)
+    rates = damped_rates(machine, J[..., 1:, :, machine.driven], given[..., ::2, :])
+    seen[..., 6 + len(told) :] = rates.reshape(*batch, -1)
     seen -= mean
     seen /= scale
     return seen
-
-
-def _angles(machine: Machine, values: Array) -> Array:
-    """Newest angles of all joints (..., n) in observations (..., obs) in physical units."""
-    first, q = 6 + len(machine.locked), np.empty((*values.shape[:-1], machine.n), values.dtype)
-    q[..., machine.locked] = values[..., 6:first]
-    newest = first + machine.history * (1 + 3 * np.arange(len(machine.driven))) - 1
-    q[..., machine.driven] = values[..., newest]
-    return q
 
 
 def _turn(p_tool: Array, vector: Array, sign: int) -> Array:
@@ -197,19 +205,20 @@ def _turn(p_tool: Array, vector: Array, sign: int) -> Array:
     x, y = p_tool[..., 0], p_tool[..., 1]
     radius = np.maximum(np.hypot(x, y), 1e-6)
     c, s = x / radius, sign * y / radius
-    turned = (c * vector[..., 0] + s * vector[..., 1], c * vector[..., 1] - s * vector[..., 0])
-    return np.stack([*turned, vector[..., 2]], axis=-1)
+    turned = vector.copy()
+    turned[..., 0] = c * vector[..., 0] + s * vector[..., 1]
+    turned[..., 1] = c * vector[..., 1] - s * vector[..., 0]
+    return turned
 
 
 def measured(machine: Machine, observation: Array) -> Measured:
     """Undo `observe`: the newest measurements in physical units, from observations (..., obs)."""
-    mean, scale, _ = _layout(machine)
+    mean, scale, _, angles, _ = _layout(machine)
     values = observation * scale + mean
-    q = _angles(machine, values)
+    q = values[..., angles]
     p_tool = tool_position(machine, q)
     v_goal, v_tool = (_turn(p_tool, values[..., i : i + 3], -1) for i in (0, 3))
-    newest = 6 + len(machine.locked) + machine.history * (2 + 3 * np.arange(len(machine.driven))) - 1
-    return Measured(v_goal, v_tool, q, values[..., newest])
+    return Measured(v_goal, v_tool, q, values[..., angles[machine.driven] + machine.history])
 
 
 def push_lag(machine: Machine, history: Array, v_goal: Array, lag: Array) -> Array:
@@ -374,8 +383,14 @@ def _draw_hold(machine: Machine, config: TaskConfig, rng: np.random.Generator, n
 def reset(machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int, plant: bool) -> State:
     """`num` machines at rest in random poses with random goals; leading shape (num,)."""
     pose, goal = draw_pose(machine, config, rng, num), draw_goal(machine, config, rng, num)
-    state = rest_state(machine, pose, goal, plant)
-    return replace(state, goal_ticks=_draw_hold(machine, config, rng, num))
+    first = _first_of_group(config, num)
+    state = rest_state(machine, pose[first], goal[first], plant)
+    return replace(state, goal_ticks=_draw_hold(machine, config, rng, num)[first])
+
+
+def _first_of_group(config: TaskConfig, num: int) -> NDArray[np.intp]:
+    """Which environment's pose and goals each of `num` has, (num,)."""
+    return np.arange(num) // config.group * config.group
 
 
 def look(machine: Machine, config: TaskConfig, state: State, rng: np.random.Generator) -> Array:
@@ -405,8 +420,9 @@ def step(
 ) -> tuple[State, Outcome]:
     """One tick of `num` environments, without resets: `action` (num, n_driven) in [-1, 1].
 
-    The reward is `reward` for the goal that held during the tick less `valve_cost`; a new goal is drawn
-    after it. On a tick that ends in the ground the reward is zero.
+    The reward is `reward` for the goal that held during the tick less `valve_cost`; where it is over, or
+    asks an arm close to the ground to sink, a new one is drawn after it. On a tick that ends in the ground
+    the reward is zero.
     """
     before, state = state, transition(machine, net, state, to_command(machine, action))
     _, v_tool, lowest = tool_state(machine, state.q.astype(np.float32), state.q_dot.astype(np.float32))
@@ -415,15 +431,25 @@ def step(
     error = 1 / rewards - 1
     if config.valve_cost:
         rewards = rewards - np.float32(config.valve_cost) * _travel(machine, before, state)
-    due = np.flatnonzero(state.goal_ticks <= 0)
-    if len(due):
-        goals, holds = state.v_goal.copy(), state.goal_ticks.copy()
-        goals[due] = draw_goal(machine, config, rng, len(due))
-        holds[due] = _draw_hold(machine, config, rng, len(due))
-        state = replace(state, v_goal=goals, goal_ticks=holds)
+    state = _next_goals(machine, config, state, lowest, rng)
     observation = look(machine, config, state, rng)
     truncated = (state.ticks >= round(config.episode_s * machine.rate)) & ~end
     return state, Outcome(observation, np.where(end, 0.0, rewards), end, truncated, error)
+
+
+def _next_goals(
+    machine: Machine, config: TaskConfig, state: State, lowest: Array, rng: np.random.Generator
+) -> State:
+    low = lowest < machine.ground + GROUND_MARGIN
+    due = np.flatnonzero((state.goal_ticks <= 0) | (low & (state.v_goal[..., 2] < 0)))
+    if not len(due):
+        return state
+    goals, holds = state.v_goal.copy(), state.goal_ticks.copy()
+    goals[due] = draw_goal(machine, config, rng, len(due))
+    goals[due, 2] = np.where(low[due], np.abs(goals[due, 2]), goals[due, 2])
+    holds[due] = _draw_hold(machine, config, rng, len(due))
+    first = _first_of_group(config, len(goals))
+    return replace(state, v_goal=goals[first], goal_ticks=holds[first])
 
 
 def _travel(machine: Machine, before: State, after: State) -> Array:
@@ -539,6 +565,54 @@ def _open(machine: Machine, actuator: ActuatorNet | Path | str) -> ActuatorNet |
     return fitting_nets(machine, net)
 
 
+class _Pictures:
+    """Frames for Gymnasium: trails of the tools since the last reset of each, and a window for `human`."""
+
+    SIZE = (960, 600)
+
+    def __init__(self, machine: Machine, mode: str | None, modes: list[str]) -> None:
+        if mode is not None and mode not in modes:
+            raise ValueError(f"render_mode: expected one of {modes}, got {mode!r}")
+        self.machine, self.mode = machine, mode
+        self.window: Any = None
+        self.trails: dict[int, list[Array]] = {}
+
+    def follow(self, state: State, fresh: ArrayLike) -> None:
+        """After a reset or a step; `fresh` are the rows that begin anew."""
+        if self.mode is not None:
+            self.trails |= {row: [] for row in np.asarray(fresh).tolist()}
+            for row, p_tool in enumerate(tool_position(self.machine, state.q)):
+                self.trails[row].append(p_tool)
+        if self.mode == "human":
+            self.take(state)
+
+    def take(self, state: State | None) -> list[NDArray[np.uint8]]:
+        """A frame (600, 960, 3) of each row, or the first row on the screen. Needs the extra `play`."""
+        from brokk_min import view  # pictures cost nothing where nobody looks
+
+        if state is None or self.mode is None:
+            raise ValueError(f"render: expected a render_mode and a reset before, got {self.mode}")
+        drawn = []
+        for row, trail in self.trails.items():
+            u, goal = state.history[row, :, 2, -1], state.v_goal[row]
+            scene = view.Scene(
+                state.q[row], state.q_dot[row], u, goal, np.array(trail), title=self.machine.name
+            )
+            drawn.append(view.draw(self.machine, [scene], self.SIZE))
+        if self.mode == "human":
+            self.window = self.window or view.Window(self.SIZE, self.machine.name)
+            self.window.pygame.event.pump()
+            self.window.show(drawn[0], self.machine.rate)
+            return []
+        return [view.picture(shapes, self.SIZE) for shapes in drawn]
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self.window is not None:
+            self.window.close()
+            self.window = None
+
+
 class TaskVectorEnv(VectorEnv[Array, Array, Any]):
     """Many machines following random tool velocities; an ended episode starts anew at once. Paper: Fig. 4
 
@@ -551,6 +625,7 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         actuator: nets (object or file) or "analytic" for the plant.
         machine: what moves.
         config: what an episode is.
+        render_mode: None or "rgb_array": `render` gives a frame of each environment.
     """
 
     def __init__(
@@ -559,8 +634,12 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         actuator: ActuatorNet | Path | str = "analytic",
         machine: Machine = BROKK_170,
         config: TaskConfig | None = None,
+        render_mode: str | None = None,
     ) -> None:
-        self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": round(machine.rate)}
+        self.metadata["autoreset_mode"] = AutoresetMode.SAME_STEP
+        self.pictures = _Pictures(machine, render_mode, self.metadata["render_modes"])
+        self.render_mode = render_mode
         self.num_envs, self.machine, self.config = num_envs, machine, config or TaskConfig()
         self.net = _open(machine, actuator)
         self.single_observation_space, self.single_action_space = _spaces(machine)
@@ -574,6 +653,7 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         """Draw new episodes for all environments."""
         super().reset(seed=seed)
         self.state = reset(self.machine, self.config, self.np_random, self.num_envs, self.net is None)
+        self.pictures.follow(self.state, range(self.num_envs))
         return look(self.machine, self.config, self.state, self.np_random), {}
 
     def step(self, actions: Array) -> tuple[Array, Array, Bools, Bools, dict[str, Any]]:
@@ -591,19 +671,32 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
             info |= {"final_obs": observation, "_final_obs": ended}
             observation = observation.copy()
             observation[rows] = look(self.machine, self.config, fresh, self.np_random)
+        self.pictures.follow(self.state, rows)
         return observation, out.reward, out.terminated, out.truncated, info
+
+    def render(self) -> tuple[NDArray[np.uint8], ...]:
+        """A frame (600, 960, 3) of each environment."""
+        return tuple(self.pictures.take(self.state))
 
 
 class TaskEnv(gymnasium.Env[Array, Array]):
-    """One machine that follows random tool velocities: `TaskVectorEnv`'s functions, batch of one."""
+    """One machine that follows random tool velocities: `TaskVectorEnv`'s functions, batch of one.
+
+    With `render_mode` "human" each step shows itself in a window; with "rgb_array" `render` gives a frame.
+    """
+
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 20}  # noqa: RUF012, as Gymnasium has it
 
     def __init__(
         self,
         actuator: ActuatorNet | Path | str = "analytic",
         machine: Machine = BROKK_170,
         config: TaskConfig | None = None,
+        render_mode: str | None = None,
     ) -> None:
-        self.metadata = {"render_modes": []}
+        self.metadata = TaskEnv.metadata | {"render_fps": round(machine.rate)}
+        self.pictures = _Pictures(machine, render_mode, self.metadata["render_modes"])
+        self.render_mode = render_mode
         self.machine, self.config = machine, config or TaskConfig()
         self.net = _open(machine, actuator)
         self.observation_space, self.action_space = _spaces(machine)
@@ -615,6 +708,7 @@ class TaskEnv(gymnasium.Env[Array, Array]):
         """Draw a new episode."""
         super().reset(seed=seed)
         self.state = reset(self.machine, self.config, self.np_random, 1, self.net is None)
+        self.pictures.follow(self.state, [0])
         return look(self.machine, self.config, self.state, self.np_random)[0], {}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
@@ -625,7 +719,16 @@ class TaskEnv(gymnasium.Env[Array, Array]):
         self.state, out = step(self.machine, self.config, self.net, self.state, action, self.np_random)
         info = {"velocity_error": float(out.velocity_error[0])}
         flags = bool(out.terminated[0]), bool(out.truncated[0])
+        self.pictures.follow(self.state, [])
         return out.observation[0], float(out.reward[0]), *flags, info
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """The present picture (600, 960, 3), or None: it is on the screen."""
+        return next(iter(self.pictures.take(self.state)), None)
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        self.pictures.close()
 
 
 def _spaces(machine: Machine) -> tuple[Any, Any]:

@@ -10,7 +10,7 @@ import html
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -123,6 +123,65 @@ def plot_bars(table: Mapping[str, Mapping[str, Mapping[str, float]]], sequences:
         ax.grid(alpha=0.3, axis="y")
         ax.set_axisbelow(True)
     return _with_legend(figure, axes[0])
+
+
+class Panel(NamedTuple):
+    """One plot: title, axes' labels with units, and curves (x, y) by label."""
+
+    title: str
+    xlabel: str
+    ylabel: str
+    curves: Mapping[str, tuple[Array, Array]]
+
+
+def plot_panels(rows: Sequence[Sequence[Panel]]) -> Any:
+    """A grid of panels; those of a column have the same axes where they show the same quantity."""
+    high, wide = len(rows), len(rows[0])
+    figure = plt.figure(figsize=(4.4 * wide, 2.8 * high), layout="constrained")
+    grid = figure.subplots(high, wide, squeeze=False)
+    for k, panels in enumerate(rows):
+        for ax, above, panel in zip(grid[k], grid[0], panels, strict=True):
+            for label, (x, y) in panel.curves.items():
+                ax.plot(x, y, label=label, linewidth=1.1)
+            ax.set_title(panel.title, fontsize=9)
+            ax.set_xlabel(panel.xlabel)
+            ax.set_ylabel(panel.ylabel)
+            ax.grid(alpha=0.3)
+            ax.legend(fontsize=7)
+            if k and above.get_ylabel() == panel.ylabel:
+                ax.sharey(above)
+                ax.autoscale()
+    return figure
+
+
+def plot_worst_and_median(net: actuator.ActuatorNet, log: logs.Log, seconds: float = 30.0) -> Any:
+    """Measured and free-running curves of the recordings with the worst and the median velocity error.
+
+    Of each the joint with the largest error.
+    """
+    errors = np.nan_to_num(actuator.recording_errors(net, log, seconds), nan=-1.0)
+    order = [i for i in np.argsort(errors.max(axis=1)) if errors[i].max() >= 0]
+    rows: list[list[Panel]] = []
+    for title, place in (("worst", -1), ("median", (len(order) - 1) // 2)):
+        index, joint = order[place], int(errors[order[place]].argmax())
+        recording, name = log.recordings[index], net.joints[joint]
+        ticks = min(round(seconds * net.rate), len(recording.q) - net.history - 1)
+        free = actuator.free_run(net, recording, np.array([net.history]), ticks)
+        later = slice(net.history + 1, net.history + 1 + ticks)
+        rows.append([])
+        for real, own, unit in zip((recording.q, recording.q_dot), free, ("rad", "rad/s"), strict=True):
+            curves = {"measured": real[later, joint], "free run": own[:, 0, joint]}
+            time = np.arange(1, ticks + 1) / net.rate
+            panel = {label: (time, y) for label, y in curves.items()}
+            rows[-1].append(Panel(f"{title}: {recording.name}", "time [s]", f"{name} [{unit}]", panel))
+    return plot_panels(rows)
+
+
+def save(path: Path, figure: Any) -> None:
+    """Write a figure as PNG, the same bytes for the same figure."""
+    with logs.whole_file(path) as file:
+        figure.savefig(file, format="png", dpi=110, metadata={"Software": None})
+    plt.close(figure)
 
 
 # --- the report -------------------------------------------------------------------------------------

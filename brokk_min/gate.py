@@ -24,9 +24,12 @@ SLEW = 40  # counts of 127 a tick by which a command may grow
 LIMIT_MARGIN = 0.02  # rad before a joint's limit from which no command goes outward
 RANGE_MARGIN = 0.05  # rad beyond a joint's limit, then the encoder is wrong
 JUMP_FACTOR, JUMP_COUNTS = 2.0, 4  # times the fastest motion, plus counts: a larger step is a jump
-STILL, MOVED = 2, 4  # frozen: ticks without a change, after as many with this many counts of motion
-HARD = 40  # counts of 127: a command that must move a joint
-MEMORY = 14  # ticks kept, and of hard pushing without motion
+# frozen: the count stands still while the joint should have moved by more than this
+DUE = 1.0  # count; what moves further shows it
+IDLE = 1.5  # dead zones: a command up to this may do nothing
+SLOWEST = 0.3  # of the fastest motion: long lever arm, weak pump
+KEPT = 0.5  # of the motion before: a joint that moved goes on at least so under the same push
+PUSH = 8  # ticks of commands the same way after which a joint moves, from rest too
 
 
 # --- codec ------------------------------------------------------------------------------------------
@@ -83,7 +86,7 @@ def valve_frame(m: ArrayLike, counter: ArrayLike, enable: ArrayLike) -> Array:
     frame = np.zeros((*m.shape[:-1], 8), np.uint8)
     frame[..., : m.shape[-1]] = encode_pwm(m / PWM_MAX)
     frame[..., 5], frame[..., 7] = counter, enable
-    frame[..., 6] = checksum(np.delete(frame, 6, axis=-1))
+    frame[..., 6] = checksum(frame[..., [0, 1, 2, 3, 4, 5, 7]])
     return frame
 
 
@@ -116,8 +119,10 @@ class GateState(NamedTuple):
     enable: Array  # dead-man switch at the last tick at which it could be trusted
     time: Array  # s, of the last tick
     counter: Array  # of the last valve frame
-    counts: Array  # newest angles last (..., n, MEMORY) [encoder counts]
-    sent: Array  # newest commands last (..., n, MEMORY) [counts of 127]
+    counts: Array  # newest two angles, newest last (..., n, 2) [encoder counts]
+    sent: Array  # newest commands last (..., n, PUSH) [counts of 127]
+    pace: Array  # at least, with the push, when the count last changed (..., n) [encoder counts a tick]
+    due: Array  # motion that should have come since then, see `motion_due` (..., n) [encoder counts]
 
 
 class GateInputs(NamedTuple):
@@ -138,8 +143,9 @@ class GateInputs(NamedTuple):
 def gate_start(machine: Machine, shape: tuple[int, ...] = ()) -> GateState:
     """Gates that have just been switched on."""
     no, zero = np.zeros(shape, bool), np.zeros(shape, int)
-    tape = np.zeros((*shape, machine.n, MEMORY), int)
-    return GateState(no, no, zero + 1, zero, ~no, np.full(shape, -np.inf), zero, tape, tape)
+    counts, sent = (np.zeros((*shape, machine.n, ticks), int) for ticks in (2, PUSH))
+    rest = np.zeros((*shape, machine.n))
+    return GateState(no, no, zero + 1, zero, ~no, np.full(shape, -np.inf), zero, counts, sent, rest, rest)
 
 
 def gate(machine: Machine, state: GateState, inputs: GateInputs, now: ArrayLike) -> tuple[GateState, Array]:
@@ -160,7 +166,8 @@ def gate(machine: Machine, state: GateState, inputs: GateInputs, now: ArrayLike)
         The next state, and the valve frame (..., 8), to be sent only if the state has `spoken`.
     """
     now, last = np.asarray(now), state.sent[..., -1]
-    wrong = gate_wrong(machine, state, inputs, now)
+    pace, due = motion_due(machine, state, inputs.counts)
+    wrong = gate_wrong(machine, state, inputs, due, now)
     edge = inputs.enable & ~state.enable & inputs.centred
     driving = inputs.enable & (state.driving | edge) & np.logical_not(wrong)
     fault = np.where(driving, 0, np.where(state.driving, wrong, state.fault))
@@ -181,25 +188,45 @@ def gate(machine: Machine, state: GateState, inputs: GateInputs, now: ArrayLike)
         enable=inputs.enable | (state.enable & ~trusted),
         time=now,
         counter=counter,
-        counts=np.concatenate([state.counts[..., 1:], inputs.counts[..., None]], axis=-1),
+        counts=np.stack([state.counts[..., 1], inputs.counts], axis=-1),
         sent=np.concatenate([state.sent[..., 1:], m[..., None]], axis=-1),
+        pace=pace,
+        due=due,
     )
     return following, valve_frame(m, counter, driving)
 
 
-def gate_wrong(machine: Machine, state: GateState, inputs: GateInputs, now: Array) -> Array:
+def motion_due(machine: Machine, state: GateState, counts: Array) -> tuple[Array, Array]:
+    """How fast each joint moved, and by how much it should have moved since its count last changed.
+
+    The lower bound of a motion that a joint owes: once commands went the same way beyond the dead zone for
+    `PUSH` ticks, `SLOWEST` of the fastest motion in proportion to the weakest of them, or `KEPT` of the
+    motion before in the proportion of the weakest to the strongest.
+
+    Returns:
+        `pace` and `due` of the next state, (..., n) [encoder counts a tick, encoder counts].
+    """
+    idle = IDLE * machine.dead_zone * PWM_MAX
+    way = np.sign(state.sent.sum(axis=-1))
+    push = state.sent * way[..., None] - idle
+    weakest, strongest = push.min(axis=-1), push.max(axis=-1)
+    pushed, moved = weakest > 0, counts != state.counts[..., 1]
+    fastest = np.minimum(machine.column("q_dot_up"), machine.column("q_dot_down"))
+    least = SLOWEST * fastest * machine.dt / machine.encoder_step / (machine.pwm_limit - idle) * weakest
+    pace = np.where(moved, np.maximum(way * (counts - state.counts[..., 0]) - 1, 0) / 2, state.pace)
+    kept = KEPT * pace * weakest / np.where(pushed, strongest, np.inf)
+    due = state.due + np.maximum(least, kept)
+    return np.where(pushed, pace, 0.0), np.where(pushed & ~moved, due, 0.0)
+
+
+def gate_wrong(machine: Machine, state: GateState, inputs: GateInputs, due: Array, now: Array) -> Array:
     """The first thing that is wrong (...): 0, or 1 + fault * (n + 1) + node, see `fault_name`."""
     n, step = machine.n, machine.encoder_step
     low, high = machine.column("q_min") - RANGE_MARGIN, machine.column("q_max") + RANGE_MARGIN
-    limit = np.where([joint.driven for joint in machine.joints], machine.pwm_limit, 0)
+    limit = np.zeros(n)
+    limit[machine.driven] = machine.pwm_limit
     fastest = JUMP_FACTOR * machine.q_dot_max * machine.dt / step + JUMP_COUNTS
-    q, then, sent = inputs.counts * step, state.counts, state.sent
-
-    # pushed hard the same way, long enough for a joint that moved or rested to move on: it must move
-    hard = sent * np.sign(sent[..., -1:]) >= HARD
-    still = (then[..., -STILL:] == inputs.counts[..., None]).all(axis=-1)
-    moved = np.abs(then[..., -STILL] - then[..., -2 * STILL]) >= MOVED
-    frozen = still & ((hard[..., -STILL - 2 :].all(axis=-1) & moved) | hard.all(axis=-1))
+    q = inputs.counts * step
 
     bad = np.zeros((*now.shape, len(FAULTS), n + 1), bool)
     bad[..., 0, 0] = inputs.error
@@ -211,12 +238,12 @@ def gate_wrong(machine: Machine, state: GateState, inputs: GateInputs, now: Arra
     bad[..., 6, :n] = inputs.frames < 1
     bad[..., 7, :n] = inputs.frames > 1
     bad[..., 8, :n] = (q < low) | (q > high)
-    bad[..., 9, :n] = np.abs(inputs.counts - then[..., -1]) > fastest
-    bad[..., 10, :n] = frozen
+    bad[..., 9, :n] = np.abs(inputs.counts - state.counts[..., 1]) > fastest
+    bad[..., 10, :n] = due > DUE
     bad[..., 11, :n] = ~(np.abs(inputs.m) <= limit)  # also if it is no number
     bad[..., 12, 0] = inputs.stop
     bad = bad.reshape(*now.shape, len(FAULTS) * (n + 1))
-    return np.where(bad.any(axis=-1), 1 + bad.argmax(axis=-1), 0)
+    return bad.any(axis=-1) * (1 + bad.argmax(axis=-1))
 
 
 def fault_name(machine: Machine, fault: int) -> str:

@@ -30,6 +30,7 @@ from brokk_min.policy import Policy, contract, save_policy
 
 Tensor = torch.Tensor
 FORMAT = 1  # of checkpoints
+TASK = TaskConfig(group=8)  # to be trained on: eight environments share starts and goals, see `relative`
 STATE = [f.name for f in fields(State) if f.name != "plant"]
 
 
@@ -141,9 +142,51 @@ def policy_loss(new: Tensor, old: Tensor, advantages: Tensor, clip: float) -> Te
     return -torch.min(ratio * advantages, clipped * advantages).mean()
 
 
+def relative(advantages: Tensor, group: int) -> Tensor:
+    """Advantages (T, N) less the mean of the others in the group at the same tick; as they are for 1.
+
+    What starts and goals, which a group shares, do to the return is no merit of an action; the critic
+    cannot foresee it. The others' mean does not depend on the action, so nothing is biased.
+
+    Example:
+        >>> relative(torch.tensor([[1.0, 2.0, 4.0, 4.0]]), 2).tolist()
+        [[-1.0, 1.0, 0.0, 0.0]]
+    """
+    if group == 1:
+        return advantages
+    groups = advantages.unflatten(1, (-1, group))
+    return ((groups - groups.mean(-1, keepdim=True)) * (group / (group - 1))).flatten(1)
+
+
 def normalise(advantages: Tensor) -> Tensor:
     """Advantages (B,) with zero mean and unit deviation."""
     return (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+
+
+def losses(agent: Agent, part: dict[str, Tensor], clip: float) -> Tensor:
+    """Policy loss, value loss, entropy, change of the policy and clipped share of a minibatch, (5,).
+
+    The change is Schulman's estimate of the KL divergence; it and the share have no gradient.
+    """
+    new = log_probability(part["action"], agent.actor(part["observation"]), agent.log_std)
+    old, advantages = part["log_probability"], normalise(part["advantage"])
+    loss = policy_loss(new, old, advantages, clip)
+    value_loss = ((agent.value(part["observation"]) - part["return"]) ** 2).mean()
+    entropy = agent.log_std.sum() + 0.5 * len(agent.log_std) * np.log(2 * np.pi * np.e)
+    with torch.no_grad():
+        change = new - old
+        kl = (torch.exp(change) - 1 - change).mean()
+        clipped = (torch.abs(torch.exp(change) - 1) > clip).float().mean()
+    return torch.stack([loss, value_loss, entropy, kl, clipped])
+
+
+def finite(name: str, values: Tensor, step: int) -> Tensor:
+    """`values` as they are; ValueError with the first place where one is no number."""
+    if not bool(torch.isfinite(values).all()):
+        place = torch.nonzero(~torch.isfinite(values))[0].tolist()
+        got = values[tuple(place)].item()
+        raise ValueError(f"{name}{place or ''}: expected a finite number at step {step}, got {got}")
+    return values
 
 
 # --- training ---------------------------------------------------------------------------------------
@@ -184,8 +227,9 @@ class Training:
         self.learning_rate = min(self.learning_rate * factor, c.learning_rate)
         scalars |= {"charts/learning_rate": rate} | losses
         for name, value in scalars.items():
-            if not np.isfinite(value):
-                raise ValueError(f"{name}: expected a finite number at step {self.steps}, got {value}")
+            finite(name, torch.tensor(value), self.steps)
+        for name, parameter in self.agent.named_parameters():  # a last gradient may spoil them unseen
+            finite(name, parameter, self.steps)
         return scalars
 
     @torch.no_grad()
@@ -198,15 +242,17 @@ class Training:
         errors, std = [], torch.exp(agent.log_std)
         finished: list[tuple[float, float]] = []
         for t in range(c.horizon):
-            observations[t] = self.observation
+            step = self.steps + t * c.num_envs
+            observations[t] = finite("observation", self.observation, step)
             mean = agent.actor(self.observation)
-            actions[t] = mean + std * torch.randn(mean.shape, generator=self.generator)
+            noise = torch.randn(mean.shape, generator=self.generator)
+            actions[t] = finite("action", mean + std * noise, step)
             following, reward, terminated, truncated, info = self.env.step(actions[t].numpy())
-            rewards[t] = torch.from_numpy(reward) * (1 - c.gamma)
+            rewards[t] = finite("reward", torch.from_numpy(reward), step) * (1 - c.gamma)
             ended[t] = torch.from_numpy(terminated | truncated).float()
             if truncated.any():
                 last = torch.from_numpy(info["final_obs"][truncated])
-                tails[t, torch.from_numpy(truncated)] = agent.value(last)
+                tails[t, torch.from_numpy(truncated)] = agent.value(finite("final_obs", last, step))
             self.observation = torch.from_numpy(following)
             errors.append(info["velocity_error"].mean())
             self.returns, self.lengths = self.returns + reward, self.lengths + 1
@@ -221,7 +267,7 @@ class Training:
             "observation": observations,
             "action": actions,
             "log_probability": log_probability(actions, agent.actor(observations), agent.log_std),
-            "advantage": advantages,
+            "advantage": relative(advantages, self.env.config.group),
             "return": advantages + values,
         }
         returns = batch["return"]
@@ -243,20 +289,12 @@ class Training:
             order = torch.randperm(size, generator=self.generator)
             for rows in torch.split(order, c.minibatch_size):
                 part = {name: tensor[rows] for name, tensor in batch.items()}
-                new = log_probability(part["action"], agent.actor(part["observation"]), agent.log_std)
-                old, advantages = part["log_probability"], normalise(part["advantage"])
-                loss = policy_loss(new, old, advantages, c.clip)
-                value_loss = ((agent.value(part["observation"]) - part["return"]) ** 2).mean()
-                entropy = agent.log_std.sum() + 0.5 * len(agent.log_std) * np.log(2 * np.pi * np.e)
+                found = losses(agent, part, c.clip)
                 self.optimizer.zero_grad()
-                torch.autograd.backward(loss + value_loss - c.entropy * entropy)
+                torch.autograd.backward(found[0] + found[1] - c.entropy * found[2])
                 nn.utils.clip_grad_norm_(agent.parameters(), c.max_grad_norm)
                 self.optimizer.step()
-                with torch.no_grad():
-                    change = new - old
-                    kl = (torch.exp(change) - 1 - change).mean()
-                    clipped = (torch.abs(torch.exp(change) - 1) > c.clip).float().mean()
-                    total += torch.stack([loss, value_loss, entropy, kl, clipped]) * len(rows)
+                total += found.detach() * len(rows)
         names = ("policy_loss", "value_loss", "entropy", "approx_kl", "clipfrac")
         means = (total / (size * c.epochs)).tolist()
         return {f"losses/{name}": value for name, value in zip(names, means, strict=True)}
@@ -313,6 +351,12 @@ class Training:
             if (found := known.get(name)) != wanted:
                 raise ValueError(f"{path}: {name}: expected {wanted}, got {found}")
         tensors = {name: torch.from_numpy(a) for name, a in arrays.items() if name != "header"}
+        try:
+            self._restore(header, arrays, tensors)
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            raise ValueError(f"{path}: expected a complete checkpoint, got {error!r}") from error
+
+    def _restore(self, header: dict[str, Any], arrays: dict[str, Any], tensors: dict[str, Tensor]) -> None:
         self.updates, self.observation = header["updates"], tensors["observation"]
         self.learning_rate, self.episodes = header["learning_rate"], tuple(header["episodes"])
         self.returns, self.lengths = arrays["returns"], arrays["lengths"]
@@ -359,9 +403,12 @@ def train(
         tensorboard: folder for the same scalars as in the CSV (needs the extra `tensorboard`).
 
     Raises:
-        ValueError: a checkpoint of another training, or a loss that is no number (the last
-            checkpoint stays).
+        ValueError: settings that do not fit, a checkpoint of another training, or an observation, action,
+            reward, loss or weight that is no number, with its place (the last checkpoint stays).
+        OSError: a file that cannot be written (the last checkpoint stays).
     """
+    if config.num_envs % task.group:
+        raise ValueError(f"num_envs: expected a multiple of group {task.group}, got {config.num_envs}")
     env = TaskVectorEnv(config.num_envs, net, machine, task)
     training = Training(env, config, seed)
     identity = {

@@ -19,6 +19,7 @@ from brokk_min.kinematics import (
     jacobian,
     joint_rates,
     lowest_point,
+    tool_jacobian,
     tool_position,
     tool_state,
     tool_velocity,
@@ -373,6 +374,20 @@ def test_whole_angles_and_lists_are_angles():
 
 
 # --- refusals -------------------------------------------------------------------------------------
+
+
+def test_position_and_jacobian_in_one_pass_are_those_alone():
+    """Runs of parallel axes are turned together; a joint alone with its alpha is a run too."""
+    alphas = [0.0, 0.0, np.pi / 2, 0.3, 0.0]
+    joints = tuple(replace(joint, alpha=a, d=0.2) for joint, a in zip(BROKK_170.joints, alphas, strict=True))
+    for machine in (BROKK_170, replace(BROKK_170, joints=joints)):
+        q = np.random.default_rng(0).uniform(-1, 1, (4, 2, 5))
+        p, J = tool_jacobian(machine, q)
+        np.testing.assert_array_equal(p, tool_position(machine, q))
+        np.testing.assert_array_equal(J[..., machine.driven], jacobian(machine, q))
+        for i in range(5):
+            ahead, behind = (tool_position(machine, q + h * np.eye(5)[i]) for h in (1e-6, -1e-6))
+            np.testing.assert_allclose(J[..., i], (ahead - behind) / 2e-6, atol=1e-8)
 
 
 @pytest.mark.parametrize("shape", [(), (4,), (6,), (5, 4), (5, 1), (0,)])

@@ -218,7 +218,7 @@ def test_weights_that_are_no_numbers_are_refused(saved, policy):
         load_policy(saved, BROKK_170)
 
 
-@pytest.mark.parametrize("header", [{"format": 99}, {"kind": "actuator net"}])
+@pytest.mark.parametrize("header", [{"format": 99}, {"format": 0}, {"kind": "actuator net"}])
 def test_another_format_or_kind_is_refused(saved, header):
     rewrite(saved, header)
     wanted = rf"expected \(policy, format \d+\), got .*{next(iter(header.values()))}"

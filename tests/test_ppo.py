@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
+import copy
 import csv
+import errno
+import inspect
+import io
+import json
+import multiprocessing
+import os
+import types
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,7 +22,9 @@ import torch
 from helpers_machines import obedient_net, small_net
 from torch import nn
 
-from brokk_min import ppo
+from brokk_min import logs, ppo
+from brokk_min.__main__ import main
+from brokk_min.actuator import save_net
 from brokk_min.env import TaskConfig, TaskVectorEnv
 from brokk_min.machine import BROKK_170
 from brokk_min.policy import load_policy
@@ -199,6 +209,27 @@ def test_policy_loss_is_the_mean():
     assert float(found) == pytest.approx(-(1.2 + 0.5 + 4.0 - 1.0) / 4)
 
 
+@pytest.mark.parametrize("group", [2, 4, 8])
+def test_an_advantage_is_judged_against_the_others_of_its_group(group):
+    """By the definition, one environment at a time; what the whole group has in common drops out."""
+    raw = torch.randn(5, 8, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    found = ppo.relative(raw, group)
+    for t in range(5):
+        for i in range(8):
+            first = i // group * group
+            others = [raw[t, j].item() for j in range(first, first + group) if j != i]
+            assert found[t, i].item() == pytest.approx(raw[t, i].item() - np.mean(others))
+    common = torch.repeat_interleave(torch.randn(5, 8 // group, dtype=torch.float64), group, dim=1)
+    torch.testing.assert_close(ppo.relative(raw + common, group), found)
+    assert ppo.relative(raw, 1) is raw
+
+
+def test_training_refuses_groups_that_do_not_fit(tmp_path):
+    net = small_net(BROKK_170, np.random.default_rng(0))
+    with pytest.raises(ValueError, match="num_envs: expected a multiple of group 8, got 12"):
+        train(BROKK_170, net, ppo.TASK, PPOConfig(num_envs=12), 0, tmp_path / "p")
+
+
 def test_normalise():
     np.testing.assert_allclose(ppo.normalise(torch.tensor([1.0, 2.0, 3.0])), [-1, 0, 1], atol=1e-6)
     wild = 50 + 7 * torch.randn(999, generator=torch.Generator().manual_seed(1))
@@ -223,6 +254,7 @@ def test_the_nets_are_those_of_the_paper():
     w = agent.actor[0].weight.detach()  # orthogonal columns of length sqrt(2)
     torch.testing.assert_close(w.T @ w, 2 * torch.eye(171), atol=1e-4, rtol=0)
     assert agent.log_std.tolist() == [-0.5] * 4
+    assert [name for name, _ in agent.named_parameters() if "." not in name] == ["log_std"]  # is learned
     x = torch.randn(3, 171, generator=torch.Generator().manual_seed(0))
     assert agent.actor(x).abs().max() < 0.2  # hardly moves at first
     torch.testing.assert_close(agent.value(x), agent.critic(x).squeeze(-1))
@@ -233,6 +265,8 @@ def test_the_nets_are_those_of_the_paper():
 
 class Script:
     """An environment that plays a tape: each observation is one number."""
+
+    config = TaskConfig()
 
     def __init__(self, e):
         self.e, self.tick = e, 0
@@ -331,7 +365,7 @@ def test_the_learning_rate_is_lowered_while_the_policy_changes_too_much():
 class Bandit:
     """One tick an episode: the reward falls with the distance of the action from a target."""
 
-    target = np.array([0.6, -0.4], np.float32)
+    config, target = TaskConfig(), np.array([0.6, -0.4], np.float32)
 
     def __init__(self, num):
         self.num = num
@@ -390,6 +424,135 @@ def test_the_task_is_learned_a_little():
     training = Training(env, config, seed=0)
     errors = [training.update()["charts/velocity_error"] for _ in range(25)]
     assert np.mean(errors[-4:]) < 0.85 * np.mean(errors[:2]), errors
+
+
+@pytest.mark.parametrize("entropy", [0.0, 0.3])
+def test_learning_is_adam_on_the_losses_of_the_paper(entropy):
+    """One pass, written once more with torch's own normal distribution, on the same minibatches."""
+    config = replace(TINY, epochs=1, minibatch_size=16, entropy=entropy, max_grad_norm=0.5, target_kl=1e9)
+    training = Training(Bandit(8), config, seed=0)
+    batch, _ = training._collect()
+    batch["advantage"] = 3 + 5 * batch["advantage"]
+    batch["log_probability"] = batch["log_probability"] + torch.linspace(-0.5, 0.5, 64)
+    agent = copy.deepcopy(training.agent)
+    optimizer = torch.optim.Adam(agent.parameters(), lr=config.learning_rate)
+    generator = torch.Generator()
+    generator.set_state(training.generator.get_state())
+    training._learn(batch)
+    for rows in torch.split(torch.randperm(64, generator=generator), 16):
+        part = {name: tensor[rows] for name, tensor in batch.items()}
+        normal = torch.distributions.Normal(agent.actor(part["observation"]), agent.log_std.exp())
+        ratio = (normal.log_prob(part["action"]).sum(-1) - part["log_probability"]).exp()
+        a = part["advantage"]
+        a = (a - a.mean()) / a.std()
+        earned = torch.where(a > 0, ratio.clamp(max=1.2), ratio.clamp(min=0.8)) * a
+        missed = (agent.critic(part["observation"])[:, 0] - part["return"]) ** 2
+        loss = missed.mean() - earned.mean() - entropy * normal.entropy().sum(-1).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(agent.parameters(), 0.5)
+        optimizer.step()
+    pairs = zip(training.agent.parameters(), agent.parameters(), strict=True)
+    for found, wanted in pairs:
+        torch.testing.assert_close(found, wanted, atol=2e-5, rtol=0)
+
+
+def test_actions_vary_as_the_policy_says():
+    training = Training(Bandit(512), replace(TINY, num_envs=512, log_std=-2.0), seed=0)
+    with torch.no_grad():
+        batch, _ = training._collect()
+        z = (batch["action"] - training.agent.actor(batch["observation"])) / np.exp(-2.0)
+    assert float(z.std()) == pytest.approx(1, abs=0.05)
+    assert abs(float(z.mean())) < 0.05
+
+
+# --- planted errors ---------------------------------------------------------------------------------
+
+
+def gae_is_right():
+    test_gae_is_the_mean_of_n_step_returns(0.9, 0.7, 0)
+
+
+def advantages_are_right():
+    test_collected_advantages_use_the_right_last_observations(0)
+
+
+def loss_is_right():
+    for case in ((1.5, 2.0, -2.4, 0.0), (1.5, -2.0, 3.0, 3.0), (0.5, 2.0, -1.0, -1.0), (0.5, -2.0, 1.6, 0.0)):
+        test_policy_loss_by_hand(*case)
+
+
+def learning_is_right():
+    test_learning_is_adam_on_the_losses_of_the_paper(0.3)
+
+
+PLANTED = (
+    ("terminated | truncated).float", "terminated).float", advantages_are_right),
+    ("            if truncated.any():", "            if False:", advantages_are_right),
+    ('info["final_obs"][truncated]', "following[truncated]", advantages_are_right),
+    ('info["final_obs"][truncated]', "observations[t].numpy()[truncated]", advantages_are_right),
+    ("torch.where(ended > 0, tails, following_values)", "following_values", advantages_are_right),
+    ("agent.value(self.observation)[None]", "values[-1:]", advantages_are_right),
+    ("values[1:], agent", "values[:-1], agent", advantages_are_right),
+    (", step) * (1 - c.gamma)", ", step)", advantages_are_right),
+    ('"return": advantages + values', '"return": advantages', advantages_are_right),
+    (
+        "delta = rewards + gamma * next_values - values",
+        "delta = rewards + next_values - values",
+        gae_is_right,
+    ),
+    ("gamma * gae_lambda * (1 - ended[t])", "gamma * gae_lambda", gae_is_right),
+    ("gamma * gae_lambda * (1", "gamma * (1", gae_is_right),
+    ("gamma * gae_lambda * (1", "gae_lambda * (1", gae_is_right),
+    ("torch.exp(new - old)\n", "torch.exp(old - new)\n", loss_is_right),
+    ("return -torch.min(", "return torch.min(", loss_is_right),
+    ("-torch.min(", "-torch.max(", loss_is_right),
+    ("-torch.min(ratio * advantages, clipped", "-torch.min(clipped * advantages, clipped", loss_is_right),
+    ("-torch.min(ratio * advantages, clipped", "-torch.min(ratio * advantages, ratio", loss_is_right),
+    ("1 - clip, 1 + clip", "1 - clip, 1 - clip", loss_is_right),
+    (" - log_std.sum() - 0.5", " - 0.5", lambda: test_log_probability_is_that_of_torch()),
+    (" - log_std.sum() - 0.5", " + log_std.sum() - 0.5", lambda: test_log_probability_is_that_of_torch()),
+    (" * torch.exp(-log_std)", "", lambda: test_log_probability_is_that_of_torch()),
+    (" * torch.exp(-log_std)", "", learning_is_right),
+    (" - log_std.sum() - 0.5", " - 0.5", learning_is_right),
+    ('normalise(part["advantage"])', 'part["advantage"]', learning_is_right),
+    ("(advantages - advantages.mean()) /", "advantages /", lambda: test_normalise()),
+    (" / (advantages.std() + 1e-8)", "", lambda: test_normalise()),
+    ("found[0] + found[1]", "found[0] - found[1]", learning_is_right),
+    ("- c.entropy * found[2]", "+ c.entropy * found[2]", learning_is_right),
+    ("entropy = agent.log_std.sum() + 0.5", "entropy = -agent.log_std.sum() + 0.5", learning_is_right),
+    ("self.optimizer.zero_grad()", "pass", learning_is_right),
+    ("nn.utils.clip_grad_norm_(agent.parameters(), c.max_grad_norm)", "pass", learning_is_right),
+    ('part["return"]) ** 2', 'part["advantage"]) ** 2', learning_is_right),
+    (
+        "nn.Parameter(torch.full((actions,), log_std))",
+        "torch.full((actions,), log_std)",
+        lambda: test_the_nets_are_those_of_the_paper(),
+    ),
+    ("mean + std * noise", "mean + noise", lambda: test_actions_vary_as_the_policy_says()),
+    (
+        "1 / 1.2 if change > 1.5 else 1.2",
+        "1.2 if change > 1.5 else 1 / 1.2",
+        lambda: test_the_learning_rate_is_lowered_while_the_policy_changes_too_much(),
+    ),
+    ("nn.ELU()", "nn.ReLU()", lambda: test_the_nets_are_those_of_the_paper()),
+)
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "check"), PLANTED, ids=[f"{a} -> {b}"[:60] for a, b, _ in PLANTED]
+)
+def test_planted_errors_are_caught_by_an_assertion(right, wrong, check, monkeypatch):
+    source = inspect.getsource(ppo)
+    assert source.count(right) == 1
+    mutant = types.ModuleType(ppo.__name__)
+    exec(source.replace(right, wrong), mutant.__dict__)
+    check()  # right as it is
+    for name, value in {"ppo": mutant, **vars(mutant)}.items():
+        if name in ("ppo", "gae", "Agent", "Training"):
+            monkeypatch.setitem(globals(), name, value)
+    with pytest.raises(AssertionError):
+        check()
 
 
 # --- the same bits --------------------------------------------------------------------------------
@@ -591,6 +754,168 @@ def test_a_loss_that_is_no_number_stops_and_keeps_the_checkpoint(tmp_path, monke
     run(tmp_path / "p.npz", resume=True)  # from update 2, before the accident
     run(tmp_path / "straight.npz")
     assert (tmp_path / "p.npz").read_bytes() == (tmp_path / "straight.npz").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("where", "message"),
+    [
+        ("observation", r"observation\[5, 7\]: expected a finite number at step 152, got nan"),
+        ("final_obs", r"final_obs\[0, 7\]: expected a finite number at step 88, got nan"),
+        ("reward", r"reward\[5\]: expected a finite number at step 144, got -inf"),
+        ("action", r"action\[0, 2\]: expected a finite number at step 128, got -?inf"),
+        ("weight", r"actor\.6\.bias\[2\]: expected a finite number at step 192, got nan"),
+    ],
+)
+def test_what_is_no_number_stops_with_its_place_and_keeps_the_checkpoint(
+    tmp_path, monkeypatch, where, message
+):
+    """In the third of four updates (`final_obs`: the second, when time runs out)."""
+    step, learn, ticks = TaskVectorEnv.step, Training._learn, [0]
+
+    def poisoned_step(self, actions):
+        ticks[0] += 1
+        seen, reward, terminated, truncated, info = step(self, actions)
+        if ticks[0] == 19 and where == "observation":
+            seen[5, 7] = np.nan
+        if ticks[0] == 19 and where == "reward":
+            reward[5] = -np.inf
+        if ticks[0] == 12 and where == "final_obs":
+            info["final_obs"][np.argmax(truncated), 7] = np.nan
+        return seen, reward, terminated, truncated, info
+
+    def poisoned_learn(self, batch):
+        result = learn(self, batch)
+        with torch.no_grad():
+            if where == "action" and self.updates == 1:
+                self.agent.log_std[2] = 100.0  # a number still, but its exponential is none
+            if where == "weight" and self.updates == 2:
+                self.agent.actor[-1].bias[2] = np.nan
+        return result
+
+    config = replace(TINY, checkpoint_every=1)
+    with monkeypatch.context() as patch:
+        patch.setattr(TaskVectorEnv, "step", poisoned_step)
+        patch.setattr(Training, "_learn", poisoned_learn)
+        with pytest.raises(ValueError, match=message):
+            run(tmp_path / "p.npz", config=config)
+    assert not (tmp_path / "p.npz").exists()
+    if where != "action":
+        run(tmp_path / "p.npz", resume=True, config=config)
+        run(tmp_path / "straight.npz", config=config)
+        assert (tmp_path / "p.npz").read_bytes() == (tmp_path / "straight.npz").read_bytes()
+
+
+def fill_the_disk(monkeypatch, kept):
+    """Files after the first `kept` find room for 100,000 bytes and then none, as on a full disk."""
+
+    class Full(io.FileIO):
+        def write(self, data):
+            if self.tell() + len(data) > 100_000:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            return super().write(data)
+
+    opened, fdopen = [0], os.fdopen
+
+    def open_file(handle, mode, **options):
+        opened[0] += 1
+        if opened[0] <= kept or "b" not in mode:
+            return fdopen(handle, mode, **options)
+        return io.BufferedWriter(Full(handle, "w"))
+
+    monkeypatch.setattr(logs.os, "fdopen", open_file)
+
+
+@pytest.mark.parametrize(("kept", "file"), [(3, "p.npz.checkpoint"), (5, "p.npz")])
+def test_a_full_disk_is_named_and_the_checkpoint_is_kept(tmp_path, monkeypatch, kept, file):
+    """Curve and checkpoint after updates 2 and 4, curve and policy at the end: six files."""
+    with monkeypatch.context() as patch:
+        fill_the_disk(patch, kept)
+        with pytest.raises(OSError, match=rf"No space left on device: '.*/{file}'"):
+            run(tmp_path / "p.npz")
+    found = sorted(path.name for path in tmp_path.iterdir())
+    assert found == ["p.npz.checkpoint", "p.npz.csv"]  # and nothing half written
+    run(tmp_path / "p.npz", resume=True)
+    run(tmp_path / "straight.npz")
+    assert (tmp_path / "p.npz").read_bytes() == (tmp_path / "straight.npz").read_bytes()
+
+
+def command(folder, *options):
+    """Arguments of a small training on the net in `folder`."""
+    small = {"num_envs": 8, "horizon": 8, "epochs": 2, "minibatch_size": 32, "total_steps": 512}
+    small |= {"checkpoint_every": 1, "threads": 1, "episode_s": 0.6}
+    pairs = [text for name, value in small.items() for text in (f"--{name.replace('_', '-')}", str(value))]
+    return ["train", "--actuator", f"{folder}/net.npz", "--out", f"{folder}/p.npz", *pairs, *options]
+
+
+def test_the_command_line_says_which_file_found_no_room(tmp_path, monkeypatch, capsys):
+    save_net(tmp_path / "net.npz", NET)
+    fill_the_disk(monkeypatch, 0)
+    assert main(command(tmp_path)) == 1
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said == f"brokk-min: [Errno 28] No space left on device: '{tmp_path}/p.npz.checkpoint'"
+
+
+def test_a_directory_that_may_only_be_read_is_refused_before_any_work(tmp_path, monkeypatch, capsys):
+    save_net(tmp_path / "net.npz", NET)
+    os.chmod(tmp_path, 0o500)
+    access = os.access  # root may write everywhere: the answer that others get
+    monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK and access(path, mode))
+    assert main(command(tmp_path)) == 2
+    assert "p.npz: expected a file in an existing, writable directory" in capsys.readouterr().err
+    os.chmod(tmp_path, 0o700)
+    assert [path.name for path in tmp_path.iterdir()] == ["net.npz"]
+
+
+def rewrite(path, header, drop=()):
+    with np.load(path) as file:
+        arrays = {name: file[name] for name in file.files if name not in drop}
+    text = json.loads(str(arrays["header"])) | header
+    with open(path, "wb") as file:
+        np.savez(file, **(arrays | {"header": np.array(json.dumps(text))}))
+
+
+@pytest.mark.parametrize(
+    ("header", "drop", "message"),
+    [
+        ({"format": 0}, (), r"expected \(checkpoint, format 1\), got \('checkpoint', 0\)"),
+        ({}, ("env_lag",), r"expected a complete checkpoint, got KeyError\('env_lag'\)"),
+        ({}, ("exp_avg_3",), r"expected a complete checkpoint, got KeyError\('exp_avg_3'\)"),
+        ({"random": {}}, (), r"expected a complete checkpoint, got "),
+    ],
+)
+def test_a_checkpoint_of_an_older_format_or_with_holes_is_refused(killed, header, drop, message):
+    rewrite(f"{killed}.checkpoint", header, drop)
+    with pytest.raises(ValueError, match=r"p\.npz\.checkpoint: " + message):
+        run(killed, resume=True)
+
+
+@pytest.mark.slow
+def test_twenty_kills_at_random_moments_end_in_the_same_bytes(tmp_path):
+    """SIGKILL of a real process, while it starts, collects, learns or writes; then one to the end."""
+    rng, straight, killed = np.random.default_rng(0), tmp_path / "straight", tmp_path / "killed"
+    for folder in (straight, killed):
+        folder.mkdir()
+        save_net(folder / "net.npz", NET)
+    more = ["--total-steps", str(64 * 400)]
+    assert main(command(straight, *more)) == 0
+    processes = multiprocessing.get_context("forkserver")
+    processes.set_forkserver_preload(["brokk_min.ppo", "brokk_min.__main__"])
+    kills, taken_up = 0, set()
+    while kills < 20:
+        process = processes.Process(target=main, args=(command(killed, *more, "--resume"),))
+        process.start()
+        process.join(rng.uniform(0, 1.5))
+        process.kill()
+        process.join()
+        if process.exitcode == 0:
+            (killed / "p.npz").unlink()  # came to its end: once more from the beginning
+        else:
+            curve = killed / "p.npz.csv"
+            kills, taken_up = kills + 1, taken_up | {len(table(killed / "p.npz")) if curve.exists() else 0}
+    assert main(command(killed, *more, "--resume")) == 0
+    assert len(taken_up) > 8
+    assert (straight / "p.npz").read_bytes() == (killed / "p.npz").read_bytes()
+    assert table(straight / "p.npz") == table(killed / "p.npz")
 
 
 def test_a_plant_is_not_what_policies_are_trained_on():
