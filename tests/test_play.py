@@ -510,6 +510,7 @@ def test_a_film_is_shown_and_closed(results: Path) -> None:
         np.zeros((3, 3)),
         np.zeros(3),
         np.zeros((0, 3)),
+        np.zeros((0, 3)),
     )
     pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=pygame.K_RIGHT))
     pygame.event.post(pygame.event.Event(pygame.QUIT))
