@@ -7,6 +7,7 @@ environment, with a plant instead of nets the evaluation, and `observe` and `to_
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -49,6 +50,7 @@ GROUND_MARGIN = 0.3  # m above the ground below which no goal asks the arm to si
 LAG_TIME, LAG_SPEED = 2.0, 0.07  # s and a share of tool_speed, tuned: see `push_lag`
 Array = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]
+Encoder = Callable[[Machine, Array], Array]  # machine and true angles -> angles read
 
 
 @dataclass(frozen=True)
@@ -307,8 +309,12 @@ def rest_state(machine: Machine, q: ArrayLike, v_goal: ArrayLike, plant: bool) -
     return State(q, np.zeros_like(q), history, goals, never, ticks, np.zeros_like(goals), plant_state)
 
 
-def transition(machine: Machine, net: ActuatorNet | None, state: State, u: Array) -> State:
+def transition(
+    machine: Machine, net: ActuatorNet | None, state: State, u: Array, read: Encoder = read_encoder
+) -> State:
     """One tick under the command `u` (..., n), by the nets, or by the plant where the state has one.
+
+    `read(machine, q)` are the angles that the encoders say; they may be disturbed for a test of robustness.
 
     Paper: Sec. 3.4 (actuator nets in the simulation), Table 1
     """
@@ -325,7 +331,7 @@ def transition(machine: Machine, net: ActuatorNet | None, state: State, u: Array
     else:
         raise ValueError("net: expected nets for a state without a plant, got None")
 
-    history, lag = push_measured(machine, history, read_encoder(machine, q), state.v_goal, state.lag)
+    history, lag = push_measured(machine, history, read(machine, q), state.v_goal, state.lag)
     return replace(
         state,
         q=q,
@@ -524,6 +530,7 @@ def rollout(
     config: TaskConfig,
     rng: np.random.Generator,
     net: ActuatorNet | None = None,
+    read: Encoder = read_encoder,
 ) -> Trace:
     """Let one controller follow given goals from rest: on the plant, or on nets. Paper: Fig. 3
 
@@ -535,6 +542,7 @@ def rollout(
         config: its `noise` holds; no episode ends.
         rng: of the noise.
         net: nets of the driven joints; None: the analytic plant.
+        read: see `transition`.
     """
     state = rest_state(machine, start, goals[0], plant=net is None)
     memory = controller.start(len(state.q))
@@ -544,7 +552,7 @@ def rollout(
         observation = look(machine, config, state, rng)
         u, memory = controller(observation, memory)
         q_measured = state.history[..., 0, -1]
-        state = transition(machine, net, state, u)
+        state = transition(machine, net, state, u, read)
         p_tool, v_tool, _ = tool_state(machine, state.q, state.q_dot)
         trace.append((state.q, state.q_dot, q_measured, u, p_tool, v_tool, reward(goal, v_tool)))
     return Trace(*map(np.array, zip(*trace, strict=True)))

@@ -154,7 +154,7 @@ def relative(advantages: Tensor, group: int) -> Tensor:
     """
     if group == 1:
         return advantages
-    groups = advantages.unflatten(1, (-1, group))
+    groups = advantages.reshape(len(advantages), -1, group)
     return ((groups - groups.mean(-1, keepdim=True)) * (group / (group - 1))).flatten(1)
 
 

@@ -15,47 +15,13 @@ from brokk_min.actuator import ActuatorNet
 from brokk_min.env import TaskConfig, Trace, rollout
 from brokk_min.kinematics import tool_position
 from brokk_min.machine import BROKK_170
+from brokk_min.metrics import metrics
+from brokk_min.sequences import task_sequences
 
-TINY = experiments.Effort(hours=0.02, fit_steps=60, train_steps=8192, generations=1, tuning_runs=2, starts=2)
-
-
-def test_line_distance_of_a_hand_worked_drift() -> None:
-    # along x with 0.3 m to the side after the second tick; the stop and the way back keep the line
-    goals = np.array([[0.2, 0, 0], [0.2, 0, 0], [0, 0, 0], [-0.1, 0, 0]])
-    p = np.array([[1.0, 0, 0], [2.0, 0.3, 0.4], [2.0, 0.3, 0.0], [1.0, 0.0, 0.1]])
-    distance = experiments.line_distance(p, goals, np.zeros(3))
-    assert distance == pytest.approx([0.0, 0.5, 0.3, 0.1])
+TINY = experiments.Effort(0.02, 60, 8192, 1, 2, 4, 2, 1.0)
 
 
-def test_line_distance_starts_a_new_line_when_the_direction_turns() -> None:
-    goals = np.array([[0.2, 0, 0], [0, 0.2, 0]])
-    p = np.array([[1.0, 0.1, 0], [1.2, 5.0, 0]])  # second line through (1, 0.1) along y
-    assert experiments.line_distance(p, goals, np.zeros(3)) == pytest.approx([0.1, 0.2])
-
-
-def test_line_distance_before_the_first_motion_is_from_the_start() -> None:
-    goals = np.array([[0.0, 0, 0], [0, 0, 0.1]])
-    p = np.array([[0.0, 0.3, 0.4], [0.1, 0.0, 7.0]])
-    assert experiments.line_distance(p, goals, np.zeros(3)) == pytest.approx([0.5, 0.1])
-
-
-def test_metrics_by_hand() -> None:
-    v = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.3, 0, 0]])[:, None]
-    u = np.array([[0.0, 0.5], [0.2, 0.5], [0.2, -0.5]])[:, None]
-    p = np.cumsum(v, axis=0) * 0.05
-    zero = np.zeros((3, 1, 5))
-    trace = Trace(zero, zero, zero, u, p, v, np.array([[1.0], [0.5], [0.75]]))
-    goals = np.tile([0.1, 0.0, 0.0], (3, 1))
-    row = experiments.metrics(BROKK_170, trace, 0, goals, np.zeros(3))
-    assert row["velocity_error_mean"] == pytest.approx((0.1 + 0.0 + 0.2) / 3)
-    assert row["velocity_rmse"] == pytest.approx(np.sqrt((0.01 + 0.04) / 3))
-    assert row["valve_travel"] == pytest.approx(0.5 + 0.2 + 1.0)  # from rest, then tick by tick
-    assert row["jerk_rms"] == pytest.approx(0.1 * 400)  # second difference 0.1 m/s at 20 Hz
-    assert row["reward_mean"] == pytest.approx(0.75)
-    assert row["off_axis_drift_max"] == pytest.approx(0.0)
-
-
-class _Perfect:
+class _Idle:
     """A controller that does nothing, for machines that should stand still."""
 
     def start(self, num: int) -> None:
@@ -68,8 +34,9 @@ class _Perfect:
 def test_an_idle_controller_stands_still_and_errs_by_the_goal() -> None:
     start = np.array([[1.5, 0.5, 0.58, 1.71, 1.24]])
     goals = np.tile([0.0, 0.0, 0.2], (20, 1, 1))
-    trace = rollout(BROKK_170, _Perfect(), start, goals, TaskConfig(), np.random.default_rng(0))
-    row = experiments.metrics(BROKK_170, trace, 0, goals[:, 0], tool_position(BROKK_170, start[0]))
+    trace = rollout(BROKK_170, _Idle(), start, goals, TaskConfig(), np.random.default_rng(0))
+    found = metrics(BROKK_170, trace, goals, tool_position(BROKK_170, start))
+    row = {name: values[0] for name, values in found.items()}
     assert row["velocity_error_mean"] == pytest.approx(0.2, abs=1e-6)
     assert row["reward_mean"] == pytest.approx(1 / 1.2, abs=1e-6)
     assert row["valve_travel"] == 0
@@ -119,10 +86,14 @@ def test_results_hold_every_run_with_its_figures(twice: tuple[Path, Path]) -> No
     runs = results["task_space"]["runs"]
     names = {"rl", "jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff"}
     keys = {(r["controller"], r["sequence"], r["start"]) for r in runs}
-    assert keys == {(c, s, i) for c in names for s in "xyz" for i in range(2)}
+    sequences = [s.name for s in task_sequences(BROKK_170)]
+    assert keys == {(c, s, i) for c in names for s in sequences for i in range(4)}
     assert all(r["velocity_rmse"] >= r["velocity_error_mean"] > 0 for r in runs)
     assert all(0 < r["reward_mean"] < 1 for r in runs)
-    rl = [r["velocity_error_mean"] for r in runs if r["controller"] == "rl"]
+    assert results["start_kinds"] == ["workspace", "limits", "workspace", "extended"]
+    assert all(r["kind"] == results["start_kinds"][r["start"]] for r in runs)
+    scored = [r for r in runs if r["kind"] == "workspace"]
+    rl = [r["velocity_error_mean"] for r in scored if r["controller"] == "rl"]
     assert results["task_space"]["summary"]["rl"]["all"]["velocity_error_mean"] == pytest.approx(np.mean(rl))
 
 
@@ -139,7 +110,7 @@ def test_results_tell_how_the_baselines_were_tuned(twice: tuple[Path, Path]) -> 
 
 def test_the_report_is_one_file_with_its_figures(twice: tuple[Path, Path]) -> None:
     text = (twice[0] / "report.html").read_text()
-    assert len(re.findall(r"src='data:image/png;base64,", text)) == 7
+    assert len(re.findall(r"src='data:image/png;base64,", text)) == 10
     assert not re.findall(r"(?:src|href)='(?!data:)", text) and "http" not in text
     assert "not a real Brokk 170" in text
 
