@@ -235,9 +235,8 @@ class Evaluate(Command):
             experiments.write_json(self.json, {"meta": meta, "runs": runs})
         for kind in dict.fromkeys(run["kind"] for run in runs):
             mine = [run for run in runs if run["kind"] == kind]
-            print(
-                f"{kind} starts ({len({run['start'] for run in mine})}), means over {len(sequences)} sequences"
-            )
+            count = len({run["start"] for run in mine})
+            print(f"{kind} starts ({count}): means over {len(sequences)} sequences")
             for name, rows in summary(mine).items():
                 cells = (f"{k} {'none' if v is None else format(v, '.4f')}" for k, v in rows["all"].items())
                 print(f"  {name:20} " + ", ".join(cells))
