@@ -51,7 +51,7 @@ class Effort:
     generations: int = 45
     tuning_runs: int = 12
     starts: int = 64
-    bound_starts: int = 4  # of them, for the regret
+    bound_starts: int = 16  # of them, for the regret
     short_s: float = 18.0  # of each axis sequence, for regret, robustness and the singular case [s]
 
 

@@ -118,7 +118,7 @@ Bars = Mapping[str, Mapping[str, Mapping[str, float | None]]]  # controller, seq
 
 def plot_bars(panels: Mapping[str, Bars]) -> Any:
     """Means with their 95 % intervals of each controller on each sequence; panels by the label of their y."""
-    figure = plt.figure(figsize=(9.4, 2.9 * len(panels)), layout="constrained")
+    figure = plt.figure(figsize=(10.4, 2.9 * len(panels)), layout="constrained")
     axes = figure.subplots(len(panels), 1, squeeze=False)[:, 0]
     for ax, (label, bars) in zip(axes, panels.items(), strict=True):
         names, width = list(next(iter(bars.values()))), 0.8 / len(bars)
@@ -128,7 +128,7 @@ def plot_bars(panels: Mapping[str, Bars]) -> Any:
             places = np.arange(len(names)) + (i - (len(bars) - 1) / 2) * width
             color = STYLES[controller]["color"]
             ax.bar(places, mean, width, yerr=ends, label=controller, color=color, error_kw={"linewidth": 0.8})
-        ax.set_xticks(np.arange(len(names)), names)
+        ax.set_xticks(np.arange(len(names)), names, fontsize=8)
         ax.set_ylabel(label)
         ax.grid(alpha=0.3, axis="y")
         ax.set_axisbelow(True)
