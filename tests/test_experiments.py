@@ -14,7 +14,7 @@ import pytest
 from benchmarks.rollout import random_net
 from brokk_min import experiments, jacobian
 from brokk_min.actuator import ActuatorNet, speed_limits
-from brokk_min.env import Measured, TaskConfig, measured, rollout, to_command
+from brokk_min.env import Measured, TaskConfig, Trace, measured, rollout, to_command
 from brokk_min.kinematics import joint_rates, tool_position
 from brokk_min.machine import BROKK_170, Machine, read_encoder
 from brokk_min.metrics import metrics
