@@ -204,9 +204,9 @@ def test_results_answer_the_papers_question(twice: tuple[Path, Path]) -> None:
     means = results["task_space"]["summary"]
     difference = [means[c]["all"]["velocity_error_mean"] for c in ("rl", "jacobian_pid_ff")]
     assert paired["mean"] == pytest.approx(difference[0] - difference[1])
-    assert paired["low"] < paired["mean"] < paired["high"]
+    assert paired["low"] <= paired["mean"] <= paired["high"]
     low, high = results["task_space"]["intervals"]["rl"]["all"]["velocity_error_mean"]
-    assert low < means["rl"]["all"]["velocity_error_mean"] < high
+    assert low <= means["rl"]["all"]["velocity_error_mean"] <= high
     assert set(results["robustness"]) == set(experiments.variations(BROKK_170))
 
 
@@ -252,6 +252,6 @@ def test_drift_is_the_largest_and_the_mean_distance_from_the_line() -> None:
     p = np.array([[0.1, 0.0, 0.0], [0.2, 0.03, 0.04], [0.3, 0.0, 0.01]])[:, None]
     zero = np.zeros((3, 1, 5))
     trace = Trace(zero, zero, zero, zero, p, 0 * p, np.ones((3, 1)))
-    row = experiments.metrics(BROKK_170, trace, 0, np.tile([0.1, 0.0, 0.0], (3, 1)), np.zeros(3))
-    assert row["off_axis_drift_max"] == pytest.approx(0.05)
-    assert row["off_axis_drift_mean"] == pytest.approx((0.0 + 0.05 + 0.01) / 3)
+    row = metrics(BROKK_170, trace, np.tile([0.1, 0.0, 0.0], (3, 1, 1)), np.zeros((1, 3)))
+    assert row["off_axis_drift_max"] == pytest.approx([0.05])
+    assert row["off_axis_drift_mean"] == pytest.approx([(0.0 + 0.05 + 0.01) / 3])

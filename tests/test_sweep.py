@@ -31,8 +31,11 @@ def short(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(module.os, "environ", dict(module.os.environ))
     if "slow" not in request.keywords:
         pose = np.array([1.5, 0.5, 0.58, 1.71, 1.24])
-        random = np.random.default_rng(2).random
-        monkeypatch.setattr(module, "scored_starts", lambda m, num, s, seed: pose + 0.1 * random((num, 5)))
+        monkeypatch.setattr(
+            module,
+            "scored_starts",
+            lambda m, num, s, seed: pose + 0.1 * np.random.default_rng(seed).random((num, 5)),
+        )
         monkeypatch.setattr(
             module, "axis_sequences", lambda m: [s._replace(goals=s.goals[15:25]) for s in full(m)]
         )
@@ -114,7 +117,7 @@ def test_a_sweep_from_the_command_line_and_once_more(
     monkeypatch.setattr(module, "apart", here)
     monkeypatch.setattr(module.os, "cpu_count", lambda: 1)  # torch's seed is one for all threads
     save_net(tmp_path / "net.npz", NET)
-    settings = {"num-envs": 4, "horizon": 4, "epochs": 1, "minibatch-size": 16, "total-steps": 32}
+    settings = {"num-envs": 4, "group": 2, "horizon": 4, "epochs": 1, "minibatch-size": 16, "total-steps": 32}
     pairs = [text for name, value in settings.items() for text in (f"--{name}", str(value))]
     command = ["sweep", "--actuator", f"{tmp_path}/net.npz", "--out", f"{tmp_path}/sweep", "--seed", "3"]
     command += ["--seeds", "2", "--poses", "2", "--episode-s", "0.6", *pairs]
@@ -124,7 +127,7 @@ def test_a_sweep_from_the_command_line_and_once_more(
     files = sorted(p.name for p in (tmp_path / "sweep").iterdir())
     seeds = [f"seed_{n}.{end}" for n in (3, 4) for end in ("json", "npz", "npz.csv")]
     assert files == [*seeds, "sweep.json"]
-    train(BROKK_170, NET, TASK, TINY, 4, tmp_path / "alone.npz")
+    train(BROKK_170, NET, replace(TASK, group=2), TINY, 4, tmp_path / "alone.npz")
     assert (tmp_path / "sweep/seed_4.npz").read_bytes() == (tmp_path / "alone.npz").read_bytes()
     written = json.loads((tmp_path / "sweep/sweep.json").read_text())
     assert len(written["runs"]) == 2 * 3 * 2 and written["table"]["rl"]["valve_travel"]["mean"] > 0
