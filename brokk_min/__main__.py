@@ -38,7 +38,7 @@ ALLOWED: tuple[tuple[float, float, str], ...] = (
     (0, 2**31 - 1, "seed"),
     (0, 1, "zero_goals axis_goals gae_lambda"),
     (0, 0.9999, "gamma"),
-    (0, 1000, "noise rest_weight valve_cost entropy"),
+    (0, 1000, "noise valve_cost entropy"),
     (0, 1e6, "hold_min_s hold_max_s"),
     (1, 1e6, "batch_size hidden num_envs group horizon epochs threads rollout"),
     (1, 1e12, "steps total_steps checkpoint_every"),
@@ -122,7 +122,7 @@ class Fit:
     figure: Path | None = None  # Also draw free runs of the worst and the median recording here, .png.
     machine: Name = ""  # Whose nets these are; by default the machine that has the joints of LOGS.
     velocity_samples: int = BROKK_170.velocity_samples  # Window of the velocity estimator at 20 Hz.
-    paper: bool = False  # The paper's own recipe: errors of one step alone, no noise, all samples alike.
+    paper: bool = False  # The paper's own recipe: errors of one step alone, no noise.
     settings: tyro.conf.OmitArgPrefixes[FitConfig] = field(default_factory=FitConfig)  # The fit.
     seed: int = 0  # Of everything random.
 
@@ -142,8 +142,8 @@ class Fit:
         name = known[0].name if len({machine.name for machine in known}) == 1 else ""
         settings = replace(self.settings, **PAPER_RECIPE) if self.paper else self.settings
         net = fit(log, settings, self.seed, self.velocity_samples, name)
-        save_net(self.out, net)
         verdict = preliminary.judge(net, log, test, known[0] if known else None)
+        save_net(self.out, net)
         if self.json:
             meta: dict[str, Any] = {"seed": self.seed, "rate": net.rate, "history": net.history}
             meta |= {"logs": [str(p) for p in self.logs], "test": [str(p) for p in self.test]}
@@ -160,7 +160,7 @@ def _print_verdict(verdict: dict[str, Any]) -> None:
     for name, s in verdict["joints"].items():
         for label, scores in ((name, s), ("  linear", s["linear"])):
             free = ", ".join(f"{run['velocity_rmse']:.4f}" for run in scores["free_run"].values())
-            steps = (f"{scores[key]:.4f}" for key in ("one_step_rmse", "persistence_rmse"))
+            steps = (f"{scores.get(key, np.nan):.4f}" for key in ("one_step_rmse", "persistence_rmse"))
             print(row.format(label, *steps, free, f"{s['creep']:.5f}" if label == name else ""))
     for warning in verdict["warnings"]:
         print(f"warning: {warning}")

@@ -23,6 +23,7 @@ from brokk_min.machine import PWM_MAX, Machine, estimate_velocity, limit_command
 Array = NDArray[np.floating[Any]]
 FORMAT = 1  # of net files
 HORIZONS = (1, 5, 10, 30)  # s, of the free-run scores
+STILL = 0.002  # rad, assumed: little more than a step of a 12-bit encoder
 MAX_RETURN = 300.0  # s, assumed: a way back to the start that takes longer is broken off
 
 
@@ -333,8 +334,16 @@ class ActuatorNet:
     def predict(self, history: Array) -> Array:
         """Mean velocity over the coming tick [rad/s] (..., n), so that q(t+dt) = q(t) + dt * velocity.
 
-        `history` is what `push_command` left, (..., n, 3, H).
+        `history` is what `push_command` left, (..., n, 3, H). A joint that had no command and moved less than
+        `STILL` during all of it stands, where a net alone would creep.
         """
+        still = ~history[..., 2, :].any(axis=-1) & (np.abs(history[..., 0, -1] - history[..., 0, 0]) < STILL)
+        velocity = self.velocity(history)
+        velocity[still] = 0.0
+        return velocity
+
+    def velocity(self, history: Array) -> Array:
+        """What the nets alone say, as `predict`."""
         n, inputs = len(self.joints), 3 * self.history
         if history.shape[-3:] != (n, 3, self.history):
             raise ValueError(f"history: expected (..., {n}, 3, {self.history}), got {history.shape}")
@@ -435,7 +444,7 @@ class FitConfig:
     batch_size: int = 1024
     """Windows a joint in each step."""
     learning_rate: float = 4e-3
-    """Of Adam at the start; falls to zero along a cosine."""
+    """Of Adam at the start; falls to zero along a cosine, and again from a quarter for free runs."""
     noise: float = 0.2
     """Standard deviation of the noise on the velocity inputs, in units of the velocities' own."""
     hidden: int = 32
@@ -444,11 +453,9 @@ class FitConfig:
     """Samples of angle, velocity and command that the nets see (paper: 13)."""
     rollout: int = 8
     """Ticks that the nets run freely in the last fifth of the steps, which learn from that (paper: 1)."""
-    rest_weight: float = 10.0
-    """Weight of windows in which the joint has stood still (paper: 1)."""
 
 
-PAPER_RECIPE: dict[str, Any] = {"noise": 0.0, "rollout": 1, "rest_weight": 1.0}  # Sec. 3.3
+PAPER_RECIPE: dict[str, Any] = {"noise": 0.0, "rollout": 1}  # Sec. 3.3
 
 
 def fit(log: Log, config: FitConfig, seed: int, velocity_samples: int, machine: str = "") -> ActuatorNet:
@@ -492,18 +499,24 @@ def _train(training: TrainingSet, config: FitConfig, seed: int, estimator: int |
     for weight in weights:
         weight.requires_grad_()
     optimizer = torch.optim.Adam(weights, lr=config.learning_rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.steps)
+    turn = (
+        round(0.8 * config.steps) if config.rollout > 1 and all(map(len, training.far_ends)) else config.steps
+    )
 
+    def fall(step: int) -> float:
+        done = step / turn if step < turn else (step - turn) / max(config.steps - turn, 1)
+        return (0.5 if step < turn else 0.125) * (1 + float(np.cos(np.pi * done)))
+
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, fall)
     target = (training.target - training.output_low) / (training.output_high - training.output_low)
-    arrays = (training.series, target.T, 1 + (config.rest_weight - 1) * training.rests.T)
+    arrays = (training.series, target.T)
     tapes = [torch.tensor(array, dtype=torch.float32).flatten(-2) for array in arrays]  # joint after joint
     first = torch.arange(n)[:, None] * len(training.target)
     for step in tqdm(range(config.steps), desc="fit nets", unit="step", disable=None):
-        far = step >= 0.8 * config.steps and all(map(len, training.far_ends))
-        ends, batch = (
-            (training.far_ends, config.batch_size // 4) if far else (training.ends, config.batch_size)
-        )
-        picks = [torch.randint(len(end), (max(batch, 1),), generator=generator) for end in ends]
+        far = step >= turn
+        ends = training.far_ends if far else training.ends
+        batch = -(-config.batch_size // 4) if far else config.batch_size
+        picks = [torch.randint(len(end), (batch,), generator=generator) for end in ends]
         at = torch.tensor(np.stack([end[pick] for end, pick in zip(ends, picks, strict=True)])) + first
         ticks = config.rollout if far else 1
         loss = _rollout_loss(training, config, weights, tapes, at, ticks, estimator, generator)
@@ -526,17 +539,17 @@ def _rollout_loss(
     estimator: int | None,
     generator: Any,
 ) -> Any:
-    """Weighted mean square of how far free runs from the windows that end `at` (n, batch) are off.
+    """Mean square of how far free runs from the windows that end `at` (n, batch) are off.
 
     After each tick, in units of the outputs' range and ticks: the error of the outputs so far, added up.
 
     Args:
-        tapes: inputs (3, n N), wanted outputs (n N,) and weights (n N,), joint after joint.
+        tapes: inputs (3, n N) and wanted outputs (n N,), joint after joint.
         estimator: samples of the velocity estimator; None: velocities are the nets' own outputs.
     """
     import torch
 
-    series, target, weight = tapes
+    series, target = tapes
     n, history = len(at), config.history
     mean, scale, low, high = (torch.tensor(array).float() for array in training[3:7])
     mean, scale = mean.reshape(n, 1, 3, history), scale.reshape(n, 1, 3, history)
@@ -554,7 +567,7 @@ def _rollout_loss(
             x = torch.relu(torch.baddbmm(weights[i + 1][:, None], x, weights[i]))
         y = torch.sigmoid(torch.baddbmm(weights[5][:, None], x, weights[4]))[..., 0]
         off = off + y - target[at + k]
-        loss = loss + (weight[at] * off**2).mean(dim=1).sum() / ticks
+        loss = loss + (off**2).mean(dim=1).sum() / ticks
         if k + 1 < ticks:
             velocity = (low[:, None] + (high - low)[:, None] * y)[..., None]
             q = torch.cat([q[..., 1:], q[..., -1:] + velocity / RATE], dim=-1)
@@ -578,7 +591,6 @@ class TrainingSet(NamedTuple):
     q_low: Array  # (n,) rad
     q_high: Array  # (n,) rad
     far_ends: list[NDArray[np.intp]]  # as `ends`, with `rollout` samples after them
-    rests: NDArray[np.bool_]  # (N, n): stood still for `history` samples
 
 
 def training_set(log: Log, history: int, rollout: int = 1) -> TrainingSet:
@@ -604,12 +616,8 @@ def training_set(log: Log, history: int, rollout: int = 1) -> TrainingSet:
     high = np.array([samples.target[end, j].max() for j, end in enumerate(ends)])
     low, high = low - 0.05 * (high - low), high + 0.05 * (high - low)
     mean, scale = np.repeat(mean, history, axis=1), np.repeat(scale, history, axis=1)
-    q = samples.whole.q
-    still = np.cumsum(np.diff(q, axis=0, prepend=q[:1] - 1.0) != 0, axis=0)  # changes of the angle so far
-    rests = still == still[np.maximum(np.arange(len(q)) - history + 1, 0)]
-    return TrainingSet(
-        series, samples.target, ends, mean, scale, low, high, q.min(axis=0), q.max(axis=0), far_ends, rests
-    )
+    ranges = samples.whole.q.min(axis=0), samples.whole.q.max(axis=0)
+    return TrainingSet(series, samples.target, ends, mean, scale, low, high, *ranges, far_ends)
 
 
 class Samples(NamedTuple):
@@ -650,8 +658,8 @@ class LinearModel(ActuatorNet):
     Weights (n, 3 H) and (n,), for standardised inputs.
     """
 
-    def predict(self, history: Array) -> Array:
-        """As `ActuatorNet.predict`."""
+    def velocity(self, history: Array) -> Array:
+        """What the model says, as `ActuatorNet.predict`."""
         x = history.reshape(*history.shape[:-2], -1)
         slope, offset = self.weights
         velocity = (((x - self.input_mean) / self.input_scale) * slope).sum(axis=-1) + offset
@@ -768,7 +776,7 @@ def run_errors(
 def recording_errors(net: ActuatorNet, log: Log, seconds: float) -> Array:
     """Velocity RMSE [rad/s] (recordings, n) of one free run of up to `seconds` from the start of each.
 
-    nan: a joint that rests in a recording, or a recording of `history` + 1 samples or fewer.
+    nan: a joint that rests in this recording but not in all, or `history` + 1 samples or fewer.
     """
     samples, lengths = end_to_end(log), np.array([len(r.q) for r in log.recordings])
     ticks = np.minimum(lengths - net.history - 1, round(seconds * net.rate))  # of each run
@@ -782,7 +790,8 @@ def recording_errors(net: ActuatorNet, log: Log, seconds: float) -> Array:
     error = velocities - whole.q_dot[starts + np.arange(1, most + 1)[:, None]]
     scored = (np.arange(most)[:, None] < ticks[long])[..., None]
     rms = np.sqrt(np.sum(np.where(scored, error, 0.0) ** 2, axis=0) / ticks[long, None])
-    result[long] = np.where(samples.moves[starts], rms, np.nan)
+    moves = samples.moves | ~samples.moves.any(axis=0)  # a joint that rests everywhere is scored at rest
+    result[long] = np.where(moves[starts], rms, np.nan)
     return result
 
 

@@ -286,13 +286,13 @@ def _numbers(path: Path, table: Table, name: str, bound: float = np.inf, unit: s
             return np.nan
 
     try:
-        numbers = np.array(cells, float)
-    except ValueError:  # a cell is no number
-        numbers = np.array([number(cell) for cell in cells])
+        numbers, wanted = np.array(cells, float), "a finite number"
+    except ValueError:
+        numbers, wanted = np.array([number(cell) for cell in cells]), "a number"
     if not (good := np.abs(numbers) <= largest).all():
         row = int(np.argmin(good))
         limits = "" if bound == np.inf else f" in [-{bound:g}, {bound:g}] ({unit})"
         raise ValueError(
-            f"{path}: row {row + 2}, column {name}: expected a finite number{limits}, got {cells[row]!r}"
+            f"{path}: row {row + 2}, column {name}: expected {wanted}{limits}, got {cells[row]!r}"
         )
     return numbers

@@ -76,18 +76,21 @@ def movers(machine: Machine, net: ActuatorNet) -> dict[str, Mover]:
 # --- preliminary tests ------------------------------------------------------------------------------
 
 
-def sweep(machine: Machine, move: Mover, joint: int, counts: int, beside: Array | None = None) -> Array:
-    """One joint from stop to stop under `counts` of 127: angle and velocity until it stops, (2, T).
+def sweeps(machine: Machine, move: Mover, joint: int, u: Array) -> list[Array]:
+    """A joint from stop to stop under each row of constant commands `u` (k, n), the others from mid range.
 
-    Paper: Sec. 3.2 (actuation range, direction; with commands `beside` (n,) for the others: coupling)
+    Returns:
+        Angle [rad] and velocity [rad/s] until it stands, (2, T) for each row.
+
+    Paper: Sec. 3.2 (actuation range, direction; coupling where the others have commands)
     """
-    q = (machine.column("q_min") + machine.column("q_max")) / 2
-    q[joint] = machine.column("q_min" if counts > 0 else "q_max")[joint]
-    u = np.zeros(machine.n) if beside is None else beside.copy()
-    u[joint] = counts / PWM_MAX
-    angle = move(q, np.tile(u, (round(SWEEP_S * machine.rate), 1)))[:, joint]
-    moving = 1 + int(np.max(np.flatnonzero(np.diff(angle)), initial=0))
-    return np.array([angle[1 : moving + 1], np.diff(angle)[:moving] * machine.rate])
+    low, high = machine.column("q_min"), machine.column("q_max")
+    q = np.tile((low + high) / 2, (len(u), 1))
+    q[:, joint] = np.where(u[:, joint] > 0, low[joint], high[joint])
+    angles = move(q, np.tile(u, (round(SWEEP_S * machine.rate), 1, 1)))[..., joint].T
+    velocities = np.diff(angles) * machine.rate
+    ends = [1 + int(np.max(np.flatnonzero(v), initial=0)) for v in velocities]
+    return [np.array([q[1 : t + 1], v[:t]]) for q, v, t in zip(angles, velocities, ends, strict=True)]
 
 
 def other_commands(machine: Machine, joint: int) -> Array:
@@ -202,14 +205,15 @@ def preliminary_tests(machine: Machine, move: Mover) -> Tests:
     """All preliminary tests with the last driven joint, the paper's q5. Paper: Sec. 3.2, Fig. 2"""
     joint, limit = int(machine.driven[-1]), machine.pwm_limit
     slow, level = round(5 / 8 * limit), np.full(machine.n, limit / PWM_MAX)  # 50 and 80 of the Brokk
-    counts = (slow, limit, -limit, -slow)
-    sweeps = {f"u = {encode_pwm(c / PWM_MAX)}": sweep(machine, move, joint, c) for c in counts}
-    together = sweep(machine, move, joint, limit, other_commands(machine, joint))
+    counts, others = np.array([slow, limit, -limit, -slow, limit]), other_commands(machine, joint)
+    u = np.where(np.arange(5)[:, None] < 4, 0.0, others)
+    u[:, joint] = counts / PWM_MAX
+    *alone, together = sweeps(machine, move, joint, u)
+    by_byte = {f"u = {encode_pwm(c / PWM_MAX)}": s for c, s in zip(counts, alone, strict=False)}
     before = (level + machine.dead_zone) / 2
     ends = machine.column("q_min"), machine.column("q_max")
     angles = steps(move, *ends, level, before, max(round(1.5 * machine.rate), 2 * machine.history))
-    coupling = {"alone": sweeps[f"u = {limit}"], "with the others": together}
-    return Tests(sweeps, coupling, angles)
+    return Tests(by_byte, {"alone": alone[1], "with the others": together}, angles)
 
 
 def run(machine: Machine, net: ActuatorNet, seed: int) -> dict[str, Any]:

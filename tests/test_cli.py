@@ -15,6 +15,7 @@ import pytest
 from benchmarks.rollout import random_net
 from brokk_min import experiments
 from brokk_min.__main__ import COMMANDS, main
+from brokk_min.actuator import load_net
 from brokk_min.logs import read_log
 
 
@@ -35,7 +36,8 @@ def test_each_command_has_help(command: str, capsys: pytest.CaptureFixture[str])
 def test_the_designs_options_exist(capsys: pytest.CaptureFixture[str]) -> None:
     wanted = {
         "collect": ["--out", "--hours", "--excitation", "--machine"],
-        "fit": ["--out", "--test", "--json", "--history"],
+        "fit": ["--out", "--test", "--json", "--figure", "--history", "--paper"],
+        "preliminary": ["--actuator", "--out"],
         "train": ["--actuator", "--out", "--total-steps", "--num-envs", "--resume"],
         "evaluate": ["--policy", "--commands", "--starts", "--plant", "--json"],
         "reproduce": ["--out", "--quick"],
@@ -74,6 +76,7 @@ def test_the_designs_options_exist(capsys: pytest.CaptureFixture[str]) -> None:
             "--joint",
         ),
         (["convert", "missing.log", "--out", "log.csv"], 1, "missing.log"),
+        (["preliminary", "--actuator", "missing.npz"], 1, "missing.npz"),
         (["export", "--policy", "missing.npz", "--out", "p.onnx"], 1, "missing.npz"),
     ],
 )
@@ -126,6 +129,38 @@ def test_fit_takes_a_foreign_log_and_beats_the_last_value(tmp_path: Path) -> Non
         assert joint["one_step_rmse"] < 0.5 * joint["persistence_rmse"]
         assert set(joint["free_run"]) == {"1", "5", "10"}  # 25 s recordings hold no 30 s run
         assert joint["free_run"]["10"]["velocity_rmse"] < 0.05
+
+
+def test_the_papers_recipe_is_one_switch(tmp_path: Path) -> None:
+    foreign_log(tmp_path / "log.csv", 0, 2)
+    files = [tmp_path / "log.csv", "--out", tmp_path / "n.npz", "--json", tmp_path / "f.json"]
+    assert run("fit", *files, "--steps", 3, "--paper") == 0
+    settings = load_net(tmp_path / "n.npz").settings
+    assert (settings["noise"], settings["rollout"], settings["steps"]) == (0, 1, 3)
+    verdict = json.loads((tmp_path / "f.json").read_text())
+    assert set(verdict) == {"meta", "joints", "tool", "warnings"}
+    keys = {"one_step_rmse", "persistence_rmse", "free_run", "linear", "creep", "response_time", "outside"}
+    assert all(set(joint) == keys for joint in verdict["joints"].values())
+
+
+def test_a_test_log_in_which_a_joint_rests_or_moves_too_shortly_is_judged(tmp_path: Path) -> None:
+    foreign_log(tmp_path / "log.csv", 0, 2)
+    rest = [f"still,{k / 20},0,0,0.1,0.2" for k in range(200)]
+    header = "run,time,u_boom,u_arm,q_boom,q_arm"
+    short = [f"short,{k / 20},0.5,0,{k / 100},0.2" for k in range(8)]
+    for i, lines in enumerate((rest, rest + short)):
+        (tmp_path / "test.csv").write_text("\n".join([header, *lines]) + "\n")
+        files = [
+            "--test",
+            tmp_path / "test.csv",
+            "--json",
+            tmp_path / f"{i}.json",
+            "--figure",
+            tmp_path / "f.png",
+        ]
+        assert run("fit", tmp_path / "log.csv", "--out", tmp_path / "n.npz", *files, "--steps", 3) == 0
+    assert json.loads((tmp_path / "0.json").read_text())["joints"]["boom"]["free_run"]["5"]
+    assert not json.loads((tmp_path / "1.json").read_text())["joints"]["boom"]["free_run"]
 
 
 def test_a_bad_log_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

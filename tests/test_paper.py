@@ -19,7 +19,7 @@ import pytest
 from helpers_machines import small_net
 
 import brokk_min
-from brokk_min import actuator, experiments, figures, jacobian, ppo, sequences
+from brokk_min import actuator, experiments, figures, jacobian, ppo, preliminary, sequences
 from brokk_min.env import TaskConfig, TaskVectorEnv
 from brokk_min.logs import velocity_of
 from brokk_min.machine import BROKK_170
@@ -35,7 +35,17 @@ SECTIONS = {"Sec. 2", "Sec. 3.2", "Sec. 3.3", "Sec. 3.4", "Sec. 4.1", "Sec. 4.2"
 # Every number that the paper gives, as its row is called; a row may hold several.
 CONSTANTS = [
     *("rate", "joints", "locked joint", "PWM code", "80/175", "50/205", "+0.24, -0.47 rad/s"),
-    *("400 ms, 100 ms", "coupling", "dead zone", "0.6 s, 0.05 s", "2 x 32", "1 h", "0.75 h, 2.5 h", "5 %"),
+    *(
+        "400 ms, 100 ms",
+        "coupling",
+        "dead zone",
+        "0.6 s, 0.05 s",
+        "2 x 32",
+        "errors of one step",
+        "1 h",
+        "0.75 h, 2.5 h",
+        "5 %",
+    ),
     *("no penalty", "256", "256-128-64", "q_s", "30 s", "K", "k"),
 ]
 
@@ -242,6 +252,19 @@ def test_the_papers_coupling_test_is_marginal() -> None:
     assert speed(BROKK_170, together) == pytest.approx(speed(BROKK_170, together * np.eye(5)[4]), rel=0.01)
     weak = replace(BROKK_170, pump_flow=0.3 * BROKK_170.pump_flow)
     assert speed(weak, together) < 0.9 * speed(weak, together * np.eye(5)[4])
+
+
+def test_the_preliminary_figure_holds_its_three_tests() -> None:
+    """q5 by 50, 80, 175, 205 over its range; alone and with the others; a step from idle and moving."""
+    tests = preliminary.preliminary_tests(BROKK_170, preliminary.plant_mover(BROKK_170))
+    assert list(tests.sweeps) == ["u = 50", "u = 80", "u = 175", "u = 205"]
+    peaks = {name: round(float(v[np.abs(v).argmax()]), 2) for name, (_, v) in tests.sweeps.items()}
+    assert (peaks["u = 80"], peaks["u = 175"]) == (0.24, -0.44)  # means over a tick
+    assert 0 < peaks["u = 50"] < 0.24 and -0.44 < peaks["u = 205"] < 0
+    alone, together = (curve[:, :150] for curve in tests.coupling.values())
+    np.testing.assert_allclose(alone, together, atol=0.01)
+    idle, moving = preliminary.response_times(tests.angles, BROKK_170.rate)[..., 4].reshape(2, -1)
+    assert np.all(idle > 2.5 * moving)
 
 
 def test_the_papers_excitation_is_the_sine() -> None:
