@@ -21,8 +21,18 @@ from brokk_min.export import export_onnx
 from brokk_min.kinematics import tool_position
 from brokk_min.logs import Log, read_log, write_log
 from brokk_min.machine import BROKK_170, Machine
+from brokk_min.metrics import summary
+from brokk_min.mpc import PerfectModel
 from brokk_min.policy import PolicyController, load_policy
-from brokk_min.sequences import axis_sequences, draw_starts, read_commands, read_starts
+from brokk_min.report import VERDICTS
+from brokk_min.sequences import (
+    draw_starts,
+    read_commands,
+    read_starts,
+    scored_starts,
+    task_sequences,
+    write_starts,
+)
 from brokk_min.simulator import simulate
 
 MACHINES = {machine.name: machine for machine in (BROKK_170,)}
@@ -40,7 +50,7 @@ ALLOWED: tuple[tuple[float, float, str], ...] = (
     (0, 0.9999, "gamma"),
     (0, 1000, "noise valve_cost entropy"),
     (0, 1e6, "hold_min_s hold_max_s"),
-    (1, 1e6, "batch_size hidden num_envs group horizon epochs threads rollout"),
+    (1, 1e6, "batch_size hidden num_envs group horizon epochs threads rollout num num_starts"),
     (1, 1e12, "steps total_steps checkpoint_every"),
     (2, 1e7, "velocity_samples history minibatch_size"),
     (-10, 3, "log_std"),
@@ -48,6 +58,8 @@ ALLOWED: tuple[tuple[float, float, str], ...] = (
     (1e-9, 1e9, "target_kl max_grad_norm clip"),
     (1e-4, 100, "hours"),
     (1, 127, "counts"),
+    (1, 10000, "seeds"),
+    (1, 1000, "poses"),
     (0.05, 1e6, "episode_s"),
     (0.1, 100, "fps"),
 )
@@ -62,6 +74,8 @@ def check(command: Any, *outputs: Path | None) -> None:
             if name in given and not low <= given[name] <= high:
                 option = name.replace("_", "-")
                 raise WrongUse(f"--{option}: expected {low} to {high}, got {given[name]}")
+    if given.get("hold_min_s", 0) > given.get("hold_max_s", 0):
+        raise WrongUse(f"--hold-max-s: expected --hold-min-s or more, got {given['hold_max_s']}")
     name = given.get("machine") or BROKK_170.name
     if name not in MACHINES:
         MACHINES[name] = machine_from(name)
@@ -192,14 +206,60 @@ def train_command() -> Any:
         def run(self) -> None:
             """Train and write the policy."""
             check(self, self.out)
-            if self.task.hold_min_s > self.task.hold_max_s:
-                raise WrongUse(f"--hold-max-s: expected --hold-min-s or more, got {self.task.hold_max_s}")
             machine = MACHINES[self.machine]
             net = fitting_nets(machine, load_net(self.actuator))
             train(machine, net, self.task, self.settings, self.seed, self.out, self.resume, self.tensorboard)
             print(f"{self.out}: trained for {self.settings.total_steps} steps; curve in {self.out}.csv")
 
     return Train
+
+
+def sweep_command() -> Any:
+    """The command `sweep`; made on demand as `train`."""
+    from brokk_min.ppo import TASK, PPOConfig
+    from brokk_min.sweep import show, sweep
+
+    @dataclass(kw_only=True)
+    class Sweep(Command):
+        """Train and evaluate many seeds on all cores or a cluster; finished seeds are not run again."""
+
+        actuator: Path  # Nets that `fit` wrote.
+        out: Path  # Folder for a policy, a curve and figures of each seed, and sweep.json.
+        seeds: int = 10  # How many, from --seed on.
+        poses: int = 16  # Start poses for each of the three scored sequences.
+        scheduler: str | None = None  # tcp://... of a dask scheduler (extra `sweep`); OUT must be shared.
+        gains: Path | None = None  # Tuned gains that `reproduce` wrote: baselines beside.
+        settings: tyro.conf.OmitArgPrefixes[PPOConfig] = field(default_factory=PPOConfig)
+        """The learner; each seed runs on one thread, whatever --threads says."""
+        task: tyro.conf.OmitArgPrefixes[TaskConfig] = TASK  # What an episode is.
+
+        def run(self) -> None:
+            """Sweep and print the table."""
+            check(self)
+            machine = MACHINES[self.machine]
+            net = fitting_nets(machine, load_net(self.actuator))
+            seeds = range(self.seed, self.seed + self.seeds)
+            of, how = self.settings, (self.poses, self.scheduler, self.gains)
+            print(show(sweep(machine, net, self.task, of, seeds, self.out, *how)))
+
+    return Sweep
+
+
+@dataclass(kw_only=True)
+class Starts(Command):
+    """Draw start poses for `evaluate`: across the workspace, near joint limits, near full extension."""
+
+    out: Path  # Poses to write, .csv.
+    num: int = 64  # How many.
+    seed: int = 2  # Of the poses.
+
+    def run(self) -> None:
+        """Draw and write."""
+        check(self, self.out)
+        machine = MACHINES[self.machine]
+        rng = np.random.default_rng(self.seed)
+        write_starts(self.out, machine, draw_starts(machine, task_sequences(machine), self.num, rng))
+        print(f"{self.out}: {self.num} start poses")
 
 
 @dataclass(kw_only=True)
@@ -212,20 +272,21 @@ class Evaluate(Command):
     plant: Literal["analytic", "net"] = "analytic"  # What moves: the analytic plant or the nets.
     json: Path | None = None  # Also write all runs here.
     gains: Path | None = None  # Tuned gains; by default gains.json beside POLICY.
+    num_starts: int = 16  # Without --starts: so many of the machine's start poses.
+    perfect_model: bool = False  # Also the bound: a controller that knows the plant (minutes).
 
     def run(self) -> None:
         """Evaluate and print the means."""
         check(self, self.json)
+        if self.perfect_model and self.plant == "net":
+            raise WrongUse("--perfect-model: expected --plant analytic, the plant that it knows, got net")
         machine, effort = MACHINES[self.machine], experiments.Effort()
         policy = load_policy(self.policy, machine)
-        sequences = axis_sequences(machine)
-        if self.commands:
-            sequences = read_commands(self.commands, machine)
+        sequences = read_commands(self.commands, machine) if self.commands else task_sequences(machine)
         if self.starts:
             starts = read_starts(self.starts, machine)
         else:
-            rng = np.random.default_rng(self.seed + 2)
-            starts = draw_starts(machine, sequences, effort.starts, rng)
+            starts = scored_starts(machine, self.num_starts, task_sequences(machine), self.seed + 2)
         controllers: dict[str, Controller] = {"rl": PolicyController(machine, policy)}
         beside = self.policy.with_name("gains.json")
         gains = self.gains or (beside if beside.exists() else "tuned now")
@@ -234,15 +295,23 @@ class Evaluate(Command):
             controllers |= experiments.read_gains(gains, machine, policy.net)
         else:
             controllers |= experiments.tuned_baselines(machine, policy.net, effort, self.seed)[0]
+        if self.perfect_model:
+            controllers["perfect_model"] = PerfectModel(machine, starts)
         moves = policy.net if self.plant == "net" else None
         runs, _ = experiments.task_space(machine, controllers, sequences, starts, self.seed, moves)
         if self.json:
             meta = experiments.meta(machine, self.seed)
             meta |= {"policy": str(self.policy), "gains": str(gains), "plant": self.plant}
-            meta |= {"commands": str(self.commands or "x, y, z"), "starts": str(self.starts or "drawn")}
+            names = ", ".join(sequence.name for sequence in sequences)
+            meta |= {"commands": str(self.commands or names), "starts": str(self.starts or self.num_starts)}
             experiments.write_json(self.json, {"meta": meta, "runs": runs})
-        for name, rows in experiments.summary(runs).items():
-            print(f"{name:20} " + ", ".join(f"{k} {v:.4f}" for k, v in rows["all"].items()))
+        for kind in dict.fromkeys(run["kind"] for run in runs):
+            mine = [run for run in runs if run["kind"] == kind]
+            num = len({run["start"] for run in mine})
+            print(f"{kind} starts ({num}), means over {len(sequences)} sequences")
+            for name, rows in summary(mine).items():
+                cells = (f"{k} {'none' if v is None else format(v, '.4f')}" for k, v in rows["all"].items())
+                print(f"  {name:20} " + ", ".join(cells))
 
 
 @dataclass(kw_only=True)
@@ -260,6 +329,8 @@ class Reproduce(Command):
         for name, rows in results["task_space"]["summary"].items():
             errors = ", ".join(f"{s} {row['velocity_error_mean']:.4f}" for s, row in rows.items())
             print(f"{name:20} mean velocity error [m/s]: {errors}")
+        for claim in results["claims"]:
+            print(f"{VERDICTS[claim['holds']]}: {claim['paper']}")
         print(f"{self.out / 'report.html'}\n{self.out / 'results.json'}")
 
 
@@ -473,20 +544,19 @@ class Replay(Command):
         try:
             file = json.loads(path.read_text())
             beside = {"policy": str(path.with_name("policy.npz")), "gains": str(path.with_name("gains.json"))}
-            told = beside | {"plant": "analytic", "commands": "x, y, z", "starts": "drawn"} | file["meta"]
+            told = beside | {"plant": "analytic", "commands": "", "starts": ""} | file["meta"]
             rows = file.get("task_space", file)["runs"]
             machine, seed = MACHINES[told["machine"]], int(told["seed"])
             starts = np.array(file["starts"]) if "starts" in file else None
         except (OSError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path}: expected results of `evaluate`, got {error!r}") from error
-        policy, sequences = load_policy(Path(told["policy"]), machine), axis_sequences(machine)
-        if told["commands"] != "x, y, z":
+        policy, sequences = load_policy(Path(told["policy"]), machine), task_sequences(machine)
+        if told["commands"] not in ("", ", ".join(s.name for s in sequences)):
             sequences = read_commands(Path(told["commands"]), machine)
-        if told["starts"] != "drawn":
-            starts = read_starts(Path(told["starts"]), machine)
+        if starts is None and told["starts"].isdigit():
+            starts = scored_starts(machine, int(told["starts"]), task_sequences(machine), seed + 2)
         elif starts is None:
-            rng = np.random.default_rng(seed + 2)
-            starts = draw_starts(machine, sequences, experiments.Effort().starts, rng)
+            starts = read_starts(Path(told["starts"]), machine)
         known: dict[str, Controller] = {"rl": PolicyController(machine, policy)}
         if set(self.controllers) - {"rl"}:
             known |= experiments.read_gains(Path(told["gains"]), machine, policy.net)
@@ -499,8 +569,8 @@ class Replay(Command):
             )
         chosen = {name: known[name] for name in self.controllers}
         net = policy.net if told["plant"] == "net" else None
-        again, traces = experiments.task_space(machine, chosen, [sequence], starts, seed, net)
-        for row in (r for r in again if r["start"] == self.start):
+        again, traces = experiments.task_space(machine, chosen, sequences, starts, seed, net)
+        for row in (r for r in again if r["start"] == self.start and r["sequence"] == sequence.name):
             same = [r for r in rows if all(r[k] == row[k] for k in ("controller", "sequence", "start"))]
             if not same or not np.isclose(same[0]["velocity_rmse"], row["velocity_rmse"], rtol=1e-3):
                 raise ValueError(f"{path}: expected the run {row}, got {same or 'none'}: another program?")
@@ -516,6 +586,8 @@ COMMANDS: dict[str, Callable[[], Any]] = {
     "fit": lambda: Fit,
     "preliminary": lambda: Preliminary,
     "train": train_command,
+    "sweep": sweep_command,
+    "starts": lambda: Starts,
     "evaluate": lambda: Evaluate,
     "reproduce": lambda: Reproduce,
     "machine": lambda: Simulate,

@@ -185,10 +185,10 @@ def collect(
 ) -> Log:
     """Record the analytic plant, one actuator at a time, `hours` for each, ways back not counted.
 
-    A recording starts with `history` samples of an idle valve, then drives until the joint meets its limit
-    or for `leg_s`. The way back to its start, and the rest there until the valve is idle, is named
-    `..._return` and dropped by `read_log`. The paper's sines start at home (mid range), rich excitation
-    at random angles. Paper: Sec. 3.3
+    A recording starts with `history` samples of an idle valve, then drives for `leg_s` or until the joint
+    meets its limit; in rich excitation it may push there for a second in all. The way back to its start,
+    and the rest there until the valve is idle, is named `..._return` and dropped by `read_log`. The
+    paper's sines start at home (mid range), rich excitation at random angles. Paper: Sec. 3.3
     """
     if excitation not in EXCITATIONS:
         raise ValueError(f"excitation: expected one of {list(EXCITATIONS)}, got {excitation!r}")
@@ -235,11 +235,16 @@ def _drive_legs(
     rest = round(5 * machine.ready_down_time * machine.rate)  # ticks until a valve is idle again
     back = np.full(len(row), length)  # tick at which each way back begins
     rested = np.zeros(len(row), int)  # ticks at rest after it
+    met, push = (
+        np.zeros(len(row), int),
+        machine.rate * (excitation == "rich"),
+    )  # ticks at a limit, allowed ones
     recorder = _Recorder(machine, q)
     while rested.min() < rest and len(recorder.u) < length + MAX_RETURN * machine.rate:
         tick, angle = len(recorder.u), recorder.q[-1][row, joint]
         at_limit = (angle < low + near) | (angle > high - near)
-        back[at_limit & (machine.history + machine.rate < tick) & (tick < back)] = tick
+        met += at_limit
+        back[at_limit & (met > push) & (machine.history + machine.rate < tick) & (tick < back)] = tick
         arrived = (np.abs(angle - start) < max(0.06, near)) | (rested > 0)
         rested += arrived & (tick >= back)
         homeward = np.where(arrived, 0.0, slow * np.sign(start - angle))

@@ -7,6 +7,7 @@ environment, with a plant instead of nets the evaluation, and `observe` and `to_
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -49,6 +50,7 @@ GROUND_MARGIN = 0.3  # m above the ground below which no goal asks the arm to si
 LAG_TIME, LAG_SPEED = 2.0, 0.07  # s and a share of tool_speed, tuned: see `push_lag`
 Array = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]
+Encoder = Callable[[Machine, Array], Array]  # machine and true angles -> angles read
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,8 @@ class TaskConfig:
     """Neighbouring environments that share start poses and goals, for learners that compare them."""
     redraw_ground: bool = True
     """Redraw start poses in the ground; False is the paper's rule: end the episode without reward."""
+    paper: bool = False
+    """Observation (no wanted rates, no weights) and reward (no valve cost) as the paper has them."""
 
 
 @dataclass(frozen=True)
@@ -108,6 +112,7 @@ class _Layout(NamedTuple):
     scale: Array
     sensed: Array  # what noise of 1 does to what sensors say, in physical units; 0 for the rest
     angles: NDArray[np.intp]  # where the newest angles of all joints stand, (n,)
+    paper: Array  # factors that make it the paper's: weights undone, wanted rates blanked
     told: NDArray[np.intp]  # what a flattened history (n * 3 * H) gives: locked angles, driven histories
 
 
@@ -132,15 +137,16 @@ def _layout(machine: Machine) -> _Layout:
                 (0 * each, command * each, samples**-0.5, 0),
             ]
         blocks += [(zero, rate[driven], 4.2, 0), (zero, 0.1 * rate[driven], 4.2, 0)]
-        means, scales, noises = zip(*((m, d / w, w * s + 0 * m) for m, d, w, s in blocks), strict=True)
-        mean, scale, sensed = (np.concatenate(a).astype(np.float32) for a in (means, scales, noises))
+        columns = zip(*((m, d / w, w * s + 0 * m, 1 / w + 0 * m) for m, d, w, s in blocks), strict=True)
+        mean, scale, sensed, paper = (np.concatenate(a).astype(np.float32) for a in columns)
+        paper[-2 * len(driven) :] = 0
         body = 6 + len(rest)
         angles = np.zeros(machine.n, int)
         angles[rest] = np.arange(6, body)
         angles[driven] = body + samples * (1 + 3 * np.arange(len(driven))) - 1
         place = np.arange(machine.n * 3 * samples).reshape(machine.n, 3, samples)
         told = np.concatenate([place[rest, 0, -1], place[driven].ravel()])
-        machine.__dict__["layout"] = _Layout(mean, scale, sensed * scale, angles, told)
+        machine.__dict__["layout"] = _Layout(mean, scale, sensed * scale, angles, paper, told)
     layout: _Layout = machine.__dict__["layout"]
     return layout
 
@@ -159,6 +165,15 @@ def observation_scale(machine: Machine) -> tuple[Array, Array]:
     what is large at its input. Paper: Sec. 3.4 (normalisation)
     """
     return _layout(machine)[:2]
+
+
+def paper_view(machine: Machine) -> Array:
+    """Factors (obs,) that leave of an observation what the paper's agent sees. Paper: Sec. 3.4
+
+    Weights of `observation_scale` are undone, wanted rates blanked: a policy trained on that runs on every
+    observation of `observe` once the factors stand in its first layer.
+    """
+    return _layout(machine).paper
 
 
 def observe(
@@ -182,7 +197,7 @@ def observe(
     Returns:
         Shape (..., 6 + locked + (3 H + 2) n_driven), float32.
     """
-    mean, scale, sensed, angles, told = _layout(machine)
+    mean, scale, sensed, angles, _, told = _layout(machine)
     q, batch = history[..., 0, -1], history.shape[:-3]
     seen = np.zeros((*batch, len(mean)), np.float32)
     seen[..., 6 : 6 + len(told)] = history.reshape(*batch, -1)[..., told]
@@ -213,7 +228,7 @@ def _turn(p_tool: Array, vector: Array, sign: int) -> Array:
 
 def measured(machine: Machine, observation: Array) -> Measured:
     """Undo `observe`: the newest measurements in physical units, from observations (..., obs)."""
-    mean, scale, _, angles, _ = _layout(machine)
+    mean, scale, _, angles, *_ = _layout(machine)
     values = observation * scale + mean
     q = values[..., angles]
     p_tool = tool_position(machine, q)
@@ -294,8 +309,12 @@ def rest_state(machine: Machine, q: ArrayLike, v_goal: ArrayLike, plant: bool) -
     return State(q, np.zeros_like(q), history, goals, never, ticks, np.zeros_like(goals), plant_state)
 
 
-def transition(machine: Machine, net: ActuatorNet | None, state: State, u: Array) -> State:
+def transition(
+    machine: Machine, net: ActuatorNet | None, state: State, u: Array, read: Encoder = read_encoder
+) -> State:
     """One tick under the command `u` (..., n), by the nets, or by the plant where the state has one.
+
+    `read(machine, q)` are the angles that the encoders say; they may be disturbed for a test of robustness.
 
     Paper: Sec. 3.4 (actuator nets in the simulation), Table 1
     """
@@ -312,7 +331,7 @@ def transition(machine: Machine, net: ActuatorNet | None, state: State, u: Array
     else:
         raise ValueError("net: expected nets for a state without a plant, got None")
 
-    history, lag = push_measured(machine, history, read_encoder(machine, q), state.v_goal, state.lag)
+    history, lag = push_measured(machine, history, read(machine, q), state.v_goal, state.lag)
     return replace(
         state,
         q=q,
@@ -397,7 +416,8 @@ def look(machine: Machine, config: TaskConfig, state: State, rng: np.random.Gene
     """The observation of a state, (..., obs), with fresh uniform noise. Paper: Sec. 3.4 (5 %)"""
     draws = rng.random((*state.q.shape[:-1], len(_layout(machine).mean)), np.float32) - np.float32(0.5)
     noise = np.float32(2 * config.noise) * draws
-    return observe(machine, state.history, state.v_goal, state.lag, noise)
+    seen = observe(machine, state.history, state.v_goal, state.lag, noise)
+    return seen * paper_view(machine) if config.paper else seen
 
 
 class Outcome(NamedTuple):
@@ -429,7 +449,7 @@ def step(
     rewards = reward(state.v_goal, v_tool)
     end = terminated(machine, lowest)
     error = 1 / rewards - 1
-    if config.valve_cost:
+    if config.valve_cost and not config.paper:
         rewards = rewards - np.float32(config.valve_cost) * _travel(machine, before, state)
     state = _next_goals(machine, config, state, lowest, rng)
     observation = look(machine, config, state, rng)
@@ -510,6 +530,7 @@ def rollout(
     config: TaskConfig,
     rng: np.random.Generator,
     net: ActuatorNet | None = None,
+    read: Encoder = read_encoder,
 ) -> Trace:
     """Let one controller follow given goals from rest: on the plant, or on nets. Paper: Fig. 3
 
@@ -521,6 +542,7 @@ def rollout(
         config: its `noise` holds; no episode ends.
         rng: of the noise.
         net: nets of the driven joints; None: the analytic plant.
+        read: see `transition`.
     """
     state = rest_state(machine, start, goals[0], plant=net is None)
     memory = controller.start(len(state.q))
@@ -530,7 +552,7 @@ def rollout(
         observation = look(machine, config, state, rng)
         u, memory = controller(observation, memory)
         q_measured = state.history[..., 0, -1]
-        state = transition(machine, net, state, u)
+        state = transition(machine, net, state, u, read)
         p_tool, v_tool, _ = tool_state(machine, state.q, state.q_dot)
         trace.append((state.q, state.q_dot, q_measured, u, p_tool, v_tool, reward(goal, v_tool)))
     return Trace(*map(np.array, zip(*trace, strict=True)))

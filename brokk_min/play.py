@@ -184,7 +184,7 @@ class Session:
             q, known.q_dot, np.nan_to_num(known.u), known.v_goal, trail, path, title, status, mood
         )
         colour = view.COLOURS.get(mode, view.STEEL)
-        return look._replace(colour=colour, notes=self.notes(mode), zoom=True)
+        return look._replace(colour=colour, notes=self.notes(mode), hold=path)
 
     def notes(self, mode: str) -> list[str]:
         """Keys, the task, and how it went."""

@@ -23,7 +23,7 @@ from torch import nn
 from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet, load_header, net_arrays
-from brokk_min.env import State, TaskConfig, TaskVectorEnv, observation_scale
+from brokk_min.env import State, TaskConfig, TaskVectorEnv, observation_scale, paper_view
 from brokk_min.logs import load_arrays, whole_file
 from brokk_min.machine import Machine
 from brokk_min.policy import Policy, contract, save_policy
@@ -154,7 +154,7 @@ def relative(advantages: Tensor, group: int) -> Tensor:
     """
     if group == 1:
         return advantages
-    groups = advantages.unflatten(1, (-1, group))
+    groups = advantages.reshape(len(advantages), -1, group)
     return ((groups - groups.mean(-1, keepdim=True)) * (group / (group - 1))).flatten(1)
 
 
@@ -305,6 +305,8 @@ class Training:
         weights = [
             (layer.weight.detach().numpy().T.copy(), layer.bias.detach().numpy().copy()) for layer in layers
         ]
+        if self.env.config.paper:
+            weights[0] = (weights[0][0] * paper_view(self.env.machine)[:, None], weights[0][1])
         mean, scale = observation_scale(self.env.machine)
         flat = tuple(array for pair in weights for array in pair)
         if self.env.net is None:
@@ -380,6 +382,19 @@ def fingerprint(net: ActuatorNet) -> str:
     return digest.hexdigest()[:16]
 
 
+def identity_of(
+    machine: Machine, net: ActuatorNet, task: TaskConfig, config: PPOConfig, seed: int
+) -> dict[str, Any]:
+    """All that decides the outcome of a training; kept in checkpoints and policies."""
+    return {
+        "machine": machine.name,
+        "actuator": fingerprint(net),
+        "seed": seed,
+        "task": asdict(task),
+        "settings": asdict(config),
+    }
+
+
 def train(
     machine: Machine,
     net: ActuatorNet,
@@ -411,13 +426,7 @@ def train(
         raise ValueError(f"num_envs: expected a multiple of group {task.group}, got {config.num_envs}")
     env = TaskVectorEnv(config.num_envs, net, machine, task)
     training = Training(env, config, seed)
-    identity = {
-        "machine": machine.name,
-        "actuator": fingerprint(net),
-        "seed": seed,
-        "task": asdict(task),
-        "settings": asdict(config),
-    }
+    identity = identity_of(machine, net, task, config, seed)
     checkpoint, curve = Path(f"{out}.checkpoint"), Path(f"{out}.csv")
     if resume and checkpoint.exists():
         training.load(checkpoint, identity)

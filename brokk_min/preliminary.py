@@ -332,7 +332,7 @@ def judge(net: ActuatorNet, log: Log, test: Log, machine: Machine | None = None)
                 )
         for kind, share in scores["outside"].items():
             if share > ALLOWED_OUTSIDE:
-                warnings.append(f"{name}: {share:.0%} of the test's {kind}s are outside the training's range")
+                warnings.append(f"{name}: {kind} outside the training's range in {share:.0%} of the test")
     tool = tool_errors(machine, net, test) if machine else {}
     return {"joints": joints, "tool": tool, "warnings": warnings}
 

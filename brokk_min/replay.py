@@ -101,13 +101,16 @@ class Run(NamedTuple):
     p_tool: Array  # m (T, 3)
     error: Array  # |v_goal - v_tool| [m/s] (T,)
     path: Array  # where the tool was to go [m] (K, 3), or none
+    hold: Array  # corners of the arm on the way [m] (K, 3)
 
 
 def recorded(machine: Machine, title: str, colour: view.Colour, known: Sequence[Known], path: Array) -> Run:
     """A run from its ticks; the velocity error is that of the velocities that it holds."""
     q, q_dot, v_goal = (np.array([getattr(k, name) for k in known]) for name in ("q", "q_dot", "v_goal"))
     p_tool, v_tool, _ = tool_state(machine, q, q_dot)
-    return Run(title, colour, known, p_tool, np.linalg.norm(v_goal - v_tool, axis=-1), path)
+    corners = view.skeleton(machine, q[::10]).reshape(-1, 3)
+    error = np.linalg.norm(v_goal - v_tool, axis=-1)
+    return Run(title, colour, known, p_tool, error, path, np.vstack([corners, path]))
 
 
 def run_of_log(machine: Machine, path: Path, colour: view.Colour) -> Run:
@@ -135,14 +138,14 @@ def run_of_trace(machine: Machine, title: str, trace: Trace, run: int, goals: Ar
 
 def film(machine: Machine, runs: Sequence[Run], tick: int, size: tuple[int, int]) -> list[view.Shape]:
     """The picture of one tick of all runs, by the same clock; what is over stands still."""
-    scenes = []
+    scenes, hold = [], np.vstack([run.hold for run in runs])
     for run in runs:
         at = min(tick, len(run.known) - 1)
         known, mean = run.known[at], run.error[: at + 1].mean()
         title, status = TITLES.get(run.title, run.title), f"{at * machine.dt:.1f} s"
         scene = view.Scene(known.q, known.q_dot, known.u, known.v_goal, run.p_tool[: at + 1], run.path)
         notes = [f"velocity error {run.error[at]:.3f} m/s", f"mean so far {mean:.3f} m/s"]
-        scenes.append(scene._replace(title=title, status=status, colour=run.colour, notes=notes))
+        scenes.append(scene._replace(title=title, status=status, colour=run.colour, notes=notes, hold=hold))
     return view.draw(machine, scenes, size)
 
 
@@ -156,12 +159,11 @@ def write_film(path: Path, machine: Machine, runs: Sequence[Run], size: tuple[in
     bar = tqdm(ticks, desc="draw", unit="picture", disable=None)
     images = (view.picture(film(machine, runs, tick, size), size) for tick in bar)
     if path.suffix == ".gif":
-        first, *others = [Image.fromarray(image) for image in images]
-        colours = others[-1].quantize(64) if others else first.quantize(64)
-        flat = [i.quantize(palette=colours, dither=Image.Dither.NONE) for i in (first, *others)]
+        films = [Image.fromarray(image) for image in images]
+        flat = [image.quantize(palette=_palette(films), dither=Image.Dither.NONE) for image in films]
         with logs.whole_file(path) as file:
-            duration, more = round(1000 * ticks.step / machine.rate), flat[1:]
-            flat[0].save(file, "GIF", save_all=True, append_images=more, duration=duration, loop=0)
+            duration = round(1000 * ticks.step / machine.rate)
+            flat[0].save(file, "GIF", save_all=True, append_images=flat[1:], duration=duration, loop=0)
     elif path.suffix == ".mp4":
         form = f"-f rawvideo -pix_fmt rgb24 -s {size[0]}x{size[1]} -r {machine.rate / ticks.step} -i -"
         form += " -pix_fmt yuv420p -f mp4 -movflags frag_keyframe+empty_moov pipe:1"
@@ -180,6 +182,14 @@ def write_film(path: Path, machine: Machine, runs: Sequence[Run], size: tuple[in
             ) from error
     else:
         raise ValueError(f"{path}: expected a name ending in .gif or .mp4, got {path.suffix!r}")
+
+
+def _palette(films: Sequence[Image.Image]) -> Image.Image:
+    """96 colours of some pictures and of all that warns or measures, however little of it there is."""
+    some = [np.asarray(film) for film in films[:: max(1, len(films) // 6)]]
+    named = [*view.COLOURS.values(), *view.MOODS.values(), view.MEASURED, view.PATH, view.WARNING]
+    swatches = np.repeat(np.array(named, np.uint8), 40, axis=0)[:, None].repeat(some[0].shape[1], axis=1)
+    return Image.fromarray(np.vstack([*some, swatches])).quantize(96)
 
 
 def show_film(machine: Machine, runs: Sequence[Run], size: tuple[int, int]) -> None:

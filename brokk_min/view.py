@@ -23,9 +23,9 @@ Colour = tuple[int, int, int]
 
 # all assumed
 NEAR_LIMIT = 0.05  # of a joint's range: nearer to its end is a warning
-NEAR_SINGULAR = 0.06  # of the arm's length [1/rad]: the tool hardly moves some way below it, see `weakest`
+NEAR_SINGULAR = 0.1  # of the arm's length [1/rad]: the tool hardly moves some way below it, see `weakest`
 ARROW = 0.2  # of a view's smaller side: an arrow of the machine's tool speed
-ZOOM = 0.06  # of the reach: what is seen around the path of a scene that zooms
+MARGIN = 0.06  # of the reach: what is seen around the points that a scene holds
 
 PAPER, INK, MUTED, GRID, TRACK = (
     (250, 250, 247),
@@ -100,7 +100,7 @@ class Scene(NamedTuple):
     mood: str = ""  # of `MOODS`, colour of the status
     colour: Colour = COLOURS["rl"]
     notes: Sequence[str] = ()
-    zoom: bool = False  # show the surroundings of the path
+    hold: Array = np.zeros((0, 3))  # what the views must show [m] (K, 3); none: all that the arm reaches
 
 
 class Camera(NamedTuple):
@@ -163,18 +163,17 @@ def _side_axes(p_tool: Array) -> Array:
 
 
 def cameras(
-    machine: Machine, p_tool: Array, side: Box, top: Box, path: Array | None = None
+    machine: Machine, p_tool: Array, side: Box, top: Box, hold: Array | None = None
 ) -> tuple[Camera, Camera]:
     """From the side, in the vertical plane of the tool, and from above with x up and y to the left.
 
-    They hold all that the arm can reach, or what lies around `path` [m] (K, 3).
+    They show all that the arm can reach, or what lies around the points `hold` [m] (K, 3).
     """
     e, found = extent(machine), []
     for box, (low, high), axes in ((side, e.side, _side_axes(p_tool)), (top, e.top, ABOVE)):
-        if path is not None:
-            middle = (path.min(0) + path.max(0)) / 2
-            radius = np.linalg.norm(path - middle, axis=1).max() + ZOOM * e.reach
-            low, high = axes @ middle - radius, axes @ middle + radius
+        if hold is not None and len(hold):
+            flat = hold @ axes.T
+            low, high = flat.min(0) - MARGIN * e.reach, flat.max(0) + MARGIN * e.reach
         left, upper, width, height = box
         soil = 0.07 * height
         scale = 0.92 * float(min(width / (high - low)[0], (height - 2 * soil) / (high - low)[1]))
@@ -194,8 +193,8 @@ def near_limit(machine: Machine, q: Array) -> NDArray[np.bool_]:
 def weakest(machine: Machine, q: Array) -> tuple[float, Array]:
     """How far the tool moves for 1 rad of the joints the way it moves least [m], and that way (3,).
 
-    The least singular value of the Jacobian; manipulability is the product of them all. Where it equals
-    the damping of `kinematics.joint_rates`, these rates give half of a velocity that way.
+    The least singular value of the Jacobian; manipulability is the product of them all, and for a slewing
+    arm says little more than how far out the tool is.
     """
     ways, values, _ = np.linalg.svd(jacobian(machine, q), full_matrices=False)
     return float(values[-1]), ways[:, -1]
@@ -257,7 +256,7 @@ def _views(machine: Machine, scene: Scene, side: Box, top: Box) -> list[Shape]:
     p_tool, v_tool, _ = tool_state(machine, scene.q, scene.q_dot)
     low, weak = near_limit(machine, scene.q), near_singular(machine, scene.q)
     shapes: list[Shape] = []
-    eyes = cameras(machine, p_tool, side, top, scene.path if scene.zoom and len(scene.path) else None)
+    eyes = cameras(machine, p_tool, side, top, scene.hold)
     for camera, box, label in zip(eyes, (side, top), ("side", "top"), strict=True):
         shapes += [Clip(box), *_backdrop(machine, camera, box, label)]
         for points, colour, width in ((scene.path, PATH, 3), (scene.trail, _pale(scene.colour), 2)):

@@ -39,7 +39,17 @@ def test_the_designs_options_exist(capsys: pytest.CaptureFixture[str]) -> None:
         "fit": ["--out", "--test", "--json", "--figure", "--history", "--paper"],
         "preliminary": ["--actuator", "--out"],
         "train": ["--actuator", "--out", "--total-steps", "--num-envs", "--resume"],
-        "evaluate": ["--policy", "--commands", "--starts", "--plant", "--json"],
+        "sweep": ["--actuator", "--out", "--seeds", "--scheduler", "--gains", "--total-steps"],
+        "evaluate": [
+            "--policy",
+            "--commands",
+            "--starts",
+            "--num-starts",
+            "--perfect-model",
+            "--plant",
+            "--json",
+        ],
+        "starts": ["--out", "--num"],
         "reproduce": ["--out", "--quick"],
         "machine": ["--interface", "--channel", "--record"],
         "drive": ["--policy", "--interface", "--channel", "--command", "--controller", "--log", "--replay"],
@@ -64,7 +74,12 @@ def test_the_designs_options_exist(capsys: pytest.CaptureFixture[str]) -> None:
         (["fit", "missing.csv", "--out", "n.npz"], 1, "missing.csv"),
         (["train", "--actuator", "missing.npz", "--out", "p.npz"], 1, "missing.npz"),
         (["train", "--actuator", "missing.npz", "--out", "p.npz", "--num-envs", "0"], 2, "--num-envs"),
+        (["sweep", "--actuator", "missing.npz", "--out", "s"], 1, "missing.npz"),
+        (["sweep", "--actuator", "missing.npz", "--out", "s", "--seeds", "0"], 2, "--seeds"),
         (["evaluate", "--policy", "missing.npz"], 1, "missing.npz"),
+        (["evaluate", "--policy", "missing.npz", "--plant", "net", "--perfect-model"], 2, "--perfect-model"),
+        (["evaluate", "--policy", "missing.npz", "--num-starts", "0"], 2, "--num-starts"),
+        (["starts", "--out", "missing/s.csv"], 2, "missing/s.csv"),
         (["machine", "--interface", "nonsense", "--channel", "0"], 1, "nonsense"),
         (["machine", "--interface", "virtual", "--channel", "0", "--start", "9", "9"], 1, "start"),
         (["drive", "--policy", "missing.npz"], 2, "--interface"),
@@ -200,6 +215,10 @@ def test_collect_fit_train_resume_evaluate(tmp_path: Path, capsys: pytest.Captur
         assert (meta["plant"], meta["machine"], meta["seed"]) == (plant, "brokk170", 0)
         assert [r["controller"] for r in runs] == ["rl", *names]
         assert {(r["sequence"], r["start"]) for r in runs} == {("up", 0)}
+    bound = ["--commands", commands, "--starts", starts, "--perfect-model", "--json", where]
+    assert run("evaluate", "--policy", policy, *bound) == 0
+    runs = json.loads(where.read_text())["runs"]
+    assert min(runs, key=lambda r: r["velocity_error_mean"])["controller"] == "perfect_model"
     starts.write_text("q1,q2,q3,q4,q5\n0,0,-0.3,2.5,1.2\n")
     capsys.readouterr()
     assert run("evaluate", "--policy", policy, "--starts", starts) == 1
@@ -217,13 +236,15 @@ def test_without_gains_the_baselines_are_tuned_and_that_is_said(
     quick = experiments.Effort(generations=1, tuning_runs=1, starts=1)
     monkeypatch.setattr("brokk_min.experiments.Effort", lambda: quick)
     where = tmp_path / "e.json"
-    assert run("evaluate", "--policy", tmp_path / "p.npz", "--json", where) == 0
+    options = ["--num-starts", 1, "--json", where]
+    assert run("evaluate", "--policy", tmp_path / "p.npz", *options) == 0
+    names = "x, y, z, diagonal_flat, diagonal_rise, circle, rectangle, stop_and_go, slow"
     assert "gains of the baselines: tuned now" in capsys.readouterr().err
     meta = json.loads(where.read_text())["meta"]
-    assert (meta["gains"], meta["commands"], meta["starts"]) == ("tuned now", "x, y, z", "drawn")
+    assert (meta["gains"], meta["commands"], meta["starts"]) == ("tuned now", names, "1")
 
 
-@pytest.mark.parametrize("command", [name for name in COMMANDS if name != "train"])
+@pytest.mark.parametrize("command", [name for name in COMMANDS if name not in ("train", "sweep")])
 def test_only_training_imports_torch(command: str) -> None:
     code = "import sys; from brokk_min.__main__ import main\ntry: main(sys.argv[1:])\n"
     code += "finally: print('torch' in sys.modules)"

@@ -1056,3 +1056,31 @@ def test_arrays_that_go_in_are_never_written_to(machine, plant):
         sealed(task.measured(machine, outcome.observation))
         _, memory = controller(outcome.observation, type(memory)(*sealed(list(memory))))
         state = after
+
+
+def test_the_papers_observation_has_plain_standard_deviations_and_no_wanted_rates() -> None:
+    """By hand for one state: (value - middle) / nominal deviation of each quantity, all weights 1."""
+    m, config = BROKK_170, TaskConfig(paper=True, noise=0.0)
+    state = task.reset(m, config, np.random.default_rng(0), 3, plant=False)
+    state = replace(state, history=state.history + np.float32(0.01), lag=state.lag + np.float32(0.02))
+    seen = task.look(m, config, state, np.random.default_rng(0))
+    np.testing.assert_array_equal(seen[:, -8:], 0)
+    middle, width = (m.column("q_min") + m.column("q_max")) / 2, m.column("q_max") - m.column("q_min")
+    q = (state.history[:, :, 0] - middle[:, None]) / (width / 12**0.5)[:, None]
+    q_dot = state.history[:, :, 1] / (m.q_dot_max / 3**0.5)[:, None]
+    u = state.history[:, :, 2] / (80 / 127 / 3**0.5)
+    np.testing.assert_allclose(seen[:, 6], q[:, 1, -1], atol=1e-5)
+    wanted = np.stack([q, q_dot, u], axis=2)[:, [0, 2, 3, 4]].reshape(3, -1)
+    np.testing.assert_allclose(seen[:, 7:-8], wanted, atol=1e-5)
+    speed = np.linalg.norm(state.v_goal, axis=-1) / (m.tool_speed / 3**0.5)
+    np.testing.assert_allclose(np.linalg.norm(seen[:, :3], axis=-1), speed, atol=1e-5)
+
+
+def test_the_papers_reward_costs_no_valve_travel() -> None:
+    m, net = BROKK_170, small_net(BROKK_170, np.random.default_rng(0))
+    outcomes = []
+    for config in (TaskConfig(paper=True), TaskConfig(valve_cost=0.0), TaskConfig()):
+        state = task.reset(m, config, np.random.default_rng(0), 4, plant=False)
+        outcomes.append(task.step(m, config, net, state, np.ones((4, 4)), np.random.default_rng(1))[1].reward)
+    np.testing.assert_array_equal(outcomes[0], outcomes[1])
+    np.testing.assert_allclose(outcomes[0] - outcomes[2], 0.01, atol=1e-6)  # idle to full on every valve

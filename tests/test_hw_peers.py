@@ -61,7 +61,7 @@ def folder(policy: Policy, tmp_path: Path) -> Path:
     table = {"meta": {"machine": "brokk170"}, "gains": dict.fromkeys(names, gains)}
     (tmp_path / "gains.json").write_text(json.dumps(table))
     (tmp_path / "c.csv").write_text(
-        "sequence,time,vx,vy,vz\nup,0,0,0,0.2\nup,1.5,0,0,0\nside,0,0,0.1,0\nside,0.5,0,0,0\n"
+        "sequence,time,vx,vy,vz\nup,0,0,0,0.2\nup,1.0,0,0,0\nside,0,0,0.1,0\nside,0.4,0,0,0\n"
     )
     return tmp_path
 
@@ -358,10 +358,9 @@ def test_two_processes_drive_replay_convert_and_survive_a_kill(
     command = ["drive", *jacobian, *where, "--command", folder / "c.csv", "--log", folder / "run.log"]
     with Process("machine", *where, "--start", *START, "--record", folder / "plant.csv") as machine:
         eventually(lambda: len(rows(folder / "plant.csv")) > 10, 60)
-        for _ in range(4):
-            code = main([str(a) for a in command])
-            if code == 0:
-                break
+        end = time.monotonic() + 120
+        while (code := main([str(a) for a in command])) and time.monotonic() < end:
+            pass
         assert code == 0, capsys.readouterr().err
         said = capsys.readouterr().out
         assert "driving v wanted +0.00 +0.00 +0.20" in said
@@ -373,12 +372,16 @@ def test_two_processes_drive_replay_convert_and_survive_a_kill(
         )
         assert "others" in capsys.readouterr().err
         assert main(["convert", str(folder / "run.log"), "--out", str(folder / "log.csv")]) == 0
-        assert sum(len(r.u) for r in read_log([folder / "log.csv"], 4).recordings) >= 40
-        moved = len(rows(folder / "plant.csv"))
-        with Process(*command) as drive:
-            eventually(lambda: np.any(rows(folder / "plant.csv")[moved:, 1:6]), 60)
-            drive.send_signal(signal.SIGKILL)
-            drive.wait()
+        assert sum(len(r.u) for r in read_log([folder / "log.csv"], 4).recordings) >= 25
+        driving, end = False, time.monotonic() + 120
+        while not driving and time.monotonic() < end:
+            moved = len(rows(folder / "plant.csv"))
+            with Process(*command) as drive:
+                while not driving and drive.poll() is None:
+                    driving = bool(np.any(rows(folder / "plant.csv")[moved:, 1:6]))
+                drive.send_signal(signal.SIGKILL)
+                drive.wait()
+        assert driving
         # all by the plant's own record: the last valid frame, and no motion 155 ms after it
         killed = rows(folder / "plant.csv")[-1, 0]
         eventually(lambda: rows(folder / "plant.csv")[-1, 0] > killed + 0.8, 60)

@@ -19,8 +19,9 @@ import pytest
 from helpers_machines import small_net
 
 import brokk_min
-from brokk_min import actuator, experiments, figures, jacobian, ppo, preliminary, sequences
-from brokk_min.env import TaskConfig, TaskVectorEnv
+from brokk_min import actuator, experiments, figures, jacobian, ppo, preliminary, report, sequences
+from brokk_min.env import TaskConfig, TaskVectorEnv, paper_view
+from brokk_min.kinematics import tool_position
 from brokk_min.logs import velocity_of
 from brokk_min.machine import BROKK_170
 
@@ -31,7 +32,15 @@ PAPER = (ROOT / "PAPER.md").read_text()
 NUMBERED = [f"eq{i}" for i in range(1, 5)] + ["Table 1"]
 PANELS = {1: "", 2: "abc", 3: "", 4: "", 5: "abcde", 6: "abcdefgh"}
 NUMBERED += [f"Fig. {figure}{panel}" for figure, panels in PANELS.items() for panel in panels or [""]]
-SECTIONS = {"Sec. 2", "Sec. 3.2", "Sec. 3.3", "Sec. 3.4", "Sec. 4.1", "Sec. 4.2"}  # those that say what to do
+SECTIONS = {
+    "Sec. 2",
+    "Sec. 3.2",
+    "Sec. 3.3",
+    "Sec. 3.4",
+    "Sec. 4.1",
+    "Sec. 4.2",
+    "Sec. 5",
+}  # those that say what to do
 # Every number that the paper gives, as its row is called; a row may hold several.
 CONSTANTS = [
     *("rate", "joints", "locked joint", "PWM code", "80/175", "50/205", "+0.24, -0.47 rad/s"),
@@ -335,6 +344,30 @@ def test_figure_6_runs_every_controller_and_shows_its_panels() -> None:
         line = next(line for line in ax.lines if line.get_label() == "rl")
         np.testing.assert_array_equal(line.get_ydata(), traces["rl", "z"].q_dot[:, 0, joint])
     plt.close("all")
+
+
+def test_figure_6_draws_its_starts_and_judges_singular_ones() -> None:
+    figure = figures.plot_starts(BROKK_170, STARTS, ["extended", "extended"])
+    reach = np.hypot(*tool_position(BROKK_170, STARTS[1])[:2])
+    assert np.max(figure.axes[0].lines[1].get_xdata()) == pytest.approx(reach)
+    plt.close("all")
+    net = small_net(BROKK_170, np.random.default_rng(0))
+    controllers = {"rl": Steady(0.3), **experiments.baselines(BROKK_170, net)}
+    short = [s._replace(goals=s.goals[15:35]) for s in sequences.axis_sequences(BROKK_170)]
+    traces, found = experiments.singular_case(BROKK_170, controllers, short, STARTS, 0)
+    assert {s for _, s in traces} == set("xyz") and found["claims"]
+    assert experiments.singular_case(BROKK_170, controllers, short, STARTS[:0], 0)[0] == {}
+
+
+def test_the_papers_view_leaves_out_the_wanted_rates() -> None:
+    factors = paper_view(BROKK_170)
+    assert factors.shape == (171,)
+    assert not factors[-8:].any() and (factors[:-8] > 0).all()
+
+
+def test_the_report_says_how_a_sentence_fares() -> None:
+    said = [report.verdict({"paper": "a", "measured": "b", "holds": h}) for h in (True, False, None)]
+    assert len(set(said)) == 3
 
 
 def test_a_driven_log_is_what_encoders_and_valves_said() -> None:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import can
@@ -254,6 +257,18 @@ def test_a_window_that_hangs_is_a_lost_device() -> None:
     loop.go(0.1, True)
     assert loop.known[-1].driving
     loop.world.close()
+
+
+def test_a_loop_whose_window_died_stops(monkeypatch: pytest.MonkeyPatch) -> None:
+    asks, levers = Mailbox(12), Levers(BROKK_170)
+    operator = Remote(asks, Chosen([levers]), levers, lambda: 10.0)
+    assert operator(False, True) == play.hw.Wish(alive=False)  # it has not said anything yet
+    monkeypatch.setattr(
+        remote.multiprocessing, "parent_process", lambda: SimpleNamespace(is_alive=lambda: False)
+    )
+    assert operator(True, True) == play.hw.Wish(alive=False, stop=True)
+    asks.write([9.9, 0, 1, 1, 0, 0.1, 0, 0, 0, 0, 0, 0])
+    assert operator(True, True) == play.hw.Wish((0.1, 0.0, 0.0), enable=True)
 
 
 def test_a_whole_traced_rectangle_is_scored() -> None:
@@ -510,6 +525,7 @@ def test_a_film_is_shown_and_closed(results: Path) -> None:
         np.zeros((3, 3)),
         np.zeros(3),
         np.zeros((0, 3)),
+        np.zeros((0, 3)),
     )
     pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=pygame.K_RIGHT))
     pygame.event.post(pygame.event.Event(pygame.QUIT))
@@ -547,6 +563,12 @@ def test_refusals(
     except SystemExit as stop:
         assert stop.code == status
     assert message in capsys.readouterr().err
+
+
+def test_the_benchmark_of_the_window_runs() -> None:
+    command = [sys.executable, "-m", "benchmarks.play", "--seconds", "0.3"]
+    done = subprocess.run(command, cwd=Path(__file__).parent.parent, capture_output=True, text=True)
+    assert done.returncode == 0 and json.loads(done.stdout)["ticks"] >= 2, done.stderr
 
 
 def test_without_a_display_play_says_so(

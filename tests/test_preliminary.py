@@ -365,7 +365,9 @@ def test_a_net_that_is_no_better_than_a_linear_model_is_told_so():
     verdict = preliminary.judge(blank_net(log), log, test)
     assert [w for w in verdict["warnings"] if w.startswith("a: a free run of 1 s") and "no better" in w]
     jumps = Log(("a",), tuple(r._replace(u=-np.abs(r.u) - 0.2) for r in test.recordings))
-    assert any("commands are outside" in w for w in preliminary.judge(blank_net(log), log, jumps)["warnings"])
+    assert any(
+        w.startswith("a: command outside") for w in preliminary.judge(blank_net(log), log, jumps)["warnings"]
+    )
 
 
 def test_tool_errors_by_hand(monkeypatch):

@@ -126,6 +126,24 @@ def test_the_trail_is_painted_where_the_tool_was() -> None:
     assert 300 < changed.sum() < 6000  # and nowhere else
 
 
+def test_views_show_what_they_are_to_hold() -> None:
+    """A line near the tool, enlarged; what lies beyond a view's edge is painted over nothing else."""
+    p = tool_position(BROKK_170, Q)
+    line = p + np.array([[0.0, 0, 0], [0.5, 0, 0], [0.5, 0.8, 0]])
+    whole, near = (draw(BROKK_170, [scene(path=line, hold=hold)], SIZE) for hold in (np.zeros((0, 3)), line))
+    spans = []
+    for shapes in (whole, near):
+        boxes = [s.box for s in shapes if isinstance(s, view.Clip)]
+        paths = [s.points for s in shapes if isinstance(s, Line) and s.colour == view.PATH]
+        for (left, upper, width, height), points in zip(boxes, paths, strict=False):
+            assert (points > (left, upper)).all() and (points < (left + width, upper + height)).all()
+        spans.append([np.ptp(points, axis=0).max() for points in paths])
+    assert (np.array(spans[1]) > 2 * np.array(spans[0])).all()
+    image = picture(near, SIZE)
+    assert (image[42, :576] == view.COLOURS["rl"]).all(axis=-1).any()  # a link leaves the view upwards
+    np.testing.assert_array_equal(image[33:39, :576] - np.array(view.PAPER), 0)
+
+
 def test_arrows_point_along_the_velocities() -> None:
     rates = np.array([0.1, 0.0, 0.05, -0.1, 0.2])
     J = jacobian(BROKK_170, Q) @ rates[BROKK_170.driven]

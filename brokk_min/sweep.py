@@ -1,0 +1,199 @@
+"""Many seeds of one training: on this machine's cores, or on a cluster through dask.distributed.
+
+Each seed leaves `seed_<n>.npz`, its learning curve and, last, `seed_<n>.json`; what is there is not run
+again. On a cluster the folder must be one that all workers see, and a worker runs one seed at a time.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from brokk_min import experiments
+from brokk_min.actuator import ActuatorNet
+from brokk_min.env import TaskConfig
+from brokk_min.machine import Machine
+from brokk_min.metrics import by_start
+from brokk_min.policy import PolicyController, load_policy
+from brokk_min.ppo import PPOConfig, identity_of, train
+from brokk_min.sequences import AXES, axis_sequences, scored_starts, task_sequences
+
+Rows = list[dict[str, Any]]  # of `experiments.task_space`
+Submit = Callable[..., "Future[Rows]"]
+
+
+def one_seed(
+    machine: Machine, net: ActuatorNet, task: TaskConfig, config: PPOConfig, seed: int, out: Path, starts: int
+) -> Rows:
+    """Train a seed and drive the machine with it; takes up what an earlier call left in the folder `out`."""
+    policy_file, result_file = out / f"seed_{seed}.npz", out / f"seed_{seed}.json"
+    identity = identity_of(machine, net, task, config, seed) | {"starts": starts}
+    if result_file.exists():
+        return _finished(result_file, identity)
+    trained = load_policy(policy_file, machine) if policy_file.exists() else None
+    if not trained or dict(trained.training) | {"starts": starts} != identity:
+        again = Path(f"{policy_file}.checkpoint").exists()
+        trained = train(machine, net, task, config, seed, policy_file, again)
+    rl = PolicyController(machine, trained)
+    runs = _on_the_machine(machine, {"rl": rl}, starts)
+    experiments.write_json(result_file, {"identity": identity, "runs": runs})
+    return runs
+
+
+def _finished(path: Path, identity: Mapping[str, Any]) -> Rows:
+    try:
+        result = json.loads(path.read_text())
+        runs, found = result["runs"], result["identity"]
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: expected the result of a seed, got {error!r}") from error
+    for name, wanted in identity.items():
+        if found.get(name) != wanted:
+            raise ValueError(f"{path}: {name}: expected {wanted}, got {found.get(name)}")
+    return runs
+
+
+def _on_the_machine(machine: Machine, controllers: Mapping[str, Any], starts: int) -> Rows:
+    """The scored sequences and starts of `evaluate --seed 0`: the same whatever seed was trained."""
+    poses = scored_starts(machine, starts, task_sequences(machine), 2)
+    return experiments.task_space(machine, controllers, axis_sequences(machine), poses, 0)[0]
+
+
+def apart(function: Callable[..., Any], *arguments: Any) -> Any:
+    """`function(*arguments)` in a process of its own, once more if that process dies.
+
+    Raises:
+        ValueError: it died both times.
+    """
+    for _ in range(2):
+        try:
+            with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+                return pool.submit(function, *arguments).result()
+        except BrokenProcessPool:
+            continue
+    raise ValueError("worker: expected it to live, got one that died twice")
+
+
+@contextmanager
+def workers(scheduler: str | None) -> Iterator[Submit]:
+    """`submit(function, *arguments)` -> Future: a core each here, or a worker each of a dask scheduler."""
+    if scheduler is None:
+        # Read by the processes when they start: one core each, and one bar for all of them.
+        os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "TQDM_DISABLE": "1"}
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            yield lambda function, *arguments: pool.submit(apart, function, *arguments)
+        return
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise ValueError("scheduler: expected the extra `brokk_min[sweep]`, got none") from error
+    with Client(scheduler, timeout=10) as client:  # type: ignore[no-untyped-call]  # dask itself runs again what a dead worker had
+        threads = {worker["nthreads"] for worker in client.scheduler_info(-1)["workers"].values()}
+        if threads - {1}:  # torch's settings and seeds are those of a process
+            raise ValueError(f"{scheduler}: expected workers with --nthreads 1, got {sorted(threads)}")
+        yield client.get_executor(retries=1, pure=False).submit
+
+
+def sweep(
+    machine: Machine,
+    net: ActuatorNet,
+    task: TaskConfig,
+    config: PPOConfig,
+    seeds: Sequence[int],
+    out: Path,
+    starts: int = 16,
+    scheduler: str | None = None,
+    gains: Path | None = None,
+) -> dict[str, dict[str, Any]]:
+    """Train and evaluate `seeds`, each on one thread, and write `sweep.json` with all runs and the table.
+
+    Args:
+        machine: what moves.
+        net: nets of its driven joints.
+        task: episodes.
+        config: settings of the learner; `threads` is 1 whatever it says.
+        seeds: of the trainings.
+        out: folder for everything.
+        starts: start poses for each of the three sequences.
+        scheduler: address of a dask scheduler; None: this machine.
+        gains: tuned gains of the baselines, for rows beside.
+
+    Returns:
+        `table` of the seeds that came to their end, and of the baselines.
+
+    Raises:
+        ValueError: with the seeds that failed and why, after all others are written.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    config, results, failed = replace(config, threads=1), dict[int, Rows](), dict[int, str]()
+    with workers(scheduler) as submit:
+        jobs = {
+            submit(one_seed, machine, net, task, config, seed, out.resolve(), starts): seed for seed in seeds
+        }
+        for job in tqdm(as_completed(jobs), total=len(jobs), desc="sweep", unit="seed", disable=None):
+            try:
+                results[jobs[job]] = job.result()
+            except Exception as error:  # one seed costs itself, not the others
+                failed[jobs[job]] = str(error)
+    others = experiments.read_gains(gains, machine, net) if gains else {}
+    beside = _on_the_machine(machine, others, starts)
+    figures = table([results[seed] for seed in sorted(results)], beside)
+    runs = [{"seed": seed} | row for seed in sorted(results) for row in results[seed]]
+    meta = experiments.meta(machine, min(seeds)) | {"seeds": len(seeds), "failed": failed}
+    experiments.write_json(out / "sweep.json", {"meta": meta, "table": figures, "runs": runs + beside})
+    if failed:
+        raise ValueError("; ".join(f"seed {seed}: {why}" for seed, why in sorted(failed.items())))
+    return figures
+
+
+def interval(values: Sequence[float]) -> dict[str, float | None]:
+    """Mean and half width of its 95 % confidence interval (Student's t); None for a single value.
+
+    Example:
+        >>> interval([1.0, 3.0])
+        {'mean': 2.0, 'half_width': 12.706}
+    """
+    from scipy.stats import t
+
+    n = len(values)
+    half = t.ppf(0.975, n - 1) * np.std(values, ddof=1) / n**0.5 if n > 1 else None
+    return {"mean": float(np.mean(values)), "half_width": None if half is None else round(float(half), 6)}
+
+
+def table(seeds: Sequence[Rows], beside: Rows) -> dict[str, dict[str, Any]]:
+    """Figures by controller: velocity error by axis and in all [m/s], drift [m], travel [full strokes].
+
+    A seed counts once, with the mean over its starts; baselines have no seeds and so no interval.
+    """
+    several = {"rl": list(seeds)} if seeds else {}
+    several |= {name: [beside] for name in dict.fromkeys(run["controller"] for run in beside)}
+    columns = {f"velocity_error_{s}": (s, "velocity_error_mean") for s in (*AXES, "all")}
+    columns |= {name: ("all", name) for name in ("off_axis_drift_max", "valve_travel")}
+
+    def means(controller: str, sequence: str, key: str) -> list[float]:
+        return [float(by_start(runs, controller, sequence, key).mean()) for runs in several[controller]]
+
+    return {c: {name: interval(means(c, *what)) for name, what in columns.items()} for c in several}
+
+
+def show(figures: Mapping[str, Mapping[str, Any]]) -> str:
+    """The table as text."""
+    columns = list(next(iter(figures.values()), {}))
+    lines = [f"{'mean and 95 % interval':20}" + "".join(f" {name:>20}" for name in columns)]
+    for controller, row in figures.items():
+        cells = []
+        for cell in row.values():
+            half = cell["half_width"]
+            cells.append(f"{cell['mean']:.4f}" + ("" if half is None else f" +- {half:.4f}"))
+        lines.append(f"{controller:20}" + "".join(f" {cell:>20}" for cell in cells))
+    return "\n".join(lines)

@@ -1,0 +1,206 @@
+"""Sweeps: the same policies as `train`, nothing done twice, dead workers, intervals, a cluster."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers_machines import small_net
+from helpers_sweep import die_until, refuse
+
+from brokk_min import sweep as module
+from brokk_min.__main__ import main
+from brokk_min.actuator import save_net
+from brokk_min.env import TaskConfig
+from brokk_min.machine import BROKK_170, Machine
+from brokk_min.ppo import PPOConfig, train
+from brokk_min.sequences import Commands, axis_sequences
+from brokk_min.sweep import apart, interval, one_seed, sweep, workers
+
+TINY = PPOConfig(num_envs=4, horizon=4, epochs=1, minibatch_size=16, total_steps=32, threads=1)
+TASK = TaskConfig(episode_s=0.6)
+NET = small_net(BROKK_170, np.random.default_rng(0))
+
+
+@pytest.fixture(autouse=True)
+def short(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sequences of half a second from poses that need no search, and environment variables put back."""
+    monkeypatch.setattr(module.os, "environ", dict(module.os.environ))
+    if "slow" not in request.keywords:
+        pose = np.array([1.5, 0.5, 0.58, 1.71, 1.24])
+        random = np.random.default_rng(2).random
+        monkeypatch.setattr(module, "scored_starts", lambda m, num, s, seed: pose + 0.1 * random((num, 5)))
+        monkeypatch.setattr(
+            module, "axis_sequences", lambda m: [s._replace(goals=s.goals[15:25]) for s in full(m)]
+        )
+
+
+def full(machine: Machine) -> list[Commands]:
+    return axis_sequences(machine)
+
+
+def here(function: Callable[..., object], *arguments: object) -> object:
+    """`apart` without the process: what is patched stays so."""
+    return function(*arguments)
+
+
+def seed_rows(error: float) -> list[dict[str, object]]:
+    """What `one_seed` returns, made up: three sequences, two starts."""
+    figures = {"velocity_rmse": 1.0, "off_axis_drift_max": 2.0 * error, "valve_travel": 10.0}
+    return [
+        {"controller": "rl", "sequence": s, "start": i, "velocity_error_mean": error + i} | figures
+        for s in "xyz"
+        for i in range(2)
+    ]
+
+
+def test_the_interval_is_students() -> None:
+    # ten values, deviation 3.0277: 2.2622 x 3.0277 / sqrt(10)
+    found = interval(list(range(1, 11)))
+    assert found["mean"] == 5.5
+    assert found["half_width"] == pytest.approx(2.16586, abs=1e-4)
+    assert interval([3.0]) == {"mean": 3.0, "half_width": None}
+
+
+def test_the_interval_holds_the_truth_in_95_of_100_sweeps() -> None:
+    draws = np.random.default_rng(0).normal(2.0, 1.0, (2000, 5))
+    held = [abs(f["mean"] - 2.0) < f["half_width"] for f in map(interval, draws)]
+    assert 0.93 < np.mean(held) < 0.97
+
+
+def test_a_seed_counts_once_in_the_table() -> None:
+    beside = [row | {"controller": "pid"} for row in seed_rows(4.0)]
+    figures = module.table([seed_rows(1.0), seed_rows(3.0)], beside)
+    assert list(figures) == ["rl", "pid"]
+    for name in ("velocity_error_x", "velocity_error_all"):
+        assert figures["rl"][name] == {"mean": 2.5, "half_width": 12.706205}  # of 1.5 and 3.5
+        assert figures["pid"][name] == {"mean": 4.5, "half_width": None}
+    assert figures["rl"]["off_axis_drift_max"]["mean"] == 4.0
+    lines = module.show(figures).splitlines()
+    assert lines[1].startswith("rl ") and "2.5000 +- 12.7062" in lines[1]
+    assert "+-" not in lines[2]
+
+
+def test_a_worker_that_dies_costs_one_retry(tmp_path: Path) -> None:
+    assert apart(die_until, tmp_path / "once", 1) == 2
+    with pytest.raises(ValueError, match="worker: expected it to live, got one that died twice"):
+        apart(die_until, tmp_path / "always", 9)
+    assert (tmp_path / "always").read_text() == "2"
+
+
+def test_a_seed_that_fails_costs_itself_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seed 1 cannot be trained; 0 and 2 are written, and what is said names 1."""
+    original = module.one_seed
+
+    def sometimes(*arguments: object) -> object:
+        return refuse("losses/policy_loss: nan") if arguments[4] == 1 else original(*arguments)
+
+    monkeypatch.setattr(module, "one_seed", sometimes)
+    monkeypatch.setattr(module, "apart", here)
+    monkeypatch.setattr(module.os, "cpu_count", lambda: 1)
+    with pytest.raises(ValueError, match=r"^seed 1: losses/policy_loss: nan$"):
+        sweep(BROKK_170, NET, TASK, TINY, range(3), tmp_path, 1)
+    written = json.loads((tmp_path / "sweep.json").read_text())
+    assert written["meta"]["failed"] == {"1": "losses/policy_loss: nan"}
+    assert {row["seed"] for row in written["runs"]} == {0, 2}
+
+
+def test_a_sweep_from_the_command_line_and_once_more(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "apart", here)
+    monkeypatch.setattr(module.os, "cpu_count", lambda: 1)  # torch's seed is one for all threads
+    save_net(tmp_path / "net.npz", NET)
+    settings = {"num-envs": 4, "horizon": 4, "epochs": 1, "minibatch-size": 16, "total-steps": 32}
+    pairs = [text for name, value in settings.items() for text in (f"--{name}", str(value))]
+    command = ["sweep", "--actuator", f"{tmp_path}/net.npz", "--out", f"{tmp_path}/sweep", "--seed", "3"]
+    command += ["--seeds", "2", "--poses", "2", "--episode-s", "0.6", *pairs]
+    assert main(command) == 0
+    first = capsys.readouterr().out
+    assert first.splitlines()[1].startswith("rl ") and first.count("+-") == 6
+    files = sorted(p.name for p in (tmp_path / "sweep").iterdir())
+    seeds = [f"seed_{n}.{end}" for n in (3, 4) for end in ("json", "npz", "npz.csv")]
+    assert files == [*seeds, "sweep.json"]
+    train(BROKK_170, NET, TASK, TINY, 4, tmp_path / "alone.npz")
+    assert (tmp_path / "sweep/seed_4.npz").read_bytes() == (tmp_path / "alone.npz").read_bytes()
+    written = json.loads((tmp_path / "sweep/sweep.json").read_text())
+    assert len(written["runs"]) == 2 * 3 * 2 and written["table"]["rl"]["valve_travel"]["mean"] > 0
+
+    def never(*_: object) -> None:
+        raise AssertionError("trained or driven again")
+
+    monkeypatch.setattr(module, "train", never)
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            module, "_on_the_machine", lambda machine, controllers, _: never() if controllers else []
+        )
+        assert main(command) == 0
+    assert capsys.readouterr().out == first
+    assert main([*command, "--horizon", "8"]) == 1
+    assert "seed_3.json: settings: expected {" in capsys.readouterr().err
+
+
+def test_a_policy_without_its_figures_is_driven_and_not_trained_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arguments = (BROKK_170, NET, TASK, TINY, 0, tmp_path, 1)
+    runs = one_seed(*arguments)
+    (tmp_path / "seed_0.json").unlink()
+    monkeypatch.setattr(module, "train", None)
+    assert one_seed(*arguments) == runs
+    (tmp_path / "seed_0.json").write_text("{")
+    with pytest.raises(ValueError, match=r"seed_0\.json: expected the result of a seed, got JSONDec"):
+        one_seed(*arguments)
+
+
+def test_a_cluster_gives_the_same_files(tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    local, far = tmp_path / "local", tmp_path / "far"
+    local.mkdir()
+    options = {"n_workers": 1, "processes": False, "dashboard_address": None, "protocol": "tcp"}
+    with distributed.LocalCluster(threads_per_worker=1, **options) as cluster:
+        address = cluster.scheduler_address
+        figures = sweep(BROKK_170, NET, TASK, TINY, [0], far, 1, address)
+        assert figures["rl"]["velocity_error_all"]["mean"] > 0
+    one_seed(BROKK_170, NET, TASK, TINY, 0, local, 1)
+    for name in ("seed_0.npz", "seed_0.json"):
+        assert (local / name).read_bytes() == (far / name).read_bytes()
+
+
+def test_workers_of_many_threads_are_refused() -> None:
+    distributed = pytest.importorskip("distributed")
+    options = {"n_workers": 1, "processes": False, "dashboard_address": None, "protocol": "tcp"}
+    with (
+        distributed.LocalCluster(threads_per_worker=2, **options) as cluster,
+        pytest.raises(ValueError, match=r"expected workers with --nthreads 1, got \[2\]"),
+        workers(cluster.scheduler_address),
+    ):
+        pass
+
+
+@pytest.mark.slow
+def test_a_worker_of_a_cluster_that_dies_costs_one_retry(tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    with (
+        distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster,
+        workers(cluster.scheduler_address) as submit,
+    ):
+        assert submit(die_until, tmp_path / "once", 1).result(120) == 2
+
+
+@pytest.mark.slow
+def test_a_sweep_in_processes_of_their_own(tmp_path: Path) -> None:
+    figures = sweep(BROKK_170, NET, TASK, TINY, [0, 1], tmp_path, 1)
+    assert figures["rl"]["velocity_error_all"]["half_width"] >= 0
+    assert (tmp_path / "seed_0.npz").read_bytes() != (tmp_path / "seed_1.npz").read_bytes()
+    assert len(list(tmp_path.iterdir())) == 7
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_is_not_there_is_named() -> None:
+    pytest.importorskip("distributed")
+    with pytest.raises(OSError, match=r"127\.0\.0\.1:9"), workers("tcp://127.0.0.1:9"):
+        pass
