@@ -315,7 +315,7 @@ def singular_case(
 
 
 def driven_log(machine: Machine, traces: Traces, controller: str, runs: int = 16) -> logs.Log:
-    """What encoders and valves said during one controller's first runs of a sequence, for `score`."""
+    """What encoders and valves said in one controller's first runs, for `score`. Paper: Sec. 4.1"""
     recordings = []
     for (name, sequence), trace in traces.items():
         for i in range(min(runs, trace.q.shape[1]) * (name == controller)):

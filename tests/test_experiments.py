@@ -14,7 +14,7 @@ import pytest
 from benchmarks.rollout import random_net
 from brokk_min import experiments, jacobian
 from brokk_min.actuator import ActuatorNet, speed_limits
-from brokk_min.env import Measured, TaskConfig, Trace, measured, rollout, to_command
+from brokk_min.env import Measured, TaskConfig, measured, rollout, to_command
 from brokk_min.kinematics import joint_rates, tool_position
 from brokk_min.machine import BROKK_170, Machine, read_encoder
 from brokk_min.metrics import metrics
@@ -246,12 +246,3 @@ def test_the_whole_chain_spends_what_fit_and_train_do_by_default():
 
     effort = experiments.Effort()
     assert (effort.fit_steps, effort.train_steps) == (FitConfig().steps, PPOConfig().total_steps)
-
-
-def test_drift_is_the_largest_and_the_mean_distance_from_the_line() -> None:
-    p = np.array([[0.1, 0.0, 0.0], [0.2, 0.03, 0.04], [0.3, 0.0, 0.01]])[:, None]
-    zero = np.zeros((3, 1, 5))
-    trace = Trace(zero, zero, zero, zero, p, 0 * p, np.ones((3, 1)))
-    row = metrics(BROKK_170, trace, np.tile([0.1, 0.0, 0.0], (3, 1, 1)), np.zeros((1, 3)))
-    assert row["off_axis_drift_max"] == pytest.approx([0.05])
-    assert row["off_axis_drift_mean"] == pytest.approx([(0.0 + 0.05 + 0.01) / 3])

@@ -136,3 +136,11 @@ def test_a_summary_leaves_out_what_was_not_measured() -> None:
     found = m.summary(runs)["a"]
     assert found["x"]["error"] == 2.0 and found["y"]["error"] is None and found["all"]["error"] == 2.0
     assert m.intervals(runs)["a"]["y"]["error"] == [None, None]
+
+
+def test_drift_is_the_largest_and_the_mean_distance_from_the_line() -> None:
+    """Off the line by 0, then 3 mm and 4 mm across, then 0 again."""
+    v = 20 * np.array([[0.01, 0.0, 0.0], [0.01, 0.003, 0.004], [0.01, -0.003, -0.004]])
+    row = figures(v, np.tile([0.1, 0.0, 0.0], (3, 1)))
+    assert row["off_axis_drift_max"] == pytest.approx(0.005)
+    assert row["off_axis_drift_mean"] == pytest.approx(0.005 / 3)

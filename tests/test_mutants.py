@@ -196,22 +196,21 @@ PLANTED: list[tuple[str, str, str, str]] = [
     ("ppo", "- log_std.sum() - 0.5", "+ log_std.sum() - 0.5", "ppo::log_probability_is_that_of_torch"),
     ("ppo", "nn.ELU()]", "nn.ReLU()]", "ppo::the_nets_are_those_of_the_paper"),
     # sequences, figures of merit
-    ("sequences", "np.outer(profile, np.eye(3)[i])", "np.outer(profile, np.eye(3)[0])",
+    ("sequences", "_along(machine, np.eye(3)[i])", "_along(machine, np.eye(3)[0])",
      "sequences::axis_sequences_move_along_one_axis_and_turn_round"),
     ("sequences", "table[c][rows][at - 1]", "table[c][rows][at % len(rows)]",
      "sequences::commands_are_held_until_the_next_row"),
     ("sequences", "good &= inside & slow & near &", "good &= inside & slow &",
      "sequences::feasible_refuses_a_tool_that_stays_behind"),
-    ("experiments", "(away @ direction) * direction)", "away @ direction)",
-     "experiments::line_distance_of_a_hand_worked_drift"),
-    ("experiments", "if not direction.any() else before)", "if not direction.any() else start)",
-     "experiments::line_distance_starts_a_new_line_when_the_direction_turns"),
-    ("experiments", "axis=0) * machine.rate**2", "axis=0) * machine.rate", "experiments::metrics_by_hand"),
-    ("experiments", '"off_axis_drift_max": float(drift.max())', '"off_axis_drift_max": float(drift.mean())',
-     "experiments::drift_is_the_largest_and_the_mean_distance_from_the_line"),
-    ("experiments", "prepend=0 * u[:1]", "", "experiments::metrics_by_hand"),
-    ("experiments", "float(np.sqrt(np.mean(error**2)))", "float(np.mean(error))",
-     "experiments::metrics_by_hand"),
+    ("metrics", "np.sum(away * direction, -1, keepdims=True) * direction", "0 * direction",
+     "metrics::line_distance_of_a_hand_worked_drift"),
+    ("metrics", "np.where(anew & ~first, before, anchor)", "np.where(anew & ~first, start, anchor)",
+     "metrics::line_distance_starts_a_new_line_when_the_direction_turns"),
+    ("metrics", "axis=0) * machine.rate**2", "axis=0) * machine.rate", "metrics::metrics_by_hand"),
+    ("metrics", "drift.max(axis=0)", "drift.mean(axis=0)",
+     "metrics::drift_is_the_largest_and_the_mean_distance_from_the_line"),
+    ("metrics", "prepend=0 * trace.u[:1]", "", "metrics::metrics_by_hand"),
+    ("metrics", "np.sqrt(np.mean(error**2, axis=0))", "np.mean(error, axis=0)", "metrics::metrics_by_hand"),
     ("experiments", "trace.q_measured[:, i]", "trace.q[:, i]",
      "paper::a_driven_log_is_what_encoders_and_valves_said"),
     ("figures", "trace.p_tool[:, run] - first", "trace.p_tool[:, run]",
@@ -311,10 +310,10 @@ def calls(test: Callable[..., object], fixtures: dict[str, object]) -> Iterator[
 
 def test_planted_errors_are_many_and_in_every_module_that_works_out_numbers() -> None:
     assert len(PLANTED) >= 40
-    numeric = (
-        "machine kinematics logs actuator env ppo policy jacobian sequences experiments figures gate bus hw"
-    )
-    assert {*numeric.split(), "simulator"} <= {module for module, *_ in PLANTED}
+    numeric = "machine kinematics logs actuator env ppo policy jacobian sequences experiments metrics"
+    assert {*numeric.split(), "figures", "gate", "bus", "hw", "simulator"} <= {
+        module for module, *_ in PLANTED
+    }
 
 
 @pytest.mark.parametrize(("module", "right", "wrong", "test"), PLANTED, ids=lambda text: text[:40])

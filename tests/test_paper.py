@@ -19,8 +19,9 @@ import pytest
 from helpers_machines import small_net
 
 import brokk_min
-from brokk_min import actuator, experiments, figures, jacobian, ppo, sequences
-from brokk_min.env import TaskConfig, TaskVectorEnv
+from brokk_min import actuator, experiments, figures, jacobian, ppo, preliminary, report, sequences
+from brokk_min.env import TaskConfig, TaskVectorEnv, paper_view
+from brokk_min.kinematics import tool_position
 from brokk_min.logs import velocity_of
 from brokk_min.machine import BROKK_170
 
@@ -31,11 +32,29 @@ PAPER = (ROOT / "PAPER.md").read_text()
 NUMBERED = [f"eq{i}" for i in range(1, 5)] + ["Table 1"]
 PANELS = {1: "", 2: "abc", 3: "", 4: "", 5: "abcde", 6: "abcdefgh"}
 NUMBERED += [f"Fig. {figure}{panel}" for figure, panels in PANELS.items() for panel in panels or [""]]
-SECTIONS = {"Sec. 2", "Sec. 3.2", "Sec. 3.3", "Sec. 3.4", "Sec. 4.1", "Sec. 4.2"}  # those that say what to do
+SECTIONS = {
+    "Sec. 2",
+    "Sec. 3.2",
+    "Sec. 3.3",
+    "Sec. 3.4",
+    "Sec. 4.1",
+    "Sec. 4.2",
+    "Sec. 5",
+}  # those that say what to do
 # Every number that the paper gives, as its row is called; a row may hold several.
 CONSTANTS = [
     *("rate", "joints", "locked joint", "PWM code", "80/175", "50/205", "+0.24, -0.47 rad/s"),
-    *("400 ms, 100 ms", "coupling", "dead zone", "0.6 s, 0.05 s", "2 x 32", "1 h", "0.75 h, 2.5 h", "5 %"),
+    *(
+        "400 ms, 100 ms",
+        "coupling",
+        "dead zone",
+        "0.6 s, 0.05 s",
+        "2 x 32",
+        "errors of one step",
+        "1 h",
+        "0.75 h, 2.5 h",
+        "5 %",
+    ),
     *("no penalty", "256", "256-128-64", "q_s", "30 s", "K", "k"),
 ]
 
@@ -244,6 +263,19 @@ def test_the_papers_coupling_test_is_marginal() -> None:
     assert speed(weak, together) < 0.9 * speed(weak, together * np.eye(5)[4])
 
 
+def test_the_preliminary_figure_holds_its_three_tests() -> None:
+    """q5 by 50, 80, 175, 205 over its range; alone and with the others; a step from idle and moving."""
+    tests = preliminary.preliminary_tests(BROKK_170, preliminary.plant_mover(BROKK_170))
+    assert list(tests.sweeps) == ["u = 50", "u = 80", "u = 175", "u = 205"]
+    peaks = {name: round(float(v[np.abs(v).argmax()]), 2) for name, (_, v) in tests.sweeps.items()}
+    assert (peaks["u = 80"], peaks["u = 175"]) == (0.24, -0.44)  # means over a tick
+    assert 0 < peaks["u = 50"] < 0.24 and -0.44 < peaks["u = 205"] < 0
+    alone, together = (curve[:, :150] for curve in tests.coupling.values())
+    np.testing.assert_allclose(alone, together, atol=0.01)
+    idle, moving = preliminary.response_times(tests.angles, BROKK_170.rate)[..., 4].reshape(2, -1)
+    assert np.all(idle > 2.5 * moving)
+
+
 def test_the_papers_excitation_is_the_sine() -> None:
     assert actuator.EXCITATIONS["sine"] is actuator.sine_command
 
@@ -312,6 +344,30 @@ def test_figure_6_runs_every_controller_and_shows_its_panels() -> None:
         line = next(line for line in ax.lines if line.get_label() == "rl")
         np.testing.assert_array_equal(line.get_ydata(), traces["rl", "z"].q_dot[:, 0, joint])
     plt.close("all")
+
+
+def test_figure_6_draws_its_starts_and_judges_singular_ones() -> None:
+    figure = figures.plot_starts(BROKK_170, STARTS, ["extended", "extended"])
+    reach = np.hypot(*tool_position(BROKK_170, STARTS[1])[:2])
+    assert np.max(figure.axes[0].lines[1].get_xdata()) == pytest.approx(reach)
+    plt.close("all")
+    net = small_net(BROKK_170, np.random.default_rng(0))
+    controllers = {"rl": Steady(0.3), **experiments.baselines(BROKK_170, net)}
+    short = [s._replace(goals=s.goals[15:35]) for s in sequences.axis_sequences(BROKK_170)]
+    traces, found = experiments.singular_case(BROKK_170, controllers, short, STARTS, 0)
+    assert {s for _, s in traces} == set("xyz") and found["claims"]
+    assert experiments.singular_case(BROKK_170, controllers, short, STARTS[:0], 0)[0] == {}
+
+
+def test_the_papers_view_leaves_out_the_wanted_rates() -> None:
+    factors = paper_view(BROKK_170)
+    assert factors.shape == (171,)
+    assert not factors[-8:].any() and (factors[:-8] > 0).all()
+
+
+def test_the_report_says_how_a_sentence_fares() -> None:
+    said = [report.verdict({"paper": "a", "measured": "b", "holds": h}) for h in (True, False, None)]
+    assert len(set(said)) == 3
 
 
 def test_a_driven_log_is_what_encoders_and_valves_said() -> None:
