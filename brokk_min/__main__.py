@@ -1,29 +1,42 @@
 """The command line: `brokk-min COMMAND --help`. Exits 0 done, 1 failed, 2 wrong use."""
 
+import json
 import os
+import runpy
 import shutil
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
 
-from brokk_min import experiments, hw
-from brokk_min.actuator import FitConfig, collect, fit, load_net, save_net, score
+from brokk_min import experiments, figures, hw, play, preliminary, remote, replay, view
+from brokk_min.actuator import PAPER_RECIPE, FitConfig, collect, fit, load_net, save_net
 from brokk_min.bus import open_line, read_frames
 from brokk_min.env import Controller, TaskConfig, fitting_nets
 from brokk_min.export import export_onnx
+from brokk_min.kinematics import tool_position
 from brokk_min.logs import Log, read_log, write_log
-from brokk_min.machine import BROKK_170
+from brokk_min.machine import BROKK_170, Machine
+from brokk_min.metrics import summary
+from brokk_min.mpc import PerfectModel
 from brokk_min.policy import PolicyController, load_policy
-from brokk_min.sequences import axis_sequences, draw_starts, read_commands, read_starts
+from brokk_min.report import VERDICTS
+from brokk_min.sequences import (
+    draw_starts,
+    read_commands,
+    read_starts,
+    scored_starts,
+    task_sequences,
+    write_starts,
+)
 from brokk_min.simulator import simulate
 
 MACHINES = {machine.name: machine for machine in (BROKK_170,)}
-Name = Annotated[str, tyro.conf.arg(metavar="{" + ",".join(MACHINES) + "}")]
+Name = Annotated[str, tyro.conf.arg(metavar="{" + ",".join(MACHINES) + "}|FILE.py:NAME")]
 
 
 class WrongUse(ValueError):
@@ -37,7 +50,7 @@ ALLOWED: tuple[tuple[float, float, str], ...] = (
     (0, 0.9999, "gamma"),
     (0, 1000, "noise valve_cost entropy"),
     (0, 1e6, "hold_min_s hold_max_s"),
-    (1, 1e6, "batch_size hidden num_envs horizon epochs threads"),
+    (1, 1e6, "batch_size hidden num_envs group horizon epochs threads rollout num num_starts"),
     (1, 1e12, "steps total_steps checkpoint_every"),
     (2, 1e7, "velocity_samples history minibatch_size"),
     (-10, 3, "log_std"),
@@ -48,6 +61,7 @@ ALLOWED: tuple[tuple[float, float, str], ...] = (
     (1, 10000, "seeds"),
     (1, 1000, "poses"),
     (0.05, 1e6, "episode_s"),
+    (0.1, 100, "fps"),
 )
 
 
@@ -62,18 +76,33 @@ def check(command: Any, *outputs: Path | None) -> None:
                 raise WrongUse(f"--{option}: expected {low} to {high}, got {given[name]}")
     if given.get("hold_min_s", 0) > given.get("hold_max_s", 0):
         raise WrongUse(f"--hold-max-s: expected --hold-min-s or more, got {given['hold_max_s']}")
-    if given.get("machine", BROKK_170.name) not in MACHINES:
-        raise WrongUse(f"--machine: expected one of {list(MACHINES)}, got {given['machine']}")
+    name = given.get("machine") or BROKK_170.name
+    if name not in MACHINES:
+        MACHINES[name] = machine_from(name)
     for path in outputs:
         if path and (path.is_dir() or not os.access(path.parent, os.W_OK)):
             raise WrongUse(f"{path}: expected a file in an existing, writable directory")
+
+
+def machine_from(name: str) -> Machine:
+    """The machine `FILE.py:NAME`: it runs the file, as `python FILE.py` would."""
+    path, _, symbol = name.rpartition(":")
+    if not path.endswith(".py"):
+        raise WrongUse(f"--machine: expected one of {list(MACHINES)} or FILE.py:NAME, got {name}")
+    try:
+        machine = runpy.run_path(path).get(symbol)
+    except Exception as error:  # whatever the file does
+        raise ValueError(f"--machine: expected {path} to run, got {error!r}") from error
+    if not isinstance(machine, Machine):
+        raise WrongUse(f"--machine: expected a Machine {symbol} in {path}, got {machine!r}")
+    return machine
 
 
 @dataclass(kw_only=True)
 class Command:
     """What most commands share."""
 
-    machine: Name = BROKK_170.name  # Which machine.
+    machine: Name = BROKK_170.name  # Which machine; FILE.py:NAME runs that file, so name only one you trust.
     seed: int = 0  # Of everything random.
 
 
@@ -104,31 +133,51 @@ class Fit:
     out: Path  # Nets to write, .npz.
     test: tuple[Path, ...] = ()  # Logs to score on; without them every tenth recording of LOGS is held out.
     json: Path | None = None  # Also write the scores here.
+    figure: Path | None = None  # Also draw free runs of the worst and the median recording here, .png.
+    machine: Name = ""  # Whose nets these are; by default the machine that has the joints of LOGS.
     velocity_samples: int = BROKK_170.velocity_samples  # Window of the velocity estimator at 20 Hz.
+    paper: bool = False  # The paper's own recipe: errors of one step alone, no noise.
     settings: tyro.conf.OmitArgPrefixes[FitConfig] = field(default_factory=FitConfig)  # The fit.
     seed: int = 0  # Of everything random.
 
     def run(self) -> None:
-        """Fit, score, write."""
+        """Fit, judge, write."""
         if not self.logs:
             raise WrongUse("LOGS: expected at least one log, got none")
-        check(self, self.out, self.json)
+        check(self, self.out, self.json, self.figure)
         if self.velocity_samples > self.settings.history:
             raise WrongUse(f"--velocity-samples: expected at most --history, got {self.velocity_samples}")
         log = read_log(self.logs, self.velocity_samples)
         log, test = (log, read_log(self.test, self.velocity_samples, log.joints)) if self.test else split(log)
-        known = [machine.name for machine in MACHINES.values() if machine.names == log.joints]
-        net = fit(log, self.settings, self.seed, self.velocity_samples, "".join(known))
+        chosen = [MACHINES[self.machine]] if self.machine else MACHINES.values()
+        known = [machine for machine in chosen if machine.names == log.joints]
+        if self.machine and not known:
+            raise ValueError(f"LOGS: expected joints of --machine {self.machine}, got {list(log.joints)}")
+        name = known[0].name if len({machine.name for machine in known}) == 1 else ""
+        settings = replace(self.settings, **PAPER_RECIPE) if self.paper else self.settings
+        net = fit(log, settings, self.seed, self.velocity_samples, name)
+        verdict = preliminary.judge(net, log, test, known[0] if known else None)
         save_net(self.out, net)
-        joints = score(net, test)
         if self.json:
             meta: dict[str, Any] = {"seed": self.seed, "rate": net.rate, "history": net.history}
             meta |= {"logs": [str(p) for p in self.logs], "test": [str(p) for p in self.test]}
-            experiments.write_json(self.json, {"meta": meta, "joints": joints})
-        print(f"{'joint':12} one step  same as last  free run of 1, 5, 10, 30 s [rad/s]")
-        for name, s in joints.items():
-            free = ", ".join(f"{run['velocity_rmse']:.4f}" for run in s["free_run"].values())
-            print(f"{name:12} {s['one_step_rmse']:8.4f}  {s['persistence_rmse']:12.4f}  {free}")
+            experiments.write_json(self.json, {"meta": meta, **verdict})
+        if self.figure:
+            figures.save(self.figure, figures.plot_worst_and_median(net, test))
+        _print_verdict(verdict)
+
+
+def _print_verdict(verdict: dict[str, Any]) -> None:
+    """Scores of the nets, of the linear model below them, and what speaks against the nets."""
+    row = "{:12} {:>9} {:>13}  {:30} {}"
+    print(row.format("joint", "one step", "same as last", "free run of 1, 5, 10, 30 s", "creep [rad/s]"))
+    for name, s in verdict["joints"].items():
+        for label, scores in ((name, s), ("  linear", s["linear"])):
+            free = ", ".join(f"{run['velocity_rmse']:.4f}" for run in scores["free_run"].values())
+            steps = (f"{scores.get(key, np.nan):.4f}" for key in ("one_step_rmse", "persistence_rmse"))
+            print(row.format(label, *steps, free, f"{s['creep']:.5f}" if label == name else ""))
+    for warning in verdict["warnings"]:
+        print(f"warning: {warning}")
 
 
 def split(log: Log) -> tuple[Log, Log]:
@@ -141,7 +190,7 @@ def split(log: Log) -> tuple[Log, Log]:
 
 def train_command() -> Any:
     """The command `train`; made on demand, because its settings live beside torch."""
-    from brokk_min.ppo import PPOConfig, train
+    from brokk_min.ppo import TASK, PPOConfig, train
 
     @dataclass(kw_only=True)
     class Train(Command):
@@ -152,7 +201,7 @@ def train_command() -> Any:
         resume: bool = False  # Take up OUT.checkpoint; the end is the same as without the break.
         tensorboard: Path | None = None  # Folder for TensorBoard (extra `tensorboard`).
         settings: tyro.conf.OmitArgPrefixes[PPOConfig] = field(default_factory=PPOConfig)  # The learner.
-        task: tyro.conf.OmitArgPrefixes[TaskConfig] = field(default_factory=TaskConfig)  # What an episode is.
+        task: tyro.conf.OmitArgPrefixes[TaskConfig] = TASK  # What an episode is.
 
         def run(self) -> None:
             """Train and write the policy."""
@@ -167,7 +216,7 @@ def train_command() -> Any:
 
 def sweep_command() -> Any:
     """The command `sweep`; made on demand as `train`."""
-    from brokk_min.ppo import PPOConfig
+    from brokk_min.ppo import TASK, PPOConfig
     from brokk_min.sweep import show, sweep
 
     @dataclass(kw_only=True)
@@ -182,7 +231,7 @@ def sweep_command() -> Any:
         gains: Path | None = None  # Tuned gains that `reproduce` wrote: baselines beside.
         settings: tyro.conf.OmitArgPrefixes[PPOConfig] = field(default_factory=PPOConfig)
         """The learner; each seed runs on one thread, whatever --threads says."""
-        task: tyro.conf.OmitArgPrefixes[TaskConfig] = field(default_factory=TaskConfig)  # What an episode is.
+        task: tyro.conf.OmitArgPrefixes[TaskConfig] = TASK  # What an episode is.
 
         def run(self) -> None:
             """Sweep and print the table."""
@@ -197,6 +246,23 @@ def sweep_command() -> Any:
 
 
 @dataclass(kw_only=True)
+class Starts(Command):
+    """Draw start poses for `evaluate`: across the workspace, near joint limits, near full extension."""
+
+    out: Path  # Poses to write, .csv.
+    num: int = 64  # How many.
+    seed: int = 2  # Of the poses.
+
+    def run(self) -> None:
+        """Draw and write."""
+        check(self, self.out)
+        machine = MACHINES[self.machine]
+        rng = np.random.default_rng(self.seed)
+        write_starts(self.out, machine, draw_starts(machine, task_sequences(machine), self.num, rng))
+        print(f"{self.out}: {self.num} start poses")
+
+
+@dataclass(kw_only=True)
 class Evaluate(Command):
     """Policy and tuned baselines on the same sequences and starts."""
 
@@ -206,20 +272,21 @@ class Evaluate(Command):
     plant: Literal["analytic", "net"] = "analytic"  # What moves: the analytic plant or the nets.
     json: Path | None = None  # Also write all runs here.
     gains: Path | None = None  # Tuned gains; by default gains.json beside POLICY.
+    num_starts: int = 16  # Without --starts: so many of the machine's start poses.
+    perfect_model: bool = False  # Also the bound: a controller that knows the plant (minutes).
 
     def run(self) -> None:
         """Evaluate and print the means."""
         check(self, self.json)
+        if self.perfect_model and self.plant == "net":
+            raise WrongUse("--perfect-model: expected --plant analytic, the plant that it knows, got net")
         machine, effort = MACHINES[self.machine], experiments.Effort()
         policy = load_policy(self.policy, machine)
-        sequences = axis_sequences(machine)
-        if self.commands:
-            sequences = read_commands(self.commands, machine)
+        sequences = read_commands(self.commands, machine) if self.commands else task_sequences(machine)
         if self.starts:
             starts = read_starts(self.starts, machine)
         else:
-            rng = np.random.default_rng(self.seed + 2)
-            starts = draw_starts(machine, sequences, effort.starts, rng)
+            starts = scored_starts(machine, self.num_starts, task_sequences(machine), self.seed + 2)
         controllers: dict[str, Controller] = {"rl": PolicyController(machine, policy)}
         beside = self.policy.with_name("gains.json")
         gains = self.gains or (beside if beside.exists() else "tuned now")
@@ -228,15 +295,23 @@ class Evaluate(Command):
             controllers |= experiments.read_gains(gains, machine, policy.net)
         else:
             controllers |= experiments.tuned_baselines(machine, policy.net, effort, self.seed)[0]
+        if self.perfect_model:
+            controllers["perfect_model"] = PerfectModel(machine, starts)
         moves = policy.net if self.plant == "net" else None
         runs, _ = experiments.task_space(machine, controllers, sequences, starts, self.seed, moves)
         if self.json:
             meta = experiments.meta(machine, self.seed)
             meta |= {"policy": str(self.policy), "gains": str(gains), "plant": self.plant}
-            meta |= {"commands": str(self.commands or "x, y, z"), "starts": str(self.starts or "drawn")}
+            names = ", ".join(sequence.name for sequence in sequences)
+            meta |= {"commands": str(self.commands or names), "starts": str(self.starts or self.num_starts)}
             experiments.write_json(self.json, {"meta": meta, "runs": runs})
-        for name, rows in experiments.summary(runs).items():
-            print(f"{name:20} " + ", ".join(f"{k} {v:.4f}" for k, v in rows["all"].items()))
+        for kind in dict.fromkeys(run["kind"] for run in runs):
+            mine = [run for run in runs if run["kind"] == kind]
+            num = len({run["start"] for run in mine})
+            print(f"{kind} starts ({num}), means over {len(sequences)} sequences")
+            for name, rows in summary(mine).items():
+                cells = (f"{k} {'none' if v is None else format(v, '.4f')}" for k, v in rows["all"].items())
+                print(f"  {name:20} " + ", ".join(cells))
 
 
 @dataclass(kw_only=True)
@@ -254,7 +329,32 @@ class Reproduce(Command):
         for name, rows in results["task_space"]["summary"].items():
             errors = ", ".join(f"{s} {row['velocity_error_mean']:.4f}" for s, row in rows.items())
             print(f"{name:20} mean velocity error [m/s]: {errors}")
+        for claim in results["claims"]:
+            print(f"{VERDICTS[claim['holds']]}: {claim['paper']}")
         print(f"{self.out / 'report.html'}\n{self.out / 'results.json'}")
+
+
+@dataclass(kw_only=True)
+class Preliminary(Command):
+    """The paper's preliminary tests and its sim-to-real experiment, machine and nets side by side."""
+
+    actuator: Path  # Nets that `fit` wrote.
+    out: Path = Path("preliminary")  # Folder for figures and preliminary.json.
+
+    def run(self) -> None:
+        """Measure, draw, write."""
+        check(self)
+        machine, net = MACHINES[self.machine], load_net(self.actuator)
+        numbers = preliminary.run(machine, net, self.seed)
+        self.out.mkdir(parents=True, exist_ok=True)
+        for name, figure in preliminary.plots(machine, net, self.seed).items():
+            figures.save(self.out / f"{name}.png", figure)
+            print(self.out / f"{name}.png")
+        meta = experiments.meta(machine, self.seed) | {"actuator": str(self.actuator)}
+        experiments.write_json(self.out / "preliminary.json", {"meta": meta, **numbers})
+        print(self.out / "preliminary.json")
+        tool = numbers["sim_to_real"]["tool"]["position_error_mean"]
+        print(f"tool, nets beside machine over 30 s: {tool:.4f} m apart in the mean")
 
 
 @dataclass(kw_only=True)
@@ -375,17 +475,127 @@ class Export(Command):
         print(f"{self.out}: observation (batch, obs) in, action (batch, driven joints) out")
 
 
+@dataclass(kw_only=True)
+class Play(Command):
+    """Drive with keyboard or gamepad in a window, and trace lines; see docs/play.md."""
+
+    policy: Path | None = None  # Policy that `train` wrote; without one there are levers only.
+    gains: Path | None = None  # Tuned gains of the Jacobian controller; by default gains.json beside POLICY.
+    interface: str = ""  # python-can's name of a bus; without one a simulated machine stands behind.
+    channel: str = ""  # Channel of the interface.
+    drive: bool = False  # Drive the machine on the bus; without it, nothing is sent there.
+    attempts: Path = Path("attempts.csv")  # Table of the traced lines, kept.
+    log: Path | None = None  # Also log every frame here, candump format.
+    start: tuple[float, ...] = remote.START  # Angles of the simulated machine at the start [rad].
+
+    def run(self) -> None:
+        """Open the window until it is closed."""
+        check(self, self.attempts, self.log)
+        if bool(self.interface) != bool(self.channel) or (self.drive and not self.interface):
+            raise WrongUse("--interface, --channel: expected both or, without --drive, none")
+        machine, where = (
+            MACHINES[self.machine],
+            remote.Where(self.interface, self.channel, self.log, self.start),
+        )
+        if self.interface and not self.drive:
+            play.watch(machine, where)
+            return
+        controllers: dict[str, Controller] = {}
+        if self.policy:
+            policy, beside = load_policy(self.policy, machine), self.policy.with_name("gains.json")
+            gains = self.gains or (beside if beside.exists() else None)
+            known = experiments.read_gains(gains, machine, policy.net) if gains else None
+            known = known or experiments.baselines(machine, policy.net)
+            controllers = {"rl": PolicyController(machine, policy), "jacobian": known["jacobian_pid_k0.1"]}
+            print(f"gains of the Jacobian controller: {gains or 'set by hand'}", file=sys.stderr)
+        play.play(machine, controllers, where, self.attempts)
+
+
+@dataclass(kw_only=True)
+class Replay(Command):
+    """Watch recorded runs side by side: logs of `drive`, or runs of `evaluate`, driven again."""
+
+    logs: tyro.conf.Positional[tuple[Path, ...]]  # One or two candump logs, or one JSON of results.
+    out: Path | None = None  # Write a film, .gif or .mp4, instead of opening a window.
+    fps: float = 10.0  # Pictures a second of the film.
+    size: tuple[int, int] = (960, 540)  # Of the picture [px].
+    controllers: tuple[str, ...] = ("rl", "jacobian_pid_k0.1")  # Whose runs of the results.
+    sequence: str = ""  # Which sequence of the results; by default the first.
+    start: int = 0  # Which start of the results.
+
+    def run(self) -> None:
+        """Open the window until it is closed, or write the film."""
+        check(self, self.out)
+        if not 1 <= len(self.logs) <= 2:
+            raise WrongUse(f"LOGS: expected one or two, got {len(self.logs)}")
+        if self.logs[0].suffix == ".json":
+            machine, runs = self._driven_again(self.logs[0])
+        else:
+            machine, colours = MACHINES[self.machine], list(view.COLOURS.values())
+            pairs = zip(self.logs, colours, strict=False)
+            runs = [replay.run_of_log(machine, log, colour) for log, colour in pairs]
+        if self.out:
+            replay.write_film(self.out, machine, runs, self.size, self.fps)
+        else:
+            replay.show_film(machine, runs, self.size)
+
+    def _driven_again(self, path: Path) -> tuple[Machine, list[replay.Run]]:
+        """Runs of a results file, simulated anew from what it says of itself and compared with its rows."""
+        try:
+            file = json.loads(path.read_text())
+            beside = {"policy": str(path.with_name("policy.npz")), "gains": str(path.with_name("gains.json"))}
+            told = beside | {"plant": "analytic", "commands": "", "starts": ""} | file["meta"]
+            rows = file.get("task_space", file)["runs"]
+            machine, seed = MACHINES[told["machine"]], int(told["seed"])
+            starts = np.array(file["starts"]) if "starts" in file else None
+        except (OSError, KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{path}: expected results of `evaluate`, got {error!r}") from error
+        policy, sequences = load_policy(Path(told["policy"]), machine), task_sequences(machine)
+        if told["commands"] not in ("", ", ".join(s.name for s in sequences)):
+            sequences = read_commands(Path(told["commands"]), machine)
+        if starts is None and told["starts"].isdigit():
+            starts = scored_starts(machine, int(told["starts"]), task_sequences(machine), seed + 2)
+        elif starts is None:
+            starts = read_starts(Path(told["starts"]), machine)
+        known: dict[str, Controller] = {"rl": PolicyController(machine, policy)}
+        if set(self.controllers) - {"rl"}:
+            known |= experiments.read_gains(Path(told["gains"]), machine, policy.net)
+        named = {s.name: s for s in sequences}
+        sequence = named.get(self.sequence or sequences[0].name)
+        if sequence is None or set(self.controllers) - set(known) or not 0 <= self.start < len(starts):
+            raise WrongUse(
+                f"--sequence, --controllers, --start: expected some of {list(named)}, of {list(known)} "
+                f"and below {len(starts)}, got {self.sequence}, {list(self.controllers)}, {self.start}"
+            )
+        chosen = {name: known[name] for name in self.controllers}
+        net = policy.net if told["plant"] == "net" else None
+        again, traces = experiments.task_space(machine, chosen, sequences, starts, seed, net)
+        for row in (r for r in again if r["start"] == self.start and r["sequence"] == sequence.name):
+            same = [r for r in rows if all(r[k] == row[k] for k in ("controller", "sequence", "start"))]
+            if not same or not np.isclose(same[0]["velocity_rmse"], row["velocity_rmse"], rtol=1e-3):
+                raise ValueError(f"{path}: expected the run {row}, got {same or 'none'}: another program?")
+        first = tool_position(machine, starts[self.start])
+        return machine, [
+            replay.run_of_trace(machine, name, traces[name, sequence.name], self.start, sequence.goals, first)
+            for name in chosen
+        ]
+
+
 COMMANDS: dict[str, Callable[[], Any]] = {
     "collect": lambda: Collect,
     "fit": lambda: Fit,
+    "preliminary": lambda: Preliminary,
     "train": train_command,
     "sweep": sweep_command,
+    "starts": lambda: Starts,
     "evaluate": lambda: Evaluate,
     "reproduce": lambda: Reproduce,
     "machine": lambda: Simulate,
     "drive": lambda: Drive,
     "convert": lambda: Convert,
     "export": lambda: Export,
+    "play": lambda: Play,
+    "replay": lambda: Replay,
 }
 
 

@@ -23,6 +23,7 @@ from brokk_min.machine import PWM_MAX, Machine, estimate_velocity, limit_command
 Array = NDArray[np.floating[Any]]
 FORMAT = 1  # of net files
 HORIZONS = (1, 5, 10, 30)  # s, of the free-run scores
+STILL = 0.002  # rad, assumed: little more than a step of a 12-bit encoder
 MAX_RETURN = 300.0  # s, assumed: a way back to the start that takes longer is broken off
 
 
@@ -120,8 +121,11 @@ def sine_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Arra
 
 
 def rich_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Array:
-    """Sines over a wide band, steps, fast random holds, stop and go out of rests; small noise, (ticks,)."""
-    limit = machine.pwm_limit / PWM_MAX
+    """Sines over a wide band, steps, fast random holds, stop and go out of rests; small noise, (ticks,).
+
+    Levels are drawn up to a third above the limit: cut there, a quarter are at the limit, as a policy's.
+    """
+    limit = 4 / 3 * machine.pwm_limit / PWM_MAX
     parts: list[Array] = []
     while sum(map(len, parts)) < ticks:
         length = int(rng.uniform(0.5, 4.0) / machine.dt)
@@ -142,7 +146,7 @@ def rich_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Arra
             part = rng.choice([0, 1]) * rng.uniform(0, machine.dead_zone) * rng.uniform(-1, 1, length)
             at = 0
             while at < length:
-                at += int(rng.uniform(0.05, 1.0) / machine.dt)
+                at += int(np.exp(rng.uniform(np.log(0.05), np.log(3.0))) / machine.dt)
                 move = int(rng.uniform(0.1, 1.0) / machine.dt)
                 part[at : at + move] = rng.uniform(-limit, limit)
                 at += move
@@ -181,10 +185,10 @@ def collect(
 ) -> Log:
     """Record the analytic plant, one actuator at a time, `hours` for each, ways back not counted.
 
-    A recording starts with `history` samples of an idle valve, then drives until the joint meets its limit
-    or for `leg_s`. The way back to its start, and the rest there until the valve is idle, is named
-    `..._return` and dropped by `read_log`. The paper's sines start at home (mid range), rich excitation
-    at random angles. Paper: Sec. 3.3
+    A recording starts with `history` samples of an idle valve, then drives for `leg_s` or until the joint
+    meets its limit; in rich excitation it may push there for a second in all. The way back to its start,
+    and the rest there until the valve is idle, is named `..._return` and dropped by `read_log`. The
+    paper's sines start at home (mid range), rich excitation at random angles. Paper: Sec. 3.3
     """
     if excitation not in EXCITATIONS:
         raise ValueError(f"excitation: expected one of {list(EXCITATIONS)}, got {excitation!r}")
@@ -221,8 +225,9 @@ def _drive_legs(
     low, high, row = machine.column("q_min"), machine.column("q_max"), np.arange(len(joint))
     q = np.tile((low + high) / 2, (len(row), 1))
     low, high = low[joint], high[joint]
-    if excitation == "rich":
-        q[row, joint] = rng.uniform(low, high)
+    if excitation == "rich":  # a tenth of the legs begins at either stop
+        past = (high - low) / 8
+        q[row, joint] = np.clip(rng.uniform(low - past, high + past), low, high)
     start, near, length = q[row, joint], 2 * machine.encoder_step, machine.history + ticks
     commands = np.zeros((len(row), length))
     commands[:, machine.history :] = [EXCITATIONS[excitation](rng, machine, ticks) for _ in row]
@@ -230,11 +235,16 @@ def _drive_legs(
     rest = round(5 * machine.ready_down_time * machine.rate)  # ticks until a valve is idle again
     back = np.full(len(row), length)  # tick at which each way back begins
     rested = np.zeros(len(row), int)  # ticks at rest after it
+    met, push = (
+        np.zeros(len(row), int),
+        machine.rate * (excitation == "rich"),
+    )  # ticks at a limit, allowed ones
     recorder = _Recorder(machine, q)
     while rested.min() < rest and len(recorder.u) < length + MAX_RETURN * machine.rate:
         tick, angle = len(recorder.u), recorder.q[-1][row, joint]
         at_limit = (angle < low + near) | (angle > high - near)
-        back[at_limit & (machine.history + machine.rate < tick) & (tick < back)] = tick
+        met += at_limit
+        back[at_limit & (met > push) & (machine.history + machine.rate < tick) & (tick < back)] = tick
         arrived = (np.abs(angle - start) < max(0.06, near)) | (rested > 0)
         rested += arrived & (tick >= back)
         homeward = np.where(arrived, 0.0, slow * np.sign(start - angle))
@@ -266,7 +276,7 @@ def rest_history(q: ArrayLike, samples: int) -> Array:
 
 
 def push_command(history: Array, u: ArrayLike) -> Array:
-    """History (..., n, 3, H) with the command `u` (..., n) of this tick appended: the nets' input."""
+    """History (..., n, 3, H) and the command `u` (..., n) of this tick: the nets' input. Paper: Table 1"""
     result = history.copy()
     result[..., 2, :-1] = history[..., 2, 1:]
     result[..., 2, -1] = u
@@ -329,8 +339,16 @@ class ActuatorNet:
     def predict(self, history: Array) -> Array:
         """Mean velocity over the coming tick [rad/s] (..., n), so that q(t+dt) = q(t) + dt * velocity.
 
-        `history` is what `push_command` left, (..., n, 3, H).
+        `history` is what `push_command` left, (..., n, 3, H). A joint that had no command and moved less than
+        `STILL` during all of it stands, where a net alone would creep.
         """
+        still = ~history[..., 2, :].any(axis=-1) & (np.abs(history[..., 0, -1] - history[..., 0, 0]) < STILL)
+        velocity = self.velocity(history)
+        velocity[still] = 0.0
+        return velocity
+
+    def velocity(self, history: Array) -> Array:
+        """What the nets alone say, as `predict`."""
         n, inputs = len(self.joints), 3 * self.history
         if history.shape[-3:] != (n, 3, self.history):
             raise ValueError(f"history: expected (..., {n}, 3, {self.history}), got {history.shape}")
@@ -431,46 +449,53 @@ class FitConfig:
     batch_size: int = 1024
     """Windows a joint in each step."""
     learning_rate: float = 4e-3
-    """Of Adam at the start; falls to zero along a cosine."""
+    """Of Adam at the start; falls to zero along a cosine, and again from a quarter for free runs."""
     noise: float = 0.2
     """Standard deviation of the noise on the velocity inputs, in units of the velocities' own."""
     hidden: int = 32
     """Units in each of the two hidden layers (paper: 32)."""
     history: int = 13
     """Samples of angle, velocity and command that the nets see (paper: 13)."""
+    rollout: int = 8
+    """Ticks that the nets run freely in the last fifth of the steps, which learn from that (paper: 1)."""
+
+
+PAPER_RECIPE: dict[str, Any] = {"noise": 0.0, "rollout": 1}  # Sec. 3.3
 
 
 def fit(log: Log, config: FitConfig, seed: int, velocity_samples: int, machine: str = "") -> ActuatorNet:
-    """Fit one net a joint to the one-step targets of a log. Paper: Sec. 3.3 (MSE, Adam)
+    """Fit one net a joint to a log. Paper: Sec. 3.3 (MSE, Adam)
 
-    The same `seed` gives the same bits on the same machine. `velocity_samples` is the window of the estimator
-    that supplied the velocities of `log`, `machine` a name for the file.
+    One-step errors first, then short free runs, in which a bias adds up while the noise of encoders does
+    not. The same `seed` gives the same bits on the same machine. `velocity_samples` is the window of the
+    estimator that supplied the velocities of `log`, `machine` a name for the file.
 
     Raises:
         ValueError: a joint that never moves long enough to be learned.
     """
+    training = training_set(log, config.history, config.rollout)
+    estimator = None if log.velocity_logged else velocity_samples
+    weights = _train(training, config, seed, estimator)
+    return ActuatorNet(
+        joints=log.joints,
+        history=config.history,
+        rate=RATE,
+        velocity_samples=velocity_samples,
+        velocity_logged=log.velocity_logged,
+        machine=machine,
+        seed=seed,
+        settings=asdict(config),
+        weights=weights,
+        **{name: getattr(training, name).astype(np.float32) for name in _NET_ARRAYS},
+    )
+
+
+def _train(training: TrainingSet, config: FitConfig, seed: int, estimator: int | None) -> tuple[Array, ...]:
+    """Weights of all nets, one Adam step for all of them at a time; `estimator` as in `_rollout_loss`."""
     import torch
 
-    samples, n, history = _end_to_end(log), len(log.joints), config.history
-    every = samples.starts(history - 1, 1, 1)
-    ends = [every[moves] for moves in samples.moves[every].T]  # of each joint's windows
-    for name, end, target in zip(log.joints, ends, samples.target.T, strict=True):
-        if not len(end) or np.ptp(target[end]) == 0:
-            raise ValueError(
-                f"joint {name}: expected a recording of {history + 1} samples or more in which it "
-                "moves, got none"
-            )
-    data = np.stack([samples.whole.q.T, samples.whole.q_dot.T, samples.whole.u.T])  # (3, n, N)
-    mean = np.array([data[:, j, end].mean(axis=1) for j, end in enumerate(ends)])
-    scale = np.array([data[:, j, end].std(axis=1) for j, end in enumerate(ends)])
-    scale = np.where(scale > 1e-9, scale, 1.0)  # a channel that never changes
-    mean, scale = np.repeat(mean, history, axis=1), np.repeat(scale, history, axis=1)  # (n, 3 H)
-    low = np.array([samples.target[end, j].min() for j, end in enumerate(ends)])
-    high = np.array([samples.target[end, j].max() for j, end in enumerate(ends)])
-    low, high = low - 0.05 * (high - low), high + 0.05 * (high - low)
-
+    n, inputs, hidden = *training.input_mean.shape, config.hidden
     generator = torch.Generator().manual_seed(seed)
-    inputs, hidden = 3 * history, config.hidden
     weights: list[torch.Tensor] = []
     for rows, columns in [(inputs, hidden), (hidden, hidden), (hidden, 1)]:
         bound = (6 / rows) ** 0.5  # He's uniform bound for ReLU
@@ -479,54 +504,132 @@ def fit(log: Log, config: FitConfig, seed: int, velocity_samples: int, machine: 
     for weight in weights:
         weight.requires_grad_()
     optimizer = torch.optim.Adam(weights, lr=config.learning_rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.steps)
+    turn = (
+        round(0.8 * config.steps) if config.rollout > 1 and all(map(len, training.far_ends)) else config.steps
+    )
 
-    series = torch.tensor(data, dtype=torch.float32).flatten(1)  # (3, n N): joint after joint
-    fractions = torch.tensor((samples.target - low) / (high - low), dtype=torch.float32).T.flatten()
-    centre, width = torch.tensor(mean)[:, None].float(), torch.tensor(scale)[:, None].float()
-    choices, lags = [torch.tensor(end) for end in ends], torch.arange(1 - history, 1)
-    first = torch.arange(n)[:, None] * len(samples.target)
-    for _ in tqdm(range(config.steps), desc="fit nets", unit="step", disable=None):
-        picks = [torch.randint(len(c), (config.batch_size,), generator=generator) for c in choices]
-        at = torch.stack([c[pick] for c, pick in zip(choices, picks, strict=True)]) + first
-        x = series[:, at[..., None] + lags].permute(1, 2, 0, 3).reshape(n, -1, inputs)
-        x = (x - centre) / width
-        if config.noise:
-            x[..., history : 2 * history] += config.noise * (
-                torch.randn(n, config.batch_size, history, generator=generator)
-                + torch.randn(n, config.batch_size, 1, generator=generator)
-            )
-        for i in (0, 2):
-            x = torch.relu(torch.baddbmm(weights[i + 1][:, None], x, weights[i]))
-        y = torch.sigmoid(torch.baddbmm(weights[5][:, None], x, weights[4]))[..., 0]
-        loss = ((y - fractions[at]) ** 2).mean(dim=1).sum()
+    def fall(step: int) -> float:
+        done = step / turn if step < turn else (step - turn) / max(config.steps - turn, 1)
+        return (0.5 if step < turn else 0.125) * (1 + float(np.cos(np.pi * done)))
+
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, fall)
+    target = (training.target - training.output_low) / (training.output_high - training.output_low)
+    arrays = (training.series, target.T)
+    tapes = [torch.tensor(array, dtype=torch.float32).flatten(-2) for array in arrays]  # joint after joint
+    first = torch.arange(n)[:, None] * len(training.target)
+    for step in tqdm(range(config.steps), desc="fit nets", unit="step", disable=None):
+        far = step >= turn
+        ends = training.far_ends if far else training.ends
+        batch = -(-config.batch_size // 4) if far else config.batch_size
+        picks = [torch.randint(len(end), (batch,), generator=generator) for end in ends]
+        at = torch.tensor(np.stack([end[pick] for end, pick in zip(ends, picks, strict=True)])) + first
+        ticks = config.rollout if far else 1
+        loss = _rollout_loss(training, config, weights, tapes, at, ticks, estimator, generator)
         optimizer.zero_grad()
-        torch.autograd.backward(loss)
+        loss.backward()
         optimizer.step()
         schedule.step()
     if not all(torch.isfinite(weight).all() for weight in weights):
         raise ValueError("weights: expected finite numbers at the end of the fit, got nan or inf")
-    arrays = {"input_mean": mean, "input_scale": scale, "output_low": low, "output_high": high}
-    arrays |= {"q_low": samples.whole.q.min(axis=0), "q_high": samples.whole.q.max(axis=0)}
-    return ActuatorNet(
-        joints=log.joints,
-        history=history,
-        rate=RATE,
-        velocity_samples=velocity_samples,
-        velocity_logged=log.velocity_logged,
-        machine=machine,
-        seed=seed,
-        settings=asdict(config),
-        weights=tuple(weight.detach().numpy() for weight in weights),
-        **{name: array.astype(np.float32) for name, array in arrays.items()},
-    )
+    return tuple(weight.detach().numpy() for weight in weights)
 
 
-class _Samples(NamedTuple):
+def _rollout_loss(
+    training: TrainingSet,
+    config: FitConfig,
+    weights: list[Any],
+    tapes: list[Any],
+    at: Any,
+    ticks: int,
+    estimator: int | None,
+    generator: Any,
+) -> Any:
+    """Mean square of how far free runs from the windows that end `at` (n, batch) are off.
+
+    After each tick, in units of the outputs' range and ticks: the error of the outputs so far, added up.
+
+    Args:
+        tapes: inputs (3, n N) and wanted outputs (n N,), joint after joint.
+        estimator: samples of the velocity estimator; None: velocities are the nets' own outputs.
+    """
+    import torch
+
+    series, target = tapes
+    n, history = len(at), config.history
+    mean, scale, low, high = (torch.tensor(array).float() for array in training[3:7])
+    mean, scale = mean.reshape(n, 1, 3, history), scale.reshape(n, 1, 3, history)
+    window = series[:, at[..., None] + torch.arange(1 - history, ticks)]  # (3, n, batch, H + ticks - 1)
+    q, q_dot, u = window[0, ..., :history], window[1, ..., :history], window[2]
+    if config.noise:
+        shape = (*at.shape, history)
+        noise = torch.randn(*shape, generator=generator) + torch.randn(*shape[:2], 1, generator=generator)
+        q_dot = q_dot + config.noise * scale[:, :, 1] * noise
+    off, loss = torch.zeros(()), torch.zeros(())
+    for k in range(ticks):
+        x = (torch.stack([q, q_dot, u[..., k : k + history]], dim=2) - mean) / scale
+        x = x.flatten(2)
+        for i in (0, 2):
+            x = torch.relu(torch.baddbmm(weights[i + 1][:, None], x, weights[i]))
+        y = torch.sigmoid(torch.baddbmm(weights[5][:, None], x, weights[4]))[..., 0]
+        off = off + y - target[at + k]
+        loss = loss + (off**2).mean(dim=1).sum() / ticks
+        if k + 1 < ticks:
+            velocity = (low[:, None] + (high - low)[:, None] * y)[..., None]
+            q = torch.cat([q[..., 1:], q[..., -1:] + velocity / RATE], dim=-1)
+            if estimator:
+                slope = torch.tensor(estimate_velocity(np.eye(estimator), estimator, 1 / RATE)).float()
+                velocity = (q[..., -estimator:] * slope).sum(dim=-1, keepdim=True)
+            q_dot = torch.cat([q_dot[..., 1:], velocity], dim=-1)
+    return loss
+
+
+class TrainingSet(NamedTuple):
+    """What models are fitted to: the windows of H samples of each joint, and their statistics."""
+
+    series: Array  # (3, n, N): angle, velocity and command of all recordings, end to end
+    target: Array  # (N, n) rad/s, see `end_to_end`
+    ends: list[NDArray[np.intp]]  # newest samples of each joint's windows
+    input_mean: Array  # (n, 3 H)
+    input_scale: Array  # (n, 3 H)
+    output_low: Array  # (n,) rad/s
+    output_high: Array  # (n,) rad/s
+    q_low: Array  # (n,) rad
+    q_high: Array  # (n,) rad
+    far_ends: list[NDArray[np.intp]]  # as `ends`, with `rollout` samples after them
+
+
+def training_set(log: Log, history: int, rollout: int = 1) -> TrainingSet:
+    """Windows of the recordings in which a joint moves; its statistics are of those alone.
+
+    Raises:
+        ValueError: a joint that never moves long enough to be learned.
+    """
+    samples = end_to_end(log)
+    every, far = (samples.starts(history - 1, ahead, 1) for ahead in (1, rollout))
+    ends, far_ends = ([at[moves] for moves in samples.moves[at].T] for at in (every, far))
+    for name, end, target in zip(log.joints, ends, samples.target.T, strict=True):
+        if not len(end) or np.ptp(target[end]) == 0:
+            raise ValueError(
+                f"joint {name}: expected a recording of {history + 1} samples or more in which it "
+                "moves, got none"
+            )
+    series = np.stack([samples.whole.q.T, samples.whole.q_dot.T, samples.whole.u.T])
+    mean = np.array([series[:, j, end].mean(axis=1) for j, end in enumerate(ends)])
+    scale = np.array([series[:, j, end].std(axis=1) for j, end in enumerate(ends)])
+    scale = np.where(scale > 1e-9, scale, 1.0)  # a channel that never changes
+    low = np.array([samples.target[end, j].min() for j, end in enumerate(ends)])
+    high = np.array([samples.target[end, j].max() for j, end in enumerate(ends)])
+    low, high = low - 0.05 * (high - low), high + 0.05 * (high - low)
+    mean, scale = np.repeat(mean, history, axis=1), np.repeat(scale, history, axis=1)
+    ranges = samples.whole.q.min(axis=0), samples.whole.q.max(axis=0)
+    return TrainingSet(series, samples.target, ends, mean, scale, low, high, *ranges, far_ends)
+
+
+class Samples(NamedTuple):
     """The recordings of a log end to end, N samples in all; windows must not cross their seams."""
 
     whole: Recording
-    target: Array  # (N, n), see `_end_to_end`
+    target: Array  # (N, n), see `end_to_end`
     moves: NDArray[np.bool_]  # (N, n): in a recording in which the joint moves or is commanded
     lengths: list[int]  # of the recordings
 
@@ -537,7 +640,7 @@ class _Samples(NamedTuple):
         return np.concatenate([seam + np.arange(before, length - after, step) for seam, length in pieces])
 
 
-def _end_to_end(log: Log) -> _Samples:
+def end_to_end(log: Log) -> Samples:
     """Join recordings, with what a net is to say at each sample.
 
     That is the mean velocity [rad/s] over the coming tick, (q(t+dt) - q(t)) / dt, from encoder angles;
@@ -551,7 +654,46 @@ def _end_to_end(log: Log) -> _Samples:
         target = np.diff(whole.q, axis=0, append=0) * RATE
     lengths = [len(r.q) for r in log.recordings]
     moves = [np.ptp(r.u, axis=0) + np.ptp(r.q, axis=0) > 0 for r in log.recordings]
-    return _Samples(whole, target, np.repeat(moves, lengths, axis=0), lengths)
+    return Samples(whole, target, np.repeat(moves, lengths, axis=0), lengths)
+
+
+class LinearModel(ActuatorNet):
+    """A linear model of the nets' inputs within the nets' range: what a net must beat.
+
+    Weights (n, 3 H) and (n,), for standardised inputs.
+    """
+
+    def velocity(self, history: Array) -> Array:
+        """What the model says, as `ActuatorNet.predict`."""
+        x = history.reshape(*history.shape[:-2], -1)
+        slope, offset = self.weights
+        velocity = (((x - self.input_mean) / self.input_scale) * slope).sum(axis=-1) + offset
+        return np.clip(velocity, self.output_low, self.output_high)
+
+
+def fit_linear(net: ActuatorNet, log: Log, penalty: float = 1e-3) -> LinearModel:
+    """Ridge regression on the inputs, targets and recordings that `net` was fitted to.
+
+    Args:
+        penalty: on squared weights, in units of the mean squared error of standardised inputs.
+    """
+    training, history = training_set(log, net.history), net.history
+    slopes, offsets = [], []
+    for j, ends in enumerate(training.ends):
+        size = 3 * history + 1
+        gram, moment = np.zeros((size, size)), np.zeros(size)
+        for chunk in np.array_split(ends, -(-len(ends) // 8192)):  # bounds the memory
+            x = training.series[:, j, chunk[:, None] + np.arange(1 - history, 1)].swapaxes(0, 1)
+            x = (x.reshape(len(chunk), -1) - training.input_mean[j]) / training.input_scale[j]
+            x = np.column_stack([x, np.ones(len(chunk))])
+            gram, moment = gram + x.T @ x, moment + x.T @ training.target[chunk, j]
+        ridge = penalty * len(ends) * np.eye(size)
+        ridge[-1, -1] = 0.0  # the offset is free
+        *slope, offset = np.linalg.solve(gram + ridge, moment)
+        slopes.append(slope)
+        offsets.append(offset)
+    header = {f.name: getattr(net, f.name) for f in fields(net)} | {"settings": {"penalty": penalty}}
+    return LinearModel(**header | {"weights": (np.array(slopes, np.float32), np.array(offsets, np.float32))})
 
 
 # --- scores ---------------------------------------------------------------------------------------
@@ -598,38 +740,63 @@ def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
         raise ValueError(f"joints: expected {list(net.joints)}, got {list(log.joints)}")
     if log.velocity_logged != net.velocity_logged:
         raise ValueError(f"velocity_logged: expected {net.velocity_logged}, got {log.velocity_logged}")
-    samples = _end_to_end(log)
+    samples = end_to_end(log)
     if not len(samples.starts(net.history, 1, 1)):
         got = samples.lengths[:9]
         raise ValueError(f"log: expected a recording above {net.history + 1} samples, got {got}")
-    moves = samples.moves | ~samples.moves.any(axis=0)  # a joint that rests everywhere is scored at rest
     result: dict[str, Any] = {name: {"free_run": {}} for name in log.joints}
     for horizon in tqdm((1 / net.rate, *HORIZONS), desc="score nets", unit="horizon", disable=None):
         ticks = round(horizon * net.rate)
         starts = samples.starts(net.history, ticks, ticks)
         if not len(starts):
             continue
-        chunks = np.array_split(starts, -(-len(starts) // 8192))  # bounds the memory
-        runs = [free_run(net, samples.whole, chunk, ticks) for chunk in chunks]
-        angles, velocities = (np.concatenate(run, axis=1) for run in zip(*runs, strict=True))
-        later = starts + np.arange(1, ticks + 1)[:, None]
-        q_error, v_error = angles - samples.whole.q[later], velocities - samples.whole.q_dot[later]
-        for j, name in enumerate(log.joints):
-            mine = moves[starts, j]
-            if not mine.any():
+        q_error, v_error = run_errors(net, samples, starts, ticks)
+        mine = samples.moves | ~samples.moves.any(axis=0)  # a joint that rests everywhere: at rest
+        for j, scored in enumerate(mine[starts].T):
+            if not scored.any():
                 continue
+            entry = result[log.joints[j]]
             if ticks == 1:
                 error = v_error if net.velocity_logged else q_error * net.rate
                 same = samples.whole.q_dot[starts, j] - samples.target[starts, j]
-                result[name] |= {
-                    "one_step_rmse": _rms(error[0, mine, j]),
-                    "persistence_rmse": _rms(same[mine]),
-                }
+                entry |= {"one_step_rmse": _rms(error[0, scored, j]), "persistence_rmse": _rms(same[scored])}
             else:
-                result[name]["free_run"][str(horizon)] = {
-                    "velocity_rmse": _rms(v_error[:, mine, j]),
-                    "position_error_median": float(np.median(np.abs(q_error[-1, mine, j]))),
-                }
+                end = float(np.median(np.abs(q_error[-1, scored, j])))
+                run = {"velocity_rmse": _rms(v_error[:, scored, j]), "position_error_median": end}
+                entry["free_run"][str(horizon)] = run
+    return result
+
+
+def run_errors(
+    net: ActuatorNet, samples: Samples, starts: NDArray[np.intp], ticks: int
+) -> tuple[Array, Array]:
+    """Errors of angle [rad] and velocity [rad/s] in free runs from `starts` (s,), (ticks, s, n) both."""
+    chunks = np.array_split(starts, -(-len(starts) // 8192))  # bounds the memory
+    runs = [free_run(net, samples.whole, chunk, ticks) for chunk in chunks]
+    angles, velocities = (np.concatenate(run, axis=1) for run in zip(*runs, strict=True))
+    later = starts + np.arange(1, ticks + 1)[:, None]
+    return angles - samples.whole.q[later], velocities - samples.whole.q_dot[later]
+
+
+def recording_errors(net: ActuatorNet, log: Log, seconds: float) -> Array:
+    """Velocity RMSE [rad/s] (recordings, n) of one free run of up to `seconds` from the start of each.
+
+    nan: a joint that rests in this recording but not in all, or `history` + 1 samples or fewer.
+    """
+    samples, lengths = end_to_end(log), np.array([len(r.q) for r in log.recordings])
+    ticks = np.minimum(lengths - net.history - 1, round(seconds * net.rate))  # of each run
+    result = np.full((len(lengths), len(net.joints)), np.nan)
+    if not (long := np.flatnonzero(ticks > 0)).size:
+        return result
+    starts, most = (np.cumsum(lengths) - lengths)[long] + net.history, int(ticks.max())
+    tail = ((0, most), (0, 0))  # shorter runs go on into what follows, unscored
+    whole = Recording("", *(np.pad(array, tail, mode="edge") for array in samples.whole[1:]))
+    _, velocities = free_run(net, whole, starts, most)
+    error = velocities - whole.q_dot[starts + np.arange(1, most + 1)[:, None]]
+    scored = (np.arange(most)[:, None] < ticks[long])[..., None]
+    rms = np.sqrt(np.sum(np.where(scored, error, 0.0) ** 2, axis=0) / ticks[long, None])
+    moves = samples.moves | ~samples.moves.any(axis=0)  # a joint that rests everywhere is scored at rest
+    result[long] = np.where(moves[starts], rms, np.nan)
     return result
 
 
@@ -637,16 +804,20 @@ def _rms(error: Array) -> float:
     return float(np.sqrt(np.mean(np.square(error))))
 
 
-def task_log(machine: Machine, runs: int, seconds: float, rng: np.random.Generator) -> Log:
+def task_log(
+    machine: Machine, runs: int, seconds: float, rng: np.random.Generator, start: ArrayLike | None = None
+) -> Log:
     """Recordings under commands like a policy's: reversals, small corrections, driven joints together.
 
     In every fifth recording the locked joints move instead: the machine lets them move only alone.
     Smoothed random levels held for 0.5 to 5 s, towards the nearer end of the range less often, so
-    that the joints stay off their stops. For scoring only; no net is fitted to them.
+    that the joints stay off their stops. For scoring only; no net is fitted to them. All begin at the
+    angles `start` (n,), or each at random ones.
     """
     q_min, q_max = machine.column("q_min"), machine.column("q_max")
     shape, limit = (runs, machine.n), machine.pwm_limit / PWM_MAX
-    start = rng.uniform(0.8 * q_min + 0.2 * q_max, 0.2 * q_min + 0.8 * q_max, shape)
+    drawn = rng.uniform(0.8 * q_min + 0.2 * q_max, 0.2 * q_min + 0.8 * q_max, shape)
+    start = drawn if start is None else np.tile(start, (runs, 1))
     level, command, left = np.zeros(shape), np.zeros(shape), np.zeros(shape)
     smoothing, noise = rng.uniform(0.05, 0.6, shape), rng.uniform(0, 0.06, shape)
     locked_turn = (np.arange(runs) % 5 == 4)[:, None]

@@ -7,6 +7,7 @@ environment, with a plant instead of nets the evaluation, and `observe` and `to_
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -45,9 +46,11 @@ from brokk_min.machine import (
     read_encoder,
 )
 
+GROUND_MARGIN = 0.3  # m above the ground below which no goal asks the arm to sink, assumed
 LAG_TIME, LAG_SPEED = 2.0, 0.07  # s and a share of tool_speed, tuned: see `push_lag`
 Array = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]
+Encoder = Callable[[Machine, Array], Array]  # machine and true angles -> angles read
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,8 @@ class TaskConfig:
     """Largest noise of the measured part of an observation, in standard deviations (paper: 5 %)."""
     valve_cost: float = 0.01
     """Reward lost for each change of a command by its limit, mean of the driven joints (paper: 0)."""
+    group: int = 1
+    """Neighbouring environments that share start poses and goals, for learners that compare them."""
     redraw_ground: bool = True
     """Redraw start poses in the ground; False is the paper's rule: end the episode without reward."""
     paper: bool = False
@@ -180,7 +185,7 @@ def observe(
     arm has to do then does not depend on where it points. Wanted rates are the joint rates that would
     give the goal velocity, and those that would make up for `lag` (both by `joint_rates`).
 
-    Paper: Sec. 3.4 (present and target tool velocity, inputs of the actuator nets); the rates are ours
+    Paper: Sec. 3.4 (present and target tool velocity, the actuator nets' inputs), Fig. 3; rates are ours
 
     Args:
         machine: n joints.
@@ -264,7 +269,7 @@ def push_measured(
 def to_command(machine: Machine, action: ArrayLike) -> Array:
     """Commands for all joints from the policy's actions: limited, in whole PWM counts.
 
-    Paper: Sec. 3.4 (PWM out) and Sec. 3.2 (65 %)
+    Paper: Sec. 3.4 (PWM out), Sec. 3.2 (65 %), Fig. 3
 
     Args:
         machine: n joints.
@@ -304,8 +309,12 @@ def rest_state(machine: Machine, q: ArrayLike, v_goal: ArrayLike, plant: bool) -
     return State(q, np.zeros_like(q), history, goals, never, ticks, np.zeros_like(goals), plant_state)
 
 
-def transition(machine: Machine, net: ActuatorNet | None, state: State, u: Array) -> State:
+def transition(
+    machine: Machine, net: ActuatorNet | None, state: State, u: Array, read: Encoder = read_encoder
+) -> State:
     """One tick under the command `u` (..., n), by the nets, or by the plant where the state has one.
+
+    `read(machine, q)` are the angles that the encoders say; they may be disturbed for a test of robustness.
 
     Paper: Sec. 3.4 (actuator nets in the simulation), Table 1
     """
@@ -322,7 +331,7 @@ def transition(machine: Machine, net: ActuatorNet | None, state: State, u: Array
     else:
         raise ValueError("net: expected nets for a state without a plant, got None")
 
-    history, lag = push_measured(machine, history, read_encoder(machine, q), state.v_goal, state.lag)
+    history, lag = push_measured(machine, history, read(machine, q), state.v_goal, state.lag)
     return replace(
         state,
         q=q,
@@ -393,8 +402,14 @@ def _draw_hold(machine: Machine, config: TaskConfig, rng: np.random.Generator, n
 def reset(machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int, plant: bool) -> State:
     """`num` machines at rest in random poses with random goals; leading shape (num,)."""
     pose, goal = draw_pose(machine, config, rng, num), draw_goal(machine, config, rng, num)
-    state = rest_state(machine, pose, goal, plant)
-    return replace(state, goal_ticks=_draw_hold(machine, config, rng, num))
+    first = _first_of_group(config, num)
+    state = rest_state(machine, pose[first], goal[first], plant)
+    return replace(state, goal_ticks=_draw_hold(machine, config, rng, num)[first])
+
+
+def _first_of_group(config: TaskConfig, num: int) -> NDArray[np.intp]:
+    """Which environment's pose and goals each of `num` has, (num,)."""
+    return np.arange(num) // config.group * config.group
 
 
 def look(machine: Machine, config: TaskConfig, state: State, rng: np.random.Generator) -> Array:
@@ -425,8 +440,9 @@ def step(
 ) -> tuple[State, Outcome]:
     """One tick of `num` environments, without resets: `action` (num, n_driven) in [-1, 1].
 
-    The reward is `reward` for the goal that held during the tick less `valve_cost`; a new goal is drawn
-    after it. On a tick that ends in the ground the reward is zero.
+    The reward is `reward` for the goal that held during the tick less `valve_cost`; where it is over, or
+    asks an arm close to the ground to sink, a new one is drawn after it. On a tick that ends in the ground
+    the reward is zero.
     """
     before, state = state, transition(machine, net, state, to_command(machine, action))
     _, v_tool, lowest = tool_state(machine, state.q.astype(np.float32), state.q_dot.astype(np.float32))
@@ -435,15 +451,25 @@ def step(
     error = 1 / rewards - 1
     if config.valve_cost and not config.paper:
         rewards = rewards - np.float32(config.valve_cost) * _travel(machine, before, state)
-    due = np.flatnonzero(state.goal_ticks <= 0)
-    if len(due):
-        goals, holds = state.v_goal.copy(), state.goal_ticks.copy()
-        goals[due] = draw_goal(machine, config, rng, len(due))
-        holds[due] = _draw_hold(machine, config, rng, len(due))
-        state = replace(state, v_goal=goals, goal_ticks=holds)
+    state = _next_goals(machine, config, state, lowest, rng)
     observation = look(machine, config, state, rng)
     truncated = (state.ticks >= round(config.episode_s * machine.rate)) & ~end
     return state, Outcome(observation, np.where(end, 0.0, rewards), end, truncated, error)
+
+
+def _next_goals(
+    machine: Machine, config: TaskConfig, state: State, lowest: Array, rng: np.random.Generator
+) -> State:
+    low = lowest < machine.ground + GROUND_MARGIN
+    due = np.flatnonzero((state.goal_ticks <= 0) | (low & (state.v_goal[..., 2] < 0)))
+    if not len(due):
+        return state
+    goals, holds = state.v_goal.copy(), state.goal_ticks.copy()
+    goals[due] = draw_goal(machine, config, rng, len(due))
+    goals[due, 2] = np.where(low[due], np.abs(goals[due, 2]), goals[due, 2])
+    holds[due] = _draw_hold(machine, config, rng, len(due))
+    first = _first_of_group(config, len(goals))
+    return replace(state, v_goal=goals[first], goal_ticks=holds[first])
 
 
 def _travel(machine: Machine, before: State, after: State) -> Array:
@@ -504,8 +530,9 @@ def rollout(
     config: TaskConfig,
     rng: np.random.Generator,
     net: ActuatorNet | None = None,
+    read: Encoder = read_encoder,
 ) -> Trace:
-    """Let one controller follow given goals from rest: on the plant, or on nets.
+    """Let one controller follow given goals from rest: on the plant, or on nets. Paper: Fig. 3
 
     Args:
         machine: n joints.
@@ -515,6 +542,7 @@ def rollout(
         config: its `noise` holds; no episode ends.
         rng: of the noise.
         net: nets of the driven joints; None: the analytic plant.
+        read: see `transition`.
     """
     state = rest_state(machine, start, goals[0], plant=net is None)
     memory = controller.start(len(state.q))
@@ -524,7 +552,7 @@ def rollout(
         observation = look(machine, config, state, rng)
         u, memory = controller(observation, memory)
         q_measured = state.history[..., 0, -1]
-        state = transition(machine, net, state, u)
+        state = transition(machine, net, state, u, read)
         p_tool, v_tool, _ = tool_state(machine, state.q, state.q_dot)
         trace.append((state.q, state.q_dot, q_measured, u, p_tool, v_tool, reward(goal, v_tool)))
     return Trace(*map(np.array, zip(*trace, strict=True)))
@@ -559,8 +587,56 @@ def _open(machine: Machine, actuator: ActuatorNet | Path | str) -> ActuatorNet |
     return fitting_nets(machine, net)
 
 
+class _Pictures:
+    """Frames for Gymnasium: trails of the tools since the last reset of each, and a window for `human`."""
+
+    SIZE = (960, 600)
+
+    def __init__(self, machine: Machine, mode: str | None, modes: list[str]) -> None:
+        if mode is not None and mode not in modes:
+            raise ValueError(f"render_mode: expected one of {modes}, got {mode!r}")
+        self.machine, self.mode = machine, mode
+        self.window: Any = None
+        self.trails: dict[int, list[Array]] = {}
+
+    def follow(self, state: State, fresh: ArrayLike) -> None:
+        """After a reset or a step; `fresh` are the rows that begin anew."""
+        if self.mode is not None:
+            self.trails |= {row: [] for row in np.asarray(fresh).tolist()}
+            for row, p_tool in enumerate(tool_position(self.machine, state.q)):
+                self.trails[row].append(p_tool)
+        if self.mode == "human":
+            self.take(state)
+
+    def take(self, state: State | None) -> list[NDArray[np.uint8]]:
+        """A frame (600, 960, 3) of each row, or the first row on the screen. Needs the extra `play`."""
+        from brokk_min import view  # pictures cost nothing where nobody looks
+
+        if state is None or self.mode is None:
+            raise ValueError(f"render: expected a render_mode and a reset before, got {self.mode}")
+        drawn = []
+        for row, trail in self.trails.items():
+            u, goal = state.history[row, :, 2, -1], state.v_goal[row]
+            scene = view.Scene(
+                state.q[row], state.q_dot[row], u, goal, np.array(trail), title=self.machine.name
+            )
+            drawn.append(view.draw(self.machine, [scene], self.SIZE))
+        if self.mode == "human":
+            self.window = self.window or view.Window(self.SIZE, self.machine.name)
+            self.window.pygame.event.pump()
+            self.window.show(drawn[0], self.machine.rate)
+            return []
+        return [view.picture(shapes, self.SIZE) for shapes in drawn]
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self.window is not None:
+            self.window.close()
+            self.window = None
+
+
 class TaskVectorEnv(VectorEnv[Array, Array, Any]):
-    """Many machines that follow random tool velocities; an ended episode starts anew in the same step.
+    """Many machines following random tool velocities; an ended episode starts anew at once. Paper: Fig. 4
 
     Observation: Box, see `observe`. Action: Box [-1, 1] a driven joint, 1 = the command limit.
     Reward: `reward` less `valve_cost`, see `step`. `info["final_obs"]` holds the last observation of an
@@ -571,6 +647,7 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         actuator: nets (object or file) or "analytic" for the plant.
         machine: what moves.
         config: what an episode is.
+        render_mode: None or "rgb_array": `render` gives a frame of each environment.
     """
 
     def __init__(
@@ -579,8 +656,12 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         actuator: ActuatorNet | Path | str = "analytic",
         machine: Machine = BROKK_170,
         config: TaskConfig | None = None,
+        render_mode: str | None = None,
     ) -> None:
-        self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": round(machine.rate)}
+        self.metadata["autoreset_mode"] = AutoresetMode.SAME_STEP
+        self.pictures = _Pictures(machine, render_mode, self.metadata["render_modes"])
+        self.render_mode = render_mode
         self.num_envs, self.machine, self.config = num_envs, machine, config or TaskConfig()
         self.net = _open(machine, actuator)
         self.single_observation_space, self.single_action_space = _spaces(machine)
@@ -594,6 +675,7 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         """Draw new episodes for all environments."""
         super().reset(seed=seed)
         self.state = reset(self.machine, self.config, self.np_random, self.num_envs, self.net is None)
+        self.pictures.follow(self.state, range(self.num_envs))
         return look(self.machine, self.config, self.state, self.np_random), {}
 
     def step(self, actions: Array) -> tuple[Array, Array, Bools, Bools, dict[str, Any]]:
@@ -611,19 +693,32 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
             info |= {"final_obs": observation, "_final_obs": ended}
             observation = observation.copy()
             observation[rows] = look(self.machine, self.config, fresh, self.np_random)
+        self.pictures.follow(self.state, rows)
         return observation, out.reward, out.terminated, out.truncated, info
+
+    def render(self) -> tuple[NDArray[np.uint8], ...]:
+        """A frame (600, 960, 3) of each environment."""
+        return tuple(self.pictures.take(self.state))
 
 
 class TaskEnv(gymnasium.Env[Array, Array]):
-    """One machine that follows random tool velocities: `TaskVectorEnv`'s functions, batch of one."""
+    """One machine that follows random tool velocities: `TaskVectorEnv`'s functions, batch of one.
+
+    With `render_mode` "human" each step shows itself in a window; with "rgb_array" `render` gives a frame.
+    """
+
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 20}  # noqa: RUF012, as Gymnasium has it
 
     def __init__(
         self,
         actuator: ActuatorNet | Path | str = "analytic",
         machine: Machine = BROKK_170,
         config: TaskConfig | None = None,
+        render_mode: str | None = None,
     ) -> None:
-        self.metadata = {"render_modes": []}
+        self.metadata = TaskEnv.metadata | {"render_fps": round(machine.rate)}
+        self.pictures = _Pictures(machine, render_mode, self.metadata["render_modes"])
+        self.render_mode = render_mode
         self.machine, self.config = machine, config or TaskConfig()
         self.net = _open(machine, actuator)
         self.observation_space, self.action_space = _spaces(machine)
@@ -635,6 +730,7 @@ class TaskEnv(gymnasium.Env[Array, Array]):
         """Draw a new episode."""
         super().reset(seed=seed)
         self.state = reset(self.machine, self.config, self.np_random, 1, self.net is None)
+        self.pictures.follow(self.state, [0])
         return look(self.machine, self.config, self.state, self.np_random)[0], {}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
@@ -645,7 +741,16 @@ class TaskEnv(gymnasium.Env[Array, Array]):
         self.state, out = step(self.machine, self.config, self.net, self.state, action, self.np_random)
         info = {"velocity_error": float(out.velocity_error[0])}
         flags = bool(out.terminated[0]), bool(out.truncated[0])
+        self.pictures.follow(self.state, [])
         return out.observation[0], float(out.reward[0]), *flags, info
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """The present picture (600, 960, 3), or None: it is on the screen."""
+        return next(iter(self.pictures.take(self.state)), None)
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        self.pictures.close()
 
 
 def _spaces(machine: Machine) -> tuple[Any, Any]:

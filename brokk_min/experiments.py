@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +17,26 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from brokk_min import __version__, actuator, figures, jacobian, kinematics, logs
-from brokk_min.env import Controller, TaskConfig, Trace, rollout
+from brokk_min import __version__, actuator, claims, figures, jacobian, kinematics, logs, report
+from brokk_min.env import Controller, Encoder, TaskConfig, Trace, rollout
 from brokk_min.figures import Traces
 from brokk_min.jacobian import JacobianController
-from brokk_min.machine import Machine
+from brokk_min.machine import Machine, read_encoder
+from brokk_min.metrics import by_start, intervals, mean_interval, metrics, paired, row_mean, summary
+from brokk_min.mpc import PerfectModel
 from brokk_min.policy import PolicyController
-from brokk_min.sequences import AXES, Commands, axis_sequences, draw_starts, tuning_goals
+from brokk_min.sequences import (
+    Commands,
+    axis_sequences,
+    scored_starts,
+    start_kinds,
+    task_sequences,
+    tuning_goals,
+)
 
 Array = NDArray[np.floating[Any]]
 Net = actuator.ActuatorNet
+PAPERS = ("jacobian_pid_k0.1", "jacobian_pid_k0.05")  # the paper's two baselines
 
 # --- controllers ------------------------------------------------------------------------------------
 
@@ -39,10 +50,12 @@ class Effort:
     train_steps: int = 6_000_000  # `PPOConfig`'s, without importing torch
     generations: int = 45
     tuning_runs: int = 12
-    starts: int = 16
+    starts: int = 64
+    bound_starts: int = 16  # of them, for the regret
+    short_s: float = 18.0  # of each axis sequence, for regret, robustness and the singular case [s]
 
 
-QUICK = Effort(0.1, 700, 200_000, 4, 4, 4)
+QUICK = Effort(0.1, 700, 200_000, 4, 4, 8, 2, 3.0)
 
 
 def baselines(machine: Machine, net: Net) -> dict[str, JacobianController]:
@@ -109,43 +122,12 @@ def read_gains(path: Path, machine: Machine, net: Net) -> dict[str, JacobianCont
 
 # --- the comparison -----------------------------------------------------------------------------------
 
-
-def line_distance(p_tool: Array, goals: Array, start: Array) -> Array:
-    """Distance of the tool from the commanded line [m], (T,).
-
-    The line starts where the tool was when the commanded direction last changed (a stop or a way back
-    along the same line is no change).
-
-    Args:
-        p_tool: tool position at the end of each tick [m], (T, 3).
-        goals: commanded velocity during each tick [m/s], (T, 3).
-        start: tool position before the first tick [m], (3,).
-    """
-    anchor, direction, distance = start, np.zeros(3), []
-    for before, p, goal in zip(np.vstack([start, p_tool[:-1]]), p_tool, goals, strict=True):
-        speed = np.linalg.norm(goal)
-        if speed > 0 and np.linalg.norm(np.cross(direction, goal / speed)) + (not direction.any()) > 1e-6:
-            anchor, direction = (anchor if not direction.any() else before), goal / speed
-        away = p - anchor
-        distance.append(np.linalg.norm(away - (away @ direction) * direction))
-    return np.array(distance)
+Sensor = Callable[[np.random.Generator], Encoder]  # a fresh encoder for each rollout
 
 
-def metrics(machine: Machine, trace: Trace, run: int, goals: Array, start: Array) -> dict[str, float]:
-    """The figures of one run, as in the evaluate JSON [m, m/s, m/s^3, full strokes, 1]."""
-    p, v, u = trace.p_tool[:, run], trace.v_tool[:, run], trace.u[:, run]
-    error = np.linalg.norm(goals - v, axis=-1)
-    drift = line_distance(p, goals, start)
-    jerk = np.diff(v, n=2, axis=0) * machine.rate**2
-    return {
-        "velocity_rmse": float(np.sqrt(np.mean(error**2))),
-        "velocity_error_mean": float(error.mean()),
-        "off_axis_drift_max": float(drift.max()),
-        "off_axis_drift_mean": float(drift.mean()),
-        "jerk_rms": float(np.sqrt(np.mean(np.sum(jerk**2, axis=-1)))) if len(jerk) else 0.0,
-        "valve_travel": float(np.abs(np.diff(u, axis=0, prepend=0 * u[:1])).sum()),
-        "reward_mean": float(trace.reward[:, run].mean()),
-    }
+def exact(rng: np.random.Generator) -> Encoder:
+    """Encoders as they are: whole counts."""
+    return read_encoder
 
 
 def task_space(
@@ -155,60 +137,201 @@ def task_space(
     starts: Array,
     seed: int,
     net: Net | None = None,
+    sensor: Sensor = exact,
 ) -> tuple[list[dict[str, Any]], Traces]:
     """Every controller on the same sequences, starts and noise. Paper: Sec. 4.2, Fig. 6
 
+    Sequences of one length and all starts are one batch.
+
     Returns:
-        One row of `metrics` a controller, sequence and start; and the traces.
+        One row a controller, sequence and start, see `metrics`; and the traces.
     """
-    runs, traces = [], {}
-    first = kinematics.tool_position(machine, starts)
-    for name, controller in controllers.items():
-        for sequence in tqdm(sequences, desc=f"evaluate {name}", unit="sequence", disable=None):
-            goals = np.repeat(sequence.goals[:, None], len(starts), axis=1)
-            rng = np.random.default_rng(seed)
-            trace = rollout(machine, controller, starts, goals, TaskConfig(), rng, net)
-            traces[name, sequence.name] = trace
-            for i in range(len(starts)):
-                row = metrics(machine, trace, i, sequence.goals, first[i])
-                runs.append({"controller": name, "sequence": sequence.name, "start": i} | row)
-    return runs, traces
+    rows: list[dict[str, Any]] = []
+    traces: dict[tuple[str, str], Trace] = {}
+    num = len(starts)
+    kinds = start_kinds(machine, starts)
+    lengths = dict.fromkeys(len(sequence.goals) for sequence in sequences)
+    groups = [[s for s in sequences if len(s.goals) == length] for length in lengths]
+    for name, group in tqdm(list(product(controllers, groups)), desc="evaluate", unit="batch", disable=None):
+        goals = np.repeat(np.stack([s.goals for s in group], axis=1), num, axis=1)
+        start, rng = np.tile(starts, (len(group), 1)), np.random.default_rng(seed)
+        read = sensor(np.random.default_rng(seed + 1))
+        trace = rollout(machine, controllers[name], start, goals, TaskConfig(), rng, net, read)
+        figures_of = metrics(machine, trace, goals, kinematics.tool_position(machine, start))
+        for i, s in enumerate(group):
+            traces[name, s.name] = Trace(*(a[:, i * num : (i + 1) * num] for a in trace))
+            for j, kind in enumerate(kinds):
+                values = {key: float(v[i * num + j]) for key, v in figures_of.items()}
+                row = {key: v if np.isfinite(v) else None for key, v in values.items()}
+                rows.append({"controller": name, "sequence": s.name, "start": j, "kind": kind} | row)
+    names, order = list(controllers), [s.name for s in sequences]
+    rows.sort(key=lambda row: (names.index(row["controller"]), order.index(row["sequence"])))
+    return rows, traces
 
 
-def summary(runs: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
-    """Mean of each figure by controller and sequence, and over all of them together ("all")."""
-
-    def means(controller: str, sequence: str) -> dict[str, float]:
-        mine = [r for r in runs if r["controller"] == controller and sequence in (r["sequence"], "all")]
-        return {key: float(np.mean([run[key] for run in mine])) for key in list(mine[0])[3:]}
-
-    controllers, sequences = (dict.fromkeys(run[key] for run in runs) for key in ("controller", "sequence"))
-    return {c: {s: means(c, s) for s in (*sequences, "all")} for c in controllers}
+def noisy(rng: np.random.Generator) -> Encoder:
+    """Encoders with normal noise of one count."""
+    return lambda machine, q: read_encoder(machine, q + machine.encoder_step * rng.standard_normal(q.shape))
 
 
-def driven_log(machine: Machine, traces: Traces, controller: str) -> logs.Log:
-    """What encoders and valves said during one controller's runs, as recordings for `score`."""
+def lossy(rng: np.random.Generator) -> Encoder:
+    """Encoders of which one sample in 20, of all joints of a machine, is lost: the last one stands again."""
+    last: list[Array] = []
+
+    def read(machine: Machine, q: Array) -> Array:
+        lost = rng.random((*q.shape[:-1], 1)) < 0.05 * len(last)
+        last[:] = [np.where(lost, last[0] if last else q, read_encoder(machine, q))]
+        return last[0]
+
+    return read
+
+
+def variations(machine: Machine) -> dict[str, tuple[Machine, Sensor]]:
+    """The machine other than its controllers know it; all figures assumed."""
+
+    def valves(up: float, down: float) -> Machine:
+        speeds = [(up * j.speed_positive, down * j.speed_negative) for j in machine.joints]
+        joints = zip(machine.joints, speeds, strict=True)
+        faster = (replace(j, speed_positive=a, speed_negative=b) for j, (a, b) in joints)
+        return replace(machine, joints=tuple(faster))
+
+    return {
+        "nominal": (machine, exact),
+        "supply flow -20 %": (replace(machine, pump_flow=0.8 * machine.pump_flow), exact),
+        "valve gain -20 %": (valves(0.8, 0.8), exact),
+        "valve gain +20 %": (valves(1.2, 1.2), exact),
+        "up -15 %, down +15 %": (valves(0.85, 1.15), exact),
+        "dead zone 5 %": (replace(machine, dead_zone=0.05), exact),
+        "dead zone 10 %": (replace(machine, dead_zone=0.10), exact),
+        "delay +25 ms": (replace(machine, delay=machine.delay + 0.025), exact),
+        "delay +50 ms": (replace(machine, delay=machine.delay + 0.050), exact),
+        "encoder noise of a count": (machine, noisy),
+        "one sample in 20 lost": (machine, lossy),
+    }
+
+
+def robustness(
+    machine: Machine,
+    controllers: Mapping[str, Controller],
+    sequences: Sequence[Commands],
+    starts: Array,
+    seed: int,
+) -> dict[str, dict[str, dict[str, float | None]]]:
+    """Mean velocity error [m/s] and its 95 % interval over starts, by variation and controller."""
+    result: dict[str, dict[str, dict[str, float | None]]] = {}
+    for name, (plant, sensor) in variations(machine).items():
+        runs, _ = task_space(plant, controllers, sequences, starts, seed, sensor=sensor)
+        errors = {c: by_start(runs, c, "all", "velocity_error_mean") for c in controllers}
+        result[name] = {c: mean_interval(e) for c, e in errors.items()}
+    return result
+
+
+def shortened(machine: Machine, sequences: Sequence[Commands], seconds: float) -> list[Commands]:
+    """The first seconds of each sequence."""
+    return [s._replace(goals=s.goals[: round(seconds * machine.rate)]) for s in sequences]
+
+
+def regret(
+    machine: Machine,
+    controllers: Mapping[str, Controller],
+    short: Sequence[Commands],
+    starts: Array,
+    seed: int,
+) -> tuple[list[dict[str, Any]], dict[str, Any], Traces]:
+    """Runs of all controllers and the bound, each one's velocity error less the bound's, and the traces."""
+    every = {**controllers, "perfect_model": PerfectModel(machine, starts)}
+    runs, traces = task_space(machine, every, short, starts, seed)
+    return runs, {c: paired(runs, c, "perfect_model", "velocity_error_mean") for c in controllers}, traces
+
+
+def comparison(
+    machine: Machine, controllers: Mapping[str, Controller], effort: Effort, seed: int
+) -> tuple[dict[str, Any], dict[str, Traces]]:
+    """The paper's experiment and what we add to it: all of `results.json` on task space control.
+
+    Means, intervals and verdicts are over the "workspace" starts, from which all sequences can be followed;
+    the other kinds stand apart.
+
+    Returns:
+        For JSON; and traces of the main runs ("all"), with the bound ("bound") and near singularities
+        ("singular").
+    """
+    sequences, names = task_sequences(machine), list(controllers)
+    starts = scored_starts(machine, effort.starts, sequences, seed + 2)
+    kinds = np.array(start_kinds(machine, starts))
+    runs, traces = task_space(machine, controllers, sequences, starts, seed)
+    scored = [run for run in runs if run["kind"] == "workspace"]
+    of_kind = {k: [run for run in runs if run["kind"] == k] for k in dict.fromkeys(kinds)}
+    means = {k: {c: rows["all"] for c, rows in summary(some).items()} for k, some in of_kind.items()}
+    short = shortened(machine, axis_sequences(machine), effort.short_s)
+    reachable = starts[kinds == "workspace"]
+    bounded, less, bound = regret(machine, controllers, short, reachable[: effort.bound_starts], seed)
+    singular, found = singular_case(machine, controllers, short, starts[kinds == "extended"], seed)
+    verdicts = claims.drift_claims(scored, PAPERS)
+    pid, along_x = controllers[PAPERS[0]], traces[PAPERS[0], "x"]
+    if isinstance(pid, JacobianController):
+        across = Trace(*(a[:, kinds == "workspace"] for a in along_x))
+        verdicts.append(claims.direction_claim(machine, pid, across, sequences[0].goals))
+    verdicts += [*found["claims"], claims.conclusion(scored, PAPERS)]
+    keys = ("velocity_error_mean", "off_axis_drift_max")
+    return {
+        "task_space": {
+            "runs": runs,
+            "summary": summary(scored),
+            "intervals": intervals(scored),
+            "by_kind": means,
+            "rl_less": {k: {c: paired(scored, "rl", c, k) for c in names if c != "rl"} for k in keys},
+        },
+        "regret": {"summary": summary(bounded), "less_perfect_model": less},
+        "robustness": robustness(machine, controllers, short, reachable[:16], seed),
+        "singular": found,
+        "claims": verdicts,
+        "starts": starts.tolist(),
+        "start_kinds": kinds.tolist(),
+    }, {"all": traces, "bound": bound, "singular": singular}
+
+
+def singular_case(
+    machine: Machine,
+    controllers: Mapping[str, Controller],
+    short: Sequence[Commands],
+    starts: Array,
+    seed: int,
+) -> tuple[Traces, dict[str, Any]]:
+    """k = 0.1 against 0.05 with the same gains, and RL, from extended starts. Paper: Fig. 6a, 6e, 6f
+
+    Returns:
+        Traces; and "summary" and "claims", empty where there are no such starts.
+    """
+    if not len(starts):
+        return {}, {"summary": {}, "claims": []}
+    some = claims.singular_controllers(controllers)
+    runs, traces = task_space(machine, some, short, starts, seed)
+    w0, share = jacobian.manipulability_threshold(machine), {}
+    for name in some:
+        shares = [claims.speed_share(machine, w0, traces[name, s.name], s.goals) for s in short]
+        share[name] = row_mean(np.array(shares).T)
+    return traces, {"summary": summary(runs), "claims": claims.singular_claims(runs, share)}
+
+
+def driven_log(machine: Machine, traces: Traces, controller: str, runs: int = 16) -> logs.Log:
+    """What encoders and valves said during one controller's first runs of a sequence, for `score`."""
     recordings = []
     for (name, sequence), trace in traces.items():
-        for i in range(trace.q.shape[1] * (name == controller)):
+        for i in range(min(runs, trace.q.shape[1]) * (name == controller)):
             u, q = trace.u[:, i].astype(float), trace.q_measured[:, i].astype(float)
             velocity = logs.velocity_of(q, machine.velocity_samples)
             recordings.append(logs.Recording(f"{name}_{sequence}_{i:02d}", u, q, velocity))
     return logs.Log(machine.names, tuple(recordings))
 
 
-def report_tables(results: Mapping[str, Any]) -> tuple[dict[str, dict[str, Any]], ...]:
-    """Errors of the nets, tuning of the baselines, means of all figures, velocity error by sequence."""
-    nets, tuning, means = {}, {}, results["task_space"]["summary"]
+def nets_table(results: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Errors of the nets by joint."""
+    nets = {}
     for joint, s in results["actuator"]["test"].items():
         nets[joint] = {key: s[key] for key in ("one_step_rmse", "persistence_rmse")}
         nets[joint] |= s["free_run"].get("10", {})
-    for name, t in results["tuning"].items():
-        bounds = ", ".join(t["at_bound"]) or "none"
-        tuning[name] = {"first": t["cost"][0], "last": t["cost"][-1], "gains at a bound": bounds}
-    everything = {name: rows["all"] for name, rows in means.items()}
-    errors = {n: {s: row["velocity_error_mean"] for s, row in rows.items()} for n, rows in means.items()}
-    return nets, tuning, everything, errors
+    return nets
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -226,7 +349,7 @@ def reproduce(machine: Machine, out: Path, effort: Effort, seed: int) -> dict[st
 
     `results.json` holds no clock: the same seed gives the same file on the same machine.
     """
-    from brokk_min.ppo import PPOConfig, train  # torch, only where something is trained
+    from brokk_min.ppo import TASK, PPOConfig, train  # torch, only where something is trained
 
     out.mkdir(parents=True, exist_ok=True)
     clock, last = {}, time.perf_counter()
@@ -249,44 +372,43 @@ def reproduce(machine: Machine, out: Path, effort: Effort, seed: int) -> dict[st
     lap("fit")
     driven = net.select([machine.names[i] for i in machine.driven])
     learner = PPOConfig(total_steps=effort.train_steps)
-    policy = train(machine, driven, TaskConfig(), learner, seed, out / "policy.npz", resume=True)
+    policy = train(machine, driven, TASK, learner, seed, out / "policy.npz", resume=True)
     lap("train")
     tuned, how = tuned_baselines(machine, driven, effort, seed)
     lap("tune")
-    sequences = axis_sequences(machine)
-    starts = draw_starts(machine, sequences, effort.starts, rng(seed + 2))
-    rl = PolicyController(machine, policy)
-    runs, traces = task_space(machine, {"rl": rl, **tuned}, sequences, starts, seed)
-    simulated, _ = task_space(machine, {"rl": rl}, sequences, starts, seed, driven)
-    driven_by_policy = actuator.score(net, driven_log(machine, traces, "rl"))
+    controllers: dict[str, Controller] = {"rl": PolicyController(machine, policy), **tuned}
+    compared, traces = comparison(machine, controllers, effort, seed)
+    starts = np.array(compared["starts"])
+    simulated, _ = task_space(
+        machine, {"rl": controllers["rl"]}, axis_sequences(machine), starts, seed, driven
+    )
+    compared["task_space"]["rl_on_nets"] = summary(simulated)["rl"]
+    driven_by_policy = actuator.score(net, driven_log(machine, traces["all"], "rl"))
     lap("evaluate")
     results = {
         "meta": meta(machine, seed) | {"effort": asdict(effort)},
         "actuator": {"test": actuator.score(net, test), "driven_by_policy": driven_by_policy},
-        "task_space": {"runs": runs, "summary": summary(runs), "rl_on_nets": summary(simulated)["rl"]},
+        **compared,
         "gains": plain_gains(tuned),
         "tuning": how,
-        "starts": starts.tolist(),
     }
     write_json(out / "results.json", results)
     write_json(out / "gains.json", {"meta": results["meta"], "gains": results["gains"]})
-    nets, tuning, means, errors = report_tables(results)
-    motion = [figures.plot_sequence(machine, traces, sequence, starts[0], 0) for sequence in sequences]
-    rates = figures.plot_joint_rates(machine, traces, sequences[0], 0)
-    bars = figures.plot_bars(results["task_space"]["summary"], [*AXES, "all"])
     parts = (
-        ("Actuator nets", "One step and free runs of 10 s on unseen recordings [rad/s, rad].", nets),
+        (
+            "Actuator nets",
+            "One step and free runs of 10 s on unseen recordings [rad/s, rad].",
+            nets_table(results),
+        ),
         ("Nets run freely", "One of these recordings.", figures.plot_free_run(net, test)),
         (
             "Learning curve",
             "The exploring policy, on the nets.",
             figures.plot_learning(out / "policy.npz.csv"),
         ),
-        ("Tuning of the baselines", "Least velocity error after a generation, on the machine.", tuning),
-        ("Task space control", "Motion along x, y and z from the first start, one scale a row.", *motion),
-        ("Joint velocities", "Motion along x from the first start.", rates),
-        ("Figures of merit", "Means over all sequences and starts [m/s, m, m/s^3, full strokes].", means),
-        ("Velocity error and drift by sequence", "Means over all starts [m/s, m].", errors, bars),
+        *report.task_parts(
+            machine, results, traces, tuning_goals(machine, effort.tuning_runs, 12.0, seed + 1000)
+        ),
     )
     figures.write_report(out / "report.html", parts, clock)
     lap("draw")

@@ -10,7 +10,7 @@ import html
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -36,6 +36,10 @@ STYLES: dict[str, dict[str, Any]] = {
     "jacobian_pid_k0.1": {"color": "#d55e00"},
     "jacobian_pid_k0.05": {"color": "#e69f00"},
     "jacobian_pid_ff": {"color": "#009e73"},
+    "perfect_model": {"color": "#cc79a7", "linestyle": "-."},
+    "workspace": {"color": "#0072b2"},
+    "limits": {"color": "#d55e00"},
+    "extended": {"color": "#e69f00"},
 }
 
 
@@ -109,20 +113,104 @@ def plot_learning(curve: Path) -> Any:
     return plot_lines(table["global_step"] / 1e6, "environment steps [million]", [row])
 
 
-def plot_bars(table: Mapping[str, Mapping[str, Mapping[str, float]]], sequences: Sequence[str]) -> Any:
-    """Mean velocity error and largest drift of each controller on each sequence."""
-    figure, axes = plt.subplots(1, 2, figsize=(8.4, 3.0), layout="constrained")
-    keys = (("velocity_error_mean", "mean velocity error [m/s]"), ("off_axis_drift_max", "largest drift [m]"))
-    width = 0.8 / len(table)
-    for ax, (key, label) in zip(axes, keys, strict=True):
-        for i, (name, rows) in enumerate(table.items()):
-            places = np.arange(len(sequences)) + (i - (len(table) - 1) / 2) * width
-            ax.bar(places, [rows[s][key] for s in sequences], width, label=name, color=STYLES[name]["color"])
-        ax.set_xticks(np.arange(len(sequences)), sequences)
+Bars = Mapping[str, Mapping[str, Mapping[str, float | None]]]  # controller, sequence: "mean", "low", "high"
+
+
+def plot_bars(panels: Mapping[str, Bars]) -> Any:
+    """Means with their 95 % intervals of each controller on each sequence; panels by the label of their y."""
+    figure = plt.figure(figsize=(10.4, 2.9 * len(panels)), layout="constrained")
+    axes = figure.subplots(len(panels), 1, squeeze=False)[:, 0]
+    for ax, (label, bars) in zip(axes, panels.items(), strict=True):
+        names, width = list(next(iter(bars.values()))), 0.8 / len(bars)
+        for i, (controller, rows) in enumerate(bars.items()):
+            mean, low, high = (np.array([rows[s][k] or 0.0 for s in names]) for k in ("mean", "low", "high"))
+            ends = np.array([mean - low, high - mean]) * [rows[s]["low"] is not None for s in names]
+            places = np.arange(len(names)) + (i - (len(bars) - 1) / 2) * width
+            color = STYLES[controller]["color"]
+            ax.bar(places, mean, width, yerr=ends, label=controller, color=color, error_kw={"linewidth": 0.8})
+        ax.set_xticks(np.arange(len(names)), names, fontsize=8)
         ax.set_ylabel(label)
         ax.grid(alpha=0.3, axis="y")
         ax.set_axisbelow(True)
     return _with_legend(figure, axes[0])
+
+
+def plot_starts(machine: Machine, starts: Array, kinds: Sequence[str]) -> Any:
+    """Start configurations drawn as arms, from the side and from above. Paper: Fig. 6a"""
+    figure, axes = plt.subplots(1, 2, figsize=(9.4, 4.4), layout="constrained")
+    points = kinematics.frames(machine, starts)[..., :3, 3]
+    heading = points[:, -1, :2] / np.maximum(np.linalg.norm(points[:, -1, :2], axis=-1, keepdims=True), 1e-9)
+    outward = np.einsum("pjk,pk->pj", points[..., :2], heading)
+    for i, kind in enumerate(kinds):
+        label = None if kind in kinds[:i] else kind
+        style = STYLES[kind] | {"linewidth": 1.0, "marker": "o", "markersize": 2, "alpha": 0.7}
+        axes[0].plot(outward[i], points[i, :, 2], label=label, **style)
+        axes[1].plot(points[i, :, 0], points[i, :, 1], **style)
+    axes[0].axhline(machine.ground, color="black", linewidth=0.8)
+    axes[0].set(xlabel="outward from the slew axis [m]", ylabel="z [m]", aspect="equal")
+    axes[1].set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    for ax in axes:
+        ax.grid(alpha=0.3)
+    return _with_legend(figure, axes[0])
+
+
+class Panel(NamedTuple):
+    """One plot: title, axes' labels with units, and curves (x, y) by label."""
+
+    title: str
+    xlabel: str
+    ylabel: str
+    curves: Mapping[str, tuple[Array, Array]]
+
+
+def plot_panels(rows: Sequence[Sequence[Panel]]) -> Any:
+    """A grid of panels; those of a column have the same axes where they show the same quantity."""
+    high, wide = len(rows), len(rows[0])
+    figure = plt.figure(figsize=(4.4 * wide, 2.8 * high), layout="constrained")
+    grid = figure.subplots(high, wide, squeeze=False)
+    for k, panels in enumerate(rows):
+        for ax, above, panel in zip(grid[k], grid[0], panels, strict=True):
+            for label, (x, y) in panel.curves.items():
+                ax.plot(x, y, label=label, linewidth=1.1)
+            ax.set_title(panel.title, fontsize=9)
+            ax.set_xlabel(panel.xlabel)
+            ax.set_ylabel(panel.ylabel)
+            ax.grid(alpha=0.3)
+            ax.legend(fontsize=7)
+            if k and above.get_ylabel() == panel.ylabel:
+                ax.sharey(above)
+                ax.autoscale()
+    return figure
+
+
+def plot_worst_and_median(net: actuator.ActuatorNet, log: logs.Log, seconds: float = 30.0) -> Any:
+    """Measured and free-running curves of the recordings with the worst and the median velocity error.
+
+    Of each the joint with the largest error.
+    """
+    errors = np.nan_to_num(actuator.recording_errors(net, log, seconds), nan=-1.0)
+    order = [i for i in np.argsort(errors.max(axis=1)) if errors[i].max() >= 0]
+    rows: list[list[Panel]] = []
+    for title, place in (("worst", -1), ("median", (len(order) - 1) // 2)):
+        index, joint = order[place], int(errors[order[place]].argmax())
+        recording, name = log.recordings[index], net.joints[joint]
+        ticks = min(round(seconds * net.rate), len(recording.q) - net.history - 1)
+        free = actuator.free_run(net, recording, np.array([net.history]), ticks)
+        later = slice(net.history + 1, net.history + 1 + ticks)
+        rows.append([])
+        for real, own, unit in zip((recording.q, recording.q_dot), free, ("rad", "rad/s"), strict=True):
+            curves = {"measured": real[later, joint], "free run": own[:, 0, joint]}
+            time = np.arange(1, ticks + 1) / net.rate
+            panel = {label: (time, y) for label, y in curves.items()}
+            rows[-1].append(Panel(f"{title}: {recording.name}", "time [s]", f"{name} [{unit}]", panel))
+    return plot_panels(rows)
+
+
+def save(path: Path, figure: Any) -> None:
+    """Write a figure as PNG, the same bytes for the same figure."""
+    with logs.whole_file(path) as file:
+        figure.savefig(file, format="png", dpi=110, metadata={"Software": None})
+    plt.close(figure)
 
 
 # --- the report -------------------------------------------------------------------------------------
@@ -133,7 +221,8 @@ td:first-child,th:first-child{text-align:left}img{max-width:100%}"""
 
 
 def write_report(path: Path, parts: Sequence[tuple[Any, ...]], clock: Mapping[str, float]) -> None:
-    """One page by itself; a part is a title, a sentence, and tables {row: {column: cell}} or figures."""
+    """One page by itself; a part is a title, a sentence, and more sentences, tables {row: {column: cell}}
+    or figures."""
     page = [
         f"<!doctype html><meta charset=utf-8><title>brokk_min report</title><style>{STYLE}</style>",
         "<h1>Task space control with reinforcement learning: what was measured</h1>",
@@ -143,14 +232,22 @@ def write_report(path: Path, parts: Sequence[tuple[Any, ...]], clock: Mapping[st
     ]
     for title, sentence, *contents in tqdm(parts, desc="draw", unit="part", disable=None):
         page.append(f"<h2>{html.escape(title)}</h2><p>{html.escape(sentence)}</p>")
-        page += [_table(c) if isinstance(c, Mapping) else _image(title, c) for c in contents]
+        page += [_content(title, content) for content in contents]
     with logs.whole_file(path, "w") as file:
         file.write("\n".join(page) + "\n")
 
 
+def _content(title: str, content: Any) -> str:
+    if isinstance(content, str):
+        return f"<p>{html.escape(content)}</p>"
+    return _table(content) if isinstance(content, Mapping) else _image(title, content)
+
+
 def _table(rows: Mapping[str, Mapping[str, Any]]) -> str:
     def line(tag: str, cells: Sequence[Any]) -> str:
-        texts = (f"{c:.4g}" if isinstance(c, float) else html.escape(str(c)) for c in cells)
+        texts = (
+            "" if c is None else f"{c:.4g}" if isinstance(c, float) else html.escape(str(c)) for c in cells
+        )
         return "<tr>" + "".join(f"<{tag}>{text}</{tag}>" for text in texts) + "</tr>"
 
     head = line("th", ["", *next(iter(rows.values()))])

@@ -25,7 +25,7 @@ LIMIT_MARGIN = 0.02  # rad before a joint's limit from which no command goes out
 RANGE_MARGIN = 0.05  # rad beyond a joint's limit, then the encoder is wrong
 JUMP_FACTOR, JUMP_COUNTS = 2.0, 4  # times the fastest motion, plus counts: a larger step is a jump
 # frozen: the count stands still while the joint should have moved by more than this
-DUE = 1.5  # counts; a moving joint may stand still for one
+DUE = 1.0  # count; what moves further shows it
 IDLE = 1.5  # dead zones: a command up to this may do nothing
 SLOWEST = 0.3  # of the fastest motion: long lever arm, weak pump
 KEPT = 0.5  # of the motion before: a joint that moved goes on at least so under the same push
@@ -121,7 +121,7 @@ class GateState(NamedTuple):
     counter: Array  # of the last valve frame
     counts: Array  # newest two angles, newest last (..., n, 2) [encoder counts]
     sent: Array  # newest commands last (..., n, PUSH) [counts of 127]
-    pace: Array  # motion with the push when the count last changed (..., n) [encoder counts a tick]
+    pace: Array  # at least, with the push, when the count last changed (..., n) [encoder counts a tick]
     due: Array  # motion that should have come since then, see `motion_due` (..., n) [encoder counts]
 
 
@@ -149,7 +149,7 @@ def gate_start(machine: Machine, shape: tuple[int, ...] = ()) -> GateState:
 
 
 def gate(machine: Machine, state: GateState, inputs: GateInputs, now: ArrayLike) -> tuple[GateState, Array]:
-    """Every command passes here: the next state and the valve frame, from state, inputs and time alone.
+    """Every command passes here: next state and valve frame from state, inputs and time alone. Paper: Sec. 2
 
     It is silent until armed, by a fresh edge of the dead-man switch with centred stick while nothing is
     wrong. Driving, it lets no command out that grows faster than `SLEW`, goes outward at a joint limit or
@@ -213,7 +213,7 @@ def motion_due(machine: Machine, state: GateState, counts: Array) -> tuple[Array
     pushed, moved = weakest > 0, counts != state.counts[..., 1]
     fastest = np.minimum(machine.column("q_dot_up"), machine.column("q_dot_down"))
     least = SLOWEST * fastest * machine.dt / machine.encoder_step / (machine.pwm_limit - idle) * weakest
-    pace = np.where(moved, np.maximum(way * (counts - state.counts[..., 0]), 0) / 2, state.pace)
+    pace = np.where(moved, np.maximum(way * (counts - state.counts[..., 0]) - 1, 0) / 2, state.pace)
     kept = KEPT * pace * weakest / np.where(pushed, strongest, np.inf)
     due = state.due + np.maximum(least, kept)
     return np.where(pushed, pace, 0.0), np.where(pushed & ~moved, due, 0.0)
@@ -223,7 +223,8 @@ def gate_wrong(machine: Machine, state: GateState, inputs: GateInputs, due: Arra
     """The first thing that is wrong (...): 0, or 1 + fault * (n + 1) + node, see `fault_name`."""
     n, step = machine.n, machine.encoder_step
     low, high = machine.column("q_min") - RANGE_MARGIN, machine.column("q_max") + RANGE_MARGIN
-    limit = np.where([joint.driven for joint in machine.joints], machine.pwm_limit, 0)
+    limit = np.zeros(n)
+    limit[machine.driven] = machine.pwm_limit
     fastest = JUMP_FACTOR * machine.q_dot_max * machine.dt / step + JUMP_COUNTS
     q = inputs.counts * step
 
@@ -242,7 +243,7 @@ def gate_wrong(machine: Machine, state: GateState, inputs: GateInputs, due: Arra
     bad[..., 11, :n] = ~(np.abs(inputs.m) <= limit)  # also if it is no number
     bad[..., 12, 0] = inputs.stop
     bad = bad.reshape(*now.shape, len(FAULTS) * (n + 1))
-    return np.where(bad.any(axis=-1), 1 + bad.argmax(axis=-1), 0)
+    return bad.any(axis=-1) * (1 + bad.argmax(axis=-1))
 
 
 def fault_name(machine: Machine, fault: int) -> str:

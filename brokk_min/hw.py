@@ -184,7 +184,7 @@ def shape_axis(axis: ArrayLike, dead: float = 0.12, expo: float = 0.6) -> Array:
 
 
 class Drive:
-    """The 20 Hz loop: what the operator wishes, through a controller and the gate, to the valves.
+    """The 20 Hz loop: the operator's wish, through a controller and the gate, to the valves. Paper: Sec. 2
 
     Args:
         machine: its joints' encoders and its valve controller are on the bus.

@@ -26,6 +26,11 @@ Table = dict[str, list[Any]]  # cells by column; row 2 of the file is cell 0
 RATE = 20.0  # Hz, paper: everything runs at 20 Hz
 MAX_GAP = 0.25  # s, assumed: a longer hole in the time stamps starts a new recording
 RETURN = "_return"
+UNITS = {  # largest value of a column and its unit; what is larger has been logged in another one
+    "u": (1.0, "of full command, not percent or bytes"),
+    "q": (62.8, "rad, not degrees"),  # ten turns, assumed
+    "q_dot": (62.8, "rad/s, not degrees/s"),
+}
 
 
 class Recording(NamedTuple):
@@ -159,11 +164,13 @@ def _recordings(
     """The checked recordings of one table at `RATE`, in the order in which they begin."""
     time = _numbers(path, table, "time")
     columns = {
-        kind: np.stack([_numbers(path, table, f"{kind}_{joint}", bound) for joint in joints], axis=1)
-        for kind, bound in (("u", 1.0), ("q", np.inf), ("q_dot", np.inf))[: 3 if logged else 2]
+        kind: np.stack([_numbers(path, table, f"{kind}_{joint}", *unit) for joint in joints], axis=1)
+        for kind, unit in list(UNITS.items())[: 3 if logged else 2]
     }
     runs: dict[str, list[int]] = {}
     for row, run in enumerate(_cells(path, table, "run")):
+        if not run.strip():
+            raise ValueError(f"{path}: row {row + 2}, column run: expected a name, got {run!r}")
         runs.setdefault(run, []).append(row)
     for run, rows in runs.items():
         gaps = _gaps(path, run, rows, time[rows])
@@ -267,17 +274,25 @@ def _cells(path: Path, table: Table, name: str) -> list[Any]:
     return table[name]
 
 
-def _numbers(path: Path, table: Table, name: str, bound: float = np.inf) -> Floats:
+def _numbers(path: Path, table: Table, name: str, bound: float = np.inf, unit: str = "") -> Floats:
     """One column as finite numbers within +-bound; the first cell that is none is named."""
-    allowed = "a finite number" if bound == np.inf else f"a number in [-{bound:g}, {bound:g}]"
+    cells = _cells(path, table, name)
     largest = min(bound + 1e-6, np.finfo(float).max)
-    numbers = []
-    for row, cell in enumerate(_cells(path, table, name), 2):
+
+    def number(cell: Any) -> float:
         try:
-            number, wanted = float(cell), allowed
+            return float(cell)
         except ValueError:
-            number, wanted = np.nan, "a number"
-        if not abs(number) <= largest:
-            raise ValueError(f"{path}: row {row}, column {name}: expected {wanted}, got {cell!r}")
-        numbers.append(number)
-    return np.array(numbers)
+            return np.nan
+
+    try:
+        numbers, wanted = np.array(cells, float), "a finite number"
+    except ValueError:
+        numbers, wanted = np.array([number(cell) for cell in cells]), "a number"
+    if not (good := np.abs(numbers) <= largest).all():
+        row = int(np.argmin(good))
+        limits = "" if bound == np.inf else f" in [-{bound:g}, {bound:g}] ({unit})"
+        raise ValueError(
+            f"{path}: row {row + 2}, column {name}: expected {wanted}{limits}, got {cells[row]!r}"
+        )
+    return numbers

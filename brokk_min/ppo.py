@@ -30,6 +30,7 @@ from brokk_min.policy import Policy, contract, save_policy
 
 Tensor = torch.Tensor
 FORMAT = 1  # of checkpoints
+TASK = TaskConfig(group=8)  # to be trained on: eight environments share starts and goals, see `relative`
 STATE = [f.name for f in fields(State) if f.name != "plant"]
 
 
@@ -141,6 +142,22 @@ def policy_loss(new: Tensor, old: Tensor, advantages: Tensor, clip: float) -> Te
     return -torch.min(ratio * advantages, clipped * advantages).mean()
 
 
+def relative(advantages: Tensor, group: int) -> Tensor:
+    """Advantages (T, N) less the mean of the others in the group at the same tick; as they are for 1.
+
+    What starts and goals, which a group shares, do to the return is no merit of an action; the critic
+    cannot foresee it. The others' mean does not depend on the action, so nothing is biased.
+
+    Example:
+        >>> relative(torch.tensor([[1.0, 2.0, 4.0, 4.0]]), 2).tolist()
+        [[-1.0, 1.0, 0.0, 0.0]]
+    """
+    if group == 1:
+        return advantages
+    groups = advantages.reshape(len(advantages), -1, group)
+    return ((groups - groups.mean(-1, keepdim=True)) * (group / (group - 1))).flatten(1)
+
+
 def normalise(advantages: Tensor) -> Tensor:
     """Advantages (B,) with zero mean and unit deviation."""
     return (advantages - advantages.mean()) / (advantages.std() + 1e-8)
@@ -250,7 +267,7 @@ class Training:
             "observation": observations,
             "action": actions,
             "log_probability": log_probability(actions, agent.actor(observations), agent.log_std),
-            "advantage": advantages,
+            "advantage": relative(advantages, self.env.config.group),
             "return": advantages + values,
         }
         returns = batch["return"]
@@ -401,10 +418,12 @@ def train(
         tensorboard: folder for the same scalars as in the CSV (needs the extra `tensorboard`).
 
     Raises:
-        ValueError: a checkpoint of another training, or an observation, action, reward, loss or weight
-            that is no number, with its place (the last checkpoint stays).
+        ValueError: settings that do not fit, a checkpoint of another training, or an observation, action,
+            reward, loss or weight that is no number, with its place (the last checkpoint stays).
         OSError: a file that cannot be written (the last checkpoint stays).
     """
+    if config.num_envs % task.group:
+        raise ValueError(f"num_envs: expected a multiple of group {task.group}, got {config.num_envs}")
     env = TaskVectorEnv(config.num_envs, net, machine, task)
     training = Training(env, config, seed)
     identity = identity_of(machine, net, task, config, seed)

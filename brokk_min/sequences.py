@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
 from brokk_min import actuator, jacobian, kinematics, logs
@@ -21,6 +21,16 @@ Array = NDArray[np.floating[Any]]
 AXES = "xyz"
 # One axis of the paper's experiment: seconds and share of tool_speed (assumed), with changes of direction.
 PATTERN = ((1, 0.0), (4, 2 / 3), (1, 0.0), (4, -2 / 3), (1, 0.0), (3, 1 / 3), (3, -1 / 3), (1, 0.0))
+# Others of the same length (assumed): seconds, then the velocity in shares of tool_speed.
+BOX = ((1, 0, 0, 0), (5, 0, 0.5, 0), (3, 0, 0, 0.5), (5, 0, -0.5, 0), (3, 0, 0, -0.5), (1, 0, 0, 0))
+STOPS = (
+    (1, 0, 0, 0),
+    *((1, 2 / 3, 0, 0), (1, 0, 0, 0)) * 4,
+    *((1, -2 / 3, 0, 0), (1, 0, 0, 0)) * 4,
+    (1, 0, 0, 0),
+)
+SLOW = ((1, 0, 0, 0), (4, 0.1, 0, 0), (4, -0.1, 0, 0), (4, 0, 0, 0.1), (4, 0, 0, -0.1), (1, 0, 0, 0))
+KINDS = ("workspace", "limits", "extended")  # of starts, see `start_kinds`
 
 
 class Commands(NamedTuple):
@@ -32,9 +42,41 @@ class Commands(NamedTuple):
 
 def axis_sequences(machine: Machine) -> list[Commands]:
     """One sequence along x, one along y, one along z. Paper: Fig. 6"""
-    seconds, shares = np.array(PATTERN).T
-    profile = machine.tool_speed * np.repeat(shares, np.rint(seconds * machine.rate).astype(int))
-    return [Commands(name, np.outer(profile, np.eye(3)[i])) for i, name in enumerate(AXES)]
+    return [Commands(name, _along(machine, np.eye(3)[i])) for i, name in enumerate(AXES)]
+
+
+def _along(machine: Machine, direction: ArrayLike) -> Array:
+    """The axis pattern along a unit vector (3,)."""
+    rows = [(seconds, *(share * np.asarray(direction, float))) for seconds, share in PATTERN]
+    return _held(machine, rows)
+
+
+def _held(machine: Machine, rows: ArrayLike) -> Array:
+    """Goals [m/s] (T, 3) of rows (seconds, shares of tool_speed along x, y, z)."""
+    table = np.asarray(rows, float)
+    return np.repeat(
+        machine.tool_speed * table[:, 1:], np.rint(table[:, 0] * machine.rate).astype(int), axis=0
+    )
+
+
+def task_sequences(machine: Machine) -> list[Commands]:
+    """All sequences that score, 18 s each: the paper's three axes and seven of ours.
+
+    Two diagonals; a circle (x-z) and a rectangle (y-z) in vertical planes at half the tool speed; stop and
+    go along x; slow motion near the dead zone along x and z. Paper: Sec. 4.2
+    """
+    turn = np.linspace(0, 2 * np.pi, round(16 * machine.rate), endpoint=False)
+    circle = 0.5 * machine.tool_speed * np.stack([np.cos(turn), 0 * turn, np.sin(turn)], axis=1)
+    rest = np.zeros((round(machine.rate), 3))
+    return [
+        *axis_sequences(machine),
+        Commands("diagonal_flat", _along(machine, [0.5**0.5, 0.5**0.5, 0])),
+        Commands("diagonal_rise", _along(machine, [3**-0.5, -(3**-0.5), 3**-0.5])),
+        Commands("circle", np.concatenate([rest, circle, rest])),
+        Commands("rectangle", _held(machine, BOX)),
+        Commands("stop_and_go", _held(machine, STOPS)),
+        Commands("slow", _held(machine, SLOW)),
+    ]
 
 
 def read_commands(path: Path, machine: Machine) -> list[Commands]:
@@ -122,14 +164,80 @@ def _feasible_draws(
     raise ValueError(f"{label}: expected {num} feasible poses for {machine.name}, got {len(poses)}")
 
 
+def start_kinds(machine: Machine, starts: Array) -> list[str]:
+    """Kind of each start (num, n), numbers assumed: "extended", "limits" or "workspace".
+
+    Extended: tool beyond 90 % of the arm's length from the first link's end, and so near a singularity that
+    the baselines' damping acts. Limits: a driven joint within 0.15 rad of an end of its range.
+    """
+    low, high = machine.column("q_min"), machine.column("q_max")
+    ends = kinematics.frames(machine, starts)[..., :3, 3]
+    reach = np.linalg.norm(ends[:, -1] - ends[:, 1], axis=-1)
+    length = np.hypot(machine.column("a"), machine.column("d"))[1:].sum()
+    w0 = jacobian.manipulability_threshold(machine)
+    damped = jacobian.manipulability(kinematics.jacobian(machine, starts)) < w0
+    room = np.minimum(starts - low, high - starts)[:, machine.driven].min(axis=-1)
+    kinds = np.where((reach > 0.9 * length) & damped, 2, np.where(room < 0.15, 1, 0))
+    return [KINDS[kind] for kind in kinds]
+
+
 def draw_starts(machine: Machine, sequences: Sequence[Commands], num: int, rng: np.random.Generator) -> Array:
-    """Random poses (num, n) [rad] from which all sequences are `feasible`; ValueError: too few such poses."""
-    goals = [np.repeat(sequence.goals[:, None], 400, axis=1) for sequence in sequences]
+    """Random poses (num, n) [rad]: of four, two "workspace", one "limits", one "extended". Paper: Fig. 6a
 
-    def draw() -> tuple[Array, list[Array]]:
-        return draw_pose(machine, TaskConfig(), rng, 400), goals
+    From the first kind all sequences are `feasible`, from the second at least half of them; the third leaves
+    parts of them out of reach. Where a machine has no poses of a kind, "workspace" stands in.
 
-    return _feasible_draws(machine, num, "draw starts", draw)[0]
+    Raises:
+        ValueError: too few poses in many draws.
+    """
+    kept: dict[str, list[Array]] = {kind: [] for kind in KINDS}
+    order = [KINDS[(0, 1, 0, 2)[i % 4]] for i in range(num)]
+    goals = [sequence.goals[:, None] for sequence in sequences]
+    with tqdm(total=num, desc="draw starts", unit="start", disable=None) as bar:
+        for _ in range(200):
+            poses = draw_pose(machine, TaskConfig(), rng, 4000).round(4)
+            kinds = np.array(start_kinds(machine, poses))
+            of = {
+                kind: poses[kinds == kind][:size] for kind, size in zip(KINDS, (1500, 30, 4000), strict=True)
+            }
+            good = [feasible(machine, of["limits"], np.repeat(goal, len(of["limits"]), 1)) for goal in goals]
+            of["limits"] = of["limits"][np.mean(good, axis=0) >= 0.5]
+            for goal in goals:
+                few = of["workspace"]
+                of["workspace"] = few[feasible(machine, few, np.repeat(goal, len(few), axis=1))]
+            for kind in KINDS:
+                kept[kind] += list(of[kind])
+            found = sum(min(len(kept[kind]), order.count(kind)) for kind in KINDS)
+            bar.update(found - bar.n)
+            if found == num:
+                break
+    try:
+        return np.array([kept[kind if kept[kind] else KINDS[0]].pop(0) for kind in order])
+    except IndexError:
+        wanted = f"{num} poses from which all sequences are feasible"
+        raise ValueError(f"{machine.name}: expected {wanted}, got fewer in 200 draws") from None
+
+
+def scored_starts(machine: Machine, num: int, sequences: Sequence[Commands], seed: int) -> Array:
+    """The first `num` starts of the machine's own file in the package, or drawn where it has none.
+
+    `brokk-min starts` made the file once. ValueError: more starts than the file has.
+    """
+    path = Path(__file__).with_name(f"starts_{machine.name}.csv")
+    if not path.exists():
+        return draw_starts(machine, sequences, num, np.random.default_rng(seed))
+    starts = read_starts(path, machine)
+    if num > len(starts):
+        raise ValueError(f"{path.name}: expected at most {len(starts)} starts, got {num}")
+    return starts[:num]
+
+
+def write_starts(path: Path, machine: Machine, starts: Array) -> None:
+    """Write poses as `read_starts` reads them."""
+    with logs.whole_file(path, "w") as file:
+        file.write(
+            "\n".join([",".join(machine.names), *(",".join(map(str, row)) for row in starts.tolist()), ""])
+        )
 
 
 def tuning_goals(machine: Machine, runs: int, seconds: float, seed: int) -> tuple[Array, Array]:

@@ -51,7 +51,8 @@ class SimulatedMachine:
         machine: what moves.
         q: angles at the start [rad], (n,).
         now: s.
-        record: called with time [s], command in force and true angles [rad] (n,), every plant step.
+        record: called every plant step with time [s], command in force and true angles [rad] (n,), and the
+            time of the last valid valve frame [s].
     """
 
     def __init__(
@@ -59,7 +60,7 @@ class SimulatedMachine:
         machine: Machine,
         q: ArrayLike,
         now: float,
-        record: Callable[[float, Array, Array], object] = lambda *_: None,
+        record: Callable[[float, Array, Array, float], object] = lambda *_: None,
     ) -> None:
         self.machine, self.record = machine, record
         self.fine = replace(machine, rate=1 / machine.plant_dt)  # the same plant, a tick is one Euler step
@@ -89,7 +90,7 @@ class SimulatedMachine:
                 self._trip()
             self.plant = plant_step(self.fine, self.plant, self.u)
             self.steps += 1
-            self.record(then, self.u, self.plant.q)
+            self.record(then, self.u, self.plant.q, self.valid)
             if then >= self.start + (self.beats + 1) * BEAT:
                 self.beats += 1
                 out += [(HEARTBEAT + node, bytes([state])) for node, state in self.nmt.items()]
@@ -183,10 +184,10 @@ def simulate(
         ended = stack.enter_context(stop_signals())
         start = line.now()
         names = [f"{kind}_{name}" for kind in "uq" for name in machine.names]
-        print("run", "time", *names, sep=",", file=file)
+        print("run", "time", *names, "valid", sep=",", file=file)
 
-        def write(now: float, u: Array, q: Array) -> None:
-            numbers = [f"{x:.7g}" for x in (*u, *q)]
+        def write(now: float, u: Array, q: Array, valid: float) -> None:
+            numbers = [*(f"{x:.7g}" for x in (*u, *q)), f"{valid - start:.6f}"]
             print("plant", f"{now - start:.3f}", *numbers, sep=",", file=file)
 
         serve(SimulatedMachine(machine, q, start, write), line, lambda: not ended)

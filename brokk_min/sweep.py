@@ -24,9 +24,10 @@ from brokk_min import experiments
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import TaskConfig
 from brokk_min.machine import Machine
+from brokk_min.metrics import by_start
 from brokk_min.policy import PolicyController, load_policy
 from brokk_min.ppo import PPOConfig, identity_of, train
-from brokk_min.sequences import AXES, axis_sequences, draw_starts
+from brokk_min.sequences import AXES, axis_sequences, scored_starts, task_sequences
 
 Rows = list[dict[str, Any]]  # of `experiments.task_space`
 Submit = Callable[..., "Future[Rows]"]
@@ -64,9 +65,8 @@ def _finished(path: Path, identity: Mapping[str, Any]) -> Rows:
 
 def _on_the_machine(machine: Machine, controllers: Mapping[str, Any], starts: int) -> Rows:
     """The scored sequences and starts of `evaluate --seed 0`: the same whatever seed was trained."""
-    sequences = axis_sequences(machine)
-    poses = draw_starts(machine, sequences, starts, np.random.default_rng(2))
-    return experiments.task_space(machine, controllers, sequences, poses, 0)[0]
+    poses = scored_starts(machine, starts, task_sequences(machine), 2)
+    return experiments.task_space(machine, controllers, axis_sequences(machine), poses, 0)[0]
 
 
 def apart(function: Callable[..., Any], *arguments: Any) -> Any:
@@ -175,15 +175,15 @@ def table(seeds: Sequence[Rows], beside: Rows) -> dict[str, dict[str, Any]]:
 
     A seed counts once, with the mean over its starts; baselines have no seeds and so no interval.
     """
-    summaries = [experiments.summary(runs)["rl"] for runs in seeds]
-    several = {"rl": summaries} if summaries else {}
-    several |= {name: [means] for name, means in experiments.summary(beside).items()}
+    several = {"rl": list(seeds)} if seeds else {}
+    several |= {name: [beside] for name in dict.fromkeys(run["controller"] for run in beside)}
     columns = {f"velocity_error_{s}": (s, "velocity_error_mean") for s in (*AXES, "all")}
     columns |= {name: ("all", name) for name in ("off_axis_drift_max", "valve_travel")}
-    return {
-        controller: {name: interval([m[s][key] for m in means]) for name, (s, key) in columns.items()}
-        for controller, means in several.items()
-    }
+
+    def means(controller: str, sequence: str, key: str) -> list[float]:
+        return [float(by_start(runs, controller, sequence, key).mean()) for runs in several[controller]]
+
+    return {c: {name: interval(means(c, *what)) for name, what in columns.items()} for c in several}
 
 
 def show(figures: Mapping[str, Mapping[str, Any]]) -> str:

@@ -45,7 +45,7 @@ class World:
         self.upward: Callable[[int, bytes], Out] = lambda can_id, data: [(can_id, data)]
         self.downward = self.upward
         self.noise: Callable[[], Out] = list  # foreign frames of the next millisecond
-        self.record: list[tuple[float, np.ndarray, np.ndarray]] = []
+        self.record: list[tuple[float, np.ndarray, np.ndarray, float]] = []
         self.syncs: list[float] = []
         self.simulated = SimulatedMachine(machine, start, 0.0, lambda *row: self.record.append(row))
         self.line = Line(self, log, clock=lambda: self.t + self.offset, rest=self.rest)
@@ -105,7 +105,7 @@ class World:
     @property
     def commands(self) -> tuple[np.ndarray, np.ndarray]:
         """Times [s] and commands in force at the valves in counts (T, n), by the plant's own record."""
-        times, u, _ = zip(*self.record, strict=True)
+        times, u, *_ = zip(*self.record, strict=True)
         return np.array(times), np.rint(np.array(u) * 127).astype(int)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import tracemalloc
 from dataclasses import fields, replace
 
 import numpy as np
@@ -431,7 +432,7 @@ def test_rich_recordings_hold_pauses_and_sine_recordings_none(collected):
             longest = max(longest, int(np.diff(moved).max()) - 1)
         return longest
 
-    assert longest_pause(collected["rich"]) >= 20
+    assert longest_pause(collected["rich"]) >= 40
     assert longest_pause(collected["sine"]) < 20
 
 
@@ -604,16 +605,28 @@ def test_prediction_refuses_another_shape():
 def test_a_step_of_the_simulation_by_hand():
     net = replace(constant_net([0.2, -0.4], False, ("a", "b")), velocity_samples=2)
     net = replace(net, q_low=np.float32([0.0, 0.985]), q_high=np.float32([1.0, 2.0]))
-    history, q = net.step(rest_history(np.array([0.5, 1.0]), 13), np.array([0.5, 1.0]), [0.3, 0.0])
+    history, q = net.step(rest_history(np.array([0.5, 1.0]), 13), np.array([0.5, 1.0]), [0.3, -0.1])
     np.testing.assert_allclose(q, [0.51, 0.985], atol=1e-6)  # the second meets its stop
     np.testing.assert_allclose(history[:, 1, -1], [0.2, -0.3], atol=1e-5)
-    np.testing.assert_allclose(history[:, 2, -2:], [[0, 0.3], [0, 0]])
+    np.testing.assert_allclose(history[:, 2, -2:], [[0, 0.3], [0, -0.1]])
     # beyond what training saw it may stay or come back, but go no further
     _, outside = net.step(history, np.array([1.5, 0.5]), [0.0, 0.0])
     np.testing.assert_allclose(outside, [1.5, 0.5], atol=1e-6)
     logged = replace(net, velocity_logged=True)
-    history, _ = logged.step(rest_history(np.array([0.5, 1.0]), 13), np.array([0.5, 1.0]), [0, 0])
+    history, _ = logged.step(rest_history(np.array([0.5, 1.0]), 13), np.array([0.5, 1.0]), [0.1, 0.1])
     np.testing.assert_allclose(history[:, 1, -1], [0.2, -0.4], atol=1e-6)
+
+
+def test_a_joint_without_a_command_that_stood_still_stays():
+    net = constant_net([0.2, 0.2, 0.2, 0.2], False, ("a", "b", "c", "d"))
+    history = rest_history(np.zeros(4, np.float32), 13)
+    history[1, 2, 1] = 0.01  # b had a command within the history that remains
+    history[2, 0, 1:] = 0.003  # c has moved
+    _, q = net.step(history, np.array([0.0, 0.0, 0.003, 0.0]), [0.0, 0.0, 0.0, 0.01])
+    np.testing.assert_allclose(q, [0.0, 0.01, 0.013, 0.01], atol=1e-6)
+    history[1, 2, 1], history[1, 2, 0] = 0.0, 0.01  # a tick later it is past
+    _, q = net.step(history, np.zeros(4), [0.0, 0.0, 0.0, 0.0])
+    assert q[1] == 0.0
 
 
 def test_selected_nets_are_the_same_nets_in_another_order():
@@ -781,6 +794,69 @@ def test_a_fit_repeats_itself_to_the_bit():
     assert not np.array_equal(one.weights[0], other.weights[0])
 
 
+@pytest.mark.parametrize("logged", [False, True])
+def test_the_loss_of_a_free_run_is_what_the_nets_say_when_run(logged):
+    """Three ticks on the nets' own outputs: the outputs' errors so far, squared, in units of their range."""
+    log, config = simple_system(0, 4, logged=logged), FitConfig(steps=1, batch_size=4, noise=0, rollout=3)
+    net = fit(log, config, seed=0, velocity_samples=4)
+    net = replace(net, q_low=net.q_low - 9, q_high=net.q_high + 9)
+    training = actuator.training_set(log, 13, 3)
+    span = training.output_high - training.output_low
+    tapes = [
+        torch.tensor(a).float().flatten(-2)
+        for a in (training.series, ((training.target - training.output_low) / span).T)
+    ]
+    at = np.array([[20, 350], [40, 700]])
+    weights = [torch.tensor(w) for w in net.weights]
+    shifted = torch.tensor(at + np.array([[0], [len(training.target)]]))
+    got = actuator._rollout_loss(
+        training, config, weights, tapes, shifted, 3, None if logged else 4, torch.Generator()
+    )
+    whole, wanted = actuator.end_to_end(log).whole, 0.0
+    for j in range(2):
+        for end in at[j]:
+            rows = np.arange(end - 12, end + 1)
+            u = whole.u[rows - 1]
+            history = np.stack([whole.q[rows], whole.q_dot[rows], u]).transpose(2, 0, 1).astype(np.float32)
+            q, off = whole.q[end], 0.0
+            for k in range(3):
+                said = net.predict(push_command(history, whole.u[end + k]))
+                history, q = net.step(history, q, whole.u[end + k])
+                off += (said[j] - training.target[end + k, j]) / span[j]
+                wanted += off**2 / 3 / 2  # mean over ticks and windows
+    assert float(got) == pytest.approx(wanted, rel=1e-3)
+
+
+def test_windows_of_free_runs_end_before_the_seams():
+    training = actuator.training_set(Log(("a",), (line("x", 0, 0.1, 30), line("y", 5, 0.2, 40))), 13, 8)
+    np.testing.assert_array_equal(training.ends[0], [*range(12, 29), *range(42, 69)])
+    np.testing.assert_array_equal(training.far_ends[0], [*range(12, 22), *range(42, 62)])
+
+
+def test_recordings_too_short_for_free_runs_are_fitted_to_one_step():
+    recordings = tuple(line(f"r{i}", 0.0, 0.1 * i, 15) for i in range(4))
+    config = FitConfig(steps=5, batch_size=8, rollout=8)
+    one = fit(Log(("a",), recordings), config, seed=0, velocity_samples=4)
+    two = fit(Log(("a",), recordings), replace(config, rollout=1), seed=0, velocity_samples=4)
+    for a, b in zip(one.weights, two.weights, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_memory_of_a_fit_grows_with_the_data_and_not_with_data_times_history():
+    """Peak beside the log of 60,000 samples; all windows of 80 samples at once would be 115 MB in float64."""
+    log = Log(("a",), (line("x", 0.0, 0.01, 60_000),))
+    net = fit(log, FitConfig(steps=1, batch_size=8, history=80), seed=0, velocity_samples=4)
+    tracemalloc.start()
+    actuator.training_set(log, 80, 8)
+    held = tracemalloc.get_traced_memory()[1]
+    tracemalloc.reset_peak()
+    actuator.fit_linear(net, log)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert held < 15e6  # 250 bytes a sample
+    assert peak < 15e6 + 6 * 8192 * 241 * 8  # and some chunks
+
+
 def line(name: str, start: float, slope: float, ticks: int, u: float = 0.5) -> Recording:
     q = np.full((ticks, 1), start) + slope * np.arange(ticks)[:, None] / 20
     return Recording(name, np.full((ticks, 1), u), q, velocity_of(q, 4))
@@ -899,6 +975,26 @@ def test_a_free_run_sees_the_past_of_the_log_and_then_only_itself():
             np.testing.assert_allclose(velocities[k, s], speeds[-1], atol=1e-4)
 
 
+def test_errors_of_whole_recordings_by_hand():
+    """A net that says 0.2 rad/s on recordings of 0.1, 0.3 (short), nothing and too few samples."""
+    pieces = (
+        line("a", 0.0, 0.1, 60),
+        line("b", 9.0, 0.35, 20),
+        line("c", 0.0, 0.0, 40, u=0.0),
+        line("d", 0, 1, 13),
+    )
+    net = constant_net([0.2], True, ("a",))
+    log = Log(
+        ("a",),
+        tuple(r._replace(q_dot=np.full_like(r.q, s)) for r, s in zip(pieces, (0.1, 0.35, 0, 1), strict=True)),
+        True,
+    )
+    errors = actuator.recording_errors(net, log, 30.0)
+    np.testing.assert_allclose(errors[:2, 0], [0.1, 0.15], atol=1e-6)
+    assert np.isnan(errors[2:]).all()
+    assert np.isnan(actuator.recording_errors(net, log._replace(recordings=log.recordings[3:]), 30.0)).all()
+
+
 def test_scores_need_the_same_joints_and_one_step_at_least():
     net = constant_net([0.2], False, ("a",))
     with pytest.raises(ValueError, match=r"joints: expected \['a'\], got \['b'\]"):
@@ -920,3 +1016,21 @@ def test_speed_limits_are_where_the_plant_settles_at_the_command_limit():
             velocity = plant_velocity(BROKK_170, state)[:, joint]
             np.testing.assert_allclose(velocity, now, rtol=0.03)
             assert (sign * limit[:, joint] > 0.05).all()
+
+
+# --- what planted errors had passed ---------------------------------------------------------------
+
+
+def test_lever_arm_of_q5_at_an_acute_angle_by_hand():
+    # sides 0.6 and 0.2 under 60 degrees: third side sqrt(0.28), height 0.6 * 0.2 * sin 60 degrees / it
+    arm = lever_arm(BROKK_170, np.full(5, np.pi / 3 - 0.4))
+    assert arm[Q5] == pytest.approx(0.19640, abs=1e-5)
+
+
+def test_the_first_count_that_moves_anything_is_eleven():
+    """8.9 counts of dead zone, and the next 1.2 open the spool too little (1 %) to wake an idle valve."""
+    for sign in (1, -1):
+        _, velocities, _ = record(BROKK_170, MIDDLE, np.full((100, 5), sign * 10 / 127))
+        assert not velocities.any()
+        _, velocities, _ = record(BROKK_170, MIDDLE, np.full((100, 5), sign * 11 / 127))
+        assert np.all(sign * velocities[-1] > 1e-4)

@@ -15,6 +15,7 @@ import pytest
 from benchmarks.rollout import random_net
 from brokk_min import experiments
 from brokk_min.__main__ import COMMANDS, main
+from brokk_min.actuator import load_net
 from brokk_min.logs import read_log
 
 
@@ -35,10 +36,20 @@ def test_each_command_has_help(command: str, capsys: pytest.CaptureFixture[str])
 def test_the_designs_options_exist(capsys: pytest.CaptureFixture[str]) -> None:
     wanted = {
         "collect": ["--out", "--hours", "--excitation", "--machine"],
-        "fit": ["--out", "--test", "--json", "--history"],
+        "fit": ["--out", "--test", "--json", "--figure", "--history", "--paper"],
+        "preliminary": ["--actuator", "--out"],
         "train": ["--actuator", "--out", "--total-steps", "--num-envs", "--resume"],
         "sweep": ["--actuator", "--out", "--seeds", "--scheduler", "--gains", "--total-steps"],
-        "evaluate": ["--policy", "--commands", "--starts", "--plant", "--json"],
+        "evaluate": [
+            "--policy",
+            "--commands",
+            "--starts",
+            "--num-starts",
+            "--perfect-model",
+            "--plant",
+            "--json",
+        ],
+        "starts": ["--out", "--num"],
         "reproduce": ["--out", "--quick"],
         "machine": ["--interface", "--channel", "--record"],
         "drive": ["--policy", "--interface", "--channel", "--command", "--controller", "--log", "--replay"],
@@ -66,6 +77,9 @@ def test_the_designs_options_exist(capsys: pytest.CaptureFixture[str]) -> None:
         (["sweep", "--actuator", "missing.npz", "--out", "s"], 1, "missing.npz"),
         (["sweep", "--actuator", "missing.npz", "--out", "s", "--seeds", "0"], 2, "--seeds"),
         (["evaluate", "--policy", "missing.npz"], 1, "missing.npz"),
+        (["evaluate", "--policy", "missing.npz", "--plant", "net", "--perfect-model"], 2, "--perfect-model"),
+        (["evaluate", "--policy", "missing.npz", "--num-starts", "0"], 2, "--num-starts"),
+        (["starts", "--out", "missing/s.csv"], 2, "missing/s.csv"),
         (["machine", "--interface", "nonsense", "--channel", "0"], 1, "nonsense"),
         (["machine", "--interface", "virtual", "--channel", "0", "--start", "9", "9"], 1, "start"),
         (["drive", "--policy", "missing.npz"], 2, "--interface"),
@@ -77,6 +91,7 @@ def test_the_designs_options_exist(capsys: pytest.CaptureFixture[str]) -> None:
             "--joint",
         ),
         (["convert", "missing.log", "--out", "log.csv"], 1, "missing.log"),
+        (["preliminary", "--actuator", "missing.npz"], 1, "missing.npz"),
         (["export", "--policy", "missing.npz", "--out", "p.onnx"], 1, "missing.npz"),
     ],
 )
@@ -131,6 +146,38 @@ def test_fit_takes_a_foreign_log_and_beats_the_last_value(tmp_path: Path) -> Non
         assert joint["free_run"]["10"]["velocity_rmse"] < 0.05
 
 
+def test_the_papers_recipe_is_one_switch(tmp_path: Path) -> None:
+    foreign_log(tmp_path / "log.csv", 0, 2)
+    files = [tmp_path / "log.csv", "--out", tmp_path / "n.npz", "--json", tmp_path / "f.json"]
+    assert run("fit", *files, "--steps", 3, "--paper") == 0
+    settings = load_net(tmp_path / "n.npz").settings
+    assert (settings["noise"], settings["rollout"], settings["steps"]) == (0, 1, 3)
+    verdict = json.loads((tmp_path / "f.json").read_text())
+    assert set(verdict) == {"meta", "joints", "tool", "warnings"}
+    keys = {"one_step_rmse", "persistence_rmse", "free_run", "linear", "creep", "response_time", "outside"}
+    assert all(set(joint) == keys for joint in verdict["joints"].values())
+
+
+def test_a_test_log_in_which_a_joint_rests_or_moves_too_shortly_is_judged(tmp_path: Path) -> None:
+    foreign_log(tmp_path / "log.csv", 0, 2)
+    rest = [f"still,{k / 20},0,0,0.1,0.2" for k in range(200)]
+    header = "run,time,u_boom,u_arm,q_boom,q_arm"
+    short = [f"short,{k / 20},0.5,0,{k / 100},0.2" for k in range(8)]
+    for i, lines in enumerate((rest, rest + short)):
+        (tmp_path / "test.csv").write_text("\n".join([header, *lines]) + "\n")
+        files = [
+            "--test",
+            tmp_path / "test.csv",
+            "--json",
+            tmp_path / f"{i}.json",
+            "--figure",
+            tmp_path / "f.png",
+        ]
+        assert run("fit", tmp_path / "log.csv", "--out", tmp_path / "n.npz", *files, "--steps", 3) == 0
+    assert json.loads((tmp_path / "0.json").read_text())["joints"]["boom"]["free_run"]["5"]
+    assert not json.loads((tmp_path / "1.json").read_text())["joints"]["boom"]["free_run"]
+
+
 def test_a_bad_log_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "log.csv"
     foreign_log(path, 0, 1)
@@ -168,6 +215,10 @@ def test_collect_fit_train_resume_evaluate(tmp_path: Path, capsys: pytest.Captur
         assert (meta["plant"], meta["machine"], meta["seed"]) == (plant, "brokk170", 0)
         assert [r["controller"] for r in runs] == ["rl", *names]
         assert {(r["sequence"], r["start"]) for r in runs} == {("up", 0)}
+    bound = ["--commands", commands, "--starts", starts, "--perfect-model", "--json", where]
+    assert run("evaluate", "--policy", policy, *bound) == 0
+    runs = json.loads(where.read_text())["runs"]
+    assert min(runs, key=lambda r: r["velocity_error_mean"])["controller"] == "perfect_model"
     starts.write_text("q1,q2,q3,q4,q5\n0,0,-0.3,2.5,1.2\n")
     capsys.readouterr()
     assert run("evaluate", "--policy", policy, "--starts", starts) == 1
@@ -185,10 +236,12 @@ def test_without_gains_the_baselines_are_tuned_and_that_is_said(
     quick = experiments.Effort(generations=1, tuning_runs=1, starts=1)
     monkeypatch.setattr("brokk_min.experiments.Effort", lambda: quick)
     where = tmp_path / "e.json"
-    assert run("evaluate", "--policy", tmp_path / "p.npz", "--json", where) == 0
+    options = ["--num-starts", 1, "--json", where]
+    assert run("evaluate", "--policy", tmp_path / "p.npz", *options) == 0
+    names = "x, y, z, diagonal_flat, diagonal_rise, circle, rectangle, stop_and_go, slow"
     assert "gains of the baselines: tuned now" in capsys.readouterr().err
     meta = json.loads(where.read_text())["meta"]
-    assert (meta["gains"], meta["commands"], meta["starts"]) == ("tuned now", "x, y, z", "drawn")
+    assert (meta["gains"], meta["commands"], meta["starts"]) == ("tuned now", names, "1")
 
 
 @pytest.mark.parametrize("command", [name for name in COMMANDS if name not in ("train", "sweep")])

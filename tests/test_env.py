@@ -24,6 +24,7 @@ from hypothesis.extra.numpy import arrays
 from scipy import stats
 
 from brokk_min import env as task
+from brokk_min import kinematics
 from brokk_min.actuator import plant_reset, plant_step, save_net
 from brokk_min.env import TaskConfig, TaskEnv, TaskVectorEnv
 from brokk_min.jacobian import GAINS, JacobianController, join_gains
@@ -492,6 +493,44 @@ def test_a_reset_is_at_rest_and_tells_its_pose():
     found = task.measured(BROKK_170, seen)
     np.testing.assert_allclose(found.q, env.state.q, atol=BROKK_170.encoder_step / 2 + 1e-6)
     np.testing.assert_allclose(found.v_goal, env.state.v_goal, atol=1e-6)
+
+
+def test_a_group_shares_starts_and_goals_and_another_group_does_not():
+    config = replace(TaskConfig(), group=4, episode_s=2.0, hold_min_s=0.2, hold_max_s=0.6)
+    env = TaskVectorEnv(8, "analytic", BROKK_170, config)
+    env.reset(seed=3)
+    rng, seen = np.random.default_rng(0), set()
+    for _ in range(100):  # over two ends of episodes
+        state = env.state
+        for group in (slice(0, 4), slice(4, 8)):
+            assert (state.v_goal[group] == state.v_goal[group][0]).all()
+            assert (state.goal_ticks[group] == state.goal_ticks[group][0]).all()
+            if state.ticks[group][0] == 0:
+                assert (state.q[group] == state.q[group][0]).all()
+        assert (state.v_goal[0] != state.v_goal[4]).any() and (state.q[0] != state.q[4]).any()
+        seen.add(tuple(state.v_goal[0]))
+        observation, *_ = env.step(rng.uniform(-1, 1, (8, 4)))
+        shown = task.measured(BROKK_170, observation).v_goal
+        np.testing.assert_allclose(shown, env.state.v_goal, atol=0.05)  # turned by noisy angles
+    assert len(seen) > 5
+
+
+def test_no_goal_asks_an_arm_close_to_the_ground_to_sink():
+    pose = np.array([[0.3, 0.2, 0.3, 1.4, 1.1]])
+    config = replace(QUIET, hold_min_s=5.0, hold_max_s=5.0)
+    lowest = kinematics.lowest_point(BROKK_170, pose)[0]
+    for near in (True, False):
+        machine = replace(BROKK_170, ground=float(lowest - (0.9 if near else 1.1) * task.GROUND_MARGIN))
+        rng = np.random.default_rng(1)
+        for _ in range(20):
+            state = task.rest_state(machine, pose, [[0.1, 0.0, -0.2]], plant=True)
+            state, _ = task.step(machine, config, None, state, np.zeros((1, 4)), rng)
+            changed = (state.v_goal != np.float32([[0.1, 0.0, -0.2]])).any()
+            assert changed == near and (state.v_goal[0, 2] >= 0) == near
+            assert not near or state.goal_ticks[0] == 100
+        state = task.rest_state(machine, pose, [[0.1, 0.0, 0.2]], plant=True)
+        state, _ = task.step(machine, config, None, state, np.zeros((1, 4)), rng)
+        np.testing.assert_array_equal(state.v_goal, np.float32([[0.1, 0.0, 0.2]]))
 
 
 def test_goals_are_redrawn_within_an_episode_and_rewards_are_for_the_old_goal():
@@ -985,6 +1024,38 @@ def test_rollout_noise_reaches_the_controller_and_is_reproducible():
     assert np.array_equal(seen["a"], seen["b"])
     tool = parts(BROKK_170, seen["a"] - seen["c"])[1] / 1.4
     assert 0.045 < np.abs(tool).max() <= 0.05 + 1e-5
+
+
+# --- nothing is written to ------------------------------------------------------------------------
+
+
+def sealed(values):
+    """The same arrays, read-only."""
+    for array in values:
+        array.setflags(write=False)
+    return values
+
+
+@pytest.mark.parametrize("plant", [True, False])
+@pytest.mark.parametrize("machine", [BROKK_170, *MACHINES[:4]], ids=lambda m: m.name)
+def test_arrays_that_go_in_are_never_written_to(machine, plant):
+    """States, observations and actions are read-only here: a write in place would raise."""
+    rng = np.random.default_rng(31)
+    net = None if plant else small_net(machine, rng)
+    state = task.reset(machine, TaskConfig(hold_min_s=0.05, hold_max_s=0.1), rng, 6, plant)
+    controller = JacobianController(machine, join_gains(machine, dict.fromkeys(GAINS, 0.1)), 0.1, 1.0)
+    memory = controller.start(6)
+    for _ in range(4):
+        sealed(flat(state))
+        (action,) = sealed([rng.uniform(-1, 1, (6, len(machine.driven))).astype(np.float32)])
+        fresh = task.reset(machine, TaskConfig(), rng, 2, plant)
+        sealed(flat(fresh))
+        after, outcome = task.step(machine, TaskConfig(), net, state, action, rng)
+        sealed(outcome)
+        task.merge(state, fresh, np.array([1, 4]))
+        sealed(task.measured(machine, outcome.observation))
+        _, memory = controller(outcome.observation, type(memory)(*sealed(list(memory))))
+        state = after
 
 
 def test_the_papers_observation_has_plain_standard_deviations_and_no_wanted_rates() -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import html
 import json
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,51 +13,17 @@ import pytest
 
 from benchmarks.rollout import random_net
 from brokk_min import experiments, jacobian
-from brokk_min.actuator import ActuatorNet
-from brokk_min.env import TaskConfig, Trace, rollout
-from brokk_min.kinematics import tool_position
-from brokk_min.machine import BROKK_170
+from brokk_min.actuator import ActuatorNet, speed_limits
+from brokk_min.env import Measured, TaskConfig, Trace, measured, rollout, to_command
+from brokk_min.kinematics import joint_rates, tool_position
+from brokk_min.machine import BROKK_170, Machine, read_encoder
+from brokk_min.metrics import metrics
+from brokk_min.sequences import task_sequences
 
-TINY = experiments.Effort(hours=0.02, fit_steps=60, train_steps=8192, generations=1, tuning_runs=2, starts=2)
-
-
-def test_line_distance_of_a_hand_worked_drift() -> None:
-    # along x with 0.3 m to the side after the second tick; the stop and the way back keep the line
-    goals = np.array([[0.2, 0, 0], [0.2, 0, 0], [0, 0, 0], [-0.1, 0, 0]])
-    p = np.array([[1.0, 0, 0], [2.0, 0.3, 0.4], [2.0, 0.3, 0.0], [1.0, 0.0, 0.1]])
-    distance = experiments.line_distance(p, goals, np.zeros(3))
-    assert distance == pytest.approx([0.0, 0.5, 0.3, 0.1])
+TINY = experiments.Effort(0.02, 60, 8192, 1, 2, 4, 2, 1.0)
 
 
-def test_line_distance_starts_a_new_line_when_the_direction_turns() -> None:
-    goals = np.array([[0.2, 0, 0], [0, 0.2, 0]])
-    p = np.array([[1.0, 0.1, 0], [1.2, 5.0, 0]])  # second line through (1, 0.1) along y
-    assert experiments.line_distance(p, goals, np.zeros(3)) == pytest.approx([0.1, 0.2])
-
-
-def test_line_distance_before_the_first_motion_is_from_the_start() -> None:
-    goals = np.array([[0.0, 0, 0], [0, 0, 0.1]])
-    p = np.array([[0.0, 0.3, 0.4], [0.1, 0.0, 7.0]])
-    assert experiments.line_distance(p, goals, np.zeros(3)) == pytest.approx([0.5, 0.1])
-
-
-def test_metrics_by_hand() -> None:
-    v = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.3, 0, 0]])[:, None]
-    u = np.array([[0.0, 0.5], [0.2, 0.5], [0.2, -0.5]])[:, None]
-    p = np.cumsum(v, axis=0) * 0.05
-    zero = np.zeros((3, 1, 5))
-    trace = Trace(zero, zero, zero, u, p, v, np.array([[1.0], [0.5], [0.75]]))
-    goals = np.tile([0.1, 0.0, 0.0], (3, 1))
-    row = experiments.metrics(BROKK_170, trace, 0, goals, np.zeros(3))
-    assert row["velocity_error_mean"] == pytest.approx((0.1 + 0.0 + 0.2) / 3)
-    assert row["velocity_rmse"] == pytest.approx(np.sqrt((0.01 + 0.04) / 3))
-    assert row["valve_travel"] == pytest.approx(0.5 + 0.2 + 1.0)  # from rest, then tick by tick
-    assert row["jerk_rms"] == pytest.approx(0.1 * 400)  # second difference 0.1 m/s at 20 Hz
-    assert row["reward_mean"] == pytest.approx(0.75)
-    assert row["off_axis_drift_max"] == pytest.approx(0.0)
-
-
-class _Perfect:
+class _Idle:
     """A controller that does nothing, for machines that should stand still."""
 
     def start(self, num: int) -> None:
@@ -68,11 +36,96 @@ class _Perfect:
 def test_an_idle_controller_stands_still_and_errs_by_the_goal() -> None:
     start = np.array([[1.5, 0.5, 0.58, 1.71, 1.24]])
     goals = np.tile([0.0, 0.0, 0.2], (20, 1, 1))
-    trace = rollout(BROKK_170, _Perfect(), start, goals, TaskConfig(), np.random.default_rng(0))
-    row = experiments.metrics(BROKK_170, trace, 0, goals[:, 0], tool_position(BROKK_170, start[0]))
+    trace = rollout(BROKK_170, _Idle(), start, goals, TaskConfig(), np.random.default_rng(0))
+    found = metrics(BROKK_170, trace, goals, tool_position(BROKK_170, start))
+    row = {name: values[0] for name, values in found.items()}
     assert row["velocity_error_mean"] == pytest.approx(0.2, abs=1e-6)
     assert row["reward_mean"] == pytest.approx(1 / 1.2, abs=1e-6)
     assert row["valve_travel"] == 0
+
+
+@dataclass(frozen=True)
+class FeedForward:
+    """Another controller, as a student would add it: the plant's steady commands for damped joint rates."""
+
+    machine: Machine
+
+    def start(self, num: int) -> None:
+        return None
+
+    def __call__(self, observation: np.ndarray, memory: None) -> tuple[np.ndarray, None]:
+        seen: Measured = measured(self.machine, observation)
+        down, up = speed_limits(self.machine, seen.q)
+        rates = joint_rates(self.machine, seen.q, seen.v_goal)
+        share = rates / np.where(rates > 0, *(limit[:, self.machine.driven] for limit in (up, -down)))
+        zone, limit = self.machine.dead_zone, self.machine.pwm_limit / 127
+        action = np.sign(share) * (zone + (limit - zone) * np.abs(share)) / limit
+        return to_command(self.machine, action), None
+
+
+def test_another_controller_takes_twenty_lines() -> None:
+    start = np.array([[1.5, 0.5, 0.58, 1.71, 1.24], [1.0, 0.5, 0.58, 1.71, 1.24]])
+    short = experiments.shortened(BROKK_170, task_sequences(BROKK_170)[:3], 4.0)
+    controllers = {"idle": _Idle(), "mine": FeedForward(BROKK_170)}
+    runs, traces = experiments.task_space(BROKK_170, controllers, short, start, 0)
+    error = {
+        c: np.mean([r["velocity_error_mean"] for r in runs if r["controller"] == c]) for c in controllers
+    }
+    assert error["mine"] < 0.5 * error["idle"]
+    assert set(traces) == {(c, s) for c in controllers for s in "xyz"}
+    assert [(r["controller"], r["sequence"], r["start"]) for r in runs[:3]] == [
+        ("idle", "x", 0),
+        ("idle", "x", 1),
+        ("idle", "y", 0),
+    ]
+
+
+def test_sequences_of_any_length_side_by_side_are_those_alone() -> None:
+    """One batch a length: rows stay with their names, quiet runs are the same as alone."""
+    start = np.array([[1.5, 0.5, 0.58, 1.71, 1.24], [1.0, 0.5, 0.9, 1.5, 1.0]])
+    long, short = (experiments.shortened(BROKK_170, task_sequences(BROKK_170), t) for t in (2.0, 1.5))
+    mixed, mine = [long[0], short[1], long[2]], {"mine": FeedForward(BROKK_170)}
+    runs, traces = experiments.task_space(BROKK_170, mine, mixed, start, 0)
+    assert [r["sequence"] for r in runs] == ["x", "x", "y", "y", "z", "z"]
+    alone, trace = experiments.task_space(BROKK_170, mine, mixed[1:2], start, 0)
+    assert [r["velocity_error_mean"] for r in alone] == [r["velocity_error_mean"] for r in runs[2:4]]
+    assert np.array_equal(trace["mine", "y"].q, traces["mine", "y"].q)
+    assert traces["mine", "z"].v_tool.shape == (40, 2, 3)
+
+
+def test_sensors_of_the_robustness_table() -> None:
+    q = np.cumsum(np.full((4000, 2, 5), 0.01), axis=0)
+    plain = np.array([experiments.exact(np.random.default_rng(0))(BROKK_170, row) for row in q])
+    np.testing.assert_array_equal(plain, read_encoder(BROKK_170, q))
+    noisy = experiments.noisy(np.random.default_rng(0))
+    counts = (np.array([noisy(BROKK_170, row) for row in q]) - q) / BROKK_170.encoder_step
+    assert counts.std() == pytest.approx(np.sqrt(1 + 1 / 12), rel=0.02)
+    lossy = experiments.lossy(np.random.default_rng(0))
+    seen = np.array([lossy(BROKK_170, row) for row in q])
+    lost = (seen[1:] == seen[:-1]).all(axis=-1)
+    assert lost.mean() == pytest.approx(0.05, abs=0.008)
+    np.testing.assert_array_equal(seen[1:][~lost], plain[1:][~lost])
+    np.testing.assert_array_equal(seen[0], plain[0])
+
+
+def test_variations_change_the_machine_and_not_what_its_controllers_know() -> None:
+    found = experiments.variations(BROKK_170)
+    assert len(found) == 11 and found["nominal"][0] is BROKK_170
+    changed = [
+        name for name, (plant, sensor) in found.items() if plant != BROKK_170 or sensor != experiments.exact
+    ]
+    assert len(changed) == 10
+    tilted = found["up -15 %, down +15 %"][0]
+    np.testing.assert_allclose(tilted.column("speed_positive"), 0.85 * BROKK_170.column("speed_positive"))
+    np.testing.assert_allclose(tilted.column("speed_negative"), 1.15 * BROKK_170.column("speed_negative"))
+    start = np.array([[1.5, 0.5, 0.58, 1.71, 1.24]] * 2)
+    short = experiments.shortened(BROKK_170, task_sequences(BROKK_170)[2:3], 3.0)
+    table = experiments.robustness(BROKK_170, {"mine": FeedForward(BROKK_170)}, short, start, 0)
+    errors = {name: row["mine"]["mean"] for name, row in table.items()}
+    assert errors["nominal"] < min(
+        errors["delay +50 ms"], errors["dead zone 10 %"], errors["valve gain -20 %"]
+    )
+    assert errors["delay +25 ms"] < errors["delay +50 ms"]
 
 
 def net_of_driven_joints() -> ActuatorNet:
@@ -119,11 +172,42 @@ def test_results_hold_every_run_with_its_figures(twice: tuple[Path, Path]) -> No
     runs = results["task_space"]["runs"]
     names = {"rl", "jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff"}
     keys = {(r["controller"], r["sequence"], r["start"]) for r in runs}
-    assert keys == {(c, s, i) for c in names for s in "xyz" for i in range(2)}
+    sequences = [s.name for s in task_sequences(BROKK_170)]
+    assert keys == {(c, s, i) for c in names for s in sequences for i in range(4)}
     assert all(r["velocity_rmse"] >= r["velocity_error_mean"] > 0 for r in runs)
     assert all(0 < r["reward_mean"] < 1 for r in runs)
-    rl = [r["velocity_error_mean"] for r in runs if r["controller"] == "rl"]
+    assert results["start_kinds"] == ["workspace", "limits", "workspace", "extended"]
+    assert all(r["kind"] == results["start_kinds"][r["start"]] for r in runs)
+    scored = [r for r in runs if r["kind"] == "workspace"]
+    rl = [r["velocity_error_mean"] for r in scored if r["controller"] == "rl"]
     assert results["task_space"]["summary"]["rl"]["all"]["velocity_error_mean"] == pytest.approx(np.mean(rl))
+
+
+def test_results_answer_the_papers_question(twice: tuple[Path, Path]) -> None:
+    results = json.loads((twice[0] / "results.json").read_text())
+    assert len(results["claims"]) == 7
+    for claim in results["claims"]:
+        assert set(claim) == {"paper", "measured", "numbers", "holds"} and claim["holds"] in (
+            True,
+            False,
+            None,
+        )
+    less = results["regret"]["less_perfect_model"]
+    assert set(less) == set(results["gains"]) | {"rl"} and all(
+        set(rows) == {*"xyz", "all"} for rows in less.values()
+    )
+    bound, rl = (
+        results["regret"]["summary"][c]["all"]["velocity_error_mean"] for c in ("perfect_model", "rl")
+    )
+    assert less["rl"]["all"]["mean"] == pytest.approx(rl - bound)
+    paired = results["task_space"]["rl_less"]["velocity_error_mean"]["jacobian_pid_ff"]["all"]
+    means = results["task_space"]["summary"]
+    difference = [means[c]["all"]["velocity_error_mean"] for c in ("rl", "jacobian_pid_ff")]
+    assert paired["mean"] == pytest.approx(difference[0] - difference[1])
+    assert paired["low"] < paired["mean"] < paired["high"]
+    low, high = results["task_space"]["intervals"]["rl"]["all"]["velocity_error_mean"]
+    assert low < means["rl"]["all"]["velocity_error_mean"] < high
+    assert set(results["robustness"]) == set(experiments.variations(BROKK_170))
 
 
 def test_results_tell_how_the_baselines_were_tuned(twice: tuple[Path, Path]) -> None:
@@ -139,9 +223,12 @@ def test_results_tell_how_the_baselines_were_tuned(twice: tuple[Path, Path]) -> 
 
 def test_the_report_is_one_file_with_its_figures(twice: tuple[Path, Path]) -> None:
     text = (twice[0] / "report.html").read_text()
-    assert len(re.findall(r"src='data:image/png;base64,", text)) == 7
+    assert len(re.findall(r"src='data:image/png;base64,", text)) == 10
     assert not re.findall(r"(?:src|href)='(?!data:)", text) and "http" not in text
     assert "not a real Brokk 170" in text
+    for claim in json.loads((twice[0] / "results.json").read_text())["claims"]:
+        assert html.escape(claim["measured"]) in text
+    assert text.count("<td>start ") == 4 and text.count("<td>tuning run ") == 2
 
 
 def test_gains_read_back_give_the_same_controller(twice: tuple[Path, Path]) -> None:
@@ -159,3 +246,12 @@ def test_the_whole_chain_spends_what_fit_and_train_do_by_default():
 
     effort = experiments.Effort()
     assert (effort.fit_steps, effort.train_steps) == (FitConfig().steps, PPOConfig().total_steps)
+
+
+def test_drift_is_the_largest_and_the_mean_distance_from_the_line() -> None:
+    p = np.array([[0.1, 0.0, 0.0], [0.2, 0.03, 0.04], [0.3, 0.0, 0.01]])[:, None]
+    zero = np.zeros((3, 1, 5))
+    trace = Trace(zero, zero, zero, zero, p, 0 * p, np.ones((3, 1)))
+    row = experiments.metrics(BROKK_170, trace, 0, np.tile([0.1, 0.0, 0.0], (3, 1)), np.zeros(3))
+    assert row["off_axis_drift_max"] == pytest.approx(0.05)
+    assert row["off_axis_drift_mean"] == pytest.approx((0.0 + 0.05 + 0.01) / 3)

@@ -157,7 +157,7 @@ def plain_due(machine: Machine, s: GateState, count: int, j: int) -> tuple[float
     if sent[7] == 0 or weakest <= 0:  # some command of the last 0.4 s may have done nothing
         return 0.0, 0.0
     if count != last:
-        return max(sign * (count - before), 0) / 2, 0.0
+        return max(sign * (count - before) - 1, 0) / 2, 0.0
     pace, slower = float(s.pace[j]), min(joint.q_dot_up, joint.q_dot_down)
     at_least = 0.3 * slower * DT / STEP / (80 - 1.5 * machine.dead_zone * 127) * weakest
     return pace, float(s.due[j]) + max(at_least, 0.5 * pace * weakest / strongest)
@@ -185,7 +185,7 @@ def plain_wrong(machine: Machine, s: GateState, i: GateInputs, now: float) -> in
         note(8, j, not joint.q_min - 0.05 <= c * STEP <= joint.q_max + 0.05)
         fastest = 2 * max(joint.q_dot_up, joint.q_dot_down) * DT / STEP + 4
         note(9, j, abs(c - old) > fastest)
-        note(10, j, plain_due(machine, s, c, j)[1] > 1.5)
+        note(10, j, plain_due(machine, s, c, j)[1] > 1.0)
         limit = 80 if joint.driven else 0
         note(11, j, not -limit <= i.m[j] <= limit)
     return min((1 + kind * 6 + node for kind, node in found), default=0)
@@ -280,14 +280,14 @@ def cases(machine: Machine, num: int, seed: int) -> tuple[GateState, GateInputs,
         counts=old,
         sent=sent,
         pace=np.where(some(0.4, n), 0.0, rng.uniform(0, 3, (num, n))),
-        due=rng.choice([0.0, 1.0, 1.4], (num, n), p=[0.7, 0.2, 0.1]),
+        due=rng.choice([0.0, 0.5, 0.9], (num, n), p=[0.7, 0.2, 0.1]),
     )
     # what is owed: as much as may be owed, to the bit, and a bit more
     owed = [
         [plain_due(machine, GateState(*row(state, k)), counts[k, j], j)[1] for j in range(n)]
         for k in range(num)
     ]
-    rest = 1.5 - (np.array(owed) - state.due)
+    rest = 1.0 - (np.array(owed) - state.due)
     bit = np.nextafter(rest, rng.choice([-9.0, 9.0], (num, n)))
     return (
         state._replace(due=np.where(some(0.8, n), state.due, np.where(some(0.5, n), rest, bit))),

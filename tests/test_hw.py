@@ -388,6 +388,44 @@ def test_every_fault_ends_neutral_within_175_ms_and_latched(name: str, phase: fl
     world.close()
 
 
+@pytest.mark.parametrize("node", [1, 3, 4, 5])
+@pytest.mark.parametrize(
+    ("counts", "bound"), [(80, 0.175), (40, 0.175), (-40, 0.175), (20, 0.45), (16, 0.85)]
+)
+def test_a_frozen_encoder_of_a_moving_joint_is_found_at_small_commands_too(
+    node: int, counts: int, bound: float
+) -> None:
+    """The table of docs/hardware.md: the smaller the command, the longer a count may stand still."""
+    push = Push(*(counts * (np.arange(1, 6) == node)))
+    world = World(push, hand := Hand())
+    world.drive.begin()
+    world.run(1.6)
+    world.rest(0.0215)
+    begun = world.t
+    freeze(Fault(world, hand, push), node)
+    world.run(1.2)
+    times, m = world.commands
+    assert m[times <= begun][-1].any() and not m[times > begun + bound].any()
+    assert world.drive.reason == f"fault: q{node}: frozen, or the joint does not move"
+    world.close()
+
+
+@pytest.mark.parametrize(("counts", "bound"), [(80, 0.55), (-40, 0.55), (20, 0.8), (16, 1.25)])
+def test_an_encoder_that_is_frozen_from_the_start_is_found(counts: int, bound: float) -> None:
+    """A joint at rest may take 0.4 s to move, so that this takes longer than the 175 ms."""
+    push = Push(0, 0, 0, 0, 0)
+    world = World(push, hand := Hand())
+    world.drive.begin()
+    world.run(0.6)
+    freeze(Fault(world, hand, push), 3)
+    push.m[2], begun = counts, world.t
+    world.run(1.6)
+    times, m = world.commands
+    assert m.any() and not m[times > begun + bound].any()
+    assert world.drive.reason == "fault: q3: frozen, or the joint does not move"
+    world.close()
+
+
 def test_a_program_that_is_killed_leaves_the_valves_neutral_and_latched() -> None:
     """SIGKILL: no more ticks. The machine's own watchdog closes, and a resumed frame does not reopen."""
     world = World(Push(*PUSH), Hand())
@@ -455,6 +493,61 @@ def test_a_fault_is_left_by_a_new_edge_only() -> None:
     assert world.drive.gate.driving and world.drive.reason == ""
     assert world.drive.status().startswith("driving v wanted +0.10 +0.00 +0.00 is ")
     assert world.commands[1][-1].tolist() == list(PUSH)
+    world.close()
+
+
+@pytest.mark.parametrize(
+    ("delay", "found"),
+    [
+        ((5, 5), False),
+        ((15, 15), False),
+        ((25, 25), True),
+        ((45, 45), True),
+        ((0, 15), False),
+        ((0, 60), True),
+    ],
+)
+def test_positions_later_than_their_window_are_found(delay: tuple[int, int], found: bool) -> None:
+    """Constantly, or by chance between two bounds [ms]; up to 20 ms are within the window."""
+    rng, push, held = np.random.default_rng(0), Push(*PUSH), list[tuple[float, bytes]]()
+    world = World(push, Hand())
+    world.drive.begin()
+    world.run(0.8)
+    begun = world.t
+
+    def hold(data: bytes) -> list[bytes]:
+        held.append((world.t + rng.uniform(*delay) / 1e3, data))
+        return []
+
+    def noise() -> Out:
+        due = [data for then, data in held if then <= world.t]
+        held[:] = [item for item in held if item[0] > world.t]
+        return [(0x183, data) for data in due]
+
+    world.upward, world.noise = only(0x183, hold), noise
+    world.run(1.0)
+    times, m = world.commands
+    assert world.drive.reason == ("fault: q3: silent" if found else "")
+    assert m[times > begun + 0.175].any() != found
+    world.close()
+
+
+def test_a_delay_of_a_whole_tick_is_found_when_it_begins_and_looks_fresh_after_it() -> None:
+    """A position has neither time nor number: what comes within its window is taken for this tick's."""
+    hand, push, held = Hand(), Push(*PUSH), list[bytes]()
+    world = World(push, hand)
+    world.drive.begin()
+    world.run(0.8)
+    begun = world.t
+    world.upward = only(0x183, lambda data: (held.append(data), held[-2:-1])[1])
+    world.run(0.3)
+    times, m = world.commands
+    assert world.drive.reason == "fault: q3: silent" and not m[times > begun + 0.175].any()
+    hand.enable = False
+    world.run(0.1)
+    hand.enable = None
+    world.run(0.2)
+    assert world.drive.gate.driving  # the limit of what can be known, told in docs/hardware.md
     world.close()
 
 
@@ -897,3 +990,8 @@ def test_more_frames_than_a_bus_can_carry_are_a_fault() -> None:
     world.run(0.2)
     assert "expected fewer than 2000 frames" in world.drive.reason and not world.drive.gate.driving
     world.close()
+
+
+def test_wishes_are_rounded_not_cut() -> None:
+    wish = hw.unpack_wish(hw.Wish((0.00019, -0.00019, 0.00011)).pack())
+    assert wish.v_goal == (0.0002, -0.0002, 0.0001)

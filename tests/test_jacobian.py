@@ -513,3 +513,133 @@ def test_candidates_side_by_side_are_the_single_controllers():
         alone = rollout(BROKK_170, one, POSE[None], goals[:, :1], quiet, rng)
         np.testing.assert_allclose(whole.u[:, i], alone.u[:, 0], atol=1e-9)
         np.testing.assert_allclose(whole.q[:, i], alone.q[:, 0], atol=1e-6)
+
+
+def test_the_map_keeps_the_joints_apart():
+    """Halfway between its angles the first joint moves at 1.5 rad/s under full command, the second at 4.5."""
+    velocity = np.array([[[-1.0, 0.0, 1.0], [-2.0, 0.0, 2.0]], [[-3.0, 0.0, 3.0], [-6.0, 0.0, 6.0]]])
+    steady = classic.SteadyMap(np.array([[0.0, 1.0], [0.0, 1.0]]), np.array([-1.0, 0.0, 1.0]), velocity)
+    found = steady.command(np.array([0.5, 0.5]), np.array([0.75, 0.75]))
+    np.testing.assert_allclose(found, [0.75 / 1.5, 0.75 / 4.5], atol=1e-9)
+
+
+# --- what a mutation tool had changed unseen -------------------------------------------------------
+
+
+def test_damping_sets_in_at_a_quarter_of_the_largest_manipulability():
+    low, high = BROKK_170.column("q_min"), BROKK_170.column("q_max")
+    q = np.random.default_rng(9).uniform(low, high, (20_000, 5))
+    largest = classic.manipulability(jacobian(BROKK_170, q)).max()
+    assert 0.24 * largest < classic.manipulability_threshold(BROKK_170) < 0.251 * largest
+    stiff = [replace(j, a=0.0, d=0.0) for j in BROKK_170.joints]  # no reach: 0, but something to divide by
+    assert 0 < classic.manipulability_threshold(replace(BROKK_170, joints=tuple(stiff))) < 1e-6
+
+
+def test_the_map_interpolates_over_several_angles_and_holds_beyond_them():
+    """Speeds at full command are 1, 2 and 4 rad/s at -1, 0.5 and 2 rad."""
+    scale, u = np.array([1.0, 2.0, 4.0])[None, :, None], np.array([-1.0, 0.0, 1.0])
+    steady = classic.SteadyMap(np.array([[-1.0, 0.5, 2.0]]), u, scale * u)
+    for angle, speed in [(-3, 1), (-1, 1), (-0.25, 1.5), (0.5, 2), (1.25, 3), (2, 4), (9, 4)]:
+        found = steady.command(np.array([float(angle)]), np.array([0.5]))
+        np.testing.assert_allclose(found, [0.5 / speed], atol=1e-9)
+
+
+def test_the_steady_map_is_what_nets_say_of_a_history_that_moves_steadily():
+    """Each entry is a fixed point, found here by a plain loop of one joint at one angle under one command."""
+    plain = obedient_net(BROKK_170)
+    first = plain.weights[0].copy()  # angles and velocities matter too, but a loop through them settles
+    first[:, :26, 0] = 0.05 * np.random.default_rng(12).standard_normal((4, 26))
+    net = replace(plain, weights=(first, *plain.weights[1:]))
+    steady = classic.steady_map(BROKK_170, net)
+    assert steady.velocity.shape == (4, 9, 41)
+    lags = np.arange(-12, 1) / 20
+    for angle in (0, 8):
+        speeds = np.zeros((41, 4))
+        for c, u in enumerate(steady.u):
+            for _ in range(200):
+                v, q = speeds[c], steady.q[:, angle]
+                rows = [[q[j] + v[j] * lags, np.full(13, v[j]), np.full(13, u)] for j in range(4)]
+                speeds[c] = 0.5 * v + 0.5 * net.predict(np.array(rows, np.float32)[None])[0]
+        rising = np.maximum.accumulate(speeds, axis=0).T
+        np.testing.assert_allclose(steady.velocity[:, angle], rising, atol=1e-5)
+        assert (np.diff(rising, axis=1) > 0).all()
+
+
+def test_gains_at_a_bound_are_all_named_whatever_the_lower_end(monkeypatch):
+    monkeypatch.setitem(classic.GAINS, "kp", (1.0, 3.0))
+    low, high = classic.gain_bounds(BROKK_170)
+    every = [f"{kind} q{i}" for kind in ("kp", "ki", "kd") for i in (1, 3, 4, 5)] + ["feedback", "ready"]
+    for ends in (low, high):
+        assert classic.gains_at_bound(JacobianController(BROKK_170, ends, 0.1, 1.0)) == every
+    middle = (low + high) / 2
+    assert classic.gains_at_bound(JacobianController(BROKK_170, middle, 0.1, 1.0)) == []
+
+
+def test_the_search_starts_about_the_gains_it_is_given():
+    low, high = classic.gain_bounds(BROKK_170)
+    start, seen = replace(controller(), gains=(low + high) / 2), []
+
+    def cost(candidates):
+        seen.append(candidates.gains)
+        return np.arange(float(len(candidates.gains)))
+
+    classic.tune(start, cost, seed=0, generations=1, label="start")
+    np.testing.assert_allclose(seen[0][0], start.gains)
+    apart = (seen[0][1:] - start.gains) / (high - low)
+    assert seen[0].shape == (32, 14) and 0.13 < apart.std() < 0.17
+    assert all(((gains >= low) & (gains <= high)).all() for gains in seen)
+
+
+def test_the_weights_of_a_tick_follow_the_rates_of_the_tick_before():
+    """The same observation, remembered rates towards a joint's limit or away from it: other commands."""
+    c, near = controller(kp=1.5), POSE.copy()
+    near[2] = BROKK_170.joints[2].q_max - 0.05
+    seen, idle = at_rest(near, GOAL)[None], c.start(1)
+    rate = np.array([[0.0, 0.1, 0.0, 0.0]])
+    _, towards = c(seen, idle._replace(rate=rate))
+    _, away = c(seen, idle._replace(rate=-rate))
+    assert np.abs(towards.rate[0, 1]) < 0.5 * np.abs(away.rate[0, 1])
+
+
+def test_the_slope_at_a_limit_is_that_a_thousandth_of_the_range_before_it():
+    """There it is (1 - 2e) / (4 e^2 (1 - e)^2) over the range, e = 0.001."""
+    width = BROKK_170.column("q_max") - BROKK_170.column("q_min")
+    for q, sign in ((BROKK_170.column("q_max"), 1), (BROKK_170.column("q_min") - 1, -1)):
+        slope = classic.limit_gradient(BROKK_170, q) * width
+        np.testing.assert_allclose(slope, sign * 0.998 / (4e-6 * 0.999**2), rtol=1e-6)
+
+
+def test_feed_forward_is_added_to_the_pid():
+    steady = classic.steady_map(BROKK_170, obedient_net(BROKK_170))
+    seen = at_rest(POSE, GOAL)[None]
+    plain, ahead, both = (
+        c(seen, c.start(1))[0][0, BROKK_170.driven]
+        for c in (
+            controller(kp=1.5),
+            replace(controller(), feedforward=steady),
+            replace(controller(kp=1.5), feedforward=steady),
+        )
+    )
+    opening = classic.valve_opening(BROKK_170, plain) + classic.valve_opening(BROKK_170, ahead)
+    np.testing.assert_allclose(classic.valve_opening(BROKK_170, both), opening, atol=1.1 / 127)
+    assert (np.abs(opening) > 3 / 127).any()
+
+
+def test_a_machine_at_rest_keeps_its_valves_closed_beside_one_that_moves():
+    c = controller(kp=1e-3, ready=0.03)
+    goals = np.array([[0.0, 0.0, 0.1], [0.0, 0.0, 0.0]])
+    u, _ = c(at_rest(np.stack([POSE, POSE]), goals), c.start(2))
+    assert u[0].any() and not u[1].any()
+
+
+def test_a_single_observation_gives_the_command_of_a_batch_of_one():
+    c = controller(w0=0.5, kp=1.0, ki=3.0, kd=0.05, feedback=0.3, ready=0.02)
+    seen, memory = at_rest(POSE, 9 * GOAL), c.start(1)
+    alone = Memory(*(part[0] for part in memory))
+    for _ in range(3):
+        (u, memory), (one, alone) = c(seen[None], memory), c(seen, alone)
+        np.testing.assert_allclose(one, u[0], atol=1e-12)
+
+
+def test_joined_gains_are_floats():
+    assert classic.join_gains(BROKK_170, dict.fromkeys(classic.GAINS, 1)).dtype == float

@@ -406,3 +406,9 @@ def test_velocities_of_another_machine_are_refused_by_their_own_name(function):
     with pytest.raises(ValueError) as caught:
         function(BROKK_170, np.zeros((2, 4)), np.zeros((2, 5)))
     assert str(caught.value) == "q: expected (..., 5), got (2, 4)"
+
+
+def test_rates_keep_the_float_type_of_the_angles():
+    q = np.array([0.3, 0.5, 0.58, 1.71, 1.24], np.float32)
+    assert joint_rates(BROKK_170, q, np.array([0.1, 0.0, 0.2])).dtype == np.float32
+    assert joint_rates(BROKK_170, q.astype(float), np.zeros(3, np.float32)).dtype == np.float64

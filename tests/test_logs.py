@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import os
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from brokk_min.__main__ import main
 from brokk_min.logs import (
     Log,
     Recording,
@@ -188,7 +190,7 @@ def test_logged_velocities_are_used_and_estimated_ones_are_causal(tmp_path):
     np.testing.assert_allclose(log.recordings[0].q_dot[:, 1], -1.0)
     del columns["q_dot_a"], columns["q_dot_b"]
     before = read_log([write(tmp_path / "without.npz", columns)], 4).recordings[0].q_dot
-    columns["q_a"] = np.where(np.arange(40) < 20, columns["q_a"], 99.0)
+    columns["q_a"] = np.where(np.arange(40) < 20, columns["q_a"], 50.0)
     after = read_log([write(tmp_path / "without.npz", columns)], 4).recordings[0].q_dot
     np.testing.assert_array_equal(before[:20], after[:20])
     assert np.abs(after[20, 0]) > 100
@@ -357,6 +359,29 @@ BAD_CSV = {
         "run,time,u_a,u_b,q_a,q_b,q_dot_a\nx,0,0,0,0,0,0\nx,0.05,0,0,0,0,0\n",
         ["row 1", "a column q_dot_b"],
     ),
+    "command as PWM byte": (
+        GOOD.replace("0.4", "175"),
+        ["row 5", "column u_a", "not percent or bytes", "175"],
+    ),
+    "angle in degrees": (GOOD.replace("1.2", "68.8"), ["row 4", "column q_a", "rad, not degrees", "68.8"]),
+    "time in milliseconds": (
+        "run,time,u_a,q_a\nx,0,0,0\nx,50,0,0\nx,100,0,0\n",
+        ["row 2", "column time", "20 Hz", "0.02 Hz"],
+    ),
+    "time of day": (GOOD.replace("0.05", "12:30:05"), ["row 3", "column time", "number", "'12:30:05'"]),
+    "no name": (GOOD.replace("x,0.10", " ,0.10"), ["row 4", "column run", "a name", "' '"]),
+    "line of units": (GOOD.replace("x,0.00", "-,s,-,rad\nx,0.00"), ["row 2", "column time", "'s'"]),
+    "remark": (GOOD.replace("x,0.10", "# pause\nx,0.10"), ["row 4", "expected 4 cells", "got 1"]),
+    "blank line": (GOOD.replace("x,0.10", "\nx,0.10"), ["row 4", "expected 4 cells", "got 0"]),
+    "open quote": (GOOD.replace("x,0.10", '"x,0.10'), ["row 4", "expected 4 cells", "got 1"]),
+    "tabs": (GOOD.replace(",", "\t"), ["row 1", "u_<joint>"]),
+    "no header": (GOOD.partition("\n")[2], ["row 1", "u_<joint>", "'0.00'"]),
+    "overflow": (GOOD.replace("1.3", "1e999"), ["row 5", "column q_a", "finite", "'1e999'"]),
+    "two files in one": (GOOD + GOOD.partition("\n")[2], ["row 6", "column time", "later than 0.15"]),
+    "velocity in degrees": (
+        "run,time,u_a,q_a,q_dot_a\nx,0,0,0,0\nx,0.05,0,0,-90\n",
+        ["row 3", "column q_dot_a", "rad/s, not degrees/s", "-90"],
+    ),
     "velocity not finite": (
         "run,time,u_a,q_a,q_dot_a\nx,0,0,0,0\nx,0.05,0,0,inf\n",
         ["row 3", "column q_dot_a", "finite", "inf"],
@@ -374,6 +399,32 @@ def test_a_bad_csv_is_refused_by_file_row_and_column(tmp_path, case):
     message = str(caught.value)
     assert message.startswith(f"{path}: ") and "expected" in message and "got" in message
     assert all(word in message for word in words), message
+
+
+NO_TEXT = {
+    "UTF-16": GOOD.encode("utf-16"),
+    "Latin-1": GOOD.replace("x", "Gr\xfcn").encode("latin-1"),
+    "zeros": GOOD.encode() + bytes(40),
+    "picture": b"\x89PNG\r\n\x1a\n\xf0\xf1",
+    "gzip": gzip.compress(GOOD.encode()),
+}
+
+
+@pytest.mark.parametrize("case", [*BAD_CSV, *NO_TEXT])
+def test_fit_refuses_a_bad_log_in_one_line_and_writes_nothing(tmp_path, capsys, case):
+    path, words = tmp_path / "bad.csv", []
+    if case in NO_TEXT:
+        path.write_bytes(NO_TEXT[case])
+    else:
+        path.write_text(BAD_CSV[case][0])
+        words = BAD_CSV[case][1]
+    options = ["--out", tmp_path / "n.npz", "--json", tmp_path / "f.json", "--figure", tmp_path / "f.png"]
+    assert main([str(a) for a in ("fit", path, *options)]) == 1
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.count("\n") == 1
+    assert said.err.startswith(f"brokk-min: {path}: ") and "expected" in said.err and "got" in said.err
+    assert all(word in said.err for word in words), said.err
+    assert [p.name for p in tmp_path.iterdir()] == ["bad.csv"]
 
 
 def test_the_good_log_of_the_table_above_is_good(tmp_path):

@@ -210,6 +210,27 @@ def test_policy_loss_is_the_mean():
     assert float(found) == pytest.approx(-(1.2 + 0.5 + 4.0 - 1.0) / 4)
 
 
+@pytest.mark.parametrize("group", [2, 4, 8])
+def test_an_advantage_is_judged_against_the_others_of_its_group(group):
+    """By the definition, one environment at a time; what the whole group has in common drops out."""
+    raw = torch.randn(5, 8, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    found = ppo.relative(raw, group)
+    for t in range(5):
+        for i in range(8):
+            first = i // group * group
+            others = [raw[t, j].item() for j in range(first, first + group) if j != i]
+            assert found[t, i].item() == pytest.approx(raw[t, i].item() - np.mean(others))
+    common = torch.repeat_interleave(torch.randn(5, 8 // group, dtype=torch.float64), group, dim=1)
+    torch.testing.assert_close(ppo.relative(raw + common, group), found)
+    assert ppo.relative(raw, 1) is raw
+
+
+def test_training_refuses_groups_that_do_not_fit(tmp_path):
+    net = small_net(BROKK_170, np.random.default_rng(0))
+    with pytest.raises(ValueError, match="num_envs: expected a multiple of group 8, got 12"):
+        train(BROKK_170, net, ppo.TASK, PPOConfig(num_envs=12), 0, tmp_path / "p")
+
+
 def test_normalise():
     np.testing.assert_allclose(ppo.normalise(torch.tensor([1.0, 2.0, 3.0])), [-1, 0, 1], atol=1e-6)
     wild = 50 + 7 * torch.randn(999, generator=torch.Generator().manual_seed(1))
@@ -245,6 +266,8 @@ def test_the_nets_are_those_of_the_paper():
 
 class Script:
     """An environment that plays a tape: each observation is one number."""
+
+    config = TaskConfig()
 
     def __init__(self, e):
         self.e, self.tick = e, 0
@@ -343,7 +366,7 @@ def test_the_learning_rate_is_lowered_while_the_policy_changes_too_much():
 class Bandit:
     """One tick an episode: the reward falls with the distance of the action from a target."""
 
-    target = np.array([0.6, -0.4], np.float32)
+    config, target = TaskConfig(), np.array([0.6, -0.4], np.float32)
 
     def __init__(self, num):
         self.num = num

@@ -14,15 +14,70 @@ from brokk_min.kinematics import lowest_point
 from brokk_min.machine import BROKK_170
 
 
-def test_starts_are_feasible_off_the_ground_and_not_the_tuning_starts() -> None:
-    scored = sequences.axis_sequences(BROKK_170)
-    starts = sequences.draw_starts(BROKK_170, scored, 6, np.random.default_rng(2))
-    assert (lowest_point(BROKK_170, starts) > 0.1).all()
+def test_the_starts_of_the_package_are_of_all_kinds_and_not_the_tuning_starts() -> None:
+    starts = sequences.scored_starts(BROKK_170, 64, [], 0)
+    kinds = np.array(sequences.start_kinds(BROKK_170, starts))
+    assert [np.sum(kinds == kind) for kind in sequences.KINDS] == [32, 16, 16]
+    assert kinds[:4].tolist() == ["workspace", "limits", "workspace", "extended"]
+    assert (lowest_point(BROKK_170, starts) > 0).all()
+    assert len(np.unique(starts, axis=0)) == 64
+    workspace = starts[kinds == "workspace"]
+    for sequence in sequences.task_sequences(BROKK_170)[:3]:
+        goals = np.repeat(sequence.goals[:, None], len(workspace), axis=1)
+        assert sequences.feasible(BROKK_170, workspace, goals).all(), sequence.name
     tuning, goals = sequences.tuning_goals(BROKK_170, 4, 6.0, 1000)
     assert np.abs(tuning[:, None] - starts[None]).max(-1).min() > 1e-3
-    goals_scored = {tuple(row) for s in scored for row in s.goals if row.any()}
+    goals_scored = {tuple(row) for s in sequences.task_sequences(BROKK_170) for row in s.goals if row.any()}
     moving = goals[np.linalg.norm(goals, axis=-1) > 0]
     assert not any(tuple(row) in goals_scored for row in moving)
+
+
+def test_more_starts_than_the_package_has_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"starts_brokk170.csv: expected at most 64 starts, got 65"):
+        sequences.scored_starts(BROKK_170, 65, [], 0)
+
+
+def test_another_machine_draws_its_starts(tmp_path: Path) -> None:
+    other = replace(BROKK_170, name="other")
+    slow = sequences.task_sequences(other)[-1:]
+    starts = sequences.scored_starts(other, 5, slow, 3)
+    kinds = sequences.start_kinds(other, starts)
+    assert kinds == ["workspace", "limits", "workspace", "extended", "workspace"]
+    feasible = sequences.feasible(other, starts, np.repeat(slow[0].goals[:, None], 5, axis=1))
+    assert feasible[[0, 1, 2, 4]].all()
+    np.testing.assert_array_equal(starts, sequences.scored_starts(other, 5, slow, 3))
+    sequences.write_starts(tmp_path / "s.csv", other, starts)
+    np.testing.assert_array_equal(sequences.read_starts(tmp_path / "s.csv", other), starts)
+
+
+def test_kinds_of_starts_by_hand() -> None:
+    ordinary = [1.5, 0.5, 0.58, 1.71, 1.24]
+    near_limit = [1.5, 0.5, 0.58, 2.80, 1.24]  # 0.1 rad below q4's 2.9
+    locked_at_limit = [1.5, 0.05, 0.58, 1.71, 1.24]  # q2 is not driven
+    upright = [0.0, 1.4, 0.5, 2.7, 1.9]  # 4.5 of 4.75 m, 0.8 m from the slew axis
+    kinds = sequences.start_kinds(BROKK_170, np.array([ordinary, near_limit, locked_at_limit, upright]))
+    assert kinds == ["workspace", "limits", "workspace", "extended"]
+
+
+def test_all_sequences_last_18_seconds_end_at_rest_and_where_they_began() -> None:
+    found = {s.name: s.goals for s in sequences.task_sequences(BROKK_170)}
+    assert list(found)[:3] == ["x", "y", "z"] and len(found) == 9
+    for name, goals in found.items():
+        assert goals.shape == (360, 3), name
+        assert not goals[:20].any() and not goals[-20:].any()
+        np.testing.assert_allclose(goals.sum(axis=0), 0, atol=1e-9)
+        assert np.linalg.norm(goals, axis=-1).max() <= BROKK_170.tool_speed
+    path = np.cumsum(found["circle"], axis=0) * 0.05
+    centre = (path[20:340].max(0) + path[20:340].min(0)) / 2
+    np.testing.assert_allclose(
+        np.linalg.norm(path[20:340] - centre, axis=-1), 0.15 * 16 / (2 * np.pi), rtol=0.02
+    )
+    assert not found["circle"][:, 1].any() and not found["rectangle"][:, 0].any()
+    corners = np.cumsum(found["rectangle"], axis=0)[[20 + 99, 20 + 159, 20 + 259, 20 + 319]] * 0.05
+    np.testing.assert_allclose(corners[:, 1:], [[0.75, 0], [0.75, 0.45], [0, 0.45], [0, 0]], atol=1e-9)
+    assert np.linalg.norm(found["slow"], axis=-1).max() == pytest.approx(0.03)
+    starts_and_stops = np.diff((np.linalg.norm(found["stop_and_go"], axis=-1) > 0).astype(int))
+    assert (starts_and_stops == 1).sum() == (starts_and_stops == -1).sum() == 8
 
 
 def test_feasible_refuses_a_path_out_of_reach() -> None:
@@ -98,3 +153,13 @@ def test_tuning_runs_are_drawn_like_the_policys_episodes() -> None:
     assert max(holds) > 40 and np.mean(holds) < config.hold_max_s * 20
     again = sequences.tuning_goals(BROKK_170, 8, 12.0, 7)
     assert np.array_equal(starts, again[0]) and np.array_equal(goals, again[1])
+
+
+def test_feasible_refuses_a_tool_that_stays_behind() -> None:
+    """Stretched out straight no joint can move the tool outward: all stand, slow and inside their ranges."""
+    wide = [replace(j, cylinder_base=0.0, q_min=-3.0, q_max=4.0) for j in BROKK_170.joints]
+    machine = replace(BROKK_170, joints=tuple(wide))
+    start = np.array([[0.0, 0.5, 0.1, np.pi, 3 * np.pi / 4]])
+    outward = np.array([np.cos(0.6), 0.0, np.sin(0.6)]) / 5  # along the links behind q2
+    assert sequences.feasible(machine, start, np.zeros((5, 1, 3)))[0]
+    assert not sequences.feasible(machine, start, np.tile(outward, (5, 1, 1)))[0]

@@ -31,7 +31,8 @@ def short(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(module.os, "environ", dict(module.os.environ))
     if "slow" not in request.keywords:
         pose = np.array([1.5, 0.5, 0.58, 1.71, 1.24])
-        monkeypatch.setattr(module, "draw_starts", lambda m, s, num, rng: pose + 0.1 * rng.random((num, 5)))
+        random = np.random.default_rng(2).random
+        monkeypatch.setattr(module, "scored_starts", lambda m, num, s, seed: pose + 0.1 * random((num, 5)))
         monkeypatch.setattr(
             module, "axis_sequences", lambda m: [s._replace(goals=s.goals[15:25]) for s in full(m)]
         )

@@ -1,0 +1,211 @@
+"""Recorded runs: what is known of a machine tick by tick, from a bus, a log or a rollout, and films of it."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from tqdm import tqdm
+
+from brokk_min import hw, logs, view
+from brokk_min.bus import OPERATOR, SYNC, WISH, Frame, Nodes, read_frames
+from brokk_min.env import Trace
+from brokk_min.gate import encoder_counts
+from brokk_min.kinematics import tool_state
+from brokk_min.machine import Machine, decode_pwm, estimate_velocity
+
+Array = NDArray[Any]
+TITLES = {
+    "rl": "RL policy",
+    "jacobian": "Jacobian + PID",
+    "levers": "levers, joint by joint",
+    "jacobian_pid_k0.1": "Jacobian + PID",
+    "jacobian_pid_ff": "Jacobian + PID with feed-forward",
+}
+
+
+class Known(NamedTuple):
+    """What the loop, a bus or a log tells of one tick."""
+
+    tick: float
+    q: Array  # rad (n,), nan: unknown
+    q_dot: Array  # rad/s (n,)
+    u: Array  # in [-1, 1] (n,)
+    v_goal: Array  # m/s (3,)
+    driving: bool
+    wrong: int = 0  # of `fault_name`
+    fault: int = 0
+    mode: int = 0
+    lateness: float = 0.0  # s
+
+    def pack(self) -> Array:
+        """As numbers in a row."""
+        return np.hstack([np.ravel(value) for value in self]).astype(float)
+
+
+def unpack_known(machine: Machine, values: Array) -> Known:
+    """What `Known.pack` packed."""
+    n = machine.n
+    tick, q, q_dot, u, v, rest = np.split(values, np.cumsum([1, n, n, n, 3]))
+    driving, wrong, fault, mode = (int(x) for x in rest[:4])
+    return Known(float(tick[0]), q, q_dot, u, v, bool(driving), wrong, fault, mode, float(rest[4]))
+
+
+class Ticks:
+    """Frames of a bus or a log, one after another, as what is known at each tick; it only listens."""
+
+    def __init__(self, machine: Machine) -> None:
+        self.machine, self.nodes, self.wish = machine, Nodes(machine), hw.Wish()
+        self.u, self.driving, self.tick = np.zeros(machine.n), False, 0
+        self.angles: list[Array] = []  # rad, as many as the velocity needs
+
+    def hear(self, frame: Frame) -> Known | None:
+        """Take in one frame; at a SYNC, what is known of the tick that it ends."""
+        if frame.id == SYNC:
+            known, self.nodes.frames[:] = self._known(), 0
+            self.tick += 1
+            return known
+        if frame.id == WISH and frame.channel == OPERATOR:
+            self.wish = hw.unpack_wish(frame.data)
+        elif frame.id == self.machine.valve_frame_id and len(frame.data) == 8:
+            self.u, self.driving = decode_pwm(list(frame.data[: self.machine.n])), frame.data[7] == 1
+        else:
+            self.nodes.hear(frame)
+        return None
+
+    def _known(self) -> Known:
+        m, v_goal = self.machine, np.array(self.wish.v_goal) * self.driving
+        if (self.nodes.frames != 1).any():
+            self.angles, nan = [], np.full(m.n, np.nan)
+            return Known(self.tick, nan, nan, self.u, v_goal, self.driving)
+        q = encoder_counts(m, self.nodes.raw) * m.encoder_step
+        self.angles = [*(self.angles or [q] * m.velocity_samples), q][-m.velocity_samples :]
+        q_dot = estimate_velocity(np.stack(self.angles, axis=-1), m.velocity_samples, m.dt)
+        return Known(self.tick, q, np.asarray(q_dot), self.u, v_goal, self.driving)
+
+
+# --- films --------------------------------------------------------------------------------------------
+
+
+class Run(NamedTuple):
+    """A recorded run: what was known tick by tick, and the tool's."""
+
+    title: str
+    colour: view.Colour
+    known: Sequence[Known]
+    p_tool: Array  # m (T, 3)
+    error: Array  # |v_goal - v_tool| [m/s] (T,)
+    path: Array  # where the tool was to go [m] (K, 3), or none
+    hold: Array  # corners of the arm on the way [m] (K, 3)
+
+
+def recorded(machine: Machine, title: str, colour: view.Colour, known: Sequence[Known], path: Array) -> Run:
+    """A run from its ticks; the velocity error is that of the velocities that it holds."""
+    q, q_dot, v_goal = (np.array([getattr(k, name) for k in known]) for name in ("q", "q_dot", "v_goal"))
+    p_tool, v_tool, _ = tool_state(machine, q, q_dot)
+    corners = view.skeleton(machine, q[::10]).reshape(-1, 3)
+    error = np.linalg.norm(v_goal - v_tool, axis=-1)
+    return Run(title, colour, known, p_tool, error, path, np.vstack([corners, path]))
+
+
+def run_of_log(machine: Machine, path: Path, colour: view.Colour) -> Run:
+    """The ticks of a candump log from the first that drives; ticks without all positions are left out.
+
+    Raises:
+        ValueError: no log, or one in which nothing drives.
+    """
+    ticks = Ticks(machine)
+    known = [k for frame in read_frames(path) if (k := ticks.hear(frame)) and np.isfinite(k.q).all()]
+    first = next((i for i, k in enumerate(known) if k.driving), None)
+    if first is None:
+        raise ValueError(f"{path}: expected a log in which the valves are driven, got none")
+    return recorded(machine, path.name, colour, known[first:], np.zeros((0, 3)))
+
+
+def run_of_trace(machine: Machine, title: str, trace: Trace, run: int, goals: Array, start: Array) -> Run:
+    """One run of a rollout: true motion, and where the goals (T, 3) lead from the start [m] (3,)."""
+    rows = zip(trace.q[:, run], trace.q_dot[:, run], trace.u[:, run], goals, strict=True)
+    known = [Known(i, *row, driving=True) for i, row in enumerate(rows)]
+    path = start + np.vstack([np.zeros(3), np.cumsum(goals, axis=0)]) * machine.dt
+    colour = next((c for name, c in view.COLOURS.items() if title.startswith(name)), view.STEEL)
+    return recorded(machine, title, colour, known, path)
+
+
+def film(machine: Machine, runs: Sequence[Run], tick: int, size: tuple[int, int]) -> list[view.Shape]:
+    """The picture of one tick of all runs, by the same clock; what is over stands still."""
+    scenes, hold = [], np.vstack([run.hold for run in runs])
+    for run in runs:
+        at = min(tick, len(run.known) - 1)
+        known, mean = run.known[at], run.error[: at + 1].mean()
+        title, status = TITLES.get(run.title, run.title), f"{at * machine.dt:.1f} s"
+        scene = view.Scene(known.q, known.q_dot, known.u, known.v_goal, run.p_tool[: at + 1], run.path)
+        notes = [f"velocity error {run.error[at]:.3f} m/s", f"mean so far {mean:.3f} m/s"]
+        scenes.append(scene._replace(title=title, status=status, colour=run.colour, notes=notes, hold=hold))
+    return view.draw(machine, scenes, size)
+
+
+def write_film(path: Path, machine: Machine, runs: Sequence[Run], size: tuple[int, int], fps: float) -> None:
+    """All runs as a GIF, or as MP4 where ffmpeg is installed.
+
+    Raises:
+        ValueError: another kind of file, or no ffmpeg.
+    """
+    ticks = range(0, max(len(run.known) for run in runs), max(1, round(machine.rate / fps)))
+    bar = tqdm(ticks, desc="draw", unit="picture", disable=None)
+    images = (view.picture(film(machine, runs, tick, size), size) for tick in bar)
+    if path.suffix == ".gif":
+        films = [Image.fromarray(image) for image in images]
+        flat = [image.quantize(palette=_palette(films), dither=Image.Dither.NONE) for image in films]
+        with logs.whole_file(path) as file:
+            duration = round(1000 * ticks.step / machine.rate)
+            flat[0].save(file, "GIF", save_all=True, append_images=flat[1:], duration=duration, loop=0)
+    elif path.suffix == ".mp4":
+        form = f"-f rawvideo -pix_fmt rgb24 -s {size[0]}x{size[1]} -r {machine.rate / ticks.step} -i -"
+        form += " -pix_fmt yuv420p -f mp4 -movflags frag_keyframe+empty_moov pipe:1"
+        try:
+            with logs.whole_file(path) as file:
+                command = ["ffmpeg", "-loglevel", "error", *form.split()]
+                with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=file) as process:
+                    for image in images:
+                        process.stdin.write(image.tobytes())  # type: ignore[union-attr]
+                    process.stdin.close()  # type: ignore[union-attr]
+                if process.returncode:
+                    raise ValueError(f"{path}: expected ffmpeg to write it, got status {process.returncode}")
+        except FileNotFoundError as error:
+            raise ValueError(
+                f"{path}: expected ffmpeg for .mp4, or a name ending in .gif, got none"
+            ) from error
+    else:
+        raise ValueError(f"{path}: expected a name ending in .gif or .mp4, got {path.suffix!r}")
+
+
+def _palette(films: Sequence[Image.Image]) -> Image.Image:
+    """96 colours of some pictures and of all that warns or measures, however little of it there is."""
+    some = [np.asarray(film) for film in films[:: max(1, len(films) // 6)]]
+    named = [*view.COLOURS.values(), *view.MOODS.values(), view.MEASURED, view.PATH, view.WARNING]
+    swatches = np.repeat(np.array(named, np.uint8), 40, axis=0)[:, None].repeat(some[0].shape[1], axis=1)
+    return Image.fromarray(np.vstack([*some, swatches])).quantize(96)
+
+
+def show_film(machine: Machine, runs: Sequence[Run], size: tuple[int, int]) -> None:
+    """All runs in a window, in real time; space halts, left and right move by a second."""
+    window, at, going = view.Window(size, "brokk_min replay"), 0, True
+    pg, last = window.pygame, max(len(run.known) for run in runs) - 1
+    try:
+        while True:
+            for event in pg.event.get():
+                if event.type == pg.QUIT or (event.type == pg.KEYDOWN and event.key == pg.K_ESCAPE):
+                    return
+                if event.type == pg.KEYDOWN:
+                    going ^= event.key == pg.K_SPACE
+                    at += round(machine.rate) * ((event.key == pg.K_RIGHT) - (event.key == pg.K_LEFT))
+            at = min(max(at, 0), last)
+            window.show(film(machine, runs, at, size), machine.rate)
+            at += going
+    finally:
+        window.close()

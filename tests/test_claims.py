@@ -1,0 +1,106 @@
+"""Verdicts follow from the numbers: made-up runs for which they are known."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers_machines import obedient_net
+
+from brokk_min import claims, experiments, report
+from brokk_min.env import Measured, Trace
+from brokk_min.machine import BROKK_170
+
+PAPERS = experiments.PAPERS
+POSE = np.array([1.5, 0.5, 0.58, 1.71, 1.24])
+
+
+def runs_with(key: str, **values: float) -> list[dict[str, Any]]:
+    """Six starts along x with a figure about a value by controller; starts differ, controllers too."""
+    names = {"rl": "rl", "high": PAPERS[0], "low": PAPERS[1]}
+    return [
+        {"controller": names[c], "sequence": "x", "start": i, "kind": "workspace", key: v + 0.001 * (i % 3)}
+        for c, v in values.items()
+        for i in range(6)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("rl", "high", "low", "holds"),
+    [
+        (0.02, 0.20, 0.30, [True, True]),  # as the paper says
+        (0.02, 0.03, 0.03, [True, False]),  # baselines stay still too
+        (0.09, 0.20, 0.30, [False, True]),
+        (0.09, 0.06, 0.30, [False, False]),  # one baseline drifts less than RL
+    ],
+)
+def test_drift(rl: float, high: float, low: float, holds: list[bool]) -> None:
+    found = claims.drift_claims(runs_with("off_axis_drift_max", rl=rl, high=high, low=low), PAPERS)
+    assert [claim["holds"] for claim in found] == holds
+    assert f"{rl + 0.001:.3g}" in found[0]["measured"]
+
+
+def test_one_start_gives_no_verdict() -> None:
+    runs = [run for run in runs_with("off_axis_drift_max", rl=0.1, high=0.2, low=0.2) if run["start"] == 0]
+    found = claims.drift_claims(runs, PAPERS)
+    assert [claim["holds"] for claim in found] == [None, None]
+    assert report.verdict(found[0]).endswith("This was not measured.")
+
+
+@pytest.mark.parametrize(("rl", "holds"), [(0.01, True), (0.02, False), (0.03, False)])
+def test_conclusion(rl: float, holds: bool) -> None:
+    runs = runs_with("velocity_error_mean", rl=rl, high=0.02, low=0.025)
+    assert claims.conclusion(runs, PAPERS)["holds"] is holds
+
+
+@pytest.mark.parametrize(
+    ("share", "jerk", "holds"),
+    [
+        ((0.9, 0.5, 0.7), (2.0, 4.0, 9.0), [True, True, True]),
+        ((0.9, 0.7, 0.5), (2.0, 9.0, 4.0), [False, False, True]),
+        ((0.6, 0.5, 0.7), (2.0, 4.0, 9.0), [True, True, False]),  # RL is slowed
+        ((0.9, 0.5, 0.7), (5.0, 4.0, 9.0), [True, True, False]),  # RL jerks
+    ],
+)
+def test_singular(share: tuple[float, ...], jerk: tuple[float, ...], holds: list[bool]) -> None:
+    names = ("rl", "jacobian_pid_k0.1", "jacobian_pid_k0.05")
+    spread = 0.01 * np.array([0, 1, 2, 0, 1, 2])
+    runs = runs_with("jerk_rms", **dict(zip(("rl", "high", "low"), jerk, strict=True)))
+    found = claims.singular_claims(runs, {n: s + spread for n, s in zip(names, share, strict=True)})
+    assert [claim["holds"] for claim in found] == holds
+
+
+def still_trace(ticks: int, q: np.ndarray, v: np.ndarray, q_dot: np.ndarray) -> Trace:
+    zero = np.zeros((ticks, len(q), 5))
+    return Trace(
+        zero + q, zero + q_dot, zero, zero, zero[..., :3], np.zeros((ticks, len(q), 3)) + v, zero[..., 0]
+    )
+
+
+def test_speed_share_counts_lasting_goals_at_singular_poses() -> None:
+    """A stretched and an ordinary pose at half the wanted speed; the first 0.6 s do not count."""
+    stretched = np.array([0.3, 0.5, 0.1, np.pi, 3 * np.pi / 4])
+    q, goals = np.stack([stretched, POSE]), np.tile([0.2, 0.0, 0.0], (30, 1))
+    trace = still_trace(30, q, np.array([0.1, 0.3, 0.0]), np.zeros(5))
+    trace.v_tool[:12] = 9.0
+    share = claims.speed_share(BROKK_170, 3.9, trace, goals)
+    assert share[0] == pytest.approx(0.5) and np.isnan(share[1])
+
+
+@pytest.mark.parametrize(("down", "holds"), [(0.9, False), (0.5, True)])
+def test_direction(down: float, holds: bool) -> None:
+    """Joints that follow 90 % of the wanted rates while the tool goes forward, and `down` on the way back."""
+    pid = experiments.baselines(BROKK_170, obedient_net(BROKK_170))["jacobian_pid_k0.1"]
+    goals = np.repeat([[0.2, 0.0, 0.0], [-0.2, 0.0, 0.0]], 20, axis=0)
+    poses = POSE + 0.02 * np.arange(4)[:, None]
+    trace = still_trace(40, poses, goals[:, None], np.zeros(5))
+    q_dot, driven = trace.q_dot, BROKK_170.driven
+    for _ in range(30):  # weights depend on the direction of motion: find the rates that it wants
+        seen = Measured(trace.v_tool, trace.v_tool, trace.q, q_dot[..., driven])
+        share = np.where(goals[:, None, :1] > 0, 0.9, down)
+        q_dot[..., driven] = share * pid.rates(seen, q_dot[..., driven])
+    found = claims.direction_claim(BROKK_170, pid, trace, goals)
+    assert found["holds"] is holds
+    errors = sorted({round(n["mean"], 2) for n in found["numbers"].values() if n["mean"] is not None})
+    assert errors == sorted({0.1, round(1 - down, 2)})

@@ -1,0 +1,138 @@
+"""Figures of merit worked by hand; intervals against SciPy; the same starts compared."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from brokk_min import metrics as m
+from brokk_min.env import Trace
+from brokk_min.machine import BROKK_170
+
+
+def line_distance(p: np.ndarray, goals: np.ndarray) -> np.ndarray:
+    return m.line_distance(p[:, None], goals[:, None], np.zeros((1, 3)))[:, 0]
+
+
+def test_line_distance_of_a_hand_worked_drift() -> None:
+    # along x with 0.3 m to the side after the second tick; the stop and the way back keep the line
+    goals = np.array([[0.2, 0, 0], [0.2, 0, 0], [0, 0, 0], [-0.1, 0, 0]])
+    p = np.array([[1.0, 0, 0], [2.0, 0.3, 0.4], [2.0, 0.3, 0.0], [1.0, 0.0, 0.1]])
+    assert line_distance(p, goals) == pytest.approx([0.0, 0.5, 0.3, 0.1])
+
+
+def test_line_distance_starts_a_new_line_when_the_direction_turns() -> None:
+    goals = np.array([[0.2, 0, 0], [0, 0.2, 0]])
+    p = np.array([[1.0, 0.1, 0], [1.2, 5.0, 0]])  # second line through (1, 0.1) along y
+    assert line_distance(p, goals) == pytest.approx([0.1, 0.2])
+
+
+def test_line_distance_before_the_first_motion_is_from_the_start() -> None:
+    goals = np.array([[0.0, 0, 0], [0, 0, 0.1]])
+    p = np.array([[0.0, 0.3, 0.4], [0.1, 0.0, 7.0]])
+    assert line_distance(p, goals) == pytest.approx([0.5, 0.1])
+
+
+def test_line_distance_of_a_batch_is_that_of_its_runs() -> None:
+    rng = np.random.default_rng(0)
+    goals = np.repeat(rng.integers(-1, 2, (6, 4, 3)) * 0.1, 5, axis=0)
+    p, start = rng.normal(size=(30, 4, 3)), rng.normal(size=(4, 3))
+    whole = m.line_distance(p, goals, start)
+    for i in range(4):
+        alone = m.line_distance(p[:, i : i + 1], goals[:, i : i + 1], start[i : i + 1])
+        np.testing.assert_allclose(whole[:, i], alone[:, 0])
+
+
+def trace_of(v: np.ndarray, q: np.ndarray | None = None, u: np.ndarray | None = None) -> Trace:
+    """One run with tool velocities v (T, 3) from the origin."""
+    middle = (BROKK_170.column("q_min") + BROKK_170.column("q_max")) / 2
+    q = np.tile(middle, (len(v), 1)) if q is None else q
+    u = np.zeros((len(v), 5)) if u is None else u
+    rewards = 1 / (1 + np.arange(len(v)))
+    return Trace(*(a[:, None] for a in (q, 0 * q, q, u, np.cumsum(v, axis=0) * 0.05, v, rewards)))
+
+
+def figures(v: np.ndarray, goals: np.ndarray, **more: np.ndarray) -> dict[str, float]:
+    found = m.metrics(BROKK_170, trace_of(v, **more), goals[:, None], np.zeros((1, 3)))
+    return {name: float(value[0]) for name, value in found.items()}
+
+
+def test_metrics_by_hand() -> None:
+    v = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.3, 0, 0]])
+    u = np.array([[0.0, 0.5], [0.2, 0.5], [0.2, -0.5]])
+    row = figures(v, np.tile([0.1, 0.0, 0.0], (3, 1)), u=u)
+    assert row["velocity_error_mean"] == pytest.approx((0.1 + 0.0 + 0.2) / 3)
+    assert row["velocity_rmse"] == pytest.approx(np.sqrt((0.01 + 0.04) / 3))
+    assert row["valve_travel"] == pytest.approx(0.5 + 0.2 + 1.0)  # from rest, then tick by tick
+    assert row["jerk_rms"] == pytest.approx(0.1 * 400)  # second difference 0.1 m/s at 20 Hz
+    assert row["reward_mean"] == pytest.approx((1 + 1 / 2 + 1 / 3) / 3)
+    assert row["off_axis_drift_max"] == pytest.approx(0.0)
+    assert row["position_error_mean"] == pytest.approx((0.005 + 0.005 + 0.005) / 3)  # behind, behind, ahead
+
+
+def test_errors_near_a_change_of_goal_are_transient() -> None:
+    """Rest for 10 ticks, then 0.2 m/s for 30: 12 ticks of 0.1 m/s error, 18 of 0.01; 0.05 at rest."""
+    goals = np.zeros((40, 3))
+    goals[10:, 0] = 0.2
+    v = goals.copy()
+    v[:10, 1], v[10:22, 0], v[22:, 0] = 0.05, 0.1, 0.19
+    row = figures(v, goals)
+    assert row["velocity_error_transient"] == pytest.approx(0.1)
+    assert row["velocity_error_steady"] == pytest.approx((10 * 0.05 + 18 * 0.01) / 28)
+    assert row["settling_time"] == pytest.approx(12 * 0.05)  # below 0.03 m/s from then on
+
+
+def test_a_run_that_does_not_settle_counts_to_the_next_change() -> None:
+    goals = np.zeros((30, 3))
+    goals[:20, 2] = 0.2  # the first goal is a change too: the machine comes from rest
+    v = np.zeros((30, 3))
+    v[5:10, 2] = 0.2  # near for a while, then away again
+    assert figures(v, goals)["settling_time"] == pytest.approx((20 * 0.05 + 0) / 2)
+
+
+def test_a_goal_that_turns_slowly_is_no_change() -> None:
+    turn = np.linspace(0, 2 * np.pi, 320)
+    goals = 0.15 * np.stack([np.cos(turn), 0 * turn, np.sin(turn)], axis=1)
+    since = m.since_change(BROKK_170, goals[:, None])
+    np.testing.assert_array_equal(since[:, 0], np.arange(320))  # the start is the only change
+    still = figures(np.zeros((4, 3)), np.zeros((4, 3)))
+    assert np.isnan(still["settling_time"]) and np.isnan(still["velocity_error_transient"])
+
+
+def test_time_at_limits_counts_driven_joints_alone() -> None:
+    q = np.tile((BROKK_170.column("q_min") + BROKK_170.column("q_max")) / 2, (8, 1))
+    q[:, 1] = BROKK_170.column("q_max")[1]  # locked
+    q[2:5, 3] = BROKK_170.column("q_max")[3] - 0.005
+    q[4:6, 0] = BROKK_170.column("q_min")[0] + 0.005
+    assert figures(np.zeros((8, 3)), np.zeros((8, 3)), q=q)["time_at_limits"] == pytest.approx(4 * 0.05)
+
+
+def test_intervals_are_students() -> None:
+    values = np.random.default_rng(1).normal(2.0, 0.3, 12)
+    expected = stats.ttest_1samp(values, 0).confidence_interval(0.95)
+    np.testing.assert_allclose(m.interval(np.append(values, np.nan)), expected)
+    assert m.interval(np.array([1.0, np.nan])) == [None, None]
+
+
+def run(controller: str, sequence: str, start: int, error: float | None) -> dict[str, object]:
+    labels = {"controller": controller, "sequence": sequence, "start": start, "kind": "workspace"}
+    return labels | {"error": error}
+
+
+def test_pairs_are_compared_on_the_same_start() -> None:
+    """Starts differ far more than controllers: the paired interval sees the difference, means do not."""
+    base = {0: 1.0, 1: 5.0, 2: 9.0}
+    runs = [run("a", s, i, e + 0.1 * i) for s in "xy" for i, e in reversed(base.items())]
+    runs += [run("b", s, i, e + (0.2 if s == "x" else 0.4)) for s in "xy" for i, e in base.items()]
+    found = m.paired(runs, "b", "a", "error")
+    assert found["x"]["mean"] == pytest.approx(0.1) and found["y"]["mean"] == pytest.approx(0.3)
+    assert found["all"]["mean"] == pytest.approx(0.2)
+    np.testing.assert_allclose([found["x"]["low"], found["x"]["high"]], m.interval(np.array([0.2, 0.1, 0.0])))
+
+
+def test_a_summary_leaves_out_what_was_not_measured() -> None:
+    runs = [run("a", "x", 0, 1.0), run("a", "y", 0, None), run("a", "x", 1, 3.0), run("a", "y", 1, None)]
+    found = m.summary(runs)["a"]
+    assert found["x"]["error"] == 2.0 and found["y"]["error"] is None and found["all"]["error"] == 2.0
+    assert m.intervals(runs)["a"]["y"]["error"] == [None, None]

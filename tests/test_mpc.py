@@ -1,0 +1,90 @@
+"""The bound: it knows the plant exactly, plans with it, and leaves less error than the classical way."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers_machines import obedient_net
+
+from brokk_min import experiments, mpc
+from brokk_min.actuator import plant_reset, plant_step
+from brokk_min.env import TaskConfig, observe, rest_state, rollout
+from brokk_min.kinematics import tool_velocity
+from brokk_min.machine import BROKK_170, limit_command
+
+POSES = np.array([[1.5, 0.5, 0.58, 1.71, 1.24], [-0.8, 0.3, 0.9, 1.5, 1.0]])
+
+
+def test_the_goal_is_read_back_from_the_observation() -> None:
+    rng = np.random.default_rng(0)
+    goals = rng.uniform(-0.3, 0.3, (2, 3))
+    state = rest_state(BROKK_170, POSES, goals, plant=True)
+    noise = rng.uniform(-0.05, 0.05, observe(BROKK_170, state.history, goals, state.lag).shape)
+    seen = observe(BROKK_170, state.history, goals, state.lag, noise)
+    np.testing.assert_allclose(mpc.wanted_velocity(BROKK_170, seen, POSES), goals, atol=1e-6)
+
+
+def test_predicted_errors_are_what_the_plant_then_does() -> None:
+    rng = np.random.default_rng(1)
+    bound = mpc.PerfectModel(BROKK_170, POSES)
+    plant = plant_reset(BROKK_170, POSES)
+    for _ in range(8):  # into motion, so that spools, readiness and delayed commands matter
+        plant = plant_step(BROKK_170, plant, limit_command(BROKK_170, rng.uniform(-0.6, 0.6, (2, 5))))
+    u = np.repeat(rng.uniform(-0.6, 0.6, (2, 3, 2, 5)), 3, axis=2)
+    goal = rng.uniform(-0.2, 0.2, (2, 3))
+    found = bound.errors(plant, u, goal)
+    assert found.shape == (2, 3, 6, 3)
+    for candidate in range(3):
+        state = plant
+        for tick in range(6):
+            before, state = state.q, plant_step(BROKK_170, state, u[:, candidate, tick])
+            v = tool_velocity(BROKK_170, state.q, (state.q - before) * 20)
+            np.testing.assert_allclose(found[:, candidate, tick], goal - v, atol=1e-5)
+
+
+def test_a_steady_opening_moves_the_tool_at_the_goal() -> None:
+    goal = np.array([[0.05, -0.1, 0.02], [0.0, 0.05, -0.08]])
+    bound, plant = mpc.PerfectModel(BROKK_170, POSES, dither=0.0), plant_reset(BROKK_170, POSES)
+    u = bound.commands(mpc.steady_opening(BROKK_170, POSES, goal)[:, None], 0)[:, 0]
+    for _ in range(20):
+        before, plant = plant.q, plant_step(BROKK_170, plant, u)
+    v = tool_velocity(BROKK_170, plant.q, (plant.q - before) * 20)
+    np.testing.assert_allclose(v, goal, atol=0.02)  # the arm has moved on meanwhile
+
+
+def test_a_step_never_makes_the_plan_worse() -> None:
+    rng = np.random.default_rng(2)
+    bound, plant = mpc.PerfectModel(BROKK_170, POSES), plant_reset(BROKK_170, POSES)
+    goal = rng.uniform(-0.2, 0.2, (2, 3))
+    plan = rng.uniform(-0.3, 0.3, (2, sum(mpc.BLOCKS), 4))
+
+    def cost(opening: np.ndarray) -> np.ndarray:
+        errors = bound.errors(plant, bound.commands(opening, 0)[:, None], goal)
+        return np.linalg.norm(errors, axis=-1).mean(axis=(1, 2))
+
+    costs = [cost(plan)]
+    for _ in range(3):
+        plan = bound.improve(plant, plan, goal, 0)
+        costs.append(cost(plan))
+    assert (np.diff(costs, axis=0) < 1e-4).all()
+    assert (costs[-1] < 0.8 * costs[0]).all()
+
+
+def test_the_bound_leaves_less_error_than_the_baselines() -> None:
+    goals = np.zeros((50, 2, 3))
+    goals[10:30, :, 2], goals[30:, :, 1] = 0.15, -0.1
+    errors = {}
+    baseline = experiments.baselines(BROKK_170, obedient_net(BROKK_170))["jacobian_pid_k0.1"]
+    for name, controller in {"bound": mpc.PerfectModel(BROKK_170, POSES), "baseline": baseline}.items():
+        trace = rollout(BROKK_170, controller, POSES, goals, TaskConfig(), np.random.default_rng(0))
+        errors[name] = np.linalg.norm(goals - trace.v_tool, axis=-1)
+        counts = trace.u * 127
+        np.testing.assert_allclose(counts, np.rint(counts), atol=1e-9)
+        assert np.abs(counts).max() <= 80 and not trace.u[..., BROKK_170.locked].any()
+    assert errors["bound"].mean() < 0.7 * errors["baseline"].mean()
+    assert errors["bound"][22:30].mean() < 0.006
+
+
+def test_a_batch_that_is_no_multiple_of_the_poses_is_refused() -> None:
+    with pytest.raises(ValueError, match="poses: expected 3 or a part of it, got 2"):
+        mpc.PerfectModel(BROKK_170, POSES).start(3)

@@ -1,0 +1,580 @@
+"""The window and what is behind it, without a display: hands, loop, lines to trace, recorded runs."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import can
+import numpy as np
+import pygame
+import pytest
+from helpers_bus import START, Push, World
+from PIL import Image
+from test_hw import BASELINE, Virtual
+
+from benchmarks.bus import random_policy
+from brokk_min import experiments, play, remote, replay, tracing, view
+from brokk_min.__main__ import main
+from brokk_min.kinematics import tool_position
+from brokk_min.machine import BROKK_170
+from brokk_min.play import Hands, Session
+from brokk_min.policy import save_policy
+from brokk_min.remote import Chosen, Levers, Loop, Mailbox, Remote
+from brokk_min.replay import Known
+from brokk_min.sequences import feasible
+from brokk_min.tracing import Attempt, Tracing
+
+MODES = ["rl", "jacobian", "levers"]
+
+
+@pytest.fixture(autouse=True)
+def no_display(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    pygame.display.init()
+    pygame.event.clear()
+    yield
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    pygame.display.init()
+    pygame.event.clear()
+
+
+# --- hands --------------------------------------------------------------------------------------------
+
+
+class Operator:
+    """Presses keys of `Hands` through pygame's queue; time goes on by half a second a look."""
+
+    def __init__(self, modes: list[str] = MODES) -> None:
+        pygame.display.set_mode((10, 10))
+        pygame.event.clear()
+        self.hands, self.now = Hands(BROKK_170, pygame, modes), 0.0
+        self.look()
+
+    def look(self, seconds: float = 0.5) -> remote.Ask:
+        for event in pygame.event.get():
+            self.hands.hear(event)
+        self.now += seconds
+        return self.hands.ask(self.now, seconds)
+
+    def key(self, name: str, down: bool = True, seconds: float = 0.5) -> remote.Ask:
+        kind = pygame.KEYDOWN if down else pygame.KEYUP
+        pygame.event.post(pygame.event.Event(kind, key=pygame.key.key_code(name)))
+        return self.look(seconds)
+
+    def event(self, kind: int, **more: Any) -> remote.Ask:
+        pygame.event.post(pygame.event.Event(kind, **more))
+        return self.look()
+
+
+@pytest.mark.parametrize(
+    ("keys", "way"),
+    [
+        ("up", (1, 0, 0)),
+        ("down", (-1, 0, 0)),
+        ("left", (0, 1, 0)),
+        ("right", (0, -1, 0)),
+        ("w", (0, 0, 1)),
+        ("s", (0, 0, -1)),
+        ("up left", (0.5**0.5, 0.5**0.5, 0)),
+        ("w s", (0, 0, 0)),
+    ],
+)
+def test_keys_ask_for_velocities_of_at_most_tool_speed(keys: str, way: tuple[float, ...]) -> None:
+    operator = Operator()
+    ask = [operator.key(key) for key in keys.split()][-1]
+    np.testing.assert_allclose(ask.v_goal, 0.3 * np.array(way), atol=1e-12)
+    assert not ask.enable and not ask.levers.any()
+    ask = [operator.key(key, down=False) for key in keys.split()][-1]
+    assert not ask.v_goal.any()  # let go: neutral at once
+
+
+def test_a_key_deflects_little_by_little_and_shift_by_a_third() -> None:
+    operator = Operator()
+    assert operator.key("up", seconds=0.05).v_goal[0] == pytest.approx(0.3 * 0.2)  # full after 0.25 s
+    assert operator.look(0.05).v_goal[0] == pytest.approx(0.3 * 0.4)
+    assert operator.look(1.0).v_goal[0] == pytest.approx(0.3)
+    assert operator.key("left shift").v_goal[0] == pytest.approx(0.1)
+
+
+def test_the_switch_counts_only_if_pressed_with_nothing_deflected() -> None:
+    operator = Operator()
+    assert operator.key("space").enable
+    assert operator.key("up").enable  # deflecting later is driving
+    operator.key("space", False)
+    assert not operator.key("space").enable
+    assert not operator.key("up", False).enable  # centring does not make up for it
+    operator.key("space", False)
+    assert operator.key("space").enable
+
+
+@pytest.mark.parametrize("loss", ["focus", "mode"])
+def test_focus_lost_and_another_translator_need_a_fresh_press(loss: str) -> None:
+    operator = Operator()
+    operator.key("space")
+    assert operator.key("up").enable
+    if loss == "focus":
+        ask = operator.event(pygame.WINDOWFOCUSLOST)
+        assert not ask.enable and not ask.v_goal.any() and ask.alive
+        assert not operator.key("space").enable  # keys that come without focus do not count
+        assert not operator.event(pygame.WINDOWFOCUSGAINED).enable
+    else:
+        ask = operator.key("tab")
+        assert not ask.enable and ask.mode == 1
+        operator.key("up", False)
+        assert not operator.look().enable  # still held
+    operator.key("space", False)
+    assert operator.key("space").enable
+
+
+def test_each_lever_is_one_joint_and_the_translators_go_round() -> None:
+    operator = Operator()
+    operator.key("tab")
+    operator.key("tab")
+    for i, (plus, minus) in enumerate(play.LEVER_KEYS[:4]):
+        ask = operator.key(plus)
+        np.testing.assert_array_equal(ask.levers, np.eye(4)[i])
+        assert ask.mode == 2 and not ask.v_goal.any()
+        operator.key(plus, False)
+        np.testing.assert_array_equal(operator.key(minus).levers, -np.eye(4)[i])
+        operator.key(minus, False)
+    assert operator.key("tab").mode == 0
+
+
+def test_closing_asks_to_stop() -> None:
+    assert Operator().event(pygame.QUIT).stop and Operator().key("escape").stop
+
+
+def test_a_gamepad_drives_and_its_removal_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")  # a dummy window never has the focus
+    pygame.joystick.quit()
+    operator = Operator()
+    device = Virtual()
+    operator.look()
+    device.button(play.PAD_BUTTON, True)
+    assert operator.look().enable
+    device.axis(1, -1.0)
+    device.axis(4, 1.0)
+    ask = operator.look()
+    np.testing.assert_allclose(ask.v_goal, 0.3 * np.array([1, 0, -1]) / 2**0.5, atol=1e-6)
+    device.button(play.PAD_MODE, True)
+    ask = operator.look()
+    assert ask.mode == 1 and not ask.enable
+    device.button(play.PAD_BUTTON, False)
+    device.axis(1, 0.0)
+    device.axis(4, 0.0)
+    operator.look()
+    device.button(play.PAD_BUTTON, True)
+    assert operator.look().enable
+    device.unplug()
+    ask = operator.look()
+    assert not ask.alive and not ask.enable and not ask.v_goal.any()
+    assert operator.key("space").alive  # the keyboard takes over, with a press of its own
+    operator.key("space", False)
+    assert operator.key("space").enable
+
+
+# --- between window and loop --------------------------------------------------------------------------
+
+
+def test_a_mailbox_gives_the_newest_values_or_none() -> None:
+    box = Mailbox(3)
+    assert box.read() is None
+    box.write([1.0, 2.0, 3.0])
+    box.write([4.0, 5.0, 6.0])
+    np.testing.assert_array_equal(box.read(), [4.0, 5.0, 6.0])
+    np.frombuffer(box.raw)[-1] += 1  # as it is while the next values are being written
+    assert box.read() is None
+
+
+def test_what_is_known_survives_the_mailbox() -> None:
+    rng = np.random.default_rng(0)
+    known = Known(7, *rng.normal(size=(3, 5)), rng.normal(size=3), True, 3, 4, 2, 0.001)
+    back = replay.unpack_known(BROKK_170, known.pack())
+    assert back._replace(q=0, q_dot=0, u=0, v_goal=0) == known._replace(q=0, q_dot=0, u=0, v_goal=0)
+    for name in ("q", "q_dot", "u", "v_goal"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(known, name))
+
+
+class Remoted:
+    """The loop behind mailboxes on a bus with an injected clock."""
+
+    def __init__(self, *controllers: Any, log: Any = None) -> None:
+        levers = Levers(BROKK_170)
+        self.asks, self.chosen = Mailbox(12), Chosen([*controllers, levers])
+        self.world = World(self.chosen, Remote(self.asks, self.chosen, levers, lambda: self.world.t), log=log)
+        self.world.drive.__class__ = Loop
+        self.known: list[Known] = []
+        self.world.drive.tell = self.known.append  # type: ignore[attr-defined]
+        self.ask(False)
+        self.world.drive.begin()
+
+    def ask(self, enable: bool, v: Any = (0, 0, 0), mode: int = 0, levers: Any = (0, 0, 0, 0)) -> None:
+        self.asks.write([self.world.t, mode, enable, 1, 0, *v, *levers])
+
+    def go(self, seconds: float, enable: bool, v: Any = (0, 0, 0), **more: Any) -> None:
+        end = self.world.t + seconds
+        while self.world.t < end - 1e-9:
+            self.ask(enable, v, **more)
+            self.world.run(0.04)
+
+
+def test_levers_pass_the_gate_one_joint_each() -> None:
+    loop = Remoted(Push(60, 0, 0, 0, 0))
+    loop.go(0.5, False, mode=1)
+    loop.go(0.2, True, mode=1)
+    assert loop.known[-1].driving and loop.known[-1].mode == 1
+    loop.go(0.5, True, mode=1, levers=(0, 0, -1, 0))
+    np.testing.assert_allclose(loop.known[-1].u * 127, [0, 0, 0, -80, 0], atol=1e-9)
+    assert loop.known[-1].q_dot[3] < -0.1 and abs(loop.known[-1].q_dot[0]) < 1e-3
+    loop.go(0.1, True, mode=0)
+    np.testing.assert_allclose(loop.known[-1].u * 127, [60, 0, 0, 0, 0], atol=1e-9)  # another translates
+    loop.go(0.1, False)
+    assert not loop.known[-1].driving and not loop.known[-1].u.any()
+    loop.world.close()
+
+
+def test_a_window_that_hangs_is_a_lost_device() -> None:
+    loop = Remoted(Push(60, 0, 0, 0, 0))
+    loop.go(0.5, False)
+    loop.go(0.4, True)
+    assert loop.known[-1].driving
+    last = loop.world.t
+    loop.world.run(0.5)
+    times, commands = loop.world.commands
+    late = times[(commands != 0).any(axis=1)].max() - last
+    assert 0.1 < late <= remote.STALE + 0.06
+    assert "operator's device lost" in play._status(BROKK_170, loop.known[-1], "")[0]
+    loop.go(0.5, True)
+    assert not loop.known[-1].driving  # back again, but the switch was never released
+    loop.go(0.1, False)
+    loop.go(0.1, True)
+    assert loop.known[-1].driving
+    loop.world.close()
+
+
+def test_a_loop_whose_window_died_stops(monkeypatch: pytest.MonkeyPatch) -> None:
+    asks, levers = Mailbox(12), Levers(BROKK_170)
+    operator = Remote(asks, Chosen([levers]), levers, lambda: 10.0)
+    assert operator(False, True) == play.hw.Wish(alive=False)  # it has not said anything yet
+    monkeypatch.setattr(
+        remote.multiprocessing, "parent_process", lambda: SimpleNamespace(is_alive=lambda: False)
+    )
+    assert operator(True, True) == play.hw.Wish(alive=False, stop=True)
+    asks.write([9.9, 0, 1, 1, 0, 0.1, 0, 0, 0, 0, 0, 0])
+    assert operator(True, True) == play.hw.Wish((0.1, 0.0, 0.0), enable=True)
+
+
+def test_a_whole_traced_rectangle_is_scored() -> None:
+    """An operator who steers to the next point of the line; the figures against sums of their own."""
+    loop = Remoted(BASELINE)
+    loop.go(0.4, False)
+    session = Session(BROKK_170, ["jacobian", "levers"], None)
+    session.take(loop.known[-1], 0.0)
+    session.next_task()
+    tracing_, first = session.tracing, loop.known[-1].q
+    assert tracing_ is not None and session.task == "rectangle"
+    np.testing.assert_allclose(tracing_.line[0], tool_position(BROKK_170, first))
+    loop.go(0.2, True)
+    rows: list[Known] = []
+    while not session.attempts and loop.world.t < 60:
+        away = tracing_.line[min(tracing_.passed + 2, len(tracing_.line) - 1)] - tool_position(
+            BROKK_170, loop.known[-1].q
+        )
+        loop.go(0.04, True, 0.2 * away / max(np.linalg.norm(away), 0.05))
+        session.take(loop.known[-1], loop.world.t)
+        rows.append(loop.known[-1])
+    loop.world.close()
+    (attempt,) = session.attempts
+    begun = next(i for i, k in enumerate(rows) if k.u.any())
+    assert attempt.seconds == pytest.approx((len(rows) - begun) / 20)
+    corners = (
+        tracing_.line[0]
+        + 5.0
+        * np.array([[0, 0, 0], [0, 0.16, 0], [0.1, 0.16, 0], [0.1, 0, 0]])
+        * view.extent(BROKK_170).reach
+        / 5.0
+    )
+    fine = np.vstack(
+        [
+            a + np.linspace(0, 1, 500)[:, None] * (b - a)
+            for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)
+        ]
+    )
+    p = tool_position(BROKK_170, np.array([k.q for k in rows[begun:]]))
+    away = np.linalg.norm(p[:, None] - fine, axis=-1).min(axis=1)
+    assert attempt.mean == pytest.approx(away.mean(), abs=1e-3) and attempt.max == pytest.approx(
+        away.max(), abs=1e-3
+    )
+    assert 0.005 < attempt.mean < 0.06 and 10 < attempt.seconds < 40
+    u = np.array([0 * rows[0].u, *(k.u for k in rows[begun:])])
+    assert attempt.valve_travel == pytest.approx(np.abs(np.diff(u, axis=0)).sum())
+    assert attempt.mode == "jacobian" and session.tracing is None
+    assert "rectangle" not in " ".join(session.notes("jacobian")) and "jacobian (1)" in " ".join(
+        session.notes("levers")
+    )
+
+
+# --- lines to trace -----------------------------------------------------------------------------------
+
+
+def test_distance_by_hand() -> None:
+    line = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0]])
+    p = np.array([[0.5, 0.0, 0.2], [-3.0, 4.0, 0.0], [1.2, 0.5, 0.0], [1.0, 1.0, 0.0]])
+    np.testing.assert_allclose(tracing.distance(line, p), [0.2, 5.0, 0.2, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize("task", list(tracing.task_lines(BROKK_170)))
+def test_every_line_can_be_traced_from_the_start(task: str) -> None:
+    line = tracing.task_lines(BROKK_170)[task]
+    steps = np.diff(line, axis=0)
+    assert not line[0].any() and np.linalg.norm(steps, axis=1).max() < tracing.SPACING + 1e-9
+    goals = np.repeat(steps, 20, axis=0)[:, None]  # 20 ticks of 0.05 s a step: a step a second
+    assert feasible(BROKK_170, np.array([START]), goals).all()
+
+
+def test_attempts_are_kept_and_tabled(tmp_path: Path) -> None:
+    path = tmp_path / "attempts.csv"
+    assert tracing.read_attempts(path) == []
+    rows = [Attempt("2026-01-01T00:00:00", "circle", "rl", 10.0 + i, 0.01, 0.02, 5.0) for i in range(2)]
+    rows.append(Attempt("2026-01-01T00:00:00", "circle", "levers", 40.0, 0.05, 0.1, 9.5))
+    tracing.write_attempts(path, rows)
+    assert path.read_text().splitlines()[0] == "when,task,mode,seconds,mean,max,valve_travel"
+    assert tracing.read_attempts(path) == rows
+    assert tracing.attempts_table(rows, "circle") == [
+        "rl (2): 10.5 s, off by 0.010 m, at most 0.020 m, valves 5",
+        "levers (1): 40.0 s, off by 0.050 m, at most 0.100 m, valves 10",
+    ]
+    assert tracing.attempts_table(rows, "rectangle") == []
+    path.write_text("a,b\n1,2\n")
+    with pytest.raises(ValueError, match=r"attempts.csv: row 1: expected a column when"):
+        tracing.read_attempts(path)
+
+
+def test_a_line_is_done_when_all_its_points_were_passed_in_order() -> None:
+    line = tool_position(BROKK_170, START) + np.array([[0.0, 0, 0], [0, 0.3, 0], [0, 0.6, 0]])
+    work = Tracing(BROKK_170, "line", line)
+    rest, open_ = Known(0, np.array(START), *np.zeros((2, 5)), np.zeros(3), True), np.full(5, 0.5)
+    assert not work.follow(rest) and not work.p  # the clock waits for the first opened valve
+    radius = np.hypot(*tool_position(BROKK_170, START)[:2])
+    for y, done in ((0.0, 1), (0.6, 1), (0.3, 2), (0.55, 3)):
+        q = np.array([np.arcsin(y / radius), *START[1:]])
+        finished = work.follow(rest._replace(q=q, u=open_))
+        assert work.passed == done and finished == (done == 3)
+
+
+# --- the window ---------------------------------------------------------------------------------------
+
+
+def test_the_window_drives_a_machine_in_another_process(tmp_path: Path) -> None:
+    """In real time: keys, the loop's process, the plant behind the bus; then focus, closing, the end."""
+    seen: list[tuple[float, Known]] = []
+    steps = iter(
+        [
+            (lambda k: k.wrong == 0, (pygame.KEYDOWN, "space")),
+            (lambda k: k.driving, (pygame.KEYDOWN, "q")),
+            (lambda k: k.q_dot[0] > 0.1, (pygame.WINDOWFOCUSLOST, "")),
+            (lambda k: not k.driving and not k.u.any(), (pygame.WINDOWFOCUSGAINED, "")),
+            (lambda k: True, (pygame.QUIT, "")),
+        ]
+    )
+    waiting = [next(steps)]
+    start = time.monotonic()
+
+    def watcher(session: Session, hands: Hands) -> bool:
+        assert time.monotonic() - start < 60, (session.known, waiting)
+        if session.known is not None:
+            seen.append((time.monotonic(), session.known))
+            condition, (kind, key) = waiting[-1]
+            if condition(session.known):
+                more = {"key": pygame.key.key_code(key)} if key else {}
+                pygame.event.post(pygame.event.Event(kind, **more))
+                waiting.append(next(steps, (lambda k: False, (0, ""))))
+        return True
+
+    inner = play.show
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(play, "show", lambda *a: inner(*a, watcher=watcher))
+        play.play(BROKK_170, {}, remote.Where(log=tmp_path / "run.log"), tmp_path / "attempts.csv")
+    assert len(waiting) == 6  # every step was taken
+    assert seen[-1][1].q[0] > 0.01 and not pygame.display.get_init()
+    run = replay.run_of_log(BROKK_170, tmp_path / "run.log", (1, 2, 3))
+    assert not run.known[-1].u.any() and not run.known[-1].driving  # the last frame was neutral
+    assert max(k.u[0] for k in run.known) >= 40 / 127
+
+
+def test_a_loop_that_cannot_begin_ends_the_window_in_one_line() -> None:
+    """Nobody answers on this bus."""
+    where = remote.Where("virtual", "empty")
+    with pytest.raises(ValueError, match="got node 1: object 0x6501"):
+        play.play(BROKK_170, {}, where, Path("attempts.csv"))
+
+
+def test_watching_sends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The frames of another program's drive come in; the bus must carry no other."""
+    peer = can.Bus("watched", interface="virtual")
+    world = World(
+        Push(60, 0, 60, 60, 60),
+        lambda driving, ready: play.hw.Wish((0.1, 0, 0) if driving else (0, 0, 0), ready),
+    )
+    frames: list[tuple[int, bytes]] = []
+    world.upward = world.downward = lambda can_id, data: frames.append((can_id, data)) or [(can_id, data)]
+    world.drive.begin()
+    world.run(1.5)
+    world.close()
+    shown: list[Known] = []
+
+    def watcher(session: Session, hands: Hands) -> bool:
+        for can_id, data in frames[:40]:
+            peer.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+        del frames[:40]
+        if session.known is not None:
+            shown.append(session.known)
+        if not frames:
+            pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=pygame.K_SPACE))
+        return bool(frames) or not pygame.event.peek(pygame.KEYDOWN) or len(shown) < 3
+
+    inner = play.show
+    monkeypatch.setattr(play, "show", lambda *a: inner(*a, watcher=watcher, fps=500.0))
+    monkeypatch.setattr(
+        play.Hands, "ask", lambda *a: remote.Ask(0.0, 0, True, True, False, np.ones(3), np.ones(4))
+    )
+    play.watch(BROKK_170, remote.Where("virtual", "watched"))
+    assert peer.recv(0.1) is None
+    peer.shutdown()
+    assert shown[-1].driving and shown[-1].q_dot[0] > 0.05
+    np.testing.assert_allclose(shown[-1].u[0] * 127, 60)
+
+
+# --- recorded runs ------------------------------------------------------------------------------------
+
+
+def test_a_log_tells_what_the_loop_knew(tmp_path: Path) -> None:
+    path = tmp_path / "run.log"
+    loop = Remoted(BASELINE, log=can.CanutilsLogWriter(path))
+    loop.go(0.5, False)
+    loop.go(0.2, True)
+    loop.go(2.0, True, (0.0, 0.2, 0.1))
+    loop.world.line.close()
+    loop.world.close()
+    run = replay.run_of_log(BROKK_170, path, (1, 2, 3))
+    told = [k for k in loop.known if k.driving][: len(run.known)]
+    assert len(run.known) >= 40
+    for a, b in zip(run.known, told, strict=True):
+        for name in ("q", "q_dot", "u", "v_goal"):
+            np.testing.assert_allclose(getattr(a, name), getattr(b, name), atol=2e-5, err_msg=name)
+    assert run.error[5] > 0.15 and run.error[-5:].mean() < 0.08  # it waits for the valves, then follows
+    idle = tmp_path / "idle.log"
+    idle.write_text("(1.0) can0 080# R\n(1.05) can0 080# R\n")
+    with pytest.raises(ValueError, match="expected a log in which the valves are driven"):
+        replay.run_of_log(BROKK_170, idle, (1, 2, 3))
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What `evaluate` writes, of a policy and gains that nobody tuned."""
+    folder = tmp_path_factory.mktemp("results")
+    policy = random_policy(np.random.default_rng(0))
+    save_policy(folder / "policy.npz", policy)
+    gains = experiments.plain_gains(experiments.baselines(BROKK_170, policy.net))
+    experiments.write_json(folder / "gains.json", {"meta": {"machine": "brokk170"}, "gains": gains})
+    (folder / "commands.csv").write_text(
+        "sequence,time,vx,vy,vz\nside,0,0,0.2,0\nside,1.5,0,0,0\nside,2,0,0,0\n"
+    )
+    (folder / "starts.csv").write_text("q1,q2,q3,q4,q5\n0,0.5,0.58,1.71,1.24\n0.5,0.5,0.58,1.71,1.24\n")
+    options = {
+        "policy": "policy.npz",
+        "commands": "commands.csv",
+        "starts": "starts.csv",
+        "json": "runs.json",
+    }
+    assert main(["evaluate", *(w for k, v in options.items() for w in (f"--{k}", str(folder / v)))]) == 0
+    return folder / "runs.json"
+
+
+def test_results_are_driven_again_into_a_film(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = results.with_name("film.gif")
+    assert main(["replay", str(results), "--out", str(out), "--start", "1", "--size", "640", "360"]) == 0
+    film = Image.open(out)
+    assert film.n_frames == 20 and film.size == (640, 360) and film.info["duration"] == 100
+    first = np.array(film.convert("RGB")).astype(int)
+    film.seek(19)
+    last = np.array(film.convert("RGB")).astype(int)
+    for half, colour in ((np.s_[:, :320], "rl"), (np.s_[:, 320:], "jacobian")):
+        assert (np.abs(last[half] - view.COLOURS[colour]).sum(axis=-1) < 40).sum() > 300
+        assert (first[half] != last[half]).any()
+    file = json.loads(results.read_text())
+    file["runs"][1]["velocity_rmse"] *= 1.1
+    wrong = results.with_name("wrong.json")
+    wrong.write_text(json.dumps(file))
+    assert main(["replay", str(wrong), "--out", str(out), "--start", "1"]) == 1
+    assert "expected the run" in capsys.readouterr().err
+
+
+def test_a_film_is_shown_and_closed(results: Path) -> None:
+    run = replay.Run(
+        "a",
+        (1, 2, 3),
+        [Known(0, np.array(START), *np.zeros((2, 5)), np.zeros(3), True)] * 3,
+        np.zeros((3, 3)),
+        np.zeros(3),
+        np.zeros((0, 3)),
+        np.zeros((0, 3)),
+    )
+    pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=pygame.K_RIGHT))
+    pygame.event.post(pygame.event.Event(pygame.QUIT))
+    replay.show_film(BROKK_170, [run, run], (320, 200))
+    assert not pygame.display.get_init()
+
+
+def test_mp4_needs_ffmpeg(
+    results: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("PATH", "")
+    out = results.with_name("film.mp4")
+    assert main(["replay", str(results), "--out", str(out)]) == 1
+    assert "expected ffmpeg for .mp4" in capsys.readouterr().err and not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "message"),
+    [
+        (["play", "--interface", "virtual"], 2, "--interface, --channel"),
+        (["play", "--drive"], 2, "--interface, --channel"),
+        (["play", "--policy", "missing.npz"], 1, "missing.npz"),
+        (["replay"], 2, "LOGS"),
+        (["replay", "a", "b", "c"], 2, "LOGS"),
+        (["replay", "missing.log"], 1, "missing.log"),
+        (["replay", "missing.json"], 1, "missing.json"),
+        (["replay", "missing.json", "--fps", "0"], 2, "--fps"),
+    ],
+)
+def test_refusals(
+    arguments: list[str], status: int, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    try:
+        assert main(arguments) == status
+    except SystemExit as stop:
+        assert stop.code == status
+    assert message in capsys.readouterr().err
+
+
+def test_the_benchmark_of_the_window_runs() -> None:
+    command = [sys.executable, "-m", "benchmarks.play", "--seconds", "0.3"]
+    done = subprocess.run(command, cwd=Path(__file__).parent.parent, capture_output=True, text=True)
+    assert done.returncode == 0 and json.loads(done.stdout)["ticks"] >= 2, done.stderr
+
+
+def test_without_a_display_play_says_so(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pygame.display.quit()
+    monkeypatch.setenv("SDL_VIDEODRIVER", "nonsense")
+    assert main(["play", "--interface", "virtual", "--channel", "none"]) == 1
+    assert "window: expected a display" in capsys.readouterr().err

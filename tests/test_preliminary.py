@@ -1,0 +1,386 @@
+"""Preliminary tests and the gap by hand, on any machine; logs of another plant; what the judge says."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers_machines import obedient_net, obedient_velocity, random_machine, small_net
+
+from benchmarks.rollout import random_net
+from brokk_min import actuator, preliminary
+from brokk_min.__main__ import main
+from brokk_min.actuator import ActuatorNet, FitConfig
+from brokk_min.logs import Log, Recording, read_log, velocity_of
+from brokk_min.machine import BROKK_170, Machine
+
+LOW, HIGH = BROKK_170.column("q_min"), BROKK_170.column("q_max")
+
+
+def constant_mover(speed_up: float, speed_down: float, late: int, rate: float = 20.0):
+    """Joints that move at one speed `late` ticks after a command, whatever its size."""
+
+    def move(q: np.ndarray, u: np.ndarray) -> np.ndarray:
+        sent = np.concatenate([np.zeros((late, *u.shape[1:])), u])[: len(u)]
+        speed = np.where(sent > 0, speed_up, np.where(sent < 0, -speed_down, 0.0))
+        return np.concatenate([q[None], q + np.cumsum(speed, axis=0) / rate])
+
+    return move
+
+
+# --- steps and response times -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("late", [0, 3, 9])
+def test_response_times_of_a_pure_delay_by_hand(late):
+    """All speed from tick `late` on: between the middles of two ticks the line passes 63 % at 0.63."""
+    level = np.full(2, 0.6)
+    angles = preliminary.steps(constant_mover(0.2, 0.4, late), -np.ones(2), np.ones(2), level, 0 * level, 30)
+    assert angles.shape == (61, 2, 2, 2, 2)
+    times = preliminary.response_times(angles, 20.0)
+    np.testing.assert_allclose(times, (late + 0.63 - 0.5) / 20, atol=1e-9)
+
+
+def test_only_the_stepping_joint_moves_away_from_the_end_behind_it():
+    level = np.full(3, 0.5)
+    low, high = np.array([0.0, -1.0, 2.0]), np.array([1.0, 1.0, 4.0])
+    angles = preliminary.steps(constant_mover(0.1, 0.1, 0), low, high, level, level / 2, 30)
+    starts = angles[0, 0]  # (up and down, stepping, joint)
+    np.testing.assert_allclose(starts[0, 1], [0.5, -0.8, 3.0])
+    np.testing.assert_allclose(starts[1, 2], [0.5, 0.0, 3.8])
+    moved = np.abs(angles[-1] - angles[0])
+    own = np.eye(3, dtype=bool)
+    assert not moved[..., ~own].any()
+    np.testing.assert_allclose(moved[0][:, own], 0.1 * 1.5)  # after the step alone
+    np.testing.assert_allclose(moved[1][:, own], 0.1 * 3.0)  # before it too
+
+
+def test_a_joint_that_does_not_answer_has_no_response_time():
+    level = np.full(2, 0.5)
+    angles = preliminary.steps(constant_mover(0.2, 0.0, 0), -np.ones(2), np.ones(2), level, level, 20)
+    times = preliminary.response_times(angles, 20.0)
+    assert np.isnan(times[0, 1]).all() and np.isfinite(times[0, 0]).all()
+    assert np.isnan(times[1]).all()  # it moves before the step as after it
+    named = preliminary.named_times(times, ("a", "b"))
+    assert named["b"]["idle"]["down"] is None and named["b"]["idle"]["up"] == pytest.approx(0.0065)
+
+
+def test_the_plants_response_times_are_the_papers():
+    level = np.full(5, 80 / 127)
+    angles = preliminary.steps(preliminary.plant_mover(BROKK_170), LOW, HIGH, level, level / 2, 30)
+    idle, moving = preliminary.response_times(angles, 20.0)
+    np.testing.assert_allclose(idle, 0.40, atol=0.01)
+    np.testing.assert_allclose(moving, 0.105, atol=0.01)
+
+
+def test_a_joint_is_brought_into_motion_beyond_its_dead_zone():
+    def move(q: np.ndarray, u: np.ndarray) -> np.ndarray:
+        speed = np.sign(u) * np.maximum(0, np.abs(u) - np.array([0.07, 0.45]))
+        return np.concatenate([q[None], q + np.cumsum(speed, axis=0) / 20])
+
+    before = preliminary.step_commands(move, -np.ones(2), np.ones(2), np.array([0.6, 1.0]), 20)
+    # tenths of the level that move by a twentieth of the full speed: 0.12 and 0.5
+    np.testing.assert_allclose(before, [(0.12 + 0.6) / 2, (0.5 + 1.0) / 2])
+
+
+# --- sweeps -----------------------------------------------------------------------------------------
+
+
+def test_a_sweep_goes_from_stop_to_stop_at_the_plants_speeds():
+    move = preliminary.plant_mover(BROKK_170)
+    u = np.zeros((2, 5))
+    u[:, 4] = [80 / 127, -80 / 127]
+    results = preliminary.sweeps(BROKK_170, move, 4, u)
+    for counts, peak, (angle, velocity) in zip((80, -80), (0.24, 0.45), results, strict=True):
+        assert angle[-1] == (HIGH if counts > 0 else LOW)[4]
+        assert np.all(velocity * counts >= 0) and velocity[-1] != 0
+        assert np.abs(velocity).max() == pytest.approx(peak, rel=0.04)
+        np.testing.assert_allclose(np.diff(angle) * 20, velocity[1:], atol=1e-9)
+
+
+def test_the_others_move_as_in_the_paper():
+    u = preliminary.other_commands(BROKK_170, 4) * 127
+    np.testing.assert_allclose(u, [-80, 0, -80, 80, 0])  # u1 and u3 175, u4 80
+
+
+def test_sweeps_a_known_distance_apart():
+    q = np.linspace(0, 2, 50)
+    up, down = np.array([q, 0.2 + 0 * q]), np.array([q[::-1], 0.25 + 0 * q])
+    assert preliminary._apart(up, down) == pytest.approx(0.05)
+
+
+# --- movers and the gap -------------------------------------------------------------------------------
+
+
+def test_a_mover_of_nets_is_their_step():
+    machine = random_machine(np.random.default_rng(3), 3)
+    net = obedient_net(machine)
+    u = np.random.default_rng(0).uniform(-0.2, 0.2, (15, 2, len(machine.driven)))
+    q = np.tile((net.q_low + net.q_high) / 2, (2, 1)).astype(float)
+    angles = preliminary.net_mover(net)(q, u)
+    np.testing.assert_allclose(np.diff(angles, axis=0) * net.rate, obedient_velocity(machine, u), atol=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_numbers_of_any_machine_are_json_and_its_locked_joints_rest(seed):
+    rng = np.random.default_rng(seed)
+    machine = random_machine(rng, int(rng.integers(1, 6)))
+    net = small_net(machine, rng, machine.names)
+    numbers = preliminary.run(machine, net, seed)
+    json.dumps(numbers, allow_nan=False)
+    driven = [machine.names[i] for i in machine.driven]
+    assert numbers["joint"] == driven[-1]
+    assert list(numbers["sim_to_real"]["joints"]) == driven
+    assert set(numbers["response_time"]) == {"machine", "nets"}
+    gap = preliminary.sim_to_real(machine, net, seed)
+    assert gap.q.shape == (600, 20, machine.n) and gap.p_tool.shape == (600, 20, 3)
+    assert not gap.q[..., machine.locked].any()
+
+
+def test_the_gap_of_a_machine_to_itself_is_none(monkeypatch):
+    plant = preliminary.plant_mover(BROKK_170)
+    monkeypatch.setattr(preliminary, "movers", lambda *_: {"machine": plant, "nets": plant})
+    net = random_net(np.random.default_rng(0))
+    assert not any(array.any() for array in preliminary.sim_to_real(BROKK_170, net, 0))
+    numbers = preliminary.run(BROKK_170, net, 0)
+    assert numbers["sim_to_real"]["tool"] == {"position_error_mean": 0.0, "velocity_rmse": 0.0}
+    assert all(row["difference_rms"] == 0 for row in numbers["sweep"].values())
+    assert list(numbers["sweep"]) == ["u = 50", "u = 80", "u = 175", "u = 205"]
+    assert numbers["coupling_rms"]["machine"] < 0.002  # "marginal and neglectable"
+
+
+def test_the_gap_is_between_tools_where_the_arms_end(monkeypatch):
+    """Nets that stand still: the gap is what the machine moved."""
+    plant = preliminary.plant_mover(BROKK_170)
+    seen = {}
+
+    def watched(q: np.ndarray, u: np.ndarray) -> np.ndarray:
+        seen["q"] = plant(q, u)
+        assert not u[..., 1].any() and np.all((np.abs(u) > 0.07).sum(axis=-1).max(axis=0) > 1)
+        np.testing.assert_allclose(q, np.tile([1.5, 0.5, 0.58, 1.71, 1.24], (20, 1)))
+        return seen["q"]
+
+    still = lambda q, u: np.repeat(q[None], len(u) + 1, axis=0)  # noqa: E731
+    monkeypatch.setattr(preliminary, "movers", lambda *_: {"machine": watched, "nets": still})
+    gap = preliminary.sim_to_real(BROKK_170, random_net(np.random.default_rng(0)), 0)
+    np.testing.assert_allclose(gap.q, seen["q"][0] - seen["q"][1:], atol=1e-12)
+    from brokk_min.kinematics import tool_position
+
+    p = tool_position(BROKK_170, seen["q"])
+    np.testing.assert_allclose(gap.p_tool, p[0] - p[1:], atol=1e-12)
+
+
+def test_the_command_writes_figures_and_numbers(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    net = replace(random_net(np.random.default_rng(0)), machine="brokk170")
+    actuator.save_net(tmp_path / "net.npz", net)
+    out = tmp_path / "a" / "b"
+    assert main(["preliminary", "--actuator", str(tmp_path / "net.npz"), "--out", str(out)]) == 0
+    assert sorted(p.name for p in out.iterdir()) == ["preliminary.json", "preliminary.png", "sim_to_real.png"]
+    assert all(p.read_bytes()[:4] == b"\x89PNG" for p in out.glob("*.png"))
+    written = json.loads((out / "preliminary.json").read_text())
+    assert written["meta"]["seed"] == 0 and len(written["sweep"]) == 4
+    assert main(["preliminary", "--actuator", str(tmp_path / "no.npz"), "--out", str(tmp_path / "c")]) == 1
+    assert not (tmp_path / "c").exists()
+    assert "no.npz" in capsys.readouterr().err
+
+
+# --- logs of another plant ----------------------------------------------------------------------------
+
+
+def other_plant(delay: float, rate: float) -> Machine:
+    """Two joints with 45 % dead zone and a long dead time."""
+    joints = [replace(BROKK_170.joints[i], name=name) for i, name in ((3, "boom"), (4, "stick"))]
+    return replace(
+        BROKK_170, name="other", joints=tuple(joints), dead_zone=0.45, delay=delay, rate=rate,
+        pwm_limit=127, ready_down_time=0.8,
+    )  # fmt: skip
+
+
+def other_log(
+    path: Path,
+    delay: float,
+    seed: int,
+    runs: int,
+    seconds: float = 25.0,
+    rate: float = 100.0,
+    alone: bool = False,
+) -> None:
+    """Angles of a 12-bit encoder at `rate` with jitter; every recording meets a stop.
+
+    Speed grows with the power 2.5 of the command beyond the dead zone. `alone`: one joint a recording.
+    """
+    machine, rng = other_plant(delay, rate), np.random.default_rng(seed)
+    low, high, ticks = machine.column("q_min"), machine.column("q_max"), round(seconds * rate)
+    u = np.zeros((ticks, runs, 2))
+    for run, joint in np.ndindex(runs, 2):
+        at = 0
+        while at < ticks and not (alone and run % 2 != joint):
+            hold = round(rate * (7.0 if at == 0 else rng.uniform(0.5, 4.0)))  # first to a stop
+            u[at : at + hold, run, joint] = rng.choice([-1, 1]) if at == 0 else rng.uniform(-1, 1)
+            at += hold
+    beyond = np.maximum(0, np.abs(u) - 0.45) / 0.55
+    valve = np.sign(u) * (0.45 * (beyond > 0) + 0.55 * beyond**2.5)
+    q = preliminary.plant_mover(machine)(rng.uniform(low, high, (runs, 2)), valve)[:-1]
+    q = np.rint(q / machine.encoder_step) * machine.encoder_step
+    time = (np.arange(ticks)[:, None] + rng.uniform(-0.2, 0.2, (ticks, runs))) / rate
+    lines = ["run,time,u_boom,u_stick,q_boom,q_stick"]
+    for run in range(runs):
+        rows = np.column_stack([time[:, run], u[:, run], q[:, run]])
+        lines += [f"take {run}," + ",".join(f"{cell:.5f}" for cell in row) for row in rows]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def fitted(tmp_path: Path, capsys: pytest.CaptureFixture[str], **log: float) -> tuple[dict, str]:
+    """Verdict and printed report of `fit` on logs of the other plant, judged on eight unseen recordings."""
+    other_log(tmp_path / "log.csv", seed=0, runs=24, **log)
+    other_log(tmp_path / "test.csv", seed=1, runs=8, **log)
+    files = ["--test", tmp_path / "test.csv", "--json", tmp_path / "f.json", "--figure", tmp_path / "f.png"]
+    options = ["--history", 30, "--steps", 1500]
+    assert (
+        main([str(a) for a in ("fit", tmp_path / "log.csv", "--out", tmp_path / "n.npz", *files, *options)])
+        == 0
+    )
+    return json.loads((tmp_path / "f.json").read_text()), capsys.readouterr().out
+
+
+@pytest.mark.parametrize("log", [{"delay": 0.3, "rate": 100.0}, {"delay": 1.0, "alone": True}])
+def test_nets_of_another_plant_beat_last_value_and_linear_model(tmp_path, capsys, log):
+    verdict, report = fitted(tmp_path, capsys, **log)
+    assert list(verdict["joints"]) == ["boom", "stick"] and verdict["tool"] == {}
+    for joint in verdict["joints"].values():
+        assert joint["one_step_rmse"] < joint["persistence_rmse"]
+        for horizon in ("5", "10"):
+            mine, linear = (s["free_run"][horizon]["velocity_rmse"] for s in (joint, joint["linear"]))
+            assert mine < 0.9 * linear, (horizon, mine, linear)
+        assert joint["creep"] < 5e-4
+    assert not [w for w in verdict["warnings"] if "linear" in w or "command" in w]
+    assert "linear" in report and "creep" in report
+    assert (tmp_path / "f.png").read_bytes()[:4] == b"\x89PNG"
+
+
+@pytest.mark.parametrize("rate", [20.0, 200.0])
+def test_short_recordings_at_any_rate_are_fitted(tmp_path, capsys, rate):
+    other_log(tmp_path / "log.csv", 0.3, seed=0, runs=30, seconds=5.0, rate=rate)
+    options = ["--out", tmp_path / "n.npz", "--json", tmp_path / "f.json", "--steps", 60]
+    assert main([str(a) for a in ("fit", tmp_path / "log.csv", *options)]) == 0
+    scores = json.loads((tmp_path / "f.json").read_text())["joints"]
+    assert set(scores["boom"]["free_run"]) == {"1"} == set(scores["boom"]["linear"]["free_run"])
+    recordings = read_log([tmp_path / "log.csv"], 4).recordings
+    assert len(recordings) == 30 and {len(r.u) for r in recordings} <= {99, 100}
+
+
+# --- the floor, the band, creep -------------------------------------------------------------------------
+
+
+def linear_log(seed: int, runs: int = 12, scale: float = 1.0) -> Log:
+    """A joint whose next velocity is 0.8 times the newest difference plus 0.1 u, exactly."""
+    rng, recordings = np.random.default_rng(seed), []
+    for run in range(runs):
+        u = scale * np.repeat(rng.uniform(-1, 1, 20), 5)[:, None]
+        q = np.zeros((100, 1))
+        for k in range(1, 99):
+            q[k + 1] = q[k] + (0.8 * (q[k] - q[k - 1]) * 20 + 0.1 * u[k]) / 20
+        recordings.append(Recording(f"r{run}", u, q, velocity_of(q, 2)))
+    return Log(("a",), tuple(recordings))
+
+
+def blank_net(log: Log, history: int = 5) -> ActuatorNet:
+    config = FitConfig(steps=1, batch_size=8, history=history)
+    return actuator.fit(log, config, seed=0, velocity_samples=2)
+
+
+def test_the_linear_model_finds_a_linear_joint():
+    log = linear_log(0)
+    model = actuator.fit_linear(blank_net(log), log, penalty=1e-9)
+    scores = actuator.score(model, linear_log(1, scale=0.3))["a"]
+    assert scores["one_step_rmse"] < 1e-3 < 0.1 * scores["persistence_rmse"]
+    assert scores["free_run"]["1"]["velocity_rmse"] < 2e-3
+
+
+def test_the_linear_model_is_ridge_regression_on_the_nets_inputs():
+    log, history = linear_log(0, 3), 4
+    net = blank_net(log, history)
+    model = actuator.fit_linear(net, log, penalty=0.01)
+    rows, targets = [], []
+    for r in log.recordings:
+        for k in range(history - 1, len(r.q) - 1):
+            window = slice(k - history + 1, k + 1)
+            rows.append(np.concatenate([r.q[window, 0], r.q_dot[window, 0], r.u[window, 0]]))
+            targets.append((r.q[k + 1, 0] - r.q[k, 0]) * 20)
+    x = (np.array(rows) - net.input_mean) / net.input_scale
+    x, y = np.column_stack([x, np.ones(len(x))]), np.array(targets)
+    extra = np.diag(np.sqrt(0.01 * len(x)) * np.append(np.ones(3 * history), 0.0))
+    wanted, *_ = np.linalg.lstsq(np.vstack([x, extra]), np.append(y, np.zeros(3 * history + 1)), rcond=None)
+    np.testing.assert_allclose(np.append(model.weights[0], model.weights[1]), wanted, atol=1e-5)
+    inputs = np.float32(rows[7]).reshape(1, 3, history)
+    assert model.predict(inputs) == pytest.approx(x[7] @ wanted, abs=1e-5)
+    far = model.predict(inputs * 1e4)  # no further than the nets can say
+    assert far in (net.output_low, net.output_high)
+
+
+def taped(u: np.ndarray, q: np.ndarray | None = None) -> Log:
+    q = np.zeros((len(u), 1)) if q is None else q[:, None]
+    return Log(("a",), (Recording("x", u[:, None], q, velocity_of(q, 2)),))
+
+
+def test_commands_outside_the_training_by_hand():
+    time = np.arange(1000) / 20
+    known = taped(np.sin(2 * np.pi * 0.2 * time), 0.5 * np.cos(time))
+
+    def shares(u: np.ndarray, q: float = 0.0) -> dict[str, float]:
+        return {
+            k: float(v[0]) for k, v in preliminary.outside_training(known, taped(u, q + 0 * u), 13).items()
+        }
+
+    assert not any(shares(0.9 * np.sin(2 * np.pi * 0.2 * time + 1)).values())
+    large = shares(np.where(np.arange(1000) < 500, 0.5, 1.2))
+    assert large["command"] == pytest.approx(500 / 987)
+    fast = shares(np.tile([0.5, 0.5, -0.5, -0.5], 250))
+    assert fast["change of command"] == pytest.approx(0.5, abs=0.01) and fast["command"] == 0
+    assert fast["mean command"] == 0
+    short = taped(np.tile([0.9, -0.9], 500))  # trained on a tremble, tested on a hold
+    slow = preliminary.outside_training(short, taped(0.5 + 0 * time), 13)
+    assert slow["mean command"][0] == 0  # this joint rests in the test: nothing to judge
+    moving = preliminary.outside_training(short, taped(0.5 + 0 * time, 0.1 * time), 13)
+    assert moving["mean command"][0] == 1 and moving["command"][0] == 0
+    assert shares(0 * time + np.sin(time), 0.6)["angle"] == 1
+
+
+def test_creep_is_the_largest_drift_of_a_joint_without_a_command(monkeypatch):
+    net = random_net(np.random.default_rng(0))
+
+    def drifting(q: np.ndarray, u: np.ndarray) -> np.ndarray:
+        assert not u.any()
+        return q + np.arange(len(u) + 1)[:, None, None] / 20 * 0.003 * (q == q.max(axis=0))
+
+    monkeypatch.setattr(preliminary, "net_mover", lambda _: drifting)
+    np.testing.assert_allclose(preliminary.creep(net), 0.003)
+
+
+def test_a_net_that_is_no_better_than_a_linear_model_is_told_so():
+    log, test = linear_log(0), linear_log(1)
+    verdict = preliminary.judge(blank_net(log), log, test)
+    assert [w for w in verdict["warnings"] if w.startswith("a: a free run of 1 s") and "no better" in w]
+    jumps = Log(("a",), tuple(r._replace(u=-np.abs(r.u) - 0.2) for r in test.recordings))
+    assert any(
+        w.startswith("a: command outside") for w in preliminary.judge(blank_net(log), log, jumps)["warnings"]
+    )
+
+
+def test_tool_errors_by_hand(monkeypatch):
+    """q1 off by 0.01 rad a second at 3.05 m from the slew axis."""
+    q = np.tile([1.5, 0.5, 0.58, 1.71, 1.24], (150, 1))
+    test = Log(BROKK_170.names, (Recording("x", 0 * q, q, 0 * q),))
+    error = lambda net, samples, starts, ticks: (  # noqa: E731
+        np.arange(1, ticks + 1)[:, None, None]
+        / 20
+        * np.array([0.01, 0, 0, 0, 0])
+        * np.ones((len(starts), 1)),
+        None,
+    )
+    monkeypatch.setattr(actuator, "run_errors", error)
+    errors = preliminary.tool_errors(BROKK_170, random_net(np.random.default_rng(0)), test)
+    assert errors == {"1": pytest.approx(0.0305, abs=2e-4), "5": pytest.approx(0.1525, abs=1e-3)}

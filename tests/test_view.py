@@ -1,0 +1,318 @@
+"""Pictures: shapes where kinematics put them, pixels of what they must show, warnings on and off."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import RecordVideo, RenderCollection
+from helpers_machines import random_machine
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import moving
+
+from brokk_min import view
+from brokk_min.env import TaskConfig, TaskEnv
+from brokk_min.jacobian import manipulability
+from brokk_min.kinematics import frames, jacobian, tool_position
+from brokk_min.machine import BROKK_170, Machine
+from brokk_min.view import Circle, Line, Polygon, Scene, Text, draw, picture
+
+Q = np.array([0.4, 0.5, 0.58, 1.71, 1.24])
+SIZE = (960, 600)
+
+
+def scene(q: np.ndarray = Q, **more: object) -> Scene:
+    still = np.zeros(len(q))
+    return Scene(q, still, still, np.zeros(3))._replace(**more)  # type: ignore[arg-type]
+
+
+def words(shapes: list[view.Shape]) -> list[str]:
+    return [shape.text for shape in shapes if isinstance(shape, Text)]
+
+
+def eyes(machine: Machine, q: np.ndarray) -> tuple[view.Camera, view.Camera]:
+    """The cameras of a picture of one arm, which `draw` alone lays out."""
+    seen: list[tuple[view.Camera, view.Camera]] = []
+    inner = view.cameras
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(view, "cameras", lambda *a: seen.append(inner(*a)) or seen[-1])
+        draw(machine, [scene(q)], SIZE)
+    return seen[0]
+
+
+def test_importing_needs_neither_pygame_nor_physics() -> None:
+    code = (
+        "import sys, brokk_min.view; print([m for m in sys.modules if m in ('can', 'pygame', 'torch', "
+        "'matplotlib', 'gymnasium') or m.startswith('brokk_min.')])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert set(eval(done.stdout)) == {"brokk_min.view", "brokk_min.kinematics", "brokk_min.machine"}
+
+
+@given(moving([()]), st.sampled_from([(960, 600), (480, 560), (1500, 300)]))
+def test_any_machine_draws_with_its_joints_where_kinematics_say(
+    drawn: tuple[Machine, np.ndarray, np.ndarray], size: tuple[int, int]
+) -> None:
+    machine, q, q_dot = drawn
+    shapes = draw(machine, [scene(q, q_dot=q_dot, v_goal=np.array([0.1, -0.2, 0.05]))], size)
+    for shape in shapes:
+        if isinstance(shape, Line | Polygon):
+            assert np.isfinite(shape.points).all() and shape.points.shape[1] == 2
+    p = frames(machine, q)[:, :3, 3]
+    heading = np.arctan2(p[-1, 1], p[-1, 0]) if np.hypot(*p[-1, :2]) > 1e-6 else 0.0
+    side = np.stack([p[:, 0] * np.cos(heading) + p[:, 1] * np.sin(heading), -p[:, 2]], axis=1)
+    top = np.stack([-p[:, 1], -p[:, 0]], axis=1)
+    centres = np.array([shape.centre for shape in shapes if isinstance(shape, Circle)][1:])  # title's dot
+    arms = np.split(centres, 2)
+    for arm, flat in zip(arms, (side, top), strict=True):
+        found = np.vstack([arm[:-1:2], arm[-1]])  # two circles a joint, one for the tool
+        np.testing.assert_array_equal(arm[:-1:2], arm[1::2])
+        moved, wanted = found - found[0], flat - flat[0]
+        scale = np.sum(moved * wanted) / max(np.sum(wanted * wanted), 1e-12)
+        np.testing.assert_allclose(moved, scale * wanted, atol=1e-6)
+        assert np.sum(wanted * wanted) < 1e-9 or scale > 1
+
+
+@pytest.mark.parametrize("n", [2, 3, 4, 5, 6])
+def test_everything_lies_within_the_picture_and_paints(n: int) -> None:
+    rng = np.random.default_rng(n)
+    machine = random_machine(rng, n)
+    q = rng.uniform(machine.column("q_min"), machine.column("q_max"))
+    shapes = draw(machine, [scene(q), scene(q)], SIZE)
+    for shape in shapes:
+        if isinstance(shape, Circle):
+            assert (shape.centre >= 0).all() and (shape.centre <= SIZE).all()
+    image = picture(shapes, SIZE)
+    assert image.shape == (600, 960, 3) and image.dtype == np.uint8
+    assert image.std() > 5
+
+
+def test_views_of_the_brokk_by_hand() -> None:
+    """At q1 = 0 and all others 0: elevations 0, 0, -pi, -3 pi/4 - pi; x and height add up by hand."""
+    q = np.array([0.0, 0.0, 0.0, np.pi, 3 * np.pi / 4])  # all links horizontal
+    side, top = eyes(BROKK_170, q)
+    flat = np.array([[0, 0], [0.25, 0.95], [1.4, 0.95], [2.65, 0.95], [3.8, 0.95], [5.0, 0.95]])
+    p = frames(BROKK_170, q)[:, :3, 3]
+    np.testing.assert_allclose(side.project(p), side.origin + side.scale * flat * (1, -1))
+    turned = np.array([np.pi / 2, 0.0, 0.0, np.pi, 3 * np.pi / 4])  # the tool points along y: left
+    away = top.project(tool_position(BROKK_170, turned)) - top.origin
+    np.testing.assert_allclose(away, [-5.0 * top.scale, 0.0], atol=1e-9)
+    side, _ = eyes(BROKK_170, turned)
+    np.testing.assert_allclose(
+        side.project(frames(BROKK_170, turned)[-1, :3, 3])[1], side.origin[1] - 0.95 * side.scale
+    )
+
+
+def test_the_trail_is_painted_where_the_tool_was() -> None:
+    p = tool_position(BROKK_170, Q)
+    trail = p + np.linspace(0, 1, 50)[:, None] * np.array([0.9, -0.5, 0.5])
+    path = p + np.array([[0.0, 0.0, 0.0], [0.8, 0.8, -0.2]])
+    shapes = draw(BROKK_170, [scene(trail=trail, path=path)], SIZE)
+    image, bare = picture(shapes, SIZE), picture(draw(BROKK_170, [scene()], SIZE), SIZE)
+    pale = next(s.colour for s in shapes if isinstance(s, Line) and len(s.points) == 50)
+    for camera in eyes(BROKK_170, Q):
+        for points, colour in ((trail[15:-1:5], pale), ((path[1:] + path[:1]) / 2, view.PATH)):
+            for x, y in np.rint(camera.project(points)).astype(int):
+                near = np.abs(image[y - 1 : y + 2, x - 1 : x + 2].astype(int) - colour).sum(axis=-1)
+                assert near.min() < 40, (x, y)
+    changed = np.abs(image.astype(int) - bare).sum(axis=-1) > 0
+    assert 300 < changed.sum() < 6000  # and nowhere else
+
+
+def test_views_show_what_they_are_to_hold() -> None:
+    """A line near the tool, enlarged; what lies beyond a view's edge is painted over nothing else."""
+    p = tool_position(BROKK_170, Q)
+    line = p + np.array([[0.0, 0, 0], [0.5, 0, 0], [0.5, 0.8, 0]])
+    whole, near = (draw(BROKK_170, [scene(path=line, hold=hold)], SIZE) for hold in (np.zeros((0, 3)), line))
+    spans = []
+    for shapes in (whole, near):
+        boxes = [s.box for s in shapes if isinstance(s, view.Clip)]
+        paths = [s.points for s in shapes if isinstance(s, Line) and s.colour == view.PATH]
+        for (left, upper, width, height), points in zip(boxes, paths, strict=False):
+            assert (points > (left, upper)).all() and (points < (left + width, upper + height)).all()
+        spans.append([np.ptp(points, axis=0).max() for points in paths])
+    assert (np.array(spans[1]) > 2 * np.array(spans[0])).all()
+    image = picture(near, SIZE)
+    assert (image[42, :576] == view.COLOURS["rl"]).all(axis=-1).any()  # a link leaves the view upwards
+    np.testing.assert_array_equal(image[33:39, :576] - np.array(view.PAPER), 0)
+
+
+def test_arrows_point_along_the_velocities() -> None:
+    rates = np.array([0.1, 0.0, 0.05, -0.1, 0.2])
+    J = jacobian(BROKK_170, Q) @ rates[BROKK_170.driven]
+    wanted = np.array([0.1, 0.05, 0.15])
+    shapes = draw(BROKK_170, [scene(q_dot=rates, v_goal=wanted)], SIZE)
+    for v, colour in ((J, view.MEASURED), (wanted, view.WANTED)):
+        shafts = [s.points for s in shapes if isinstance(s, Line) and s.colour == colour and s.width == 3]
+        assert len(shafts) == 2  # one a view
+        for camera, shaft in zip(eyes(BROKK_170, Q), shafts, strict=True):
+            along, flat = shaft[1] - shaft[0], camera.axes @ v * (1, -1)
+            np.testing.assert_allclose(along / np.hypot(*along), flat / np.hypot(*flat), atol=1e-6)
+    still = draw(BROKK_170, [scene()], SIZE)
+    assert not [s for s in still if isinstance(s, Line) and s.width == 3]
+
+
+@pytest.mark.parametrize(("u", "share"), [(80, 1.0), (-40, -0.5), (0, 0.0)])
+def test_valve_bars_are_as_long_as_the_command(u: int, share: float) -> None:
+    command = np.zeros(5)
+    command[3] = u / 127
+    shapes = draw(BROKK_170, [scene(u=command)], SIZE)
+    y = next(s.at[1] for s in shapes if isinstance(s, Text) and s.text == "q4")
+    bars = [s for s in shapes if isinstance(s, Polygon) and s.points[:, 1].mean() == y]
+    track = max(
+        (b for b in bars if b.colour == view.TRACK and np.ptp(b.points[:, 1]) > 6),
+        key=lambda b: np.ptp(b.points[:, 0]),
+    )
+    filled = [b for b in bars if b.colour == view.COLOURS["rl"]]
+    half = np.ptp(track.points[:, 0]) / 2
+    assert sum(b.points[1, 0] - b.points[0, 0] for b in filled) == pytest.approx(share * half)
+    assert f"{u:+d}" in words(shapes) and "locked" in words(shapes)
+
+
+def red(image: np.ndarray) -> int:
+    return int((np.abs(image.astype(int) - view.WARNING).sum(axis=-1) < 30).sum())
+
+
+def test_a_limit_and_a_singularity_warn_in_red() -> None:
+    clean = draw(BROKK_170, [scene(mood="driving", status="driving")], SIZE)
+    assert not [w for w in words(clean) if "near" in w] and red(picture(clean, SIZE)) == 0
+    at_limit = Q.copy()
+    at_limit[3] = 2.9 - 0.05 * 2.3 + 1e-3  # range 0.6 to 2.9, five percent of it
+    shapes = draw(BROKK_170, [scene(at_limit)], SIZE)
+    assert [w for w in words(shapes) if "near" in w] == ["q4 near its limit"]
+    assert red(picture(shapes, SIZE)) > 50
+    at_limit[3] -= 2e-3
+    assert not [w for w in words(draw(BROKK_170, [scene(at_limit)], SIZE)) if "near" in w]
+    locked = Q.copy()
+    locked[1] = 0.0  # at its limit, but nobody drives it there
+    assert not [w for w in words(draw(BROKK_170, [scene(locked)], SIZE)) if "limit" in w]
+    wide = replace(
+        BROKK_170,
+        joints=tuple(replace(j, q_min=-3.0, q_max=3.2, cylinder_base=0.0) for j in BROKK_170.joints),
+    )
+    stretched = np.array([0.3, 0.4, 0.0, np.pi, 3 * np.pi / 4])
+    shapes = draw(wide, [scene(stretched)], SIZE)
+    assert "near a singularity" in words(shapes)
+    value, way = view.weakest(wide, stretched)
+    outward = np.array([np.cos(0.3) * np.cos(0.4), np.sin(0.3) * np.cos(0.4), np.sin(0.4)])
+    assert value == pytest.approx(0, abs=1e-9) and abs(way @ outward) == pytest.approx(1)
+
+
+@given(st.integers(0, 1000))
+def test_the_weakest_way_bounds_manipulability(seed: int) -> None:
+    q = np.random.default_rng(seed).uniform(BROKK_170.column("q_min"), BROKK_170.column("q_max"))
+    J, (value, way) = jacobian(BROKK_170, q), view.weakest(BROKK_170, q)
+    assert np.linalg.norm(way @ J) == pytest.approx(value, abs=1e-9)
+    singular = np.sqrt(np.maximum(np.linalg.eigvalsh(J @ J.T), 0))
+    assert np.prod(singular) == pytest.approx(manipulability(J), abs=1e-6)
+    assert value == pytest.approx(singular[0], abs=1e-6)
+
+
+def test_unknown_positions_and_states_are_said() -> None:
+    shapes = draw(BROKK_170, [scene(np.full(5, np.nan), status="waiting: q1: silent", mood="waiting")], SIZE)
+    assert {"no positions", "waiting: q1: silent"} <= set(words(shapes))
+    assert picture(shapes, SIZE).std() > 0
+
+
+def test_two_arms_share_no_column() -> None:
+    left, right = scene(colour=(1, 2, 3)), scene(colour=(4, 5, 6))
+    shapes = draw(BROKK_170, [left, right], SIZE)
+    for colour, inside in (((1, 2, 3), slice(0, 480)), ((4, 5, 6), slice(480, 960))):
+        links = np.vstack([s.points for s in shapes if isinstance(s, Polygon) and s.colour == colour])
+        assert (links[:, 0] >= inside.start).all() and (links[:, 0] <= inside.stop).all()
+
+
+def test_pygame_is_asked_for_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    with pytest.raises(ValueError, match=r"expected pygame \(extra brokk_min\[play\]\)"):
+        picture([], SIZE)
+
+
+# --- Gymnasium ----------------------------------------------------------------------------------------
+
+
+def test_gymnasium_renders_what_happens() -> None:
+    env = gymnasium.make("brokk_min/Brokk170-v0", render_mode="rgb_array")
+    check_env(env.unwrapped)
+    env = RenderCollection(env, pop_frames=False)
+    env.reset(seed=1)
+    for _ in range(12):
+        env.step(np.array([1.0, 0.0, 0.0, 1.0], np.float32))
+    images = env.render()
+    assert isinstance(images, list) and len(images) == 13
+    inner = env.unwrapped
+    assert isinstance(inner, TaskEnv) and inner.state is not None
+    state, trail = inner.state, np.array(inner.pictures.trails[0])
+    shown = scene(state.q[0], q_dot=state.q_dot[0], v_goal=state.v_goal[0], trail=trail, title="brokk170")
+    shown = shown._replace(u=state.history[0, :, 2, -1])
+    np.testing.assert_array_equal(images[-1], picture(draw(BROKK_170, [shown], SIZE), SIZE))
+    assert len(shown.trail) == 13 and (images[-1] != images[0]).any()
+    np.testing.assert_allclose(shown.trail[-1], tool_position(BROKK_170, inner.state.q[0]))
+    env.reset(seed=2)
+    assert len(inner.pictures.trails[0]) == 1  # a new episode leaves no trail of the old one
+    env.close()
+
+
+def test_gymnasium_shows_a_window(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    env = gymnasium.make("brokk_min/Brokk170-v0", render_mode="human")
+    env.reset(seed=1)
+    env.step(np.zeros(4, np.float32))
+    window = env.unwrapped.pictures.window  # type: ignore[attr-defined]
+    assert window.surface.get_size() == SIZE and env.render() is None
+    blue = view.COLOURS["rl"]
+    image = window.pygame.surfarray.array3d(window.surface)
+    assert (image == blue).all(axis=-1).sum() > 1000
+    env.close()
+    assert not window.pygame.display.get_init()
+
+
+def test_many_environments_render_one_frame_each() -> None:
+    envs = gymnasium.make_vec(
+        "brokk_min/Brokk170-v0", num_envs=2, config=TaskConfig(episode_s=0.2), render_mode="rgb_array"
+    )
+    envs.reset(seed=0)
+    for _ in range(6):
+        envs.step(np.zeros((2, 4), np.float32))
+    images = envs.render()
+    assert isinstance(images, tuple) and [image.shape for image in images] == [(600, 960, 3)] * 2
+    assert (images[0] != images[1]).any()
+    trails = envs.unwrapped.pictures.trails  # type: ignore[attr-defined]
+    assert [len(trail) for trail in trails.values()] == [3, 3]  # one of the reset in step 4, then two
+
+
+def test_a_video_is_recorded(tmp_path: Path) -> None:
+    pytest.importorskip("moviepy")
+    env = RecordVideo(
+        gymnasium.make("brokk_min/Brokk170-v0", render_mode="rgb_array"), str(tmp_path), video_length=5
+    )
+    env.reset(seed=1)
+    for _ in range(6):
+        env.step(np.zeros(4, np.float32))
+    env.close()
+    assert next(tmp_path.glob("*.mp4")).stat().st_size > 1000
+
+
+def test_rendering_refuses_what_it_cannot_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ValueError, match=r"render_mode: expected one of .* got 'ansi'"):
+        TaskEnv(render_mode="ansi")
+    with pytest.raises(ValueError, match="render: expected a render_mode and a reset before"):
+        TaskEnv(render_mode="rgb_array").render()
+    env = TaskEnv(render_mode="rgb_array")
+    env.reset(seed=0)
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    with pytest.raises(ValueError, match=r"expected pygame \(extra brokk_min\[play\]\)"):
+        env.render()
+
+
+def test_a_window_needs_a_display(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "nonsense")
+    with pytest.raises(ValueError, match="window: expected a display"):
+        view.Window(SIZE, "none")
