@@ -161,7 +161,7 @@ def interval(values: Sequence[float]) -> dict[str, float | None]:
 
     Example:
         >>> interval([1.0, 3.0])
-        {'mean': 2.0, 'half_width': 12.706}
+        {'mean': 2.0, 'half_width': 12.706205}
     """
     from scipy.stats import t
 

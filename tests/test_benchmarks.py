@@ -1,0 +1,61 @@
+"""The benchmarks run: every adapter trains, every figure is a number. What they measure is not judged."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import limits, peers
+
+
+@pytest.mark.parametrize("learner", list(peers.LEARNERS))
+def test_each_learner_trains_on_the_environment(learner: str, tmp_path: Path) -> None:
+    if learner == "rl_games" and not importlib.util.find_spec("rl_games"):
+        pytest.skip("rl_games is not installed")
+    options = peers.Options(quick=True, learners=(learner,), target=9.0, threads=1, json=tmp_path / "p.json")
+    (row,) = peers.main(options)["runs"]
+    assert row["learner"] == learner and row["updates"] == 2
+    assert 0.3 < row["best"] < 1 and row["trained_s"] > 0 and row["seconds"] is None
+    assert json.loads((tmp_path / "p.json").read_text())["runs"] == [row]
+
+
+def test_who_is_fastest_is_the_median_over_seeds_at_the_best_rate(monkeypatch: pytest.MonkeyPatch) -> None:
+    times = {(1e-3, 0): 9.0, (1e-3, 1): None, (1e-3, 2): 5.0, (1e-2, 0): 8.0, (1e-2, 1): 7.0, (1e-2, 2): 30.0}
+
+    def race(name: str, net: object, rate: float, seed: int, *_: object) -> dict[str, object]:
+        seconds = times[rate, seed] if name == "ours" else None
+        return {"learner": name, "learning_rate": rate, "seed": seed, "seconds": seconds}
+
+    monkeypatch.setattr(peers, "race", race)
+    options = peers.Options(learners=("ours", "sb3"), learning_rates=(1e-3, 1e-2), target=0.9)
+    assert peers.main(options)["median_s_at_best_rate"] == {"ours": 8.0, "sb3": None}
+
+
+def test_limits_are_measured(tmp_path: Path) -> None:
+    found = limits.main(limits.Options(quick=True, threads=1, num_envs=(4, 8), json=tmp_path / "l.json"))
+    assert list(found["environment"]) == ["4", "8"]
+    assert all(row["step_over_products"] > 0 for row in found["environment"].values())
+    assert found["update"]["share_of_best"] > 0
+    assert found["update"]["gflops"]["products_numpy"] > 0
+    assert found["kinematics"]["us_per_configuration"] > 0
+    assert json.loads((tmp_path / "l.json").read_text())["update"] == found["update"]
+
+
+def test_the_products_of_a_gradient_by_hand() -> None:
+    """171-256-128-64-4: forward and by weight everywhere, by input from the second layer on."""
+    sizes = limits.shapes(171, 4, 10)
+    work = sum(m * k * n for m, k, n in sizes)
+    actor, critic = (171 * 256 + 256 * 128 + 128 * 64 + 64 * last for last in (4, 1))
+    assert work == 10 * (3 * (actor + critic) - 2 * 171 * 256)
+    seen = limits.products("numpy", sizes)()
+    for kind in ("torch", "onednn"):
+        try:
+            others = limits.products(kind, sizes)()
+        except (AttributeError, RuntimeError):
+            pytest.skip(f"no {kind}")
+        for a, b in zip(seen, others, strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-2)
