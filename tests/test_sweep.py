@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -120,7 +121,7 @@ def test_a_sweep_from_the_command_line_and_once_more(
     settings = {"num-envs": 4, "group": 2, "horizon": 4, "epochs": 1, "minibatch-size": 16, "total-steps": 32}
     pairs = [text for name, value in settings.items() for text in (f"--{name}", str(value))]
     command = ["sweep", "--actuator", f"{tmp_path}/net.npz", "--out", f"{tmp_path}/sweep", "--seed", "3"]
-    command += ["--seeds", "2", "--poses", "2", "--episode-s", "0.6", "--group", "1", *pairs]
+    command += ["--seeds", "2", "--poses", "2", "--episode-s", "0.6", *pairs]
     assert main(command) == 0
     first = capsys.readouterr().out
     assert first.splitlines()[1].startswith("rl ") and first.count("+-") == 6
@@ -153,9 +154,7 @@ def test_a_policy_without_its_figures_is_driven_and_not_trained_again(
     runs = one_seed(*arguments)
     (tmp_path / "seed_0.json").unlink()
     monkeypatch.setattr(module, "train", None)
-    for again, first in zip(one_seed(*arguments), runs, strict=True):
-        assert again["velocity_error_mean"] == pytest.approx(first["velocity_error_mean"], abs=1e-3)
-        assert again["valve_travel"] == pytest.approx(first["valve_travel"], abs=0.1)  # a few PWM counts
+    assert one_seed(*arguments) == runs
     (tmp_path / "seed_0.json").write_text("{")
     with pytest.raises(ValueError, match=r"seed_0\.json: expected the result of a seed, got JSONDec"):
         one_seed(*arguments)
@@ -171,7 +170,8 @@ def test_a_cluster_gives_the_same_files(tmp_path: Path) -> None:
         figures = sweep(BROKK_170, NET, TASK, TINY, [0], far, 1, address)
         assert figures["rl"]["velocity_error_all"]["mean"] > 0
     one_seed(BROKK_170, NET, TASK, TINY, 0, local, 1)
-    assert (local / "seed_0.npz").read_bytes() == (far / "seed_0.npz").read_bytes()
+    for name in ("seed_0.npz", "seed_0.json"):
+        assert (local / name).read_bytes() == (far / name).read_bytes()
 
 
 def test_workers_of_many_threads_are_refused() -> None:
