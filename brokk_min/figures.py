@@ -248,7 +248,8 @@ def _table(rows: Mapping[str, Mapping[str, Any]]) -> str:
         texts = (
             "" if c is None else f"{c:.4g}" if isinstance(c, float) else html.escape(str(c)) for c in cells
         )
-        return "<tr>" + "".join(f"<{tag}>{text}</{tag}>" for text in texts) + "</tr>"
+        parts = (f"<{tag}>{text.replace('_', '_<wbr>')}</{tag}>" for text in texts)
+        return "<tr>" + "".join(parts) + "</tr>"
 
     head = line("th", ["", *next(iter(rows.values()))])
     return f"<table>{head}{''.join(line('td', [name, *row.values()]) for name, row in rows.items())}</table>"

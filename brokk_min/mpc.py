@@ -20,11 +20,11 @@ from brokk_min.kinematics import jacobian, tool_position, tool_velocity
 from brokk_min.machine import PWM_MAX, Machine, limit_command, read_encoder
 
 Array = NDArray[np.floating[Any]]
-BLOCKS = (1, 1, 2, 4, 6)  # ticks at which a plan may turn lie between; their sum is the horizon (tuned)
-STEPS = (1.0, 0.5, 0.2)  # shares of a Gauss-Newton step that are tried (tuned)
-PROBE = 0.03  # valve opening by which a plan is disturbed to see what it does (tuned)
-SOFT = 0.01  # m/s, errors below it weigh as squares, above it by their size (tuned)
-ROUNDING = 5  # ticks over which the choice of whole counts is judged (tuned)
+BLOCKS = (1, 1, 2, 4, 6)  # ticks at which a plan may turn lie between; their sum is the horizon (assumed)
+STEPS = (1.0, 0.5, 0.2)  # shares of a Gauss-Newton step that are tried (assumed)
+PROBE = 0.03  # valve opening by which a plan is disturbed to see what it does (assumed)
+SOFT = 0.01  # m/s, errors below it weigh as squares, above it by their size (assumed)
+ROUNDING = 5  # ticks over which the choice of whole counts is judged (assumed)
 
 
 class Plan(NamedTuple):
