@@ -181,8 +181,11 @@ def _simulated(machine: Machine, where: Where, running: Callable[[], bool]) -> I
     if where.interface:
         yield
         return
+    q, low, high = np.array(where.start), machine.column("q_min"), machine.column("q_max")
+    if q.shape != (machine.n,) or not ((low <= q) & (q <= high)).all():
+        raise ValueError(f"start: expected {machine.n} angles within the joints' ranges, got {q.tolist()}")
     with open_line("virtual", "brokk_min play") as line:
-        simulated = SimulatedMachine(machine, where.start[: machine.n], line.now())
+        simulated = SimulatedMachine(machine, q, line.now())
         thread = Thread(target=serve, args=(simulated, line, running))
         thread.start()
         try:

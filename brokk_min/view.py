@@ -259,11 +259,12 @@ def _views(machine: Machine, scene: Scene, side: Box, top: Box) -> list[Shape]:
     eyes = cameras(machine, p_tool, side, top, scene.hold)
     for camera, box, label in zip(eyes, (side, top), ("side", "top"), strict=True):
         shapes += [Clip(box), *_backdrop(machine, camera, box, label)]
+        shapes += _arm(machine, camera, scene, low)
         for points, colour, width in ((scene.path, PATH, 3), (scene.trail, _pale(scene.colour), 2)):
             if len(points) > 1:
                 shapes.append(Line(camera.project(points), colour, width))
-        shapes += _arm(machine, camera, scene, low)
         tip = camera.project(p_tool)
+        shapes.append(Circle(tip, 4.0, INK))
         if weak:
             shapes.append(Line(_ring(tip, 15.0), WARNING, 2))
         for v, colour in ((v_tool, MEASURED), (scene.v_goal, WANTED)):
@@ -302,7 +303,7 @@ def _backdrop(machine: Machine, camera: Camera, box: Box, label: str) -> list[Sh
 def _arm(machine: Machine, camera: Camera, scene: Scene, low: NDArray[np.bool_]) -> list[Shape]:
     """Links that grow thinner towards the tool, joints at their frames, red where a limit is near."""
     corners = camera.project(skeleton(machine, scene.q))
-    thick = max(3.0, 0.032 * extent(machine).reach * camera.scale)
+    thick = min(30.0, max(3.0, 0.032 * extent(machine).reach * camera.scale))
     sizes = np.linspace(thick, 0.45 * thick, 2 * machine.n + 1)
     sizes[-1] = 0.12 * thick
     base = camera.origin + thick * np.array([[-2.0, -0.9], [2.0, -0.9], [2.3, 0.0], [-2.3, 0.0]])
@@ -321,7 +322,7 @@ def _arm(machine: Machine, camera: Camera, scene: Scene, low: NDArray[np.bool_])
         size = max(4.0, float(sizes[2 * i]))
         shapes.append(Circle(corners[2 * i], 1.1 * size, WARNING if low[i] else _pale(scene.colour, 0.15)))
         shapes.append(Circle(corners[2 * i], 0.5 * size, PAPER))
-    return [*shapes, Circle(corners[-1], max(2.5, 0.2 * thick), INK)]
+    return shapes
 
 
 def _rows(machine: Machine, scene: Scene, box: Box) -> list[Shape]:

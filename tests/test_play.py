@@ -548,6 +548,11 @@ def test_mp4_needs_ffmpeg(
         (["play", "--interface", "virtual"], 2, "--interface, --channel"),
         (["play", "--drive"], 2, "--interface, --channel"),
         (["play", "--policy", "missing.npz"], 1, "missing.npz"),
+        (
+            ["play", "--start", "0", "9"],
+            1,
+            "start: expected 5 angles within the joints' ranges, got [0.0, 9.0]",
+        ),
         (["replay"], 2, "LOGS"),
         (["replay", "a", "b", "c"], 2, "LOGS"),
         (["replay", "missing.log"], 1, "missing.log"),
