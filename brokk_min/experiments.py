@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from brokk_min import __version__, actuator, claims, figures, jacobian, kinematics, logs, report
+from brokk_min import __version__, actuator, claims, figures, jacobian, kinematics, logs, preliminary, report
 from brokk_min.env import Controller, Encoder, TaskConfig, Trace, rollout
 from brokk_min.figures import Traces
 from brokk_min.jacobian import JacobianController
@@ -325,15 +325,6 @@ def driven_log(machine: Machine, traces: Traces, controller: str, runs: int = 16
     return logs.Log(machine.names, tuple(recordings))
 
 
-def nets_table(results: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Errors of the nets by joint."""
-    nets = {}
-    for joint, s in results["actuator"]["test"].items():
-        nets[joint] = {key: s[key] for key in ("one_step_rmse", "persistence_rmse")}
-        nets[joint] |= s["free_run"].get("10", {})
-    return nets
-
-
 def write_json(path: Path, value: Any) -> None:
     """Write JSON whole, floats as they are."""
     with logs.whole_file(path, "w") as file:
@@ -388,28 +379,16 @@ def reproduce(machine: Machine, out: Path, effort: Effort, seed: int) -> dict[st
     results = {
         "meta": meta(machine, seed) | {"effort": asdict(effort)},
         "actuator": {"test": actuator.score(net, test), "driven_by_policy": driven_by_policy},
+        "preliminary": preliminary.run(machine, net, seed),
         **compared,
         "gains": plain_gains(tuned),
         "tuning": how,
     }
     write_json(out / "results.json", results)
     write_json(out / "gains.json", {"meta": results["meta"], "gains": results["gains"]})
-    parts = (
-        (
-            "Actuator nets",
-            "One step and free runs of 10 s on unseen recordings [rad/s, rad].",
-            nets_table(results),
-        ),
-        ("Nets run freely", "One of these recordings.", figures.plot_free_run(net, test)),
-        (
-            "Learning curve",
-            "The exploring policy, on the nets.",
-            figures.plot_learning(out / "policy.npz.csv"),
-        ),
-        *report.task_parts(
-            machine, results, traces, tuning_goals(machine, effort.tuning_runs, 12.0, seed + 1000)
-        ),
-    )
+    goals = tuning_goals(machine, effort.tuning_runs, 12.0, seed + 1000)
+    parts = report.net_parts(machine, net, test, results, seed, out / "policy.npz.csv")
+    parts += report.task_parts(machine, results, traces, goals)
     figures.write_report(out / "report.html", parts, clock)
     lap("draw")
     stages.close()

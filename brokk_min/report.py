@@ -1,4 +1,4 @@
-"""The report's part on task space control, in the paper's order: sentence, verdict, figure.
+"""The report in the paper's order: nets and training, then task space control with its verdicts.
 
 Paper: Sec. 4.2
 """
@@ -6,13 +6,16 @@ Paper: Sec. 4.2
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min import figures
+from brokk_min import figures, preliminary
+from brokk_min.actuator import ActuatorNet
 from brokk_min.figures import Traces
+from brokk_min.logs import Log
 from brokk_min.machine import Machine
 from brokk_min.sequences import axis_sequences, task_sequences
 
@@ -24,6 +27,29 @@ Part = tuple[Any, ...]  # title, sentence, contents: see `figures.write_report`
 def verdict(claim: Mapping[str, Any]) -> str:
     """The paper's sentence, what was measured, and whether it holds."""
     return f"Paper: {claim['paper']} Measured: {claim['measured']}. This {VERDICTS[claim['holds']]}."
+
+
+def net_parts(
+    machine: Machine, net: ActuatorNet, test: Log, results: Mapping[str, Any], seed: int, curve: Path
+) -> list[Part]:
+    """Parts on the nets and the training: errors, the paper's preliminary and sim-to-real figures, curve.
+
+    Paper: Sec. 3.2
+    """
+    errors = {}
+    for joint, s in results["actuator"]["test"].items():
+        errors[joint] = {key: s[key] for key in ("one_step_rmse", "persistence_rmse")}
+        errors[joint] |= s["free_run"].get("10", {})
+    tests, gap = preliminary.plots(machine, net, seed).values()
+    tool = results["preliminary"]["sim_to_real"]["tool"]
+    apart = f"Over 30 s: {tool['position_error_mean']:.3f} m, {tool['velocity_rmse']:.3f} m/s (RMS)."
+    return [
+        ("Actuator nets", "One step and free runs of 10 s on unseen recordings [rad/s, rad].", errors),
+        ("Nets run freely", "One of these recordings.", figures.plot_free_run(net, test)),
+        ("Preliminary tests (Fig. 2)", "The machine above, the nets below.", tests),
+        ("Sim-to-real gap (Fig. 5)", f"Nets less machine under the same commands. {apart}", gap),
+        ("Learning curve", "The exploring policy, on the nets.", figures.plot_learning(curve)),
+    ]
 
 
 def task_parts(
