@@ -36,6 +36,7 @@ from brokk_min.sequences import (
 from brokk_min.simulator import simulate
 
 MACHINES = {machine.name: machine for machine in (BROKK_170,)}
+SHIPPED = Path(__file__).with_name("shipped")  # a folder a machine: policy and gains of `make reproduce`
 Name = Annotated[str, tyro.conf.arg(metavar="{" + ",".join(MACHINES) + "}|FILE.py:NAME")]
 
 
@@ -266,7 +267,8 @@ class Starts(Command):
 class Evaluate(Command):
     """Policy and tuned baselines on the same sequences and starts."""
 
-    policy: Path  # Policy that `train` wrote.
+    policy: Path | None = None
+    """Policy that `train` wrote; by default the one that comes with the package."""
     commands: Path | None = None  # Velocity sequences, CSV: sequence,time,vx,vy,vz [s, m/s].
     starts: Path | None = None  # Start poses, CSV: one column a joint [rad].
     plant: Literal["analytic", "net"] = "analytic"  # What moves: the analytic plant or the nets.
@@ -281,14 +283,15 @@ class Evaluate(Command):
         if self.perfect_model and self.plant == "net":
             raise WrongUse("--perfect-model: expected --plant analytic, the plant that it knows, got net")
         machine, effort = MACHINES[self.machine], experiments.Effort()
-        policy = load_policy(self.policy, machine)
+        path = self.policy or SHIPPED / machine.name / "policy.npz"
+        policy = load_policy(path, machine)
         sequences = read_commands(self.commands, machine) if self.commands else task_sequences(machine)
         if self.starts:
             starts = read_starts(self.starts, machine)
         else:
             starts = scored_starts(machine, self.num_starts, task_sequences(machine), self.seed + 2)
         controllers: dict[str, Controller] = {"rl": PolicyController(machine, policy)}
-        beside = self.policy.with_name("gains.json")
+        beside = path.with_name("gains.json")
         gains = self.gains or (beside if beside.exists() else "tuned now")
         print(f"gains of the baselines: {gains}", file=sys.stderr)
         if isinstance(gains, Path):
@@ -301,7 +304,7 @@ class Evaluate(Command):
         runs, _ = experiments.task_space(machine, controllers, sequences, starts, self.seed, moves)
         if self.json:
             meta = experiments.meta(machine, self.seed)
-            meta |= {"policy": str(self.policy), "gains": str(gains), "plant": self.plant}
+            meta |= {"policy": str(path), "gains": str(gains), "plant": self.plant}
             names = ", ".join(sequence.name for sequence in sequences)
             meta |= {"commands": str(self.commands or names), "starts": str(self.starts or self.num_starts)}
             experiments.write_json(self.json, {"meta": meta, "runs": runs})
@@ -479,7 +482,8 @@ class Export(Command):
 class Play(Command):
     """Drive with keyboard or gamepad in a window, and trace lines; see docs/play.md."""
 
-    policy: Path | None = None  # Policy that `train` wrote; without one there are levers only.
+    policy: Path | None = None
+    """Policy that `train` wrote; by default the one that comes with the package; without any, levers only."""
     gains: Path | None = None  # Tuned gains of the Jacobian controller; by default gains.json beside POLICY.
     interface: str = ""  # python-can's name of a bus; without one a simulated machine stands behind.
     channel: str = ""  # Channel of the interface.
@@ -501,8 +505,9 @@ class Play(Command):
             play.watch(machine, where)
             return
         controllers: dict[str, Controller] = {}
-        if self.policy:
-            policy, beside = load_policy(self.policy, machine), self.policy.with_name("gains.json")
+        path = self.policy or SHIPPED / machine.name / "policy.npz"
+        if self.policy or path.exists():
+            policy, beside = load_policy(path, machine), path.with_name("gains.json")
             gains = self.gains or (beside if beside.exists() else None)
             known = experiments.read_gains(gains, machine, policy.net) if gains else None
             known = known or experiments.baselines(machine, policy.net)

@@ -24,7 +24,7 @@ from brokk_min.jacobian import JacobianController
 from brokk_min.machine import Machine, read_encoder
 from brokk_min.metrics import by_start, intervals, mean_interval, metrics, paired, row_mean, summary
 from brokk_min.mpc import PerfectModel
-from brokk_min.policy import PolicyController
+from brokk_min.policy import PolicyController, save_policy
 from brokk_min.sequences import (
     Commands,
     axis_sequences,
@@ -386,6 +386,9 @@ def reproduce(machine: Machine, out: Path, effort: Effort, seed: int) -> dict[st
     }
     write_json(out / "results.json", results)
     write_json(out / "gains.json", {"meta": results["meta"], "gains": results["gains"]})
+    errors = {c: rows["all"]["velocity_error_mean"] for c, rows in compared["task_space"]["summary"].items()}
+    told = {"command": f"brokk-min reproduce --seed {seed}", "velocity_error_mean": errors}
+    save_policy(out / "policy.npz", replace(policy, training={**policy.training, **told}))
     goals = tuning_goals(machine, effort.tuning_runs, 12.0, seed + 1000)
     parts = report.net_parts(machine, net, test, results, seed, out / "policy.npz.csv")
     parts += report.task_parts(machine, results, traces, goals)

@@ -32,10 +32,7 @@ def verdict(claim: Mapping[str, Any]) -> str:
 def net_parts(
     machine: Machine, net: ActuatorNet, test: Log, results: Mapping[str, Any], seed: int, curve: Path
 ) -> list[Part]:
-    """Parts on the nets and the training: errors, the paper's preliminary and sim-to-real figures, curve.
-
-    Paper: Sec. 3.2
-    """
+    """Parts on the nets and the training: errors, the paper's preliminary and sim-to-real figures, curve."""
     errors = {}
     for joint, s in results["actuator"]["test"].items():
         errors[joint] = {key: s[key] for key in ("one_step_rmse", "persistence_rmse")}
