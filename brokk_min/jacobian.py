@@ -158,11 +158,14 @@ class SteadyMap:
 def steady_map(machine: Machine, net: ActuatorNet, angles: int = 9, commands: int = 41) -> SteadyMap:
     """Ask the nets how fast each driven joint moves steadily under each command at each angle."""
     low, high = machine.column("q_min")[machine.driven], machine.column("q_max")[machine.driven]
-    q = np.linspace(low, high, angles)[:, None]  # (a, 1, n)
+    inset = 0.05 * (high - low)  # assumed; at the very end a stop holds the joint, whatever the command
+    q = np.linspace(low + inset, high - inset, angles)[:, None]  # (a, 1, n)
     u = np.linspace(-1, 1, commands) * machine.pwm_limit / PWM_MAX
     history = np.zeros((angles, commands, len(low), 3, net.history), np.float32)
     history[..., 2, :] = u[:, None, None]
-    velocity, lags = np.zeros((angles, commands, len(low))), np.arange(1 - net.history, 1) / net.rate
+    lags, share = np.arange(1 - net.history, 1) / net.rate, np.linspace(-1, 1, commands)[:, None]
+    moving = np.where(share > 0, net.output_high * share, -net.output_low * share)
+    velocity = np.tile(moving, (angles, 1, 1))  # from rest they might see a joint that stands at its stop
     for _ in range(60):  # fixed point: a history that moves as fast as the nets say it does
         history[..., 0, :] = q[..., None] + velocity[..., None] * lags
         history[..., 1, :] = velocity[..., None]
