@@ -217,7 +217,7 @@ def robustness(
     starts: Array,
     seed: int,
 ) -> dict[str, dict[str, dict[str, float | None]]]:
-    """Mean velocity error [m/s] and its 95 % interval over starts, by variation and controller."""
+    """Mean velocity error [m/s], 95 % interval over starts, by variation and controller. Paper: Sec. 4.2"""
     result: dict[str, dict[str, dict[str, float | None]]] = {}
     for name, (plant, sensor) in variations(machine).items():
         runs, _ = task_space(plant, controllers, sequences, starts, seed, sensor=sensor)

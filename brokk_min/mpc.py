@@ -42,6 +42,8 @@ class PerfectModel:
     It follows the plant by its own commands, so that its state (spools, readiness, delayed commands) is
     exact; observations tell it the goal alone. Valves that are hardly open go to and fro by `dither`, which
     keeps them ready. It drives the machine as it is known, no other.
+
+    Paper: Sec. 4.2 (nothing: beyond it)
     """
 
     machine: Machine

@@ -52,8 +52,8 @@ class PPOConfig:
     """Of Adam at the start and at most; follows `target_kl` and falls linearly to zero at the end."""
     target_kl: float = 0.02
     """Change of the policy in one update at which the learning rate stays as it is (as in rl_games)."""
-    gamma: float = 0.8
-    """Discount a tick: 0.8 looks 5 ticks (0.25 s) ahead, about the machine's response time."""
+    gamma: float = 0.9
+    """Discount a tick: 0.9 looks 10 ticks (0.5 s) ahead, somewhat beyond the machine's response time."""
     gae_lambda: float = 0.95
     """Weight of longer returns in the advantage."""
     clip: float = 0.2

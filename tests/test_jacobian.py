@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 from helpers_machines import obedient_net, obedient_velocity, random_machine
 from scipy.optimize import minimize
 
+from benchmarks.rollout import random_net
 from brokk_min import jacobian as classic
+from brokk_min.actuator import ActuatorNet
 from brokk_min.env import TaskConfig, measured, observe, rollout
 from brokk_min.jacobian import JacobianController, Memory
 from brokk_min.kinematics import jacobian
@@ -644,3 +646,21 @@ def test_a_single_observation_gives_the_command_of_a_batch_of_one():
 
 def test_joined_gains_are_floats():
     assert classic.join_gains(BROKK_170, dict.fromkeys(classic.GAINS, 1)).dtype == float
+
+
+def test_the_steady_map_is_of_motion_even_where_nets_know_stops() -> None:
+    """A net that has seen a pushed joint stand at its stop must not be asked about one that stands."""
+
+    class Stalling(ActuatorNet):
+        def predict(self, history):  # 0.3 rad/s a unit of command, but what stands, stands
+            speed = 0.3 * history[..., 2, -1]
+            return np.where(np.abs(history[..., 1, -1]) < 0.01, 0.0, speed)
+
+    net = random_net(np.random.default_rng(0)).select([BROKK_170.names[i] for i in BROKK_170.driven])
+    stalling = Stalling(**{f.name: getattr(net, f.name) for f in fields(net)})
+    found = classic.steady_map(BROKK_170, stalling)
+    moving = np.abs(found.u) > 0.1
+    np.testing.assert_allclose(
+        found.velocity[..., moving], np.broadcast_to(0.3 * found.u[moving], (4, 9, moving.sum())), atol=1e-4
+    )
+    assert (found.q[:, 0] > BROKK_170.column("q_min")[BROKK_170.driven]).all()
