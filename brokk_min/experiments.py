@@ -373,7 +373,8 @@ def reproduce(machine: Machine, out: Path, effort: Effort, seed: int) -> dict[st
     simulated, _ = task_space(
         machine, {"rl": controllers["rl"]}, axis_sequences(machine), starts, seed, driven
     )
-    compared["task_space"]["rl_on_nets"] = summary(simulated)["rl"]
+    reachable = [run for run in simulated if run["kind"] == "workspace"]
+    compared["task_space"]["rl_on_nets"] = summary(reachable)["rl"]
     driven_by_policy = actuator.score(net, driven_log(machine, traces["all"], "rl"))
     lap("evaluate")
     results = {

@@ -14,9 +14,12 @@ import pytest
 
 from benchmarks.rollout import random_net
 from brokk_min import experiments
-from brokk_min.__main__ import COMMANDS, main
+from brokk_min.__main__ import COMMANDS, SHIPPED, main
 from brokk_min.actuator import load_net
 from brokk_min.logs import read_log
+from brokk_min.machine import BROKK_170
+from brokk_min.metrics import summary
+from brokk_min.policy import load_policy
 
 
 def run(*arguments: object) -> int:
@@ -250,3 +253,23 @@ def test_only_training_imports_torch(command: str) -> None:
     code += "finally: print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code, command, "--help"], capture_output=True, text=True)
     assert done.stdout.endswith("False\n"), done.stderr
+
+
+def test_a_policy_comes_with_the_package_and_tracks(tmp_path: Path) -> None:
+    """Its file says what made it and how good it was; driven again, it still beats the paper's way."""
+    policy = load_policy(SHIPPED / "brokk170" / "policy.npz", BROKK_170)
+    told = policy.training["velocity_error_mean"]
+    assert policy.training["command"] == "brokk-min reproduce --seed 0" and policy.training["seed"] == 0
+    assert told["rl"] < min(told["jacobian_pid_k0.1"], told["jacobian_pid_k0.05"])
+    table = json.loads((SHIPPED / "brokk170" / "gains.json").read_text())
+    assert set(table["gains"]) | {"rl"} == set(told) and table["meta"]["seed"] == 0
+    assert run("evaluate", "--num-starts", 4, "--json", tmp_path / "e.json") == 0
+    rows = summary(json.loads((tmp_path / "e.json").read_text())["runs"])
+    errors = {name: row["all"]["velocity_error_mean"] for name, row in rows.items()}
+    assert 0 < errors["rl"] < min(errors["jacobian_pid_k0.1"], errors["jacobian_pid_k0.05"])
+
+
+def test_a_machine_without_a_policy_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    other = Path(__file__).parent.parent / "examples" / "mini_excavator.py"
+    assert run("evaluate", "--machine", f"{other}:MINI_EXCAVATOR") == 1
+    assert "policy.npz" in capsys.readouterr().err
