@@ -172,7 +172,7 @@ def losses(agent: Agent, part: dict[str, Tensor], clip: float) -> Tensor:
     old, advantages = part["log_probability"], normalise(part["advantage"])
     loss = policy_loss(new, old, advantages, clip)
     value_loss = ((agent.value(part["observation"]) - part["return"]) ** 2).mean()
-    entropy = agent.log_std.sum() + 0.5 * len(agent.log_std) * np.log(2 * np.pi * np.e)
+    entropy = agent.log_std.sum() + 0.5 * len(agent.log_std) * (1 + np.log(2 * np.pi))
     with torch.no_grad():
         change = new - old
         kl = (torch.exp(change) - 1 - change).mean()
