@@ -51,7 +51,7 @@ ALLOWED: tuple[tuple[float, float, str], ...] = (
     (0, 0.9999, "gamma"),
     (0, 1000, "noise valve_cost entropy"),
     (0, 1e6, "hold_min_s hold_max_s"),
-    (1, 1e6, "batch_size hidden num_envs group horizon epochs threads rollout num num_starts"),
+    (1, 1e6, "batch_size hidden num_envs horizon epochs threads rollout num num_starts"),
     (1, 1e12, "steps total_steps checkpoint_every"),
     (2, 1e7, "velocity_samples history minibatch_size"),
     (-10, 3, "log_std"),
@@ -191,7 +191,7 @@ def split(log: Log) -> tuple[Log, Log]:
 
 def train_command() -> Any:
     """The command `train`; made on demand, because its settings live beside torch."""
-    from brokk_min.ppo import TASK, PPOConfig, train
+    from brokk_min.ppo import PPOConfig, train
 
     @dataclass(kw_only=True)
     class Train(Command):
@@ -202,7 +202,7 @@ def train_command() -> Any:
         resume: bool = False  # Take up OUT.checkpoint; the end is the same as without the break.
         tensorboard: Path | None = None  # Folder for TensorBoard (extra `tensorboard`).
         settings: tyro.conf.OmitArgPrefixes[PPOConfig] = field(default_factory=PPOConfig)  # The learner.
-        task: tyro.conf.OmitArgPrefixes[TaskConfig] = TASK  # What an episode is.
+        task: tyro.conf.OmitArgPrefixes[TaskConfig] = field(default_factory=TaskConfig)  # What an episode is.
 
         def run(self) -> None:
             """Train and write the policy."""
@@ -217,7 +217,7 @@ def train_command() -> Any:
 
 def sweep_command() -> Any:
     """The command `sweep`; made on demand as `train`."""
-    from brokk_min.ppo import TASK, PPOConfig
+    from brokk_min.ppo import PPOConfig
     from brokk_min.sweep import show, sweep
 
     @dataclass(kw_only=True)
@@ -232,7 +232,7 @@ def sweep_command() -> Any:
         gains: Path | None = None  # Tuned gains that `reproduce` wrote: baselines beside.
         settings: tyro.conf.OmitArgPrefixes[PPOConfig] = field(default_factory=PPOConfig)
         """The learner; each seed runs on one thread, whatever --threads says."""
-        task: tyro.conf.OmitArgPrefixes[TaskConfig] = TASK  # What an episode is.
+        task: tyro.conf.OmitArgPrefixes[TaskConfig] = field(default_factory=TaskConfig)  # What an episode is.
 
         def run(self) -> None:
             """Sweep and print the table."""

@@ -349,17 +349,30 @@ class ActuatorNet:
 
     def velocity(self, history: Array) -> Array:
         """What the nets alone say, as `predict`."""
+        return self._layers(history)[0]
+
+    def slope(self, history: Array) -> tuple[Array, Array]:
+        """What the nets alone say, and its derivative by the history, (..., n, 3, H)."""
+        velocity, fraction, second, first = self._layers(history)
+        w1, _, w2, _, w3, _ = self._folded
+        by = (self.output_high - self.output_low)[:, None, None] * fraction * (1 - fraction)
+        by = by @ w3.swapaxes(1, 2) * (second > 0)
+        by = by @ w2.swapaxes(1, 2) * (first > 0)
+        return velocity, (by @ w1.swapaxes(1, 2)).swapaxes(0, 1).reshape(history.shape)
+
+    def _layers(self, history: Array) -> tuple[Array, ...]:
+        """Velocity as `velocity`, then what the layers say, (n, batch, units), the last first."""
         n, inputs = len(self.joints), 3 * self.history
         if history.shape[-3:] != (n, 3, self.history):
             raise ValueError(f"history: expected (..., {n}, 3, {self.history}), got {history.shape}")
         x = history.reshape(-1, n, inputs).swapaxes(0, 1)  # (n, batch, 3 H)
         w1, b1, w2, b2, w3, b3 = self._folded
-        x = np.maximum(x @ w1 + b1, 0)
-        x = np.maximum(x @ w2 + b2, 0)
-        fraction = 1 / (1 + np.exp(-(x @ w3 + b3)[..., 0]))
+        first = np.maximum(x @ w1 + b1, 0)
+        second = np.maximum(first @ w2 + b2, 0)
+        fraction = 1 / (1 + np.exp(-(second @ w3 + b3)))
         low, high = self.output_low[:, None], self.output_high[:, None]
-        velocity: Array = (low + (high - low) * fraction).T
-        return velocity.reshape(history.shape[:-2])
+        velocity: Array = (low + (high - low) * fraction[..., 0]).T
+        return velocity.reshape(history.shape[:-2]), fraction, second, first
 
     @cached_property
     def _folded(self) -> tuple[Array, ...]:

@@ -71,8 +71,6 @@ class TaskConfig:
     """Largest noise of the measured part of an observation, in standard deviations (paper: 5 %)."""
     valve_cost: float = 0.01
     """Reward lost for each change of a command by its limit, mean of the driven joints (paper: 0)."""
-    group: int = 1
-    """Neighbouring environments that share start poses and goals, for learners that compare them."""
     redraw_ground: bool = True
     """Redraw start poses in the ground; False is the paper's rule: end the episode without reward."""
     paper: bool = False
@@ -402,14 +400,8 @@ def _draw_hold(machine: Machine, config: TaskConfig, rng: np.random.Generator, n
 def reset(machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int, plant: bool) -> State:
     """`num` machines at rest in random poses with random goals; leading shape (num,)."""
     pose, goal = draw_pose(machine, config, rng, num), draw_goal(machine, config, rng, num)
-    first = _first_of_group(config, num)
-    state = rest_state(machine, pose[first], goal[first], plant)
-    return replace(state, goal_ticks=_draw_hold(machine, config, rng, num)[first])
-
-
-def _first_of_group(config: TaskConfig, num: int) -> NDArray[np.intp]:
-    """Which environment's pose and goals each of `num` has, (num,)."""
-    return np.arange(num) // config.group * config.group
+    state = rest_state(machine, pose, goal, plant)
+    return replace(state, goal_ticks=_draw_hold(machine, config, rng, num))
 
 
 def look(machine: Machine, config: TaskConfig, state: State, rng: np.random.Generator) -> Array:
@@ -468,8 +460,7 @@ def _next_goals(
     goals[due] = draw_goal(machine, config, rng, len(due))
     goals[due, 2] = np.where(low[due], np.abs(goals[due, 2]), goals[due, 2])
     holds[due] = _draw_hold(machine, config, rng, len(due))
-    first = _first_of_group(config, len(goals))
-    return replace(state, v_goal=goals[first], goal_ticks=holds[first])
+    return replace(state, v_goal=goals, goal_ticks=holds)
 
 
 def _travel(machine: Machine, before: State, after: State) -> Array:

@@ -340,7 +340,7 @@ def reproduce(machine: Machine, out: Path, effort: Effort, seed: int) -> dict[st
 
     `results.json` holds no clock: the same seed gives the same file on the same machine.
     """
-    from brokk_min.ppo import TASK, PPOConfig, train  # torch, only where something is trained
+    from brokk_min.ppo import PPOConfig, train  # torch, only where something is trained
 
     out.mkdir(parents=True, exist_ok=True)
     clock, last = {}, time.perf_counter()
@@ -363,7 +363,7 @@ def reproduce(machine: Machine, out: Path, effort: Effort, seed: int) -> dict[st
     lap("fit")
     driven = net.select([machine.names[i] for i in machine.driven])
     learner = PPOConfig(total_steps=effort.train_steps)
-    policy = train(machine, driven, TASK, learner, seed, out / "policy.npz", resume=True)
+    policy = train(machine, driven, TaskConfig(), learner, seed, out / "policy.npz", resume=True)
     lap("train")
     tuned, how = tuned_baselines(machine, driven, effort, seed)
     lap("tune")

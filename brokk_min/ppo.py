@@ -3,6 +3,9 @@
 Paper: Sec. 3.4. Clipped objective, generalised advantage estimation, 256 environments at once. An
 episode that runs out of time is not an episode that failed: at a truncation the return goes on with
 the value of the episode's own last observation (`next_values`), at a termination it stops.
+
+Advantages come from a critic, as in the paper, or, because the simulation is made of nets, from their
+derivatives (`adjoint`): what an action's deviation from the mean was worth, to first order.
 """
 
 from __future__ import annotations
@@ -23,14 +26,14 @@ from torch import nn
 from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet, load_header, net_arrays
-from brokk_min.env import State, TaskConfig, TaskVectorEnv, observation_scale, paper_view
+from brokk_min.adjoint import Rollout, action_gradients
+from brokk_min.env import State, TaskConfig, TaskVectorEnv, observation_scale, paper_view, to_command
 from brokk_min.logs import load_arrays, whole_file
 from brokk_min.machine import Machine
 from brokk_min.policy import Policy, contract, save_policy
 
 Tensor = torch.Tensor
 FORMAT = 1  # of checkpoints
-TASK = TaskConfig(group=8)  # to be trained on: eight environments share starts and goals, see `relative`
 STATE = [f.name for f in fields(State) if f.name != "plant"]
 
 
@@ -52,6 +55,8 @@ class PPOConfig:
     """Of Adam at the start and at most; follows `target_kl` and falls linearly to zero at the end."""
     target_kl: float = 0.02
     """Change of the policy in one update at which the learning rate stays as it is (as in rl_games)."""
+    critic: bool = False
+    """Advantages by a critic and GAE, as in the paper and under `--paper`, not by the nets' derivatives."""
     gamma: float = 0.9
     """Discount a tick: 0.9 looks 10 ticks (0.5 s) ahead, somewhat beyond the machine's response time."""
     gae_lambda: float = 0.95
@@ -64,6 +69,8 @@ class PPOConfig:
     """Gradients are scaled down to this norm."""
     log_std: float = -1.2
     """Logarithm of the actions' standard deviation at the start."""
+    log_std_end: float = -3.5
+    """The same at the end, with straight steps between; with a critic it is learned instead."""
     checkpoint_every: int = 50
     """Updates between two checkpoints."""
     threads: int = 2
@@ -142,22 +149,6 @@ def policy_loss(new: Tensor, old: Tensor, advantages: Tensor, clip: float) -> Te
     return -torch.min(ratio * advantages, clipped * advantages).mean()
 
 
-def relative(advantages: Tensor, group: int) -> Tensor:
-    """Advantages (T, N) less the mean of the others in the group at the same tick; as they are for 1.
-
-    What starts and goals, which a group shares, do to the return is no merit of an action; the critic
-    cannot foresee it. The others' mean does not depend on the action, so nothing is biased.
-
-    Example:
-        >>> relative(torch.tensor([[1.0, 2.0, 4.0, 4.0]]), 2).tolist()
-        [[-1.0, 1.0, 0.0, 0.0]]
-    """
-    if group == 1:
-        return advantages
-    groups = advantages.reshape(len(advantages), -1, group)
-    return ((groups - groups.mean(-1, keepdim=True)) * (group / (group - 1))).flatten(1)
-
-
 def normalise(advantages: Tensor) -> Tensor:
     """Advantages (B,) with zero mean and unit deviation."""
     return (advantages - advantages.mean()) / (advantages.std() + 1e-8)
@@ -166,12 +157,15 @@ def normalise(advantages: Tensor) -> Tensor:
 def losses(agent: Agent, part: dict[str, Tensor], clip: float) -> Tensor:
     """Policy loss, value loss, entropy, change of the policy and clipped share of a minibatch, (5,).
 
-    The change is Schulman's estimate of the KL divergence; it and the share have no gradient.
+    The change is Schulman's estimate of the KL divergence; it and the share have no gradient. There is no
+    value loss without returns.
     """
     new = log_probability(part["action"], agent.actor(part["observation"]), agent.log_std)
     old, advantages = part["log_probability"], normalise(part["advantage"])
     loss = policy_loss(new, old, advantages, clip)
-    value_loss = ((agent.value(part["observation"]) - part["return"]) ** 2).mean()
+    value_loss = torch.zeros(())
+    if "return" in part:
+        value_loss = ((agent.value(part["observation"]) - part["return"]) ** 2).mean()
     entropy = agent.log_std.sum() + 0.5 * len(agent.log_std) * (1 + np.log(2 * np.pi))
     with torch.no_grad():
         change = new - old
@@ -203,6 +197,8 @@ class Training:
             torch.manual_seed(seed)
             shapes = env.single_observation_space.shape, env.single_action_space.shape
             self.agent = Agent(shapes[0][0], shapes[1][0], config.log_std)  # type: ignore[index]
+        self.critic = config.critic or env.config.paper
+        self.agent.log_std.requires_grad_(self.critic)
         self.optimizer = torch.optim.Adam(self.agent.parameters(), lr=config.learning_rate, fused=True)
         self.updates, self.learning_rate = 0, config.learning_rate
         self.returns, self.lengths = (np.zeros(config.num_envs) for _ in range(2))  # of running episodes
@@ -219,6 +215,9 @@ class Training:
         c = self.config
         rate = self.learning_rate * max(0.0, 1 - self.steps / c.total_steps)
         self.optimizer.param_groups[0]["lr"] = rate
+        if not self.critic:
+            done = self.steps / c.total_steps
+            self.agent.log_std.data.fill_(c.log_std + (c.log_std_end - c.log_std) * done)
         batch, scalars = self._collect()
         losses = self._learn(batch)
         self.updates += 1
@@ -234,57 +233,76 @@ class Training:
 
     @torch.no_grad()
     def _collect(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        c, agent = self.config, self.agent
-        shape = (c.horizon, c.num_envs)
+        """`horizon` ticks of every environment, every action judged."""
+        c, agent, env = self.config, self.agent, self.env
+        shape, std = (c.horizon, c.num_envs), torch.exp(agent.log_std)
         observations = torch.empty(*shape, self.observation.shape[-1])
-        actions = torch.empty(*shape, len(agent.log_std))
-        rewards, ended, tails = (torch.zeros(shape) for _ in range(3))
-        errors, std = [], torch.exp(agent.log_std)
-        finished: list[tuple[float, float]] = []
+        actions, means = (torch.empty(*shape, len(std)) for _ in range(2))
+        rewards, tails, ended = torch.empty(shape), torch.zeros(shape), torch.empty(shape, dtype=torch.bool)
+        ticks: list[tuple[Any, ...]] = []
+        errors, finished = [], []
         for t in range(c.horizon):
-            step = self.steps + t * c.num_envs
+            step, state = self.steps + t * c.num_envs, env.state
             observations[t] = finite("observation", self.observation, step)
-            mean = agent.actor(self.observation)
-            noise = torch.randn(mean.shape, generator=self.generator)
-            actions[t] = finite("action", mean + std * noise, step)
-            following, reward, terminated, truncated, info = self.env.step(actions[t].numpy())
-            rewards[t] = finite("reward", torch.from_numpy(reward), step) * (1 - c.gamma)
-            ended[t] = torch.from_numpy(terminated | truncated).float()
-            if truncated.any():
+            means[t] = agent.actor(self.observation)
+            noise = torch.randn(means[t].shape, generator=self.generator)
+            actions[t] = finite("action", means[t] + std * noise, step)
+            following, reward, terminated, truncated, info = env.step(actions[t].numpy())
+            rewards[t] = finite("reward", torch.from_numpy(reward), step)
+            over = terminated | truncated
+            ended[t] = torch.from_numpy(over)
+            if not self.critic:
+                u = to_command(env.machine, actions[t].numpy())
+                ticks.append((state.q, state.history, state.v_goal, u, over))  # type: ignore[union-attr]
+            elif truncated.any():
                 last = torch.from_numpy(info["final_obs"][truncated])
                 tails[t, torch.from_numpy(truncated)] = agent.value(finite("final_obs", last, step))
             self.observation = torch.from_numpy(following)
             errors.append(info["velocity_error"].mean())
             self.returns, self.lengths = self.returns + reward, self.lengths + 1
-            over = terminated | truncated
             finished += list(zip(self.returns[over], self.lengths[over], strict=True))
             self.returns, self.lengths = (np.where(over, 0, x) for x in (self.returns, self.lengths))
-        values = agent.value(observations)
-        following_values = torch.cat([values[1:], agent.value(self.observation)[None]])
-        next_values = torch.where(ended > 0, tails, following_values)
-        advantages = gae(rewards, values, next_values, ended, c.gamma, c.gae_lambda)
-        batch = {
-            "observation": observations,
-            "action": actions,
-            "log_probability": log_probability(actions, agent.actor(observations), agent.log_std),
-            "advantage": relative(advantages, self.env.config.group),
-            "return": advantages + values,
-        }
-        returns = batch["return"]
         if finished:  # few episodes end in one update: the last ones stand until then
             self.episodes = tuple(map(float, np.mean(finished, axis=0)))
         scalars = {
             "charts/episodic_return": self.episodes[0],
             "charts/episodic_length": self.episodes[1],
-            "charts/reward": float(rewards.mean()) / (1 - c.gamma),
+            "charts/reward": float(rewards.mean()),
             "charts/velocity_error": float(np.mean(errors)),
-            "losses/explained_variance": float(1 - advantages.var() / (returns.var() + 1e-12)),
         }
+        batch = {"observation": observations, "action": actions}
+        batch["log_probability"] = log_probability(actions, means, agent.log_std)
+        if self.critic:
+            batch |= self._by_critic(observations, rewards, tails, ended.float())
+            unexplained = batch["advantage"].var() / (batch["return"].var() + 1e-12)
+            scalars["losses/explained_variance"] = float(1 - unexplained)
+        else:
+            batch["advantage"] = self._by_adjoint(ticks, actions, means)
         return {name: tensor.flatten(0, 1) for name, tensor in batch.items()}, scalars
+
+    def _by_critic(
+        self, observations: Tensor, rewards: Tensor, tails: Tensor, ended: Tensor
+    ) -> dict[str, Tensor]:
+        """Advantages and returns (T, N); `tails`: values of the last observations of truncated episodes."""
+        c, values = self.config, self.agent.value(observations)
+        following = torch.cat([values[1:], self.agent.value(self.observation)[None]])
+        following = torch.where(ended > 0, tails, following)
+        advantages = gae(rewards * (1 - c.gamma), values, following, ended, c.gamma, c.gae_lambda)
+        return {"advantage": advantages, "return": advantages + values}
+
+    def _by_adjoint(self, ticks: list[tuple[Any, ...]], actions: Tensor, means: Tensor) -> Tensor:
+        """Advantages (T, N): what the deviation from the mean action was worth, to first order."""
+        env, net = self.env, self.env.net
+        if net is None:
+            raise ValueError("actuator: expected nets, whose derivatives are known, got the analytic plant")
+        rollout = Rollout(*map(np.stack, zip(*ticks, strict=True)))
+        slope = action_gradients(env.machine, net, rollout, self.config.gamma, env.config.valve_cost)
+        deviation = actions.clamp(-1, 1) - means.clamp(-1, 1)  # of what the valves got
+        return (torch.from_numpy(slope) * deviation).sum(-1)
 
     def _learn(self, batch: dict[str, Tensor]) -> dict[str, float]:
         c, agent = self.config, self.agent
-        size, total = len(batch["return"]), torch.zeros(5)
+        size, total = len(batch["action"]), torch.zeros(5)
         for _ in range(c.epochs):
             order = torch.randperm(size, generator=self.generator)
             for rows in torch.split(order, c.minibatch_size):
@@ -335,7 +353,7 @@ class Training:
         moments = self.optimizer.state
         for i, parameter in enumerate(self.agent.parameters()):
             arrays[f"parameter_{i}"] = parameter.detach().numpy()
-            for name, value in moments[parameter].items():
+            for name, value in moments.get(parameter, {}).items():  # none of what is not trained
                 arrays[f"{name}_{i}"] = value.numpy()
         with whole_file(path) as file:
             np.savez(file, header=np.array(json.dumps(header)), **arrays)
@@ -371,7 +389,8 @@ class Training:
             for i, parameter in enumerate(self.agent.parameters()):
                 parameter.copy_(tensors[f"parameter_{i}"])
                 names = ("step", "exp_avg", "exp_avg_sq")
-                moments[parameter] = {name: tensors[f"{name}_{i}"] for name in names}
+                if f"step_{i}" in tensors:
+                    moments[parameter] = {name: tensors[f"{name}_{i}"] for name in names}
 
 
 def fingerprint(net: ActuatorNet) -> str:
@@ -422,8 +441,6 @@ def train(
             reward, loss or weight that is no number, with its place (the last checkpoint stays).
         OSError: a file that cannot be written (the last checkpoint stays).
     """
-    if config.num_envs % task.group:
-        raise ValueError(f"num_envs: expected a multiple of group {task.group}, got {config.num_envs}")
     env = TaskVectorEnv(config.num_envs, net, machine, task)
     training = Training(env, config, seed)
     identity = identity_of(machine, net, task, config, seed)
