@@ -315,7 +315,8 @@ class Training:
                 total += found.detach() * len(rows)
         names = ("policy_loss", "value_loss", "entropy", "approx_kl", "clipfrac")
         means = (total / (size * c.epochs)).tolist()
-        return {f"losses/{name}": value for name, value in zip(names, means, strict=True)}
+        found = dict(zip(names, means, strict=True))
+        return {f"losses/{name}": found[name] for name in names if self.critic or name != "value_loss"}
 
     def policy(self, training: dict[str, Any]) -> Policy:
         """The actor as it stands, for the machine it was trained for."""

@@ -495,26 +495,6 @@ def test_a_reset_is_at_rest_and_tells_its_pose():
     np.testing.assert_allclose(found.v_goal, env.state.v_goal, atol=1e-6)
 
 
-def test_a_group_shares_starts_and_goals_and_another_group_does_not():
-    config = replace(TaskConfig(), group=4, episode_s=2.0, hold_min_s=0.2, hold_max_s=0.6)
-    env = TaskVectorEnv(8, "analytic", BROKK_170, config)
-    env.reset(seed=3)
-    rng, seen = np.random.default_rng(0), set()
-    for _ in range(100):  # over two ends of episodes
-        state = env.state
-        for group in (slice(0, 4), slice(4, 8)):
-            assert (state.v_goal[group] == state.v_goal[group][0]).all()
-            assert (state.goal_ticks[group] == state.goal_ticks[group][0]).all()
-            if state.ticks[group][0] == 0:
-                assert (state.q[group] == state.q[group][0]).all()
-        assert (state.v_goal[0] != state.v_goal[4]).any() and (state.q[0] != state.q[4]).any()
-        seen.add(tuple(state.v_goal[0]))
-        observation, *_ = env.step(rng.uniform(-1, 1, (8, 4)))
-        shown = task.measured(BROKK_170, observation).v_goal
-        np.testing.assert_allclose(shown, env.state.v_goal, atol=0.05)  # turned by noisy angles
-    assert len(seen) > 5
-
-
 def test_no_goal_asks_an_arm_close_to_the_ground_to_sink():
     pose = np.array([[0.3, 0.2, 0.3, 1.4, 1.1]])
     config = replace(QUIET, hold_min_s=5.0, hold_max_s=5.0)

@@ -26,7 +26,7 @@ from torch import nn
 from brokk_min import logs, ppo
 from brokk_min.__main__ import main
 from brokk_min.actuator import save_net
-from brokk_min.env import TaskConfig, TaskVectorEnv, look
+from brokk_min.env import TaskConfig, TaskVectorEnv, look, to_command
 from brokk_min.machine import BROKK_170
 from brokk_min.policy import load_policy
 from brokk_min.ppo import Agent, PPOConfig, Training, gae, train
@@ -34,6 +34,7 @@ from brokk_min.ppo import Agent, PPOConfig, Training, gae, train
 TINY = PPOConfig(
     num_envs=8, horizon=8, epochs=2, minibatch_size=32, total_steps=4 * 64, checkpoint_every=2, threads=1
 )
+CRITIC = replace(TINY, critic=True)
 TASK = TaskConfig(episode_s=0.6)  # 12 ticks: time runs out within the first updates
 NET = small_net(BROKK_170, np.random.default_rng(0))
 
@@ -210,27 +211,6 @@ def test_policy_loss_is_the_mean():
     assert float(found) == pytest.approx(-(1.2 + 0.5 + 4.0 - 1.0) / 4)
 
 
-@pytest.mark.parametrize("group", [2, 4, 8])
-def test_an_advantage_is_judged_against_the_others_of_its_group(group):
-    """By the definition, one environment at a time; what the whole group has in common drops out."""
-    raw = torch.randn(5, 8, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    found = ppo.relative(raw, group)
-    for t in range(5):
-        for i in range(8):
-            first = i // group * group
-            others = [raw[t, j].item() for j in range(first, first + group) if j != i]
-            assert found[t, i].item() == pytest.approx(raw[t, i].item() - np.mean(others))
-    common = torch.repeat_interleave(torch.randn(5, 8 // group, dtype=torch.float64), group, dim=1)
-    torch.testing.assert_close(ppo.relative(raw + common, group), found)
-    assert ppo.relative(raw, 1) is raw
-
-
-def test_training_refuses_groups_that_do_not_fit(tmp_path):
-    net = small_net(BROKK_170, np.random.default_rng(0))
-    with pytest.raises(ValueError, match="num_envs: expected a multiple of group 8, got 12"):
-        train(BROKK_170, net, ppo.TASK, PPOConfig(num_envs=12), 0, tmp_path / "p")
-
-
 def test_normalise():
     np.testing.assert_allclose(ppo.normalise(torch.tensor([1.0, 2.0, 3.0])), [-1, 0, 1], atol=1e-6)
     wild = 50 + 7 * torch.randn(999, generator=torch.Generator().manual_seed(1))
@@ -267,7 +247,7 @@ def test_the_nets_are_those_of_the_paper():
 class Script:
     """An environment that plays a tape: each observation is one number."""
 
-    config = TaskConfig()
+    config, state = TaskConfig(), None
 
     def __init__(self, e):
         self.e, self.tick = e, 0
@@ -300,7 +280,7 @@ class Echo(nn.Module):
 def test_collected_advantages_use_the_right_last_observations(seed):
     """A critic that echoes a scripted environment: values, and so advantages, are known."""
     e = episodes(seed)
-    config = replace(TINY, num_envs=6, horizon=12, gamma=0.9, gae_lambda=0.7)
+    config = replace(CRITIC, num_envs=6, horizon=12, gamma=0.9, gae_lambda=0.7)
     training = Training(Script(e), config, seed=0)
     training.agent.critic = Echo()
     batch, _ = training._collect()
@@ -315,7 +295,7 @@ def test_collected_advantages_use_the_right_last_observations(seed):
 
 def test_the_critic_is_asked_about_final_observations_of_truncations():
     """In the real environment: a spy on the critic sees `final_obs` where time ran out."""
-    training = Training(TaskVectorEnv(8, NET, BROKK_170, TASK), replace(TINY, horizon=13), seed=1)
+    training = Training(TaskVectorEnv(8, NET, BROKK_170, TASK), replace(CRITIC, horizon=13), seed=1)
     asked, given = [], []
     value, step = training.agent.value, training.env.step
     training.agent.value = lambda x: (asked.append(x.clone()), value(x))[1]
@@ -334,9 +314,51 @@ def test_the_critic_is_asked_about_final_observations_of_truncations():
         assert (rows == final).all(-1).any()
 
 
+def test_without_a_critic_an_action_is_judged_by_its_slope(monkeypatch):
+    """Slope times what noise added to the command the valves got; slopes are of the right rollout."""
+    training = Training(TaskVectorEnv(8, NET, BROKK_170, TASK), replace(TINY, horizon=13, log_std=-0.5), 1)
+    training.agent.actor[-1].bias.data += torch.tensor([1.1, -0.9, 0.3, 0.0])  # beyond the limit
+    slopes = np.random.default_rng(0).standard_normal((13, 8, 4)).astype(np.float32)
+    asked, begun, over, step = [], [], [], training.env.step
+
+    def spy(actions):
+        begun.append(training.env.state)
+        result = step(actions)
+        over.append(result[2] | result[3])
+        return result
+
+    training.env.step = spy
+    given = vars(ppo)  # of the module under test, which may be a mutant
+    monkeypatch.setitem(given, "action_gradients", lambda *a: (asked.append(a), slopes)[1])
+    batch, scalars = training._collect()
+    with torch.no_grad():
+        mean = training.agent.actor(batch["observation"])
+    deviation = batch["action"].clamp(-1, 1) - mean.clamp(-1, 1)
+    wanted = (torch.from_numpy(slopes).flatten(0, 1) * deviation).sum(-1)
+    torch.testing.assert_close(batch["advantage"], wanted, atol=1e-5, rtol=1e-5)
+    assert (mean.abs() > 1).any() and "return" not in batch and "losses/explained_variance" not in scalars
+    (machine, net, rollout, gamma, cost), *none = asked
+    assert (machine, net.joints, gamma, cost) == (BROKK_170, NET.joints, TINY.gamma, TASK.valve_cost)
+    assert not none and np.any(over)
+    for name in ("q", "history", "v_goal"):
+        np.testing.assert_array_equal(getattr(rollout, name), [getattr(s, name) for s in begun])
+    commands = to_command(BROKK_170, batch["action"].view(13, 8, 4).numpy())
+    np.testing.assert_array_equal(rollout.u, commands)
+    np.testing.assert_array_equal(rollout.ended, over)
+
+
+def test_without_a_critic_the_deviation_falls_in_a_line():
+    training = Training(TaskVectorEnv(8, NET, BROKK_170, TASK), replace(TINY, log_std_end=-2.2), 1)
+    found = []
+    for _ in range(4):
+        training.update()
+        found.append(training.agent.log_std.tolist())
+    np.testing.assert_allclose(found, np.tile([[-1.2], [-1.45], [-1.7], [-1.95]], 4), atol=1e-6)
+
+
 def test_without_a_learning_rate_nothing_changes():
     """Old and new probabilities then agree: what is stored is what the policy did."""
-    training = Training(TaskVectorEnv(8, NET, BROKK_170, TASK), replace(TINY, learning_rate=0.0), 2)
+    training = Training(TaskVectorEnv(8, NET, BROKK_170, TASK), replace(CRITIC, learning_rate=0.0), 2)
     before = [p.detach().clone() for p in training.agent.parameters()]
     scalars = training.update()
     assert all(map(torch.equal, before, training.agent.parameters()))
@@ -366,7 +388,7 @@ def test_the_learning_rate_is_lowered_while_the_policy_changes_too_much():
 class Bandit:
     """One tick an episode: the reward falls with the distance of the action from a target."""
 
-    config, target = TaskConfig(), np.array([0.6, -0.4], np.float32)
+    config, state, target = TaskConfig(), None, np.array([0.6, -0.4], np.float32)
 
     def __init__(self, num):
         self.num = num
@@ -393,6 +415,7 @@ def test_a_bandit_is_learned():
         total_steps=30 * 512,
         learning_rate=1e-3,
         log_std=-0.7,
+        critic=True,
         threads=1,
     )
     training = Training(Bandit(64), config, seed=0)
@@ -430,7 +453,8 @@ def test_the_task_is_learned_a_little():
 @pytest.mark.parametrize("entropy", [0.0, 0.3])
 def test_learning_is_adam_on_the_losses_of_the_paper(entropy):
     """One pass, written once more with torch's own normal distribution, on the same minibatches."""
-    config = replace(TINY, epochs=1, minibatch_size=16, entropy=entropy, max_grad_norm=0.5, target_kl=1e9)
+    config = replace(CRITIC, epochs=1, minibatch_size=16, entropy=entropy, max_grad_norm=0.5)
+    config = replace(config, target_kl=1e9)
     training = Training(Bandit(8), config, seed=0)
     batch, _ = training._collect()
     batch["advantage"] = 3 + 5 * batch["advantage"]
@@ -459,7 +483,7 @@ def test_learning_is_adam_on_the_losses_of_the_paper(entropy):
 
 
 def test_actions_vary_as_the_policy_says():
-    training = Training(Bandit(512), replace(TINY, num_envs=512, log_std=-2.0), seed=0)
+    training = Training(Bandit(512), replace(CRITIC, num_envs=512, log_std=-2.0), seed=0)
     with torch.no_grad():
         batch, _ = training._collect()
         z = (batch["action"] - training.agent.actor(batch["observation"])) / np.exp(-2.0)
@@ -478,6 +502,11 @@ def advantages_are_right():
     test_collected_advantages_use_the_right_last_observations(0)
 
 
+def actions_are_judged_by_their_slopes():
+    with pytest.MonkeyPatch.context() as patch:
+        test_without_a_critic_an_action_is_judged_by_its_slope(patch)
+
+
 def loss_is_right():
     for case in ((1.5, 2.0, -2.4, 0.0), (1.5, -2.0, 3.0, 3.0), (0.5, 2.0, -1.0, -1.0), (0.5, -2.0, 1.6, 0.0)):
         test_policy_loss_by_hand(*case)
@@ -488,14 +517,18 @@ def learning_is_right():
 
 
 PLANTED = (
-    ("terminated | truncated).float", "terminated).float", advantages_are_right),
-    ("            if truncated.any():", "            if False:", advantages_are_right),
+    ("ended[t] = torch.from_numpy(over)", "ended[t] = torch.from_numpy(terminated)", advantages_are_right),
+    ("elif truncated.any():", "elif False:", advantages_are_right),
     ('info["final_obs"][truncated]', "following[truncated]", advantages_are_right),
     ('info["final_obs"][truncated]', "observations[t].numpy()[truncated]", advantages_are_right),
-    ("torch.where(ended > 0, tails, following_values)", "following_values", advantages_are_right),
-    ("agent.value(self.observation)[None]", "values[-1:]", advantages_are_right),
-    ("values[1:], agent", "values[:-1], agent", advantages_are_right),
-    (", step) * (1 - c.gamma)", ", step)", advantages_are_right),
+    ("torch.where(ended > 0, tails, following)", "following", advantages_are_right),
+    ("self.agent.value(self.observation)[None]", "values[-1:]", advantages_are_right),
+    ("values[1:], self.agent", "values[:-1], self.agent", advantages_are_right),
+    ("rewards * (1 - c.gamma)", "rewards", advantages_are_right),
+    ("actions.clamp(-1, 1) - means.clamp(-1, 1)", "actions - means", actions_are_judged_by_their_slopes),
+    ("actions.clamp(-1, 1) - means", "means - actions", actions_are_judged_by_their_slopes),
+    ("* deviation).sum(-1)", "* deviation).mean(-1)", actions_are_judged_by_their_slopes),
+    ("state.v_goal, u, over", "state.v_goal, u, terminated", actions_are_judged_by_their_slopes),
     ('"return": advantages + values', '"return": advantages', advantages_are_right),
     (
         "delta = rewards + gamma * next_values - values",
@@ -530,7 +563,7 @@ PLANTED = (
         "torch.full((actions,), log_std)",
         lambda: test_the_nets_are_those_of_the_paper(),
     ),
-    ("mean + std * noise", "mean + noise", lambda: test_actions_vary_as_the_policy_says()),
+    ("means[t] + std * noise", "means[t] + noise", lambda: test_actions_vary_as_the_policy_says()),
     (
         "1 / 1.2 if change > 1.5 else 1.2",
         "1.2 if change > 1.5 else 1 / 1.2",
@@ -583,8 +616,9 @@ def test_the_same_seed_gives_the_same_bits_whatever_torch_drew_before():
     assert not torch.equal(runs[0][0][0], weights_of(other)[0])
 
 
-def test_a_checkpoint_goes_on_to_the_same_bits(tmp_path):
-    straight, first, second = learner(), learner(), learner(seed=3)
+@pytest.mark.parametrize("config", [TINY, CRITIC], ids=["adjoint", "critic"])
+def test_a_checkpoint_goes_on_to_the_same_bits(tmp_path, config):
+    straight, first, second = (learner(config=config) for _ in range(3))
     straight_curve = [straight.update() for _ in range(4)]
     curve = [first.update() for _ in range(2)]
     first.save(tmp_path / "c", {"seed": 3})
@@ -655,8 +689,9 @@ def test_a_killed_training_is_taken_up_to_the_same_bytes(tmp_path, monkeypatch, 
     ]
 
 
-def test_what_train_writes_can_be_driven_and_read(tmp_path):
-    policy = run(tmp_path / "p.npz")
+@pytest.mark.parametrize("config", [TINY, CRITIC], ids=["adjoint", "critic"])
+def test_what_train_writes_can_be_driven_and_read(tmp_path, config):
+    policy = run(tmp_path / "p.npz", config=config)
     again = load_policy(tmp_path / "p.npz", BROKK_170)
     assert all(map(np.array_equal, policy.weights, again.weights))
     assert again.training["seed"] == 5
@@ -666,9 +701,10 @@ def test_what_train_writes_can_be_driven_and_read(tmp_path):
         rows = list(csv.DictReader(file))
     assert [int(row["global_step"]) for row in rows] == [64, 128, 192, 256]
     wanted = {"global_step", "charts/reward", "charts/velocity_error", "charts/learning_rate"}
-    wanted |= {"charts/SPS", "losses/policy_loss", "losses/value_loss", "losses/entropy"}
-    wanted |= {"losses/approx_kl", "losses/clipfrac", "losses/explained_variance"}
-    assert wanted <= set(rows[0])
+    wanted |= {"charts/SPS", "losses/policy_loss", "losses/entropy", "losses/approx_kl", "losses/clipfrac"}
+    wanted |= {"charts/episodic_return", "charts/episodic_length"}
+    of_critic = {"losses/value_loss", "losses/explained_variance"}
+    assert set(rows[0]) == wanted | (of_critic if config.critic else set())
     assert all(0 < float(row["charts/reward"]) <= 1 for row in rows)
     assert all(np.isfinite(float(value)) for row in rows for value in row.values())
 
@@ -793,7 +829,7 @@ def test_what_is_no_number_stops_with_its_place_and_keeps_the_checkpoint(
                 self.agent.actor[-1].bias[2] = np.nan
         return result
 
-    config = replace(TINY, checkpoint_every=1)
+    config = replace(TINY, checkpoint_every=1, critic=where in ("final_obs", "action"))
     with monkeypatch.context() as patch:
         patch.setattr(TaskVectorEnv, "step", poisoned_step)
         patch.setattr(Training, "_learn", poisoned_learn)
@@ -931,9 +967,11 @@ def test_twenty_kills_at_random_moments_end_in_the_same_bytes(tmp_path):
 
 def test_a_plant_is_not_what_policies_are_trained_on():
     """A checkpoint or policy of the analytic plant would say nothing of the simulation."""
-    training = Training(TaskVectorEnv(8, "analytic", BROKK_170, TASK), TINY, 0)
+    env = TaskVectorEnv(8, "analytic", BROKK_170, TASK)
     with pytest.raises(ValueError, match="actuator: expected a policy trained on nets, got"):
-        training.policy({})
+        Training(env, CRITIC, 0).policy({})
+    with pytest.raises(ValueError, match="actuator: expected nets, whose derivatives are known, got the ana"):
+        Training(env, TINY, 0).update()
 
 
 def test_a_policy_of_the_papers_observation_runs_on_every_observation(tmp_path):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -118,7 +117,7 @@ def test_a_sweep_from_the_command_line_and_once_more(
     monkeypatch.setattr(module, "apart", here)
     monkeypatch.setattr(module.os, "cpu_count", lambda: 1)  # torch's seed is one for all threads
     save_net(tmp_path / "net.npz", NET)
-    settings = {"num-envs": 4, "group": 2, "horizon": 4, "epochs": 1, "minibatch-size": 16, "total-steps": 32}
+    settings = {"num-envs": 4, "horizon": 4, "epochs": 1, "minibatch-size": 16, "total-steps": 32}
     pairs = [text for name, value in settings.items() for text in (f"--{name}", str(value))]
     command = ["sweep", "--actuator", f"{tmp_path}/net.npz", "--out", f"{tmp_path}/sweep", "--seed", "3"]
     command += ["--seeds", "2", "--poses", "2", "--episode-s", "0.6", *pairs]
@@ -128,7 +127,7 @@ def test_a_sweep_from_the_command_line_and_once_more(
     files = sorted(p.name for p in (tmp_path / "sweep").iterdir())
     seeds = [f"seed_{n}.{end}" for n in (3, 4) for end in ("json", "npz", "npz.csv")]
     assert files == [*seeds, "sweep.json"]
-    train(BROKK_170, NET, replace(TASK, group=2), TINY, 4, tmp_path / "alone.npz")
+    train(BROKK_170, NET, TASK, TINY, 4, tmp_path / "alone.npz")
     assert (tmp_path / "sweep/seed_4.npz").read_bytes() == (tmp_path / "alone.npz").read_bytes()
     written = json.loads((tmp_path / "sweep/sweep.json").read_text())
     assert len(written["runs"]) == 2 * 3 * 2 and written["table"]["rl"]["valve_travel"]["mean"] > 0
