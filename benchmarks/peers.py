@@ -113,7 +113,7 @@ def cleanrl(env: TaskVectorEnv, rate: float, seed: int, threads: int) -> Iterato
     agent = ppo.Agent(env.single_observation_space.shape[0], env.single_action_space.shape[0], -1.2)
     optimizer = torch.optim.Adam(agent.parameters(), lr=rate, eps=1e-5)
     seen = torch.from_numpy(env.reset(seed=seed)[0])
-    horizon, gamma = 32, 0.8
+    horizon, gamma = 32, 0.9
     while True:
         kept: dict[str, list[torch.Tensor]] = {
             key: [] for key in ("x", "a", "logp", "value", "reward", "end")
@@ -187,7 +187,7 @@ def sb3(env: TaskVectorEnv, rate: float, seed: int, threads: int) -> Iterator[Ac
             return [False] * env.num_envs
 
     nets = {"net_arch": [256, 128, 64], "activation_fn": torch.nn.ELU, "log_std_init": -1.2}
-    how = {"n_steps": 32, "batch_size": min(2048, 32 * env.num_envs), "n_epochs": 4, "gamma": 0.8}
+    how = {"n_steps": 32, "batch_size": min(2048, 32 * env.num_envs), "n_epochs": 4, "gamma": 0.9}
     model = PPO(
         "MlpPolicy", Adapter(), learning_rate=rate, policy_kwargs=nets, seed=seed, device="cpu", **how
     )
@@ -234,7 +234,7 @@ def rl_games(env: TaskVectorEnv, rate: float, seed: int, threads: int) -> Iterat
         config = {
             "name": "brokk", "env_name": "brokk", "reward_shaper": {"scale_value": 1.0}, "device": "cpu",
             "device_name": "cpu", "train_dir": folder, "num_actors": env.num_envs, "ppo": True, "tau": 0.95,
-            "normalize_input": True, "normalize_value": True, "normalize_advantage": True, "gamma": 0.8,
+            "normalize_input": True, "normalize_value": True, "normalize_advantage": True, "gamma": 0.9,
             "learning_rate": rate, "lr_schedule": "adaptive", "kl_threshold": 0.02, "e_clip": 0.2,
             "clip_value": False, "horizon_length": 32, "minibatch_size": min(2048, 32 * env.num_envs),
             "mini_epochs": 4, "critic_coef": 1.0, "entropy_coef": 0.0, "grad_norm": 1.0,

@@ -51,10 +51,10 @@ class PPOConfig:
     """Passes over the collected steps in each update."""
     minibatch_size: int = 2048
     """Steps in one gradient."""
-    learning_rate: float = 1e-3
+    learning_rate: float = 4e-3
     """Of Adam at the start and at most; follows `target_kl` and falls linearly to zero at the end."""
-    target_kl: float = 0.02
-    """Change of the policy in one update at which the learning rate stays as it is (as in rl_games)."""
+    target_kl: float = 0.1
+    """Change of the policy in one update at which the learning rate stays as it is (rule of rl_games)."""
     critic: bool = False
     """Advantages by a critic and GAE, as in the paper and under `--paper`, not by the nets' derivatives."""
     gamma: float = 0.9
