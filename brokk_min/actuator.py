@@ -123,14 +123,15 @@ def sine_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Arra
 def rich_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Array:
     """Sines over a wide band, steps, fast random holds, stop and go out of rests; small noise, (ticks,).
 
-    Levels are drawn up to a third above the limit: cut there, a quarter are at the limit, as a policy's.
+    Steps last up to 10 s, so that joints also run through to their stops. Levels are drawn up to a third
+    above the limit: cut there, a quarter are at the limit, as a policy's.
     """
     limit = 4 / 3 * machine.pwm_limit / PWM_MAX
     parts: list[Array] = []
     while sum(map(len, parts)) < ticks:
-        length = int(rng.uniform(0.5, 4.0) / machine.dt)
-        time = machine.dt * np.arange(length)
         kind = rng.choice(["sine", "step", "holds", "go"], p=[0.25, 0.15, 0.25, 0.35])
+        length = int(rng.uniform(0.5, 10.0 if kind == "step" else 4.0) / machine.dt)
+        time = machine.dt * np.arange(length)
         amplitude = rng.uniform(machine.dead_zone, limit)
         if kind == "sine":
             frequency = np.exp(rng.uniform(np.log(0.05), np.log(4.0)))
@@ -451,14 +452,14 @@ class FitConfig:
     """Windows a joint in each step."""
     learning_rate: float = 4e-3
     """Of Adam at the start; falls to zero along a cosine, and again from a quarter for free runs."""
-    noise: float = 0.2
+    noise: float = 0.05
     """Standard deviation of the noise on the velocity inputs, in units of the velocities' own."""
     hidden: int = 32
     """Units in each of the two hidden layers (paper: 32)."""
     history: int = 13
     """Samples of angle, velocity and command that the nets see (paper: 13)."""
     rollout: int = 8
-    """Ticks that the nets run freely in the last fifth of the steps, which learn from that (paper: 1)."""
+    """Ticks that the nets run freely in the second half of the steps, which learns from that (paper: 1)."""
 
 
 PAPER_RECIPE: dict[str, Any] = {"noise": 0.0, "rollout": 1}  # Sec. 3.3
@@ -507,7 +508,7 @@ def _train(training: TrainingSet, config: FitConfig, seed: int, estimator: int |
         weight.requires_grad_()
     optimizer = torch.optim.Adam(weights, lr=config.learning_rate)
     runs_free = config.rollout > 1 and all(map(len, training.far_ends))
-    turn = round(0.8 * config.steps) if runs_free else config.steps
+    turn = config.steps // 2 if runs_free else config.steps
 
     def fall(step: int) -> float:
         done = step / turn if step < turn else (step - turn) / max(config.steps - turn, 1)

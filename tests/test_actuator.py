@@ -796,7 +796,7 @@ def test_a_fit_repeats_itself_to_the_bit():
 
 @pytest.mark.parametrize("logged", [False, True])
 def test_the_loss_of_a_free_run_is_what_the_nets_do_when_run(logged):
-    """Three ticks on the nets' own outputs, stops included: squared errors so far, in units of their range."""
+    """Three ticks on the nets' own outputs, stops included: squared errors so far, in units of the range."""
     log, config = simple_system(0, 4, logged=logged), FitConfig(steps=1, batch_size=4, noise=0, rollout=3)
     net = fit(log, config, seed=0, velocity_samples=4)
     net.weights[5][:] = 9.0  # fast upwards
