@@ -123,14 +123,15 @@ def sine_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Arra
 def rich_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Array:
     """Sines over a wide band, steps, fast random holds, stop and go out of rests; small noise, (ticks,).
 
-    Levels are drawn up to a third above the limit: cut there, a quarter are at the limit, as a policy's.
+    Steps last up to 10 s, so that joints also run through to their stops. Levels are drawn up to a third
+    above the limit: cut there, a quarter are at the limit, as a policy's.
     """
     limit = 4 / 3 * machine.pwm_limit / PWM_MAX
     parts: list[Array] = []
     while sum(map(len, parts)) < ticks:
-        length = int(rng.uniform(0.5, 4.0) / machine.dt)
-        time = machine.dt * np.arange(length)
         kind = rng.choice(["sine", "step", "holds", "go"], p=[0.25, 0.15, 0.25, 0.35])
+        length = int(rng.uniform(0.5, 10.0 if kind == "step" else 4.0) / machine.dt)
+        time = machine.dt * np.arange(length)
         amplitude = rng.uniform(machine.dead_zone, limit)
         if kind == "sine":
             frequency = np.exp(rng.uniform(np.log(0.05), np.log(4.0)))
@@ -142,8 +143,9 @@ def rich_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Arra
         elif kind == "holds":
             hold = int(rng.integers(1, 8))
             part = np.repeat(rng.uniform(-limit, limit, length // hold + 1), hold)[:length]
-        else:  # out of rests, in half of the cases with a restless hand within the dead zone
-            part = rng.choice([0, 1]) * rng.uniform(0, machine.dead_zone) * rng.uniform(-1, 1, length)
+        else:  # out of rests, in half of the cases with a restless hand: what just opens a valve keeps it ready
+            reach, hold = rng.choice([0, 1]) * rng.uniform(0, 2) * machine.dead_zone, int(rng.integers(1, 8))
+            part = np.repeat(rng.uniform(-reach, reach, length // hold + 1), hold)[:length]
             at = 0
             while at < length:
                 at += int(np.exp(rng.uniform(np.log(0.05), np.log(3.0))) / machine.dt)
@@ -389,11 +391,12 @@ class ActuatorNet:
         """
         history = push_command(history, u)
         predicted = self.predict(history)
-        q = np.clip(q + predicted / self.rate, np.minimum(q, self.q_low), np.maximum(q, self.q_high))
+        free, before = q + predicted / self.rate, q
+        q = np.clip(free, np.minimum(q, self.q_low), np.maximum(q, self.q_high))
 
         def velocity(angles: Array) -> Array:
             if self.velocity_logged:
-                return predicted
+                return np.where(q == free, predicted, (q - before) * self.rate)
             return estimate_velocity(angles, self.velocity_samples, 1 / self.rate)
 
         return push_angle(history, q, velocity), q
@@ -463,14 +466,14 @@ class FitConfig:
     """Windows a joint in each step."""
     learning_rate: float = 4e-3
     """Of Adam at the start; falls to zero along a cosine, and again from a quarter for free runs."""
-    noise: float = 0.2
+    noise: float = 0.05
     """Standard deviation of the noise on the velocity inputs, in units of the velocities' own."""
     hidden: int = 32
     """Units in each of the two hidden layers (paper: 32)."""
     history: int = 13
     """Samples of angle, velocity and command that the nets see (paper: 13)."""
     rollout: int = 8
-    """Ticks that the nets run freely in the last fifth of the steps, which learn from that (paper: 1)."""
+    """Ticks that the nets run freely in the second half of the steps, which learns from that (paper: 1)."""
 
 
 PAPER_RECIPE: dict[str, Any] = {"noise": 0.0, "rollout": 1}  # Sec. 3.3
@@ -480,8 +483,9 @@ def fit(log: Log, config: FitConfig, seed: int, velocity_samples: int, machine: 
     """Fit one net a joint to a log. Paper: Sec. 3.3 (MSE, Adam)
 
     One-step errors first, then short free runs, in which a bias adds up while the noise of encoders does
-    not. The same `seed` gives the same bits on the same machine. `velocity_samples` is the window of the
-    estimator that supplied the velocities of `log`, `machine` a name for the file.
+    not. What `ActuatorNet.step` cuts off at a stop is no error: nets need not brake before it. The same
+    `seed` gives the same bits on the same machine. `velocity_samples` is the window of the estimator that
+    supplied the velocities of `log`, `machine` a name for the file.
 
     Raises:
         ValueError: a joint that never moves long enough to be learned.
@@ -517,17 +521,15 @@ def _train(training: TrainingSet, config: FitConfig, seed: int, estimator: int |
     for weight in weights:
         weight.requires_grad_()
     optimizer = torch.optim.Adam(weights, lr=config.learning_rate)
-    turn = (
-        round(0.8 * config.steps) if config.rollout > 1 and all(map(len, training.far_ends)) else config.steps
-    )
+    runs_free = config.rollout > 1 and all(map(len, training.far_ends))
+    turn = config.steps // 2 if runs_free else config.steps
 
     def fall(step: int) -> float:
         done = step / turn if step < turn else (step - turn) / max(config.steps - turn, 1)
         return (0.5 if step < turn else 0.125) * (1 + float(np.cos(np.pi * done)))
 
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, fall)
-    target = (training.target - training.output_low) / (training.output_high - training.output_low)
-    arrays = (training.series, target.T)
+    arrays = (training.series, training.target.T)
     tapes = [torch.tensor(array, dtype=torch.float32).flatten(-2) for array in arrays]  # joint after joint
     first = torch.arange(n)[:, None] * len(training.target)
     for step in tqdm(range(config.steps), desc="fit nets", unit="step", disable=None):
@@ -559,10 +561,11 @@ def _rollout_loss(
 ) -> Any:
     """Mean square of how far free runs from the windows that end `at` (n, batch) are off.
 
-    After each tick, in units of the outputs' range and ticks: the error of the outputs so far, added up.
+    After each tick, in units of the outputs' range and ticks: the error of the velocities so far, added up.
+    A joint goes no further than its stops, as in `ActuatorNet.step`.
 
     Args:
-        tapes: inputs (3, n N) and wanted outputs (n N,), joint after joint.
+        tapes: inputs (3, n N) and wanted velocities (n N,) [rad/s], joint after joint.
         estimator: samples of the velocity estimator; None: velocities are the nets' own outputs.
     """
     import torch
@@ -571,12 +574,13 @@ def _rollout_loss(
     n, history = len(at), config.history
     mean, scale, low, high = (torch.tensor(array).float() for array in training[3:7])
     mean, scale = mean.reshape(n, 1, 3, history), scale.reshape(n, 1, 3, history)
-    window = series[:, at[..., None] + torch.arange(1 - history, ticks)]  # (3, n, batch, H + ticks - 1)
+    window = series.unfold(-1, history + ticks - 1, 1)[:, at - (history - 1)]  # (3, n, batch, H + ticks - 1)
     q, q_dot, u = window[0, ..., :history], window[1, ..., :history], window[2]
     if config.noise:
         shape = (*at.shape, history)
         noise = torch.randn(*shape, generator=generator) + torch.randn(*shape[:2], 1, generator=generator)
         q_dot = q_dot + config.noise * scale[:, :, 1] * noise
+    stops = [torch.tensor(array).float()[:, None] for array in (training.q_low, training.q_high)]
     off, loss = torch.zeros(()), torch.zeros(())
     for k in range(ticks):
         x = (torch.stack([q, q_dot, u[..., k : k + history]], dim=2) - mean) / scale
@@ -584,15 +588,16 @@ def _rollout_loss(
         for i in (0, 2):
             x = torch.relu(torch.baddbmm(weights[i + 1][:, None], x, weights[i]))
         y = torch.sigmoid(torch.baddbmm(weights[5][:, None], x, weights[4]))[..., 0]
-        off = off + y - target[at + k]
+        room = [(stop - q[..., -1]) * RATE for stop in stops]
+        velocity = torch.clamp(low[:, None] + (high - low)[:, None] * y, *room)
+        off = off + (velocity - target[at + k]) / (high - low)[:, None]
         loss = loss + (off**2).mean(dim=1).sum() / ticks
         if k + 1 < ticks:
-            velocity = (low[:, None] + (high - low)[:, None] * y)[..., None]
-            q = torch.cat([q[..., 1:], q[..., -1:] + velocity / RATE], dim=-1)
+            q = torch.cat([q[..., 1:], (q[..., -1] + velocity / RATE)[..., None]], dim=-1)
             if estimator:
                 slope = torch.tensor(estimate_velocity(np.eye(estimator), estimator, 1 / RATE)).float()
-                velocity = (q[..., -estimator:] * slope).sum(dim=-1, keepdim=True)
-            q_dot = torch.cat([q_dot[..., 1:], velocity], dim=-1)
+                velocity = (q[..., -estimator:] * slope).sum(dim=-1)
+            q_dot = torch.cat([q_dot[..., 1:], velocity[..., None]], dim=-1)
     return loss
 
 
@@ -632,7 +637,8 @@ def training_set(log: Log, history: int, rollout: int = 1) -> TrainingSet:
     scale = np.where(scale > 1e-9, scale, 1.0)  # a channel that never changes
     low = np.array([samples.target[end, j].min() for j, end in enumerate(ends)])
     high = np.array([samples.target[end, j].max() for j, end in enumerate(ends)])
-    low, high = low - 0.05 * (high - low), high + 0.05 * (high - low)
+    margin = 0.05 * (high - low) + 1e-6  # rad/s; never none, where a joint knows one speed
+    low, high = low - margin, high + margin
     mean, scale = np.repeat(mean, history, axis=1), np.repeat(scale, history, axis=1)
     ranges = samples.whole.q.min(axis=0), samples.whole.q.max(axis=0)
     return TrainingSet(series, samples.target, ends, mean, scale, low, high, *ranges, far_ends)

@@ -98,7 +98,7 @@ PLANTED: list[tuple[str, str, str, str]] = [
      "actuator::prediction_against_a_loop_in_double_precision"),
     ("actuator", "low + (high - low) * fraction", "low + high * fraction",
      "actuator::prediction_against_a_loop_in_double_precision"),
-    ("actuator", "np.clip(q + predicted / self.rate", "np.clip(q + predicted * self.rate",
+    ("actuator", "q + predicted / self.rate, q", "q + predicted * self.rate, q",
      "actuator::a_step_of_the_simulation_by_hand"),
     ("actuator", "np.arange(before, length - after, step)", "np.arange(before, length, step)",
      "actuator::windows_never_cross_recordings"),
