@@ -143,9 +143,8 @@ def rich_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Arra
         elif kind == "holds":
             hold = int(rng.integers(1, 8))
             part = np.repeat(rng.uniform(-limit, limit, length // hold + 1), hold)[:length]
-        else:  # out of rests, in half of the cases with a restless hand: what just opens a valve keeps it ready
-            reach, hold = rng.choice([0, 1]) * rng.uniform(0, 2) * machine.dead_zone, int(rng.integers(1, 8))
-            part = np.repeat(rng.uniform(-reach, reach, length // hold + 1), hold)[:length]
+        else:  # out of rests, in half of the cases with a restless hand within the dead zone
+            part = rng.choice([0, 1]) * rng.uniform(0, machine.dead_zone) * rng.uniform(-1, 1, length)
             at = 0
             while at < length:
                 at += int(np.exp(rng.uniform(np.log(0.05), np.log(3.0))) / machine.dt)
