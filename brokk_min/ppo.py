@@ -315,8 +315,8 @@ class Training:
                 total += found.detach() * len(rows)
         names = ("policy_loss", "value_loss", "entropy", "approx_kl", "clipfrac")
         means = (total / (size * c.epochs)).tolist()
-        found = dict(zip(names, means, strict=True))
-        return {f"losses/{name}": found[name] for name in names if self.critic or name != "value_loss"}
+        pairs = zip(names, means, strict=True)
+        return {f"losses/{name}": mean for name, mean in pairs if self.critic or name != "value_loss"}
 
     def policy(self, training: dict[str, Any]) -> Policy:
         """The actor as it stands, for the machine it was trained for."""
