@@ -360,7 +360,7 @@ def reproduce(machine: Machine, out: Path, effort: Effort, seed: int) -> dict[st
     config = actuator.FitConfig(steps=effort.fit_steps, history=machine.history)
     net = actuator.fit(log, config, seed, machine.velocity_samples, machine.name)
     actuator.save_net(out / "net.npz", net)
-    half = replace(config, steps=effort.fit_steps // 2)  # as good as all of them, by this recipe
+    half = replace(config, steps=effort.fit_steps // 2)  # for time
     paper = preliminary.paper_recipe(machine, test, effort.hours, half, seed)
     lap("fit")
     driven = net.select([machine.names[i] for i in machine.driven])
