@@ -236,10 +236,8 @@ def _drive_legs(
     rest = round(5 * machine.ready_down_time * machine.rate)  # ticks until a valve is idle again
     back = np.full(len(row), length)  # tick at which each way back begins
     rested = np.zeros(len(row), int)  # ticks at rest after it
-    met, push = (
-        np.zeros(len(row), int),
-        machine.rate * (excitation == "rich"),
-    )  # ticks at a limit, allowed ones
+    met = np.zeros(len(row), int)  # ticks at a limit
+    push = machine.rate * (excitation == "rich")  # allowed ones
     recorder = _Recorder(machine, q)
     while rested.min() < rest and len(recorder.u) < length + MAX_RETURN * machine.rate:
         tick, angle = len(recorder.u), recorder.q[-1][row, joint]

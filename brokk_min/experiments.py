@@ -360,6 +360,8 @@ def reproduce(machine: Machine, out: Path, effort: Effort, seed: int) -> dict[st
     config = actuator.FitConfig(steps=effort.fit_steps, history=machine.history)
     net = actuator.fit(log, config, seed, machine.velocity_samples, machine.name)
     actuator.save_net(out / "net.npz", net)
+    half = replace(config, steps=effort.fit_steps // 2)  # for time
+    paper = preliminary.paper_recipe(machine, test, effort.hours, half, seed)
     lap("fit")
     driven = net.select([machine.names[i] for i in machine.driven])
     learner = PPOConfig(total_steps=effort.train_steps)
@@ -381,6 +383,7 @@ def reproduce(machine: Machine, out: Path, effort: Effort, seed: int) -> dict[st
         "meta": meta(machine, seed) | {"effort": asdict(effort)},
         "actuator": {"test": actuator.score(net, test), "driven_by_policy": driven_by_policy},
         "preliminary": preliminary.run(machine, net, seed),
+        "paper_recipe": paper,
         **compared,
         "gains": plain_gains(tuned),
         "tuning": how,

@@ -7,15 +7,16 @@ and velocities are means over a tick, without encoder and estimator: what is com
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brokk_min import actuator, figures, kinematics
-from brokk_min.actuator import ActuatorNet
+from brokk_min.actuator import ActuatorNet, FitConfig
 from brokk_min.env import fitting_nets
-from brokk_min.logs import Log
+from brokk_min.logs import RETURN, Log
 from brokk_min.machine import BROKK_170, PWM_MAX, Machine, encode_pwm
 
 Array = NDArray[np.floating[Any]]
@@ -262,6 +263,21 @@ def _gap_numbers(machine: Machine, gap: Gap) -> dict[str, Any]:
     tool = {"position_error_mean": float(position[0]), "velocity_rmse": float(velocity[0])}
     spread = {"median": float(np.median(position)), "max": float(position.max()), "runs": len(position)}
     return {"tool": tool, "joints": joints, "tool_position_error_mean_of_runs": spread}
+
+
+def paper_recipe(
+    machine: Machine, test: Log, hours: float, config: FitConfig, seed: int
+) -> dict[str, dict[str, Any]]:
+    """Scores on `test` and gap of nets by the paper's recipe (sines, errors of one step), for JSON.
+
+    Paper: Sec. 3.3
+    """
+    log = actuator.collect(machine, hours, "sine", np.random.default_rng(seed))
+    legs = tuple(r for r in log.recordings if not r.name.endswith(RETURN))
+    config = replace(config, **actuator.PAPER_RECIPE)
+    net = actuator.fit(log._replace(recordings=legs), config, seed, machine.velocity_samples, machine.name)
+    gap = _gap_numbers(machine, sim_to_real(machine, net, seed))
+    return {"test": actuator.score(net, test), "sim_to_real": gap}
 
 
 def plots(machine: Machine, net: ActuatorNet, seed: int) -> dict[str, Any]:

@@ -176,6 +176,8 @@ def test_results_hold_every_run_with_its_figures(twice: tuple[Path, Path]) -> No
     assert keys == {(c, s, i) for c in names for s in sequences for i in range(4)}
     assert all(r["velocity_rmse"] >= r["velocity_error_mean"] > 0 for r in runs)
     assert all(0 < r["reward_mean"] < 1 for r in runs)
+    assert set(results["paper_recipe"]["test"]) == set(results["actuator"]["test"])
+    assert results["paper_recipe"]["sim_to_real"]["tool"]["position_error_mean"] > 0
     assert results["start_kinds"] == ["workspace", "limits", "workspace", "extended"]
     assert all(r["kind"] == results["start_kinds"][r["start"]] for r in runs)
     scored = [r for r in runs if r["kind"] == "workspace"]
@@ -228,6 +230,7 @@ def test_the_report_is_one_file_with_its_figures(twice: tuple[Path, Path]) -> No
     assert "not a real Brokk 170" in text
     for claim in json.loads((twice[0] / "results.json").read_text())["claims"]:
         assert html.escape(claim["measured"]) in text
+    assert "<td>rich, free runs (ours)</td>" in text and "<td>sines, one step (paper)</td>" in text
     assert text.count("<td>start ") == 4 and text.count("<td>tuning run ") == 2
 
 

@@ -173,6 +173,24 @@ def test_the_gap_is_between_tools_where_the_arms_end(monkeypatch):
     np.testing.assert_allclose(gap.p_tool, p[0] - p[1:], atol=1e-12)
 
 
+def test_the_papers_recipe_is_sines_without_ways_back_and_errors_of_one_step(monkeypatch):
+    seen = {}
+
+    def recording_fit(log: Log, config: FitConfig, *rest: object) -> ActuatorNet:
+        seen.update(log=log, config=config)
+        return real_fit(log, config, *rest)
+
+    real_fit, real_collect = actuator.fit, actuator.collect
+    monkeypatch.setattr(actuator, "fit", recording_fit)
+    monkeypatch.setattr(actuator, "collect", lambda *a: seen.update(excitation=a[2]) or real_collect(*a))
+    test = actuator.task_log(BROKK_170, 2, 12.0, np.random.default_rng(1))
+    result = preliminary.paper_recipe(BROKK_170, test, 0.02, FitConfig(steps=3, batch_size=8), 0)
+    assert seen["excitation"] == "sine" and seen["config"] == FitConfig(3, 8, noise=0.0, rollout=1)
+    assert seen["log"].recordings and not any(r.name.endswith("_return") for r in seen["log"].recordings)
+    assert set(result["test"]) == set(BROKK_170.names) and "10" in result["test"]["q5"]["free_run"]
+    assert result["sim_to_real"]["tool_position_error_mean_of_runs"]["runs"] == 20
+
+
 def test_the_command_writes_figures_and_numbers(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     net = replace(random_net(np.random.default_rng(0)), machine="brokk170")
     actuator.save_net(tmp_path / "net.npz", net)
