@@ -124,7 +124,11 @@ def attempts_table(attempts: Iterable[Attempt], task: str) -> list[str]:
             by_mode.setdefault(attempt.mode, []).append(attempt)
     lines = []
     for mode, rows in by_mode.items():
-        s, mean, largest, travel = np.array([row[3:] for row in rows], float).mean(axis=0)
-        figures = f"{s:.1f} s, off by {mean:.3f} m, at most {largest:.3f} m, valves {travel:.0f}"
-        lines.append(f"{mode} ({len(rows)}): {figures}")
+        lines.append(f"mean of {len(rows)} by {mode}: {figures(np.mean([row[3:] for row in rows], axis=0))}")
     return lines
+
+
+def figures(numbers: Iterable[float]) -> str:
+    """The four figures of an attempt in words."""
+    seconds, mean, largest, travel = numbers
+    return f"{seconds:.1f} s, off by {mean:.3f} m, at most {largest:.3f} m, valves {travel:.0f}"
