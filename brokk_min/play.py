@@ -208,8 +208,8 @@ class Session:
         ]
         if self.tracing:
             passed = f"{self.tracing.passed} of {len(self.tracing.line)}"
-            seconds = len(self.tracing.p) * self.machine.dt
-            lines.append(f"{self.task}: follow the orange line to its ring, {seconds:.1f} s, {passed}")
+            seconds = f"{self.tracing.seconds:.1f} s"
+            lines.append(f"{self.task}: follow the orange line to its ring, {seconds}, {passed}")
         elif self.done:
             lines.append(f"{self.done.task} by {self.done.mode}: {tracing.figures(self.done[3:])}")
         return lines + tracing.attempts_table(self.attempts, self.task)

@@ -76,12 +76,16 @@ class Tracing:
     p: list[Array] = field(default_factory=list)
     u: list[Array] = field(default_factory=list)
     passed: int = 0
+    begun: float = 0.0  # tick
+    seconds: float = 0.0  # since then; by ticks, because a busy window misses some
 
     def follow(self, known: Known) -> bool:
         """One tick; True if it was the last."""
         if not self.p and not known.u.any():
             return False
         p = tool_position(self.machine, known.q)
+        self.begun = self.begun if self.p else known.tick
+        self.seconds = (known.tick - self.begun + 1) * self.machine.dt
         self.p.append(p)
         self.u.append(known.u)
         while self.passed < len(self.line) and np.linalg.norm(self.line[self.passed] - p) < CAPTURE:
@@ -92,8 +96,8 @@ class Tracing:
         """The figures of the finished attempt."""
         away, u = distance(self.line, np.array(self.p)), np.array(self.u)
         travel = float(np.abs(np.diff(u, axis=0, prepend=0 * u[:1])).sum())
-        seconds, when = len(self.p) * self.machine.dt, time.strftime("%Y-%m-%dT%H:%M:%S")
-        return Attempt(when, self.task, mode, seconds, float(away.mean()), float(away.max()), travel)
+        when = time.strftime("%Y-%m-%dT%H:%M:%S")
+        return Attempt(when, self.task, mode, self.seconds, float(away.mean()), float(away.max()), travel)
 
 
 def read_attempts(path: Path) -> list[Attempt]:

@@ -454,10 +454,11 @@ def test_a_line_is_done_when_all_its_points_were_passed_in_order() -> None:
     rest, open_ = Known(0, np.array(START), *np.zeros((2, 5)), np.zeros(3), True), np.full(5, 0.5)
     assert not work.follow(rest) and not work.p  # the clock waits for the first opened valve
     radius = np.hypot(*tool_position(BROKK_170, START)[:2])
-    for y, done in ((0.0, 1), (0.6, 1), (0.3, 2), (0.55, 3)):
+    for tick, y, done in ((7, 0.0, 1), (8, 0.6, 1), (9, 0.3, 2), (16, 0.55, 3)):  # six ticks were missed
         q = np.array([np.arcsin(y / radius), *START[1:]])
-        finished = work.follow(rest._replace(q=q, u=open_))
+        finished = work.follow(rest._replace(tick=tick, q=q, u=open_))
         assert work.passed == done and finished == (done == 3)
+    assert work.score("levers").seconds == pytest.approx(0.5)
 
 
 # --- the window ---------------------------------------------------------------------------------------
