@@ -342,7 +342,8 @@ def _rows(machine: Machine, scene: Scene, box: Box) -> list[Shape]:
         if np.isfinite(scene.q[i]):
             at = ends[0] + (ends[1] - ends[0]) * float((scene.q[i] - low[i]) / (high[i] - low[i]))
             shapes += [_bar(at - 3, at + 3, y, 8, ink)]
-            shapes += [Text((ends[1] + 8, y), f"{scene.q[i]:+.2f}", 12, ink)]
+            angle = round(float(scene.q[i]), 2) + 0  # no -0.00
+            shapes += [Text((ends[1] + 8, y), f"{angle:+.2f}", 12, ink)]
         if joint.driven:
             zero, half = (ends[2] + ends[3]) / 2, (ends[3] - ends[2]) / 2
             counts = float(scene.u[i]) * PWM_MAX

@@ -423,9 +423,10 @@ def test_the_tool_stays_in_view_however_far_off_the_line() -> None:
     session.next_task()
     far = np.array([-1.5, *START[1:]])
     session.take(rest._replace(q=far), 1.0)
-    shapes = view.draw(BROKK_170, [session.scene(2.0, "levers", "")], play.SIZE)
+    shapes = view.draw(BROKK_170, [session.scene(1.2, "levers", "")], play.SIZE)
     clips = [s.box for s in shapes if isinstance(s, view.Clip)][:2]
     dots = [s.centre for s in shapes if isinstance(s, view.Circle) and s.colour == view.INK]
+    assert len(dots) == 2
     for (left, upper, width, height), dot in zip(clips, dots, strict=True):
         assert left < dot[0] < left + width and upper < dot[1] < upper + height
 
