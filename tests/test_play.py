@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -466,36 +466,46 @@ def test_a_line_is_done_when_all_its_points_were_passed_in_order() -> None:
 
 
 def test_the_window_drives_a_machine_in_another_process(tmp_path: Path) -> None:
-    """In real time: keys, the loop's process, the plant behind the bus; then focus, closing, the end."""
+    """In real time: keys, the loop's process, the plant behind the bus; then focus, closing, the end.
+
+    On a busy computer the gate may refuse or stop for a late tick: then the switch is pressed anew.
+    """
     seen: list[tuple[float, Known]] = []
-    steps = iter(
-        [
-            (lambda k: k.wrong == 0, (pygame.KEYDOWN, "space")),
-            (lambda k: k.driving, (pygame.KEYDOWN, "q")),
-            (lambda k: k.q_dot[0] > 0.1, (pygame.WINDOWFOCUSLOST, "")),
-            (lambda k: not k.driving and not k.u.any(), (pygame.WINDOWFOCUSGAINED, "")),
-            (lambda k: True, (pygame.QUIT, "")),
-        ]
-    )
-    waiting = [next(steps)]
-    start = time.monotonic()
+    steps: list[tuple[Callable[[Known], bool], int, str]] = [
+        (lambda k: k.wrong == 0, pygame.KEYDOWN, "space"),
+        (lambda k: k.driving, pygame.KEYDOWN, "q"),
+        (lambda k: k.q_dot[0] > 0.1, pygame.WINDOWFOCUSLOST, ""),
+        (lambda k: not k.driving and not k.u.any(), pygame.WINDOWFOCUSGAINED, ""),
+        (lambda k: True, pygame.QUIT, ""),
+    ]
+    at, pressed, start = 0, 0.0, time.monotonic()
+
+    def post(kind: int, key: str) -> None:
+        more = {"key": pygame.key.key_code(key)} if key else {}
+        pygame.event.post(pygame.event.Event(kind, **more))
 
     def watcher(session: Session, hands: Hands) -> bool:
-        assert time.monotonic() - start < 60, (session.known, waiting)
-        if session.known is not None:
-            seen.append((time.monotonic(), session.known))
-            condition, (kind, key) = waiting[-1]
-            if condition(session.known):
-                more = {"key": pygame.key.key_code(key)} if key else {}
-                pygame.event.post(pygame.event.Event(kind, **more))
-                waiting.append(next(steps, (lambda k: False, (0, ""))))
+        nonlocal at, pressed
+        now, known = time.monotonic(), session.known
+        assert now - start < 60, (known, at)
+        if known is None or at == len(steps):
+            return True
+        seen.append((now, known))
+        condition, kind, key = steps[at]
+        if condition(known):
+            post(kind, key)
+            at, pressed = at + 1, now
+        elif at in (1, 2) and not known.driving and now - pressed > 1.0:
+            post(pygame.KEYUP, "q")
+            post(pygame.KEYUP, "space")
+            at = 0
         return True
 
     inner = play.show
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(play, "show", lambda *a: inner(*a, watcher=watcher))
         play.play(BROKK_170, {}, remote.Where(log=tmp_path / "run.log"), tmp_path / "attempts.csv")
-    assert len(waiting) == 6  # every step was taken
+    assert at == len(steps)
     assert seen[-1][1].q[0] > 0.01 and not pygame.display.get_init()
     run = replay.run_of_log(BROKK_170, tmp_path / "run.log", (1, 2, 3))
     assert not run.known[-1].u.any() and not run.known[-1].driving  # the last frame was neutral
