@@ -490,17 +490,16 @@ class Play(Command):
     drive: bool = False  # Drive the machine on the bus; without it, nothing is sent there.
     attempts: Path = Path("attempts.csv")  # Table of the traced lines, kept.
     log: Path | None = None  # Also log every frame here, candump format.
-    start: tuple[float, ...] = remote.START  # Angles of the simulated machine at the start [rad].
+    start: tuple[float, ...] = ()
+    """Angles of the simulated machine at the start [rad]; by default the paper's, or amid the ranges."""
 
     def run(self) -> None:
         """Open the window until it is closed."""
         check(self, self.attempts, self.log)
         if bool(self.interface) != bool(self.channel) or (self.drive and not self.interface):
             raise WrongUse("--interface, --channel: expected both or, without --drive, none")
-        machine, where = (
-            MACHINES[self.machine],
-            remote.Where(self.interface, self.channel, self.log, self.start),
-        )
+        machine = MACHINES[self.machine]
+        where = remote.Where(self.interface, self.channel, self.log, self.start)
         if self.interface and not self.drive:
             play.watch(machine, where)
             return
@@ -520,10 +519,10 @@ class Play(Command):
 class Replay(Command):
     """Watch recorded runs side by side: logs of `drive`, or runs of `evaluate`, driven again."""
 
-    logs: tyro.conf.Positional[tuple[Path, ...]]  # One or two candump logs, or one JSON of results.
+    logs: tyro.conf.Positional[tuple[Path, ...]]  # One or two: candump logs, or JSON of results.
     out: Path | None = None  # Write a film, .gif or .mp4, instead of opening a window.
     fps: float = 10.0  # Pictures a second of the film.
-    size: tuple[int, int] = (960, 540)  # Of the picture [px].
+    size: tuple[int, int] = (960, 540)  # Of the picture [px], 320 to 4000 both ways for each arm.
     controllers: tuple[str, ...] = ("rl", "jacobian_pid_k0.1")  # Whose runs of the results.
     sequence: str = ""  # Which sequence of the results; by default the first.
     start: int = 0  # Which start of the results.
@@ -533,28 +532,34 @@ class Replay(Command):
         check(self, self.out)
         if not 1 <= len(self.logs) <= 2:
             raise WrongUse(f"LOGS: expected one or two, got {len(self.logs)}")
-        if self.logs[0].suffix == ".json":
-            machine, runs = self._driven_again(self.logs[0])
-        else:
-            machine, colours = MACHINES[self.machine], list(view.COLOURS.values())
-            pairs = zip(self.logs, colours, strict=False)
-            runs = [replay.run_of_log(machine, log, colour) for log, colour in pairs]
+        arms = sum(len(self.controllers) if log.suffix == ".json" else 1 for log in self.logs)
+        if not arms or not 320 * arms <= self.size[0] <= 4000 or not 320 <= self.size[1] <= 4000:
+            raise WrongUse(
+                f"--controllers, --size: expected some and {320 * arms} 320 to 4000 4000, "
+                f"got {arms} and {self.size[0]} {self.size[1]}"
+            )
+        machine, runs = MACHINES[self.machine], list[replay.Run]()
+        for log, colour in zip(self.logs, view.COLOURS.values(), strict=False):
+            again = log.suffix == ".json"
+            runs += self._driven_again(log) if again else [replay.run_of_log(machine, log, colour)]
         if self.out:
             replay.write_film(self.out, machine, runs, self.size, self.fps)
         else:
             replay.show_film(machine, runs, self.size)
 
-    def _driven_again(self, path: Path) -> tuple[Machine, list[replay.Run]]:
+    def _driven_again(self, path: Path) -> list[replay.Run]:
         """Runs of a results file, simulated anew from what it says of itself and compared with its rows."""
         try:
             file = json.loads(path.read_text())
             beside = {"policy": str(path.with_name("policy.npz")), "gains": str(path.with_name("gains.json"))}
             told = beside | {"plant": "analytic", "commands": "", "starts": ""} | file["meta"]
             rows = file.get("task_space", file)["runs"]
-            machine, seed = MACHINES[told["machine"]], int(told["seed"])
+            machine, seed = MACHINES[self.machine], int(told["seed"])
             starts = np.array(file["starts"]) if "starts" in file else None
         except (OSError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path}: expected results of `evaluate`, got {error!r}") from error
+        if told.get("machine") != machine.name:
+            raise ValueError(f"{path}: expected --machine {told.get('machine')}, got {self.machine}")
         policy, sequences = load_policy(Path(told["policy"]), machine), task_sequences(machine)
         if told["commands"] not in ("", ", ".join(s.name for s in sequences)):
             sequences = read_commands(Path(told["commands"]), machine)
@@ -580,7 +585,7 @@ class Replay(Command):
             if not same or not np.isclose(same[0]["velocity_rmse"], row["velocity_rmse"], rtol=1e-3):
                 raise ValueError(f"{path}: expected the run {row}, got {same or 'none'}: another program?")
         first = tool_position(machine, starts[self.start])
-        return machine, [
+        return [
             replay.run_of_trace(machine, name, traces[name, sequence.name], self.start, sequence.goals, first)
             for name in chosen
         ]

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min import hw, view
+from brokk_min import hw, tracing, view
 from brokk_min.bus import open_line
 from brokk_min.env import Controller
 from brokk_min.gate import fault_name
@@ -21,7 +22,6 @@ from brokk_min.kinematics import tool_position
 from brokk_min.machine import Machine
 from brokk_min.remote import Ask, Where, control_process
 from brokk_min.replay import TITLES, Known, Ticks, unpack_known
-from brokk_min.tracing import Tracing, attempts_table, read_attempts, task_lines, write_attempts
 
 Array = NDArray[Any]
 SIZE = (1120, 680)  # of the window [px]
@@ -31,7 +31,8 @@ RISE = 0.25  # s from a key's press to full deflection (assumed)
 
 VELOCITY_KEYS = (("up", "down"), ("left", "right"), ("w", "s"))  # +x -x, +y -y, +z -z: as the top view shows
 LEVER_KEYS = (("q", "a"), ("w", "s"), ("e", "d"), ("r", "f"), ("t", "g"), ("y", "h"))
-PAD_AXES, PAD_BUTTON, PAD_MODE = (1, 0, 4, 3, 2, 5), 5, 3  # as `hw.Joystick` has them
+PAD_AXES = 1, 0, 4, 3  # as `hw.Joystick` has them; 2 and 5 are triggers, which do not rest in the middle
+PAD_BUTTON, PAD_MODE, PAD_NEXT, PAD_AGAIN = 5, 3, 0, 1
 
 
 class Hands:
@@ -53,10 +54,10 @@ class Hands:
         self.codes = [[[pygame.key.key_code(k) for k in pair] for pair in table] for table in pairs]
         self.held = set[int]()
         self.focus, self.blocked, self.lost, self.closed, self.enable = True, True, False, False, False
-        self.task_wanted = False
+        self.task_wanted = ""  # "next" or "again"
         self.deflection = np.zeros(3)
-        self.pad: Any = None
         pygame.joystick.init()
+        self.pad: Any = pygame.joystick.Joystick(0) if pygame.joystick.get_count() else None
 
     def hear(self, event: Any) -> None:
         """Take in one event."""
@@ -68,7 +69,8 @@ class Hands:
             self.held.add(event.key)
             if event.key == pg.K_TAB:
                 self.switch()
-            self.task_wanted |= event.key == pg.K_RETURN
+            tasks = {pg.K_RETURN: "next", pg.K_BACKSPACE: "again"}
+            self.task_wanted = tasks.get(event.key, self.task_wanted)
         elif event.type == pg.KEYUP:
             self.held.discard(event.key)
         elif event.type == pg.WINDOWFOCUSLOST:
@@ -77,13 +79,15 @@ class Hands:
         elif event.type == pg.WINDOWFOCUSGAINED:
             self.focus = True
         elif event.type == pg.JOYDEVICEADDED and self.pad is None:
-            self.pad, self.lost = pg.joystick.Joystick(event.device_index), False
+            self.pad, self.lost, self.blocked = pg.joystick.Joystick(event.device_index), False, True
         elif (
             event.type == pg.JOYDEVICEREMOVED and self.pad and event.instance_id == self.pad.get_instance_id()
         ):
             self.pad, self.lost, self.blocked = None, True, True
         elif event.type == pg.JOYBUTTONDOWN and event.button == PAD_MODE:
             self.switch()
+        elif event.type == pg.JOYBUTTONDOWN:
+            self.task_wanted = {PAD_NEXT: "next", PAD_AGAIN: "again"}.get(event.button, self.task_wanted)
 
     def switch(self) -> None:
         """The next one translates; the dead-man switch must be pressed afresh."""
@@ -135,11 +139,13 @@ class Hands:
 class Session:
     """What the window shows: the newest ticks, the tool's trail, the line being traced, attempts."""
 
-    def __init__(self, machine: Machine, modes: Sequence[str], path: Path | None) -> None:
-        self.machine, self.modes, self.path = machine, modes, path
-        self.attempts = read_attempts(path) if path else []
-        self.lines, self.task = task_lines(machine), ""
-        self.tracing: Tracing | None = None
+    def __init__(self, machine: Machine, modes: Sequence[str], file: Path | None) -> None:
+        self.machine, self.modes, self.file = machine, modes, file
+        self.attempts = tracing.read_attempts(file) if file else []
+        self.lines, self.task = tracing.task_lines(machine), ""
+        self.tracing: tracing.Tracing | None = None
+        self.path = np.zeros((0, 3))  # of the last line, m
+        self.done: tracing.Attempt | None = None
         self.before: Known | None = None
         self.known: Known | None = None
         self.arrived, self.trail = 0.0, list[Array]()
@@ -150,21 +156,24 @@ class Session:
         if not np.isfinite(known.q).all():
             return
         self.trail = [*self.trail, tool_position(self.machine, known.q)][-600:]
-        if self.tracing and self.before and known.mode != self.before.mode:
-            self.tracing = None  # another one translates: begin again
+        if self.tracing and self.tracing.p and self.before and known.mode != self.before.mode:
+            self.next_task(again=True)  # another one translates
         if self.tracing and self.tracing.follow(known):
-            self.attempts.append(self.tracing.score(self.modes[known.mode]))
+            self.done = self.tracing.score(self.modes[known.mode])
+            self.attempts.append(self.done)
             self.tracing = None
-            if self.path:
-                write_attempts(self.path, self.attempts)
+            if self.file:
+                tracing.write_attempts(self.file, self.attempts)
 
-    def next_task(self) -> None:
-        """The next line, from where the tool is."""
+    def next_task(self, again: bool = False) -> None:
+        """The next line, or the same one again, from where the tool is."""
         names = list(self.lines)
         if self.trail:
-            self.task = names[(names.index(self.task) + 1) % len(names)] if self.task else names[0]
-            self.tracing = Tracing(self.machine, self.task, self.trail[-1] + self.lines[self.task])
-            self.trail = []
+            if not (again and self.task):
+                self.task = names[(names.index(self.task) + 1) % len(names)] if self.task else names[0]
+            self.path = self.trail[-1] + self.lines[self.task]
+            self.tracing = tracing.Tracing(self.machine, self.task, self.path)
+            self.trail, self.done = [], None
 
     def scene(self, now: float, mode: str, hint: str) -> view.Scene:
         """What is to be seen now; angles between the last two ticks, so that motion looks smooth."""
@@ -178,30 +187,32 @@ class Session:
         if self.before is not None:
             share = min(1.0, (now - self.arrived) / self.machine.dt)
             q = np.where(np.isfinite(self.before.q), self.before.q + share * (q - self.before.q), q)
-        path = self.tracing.line if self.tracing else np.zeros((0, 3))
-        trail, title = np.array(self.trail).reshape(-1, 3), TITLES.get(mode, mode)
-        look = view.Scene(
-            q, known.q_dot, np.nan_to_num(known.u), known.v_goal, trail, path, title, status, mood
-        )
+        trail, title = np.array(self.trail).reshape(-1, 3), TITLES.get(mode, self.machine.name)
+        u = np.nan_to_num(known.u)
+        look = view.Scene(q, known.q_dot, u, known.v_goal, trail, self.path, title=title)
+        if self.tracing:  # near, but never so near that the tool is not seen
+            passed, hold = self.tracing.passed, np.vstack([self.path, tool_position(self.machine, q)])
+            look = look._replace(target=self.path[passed : passed + 1], hold=hold)
         colour = view.COLOURS.get(mode, view.STEEL)
-        return look._replace(colour=colour, notes=self.notes(mode), hold=path)
+        return look._replace(status=status, mood=mood, colour=colour, notes=self.notes(mode))
 
     def notes(self, mode: str) -> list[str]:
         """Keys, the task, and how it went."""
         if not mode:
-            return ["only listening: nothing is sent", "ESC: end"]
-        keys = " ".join("/".join(pair) for pair in LEVER_KEYS[: len(self.machine.driven)])
-        stick = f"{keys}: joints" if mode == "levers" else "arrows: x, y    W/S: up, down"
+            return ["only listening: nothing is sent; --drive drives", "ESC: end"]
+        driven = [self.machine.names[i] for i in self.machine.driven]
+        keys = "  ".join(f"{a}/{b}: {name}" for (a, b), name in zip(LEVER_KEYS, driven, strict=False))
         lines = [
-            f"hold SPACE to drive    {stick}    SHIFT: slow",
-            "TAB: who translates    ENTER: next line    ESC: end",
+            f"hold SPACE to drive    {keys if mode == 'levers' else 'arrows: x, y    W/S: up, down'}",
+            "SHIFT: slow  TAB: who translates  ENTER: next line  BACKSPACE: again  ESC: end",
         ]
         if self.tracing:
-            done = f"{self.tracing.passed} of {len(self.tracing.line)}"
-            lines.append(
-                f"{self.task}: follow the orange line, {len(self.tracing.p) * self.machine.dt:.1f} s, {done}"
-            )
-        return lines + attempts_table(self.attempts, self.task)
+            passed = f"{self.tracing.passed} of {len(self.tracing.line)}"
+            seconds = f"{self.tracing.seconds:.1f} s"
+            lines.append(f"{self.task}: follow the orange line to its ring, {seconds}, {passed}")
+        elif self.done:
+            lines.append(f"{self.done.task} by {self.done.mode}: {tracing.figures(self.done[3:])}")
+        return lines + tracing.attempts_table(self.attempts, self.task)
 
 
 def _status(machine: Machine, known: Known, hint: str) -> tuple[str, str]:
@@ -219,6 +230,7 @@ Watcher = Callable[[Session, Hands], bool]
 
 
 def show(
+    window: view.Window,
     session: Session,
     hear: Callable[[], Known | None],
     tell: Callable[[Ask], object],
@@ -229,13 +241,13 @@ def show(
     """The window until it is closed: events, what the loop knows, a picture, `fps` times a second.
 
     Args:
+        window: open.
         session: what is shown; without modes it only watches.
         hear: the newest tick, if any.
         tell: takes what is asked for.
         ended: why the loop ended; None: it runs.
         watcher: is called at each picture; False closes the window.
     """
-    window = view.Window(SIZE, f"brokk_min: {session.machine.name}")
     pygame, modes = window.pygame, session.modes or [""]
     hands, before = Hands(session.machine, pygame, modes), time.monotonic()
     ask = hands.ask(before, 0.0)
@@ -252,26 +264,30 @@ def show(
             if known is not None and (session.known is None or known.tick != session.known.tick):
                 session.take(known, now)
             if hands.task_wanted and session.modes:
-                session.next_task()
-            hands.task_wanted = False
+                session.next_task(hands.task_wanted == "again")
+            hands.task_wanted = ""
             scene = session.scene(now, modes[hands.mode], _hint(session, hands))
             window.show(view.draw(session.machine, [scene], SIZE), fps)
     finally:
         tell(ask._replace(enable=False, stop=True))
-        window.close()
 
 
 def _hint(session: Session, hands: Hands) -> str:
     """What the operator has to do next."""
     if not session.modes:
-        return "watching" if session.known else "nobody sends SYNC"
+        return "watching" if session.known else "nobody sends SYNC: start what drives, or use --drive"
     if session.known is None:
         return "starting"
     if not hands.focus:
         return "neutral: the window has no focus"
-    return (
-        "release the switch, then press it with nothing deflected" if hands.blocked else "ready: hold SPACE"
-    )
+    if hands.blocked:
+        return "release the switch, then press it with nothing deflected"
+    return "ready: hold SPACE" + f" or button {PAD_BUTTON}" * (hands.pad is not None)
+
+
+def _window(machine: Machine) -> AbstractContextManager[view.Window]:
+    """Before a loop begins: nothing may reach a bus if nobody can see it."""
+    return view.open_window(SIZE, f"brokk_min: {machine.name}")
 
 
 def play(machine: Machine, controllers: Mapping[str, Controller], where: Where, attempts: Path) -> None:
@@ -280,20 +296,20 @@ def play(machine: Machine, controllers: Mapping[str, Controller], where: Where, 
     Raises:
         ValueError: no window, no bus, or a loop that ended by itself.
     """
-    session = Session(machine, [*controllers, "levers"], attempts)
-    with control_process(machine, list(controllers.values()), where) as (asks, tells, ended):
+    session, chosen = Session(machine, [*controllers, "levers"], attempts), list(controllers.values())
+    with _window(machine) as window, control_process(machine, chosen, where) as (asks, tells, ended):
 
         def hear() -> Known | None:
             values = tells.read()
             return None if values is None else unpack_known(machine, values)
 
-        show(session, hear, lambda ask: asks.write(np.hstack(ask)), ended)
+        show(window, session, hear, lambda ask: asks.write(np.hstack(ask)), ended)
 
 
 def watch(machine: Machine, where: Where) -> None:
     """Look at a machine on a bus; nothing is sent."""
     session, ticks = Session(machine, [], None), Ticks(machine)
-    with open_line(where.interface, where.channel, where.log) as line:
+    with _window(machine) as window, open_line(where.interface, where.channel, where.log) as line:
 
         def hear() -> Known | None:
             known = None
@@ -301,4 +317,4 @@ def watch(machine: Machine, where: Where) -> None:
                 known = ticks.hear(frame) or known
             return known
 
-        show(session, hear, lambda ask: None, lambda: None)
+        show(window, session, hear, lambda ask: None, lambda: None)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from brokk_min import hw
 from brokk_min.bus import open_line
 from brokk_min.env import Controller, to_command
-from brokk_min.machine import PWM_MAX, Machine
+from brokk_min.machine import BROKK_170, PWM_MAX, Machine
 from brokk_min.replay import Known
 from brokk_min.simulator import SimulatedMachine, serve
 
@@ -154,7 +154,7 @@ class Where:
     interface: str = ""
     channel: str = ""
     log: Path | None = None
-    start: tuple[float, ...] = START  # of the simulated machine [rad]
+    start: tuple[float, ...] = ()  # of the simulated machine [rad]; none: `START`, or amid its ranges
 
 
 def control(
@@ -181,7 +181,8 @@ def _simulated(machine: Machine, where: Where, running: Callable[[], bool]) -> I
     if where.interface:
         yield
         return
-    q, low, high = np.array(where.start), machine.column("q_min"), machine.column("q_max")
+    low, high = machine.column("q_min"), machine.column("q_max")
+    q = np.array(where.start or (START if machine == BROKK_170 else (low + high) / 2))
     if q.shape != (machine.n,) or not ((low <= q) & (q <= high)).all():
         raise ValueError(f"start: expected {machine.n} angles within the joints' ranges, got {q.tolist()}")
     with open_line("virtual", "brokk_min play") as line:

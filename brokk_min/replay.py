@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -153,35 +153,40 @@ def write_film(path: Path, machine: Machine, runs: Sequence[Run], size: tuple[in
     """All runs as a GIF, or as MP4 where ffmpeg is installed.
 
     Raises:
-        ValueError: another kind of file, or no ffmpeg.
+        ValueError: another kind of file, or no ffmpeg that writes it.
     """
+    writers = {".gif": _write_gif, ".mp4": _write_mp4}
+    if path.suffix not in writers:
+        raise ValueError(f"{path}: expected a name ending in .gif or .mp4, got {path.suffix!r}")
     ticks = range(0, max(len(run.known) for run in runs), max(1, round(machine.rate / fps)))
     bar = tqdm(ticks, desc="draw", unit="picture", disable=None)
     images = (view.picture(film(machine, runs, tick, size), size) for tick in bar)
-    if path.suffix == ".gif":
-        films = [Image.fromarray(image) for image in images]
-        flat = [image.quantize(palette=_palette(films), dither=Image.Dither.NONE) for image in films]
-        with logs.whole_file(path) as file:
-            duration = round(1000 * ticks.step / machine.rate)
-            flat[0].save(file, "GIF", save_all=True, append_images=flat[1:], duration=duration, loop=0)
-    elif path.suffix == ".mp4":
-        form = f"-f rawvideo -pix_fmt rgb24 -s {size[0]}x{size[1]} -r {machine.rate / ticks.step} -i -"
-        form += " -pix_fmt yuv420p -f mp4 -movflags frag_keyframe+empty_moov pipe:1"
-        try:
-            with logs.whole_file(path) as file:
-                command = ["ffmpeg", "-loglevel", "error", *form.split()]
-                with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=file) as process:
-                    for image in images:
-                        process.stdin.write(image.tobytes())  # type: ignore[union-attr]
-                    process.stdin.close()  # type: ignore[union-attr]
-                if process.returncode:
-                    raise ValueError(f"{path}: expected ffmpeg to write it, got status {process.returncode}")
-        except FileNotFoundError as error:
-            raise ValueError(
-                f"{path}: expected ffmpeg for .mp4, or a name ending in .gif, got none"
-            ) from error
-    else:
-        raise ValueError(f"{path}: expected a name ending in .gif or .mp4, got {path.suffix!r}")
+    with logs.whole_file(path) as file:
+        writers[path.suffix](file, images, size, machine.rate / ticks.step)
+
+
+def _write_gif(file: IO[bytes], images: Iterable[Array], size: tuple[int, int], fps: float) -> None:
+    films = [Image.fromarray(image) for image in images]
+    flat = [image.quantize(palette=_palette(films), dither=Image.Dither.NONE) for image in films]
+    duration = round(1000 / fps)
+    flat[0].save(file, "GIF", save_all=True, append_images=flat[1:], duration=duration, loop=0)
+
+
+def _write_mp4(file: IO[bytes], images: Iterable[Array], size: tuple[int, int], fps: float) -> None:
+    form = f"-f rawvideo -pix_fmt rgb24 -s {size[0]}x{size[1]} -r {fps} -i - -pix_fmt yuv420p"
+    form += " -vf crop=trunc(iw/2)*2:trunc(ih/2)*2"  # the code knows even sizes only
+    form += " -f mp4 -movflags frag_keyframe+empty_moov pipe:1"
+    command = ["ffmpeg", "-loglevel", "error", *form.split()]
+    try:
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=file) as process:
+            for image in images:
+                process.stdin.write(image.tobytes())  # type: ignore[union-attr]
+    except FileNotFoundError as error:
+        raise ValueError("film: expected ffmpeg for .mp4, or a name ending in .gif, got none") from error
+    except BrokenPipeError:
+        process.returncode = process.returncode or 1  # it did not read all pictures
+    if process.returncode:
+        raise ValueError(f"film: expected ffmpeg to write it, got its status {process.returncode}")
 
 
 def _palette(films: Sequence[Image.Image]) -> Image.Image:
@@ -194,9 +199,9 @@ def _palette(films: Sequence[Image.Image]) -> Image.Image:
 
 def show_film(machine: Machine, runs: Sequence[Run], size: tuple[int, int]) -> None:
     """All runs in a window, in real time; space halts, left and right move by a second."""
-    window, at, going = view.Window(size, "brokk_min replay"), 0, True
-    pg, last = window.pygame, max(len(run.known) for run in runs) - 1
-    try:
+    at, going, last = 0, True, max(len(run.known) for run in runs) - 1
+    with view.open_window(size, "brokk_min replay") as window:
+        pg = window.pygame
         while True:
             for event in pg.event.get():
                 if event.type == pg.QUIT or (event.type == pg.KEYDOWN and event.key == pg.K_ESCAPE):
@@ -207,5 +212,3 @@ def show_film(machine: Machine, runs: Sequence[Run], size: tuple[int, int]) -> N
             at = min(max(at, 0), last)
             window.show(film(machine, runs, at, size), machine.rate)
             at += going
-    finally:
-        window.close()

@@ -76,12 +76,16 @@ class Tracing:
     p: list[Array] = field(default_factory=list)
     u: list[Array] = field(default_factory=list)
     passed: int = 0
+    begun: float = 0.0  # tick
+    seconds: float = 0.0  # since then; by ticks, because a busy window misses some
 
     def follow(self, known: Known) -> bool:
         """One tick; True if it was the last."""
         if not self.p and not known.u.any():
             return False
         p = tool_position(self.machine, known.q)
+        self.begun = self.begun if self.p else known.tick
+        self.seconds = (known.tick - self.begun + 1) * self.machine.dt
         self.p.append(p)
         self.u.append(known.u)
         while self.passed < len(self.line) and np.linalg.norm(self.line[self.passed] - p) < CAPTURE:
@@ -92,8 +96,8 @@ class Tracing:
         """The figures of the finished attempt."""
         away, u = distance(self.line, np.array(self.p)), np.array(self.u)
         travel = float(np.abs(np.diff(u, axis=0, prepend=0 * u[:1])).sum())
-        seconds, when = len(self.p) * self.machine.dt, time.strftime("%Y-%m-%dT%H:%M:%S")
-        return Attempt(when, self.task, mode, seconds, float(away.mean()), float(away.max()), travel)
+        when = time.strftime("%Y-%m-%dT%H:%M:%S")
+        return Attempt(when, self.task, mode, self.seconds, float(away.mean()), float(away.max()), travel)
 
 
 def read_attempts(path: Path) -> list[Attempt]:
@@ -124,7 +128,11 @@ def attempts_table(attempts: Iterable[Attempt], task: str) -> list[str]:
             by_mode.setdefault(attempt.mode, []).append(attempt)
     lines = []
     for mode, rows in by_mode.items():
-        s, mean, largest, travel = np.array([row[3:] for row in rows], float).mean(axis=0)
-        figures = f"{s:.1f} s, off by {mean:.3f} m, at most {largest:.3f} m, valves {travel:.0f}"
-        lines.append(f"{mode} ({len(rows)}): {figures}")
+        lines.append(f"mean of {len(rows)} by {mode}: {figures(np.mean([row[3:] for row in rows], axis=0))}")
     return lines
+
+
+def figures(numbers: Iterable[float]) -> str:
+    """The four figures of an attempt in words."""
+    seconds, mean, largest, travel = numbers
+    return f"{seconds:.1f} s, off by {mean:.3f} m, at most {largest:.3f} m, valves {travel:.0f}"

@@ -7,7 +7,8 @@ the only function that needs pygame (extra `play`). Coordinates of shapes are pi
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,13 +28,8 @@ NEAR_SINGULAR = 0.1  # of the arm's length [1/rad]: the tool hardly moves some w
 ARROW = 0.2  # of a view's smaller side: an arrow of the machine's tool speed
 MARGIN = 0.06  # of the reach: what is seen around the points that a scene holds
 
-PAPER, INK, MUTED, GRID, TRACK = (
-    (250, 250, 247),
-    (33, 37, 43),
-    (120, 128, 138),
-    (228, 230, 232),
-    (212, 216, 221),
-)
+PAPER, INK, MUTED = (250, 250, 247), (33, 37, 43), (120, 128, 138)
+GRID, TRACK = (228, 230, 232), (212, 216, 221)
 SOIL, STEEL, WARNING = (214, 203, 186), (74, 80, 88), (208, 28, 28)
 WANTED, MEASURED, PATH = INK, (0, 158, 115), (230, 159, 0)
 COLOURS: dict[str, Colour] = {"rl": (0, 114, 178), "jacobian": (213, 94, 0), "levers": (124, 87, 148)}
@@ -95,6 +91,7 @@ class Scene(NamedTuple):
     v_goal: Array  # wanted tool velocity [m/s] (3,)
     trail: Array = np.zeros((0, 3))  # where the tool was [m] (T, 3)
     path: Array = np.zeros((0, 3))  # where it is to go [m] (K, 3)
+    target: Array = np.zeros((0, 3))  # where on that to go next [m], (1, 3) or none
     title: str = ""
     status: str = ""
     mood: str = ""  # of `MOODS`, colour of the status
@@ -223,31 +220,33 @@ def draw(machine: Machine, scenes: Sequence[Scene], size: tuple[int, int]) -> li
 def _panel(machine: Machine, scene: Scene, box: Box) -> list[Shape]:
     """One arm: title and state above, both views, a row for each joint, notes."""
     left, _, width, height = box
-    head, wide = 40.0, width > 1.3 * height
-    foot = max(26.0 + 22 * machine.n, 0.0 if wide else 0.4 * height)
-    middle = height - head - foot
+    head, foot, wide = 40.0, 26.0 + 22 * machine.n, width > 1.3 * height
     if wide:
-        side, top = (left, head, 0.6 * width, middle), (left + 0.6 * width, head, 0.4 * width, middle)
-        rows = (left + 16, height - foot + 6, 0.52 * width, foot)
-        notes = (left + 0.58 * width, height - foot + 6, 0.4 * width, foot)
+        foot = max(foot, 6.0 + 18 * len(scene.notes))
+        upper, share, middle = height - foot, 0.6 * width, height - head - foot
+        side, top = (left, head, share, middle), (left + share, head, width - share, middle)
+        rows, notes = (left + 16, upper + 6, 0.52 * width, foot), (left + 0.52 * width + 36, upper + 14)
     else:
-        side, top = (left, head, width, middle), (left, height - foot, 0.45 * width, foot)
-        rows = (left + 0.47 * width, height - foot + 6, 0.51 * width, foot)
-        notes = (left + 16, head + 26, width, 0.0)
+        foot = max(foot, 0.4 * height)
+        upper, share = height - foot, 0.38 * width
+        side, top = (left, head, width, upper - head), (left, upper, share, foot)
+        rows, notes = (left + share + 8, upper + 6, width - share - 16, foot), (left + 16, head + 34)
     shapes = _heading(scene, box)
     if np.isfinite(scene.q).all():
         shapes += _views(machine, scene, side, top)
     else:
-        shapes.append(Text((left + width / 2, head + middle / 2), "no positions", 20, WARNING, 0.5))
+        shapes.append(Text((left + width / 2, (head + upper) / 2), "no positions", 20, WARNING, 0.5))
     shapes += _rows(machine, scene, rows)
-    return shapes + [Text((notes[0], notes[1] + 8 + 18 * i), note, 12) for i, note in enumerate(scene.notes)]
+    return shapes + [Text((notes[0], notes[1] + 18 * i), note, 12) for i, note in enumerate(scene.notes)]
 
 
 def _heading(scene: Scene, box: Box) -> list[Shape]:
     left, _, width, _ = box
+    room = width - 60 - 9 * len(scene.status)  # px that the status leaves; letters are 0.7 of their size wide
+    size = int(np.clip(room / (0.7 * max(1, len(scene.title))), 8, 18))
     return [
         Circle(np.array([left + 22.0, 21.0]), 7, scene.colour),
-        Text((left + 36, 21), scene.title, 18, INK),
+        Text((left + 36, 21), scene.title, size, INK),
         Text((left + width - 16, 21), scene.status, 14, MOODS[scene.mood], 1.0),
     ]
 
@@ -263,6 +262,7 @@ def _views(machine: Machine, scene: Scene, side: Box, top: Box) -> list[Shape]:
         for points, colour, width in ((scene.path, PATH, 3), (scene.trail, _pale(scene.colour), 2)):
             if len(points) > 1:
                 shapes.append(Line(camera.project(points), colour, width))
+        shapes += [Line(_ring(camera.project(p), 9.0), PATH, 3) for p in scene.target]
         tip = camera.project(p_tool)
         shapes.append(Circle(tip, 4.0, INK))
         if weak:
@@ -270,14 +270,12 @@ def _views(machine: Machine, scene: Scene, side: Box, top: Box) -> list[Shape]:
         for v, colour in ((v_tool, MEASURED), (scene.v_goal, WANTED)):
             pixels = ARROW * min(box[2:]) / machine.tool_speed * (camera.axes @ v) * (1, -1)
             shapes += _arrow(tip, tip + pixels, colour)
-    words = [f"{machine.names[i]} near its limit" for i in np.flatnonzero(low)]
-    words += ["near a singularity"] * weak
+    fast, asked = (float(np.linalg.norm(v)) for v in (v_tool, scene.v_goal))
+    words = [(f"wanted {asked:.2f} m/s", WANTED), (f"measured {fast:.2f} m/s", MEASURED)]
+    words += [(f"{machine.names[i]} near its limit", WARNING) for i in np.flatnonzero(low)]
+    words += [("near a singularity", WARNING)] * weak
     x, y = side[0] + side[2] - 14, side[1] + 14
-    shapes += [
-        Text((x, y), "measured", 11, MEASURED, 1.0),
-        Text((x - 64, y), "wanted velocity", 11, WANTED, 1.0),
-    ]
-    shapes += [Text((x, y + 20 + 18 * i), word, 13, WARNING, 1.0) for i, word in enumerate(words)]
+    shapes += [Text((x, y + 18 * i), word, 12, colour, 1.0) for i, (word, colour) in enumerate(words)]
     return [*shapes, Clip((0.0, 0.0, 1e4, 1e4))]
 
 
@@ -301,7 +299,7 @@ def _backdrop(machine: Machine, camera: Camera, box: Box, label: str) -> list[Sh
 
 
 def _arm(machine: Machine, camera: Camera, scene: Scene, low: NDArray[np.bool_]) -> list[Shape]:
-    """Links that grow thinner towards the tool, joints at their frames, red where a limit is near."""
+    """Links that grow thinner towards the tool, joints at their frames; near a limit red and larger."""
     corners = camera.project(skeleton(machine, scene.q))
     thick = min(30.0, max(3.0, 0.032 * extent(machine).reach * camera.scale))
     sizes = np.linspace(thick, 0.45 * thick, 2 * machine.n + 1)
@@ -320,7 +318,8 @@ def _arm(machine: Machine, camera: Camera, scene: Scene, low: NDArray[np.bool_])
             shapes.append(Polygon(np.array(ends), scene.colour if i > 0 else STEEL))
     for i in range(machine.n):
         size = max(4.0, float(sizes[2 * i]))
-        shapes.append(Circle(corners[2 * i], 1.1 * size, WARNING if low[i] else _pale(scene.colour, 0.15)))
+        ring, colour = (1.5, WARNING) if low[i] else (1.1, _pale(scene.colour, 0.15))
+        shapes.append(Circle(corners[2 * i], ring * size, colour))
         shapes.append(Circle(corners[2 * i], 0.5 * size, PAPER))
     return shapes
 
@@ -328,12 +327,14 @@ def _arm(machine: Machine, camera: Camera, scene: Scene, low: NDArray[np.bool_])
 def _rows(machine: Machine, scene: Scene, box: Box) -> list[Shape]:
     """A row for each joint: name, angle on its range, command on the valve's."""
     left, upper, width, _ = box
-    ends = left + np.array([46.0, 0.5 * width - 44, 0.5 * width + 14, width - 40])
+    name = max(46.0, 9.0 * max(map(len, machine.names)))
+    track = (width - name - 58 - 40) / 2  # 58 px for the angle in digits, 40 px for the command
+    ends = left + name + np.array([0, track, track + 58, 2 * track + 58])
     low, high = machine.column("q_min"), machine.column("q_max")
     warned = near_limit(machine, scene.q)
     shapes: list[Shape] = [
         Text((ends[0], upper + 6), "angle [rad]", 11, MUTED),
-        Text((ends[2], upper + 6), f"valve [of {machine.pwm_limit}]", 11, MUTED),
+        Text((min(ends[2], left + width - 66), upper + 6), f"valve of {machine.pwm_limit}", 11, MUTED),
     ]
     for i, joint in enumerate(machine.joints):
         y, ink = upper + 26 + 22 * i, WARNING if warned[i] else INK if joint.driven else MUTED
@@ -341,7 +342,8 @@ def _rows(machine: Machine, scene: Scene, box: Box) -> list[Shape]:
         if np.isfinite(scene.q[i]):
             at = ends[0] + (ends[1] - ends[0]) * float((scene.q[i] - low[i]) / (high[i] - low[i]))
             shapes += [_bar(at - 3, at + 3, y, 8, ink)]
-            shapes += [Text((ends[1] + 8, y), f"{scene.q[i]:+.2f}", 12, ink)]
+            angle = round(float(scene.q[i]), 2) + 0  # no -0.00
+            shapes += [Text((ends[1] + 8, y), f"{angle:+.2f}", 12, ink)]
         if joint.driven:
             zero, half = (ends[2] + ends[3]) / 2, (ends[3] - ends[2]) / 2
             counts = float(scene.u[i]) * PWM_MAX
@@ -349,7 +351,7 @@ def _rows(machine: Machine, scene: Scene, box: Box) -> list[Shape]:
             if counts:
                 shapes.append(_bar(zero, zero + half * counts / machine.pwm_limit, y, 6, scene.colour))
             shapes += [_bar(zero - 1, zero + 1, y, 8, INK)]
-            shapes += [Text((left + width, y), f"{counts:+.0f}", 12, INK, 1.0)]
+            shapes += [Text((left + width, y), f"{round(counts):+d}", 12, INK, 1.0)]
         else:
             shapes.append(Text((ends[2], y), "locked", 12, MUTED))
     return shapes
@@ -402,12 +404,13 @@ def need_pygame() -> Any:
 
 @lru_cache(maxsize=1024)
 def _word(text: str, size: int, colour: Colour) -> Any:
-    """Text as a surface; the typeface is the one that matplotlib brings, the same everywhere."""
-    return _font(size).render(text, True, colour)
+    """Text as a surface, on the paper's colour so that it stays legible over an arm."""
+    return _font(size).render(text, True, colour, PAPER)
 
 
 @lru_cache(maxsize=16)
 def _font(size: int) -> Any:
+    """The typeface that matplotlib brings: the same everywhere."""
     import matplotlib
 
     pygame = need_pygame()
@@ -455,7 +458,7 @@ class Window:
             self.surface = pygame.display.set_mode(size)
         except pygame.error as error:
             raise ValueError(
-                f"window: expected a display (SDL_VIDEODRIVER=dummy: none), got {error}"
+                f"window: expected a display (SDL_VIDEODRIVER=dummy draws unseen), got {error}"
             ) from error
         pygame.display.set_caption(title)
         self.size, self.clock = size, pygame.time.Clock()
@@ -469,6 +472,25 @@ class Window:
     def close(self) -> None:
         """Close the window; what else uses pygame goes on."""
         self.pygame.display.quit()
+
+
+@contextmanager
+def open_window(size: tuple[int, int], title: str) -> Iterator[Window]:
+    """A window for somebody to look at, closed at the end of the block.
+
+    Without a display SDL draws unseen. That serves tests, and whoever asks for it with SDL_VIDEODRIVER.
+
+    Raises:
+        ValueError: no pygame, or no display.
+    """
+    window = Window(size, title)
+    try:
+        driver = window.pygame.display.get_driver()
+        if driver in ("offscreen", "dummy") and not os.environ.get("SDL_VIDEODRIVER"):
+            raise ValueError("window: expected a display (SDL_VIDEODRIVER=dummy draws unseen), got none")
+        yield window
+    finally:
+        window.close()
 
 
 def picture(shapes: Sequence[Shape], size: tuple[int, int]) -> NDArray[np.uint8]:

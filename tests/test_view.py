@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 import sys
 from dataclasses import replace
@@ -219,6 +220,51 @@ def test_unknown_positions_and_states_are_said() -> None:
     shapes = draw(BROKK_170, [scene(np.full(5, np.nan), status="waiting: q1: silent", mood="waiting")], SIZE)
     assert {"no positions", "waiting: q1: silent"} <= set(words(shapes))
     assert picture(shapes, SIZE).std() > 0
+
+
+def boxes_of_words(shapes: list[view.Shape]) -> dict[str, np.ndarray]:
+    """Left, upper, right and lower end of each text as painted [px]."""
+    found = {}
+    for at, text, size, colour, anchor in (s for s in shapes if isinstance(s, Text) and s.text):
+        width, height = view._word(text, size, colour).get_size()
+        left, upper = at[0] - anchor * width, at[1] - height / 2
+        found[f"{text} at {at}"] = np.array([left, upper, left + width, upper + height])
+    return found
+
+
+@pytest.mark.parametrize(("arms", "size"), [(1, (1120, 680)), (1, SIZE), (2, (900, 480)), (3, (960, 540))])
+@pytest.mark.parametrize("n", [2, 3, 5])
+def test_no_text_is_cut_off_or_lies_on_another(n: int, arms: int, size: tuple[int, int]) -> None:
+    rng = np.random.default_rng(n)
+    drawn = random_machine(rng, n)
+    name = "bucke" if arms > 1 else "cylinder_"
+    joints = tuple(replace(joint, name=f"{name}{i}") for i, joint in enumerate(drawn.joints))
+    machine = replace(drawn, joints=joints)
+    notes = [f"note {i}" for i in range(6 if arms == 1 else 2)]
+    at_limits = scene(machine.column("q_max"), title="drive_of_the_long_name_2026-11-21.log", status="12.3 s")
+    shapes = draw(machine, [at_limits._replace(notes=notes)] * arms, size)
+    assert sum("near its limit" in word for word in words(shapes)) == arms * len(machine.driven)
+    found = boxes_of_words(shapes)
+    for name, box in found.items():
+        assert (box[:2] >= 0).all() and (box[2:] <= size).all(), name
+    for (a, one), (b, other) in itertools.combinations(found.items(), 2):
+        assert (one[:2] >= other[2:]).any() or (other[:2] >= one[2:]).any(), (a, b)
+    tracks = [s.points for s in shapes if isinstance(s, Polygon) and s.colour == view.TRACK]
+    assert min(track[1, 0] - track[0, 0] for track in tracks) > 10
+
+
+def test_text_stays_legible_over_an_arm() -> None:
+    under = view.Polygon(np.array([[0, 0], [200, 0], [200, 40], [0, 40]]), view.COLOURS["jacobian"])
+    image = picture([under, Text((10, 20), "near", 13, view.WARNING)], (200, 40))
+    assert (image[20, 10:30] == view.PAPER).all(axis=-1).any()
+
+
+def test_the_next_point_of_a_line_is_ringed() -> None:
+    p = tool_position(BROKK_170, Q) + np.array([[0.0, 0.5, 0.3]])
+    shapes = draw(BROKK_170, [scene(target=p)], SIZE)
+    rings = [s.points for s in shapes if isinstance(s, Line) and s.colour == view.PATH]
+    for ring, camera in zip(rings, eyes(BROKK_170, Q), strict=True):
+        np.testing.assert_allclose(np.hypot(*(ring - camera.project(p)).T), 9.0)
 
 
 def test_two_arms_share_no_column() -> None:
