@@ -12,6 +12,7 @@ import os
 import struct
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -40,6 +41,8 @@ from brokk_min.logs import Log, Recording, velocity_of
 from brokk_min.machine import PWM_MAX, Machine, decode_pwm
 
 Array = NDArray[Any]
+AWAKE = 0.004  # s before SYNC and after it in which the loop does not sleep (tuned)
+REHEARSALS = 4  # of a tick before it (tuned)
 WINDOW = 0.020  # s after SYNC in which the encoders must answer (assumed)
 MAX_FRAMES = 2000  # read in a row; more than a bus can carry in a tick
 
@@ -237,7 +240,10 @@ class Drive:
         line, wanted, self.wish = self.line, np.zeros(self.machine.n), self.wish._replace(error=False)
         end = min(self.deadline, line.now() + self.machine.dt)  # the clock may have gone backwards
         with self._caught():
-            self._listen(end)
+            self._listen(end - AWAKE)
+            line.rest(max(0.0, end - AWAKE - line.now()))
+            self._rehearse()
+            self._listen(end, AWAKE)
         line.rest(max(0.0, end - line.now()))  # a broken bus does not wait
         self._next_deadline()
         with self._caught():
@@ -246,14 +252,17 @@ class Drive:
         self.nodes.frames *= 2  # a position from before its SYNC is as wrong as a doubled one
         with self._caught():
             line.send(SYNC, b"")
-            self._rehearse()
-            self._listen(line.now() + WINDOW, until_complete=True)
-            wanted = self._control()
+            self._listen(line.now() + WINDOW, AWAKE, until_complete=True)
+        counts = encoder_counts(self.machine, self.nodes.raw)
+        with self._caught():
+            wanted = self._control(counts)
         self.wish = self.wish._replace(
             stop=self.wish.stop or bool(self.signals), error=self.wish.error or bool(self.problem)
         )
-        now = line.note(self.wish.pack())
-        self._speak(self._gate(wanted, now))
+        frame = self._gate(wanted, counts, line.note(self.wish.pack()))
+        problem, self.problem = self.problem, ""
+        self._speak(frame)
+        self._remember(problem)
         with self._caught():
             if not (self.wish.enable or self.gate.driving) and (self.nodes.nmt != OPERATIONAL).any():
                 line.send(NMT, bytes([1, 0]))  # nodes that fell back; not while the operator holds the switch
@@ -270,7 +279,8 @@ class Drive:
                         show(self.status())
         except BaseException:
             self.problem = "the loop ended"
-            self._speak(self._gate(np.zeros(self.machine.n), self.line.now()))
+            counts = encoder_counts(self.machine, self.nodes.raw)
+            self._speak(self._gate(np.zeros(self.machine.n), counts, self.line.now()))
             raise
 
     def status(self) -> str:
@@ -293,12 +303,12 @@ class Drive:
         except Exception as error:
             self.problem = f"{type(error).__name__}: {error}"
 
-    def _listen(self, end: float, until_complete: bool = False) -> None:
+    def _listen(self, end: float, awake: float = 0.0, until_complete: bool = False) -> None:
         """Read until `end` and until the bus is empty, or until every encoder was heard."""
         for _ in range(MAX_FRAMES):
             if until_complete and (self.nodes.frames > 0).all():
                 return
-            frame = self.line.recv(max(0.0, end - self.line.now()))
+            frame = self.line.recv(max(0.0, end - self.line.now()), awake)
             if frame is None:
                 return
             self.nodes.hear(frame)
@@ -317,41 +327,41 @@ class Drive:
         self.number += 1 + missed
         self.ticks += 1
 
-    def _control(self) -> Array:
-        """What the controller wants [counts of 127], (n,)."""
+    def _control(self, counts: Array) -> Array:
+        """What the controller wants [counts of 127] (n,) at angles `counts` [encoder counts]."""
         m = self.machine
         if (self.nodes.frames != 1).any():
             self.history = None  # a gap: what came before it no longer joins what comes after
             return np.zeros(m.n)
-        counts = encoder_counts(m, self.nodes.raw).astype(np.float32)
-        q = (counts * m.encoder_step)[None]  # float32, as `read_encoder` gives in the simulation
+        q = counts[None].astype(np.float32) * m.encoder_step  # as `read_encoder` gives in the simulation
         if self.history is None:
-            self.history, self.lag = rest_history(q, m.history), np.zeros((1, 3), np.float32)
+            self.history, arm = rest_history(q, m.history), None
         else:
-            self.history, self.lag = push_measured(m, self.history, q, self.asked, self.lag)
+            self.history, self.lag, arm = push_measured(m, self.history, q, self.asked, self.lag)
         if not self.gate.driving:
             self.memory, self.lag = self.controller.start(1), np.zeros((1, 3), np.float32)
-        u, self.memory = self._ask()
         self.asked = np.array([self.wish.v_goal], np.float32)
+        seen = observe(m, self.history, self.asked, self.lag, arm=arm)
+        u, self.memory = self.controller(seen, self.memory)
         return np.asarray(np.rint(u[0] * PWM_MAX), float)
 
-    def _ask(self) -> tuple[Array, Any]:
-        """The controller's command u (1, n) and next memory for what is known."""
-        v_goal = np.array([self.wish.v_goal], np.float32)
-        seen = observe(self.machine, np.asarray(self.history), v_goal, self.lag)
-        return self.controller(seen, self.memory)
-
     def _rehearse(self) -> None:
-        """Compute a tick for nothing while the encoders answer: 45 ms of sleep have cooled the caches."""
-        if self.history is not None:
-            u, _ = self._ask()
-            gate(self.machine, self.gate, self._inputs(u[0]), self.line.now())
+        """Let twins compute the next tick for nothing: after a sleep the first takes three times as long."""
+        if self.history is None:
+            return
+        nodes = copy(self.nodes)
+        nodes.frames = np.ones_like(nodes.frames)
+        for _ in range(REHEARSALS):
+            twin = copy(self)
+            twin.nodes, counts = nodes, encoder_counts(self.machine, nodes.raw)
+            twin._gate(twin._control(counts), counts, self.line.now())
 
-    def _inputs(self, wanted: Array) -> GateInputs:
+    def _gate(self, wanted: Array, counts: Array, now: float) -> bytes:
+        """Pass the gate with what this tick knows; the valve frame."""
         nodes, wish = self.nodes, self.wish
-        return GateInputs(
+        inputs = GateInputs(
             m=wanted,
-            counts=encoder_counts(self.machine, nodes.raw),
+            counts=counts,
             frames=nodes.frames,
             beat=nodes.beat,
             nmt=nodes.nmt,
@@ -361,18 +371,18 @@ class Drive:
             stop=np.array(wish.stop),
             error=np.array(wish.error or bool(self.problem)),
         )
+        self.gate, frame = gate(self.machine, self.gate, inputs, now)
+        return frame.tobytes()
 
-    def _gate(self, wanted: Array, now: float) -> bytes:
-        """Pass the gate; forget what this tick heard and remember what it sent."""
-        self.gate, frame = gate(self.machine, self.gate, self._inputs(wanted), now)
+    def _remember(self, problem: str) -> None:
+        """What was sent and what is wrong; forget what this tick heard."""
         if self.history is not None:
             self.history = push_command(self.history, self.gate.sent[..., -1] / PWM_MAX)
         stopped, wrong = (fault_name(self.machine, int(f)) for f in (self.gate.fault, self.gate.wrong))
         self.reason = f"fault: {stopped}" if stopped else wrong
-        self.remark = "" if self.gate.driving else self.problem or self.remark
+        self.remark = "" if self.gate.driving else problem or self.remark
         self.reason += f" ({self.remark})" if self.remark else ""
-        self.nodes.frames[:], self.problem = 0, ""
-        return frame.tobytes()
+        self.nodes.frames[:] = 0
 
     def _speak(self, frame: bytes) -> None:
         """Send the valve frame, once the gate was armed."""
@@ -405,7 +415,7 @@ class Tape:
     def flush(self) -> None:
         """Nor does it write."""
 
-    def recv(self, timeout: float) -> Frame | None:
+    def recv(self, timeout: float, awake: float = 0.0) -> Frame | None:
         """The next frame that was read before anything was sent."""
         if not self.more or self.frames[self.at].sent:
             return None

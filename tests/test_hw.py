@@ -600,9 +600,10 @@ def test_ticks_keep_an_absolute_grid_and_missed_ones_are_skipped_never_made_up()
     world.step = 0.0007  # does not divide a tick
     world.drive.begin()
     begun = world.t
-    stalls = {40: 0.13, 80: 0.049, 90: 0.26}
+    stalls = {40: 0.13, 80: 0.052, 90: 0.26}
     for k in range(120):
-        world.drive.controller.act = lambda k=k: world.rest(stalls.pop(k, 0.004))  # type: ignore
+        busy = stalls.get(k, 0.004)
+        world.downward = lambda i, data, busy=busy: (world.rest(busy * (i == 0x210)), [(i, data)])[1]  # type: ignore
         world.drive.tick()
     ticks = (np.array(world.syncs) - begun) / 0.05
     late = np.flatnonzero(ticks - np.floor(ticks + 0.03) > 0.03)
