@@ -19,21 +19,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from brokk_min import bus
 from brokk_min.actuator import push_command, rest_history
-from brokk_min.bus import (
-    BEAT,
-    BEAT_OBJECT,
-    NMT,
-    OPERATOR,
-    RESOLUTION_OBJECT,
-    SYNC,
-    SYNC_OBJECT,
-    WISH,
-    Frame,
-    Nodes,
-    sdo,
-    stop_signals,
-)
 from brokk_min.env import Controller, measured, observe, push_measured
 from brokk_min.gate import OPERATIONAL, GateInputs, encoder_counts, fault_name, gate, gate_start
 from brokk_min.kinematics import tool_state
@@ -202,7 +189,7 @@ class Drive:
         if machine.n > 5:
             raise ValueError(f"{machine.name}: expected at most 5 joints in a valve frame, got {machine.n}")
         self.machine, self.controller, self.line, self.operator = machine, controller, line, operator
-        self.nodes, self.gate, self.wish = Nodes(machine), gate_start(machine), Wish()
+        self.nodes, self.gate, self.wish = bus.Nodes(machine), gate_start(machine), Wish()
         self.memory = controller.start(1)
         self.history: Array | None = None
         self.lag: Array = np.zeros((1, 3), np.float32)  # of `push_lag`
@@ -219,15 +206,15 @@ class Drive:
             ValueError: an encoder that does not answer or has another resolution.
         """
         for joint in self.machine.joints:
-            turn = sdo(self.line, joint.encoder_node, RESOLUTION_OBJECT)
+            turn = bus.sdo(self.line, joint.encoder_node, bus.RESOLUTION_OBJECT)
             if turn != 2**self.machine.encoder_bits:
                 raise ValueError(
                     f"{joint.name}: expected {2**self.machine.encoder_bits} counts a turn of encoder node "
                     f"{joint.encoder_node} (object 0x6501), got {turn}"
                 )
-            sdo(self.line, joint.encoder_node, BEAT_OBJECT, round(1e3 * BEAT), size=2)
-            sdo(self.line, joint.encoder_node, SYNC_OBJECT, 1, size=1)  # a position after every SYNC
-        self.line.send(NMT, bytes([1, 0]))
+            bus.sdo(self.line, joint.encoder_node, bus.BEAT_OBJECT, round(1e3 * bus.BEAT), size=2)
+            bus.sdo(self.line, joint.encoder_node, bus.SYNC_OBJECT, 1, size=1)  # at every SYNC
+        self.line.send(bus.NMT, bytes([1, 0]))
         self.begun = self.line.now()
 
     @property
@@ -251,7 +238,7 @@ class Drive:
             self.wish = unpack_wish(wish.pack())  # as the log has it, so that a replay gets the same
         self.nodes.frames *= 2  # a position from before its SYNC is as wrong as a doubled one
         with self._caught():
-            line.send(SYNC, b"")
+            line.send(bus.SYNC, b"")
             self._listen(line.now() + WINDOW, AWAKE, until_complete=True)
         counts = encoder_counts(self.machine, self.nodes.raw)
         with self._caught():
@@ -265,7 +252,9 @@ class Drive:
         self._remember(problem)
         with self._caught():
             if not (self.wish.enable or self.gate.driving) and (self.nodes.nmt != OPERATIONAL).any():
-                line.send(NMT, bytes([1, 0]))  # nodes that fell back; not while the operator holds the switch
+                line.send(
+                    bus.NMT, bytes([1, 0])
+                )  # nodes that fell back; not while the operator holds the switch
             line.flush()
         return not self.wish.stop
 
@@ -273,7 +262,7 @@ class Drive:
         """Tick until the operator, SIGINT or SIGTERM stops it; the last frame is neutral whatever happens."""
         gc.freeze()  # what is there now stays: no long collection in the middle of a tick
         try:
-            with stop_signals() as self.signals:
+            with bus.stop_signals() as self.signals:
                 while self.tick():
                     if self.ticks % 5 == 0:
                         show(self.status())
@@ -359,18 +348,9 @@ class Drive:
     def _gate(self, wanted: Array, counts: Array, now: float) -> bytes:
         """Pass the gate with what this tick knows; the valve frame."""
         nodes, wish = self.nodes, self.wish
-        inputs = GateInputs(
-            m=wanted,
-            counts=counts,
-            frames=nodes.frames,
-            beat=nodes.beat,
-            nmt=nodes.nmt,
-            enable=np.array(wish.enable),
-            centred=np.array(not any(wish.v_goal)),
-            alive=np.array(wish.alive),
-            stop=np.array(wish.stop),
-            error=np.array(wish.error or bool(self.problem)),
-        )
+        error = wish.error or bool(self.problem)
+        flags = np.array([wish.enable, not any(wish.v_goal), wish.alive, wish.stop, error])
+        inputs = GateInputs(wanted, counts, nodes.frames, nodes.beat, nodes.nmt, *flags)
         self.gate, frame = gate(self.machine, self.gate, inputs, now)
         return frame.tobytes()
 
@@ -397,8 +377,8 @@ class Drive:
 class Tape:
     """A recorded log in place of a `Line`: gives back what was read and compares what is sent."""
 
-    def __init__(self, frames: Sequence[Frame]) -> None:
-        self.frames, self.at, self.sent, self.wrong = frames, 0, list[Frame](), ""
+    def __init__(self, frames: Sequence[bus.Frame]) -> None:
+        self.frames, self.at, self.sent, self.wrong = frames, 0, list[bus.Frame](), ""
 
     @property
     def more(self) -> bool:
@@ -415,7 +395,7 @@ class Tape:
     def flush(self) -> None:
         """Nor does it write."""
 
-    def recv(self, timeout: float, awake: float = 0.0) -> Frame | None:
+    def recv(self, timeout: float, awake: float = 0.0) -> bus.Frame | None:
         """The next frame that was read before anything was sent."""
         if not self.more or self.frames[self.at].sent:
             return None
@@ -424,19 +404,19 @@ class Tape:
 
     def send(self, can_id: int, data: bytes) -> None:
         """Keep what is sent, and step over what was sent then."""
-        self.sent.append(Frame(self.now(), can_id, data, True))
+        self.sent.append(bus.Frame(self.now(), can_id, data, True))
         self._step(can_id)
 
     def note(self, data: bytes) -> float:
         """The time of the wish."""
         now = self.now()
-        self._step(WISH)
+        self._step(bus.WISH)
         return now
 
     def wish(self, driving: bool, ready: bool) -> Wish:
         """What the operator wished then."""
         ahead = (self.frames[i] for i in range(self.at, len(self.frames)))
-        return next((unpack_wish(frame.data) for frame in ahead if frame.id == WISH), Wish(stop=True))
+        return next((unpack_wish(frame.data) for frame in ahead if frame.id == bus.WISH), Wish(stop=True))
 
     def _step(self, can_id: int) -> None:
         if self.more and (not (at := self.frames[self.at]).sent or at.id != can_id):
@@ -445,7 +425,7 @@ class Tape:
         self.at += 1
 
 
-def replay(machine: Machine, controller: Controller, frames: Sequence[Frame]) -> list[Frame]:
+def replay(machine: Machine, controller: Controller, frames: Sequence[bus.Frame]) -> list[bus.Frame]:
     """Run the loop on a recorded log of it; what it sends now, to be compared with what it sent then.
 
     Raises:
@@ -458,10 +438,10 @@ def replay(machine: Machine, controller: Controller, frames: Sequence[Frame]) ->
         drive.tick()
     if tape.wrong:
         raise ValueError(tape.wrong)
-    return tape.sent[: sum(f.sent and f.channel != OPERATOR for f in frames)]
+    return tape.sent[: sum(f.sent and f.channel != bus.OPERATOR for f in frames)]
 
 
-def compare(machine: Machine, frames: Sequence[Frame], sent: Sequence[Frame]) -> tuple[int, int]:
+def compare(machine: Machine, frames: Sequence[bus.Frame], sent: Sequence[bus.Frame]) -> tuple[int, int]:
     """How many valve frames of `sent` are those of the log, byte by byte, and how many the log has."""
     old, new = (
         [f.data for f in side if f.sent and f.id == machine.valve_frame_id] for side in (frames, sent)
@@ -469,15 +449,15 @@ def compare(machine: Machine, frames: Sequence[Frame], sent: Sequence[Frame]) ->
     return sum(a == b for a, b in zip(old, new)), max(len(old), len(new))
 
 
-def driven_log(machine: Machine, frames: Iterable[Frame]) -> Log:
+def driven_log(machine: Machine, frames: Iterable[bus.Frame]) -> Log:
     """What encoders said and valves got while driving, as recordings for `fit`; a gap starts a new one.
 
     Raises:
         ValueError: nothing was driven for long enough.
     """
-    nodes, parts, start, last = Nodes(machine), list[list[Any]](), 0.0, -np.inf
+    nodes, parts, start, last = bus.Nodes(machine), list[list[Any]](), 0.0, -np.inf
     for frame in frames:
-        if frame.id == SYNC:
+        if frame.id == bus.SYNC:
             nodes.frames[:], start = 0, frame.time
         elif frame.id == machine.valve_frame_id and len(frame.data) == 8:
             if frame.data[7] == 1 and (nodes.frames == 1).all():

@@ -28,6 +28,7 @@ from brokk_min.jacobian import JacobianController, join_gains, manipulability_th
 from brokk_min.kinematics import joint_rates, tool_state
 from brokk_min.logs import read_log, write_log
 from brokk_min.machine import BROKK_170
+from brokk_min.policy import PolicyController, load_policy
 
 PUSH = (60, 0, 60, 60, 60)
 BASELINE = JacobianController(
@@ -53,11 +54,16 @@ def test_importing_opens_nothing_and_needs_no_extras() -> None:
 # --- the loop on the plant ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("sequence", axis_sequences(BROKK_170), ids=lambda s: s.name)
-def test_reward_over_the_bus_is_that_of_evaluate(sequence: Any) -> None:
+SHIPPED = Path(hw.__file__).with_name("shipped") / BROKK_170.name / "policy.npz"
+
+
+@pytest.mark.parametrize(("axis", "controller"), [(0, "rl"), (1, "rl"), (2, "rl"), (2, "jacobian")])
+def test_reward_over_the_bus_is_that_of_evaluate(axis: int, controller: str) -> None:
     """Within 1 %, with 2 ms of bus and machine between SYNC and valve frame."""
+    sequence = axis_sequences(BROKK_170)[axis]
+    driver = PolicyController(BROKK_170, load_policy(SHIPPED, BROKK_170)) if controller == "rl" else BASELINE
     script = hw.Script(BROKK_170, sequence.goals)
-    world = World(BASELINE, script)
+    world = World(driver, script)
     world.drive.operator = lambda driving, ready: (world.rest(0.002), script(driving, ready))[1]
     world.drive.begin()
     while world.drive.tick():
@@ -71,7 +77,7 @@ def test_reward_over_the_bus_is_that_of_evaluate(sequence: Any) -> None:
     v = tool_state(BROKK_170, q[1:], np.diff(q, axis=0) * 20)[1]
     over_bus = reward(sequence.goals, v).mean()
     trace = rollout(
-        BROKK_170, BASELINE, np.array([START]), sequence.goals[:, None], TaskConfig(noise=0.0),
+        BROKK_170, driver, np.array([START]), sequence.goals[:, None], TaskConfig(noise=0.0),
         np.random.default_rng(0),
     )  # fmt: skip
     assert over_bus == pytest.approx(trace.reward.mean(), rel=0.01)
