@@ -655,6 +655,59 @@ def test_a_wait_does_not_follow_the_time_of_day(monkeypatch: pytest.MonkeyPatch)
     assert 0.015 < time.monotonic() - begun < 5.0
 
 
+class SelectBus:
+    """A bus that is silent; a wait on it takes as long as the wait says, or a millisecond."""
+
+    def __init__(self) -> None:
+        self.t, self.waits = 0.0, list[float]()
+
+    def fileno(self) -> int:
+        return 7
+
+    def recv(self, timeout: float) -> None:
+        assert timeout == 0.0
+
+    def select(self, read: list[int], *rest: Any) -> tuple[list[int], list[int], list[int]]:
+        assert read == [7]
+        self.waits.append(rest[-1])
+        self.t += rest[-1] or 0.001
+        return [], [], []
+
+
+@pytest.mark.parametrize(("awake", "slept"), [(0.0, [0.019]), (0.004, [0.016]), (0.020, [])])
+def test_a_wait_sleeps_only_after_the_time_it_is_told_to_be_awake(
+    awake: float, slept: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    silent = SelectBus()
+    line = bus.Line(silent, clock=lambda: silent.t)
+    monkeypatch.setattr("brokk_min.bus.select.select", silent.select)
+    assert line.recv(0.020, awake) is None
+    assert [wait for wait in silent.waits if wait] == pytest.approx(slept)
+    assert 0.020 <= silent.t < 0.0225
+
+
+def test_a_rehearsal_comes_before_sync_and_leaves_no_trace() -> None:
+    push = Push(*PUSH)
+    world = World(push, Hand())
+    calls, told = list[float](), list[float]()
+    push.act = lambda: calls.append(world.t)
+    world.downward = lambda i, data: (told.append(world.t) if i == 0x80 else None, [(i, data)])[1]
+    world.drive.begin()
+    world.run(1.0)
+    before = dict(vars(world.drive))
+    nodes = [np.copy(a) for a in (world.drive.nodes.frames, world.drive.nodes.raw, world.drive.nodes.beat)]
+    calls.clear()
+    world.drive._rehearse()
+    assert len(calls) == hw.REHEARSALS
+    assert vars(world.drive) == before and all(vars(world.drive)[k] is before[k] for k in before)
+    for kept, now in zip(nodes, (world.drive.nodes.frames, world.drive.nodes.raw, world.drive.nodes.beat)):
+        np.testing.assert_array_equal(kept, now)
+    calls.clear()
+    world.drive.tick()
+    assert calls[0] < told[-1] <= calls[-1] and len(calls) == hw.REHEARSALS + 1
+    world.close()
+
+
 # --- start --------------------------------------------------------------------------------------------
 
 
@@ -727,6 +780,7 @@ def test_a_line_tells_our_frames_from_others_and_logs_all() -> None:
     assert [f and f.id for f in frames] == [-1, 0x123, -1, -1, -1, -1]
     assert line.recv(0.0) is None
     line.note(b"\x09")
+    assert not text.getvalue()  # writing waits until there is time
     line.flush()
     lines = text.getvalue().splitlines()
     assert len(lines) == 7  # all but the echo
