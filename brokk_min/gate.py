@@ -232,7 +232,7 @@ def gate_wrong(machine: Machine, state: GateState, inputs: GateInputs, due: Arra
     bad[..., 0, 0] = inputs.error
     bad[..., 1, 0] = np.abs(now - state.time - machine.dt) > machine.dt / 2
     bad[..., 2, 0] = ~inputs.alive
-    bad[..., 3, :] = inputs.beat == -np.inf
+    bad[..., 3, :] = np.isneginf(inputs.beat)
     bad[..., 4, :] = now[..., None] - inputs.beat > BEAT_LOST
     bad[..., 5, :] = inputs.nmt != OPERATIONAL
     bad[..., 6, :n] = inputs.frames < 1

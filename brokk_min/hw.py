@@ -229,7 +229,7 @@ class Drive:
         with self._caught():
             self._listen(end - AWAKE)
             line.rest(max(0.0, end - AWAKE - line.now()))
-            self._rehearse()
+            self._rehearse(end)
             self._listen(end, AWAKE)
         line.rest(max(0.0, end - line.now()))  # a broken bus does not wait
         self._next_deadline()
@@ -334,13 +334,13 @@ class Drive:
         u, self.memory = self.controller(seen, self.memory)
         return np.asarray(np.rint(u[0] * PWM_MAX), float)
 
-    def _rehearse(self) -> None:
-        """Let twins compute the next tick for nothing: after a sleep the first takes three times as long."""
-        if self.history is None:
-            return
+    def _rehearse(self, end: float) -> None:
+        """Let twins compute the next tick for nothing while there is time; after sleep the first is slow."""
         nodes = copy(self.nodes)
         nodes.frames = np.ones_like(nodes.frames)
         for _ in range(REHEARSALS):
+            if self.history is None or self.line.now() >= end:
+                break
             twin = copy(self)
             twin.nodes, counts = nodes, encoder_counts(self.machine, nodes.raw)
             twin._gate(twin._control(counts), counts, self.line.now())

@@ -330,6 +330,10 @@ FAULTS: dict[str, tuple[Callable[[Fault], object], str]] = {
         "tick late, or the clock was set",
     ),
     "clock stepped back": (lambda f: setattr(f.world, "offset", -3600.0), "tick late, or the clock was set"),
+    "log cannot be written": (
+        lambda f: setattr(f.world.line, "flush", raises(OSError("no space"))),
+        "error (OSError: no space)",
+    ),
     "late tick": (lambda f: stall(f, 0.08), "tick late"),
     "hang": (lambda f: stall(f, 0.8), "tick late"),
     "policy returns NaN": (lambda f: f.push.m.__setitem__(2, np.nan), "q3: no valid command"),
@@ -697,7 +701,7 @@ def test_a_rehearsal_comes_before_sync_and_leaves_no_trace() -> None:
     before = dict(vars(world.drive))
     nodes = [np.copy(a) for a in (world.drive.nodes.frames, world.drive.nodes.raw, world.drive.nodes.beat)]
     calls.clear()
-    world.drive._rehearse()
+    world.drive._rehearse(world.line.now() + 0.001)
     assert len(calls) == hw.REHEARSALS
     assert vars(world.drive) == before and all(vars(world.drive)[k] is before[k] for k in before)
     for kept, now in zip(nodes, (world.drive.nodes.frames, world.drive.nodes.raw, world.drive.nodes.beat)):
@@ -705,6 +709,11 @@ def test_a_rehearsal_comes_before_sync_and_leaves_no_trace() -> None:
     calls.clear()
     world.drive.tick()
     assert calls[0] < told[-1] <= calls[-1] and len(calls) == hw.REHEARSALS + 1
+    push.act = lambda: world.rest(0.010)  # a slow controller; no time for more than one rehearsal
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(hw, "REHEARSALS", 4)
+        world.run(1.0)
+    assert world.drive.gate.driving and world.drive.skipped == 0
     world.close()
 
 
