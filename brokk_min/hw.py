@@ -28,7 +28,7 @@ from brokk_min.logs import Log, Recording, velocity_of
 from brokk_min.machine import PWM_MAX, Machine, decode_pwm
 
 Array = NDArray[Any]
-AWAKE = 0.004  # s before SYNC and after it in which the loop does not sleep (tuned)
+AWAKE = 0.002  # s before SYNC and after it in which the loop does not sleep (tuned)
 REHEARSALS = 4  # of a tick before it (tuned)
 WINDOW = 0.020  # s after SYNC in which the encoders must answer (assumed)
 MAX_FRAMES = 2000  # read in a row; more than a bus can carry in a tick
