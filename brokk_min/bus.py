@@ -60,6 +60,8 @@ class Line:
         rest: Callable[[float], object] = time.sleep,
     ) -> None:
         self.bus, self.log, self.name, self.clock, self.rest = bus, log, name, clock, rest
+        self.message = _can().Message
+        self.kept: deque[Any] = deque()  # messages on their way into the log
         self.start = time.time() - clock()  # candump logs carry the time of day, but it may be set
         self.echo: deque[tuple[int, bytes]] | None = deque(maxlen=64) if echo else None
         try:
@@ -71,10 +73,13 @@ class Line:
         """Time of day at the start plus monotonic time since [s], in whole microseconds as the log has it."""
         return round(self.start + self.clock(), 6)
 
-    def recv(self, timeout: float) -> Frame | None:
-        """The next frame, or None if none comes within `timeout` [s]."""
+    def recv(self, timeout: float, awake: float = 0.0) -> Frame | None:
+        """The next frame, or None if none comes within `timeout` [s]; sleeps only after `awake` of it."""
         if self.file >= 0 and timeout > 0:  # python-can's own timeout follows the time of day
-            select.select([self.file], [], [], timeout)
+            start = self.clock()
+            while not select.select([self.file], [], [], 0)[0] and (gone := self.clock() - start) < timeout:
+                if gone >= awake:
+                    select.select([self.file], [], [], timeout - gone)
             timeout = 0.0
         message = self.bus.recv(timeout)
         if message is None:
@@ -88,7 +93,7 @@ class Line:
 
     def send(self, can_id: int, data: bytes) -> None:
         """Send one frame, once; never periodically: the kernel would go on after a hang."""
-        message = _message(can_id, data)
+        message = self._message(can_id, data)
         self.bus.send(message, timeout=0.01)
         if self.echo is not None:
             self.echo.append((can_id, data))
@@ -97,30 +102,31 @@ class Line:
     def note(self, data: bytes) -> float:
         """Log what is not on the bus, the operator's wish, on a channel of its own; when that was [s]."""
         now = self.now()
-        self._keep(_message(WISH, data), now, OPERATOR)
+        self._keep(self._message(WISH, data), now, OPERATOR)
         return now
 
     def flush(self) -> None:
-        """Let the log survive the program's sudden end."""
+        """Write the log on, so that it survives the program's sudden end."""
+        while self.kept:
+            self.log.on_message_received(self.kept.popleft())
         if self.log is not None:
             self.log.file.flush()
 
+    def _message(self, can_id: int, data: bytes) -> Any:
+        return self.message(arbitration_id=can_id, data=data, is_extended_id=False, is_rx=False)
+
     def _keep(self, message: Any, now: float, channel: str) -> None:
+        """For `flush`, which waits until there is time."""
         if self.log is not None:
             message.timestamp, message.channel = now, channel
-            self.log.on_message_received(message)
+            self.kept.append(message)
 
     def close(self) -> None:
         """Close bus and log."""
         self.bus.shutdown()
         if self.log is not None:
+            self.flush()
             self.log.stop()
-
-
-def _message(can_id: int, data: bytes) -> Any:
-    from can import Message
-
-    return Message(arbitration_id=can_id, data=data, is_extended_id=False, is_rx=False)
 
 
 def _plain_id(message: Any) -> int:

@@ -28,14 +28,7 @@ from brokk_min.actuator import (
     push_command,
     rest_history,
 )
-from brokk_min.kinematics import (
-    damped_rates,
-    lowest_point,
-    tool_jacobian,
-    tool_position,
-    tool_state,
-    tool_velocity,
-)
+from brokk_min.kinematics import damped_rates, lowest_point, tool_jacobian, tool_position, tool_state
 from brokk_min.machine import (
     BROKK_170,
     PWM_MAX,
@@ -174,8 +167,27 @@ def paper_view(machine: Machine) -> Array:
     return _layout(machine).paper
 
 
+class Arm(NamedTuple):
+    """The arm as its encoders show it, from one pass over its frames; see `measured_arm`."""
+
+    p_tool: Array  # tool position [m], (..., 3)
+    J: Array  # its derivative by all joints' angles [m/rad], (..., 3, n)
+    v_tool: Array  # tool velocity [m/s], (..., 3)
+
+
+def measured_arm(machine: Machine, history: Array) -> Arm:
+    """The arm at the newest of the measured samples `history` (..., n, 3, H)."""
+    p_tool, J = tool_jacobian(machine, history[..., 0, -1])
+    return Arm(p_tool, J, np.add.reduce(J * history[..., None, :, 1, -1], axis=-1))
+
+
 def observe(
-    machine: Machine, history: Array, v_goal: ArrayLike, lag: Array, noise: Array | float = 0.0
+    machine: Machine,
+    history: Array,
+    v_goal: ArrayLike,
+    lag: Array,
+    noise: Array | float = 0.0,
+    arm: Arm | None = None,
 ) -> Array:
     """What the policy sees: goal and tool velocity, locked angles, driven histories, wanted joint rates.
 
@@ -191,22 +203,27 @@ def observe(
         v_goal: wanted tool velocity [m/s], base frame, shape (..., 3).
         lag: of `push_lag` [m], base frame, shape (..., 3).
         noise: of what sensors say, in standard deviations, shape (..., obs) or a number.
+        arm: `measured_arm` of `history` where it is known.
 
     Returns:
         Shape (..., 6 + locked + (3 H + 2) n_driven), float32.
     """
     mean, scale, sensed, angles, _, told = _layout(machine)
-    q, batch = history[..., 0, -1], history.shape[:-3]
+    batch = history.shape[:-3]
     seen = np.zeros((*batch, len(mean)), np.float32)
     seen[..., 6 : 6 + len(told)] = history.reshape(*batch, -1)[..., told]
     seen += noise * sensed
-    # the arm where it is and where it is seen, in one pass: few large steps are faster than many small ones
-    p_tool, J = tool_jacobian(machine, np.stack([q, seen[..., angles]], axis=-2))
+    if arm is None or np.ndim(noise) or noise:
+        # the arm where it is and where it is seen, in one pass: one large step is faster than two small ones
+        poses = np.stack([history[..., 0, -1], seen[..., angles]], axis=-2)
+        p_tool, J = tool_jacobian(machine, poses)
+        v_tool = np.add.reduce(J[..., 0, :, :] * history[..., None, :, 1, -1], axis=-1)
+    else:  # it is seen where it is
+        p_tool, J, v_tool = arm.p_tool[..., None, :], arm.J[..., None, :, :], arm.v_tool
     given = np.empty((*batch, 3, 3), np.float32)
-    given[..., 0, :], given[..., 2, :] = v_goal, lag
-    given[..., 1, :] = (J[..., 0, :, :] * history[..., None, :, 1, -1]).sum(axis=-1)
+    given[..., 0, :], given[..., 1, :], given[..., 2, :] = v_goal, v_tool, lag
     seen[..., :6] += _turn(p_tool[..., :1, :], given[..., :2, :], 1).reshape(*batch, 6)
-    rates = damped_rates(machine, J[..., 1:, :, machine.driven], given[..., ::2, :])
+    rates = damped_rates(machine, J[..., -1:, :, machine.driven], given[..., ::2, :])
     seen[..., 6 + len(told) :] = rates.reshape(*batch, -1)
     seen -= mean
     seen /= scale
@@ -234,7 +251,7 @@ def measured(machine: Machine, observation: Array) -> Measured:
     return Measured(v_goal, v_tool, q, values[..., angles[machine.driven] + machine.history])
 
 
-def push_lag(machine: Machine, history: Array, v_goal: Array, lag: Array) -> Array:
+def push_lag(machine: Machine, history: Array, v_goal: Array, lag: Array, arm: Arm | None = None) -> Array:
     """How far the tool stays behind [m] (..., 3): the leaky integral of the velocity error, a tick on.
 
     It tells a lasting error from a passing one. Errors count up to `LAG_SPEED` of the machine's tool
@@ -245,9 +262,10 @@ def push_lag(machine: Machine, history: Array, v_goal: Array, lag: Array) -> Arr
         history: measured samples after the tick, (..., n, 3, H).
         v_goal: what was wanted during the tick [m/s], (..., 3).
         lag: before the tick, (..., 3).
+        arm: `measured_arm` of `history` where it is known.
     """
-    error = v_goal - tool_velocity(machine, history[..., 0, -1], history[..., 1, -1])
-    size = np.sqrt(np.sum(error * error, axis=-1, keepdims=True))
+    error = v_goal - (arm or measured_arm(machine, history)).v_tool
+    size = np.sqrt(np.add.reduce(error * error, axis=-1, keepdims=True))
     limit = np.float32(LAG_SPEED * machine.tool_speed)
     counted = lag + error * (limit / np.maximum(size, limit)) * np.float32(machine.dt)
     return counted * np.float32(np.exp(-machine.dt / LAG_TIME))
@@ -255,13 +273,14 @@ def push_lag(machine: Machine, history: Array, v_goal: Array, lag: Array) -> Arr
 
 def push_measured(
     machine: Machine, history: Array, q: Array, v_goal: Array, lag: Array
-) -> tuple[Array, Array]:
-    """History and lag a tick on, after the encoders said `q` [rad] (..., n): in simulation and hardware.
+) -> tuple[Array, Array, Arm]:
+    """History, lag and arm a tick on, after the encoders said `q` [rad] (..., n): simulation and hardware.
 
     `history` is what `push_command` left, `v_goal` [m/s] (..., 3) what was wanted during the tick.
     """
     history = push_angle(history, q, lambda a: estimate_velocity(a, machine.velocity_samples, machine.dt))
-    return history, push_lag(machine, history, v_goal, lag)
+    arm = measured_arm(machine, history)
+    return history, push_lag(machine, history, v_goal, lag, arm), arm
 
 
 def to_command(machine: Machine, action: ArrayLike) -> Array:
@@ -329,7 +348,7 @@ def transition(
     else:
         raise ValueError("net: expected nets for a state without a plant, got None")
 
-    history, lag = push_measured(machine, history, read(machine, q), state.v_goal, state.lag)
+    history, lag, _ = push_measured(machine, history, read(machine, q), state.v_goal, state.lag)
     return replace(
         state,
         q=q,

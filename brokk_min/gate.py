@@ -75,9 +75,9 @@ def checksum(frame: ArrayLike) -> Array:
     """
     frame = np.asarray(frame, np.uint8)
     crc: Array = np.array(0xFF, np.uint8)
-    for i in range(frame.shape[-1]):
-        crc = _CRC[crc ^ frame[..., i]]
-    return crc ^ np.uint8(0xFF)
+    for byte in frame.T:
+        crc = _CRC[crc ^ byte]
+    return (crc ^ np.uint8(0xFF)).T
 
 
 def valve_frame(m: ArrayLike, counter: ArrayLike, enable: ArrayLike) -> Array:
@@ -176,7 +176,7 @@ def gate(machine: Machine, state: GateState, inputs: GateInputs, now: ArrayLike)
     up = np.where(q < machine.column("q_max") - LIMIT_MARGIN, np.maximum(last, 0) + SLEW, 0)
     down = np.where(q > machine.column("q_min") + LIMIT_MARGIN, np.minimum(last, 0) - SLEW, 0)
     moving = state.driving & driving  # the tick that arms is still neutral
-    m = np.where(moving[..., None], np.clip(inputs.m, down, up), 0).astype(int)
+    m = np.where(moving[..., None], np.minimum(np.maximum(inputs.m, down), up), 0).astype(int)
 
     counter = (state.counter + 1) % 256
     trusted = inputs.alive & ~inputs.error  # a lost device or an exception is no release of the switch
@@ -188,7 +188,7 @@ def gate(machine: Machine, state: GateState, inputs: GateInputs, now: ArrayLike)
         enable=inputs.enable | (state.enable & ~trusted),
         time=now,
         counter=counter,
-        counts=np.stack([state.counts[..., 1], inputs.counts], axis=-1),
+        counts=np.concatenate([state.counts[..., 1:], inputs.counts[..., None]], axis=-1),
         sent=np.concatenate([state.sent[..., 1:], m[..., None]], axis=-1),
         pace=pace,
         due=due,

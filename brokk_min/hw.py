@@ -12,27 +12,15 @@ import os
 import struct
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from brokk_min import bus
 from brokk_min.actuator import push_command, rest_history
-from brokk_min.bus import (
-    BEAT,
-    BEAT_OBJECT,
-    NMT,
-    OPERATOR,
-    RESOLUTION_OBJECT,
-    SYNC,
-    SYNC_OBJECT,
-    WISH,
-    Frame,
-    Nodes,
-    sdo,
-    stop_signals,
-)
 from brokk_min.env import Controller, measured, observe, push_measured
 from brokk_min.gate import OPERATIONAL, GateInputs, encoder_counts, fault_name, gate, gate_start
 from brokk_min.kinematics import tool_state
@@ -40,6 +28,8 @@ from brokk_min.logs import Log, Recording, velocity_of
 from brokk_min.machine import PWM_MAX, Machine, decode_pwm
 
 Array = NDArray[Any]
+AWAKE = 0.002  # s before SYNC and after it in which the loop does not sleep (tuned)
+REHEARSALS = 4  # of a tick before it (tuned)
 WINDOW = 0.020  # s after SYNC in which the encoders must answer (assumed)
 MAX_FRAMES = 2000  # read in a row; more than a bus can carry in a tick
 
@@ -199,7 +189,7 @@ class Drive:
         if machine.n > 5:
             raise ValueError(f"{machine.name}: expected at most 5 joints in a valve frame, got {machine.n}")
         self.machine, self.controller, self.line, self.operator = machine, controller, line, operator
-        self.nodes, self.gate, self.wish = Nodes(machine), gate_start(machine), Wish()
+        self.nodes, self.gate, self.wish = bus.Nodes(machine), gate_start(machine), Wish()
         self.memory = controller.start(1)
         self.history: Array | None = None
         self.lag: Array = np.zeros((1, 3), np.float32)  # of `push_lag`
@@ -216,15 +206,15 @@ class Drive:
             ValueError: an encoder that does not answer or has another resolution.
         """
         for joint in self.machine.joints:
-            turn = sdo(self.line, joint.encoder_node, RESOLUTION_OBJECT)
+            turn = bus.sdo(self.line, joint.encoder_node, bus.RESOLUTION_OBJECT)
             if turn != 2**self.machine.encoder_bits:
                 raise ValueError(
                     f"{joint.name}: expected {2**self.machine.encoder_bits} counts a turn of encoder node "
                     f"{joint.encoder_node} (object 0x6501), got {turn}"
                 )
-            sdo(self.line, joint.encoder_node, BEAT_OBJECT, round(1e3 * BEAT), size=2)
-            sdo(self.line, joint.encoder_node, SYNC_OBJECT, 1, size=1)  # a position after every SYNC
-        self.line.send(NMT, bytes([1, 0]))
+            bus.sdo(self.line, joint.encoder_node, bus.BEAT_OBJECT, round(1e3 * bus.BEAT), size=2)
+            bus.sdo(self.line, joint.encoder_node, bus.SYNC_OBJECT, 1, size=1)  # at every SYNC
+        self.line.send(bus.NMT, bytes([1, 0]))
         self.begun = self.line.now()
 
     @property
@@ -237,7 +227,10 @@ class Drive:
         line, wanted, self.wish = self.line, np.zeros(self.machine.n), self.wish._replace(error=False)
         end = min(self.deadline, line.now() + self.machine.dt)  # the clock may have gone backwards
         with self._caught():
-            self._listen(end)
+            self._listen(end - AWAKE)
+            line.rest(max(0.0, end - AWAKE - line.now()))
+            self._rehearse(end)
+            self._listen(end, AWAKE)
         line.rest(max(0.0, end - line.now()))  # a broken bus does not wait
         self._next_deadline()
         with self._caught():
@@ -245,18 +238,23 @@ class Drive:
             self.wish = unpack_wish(wish.pack())  # as the log has it, so that a replay gets the same
         self.nodes.frames *= 2  # a position from before its SYNC is as wrong as a doubled one
         with self._caught():
-            line.send(SYNC, b"")
-            self._rehearse()
-            self._listen(line.now() + WINDOW, until_complete=True)
-            wanted = self._control()
+            line.send(bus.SYNC, b"")
+            self._listen(line.now() + WINDOW, AWAKE, until_complete=True)
+        counts = encoder_counts(self.machine, self.nodes.raw)
+        with self._caught():
+            wanted = self._control(counts)
         self.wish = self.wish._replace(
             stop=self.wish.stop or bool(self.signals), error=self.wish.error or bool(self.problem)
         )
-        now = line.note(self.wish.pack())
-        self._speak(self._gate(wanted, now))
+        frame = self._gate(wanted, counts, line.note(self.wish.pack()))
+        problem, self.problem = self.problem, ""
+        self._speak(frame)
+        self._remember(problem)
         with self._caught():
             if not (self.wish.enable or self.gate.driving) and (self.nodes.nmt != OPERATIONAL).any():
-                line.send(NMT, bytes([1, 0]))  # nodes that fell back; not while the operator holds the switch
+                line.send(
+                    bus.NMT, bytes([1, 0])
+                )  # nodes that fell back; not while the operator holds the switch
             line.flush()
         return not self.wish.stop
 
@@ -264,13 +262,14 @@ class Drive:
         """Tick until the operator, SIGINT or SIGTERM stops it; the last frame is neutral whatever happens."""
         gc.freeze()  # what is there now stays: no long collection in the middle of a tick
         try:
-            with stop_signals() as self.signals:
+            with bus.stop_signals() as self.signals:
                 while self.tick():
                     if self.ticks % 5 == 0:
                         show(self.status())
         except BaseException:
             self.problem = "the loop ended"
-            self._speak(self._gate(np.zeros(self.machine.n), self.line.now()))
+            counts = encoder_counts(self.machine, self.nodes.raw)
+            self._speak(self._gate(np.zeros(self.machine.n), counts, self.line.now()))
             raise
 
     def status(self) -> str:
@@ -293,12 +292,12 @@ class Drive:
         except Exception as error:
             self.problem = f"{type(error).__name__}: {error}"
 
-    def _listen(self, end: float, until_complete: bool = False) -> None:
+    def _listen(self, end: float, awake: float = 0.0, until_complete: bool = False) -> None:
         """Read until `end` and until the bus is empty, or until every encoder was heard."""
         for _ in range(MAX_FRAMES):
             if until_complete and (self.nodes.frames > 0).all():
                 return
-            frame = self.line.recv(max(0.0, end - self.line.now()))
+            frame = self.line.recv(max(0.0, end - self.line.now()), awake)
             if frame is None:
                 return
             self.nodes.hear(frame)
@@ -317,62 +316,53 @@ class Drive:
         self.number += 1 + missed
         self.ticks += 1
 
-    def _control(self) -> Array:
-        """What the controller wants [counts of 127], (n,)."""
+    def _control(self, counts: Array) -> Array:
+        """What the controller wants [counts of 127] (n,) at angles `counts` [encoder counts]."""
         m = self.machine
         if (self.nodes.frames != 1).any():
             self.history = None  # a gap: what came before it no longer joins what comes after
             return np.zeros(m.n)
-        counts = encoder_counts(m, self.nodes.raw).astype(np.float32)
-        q = (counts * m.encoder_step)[None]  # float32, as `read_encoder` gives in the simulation
+        q = counts[None].astype(np.float32) * m.encoder_step  # as `read_encoder` gives in the simulation
         if self.history is None:
-            self.history, self.lag = rest_history(q, m.history), np.zeros((1, 3), np.float32)
+            self.history, arm = rest_history(q, m.history), None
         else:
-            self.history, self.lag = push_measured(m, self.history, q, self.asked, self.lag)
+            self.history, self.lag, arm = push_measured(m, self.history, q, self.asked, self.lag)
         if not self.gate.driving:
             self.memory, self.lag = self.controller.start(1), np.zeros((1, 3), np.float32)
-        u, self.memory = self._ask()
         self.asked = np.array([self.wish.v_goal], np.float32)
+        seen = observe(m, self.history, self.asked, self.lag, arm=arm)
+        u, self.memory = self.controller(seen, self.memory)
         return np.asarray(np.rint(u[0] * PWM_MAX), float)
 
-    def _ask(self) -> tuple[Array, Any]:
-        """The controller's command u (1, n) and next memory for what is known."""
-        v_goal = np.array([self.wish.v_goal], np.float32)
-        seen = observe(self.machine, np.asarray(self.history), v_goal, self.lag)
-        return self.controller(seen, self.memory)
+    def _rehearse(self, end: float) -> None:
+        """Let twins compute the next tick for nothing while there is time; after sleep the first is slow."""
+        nodes = copy(self.nodes)
+        nodes.frames = np.ones_like(nodes.frames)
+        for _ in range(REHEARSALS):
+            if self.history is None or self.line.now() >= end:
+                break
+            twin = copy(self)
+            twin.nodes, counts = nodes, encoder_counts(self.machine, nodes.raw)
+            twin._gate(twin._control(counts), counts, self.line.now())
 
-    def _rehearse(self) -> None:
-        """Compute a tick for nothing while the encoders answer: 45 ms of sleep have cooled the caches."""
-        if self.history is not None:
-            u, _ = self._ask()
-            gate(self.machine, self.gate, self._inputs(u[0]), self.line.now())
-
-    def _inputs(self, wanted: Array) -> GateInputs:
+    def _gate(self, wanted: Array, counts: Array, now: float) -> bytes:
+        """Pass the gate with what this tick knows; the valve frame."""
         nodes, wish = self.nodes, self.wish
-        return GateInputs(
-            m=wanted,
-            counts=encoder_counts(self.machine, nodes.raw),
-            frames=nodes.frames,
-            beat=nodes.beat,
-            nmt=nodes.nmt,
-            enable=np.array(wish.enable),
-            centred=np.array(not any(wish.v_goal)),
-            alive=np.array(wish.alive),
-            stop=np.array(wish.stop),
-            error=np.array(wish.error or bool(self.problem)),
-        )
+        error = wish.error or bool(self.problem)
+        flags = np.array([wish.enable, not any(wish.v_goal), wish.alive, wish.stop, error])
+        inputs = GateInputs(wanted, counts, nodes.frames, nodes.beat, nodes.nmt, *flags)
+        self.gate, frame = gate(self.machine, self.gate, inputs, now)
+        return frame.tobytes()
 
-    def _gate(self, wanted: Array, now: float) -> bytes:
-        """Pass the gate; forget what this tick heard and remember what it sent."""
-        self.gate, frame = gate(self.machine, self.gate, self._inputs(wanted), now)
+    def _remember(self, problem: str) -> None:
+        """What was sent and what is wrong; forget what this tick heard."""
         if self.history is not None:
             self.history = push_command(self.history, self.gate.sent[..., -1] / PWM_MAX)
         stopped, wrong = (fault_name(self.machine, int(f)) for f in (self.gate.fault, self.gate.wrong))
         self.reason = f"fault: {stopped}" if stopped else wrong
-        self.remark = "" if self.gate.driving else self.problem or self.remark
+        self.remark = "" if self.gate.driving else problem or self.remark
         self.reason += f" ({self.remark})" if self.remark else ""
-        self.nodes.frames[:], self.problem = 0, ""
-        return frame.tobytes()
+        self.nodes.frames[:] = 0
 
     def _speak(self, frame: bytes) -> None:
         """Send the valve frame, once the gate was armed."""
@@ -387,8 +377,8 @@ class Drive:
 class Tape:
     """A recorded log in place of a `Line`: gives back what was read and compares what is sent."""
 
-    def __init__(self, frames: Sequence[Frame]) -> None:
-        self.frames, self.at, self.sent, self.wrong = frames, 0, list[Frame](), ""
+    def __init__(self, frames: Sequence[bus.Frame]) -> None:
+        self.frames, self.at, self.sent, self.wrong = frames, 0, list[bus.Frame](), ""
 
     @property
     def more(self) -> bool:
@@ -405,7 +395,7 @@ class Tape:
     def flush(self) -> None:
         """Nor does it write."""
 
-    def recv(self, timeout: float) -> Frame | None:
+    def recv(self, timeout: float, awake: float = 0.0) -> bus.Frame | None:
         """The next frame that was read before anything was sent."""
         if not self.more or self.frames[self.at].sent:
             return None
@@ -414,19 +404,19 @@ class Tape:
 
     def send(self, can_id: int, data: bytes) -> None:
         """Keep what is sent, and step over what was sent then."""
-        self.sent.append(Frame(self.now(), can_id, data, True))
+        self.sent.append(bus.Frame(self.now(), can_id, data, True))
         self._step(can_id)
 
     def note(self, data: bytes) -> float:
         """The time of the wish."""
         now = self.now()
-        self._step(WISH)
+        self._step(bus.WISH)
         return now
 
     def wish(self, driving: bool, ready: bool) -> Wish:
         """What the operator wished then."""
         ahead = (self.frames[i] for i in range(self.at, len(self.frames)))
-        return next((unpack_wish(frame.data) for frame in ahead if frame.id == WISH), Wish(stop=True))
+        return next((unpack_wish(frame.data) for frame in ahead if frame.id == bus.WISH), Wish(stop=True))
 
     def _step(self, can_id: int) -> None:
         if self.more and (not (at := self.frames[self.at]).sent or at.id != can_id):
@@ -435,7 +425,7 @@ class Tape:
         self.at += 1
 
 
-def replay(machine: Machine, controller: Controller, frames: Sequence[Frame]) -> list[Frame]:
+def replay(machine: Machine, controller: Controller, frames: Sequence[bus.Frame]) -> list[bus.Frame]:
     """Run the loop on a recorded log of it; what it sends now, to be compared with what it sent then.
 
     Raises:
@@ -448,10 +438,10 @@ def replay(machine: Machine, controller: Controller, frames: Sequence[Frame]) ->
         drive.tick()
     if tape.wrong:
         raise ValueError(tape.wrong)
-    return tape.sent[: sum(f.sent and f.channel != OPERATOR for f in frames)]
+    return tape.sent[: sum(f.sent and f.channel != bus.OPERATOR for f in frames)]
 
 
-def compare(machine: Machine, frames: Sequence[Frame], sent: Sequence[Frame]) -> tuple[int, int]:
+def compare(machine: Machine, frames: Sequence[bus.Frame], sent: Sequence[bus.Frame]) -> tuple[int, int]:
     """How many valve frames of `sent` are those of the log, byte by byte, and how many the log has."""
     old, new = (
         [f.data for f in side if f.sent and f.id == machine.valve_frame_id] for side in (frames, sent)
@@ -459,15 +449,15 @@ def compare(machine: Machine, frames: Sequence[Frame], sent: Sequence[Frame]) ->
     return sum(a == b for a, b in zip(old, new)), max(len(old), len(new))
 
 
-def driven_log(machine: Machine, frames: Iterable[Frame]) -> Log:
+def driven_log(machine: Machine, frames: Iterable[bus.Frame]) -> Log:
     """What encoders said and valves got while driving, as recordings for `fit`; a gap starts a new one.
 
     Raises:
         ValueError: nothing was driven for long enough.
     """
-    nodes, parts, start, last = Nodes(machine), list[list[Any]](), 0.0, -np.inf
+    nodes, parts, start, last = bus.Nodes(machine), list[list[Any]](), 0.0, -np.inf
     for frame in frames:
-        if frame.id == SYNC:
+        if frame.id == bus.SYNC:
             nodes.frames[:], start = 0, frame.time
         elif frame.id == machine.valve_frame_id and len(frame.data) == 8:
             if frame.data[7] == 1 and (nodes.frames == 1).all():

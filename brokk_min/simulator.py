@@ -17,22 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from brokk_min import bus
 from brokk_min.actuator import plant_reset, plant_step
-from brokk_min.bus import (
-    BEAT,
-    BEAT_OBJECT,
-    HEARTBEAT,
-    NMT,
-    RESOLUTION_OBJECT,
-    SDO_ANSWER,
-    SDO_REQUEST,
-    SYNC,
-    SYNC_OBJECT,
-    TPDO1,
-    Frame,
-    open_line,
-    stop_signals,
-)
 from brokk_min.gate import OPERATIONAL, checksum, encoder_raw
 from brokk_min.machine import Machine, decode_pwm
 
@@ -70,13 +56,13 @@ class SimulatedMachine:
         self.nmt = dict.fromkeys([*self.encoders, machine.controller_node], PRE_OPERATIONAL)
         self.valid, self.counter = now, -1
         self.enabled = False  # by a neutral frame with the enable byte set, until the byte is cleared
-        known = {BEAT_OBJECT: round(1e3 * BEAT), SYNC_OBJECT: 1, RESOLUTION_OBJECT: 2**machine.encoder_bits}
-        known |= {(0x1000, 0): 406}
+        known = {bus.BEAT_OBJECT: round(1e3 * bus.BEAT), bus.SYNC_OBJECT: 1, (0x1000, 0): 406}
+        known |= {bus.RESOLUTION_OBJECT: 2**machine.encoder_bits}
         self.objects = {(node, *where): value for node in self.encoders for where, value in known.items()}
 
     def boot(self) -> list[tuple[int, bytes]]:
         """What the nodes say when switched on."""
-        return [(HEARTBEAT + node, bytes([BOOT])) for node in self.nmt]
+        return [(bus.HEARTBEAT + node, bytes([BOOT])) for node in self.nmt]
 
     def wait(self, now: float) -> float:
         """Seconds until something happens by itself."""
@@ -91,24 +77,24 @@ class SimulatedMachine:
             self.plant = plant_step(self.fine, self.plant, self.u)
             self.steps += 1
             self.record(then, self.u, self.plant.q, self.valid)
-            if then >= self.start + (self.beats + 1) * BEAT:
+            if then >= self.start + (self.beats + 1) * bus.BEAT:
                 self.beats += 1
-                out += [(HEARTBEAT + node, bytes([state])) for node, state in self.nmt.items()]
+                out += [(bus.HEARTBEAT + node, bytes([state])) for node, state in self.nmt.items()]
         return out
 
-    def receive(self, frame: Frame) -> list[tuple[int, bytes]]:
+    def receive(self, frame: bus.Frame) -> list[tuple[int, bytes]]:
         """Take in one frame; frames to answer with."""
-        node = frame.id - SDO_REQUEST
-        if frame.id == NMT and len(frame.data) == 2:
+        node = frame.id - bus.SDO_REQUEST
+        if frame.id == bus.NMT and len(frame.data) == 2:
             return self._on_nmt(*frame.data)
-        if frame.id == SYNC:
+        if frame.id == bus.SYNC:
             raw = encoder_raw(self.machine, np.rint(self.plant.q / self.machine.encoder_step).astype(int))
             pairs = zip(self.encoders, raw.tolist(), strict=True)
-            return [(TPDO1 + e, struct.pack("<I", r)) for e, r in pairs if self.nmt[e] == OPERATIONAL]
+            return [(bus.TPDO1 + e, struct.pack("<I", r)) for e, r in pairs if self.nmt[e] == OPERATIONAL]
         if frame.id == self.machine.valve_frame_id:
             self._on_valve_frame(frame)
         elif node in self.encoders and len(frame.data) == 8:
-            return [(SDO_ANSWER + node, self._on_sdo(node, frame.data))]
+            return [(bus.SDO_ANSWER + node, self._on_sdo(node, frame.data))]
         return []
 
     def _on_nmt(self, command: int, node: int) -> list[tuple[int, bytes]]:
@@ -118,9 +104,9 @@ class SimulatedMachine:
             self.nmt[n] = states[command]
         if self.nmt[self.machine.controller_node] != OPERATIONAL or not self.enabled:
             self._neutral()
-        return [(HEARTBEAT + n, bytes([BOOT])) for n in touched if command > 128]
+        return [(bus.HEARTBEAT + n, bytes([BOOT])) for n in touched if command > 128]
 
-    def _on_valve_frame(self, frame: Frame) -> None:
+    def _on_valve_frame(self, frame: bus.Frame) -> None:
         data = np.frombuffer(frame.data, np.uint8)
         if len(data) != 8 or checksum(np.delete(data, 6)) != data[6]:
             self._trip()
@@ -148,7 +134,7 @@ class SimulatedMachine:
             return struct.pack("<BHBI", 0x80, index, sub, 0x06020000)  # no such object
         if command == 0x40:
             return struct.pack("<BHBI", 0x43, index, sub, self.objects[node, index, sub])
-        if command & 0xE3 == 0x23 and (index, sub) in (BEAT_OBJECT, SYNC_OBJECT):
+        if command & 0xE3 == 0x23 and (index, sub) in (bus.BEAT_OBJECT, bus.SYNC_OBJECT):
             self.objects[node, index, sub] = value
             return struct.pack("<BHBI", 0x60, index, sub, 0)
         return struct.pack("<BHBI", 0x80, index, sub, 0x06010000)  # no such access
@@ -179,9 +165,9 @@ def simulate(
         raise ValueError(f"start: expected {machine.n} angles within the joints' ranges, got {q.tolist()}")
     gc.freeze()  # no long collection while the encoders should answer
     with ExitStack() as stack:
-        line = stack.enter_context(open_line(interface, channel))
+        line = stack.enter_context(bus.open_line(interface, channel))
         file = stack.enter_context(open(record or os.devnull, "w", buffering=1))
-        ended = stack.enter_context(stop_signals())
+        ended = stack.enter_context(bus.stop_signals())
         start = line.now()
         names = [f"{kind}_{name}" for kind in "uq" for name in machine.names]
         print("run", "time", *names, "valid", sep=",", file=file)

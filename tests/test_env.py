@@ -28,7 +28,7 @@ from brokk_min import kinematics
 from brokk_min.actuator import plant_reset, plant_step, save_net
 from brokk_min.env import TaskConfig, TaskEnv, TaskVectorEnv
 from brokk_min.jacobian import GAINS, JacobianController, join_gains
-from brokk_min.kinematics import joint_rates, tool_position
+from brokk_min.kinematics import joint_rates, tool_position, tool_velocity
 from brokk_min.machine import BROKK_170, estimate_velocity, read_encoder
 
 POSE = np.array([1.5, 0.5, 0.58, 1.71, 1.24])  # the paper's q_s
@@ -253,6 +253,22 @@ def test_measured_undoes_observe(machine):
     alone = task.measured(machine, task.observe(machine, history[1, 2], v_goal[1, 2], lag[1, 2]))
     for whole, single in zip(back, alone, strict=True):
         np.testing.assert_allclose(whole[1, 2], single, atol=1e-5)
+
+
+@pytest.mark.parametrize("machine", [BROKK_170, *MACHINES], ids=lambda m: m.name)
+def test_an_arm_that_is_known_changes_no_bit(machine):
+    """What the hardware path passes on from one function to the next to save time, noise or not."""
+    rng = np.random.default_rng(21)
+    for shape in ((1,), (50,)):
+        history, v_goal, lag = (a.astype(np.float32) for a in random_sight(machine, rng, shape))
+        q = history[..., 0, 0]
+        history, after, arm = task.push_measured(machine, history, q, v_goal, lag)
+        assert np.abs(arm.v_tool - tool_velocity(machine, q, history[..., 1, -1])).max() == 0
+        np.testing.assert_array_equal(after, task.push_lag(machine, history, v_goal, lag))
+        clean = task.observe(machine, history, v_goal, after)
+        for noise in (0.0, 0.01, rng.uniform(-0.5, 0.5, clean.shape).astype(np.float32)):
+            seen = [task.observe(machine, history, v_goal, after, noise, known) for known in (None, arm)]
+            np.testing.assert_array_equal(*seen)
 
 
 @pytest.mark.parametrize("machine", [BROKK_170, *MACHINES], ids=lambda m: m.name)

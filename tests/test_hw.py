@@ -28,6 +28,7 @@ from brokk_min.jacobian import JacobianController, join_gains, manipulability_th
 from brokk_min.kinematics import joint_rates, tool_state
 from brokk_min.logs import read_log, write_log
 from brokk_min.machine import BROKK_170
+from brokk_min.policy import PolicyController, load_policy
 
 PUSH = (60, 0, 60, 60, 60)
 BASELINE = JacobianController(
@@ -53,11 +54,16 @@ def test_importing_opens_nothing_and_needs_no_extras() -> None:
 # --- the loop on the plant ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("sequence", axis_sequences(BROKK_170), ids=lambda s: s.name)
-def test_reward_over_the_bus_is_that_of_evaluate(sequence: Any) -> None:
+SHIPPED = Path(hw.__file__).with_name("shipped") / BROKK_170.name / "policy.npz"
+
+
+@pytest.mark.parametrize(("axis", "controller"), [(0, "rl"), (1, "rl"), (2, "rl"), (2, "jacobian")])
+def test_reward_over_the_bus_is_that_of_evaluate(axis: int, controller: str) -> None:
     """Within 1 %, with 2 ms of bus and machine between SYNC and valve frame."""
+    sequence = axis_sequences(BROKK_170)[axis]
+    driver = PolicyController(BROKK_170, load_policy(SHIPPED, BROKK_170)) if controller == "rl" else BASELINE
     script = hw.Script(BROKK_170, sequence.goals)
-    world = World(BASELINE, script)
+    world = World(driver, script)
     world.drive.operator = lambda driving, ready: (world.rest(0.002), script(driving, ready))[1]
     world.drive.begin()
     while world.drive.tick():
@@ -71,7 +77,7 @@ def test_reward_over_the_bus_is_that_of_evaluate(sequence: Any) -> None:
     v = tool_state(BROKK_170, q[1:], np.diff(q, axis=0) * 20)[1]
     over_bus = reward(sequence.goals, v).mean()
     trace = rollout(
-        BROKK_170, BASELINE, np.array([START]), sequence.goals[:, None], TaskConfig(noise=0.0),
+        BROKK_170, driver, np.array([START]), sequence.goals[:, None], TaskConfig(noise=0.0),
         np.random.default_rng(0),
     )  # fmt: skip
     assert over_bus == pytest.approx(trace.reward.mean(), rel=0.01)
@@ -324,6 +330,10 @@ FAULTS: dict[str, tuple[Callable[[Fault], object], str]] = {
         "tick late, or the clock was set",
     ),
     "clock stepped back": (lambda f: setattr(f.world, "offset", -3600.0), "tick late, or the clock was set"),
+    "log cannot be written": (
+        lambda f: setattr(f.world.line, "flush", raises(OSError("no space"))),
+        "error (OSError: no space)",
+    ),
     "late tick": (lambda f: stall(f, 0.08), "tick late"),
     "hang": (lambda f: stall(f, 0.8), "tick late"),
     "policy returns NaN": (lambda f: f.push.m.__setitem__(2, np.nan), "q3: no valid command"),
@@ -600,9 +610,10 @@ def test_ticks_keep_an_absolute_grid_and_missed_ones_are_skipped_never_made_up()
     world.step = 0.0007  # does not divide a tick
     world.drive.begin()
     begun = world.t
-    stalls = {40: 0.13, 80: 0.049, 90: 0.26}
+    stalls = {40: 0.13, 80: 0.052, 90: 0.26}
     for k in range(120):
-        world.drive.controller.act = lambda k=k: world.rest(stalls.pop(k, 0.004))  # type: ignore
+        busy = stalls.get(k, 0.004)
+        world.downward = lambda i, data, busy=busy: (world.rest(busy * (i == 0x210)), [(i, data)])[1]  # type: ignore
         world.drive.tick()
     ticks = (np.array(world.syncs) - begun) / 0.05
     late = np.flatnonzero(ticks - np.floor(ticks + 0.03) > 0.03)
@@ -646,6 +657,64 @@ def test_a_wait_does_not_follow_the_time_of_day(monkeypatch: pytest.MonkeyPatch)
     begun = time.monotonic()
     assert line.recv(0.02) is None
     assert 0.015 < time.monotonic() - begun < 5.0
+
+
+class SelectBus:
+    """A bus that is silent; a wait on it takes as long as the wait says, or a millisecond."""
+
+    def __init__(self) -> None:
+        self.t, self.waits = 0.0, list[float]()
+
+    def fileno(self) -> int:
+        return 7
+
+    def recv(self, timeout: float) -> None:
+        assert timeout == 0.0
+
+    def select(self, read: list[int], *rest: Any) -> tuple[list[int], list[int], list[int]]:
+        assert read == [7]
+        self.waits.append(rest[-1])
+        self.t += rest[-1] or 0.001
+        return [], [], []
+
+
+@pytest.mark.parametrize(("awake", "slept"), [(0.0, [0.019]), (0.004, [0.016]), (0.020, [])])
+def test_a_wait_sleeps_only_after_the_time_it_is_told_to_be_awake(
+    awake: float, slept: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    silent = SelectBus()
+    line = bus.Line(silent, clock=lambda: silent.t)
+    monkeypatch.setattr("brokk_min.bus.select.select", silent.select)
+    assert line.recv(0.020, awake) is None
+    assert [wait for wait in silent.waits if wait] == pytest.approx(slept)
+    assert 0.020 <= silent.t < 0.0225
+
+
+def test_a_rehearsal_comes_before_sync_and_leaves_no_trace() -> None:
+    push = Push(*PUSH)
+    world = World(push, Hand())
+    calls, told = list[float](), list[float]()
+    push.act = lambda: calls.append(world.t)
+    world.downward = lambda i, data: (told.append(world.t) if i == 0x80 else None, [(i, data)])[1]
+    world.drive.begin()
+    world.run(1.0)
+    before = dict(vars(world.drive))
+    nodes = [np.copy(a) for a in (world.drive.nodes.frames, world.drive.nodes.raw, world.drive.nodes.beat)]
+    calls.clear()
+    world.drive._rehearse(world.line.now() + 0.001)
+    assert len(calls) == hw.REHEARSALS
+    assert vars(world.drive) == before and all(vars(world.drive)[k] is before[k] for k in before)
+    for kept, now in zip(nodes, (world.drive.nodes.frames, world.drive.nodes.raw, world.drive.nodes.beat)):
+        np.testing.assert_array_equal(kept, now)
+    calls.clear()
+    world.drive.tick()
+    assert calls[0] < told[-1] <= calls[-1] and len(calls) == hw.REHEARSALS + 1
+    push.act = lambda: world.rest(0.010)  # a slow controller; no time for more than one rehearsal
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(hw, "REHEARSALS", 4)
+        world.run(1.0)
+    assert world.drive.gate.driving and world.drive.skipped == 0
+    world.close()
 
 
 # --- start --------------------------------------------------------------------------------------------
@@ -720,6 +789,7 @@ def test_a_line_tells_our_frames_from_others_and_logs_all() -> None:
     assert [f and f.id for f in frames] == [-1, 0x123, -1, -1, -1, -1]
     assert line.recv(0.0) is None
     line.note(b"\x09")
+    assert not text.getvalue()  # writing waits until there is time
     line.flush()
     lines = text.getvalue().splitlines()
     assert len(lines) == 7  # all but the echo
