@@ -13,7 +13,7 @@ import pytest
 
 from benchmarks.rollout import random_net
 from brokk_min import experiments, jacobian
-from brokk_min.actuator import ActuatorNet, speed_limits
+from brokk_min.actuator import ActuatorNet, plant_reset, plant_step, speed_limits
 from brokk_min.env import Measured, TaskConfig, measured, rollout, to_command
 from brokk_min.kinematics import joint_rates, tool_position
 from brokk_min.machine import BROKK_170, Machine, read_encoder
@@ -110,11 +110,11 @@ def test_sensors_of_the_robustness_table() -> None:
 
 def test_variations_change_the_machine_and_not_what_its_controllers_know() -> None:
     found = experiments.variations(BROKK_170)
-    assert len(found) == 11 and found["nominal"][0] is BROKK_170
+    assert len(found) == 12 and found["nominal"][0] is BROKK_170
     changed = [
         name for name, (plant, sensor) in found.items() if plant != BROKK_170 or sensor != experiments.exact
     ]
-    assert len(changed) == 10
+    assert len(changed) == 11
     tilted = found["up -15 %, down +15 %"][0]
     np.testing.assert_allclose(tilted.column("speed_positive"), 0.85 * BROKK_170.column("speed_positive"))
     np.testing.assert_allclose(tilted.column("speed_negative"), 1.15 * BROKK_170.column("speed_negative"))
@@ -126,6 +126,26 @@ def test_variations_change_the_machine_and_not_what_its_controllers_know() -> No
         errors["delay +50 ms"], errors["dead zone 10 %"], errors["valve gain -20 %"]
     )
     assert errors["delay +25 ms"] < errors["delay +50 ms"]
+    supply = {name: row["mine"]["supply_demand"] for name, row in table.items()}
+    assert supply["supply flow -20 %"] == pytest.approx(supply["nominal"] / 0.8, rel=0.05)
+    assert errors["supply flow -20 %"] == errors["nominal"] and supply["supply flow -20 %"] < 1
+    assert table["supply flow -20 %"]["mine"]["supply_limits"] == 0
+    assert supply["supply flow -70 %"] > 1 and table["supply flow -70 %"]["mine"]["supply_limits"] > 0
+    assert errors["supply flow -70 %"] > errors["nominal"]
+
+
+def test_what_valves_ask_of_the_pump_is_what_the_plant_divides_among_them() -> None:
+    """Commands held until the spools stand: cylinders reach their full speed where the share is below one."""
+    q = np.tile([0.0, 0.7, 0.6, 1.7, 1.0], (2, 1))
+    u = np.array([[0.6, 0.6, -0.6, 0.6, -0.6], [1.0, -1.0, 1.0, -1.0, 1.0]])
+    state = plant_reset(BROKK_170, q)
+    for _ in range(12):
+        state = plant_step(BROKK_170, state, u)
+    fastest = np.where(u > 0, BROKK_170.column("speed_positive"), BROKK_170.column("speed_negative"))
+    opening = np.sign(u) * (np.abs(u) - 0.07) / 0.93
+    share = experiments.supply_demand(BROKK_170, u)
+    assert share[0] < 1 < share[1]
+    np.testing.assert_allclose(state.speed, fastest * opening / np.maximum(1, share)[:, None], rtol=1e-3)
 
 
 def net_of_driven_joints() -> ActuatorNet:
@@ -185,7 +205,7 @@ def test_results_hold_every_run_with_its_figures(twice: tuple[Path, Path]) -> No
 
 def test_results_answer_the_papers_question(twice: tuple[Path, Path]) -> None:
     results = json.loads((twice[0] / "results.json").read_text())
-    assert len(results["claims"]) == 7
+    assert len(results["claims"]) == 9
     for claim in results["claims"]:
         assert set(claim) == {"paper", "measured", "numbers", "holds"} and claim["holds"] in (
             True,
@@ -216,6 +236,7 @@ def test_results_tell_how_the_baselines_were_tuned(twice: tuple[Path, Path]) -> 
     for name, how in results["tuning"].items():
         assert how["seed"] == 3 and len(how["cost"]) == TINY.generations
         assert 0 < how["cost"][-1] <= how["cost"][0] < 0.3
+        assert how["cost_anew"] == pytest.approx(how["cost"][-1], rel=0.2) != how["cost"][-1]
         spans = jacobian.GAINS.items()
         ends = [k for k, (low, high) in spans for g in results["gains"][name][k] if g in (low, high)]
         assert len([g for g in how["at_bound"] if g.split()[0] in ends]) >= len(ends)
