@@ -228,7 +228,10 @@ def variations(machine: Machine) -> dict[str, tuple[Machine, Sensor]]:
 
 
 def supply_demand(machine: Machine, u: Array) -> Array:
-    """Flow that commands (..., n) ask of the pump once the spools follow, as a share of its flow, (...)."""
+    """Flow that commands (..., n) ask of the pump once spools follow, as a share of its own, (...).
+
+    Paper: Sec. 4.2
+    """
     opening = jacobian.valve_opening(machine, u)
     fastest = (machine.column(name) for name in ("speed_positive", "speed_negative"))
     flow = np.abs(machine.column("cylinder_area") * np.where(opening > 0, *fastest) * opening)

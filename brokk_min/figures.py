@@ -115,10 +115,11 @@ def plot_joint_rates(machine: Machine, traces: Traces, sequence: Commands, run: 
 
 
 def plot_free_run(net: actuator.ActuatorNet, log: logs.Log, seconds: float = 30.0) -> Any:
-    """Recorded and free-running angle and velocity of every joint in one unseen recording."""
+    """Recorded and free-running angle and velocity of the joints that move in one unseen recording."""
     recording = log.recordings[0]
     of_joints = [_over_time(1 / net.rate, *row) for row in _free_run(net, recording, seconds)]
-    return plot_panels(list(zip(*of_joints, strict=True)))
+    rows = zip(recording.u.any(axis=0), *of_joints, strict=True)
+    return plot_panels([panels for moves, *panels in rows if moves])
 
 
 def _free_run(net: actuator.ActuatorNet, recording: logs.Recording, seconds: float) -> Any:

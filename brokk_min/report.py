@@ -39,8 +39,8 @@ def found(results: Mapping[str, Any]) -> Part:
     bound = results["regret"]["summary"]["perfect_model"]["all"][error]
     text = f"Mean velocity error of the tool over all sequences [m/s]: {said}. A controller that has the "
     text += f"plant's equations and state is left with {bound:.4f} (along x, y and z alone)."
-    rows = {claim["paper"]: {"": VERDICTS[claim["holds"]]} for claim in results["claims"]}
-    return "What was found", text, {"The paper says": {"": "This"}} | rows
+    rows = {claim["paper"]: {"what the paper says": VERDICTS[claim["holds"]]} for claim in results["claims"]}
+    return "What was found", text, rows
 
 
 def net_parts(
@@ -140,17 +140,11 @@ def _with_interval(number: Mapping[str, float | None]) -> str:
 
 
 def _bars(task: Mapping[str, Any], key: str) -> figures.Bars:
-    return {
-        c: {
-            s: {
-                "mean": row[key],
-                "low": task["intervals"][c][s][key][0],
-                "high": task["intervals"][c][s][key][1],
-            }
-            for s, row in rows.items()
-        }
-        for c, rows in task["summary"].items()
-    }
+    def number(c: str, s: str) -> dict[str, float | None]:
+        low, high = task["intervals"][c][s][key]
+        return {"mean": task["summary"][c][s][key], "low": low, "high": high}
+
+    return {c: {s: number(c, s) for s in rows} for c, rows in task["summary"].items()}
 
 
 def _tables(results: Mapping[str, Any], last: str) -> list[Part]:
@@ -172,10 +166,7 @@ def _tables(results: Mapping[str, Any], last: str) -> list[Part]:
     for variation, of in results["robustness"].items():
         robust[variation] = {c: _with_interval(n) for c, n in of.items()}
         most, share = (max(n[key] for n in of.values()) for key in ("supply_demand", "supply_limits"))
-        robust[variation] |= {
-            "most of the pump's flow": f"{most:.0%}",
-            "limited by it": f"{share:.1%} of ticks",
-        }
+        robust[variation] |= {"pump's flow asked for": f"{most:.0%}", "ticks it limits": f"{share:.1%}"}
     ends = "95 % intervals over starts in brackets"
     return [
         ("Figures of merit", "Means over all sequences.", everything, last),
@@ -214,8 +205,9 @@ def _seeds(table: Mapping[str, Mapping[str, Any]]) -> list[Part]:
     if not table:
         return []
     cells = {k: {c: _with_interval(of[k]) for c, of in table.items()} for k in table["rl"]}
-    bars = {c: {k: n for k, n in of.items() if "error" in k} for c, of in table.items() if "less" not in c}
-    bars = {c: {k.removeprefix("velocity_error_"): n for k, n in of.items()} for c, of in bars.items()}
+    errors = [k for k in table["rl"] if k.startswith("velocity_error_")]
+    alone = {c: of for c, of in table.items() if "less" not in c}
+    bars = {c: {k.split("_", 2)[2]: of[k] for k in errors} for c, of in alone.items()}
     text = (
         "Means over training seeds on the machine, and 95 % intervals over them (Student's t; a seed counts "
         "once, with the mean over its workspace starts) [m/s, m, full strokes]. Baselines are not trained."
@@ -231,16 +223,16 @@ def _lists(machine: Machine, results: Mapping[str, Any], tuning: tuple[Array, Ar
     sequences = {s.name: _path(machine, s.goals) for s in task_sequences(machine)}
     runs = enumerate(zip(tuning[0], tuning[1].swapaxes(0, 1), strict=True))
     tuned = {f"tuning run {i}": _pose(machine, pose) | _path(machine, goals) for i, (pose, goals) in runs}
-    how = {}
-    for name, t in results["tuning"].items():
-        bounds = ", ".join(t["at_bound"]) or "none"
-        how[name] = {
+    how = {
+        name: {
             "seed": t["seed"],
             "first": t["cost"][0],
             "last": t["cost"][-1],
             "under other noise": t["cost_anew"],
-            "gains at a bound": bounds,
+            "gains at a bound": ", ".join(t["at_bound"]) or "none",
         }
+        for name, t in results["tuning"].items()
+    }
     return [
         ("Scored sequences", "Seconds, changes of goal, largest speed [m/s], path [m].", sequences),
         ("Scored starts", "Angles [rad].", scored),

@@ -54,7 +54,9 @@ def least_motion(machine: Machine, starts: Array) -> list[Commands]:
 
     At a half and a quarter of its speed (assumed): at the whole, it is the joints' own speed that limits
     the tool near a singularity, and not damping. The direction is the left singular vector of the
-    Jacobian's least singular value, its largest component positive. Paper: Fig. 6e, f
+    Jacobian's least singular value, its largest component positive.
+
+    Paper: Fig. 6e, Fig. 6f
     """
     direction = np.linalg.svd(kinematics.jacobian(machine, starts))[0][..., -1]
     largest = np.abs(direction).argmax(axis=-1)[:, None]

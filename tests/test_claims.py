@@ -66,9 +66,7 @@ def test_tracking(x: float, z: float, drift: float, holds: list[bool]) -> None:
         runs += [a | b | {"sequence": sequence} for a, b in zip(errors, drifts, strict=True)]
     found = claims.tracking_claims(runs, PAPERS)
     assert [claim["holds"] for claim in found] == holds
-    assert found[1]["numbers"]["z, off_axis_drift_max, rl less jacobian_pid_k0.1"]["mean"] == pytest.approx(
-        drift - 0.2
-    )
+    assert found[1]["numbers"]["drift z, less jacobian_pid_k0.1"]["mean"] == pytest.approx(drift - 0.2)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -108,7 +108,9 @@ def test_sensors_of_the_robustness_table() -> None:
     np.testing.assert_array_equal(seen[0], plain[0])
 
 
-def test_variations_change_the_machine_and_not_what_its_controllers_know() -> None:
+def test_variations_change_the_machine_and_not_what_its_controllers_know(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     found = experiments.variations(BROKK_170)
     assert len(found) == 12 and found["nominal"][0] is BROKK_170
     changed = [
@@ -130,22 +132,25 @@ def test_variations_change_the_machine_and_not_what_its_controllers_know() -> No
     assert supply["supply flow -20 %"] == pytest.approx(supply["nominal"] / 0.8, rel=0.05)
     assert errors["supply flow -20 %"] == errors["nominal"] and supply["supply flow -20 %"] < 1
     assert table["supply flow -20 %"]["mine"]["supply_limits"] == 0
-    assert supply["supply flow -70 %"] > 1 and table["supply flow -70 %"]["mine"]["supply_limits"] > 0
-    assert errors["supply flow -70 %"] > errors["nominal"]
+    weak = replace(BROKK_170, pump_flow=0.2 * BROKK_170.pump_flow)
+    monkeypatch.setattr(experiments, "variations", lambda m: {"weak": (weak, experiments.exact)})
+    row = experiments.robustness(BROKK_170, {"mine": FeedForward(BROKK_170)}, short, start, 0)["weak"]["mine"]
+    assert row["supply_demand"] > 1 and 0 < row["supply_limits"] < 1 and row["mean"] > errors["nominal"]
 
 
 def test_what_valves_ask_of_the_pump_is_what_the_plant_divides_among_them() -> None:
     """Commands held until the spools stand: cylinders reach their full speed where the share is below one."""
     q = np.tile([0.0, 0.7, 0.6, 1.7, 1.0], (2, 1))
-    u = np.array([[0.6, 0.6, -0.6, 0.6, -0.6], [1.0, -1.0, 1.0, -1.0, 1.0]])
+    u = np.array([[0.4, 0.4, -0.4, 0.4, -0.4], [1.0, -1.0, 1.0, -1.0, 1.0]])
     state = plant_reset(BROKK_170, q)
-    for _ in range(12):
+    state = state._replace(ready=np.ones_like(q))
+    for _ in range(8):
         state = plant_step(BROKK_170, state, u)
     fastest = np.where(u > 0, BROKK_170.column("speed_positive"), BROKK_170.column("speed_negative"))
     opening = np.sign(u) * (np.abs(u) - 0.07) / 0.93
     share = experiments.supply_demand(BROKK_170, u)
     assert share[0] < 1 < share[1]
-    np.testing.assert_allclose(state.speed, fastest * opening / np.maximum(1, share)[:, None], rtol=1e-3)
+    np.testing.assert_allclose(state.speed, fastest * opening / np.maximum(1, share)[:, None], rtol=0.01)
 
 
 def net_of_driven_joints() -> ActuatorNet:
