@@ -118,8 +118,8 @@ def plot_free_run(net: actuator.ActuatorNet, log: logs.Log, seconds: float = 30.
     """Recorded and free-running angle and velocity of the joints that move in one unseen recording."""
     recording = log.recordings[0]
     of_joints = [_over_time(1 / net.rate, *row) for row in _free_run(net, recording, seconds)]
-    rows = zip(recording.u.any(axis=0), *of_joints, strict=True)
-    return plot_panels([panels for moves, *panels in rows if moves])
+    rows = zip(recording.u.T, *of_joints, strict=True)
+    return plot_panels([panels for u, *panels in rows if u.any()])
 
 
 def _free_run(net: actuator.ActuatorNet, recording: logs.Recording, seconds: float) -> Any:
