@@ -10,9 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 
 from benchmarks.rollout import random_net
-from brokk_min import experiments, jacobian
+from brokk_min import experiments, figures, jacobian
 from brokk_min.actuator import ActuatorNet, plant_reset, plant_step, speed_limits
 from brokk_min.env import Measured, TaskConfig, measured, rollout, to_command
 from brokk_min.kinematics import joint_rates, tool_position
@@ -151,6 +152,14 @@ def test_what_valves_ask_of_the_pump_is_what_the_plant_divides_among_them() -> N
     share = experiments.supply_demand(BROKK_170, u)
     assert share[0] < 1 < share[1]
     np.testing.assert_allclose(state.speed, fastest * opening / np.maximum(1, share)[:, None], rtol=0.01)
+
+
+def test_curves_of_one_plot_differ_on_grey_paper() -> None:
+    controllers = ("rl", "jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff", "perfect_model")
+    for group in (controllers, ("workspace", "limits", "extended")):
+        colours = np.array([to_rgb(figures.STYLES[name]["color"]) for name in group])
+        grey = np.sort(colours @ [0.299, 0.587, 0.114])
+        assert (np.diff(grey) > 0.1).all() and grey[-1] < 0.8, group
 
 
 def net_of_driven_joints() -> ActuatorNet:
