@@ -259,7 +259,8 @@ def test_results_tell_how_the_baselines_were_tuned(twice: tuple[Path, Path]) -> 
 def test_the_report_is_one_file_with_its_figures(twice: tuple[Path, Path]) -> None:
     text = (twice[0] / "report.html").read_text()
     assert len(re.findall(r"src='data:image/png;base64,", text)) == 12
-    assert not re.findall(r"(?:src|href)='(?!data:)", text) and "http" not in text
+    words = re.sub(r"base64,[^']*", "", text)  # four letters of a picture may spell anything
+    assert not re.findall(r"(?:src|href)='(?!data:)", words) and "http" not in words
     assert "not a real Brokk 170" in text
     for claim in json.loads((twice[0] / "results.json").read_text())["claims"]:
         assert html.escape(claim["measured"]) in text
