@@ -227,7 +227,7 @@ def sweep_command() -> Any:
         actuator: Path  # Nets that `fit` wrote.
         out: Path  # Folder for a policy, a curve and figures of each seed, and sweep.json.
         seeds: int = 10  # How many, from --seed on.
-        poses: int = 16  # Start poses for each of the three scored sequences.
+        poses: int = 16  # Start poses for each scored sequence, half of them of the workspace.
         scheduler: str | None = None  # tcp://... of a dask scheduler (extra `sweep`); OUT must be shared.
         gains: Path | None = None  # Tuned gains that `reproduce` wrote: baselines beside.
         settings: tyro.conf.OmitArgPrefixes[PPOConfig] = field(default_factory=PPOConfig)
@@ -323,12 +323,13 @@ class Reproduce(Command):
 
     out: Path = Path("results")  # Folder for everything.
     quick: bool = False  # The same, smaller: to see that it runs, not to judge the policy.
+    sweep: Path | None = None  # sweep.json of a sweep on these nets: intervals over its seeds in the report.
 
     def run(self) -> None:
         """Run the chain and print the means."""
         check(self)
         effort = experiments.QUICK if self.quick else experiments.Effort()
-        results = experiments.reproduce(MACHINES[self.machine], self.out, effort, self.seed)
+        results = experiments.reproduce(MACHINES[self.machine], self.out, effort, self.seed, self.sweep)
         for name, rows in results["task_space"]["summary"].items():
             errors = ", ".join(f"{s} {row['velocity_error_mean']:.4f}" for s, row in rows.items())
             print(f"{name:20} mean velocity error [m/s]: {errors}")

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -24,10 +25,11 @@ from brokk_min.jacobian import JacobianController
 from brokk_min.machine import Machine, read_encoder
 from brokk_min.metrics import by_start, intervals, mean_interval, metrics, paired, row_mean, summary
 from brokk_min.mpc import PerfectModel
-from brokk_min.policy import PolicyController, save_policy
+from brokk_min.policy import Policy, PolicyController, save_policy
 from brokk_min.sequences import (
     Commands,
     axis_sequences,
+    least_motion,
     scored_starts,
     start_kinds,
     task_sequences,
@@ -77,7 +79,8 @@ def tuned_baselines(
     """The baselines, each tuned on the machine itself, and how their tuning went, for JSON.
 
     The cost is the figure that is scored, mean |v_goal - v_tool|, on `tuning_goals`. Tuning on the
-    machine favours the baselines: the policy never sees it.
+    machine favours the baselines: the policy never sees it. The least of many noisy costs flatters, so
+    "cost_anew" is the mean of 16 more of the gains that were found.
     """
     start, goals = tuning_goals(machine, effort.tuning_runs, 12.0, seed + 1000)
 
@@ -92,7 +95,9 @@ def tuned_baselines(
     tuned, how = {}, {}
     for name, controller in baselines(machine, net).items():
         tuned[name], costs = jacobian.tune(controller, cost, seed, effort.generations, name)
-        how[name] = {"seed": seed, "cost": costs, "at_bound": jacobian.gains_at_bound(tuned[name])}
+        anew = float(cost(replace(tuned[name], gains=np.tile(tuned[name].gains, (16, 1)))).mean())
+        at_bound = jacobian.gains_at_bound(tuned[name])
+        how[name] = {"seed": seed, "cost": costs, "cost_anew": anew, "at_bound": at_bound}
     return tuned, how
 
 
@@ -118,6 +123,17 @@ def read_gains(path: Path, machine: Machine, net: Net) -> dict[str, JacobianCont
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: expected gains for {machine.name}, got {error!r}") from error
     return result
+
+
+def read_seeds(path: Path) -> dict[str, dict[str, Any]]:
+    """The table of `sweep.table` in the `sweep.json` of a sweep; ValueError: there is none."""
+    try:
+        table: dict[str, dict[str, Any]] = json.loads(path.read_text())["table"]
+        if not {"mean", "low", "high"} <= set(table["rl"]["velocity_error_all"]):
+            raise ValueError(f"{table['rl']}")
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: expected the sweep.json of a sweep, got {error!r}") from error
+    return table
 
 
 # --- the comparison -----------------------------------------------------------------------------------
@@ -153,7 +169,7 @@ def task_space(
     lengths = dict.fromkeys(len(sequence.goals) for sequence in sequences)
     groups = [[s for s in sequences if len(s.goals) == length] for length in lengths]
     for name, group in tqdm(list(product(controllers, groups)), desc="evaluate", unit="batch", disable=None):
-        goals = np.repeat(np.stack([s.goals for s in group], axis=1), num, axis=1)
+        goals = np.concatenate([s.of_each(num) for s in group], axis=1)
         start, rng = np.tile(starts, (len(group), 1)), np.random.default_rng(seed)
         read = sensor(np.random.default_rng(seed + 1))
         trace = rollout(machine, controllers[name], start, goals, TaskConfig(), rng, net, read)
@@ -198,6 +214,7 @@ def variations(machine: Machine) -> dict[str, tuple[Machine, Sensor]]:
     return {
         "nominal": (machine, exact),
         "supply flow -20 %": (replace(machine, pump_flow=0.8 * machine.pump_flow), exact),
+        "supply flow -70 %": (replace(machine, pump_flow=0.3 * machine.pump_flow), exact),
         "valve gain -20 %": (valves(0.8, 0.8), exact),
         "valve gain +20 %": (valves(1.2, 1.2), exact),
         "up -15 %, down +15 %": (valves(0.85, 1.15), exact),
@@ -210,19 +227,39 @@ def variations(machine: Machine) -> dict[str, tuple[Machine, Sensor]]:
     }
 
 
+def supply_demand(machine: Machine, u: Array) -> Array:
+    """Flow that commands (..., n) ask of the pump once spools follow, as a share of its own, (...).
+
+    Paper: Sec. 4.2
+    """
+    opening = jacobian.valve_opening(machine, u)
+    fastest = (machine.column(name) for name in ("speed_positive", "speed_negative"))
+    flow = np.abs(machine.column("cylinder_area") * np.where(opening > 0, *fastest) * opening)
+    share: Array = flow.sum(axis=-1) / machine.pump_flow
+    return share
+
+
 def robustness(
     machine: Machine,
     controllers: Mapping[str, Controller],
     sequences: Sequence[Commands],
     starts: Array,
     seed: int,
-) -> dict[str, dict[str, dict[str, float | None]]]:
-    """Mean velocity error [m/s], 95 % interval over starts, by variation and controller. Paper: Sec. 4.2"""
-    result: dict[str, dict[str, dict[str, float | None]]] = {}
+) -> dict[str, dict[str, dict[str, Any]]]:
+    """Mean velocity error [m/s], 95 % interval over starts, by variation and controller. Paper: Sec. 4.2
+
+    And "supply_demand", the largest share of the pump's flow that was asked for, and "supply_limits", the
+    share of ticks at which it was more than all.
+    """
+    result: dict[str, dict[str, dict[str, Any]]] = {}
     for name, (plant, sensor) in variations(machine).items():
-        runs, _ = task_space(plant, controllers, sequences, starts, seed, sensor=sensor)
-        errors = {c: by_start(runs, c, "all", "velocity_error_mean") for c in controllers}
-        result[name] = {c: mean_interval(e) for c, e in errors.items()}
+        runs, traces = task_space(plant, controllers, sequences, starts, seed, sensor=sensor)
+        result[name] = {}
+        for c in controllers:
+            asked = np.array([supply_demand(plant, traces[c, s.name].u) for s in sequences])
+            errors = by_start(runs, c, "all", "velocity_error_mean")
+            result[name][c] = {**mean_interval(errors), "supply_demand": float(asked.max())}
+            result[name][c]["supply_limits"] = float((asked > 1).mean())
     return result
 
 
@@ -266,13 +303,13 @@ def comparison(
     short = shortened(machine, axis_sequences(machine), effort.short_s)
     reachable = starts[kinds == "workspace"]
     bounded, less, bound = regret(machine, controllers, short, reachable[: effort.bound_starts], seed)
-    singular, found = singular_case(machine, controllers, short, starts[kinds == "extended"], seed)
+    singular, found = singular_case(machine, controllers, starts[kinds == "extended"], effort.short_s, seed)
     verdicts = claims.drift_claims(scored, PAPERS)
     pid, along_x = controllers[PAPERS[0]], traces[PAPERS[0], "x"]
     if isinstance(pid, JacobianController):
         across = Trace(*(a[:, kinds == "workspace"] for a in along_x))
         verdicts.append(claims.direction_claim(machine, pid, across, sequences[0].goals))
-    verdicts += [*found["claims"], claims.conclusion(scored, PAPERS)]
+    verdicts += [*found["claims"], *claims.tracking_claims(scored, PAPERS)]
     keys = ("velocity_error_mean", "off_axis_drift_max")
     return {
         "task_space": {
@@ -292,26 +329,28 @@ def comparison(
 
 
 def singular_case(
-    machine: Machine,
-    controllers: Mapping[str, Controller],
-    short: Sequence[Commands],
-    starts: Array,
-    seed: int,
+    machine: Machine, controllers: Mapping[str, Controller], starts: Array, seconds: float, seed: int
 ) -> tuple[Traces, dict[str, Any]]:
-    """k = 0.1 against 0.05 with the same gains, and RL, from extended starts. Paper: Fig. 6a, 6e, 6f
+    """k = 0.1 against 0.05 with the same gains, and RL, along the `least_motion` of extended starts.
+
+    Paper: Fig. 6a, 6e, 6f
 
     Returns:
-        Traces; and "summary" and "claims", empty where there are no such starts.
+        Traces; and "summary", "claims", "w0" and of each start "manipulability" and "least" singular value
+        of the Jacobian [m/rad]; empty where there are no such starts.
     """
     if not len(starts):
         return {}, {"summary": {}, "claims": []}
     some = claims.singular_controllers(controllers)
-    runs, traces = task_space(machine, some, short, starts, seed)
-    w0, share = jacobian.manipulability_threshold(machine), {}
+    sequences = shortened(machine, least_motion(machine, starts), seconds)
+    runs, traces = task_space(machine, some, sequences, starts, seed)
+    w0, J, share = jacobian.manipulability_threshold(machine), kinematics.jacobian(machine, starts), {}
     for name in some:
-        shares = [claims.speed_share(machine, w0, traces[name, s.name], s.goals) for s in short]
-        share[name] = row_mean(np.array(shares).T)
-    return traces, {"summary": summary(runs), "claims": claims.singular_claims(runs, share)}
+        each = [(traces[name, s.name], s.of_each(len(starts))) for s in sequences]
+        share[name] = row_mean(np.array([claims.speed_share(machine, w0, *pair) for pair in each]).T)
+    least = np.linalg.svd(J, compute_uv=False)[:, -1].tolist()
+    near = {"w0": w0, "manipulability": jacobian.manipulability(J).tolist(), "least": least}
+    return traces, {"summary": summary(runs), "claims": claims.singular_claims(runs, share)} | near
 
 
 def driven_log(machine: Machine, traces: Traces, controller: str, runs: int = 16) -> logs.Log:
@@ -335,72 +374,93 @@ def write_json(path: Path, value: Any) -> None:
 # --- the whole chain --------------------------------------------------------------------------------
 
 
-def reproduce(machine: Machine, out: Path, effort: Effort, seed: int) -> dict[str, Any]:
+def reproduce(
+    machine: Machine, out: Path, effort: Effort, seed: int, sweep: Path | None = None
+) -> dict[str, Any]:
     """Logs, nets, policy, baselines, comparison, `results.json` and `report.html` in the folder `out`.
 
-    `results.json` holds no clock: the same seed gives the same file on the same machine.
+    `results.json` holds no clock: the same seed gives the same file on the same machine. The figures of
+    training seeds in the file `sweep`, which `sweep.sweep` wrote, join the report.
     """
     from brokk_min.ppo import PPOConfig, train  # torch, only where something is trained
 
+    seeds = read_seeds(sweep) if sweep else {}
     out.mkdir(parents=True, exist_ok=True)
-    clock, last = {}, time.perf_counter()
+    clock: dict[str, float] = {}
     stages = tqdm(total=6, desc="stages done", unit="stage", position=1, disable=None)
 
-    def lap(name: str) -> None:
-        nonlocal last
-        clock[name], last = time.perf_counter() - last, time.perf_counter()
+    @contextmanager
+    def stage(name: str) -> Iterator[None]:
+        begun = time.perf_counter()
+        yield
+        clock[name] = time.perf_counter() - begun
         stages.set_postfix_str(name)
         stages.update()
 
-    files, rng = (out / "log.npz", out / "log_test.npz"), np.random.default_rng
-    logs.write_log(files[0], actuator.collect(machine, effort.hours, "rich", rng(seed)))
-    logs.write_log(files[1], actuator.task_log(machine, 20, 40.0, rng(seed + 1)))
-    lap("record")
-    log, test = (logs.read_log([file], machine.velocity_samples) for file in files)
-    config = actuator.FitConfig(steps=effort.fit_steps, history=machine.history)
-    net = actuator.fit(log, config, seed, machine.velocity_samples, machine.name)
-    actuator.save_net(out / "net.npz", net)
-    half = replace(config, steps=effort.fit_steps // 2)  # for time
-    paper = preliminary.paper_recipe(machine, test, effort.hours, half, seed)
-    lap("fit")
-    driven = net.select([machine.names[i] for i in machine.driven])
-    learner = PPOConfig(total_steps=effort.train_steps)
-    policy = train(machine, driven, TaskConfig(), learner, seed, out / "policy.npz", resume=True)
-    lap("train")
-    tuned, how = tuned_baselines(machine, driven, effort, seed)
-    lap("tune")
-    controllers: dict[str, Controller] = {"rl": PolicyController(machine, policy), **tuned}
-    compared, traces = comparison(machine, controllers, effort, seed)
-    starts = np.array(compared["starts"])
-    simulated, _ = task_space(
-        machine, {"rl": controllers["rl"]}, axis_sequences(machine), starts, seed, driven
-    )
-    reachable = [run for run in simulated if run["kind"] == "workspace"]
-    compared["task_space"]["rl_on_nets"] = summary(reachable)["rl"]
-    driven_by_policy = actuator.score(net, driven_log(machine, traces["all"], "rl"))
-    lap("evaluate")
-    results = {
-        "meta": meta(machine, seed) | {"effort": asdict(effort)},
-        "actuator": {"test": actuator.score(net, test), "driven_by_policy": driven_by_policy},
-        "preliminary": preliminary.run(machine, net, seed),
-        "paper_recipe": paper,
-        **compared,
-        "gains": plain_gains(tuned),
-        "tuning": how,
-    }
-    write_json(out / "results.json", results)
-    write_json(out / "gains.json", {"meta": results["meta"], "gains": results["gains"]})
-    errors = {c: rows["all"]["velocity_error_mean"] for c, rows in compared["task_space"]["summary"].items()}
-    told = {"command": f"brokk-min reproduce --seed {seed}", "velocity_error_mean": errors}
-    save_policy(out / "policy.npz", replace(policy, training={**policy.training, **told}))
-    goals = tuning_goals(machine, effort.tuning_runs, 12.0, seed + 1000)
-    parts = report.net_parts(machine, net, test, results, seed, out / "policy.npz.csv")
-    parts += report.task_parts(machine, results, traces, goals)
-    figures.write_report(out / "report.html", parts, clock)
-    lap("draw")
+    with stage("record"):
+        log, test = record(machine, out, effort, seed)
+    with stage("fit"):
+        config = actuator.FitConfig(steps=effort.fit_steps, history=machine.history)
+        net = actuator.fit(log, config, seed, machine.velocity_samples, machine.name)
+        actuator.save_net(out / "net.npz", net)
+        half = replace(config, steps=effort.fit_steps // 2)  # for time
+        paper = preliminary.paper_recipe(machine, test, effort.hours, half, seed)
+    with stage("train"):
+        driven = net.select([machine.names[i] for i in machine.driven])
+        learner = PPOConfig(total_steps=effort.train_steps)
+        policy = train(machine, driven, TaskConfig(), learner, seed, out / "policy.npz", resume=True)
+    with stage("tune"):
+        tuned, how = tuned_baselines(machine, driven, effort, seed)
+    with stage("evaluate"):
+        rl = PolicyController(machine, policy)
+        compared, traces = comparison(machine, {"rl": rl, **tuned}, effort, seed)
+        compared["task_space"]["rl_on_nets"] = on_nets(machine, rl, compared, seed)
+        driven_log_score = actuator.score(net, driven_log(machine, traces["all"], "rl"))
+        results = {
+            "meta": meta(machine, seed) | {"effort": asdict(effort)},
+            "actuator": {"test": actuator.score(net, test), "driven_by_policy": driven_log_score},
+            "preliminary": preliminary.run(machine, net, seed),
+            "paper_recipe": paper,
+            **compared,
+            "gains": plain_gains(tuned),
+            "tuning": how,
+            "training_seeds": seeds,
+        }
+    with stage("draw"):
+        write_json(out / "results.json", results)
+        write_json(out / "gains.json", {"meta": results["meta"], "gains": results["gains"]})
+        save_policy(out / "policy.npz", told(policy, results, seed))
+        goals = tuning_goals(machine, effort.tuning_runs, 12.0, seed + 1000)
+        parts = report.net_parts(machine, net, test, results, seed, out / "policy.npz.csv")
+        parts = [report.found(results), *parts, *report.task_parts(machine, results, traces, goals)]
+        figures.write_report(out / "report.html", parts, clock)
     stages.close()
     write_json(out / "timing.json", clock)
     return results
+
+
+def record(machine: Machine, out: Path, effort: Effort, seed: int) -> list[logs.Log]:
+    """Logs to fit nets to and to score them on, written and read back as anybody's."""
+    files, rng = (out / "log.npz", out / "log_test.npz"), np.random.default_rng
+    logs.write_log(files[0], actuator.collect(machine, effort.hours, "rich", rng(seed)))
+    logs.write_log(files[1], actuator.task_log(machine, 20, 40.0, rng(seed + 1)))
+    return [logs.read_log([file], machine.velocity_samples) for file in files]
+
+
+def on_nets(
+    machine: Machine, rl: PolicyController, compared: Mapping[str, Any], seed: int
+) -> dict[str, dict[str, float | None]]:
+    """`summary` of the policy on its own nets, along x, y and z from the workspace starts."""
+    starts = np.array(compared["starts"])[np.array(compared["start_kinds"]) == "workspace"]
+    runs, _ = task_space(machine, {"rl": rl}, axis_sequences(machine), starts, seed, rl.policy.net)
+    return summary(runs)["rl"]
+
+
+def told(policy: Policy, results: Mapping[str, Any], seed: int) -> Policy:
+    """The policy with the command that made it and its figures in its file's header."""
+    errors = {c: of["all"]["velocity_error_mean"] for c, of in results["task_space"]["summary"].items()}
+    said = {"command": f"brokk-min reproduce --seed {seed}", "velocity_error_mean": errors}
+    return replace(policy, training={**policy.training, **said})
 
 
 def meta(machine: Machine, seed: int) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import html
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -28,130 +28,22 @@ import matplotlib.pyplot as plt
 Array = NDArray[np.floating[Any]]
 Traces = Mapping[tuple[str, str], Trace]  # by controller and sequence, starts as one batch
 
+plt.rcParams.update({"font.size": 8, "axes.grid": True, "grid.alpha": 0.3, "axes.axisbelow": True})
+WIDTH = 10.0  # inch, of every figure: so letters are of one size in the report
+
+# Brightness of its own for each of those that stand in one plot: they differ on grey paper too.
 STYLES: dict[str, dict[str, Any]] = {
-    "wanted": {"color": "black", "linestyle": "--"},
-    "machine": {"color": "black"},
-    "nets": {"color": "#0072b2", "linestyle": "--"},
-    "rl": {"color": "#0072b2"},
-    "jacobian_pid_k0.1": {"color": "#d55e00"},
-    "jacobian_pid_k0.05": {"color": "#e69f00"},
-    "jacobian_pid_ff": {"color": "#009e73"},
-    "perfect_model": {"color": "#cc79a7", "linestyle": "-."},
-    "workspace": {"color": "#0072b2"},
-    "limits": {"color": "#d55e00"},
-    "extended": {"color": "#e69f00"},
+    "wanted": {"color": "black", "linestyle": ":"},
+    "rl": {"color": "#08306b"},
+    "jacobian_pid_k0.1": {"color": "#d9661a"},
+    "jacobian_pid_k0.05": {"color": "#f0b84a", "linestyle": "--"},
+    "jacobian_pid_ff": {"color": "#00886a", "linestyle": "-."},
+    "perfect_model": {"color": "#c987b7"},
+    "workspace": {"color": "#08306b"},
+    "limits": {"color": "#d9661a"},
+    "extended": {"color": "#f0b84a"},
 }
-
-
-Row = tuple[Sequence[str], Mapping[str, Array]]  # labels of k y axes, and curves (T, k) by name
-
-
-def plot_lines(x: Array, xlabel: str, rows: Sequence[Row], one_scale: bool = False) -> Any:
-    """Rows of line plots over the same x under one legend; `one_scale`: one y axis in each row."""
-    share: Literal["row", "none"] = "row" if one_scale else "none"
-    high, wide = len(rows), len(rows[0][0])
-    figure = plt.figure(figsize=(4.0 * wide + 0.4, 2.3 * high + 0.4), layout="constrained")
-    grid = figure.subplots(high, wide, squeeze=False, sharey=share)
-    for axes, (labels, curves) in zip(grid, rows, strict=True):
-        for i, (ax, label) in enumerate(zip(axes, labels, strict=True)):
-            for name, y in curves.items():
-                ax.plot(x, y[:, i], label=name, linewidth=1.1, **STYLES[name])
-            ax.set_ylabel(label)
-            ax.grid(alpha=0.3)
-    for ax in grid[-1]:
-        ax.set_xlabel(xlabel)
-    return _with_legend(figure, grid[0, 0])
-
-
-def _with_legend(figure: Any, ax: Any) -> Any:
-    figure.legend(*ax.get_legend_handles_labels(), loc="outside upper center", ncol=5, fontsize=8)
-    return figure
-
-
-def _during(traces: Traces, sequence: Commands) -> dict[str, Trace]:
-    return {name: trace for (name, other), trace in traces.items() if other == sequence.name}
-
-
-def plot_sequence(machine: Machine, traces: Traces, sequence: Commands, start: Array, run: int) -> Any:
-    """Tool position and velocity along x, y, z of all controllers in one run. Paper: Fig. 6"""
-    first = kinematics.tool_position(machine, start)
-    p, v = {"wanted": np.cumsum(sequence.goals, axis=0) * machine.dt}, {"wanted": sequence.goals}
-    for name, trace in _during(traces, sequence).items():
-        p[name], v[name] = trace.p_tool[:, run] - first, trace.v_tool[:, run]
-    rows = [([f"{a} - {a}(0) [m]" for a in AXES], p), ([f"velocity {a} [m/s]" for a in AXES], v)]
-    return plot_lines(machine.dt * np.arange(1, len(sequence.goals) + 1), "time [s]", rows, one_scale=True)
-
-
-def plot_joint_rates(machine: Machine, traces: Traces, sequence: Commands, run: int) -> Any:
-    """Velocity of the driven joints of all controllers in one run. Paper: Fig. 6d"""
-    labels = [f"velocity {machine.names[i]} [rad/s]" for i in machine.driven]
-    rates = {name: t.q_dot[:, run, machine.driven] for name, t in _during(traces, sequence).items()}
-    return plot_lines(machine.dt * np.arange(1, len(sequence.goals) + 1), "time [s]", [(labels, rates)])
-
-
-def plot_free_run(net: actuator.ActuatorNet, log: logs.Log, seconds: float = 30.0) -> Any:
-    """Recorded and free-running angle and velocity of every joint in one unseen recording."""
-    recording = log.recordings[0]
-    ticks = min(round(seconds * net.rate), len(recording.q) - net.history - 1)
-    q, q_dot = actuator.free_run(net, recording, np.array([net.history]), ticks)
-    later = slice(net.history + 1, net.history + 1 + ticks)
-    rows = [
-        ([f"{joint} [rad]" for joint in net.joints], {"machine": recording.q[later], "nets": q[:, 0]}),
-        (
-            [f"{joint} [rad/s]" for joint in net.joints],
-            {"machine": recording.q_dot[later], "nets": q_dot[:, 0]},
-        ),
-    ]
-    return plot_lines(np.arange(1, ticks + 1) / net.rate, "time [s]", rows)
-
-
-def plot_learning(curve: Path) -> Any:
-    """Mean reward and velocity error of the exploring policy over environment steps."""
-    table = logs.read_table(curve, ["global_step", "charts/reward", "charts/velocity_error"])
-    curves = {"rl": np.stack([table["charts/reward"], table["charts/velocity_error"]], axis=1)}
-    row = (["reward a step [1]", "velocity error [m/s]"], curves)
-    return plot_lines(table["global_step"] / 1e6, "environment steps [million]", [row])
-
-
-Bars = Mapping[str, Mapping[str, Mapping[str, float | None]]]  # controller, sequence: "mean", "low", "high"
-
-
-def plot_bars(panels: Mapping[str, Bars]) -> Any:
-    """Means with their 95 % intervals of each controller on each sequence; panels by the label of their y."""
-    figure = plt.figure(figsize=(10.4, 2.9 * len(panels)), layout="constrained")
-    axes = figure.subplots(len(panels), 1, squeeze=False)[:, 0]
-    for ax, (label, bars) in zip(axes, panels.items(), strict=True):
-        names, width = list(next(iter(bars.values()))), 0.8 / len(bars)
-        for i, (controller, rows) in enumerate(bars.items()):
-            mean, low, high = (np.array([rows[s][k] or 0.0 for s in names]) for k in ("mean", "low", "high"))
-            ends = np.array([mean - low, high - mean]) * [rows[s]["low"] is not None for s in names]
-            places = np.arange(len(names)) + (i - (len(bars) - 1) / 2) * width
-            color = STYLES[controller]["color"]
-            ax.bar(places, mean, width, yerr=ends, label=controller, color=color, error_kw={"linewidth": 0.8})
-        ax.set_xticks(np.arange(len(names)), names, fontsize=8)
-        ax.set_ylabel(label)
-        ax.grid(alpha=0.3, axis="y")
-        ax.set_axisbelow(True)
-    return _with_legend(figure, axes[0])
-
-
-def plot_starts(machine: Machine, starts: Array, kinds: Sequence[str]) -> Any:
-    """Start configurations drawn as arms, from the side and from above. Paper: Fig. 6a"""
-    figure, axes = plt.subplots(1, 2, figsize=(9.4, 4.4), layout="constrained")
-    points = kinematics.frames(machine, starts)[..., :3, 3]
-    heading = points[:, -1, :2] / np.maximum(np.linalg.norm(points[:, -1, :2], axis=-1, keepdims=True), 1e-9)
-    outward = np.einsum("pjk,pk->pj", points[..., :2], heading)
-    for i, kind in enumerate(kinds):
-        label = None if kind in kinds[:i] else kind
-        style = STYLES[kind] | {"linewidth": 1.0, "marker": "o", "markersize": 2, "alpha": 0.7}
-        axes[0].plot(outward[i], points[i, :, 2], label=label, **style)
-        axes[1].plot(points[i, :, 0], points[i, :, 1], **style)
-    axes[0].axhline(machine.ground, color="black", linewidth=0.8)
-    axes[0].set(xlabel="outward from the slew axis [m]", ylabel="z [m]", aspect="equal")
-    axes[1].set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    for ax in axes:
-        ax.grid(alpha=0.3)
-    return _with_legend(figure, axes[0])
+OTHERS = [STYLES[name] for name in ("rl", "jacobian_pid_k0.1", "jacobian_pid_ff", "jacobian_pid_k0.05")]
 
 
 class Panel(NamedTuple):
@@ -163,24 +55,126 @@ class Panel(NamedTuple):
     curves: Mapping[str, tuple[Array, Array]]
 
 
-def plot_panels(rows: Sequence[Sequence[Panel]]) -> Any:
-    """A grid of panels; those of a column have the same axes where they show the same quantity."""
-    high, wide = len(rows), len(rows[0])
-    figure = plt.figure(figsize=(4.4 * wide, 2.8 * high), layout="constrained")
-    grid = figure.subplots(high, wide, squeeze=False)
-    for k, panels in enumerate(rows):
-        for ax, above, panel in zip(grid[k], grid[0], panels, strict=True):
-            for label, (x, y) in panel.curves.items():
-                ax.plot(x, y, label=label, linewidth=1.1)
-            ax.set_title(panel.title, fontsize=9)
-            ax.set_xlabel(panel.xlabel)
-            ax.set_ylabel(panel.ylabel)
-            ax.grid(alpha=0.3)
-            ax.legend(fontsize=7)
+def plot_panels(rows: Sequence[Sequence[Panel]], one_scale: bool = False) -> Any:
+    """Rows of panels; under one legend where all show the same curves.
+
+    Panels of a column that show the same quantity have one y axis; with `one_scale` those of a row, too.
+    """
+    high, wide = len(rows), max(map(len, rows))
+    figure = plt.figure(figsize=(WIDTH, 2.4 * high + 0.3), layout="constrained")
+    grid = figure.subplots(high, wide, squeeze=False, sharey="row" if one_scale else "none")
+    alike = len({tuple(panel.curves) for panels in rows for panel in panels}) == 1
+    for k, (axes, panels) in enumerate(zip(grid, rows, strict=True)):
+        for ax, above, panel in zip(axes, grid[0], panels, strict=False):
+            for i, (label, (x, y)) in enumerate(panel.curves.items()):
+                ax.plot(x, y, label=label, linewidth=1.1, **STYLES.get(label, OTHERS[i % len(OTHERS)]))
+            ax.set(title=panel.title, xlabel=panel.xlabel, ylabel=panel.ylabel)
+            if not alike:
+                ax.legend()
             if k and above.get_ylabel() == panel.ylabel:
                 ax.sharey(above)
                 ax.autoscale()
+        for ax in axes[len(panels) :]:
+            ax.remove()
+    return _with_legend(figure, grid[0, 0]) if alike else figure
+
+
+def _over_time(dt: float, labels: Sequence[str], curves: Mapping[str, Array]) -> list[Panel]:
+    """A panel for each label: columns of curves (T, labels) over time."""
+    return [
+        Panel("", "time [s]", label, {n: (dt * np.arange(1, len(y) + 1), y[:, i]) for n, y in curves.items()})
+        for i, label in enumerate(labels)
+    ]
+
+
+def _with_legend(figure: Any, ax: Any) -> Any:
+    figure.legend(*ax.get_legend_handles_labels(), loc="outside upper center", ncol=5)
     return figure
+
+
+def _during(traces: Traces, sequence: Commands) -> dict[str, Trace]:
+    return {name: trace for (name, other), trace in traces.items() if other == sequence.name}
+
+
+def plot_sequence(machine: Machine, traces: Traces, sequence: Commands, start: Array, run: int) -> Any:
+    """Tool position and velocity along x, y, z of all controllers in one run. Paper: Fig. 6"""
+    first, goals = kinematics.tool_position(machine, start), sequence.of_each(run + 1)[:, run]
+    p, v = {"wanted": np.cumsum(goals, axis=0) * machine.dt}, {"wanted": goals}
+    for name, trace in _during(traces, sequence).items():
+        p[name], v[name] = trace.p_tool[:, run] - first, trace.v_tool[:, run]
+    rows = (([f"{a} - {a}(0) [m]" for a in AXES], p), ([f"velocity {a} [m/s]" for a in AXES], v))
+    return plot_panels([_over_time(machine.dt, *row) for row in rows], one_scale=True)
+
+
+def plot_joint_rates(machine: Machine, traces: Traces, sequence: Commands, run: int) -> Any:
+    """Velocity of the driven joints of all controllers in one run. Paper: Fig. 6d"""
+    labels = [f"velocity {machine.names[i]} [rad/s]" for i in machine.driven]
+    rates = {name: t.q_dot[:, run, machine.driven] for name, t in _during(traces, sequence).items()}
+    panels = _over_time(machine.dt, labels, rates)
+    return plot_panels([panels[i : i + 2] for i in range(0, len(panels), 2)])
+
+
+def plot_free_run(net: actuator.ActuatorNet, log: logs.Log, seconds: float = 30.0) -> Any:
+    """Recorded and free-running angle and velocity of the joints that move in one unseen recording."""
+    recording = log.recordings[0]
+    of_joints = [_over_time(1 / net.rate, *row) for row in _free_run(net, recording, seconds)]
+    rows = zip(recording.u.T, *of_joints, strict=True)
+    return plot_panels([panels for u, *panels in rows if u.any()])
+
+
+def _free_run(net: actuator.ActuatorNet, recording: logs.Recording, seconds: float) -> Any:
+    """Labels and curves (T, joints) of angles, then of velocities, recorded and run freely."""
+    ticks = min(round(seconds * net.rate), len(recording.q) - net.history - 1)
+    free = actuator.free_run(net, recording, np.array([net.history]), ticks)
+    later = slice(net.history + 1, net.history + 1 + ticks)
+    for real, own, unit in zip((recording.q, recording.q_dot), free, ("rad", "rad/s"), strict=True):
+        yield [f"{joint} [{unit}]" for joint in net.joints], {"measured": real[later], "free run": own[:, 0]}
+
+
+def plot_learning(curve: Path) -> Any:
+    """Mean reward and velocity error of the exploring policy over environment steps."""
+    labels = {"charts/reward": "reward a step [1]", "charts/velocity_error": "velocity error [m/s]"}
+    table = logs.read_table(curve, ["global_step", *labels])
+    steps, wide = table["global_step"] / 1e6, "environment steps [million]"
+    return plot_panels([[Panel("", wide, label, {"rl": (steps, table[k])}) for k, label in labels.items()]])
+
+
+Bars = Mapping[str, Mapping[str, Mapping[str, float | None]]]  # controller, sequence: "mean", "low", "high"
+
+
+def plot_bars(panels: Mapping[str, Bars]) -> Any:
+    """Means with their 95 % intervals of each controller on each sequence; panels by the label of their y."""
+    figure = plt.figure(figsize=(WIDTH, 2.8 * len(panels)), layout="constrained")
+    axes = figure.subplots(len(panels), 1, squeeze=False)[:, 0]
+    for ax, (label, bars) in zip(axes, panels.items(), strict=True):
+        names, width = list(next(iter(bars.values()))), 0.8 / len(bars)
+        for i, (controller, rows) in enumerate(bars.items()):
+            mean, low, high = (np.array([rows[s][k] or 0.0 for s in names]) for k in ("mean", "low", "high"))
+            ends = np.array([mean - low, high - mean]) * [rows[s]["low"] is not None for s in names]
+            places = np.arange(len(names)) + (i - (len(bars) - 1) / 2) * width
+            color = STYLES[controller]["color"]
+            ax.bar(places, mean, width, yerr=ends, label=controller, color=color, error_kw={"linewidth": 0.8})
+        ax.set_xticks(np.arange(len(names)), names)
+        ax.set_ylabel(label)
+        ax.grid(False, axis="x")
+    return _with_legend(figure, axes[0])
+
+
+def plot_starts(machine: Machine, starts: Array, kinds: Sequence[str]) -> Any:
+    """Start configurations drawn as arms, from the side and from above. Paper: Fig. 6a"""
+    figure, axes = plt.subplots(1, 2, figsize=(WIDTH, 4.4), layout="constrained")
+    points = kinematics.frames(machine, starts)[..., :3, 3]
+    heading = points[:, -1, :2] / np.maximum(np.linalg.norm(points[:, -1, :2], axis=-1, keepdims=True), 1e-9)
+    outward = np.einsum("pjk,pk->pj", points[..., :2], heading)
+    for i, kind in enumerate(kinds):
+        label = None if kind in kinds[:i] else kind
+        style = STYLES[kind] | {"linewidth": 1.0, "marker": "o", "markersize": 2, "alpha": 0.6}
+        axes[0].plot(outward[i], points[i, :, 2], label=label, **style)
+        axes[1].plot(points[i, :, 0], points[i, :, 1], **style)
+    axes[0].axhline(machine.ground, color="black", linewidth=0.8)
+    axes[0].set(xlabel="outward from the slew axis [m]", ylabel="z [m]", aspect="equal")
+    axes[1].set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    return _with_legend(figure, axes[0])
 
 
 def plot_worst_and_median(net: actuator.ActuatorNet, log: logs.Log, seconds: float = 30.0) -> Any:
@@ -190,19 +184,12 @@ def plot_worst_and_median(net: actuator.ActuatorNet, log: logs.Log, seconds: flo
     """
     errors = np.nan_to_num(actuator.recording_errors(net, log, seconds), nan=-1.0)
     order = [i for i in np.argsort(errors.max(axis=1)) if errors[i].max() >= 0]
-    rows: list[list[Panel]] = []
+    rows = []
     for title, place in (("worst", -1), ("median", (len(order) - 1) // 2)):
         index, joint = order[place], int(errors[order[place]].argmax())
-        recording, name = log.recordings[index], net.joints[joint]
-        ticks = min(round(seconds * net.rate), len(recording.q) - net.history - 1)
-        free = actuator.free_run(net, recording, np.array([net.history]), ticks)
-        later = slice(net.history + 1, net.history + 1 + ticks)
-        rows.append([])
-        for real, own, unit in zip((recording.q, recording.q_dot), free, ("rad", "rad/s"), strict=True):
-            curves = {"measured": real[later, joint], "free run": own[:, 0, joint]}
-            time = np.arange(1, ticks + 1) / net.rate
-            panel = {label: (time, y) for label, y in curves.items()}
-            rows[-1].append(Panel(f"{title}: {recording.name}", "time [s]", f"{name} [{unit}]", panel))
+        of_joints = [_over_time(1 / net.rate, *row) for row in _free_run(net, log.recordings[index], seconds)]
+        name = f"{title}: {log.recordings[index].name}"
+        rows.append([panels[joint]._replace(title=name) for panels in of_joints])
     return plot_panels(rows)
 
 

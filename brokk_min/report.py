@@ -17,7 +17,7 @@ from brokk_min.actuator import ActuatorNet
 from brokk_min.figures import Traces
 from brokk_min.logs import Log
 from brokk_min.machine import Machine
-from brokk_min.sequences import axis_sequences, task_sequences
+from brokk_min.sequences import axis_sequences, least_motion, task_sequences
 
 Array = NDArray[np.floating[Any]]
 VERDICTS = {True: "holds here", False: "does not hold here", None: "was not measured"}
@@ -26,11 +26,25 @@ RECIPES = (
     "these recordings [rad/s]; mean distance of the tools in 30 s, median and worst run of Fig. 5 [m]."
 )
 Part = tuple[Any, ...]  # title, sentence, contents: see `figures.write_report`
+UNITS = {"velocity": "m/s", "off": "m", "position": "m", "settling": "s", "time": "s", "jerk": "m/s^3"}
+UNITS |= {"valve": "full strokes", "reward": "1"}  # of the figures of `metrics`, by their first word
 
 
 def verdict(claim: Mapping[str, Any]) -> str:
     """The paper's sentence, what was measured, and whether it holds."""
     return f"Paper: {claim['paper']} Measured: {claim['measured']}. This {VERDICTS[claim['holds']]}."
+
+
+def found(results: Mapping[str, Any]) -> Part:
+    """The first part: the paper's question and its sentences answered."""
+    error = "velocity_error_mean"
+    means = {name: rows["all"][error] for name, rows in results["task_space"]["summary"].items()}
+    said = ", ".join(f"{name} {mean:.4f}" for name, mean in means.items() if mean is not None)
+    bound = results["regret"]["summary"]["perfect_model"]["all"][error]
+    text = f"Mean velocity error of the tool over all sequences [m/s]: {said}. A controller that has the "
+    text += f"plant's equations and state is left with {bound:.4f} (along x, y and z alone)."
+    rows = {claim["paper"]: {"what the paper says": VERDICTS[claim["holds"]]} for claim in results["claims"]}
+    return "What was found", text, rows
 
 
 def net_parts(
@@ -79,20 +93,22 @@ def task_parts(
     """
     starts, kinds = np.array(results["starts"]), results["start_kinds"]
     said = [verdict(claim) for claim in results["claims"]]
-    still, singular, last = said[:3], said[3:-1], said[-1:]
+    ahead = len(said) - 3 - len(results["singular"]["claims"])
+    still, near, (track, along_z, last) = said[:ahead], said[ahead:-3], said[-3:]
     first = kinds.index("workspace")
-    main = traces["all"]
-    plots = [figures.plot_sequence(machine, main, s, starts[first], first) for s in axis_sequences(machine)]
-    rates = figures.plot_joint_rates(machine, main, axis_sequences(machine)[0], first)
-    first_start = "From the first start; one scale a row."
+    main, axes = traces["all"], axis_sequences(machine)
+    plots = [figures.plot_sequence(machine, main, s, starts[first], first) for s in axes]
+    rates = figures.plot_joint_rates(machine, main, axes[0], first)
+    text = "From the first start; one scale a row."
     parts: list[Part] = [
         ("Start configurations (Fig. 6a)", _starts_text(kinds), figures.plot_starts(machine, starts, kinds)),
-        ("Motion along x (Fig. 6b-d)", first_start, *still, plots[0], rates),
-        ("Motion along y (Fig. 6e, f)", first_start, plots[1]),
-        ("Motion along z (Fig. 6g, h)", first_start, plots[2]),
+        ("Motion along x (Fig. 6b-d)", text, *still, plots[0], rates),
+        ("Motion along y (Fig. 6e, f)", text, track, plots[1]),
+        ("Motion along z (Fig. 6g, h)", text, along_z, plots[2]),
     ]
     if traces["singular"]:
-        parts.append(_singular(machine, results, traces["singular"], starts, singular))
+        extended = starts[[kind == "extended" for kind in kinds]]
+        parts.append(_singular(machine, results["singular"], traces["singular"], extended, near))
     return [*parts, *_tables(results, last), *_lists(machine, results, tuning)]
 
 
@@ -106,17 +122,31 @@ def _starts_text(kinds: Sequence[str]) -> str:
 
 
 def _singular(
-    machine: Machine, results: Mapping[str, Any], traces: Traces, starts: Array, said: Sequence[str]
+    machine: Machine, found: Mapping[str, Any], traces: Traces, extended: Array, said: Sequence[str]
 ) -> Part:
-    extended = starts[[kind == "extended" for kind in results["start_kinds"]]]
-    ticks = next(iter(traces.values())).q.shape[0]
-    along_y = axis_sequences(machine)[1]
-    cut = along_y._replace(goals=along_y.goals[:ticks])
-    plot = figures.plot_sequence(machine, traces, cut, extended[0], 0)
+    run = int(np.argmin(found["manipulability"]))
+    ticks = len(next(iter(traces.values())).q)
+    half = least_motion(machine, extended)[0]
+    plot = figures.plot_sequence(machine, traces, half._replace(goals=half.goals[:ticks]), extended[run], run)
     keys = ("velocity_error_mean", "jerk_rms", "off_axis_drift_max", "time_at_limits")
-    rows = {c: {k: of["all"][k] for k in keys} for c, of in results["singular"]["summary"].items()}
-    text = "From extended starts; k = 0.05 with the gains of k = 0.1. Figure: along y from the first."
-    return ("Near the singularity (Fig. 6a, e, f)", text, *said, plot, rows)
+    rows = {c: {k: of["all"][k] for k in keys} for c, of in found["summary"].items()}
+    ends = [f"{min(found[k]):.2f} to {max(found[k]):.2f}" for k in ("manipulability", "least")]
+    text = (
+        f"From the extended starts (manipulability {ends[0]}, damping sets in below {found['w0']:.2f}; "
+        f"least singular value of the Jacobian {ends[1]} m/rad), to and fro in the direction in which the "
+        "arm can move least, at a half and a quarter of the axis sequences' speed: at the whole, the joints' "
+        "own limits slow the tool there, whatever the damping. k = 0.05 with the gains of k = 0.1. "
+        "Figure: half the speed, from the start nearest to a singularity."
+    )
+    return ("Near the singularity (Fig. 6a, e, f)", text, *said, plot, _with_units(rows))
+
+
+def _with_units(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """The same rows, the unit of each figure beside its name."""
+    return {
+        name: {f"{key} [{UNITS[key.split('_')[0]]}]": value for key, value in row.items()}
+        for name, row in rows.items()
+    }
 
 
 def _with_interval(number: Mapping[str, float | None]) -> str:
@@ -127,22 +157,16 @@ def _with_interval(number: Mapping[str, float | None]) -> str:
 
 
 def _bars(task: Mapping[str, Any], key: str) -> figures.Bars:
-    return {
-        c: {
-            s: {
-                "mean": row[key],
-                "low": task["intervals"][c][s][key][0],
-                "high": task["intervals"][c][s][key][1],
-            }
-            for s, row in rows.items()
-        }
-        for c, rows in task["summary"].items()
-    }
+    def number(c: str, s: str) -> dict[str, float | None]:
+        low, high = task["intervals"][c][s][key]
+        return {"mean": task["summary"][c][s][key], "low": low, "high": high}
+
+    return {c: {s: number(c, s) for s in rows} for c, rows in task["summary"].items()}
 
 
-def _tables(results: Mapping[str, Any], last: Sequence[str]) -> list[Part]:
+def _tables(results: Mapping[str, Any], last: str) -> list[Part]:
     task, less = results["task_space"], results["regret"]["less_perfect_model"]
-    everything = {name: rows["all"] for name, rows in task["summary"].items()}
+    everything = _with_units({name: rows["all"] for name, rows in task["summary"].items()})
     error, drift = (_bars(task, key) for key in ("velocity_error_mean", "off_axis_drift_max"))
     cells = {s: {c: _with_interval(rows[s]) for c, rows in error.items()} for s in next(iter(error.values()))}
     pairs = {
@@ -151,13 +175,18 @@ def _tables(results: Mapping[str, Any], last: Sequence[str]) -> list[Part]:
         for c, rows in of.items()
     }
     kinds = {f"{c}, {kind}": row for kind, rows in task["by_kind"].items() for c, row in rows.items()}
+    kinds = _with_units(kinds)
     bound = results["regret"]["summary"]["perfect_model"]
     scale = {"perfect_model (its error)": {s: row["velocity_error_mean"] for s, row in bound.items()}}
     regrets = scale | {c: {s: _with_interval(n) for s, n in rows.items()} for c, rows in less.items()}
-    robust = {v: {c: _with_interval(n) for c, n in rows.items()} for v, rows in results["robustness"].items()}
+    robust: dict[str, dict[str, str]] = {}
+    for variation, of in results["robustness"].items():
+        robust[variation] = {c: _with_interval(n) for c, n in of.items()}
+        most, share = (max(n[key] for n in of.values()) for key in ("supply_demand", "supply_limits"))
+        robust[variation] |= {"pump's flow asked for": f"{most:.0%}", "ticks it limits": f"{share:.1%}"}
     ends = "95 % intervals over starts in brackets"
     return [
-        ("Figures of merit", "Means over all sequences [m/s, s, m, m/s^3, full strokes].", everything, *last),
+        ("Figures of merit", "Means over all sequences.", everything, last),
         (
             "Velocity error and drift by sequence",
             f"{ends} [m/s, m].",
@@ -179,10 +208,28 @@ def _tables(results: Mapping[str, Any], last: Sequence[str]) -> list[Part]:
         ),
         (
             "Robustness",
-            f"Mean velocity error along x, y and z on a machine unlike the known one; {ends} [m/s].",
+            f"Mean velocity error along x, y and z on a machine unlike the known one; {ends} [m/s]. Last "
+            "columns: the most of the pump's flow that any controller asks for, and how often that is more "
+            "than there is.",
             robust,
         ),
+        *_seeds(results["training_seeds"]),
     ]
+
+
+def _seeds(table: Mapping[str, Mapping[str, Any]]) -> list[Part]:
+    """The figures of a sweep, if there is one."""
+    if not table:
+        return []
+    cells = {k: {c: _with_interval(of[k]) for c, of in table.items()} for k in table["rl"]}
+    errors = [k for k in table["rl"] if k.startswith("velocity_error_")]
+    alone = {c: of for c, of in table.items() if "less" not in c}
+    bars = {c: {k.split("_", 2)[2]: of[k] for k in errors} for c, of in alone.items()}
+    text = (
+        "Means over training seeds on the machine, and 95 % intervals over them (Student's t; a seed counts "
+        "once, with the mean over its workspace starts) [m/s, m, full strokes]. Baselines are not trained."
+    )
+    return [("Training seeds", text, cells, figures.plot_bars({"mean velocity error [m/s]": bars}))]
 
 
 def _lists(machine: Machine, results: Mapping[str, Any], tuning: tuple[Array, Array]) -> list[Part]:
@@ -193,21 +240,23 @@ def _lists(machine: Machine, results: Mapping[str, Any], tuning: tuple[Array, Ar
     sequences = {s.name: _path(machine, s.goals) for s in task_sequences(machine)}
     runs = enumerate(zip(tuning[0], tuning[1].swapaxes(0, 1), strict=True))
     tuned = {f"tuning run {i}": _pose(machine, pose) | _path(machine, goals) for i, (pose, goals) in runs}
-    how = {}
-    for name, t in results["tuning"].items():
-        bounds = ", ".join(t["at_bound"]) or "none"
-        how[name] = {
+    how = {
+        name: {
             "seed": t["seed"],
             "first": t["cost"][0],
             "last": t["cost"][-1],
-            "gains at a bound": bounds,
+            "under other noise": t["cost_anew"],
+            "gains at a bound": ", ".join(t["at_bound"]) or "none",
         }
+        for name, t in results["tuning"].items()
+    }
     return [
         ("Scored sequences", "Seconds, changes of goal, largest speed [m/s], path [m].", sequences),
         ("Scored starts", "Angles [rad].", scored),
         (
             "Tuning of the baselines",
-            "Least velocity error after the first and last generation [m/s]; gains in results.json.",
+            "Least velocity error after the first and last generation [m/s], and that of the gains found, "
+            "under other noise; gains in results.json.",
             how,
         ),
         ("Tuning runs", "Starts [rad] and random goals, apart from those that score.", tuned),

@@ -34,15 +34,35 @@ KINDS = ("workspace", "limits", "extended")  # of starts, see `start_kinds`
 
 
 class Commands(NamedTuple):
-    """A named sequence of wanted tool velocities [m/s] at the control rate, (T, 3)."""
+    """A named sequence of wanted tool velocities [m/s] at the control rate, (T, 3) or (T, starts, 3)."""
 
     name: str
     goals: Array
+
+    def of_each(self, num: int) -> Array:
+        """Goals of the first `num` starts, (T, num, 3)."""
+        return self.goals[:, :num] if self.goals.ndim == 3 else np.repeat(self.goals[:, None], num, axis=1)
 
 
 def axis_sequences(machine: Machine) -> list[Commands]:
     """One sequence along x, one along y, one along z. Paper: Fig. 6"""
     return [Commands(name, _along(machine, np.eye(3)[i])) for i, name in enumerate(AXES)]
+
+
+def least_motion(machine: Machine, starts: Array) -> list[Commands]:
+    """The axis pattern along the direction in which the arm at each of `starts` (num, n) can hardly move.
+
+    At a half and a quarter of its speed (assumed): at the whole, it is the joints' own speed that limits
+    the tool near a singularity, and not damping. The direction is the left singular vector of the
+    Jacobian's least singular value, its largest component positive.
+
+    Paper: Fig. 6e, Fig. 6f
+    """
+    direction = np.linalg.svd(kinematics.jacobian(machine, starts))[0][..., -1]
+    largest = np.abs(direction).argmax(axis=-1)[:, None]
+    direction = direction * np.sign(np.take_along_axis(direction, largest, axis=-1))
+    goals = np.stack([_along(machine, towards) for towards in direction], axis=1)
+    return [Commands("least_half", 0.5 * goals), Commands("least_quarter", 0.25 * goals)]
 
 
 def _along(machine: Machine, direction: ArrayLike) -> Array:

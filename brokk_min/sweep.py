@@ -18,17 +18,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 from brokk_min import experiments
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import TaskConfig
 from brokk_min.machine import Machine
-from brokk_min.metrics import by_start
+from brokk_min.metrics import by_start, mean_interval
 from brokk_min.policy import PolicyController, load_policy
 from brokk_min.ppo import PPOConfig, identity_of, train
-from brokk_min.sequences import AXES, axis_sequences, scored_starts, task_sequences
+from brokk_min.sequences import AXES, scored_starts, task_sequences
 
+Array = NDArray[np.floating[Any]]
 Rows = list[dict[str, Any]]  # of `experiments.task_space`
 Submit = Callable[..., "Future[Rows]"]
 
@@ -38,11 +40,12 @@ def one_seed(
 ) -> Rows:
     """Train a seed and drive the machine with it; takes up what an earlier call left in the folder `out`."""
     policy_file, result_file = out / f"seed_{seed}.npz", out / f"seed_{seed}.json"
-    identity = identity_of(machine, net, task, config, seed) | {"starts": starts}
+    driven = {"starts": starts, "sequences": [s.name for s in task_sequences(machine)]}
+    identity = identity_of(machine, net, task, config, seed) | driven
     if result_file.exists():
         return _finished(result_file, identity)
     trained = load_policy(policy_file, machine) if policy_file.exists() else None
-    if not trained or dict(trained.training) | {"starts": starts} != identity:
+    if not trained or dict(trained.training) | driven != identity:
         again = Path(f"{policy_file}.checkpoint").exists()
         trained = train(machine, net, task, config, seed, policy_file, again)
     rl = PolicyController(machine, trained)
@@ -65,8 +68,9 @@ def _finished(path: Path, identity: Mapping[str, Any]) -> Rows:
 
 def _on_the_machine(machine: Machine, controllers: Mapping[str, Any], starts: int) -> Rows:
     """The scored sequences and starts of `evaluate --seed 0`: the same whatever seed was trained."""
-    poses = scored_starts(machine, starts, task_sequences(machine), 2)
-    return experiments.task_space(machine, controllers, axis_sequences(machine), poses, 0)[0]
+    sequences = task_sequences(machine)
+    poses = scored_starts(machine, starts, sequences, 2)
+    return experiments.task_space(machine, controllers, sequences, poses, 0)[0]
 
 
 def apart(function: Callable[..., Any], *arguments: Any) -> Any:
@@ -124,7 +128,7 @@ def sweep(
         config: settings of the learner; `threads` is 1 whatever it says.
         seeds: of the trainings.
         out: folder for everything.
-        starts: start poses for each of the three sequences.
+        starts: start poses for each scored sequence.
         scheduler: address of a dask scheduler; None: this machine.
         gains: tuned gains of the baselines, for rows beside.
 
@@ -156,44 +160,35 @@ def sweep(
     return figures
 
 
-def interval(values: Sequence[float]) -> dict[str, float | None]:
-    """Mean and half width of its 95 % confidence interval (Student's t); None for a single value.
-
-    Example:
-        >>> interval([1.0, 3.0])
-        {'mean': 2.0, 'half_width': 12.706205}
-    """
-    from scipy.stats import t
-
-    n = len(values)
-    half = t.ppf(0.975, n - 1) * np.std(values, ddof=1) / n**0.5 if n > 1 else None
-    return {"mean": float(np.mean(values)), "half_width": None if half is None else round(float(half), 6)}
-
-
 def table(seeds: Sequence[Rows], beside: Rows) -> dict[str, dict[str, Any]]:
-    """Figures by controller: velocity error by axis and in all [m/s], drift [m], travel [full strokes].
+    """Velocity error by sequence and of all [m/s], drift [m], travel [full strokes] by controller.
 
-    A seed counts once, with the mean over its starts; baselines have no seeds and so no interval.
+    A seed counts once, with the mean over its workspace starts; intervals are over seeds. Baselines have no
+    seeds and so no interval, but what RL has less than each ("rl less ...") has one again.
     """
-    several = {"rl": list(seeds)} if seeds else {}
-    several |= {name: [beside] for name in dict.fromkeys(run["controller"] for run in beside)}
-    columns = {f"velocity_error_{s}": (s, "velocity_error_mean") for s in (*AXES, "all")}
+    sequences = list(dict.fromkeys(run["sequence"] for run in [*beside, *(row for s in seeds for row in s)]))
+    columns = {f"velocity_error_{s}": (s, "velocity_error_mean") for s in (*sequences, "all")}
     columns |= {name: ("all", name) for name in ("off_axis_drift_max", "valve_travel")}
 
-    def means(controller: str, sequence: str, key: str) -> list[float]:
-        return [float(by_start(runs, controller, sequence, key).mean()) for runs in several[controller]]
+    def means(runs: Rows, controller: str) -> Array:
+        scored = [run for run in runs if run["kind"] == "workspace"]
+        return np.array([by_start(scored, controller, *what).mean() for what in columns.values()])
 
-    return {c: {name: interval(means(c, *what)) for name, what in columns.items()} for c in several}
+    rows = {"rl": np.array([means(runs, "rl") for runs in seeds])} if seeds else {}
+    for name in dict.fromkeys(run["controller"] for run in beside):
+        rows[name] = means(beside, name)[None]
+        rows |= {f"rl less {name}": rows["rl"] - rows[name]} if seeds else {}
+    return {c: dict(zip(columns, map(mean_interval, of.T), strict=True)) for c, of in rows.items()}
 
 
 def show(figures: Mapping[str, Mapping[str, Any]]) -> str:
-    """The table as text."""
-    columns = list(next(iter(figures.values()), {}))
-    lines = [f"{'mean and 95 % interval':20}" + "".join(f" {name:>20}" for name in columns)]
+    """The table as text: a line for each controller."""
+    columns = {f"velocity_error_{s}": f"{s} [m/s]" for s in (*AXES, "all")}
+    columns |= {"off_axis_drift_max": "drift [m]", "valve_travel": "travel [1]"}
+    lines = [f"{'mean and 95 % interval':28}" + "".join(f" {name:>18}" for name in columns.values())]
     for controller, row in figures.items():
-        cells = []
-        for cell in row.values():
-            half = cell["half_width"]
-            cells.append(f"{cell['mean']:.4f}" + ("" if half is None else f" +- {half:.4f}"))
-        lines.append(f"{controller:20}" + "".join(f" {cell:>20}" for cell in cells))
+        cells = [row[name] for name in columns]
+        halves = ["" if n["high"] is None else f" +- {n['high'] - n['mean']:.4f}" for n in cells]
+        texts = (f"{n['mean']:.4f}{half}" for n, half in zip(cells, halves, strict=True))
+        lines.append(f"{controller:28}" + "".join(f" {text:>18}" for text in texts))
     return "\n".join(lines)

@@ -48,10 +48,25 @@ def test_one_start_gives_no_verdict() -> None:
     assert report.verdict(found[0]).endswith("This was not measured.")
 
 
-@pytest.mark.parametrize(("rl", "holds"), [(0.01, True), (0.02, False), (0.03, False)])
-def test_conclusion(rl: float, holds: bool) -> None:
-    runs = runs_with("velocity_error_mean", rl=rl, high=0.02, low=0.025)
-    assert claims.conclusion(runs, PAPERS)["holds"] is holds
+@pytest.mark.parametrize(
+    ("x", "z", "drift", "holds"),
+    [
+        (0.01, 0.01, 0.1, [True, True, True]),
+        (0.01, 0.01, 0.3, [True, False, True]),  # drifts more along z
+        (0.03, 0.01, 0.1, [False, True, True]),  # worse along x by 0.01 and better along y and z by 0.01
+        (0.01, 0.03, 0.1, [False, False, True]),
+        (0.04, 0.03, 0.1, [False, False, False]),
+    ],
+)
+def test_tracking(x: float, z: float, drift: float, holds: list[bool]) -> None:
+    runs = []
+    for sequence, rl in {"x": x, "y": 0.01, "z": z}.items():
+        errors = runs_with("velocity_error_mean", rl=rl, high=0.02, low=0.02 - 0.005 * (rl > 0.02))
+        drifts = runs_with("off_axis_drift_max", rl=drift, high=0.2, low=0.2)
+        runs += [a | b | {"sequence": sequence} for a, b in zip(errors, drifts, strict=True)]
+    found = claims.tracking_claims(runs, PAPERS)
+    assert [claim["holds"] for claim in found] == holds
+    assert found[1]["numbers"]["drift z, less jacobian_pid_k0.1"]["mean"] == pytest.approx(drift - 0.2)
 
 
 @pytest.mark.parametrize(
@@ -84,7 +99,7 @@ def test_speed_share_counts_lasting_goals_at_singular_poses() -> None:
     q, goals = np.stack([stretched, POSE]), np.tile([0.2, 0.0, 0.0], (30, 1))
     trace = still_trace(30, q, np.array([0.1, 0.3, 0.0]), np.zeros(5))
     trace.v_tool[:12] = 9.0
-    share = claims.speed_share(BROKK_170, 3.9, trace, goals)
+    share = claims.speed_share(BROKK_170, 3.9, trace, np.repeat(goals[:, None], 2, axis=1))
     assert share[0] == pytest.approx(0.5) and np.isnan(share[1])
 
 

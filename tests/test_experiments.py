@@ -5,15 +5,16 @@ from __future__ import annotations
 import html
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 
 from benchmarks.rollout import random_net
-from brokk_min import experiments, jacobian
-from brokk_min.actuator import ActuatorNet, speed_limits
+from brokk_min import experiments, figures, jacobian
+from brokk_min.actuator import ActuatorNet, plant_reset, plant_step, speed_limits
 from brokk_min.env import Measured, TaskConfig, measured, rollout, to_command
 from brokk_min.kinematics import joint_rates, tool_position
 from brokk_min.machine import BROKK_170, Machine, read_encoder
@@ -108,13 +109,15 @@ def test_sensors_of_the_robustness_table() -> None:
     np.testing.assert_array_equal(seen[0], plain[0])
 
 
-def test_variations_change_the_machine_and_not_what_its_controllers_know() -> None:
+def test_variations_change_the_machine_and_not_what_its_controllers_know(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     found = experiments.variations(BROKK_170)
-    assert len(found) == 11 and found["nominal"][0] is BROKK_170
+    assert len(found) == 12 and found["nominal"][0] is BROKK_170
     changed = [
         name for name, (plant, sensor) in found.items() if plant != BROKK_170 or sensor != experiments.exact
     ]
-    assert len(changed) == 10
+    assert len(changed) == 11
     tilted = found["up -15 %, down +15 %"][0]
     np.testing.assert_allclose(tilted.column("speed_positive"), 0.85 * BROKK_170.column("speed_positive"))
     np.testing.assert_allclose(tilted.column("speed_negative"), 1.15 * BROKK_170.column("speed_negative"))
@@ -126,6 +129,37 @@ def test_variations_change_the_machine_and_not_what_its_controllers_know() -> No
         errors["delay +50 ms"], errors["dead zone 10 %"], errors["valve gain -20 %"]
     )
     assert errors["delay +25 ms"] < errors["delay +50 ms"]
+    supply = {name: row["mine"]["supply_demand"] for name, row in table.items()}
+    assert supply["supply flow -20 %"] == pytest.approx(supply["nominal"] / 0.8, rel=0.05)
+    assert errors["supply flow -20 %"] == errors["nominal"] and supply["supply flow -20 %"] < 1
+    assert table["supply flow -20 %"]["mine"]["supply_limits"] == 0
+    weak = replace(BROKK_170, pump_flow=0.2 * BROKK_170.pump_flow)
+    monkeypatch.setattr(experiments, "variations", lambda m: {"weak": (weak, experiments.exact)})
+    row = experiments.robustness(BROKK_170, {"mine": FeedForward(BROKK_170)}, short, start, 0)["weak"]["mine"]
+    assert row["supply_demand"] > 1 and 0 < row["supply_limits"] < 1 and row["mean"] > errors["nominal"]
+
+
+def test_what_valves_ask_of_the_pump_is_what_the_plant_divides_among_them() -> None:
+    """Commands held until the spools stand: cylinders reach their full speed where the share is below one."""
+    q = np.tile([0.0, 0.7, 0.6, 1.7, 1.0], (2, 1))
+    u = np.array([[0.4, 0.4, -0.4, 0.4, -0.4], [1.0, -1.0, 1.0, -1.0, 1.0]])
+    state = plant_reset(BROKK_170, q)
+    state = state._replace(ready=np.ones_like(q))
+    for _ in range(8):
+        state = plant_step(BROKK_170, state, u)
+    fastest = np.where(u > 0, BROKK_170.column("speed_positive"), BROKK_170.column("speed_negative"))
+    opening = np.sign(u) * (np.abs(u) - 0.07) / 0.93
+    share = experiments.supply_demand(BROKK_170, u)
+    assert share[0] < 1 < share[1]
+    np.testing.assert_allclose(state.speed, fastest * opening / np.maximum(1, share)[:, None], rtol=0.01)
+
+
+def test_curves_of_one_plot_differ_on_grey_paper() -> None:
+    controllers = ("rl", "jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff", "perfect_model")
+    for group in (controllers, ("workspace", "limits", "extended")):
+        colours = np.array([to_rgb(figures.STYLES[name]["color"]) for name in group])
+        grey = np.sort(colours @ [0.299, 0.587, 0.114])
+        assert (np.diff(grey) > 0.1).all() and grey[-1] < 0.8, group
 
 
 def net_of_driven_joints() -> ActuatorNet:
@@ -187,7 +221,7 @@ def test_results_hold_every_run_with_its_figures(twice: tuple[Path, Path]) -> No
 
 def test_results_answer_the_papers_question(twice: tuple[Path, Path]) -> None:
     results = json.loads((twice[0] / "results.json").read_text())
-    assert len(results["claims"]) == 7
+    assert len(results["claims"]) == 9
     for claim in results["claims"]:
         assert set(claim) == {"paper", "measured", "numbers", "holds"} and claim["holds"] in (
             True,
@@ -218,6 +252,7 @@ def test_results_tell_how_the_baselines_were_tuned(twice: tuple[Path, Path]) -> 
     for name, how in results["tuning"].items():
         assert how["seed"] == 3 and len(how["cost"]) == TINY.generations
         assert 0 < how["cost"][-1] <= how["cost"][0] < 0.3
+        assert how["cost_anew"] == pytest.approx(how["cost"][-1], rel=0.2) != how["cost"][-1]
         spans = jacobian.GAINS.items()
         ends = [k for k, (low, high) in spans for g in results["gains"][name][k] if g in (low, high)]
         assert len([g for g in how["at_bound"] if g.split()[0] in ends]) >= len(ends)
@@ -226,7 +261,8 @@ def test_results_tell_how_the_baselines_were_tuned(twice: tuple[Path, Path]) -> 
 def test_the_report_is_one_file_with_its_figures(twice: tuple[Path, Path]) -> None:
     text = (twice[0] / "report.html").read_text()
     assert len(re.findall(r"src='data:image/png;base64,", text)) == 12
-    assert not re.findall(r"(?:src|href)='(?!data:)", text) and "http" not in text
+    words = re.sub(r"base64,[^']*", "", text)  # four letters of a picture may spell anything
+    assert not re.findall(r"(?:src|href)='(?!data:)", words) and "http" not in words
     assert "not a real Brokk 170" in text
     for claim in json.loads((twice[0] / "results.json").read_text())["claims"]:
         assert html.escape(claim["measured"]) in text

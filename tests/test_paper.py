@@ -353,10 +353,10 @@ def test_figure_6_draws_its_starts_and_judges_singular_ones() -> None:
     plt.close("all")
     net = small_net(BROKK_170, np.random.default_rng(0))
     controllers = {"rl": Steady(0.3), **experiments.baselines(BROKK_170, net)}
-    short = [s._replace(goals=s.goals[15:35]) for s in sequences.axis_sequences(BROKK_170)]
-    traces, found = experiments.singular_case(BROKK_170, controllers, short, STARTS, 0)
-    assert {s for _, s in traces} == set("xyz") and found["claims"]
-    assert experiments.singular_case(BROKK_170, controllers, short, STARTS[:0], 0)[0] == {}
+    traces, found = experiments.singular_case(BROKK_170, controllers, STARTS, 2.0, 0)
+    assert {s for _, s in traces} == {"least_half", "least_quarter"} and len(found["claims"]) == 3
+    assert [len(found[key]) for key in ("manipulability", "least")] == [2, 2]
+    assert experiments.singular_case(BROKK_170, controllers, STARTS[:0], 2.0, 0)[0] == {}
 
 
 def test_the_papers_view_leaves_out_the_wanted_rates() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from brokk_min import sequences
 from brokk_min.env import TaskConfig
-from brokk_min.kinematics import lowest_point
+from brokk_min.kinematics import jacobian, lowest_point
 from brokk_min.machine import BROKK_170
 
 
@@ -163,3 +163,29 @@ def test_feasible_refuses_a_tool_that_stays_behind() -> None:
     outward = np.array([np.cos(0.6), 0.0, np.sin(0.6)]) / 5  # along the links behind q2
     assert sequences.feasible(machine, start, np.zeros((5, 1, 3)))[0]
     assert not sequences.feasible(machine, start, np.tile(outward, (5, 1, 1)))[0]
+
+
+def test_the_least_motion_is_the_one_that_asks_most_of_the_joints() -> None:
+    """By hand: beside the slew axis sideways motion is the hardest; and of all directions none needs more."""
+    upright = [0.0, 1.139, 0.97, 2.804, 1.948]  # tool 0.1 m from the slew axis
+    starts = np.array([upright, [0.5, *upright[1:]], [1.5, 0.5, 0.58, 1.71, 1.24]])
+    half, quarter = sequences.least_motion(BROKK_170, starts)
+    assert half.goals.shape == (360, 3, 3)
+    np.testing.assert_allclose(half.goals, 2 * quarter.goals)
+    speeds = np.linalg.norm(half.goals, axis=-1)
+    np.testing.assert_allclose(np.unique(speeds.round(9)), [0.0, 0.05, 0.1])
+    towards = half.goals[30] / 0.1
+    np.testing.assert_allclose(towards[0], [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(towards[1], [-np.sin(0.5), np.cos(0.5), 0], atol=1e-12)
+    inverse = np.linalg.pinv(jacobian(BROKK_170, starts))
+    hardest = np.linalg.norm((inverse @ towards[..., None])[..., 0], axis=-1)
+    others = np.random.default_rng(0).normal(size=(500, 1, 3))
+    others /= np.linalg.norm(others, axis=-1, keepdims=True)
+    assert (np.linalg.norm((inverse @ others[..., None])[..., 0], axis=-1) <= hardest + 1e-9).all()
+
+
+def test_goals_for_all_starts_or_each() -> None:
+    goals = np.arange(12.0).reshape(2, 2, 3)
+    np.testing.assert_array_equal(sequences.Commands("each", goals).of_each(2), goals)
+    one = sequences.Commands("one", goals[:, 0]).of_each(3)
+    np.testing.assert_array_equal(one, np.stack([goals[:, 0]] * 3, axis=1))

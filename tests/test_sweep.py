@@ -11,14 +11,16 @@ import pytest
 from helpers_machines import small_net
 from helpers_sweep import die_until, refuse
 
+from brokk_min import experiments
 from brokk_min import sweep as module
 from brokk_min.__main__ import main
 from brokk_min.actuator import save_net
 from brokk_min.env import TaskConfig
 from brokk_min.machine import BROKK_170, Machine
+from brokk_min.metrics import mean_interval
 from brokk_min.ppo import PPOConfig, train
 from brokk_min.sequences import Commands, axis_sequences
-from brokk_min.sweep import apart, interval, one_seed, sweep, workers
+from brokk_min.sweep import apart, one_seed, sweep, workers
 
 TINY = PPOConfig(num_envs=4, horizon=4, epochs=1, minibatch_size=16, total_steps=32, threads=1)
 TASK = TaskConfig(episode_s=0.6)
@@ -37,7 +39,7 @@ def short(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> No
             lambda m, num, s, seed: pose + 0.1 * np.random.default_rng(seed).random((num, 5)),
         )
         monkeypatch.setattr(
-            module, "axis_sequences", lambda m: [s._replace(goals=s.goals[15:25]) for s in full(m)]
+            module, "task_sequences", lambda m: [s._replace(goals=s.goals[15:25]) for s in full(m)]
         )
 
 
@@ -51,40 +53,47 @@ def here(function: Callable[..., object], *arguments: object) -> object:
 
 
 def seed_rows(error: float) -> list[dict[str, object]]:
-    """What `one_seed` returns, made up: three sequences, two starts."""
+    """What `one_seed` returns, made up: three sequences, three starts of which two count."""
     figures = {"velocity_rmse": 1.0, "off_axis_drift_max": 2.0 * error, "valve_travel": 10.0}
     return [
-        {"controller": "rl", "sequence": s, "start": i, "velocity_error_mean": error + i} | figures
+        {"controller": "rl", "sequence": s, "start": i, "kind": kind, "velocity_error_mean": e} | figures
         for s in "xyz"
-        for i in range(2)
+        for i, (kind, e) in enumerate((("workspace", error), ("limits", 99.0), ("workspace", error + 1)))
     ]
-
-
-def test_the_interval_is_students() -> None:
-    # ten values, deviation 3.0277: 2.2622 x 3.0277 / sqrt(10)
-    found = interval(list(range(1, 11)))
-    assert found["mean"] == 5.5
-    assert found["half_width"] == pytest.approx(2.16586, abs=1e-4)
-    assert interval([3.0]) == {"mean": 3.0, "half_width": None}
 
 
 def test_the_interval_holds_the_truth_in_95_of_100_sweeps() -> None:
     draws = np.random.default_rng(0).normal(2.0, 1.0, (2000, 5))
-    held = [abs(f["mean"] - 2.0) < f["half_width"] for f in map(interval, draws)]
+    held = [n["low"] < 2.0 < n["high"] for n in map(mean_interval, draws)]
     assert 0.93 < np.mean(held) < 0.97
 
 
 def test_a_seed_counts_once_in_the_table() -> None:
-    beside = [row | {"controller": "pid"} for row in seed_rows(4.0)]
+    beside = [row | {"controller": "pid"} for row in seed_rows(5.0)]
     figures = module.table([seed_rows(1.0), seed_rows(3.0)], beside)
-    assert list(figures) == ["rl", "pid"]
+    assert list(figures) == ["rl", "pid", "rl less pid"]
     for name in ("velocity_error_x", "velocity_error_all"):
-        assert figures["rl"][name] == {"mean": 2.5, "half_width": 12.706205}  # of 1.5 and 3.5
-        assert figures["pid"][name] == {"mean": 4.5, "half_width": None}
+        # two seeds, 1.5 and 3.5: half of 12.7062 x sqrt(2) / sqrt(2) x 2
+        assert figures["rl"][name] == pytest.approx({"mean": 2.5, "low": -10.2062, "high": 15.2062}, abs=1e-4)
+        assert figures["pid"][name] == {"mean": 5.5, "low": None, "high": None}
+        assert figures["rl less pid"][name]["mean"] == -3.0
+        assert figures["rl less pid"][name]["high"] == pytest.approx(12.7062 - 3.0, abs=1e-4)
     assert figures["rl"]["off_axis_drift_max"]["mean"] == 4.0
     lines = module.show(figures).splitlines()
     assert lines[1].startswith("rl ") and "2.5000 +- 12.7062" in lines[1]
-    assert "+-" not in lines[2]
+    assert "+-" not in lines[2] and "-3.0000 +- 12.7062" in lines[3]
+    assert list(module.table([], beside)) == ["pid"]
+
+
+def test_a_table_is_read_for_the_report_and_other_files_are_not(tmp_path: Path) -> None:
+    path = tmp_path / "sweep.json"
+    figures = module.table([seed_rows(1.0), seed_rows(3.0)], [])
+    path.write_text(json.dumps({"table": figures}))
+    assert experiments.read_seeds(path) == figures
+    for text in ("{", "[]", '{"table": {"rl": {"velocity_error_all": {"mean": 1}}}}'):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=r"sweep\.json: expected the sweep\.json of a sweep, got "):
+            experiments.read_seeds(path)
 
 
 def test_a_worker_that_dies_costs_one_retry(tmp_path: Path) -> None:
@@ -197,7 +206,7 @@ def test_a_worker_of_a_cluster_that_dies_costs_one_retry(tmp_path: Path) -> None
 @pytest.mark.slow
 def test_a_sweep_in_processes_of_their_own(tmp_path: Path) -> None:
     figures = sweep(BROKK_170, NET, TASK, TINY, [0, 1], tmp_path, 1)
-    assert figures["rl"]["velocity_error_all"]["half_width"] >= 0
+    assert figures["rl"]["velocity_error_all"]["high"] >= figures["rl"]["velocity_error_all"]["low"]
     assert (tmp_path / "seed_0.npz").read_bytes() != (tmp_path / "seed_1.npz").read_bytes()
     assert len(list(tmp_path.iterdir())) == 7
 
