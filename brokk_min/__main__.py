@@ -22,7 +22,6 @@ from brokk_min.kinematics import tool_position
 from brokk_min.logs import Log, read_log, write_log
 from brokk_min.machine import BROKK_170, Machine
 from brokk_min.metrics import summary
-from brokk_min.mpc import PerfectModel
 from brokk_min.policy import PolicyController, load_policy
 from brokk_min.report import VERDICTS
 from brokk_min.sequences import (
@@ -299,7 +298,7 @@ class Evaluate(Command):
         else:
             controllers |= experiments.tuned_baselines(machine, policy.net, effort, self.seed)[0]
         if self.perfect_model:
-            controllers["perfect_model"] = PerfectModel(machine, starts)
+            controllers |= experiments.bounds(machine, starts)
         moves = policy.net if self.plant == "net" else None
         runs, _ = experiments.task_space(machine, controllers, sequences, starts, self.seed, moves)
         if self.json:

@@ -27,6 +27,7 @@ RECIPES = (
 )
 Part = tuple[Any, ...]  # title, sentence, contents: see `figures.write_report`
 UNITS = {"velocity": "m/s", "off": "m", "position": "m", "settling": "s", "time": "s", "jerk": "m/s^3"}
+BOUNDS = ("perfect_model", "perfect_model_no_dither")  # of `experiments.bounds`
 UNITS |= {"valve": "full strokes", "reward": "1"}  # of the figures of `metrics`, by their first word
 
 
@@ -40,9 +41,10 @@ def found(results: Mapping[str, Any]) -> Part:
     error = "velocity_error_mean"
     means = {name: rows["all"][error] for name, rows in results["task_space"]["summary"].items()}
     said = ", ".join(f"{name} {mean:.4f}" for name, mean in means.items() if mean is not None)
-    bound = results["regret"]["summary"]["perfect_model"]["all"][error]
+    bound, idle = (results["regret"]["summary"][name]["all"][error] for name in BOUNDS)
     text = f"Mean velocity error of the tool over all sequences [m/s]: {said}. A controller that has the "
-    text += f"plant's equations and state is left with {bound:.4f} (along x, y and z alone)."
+    text += f"plant's equations and state is left with {bound:.4f} (along x, y and z alone), or with "
+    text += f"{idle:.4f} if it leaves valves idle while the tool is to stand still."
     rows = {claim["paper"]: {"what the paper says": VERDICTS[claim["holds"]]} for claim in results["claims"]}
     return "What was found", text, rows
 
@@ -176,8 +178,12 @@ def _tables(results: Mapping[str, Any], last: str) -> list[Part]:
     }
     kinds = {f"{c}, {kind}": row for kind, rows in task["by_kind"].items() for c, row in rows.items()}
     kinds = _with_units(kinds)
-    bound = results["regret"]["summary"]["perfect_model"]
-    scale = {"perfect_model (its error)": {s: row["velocity_error_mean"] for s, row in bound.items()}}
+    every = {name: results["regret"]["summary"][name] for name in BOUNDS}
+    scale = {
+        f"{name} (its error)": {s: row["velocity_error_mean"] for s, row in rows.items()}
+        | {"valve travel": rows["all"]["valve_travel"]}
+        for name, rows in every.items()
+    }
     regrets = scale | {c: {s: _with_interval(n) for s, n in rows.items()} for c, rows in less.items()}
     robust: dict[str, dict[str, str]] = {}
     for variation, of in results["robustness"].items():

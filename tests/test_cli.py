@@ -221,7 +221,8 @@ def test_collect_fit_train_resume_evaluate(tmp_path: Path, capsys: pytest.Captur
     bound = ["--commands", commands, "--starts", starts, "--perfect-model", "--json", where]
     assert run("evaluate", "--policy", policy, *bound) == 0
     runs = json.loads(where.read_text())["runs"]
-    assert min(runs, key=lambda r: r["velocity_error_mean"])["controller"] == "perfect_model"
+    best = sorted(runs, key=lambda r: r["velocity_error_mean"])[:2]  # awake valves answer sooner
+    assert [run["controller"] for run in best] == ["perfect_model", "perfect_model_no_dither"]
     starts.write_text("q1,q2,q3,q4,q5\n0,0,-0.3,2.5,1.2\n")
     capsys.readouterr()
     assert run("evaluate", "--policy", policy, "--starts", starts) == 1
