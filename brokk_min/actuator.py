@@ -117,7 +117,7 @@ def sine_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Arra
     """One sine of random amplitude (dead zone to limit) and frequency, (ticks,). Paper: Sec. 3.3."""
     amplitude = rng.uniform(machine.dead_zone, machine.pwm_limit / PWM_MAX)
     frequency, phase = rng.uniform(0.02, 0.5), rng.uniform(0, 2 * np.pi)
-    return amplitude * np.sin(2 * np.pi * frequency * machine.dt * np.arange(ticks) + phase)
+    return np.asarray(amplitude * np.sin(2 * np.pi * frequency * machine.dt * np.arange(ticks) + phase))
 
 
 def rich_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Array:
@@ -389,7 +389,7 @@ class ActuatorNet:
 _NET_ARRAYS = ("input_mean", "input_scale", "output_low", "output_high", "q_low", "q_high")
 
 
-def net_arrays(net: ActuatorNet) -> dict[str, NDArray[Any]]:
+def net_arrays(net: ActuatorNet) -> dict[str, Any]:
     """Nets as named arrays, a JSON header among them: what a file holds."""
     plain = {f.name: getattr(net, f.name) for f in fields(net) if f.name not in (*_NET_ARRAYS, "weights")}
     text = json.dumps({"format": FORMAT, "kind": "actuator net", **plain})
@@ -420,7 +420,7 @@ def net_from_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> ActuatorNet:
 def save_net(path: Path, net: ActuatorNet) -> None:
     """Write nets as one `.npz`: weights plus a JSON header."""
     with whole_file(path) as file:
-        np.savez(file, **net_arrays(net))  # type: ignore[arg-type]
+        np.savez(file, **net_arrays(net))
 
 
 def load_net(path: Path) -> ActuatorNet:
@@ -668,7 +668,7 @@ class LinearModel(ActuatorNet):
         x = history.reshape(*history.shape[:-2], -1)
         slope, offset = self.weights
         velocity = (((x - self.input_mean) / self.input_scale) * slope).sum(axis=-1) + offset
-        return np.clip(velocity, self.output_low, self.output_high)
+        return np.asarray(np.clip(velocity, self.output_low, self.output_high))
 
 
 def fit_linear(net: ActuatorNet, log: Log, penalty: float = 1e-3) -> LinearModel:

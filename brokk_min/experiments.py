@@ -87,7 +87,7 @@ def tuned_baselines(
         wanted, rng = np.tile(goals, (1, candidates, 1)), np.random.default_rng(seed)
         trace = rollout(machine, batch, np.tile(start, (candidates, 1)), wanted, TaskConfig(), rng)
         error = np.linalg.norm(wanted - trace.v_tool, axis=-1)
-        return error.mean(0).reshape(candidates, runs).mean(1)
+        return np.asarray(error.mean(0).reshape(candidates, runs).mean(1))
 
     tuned, how = {}, {}
     for name, controller in baselines(machine, net).items():

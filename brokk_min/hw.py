@@ -177,7 +177,7 @@ def shape_axis(axis: ArrayLike, dead: float = 0.12, expo: float = 0.6) -> Array:
     """
     axis = np.asarray(axis, float)
     s = np.sign(axis) * np.maximum(0.0, np.abs(axis) - dead) / (1 - dead)
-    return (1 - expo) * s + expo * s**3
+    return np.asarray((1 - expo) * s + expo * s**3)
 
 
 # --- the loop ---------------------------------------------------------------------------------------

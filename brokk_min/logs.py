@@ -92,7 +92,7 @@ def write_log(path: Path, log: Log) -> None:
         raise ValueError(f"{path}: expected at least one recording to write, got none")
     names = [recording.name for recording in log.recordings]
     lengths = [len(recording.u) for recording in log.recordings]
-    columns: dict[str, NDArray[Any]] = {
+    columns: dict[str, Any] = {
         "run": np.repeat(names, lengths),
         "time": np.concatenate([np.arange(length) / RATE for length in lengths]),
     }
@@ -102,7 +102,7 @@ def write_log(path: Path, log: Log) -> None:
         columns |= {f"{kind}_{name}": values[:, i] for i, name in enumerate(log.joints)}
     if path.suffix == ".npz":
         with whole_file(path) as file:
-            np.savez_compressed(file, **columns)  # type: ignore[arg-type]
+            np.savez_compressed(file, **columns)
     elif path.suffix == ".csv":
         with whole_file(path, "w") as file:
             writer = csv.writer(file, lineterminator="\n")

@@ -10,6 +10,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
+import math
 import sys
 import time
 from dataclasses import asdict, dataclass, fields
@@ -105,7 +106,7 @@ class Agent(nn.Module):
 def log_probability(action: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
     """Log-density (...) of actions (..., a) under independent normals."""
     z = (action - mean) * torch.exp(-log_std)
-    return -0.5 * (z * z).sum(-1) - log_std.sum() - 0.5 * action.shape[-1] * np.log(2 * np.pi)
+    return -0.5 * (z * z).sum(-1) - log_std.sum() - 0.5 * action.shape[-1] * math.log(2 * math.pi)
 
 
 def gae(
@@ -201,8 +202,8 @@ class Training:
         self.generator = torch.Generator().manual_seed(seed)
         with torch.random.fork_rng():
             torch.manual_seed(seed)
-            shapes = env.single_observation_space.shape, env.single_action_space.shape
-            self.agent = Agent(shapes[0][0], shapes[1][0], config.log_std)  # type: ignore[index]
+            sizes = len(observation_scale(env.machine)[0]), len(env.machine.driven)
+            self.agent = Agent(*sizes, config.log_std)
         self.optimizer = torch.optim.Adam(self.agent.parameters(), lr=config.learning_rate, fused=True)
         self.updates, self.learning_rate = 0, config.learning_rate
         self.returns, self.lengths = (np.zeros(config.num_envs) for _ in range(2))  # of running episodes

@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -170,10 +170,11 @@ def write_film(path: Path, machine: Machine, runs: Sequence[Run], size: tuple[in
         try:
             with logs.whole_file(path) as file:
                 command = ["ffmpeg", "-loglevel", "error", *form.split()]
-                with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=file) as process:
-                    for image in images:
-                        process.stdin.write(image.tobytes())  # type: ignore[union-attr]
-                    process.stdin.close()  # type: ignore[union-attr]
+                with (
+                    subprocess.Popen(command, stdin=subprocess.PIPE, stdout=file) as process,
+                    cast(IO[bytes], process.stdin) as pipe,
+                ):
+                    pipe.writelines(image.tobytes() for image in images)
                 if process.returncode:
                     raise ValueError(f"{path}: expected ffmpeg to write it, got status {process.returncode}")
         except FileNotFoundError as error:
