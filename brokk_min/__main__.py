@@ -151,8 +151,8 @@ class Fit:
     test: tuple[Path, ...] = ()  # Logs to score on; without them every tenth recording of LOGS is held out.
     json: Path | None = None  # Also write the scores here.
     figure: Path | None = None  # Also draw free runs of the worst and the median recording here, .png.
-    machine: Name = ""  # Whose nets these are; by default the Brokk's if its joints are those of LOGS.
-    velocity_samples: int = BROKK_170.velocity_samples  # Window of the velocity estimator at 20 Hz.
+    machine: Name = ""  # Whose nets, at its rate; by default the Brokk's if its joints are those of LOGS.
+    velocity_samples: int = BROKK_170.velocity_samples  # Window of the velocity estimator.
     paper: bool = False  # The paper's own recipe: errors of one step alone, no noise.
     settings: tyro.conf.OmitArgPrefixes[FitConfig] = field(default_factory=FitConfig)  # The fit.
     seed: int = 0  # Of everything random.
@@ -164,8 +164,9 @@ class Fit:
         machine = check(self, self.out, self.json, self.figure)
         if self.velocity_samples > self.settings.history:
             raise WrongUse(f"--velocity-samples: expected at most --history, got {self.velocity_samples}")
-        log = read_log(self.logs, self.velocity_samples)
-        log, test = (log, read_log(self.test, self.velocity_samples, log.joints)) if self.test else split(log)
+        log = read_log(self.logs, self.velocity_samples, rate=machine.rate)
+        unseen = (self.test, self.velocity_samples, log.joints, log.rate)
+        log, test = (log, read_log(*unseen)) if self.test else split(log)
         known = machine if machine.names == log.joints else None
         if self.machine and not known:
             raise ValueError(f"LOGS: expected joints of --machine {self.machine}, got {list(log.joints)}")

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
-from brokk_min.logs import RATE, RETURN, Log, Recording, load_arrays, velocity_of, whole_file
+from brokk_min.logs import RETURN, Log, Recording, load_arrays, velocity_of, whole_file
 from brokk_min.machine import PWM_MAX, Machine, estimate_velocity, limit_command, read_encoder
 
 Array = NDArray[np.floating[Any]]
@@ -177,7 +177,7 @@ class _Recorder:
         """Ticks `start` to `end` of one row, with estimated velocities."""
         end = len(self.u) if end is None else end
         u, q = (np.array([tick[row] for tick in tape[start:end]]) for tape in (self.u, self.q))
-        return Recording(name, u, q, velocity_of(q, self.machine.velocity_samples))
+        return Recording(name, u, q, velocity_of(q, self.machine.velocity_samples, self.machine.rate))
 
 
 def collect(
@@ -192,8 +192,6 @@ def collect(
     """
     if excitation not in EXCITATIONS:
         raise ValueError(f"excitation: expected one of {list(EXCITATIONS)}, got {excitation!r}")
-    if machine.rate != RATE:
-        raise ValueError(f"rate: expected {RATE:g} Hz as in every log, got {machine.rate:g} Hz")
     if not 0 < hours < np.inf:
         raise ValueError(f"hours: expected above 0, got {hours}")
     wanted = max(machine.history + 2, round(hours * 3600 * machine.rate))  # samples of each joint
@@ -211,7 +209,8 @@ def collect(
                     recordings[j].append(recorder.recording(name + RETURN, row, back[row], home[row]))
                     counted[j] += leg
                     bar.update(leg)
-    return Log(machine.names, tuple(r for of_joint in recordings for r in of_joint))
+    kept = tuple(recording for of_joint in recordings for recording in of_joint)
+    return Log(machine.names, kept, rate=machine.rate)
 
 
 def _drive_legs(
@@ -479,7 +478,7 @@ def fit(log: Log, config: FitConfig, seed: int, velocity_samples: int, machine: 
     return ActuatorNet(
         joints=log.joints,
         history=config.history,
-        rate=RATE,
+        rate=log.rate,
         velocity_samples=velocity_samples,
         velocity_logged=log.velocity_logged,
         machine=machine,
@@ -575,9 +574,11 @@ def _rollout_loss(
         loss = loss + (off**2).mean(dim=1).sum() / ticks
         if k + 1 < ticks:
             velocity = (low[:, None] + (high - low)[:, None] * y)[..., None]
-            q = torch.cat([q[..., 1:], q[..., -1:] + velocity / RATE], dim=-1)
+            q = torch.cat([q[..., 1:], q[..., -1:] + velocity / training.rate], dim=-1)
             if estimator:
-                slope = torch.tensor(estimate_velocity(np.eye(estimator), estimator, 1 / RATE)).float()
+                slope = torch.tensor(
+                    estimate_velocity(np.eye(estimator), estimator, 1 / training.rate)
+                ).float()
                 velocity = (q[..., -estimator:] * slope).sum(dim=-1, keepdim=True)
             q_dot = torch.cat([q_dot[..., 1:], velocity], dim=-1)
     return loss
@@ -596,6 +597,7 @@ class TrainingSet(NamedTuple):
     q_low: Array  # (n,) rad
     q_high: Array  # (n,) rad
     far_ends: list[NDArray[np.intp]]  # as `ends`, with `rollout` samples after them
+    rate: float  # of the samples [Hz]
 
 
 def training_set(log: Log, history: int, rollout: int = 1) -> TrainingSet:
@@ -622,7 +624,7 @@ def training_set(log: Log, history: int, rollout: int = 1) -> TrainingSet:
     low, high = low - 0.05 * (high - low), high + 0.05 * (high - low)
     mean, scale = np.repeat(mean, history, axis=1), np.repeat(scale, history, axis=1)
     ranges = samples.whole.q.min(axis=0), samples.whole.q.max(axis=0)
-    return TrainingSet(series, samples.target, ends, mean, scale, low, high, *ranges, far_ends)
+    return TrainingSet(series, samples.target, ends, mean, scale, low, high, *ranges, far_ends, log.rate)
 
 
 class Samples(NamedTuple):
@@ -651,7 +653,7 @@ def end_to_end(log: Log) -> Samples:
     if log.velocity_logged:
         target = np.roll(whole.q_dot, -1, axis=0)
     else:
-        target = np.diff(whole.q, axis=0, append=0) * RATE
+        target = np.diff(whole.q, axis=0, append=0) * log.rate
     lengths = [len(r.q) for r in log.recordings]
     moves = [np.ptp(r.u, axis=0) + np.ptp(r.q, axis=0) > 0 for r in log.recordings]
     return Samples(whole, target, np.repeat(moves, lengths, axis=0), lengths)
@@ -738,6 +740,8 @@ def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
     """
     if log.joints != net.joints:
         raise ValueError(f"joints: expected {list(net.joints)}, got {list(log.joints)}")
+    if log.rate != net.rate:
+        raise ValueError(f"rate: expected {net.rate:g} Hz, got {log.rate:g} Hz")
     if log.velocity_logged != net.velocity_logged:
         raise ValueError(f"velocity_logged: expected {net.velocity_logged}, got {log.velocity_logged}")
     samples = end_to_end(log)
@@ -833,4 +837,6 @@ def task_log(
         command = command + smoothing * (level - command)
         jitter = noise * rng.standard_normal(shape) * (level != 0)
         recorder.play(moving * (command + jitter))
-    return Log(machine.names, tuple(recorder.recording(f"task_{i:02d}", i) for i in range(runs)))
+    return Log(
+        machine.names, tuple(recorder.recording(f"task_{i:02d}", i) for i in range(runs)), rate=machine.rate
+    )

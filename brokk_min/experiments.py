@@ -320,9 +320,9 @@ def driven_log(machine: Machine, traces: Traces, controller: str, runs: int = 16
     for (name, sequence), trace in traces.items():
         for i in range(min(runs, trace.q.shape[1]) * (name == controller)):
             u, q = trace.u[:, i].astype(float), trace.q_measured[:, i].astype(float)
-            velocity = logs.velocity_of(q, machine.velocity_samples)
+            velocity = logs.velocity_of(q, machine.velocity_samples, machine.rate)
             recordings.append(logs.Recording(f"{name}_{sequence}_{i:02d}", u, q, velocity))
-    return logs.Log(machine.names, tuple(recordings))
+    return logs.Log(machine.names, tuple(recordings), rate=machine.rate)
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -356,7 +356,7 @@ def reproduce(machine: Machine, out: Path, effort: Effort, seed: int) -> dict[st
     logs.write_log(files[0], actuator.collect(machine, effort.hours, "rich", rng(seed)))
     logs.write_log(files[1], actuator.task_log(machine, 20, 40.0, rng(seed + 1)))
     lap("record")
-    log, test = (logs.read_log([file], machine.velocity_samples) for file in files)
+    log, test = (logs.read_log([file], machine.velocity_samples, rate=machine.rate) for file in files)
     config = actuator.FitConfig(steps=effort.fit_steps, history=machine.history)
     net = actuator.fit(log, config, seed, machine.velocity_samples, machine.name)
     actuator.save_net(out / "net.npz", net)

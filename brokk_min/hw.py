@@ -483,8 +483,8 @@ def driven_log(machine: Machine, frames: Iterable[Frame]) -> Log:
         if len(part) > machine.history + 1:
             u, q = map(np.array, zip(*part, strict=True))
             recordings.append(
-                Recording(f"drive_{number:03d}", u, q, velocity_of(q, machine.velocity_samples))
+                Recording(f"drive_{number:03d}", u, q, velocity_of(q, machine.velocity_samples, machine.rate))
             )
     if not recordings:
         raise ValueError(f"log: expected more than {machine.history + 1} ticks of driving in a row, got none")
-    return Log(machine.names, tuple(recordings))
+    return Log(machine.names, tuple(recordings), rate=machine.rate)
