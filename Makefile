@@ -5,14 +5,19 @@ OUT ?= $(if $(QUICK),results-quick,results)
 RUN := .venv/bin/python -m
 QUICK ?=
 
-.PHONY: reproduce test lint bench clean
+.PHONY: reproduce test check lint bench clean
 .DELETE_ON_ERROR:
 
 reproduce: .venv/installed
 	$(RUN) brokk_min reproduce --out "$(OUT)" $(if $(QUICK),--quick)
 
-test: .venv/installed-dev lint
-	$(RUN) pytest
+test: lint check
+
+check: .venv/installed-dev
+	$(RUN) coverage erase
+	$(RUN) coverage run -m pytest
+	$(RUN) coverage combine --quiet
+	$(RUN) coverage report
 
 lint: .venv/installed-dev
 	$(RUN) ruff check .
@@ -34,4 +39,4 @@ bench: .venv/installed-dev
 	touch .venv/installed .venv/installed-dev
 
 clean:
-	rm -rf .venv results results-quick .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv .coverage* results results-quick .mypy_cache .ruff_cache .pytest_cache .hypothesis

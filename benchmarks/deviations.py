@@ -1,19 +1,27 @@
-"""What the deviations and assumptions of PAPER.md change, as far as it can be measured without training.
+"""What the deviations and assumptions of PAPER.md change, measured.
 
-Each function returns the figures of one entry; `python -m benchmarks.deviations` prints them all.
+Each function returns the figures of one entry; `python -m benchmarks.deviations` prints them. D4, D5, D7, A4
+and A5 fit nets and train policies: `python -m benchmarks.deviations --train`, some 15 minutes on a core.
 """
 
 from __future__ import annotations
 
+import sys
+import tempfile
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from unittest import mock
 
 import numpy as np
 
-from brokk_min import jacobian, kinematics, machine, sequences
+from brokk_min import actuator, env, experiments, jacobian, kinematics, logs, machine, preliminary, sequences
+from brokk_min.__main__ import SHIPPED
 from brokk_min.env import TaskConfig, TaskVectorEnv, rollout, terminated
 from brokk_min.jacobian import JacobianController
 from brokk_min.machine import BROKK_170
+from brokk_min.policy import PolicyController, load_policy
 
 M = BROKK_170
 LOW, HIGH = M.column("q_min"), M.column("q_max")
@@ -104,14 +112,95 @@ def a11() -> dict[str, float]:
     return {"open": error(GAINS, 0.05), "idle": error(GAINS | {"ready": 0.0}, 0.05)}
 
 
+# --- by fitting and training --------------------------------------------------------------------------
+
+NOISE = actuator.FitConfig().noise
+STEPS = 2_000_000  # of each training here, a third of the default
+
+
+@cache
+def fitted(excitation: str, noise: float, seed: int) -> dict[str, float]:
+    """Nets of the driven joints fitted to 1 h a joint, on drives like a policy's: the worst joint."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "log.npz"
+        logs.write_log(path, actuator.collect(M, 1.0, excitation, np.random.default_rng(seed)))
+        log = logs.read_log([path], M.velocity_samples)
+    net = actuator.fit(log, actuator.FitConfig(noise=noise), seed, M.velocity_samples, M.name)
+    test = actuator.task_log(M, 20, 40.0, np.random.default_rng(seed + 1))
+    verdict = preliminary.judge(net, log, test, M)
+    rows = [verdict["joints"][M.names[i]] for i in M.driven]
+    return {
+        "10 s [rad/s]": max(row["free_run"]["10"]["velocity_rmse"] for row in rows),
+        "creep [rad/s]": max(row["creep"] for row in rows),
+        "warnings": len(verdict["warnings"]),
+    }
+
+
+def trained(task: TaskConfig) -> dict[str, float]:
+    """A policy trained on the package's nets, on nets and plant: error [m/s] along x, y, z, valve travel."""
+    from brokk_min.ppo import PPOConfig, train
+
+    net = load_policy(SHIPPED / M.name / "policy.npz", M).net
+    with tempfile.TemporaryDirectory() as folder:
+        config = PPOConfig(total_steps=STEPS, threads=1)
+        policy = train(M, net, task, config, 0, Path(folder) / "policy.npz")
+    axes, controller = sequences.axis_sequences(M), {"rl": PolicyController(M, policy)}
+    starts = sequences.scored_starts(M, 32, sequences.task_sequences(M), 2)
+    result = {}
+    for name, moves in (("nets", net), ("plant", None)):
+        runs, _ = experiments.task_space(M, controller, axes, starts, 0, moves)
+        for key in ("velocity_error_mean", "valve_travel"):
+            result[f"{name}, {key}"] = float(np.mean([run[key] for run in runs]))
+    return result
+
+
+def beside(**ways: dict[str, float]) -> dict[str, float]:
+    """Figures of several ways under one roof."""
+    return {f"{way}, {name}": value for way, of in ways.items() for name, value in of.items()}
+
+
+@cache
+def as_it_is() -> dict[str, float]:
+    """The training that the others are compared with."""
+    return trained(TaskConfig())
+
+
+def d4() -> dict[str, float]:
+    """Nets fitted with noise on their velocity inputs and without, seeds 0 and 1."""
+    ways = {f"noise {n}, seed {s}": fitted("rich", n, s) for s in (0, 1) for n in (NOISE, 0.0)}
+    return beside(**ways)
+
+
+def a4() -> dict[str, float]:
+    """Nets fitted to rich excitation and to sines."""
+    return beside(rich=fitted("rich", NOISE, 0), sine=fitted("sine", NOISE, 0))
+
+
+def d5() -> dict[str, float]:
+    """Policies trained with a cost of moving the valves and without."""
+    return beside(ours=as_it_is(), **{"no cost": trained(TaskConfig(valve_cost=0.0))})
+
+
+def d7() -> dict[str, float]:
+    """A policy that sees what the paper's does, without a cost of moving the valves: compare with D5's."""
+    return trained(TaskConfig(paper=True))
+
+
+def a5() -> dict[str, float]:
+    """A policy that sees velocities in the base frame instead of along the tool's heading."""
+    with mock.patch.object(env, "_turn", lambda p_tool, vector, sign: vector.copy()):
+        return beside(**{"base frame": trained(TaskConfig()), "heading": as_it_is()})
+
+
 ENTRIES: tuple[Callable[[], dict[str, float]], ...] = (a1, d1, d3, d6, a6, a7, a9, a11)
+TRAINED: tuple[Callable[[], dict[str, float]], ...] = (d4, a4, d5, d7, a5)
 
 
 def main() -> None:
-    """Print all figures."""
-    for entry in ENTRIES:
+    """Print all figures, or with `--train` those that need it."""
+    for entry in TRAINED if "--train" in sys.argv[1:] else ENTRIES:
         figures = ", ".join(f"{name} {value:.4g}" for name, value in entry().items())
-        print(f"{entry.__name__.upper():4} {entry.__doc__}\n     {figures}")
+        print(f"{entry.__name__.upper():4} {entry.__doc__}\n     {figures}", flush=True)
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
+from numpy.typing import NDArray
 
 from brokk_min import experiments, figures, hw, play, preliminary, remote, replay, view
 from brokk_min.actuator import PAPER_RECIPE, FitConfig, collect, fit, load_net, save_net
@@ -25,6 +26,7 @@ from brokk_min.metrics import summary
 from brokk_min.policy import PolicyController, load_policy
 from brokk_min.report import VERDICTS
 from brokk_min.sequences import (
+    Commands,
     draw_starts,
     read_commands,
     read_starts,
@@ -65,8 +67,8 @@ ALLOWED: tuple[tuple[float, float, str], ...] = (
 )
 
 
-def check(command: Any, *outputs: Path | None) -> None:
-    """Refuse options that cannot be meant and outputs that cannot be written, before any work."""
+def check(command: Any, *outputs: Path | None) -> Machine:
+    """Refuse options that cannot be meant and outputs that cannot be written; the machine."""
     given = {**vars(getattr(command, "settings", None) or command), **vars(command)}
     given |= vars(command.task) if hasattr(command, "task") else {}
     for low, high, names in ALLOWED:
@@ -76,12 +78,11 @@ def check(command: Any, *outputs: Path | None) -> None:
                 raise WrongUse(f"--{option}: expected {low} to {high}, got {given[name]}")
     if given.get("hold_min_s", 0) > given.get("hold_max_s", 0):
         raise WrongUse(f"--hold-max-s: expected --hold-min-s or more, got {given['hold_max_s']}")
-    name = given.get("machine") or BROKK_170.name
-    if name not in MACHINES:
-        MACHINES[name] = machine_from(name)
+    machine = MACHINES.get(command.machine or BROKK_170.name) or machine_from(command.machine)
     for path in outputs:
         if path and (path.is_dir() or not os.access(path.parent, os.W_OK)):
             raise WrongUse(f"{path}: expected a file in an existing, writable directory")
+    return machine
 
 
 def machine_from(name: str) -> Machine:
@@ -96,6 +97,22 @@ def machine_from(name: str) -> Machine:
     if not isinstance(machine, Machine):
         raise WrongUse(f"--machine: expected a Machine {symbol} in {path}, got {machine!r}")
     return machine
+
+
+def chosen_policy(machine: Machine, policy: Path | None, gains: Path | None) -> tuple[Path, Path | None]:
+    """The policy file, by default the package's; tuned gains, by default beside it (None: no file there)."""
+    path = policy or SHIPPED / machine.name / "policy.npz"
+    beside = path.with_name("gains.json")
+    return path, gains or (beside if beside.exists() else None)
+
+
+def goals_and_starts(
+    machine: Machine, commands: Path | None, starts: Path | None, num: int, seed: int
+) -> tuple[list[Commands], NDArray[np.floating]]:
+    """Velocity sequences and start poses of files, or where there is none the machine's own."""
+    own = task_sequences(machine)
+    poses = read_starts(starts, machine) if starts else scored_starts(machine, num, own, seed + 2)
+    return read_commands(commands, machine) if commands else own, poses
 
 
 @dataclass(kw_only=True)
@@ -116,11 +133,10 @@ class Collect(Command):
 
     def run(self) -> None:
         """Write the log."""
-        check(self, self.out)
+        machine = check(self, self.out)
         if self.out.suffix not in (".csv", ".npz"):
             raise WrongUse(f"--out: expected a name ending in .csv or .npz, got {self.out}")
-        rng = np.random.default_rng(self.seed)
-        log = collect(MACHINES[self.machine], self.hours, self.excitation, rng)
+        log = collect(machine, self.hours, self.excitation, np.random.default_rng(self.seed))
         write_log(self.out, log)
         print(f"{self.out}: {len(log.recordings)} recordings of {', '.join(log.joints)}")
 
@@ -134,8 +150,8 @@ class Fit:
     test: tuple[Path, ...] = ()  # Logs to score on; without them every tenth recording of LOGS is held out.
     json: Path | None = None  # Also write the scores here.
     figure: Path | None = None  # Also draw free runs of the worst and the median recording here, .png.
-    machine: Name = ""  # Whose nets these are; by default the machine that has the joints of LOGS.
-    velocity_samples: int = BROKK_170.velocity_samples  # Window of the velocity estimator at 20 Hz.
+    machine: Name = ""  # Whose nets, at its rate; by default the Brokk's if its joints are those of LOGS.
+    velocity_samples: int = BROKK_170.velocity_samples  # Window of the velocity estimator.
     paper: bool = False  # The paper's own recipe: errors of one step alone, no noise.
     settings: tyro.conf.OmitArgPrefixes[FitConfig] = field(default_factory=FitConfig)  # The fit.
     seed: int = 0  # Of everything random.
@@ -144,19 +160,18 @@ class Fit:
         """Fit, judge, write."""
         if not self.logs:
             raise WrongUse("LOGS: expected at least one log, got none")
-        check(self, self.out, self.json, self.figure)
+        machine = check(self, self.out, self.json, self.figure)
         if self.velocity_samples > self.settings.history:
             raise WrongUse(f"--velocity-samples: expected at most --history, got {self.velocity_samples}")
-        log = read_log(self.logs, self.velocity_samples)
-        log, test = (log, read_log(self.test, self.velocity_samples, log.joints)) if self.test else split(log)
-        chosen = [MACHINES[self.machine]] if self.machine else MACHINES.values()
-        known = [machine for machine in chosen if machine.names == log.joints]
+        log = read_log(self.logs, self.velocity_samples, rate=machine.rate)
+        unseen = (self.test, self.velocity_samples, log.joints, log.rate)
+        log, test = (log, read_log(*unseen)) if self.test else split(log)
+        known = machine if machine.names == log.joints else None
         if self.machine and not known:
             raise ValueError(f"LOGS: expected joints of --machine {self.machine}, got {list(log.joints)}")
-        name = known[0].name if len({machine.name for machine in known}) == 1 else ""
         settings = replace(self.settings, **PAPER_RECIPE) if self.paper else self.settings
-        net = fit(log, settings, self.seed, self.velocity_samples, name)
-        verdict = preliminary.judge(net, log, test, known[0] if known else None)
+        net = fit(log, settings, self.seed, self.velocity_samples, known.name if known else "")
+        verdict = preliminary.judge(net, log, test, known)
         save_net(self.out, net)
         if self.json:
             meta: dict[str, Any] = {"seed": self.seed, "rate": net.rate, "history": net.history}
@@ -205,8 +220,7 @@ def train_command() -> Any:
 
         def run(self) -> None:
             """Train and write the policy."""
-            check(self, self.out)
-            machine = MACHINES[self.machine]
+            machine = check(self, self.out)
             net = fitting_nets(machine, load_net(self.actuator))
             train(machine, net, self.task, self.settings, self.seed, self.out, self.resume, self.tensorboard)
             print(f"{self.out}: trained for {self.settings.total_steps} steps; curve in {self.out}.csv")
@@ -235,8 +249,7 @@ def sweep_command() -> Any:
 
         def run(self) -> None:
             """Sweep and print the table."""
-            check(self)
-            machine = MACHINES[self.machine]
+            machine = check(self)
             net = fitting_nets(machine, load_net(self.actuator))
             seeds = range(self.seed, self.seed + self.seeds)
             of, how = self.settings, (self.poses, self.scheduler, self.gains)
@@ -255,9 +268,7 @@ class Starts(Command):
 
     def run(self) -> None:
         """Draw and write."""
-        check(self, self.out)
-        machine = MACHINES[self.machine]
-        rng = np.random.default_rng(self.seed)
+        machine, rng = check(self, self.out), np.random.default_rng(self.seed)
         write_starts(self.out, machine, draw_starts(machine, task_sequences(machine), self.num, rng))
         print(f"{self.out}: {self.num} start poses")
 
@@ -278,32 +289,27 @@ class Evaluate(Command):
 
     def run(self) -> None:
         """Evaluate and print the means."""
-        check(self, self.json)
+        machine = check(self, self.json)
         if self.perfect_model and self.plant == "net":
             raise WrongUse("--perfect-model: expected --plant analytic, the plant that it knows, got net")
-        machine, effort = MACHINES[self.machine], experiments.Effort()
-        path = self.policy or SHIPPED / machine.name / "policy.npz"
+        path, gains = chosen_policy(machine, self.policy, self.gains)
         policy = load_policy(path, machine)
-        sequences = read_commands(self.commands, machine) if self.commands else task_sequences(machine)
-        if self.starts:
-            starts = read_starts(self.starts, machine)
-        else:
-            starts = scored_starts(machine, self.num_starts, task_sequences(machine), self.seed + 2)
+        sequences, starts = goals_and_starts(machine, self.commands, self.starts, self.num_starts, self.seed)
+        print(f"gains of the baselines: {gains or 'tuned now'}", file=sys.stderr)
         controllers: dict[str, Controller] = {"rl": PolicyController(machine, policy)}
-        beside = path.with_name("gains.json")
-        gains = self.gains or (beside if beside.exists() else "tuned now")
-        print(f"gains of the baselines: {gains}", file=sys.stderr)
-        if isinstance(gains, Path):
+        if gains:
             controllers |= experiments.read_gains(gains, machine, policy.net)
         else:
-            controllers |= experiments.tuned_baselines(machine, policy.net, effort, self.seed)[0]
+            controllers |= experiments.tuned_baselines(machine, policy.net, experiments.Effort(), self.seed)[
+                0
+            ]
         if self.perfect_model:
             controllers |= experiments.bounds(machine, starts)
         moves = policy.net if self.plant == "net" else None
         runs, _ = experiments.task_space(machine, controllers, sequences, starts, self.seed, moves)
         if self.json:
             meta = experiments.meta(machine, self.seed)
-            meta |= {"policy": str(path), "gains": str(gains), "plant": self.plant}
+            meta |= {"policy": str(path), "gains": str(gains or "tuned now"), "plant": self.plant}
             names = ", ".join(sequence.name for sequence in sequences)
             meta |= {"commands": str(self.commands or names), "starts": str(self.starts or self.num_starts)}
             experiments.write_json(self.json, {"meta": meta, "runs": runs})
@@ -326,9 +332,8 @@ class Reproduce(Command):
 
     def run(self) -> None:
         """Run the chain and print the means."""
-        check(self)
         effort = experiments.QUICK if self.quick else experiments.Effort()
-        results = experiments.reproduce(MACHINES[self.machine], self.out, effort, self.seed, self.sweep)
+        results = experiments.reproduce(check(self), self.out, effort, self.seed, self.sweep)
         for name, rows in results["task_space"]["summary"].items():
             errors = ", ".join(f"{s} {row['velocity_error_mean']:.4f}" for s, row in rows.items())
             print(f"{name:20} mean velocity error [m/s]: {errors}")
@@ -346,8 +351,7 @@ class Preliminary(Command):
 
     def run(self) -> None:
         """Measure, draw, write."""
-        check(self)
-        machine, net = MACHINES[self.machine], load_net(self.actuator)
+        machine, net = check(self), load_net(self.actuator)
         numbers = preliminary.run(machine, net, self.seed)
         self.out.mkdir(parents=True, exist_ok=True)
         for name, figure in preliminary.plots(machine, net, self.seed).items():
@@ -366,15 +370,15 @@ class Simulate(Command):
 
     interface: str  # python-can's name of the bus, udp_multicast for a try without hardware.
     channel: str  # Channel of the interface, for udp_multicast 239.74.163.2.
-    start: tuple[float, ...] = (1.5, 0.5, 0.58, 1.71, 1.24)  # Angles at the start [rad].
+    start: tuple[float, ...] = remote.START  # Angles at the start [rad].
     record: Path | None = None
     """Also log command in force and true angles at every step of the plant here, .csv."""
 
     def run(self) -> None:
         """Run until SIGINT or SIGTERM."""
-        check(self, self.record)
+        machine = check(self, self.record)
         print(f"{self.machine} on {self.interface} {self.channel}; Ctrl-C ends it", flush=True)
-        simulate(MACHINES[self.machine], self.start, self.interface, self.channel, self.record)
+        simulate(machine, self.start, self.interface, self.channel, self.record)
 
 
 @dataclass(kw_only=True)
@@ -399,10 +403,10 @@ class Drive(Command):
 
     def run(self) -> None:
         """Drive until the sequences or the operator end it, or compare a log."""
-        check(self, self.log)
+        machine = check(self, self.log)
         if not self.replay and not (self.interface and self.channel):
             raise WrongUse("--interface, --channel: expected a CAN bus, or --replay, got none")
-        machine, controller = MACHINES[self.machine], self._controller()
+        controller = self._controller(machine)
         if self.replay:
             frames = list(read_frames(self.replay))
             same, sent = hw.compare(machine, frames, hw.replay(machine, controller, frames))
@@ -425,8 +429,7 @@ class Drive(Command):
         if isinstance(operator, hw.Script) and not operator.done:
             raise ValueError(f"drive: expected to play all sequences, got {drive.reason or 'a stop'}")
 
-    def _controller(self) -> Controller:
-        machine = MACHINES[self.machine]
+    def _controller(self, machine: Machine) -> Controller:
         if self.controller == "jog":
             driven = [machine.names[i] for i in machine.driven]
             if self.joint not in driven:
@@ -458,8 +461,7 @@ class Convert(Command):
 
     def run(self) -> None:
         """Write the log."""
-        check(self, self.out)
-        log = hw.driven_log(MACHINES[self.machine], read_frames(self.log))
+        log = hw.driven_log(check(self, self.out), read_frames(self.log))
         write_log(self.out, log)
         print(f"{self.out}: {len(log.recordings)} recordings of {', '.join(log.joints)}")
 
@@ -473,8 +475,7 @@ class Export(Command):
 
     def run(self) -> None:
         """Write the file."""
-        check(self, self.out)
-        export_onnx(self.out, load_policy(self.policy, MACHINES[self.machine]))
+        export_onnx(self.out, load_policy(self.policy, check(self, self.out)))
         print(f"{self.out}: observation (batch, obs) in, action (batch, driven joints) out")
 
 
@@ -495,19 +496,17 @@ class Play(Command):
 
     def run(self) -> None:
         """Open the window until it is closed."""
-        check(self, self.attempts, self.log)
+        machine = check(self, self.attempts, self.log)
         if bool(self.interface) != bool(self.channel) or (self.drive and not self.interface):
             raise WrongUse("--interface, --channel: expected both or, without --drive, none")
-        machine = MACHINES[self.machine]
         where = remote.Where(self.interface, self.channel, self.log, self.start)
         if self.interface and not self.drive:
             play.watch(machine, where)
             return
         controllers: dict[str, Controller] = {}
-        path = self.policy or SHIPPED / machine.name / "policy.npz"
+        path, gains = chosen_policy(machine, self.policy, self.gains)
         if self.policy or path.exists():
-            policy, beside = load_policy(path, machine), path.with_name("gains.json")
-            gains = self.gains or (beside if beside.exists() else None)
+            policy = load_policy(path, machine)
             known = experiments.read_gains(gains, machine, policy.net) if gains else None
             known = known or experiments.baselines(machine, policy.net)
             controllers = {"rl": PolicyController(machine, policy), "jacobian": known["jacobian_pid_k0.1"]}
@@ -529,7 +528,7 @@ class Replay(Command):
 
     def run(self) -> None:
         """Open the window until it is closed, or write the film."""
-        check(self, self.out)
+        machine, colours = check(self, self.out), view.COLOURS.values()
         if not 1 <= len(self.logs) <= 2:
             raise WrongUse(f"LOGS: expected one or two, got {len(self.logs)}")
         arms = sum(len(self.controllers) if log.suffix == ".json" else 1 for log in self.logs)
@@ -538,39 +537,37 @@ class Replay(Command):
                 f"--controllers, --size: expected some and {320 * arms} 320 to 4000 4000, "
                 f"got {arms} and {self.size[0]} {self.size[1]}"
             )
-        machine, runs = MACHINES[self.machine], list[replay.Run]()
-        for log, colour in zip(self.logs, view.COLOURS.values(), strict=False):
+        runs = list[replay.Run]()
+        for log, colour in zip(self.logs, colours, strict=False):
             again = log.suffix == ".json"
-            runs += self._driven_again(log) if again else [replay.run_of_log(machine, log, colour)]
+            runs += self._driven_again(machine, log) if again else [replay.run_of_log(machine, log, colour)]
         if self.out:
             replay.write_film(self.out, machine, runs, self.size, self.fps)
         else:
             replay.show_film(machine, runs, self.size)
 
-    def _driven_again(self, path: Path) -> list[replay.Run]:
+    def _driven_again(self, machine: Machine, path: Path) -> list[replay.Run]:
         """Runs of a results file, simulated anew from what it says of itself and compared with its rows."""
         try:
             file = json.loads(path.read_text())
             beside = {"policy": str(path.with_name("policy.npz")), "gains": str(path.with_name("gains.json"))}
             told = beside | {"plant": "analytic", "commands": "", "starts": ""} | file["meta"]
             rows = file.get("task_space", file)["runs"]
-            machine, seed = MACHINES[self.machine], int(told["seed"])
-            starts = np.array(file["starts"]) if "starts" in file else None
+            names, seed = ", ".join(s.name for s in task_sequences(machine)), int(told["seed"])
+            num = int(told["starts"]) if told["starts"].isdigit() else 0
+            given = np.array(file["starts"], float) if "starts" in file else None
         except (OSError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path}: expected results of `evaluate`, got {error!r}") from error
         if told.get("machine") != machine.name:
             raise ValueError(f"{path}: expected --machine {told.get('machine')}, got {self.machine}")
-        policy, sequences = load_policy(Path(told["policy"]), machine), task_sequences(machine)
-        if told["commands"] not in ("", ", ".join(s.name for s in sequences)):
-            sequences = read_commands(Path(told["commands"]), machine)
-        if starts is None and told["starts"].isdigit():
-            starts = scored_starts(machine, int(told["starts"]), task_sequences(machine), seed + 2)
-        elif starts is None:
-            starts = read_starts(Path(told["starts"]), machine)
+        commands = None if told["commands"] in ("", names) else Path(told["commands"])
+        poses = None if num or not told["starts"] else Path(told["starts"])
+        sequences, starts = goals_and_starts(machine, commands, poses, num, seed)
+        starts = starts if given is None else given
+        policy, named = load_policy(Path(told["policy"]), machine), {s.name: s for s in sequences}
         known: dict[str, Controller] = {"rl": PolicyController(machine, policy)}
         if set(self.controllers) - {"rl"}:
             known |= experiments.read_gains(Path(told["gains"]), machine, policy.net)
-        named = {s.name: s for s in sequences}
         sequence = named.get(self.sequence or sequences[0].name)
         if sequence is None or set(self.controllers) - set(known) or not 0 <= self.start < len(starts):
             raise WrongUse(

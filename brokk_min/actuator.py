@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
-from brokk_min.logs import RATE, RETURN, Log, Recording, load_arrays, velocity_of, whole_file
+from brokk_min.logs import RETURN, Log, Recording, load_arrays, velocity_of, whole_file
 from brokk_min.machine import PWM_MAX, Machine, estimate_velocity, limit_command, read_encoder
 
 Array = NDArray[np.floating[Any]]
@@ -117,7 +117,7 @@ def sine_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Arra
     """One sine of random amplitude (dead zone to limit) and frequency, (ticks,). Paper: Sec. 3.3."""
     amplitude = rng.uniform(machine.dead_zone, machine.pwm_limit / PWM_MAX)
     frequency, phase = rng.uniform(0.02, 0.5), rng.uniform(0, 2 * np.pi)
-    return amplitude * np.sin(2 * np.pi * frequency * machine.dt * np.arange(ticks) + phase)
+    return np.asarray(amplitude * np.sin(2 * np.pi * frequency * machine.dt * np.arange(ticks) + phase))
 
 
 def rich_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Array:
@@ -178,7 +178,7 @@ class _Recorder:
         """Ticks `start` to `end` of one row, with estimated velocities."""
         end = len(self.u) if end is None else end
         u, q = (np.array([tick[row] for tick in tape[start:end]]) for tape in (self.u, self.q))
-        return Recording(name, u, q, velocity_of(q, self.machine.velocity_samples))
+        return Recording(name, u, q, velocity_of(q, self.machine.velocity_samples, self.machine.rate))
 
 
 def collect(
@@ -193,8 +193,6 @@ def collect(
     """
     if excitation not in EXCITATIONS:
         raise ValueError(f"excitation: expected one of {list(EXCITATIONS)}, got {excitation!r}")
-    if machine.rate != RATE:
-        raise ValueError(f"rate: expected {RATE:g} Hz as in every log, got {machine.rate:g} Hz")
     if not 0 < hours < np.inf:
         raise ValueError(f"hours: expected above 0, got {hours}")
     wanted = max(machine.history + 2, round(hours * 3600 * machine.rate))  # samples of each joint
@@ -212,7 +210,8 @@ def collect(
                     recordings[j].append(recorder.recording(name + RETURN, row, back[row], home[row]))
                     counted[j] += leg
                     bar.update(leg)
-    return Log(machine.names, tuple(r for of_joint in recordings for r in of_joint))
+    kept = tuple(recording for of_joint in recordings for recording in of_joint)
+    return Log(machine.names, kept, rate=machine.rate)
 
 
 def _drive_legs(
@@ -402,7 +401,7 @@ class ActuatorNet:
 _NET_ARRAYS = ("input_mean", "input_scale", "output_low", "output_high", "q_low", "q_high")
 
 
-def net_arrays(net: ActuatorNet) -> dict[str, NDArray[Any]]:
+def net_arrays(net: ActuatorNet) -> dict[str, Any]:
     """Nets as named arrays, a JSON header among them: what a file holds."""
     plain = {f.name: getattr(net, f.name) for f in fields(net) if f.name not in (*_NET_ARRAYS, "weights")}
     text = json.dumps({"format": FORMAT, "kind": "actuator net", **plain})
@@ -433,7 +432,7 @@ def net_from_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> ActuatorNet:
 def save_net(path: Path, net: ActuatorNet) -> None:
     """Write nets as one `.npz`: weights plus a JSON header."""
     with whole_file(path) as file:
-        np.savez(file, **net_arrays(net))  # type: ignore[arg-type]
+        np.savez(file, **net_arrays(net))
 
 
 def load_net(path: Path) -> ActuatorNet:
@@ -493,7 +492,7 @@ def fit(log: Log, config: FitConfig, seed: int, velocity_samples: int, machine: 
     return ActuatorNet(
         joints=log.joints,
         history=config.history,
-        rate=RATE,
+        rate=log.rate,
         velocity_samples=velocity_samples,
         velocity_logged=log.velocity_logged,
         machine=machine,
@@ -585,14 +584,15 @@ def _rollout_loss(
         for i in (0, 2):
             x = torch.relu(torch.baddbmm(weights[i + 1][:, None], x, weights[i]))
         y = torch.sigmoid(torch.baddbmm(weights[5][:, None], x, weights[4]))[..., 0]
-        room = [(stop - q[..., -1]) * RATE for stop in stops]
+        room = [(stop - q[..., -1]) * training.rate for stop in stops]
         velocity = torch.clamp(low[:, None] + (high - low)[:, None] * y, *room)
         off = off + (velocity - target[at + k]) / (high - low)[:, None]
         loss = loss + (off**2).mean(dim=1).sum() / ticks
         if k + 1 < ticks:
-            q = torch.cat([q[..., 1:], (q[..., -1] + velocity / RATE)[..., None]], dim=-1)
+            q = torch.cat([q[..., 1:], (q[..., -1] + velocity / training.rate)[..., None]], dim=-1)
             if estimator:
-                slope = torch.tensor(estimate_velocity(np.eye(estimator), estimator, 1 / RATE)).float()
+                eye, dt = np.eye(estimator), 1 / training.rate
+                slope = torch.tensor(estimate_velocity(eye, estimator, dt)).float()
                 velocity = (q[..., -estimator:] * slope).sum(dim=-1)
             q_dot = torch.cat([q_dot[..., 1:], velocity[..., None]], dim=-1)
     return loss
@@ -611,6 +611,7 @@ class TrainingSet(NamedTuple):
     q_low: Array  # (n,) rad
     q_high: Array  # (n,) rad
     far_ends: list[NDArray[np.intp]]  # as `ends`, with `rollout` samples after them
+    rate: float  # of the samples [Hz]
 
 
 def training_set(log: Log, history: int, rollout: int = 1) -> TrainingSet:
@@ -638,7 +639,7 @@ def training_set(log: Log, history: int, rollout: int = 1) -> TrainingSet:
     low, high = low - margin, high + margin
     mean, scale = np.repeat(mean, history, axis=1), np.repeat(scale, history, axis=1)
     ranges = samples.whole.q.min(axis=0), samples.whole.q.max(axis=0)
-    return TrainingSet(series, samples.target, ends, mean, scale, low, high, *ranges, far_ends)
+    return TrainingSet(series, samples.target, ends, mean, scale, low, high, *ranges, far_ends, log.rate)
 
 
 class Samples(NamedTuple):
@@ -667,7 +668,7 @@ def end_to_end(log: Log) -> Samples:
     if log.velocity_logged:
         target = np.roll(whole.q_dot, -1, axis=0)
     else:
-        target = np.diff(whole.q, axis=0, append=0) * RATE
+        target = np.diff(whole.q, axis=0, append=0) * log.rate
     lengths = [len(r.q) for r in log.recordings]
     moves = [np.ptp(r.u, axis=0) + np.ptp(r.q, axis=0) > 0 for r in log.recordings]
     return Samples(whole, target, np.repeat(moves, lengths, axis=0), lengths)
@@ -684,7 +685,7 @@ class LinearModel(ActuatorNet):
         x = history.reshape(*history.shape[:-2], -1)
         slope, offset = self.weights
         velocity = (((x - self.input_mean) / self.input_scale) * slope).sum(axis=-1) + offset
-        return np.clip(velocity, self.output_low, self.output_high)
+        return np.asarray(np.clip(velocity, self.output_low, self.output_high))
 
 
 def fit_linear(net: ActuatorNet, log: Log, penalty: float = 1e-3) -> LinearModel:
@@ -754,6 +755,8 @@ def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
     """
     if log.joints != net.joints:
         raise ValueError(f"joints: expected {list(net.joints)}, got {list(log.joints)}")
+    if log.rate != net.rate:
+        raise ValueError(f"rate: expected {net.rate:g} Hz, got {log.rate:g} Hz")
     if log.velocity_logged != net.velocity_logged:
         raise ValueError(f"velocity_logged: expected {net.velocity_logged}, got {log.velocity_logged}")
     samples = end_to_end(log)
@@ -849,4 +852,6 @@ def task_log(
         command = command + smoothing * (level - command)
         jitter = noise * rng.standard_normal(shape) * (level != 0)
         recorder.play(moving * (command + jitter))
-    return Log(machine.names, tuple(recorder.recording(f"task_{i:02d}", i) for i in range(runs)))
+    return Log(
+        machine.names, tuple(recorder.recording(f"task_{i:02d}", i) for i in range(runs)), rate=machine.rate
+    )

@@ -268,7 +268,7 @@ def push_lag(machine: Machine, history: Array, v_goal: Array, lag: Array, arm: A
     size = np.sqrt(np.add.reduce(error * error, axis=-1, keepdims=True))
     limit = np.float32(LAG_SPEED * machine.tool_speed)
     counted = lag + error * (limit / np.maximum(size, limit)) * np.float32(machine.dt)
-    return counted * np.float32(np.exp(-machine.dt / LAG_TIME))
+    return np.asarray(counted * np.float32(np.exp(-machine.dt / LAG_TIME)))
 
 
 def push_measured(
@@ -408,7 +408,7 @@ def draw_goal(machine: Machine, config: TaskConfig, rng: np.random.Generator, nu
     direction = np.where(kind < config.zero_goals + config.axis_goals, axis, direction)
     direction = np.where(kind < config.zero_goals, 0.0, direction)
     length = np.maximum(np.linalg.norm(direction, axis=-1, keepdims=True), 1e-12)
-    return direction / length * rng.uniform(0, machine.tool_speed, (num, 1))
+    return np.asarray(direction / length * rng.uniform(0, machine.tool_speed, (num, 1)))
 
 
 def _draw_hold(machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int) -> NDArray[np.int64]:
@@ -485,7 +485,7 @@ def _next_goals(
 def _travel(machine: Machine, before: State, after: State) -> Array:
     """Mean change of the driven joints' commands in one tick, in units of the command limit, (num,)."""
     newest = [s.history[..., machine.driven, 2, -1] for s in (before, after)]
-    return np.abs(newest[1] - newest[0]).mean(axis=-1) * np.float32(PWM_MAX / machine.pwm_limit)
+    return np.asarray(np.abs(newest[1] - newest[0]).mean(axis=-1) * np.float32(PWM_MAX / machine.pwm_limit))
 
 
 def merge(old: State, new: State, rows: NDArray[np.intp]) -> State:

@@ -90,7 +90,7 @@ def tuned_baselines(
         wanted, rng = np.tile(goals, (1, candidates, 1)), np.random.default_rng(seed)
         trace = rollout(machine, batch, np.tile(start, (candidates, 1)), wanted, TaskConfig(), rng)
         error = np.linalg.norm(wanted - trace.v_tool, axis=-1)
-        return error.mean(0).reshape(candidates, runs).mean(1)
+        return np.asarray(error.mean(0).reshape(candidates, runs).mean(1))
 
     tuned, how = {}, {}
     for name, controller in baselines(machine, net).items():
@@ -365,9 +365,9 @@ def driven_log(machine: Machine, traces: Traces, controller: str, runs: int = 16
     for (name, sequence), trace in traces.items():
         for i in range(min(runs, trace.q.shape[1]) * (name == controller)):
             u, q = trace.u[:, i].astype(float), trace.q_measured[:, i].astype(float)
-            velocity = logs.velocity_of(q, machine.velocity_samples)
+            velocity = logs.velocity_of(q, machine.velocity_samples, machine.rate)
             recordings.append(logs.Recording(f"{name}_{sequence}_{i:02d}", u, q, velocity))
-    return logs.Log(machine.names, tuple(recordings))
+    return logs.Log(machine.names, tuple(recordings), rate=machine.rate)
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -450,7 +450,7 @@ def record(machine: Machine, out: Path, effort: Effort, seed: int) -> list[logs.
     files, rng = (out / "log.npz", out / "log_test.npz"), np.random.default_rng
     logs.write_log(files[0], actuator.collect(machine, effort.hours, "rich", rng(seed)))
     logs.write_log(files[1], actuator.task_log(machine, 20, 40.0, rng(seed + 1)))
-    return [logs.read_log([file], machine.velocity_samples) for file in files]
+    return [logs.read_log([file], machine.velocity_samples, rate=machine.rate) for file in files]
 
 
 def on_nets(

@@ -47,13 +47,13 @@ def encoder_counts(machine: Machine, raw: ArrayLike) -> Array:
     low, high, zero, sign = map(machine.column, ("q_min", "q_max", "encoder_zero", "encoder_sign"))
     counts = sign.astype(int) * ((np.asarray(raw) & POSITION_MASK) - zero.astype(int))
     start = np.rint((low + high) / 2 / machine.encoder_step).astype(int) - turn // 2
-    return (counts - start) % turn + start
+    return np.asarray((counts - start) % turn + start)
 
 
 def encoder_raw(machine: Machine, counts: ArrayLike) -> Array:
     """What encoders with 26 bits say for joint angles in counts (..., n)."""
     zero, sign = (machine.column(name).astype(int) for name in ("encoder_zero", "encoder_sign"))
-    return (sign * np.asarray(counts) + zero) & POSITION_MASK
+    return np.asarray((sign * np.asarray(counts) + zero) & POSITION_MASK)
 
 
 def _crc_table() -> Array:
@@ -243,7 +243,8 @@ def gate_wrong(machine: Machine, state: GateState, inputs: GateInputs, due: Arra
     bad[..., 11, :n] = ~(np.abs(inputs.m) <= limit)  # also if it is no number
     bad[..., 12, 0] = inputs.stop
     bad = bad.reshape(*now.shape, len(FAULTS) * (n + 1))
-    return bad.any(axis=-1) * (1 + bad.argmax(axis=-1))
+    wrong: Array = bad.any(axis=-1) * (1 + bad.argmax(axis=-1))
+    return wrong
 
 
 def fault_name(machine: Machine, fault: int) -> str:

@@ -167,7 +167,7 @@ def shape_axis(axis: ArrayLike, dead: float = 0.12, expo: float = 0.6) -> Array:
     """
     axis = np.asarray(axis, float)
     s = np.sign(axis) * np.maximum(0.0, np.abs(axis) - dead) / (1 - dead)
-    return (1 - expo) * s + expo * s**3
+    return np.asarray((1 - expo) * s + expo * s**3)
 
 
 # --- the loop ---------------------------------------------------------------------------------------
@@ -473,8 +473,8 @@ def driven_log(machine: Machine, frames: Iterable[bus.Frame]) -> Log:
         if len(part) > machine.history + 1:
             u, q = map(np.array, zip(*part, strict=True))
             recordings.append(
-                Recording(f"drive_{number:03d}", u, q, velocity_of(q, machine.velocity_samples))
+                Recording(f"drive_{number:03d}", u, q, velocity_of(q, machine.velocity_samples, machine.rate))
             )
     if not recordings:
         raise ValueError(f"log: expected more than {machine.history + 1} ticks of driving in a row, got none")
-    return Log(machine.names, tuple(recordings))
+    return Log(machine.names, tuple(recordings), rate=machine.rate)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import OptimizeResult, differential_evolution
+from scipy.optimize import Bounds, OptimizeResult, differential_evolution
 from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet
@@ -65,7 +65,7 @@ def limit_weights(machine: Machine, q: ArrayLike, q_dot: ArrayLike) -> Array:
 def manipulability(J: ArrayLike) -> Array:
     """sqrt(det(J J^T)) of Jacobians (..., 3, n); 0 at a singularity. Shape (...)."""
     J = np.asarray(J)
-    return np.sqrt(np.maximum(np.linalg.det(J @ np.swapaxes(J, -1, -2)), 0.0))
+    return np.asarray(np.sqrt(np.maximum(np.linalg.det(J @ np.swapaxes(J, -1, -2)), 0.0)))
 
 
 def nakamura_damping(w: ArrayLike, w0: float, k: float) -> Array:
@@ -214,7 +214,7 @@ class JacobianController:
         rate = (inverse @ (seen.v_goal + feedback)[..., None])[..., 0]
         fastest = np.where(rate > 0, m.column("q_dot_up")[driven], m.column("q_dot_down")[driven])
         excess = np.max(np.abs(rate) / fastest, axis=-1, keepdims=True)
-        return rate / np.maximum(1.0, excess)  # slower, but in the same direction
+        return np.asarray(rate / np.maximum(1.0, excess))  # slower, but in the same direction
 
     def __call__(self, observation: Array, memory: Memory) -> tuple[Array, Memory]:
         """Commands u (..., n) for observations (..., obs) of `env.observe`, and the next memory."""
@@ -263,7 +263,7 @@ def tune(
     first[0] = controller.gains
     costs: list[float] = []
 
-    def objective(vectors: Array) -> Array:
+    def objective(vectors: Array) -> Any:  # (candidates,): SciPy's types know no vectorised search
         return cost(replace(controller, gains=vectors.T))
 
     with tqdm(total=generations, desc=f"tune {label}", unit="generation", disable=None) as bar:
@@ -274,7 +274,7 @@ def tune(
 
         result = differential_evolution(
             objective,
-            list(zip(low, high, strict=True)),
+            Bounds(low, high),
             init=np.clip(first, low, high),
             maxiter=generations,
             mutation=(0.4, 0.9),

@@ -204,4 +204,4 @@ def lowest_point(machine: Machine, q: ArrayLike) -> Array:
 
 
 def _lowest(chain: Chain) -> Array:
-    return np.minimum.reduce(chain.p[2, 1:])
+    return np.asarray(np.minimum.reduce(chain.p[2, 1:]))

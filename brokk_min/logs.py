@@ -2,8 +2,8 @@
 
 Columns `run,time,u_<joint>...,q_<joint>...[,q_dot_<joint>...]`, one row a sample; `.csv`, or `.npz`
 with the same columns as arrays. `run` names the recording, time is in s, u in [-1, 1] of full
-command (held until the next row), q in rad, q_dot in rad/s. Any joints, any rate of 20 Hz or more,
-jitter allowed. A recording whose name ends in `_return` is a way back to the start and is dropped.
+command (held until the next row), q in rad, q_dot in rad/s. Any joints, any rate not below the
+machine's, jitter allowed. A recording whose name ends in `_return` is a way back to the start and is dropped.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from brokk_min.machine import estimate_velocity
 
 Floats = NDArray[np.float64]
 Table = dict[str, list[Any]]  # cells by column; row 2 of the file is cell 0
-RATE = 20.0  # Hz, paper: everything runs at 20 Hz
+RATE = 20.0  # Hz, paper: everything runs at 20 Hz; other machines have others
 MAX_GAP = 0.25  # s, assumed: a longer hole in the time stamps starts a new recording
 RETURN = "_return"
 UNITS = {  # largest value of a column and its unit; what is larger has been logged in another one
@@ -34,7 +34,7 @@ UNITS = {  # largest value of a column and its unit; what is larger has been log
 
 
 class Recording(NamedTuple):
-    """One recording at `RATE`: arrays (T, n) of command [-1, 1], angle [rad], velocity [rad/s]."""
+    """One recording of a log: arrays (T, n) of command [-1, 1], angle [rad], velocity [rad/s]."""
 
     name: str
     u: Floats
@@ -48,6 +48,7 @@ class Log(NamedTuple):
     joints: tuple[str, ...]
     recordings: tuple[Recording, ...]
     velocity_logged: bool = False
+    rate: float = RATE  # Hz
 
 
 @contextmanager
@@ -92,9 +93,9 @@ def write_log(path: Path, log: Log) -> None:
         raise ValueError(f"{path}: expected at least one recording to write, got none")
     names = [recording.name for recording in log.recordings]
     lengths = [len(recording.u) for recording in log.recordings]
-    columns: dict[str, NDArray[Any]] = {
+    columns: dict[str, Any] = {
         "run": np.repeat(names, lengths),
-        "time": np.concatenate([np.arange(length) / RATE for length in lengths]),
+        "time": np.concatenate([np.arange(length) / log.rate for length in lengths]),
     }
     kinds = ("u", "q", "q_dot") if log.velocity_logged else ("u", "q")
     for kind in kinds:
@@ -102,7 +103,7 @@ def write_log(path: Path, log: Log) -> None:
         columns |= {f"{kind}_{name}": values[:, i] for i, name in enumerate(log.joints)}
     if path.suffix == ".npz":
         with whole_file(path) as file:
-            np.savez_compressed(file, **columns)  # type: ignore[arg-type]
+            np.savez_compressed(file, **columns)
     elif path.suffix == ".csv":
         with whole_file(path, "w") as file:
             writer = csv.writer(file, lineterminator="\n")
@@ -113,10 +114,12 @@ def write_log(path: Path, log: Log) -> None:
         raise ValueError(f"{path}: expected a name ending in .csv or .npz, got {path.suffix!r}")
 
 
-def read_log(paths: Sequence[Path], velocity_samples: int, joints: Sequence[str] | None = None) -> Log:
-    """Read tables of one machine, check them, and bring them to `RATE`.
+def read_log(
+    paths: Sequence[Path], velocity_samples: int, joints: Sequence[str] | None = None, rate: float = RATE
+) -> Log:
+    """Read tables of one machine, check them, and bring them to one `rate` [Hz].
 
-    Command held, angle interpolated (DESIGN: resampled to 20 Hz). A gap longer than `MAX_GAP` cuts a
+    Command held, angle interpolated. A gap longer than `MAX_GAP` cuts a
     recording in two. Without q_dot columns the causal estimator supplies velocities: a recording is
     taken to start at rest; what follows a gap is not, and loses the rows that would need samples of it.
 
@@ -139,10 +142,10 @@ def read_log(paths: Sequence[Path], velocity_samples: int, joints: Sequence[str]
         logged.add(has_velocity)
         if len(logged) > 1:
             raise ValueError(f"{path}: expected q_dot columns in all files or none, got a mixture")
-        recordings += _recordings(path, table, names, has_velocity, velocity_samples)
+        recordings += _recordings(path, table, names, has_velocity, velocity_samples, rate)
     if not recordings:
         raise ValueError(f"{', '.join(map(str, paths))}: expected at least one recording, got none")
-    return Log(names, tuple(recordings), True in logged)
+    return Log(names, tuple(recordings), True in logged, rate)
 
 
 def _joints(path: Path, table: Table) -> tuple[str, ...]:
@@ -159,9 +162,9 @@ def _joints(path: Path, table: Table) -> tuple[str, ...]:
 
 
 def _recordings(
-    path: Path, table: Table, joints: Sequence[str], logged: bool, samples: int
+    path: Path, table: Table, joints: Sequence[str], logged: bool, samples: int, rate: float
 ) -> Iterator[Recording]:
-    """The checked recordings of one table at `RATE`, in the order in which they begin."""
+    """The checked recordings of one table at `rate`, in the order in which they begin."""
     time = _numbers(path, table, "time")
     columns = {
         kind: np.stack([_numbers(path, table, f"{kind}_{joint}", *unit) for joint in joints], axis=1)
@@ -173,16 +176,16 @@ def _recordings(
             raise ValueError(f"{path}: row {row + 2}, column run: expected a name, got {run!r}")
         runs.setdefault(run, []).append(row)
     for run, rows in runs.items():
-        gaps = _gaps(path, run, rows, time[rows])
+        gaps = _gaps(path, run, rows, time[rows], rate)
         for part, piece in enumerate(np.split(rows, gaps) if not run.endswith(RETURN) else ()):
-            arrays = _resample(time[piece], {k: c[piece] for k, c in columns.items()}, samples)
+            arrays = _resample(time[piece], {k: c[piece] for k, c in columns.items()}, samples, rate)
             unknown = samples - 1 if part and not logged else 0  # rows that need samples of the gap
             if len(arrays[0]) > unknown:
                 name = f"{run}#{part + 1}" if part else run
                 yield Recording(name, *(array[unknown:] for array in arrays))
 
 
-def _gaps(path: Path, run: str, rows: Sequence[int], time: Floats) -> NDArray[np.intp]:
+def _gaps(path: Path, run: str, rows: Sequence[int], time: Floats, rate: float) -> NDArray[np.intp]:
     """Where a recording is to be cut; time stamps that do not rise fast enough are refused."""
     step = np.diff(time)
     if not (step > 0).all():
@@ -191,29 +194,31 @@ def _gaps(path: Path, run: str, rows: Sequence[int], time: Floats) -> NDArray[np
             f"{path}: row {rows[late] + 2}, column time: expected later than {time[late - 1]} "
             f"within run {run!r}, got {time[late]}"
         )
-    if len(step) and np.median(step) > 1.05 / RATE:
+    if len(step) and np.median(step) > 1.05 / rate:
         raise ValueError(
-            f"{path}: row {rows[0] + 2}, column time: expected {RATE:g} Hz or more in run "
+            f"{path}: row {rows[0] + 2}, column time: expected {rate:g} Hz or more in run "
             f"{run!r}, got {1 / np.median(step):.3g} Hz"
         )
     return np.flatnonzero(step > MAX_GAP) + 1
 
 
-def _resample(time: Floats, columns: dict[str, Floats], samples: int) -> tuple[Floats, ...]:
-    """u held, q and q_dot interpolated at `RATE`; q_dot estimated where the log has none."""
-    grid = time[0] + np.arange(int((time[-1] - time[0]) * RATE + 1e-6) + 1) / RATE
+def _resample(time: Floats, columns: dict[str, Floats], samples: int, rate: float) -> tuple[Floats, ...]:
+    """u held, q and q_dot interpolated at `rate`; q_dot estimated where the log has none."""
+    grid = time[0] + np.arange(int((time[-1] - time[0]) * rate + 1e-6) + 1) / rate
     held = np.searchsorted(time, grid + 1e-6, side="right") - 1
 
     def between(values: Floats) -> Floats:
         return np.stack([np.interp(grid, time, column) for column in values.T], axis=1)
 
     q = between(columns["q"])
-    q_dot = between(columns["q_dot"]) if "q_dot" in columns else velocity_of(q, samples)
+    q_dot = between(columns["q_dot"]) if "q_dot" in columns else velocity_of(q, samples, rate)
     return columns["u"][held], q, q_dot
 
 
-def velocity_of(q: Floats, samples: int) -> Floats:
+def velocity_of(q: Floats, samples: int, rate: float = RATE) -> Floats:
     """Causal velocity [rad/s] at each row of one recording `q` [rad] (T, n), at rest before it.
+
+    `rate` [Hz] is that of the rows.
 
     Example:
         >>> velocity_of(np.array([[0.0], [0.0], [0.3], [0.6]]), samples=2).ravel().tolist()
@@ -221,7 +226,7 @@ def velocity_of(q: Floats, samples: int) -> Floats:
     """
     padded = np.concatenate([np.repeat(q[:1], samples - 1, axis=0), q])
     windows = np.lib.stride_tricks.sliding_window_view(padded, samples, axis=0)
-    return np.asarray(estimate_velocity(windows, samples, 1 / RATE), float)
+    return np.asarray(estimate_velocity(windows, samples, 1 / rate), float)
 
 
 def read_table(path: Path, columns: Sequence[str], text: Sequence[str] = ()) -> dict[str, NDArray[Any]]:

@@ -232,7 +232,7 @@ def encode_pwm(u: ArrayLike) -> NDArray[np.uint8]:
     if not np.all(np.abs(u) <= 1):
         raise ValueError(f"u: expected within [-1, 1], got {u[~(np.abs(u) <= 1)].flat[0]}")
     counts = np.rint(u * PWM_MAX).astype(int)
-    return np.where(counts < 0, 255 + counts, counts).astype(np.uint8)
+    return np.asarray(np.where(counts < 0, 255 + counts, counts), np.uint8)
 
 
 def decode_pwm(u_byte: ArrayLike) -> NDArray[np.float64]:

@@ -113,7 +113,7 @@ class PerfectModel:
         options = np.concatenate([opening[:, None], tried], axis=1)
         size = np.linalg.norm(np.concatenate([probed[:, :1], after], axis=1), axis=-1)
         cost = size.mean(axis=-1) + 1e-4 * np.square(options).mean(axis=(-1, -2))  # of equals the smaller
-        return options[np.arange(num), cost.argmin(axis=1)]
+        return np.asarray(options[np.arange(num), cost.argmin(axis=1)])
 
     def whole_counts(self, plant: PlantState, opening: Array, goal: Array, tick: int) -> Array:
         """The plan's first commands (num, n) in whole counts: the best of all ways to round them."""

@@ -126,7 +126,7 @@ class Hands:
         if self.pad is not None:
             axes = [i for i in PAD_AXES[: len(keys)] if i < self.pad.get_numaxes()]
             keys[: len(axes)] -= hw.shape_axis([self.pad.get_axis(i) for i in axes])
-        return np.clip(keys, -1, 1)
+        return np.asarray(np.clip(keys, -1, 1))
 
     def _pad_button(self) -> bool:
         pad = self.pad

@@ -92,7 +92,7 @@ def save_policy(path: Path, policy: Policy) -> None:
     arrays |= {f"weight_{i}": weight for i, weight in enumerate(policy.weights)}
     arrays |= {f"net_{name}": array for name, array in net_arrays(policy.net).items()}
     with whole_file(path) as file:
-        np.savez(file, **arrays)  # type: ignore[arg-type]
+        np.savez(file, **dict[str, Any](arrays))
 
 
 def load_policy(path: Path, machine: Machine) -> Policy:

@@ -13,12 +13,13 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
+import math
 import sys
 import time
 from dataclasses import asdict, dataclass, fields
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -112,7 +113,7 @@ class Agent(nn.Module):
 def log_probability(action: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
     """Log-density (...) of actions (..., a) under independent normals."""
     z = (action - mean) * torch.exp(-log_std)
-    return -0.5 * (z * z).sum(-1) - log_std.sum() - 0.5 * action.shape[-1] * np.log(2 * np.pi)
+    return -0.5 * (z * z).sum(-1) - log_std.sum() - 0.5 * action.shape[-1] * math.log(2 * math.pi)
 
 
 def gae(
@@ -195,8 +196,8 @@ class Training:
         self.generator = torch.Generator().manual_seed(seed)
         with torch.random.fork_rng():
             torch.manual_seed(seed)
-            shapes = env.single_observation_space.shape, env.single_action_space.shape
-            self.agent = Agent(shapes[0][0], shapes[1][0], config.log_std)  # type: ignore[index]
+            sizes = len(observation_scale(env.machine)[0]), len(env.machine.driven)
+            self.agent = Agent(*sizes, config.log_std)
         self.critic = config.critic or env.config.paper
         self.agent.log_std.requires_grad_(self.critic)
         self.optimizer = torch.optim.Adam(self.agent.parameters(), lr=config.learning_rate, fused=True)
@@ -242,7 +243,7 @@ class Training:
         ticks: list[tuple[Any, ...]] = []
         errors, finished = [], []
         for t in range(c.horizon):
-            step, state = self.steps + t * c.num_envs, env.state
+            step, state = self.steps + t * c.num_envs, cast(State, env.state)
             observations[t] = finite("observation", self.observation, step)
             means[t] = agent.actor(self.observation)
             noise = torch.randn(means[t].shape, generator=self.generator)
@@ -253,7 +254,7 @@ class Training:
             ended[t] = torch.from_numpy(over)
             if not self.critic:
                 u = to_command(env.machine, actions[t].numpy())
-                ticks.append((state.q, state.history, state.v_goal, u, over))  # type: ignore[union-attr]
+                ticks.append((state.q, state.history, state.v_goal, u, over))
             elif truncated.any():
                 last = torch.from_numpy(info["final_obs"][truncated])
                 tails[t, torch.from_numpy(truncated)] = agent.value(finite("final_obs", last, step))

@@ -121,7 +121,7 @@ def steps(move: Mover, q_low: Array, q_high: Array, level: Array, before: Array,
 
 def step_velocity(angles: Array, rate: float) -> Array:
     """Velocity of each stepping joint in its direction [rad/s] (2 wait, 2, 2, n): positive in both."""
-    return np.diff(np.diagonal(angles, axis1=3, axis2=4), axis=0) * rate * np.array([[1], [-1]])
+    return np.asarray(np.diff(np.diagonal(angles, axis1=3, axis2=4), axis=0) * rate * np.array([[1], [-1]]))
 
 
 def response_times(angles: Array, rate: float) -> Array:
@@ -146,7 +146,7 @@ def step_commands(move: Mover, q_low: Array, q_high: Array, level: Array, wait: 
         angles = steps(move, q_low, q_high, share * level, share * level, wait)
         speeds.append(step_velocity(angles, 1.0)[wait:, 0].max(axis=0).min(axis=0))  # (n,)
     moves = np.array(speeds) > 0.05 * speeds[-1]
-    return (shares[np.argmax(moves, axis=0)] + 1) / 2 * level
+    return np.asarray((shares[np.argmax(moves, axis=0)] + 1) / 2 * level)
 
 
 def named_times(times: Array, joints: Sequence[str]) -> dict[str, Any]:
@@ -357,7 +357,7 @@ def creep(net: ActuatorNet, seconds: float = 10.0) -> Array:
     """Largest speed [rad/s] (n,) of joints left at rest without a command, from 21 angles over the range."""
     q = np.linspace(net.q_low, net.q_high, 21)
     angles = net_mover(net)(q, np.zeros((round(seconds * net.rate), *q.shape)))
-    return np.abs(angles[-1] - q).max(axis=0) / seconds
+    return np.asarray(np.abs(angles[-1] - q).max(axis=0) / seconds)
 
 
 def _times(net: ActuatorNet, log: Log, machine: Machine | None) -> dict[str, dict[str, Any]]:

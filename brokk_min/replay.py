@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -179,8 +179,7 @@ def _write_mp4(file: IO[bytes], images: Iterable[Array], size: tuple[int, int], 
     command = ["ffmpeg", "-loglevel", "error", *form.split()]
     try:
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=file) as process:
-            for image in images:
-                process.stdin.write(image.tobytes())  # type: ignore[union-attr]
+            cast(IO[bytes], process.stdin).writelines(image.tobytes() for image in images)
     except FileNotFoundError as error:
         raise ValueError("film: expected ffmpeg for .mp4, or a name ending in .gif, got none") from error
     except BrokenPipeError:

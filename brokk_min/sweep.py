@@ -56,8 +56,9 @@ def one_seed(
 
 def _finished(path: Path, identity: Mapping[str, Any]) -> Rows:
     try:
-        result = json.loads(path.read_text())
-        runs, found = result["runs"], result["identity"]
+        result: dict[str, Any] = json.loads(path.read_text())
+        runs: Rows = result["runs"]
+        found = result["identity"]
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: expected the result of a seed, got {error!r}") from error
     for name, wanted in identity.items():
@@ -101,7 +102,8 @@ def workers(scheduler: str | None) -> Iterator[Submit]:
         from distributed import Client
     except ImportError as error:
         raise ValueError("scheduler: expected the extra `brokk_min[sweep]`, got none") from error
-    with Client(scheduler, timeout=10) as client:  # type: ignore[no-untyped-call]  # dask itself runs again what a dead worker had
+    connect: Callable[..., Any] = Client
+    with connect(scheduler, timeout=10) as client:  # dask itself runs again what a dead worker had
         threads = {worker["nthreads"] for worker in client.scheduler_info(-1)["workers"].values()}
         if threads - {1}:  # torch's settings and seeds are those of a process
             raise ValueError(f"{scheduler}: expected workers with --nthreads 1, got {sorted(threads)}")

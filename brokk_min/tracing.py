@@ -51,7 +51,7 @@ def distance(line: Array, p: Array) -> Array:
     a, along = line[:-1], np.diff(line, axis=0)
     away = p[:, None] - a
     share = np.clip((away * along).sum(-1) / np.maximum((along * along).sum(-1), 1e-12), 0, 1)
-    return np.linalg.norm(away - share[..., None] * along, axis=-1).min(axis=1)
+    return np.asarray(np.linalg.norm(away - share[..., None] * along, axis=-1).min(axis=1))
 
 
 class Attempt(NamedTuple):

@@ -184,7 +184,7 @@ def near_limit(machine: Machine, q: Array) -> NDArray[np.bool_]:
     low, high = machine.column("q_min"), machine.column("q_max")
     margin = NEAR_LIMIT * (high - low)
     driven = np.array([joint.driven for joint in machine.joints])
-    return ((q < low + margin) | (q > high - margin)) & driven
+    return np.asarray(((q < low + margin) | (q > high - margin)) & driven)
 
 
 def weakest(machine: Machine, q: Array) -> tuple[float, Array]:

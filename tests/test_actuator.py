@@ -146,6 +146,19 @@ def test_a_command_arrives_after_the_delay_and_not_a_step_earlier():
     np.testing.assert_allclose(state.spool, 1 - (5 / 6) ** 2, atol=1e-12)
 
 
+def test_nets_have_the_rate_of_their_log_and_are_judged_at_no_other():
+    machine, config = replace(BROKK_170, rate=50.0), FitConfig(steps=12, rollout=2, hidden=4)
+    log = collect(machine, 0.002, "rich", np.random.default_rng(0))
+    assert log.rate == 50
+    q = log.recordings[0].q
+    slope = [estimate_velocity(q[i - 3 : i + 1].T, 4, 0.02) for i in range(4, len(q))]
+    np.testing.assert_allclose(log.recordings[0].q_dot[4:], slope, atol=1e-12)
+    net = fit(log, config, 0, 4, machine.name)
+    assert net.rate == 50
+    with pytest.raises(ValueError, match="rate: expected 50 Hz, got 20 Hz"):
+        score(net, log._replace(rate=20.0))
+
+
 @pytest.mark.parametrize("rate", [10.0, 20.0, 25.0, 30.0, 40.0, 60.0])
 def test_a_tick_lasts_one_over_the_rate(rate):
     """Or a machine whose tick is no multiple of the plant's step is refused."""

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import limits, peers
+from benchmarks import deviations, limits, peers
+from brokk_min import env, experiments
 
 
 @pytest.mark.parametrize("learner", list(peers.LEARNERS))
@@ -59,3 +60,19 @@ def test_the_products_of_a_gradient_by_hand() -> None:
             pytest.skip(f"no {kind}")
         for a, b in zip(seen, others, strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-2)
+
+
+def test_deviations_train_and_compare_what_they_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One update of the learner; what its policy does is not judged. The heading is back afterwards."""
+    seen, turn = [], env._turn
+
+    def runs(machine: object, controllers: object, sequences: list[object], starts: np.ndarray, *_: object):
+        seen.append((len(sequences), len(starts), env._turn is turn))
+        return [{"velocity_error_mean": 0.1, "valve_travel": 20.0}], {}
+
+    monkeypatch.setattr(deviations, "STEPS", 256 * 32)
+    monkeypatch.setattr(experiments, "task_space", runs)
+    monkeypatch.setattr(deviations, "as_it_is", dict)
+    found = deviations.a5()
+    assert found["base frame, plant, valve_travel"] == 20.0 and len(found) == 4
+    assert seen == [(3, 32, False)] * 2 and env._turn is turn

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import doctest
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
+
+from brokk_min.__main__ import COMMANDS, main
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
@@ -27,3 +32,24 @@ def test_the_benchmark_of_rollouts_runs() -> None:
     command = [sys.executable, "-m", "benchmarks.rollout", "--num-envs", "4", "--ticks", "2"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0 and "steps" in done.stdout, done.stderr
+
+
+PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+LINE = re.compile(r"^ *brokk-min (.*?)(?: {2,}#.*)?$", re.M)
+LINES = {line for page in PAGES for line in LINE.findall(page.read_text())}
+
+
+@pytest.mark.parametrize("line", sorted(LINES))
+def test_every_command_line_of_the_documents_is_one(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its options are read; what the commands do has tests of its own (`test_cli.py`, `test_porting.py`)."""
+    words, ran = shlex.split(line), []
+    command = COMMANDS[words[0]]()
+    monkeypatch.setattr(command, "run", lambda self: ran.append(self))
+    monkeypatch.setitem(COMMANDS, words[0], lambda: command)
+    assert main(words) == 0 and len(ran) == 1
+
+
+def test_make_knows_the_targets_of_the_readme() -> None:
+    for target in sorted(set(re.findall(r"^make (\w+)", README, re.M))):
+        done = subprocess.run(["make", "-n", target], cwd=ROOT, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr

@@ -874,6 +874,18 @@ def test_make_vec_gives_the_vector_class():
     assert len(np.unique(seen[:, 7])) > 250  # they start apart
 
 
+def test_metadata_tell_the_rate_and_the_kind_of_pictures():
+    fast = replace(BROKK_170, rate=50.0)
+    one = TaskEnv(machine=fast, render_mode="rgb_array")
+    many = TaskVectorEnv(2, machine=fast, render_mode="rgb_array")
+    assert one.metadata == {"render_modes": ["human", "rgb_array"], "render_fps": 50}
+    assert TaskEnv.metadata["render_fps"] == 20
+    wanted = {"render_modes": ["rgb_array"], "render_fps": 50, "autoreset_mode": AutoresetMode.SAME_STEP}
+    assert many.metadata == wanted and one.render_mode == many.render_mode == "rgb_array"
+    with pytest.raises(ValueError, match=r"render_mode: expected one of \['rgb_array'\], got 'human'"):
+        TaskVectorEnv(2, render_mode="human")
+
+
 @pytest.mark.parametrize("make", [lambda: TaskVectorEnv(3), TaskEnv], ids=["vector", "single"])
 def test_seeds_reproduce_and_differ(make):
     def run(seed):
@@ -1007,6 +1019,23 @@ def test_rollout_tells_what_happened_when():
         q = plant.q
     assert np.array_equal(trace.u, tape)
     np.testing.assert_allclose(np.diff(trace.p_tool, axis=0)[20:] * 20, trace.v_tool[21:], atol=0.01)
+
+
+def test_a_rollout_on_nets_moves_by_them_and_reads_the_encoders_it_is_given():
+    machine, rng = BROKK_170, np.random.default_rng(20)
+    net, tape = small_net(machine, rng), task.to_command(machine, rng.uniform(-1, 1, (8, 2, 4)))
+    start, goals = np.stack([POSE, POSE + 0.1]), np.zeros((8, 2, 3))
+
+    def shifted(machine, q):
+        return read_encoder(machine, q + 0.01)
+
+    trace = task.rollout(machine, Recorder(tape), start, goals, QUIET, rng, net, shifted)
+    state = task.rest_state(machine, start, goals[0], plant=False)
+    for t in range(8):
+        assert np.array_equal(trace.q_measured[t], state.history[..., 0, -1])
+        state = task.transition(machine, net, state, tape[t], shifted)
+        assert np.array_equal(trace.q[t], state.q)
+    assert np.abs(trace.q[-1] - start).max() > 0.01
 
 
 def test_rollout_noise_reaches_the_controller_and_is_reproducible():

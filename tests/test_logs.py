@@ -166,6 +166,24 @@ def test_resampling_against_a_loop(tmp_path_factory, steps, seed):
     np.testing.assert_allclose(recording.q[:, 0], q, atol=1e-9)
 
 
+@pytest.mark.parametrize("rate", [10.0, 25.0, 50.0])
+def test_a_log_is_brought_to_the_rate_that_is_asked_for(tmp_path, rate):
+    """A log at 100 Hz: 0.2 rad/s for 3 s, the command from 1 s on; slower logs than the rate are refused."""
+    rows = [f"a,{i / 100},{float(i >= 100)},{0.2 * i / 100}" for i in range(301)]
+    (tmp_path / "log.csv").write_text("\n".join(["run,time,u_a,q_a", *rows]) + "\n")
+    log = read_log([tmp_path / "log.csv"], 4, rate=rate)
+    time = np.arange(round(3 * rate) + 1) / rate
+    np.testing.assert_allclose(log.recordings[0].q[:, 0], 0.2 * time, atol=1e-9)
+    np.testing.assert_allclose(log.recordings[0].u[:, 0], time >= 1)
+    np.testing.assert_allclose(log.recordings[0].q_dot[3:, 0], 0.2, atol=1e-9)
+    write_log(tmp_path / "again.csv", log)
+    again = read_log([tmp_path / "again.csv"], 4, rate=rate)
+    assert again.rate == log.rate == rate
+    np.testing.assert_allclose(again.recordings[0].q, log.recordings[0].q, atol=1e-6)
+    with pytest.raises(ValueError, match="expected 200 Hz or more in run 'a', got 100 Hz"):
+        read_log([tmp_path / "log.csv"], 4, rate=200.0)
+
+
 def test_a_straight_motion_has_its_velocity_at_any_rate(tmp_path):
     time = np.arange(200) / 100
     columns = table("x", time, 0, ("a",)) | {"q_a": 0.3 * time}

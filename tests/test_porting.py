@@ -80,6 +80,7 @@ def test_the_example_differs_from_the_brokk_where_a_port_may_break(mini: Machine
         "n",
         "name",
         "names",
+        "rate",
         "history",
         "velocity_samples",
         "encoder_bits",
@@ -108,8 +109,8 @@ def test_the_blocks_of_python_run(here: Path, capsys: pytest.CaptureFixture[str]
     found = re.findall(r"\[ *([\d.]+) +0\. +([\d.]+) *\]", said)
     told = re.findall(r"([\d.]+) m out, ([\d.]+) m high", PAGE)
     assert np.array(found, float).tolist() == np.array(told, float).tolist() and len(told) == 2
-    log = read_log([Path("ours.csv")], 5)
-    assert log.joints == tuple(names) and len(log.recordings[0].q) == 20
+    log = read_log([Path("ours.csv")], 5, rate=25.0)
+    assert log.joints == tuple(names) and len(log.recordings[0].q) == 25
     with open("theirs.csv") as file:
         first = next(csv.DictReader(file))
     assert log.recordings[0].q[0, 2] == pytest.approx(np.deg2rad(float(first["arm_deg"])), rel=1e-6)
@@ -129,6 +130,8 @@ def test_the_commands_run_one_after_the_other(here: Path, mini: Machine) -> None
         given = [word for word in words if word not in ("--hours", "1")]
         assert main([*given, *QUICK[words[0]].split()]) == 0, words
     runs = json.loads(Path("nets.json").read_text())
+    net = load_net(Path("net.npz"))
+    assert (net.rate, net.history, net.velocity_samples) == (25.0, mini.history, mini.velocity_samples)
     assert runs["meta"]["machine"] == "mini_excavator" and runs["meta"]["plant"] == "net"
     assert all(np.isfinite(run["velocity_rmse"]) for run in runs["runs"])
 
@@ -148,7 +151,7 @@ def test_it_is_driven_over_the_bus(mini: Machine) -> None:
     controller = JacobianController(mini, gains, 0.1, manipulability_threshold(mini))
     start = (0.1, -0.5, 1.4, 0.8)
     for axis in range(3):
-        goals = np.tile(0.15 * np.eye(3)[axis], (40, 1))
+        goals = np.tile(0.15 * np.eye(3)[axis], (50, 1))  # 2 s
         script = hw.Script(mini, goals)
         world = World(controller, script, mini, start=start)
         world.drive.begin()
@@ -182,7 +185,7 @@ def test_files_without_a_machine_are_refused(
 
 def test_nets_for_a_machine_need_its_joints(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     Path("foreign.csv").write_text(
-        "run,time,u_a,q_a\n" + "".join(f"x,{i / 20},0.5,{i / 50}\n" for i in range(40))
+        "run,time,u_a,q_a\n" + "".join(f"x,{i / 25},0.5,{i / 50}\n" for i in range(40))
     )
     name = "mini_excavator.py:MINI_EXCAVATOR"
     assert main(["fit", "foreign.csv", "--test", "foreign.csv", "--machine", name, "--out", "n.npz"]) == 1
