@@ -462,14 +462,14 @@ class FitConfig:
     """Windows a joint in each step."""
     learning_rate: float = 4e-3
     """Of Adam at the start; falls to zero along a cosine, and again from a quarter for free runs."""
-    noise: float = 0.05
+    noise: float = 0.1
     """Standard deviation of the noise on the velocity inputs, in units of the velocities' own."""
     hidden: int = 32
     """Units in each of the two hidden layers (paper: 32)."""
     history: int = 13
     """Samples of angle, velocity and command that the nets see (paper: 13)."""
     rollout: int = 8
-    """Ticks that the nets run freely in the second half of the steps, which learns from that (paper: 1)."""
+    """Ticks that the nets run freely in the last third of the steps, which learn from that (paper: 1)."""
 
 
 PAPER_RECIPE: dict[str, Any] = {"noise": 0.0, "rollout": 1}  # Sec. 3.3
@@ -518,7 +518,7 @@ def _train(training: TrainingSet, config: FitConfig, seed: int, estimator: int |
         weight.requires_grad_()
     optimizer = torch.optim.Adam(weights, lr=config.learning_rate)
     runs_free = config.rollout > 1 and all(map(len, training.far_ends))
-    turn = config.steps // 2 if runs_free else config.steps
+    turn = round(0.65 * config.steps) if runs_free else config.steps
 
     def fall(step: int) -> float:
         done = step / turn if step < turn else (step - turn) / max(config.steps - turn, 1)
