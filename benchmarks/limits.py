@@ -108,9 +108,9 @@ def update(options: Options) -> dict[str, Any]:
     env = TaskVectorEnv(config.num_envs, random_net(np.random.default_rng(0)), config=TaskConfig())
     training = Training(env, config, 0)
     batch, _ = training._collect()
-    rows = min(config.minibatch_size, len(batch["return"]))
+    rows = min(config.minibatch_size, len(batch["action"]))
     sizes = shapes(batch["observation"].shape[1], 4, rows)
-    gradients = config.epochs * len(batch["return"]) / rows
+    gradients = config.epochs * len(batch["action"]) / rows
     work = sum(2 * m * k * n for m, k, n in sizes)
     calls = {"update": lambda: training._learn(batch), "torch": products("torch", sizes)}
     try:
