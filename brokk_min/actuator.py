@@ -126,7 +126,7 @@ def rich_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Arra
     Steps last up to 10 s, so that joints also run through to their stops. Levels are drawn up to a third
     above the limit: cut there, a quarter are at the limit, as a policy's.
     """
-    limit = 4 / 3 * machine.pwm_limit / PWM_MAX
+    limit, idle = 4 / 3 * machine.pwm_limit / PWM_MAX, 5 * machine.ready_down_time
     parts: list[Array] = []
     while sum(map(len, parts)) < ticks:
         kind = rng.choice(["sine", "step", "holds", "go"], p=[0.25, 0.15, 0.25, 0.35])
@@ -147,7 +147,8 @@ def rich_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Arra
             part = rng.choice([0, 1]) * rng.uniform(0, machine.dead_zone) * rng.uniform(-1, 1, length)
             at = 0
             while at < length:
-                at += int(np.exp(rng.uniform(np.log(0.05), np.log(3.0))) / machine.dt)
+                rest = np.exp(rng.uniform(np.log(0.05), np.log(3.0)))
+                at += int((idle if rng.random() < 0.5 else rest) / machine.dt)
                 move = int(rng.uniform(0.1, 1.0) / machine.dt)
                 part[at : at + move] = rng.uniform(-limit, limit)
                 at += move
