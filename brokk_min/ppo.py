@@ -196,8 +196,9 @@ class Training:
         self.generator = torch.Generator().manual_seed(seed)
         with torch.random.fork_rng():
             torch.manual_seed(seed)
-            sizes = len(observation_scale(env.machine)[0]), len(env.machine.driven)
-            self.agent = Agent(*sizes, config.log_std)
+            spaces = env.single_observation_space, env.single_action_space
+            seen, actions = (math.prod(space.shape or ()) for space in spaces)
+            self.agent = Agent(seen, actions, config.log_std)
         self.critic = config.critic or env.config.paper
         self.agent.log_std.requires_grad_(self.critic)
         self.optimizer = torch.optim.Adam(self.agent.parameters(), lr=config.learning_rate, fused=True)

@@ -74,15 +74,16 @@ def test_reproduce_prints_means_and_verdicts(
 ) -> None:
     given = {}
 
-    def chain(machine: Any, out: Path, effort: Any, seed: int) -> dict[str, Any]:
-        given.update(machine=machine.name, out=out, effort=effort, seed=seed)
+    def chain(machine: Any, out: Path, effort: Any, seed: int, sweep: Path | None) -> dict[str, Any]:
+        given.update(machine=machine.name, out=out, effort=effort, seed=seed, sweep=sweep)
         means = {"rl": {"x": {"velocity_error_mean": 0.0125}}}
         return {"task_space": {"summary": means}, "claims": [{"holds": True, "paper": "It works."}]}
 
     monkeypatch.setattr(experiments, "reproduce", chain)
     for words, effort in (((), experiments.Effort()), (("--quick",), experiments.QUICK)):
         assert run("reproduce", "--out", tmp_path, "--seed", 3, *words) == 0
-        assert given == {"machine": "brokk170", "out": tmp_path, "effort": effort, "seed": 3}
+        wanted = {"machine": "brokk170", "out": tmp_path, "effort": effort, "seed": 3, "sweep": None}
+        assert given == wanted
     said = capsys.readouterr().out
     assert "x 0.0125" in said and f"{report.VERDICTS[True]}: It works." in said and "report.html" in said
 
@@ -138,7 +139,7 @@ def test_results_are_shown_from_the_files_that_they_name(
     table["meta"]["machine"] = "mini"
     starts.write_text(json.dumps(table))
     assert run("replay", starts) == 1
-    assert "expected results of `evaluate`, got KeyError('mini')" in capsys.readouterr().err
+    assert "expected --machine mini, got brokk170" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("status", "message"), [(0, ""), (3, "expected ffmpeg to write it, got status 3")])
@@ -154,11 +155,11 @@ def test_a_film_goes_through_ffmpeg_picture_by_picture(
     (tmp_path / "ffmpeg").write_text(f"#!/bin/sh\ncat\nexit {status}\n")
     (tmp_path / "ffmpeg").chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
-    film = ["--out", tmp_path / "f.mp4", "--size", 320, 240]
+    film = ["--out", tmp_path / "f.mp4", "--size", 320, 320]
     assert run("replay", results, "--controllers", "rl", *film) == (1 if status else 0)
     assert message in capsys.readouterr().err
     written = list(tmp_path.glob("f.mp4"))
-    assert [path.stat().st_size for path in written] == ([] if status else [5 * 320 * 240 * 3])
+    assert [path.stat().st_size for path in written] == ([] if status else [5 * 320 * 320 * 3])
 
 
 def test_films_have_two_kinds_of_names(results: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -252,7 +252,8 @@ def test_results_tell_how_the_baselines_were_tuned(twice: tuple[Path, Path]) -> 
     for name, how in results["tuning"].items():
         assert how["seed"] == 3 and len(how["cost"]) == TINY.generations
         assert 0 < how["cost"][-1] <= how["cost"][0] < 0.3
-        assert how["cost_anew"] == pytest.approx(how["cost"][-1], rel=0.2) != how["cost"][-1]
+        assert how["cost_anew"] != how["cost"][-1]  # noise of its own
+        assert how["cost_anew"] == pytest.approx(how["cost"][-1], rel=0.2)
         spans = jacobian.GAINS.items()
         ends = [k for k, (low, high) in spans for g in results["gains"][name][k] if g in (low, high)]
         assert len([g for g in how["at_bound"] if g.split()[0] in ends]) >= len(ends)
