@@ -15,7 +15,7 @@ test: lint check
 
 check: .venv/installed-dev
 	$(RUN) coverage erase
-	$(RUN) coverage run -m pytest
+	$(RUN) coverage run -m pytest --numprocesses 2 --dist loadfile
 	$(RUN) coverage combine --quiet
 	$(RUN) coverage report
 

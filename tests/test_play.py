@@ -269,7 +269,7 @@ def test_levers_pass_the_gate_one_joint_each() -> None:
     loop.go(0.5, False, mode=1)
     loop.go(0.2, True, mode=1)
     assert loop.known[-1].driving and loop.known[-1].mode == 1
-    loop.go(0.5, True, mode=1, levers=(0, 0, -1, 0))
+    loop.go(0.6, True, mode=1, levers=(0, 0, -1, 0))
     np.testing.assert_allclose(loop.known[-1].u * 127, [0, 0, 0, -80, 0], atol=1e-9)
     assert loop.known[-1].q_dot[3] < -0.1 and abs(loop.known[-1].q_dot[0]) < 1e-3
     loop.go(0.1, True, mode=0)
