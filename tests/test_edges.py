@@ -142,7 +142,9 @@ def test_results_are_shown_from_the_files_that_they_name(
     assert "expected --machine mini, got brokk170" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("status", "message"), [(0, ""), (3, "expected ffmpeg to write it, got its status 3")])
+@pytest.mark.parametrize(
+    ("status", "message"), [(0, ""), (3, "expected ffmpeg to write it, got its status 3")]
+)
 def test_a_film_goes_through_ffmpeg_picture_by_picture(
     status: int,
     message: str,
