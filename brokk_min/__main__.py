@@ -300,9 +300,8 @@ class Evaluate(Command):
         if gains:
             controllers |= experiments.read_gains(gains, machine, policy.net)
         else:
-            controllers |= experiments.tuned_baselines(machine, policy.net, experiments.Effort(), self.seed)[
-                0
-            ]
+            tuned, _ = experiments.tuned_baselines(machine, policy.net, experiments.Effort(), self.seed)
+            controllers |= tuned
         if self.perfect_model:
             controllers |= experiments.bounds(machine, starts)
         moves = policy.net if self.plant == "net" else None

@@ -67,7 +67,7 @@ class TaskConfig:
     redraw_ground: bool = True
     """Redraw start poses in the ground; False is the paper's rule: end the episode without reward."""
     paper: bool = False
-    """Observation (no wanted rates, no weights) and reward (no valve cost) as the paper has them."""
+    """Observation (no wanted rates, no weights), reward (no valve cost) and critic as the paper has them."""
 
 
 @dataclass(frozen=True)

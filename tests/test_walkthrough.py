@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import re
-from contextlib import redirect_stdout
+import tempfile
+from contextlib import chdir, redirect_stdout
 from pathlib import Path
 
 import matplotlib
@@ -51,7 +52,9 @@ def write() -> None:
             exec(compile(match[1], str(PAGE), "exec"), namespace)
         return f"```python\n{match[1]}```\n" + (f"```\n{said.getvalue()}```\n" if said.getvalue() else "")
 
-    PAGE.write_text(BLOCK.sub(with_output, PAGE.read_text()))
+    with tempfile.TemporaryDirectory() as folder, chdir(folder):  # figures stay out of the project
+        text = BLOCK.sub(with_output, PAGE.read_text())
+    PAGE.write_text(text)
 
 
 if __name__ == "__main__":
