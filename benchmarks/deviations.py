@@ -16,7 +16,18 @@ from unittest import mock
 
 import numpy as np
 
-from brokk_min import actuator, env, experiments, jacobian, kinematics, logs, machine, preliminary, sequences
+from brokk_min import (
+    env,
+    excitation,
+    experiments,
+    fitting,
+    jacobian,
+    kinematics,
+    logs,
+    machine,
+    preliminary,
+    sequences,
+)
 from brokk_min.__main__ import SHIPPED
 from brokk_min.env import TaskConfig, TaskVectorEnv, rollout, terminated
 from brokk_min.jacobian import JacobianController
@@ -114,19 +125,19 @@ def a11() -> dict[str, float]:
 
 # --- by fitting and training --------------------------------------------------------------------------
 
-NOISE = actuator.FitConfig().noise
+NOISE = fitting.FitConfig().noise
 STEPS = 2_000_000  # of each training here, a quarter of the default
 
 
 @cache
-def fitted(excitation: str, noise: float, seed: int) -> dict[str, float]:
+def fitted(kind: str, noise: float, seed: int) -> dict[str, float]:
     """Nets of the driven joints fitted to 1 h a joint, on drives like a policy's: the worst joint."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "log.npz"
-        logs.write_log(path, actuator.collect(M, 1.0, excitation, np.random.default_rng(seed)))
+        logs.write_log(path, excitation.collect(M, 1.0, kind, np.random.default_rng(seed)))
         log = logs.read_log([path], M.velocity_samples)
-    net = actuator.fit(log, actuator.FitConfig(noise=noise), seed, M.velocity_samples, M.name)
-    test = actuator.task_log(M, 20, 40.0, np.random.default_rng(seed + 1))
+    net = fitting.fit(log, fitting.FitConfig(noise=noise), seed, M.velocity_samples, M.name)
+    test = excitation.task_log(M, 20, 40.0, np.random.default_rng(seed + 1))
     verdict = preliminary.judge(net, log, test, M)
     rows = [verdict["joints"][M.names[i]] for i in M.driven]
     return {

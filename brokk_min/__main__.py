@@ -15,10 +15,12 @@ import tyro
 from numpy.typing import NDArray
 
 from brokk_min import experiments, figures, hw, play, preliminary, remote, replay, view
-from brokk_min.actuator import PAPER_RECIPE, FitConfig, collect, fit, load_net, save_net
+from brokk_min.actuator import load_net, save_net
 from brokk_min.bus import open_line, read_frames
 from brokk_min.env import Controller, TaskConfig, fitting_nets
+from brokk_min.excitation import collect
 from brokk_min.export import export_onnx
+from brokk_min.fitting import PAPER_RECIPE, FitConfig, fit
 from brokk_min.kinematics import tool_position
 from brokk_min.logs import Log, read_log, write_log
 from brokk_min.machine import BROKK_170, Machine

@@ -18,16 +18,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from brokk_min.actuator import (
-    ActuatorNet,
-    PlantState,
-    load_net,
-    plant_reset,
-    plant_step,
-    push_angle,
-    push_command,
-    rest_history,
-)
+from brokk_min.actuator import ActuatorNet, load_net, push_angle, push_command, rest_history
 from brokk_min.kinematics import damped_rates, lowest_point, tool_jacobian, tool_position, tool_state
 from brokk_min.machine import (
     BROKK_170,
@@ -38,6 +29,7 @@ from brokk_min.machine import (
     limit_command,
     read_encoder,
 )
+from brokk_min.plant import PlantState, plant_reset, plant_step
 
 GROUND_MARGIN = 0.3  # m above the ground below which no goal asks the arm to sink, assumed
 LAG_TIME, LAG_SPEED = 2.0, 0.07  # s and a share of tool_speed, tuned: see `push_lag`

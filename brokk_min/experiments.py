@@ -18,7 +18,20 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from brokk_min import __version__, actuator, claims, figures, jacobian, kinematics, logs, preliminary, report
+from brokk_min import (
+    __version__,
+    actuator,
+    claims,
+    excitation,
+    figures,
+    fitting,
+    jacobian,
+    kinematics,
+    logs,
+    preliminary,
+    report,
+    scores,
+)
 from brokk_min.env import Controller, Encoder, TaskConfig, Trace, rollout
 from brokk_min.figures import Traces
 from brokk_min.jacobian import JacobianController
@@ -48,7 +61,7 @@ class Effort:
     """How much is spent; the quick chain has the same parts, smaller."""
 
     hours: float = 1.0
-    fit_steps: int = actuator.FitConfig.steps
+    fit_steps: int = fitting.FitConfig.steps
     train_steps: int = 8_000_000  # `PPOConfig`'s, without importing torch
     generations: int = 45
     tuning_runs: int = 12
@@ -406,8 +419,8 @@ def reproduce(
     with stage("record"):
         log, test = record(machine, out, effort, seed)
     with stage("fit"):
-        config = actuator.FitConfig(steps=effort.fit_steps, history=machine.history)
-        net = actuator.fit(log, config, seed, machine.velocity_samples, machine.name)
+        config = fitting.FitConfig(steps=effort.fit_steps, history=machine.history)
+        net = fitting.fit(log, config, seed, machine.velocity_samples, machine.name)
         actuator.save_net(out / "net.npz", net)
         half = replace(config, steps=effort.fit_steps // 2)  # for time
         paper = preliminary.paper_recipe(machine, test, effort.hours, half, seed)
@@ -421,10 +434,10 @@ def reproduce(
         rl = PolicyController(machine, policy)
         compared, traces = comparison(machine, {"rl": rl, **tuned}, effort, seed)
         compared["task_space"]["rl_on_nets"] = on_nets(machine, rl, compared, seed)
-        driven_log_score = actuator.score(net, driven_log(machine, traces["all"], "rl"))
+        driven_log_score = scores.score(net, driven_log(machine, traces["all"], "rl"))
         results = {
             "meta": meta(machine, seed) | {"effort": asdict(effort)},
-            "actuator": {"test": actuator.score(net, test), "driven_by_policy": driven_log_score},
+            "actuator": {"test": scores.score(net, test), "driven_by_policy": driven_log_score},
             "preliminary": preliminary.run(machine, net, seed),
             "paper_recipe": paper,
             **compared,
@@ -448,8 +461,8 @@ def reproduce(
 def record(machine: Machine, out: Path, effort: Effort, seed: int) -> list[logs.Log]:
     """Logs to fit nets to and to score them on, written and read back as anybody's."""
     files, rng = (out / "log.npz", out / "log_test.npz"), np.random.default_rng
-    logs.write_log(files[0], actuator.collect(machine, effort.hours, "rich", rng(seed)))
-    logs.write_log(files[1], actuator.task_log(machine, 20, 40.0, rng(seed + 1)))
+    logs.write_log(files[0], excitation.collect(machine, effort.hours, "rich", rng(seed)))
+    logs.write_log(files[1], excitation.task_log(machine, 20, 40.0, rng(seed + 1)))
     return [logs.read_log([file], machine.velocity_samples, rate=machine.rate) for file in files]
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from brokk_min import actuator, kinematics, logs
+from brokk_min import actuator, kinematics, logs, scores
 from brokk_min.env import Trace
 from brokk_min.machine import Machine
 from brokk_min.sequences import AXES, Commands
@@ -125,7 +125,7 @@ def plot_free_run(net: actuator.ActuatorNet, log: logs.Log, seconds: float = 30.
 def _free_run(net: actuator.ActuatorNet, recording: logs.Recording, seconds: float) -> Any:
     """Labels and curves (T, joints) of angles, then of velocities, recorded and run freely."""
     ticks = min(round(seconds * net.rate), len(recording.q) - net.history - 1)
-    free = actuator.free_run(net, recording, np.array([net.history]), ticks)
+    free = scores.free_run(net, recording, np.array([net.history]), ticks)
     later = slice(net.history + 1, net.history + 1 + ticks)
     for real, own, unit in zip((recording.q, recording.q_dot), free, ("rad", "rad/s"), strict=True):
         yield [f"{joint} [{unit}]" for joint in net.joints], {"measured": real[later], "free run": own[:, 0]}
@@ -182,7 +182,7 @@ def plot_worst_and_median(net: actuator.ActuatorNet, log: logs.Log, seconds: flo
 
     Of each the joint with the largest error.
     """
-    errors = np.nan_to_num(actuator.recording_errors(net, log, seconds), nan=-1.0)
+    errors = np.nan_to_num(scores.recording_errors(net, log, seconds), nan=-1.0)
     order = [i for i in np.argsort(errors.max(axis=1)) if errors[i].max() >= 0]
     rows = []
     for title, place in (("worst", -1), ("median", (len(order) - 1) // 2)):

@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min.actuator import PlantState, lever_arm, plant_reset, plant_step
 from brokk_min.env import observation_scale
 from brokk_min.jacobian import dls, valve_opening
 from brokk_min.kinematics import jacobian, tool_position, tool_velocity
 from brokk_min.machine import PWM_MAX, Machine, limit_command, read_encoder
+from brokk_min.plant import PlantState, lever_arm, plant_reset, plant_step
 
 Array = NDArray[np.floating[Any]]
 BLOCKS = (1, 1, 2, 4, 6)  # ticks at which a plan may turn lie between; their sum is the horizon (assumed)

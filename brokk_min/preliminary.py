@@ -13,11 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min import actuator, figures, kinematics
-from brokk_min.actuator import ActuatorNet, FitConfig
+from brokk_min import actuator, excitation, figures, fitting, kinematics, scores
+from brokk_min.actuator import ActuatorNet
 from brokk_min.env import fitting_nets
+from brokk_min.fitting import FitConfig
 from brokk_min.logs import RETURN, Log
 from brokk_min.machine import BROKK_170, PWM_MAX, Machine, encode_pwm
+from brokk_min.plant import plant_reset, plant_step
 
 Array = NDArray[np.floating[Any]]
 Mover = Callable[[Array, Array], Array]  # angles (..., n) and commands (T, ..., n) -> angles (T+1, ..., n)
@@ -33,10 +35,10 @@ def plant_mover(machine: Machine) -> Mover:
     """The analytic plant from rest."""
 
     def move(q: Array, u: Array) -> Array:
-        state = actuator.plant_reset(machine, q)
+        state = plant_reset(machine, q)
         angles = [state.q]
         for command in u:
-            state = actuator.plant_step(machine, state, command)
+            state = plant_step(machine, state, command)
             angles.append(state.q)
         return np.array(angles)
 
@@ -180,7 +182,7 @@ def sim_to_real(machine: Machine, net: ActuatorNet, seed: int) -> Gap:
     """Play sequences of 30 s that move several joints at once from q_s. Paper: Sec. 4.1, Fig. 5"""
     middle = (machine.column("q_min") + machine.column("q_max")) / 2
     start = np.array(STARTS.get(machine.name, middle))
-    log = actuator.task_log(machine, GAP_RUNS * 5 // 4, GAP_S, np.random.default_rng(seed), start)
+    log = excitation.task_log(machine, GAP_RUNS * 5 // 4, GAP_S, np.random.default_rng(seed), start)
     u = np.stack([r.u for i, r in enumerate(log.recordings) if i % 5 < 4], axis=1)  # driven joints move
     motion = []
     for move in movers(machine, net).values():
@@ -272,12 +274,12 @@ def paper_recipe(
 
     Paper: Sec. 3.3
     """
-    log = actuator.collect(machine, hours, "sine", np.random.default_rng(seed))
+    log = excitation.collect(machine, hours, "sine", np.random.default_rng(seed))
     legs = tuple(r for r in log.recordings if not r.name.endswith(RETURN))
-    config = replace(config, **actuator.PAPER_RECIPE)
-    net = actuator.fit(log._replace(recordings=legs), config, seed, machine.velocity_samples, machine.name)
+    config = replace(config, **fitting.PAPER_RECIPE)
+    net = fitting.fit(log._replace(recordings=legs), config, seed, machine.velocity_samples, machine.name)
     gap = _gap_numbers(machine, sim_to_real(machine, net, seed))
-    return {"test": actuator.score(net, test), "sim_to_real": gap}
+    return {"test": scores.score(net, test), "sim_to_real": gap}
 
 
 def plots(machine: Machine, net: ActuatorNet, seed: int) -> dict[str, Any]:
@@ -329,24 +331,24 @@ def _pairs(curves: dict[str, Array]) -> dict[str, tuple[Array, Array]]:
 def judge(net: ActuatorNet, log: Log, test: Log, machine: Machine | None = None) -> dict[str, Any]:
     """Scores of nets fitted to `log` on unseen recordings `test`, as in the fit JSON, with warnings.
 
-    Each joint: what `actuator.score` says of the nets and, as `linear`, of the linear model; `creep` at
+    Each joint: what `scores.score` says of the nets and, as `linear`, of the linear model; `creep` at
     zero command [rad/s]; `response_time` of the nets and `machine_response_time` of a known machine [s];
     `outside` as in `outside_training`. `tool`: median error at the end of free runs of a known machine [m].
     """
-    joints, warnings = actuator.score(net, test), []
-    floor = actuator.score(actuator.fit_linear(net, log), test)
+    joints, warnings = scores.score(net, test), []
+    floor = scores.score(fitting.fit_linear(net, log), test)
     still, outside, times = creep(net), outside_training(log, test, net.history), _times(net, log, machine)
-    for j, (name, scores) in enumerate(joints.items()):
-        scores |= {"linear": floor[name], "creep": float(still[j]), **{k: t[name] for k, t in times.items()}}
-        scores["outside"] = {kind: float(share[j]) for kind, share in outside.items()}
-        for horizon, mine in scores["free_run"].items():
+    for j, (name, found) in enumerate(joints.items()):
+        found |= {"linear": floor[name], "creep": float(still[j]), **{k: t[name] for k, t in times.items()}}
+        found["outside"] = {kind: float(share[j]) for kind, share in outside.items()}
+        for horizon, mine in found["free_run"].items():
             other = floor[name]["free_run"][horizon]["velocity_rmse"]
             if mine["velocity_rmse"] >= other:
                 warnings.append(
                     f"{name}: a free run of {horizon} s is off by {mine['velocity_rmse']:.4f} rad/s, "
                     f"a linear model only by {other:.4f}: the net is no better"
                 )
-        for kind, share in scores["outside"].items():
+        for kind, share in found["outside"].items():
             if share > ALLOWED_OUTSIDE:
                 warnings.append(f"{name}: {kind} outside the training's range in {share:.0%} of the test")
     tool = tool_errors(machine, net, test) if machine else {}
@@ -392,7 +394,7 @@ def outside_training(log: Log, test: Log, history: int) -> dict[str, Array]:
 
 
 def _signals(log: Log, history: int) -> dict[str, list[Array]]:
-    samples = actuator.end_to_end(log)
+    samples = fitting.end_to_end(log)
     at, u = samples.starts(history, 0, 1), samples.whole.u
     total = np.cumsum(np.concatenate([0 * u[:1], u]), axis=0)
     kinds = {
@@ -407,12 +409,12 @@ def _signals(log: Log, history: int) -> dict[str, list[Array]]:
 
 def tool_errors(machine: Machine, net: ActuatorNet, test: Log) -> dict[str, float]:
     """Median distance [m] of the tool from the recorded one at the end of free runs, by horizon."""
-    samples, result = actuator.end_to_end(test), {}
-    for horizon in actuator.HORIZONS:
+    samples, result = fitting.end_to_end(test), {}
+    for horizon in scores.HORIZONS:
         ticks = round(horizon * net.rate)
         starts = samples.starts(net.history, ticks, ticks)
         if len(starts):
-            q_error, _ = actuator.run_errors(net, samples, starts, ticks)
+            q_error, _ = scores.run_errors(net, samples, starts, ticks)
             recorded = samples.whole.q[starts + ticks]
             ends = (kinematics.tool_position(machine, q) for q in (recorded, recorded + q_error[-1]))
             apart = np.linalg.norm(next(ends) - next(ends), axis=-1)

@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
-from brokk_min import actuator, jacobian, kinematics, logs
+from brokk_min import jacobian, kinematics, logs
 from brokk_min.env import TaskConfig, draw_pose, reset, terminated
 from brokk_min.machine import Machine
+from brokk_min.plant import speed_limits
 
 Array = NDArray[np.floating[Any]]
 AXES = "xyz"
@@ -157,7 +158,7 @@ def feasible(machine: Machine, start: Array, goals: Array) -> NDArray[np.bool_]:
         rates[:, driven] = (inverse @ (goal + (wanted - p))[..., None])[..., 0]
         q, wanted = q + rates * machine.dt, wanted + goal * machine.dt
         inside = ((q[:, driven] > low) & (q[:, driven] < high)).all(-1)
-        down, up = actuator.speed_limits(machine, q)
+        down, up = speed_limits(machine, q)
         slow = ((rates > 0.9 * down) & (rates < 0.9 * up))[:, driven].all(-1)
         near = np.linalg.norm(wanted - p, axis=-1) < 0.02
         good &= inside & slow & near & (lowest > machine.ground + 0.1)

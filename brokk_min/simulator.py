@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brokk_min import bus
-from brokk_min.actuator import plant_reset, plant_step
 from brokk_min.gate import OPERATIONAL, checksum, encoder_raw
 from brokk_min.machine import Machine, decode_pwm
+from brokk_min.plant import plant_reset, plant_step
 
 Array = NDArray[Any]
 BOOT, STOPPED, PRE_OPERATIONAL = 0, 4, 127  # CANopen states beside OPERATIONAL

@@ -1,4 +1,4 @@
-"""Random machines, cheap actuator nets, scripted randomness and an oracle for the tests of the task."""
+"""Random machines, cheap actuator nets, a recording, scripted randomness and an oracle for the tests."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from brokk_min.actuator import ActuatorNet
 from brokk_min.kinematics import jacobian
+from brokk_min.logs import Recording, velocity_of
 from brokk_min.machine import BROKK_170, Joint, Machine
 
 GAIN = 3.0  # of `obedient_net`
@@ -149,3 +150,53 @@ class RowRandom:
 
     def uniform(self, low: float, high: float, size: int | tuple[int, ...]) -> np.ndarray:
         return np.concatenate([s.uniform(low, high, self._rows(size)) for s in self.sources])
+
+
+def random_net(seed: int = 0, n: int = 3, history: int = 13, hidden: int = 32) -> ActuatorNet:
+    rng = np.random.default_rng(seed)
+    inputs = 3 * history
+
+    def draw(*shape: int) -> np.ndarray:
+        return (rng.standard_normal(shape) / shape[1] ** 0.5).astype(np.float32)
+
+    return ActuatorNet(
+        joints=tuple(f"j{i}" for i in range(n)),
+        history=history,
+        rate=20.0,
+        velocity_samples=4,
+        velocity_logged=False,
+        machine="some",
+        seed=seed,
+        settings={"steps": 5},
+        input_mean=rng.uniform(-1, 1, (n, inputs)).astype(np.float32),
+        input_scale=rng.uniform(0.1, 2, (n, inputs)).astype(np.float32),
+        output_low=rng.uniform(-0.6, -0.1, n).astype(np.float32),
+        output_high=rng.uniform(0.1, 0.6, n).astype(np.float32),
+        q_low=np.full(n, -2.0, np.float32),
+        q_high=np.full(n, 2.0, np.float32),
+        weights=(
+            draw(n, inputs, hidden), draw(n, hidden), draw(n, hidden, hidden), draw(n, hidden),
+            draw(n, hidden, 1), draw(n, 1),
+        ),
+    )  # fmt: skip
+
+
+def constant_net(velocity: list[float], logged: bool, joints: tuple[str, ...]) -> ActuatorNet:
+    """Nets that say `velocity` whatever they see: no weights, sigmoid(0) = 1/2, the middle."""
+    middle = np.array(velocity, np.float32)
+    net = random_net(n=len(velocity))
+    return replace(
+        net,
+        joints=joints,
+        velocity_logged=logged,
+        weights=tuple(np.zeros_like(w) for w in net.weights),
+        output_low=middle - 1,
+        output_high=middle + 1,
+        q_low=np.full(len(velocity), -1e3, np.float32),
+        q_high=np.full(len(velocity), 1e3, np.float32),
+    )
+
+
+def line(name: str, start: float, slope: float, ticks: int, u: float = 0.5) -> Recording:
+    q = np.full((ticks, 1), start) + slope * np.arange(ticks)[:, None] / 20
+    return Recording(name, np.full((ticks, 1), u), q, velocity_of(q, 4))

@@ -16,8 +16,8 @@ from helpers_machines import small_net
 
 from brokk_min import claims, experiments, play, ppo, replay, report, sequences, sweep
 from brokk_min.__main__ import COMMANDS, main
-from brokk_min.actuator import FitConfig, fit
 from brokk_min.env import TaskConfig
+from brokk_min.fitting import FitConfig, fit
 from brokk_min.logs import Log, Recording, read_log, velocity_of, write_log
 from brokk_min.machine import BROKK_170, decode_pwm
 from brokk_min.sequences import read_starts, start_kinds, task_sequences

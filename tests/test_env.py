@@ -25,11 +25,12 @@ from scipy import stats
 
 from brokk_min import env as task
 from brokk_min import kinematics
-from brokk_min.actuator import plant_reset, plant_step, save_net
+from brokk_min.actuator import save_net
 from brokk_min.env import TaskConfig, TaskEnv, TaskVectorEnv
 from brokk_min.jacobian import GAINS, JacobianController, join_gains
 from brokk_min.kinematics import joint_rates, tool_position, tool_velocity
 from brokk_min.machine import BROKK_170, estimate_velocity, read_encoder
+from brokk_min.plant import plant_reset, plant_step
 
 POSE = np.array([1.5, 0.5, 0.58, 1.71, 1.24])  # the paper's q_s
 FINE = replace(BROKK_170, encoder_bits=32)  # so fine that float32 rounding cannot flip a count

@@ -14,11 +14,12 @@ from matplotlib.colors import to_rgb
 
 from benchmarks.rollout import random_net
 from brokk_min import experiments, figures, jacobian
-from brokk_min.actuator import ActuatorNet, plant_reset, plant_step, speed_limits
+from brokk_min.actuator import ActuatorNet
 from brokk_min.env import Measured, TaskConfig, measured, rollout, to_command
 from brokk_min.kinematics import joint_rates, tool_position
 from brokk_min.machine import BROKK_170, Machine, read_encoder
 from brokk_min.metrics import metrics
+from brokk_min.plant import plant_reset, plant_step, speed_limits
 from brokk_min.sequences import task_sequences
 
 TINY = experiments.Effort(0.02, 60, 8192, 1, 2, 4, 2, 1.0)
@@ -281,7 +282,7 @@ def test_gains_read_back_give_the_same_controller(twice: tuple[Path, Path]) -> N
 
 
 def test_the_whole_chain_spends_what_fit_and_train_do_by_default():
-    from brokk_min.actuator import FitConfig
+    from brokk_min.fitting import FitConfig
     from brokk_min.ppo import PPOConfig
 
     effort = experiments.Effort()

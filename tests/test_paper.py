@@ -19,11 +19,23 @@ import pytest
 from helpers_machines import small_net
 
 import brokk_min
-from brokk_min import actuator, experiments, figures, jacobian, ppo, preliminary, report, sequences
+from brokk_min import (
+    excitation,
+    experiments,
+    figures,
+    fitting,
+    jacobian,
+    ppo,
+    preliminary,
+    report,
+    scores,
+    sequences,
+)
 from brokk_min.env import TaskConfig, TaskVectorEnv, paper_view
 from brokk_min.kinematics import tool_position
 from brokk_min.logs import velocity_of
 from brokk_min.machine import BROKK_170
+from brokk_min.plant import plant_reset, plant_step
 
 ROOT = Path(__file__).parent.parent
 PAPER = (ROOT / "PAPER.md").read_text()
@@ -213,11 +225,11 @@ def test_tests_exist_and_use_the_symbols(code: str, test: str) -> None:
 
 
 def test_the_constants_are_the_papers() -> None:
-    net, learner = actuator.FitConfig(), ppo.PPOConfig()
+    net, learner = fitting.FitConfig(), ppo.PPOConfig()
     assert (BROKK_170.n, BROKK_170.history, net.history) == (5, 13, 13)
     assert (BROKK_170.history - 1) * BROKK_170.dt == pytest.approx(0.6)
     assert (net.hidden, TaskConfig().noise, learner.num_envs) == (32, 0.05, 256)
-    assert (experiments.Effort().hours, max(actuator.HORIZONS)) == (1.0, 30)
+    assert (experiments.Effort().hours, max(scores.HORIZONS)) == (1.0, 30)
     layers = [layer.out_features for layer in ppo.mlp(7, 1, 1.0) if hasattr(layer, "out_features")]
     assert layers == [256, 128, 64, 1]
     baselines = experiments.baselines(BROKK_170, small_net(BROKK_170, np.random.default_rng(0)))
@@ -232,10 +244,10 @@ def test_the_constants_are_the_papers() -> None:
 def rise_time(machine: brokk_min.Machine, before: int) -> float:
     """Seconds until q5 has 63 % of its gain in speed at 50 counts, after `before` counts."""
     fine = replace(machine, rate=1 / machine.plant_dt)
-    state = actuator.plant_reset(fine, [1.5, 0.5, 0.58, 1.71, 0.3])
+    state = plant_reset(fine, [1.5, 0.5, 0.58, 1.71, 0.3])
     speeds = []
     for count in [before] * 200 + [50] * 200:
-        state = actuator.plant_step(fine, state, count / 127 * np.eye(5)[4])
+        state = plant_step(fine, state, count / 127 * np.eye(5)[4])
         speeds.append(state.speed[4])
     return (np.argmax(np.array(speeds[200:]) > speeds[199] + 0.63 * (speeds[-1] - speeds[199])) + 1) * 0.005
 
@@ -253,9 +265,9 @@ def test_the_papers_coupling_test_is_marginal() -> None:
     together = np.array([-80, 0, -80, 80, 80]) / 127
 
     def speed(machine: brokk_min.Machine, u: np.ndarray) -> float:
-        state = actuator.plant_reset(machine, [0.5, 0.5, 1.4, 1.2, 0.3])
+        state = plant_reset(machine, [0.5, 0.5, 1.4, 1.2, 0.3])
         for _ in range(30):
-            state = actuator.plant_step(machine, state, u)
+            state = plant_step(machine, state, u)
         return float(state.speed[4])
 
     assert speed(BROKK_170, together) == pytest.approx(speed(BROKK_170, together * np.eye(5)[4]), rel=0.01)
@@ -277,7 +289,7 @@ def test_the_preliminary_figure_holds_its_three_tests() -> None:
 
 
 def test_the_papers_excitation_is_the_sine() -> None:
-    assert actuator.EXCITATIONS["sine"] is actuator.sine_command
+    assert excitation.EXCITATIONS["sine"] is excitation.sine_command
 
 
 def test_valve_opening_by_hand() -> None:

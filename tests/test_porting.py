@@ -14,11 +14,12 @@ from helpers_bus import World
 
 from brokk_min import experiments, hw
 from brokk_min.__main__ import main
-from brokk_min.actuator import load_net, speed_limits
+from brokk_min.actuator import load_net
 from brokk_min.jacobian import JacobianController, join_gains, manipulability_threshold
 from brokk_min.kinematics import frames, tool_position
 from brokk_min.logs import read_log
 from brokk_min.machine import Machine
+from brokk_min.plant import speed_limits
 from brokk_min.sequences import axis_sequences, draw_starts
 
 ROOT = Path(__file__).parent.parent

@@ -11,9 +11,10 @@ import pytest
 from helpers_machines import obedient_net, obedient_velocity, random_machine, small_net
 
 from benchmarks.rollout import random_net
-from brokk_min import actuator, preliminary
+from brokk_min import actuator, excitation, fitting, preliminary, scores
 from brokk_min.__main__ import main
-from brokk_min.actuator import ActuatorNet, FitConfig
+from brokk_min.actuator import ActuatorNet
+from brokk_min.fitting import FitConfig
 from brokk_min.logs import Log, Recording, read_log, velocity_of
 from brokk_min.machine import BROKK_170, Machine
 
@@ -180,10 +181,10 @@ def test_the_papers_recipe_is_sines_without_ways_back_and_errors_of_one_step(mon
         seen.update(log=log, config=config)
         return real_fit(log, config, *rest)
 
-    real_fit, real_collect = actuator.fit, actuator.collect
-    monkeypatch.setattr(actuator, "fit", recording_fit)
-    monkeypatch.setattr(actuator, "collect", lambda *a: seen.update(excitation=a[2]) or real_collect(*a))
-    test = actuator.task_log(BROKK_170, 2, 12.0, np.random.default_rng(1))
+    real_fit, real_collect = fitting.fit, excitation.collect
+    monkeypatch.setattr(fitting, "fit", recording_fit)
+    monkeypatch.setattr(excitation, "collect", lambda *a: seen.update(excitation=a[2]) or real_collect(*a))
+    test = excitation.task_log(BROKK_170, 2, 12.0, np.random.default_rng(1))
     result = preliminary.paper_recipe(BROKK_170, test, 0.02, FitConfig(steps=3, batch_size=8), 0)
     assert seen["excitation"] == "sine" and seen["config"] == FitConfig(3, 8, noise=0.0, rollout=1)
     assert seen["log"].recordings and not any(r.name.endswith("_return") for r in seen["log"].recordings)
@@ -307,21 +308,21 @@ def linear_log(seed: int, runs: int = 12, scale: float = 1.0) -> Log:
 
 def blank_net(log: Log, history: int = 5) -> ActuatorNet:
     config = FitConfig(steps=1, batch_size=8, history=history)
-    return actuator.fit(log, config, seed=0, velocity_samples=2)
+    return fitting.fit(log, config, seed=0, velocity_samples=2)
 
 
 def test_the_linear_model_finds_a_linear_joint():
     log = linear_log(0)
-    model = actuator.fit_linear(blank_net(log), log, penalty=1e-9)
-    scores = actuator.score(model, linear_log(1, scale=0.3))["a"]
-    assert scores["one_step_rmse"] < 1e-3 < 0.1 * scores["persistence_rmse"]
-    assert scores["free_run"]["1"]["velocity_rmse"] < 2e-3
+    model = fitting.fit_linear(blank_net(log), log, penalty=1e-9)
+    found = scores.score(model, linear_log(1, scale=0.3))["a"]
+    assert found["one_step_rmse"] < 1e-3 < 0.1 * found["persistence_rmse"]
+    assert found["free_run"]["1"]["velocity_rmse"] < 2e-3
 
 
 def test_the_linear_model_is_ridge_regression_on_the_nets_inputs():
     log, history = linear_log(0, 3), 4
     net = blank_net(log, history)
-    model = actuator.fit_linear(net, log, penalty=0.01)
+    model = fitting.fit_linear(net, log, penalty=0.01)
     rows, targets = [], []
     for r in log.recordings:
         for k in range(history - 1, len(r.q) - 1):
@@ -399,6 +400,6 @@ def test_tool_errors_by_hand(monkeypatch):
         * np.ones((len(starts), 1)),
         None,
     )
-    monkeypatch.setattr(actuator, "run_errors", error)
+    monkeypatch.setattr(scores, "run_errors", error)
     errors = preliminary.tool_errors(BROKK_170, random_net(np.random.default_rng(0)), test)
     assert errors == {"1": pytest.approx(0.0305, abs=2e-4), "5": pytest.approx(0.1525, abs=1e-3)}

@@ -1,0 +1,219 @@
+"""How the machine is driven, and the logs that come of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from brokk_min import excitation
+from brokk_min.excitation import EXCITATIONS, collect, task_log
+from brokk_min.logs import Log, Recording, read_log, velocity_of, write_log
+from brokk_min.machine import BROKK_170, read_encoder
+from brokk_min.plant import plant_reset, plant_step
+
+LIMIT = 80 / 127
+Q5 = 4
+
+
+@pytest.fixture(scope="module")
+def collected() -> dict[str, Log]:
+    return {kind: collect(BROKK_170, 0.05, kind, np.random.default_rng(7)) for kind in ("sine", "rich")}
+
+
+def test_sines_have_amplitudes_between_dead_zone_and_limit_and_random_frequencies():
+    rng = np.random.default_rng(0)
+    amplitudes, frequencies = [], []
+    for _ in range(200):
+        u = EXCITATIONS["sine"](rng, BROKK_170, 1200)
+        # any sine: u[t + 1] + u[t - 1] = 2 cos(w dt) u[t]
+        doubled = (u[2:] + u[:-2]) @ u[1:-1] / (u[1:-1] @ u[1:-1])
+        np.testing.assert_allclose(u[2:] + u[:-2], doubled * u[1:-1], atol=1e-9)
+        amplitudes.append(np.abs(u).max())
+        frequencies.append(np.arccos(doubled / 2) / (2 * np.pi * 0.05))
+    assert 0.069 < min(amplitudes) < 0.15 and 0.55 < max(amplitudes) <= LIMIT
+    assert np.ptp(frequencies) > 0.3 and min(frequencies) > 0
+
+
+def test_rich_commands_hold_jump_and_pause_and_have_the_asked_length():
+    rng = np.random.default_rng(0)
+    tapes = [EXCITATIONS["rich"](rng, BROKK_170, 600) for _ in range(40)]
+    assert all(tape.shape == (600,) for tape in tapes)
+    u = np.concatenate(tapes)
+    assert 0.05 < np.mean(u == 0) < 0.4  # pauses
+    assert np.sum(np.abs(np.diff(u)) > 0.5) > 50  # jumps
+    assert np.mean((np.diff(u) == 0) & (u[1:] != 0)) > 0.1  # holds
+
+
+@pytest.mark.parametrize("kind", ["sine", "rich"])
+def test_every_actuator_is_driven_as_long_as_asked_within_the_limits(collected, kind):
+    log = collected[kind]
+    assert log.joints == BROKK_170.names
+    driven = dict.fromkeys(log.joints, 0)
+    for r in log.recordings:
+        name = next(joint for joint in log.joints if r.name.startswith(joint))
+        mine = log.joints.index(name)
+        others = [i for i in range(5) if i != mine]
+        assert not r.u[:, others].any(), r.name
+        assert not np.ptp(r.q[:, others], axis=0).any(), r.name
+        counts = r.u * 127
+        np.testing.assert_allclose(counts, np.rint(counts), atol=1e-9)
+        assert np.abs(np.rint(counts)).max() <= 80
+        angles = r.q / BROKK_170.encoder_step
+        np.testing.assert_allclose(angles, np.rint(angles), atol=1e-6)
+        if not r.name.endswith("_return"):
+            driven[name] += len(r.u)
+            assert len(r.u) <= 613  # 13 samples at rest and 30 s
+        np.testing.assert_array_equal(r.q_dot, velocity_of(r.q, 4))
+    for name, ticks in driven.items():
+        assert 3600 <= ticks <= 3605, name  # 0.05 h at 20 Hz
+
+
+def test_ways_back_are_marked_and_lead_home(collected):
+    log = collected["sine"]
+    home = (BROKK_170.column("q_min") + BROKK_170.column("q_max")) / 2
+    names = [r.name for r in log.recordings]
+    assert len(set(names)) == len(names)
+    back = [r for r in log.recordings if r.name.endswith("_return")]
+    assert len(back) >= 5
+    for r in log.recordings:
+        mine = next(i for i, joint in enumerate(log.joints) if r.name.startswith(joint))
+        if r.name.endswith("_return"):
+            assert abs(r.q[-1, mine] - home[mine]) < 0.12
+        else:
+            assert abs(r.q[0, mine] - home[mine]) < 0.12
+
+
+def test_legs_end_at_a_limit_or_when_their_time_is_over(collected):
+    log, tick = collected["rich"], 0.05 * BROKK_170.q_dot_max + 0.01
+    low, high = BROKK_170.column("q_min") + tick, BROKK_170.column("q_max") - tick
+    ended = [r for r in log.recordings if not r.name.endswith("_return")]
+    last = {r.name[:2]: r.name for r in ended}  # of each joint: cut when the time is over
+    for r in ended:
+        if r.name in last.values():
+            continue
+        mine = next(i for i, joint in enumerate(log.joints) if r.name.startswith(joint))
+        edge = r.q[-2:, mine]
+        assert len(r.q) == 613 or edge.min() < low[mine] or edge.max() > high[mine], r.name
+        assert 33 < len(r.q) <= 613, r.name  # a second of driving at least
+
+
+def legs_of(log: Log) -> list[tuple[int, Recording, Recording]]:
+    """Joint, leg and way back of each pair but the last of each joint, whose leg is cut."""
+    named = {r.name: r for r in log.recordings}
+    last = {r.name[:2]: r.name.removesuffix("_return") for r in log.recordings}
+    pairs = [(r, named[r.name + "_return"]) for r in log.recordings if r.name + "_return" in named]
+    return [(log.joints.index(r.name[:2]), r, b) for r, b in pairs if r.name not in last.values()]
+
+
+@pytest.mark.parametrize("kind", ["sine", "rich"])
+def test_a_leg_begins_at_true_idle_and_the_rest_before_it_belongs_to_it(collected, kind):
+    """The first window of every leg is 13 samples at rest, then the first command."""
+    for r in collected[kind].recordings:
+        if not r.name.endswith("_return"):
+            assert not r.u[:13].any() and not np.ptp(r.q[:14], axis=0).any(), r.name
+            assert not np.abs(r.q_dot[:14]).max() > 1e-12, r.name
+    legs = legs_of(collected[kind])
+    assert len(legs) > 20
+    starts = [np.abs(leg.u[13:16, joint]).max() > BROKK_170.dead_zone for joint, leg, _ in legs]
+    assert np.mean(starts) > 0.5  # the others begin with a pause or near a sine's zero
+
+
+@pytest.mark.parametrize("kind", ["sine", "rich"])
+def test_a_way_back_goes_on_where_the_leg_ended_and_rests_at_its_start_until_idle(collected, kind):
+    for joint, leg, back in legs_of(collected[kind]):
+        assert np.abs(back.q[0] - leg.q[-1]).max() < 0.03, leg.name  # a tick at full speed
+        assert abs(back.q[-1, joint] - leg.q[0, joint]) < 0.1, leg.name
+        assert not back.u[-40:].any() and len(back.u) >= 40, leg.name  # 2 s, 5 times 0.4 s
+
+
+def test_ways_back_are_driven_halfway_between_dead_zone_and_limit():
+    for limit, counts in ((80, 44), (40, 24), (120, 64)):  # (0.07 + limit / 127) / 2
+        machine = replace(BROKK_170, pwm_limit=limit)
+        log = collect(machine, 0.004, "rich", np.random.default_rng(0))
+        back = np.concatenate([r.u for r in log.recordings if r.name.endswith("_return")])
+        assert set(np.rint(np.abs(back) * 127).ravel().tolist()) == {0, counts}
+
+
+def test_a_joint_too_slow_to_come_back_does_not_keep_the_recording_waiting(monkeypatch):
+    monkeypatch.setattr(excitation, "MAX_RETURN", 1.0)
+    log = collect(BROKK_170, 0.004, "sine", np.random.default_rng(0))
+    assert max(len(r.q) for r in log.recordings if r.name.endswith("_return")) <= 600 + 20
+    driven = sum(len(r.q) for r in log.recordings if not r.name.endswith("_return"))
+    assert driven == 5 * 288
+
+
+def test_rich_recordings_hold_pauses_and_sine_recordings_none(collected):
+    def longest_pause(log: Log) -> int:
+        longest = 0
+        for r in log.recordings:
+            if r.name.endswith("_return"):
+                continue
+            moved = np.flatnonzero(np.concatenate([[1], r.u[13:].any(axis=1), [1]]))
+            longest = max(longest, int(np.diff(moved).max()) - 1)
+        return longest
+
+    assert longest_pause(collected["rich"]) >= 40
+    assert longest_pause(collected["sine"]) < 20
+
+
+def test_recorded_angles_are_those_before_the_command_beside_them(collected):
+    """A replay of the commands through the plant gives the recorded angles, tick by tick."""
+    home = (BROKK_170.column("q_min") + BROKK_170.column("q_max")) / 2
+    for kind, log in collected.items():
+        first = next(r for r in log.recordings if r.name.startswith("q5"))
+        start, tolerance = (home, 0.0) if kind == "sine" else (first.q[0], 2.0)  # known to a count
+        state = plant_reset(BROKK_170, np.where(np.arange(5) == Q5, start, home))
+        for u, q in zip(first.u, first.q, strict=True):
+            counts = (read_encoder(BROKK_170, state.q) - q) / BROKK_170.encoder_step
+            assert np.abs(counts).max() <= tolerance + 1e-6
+            state = plant_step(BROKK_170, state, u)
+
+
+def test_one_seed_gives_one_log_to_the_bit_and_another_seed_another():
+    again = collect(BROKK_170, 0.003, "rich", np.random.default_rng(3))
+    same = collect(BROKK_170, 0.003, "rich", np.random.default_rng(3))
+    other = collect(BROKK_170, 0.003, "rich", np.random.default_rng(4))
+    assert [r.name for r in again.recordings] == [r.name for r in same.recordings]
+    for one, two in zip(again.recordings, same.recordings, strict=True):
+        np.testing.assert_array_equal(one.u, two.u)
+        np.testing.assert_array_equal(one.q, two.q)
+    assert not np.array_equal(again.recordings[0].u, other.recordings[0].u)
+
+
+def test_a_collected_log_reads_back_without_its_ways_back(collected, tmp_path):
+    log = collected["sine"]
+    write_log(tmp_path / "log.npz", log)
+    again = read_log([tmp_path / "log.npz"], 4)
+    kept = [r for r in log.recordings if not r.name.endswith("_return")]
+    assert [r.name for r in again.recordings] == [r.name for r in kept]
+    for got, wanted in zip(again.recordings, kept, strict=True):
+        np.testing.assert_allclose(got.u, wanted.u, atol=1e-12)
+        np.testing.assert_allclose(got.q, wanted.q, atol=1e-12)
+
+
+def test_another_excitation_or_no_time_is_refused():
+    rng = np.random.default_rng(0)
+    with pytest.raises(ValueError, match=r"excitation: expected .*sine.*rich.*, got 'square'"):
+        collect(BROKK_170, 1.0, "square", rng)
+    for hours in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match=f"hours: expected above 0, got {hours}"):
+            collect(BROKK_170, hours, "sine", rng)
+
+
+def test_task_recordings_move_driven_or_locked_joints_within_the_limits_and_replay():
+    log = task_log(BROKK_170, 5, 20.0, np.random.default_rng(0))
+    assert len(log.recordings) == 5
+    for i, r in enumerate(log.recordings):
+        moved = np.flatnonzero(np.ptp(r.q, axis=0) > 0.05).tolist()
+        assert moved == ([1] if i == 4 else [0, 2, 3, 4])  # q2 moves only alone
+        assert r.u.shape == r.q.shape == (400, 5)
+        counts = r.u * 127
+        np.testing.assert_allclose(counts, np.rint(counts), atol=1e-9)
+        assert np.abs(counts).max() <= 80 + 1e-9
+        # replayed from the first angle, half a count off at most, all tapes agree with the plant
+        state = plant_reset(BROKK_170, r.q[0])
+        for u in r.u:
+            state = plant_step(BROKK_170, state, u)
+        assert np.abs(state.q - r.q[-1]).max() < 0.02
