@@ -23,7 +23,7 @@ from brokk_min import play
 from brokk_min.machine import BROKK_170
 from brokk_min.policy import PolicyController
 from brokk_min.remote import Where
-from brokk_min.replay import Known
+from brokk_min.ticks import Known
 
 
 @dataclass

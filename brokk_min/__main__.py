@@ -1,6 +1,5 @@
 """The command line: `brokk-min COMMAND --help`. Exits 0 done, 1 failed, 2 wrong use."""
 
-import json
 import os
 import runpy
 import shutil
@@ -12,7 +11,6 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
-from numpy.typing import NDArray
 
 from brokk_min import experiments, figures, hw, play, preliminary, remote, replay, view
 from brokk_min.actuator import load_net, save_net
@@ -21,21 +19,12 @@ from brokk_min.env import Controller, TaskConfig, fitting_nets
 from brokk_min.excitation import collect
 from brokk_min.export import export_onnx
 from brokk_min.fitting import PAPER_RECIPE, FitConfig, fit
-from brokk_min.kinematics import tool_position
 from brokk_min.logs import Log, read_log, write_log
 from brokk_min.machine import BROKK_170, Machine
 from brokk_min.metrics import summary
 from brokk_min.policy import PolicyController, load_policy
 from brokk_min.report import VERDICTS
-from brokk_min.sequences import (
-    Commands,
-    draw_starts,
-    read_commands,
-    read_starts,
-    scored_starts,
-    task_sequences,
-    write_starts,
-)
+from brokk_min.sequences import draw_starts, goals_and_starts, read_commands, task_sequences, write_starts
 from brokk_min.simulator import simulate
 
 MACHINES = {machine.name: machine for machine in (BROKK_170,)}
@@ -106,15 +95,6 @@ def chosen_policy(machine: Machine, policy: Path | None, gains: Path | None) -> 
     path = policy or SHIPPED / machine.name / "policy.npz"
     beside = path.with_name("gains.json")
     return path, gains or (beside if beside.exists() else None)
-
-
-def goals_and_starts(
-    machine: Machine, commands: Path | None, starts: Path | None, num: int, seed: int
-) -> tuple[list[Commands], NDArray[np.floating]]:
-    """Velocity sequences and start poses of files, or where there is none the machine's own."""
-    own = task_sequences(machine)
-    poses = read_starts(starts, machine) if starts else scored_starts(machine, num, own, seed + 2)
-    return read_commands(commands, machine) if commands else own, poses
 
 
 @dataclass(kw_only=True)
@@ -541,52 +521,22 @@ class Replay(Command):
         runs = list[replay.Run]()
         for log, colour in zip(self.logs, colours, strict=False):
             again = log.suffix == ".json"
-            runs += self._driven_again(machine, log) if again else [replay.run_of_log(machine, log, colour)]
+            runs += self._again(machine, log) if again else [replay.run_of_log(machine, log, colour)]
         if self.out:
             replay.write_film(self.out, machine, runs, self.size, self.fps)
         else:
             replay.show_film(machine, runs, self.size)
 
-    def _driven_again(self, machine: Machine, path: Path) -> list[replay.Run]:
-        """Runs of a results file, simulated anew from what it says of itself and compared with its rows."""
-        try:
-            file = json.loads(path.read_text())
-            beside = {"policy": str(path.with_name("policy.npz")), "gains": str(path.with_name("gains.json"))}
-            told = beside | {"plant": "analytic", "commands": "", "starts": ""} | file["meta"]
-            rows = file.get("task_space", file)["runs"]
-            names, seed = ", ".join(s.name for s in task_sequences(machine)), int(told["seed"])
-            num = int(told["starts"]) if told["starts"].isdigit() else 0
-            given = np.array(file["starts"], float) if "starts" in file else None
-        except (OSError, KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"{path}: expected results of `evaluate`, got {error!r}") from error
-        if told.get("machine") != machine.name:
-            raise ValueError(f"{path}: expected --machine {told.get('machine')}, got {self.machine}")
-        commands = None if told["commands"] in ("", names) else Path(told["commands"])
-        poses = None if num or not told["starts"] else Path(told["starts"])
-        sequences, starts = goals_and_starts(machine, commands, poses, num, seed)
-        starts = starts if given is None else given
-        policy, named = load_policy(Path(told["policy"]), machine), {s.name: s for s in sequences}
-        known: dict[str, Controller] = {"rl": PolicyController(machine, policy)}
-        if set(self.controllers) - {"rl"}:
-            known |= experiments.read_gains(Path(told["gains"]), machine, policy.net)
-        sequence = named.get(self.sequence or sequences[0].name)
-        if sequence is None or set(self.controllers) - set(known) or not 0 <= self.start < len(starts):
+    def _again(self, machine: Machine, path: Path) -> list[replay.Run]:
+        results = replay.read_results(machine, path, self.controllers)
+        named, known, num = list(results.sequences), list(results.controllers), len(results.starts)
+        sequence = self.sequence or named[0]
+        if sequence not in named or set(self.controllers) - set(known) or not 0 <= self.start < num:
             raise WrongUse(
-                f"--sequence, --controllers, --start: expected some of {list(named)}, of {list(known)} "
-                f"and below {len(starts)}, got {self.sequence}, {list(self.controllers)}, {self.start}"
+                f"--sequence, --controllers, --start: expected some of {named}, of {known} "
+                f"and below {num}, got {self.sequence}, {list(self.controllers)}, {self.start}"
             )
-        chosen = {name: known[name] for name in self.controllers}
-        net = policy.net if told["plant"] == "net" else None
-        again, traces = experiments.task_space(machine, chosen, sequences, starts, seed, net)
-        for row in (r for r in again if r["start"] == self.start and r["sequence"] == sequence.name):
-            same = [r for r in rows if all(r[k] == row[k] for k in ("controller", "sequence", "start"))]
-            if not same or not np.isclose(same[0]["velocity_rmse"], row["velocity_rmse"], rtol=1e-3):
-                raise ValueError(f"{path}: expected the run {row}, got {same or 'none'}: another program?")
-        first = tool_position(machine, starts[self.start])
-        return [
-            replay.run_of_trace(machine, name, traces[name, sequence.name], self.start, sequence.goals, first)
-            for name in chosen
-        ]
+        return replay.driven_again(machine, results, self.controllers, sequence, self.start)
 
 
 COMMANDS: dict[str, Callable[[], Any]] = {

@@ -612,7 +612,7 @@ class _Pictures:
 
     def take(self, state: State | None) -> list[NDArray[np.uint8]]:
         """A frame (600, 960, 3) of each row, or the first row on the screen. Needs the extra `play`."""
-        from brokk_min import view  # pictures cost nothing where nobody looks
+        from brokk_min import view, window  # pictures cost nothing where nobody looks
 
         if state is None or self.mode is None:
             raise ValueError(f"render: expected a render_mode and a reset before, got {self.mode}")
@@ -624,11 +624,11 @@ class _Pictures:
             )
             drawn.append(view.draw(self.machine, [scene], self.SIZE))
         if self.mode == "human":
-            self.window = self.window or view.Window(self.SIZE, self.machine.name)
+            self.window = self.window or window.Window(self.SIZE, self.machine.name)
             self.window.pygame.event.pump()
             self.window.show(drawn[0], self.machine.rate)
             return []
-        return [view.picture(shapes, self.SIZE) for shapes in drawn]
+        return [window.picture(shapes, self.SIZE) for shapes in drawn]
 
     def close(self) -> None:
         """Close the window, if there is one."""

@@ -21,7 +21,9 @@ from brokk_min.gate import fault_name
 from brokk_min.kinematics import tool_position
 from brokk_min.machine import Machine
 from brokk_min.remote import Ask, Where, control_process
-from brokk_min.replay import TITLES, Known, Ticks, unpack_known
+from brokk_min.ticks import Known, Ticks, unpack_known
+from brokk_min.view import TITLES
+from brokk_min.window import Window, open_window
 
 Array = NDArray[Any]
 SIZE = (1120, 680)  # of the window [px]
@@ -230,7 +232,7 @@ Watcher = Callable[[Session, Hands], bool]
 
 
 def show(
-    window: view.Window,
+    window: Window,
     session: Session,
     hear: Callable[[], Known | None],
     tell: Callable[[Ask], object],
@@ -285,9 +287,9 @@ def _hint(session: Session, hands: Hands) -> str:
     return "ready: hold SPACE" + f" or button {PAD_BUTTON}" * (hands.pad is not None)
 
 
-def _window(machine: Machine) -> AbstractContextManager[view.Window]:
+def _window(machine: Machine) -> AbstractContextManager[Window]:
     """Before a loop begins: nothing may reach a bus if nobody can see it."""
-    return view.open_window(SIZE, f"brokk_min: {machine.name}")
+    return open_window(SIZE, f"brokk_min: {machine.name}")
 
 
 def play(machine: Machine, controllers: Mapping[str, Controller], where: Where, attempts: Path) -> None:

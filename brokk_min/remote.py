@@ -22,8 +22,8 @@ from brokk_min import hw
 from brokk_min.bus import open_line
 from brokk_min.env import Controller, to_command
 from brokk_min.machine import BROKK_170, PWM_MAX, Machine
-from brokk_min.replay import Known
 from brokk_min.simulator import SimulatedMachine, serve
+from brokk_min.ticks import Known
 
 Array = NDArray[Any]
 START = (0.0, 0.5, 0.58, 1.71, 1.24)  # rad, the paper's start pose, pointing forward

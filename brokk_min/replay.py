@@ -1,7 +1,8 @@
-"""Recorded runs: what is known of a machine tick by tick, from a bus, a log or a rollout, and films of it."""
+"""Recorded runs, of a log or of results driven again, side by side: films of them."""
 
 from __future__ import annotations
 
+import json
 import subprocess
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -12,84 +13,19 @@ from numpy.typing import NDArray
 from PIL import Image
 from tqdm import tqdm
 
-from brokk_min import hw, logs, view
-from brokk_min.bus import OPERATOR, SYNC, WISH, Frame, Nodes, read_frames
-from brokk_min.env import Trace
-from brokk_min.gate import encoder_counts
-from brokk_min.kinematics import tool_state
-from brokk_min.machine import Machine, decode_pwm, estimate_velocity
+from brokk_min import experiments, logs, view
+from brokk_min.actuator import ActuatorNet
+from brokk_min.bus import read_frames
+from brokk_min.env import Controller, Trace
+from brokk_min.kinematics import tool_position, tool_state
+from brokk_min.looks import skeleton
+from brokk_min.machine import Machine
+from brokk_min.policy import PolicyController, load_policy
+from brokk_min.sequences import Commands, goals_and_starts, task_sequences
+from brokk_min.ticks import Known, Ticks
+from brokk_min.window import open_window, picture
 
 Array = NDArray[Any]
-TITLES = {
-    "rl": "RL policy",
-    "jacobian": "Jacobian + PID",
-    "levers": "levers, joint by joint",
-    "jacobian_pid_k0.1": "Jacobian + PID",
-    "jacobian_pid_ff": "Jacobian + PID with feed-forward",
-}
-
-
-class Known(NamedTuple):
-    """What the loop, a bus or a log tells of one tick."""
-
-    tick: float
-    q: Array  # rad (n,), nan: unknown
-    q_dot: Array  # rad/s (n,)
-    u: Array  # in [-1, 1] (n,)
-    v_goal: Array  # m/s (3,)
-    driving: bool
-    wrong: int = 0  # of `fault_name`
-    fault: int = 0
-    mode: int = 0
-    lateness: float = 0.0  # s
-
-    def pack(self) -> Array:
-        """As numbers in a row."""
-        return np.hstack([np.ravel(value) for value in self]).astype(float)
-
-
-def unpack_known(machine: Machine, values: Array) -> Known:
-    """What `Known.pack` packed."""
-    n = machine.n
-    tick, q, q_dot, u, v, rest = np.split(values, np.cumsum([1, n, n, n, 3]))
-    driving, wrong, fault, mode = (int(x) for x in rest[:4])
-    return Known(float(tick[0]), q, q_dot, u, v, bool(driving), wrong, fault, mode, float(rest[4]))
-
-
-class Ticks:
-    """Frames of a bus or a log, one after another, as what is known at each tick; it only listens."""
-
-    def __init__(self, machine: Machine) -> None:
-        self.machine, self.nodes, self.wish = machine, Nodes(machine), hw.Wish()
-        self.u, self.driving, self.tick = np.zeros(machine.n), False, 0
-        self.angles: list[Array] = []  # rad, as many as the velocity needs
-
-    def hear(self, frame: Frame) -> Known | None:
-        """Take in one frame; at a SYNC, what is known of the tick that it ends."""
-        if frame.id == SYNC:
-            known, self.nodes.frames[:] = self._known(), 0
-            self.tick += 1
-            return known
-        if frame.id == WISH and frame.channel == OPERATOR:
-            self.wish = hw.unpack_wish(frame.data)
-        elif frame.id == self.machine.valve_frame_id and len(frame.data) == 8:
-            self.u, self.driving = decode_pwm(list(frame.data[: self.machine.n])), frame.data[7] == 1
-        else:
-            self.nodes.hear(frame)
-        return None
-
-    def _known(self) -> Known:
-        m, v_goal = self.machine, np.array(self.wish.v_goal) * self.driving
-        if (self.nodes.frames != 1).any():
-            self.angles, nan = [], np.full(m.n, np.nan)
-            return Known(self.tick, nan, nan, self.u, v_goal, self.driving)
-        q = encoder_counts(m, self.nodes.raw) * m.encoder_step
-        self.angles = [*(self.angles or [q] * m.velocity_samples), q][-m.velocity_samples :]
-        q_dot = estimate_velocity(np.stack(self.angles, axis=-1), m.velocity_samples, m.dt)
-        return Known(self.tick, q, np.asarray(q_dot), self.u, v_goal, self.driving)
-
-
-# --- films --------------------------------------------------------------------------------------------
 
 
 class Run(NamedTuple):
@@ -108,7 +44,7 @@ def recorded(machine: Machine, title: str, colour: view.Colour, known: Sequence[
     """A run from its ticks; the velocity error is that of the velocities that it holds."""
     q, q_dot, v_goal = (np.array([getattr(k, name) for k in known]) for name in ("q", "q_dot", "v_goal"))
     p_tool, v_tool, _ = tool_state(machine, q, q_dot)
-    corners = view.skeleton(machine, q[::10]).reshape(-1, 3)
+    corners = skeleton(machine, q[::10]).reshape(-1, 3)
     error = np.linalg.norm(v_goal - v_tool, axis=-1)
     return Run(title, colour, known, p_tool, error, path, np.vstack([corners, path]))
 
@@ -136,13 +72,74 @@ def run_of_trace(machine: Machine, title: str, trace: Trace, run: int, goals: Ar
     return recorded(machine, title, colour, known, path)
 
 
+class Results(NamedTuple):
+    """What a results file says of itself, and what it takes to drive its runs again."""
+
+    path: Path
+    runs: list[dict[str, Any]]  # its rows
+    sequences: dict[str, Commands]
+    starts: Array  # rad (starts, n)
+    controllers: dict[str, Controller]
+    net: ActuatorNet | None  # what moved; None: the plant
+    seed: int
+
+
+def read_results(machine: Machine, path: Path, controllers: Sequence[str]) -> Results:
+    """A JSON file of `evaluate` or `reproduce`; its gains are read if other `controllers` than RL are wanted.
+
+    Raises:
+        ValueError: no results, or of another machine; the files that it names are not as they should be.
+    """
+    try:
+        file = json.loads(path.read_text())
+        beside = {"policy": str(path.with_name("policy.npz")), "gains": str(path.with_name("gains.json"))}
+        told = beside | {"plant": "analytic", "commands": "", "starts": ""} | file["meta"]
+        rows = file.get("task_space", file)["runs"]
+        names, seed = ", ".join(s.name for s in task_sequences(machine)), int(told["seed"])
+        num = int(told["starts"]) if told["starts"].isdigit() else 0
+        given = np.array(file["starts"], float) if "starts" in file else None
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: expected results of `evaluate`, got {error!r}") from error
+    if told.get("machine") != machine.name:
+        raise ValueError(f"{path}: expected --machine {told.get('machine')}, got {machine.name}")
+    commands = None if told["commands"] in ("", names) else Path(told["commands"])
+    poses = None if num or not told["starts"] else Path(told["starts"])
+    sequences, starts = goals_and_starts(machine, commands, poses, num, seed)
+    policy = load_policy(Path(told["policy"]), machine)
+    known: dict[str, Controller] = {"rl": PolicyController(machine, policy)}
+    if set(controllers) - {"rl"}:
+        known |= experiments.read_gains(Path(told["gains"]), machine, policy.net)
+    net, named = policy.net if told["plant"] == "net" else None, {s.name: s for s in sequences}
+    return Results(path, rows, named, starts if given is None else given, known, net, seed)
+
+
+def driven_again(
+    machine: Machine, results: Results, controllers: Sequence[str], sequence: str, start: int
+) -> list[Run]:
+    """One run of each controller, simulated anew.
+
+    Raises:
+        ValueError: it is not the run that the file has.
+    """
+    chosen, every = {name: results.controllers[name] for name in controllers}, [*results.sequences.values()]
+    found, traces = experiments.task_space(machine, chosen, every, results.starts, results.seed, results.net)
+    for row in (r for r in found if r["start"] == start and r["sequence"] == sequence):
+        same = [r for r in results.runs if all(r[k] == row[k] for k in ("controller", "sequence", "start"))]
+        if not same or not np.isclose(same[0]["velocity_rmse"], row["velocity_rmse"], rtol=1e-3):
+            raise ValueError(
+                f"{results.path}: expected the run {row}, got {same or 'none'}: another program?"
+            )
+    goals, first = results.sequences[sequence].goals, tool_position(machine, results.starts[start])
+    return [run_of_trace(machine, name, traces[name, sequence], start, goals, first) for name in chosen]
+
+
 def film(machine: Machine, runs: Sequence[Run], tick: int, size: tuple[int, int]) -> list[view.Shape]:
     """The picture of one tick of all runs, by the same clock; what is over stands still."""
     scenes, hold = [], np.vstack([run.hold for run in runs])
     for run in runs:
         at = min(tick, len(run.known) - 1)
         known, mean = run.known[at], run.error[: at + 1].mean()
-        title, status = TITLES.get(run.title, run.title), f"{at * machine.dt:.1f} s"
+        title, status = view.TITLES.get(run.title, run.title), f"{at * machine.dt:.1f} s"
         scene = view.Scene(known.q, known.q_dot, known.u, known.v_goal, run.p_tool[: at + 1], run.path)
         notes = [f"velocity error {run.error[at]:.3f} m/s", f"mean so far {mean:.3f} m/s"]
         scenes.append(scene._replace(title=title, status=status, colour=run.colour, notes=notes, hold=hold))
@@ -160,7 +157,7 @@ def write_film(path: Path, machine: Machine, runs: Sequence[Run], size: tuple[in
         raise ValueError(f"{path}: expected a name ending in .gif or .mp4, got {path.suffix!r}")
     ticks = range(0, max(len(run.known) for run in runs), max(1, round(machine.rate / fps)))
     bar = tqdm(ticks, desc="draw", unit="picture", disable=None)
-    images = (view.picture(film(machine, runs, tick, size), size) for tick in bar)
+    images = (picture(film(machine, runs, tick, size), size) for tick in bar)
     with logs.whole_file(path) as file:
         writers[path.suffix](file, images, size, machine.rate / ticks.step)
 
@@ -199,7 +196,7 @@ def _palette(films: Sequence[Image.Image]) -> Image.Image:
 def show_film(machine: Machine, runs: Sequence[Run], size: tuple[int, int]) -> None:
     """All runs in a window, in real time; space halts, left and right move by a second."""
     at, going, last = 0, True, max(len(run.known) for run in runs) - 1
-    with view.open_window(size, "brokk_min replay") as window:
+    with open_window(size, "brokk_min replay") as window:
         pg = window.pygame
         while True:
             for event in pg.event.get():

@@ -253,6 +253,15 @@ def scored_starts(machine: Machine, num: int, sequences: Sequence[Commands], see
     return starts[:num]
 
 
+def goals_and_starts(
+    machine: Machine, commands: Path | None, starts: Path | None, num: int, seed: int
+) -> tuple[list[Commands], Array]:
+    """Velocity sequences and start poses of files, or where there is none the machine's own."""
+    own = task_sequences(machine)
+    poses = read_starts(starts, machine) if starts else scored_starts(machine, num, own, seed + 2)
+    return read_commands(commands, machine) if commands else own, poses
+
+
 def write_starts(path: Path, machine: Machine, starts: Array) -> None:
     """Write poses as `read_starts` reads them."""
     with logs.whole_file(path, "w") as file:

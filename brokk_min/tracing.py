@@ -13,10 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min import logs, view
+from brokk_min import logs
 from brokk_min.kinematics import tool_position
+from brokk_min.looks import extent
 from brokk_min.machine import Machine
-from brokk_min.replay import Known
+from brokk_min.ticks import Known
 
 Array = NDArray[Any]
 CAPTURE = 0.1  # m, assumed: a point of the line counts as passed nearer than this
@@ -28,7 +29,7 @@ def task_lines(machine: Machine) -> dict[str, Array]:
 
     A level rectangle, an upright circle and straight lines along the axes; none goes down from its start.
     """
-    size = view.extent(machine).reach
+    size = extent(machine).reach
     turn = np.linspace(0, 2 * np.pi, 60)
     square = np.array([[0, 0, 0], [0, 0.16, 0], [0.1, 0.16, 0], [0.1, 0, 0], [0, 0, 0]])
     circle = 0.06 * np.stack([np.sin(turn), 0 * turn, 1 - np.cos(turn)], axis=1)

@@ -1,32 +1,26 @@
-"""Pictures of arms: a pure function from machines and what they do to shapes, and shapes onto a surface.
+"""Pictures of arms: a pure function from machines and what they do to shapes.
 
-`draw` knows kinematics and nothing of physics, control or buses; any `Machine` can be drawn. `paint` is
-the only function that needs pygame (extra `play`). Coordinates of shapes are pixels, y down.
+`draw` knows kinematics and nothing of physics, control or buses; any `Machine` can be drawn. Coordinates of
+shapes are pixels, y down; `window` paints them.
 """
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from functools import lru_cache
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from brokk_min.kinematics import frames, jacobian, tool_state
+from brokk_min.kinematics import tool_state
+from brokk_min.looks import Box, Camera, cameras, extent, near_limit, near_singular, skeleton
 from brokk_min.machine import PWM_MAX, Machine
 
 Array = NDArray[np.floating[Any]]
 Colour = tuple[int, int, int]
 
 # all assumed
-NEAR_LIMIT = 0.05  # of a joint's range: nearer to its end is a warning
-NEAR_SINGULAR = 0.1  # of the arm's length [1/rad]: the tool hardly moves some way below it, see `weakest`
 ARROW = 0.2  # of a view's smaller side: an arrow of the machine's tool speed
-MARGIN = 0.06  # of the reach: what is seen around the points that a scene holds
 
 PAPER, INK, MUTED = (250, 250, 247), (33, 37, 43), (120, 128, 138)
 GRID, TRACK = (228, 230, 232), (212, 216, 221)
@@ -34,6 +28,13 @@ SOIL, STEEL, WARNING = (214, 203, 186), (74, 80, 88), (208, 28, 28)
 WANTED, MEASURED, PATH = INK, (0, 158, 115), (230, 159, 0)
 COLOURS: dict[str, Colour] = {"rl": (0, 114, 178), "jacobian": (213, 94, 0), "levers": (124, 87, 148)}
 MOODS: dict[str, Colour] = {"driving": (0, 130, 90), "ready": (0, 100, 170), "waiting": WARNING, "": MUTED}
+TITLES = {
+    "rl": "RL policy",
+    "jacobian": "Jacobian + PID",
+    "levers": "levers, joint by joint",
+    "jacobian_pid_k0.1": "Jacobian + PID",
+    "jacobian_pid_ff": "Jacobian + PID with feed-forward",
+}
 
 
 class Line(NamedTuple):
@@ -69,16 +70,12 @@ class Text(NamedTuple):
     anchor: float = 0.0
 
 
-Box = tuple[float, float, float, float]  # left, top, width, height [px]
-
-
 class Clip(NamedTuple):
     """What follows is seen within this box only, but for text."""
 
     box: Box
 
 
-ABOVE = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])  # right and up as seen from above
 Shape = Line | Polygon | Circle | Text | Clip
 
 
@@ -98,112 +95,6 @@ class Scene(NamedTuple):
     colour: Colour = COLOURS["rl"]
     notes: Sequence[str] = ()
     hold: Array = np.zeros((0, 3))  # what the views must show [m] (K, 3); none: all that the arm reaches
-
-
-class Camera(NamedTuple):
-    """An orthographic view: pixel of the base frame's origin, pixels per metre, directions right and up."""
-
-    origin: Array
-    scale: float
-    axes: Array  # (2, 3)
-
-    def project(self, p: ArrayLike) -> Array:
-        """Pixels (..., 2) of points (..., 3) [m]."""
-        return self.origin + self.scale * (np.asarray(p) @ self.axes.T) * (1, -1)
-
-
-# --- what a machine looks like ----------------------------------------------------------------------
-
-
-class Extent(NamedTuple):
-    """What both views must hold [m]: ends of right and up from the side and from above; the reach."""
-
-    side: Array  # (2, 2)
-    top: Array
-    reach: float
-
-
-@lru_cache(maxsize=32)
-def extent(machine: Machine) -> Extent:
-    """The extent of the arm over random poses, no lower than the ground if the arm reaches it."""
-    low, high = machine.column("q_min"), machine.column("q_max")
-    p = skeleton(machine, np.random.default_rng(0).uniform(low, high, (2000, machine.n)))
-    side, top = p @ np.swapaxes(_side_axes(p[:, -1]), -1, -2), p @ ABOVE.T
-    boxes = [np.stack([a.min((0, 1)), a.max((0, 1))]) for a in (side, top)]
-    reach = float(np.hypot(p[..., 0], p[..., 1]).max()) + 1e-3
-    for box in boxes:
-        box[1] = np.maximum(box[1], box[0] + 0.2 * reach)  # an arm in one plane has no width
-    if boxes[0][0, 1] - 0.2 * reach < machine.ground < boxes[0][1, 1]:
-        boxes[0][0, 1] = machine.ground
-    return Extent(boxes[0], boxes[1], reach)
-
-
-def skeleton(machine: Machine, q: ArrayLike) -> Array:
-    """Corners of the arm [m], (..., 2 n + 1, 3): the base, then the end of each joint's d and of its a."""
-    T = frames(machine, q)
-    p, z = T[..., :3, 3], T[..., :3, 2]
-    corners = np.empty((*p.shape[:-2], 2 * machine.n + 1, 3))
-    corners[..., ::2, :] = p
-    corners[..., 1::2, :] = p[..., :-1, :] + machine.column("d")[:, None] * z[..., :-1, :]
-    return corners
-
-
-def _side_axes(p_tool: Array) -> Array:
-    """Right (towards the tool) and up, (..., 2, 3), for tool positions (..., 3)."""
-    radius = np.hypot(p_tool[..., 0], p_tool[..., 1])
-    far = radius > 1e-6
-    axes = np.zeros((*radius.shape, 2, 3))
-    axes[..., 0, 0] = np.where(far, p_tool[..., 0], 1.0) / np.where(far, radius, 1.0)
-    axes[..., 0, 1] = np.where(far, p_tool[..., 1], 0.0) / np.where(far, radius, 1.0)
-    axes[..., 1, 2] = 1.0
-    return axes
-
-
-def cameras(
-    machine: Machine, p_tool: Array, side: Box, top: Box, hold: Array | None = None
-) -> tuple[Camera, Camera]:
-    """From the side, in the vertical plane of the tool, and from above with x up and y to the left.
-
-    They show all that the arm can reach, or what lies around the points `hold` [m] (K, 3).
-    """
-    e, found = extent(machine), []
-    for box, (low, high), axes in ((side, e.side, _side_axes(p_tool)), (top, e.top, ABOVE)):
-        if hold is not None and len(hold):
-            flat = hold @ axes.T
-            low, high = flat.min(0) - MARGIN * e.reach, flat.max(0) + MARGIN * e.reach
-        left, upper, width, height = box
-        soil = 0.07 * height
-        scale = 0.92 * float(min(width / (high - low)[0], (height - 2 * soil) / (high - low)[1]))
-        x = left + width / 2 - scale * (low + high)[0] / 2
-        found.append(Camera(np.array([x, upper + height - soil + scale * low[1]]), scale, axes))
-    return found[0], found[1]
-
-
-def near_limit(machine: Machine, q: Array) -> NDArray[np.bool_]:
-    """Is each driven joint within `NEAR_LIMIT` of an end of its range? (..., n)"""
-    low, high = machine.column("q_min"), machine.column("q_max")
-    margin = NEAR_LIMIT * (high - low)
-    driven = np.array([joint.driven for joint in machine.joints])
-    return np.asarray(((q < low + margin) | (q > high - margin)) & driven)
-
-
-def weakest(machine: Machine, q: Array) -> tuple[float, Array]:
-    """How far the tool moves for 1 rad of the joints the way it moves least [m], and that way (3,).
-
-    The least singular value of the Jacobian; manipulability is the product of them all, and for a slewing
-    arm says little more than how far out the tool is.
-    """
-    ways, values, _ = np.linalg.svd(jacobian(machine, q), full_matrices=False)
-    return float(values[-1]), ways[:, -1]
-
-
-def near_singular(machine: Machine, q: Array) -> bool:
-    """Is there a way along which the tool hardly moves?"""
-    length = np.hypot(machine.column("a"), machine.column("d")).sum()
-    return weakest(machine, q)[0] < NEAR_SINGULAR * float(length)
-
-
-# --- shapes -----------------------------------------------------------------------------------------
 
 
 def draw(machine: Machine, scenes: Sequence[Scene], size: tuple[int, int]) -> list[Shape]:
@@ -383,119 +274,3 @@ def _pale(colour: Colour, share: float = 0.45) -> Colour:
     """Nearer to the paper's colour; a negative share darkens."""
     r, g, b = (round(c + share * (p - c)) for c, p in zip(colour, PAPER, strict=True))
     return r, g, b
-
-
-# --- onto a surface ---------------------------------------------------------------------------------
-
-
-def need_pygame() -> Any:
-    """pygame, which is imported only where something is painted.
-
-    Raises:
-        ValueError: it is not installed.
-    """
-    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    try:
-        import pygame
-    except ImportError as error:
-        raise ValueError(f"picture: expected pygame (extra brokk_min[play]), got {error}") from error
-    return pygame
-
-
-@lru_cache(maxsize=1024)
-def _word(text: str, size: int, colour: Colour) -> Any:
-    """Text as a surface, on the paper's colour so that it stays legible over an arm."""
-    return _font(size).render(text, True, colour, PAPER)
-
-
-@lru_cache(maxsize=16)
-def _font(size: int) -> Any:
-    """The typeface that matplotlib brings: the same everywhere."""
-    import matplotlib
-
-    pygame = need_pygame()
-    pygame.font.init()
-    return pygame.font.Font(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf", size)
-
-
-def paint(surface: Any, shapes: Sequence[Shape]) -> None:
-    """Shapes on a pygame surface, edges smoothed: drawn twice as large and scaled down; text lies on top."""
-    pygame, twice = need_pygame(), _canvas((2 * surface.get_width(), 2 * surface.get_height()))
-    twice.set_clip(None)
-    twice.fill(PAPER)
-    for shape in shapes:
-        match shape:
-            case Line(points, colour, width):
-                pygame.draw.lines(twice, colour, False, (2 * points).tolist(), 2 * width)
-            case Polygon(points, colour):
-                pygame.draw.polygon(twice, colour, (2 * points).tolist())
-            case Circle(centre, radius, colour):
-                pygame.draw.circle(twice, colour, (2 * centre).tolist(), 2 * radius)
-            case Clip(box):
-                twice.set_clip([round(2 * edge) for edge in box])
-    pygame.transform.smoothscale(twice, surface.get_size(), surface)
-    for at, text, size, colour, anchor in (shape for shape in shapes if isinstance(shape, Text)):
-        word = _word(text, size, colour)
-        surface.blit(word, (at[0] - anchor * word.get_width(), at[1] - word.get_height() / 2))
-
-
-@lru_cache(maxsize=2)
-def _canvas(size: tuple[int, int]) -> Any:
-    return need_pygame().Surface(size, depth=32)
-
-
-class Window:
-    """A window for shapes.
-
-    Raises:
-        ValueError: no pygame, or no display.
-    """
-
-    def __init__(self, size: tuple[int, int], title: str) -> None:
-        self.pygame = pygame = need_pygame()
-        try:
-            pygame.display.init()
-            self.surface = pygame.display.set_mode(size)
-        except pygame.error as error:
-            raise ValueError(
-                f"window: expected a display (SDL_VIDEODRIVER=dummy draws unseen), got {error}"
-            ) from error
-        pygame.display.set_caption(title)
-        self.size, self.clock = size, pygame.time.Clock()
-
-    def show(self, shapes: Sequence[Shape], fps: float) -> None:
-        """Show shapes, not before 1 / `fps` after the last ones."""
-        paint(self.surface, shapes)
-        self.pygame.display.flip()
-        self.clock.tick(fps)
-
-    def close(self) -> None:
-        """Close the window; what else uses pygame goes on."""
-        self.pygame.display.quit()
-
-
-@contextmanager
-def open_window(size: tuple[int, int], title: str) -> Iterator[Window]:
-    """A window for somebody to look at, closed at the end of the block.
-
-    Without a display SDL draws unseen. That serves tests, and whoever asks for it with SDL_VIDEODRIVER.
-
-    Raises:
-        ValueError: no pygame, or no display.
-    """
-    window = Window(size, title)
-    try:
-        driver = window.pygame.display.get_driver()
-        if driver in ("offscreen", "dummy") and not os.environ.get("SDL_VIDEODRIVER"):
-            raise ValueError("window: expected a display (SDL_VIDEODRIVER=dummy draws unseen), got none")
-        yield window
-    finally:
-        window.close()
-
-
-def picture(shapes: Sequence[Shape], size: tuple[int, int]) -> NDArray[np.uint8]:
-    """Shapes as an image (height, width, 3); needs no display."""
-    surface = need_pygame().Surface(size, depth=32)
-    paint(surface, shapes)
-    pixels: NDArray[np.uint8] = need_pygame().surfarray.array3d(surface)
-    return np.ascontiguousarray(pixels.swapaxes(0, 1))

@@ -23,15 +23,15 @@ from test_hw import BASELINE, Virtual
 from test_view import boxes_of_words
 
 from benchmarks.bus import random_policy
-from brokk_min import experiments, play, remote, replay, tracing, view
+from brokk_min import experiments, looks, play, remote, replay, ticks, tracing, view
 from brokk_min.__main__ import machine_from, main
 from brokk_min.kinematics import tool_position
 from brokk_min.machine import BROKK_170
 from brokk_min.play import Hands, Session
 from brokk_min.policy import save_policy
 from brokk_min.remote import Chosen, Levers, Loop, Mailbox, Remote
-from brokk_min.replay import Known
 from brokk_min.sequences import feasible
+from brokk_min.ticks import Known
 from brokk_min.tracing import Attempt, Tracing
 
 MODES = ["rl", "jacobian", "levers"]
@@ -235,7 +235,7 @@ def test_a_mailbox_gives_the_newest_values_or_none() -> None:
 def test_what_is_known_survives_the_mailbox() -> None:
     rng = np.random.default_rng(0)
     known = Known(7, *rng.normal(size=(3, 5)), rng.normal(size=3), True, 3, 4, 2, 0.001)
-    back = replay.unpack_known(BROKK_170, known.pack())
+    back = ticks.unpack_known(BROKK_170, known.pack())
     assert back._replace(q=0, q_dot=0, u=0, v_goal=0) == known._replace(q=0, q_dot=0, u=0, v_goal=0)
     for name in ("q", "q_dot", "u", "v_goal"):
         np.testing.assert_array_equal(getattr(back, name), getattr(known, name))
@@ -337,7 +337,7 @@ def test_a_whole_traced_rectangle_is_scored() -> None:
         tracing_.line[0]
         + 5.0
         * np.array([[0, 0, 0], [0, 0.16, 0], [0.1, 0.16, 0], [0.1, 0, 0]])
-        * view.extent(BROKK_170).reach
+        * looks.extent(BROKK_170).reach
         / 5.0
     )
     fine = np.vstack(
@@ -445,7 +445,7 @@ def test_what_the_window_says_fits_and_tells_how_it_went(mode: str) -> None:
             shapes = view.draw(machine, [look], play.SIZE)
             boxes = np.array(list(boxes_of_words(shapes).values()))
             assert boxes.min() >= 0 and (boxes[:, 2:] <= play.SIZE).all()
-        assert look.title == (replay.TITLES[mode] if mode else machine.name)
+        assert look.title == (view.TITLES[mode] if mode else machine.name)
         assert any("rectangle by jacobian: 123.4 s" in note for note in look.notes) == bool(mode)
 
 

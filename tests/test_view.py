@@ -18,12 +18,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import moving
 
-from brokk_min import view
+from brokk_min import looks, view, window
 from brokk_min.env import TaskConfig, TaskEnv
 from brokk_min.jacobian import manipulability
 from brokk_min.kinematics import frames, jacobian, tool_position
 from brokk_min.machine import BROKK_170, Machine
-from brokk_min.view import Circle, Line, Polygon, Scene, Text, draw, picture
+from brokk_min.view import Circle, Line, Polygon, Scene, Text, draw
+from brokk_min.window import picture
 
 Q = np.array([0.4, 0.5, 0.58, 1.71, 1.24])
 SIZE = (960, 600)
@@ -38,10 +39,10 @@ def words(shapes: list[view.Shape]) -> list[str]:
     return [shape.text for shape in shapes if isinstance(shape, Text)]
 
 
-def eyes(machine: Machine, q: np.ndarray) -> tuple[view.Camera, view.Camera]:
+def eyes(machine: Machine, q: np.ndarray) -> tuple[looks.Camera, looks.Camera]:
     """The cameras of a picture of one arm, which `draw` alone lays out."""
-    seen: list[tuple[view.Camera, view.Camera]] = []
-    inner = view.cameras
+    seen: list[tuple[looks.Camera, looks.Camera]] = []
+    inner = looks.cameras
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(view, "cameras", lambda *a: seen.append(inner(*a)) or seen[-1])
         draw(machine, [scene(q)], SIZE)
@@ -50,11 +51,12 @@ def eyes(machine: Machine, q: np.ndarray) -> tuple[view.Camera, view.Camera]:
 
 def test_importing_needs_neither_pygame_nor_physics() -> None:
     code = (
-        "import sys, brokk_min.view; print([m for m in sys.modules if m in ('can', 'pygame', 'torch', "
+        "import sys, brokk_min.window; print([m for m in sys.modules if m in ('can', 'pygame', 'torch', "
         "'matplotlib', 'gymnasium') or m.startswith('brokk_min.')])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert set(eval(done.stdout)) == {"brokk_min.view", "brokk_min.kinematics", "brokk_min.machine"}
+    pure = ("window", "view", "looks", "kinematics", "machine")
+    assert set(eval(done.stdout)) == {f"brokk_min.{name}" for name in pure}
 
 
 @given(moving([()]), st.sampled_from([(960, 600), (480, 560), (1500, 300)]))
@@ -201,7 +203,7 @@ def test_a_limit_and_a_singularity_warn_in_red() -> None:
     stretched = np.array([0.3, 0.4, 0.0, np.pi, 3 * np.pi / 4])
     shapes = draw(wide, [scene(stretched)], SIZE)
     assert "near a singularity" in words(shapes)
-    value, way = view.weakest(wide, stretched)
+    value, way = looks.weakest(wide, stretched)
     outward = np.array([np.cos(0.3) * np.cos(0.4), np.sin(0.3) * np.cos(0.4), np.sin(0.4)])
     assert value == pytest.approx(0, abs=1e-9) and abs(way @ outward) == pytest.approx(1)
 
@@ -209,7 +211,7 @@ def test_a_limit_and_a_singularity_warn_in_red() -> None:
 @given(st.integers(0, 1000))
 def test_the_weakest_way_bounds_manipulability(seed: int) -> None:
     q = np.random.default_rng(seed).uniform(BROKK_170.column("q_min"), BROKK_170.column("q_max"))
-    J, (value, way) = jacobian(BROKK_170, q), view.weakest(BROKK_170, q)
+    J, (value, way) = jacobian(BROKK_170, q), looks.weakest(BROKK_170, q)
     assert np.linalg.norm(way @ J) == pytest.approx(value, abs=1e-9)
     singular = np.sqrt(np.maximum(np.linalg.eigvalsh(J @ J.T), 0))
     assert np.prod(singular) == pytest.approx(manipulability(J), abs=1e-6)
@@ -226,7 +228,7 @@ def boxes_of_words(shapes: list[view.Shape]) -> dict[str, np.ndarray]:
     """Left, upper, right and lower end of each text as painted [px]."""
     found = {}
     for at, text, size, colour, anchor in (s for s in shapes if isinstance(s, Text) and s.text):
-        width, height = view._word(text, size, colour).get_size()
+        width, height = window._word(text, size, colour).get_size()
         left, upper = at[0] - anchor * width, at[1] - height / 2
         found[f"{text} at {at}"] = np.array([left, upper, left + width, upper + height])
     return found
@@ -361,4 +363,4 @@ def test_rendering_refuses_what_it_cannot_do(monkeypatch: pytest.MonkeyPatch) ->
 def test_a_window_needs_a_display(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SDL_VIDEODRIVER", "nonsense")
     with pytest.raises(ValueError, match="window: expected a display"):
-        view.Window(SIZE, "none")
+        window.Window(SIZE, "none")
