@@ -28,10 +28,10 @@ from brokk_min import (
     preliminary,
     sequences,
 )
-from brokk_min.__main__ import SHIPPED
 from brokk_min.env import TaskConfig, TaskVectorEnv, rollout, terminated
 from brokk_min.jacobian import JacobianController
 from brokk_min.machine import BROKK_170
+from brokk_min.options import SHIPPED
 from brokk_min.policy import PolicyController, load_policy
 
 M = BROKK_170

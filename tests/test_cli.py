@@ -14,11 +14,12 @@ import pytest
 
 from benchmarks.rollout import random_net
 from brokk_min import experiments
-from brokk_min.__main__ import COMMANDS, SHIPPED, main
+from brokk_min.__main__ import COMMANDS, main
 from brokk_min.actuator import load_net
 from brokk_min.logs import read_log
 from brokk_min.machine import BROKK_170
 from brokk_min.metrics import summary
+from brokk_min.options import SHIPPED
 from brokk_min.policy import load_policy
 
 
@@ -236,7 +237,7 @@ def test_without_gains_the_baselines_are_tuned_and_that_is_said(
 ) -> None:
     net = random_net(np.random.default_rng(0)).select(["q1", "q3", "q4", "q5"])
     policy = SimpleNamespace(net=replace(net, machine="brokk170"), act=lambda seen: np.zeros((len(seen), 4)))
-    monkeypatch.setattr("brokk_min.__main__.load_policy", lambda *_: policy)
+    monkeypatch.setattr("brokk_min.commands.load_policy", lambda *_: policy)
     quick = experiments.Effort(generations=1, tuning_runs=1, starts=1)
     monkeypatch.setattr("brokk_min.experiments.Effort", lambda: quick)
     where = tmp_path / "e.json"

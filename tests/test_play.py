@@ -24,9 +24,10 @@ from test_view import boxes_of_words
 
 from benchmarks.bus import random_policy
 from brokk_min import experiments, looks, play, remote, replay, ticks, tracing, view
-from brokk_min.__main__ import machine_from, main
+from brokk_min.__main__ import main
 from brokk_min.kinematics import tool_position
 from brokk_min.machine import BROKK_170
+from brokk_min.options import machine_from
 from brokk_min.play import Hands, Session
 from brokk_min.policy import save_policy
 from brokk_min.remote import Chosen, Levers, Loop, Mailbox, Remote
