@@ -1,7 +1,8 @@
 """What the deviations and assumptions of PAPER.md change, measured.
 
 Each function returns the figures of one entry; `python -m benchmarks.deviations` prints them. D4, D5, D7,
-D10, A4 and A5 fit nets and train policies: `python -m benchmarks.deviations --train`, some 15 minutes.
+D10, A4 and A5 fit nets and train policies: `python -m benchmarks.deviations --train`, some 15 minutes. An
+entry's name prints that entry alone: `python -m benchmarks.deviations d4`.
 """
 
 from __future__ import annotations
@@ -213,8 +214,9 @@ TRAINED: tuple[Callable[[], dict[str, float]], ...] = (d4, a4, d5, d7, d10, a5)
 
 
 def main() -> None:
-    """Print all figures, or with `--train` those that need it."""
-    for entry in TRAINED if "--train" in sys.argv[1:] else ENTRIES:
+    """Print the figures of the entries named; of none named, all, or with `--train` those that need it."""
+    named = [entry for entry in (*ENTRIES, *TRAINED) if entry.__name__ in sys.argv[1:]]
+    for entry in named or (TRAINED if "--train" in sys.argv[1:] else ENTRIES):
         figures = ", ".join(f"{name} {value:.4g}" for name, value in entry().items())
         print(f"{entry.__name__.upper():4} {entry.__doc__}\n     {figures}", flush=True)
 
