@@ -24,6 +24,7 @@ from brokk_min.figures import Traces
 from brokk_min.jacobian import JacobianController
 from brokk_min.machine import Machine, read_encoder
 from brokk_min.metrics import (
+    Run,
     by_start,
     intervals,
     mean_interval,
@@ -212,16 +213,21 @@ def task_space(
         start, rng = np.tile(starts, (len(group), 1)), np.random.default_rng(seed)
         read = sensor(np.random.default_rng(seed + 1))
         trace = rollout(machine, controllers[name], start, goals, TaskConfig(), rng, net, read)
-        figures_of = metrics(machine, trace, goals, kinematics.tool_position(machine, start))
+        found = metrics(machine, trace, goals, kinematics.tool_position(machine, start))
         for i, s in enumerate(group):
-            traces[name, s.name] = Trace(*(a[:, i * num : (i + 1) * num] for a in trace))
-            for j, kind in enumerate(kinds):
-                values = {key: float(v[i * num + j]) for key, v in figures_of.items()}
-                row = {key: v if np.isfinite(v) else None for key, v in values.items()}
-                rows.append({"controller": name, "sequence": s.name, "start": j, "kind": kind} | row)
+            mine, label = slice(i * num, (i + 1) * num), {"controller": name, "sequence": s.name}
+            traces[name, s.name] = Trace(*(a[:, mine] for a in trace))
+            rows += _rows(label, kinds, {key: v[mine] for key, v in found.items()})
     names, order = list(controllers), [s.name for s in sequences]
     rows.sort(key=lambda row: (names.index(row["controller"]), order.index(row["sequence"])))
     return rows, traces
+
+
+def _rows(label: Mapping[str, Any], kinds: Sequence[str], found: Mapping[str, Array]) -> list[dict[str, Any]]:
+    """One row a start of figures (starts,); None where there is none."""
+    plain = {key: [float(v) if np.isfinite(v) else None for v in values] for key, values in found.items()}
+    rows = ({key: values[j] for key, values in plain.items()} for j in range(len(kinds)))
+    return [{**label, "start": j, "kind": kinds[j]} | row for j, row in enumerate(rows)]
 
 
 def noisy(rng: np.random.Generator) -> Encoder:
@@ -287,8 +293,9 @@ def robustness(
 ) -> dict[str, dict[str, dict[str, Any]]]:
     """Mean velocity error [m/s], 95 % interval over starts, by variation and controller. Paper: Sec. 4.2
 
-    And "supply_demand", the largest share of the pump's flow that was asked for, and "supply_limits", the
-    share of ticks at which it was more than all.
+    And "supply_demand", the largest share of the pump's flow that was asked for, "supply_limits", the share
+    of ticks at which it was more than all, and of baselines "rl_less", the policy's error less theirs on the
+    same starts.
     """
     result: dict[str, dict[str, dict[str, Any]]] = {}
     for name, (plant, sensor) in variations(machine).items():
@@ -299,6 +306,8 @@ def robustness(
             errors = by_start(runs, c, "all", "velocity_error_mean")
             result[name][c] = {**mean_interval(errors), "supply_demand": float(asked.max())}
             result[name][c]["supply_limits"] = float((asked > 1).mean())
+            if "rl" in controllers and c != "rl":
+                result[name][c]["rl_less"] = paired(runs, "rl", c, "velocity_error_mean")["all"]
     return result
 
 
@@ -338,28 +347,20 @@ def comparison(
         For JSON; and traces of the main runs ("all"), with the bound ("bound") and near singularities
         ("singular").
     """
-    sequences, names = task_sequences(machine), list(controllers)
+    sequences = task_sequences(machine)
     starts = scored_starts(machine, effort.starts, sequences, seed + 2)
     kinds = np.array(start_kinds(machine, starts))
     runs, traces = task_space(machine, controllers, sequences, starts, seed)
     scored = [run for run in runs if run["kind"] == "workspace"]
-    of_kind = {k: [run for run in runs if run["kind"] == k] for k in dict.fromkeys(kinds)}
-    means = {k: {c: rows["all"] for c, rows in summary(some).items()} for k, some in of_kind.items()}
     short = shortened(machine, axis_sequences(machine), effort.short_s)
     reachable = starts[kinds == "workspace"]
     bounded, less, bound = regret(machine, controllers, short, reachable[: effort.bound_starts], seed)
     singular, found = singular_case(machine, controllers, starts[kinds == "extended"], effort.short_s, seed)
-    across = {c: Trace(*(a[:, kinds == "workspace"] for a in traces[c, "x"])) for c in names}
+    across = {c: Trace(*(a[:, kinds == "workspace"] for a in traces[c, "x"])) for c in controllers}
     verdicts = judged(machine, controllers, scored, across, sequences[0].goals)
     verdicts[3:3] = found["claims"]  # the paper's order
     return {
-        "task_space": {
-            "runs": runs,
-            "summary": summary(scored),
-            "intervals": intervals(scored),
-            "by_kind": means,
-            "rl_less": paired_with_others(scored, "rl"),
-        },
+        "task_space": tables(runs, scored),
         "regret": {"summary": summary(bounded), "less_perfect_model": less},
         "robustness": robustness(machine, controllers, short, reachable[:16], seed),
         "singular": found,
@@ -369,10 +370,24 @@ def comparison(
     }, {"all": traces, "bound": bound, "singular": singular}
 
 
+def tables(runs: Sequence[Run], scored: Sequence[Run]) -> dict[str, Any]:
+    """Runs, and figures of those that count: means, intervals, the policy's less the baselines'; for JSON."""
+    of_kind = {
+        kind: [run for run in runs if run["kind"] == kind] for kind in dict.fromkeys(r["kind"] for r in runs)
+    }
+    return {
+        "runs": runs,
+        "summary": summary(scored),
+        "intervals": intervals(scored),
+        "by_kind": {k: {c: rows["all"] for c, rows in summary(of).items()} for k, of in of_kind.items()},
+        "rl_less": paired_with_others(scored, "rl"),
+    }
+
+
 def judged(
     machine: Machine,
     controllers: Mapping[str, Controller],
-    runs: Sequence[Mapping[str, Any]],
+    runs: Sequence[Run],
     along_x: Mapping[str, Trace],
     goals: Array,
 ) -> list[dict[str, Any]]:

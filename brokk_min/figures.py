@@ -79,15 +79,21 @@ def plot_panels(rows: Sequence[Sequence[Panel]], one_scale: bool = False) -> Any
             for i, (label, (x, y)) in enumerate(panel.curves.items()):
                 ax.plot(x, y, label=label, linewidth=1.1, **STYLES.get(label, OTHERS[i % len(OTHERS)]))
             ax.set(xlabel=panel.xlabel, ylabel=panel.ylabel)
-            ax.set_title(panel.title, fontsize="medium", pad=6 if alike else 20)
-            if not alike:  # above the curves: within, it hides some
-                ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncol=len(panel.curves), **TIGHT)
+            lines = 0 if alike else _legend_above(ax, most=2 if wide > 2 else 4)
+            ax.set_title(panel.title, fontsize="medium", pad=6 + 16 * lines)
             if k and above.get_ylabel() == panel.ylabel:
                 ax.sharey(above)
                 ax.autoscale()
         for ax in axes[len(panels) :]:
             ax.remove()
     return _with_legend(figure, grid[0, 0]) if alike else figure
+
+
+def _legend_above(ax: Any, most: int) -> int:
+    """A legend above the curves, where it hides none, with at most so many entries a line: its lines."""
+    entries = len(ax.get_legend_handles_labels()[1])
+    ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncol=min(entries, most), **TIGHT)
+    return -(-entries // most)
 
 
 def _over_time(dt: float, labels: Sequence[str], curves: Mapping[str, Array]) -> list[Panel]:
@@ -173,7 +179,7 @@ def plot_bars(panels: Mapping[str, Bars]) -> Any:
 
 def plot_starts(machine: Machine, starts: Array, kinds: Sequence[str]) -> Any:
     """Start configurations drawn as arms, from the side and from above. Paper: Fig. 6a"""
-    figure, axes = plt.subplots(1, 2, figsize=(WIDTH, 4.4), layout="constrained")
+    figure, axes = plt.subplots(1, 2, figsize=(WIDTH, 4.6), layout="compressed")
     points = kinematics.frames(machine, starts)[..., :3, 3]
     heading = points[:, -1, :2] / np.maximum(np.linalg.norm(points[:, -1, :2], axis=-1, keepdims=True), 1e-9)
     outward = np.einsum("pjk,pk->pj", points[..., :2], heading)

@@ -278,6 +278,10 @@ def test_results_answer_the_papers_question(twice: tuple[Path, Path]) -> None:
     low, high = results["task_space"]["intervals"]["jacobian_pid_ff"]["x"]["velocity_error_mean"]
     assert low < means["jacobian_pid_ff"]["x"]["velocity_error_mean"] < high
     assert set(results["robustness"]) == set(experiments.variations(BROKK_170))
+    nominal = results["robustness"]["nominal"]
+    less = nominal["jacobian_pid_ff"]["rl_less"]
+    assert less["mean"] == pytest.approx(nominal["rl"]["mean"] - nominal["jacobian_pid_ff"]["mean"])
+    assert less["low"] < less["mean"] < less["high"] and "rl_less" not in nominal["rl"]
 
 
 def test_results_tell_how_the_baselines_were_tuned(twice: tuple[Path, Path]) -> None:
