@@ -171,7 +171,7 @@ def plot_bars(panels: Mapping[str, Bars]) -> Any:
             places = np.arange(len(names)) + (i - (len(bars) - 1) / 2) * width
             color = STYLES[controller]["color"]
             ax.bar(places, mean, width, yerr=ends, label=controller, color=color, error_kw={"linewidth": 0.8})
-        ax.set_xticks(np.arange(len(names)), names)
+        ax.set_xticks(np.arange(len(names)), [name.replace("_", "\n") for name in names])
         ax.set_ylabel(label)
         ax.grid(False, axis="x")
     return _with_legend(figure, axes[0])
@@ -255,9 +255,8 @@ def _content(title: str, content: Any) -> str:
     if isinstance(content, str):
         return f"<p>{html.escape(content)}</p>"
     if isinstance(content, Quote):
-        lines = (
-            f"<p>{html.escape(text)}. <b>{html.escape(verdict)}</b></p>" for text, verdict in content.lines
-        )
+        pairs = ((html.escape(text), html.escape(verdict)) for text, verdict in content.lines)
+        lines = (f"<p><b>Measured:</b> {text}. <b>{verdict}</b></p>" for text, verdict in pairs)
         return f"<blockquote><p><b>Paper:</b> {html.escape(content.paper)}</p>{''.join(lines)}</blockquote>"
     return _table(content) if isinstance(content, Mapping) else _image(title, content)
 

@@ -17,7 +17,7 @@ from brokk_min.actuator import ActuatorNet
 from brokk_min.figures import Quote, Traces
 from brokk_min.logs import Log
 from brokk_min.machine import Machine
-from brokk_min.sequences import axis_sequences, held_rows, least_motion, task_sequences
+from brokk_min.sequences import KINDS, axis_sequences, held_rows, least_motion, task_sequences
 
 Array = NDArray[np.floating[Any]]
 VERDICTS = {True: "holds here", False: "does not hold here", None: "was not measured"}
@@ -31,7 +31,7 @@ CHOSEN = (
     "paper's learner change was measured on scored sequences while this was built (PAPER.md, D4 to D10); the "
     "baselines' gains never saw them."
 )
-BESIDE = "The same of a baseline with velocity feed-forward from the nets, which the paper does not have: "
+BESIDE = "the same of a baseline with velocity feed-forward from the nets, which the paper does not have: "
 ENDS = "95 % intervals over starts in brackets"
 TUNED = (
     "Mean velocity error on the tuning runs below: least after the first and last generation [m/s], and "
@@ -66,7 +66,7 @@ def found(results: Mapping[str, Any]) -> Part:
     for claim in (*results["net_claims"], *results["claims"]):
         answer = {"what the paper says": VERDICTS[claim["holds"]]}
         stronger = VERDICTS[claim["stronger"]["holds"]] if "stronger" in claim else ""
-        rows[claim["paper"]] = answer | {"of a baseline with feed-forward": stronger}
+        rows[claim["paper"]] = answer | {"for a baseline with feed-forward": stronger}
     return "What was found", text, rows
 
 
@@ -254,11 +254,13 @@ def _pairs(less: Mapping[str, Any]) -> Part:
 
 
 def _kinds(by_kind: Mapping[str, Any]) -> Part:
-    text = "Means over all sequences; limits and extended starts put parts of the goals out of reach."
+    """Figures from the starts that do not count."""
+    text = "Means over all sequences; from limits and extended starts parts of the goals are out of reach."
     contents: list[Any] = []
     for kind, rows in by_kind.items():
-        contents += [f"{kind.capitalize()} starts.", _turned(_with_units(rows))]
-    return "By kind of start", text, *contents
+        if kind != KINDS[0]:
+            contents += [f"{kind.capitalize()} starts.", _turned(_with_units(rows))]
+    return "Starts of other kinds", text, *contents
 
 
 def _regret(regret: Mapping[str, Any]) -> Part:
@@ -350,7 +352,7 @@ def _pose(machine: Machine, pose: Array) -> dict[str, Any]:
 def _path(rows: Array) -> dict[str, Any]:
     """Length and goals of a sequence of `held_rows`; of one that turns at every tick no goals."""
     seconds, speed = rows[:, 0], np.linalg.norm(rows[:, 1:], axis=-1)
-    held = "; ".join(f"{s:g} s {x:.3g} {y:.3g} {z:.3g}" for s, x, y, z in rows)
+    held = "; ".join(f"{s:g} s ({x:.3g}, {y:.3g}, {z:.3g})" for s, x, y, z in rows + 0.0)  # no -0
     figures = {"seconds": float(seconds.sum()), "changes": len(rows) - 1, "speed [m/s]": float(speed.max())}
     goals = held if len(rows) < 50 else "at every tick another"
     return figures | {"path [m]": float(speed @ seconds), "held for, vx, vy, vz [m/s]": goals}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import itertools
 import json
 import re
 from dataclasses import dataclass, replace
@@ -168,6 +169,15 @@ def test_curves_of_one_plot_differ_on_grey_paper() -> None:
         colours = np.array([to_rgb(figures.STYLES[name]["color"]) for name in group])
         grey = np.sort(colours @ [0.299, 0.587, 0.114])
         assert (np.diff(grey) > 0.1).all() and grey[-1] < 0.8, group
+
+
+def test_names_below_bars_do_not_touch() -> None:
+    names = [s.name for s in task_sequences(BROKK_170)]
+    number = {"mean": 0.1, "low": 0.05, "high": 0.2}
+    figure = figures.plot_bars({"error [m/s]": {"rl": dict.fromkeys([*names, "all"], number)}})
+    figure.draw_without_rendering()
+    boxes = [label.get_window_extent() for label in figure.axes[0].get_xticklabels()]
+    assert all(one.x1 + 4 < two.x0 for one, two in itertools.pairwise(boxes))
 
 
 def net_of_driven_joints() -> ActuatorNet:
@@ -353,6 +363,12 @@ def test_an_interval_is_written_with_digits_that_tell_it() -> None:
     assert report._with_interval({"mean": 41.267, "low": 40.0, "high": 42.5}) == "41.27 (40 to 42.5)"
     assert report._with_interval({"mean": 0.5, "low": None, "high": None}) == "0.5000"
     assert report._with_interval({"mean": None, "low": None, "high": None}) == ""
+
+
+def test_a_sequence_is_listed_with_the_goals_that_it_holds() -> None:
+    found = report._path(np.array([[1.0, 0.0, 0.0, 0.0], [0.85, -0.0, -0.2, 0.0]]))
+    assert list(found.values()) == [1.85, 1, 0.2, pytest.approx(0.17), "1 s (0, 0, 0); 0.85 s (0, -0.2, 0)"]
+    assert report._path(np.ones((60, 4)))["held for, vx, vy, vz [m/s]"] == "at every tick another"
 
 
 def test_runs_of_the_tuning_are_those_of_its_seed(twice: tuple[Path, Path]) -> None:
