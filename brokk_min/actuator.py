@@ -6,6 +6,7 @@ the hardware keep. `fitting` makes nets from logs, `scores` judges them, `env` p
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
@@ -177,6 +178,14 @@ def net_arrays(net: ActuatorNet) -> dict[str, Any]:
     arrays = {name: getattr(net, name) for name in NET_ARRAYS}
     arrays |= {f"weight_{i}": weight for i, weight in enumerate(net.weights)}
     return {"header": np.array(text), **arrays}
+
+
+def fingerprint(net: ActuatorNet) -> str:
+    """Hash of the nets, header and all: what was trained or tuned with them says so by it."""
+    digest = hashlib.sha256()
+    for name, array in net_arrays(net).items():
+        digest.update(name.encode() + np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()[:16]
 
 
 def net_from_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> ActuatorNet:

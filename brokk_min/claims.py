@@ -19,12 +19,15 @@ from brokk_min.machine import Machine
 from brokk_min.metrics import TRANSIENT, Run, by_start, interval, mean_interval, since_change
 
 Array = NDArray[np.floating[Any]]
-Claim = dict[str, Any]  # paper, measured, numbers, holds (None: no such runs)
+Claim = dict[str, Any]  # paper, measured, numbers, unit, holds (None: no such runs); see `beside`
 STILL = 0.05  # m, assumed: a tool that stays so near its line stays still across it
+SMALL = 0.05  # m, assumed: two tools so near to each other after the same commands differ little
+MARGINAL = 0.01  # rad/s, assumed: joint rates that differ by less differ marginally
+LATER = 2.0  # assumed: a response that takes so many times as long is another
 UNLIKE = 1.25  # assumed: errors of two directions whose ratio is larger differ
 
 
-def _said(numbers: Mapping[str, Mapping[str, float | None]], unit: str) -> str:
+def said(numbers: Mapping[str, Mapping[str, float | None]], unit: str) -> str:
     """Numbers as a sentence: means with their intervals."""
     cells = []
     for name, n in numbers.items():
@@ -34,7 +37,20 @@ def _said(numbers: Mapping[str, Mapping[str, float | None]], unit: str) -> str:
 
 
 def _claim(paper: str, what: str, unit: str, numbers: Mapping[str, Any], holds: bool | None) -> Claim:
-    return {"paper": paper, "measured": f"{what}: {_said(numbers, unit)}", "numbers": numbers, "holds": holds}
+    measured = f"{what}: {said(numbers, unit)}"
+    return {"paper": paper, "measured": measured, "numbers": numbers, "unit": unit, "holds": holds}
+
+
+def beside(claim: Claim, stronger: Claim) -> Claim:
+    """A claim, and as "stronger" how it fares against a baseline that the paper does not have.
+
+    Example:
+        >>> claim, other = ({"numbers": {c: 1}, "unit": "m", "holds": c} for c in (True, False))
+        >>> beside(claim, other)["stronger"]["holds"], "stronger" in beside(claim, claim)
+        (False, False)
+    """
+    same = claim["numbers"] == stronger["numbers"]  # of RL alone
+    return claim if same else claim | {"stronger": {k: stronger[k] for k in ("numbers", "unit", "holds")}}
 
 
 def _below(number: Mapping[str, float | None], limit: float) -> bool | None:
@@ -47,6 +63,68 @@ def _above(number: Mapping[str, float | None], limit: float) -> bool | None:
 
 def _all(*verdicts: bool | None) -> bool | None:
     return None if None in verdicts else all(verdicts)
+
+
+def net_claims(found: Mapping[str, Any]) -> list[Claim]:
+    """Are machine and nets as the paper found its own (Fig. 2 and 5)? Paper: Sec. 3.2
+
+    Single tests, so without intervals. `found`: of `preliminary.run`.
+    """
+    gap = found["sim_to_real"]
+    apart = {"in the figure": gap["tool"]["position_error_mean"]}
+    apart["median of runs"] = gap["tool_position_error_mean_of_runs"]["median"]
+    return [
+        _faster_down(found),
+        _later_from_idle(found),
+        _claim(
+            "When other joints move as well, the difference is marginal and negligible.",
+            f"velocity of {found['joint']} alone less that with the others (RMS), to be below {MARGINAL}",
+            "rad/s",
+            _single(found["coupling_rms"]),
+            max(found["coupling_rms"].values()) < MARGINAL,
+        ),
+        _claim(
+            "Over 30 s the discrepancy between simulation and machine remains reasonably small.",
+            f"mean distance of the tools under the same commands, to be below {SMALL}",
+            "m",
+            _single(apart),
+            max(apart.values()) < SMALL,
+        ),
+    ]
+
+
+def _faster_down(found: Mapping[str, Any]) -> Claim:
+    (up, rising), (down, falling) = list(found["sweep"].items())[1:3]  # at the limit, either way
+    peaks = {kind: (rising[f"{kind}_peak"], falling[f"{kind}_peak"]) for kind in ("machine", "nets")}
+    numbers = {f"{kind}, {u}": v for kind, of in peaks.items() for u, v in zip((up, down), of, strict=True)}
+    paper = "The velocity is larger when rotating towards gravity: 0.24 rad/s one way, 0.47 the other."
+    what = f"peak speed of {found['joint']}, under {down} to be above that under {up}"
+    return _claim(paper, what, "rad/s", _single(numbers), all(slow < fast for slow, fast in peaks.values()))
+
+
+def _later_from_idle(found: Mapping[str, Any]) -> Claim:
+    times = {kind: of[found["joint"]] for kind, of in found["response_time"].items()}
+    numbers = {f"{kind}, {when}": of[when]["up"] for kind, of in times.items() for when in ("idle", "moving")}
+    later = (
+        [of["idle"]["up"] >= LATER * of["moving"]["up"] for of in times.values()]
+        if all(numbers.values())
+        else []
+    )
+    paper = "The same command is answered after about 400 ms from idle and 100 ms when already moving."
+    what = f"response time of {found['joint']} (to 63 %), from idle to be {LATER:g} times as long or more"
+    return _claim(paper, what, "s", _single(numbers), all(later) if later else None)
+
+
+def _single(numbers: Mapping[str, float | None]) -> dict[str, dict[str, float | None]]:
+    return {name: {"mean": number, "low": None, "high": None} for name, number in numbers.items()}
+
+
+def training_claim(seconds: float, steps: int) -> Claim:
+    """Does training take as long as the paper's? Its clock, so for the report alone. Paper: Sec. 3.4"""
+    hours = seconds / 3600
+    paper = "The training process takes around 2.5 hours to converge."
+    what = f"time of {steps:,} environment steps, to be within a factor of {LATER:g} of that"
+    return _claim(paper, what, "h", _single({"here": hours}), 1 / LATER < hours / 2.5 < LATER)
 
 
 def drift_claims(runs: Sequence[Run], baselines: Sequence[str]) -> list[Claim]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -36,12 +36,23 @@ from brokk_min.env import Controller, Encoder, TaskConfig, Trace, rollout
 from brokk_min.figures import Traces
 from brokk_min.jacobian import JacobianController
 from brokk_min.machine import Machine, read_encoder
-from brokk_min.metrics import by_start, intervals, mean_interval, metrics, paired, row_mean, summary
+from brokk_min.metrics import (
+    Run,
+    by_start,
+    intervals,
+    mean_interval,
+    metrics,
+    paired,
+    paired_with_others,
+    row_mean,
+    summary,
+)
 from brokk_min.mpc import PerfectModel
 from brokk_min.policy import Policy, PolicyController, save_policy
 from brokk_min.sequences import (
     Commands,
     axis_sequences,
+    held_rows,
     least_motion,
     scored_starts,
     start_kinds,
@@ -52,6 +63,7 @@ from brokk_min.sequences import (
 Array = NDArray[np.floating[Any]]
 Net = actuator.ActuatorNet
 PAPERS = ("jacobian_pid_k0.1", "jacobian_pid_k0.05")  # the paper's two baselines
+STRONGER = ("jacobian_pid_ff",)  # than the paper's: its sentences are put to it, too
 
 # --- controllers ------------------------------------------------------------------------------------
 
@@ -86,6 +98,11 @@ def baselines(machine: Machine, net: Net) -> dict[str, JacobianController]:
     }
 
 
+def tuning_set(effort: Effort, seed: int) -> tuple[int, float, int]:
+    """Number, length [s] and seed of the runs that the baselines are tuned on: apart from all that scores."""
+    return effort.tuning_runs, 12.0, seed + 1000
+
+
 def tuned_baselines(
     machine: Machine, net: Net, effort: Effort, seed: int
 ) -> tuple[dict[str, JacobianController], dict[str, dict[str, Any]]]:
@@ -95,7 +112,7 @@ def tuned_baselines(
     machine favours the baselines: the policy never sees it. The least of many noisy costs flatters, so
     "cost_anew" is the mean of 16 more of the gains that were found.
     """
-    start, goals = tuning_goals(machine, effort.tuning_runs, 12.0, seed + 1000)
+    start, goals = tuning_goals(machine, *tuning_set(effort, seed))
 
     def cost(controller: JacobianController) -> Array:
         candidates, runs = len(controller.gains), len(start)
@@ -120,33 +137,56 @@ def plain_gains(controllers: Mapping[str, JacobianController]) -> dict[str, dict
     return {name: {key: gain.tolist() for key, gain in gains.items()} for name, gains in named.items()}
 
 
+def write_gains(path: Path, controllers: Mapping[str, JacobianController], about: Mapping[str, Any]) -> None:
+    """Write the baselines' gains as `read_gains` reads them; `about` is the `meta` of their tuning."""
+    write_json(path, {"meta": about, "gains": plain_gains(controllers)})
+
+
 def read_gains(path: Path, machine: Machine, net: Net) -> dict[str, JacobianController]:
     """The baselines with gains that `reproduce` wrote.
 
     Raises:
-        ValueError: no such file, or gains of other controllers, joints or another machine.
+        ValueError: no such file, or gains of other controllers or joints, tuned for another machine or with
+            other nets, whose feed-forward is another.
     """
-    result = baselines(machine, net)
+    result, wanted = baselines(machine, net), tuned_for(machine, net)
     try:
         table = json.loads(path.read_text())
-        if table["meta"]["machine"] != machine.name:
-            raise ValueError(f"gains of {table['meta']['machine']}")
+        found = {name: table["meta"].get(name) for name in wanted}
+        if found != wanted:
+            raise ValueError(f"gains for {found}")
         for name, controller in result.items():
             result[name] = replace(controller, gains=jacobian.join_gains(machine, table["gains"][name]))
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: expected gains for {machine.name}, got {error!r}") from error
+    except (AttributeError, OSError, KeyError, TypeError, ValueError) as error:
+        nets = f"{machine.name} with nets {wanted['actuator']}"
+        raise ValueError(f"{path}: expected gains for {nets}, got {error!r}") from error
     return result
 
 
-def read_seeds(path: Path) -> dict[str, dict[str, Any]]:
-    """The table of `sweep.table` in the `sweep.json` of a sweep; ValueError: there is none."""
+def tuned_for(machine: Machine, net: Net) -> dict[str, str]:
+    """What gains and sweeps belong to: the machine's name and the fingerprint of its driven joints' nets."""
+    return {"machine": machine.name, "actuator": actuator.fingerprint(net)}
+
+
+def read_seeds(path: Path) -> dict[str, Any]:
+    """The `sweep.json` of a sweep, its "table" that of `sweep.table`; ValueError: it is none."""
     try:
-        table: dict[str, dict[str, Any]] = json.loads(path.read_text())["table"]
-        if not {"mean", "low", "high"} <= set(table["rl"]["velocity_error_all"]):
-            raise ValueError(f"{table['rl']}")
+        found: dict[str, Any] = json.loads(path.read_text())
+        if not {"mean", "low", "high"} <= set(found["table"]["rl"]["velocity_error_all"]):
+            raise ValueError(f"{found['table']['rl']}")
+        dict(found["meta"])
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: expected the sweep.json of a sweep, got {error!r}") from error
-    return table
+    return found
+
+
+def seeds_of(machine: Machine, net: Net, sweep: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """The table of a sweep that `read_seeds` read; ValueError: one of another machine or with other nets."""
+    wanted = tuned_for(machine, net)
+    found = {name: sweep["meta"].get(name) for name in wanted}
+    if found != wanted:
+        raise ValueError(f"sweep: expected one with {wanted}, got {found}")
+    return dict(sweep["table"])
 
 
 # --- the comparison -----------------------------------------------------------------------------------
@@ -186,16 +226,21 @@ def task_space(
         start, rng = np.tile(starts, (len(group), 1)), np.random.default_rng(seed)
         read = sensor(np.random.default_rng(seed + 1))
         trace = rollout(machine, controllers[name], start, goals, TaskConfig(), rng, net, read)
-        figures_of = metrics(machine, trace, goals, kinematics.tool_position(machine, start))
+        found = metrics(machine, trace, goals, kinematics.tool_position(machine, start))
         for i, s in enumerate(group):
-            traces[name, s.name] = Trace(*(a[:, i * num : (i + 1) * num] for a in trace))
-            for j, kind in enumerate(kinds):
-                values = {key: float(v[i * num + j]) for key, v in figures_of.items()}
-                row = {key: v if np.isfinite(v) else None for key, v in values.items()}
-                rows.append({"controller": name, "sequence": s.name, "start": j, "kind": kind} | row)
+            mine, label = slice(i * num, (i + 1) * num), {"controller": name, "sequence": s.name}
+            traces[name, s.name] = Trace(*(a[:, mine] for a in trace))
+            rows += _rows(label, kinds, {key: v[mine] for key, v in found.items()})
     names, order = list(controllers), [s.name for s in sequences]
     rows.sort(key=lambda row: (names.index(row["controller"]), order.index(row["sequence"])))
     return rows, traces
+
+
+def _rows(label: Mapping[str, Any], kinds: Sequence[str], found: Mapping[str, Array]) -> list[dict[str, Any]]:
+    """One row a start of figures (starts,); None where there is none."""
+    plain = {key: [float(v) if np.isfinite(v) else None for v in values] for key, values in found.items()}
+    rows = ({key: values[j] for key, values in plain.items()} for j in range(len(kinds)))
+    return [{**label, "start": j, "kind": kinds[j]} | row for j, row in enumerate(rows)]
 
 
 def noisy(rng: np.random.Generator) -> Encoder:
@@ -261,8 +306,9 @@ def robustness(
 ) -> dict[str, dict[str, dict[str, Any]]]:
     """Mean velocity error [m/s], 95 % interval over starts, by variation and controller. Paper: Sec. 4.2
 
-    And "supply_demand", the largest share of the pump's flow that was asked for, and "supply_limits", the
-    share of ticks at which it was more than all.
+    And "supply_demand", the largest share of the pump's flow that was asked for, "supply_limits", the share
+    of ticks at which it was more than all, and of baselines "rl_less", the policy's error less theirs on the
+    same starts.
     """
     result: dict[str, dict[str, dict[str, Any]]] = {}
     for name, (plant, sensor) in variations(machine).items():
@@ -273,6 +319,8 @@ def robustness(
             errors = by_start(runs, c, "all", "velocity_error_mean")
             result[name][c] = {**mean_interval(errors), "supply_demand": float(asked.max())}
             result[name][c]["supply_limits"] = float((asked > 1).mean())
+            if "rl" in controllers and c != "rl":
+                result[name][c]["rl_less"] = paired(runs, "rl", c, "velocity_error_mean")["all"]
     return result
 
 
@@ -312,32 +360,20 @@ def comparison(
         For JSON; and traces of the main runs ("all"), with the bound ("bound") and near singularities
         ("singular").
     """
-    sequences, names = task_sequences(machine), list(controllers)
+    sequences = task_sequences(machine)
     starts = scored_starts(machine, effort.starts, sequences, seed + 2)
     kinds = np.array(start_kinds(machine, starts))
     runs, traces = task_space(machine, controllers, sequences, starts, seed)
     scored = [run for run in runs if run["kind"] == "workspace"]
-    of_kind = {k: [run for run in runs if run["kind"] == k] for k in dict.fromkeys(kinds)}
-    means = {k: {c: rows["all"] for c, rows in summary(some).items()} for k, some in of_kind.items()}
     short = shortened(machine, axis_sequences(machine), effort.short_s)
     reachable = starts[kinds == "workspace"]
     bounded, less, bound = regret(machine, controllers, short, reachable[: effort.bound_starts], seed)
     singular, found = singular_case(machine, controllers, starts[kinds == "extended"], effort.short_s, seed)
-    verdicts = claims.drift_claims(scored, PAPERS)
-    pid, along_x = controllers[PAPERS[0]], traces[PAPERS[0], "x"]
-    if isinstance(pid, JacobianController):
-        across = Trace(*(a[:, kinds == "workspace"] for a in along_x))
-        verdicts.append(claims.direction_claim(machine, pid, across, sequences[0].goals))
-    verdicts += [*found["claims"], *claims.tracking_claims(scored, PAPERS)]
-    keys = ("velocity_error_mean", "off_axis_drift_max")
+    across = {c: Trace(*(a[:, kinds == "workspace"] for a in traces[c, "x"])) for c in controllers}
+    verdicts = judged(machine, controllers, scored, across, sequences[0].goals)
+    verdicts[3:3] = found["claims"]  # the paper's order
     return {
-        "task_space": {
-            "runs": runs,
-            "summary": summary(scored),
-            "intervals": intervals(scored),
-            "by_kind": means,
-            "rl_less": {k: {c: paired(scored, "rl", c, k) for c in names if c != "rl"} for k in keys},
-        },
+        "task_space": tables(runs, scored),
         "regret": {"summary": summary(bounded), "less_perfect_model": less},
         "robustness": robustness(machine, controllers, short, reachable[:16], seed),
         "singular": found,
@@ -345,6 +381,48 @@ def comparison(
         "starts": starts.tolist(),
         "start_kinds": kinds.tolist(),
     }, {"all": traces, "bound": bound, "singular": singular}
+
+
+def tables(runs: Sequence[Run], scored: Sequence[Run]) -> dict[str, Any]:
+    """Runs, and figures of those that count: means, intervals, the policy's less the baselines'; for JSON."""
+    of_kind = {
+        kind: [run for run in runs if run["kind"] == kind] for kind in dict.fromkeys(r["kind"] for r in runs)
+    }
+    return {
+        "runs": runs,
+        "summary": summary(scored),
+        "intervals": intervals(scored),
+        "by_kind": {k: {c: rows["all"] for c, rows in summary(of).items()} for k, of in of_kind.items()},
+        "rl_less": paired_with_others(scored, "rl"),
+    }
+
+
+def judged(
+    machine: Machine,
+    controllers: Mapping[str, Controller],
+    runs: Sequence[Run],
+    along_x: Mapping[str, Trace],
+    goals: Array,
+) -> list[dict[str, Any]]:
+    """The paper's sentences on its baselines, each put to the stronger one, too: drift, direction, tracking.
+
+    Args:
+        machine: n joints.
+        controllers: by name.
+        runs: those that count.
+        along_x: their traces along x by controller.
+        goals: of these [m/s], (T, 3).
+    """
+    pids = {name: pid for name, pid in controllers.items() if isinstance(pid, JacobianController)}
+    of_paper, of_stronger = (
+        [
+            *claims.drift_claims(runs, names),
+            claims.direction_claim(machine, pids[names[0]], along_x[names[0]], goals),
+            *claims.tracking_claims(runs, names),
+        ]
+        for names in (PAPERS, STRONGER)
+    )
+    return [claims.beside(*pair) for pair in zip(of_paper, of_stronger, strict=True)]
 
 
 def singular_case(
@@ -405,57 +483,96 @@ def reproduce(
 
     seeds = read_seeds(sweep) if sweep else {}
     out.mkdir(parents=True, exist_ok=True)
-    clock: dict[str, float] = {}
-    stages = tqdm(total=6, desc="stages done", unit="stage", position=1, disable=None)
-
-    @contextmanager
-    def stage(name: str) -> Iterator[None]:
-        begun = time.perf_counter()
-        yield
-        clock[name] = time.perf_counter() - begun
-        stages.set_postfix_str(name)
-        stages.update()
-
+    clock, stage = stages(6)
     with stage("record"):
         log, test = record(machine, out, effort, seed)
     with stage("fit"):
-        config = fitting.FitConfig(steps=effort.fit_steps, history=machine.history)
-        net = fitting.fit(log, config, seed, machine.velocity_samples, machine.name)
-        actuator.save_net(out / "net.npz", net)
-        half = replace(config, steps=effort.fit_steps // 2)  # for time
-        paper = preliminary.paper_recipe(machine, test, effort.hours, half, seed)
-    with stage("train"):
+        net, paper = fitted(machine, out, log, test, effort, seed)
         driven = net.select([machine.names[i] for i in machine.driven])
+        over_seeds = seeds_of(machine, driven, seeds) if seeds else {}
+    with stage("train"):
         learner = PPOConfig(total_steps=effort.train_steps)
         policy = train(machine, driven, TaskConfig(), learner, seed, out / "policy.npz", resume=True)
     with stage("tune"):
         tuned, how = tuned_baselines(machine, driven, effort, seed)
     with stage("evaluate"):
         rl = PolicyController(machine, policy)
-        compared, traces = comparison(machine, {"rl": rl, **tuned}, effort, seed)
-        compared["task_space"]["rl_on_nets"] = on_nets(machine, rl, compared, seed)
-        driven_log_score = scores.score(net, driven_log(machine, traces["all"], "rl"))
+        measured, traces = measure(machine, net, test, rl, tuned, effort, seed)
         results = {
-            "meta": meta(machine, seed) | {"effort": asdict(effort)},
-            "actuator": {"test": scores.score(net, test), "driven_by_policy": driven_log_score},
-            "preliminary": preliminary.run(machine, net, seed),
+            "meta": meta(machine, seed) | tuned_for(machine, driven) | {"effort": asdict(effort)},
             "paper_recipe": paper,
-            **compared,
+            **measured,
             "gains": plain_gains(tuned),
             "tuning": how,
-            "training_seeds": seeds,
+            "training_seeds": over_seeds,
         }
     with stage("draw"):
         write_json(out / "results.json", results)
-        write_json(out / "gains.json", {"meta": results["meta"], "gains": results["gains"]})
+        write_gains(out / "gains.json", tuned, results["meta"])
         save_policy(out / "policy.npz", told(policy, results, seed))
-        goals = tuning_goals(machine, effort.tuning_runs, 12.0, seed + 1000)
-        parts = report.net_parts(machine, net, test, results, seed, out / "policy.npz.csv")
-        parts = [report.found(results), *parts, *report.task_parts(machine, results, traces, goals)]
+        parts = report.net_parts(machine, net, test, results, seed, out / "policy.npz.csv", clock["train"])
+        parts = [report.found(results), *parts, *report.task_parts(machine, results, traces)]
         figures.write_report(out / "report.html", parts, clock)
-    stages.close()
     write_json(out / "timing.json", clock)
     return results
+
+
+def stages(total: int) -> tuple[dict[str, float], Callable[[str], AbstractContextManager[None]]]:
+    """Seconds by stage, filled in as `total` stages end, and what each stage is to run in."""
+    clock: dict[str, float] = {}
+    bar = tqdm(total=total, desc="stages done", unit="stage", position=1, disable=None)
+
+    @contextmanager
+    def stage(name: str) -> Iterator[None]:
+        begun = time.perf_counter()
+        yield
+        clock[name] = time.perf_counter() - begun
+        bar.set_postfix_str(name)
+        bar.update()
+        if len(clock) == total:
+            bar.close()
+
+    return clock, stage
+
+
+def fitted(
+    machine: Machine, out: Path, log: logs.Log, test: logs.Log, effort: Effort, seed: int
+) -> tuple[Net, dict[str, Any]]:
+    """Nets of all joints, written to `net.npz`, and how those by the paper's recipe fare, for JSON."""
+    config = fitting.FitConfig(steps=effort.fit_steps, history=machine.history)
+    net = fitting.fit(log, config, seed, machine.velocity_samples, machine.name)
+    actuator.save_net(out / "net.npz", net)
+    half = replace(config, steps=effort.fit_steps // 2)  # for time
+    return net, preliminary.paper_recipe(machine, test, effort.hours, half, seed)
+
+
+def measure(
+    machine: Machine,
+    net: Net,
+    test: logs.Log,
+    rl: PolicyController,
+    tuned: Mapping[str, JacobianController],
+    effort: Effort,
+    seed: int,
+) -> tuple[dict[str, Any], dict[str, Traces]]:
+    """All that is measured of nets, policy and baselines: `results.json`, and traces of `comparison`."""
+    compared, traces = comparison(machine, {"rl": rl, **tuned}, effort, seed)
+    compared["task_space"]["rl_on_nets"] = on_nets(machine, rl, compared, seed)
+    driven = scores.score(net, driven_log(machine, traces["all"], "rl"))
+    before, tuning = preliminary.run(machine, net, seed), tuning_goals(machine, *tuning_set(effort, seed))
+    return {
+        "actuator": {"test": scores.score(net, test), "driven_by_policy": driven},
+        "preliminary": before,
+        "net_claims": claims.net_claims(before),
+        **compared,
+        "tuning_runs": tuning_runs(machine, *tuning),
+    }, traces
+
+
+def tuning_runs(machine: Machine, starts: Array, goals: Array) -> list[dict[str, Any]]:
+    """Each run that the baselines were tuned on, for JSON: "start" [rad] and "goals", see `held_rows`."""
+    runs = zip(starts, goals.swapaxes(0, 1), strict=True)
+    return [{"start": s.tolist(), "goals": held_rows(machine, run).tolist()} for s, run in runs]
 
 
 def record(machine: Machine, out: Path, effort: Effort, seed: int) -> list[logs.Log]:

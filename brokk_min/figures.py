@@ -28,8 +28,9 @@ import matplotlib.pyplot as plt
 Array = NDArray[np.floating[Any]]
 Traces = Mapping[tuple[str, str], Trace]  # by controller and sequence, starts as one batch
 
-plt.rcParams.update({"font.size": 8, "axes.grid": True, "grid.alpha": 0.3, "axes.axisbelow": True})
-WIDTH = 10.0  # inch, of every figure: so letters are of one size in the report
+plt.rcParams.update({"font.size": 10, "axes.grid": True, "grid.alpha": 0.3, "axes.axisbelow": True})
+WIDTH = 10.0  # inch, of every figure: so letters are of one size in the report, on A4 paper 7 points
+DPI = 150  # for paper
 
 # Brightness of its own for each of those that stand in one plot: they differ on grey paper too.
 STYLES: dict[str, dict[str, Any]] = {
@@ -43,7 +44,16 @@ STYLES: dict[str, dict[str, Any]] = {
     "limits": {"color": "#d9661a"},
     "extended": {"color": "#f0b84a"},
 }
-OTHERS = [STYLES[name] for name in ("rl", "jacobian_pid_k0.1", "jacobian_pid_ff", "jacobian_pid_k0.05")]
+# Curves without a style of their own; dashed where one may hide another.
+OTHERS: list[dict[str, Any]] = [
+    {"color": "#08306b"},
+    {"color": "#d9661a", "linestyle": "--"},
+    {"color": "#00886a", "linestyle": "-."},
+    {"color": "#f0b84a", "linestyle": (0, (4, 1, 1, 1, 1, 1))},
+]
+
+
+TIGHT = {"frameon": False, "borderpad": 0.2, "columnspacing": 0.9, "handlelength": 1.6, "handletextpad": 0.4}
 
 
 class Panel(NamedTuple):
@@ -56,27 +66,34 @@ class Panel(NamedTuple):
 
 
 def plot_panels(rows: Sequence[Sequence[Panel]], one_scale: bool = False) -> Any:
-    """Rows of panels; under one legend where all show the same curves.
+    """Rows of panels; under one legend where all show the same curves, otherwise each under its own.
 
     Panels of a column that show the same quantity have one y axis; with `one_scale` those of a row, too.
     """
     high, wide = len(rows), max(map(len, rows))
-    figure = plt.figure(figsize=(WIDTH, 2.4 * high + 0.3), layout="constrained")
+    figure = plt.figure(figsize=(WIDTH, 2.6 * high + 0.3), layout="constrained")
     grid = figure.subplots(high, wide, squeeze=False, sharey="row" if one_scale else "none")
     alike = len({tuple(panel.curves) for panels in rows for panel in panels}) == 1
     for k, (axes, panels) in enumerate(zip(grid, rows, strict=True)):
         for ax, above, panel in zip(axes, grid[0], panels, strict=False):
             for i, (label, (x, y)) in enumerate(panel.curves.items()):
                 ax.plot(x, y, label=label, linewidth=1.1, **STYLES.get(label, OTHERS[i % len(OTHERS)]))
-            ax.set(title=panel.title, xlabel=panel.xlabel, ylabel=panel.ylabel)
-            if not alike:
-                ax.legend()
+            ax.set(xlabel=panel.xlabel, ylabel=panel.ylabel)
+            lines = 0 if alike else _legend_above(ax, most=2 if wide > 2 else 4)
+            ax.set_title(panel.title, fontsize="medium", pad=6 + 16 * lines)
             if k and above.get_ylabel() == panel.ylabel:
                 ax.sharey(above)
                 ax.autoscale()
         for ax in axes[len(panels) :]:
             ax.remove()
     return _with_legend(figure, grid[0, 0]) if alike else figure
+
+
+def _legend_above(ax: Any, most: int) -> int:
+    """A legend above the curves, where it hides none, with at most so many entries a line: its lines."""
+    entries = len(ax.get_legend_handles_labels()[1])
+    ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncol=min(entries, most), **TIGHT)
+    return -(-entries // most)
 
 
 def _over_time(dt: float, labels: Sequence[str], curves: Mapping[str, Array]) -> list[Panel]:
@@ -154,7 +171,7 @@ def plot_bars(panels: Mapping[str, Bars]) -> Any:
             places = np.arange(len(names)) + (i - (len(bars) - 1) / 2) * width
             color = STYLES[controller]["color"]
             ax.bar(places, mean, width, yerr=ends, label=controller, color=color, error_kw={"linewidth": 0.8})
-        ax.set_xticks(np.arange(len(names)), names)
+        ax.set_xticks(np.arange(len(names)), [name.replace("_", "\n") for name in names])
         ax.set_ylabel(label)
         ax.grid(False, axis="x")
     return _with_legend(figure, axes[0])
@@ -162,7 +179,7 @@ def plot_bars(panels: Mapping[str, Bars]) -> Any:
 
 def plot_starts(machine: Machine, starts: Array, kinds: Sequence[str]) -> Any:
     """Start configurations drawn as arms, from the side and from above. Paper: Fig. 6a"""
-    figure, axes = plt.subplots(1, 2, figsize=(WIDTH, 4.4), layout="constrained")
+    figure, axes = plt.subplots(1, 2, figsize=(WIDTH, 4.6), layout="compressed")
     points = kinematics.frames(machine, starts)[..., :3, 3]
     heading = points[:, -1, :2] / np.maximum(np.linalg.norm(points[:, -1, :2], axis=-1, keepdims=True), 1e-9)
     outward = np.einsum("pjk,pk->pj", points[..., :2], heading)
@@ -196,7 +213,7 @@ def plot_worst_and_median(net: actuator.ActuatorNet, log: logs.Log, seconds: flo
 def save(path: Path, figure: Any) -> None:
     """Write a figure as PNG, the same bytes for the same figure."""
     with logs.whole_file(path) as file:
-        figure.savefig(file, format="png", dpi=110, metadata={"Software": None})
+        figure.savefig(file, format="png", dpi=DPI, metadata={"Software": None})
     plt.close(figure)
 
 
@@ -204,12 +221,22 @@ def save(path: Path, figure: Any) -> None:
 
 STYLE = """body{font:15px/1.45 sans-serif;max-width:1100px;margin:2em auto;padding:0 1em}
 table{border-collapse:collapse;margin:1em 0}td,th{border:1px solid #bbb;padding:.25em .6em;text-align:right}
-td:first-child,th:first-child{text-align:left}img{max-width:100%}"""
+td:first-child,th:first-child,.wide{text-align:left}td{white-space:nowrap}.wide{white-space:normal}
+blockquote{margin:1em 0;padding:.1em 1em;border-left:4px solid #08306b;background:#f3f5f8}
+blockquote p{margin:.5em 0}img{max-width:100%}
+@media print{body{font-size:11px}h2{break-after:avoid}img,tr,blockquote{break-inside:avoid}}"""
+
+
+class Quote(NamedTuple):
+    """A sentence of the paper, and lines of what was measured and the verdict."""
+
+    paper: str
+    lines: Sequence[tuple[str, str]]
 
 
 def write_report(path: Path, parts: Sequence[tuple[Any, ...]], clock: Mapping[str, float]) -> None:
-    """One page by itself; a part is a title, a sentence, and more sentences, tables {row: {column: cell}}
-    or figures."""
+    """One page by itself; a part is a title, a sentence, and more sentences, quotes, tables
+    {row: {column: cell}} or figures."""
     page = [
         f"<!doctype html><meta charset=utf-8><title>brokk_min report</title><style>{STYLE}</style>",
         "<h1>Task space control with reinforcement learning: what was measured</h1>",
@@ -227,6 +254,10 @@ def write_report(path: Path, parts: Sequence[tuple[Any, ...]], clock: Mapping[st
 def _content(title: str, content: Any) -> str:
     if isinstance(content, str):
         return f"<p>{html.escape(content)}</p>"
+    if isinstance(content, Quote):
+        pairs = ((html.escape(text), html.escape(verdict)) for text, verdict in content.lines)
+        lines = (f"<p><b>Measured:</b> {text}. <b>{verdict}</b></p>" for text, verdict in pairs)
+        return f"<blockquote><p><b>Paper:</b> {html.escape(content.paper)}</p>{''.join(lines)}</blockquote>"
     return _table(content) if isinstance(content, Mapping) else _image(title, content)
 
 
@@ -235,7 +266,8 @@ def _table(rows: Mapping[str, Mapping[str, Any]]) -> str:
         texts = (
             "" if c is None else f"{c:.4g}" if isinstance(c, float) else html.escape(str(c)) for c in cells
         )
-        parts = (f"<{tag}>{text.replace('_', '_<wbr>')}</{tag}>" for text in texts)
+        wide = ((" class=wide" if len(text) > 40 else "", text.replace("_", "_<wbr>")) for text in texts)
+        parts = (f"<{tag}{kind}>{text}</{tag}>" for kind, text in wide)
         return "<tr>" + "".join(parts) + "</tr>"
 
     head = line("th", ["", *next(iter(rows.values()))])
@@ -244,7 +276,7 @@ def _table(rows: Mapping[str, Mapping[str, Any]]) -> str:
 
 def _image(title: str, figure: Any) -> str:
     buffer = io.BytesIO()
-    figure.savefig(buffer, dpi=110, metadata={"Software": None})
+    figure.savefig(buffer, dpi=DPI, metadata={"Software": None})
     plt.close(figure)
     image = base64.b64encode(buffer.getvalue()).decode()
     return f"<img alt='{html.escape(title)}' src='data:image/png;base64,{image}'>"

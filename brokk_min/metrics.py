@@ -18,7 +18,8 @@ Run = Mapping[str, Any]  # controller, sequence, start, kind, then the figures o
 LABELS = ("controller", "sequence", "start", "kind")
 CHANGE = 0.05  # share of tool_speed, assumed: a goal that jumps by more has changed
 TRANSIENT = 0.6  # s after a change, assumed: as long as the policy's memory
-BAND = 0.1  # share of tool_speed, assumed: settled while the velocity error stays below it
+BAND = 0.1  # share of tool_speed, assumed: settled while the velocity error stays below it,
+PART = 0.5  # and below this share of the change, assumed: or a slow goal would be met by standing still
 AT_LIMIT = 0.01  # rad, assumed: so near an end of its range a joint is at it
 
 
@@ -51,19 +52,30 @@ def line_distance(p_tool: Array, goals: Array, start: Array) -> Array:
 
 def since_change(machine: Machine, goals: Array) -> NDArray[np.int64]:
     """Ticks since the goal (T, num, 3) last changed by more than `CHANGE`, (T, num); -1: not yet."""
-    jump = np.linalg.norm(np.diff(goals, axis=0, prepend=0 * goals[:1]), axis=-1)
     tick = np.arange(len(goals))[:, None]
-    last = np.maximum.accumulate(np.where(jump > CHANGE * machine.tool_speed, tick, -1), axis=0)
+    last = np.maximum.accumulate(np.where(_jumps(goals) > CHANGE * machine.tool_speed, tick, -1), axis=0)
     return np.where(last < 0, -1, tick - last)
 
 
-def settling_time(machine: Machine, error: Array, since: NDArray[np.int64]) -> Array:
+def _jumps(goals: Array) -> Array:
+    """How much goals (T, num, 3) change from tick to tick, at first from rest [m/s], (T, num)."""
+    jumps: Array = np.linalg.norm(np.diff(goals, axis=0, prepend=0 * goals[:1]), axis=-1)
+    return jumps
+
+
+def settling_time(machine: Machine, error: Array, goals: Array) -> Array:
     """Mean time [s] from a change of goal until the error (T, num) stays in its band, (num,); NaN: no change.
 
-    Where it does not before the next change, the whole time between the changes counts.
+    Where it does not before the next change, the whole time between the changes counts. `goals` (T, num, 3).
     """
-    segment = np.cumsum(since == 0, axis=0)
-    late = np.where((error > BAND * machine.tool_speed) & (since >= 0), since + 1, 0)
+    since = since_change(machine, goals)
+    segment, last_change = (
+        np.cumsum(since == 0, axis=0),
+        np.arange(len(goals))[:, None] - np.maximum(since, 0),
+    )
+    jump = np.take_along_axis(_jumps(goals), last_change, axis=0)
+    band = np.minimum(BAND * machine.tool_speed, PART * jump)
+    late = np.where((error > band) & (since >= 0), since + 1, 0)
     last = np.zeros((segment.max() + 1, error.shape[1]))
     np.maximum.at(last, (segment, np.arange(error.shape[1])), late)
     changes = segment[-1]
@@ -89,7 +101,7 @@ def metrics(machine: Machine, trace: Trace, goals: Array, start: Array) -> dict[
         "velocity_error_mean": error.mean(axis=0),
         "velocity_error_transient": _mean(error, transient),
         "velocity_error_steady": _mean(error, ~transient),
-        "settling_time": settling_time(machine, error, since),
+        "settling_time": settling_time(machine, error, goals),
         "off_axis_drift_max": drift.max(axis=0),
         "off_axis_drift_mean": drift.mean(axis=0),
         "position_error_mean": np.linalg.norm(behind, axis=-1).mean(axis=0),
@@ -178,3 +190,11 @@ def paired(runs: Sequence[Run], one: str, other: str, key: str) -> dict[str, dic
     """A figure of one controller less another's on the same starts, by sequence: `mean_interval` each."""
     sequences = _named(runs)[1]
     return {s: mean_interval(by_start(runs, one, s, key) - by_start(runs, other, s, key)) for s in sequences}
+
+
+def paired_with_others(
+    runs: Sequence[Run], one: str
+) -> dict[str, dict[str, dict[str, dict[str, float | None]]]]:
+    """Every figure of one controller less each other's: `paired`, by figure and other controller."""
+    controllers, _, keys = _named(runs)
+    return {k: {c: paired(runs, one, c, k) for c in controllers if c != one} for k in keys}

@@ -11,7 +11,6 @@ derivatives (`adjoint`): what an action's deviation from the mean was worth, to 
 from __future__ import annotations
 
 import csv
-import hashlib
 import json
 import math
 import sys
@@ -26,7 +25,7 @@ import torch
 from torch import nn
 from tqdm import tqdm
 
-from brokk_min.actuator import ActuatorNet, load_header, net_arrays
+from brokk_min.actuator import ActuatorNet, fingerprint, load_header
 from brokk_min.adjoint import Rollout, action_gradients
 from brokk_min.env import State, TaskConfig, TaskVectorEnv, observation_scale, paper_view, to_command
 from brokk_min.logs import load_arrays, whole_file
@@ -394,14 +393,6 @@ class Training:
                 names = ("step", "exp_avg", "exp_avg_sq")
                 if f"step_{i}" in tensors:
                     moments[parameter] = {name: tensors[f"{name}_{i}"] for name in names}
-
-
-def fingerprint(net: ActuatorNet) -> str:
-    """Hash of the nets, header and all: which simulation a policy was trained in."""
-    digest = hashlib.sha256()
-    for name, array in net_arrays(net).items():
-        digest.update(name.encode() + np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()[:16]
 
 
 def identity_of(

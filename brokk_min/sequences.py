@@ -80,6 +80,13 @@ def _held(machine: Machine, rows: ArrayLike) -> Array:
     )
 
 
+def held_rows(machine: Machine, goals: Array) -> Array:
+    """`_held` turned round: rows of seconds and the velocity [m/s] held for them, of goals (T, 3)."""
+    at = np.concatenate([[0], np.flatnonzero(np.any(np.diff(goals, axis=0) != 0, axis=-1)) + 1])
+    seconds = np.diff([*at, len(goals)]) / machine.rate
+    return np.concatenate([seconds[:, None], goals[at]], axis=1)
+
+
 def task_sequences(machine: Machine) -> list[Commands]:
     """All sequences that score, 18 s each: the paper's three axes and seven of ours.
 

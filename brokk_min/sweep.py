@@ -155,7 +155,8 @@ def sweep(
     beside = _on_the_machine(machine, others, starts)
     figures = table([results[seed] for seed in sorted(results)], beside)
     runs = [{"seed": seed} | row for seed in sorted(results) for row in results[seed]]
-    meta = experiments.meta(machine, min(seeds)) | {"seeds": len(seeds), "failed": failed}
+    meta = experiments.meta(machine, min(seeds)) | experiments.tuned_for(machine, net)
+    meta |= {"seeds": len(seeds), "failed": failed}
     experiments.write_json(out / "sweep.json", {"meta": meta, "table": figures, "runs": runs + beside})
     if failed:
         raise ValueError("; ".join(f"seed {seed}: {why}" for seed, why in sorted(failed.items())))

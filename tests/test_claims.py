@@ -45,7 +45,7 @@ def test_one_start_gives_no_verdict() -> None:
     runs = [run for run in runs_with("off_axis_drift_max", rl=0.1, high=0.2, low=0.2) if run["start"] == 0]
     found = claims.drift_claims(runs, PAPERS)
     assert [claim["holds"] for claim in found] == [None, None]
-    assert report.verdict(found[0]).endswith("This was not measured.")
+    assert report.verdict(found[0]).lines == ((found[0]["measured"], "This was not measured."),)
 
 
 @pytest.mark.parametrize(
@@ -119,3 +119,57 @@ def test_direction(down: float, holds: bool) -> None:
     assert found["holds"] is holds
     errors = sorted({round(n["mean"], 2) for n in found["numbers"].values() if n["mean"] is not None})
     assert errors == sorted({0.1, round(1 - down, 2)})
+
+
+def preliminary_numbers(**change: Any) -> dict[str, Any]:
+    """What `preliminary.run` says of a machine as the paper's and of nets that are as it."""
+    times = {"q5": {"idle": {"up": 0.4, "down": 0.4}, "moving": {"up": 0.1, "down": 0.1}}}
+    peak = {"u = 50": 0.1, "u = 80": 0.24, "u = 175": 0.45, "u = 205": 0.3}
+    gap = {"tool": {"position_error_mean": 0.03}, "tool_position_error_mean_of_runs": {"median": 0.02}}
+    return {
+        "joint": "q5",
+        "sweep": {u: {"machine_peak": v, "nets_peak": v} for u, v in peak.items()},
+        "coupling_rms": {"machine": 0.0, "nets": 0.001},
+        "response_time": {"machine": times, "nets": times},
+        "sim_to_real": gap,
+    } | change
+
+
+def test_machine_and_nets_are_as_the_paper_found_its_own() -> None:
+    slow = {"q5": {"idle": {"up": 0.15, "down": 0.4}, "moving": {"up": 0.1, "down": 0.1}}}
+    never = {"q5": {"idle": {"up": None, "down": 0.4}, "moving": {"up": 0.1, "down": 0.1}}}
+    good = preliminary_numbers()
+    even = good["sweep"] | {"u = 175": {"machine_peak": 0.45, "nets_peak": 0.2}}
+    far = {"tool": {"position_error_mean": 0.03}, "tool_position_error_mean_of_runs": {"median": 0.06}}
+    for change, holds in (
+        ({}, [True, True, True, True]),
+        ({"sweep": even}, [False, True, True, True]),
+        ({"response_time": good["response_time"] | {"nets": slow}}, [True, False, True, True]),
+        ({"response_time": good["response_time"] | {"nets": never}}, [True, None, True, True]),
+        ({"coupling_rms": {"machine": 0.0, "nets": 0.02}}, [True, True, False, True]),
+        ({"sim_to_real": far}, [True, True, True, False]),
+    ):
+        found = claims.net_claims(preliminary_numbers(**change))
+        assert [claim["holds"] for claim in found] == holds, change
+    assert (
+        "nets, idle none"
+        in claims.net_claims(preliminary_numbers(response_time={"nets": never}))[1]["measured"]
+    )
+
+
+@pytest.mark.parametrize(("hours", "holds"), [(0.1, False), (2.0, True), (4.0, True), (6.0, False)])
+def test_training_lasts_as_long_as_the_papers_or_not(hours: float, holds: bool) -> None:
+    claim = claims.training_claim(hours * 3600, 8_000_000)
+    assert claim["holds"] is holds and "8,000,000" in claim["measured"]
+
+
+def test_a_stronger_baseline_stands_beside_the_papers() -> None:
+    runs = runs_with("off_axis_drift_max", rl=0.02, high=0.2, low=0.3)
+    runs += [run | {"controller": "strong", "off_axis_drift_max": 0.03} for run in runs[:6]]
+    of_paper, of_strong = (claims.drift_claims(runs, names) for names in (PAPERS, ["strong"]))
+    still, fails = (claims.beside(*pair) for pair in zip(of_paper, of_strong, strict=True))
+    assert "stronger" not in still  # a sentence on RL alone
+    assert fails["holds"] is True and fails["stronger"]["holds"] is False
+    lines = report.verdict(fails).lines
+    assert [verdict for _, verdict in lines] == ["This holds here.", "This does not hold here."]
+    assert lines[1][0].startswith(report.BESIDE + "strong 0.03") and "high" not in lines[1][0]

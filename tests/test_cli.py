@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -206,7 +207,8 @@ def test_collect_fit_train_resume_evaluate(tmp_path: Path, capsys: pytest.Captur
     starts.write_text("q1,q2,q3,q4,q5\n0,0.5,0.58,1.71,1.24\n")
     gains = {k: [0.5] * 4 for k in ("kp", "ki", "kd")} | {"feedback": [0.1], "ready": [0.01]}
     names = ("jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff")
-    table = {"meta": {"machine": "brokk170"}, "gains": dict.fromkeys(names, gains)}
+    about = experiments.tuned_for(BROKK_170, load_policy(policy, BROKK_170).net)
+    table = {"meta": about, "gains": dict.fromkeys(names, gains)}
     (tmp_path / "gains.json").write_text(json.dumps(table))
     for plant in ("analytic", "net"):
         where = tmp_path / f"{plant}.json"
@@ -224,8 +226,11 @@ def test_collect_fit_train_resume_evaluate(tmp_path: Path, capsys: pytest.Captur
     runs = json.loads(where.read_text())["runs"]
     best = sorted(runs, key=lambda r: r["velocity_error_mean"])[:2]  # awake valves answer sooner
     assert [run["controller"] for run in best] == ["perfect_model", "perfect_model_no_dither"]
-    starts.write_text("q1,q2,q3,q4,q5\n0,0,-0.3,2.5,1.2\n")
+    shipped = ["--starts", starts, "--gains", SHIPPED / "brokk170" / "gains.json"]  # of other nets
     capsys.readouterr()
+    assert run("evaluate", "--policy", policy, *shipped) == 1
+    assert re.search(rf"with nets {about['actuator']}, got .*gains for", capsys.readouterr().err)
+    starts.write_text("q1,q2,q3,q4,q5\n0,0,-0.3,2.5,1.2\n")
     assert run("evaluate", "--policy", policy, "--starts", starts) == 1
     assert "s.csv: row 2: expected the whole arm above" in capsys.readouterr().err
     assert run("evaluate", "--policy", net) == 1

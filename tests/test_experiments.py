@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import itertools
 import json
 import re
 from dataclasses import dataclass, replace
@@ -13,14 +14,14 @@ import pytest
 from matplotlib.colors import to_rgb
 
 from benchmarks.rollout import random_net
-from brokk_min import experiments, figures, jacobian
-from brokk_min.actuator import ActuatorNet
+from brokk_min import experiments, figures, jacobian, report
+from brokk_min.actuator import ActuatorNet, fingerprint, load_net, save_net
 from brokk_min.env import Measured, TaskConfig, measured, rollout, to_command
 from brokk_min.kinematics import joint_rates, tool_position
 from brokk_min.machine import BROKK_170, Machine, read_encoder
 from brokk_min.metrics import metrics
 from brokk_min.plant import plant_reset, plant_step, speed_limits
-from brokk_min.sequences import task_sequences
+from brokk_min.sequences import task_sequences, tuning_goals
 
 TINY = experiments.Effort(0.02, 60, 8192, 1, 2, 4, 2, 1.0)
 
@@ -163,15 +164,43 @@ def test_curves_of_one_plot_differ_on_grey_paper() -> None:
         assert (np.diff(grey) > 0.1).all() and grey[-1] < 0.8, group
 
 
+def test_names_below_bars_do_not_touch() -> None:
+    names = [s.name for s in task_sequences(BROKK_170)]
+    number = {"mean": 0.1, "low": 0.05, "high": 0.2}
+    figure = figures.plot_bars({"error [m/s]": {"rl": dict.fromkeys([*names, "all"], number)}})
+    figure.draw_without_rendering()
+    boxes = [label.get_window_extent() for label in figure.axes[0].get_xticklabels()]
+    assert all(one.x1 + 4 < two.x0 for one, two in itertools.pairwise(boxes))
+
+
 def net_of_driven_joints() -> ActuatorNet:
     return random_net(np.random.default_rng(0)).select(["q1", "q3", "q4", "q5"])
 
 
-def test_gains_of_another_machine_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "gains.json"
-    path.write_text(json.dumps({"meta": {"machine": "digger"}, "gains": {}}))
-    with pytest.raises(ValueError, match=r"expected gains for brokk170.*digger"):
-        experiments.read_gains(path, BROKK_170, net_of_driven_joints())
+def test_gains_of_another_machine_or_of_other_nets_are_refused(tmp_path: Path) -> None:
+    """What they are for is said, and what was wanted; a file that does not say it is refused as well."""
+    path, net = tmp_path / "gains.json", net_of_driven_joints()
+    tuned, about = experiments.baselines(BROKK_170, net), experiments.tuned_for(BROKK_170, net)
+    for key, value in {"machine": "digger", "actuator": "0123456789abcdef"}.items():
+        experiments.write_gains(path, tuned, about | {key: value})
+        with pytest.raises(ValueError, match=rf"gains.json: expected gains for brokk170.*{value}") as error:
+            experiments.read_gains(path, BROKK_170, net)
+        assert about["actuator"] in str(error.value)
+    experiments.write_gains(path, tuned, {"machine": "brokk170"})
+    with pytest.raises(ValueError, match=rf"nets {about['actuator']}, got .*'actuator': None"):
+        experiments.read_gains(path, BROKK_170, net)
+    path.write_text('{"meta": [], "gains": {}}')
+    with pytest.raises(ValueError, match=r"gains.json: expected gains for brokk170"):
+        experiments.read_gains(path, BROKK_170, net)
+
+
+def test_a_fingerprint_is_of_the_nets_and_survives_a_file(tmp_path: Path) -> None:
+    net = net_of_driven_joints()
+    save_net(tmp_path / "net.npz", net)
+    assert fingerprint(load_net(tmp_path / "net.npz")) == fingerprint(net)
+    weights = (net.weights[0] + 1e-6, *net.weights[1:])
+    others = (net.select(["q1"]), replace(net, rate=25.0), replace(net, weights=weights))
+    assert len({fingerprint(other) for other in (net, *others)}) == 4
 
 
 @pytest.mark.parametrize(
@@ -181,10 +210,11 @@ def test_gains_of_another_machine_are_refused(tmp_path: Path) -> None:
 def test_damaged_gains_are_refused(tmp_path: Path, change: dict[str, object], message: str) -> None:
     net, path = net_of_driven_joints(), tmp_path / "gains.json"
     table = experiments.plain_gains(experiments.baselines(BROKK_170, net))
-    path.write_text(json.dumps({"meta": {"machine": "brokk170"}, "gains": table}))
+    about = experiments.tuned_for(BROKK_170, net)
+    path.write_text(json.dumps({"meta": about, "gains": table}))
     assert experiments.plain_gains(experiments.read_gains(path, BROKK_170, net)) == table
     table["jacobian_pid_ff"] |= change
-    path.write_text(json.dumps({"meta": {"machine": "brokk170"}, "gains": table}))
+    path.write_text(json.dumps({"meta": about, "gains": table}))
     with pytest.raises(ValueError, match=rf"gains.json: expected gains for brokk170.*{message}"):
         experiments.read_gains(path, BROKK_170, net)
 
@@ -224,11 +254,17 @@ def test_results_answer_the_papers_question(twice: tuple[Path, Path]) -> None:
     results = json.loads((twice[0] / "results.json").read_text())
     assert len(results["claims"]) == 9
     for claim in results["claims"]:
-        assert set(claim) == {"paper", "measured", "numbers", "holds"} and claim["holds"] in (
-            True,
-            False,
-            None,
-        )
+        assert set(claim) - {"stronger"} == {"paper", "measured", "numbers", "unit", "holds"}
+        assert claim["holds"] in (True, False, None)
+    assert ["stronger" in c for c in results["claims"]] == [False, True, True] + [False] * 3 + [True] * 3
+    less = results["task_space"]["rl_less"]["velocity_error_mean"]["jacobian_pid_ff"]
+    for claim, sequences in zip(results["claims"][-3:], ("xyz", "z", ["all"]), strict=True):
+        stronger = claim["stronger"]
+        assert [stronger["numbers"][f"error {s}, less jacobian_pid_ff"] for s in sequences] == [
+            less[s] for s in sequences
+        ]
+        assert stronger["holds"] is all(n["high"] < 0 for n in stronger["numbers"].values())
+    assert len(results["net_claims"]) == 4
     less = results["regret"]["less_perfect_model"]
     assert set(less) == set(results["gains"]) | {"rl"} and all(
         set(rows) == {*"xyz", "all"} for rows in less.values()
@@ -245,6 +281,10 @@ def test_results_answer_the_papers_question(twice: tuple[Path, Path]) -> None:
     low, high = results["task_space"]["intervals"]["jacobian_pid_ff"]["x"]["velocity_error_mean"]
     assert low < means["jacobian_pid_ff"]["x"]["velocity_error_mean"] < high
     assert set(results["robustness"]) == set(experiments.variations(BROKK_170))
+    nominal = results["robustness"]["nominal"]
+    less = nominal["jacobian_pid_ff"]["rl_less"]
+    assert less["mean"] == pytest.approx(nominal["rl"]["mean"] - nominal["jacobian_pid_ff"]["mean"])
+    assert less["low"] < less["mean"] < less["high"] and "rl_less" not in nominal["rl"]
 
 
 def test_results_tell_how_the_baselines_were_tuned(twice: tuple[Path, Path]) -> None:
@@ -266,10 +306,86 @@ def test_the_report_is_one_file_with_its_figures(twice: tuple[Path, Path]) -> No
     words = re.sub(r"base64,[^']*", "", text)  # four letters of a picture may spell anything
     assert not re.findall(r"(?:src|href)='(?!data:)", words) and "http" not in words
     assert "not a real Brokk 170" in text
-    for claim in json.loads((twice[0] / "results.json").read_text())["claims"]:
+    results = json.loads((twice[0] / "results.json").read_text())
+    for claim in (*results["net_claims"], *results["claims"]):
         assert html.escape(claim["measured"]) in text
+    titles = [html.unescape(title) for title in re.findall(r"<h2>(.*?)</h2>", text)]
+    assert len(titles) == len(set(titles))
+    for part in re.split("<h2>", text)[1:]:  # each of the paper's figures has its sentences beside
+        wanted = re.match(r"[^<]*Fig\. (?!6a\))|Learning", part)
+        assert ("<blockquote>" in part and "<img" in part) if wanted else True, part[:60]
     assert "<td>rich, free runs (ours)</td>" in text and "<td>sines, one step (paper)</td>" in text
     assert text.count("<td>start ") == 4 and text.count("<td>tuning run ") == 2
+
+
+def test_the_report_is_in_the_papers_order(twice: tuple[Path, Path]) -> None:
+    text = (twice[0] / "report.html").read_text()
+    papers = re.findall(r"<h2>[^<]*\((Fig\. [^)]*)\)</h2>|<h2>(Actuator nets|Learning curve)</h2>", text)
+    assert ["".join(found) for found in papers] == [
+        "Fig. 2",
+        "Actuator nets",
+        "Learning curve",
+        "Fig. 5",
+        "Fig. 6a",
+        "Fig. 6b-d",
+        "Fig. 6e, f",
+        "Fig. 6g, h",
+        "Fig. 6a, e, f",
+    ]
+
+
+def test_every_figure_of_merit_stands_with_its_interval_and_against_each_baseline(
+    twice: tuple[Path, Path],
+) -> None:
+    results = json.loads((twice[0] / "results.json").read_text())
+    task, text = results["task_space"], (twice[0] / "report.html").read_text()
+    keys = list(task["summary"]["rl"]["all"])
+    assert len(keys) == 12 and list(task["rl_less"]) == keys
+    for key in ("settling_time", "jerk_rms", "valve_travel", "time_at_limits", "reward_mean"):
+        low, high = task["intervals"]["jacobian_pid_ff"]["all"][key]
+        mean = task["summary"]["jacobian_pid_ff"]["all"][key]
+        numbers = {"mean": mean, "low": low, "high": high}
+        assert f"<td>{report._with_interval(numbers)}</td>" in text, key
+        less = task["rl_less"][key]["jacobian_pid_ff"]["all"]
+        assert less["mean"] == pytest.approx(task["summary"]["rl"]["all"][key] - mean, abs=1e-9)
+        assert f"<td>{report._with_interval(less)}</td>" in text, key
+
+
+def test_an_interval_is_written_with_digits_that_tell_it() -> None:
+    assert report._with_interval({"mean": 0.01234, "low": -0.5, "high": 0.03}) == "0.0123 (-0.5000 to 0.0300)"
+    assert report._with_interval({"mean": 41.267, "low": 40.0, "high": 42.5}) == "41.27 (40 to 42.5)"
+    assert report._with_interval({"mean": 0.5, "low": None, "high": None}) == "0.5000"
+    assert report._with_interval({"mean": None, "low": None, "high": None}) == ""
+
+
+def test_a_sequence_is_listed_with_the_goals_that_it_holds() -> None:
+    found = report._path(np.array([[1.0, 0.0, 0.0, 0.0], [0.85, -0.0, -0.2, 0.0]]))
+    assert list(found.values()) == [1.85, 1, 0.2, pytest.approx(0.17), "1 s (0, 0, 0); 0.85 s (0, -0.2, 0)"]
+    assert report._path(np.ones((60, 4)))["held for, vx, vy, vz [m/s]"] == "at every tick another"
+
+
+def test_runs_of_the_tuning_are_those_of_its_seed(twice: tuple[Path, Path]) -> None:
+    found = json.loads((twice[0] / "results.json").read_text())["tuning_runs"]
+    starts, goals = tuning_goals(BROKK_170, TINY.tuning_runs, 12.0, 3 + 1000)
+    np.testing.assert_allclose([run["start"] for run in found], starts)
+    for run, wanted in zip(found, goals.swapaxes(0, 1), strict=True):
+        rows = np.array(run["goals"])
+        again = np.repeat(rows[:, 1:], np.rint(rows[:, 0] * 20).astype(int), axis=0)
+        np.testing.assert_allclose(again, wanted)
+
+
+def test_panels_have_their_legends_above_the_curves_and_units_on_every_axis() -> None:
+    x = np.linspace(0, 1, 5)
+    curves = [{f"{k}{i}": (x, x * i) for i in range(4)} for k in "ab"]
+    row = [figures.Panel(f"panel {i}", "time [s]", "speed [m/s]", c) for i, c in enumerate(curves)]
+    figure = figures.plot_panels([row])
+    figure.draw_without_rendering()
+    boxes = [ax.get_legend().get_window_extent() for ax in figure.axes]
+    assert all(box.y0 >= ax.get_window_extent().y1 for box, ax in zip(boxes, figure.axes, strict=True))
+    assert boxes[0].x1 <= boxes[1].x0  # beside each other
+    for ax, box in zip(figure.axes, boxes, strict=True):
+        assert ax.title.get_window_extent().y0 >= box.y1 - 2
+    assert figure.axes[0].xaxis.label.get_fontsize() * 7 / figures.WIDTH >= 7  # on a page 7 inches wide
 
 
 def test_gains_read_back_give_the_same_controller(twice: tuple[Path, Path]) -> None:

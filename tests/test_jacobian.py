@@ -6,6 +6,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+import scipy.linalg
 from helpers_machines import obedient_net, obedient_velocity, random_machine
 from scipy.optimize import minimize
 
@@ -43,9 +44,10 @@ def test_dls_by_hand():
 @pytest.mark.parametrize("n", [1, 2, 3, 4, 6])
 @pytest.mark.parametrize("seed", range(4))
 def test_dls_solves_the_augmented_least_squares(seed, n):
+    """SciPy's least squares with the damping as further rows."""
     J, W, damping, v, _ = case(seed, n)
     tall = np.vstack([J, np.sqrt(damping) * np.diag(np.sqrt(W))])
-    wanted = np.linalg.lstsq(tall, np.concatenate([v, np.zeros(n)]), rcond=None)[0]
+    wanted = scipy.linalg.lstsq(tall, np.concatenate([v, np.zeros(n)]))[0]
     np.testing.assert_allclose(classic.dls(J, W, damping) @ v, wanted, atol=1e-10)
 
 

@@ -91,6 +91,16 @@ def test_a_run_that_does_not_settle_counts_to_the_next_change() -> None:
     assert figures(v, goals)["settling_time"] == pytest.approx((20 * 0.05 + 0) / 2)
 
 
+def test_a_slow_goal_is_not_met_by_standing_still() -> None:
+    """0.03 m/s, a tenth of the tool's speed: an error of 0.02 is no settling, one of 0.01 is."""
+    goals = np.zeros((40, 3))
+    goals[10:, 0] = 0.03
+    assert figures(np.zeros((40, 3)), goals)["settling_time"] == pytest.approx(30 * 0.05)
+    v = goals.copy()
+    v[10:20, 0], v[20:, 0] = 0.01, 0.02
+    assert figures(v, goals)["settling_time"] == pytest.approx(10 * 0.05)
+
+
 def test_a_goal_that_turns_slowly_is_no_change() -> None:
     turn = np.linspace(0, 2 * np.pi, 320)
     goals = 0.15 * np.stack([np.cos(turn), 0 * turn, np.sin(turn)], axis=1)
@@ -129,6 +139,18 @@ def test_pairs_are_compared_on_the_same_start() -> None:
     assert found["x"]["mean"] == pytest.approx(0.1) and found["y"]["mean"] == pytest.approx(0.3)
     assert found["all"]["mean"] == pytest.approx(0.2)
     np.testing.assert_allclose([found["x"]["low"], found["x"]["high"]], m.interval(np.array([0.2, 0.1, 0.0])))
+
+
+def test_one_is_compared_with_all_others_in_every_figure() -> None:
+    runs = [
+        run(c, "x", i, e) | {"other": 2 * e}
+        for c, e in {"a": 1.0, "b": 3.0, "c": 7.0}.items()
+        for i in (0, 1)
+    ]
+    found = m.paired_with_others(runs, "b")
+    assert list(found) == ["error", "other"] and list(found["error"]) == ["a", "c"]
+    assert [found["other"][c]["all"]["mean"] for c in "ac"] == [4.0, -8.0]
+    assert found["error"]["a"] == m.paired(runs, "b", "a", "error")
 
 
 def test_a_summary_leaves_out_what_was_not_measured() -> None:

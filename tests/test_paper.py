@@ -64,7 +64,8 @@ CONSTANTS = [
         "2 x 32",
         "errors of one step",
         "1 h",
-        "0.75 h, 2.5 h",
+        "0.75 h",
+        "2.5 h",
         "5 %",
     ),
     *("no penalty", "256", "256-128-64", "q_s", "30 s", "K", "k"),
@@ -380,6 +381,7 @@ def test_the_papers_view_leaves_out_the_wanted_rates() -> None:
 def test_the_report_says_how_a_sentence_fares() -> None:
     said = [report.verdict({"paper": "a", "measured": "b", "holds": h}) for h in (True, False, None)]
     assert len(set(said)) == 3
+    assert [quote.lines[0][1] for quote in said] == [f"This {v}." for v in report.VERDICTS.values()]
 
 
 def test_a_driven_log_is_what_encoders_and_valves_said() -> None:

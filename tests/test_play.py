@@ -605,8 +605,8 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("results")
     policy = random_policy(np.random.default_rng(0))
     save_policy(folder / "policy.npz", policy)
-    gains = experiments.plain_gains(experiments.baselines(BROKK_170, policy.net))
-    experiments.write_json(folder / "gains.json", {"meta": {"machine": "brokk170"}, "gains": gains})
+    about = experiments.tuned_for(BROKK_170, policy.net)
+    experiments.write_gains(folder / "gains.json", experiments.baselines(BROKK_170, policy.net), about)
     (folder / "commands.csv").write_text(
         "sequence,time,vx,vy,vz\nside,0,0,0.2,0\nside,1.5,0,0,0\nside,2,0,0,0\n"
     )

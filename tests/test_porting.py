@@ -15,6 +15,7 @@ from helpers_bus import World
 from brokk_min import experiments, hw
 from brokk_min.__main__ import main
 from brokk_min.actuator import load_net
+from brokk_min.env import fitting_nets
 from brokk_min.jacobian import JacobianController, join_gains, manipulability_threshold
 from brokk_min.kinematics import frames, tool_position
 from brokk_min.logs import read_log
@@ -126,8 +127,9 @@ def test_the_commands_run_one_after_the_other(here: Path, mini: Machine) -> None
     assert [words[0] for words in COMMANDS] == ["collect", "fit", "train", "evaluate", "machine", "drive"]
     for words in COMMANDS[:4]:
         if words[0] == "evaluate":  # gains, so that nothing is tuned
-            made = experiments.plain_gains(experiments.baselines(mini, load_net(Path("net.npz"))))
-            Path("gains.json").write_text(json.dumps({"meta": {"machine": mini.name}, "gains": made}))
+            net = fitting_nets(mini, load_net(Path("net.npz")))
+            about = experiments.tuned_for(mini, net)
+            experiments.write_gains(Path("gains.json"), experiments.baselines(mini, net), about)
         given = [word for word in words if word not in ("--hours", "1")]
         assert main([*given, *QUICK[words[0]].split()]) == 0, words
     runs = json.loads(Path("nets.json").read_text())

@@ -32,6 +32,23 @@ def test_the_starts_of_the_package_are_of_all_kinds_and_not_the_tuning_starts() 
     assert not any(tuple(row) in goals_scored for row in moving)
 
 
+def test_the_starts_of_the_package_are_those_of_their_seed() -> None:
+    """`brokk-min starts` draws the file; its first ones in a tenth of the time."""
+    every = sequences.task_sequences(BROKK_170)
+    drawn = sequences.draw_starts(BROKK_170, every, 4, np.random.default_rng(2))
+    np.testing.assert_array_equal(drawn, sequences.scored_starts(BROKK_170, 4, [], 0))
+
+
+def test_held_rows_are_what_is_held() -> None:
+    for sequence in sequences.task_sequences(BROKK_170):
+        rows = sequences.held_rows(BROKK_170, sequence.goals)
+        ticks = np.rint(rows[:, 0] * 20).astype(int)
+        np.testing.assert_array_equal(np.repeat(rows[:, 1:], ticks, axis=0), sequence.goals)
+        assert (np.diff(rows[:, 1:], axis=0) != 0).any(axis=1).all()
+    first = sequences.held_rows(BROKK_170, sequences.task_sequences(BROKK_170)[0].goals)
+    np.testing.assert_allclose(first[:3], [[1, 0, 0, 0], [4, 0.2, 0, 0], [1, 0, 0, 0]])
+
+
 def test_more_starts_than_the_package_has_are_refused() -> None:
     with pytest.raises(ValueError, match=r"starts_brokk170.csv: expected at most 64 starts, got 65"):
         sequences.scored_starts(BROKK_170, 65, [], 0)

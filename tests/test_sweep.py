@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -88,9 +89,14 @@ def test_a_seed_counts_once_in_the_table() -> None:
 def test_a_table_is_read_for_the_report_and_other_files_are_not(tmp_path: Path) -> None:
     path = tmp_path / "sweep.json"
     figures = module.table([seed_rows(1.0), seed_rows(3.0)], [])
-    path.write_text(json.dumps({"table": figures}))
-    assert experiments.read_seeds(path) == figures
-    for text in ("{", "[]", '{"table": {"rl": {"velocity_error_all": {"mean": 1}}}}'):
+    about = experiments.tuned_for(BROKK_170, NET)
+    path.write_text(json.dumps({"meta": about, "table": figures}))
+    assert experiments.seeds_of(BROKK_170, NET, experiments.read_seeds(path)) == figures
+    other = replace(NET, output_high=2 * NET.output_high)
+    with pytest.raises(ValueError, match=rf"sweep: expected one with .*got .*{about['actuator']}"):
+        experiments.seeds_of(BROKK_170, other, experiments.read_seeds(path))
+    without = json.dumps({"table": figures})
+    for text in ("{", "[]", without, '{"meta": {}, "table": {"rl": {"velocity_error_all": {"mean": 1}}}}'):
         path.write_text(text)
         with pytest.raises(ValueError, match=r"sweep\.json: expected the sweep\.json of a sweep, got "):
             experiments.read_seeds(path)
