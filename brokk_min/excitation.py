@@ -30,14 +30,15 @@ def sine_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Arra
 def rich_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Array:
     """Sines over a wide band, steps, fast random holds, stop and go out of rests; small noise, (ticks,).
 
-    Steps last up to 10 s, so that joints also run through to their stops. Levels are drawn up to a third
+    Steps last up to 10 s, so that joints also run through to their stops, and so does stop and go, so that
+    most of its starts come out of long rests. Levels are drawn up to a third
     above the limit: cut there, a quarter are at the limit, as a policy's.
     """
     limit, idle = 4 / 3 * machine.pwm_limit / PWM_MAX, 5 * machine.ready_down_time
     parts: list[Array] = []
     while sum(map(len, parts)) < ticks:
         kind = rng.choice(["sine", "step", "holds", "go"], p=[0.25, 0.15, 0.25, 0.35])
-        length = int(rng.uniform(0.5, 10.0 if kind == "step" else 4.0) / machine.dt)
+        length = int(rng.uniform(0.5, 10.0 if kind in ("step", "go") else 4.0) / machine.dt)
         time = machine.dt * np.arange(length)
         amplitude = rng.uniform(machine.dead_zone, limit)
         if kind == "sine":
