@@ -178,6 +178,10 @@ def test_observation_by_hand():
     assert seen.dtype == np.float32
     np.testing.assert_allclose(seen[:3], 1.4 * 3**0.5 * np.array([1, -1 / 3, -0.5]), rtol=1e-5)
     assert seen[6] == pytest.approx(1.4 * (0.5 - 0.7) / (1.4 / 12**0.5), rel=1e-6)
+    noisy = task.observe(BROKK_170, told_history(), v_goal, lag, noise=0.1)  # of a standard deviation more
+    np.testing.assert_allclose(
+        (noisy - seen)[:8], [0, 0, 0, 0.14, 0.14, 0.14, 0.14, 0.1 * 13**-0.5], atol=1e-6
+    )
     spread, lags = 12**0.5, np.arange(13)
     q1, q3, q5 = (13**0.5 * seen[i : i + 39].reshape(3, 13) for i in (7, 46, 124))  # each weighs 13^-0.5
     np.testing.assert_allclose(q1[0], (1.5 + 0.01 * (lags - 12)) / (4.28 / spread), rtol=1e-5)
