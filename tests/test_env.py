@@ -348,8 +348,11 @@ def test_noise_is_uniform_within_five_percent_and_fresh_on_what_is_sensed(machin
 
 
 @pytest.mark.parametrize("shape", [(), (2, 3)])
-def test_a_look_takes_any_leading_axes(shape):
-    state = task.rest_state(BROKK_170, np.broadcast_to(POSE, (*shape, 5)), STILL, plant=False)
+def test_states_and_looks_take_any_leading_axes_and_whole_numbers(shape):
+    state = task.rest_state(BROKK_170, np.full((*shape, 5), 1), STILL, plant=False)
+    assert state.q.dtype == float and state.v_goal.shape == state.lag.shape == (*shape, 3)
+    assert state.ticks.shape == state.goal_ticks.shape == shape
+    assert state.ticks.dtype == state.goal_ticks.dtype == np.int64
     assert task.look(BROKK_170, TaskConfig(), state, np.random.default_rng(0)).shape == (*shape, 171)
 
 
