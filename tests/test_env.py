@@ -179,6 +179,10 @@ def test_observation_by_hand():
     assert seen.dtype == np.float32
     np.testing.assert_allclose(seen[:3], 1.4 * 3**0.5 * np.array([1, -1 / 3, -0.5]), rtol=1e-5)
     assert seen[6] == pytest.approx(1.4 * (0.5 - 0.7) / (1.4 / 12**0.5), rel=1e-6)
+    noisy = task.observe(BROKK_170, told_history(), v_goal, lag, noise=0.1)  # of a standard deviation more
+    np.testing.assert_allclose(
+        (noisy - seen)[:8], [0, 0, 0, 0.14, 0.14, 0.14, 0.14, 0.1 * 13**-0.5], atol=1e-6
+    )
     spread, lags = 12**0.5, np.arange(13)
     q1, q3, q5 = (13**0.5 * seen[i : i + 39].reshape(3, 13) for i in (7, 46, 124))  # each weighs 13^-0.5
     np.testing.assert_allclose(q1[0], (1.5 + 0.01 * (lags - 12)) / (4.28 / spread), rtol=1e-5)
@@ -344,6 +348,15 @@ def test_noise_is_uniform_within_five_percent_and_fresh_on_what_is_sensed(machin
     assert np.array_equal(task.look(machine, QUIET, state, rng), clean)
 
 
+@pytest.mark.parametrize("shape", [(), (2, 3)])
+def test_states_and_looks_take_any_leading_axes_and_whole_numbers(shape):
+    state = task.rest_state(BROKK_170, np.full((*shape, 5), 1), STILL, plant=False)
+    assert state.q.dtype == float and state.v_goal.shape == state.lag.shape == (*shape, 3)
+    assert state.ticks.shape == state.goal_ticks.shape == shape
+    assert state.ticks.dtype == state.goal_ticks.dtype == np.int64
+    assert task.look(BROKK_170, TaskConfig(), state, np.random.default_rng(0)).shape == (*shape, 171)
+
+
 def test_the_observation_of_an_environment_is_noisy_within_five_percent():
     env = TaskVectorEnv(300)
     seen, _ = env.reset(seed=0)
@@ -465,6 +478,7 @@ def test_redrawn_poses_are_off_the_ground_and_the_papers_are_not():
     for q in (free, raw):
         assert ((q >= low) & (q <= high)).all()
     assert np.array_equal(free[~buried], raw[~buried])  # only the bad ones are drawn again
+    assert len(np.unique(free, axis=0)) == 2000  # each for itself
     assert stats.kstest((raw[:, 0] + 2.14) / 4.28, "uniform").pvalue > 1e-3
 
 
@@ -525,9 +539,17 @@ def test_no_goal_asks_an_arm_close_to_the_ground_to_sink():
             changed = (state.v_goal != np.float32([[0.1, 0.0, -0.2]])).any()
             assert changed == near and (state.v_goal[0, 2] >= 0) == near
             assert not near or state.goal_ticks[0] == 100
-        state = task.rest_state(machine, pose, [[0.1, 0.0, 0.2]], plant=True)
-        state, _ = task.step(machine, config, None, state, np.zeros((1, 4)), rng)
-        np.testing.assert_array_equal(state.v_goal, np.float32([[0.1, 0.0, 0.2]]))
+        for upward in (0.0, 0.2):  # to move level or up is no sinking
+            state = task.rest_state(machine, pose, [[0.1, 0.0, upward]], plant=True)
+            state, _ = task.step(machine, config, None, state, np.zeros((1, 4)), rng)
+            np.testing.assert_array_equal(state.v_goal, np.float32([[0.1, 0.0, upward]]))
+
+
+def test_a_goal_holds_for_whole_ticks_and_at_least_one():
+    for seconds, ticks in ((0.0, 1), (0.06, 1), (0.12, 2), (0.13, 3), (0.5, 10)):
+        config = TaskConfig(hold_min_s=seconds, hold_max_s=seconds)
+        held = task.reset(BROKK_170, config, np.random.default_rng(0), 3, plant=False).goal_ticks
+        assert held.dtype == np.int64 and held.tolist() == [ticks] * 3
 
 
 def test_goals_are_redrawn_within_an_episode_and_rewards_are_for_the_old_goal():
@@ -765,6 +787,7 @@ def test_final_obs_is_the_end_of_the_old_episode(actuator):
         a, reward, terminated, truncated, info = short.step(action)
         b, wanted, *_, other = long.step(action)
         assert np.array_equal(reward, wanted)  # the last tick is paid like any other
+        assert np.array_equal(info["velocity_error"], other["velocity_error"])
         assert not terminated.any()
         assert truncated.all() == (tick == 20)
         assert ("final_obs" in info) == (tick == 20)
@@ -1037,6 +1060,8 @@ def test_a_rollout_on_nets_moves_by_them_and_reads_the_encoders_it_is_given():
         state = task.transition(machine, net, state, tape[t], shifted)
         assert np.array_equal(trace.q[t], state.q)
     assert np.abs(trace.q[-1] - start).max() > 0.01
+    short = task.rollout(machine, Recorder(tape), start, goals[:1], QUIET, rng, net, shifted)
+    assert all(np.array_equal(one, all_ticks[:1]) for one, all_ticks in zip(short, trace))
 
 
 def test_rollout_noise_reaches_the_controller_and_is_reproducible():

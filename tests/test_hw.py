@@ -574,6 +574,23 @@ def test_a_lost_joystick_is_no_release_of_the_switch() -> None:
     world.close()
 
 
+def test_the_status_by_hand() -> None:
+    """A straight level arm, 5 m from the slew axis, that slews at 0.1 rad/s."""
+    world = World(Push(*PUSH), Hand())
+    drive, no = world.drive, " ".join(["+nan"] * 3)
+    assert (
+        drive.status()
+        == f"waiting v wanted +0.00 +0.00 +0.00 is {no} q {no} +nan +nan late 0.0 ms, skipped 0"
+    )
+    drive.history = np.full((1, 5, 3, 13), 9.0)
+    drive.history[0, :, :2, -1] = np.transpose([[0, 0, 0, np.pi, 3 * np.pi / 4], [0.1, 0, 0, 0, 0]])
+    drive.lateness, drive.skipped = 0.5, 7
+    drive.wish = hw.Wish((0.1, -0.2, 0.25))
+    said = "waiting v wanted +0.10 -0.20 +0.25 is +0.00 +0.50 +0.00 q +0.00 +0.00 +0.00 +3.14 +2.36"
+    assert drive.status().replace("-0.00", "+0.00") == said + " late 500.0 ms, skipped 7"
+    world.close()
+
+
 def test_nodes_that_were_never_there_are_named() -> None:
     world = World(Push(*PUSH), Hand())
     world.drive.begin()
@@ -837,6 +854,23 @@ def test_a_recorded_log_replays_to_the_same_bytes(tmp_path: Path) -> None:
         hw.replay(BROKK_170, BASELINE, [f for f in frames if f.id != 0x210])
 
 
+def test_a_tape_by_hand() -> None:
+    read, wish = bus.Frame(1.1, 0x181, b"\x07"), hw.Wish((0.1, 0.0, 0.0), enable=True)
+    sync, noted = bus.Frame(1.0, 0x080, b"", True), bus.Frame(1.2, bus.WISH, wish.pack(), True, bus.OPERATOR)
+    last = bus.Frame(1.3, 0x182, b"\x08")
+    tape = hw.Tape([sync, read, noted, last])
+    assert tape.recv(0.1) is None and tape.wish(True, True) == wish  # SYNC is to be sent first
+    tape.send(0x080, b"")
+    assert tape.sent == [sync] and tape.recv(0.1) is read and tape.recv(0.1) is None
+    assert tape.note(b"") == 1.2 and tape.now() == 1.3 and tape.recv(0.1) is last
+    assert not tape.more and not tape.wrong and tape.recv(0.1) is None and tape.now() == 1.3
+    assert tape.wish(True, True) == hw.Wish(stop=True)
+    for found in (sync._replace(id=0x210), sync._replace(sent=False)):  # another was sent, or none
+        tape = hw.Tape([found, read])
+        tape.send(0x080, b"")
+        assert tape.wrong == f"log: expected 080 sent at 1.000000, got {found.id:03X}" and not tape.more
+
+
 def test_a_log_of_a_drive_reads_back_as_a_log_of_the_machine(tmp_path: Path) -> None:
     world = drive_logged(tmp_path / "run.log")
     log = hw.driven_log(BROKK_170, bus.read_frames(tmp_path / "run.log"))
@@ -915,10 +949,11 @@ def test_a_script_waits_presses_plays_and_ends() -> None:
     assert script(True, True) == hw.Wish((0.0, 0.2, 0.0), enable=True)
     assert script.done and script(True, True).stop
     faulted = hw.Script(BROKK_170, np.array([[0.1, 0, 0], [0, 0.2, 0]]))
-    faulted(False, True), faulted(True, True)
+    assert faulted(False, True).enable and faulted(True, True).enable  # it does not wait to press
     assert faulted(False, True) == hw.Wish(stop=True) and not faulted.done
     never = hw.Script(BROKK_170, np.zeros((1, 3)), patience_s=0.2)
     assert [never(False, False).stop for _ in range(5)] == [False] * 4 + [True]
+    assert not hw.Script(BROKK_170, np.array([[0.0, 0.0, 0.3]])).done  # no faster than allowed
     with pytest.raises(ValueError, match=r"command: expected at most 0.3 m/s, got 0.5 m/s"):
         hw.Script(BROKK_170, np.array([[0.3, 0.4, 0.0]]))
     with pytest.raises(ValueError, match="command"):
@@ -965,6 +1000,9 @@ def test_joystick_through_a_virtual_device() -> None:
     device.axis(0, 0.1)  # within the dead zone
     wish = stick(True, True)
     assert wish.enable and wish.v_goal == pytest.approx((0.3, 0.0, 0.0), abs=1e-4)
+    device.axis(1, -0.56)
+    assert stick(True, True).v_goal == pytest.approx((0.275 * 0.3, 0.0, 0.0), abs=1e-4)
+    device.axis(1, -1.0)
     device.axis(0, 1.0)
     device.axis(4, -0.56)
     x, y, z = stick(True, True).v_goal
@@ -979,11 +1017,32 @@ def test_joystick_through_a_virtual_device() -> None:
     again = Virtual()
     again.button(5, True)
     assert stick(False, True) == hw.Wish((0.0, 0.0, 0.0), enable=True)
-    with pytest.raises(ValueError, match=r"joystick: expected axes \[1, 0, 9\] and button 5, got 6 and 8"):
-        hw.Joystick(BROKK_170, axes=(1, 0, 9))
+    other = Virtual()
+    again.axis(1, -1.0)
+    assert stick(True, True).v_goal[0] > 0.299  # one more device changes nothing
+    with pytest.raises(ValueError, match=r"joystick: expected axes \[1, 0, 6\] and button 5, got 6 and 8"):
+        hw.Joystick(BROKK_170, axes=(1, 0, 6))
     with pytest.raises(ValueError, match="button 8"):
         hw.Joystick(BROKK_170, button=8)
+    other.unplug()
+    assert stick(True, True).alive
     again.unplug()
+    assert stick(True, True) == hw.Wish(alive=False)
+
+
+def test_a_joystick_needs_pygame_but_no_window(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("pygame")
+    wanted = {"PYGAME_HIDE_SUPPORT_PROMPT": "1", "SDL_VIDEODRIVER": "dummy"}
+    wanted["SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS"] = "1"
+    for name in wanted:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("pygame.joystick.get_count", lambda: 0)
+    with pytest.raises(ValueError, match=r"^joystick: expected one, got none$"):
+        hw.Joystick(BROKK_170)
+    assert {name: os.environ[name] for name in wanted} == wanted
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    with pytest.raises(ValueError, match=r"joystick: expected pygame \(extra brokk_min\[play\]\), got"):
+        hw.Joystick(BROKK_170)
 
 
 def test_jog_moves_one_joint_the_way_the_stick_points() -> None:
@@ -1020,12 +1079,12 @@ def test_signals_end_the_run_with_a_neutral_frame() -> None:
         sent: Out = []
         world.downward = lambda can_id, data, sent=sent: (sent.append((can_id, data)), [(can_id, data)])[1]
         world.drive.begin()
-        shown: list[str] = []
+        shown, at = list[str](), list[int]()
         hand.act = lambda w=world, n=number: os.kill(os.getpid(), n) if w.drive.ticks == 20 else None
         before = signal.getsignal(number)
-        world.drive.run(shown.append)
+        world.drive.run(lambda text: (shown.append(text), at.append(world.drive.ticks)))  # noqa: B023
         assert world.drive.ticks in (20, 21) and signal.getsignal(number) is before
-        assert len(shown) in (3, 4) and shown[-1].startswith("driving")
+        assert at[:3] == [5, 10, 15] and len(shown) in (3, 4) and shown[-1].startswith("driving")
         last = [data for can_id, data in sent if can_id == 0x210][-2:]
         assert any(last[0][:5]) and not any(last[1][:5]) and last[1][7] == 0
         world.close()
@@ -1035,8 +1094,12 @@ def test_an_error_of_the_program_itself_ends_it_neutral() -> None:
     world = World(Push(*PUSH), Hand())
     world.drive.begin()
     world.run(1.0)
+    told: Out = []
+    world.downward = lambda can_id, data: (told.append((can_id, data)), [(can_id, data)])[1]
     with pytest.raises(BrokenPipeError):
         world.drive.run(raises(BrokenPipeError("nobody reads")))
+    counter = int(world.drive.gate.counter)
+    assert told[-1] == (0x210, valve_frame([0] * 5, counter, 0).tobytes())  # a whole frame, that says so
     world.rest(0.01)
     assert not world.commands[1][-1].any()
     silent = World(Push(*PUSH), Hand())
