@@ -3,8 +3,9 @@
     python -m benchmarks.peers --actuator NET --gains GAINS [--seeds 0 1 2] [--learning-rates 3e-4 1e-3 3e-3]
 
 All train on the same Gymnasium vector environment with the paper's network; each has its own adapter below.
-Runs are interleaved, because machines drift. A policy's mean action is tried on other episodes now and then,
-off the clock, until it earns what the PID earns there.
+A policy's mean action is tried on other episodes now and then, off the clock, until it earns what the PID
+earns there. With the first seed every learner tries all learning rates and planned lengths (its schedules end
+with the plan), with the other seeds what was best then. Runs are interleaved, because machines drift.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import product, zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +49,8 @@ class Options:
     """One run each."""
     learning_rates: tuple[float, ...] = (3e-4, 1e-3, 3e-3)
     """All are tried; each learner is judged by its best."""
+    planned: tuple[int, ...] = (300_000, 1_000_000, 3_000_000)
+    """Steps after which schedules end; all are tried."""
     limit_s: float = 300.0
     """Longest run."""
     threads: int = 2
@@ -87,8 +91,8 @@ def earned(net: ActuatorNet, act: Act, quick: bool) -> float:
 # --- learners: after each update they yield the policy as it stands ---------------------------------
 
 
-def ours(env: TaskVectorEnv, rate: float, seed: int, threads: int) -> Iterator[Act]:
-    config = ppo.PPOConfig(num_envs=env.num_envs, learning_rate=rate, threads=threads)
+def ours(env: TaskVectorEnv, rate: float, planned: int, seed: int, threads: int) -> Iterator[Act]:
+    config = ppo.PPOConfig(num_envs=env.num_envs, learning_rate=rate, total_steps=planned, threads=threads)
     training = ppo.Training(env, config, seed)
     while True:
         training.update()
@@ -103,7 +107,7 @@ def torch_act(actor: Callable[[torch.Tensor], torch.Tensor]) -> Act:
     return act
 
 
-def cleanrl(env: TaskVectorEnv, rate: float, seed: int, threads: int) -> Iterator[Act]:
+def cleanrl(env: TaskVectorEnv, rate: float, planned: int, seed: int, threads: int) -> Iterator[Act]:
     """`ppo_continuous_action` in short, with the nets, batches and discount of ours.
 
     Better than the original in two ways, or it would not get there: a truncation goes on with the value of
@@ -113,8 +117,10 @@ def cleanrl(env: TaskVectorEnv, rate: float, seed: int, threads: int) -> Iterato
     agent = ppo.Agent(env.single_observation_space.shape[0], env.single_action_space.shape[0], -1.2)
     optimizer = torch.optim.Adam(agent.parameters(), lr=rate, eps=1e-5)
     seen = torch.from_numpy(env.reset(seed=seed)[0])
-    horizon, gamma = 32, 0.9
+    horizon, gamma, steps = 32, 0.9, 0
     while True:
+        optimizer.param_groups[0]["lr"] = rate * max(0.0, 1 - steps / planned)
+        steps += horizon * env.num_envs
         kept: dict[str, list[torch.Tensor]] = {
             key: [] for key in ("x", "a", "logp", "value", "reward", "end")
         }
@@ -151,7 +157,7 @@ def cleanrl(env: TaskVectorEnv, rate: float, seed: int, threads: int) -> Iterato
         yield torch_act(agent.actor)
 
 
-def sb3(env: TaskVectorEnv, rate: float, seed: int, threads: int) -> Iterator[Act]:
+def sb3(env: TaskVectorEnv, rate: float, planned: int, seed: int, threads: int) -> Iterator[Act]:
     from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import VecEnv
 
@@ -188,16 +194,22 @@ def sb3(env: TaskVectorEnv, rate: float, seed: int, threads: int) -> Iterator[Ac
 
     nets = {"net_arch": [256, 128, 64], "activation_fn": torch.nn.ELU, "log_std_init": -1.2}
     how = {"n_steps": 32, "batch_size": min(2048, 32 * env.num_envs), "n_epochs": 4, "gamma": 0.9}
+    steps = 0
+
+    def falling(_: float) -> float:  # each call of `learn` would begin the schedule anew
+        return rate * max(0.0, 1 - steps / planned)
+
     model = PPO(
-        "MlpPolicy", Adapter(), learning_rate=rate, policy_kwargs=nets, seed=seed, device="cpu", **how
+        "MlpPolicy", Adapter(), learning_rate=falling, policy_kwargs=nets, seed=seed, device="cpu", **how
     )
     torch.set_num_threads(threads)
     while True:
         model.learn(32 * env.num_envs, reset_num_timesteps=False)
+        steps += 32 * env.num_envs
         yield lambda x: model.predict(x, deterministic=True)[0]
 
 
-def rl_games(env: TaskVectorEnv, rate: float, seed: int, threads: int) -> Iterator[Act]:
+def rl_games(env: TaskVectorEnv, rate: float, planned: int, seed: int, threads: int) -> Iterator[Act]:
     from rl_games.common import env_configurations, vecenv
     from rl_games.torch_runner import Runner
 
@@ -267,55 +279,74 @@ def rl_games(env: TaskVectorEnv, rate: float, seed: int, threads: int) -> Iterat
 
 
 LEARNERS = {"ours": ours, "sb3": sb3, "cleanrl": cleanrl, "rl_games": rl_games}
+Setting = tuple[float, int]  # learning rate, planned steps
 
 
 def race(
-    name: str, net: ActuatorNet, rate: float, seed: int, target: float, options: Options
+    name: str, net: ActuatorNet, setting: Setting, seed: int, target: float, options: Options
 ) -> dict[str, Any]:
-    """One run: seconds of training until mean actions earn `target`, None past the limit."""
+    """One run: seconds of training until mean actions earn `target`, None past the limit or the plan."""
     torch.set_num_threads(options.threads)
     env, clock, updates, best = TaskVectorEnv(16 if options.quick else 256, net), 0.0, 0, -np.inf
+    rate, planned = setting
     tried, start = 0.0, time.perf_counter()
     with contextlib.redirect_stdout(io.StringIO()):  # rl_games talks
-        for act in LEARNERS[name](env, rate, seed, options.threads):
+        for act in LEARNERS[name](env, rate, planned, seed, options.threads):
             clock, updates = clock + time.perf_counter() - start, updates + 1
-            if options.quick or clock - tried > 2:  # s of training between two trials
+            over = updates * 32 * env.num_envs >= planned or (options.quick and updates == 2)
+            if over or options.quick or clock - tried > 2:  # s of training between two trials
                 tried, best = clock, max(best, earned(net, act, options.quick))
-            if best >= target or clock > options.limit_s or (options.quick and updates == 2):
+            if best >= target or over or clock > options.limit_s:
                 break
             start = time.perf_counter()
-    row = {"learner": name, "learning_rate": rate, "seed": seed, "best": best, "updates": updates}
-    return row | {"trained_s": clock, "seconds": clock if best >= target else None}
+    row = {"learner": name, "learning_rate": rate, "planned": planned, "seed": seed, "best": best}
+    return row | {"updates": updates, "trained_s": clock, "seconds": clock if best >= target else None}
+
+
+def settings_of(name: str, options: Options) -> list[Setting]:
+    """What a learner tries. rl_games follows the change of the policy and not a plan."""
+    planned = options.planned[-1:] if name == "rl_games" else options.planned
+    return [(rate, steps) for rate in options.learning_rates for steps in planned]
+
+
+def best_setting(rows: list[dict[str, Any]]) -> Setting:
+    """Of the runs of a learner with one seed: that of the fastest, or of the one that came closest."""
+    best = min(rows, key=lambda row: (row["seconds"] or np.inf, -row["best"]))
+    return best["learning_rate"], best["planned"]
 
 
 def main(options: Options) -> dict[str, Any]:
     if options.quick:
         options.seeds, options.learning_rates = options.seeds[:1], options.learning_rates[:1]
+        options.planned = options.planned[-1:]
     net = load_net(options.actuator) if options.actuator else random_net(np.random.default_rng(0))
     net = net.select([BROKK_170.names[i] for i in BROKK_170.driven])
     target = options.target if options.target is not None else earned(net, pid(net, options), options.quick)
     missing = [name for name in options.learners if name == "rl_games" and not importlib.util.find_spec(name)]
-    rows = []
-    for seed in options.seeds:
-        for rate in options.learning_rates:
-            for name in options.learners:
-                if name not in missing:
-                    rows.append(race(name, net, rate, seed, target, options))
-                    print(json.dumps(rows[-1]), flush=True)
-    fastest = {}
-    for name in sorted({row["learner"] for row in rows}):
-        times = [
-            [
-                row["seconds"] or np.inf
-                for row in rows
-                if (row["learner"], row["learning_rate"]) == (name, rate)
-            ]
-            for rate in options.learning_rates
-        ]
-        median = min(map(np.median, times))
-        fastest[name] = float(median) if np.isfinite(median) else None
-    result = {"target": target, "load": os.getloadavg(), "threads": options.threads}
-    result |= {"not_installed": missing, "median_s_at_best_rate": fastest, "runs": rows}
+    tried: dict[str, list[dict[str, Any]]] = {name: [] for name in options.learners if name not in missing}
+
+    def run(name: str, setting: Setting, seed: int) -> None:
+        tried[name].append(race(name, net, setting, seed, target, options))
+        print(json.dumps(tried[name][-1]), flush=True)
+
+    first, *others = options.seeds
+    for settings in zip_longest(*(settings_of(name, options) for name in tried)):
+        for name, setting in zip(tried, settings, strict=True):
+            if setting:
+                run(name, setting, first)
+    chosen = {name: best_setting(rows) for name, rows in tried.items()}
+    for seed, name in product(others, tried):
+        run(name, chosen[name], seed)
+    median = {}
+    for name, rows in tried.items():
+        seconds = [r["seconds"] for r in rows if (r["learning_rate"], r["planned"]) == chosen[name]]
+        median[name] = float(np.median([np.inf if s is None else s for s in seconds]))
+    result = {"target": target, "load": os.getloadavg(), "threads": options.threads, "not_installed": missing}
+    result |= {
+        "chosen": chosen,
+        "median_s": {name: s if np.isfinite(s) else None for name, s in median.items()},
+    }
+    result |= {"runs": [row for rows in tried.values() for row in rows]}
     print(json.dumps({key: result[key] for key in list(result)[:-1]}, indent=1))
     if options.json:
         options.json.write_text(json.dumps(result, indent=1) + "\n")

@@ -24,16 +24,26 @@ def test_each_learner_trains_on_the_environment(learner: str, tmp_path: Path) ->
     assert json.loads((tmp_path / "p.json").read_text())["runs"] == [row]
 
 
-def test_who_is_fastest_is_the_median_over_seeds_at_the_best_rate(monkeypatch: pytest.MonkeyPatch) -> None:
-    times = {(1e-3, 0): 9.0, (1e-3, 1): None, (1e-3, 2): 5.0, (1e-2, 0): 8.0, (1e-2, 1): 7.0, (1e-2, 2): 30.0}
+def test_settings_are_chosen_with_the_first_seed_and_judged_by_the_median(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    times = {(1e-3, 0): 9.0, (1e-3, 1): 4.0, (1e-3, 2): 5.0, (1e-2, 0): 8.0, (1e-2, 1): 7.0, (1e-2, 2): 30.0}
+    run: list[tuple[str, float, int]] = []
 
-    def race(name: str, net: object, rate: float, seed: int, *_: object) -> dict[str, object]:
+    def race(name: str, net: object, setting: peers.Setting, seed: int, *_: object) -> dict[str, object]:
+        rate, planned = setting
         seconds = times[rate, seed] if name == "ours" else None
-        return {"learner": name, "learning_rate": rate, "seed": seed, "seconds": seconds}
+        run.append((name, rate, seed))
+        row = {"learner": name, "learning_rate": rate, "planned": planned, "seed": seed}
+        return row | {"seconds": seconds, "best": 0.8 - rate}
 
     monkeypatch.setattr(peers, "race", race)
-    options = peers.Options(learners=("ours", "sb3"), learning_rates=(1e-3, 1e-2), target=0.9)
-    assert peers.main(options)["median_s_at_best_rate"] == {"ours": 8.0, "sb3": None}
+    options = peers.Options(learners=("ours", "sb3"), learning_rates=(1e-3, 1e-2), planned=(100,), target=0.9)
+    found = peers.main(options)
+    assert found["chosen"] == {"ours": (1e-2, 100), "sb3": (1e-3, 100)}
+    assert found["median_s"] == {"ours": 8.0, "sb3": None}
+    assert run[:4] == [("ours", 1e-3, 0), ("sb3", 1e-3, 0), ("ours", 1e-2, 0), ("sb3", 1e-2, 0)]
+    assert sorted(run[4:]) == [(n, r, seed) for n, r in (("ours", 1e-2), ("sb3", 1e-3)) for seed in (1, 2)]
 
 
 def test_limits_are_measured(tmp_path: Path) -> None:
