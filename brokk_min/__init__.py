@@ -16,6 +16,11 @@ Glossary:
     driven      joints that the controller moves; the others are locked, set by the operator
 """
 
+import os
+
+# Before NumPy is imported: its BLAS threads, waiting for work, would take the cores from torch's.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 from brokk_min.machine import BROKK_170, Joint, Machine
 
 __version__ = "0.1.0"

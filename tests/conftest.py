@@ -6,6 +6,8 @@ import os
 
 from hypothesis import HealthCheck, settings
 
+import brokk_min  # noqa: F401, before NumPy: it settles how many threads that takes
+
 SLOW = [HealthCheck.too_slow, HealthCheck.data_too_large]
 
 settings.register_profile("dev", max_examples=25, deadline=None, suppress_health_check=SLOW)
