@@ -561,6 +561,26 @@ def test_a_delay_of_a_whole_tick_is_found_when_it_begins_and_looks_fresh_after_i
     world.close()
 
 
+def test_nodes_that_fell_back_are_started_once_the_switch_is_released() -> None:
+    hand, sent = Hand(), list[tuple[int, bytes]]()
+    world = World(Push(*PUSH), hand)
+    world.downward = lambda can_id, data: (sent.append((can_id, data)), [(can_id, data)])[1]
+    world.drive.begin()
+    world.run(0.6)
+    sent.clear()
+    world.simulated.nmt[4] = 127
+    world.run(0.4)
+    assert world.drive.reason == "fault: q4: not operational" and world.drive.gate.wrong
+    assert 0x000 not in dict(sent) and {data for can_id, data in sent if can_id == 0x080} == {b""}
+    hand.enable = False
+    world.run(0.2)
+    assert {data for can_id, data in sent if can_id == 0x000} == {b"\x01\x00"} and not world.drive.gate.wrong
+    sent.clear()
+    world.run(0.2)
+    assert 0x000 not in dict(sent) and world.drive.status().startswith("ready")
+    world.close()
+
+
 def test_a_lost_joystick_is_no_release_of_the_switch() -> None:
     hand = Hand()
     world = World(Push(*PUSH), hand)
@@ -705,6 +725,39 @@ def test_a_wait_sleeps_only_after_the_time_it_is_told_to_be_awake(
     assert line.recv(0.020, awake) is None
     assert [wait for wait in silent.waits if wait] == pytest.approx(slept)
     assert 0.020 <= silent.t < 0.0225
+
+
+def test_the_loop_sleeps_but_not_just_before_sync_nor_while_encoders_answer() -> None:
+    """A wait may sleep from `awake` after its begin to its end."""
+    world, waits = World(Push(*PUSH), Hand()), list[tuple[float, float]]()
+    world.drive.begin()
+    recv = world.line.recv
+
+    def wait(timeout: float, awake: float = 0.0) -> bus.Frame | None:
+        waits.append((world.t + awake, world.t + timeout))
+        return recv(timeout, awake)
+
+    world.line.recv = wait  # type: ignore[method-assign]
+    world.run(1.0)
+    assert world.drive.reason == "" and world.drive.gate.driving
+    asleep = np.array([w for w in waits if w[1] > w[0] + 1e-5])
+    for sync in world.syncs:
+        assert ((asleep[:, 1] < sync - hw.AWAKE + 1e-5) | (asleep[:, 0] > sync - 1e-5)).all()
+        for_encoders = asleep[np.abs(asleep[:, 1] - sync - hw.WINDOW) < 1e-3, 0]
+        assert len(for_encoders) and (for_encoders > sync + hw.AWAKE - 1e-5).all()
+    before = [max(asleep[asleep[:, 0] < sync, 1]) for sync in world.syncs[1:]]
+    np.testing.assert_allclose(np.array(world.syncs[1:]) - before, hw.AWAKE, atol=1e-5)
+    world.close()
+
+
+def test_a_small_step_back_of_the_clock_begins_a_new_grid() -> None:
+    world = World(Push(0, 0, 0, 0, 0), Hand())
+    world.drive.begin()
+    world.run(0.5)
+    world.offset = -1.0
+    world.run(1.0)
+    assert np.diff(world.syncs)[-15:] == pytest.approx([0.05] * 15, abs=5e-4)
+    world.close()
 
 
 def test_a_rehearsal_comes_before_sync_and_leaves_no_trace() -> None:
@@ -893,6 +946,26 @@ def test_a_log_of_a_drive_reads_back_as_a_log_of_the_machine(tmp_path: Path) -> 
         np.testing.assert_allclose(m[inside], recording.u * 127, atol=1e-6)  # the command that came next
     with pytest.raises(ValueError, match="expected more than 14 ticks of driving in a row, got none"):
         hw.driven_log(BROKK_170, list(bus.read_frames(tmp_path / "run.log"))[:200])
+
+
+def test_a_log_by_hand_gives_commands_and_angles_tick_by_tick() -> None:
+    """Ticks are missing; a foreign frame and a cut one in each change nothing; 14 ticks are too few."""
+    machine, frames = replace(BROKK_170, rate=10.0), list[bus.Frame]()
+    parts = range(15), range(16, 36), range(37, 51)
+    for k in (k for part in parts for k in part):
+        t = 100 + k / 10
+        frames.append(bus.Frame(t, 0x080, b"", True))
+        frames += [bus.Frame(t, 0x180 + node, struct.pack("<I", 100 * node + k)) for node in range(1, 6)]
+        frames.append(bus.Frame(t, 0x555, b"\x01" * 8))
+        frames.append(bus.Frame(t, 0x210, valve_frame([80, 0, -80, 1, 0], k, 1).tobytes(), True))
+        frames.append(bus.Frame(t, 0x210, b"\x01" * 7, True))
+    log = hw.driven_log(machine, frames)
+    assert log.rate == 10 and [len(r.q) for r in log.recordings] == [15, 20]
+    for recording, ticks in zip(log.recordings, parts):
+        counts = 100 * np.arange(1, 6) + np.array(ticks)[:, None]
+        np.testing.assert_allclose(recording.q, counts * machine.encoder_step, atol=1e-12)
+        np.testing.assert_allclose(recording.q_dot[4:], 10 * machine.encoder_step, atol=1e-12)
+        np.testing.assert_allclose(recording.u * 127, len(ticks) * [[80, 0, -80, 1, 0]], atol=1e-9)
 
 
 def test_a_gap_in_a_log_starts_a_new_recording(tmp_path: Path) -> None:
