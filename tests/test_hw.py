@@ -23,7 +23,7 @@ from helpers_bus import START, Hand, Out, Push, World
 from brokk_min import bus, hw
 from brokk_min.env import TaskConfig, measured, observation_scale, reward, rollout, to_command
 from brokk_min.experiments import axis_sequences
-from brokk_min.gate import encoder_raw, valve_frame
+from brokk_min.gate import encoder_raw, fault_name, valve_frame
 from brokk_min.jacobian import JacobianController, join_gains, manipulability_threshold
 from brokk_min.kinematics import joint_rates, tool_state
 from brokk_min.logs import read_log, write_log
@@ -91,6 +91,7 @@ class Listener:
         self.told: list[np.ndarray] = []
 
     def start(self, num: int) -> None:
+        assert num == 1
         self.told.clear()
 
     def __call__(self, observation: np.ndarray, memory: None) -> tuple[np.ndarray, None]:
@@ -134,6 +135,10 @@ def test_it_is_silent_until_armed_and_moves_a_tick_later() -> None:
     frames = [data for can_id, data in sent if can_id == 0x210]
     assert [list(f[:5]) for f in frames] == [[0] * 5, [40, 0, 40, 40, 40]]
     assert [f[7] for f in frames] == [1, 1] and frames[1][5] == frames[0][5] + 1
+    assert world.drive.history is not None  # what the controller is told of its commands
+    np.testing.assert_allclose(
+        world.drive.history[0, :, 2, -2:].T * 127, [[0] * 5, [40, 0, 40, 40, 40]], atol=1e-5
+    )
     world.close()
 
 
@@ -503,6 +508,14 @@ def test_a_fault_is_left_by_a_new_edge_only() -> None:
     assert world.drive.gate.driving and world.drive.reason == ""
     assert world.drive.status().startswith("driving v wanted +0.10 +0.00 +0.00 is ")
     assert world.commands[1][-1].tolist() == list(PUSH)
+    hand.act, hand.enable = raises(OSError("gone")), False
+    world.run(0.1)
+    hand.act = lambda: None
+    world.run(0.1)
+    assert world.drive.reason == "fault: error (OSError: gone)"
+    hand.enable = True
+    world.run(0.2)
+    assert world.drive.gate.driving and world.drive.reason == ""
     world.close()
 
 
@@ -794,7 +807,15 @@ def test_begin_sets_up_the_encoders_and_starts_the_nodes() -> None:
     world = World(Push(*PUSH), Hand())
     world.simulated.objects[3, 0x1017, 0] = 0
     world.simulated.objects[3, 0x1800, 2] = 254
+    asked: Out = []
+    world.downward = lambda can_id, data: (asked.append((can_id, data)), [(can_id, data)])[1]
     world.drive.begin()
+    assert [data.hex(" ") for can_id, data in asked if can_id == 0x603] == [
+        "40 01 65 00 00 00 00 00",  # read the resolution
+        "2b 17 10 00 32 00 00 00",  # two bytes: a heartbeat every 50 ms
+        "2f 00 18 02 01 00 00 00",  # one byte: a position at every SYNC
+    ]
+    assert asked[-1] == (0x000, b"\x01\x00")
     world.rest(0.01)
     assert world.simulated.objects[3, 0x1017, 0] == 50 and world.simulated.objects[3, 0x1800, 2] == 1
     assert set(world.simulated.nmt.values()) == {5}
@@ -1173,6 +1194,7 @@ def test_an_error_of_the_program_itself_ends_it_neutral() -> None:
         world.drive.run(raises(BrokenPipeError("nobody reads")))
     counter = int(world.drive.gate.counter)
     assert told[-1] == (0x210, valve_frame([0] * 5, counter, 0).tobytes())  # a whole frame, that says so
+    assert fault_name(BROKK_170, int(world.drive.gate.fault)) == "error"
     world.rest(0.01)
     assert not world.commands[1][-1].any()
     silent = World(Push(*PUSH), Hand())
