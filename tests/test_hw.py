@@ -23,7 +23,7 @@ from helpers_bus import START, Hand, Out, Push, World
 from brokk_min import bus, hw
 from brokk_min.env import TaskConfig, measured, observation_scale, reward, rollout, to_command
 from brokk_min.experiments import axis_sequences
-from brokk_min.gate import encoder_raw, valve_frame
+from brokk_min.gate import encoder_raw, fault_name, valve_frame
 from brokk_min.jacobian import JacobianController, join_gains, manipulability_threshold
 from brokk_min.kinematics import joint_rates, tool_state
 from brokk_min.logs import read_log, write_log
@@ -91,6 +91,7 @@ class Listener:
         self.told: list[np.ndarray] = []
 
     def start(self, num: int) -> None:
+        assert num == 1
         self.told.clear()
 
     def __call__(self, observation: np.ndarray, memory: None) -> tuple[np.ndarray, None]:
@@ -134,6 +135,10 @@ def test_it_is_silent_until_armed_and_moves_a_tick_later() -> None:
     frames = [data for can_id, data in sent if can_id == 0x210]
     assert [list(f[:5]) for f in frames] == [[0] * 5, [40, 0, 40, 40, 40]]
     assert [f[7] for f in frames] == [1, 1] and frames[1][5] == frames[0][5] + 1
+    assert world.drive.history is not None  # what the controller is told of its commands
+    np.testing.assert_allclose(
+        world.drive.history[0, :, 2, -2:].T * 127, [[0] * 5, [40, 0, 40, 40, 40]], atol=1e-5
+    )
     world.close()
 
 
@@ -503,6 +508,14 @@ def test_a_fault_is_left_by_a_new_edge_only() -> None:
     assert world.drive.gate.driving and world.drive.reason == ""
     assert world.drive.status().startswith("driving v wanted +0.10 +0.00 +0.00 is ")
     assert world.commands[1][-1].tolist() == list(PUSH)
+    hand.act, hand.enable = raises(OSError("gone")), False
+    world.run(0.1)
+    hand.act = lambda: None
+    world.run(0.1)
+    assert world.drive.reason == "fault: error (OSError: gone)"
+    hand.enable = True
+    world.run(0.2)
+    assert world.drive.gate.driving and world.drive.reason == ""
     world.close()
 
 
@@ -558,6 +571,26 @@ def test_a_delay_of_a_whole_tick_is_found_when_it_begins_and_looks_fresh_after_i
     hand.enable = None
     world.run(0.2)
     assert world.drive.gate.driving  # the limit of what can be known, told in docs/hardware.md
+    world.close()
+
+
+def test_nodes_that_fell_back_are_started_once_the_switch_is_released() -> None:
+    hand, sent = Hand(), list[tuple[int, bytes]]()
+    world = World(Push(*PUSH), hand)
+    world.downward = lambda can_id, data: (sent.append((can_id, data)), [(can_id, data)])[1]
+    world.drive.begin()
+    world.run(0.6)
+    sent.clear()
+    world.simulated.nmt[4] = 127
+    world.run(0.4)
+    assert world.drive.reason == "fault: q4: not operational" and world.drive.gate.wrong
+    assert 0x000 not in dict(sent) and {data for can_id, data in sent if can_id == 0x080} == {b""}
+    hand.enable = False
+    world.run(0.2)
+    assert {data for can_id, data in sent if can_id == 0x000} == {b"\x01\x00"} and not world.drive.gate.wrong
+    sent.clear()
+    world.run(0.2)
+    assert 0x000 not in dict(sent) and world.drive.status().startswith("ready")
     world.close()
 
 
@@ -707,6 +740,39 @@ def test_a_wait_sleeps_only_after_the_time_it_is_told_to_be_awake(
     assert 0.020 <= silent.t < 0.0225
 
 
+def test_the_loop_sleeps_but_not_just_before_sync_nor_while_encoders_answer() -> None:
+    """A wait may sleep from `awake` after its begin to its end."""
+    world, waits = World(Push(*PUSH), Hand()), list[tuple[float, float]]()
+    world.drive.begin()
+    recv = world.line.recv
+
+    def wait(timeout: float, awake: float = 0.0) -> bus.Frame | None:
+        waits.append((world.t + awake, world.t + timeout))
+        return recv(timeout, awake)
+
+    world.line.recv = wait  # type: ignore[method-assign]
+    world.run(1.0)
+    assert world.drive.reason == "" and world.drive.gate.driving
+    asleep = np.array([w for w in waits if w[1] > w[0] + 1e-5])
+    for sync in world.syncs:
+        assert ((asleep[:, 1] < sync - hw.AWAKE + 1e-5) | (asleep[:, 0] > sync - 1e-5)).all()
+        for_encoders = asleep[np.abs(asleep[:, 1] - sync - hw.WINDOW) < 1e-3, 0]
+        assert len(for_encoders) and (for_encoders > sync + hw.AWAKE - 1e-5).all()
+    before = [max(asleep[asleep[:, 0] < sync, 1]) for sync in world.syncs[1:]]
+    np.testing.assert_allclose(np.array(world.syncs[1:]) - before, hw.AWAKE, atol=1e-5)
+    world.close()
+
+
+def test_a_small_step_back_of_the_clock_begins_a_new_grid() -> None:
+    world = World(Push(0, 0, 0, 0, 0), Hand())
+    world.drive.begin()
+    world.run(0.5)
+    world.offset = -1.0
+    world.run(1.0)
+    assert np.diff(world.syncs)[-15:] == pytest.approx([0.05] * 15, abs=5e-4)
+    world.close()
+
+
 def test_a_rehearsal_comes_before_sync_and_leaves_no_trace() -> None:
     push = Push(*PUSH)
     world = World(push, Hand())
@@ -741,7 +807,15 @@ def test_begin_sets_up_the_encoders_and_starts_the_nodes() -> None:
     world = World(Push(*PUSH), Hand())
     world.simulated.objects[3, 0x1017, 0] = 0
     world.simulated.objects[3, 0x1800, 2] = 254
+    asked: Out = []
+    world.downward = lambda can_id, data: (asked.append((can_id, data)), [(can_id, data)])[1]
     world.drive.begin()
+    assert [data.hex(" ") for can_id, data in asked if can_id == 0x603] == [
+        "40 01 65 00 00 00 00 00",  # read the resolution
+        "2b 17 10 00 32 00 00 00",  # two bytes: a heartbeat every 50 ms
+        "2f 00 18 02 01 00 00 00",  # one byte: a position at every SYNC
+    ]
+    assert asked[-1] == (0x000, b"\x01\x00")
     world.rest(0.01)
     assert world.simulated.objects[3, 0x1017, 0] == 50 and world.simulated.objects[3, 0x1800, 2] == 1
     assert set(world.simulated.nmt.values()) == {5}
@@ -893,6 +967,26 @@ def test_a_log_of_a_drive_reads_back_as_a_log_of_the_machine(tmp_path: Path) -> 
         np.testing.assert_allclose(m[inside], recording.u * 127, atol=1e-6)  # the command that came next
     with pytest.raises(ValueError, match="expected more than 14 ticks of driving in a row, got none"):
         hw.driven_log(BROKK_170, list(bus.read_frames(tmp_path / "run.log"))[:200])
+
+
+def test_a_log_by_hand_gives_commands_and_angles_tick_by_tick() -> None:
+    """Ticks are missing; a foreign frame and a cut one in each change nothing; 14 ticks are too few."""
+    machine, frames = replace(BROKK_170, rate=10.0), list[bus.Frame]()
+    parts = range(15), range(16, 36), range(37, 51)
+    for k in (k for part in parts for k in part):
+        t = 100 + k / 10
+        frames.append(bus.Frame(t, 0x080, b"", True))
+        frames += [bus.Frame(t, 0x180 + node, struct.pack("<I", 100 * node + k)) for node in range(1, 6)]
+        frames.append(bus.Frame(t, 0x555, b"\x01" * 8))
+        frames.append(bus.Frame(t, 0x210, valve_frame([80, 0, -80, 1, 0], k, 1).tobytes(), True))
+        frames.append(bus.Frame(t, 0x210, b"\x01" * 7, True))
+    log = hw.driven_log(machine, frames)
+    assert log.rate == 10 and [len(r.q) for r in log.recordings] == [15, 20]
+    for recording, ticks in zip(log.recordings, parts):
+        counts = 100 * np.arange(1, 6) + np.array(ticks)[:, None]
+        np.testing.assert_allclose(recording.q, counts * machine.encoder_step, atol=1e-12)
+        np.testing.assert_allclose(recording.q_dot[4:], 10 * machine.encoder_step, atol=1e-12)
+        np.testing.assert_allclose(recording.u * 127, len(ticks) * [[80, 0, -80, 1, 0]], atol=1e-9)
 
 
 def test_a_gap_in_a_log_starts_a_new_recording(tmp_path: Path) -> None:
@@ -1100,6 +1194,7 @@ def test_an_error_of_the_program_itself_ends_it_neutral() -> None:
         world.drive.run(raises(BrokenPipeError("nobody reads")))
     counter = int(world.drive.gate.counter)
     assert told[-1] == (0x210, valve_frame([0] * 5, counter, 0).tobytes())  # a whole frame, that says so
+    assert fault_name(BROKK_170, int(world.drive.gate.fault)) == "error"
     world.rest(0.01)
     assert not world.commands[1][-1].any()
     silent = World(Push(*PUSH), Hand())
