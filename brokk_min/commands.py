@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 import tyro
 
-from brokk_min import experiments, figures, preliminary
+from brokk_min import chain, experiments, figures, preliminary
 from brokk_min.actuator import load_net, save_net
 from brokk_min.env import Controller, TaskConfig, fitting_nets
 from brokk_min.excitation import collect
@@ -231,7 +231,7 @@ class Reproduce(Command):
     def run(self) -> None:
         """Run the chain and print the means."""
         effort = experiments.QUICK if self.quick else experiments.Effort()
-        results = experiments.reproduce(check(self), self.out, effort, self.seed, self.sweep)
+        results = chain.reproduce(check(self), self.out, effort, self.seed, self.sweep)
         for name, rows in results["task_space"]["summary"].items():
             errors = ", ".join(f"{s} {row['velocity_error_mean']:.4f}" for s, row in rows.items())
             print(f"{name:20} mean velocity error [m/s]: {errors}")

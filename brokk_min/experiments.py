@@ -1,4 +1,4 @@
-"""The paper's experiment as numbers, and the whole chain.
+"""The paper's experiment as numbers: baselines and their tuning, the comparison, the bound, robustness.
 
 `task_space` runs every controller on the same starts and velocity sequences on the same machine.
 """
@@ -6,10 +6,8 @@
 from __future__ import annotations
 
 import json
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -18,24 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from brokk_min import (
-    __version__,
-    actuator,
-    claims,
-    excitation,
-    figures,
-    fitting,
-    jacobian,
-    kinematics,
-    logs,
-    preliminary,
-    report,
-    scores,
-)
-from brokk_min.env import Controller, Encoder, TaskConfig, Trace, rollout
+from brokk_min import __version__, actuator, claims, fitting, jacobian, kinematics, logs
+from brokk_min.env import Controller, TaskConfig, Trace, rollout
 from brokk_min.figures import Traces
 from brokk_min.jacobian import JacobianController
-from brokk_min.machine import Machine, read_encoder
+from brokk_min.machine import Machine
 from brokk_min.metrics import (
     Run,
     by_start,
@@ -48,17 +33,16 @@ from brokk_min.metrics import (
     summary,
 )
 from brokk_min.mpc import PerfectModel
-from brokk_min.policy import Policy, PolicyController, save_policy
 from brokk_min.sequences import (
     Commands,
     axis_sequences,
-    held_rows,
     least_motion,
     scored_starts,
     start_kinds,
     task_sequences,
     tuning_goals,
 )
+from brokk_min.variations import Sensor, exact, supply_demand, variations
 
 Array = NDArray[np.floating[Any]]
 Net = actuator.ActuatorNet
@@ -191,13 +175,6 @@ def seeds_of(machine: Machine, net: Net, sweep: Mapping[str, Any]) -> dict[str, 
 
 # --- the comparison -----------------------------------------------------------------------------------
 
-Sensor = Callable[[np.random.Generator], Encoder]  # a fresh encoder for each rollout
-
-
-def exact(rng: np.random.Generator) -> Encoder:
-    """Encoders as they are: whole counts."""
-    return read_encoder
-
 
 def task_space(
     machine: Machine,
@@ -241,60 +218,6 @@ def _rows(label: Mapping[str, Any], kinds: Sequence[str], found: Mapping[str, Ar
     plain = {key: [float(v) if np.isfinite(v) else None for v in values] for key, values in found.items()}
     rows = ({key: values[j] for key, values in plain.items()} for j in range(len(kinds)))
     return [{**label, "start": j, "kind": kinds[j]} | row for j, row in enumerate(rows)]
-
-
-def noisy(rng: np.random.Generator) -> Encoder:
-    """Encoders with normal noise of one count."""
-    return lambda machine, q: read_encoder(machine, q + machine.encoder_step * rng.standard_normal(q.shape))
-
-
-def lossy(rng: np.random.Generator) -> Encoder:
-    """Encoders of which one sample in 20, of all joints of a machine, is lost: the last one stands again."""
-    last: list[Array] = []
-
-    def read(machine: Machine, q: Array) -> Array:
-        lost = rng.random((*q.shape[:-1], 1)) < 0.05 * len(last)
-        last[:] = [np.where(lost, last[0] if last else q, read_encoder(machine, q))]
-        return last[0]
-
-    return read
-
-
-def variations(machine: Machine) -> dict[str, tuple[Machine, Sensor]]:
-    """The machine other than its controllers know it; all figures assumed."""
-
-    def valves(up: float, down: float) -> Machine:
-        speeds = [(up * j.speed_positive, down * j.speed_negative) for j in machine.joints]
-        joints = zip(machine.joints, speeds, strict=True)
-        faster = (replace(j, speed_positive=a, speed_negative=b) for j, (a, b) in joints)
-        return replace(machine, joints=tuple(faster))
-
-    return {
-        "nominal": (machine, exact),
-        "supply flow -20 %": (replace(machine, pump_flow=0.8 * machine.pump_flow), exact),
-        "supply flow -70 %": (replace(machine, pump_flow=0.3 * machine.pump_flow), exact),
-        "valve gain -20 %": (valves(0.8, 0.8), exact),
-        "valve gain +20 %": (valves(1.2, 1.2), exact),
-        "up -15 %, down +15 %": (valves(0.85, 1.15), exact),
-        "dead zone 5 %": (replace(machine, dead_zone=0.05), exact),
-        "dead zone 10 %": (replace(machine, dead_zone=0.10), exact),
-        "delay +25 ms": (replace(machine, delay=machine.delay + 0.025), exact),
-        "delay +50 ms": (replace(machine, delay=machine.delay + 0.050), exact),
-        "encoder noise of a count": (machine, noisy),
-        "one sample in 20 lost": (machine, lossy),
-    }
-
-
-def supply_demand(machine: Machine, u: Array) -> Array:
-    """Flow that commands (..., n) ask of the pump once spools follow, as a share of its own, (...).
-
-    Paper: Sec. 4.2
-    """
-    opening = jacobian.valve_opening(machine, u)
-    fastest = (machine.column(name) for name in ("speed_positive", "speed_negative"))
-    flow = np.abs(machine.column("cylinder_area") * np.where(opening > 0, *fastest) * opening)
-    share: Array = flow.sum(axis=-1) / machine.pump_flow
-    return share
 
 
 def robustness(
@@ -466,137 +389,6 @@ def write_json(path: Path, value: Any) -> None:
     with logs.whole_file(path, "w") as file:
         json.dump(value, file, indent=1, allow_nan=False)
         file.write("\n")
-
-
-# --- the whole chain --------------------------------------------------------------------------------
-
-
-def reproduce(
-    machine: Machine, out: Path, effort: Effort, seed: int, sweep: Path | None = None
-) -> dict[str, Any]:
-    """Logs, nets, policy, baselines, comparison, `results.json` and `report.html` in the folder `out`.
-
-    `results.json` holds no clock: the same seed gives the same file on the same machine. The figures of
-    training seeds in the file `sweep`, which `sweep.sweep` wrote, join the report.
-    """
-    from brokk_min.ppo import PPOConfig, train  # torch, only where something is trained
-
-    seeds = read_seeds(sweep) if sweep else {}
-    out.mkdir(parents=True, exist_ok=True)
-    clock, stage = stages(6)
-    with stage("record"):
-        log, test = record(machine, out, effort, seed)
-    with stage("fit"):
-        net, paper = fitted(machine, out, log, test, effort, seed)
-        driven = net.select([machine.names[i] for i in machine.driven])
-        over_seeds = seeds_of(machine, driven, seeds) if seeds else {}
-    with stage("train"):
-        learner = PPOConfig(total_steps=effort.train_steps)
-        policy = train(machine, driven, TaskConfig(), learner, seed, out / "policy.npz", resume=True)
-    with stage("tune"):
-        tuned, how = tuned_baselines(machine, driven, effort, seed)
-    with stage("evaluate"):
-        rl = PolicyController(machine, policy)
-        measured, traces = measure(machine, net, test, rl, tuned, effort, seed)
-        results = {
-            "meta": meta(machine, seed) | tuned_for(machine, driven) | {"effort": asdict(effort)},
-            "paper_recipe": paper,
-            **measured,
-            "gains": plain_gains(tuned),
-            "tuning": how,
-            "training_seeds": over_seeds,
-        }
-    with stage("draw"):
-        write_json(out / "results.json", results)
-        write_gains(out / "gains.json", tuned, results["meta"])
-        save_policy(out / "policy.npz", told(policy, results, seed))
-        parts = report.net_parts(machine, net, test, results, seed, out / "policy.npz.csv", clock["train"])
-        parts = [report.found(results), *parts, *report.task_parts(machine, results, traces)]
-        figures.write_report(out / "report.html", parts, clock)
-    write_json(out / "timing.json", clock)
-    return results
-
-
-def stages(total: int) -> tuple[dict[str, float], Callable[[str], AbstractContextManager[None]]]:
-    """Seconds by stage, filled in as `total` stages end, and what each stage is to run in."""
-    clock: dict[str, float] = {}
-    bar = tqdm(total=total, desc="stages done", unit="stage", position=1, disable=None)
-
-    @contextmanager
-    def stage(name: str) -> Iterator[None]:
-        begun = time.perf_counter()
-        yield
-        clock[name] = time.perf_counter() - begun
-        bar.set_postfix_str(name)
-        bar.update()
-        if len(clock) == total:
-            bar.close()
-
-    return clock, stage
-
-
-def fitted(
-    machine: Machine, out: Path, log: logs.Log, test: logs.Log, effort: Effort, seed: int
-) -> tuple[Net, dict[str, Any]]:
-    """Nets of all joints, written to `net.npz`, and how those by the paper's recipe fare, for JSON."""
-    config = fitting.FitConfig(steps=effort.fit_steps, history=machine.history)
-    net = fitting.fit(log, config, seed, machine.velocity_samples, machine.name)
-    actuator.save_net(out / "net.npz", net)
-    half = replace(config, steps=effort.fit_steps // 2)  # for time
-    return net, preliminary.paper_recipe(machine, test, effort.hours, half, seed)
-
-
-def measure(
-    machine: Machine,
-    net: Net,
-    test: logs.Log,
-    rl: PolicyController,
-    tuned: Mapping[str, JacobianController],
-    effort: Effort,
-    seed: int,
-) -> tuple[dict[str, Any], dict[str, Traces]]:
-    """All that is measured of nets, policy and baselines: `results.json`, and traces of `comparison`."""
-    compared, traces = comparison(machine, {"rl": rl, **tuned}, effort, seed)
-    compared["task_space"]["rl_on_nets"] = on_nets(machine, rl, compared, seed)
-    driven = scores.score(net, driven_log(machine, traces["all"], "rl"))
-    before, tuning = preliminary.run(machine, net, seed), tuning_goals(machine, *tuning_set(effort, seed))
-    return {
-        "actuator": {"test": scores.score(net, test), "driven_by_policy": driven},
-        "preliminary": before,
-        "net_claims": claims.net_claims(before),
-        **compared,
-        "tuning_runs": tuning_runs(machine, *tuning),
-    }, traces
-
-
-def tuning_runs(machine: Machine, starts: Array, goals: Array) -> list[dict[str, Any]]:
-    """Each run that the baselines were tuned on, for JSON: "start" [rad] and "goals", see `held_rows`."""
-    runs = zip(starts, goals.swapaxes(0, 1), strict=True)
-    return [{"start": s.tolist(), "goals": held_rows(machine, run).tolist()} for s, run in runs]
-
-
-def record(machine: Machine, out: Path, effort: Effort, seed: int) -> list[logs.Log]:
-    """Logs to fit nets to and to score them on, written and read back as anybody's."""
-    files, rng = (out / "log.npz", out / "log_test.npz"), np.random.default_rng
-    logs.write_log(files[0], excitation.collect(machine, effort.hours, "rich", rng(seed)))
-    logs.write_log(files[1], excitation.task_log(machine, 20, 40.0, rng(seed + 1)))
-    return [logs.read_log([file], machine.velocity_samples, rate=machine.rate) for file in files]
-
-
-def on_nets(
-    machine: Machine, rl: PolicyController, compared: Mapping[str, Any], seed: int
-) -> dict[str, dict[str, float | None]]:
-    """`summary` of the policy on its own nets, along x, y and z from the workspace starts."""
-    starts = np.array(compared["starts"])[np.array(compared["start_kinds"]) == "workspace"]
-    runs, _ = task_space(machine, {"rl": rl}, axis_sequences(machine), starts, seed, rl.policy.net)
-    return summary(runs)["rl"]
-
-
-def told(policy: Policy, results: Mapping[str, Any], seed: int) -> Policy:
-    """The policy with the command that made it and its figures in its file's header."""
-    errors = {c: of["all"]["velocity_error_mean"] for c, of in results["task_space"]["summary"].items()}
-    said = {"command": f"brokk-min reproduce --seed {seed}", "velocity_error_mean": errors}
-    return replace(policy, training={**policy.training, **said})
 
 
 def meta(machine: Machine, seed: int) -> dict[str, Any]:

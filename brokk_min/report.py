@@ -116,7 +116,7 @@ def task_parts(machine: Machine, results: Mapping[str, Any], traces: Mapping[str
 
     Args:
         machine: n joints.
-        results: of `experiments.reproduce`.
+        results: of `chain.reproduce`.
         traces: of `experiments.comparison`.
     """
     starts, kinds = np.array(results["starts"]), results["start_kinds"]

@@ -14,7 +14,7 @@ import pytest
 from matplotlib.colors import to_rgb
 
 from benchmarks.rollout import random_net
-from brokk_min import experiments, figures, jacobian, report
+from brokk_min import chain, experiments, figures, jacobian, report, variations
 from brokk_min.actuator import ActuatorNet, fingerprint, load_net, save_net
 from brokk_min.env import Measured, TaskConfig, measured, rollout, to_command
 from brokk_min.kinematics import joint_rates, tool_position
@@ -98,12 +98,12 @@ def test_sequences_of_any_length_side_by_side_are_those_alone() -> None:
 
 def test_sensors_of_the_robustness_table() -> None:
     q = np.cumsum(np.full((4000, 2, 5), 0.01), axis=0)
-    plain = np.array([experiments.exact(np.random.default_rng(0))(BROKK_170, row) for row in q])
+    plain = np.array([variations.exact(np.random.default_rng(0))(BROKK_170, row) for row in q])
     np.testing.assert_array_equal(plain, read_encoder(BROKK_170, q))
-    noisy = experiments.noisy(np.random.default_rng(0))
+    noisy = variations.noisy(np.random.default_rng(0))
     counts = (np.array([noisy(BROKK_170, row) for row in q]) - q) / BROKK_170.encoder_step
     assert counts.std() == pytest.approx(np.sqrt(1 + 1 / 12), rel=0.02)
-    lossy = experiments.lossy(np.random.default_rng(0))
+    lossy = variations.lossy(np.random.default_rng(0))
     seen = np.array([lossy(BROKK_170, row) for row in q])
     lost = (seen[1:] == seen[:-1]).all(axis=-1)
     assert lost.mean() == pytest.approx(0.05, abs=0.008)
@@ -114,10 +114,10 @@ def test_sensors_of_the_robustness_table() -> None:
 def test_variations_change_the_machine_and_not_what_its_controllers_know(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    found = experiments.variations(BROKK_170)
+    found = variations.variations(BROKK_170)
     assert len(found) == 12 and found["nominal"][0] is BROKK_170
     changed = [
-        name for name, (plant, sensor) in found.items() if plant != BROKK_170 or sensor != experiments.exact
+        name for name, (plant, sensor) in found.items() if plant != BROKK_170 or sensor != variations.exact
     ]
     assert len(changed) == 11
     tilted = found["up -15 %, down +15 %"][0]
@@ -136,7 +136,7 @@ def test_variations_change_the_machine_and_not_what_its_controllers_know(
     assert errors["supply flow -20 %"] == errors["nominal"] and supply["supply flow -20 %"] < 1
     assert table["supply flow -20 %"]["mine"]["supply_limits"] == 0
     weak = replace(BROKK_170, pump_flow=0.2 * BROKK_170.pump_flow)
-    monkeypatch.setattr(experiments, "variations", lambda m: {"weak": (weak, experiments.exact)})
+    monkeypatch.setattr(experiments, "variations", lambda m: {"weak": (weak, variations.exact)})
     row = experiments.robustness(BROKK_170, {"mine": FeedForward(BROKK_170)}, short, start, 0)["weak"]["mine"]
     assert row["supply_demand"] > 1 and 0 < row["supply_limits"] < 1 and row["mean"] > errors["nominal"]
 
@@ -151,7 +151,7 @@ def test_what_valves_ask_of_the_pump_is_what_the_plant_divides_among_them() -> N
         state = plant_step(BROKK_170, state, u)
     fastest = np.where(u > 0, BROKK_170.column("speed_positive"), BROKK_170.column("speed_negative"))
     opening = np.sign(u) * (np.abs(u) - 0.07) / 0.93
-    share = experiments.supply_demand(BROKK_170, u)
+    share = variations.supply_demand(BROKK_170, u)
     assert share[0] < 1 < share[1]
     np.testing.assert_allclose(state.speed, fastest * opening / np.maximum(1, share)[:, None], rtol=0.01)
 
@@ -223,7 +223,7 @@ def test_damaged_gains_are_refused(tmp_path: Path, change: dict[str, object], me
 def twice(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     folders = tmp_path_factory.mktemp("a b"), tmp_path_factory.mktemp("second")  # a space in the path
     for folder in folders:
-        experiments.reproduce(BROKK_170, folder, TINY, 3)
+        chain.reproduce(BROKK_170, folder, TINY, 3)
     return folders
 
 
@@ -280,7 +280,7 @@ def test_results_answer_the_papers_question(twice: tuple[Path, Path]) -> None:
     assert paired["low"] < paired["mean"] < paired["high"]
     low, high = results["task_space"]["intervals"]["jacobian_pid_ff"]["x"]["velocity_error_mean"]
     assert low < means["jacobian_pid_ff"]["x"]["velocity_error_mean"] < high
-    assert set(results["robustness"]) == set(experiments.variations(BROKK_170))
+    assert set(results["robustness"]) == set(variations.variations(BROKK_170))
     nominal = results["robustness"]["nominal"]
     less = nominal["jacobian_pid_ff"]["rl_less"]
     assert less["mean"] == pytest.approx(nominal["rl"]["mean"] - nominal["jacobian_pid_ff"]["mean"])
