@@ -626,6 +626,7 @@ def test_the_status_by_hand() -> None:
 
 def test_nodes_that_were_never_there_are_named() -> None:
     world = World(Push(*PUSH), Hand())
+    assert np.isneginf(world.drive.nodes.beat).all()  # nothing was heard yet
     world.drive.begin()
     world.upward = only(0x704, lambda d: [])
     world.drive.nodes.beat[:] = -np.inf
@@ -713,7 +714,7 @@ class SelectBus:
     """A bus that is silent; a wait on it takes as long as the wait says, or a millisecond."""
 
     def __init__(self) -> None:
-        self.t, self.waits = 0.0, list[float]()
+        self.t, self.waits, self.ready = 7.0, list[float](), list[int]()
 
     def fileno(self) -> int:
         return 7
@@ -725,19 +726,22 @@ class SelectBus:
         assert read == [7]
         self.waits.append(rest[-1])
         self.t += rest[-1] or 0.001
-        return [], [], []
+        return self.ready, [], []
 
 
-@pytest.mark.parametrize(("awake", "slept"), [(0.0, [0.019]), (0.004, [0.016]), (0.020, [])])
+@pytest.mark.parametrize(("awake", "slept"), [((), [0.019]), ((0.004,), [0.016]), ((0.020,), [])])
 def test_a_wait_sleeps_only_after_the_time_it_is_told_to_be_awake(
-    awake: float, slept: list[float], monkeypatch: pytest.MonkeyPatch
+    awake: tuple[float, ...], slept: list[float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     silent = SelectBus()
     line = bus.Line(silent, clock=lambda: silent.t)
     monkeypatch.setattr("brokk_min.bus.select.select", silent.select)
-    assert line.recv(0.020, awake) is None
+    assert line.recv(0.020, *awake) is None
     assert [wait for wait in silent.waits if wait] == pytest.approx(slept)
-    assert 0.020 <= silent.t < 0.0225
+    assert 0.020 <= silent.t - 7.0 < 0.0225
+    silent.t, silent.ready = 7.0, [7]
+    line.recv(0.020, *awake)
+    assert silent.t < 7.002  # what is there is read at once
 
 
 def test_the_loop_sleeps_but_not_just_before_sync_nor_while_encoders_answer() -> None:
@@ -765,6 +769,7 @@ def test_the_loop_sleeps_but_not_just_before_sync_nor_while_encoders_answer() ->
 
 def test_a_small_step_back_of_the_clock_begins_a_new_grid() -> None:
     world = World(Push(0, 0, 0, 0, 0), Hand())
+    world.downward = lambda i, data: (world.rest(0.004 * (i == 0x210)), [(i, data)])[1]  # the loop is busy
     world.drive.begin()
     world.run(0.5)
     world.offset = -1.0
@@ -830,11 +835,12 @@ def test_begin_refuses_encoders_that_do_not_fit() -> None:
     del world.simulated.objects[4, 0x6501, 0]
     with pytest.raises(ValueError, match=r"node 4: object 0x6501:00: .*abort 0x06020000"):
         world.drive.begin()
-    world.upward = lambda can_id, data: []
+    world.upward, begun = lambda can_id, data: [], world.t
     with pytest.raises(
         ValueError, match=r"node 1: object 0x6501:00: expected an answer within 0.5 s, got none"
     ):
         world.drive.begin()
+    assert world.t - begun == pytest.approx(0.5, abs=0.002)
     with pytest.raises(ValueError, match=r"6_joints: expected at most 5 joints"):
         six = (*BROKK_170.joints, replace(BROKK_170.joints[4], name="q6", encoder_node=6))
         hw.Drive(replace(BROKK_170, name="6_joints", joints=six), BASELINE, world.line, Hand())
@@ -878,6 +884,7 @@ def test_a_line_tells_our_frames_from_others_and_logs_all() -> None:
     there.send(can.Message(arbitration_id=0x126, is_fd=True, data=bytes(12), is_extended_id=False))
     frames = [line.recv(0.5) for _ in range(6)]
     assert [f and f.id for f in frames] == [-1, 0x123, -1, -1, -1, -1]
+    assert frames[0] == bus.Frame(line.now(), -1, b"\x01\x02")
     assert line.recv(0.0) is None
     line.note(b"\x09")
     assert not text.getvalue()  # writing waits until there is time
@@ -885,9 +892,36 @@ def test_a_line_tells_our_frames_from_others_and_logs_all() -> None:
     lines = text.getvalue().splitlines()
     assert len(lines) == 7  # all but the echo
     assert re.fullmatch(r"\(\d+\.\d{6}\) can0 123#0102 T", lines[0])
+    assert re.fullmatch(r"\(\d+\.\d{6}\) can0 123#0102 R", lines[1])
     assert re.fullmatch(r"\(\d+\.\d{6}\) operator 7FF#09 T", lines[-1])
+    plain = bus.Line(here)  # of a bus that gives back nothing: what looks like ours is somebody else's
+    plain.send(0x123, b"\x01\x02")
+    there.send(can.Message(arbitration_id=0x123, data=b"\x01\x02", is_extended_id=False))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("brokk_min.bus.select.select", raises(OSError("no descriptor to wait on")))
+        frame = plain.recv(0.5)
+    assert frame and frame.id == 0x123
     here.shutdown()
     there.shutdown()
+
+
+def test_a_line_that_is_closed_has_written_all_and_one_without_log_closes(tmp_path: Path) -> None:
+    class Quick(SelectBus):
+        def send(self, message: can.Message, timeout: float) -> None:
+            assert 0 < timeout <= 0.02  # a full buffer must not hold up the tick
+
+        def shutdown(self) -> None:
+            self.t = -1.0
+
+    for log in (None, can.CanutilsLogWriter(tmp_path / "a.log")):
+        line = bus.Line(here := Quick(), log, "can0", clock=lambda: 1e6 + 0.12345678)
+        assert abs(line.now() - time.time()) < 60
+        line.start = 0.0
+        line.send(0x123, b"\x01")
+        assert line.now() == 1000000.123457
+        line.close()
+        assert here.t == -1.0
+    assert (tmp_path / "a.log").read_text() == "(1000000.123457) can0 123#01 T\n"
 
 
 def drive_logged(path: Path, seconds: float = 4.0) -> World:
