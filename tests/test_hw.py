@@ -1033,6 +1033,12 @@ def test_a_gap_in_a_log_starts_a_new_recording(tmp_path: Path) -> None:
     assert len(lengths) == len(whole) + 1 and sum(whole) - 4 <= sum(lengths) < sum(whole)
 
 
+def test_python_can_is_asked_for_in_one_sentence(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(sys.modules, "can", None)
+    with pytest.raises(ValueError, match=r"^CAN: expected python-can \(extra brokk_min\[hw\]\), got"):
+        list(bus.read_frames(tmp_path / "a.log"))
+
+
 def test_logs_that_are_none_are_refused(tmp_path: Path) -> None:
     for text in ("nonsense\n", "(1.0) can0 12#zz\n", "(x) can0 123#00 R\n"):
         (tmp_path / "bad.log").write_text(text)
