@@ -883,7 +883,7 @@ def test_gymnasium_and_stable_baselines_accept_the_environment():
         check_env(env.unwrapped, skip_render_check=True)
     check_sb3(env.unwrapped)
     assert env.observation_space.shape == (171,)
-    assert env.action_space.low.tolist() == [-1] * 4
+    assert env.action_space.low.tolist() == [-1] * 4 and env.action_space.high.tolist() == [1] * 4
 
 
 def test_make_vec_gives_the_vector_class():

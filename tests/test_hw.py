@@ -508,10 +508,14 @@ def test_a_fault_is_left_by_a_new_edge_only() -> None:
     assert world.drive.gate.driving and world.drive.reason == ""
     assert world.drive.status().startswith("driving v wanted +0.10 +0.00 +0.00 is ")
     assert world.commands[1][-1].tolist() == list(PUSH)
+    noted, note = list[hw.Wish](), world.line.note
+    world.line.note = lambda data: (noted.append(hw.unpack_wish(data)), note(data))[1]  # type: ignore
     hand.act, hand.enable = raises(OSError("gone")), False
     world.run(0.1)
+    assert noted[-1].error  # so that a replay of the log gets the same
     hand.act = lambda: None
     world.run(0.1)
+    assert not noted[-1].error
     assert world.drive.reason == "fault: error (OSError: gone)"
     hand.enable = True
     world.run(0.2)
@@ -748,13 +752,17 @@ def test_the_loop_sleeps_but_not_just_before_sync_nor_while_encoders_answer() ->
     """A wait may sleep from `awake` after its begin to its end."""
     world, waits = World(Push(*PUSH), Hand()), list[tuple[float, float]]()
     world.drive.begin()
-    recv = world.line.recv
+    recv, rest = world.line.recv, world.line.rest
+
+    def pause(seconds: float) -> None:
+        waits.append((world.t, world.t + seconds))
+        rest(seconds)
 
     def wait(timeout: float, awake: float = 0.0) -> bus.Frame | None:
         waits.append((world.t + awake, world.t + timeout))
         return recv(timeout, awake)
 
-    world.line.recv = wait  # type: ignore[method-assign]
+    world.line.recv, world.line.rest = wait, pause  # type: ignore[method-assign]
     world.run(1.0)
     assert world.drive.reason == "" and world.drive.gate.driving
     asleep = np.array([w for w in waits if w[1] > w[0] + 1e-5])
@@ -1031,6 +1039,12 @@ def test_a_gap_in_a_log_starts_a_new_recording(tmp_path: Path) -> None:
     lengths = [len(r.q) for r in hw.driven_log(BROKK_170, holed).recordings]
     whole = [len(r.q) for r in hw.driven_log(BROKK_170, frames).recordings]
     assert len(lengths) == len(whole) + 1 and sum(whole) - 4 <= sum(lengths) < sum(whole)
+
+
+def test_python_can_is_asked_for_in_one_sentence(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(sys.modules, "can", None)
+    with pytest.raises(ValueError, match=r"^CAN: expected python-can \(extra brokk_min\[hw\]\), got"):
+        list(bus.read_frames(tmp_path / "a.log"))
 
 
 def test_logs_that_are_none_are_refused(tmp_path: Path) -> None:
