@@ -84,6 +84,7 @@ def test_valve_frame_by_hand() -> None:
 
 def test_encoders_wrap_across_zero_and_are_masked() -> None:
     q1 = [encoder_counts(BROKK_170, [raw, 0, 0, 1000, 0])[0] for raw in (1, 0, 2**26 - 1, 2**26 - 2)]
+    assert encoder_counts(BROKK_170, [1, 0, 0, 1000, 0]).dtype == int
     assert q1 == [1, 0, -1, -2]  # multi-turn: below zero comes the largest value
     assert encoder_counts(BROKK_170, [4095, 4095, 4095, 4095, 4095])[0] == -1  # single-turn
     junk = encoder_counts(BROKK_170, np.array([5, 5, 5, 1000, 5]) | 0x3F << 26)
@@ -351,6 +352,7 @@ def test_one_gate_alone_gives_what_many_give() -> None:
     for k, (after, frame) in enumerate(wanted):
         found, bytes_ = gate(BROKK_170, GateState(*row(state, k)), GateInputs(*row(inputs, k)), now[k])
         assert bytes_.tobytes() == frame and found.driving == after.driving and found.wrong == after.wrong
+        assert found.sent.dtype == found.counts.dtype == int
 
 
 def test_a_gate_starts_silent() -> None:
@@ -360,6 +362,9 @@ def test_a_gate_starts_silent() -> None:
         assert not np.any(s.driving) and not np.any(s.spoken) and np.all(s.enable) and np.all(s.wrong == 1)
         assert np.all(s.time == -np.inf) and not np.any(s.fault) and not np.any(s.counter)
         assert not np.any(s.counts) and not np.any(s.sent)
+        assert all(f.shape == shape and f.dtype == bool for f in (s.driving, s.spoken, s.enable))
+        assert all(f.shape == shape and f.dtype == int for f in (s.wrong, s.fault, s.counter))
+        assert s.counts.dtype == s.sent.dtype == int
         assert s.pace.shape == s.due.shape == (*shape, 5) and not np.any(s.pace) and not np.any(s.due)
 
 

@@ -291,8 +291,8 @@ def test_gymnasium_renders_what_happens() -> None:
     check_env(env.unwrapped)
     env = RenderCollection(env, pop_frames=False)
     env.reset(seed=1)
-    for _ in range(12):
-        env.step(np.array([1.0, 0.0, 0.0, 1.0], np.float32))
+    for k in range(12):
+        env.step(np.array([1.0 if k < 11 else 0.5, 0.0, 0.0, 1.0], np.float32))  # the newest command shows
     images = env.render()
     assert isinstance(images, list) and len(images) == 13
     inner = env.unwrapped
