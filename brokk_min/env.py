@@ -243,7 +243,7 @@ def measured(machine: Machine, observation: Array) -> Measured:
     return Measured(v_goal, v_tool, q, values[..., angles[machine.driven] + machine.history])
 
 
-def push_lag(machine: Machine, history: Array, v_goal: Array, lag: Array, arm: Arm | None = None) -> Array:
+def push_lag(machine: Machine, v_tool: Array, v_goal: Array, lag: Array) -> Array:
     """How far the tool stays behind [m] (..., 3): the leaky integral of the velocity error, a tick on.
 
     It tells a lasting error from a passing one. Errors count up to `LAG_SPEED` of the machine's tool
@@ -251,12 +251,11 @@ def push_lag(machine: Machine, history: Array, v_goal: Array, lag: Array, arm: A
 
     Args:
         machine: n joints.
-        history: measured samples after the tick, (..., n, 3, H).
+        v_tool: measured tool velocity after the tick [m/s], (..., 3).
         v_goal: what was wanted during the tick [m/s], (..., 3).
         lag: before the tick, (..., 3).
-        arm: `measured_arm` of `history` where it is known.
     """
-    error = v_goal - (arm or measured_arm(machine, history)).v_tool
+    error = v_goal - v_tool
     size = np.sqrt(np.add.reduce(error * error, axis=-1, keepdims=True))
     limit = np.float32(LAG_SPEED * machine.tool_speed)
     counted = lag + error * (limit / np.maximum(size, limit)) * np.float32(machine.dt)
@@ -272,7 +271,7 @@ def push_measured(
     """
     history = push_angle(history, q, lambda a: estimate_velocity(a, machine.velocity_samples, machine.dt))
     arm = measured_arm(machine, history)
-    return history, push_lag(machine, history, v_goal, lag, arm), arm
+    return history, push_lag(machine, arm.v_tool, v_goal, lag), arm
 
 
 def to_command(machine: Machine, action: ArrayLike) -> Array:

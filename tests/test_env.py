@@ -269,7 +269,9 @@ def test_an_arm_that_is_known_changes_no_bit(machine):
         q = history[..., 0, 0]
         history, after, arm = task.push_measured(machine, history, q, v_goal, lag)
         assert np.abs(arm.v_tool - tool_velocity(machine, q, history[..., 1, -1])).max() == 0
-        np.testing.assert_array_equal(after, task.push_lag(machine, history, v_goal, lag))
+        np.testing.assert_array_equal(
+            after, task.push_lag(machine, task.measured_arm(machine, history).v_tool, v_goal, lag)
+        )
         clean = task.observe(machine, history, v_goal, after)
         for noise in (0.0, 0.01, rng.uniform(-0.5, 0.5, clean.shape).astype(np.float32)):
             seen = [task.observe(machine, history, v_goal, after, noise, known) for known in (None, arm)]
@@ -373,22 +375,15 @@ def test_the_observation_of_an_environment_is_noisy_within_five_percent():
 # --- the lag --------------------------------------------------------------------------------------
 
 
-def standing(num=1):
-    """Histories (num, 5, 3, 13) of machines that stand still."""
-    history = np.zeros((num, 5, 3, 13), np.float32)
-    history[:, :, 0] = POSE[:, None]
-    return history
-
-
 def test_lag_by_hand():
     """Errors of 0.012 m/s count in full, larger ones than 0.021 m/s (7 % of 0.3) as that, 50 ms each."""
     forget = np.exp(-0.025)
     goals = np.array([[0.012, 0, 0], [0, -0.2, 0], [0.3, 0, 0.4], [0, 0, 0.021]], np.float32)
     wanted = np.array([[0.012, 0, 0], [0, -0.021, 0], [0.0126, 0, 0.0168], [0, 0, 0.021]]) * 0.05 * forget
-    lag = task.push_lag(BROKK_170, standing(4), goals, np.zeros((4, 3), np.float32))
+    lag = task.push_lag(BROKK_170, np.zeros((4, 3), np.float32), goals, np.zeros((4, 3), np.float32))
     np.testing.assert_allclose(lag, wanted, rtol=1e-5, atol=1e-10)
     assert lag.dtype == np.float32
-    again = task.push_lag(BROKK_170, standing(4), goals[::-1], lag)
+    again = task.push_lag(BROKK_170, np.zeros((4, 3), np.float32), goals[::-1], lag)
     np.testing.assert_allclose(again, (wanted + wanted[::-1] / forget) * forget, rtol=1e-5, atol=1e-10)
 
 
@@ -398,24 +393,25 @@ def test_the_tool_velocity_counts_against_the_goal():
     ahead, behind = (closed_form(q + sign * 1e-6 * q_dot)[0] for sign in (1, -1))
     v_tool = (ahead - behind) / 2e-6
     assert np.linalg.norm(v_tool) > 0.1
+    measured = task.measured_arm(BROKK_170, history).v_tool
     lag = np.array([0.01, 0.02, -0.03])
-    kept = task.push_lag(BROKK_170, history, v_tool, lag)
+    kept = task.push_lag(BROKK_170, measured, v_tool, lag)
     np.testing.assert_allclose(kept, lag * np.exp(-0.025), atol=1e-8)  # no error: forgotten, nothing more
     error = np.array([0.01, 0.0, -0.005])
-    after = task.push_lag(BROKK_170, history, v_tool + error, lag)
+    after = task.push_lag(BROKK_170, measured, v_tool + error, lag)
     np.testing.assert_allclose(after, (lag + 0.05 * error) * np.exp(-0.025), atol=1e-8)
 
 
 def test_a_lasting_error_fills_the_lag_and_it_is_forgotten_within_two_seconds():
-    small, history = np.array([[0.008, -0.004, 0.001]]), standing()
+    small, still = np.array([[0.008, -0.004, 0.001]]), np.zeros((1, 3))
     lag, sums = np.zeros((1, 3)), []
     for tick in range(1, 1001):
-        lag = task.push_lag(BROKK_170, history, small, lag)
+        lag = task.push_lag(BROKK_170, still, small, lag)
         sums.append(small * 0.05 * np.exp(-0.025 * np.arange(1, tick + 1)).sum())
         np.testing.assert_allclose(lag, sums[-1], rtol=1e-6)
     np.testing.assert_allclose(lag, 1.975 * small, rtol=1e-3)  # error x dt / (e^0.025 - 1), about x 2 s
     for _ in range(40):
-        lag = task.push_lag(BROKK_170, history, np.zeros((1, 3)), lag)
+        lag = task.push_lag(BROKK_170, still, np.zeros((1, 3)), lag)
     np.testing.assert_allclose(lag, sums[-1] / np.e, rtol=1e-5)
 
 
@@ -423,11 +419,9 @@ def test_a_lasting_error_fills_the_lag_and_it_is_forgotten_within_two_seconds():
 def test_the_lag_is_bounded_and_points_along_the_error(machine):
     machine = replace(machine, rate=40.0)
     rng, limit = np.random.default_rng(21), 0.07 * machine.tool_speed
-    history = np.zeros((30, machine.n, 3, machine.history))
-    history[:, :, 0] = machine.column("q_min")[:, None]
     error = rng.standard_normal((30, 3)) * 10.0 ** rng.uniform(-3, 2, (30, 1)) * limit
     size = np.linalg.norm(error, axis=-1, keepdims=True)
-    lag = task.push_lag(machine, history, error, np.zeros((30, 3)))
+    lag = task.push_lag(machine, np.zeros((30, 3)), error, np.zeros((30, 3)))
     counted = error / size * np.minimum(size, limit) * 0.025 * np.exp(-0.0125)
     np.testing.assert_allclose(lag, counted, rtol=1e-5)
     assert (size < limit).sum() > 5 and (size > limit).sum() > 5

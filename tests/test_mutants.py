@@ -139,7 +139,7 @@ PLANTED: list[tuple[str, str, str, str]] = [
      "env::noise_is_uniform_within_five_percent_and_fresh_on_what_is_sensed"),
     ("env", "seen += noise * sensed", "seen += noise * scale",
      "env::noise_is_uniform_within_five_percent_and_fresh_on_what_is_sensed"),
-    ("env", "error = v_goal - (arm or", "error = v_goal + (arm or",
+    ("env", "error = v_goal - v_tool", "error = v_goal + v_tool",
      "env::the_tool_velocity_counts_against_the_goal"),
     ("env", "np.exp(-machine.dt / LAG_TIME)", "np.exp(-LAG_TIME / machine.dt)", "env::lag_by_hand"),
     ("env", "np.clip(moved, low[driven], high[driven])", "np.clip(moved, low[driven], np.inf)",

@@ -69,7 +69,7 @@ CALLS: dict[str, Callable[[], Any]] = {
     "baseline": lambda: BASELINE(SEEN, jacobian.Memory(*map(fixed, BASELINE.start(4)))),
     "observe": lambda: env.observe(M, HISTORY, V32, LAG, fixed(np.full(SEEN.shape, 0.01, np.float32))),
     "measured": lambda: env.measured(M, SEEN),
-    "push_lag": lambda: env.push_lag(M, HISTORY, V32, LAG),
+    "push_lag": lambda: env.push_lag(M, V32, V32, LAG),
     "push_measured": lambda: env.push_measured(M, HISTORY, Q32, V32, LAG),
     "to_command": lambda: env.to_command(M, fixed(np.ones((4, 4), np.float32))),
     "reward": lambda: env.reward(V, fixed(np.zeros((4, 3)))),
