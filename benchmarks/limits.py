@@ -64,10 +64,10 @@ def seconds(calls: dict[str, Callable[[], Any]], repeats: int, block: float) -> 
     return {name: float(min(found)) for name, found in times.items()}
 
 
-def shapes(inputs: int, actions: int, batch: int) -> list[tuple[int, int, int]]:
-    """(m, k, n) of all products in one gradient of actor and critic: forward, by weight, by input."""
+def shapes(inputs: int, outputs: tuple[int, ...], batch: int) -> list[tuple[int, int, int]]:
+    """(m, k, n) of all products in one gradient of nets with these outputs: forward, by weight, by input."""
     result = []
-    for last in (actions, 1):
+    for last in outputs:
         for i, (a, b) in enumerate(pairwise((inputs, 256, 128, 64, last))):
             result += [(batch, a, b), (a, batch, b)] + ([(batch, b, a)] if i else [])
     return result
@@ -109,7 +109,8 @@ def update(options: Options) -> dict[str, Any]:
     training = Training(env, config, 0)
     batch, _ = training._collect()
     rows = min(config.minibatch_size, len(batch["action"]))
-    sizes = shapes(batch["observation"].shape[1], 4, rows)
+    outputs = (4, 1) if training.critic else (4,)
+    sizes = shapes(batch["observation"].shape[1], outputs, rows)
     gradients = config.epochs * len(batch["action"]) / rows
     work = sum(2 * m * k * n for m, k, n in sizes)
     calls = {"update": lambda: training._learn(batch), "torch": products("torch", sizes)}
@@ -161,7 +162,7 @@ def main(options: Options) -> dict[str, Any]:
     if options.quick:
         options.repeats, options.num_envs = 1, options.num_envs[:2]
     if options.numpy_products:
-        call = products("numpy", shapes(171, 4, PPOConfig.minibatch_size))
+        call = products("numpy", shapes(171, (4,), PPOConfig.minibatch_size))
         print(seconds({"numpy": call}, options.repeats, 0.02 if options.quick else 0.1)["numpy"])
         return {}
     result = {

@@ -58,10 +58,11 @@ def test_limits_are_measured(tmp_path: Path) -> None:
 
 def test_the_products_of_a_gradient_by_hand() -> None:
     """171-256-128-64-4: forward and by weight everywhere, by input from the second layer on."""
-    sizes = limits.shapes(171, 4, 10)
-    work = sum(m * k * n for m, k, n in sizes)
+    sizes = limits.shapes(171, (4, 1), 10)
     actor, critic = (171 * 256 + 256 * 128 + 128 * 64 + 64 * last for last in (4, 1))
-    assert work == 10 * (3 * (actor + critic) - 2 * 171 * 256)
+    for outputs, both in (((4,), actor), ((4, 1), actor + critic)):
+        work = sum(m * k * n for m, k, n in limits.shapes(171, outputs, 10))
+        assert work == 10 * (3 * both - len(outputs) * 171 * 256)
     seen = limits.products("numpy", sizes)()
     for kind in ("torch", "onednn"):
         try:
