@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from helpers_machines import small_net
 
-from brokk_min import claims, experiments, play, ppo, replay, report, sequences, sweep
+from brokk_min import chain, claims, experiments, play, ppo, replay, report, sequences, sweep
 from brokk_min.__main__ import COMMANDS, main
 from brokk_min.env import TaskConfig
 from brokk_min.fitting import FitConfig, fit
@@ -74,12 +74,12 @@ def test_reproduce_prints_means_and_verdicts(
 ) -> None:
     given = {}
 
-    def chain(machine: Any, out: Path, effort: Any, seed: int, sweep: Path | None) -> dict[str, Any]:
+    def instead(machine: Any, out: Path, effort: Any, seed: int, sweep: Path | None) -> dict[str, Any]:
         given.update(machine=machine.name, out=out, effort=effort, seed=seed, sweep=sweep)
         means = {"rl": {"x": {"velocity_error_mean": 0.0125}}}
         return {"task_space": {"summary": means}, "claims": [{"holds": True, "paper": "It works."}]}
 
-    monkeypatch.setattr(experiments, "reproduce", chain)
+    monkeypatch.setattr(chain, "reproduce", instead)
     for words, effort in (((), experiments.Effort()), (("--quick",), experiments.QUICK)):
         assert run("reproduce", "--out", tmp_path, "--seed", 3, *words) == 0
         wanted = {"machine": "brokk170", "out": tmp_path, "effort": effort, "seed": 3, "sweep": None}
