@@ -127,7 +127,7 @@ def a11() -> dict[str, float]:
 # --- by fitting and training --------------------------------------------------------------------------
 
 NOISE = fitting.FitConfig().noise
-STEPS = 2_000_000  # of each training here, a quarter of the default
+STEPS = 2_000_000  # of each training here, a fifth of the default
 
 
 @cache
