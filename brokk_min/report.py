@@ -282,36 +282,44 @@ def _regret(regret: Mapping[str, Any]) -> Part:
 
 def _robust(robustness: Mapping[str, Any]) -> Part:
     rows: dict[str, dict[str, str]] = {}
+    supply: dict[str, dict[str, str]] = {}
     for variation, of in robustness.items():
         most, share = (max(n[key] for n in of.values()) for key in ("supply_demand", "supply_limits"))
         rows[variation] = {
             c: _with_interval({k: n[k] for k in ("mean", "low", "high")}) for c, n in of.items()
         }
-        rows[variation] |= {"pump's flow asked for": f"{most:.0%}", "ticks it limits": f"{share:.1%}"}
-    text = (
-        f"Mean velocity error along x, y and z on a machine unlike the known one [m/s]; {ENDS}. Last "
-        "columns: the most of the pump's flow that any controller asks for, and how often that is more "
-        "than there is."
+        supply[variation] = {"pump's flow asked for": f"{most:.0%}", "ticks it limits": f"{share:.1%}"}
+    text = f"Mean velocity error along x, y and z on a machine unlike the known one [m/s]; {ENDS}."
+    asked = (
+        "The most of the pump's flow that any controller asks for, and how often that is more than there is."
     )
     less = {
         name: {c: n["rl_less"] for c, n in of.items() if "rl_less" in n} for name, of in robustness.items()
     }
-    return "Robustness", text, rows, "RL less each baseline, on the same starts [m/s].", _cells(less)
+    paired = "RL less each baseline, on the same starts [m/s]."
+    return "Robustness", text, rows, paired, _cells(less), asked, supply
 
 
 def _seeds(table: Mapping[str, Mapping[str, Any]]) -> list[Part]:
     """The figures of a sweep, if there is one."""
     if not table:
         return []
-    cells = {k: {c: _with_interval(of[k]) for c, of in table.items()} for k in table["rl"]}
+    alone, less = (
+        {
+            k: {c: _with_interval(of[k]) for c, of in table.items() if ("less" in c) is paired}
+            for k in table["rl"]
+        }
+        for paired in (False, True)
+    )
     errors = [k for k in table["rl"] if k.startswith("velocity_error_")]
-    alone = {c: of for c, of in table.items() if "less" not in c}
-    bars = {c: {k.split("_", 2)[2]: of[k] for k in errors} for c, of in alone.items()}
+    trained = {c: of for c, of in table.items() if "less" not in c}
+    bars = {c: {k.split("_", 2)[2]: of[k] for k in errors} for c, of in trained.items()}
     text = (
         "Means over training seeds on the machine, and 95 % intervals over them (Student's t; a seed counts "
         "once, with the mean over its workspace starts) [m/s, m, full strokes]. Baselines are not trained."
     )
-    return [("Training seeds", text, cells, figures.plot_bars({"mean velocity error [m/s]": bars}))]
+    plot = figures.plot_bars({"mean velocity error [m/s]": bars})
+    return [("Training seeds", text, alone, "What RL has less than each baseline.", less, plot)]
 
 
 def _lists(machine: Machine, results: Mapping[str, Any]) -> list[Part]:
