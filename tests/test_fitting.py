@@ -75,6 +75,14 @@ def test_a_fit_repeats_itself_to_the_bit():
     assert not np.array_equal(one.weights[0], other.weights[0])
 
 
+def test_a_joint_moves_in_a_recording_in_which_its_angle_or_its_command_changes():
+    still, ramp = np.zeros(6), np.arange(6) / 10
+    u, q = np.stack([still, still, ramp], 1), np.stack([ramp, still, still], 1)
+    log = Log(("a", "b", "c"), (Recording("angle too", u, q, q), Recording("command alone", u, 0 * q, q)))
+    found = [[True, False, True]] * 6 + [[False, False, True]] * 6
+    assert fitting.end_to_end(log).moves.tolist() == found
+
+
 @pytest.mark.parametrize("logged", [False, True])
 def test_the_loss_of_a_free_run_is_what_the_nets_do_when_run(logged):
     """Three ticks on the nets' own outputs, stops included: squared errors so far, in units of the range."""

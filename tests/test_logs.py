@@ -114,6 +114,7 @@ def test_a_recording_may_be_called_anything(tmp_path):
     named = log._replace(recordings=(log.recordings[0]._replace(name='Tuesday, "wet"'),))
     write_log(tmp_path / "log.csv", named)
     assert read_log([tmp_path / "log.csv"], 4).recordings[0].name == 'Tuesday, "wet"'
+    assert b"\r" not in (tmp_path / "log.csv").read_bytes()  # one kind of line end on all systems
 
 
 # --- resampling -----------------------------------------------------------------------------------

@@ -166,3 +166,8 @@ def test_drift_is_the_largest_and_the_mean_distance_from_the_line() -> None:
     row = figures(v, np.tile([0.1, 0.0, 0.0], (3, 1)))
     assert row["off_axis_drift_max"] == pytest.approx(0.005)
     assert row["off_axis_drift_mean"] == pytest.approx(0.005 / 3)
+
+
+def test_the_mean_of_a_row_leaves_out_what_is_no_number() -> None:
+    assert m.row_mean(np.array([[1.0, np.nan, 4.0], [2.0, 3.0, 7.0]])).tolist() == [2.5, 4.0]
+    assert np.isnan(m.row_mean(np.full((1, 2), np.nan))).all()

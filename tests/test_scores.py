@@ -131,6 +131,13 @@ def test_errors_of_whole_recordings_by_hand():
     assert np.isnan(scores.recording_errors(net, log._replace(recordings=log.recordings[3:]), 30.0)).all()
 
 
+def test_a_whole_recording_is_scored_from_the_sample_after_the_first_history():
+    net, q_dot = constant_net([0.2], True, ("a",)), 0.01 * np.arange(40.0)[:, None]
+    log = Log(("a",), (line("a", 0.0, 0.1, 40)._replace(q_dot=q_dot),), True)
+    wanted = np.sqrt(np.mean((0.2 - q_dot[net.history + 1 :]) ** 2))
+    assert scores.recording_errors(net, log, 30.0) == pytest.approx(wanted, abs=1e-6)
+
+
 def test_scores_need_the_same_joints_and_one_step_at_least():
     net = constant_net([0.2], False, ("a",))
     with pytest.raises(ValueError, match=r"joints: expected \['a'\], got \['b'\]"):
