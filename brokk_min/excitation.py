@@ -31,8 +31,8 @@ def rich_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Arra
     """Sines over a wide band, steps, fast random holds, stop and go out of rests; small noise, (ticks,).
 
     Steps last up to 10 s, so that joints also run through to their stops, and so does stop and go, so that
-    most of its starts come out of long rests. Levels are drawn up to a third
-    above the limit: cut there, a quarter are at the limit, as a policy's.
+    most of its starts come out of long rests. Levels are drawn up to a third above the limit: cut there, a
+    quarter are at the limit, as a policy's.
     """
     limit, idle = 4 / 3 * machine.pwm_limit / PWM_MAX, 5 * machine.ready_down_time
     parts: list[Array] = []
