@@ -68,7 +68,10 @@ class Fit:
         known = machine if machine.names == log.joints else None
         if self.machine and not known:
             raise ValueError(f"LOGS: expected joints of --machine {self.machine}, got {list(log.joints)}")
-        settings = replace(self.settings, **PAPER_RECIPE) if self.paper else self.settings
+        settings = self.settings
+        if known and settings.dead_zone is None:
+            settings = replace(settings, dead_zone=known.dead_zone)
+        settings = replace(settings, **PAPER_RECIPE) if self.paper else settings
         net = fit(log, settings, self.seed, self.velocity_samples, known.name if known else "")
         verdict = preliminary.judge(net, log, test, known)
         save_net(self.out, net)

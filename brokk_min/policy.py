@@ -17,7 +17,7 @@ from brokk_min.logs import load_arrays, whole_file
 from brokk_min.machine import Machine
 
 Array = NDArray[np.floating[Any]]
-FORMAT = 1  # of policy files
+FORMAT = 2  # of policy files; 1: actions in units of the command limit, dead zone and all
 
 
 @dataclass(frozen=True)
@@ -76,6 +76,7 @@ def contract(machine: Machine) -> dict[str, Any]:
         "rate": machine.rate,
         "velocity_samples": machine.velocity_samples,
         "pwm_limit": machine.pwm_limit,
+        "dead_zone": machine.dead_zone,
         "geometry": [[j.a, j.alpha, j.d, j.theta, j.q_min, j.q_max] for j in machine.joints],
     }
 
