@@ -55,7 +55,7 @@ class TaskConfig:
     """Share of goals along x, y or z; the others point anywhere."""
     noise: float = 0.05
     """Largest noise of the measured part of an observation, in standard deviations (paper: 5 %)."""
-    valve_cost: float = 0.01
+    valve_cost: float = 0.05
     """Reward lost for each change of a command by its limit, mean of the driven joints (paper: 0)."""
     redraw_ground: bool = True
     """Redraw start poses in the ground; False is the paper's rule: end the episode without reward."""

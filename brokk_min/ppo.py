@@ -57,8 +57,8 @@ class PPOConfig:
     """Change of the policy in one update at which the learning rate stays as it is (rule of rl_games)."""
     critic: bool = False
     """Advantages by a critic and GAE, as in the paper and under `--paper`, not by the nets' derivatives."""
-    gamma: float = 0.9
-    """Discount a tick: 0.9 looks 10 ticks (0.5 s) ahead, somewhat beyond the machine's response time."""
+    gamma: float = 0.95
+    """Discount a tick: 0.95 looks 20 ticks (1 s) ahead, beyond the answer of a valve that has gone idle."""
     gae_lambda: float = 0.95
     """Weight of longer returns in the advantage."""
     clip: float = 0.2
@@ -67,9 +67,9 @@ class PPOConfig:
     """Bonus for the entropy of the action distribution."""
     max_grad_norm: float = 1.0
     """Gradients are scaled down to this norm."""
-    log_std: float = -1.2
+    log_std: float = -1.8
     """Logarithm of the actions' standard deviation at the start."""
-    log_std_end: float = -3.5
+    log_std_end: float = -4.5
     """The same at the end, with straight steps between; with a critic it is learned instead."""
     checkpoint_every: int = 50
     """Updates between two checkpoints."""
