@@ -27,7 +27,8 @@ from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet, fingerprint, load_header
 from brokk_min.adjoint import Rollout, action_gradients
-from brokk_min.env import State, TaskConfig, TaskVectorEnv, observation_scale, paper_view, to_command
+from brokk_min.env import State, TaskConfig, observation_scale, paper_view, to_command
+from brokk_min.environments import TaskVectorEnv
 from brokk_min.logs import load_arrays, whole_file
 from brokk_min.machine import Machine
 from brokk_min.policy import Policy, contract, save_policy

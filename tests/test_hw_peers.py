@@ -29,7 +29,8 @@ from helpers_machines import small_net
 from brokk_min import bus, experiments, hw, simulator
 from brokk_min.__main__ import main
 from brokk_min.actuator import load_net
-from brokk_min.env import TaskVectorEnv, observation_scale
+from brokk_min.env import observation_scale
+from brokk_min.environments import TaskVectorEnv
 from brokk_min.export import export_onnx
 from brokk_min.gate import encoder_raw
 from brokk_min.logs import read_log

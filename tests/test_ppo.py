@@ -26,7 +26,8 @@ from torch import nn
 from brokk_min import logs, ppo
 from brokk_min.__main__ import main
 from brokk_min.actuator import save_net
-from brokk_min.env import TaskConfig, TaskVectorEnv, look, to_command
+from brokk_min.env import TaskConfig, look, to_command
+from brokk_min.environments import TaskVectorEnv
 from brokk_min.machine import BROKK_170
 from brokk_min.policy import load_policy
 from brokk_min.ppo import Agent, PPOConfig, Training, gae, train

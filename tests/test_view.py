@@ -19,7 +19,8 @@ from hypothesis import strategies as st
 from strategies import moving
 
 from brokk_min import looks, view, window
-from brokk_min.env import TaskConfig, TaskEnv
+from brokk_min.env import TaskConfig
+from brokk_min.environments import TaskEnv
 from brokk_min.jacobian import manipulability
 from brokk_min.kinematics import frames, jacobian, tool_position
 from brokk_min.machine import BROKK_170, Machine
