@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from brokk_min import bus
 from brokk_min.actuator import push_command, rest_history
 from brokk_min.env import Controller, measured, observe, push_measured
+from brokk_min.extras import need
 from brokk_min.gate import OPERATIONAL, GateInputs, encoder_counts, fault_name, gate, gate_start
 from brokk_min.kinematics import tool_state
 from brokk_min.logs import Log, Recording, velocity_of
@@ -107,10 +108,7 @@ class Joystick:
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # events need a window, or this
         os.environ.setdefault("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")
-        try:
-            import pygame
-        except ImportError as error:
-            raise ValueError(f"joystick: expected pygame (extra brokk_min[play]), got {error}") from error
+        pygame = need("pygame", "play")
         pygame.display.init()
         pygame.joystick.init()
         if not pygame.joystick.get_count():

@@ -24,6 +24,7 @@ from tqdm import tqdm
 from brokk_min import experiments
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import TaskConfig
+from brokk_min.extras import need
 from brokk_min.machine import Machine
 from brokk_min.metrics import by_start, mean_interval
 from brokk_min.policy import PolicyController, load_policy
@@ -98,12 +99,9 @@ def workers(scheduler: str | None) -> Iterator[Submit]:
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             yield lambda function, *arguments: pool.submit(apart, function, *arguments)
         return
-    try:
-        from distributed import Client
-    except ImportError as error:
-        raise ValueError("scheduler: expected the extra `brokk_min[sweep]`, got none") from error
-    connect: Callable[..., Any] = Client
-    with connect(scheduler, timeout=10) as client:  # dask itself runs again what a dead worker had
+    with need("distributed", "sweep").Client(
+        scheduler, timeout=10
+    ) as client:  # dask itself runs again what a dead worker had
         threads = {worker["nthreads"] for worker in client.scheduler_info(-1)["workers"].values()}
         if threads - {1}:  # torch's settings and seeds are those of a process
             raise ValueError(f"{scheduler}: expected workers with --nthreads 1, got {sorted(threads)}")
