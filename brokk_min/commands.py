@@ -211,13 +211,18 @@ class Evaluate(Command):
             names = ", ".join(sequence.name for sequence in sequences)
             meta |= {"commands": str(self.commands or names), "starts": str(self.starts or self.num_starts)}
             experiments.write_json(self.json, {"meta": meta, "runs": runs})
-        for kind in dict.fromkeys(run["kind"] for run in runs):
-            mine = [run for run in runs if run["kind"] == kind]
-            num = len({run["start"] for run in mine})
-            print(f"{kind} starts ({num}), means over {len(sequences)} sequences")
-            for name, rows in summary(mine).items():
-                cells = (f"{k} {'none' if v is None else format(v, '.4f')}" for k, v in rows["all"].items())
-                print(f"  {name:20} " + ", ".join(cells))
+        _print_means(runs, len(sequences))
+
+
+def _print_means(runs: list[dict[str, Any]], sequences: int) -> None:
+    """Means of all figures by kind of start and controller."""
+    for kind in dict.fromkeys(run["kind"] for run in runs):
+        mine = [run for run in runs if run["kind"] == kind]
+        num = len({run["start"] for run in mine})
+        print(f"{kind} starts ({num}), means over {sequences} sequences")
+        for name, rows in summary(mine).items():
+            cells = (f"{k} {'none' if v is None else format(v, '.4f')}" for k, v in rows["all"].items())
+            print(f"  {name:20} " + ", ".join(cells))
 
 
 @dataclass(kw_only=True)

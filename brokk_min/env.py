@@ -496,13 +496,10 @@ def merge(old: State, new: State, rows: NDArray[np.intp]) -> State:
         return a
 
     arrays = {f.name: put(getattr(old, f.name), getattr(new, f.name)) for f in fields(State)[:-1]}
-    plant = None
-    if old.plant is not None and new.plant is not None:
-        pending = tuple(map(put, old.plant.pending, new.plant.pending))
-        plant = new.plant._replace(
-            **{k: put(getattr(old.plant, k), getattr(new.plant, k)) for k in PlantState._fields[:-1]},
-            pending=pending,
-        )
+    if old.plant is None or new.plant is None:
+        return State(**arrays)
+    (*one, one_pending), (*other, other_pending) = old.plant, new.plant
+    plant = PlantState._make([*map(put, one, other), tuple(map(put, one_pending, other_pending))])
     return State(**arrays, plant=plant)
 
 

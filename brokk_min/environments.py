@@ -38,7 +38,7 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
 
     def __init__(
         self,
-        num_envs: int = 1,
+        num_envs: int,
         actuator: ActuatorNet | Path | str = "analytic",
         machine: Machine = BROKK_170,
         config: TaskConfig | None = None,

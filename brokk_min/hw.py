@@ -115,7 +115,6 @@ class Joystick:
             raise ValueError("joystick: expected one, got none")
         self.pygame, self.speed, self.axes, self.button = pygame, machine.tool_speed, axes, button
         self.stick: Any = pygame.joystick.Joystick(0)
-        self.instance = self.stick.get_instance_id()
         found = self.stick.get_numaxes(), self.stick.get_numbuttons()
         if max(axes) >= found[0] or button >= found[1]:
             raise ValueError(
@@ -125,12 +124,11 @@ class Joystick:
     def __call__(self, driving: bool, ready: bool) -> Wish:
         """The wish of this tick. A device that is gone reads zero on all axes, so its removal is told."""
         for event in self.pygame.event.get():
-            if event.type == self.pygame.JOYDEVICEREMOVED and event.instance_id == self.instance:
-                self.stick, self.instance = None, -1
-            elif event.type == self.pygame.JOYDEVICEADDED and self.stick is None:
+            if event.type == self.pygame.JOYDEVICEADDED and not self.stick:
                 self.stick = self.pygame.joystick.Joystick(event.device_index)
-                self.instance = self.stick.get_instance_id()
-        if self.stick is None:
+            elif event.type == self.pygame.JOYDEVICEREMOVED and self.stick:
+                self.stick = None if event.instance_id == self.stick.get_instance_id() else self.stick
+        if not self.stick:
             return Wish(alive=False)
         v = -shape_axis([self.stick.get_axis(i) for i in self.axes]) * self.speed
         x, y, z = map(float, v / max(1.0, float(np.linalg.norm(v)) / self.speed))
@@ -156,14 +154,14 @@ class Jog:
         return asked * chosen * self.counts / PWM_MAX, None
 
 
-def shape_axis(axis: ArrayLike, dead: float = 0.12, expo: float = 0.6) -> Array:
-    """Deflection in [-1, 1] with a dead zone, and flatter near the middle: (1 - expo) s + expo s^3.
+def shape_axis(axis: ArrayLike) -> Array:
+    """Deflection in [-1, 1] with a dead zone of 12 %, and flatter near the middle: (1 - expo) s + expo s^3.
 
     Example:
         >>> shape_axis([-1.0, 0.1, 0.56, 1.0])
         array([-1.   ,  0.   ,  0.275,  1.   ])
     """
-    axis = np.asarray(axis, float)
+    axis, dead, expo = np.asarray(axis, float), 0.12, 0.6  # assumed
     s = np.sign(axis) * np.maximum(0.0, np.abs(axis) - dead) / (1 - dead)
     return np.asarray((1 - expo) * s + expo * s**3)
 
@@ -222,15 +220,8 @@ class Drive:
 
     def tick(self) -> bool:
         """Wait for the deadline, then one tick; False if it was the last."""
-        line, wanted, self.wish = self.line, np.zeros(self.machine.n), self.wish._replace(error=False)
-        end = min(self.deadline, line.now() + self.machine.dt)  # the clock may have gone backwards
-        with self._caught():
-            self._listen(end - AWAKE)
-            line.rest(max(0.0, end - AWAKE - line.now()))
-            self._rehearse(end)
-            self._listen(end, AWAKE)
-        line.rest(max(0.0, end - line.now()))  # a broken bus does not wait
-        self._next_deadline()
+        self._wait()
+        line, wanted = self.line, np.zeros(self.machine.n)
         with self._caught():
             wish = self.operator(bool(self.gate.driving), bool(self.gate.wrong == 0))
             self.wish = unpack_wish(wish.pack())  # as the log has it, so that a replay gets the same
@@ -250,9 +241,7 @@ class Drive:
         self._remember(problem)
         with self._caught():
             if not (self.wish.enable or self.gate.driving) and (self.nodes.nmt != OPERATIONAL).any():
-                line.send(
-                    bus.NMT, bytes([1, 0])
-                )  # nodes that fell back; not while the operator holds the switch
+                line.send(bus.NMT, bytes([1, 0]))  # nodes fell back; not while the operator holds the switch
             line.flush()
         return not self.wish.stop
 
@@ -300,6 +289,18 @@ class Drive:
                 return
             self.nodes.hear(frame)
         raise OverflowError(f"bus: expected fewer than {MAX_FRAMES} frames in a row, got more")
+
+    def _wait(self) -> None:
+        """Listen and rehearse until the deadline."""
+        line = self.line
+        end = min(self.deadline, line.now() + self.machine.dt)  # the clock may have gone backwards
+        with self._caught():
+            self._listen(end - AWAKE)
+            line.rest(max(0.0, end - AWAKE - line.now()))
+            self._rehearse(end)
+            self._listen(end, AWAKE)
+        line.rest(max(0.0, end - line.now()))  # a broken bus does not wait
+        self._next_deadline()
 
     def _next_deadline(self) -> None:
         """The next deadline in the future on the same grid; a new grid if the clock went backwards."""

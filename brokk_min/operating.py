@@ -27,7 +27,8 @@ class Simulate(Command):
 
     interface: str  # python-can's name of the bus, udp_multicast for a try without hardware.
     channel: str  # Channel of the interface, for udp_multicast 239.74.163.2.
-    start: tuple[float, ...] = remote.START  # Angles at the start [rad].
+    start: tuple[float, ...] = ()
+    """Angles at the start [rad]; by default the paper's, pointing forward, or amid the ranges."""
     record: Path | None = None
     """Also log command in force and true angles at every step of the plant here, .csv."""
 

@@ -33,7 +33,7 @@ from brokk_min.adjoint import Rollout, action_gradients
 from brokk_min.env import State, TaskConfig, observation_scale, paper_view, to_command
 from brokk_min.environments import TaskVectorEnv
 from brokk_min.extras import need
-from brokk_min.logs import load_arrays, whole_file
+from brokk_min.logs import expect_same, load_arrays, whole_file
 from brokk_min.machine import Machine
 from brokk_min.policy import Policy, contract, save_policy
 
@@ -380,10 +380,7 @@ class Training:
         """
         arrays = load_arrays(path)
         header = load_header(path, arrays, "checkpoint", FORMAT)
-        known = header.get("identity", {})
-        for name, wanted in identity.items():
-            if (found := known.get(name)) != wanted:
-                raise ValueError(f"{path}: {name}: expected {wanted}, got {found}")
+        expect_same(path, header.get("identity", {}), identity)
         tensors = {name: torch.from_numpy(a) for name, a in arrays.items() if name != "header"}
         try:
             self._restore(header, arrays, tensors)

@@ -295,8 +295,8 @@ def plots(machine: Machine, net: ActuatorNet, seed: int) -> dict[str, Any]:
         angle = f"{names[-1]} [rad]"
         rows += [
             [
-                figures.Panel(f"{name}: range and direction", angle, of, _pairs(tests.sweeps)),
-                figures.Panel(f"{name}: coupling", angle, of, _pairs(tests.coupling)),
+                figures.Panel(f"{name}: range and direction", angle, of, tests.sweeps),
+                figures.Panel(f"{name}: coupling", angle, of, tests.coupling),
                 figures.Panel(f"{name}: past movement", "time after the step [s]", of, stepping),
             ]
         ]
@@ -319,10 +319,6 @@ def plots(machine: Machine, net: ActuatorNet, seed: int) -> dict[str, Any]:
         ],
     ]
     return {"preliminary": figures.plot_panels(rows), "sim_to_real": figures.plot_panels(differences)}
-
-
-def _pairs(curves: dict[str, Array]) -> dict[str, tuple[Array, Array]]:
-    return {label: (angle, velocity) for label, (angle, velocity) in curves.items()}
 
 
 # --- whether nets fitted to any log can be trusted ----------------------------------------------------
@@ -355,9 +351,9 @@ def judge(net: ActuatorNet, log: Log, test: Log, machine: Machine | None = None)
     return {"joints": joints, "tool": tool, "warnings": warnings}
 
 
-def creep(net: ActuatorNet, seconds: float = 10.0) -> Array:
-    """Largest speed [rad/s] (n,) of joints left at rest without a command, from 21 angles over the range."""
-    q = np.linspace(net.q_low, net.q_high, 21)
+def creep(net: ActuatorNet) -> Array:
+    """Largest speed [rad/s] (n,) of joints left without a command for 10 s, from 21 angles over the range."""
+    seconds, q = 10.0, np.linspace(net.q_low, net.q_high, 21)
     angles = net_mover(net)(q, np.zeros((round(seconds * net.rate), *q.shape)))
     return np.asarray(np.abs(angles[-1] - q).max(axis=0) / seconds)
 

@@ -25,6 +25,7 @@ from brokk_min import experiments
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import TaskConfig
 from brokk_min.extras import need
+from brokk_min.logs import expect_same
 from brokk_min.machine import Machine
 from brokk_min.metrics import by_start, mean_interval
 from brokk_min.policy import PolicyController, load_policy
@@ -62,9 +63,7 @@ def _finished(path: Path, identity: Mapping[str, Any]) -> Rows:
         found = result["identity"]
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: expected the result of a seed, got {error!r}") from error
-    for name, wanted in identity.items():
-        if found.get(name) != wanted:
-            raise ValueError(f"{path}: {name}: expected {wanted}, got {found.get(name)}")
+    expect_same(path, found, identity)
     return runs
 
 
@@ -115,7 +114,7 @@ def sweep(
     config: PPOConfig,
     seeds: Sequence[int],
     out: Path,
-    starts: int = 16,
+    starts: int,
     scheduler: str | None = None,
     gains: Path | None = None,
 ) -> dict[str, dict[str, Any]]:

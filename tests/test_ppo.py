@@ -725,7 +725,7 @@ def killed(tmp_path, monkeypatch):
         ({"seed": 6}, r"seed: expected 6, got 5"),
         ({"config": replace(TINY, gamma=0.5)}, r"settings: expected .*'gamma': 0\.5.*got .*gamma"),
         ({"task": TaskConfig(episode_s=0.7)}, r"task: expected .*0\.7.*, got .*0\.6"),
-        ({"net": small_net(BROKK_170, np.random.default_rng(1))}, r"actuator: expected \w+, got \w+"),
+        ({"net": small_net(BROKK_170, np.random.default_rng(1))}, r"actuator: expected '\w+', got '\w+'"),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )
