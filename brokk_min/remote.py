@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min import hw
+from brokk_min import hw, wishes
 from brokk_min.bus import open_line
 from brokk_min.env import Controller, to_command
 from brokk_min.machine import PWM_MAX, Machine
@@ -110,17 +110,17 @@ class Remote:
         self.asks, self.chosen, self.levers, self.clock = asks, chosen, levers, clock
         self.ask: Ask | None = None
 
-    def __call__(self, driving: bool, ready: bool) -> hw.Wish:
+    def __call__(self, driving: bool, ready: bool) -> wishes.Wish:
         """The wish of this tick."""
         if (values := self.asks.read()) is not None:
             self.ask = unpack_ask(values)
         ask = self.ask
         if ask is None or self.clock() - ask.time > STALE:
             parent = multiprocessing.parent_process()
-            return hw.Wish(alive=False, stop=parent is not None and not parent.is_alive())
+            return wishes.Wish(alive=False, stop=parent is not None and not parent.is_alive())
         self.chosen.mode, self.levers.levers = ask.mode, ask.levers
         x, y, z = map(float, ask.v_goal)
-        return hw.Wish((x, y, z), ask.enable, ask.alive, ask.stop)
+        return wishes.Wish((x, y, z), ask.enable, ask.alive, ask.stop)
 
 
 class Loop(hw.Drive):

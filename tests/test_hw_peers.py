@@ -25,7 +25,7 @@ from canopen.objectdictionary import ObjectDictionary, ODArray, ODRecord, ODVari
 from helpers_bus import START, Hand, Push, World
 from helpers_machines import small_net
 
-from brokk_min import bus, experiments, hw, simulator
+from brokk_min import bus, experiments, hw, simulator, wishes
 from brokk_min.__main__ import main
 from brokk_min.actuator import load_net
 from brokk_min.env import observation_scale
@@ -250,7 +250,7 @@ def test_missing_extras_are_named(policy: Policy, tmp_path: Path, monkeypatch: p
     with pytest.raises(ValueError, match=r"onnx: expected the extra brokk_min\[export\]"):
         export_onnx(tmp_path / "p.onnx", policy)
     with pytest.raises(ValueError, match=r"pygame: expected the extra brokk_min\[play\]"):
-        hw.Joystick(BROKK_170)
+        wishes.Joystick(BROKK_170)
     with pytest.raises(ValueError, match=r"can: expected the extra brokk_min\[hw\]"):
         list(bus.read_frames(tmp_path / "run.log"))
 
