@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 import tyro
 
-from brokk_min import chain, experiments, figures, preliminary
+from brokk_min import chain, experiments, figures, preliminary, trust
 from brokk_min.actuator import load_net, save_net
 from brokk_min.env import Controller, TaskConfig, fitting_nets
 from brokk_min.excitation import collect
@@ -70,7 +70,7 @@ class Fit:
             raise ValueError(f"LOGS: expected joints of --machine {self.machine}, got {list(log.joints)}")
         settings = replace(self.settings, **PAPER_RECIPE) if self.paper else self.settings
         net = fit(log, settings, self.seed, self.velocity_samples, known.name if known else "")
-        verdict = preliminary.judge(net, log, test, known)
+        verdict = trust.judge(net, log, test, known)
         save_net(self.out, net)
         if self.json:
             meta: dict[str, Any] = {"seed": self.seed, "rate": net.rate, "history": net.history}

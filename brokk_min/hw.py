@@ -2,8 +2,8 @@
 
 Each tick of `Drive`: SYNC, the encoders' positions, the observation, the controller, the safety gate, the
 valve frame. `gate` decides what may reach the valves, `bus` carries frames, `blackbox` runs the loop again on
-its logs, `simulator` is a machine to try. Nothing here is a safety function:
-a real machine keeps its hard-wired emergency stop (docs/hardware.md).
+its logs, `simulator` is a machine to try. Nothing here is a safety function: a real machine keeps its
+hard-wired emergency stop (docs/hardware.md).
 """
 
 from __future__ import annotations
