@@ -1,4 +1,4 @@
-"""What only some commands need: imported when they run, and missed in one line."""
+"""Packages that only some commands need, imported when one of these runs (pyproject.toml has them as extras)."""
 
 from __future__ import annotations
 
