@@ -1,4 +1,4 @@
-"""Packages that only some commands need, imported when one of these runs (pyproject.toml has them as extras)."""
+"""Packages that only some commands need (the extras of pyproject.toml), imported when one of these runs."""
 
 from __future__ import annotations
 

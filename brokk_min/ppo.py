@@ -333,17 +333,15 @@ class Training:
 
     def policy(self, training: dict[str, Any]) -> Policy:
         """The actor as it stands, for the machine it was trained for."""
-        layers = [layer for layer in self.agent.actor if isinstance(layer, nn.Linear)]
-        weights = [
-            (layer.weight.detach().numpy().T.copy(), layer.bias.detach().numpy().copy()) for layer in layers
-        ]
-        if self.env.config.paper:
-            weights[0] = (weights[0][0] * paper_view(self.env.machine)[:, None], weights[0][1])
-        mean, scale = observation_scale(self.env.machine)
-        flat = tuple(array for pair in weights for array in pair)
-        if self.env.net is None:
+        machine, net = self.env.machine, self.env.net
+        if net is None:
             raise ValueError("actuator: expected a policy trained on nets, got the analytic plant")
-        return Policy(contract(self.env.machine), training, mean, scale, flat, self.env.net)
+        layers = [layer for layer in self.agent.actor if isinstance(layer, nn.Linear)]
+        arrays = (array.detach().numpy() for layer in layers for array in (layer.weight.T, layer.bias))
+        first, *rest = (array.copy() for array in arrays)
+        if self.env.config.paper:
+            first = first * paper_view(machine)[:, None]
+        return Policy(contract(machine), training, *observation_scale(machine), (first, *rest), net)
 
     # --- checkpoints: all of the above as arrays, nothing pickled
 
