@@ -29,7 +29,8 @@ from brokk_min import (
     preliminary,
     sequences,
 )
-from brokk_min.env import TaskConfig, TaskVectorEnv, rollout, terminated
+from brokk_min.env import TaskConfig, rollout, terminated
+from brokk_min.environments import TaskVectorEnv
 from brokk_min.jacobian import JacobianController
 from brokk_min.machine import BROKK_170
 from brokk_min.options import SHIPPED

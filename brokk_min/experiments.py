@@ -378,11 +378,11 @@ def singular_case(
     return traces, {"summary": summary(runs), "claims": claims.singular_claims(runs, share)} | near
 
 
-def driven_log(machine: Machine, traces: Traces, controller: str, runs: int = 16) -> logs.Log:
-    """What encoders and valves said in one controller's first runs, for `score`. Paper: Sec. 4.1"""
+def driven_log(machine: Machine, traces: Traces, controller: str) -> logs.Log:
+    """What encoders and valves said in one controller's first 16 runs of each sequence. Paper: Sec. 4.1"""
     recordings = []
     for (name, sequence), trace in traces.items():
-        for i in range(min(runs, trace.q.shape[1]) * (name == controller)):
+        for i in range(min(16, trace.q.shape[1]) * (name == controller)):
             u, q = trace.u[:, i].astype(float), trace.q_measured[:, i].astype(float)
             velocity = logs.velocity_of(q, machine.velocity_samples, machine.rate)
             recordings.append(logs.Recording(f"{name}_{sequence}_{i:02d}", u, q, velocity))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from brokk_min.actuator import ActuatorNet, load_header, net_arrays, net_from_arrays
 from brokk_min.env import fitting_nets, observation_scale, to_command
-from brokk_min.logs import load_arrays, whole_file
+from brokk_min.logs import expect_same, load_arrays, whole_file
 from brokk_min.machine import Machine
 
 Array = NDArray[np.floating[Any]]
@@ -105,10 +105,8 @@ def load_policy(path: Path, machine: Machine) -> Policy:
     """
     arrays = load_arrays(path)
     header = load_header(path, arrays, "policy", FORMAT)
-    wanted, found = contract(machine), header.get("contract", {})
-    for name, value in wanted.items():
-        if found.get(name) != value:
-            raise ValueError(f"{path}: {name}: expected {value!r}, got {found.get(name)!r}")
+    found = header.get("contract", {})
+    expect_same(path, found, contract(machine))
     try:
         weights = tuple(arrays[f"weight_{i}"] for i in range(8))
         net = {name[4:]: array for name, array in arrays.items() if name.startswith("net_")}

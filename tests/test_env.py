@@ -27,7 +27,8 @@ from strategies import machines
 from brokk_min import env as task
 from brokk_min import kinematics
 from brokk_min.actuator import save_net
-from brokk_min.env import TaskConfig, TaskEnv, TaskVectorEnv
+from brokk_min.env import TaskConfig
+from brokk_min.environments import TaskEnv, TaskVectorEnv
 from brokk_min.jacobian import GAINS, JacobianController, join_gains
 from brokk_min.kinematics import joint_rates, tool_position, tool_velocity
 from brokk_min.machine import BROKK_170, estimate_velocity, read_encoder

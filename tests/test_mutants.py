@@ -157,7 +157,8 @@ PLANTED: list[tuple[str, str, str, str]] = [
     ("env", "np.where(end, 0.0, rewards)", "rewards", "env::poses_in_the_ground_end_at_once_without_reward"),
     ("env", "round(config.episode_s * machine.rate)) & ~end", "round(config.episode_s * machine.rate))",
      "env::ground_and_time_limit_are_never_both"),
-    ("env", "observation = observation.copy()", "pass", "env::final_obs_is_the_end_of_the_old_episode"),
+    ("environments", "observation = observation.copy()", "pass",
+     "env::final_obs_is_the_end_of_the_old_episode"),
     ("env", "a[rows] = b\n", "a[: len(b)] = b\n", "env::merge_replaces_whole_rows_and_nothing_else"),
     ("env", "kind < config.zero_goals + config.axis_goals", "kind < config.axis_goals",
      "env::goals_have_the_configured_shares_speeds_and_directions"),
@@ -251,11 +252,11 @@ PLANTED: list[tuple[str, str, str, str]] = [
      "paper::figure_6_runs_every_controller_and_shows_its_panels"),
     # the bus
     ("gate", "np.maximum(last, 0) + SLEW", "last + SLEW", "gate::the_gate_is_what_its_promises_say"),
-    ("hw", "round(1e4 * v)", "int(1e4 * v)", "hw::wishes_are_rounded_not_cut"),
-    ("hw", "expo * s**3", "expo * s**2", "hw::axes_are_shaped_evenly_to_both_sides"),
-    ("hw", "asked * chosen * self.counts", "asked * self.counts",
+    ("wishes", "round(1e4 * v)", "int(1e4 * v)", "hw::wishes_are_rounded_not_cut"),
+    ("wishes", "expo * s**3", "expo * s**2", "hw::axes_are_shaped_evenly_to_both_sides"),
+    ("wishes", "asked * chosen * self.counts", "asked * self.counts",
      "hw::jog_moves_one_joint_the_way_the_stick_points"),
-    ("hw", "ready and not self.pressed", "ready", "hw::a_script_waits_presses_plays_and_ends"),
+    ("wishes", "ready and not self.pressed", "ready", "hw::a_script_waits_presses_plays_and_ends"),
     ("bus", "(4 - (frame.data[0] >> 2 & 3))", "4", "hw::sdo_reads_small_objects_and_skips_foreign_answers"),
     ("simulator", "int(data[5]) - 1) % 256", "int(data[5]) - 1)",
      "hw::reward_over_the_bus_is_that_of_evaluate"),
@@ -343,7 +344,7 @@ def calls(test: Callable[..., object], fixtures: dict[str, object]) -> Iterator[
 def test_planted_errors_are_many_and_in_every_module_that_works_out_numbers() -> None:
     assert len(PLANTED) >= 40
     numeric = "machine kinematics logs plant excitation actuator fitting scores env ppo policy jacobian"
-    others = "sequences experiments metrics figures gate bus hw simulator"
+    others = "sequences experiments metrics figures gate bus wishes simulator"
     assert {*numeric.split(), *others.split()} <= {module for module, *_ in PLANTED}
 
 

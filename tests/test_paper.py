@@ -31,7 +31,8 @@ from brokk_min import (
     scores,
     sequences,
 )
-from brokk_min.env import TaskConfig, TaskVectorEnv, paper_view
+from brokk_min.env import TaskConfig, paper_view
+from brokk_min.environments import TaskVectorEnv
 from brokk_min.kinematics import tool_position
 from brokk_min.logs import velocity_of
 from brokk_min.machine import BROKK_170
