@@ -47,7 +47,7 @@ STATE = [f.name for f in fields(State) if f.name != "plant"]
 class PPOConfig:
     """Settings of the learner; those that the paper names are marked."""
 
-    total_steps: int = 10_000_000
+    total_steps: int = 6_000_000
     """Environment steps in all."""
     num_envs: int = 256
     """Environments side by side (paper: 256)."""
@@ -59,7 +59,7 @@ class PPOConfig:
     """Steps in one gradient."""
     learning_rate: float = 4e-3
     """Of Adam at the start and at most; follows `target_kl` and falls linearly to zero at the end."""
-    target_kl: float = 0.1
+    target_kl: float = 0.3
     """Change of the policy in one update at which the learning rate stays as it is (rule of rl_games)."""
     critic: bool = False
     """Advantages by a critic and GAE, as in the paper and under `--paper`, not by the nets' derivatives."""

@@ -122,7 +122,8 @@ def test_commands_rise_with_actions_by_their_slope(machine, one, other):
     """Odd, never falling; and the slopes below and above the end of the dead zone add up to the limit."""
     low, high = sorted([one, other])
     driven, limit = machine.driven, machine.pwm_limit / 127
-    u = task.to_command(machine, np.array([[low], [high], [-high], [1.0]]) * np.ones(len(driven)))[..., driven]
+    action = np.array([[low], [high], [-high], [1.0]]) * np.ones(len(driven))
+    u = task.to_command(machine, action)[..., driven]
     assert (u[0] <= u[1]).all() and np.array_equal(u[1], -u[2])
     np.testing.assert_allclose(u[3], limit, atol=1e-9)
     slope = task.command_slope(machine, np.array([[0.0], [limit], [-limit]]) * np.ones(machine.n))

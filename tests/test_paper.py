@@ -239,6 +239,7 @@ def test_the_constants_are_the_papers() -> None:
         "jacobian_pid_k0.1": 0.1,
         "jacobian_pid_k0.05": 0.05,
         "jacobian_pid_ff": 0.1,
+        "jacobian_pid_ff_awake": 0.1,
     }
     assert jacobian.GAINS["feedback"] == (0.0, 1.0)
 

@@ -186,7 +186,9 @@ def test_the_papers_recipe_is_sines_without_ways_back_and_errors_of_one_step(mon
     monkeypatch.setattr(excitation, "collect", lambda *a: seen.update(excitation=a[2]) or real_collect(*a))
     test = excitation.task_log(BROKK_170, 2, 12.0, np.random.default_rng(1))
     result = preliminary.paper_recipe(BROKK_170, test, 0.02, FitConfig(steps=3, batch_size=8), 0)
-    assert seen["excitation"] == "sine" and seen["config"] == FitConfig(3, 8, noise=0.0, rollout=1)
+    assert seen["excitation"] == "sine" and seen["config"] == FitConfig(
+        3, 8, noise=0.0, rollout=1, dead_zone=0.0
+    )
     assert seen["log"].recordings and not any(r.name.endswith("_return") for r in seen["log"].recordings)
     assert set(result["test"]) == set(BROKK_170.names) and "10" in result["test"]["q5"]["free_run"]
     assert result["sim_to_real"]["tool_position_error_mean_of_runs"]["runs"] == 20
