@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,13 @@ from brokk_min.machine import BROKK_170
 
 PAPERS = experiments.PAPERS
 POSE = np.array([1.5, 0.5, 0.58, 1.71, 1.24])
+
+
+def judged(found: list[dict[str, Any]]) -> list[bool | None]:
+    """The verdicts on claims, each on a sentence of the paper."""
+    for claim in found:
+        assert re.fullmatch(r"(RL:?|[A-Z][a-z]*) [^X]*[a-z][^X]*\.", claim["paper"]), claim["paper"]
+    return [claim["holds"] for claim in found]
 
 
 def runs_with(key: str, **values: float) -> list[dict[str, Any]]:
@@ -37,14 +45,14 @@ def runs_with(key: str, **values: float) -> list[dict[str, Any]]:
 )
 def test_drift(rl: float, high: float, low: float, holds: list[bool]) -> None:
     found = claims.drift_claims(runs_with("off_axis_drift_max", rl=rl, high=high, low=low), PAPERS)
-    assert [claim["holds"] for claim in found] == holds
+    assert judged(found) == holds
     assert f"{rl + 0.001:.3g}" in found[0]["measured"]
 
 
 def test_one_start_gives_no_verdict() -> None:
     runs = [run for run in runs_with("off_axis_drift_max", rl=0.1, high=0.2, low=0.2) if run["start"] == 0]
     found = claims.drift_claims(runs, PAPERS)
-    assert [claim["holds"] for claim in found] == [None, None]
+    assert judged(found) == [None, None]
     assert report.verdict(found[0]).lines == ((found[0]["measured"], "This was not measured."),)
 
 
@@ -65,7 +73,7 @@ def test_tracking(x: float, z: float, drift: float, holds: list[bool]) -> None:
         drifts = runs_with("off_axis_drift_max", rl=drift, high=0.2, low=0.2)
         runs += [a | b | {"sequence": sequence} for a, b in zip(errors, drifts, strict=True)]
     found = claims.tracking_claims(runs, PAPERS)
-    assert [claim["holds"] for claim in found] == holds
+    assert judged(found) == holds
     assert found[1]["numbers"]["drift z, less jacobian_pid_k0.1"]["mean"] == pytest.approx(drift - 0.2)
 
 
@@ -83,7 +91,7 @@ def test_singular(share: tuple[float, ...], jerk: tuple[float, ...], holds: list
     spread = 0.01 * np.array([0, 1, 2, 0, 1, 2])
     runs = runs_with("jerk_rms", **dict(zip(("rl", "high", "low"), jerk, strict=True)))
     found = claims.singular_claims(runs, {n: s + spread for n, s in zip(names, share, strict=True)})
-    assert [claim["holds"] for claim in found] == holds
+    assert judged(found) == holds
 
 
 def still_trace(ticks: int, q: np.ndarray, v: np.ndarray, q_dot: np.ndarray) -> Trace:
@@ -150,7 +158,7 @@ def test_machine_and_nets_are_as_the_paper_found_its_own() -> None:
         ({"sim_to_real": far}, [True, True, True, False]),
     ):
         found = claims.net_claims(preliminary_numbers(**change))
-        assert [claim["holds"] for claim in found] == holds, change
+        assert judged(found) == holds, change
     assert (
         "nets, idle none"
         in claims.net_claims(preliminary_numbers(response_time={"nets": never}))[1]["measured"]

@@ -91,6 +91,14 @@ def test_a_run_that_does_not_settle_counts_to_the_next_change() -> None:
     assert figures(v, goals)["settling_time"] == pytest.approx((20 * 0.05 + 0) / 2)
 
 
+def test_a_change_at_the_last_tick_counts_too() -> None:
+    goals = np.zeros((10, 3))
+    goals[9:, 1] = 0.2
+    assert figures(np.zeros((10, 3)), goals)["settling_time"] == pytest.approx(0.05)
+    goals[5:9, 1] = 0.1  # a change to 0.1 that is met at once, and that one
+    assert figures(goals - 0.2 * (goals == 0.2), goals)["settling_time"] == pytest.approx((0 + 0.05) / 2)
+
+
 def test_a_slow_goal_is_not_met_by_standing_still() -> None:
     """0.03 m/s, a tenth of the tool's speed: an error of 0.02 is no settling, one of 0.01 is."""
     goals = np.zeros((40, 3))
