@@ -289,3 +289,40 @@ def test_a_restless_hand_stays_within_the_dead_zone():
     u = EXCITATIONS["rich"](Picked("go", hand=1, low=True), BROKK_170, 100_000)
     rest = u[np.abs(u) < 0.07]
     assert len(rest) > 50_000 and (rest != 0).all() and min(rest.max(), -rest.min()) > 0.06
+
+
+class Sudden(np.random.Generator):
+    """Draws no noise, and commands that are at once at their levels."""
+
+    def __init__(self) -> None:
+        super().__init__(np.random.PCG64(0))
+
+    def uniform(self, low=0.0, high=1.0, size=None):
+        drawn = super().uniform(low, high, size)
+        return drawn * 0 + 1 if np.isscalar(low) and (low, high) == (0.05, 0.6) else drawn
+
+    def standard_normal(self, *args, **options):
+        return super().standard_normal(*args, **options) * 0
+
+
+def test_joints_of_a_task_hold_each_a_level_for_a_time_of_its_own_and_go_to_the_nearer_end_less_often():
+    log = task_log(BROKK_170, 10, 80.0, Sudden())
+    low, span = BROKK_170.column("q_min"), BROKK_170.column("q_max") - BROKK_170.column("q_min")
+    held, levels, places, together = [], [], [], []
+    for i, r in enumerate(log.recordings):
+        changes = np.diff(r.u, axis=0) != 0
+        for j in [1] if i % 5 == 4 else [0, 2, 3, 4]:
+            at = np.flatnonzero(changes[:, j])
+            held += np.diff(at).tolist()
+            levels += r.u[at + 1, j].tolist()
+            places += ((r.q[at + 1, j] - low[j]) / span[j]).tolist()
+            together.append(changes[at][:, [k for k in range(5) if k not in (1, j)]].mean())
+    short, middle, long = np.quantile(held, [0.05, 0.5, 0.97])
+    assert 9 < short < 20 and 45 < middle < 65 and 93 < long < 150
+    levels, places = np.array(levels), np.array(places)
+    assert min(levels.max(), -levels.min()) > 0.98 * LIMIT and 0.08 < np.mean(levels == 0) < 0.22
+    upward = [np.mean(levels[near & (levels != 0)] > 0) for near in (places < 0.3, places > 0.7)]
+    assert upward[0] > 0.8 and upward[1] < 0.2 and max(together) < 0.1
+    noisy = task_log(BROKK_170, 4, 20.0, np.random.default_rng(0))
+    steps = np.abs(np.concatenate([np.diff(r.u[:, [0, 2, 3, 4]], axis=0) for r in noisy.recordings])) * 127
+    assert steps.max() < 100 and 0.5 < np.median(steps) < 10
