@@ -18,10 +18,20 @@ POSE = np.array([1.5, 0.5, 0.58, 1.71, 1.24])
 
 
 def judged(found: list[dict[str, Any]]) -> list[bool | None]:
-    """The verdicts on claims, each on a sentence of the paper."""
+    """The verdicts on claims, each on a sentence of the paper, with what was measured and its unit."""
     for claim in found:
         assert re.fullmatch(r"(RL:?|[A-Z][a-z]*) [^X]*[a-z][^X]*\.", claim["paper"]), claim["paper"]
+        what, end = claim["measured"], ": " + claims.said(claim["numbers"], claim["unit"])
+        assert what.endswith(end) and re.match("(RL's )?[a-z]", what) and "XX" not in what, what
+        assert claim["unit"] in ("1", "s", "h", "m", "rad/s", "m/s, m", "m/s^3")
+        assert all(name == name.lower() and len(n) == 3 for name, n in claim["numbers"].items())
     return [claim["holds"] for claim in found]
+
+
+def test_numbers_are_said_with_their_intervals() -> None:
+    numbers = {"a": {"mean": 1.0, "low": 0.5, "high": 1.5}, "b": {"mean": 2.0, "low": None, "high": None}}
+    none = {"mean": None, "low": None, "high": None}
+    assert claims.said(numbers | {"c": none}, "m") == "a 1 (0.5 to 1.5); b 2; c none [m]"
 
 
 def runs_with(key: str, **values: float) -> list[dict[str, Any]]:
@@ -124,7 +134,7 @@ def test_direction(down: float, holds: bool) -> None:
         share = np.where(goals[:, None, :1] > 0, 0.9, down)
         q_dot[..., driven] = share * pid.rates(seen, q_dot[..., driven])
     found = claims.direction_claim(BROKK_170, pid, trace, goals)
-    assert found["holds"] is holds
+    assert judged([found]) == [holds]
     errors = sorted({round(n["mean"], 2) for n in found["numbers"].values() if n["mean"] is not None})
     assert errors == sorted({0.1, round(1 - down, 2)})
 
@@ -168,7 +178,7 @@ def test_machine_and_nets_are_as_the_paper_found_its_own() -> None:
 @pytest.mark.parametrize(("hours", "holds"), [(0.1, False), (2.0, True), (4.0, True), (6.0, False)])
 def test_training_lasts_as_long_as_the_papers_or_not(hours: float, holds: bool) -> None:
     claim = claims.training_claim(hours * 3600, 8_000_000)
-    assert claim["holds"] is holds and "8,000,000" in claim["measured"]
+    assert judged([claim]) == [holds] and "8,000,000" in claim["measured"]
 
 
 def test_a_stronger_baseline_stands_beside_the_papers() -> None:
