@@ -68,6 +68,26 @@ def test_a_step_never_makes_the_plan_worse() -> None:
         costs.append(cost(plan))
     assert (np.diff(costs, axis=0) < 1e-4).all()
     assert (costs[-1] < 0.8 * costs[0]).all()
+    room = (80 / 127 - BROKK_170.dead_zone) / (1 - BROKK_170.dead_zone)
+    assert np.abs(bound.improve(plant, plan, 9 * goal, 0)).max() == pytest.approx(room)  # no further
+
+
+def test_a_valve_that_is_hardly_open_goes_to_and_fro() -> None:
+    bound, opening = mpc.PerfectModel(BROKK_170, POSES), np.tile([0.0, 0.04, 0.08, -0.3], (4, 1))
+    u = bound.commands(opening, 3)[:, BROKK_170.driven]
+    found = np.sign(u) * (np.abs(u) - BROKK_170.dead_zone) / (1 - BROKK_170.dead_zone)
+    wanted = [[-0.04, 0.02, 0.08, -0.3], [0.04, 0.06, 0.08, -0.3]]  # by 0.04 less half the opening
+    np.testing.assert_allclose(found, wanted * 2, atol=1e-8)
+
+
+def test_a_plan_begins_at_rest_and_goes_on_tick_by_tick() -> None:
+    bound, goals = mpc.PerfectModel(BROKK_170, POSES), np.full((4, 3), 0.1)
+    memory = bound.start(4)
+    np.testing.assert_array_equal(memory.plant.q, np.concatenate([POSES, POSES]))
+    assert memory.tick == 0 and not memory.opening.any()
+    state = rest_state(BROKK_170, memory.plant.q, goals, plant=True)
+    _, after = bound(observe(BROKK_170, state.history, goals, state.lag), memory)
+    assert after.tick == 1 and after.opening.shape == memory.opening.shape
 
 
 def test_the_bound_leaves_less_error_than_the_baselines() -> None:
