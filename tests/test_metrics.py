@@ -37,6 +37,7 @@ def test_line_distance_before_the_first_motion_is_from_the_start() -> None:
 def test_line_distance_of_a_batch_is_that_of_its_runs() -> None:
     rng = np.random.default_rng(0)
     goals = np.repeat(rng.integers(-1, 2, (6, 4, 3)) * 0.1, 5, axis=0)
+    goals[:10, 0] = 0.0  # one rests while the others move
     p, start = rng.normal(size=(30, 4, 3)), rng.normal(size=(4, 3))
     whole = m.line_distance(p, goals, start)
     for i in range(4):
@@ -148,6 +149,7 @@ def test_intervals_are_students() -> None:
     expected = stats.ttest_1samp(values, 0).confidence_interval(0.95)
     np.testing.assert_allclose(m.interval(np.append(values, np.nan)), expected)
     assert m.interval(np.array([1.0, np.nan])) == [None, None]
+    assert m.interval(np.array([1.0, 3.0])) == pytest.approx([2 - 12.7062, 2 + 12.7062], abs=1e-4)
 
 
 def run(controller: str, sequence: str, start: int, error: float | None) -> dict[str, object]:
@@ -183,6 +185,7 @@ def test_a_summary_leaves_out_what_was_not_measured() -> None:
     found = m.summary(runs)["a"]
     assert found["x"]["error"] == 2.0 and found["y"]["error"] is None and found["all"]["error"] == 2.0
     assert m.intervals(runs)["a"]["y"]["error"] == [None, None]
+    assert m.intervals(runs)["a"]["x"]["error"] == m.interval(np.array([1.0, 3.0]))
 
 
 def test_drift_is_the_largest_and_the_mean_distance_from_the_line() -> None:
