@@ -164,6 +164,7 @@ def test_a_whole_recording_is_scored_from_the_sample_after_the_first_history():
     log = Log(("a",), (line("a", 0.0, 0.1, 40)._replace(q_dot=q_dot),), True)
     wanted = np.sqrt(np.mean((0.2 - q_dot[net.history + 1 :]) ** 2))
     assert scores.recording_errors(net, log, 30.0) == pytest.approx(wanted, abs=1e-6)
+    assert score(net, log)["a"]["one_step_rmse"] == pytest.approx(wanted, abs=1e-6)  # the log's velocities
 
 
 def test_scores_need_the_same_joints_and_one_step_at_least():
