@@ -1,8 +1,8 @@
 """What the deviations and assumptions of PAPER.md change, measured.
 
 Each function returns the figures of one entry; `python -m benchmarks.deviations` prints them. D4, D5, D7,
-D10, A4 and A5 fit nets and train policies: `python -m benchmarks.deviations --train`, some 15 minutes. An
-entry's name prints that entry alone: `python -m benchmarks.deviations d4`.
+D10 to D12, A4 and A5 fit nets and train policies: `python -m benchmarks.deviations --train`, some 25 minutes.
+An entry's name prints that entry alone: `python -m benchmarks.deviations d4`.
 """
 
 from __future__ import annotations
@@ -13,11 +13,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import numpy as np
 
 from brokk_min import (
+    actuator,
     env,
     excitation,
     experiments,
@@ -29,9 +31,10 @@ from brokk_min import (
     preliminary,
     sequences,
 )
-from brokk_min.env import TaskConfig, TaskVectorEnv, rollout, terminated
+from brokk_min.env import TaskConfig, rollout, terminated
+from brokk_min.environments import TaskVectorEnv
 from brokk_min.jacobian import JacobianController
-from brokk_min.machine import BROKK_170
+from brokk_min.machine import BROKK_170, PWM_MAX
 from brokk_min.options import SHIPPED
 from brokk_min.policy import PolicyController, load_policy
 
@@ -130,14 +133,20 @@ NOISE = fitting.FitConfig().noise
 STEPS = 2_000_000  # of each training here, a fifth of the default
 
 
-@cache
-def fitted(kind: str, noise: float, seed: int) -> dict[str, float]:
-    """Nets of the driven joints fitted to 1 h a joint, on drives like a policy's: the worst joint."""
+def nets(kind: str, seed: int, **settings: float) -> tuple[actuator.ActuatorNet, logs.Log]:
+    """Nets fitted to 1 h a joint with some settings, and the log."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "log.npz"
         logs.write_log(path, excitation.collect(M, 1.0, kind, np.random.default_rng(seed)))
         log = logs.read_log([path], M.velocity_samples)
-    net = fitting.fit(log, fitting.FitConfig(noise=noise), seed, M.velocity_samples, M.name)
+    config = replace(fitting.FitConfig(dead_zone=M.dead_zone), **dict[str, Any](settings))
+    return fitting.fit(log, config, seed, M.velocity_samples, M.name), log
+
+
+@cache
+def fitted(kind: str, noise: float, seed: int) -> dict[str, float]:
+    """Nets of the driven joints, on drives like a policy's: the worst joint."""
+    net, log = nets(kind, seed, noise=noise)
     test = excitation.task_log(M, 20, 40.0, np.random.default_rng(seed + 1))
     verdict = preliminary.judge(net, log, test, M)
     rows = [verdict["joints"][M.names[i]] for i in M.driven]
@@ -148,11 +157,16 @@ def fitted(kind: str, noise: float, seed: int) -> dict[str, float]:
     }
 
 
-def trained(task: TaskConfig, critic: bool = False) -> dict[str, float]:
-    """A policy trained on the package's nets, on nets and plant: error [m/s] along x, y, z, valve travel."""
+def trained(
+    task: TaskConfig, critic: bool = False, net: actuator.ActuatorNet | None = None
+) -> dict[str, float]:
+    """A policy trained on the package's nets, or others; there and on the plant: error [m/s], valve travel.
+
+    Along x, y and z.
+    """
     from brokk_min.ppo import PPOConfig, train
 
-    net = load_policy(SHIPPED / M.name / "policy.npz", M).net
+    net = net or load_policy(SHIPPED / M.name / "policy.npz", M).net
     with tempfile.TemporaryDirectory() as folder:
         config = PPOConfig(total_steps=STEPS, critic=critic, threads=1)
         policy = train(M, net, task, config, 0, Path(folder) / "policy.npz")
@@ -203,6 +217,23 @@ def d10() -> dict[str, float]:
     return beside(critic=trained(TaskConfig(), critic=True), ours=as_it_is())
 
 
+def d11() -> dict[str, float]:
+    """Policies trained on nets that see commands as the paper has it, and in whose log no valve hovers."""
+    driven = [M.names[i] for i in M.driven]
+    plain = nets("rich", 0, dead_zone=0.0)[0].select(driven)
+    shares = {"sine": 0.25, "step": 0.15, "holds": 0.25, "go": 0.35}
+    with mock.patch.object(excitation, "MIX", shares):
+        never, old = nets("rich", 0)[0].select(driven), nets("rich", 0, dead_zone=0.0)[0].select(driven)
+    ways = {"plain commands": plain, "no hovering": never, "both": old}
+    return beside(**{name: trained(TaskConfig(), net=net) for name, net in ways.items()}, ours=as_it_is())
+
+
+def d12() -> dict[str, float]:
+    """A policy whose actions begin at 0 counts, dead zone and all."""
+    with mock.patch.object(env, "_command_range", lambda machine: (0.0, machine.pwm_limit / PWM_MAX)):
+        return beside(**{"from 0": trained(TaskConfig())}, ours=as_it_is())
+
+
 def a5() -> dict[str, float]:
     """A policy that sees velocities in the base frame instead of along the tool's heading."""
     with mock.patch.object(env, "_turn", lambda p_tool, vector, sign: vector.copy()):
@@ -210,7 +241,7 @@ def a5() -> dict[str, float]:
 
 
 ENTRIES: tuple[Callable[[], dict[str, float]], ...] = (a1, d1, d3, d6, a6, a7, a9, a11)
-TRAINED: tuple[Callable[[], dict[str, float]], ...] = (d4, a4, d5, d7, d10, a5)
+TRAINED: tuple[Callable[[], dict[str, float]], ...] = (d4, a4, d5, d7, d10, d11, d12, a5)
 
 
 def main() -> None:

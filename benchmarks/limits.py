@@ -25,7 +25,8 @@ import torch
 import tyro
 
 from benchmarks.rollout import random_net
-from brokk_min.env import TaskConfig, TaskVectorEnv
+from brokk_min.env import TaskConfig
+from brokk_min.environments import TaskVectorEnv
 from brokk_min.kinematics import tool_jacobian
 from brokk_min.machine import BROKK_170
 from brokk_min.ppo import PPOConfig, Training

@@ -31,7 +31,7 @@ from gymnasium import spaces
 from benchmarks.rollout import random_net
 from brokk_min import experiments, ppo
 from brokk_min.actuator import ActuatorNet, load_net
-from brokk_min.env import TaskVectorEnv
+from brokk_min.environments import TaskVectorEnv
 from brokk_min.machine import BROKK_170, PWM_MAX
 
 Act = Callable[[np.ndarray], np.ndarray]  # observations (num, obs) -> mean actions (num, 4)

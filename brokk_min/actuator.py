@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -23,6 +24,7 @@ from brokk_min.machine import estimate_velocity
 Array = NDArray[np.floating[Any]]
 FORMAT = 1  # of net files
 STILL = 0.002  # rad, assumed: little more than a step of a 12-bit encoder
+FINE = 0.02  # of full opening, assumed: below it nets see openings on a scale that is about linear
 
 
 def rest_history(q: ArrayLike, samples: int) -> Array:
@@ -63,6 +65,33 @@ def push_angle(history: Array, q: ArrayLike, velocity: Callable[[Array], Array])
     return result
 
 
+def valve_scale(u: ArrayLike, dead_zone: float) -> Array:
+    """Commands as nets see them: what lies beyond the dead zone, on a logarithmic scale; same shape, -1..1.
+
+    A valve is kept awake, or goes idle, by what it is opened within a few counts of its dead zone, and these
+    are a hundredth of all commands. `dead_zone` is a share of full command; 0: `u` as it is, as the paper
+    has it. Paper: Table 1 (u), Sec. 3.2 (7 %)
+
+    Example:
+        >>> valve_scale([-1.0, 0.07, 0.08, 0.1, 0.3], 0.07).round(2)
+        array([-1.  ,  0.  ,  0.11,  0.24,  0.66])
+    """
+    u = np.asarray(u)
+    if not dead_zone:
+        return u
+    opening = np.maximum(np.abs(u) - dead_zone, 0) / (1 - dead_zone)
+    return np.asarray(np.sign(u) * np.log(1 + opening / FINE) / math.log(1 + 1 / FINE))
+
+
+def valve_scale_slope(u: Array, dead_zone: float) -> Array:
+    """Derivative of `valve_scale` by `u`, same shape; 0 within the dead zone."""
+    if not dead_zone:
+        return np.ones_like(u)
+    opening = (np.abs(u) - dead_zone) / (1 - dead_zone)
+    slope = (1 - dead_zone) * (FINE + np.maximum(opening, 0)) * math.log(1 + 1 / FINE)
+    return np.asarray((opening > 0) / slope)
+
+
 # --- nets -----------------------------------------------------------------------------------------
 
 
@@ -90,6 +119,7 @@ class ActuatorNet:
     q_low: Array  # (n,) rad, smallest angle of the training log: the simulation stops there
     q_high: Array  # (n,) rad
     weights: tuple[Array, ...]
+    dead_zone: float = 0.0  # of full command: they were trained on `valve_scale` of commands
 
     def select(self, joints: Sequence[str]) -> ActuatorNet:
         """The same nets for some joints, in the order given.
@@ -126,14 +156,24 @@ class ActuatorNet:
         by = (self.output_high - self.output_low)[:, None, None] * fraction * (1 - fraction)
         by = by @ w3.swapaxes(1, 2) * (second > 0)
         by = by @ w2.swapaxes(1, 2) * (first > 0)
-        return velocity, (by @ w1.swapaxes(1, 2)).swapaxes(0, 1).reshape(history.shape)
+        by = (by @ w1.swapaxes(1, 2)).swapaxes(0, 1).reshape(history.shape)
+        by[..., 2, :] *= valve_scale_slope(history[..., 2, :], self.dead_zone)
+        return velocity, by
+
+    def inputs(self, history: Array) -> Array:
+        """What stands in a history (..., n, 3, H) as nets were shown it, in one row, (..., n, 3 H)."""
+        n = len(self.joints)
+        if history.shape[-3:] != (n, 3, self.history):
+            raise ValueError(f"history: expected (..., {n}, 3, {self.history}), got {history.shape}")
+        if self.dead_zone:
+            history = history.copy()
+            history[..., 2, :] = valve_scale(history[..., 2, :], self.dead_zone)
+        return history.reshape(*history.shape[:-2], 3 * self.history)
 
     def _layers(self, history: Array) -> tuple[Array, ...]:
         """Velocity as `velocity`, then what the layers say, (n, batch, units), the last first."""
-        n, inputs = len(self.joints), 3 * self.history
-        if history.shape[-3:] != (n, 3, self.history):
-            raise ValueError(f"history: expected (..., {n}, 3, {self.history}), got {history.shape}")
-        x = history.reshape(-1, n, inputs).swapaxes(0, 1)  # (n, batch, 3 H)
+        x = self.inputs(history)
+        x = x.reshape(-1, *x.shape[-2:]).swapaxes(0, 1)  # (n, batch, 3 H)
         w1, b1, w2, b2, w3, b3 = self._folded
         first = np.maximum(x @ w1 + b1, 0)
         second = np.maximum(first @ w2 + b2, 0)

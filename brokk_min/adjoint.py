@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brokk_min.actuator import ActuatorNet, push_command
+from brokk_min.env import command_slope
 from brokk_min.kinematics import tool_jacobian
 from brokk_min.machine import PWM_MAX, Machine, estimate_velocity
 
@@ -35,7 +36,8 @@ def action_gradients(
     """Derivative of the discounted rewards to come by each action, all other actions as they were.
 
     Rewards are those of `env.step`. Encoders and commands count as exact, not as whole steps, and the
-    Jacobian as constant: in a second a joint turns little. Paper: Sec. 3.4 (nets in the simulation); ours
+    Jacobian and `env.command_slope` as constant: in a second a joint turns little.
+    Paper: Sec. 3.4 (nets in the simulation); ours
 
     Args:
         machine: n joints.
@@ -45,12 +47,13 @@ def action_gradients(
         valve_cost: of `env.TaskConfig`.
 
     Returns:
-        Shape (T, num, n_driven), float32, by actions in units of the command limit.
+        Shape (T, num, n_driven), float32, by actions as `env.to_command` takes them.
     """
-    driven, unit = machine.driven, machine.pwm_limit / PWM_MAX
+    driven, by_action = machine.driven, command_slope(machine, rollout.u)
     by_velocity, by_history, free = _each_tick(machine, net, rollout)
     turned = (rollout.u - rollout.history[..., 2, -1])[..., driven]
-    cost = np.sign(turned).astype(np.float32) * np.float32(valve_cost / len(driven))
+    cost = np.sign(turned).astype(np.float32)
+    cost *= np.float32(valve_cost / len(driven) * PWM_MAX / machine.pwm_limit)
     samples = machine.velocity_samples
     window = estimate_velocity(np.eye(samples), samples, machine.dt).astype(np.float32)
     result = np.empty_like(by_velocity)
@@ -64,7 +67,7 @@ def action_gradients(
         before = (angle * np.float32(machine.dt) + by_velocity[t])[..., None, None] * by_history[t]
         before[..., :2, 1:] += past[..., :2, :-1]  # each measured sample moves back to where it was,
         before[..., 2, :] += past[..., 2, :]  # commands stand where the tick put them
-        result[t] = before[..., 2, -1] * unit - cost[t] + turn
+        result[t] = (before[..., 2, -1] - cost[t] + turn) * by_action[t]
         before[..., 2, 1:] = before[..., 2, :-1]
         before[..., 2, 0] = 0
         past, turn = before, cost[t]

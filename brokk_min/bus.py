@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from brokk_min.extras import need
 from brokk_min.machine import Machine
 
 # CANopen (CiA 301): identifiers are these plus the node's number
@@ -60,7 +61,7 @@ class Line:
         rest: Callable[[float], object] = time.sleep,
     ) -> None:
         self.bus, self.log, self.name, self.clock, self.rest = bus, log, name, clock, rest
-        self.message = _can().Message
+        self.message = need("can", "hw").Message
         self.kept: deque[Any] = deque()  # messages on their way into the log
         self.start = time.time() - clock()  # candump logs carry the time of day, but it may be set
         self.echo: deque[tuple[int, bytes]] | None = deque(maxlen=64) if echo else None
@@ -134,14 +135,6 @@ def _plain_id(message: Any) -> int:
     return -1 if any(flags) else int(message.arbitration_id)
 
 
-def _can() -> Any:
-    try:
-        import can
-    except ImportError as error:
-        raise ValueError(f"CAN: expected python-can (extra brokk_min[hw]), got {error}") from error
-    return can
-
-
 @contextmanager
 def open_line(interface: str, channel: str, log: Path | None = None) -> Iterator[Line]:
     """A bus by python-can's names, closed at the end of the block; `log` grows while it runs.
@@ -149,7 +142,7 @@ def open_line(interface: str, channel: str, log: Path | None = None) -> Iterator
     Raises:
         ValueError: python-can is not there, finds no such bus, or fails in the block.
     """
-    can = _can()
+    can = need("can", "hw")
     try:
         bus = can.Bus(interface=interface, channel=channel)
     except Exception as error:  # each interface has its own
@@ -185,7 +178,7 @@ def read_frames(path: Path) -> Iterator[Frame]:
     Raises:
         ValueError: no such log, or a line that is no frame.
     """
-    can = _can()
+    can = need("can", "hw")
     try:
         with open(path, encoding="utf-8") as file, can.CanutilsLogReader(file) as reader:
             reader.file = (line for line in file if line.endswith("\n"))

@@ -107,7 +107,7 @@ def fitted(
     machine: Machine, out: Path, log: logs.Log, test: logs.Log, effort: Effort, seed: int
 ) -> tuple[Net, dict[str, Any]]:
     """Nets of all joints, written to `net.npz`, and how those by the paper's recipe fare, for JSON."""
-    config = fitting.FitConfig(steps=effort.fit_steps, history=machine.history)
+    config = fitting.FitConfig(steps=effort.fit_steps, history=machine.history, dead_zone=machine.dead_zone)
     net = fitting.fit(log, config, seed, machine.velocity_samples, machine.name)
     actuator.save_net(out / "net.npz", net)
     half = replace(config, steps=effort.fit_steps // 2)  # for time

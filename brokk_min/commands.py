@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 import tyro
 
-from brokk_min import chain, experiments, figures, preliminary
+from brokk_min import chain, experiments, figures, preliminary, trust
 from brokk_min.actuator import load_net, save_net
 from brokk_min.env import Controller, TaskConfig, fitting_nets
 from brokk_min.excitation import collect
@@ -68,9 +68,12 @@ class Fit:
         known = machine if machine.names == log.joints else None
         if self.machine and not known:
             raise ValueError(f"LOGS: expected joints of --machine {self.machine}, got {list(log.joints)}")
-        settings = replace(self.settings, **PAPER_RECIPE) if self.paper else self.settings
+        settings = self.settings
+        if known and settings.dead_zone is None:
+            settings = replace(settings, dead_zone=known.dead_zone)
+        settings = replace(settings, **PAPER_RECIPE) if self.paper else settings
         net = fit(log, settings, self.seed, self.velocity_samples, known.name if known else "")
-        verdict = preliminary.judge(net, log, test, known)
+        verdict = trust.judge(net, log, test, known)
         save_net(self.out, net)
         if self.json:
             meta: dict[str, Any] = {"seed": self.seed, "rate": net.rate, "history": net.history}
@@ -211,13 +214,18 @@ class Evaluate(Command):
             names = ", ".join(sequence.name for sequence in sequences)
             meta |= {"commands": str(self.commands or names), "starts": str(self.starts or self.num_starts)}
             experiments.write_json(self.json, {"meta": meta, "runs": runs})
-        for kind in dict.fromkeys(run["kind"] for run in runs):
-            mine = [run for run in runs if run["kind"] == kind]
-            num = len({run["start"] for run in mine})
-            print(f"{kind} starts ({num}), means over {len(sequences)} sequences")
-            for name, rows in summary(mine).items():
-                cells = (f"{k} {'none' if v is None else format(v, '.4f')}" for k, v in rows["all"].items())
-                print(f"  {name:20} " + ", ".join(cells))
+        _print_means(runs, len(sequences))
+
+
+def _print_means(runs: list[dict[str, Any]], sequences: int) -> None:
+    """Means of all figures by kind of start and controller."""
+    for kind in dict.fromkeys(run["kind"] for run in runs):
+        mine = [run for run in runs if run["kind"] == kind]
+        num = len({run["start"] for run in mine})
+        print(f"{kind} starts ({num}), means over {sequences} sequences")
+        for name, rows in summary(mine).items():
+            cells = (f"{k} {'none' if v is None else format(v, '.4f')}" for k, v in rows["all"].items())
+            print(f"  {name:20} " + ", ".join(cells))
 
 
 @dataclass(kw_only=True)

@@ -1,38 +1,27 @@
-"""The task: follow a tool velocity with the driven joints. Pure functions, thin Gymnasium classes.
+"""The task: follow a tool velocity with the driven joints. Pure functions for any number of machines.
 
 `transition` moves the machine without randomness; `observe`, `reward` and `terminated` look at it;
-`step` composes them and draws noise and goals. The same functions with a batch of one are the single
-environment, with a plant instead of nets the evaluation, and `observe` and `to_command` the hardware.
+`step` composes them and draws noise and goals. With nets these functions are the simulation (`environments`
+for Gymnasium), with a plant the evaluation; `observe` and `to_command` serve the hardware, too.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-import gymnasium
 import numpy as np
-from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from brokk_min.actuator import ActuatorNet, load_net, push_angle, push_command, rest_history
+from brokk_min.actuator import ActuatorNet, push_angle, push_command, rest_history
 from brokk_min.kinematics import damped_rates, lowest_point, tool_jacobian, tool_position, tool_state
-from brokk_min.machine import (
-    BROKK_170,
-    PWM_MAX,
-    Machine,
-    as_floats,
-    estimate_velocity,
-    limit_command,
-    read_encoder,
-)
+from brokk_min.machine import PWM_MAX, Machine, as_floats, estimate_velocity, limit_command, read_encoder
 from brokk_min.plant import PlantState, plant_reset, plant_step
 
 GROUND_MARGIN = 0.3  # m above the ground below which no goal asks the arm to sink, assumed
 LAG_TIME, LAG_SPEED = 2.0, 0.07  # s and a share of tool_speed, tuned: see `push_lag`
+RAMP = 0.01  # of the command limit, assumed: actions this small take a command through the dead zone
 Array = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]
 Encoder = Callable[[Machine, Array], Array]  # machine and true angles -> angles read
@@ -54,7 +43,7 @@ class TaskConfig:
     """Share of goals along x, y or z; the others point anywhere."""
     noise: float = 0.05
     """Largest noise of the measured part of an observation, in standard deviations (paper: 5 %)."""
-    valve_cost: float = 0.01
+    valve_cost: float = 0.05
     """Reward lost for each change of a command by its limit, mean of the driven joints (paper: 0)."""
     redraw_ground: bool = True
     """Redraw start poses in the ground; False is the paper's rule: end the episode without reward."""
@@ -275,9 +264,12 @@ def push_measured(
 
 
 def to_command(machine: Machine, action: ArrayLike) -> Array:
-    """Commands for all joints from the policy's actions: limited, in whole PWM counts.
+    """Commands for all joints from the policy's actions: beyond the dead zone, limited, in whole PWM counts.
 
-    Paper: Sec. 3.4 (PWM out), Sec. 3.2 (65 %), Fig. 3
+    As the baselines' PIDs, a policy need not find the dead zone: the command goes through it within the
+    first `RAMP` of an action and rises evenly from there. A valve is then barely open near action 0.
+
+    Paper: Sec. 3.4 (PWM out), Sec. 3.2 (7 %, 65 %), Fig. 3
 
     Args:
         machine: n joints.
@@ -290,8 +282,9 @@ def to_command(machine: Machine, action: ArrayLike) -> Array:
         ValueError: a wrong shape or a value that is no number.
 
     Example:
+        >>> from brokk_min.machine import BROKK_170
         >>> to_command(BROKK_170, [1.0, -0.5, 0.0, 2.0]) * 127
-        array([ 80.,   0., -40.,   0.,  80.])
+        array([ 80.,   0., -44.,   0.,  80.])
     """
     action = as_floats(action)
     if action.shape[-1:] != machine.driven.shape:
@@ -299,11 +292,46 @@ def to_command(machine: Machine, action: ArrayLike) -> Array:
     if not np.isfinite(action).all():
         raise ValueError(f"action: expected finite numbers, got {action[~np.isfinite(action)][0]}")
     u = np.zeros((*action.shape[:-1], machine.n), action.dtype)
-    u[..., machine.driven] = np.clip(action, -1.0, 1.0) * (machine.pwm_limit / PWM_MAX)
+    dead, beyond = _command_range(machine)
+    action = np.asarray(np.clip(action, -1.0, 1.0))
+    u[..., machine.driven] = np.clip(action / RAMP, -1.0, 1.0) * dead + action * beyond
     return limit_command(machine, u)
 
 
+def command_slope(machine: Machine, u: Array) -> Array:
+    """Derivative of `to_command` by the action at commands `u` (..., n): (..., n_driven), float32."""
+    dead, beyond = _command_range(machine)
+    through = np.abs(u[..., machine.driven]) < dead + RAMP * beyond
+    return np.asarray((beyond + through * (dead / RAMP)).astype(np.float32))
+
+
+def _command_range(machine: Machine) -> tuple[float, float]:
+    """The dead zone, and what is left from there to the command limit, as shares of full command."""
+    limit = machine.pwm_limit / PWM_MAX
+    dead = min(machine.dead_zone, limit)
+    return dead, limit - dead
+
+
 # --- the episode ------------------------------------------------------------------------------------
+
+
+def fitting_nets(machine: Machine, net: ActuatorNet) -> ActuatorNet:
+    """The nets of the machine's driven joints.
+
+    Raises:
+        ValueError: nets that do not fit the machine, naming what was wanted and found.
+    """
+    wanted = {
+        "machine": machine.name,
+        "rate": machine.rate,
+        "history": machine.history,
+        "velocity_samples": machine.velocity_samples,
+        "velocity_logged": False,  # a bus carries angles only
+    }
+    found = {name: getattr(net, name) for name in wanted}
+    if found != wanted:
+        raise ValueError(f"actuator: expected nets for {machine.name} with {wanted}, got {found}")
+    return net.select([machine.names[i] for i in machine.driven])
 
 
 def rest_state(machine: Machine, q: ArrayLike, v_goal: ArrayLike, plant: bool) -> State:
@@ -488,13 +516,10 @@ def merge(old: State, new: State, rows: NDArray[np.intp]) -> State:
         return a
 
     arrays = {f.name: put(getattr(old, f.name), getattr(new, f.name)) for f in fields(State)[:-1]}
-    plant = None
-    if old.plant is not None and new.plant is not None:
-        pending = tuple(map(put, old.plant.pending, new.plant.pending))
-        plant = new.plant._replace(
-            **{k: put(getattr(old.plant, k), getattr(new.plant, k)) for k in PlantState._fields[:-1]},
-            pending=pending,
-        )
+    if old.plant is None or new.plant is None:
+        return State(**arrays)
+    (*one, one_pending), (*other, other_pending) = old.plant, new.plant
+    plant = PlantState._make([*map(put, one, other), tuple(map(put, one_pending, other_pending))])
     return State(**arrays, plant=plant)
 
 
@@ -557,211 +582,3 @@ def rollout(
         p_tool, v_tool, _ = tool_state(machine, state.q, state.q_dot)
         trace.append((state.q, state.q_dot, q_measured, u, p_tool, v_tool, reward(goal, v_tool)))
     return Trace(*map(np.array, zip(*trace, strict=True)))
-
-
-# --- Gymnasium --------------------------------------------------------------------------------------
-
-
-def fitting_nets(machine: Machine, net: ActuatorNet) -> ActuatorNet:
-    """The nets of the machine's driven joints.
-
-    Raises:
-        ValueError: nets that do not fit the machine, naming what was wanted and found.
-    """
-    wanted = {
-        "machine": machine.name,
-        "rate": machine.rate,
-        "history": machine.history,
-        "velocity_samples": machine.velocity_samples,
-        "velocity_logged": False,  # a bus carries angles only
-    }
-    found = {name: getattr(net, name) for name in wanted}
-    if found != wanted:
-        raise ValueError(f"actuator: expected nets for {machine.name} with {wanted}, got {found}")
-    return net.select([machine.names[i] for i in machine.driven])
-
-
-def _open(machine: Machine, actuator: ActuatorNet | Path | str) -> ActuatorNet | None:
-    if isinstance(actuator, str) and actuator == "analytic":
-        return None
-    net = actuator if isinstance(actuator, ActuatorNet) else load_net(Path(actuator))
-    return fitting_nets(machine, net)
-
-
-class _Pictures:
-    """Frames for Gymnasium: trails of the tools since the last reset of each, and a window for `human`."""
-
-    SIZE = (960, 600)
-
-    def __init__(self, machine: Machine, mode: str | None, modes: list[str]) -> None:
-        if mode is not None and mode not in modes:
-            raise ValueError(f"render_mode: expected one of {modes}, got {mode!r}")
-        self.machine, self.mode = machine, mode
-        self.window: Any = None
-        self.trails: dict[int, list[Array]] = {}
-
-    def follow(self, state: State, fresh: ArrayLike) -> None:
-        """After a reset or a step; `fresh` are the rows that begin anew."""
-        if self.mode is not None:
-            self.trails |= {row: [] for row in np.asarray(fresh).tolist()}
-            for row, p_tool in enumerate(tool_position(self.machine, state.q)):
-                self.trails[row].append(p_tool)
-        if self.mode == "human":
-            self.take(state)
-
-    def take(self, state: State | None) -> list[NDArray[np.uint8]]:
-        """A frame (600, 960, 3) of each row, or the first row on the screen. Needs the extra `play`."""
-        from brokk_min import view, window  # pictures cost nothing where nobody looks
-
-        if state is None or self.mode is None:
-            raise ValueError(f"render: expected a render_mode and a reset before, got {self.mode}")
-        drawn = []
-        for row, trail in self.trails.items():
-            u, goal = state.history[row, :, 2, -1], state.v_goal[row]
-            scene = view.Scene(
-                state.q[row], state.q_dot[row], u, goal, np.array(trail), title=self.machine.name
-            )
-            drawn.append(view.draw(self.machine, [scene], self.SIZE))
-        if self.mode == "human":
-            self.window = self.window or window.Window(self.SIZE, self.machine.name)
-            self.window.pygame.event.pump()
-            self.window.show(drawn[0], self.machine.rate)
-            return []
-        return [window.picture(shapes, self.SIZE) for shapes in drawn]
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        if self.window is not None:
-            self.window.close()
-            self.window = None
-
-
-class TaskVectorEnv(VectorEnv[Array, Array, Any]):
-    """Many machines following random tool velocities; an ended episode starts anew at once. Paper: Fig. 4
-
-    Observation: Box, see `observe`. Action: Box [-1, 1] a driven joint, 1 = the command limit.
-    Reward: `reward` less `valve_cost`, see `step`. `info["final_obs"]` holds the last observation of an
-    ended episode where `info["_final_obs"]` is set; `info["velocity_error"]` is |v_goal - v_tool| [m/s].
-
-    Args:
-        num_envs: how many.
-        actuator: nets (object or file) or "analytic" for the plant.
-        machine: what moves.
-        config: what an episode is.
-        render_mode: None or "rgb_array": `render` gives a frame of each environment.
-    """
-
-    def __init__(
-        self,
-        num_envs: int = 1,
-        actuator: ActuatorNet | Path | str = "analytic",
-        machine: Machine = BROKK_170,
-        config: TaskConfig | None = None,
-        render_mode: str | None = None,
-    ) -> None:
-        self.metadata = {"render_modes": ["rgb_array"], "render_fps": round(machine.rate)}
-        self.metadata["autoreset_mode"] = AutoresetMode.SAME_STEP
-        self.pictures = _Pictures(machine, render_mode, self.metadata["render_modes"])
-        self.render_mode = render_mode
-        self.num_envs, self.machine, self.config = num_envs, machine, config or TaskConfig()
-        self.net = _open(machine, actuator)
-        self.single_observation_space, self.single_action_space = _spaces(machine)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
-        self.state: State | None = None
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Array, dict[str, Any]]:
-        """Draw new episodes for all environments."""
-        super().reset(seed=seed)
-        self.state = reset(self.machine, self.config, self.np_random, self.num_envs, self.net is None)
-        self.pictures.follow(self.state, range(self.num_envs))
-        return look(self.machine, self.config, self.state, self.np_random), {}
-
-    def step(self, actions: Array) -> tuple[Array, Array, Bools, Bools, dict[str, Any]]:
-        """One tick of all environments: actions (num_envs, n_driven)."""
-        if self.state is None:
-            raise ValueError("step: expected a reset before the first step, got none")
-        self.state, out = step(self.machine, self.config, self.net, self.state, actions, self.np_random)
-        observation = out.observation
-        info: dict[str, Any] = {"velocity_error": out.velocity_error}
-        ended = out.terminated | out.truncated
-        rows = np.flatnonzero(ended)
-        if len(rows):
-            fresh = reset(self.machine, self.config, self.np_random, len(rows), self.net is None)
-            self.state = merge(self.state, fresh, rows)
-            info |= {"final_obs": observation, "_final_obs": ended}
-            observation = observation.copy()
-            observation[rows] = look(self.machine, self.config, fresh, self.np_random)
-        self.pictures.follow(self.state, rows)
-        return observation, out.reward, out.terminated, out.truncated, info
-
-    def render(self) -> tuple[NDArray[np.uint8], ...]:
-        """A frame (600, 960, 3) of each environment."""
-        return tuple(self.pictures.take(self.state))
-
-
-class TaskEnv(gymnasium.Env[Array, Array]):
-    """One machine that follows random tool velocities: `TaskVectorEnv`'s functions, batch of one.
-
-    With `render_mode` "human" each step shows itself in a window; with "rgb_array" `render` gives a frame.
-    """
-
-    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 20}  # noqa: RUF012, as Gymnasium has it
-
-    def __init__(
-        self,
-        actuator: ActuatorNet | Path | str = "analytic",
-        machine: Machine = BROKK_170,
-        config: TaskConfig | None = None,
-        render_mode: str | None = None,
-    ) -> None:
-        self.metadata = TaskEnv.metadata | {"render_fps": round(machine.rate)}
-        self.pictures = _Pictures(machine, render_mode, self.metadata["render_modes"])
-        self.render_mode = render_mode
-        self.machine, self.config = machine, config or TaskConfig()
-        self.net = _open(machine, actuator)
-        self.observation_space, self.action_space = _spaces(machine)
-        self.state: State | None = None
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Array, dict[str, Any]]:
-        """Draw a new episode."""
-        super().reset(seed=seed)
-        self.state = reset(self.machine, self.config, self.np_random, 1, self.net is None)
-        self.pictures.follow(self.state, [0])
-        return look(self.machine, self.config, self.state, self.np_random)[0], {}
-
-    def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """One tick: action (n_driven,)."""
-        if self.state is None:
-            raise ValueError("step: expected a reset before the first step, got none")
-        action = np.asarray(action)[None]
-        self.state, out = step(self.machine, self.config, self.net, self.state, action, self.np_random)
-        info = {"velocity_error": float(out.velocity_error[0])}
-        flags = bool(out.terminated[0]), bool(out.truncated[0])
-        self.pictures.follow(self.state, [])
-        return out.observation[0], float(out.reward[0]), *flags, info
-
-    def render(self) -> NDArray[np.uint8] | None:
-        """The present picture (600, 960, 3), or None: it is on the screen."""
-        return next(iter(self.pictures.take(self.state)), None)
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        self.pictures.close()
-
-
-def _spaces(machine: Machine) -> tuple[Any, Any]:
-    size = len(_layout(machine).mean)
-    action = gymnasium.spaces.Box(-1.0, 1.0, (len(machine.driven),), np.float32)
-    return gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32), action
-
-
-gymnasium.register(
-    "brokk_min/Brokk170-v0",
-    entry_point="brokk_min.env:TaskEnv",
-    vector_entry_point="brokk_min.env:TaskVectorEnv",
-)

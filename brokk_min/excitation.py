@@ -6,6 +6,7 @@ Nets are fitted to what `collect` records, one actuator at a time, over its whol
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ from brokk_min.machine import PWM_MAX, Machine, limit_command, read_encoder
 from brokk_min.plant import plant_reset, plant_step
 
 Array = NDArray[np.floating[Any]]
+# Shares of what rich excitation is made of, assumed.
+MIX = {"sine": 0.14, "step": 0.08, "holds": 0.14, "go": 0.36, "hover": 0.28}
 MAX_RETURN = 300.0  # s, assumed: a way back to the start that takes longer is broken off
 
 
@@ -28,17 +31,17 @@ def sine_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Arra
 
 
 def rich_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Array:
-    """Sines over a wide band, steps, fast random holds, stop and go out of rests; small noise, (ticks,).
+    """Sines over a wide band, steps, random holds, starts out of rests and off barely open valves, (ticks,).
 
-    Steps last up to 10 s, so that joints also run through to their stops, and so does stop and go, so that
-    most of its starts come out of long rests. Levels are drawn up to a third above the limit: cut there, a
+    Steps last up to 10 s, so that joints also run through to their stops, and so do series of starts, so
+    that most of them come out of long rests. Levels are drawn up to a third above the limit: cut there, a
     quarter are at the limit, as a policy's.
     """
-    limit, idle = 4 / 3 * machine.pwm_limit / PWM_MAX, 5 * machine.ready_down_time
+    limit = 4 / 3 * machine.pwm_limit / PWM_MAX
     parts: list[Array] = []
     while sum(map(len, parts)) < ticks:
-        kind = rng.choice(["sine", "step", "holds", "go"], p=[0.25, 0.15, 0.25, 0.35])
-        length = int(rng.uniform(0.5, 10.0 if kind in ("step", "go") else 4.0) / machine.dt)
+        kind = rng.choice(list(MIX), p=list(MIX.values()))
+        length = int(rng.uniform(0.5, 4.0 if kind in ("sine", "holds") else 10.0) / machine.dt)
         time = machine.dt * np.arange(length)
         amplitude = rng.uniform(machine.dead_zone, limit)
         if kind == "sine":
@@ -51,19 +54,38 @@ def rich_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Arra
         elif kind == "holds":
             hold = int(rng.integers(1, 8))
             part = np.repeat(rng.uniform(-limit, limit, length // hold + 1), hold)[:length]
-        else:  # out of rests, in half of the cases with a restless hand within the dead zone
-            part = rng.choice([0, 1]) * rng.uniform(0, machine.dead_zone) * rng.uniform(-1, 1, length)
-            at = 0
-            while at < length:
-                rest = np.exp(rng.uniform(np.log(0.05), np.log(3.0)))
-                at += int((idle if rng.random() < 0.5 else rest) / machine.dt)
-                move = int(rng.uniform(0.1, 1.0) / machine.dt)
-                part[at : at + move] = rng.uniform(-limit, limit)
-                at += move
-        if kind != "go" and rng.random() < 0.5:
+        else:
+            part = _starts(rng, machine, length, limit, _rest if kind == "go" else _hover)
+        if kind in ("sine", "step", "holds") and rng.random() < 0.5:
             part = part + rng.uniform(0, 0.08) * rng.standard_normal(length)
         parts.append(part)
     return np.concatenate(parts)[:ticks]
+
+
+def _starts(
+    rng: np.random.Generator, machine: Machine, length: int, limit: float, wait: Callable[..., Array]
+) -> Array:
+    """Levels up to `limit` for 0.1 to 1 s, each after a `wait`, (length,)."""
+    pieces: list[Array] = []
+    restless = rng.choice([0, 1]) * rng.uniform(0, machine.dead_zone)  # a hand within the dead zone
+    while sum(map(len, pieces)) < length:
+        move = int(rng.uniform(0.1, 1.0) / machine.dt)
+        pieces += [wait(rng, machine, restless), np.full(move, rng.uniform(-limit, limit))]
+    return np.concatenate(pieces)[:length]
+
+
+def _rest(rng: np.random.Generator, machine: Machine, restless: float) -> Array:
+    """A rest, in half of the cases until the valve is idle, with noise of size `restless`."""
+    idle, short = 5 * machine.ready_down_time, np.exp(rng.uniform(np.log(0.05), np.log(3.0)))
+    ticks = int((idle if rng.random() < 0.5 else short) / machine.dt)
+    return restless * rng.uniform(-1, 1, ticks)
+
+
+def _hover(rng: np.random.Generator, machine: Machine, _: float) -> Array:
+    """A valve barely open or not quite, to one side or to and fro: where it wakes is what nets must know."""
+    ticks = int(rng.uniform(0.2, 2.0) / machine.dt)
+    turns = np.arange(ticks) // rng.choice([1, 2, 3, 4, 6, ticks])
+    return np.asarray(rng.choice([-1, 1]) * rng.uniform(0.9, 1.5) * machine.dead_zone * (-1.0) ** turns)
 
 
 EXCITATIONS = {"sine": sine_command, "rich": rich_command}

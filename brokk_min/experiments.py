@@ -48,6 +48,7 @@ Array = NDArray[np.floating[Any]]
 Net = actuator.ActuatorNet
 PAPERS = ("jacobian_pid_k0.1", "jacobian_pid_k0.05")  # the paper's two baselines
 STRONGER = ("jacobian_pid_ff",)  # than the paper's: its sentences are put to it, too
+AWAKE = "jacobian_pid_ff_awake"  # the same, its valves never closed: what the policy learns to do
 
 # --- controllers ------------------------------------------------------------------------------------
 
@@ -58,7 +59,7 @@ class Effort:
 
     hours: float = 1.0
     fit_steps: int = fitting.FitConfig.steps
-    train_steps: int = 10_000_000  # `PPOConfig`'s, without importing torch
+    train_steps: int = 6_000_000  # `PPOConfig`'s, without importing torch
     generations: int = 45
     tuning_runs: int = 12
     starts: int = 64
@@ -70,7 +71,10 @@ QUICK = Effort(0.1, 700, 200_000, 4, 4, 8, 2, 3.0)
 
 
 def baselines(machine: Machine, net: Net) -> dict[str, JacobianController]:
-    """The paper's two baselines and one with feed-forward, with gains set by hand. Paper: Sec. 4.2"""
+    """The paper's two baselines and two with feed-forward, with gains set by hand. Paper: Sec. 4.2
+
+    The last keeps its valves barely open even while the tool is to stand still.
+    """
     w0 = jacobian.manipulability_threshold(machine)
     pid = jacobian.join_gains(machine, {"kp": 1.0, "ki": 8.0, "kd": 0.05, "feedback": 0.4, "ready": 0.015})
     mild = jacobian.join_gains(machine, {"kp": 0.2, "ki": 0.5, "kd": 0.02, "feedback": 0.1, "ready": 0.015})
@@ -79,6 +83,7 @@ def baselines(machine: Machine, net: Net) -> dict[str, JacobianController]:
         "jacobian_pid_k0.1": JacobianController(machine, pid, 0.1, w0),
         "jacobian_pid_k0.05": JacobianController(machine, pid, 0.05, w0),
         "jacobian_pid_ff": JacobianController(machine, mild, 0.1, w0, steady),
+        AWAKE: JacobianController(machine, mild, 0.1, w0, steady, awake=True),
     }
 
 
@@ -373,11 +378,11 @@ def singular_case(
     return traces, {"summary": summary(runs), "claims": claims.singular_claims(runs, share)} | near
 
 
-def driven_log(machine: Machine, traces: Traces, controller: str, runs: int = 16) -> logs.Log:
-    """What encoders and valves said in one controller's first runs, for `score`. Paper: Sec. 4.1"""
+def driven_log(machine: Machine, traces: Traces, controller: str) -> logs.Log:
+    """What encoders and valves said in one controller's first 16 runs of each sequence. Paper: Sec. 4.1"""
     recordings = []
     for (name, sequence), trace in traces.items():
-        for i in range(min(runs, trace.q.shape[1]) * (name == controller)):
+        for i in range(min(16, trace.q.shape[1]) * (name == controller)):
             u, q = trace.u[:, i].astype(float), trace.q_measured[:, i].astype(float)
             velocity = logs.velocity_of(q, machine.velocity_samples, machine.rate)
             recordings.append(logs.Recording(f"{name}_{sequence}_{i:02d}", u, q, velocity))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from brokk_min.extras import need
 from brokk_min.logs import whole_file
 from brokk_min.policy import Policy
 
@@ -17,10 +18,9 @@ def export_onnx(path: Path, policy: Policy) -> None:
     Raises:
         ValueError: the package onnx is not there.
     """
-    try:
-        from onnx import TensorProto, checker, helper, numpy_helper
-    except ImportError as error:
-        raise ValueError(f"export: expected onnx (extra brokk_min[export]), got {error}") from error
+    onnx, checker, helper, numpy_helper = (
+        need(name, "export") for name in ("onnx", "onnx.checker", "onnx.helper", "onnx.numpy_helper")
+    )
     layers = len(policy.weights) // 2
     arrays = {f"{'wb'[i % 2]}{i // 2}": weight for i, weight in enumerate(policy.weights)}
     nodes = []
@@ -32,7 +32,7 @@ def export_onnx(path: Path, policy: Policy) -> None:
             nodes.append(helper.make_node("Elu", [target], [f"y{i}"]))
     sizes = {"observation": len(policy.mean), "action": policy.weights[-1].shape[-1]}
     info = helper.make_tensor_value_info
-    ends = [info(name, TensorProto.FLOAT, ["batch", size]) for name, size in sizes.items()]
+    ends = [info(name, onnx.TensorProto.FLOAT, ["batch", size]) for name, size in sizes.items()]
     values = [numpy_helper.from_array(array.astype(np.float32), name) for name, array in arrays.items()]
     graph = helper.make_graph(nodes, "policy", ends[:1], ends[1:], values)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)

@@ -31,6 +31,7 @@ Traces = Mapping[tuple[str, str], Trace]  # by controller and sequence, starts a
 plt.rcParams.update({"font.size": 10, "axes.grid": True, "grid.alpha": 0.3, "axes.axisbelow": True})
 WIDTH = 10.0  # inch, of every figure: so letters are of one size in the report, on A4 paper 7 points
 DPI = 150  # for paper
+FREE_S = 30.0  # s of free runs that are drawn, as the paper's
 
 # Brightness of its own for each of those that stand in one plot: they differ on grey paper too.
 STYLES: dict[str, dict[str, Any]] = {
@@ -39,6 +40,7 @@ STYLES: dict[str, dict[str, Any]] = {
     "jacobian_pid_k0.1": {"color": "#d9661a"},
     "jacobian_pid_k0.05": {"color": "#f0b84a", "linestyle": "--"},
     "jacobian_pid_ff": {"color": "#00886a", "linestyle": "-."},
+    "jacobian_pid_ff_awake": {"color": "#6fbf9b", "linestyle": (0, (4, 1, 1, 1))},
     "perfect_model": {"color": "#c987b7"},
     "workspace": {"color": "#08306b"},
     "limits": {"color": "#d9661a"},
@@ -62,7 +64,7 @@ class Panel(NamedTuple):
     title: str
     xlabel: str
     ylabel: str
-    curves: Mapping[str, tuple[Array, Array]]
+    curves: Mapping[str, Array | tuple[Array, Array]]
 
 
 def plot_panels(rows: Sequence[Sequence[Panel]], one_scale: bool = False) -> Any:
@@ -131,17 +133,17 @@ def plot_joint_rates(machine: Machine, traces: Traces, sequence: Commands, run: 
     return plot_panels([panels[i : i + 2] for i in range(0, len(panels), 2)])
 
 
-def plot_free_run(net: actuator.ActuatorNet, log: logs.Log, seconds: float = 30.0) -> Any:
+def plot_free_run(net: actuator.ActuatorNet, log: logs.Log) -> Any:
     """Recorded and free-running angle and velocity of the joints that move in one unseen recording."""
     recording = log.recordings[0]
-    of_joints = [_over_time(1 / net.rate, *row) for row in _free_run(net, recording, seconds)]
+    of_joints = [_over_time(1 / net.rate, *row) for row in _free_run(net, recording)]
     rows = zip(recording.u.T, *of_joints, strict=True)
     return plot_panels([panels for u, *panels in rows if u.any()])
 
 
-def _free_run(net: actuator.ActuatorNet, recording: logs.Recording, seconds: float) -> Any:
+def _free_run(net: actuator.ActuatorNet, recording: logs.Recording) -> Any:
     """Labels and curves (T, joints) of angles, then of velocities, recorded and run freely."""
-    ticks = min(round(seconds * net.rate), len(recording.q) - net.history - 1)
+    ticks = min(round(FREE_S * net.rate), len(recording.q) - net.history - 1)
     free = scores.free_run(net, recording, np.array([net.history]), ticks)
     later = slice(net.history + 1, net.history + 1 + ticks)
     for real, own, unit in zip((recording.q, recording.q_dot), free, ("rad", "rad/s"), strict=True):
@@ -194,17 +196,17 @@ def plot_starts(machine: Machine, starts: Array, kinds: Sequence[str]) -> Any:
     return _with_legend(figure, axes[0])
 
 
-def plot_worst_and_median(net: actuator.ActuatorNet, log: logs.Log, seconds: float = 30.0) -> Any:
+def plot_worst_and_median(net: actuator.ActuatorNet, log: logs.Log) -> Any:
     """Measured and free-running curves of the recordings with the worst and the median velocity error.
 
     Of each the joint with the largest error.
     """
-    errors = np.nan_to_num(scores.recording_errors(net, log, seconds), nan=-1.0)
+    errors = np.nan_to_num(scores.recording_errors(net, log, FREE_S), nan=-1.0)
     order = [i for i in np.argsort(errors.max(axis=1)) if errors[i].max() >= 0]
     rows = []
     for title, place in (("worst", -1), ("median", (len(order) - 1) // 2)):
         index, joint = order[place], int(errors[order[place]].argmax())
-        of_joints = [_over_time(1 / net.rate, *row) for row in _free_run(net, log.recordings[index], seconds)]
+        of_joints = [_over_time(1 / net.rate, *row) for row in _free_run(net, log.recordings[index])]
         name = f"{title}: {log.recordings[index].name}"
         rows.append([panels[joint]._replace(title=name) for panels in of_joints])
     return plot_panels(rows)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from brokk_min.actuator import NET_ARRAYS, ActuatorNet
+from brokk_min.actuator import NET_ARRAYS, ActuatorNet, valve_scale
 from brokk_min.logs import Log, Recording
 from brokk_min.machine import estimate_velocity
 
@@ -24,13 +24,13 @@ Array = NDArray[np.floating[Any]]
 class FitConfig:
     """How the nets are fitted."""
 
-    steps: int = 16000
+    steps: int = 20000
     """Adam steps."""
     batch_size: int = 512
     """Windows a joint in each step; 10,000 steps of 1024 take about as long and fit worse."""
     learning_rate: float = 4e-3
     """Of Adam at the start; falls to zero along a cosine, and again from a quarter for free runs."""
-    noise: float = 0.1
+    noise: float = 0.2
     """Standard deviation of the noise on the velocity inputs, in units of the velocities' own."""
     hidden: int = 32
     """Units in each of the two hidden layers (paper: 32)."""
@@ -38,9 +38,12 @@ class FitConfig:
     """Samples of angle, velocity and command that the nets see (paper: 13)."""
     rollout: int = 8
     """Ticks that the nets run freely in the last third of the steps, which learn from that (paper: 1)."""
+    dead_zone: float | None = None
+    """Command, of full command, within which no valve opens: nets then see `valve_scale` of commands.
+    None: that of the machine where it is known, otherwise 0: commands as they are (paper)."""
 
 
-PAPER_RECIPE: dict[str, Any] = {"noise": 0.0, "rollout": 1}  # Sec. 3.3
+PAPER_RECIPE: dict[str, Any] = {"noise": 0.0, "rollout": 1, "dead_zone": 0.0}  # Sec. 3.3
 
 
 def fit(log: Log, config: FitConfig, seed: int, velocity_samples: int, machine: str = "") -> ActuatorNet:
@@ -54,7 +57,7 @@ def fit(log: Log, config: FitConfig, seed: int, velocity_samples: int, machine: 
     Raises:
         ValueError: a joint that never moves long enough to be learned.
     """
-    training = training_set(log, config.history, config.rollout)
+    training = training_set(log, config.history, config.rollout, config.dead_zone or 0.0)
     estimator = None if log.velocity_logged else velocity_samples
     weights = _train(training, config, seed, estimator)
     return ActuatorNet(
@@ -67,6 +70,7 @@ def fit(log: Log, config: FitConfig, seed: int, velocity_samples: int, machine: 
         seed=seed,
         settings=asdict(config),
         weights=weights,
+        dead_zone=config.dead_zone or 0.0,
         **{name: getattr(training, name).astype(np.float32) for name in NET_ARRAYS},
     )
 
@@ -169,7 +173,7 @@ def _rollout_loss(
 class TrainingSet(NamedTuple):
     """What models are fitted to: the windows of H samples of each joint, and their statistics."""
 
-    series: Array  # (3, n, N): angle, velocity and command of all recordings, end to end
+    series: Array  # (3, n, N): angle, velocity and `valve_scale` of commands, recordings end to end
     target: Array  # (N, n) rad/s, see `end_to_end`
     ends: list[NDArray[np.intp]]  # newest samples of each joint's windows
     input_mean: Array  # (n, 3 H)
@@ -182,7 +186,7 @@ class TrainingSet(NamedTuple):
     rate: float  # of the samples [Hz]
 
 
-def training_set(log: Log, history: int, rollout: int = 1) -> TrainingSet:
+def training_set(log: Log, history: int, rollout: int = 1, dead_zone: float = 0.0) -> TrainingSet:
     """Windows of the recordings in which a joint moves; its statistics are of those alone.
 
     Raises:
@@ -197,7 +201,8 @@ def training_set(log: Log, history: int, rollout: int = 1) -> TrainingSet:
                 f"joint {name}: expected a recording of {history + 1} samples or more in which it "
                 "moves, got none"
             )
-    series = np.stack([samples.whole.q.T, samples.whole.q_dot.T, samples.whole.u.T])
+    commands = valve_scale(samples.whole.u, dead_zone)
+    series = np.stack([samples.whole.q.T, samples.whole.q_dot.T, commands.T])
     mean = np.array([series[:, j, end].mean(axis=1) for j, end in enumerate(ends)])
     scale = np.array([series[:, j, end].std(axis=1) for j, end in enumerate(ends)])
     scale = np.where(scale > 1e-9, scale, 1.0)  # a channel that never changes
@@ -250,9 +255,10 @@ class LinearModel(ActuatorNet):
 
     def velocity(self, history: Array) -> Array:
         """What the model says, as `ActuatorNet.predict`."""
-        x = history.reshape(*history.shape[:-2], -1)
         slope, offset = self.weights
-        velocity = (((x - self.input_mean) / self.input_scale) * slope).sum(axis=-1) + offset
+        velocity = (((self.inputs(history) - self.input_mean) / self.input_scale) * slope).sum(
+            axis=-1
+        ) + offset
         return np.asarray(np.clip(velocity, self.output_low, self.output_high))
 
 
@@ -262,7 +268,7 @@ def fit_linear(net: ActuatorNet, log: Log, penalty: float = 1e-3) -> LinearModel
     Args:
         penalty: on squared weights, in units of the mean squared error of standardised inputs.
     """
-    training, history = training_set(log, net.history), net.history
+    training, history = training_set(log, net.history, dead_zone=net.dead_zone), net.history
     slopes, offsets = [], []
     for j, ends in enumerate(training.ends):
         size = 3 * history + 1

@@ -93,7 +93,7 @@ GAINS = {
     "ki": (0.0, 12.0),  # valve opening per rad
     "kd": (0.0, 0.3),  # valve opening per rad/s^2
     "feedback": (0.0, 1.0),  # K = feedback * I of eq3
-    "ready": (0.0, 0.04),  # least valve opening while the tool is to move
+    "ready": (0.0, 0.04),  # least valve opening while the tool is to move, or always
 }
 
 
@@ -189,7 +189,7 @@ class JacobianController:
     The PID acts on the valve opening beyond the dead zone; the dead zone is added after it, and the
     integral stops where the command saturates. With `feedforward`, the steady command of the nets
     for the wanted rate is added. While the tool is to move, no valve goes below the opening `ready`:
-    one that has gone idle answers late (paper Sec. 3.2).
+    one that has gone idle answers late (paper Sec. 3.2). With `awake`, not even while it is to stand.
     """
 
     machine: Machine
@@ -197,6 +197,7 @@ class JacobianController:
     k: float  # of Nakamura's damping
     w0: float  # manipulability below which damping sets in
     feedforward: SteadyMap | None = None
+    awake: bool = False
 
     def start(self, num: int) -> Memory:
         """Memory of `num` controllers at rest."""
@@ -230,7 +231,7 @@ class JacobianController:
         winding = (np.abs(opening) >= room) & (np.sign(opening) == np.sign(error))
         integral = memory.integral + np.where(winding, 0.0, g["ki"] * error * m.dt)
         moving = np.linalg.norm(seen.v_goal, axis=-1, keepdims=True) > 1e-6
-        size = np.maximum(np.abs(opening), moving * g["ready"])
+        size = np.maximum(np.abs(opening), (moving | self.awake) * g["ready"])
         size = (size >= 0.5 / PWM_MAX) * (m.dead_zone + (1 - m.dead_zone) * size)  # below half a count: idle
         u = np.zeros((*opening.shape[:-1], m.n))
         u[..., m.driven] = np.sign(opening) * size

@@ -11,7 +11,7 @@ from __future__ import annotations
 import csv
 import os
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -84,6 +84,13 @@ def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
             return {name: file[name] for name in file.files}
     except Exception as error:  # zipfile, zlib and NumPy raise anything on damaged files
         raise ValueError(f"{path}: expected a readable .npz file, got {error!r}") from error
+
+
+def expect_same(path: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    """Refuse a file that says other than `wanted` of itself: ValueError, with the first name that differs."""
+    for name, value in wanted.items():
+        if found.get(name) != value:
+            raise ValueError(f"{path}: {name}: expected {value!r}, got {found.get(name)!r}")
 
 
 def write_log(path: Path, log: Log) -> None:

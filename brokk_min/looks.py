@@ -77,16 +77,14 @@ def _side_axes(p_tool: Array) -> Array:
     return axes
 
 
-def cameras(
-    machine: Machine, p_tool: Array, side: Box, top: Box, hold: Array | None = None
-) -> tuple[Camera, Camera]:
+def cameras(machine: Machine, p_tool: Array, side: Box, top: Box, hold: Array) -> tuple[Camera, Camera]:
     """From the side, in the vertical plane of the tool, and from above with x up and y to the left.
 
-    They show all that the arm can reach, or what lies around the points `hold` [m] (K, 3).
+    They show all that the arm can reach, or what lies around the points `hold` [m] (K, 3), if any.
     """
     e, found = extent(machine), []
     for box, (low, high), axes in ((side, e.side, _side_axes(p_tool)), (top, e.top, ABOVE)):
-        if hold is not None and len(hold):
+        if len(hold):
             flat = hold @ axes.T
             low, high = flat.min(0) - MARGIN * e.reach, flat.max(0) + MARGIN * e.reach
         left, upper, width, height = box

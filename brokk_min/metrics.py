@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from brokk_min.env import Trace
 from brokk_min.machine import Machine
 
 Array = NDArray[np.floating[Any]]
+T = TypeVar("T")
 Run = Mapping[str, Any]  # controller, sequence, start, kind, then the figures of `metrics`
 LABELS = ("controller", "sequence", "start", "kind")
 CHANGE = 0.05  # share of tool_speed, assumed: a goal that jumps by more has changed
@@ -157,6 +158,14 @@ def _named(runs: Sequence[Run]) -> tuple[list[str], list[str], list[str]]:
     return controllers, [*sequences, "all"], [key for key in runs[0] if key not in LABELS]
 
 
+def _of_each(runs: Sequence[Run], what: Callable[[Array], T]) -> dict[str, dict[str, dict[str, T]]]:
+    """`what` of the starts' values of each figure, by controller and sequence."""
+    controllers, sequences, keys = _named(runs)
+    return {
+        c: {s: {key: what(by_start(runs, c, s, key)) for key in keys} for s in sequences} for c in controllers
+    }
+
+
 def _number(values: Array) -> float | None:
     kept = values[np.isfinite(values)]
     return float(kept.mean()) if len(kept) else None
@@ -164,20 +173,12 @@ def _number(values: Array) -> float | None:
 
 def summary(runs: Sequence[Run]) -> dict[str, dict[str, dict[str, float | None]]]:
     """Mean of each figure over starts by controller and sequence, and over all sequences ("all")."""
-    controllers, sequences, keys = _named(runs)
-    return {
-        c: {s: {key: _number(by_start(runs, c, s, key)) for key in keys} for s in sequences}
-        for c in controllers
-    }
+    return _of_each(runs, _number)
 
 
 def intervals(runs: Sequence[Run]) -> dict[str, dict[str, dict[str, list[float | None]]]]:
     """95 % confidence intervals over starts of the means of `summary`."""
-    controllers, sequences, keys = _named(runs)
-    return {
-        c: {s: {key: interval(by_start(runs, c, s, key)) for key in keys} for s in sequences}
-        for c in controllers
-    }
+    return _of_each(runs, interval)
 
 
 def mean_interval(values: Array) -> dict[str, float | None]:

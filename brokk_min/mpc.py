@@ -48,7 +48,6 @@ class PerfectModel:
 
     machine: Machine
     poses: Array  # start angles [rad] (k, n); a batch is these, repeated
-    iterations: int = 1
     dither: float = 0.04  # valve opening (tuned)
 
     def start(self, num: int) -> Plan:
@@ -62,9 +61,8 @@ class PerfectModel:
         """Commands u (num, n) for observations (num, obs) of `env.observe`, and the next memory."""
         plant, tick = memory.plant, memory.tick
         goal = wanted_velocity(self.machine, observation, plant.q)
-        opening = np.concatenate([memory.opening[:, 1:], memory.opening[:, -1:]], axis=1)
-        for _ in range(self.iterations):
-            opening = self.improve(plant, opening, goal, tick)
+        before = np.concatenate([memory.opening[:, 1:], memory.opening[:, -1:]], axis=1)
+        opening = self.improve(plant, before, goal, tick)
         u = self.whole_counts(plant, opening, goal, tick)
         return u, Plan(plant_step(self.machine, plant, u), opening, tick + 1)
 
@@ -95,9 +93,7 @@ class PerfectModel:
         """The best of a plan (num, horizon, n_driven), Gauss-Newton steps from it and steady openings."""
         m, (num, horizon, n) = self.machine, opening.shape
         room = valve_opening(m, m.pwm_limit / PWM_MAX)
-        later = np.repeat(
-            np.triu(np.ones((len(BLOCKS), len(BLOCKS)))), BLOCKS, axis=1
-        )  # from a tick to the end
+        later = np.repeat(np.triu(np.ones((len(BLOCKS),) * 2)), BLOCKS, axis=1)  # from a tick to the end
         basis = np.einsum("bh,jn->bjhn", later, np.eye(n)).reshape(-1, horizon, n)
         plans = np.concatenate([opening[:, None], opening[:, None] + PROBE * basis], axis=1)
         probed = self.errors(plant, self.commands(np.clip(plans, -room, room), tick), goal)

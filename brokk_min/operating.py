@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 import tyro
 
-from brokk_min import experiments, hw, play, remote, replay, view
+from brokk_min import blackbox, experiments, hw, play, remote, replay, view, wishes
 from brokk_min.bus import open_line, read_frames
 from brokk_min.env import Controller
 from brokk_min.export import export_onnx
@@ -27,7 +27,8 @@ class Simulate(Command):
 
     interface: str  # python-can's name of the bus, udp_multicast for a try without hardware.
     channel: str  # Channel of the interface, for udp_multicast 239.74.163.2.
-    start: tuple[float, ...] = remote.START  # Angles at the start [rad].
+    start: tuple[float, ...] = ()
+    """Angles at the start [rad]; by default the paper's, pointing forward, or amid the ranges."""
     record: Path | None = None
     """Also log command in force and true angles at every step of the plant here, .csv."""
 
@@ -66,16 +67,16 @@ class Drive(Command):
         controller = self._controller(machine)
         if self.replay:
             frames = list(read_frames(self.replay))
-            same, sent = hw.compare(machine, frames, hw.replay(machine, controller, frames))
+            same, sent = blackbox.compare(machine, frames, blackbox.replay(machine, controller, frames))
             print(f"{self.replay}: {same} of {sent} valve frames are the same")
             if same < sent:
                 raise ValueError(f"{self.replay}: expected the frames of the log, got {sent - same} others")
             return
         if self.command == "joystick":
-            operator: hw.Joystick | hw.Script = hw.Joystick(machine, self.axes, self.button)
+            operator: wishes.Joystick | wishes.Script = wishes.Joystick(machine, self.axes, self.button)
         else:
             sequences = read_commands(Path(self.command), machine)
-            operator = hw.Script(machine, np.concatenate([s.goals for s in sequences]))
+            operator = wishes.Script(machine, np.concatenate([s.goals for s in sequences]))
         with open_line(self.interface, self.channel, self.log) as line:
             drive = hw.Drive(machine, controller, line, operator)
             drive.begin()
@@ -83,7 +84,7 @@ class Drive(Command):
                 drive.run(_show)
             finally:
                 print(end="\n" if sys.stdout.isatty() else "")
-        if isinstance(operator, hw.Script) and not operator.done:
+        if isinstance(operator, wishes.Script) and not operator.done:
             raise ValueError(f"drive: expected to play all sequences, got {drive.reason or 'a stop'}")
 
     def _controller(self, machine: Machine) -> Controller:
@@ -91,7 +92,7 @@ class Drive(Command):
             driven = [machine.names[i] for i in machine.driven]
             if self.joint not in driven:
                 raise WrongUse(f"--joint: expected one that may be driven, {driven}, got {self.joint}")
-            return hw.Jog(machine, self.joint, self.counts)
+            return wishes.Jog(machine, self.joint, self.counts)
         if not self.policy:
             raise WrongUse("--policy: expected a policy that `train` wrote, got none")
         policy = load_policy(self.policy, machine)
@@ -118,7 +119,7 @@ class Convert(Command):
 
     def run(self) -> None:
         """Write the log."""
-        log = hw.driven_log(check(self, self.out), read_frames(self.log))
+        log = blackbox.driven_log(check(self, self.out), read_frames(self.log))
         write_log(self.out, log)
         print(f"{self.out}: {len(log.recordings)} recordings of {', '.join(log.joints)}")
 

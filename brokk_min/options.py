@@ -29,7 +29,7 @@ ALLOWED: tuple[tuple[float, float, str], ...] = (
     (1, 1e6, "batch_size hidden num_envs horizon epochs threads rollout num num_starts"),
     (1, 1e12, "steps total_steps checkpoint_every"),
     (2, 1e7, "velocity_samples history minibatch_size"),
-    (-10, 3, "log_std"),
+    (-10, 3, "log_std log_std_end"),
     (1e-9, 1, "learning_rate"),
     (1e-9, 1e9, "target_kl max_grad_norm clip"),
     (1e-4, 100, "hours"),

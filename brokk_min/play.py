@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min import hw, tracing, view
+from brokk_min import tracing, view, wishes
 from brokk_min.bus import open_line
 from brokk_min.env import Controller
 from brokk_min.gate import fault_name
@@ -33,7 +33,7 @@ RISE = 0.25  # s from a key's press to full deflection (assumed)
 
 VELOCITY_KEYS = (("up", "down"), ("left", "right"), ("w", "s"))  # +x -x, +y -y, +z -z: as the top view shows
 LEVER_KEYS = (("q", "a"), ("w", "s"), ("e", "d"), ("r", "f"), ("t", "g"), ("y", "h"))
-PAD_AXES = 1, 0, 4, 3  # as `hw.Joystick` has them; 2 and 5 are triggers, which do not rest in the middle
+PAD_AXES = 1, 0, 4, 3  # as `wishes.Joystick` has them; 2 and 5 are triggers, which do not rest in the middle
 PAD_BUTTON, PAD_MODE, PAD_NEXT, PAD_AGAIN = 5, 3, 0, 1
 
 
@@ -127,7 +127,7 @@ class Hands:
             keys /= 3
         if self.pad is not None:
             axes = [i for i in PAD_AXES[: len(keys)] if i < self.pad.get_numaxes()]
-            keys[: len(axes)] -= hw.shape_axis([self.pad.get_axis(i) for i in axes])
+            keys[: len(axes)] -= wishes.shape_axis([self.pad.get_axis(i) for i in axes])
         return np.asarray(np.clip(keys, -1, 1))
 
     def _pad_button(self) -> bool:

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from brokk_min.actuator import ActuatorNet, load_header, net_arrays, net_from_arrays
 from brokk_min.env import fitting_nets, observation_scale, to_command
-from brokk_min.logs import load_arrays, whole_file
+from brokk_min.logs import expect_same, load_arrays, whole_file
 from brokk_min.machine import Machine
 
 Array = NDArray[np.floating[Any]]
-FORMAT = 1  # of policy files
+FORMAT = 2  # of policy files; 1: actions in units of the command limit, dead zone and all
 
 
 @dataclass(frozen=True)
@@ -76,6 +76,7 @@ def contract(machine: Machine) -> dict[str, Any]:
         "rate": machine.rate,
         "velocity_samples": machine.velocity_samples,
         "pwm_limit": machine.pwm_limit,
+        "dead_zone": machine.dead_zone,
         "geometry": [[j.a, j.alpha, j.d, j.theta, j.q_min, j.q_max] for j in machine.joints],
     }
 
@@ -104,10 +105,8 @@ def load_policy(path: Path, machine: Machine) -> Policy:
     """
     arrays = load_arrays(path)
     header = load_header(path, arrays, "policy", FORMAT)
-    wanted, found = contract(machine), header.get("contract", {})
-    for name, value in wanted.items():
-        if found.get(name) != value:
-            raise ValueError(f"{path}: {name}: expected {value!r}, got {found.get(name)!r}")
+    found = header.get("contract", {})
+    expect_same(path, found, contract(machine))
     try:
         weights = tuple(arrays[f"weight_{i}"] for i in range(8))
         net = {name[4:]: array for name, array in arrays.items() if name.startswith("net_")}

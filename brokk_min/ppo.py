@@ -15,6 +15,8 @@ import json
 import math
 import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from itertools import pairwise
 from pathlib import Path
@@ -22,16 +24,20 @@ from typing import Any, cast
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet, fingerprint, load_header
 from brokk_min.adjoint import Rollout, action_gradients
-from brokk_min.env import State, TaskConfig, TaskVectorEnv, observation_scale, paper_view, to_command
-from brokk_min.logs import load_arrays, whole_file
+from brokk_min.env import State, TaskConfig, observation_scale, paper_view, to_command
+from brokk_min.environments import TaskVectorEnv
+from brokk_min.extras import need
+from brokk_min.logs import expect_same, load_arrays, whole_file
 from brokk_min.machine import Machine
 from brokk_min.policy import Policy, contract, save_policy
 
+Array = NDArray[Any]
 Tensor = torch.Tensor
 FORMAT = 1  # of checkpoints
 STATE = [f.name for f in fields(State) if f.name != "plant"]
@@ -41,7 +47,7 @@ STATE = [f.name for f in fields(State) if f.name != "plant"]
 class PPOConfig:
     """Settings of the learner; those that the paper names are marked."""
 
-    total_steps: int = 10_000_000
+    total_steps: int = 6_000_000
     """Environment steps in all."""
     num_envs: int = 256
     """Environments side by side (paper: 256)."""
@@ -53,12 +59,12 @@ class PPOConfig:
     """Steps in one gradient."""
     learning_rate: float = 4e-3
     """Of Adam at the start and at most; follows `target_kl` and falls linearly to zero at the end."""
-    target_kl: float = 0.1
+    target_kl: float = 0.3
     """Change of the policy in one update at which the learning rate stays as it is (rule of rl_games)."""
     critic: bool = False
     """Advantages by a critic and GAE, as in the paper and under `--paper`, not by the nets' derivatives."""
-    gamma: float = 0.9
-    """Discount a tick: 0.9 looks 10 ticks (0.5 s) ahead, somewhat beyond the machine's response time."""
+    gamma: float = 0.95
+    """Discount a tick: 0.95 looks 20 ticks (1 s) ahead, beyond the answer of a valve that has gone idle."""
     gae_lambda: float = 0.95
     """Weight of longer returns in the advantage."""
     clip: float = 0.2
@@ -67,9 +73,9 @@ class PPOConfig:
     """Bonus for the entropy of the action distribution."""
     max_grad_norm: float = 1.0
     """Gradients are scaled down to this norm."""
-    log_std: float = -1.2
+    log_std: float = -1.8
     """Logarithm of the actions' standard deviation at the start."""
-    log_std_end: float = -3.5
+    log_std_end: float = -4.5
     """The same at the end, with straight steps between; with a critic it is learned instead."""
     checkpoint_every: int = 50
     """Updates between two checkpoints."""
@@ -241,7 +247,7 @@ class Training:
         actions, means = (torch.empty(*shape, len(std)) for _ in range(2))
         rewards, tails, ended = torch.empty(shape), torch.zeros(shape), torch.empty(shape, dtype=torch.bool)
         ticks: list[tuple[Any, ...]] = []
-        errors, finished = [], []
+        errors = []
         for t in range(c.horizon):
             step, state = self.steps + t * c.num_envs, cast(State, env.state)
             observations[t] = finite("observation", self.observation, step)
@@ -260,11 +266,7 @@ class Training:
                 tails[t, torch.from_numpy(truncated)] = agent.value(finite("final_obs", last, step))
             self.observation = torch.from_numpy(following)
             errors.append(info["velocity_error"].mean())
-            self.returns, self.lengths = self.returns + reward, self.lengths + 1
-            finished += list(zip(self.returns[over], self.lengths[over], strict=True))
-            self.returns, self.lengths = (np.where(over, 0, x) for x in (self.returns, self.lengths))
-        if finished:  # few episodes end in one update: the last ones stand until then
-            self.episodes = tuple(map(float, np.mean(finished, axis=0)))
+        self._count_episodes(rewards.numpy(), ended.numpy())
         scalars = {
             "charts/episodic_return": self.episodes[0],
             "charts/episodic_length": self.episodes[1],
@@ -280,6 +282,16 @@ class Training:
         else:
             batch["advantage"] = self._by_adjoint(ticks, actions, means)
         return {name: tensor.flatten(0, 1) for name, tensor in batch.items()}, scalars
+
+    def _count_episodes(self, rewards: Array, ended: Array) -> None:
+        """Mean return and length of the episodes that ended in these ticks (T, N), if any did."""
+        finished = []
+        for reward, over in zip(rewards, ended, strict=True):
+            self.returns, self.lengths = self.returns + reward, self.lengths + 1
+            finished += list(zip(self.returns[over], self.lengths[over], strict=True))
+            self.returns, self.lengths = (np.where(over, 0, x) for x in (self.returns, self.lengths))
+        if finished:
+            self.episodes = tuple(map(float, np.mean(finished, axis=0)))
 
     def _by_critic(
         self, observations: Tensor, rewards: Tensor, tails: Tensor, ended: Tensor
@@ -321,17 +333,15 @@ class Training:
 
     def policy(self, training: dict[str, Any]) -> Policy:
         """The actor as it stands, for the machine it was trained for."""
-        layers = [layer for layer in self.agent.actor if isinstance(layer, nn.Linear)]
-        weights = [
-            (layer.weight.detach().numpy().T.copy(), layer.bias.detach().numpy().copy()) for layer in layers
-        ]
-        if self.env.config.paper:
-            weights[0] = (weights[0][0] * paper_view(self.env.machine)[:, None], weights[0][1])
-        mean, scale = observation_scale(self.env.machine)
-        flat = tuple(array for pair in weights for array in pair)
-        if self.env.net is None:
+        machine, net = self.env.machine, self.env.net
+        if net is None:
             raise ValueError("actuator: expected a policy trained on nets, got the analytic plant")
-        return Policy(contract(self.env.machine), training, mean, scale, flat, self.env.net)
+        layers = [layer for layer in self.agent.actor if isinstance(layer, nn.Linear)]
+        arrays = (array.detach().numpy() for layer in layers for array in (layer.weight.T, layer.bias))
+        first, *rest = (array.copy() for array in arrays)
+        if self.env.config.paper:
+            first = first * paper_view(machine)[:, None]
+        return Policy(contract(machine), training, *observation_scale(machine), (first, *rest), net)
 
     # --- checkpoints: all of the above as arrays, nothing pickled
 
@@ -368,10 +378,7 @@ class Training:
         """
         arrays = load_arrays(path)
         header = load_header(path, arrays, "checkpoint", FORMAT)
-        known = header.get("identity", {})
-        for name, wanted in identity.items():
-            if (found := known.get(name)) != wanted:
-                raise ValueError(f"{path}: {name}: expected {wanted}, got {found}")
+        expect_same(path, header.get("identity", {}), identity)
         tensors = {name: torch.from_numpy(a) for name, a in arrays.items() if name != "header"}
         try:
             self._restore(header, arrays, tensors)
@@ -439,38 +446,37 @@ def train(
     training = Training(env, config, seed)
     identity = identity_of(machine, net, task, config, seed)
     checkpoint, curve = Path(f"{out}.checkpoint"), Path(f"{out}.csv")
+    _take_up(training, checkpoint, identity, resume)
+    rows = _read_curve(curve, training.steps) if training.updates else []
+    first, start, total = training.steps, time.perf_counter(), config.total_steps
+    bar = tqdm(total=total, initial=first, desc="train", unit="step", disable=None)
+    with bar, _tensorboard(tensorboard) as note:
+        while training.steps < total:
+            scalars = training.update()
+            speed = (training.steps - first) / (time.perf_counter() - start)
+            rows.append({"global_step": training.steps} | scalars | {"charts/SPS": round(speed)})
+            note(rows[-1])
+            bar.update(training.steps - bar.n)
+            reward, error = scalars["charts/reward"], scalars["charts/velocity_error"]
+            bar.set_postfix_str(f"reward {reward:.3f}, error {error:.3f} m/s")
+            if training.updates % config.checkpoint_every == 0:
+                _write_curve(curve, rows)
+                training.save(checkpoint, identity)
+    _write_curve(curve, rows)
+    policy = training.policy(identity)
+    save_policy(out, policy)
+    checkpoint.unlink(missing_ok=True)
+    return policy
+
+
+def _take_up(training: Training, checkpoint: Path, identity: dict[str, Any], resume: bool) -> None:
+    """Go on from the checkpoint where that is wanted; refuse to begin over one where it is not."""
     if resume and checkpoint.exists():
         training.load(checkpoint, identity)
     elif resume:
         tqdm.write(f"{checkpoint}: no checkpoint, training starts from the beginning", file=sys.stderr)
     elif checkpoint.exists():
         raise ValueError(f"{checkpoint}: expected --resume or no checkpoint, got one of a broken training")
-    rows = _read_curve(curve, training.steps) if training.updates else []
-    writer = _tensorboard(tensorboard)
-    start = time.perf_counter()
-    first = training.steps
-    with tqdm(total=config.total_steps, initial=first, desc="train", unit="step", disable=None) as bar:
-        while training.steps < config.total_steps:
-            scalars = training.update()
-            speed = (training.steps - first) / (time.perf_counter() - start)
-            rows.append({"global_step": training.steps} | scalars | {"charts/SPS": round(speed)})
-            for name, value in list(rows[-1].items())[1:]:
-                if writer:
-                    writer.add_scalar(name, value, training.steps)
-            bar.update(training.steps - bar.n)
-            bar.set_postfix_str(
-                f"reward {scalars['charts/reward']:.3f}, error {scalars['charts/velocity_error']:.3f} m/s"
-            )
-            if training.updates % config.checkpoint_every == 0:
-                _write_curve(curve, rows)
-                training.save(checkpoint, identity)
-    if writer:
-        writer.close()
-    _write_curve(curve, rows)
-    policy = training.policy(identity)
-    save_policy(out, policy)
-    checkpoint.unlink(missing_ok=True)
-    return policy
 
 
 def _read_curve(path: Path, steps: int) -> list[dict[str, Any]]:
@@ -488,11 +494,11 @@ def _write_curve(path: Path, rows: list[dict[str, Any]]) -> None:
         writer.writerows(rows)
 
 
-def _tensorboard(folder: Path | None) -> Any:
+@contextmanager
+def _tensorboard(folder: Path | None) -> Iterator[Callable[[dict[str, Any]], object]]:
+    """What also writes rows of the curve to a folder for TensorBoard, or, without a folder, nowhere."""
     if folder is None:
-        return None
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        raise ValueError("tensorboard: expected the extra `brokk_min[tensorboard]`, got none") from error
-    return SummaryWriter(str(folder))
+        yield lambda row: None
+        return
+    with need("torch.utils.tensorboard", "tensorboard").SummaryWriter(str(folder)) as writer:
+        yield lambda row: [writer.add_scalar(k, v, row["global_step"]) for k, v in list(row.items())[1:]]

@@ -1,4 +1,4 @@
-"""What is measured before nets are trusted: preliminary tests, sim-to-real gap, and the floor to beat.
+"""What is measured before nets are trusted: preliminary tests and sim-to-real gap.
 
 The paper's tests are put to a machine (the analytic plant) and to its nets side by side. Angles are exact
 and velocities are means over a tick, without encoder and estimator: what is compared is the motion.
@@ -13,9 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min import actuator, excitation, figures, fitting, kinematics, scores
+from brokk_min import actuator, excitation, fitting, kinematics, scores
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import fitting_nets
+from brokk_min.figures import Panel, plot_panels
 from brokk_min.fitting import FitConfig
 from brokk_min.logs import RETURN, Log
 from brokk_min.machine import BROKK_170, PWM_MAX, Machine, encode_pwm
@@ -28,7 +29,6 @@ STARTS = {BROKK_170.name: (1.5, 0.5, 0.58, 1.71, 1.24)}  # rad, paper: q_s; othe
 SWEEP_S = 40.0  # s, assumed: long enough for the slower sweep of the Brokk's slowest joint
 RISE = 0.63  # paper's response times: 0.4 s and 0.1 s, read as the time to 63 % of the change
 GAP_S, GAP_RUNS = 30.0, 20  # s, paper; sequences that the figure's one is compared with
-ALLOWED_OUTSIDE = 0.02  # of the samples, assumed: 0.2 % of the training are outside by definition
 
 
 def plant_mover(machine: Machine) -> Mover:
@@ -284,139 +284,35 @@ def paper_recipe(
 
 def plots(machine: Machine, net: ActuatorNet, seed: int) -> dict[str, Any]:
     """The paper's Fig. 2, machine above nets, and Fig. 5, by the names of their files."""
-    names = [machine.names[i] for i in machine.driven]
-    of = f"velocity {names[-1]} [rad/s]"
-    rows = []
-    for name, move in movers(machine, net).items():
+    return {"preliminary": _plot_tests(machine, net), "sim_to_real": _plot_gap(machine, net, seed)}
+
+
+def _plot_tests(machine: Machine, net: ActuatorNet) -> Any:
+    name = machine.names[machine.driven[-1]]
+    angle, velocity, rows = f"{name} [rad]", f"velocity {name} [rad/s]", []
+    for of, move in movers(machine, net).items():
         tests = preliminary_tests(machine, move)
         v = step_velocity(tests.angles, machine.rate)[:, :, 0, machine.driven[-1]]
         time = (np.arange(len(v)) + 0.5 - len(v) / 2) * machine.dt
         stepping = {"from idle": (time, v[:, 0]), "while moving": (time, v[:, 1])}
-        angle = f"{names[-1]} [rad]"
-        rows += [
-            [
-                figures.Panel(f"{name}: range and direction", angle, of, _pairs(tests.sweeps)),
-                figures.Panel(f"{name}: coupling", angle, of, _pairs(tests.coupling)),
-                figures.Panel(f"{name}: past movement", "time after the step [s]", of, stepping),
-            ]
+        row = [
+            Panel(f"{of}: range and direction", angle, velocity, tests.sweeps),
+            Panel(f"{of}: coupling", angle, velocity, tests.coupling),
+            Panel(f"{of}: past movement", "time after the step [s]", velocity, stepping),
         ]
-    gap = sim_to_real(machine, net, seed)
+        rows.append(row)
+    return plot_panels(rows)
+
+
+def _plot_gap(machine: Machine, net: ActuatorNet, seed: int) -> Any:
+    gap, names = sim_to_real(machine, net, seed), [machine.names[i] for i in machine.driven]
     time = np.arange(1, len(gap.q) + 1) * machine.dt
 
-    def panel(what: str, values: Array, labels: Sequence[str]) -> figures.Panel:
-        curves = {label: (time, y) for label, y in zip(labels, values.T, strict=True)}
-        return figures.Panel("nets - machine", "time [s]", what, curves)
+    def panel(what: str, values: Array, labels: Sequence[str]) -> Panel:
+        curves = {label: (time, y) for label, y in zip(labels, values[:, 0].T, strict=True)}
+        return Panel("nets - machine", "time [s]", what, curves)
 
-    joints = (a[:, 0, machine.driven] for a in (gap.q_dot, gap.q))
-    differences = [
-        [
-            panel("tool velocity [m/s]", gap.v_tool[:, 0], "xyz"),
-            panel("tool position [m]", gap.p_tool[:, 0], "xyz"),
-        ],
-        [
-            panel("joint velocity [rad/s]", next(joints), names),
-            panel("joint angle [rad]", next(joints), names),
-        ],
-    ]
-    return {"preliminary": figures.plot_panels(rows), "sim_to_real": figures.plot_panels(differences)}
-
-
-def _pairs(curves: dict[str, Array]) -> dict[str, tuple[Array, Array]]:
-    return {label: (angle, velocity) for label, (angle, velocity) in curves.items()}
-
-
-# --- whether nets fitted to any log can be trusted ----------------------------------------------------
-
-
-def judge(net: ActuatorNet, log: Log, test: Log, machine: Machine | None = None) -> dict[str, Any]:
-    """Scores of nets fitted to `log` on unseen recordings `test`, as in the fit JSON, with warnings.
-
-    Each joint: what `scores.score` says of the nets and, as `linear`, of the linear model; `creep` at
-    zero command [rad/s]; `response_time` of the nets and `machine_response_time` of a known machine [s];
-    `outside` as in `outside_training`. `tool`: median error at the end of free runs of a known machine [m].
-    """
-    joints, warnings = scores.score(net, test), []
-    floor = scores.score(fitting.fit_linear(net, log), test)
-    still, outside, times = creep(net), outside_training(log, test, net.history), _times(net, log, machine)
-    for j, (name, found) in enumerate(joints.items()):
-        found |= {"linear": floor[name], "creep": float(still[j]), **{k: t[name] for k, t in times.items()}}
-        found["outside"] = {kind: float(share[j]) for kind, share in outside.items()}
-        for horizon, mine in found["free_run"].items():
-            other = floor[name]["free_run"][horizon]["velocity_rmse"]
-            if mine["velocity_rmse"] >= other:
-                warnings.append(
-                    f"{name}: a free run of {horizon} s is off by {mine['velocity_rmse']:.4f} rad/s, "
-                    f"a linear model only by {other:.4f}: the net is no better"
-                )
-        for kind, share in found["outside"].items():
-            if share > ALLOWED_OUTSIDE:
-                warnings.append(f"{name}: {kind} outside the training's range in {share:.0%} of the test")
-    tool = tool_errors(machine, net, test) if machine else {}
-    return {"joints": joints, "tool": tool, "warnings": warnings}
-
-
-def creep(net: ActuatorNet, seconds: float = 10.0) -> Array:
-    """Largest speed [rad/s] (n,) of joints left at rest without a command, from 21 angles over the range."""
-    q = np.linspace(net.q_low, net.q_high, 21)
-    angles = net_mover(net)(q, np.zeros((round(seconds * net.rate), *q.shape)))
-    return np.asarray(np.abs(angles[-1] - q).max(axis=0) / seconds)
-
-
-def _times(net: ActuatorNet, log: Log, machine: Machine | None) -> dict[str, dict[str, Any]]:
-    """Response times to the largest command of a log, of the nets and of a known machine, by joint."""
-    level = np.abs(np.concatenate([r.u for r in log.recordings])).max(axis=0)
-    move, ends = net_mover(net), (net.q_low, net.q_high)
-    wait = max(round(1.5 * net.rate), 2 * net.history)
-    before = step_commands(move, *ends, level, wait)
-    both = {"response_time": move} | ({"machine_response_time": plant_mover(machine)} if machine else {})
-    return {
-        name: named_times(response_times(steps(m, *ends, level, before, wait), net.rate), net.joints)
-        for name, m in both.items()
-    }
-
-
-def outside_training(log: Log, test: Log, history: int) -> dict[str, Array]:
-    """Share of the test's samples (n,) outside the middle 99.8 % of the training's, by kind.
-
-    Kinds: command, change of command over a tick (fast end of the band), mean command over a history
-    (slow end), angle. A joint is judged where it moves.
-    """
-    known, seen = _signals(log, history), _signals(test, history)
-    result = {}
-    for kind in known:
-        ends = [np.quantile(x, [0.001, 0.999]) for x in known[kind]]
-        slack = [0.02 * (high - low) + 1e-6 for low, high in ends]
-        pairs = zip(seen[kind], ends, slack, strict=True)
-        result[kind] = np.array(
-            [np.mean((x < e[0] - s) | (x > e[1] + s)) if len(x) else 0.0 for x, e, s in pairs]
-        )
-    return result
-
-
-def _signals(log: Log, history: int) -> dict[str, list[Array]]:
-    samples = fitting.end_to_end(log)
-    at, u = samples.starts(history, 0, 1), samples.whole.u
-    total = np.cumsum(np.concatenate([0 * u[:1], u]), axis=0)
-    kinds = {
-        "command": u[at],
-        "change of command": u[at] - u[at - 1],
-        "mean command": (total[at + 1] - total[at + 1 - history]) / history,
-        "angle": samples.whole.q[at],
-    }
-    moves = samples.moves[at]
-    return {kind: [x[m] for x, m in zip(values.T, moves.T, strict=True)] for kind, values in kinds.items()}
-
-
-def tool_errors(machine: Machine, net: ActuatorNet, test: Log) -> dict[str, float]:
-    """Median distance [m] of the tool from the recorded one at the end of free runs, by horizon."""
-    samples, result = fitting.end_to_end(test), {}
-    for horizon in scores.HORIZONS:
-        ticks = round(horizon * net.rate)
-        starts = samples.starts(net.history, ticks, ticks)
-        if len(starts):
-            q_error, _ = scores.run_errors(net, samples, starts, ticks)
-            recorded = samples.whole.q[starts + ticks]
-            ends = (kinematics.tool_position(machine, q) for q in (recorded, recorded + q_error[-1]))
-            apart = np.linalg.norm(next(ends) - next(ends), axis=-1)
-            result[str(horizon)] = float(np.median(apart))
-    return result
+    tool = [panel("tool velocity [m/s]", gap.v_tool, "xyz"), panel("tool position [m]", gap.p_tool, "xyz")]
+    q, q_dot = gap.q[..., machine.driven], gap.q_dot[..., machine.driven]
+    joints = [panel("joint velocity [rad/s]", q_dot, names), panel("joint angle [rad]", q, names)]
+    return plot_panels([tool, joints])

@@ -18,15 +18,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min import hw
+from brokk_min import hw, wishes
 from brokk_min.bus import open_line
 from brokk_min.env import Controller, to_command
-from brokk_min.machine import BROKK_170, PWM_MAX, Machine
-from brokk_min.simulator import SimulatedMachine, serve
+from brokk_min.machine import PWM_MAX, Machine
+from brokk_min.simulator import SimulatedMachine, serve, start_pose
 from brokk_min.ticks import Known
 
 Array = NDArray[Any]
-START = (0.0, 0.5, 0.58, 1.71, 1.24)  # rad, the paper's start pose, pointing forward
 STALE = 0.2  # s without a word from the window, then the operator's device is lost (assumed)
 
 
@@ -111,17 +110,17 @@ class Remote:
         self.asks, self.chosen, self.levers, self.clock = asks, chosen, levers, clock
         self.ask: Ask | None = None
 
-    def __call__(self, driving: bool, ready: bool) -> hw.Wish:
+    def __call__(self, driving: bool, ready: bool) -> wishes.Wish:
         """The wish of this tick."""
         if (values := self.asks.read()) is not None:
             self.ask = unpack_ask(values)
         ask = self.ask
         if ask is None or self.clock() - ask.time > STALE:
             parent = multiprocessing.parent_process()
-            return hw.Wish(alive=False, stop=parent is not None and not parent.is_alive())
+            return wishes.Wish(alive=False, stop=parent is not None and not parent.is_alive())
         self.chosen.mode, self.levers.levers = ask.mode, ask.levers
         x, y, z = map(float, ask.v_goal)
-        return hw.Wish((x, y, z), ask.enable, ask.alive, ask.stop)
+        return wishes.Wish((x, y, z), ask.enable, ask.alive, ask.stop)
 
 
 class Loop(hw.Drive):
@@ -154,7 +153,7 @@ class Where:
     interface: str = ""
     channel: str = ""
     log: Path | None = None
-    start: tuple[float, ...] = ()  # of the simulated machine [rad]; none: `START`, or amid its ranges
+    start: tuple[float, ...] = ()  # of the simulated machine [rad], see `start_pose`
 
 
 def control(
@@ -181,10 +180,7 @@ def _simulated(machine: Machine, where: Where, running: Callable[[], bool]) -> I
     if where.interface:
         yield
         return
-    low, high = machine.column("q_min"), machine.column("q_max")
-    q = np.array(where.start or (START if machine == BROKK_170 else (low + high) / 2))
-    if q.shape != (machine.n,) or not ((low <= q) & (q <= high)).all():
-        raise ValueError(f"start: expected {machine.n} angles within the joints' ranges, got {q.tolist()}")
+    q = start_pose(machine, where.start)
     with open_line("virtual", "brokk_min play") as line:
         simulated = SimulatedMachine(machine, q, line.now())
         thread = Thread(target=serve, args=(simulated, line, running))

@@ -57,12 +57,9 @@ def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
     Raises:
         ValueError: joints or velocities of another kind than the nets', or no recording long enough.
     """
-    if log.joints != net.joints:
-        raise ValueError(f"joints: expected {list(net.joints)}, got {list(log.joints)}")
-    if log.rate != net.rate:
-        raise ValueError(f"rate: expected {net.rate:g} Hz, got {log.rate:g} Hz")
-    if log.velocity_logged != net.velocity_logged:
-        raise ValueError(f"velocity_logged: expected {net.velocity_logged}, got {log.velocity_logged}")
+    for name in ("joints", "rate", "velocity_logged"):
+        if (found := getattr(log, name)) != (wanted := getattr(net, name)):
+            raise ValueError(f"{name}: expected {wanted}, got {found}")
     samples = end_to_end(log)
     if not len(samples.starts(net.history, 1, 1)):
         got = samples.lengths[:9]

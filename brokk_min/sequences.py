@@ -5,7 +5,7 @@ Sequences and starts that score are never used for tuning; `tuning_goals` makes 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -172,26 +172,6 @@ def feasible(machine: Machine, start: Array, goals: Array) -> NDArray[np.bool_]:
     return good
 
 
-def _feasible_draws(
-    machine: Machine, num: int, label: str, draw: Callable[[], tuple[Array, list[Array]]]
-) -> tuple[Array, Array]:
-    """First `num` poses (num, n), and goals (T, num, 3), of those drawn whose goals are all `feasible`."""
-    poses: list[Array] = []
-    first: list[Array] = []
-    with tqdm(total=num, desc=label, unit="start", disable=None) as bar:
-        for _ in range(60):
-            pose, goals = draw()
-            keep = np.arange(len(pose))
-            for goal in goals:
-                keep = keep[feasible(machine, pose[keep], goal[:, keep])]
-            poses += list(pose[keep])
-            first += list(goals[0].swapaxes(0, 1)[keep])
-            bar.update(min(num, len(poses)) - bar.n)
-            if len(poses) >= num:
-                return np.array(poses[:num]), np.array(first[:num]).swapaxes(0, 1)
-    raise ValueError(f"{label}: expected {num} feasible poses for {machine.name}, got {len(poses)}")
-
-
 def start_kinds(machine: Machine, starts: Array) -> list[str]:
     """Kind of each start (num, n), numbers assumed: "extended", "limits" or "workspace".
 
@@ -278,16 +258,23 @@ def write_starts(path: Path, machine: Machine, starts: Array) -> None:
 
 
 def tuning_goals(machine: Machine, runs: int, seconds: float, seed: int) -> tuple[Array, Array]:
-    """Feasible starts (runs, n) and goals (T, runs, 3), drawn as the policy's by `reset`: for tuning only."""
+    """Feasible starts (runs, n) and goals (T, runs, 3), drawn as the policy's by `reset`: for tuning only.
+
+    Raises:
+        ValueError: too few in many draws.
+    """
     rng, config, ticks = np.random.default_rng(seed), TaskConfig(), round(seconds * machine.rate)
     holds = int(np.ceil(seconds / config.hold_min_s))  # that many are always long enough
-
-    def draw() -> tuple[Array, list[Array]]:
-        drawn = reset(machine, config, rng, 200 * holds, plant=False)
-        goals = [
-            np.repeat(drawn.v_goal[i : i + holds], drawn.goal_ticks[i : i + holds], axis=0)[:ticks]
-            for i in range(0, 200 * holds, holds)
-        ]
-        return drawn.q[::holds].astype(float), [np.stack(goals, axis=1)]
-
-    return _feasible_draws(machine, runs, "draw tuning runs", draw)
+    starts, kept = list[Array](), list[Array]()
+    with tqdm(total=runs, desc="draw tuning runs", unit="run", disable=None) as bar:
+        for _ in range(60):
+            drawn = reset(machine, config, rng, 200 * holds, plant=False)
+            rows = [slice(i, i + holds) for i in range(0, 200 * holds, holds)]
+            goals = np.array([np.repeat(drawn.v_goal[r], drawn.goal_ticks[r], axis=0)[:ticks] for r in rows])
+            good = feasible(machine, drawn.q[::holds], goals.swapaxes(0, 1))
+            starts += list(drawn.q[::holds][good])
+            kept += list(goals[good])
+            bar.update(min(runs, len(starts)) - bar.n)
+            if len(starts) >= runs:
+                return np.array(starts[:runs]), np.array(kept[:runs]).swapaxes(0, 1)
+    raise ValueError(f"{machine.name}: expected {runs} feasible runs to tune on, got {len(starts)}")

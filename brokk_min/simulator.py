@@ -8,7 +8,7 @@ from __future__ import annotations
 import gc
 import os
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -19,11 +19,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from brokk_min import bus
 from brokk_min.gate import OPERATIONAL, checksum, encoder_raw
-from brokk_min.machine import Machine, decode_pwm
+from brokk_min.machine import BROKK_170, Machine, decode_pwm
 from brokk_min.plant import plant_reset, plant_step
 
 Array = NDArray[Any]
 BOOT, STOPPED, PRE_OPERATIONAL = 0, 4, 127  # CANopen states beside OPERATIONAL
+START = (0.0, 0.5, 0.58, 1.71, 1.24)  # rad, the paper's start pose, pointing forward
 WATCHDOG = 0.150  # s without valid valve frame, then the valves go neutral (assumed)
 
 
@@ -152,17 +153,27 @@ def serve(machine: SimulatedMachine, line: Any, running: Callable[[], bool]) -> 
             line.send(can_id, data)
 
 
+def start_pose(machine: Machine, given: Sequence[float]) -> Array:
+    """Angles at the start [rad] (n,): those given, or else the Brokk's `START`, or amid another's ranges.
+
+    Raises:
+        ValueError: a pose that the machine cannot take.
+    """
+    low, high = machine.column("q_min"), machine.column("q_max")
+    q = np.array(given or (START if machine == BROKK_170 else (low + high) / 2), float)
+    if q.shape != (machine.n,) or not ((low <= q) & (q <= high)).all():
+        raise ValueError(f"start: expected {machine.n} angles within the joints' ranges, got {q.tolist()}")
+    return q
+
+
 def simulate(
-    machine: Machine, q: ArrayLike, interface: str, channel: str, record: Path | None = None
+    machine: Machine, q: Sequence[float], interface: str, channel: str, record: Path | None = None
 ) -> None:
     """Run a simulated machine on a bus until SIGINT or SIGTERM; `record` gets a log of all its Euler steps.
 
-    Raises:
-        ValueError: no such bus, or a pose that the machine cannot take.
+    It starts at `start_pose(machine, q)`. ValueError: no such bus, or no such pose.
     """
-    q = np.array(q, float)
-    if q.shape != (machine.n,) or not ((machine.column("q_min") <= q) & (q <= machine.column("q_max"))).all():
-        raise ValueError(f"start: expected {machine.n} angles within the joints' ranges, got {q.tolist()}")
+    pose = start_pose(machine, q)
     gc.freeze()  # no long collection while the encoders should answer
     with ExitStack() as stack:
         line = stack.enter_context(bus.open_line(interface, channel))
@@ -176,4 +187,4 @@ def simulate(
             numbers = [*(f"{x:.7g}" for x in (*u, *q)), f"{valid - start:.6f}"]
             print("plant", f"{now - start:.3f}", *numbers, sep=",", file=file)
 
-        serve(SimulatedMachine(machine, q, start, write), line, lambda: not ended)
+        serve(SimulatedMachine(machine, pose, start, write), line, lambda: not ended)

@@ -24,6 +24,8 @@ from tqdm import tqdm
 from brokk_min import experiments
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import TaskConfig
+from brokk_min.extras import need
+from brokk_min.logs import expect_same
 from brokk_min.machine import Machine
 from brokk_min.metrics import by_start, mean_interval
 from brokk_min.policy import PolicyController, load_policy
@@ -61,9 +63,7 @@ def _finished(path: Path, identity: Mapping[str, Any]) -> Rows:
         found = result["identity"]
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: expected the result of a seed, got {error!r}") from error
-    for name, wanted in identity.items():
-        if found.get(name) != wanted:
-            raise ValueError(f"{path}: {name}: expected {wanted}, got {found.get(name)}")
+    expect_same(path, found, identity)
     return runs
 
 
@@ -98,12 +98,9 @@ def workers(scheduler: str | None) -> Iterator[Submit]:
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             yield lambda function, *arguments: pool.submit(apart, function, *arguments)
         return
-    try:
-        from distributed import Client
-    except ImportError as error:
-        raise ValueError("scheduler: expected the extra `brokk_min[sweep]`, got none") from error
-    connect: Callable[..., Any] = Client
-    with connect(scheduler, timeout=10) as client:  # dask itself runs again what a dead worker had
+    with need("distributed", "sweep").Client(
+        scheduler, timeout=10
+    ) as client:  # dask itself runs again what a dead worker had
         threads = {worker["nthreads"] for worker in client.scheduler_info(-1)["workers"].values()}
         if threads - {1}:  # torch's settings and seeds are those of a process
             raise ValueError(f"{scheduler}: expected workers with --nthreads 1, got {sorted(threads)}")
@@ -117,7 +114,7 @@ def sweep(
     config: PPOConfig,
     seeds: Sequence[int],
     out: Path,
-    starts: int = 16,
+    starts: int,
     scheduler: str | None = None,
     gains: Path | None = None,
 ) -> dict[str, dict[str, Any]]:

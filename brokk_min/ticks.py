@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min import hw
+from brokk_min import wishes
 from brokk_min.bus import OPERATOR, SYNC, WISH, Frame, Nodes
 from brokk_min.gate import encoder_counts
 from brokk_min.machine import Machine, decode_pwm, estimate_velocity
@@ -46,7 +46,7 @@ class Ticks:
     """Frames of a bus or a log, one after another, as what is known at each tick."""
 
     def __init__(self, machine: Machine) -> None:
-        self.machine, self.nodes, self.wish = machine, Nodes(machine), hw.Wish()
+        self.machine, self.nodes, self.wish = machine, Nodes(machine), wishes.Wish()
         self.u, self.driving, self.tick = np.zeros(machine.n), False, 0
         self.angles: list[Array] = []  # rad, as many as the velocity needs
 
@@ -57,7 +57,7 @@ class Ticks:
             self.tick += 1
             return known
         if frame.id == WISH and frame.channel == OPERATOR:
-            self.wish = hw.unpack_wish(frame.data)
+            self.wish = wishes.unpack_wish(frame.data)
         elif frame.id == self.machine.valve_frame_id and len(frame.data) == 8:
             self.u, self.driving = decode_pwm(list(frame.data[: self.machine.n])), frame.data[7] == 1
         else:

@@ -34,6 +34,7 @@ TITLES = {
     "levers": "levers, joint by joint",
     "jacobian_pid_k0.1": "Jacobian + PID",
     "jacobian_pid_ff": "Jacobian + PID with feed-forward",
+    "jacobian_pid_ff_awake": "the same, valves kept open",
 }
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from brokk_min.extras import need
 from brokk_min.view import PAPER, Circle, Clip, Colour, Line, Polygon, Shape, Text
 
 
@@ -22,11 +23,7 @@ def need_pygame() -> Any:
         ValueError: it is not installed.
     """
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    try:
-        import pygame
-    except ImportError as error:
-        raise ValueError(f"picture: expected pygame (extra brokk_min[play]), got {error}") from error
-    return pygame
+    return need("pygame", "play")
 
 
 @lru_cache(maxsize=1024)
@@ -88,7 +85,7 @@ class Window:
                 f"window: expected a display (SDL_VIDEODRIVER=dummy draws unseen), got {error}"
             ) from error
         pygame.display.set_caption(title)
-        self.size, self.clock = size, pygame.time.Clock()
+        self.clock = pygame.time.Clock()
 
     def show(self, shapes: Sequence[Shape], fps: float) -> None:
         """Show shapes, not before 1 / `fps` after the last ones."""

@@ -12,9 +12,10 @@ import numpy as np
 from brokk_min import hw
 from brokk_min.bus import Frame, Line
 from brokk_min.env import Controller
-from brokk_min.hw import Drive, Wish
+from brokk_min.hw import Drive
 from brokk_min.machine import BROKK_170, Machine
 from brokk_min.simulator import SimulatedMachine
+from brokk_min.wishes import Wish
 
 hw.REHEARSALS = 1  # nothing cools down on an injected clock
 START = (0.0, 0.5, 0.58, 1.71, 1.24)

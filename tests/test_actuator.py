@@ -10,7 +10,16 @@ import pytest
 import torch
 from helpers_machines import constant_net, random_net
 
-from brokk_min.actuator import ActuatorNet, load_net, push_angle, push_command, rest_history, save_net
+from brokk_min.actuator import (
+    ActuatorNet,
+    load_net,
+    push_angle,
+    push_command,
+    rest_history,
+    save_net,
+    valve_scale,
+    valve_scale_slope,
+)
 
 # --- histories ------------------------------------------------------------------------------------
 
@@ -59,6 +68,55 @@ def test_prediction_against_a_loop_in_double_precision(leading):
             low, high = float(net.output_low[j]), float(net.output_high[j])
             assert got[index][j] == pytest.approx(low + y * (high - low), abs=2e-5)
             assert low <= got[index][j] <= high
+
+
+def test_what_nets_see_of_a_command_by_hand():
+    """Openings 0.01 and 0.5 beyond a dead zone of 0.2: ln(1.5) and ln(26) of ln(51)."""
+    u = np.array([-1.0, -0.2, 0.0, 0.1, 0.208, 0.6, 1.0])
+    u.setflags(write=False)
+    wanted = np.array([-1, 0, 0, 0, np.log(1.5) / np.log(51), np.log(26) / np.log(51), 1])
+    np.testing.assert_allclose(valve_scale(u, 0.2), wanted, atol=1e-12)
+    np.testing.assert_array_equal(valve_scale(u, 0.0), u)
+    np.testing.assert_array_equal(valve_scale_slope(u, 0.0), 1)
+    assert valve_scale(np.float32([0.3]), 0.2).dtype == np.float32
+
+
+@pytest.mark.parametrize("dead_zone", [0.0, 0.07, 0.3])
+def test_the_slope_of_the_scale_is_a_difference(dead_zone):
+    u = np.linspace(-0.999, 0.999, 400)
+    ends = valve_scale(u + 1e-7, dead_zone) - valve_scale(u - 1e-7, dead_zone)
+    np.testing.assert_allclose(valve_scale_slope(u, dead_zone), ends / 2e-7, rtol=1e-5, atol=1e-6)
+
+
+def test_nets_that_know_a_dead_zone_are_nets_shown_other_commands():
+    plain = random_net(history=5)
+    net, rng = replace(plain, dead_zone=0.1), np.random.default_rng(2)
+    history = rng.uniform(-1, 1, (6, 3, 3, 5))
+    history[0, :, 2] *= 0.1  # not one command that opens a valve
+    other = history.copy()
+    other[:, :, 2] = valve_scale(history[:, :, 2], 0.1)
+    history.setflags(write=False)
+    np.testing.assert_array_equal(net.velocity(history), plain.velocity(other))
+    idle = history.copy()
+    idle[0, :, 2] = 0.0
+    np.testing.assert_array_equal(net.velocity(history)[0], net.velocity(idle)[0])
+    assert (net.velocity(history)[1:] != plain.velocity(history)[1:]).all()
+
+
+def test_the_slope_of_nets_that_know_a_dead_zone_is_a_difference():
+    net = random_net(history=4)
+    net = replace(net, dead_zone=0.1, weights=tuple(w.astype(float) for w in net.weights))
+    history = np.random.default_rng(3).uniform(-1, 1, (5, 3, 3, 4))
+    slope = net.slope(history)[1]
+    for kind in range(3):
+        for sample in range(4):
+            ends = []
+            for step in (1e-6, -1e-6):
+                other = history.copy()
+                other[..., kind, sample] += step
+                ends.append(net.velocity(other))
+            difference = (ends[0] - ends[1]) / 2e-6
+            np.testing.assert_allclose(slope[..., kind, sample], difference, rtol=1e-4, atol=1e-6)
 
 
 def test_prediction_refuses_another_shape():

@@ -52,6 +52,14 @@ def case(seed, machine=None):
     return machine, net, states[-1], commands[15:]
 
 
+def by_action(machine, u):
+    """Slope of the command by the action at `u`: of the line from 0 through the dead zone to the limit."""
+    limit, dead = machine.pwm_limit / PWM_MAX, machine.dead_zone
+    knee = dead + task.RAMP * (limit - dead)
+    u = np.abs(u[..., machine.driven])
+    return np.where(u < knee, knee / task.RAMP, (limit - knee) / (1 - task.RAMP))
+
+
 def rewards_of(machine, states, along):
     """Rewards (T, num) with the Jacobians of the states `along`, which count as constant."""
     J = np.stack([jacobian(machine, s.q) for s in along[1:]])
@@ -74,7 +82,7 @@ def test_gradients_are_finite_differences_of_the_simulation(seed, gamma):
                 other[t, :, joint] += sign * step
                 rewards = rewards_of(machine, simulate(machine, net, start, other), states)
                 ends.append((weights[: TICKS - t, None] * rewards[t:]).sum(axis=0))
-            slope = (ends[0] - ends[1]) / (2 * step) * machine.pwm_limit / PWM_MAX
+            slope = (ends[0] - ends[1]) / (2 * step) * by_action(machine, commands[t])[:, k]
             np.testing.assert_allclose(found[t, :, k], slope, rtol=2e-3, atol=2e-5)
 
 
@@ -91,7 +99,8 @@ def test_a_constant_jacobian_costs_little():
             other[0, :, joint] += sign * 1e-5
             after = simulate(machine, net, start, other)
             ends.append((0.9 ** np.arange(TICKS)[:, None] * rewards_of(machine, after, after)).sum(axis=0))
-        whole[:, k] = (ends[0] - ends[1]) / 2e-5 * machine.pwm_limit / PWM_MAX
+        whole[:, k] = (ends[0] - ends[1]) / 2e-5
+    whole *= by_action(machine, commands[0])
     assert np.linalg.norm(found - whole) < 0.05 * np.linalg.norm(whole)
 
 
@@ -109,7 +118,7 @@ def test_one_tick_by_hand():
     fastest = 1.2 * BROKK_170.q_dot_max[BROKK_170.driven]
     share = (rates / fastest + 1) / 2  # of the sigmoid
     by_command = 2 * fastest * GAIN * share * (1 - share)
-    wanted = (error / size) @ J / (1 + size) ** 2 * by_command * 80 / 127
+    wanted = (error / size) @ J / (1 + size) ** 2 * by_command * (80 / 127 - 0.07)
     np.testing.assert_allclose(found, wanted, rtol=1e-4)
 
 
@@ -138,7 +147,8 @@ def test_the_cost_of_moving_a_valve_is_in_it():
     before = np.concatenate([start.history[None, ..., 2, -1], commands[:-1]])
     sign = np.sign(commands - before)[..., machine.driven]
     later = np.concatenate([sign[1:], 0 * sign[:1]])
-    np.testing.assert_allclose(dear - free, -0.05 / len(machine.driven) * (sign - 0.8 * later), atol=1e-6)
+    by_command = -0.05 / len(machine.driven) * (sign - 0.8 * later) * PWM_MAX / machine.pwm_limit
+    np.testing.assert_allclose(dear - free, by_command * by_action(machine, commands), rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize(("end", "push"), [("q_max", 0.4), ("q_min", -0.4)])

@@ -207,7 +207,7 @@ def test_a_machine_that_can_follow_nothing_has_no_starts(monkeypatch: pytest.Mon
     rng = np.random.default_rng(0)
     with pytest.raises(ValueError, match="expected 2 poses from which all sequences are feasible, got fewer"):
         sequences.draw_starts(BROKK_170, task_sequences(BROKK_170)[:1], 2, rng)
-    with pytest.raises(ValueError, match="expected 2 feasible poses for brokk170, got 0"):
+    with pytest.raises(ValueError, match="brokk170: expected 2 feasible runs to tune on, got 0"):
         sequences.tuning_goals(BROKK_170, 2, 1.0, 0)
 
 

@@ -22,11 +22,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy import stats
+from strategies import machines
 
 from brokk_min import env as task
 from brokk_min import kinematics
 from brokk_min.actuator import save_net
-from brokk_min.env import TaskConfig, TaskEnv, TaskVectorEnv
+from brokk_min.env import TaskConfig
+from brokk_min.environments import TaskEnv, TaskVectorEnv
 from brokk_min.jacobian import GAINS, JacobianController, join_gains
 from brokk_min.kinematics import joint_rates, tool_position, tool_velocity
 from brokk_min.machine import BROKK_170, estimate_velocity, read_encoder
@@ -107,10 +109,29 @@ def test_ground_is_below_not_at():
 
 
 def test_to_command_by_hand():
-    action = [0.5, -3.0, 0.006, 0.007]  # 40; clipped to -80; 0.48 and 0.56 of a count
+    """The dead zone has 8.89 counts, 71.11 are beyond: 8.89 + 35.56; clipped to -80; at 0.01 and 0.005."""
+    action = [0.5, -3.0, -0.01, 0.005]  # the last two: 8.89 + 0.71 and half of that
     counts = task.to_command(BROKK_170, action) * 127
-    np.testing.assert_allclose(counts, [40, 0, -80, 0, 1], atol=1e-9)
+    np.testing.assert_allclose(counts, [44, 0, -80, -10, 5], atol=1e-9)
     assert counts[1] == 0  # q2 is the operator's
+    assert not task.to_command(BROKK_170, np.zeros(4)).any()
+
+
+@given(machines(), st.floats(0, 1), st.floats(0, 1))
+def test_commands_rise_with_actions_by_their_slope(machine, one, other):
+    """Odd, never falling; and the slopes below and above the end of the dead zone add up to the limit."""
+    low, high = sorted([one, other])
+    driven, limit = machine.driven, machine.pwm_limit / 127
+    action = np.array([[low], [high], [-high], [1.0]]) * np.ones(len(driven))
+    u = task.to_command(machine, action)[..., driven]
+    assert (u[0] <= u[1]).all() and np.array_equal(u[1], -u[2])
+    np.testing.assert_allclose(u[3], limit, atol=1e-9)
+    slope = task.command_slope(machine, np.array([[0.0], [limit], [-limit]]) * np.ones(machine.n))
+    assert slope.shape == (3, len(driven)) and slope.dtype == np.float32
+    if machine.dead_zone < limit - 0.01:
+        whole = slope[0] * task.RAMP + slope[1] * (1 - task.RAMP)
+        np.testing.assert_allclose(whole, limit, rtol=1e-5)
+        assert np.array_equal(slope[1], slope[2]) and (slope[0] >= slope[1]).all()
 
 
 @pytest.mark.parametrize("machine", MACHINES, ids=lambda m: m.name)
@@ -122,7 +143,10 @@ def test_to_command_sends_whole_counts_in_the_order_of_the_joints(machine):
     assert np.abs(counts).max() <= machine.pwm_limit + 1e-4
     wanted = np.zeros_like(counts)
     for column, joint in enumerate(machine.driven):
-        wanted[:, joint] = np.clip(action[:, column], -1, 1) * machine.pwm_limit
+        points = np.array([0, task.RAMP, 1]), np.array([0, 0, machine.pwm_limit], float)
+        dead = 127 * machine.dead_zone
+        points[1][1] = dead + task.RAMP * (machine.pwm_limit - dead)
+        wanted[:, joint] = np.sign(action[:, column]) * np.interp(np.abs(action[:, column]), *points)
     assert np.abs(counts - wanted).max() <= 0.5 + 1e-4
     assert not counts[:, machine.locked].any()
 

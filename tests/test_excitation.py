@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -44,6 +45,22 @@ def test_rich_commands_hold_jump_and_pause_and_have_the_asked_length():
     assert 0.05 < np.mean(u == 0) < 0.4  # pauses
     assert np.sum(np.abs(np.diff(u)) > 0.5) > 50  # jumps
     assert np.mean((np.diff(u) == 0) & (u[1:] != 0)) > 0.1  # holds
+
+
+def test_valves_are_held_barely_open_and_moved_off_from_there():
+    """Nothing but such parts: levels of 8 to 16 counts, also to and fro, then a level for 0.1 to 1 s."""
+    rng = np.random.default_rng(1)
+    with mock.patch.object(excitation, "MIX", {"hover": 1.0}):
+        u = np.concatenate([EXCITATIONS["rich"](rng, BROKK_170, 600) for _ in range(40)])
+    at = np.flatnonzero(np.abs(np.diff(u, prepend=np.nan)) > 1e-9)  # levels that hold for a while begin
+    level, held = u[at[:-1]], np.diff(at)
+    barely = (np.abs(level) > 0.9 * 0.07) & (np.abs(level) < 1.5 * 0.07)
+    assert 0.063 < np.abs(level[barely]).min() < 0.066 and 0.103 < np.abs(level[barely]).max() < 0.1051
+    turned = np.isclose(level[1:], -level[:-1]) & barely[1:]
+    assert {1, 2, 3, 4, 6} <= set(held[1:][turned].tolist())  # ticks to one side
+    off = ~barely & np.append(False, barely[:-1])
+    assert off.sum() > 300 and np.abs(level[off]).max() > LIMIT
+    assert held[off].max() <= 20 and held[off].min() >= 1  # the first or last of a part may be cut
 
 
 @pytest.mark.parametrize("kind", ["sine", "rich"])

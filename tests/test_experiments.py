@@ -61,9 +61,7 @@ class FeedForward:
         down, up = speed_limits(self.machine, seen.q)
         rates = joint_rates(self.machine, seen.q, seen.v_goal)
         share = rates / np.where(rates > 0, *(limit[:, self.machine.driven] for limit in (up, -down)))
-        zone, limit = self.machine.dead_zone, self.machine.pwm_limit / 127
-        action = np.sign(share) * (zone + (limit - zone) * np.abs(share)) / limit
-        return to_command(self.machine, action), None
+        return to_command(self.machine, share), None
 
 
 def test_another_controller_takes_twenty_lines() -> None:
@@ -235,7 +233,7 @@ def test_the_chain_gives_the_same_bits_twice(twice: tuple[Path, Path]) -> None:
 def test_results_hold_every_run_with_its_figures(twice: tuple[Path, Path]) -> None:
     results = json.loads((twice[0] / "results.json").read_text())
     runs = results["task_space"]["runs"]
-    names = {"rl", "jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff"}
+    names = {"rl", "jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff", "jacobian_pid_ff_awake"}
     keys = {(r["controller"], r["sequence"], r["start"]) for r in runs}
     sequences = [s.name for s in task_sequences(BROKK_170)]
     assert keys == {(c, s, i) for c in names for s in sequences for i in range(4)}

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from helpers_bus import START, Hand, Out, Push, World
 
-from brokk_min import bus, hw
+from brokk_min import blackbox, bus, hw, wishes
 from brokk_min.env import TaskConfig, measured, observation_scale, reward, rollout, to_command
 from brokk_min.experiments import axis_sequences
 from brokk_min.gate import encoder_raw, fault_name, valve_frame
@@ -45,10 +45,11 @@ BASELINE = JacobianController(
 def test_importing_opens_nothing_and_needs_no_extras() -> None:
     code = (
         "import sys; import brokk_min.hw, brokk_min.simulator, brokk_min.export, brokk_min.policy; "
-        "print([m for m in ('can', 'pygame', 'torch', 'onnx', 'matplotlib', 'canopen') if m in sys.modules])"
+        "heavy = {'can', 'pygame', 'torch', 'onnx', 'matplotlib', 'canopen', 'gymnasium', 'scipy'}; "
+        "print(heavy & {*sys.modules})"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    assert done.stdout.strip() == "set()"
 
 
 # --- the loop on the plant ----------------------------------------------------------------------------
@@ -62,7 +63,7 @@ def test_reward_over_the_bus_is_that_of_evaluate(axis: int, controller: str) -> 
     """Within 1 %, with 2 ms of bus and machine between SYNC and valve frame."""
     sequence = axis_sequences(BROKK_170)[axis]
     driver = PolicyController(BROKK_170, load_policy(SHIPPED, BROKK_170)) if controller == "rl" else BASELINE
-    script = hw.Script(BROKK_170, sequence.goals)
+    script = wishes.Script(BROKK_170, sequence.goals)
     world = World(driver, script)
     world.drive.operator = lambda driving, ready: (world.rest(0.002), script(driving, ready))[1]
     world.drive.begin()
@@ -102,7 +103,7 @@ class Listener:
 def test_the_policy_is_told_how_far_the_tool_stays_behind() -> None:
     """The observation's last block against a sum over its own goals and velocities."""
     sequence = axis_sequences(BROKK_170)[0]
-    listener, script = Listener(), hw.Script(BROKK_170, sequence.goals[:200])
+    listener, script = Listener(), wishes.Script(BROKK_170, sequence.goals[:200])
     world = World(listener, script)
     world.drive.begin()
     while world.drive.tick():
@@ -508,8 +509,8 @@ def test_a_fault_is_left_by_a_new_edge_only() -> None:
     assert world.drive.gate.driving and world.drive.reason == ""
     assert world.drive.status().startswith("driving v wanted +0.10 +0.00 +0.00 is ")
     assert world.commands[1][-1].tolist() == list(PUSH)
-    noted, note = list[hw.Wish](), world.line.note
-    world.line.note = lambda data: (noted.append(hw.unpack_wish(data)), note(data))[1]  # type: ignore
+    noted, note = list[wishes.Wish](), world.line.note
+    world.line.note = lambda data: (noted.append(wishes.unpack_wish(data)), note(data))[1]  # type: ignore
     hand.act, hand.enable = raises(OSError("gone")), False
     world.run(0.1)
     assert noted[-1].error  # so that a replay of the log gets the same
@@ -622,7 +623,7 @@ def test_the_status_by_hand() -> None:
     drive.history = np.full((1, 5, 3, 13), 9.0)
     drive.history[0, :, :2, -1] = np.transpose([[0, 0, 0, np.pi, 3 * np.pi / 4], [0.1, 0, 0, 0, 0]])
     drive.lateness, drive.skipped = 0.5, 7
-    drive.wish = hw.Wish((0.1, -0.2, 0.25))
+    drive.wish = wishes.Wish((0.1, -0.2, 0.25))
     said = "waiting v wanted +0.10 -0.20 +0.25 is +0.00 +0.50 +0.00 q +0.00 +0.00 +0.00 +3.14 +2.36"
     assert drive.status().replace("-0.00", "+0.00") == said + " late 500.0 ms, skipped 7"
     world.close()
@@ -954,42 +955,42 @@ def drive_logged(path: Path, seconds: float = 4.0) -> World:
 def test_a_recorded_log_replays_to_the_same_bytes(tmp_path: Path) -> None:
     drive_logged(tmp_path / "run.log")
     frames = list(bus.read_frames(tmp_path / "run.log"))
-    again = hw.replay(BROKK_170, BASELINE, frames)
+    again = blackbox.replay(BROKK_170, BASELINE, frames)
     sent = [f for f in frames if f.sent and f.channel != "operator"]
     assert [(f.id, f.data) for f in again] == [(f.id, f.data) for f in sent]
     valves = [f.data for f in sent if f.id == 0x210]
     assert len(valves) > 60 and len({v[:5] for v in valves}) > 30
-    assert hw.compare(BROKK_170, frames, again) == (len(valves), len(valves))
-    other = hw.compare(BROKK_170, frames, hw.replay(BROKK_170, Push(0, 0, 0, 0, 0), frames))
+    assert blackbox.compare(BROKK_170, frames, again) == (len(valves), len(valves))
+    other = blackbox.compare(BROKK_170, frames, blackbox.replay(BROKK_170, Push(0, 0, 0, 0, 0), frames))
     assert other[0] < 0.5 * other[1]
     cut = frames[: len(frames) * 2 // 3]  # as after a SIGKILL
-    assert [f.data for f in hw.replay(BROKK_170, BASELINE, cut)] == [
+    assert [f.data for f in blackbox.replay(BROKK_170, BASELINE, cut)] == [
         f.data for f in cut if f.sent and f.channel != "operator"
     ]
     with pytest.raises(ValueError, match=r"log: expected \w+ sent at .*, got"):
-        hw.replay(BROKK_170, BASELINE, [f for f in frames if f.id != 0x210])
+        blackbox.replay(BROKK_170, BASELINE, [f for f in frames if f.id != 0x210])
 
 
 def test_a_tape_by_hand() -> None:
-    read, wish = bus.Frame(1.1, 0x181, b"\x07"), hw.Wish((0.1, 0.0, 0.0), enable=True)
+    read, wish = bus.Frame(1.1, 0x181, b"\x07"), wishes.Wish((0.1, 0.0, 0.0), enable=True)
     sync, noted = bus.Frame(1.0, 0x080, b"", True), bus.Frame(1.2, bus.WISH, wish.pack(), True, bus.OPERATOR)
     last = bus.Frame(1.3, 0x182, b"\x08")
-    tape = hw.Tape([sync, read, noted, last])
+    tape = blackbox.Tape([sync, read, noted, last])
     assert tape.recv(0.1) is None and tape.wish(True, True) == wish  # SYNC is to be sent first
     tape.send(0x080, b"")
     assert tape.sent == [sync] and tape.recv(0.1) is read and tape.recv(0.1) is None
     assert tape.note(b"") == 1.2 and tape.now() == 1.3 and tape.recv(0.1) is last
     assert not tape.more and not tape.wrong and tape.recv(0.1) is None and tape.now() == 1.3
-    assert tape.wish(True, True) == hw.Wish(stop=True)
+    assert tape.wish(True, True) == wishes.Wish(stop=True)
     for found in (sync._replace(id=0x210), sync._replace(sent=False)):  # another was sent, or none
-        tape = hw.Tape([found, read])
+        tape = blackbox.Tape([found, read])
         tape.send(0x080, b"")
         assert tape.wrong == f"log: expected 080 sent at 1.000000, got {found.id:03X}" and not tape.more
 
 
 def test_a_log_of_a_drive_reads_back_as_a_log_of_the_machine(tmp_path: Path) -> None:
     world = drive_logged(tmp_path / "run.log")
-    log = hw.driven_log(BROKK_170, bus.read_frames(tmp_path / "run.log"))
+    log = blackbox.driven_log(BROKK_170, bus.read_frames(tmp_path / "run.log"))
     assert log.joints == BROKK_170.names and [r.name for r in log.recordings] == ["drive_000", "drive_001"]
     write_log(tmp_path / "log.csv", log)
     read = read_log([tmp_path / "log.csv"], BROKK_170.velocity_samples)
@@ -1008,7 +1009,7 @@ def test_a_log_of_a_drive_reads_back_as_a_log_of_the_machine(tmp_path: Path) -> 
         inside = np.searchsorted(times, moments + 0.03)
         np.testing.assert_allclose(m[inside], recording.u * 127, atol=1e-6)  # the command that came next
     with pytest.raises(ValueError, match="expected more than 14 ticks of driving in a row, got none"):
-        hw.driven_log(BROKK_170, list(bus.read_frames(tmp_path / "run.log"))[:200])
+        blackbox.driven_log(BROKK_170, list(bus.read_frames(tmp_path / "run.log"))[:200])
 
 
 def test_a_log_by_hand_gives_commands_and_angles_tick_by_tick() -> None:
@@ -1022,7 +1023,7 @@ def test_a_log_by_hand_gives_commands_and_angles_tick_by_tick() -> None:
         frames.append(bus.Frame(t, 0x555, b"\x01" * 8))
         frames.append(bus.Frame(t, 0x210, valve_frame([80, 0, -80, 1, 0], k, 1).tobytes(), True))
         frames.append(bus.Frame(t, 0x210, b"\x01" * 7, True))
-    log = hw.driven_log(machine, frames)
+    log = blackbox.driven_log(machine, frames)
     assert log.rate == 10 and [len(r.q) for r in log.recordings] == [15, 20]
     for recording, ticks in zip(log.recordings, parts):
         counts = 100 * np.arange(1, 6) + np.array(ticks)[:, None]
@@ -1036,14 +1037,14 @@ def test_a_gap_in_a_log_starts_a_new_recording(tmp_path: Path) -> None:
     frames = list(bus.read_frames(tmp_path / "run.log"))
     middle = frames[0].time + 1.6
     holed = [f for f in frames if not middle < f.time < middle + 0.12]
-    lengths = [len(r.q) for r in hw.driven_log(BROKK_170, holed).recordings]
-    whole = [len(r.q) for r in hw.driven_log(BROKK_170, frames).recordings]
+    lengths = [len(r.q) for r in blackbox.driven_log(BROKK_170, holed).recordings]
+    whole = [len(r.q) for r in blackbox.driven_log(BROKK_170, frames).recordings]
     assert len(lengths) == len(whole) + 1 and sum(whole) - 4 <= sum(lengths) < sum(whole)
 
 
 def test_python_can_is_asked_for_in_one_sentence(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, "can", None)
-    with pytest.raises(ValueError, match=r"^CAN: expected python-can \(extra brokk_min\[hw\]\), got"):
+    with pytest.raises(ValueError, match=r"^can: expected the extra brokk_min\[hw\], got"):
         list(bus.read_frames(tmp_path / "a.log"))
 
 
@@ -1072,34 +1073,34 @@ def test_a_plain_candump_log_is_read_too(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
-# --- operators ----------------------------------------------------------------------------------------
+# --- wishes ----------------------------------------------------------------------------------------
 
 
 def test_wishes_survive_the_log_to_a_tenth_of_a_millimetre() -> None:
     for flags in range(16):
-        wish = hw.Wish((0.3, -0.12345, 3.2), *(bool(flags & 1 << i) for i in range(4)))
-        assert hw.unpack_wish(wish.pack()) == wish._replace(v_goal=(0.3, -0.1234, 3.2))
+        wish = wishes.Wish((0.3, -0.12345, 3.2), *(bool(flags & 1 << i) for i in range(4)))
+        assert wishes.unpack_wish(wish.pack()) == wish._replace(v_goal=(0.3, -0.1234, 3.2))
 
 
 def test_a_script_waits_presses_plays_and_ends() -> None:
-    script = hw.Script(BROKK_170, np.array([[0.1, 0, 0], [0, 0.2, 0]]))
-    assert script(False, False) == hw.Wish() and script(False, True) == hw.Wish(enable=True)
-    assert script(False, True) == hw.Wish()  # it did not work: let go, and press again
-    assert script(False, True) == hw.Wish(enable=True)
-    assert script(True, True) == hw.Wish((0.1, 0.0, 0.0), enable=True)
+    script = wishes.Script(BROKK_170, np.array([[0.1, 0, 0], [0, 0.2, 0]]))
+    assert script(False, False) == wishes.Wish() and script(False, True) == wishes.Wish(enable=True)
+    assert script(False, True) == wishes.Wish()  # it did not work: let go, and press again
+    assert script(False, True) == wishes.Wish(enable=True)
+    assert script(True, True) == wishes.Wish((0.1, 0.0, 0.0), enable=True)
     assert not script.done
-    assert script(True, True) == hw.Wish((0.0, 0.2, 0.0), enable=True)
+    assert script(True, True) == wishes.Wish((0.0, 0.2, 0.0), enable=True)
     assert script.done and script(True, True).stop
-    faulted = hw.Script(BROKK_170, np.array([[0.1, 0, 0], [0, 0.2, 0]]))
+    faulted = wishes.Script(BROKK_170, np.array([[0.1, 0, 0], [0, 0.2, 0]]))
     assert faulted(False, True).enable and faulted(True, True).enable  # it does not wait to press
-    assert faulted(False, True) == hw.Wish(stop=True) and not faulted.done
-    never = hw.Script(BROKK_170, np.zeros((1, 3)), patience_s=0.2)
+    assert faulted(False, True) == wishes.Wish(stop=True) and not faulted.done
+    never = wishes.Script(BROKK_170, np.zeros((1, 3)), patience_s=0.2)
     assert [never(False, False).stop for _ in range(5)] == [False] * 4 + [True]
-    assert not hw.Script(BROKK_170, np.array([[0.0, 0.0, 0.3]])).done  # no faster than allowed
+    assert not wishes.Script(BROKK_170, np.array([[0.0, 0.0, 0.3]])).done  # no faster than allowed
     with pytest.raises(ValueError, match=r"command: expected at most 0.3 m/s, got 0.5 m/s"):
-        hw.Script(BROKK_170, np.array([[0.3, 0.4, 0.0]]))
+        wishes.Script(BROKK_170, np.array([[0.3, 0.4, 0.0]]))
     with pytest.raises(ValueError, match="command"):
-        hw.Script(BROKK_170, np.array([[np.nan, 0.4, 0.0]]))
+        wishes.Script(BROKK_170, np.array([[np.nan, 0.4, 0.0]]))
 
 
 class Virtual:
@@ -1133,10 +1134,10 @@ class Virtual:
 
 def test_joystick_through_a_virtual_device() -> None:
     with pytest.raises(ValueError, match="joystick: expected one, got none"):
-        hw.Joystick(BROKK_170)
+        wishes.Joystick(BROKK_170)
     device = Virtual()
-    stick = hw.Joystick(BROKK_170)
-    assert stick(False, False) == hw.Wish((0.0, 0.0, 0.0))
+    stick = wishes.Joystick(BROKK_170)
+    assert stick(False, False) == wishes.Wish((0.0, 0.0, 0.0))
     device.button(5, True)
     device.axis(1, -1.0)
     device.axis(0, 0.1)  # within the dead zone
@@ -1154,22 +1155,22 @@ def test_joystick_through_a_virtual_device() -> None:
     assert not stick(True, True).enable
     device.button(5, True)
     device.unplug()
-    assert stick(True, True) == hw.Wish(alive=False)
-    assert stick(True, True) == hw.Wish(alive=False)
+    assert stick(True, True) == wishes.Wish(alive=False)
+    assert stick(True, True) == wishes.Wish(alive=False)
     again = Virtual()
     again.button(5, True)
-    assert stick(False, True) == hw.Wish((0.0, 0.0, 0.0), enable=True)
+    assert stick(False, True) == wishes.Wish((0.0, 0.0, 0.0), enable=True)
     other = Virtual()
     again.axis(1, -1.0)
     assert stick(True, True).v_goal[0] > 0.299  # one more device changes nothing
     with pytest.raises(ValueError, match=r"joystick: expected axes \[1, 0, 6\] and button 5, got 6 and 8"):
-        hw.Joystick(BROKK_170, axes=(1, 0, 6))
+        wishes.Joystick(BROKK_170, axes=(1, 0, 6))
     with pytest.raises(ValueError, match="button 8"):
-        hw.Joystick(BROKK_170, button=8)
+        wishes.Joystick(BROKK_170, button=8)
     other.unplug()
     assert stick(True, True).alive
     again.unplug()
-    assert stick(True, True) == hw.Wish(alive=False)
+    assert stick(True, True) == wishes.Wish(alive=False)
 
 
 def test_a_joystick_needs_pygame_but_no_window(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -1180,16 +1181,16 @@ def test_a_joystick_needs_pygame_but_no_window(monkeypatch: pytest.MonkeyPatch) 
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr("pygame.joystick.get_count", lambda: 0)
     with pytest.raises(ValueError, match=r"^joystick: expected one, got none$"):
-        hw.Joystick(BROKK_170)
+        wishes.Joystick(BROKK_170)
     assert {name: os.environ[name] for name in wanted} == wanted
     monkeypatch.setitem(sys.modules, "pygame", None)
-    with pytest.raises(ValueError, match=r"joystick: expected pygame \(extra brokk_min\[play\]\), got"):
-        hw.Joystick(BROKK_170)
+    with pytest.raises(ValueError, match=r"pygame: expected the extra brokk_min\[play\], got"):
+        wishes.Joystick(BROKK_170)
 
 
 def test_jog_moves_one_joint_the_way_the_stick_points() -> None:
     hand = Hand()
-    world = World(hw.Jog(BROKK_170, "q4", 14), hand)
+    world = World(wishes.Jog(BROKK_170, "q4", 14), hand)
     world.drive.begin()
     world.run(1.5)
     assert world.commands[1][-1].tolist() == [0, 0, 0, 14, 0]
@@ -1205,7 +1206,7 @@ def test_jog_moves_one_joint_the_way_the_stick_points() -> None:
 
 def test_axes_are_shaped_evenly_to_both_sides() -> None:
     axis = np.linspace(-1, 1, 201)
-    shaped = hw.shape_axis(axis)
+    shaped = wishes.shape_axis(axis)
     np.testing.assert_allclose(shaped, -shaped[::-1], atol=1e-12)
     assert (np.diff(shaped) >= 0).all() and not shaped[np.abs(axis) < 0.12].any()
     assert np.abs(shaped).max() == 1.0 and shaped[101:].max() == 1.0 and shaped[150] < 0.5 * axis[150]
@@ -1269,5 +1270,5 @@ def test_more_frames_than_a_bus_can_carry_are_a_fault() -> None:
 
 
 def test_wishes_are_rounded_not_cut() -> None:
-    wish = hw.unpack_wish(hw.Wish((0.00019, -0.00019, 0.00011)).pack())
+    wish = wishes.unpack_wish(wishes.Wish((0.00019, -0.00019, 0.00011)).pack())
     assert wish.v_goal == (0.0002, -0.0002, 0.0001)

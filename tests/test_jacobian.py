@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 
 from benchmarks.rollout import random_net
 from brokk_min import jacobian as classic
-from brokk_min.actuator import ActuatorNet
+from brokk_min.actuator import ActuatorNet, rest_history
 from brokk_min.env import TaskConfig, measured, observe, rollout
 from brokk_min.jacobian import JacobianController, Memory
 from brokk_min.kinematics import jacobian
@@ -339,6 +339,18 @@ def test_no_valve_goes_idle_while_the_tool_is_to_move():
     same, _ = controller(kp=1.5)(at_rest(POSE, GOAL)[None], c.start(1))
     beyond = np.abs(same) > wanted / 127
     assert beyond.any() and (far[beyond] == same[beyond]).all()  # a least opening, not one more
+
+
+def test_valves_that_stay_awake_are_barely_open_when_the_tool_is_to_stand():
+    """A tool that sinks a little is called back with the least opening; without `awake` by closed valves."""
+    history = np.array(rest_history(POSE, 13))
+    history[..., 1, :] = [[0.001], [0.0], [-0.001], [0.001], [0.001]]
+    seen = observe(BROKK_170, history, np.zeros(3), np.zeros(3))[None]
+    c = controller(kp=1e-3, ready=0.03)
+    assert not c(seen, c.start(1))[0].any()
+    u, _ = replace(c, awake=True)(seen, c.start(1))
+    wanted = round(127 * (0.07 + 0.93 * 0.03))
+    assert np.rint(u[0] * 127).tolist() == [-wanted, 0, wanted, -wanted, -wanted]
 
 
 def test_controllers_of_a_batch_do_not_meet():

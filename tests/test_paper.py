@@ -31,7 +31,8 @@ from brokk_min import (
     scores,
     sequences,
 )
-from brokk_min.env import TaskConfig, TaskVectorEnv, paper_view
+from brokk_min.env import TaskConfig, paper_view
+from brokk_min.environments import TaskVectorEnv
 from brokk_min.kinematics import tool_position
 from brokk_min.logs import velocity_of
 from brokk_min.machine import BROKK_170
@@ -238,6 +239,7 @@ def test_the_constants_are_the_papers() -> None:
         "jacobian_pid_k0.1": 0.1,
         "jacobian_pid_k0.05": 0.05,
         "jacobian_pid_ff": 0.1,
+        "jacobian_pid_ff_awake": 0.1,
     }
     assert jacobian.GAINS["feedback"] == (0.0, 1.0)
 

@@ -302,13 +302,13 @@ def test_a_window_that_hangs_is_a_lost_device() -> None:
 def test_a_loop_whose_window_died_stops(monkeypatch: pytest.MonkeyPatch) -> None:
     asks, levers = Mailbox(12), Levers(BROKK_170)
     operator = Remote(asks, Chosen([levers]), levers, lambda: 10.0)
-    assert operator(False, True) == play.hw.Wish(alive=False)  # it has not said anything yet
+    assert operator(False, True) == play.wishes.Wish(alive=False)  # it has not said anything yet
     monkeypatch.setattr(
         remote.multiprocessing, "parent_process", lambda: SimpleNamespace(is_alive=lambda: False)
     )
-    assert operator(True, True) == play.hw.Wish(alive=False, stop=True)
+    assert operator(True, True) == play.wishes.Wish(alive=False, stop=True)
     asks.write([9.9, 0, 1, 1, 0, 0.1, 0, 0, 0, 0, 0, 0])
-    assert operator(True, True) == play.hw.Wish((0.1, 0.0, 0.0), enable=True)
+    assert operator(True, True) == play.wishes.Wish((0.1, 0.0, 0.0), enable=True)
 
 
 def test_a_whole_traced_rectangle_is_scored() -> None:
@@ -544,7 +544,7 @@ def test_watching_sends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     peer = can.Bus("watched", interface="virtual")
     world = World(
         Push(60, 0, 60, 60, 60),
-        lambda driving, ready: play.hw.Wish((0.1, 0, 0) if driving else (0, 0, 0), ready),
+        lambda driving, ready: play.wishes.Wish((0.1, 0, 0) if driving else (0, 0, 0), ready),
     )
     frames: list[tuple[int, bytes]] = []
     world.upward = world.downward = lambda can_id, data: frames.append((can_id, data)) or [(can_id, data)]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from helpers_bus import World
 
-from brokk_min import experiments, hw
+from brokk_min import experiments, wishes
 from brokk_min.__main__ import main
 from brokk_min.actuator import load_net
 from brokk_min.env import fitting_nets
@@ -155,7 +155,7 @@ def test_it_is_driven_over_the_bus(mini: Machine) -> None:
     start = (0.1, -0.5, 1.4, 0.8)
     for axis in range(3):
         goals = np.tile(0.15 * np.eye(3)[axis], (50, 1))  # 2 s
-        script = hw.Script(mini, goals)
+        script = wishes.Script(mini, goals)
         world = World(controller, script, mini, start=start)
         world.drive.begin()
         while world.drive.tick():

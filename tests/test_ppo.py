@@ -26,7 +26,8 @@ from torch import nn
 from brokk_min import logs, ppo
 from brokk_min.__main__ import main
 from brokk_min.actuator import save_net
-from brokk_min.env import TaskConfig, TaskVectorEnv, look, to_command
+from brokk_min.env import TaskConfig, look, to_command
+from brokk_min.environments import TaskVectorEnv
 from brokk_min.machine import BROKK_170
 from brokk_min.policy import load_policy
 from brokk_min.ppo import Agent, PPOConfig, Training, gae, train
@@ -724,7 +725,7 @@ def killed(tmp_path, monkeypatch):
         ({"seed": 6}, r"seed: expected 6, got 5"),
         ({"config": replace(TINY, gamma=0.5)}, r"settings: expected .*'gamma': 0\.5.*got .*gamma"),
         ({"task": TaskConfig(episode_s=0.7)}, r"task: expected .*0\.7.*, got .*0\.6"),
-        ({"net": small_net(BROKK_170, np.random.default_rng(1))}, r"actuator: expected \w+, got \w+"),
+        ({"net": small_net(BROKK_170, np.random.default_rng(1))}, r"actuator: expected '\w+', got '\w+'"),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )

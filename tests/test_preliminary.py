@@ -11,7 +11,7 @@ import pytest
 from helpers_machines import obedient_net, obedient_velocity, random_machine, small_net
 
 from benchmarks.rollout import random_net
-from brokk_min import actuator, excitation, fitting, preliminary, scores
+from brokk_min import actuator, excitation, fitting, preliminary, scores, trust
 from brokk_min.__main__ import main
 from brokk_min.actuator import ActuatorNet
 from brokk_min.fitting import FitConfig
@@ -186,7 +186,9 @@ def test_the_papers_recipe_is_sines_without_ways_back_and_errors_of_one_step(mon
     monkeypatch.setattr(excitation, "collect", lambda *a: seen.update(excitation=a[2]) or real_collect(*a))
     test = excitation.task_log(BROKK_170, 2, 12.0, np.random.default_rng(1))
     result = preliminary.paper_recipe(BROKK_170, test, 0.02, FitConfig(steps=3, batch_size=8), 0)
-    assert seen["excitation"] == "sine" and seen["config"] == FitConfig(3, 8, noise=0.0, rollout=1)
+    assert seen["excitation"] == "sine" and seen["config"] == FitConfig(
+        3, 8, noise=0.0, rollout=1, dead_zone=0.0
+    )
     assert seen["log"].recordings and not any(r.name.endswith("_return") for r in seen["log"].recordings)
     assert set(result["test"]) == set(BROKK_170.names) and "10" in result["test"]["q5"]["free_run"]
     assert result["sim_to_real"]["tool_position_error_mean_of_runs"]["runs"] == 20
@@ -350,9 +352,7 @@ def test_commands_outside_the_training_by_hand():
     known = taped(np.sin(2 * np.pi * 0.2 * time), 0.5 * np.cos(time))
 
     def shares(u: np.ndarray, q: float = 0.0) -> dict[str, float]:
-        return {
-            k: float(v[0]) for k, v in preliminary.outside_training(known, taped(u, q + 0 * u), 13).items()
-        }
+        return {k: float(v[0]) for k, v in trust.outside_training(known, taped(u, q + 0 * u), 13).items()}
 
     assert not any(shares(0.9 * np.sin(2 * np.pi * 0.2 * time + 1)).values())
     large = shares(np.where(np.arange(1000) < 500, 0.5, 1.2))
@@ -361,9 +361,9 @@ def test_commands_outside_the_training_by_hand():
     assert fast["change of command"] == pytest.approx(0.5, abs=0.01) and fast["command"] == 0
     assert fast["mean command"] == 0
     short = taped(np.tile([0.9, -0.9], 500))  # trained on a tremble, tested on a hold
-    slow = preliminary.outside_training(short, taped(0.5 + 0 * time), 13)
+    slow = trust.outside_training(short, taped(0.5 + 0 * time), 13)
     assert slow["mean command"][0] == 0  # this joint rests in the test: nothing to judge
-    moving = preliminary.outside_training(short, taped(0.5 + 0 * time, 0.1 * time), 13)
+    moving = trust.outside_training(short, taped(0.5 + 0 * time, 0.1 * time), 13)
     assert moving["mean command"][0] == 1 and moving["command"][0] == 0
     assert shares(0 * time + np.sin(time), 0.6)["angle"] == 1
 
@@ -375,17 +375,17 @@ def test_creep_is_the_largest_drift_of_a_joint_without_a_command(monkeypatch):
         assert not u.any()
         return q + np.arange(len(u) + 1)[:, None, None] / 20 * 0.003 * (q == q.max(axis=0))
 
-    monkeypatch.setattr(preliminary, "net_mover", lambda _: drifting)
-    np.testing.assert_allclose(preliminary.creep(net), 0.003)
+    monkeypatch.setattr(trust, "net_mover", lambda _: drifting)
+    np.testing.assert_allclose(trust.creep(net), 0.003)
 
 
 def test_a_net_that_is_no_better_than_a_linear_model_is_told_so():
     log, test = linear_log(0), linear_log(1)
-    verdict = preliminary.judge(blank_net(log), log, test)
+    verdict = trust.judge(blank_net(log), log, test)
     assert [w for w in verdict["warnings"] if w.startswith("a: a free run of 1 s") and "no better" in w]
     jumps = Log(("a",), tuple(r._replace(u=-np.abs(r.u) - 0.2) for r in test.recordings))
     assert any(
-        w.startswith("a: command outside") for w in preliminary.judge(blank_net(log), log, jumps)["warnings"]
+        w.startswith("a: command outside") for w in trust.judge(blank_net(log), log, jumps)["warnings"]
     )
 
 
@@ -401,5 +401,5 @@ def test_tool_errors_by_hand(monkeypatch):
         None,
     )
     monkeypatch.setattr(scores, "run_errors", error)
-    errors = preliminary.tool_errors(BROKK_170, random_net(np.random.default_rng(0)), test)
+    errors = trust.tool_errors(BROKK_170, random_net(np.random.default_rng(0)), test)
     assert errors == {"1": pytest.approx(0.0305, abs=2e-4), "5": pytest.approx(0.1525, abs=1e-3)}

@@ -19,7 +19,8 @@ from hypothesis import strategies as st
 from strategies import moving
 
 from brokk_min import looks, view, window
-from brokk_min.env import TaskConfig, TaskEnv
+from brokk_min.env import TaskConfig
+from brokk_min.environments import TaskEnv
 from brokk_min.jacobian import manipulability
 from brokk_min.kinematics import frames, jacobian, tool_position
 from brokk_min.machine import BROKK_170, Machine
@@ -55,7 +56,7 @@ def test_importing_needs_neither_pygame_nor_physics() -> None:
         "'matplotlib', 'gymnasium') or m.startswith('brokk_min.')])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    pure = ("window", "view", "looks", "kinematics", "machine")
+    pure = ("window", "view", "looks", "kinematics", "machine", "extras")
     assert set(eval(done.stdout)) == {f"brokk_min.{name}" for name in pure}
 
 
@@ -279,7 +280,7 @@ def test_two_arms_share_no_column() -> None:
 
 def test_pygame_is_asked_for_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pygame", None)
-    with pytest.raises(ValueError, match=r"expected pygame \(extra brokk_min\[play\]\)"):
+    with pytest.raises(ValueError, match=r"pygame: expected the extra brokk_min\[play\], got"):
         picture([], SIZE)
 
 
@@ -356,7 +357,7 @@ def test_rendering_refuses_what_it_cannot_do(monkeypatch: pytest.MonkeyPatch) ->
     env = TaskEnv(render_mode="rgb_array")
     env.reset(seed=0)
     monkeypatch.setitem(sys.modules, "pygame", None)
-    with pytest.raises(ValueError, match=r"expected pygame \(extra brokk_min\[play\]\)"):
+    with pytest.raises(ValueError, match=r"pygame: expected the extra brokk_min\[play\], got"):
         env.render()
 
 
