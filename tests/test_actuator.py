@@ -144,14 +144,14 @@ def test_a_step_of_the_simulation_by_hand():
 
 def test_a_joint_without_a_command_that_stood_still_stays():
     net = constant_net([0.2, 0.2, 0.2, 0.2], False, ("a", "b", "c", "d"))
-    history = rest_history(np.zeros(4, np.float32), 13)
+    history = rest_history(np.full(4, 0.5, np.float32), 13)
     history[1, 2, 1] = 0.01  # b had a command within the history that remains
-    history[2, 0, 1:] = 0.003  # c has moved
-    _, q = net.step(history, np.array([0.0, 0.0, 0.003, 0.0]), [0.0, 0.0, 0.0, 0.01])
-    np.testing.assert_allclose(q, [0.0, 0.01, 0.013, 0.01], atol=1e-6)
+    history[2, 0, -1:] = 0.503  # c has moved
+    _, q = net.step(history, np.array([0.5, 0.5, 0.503, 0.5]), [0.0, 0.0, 0.0, 0.01])
+    np.testing.assert_allclose(q, [0.5, 0.51, 0.513, 0.51], atol=1e-6)
     history[1, 2, 1], history[1, 2, 0] = 0.0, 0.01  # a tick later it is past
-    _, q = net.step(history, np.zeros(4), [0.0, 0.0, 0.0, 0.0])
-    assert q[1] == 0.0
+    _, q = net.step(history, np.full(4, 0.5), [0.0, 0.0, 0.0, 0.0])
+    assert q[1] == 0.5
 
 
 def test_selected_nets_are_the_same_nets_in_another_order():

@@ -151,13 +151,14 @@ def test_the_cost_of_moving_a_valve_is_in_it():
     np.testing.assert_allclose(dear - free, by_command * by_action(machine, commands), rtol=1e-4, atol=1e-5)
 
 
-def test_a_joint_at_its_stop_gains_nothing_by_pushing():
+@pytest.mark.parametrize(("end", "push"), [("q_max", 0.4), ("q_min", -0.4)])
+def test_a_joint_at_its_stop_gains_nothing_by_pushing(end, push):
     machine = BROKK_170
     net, u = obedient_net(machine), np.zeros((3, 1, 5))
     q = (machine.column("q_min") + machine.column("q_max")) / 2
-    q[4] = machine.column("q_max")[4]
+    q[4] = machine.column(end)[4]
     state = task.rest_state(machine, q[None], [0.1, 0.1, 0.1], plant=False)
-    u[..., 4], u[..., 3] = 0.4, 0.3
+    u[..., 4], u[..., 3] = push, 0.3
     found = action_gradients(machine, net, rollout_of(simulate(machine, net, state, u), u), 0.9, 0.0)[:, 0]
     assert not found[:, 3].any() and found[:, 2].all()
 

@@ -34,7 +34,7 @@ def test_sines_have_amplitudes_between_dead_zone_and_limit_and_random_frequencie
         amplitudes.append(np.abs(u).max())
         frequencies.append(np.arccos(doubled / 2) / (2 * np.pi * 0.05))
     assert 0.069 < min(amplitudes) < 0.15 and 0.55 < max(amplitudes) <= LIMIT
-    assert np.ptp(frequencies) > 0.3 and min(frequencies) > 0
+    assert 0.02 <= min(frequencies) < 0.03 and 0.47 < max(frequencies) <= 0.5
 
 
 def test_rich_commands_hold_jump_and_pause_and_have_the_asked_length():
@@ -235,3 +235,113 @@ def test_task_recordings_move_driven_or_locked_joints_within_the_limits_and_repl
         for u in r.u:
             state = plant_step(BROKK_170, state, u)
         assert np.abs(state.q - r.q[-1]).max() < 0.02
+
+
+class Picked(np.random.Generator):
+    """Draws one kind of part alone; `hand`: restless at rest; `low`: `random` is 0, or else just below 1."""
+
+    def __init__(self, kind: str, hand: int = 0, low: bool = False) -> None:
+        super().__init__(np.random.PCG64(0))
+        self.kind, self.hand, self.low = kind, hand, low
+
+    def choice(self, a, *args, **options):
+        drawn = super().choice(a, *args, **options)
+        return self.kind if self.kind in a else self.hand if 0 in a else drawn
+
+    def random(self, *args, **options):
+        return super().random(*args, **options) * 0 + (0.0 if self.low else 0.999)
+
+
+def lengths_where(same: np.ndarray) -> np.ndarray:
+    """Lengths of the stretches between places at which `same` does not hold."""
+    return np.diff(np.flatnonzero(~same))
+
+
+def test_steps_last_half_a_second_to_ten_at_levels_from_the_dead_zone_to_a_third_above_the_limit():
+    u = EXCITATIONS["rich"](Picked("step"), BROKK_170, 100_000)
+    lengths = lengths_where(np.diff(u) == 0)
+    assert lengths.min() in (10, 11) and 195 <= lengths.max() < 200
+    for side in (u[u > 0], -u[u < 0]):
+        assert 0.07 <= side.min() < 0.08 and 0.99 * 4 / 3 * LIMIT < side.max() <= 4 / 3 * LIMIT
+    noisy = EXCITATIONS["rich"](Picked("step", low=True), BROKK_170, 50_000)
+    assert 0.02 < np.median(np.abs(np.diff(noisy))) < 0.05  # its spread is drawn up to 0.08
+
+
+def test_holds_last_one_to_seven_ticks_at_levels_up_to_a_third_above_the_limit():
+    u = EXCITATIONS["rich"](Picked("holds"), BROKK_170, 50_000)
+    lengths = lengths_where(np.diff(u) == 0)
+    assert lengths.max() == 7 and np.bincount(lengths)[1:].min() > 500
+    assert min(u.max(), -u.min()) > 0.99 * 4 / 3 * LIMIT and np.abs(u).max() <= 4 / 3 * LIMIT
+
+
+def test_fast_sines_last_half_a_second_to_four_from_a_twentieth_of_a_hertz_to_four():
+    u = EXCITATIONS["rich"](Picked("sine"), BROKK_170, 50_000)
+    d = np.diff(u)
+    doubled = (d[2:] + d[:-2]) / d[1:-1]  # of any sine 2 cos(w dt), about whatever mean
+    same = np.abs(np.diff(doubled)) < 1e-5
+    parts = lengths_where(same)
+    assert parts.max() in (75, 76) and parts[parts > 1].min() in (6, 7)  # less the four ticks about a seam
+    inside = np.clip(doubled[:-1][same] / 2, -1, 1)
+    slow, middle, fast = np.quantile(np.arccos(inside) / (2 * np.pi * 0.05), [0.01, 0.5, 0.99])
+    assert 0.045 < slow < 0.06 and 0.35 < middle < 0.6 and 3.6 < fast < 4.05
+    assert min(u.max(), -u.min()) > 1.5 * LIMIT and np.abs(u).max() <= (4 / 3 + 0.4) * LIMIT  # 0.3 of 4/3
+
+
+def moves_and_rests(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lengths of the stretches in which a tape that begins and ends at rest moves, and of those between."""
+    edges = np.flatnonzero(np.diff(np.r_[0, np.abs(u) > 0.07, 0]))
+    return edges[1::2] - edges[::2], edges[2::2] - edges[1:-1:2]
+
+
+def test_stop_and_go_moves_for_a_second_at_most_out_of_rests_up_to_idle():
+    """Rests of 0.05 to 3 s, short ones more often, or until the valve is idle, 2 s."""
+    u = EXCITATIONS["rich"](Picked("go"), BROKK_170, 100_000)
+    assert min(u.max(), -u.min()) > 0.99 * 4 / 3 * LIMIT and np.abs(u).max() <= 4 / 3 * LIMIT
+    moves, rests = moves_and_rests(u)
+    assert 17 <= np.quantile(moves, 0.95) <= moves.max() < 20 and np.quantile(moves, 0.1) in (2, 3, 4)
+    assert 5 < np.median(rests) < 10 and rests.min() == 1 and 50 < np.quantile(rests, 0.98) < 65
+    rests = moves_and_rests(EXCITATIONS["rich"](Picked("go", low=True), BROKK_170, 100_000))[1]
+    assert np.mean(rests == 40) > 0.4 and rests.min() == 40
+
+
+def test_a_restless_hand_stays_within_the_dead_zone():
+    u = EXCITATIONS["rich"](Picked("go", hand=1, low=True), BROKK_170, 100_000)
+    rest = u[np.abs(u) < 0.07]
+    assert len(rest) > 50_000 and (rest != 0).all() and min(rest.max(), -rest.min()) > 0.06
+
+
+class Sudden(np.random.Generator):
+    """Draws no noise, and commands that are at once at their levels."""
+
+    def __init__(self) -> None:
+        super().__init__(np.random.PCG64(0))
+
+    def uniform(self, low=0.0, high=1.0, size=None):
+        drawn = super().uniform(low, high, size)
+        return drawn * 0 + 1 if np.isscalar(low) and (low, high) == (0.05, 0.6) else drawn
+
+    def standard_normal(self, *args, **options):
+        return super().standard_normal(*args, **options) * 0
+
+
+def test_joints_of_a_task_hold_each_a_level_for_a_time_of_its_own_and_go_to_the_nearer_end_less_often():
+    log = task_log(BROKK_170, 10, 80.0, Sudden())
+    low, span = BROKK_170.column("q_min"), BROKK_170.column("q_max") - BROKK_170.column("q_min")
+    held, levels, places, together = [], [], [], []
+    for i, r in enumerate(log.recordings):
+        changes = np.diff(r.u, axis=0) != 0
+        for j in [1] if i % 5 == 4 else [0, 2, 3, 4]:
+            at = np.flatnonzero(changes[:, j])
+            held += np.diff(at).tolist()
+            levels += r.u[at + 1, j].tolist()
+            places += ((r.q[at + 1, j] - low[j]) / span[j]).tolist()
+            together.append(changes[at][:, [k for k in range(5) if k not in (1, j)]].mean())
+    short, middle, long = np.quantile(held, [0.05, 0.5, 0.97])
+    assert 9 < short < 20 and 45 < middle < 65 and 93 < long < 150
+    levels, places = np.array(levels), np.array(places)
+    assert min(levels.max(), -levels.min()) > 0.98 * LIMIT and 0.08 < np.mean(levels == 0) < 0.22
+    upward = [np.mean(levels[near & (levels != 0)] > 0) for near in (places < 0.3, places > 0.7)]
+    assert upward[0] > 0.8 and upward[1] < 0.2 and max(together) < 0.1
+    noisy = task_log(BROKK_170, 4, 20.0, np.random.default_rng(0))
+    steps = np.abs(np.concatenate([np.diff(r.u[:, [0, 2, 3, 4]], axis=0) for r in noisy.recordings])) * 127
+    assert steps.max() < 100 and 0.5 < np.median(steps) < 10

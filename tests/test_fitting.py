@@ -75,6 +75,15 @@ def test_a_fit_repeats_itself_to_the_bit():
     assert not np.array_equal(one.weights[0], other.weights[0])
 
 
+def test_the_first_weights_are_hes_uniform_ones():
+    net = fit(simple_system(0, 3), FitConfig(steps=0), seed=0, velocity_samples=4)
+    for inputs, weights, offsets in zip((39, 32, 32), net.weights[::2], net.weights[1::2], strict=True):
+        bound = np.sqrt(6 / inputs)
+        assert weights.shape[1] == inputs and not offsets.any()
+        assert 0.9 * bound < weights.max() <= bound and -0.9 * bound > weights.min() >= -bound
+        assert weights.std() == pytest.approx(bound / np.sqrt(3), rel=0.15)
+
+
 def test_a_joint_moves_in_a_recording_in_which_its_angle_or_its_command_changes():
     still, ramp = np.zeros(6), np.arange(6) / 10
     u, q = np.stack([still, still, ramp], 1), np.stack([ramp, still, still], 1)

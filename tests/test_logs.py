@@ -256,7 +256,7 @@ def test_gaps_cut_a_recording(tmp_path):
     time[60:] += 0.25  # 0.3 s: cut
     columns = table("x", time)
     first, second = read_log([write(tmp_path / "log.npz", columns)], 4).recordings
-    assert first.name == "x" and second.name != "x" and second.name.startswith("x")
+    assert first.name == "x" and second.name == "x#2"
     np.testing.assert_allclose(second.q[:, 0], columns["q_a"][63:], atol=1e-9)
     assert len(first.q) == len(first.q_dot) == 60 + 3
     np.testing.assert_allclose(first.u[29:33, 0], columns["u_a"][29])  # held over the hole
@@ -281,7 +281,7 @@ def test_too_little_between_two_gaps_is_left_out(tmp_path):
     time[20:] += 1.0
     time[23:] += 1.0
     path = write(tmp_path / "log.csv", table("x", time))
-    assert [len(r.q) for r in read_log([path], 4).recordings] == [20, 14]
+    assert [(r.name, len(r.q)) for r in read_log([path], 4).recordings] == [("x", 20), ("x#3", 14)]
     assert [len(r.q) for r in read_log([path], 3).recordings] == [20, 1, 15]
 
 

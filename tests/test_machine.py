@@ -87,6 +87,8 @@ BAD = [
     ({"spool_idle": -0.1}, ["spool_idle", "0 to 1", "got -0.1"]),
     ({"pump_flow": 0.0}, ["pump_flow", "got 0.0"]),
     ({"plant_dt": 0.0}, ["plant_dt", "1e-06 to 1", "got 0.0"]),
+    ({"plant_dt": 0.03}, ["plant_dt", "1/rate = 0.05 to be a multiple", "got 0.03"]),
+    ({"plant_dt": 1.0, "rate": 1e7}, ["plant_dt", "1/rate = 1e-07 to be a multiple", "got 1.0"]),
     ({"encoder_bits": 0}, ["encoder_bits", "1 to 32", "got 0"]),
     ({"encoder_bits": 33}, ["encoder_bits", "1 to 32", "got 33"]),
     ({"velocity_samples": 1}, ["velocity_samples", "2 to 100", "got 1"]),
@@ -118,6 +120,7 @@ def test_values_at_the_ends_of_the_allowed_ranges_are_machines():
     replace(BROKK_170, pwm_limit=1, dead_zone=0.0, delay=0.0, velocity_samples=2, history=2)
     replace(BROKK_170, pwm_limit=127, valve_frame_id=0x7FF, ready_threshold=0.0, encoder_bits=32)
     replace(BROKK_170, **with_joint(0, encoder_node=127, a=0.0, d=-1.0))
+    replace(BROKK_170, plant_dt=BROKK_170.dt)
 
 
 def numeric_fields() -> list[tuple[str, dataclasses.Field]]:

@@ -37,6 +37,7 @@ def test_line_distance_before_the_first_motion_is_from_the_start() -> None:
 def test_line_distance_of_a_batch_is_that_of_its_runs() -> None:
     rng = np.random.default_rng(0)
     goals = np.repeat(rng.integers(-1, 2, (6, 4, 3)) * 0.1, 5, axis=0)
+    goals[:10, 0] = 0.0  # one rests while the others move
     p, start = rng.normal(size=(30, 4, 3)), rng.normal(size=(4, 3))
     whole = m.line_distance(p, goals, start)
     for i in range(4):
@@ -71,6 +72,21 @@ def test_metrics_by_hand() -> None:
     assert row["position_error_mean"] == pytest.approx((0.005 + 0.005 + 0.005) / 3)  # behind, behind, ahead
 
 
+def test_figures_of_a_batch_are_those_of_its_runs() -> None:
+    rng = np.random.default_rng(0)
+    goals, start = np.repeat(rng.integers(-1, 2, (3, 4, 3)) * 0.1, 10, axis=0), rng.normal(size=(4, 3))
+    kinds = (rng.normal(0, 0.1, (30, 4, size)) for size in (5, 5, 5, 5, 3, 3))
+    trace = Trace(*kinds, rng.random((30, 4)))
+    whole = m.metrics(BROKK_170, trace, goals, start)
+    for i in range(4):
+        one = slice(i, i + 1)
+        alone = m.metrics(BROKK_170, Trace(*(a[:, one] for a in trace)), goals[:, one], start[one])
+        for name, value in whole.items():
+            np.testing.assert_allclose(value[one], alone[name], err_msg=name)
+    jerk = np.diff(trace.v_tool, n=2, axis=0) * 400
+    np.testing.assert_allclose(whole["jerk_rms"] ** 2, (jerk**2).sum(axis=(0, 2)) / 28)
+
+
 def test_errors_near_a_change_of_goal_are_transient() -> None:
     """Rest for 10 ticks, then 0.2 m/s for 30: 12 ticks of 0.1 m/s error, 18 of 0.01; 0.05 at rest."""
     goals = np.zeros((40, 3))
@@ -91,6 +107,15 @@ def test_a_run_that_does_not_settle_counts_to_the_next_change() -> None:
     assert figures(v, goals)["settling_time"] == pytest.approx((20 * 0.05 + 0) / 2)
 
 
+def test_a_change_at_the_last_tick_counts_too() -> None:
+    goals = np.zeros((10, 3))
+    goals[9:, 1] = 0.2
+    assert figures(np.zeros((10, 3)), goals)["settling_time"] == pytest.approx(0.05)
+    goals[5:9, 1] = 0.1  # a change that is all but met at once, and that one
+    v = np.where(goals == 0.2, 0.0, 0.9 * goals)
+    assert figures(v, goals)["settling_time"] == pytest.approx((0 + 0.05) / 2)
+
+
 def test_a_slow_goal_is_not_met_by_standing_still() -> None:
     """0.03 m/s, a tenth of the tool's speed: an error of 0.02 is no settling, one of 0.01 is."""
     goals = np.zeros((40, 3))
@@ -106,6 +131,7 @@ def test_a_goal_that_turns_slowly_is_no_change() -> None:
     goals = 0.15 * np.stack([np.cos(turn), 0 * turn, np.sin(turn)], axis=1)
     since = m.since_change(BROKK_170, goals[:, None])
     np.testing.assert_array_equal(since[:, 0], np.arange(320))  # the start is the only change
+    assert (m.since_change(BROKK_170, np.zeros((4, 1, 3))) == -1).all()
     still = figures(np.zeros((4, 3)), np.zeros((4, 3)))
     assert np.isnan(still["settling_time"]) and np.isnan(still["velocity_error_transient"])
 
@@ -123,6 +149,7 @@ def test_intervals_are_students() -> None:
     expected = stats.ttest_1samp(values, 0).confidence_interval(0.95)
     np.testing.assert_allclose(m.interval(np.append(values, np.nan)), expected)
     assert m.interval(np.array([1.0, np.nan])) == [None, None]
+    assert m.interval(np.array([1.0, 3.0])) == pytest.approx([2 - 12.7062, 2 + 12.7062], abs=1e-4)
 
 
 def run(controller: str, sequence: str, start: int, error: float | None) -> dict[str, object]:
@@ -158,6 +185,7 @@ def test_a_summary_leaves_out_what_was_not_measured() -> None:
     found = m.summary(runs)["a"]
     assert found["x"]["error"] == 2.0 and found["y"]["error"] is None and found["all"]["error"] == 2.0
     assert m.intervals(runs)["a"]["y"]["error"] == [None, None]
+    assert m.intervals(runs)["a"]["x"]["error"] == m.interval(np.array([1.0, 3.0]))
 
 
 def test_drift_is_the_largest_and_the_mean_distance_from_the_line() -> None:
@@ -170,4 +198,4 @@ def test_drift_is_the_largest_and_the_mean_distance_from_the_line() -> None:
 
 def test_the_mean_of_a_row_leaves_out_what_is_no_number() -> None:
     assert m.row_mean(np.array([[1.0, np.nan, 4.0], [2.0, 3.0, 7.0]])).tolist() == [2.5, 4.0]
-    assert np.isnan(m.row_mean(np.full((1, 2), np.nan))).all()
+    assert m.row_mean(np.array([[np.nan, 3.0]])) == 3.0 and np.isnan(m.row_mean(np.full((1, 2), np.nan)))

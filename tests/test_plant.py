@@ -101,6 +101,14 @@ def test_the_pump_is_enough_at_the_limit_and_too_small_at_full_command():
     assert loss(1.0) > 0.05
 
 
+def test_each_machine_of_a_batch_has_a_pump_of_its_own():
+    starts = MIDDLE + 0.1 * np.arange(3)[:, None]
+    batch, one = plant_reset(BROKK_170, starts), plant_reset(BROKK_170, starts[1])
+    for _ in range(12):
+        batch, one = (plant_step(BROKK_170, s, np.ones_like(s.q)) for s in (batch, one))
+    np.testing.assert_allclose(batch.q[1], one.q, atol=1e-12)
+
+
 def test_a_command_arrives_after_the_delay_and_not_a_step_earlier():
     state = plant_reset(FAST, MIDDLE)
     for tick in range(12):

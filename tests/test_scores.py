@@ -10,7 +10,7 @@ from helpers_machines import constant_net, line, random_net
 
 from brokk_min import scores
 from brokk_min.excitation import collect
-from brokk_min.fitting import FitConfig, fit
+from brokk_min.fitting import FitConfig, end_to_end, fit
 from brokk_min.logs import Log, Recording, velocity_of
 from brokk_min.machine import BROKK_170, estimate_velocity
 from brokk_min.scores import free_run, score
@@ -131,11 +131,40 @@ def test_errors_of_whole_recordings_by_hand():
     assert np.isnan(scores.recording_errors(net, log._replace(recordings=log.recordings[3:]), 30.0)).all()
 
 
+def test_each_joint_is_scored_where_it_moves_and_everywhere_if_it_never_does():
+    """Joint a moves in a recording of 15 samples, one tick to be judged; b never; c in one of 60."""
+    still, ramp = np.zeros(60), 0.1 * np.arange(60) / 20
+    short, long = (np.stack(columns, axis=1) for columns in ((ramp, still, still), (still, still, ramp)))
+    tapes = (short[:15], long)
+    log = Log(
+        ("a", "b", "c"), tuple(Recording("", 0 * q, q, np.gradient(q, 0.05, axis=0)) for q in tapes), True
+    )
+    net = replace(constant_net([0.2] * 3, True, log.joints), q_low=np.full(3, -9.0), q_high=np.full(3, 9.0))
+    with_one = {name: entry["free_run"].keys() for name, entry in score(net, log).items()}
+    assert with_one == {"a": set(), "b": {"1"}, "c": {"1"}}
+    errors = scores.recording_errors(net, log, 30.0)
+    np.testing.assert_array_equal(np.isfinite(errors), [[True, True, False], [False, True, True]])
+
+
+def test_many_free_runs_are_as_few():
+    q = np.cumsum(np.random.default_rng(0).uniform(-0.02, 0.02, (9000, 2)), axis=0)
+    net, log = (
+        random_net(n=2, history=5),
+        Log(("a", "b"), (Recording("", 0.1 + 0 * q, q, velocity_of(q, 4)),)),
+    )
+    samples, starts = end_to_end(log), np.arange(5, 8990)
+    many = scores.run_errors(net, samples, starts, 2)
+    for found, wanted in zip(many, scores.run_errors(net, samples, starts[8000:], 2), strict=True):
+        assert found.shape == (2, 8985, 2)
+        np.testing.assert_allclose(found[:, 8000:], wanted, atol=1e-6)
+
+
 def test_a_whole_recording_is_scored_from_the_sample_after_the_first_history():
     net, q_dot = constant_net([0.2], True, ("a",)), 0.01 * np.arange(40.0)[:, None]
     log = Log(("a",), (line("a", 0.0, 0.1, 40)._replace(q_dot=q_dot),), True)
     wanted = np.sqrt(np.mean((0.2 - q_dot[net.history + 1 :]) ** 2))
     assert scores.recording_errors(net, log, 30.0) == pytest.approx(wanted, abs=1e-6)
+    assert score(net, log)["a"]["one_step_rmse"] == pytest.approx(wanted, abs=1e-6)  # the log's velocities
 
 
 def test_scores_need_the_same_joints_and_one_step_at_least():
