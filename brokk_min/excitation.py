@@ -206,8 +206,7 @@ def task_log(
         fraction = (recorder.q[-1] - q_min) / (q_max - q_min)
         up = rng.random(shape) > np.clip(1.5 * fraction - 0.25, 0, 1)
         drawn = np.where(up, 1, -1) * rng.uniform(0, limit, shape) * (rng.random(shape) < 0.85)
-        near = np.where(up, fraction > 0.9, fraction < 0.1)
-        level = np.where((left <= 0) | (near & (level * (2 * up - 1) > 0)), drawn, level)
+        level = np.where(left <= 0, drawn, level)
         left = np.where(left <= 0, rng.uniform(0.5, 5.0, shape), left) - machine.dt
         command = command + smoothing * (level - command)
         jitter = noise * rng.standard_normal(shape) * (level != 0)
