@@ -21,8 +21,7 @@ from brokk_min.plant import PlantState, plant_reset, plant_step
 
 GROUND_MARGIN = 0.3  # m above the ground below which no goal asks the arm to sink, assumed
 LAG_TIME, LAG_SPEED = 2.0, 0.07  # s and a share of tool_speed, tuned: see `push_lag`
-RAMP = 0.01  # assumed: an action this small takes a command through the dead zone, to
-OPEN = 0.018  # of full opening beyond it, tuned: there a valve is awake, cf. `ready` of `jacobian.GAINS`
+RAMP = 0.01  # of the command limit, assumed: actions this small take a command through the dead zone
 Array = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]
 Encoder = Callable[[Machine, Array], Array]  # machine and true angles -> angles read
@@ -267,9 +266,8 @@ def push_measured(
 def to_command(machine: Machine, action: ArrayLike) -> Array:
     """Commands for all joints from the policy's actions: beyond the dead zone, limited, in whole PWM counts.
 
-    As the baselines' PIDs, a policy need not find the dead zone: within the first `RAMP` of an action the
-    command goes through it and to the opening `OPEN`, and rises evenly from there. So near action 0 a
-    valve is barely open.
+    As the baselines' PIDs, a policy need not find the dead zone: the command goes through it within the
+    first `RAMP` of an action and rises evenly from there. A valve is then barely open near action 0.
 
     Paper: Sec. 3.4 (PWM out), Sec. 3.2 (7 %, 65 %), Fig. 3
 
@@ -286,7 +284,7 @@ def to_command(machine: Machine, action: ArrayLike) -> Array:
     Example:
         >>> from brokk_min.machine import BROKK_170
         >>> to_command(BROKK_170, [1.0, -0.5, 0.0, 2.0]) * 127
-        array([ 80.,   0., -46.,   0.,  80.])
+        array([ 80.,   0., -44.,   0.,  80.])
     """
     action = as_floats(action)
     if action.shape[-1:] != machine.driven.shape:
@@ -294,24 +292,24 @@ def to_command(machine: Machine, action: ArrayLike) -> Array:
     if not np.isfinite(action).all():
         raise ValueError(f"action: expected finite numbers, got {action[~np.isfinite(action)][0]}")
     u = np.zeros((*action.shape[:-1], machine.n), action.dtype)
-    begin, beyond = _command_range(machine)
+    dead, beyond = _command_range(machine)
     action = np.asarray(np.clip(action, -1.0, 1.0))
-    u[..., machine.driven] = np.clip(action / RAMP, -1.0, 1.0) * begin + action * beyond
+    u[..., machine.driven] = np.clip(action / RAMP, -1.0, 1.0) * dead + action * beyond
     return limit_command(machine, u)
 
 
 def command_slope(machine: Machine, u: Array) -> Array:
     """Derivative of `to_command` by the action at commands `u` (..., n): (..., n_driven), float32."""
-    begin, beyond = _command_range(machine)
-    through = np.abs(u[..., machine.driven]) < begin + RAMP * beyond
-    return np.asarray((beyond + through * (begin / RAMP)).astype(np.float32))
+    dead, beyond = _command_range(machine)
+    through = np.abs(u[..., machine.driven]) < dead + RAMP * beyond
+    return np.asarray((beyond + through * (dead / RAMP)).astype(np.float32))
 
 
 def _command_range(machine: Machine) -> tuple[float, float]:
-    """Where commands begin beyond the dead zone, and from there to the limit, as shares of full command."""
+    """The dead zone, and what is left from there to the command limit, as shares of full command."""
     limit = machine.pwm_limit / PWM_MAX
-    begin = min(machine.dead_zone + OPEN * (1 - machine.dead_zone), limit)
-    return begin, limit - begin
+    dead = min(machine.dead_zone, limit)
+    return dead, limit - dead
 
 
 # --- the episode ------------------------------------------------------------------------------------

@@ -53,9 +53,9 @@ def case(seed, machine=None):
 
 
 def by_action(machine, u):
-    """Slope of the command by the action at `u`: of the line from 0 to a valve barely open, to the limit."""
-    limit, begin = machine.pwm_limit / PWM_MAX, machine.dead_zone + task.OPEN * (1 - machine.dead_zone)
-    knee = begin + task.RAMP * (limit - begin)
+    """Slope of the command by the action at `u`: of the line from 0 through the dead zone to the limit."""
+    limit, dead = machine.pwm_limit / PWM_MAX, machine.dead_zone
+    knee = dead + task.RAMP * (limit - dead)
     u = np.abs(u[..., machine.driven])
     return np.where(u < knee, knee / task.RAMP, (limit - knee) / (1 - task.RAMP))
 
@@ -118,7 +118,7 @@ def test_one_tick_by_hand():
     fastest = 1.2 * BROKK_170.q_dot_max[BROKK_170.driven]
     share = (rates / fastest + 1) / 2  # of the sigmoid
     by_command = 2 * fastest * GAIN * share * (1 - share)
-    wanted = (error / size) @ J / (1 + size) ** 2 * by_command * (80 / 127 - 0.07 - 0.018 * 0.93)
+    wanted = (error / size) @ J / (1 + size) ** 2 * by_command * (80 / 127 - 0.07)
     np.testing.assert_allclose(found, wanted, rtol=1e-4)
 
 

@@ -109,10 +109,10 @@ def test_ground_is_below_not_at():
 
 
 def test_to_command_by_hand():
-    """Begun at 8.89 + 0.018 x 118.11 = 11.02 counts, 68.98 are beyond: 11.02 + 34.49; clipped to -80."""
-    action = [0.5, -3.0, -0.01, 0.005]  # the last two: 11.02 + 0.69 and half of that
+    """The dead zone has 8.89 counts, 71.11 are beyond: 8.89 + 35.56; clipped to -80; at 0.01 and 0.005."""
+    action = [0.5, -3.0, -0.01, 0.005]  # the last two: 8.89 + 0.71 and half of that
     counts = task.to_command(BROKK_170, action) * 127
-    np.testing.assert_allclose(counts, [46, 0, -80, -12, 6], atol=1e-9)
+    np.testing.assert_allclose(counts, [44, 0, -80, -10, 5], atol=1e-9)
     assert counts[1] == 0  # q2 is the operator's
     assert not task.to_command(BROKK_170, np.zeros(4)).any()
 
@@ -128,7 +128,7 @@ def test_commands_rise_with_actions_by_their_slope(machine, one, other):
     np.testing.assert_allclose(u[3], limit, atol=1e-9)
     slope = task.command_slope(machine, np.array([[0.0], [limit], [-limit]]) * np.ones(machine.n))
     assert slope.shape == (3, len(driven)) and slope.dtype == np.float32
-    if machine.dead_zone < limit - 0.03:
+    if machine.dead_zone < limit - 0.01:
         whole = slope[0] * task.RAMP + slope[1] * (1 - task.RAMP)
         np.testing.assert_allclose(whole, limit, rtol=1e-5)
         assert np.array_equal(slope[1], slope[2]) and (slope[0] >= slope[1]).all()
@@ -144,8 +144,8 @@ def test_to_command_sends_whole_counts_in_the_order_of_the_joints(machine):
     wanted = np.zeros_like(counts)
     for column, joint in enumerate(machine.driven):
         points = np.array([0, task.RAMP, 1]), np.array([0, 0, machine.pwm_limit], float)
-        begin = 127 * machine.dead_zone + 127 * task.OPEN * (1 - machine.dead_zone)
-        points[1][1] = begin + task.RAMP * (machine.pwm_limit - begin)
+        dead = 127 * machine.dead_zone
+        points[1][1] = dead + task.RAMP * (machine.pwm_limit - dead)
         wanted[:, joint] = np.sign(action[:, column]) * np.interp(np.abs(action[:, column]), *points)
     assert np.abs(counts - wanted).max() <= 0.5 + 1e-4
     assert not counts[:, machine.locked].any()

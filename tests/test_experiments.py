@@ -16,9 +16,9 @@ from matplotlib.colors import to_rgb
 from benchmarks.rollout import random_net
 from brokk_min import chain, experiments, figures, jacobian, report, variations
 from brokk_min.actuator import ActuatorNet, fingerprint, load_net, save_net
-from brokk_min.env import Measured, TaskConfig, measured, rollout
+from brokk_min.env import Measured, TaskConfig, measured, rollout, to_command
 from brokk_min.kinematics import joint_rates, tool_position
-from brokk_min.machine import BROKK_170, Machine, limit_command, read_encoder
+from brokk_min.machine import BROKK_170, Machine, read_encoder
 from brokk_min.metrics import metrics
 from brokk_min.plant import plant_reset, plant_step, speed_limits
 from brokk_min.sequences import task_sequences, tuning_goals
@@ -61,10 +61,7 @@ class FeedForward:
         down, up = speed_limits(self.machine, seen.q)
         rates = joint_rates(self.machine, seen.q, seen.v_goal)
         share = rates / np.where(rates > 0, *(limit[:, self.machine.driven] for limit in (up, -down)))
-        zone, limit = self.machine.dead_zone, self.machine.pwm_limit / 127
-        u = np.zeros_like(seen.q)
-        u[:, self.machine.driven] = np.sign(share) * (zone + (limit - zone) * np.abs(share))
-        return limit_command(self.machine, u), None
+        return to_command(self.machine, share), None
 
 
 def test_another_controller_takes_twenty_lines() -> None:
