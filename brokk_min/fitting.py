@@ -24,13 +24,13 @@ Array = NDArray[np.floating[Any]]
 class FitConfig:
     """How the nets are fitted."""
 
-    steps: int = 20000
+    steps: int = 16000
     """Adam steps."""
     batch_size: int = 512
     """Windows a joint in each step; 10,000 steps of 1024 take about as long and fit worse."""
     learning_rate: float = 4e-3
     """Of Adam at the start; falls to zero along a cosine, and again from a quarter for free runs."""
-    noise: float = 0.2
+    noise: float = 0.1
     """Standard deviation of the noise on the velocity inputs, in units of the velocities' own."""
     hidden: int = 32
     """Units in each of the two hidden layers (paper: 32)."""
