@@ -17,6 +17,7 @@ from brokk_min.logs import expect_same, load_arrays, whole_file
 from brokk_min.machine import Machine
 
 Array = NDArray[np.floating[Any]]
+STAND = 3.0  # s, assumed: valves close when the tool was to stand still for longer
 FORMAT = 2  # of policy files; 1: actions in units of the command limit, dead zone and all
 
 
@@ -53,17 +54,26 @@ class Policy:
 
 @dataclass(frozen=True)
 class PolicyController:
-    """A policy as an `env.Controller`; it needs no memory, the observation carries its own."""
+    """A policy as an `env.Controller`. The observation carries what it needs to remember.
+
+    Policies keep valves barely open where the tool is to stand, as if it were to move again at once. But
+    then it wanders. So the valves close when it was to stand for longer than `STAND`; that is remembered.
+    """
 
     machine: Machine
     policy: Policy
 
-    def start(self, num: int) -> None:
-        """Nothing to remember."""
+    def start(self, num: int) -> NDArray[np.int64]:
+        """Ticks for which each of `num` tools was to stand, (num,)."""
+        return np.zeros(num, np.int64)
 
-    def __call__(self, observation: Array, memory: None) -> tuple[Array, None]:
-        """Commands u (..., n) for observations (..., obs)."""
-        return to_command(self.machine, self.policy.act(observation)), None
+    def __call__(self, observation: Array, memory: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
+        """Commands u (num, n) for observations (num, obs), and the next memory."""
+        u = to_command(self.machine, self.policy.act(observation))
+        moves = observation[..., :3].any(axis=-1)  # the goal, of which nothing is noise
+        stood = np.where(moves, 0, memory + 1)
+        u[stood > STAND * self.machine.rate] = 0.0
+        return u, stood
 
 
 def contract(machine: Machine) -> dict[str, Any]:

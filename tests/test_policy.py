@@ -119,8 +119,21 @@ def test_the_controller_sends_what_the_policy_says(policy):
     controller = PolicyController(BROKK_170, policy)
     u, memory = controller(observation, controller.start(5))
     assert np.array_equal(u, to_command(BROKK_170, policy.act(observation)))
-    assert memory is None
+    assert memory.tolist() == [0] * 5
     assert len(np.unique(u[:, 0])) > 1
+
+
+def test_valves_close_when_the_tool_was_to_stand_for_three_seconds():
+    """One tool is asked to move once, the other never: for 60 ticks their valves may be kept awake."""
+    controller, seen = PolicyController(BROKK_170, trained()[1]), np.full((2, 171), 0.5, np.float32)
+    memory, awake = controller.start(2), []
+    for tick in range(130):
+        seen[:, :3] = [[0.0, 0.0, 0.1 * (tick == 50)], [0.0, 0.0, 0.0]]
+        u, memory = controller(seen, memory)
+        awake.append(u.any(axis=1))
+    first, second = np.array(awake).T
+    assert first[:111].all() and not first[111:].any()
+    assert second[:60].all() and not second[60:].any()
 
 
 def test_a_policy_runs_without_torch_and_scipy(saved):
