@@ -84,7 +84,7 @@ PLANTED: list[tuple[str, str, str, str]] = [
     ("plant", "/ (1 - machine.dead_zone)\n    arm", "\n    arm",
      "plant::speed_limits_are_where_the_plant_settles_at_the_command_limit"),
     # excitation and recordings
-    ("excitation", "* (-1.0) ** turns", "",
+    ("excitation", "* (-1.0) ** turns", "* 1.0**turns",
      "excitation::valves_are_held_barely_open_and_moved_off_from_there"),
     ("excitation", "amplitude = rng.uniform(machine.dead_zone, machine.pwm_limit / PWM_MAX)",
      "amplitude = rng.uniform(0, machine.pwm_limit / PWM_MAX)",
