@@ -225,7 +225,7 @@ def _print_means(runs: list[dict[str, Any]], sequences: int) -> None:
         print(f"{kind} starts ({num}), means over {sequences} sequences")
         for name, rows in summary(mine).items():
             cells = (f"{k} {'none' if v is None else format(v, '.4f')}" for k, v in rows["all"].items())
-            print(f"  {name:20} " + ", ".join(cells))
+            print(f"  {name:22} " + ", ".join(cells))
 
 
 @dataclass(kw_only=True)
@@ -242,7 +242,7 @@ class Reproduce(Command):
         results = chain.reproduce(check(self), self.out, effort, self.seed, self.sweep)
         for name, rows in results["task_space"]["summary"].items():
             errors = ", ".join(f"{s} {row['velocity_error_mean']:.4f}" for s, row in rows.items())
-            print(f"{name:20} mean velocity error [m/s]: {errors}")
+            print(f"{name:22} mean velocity error [m/s]: {errors}")
         for claim in results["claims"]:
             print(f"{VERDICTS[claim['holds']]}: {claim['paper']}")
         print(f"{self.out / 'report.html'}\n{self.out / 'results.json'}")
