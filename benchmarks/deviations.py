@@ -28,8 +28,8 @@ from brokk_min import (
     kinematics,
     logs,
     machine,
-    preliminary,
     sequences,
+    trust,
 )
 from brokk_min.env import TaskConfig, rollout, terminated
 from brokk_min.environments import TaskVectorEnv
@@ -148,7 +148,7 @@ def fitted(kind: str, noise: float, seed: int) -> dict[str, float]:
     """Nets of the driven joints, on drives like a policy's: the worst joint."""
     net, log = nets(kind, seed, noise=noise)
     test = excitation.task_log(M, 20, 40.0, np.random.default_rng(seed + 1))
-    verdict = preliminary.judge(net, log, test, M)
+    verdict = trust.judge(net, log, test, M)
     rows = [verdict["joints"][M.names[i]] for i in M.driven]
     return {
         "10 s [rad/s]": max(row["free_run"]["10"]["velocity_rmse"] for row in rows),

@@ -82,7 +82,7 @@ def test_reward_over_the_bus_is_that_of_evaluate(axis: int, controller: str) -> 
         np.random.default_rng(0),
     )  # fmt: skip
     assert over_bus == pytest.approx(trace.reward.mean(), rel=0.01)
-    assert trace.reward.mean() < 0.99  # there was something to lose
+    assert trace.reward.mean() < 0.995  # there was something to lose
 
 
 class Listener:

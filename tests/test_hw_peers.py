@@ -57,7 +57,7 @@ def policy() -> Policy:
 def folder(policy: Policy, tmp_path: Path) -> Path:
     save_policy(tmp_path / "policy.npz", policy)
     gains = {k: [1.0] * 4 for k in ("kp", "ki", "kd")} | {"kd": [0.0] * 4, "feedback": 0.1, "ready": 0.0}
-    names = ("jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff")
+    names = ("jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff", "jacobian_pid_ff_awake")
     table = {"meta": experiments.tuned_for(BROKK_170, policy.net), "gains": dict.fromkeys(names, gains)}
     (tmp_path / "gains.json").write_text(json.dumps(table))
     (tmp_path / "c.csv").write_text(

@@ -349,7 +349,9 @@ def test_without_a_critic_an_action_is_judged_by_its_slope(monkeypatch):
 
 
 def test_without_a_critic_the_deviation_falls_in_a_line():
-    training = Training(TaskVectorEnv(8, NET, BROKK_170, TASK), replace(TINY, log_std_end=-2.2), 1)
+    training = Training(
+        TaskVectorEnv(8, NET, BROKK_170, TASK), replace(TINY, log_std=-1.2, log_std_end=-2.2), 1
+    )
     found = []
     for _ in range(4):
         training.update()
