@@ -96,7 +96,7 @@ def a7() -> dict[str, float]:
 def a9() -> dict[str, float]:
     """Share of poses off the ground from which each sequence, and all three, are feasible."""
     good = []
-    q = sequences.draw_pose(M, TaskConfig(), np.random.default_rng(0), 3000)
+    q = env.draw_pose(M, TaskConfig(), np.random.default_rng(0), 3000)
     for sequence in sequences.axis_sequences(M):
         goals = np.repeat(sequence.goals[:, None], len(q), axis=1)
         good.append(sequences.feasible(M, q, goals))
