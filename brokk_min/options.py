@@ -25,6 +25,7 @@ ALLOWED: tuple[tuple[float, float, str], ...] = (
     (0, 1, "zero_goals axis_goals gae_lambda"),
     (0, 0.9999, "gamma"),
     (0, 1000, "noise valve_cost entropy"),
+    (0, 0.99, "dead_zone"),
     (0, 1e6, "hold_min_s hold_max_s"),
     (1, 1e6, "batch_size hidden num_envs horizon epochs threads rollout num num_starts"),
     (1, 1e12, "steps total_steps checkpoint_every"),
@@ -47,7 +48,7 @@ def check(command: Any, *outputs: Path | None) -> Machine:
     given |= vars(command.task) if hasattr(command, "task") else {}
     for low, high, names in ALLOWED:
         for name in names.split():
-            if name in given and not low <= given[name] <= high:
+            if given.get(name) is not None and not low <= given[name] <= high:
                 option = name.replace("_", "-")
                 raise WrongUse(f"--{option}: expected {low} to {high}, got {given[name]}")
     if given.get("hold_min_s", 0) > given.get("hold_max_s", 0):
