@@ -77,6 +77,11 @@ def test_the_designs_options_exist(capsys: pytest.CaptureFixture[str]) -> None:
         (["nonsense"], 2, "nonsense"),
         (["fit", "--out", "n.npz"], 2, "LOGS"),
         (["fit", "missing.csv", "--out", "n.npz"], 1, "missing.csv"),
+        (
+            ["fit", "missing.csv", "--out", "n.npz", "--dead-zone", "1.5"],
+            2,
+            "--dead-zone: expected 0 to 0.99",
+        ),
         (["train", "--actuator", "missing.npz", "--out", "p.npz"], 1, "missing.npz"),
         (["train", "--actuator", "missing.npz", "--out", "p.npz", "--num-envs", "0"], 2, "--num-envs"),
         (["sweep", "--actuator", "missing.npz", "--out", "s"], 1, "missing.npz"),
