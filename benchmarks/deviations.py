@@ -130,7 +130,7 @@ def a11() -> dict[str, float]:
 # --- by fitting and training --------------------------------------------------------------------------
 
 NOISE = fitting.FitConfig().noise
-STEPS = 2_000_000  # of each training here, a fifth of the default
+STEPS = 2_000_000  # of each training here, a third of the default
 
 
 def nets(kind: str, seed: int, **settings: float) -> tuple[actuator.ActuatorNet, logs.Log]:
@@ -229,14 +229,16 @@ def d11() -> dict[str, float]:
 
 def d12() -> dict[str, float]:
     """A policy whose actions begin at 0 counts, dead zone and all."""
+    ours = as_it_is()
     with mock.patch.object(env, "_command_range", lambda machine: (0.0, machine.pwm_limit / PWM_MAX)):
-        return beside(**{"from 0": trained(TaskConfig())}, ours=as_it_is())
+        return beside(**{"from 0": trained(TaskConfig())}, ours=ours)
 
 
 def a5() -> dict[str, float]:
     """A policy that sees velocities in the base frame instead of along the tool's heading."""
+    ours = as_it_is()
     with mock.patch.object(env, "_turn", lambda p_tool, vector, sign: vector.copy()):
-        return beside(**{"base frame": trained(TaskConfig()), "heading": as_it_is()})
+        return beside(**{"base frame": trained(TaskConfig()), "heading": ours})
 
 
 ENTRIES: tuple[Callable[[], dict[str, float]], ...] = (a1, d1, d3, d6, a6, a7, a9, a11)

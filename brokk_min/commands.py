@@ -51,7 +51,7 @@ class Fit:
     figure: Path | None = None  # Also draw free runs of the worst and the median recording here, .png.
     machine: Name = ""  # Whose nets, at its rate; by default the Brokk's if its joints are those of LOGS.
     velocity_samples: int = BROKK_170.velocity_samples  # Window of the velocity estimator.
-    paper: bool = False  # The paper's own recipe: errors of one step alone, no noise.
+    paper: bool = False  # The paper's own recipe: errors of one step alone, no noise, commands as they are.
     settings: tyro.conf.OmitArgPrefixes[FitConfig] = field(default_factory=FitConfig)  # The fit.
     seed: int = 0  # Of everything random.
 
@@ -77,10 +77,12 @@ class Fit:
         save_net(self.out, net)
         if self.json:
             meta: dict[str, Any] = {"seed": self.seed, "rate": net.rate, "history": net.history}
+            meta |= {"machine": net.machine, "dead_zone": net.dead_zone}
             meta |= {"logs": [str(p) for p in self.logs], "test": [str(p) for p in self.test]}
             experiments.write_json(self.json, {"meta": meta, **verdict})
         if self.figure:
             figures.save(self.figure, figures.plot_worst_and_median(net, test))
+        print(f"nets of {net.machine or 'no known machine'}, dead zone {net.dead_zone} of full command")
         _print_verdict(verdict)
 
 

@@ -273,7 +273,7 @@ def to_command(machine: Machine, action: ArrayLike) -> Array:
 
     Args:
         machine: n joints.
-        action: for the driven joints, 1 = the command limit; clipped to [-1, 1]. (..., n_driven)
+        action: for the driven joints, 0: closed, 1: the command limit; clipped to [-1, 1]. (..., n_driven)
 
     Returns:
         u in [-1, 1] of full command, shape (..., n); locked joints get 0.

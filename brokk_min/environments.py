@@ -24,9 +24,10 @@ from brokk_min.machine import BROKK_170, Machine
 class TaskVectorEnv(VectorEnv[Array, Array, Any]):
     """Many machines following random tool velocities; an ended episode starts anew at once. Paper: Fig. 4
 
-    Observation: Box, see `env.observe`. Action: Box [-1, 1] a driven joint, 1 = the command limit. Reward:
-    see `env.step`. `info["final_obs"]` holds the last observation of an ended episode where
-    `info["_final_obs"]` is set; `info["velocity_error"]` is |v_goal - v_tool| [m/s].
+    Observation: Box, see `env.observe`. Action: Box [-1, 1] a driven joint, from closed (0) through the
+    dead zone to the command limit (1), see `env.to_command`. Reward: see `env.step`. `info["final_obs"]`
+    holds the last observation of an ended episode where `info["_final_obs"]` is set;
+    `info["velocity_error"]` is |v_goal - v_tool| [m/s].
 
     Args:
         num_envs: how many.

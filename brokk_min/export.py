@@ -7,13 +7,17 @@ from pathlib import Path
 
 import numpy as np
 
+from brokk_min.env import RAMP
 from brokk_min.extras import need
 from brokk_min.logs import whole_file
-from brokk_min.policy import Policy
+from brokk_min.policy import STAND, Policy
 
 
 def export_onnx(path: Path, policy: Policy) -> None:
     """Write a policy as one self-contained ONNX file: `observation` (batch, obs) in, `action` out.
+
+    What follows is up to the other program: actions go through `env.to_command` (metadata `dead_zone`,
+    `pwm_limit`, `ramp`), and valves close when the tool was to stand for `stand_s` (`policy.STAND`).
 
     Raises:
         ValueError: the package onnx is not there.
@@ -38,7 +42,8 @@ def export_onnx(path: Path, policy: Policy) -> None:
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     contract = {key: json.dumps(value) for key, value in policy.contract.items()}
     scales = {"mean": json.dumps(policy.mean.tolist()), "scale": json.dumps(policy.scale.tolist())}
-    helper.set_model_props(model, contract | scales)
+    after = {"ramp": json.dumps(RAMP), "stand_s": json.dumps(STAND)}  # see `to_command`, `PolicyController`
+    helper.set_model_props(model, contract | scales | after)
     checker.check_model(model, full_check=True)
     with whole_file(path) as file:
         file.write(model.SerializeToString())

@@ -57,7 +57,8 @@ def fit(log: Log, config: FitConfig, seed: int, velocity_samples: int, machine: 
     Raises:
         ValueError: a joint that never moves long enough to be learned.
     """
-    training = training_set(log, config.history, config.rollout, config.dead_zone or 0.0)
+    dead_zone = config.dead_zone or 0.0
+    training = training_set(log, config.history, config.rollout, dead_zone)
     estimator = None if log.velocity_logged else velocity_samples
     weights = _train(training, config, seed, estimator)
     return ActuatorNet(
@@ -70,7 +71,7 @@ def fit(log: Log, config: FitConfig, seed: int, velocity_samples: int, machine: 
         seed=seed,
         settings=asdict(config),
         weights=weights,
-        dead_zone=config.dead_zone or 0.0,
+        dead_zone=dead_zone,
         **{name: getattr(training, name).astype(np.float32) for name in NET_ARRAYS},
     )
 

@@ -71,7 +71,7 @@ def unpack_ask(values: Array) -> Ask:
 
 
 class Levers:
-    """A controller that translates nothing: each lever is one driven joint's command."""
+    """A controller that translates nothing: each lever is one driven joint's action of `env.to_command`."""
 
     def __init__(self, machine: Machine) -> None:
         self.machine, self.levers = machine, np.zeros(len(machine.driven))

@@ -103,6 +103,17 @@ def test_nets_that_know_a_dead_zone_are_nets_shown_other_commands():
     assert (net.velocity(history)[1:] != plain.velocity(history)[1:]).all()
 
 
+def test_a_file_from_before_dead_zones_holds_nets_that_see_plain_commands(tmp_path):
+    net = replace(random_net(history=5), dead_zone=0.1)
+    save_net(tmp_path / "net.npz", net)
+    assert load_net(tmp_path / "net.npz").dead_zone == 0.1
+    arrays = dict(np.load(tmp_path / "net.npz"))
+    header = json.loads(str(arrays["header"]))
+    del header["dead_zone"]
+    np.savez(tmp_path / "old.npz", **arrays | {"header": np.array(json.dumps(header))})
+    assert load_net(tmp_path / "old.npz").dead_zone == 0.0
+
+
 def test_the_slope_of_nets_that_know_a_dead_zone_is_a_difference():
     net = random_net(history=4)
     net = replace(net, dead_zone=0.1, weights=tuple(w.astype(float) for w in net.weights))

@@ -9,6 +9,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from benchmarks.rollout import random_net
 from brokk_min import experiments
 from brokk_min.__main__ import COMMANDS, main
 from brokk_min.actuator import load_net
-from brokk_min.logs import read_log
+from brokk_min.logs import Log, Recording, read_log, write_log
 from brokk_min.machine import BROKK_170
 from brokk_min.metrics import summary
 from brokk_min.options import SHIPPED
@@ -257,6 +258,37 @@ def test_without_gains_the_baselines_are_tuned_and_that_is_said(
     assert "gains of the baselines: tuned now" in capsys.readouterr().err
     meta = json.loads(where.read_text())["meta"]
     assert (meta["gains"], meta["commands"], meta["starts"]) == ("tuned now", names, "1")
+
+
+@pytest.mark.parametrize(
+    ("joints", "options", "dead_zone"),
+    [
+        (BROKK_170.names, [], 0.07),
+        (BROKK_170.names, ["--dead-zone", "0"], 0.0),
+        (BROKK_170.names, ["--paper"], 0.0),
+        (("boom", "stick"), [], None),
+        (("boom", "stick"), ["--dead-zone", "0.1"], 0.1),
+    ],
+)
+def test_nets_get_the_dead_zone_of_a_known_machine_or_the_one_given(
+    joints: tuple[str, ...],
+    options: list[str],
+    dead_zone: float | None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seen: list[Any] = []
+
+    def stop(log: Any, settings: Any, *rest: Any) -> Any:
+        seen.append((log.joints, settings.dead_zone))
+        raise ValueError("enough")
+
+    monkeypatch.setattr("brokk_min.commands.fit", stop)
+    q = np.cumsum(np.full((40, len(joints)), 0.01), axis=0)
+    rows = [Recording(name, 0 * q, q, 0 * q) for name in "ab"]
+    write_log(tmp_path / "log.csv", Log(joints, tuple(rows)))
+    assert run("fit", tmp_path / "log.csv", "--out", tmp_path / "net.npz", *options) == 1
+    assert seen == [(joints, dead_zone)]
 
 
 @pytest.mark.parametrize("command", [name for name in COMMANDS if name not in ("train", "sweep")])
