@@ -127,6 +127,23 @@ def a11() -> dict[str, float]:
     return {"open": error(GAINS, 0.05), "idle": error(GAINS | {"ready": 0.0}, 0.05)}
 
 
+def stand() -> dict[str, float]:
+    """Way [m] of the tool from 0.5 to 3 s after a stop, when valves close; dead zone as told, and less."""
+    starts = sequences.scored_starts(M, 64, sequences.task_sequences(M), 2)
+    starts = starts[np.array(sequences.start_kinds(M, starts)) == "workspace"]
+    policy = PolicyController(M, load_policy(SHIPPED / M.name / "policy.npz", M))
+    result = {}
+    for dead_zone in (M.dead_zone, M.dead_zone - 0.02):
+        plant, ways = replace(M, dead_zone=dead_zone), []
+        for direction in np.concatenate([np.eye(3), -np.eye(3)]):
+            goals = np.zeros((110, len(starts), 3))
+            goals[:40] = 2 / 3 * M.tool_speed * direction
+            p = rollout(plant, policy, starts, goals, TaskConfig(), np.random.default_rng(0)).p_tool
+            ways.append(np.linalg.norm(p[99] - p[49], axis=-1))
+        result |= {f"{dead_zone:.2f}, median": np.median(ways), f"{dead_zone:.2f}, most": np.max(ways)}
+    return {name: float(way) for name, way in result.items()}
+
+
 # --- by fitting and training --------------------------------------------------------------------------
 
 NOISE = fitting.FitConfig().noise
@@ -241,7 +258,7 @@ def a5() -> dict[str, float]:
         return beside(**{"base frame": trained(TaskConfig()), "heading": ours})
 
 
-ENTRIES: tuple[Callable[[], dict[str, float]], ...] = (a1, d1, d3, d6, a6, a7, a9, a11)
+ENTRIES: tuple[Callable[[], dict[str, float]], ...] = (a1, d1, d3, d6, a6, a7, a9, a11, stand)
 TRAINED: tuple[Callable[[], dict[str, float]], ...] = (d4, a4, d5, d7, d10, d11, d12, a5)
 
 
