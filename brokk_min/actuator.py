@@ -79,8 +79,9 @@ def valve_scale(u: ArrayLike, dead_zone: float) -> Array:
     u = np.asarray(u)
     if not dead_zone:
         return u
-    opening = np.maximum(np.abs(u) - dead_zone, 0) / (1 - dead_zone)
-    return np.asarray(np.sign(u) * np.log(1 + opening / FINE) / math.log(1 + 1 / FINE))
+    opening = (u - np.clip(u, -dead_zone, dead_zone)) / (1 - dead_zone)
+    scaled: Array = np.copysign(np.log(1 + np.abs(opening) / FINE) / math.log(1 + 1 / FINE), opening)
+    return scaled
 
 
 def valve_scale_slope(u: Array, dead_zone: float) -> Array:
@@ -166,8 +167,8 @@ class ActuatorNet:
         if history.shape[-3:] != (n, 3, self.history):
             raise ValueError(f"history: expected (..., {n}, 3, {self.history}), got {history.shape}")
         if self.dead_zone:
-            history = history.copy()
-            history[..., 2, :] = valve_scale(history[..., 2, :], self.dead_zone)
+            history = history.copy(order="K")  # the simulation's has joints outermost, as products want them
+            history[..., 2, :] = valve_scale(history[..., 2, :].copy(order="K"), self.dead_zone)
         return history.reshape(*history.shape[:-2], 3 * self.history)
 
     def _layers(self, history: Array) -> tuple[Array, ...]:

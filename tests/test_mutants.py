@@ -92,7 +92,7 @@ PLANTED: list[tuple[str, str, str, str]] = [
     # history, nets: windows and normalisation
     ("actuator", "result[..., 2, :-1] = history[..., 2, 1:]", "result[..., 2, 1:] = history[..., 2, :-1]",
      "actuator::a_history_by_hand"),
-    ("actuator", "np.abs(u) - dead_zone, 0) / (1 - dead_zone)", "np.abs(u), 0)",
+    ("actuator", "(u - np.clip(u, -dead_zone, dead_zone)) / (1 - dead_zone)", "u * 1.0",
      "actuator::what_nets_see_of_a_command_by_hand"),
     ("actuator", "by[..., 2, :] *= valve_scale_slope(history[..., 2, :], self.dead_zone)", "pass",
      "actuator::the_slope_of_nets_that_know_a_dead_zone_is_a_difference"),
