@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brokk_min.logs import load_arrays, whole_file
-from brokk_min.machine import estimate_velocity
+from brokk_min.machine import estimate_velocity, valve_opening
 
 Array = NDArray[np.floating[Any]]
 FORMAT = 1  # of net files
@@ -79,7 +79,7 @@ def valve_scale(u: ArrayLike, dead_zone: float) -> Array:
     u = np.asarray(u)
     if not dead_zone:
         return u
-    opening = (u - np.clip(u, -dead_zone, dead_zone)) / (1 - dead_zone)
+    opening = valve_opening(u, dead_zone)
     scaled: Array = np.copysign(np.log(1 + np.abs(opening) / FINE) / math.log(1 + 1 / FINE), opening)
     return scaled
 
@@ -88,8 +88,8 @@ def valve_scale_slope(u: Array, dead_zone: float) -> Array:
     """Derivative of `valve_scale` by `u`, same shape; 0 within the dead zone."""
     if not dead_zone:
         return np.ones_like(u)
-    opening = (np.abs(u) - dead_zone) / (1 - dead_zone)
-    slope = (1 - dead_zone) * (FINE + np.maximum(opening, 0)) * math.log(1 + 1 / FINE)
+    opening = np.abs(valve_opening(u, dead_zone))
+    slope = (1 - dead_zone) * (FINE + opening) * math.log(1 + 1 / FINE)
     return np.asarray((opening > 0) / slope)
 
 

@@ -18,7 +18,7 @@ from tqdm import tqdm
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import Measured, measured
 from brokk_min.kinematics import jacobian
-from brokk_min.machine import PWM_MAX, Machine, limit_command
+from brokk_min.machine import PWM_MAX, Machine, limit_command, valve_opening
 
 Array = NDArray[np.floating[Any]]
 
@@ -174,12 +174,6 @@ def steady_map(machine: Machine, net: ActuatorNet, angles: int = 9, commands: in
     return SteadyMap(q[:, 0].T, u, rising)
 
 
-def valve_opening(machine: Machine, u: ArrayLike) -> Array:
-    """Opening in [-1, 1] beyond the dead zone under a command `u`, same shape. Paper: Sec. 3.2"""
-    beyond: Array = np.maximum(0.0, np.abs(u) - machine.dead_zone) / (1 - machine.dead_zone)
-    return np.sign(u) * beyond
-
-
 @dataclass(frozen=True)
 class JacobianController:
     """Observation in, command out: resolved rates (eq3), then a PID a joint.
@@ -226,8 +220,8 @@ class JacobianController:
         slope = 0.7 * memory.slope + 0.3 * (error - memory.error) * m.rate
         opening = g["kp"] * error + memory.integral + g["kd"] * slope
         if self.feedforward is not None:
-            opening += valve_opening(m, self.feedforward.command(seen.q[..., m.driven], rate))
-        room = valve_opening(m, m.pwm_limit / PWM_MAX)
+            opening += valve_opening(self.feedforward.command(seen.q[..., m.driven], rate), m.dead_zone)
+        room = valve_opening(m.pwm_limit / PWM_MAX, m.dead_zone)
         winding = (np.abs(opening) >= room) & (np.sign(opening) == np.sign(error))
         integral = memory.integral + np.where(winding, 0.0, g["ki"] * error * m.dt)
         moving = np.linalg.norm(seen.v_goal, axis=-1, keepdims=True) > 1e-6

@@ -216,6 +216,20 @@ def limit_command(machine: Machine, u: ArrayLike) -> NDArray[np.floating]:
     return limited
 
 
+def valve_opening(u: ArrayLike, dead_zone: float) -> NDArray[np.floating]:
+    """Opening of a valve in [-1, 1] under a command `u`: what lies beyond the dead zone.
+
+    Shape and float type of `u`; `dead_zone` is a share of full command. Paper: Sec. 3.2 (7 %)
+
+    Example:
+        >>> valve_opening([-1.0, 0.05, 0.535], 0.07).round(3)
+        array([-1. ,  0. ,  0.5])
+    """
+    u = as_floats(u)
+    opening: NDArray[np.floating] = (u - np.clip(u, -dead_zone, dead_zone)) / (1 - dead_zone)
+    return opening
+
+
 def encode_pwm(u: ArrayLike) -> NDArray[np.uint8]:
     """Byte on the bus for a command `u` in [-1, 1] (...): m >= 0 -> m, m < 0 -> 255 - |m|.
 

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brokk_min.env import observation_scale
-from brokk_min.jacobian import dls, valve_opening
+from brokk_min.jacobian import dls
 from brokk_min.kinematics import jacobian, tool_position, tool_velocity
-from brokk_min.machine import PWM_MAX, Machine, limit_command, read_encoder
+from brokk_min.machine import PWM_MAX, Machine, limit_command, read_encoder, valve_opening
 from brokk_min.plant import PlantState, lever_arm, plant_reset, plant_step
 
 Array = NDArray[np.floating[Any]]
@@ -92,7 +92,7 @@ class PerfectModel:
     def improve(self, plant: PlantState, opening: Array, goal: Array, tick: int) -> Array:
         """The best of a plan (num, horizon, n_driven), Gauss-Newton steps from it and steady openings."""
         m, (num, horizon, n) = self.machine, opening.shape
-        room = valve_opening(m, m.pwm_limit / PWM_MAX)
+        room = valve_opening(m.pwm_limit / PWM_MAX, m.dead_zone)
         later = np.repeat(np.triu(np.ones((len(BLOCKS),) * 2)), BLOCKS, axis=1)  # from a tick to the end
         basis = np.einsum("bh,jn->bjhn", later, np.eye(n)).reshape(-1, horizon, n)
         plans = np.concatenate([opening[:, None], opening[:, None] + PROBE * basis], axis=1)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brokk_min.machine import PWM_MAX, Machine
+from brokk_min.machine import PWM_MAX, Machine, valve_opening
 
 Array = NDArray[np.floating[Any]]
 
@@ -60,12 +60,12 @@ def plant_step(machine: Machine, state: PlantState, u: ArrayLike) -> PlantState:
     m, dt = machine, machine.plant_dt
     q, speed, spool, ready, _ = state
     commands = (np.array(u, float), *state.pending)  # a copy: it outlives the call
+    openings = [valve_opening(command, m.dead_zone) for command in commands]
     up, down = m.column("speed_positive"), m.column("speed_negative")
     q_min, q_max, area = m.column("q_min"), m.column("q_max"), m.column("cylinder_area")
     steps, lag = round(m.dt / dt), round(m.delay / dt)
     for i in range(steps):
-        a = commands[-((i - lag) // steps)]
-        opening = np.sign(a) * np.maximum(0.0, (np.abs(a) - m.dead_zone) / (1 - m.dead_zone))
+        opening = openings[-((i - lag) // steps)]
         gate = np.clip((ready - m.ready_threshold) / (1 - m.ready_threshold), 0.0, 1.0)
         gate = np.sqrt(gate * gate * (3 - 2 * gate))  # 0 up to the threshold: smoothstep(0) = 0
         demand = np.where(spool > 0, up, down) * spool * gate
@@ -92,7 +92,7 @@ def speed_limits(machine: Machine, q: ArrayLike) -> tuple[Array, Array]:
 
     At the command limit. Paper: eq1
     """
-    opening = (machine.pwm_limit / PWM_MAX - machine.dead_zone) / (1 - machine.dead_zone)
+    opening = valve_opening(machine.pwm_limit / PWM_MAX, machine.dead_zone)
     arm = lever_arm(machine, q)
     speeds = -machine.column("speed_negative"), machine.column("speed_positive")
     down, up = (opening * speed / arm for speed in speeds)

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min import jacobian
 from brokk_min.env import Encoder
-from brokk_min.machine import Machine, read_encoder
+from brokk_min.machine import Machine, read_encoder, valve_opening
 
 Array = NDArray[np.floating[Any]]
 Sensor = Callable[[np.random.Generator], Encoder]  # a fresh encoder for each rollout
@@ -69,7 +68,7 @@ def supply_demand(machine: Machine, u: Array) -> Array:
 
     Paper: Sec. 4.2
     """
-    opening = jacobian.valve_opening(machine, u)
+    opening = valve_opening(u, machine.dead_zone)
     fastest = (machine.column(name) for name in ("speed_positive", "speed_negative"))
     flow = np.abs(machine.column("cylinder_area") * np.where(opening > 0, *fastest) * opening)
     share: Array = flow.sum(axis=-1) / machine.pump_flow

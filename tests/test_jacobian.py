@@ -16,7 +16,7 @@ from brokk_min.actuator import ActuatorNet, rest_history
 from brokk_min.env import TaskConfig, measured, observe, rollout
 from brokk_min.jacobian import JacobianController, Memory
 from brokk_min.kinematics import jacobian
-from brokk_min.machine import BROKK_170
+from brokk_min.machine import BROKK_170, valve_opening
 
 POSE = np.array([1.5, 0.5, 0.58, 1.71, 1.24])  # the paper's q_s
 STRETCHED = np.array([0.3, 0.5, 0.1, np.pi, 3 * np.pi / 4])  # all links in one line
@@ -636,8 +636,8 @@ def test_feed_forward_is_added_to_the_pid():
             replace(controller(kp=1.5), feedforward=steady),
         )
     )
-    opening = classic.valve_opening(BROKK_170, plain) + classic.valve_opening(BROKK_170, ahead)
-    np.testing.assert_allclose(classic.valve_opening(BROKK_170, both), opening, atol=1.1 / 127)
+    opening = valve_opening(plain, 0.07) + valve_opening(ahead, 0.07)
+    np.testing.assert_allclose(valve_opening(both, 0.07), opening, atol=1.1 / 127)
     assert (np.abs(opening) > 3 / 127).any()
 
 

@@ -68,7 +68,7 @@ PLANTED: list[tuple[str, str, str, str]] = [
     # plant
     ("plant", "- 2 * base * rod * np.cos(angle)", "+ 2 * base * rod * np.cos(angle)",
      "plant::lever_arm_of_q5_at_an_acute_angle_by_hand"),
-    ("plant", "(np.abs(a) - m.dead_zone) /", "(np.abs(a) - m.dead_zone + 1 / 127) /",
+    ("plant", "valve_opening(command, m.dead_zone)", "valve_opening(command, m.dead_zone - 1 / 127)",
      "plant::the_first_count_that_moves_anything_is_eleven"),
     ("plant", "(i - lag) // steps", "(i - lag + 1) // steps",
      "plant::a_command_arrives_after_the_delay_and_not_a_step_earlier"),
@@ -81,7 +81,7 @@ PLANTED: list[tuple[str, str, str, str]] = [
     ("plant", "spool > 0, up, down", "spool > 0, down, up", "plant::the_plant_is_its_equations"),
     ("plant", "(q >= q_max) & (speed > 0)", "(q >= q_max) & (speed < 0)",
      "plant::stops_hold_and_let_go"),
-    ("plant", "/ (1 - machine.dead_zone)\n    arm", "\n    arm",
+    ("plant", "valve_opening(machine.pwm_limit / PWM_MAX, machine.dead_zone)", "machine.pwm_limit / PWM_MAX",
      "plant::speed_limits_are_where_the_plant_settles_at_the_command_limit"),
     # excitation and recordings
     ("excitation", "* (-1.0) ** turns", "* 1.0**turns",
@@ -92,7 +92,7 @@ PLANTED: list[tuple[str, str, str, str]] = [
     # history, nets: windows and normalisation
     ("actuator", "result[..., 2, :-1] = history[..., 2, 1:]", "result[..., 2, 1:] = history[..., 2, :-1]",
      "actuator::a_history_by_hand"),
-    ("actuator", "(u - np.clip(u, -dead_zone, dead_zone)) / (1 - dead_zone)", "u * 1.0",
+    ("actuator", "valve_opening(u, dead_zone)\n    scaled", "u\n    scaled",
      "actuator::what_nets_see_of_a_command_by_hand"),
     ("actuator", "by[..., 2, :] *= valve_scale_slope(history[..., 2, :], self.dead_zone)", "pass",
      "actuator::the_slope_of_nets_that_know_a_dead_zone_is_a_difference"),

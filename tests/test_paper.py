@@ -35,7 +35,7 @@ from brokk_min.env import TaskConfig, paper_view
 from brokk_min.environments import TaskVectorEnv
 from brokk_min.kinematics import tool_position
 from brokk_min.logs import velocity_of
-from brokk_min.machine import BROKK_170
+from brokk_min.machine import BROKK_170, valve_opening
 from brokk_min.plant import plant_reset, plant_step
 
 ROOT = Path(__file__).parent.parent
@@ -296,7 +296,7 @@ def test_the_papers_excitation_is_the_sine() -> None:
 
 
 def test_valve_opening_by_hand() -> None:
-    found = jacobian.valve_opening(BROKK_170, [-1.0, -0.07, 0.0, 0.05, 0.07, 0.535, 1.0])
+    found = valve_opening([-1.0, -0.07, 0.0, 0.05, 0.07, 0.535, 1.0], 0.07)
     np.testing.assert_allclose(found, [-1, 0, 0, 0, 0, 0.5, 1], atol=1e-12)
 
 

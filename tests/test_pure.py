@@ -65,7 +65,7 @@ CALLS: dict[str, Callable[[], Any]] = {
     "limit_weights": lambda: jacobian.limit_weights(M, Q, RATE),
     "manipulability": lambda: jacobian.manipulability(J),
     "nakamura_damping": lambda: jacobian.nakamura_damping(fixed([0.1, 0.9]), 0.5, 0.1),
-    "valve_opening": lambda: jacobian.valve_opening(M, U),
+    "valve_opening": lambda: machine.valve_opening(U, 0.07),
     "baseline": lambda: BASELINE(SEEN, jacobian.Memory(*map(fixed, BASELINE.start(4)))),
     "observe": lambda: env.observe(M, HISTORY, V32, LAG, fixed(np.full(SEEN.shape, 0.01, np.float32))),
     "measured": lambda: env.measured(M, SEEN),
