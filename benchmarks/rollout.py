@@ -2,14 +2,15 @@
 
     python -m benchmarks.rollout [--actuator NET] [--json F]
 
-The nets' speed does not depend on what they learned, so without NET a random net is used.
+The nets' speed does not depend on what they learned, so without NET random nets are used that
+know the dead zone, as fitted ones do.
 """
 
 from __future__ import annotations
 
 import json
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +51,8 @@ def random_net(rng: np.random.Generator) -> ActuatorNet:
 
 def main(options: Options) -> None:
     rng = np.random.default_rng(0)
-    net = load_net(options.actuator) if options.actuator else random_net(rng)
+    random = replace(random_net(rng), dead_zone=BROKK_170.dead_zone)
+    net = load_net(options.actuator) if options.actuator else random
     env = TaskVectorEnv(options.num_envs, net)
     env.reset(seed=0)
     actions = rng.uniform(-1, 1, (32, options.num_envs, len(env.machine.driven))).astype(np.float32)
