@@ -137,6 +137,9 @@ class Machine:
                 raise ValueError(f"joints: expected different {what}, got {values}")
         if self.controller_node in nodes:
             raise ValueError(f"controller_node: expected none of {nodes}, got {self.controller_node}")
+        if not self.dead_zone * PWM_MAX < self.pwm_limit:  # no valve would ever open
+            limit = f"{self.pwm_limit}/{PWM_MAX}"
+            raise ValueError(f"dead_zone: expected below the command limit {limit}, got {self.dead_zone!r}")
         steps = self.dt / self.plant_dt
         if abs(steps - round(steps)) > 1e-6 or steps < 0.5:
             raise ValueError(f"plant_dt: expected 1/rate = {self.dt} to be a multiple, got {self.plant_dt}")

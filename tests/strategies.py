@@ -51,13 +51,14 @@ def machines(draw: st.DrawFn, min_joints: int = 2, max_joints: int = 6) -> Machi
     """Machines of 2 to 6 joints, some of them locked, with valves and a pump of their own."""
     n = draw(st.integers(min_joints, max_joints))
     driven = draw(st.lists(st.booleans(), min_size=n, max_size=n).filter(any))
+    pwm_limit = draw(st.integers(20, 127))
     return replace(
         BROKK_170,
         name="drawn",
         joints=tuple(draw(joints(i, drives)) for i, drives in enumerate(driven)),
         rate=draw(st.sampled_from([10.0, 20.0, 25.0, 50.0])),
-        pwm_limit=draw(st.integers(20, 127)),
-        dead_zone=draw(reals(0.0, 0.3)),
+        pwm_limit=pwm_limit,
+        dead_zone=draw(reals(0.0, min(0.3, 0.9 * pwm_limit / 127))),
         delay=draw(st.sampled_from([0.0, 0.005, 0.04, 0.1, 0.13])),
         spool_time=draw(reals(0.01, 0.1)),
         cylinder_time=draw(reals(0.01, 0.1)),

@@ -78,6 +78,9 @@ BAD = [
     ({"pwm_limit": 128}, ["pwm_limit", "1 to 127", "got 128"]),
     ({"dead_zone": -0.01}, ["dead_zone", "0 to 0.99", "got -0.01"]),
     ({"dead_zone": 1.0}, ["dead_zone", "0 to 0.99", "got 1.0"]),
+    ({"dead_zone": 0.63}, ["dead_zone", "below the command limit 80/127", "got 0.63"]),
+    ({"dead_zone": 0.125, "pwm_limit": 10}, ["dead_zone", "below the command limit 10/127", "got 0.125"]),
+    ({"dead_zone": 80 / 127}, ["dead_zone", "below", "got 0.629"]),
     ({"delay": -0.04}, ["delay", "0 to inf", "got -0.04"]),
     ({"spool_time": 0.0}, ["spool_time", "got 0.0"]),
     ({"cylinder_time": 0.0}, ["cylinder_time", "got 0.0"]),
@@ -117,6 +120,7 @@ def test_every_numeric_field_is_in_the_table_of_bad_fields():
 
 
 def test_values_at_the_ends_of_the_allowed_ranges_are_machines():
+    replace(BROKK_170, pwm_limit=10, dead_zone=0.078)
     replace(BROKK_170, pwm_limit=1, dead_zone=0.0, delay=0.0, velocity_samples=2, history=2)
     replace(BROKK_170, pwm_limit=127, valve_frame_id=0x7FF, ready_threshold=0.0, encoder_bits=32)
     replace(BROKK_170, **with_joint(0, encoder_node=127, a=0.0, d=-1.0))
