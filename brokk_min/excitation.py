@@ -20,6 +20,7 @@ from brokk_min.plant import plant_reset, plant_step
 Array = NDArray[np.floating[Any]]
 # Shares of what rich excitation is made of, assumed.
 MIX = {"sine": 0.17, "step": 0.1, "holds": 0.17, "go": 0.21, "hover": 0.35}
+BARELY = 0.049  # of full command, assumed: a valve so far beyond its dead zone is barely open
 MAX_RETURN = 300.0  # s, assumed: a way back to the start that takes longer is broken off
 
 
@@ -85,7 +86,9 @@ def _hover(rng: np.random.Generator, machine: Machine, _: float) -> Array:
     """A valve barely open or not quite, to one side or to and fro: where it wakes is what nets must know."""
     ticks = int(rng.uniform(0.2, 2.0) / machine.dt)
     turns = np.arange(ticks) // rng.choice([1, 2, 3, 4, 6, ticks])
-    return np.asarray(rng.choice([-1, 1]) * rng.uniform(0.9, 1.7) * machine.dead_zone * (-1.0) ** turns)
+    side = rng.choice([-1, 1])
+    level = rng.uniform(0.9 * machine.dead_zone, machine.dead_zone + BARELY)
+    return np.asarray(side * level * (-1.0) ** turns)
 
 
 EXCITATIONS = {"sine": sine_command, "rich": rich_command}

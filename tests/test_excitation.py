@@ -63,6 +63,15 @@ def test_valves_are_held_barely_open_and_moved_off_from_there():
     assert held[off].max() <= 20 and held[off].min() >= 1  # the first or last of a part may be cut
 
 
+@pytest.mark.parametrize(("dead_zone", "least", "most"), [(0.0, 0.0, 0.049), (0.2, 0.18, 0.249)])
+def test_valves_with_another_dead_zone_or_none_are_held_barely_open_too(dead_zone, least, most):
+    rng, machine = np.random.default_rng(2), replace(BROKK_170, dead_zone=dead_zone)
+    held = np.array([np.abs(excitation._hover(rng, machine, 0.0)) for _ in range(400)], object)
+    levels = np.array([level[0] for level in held])
+    assert all(np.ptp(level) == 0 for level in held)
+    assert least <= levels.min() < least + 0.002 and most - 0.002 < levels.max() <= most
+
+
 @pytest.mark.parametrize("kind", ["sine", "rich"])
 def test_every_actuator_is_driven_as_long_as_asked_within_the_limits(collected, kind):
     log = collected[kind]

@@ -89,6 +89,8 @@ PLANTED: list[tuple[str, str, str, str]] = [
     ("excitation", "amplitude = rng.uniform(machine.dead_zone, machine.pwm_limit / PWM_MAX)",
      "amplitude = rng.uniform(0, machine.pwm_limit / PWM_MAX)",
      "excitation::sines_have_amplitudes_between_dead_zone_and_limit_and_random_frequencies"),
+    ("excitation", "machine.dead_zone + BARELY", "1.7 * machine.dead_zone",
+     "excitation::valves_with_another_dead_zone_or_none_are_held_barely_open_too"),
     # history, nets: windows and normalisation
     ("actuator", "result[..., 2, :-1] = history[..., 2, 1:]", "result[..., 2, 1:] = history[..., 2, :-1]",
      "actuator::a_history_by_hand"),
