@@ -138,12 +138,12 @@ class ActuatorNet:
     def predict(self, history: Array) -> Array:
         """Mean velocity over the coming tick [rad/s] (..., n), so that q(t+dt) = q(t) + dt * velocity.
 
-        `history` is what `push_command` left, (..., n, 3, H). A joint that had no command and moved less than
-        `STILL` during all of it stands, where a net alone would creep.
+        `history` is what `push_command` left, (..., n, 3, H). A joint that had no command beyond the dead
+        zone and moved less than `STILL` during all of it stands, where a net alone would creep.
         """
-        still = ~history[..., 2, :].any(axis=-1) & (np.abs(history[..., 0, -1] - history[..., 0, 0]) < STILL)
+        idle = (np.abs(history[..., 2, :]) <= self.dead_zone).all(axis=-1)
         velocity = self.velocity(history)
-        velocity[still] = 0.0
+        velocity[idle & (np.abs(history[..., 0, -1] - history[..., 0, 0]) < STILL)] = 0.0
         return velocity
 
     def velocity(self, history: Array) -> Array:

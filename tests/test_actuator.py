@@ -165,6 +165,17 @@ def test_a_joint_without_a_command_that_stood_still_stays():
     assert q[1] == 0.5
 
 
+def test_commands_within_the_dead_zone_that_nets_know_move_nothing_that_stood_still():
+    """Of 8.9 counts: 8 for the whole history are none, one of 9 is, and a joint that moved is for the net."""
+    net = constant_net([0.2, 0.2, 0.2, 0.2], False, ("a", "b", "c", "d"))
+    history = rest_history(np.full(4, 0.5, np.float32), 13)
+    history[:, 2] = np.float32([[8], [-8], [8], [8]]) / np.float32(127)
+    history[1, 2, 3] = -9 / 127
+    history[2, 0, -1:] = 0.503
+    np.testing.assert_allclose(replace(net, dead_zone=0.07).predict(history), [0, 0.2, 0.2, 0], atol=1e-6)
+    np.testing.assert_allclose(net.predict(history), 0.2, atol=1e-6)  # these know none
+
+
 def test_selected_nets_are_the_same_nets_in_another_order():
     net = random_net()
     history = np.random.default_rng(2).uniform(-1, 1, (6, 3, 3, 13)).astype(np.float32)

@@ -94,6 +94,8 @@ PLANTED: list[tuple[str, str, str, str]] = [
     # history, nets: windows and normalisation
     ("actuator", "result[..., 2, :-1] = history[..., 2, 1:]", "result[..., 2, 1:] = history[..., 2, :-1]",
      "actuator::a_history_by_hand"),
+    ("actuator", "<= self.dead_zone).all", "<= 0).all",
+     "actuator::commands_within_the_dead_zone_that_nets_know_move_nothing_that_stood_still"),
     ("actuator", "valve_opening(u, dead_zone)\n    scaled", "u\n    scaled",
      "actuator::what_nets_see_of_a_command_by_hand"),
     ("actuator", "by[..., 2, :] *= valve_scale_slope(history[..., 2, :], self.dead_zone)", "pass",
