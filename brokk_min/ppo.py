@@ -407,7 +407,7 @@ def identity_of(
 ) -> dict[str, Any]:
     """All that decides the outcome of a training; kept in checkpoints and policies."""
     return {
-        "machine": machine.name,
+        **contract(machine),
         "actuator": fingerprint(net),
         "seed": seed,
         "task": asdict(task),

@@ -662,8 +662,8 @@ def stop_after(monkeypatch, updates, error=KeyboardInterrupt):
     monkeypatch.setattr(Training, "update", update)
 
 
-def run(path, resume=False, seed=5, config=TINY, net=NET, task=TASK):
-    return train(BROKK_170, net, task, config, seed, path, resume)
+def run(path, resume=False, seed=5, config=TINY, net=NET, task=TASK, machine=BROKK_170):
+    return train(machine, net, task, config, seed, path, resume)
 
 
 def table(path):
@@ -725,6 +725,8 @@ def killed(tmp_path, monkeypatch):
     ("change", "message"),
     [
         ({"seed": 6}, r"seed: expected 6, got 5"),
+        ({"machine": replace(BROKK_170, dead_zone=0.05)}, r"dead_zone: expected 0\.05, got 0\.07"),
+        ({"machine": replace(BROKK_170, pwm_limit=60)}, r"pwm_limit: expected 60, got 80"),
         ({"config": replace(TINY, gamma=0.5)}, r"settings: expected .*'gamma': 0\.5.*got .*gamma"),
         ({"task": TaskConfig(episode_s=0.7)}, r"task: expected .*0\.7.*, got .*0\.6"),
         ({"net": small_net(BROKK_170, np.random.default_rng(1))}, r"actuator: expected '\w+', got '\w+'"),
