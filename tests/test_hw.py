@@ -28,7 +28,7 @@ from brokk_min.jacobian import JacobianController, join_gains, manipulability_th
 from brokk_min.kinematics import joint_rates, tool_state
 from brokk_min.logs import read_log, write_log
 from brokk_min.machine import BROKK_170
-from brokk_min.policy import PolicyController, load_policy
+from brokk_min.policy import STAND, PolicyController, load_policy
 
 PUSH = (60, 0, 60, 60, 60)
 BASELINE = JacobianController(
@@ -121,6 +121,24 @@ def test_the_policy_is_told_how_far_the_tool_stays_behind() -> None:
         np.testing.assert_allclose(told[-4:] * scale[-4:], joint_rates(BROKK_170, now.q, lag), atol=1e-4)
         checked += np.linalg.norm(lag) > 0.005
     assert checked > 100
+
+
+def test_valves_close_on_the_bus_when_the_tool_was_to_stand_for_three_seconds() -> None:
+    hand = Hand()
+    world = World(PolicyController(BROKK_170, load_policy(SHIPPED, BROKK_170)), hand)
+    sent: list[list[int]] = []
+    world.downward = lambda can_id, data: (can_id == 0x210 and sent.append([*data[:5]]), [(can_id, data)])[1]
+    world.drive.begin()
+    world.run(1.5)
+    hand.v, before = (0.0, 0.0, 0.0), len(sent)
+    world.run(STAND + 1.0)
+    hand.v, after = (0.0, 0.1, 0.0), len(sent)
+    world.run(1.0)
+    world.close()
+    opened = np.array(sent).any(axis=1)
+    assert opened[before - 20 : before].all() and opened[-15:].all()
+    stood = before + round(STAND * BROKK_170.rate)
+    assert opened[before + 1 : stood].mean() > 0.5 and not opened[stood + 1 : after].any()
 
 
 def test_it_is_silent_until_armed_and_moves_a_tick_later() -> None:
