@@ -21,6 +21,7 @@ Array = NDArray[np.floating[Any]]
 # Shares of what rich excitation is made of, assumed.
 MIX = {"sine": 0.17, "step": 0.1, "holds": 0.17, "go": 0.21, "hover": 0.35}
 BARELY = 0.049  # of full command, assumed: a valve so far beyond its dead zone is barely open
+LEG = 30.0  # s, assumed: the longest drive that is recorded in one piece
 MAX_RETURN = 300.0  # s, assumed: a way back to the start that takes longer is broken off
 
 
@@ -115,12 +116,10 @@ class _Recorder:
         return Recording(name, u, q, velocity_of(q, self.machine.velocity_samples, self.machine.rate))
 
 
-def collect(
-    machine: Machine, hours: float, excitation: str, rng: np.random.Generator, leg_s: float = 30.0
-) -> Log:
+def collect(machine: Machine, hours: float, excitation: str, rng: np.random.Generator) -> Log:
     """Record the analytic plant, one actuator at a time, `hours` for each, ways back not counted.
 
-    A recording starts with `history` samples of an idle valve, then drives for `leg_s` or until the joint
+    A recording starts with `history` samples of an idle valve, then drives for `LEG` or until the joint
     meets its limit; in rich excitation it may push there for a second in all. The way back to its start,
     and the rest there until the valve is idle, is named `..._return` and dropped by `read_log`. The
     paper's sines start at home (mid range), rich excitation at random angles. Paper: Sec. 3.3
@@ -136,7 +135,7 @@ def collect(
     with tqdm(total=wanted * machine.n, desc=f"record ({excitation})", unit="sample", disable=None) as bar:
         while counted.min() < wanted:
             joint = np.repeat(np.flatnonzero(counted < wanted), side_by_side)
-            recorder, back, home = _drive_legs(machine, joint, excitation, rng, round(leg_s * machine.rate))
+            recorder, back, home = _drive_legs(machine, joint, excitation, rng)
             for row, j in enumerate(joint):
                 if leg := min(back[row], wanted - counted[j]):
                     name = f"{machine.names[j]}_{len(recordings[j]) // 2:03d}"
@@ -149,14 +148,15 @@ def collect(
 
 
 def _drive_legs(
-    machine: Machine, joint: NDArray[np.intp], excitation: str, rng: np.random.Generator, ticks: int
+    machine: Machine, joint: NDArray[np.intp], excitation: str, rng: np.random.Generator
 ) -> tuple[_Recorder, NDArray[np.intp], NDArray[np.intp]]:
-    """Drive joint `joint[k]` of row k until it meets its limit or `ticks` are over, then back to its start.
+    """Drive joint `joint[k]` of row k until it meets its limit or `LEG` is over, then back to its start.
 
     Returns:
         What was recorded, and the ticks (rows,) at which the ways back begin and end.
     """
     low, high, row = machine.column("q_min"), machine.column("q_max"), np.arange(len(joint))
+    ticks = round(LEG * machine.rate)
     q = np.tile((low + high) / 2, (len(row), 1))
     low, high = low[joint], high[joint]
     if excitation == "rich":  # a tenth of the legs begins at either stop

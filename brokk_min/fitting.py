@@ -6,7 +6,7 @@ of all joints are fitted at once. `fit_linear`, on the same windows, is what the
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -58,6 +58,7 @@ def fit(log: Log, config: FitConfig, seed: int, velocity_samples: int, machine: 
         ValueError: a joint that never moves long enough to be learned.
     """
     dead_zone = config.dead_zone or 0.0
+    config = replace(config, dead_zone=dead_zone)  # as it is used, for the file
     training = training_set(log, config.history, config.rollout, dead_zone)
     estimator = None if log.velocity_logged else velocity_samples
     weights = _train(training, config, seed, estimator)

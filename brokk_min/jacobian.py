@@ -155,8 +155,9 @@ class SteadyMap:
         return command
 
 
-def steady_map(machine: Machine, net: ActuatorNet, angles: int = 9, commands: int = 41) -> SteadyMap:
+def steady_map(machine: Machine, net: ActuatorNet) -> SteadyMap:
     """Ask the nets how fast each driven joint moves steadily under each command at each angle."""
+    angles, commands = 9, 41  # assumed
     low, high = machine.column("q_min")[machine.driven], machine.column("q_max")[machine.driven]
     inset = 0.05 * (high - low)  # assumed; at the very end a stop holds the joint, whatever the command
     q = np.linspace(low + inset, high - inset, angles)[:, None]  # (a, 1, n)

@@ -82,11 +82,6 @@ def plant_step(machine: Machine, state: PlantState, u: ArrayLike) -> PlantState:
     return PlantState(q, speed, spool, ready, commands[: len(state.pending)])
 
 
-def plant_velocity(machine: Machine, state: PlantState) -> Array:
-    """Joint velocity [rad/s] (..., n) of the plant. Paper: eq1."""
-    return state.speed / lever_arm(machine, state.q)
-
-
 def speed_limits(machine: Machine, q: ArrayLike) -> tuple[Array, Array]:
     """Fastest negative and positive velocity [rad/s] (..., n) that a joint alone can hold at angles `q`.
 

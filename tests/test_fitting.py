@@ -50,6 +50,7 @@ def test_nets_learn_a_simple_system(logged):
     net = fit(simple_system(0, 25, logged=logged), config, seed=0, velocity_samples=4, machine="toy")
     assert net.joints == ("boom", "stick") and net.machine == "toy" and net.rate == 20.0
     assert net.velocity_logged == logged and net.settings["steps"] == 500
+    assert net.settings["dead_zone"] == net.dead_zone == 0.0  # none given: 0, and the file says so
     unseen = simple_system(1, 6, logged=logged)
     result = score(net, unseen)
     for name in ("boom", "stick"):
