@@ -84,7 +84,7 @@ def test_every_actuator_is_driven_as_long_as_asked_within_the_limits(collected, 
             assert len(r.u) <= 613  # 13 samples at rest and 30 s
         np.testing.assert_array_equal(r.q_dot, velocity_of(r.q, 4))
     for name, ticks in driven.items():
-        assert 3600 <= ticks <= 3605, name  # 0.05 h at 20 Hz
+        assert ticks == 3600, name  # 0.05 h at 20 Hz
 
 
 def test_ways_back_are_marked_and_lead_home(collected):
@@ -159,6 +159,13 @@ def test_a_joint_too_slow_to_come_back_does_not_keep_the_recording_waiting(monke
     assert max(len(r.q) for r in log.recordings if r.name.endswith("_return")) <= 600 + 20
     driven = sum(len(r.q) for r in log.recordings if not r.name.endswith("_return"))
     assert driven == 5 * 288
+
+
+def test_recordings_have_room_for_a_window_and_the_sample_after_it_however_short_their_time():
+    log = collect(BROKK_170, 1e-6, "sine", np.random.default_rng(0), leg_s=2.0)
+    legs = {r.name: len(r.q) for r in log.recordings if not r.name.endswith("_return")}
+    assert legs == {f"q{i}_000": 15 for i in range(1, 6)}
+    assert log.rate == 20.0 and log.recordings[0].q_dot.shape == (15, 5)
 
 
 def test_rich_recordings_hold_pauses_and_sine_recordings_none(collected):
