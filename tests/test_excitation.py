@@ -433,3 +433,29 @@ def test_recorded_commands_of_a_task_by_hand():
     assert all((r.q[0] == read_encoder(BROKK_170, np.array(pose))).all() for r in same.recordings)
     pausing = task_log(BROKK_170, 1, 0.5, Share(0.9)).recordings[0]  # 0.15 of the levels are none
     assert not pausing.u.any()
+
+
+@pytest.mark.parametrize(("kind", "pushed"), [("sine", 0), ("rich", 20)])
+def test_a_leg_and_its_way_back_by_hand(kind, pushed, monkeypatch):
+    """Full command up: q5 from amid its range or its stop to the stop, perhaps pushing, and back to rest."""
+    monkeypatch.setitem(EXCITATIONS, kind, lambda rng, machine, ticks: np.full(ticks, LIMIT))
+    high, start = BROKK_170.column("q_max")[Q5], np.array([1.0, 2.0])[: 1 if kind == "sine" else 2]
+    drawn = Share(np.array([0.5, 0.95]))  # of the range and an eighth more on either side
+    recorder, back, home = excitation._drive_legs(BROKK_170, np.full(len(start), Q5), kind, drawn, 240)
+    q, u = np.array(recorder.q), np.rint(127 * np.array(recorder.u))
+    middle = read_encoder(BROKK_170, (BROKK_170.column("q_min") + BROKK_170.column("q_max")) / 2)
+    assert (np.delete(q, Q5, -1) == np.delete(middle, Q5)).all()
+    assert not np.delete(u, Q5, -1).any()
+    for row, (angles, counts) in enumerate(zip(q[..., Q5].T, u[..., Q5].T, strict=True)):
+        met = np.flatnonzero(angles > high - 2 * BROKK_170.encoder_step)
+        turn = max(met[pushed], 34)  # after 13 samples at rest and more than a second
+        assert angles[0] == read_encoder(BROKK_170, start[row]) and back[row] == turn
+        come = turn + np.flatnonzero(np.abs(angles[turn:] - angles[0]) < 0.06)[0]
+        wanted = np.concatenate(
+            [np.zeros(13), np.full(turn - 13, 80), np.full(come - turn, -44), np.zeros(40)]
+        )
+        np.testing.assert_array_equal(counts[: len(wanted)], wanted)
+        assert home[row] == len(wanted) and not counts[len(wanted) :].any()
+    assert len(u) == home.max()
+    early = excitation._drive_legs(BROKK_170, np.array([Q5]), kind, Share(0.5), 20)[1]
+    assert early.tolist() == [33]  # its time is over before it meets a limit
