@@ -10,8 +10,9 @@ import pytest
 
 from brokk_min import sequences
 from brokk_min.env import TaskConfig
-from brokk_min.kinematics import jacobian, lowest_point
-from brokk_min.machine import BROKK_170
+from brokk_min.kinematics import jacobian, lowest_point, tool_position
+from brokk_min.machine import BROKK_170, Machine
+from brokk_min.plant import speed_limits
 
 
 def test_the_starts_of_the_package_are_of_all_kinds_and_not_the_tuning_starts() -> None:
@@ -206,3 +207,59 @@ def test_goals_for_all_starts_or_each() -> None:
     np.testing.assert_array_equal(sequences.Commands("each", goals).of_each(2), goals)
     one = sequences.Commands("one", goals[:, 0]).of_each(3)
     np.testing.assert_array_equal(one, np.stack([goals[:, 0]] * 3, axis=1))
+
+
+def test_directions_and_names_of_the_sequences() -> None:
+    found = {s.name: s.goals for s in sequences.task_sequences(BROKK_170)}
+    assert list(found)[3:] == ["diagonal_flat", "diagonal_rise", "circle", "rectangle", "stop_and_go", "slow"]
+    np.testing.assert_allclose(found["diagonal_flat"][30], 0.2 * np.array([1, 1, 0]) / 2**0.5)
+    np.testing.assert_allclose(found["diagonal_rise"][30], 0.2 * np.array([1, -1, 1]) / 3**0.5)
+    np.testing.assert_allclose(found["circle"][[20, 100]], [[0.15, 0, 0], [0, 0, 0.15]], atol=1e-12)
+    least = sequences.least_motion(BROKK_170, np.array([[0.0, 1.139, 0.97, 2.804, 1.948]]))
+    assert [s.name for s in least] == ["least_half", "least_quarter"]
+
+
+def test_margins_of_what_is_feasible_by_hand() -> None:
+    """Joints 0.05 rad and the arm 0.1 m off their ends, driven joints below 0.9 of their speed."""
+    ordinary, still = np.array([0.0, 0.5, 0.58, 1.71, 1.24]), np.zeros((2, 1, 3))
+    low, high = BROKK_170.column("q_min"), BROKK_170.column("q_max")
+
+    def can(start: np.ndarray, goals: np.ndarray = still, machine: Machine = BROKK_170) -> bool:
+        return bool(sequences.feasible(machine, start[None], goals)[0])
+
+    for joint in BROKK_170.driven:
+        for end, inward in ((low, 1), (high, -1)):
+            near, far = ordinary.copy(), ordinary.copy()
+            near[joint], far[joint] = end[joint] + inward * 0.049, end[joint] + inward * 0.051
+            clear = lowest_point(BROKK_170, far) > 0.1
+            assert not can(near) and can(far) == clear, joint
+    lowest = float(lowest_point(BROKK_170, ordinary))
+    for ground, good in ((lowest - 0.101, True), (lowest - 0.099, False)):
+        assert can(ordinary, machine=replace(BROKK_170, ground=ground)) == good
+    radius = np.hypot(*tool_position(BROKK_170, ordinary)[:2])
+    for way, limit in zip((-1, 1), speed_limits(BROKK_170, ordinary), strict=True):
+        for share, good in ((0.89, True), (0.91, False)):
+            slewing = np.array([0.0, share * abs(limit[0]) * radius * way, 0.0])
+            assert can(ordinary, np.tile(slewing, (2, 1, 1)), replace(BROKK_170, rate=100.0)) == good
+
+
+def test_commands_of_a_file_by_hand(tmp_path: Path) -> None:
+    """Values count from their row on, to the tick; a sequence lasts a tick or more."""
+    path = tmp_path / "c.csv"
+    path.write_text("sequence,time,vx,vy,vz\na,5,1,2,3\na,5.1,4,5,6\na,5.15,0,0,0\nb,0,7,8,9\nb,0.05,0,0,0\n")
+    first, second = sequences.read_commands(path, BROKK_170)
+    assert first.goals.tolist() == [[1, 2, 3], [1, 2, 3], [4, 5, 6]] and second.goals.tolist() == [[7, 8, 9]]
+    for rows in ("b,0,1,0,0\nb,0,2,0,0\nb,1,0,0,0\n", "b,1,0,0,0\n"):
+        path.write_text(f"sequence,time,vx,vy,vz\n{rows}")
+        with pytest.raises(
+            ValueError, match=r"c.csv: sequence b: expected two or more rows with rising time"
+        ):
+            sequences.read_commands(path, BROKK_170)
+
+
+def test_kinds_of_starts_at_their_thresholds() -> None:
+    ordinary = np.array([1.5, 0.5, 0.58, 1.71, 1.24])
+    ends = np.tile(ordinary, (4, 1))
+    ends[[0, 1], 3] = 2.9 - np.array([0.151, 0.149])
+    ends[[2, 3], 4] = [0.151, 0.149]
+    assert sequences.start_kinds(BROKK_170, ends) == ["workspace", "limits"] * 2
