@@ -7,6 +7,7 @@ import os
 import struct
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -358,6 +359,26 @@ def test_a_loop_whose_window_died_stops(monkeypatch: pytest.MonkeyPatch) -> None
     assert operator(True, True) == play.wishes.Wish((0.1, 0.0, 0.0), enable=True)
     asks.write([10.0, 0, 0, 1, 1, 0, 0, 0, 0, 0, 0, 0])
     assert operator(True, True) == play.wishes.Wish(stop=True)
+
+
+def test_the_loops_process_drives_a_machine_of_its_own_until_it_is_told_to_stop(tmp_path: Path) -> None:
+    """In this process: the window asks to stop at once; what the loop knew of its tick and the log remain."""
+    asks, tells, said = Mailbox(12), Mailbox(24), list[str]()
+    asks.write([time.monotonic() + 100, 1, 0, 1, 1, 0.1, 0, 0, 0, 0, 0, 0])
+    where = remote.Where(log=tmp_path / "run.log", start=tuple(START))
+    modes: list[int] = []
+    push = SimpleNamespace(start=modes.append)
+    remote.control(BROKK_170, [push], where, asks, tells)
+    told = tells.read()
+    assert told is not None and (tmp_path / "run.log").stat().st_size > 0
+    known = ticks.unpack_known(BROKK_170, told)
+    np.testing.assert_allclose(known.q, START, atol=BROKK_170.encoder_step)
+    assert known.mode == 1 and not known.driving and known.v_goal.tolist() == [0.1, 0, 0]
+    assert not [thread for thread in threading.enumerate() if "serve" in thread.name]
+    pipe = SimpleNamespace(send=said.append)
+    remote._control_process(pipe, BROKK_170, [], remote.Where("nonsense", "bus"), asks, tells)
+    remote._control_process(pipe, None, [], where, asks, tells)
+    assert said[0].startswith("nonsense bus: expected a CAN bus") and said[1].startswith("AttributeError: ")
 
 
 def test_a_whole_traced_rectangle_is_scored() -> None:
