@@ -403,3 +403,116 @@ def test_tool_errors_by_hand(monkeypatch):
     monkeypatch.setattr(scores, "run_errors", error)
     errors = trust.tool_errors(BROKK_170, random_net(np.random.default_rng(0)), test)
     assert errors == {"1": pytest.approx(0.0305, abs=2e-4), "5": pytest.approx(0.1525, abs=1e-3)}
+
+
+# --- numbers and figures by hand ------------------------------------------------------------------------
+
+
+def made_up_gap() -> preliminary.Gap:
+    """Two ticks, three runs; only the first run counts for joints, run k is off by k + 1 as much."""
+    size = np.arange(1, 4)[:, None]
+    q = np.array([0.1, -0.3])[:, None, None] * size * np.array([1.0, 9, 2, 3, 4])
+    p = np.array([0.3, 0.5])[:, None, None] * size * np.array([0.6, 0.8, 0.0])
+    return preliminary.Gap(q, 2 * q, p, 2 * p)
+
+
+def test_numbers_of_a_gap_by_hand():
+    found = preliminary._gap_numbers(BROKK_170, made_up_gap())
+    assert found["tool"] == {
+        "position_error_mean": pytest.approx(0.4),
+        "velocity_rmse": pytest.approx(2 * np.sqrt((0.09 + 0.25) / 2)),
+    }
+    spread = {"median": pytest.approx(0.8), "max": pytest.approx(1.2), "runs": 3}
+    assert found["tool_position_error_mean_of_runs"] == spread
+    assert list(found["joints"]) == ["q1", "q3", "q4", "q5"]
+    assert found["joints"]["q4"] == {
+        "velocity_rmse": pytest.approx(2 * 3 * np.sqrt((0.01 + 0.09) / 2)),
+        "position_error_mean": pytest.approx(3 * 0.2),
+        "position_error_max": pytest.approx(3 * 0.3),
+    }
+
+
+def test_sweeps_are_compared_by_their_peaks_and_between_their_outer_twentieths():
+    q = np.linspace(0.0, 1.0, 201)
+    bent = np.where((q < 0.03) | (q > 0.97), 7.0, 0.3)  # nothing of that counts
+    numbers = preliminary._sweep_numbers(np.array([q, -0.5 + 0 * q]), np.array([q, bent]))
+    assert numbers == {"machine_peak": 0.5, "nets_peak": 7.0, "difference_rms": pytest.approx(0.8)}
+    steep = np.array([q, np.where(np.abs(q - 0.5) < 0.4251, 0.3, 7.0)])  # but from 0.06 to 0.94
+    assert preliminary._sweep_numbers(np.array([q, 0.3 + 0 * q]), steep)["difference_rms"] > 0.1
+
+
+def test_the_tests_are_those_of_the_last_driven_joint_at_five_eighths_and_all_of_the_limit():
+    seen = []
+
+    def move(q: np.ndarray, u: np.ndarray) -> np.ndarray:
+        seen.append((q, u))
+        return constant_mover(0.25, 0.5, 0)(q, u)
+
+    tests = preliminary.preliminary_tests(BROKK_170, move)
+    assert list(tests.sweeps) == ["u = 50", "u = 80", "u = 175", "u = 205"]
+    q, u = seen[0]
+    assert u.shape == (800, 5, 5) and (u == u[0]).all()
+    np.testing.assert_allclose(
+        u[0] * 127, [[0, 0, 0, 0, c] for c in (50, 80, -80, -50)] + [[-80, 0, -80, 80, 80]]
+    )
+    np.testing.assert_array_equal(q[:, 4], [LOW[4], LOW[4], HIGH[4], HIGH[4], LOW[4]])
+    np.testing.assert_allclose(q[:, :4], np.tile(((LOW + HIGH) / 2)[:4], (5, 1)))
+    for name, speed in zip(tests.sweeps, (0.25, 0.25, -0.5, -0.5), strict=True):
+        angle, velocity = tests.sweeps[name]
+        np.testing.assert_allclose(velocity, speed)
+        assert angle[0] == pytest.approx((LOW[4] if speed > 0 else HIGH[4]) + speed / 20)
+    assert list(tests.coupling) == ["alone", "with the others"]
+    np.testing.assert_array_equal(tests.coupling["alone"], tests.sweeps["u = 80"])
+    q, u = seen[1]
+    assert tests.angles.shape == (61, 2, 2, 5, 5) and u.shape == (60, 2, 2, 5, 5)
+    assert u[0, 1, 0, 4, 4] * 127 == pytest.approx((80 + 0.07 * 127) / 2) and not u[:30, 0].any()
+    np.testing.assert_allclose(u[30:, :, 1, 2, 2] * 127, -80)
+
+
+def test_figures_show_machine_above_nets_and_what_nets_are_off(monkeypatch):
+    up, slow = constant_mover(0.25, 0.5, 2), constant_mover(0.2, 0.4, 4)
+    monkeypatch.setattr(preliminary, "movers", lambda *_: {"machine": up, "nets": slow})
+    monkeypatch.setattr(preliminary, "plot_panels", lambda rows: rows)
+    monkeypatch.setattr(preliminary, "sim_to_real", lambda *_: made_up_gap())
+    figures = preliminary.plots(BROKK_170, random_net(np.random.default_rng(0)), 0)
+    assert list(figures) == ["preliminary", "sim_to_real"]
+    for of, row, late, speed in zip(
+        ("machine", "nets"), figures["preliminary"], (2, 4), (0.25, 0.2), strict=True
+    ):
+        kinds = ("range and direction", "coupling", "past movement")
+        assert [panel.title for panel in row] == [f"{of}: {kind}" for kind in kinds]
+        assert [(p.xlabel, p.ylabel) for p in row] == [("q5 [rad]", "velocity q5 [rad/s]")] * 2 + [
+            ("time after the step [s]", "velocity q5 [rad/s]")
+        ]
+        assert len(row[0].curves) == 4 and len(row[1].curves) == 2
+        time, velocity = row[2].curves["from idle"]
+        np.testing.assert_allclose(time, 0.05 * (np.arange(60) - 29.5))
+        np.testing.assert_allclose(velocity, np.where(np.arange(60) < 30 + late, 0, speed), atol=1e-9)
+        np.testing.assert_allclose(row[2].curves["while moving"][1][late:], speed)
+    (tool_v, tool_p), (q_dot, q) = figures["sim_to_real"]
+    gap = made_up_gap()
+    for panel, values, label in (
+        (tool_v, gap.v_tool, "tool velocity [m/s]"), (tool_p, gap.p_tool, "tool position [m]"),
+        (q_dot, gap.q_dot[..., [0, 2, 3, 4]], "joint velocity [rad/s]"),
+        (q, gap.q[..., [0, 2, 3, 4]], "joint angle [rad]"),
+    ):  # fmt: skip
+        assert (panel.title, panel.xlabel, panel.ylabel) == ("nets - machine", "time [s]", label)
+        assert list(panel.curves) == (["x", "y", "z"] if "tool" in label else ["q1", "q3", "q4", "q5"])
+        for (time, curve), column in zip(panel.curves.values(), values[:, 0].T, strict=True):
+            np.testing.assert_allclose(time, [0.05, 0.1])
+            np.testing.assert_array_equal(curve, column)
+
+
+def test_a_mover_of_nets_leaves_the_locked_joints_where_they_are():
+    net = random_net(np.random.default_rng(0))
+    q, u = np.tile((LOW + HIGH) / 2, (2, 1)), np.full((3, 2, 5), 0.5)
+    moved = preliminary.driven_mover(BROKK_170, net)(q, u)
+    driven = preliminary.net_mover(net.select(["q1", "q3", "q4", "q5"]))(
+        q[:, [0, 2, 3, 4]], u[..., [0, 2, 3, 4]]
+    )
+    assert moved.shape == (4, 2, 5) and (moved[..., 1] == q[0, 1]).all()
+    np.testing.assert_array_equal(moved[..., [0, 2, 3, 4]], driven)
+    both = preliminary.movers(BROKK_170, net)
+    assert list(both) == ["machine", "nets"]
+    np.testing.assert_array_equal(both["nets"](q, u), moved)
+    np.testing.assert_array_equal(both["machine"](q, u), preliminary.plant_mover(BROKK_170)(q, u))
