@@ -263,3 +263,65 @@ def test_kinds_of_starts_at_their_thresholds() -> None:
     ends[[0, 1], 3] = 2.9 - np.array([0.151, 0.149])
     ends[[2, 3], 4] = [0.151, 0.149]
     assert sequences.start_kinds(BROKK_170, ends) == ["workspace", "limits"] * 2
+
+
+def test_drawn_starts_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Poses are numbers; from number k goals up to k can be followed. Two sequences have goals 3 and 6."""
+    draws: list[list[tuple[str, float]]] = []
+    calls = []
+
+    def pose(machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int) -> np.ndarray:
+        calls.append(num)
+        drawn = draws[min(len(calls), len(draws)) - 1]
+        return np.array([[value + 1e-5, sequences.KINDS.index(kind), 0, 0, 0] for kind, value in drawn])
+
+    def able(machine: Machine, start: np.ndarray, goals: np.ndarray) -> np.ndarray:
+        assert goals.shape == (2, len(start), 3)
+        return start[:, 0] >= goals[0, :, 0]
+
+    monkeypatch.setattr(sequences, "draw_pose", pose)
+    monkeypatch.setattr(sequences, "start_kinds", lambda m, q: [sequences.KINDS[int(k)] for k in q[:, 1]])
+    monkeypatch.setattr(sequences, "feasible", able)
+    goals = [sequences.Commands(f"to {k}", np.tile([k, 0.0, 0.0], (2, 1))) for k in (3, 6)]
+
+    def drawn(num: int, *kinds: list[tuple[str, float]]) -> list[float]:
+        draws[:] = kinds
+        calls.clear()
+        return sequences.draw_starts(BROKK_170, goals, num, np.random.default_rng(0))[:, 0].tolist()
+
+    works = [("workspace", 5), ("workspace", 7), ("limits", 2), ("limits", 4), ("extended", 1)]
+    more = [("workspace", 8), ("limits", 9), ("extended", 0), ("workspace", 6)]
+    assert drawn(4, works, more) == [7, 4, 8, 1] and calls == [4000, 4000]
+    assert drawn(8, works, more) == [7, 4, 8, 1, 6, 9, 8, 0] and len(calls) == 3
+    few = [("workspace", 6), ("workspace", 7), ("workspace", 8), ("workspace", 2)]
+    with pytest.raises(
+        ValueError, match=r"^brokk170: expected 9 poses from .* feasible, got fewer in 200 draws$"
+    ):
+        drawn(9, [("workspace", 2)])
+    assert len(calls) == 200
+    assert drawn(4, few) == [6, 7, 8, 6]  # the other kinds have none: workspace stands in
+
+
+def test_tuning_runs_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 200 drawn at a time those that are feasible, in turn; the goals of a run hold one after another."""
+    seen, inner = [], sequences.reset
+
+    def able(machine: Machine, start: np.ndarray, goals: np.ndarray) -> np.ndarray:
+        assert start.shape == (200, 5) and goals.shape == (30, 200, 3)
+        seen.append((start, goals))
+        return np.arange(200) % 100 == 7
+
+    monkeypatch.setattr(sequences, "feasible", able)
+    starts, goals = sequences.tuning_goals(BROKK_170, 3, 1.5, 5)
+    assert len(seen) == 2 and goals.shape == (30, 3, 3)
+    for k, (draw, row) in enumerate(((0, 7), (0, 107), (1, 7))):
+        np.testing.assert_array_equal(starts[k], seen[draw][0][row])
+        np.testing.assert_array_equal(goals[:, k], seen[draw][1][:, row])
+    holds = int(np.ceil(1.5 / TaskConfig().hold_min_s))
+    drawn = inner(BROKK_170, TaskConfig(), np.random.default_rng(5), 200 * holds, plant=False)
+    np.testing.assert_array_equal(starts[0], drawn.q[7 * holds])
+    first = np.repeat(drawn.v_goal[7 * holds : 8 * holds], drawn.goal_ticks[7 * holds : 8 * holds], axis=0)
+    np.testing.assert_array_equal(goals[:, 0], first[:30])
+    monkeypatch.setattr(sequences, "feasible", lambda machine, start, goals: np.arange(200) == len(seen))
+    with pytest.raises(ValueError, match=r"^brokk170: expected 61 feasible runs to tune on, got 60$"):
+        sequences.tuning_goals(BROKK_170, 61, 0.1, 5)
