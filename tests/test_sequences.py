@@ -325,3 +325,17 @@ def test_tuning_runs_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sequences, "feasible", lambda machine, start, goals: np.arange(200) == len(seen))
     with pytest.raises(ValueError, match=r"^brokk170: expected 61 feasible runs to tune on, got 60$"):
         sequences.tuning_goals(BROKK_170, 61, 0.1, 5)
+
+
+def test_a_file_of_starts_by_hand(tmp_path: Path) -> None:
+    path = tmp_path / "s.csv"
+    sequences.write_starts(
+        path, BROKK_170, np.array([[0.5, 0.5, 0.58, 1.71, 1.24], [-0.25, 0.5, 0.1, 2.0, 1.0]])
+    )
+    assert path.read_text() == "q1,q2,q3,q4,q5\n0.5,0.5,0.58,1.71,1.24\n-0.25,0.5,0.1,2.0,1.0\n"
+    commands = tmp_path / "c.csv"
+    commands.write_text("sequence,time,vx,vy,vz\na,0,0.1,0,0\na,1,0,0,0\n")
+    found, starts = sequences.goals_and_starts(BROKK_170, commands, path, 9, 0)
+    assert [s.name for s in found] == ["a"] and starts.tolist()[1] == [-0.25, 0.5, 0.1, 2.0, 1.0]
+    found, starts = sequences.goals_and_starts(BROKK_170, None, None, 3, 0)
+    assert len(found) == 9 and np.array_equal(starts, sequences.scored_starts(BROKK_170, 3, found, 2))
