@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -83,7 +84,7 @@ def made_up() -> dict[str, Any]:
         "actuator": {"test": tested},
         "preliminary": {"sim_to_real": gap},
         "paper_recipe": {"test": tested, "sim_to_real": gap},
-        "tuning": {"pid": {"seed": 3, "cost": [0.5, 0.25], "cost_anew": 0.3, "at_bound": ["kp q1"]}},
+        "tuning": {"pid": {"seed": 3, "cost": [0.5, 0.25], "cost_anew": 0.3, "at_bound": ["kp q1", "ki q3"]}},
         "tuning_runs": [{"start": POSE, "goals": [[1.0, 0.0, 0.0, 0.0], [2.0, 0.3, 0.0, 0.4]]}],
         "training_seeds": {},
     }  # fmt: skip
@@ -179,7 +180,7 @@ def test_parts_on_the_task_stand_with_their_sentences_and_figures(drawn: None) -
     np.testing.assert_array_equal(half.goals, wanted)
     assert start.tolist() == results["starts"][2] and run == 0
     units = {f"{ERROR} [m/s]": 0.03, "jerk_rms [m/s^3]": 1.0, f"{DRIFT} [m]": 0.1, "time_at_limits [s]": 2.0}
-    assert singular[4]["pid"] == units
+    assert singular[4]["pid"] == units and by_title["Figures of merit"][2] == quote("last", NOT)
     assert len(report.task_parts(BROKK_170, results, traces | {"singular": {}})) == len(parts) - 1  # type: ignore[arg-type, operator]
 
 
@@ -221,14 +222,17 @@ def test_tables_of_the_comparison_by_hand(drawn: None) -> None:
 
 def test_figures_of_training_seeds_join_the_tables(drawn: None) -> None:
     assert report._seeds({}) == []
-    rl = {"velocity_error_all": number(0.5, 0.25, 0.75), "valve_travel": number(9.0)}
-    less = {"velocity_error_all": number(-0.5), "valve_travel": number(1.0)}
+    rl = {"velocity_error_to_go": number(0.5, 0.25, 0.75), "valve_travel": number(9.0)}
+    less = {"velocity_error_to_go": number(-0.5), "valve_travel": number(1.0)}
     results = made_up() | {"training_seeds": {"rl": rl, "pid": rl, "rl less pid": less}}
     _, _, alone, _, paired, (name, bars) = report._tables(results, quote("last", NOT))[-1]
     cell = {"rl": "0.5000 (0.2500 to 0.7500)", "pid": "0.5000 (0.2500 to 0.7500)"}
-    assert alone == {"velocity_error_all": cell, "valve_travel": {"rl": "9", "pid": "9"}}
-    assert paired == {"velocity_error_all": {"rl less pid": "-0.5000"}, "valve_travel": {"rl less pid": "1"}}
-    shown = {"rl": {"all": rl["velocity_error_all"]}, "pid": {"all": rl["velocity_error_all"]}}
+    assert alone == {"velocity_error_to_go": cell, "valve_travel": {"rl": "9", "pid": "9"}}
+    assert paired == {
+        "velocity_error_to_go": {"rl less pid": "-0.5000"},
+        "valve_travel": {"rl less pid": "1"},
+    }
+    shown = {c: {"to_go": rl["velocity_error_to_go"]} for c in ("rl", "pid")}
     assert (name, bars) == ("plot_bars", {"mean velocity error [m/s]": shown})
 
 
@@ -238,7 +242,7 @@ def test_what_was_scored_and_tuned_on_is_listed() -> None:
     angles = dict(zip(BROKK_170.names, POSE, strict=True))
     assert scored["start 0"] == angles | {"kind": "limits"} and scored["start 2"]["kind"] == "extended"
     costs = {"seed": 3, "first": 0.5, "last": 0.25, "under other noise": 0.3}
-    assert tuned == {"pid": costs | {"gains at a bound": "kp q1"}}
+    assert tuned == {"pid": costs | {"gains at a bound": "kp q1, ki q3"}}
     free = report._tuning({"a": {"seed": 3, "cost": [0.5, 0.25], "cost_anew": 0.3, "at_bound": []}})
     assert free == {"a": costs | {"gains at a bound": "none"}}
     goals = "1 s (0, 0, 0); 2 s (0.3, 0, 0.4)"
@@ -364,6 +368,12 @@ def test_arms_at_their_starts_are_drawn_from_the_side_and_from_above() -> None:
     ):
         np.testing.assert_allclose(arm[:, -1], [x, y], atol=0.01)
     assert [t.get_text() for t in figure.legends[0].get_texts()] == ["limits", "workspace"]
+    names = [(ax.get_xlabel(), ax.get_ylabel()) for ax in figure.axes]
+    assert names == [("outward from the slew axis [m]", "z [m]"), ("x [m]", "y [m]")]
+    assert all(ax.get_aspect() == 1.0 for ax in figure.axes)
+    colours = [figures.STYLES[kind]["color"] for kind in ("limits", "workspace", "limits")]
+    for ax in figure.axes:
+        assert [line.get_color() for line in ax.get_lines()[:3]] == colours
 
 
 @pytest.mark.usefixtures("closing")
@@ -376,3 +386,61 @@ def test_a_learning_curve_is_drawn_over_millions_of_steps(tmp_path: Path) -> Non
     assert (
         error.get_ylabel() == "velocity error [m/s]" and reward.get_xlabel() == "environment steps [million]"
     )
+
+
+@pytest.mark.parametrize(("samples", "ticks"), [(40, 34), (900, 600)])
+def test_free_runs_begin_after_a_history_and_last_30_s_or_to_the_end(
+    samples: int, ticks: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    net: Any = SimpleNamespace(history=5, rate=20.0, joints=("a", "b"))
+    q = np.arange(2.0 * samples).reshape(samples, 2)
+    recording = figures.logs.Recording("r", np.eye(2)[np.ones(samples, int)], q, -q)
+    own = np.full((ticks, 1, 2), 7.0)
+
+    def free(of: Any, one: Any, starts: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]:
+        assert (of, one, starts.tolist(), steps) == (net, recording, [5], ticks)
+        return own, -own
+
+    monkeypatch.setattr(figures.scores, "free_run", free)
+    monkeypatch.setattr(figures, "plot_panels", lambda rows: rows)
+    ((angle, velocity),) = figures.plot_free_run(net, figures.logs.Log(("a", "b"), (recording,)))
+    assert (angle.ylabel, velocity.ylabel) == ("b [rad]", "b [rad/s]")  # the other has no command
+    for panel, sign in ((angle, 1), (velocity, -1)):
+        time, real = panel.curves["measured"]
+        np.testing.assert_allclose(time, 0.05 * np.arange(1, ticks + 1))
+        np.testing.assert_array_equal(real, sign * q[6 : 6 + ticks, 1])
+        np.testing.assert_array_equal(panel.curves["free run"][1], sign * own[:, 0, 1])
+
+
+def test_the_worst_and_the_median_recording_are_shown_by_their_worst_joint(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    errors = np.array([[0.1, 0.3], [np.nan, np.nan], [0.9, 0.2], [0.4, np.nan]])
+    names = ("r0", "r1", "r2", "r3")
+    log = figures.logs.Log(("a", "b"), tuple(figures.logs.Recording(n, *np.zeros((3, 1, 2))) for n in names))
+    monkeypatch.setattr(
+        figures.scores, "recording_errors", lambda net, log, seconds: errors if seconds == 30.0 else 0
+    )
+    curves = lambda net, r: [([f"{r.name} {j} {k}" for j in "ab"], {"c": np.ones((2, 2))}) for k in "qv"]  # noqa: E731
+    monkeypatch.setattr(figures, "_free_run", curves)
+    monkeypatch.setattr(figures, "plot_panels", lambda rows: rows)
+    worst, median = figures.plot_worst_and_median(SimpleNamespace(rate=20.0), log)  # type: ignore[arg-type]
+    assert [(p.title, p.ylabel) for p in worst] == [("worst: r2", "r2 a q"), ("worst: r2", "r2 a v")]
+    assert [(p.title, p.ylabel) for p in median] == [("median: r3", "r3 a q"), ("median: r3", "r3 a v")]
+
+
+@pytest.mark.usefixtures("closing")
+def test_a_figure_is_saved_the_same_each_time_and_closed(tmp_path: Path) -> None:
+    pages = []
+    for name in ("a.png", "b.png"):
+        figure = figures.plt.figure(figsize=(1.0, 0.5))
+        figure.add_subplot().plot([0, 1])
+        figures.save(tmp_path / name, figure)
+        figure = figures.plt.figure(figsize=(1.0, 0.5))
+        figure.add_subplot().plot([0, 1])
+        pages.append(figures._content("a < b", figure))
+        assert not figures.plt.get_fignums()
+    one, two = ((tmp_path / name).read_bytes() for name in ("a.png", "b.png"))
+    assert one == two and one[:4] == b"\x89PNG" and one[16:24] == bytes([0, 0, 0, 150, 0, 0, 0, 75])
+    assert pages[0] == pages[1] and pages[0].startswith("<img alt='a &lt; b' src='data:image/png;base64,")
+    assert base64.b64decode(pages[0].split(",")[1][:-2]) == one and b"Software" not in one
