@@ -438,7 +438,7 @@ def test_the_comparison_asks_its_parts_for_what_they_are_for(monkeypatch: pytest
     controllers: Any = {"a": _Idle(), "b": _Idle()}
     found, shown = experiments.comparison(BROKK_170, controllers, effort, 7)
     every = [s.name for s in task_sequences(BROKK_170)]
-    assert asked["scored_starts"][1] == 4 and asked["scored_starts"][3] == 9
+    assert asked["scored_starts"][:2] == (BROKK_170, 4) and asked["scored_starts"][3] == 9
     assert [s.name for s in asked["scored_starts"][2]] == every
     machine, who, sequences, where, seed = asked["task_space"]
     assert (machine, who, [s.name for s in sequences], where is starts, seed) == (
@@ -515,7 +515,7 @@ def test_a_log_of_driven_runs_by_hand() -> None:
 
 def test_tables_keep_the_runs_that_count_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     rows = [
-        {"controller": c, "sequence": s, "start": i, "kind": kind, "error": base + i}
+        {"controller": c, "sequence": s, "start": i, "kind": kind, "error": base + i + (kind == "limits") / 2}
         for c, base in (("rl", 1.0), ("pid", 4.0))
         for s in "xy"
         for i, kind in enumerate(("workspace", "limits", "workspace"))
@@ -523,9 +523,8 @@ def test_tables_keep_the_runs_that_count_apart(monkeypatch: pytest.MonkeyPatch) 
     scored = [row for row in rows if row["kind"] == "workspace"]
     found = experiments.tables(rows, scored)
     assert found["runs"] is rows and found["summary"]["pid"] == {s: {"error": 5.0} for s in ("x", "y", "all")}
-    assert found["by_kind"] == {
-        kind: {"rl": {"error": 2.0}, "pid": {"error": 5.0}} for kind in ("workspace", "limits")
-    }
+    limits = {"rl": {"error": 2.5}, "pid": {"error": 5.5}}
+    assert found["by_kind"] == {"workspace": {"rl": {"error": 2.0}, "pid": {"error": 5.0}}, "limits": limits}
     assert found["rl_less"] == {
         "error": {"pid": {s: {"mean": -3.0, "low": -3.0, "high": -3.0} for s in ("x", "y", "all")}}
     }
@@ -617,6 +616,49 @@ def test_gains_are_written_by_name_and_tuning_is_apart_from_scoring(tmp_path: Pa
         experiments.write_json(tmp_path / "a.json", {"b": float("nan")})
     about = experiments.meta(BROKK_170, 4)
     assert about == {"brokk_min": "0.1.0", "machine": "brokk170", "seed": 4, "units": "m, m/s, s, rad"}
+
+
+def test_robustness_says_what_the_policy_has_less_than_others_on_each_machine(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[Any] = []
+    trace = made_up_trace(4, 2)._replace(u=np.zeros((4, 2, 5)))
+    full = trace._replace(u=np.where(np.arange(4)[:, None, None] < 1, 1.0, 0.0) * np.ones((4, 2, 5)))
+
+    def driven(plant: Machine, *a: Any, **more: Any) -> Any:
+        asked.append((plant, *a, more))
+        error = plant.delay
+        rows = [
+            {"controller": c, "sequence": "x", "start": i, "kind": "k", "velocity_error_mean": error + e + i}
+            for c, e in (("rl", 1.0), ("pid", 3.0))
+            for i in range(2)
+        ]
+        return rows, {("rl", "x"): trace, ("pid", "x"): full}
+
+    monkeypatch.setattr(experiments, "task_space", driven)
+    controllers: Any = {"rl": _Idle(), "pid": _Idle()}
+    short = experiments.shortened(BROKK_170, task_sequences(BROKK_170)[:1], 1.0)
+    found = experiments.robustness(BROKK_170, controllers, short, np.zeros((2, 5)), 9)
+    wanted = variations.variations(BROKK_170)
+    assert list(found) == list(wanted)
+    for (plant, sensor), call in zip(wanted.values(), asked, strict=True):
+        assert call[0] == plant and call[1:3] == (controllers, short) and call[4:] == (9, {"sensor": sensor})
+    late = found["delay +50 ms"]
+    assert late["rl"] == {
+        "mean": pytest.approx(1.59),  # two starts, 1.09 and 2.09: half of 12.7062 to either side
+        "low": pytest.approx(1.59 - 6.3531, abs=1e-3), "high": pytest.approx(1.59 + 6.3531, abs=1e-3),
+        "supply_demand": 0.0, "supply_limits": 0.0,
+    }  # fmt: skip
+    assert late["pid"]["rl_less"] == pytest.approx({"mean": -2.0, "low": -2.0, "high": -2.0})
+    assert late["pid"]["supply_demand"] == pytest.approx(
+        float(variations.supply_demand(BROKK_170, np.ones(5)))
+    )
+    assert late["pid"]["supply_demand"] > 1 and late["pid"]["supply_limits"] == 0.25
+    alone: Any = {"pid": _Idle()}
+    assert (
+        "rl_less"
+        not in experiments.robustness(BROKK_170, alone, short, np.zeros((2, 5)), 9)["nominal"]["pid"]
+    )
 
 
 def test_variations_by_hand() -> None:
