@@ -21,7 +21,7 @@ from brokk_min.actuator import load_net
 from brokk_min.logs import Log, Recording, read_log, write_log
 from brokk_min.machine import BROKK_170
 from brokk_min.metrics import summary
-from brokk_min.options import SHIPPED
+from brokk_min.options import SHIPPED, WrongUse, check, chosen_policy, machine_from
 from brokk_min.policy import load_policy
 
 
@@ -317,3 +317,57 @@ def test_a_machine_without_a_policy_says_so(capsys: pytest.CaptureFixture[str]) 
     other = Path(__file__).parent.parent / "examples" / "mini_excavator.py"
     assert run("evaluate", "--machine", f"{other}:MINI_EXCAVATOR") == 1
     assert "policy.npz" in capsys.readouterr().err
+
+
+# --- what options may be --------------------------------------------------------------------------------
+
+
+def test_options_are_looked_for_in_the_command_its_settings_and_its_task(tmp_path: Path) -> None:
+    def given(**more: object) -> SimpleNamespace:
+        return SimpleNamespace(machine="brokk170", **more)
+
+    assert check(given(seed=0, hours=100)) is BROKK_170 and check(given(seed=2**31 - 1)) is BROKK_170
+    assert check(SimpleNamespace(machine="")) is BROKK_170  # none named: the Brokk
+    inner = SimpleNamespace(num_envs=0, total_steps=5)
+    with pytest.raises(WrongUse, match=r"^--num-envs: expected 1 to 1000000.0, got 0$"):
+        check(given(settings=inner))
+    with pytest.raises(WrongUse, match=r"^--zero-goals: expected 0 to 1, got 1.5$"):
+        check(given(task=SimpleNamespace(zero_goals=1.5)))
+    with pytest.raises(WrongUse, match=r"^--counts: expected 1 to 127, got 128$"):
+        check(given(settings=inner, counts=128, num_envs=1))  # the command's own count before its settings
+    assert check(given(dead_zone=None)) is BROKK_170  # not given
+    assert check(given(task=SimpleNamespace(hold_min_s=2.0, hold_max_s=2.0))) is BROKK_170
+    with pytest.raises(WrongUse, match=r"^--hold-max-s: expected --hold-min-s or more, got 0.5$"):
+        check(given(task=SimpleNamespace(hold_min_s=0.75, hold_max_s=0.5)))
+    assert check(given(), tmp_path / "new.csv", None) is BROKK_170
+    for path in (tmp_path, tmp_path / "missing" / "new.csv"):
+        with pytest.raises(WrongUse, match=r": expected a file in an existing, writable directory$") as error:
+            check(given(), None, path)
+        assert str(error.value).startswith(f"{path}: ")
+
+
+def test_a_machine_of_a_file_is_a_machine(tmp_path: Path) -> None:
+    file = tmp_path / "a:b.py"
+    file.write_text("from brokk_min.machine import BROKK_170 as MINE\nNONE = 3\n")
+    assert check(SimpleNamespace(machine=f"{file}:MINE")) == BROKK_170
+    with pytest.raises(WrongUse, match=r"^--machine: expected a Machine NONE in .*a:b.py, got 3$"):
+        machine_from(f"{file}:NONE")
+    with pytest.raises(
+        WrongUse, match=r"^--machine: expected one of \['brokk170'\] or FILE.py:NAME, got digger$"
+    ):
+        machine_from("digger")
+    file.write_text("raise KeyError('no')")
+    with pytest.raises(ValueError, match=r"^--machine: expected .*a:b.py to run, got KeyError\('no'\)$"):
+        machine_from(f"{file}:MINE")
+
+
+def test_gains_lie_beside_their_policy(tmp_path: Path) -> None:
+    assert chosen_policy(BROKK_170, None, None) == (
+        SHIPPED / "brokk170" / "policy.npz",
+        SHIPPED / "brokk170" / "gains.json",
+    )
+    mine, gains = tmp_path / "p.npz", tmp_path / "gains.json"
+    assert chosen_policy(BROKK_170, mine, None) == (mine, None)
+    gains.touch()
+    assert chosen_policy(BROKK_170, mine, None) == (mine, gains)
+    assert chosen_policy(BROKK_170, mine, tmp_path / "other.json") == (mine, tmp_path / "other.json")

@@ -93,7 +93,7 @@ def test_every_actuator_is_driven_as_long_as_asked_within_the_limits(collected, 
             assert len(r.u) <= 613  # 13 samples at rest and 30 s
         np.testing.assert_array_equal(r.q_dot, velocity_of(r.q, 4))
     for name, ticks in driven.items():
-        assert 3600 <= ticks <= 3605, name  # 0.05 h at 20 Hz
+        assert ticks == 3600, name  # 0.05 h at 20 Hz
 
 
 def test_ways_back_are_marked_and_lead_home(collected):
@@ -168,6 +168,13 @@ def test_a_joint_too_slow_to_come_back_does_not_keep_the_recording_waiting(monke
     assert max(len(r.q) for r in log.recordings if r.name.endswith("_return")) <= 600 + 20
     driven = sum(len(r.q) for r in log.recordings if not r.name.endswith("_return"))
     assert driven == 5 * 288
+
+
+def test_recordings_have_room_for_a_window_and_the_sample_after_it_however_short_their_time():
+    log = collect(BROKK_170, 1e-6, "sine", np.random.default_rng(0), leg_s=2.0)
+    legs = {r.name: len(r.q) for r in log.recordings if not r.name.endswith("_return")}
+    assert legs == {f"q{i}_000": 15 for i in range(1, 6)}
+    assert log.rate == 20.0 and log.recordings[0].q_dot.shape == (15, 5)
 
 
 def test_rich_recordings_hold_pauses_and_sine_recordings_none(collected):
@@ -354,3 +361,110 @@ def test_joints_of_a_task_hold_each_a_level_for_a_time_of_its_own_and_go_to_the_
     noisy = task_log(BROKK_170, 4, 20.0, np.random.default_rng(0))
     steps = np.abs(np.concatenate([np.diff(r.u[:, [0, 2, 3, 4]], axis=0) for r in noisy.recordings])) * 127
     assert steps.max() < 100 and 0.5 < np.median(steps) < 10
+
+
+class Share(np.random.Generator):
+    """Draws nothing: whatever is uniform lies at `share` of its interval, normal numbers are 1."""
+
+    def __init__(self, share: float, kind: str = "", sign: int = 1) -> None:
+        super().__init__(np.random.PCG64(0))
+        self.share, self.kind, self.sign = share, kind, sign
+        self.shares: list[list[float]] = []
+
+    def uniform(self, low=0.0, high=1.0, size=None):
+        return (1 - self.share) * np.asarray(low) + self.share * np.asarray(high) + np.zeros(size or ())
+
+    def random(self, size=None):
+        return self.uniform(size=size)
+
+    def integers(self, low, high):
+        return low + int(self.share * (high - low))
+
+    def standard_normal(self, size):
+        return np.ones(size)
+
+    def choice(self, a, p=None):
+        if "sine" not in a:
+            return self.sign if -1 in a else a[int(self.share * len(a))]
+        self.shares.append(p)
+        return self.kind
+
+
+def test_commands_by_hand_where_each_draw_is_a_quarter_of_what_it_may_be():
+    time, top = 0.05 * np.arange(40), 4 / 3 * LIMIT
+    slow = (0.07 + 0.25 * (LIMIT - 0.07)) * np.cos(2 * np.pi * 0.14 * time)  # 0.02 to 0.5 Hz, phase pi / 2
+    np.testing.assert_allclose(EXCITATIONS["sine"](Share(0.25), BROKK_170, 40), slow, atol=1e-12)
+    level, noise = 0.07 + 0.25 * (top - 0.07), 0.25 * 0.08
+    fast = -0.15 * top + level * np.cos(2 * np.pi * 0.05 * 80**0.25 * time[:27])  # 1.375 s of 0.5 to 4
+    got = EXCITATIONS["rich"](rng := Share(0.25, "sine"), BROKK_170, 27)
+    np.testing.assert_allclose(got, fast + noise, atol=1e-12)
+    assert rng.shares == [list(excitation.MIX.values())]  # one part is enough, of shares as they stand there
+    half = EXCITATIONS["rich"](Share(0.5, "sine"), BROKK_170, 45)  # no noise; phase pi, mean 0
+    level = (0.07 + top) / 2
+    wave = -level * np.sin(2 * np.pi * 0.05 * 80**0.5 * 0.05 * np.arange(45))
+    np.testing.assert_allclose(half, wave, atol=1e-12)
+    for kind, ticks in (("step", 57), ("holds", 27), ("go", 57), ("hover", 57)):  # 2.875 s or 1.375 s
+        EXCITATIONS["rich"](rng := Share(0.25, kind), BROKK_170, 2 * ticks + 1)
+        assert len(rng.shares) == 3, kind
+    got = EXCITATIONS["rich"](Share(0.25, "hover", sign=-1), BROKK_170, 26)
+    barely = (0.9 + 0.25 * 0.8) * 0.07 * np.array([-1, -1, 1, 1, -1, -1, 1, 1, -1, -1, 1, 1, -1])  # 0.65 s
+    np.testing.assert_allclose(got[:13], barely, atol=1e-12)
+    np.testing.assert_allclose(got[13:19], -0.5 * top, atol=1e-12)  # 0.325 s, then the next wait
+    np.testing.assert_allclose(got[19:], barely[:7], atol=1e-12)
+    got = EXCITATIONS["rich"](Share(0.75, "go"), BROKK_170, 60)
+    rest = int(np.exp(0.25 * np.log(0.05) + 0.75 * np.log(3.0)) / 0.05)
+    assert (rest, got[:rest].tolist()) == (21, [0.75 * 0.07 * 0.5] * 21)  # restless at 0.75 of the dead zone
+    np.testing.assert_allclose(got[rest : rest + 15], 0.5 * top, atol=1e-12)
+
+
+def test_recorded_commands_of_a_task_by_hand():
+    """Draws of a quarter: from 0.35 of the range down at a quarter of the limit, for 1.625 s, and so on.
+
+    The chance to go up there is 1 - (1.5 * 0.35 - 0.25) = 0.725, at a third of the range 0.75.
+    """
+    log = task_log(BROKK_170, 5, 4.0, Share(0.25))
+    assert [r.name for r in log.recordings] == ["task_00", "task_01", "task_02", "task_03", "task_04"]
+    low, high = BROKK_170.column("q_min"), BROKK_170.column("q_max")
+    for i, r in enumerate(log.recordings):
+        np.testing.assert_array_equal(r.q[0], read_encoder(BROKK_170, 0.65 * low + 0.35 * high))
+        moving = np.array([i == 4 if j == 1 else i < 4 for j in range(5)])
+        command = np.zeros(5)
+        for tick, (q, u) in enumerate(zip(r.q, r.u, strict=True)):
+            if tick % 33 == 0:  # 1.625 s are over after 32.5 ticks
+                level = 0.25 * LIMIT * np.where((q - low) / (high - low) < 1 / 3, 1, -1)
+                assert tick or (level < 0).all()
+            command = command + (0.05 + 0.25 * 0.55) * (level - command)
+            counts = np.rint(127 * (command + 0.25 * 0.06)) * moving
+            np.testing.assert_allclose(127 * u, counts, atol=1e-9)
+        assert (level > 0)[moving].any()
+    pose = [1.0, 0.5, 0.58, 1.71, 1.24]
+    same = task_log(BROKK_170, 2, 0.1, Share(0.25), pose)
+    assert all((r.q[0] == read_encoder(BROKK_170, np.array(pose))).all() for r in same.recordings)
+    pausing = task_log(BROKK_170, 1, 0.5, Share(0.9)).recordings[0]  # 0.15 of the levels are none
+    assert not pausing.u.any()
+
+
+@pytest.mark.parametrize(("kind", "pushed"), [("sine", 0), ("rich", 20)])
+def test_a_leg_and_its_way_back_by_hand(kind, pushed, monkeypatch):
+    """Full command up: q5 from amid its range or its stop to the stop, perhaps pushing, and back to rest."""
+    monkeypatch.setitem(EXCITATIONS, kind, lambda rng, machine, ticks: np.full(ticks, LIMIT))
+    high, start = BROKK_170.column("q_max")[Q5], np.array([1.0, 2.0])[: 1 if kind == "sine" else 2]
+    drawn = Share(np.array([0.5, 0.95]))  # of the range and an eighth more on either side
+    recorder, back, home = excitation._drive_legs(BROKK_170, np.full(len(start), Q5), kind, drawn, 240)
+    q, u = np.array(recorder.q), np.rint(127 * np.array(recorder.u))
+    middle = read_encoder(BROKK_170, (BROKK_170.column("q_min") + BROKK_170.column("q_max")) / 2)
+    assert (np.delete(q, Q5, -1) == np.delete(middle, Q5)).all()
+    assert not np.delete(u, Q5, -1).any()
+    for row, (angles, counts) in enumerate(zip(q[..., Q5].T, u[..., Q5].T, strict=True)):
+        met = np.flatnonzero(angles > high - 2 * BROKK_170.encoder_step)
+        turn = max(met[pushed], 34)  # after 13 samples at rest and more than a second
+        assert angles[0] == read_encoder(BROKK_170, start[row]) and back[row] == turn
+        come = turn + np.flatnonzero(np.abs(angles[turn:] - angles[0]) < 0.06)[0]
+        wanted = np.concatenate(
+            [np.zeros(13), np.full(turn - 13, 80), np.full(come - turn, -44), np.zeros(40)]
+        )
+        np.testing.assert_array_equal(counts[: len(wanted)], wanted)
+        assert home[row] == len(wanted) and not counts[len(wanted) :].any()
+    assert len(u) == home.max()
+    early = excitation._drive_legs(BROKK_170, np.array([Q5]), kind, Share(0.5), 20)[1]
+    assert early.tolist() == [33]  # its time is over before it meets a limit

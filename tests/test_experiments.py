@@ -8,16 +8,18 @@ import json
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 
 from benchmarks.rollout import random_net
-from brokk_min import chain, experiments, figures, jacobian, report, variations
+from brokk_min import chain, experiments, figures, jacobian, kinematics, report, variations
 from brokk_min.actuator import ActuatorNet, fingerprint, load_net, save_net
-from brokk_min.env import Measured, TaskConfig, measured, rollout, to_command
+from brokk_min.env import Measured, TaskConfig, Trace, measured, rollout, to_command
 from brokk_min.kinematics import joint_rates, tool_position
+from brokk_min.logs import velocity_of
 from brokk_min.machine import BROKK_170, Machine, read_encoder
 from brokk_min.metrics import metrics
 from brokk_min.plant import plant_reset, plant_step, speed_limits
@@ -401,3 +403,280 @@ def test_the_whole_chain_spends_what_fit_and_train_do_by_default():
 
     effort = experiments.Effort()
     assert (effort.fit_steps, effort.train_steps) == (FitConfig().steps, PPOConfig().total_steps)
+
+
+# --- the parts of the comparison, their inputs made up ----------------------------------------------------
+
+
+def made_up_trace(ticks: int, runs: int, seed: int = 0) -> Trace:
+    rng = np.random.default_rng(seed)
+    return Trace(
+        *(rng.normal(size=(ticks, runs, n)) for n in (5, 5, 5, 5, 3, 3)), rng.normal(size=(ticks, runs))
+    )
+
+
+def test_the_comparison_asks_its_parts_for_what_they_are_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seeds, starts by kind, lengths, and whose traces: each part returns what it was asked."""
+    starts, kinds = np.arange(20.0).reshape(4, 5), ["limits", "workspace", "extended", "workspace"]
+    runs = [{"start": i, "kind": kind} for i, kind in enumerate(kinds)]
+    traces = {(c, s): made_up_trace(6, 4, k) for k, (c, s) in enumerate(itertools.product("ab", "xy"))}
+    asked: dict[str, tuple[Any, ...]] = {}
+
+    def part(name: str, answer: Any) -> None:
+        monkeypatch.setattr(experiments, name, lambda *a: asked.setdefault(name, a) and answer)
+
+    part("scored_starts", starts)
+    part("start_kinds", kinds)
+    part("task_space", (runs, traces))
+    part("regret", (runs[:1], {"less": 1}, {"bound": 2}))
+    part("singular_case", ({"trace": 3}, {"claims": ["near", "close"]}))
+    part("robustness", {"nominal": 4})
+    part("tables", {"tables": 5})
+    part("summary", {"summary": 6})
+    part("judged", ["still", "slow", "turn", "track", "along z", "last"])
+    effort = replace(experiments.Effort(), starts=4, bound_starts=1, short_s=3.0)
+    controllers: Any = {"a": _Idle(), "b": _Idle()}
+    found, shown = experiments.comparison(BROKK_170, controllers, effort, 7)
+    every = [s.name for s in task_sequences(BROKK_170)]
+    assert asked["scored_starts"][:2] == (BROKK_170, 4) and asked["scored_starts"][3] == 9
+    assert [s.name for s in asked["scored_starts"][2]] == every
+    machine, who, sequences, where, seed = asked["task_space"]
+    assert (machine, who, [s.name for s in sequences], where is starts, seed) == (
+        BROKK_170,
+        controllers,
+        every,
+        True,
+        7,
+    )
+    machine, who, short, where, seed = asked["regret"]
+    assert (machine, who, where.tolist(), seed) == (BROKK_170, controllers, starts[1:2].tolist(), 7)
+    assert [(s.name, len(s.goals)) for s in short] == [("x", 60), ("y", 60), ("z", 60)]
+    machine, who, where, seconds, seed = asked["singular_case"]
+    assert (machine, who, where.tolist(), seconds, seed) == (
+        BROKK_170,
+        controllers,
+        starts[2:3].tolist(),
+        3.0,
+        7,
+    )
+    machine, who, shorter, where, seed = asked["robustness"]
+    assert (machine, who, where.tolist(), seed) == (BROKK_170, controllers, starts[[1, 3]].tolist(), 7)
+    assert (
+        shorter is short and asked["tables"] == (runs, [runs[1], runs[3]]) and asked["summary"] == (runs[:1],)
+    )
+    machine, who, scored, along, goals = asked["judged"]
+    assert (machine, who, scored, list(along)) == (BROKK_170, controllers, [runs[1], runs[3]], ["a", "b"])
+    np.testing.assert_array_equal(along["b"].q, traces["b", "x"].q[:, [1, 3]])
+    np.testing.assert_array_equal(along["b"].reward, traces["b", "x"].reward[:, [1, 3]])
+    np.testing.assert_array_equal(goals, task_sequences(BROKK_170)[0].goals)
+    assert found == {
+        "task_space": {"tables": 5}, "regret": {"summary": {"summary": 6}, "less_perfect_model": {"less": 1}},
+        "robustness": {"nominal": 4}, "singular": {"claims": ["near", "close"]},
+        "claims": ["still", "slow", "turn", "near", "close", "track", "along z", "last"],
+        "starts": starts.tolist(), "start_kinds": kinds,
+    }  # fmt: skip
+    assert shown == {"all": traces, "bound": {"bound": 2}, "singular": {"trace": 3}}
+
+
+def test_regret_is_against_the_bound_and_gains_dither_only_where_they_should(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    start = np.array([[1.5, 0.5, 0.58, 1.71, 1.24]])
+    found = experiments.bounds(BROKK_170, start)
+    assert list(found) == ["perfect_model", "perfect_model_no_dither"]
+    one, still = found.values()
+    assert still.dither == 0.0 != one.dither and (one.machine, still.machine) == (BROKK_170, BROKK_170)  # type: ignore[attr-defined]
+    rows = [
+        {"controller": c, "sequence": "x", "start": i, "kind": "workspace", "velocity_error_mean": e + i * i}
+        for c, e in (("mine", 3.0), ("perfect_model", 1.0))
+        for i in range(2)
+    ]
+    asked: list[Any] = []
+    monkeypatch.setattr(experiments, "task_space", lambda *a: asked.append(a) or (rows, {"trace": 1}))
+    mine: Any = {"mine": _Idle()}
+    runs, less, traces = experiments.regret(BROKK_170, mine, [], start, 5)
+    assert (runs, traces, asked[0][4]) == (rows, {"trace": 1}, 5) and asked[0][3] is start
+    assert list(asked[0][1]) == ["mine", "perfect_model", "perfect_model_no_dither"]
+    assert less == {"mine": {s: {"mean": 2.0, "low": 2.0, "high": 2.0} for s in ("x", "all")}}
+
+
+def test_a_log_of_driven_runs_by_hand() -> None:
+    trace = made_up_trace(30, 18)._replace(u=np.full((30, 18, 5), np.float32(0.1)))
+    traces = {("rl", "x"): trace, ("pid", "x"): trace, ("rl", "y"): made_up_trace(30, 2)}
+    log = experiments.driven_log(BROKK_170, traces, "rl")
+    names = [r.name for r in log.recordings]
+    assert names == [f"rl_x_{i:02d}" for i in range(16)] + ["rl_y_00", "rl_y_01"]
+    assert (log.joints, log.rate, log.velocity_logged) == (BROKK_170.names, 20.0, False)
+    third = log.recordings[3]
+    np.testing.assert_array_equal(third.q, trace.q_measured[:, 3])
+    assert third.u.dtype == float and np.allclose(third.u, 0.1)
+    np.testing.assert_allclose(third.q_dot, velocity_of(trace.q_measured[:, 3], 4, 20.0))
+
+
+def test_tables_keep_the_runs_that_count_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = [
+        {"controller": c, "sequence": s, "start": i, "kind": kind, "error": base + i + (kind == "limits") / 2}
+        for c, base in (("rl", 1.0), ("pid", 4.0))
+        for s in "xy"
+        for i, kind in enumerate(("workspace", "limits", "workspace"))
+    ]
+    scored = [row for row in rows if row["kind"] == "workspace"]
+    found = experiments.tables(rows, scored)
+    assert found["runs"] is rows and found["summary"]["pid"] == {s: {"error": 5.0} for s in ("x", "y", "all")}
+    limits = {"rl": {"error": 2.5}, "pid": {"error": 5.5}}
+    assert found["by_kind"] == {"workspace": {"rl": {"error": 2.0}, "pid": {"error": 5.0}}, "limits": limits}
+    assert found["rl_less"] == {
+        "error": {"pid": {s: {"mean": -3.0, "low": -3.0, "high": -3.0} for s in ("x", "y", "all")}}
+    }
+    low, high = found["intervals"]["rl"]["x"]["error"]
+    assert low == pytest.approx(2 - 12.7062, abs=1e-3) and high == pytest.approx(2 + 12.7062, abs=1e-3)
+
+
+def test_sentences_are_put_to_the_papers_baselines_and_to_the_stronger_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    net = net_of_driven_joints()
+    pids = experiments.baselines(BROKK_170, net)
+    asked: list[Any] = []
+
+    def said(name: str, count: int) -> Any:
+        def answer(*a: Any) -> Any:
+            asked.append((name, *a))
+            many = [
+                {"paper": f"{name} {i}", "numbers": {"n": len(asked)}, "unit": "m", "holds": None}
+                for i in range(count)
+            ]
+            return many if count > 1 else many[0]
+
+        return answer
+
+    for name, count in (("drift_claims", 2), ("direction_claim", 1), ("tracking_claims", 3)):
+        monkeypatch.setattr(experiments.claims, name, said(name, count))
+    along: Any = {name: f"trace of {name}" for name in pids}
+    goals = np.zeros((2, 3))
+    found = experiments.judged(BROKK_170, {"rl": _Idle(), **pids}, [{"run": 1}], along, goals)
+    assert [claim["paper"] for claim in found] == [
+        "drift_claims 0", "drift_claims 1", "direction_claim 0", *(f"tracking_claims {i}" for i in range(3)),
+    ]  # fmt: skip
+    assert [claim["numbers"]["n"] for claim in found] == [1, 1, 2, 3, 3, 3]
+    assert [claim["stronger"]["numbers"]["n"] for claim in found] == [4, 4, 5, 6, 6, 6]
+    assert asked[0] == ("drift_claims", [{"run": 1}], experiments.PAPERS)
+    assert asked[3][2] == experiments.STRONGER == asked[5][2]
+    for i, name in ((1, "jacobian_pid_k0.1"), (4, "jacobian_pid_ff")):
+        assert (
+            asked[i][:4] == ("direction_claim", BROKK_170, pids[name], f"trace of {name}")
+            and asked[i][4] is goals
+        )
+
+
+def test_damping_alone_is_compared_near_a_singularity() -> None:
+    """Half a second along what an upright arm can do least, of two baselines with the same gains."""
+    empty = experiments.singular_case(BROKK_170, {}, np.zeros((0, 5)), 1.0, 0)
+    assert empty == ({}, {"summary": {}, "claims": []})
+    start = np.array([[0.0, 1.139, 0.97, 2.804, 1.948], [1.0, 1.2, 0.9, 2.8, 1.9]])
+    pids = experiments.baselines(BROKK_170, net_of_driven_joints())
+    traces, found = experiments.singular_case(BROKK_170, {"rl": _Idle(), **pids}, start, 1.5, 3)
+    names = ("rl", "jacobian_pid_k0.1", "jacobian_pid_k0.05")
+    assert list(traces) == [(c, s) for c in names for s in ("least_half", "least_quarter")]
+    assert all(trace.q.shape == (30, 2, 5) for trace in traces.values())
+    np.testing.assert_array_equal(traces["rl", "least_half"].q[-1], start)
+    J = kinematics.jacobian(BROKK_170, start)
+    assert found["w0"] == jacobian.manipulability_threshold(BROKK_170)
+    np.testing.assert_allclose(found["manipulability"], np.sqrt(np.linalg.det(J @ J.swapaxes(-1, -2))))
+    np.testing.assert_allclose(
+        found["least"], [np.sqrt(np.linalg.eigvalsh(j @ j.T)[0]) for j in J], rtol=1e-6
+    )
+    assert list(found["summary"]) == list(names) and len(found["claims"]) == 3
+    assert found["summary"]["rl"]["all"]["velocity_error_mean"] == pytest.approx(0.075 * 10 / 30)
+
+
+def test_gains_are_written_by_name_and_tuning_is_apart_from_scoring(tmp_path: Path) -> None:
+    net = net_of_driven_joints()
+    pids = experiments.baselines(BROKK_170, net)
+    assert list(pids) == [*experiments.PAPERS, "jacobian_pid_ff", "jacobian_pid_ff_awake"]
+    assert [(c.k, c.awake, c.feedforward is not None) for c in pids.values()] == [
+        (0.1, False, False), (0.05, False, False), (0.1, False, True), (0.1, True, True),
+    ]  # fmt: skip
+    plain = experiments.plain_gains(pids)
+    wanted = {
+        "kp": (1.0, 0.2),
+        "ki": (8.0, 0.5),
+        "kd": (0.05, 0.02),
+        "feedback": (0.4, 0.1),
+        "ready": (0.015, 0.015),
+    }
+    for name, gains in plain.items():
+        assert {key: set(np.ravel(values).round(9)) for key, values in gains.items()} == {
+            key: {values["ff" in name]} for key, values in wanted.items()
+        }
+    assert experiments.tuning_set(experiments.Effort(tuning_runs=7), 3) == (7, 12.0, 1003)
+    experiments.write_json(tmp_path / "a.json", {"b": [0.1]})
+    assert (tmp_path / "a.json").read_text() == '{\n "b": [\n  0.1\n ]\n}\n'
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        experiments.write_json(tmp_path / "a.json", {"b": float("nan")})
+    about = experiments.meta(BROKK_170, 4)
+    assert about == {"brokk_min": "0.1.0", "machine": "brokk170", "seed": 4, "units": "m, m/s, s, rad"}
+
+
+def test_robustness_says_what_the_policy_has_less_than_others_on_each_machine(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[Any] = []
+    trace = made_up_trace(4, 2)._replace(u=np.zeros((4, 2, 5)))
+    full = trace._replace(u=np.where(np.arange(4)[:, None, None] < 1, 1.0, 0.0) * np.ones((4, 2, 5)))
+
+    def driven(plant: Machine, *a: Any, **more: Any) -> Any:
+        asked.append((plant, *a, more))
+        error = plant.delay
+        rows = [
+            {"controller": c, "sequence": "x", "start": i, "kind": "k", "velocity_error_mean": error + e + i}
+            for c, e in (("rl", 1.0), ("pid", 3.0))
+            for i in range(2)
+        ]
+        return rows, {("rl", "x"): trace, ("pid", "x"): full}
+
+    monkeypatch.setattr(experiments, "task_space", driven)
+    controllers: Any = {"rl": _Idle(), "pid": _Idle()}
+    short = experiments.shortened(BROKK_170, task_sequences(BROKK_170)[:1], 1.0)
+    found = experiments.robustness(BROKK_170, controllers, short, np.zeros((2, 5)), 9)
+    wanted = variations.variations(BROKK_170)
+    assert list(found) == list(wanted)
+    for (plant, sensor), call in zip(wanted.values(), asked, strict=True):
+        assert call[0] == plant and call[1:3] == (controllers, short) and call[4:] == (9, {"sensor": sensor})
+    late = found["delay +50 ms"]
+    assert late["rl"] == {
+        "mean": pytest.approx(1.59),  # two starts, 1.09 and 2.09: half of 12.7062 to either side
+        "low": pytest.approx(1.59 - 6.3531, abs=1e-3), "high": pytest.approx(1.59 + 6.3531, abs=1e-3),
+        "supply_demand": 0.0, "supply_limits": 0.0,
+    }  # fmt: skip
+    assert late["pid"]["rl_less"] == pytest.approx({"mean": -2.0, "low": -2.0, "high": -2.0})
+    assert late["pid"]["supply_demand"] == pytest.approx(
+        float(variations.supply_demand(BROKK_170, np.ones(5)))
+    )
+    assert late["pid"]["supply_demand"] > 1 and late["pid"]["supply_limits"] == 0.25
+    alone: Any = {"pid": _Idle()}
+    assert (
+        "rl_less"
+        not in experiments.robustness(BROKK_170, alone, short, np.zeros((2, 5)), 9)["nominal"]["pid"]
+    )
+
+
+def test_variations_by_hand() -> None:
+    found = {name: plant for name, (plant, _) in variations.variations(BROKK_170).items()}
+    assert {name: (m.pump_flow / BROKK_170.pump_flow, m.dead_zone, m.delay) for name, m in found.items()} == {
+        name: pytest.approx(
+            (
+                {"supply flow -20 %": 0.8, "supply flow -70 %": 0.3}.get(name, 1.0),
+                {"dead zone 5 %": 0.05, "dead zone 10 %": 0.10}.get(name, 0.07),
+                {"delay +25 ms": 0.065, "delay +50 ms": 0.09}.get(name, 0.04),
+            )
+        )
+        for name in found
+    }
+    for name, share in (("valve gain -20 %", 0.8), ("valve gain +20 %", 1.2)):
+        for speed in ("speed_positive", "speed_negative"):
+            np.testing.assert_allclose(found[name].column(speed), share * BROKK_170.column(speed))
+    sensors = {name: sensor for name, (_, sensor) in variations.variations(BROKK_170).items()}
+    assert [name for name, sensor in sensors.items() if sensor is not variations.exact] == [
+        "encoder noise of a count", "one sample in 20 lost",
+    ]  # fmt: skip

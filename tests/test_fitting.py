@@ -11,7 +11,7 @@ import torch
 from helpers_machines import line
 
 from brokk_min import fitting
-from brokk_min.actuator import rest_history
+from brokk_min.actuator import rest_history, valve_scale
 from brokk_min.fitting import FitConfig, fit
 from brokk_min.logs import Log, Recording, velocity_of
 from brokk_min.scores import score
@@ -203,3 +203,69 @@ def test_a_joint_that_stands_still_is_refused_by_name():
     pairs = (np.concatenate([column, still], axis=1) for column in both)
     with pytest.raises(ValueError, match="joint stick"):
         fit(Log(("boom", "stick"), (Recording("x", *pairs),)), FitConfig(steps=1), 0, 4)
+
+
+def test_nets_say_how_they_were_fitted():
+    log, config = simple_system(0, 2, 40), FitConfig(steps=0, history=5, dead_zone=0.25)
+    net = fit(log, config, 7, 3, "toy")
+    assert (net.joints, net.history, net.rate, net.velocity_samples) == (("boom", "stick"), 5, 20.0, 3)
+    assert (net.machine, net.seed, net.dead_zone, net.settings) == ("toy", 7, 0.25, vars(config))
+    assert not net.velocity_logged and fit(log, FitConfig(steps=0), 7, 3).machine == ""
+    assert fit(log, FitConfig(steps=0), 7, 3).dead_zone == 0.0
+    commands = np.concatenate([valve_scale(r.u, 0.25)[4:-1] for r in log.recordings])
+    np.testing.assert_allclose(net.input_mean[:, 10:], np.tile(commands.mean(axis=0)[:, None], 5), rtol=1e-6)
+    np.testing.assert_allclose(net.input_scale[:, 14], commands.std(axis=0), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("rollout", "logged"), [(8, False), (1, True)])
+def test_rates_and_batches_of_a_fit_by_hand(rollout, logged, monkeypatch):
+    """Of 20 steps 13 to errors of one tick, along half a cosine, 7 to free runs, from a quarter of it."""
+    rates, asked, inner = [], [], torch.optim.Adam.step
+
+    def step(self, *rest):
+        rates.append(self.param_groups[0]["lr"])
+        return inner(self, *rest)
+
+    def loss(training, config, weights, tapes, at, ticks, estimator, generator):
+        ends = training.far_ends if ticks > 1 else training.ends
+        for j, chosen in enumerate(at.numpy() - len(training.target) * np.arange(2)[:, None]):
+            assert set(chosen.tolist()) <= set(ends[j].tolist())
+        assert [tape.shape for tape in tapes] == [(3, 2 * 240), (2 * 240,)]
+        assert [tuple(w.shape) for w in weights] == [(2, 39, 6), (2, 6), (2, 6, 6), (2, 6), (2, 6, 1), (2, 1)]
+        asked.append((ticks, at.shape[1], estimator))
+        return sum((weight**2).sum() for weight in weights)
+
+    monkeypatch.setattr(torch.optim.Adam, "step", step)
+    monkeypatch.setattr(fitting, "_rollout_loss", loss)
+    config = FitConfig(steps=20, batch_size=30, learning_rate=0.01, rollout=rollout, hidden=6)
+    fit(simple_system(0, 4, 60, logged), config, 0, 4)
+    turn, estimator = (13, 4) if rollout > 1 else (20, None)
+    wanted = [0.005 * (1 + np.cos(np.pi * k / turn)) for k in range(turn)]
+    wanted += [0.00125 * (1 + np.cos(np.pi * k / 7)) for k in range(20 - turn)]
+    np.testing.assert_allclose(rates, wanted)
+    assert asked == [(1, 30, estimator)] * turn + [(8, 8, estimator)] * (20 - turn)
+
+
+def test_noise_is_on_velocities_of_each_sample_and_of_each_window_in_their_own_units(monkeypatch):
+    """Every draw 1: as if all velocities were 2 * 0.1 of their deviations higher."""
+    training, generator = fitting.training_set(simple_system(0, 2, 60), 13), torch.Generator()
+    net = fit(simple_system(0, 2, 60), FitConfig(steps=0), 0, 4)
+    weights, at = [torch.tensor(w) for w in net.weights], torch.tensor([[20, 30, 90], [140, 150, 200]])
+    shapes = []
+
+    def ones(*shape, generator):
+        shapes.append(shape)
+        return torch.ones(shape)
+
+    def loss(shift, noise):
+        series = training.series.copy()
+        series[1] += shift * training.input_scale[:, 13:14]
+        tapes = [torch.tensor(a).float().flatten(-2) for a in (series, training.target.T)]
+        config = FitConfig(noise=noise)
+        return float(fitting._rollout_loss(training, config, weights, tapes, at, 1, 4, generator))
+
+    monkeypatch.setattr(torch, "randn", ones)
+    assert (
+        loss(0.0, 0.1) == pytest.approx(loss(0.2, 0.0), rel=1e-5) != pytest.approx(loss(0.0, 0.0), rel=1e-3)
+    )
+    assert shapes == [(2, 3, 13), (2, 3, 1)]

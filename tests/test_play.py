@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import struct
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -23,8 +25,10 @@ from test_hw import BASELINE, Virtual
 from test_view import boxes_of_words
 
 from benchmarks.bus import random_policy
-from brokk_min import experiments, looks, play, remote, replay, ticks, tracing, view
+from brokk_min import experiments, looks, play, remote, replay, ticks, tracing, view, wishes
 from brokk_min.__main__ import main
+from brokk_min.bus import OPERATOR, SYNC, TPDO1, WISH, Frame
+from brokk_min.gate import encoder_raw
 from brokk_min.kinematics import tool_position
 from brokk_min.machine import BROKK_170
 from brokk_min.options import machine_from
@@ -231,6 +235,9 @@ def test_a_mailbox_gives_the_newest_values_or_none() -> None:
     np.testing.assert_array_equal(box.read(), [4.0, 5.0, 6.0])
     np.frombuffer(box.raw)[-1] += 1  # as it is while the next values are being written
     assert box.read() is None
+    first = Mailbox(2)
+    first.write([-1.0, 0.0])
+    np.testing.assert_array_equal(first.read(), [-1.0, 0.0])
 
 
 def test_what_is_known_survives_the_mailbox() -> None:
@@ -240,6 +247,47 @@ def test_what_is_known_survives_the_mailbox() -> None:
     assert back._replace(q=0, q_dot=0, u=0, v_goal=0) == known._replace(q=0, q_dot=0, u=0, v_goal=0)
     for name in ("q", "q_dot", "u", "v_goal"):
         np.testing.assert_array_equal(getattr(back, name), getattr(known, name))
+
+
+def test_ticks_of_a_bus_by_hand() -> None:
+    """Angles are known once every encoder spoke; goals count while driving; other frames say nothing."""
+    heard = ticks.Ticks(BROKK_170)
+    wish, nonsense = wishes.Wish((0.1, 0.0, -0.2), enable=True).pack(), bytes([80, 0, 0, 0, 0, 0, 0, 1])
+    assert heard.hear(Frame(0.0, WISH, wish, channel=OPERATOR)) is None
+    assert heard.hear(Frame(0.0, WISH, wishes.Wish((0.3, 0.0, 0.0)).pack(), channel="can0")) is None
+    heard.hear(Frame(0.0, BROKK_170.valve_frame_id + 1, nonsense))
+    heard.hear(Frame(0.0, BROKK_170.valve_frame_id, nonsense[:7]))
+    first = heard.hear(Frame(0.0, SYNC, b""))
+    assert first is not None and (first.tick, first.driving) == (0, False)
+    assert np.isnan(first.q).all() and np.isnan(first.q_dot).all()
+    assert not first.u.any() and not first.v_goal.any()
+    heard.hear(Frame(0.05, BROKK_170.valve_frame_id, nonsense))
+    for tick, q1 in ((1, 0.0), (2, 0.1)):
+        angles = np.array([q1, *START[1:]])
+        raw = encoder_raw(BROKK_170, np.rint(angles / BROKK_170.encoder_step).astype(int))
+        for joint, count in zip(BROKK_170.joints, raw.tolist(), strict=True):
+            heard.hear(Frame(0.05, TPDO1 + joint.encoder_node, struct.pack("<I", count)))
+        known = heard.hear(Frame(0.05, SYNC, b""))
+        assert known is not None and (known.tick, known.driving) == (tick, True)
+        np.testing.assert_allclose(known.q, angles, atol=BROKK_170.encoder_step / 2)
+        np.testing.assert_array_equal(known.v_goal, [0.1, 0.0, -0.2])
+        np.testing.assert_allclose(known.u * 127, [80, 0, 0, 0, 0], atol=1e-9)
+    # 0.1 rad in the last of four samples: the slope of a line through them is 0.3 of it a sample
+    np.testing.assert_allclose(known.q_dot, [0.3 * 0.1 * 20, 0, 0, 0, 0], atol=0.3 * 20 * 1e-3)
+
+
+def test_levers_are_repeated_for_each_observation_and_another_translator_starts_as_many() -> None:
+    levers, begun = Levers(BROKK_170), []
+    levers.levers = np.array([1.0, 0.0, -1.0, 0.0])
+    u, _ = levers(np.zeros((3, 7)), None)
+    np.testing.assert_allclose(u * 127, np.tile([80, 0, 0, -80, 0], (3, 1)), atol=1e-9)
+    push = SimpleNamespace(start=begun.append)
+    chosen = Chosen([levers, lambda seen, memory: (seen, memory)])
+    memory = chosen.start(3)
+    assert memory == (0, None) and chosen(np.zeros((3, 7)), memory)[1] == (0, None)
+    chosen.controllers[1].start = push.start  # type: ignore[attr-defined]
+    chosen.mode = 1
+    assert chosen(np.ones((3, 7)), memory)[1] == (1, None) and begun == [3]
 
 
 class Remoted:
@@ -309,6 +357,28 @@ def test_a_loop_whose_window_died_stops(monkeypatch: pytest.MonkeyPatch) -> None
     assert operator(True, True) == play.wishes.Wish(alive=False, stop=True)
     asks.write([9.9, 0, 1, 1, 0, 0.1, 0, 0, 0, 0, 0, 0])
     assert operator(True, True) == play.wishes.Wish((0.1, 0.0, 0.0), enable=True)
+    asks.write([10.0, 0, 0, 1, 1, 0, 0, 0, 0, 0, 0, 0])
+    assert operator(True, True) == play.wishes.Wish(stop=True)
+
+
+def test_the_loops_process_drives_a_machine_of_its_own_until_it_is_told_to_stop(tmp_path: Path) -> None:
+    """In this process: the window asks to stop at once; what the loop knew of its tick and the log remain."""
+    asks, tells, said = Mailbox(12), Mailbox(24), list[str]()
+    asks.write([time.monotonic() + 100, 1, 0, 1, 1, 0.1, 0, 0, 0, 0, 0, 0])
+    where = remote.Where(log=tmp_path / "run.log", start=tuple(START))
+    modes: list[int] = []
+    push = SimpleNamespace(start=modes.append)
+    remote.control(BROKK_170, [push], where, asks, tells)
+    told = tells.read()
+    assert told is not None and (tmp_path / "run.log").stat().st_size > 0
+    known = ticks.unpack_known(BROKK_170, told)
+    np.testing.assert_allclose(known.q, START, atol=BROKK_170.encoder_step)
+    assert known.mode == 1 and not known.driving and known.v_goal.tolist() == [0.1, 0, 0]
+    assert not [thread for thread in threading.enumerate() if "serve" in thread.name]
+    pipe = SimpleNamespace(send=said.append)
+    remote._control_process(pipe, BROKK_170, [], remote.Where("nonsense", "bus"), asks, tells)
+    remote._control_process(pipe, None, [], where, asks, tells)
+    assert said[0].startswith("nonsense bus: expected a CAN bus") and said[1].startswith("AttributeError: ")
 
 
 def test_a_whole_traced_rectangle_is_scored() -> None:
@@ -370,6 +440,26 @@ def test_distance_by_hand() -> None:
     np.testing.assert_allclose(tracing.distance(line, p), [0.2, 5.0, 0.2, 0.0], atol=1e-12)
 
 
+def test_lines_to_trace_by_hand() -> None:
+    """In shares of the reach: a rectangle of 0.1 by 0.16, a circle of radius 0.06, axes of 0.14."""
+    lines, reach = tracing.task_lines(BROKK_170), looks.extent(BROKK_170).reach
+    assert list(lines) == ["rectangle", "circle", "line x", "line y", "line z"]
+    square = lines["rectangle"] / reach
+    assert np.diff(square, axis=0).any(axis=1).all()
+    corners = square[[0, *(np.flatnonzero(np.abs(np.diff(square, n=2, axis=0)).max(axis=1) > 1e-9) + 1), -1]]
+    np.testing.assert_allclose(
+        corners, [[0, 0, 0], [0, 0.16, 0], [0.1, 0.16, 0], [0.1, 0, 0], [0, 0, 0]], atol=1e-9
+    )
+    circle = lines["circle"] / reach
+    np.testing.assert_allclose(np.hypot(circle[:, 0], circle[:, 2] - 0.06), 0.06, atol=1e-9)
+    assert not circle[:, 1].any() and len(circle) == 60 and abs(circle[-1]).max() < 1e-9
+    assert circle[15, 0] > 0.059 and circle[30, 2] > 0.119  # outward, then up
+    for i, axis in enumerate("xyz"):
+        np.testing.assert_allclose(lines[f"line {axis}"][-1], 0.14 * reach * np.eye(3)[i])
+        steps = np.diff(lines[f"line {axis}"], axis=0)[:, i]
+        np.testing.assert_allclose(steps, 0.14 * reach / np.ceil(0.14 * reach / 0.05))
+
+
 @pytest.mark.parametrize("task", list(tracing.task_lines(BROKK_170)))
 def test_every_line_can_be_traced_from_the_start(task: str) -> None:
     line = tracing.task_lines(BROKK_170)[task]
@@ -387,6 +477,10 @@ def test_attempts_are_kept_and_tabled(tmp_path: Path) -> None:
     tracing.write_attempts(path, rows)
     assert path.read_text().splitlines()[0] == "when,task,mode,seconds,mean,max,valve_travel"
     assert tracing.read_attempts(path) == rows
+    tracing.write_attempts(path, [rows[0]._replace(mean=1 / 3, valve_travel=123456.789)])
+    last = b"2026-01-01T00:00:00,circle,rl,10,0.333333,0.02,123457\n"
+    assert path.read_bytes().endswith(b"valve_travel\n" + last)
+    tracing.write_attempts(path, rows)
     assert tracing.attempts_table(rows, "circle") == [
         "mean of 2 by rl: 10.5 s, off by 0.010 m, at most 0.020 m, valves 5",
         "mean of 1 by levers: 40.0 s, off by 0.050 m, at most 0.100 m, valves 10",
@@ -460,7 +554,9 @@ def test_a_line_is_done_when_all_its_points_were_passed_in_order() -> None:
         q = np.array([np.arcsin(y / radius), *START[1:]])
         finished = work.follow(rest._replace(tick=tick, q=q, u=open_))
         assert work.passed == done and finished == (done == 3)
-    assert work.score("levers").seconds == pytest.approx(0.5)
+    score = work.score("levers")
+    assert score.seconds == pytest.approx(0.5)
+    assert abs(time.mktime(time.strptime(score.when, "%Y-%m-%dT%H:%M:%S")) - time.time()) < 60
 
 
 # --- the window ---------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -165,13 +166,18 @@ def test_the_gap_is_between_tools_where_the_arms_end(monkeypatch):
         return seen["q"]
 
     still = lambda q, u: np.repeat(q[None], len(u) + 1, axis=0)  # noqa: E731
-    monkeypatch.setattr(preliminary, "movers", lambda *_: {"machine": watched, "nets": still})
-    gap = preliminary.sim_to_real(BROKK_170, random_net(np.random.default_rng(0)), 0)
+    net = random_net(np.random.default_rng(0))
+    monkeypatch.setattr(
+        preliminary, "movers", lambda *a: {"machine": watched, "nets": still} if a == (BROKK_170, net) else {}
+    )
+    gap = preliminary.sim_to_real(BROKK_170, net, 0)
     np.testing.assert_allclose(gap.q, seen["q"][0] - seen["q"][1:], atol=1e-12)
     from brokk_min.kinematics import tool_position
 
     p = tool_position(BROKK_170, seen["q"])
     np.testing.assert_allclose(gap.p_tool, p[0] - p[1:], atol=1e-12)
+    np.testing.assert_allclose(gap.q_dot, -20 * np.diff(seen["q"], axis=0), atol=1e-12)
+    np.testing.assert_allclose(gap.v_tool, -20 * np.diff(p, axis=0), atol=1e-12)
 
 
 def test_the_papers_recipe_is_sines_without_ways_back_and_errors_of_one_step(monkeypatch):
@@ -403,3 +409,202 @@ def test_tool_errors_by_hand(monkeypatch):
     monkeypatch.setattr(scores, "run_errors", error)
     errors = trust.tool_errors(BROKK_170, random_net(np.random.default_rng(0)), test)
     assert errors == {"1": pytest.approx(0.0305, abs=2e-4), "5": pytest.approx(0.1525, abs=1e-3)}
+
+
+# --- numbers and figures by hand ------------------------------------------------------------------------
+
+
+def made_up_gap() -> preliminary.Gap:
+    """Two ticks, three runs; only the first run counts for joints, run k is off by k + 1 as much."""
+    size = np.arange(1, 4)[:, None]
+    q = np.array([0.1, -0.3])[:, None, None] * size * np.array([1.0, 9, 2, 3, 4])
+    p = np.array([0.3, 0.5])[:, None, None] * size * np.array([0.6, 0.8, 0.0])
+    return preliminary.Gap(q, 2 * q, p, 2 * p)
+
+
+def test_numbers_of_a_gap_by_hand():
+    found = preliminary._gap_numbers(BROKK_170, made_up_gap())
+    assert found["tool"] == {
+        "position_error_mean": pytest.approx(0.4),
+        "velocity_rmse": pytest.approx(2 * np.sqrt((0.09 + 0.25) / 2)),
+    }
+    spread = {"median": pytest.approx(0.8), "max": pytest.approx(1.2), "runs": 3}
+    assert found["tool_position_error_mean_of_runs"] == spread
+    assert list(found["joints"]) == ["q1", "q3", "q4", "q5"]
+    assert found["joints"]["q4"] == {
+        "velocity_rmse": pytest.approx(2 * 3 * np.sqrt((0.01 + 0.09) / 2)),
+        "position_error_mean": pytest.approx(3 * 0.2),
+        "position_error_max": pytest.approx(3 * 0.3),
+    }
+
+
+def test_sweeps_are_compared_by_their_peaks_and_between_their_outer_twentieths():
+    q = np.linspace(0.0, 1.0, 201)
+    bent = np.where((q < 0.03) | (q > 0.97), 7.0, 0.3)  # nothing of that counts
+    numbers = preliminary._sweep_numbers(np.array([q, -0.5 + 0 * q]), np.array([q, bent]))
+    assert numbers == {"machine_peak": 0.5, "nets_peak": 7.0, "difference_rms": pytest.approx(0.8)}
+    steep = np.array([q, np.where(np.abs(q - 0.5) < 0.4251, 0.3, 7.0)])  # but from 0.06 to 0.94
+    assert preliminary._sweep_numbers(np.array([q, 0.3 + 0 * q]), steep)["difference_rms"] > 0.1
+
+
+def test_the_tests_are_those_of_the_last_driven_joint_at_five_eighths_and_all_of_the_limit():
+    seen = []
+
+    def move(q: np.ndarray, u: np.ndarray) -> np.ndarray:
+        seen.append((q, u))
+        return constant_mover(0.25, 0.5, 0)(q, u)
+
+    tests = preliminary.preliminary_tests(BROKK_170, move)
+    assert list(tests.sweeps) == ["u = 50", "u = 80", "u = 175", "u = 205"]
+    q, u = seen[0]
+    assert u.shape == (800, 5, 5) and (u == u[0]).all()
+    np.testing.assert_allclose(
+        u[0] * 127, [[0, 0, 0, 0, c] for c in (50, 80, -80, -50)] + [[-80, 0, -80, 80, 80]]
+    )
+    np.testing.assert_array_equal(q[:, 4], [LOW[4], LOW[4], HIGH[4], HIGH[4], LOW[4]])
+    np.testing.assert_allclose(q[:, :4], np.tile(((LOW + HIGH) / 2)[:4], (5, 1)))
+    for name, speed in zip(tests.sweeps, (0.25, 0.25, -0.5, -0.5), strict=True):
+        angle, velocity = tests.sweeps[name]
+        np.testing.assert_allclose(velocity, speed)
+        assert angle[0] == pytest.approx((LOW[4] if speed > 0 else HIGH[4]) + speed / 20)
+    assert list(tests.coupling) == ["alone", "with the others"]
+    np.testing.assert_array_equal(tests.coupling["alone"], tests.sweeps["u = 80"])
+    q, u = seen[1]
+    assert tests.angles.shape == (61, 2, 2, 5, 5) and u.shape == (60, 2, 2, 5, 5)
+    assert u[0, 1, 0, 4, 4] * 127 == pytest.approx((80 + 0.07 * 127) / 2) and not u[:30, 0].any()
+    np.testing.assert_allclose(u[30:, :, 1, 2, 2] * 127, -80)
+
+
+def test_figures_show_machine_above_nets_and_what_nets_are_off(monkeypatch):
+    up, slow = constant_mover(0.25, 0.5, 2), constant_mover(0.2, 0.4, 4)
+
+    def only_q5(move):
+        return lambda q, u: np.where(np.arange(5) == 4, move(q, u), q)
+
+    net = random_net(np.random.default_rng(0))
+    both = {"machine": only_q5(up), "nets": only_q5(slow)}
+    monkeypatch.setattr(preliminary, "movers", lambda *a: both if a == (BROKK_170, net) else {})
+    monkeypatch.setattr(preliminary, "plot_panels", lambda rows: rows)
+    monkeypatch.setattr(
+        preliminary, "sim_to_real", lambda *a: made_up_gap() if a == (BROKK_170, net, 7) else None
+    )
+    figures = preliminary.plots(BROKK_170, net, 7)
+    assert list(figures) == ["preliminary", "sim_to_real"]
+    for of, row, late, speed in zip(
+        ("machine", "nets"), figures["preliminary"], (2, 4), (0.25, 0.2), strict=True
+    ):
+        kinds = ("range and direction", "coupling", "past movement")
+        assert [panel.title for panel in row] == [f"{of}: {kind}" for kind in kinds]
+        assert [(p.xlabel, p.ylabel) for p in row] == [("q5 [rad]", "velocity q5 [rad/s]")] * 2 + [
+            ("time after the step [s]", "velocity q5 [rad/s]")
+        ]
+        assert len(row[0].curves) == 4 and len(row[1].curves) == 2
+        time, velocity = row[2].curves["from idle"]
+        np.testing.assert_allclose(time, 0.05 * (np.arange(60) - 29.5))
+        np.testing.assert_allclose(velocity, np.where(np.arange(60) < 30 + late, 0, speed), atol=1e-9)
+        np.testing.assert_allclose(row[2].curves["while moving"][1][late:], speed)
+    (tool_v, tool_p), (q_dot, q) = figures["sim_to_real"]
+    gap = made_up_gap()
+    for panel, values, label in (
+        (tool_v, gap.v_tool, "tool velocity [m/s]"), (tool_p, gap.p_tool, "tool position [m]"),
+        (q_dot, gap.q_dot[..., [0, 2, 3, 4]], "joint velocity [rad/s]"),
+        (q, gap.q[..., [0, 2, 3, 4]], "joint angle [rad]"),
+    ):  # fmt: skip
+        assert (panel.title, panel.xlabel, panel.ylabel) == ("nets - machine", "time [s]", label)
+        assert list(panel.curves) == (["x", "y", "z"] if "tool" in label else ["q1", "q3", "q4", "q5"])
+        for (time, curve), column in zip(panel.curves.values(), values[:, 0].T, strict=True):
+            np.testing.assert_allclose(time, [0.05, 0.1])
+            np.testing.assert_array_equal(curve, column)
+
+
+def test_a_mover_of_nets_leaves_the_locked_joints_where_they_are():
+    net = random_net(np.random.default_rng(0))
+    q, u = np.tile((LOW + HIGH) / 2, (2, 1)), np.full((3, 2, 5), 0.5)
+    moved = preliminary.driven_mover(BROKK_170, net)(q, u)
+    driven = preliminary.net_mover(net.select(["q1", "q3", "q4", "q5"]))(
+        q[:, [0, 2, 3, 4]], u[..., [0, 2, 3, 4]]
+    )
+    assert moved.shape == (4, 2, 5) and (moved[..., 1] == q[0, 1]).all()
+    np.testing.assert_array_equal(moved[..., [0, 2, 3, 4]], driven)
+    both = preliminary.movers(BROKK_170, net)
+    assert list(both) == ["machine", "nets"]
+    np.testing.assert_array_equal(both["nets"](q, u), moved)
+    np.testing.assert_array_equal(both["machine"](q, u), preliminary.plant_mover(BROKK_170)(q, u))
+
+
+def test_what_is_held_against_the_training_by_hand():
+    ramp = np.arange(8.0)
+    found = trust._signals(taped(ramp**2, ramp / 10), 3)
+    assert {kind: values[0].tolist() for kind, values in found.items()} == {
+        "command": [9, 16, 25, 36, 49],
+        "change of command": [5, 7, 9, 11, 13],
+        "mean command": pytest.approx([14 / 3, 29 / 3, 50 / 3, 77 / 3, 110 / 3]),
+        "angle": pytest.approx([0.3, 0.4, 0.5, 0.6, 0.7]),
+    }
+    ramp = np.concatenate([np.zeros(12), np.linspace(0, 1, 1001)])  # the first history is left out
+    known = taped(ramp, 2 + 2 * ramp)
+    for beyond, share in ((0.0005, 0.0), (0.0015, 0.5)):  # a fiftieth of 0.001 to 0.999 is let pass
+        edge = np.array([*np.tile([-0.018, 1.018], 6), *np.tile([-0.018 - beyond, 0.5], 30)])
+        outside = trust.outside_training(known, taped(edge, 3 + 0 * edge), 12)
+        assert outside["command"][0] == share, beyond
+        high = np.array([*np.tile([0.5, 0.5], 6), *np.tile([1.018 + beyond, 0.5], 30)])
+        assert trust.outside_training(known, taped(high, 3 + 0 * high), 12)["command"][0] == share
+
+
+def test_the_judge_puts_its_parts_together(monkeypatch):
+    net, log, test = SimpleNamespace(history=5), linear_log(0), linear_log(1)
+    asked = {}
+
+    def part(module, name, answer):
+        monkeypatch.setattr(module, name, lambda *a: asked.setdefault(name, []).append(a) or answer(*a))
+
+    free = {"1": {"velocity_rmse": 0.2}, "5": {"velocity_rmse": 0.1}}
+    of_net, of_floor = (
+        {"a": {"free_run": free}},
+        {"a": {"free_run": {k: {"velocity_rmse": 0.15} for k in free}}},
+    )
+    part(fitting, "fit_linear", lambda *a: "floor")
+    part(scores, "score", lambda model, log: of_floor if model == "floor" else of_net)
+    part(trust, "creep", lambda *a: np.array([0.25]))
+    part(trust, "outside_training", lambda *a: {"angle": np.array([0.02]), "command": np.array([0.031])})
+    part(trust, "_times", lambda *a: {"response_time": {"a": 1}, "machine_response_time": {"a": 2}})
+    part(trust, "tool_errors", lambda *a: {"1": 0.5})
+    verdict = trust.judge(net, log, test, BROKK_170)
+    assert asked["_times"] == [(net, log, BROKK_170)] and asked["tool_errors"] == [(BROKK_170, net, test)]
+    assert asked["score"] == [(net, test), ("floor", test)] and asked["fit_linear"] == [(net, log)]
+    assert asked["outside_training"] == [(log, test, 5)] and asked["creep"] == [(net,)]
+    assert verdict["joints"]["a"] == {
+        "free_run": free, "linear": of_floor["a"], "creep": 0.25,
+        "response_time": 1, "machine_response_time": 2, "outside": {"angle": 0.02, "command": 0.031},
+    }  # fmt: skip
+    assert verdict["tool"] == {"1": 0.5} and verdict["warnings"] == [
+        "a: a free run of 1 s is off by 0.2000 rad/s, a linear model only by 0.1500: the net is no better",
+        "a: command outside the training's range in 3% of the test",
+    ]
+    assert trust.judge(net, log, test)["tool"] == {} and len(asked["tool_errors"]) == 1
+
+
+def test_response_times_are_asked_for_at_the_largest_command_of_the_log(monkeypatch):
+    net, asked = SimpleNamespace(history=5, rate=20.0, q_low=object(), q_high=object(), joints=("a",)), []
+    monkeypatch.setattr(trust, "net_mover", lambda n: "nets")
+    monkeypatch.setattr(trust, "plant_mover", lambda m: "plant" if m is BROKK_170 else None)
+    monkeypatch.setattr(trust, "step_commands", lambda *a: asked.append(a) or "before")
+    monkeypatch.setattr(trust, "steps", lambda *a: asked.append(a) or a[0])
+    monkeypatch.setattr(trust, "response_times", lambda angles, rate: (angles, rate))
+    monkeypatch.setattr(trust, "named_times", lambda times, joints: (*times, joints))
+    log = taped(np.array([0.1, -0.7, 0.3]))
+    found = trust._times(
+        net, log._replace(recordings=(*log.recordings, *taped(np.array([0.2, 0.6])).recordings)), BROKK_170
+    )
+    assert found == {
+        "response_time": ("nets", 20.0, ("a",)),
+        "machine_response_time": ("plant", 20.0, ("a",)),
+    }
+    for call, mover in zip(asked, ("nets", "nets", "plant"), strict=True):
+        assert call[0] == mover and (call[1] is net.q_low, call[2] is net.q_high) == (True, True)
+        assert call[3].tolist() == [0.7] and call[-1] == 30  # 1.5 s
+    assert asked[1][4] == asked[2][4] == "before"
+    assert (
+        list(trust._times(SimpleNamespace(**vars(net) | {"history": 20}), log, None)) == ["response_time"]
+        and asked[-1][-1] == 40
+    )

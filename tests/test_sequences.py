@@ -10,8 +10,9 @@ import pytest
 
 from brokk_min import sequences
 from brokk_min.env import TaskConfig
-from brokk_min.kinematics import jacobian, lowest_point
-from brokk_min.machine import BROKK_170
+from brokk_min.kinematics import jacobian, lowest_point, tool_position
+from brokk_min.machine import BROKK_170, Machine
+from brokk_min.plant import speed_limits
 
 
 def test_the_starts_of_the_package_are_of_all_kinds_and_not_the_tuning_starts() -> None:
@@ -206,3 +207,135 @@ def test_goals_for_all_starts_or_each() -> None:
     np.testing.assert_array_equal(sequences.Commands("each", goals).of_each(2), goals)
     one = sequences.Commands("one", goals[:, 0]).of_each(3)
     np.testing.assert_array_equal(one, np.stack([goals[:, 0]] * 3, axis=1))
+
+
+def test_directions_and_names_of_the_sequences() -> None:
+    found = {s.name: s.goals for s in sequences.task_sequences(BROKK_170)}
+    assert list(found)[3:] == ["diagonal_flat", "diagonal_rise", "circle", "rectangle", "stop_and_go", "slow"]
+    np.testing.assert_allclose(found["diagonal_flat"][30], 0.2 * np.array([1, 1, 0]) / 2**0.5)
+    np.testing.assert_allclose(found["diagonal_rise"][30], 0.2 * np.array([1, -1, 1]) / 3**0.5)
+    np.testing.assert_allclose(found["circle"][[20, 100]], [[0.15, 0, 0], [0, 0, 0.15]], atol=1e-12)
+    least = sequences.least_motion(BROKK_170, np.array([[0.0, 1.139, 0.97, 2.804, 1.948]]))
+    assert [s.name for s in least] == ["least_half", "least_quarter"]
+
+
+def test_margins_of_what_is_feasible_by_hand() -> None:
+    """Joints 0.05 rad and the arm 0.1 m off their ends, driven joints below 0.9 of their speed."""
+    ordinary, still = np.array([0.0, 0.5, 0.58, 1.71, 1.24]), np.zeros((2, 1, 3))
+    low, high = BROKK_170.column("q_min"), BROKK_170.column("q_max")
+
+    def can(start: np.ndarray, goals: np.ndarray = still, machine: Machine = BROKK_170) -> bool:
+        return bool(sequences.feasible(machine, start[None], goals)[0])
+
+    for joint in BROKK_170.driven:
+        for end, inward in ((low, 1), (high, -1)):
+            near, far = ordinary.copy(), ordinary.copy()
+            near[joint], far[joint] = end[joint] + inward * 0.049, end[joint] + inward * 0.051
+            clear = lowest_point(BROKK_170, far) > 0.1
+            assert not can(near) and can(far) == clear, joint
+    lowest = float(lowest_point(BROKK_170, ordinary))
+    for ground, good in ((lowest - 0.101, True), (lowest - 0.099, False)):
+        assert can(ordinary, machine=replace(BROKK_170, ground=ground)) == good
+    radius = np.hypot(*tool_position(BROKK_170, ordinary)[:2])
+    for way, limit in zip((-1, 1), speed_limits(BROKK_170, ordinary), strict=True):
+        for share, good in ((0.89, True), (0.91, False)):
+            slewing = np.array([0.0, share * abs(limit[0]) * radius * way, 0.0])
+            assert can(ordinary, np.tile(slewing, (2, 1, 1)), replace(BROKK_170, rate=100.0)) == good
+
+
+def test_commands_of_a_file_by_hand(tmp_path: Path) -> None:
+    """Values count from their row on, to the tick; a sequence lasts a tick or more."""
+    path = tmp_path / "c.csv"
+    path.write_text("sequence,time,vx,vy,vz\na,5,1,2,3\na,5.1,4,5,6\na,5.15,0,0,0\nb,0,7,8,9\nb,0.05,0,0,0\n")
+    first, second = sequences.read_commands(path, BROKK_170)
+    assert first.goals.tolist() == [[1, 2, 3], [1, 2, 3], [4, 5, 6]] and second.goals.tolist() == [[7, 8, 9]]
+    for rows in ("b,0,1,0,0\nb,0,2,0,0\nb,1,0,0,0\n", "b,1,0,0,0\n"):
+        path.write_text(f"sequence,time,vx,vy,vz\n{rows}")
+        with pytest.raises(
+            ValueError, match=r"c.csv: sequence b: expected two or more rows with rising time"
+        ):
+            sequences.read_commands(path, BROKK_170)
+
+
+def test_kinds_of_starts_at_their_thresholds() -> None:
+    ordinary = np.array([1.5, 0.5, 0.58, 1.71, 1.24])
+    ends = np.tile(ordinary, (4, 1))
+    ends[[0, 1], 3] = 2.9 - np.array([0.151, 0.149])
+    ends[[2, 3], 4] = [0.151, 0.149]
+    assert sequences.start_kinds(BROKK_170, ends) == ["workspace", "limits"] * 2
+
+
+def test_drawn_starts_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Poses are numbers; from number k goals up to k can be followed. Two sequences have goals 3 and 6."""
+    draws: list[list[tuple[str, float]]] = []
+    calls = []
+
+    def pose(machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int) -> np.ndarray:
+        calls.append(num)
+        drawn = draws[min(len(calls), len(draws)) - 1]
+        return np.array([[value + 1e-5, sequences.KINDS.index(kind), 0, 0, 0] for kind, value in drawn])
+
+    def able(machine: Machine, start: np.ndarray, goals: np.ndarray) -> np.ndarray:
+        assert goals.shape == (2, len(start), 3)
+        return start[:, 0] >= goals[0, :, 0]
+
+    monkeypatch.setattr(sequences, "draw_pose", pose)
+    monkeypatch.setattr(sequences, "start_kinds", lambda m, q: [sequences.KINDS[int(k)] for k in q[:, 1]])
+    monkeypatch.setattr(sequences, "feasible", able)
+    goals = [sequences.Commands(f"to {k}", np.tile([k, 0.0, 0.0], (2, 1))) for k in (3, 6)]
+
+    def drawn(num: int, *kinds: list[tuple[str, float]]) -> list[float]:
+        draws[:] = kinds
+        calls.clear()
+        return sequences.draw_starts(BROKK_170, goals, num, np.random.default_rng(0))[:, 0].tolist()
+
+    works = [("workspace", 5), ("workspace", 7), ("limits", 2), ("limits", 4), ("extended", 1)]
+    more = [("workspace", 8), ("limits", 9), ("extended", 0), ("workspace", 6)]
+    assert drawn(4, works, more) == [7, 4, 8, 1] and calls == [4000, 4000]
+    assert drawn(8, works, more) == [7, 4, 8, 1, 6, 9, 8, 0] and len(calls) == 3
+    few = [("workspace", 6), ("workspace", 7), ("workspace", 8), ("workspace", 2)]
+    with pytest.raises(
+        ValueError, match=r"^brokk170: expected 9 poses from .* feasible, got fewer in 200 draws$"
+    ):
+        drawn(9, [("workspace", 2)])
+    assert len(calls) == 200
+    assert drawn(4, few) == [6, 7, 8, 6]  # the other kinds have none: workspace stands in
+
+
+def test_tuning_runs_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 200 drawn at a time those that are feasible, in turn; the goals of a run hold one after another."""
+    seen, inner = [], sequences.reset
+
+    def able(machine: Machine, start: np.ndarray, goals: np.ndarray) -> np.ndarray:
+        assert start.shape == (200, 5) and goals.shape == (30, 200, 3)
+        seen.append((start, goals))
+        return np.arange(200) % 100 == 7
+
+    monkeypatch.setattr(sequences, "feasible", able)
+    starts, goals = sequences.tuning_goals(BROKK_170, 3, 1.5, 5)
+    assert len(seen) == 2 and goals.shape == (30, 3, 3)
+    for k, (draw, row) in enumerate(((0, 7), (0, 107), (1, 7))):
+        np.testing.assert_array_equal(starts[k], seen[draw][0][row])
+        np.testing.assert_array_equal(goals[:, k], seen[draw][1][:, row])
+    holds = int(np.ceil(1.5 / TaskConfig().hold_min_s))
+    drawn = inner(BROKK_170, TaskConfig(), np.random.default_rng(5), 200 * holds, plant=False)
+    np.testing.assert_array_equal(starts[0], drawn.q[7 * holds])
+    first = np.repeat(drawn.v_goal[7 * holds : 8 * holds], drawn.goal_ticks[7 * holds : 8 * holds], axis=0)
+    np.testing.assert_array_equal(goals[:, 0], first[:30])
+    monkeypatch.setattr(sequences, "feasible", lambda machine, start, goals: np.arange(200) == len(seen))
+    with pytest.raises(ValueError, match=r"^brokk170: expected 61 feasible runs to tune on, got 60$"):
+        sequences.tuning_goals(BROKK_170, 61, 0.1, 5)
+
+
+def test_a_file_of_starts_by_hand(tmp_path: Path) -> None:
+    path = tmp_path / "s.csv"
+    sequences.write_starts(
+        path, BROKK_170, np.array([[0.5, 0.5, 0.58, 1.71, 1.24], [-0.25, 0.5, 0.1, 2.0, 1.0]])
+    )
+    assert path.read_text() == "q1,q2,q3,q4,q5\n0.5,0.5,0.58,1.71,1.24\n-0.25,0.5,0.1,2.0,1.0\n"
+    commands = tmp_path / "c.csv"
+    commands.write_text("sequence,time,vx,vy,vz\na,0,0.1,0,0\na,1,0,0,0\n")
+    found, starts = sequences.goals_and_starts(BROKK_170, commands, path, 9, 0)
+    assert [s.name for s in found] == ["a"] and starts.tolist()[1] == [-0.25, 0.5, 0.1, 2.0, 1.0]
+    found, starts = sequences.goals_and_starts(BROKK_170, None, None, 3, 0)
+    assert len(found) == 9 and np.array_equal(starts, sequences.scored_starts(BROKK_170, 3, found, 2))

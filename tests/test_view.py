@@ -114,6 +114,33 @@ def test_views_of_the_brokk_by_hand() -> None:
     )
 
 
+def test_cameras_by_hand() -> None:
+    """A view of 400 by 200 px at (10, 20), 14 px of soil: what is held fills 0.92 of 400 or of 172 px."""
+    side, top = (10.0, 20.0, 400.0, 200.0), (0.0, 0.0, 100.0, 100.0)
+    reach, p_tool = looks.extent(BROKK_170).reach, np.array([0.0, 3.0, 1.0])
+    assert 4.5 < reach < 5.0  # of 5 m; drawn poses come near it
+    hold = np.array([[0.0, 1.0, 0.5], [0.0, 2.0, 0.75]])
+    one, other = looks.cameras(BROKK_170, p_tool, side, top, hold)
+    margin = 0.06 * reach
+    assert one.scale == pytest.approx(0.92 * min(400 / (1 + 2 * margin), 172 / (0.25 + 2 * margin)))
+    middle, low = np.array([0.0, 1.5, 0.0]), np.array([0.0, 1.0, 0.5 - margin])
+    assert one.project(middle)[0] == pytest.approx(210) and one.project(low)[1] == pytest.approx(206)
+    assert other.scale == pytest.approx(0.92 * min(100 / (1 + 2 * margin), 86 / (2 * margin)))
+    assert other.project(middle)[0] == pytest.approx(50) and other.project([2.0, 0, 0])[1] < 50
+    right = looks._side_axes(np.array([[3.0, 4.0, 1.0], [0.0, 0.0, 2.0], [0.0, -0.5, 0.0]]))
+    np.testing.assert_allclose(right[:, 0], [[0.6, 0.8, 0], [1, 0, 0], [0, -1, 0]])
+    np.testing.assert_allclose(right[:, 1], [[0, 0, 1]] * 3)
+
+
+def test_corners_of_an_arm_by_hand() -> None:
+    """Two links that turn about z, each 0.2 m above the one before and 1 m long."""
+    joints = [replace(j, a=1.0, d=0.2, alpha=0.0, theta=0.0) for j in BROKK_170.joints[:2]]
+    arm = replace(BROKK_170, joints=tuple(joints))
+    found = looks.skeleton(arm, np.array([0.0, np.pi / 2]))
+    wanted = [[0, 0, 0], [0, 0, 0.2], [1, 0, 0.2], [1, 0, 0.4], [1, 1, 0.4]]
+    np.testing.assert_allclose(found, wanted, atol=1e-12)
+
+
 def test_the_trail_is_painted_where_the_tool_was() -> None:
     p = tool_position(BROKK_170, Q)
     trail = p + np.linspace(0, 1, 50)[:, None] * np.array([0.9, -0.5, 0.5])
