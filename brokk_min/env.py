@@ -15,7 +15,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brokk_min.actuator import ActuatorNet, push_angle, push_command, rest_history
-from brokk_min.kinematics import damped_rates, lowest_point, tool_jacobian, tool_position, tool_state
+from brokk_min.kinematics import (
+    damped_rates,
+    lowest_point,
+    tool_jacobian,
+    tool_position,
+    tool_state,
+    tool_velocity,
+)
 from brokk_min.machine import PWM_MAX, Machine, as_floats, estimate_velocity, limit_command, read_encoder
 from brokk_min.plant import PlantState, plant_reset, plant_step
 
@@ -45,10 +52,12 @@ class TaskConfig:
     """Largest noise of the measured part of an observation, in standard deviations (paper: 5 %)."""
     valve_cost: float = 0.05
     """Reward lost for each change of a command by its limit, mean of the driven joints (paper: 0)."""
+    lag_cost: float = 1.0
+    """Reward lost for each metre that the tool stays behind, see `push_lag` [1/m] (paper: 0)."""
     redraw_ground: bool = True
     """Redraw start poses in the ground; False is the paper's rule: end the episode without reward."""
     paper: bool = False
-    """Observation (no wanted rates, no weights), reward (no valve cost) and critic as the paper has them."""
+    """Observation (no wanted rates, no weights), reward (no costs) and critic as the paper has them."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +71,7 @@ class State:
     goal_ticks: NDArray[np.int64]  # ticks until a new goal, (...)
     ticks: NDArray[np.int64]  # ticks since the reset, (...)
     lag: Array  # see `push_lag` [m], (..., 3)
+    motion: Array  # as `history`, but of true angles: what nets go on from
     plant: PlantState | None = None  # None: the nets move the machine
 
 
@@ -83,8 +93,8 @@ class _Layout(NamedTuple):
     mean: Array
     scale: Array
     sensed: Array  # what noise of 1 does to what sensors say, in physical units; 0 for the rest
-    angles: NDArray[np.intp]  # where the newest angles of all joints stand, (n,)
     paper: Array  # factors that make it the paper's: weights undone, wanted rates blanked
+    turned: Array  # what velocities add to the mean of a joint's angles to make it the newest [s], (H,)
     told: NDArray[np.intp]  # what a flattened history (n * 3 * H) gives: locked angles, driven histories
 
 
@@ -112,13 +122,13 @@ def _layout(machine: Machine) -> _Layout:
         columns = zip(*((m, d / w, w * s + 0 * m, 1 / w + 0 * m) for m, d, w, s in blocks), strict=True)
         mean, scale, sensed, paper = (np.concatenate(a).astype(np.float32) for a in columns)
         paper[-2 * len(driven) :] = 0
-        body = 6 + len(rest)
-        angles = np.zeros(machine.n, int)
-        angles[rest] = np.arange(6, body)
-        angles[driven] = body + samples * (1 + 3 * np.arange(len(driven))) - 1
+        # velocity j is in j of H sums, and late by half its window: to it comes so often what it grew by
+        late = machine.velocity_samples / 2 - 1
+        turned = (np.arange(samples) - late + late * samples * (np.arange(samples) == samples - 1)) / samples
+        turned = (machine.dt * turned).astype(np.float32)
         place = np.arange(machine.n * 3 * samples).reshape(machine.n, 3, samples)
         told = np.concatenate([place[rest, 0, -1], place[driven].ravel()])
-        machine.__dict__["layout"] = _Layout(mean, scale, sensed * scale, angles, paper, told)
+        machine.__dict__["layout"] = _Layout(mean, scale, sensed * scale, paper, turned, told)
     layout: _Layout = machine.__dict__["layout"]
     return layout
 
@@ -148,33 +158,15 @@ def paper_view(machine: Machine) -> Array:
     return _layout(machine).paper
 
 
-class Arm(NamedTuple):
-    """The arm as its encoders show it, from one pass over its frames; see `measured_arm`."""
-
-    p_tool: Array  # tool position [m], (..., 3)
-    J: Array  # its derivative by all joints' angles [m/rad], (..., 3, n)
-    v_tool: Array  # tool velocity [m/s], (..., 3)
-
-
-def measured_arm(machine: Machine, history: Array) -> Arm:
-    """The arm at the newest of the measured samples `history` (..., n, 3, H)."""
-    p_tool, J = tool_jacobian(machine, history[..., 0, -1])
-    return Arm(p_tool, J, np.add.reduce(J * history[..., None, :, 1, -1], axis=-1))
-
-
 def observe(
-    machine: Machine,
-    history: Array,
-    v_goal: ArrayLike,
-    lag: Array,
-    noise: Array | float = 0.0,
-    arm: Arm | None = None,
+    machine: Machine, history: Array, v_goal: ArrayLike, lag: Array, noise: Array | float = 0.0
 ) -> Array:
     """What the policy sees: goal and tool velocity, locked angles, driven histories, wanted joint rates.
 
     Velocities are given along the tool's heading: outward from the z axis, sideways, up. What a slewing
     arm has to do then does not depend on where it points. Wanted rates are the joint rates that would
-    give the goal velocity, and those that would make up for `lag` (both by `joint_rates`).
+    give the goal velocity, and those that would make up for `lag` (both by `joint_rates`). The arm is taken
+    to stand where all that is seen of its angles says, see `_angles`.
 
     Paper: Sec. 3.4 (present and target tool velocity, the actuator nets' inputs), Fig. 3; rates are ours
 
@@ -184,31 +176,46 @@ def observe(
         v_goal: wanted tool velocity [m/s], base frame, shape (..., 3).
         lag: of `push_lag` [m], base frame, shape (..., 3).
         noise: of what sensors say, in standard deviations, shape (..., obs) or a number.
-        arm: `measured_arm` of `history` where it is known.
 
     Returns:
         Shape (..., 6 + locked + (3 H + 2) n_driven), float32.
     """
-    mean, scale, sensed, angles, _, told = _layout(machine)
+    mean, scale, sensed, _, _, told = _layout(machine)
     batch = history.shape[:-3]
     seen = np.zeros((*batch, len(mean)), np.float32)
     seen[..., 6 : 6 + len(told)] = history.reshape(*batch, -1)[..., told]
     seen += noise * sensed
-    if arm is None or np.ndim(noise) or noise:
-        # the arm where it is and where it is seen, in one pass: one large step is faster than two small ones
-        poses = np.stack([history[..., 0, -1], seen[..., angles]], axis=-2)
-        p_tool, J = tool_jacobian(machine, poses)
-        v_tool = np.add.reduce(J[..., 0, :, :] * history[..., None, :, 1, -1], axis=-1)
-    else:  # it is seen where it is
-        p_tool, J, v_tool = arm.p_tool[..., None, :], arm.J[..., None, :, :], arm.v_tool
+    p_tool, J = tool_jacobian(machine, _angles(machine, seen))
     given = np.empty((*batch, 3, 3), np.float32)
-    given[..., 0, :], given[..., 1, :], given[..., 2, :] = v_goal, v_tool, lag
-    seen[..., :6] += _turn(p_tool[..., :1, :], given[..., :2, :], 1).reshape(*batch, 6)
-    rates = damped_rates(machine, J[..., -1:, :, machine.driven], given[..., ::2, :])
+    given[..., 0, :], given[..., 2, :] = v_goal, lag
+    given[..., 1, :] = np.add.reduce(J * history[..., None, :, 1, -1], axis=-1)
+    seen[..., :6] += _turn(p_tool[..., None, :], given[..., :2, :], 1).reshape(*batch, 6)
+    rates = damped_rates(machine, J[..., None, :, machine.driven], given[..., ::2, :])
     seen[..., 6 + len(told) :] = rates.reshape(*batch, -1)
     seen -= mean
     seen /= scale
     return seen
+
+
+def _samples(machine: Machine, values: Array) -> Array:
+    """The driven joints' histories (..., n_driven, 3, H) in an observation in physical units (..., obs)."""
+    body, num = 6 + len(machine.locked), len(machine.driven)
+    return values[..., body : body + num * 3 * machine.history].reshape(
+        *values.shape[:-1], num, 3, machine.history
+    )
+
+
+def _angles(machine: Machine, values: Array) -> Array:
+    """Where the joints are [rad] (..., n), from an observation in physical units (..., obs).
+
+    Each sample of a driven joint's angle says where the joint is now, once what it turned since is added. The
+    mean of them all has a fraction of the newest one's noise.
+    """
+    samples, turned = _samples(machine, values), _layout(machine).turned
+    q = np.empty((*values.shape[:-1], machine.n), values.dtype)
+    q[..., machine.locked] = values[..., 6 : 6 + len(machine.locked)]
+    q[..., machine.driven] = samples[..., 0, :].mean(axis=-1) + (samples[..., 1, :] * turned).sum(axis=-1)
+    return q
 
 
 def _turn(p_tool: Array, vector: Array, sign: int) -> Array:
@@ -223,13 +230,13 @@ def _turn(p_tool: Array, vector: Array, sign: int) -> Array:
 
 
 def measured(machine: Machine, observation: Array) -> Measured:
-    """Undo `observe`: the newest measurements in physical units, from observations (..., obs)."""
-    mean, scale, _, angles, *_ = _layout(machine)
+    """Undo `observe`: what is measured now, in physical units, from observations (..., obs)."""
+    mean, scale = observation_scale(machine)
     values = observation * scale + mean
-    q = values[..., angles]
+    q = _angles(machine, values)
     p_tool = tool_position(machine, q)
     v_goal, v_tool = (_turn(p_tool, values[..., i : i + 3], -1) for i in (0, 3))
-    return Measured(v_goal, v_tool, q, values[..., angles[machine.driven] + machine.history])
+    return Measured(v_goal, v_tool, q, _samples(machine, values)[..., 1, -1])
 
 
 def push_lag(machine: Machine, v_tool: Array, v_goal: Array, lag: Array) -> Array:
@@ -251,16 +258,21 @@ def push_lag(machine: Machine, v_tool: Array, v_goal: Array, lag: Array) -> Arra
     return np.asarray(counted * np.float32(np.exp(-machine.dt / LAG_TIME)))
 
 
+def push_motion(machine: Machine, history: Array, q: Array) -> Array:
+    """History (..., n, 3, H) of `push_command` with the angles `q` [rad] (..., n), and their newest slope."""
+    return push_angle(history, q, lambda a: estimate_velocity(a, machine.velocity_samples, machine.dt))
+
+
 def push_measured(
     machine: Machine, history: Array, q: Array, v_goal: Array, lag: Array
-) -> tuple[Array, Array, Arm]:
-    """History, lag and arm a tick on, after the encoders said `q` [rad] (..., n): simulation and hardware.
+) -> tuple[Array, Array]:
+    """History and lag a tick on, after the encoders said `q` [rad] (..., n): simulation and hardware.
 
     `history` is what `push_command` left, `v_goal` [m/s] (..., 3) what was wanted during the tick.
     """
-    history = push_angle(history, q, lambda a: estimate_velocity(a, machine.velocity_samples, machine.dt))
-    arm = measured_arm(machine, history)
-    return history, push_lag(machine, arm.v_tool, v_goal, lag), arm
+    history = push_motion(machine, history, q)
+    v_tool = tool_velocity(machine, history[..., 0, -1], history[..., 1, -1])
+    return history, push_lag(machine, v_tool, v_goal, lag)
 
 
 def to_command(machine: Machine, action: ArrayLike) -> Array:
@@ -337,12 +349,14 @@ def fitting_nets(machine: Machine, net: ActuatorNet) -> ActuatorNet:
 def rest_state(machine: Machine, q: ArrayLike, v_goal: ArrayLike, plant: bool) -> State:
     """Machines at rest at angles `q` [rad] (..., n) with goals (..., 3) [m/s] that never change."""
     q = np.array(q, float)
-    history = rest_history(read_encoder(machine, q).astype(np.float32), machine.history)
+    history, motion = (
+        rest_history(a.astype(np.float32), machine.history) for a in (read_encoder(machine, q), q)
+    )
     goals = np.broadcast_to(np.asarray(v_goal, np.float32), (*q.shape[:-1], 3))
     never = np.full(q.shape[:-1], np.iinfo(np.int64).max)
     ticks = np.zeros(q.shape[:-1], np.int64)
     plant_state = plant_reset(machine, q) if plant else None
-    return State(q, np.zeros_like(q), history, goals, never, ticks, np.zeros_like(goals), plant_state)
+    return State(q, np.zeros_like(q), history, goals, never, ticks, np.zeros_like(goals), motion, plant_state)
 
 
 def transition(
@@ -351,23 +365,25 @@ def transition(
     """One tick under the command `u` (..., n), by the nets, or by the plant where the state has one.
 
     `read(machine, q)` are the angles that the encoders say; they may be disturbed for a test of robustness.
+    Nets go on from the true angles, for the steps of an encoder do not move an arm.
 
     Paper: Sec. 3.4 (actuator nets in the simulation), Table 1
     """
-    history = push_command(state.history, u)
+    motion = push_command(state.motion, u)
     q, plant = state.q, None
     if state.plant is not None:
         plant = plant_step(machine, state.plant, u)
         q = plant.q
     elif net is not None:
         driven, low, high = machine.driven, machine.column("q_min"), machine.column("q_max")
-        moved = q[..., driven] + net.predict(history[..., driven, :, :]) * machine.dt
+        moved = q[..., driven] + net.predict(motion[..., driven, :, :]) * machine.dt
         q = q.copy()
         q[..., driven] = np.clip(moved, low[driven], high[driven])
     else:
         raise ValueError("net: expected nets for a state without a plant, got None")
 
-    history, lag, _ = push_measured(machine, history, read(machine, q), state.v_goal, state.lag)
+    history = push_command(state.history, u)
+    history, lag = push_measured(machine, history, read(machine, q), state.v_goal, state.lag)
     return replace(
         state,
         q=q,
@@ -376,6 +392,7 @@ def transition(
         goal_ticks=state.goal_ticks - 1,
         ticks=state.ticks + 1,
         lag=lag,
+        motion=push_motion(machine, motion, q),
         plant=plant,
     )
 
@@ -470,17 +487,18 @@ def step(
 ) -> tuple[State, Outcome]:
     """One tick of `num` environments, without resets: `action` (num, n_driven) in [-1, 1].
 
-    The reward is `reward` for the goal that held during the tick less `valve_cost`; where it is over, or
-    asks an arm close to the ground to sink, a new one is drawn after it. On a tick that ends in the ground
-    the reward is zero.
+    The reward is `reward` for the goal that held during the tick less `valve_cost` and `lag_cost`; where the
+    goal is over, or asks an arm close to the ground to sink, a new one is drawn after it. On a tick that ends
+    in the ground the reward is zero.
     """
     before, state = state, transition(machine, net, state, to_command(machine, action))
     _, v_tool, lowest = tool_state(machine, state.q.astype(np.float32), state.q_dot.astype(np.float32))
     rewards = reward(state.v_goal, v_tool)
     end = terminated(machine, lowest)
     error = 1 / rewards - 1
-    if config.valve_cost and not config.paper:
+    if not config.paper:
         rewards = rewards - np.float32(config.valve_cost) * _travel(machine, before, state)
+        rewards = rewards - np.float32(config.lag_cost) * np.linalg.norm(state.lag, axis=-1)
     state = _next_goals(machine, config, state, lowest, rng)
     observation = look(machine, config, state, rng)
     truncated = (state.ticks >= round(config.episode_s * machine.rate)) & ~end

@@ -186,13 +186,13 @@ class Drive:
             return np.zeros(m.n)
         q = counts[None].astype(np.float32) * m.encoder_step  # as `read_encoder` gives in the simulation
         if self.history is None:
-            self.history, arm = rest_history(q, m.history), None
+            self.history = rest_history(q, m.history)
         else:
-            self.history, self.lag, arm = push_measured(m, self.history, q, self.asked, self.lag)
+            self.history, self.lag = push_measured(m, self.history, q, self.asked, self.lag)
         if not self.gate.driving:
             self.memory, self.lag = self.controller.start(1), np.zeros((1, 3), np.float32)
         self.asked = np.array([self.wish.v_goal], np.float32)
-        seen = observe(m, self.history, self.asked, self.lag, arm=arm)
+        seen = observe(m, self.history, self.asked, self.lag)
         u, self.memory = self.controller(seen, self.memory)
         return np.asarray(np.rint(u[0] * PWM_MAX), float)
 

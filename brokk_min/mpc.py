@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min.env import observation_scale
+from brokk_min.env import measured
 from brokk_min.jacobian import dls
-from brokk_min.kinematics import jacobian, tool_position, tool_velocity
-from brokk_min.machine import PWM_MAX, Machine, limit_command, read_encoder, valve_opening
+from brokk_min.kinematics import jacobian, tool_velocity
+from brokk_min.machine import PWM_MAX, Machine, limit_command, valve_opening
 from brokk_min.plant import PlantState, lever_arm, plant_reset, plant_step
 
 Array = NDArray[np.floating[Any]]
@@ -60,7 +60,7 @@ class PerfectModel:
     def __call__(self, observation: Array, memory: Plan) -> tuple[Array, Plan]:
         """Commands u (num, n) for observations (num, obs) of `env.observe`, and the next memory."""
         plant, tick = memory.plant, memory.tick
-        goal = wanted_velocity(self.machine, observation, plant.q)
+        goal = measured(self.machine, observation).v_goal.astype(float)
         before = np.concatenate([memory.opening[:, 1:], memory.opening[:, -1:]], axis=1)
         opening = self.improve(plant, before, goal, tick)
         u = self.whole_counts(plant, opening, goal, tick)
@@ -123,15 +123,6 @@ class PerfectModel:
         cost = np.linalg.norm(self.errors(plant, u, goal), axis=-1).mean(axis=-1)
         best: Array = u[np.arange(len(u)), cost.argmin(axis=1), 0]
         return best
-
-
-def wanted_velocity(machine: Machine, observation: Array, q: Array) -> Array:
-    """The goal [m/s] (num, 3) in observations (num, obs) of machines whose true angles are `q` (num, n)."""
-    mean, scale = observation_scale(machine)
-    out, side, up = (observation * scale + mean)[:, :3].astype(float).T
-    x, y, _ = tool_position(machine, read_encoder(machine, q)).T
-    radius = np.maximum(np.hypot(x, y), 1e-6)
-    return np.stack([(x * out - y * side) / radius, (y * out + x * side) / radius, up], axis=1)
 
 
 def steady_opening(machine: Machine, q: Array, goal: Array) -> Array:

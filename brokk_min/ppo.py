@@ -260,7 +260,7 @@ class Training:
             ended[t] = torch.from_numpy(over)
             if not self.critic:
                 u = to_command(env.machine, actions[t].numpy())
-                ticks.append((state.q, state.history, state.v_goal, u, over))
+                ticks.append((state.q, state.motion, state.v_goal, state.lag, u, over))
             elif truncated.any():
                 last = torch.from_numpy(info["final_obs"][truncated])
                 tails[t, torch.from_numpy(truncated)] = agent.value(finite("final_obs", last, step))
@@ -309,7 +309,7 @@ class Training:
         if net is None:
             raise ValueError("actuator: expected nets, whose derivatives are known, got the analytic plant")
         rollout = Rollout(*map(np.stack, zip(*ticks, strict=True)))
-        slope = action_gradients(env.machine, net, rollout, self.config.gamma, env.config.valve_cost)
+        slope = action_gradients(env.machine, net, rollout, self.config.gamma, env.config)
         deviation = actions.clamp(-1, 1) - means.clamp(-1, 1)  # of what the valves got
         return (torch.from_numpy(slope) * deviation).sum(-1)
 

@@ -10,7 +10,7 @@ from helpers_machines import GAIN, obedient_net, obedient_velocity, random_machi
 
 from brokk_min import env as task
 from brokk_min.adjoint import Rollout, action_gradients
-from brokk_min.kinematics import jacobian
+from brokk_min.kinematics import jacobian, tool_velocity
 from brokk_min.machine import BROKK_170, PWM_MAX
 
 NUM, TICKS = 3, 9
@@ -19,6 +19,10 @@ NUM, TICKS = 3, 9
 def exactly(machine, q):
     """Encoders without steps: differences show what a derivative is."""
     return q
+
+
+def costs(valve=0.0, lag=0.0):
+    return task.TaskConfig(valve_cost=valve, lag_cost=lag)
 
 
 def simulate(machine, net, state, commands):
@@ -30,7 +34,7 @@ def simulate(machine, net, state, commands):
 
 
 def rollout_of(states, commands, ended=None):
-    arrays = (np.stack([getattr(s, name) for s in states[:-1]]) for name in ("q", "history", "v_goal"))
+    arrays = (np.stack([getattr(s, n) for s in states[:-1]]) for n in ("q", "motion", "v_goal", "lag"))
     ended = np.zeros(commands.shape[:2], bool) if ended is None else ended
     return Rollout(*arrays, commands, ended)
 
@@ -45,7 +49,7 @@ def case(seed, machine=None):
     low, high = machine.column("q_min"), machine.column("q_max")
     q = rng.uniform(0.7 * low + 0.3 * high, 0.3 * low + 0.7 * high, (NUM, machine.n))
     state = task.rest_state(machine, q, rng.standard_normal((NUM, 3)), plant=False)
-    state = replace(state, history=state.history.astype(float))
+    state = replace(state, history=state.history.astype(float), motion=state.motion.astype(float))
     commands = np.zeros((15 + TICKS, NUM, machine.n))
     commands[..., machine.driven] = rng.uniform(-0.6, 0.6, (*commands.shape[:2], len(machine.driven)))
     states = simulate(machine, net, state, commands[:15])
@@ -72,7 +76,7 @@ def rewards_of(machine, states, along):
 def test_gradients_are_finite_differences_of_the_simulation(seed, gamma):
     machine, net, start, commands = case(seed)
     states = simulate(machine, net, start, commands)
-    found = action_gradients(machine, net, rollout_of(states, commands), gamma, 0.0)
+    found = action_gradients(machine, net, rollout_of(states, commands), gamma, costs())
     step, weights = 1e-5, gamma ** np.arange(TICKS)
     for t in range(TICKS):
         for k, joint in enumerate(machine.driven):
@@ -90,7 +94,7 @@ def test_a_constant_jacobian_costs_little():
     """What is left out, the turn of the arm within the horizon, on the machine of the paper."""
     machine, net, start, commands = case(1, BROKK_170)
     states = simulate(machine, net, start, commands)
-    found = action_gradients(machine, net, rollout_of(states, commands), 0.9, 0.0)[0]
+    found = action_gradients(machine, net, rollout_of(states, commands), 0.9, costs())[0]
     whole = np.empty_like(found)
     for k, joint in enumerate(machine.driven):
         ends = []
@@ -110,7 +114,7 @@ def test_one_tick_by_hand():
     u[..., BROKK_170.driven] = [0.3, -0.2, 0.1, 0.4]
     state = task.rest_state(BROKK_170, [[0.0, 0.5, 0.6, 1.7, 1.2]], [0.2, 0.1, -0.1], plant=False)
     states = simulate(BROKK_170, net, state, u)
-    found = action_gradients(BROKK_170, net, rollout_of(states, u), 0.9, 0.0)[0, 0]
+    found = action_gradients(BROKK_170, net, rollout_of(states, u), 0.9, costs())[0, 0]
     rates = obedient_velocity(BROKK_170, u[0, 0, BROKK_170.driven])
     J = jacobian(BROKK_170, states[1].q[0])
     error = state.v_goal[0] - J @ rates
@@ -128,12 +132,15 @@ def test_nothing_is_earned_beyond_the_end_of_an_episode_or_by_another_environmen
     ended = np.zeros((TICKS, NUM), bool)
     ended[4, 1] = True
     whole, cut = (
-        action_gradients(machine, net, rollout_of(states, commands, e), 0.9, 0.01) for e in (None, ended)
+        action_gradients(machine, net, rollout_of(states, commands, e), 0.9, costs(0.01, 2.0))
+        for e in (None, ended)
     )
     np.testing.assert_array_equal(cut[5:], whole[5:])
     np.testing.assert_array_equal(cut[:, [0, 2]], whole[:, [0, 2]])
     first = rollout_of(states[:6], commands[:5])
-    np.testing.assert_array_equal(cut[:5, 1], action_gradients(machine, net, first, 0.9, 0.01)[:, 1])
+    np.testing.assert_array_equal(
+        cut[:5, 1], action_gradients(machine, net, first, 0.9, costs(0.01, 2.0))[:, 1]
+    )
     assert (cut[:4, 1] != whole[:4, 1]).any()
 
 
@@ -142,13 +149,52 @@ def test_the_cost_of_moving_a_valve_is_in_it():
     machine, net, start, commands = case(3)
     states = simulate(machine, net, start, commands)
     free, dear = (
-        action_gradients(machine, net, rollout_of(states, commands), 0.8, cost) for cost in (0.0, 0.05)
+        action_gradients(machine, net, rollout_of(states, commands), 0.8, costs(cost)) for cost in (0.0, 0.05)
     )
     before = np.concatenate([start.history[None, ..., 2, -1], commands[:-1]])
     sign = np.sign(commands - before)[..., machine.driven]
     later = np.concatenate([sign[1:], 0 * sign[:1]])
     by_command = -0.05 / len(machine.driven) * (sign - 0.8 * later) * PWM_MAX / machine.pwm_limit
     np.testing.assert_allclose(dear - free, by_command * by_action(machine, commands), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_cost_of_staying_behind_is_in_it(seed):
+    """Differences of the whole simulation, where the newest velocity is that of the tick alone."""
+    rng = np.random.default_rng(seed)
+    machine = replace(random_machine(rng, int(rng.integers(2, 6))), velocity_samples=2)
+    machine, net, start, commands = case(seed, machine)
+    start = replace(start, lag=rng.normal(0, 0.1, (NUM, 3)))
+    states = simulate(machine, net, start, commands)
+    J = [jacobian(machine, s.q) for s in states]
+    v_tool = np.array([tool_velocity(machine, s.q, s.q_dot) for s in states[1:]])
+    middle = np.quantile(np.linalg.norm(start.v_goal - v_tool, axis=-1), 0.52)
+    machine = replace(
+        machine, tool_speed=float(middle) / task.LAG_SPEED
+    )  # half of the errors are beyond the limit
+    states = simulate(machine, net, start, commands)
+
+    def cost(states):
+        """Discounted lags (T, num), each tick's tool velocity by the Jacobian that counts as constant."""
+        lag, found = start.lag, []
+        for t, s in enumerate(states[1:]):
+            v_tool = (J[t + 1] @ s.q_dot[..., machine.driven, None])[..., 0]
+            lag = task.push_lag(machine, v_tool, start.v_goal, lag)
+            found.append(3.0 * 0.8**t * np.linalg.norm(lag, axis=-1))
+        return np.array(found)
+
+    free, dear = (
+        action_gradients(machine, net, rollout_of(states, commands), 0.8, costs(0, c)) for c in (0.0, 3.0)
+    )
+    for t in range(TICKS):
+        for k, joint in enumerate(machine.driven):
+            ends = []
+            for sign in (1, -1):
+                other = commands.copy()
+                other[t, :, joint] += sign * 1e-5
+                ends.append(cost(simulate(machine, net, start, other))[t:].sum(axis=0) / 0.8**t)
+            slope = -(ends[0] - ends[1]) / 2e-5 * by_action(machine, commands[t])[:, k]
+            np.testing.assert_allclose((dear - free)[t, :, k], slope, rtol=2e-3, atol=1e-4)
 
 
 @pytest.mark.parametrize(("end", "push"), [("q_max", 0.4), ("q_min", -0.4)])
@@ -159,7 +205,9 @@ def test_a_joint_at_its_stop_gains_nothing_by_pushing(end, push):
     q[4] = machine.column(end)[4]
     state = task.rest_state(machine, q[None], [0.1, 0.1, 0.1], plant=False)
     u[..., 4], u[..., 3] = push, 0.3
-    found = action_gradients(machine, net, rollout_of(simulate(machine, net, state, u), u), 0.9, 0.0)[:, 0]
+    found = action_gradients(machine, net, rollout_of(simulate(machine, net, state, u), u), 0.9, costs())[
+        :, 0
+    ]
     assert not found[:, 3].any() and found[:, 2].all()
 
 
@@ -168,6 +216,6 @@ def test_read_only_arrays_go_in_and_nothing_is_changed():
     rollout = rollout_of(simulate(machine, net, start, commands), commands)
     for array in rollout:
         array.setflags(write=False)
-    first, second = (action_gradients(machine, net, rollout, 0.9, 0.01) for _ in range(2))
+    first, second = (action_gradients(machine, net, rollout, 0.9, costs(0.01, 2.0)) for _ in range(2))
     np.testing.assert_array_equal(first, second)
     assert first.dtype == np.float32 and np.isfinite(first).all()

@@ -186,6 +186,28 @@ def told_history():
 STILL = np.zeros(3)  # no lag, no goal
 
 
+def told_angles(machine, history):
+    """The mean of all samples of a driven joint's angle, each moved on by all later velocities.
+
+    A velocity is the slope of some angles: late by half of their span, and so moved on as well.
+    """
+    late, q = (machine.velocity_samples - 1) / 2 - 1 / 2, history[..., 0, -1].copy()
+    for joint in machine.driven:
+        angle, velocity = history[..., joint, 0, :], history[..., joint, 1, :]
+        tick = (velocity[..., 1:] + late * np.diff(velocity)) * machine.dt
+        q[..., joint] = np.mean(
+            [angle[..., k] + tick[..., k:].sum(-1) for k in range(machine.history)], axis=0
+        )
+    return q
+
+
+def headed(machine, q, v):
+    """Velocities `v` (..., 3) outward from the z axis, sideways and up, the tool being where `q` says."""
+    x, y, _ = np.moveaxis(tool_position(machine, q), -1, 0)
+    turn = np.exp(-1j * np.arctan2(y, x)) * (v[..., 0] + 1j * v[..., 1])
+    return np.stack([turn.real, turn.imag, v[..., 2]], axis=-1)
+
+
 def parts(machine, seen):
     """Observations cut up: goal (3), tool velocity (3), locked angles, histories (n, 3, H), two rates."""
     rest, driven, samples = len(machine.locked), len(machine.driven), machine.history
@@ -196,7 +218,9 @@ def parts(machine, seen):
 
 
 def test_observation_by_hand():
-    outward, sideways = np.array([np.cos(1.5), np.sin(1.5)]), np.array([-np.sin(1.5), np.cos(1.5)])
+    told = told_angles(BROKK_170, told_history())
+    assert told[0] == pytest.approx(1.5 - 0.06 + 0.05 * 0.001 * sum(j * (j + 1) / 13 for j in range(13)))
+    outward, sideways = (np.array([np.cos(a), np.sin(a)]) for a in (told[0], told[0] + np.pi / 2))
     v_goal, lag = np.array([*(0.3 * outward - 0.1 * sideways), -0.15]), np.array([0.02, -0.01, 0.03])
     seen = task.observe(BROKK_170, told_history(), v_goal, lag)
     assert seen.shape == (171,)  # 6 + q2 + 4 joints x 39 + 2 x 4 rates
@@ -204,9 +228,7 @@ def test_observation_by_hand():
     np.testing.assert_allclose(seen[:3], 1.4 * 3**0.5 * np.array([1, -1 / 3, -0.5]), rtol=1e-5)
     assert seen[6] == pytest.approx(1.4 * (0.5 - 0.7) / (1.4 / 12**0.5), rel=1e-6)
     noisy = task.observe(BROKK_170, told_history(), v_goal, lag, noise=0.1)  # of a standard deviation more
-    np.testing.assert_allclose(
-        (noisy - seen)[:8], [0, 0, 0, 0.14, 0.14, 0.14, 0.14, 0.1 * 13**-0.5], atol=1e-6
-    )
+    np.testing.assert_allclose((noisy - seen)[6:33], [0.14, *([0.1 * 13**-0.5] * 26)], atol=1e-6)
     spread, lags = 12**0.5, np.arange(13)
     q1, q3, q5 = (13**0.5 * seen[i : i + 39].reshape(3, 13) for i in (7, 46, 124))  # each weighs 13^-0.5
     np.testing.assert_allclose(q1[0], (1.5 + 0.01 * (lags - 12)) / (4.28 / spread), rtol=1e-5)
@@ -219,7 +241,7 @@ def test_observation_by_hand():
     assert (np.diff(q1[0]) > 0).all()  # oldest first
     fastest = np.array([0.20, 0.28, 0.38, 0.47]) / 3**0.5
     for found, v, nominal in ((seen[163:167], v_goal, fastest), (seen[167:], lag, 0.1 * fastest)):
-        wanted = damped_rates(BROKK_170, POSE, v) / nominal * 4.2
+        wanted = damped_rates(BROKK_170, told, v) / nominal * 4.2
         np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-4)
         assert np.abs(wanted).min() > 0.02  # the four numbers are four
 
@@ -227,7 +249,7 @@ def test_observation_by_hand():
 def test_observed_tool_velocity_is_the_derivative_of_the_closed_form():
     """Seen along the heading: the derivatives of radius, heading times radius, and height."""
     history, step = told_history(), 1e-6
-    q, q_dot = history[:, 0, -1], history[:, 1, -1]
+    q, q_dot = told_angles(BROKK_170, history), history[:, 1, -1]
     after, before = (closed_form(q + sign * step * q_dot)[0] for sign in (1, -1))
     radius = np.hypot(*closed_form(q)[0][:2])
     outward = (np.hypot(*after[:2]) - np.hypot(*before[:2])) / (2 * step)
@@ -269,15 +291,15 @@ def test_measured_undoes_observe(machine):
     seen = task.observe(machine, history, v_goal, lag)
     size = 6 + len(machine.locked) + (3 * machine.history + 2) * len(machine.driven)
     assert seen.shape == (2, 3, size)
-    back = task.measured(machine, seen)
+    back, told = task.measured(machine, seen), told_angles(machine, history)
     np.testing.assert_allclose(back.v_goal, v_goal, atol=1e-6)
-    np.testing.assert_allclose(back.q, history[..., 0, -1], atol=1e-5)
+    np.testing.assert_allclose(back.q, told, atol=1e-5)
     np.testing.assert_allclose(back.q_dot, history[..., machine.driven, 1, -1], atol=1e-5)
     still = np.zeros((2, 3, machine.n, 3, machine.history))
     still[..., 0, :], still[..., machine.driven, 1, :] = history[..., 0, :], 0.1
     v_tool = task.measured(machine, task.observe(machine, still, v_goal, lag)).v_tool
     step = 1e-6 * still[..., 1, -1]
-    ahead, behind = (tool_position(machine, still[..., 0, -1] + sign * step) for sign in (1, -1))
+    ahead, behind = (tool_position(machine, told_angles(machine, still) + s * step) for s in (1, -1))
     np.testing.assert_allclose(v_tool, (ahead - behind) / 2e-6, atol=1e-5)
     alone = task.measured(machine, task.observe(machine, history[1, 2], v_goal[1, 2], lag[1, 2]))
     for whole, single in zip(back, alone, strict=True):
@@ -285,21 +307,39 @@ def test_measured_undoes_observe(machine):
 
 
 @pytest.mark.parametrize("machine", [BROKK_170, *MACHINES], ids=lambda m: m.name)
-def test_an_arm_that_is_known_changes_no_bit(machine):
-    """What the hardware path passes on from one function to the next to save time, noise or not."""
-    rng = np.random.default_rng(21)
-    for shape in ((1,), (50,)):
-        history, v_goal, lag = (a.astype(np.float32) for a in random_sight(machine, rng, shape))
-        q = history[..., 0, 0]
-        history, after, arm = task.push_measured(machine, history, q, v_goal, lag)
-        assert np.abs(arm.v_tool - tool_velocity(machine, q, history[..., 1, -1])).max() == 0
-        np.testing.assert_array_equal(
-            after, task.push_lag(machine, task.measured_arm(machine, history).v_tool, v_goal, lag)
-        )
-        clean = task.observe(machine, history, v_goal, after)
-        for noise in (0.0, 0.01, rng.uniform(-0.5, 0.5, clean.shape).astype(np.float32)):
-            seen = [task.observe(machine, history, v_goal, after, noise, known) for known in (None, arm)]
-            np.testing.assert_array_equal(*seen)
+def test_a_tick_is_measured_alike_in_simulation_and_on_hardware(machine):
+    """What both call: the newest angle, its velocity, and the lag by the tool velocity of these two."""
+    history, v_goal, lag = random_sight(machine, np.random.default_rng(21), (50,))
+    q = history[..., 0, 0]
+    after, late = task.push_measured(machine, history, q, v_goal, lag)
+    np.testing.assert_array_equal(after[..., :2, :-1], history[..., :2, 1:])
+    np.testing.assert_array_equal(after[..., 2, :], history[..., 2, :])
+    np.testing.assert_array_equal(after[..., 0, -1], q)
+    slope = estimate_velocity(after[..., 0, :], machine.velocity_samples, machine.dt)
+    np.testing.assert_array_equal(after[..., 1, -1], slope)
+    np.testing.assert_array_equal(
+        late, task.push_lag(machine, tool_velocity(machine, q, after[..., 1, -1]), v_goal, lag)
+    )
+
+
+@pytest.mark.parametrize("machine", [BROKK_170, *MACHINES], ids=lambda m: m.name)
+def test_angles_are_told_by_all_samples(machine):
+    """Exact where joints turn evenly or speed up; of noise on samples a thirteenth of the variance is left."""
+    rng, H = np.random.default_rng(24), machine.history
+    history, v_goal, lag = random_sight(machine, rng, (300,))
+    even, time = history.copy(), machine.dt * np.arange(-H - machine.velocity_samples, 1)
+    path = history[..., 0, -1:] + history[..., 1, -1:] * time + history[..., 2, -1:] * time**2
+    windows = np.lib.stride_tricks.sliding_window_view(path, machine.velocity_samples, axis=-1)
+    even[..., 1, :] = estimate_velocity(windows, machine.velocity_samples, machine.dt)[..., -H:]
+    even[..., 0, :] = path[..., -H:]
+    seen = task.observe(machine, even, v_goal, lag)
+    np.testing.assert_allclose(task.measured(machine, seen).q, even[..., 0, -1], atol=2e-5)
+    noise = rng.uniform(-0.5, 0.5, seen.shape).astype(np.float32)
+    error = task.measured(machine, task.observe(machine, even, v_goal, lag, noise)).q - even[..., 0, -1]
+    spread = (machine.column("q_max") - machine.column("q_min")) / 12  # of a uniform half of a deviation
+    share = error.std(axis=0) / spread
+    np.testing.assert_allclose(share[machine.locked], 1, atol=0.2)
+    assert (share[machine.driven] < 1.5 * H**-0.5).all()
 
 
 @pytest.mark.parametrize("machine", [BROKK_170, *MACHINES], ids=lambda m: m.name)
@@ -312,7 +352,7 @@ def test_wanted_rates_are_damped_least_squares_at_the_angles_that_are_shown(mach
     for noise in (0.0, rng.uniform(-0.5, 0.5, clean.shape).astype(np.float32)):
         seen = task.observe(machine, history, v_goal, lag, noise)
         q = task.measured(machine, seen.astype(float)).q
-        off = np.abs(q - history[..., 0, -1]).max()
+        off = np.abs(q - told_angles(machine, history)).max()
         assert off > 0.05 if np.any(noise) else off < 1e-5
         for found, v, scale in zip(
             parts(machine, seen)[-2:], (v_goal, lag), (nominal, 0.1 * nominal), strict=True
@@ -349,7 +389,10 @@ def test_scale_belongs_to_uniform_values_over_the_ranges(machine):
 
 @pytest.mark.parametrize("machine", [BROKK_170, MACHINES[0]], ids=lambda m: m.name)
 def test_noise_is_uniform_within_five_percent_and_fresh_on_what_is_sensed(machine):
-    """On tool velocity, angles and velocities in standard deviations; goal and commands are exact."""
+    """On tool velocity, angles and velocities in standard deviations; goal and commands are exact.
+
+    The directions in which velocities are given are those of the arm that is told.
+    """
     rng, num = np.random.default_rng(4), 400
     history, v_goal, lag = random_sight(machine, rng, (num,))
     state = replace(
@@ -358,13 +401,17 @@ def test_noise_is_uniform_within_five_percent_and_fresh_on_what_is_sensed(machin
     clean = task.observe(machine, history, v_goal, lag)
     seen = task.look(machine, TaskConfig(), state, rng)
     assert seen.dtype == np.float32
-    goal, tool, angles, body, *_ = parts(machine, seen - clean)
-    assert not goal.any() and not body[:, :, 2].any()
+    *_, angles, body, _, _ = parts(machine, seen - clean)
+    assert not body[:, :, 2].any()
+    back = task.measured(machine, seen)
+    np.testing.assert_allclose(back.v_goal, v_goal, atol=1e-5)
+    exact = tool_velocity(machine, back.q, history[..., 1, -1])
+    tool = headed(machine, back.q, back.v_tool - exact) * 1.4 * 3**0.5 / machine.tool_speed
     sensed = []
     for error, weight in ((tool, 1.4), (angles, 1.4), (body[:, :, :2], machine.history**-0.5)):
         draws = error.reshape(num, -1) / weight
         if draws.size:  # MACHINES[0] has no locked joint
-            assert 0.0495 < np.abs(draws).max() < 0.05 + 1e-5
+            assert 0.0495 < np.abs(draws).max() < 0.05 + 1e-4
             assert stats.kstest(draws.ravel(), stats.uniform(-0.05, 0.1).cdf).pvalue > 1e-4
         sensed.append(draws)
     draws = np.concatenate(sensed, axis=1)
@@ -389,9 +436,12 @@ def test_the_observation_of_an_environment_is_noisy_within_five_percent():
     for _ in range(3):
         state = env.state
         error = seen - task.observe(BROKK_170, state.history, state.v_goal, state.lag)
-        goal, tool, angles, body, *_ = parts(BROKK_170, error)
-        assert not goal.any() and not body[:, :, 2].any()
-        for noise in (tool / 1.4, angles / 1.4, body[:, :, :2] * 13**0.5):
+        *_, angles, body, _, _ = parts(BROKK_170, error)
+        assert not body[:, :, 2].any()
+        back = task.measured(BROKK_170, seen)
+        exact = tool_velocity(BROKK_170, back.q, state.history[..., 1, -1])
+        tool = headed(BROKK_170, back.q, back.v_tool - exact) * 3**0.5 / 0.3
+        for noise in (tool, angles / 1.4, body[:, :, :2] * 13**0.5):
             assert 0.049 < np.abs(noise).max() < 0.05 + 2e-5
         seen = env.step(env.action_space.sample())[0]
 
@@ -417,7 +467,7 @@ def test_the_tool_velocity_counts_against_the_goal():
     ahead, behind = (closed_form(q + sign * 1e-6 * q_dot)[0] for sign in (1, -1))
     v_tool = (ahead - behind) / 2e-6
     assert np.linalg.norm(v_tool) > 0.1
-    measured = task.measured_arm(BROKK_170, history).v_tool
+    measured = tool_velocity(BROKK_170, q, q_dot)
     lag = np.array([0.01, 0.02, -0.03])
     kept = task.push_lag(BROKK_170, measured, v_tool, lag)
     np.testing.assert_allclose(kept, lag * np.exp(-0.025), atol=1e-8)  # no error: forgotten, nothing more
@@ -473,7 +523,8 @@ def test_the_lag_of_an_environment_follows_what_the_policy_saw(kind):
             np.testing.assert_allclose(shown, wanted, atol=1e-5)
             assert np.abs(shown).max() > 1e-4
         lag[over], ends = 0.0, ends + over.sum()
-        np.testing.assert_allclose(env.state.lag, lag, atol=1e-6)
+        np.testing.assert_allclose(env.state.lag, lag, atol=2e-5)  # they show the arm a little smoother
+        lag = env.state.lag.astype(float)
         assert not env.state.lag[over].any() and not parts(LOW, seen)[-1][over].any()
         before = task.measured(LOW, seen)
         np.testing.assert_allclose(
@@ -572,7 +623,13 @@ def test_a_goal_holds_for_whole_ticks_and_at_least_one():
 
 def test_goals_are_redrawn_within_an_episode_and_rewards_are_for_the_old_goal():
     config = TaskConfig(
-        hold_min_s=0.2, hold_max_s=0.5, zero_goals=0.0, episode_s=60.0, noise=0.0, valve_cost=0.02
+        hold_min_s=0.2,
+        hold_max_s=0.5,
+        zero_goals=0.0,
+        episode_s=60.0,
+        noise=0.0,
+        valve_cost=0.02,
+        lag_cost=3.0,
     )
     env = TaskVectorEnv(4, machine=LOW, config=config)
     seen, _ = env.reset(seed=2)
@@ -588,7 +645,8 @@ def test_goals_are_redrawn_within_an_episode_and_rewards_are_for_the_old_goal():
         towards = step * state.q_dot
         v_tool = (closed_form(state.q + towards)[0] - closed_form(state.q - towards)[0]) / (2 * step)
         error = np.linalg.norm(before - v_tool, axis=-1)
-        np.testing.assert_allclose(reward, 1 / (1 + error) - 0.02 * travel, atol=1e-5)
+        cost = 0.02 * travel + 3 * np.linalg.norm(state.lag, axis=-1)
+        np.testing.assert_allclose(reward, 1 / (1 + error) - cost, atol=1e-5)
         np.testing.assert_allclose(info["velocity_error"], error, atol=1e-5)
         goals.append(state.v_goal)
     for row in range(4):
@@ -621,6 +679,18 @@ def test_transition_on_nets_by_hand():
     before = np.rint(POSE / BROKK_170.encoder_step)
     slope = 0.3 * (counts - before) * BROKK_170.encoder_step / 0.05  # weights -3, -1, 1, 3 over 10
     np.testing.assert_allclose(after.history[:, 1, -1], slope, atol=1e-5)
+
+
+def test_what_encoders_say_moves_no_simulated_arm():
+    net, rng = small_net(BROKK_170, np.random.default_rng(5)), np.random.default_rng(6)
+    right = wrong = task.rest_state(BROKK_170, POSE, np.zeros(3), plant=False)
+    for _ in range(20):
+        u = task.to_command(BROKK_170, rng.uniform(-1, 1, 4))
+        right = task.transition(BROKK_170, net, right, u)
+        wrong = task.transition(BROKK_170, net, wrong, u, lambda _, q: q + rng.normal(0, 0.1, q.shape))
+        np.testing.assert_array_equal(wrong.q, right.q)
+        np.testing.assert_array_equal(right.motion[:, 0, -1], right.q.astype(np.float32))
+    assert np.abs(wrong.history - right.history).max() > 0.1 and np.abs(right.q - POSE).max() > 0.01
 
 
 def test_nets_in_the_loop_agree_with_plain_loops():
@@ -737,7 +807,7 @@ def test_many_environments_equal_single_ones(kind):
         seen, reward, terminated, truncated, info = many.step(action)
         others, rewards, terminations, truncations, infos = sync.step(action)
         np.testing.assert_allclose(seen, others, atol=1e-6)
-        np.testing.assert_allclose(reward, rewards, atol=1e-6)
+        np.testing.assert_allclose(reward, rewards, atol=3e-6)
         assert np.array_equal(terminated, terminations)
         assert np.array_equal(truncated, truncations)
         assert ("final_obs" in info) == ("final_obs" in infos)
@@ -1051,7 +1121,10 @@ def test_rollout_tells_what_happened_when():
         seen = task.measured(machine, spy.seen[t])
         np.testing.assert_allclose(seen.v_goal, goals[t], atol=1e-6)
         np.testing.assert_allclose(trace.q_measured[t], q, atol=machine.encoder_step / 2 + 1e-6)
-        np.testing.assert_allclose(seen.q, trace.q_measured[t], atol=1e-5)
+        np.testing.assert_allclose(seen.q, trace.q_measured[t], atol=0.01)  # told by all its samples
+        mean, scale = task.observation_scale(machine)
+        newest = task._samples(machine, spy.seen[t] * scale + mean)[..., 0, -1]
+        np.testing.assert_allclose(newest, trace.q_measured[t][:, machine.driven], atol=1e-5)
         plant = plant_step(machine, plant, tape[t])
         np.testing.assert_allclose(trace.q[t], plant.q, atol=1e-12)
         np.testing.assert_allclose(trace.q_dot[t], (plant.q - q) * 20, atol=1e-10)
@@ -1145,10 +1218,14 @@ def test_the_papers_observation_has_plain_standard_deviations_and_no_wanted_rate
     np.testing.assert_allclose(np.linalg.norm(seen[:, :3], axis=-1), speed, atol=1e-5)
 
 
-def test_the_papers_reward_costs_no_valve_travel() -> None:
+def test_the_papers_reward_has_no_costs() -> None:
     m, net = BROKK_170, small_net(BROKK_170, np.random.default_rng(0))
     outcomes = []
-    for config in (TaskConfig(paper=True), TaskConfig(valve_cost=0.0), TaskConfig()):
+    for config in (
+        TaskConfig(paper=True),
+        TaskConfig(valve_cost=0.0, lag_cost=0.0),
+        TaskConfig(lag_cost=0.0),
+    ):
         state = task.reset(m, config, np.random.default_rng(0), 4, plant=False)
         outcomes.append(task.step(m, config, net, state, np.ones((4, 4)), np.random.default_rng(1))[1].reward)
     np.testing.assert_array_equal(outcomes[0], outcomes[1])

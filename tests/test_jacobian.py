@@ -201,6 +201,7 @@ def at_rest(q, v_goal, machine=BROKK_170, q_dot=None):
     history[..., 0, :] = q[..., None]
     if q_dot is not None:
         history[..., 1, :] = np.asarray(q_dot)[..., None]
+        history[..., 0, :] += history[..., 1, :] * machine.dt * np.arange(1 - machine.history, 1)
     return observe(machine, history, np.asarray(v_goal, float), np.zeros(3))
 
 

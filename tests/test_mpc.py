@@ -17,15 +17,6 @@ from brokk_min.plant import plant_reset, plant_step
 POSES = np.array([[1.5, 0.5, 0.58, 1.71, 1.24], [-0.8, 0.3, 0.9, 1.5, 1.0]])
 
 
-def test_the_goal_is_read_back_from_the_observation() -> None:
-    rng = np.random.default_rng(0)
-    goals = rng.uniform(-0.3, 0.3, (2, 3))
-    state = rest_state(BROKK_170, POSES, goals, plant=True)
-    noise = rng.uniform(-0.05, 0.05, observe(BROKK_170, state.history, goals, state.lag).shape)
-    seen = observe(BROKK_170, state.history, goals, state.lag, noise)
-    np.testing.assert_allclose(mpc.wanted_velocity(BROKK_170, seen, POSES), goals, atol=1e-6)
-
-
 def test_predicted_errors_are_what_the_plant_then_does() -> None:
     rng = np.random.default_rng(1)
     bound = mpc.PerfectModel(BROKK_170, POSES)

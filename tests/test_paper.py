@@ -303,7 +303,7 @@ def test_valve_opening_by_hand() -> None:
 def test_without_a_valve_cost_the_reward_is_eq2_alone() -> None:
     rewards = {}
     for cost in (0.0, 0.01):
-        env = TaskVectorEnv(20, config=TaskConfig(valve_cost=cost))
+        env = TaskVectorEnv(20, config=TaskConfig(valve_cost=cost, lag_cost=0.0))
         env.reset(seed=0)
         _, rewards[cost], ended, _, info = env.step(np.ones((20, 4), np.float32))
         assert not ended.any()

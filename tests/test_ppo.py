@@ -338,10 +338,10 @@ def test_without_a_critic_an_action_is_judged_by_its_slope(monkeypatch):
     wanted = (torch.from_numpy(slopes).flatten(0, 1) * deviation).sum(-1)
     torch.testing.assert_close(batch["advantage"], wanted, atol=1e-5, rtol=1e-5)
     assert (mean.abs() > 1).any() and "return" not in batch and "losses/explained_variance" not in scalars
-    (machine, net, rollout, gamma, cost), *none = asked
-    assert (machine, net.joints, gamma, cost) == (BROKK_170, NET.joints, TINY.gamma, TASK.valve_cost)
+    (machine, net, rollout, gamma, task), *none = asked
+    assert (machine, net.joints, gamma, task) == (BROKK_170, NET.joints, TINY.gamma, TASK)
     assert not none and np.any(over)
-    for name in ("q", "history", "v_goal"):
+    for name in ("q", "motion", "v_goal", "lag"):
         np.testing.assert_array_equal(getattr(rollout, name), [getattr(s, name) for s in begun])
     commands = to_command(BROKK_170, batch["action"].view(13, 8, 4).numpy())
     np.testing.assert_array_equal(rollout.u, commands)
@@ -531,7 +531,7 @@ PLANTED = (
     ("actions.clamp(-1, 1) - means.clamp(-1, 1)", "actions - means", actions_are_judged_by_their_slopes),
     ("actions.clamp(-1, 1) - means", "means - actions", actions_are_judged_by_their_slopes),
     ("* deviation).sum(-1)", "* deviation).mean(-1)", actions_are_judged_by_their_slopes),
-    ("state.v_goal, u, over", "state.v_goal, u, terminated", actions_are_judged_by_their_slopes),
+    ("state.lag, u, over", "state.lag, u, terminated", actions_are_judged_by_their_slopes),
     ('"return": advantages + values', '"return": advantages', advantages_are_right),
     (
         "delta = rewards + gamma * next_values - values",
