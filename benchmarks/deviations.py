@@ -40,7 +40,7 @@ from brokk_min.policy import PolicyController, load_policy
 
 M = BROKK_170
 LOW, HIGH = M.column("q_min"), M.column("q_max")
-# By hand, as `experiments.baselines` starts from.
+# By hand, as `baselines.baselines` starts from.
 GAINS = {"kp": 1.0, "ki": 8.0, "kd": 0.05, "feedback": 0.4, "ready": 0.015}
 
 

@@ -29,7 +29,7 @@ import tyro
 from gymnasium import spaces
 
 from benchmarks.rollout import random_net
-from brokk_min import experiments, ppo
+from brokk_min import baselines, ppo
 from brokk_min.actuator import ActuatorNet, load_net
 from brokk_min.environments import TaskVectorEnv
 from brokk_min.machine import BROKK_170, PWM_MAX
@@ -65,8 +65,8 @@ class Options:
 
 def pid(net: ActuatorNet, options: Options) -> Act:
     """The paper's controller as a source of actions, with a memory of its own."""
-    known = experiments.read_gains(options.gains, BROKK_170, net) if options.gains else None
-    controller = (known or experiments.baselines(BROKK_170, net))["jacobian_pid_k0.1"]
+    known = baselines.read_gains(options.gains, BROKK_170, net) if options.gains else None
+    controller = (known or baselines.baselines(BROKK_170, net))["jacobian_pid_k0.1"]
     memory: Any = None
 
     def act(observation: np.ndarray) -> np.ndarray:

@@ -13,30 +13,16 @@ import numpy as np
 from tqdm import tqdm
 
 from brokk_min import actuator, claims, excitation, figures, fitting, logs, preliminary, report, scores
+from brokk_min.baselines import plain_gains, tuned_baselines, tuned_for, tuning_set, write_gains
 from brokk_min.env import TaskConfig
-from brokk_min.experiments import (
-    Array,
-    Effort,
-    Net,
-    comparison,
-    driven_log,
-    meta,
-    plain_gains,
-    read_seeds,
-    seeds_of,
-    task_space,
-    tuned_baselines,
-    tuned_for,
-    tuning_set,
-    write_gains,
-    write_json,
-)
+from brokk_min.experiments import Array, Effort, Net, comparison, driven_log, meta, task_space
 from brokk_min.figures import Traces
 from brokk_min.jacobian import JacobianController
+from brokk_min.logs import write_json
 from brokk_min.machine import Machine
 from brokk_min.metrics import summary
 from brokk_min.policy import Policy, PolicyController, save_policy
-from brokk_min.sequences import axis_sequences, held_rows, tuning_goals
+from brokk_min.sequences import axis_sequences, held_rows
 
 
 def reproduce(
@@ -48,6 +34,7 @@ def reproduce(
     training seeds in the file `sweep`, which `sweep.sweep` wrote, join the report.
     """
     from brokk_min.ppo import PPOConfig, train  # torch, only where something is trained
+    from brokk_min.sweep import read_seeds, seeds_of
 
     seeds = read_seeds(sweep) if sweep else {}
     out.mkdir(parents=True, exist_ok=True)
@@ -62,7 +49,7 @@ def reproduce(
         learner = PPOConfig(total_steps=effort.train_steps)
         policy = train(machine, driven, TaskConfig(), learner, seed, out / "policy.npz", resume=True)
     with stage("tune"):
-        tuned, how = tuned_baselines(machine, driven, effort, seed)
+        tuned, how = tuned_baselines(machine, driven, effort.tuning_runs, effort.generations, seed)
     with stage("evaluate"):
         rl = PolicyController(machine, policy)
         measured, traces = measure(machine, net, test, rl, tuned, effort, seed)
@@ -127,7 +114,7 @@ def measure(
     compared, traces = comparison(machine, {"rl": rl, **tuned}, effort, seed)
     compared["task_space"]["rl_on_nets"] = on_nets(machine, rl, compared, seed)
     driven = scores.score(net, driven_log(machine, traces["all"], "rl"))
-    before, tuning = preliminary.run(machine, net, seed), tuning_goals(machine, *tuning_set(effort, seed))
+    before, tuning = preliminary.run(machine, net, seed), tuning_set(machine, effort.tuning_runs, seed)
     return {
         "actuator": {"test": scores.score(net, test), "driven_by_policy": driven},
         "preliminary": before,

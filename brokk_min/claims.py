@@ -214,44 +214,36 @@ def singular_claims(runs: Sequence[Run], share: Mapping[str, Array]) -> list[Cla
         runs: of `singular_controllers` from extended starts.
         share: of `speed_share` by controller in the same runs, (starts,).
     """
-    high, low = "jacobian_pid_k0.1", "jacobian_pid_k0.05"
     jerk = {name: by_start(runs, name, "all", "jerk_rms") for name in share}
-    shares, jerks = ({name: mean_interval(v) for name, v in of.items()} for of in (share, jerk))
-    pair = {
-        "k 0.1": shares[high],
-        "k 0.05": shares[low],
-        "k 0.1 less k 0.05": mean_interval(share[high] - share[low]),
-    }
-    rough = {
-        "k 0.1": jerks[high],
-        "k 0.05": jerks[low],
-        "k 0.05 less k 0.1": mean_interval(jerk[low] - jerk[high]),
-    }
-    faster, smoother = mean_interval(share["rl"] - share[low]), mean_interval(jerk["rl"] - jerk[high])
-    neither = _all(_above(faster, 0.0), _below(smoother, 0.0))
-    return [
-        _claim(
-            "Near a singularity the damping impedes accurate task space control: it slows the tool.",
-            "speed along the goal as a share of it, k = 0.1 to be below k = 0.05 with the same gains",
-            "1",
-            pair,
-            _below(pair["k 0.1 less k 0.05"], 0.0),
-        ),
-        _claim(
-            "With less damping (k = 0.05 instead of 0.1) the system moves jerkily near the singularity.",
-            "jerk, k = 0.05 to be above k = 0.1 with the same gains",
-            "m/s^3",
-            rough,
-            _above(rough["k 0.05 less k 0.1"], 0.0),
-        ),
-        _claim(
-            "RL is more robust there: neither slowed nor jerky.",
-            "share of the wanted speed to be above that of k = 0.05, and jerk [m/s^3] below that of k = 0.1",
-            "1",
-            {"rl share": shares["rl"], "less k 0.05": faster, "rl jerk": jerks["rl"], "less k 0.1": smoother},
-            neither,
-        ),
-    ]
+    return [_slowed(share), _jerky(jerk), _neither(share, jerk)]
+
+
+def _slowed(share: Mapping[str, Array]) -> Claim:
+    high, low = share["jacobian_pid_k0.1"], share["jacobian_pid_k0.05"]
+    less = mean_interval(high - low)
+    numbers = {"k 0.1": mean_interval(high), "k 0.05": mean_interval(low), "k 0.1 less k 0.05": less}
+    paper = "Near a singularity the damping impedes accurate task space control: it slows the tool."
+    what = "speed along the goal as a share of it, k = 0.1 to be below k = 0.05 with the same gains"
+    return _claim(paper, what, "1", numbers, _below(less, 0.0))
+
+
+def _jerky(jerk: Mapping[str, Array]) -> Claim:
+    high, low = jerk["jacobian_pid_k0.1"], jerk["jacobian_pid_k0.05"]
+    more = mean_interval(low - high)
+    numbers = {"k 0.1": mean_interval(high), "k 0.05": mean_interval(low), "k 0.05 less k 0.1": more}
+    paper = "With less damping (k = 0.05 instead of 0.1) the system moves jerkily near the singularity."
+    what = "jerk, k = 0.05 to be above k = 0.1 with the same gains"
+    return _claim(paper, what, "m/s^3", numbers, _above(more, 0.0))
+
+
+def _neither(share: Mapping[str, Array], jerk: Mapping[str, Array]) -> Claim:
+    faster = mean_interval(share["rl"] - share["jacobian_pid_k0.05"])
+    smoother = mean_interval(jerk["rl"] - jerk["jacobian_pid_k0.1"])
+    numbers = {"rl share": mean_interval(share["rl"]), "less k 0.05": faster}
+    numbers |= {"rl jerk": mean_interval(jerk["rl"]), "less k 0.1": smoother}
+    paper = "RL is more robust there: neither slowed nor jerky."
+    what = "share of the wanted speed to be above that of k = 0.05, and jerk [m/s^3] below that of k = 0.1"
+    return _claim(paper, what, "1", numbers, _all(_above(faster, 0.0), _below(smoother, 0.0)))
 
 
 def tracking_claims(runs: Sequence[Run], baselines: Sequence[str]) -> list[Claim]:

@@ -8,12 +8,12 @@ from typing import Any, Literal
 import numpy as np
 import tyro
 
-from brokk_min import chain, experiments, figures, preliminary, trust
+from brokk_min import baselines, chain, experiments, figures, preliminary, trust
 from brokk_min.actuator import load_net, save_net
 from brokk_min.env import Controller, TaskConfig, fitting_nets
 from brokk_min.excitation import collect
 from brokk_min.fitting import PAPER_RECIPE, FitConfig, fit
-from brokk_min.logs import Log, read_log, write_log
+from brokk_min.logs import Log, read_log, write_json, write_log
 from brokk_min.machine import BROKK_170
 from brokk_min.metrics import summary
 from brokk_min.options import Command, Name, WrongUse, check, chosen_policy
@@ -79,7 +79,7 @@ class Fit:
             meta: dict[str, Any] = {"seed": self.seed, "rate": net.rate, "history": net.history}
             meta |= {"machine": net.machine, "dead_zone": net.dead_zone}
             meta |= {"logs": [str(p) for p in self.logs], "test": [str(p) for p in self.test]}
-            experiments.write_json(self.json, {"meta": meta, **verdict})
+            write_json(self.json, {"meta": meta, **verdict})
         if self.figure:
             figures.save(self.figure, figures.plot_worst_and_median(net, test))
         print(f"nets of {net.machine or 'no known machine'}, dead zone {net.dead_zone} of full command")
@@ -202,9 +202,11 @@ class Evaluate(Command):
         print(f"gains of the baselines: {gains or 'tuned now'}", file=sys.stderr)
         controllers: dict[str, Controller] = {"rl": PolicyController(machine, policy)}
         if gains:
-            controllers |= experiments.read_gains(gains, machine, policy.net)
+            controllers |= baselines.read_gains(gains, machine, policy.net)
         else:
-            tuned, _ = experiments.tuned_baselines(machine, policy.net, experiments.Effort(), self.seed)
+            effort = experiments.Effort()
+            how_much = effort.tuning_runs, effort.generations
+            tuned, _ = baselines.tuned_baselines(machine, policy.net, *how_much, self.seed)
             controllers |= tuned
         if self.perfect_model:
             controllers |= experiments.bounds(machine, starts)
@@ -215,7 +217,7 @@ class Evaluate(Command):
             meta |= {"policy": str(path), "gains": str(gains or "tuned now"), "plant": self.plant}
             names = ", ".join(sequence.name for sequence in sequences)
             meta |= {"commands": str(self.commands or names), "starts": str(self.starts or self.num_starts)}
-            experiments.write_json(self.json, {"meta": meta, "runs": runs})
+            write_json(self.json, {"meta": meta, "runs": runs})
         _print_means(runs, len(sequences))
 
 
@@ -266,7 +268,7 @@ class Preliminary(Command):
             figures.save(self.out / f"{name}.png", figure)
             print(self.out / f"{name}.png")
         meta = experiments.meta(machine, self.seed) | {"actuator": str(self.actuator)}
-        experiments.write_json(self.out / "preliminary.json", {"meta": meta, **numbers})
+        write_json(self.out / "preliminary.json", {"meta": meta, **numbers})
         print(self.out / "preliminary.json")
         tool = numbers["sim_to_real"]["tool"]["position_error_mean"]
         print(f"tool, nets beside machine over 30 s: {tool:.4f} m apart in the mean")

@@ -1,15 +1,13 @@
-"""The paper's experiment as numbers: baselines and their tuning, the comparison, the bound, robustness.
+"""The paper's experiment as numbers: the comparison, the bound, robustness, the singular case.
 
 `task_space` runs every controller on the same starts and velocity sequences on the same machine.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +15,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from brokk_min import __version__, actuator, claims, fitting, jacobian, kinematics, logs
+from brokk_min.baselines import PAPERS, STRONGER
 from brokk_min.env import Controller, TaskConfig, Trace, rollout
 from brokk_min.figures import Traces
 from brokk_min.jacobian import JacobianController
@@ -40,17 +39,11 @@ from brokk_min.sequences import (
     scored_starts,
     start_kinds,
     task_sequences,
-    tuning_goals,
 )
 from brokk_min.variations import Sensor, exact, supply_demand, variations
 
 Array = NDArray[np.floating[Any]]
 Net = actuator.ActuatorNet
-PAPERS = ("jacobian_pid_k0.1", "jacobian_pid_k0.05")  # the paper's two baselines
-STRONGER = ("jacobian_pid_ff",)  # than the paper's: its sentences are put to it, too
-AWAKE = "jacobian_pid_ff_awake"  # the same, its valves never closed: what the policy learns to do
-
-# --- controllers ------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -68,117 +61,6 @@ class Effort:
 
 
 QUICK = Effort(0.1, 700, 200_000, 4, 4, 8, 2, 3.0)
-
-
-def baselines(machine: Machine, net: Net) -> dict[str, JacobianController]:
-    """The paper's two baselines and two with feed-forward, with gains set by hand. Paper: Sec. 4.2
-
-    The last keeps its valves barely open even while the tool is to stand still.
-    """
-    w0 = jacobian.manipulability_threshold(machine)
-    pid = jacobian.join_gains(machine, {"kp": 1.0, "ki": 8.0, "kd": 0.05, "feedback": 0.4, "ready": 0.015})
-    mild = jacobian.join_gains(machine, {"kp": 0.2, "ki": 0.5, "kd": 0.02, "feedback": 0.1, "ready": 0.015})
-    steady = jacobian.steady_map(machine, net)
-    return {
-        "jacobian_pid_k0.1": JacobianController(machine, pid, 0.1, w0),
-        "jacobian_pid_k0.05": JacobianController(machine, pid, 0.05, w0),
-        "jacobian_pid_ff": JacobianController(machine, mild, 0.1, w0, steady),
-        AWAKE: JacobianController(machine, mild, 0.1, w0, steady, awake=True),
-    }
-
-
-def tuning_set(effort: Effort, seed: int) -> tuple[int, float, int]:
-    """Number, length [s] and seed of the runs that the baselines are tuned on: apart from all that scores."""
-    return effort.tuning_runs, 12.0, seed + 1000
-
-
-def tuned_baselines(
-    machine: Machine, net: Net, effort: Effort, seed: int
-) -> tuple[dict[str, JacobianController], dict[str, dict[str, Any]]]:
-    """The baselines, each tuned on the machine itself, and how their tuning went, for JSON.
-
-    The cost is the figure that is scored, mean |v_goal - v_tool|, on `tuning_goals`. Tuning on the
-    machine favours the baselines: the policy never sees it. The least of many noisy costs flatters, so
-    "cost_anew" is the mean of 16 more of the gains that were found.
-    """
-    start, goals = tuning_goals(machine, *tuning_set(effort, seed))
-
-    def cost(controller: JacobianController) -> Array:
-        candidates, runs = len(controller.gains), len(start)
-        batch = replace(controller, gains=np.repeat(controller.gains, runs, axis=0))
-        wanted, rng = np.tile(goals, (1, candidates, 1)), np.random.default_rng(seed)
-        trace = rollout(machine, batch, np.tile(start, (candidates, 1)), wanted, TaskConfig(), rng)
-        error = np.linalg.norm(wanted - trace.v_tool, axis=-1)
-        return np.asarray(error.mean(0).reshape(candidates, runs).mean(1))
-
-    tuned, how = {}, {}
-    for name, controller in baselines(machine, net).items():
-        tuned[name], costs = jacobian.tune(controller, cost, seed, effort.generations, name)
-        anew = float(cost(replace(tuned[name], gains=np.tile(tuned[name].gains, (16, 1)))).mean())
-        at_bound = jacobian.gains_at_bound(tuned[name])
-        how[name] = {"seed": seed, "cost": costs, "cost_anew": anew, "at_bound": at_bound}
-    return tuned, how
-
-
-def plain_gains(controllers: Mapping[str, JacobianController]) -> dict[str, dict[str, list[float]]]:
-    """Gains of each baseline by name, for JSON."""
-    named = {name: jacobian.split_gains(c.gains) for name, c in controllers.items()}
-    return {name: {key: gain.tolist() for key, gain in gains.items()} for name, gains in named.items()}
-
-
-def write_gains(path: Path, controllers: Mapping[str, JacobianController], about: Mapping[str, Any]) -> None:
-    """Write the baselines' gains as `read_gains` reads them; `about` is the `meta` of their tuning."""
-    write_json(path, {"meta": about, "gains": plain_gains(controllers)})
-
-
-def read_gains(path: Path, machine: Machine, net: Net) -> dict[str, JacobianController]:
-    """The baselines with gains that `reproduce` wrote.
-
-    Raises:
-        ValueError: no such file, or gains of other controllers or joints, tuned for another machine or with
-            other nets, whose feed-forward is another.
-    """
-    result, wanted = baselines(machine, net), tuned_for(machine, net)
-    try:
-        table = json.loads(path.read_text())
-        found = {name: table["meta"].get(name) for name in wanted}
-        if found != wanted:
-            raise ValueError(f"gains for {found}")
-        for name, controller in result.items():
-            result[name] = replace(controller, gains=jacobian.join_gains(machine, table["gains"][name]))
-    except (AttributeError, OSError, KeyError, TypeError, ValueError) as error:
-        nets = f"{machine.name} with nets {wanted['actuator']}"
-        raise ValueError(f"{path}: expected gains for {nets}, got {error!r}") from error
-    return result
-
-
-def tuned_for(machine: Machine, net: Net) -> dict[str, str]:
-    """What gains and sweeps belong to: the machine's name and the fingerprint of its driven joints' nets."""
-    return {"machine": machine.name, "actuator": actuator.fingerprint(net)}
-
-
-def read_seeds(path: Path) -> dict[str, Any]:
-    """The `sweep.json` of a sweep, its "table" that of `sweep.table`; ValueError: it is none."""
-    try:
-        found: dict[str, Any] = json.loads(path.read_text())
-        if not {"mean", "low", "high"} <= set(found["table"]["rl"]["velocity_error_all"]):
-            raise ValueError(f"{found['table']['rl']}")
-        dict(found["meta"])
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: expected the sweep.json of a sweep, got {error!r}") from error
-    return found
-
-
-def seeds_of(machine: Machine, net: Net, sweep: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """The table of a sweep that `read_seeds` read; ValueError: one of another machine or with other nets."""
-    wanted = tuned_for(machine, net)
-    found = {name: sweep["meta"].get(name) for name in wanted}
-    if found != wanted:
-        raise ValueError(f"sweep: expected one with {wanted}, got {found}")
-    return dict(sweep["table"])
-
-
-# --- the comparison -----------------------------------------------------------------------------------
 
 
 def task_space(
@@ -387,13 +269,6 @@ def driven_log(machine: Machine, traces: Traces, controller: str) -> logs.Log:
             velocity = logs.velocity_of(q, machine.velocity_samples, machine.rate)
             recordings.append(logs.Recording(f"{name}_{sequence}_{i:02d}", u, q, velocity))
     return logs.Log(machine.names, tuple(recordings), rate=machine.rate)
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write JSON whole, floats as they are."""
-    with logs.whole_file(path, "w") as file:
-        json.dump(value, file, indent=1, allow_nan=False)
-        file.write("\n")
 
 
 def meta(machine: Machine, seed: int) -> dict[str, Any]:

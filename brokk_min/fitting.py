@@ -81,15 +81,9 @@ def _train(training: TrainingSet, config: FitConfig, seed: int, estimator: int |
     """Weights of all nets, one Adam step for all of them at a time; `estimator` as in `_rollout_loss`."""
     import torch
 
-    n, inputs, hidden = *training.input_mean.shape, config.hidden
+    n, inputs = training.input_mean.shape
     generator = torch.Generator().manual_seed(seed)
-    weights: list[torch.Tensor] = []
-    for rows, columns in [(inputs, hidden), (hidden, hidden), (hidden, 1)]:
-        bound = (6 / rows) ** 0.5  # He's uniform bound for ReLU
-        weights.append((torch.rand(n, rows, columns, generator=generator) * 2 - 1) * bound)
-        weights.append(torch.zeros(n, columns))
-    for weight in weights:
-        weight.requires_grad_()
+    weights = _first_weights(n, inputs, config.hidden, generator)
     optimizer = torch.optim.Adam(weights, lr=config.learning_rate)
     runs_free = config.rollout > 1 and all(map(len, training.far_ends))
     turn = round(0.65 * config.steps) if runs_free else config.steps
@@ -117,6 +111,18 @@ def _train(training: TrainingSet, config: FitConfig, seed: int, estimator: int |
     if not all(torch.isfinite(weight).all() for weight in weights):
         raise ValueError("weights: expected finite numbers at the end of the fit, got nan or inf")
     return tuple(weight.detach().numpy() for weight in weights)
+
+
+def _first_weights(n: int, inputs: int, hidden: int, generator: Any) -> list[Any]:
+    """Weights and biases of n nets, layer by layer, as `ActuatorNet.weights` has them."""
+    import torch
+
+    weights: list[torch.Tensor] = []
+    for rows, columns in [(inputs, hidden), (hidden, hidden), (hidden, 1)]:
+        bound = (6 / rows) ** 0.5  # He's uniform bound for ReLU
+        weights.append((torch.rand(n, rows, columns, generator=generator) * 2 - 1) * bound)
+        weights.append(torch.zeros(n, columns))
+    return [weight.requires_grad_() for weight in weights]
 
 
 def _rollout_loss(

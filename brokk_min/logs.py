@@ -9,6 +9,7 @@ machine's, jitter allowed. A recording whose name ends in `_return` is a way bac
 from __future__ import annotations
 
 import csv
+import json
 import os
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -71,6 +72,13 @@ def whole_file(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
         if isinstance(error, OSError) and error.filename is None:
             error.filename = str(path)  # a full disk does not say which file it was
         raise
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write JSON whole, floats as they are."""
+    with whole_file(path, "w") as file:
+        json.dump(value, file, indent=1, allow_nan=False)
+        file.write("\n")
 
 
 def load_arrays(path: Path) -> dict[str, NDArray[Any]]:

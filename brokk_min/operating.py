@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 import tyro
 
-from brokk_min import blackbox, experiments, hw, play, remote, replay, view, wishes
+from brokk_min import baselines, blackbox, hw, play, remote, replay, view, wishes
 from brokk_min.bus import open_line, read_frames
 from brokk_min.env import Controller
 from brokk_min.export import export_onnx
@@ -99,7 +99,7 @@ class Drive(Command):
         if self.controller == "rl":
             return PolicyController(machine, policy)
         gains = self.gains or self.policy.with_name("gains.json")
-        return experiments.read_gains(gains, machine, policy.net)["jacobian_pid_k0.1"]
+        return baselines.read_gains(gains, machine, policy.net)["jacobian_pid_k0.1"]
 
 
 def _show(text: str) -> None:
@@ -165,8 +165,8 @@ class Play(Command):
         path, gains = chosen_policy(machine, self.policy, self.gains)
         if self.policy or path.exists():
             policy = load_policy(path, machine)
-            known = experiments.read_gains(gains, machine, policy.net) if gains else None
-            known = known or experiments.baselines(machine, policy.net)
+            known = baselines.read_gains(gains, machine, policy.net) if gains else None
+            known = known or baselines.baselines(machine, policy.net)
             controllers = {"rl": PolicyController(machine, policy), "jacobian": known["jacobian_pid_k0.1"]}
             print(f"gains of the Jacobian controller: {gains or 'set by hand'}", file=sys.stderr)
         play.play(machine, controllers, where, self.attempts)

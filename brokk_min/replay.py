@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from tqdm import tqdm
 
-from brokk_min import experiments, logs, view
+from brokk_min import baselines, experiments, logs, view
 from brokk_min.actuator import ActuatorNet
 from brokk_min.bus import read_frames
 from brokk_min.env import Controller, Trace
@@ -108,7 +108,7 @@ def read_results(machine: Machine, path: Path, controllers: Sequence[str]) -> Re
     policy = load_policy(Path(told["policy"]), machine)
     known: dict[str, Controller] = {"rl": PolicyController(machine, policy)}
     if set(controllers) - {"rl"}:
-        known |= experiments.read_gains(Path(told["gains"]), machine, policy.net)
+        known |= baselines.read_gains(Path(told["gains"]), machine, policy.net)
     net, named = policy.net if told["plant"] == "net" else None, {s.name: s for s in sequences}
     return Results(path, rows, named, starts if given is None else given, known, net, seed)
 

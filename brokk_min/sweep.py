@@ -23,9 +23,10 @@ from tqdm import tqdm
 
 from brokk_min import experiments
 from brokk_min.actuator import ActuatorNet
+from brokk_min.baselines import read_gains, tuned_for
 from brokk_min.env import TaskConfig
 from brokk_min.extras import need
-from brokk_min.logs import expect_same
+from brokk_min.logs import expect_same, write_json
 from brokk_min.machine import Machine
 from brokk_min.metrics import by_start, mean_interval
 from brokk_min.policy import PolicyController, load_policy
@@ -52,7 +53,7 @@ def one_seed(
         trained = train(machine, net, task, config, seed, policy_file, again)
     rl = PolicyController(machine, trained)
     runs = _on_the_machine(machine, {"rl": rl}, starts)
-    experiments.write_json(result_file, {"identity": identity, "runs": runs})
+    write_json(result_file, {"identity": identity, "runs": runs})
     return runs
 
 
@@ -148,13 +149,13 @@ def sweep(
                 results[jobs[job]] = job.result()
             except Exception as error:  # one seed costs itself, not the others
                 failed[jobs[job]] = str(error)
-    others = experiments.read_gains(gains, machine, net) if gains else {}
+    others = read_gains(gains, machine, net) if gains else {}
     beside = _on_the_machine(machine, others, starts)
     figures = table([results[seed] for seed in sorted(results)], beside)
     runs = [{"seed": seed} | row for seed in sorted(results) for row in results[seed]]
-    meta = experiments.meta(machine, min(seeds)) | experiments.tuned_for(machine, net)
+    meta = experiments.meta(machine, min(seeds)) | tuned_for(machine, net)
     meta |= {"seeds": len(seeds), "failed": failed}
-    experiments.write_json(out / "sweep.json", {"meta": meta, "table": figures, "runs": runs + beside})
+    write_json(out / "sweep.json", {"meta": meta, "table": figures, "runs": runs + beside})
     if failed:
         raise ValueError("; ".join(f"seed {seed}: {why}" for seed, why in sorted(failed.items())))
     return figures
@@ -179,6 +180,27 @@ def table(seeds: Sequence[Rows], beside: Rows) -> dict[str, dict[str, Any]]:
         rows[name] = means(beside, name)[None]
         rows |= {f"rl less {name}": rows["rl"] - rows[name]} if seeds else {}
     return {c: dict(zip(columns, map(mean_interval, of.T), strict=True)) for c, of in rows.items()}
+
+
+def read_seeds(path: Path) -> dict[str, Any]:
+    """The `sweep.json` of a sweep, its "table" that of `sweep.table`; ValueError: it is none."""
+    try:
+        found: dict[str, Any] = json.loads(path.read_text())
+        if not {"mean", "low", "high"} <= set(found["table"]["rl"]["velocity_error_all"]):
+            raise ValueError(f"{found['table']['rl']}")
+        dict(found["meta"])
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: expected the sweep.json of a sweep, got {error!r}") from error
+    return found
+
+
+def seeds_of(machine: Machine, net: ActuatorNet, sweep: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """The table of a sweep that `read_seeds` read; ValueError: one of another machine or with other nets."""
+    wanted = tuned_for(machine, net)
+    found = {name: sweep["meta"].get(name) for name in wanted}
+    if found != wanted:
+        raise ValueError(f"sweep: expected one with {wanted}, got {found}")
+    return dict(sweep["table"])
 
 
 def show(figures: Mapping[str, Mapping[str, Any]]) -> str:

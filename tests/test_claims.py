@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from helpers_machines import obedient_net
 
-from brokk_min import claims, experiments, report
+from brokk_min import baselines, claims, report
 from brokk_min.env import Measured, Trace
 from brokk_min.machine import BROKK_170
 
-PAPERS = experiments.PAPERS
+PAPERS = baselines.PAPERS
 POSE = np.array([1.5, 0.5, 0.58, 1.71, 1.24])
 
 
@@ -132,7 +132,7 @@ def test_direction(down: float | tuple[float, ...], holds: bool) -> None:
 
     One run that goes back badly says nothing of the others.
     """
-    pid = experiments.baselines(BROKK_170, obedient_net(BROKK_170))["jacobian_pid_k0.1"]
+    pid = baselines.baselines(BROKK_170, obedient_net(BROKK_170))["jacobian_pid_k0.1"]
     goals = np.repeat([[0.2, 0.0, 0.0], [-0.2, 0.0, 0.0]], 20, axis=0)
     poses = POSE + 0.02 * np.arange(4)[:, None]
     trace = still_trace(40, poses, goals[:, None], np.zeros(5))

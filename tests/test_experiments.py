@@ -15,11 +15,11 @@ import pytest
 from matplotlib.colors import to_rgb
 
 from benchmarks.rollout import random_net
-from brokk_min import chain, experiments, figures, jacobian, kinematics, report, variations
+from brokk_min import baselines, chain, experiments, figures, jacobian, kinematics, report, variations
 from brokk_min.actuator import ActuatorNet, fingerprint, load_net, save_net
 from brokk_min.env import Measured, TaskConfig, Trace, measured, rollout, to_command
 from brokk_min.kinematics import joint_rates, tool_position
-from brokk_min.logs import velocity_of
+from brokk_min.logs import velocity_of, write_json
 from brokk_min.machine import BROKK_170, Machine, read_encoder
 from brokk_min.metrics import metrics
 from brokk_min.plant import plant_reset, plant_step, speed_limits
@@ -180,18 +180,18 @@ def net_of_driven_joints() -> ActuatorNet:
 def test_gains_of_another_machine_or_of_other_nets_are_refused(tmp_path: Path) -> None:
     """What they are for is said, and what was wanted; a file that does not say it is refused as well."""
     path, net = tmp_path / "gains.json", net_of_driven_joints()
-    tuned, about = experiments.baselines(BROKK_170, net), experiments.tuned_for(BROKK_170, net)
+    tuned, about = baselines.baselines(BROKK_170, net), baselines.tuned_for(BROKK_170, net)
     for key, value in {"machine": "digger", "actuator": "0123456789abcdef"}.items():
-        experiments.write_gains(path, tuned, about | {key: value})
+        baselines.write_gains(path, tuned, about | {key: value})
         with pytest.raises(ValueError, match=rf"gains.json: expected gains for brokk170.*{value}") as error:
-            experiments.read_gains(path, BROKK_170, net)
+            baselines.read_gains(path, BROKK_170, net)
         assert about["actuator"] in str(error.value)
-    experiments.write_gains(path, tuned, {"machine": "brokk170"})
+    baselines.write_gains(path, tuned, {"machine": "brokk170"})
     with pytest.raises(ValueError, match=rf"nets {about['actuator']}, got .*'actuator': None"):
-        experiments.read_gains(path, BROKK_170, net)
+        baselines.read_gains(path, BROKK_170, net)
     path.write_text('{"meta": [], "gains": {}}')
     with pytest.raises(ValueError, match=r"gains.json: expected gains for brokk170"):
-        experiments.read_gains(path, BROKK_170, net)
+        baselines.read_gains(path, BROKK_170, net)
 
 
 def test_a_fingerprint_is_of_the_nets_and_survives_a_file(tmp_path: Path) -> None:
@@ -209,14 +209,14 @@ def test_a_fingerprint_is_of_the_nets_and_survives_a_file(tmp_path: Path) -> Non
 )
 def test_damaged_gains_are_refused(tmp_path: Path, change: dict[str, object], message: str) -> None:
     net, path = net_of_driven_joints(), tmp_path / "gains.json"
-    table = experiments.plain_gains(experiments.baselines(BROKK_170, net))
-    about = experiments.tuned_for(BROKK_170, net)
+    table = baselines.plain_gains(baselines.baselines(BROKK_170, net))
+    about = baselines.tuned_for(BROKK_170, net)
     path.write_text(json.dumps({"meta": about, "gains": table}))
-    assert experiments.plain_gains(experiments.read_gains(path, BROKK_170, net)) == table
+    assert baselines.plain_gains(baselines.read_gains(path, BROKK_170, net)) == table
     table["jacobian_pid_ff"] |= change
     path.write_text(json.dumps({"meta": about, "gains": table}))
     with pytest.raises(ValueError, match=rf"gains.json: expected gains for brokk170.*{message}"):
-        experiments.read_gains(path, BROKK_170, net)
+        baselines.read_gains(path, BROKK_170, net)
 
 
 @pytest.fixture(scope="module")
@@ -392,9 +392,9 @@ def test_gains_read_back_give_the_same_controller(twice: tuple[Path, Path]) -> N
     from brokk_min.policy import load_policy
 
     net = load_policy(twice[0] / "policy.npz", BROKK_170).net
-    read = experiments.read_gains(twice[0] / "gains.json", BROKK_170, net)
+    read = baselines.read_gains(twice[0] / "gains.json", BROKK_170, net)
     written = json.loads((twice[0] / "results.json").read_text())["gains"]
-    assert experiments.plain_gains(read) == written
+    assert baselines.plain_gains(read) == written
 
 
 def test_the_whole_chain_spends_what_fit_and_train_do_by_default():
@@ -536,7 +536,7 @@ def test_sentences_are_put_to_the_papers_baselines_and_to_the_stronger_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     net = net_of_driven_joints()
-    pids = experiments.baselines(BROKK_170, net)
+    pids = baselines.baselines(BROKK_170, net)
     asked: list[Any] = []
 
     def said(name: str, count: int) -> Any:
@@ -560,8 +560,8 @@ def test_sentences_are_put_to_the_papers_baselines_and_to_the_stronger_one(
     ]  # fmt: skip
     assert [claim["numbers"]["n"] for claim in found] == [1, 1, 2, 3, 3, 3]
     assert [claim["stronger"]["numbers"]["n"] for claim in found] == [4, 4, 5, 6, 6, 6]
-    assert asked[0] == ("drift_claims", [{"run": 1}], experiments.PAPERS)
-    assert asked[3][2] == experiments.STRONGER == asked[5][2]
+    assert asked[0] == ("drift_claims", [{"run": 1}], baselines.PAPERS)
+    assert asked[3][2] == baselines.STRONGER == asked[5][2]
     for i, name in ((1, "jacobian_pid_k0.1"), (4, "jacobian_pid_ff")):
         assert (
             asked[i][:4] == ("direction_claim", BROKK_170, pids[name], f"trace of {name}")
@@ -574,7 +574,7 @@ def test_damping_alone_is_compared_near_a_singularity() -> None:
     empty = experiments.singular_case(BROKK_170, {}, np.zeros((0, 5)), 1.0, 0)
     assert empty == ({}, {"summary": {}, "claims": []})
     start = np.array([[0.0, 1.139, 0.97, 2.804, 1.948], [1.0, 1.2, 0.9, 2.8, 1.9]])
-    pids = experiments.baselines(BROKK_170, net_of_driven_joints())
+    pids = baselines.baselines(BROKK_170, net_of_driven_joints())
     traces, found = experiments.singular_case(BROKK_170, {"rl": _Idle(), **pids}, start, 1.5, 3)
     names = ("rl", "jacobian_pid_k0.1", "jacobian_pid_k0.05")
     assert list(traces) == [(c, s) for c in names for s in ("least_half", "least_quarter")]
@@ -592,12 +592,12 @@ def test_damping_alone_is_compared_near_a_singularity() -> None:
 
 def test_gains_are_written_by_name_and_tuning_is_apart_from_scoring(tmp_path: Path) -> None:
     net = net_of_driven_joints()
-    pids = experiments.baselines(BROKK_170, net)
-    assert list(pids) == [*experiments.PAPERS, "jacobian_pid_ff", "jacobian_pid_ff_awake"]
+    pids = baselines.baselines(BROKK_170, net)
+    assert list(pids) == [*baselines.PAPERS, "jacobian_pid_ff", "jacobian_pid_ff_awake"]
     assert [(c.k, c.awake, c.feedforward is not None) for c in pids.values()] == [
         (0.1, False, False), (0.05, False, False), (0.1, False, True), (0.1, True, True),
     ]  # fmt: skip
-    plain = experiments.plain_gains(pids)
+    plain = baselines.plain_gains(pids)
     wanted = {
         "kp": (1.0, 0.2),
         "ki": (8.0, 0.5),
@@ -609,11 +609,12 @@ def test_gains_are_written_by_name_and_tuning_is_apart_from_scoring(tmp_path: Pa
         assert {key: set(np.ravel(values).round(9)) for key, values in gains.items()} == {
             key: {values["ff" in name]} for key, values in wanted.items()
         }
-    assert experiments.tuning_set(experiments.Effort(tuning_runs=7), 3) == (7, 12.0, 1003)
-    experiments.write_json(tmp_path / "a.json", {"b": [0.1]})
+    found, again = baselines.tuning_set(BROKK_170, 7, 3), tuning_goals(BROKK_170, 7, 12.0, 1003)
+    assert all(map(np.array_equal, found, again))
+    write_json(tmp_path / "a.json", {"b": [0.1]})
     assert (tmp_path / "a.json").read_text() == '{\n "b": [\n  0.1\n ]\n}\n'
     with pytest.raises(ValueError, match="not JSON compliant"):
-        experiments.write_json(tmp_path / "a.json", {"b": float("nan")})
+        write_json(tmp_path / "a.json", {"b": float("nan")})
     about = experiments.meta(BROKK_170, 4)
     assert about == {"brokk_min": "0.1.0", "machine": "brokk170", "seed": 4, "units": "m, m/s, s, rad"}
 

@@ -25,7 +25,7 @@ from canopen.objectdictionary import ObjectDictionary, ODArray, ODRecord, ODVari
 from helpers_bus import START, Hand, Push, World
 from helpers_machines import small_net
 
-from brokk_min import bus, experiments, hw, simulator, wishes
+from brokk_min import baselines, bus, hw, simulator, wishes
 from brokk_min.__main__ import main
 from brokk_min.actuator import load_net
 from brokk_min.env import observation_scale
@@ -58,7 +58,7 @@ def folder(policy: Policy, tmp_path: Path) -> Path:
     save_policy(tmp_path / "policy.npz", policy)
     gains = {k: [1.0] * 4 for k in ("kp", "ki", "kd")} | {"kd": [0.0] * 4, "feedback": 0.1, "ready": 0.0}
     names = ("jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff", "jacobian_pid_ff_awake")
-    table = {"meta": experiments.tuned_for(BROKK_170, policy.net), "gains": dict.fromkeys(names, gains)}
+    table = {"meta": baselines.tuned_for(BROKK_170, policy.net), "gains": dict.fromkeys(names, gains)}
     (tmp_path / "gains.json").write_text(json.dumps(table))
     (tmp_path / "c.csv").write_text(
         "sequence,time,vx,vy,vz\nup,0,0,0,0.2\nup,1.0,0,0,0\nside,0,0,0.1,0\nside,0.4,0,0,0\n"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers_machines import obedient_net
 
-from brokk_min import experiments, mpc
+from brokk_min import baselines, mpc
 from brokk_min.env import TaskConfig, observe, rest_state, rollout
 from brokk_min.kinematics import tool_velocity
 from brokk_min.machine import BROKK_170, limit_command
@@ -105,7 +105,7 @@ def test_the_bound_leaves_less_error_than_the_baselines() -> None:
     goals = np.zeros((50, 2, 3))
     goals[10:30, :, 2], goals[30:, :, 1] = 0.15, -0.1
     errors = {}
-    baseline = experiments.baselines(BROKK_170, obedient_net(BROKK_170))["jacobian_pid_k0.1"]
+    baseline = baselines.baselines(BROKK_170, obedient_net(BROKK_170))["jacobian_pid_k0.1"]
     for name, controller in {"bound": mpc.PerfectModel(BROKK_170, POSES), "baseline": baseline}.items():
         trace = rollout(BROKK_170, controller, POSES, goals, TaskConfig(), np.random.default_rng(0))
         errors[name] = np.linalg.norm(goals - trace.v_tool, axis=-1)

@@ -20,6 +20,7 @@ from helpers_machines import small_net
 
 import brokk_min
 from brokk_min import (
+    baselines,
     excitation,
     experiments,
     figures,
@@ -234,8 +235,8 @@ def test_the_constants_are_the_papers() -> None:
     assert (experiments.Effort().hours, max(scores.HORIZONS)) == (1.0, 30)
     layers = [layer.out_features for layer in ppo.mlp(7, 1, 1.0) if hasattr(layer, "out_features")]
     assert layers == [256, 128, 64, 1]
-    baselines = experiments.baselines(BROKK_170, small_net(BROKK_170, np.random.default_rng(0)))
-    assert {name: c.k for name, c in baselines.items()} == {
+    controllers = baselines.baselines(BROKK_170, small_net(BROKK_170, np.random.default_rng(0)))
+    assert {name: c.k for name, c in controllers.items()} == {
         "jacobian_pid_k0.1": 0.1,
         "jacobian_pid_k0.05": 0.05,
         "jacobian_pid_ff": 0.1,
@@ -367,7 +368,7 @@ def test_figure_6_draws_its_starts_and_judges_singular_ones() -> None:
     assert np.max(figure.axes[0].lines[1].get_xdata()) == pytest.approx(reach)
     plt.close("all")
     net = small_net(BROKK_170, np.random.default_rng(0))
-    controllers = {"rl": Steady(0.3), **experiments.baselines(BROKK_170, net)}
+    controllers = {"rl": Steady(0.3), **baselines.baselines(BROKK_170, net)}
     traces, found = experiments.singular_case(BROKK_170, controllers, STARTS, 2.0, 0)
     assert {s for _, s in traces} == {"least_half", "least_quarter"} and len(found["claims"]) == 3
     assert [len(found[key]) for key in ("manipulability", "least")] == [2, 2]

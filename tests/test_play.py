@@ -25,7 +25,7 @@ from test_hw import BASELINE, Virtual
 from test_view import boxes_of_words
 
 from benchmarks.bus import random_policy
-from brokk_min import experiments, looks, play, remote, replay, ticks, tracing, view, wishes
+from brokk_min import baselines, looks, play, remote, replay, ticks, tracing, view, wishes
 from brokk_min.__main__ import main
 from brokk_min.bus import OPERATOR, SYNC, TPDO1, WISH, Frame
 from brokk_min.gate import encoder_raw
@@ -701,8 +701,8 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("results")
     policy = random_policy(np.random.default_rng(0))
     save_policy(folder / "policy.npz", policy)
-    about = experiments.tuned_for(BROKK_170, policy.net)
-    experiments.write_gains(folder / "gains.json", experiments.baselines(BROKK_170, policy.net), about)
+    about = baselines.tuned_for(BROKK_170, policy.net)
+    baselines.write_gains(folder / "gains.json", baselines.baselines(BROKK_170, policy.net), about)
     (folder / "commands.csv").write_text(
         "sequence,time,vx,vy,vz\nside,0,0,0.2,0\nside,1.5,0,0,0\nside,2,0,0,0\n"
     )

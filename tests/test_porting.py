@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from helpers_bus import World
 
-from brokk_min import experiments, wishes
+from brokk_min import baselines, wishes
 from brokk_min.__main__ import main
 from brokk_min.actuator import load_net
 from brokk_min.env import fitting_nets
@@ -128,8 +128,8 @@ def test_the_commands_run_one_after_the_other(here: Path, mini: Machine) -> None
     for words in COMMANDS[:4]:
         if words[0] == "evaluate":  # gains, so that nothing is tuned
             net = fitting_nets(mini, load_net(Path("net.npz")))
-            about = experiments.tuned_for(mini, net)
-            experiments.write_gains(Path("gains.json"), experiments.baselines(mini, net), about)
+            about = baselines.tuned_for(mini, net)
+            baselines.write_gains(Path("gains.json"), baselines.baselines(mini, net), about)
         given = [word for word in words if word not in ("--hours", "1")]
         assert main([*given, *QUICK[words[0]].split()]) == 0, words
     runs = json.loads(Path("nets.json").read_text())

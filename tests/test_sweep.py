@@ -12,7 +12,7 @@ import pytest
 from helpers_machines import small_net
 from helpers_sweep import die_until, refuse
 
-from brokk_min import experiments
+from brokk_min import baselines
 from brokk_min import sweep as module
 from brokk_min.__main__ import main
 from brokk_min.actuator import save_net
@@ -89,17 +89,17 @@ def test_a_seed_counts_once_in_the_table() -> None:
 def test_a_table_is_read_for_the_report_and_other_files_are_not(tmp_path: Path) -> None:
     path = tmp_path / "sweep.json"
     figures = module.table([seed_rows(1.0), seed_rows(3.0)], [])
-    about = experiments.tuned_for(BROKK_170, NET)
+    about = baselines.tuned_for(BROKK_170, NET)
     path.write_text(json.dumps({"meta": about, "table": figures}))
-    assert experiments.seeds_of(BROKK_170, NET, experiments.read_seeds(path)) == figures
+    assert module.seeds_of(BROKK_170, NET, module.read_seeds(path)) == figures
     other = replace(NET, output_high=2 * NET.output_high)
     with pytest.raises(ValueError, match=rf"sweep: expected one with .*got .*{about['actuator']}"):
-        experiments.seeds_of(BROKK_170, other, experiments.read_seeds(path))
+        module.seeds_of(BROKK_170, other, module.read_seeds(path))
     without = json.dumps({"table": figures})
     for text in ("{", "[]", without, '{"meta": {}, "table": {"rl": {"velocity_error_all": {"mean": 1}}}}'):
         path.write_text(text)
         with pytest.raises(ValueError, match=r"sweep\.json: expected the sweep\.json of a sweep, got "):
-            experiments.read_seeds(path)
+            module.read_seeds(path)
 
 
 def test_a_worker_that_dies_costs_one_retry(tmp_path: Path) -> None:

@@ -1,0 +1,112 @@
+"""The classical controllers that the policy is compared with: their settings, tuning and files of gains."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brokk_min import jacobian
+from brokk_min.actuator import ActuatorNet, fingerprint
+from brokk_min.env import TaskConfig, rollout
+from brokk_min.jacobian import JacobianController
+from brokk_min.logs import write_json
+from brokk_min.machine import Machine
+from brokk_min.sequences import tuning_goals
+
+Array = NDArray[np.floating[Any]]
+PAPERS = ("jacobian_pid_k0.1", "jacobian_pid_k0.05")  # the paper's two baselines
+STRONGER = ("jacobian_pid_ff",)  # than the paper's: its sentences are put to it, too
+AWAKE = "jacobian_pid_ff_awake"  # the same, its valves never closed: what the policy learns to do
+
+
+def baselines(machine: Machine, net: ActuatorNet) -> dict[str, JacobianController]:
+    """The paper's two baselines and two with feed-forward, with gains set by hand. Paper: Sec. 4.2
+
+    The last keeps its valves barely open even while the tool is to stand still.
+    """
+    w0 = jacobian.manipulability_threshold(machine)
+    pid = jacobian.join_gains(machine, {"kp": 1.0, "ki": 8.0, "kd": 0.05, "feedback": 0.4, "ready": 0.015})
+    mild = jacobian.join_gains(machine, {"kp": 0.2, "ki": 0.5, "kd": 0.02, "feedback": 0.1, "ready": 0.015})
+    steady = jacobian.steady_map(machine, net)
+    return {
+        "jacobian_pid_k0.1": JacobianController(machine, pid, 0.1, w0),
+        "jacobian_pid_k0.05": JacobianController(machine, pid, 0.05, w0),
+        "jacobian_pid_ff": JacobianController(machine, mild, 0.1, w0, steady),
+        AWAKE: JacobianController(machine, mild, 0.1, w0, steady, awake=True),
+    }
+
+
+def tuning_set(machine: Machine, runs: int, seed: int) -> tuple[Array, Array]:
+    """Starts and goals of `runs` runs that the baselines are tuned on: apart from all that scores."""
+    return tuning_goals(machine, runs, 12.0, seed + 1000)
+
+
+def tuned_baselines(
+    machine: Machine, net: ActuatorNet, runs: int, generations: int, seed: int
+) -> tuple[dict[str, JacobianController], dict[str, dict[str, Any]]]:
+    """The baselines, each tuned on the machine itself, and how their tuning went, for JSON.
+
+    The cost is the figure that is scored, mean |v_goal - v_tool|, on the `tuning_set`. Tuning on the
+    machine favours the baselines: the policy never sees it. The least of many noisy costs flatters, so
+    "cost_anew" is the mean of 16 more of the gains that were found.
+    """
+    start, goals = tuning_set(machine, runs, seed)
+
+    def cost(controller: JacobianController) -> Array:
+        candidates = len(controller.gains)
+        batch = replace(controller, gains=np.repeat(controller.gains, runs, axis=0))
+        wanted, rng = np.tile(goals, (1, candidates, 1)), np.random.default_rng(seed)
+        trace = rollout(machine, batch, np.tile(start, (candidates, 1)), wanted, TaskConfig(), rng)
+        error = np.linalg.norm(wanted - trace.v_tool, axis=-1)
+        return np.asarray(error.mean(0).reshape(candidates, runs).mean(1))
+
+    tuned, how = {}, {}
+    for name, controller in baselines(machine, net).items():
+        tuned[name], costs = jacobian.tune(controller, cost, seed, generations, name)
+        anew = float(cost(replace(tuned[name], gains=np.tile(tuned[name].gains, (16, 1)))).mean())
+        at_bound = jacobian.gains_at_bound(tuned[name])
+        how[name] = {"seed": seed, "cost": costs, "cost_anew": anew, "at_bound": at_bound}
+    return tuned, how
+
+
+def plain_gains(controllers: Mapping[str, JacobianController]) -> dict[str, dict[str, list[float]]]:
+    """Gains of each baseline by name, for JSON."""
+    named = {name: jacobian.split_gains(c.gains) for name, c in controllers.items()}
+    return {name: {key: gain.tolist() for key, gain in gains.items()} for name, gains in named.items()}
+
+
+def write_gains(path: Path, controllers: Mapping[str, JacobianController], about: Mapping[str, Any]) -> None:
+    """Write the baselines' gains as `read_gains` reads them; `about` is the `meta` of their tuning."""
+    write_json(path, {"meta": about, "gains": plain_gains(controllers)})
+
+
+def read_gains(path: Path, machine: Machine, net: ActuatorNet) -> dict[str, JacobianController]:
+    """The baselines with gains that `reproduce` wrote.
+
+    Raises:
+        ValueError: no such file, or gains of other controllers or joints, tuned for another machine or with
+            other nets, whose feed-forward is another.
+    """
+    result, wanted = baselines(machine, net), tuned_for(machine, net)
+    try:
+        table = json.loads(path.read_text())
+        found = {name: table["meta"].get(name) for name in wanted}
+        if found != wanted:
+            raise ValueError(f"gains for {found}")
+        for name, controller in result.items():
+            result[name] = replace(controller, gains=jacobian.join_gains(machine, table["gains"][name]))
+    except (AttributeError, OSError, KeyError, TypeError, ValueError) as error:
+        nets = f"{machine.name} with nets {wanted['actuator']}"
+        raise ValueError(f"{path}: expected gains for {nets}, got {error!r}") from error
+    return result
+
+
+def tuned_for(machine: Machine, net: ActuatorNet) -> dict[str, str]:
+    """What gains and sweeps belong to: the machine's name and the fingerprint of its driven joints' nets."""
+    return {"machine": machine.name, "actuator": fingerprint(net)}
