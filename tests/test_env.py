@@ -324,7 +324,7 @@ def test_a_tick_is_measured_alike_in_simulation_and_on_hardware(machine):
 
 @pytest.mark.parametrize("machine", [BROKK_170, *MACHINES], ids=lambda m: m.name)
 def test_angles_are_told_by_all_samples(machine):
-    """Exact where joints turn evenly or speed up; of noise on samples a thirteenth of the variance is left."""
+    """Exact where joints turn evenly or speed up; of noise a thirteenth of its variance is left."""
     rng, H = np.random.default_rng(24), machine.history
     history, v_goal, lag = random_sight(machine, rng, (300,))
     even, time = history.copy(), machine.dt * np.arange(-H - machine.velocity_samples, 1)
