@@ -333,6 +333,9 @@ def test_motion_along_a_sequence_is_drawn_from_where_it_began() -> None:
     time = 0.05 * np.arange(1, 361)
     labels = ["x - x(0) [m]", "y - y(0) [m]", "z - z(0) [m]", *(f"velocity {a} [m/s]" for a in "xyz")]
     assert [ax.get_ylabel() for ax in figure.axes] == labels
+    assert {(ax.get_xlabel(), ax.get_title()) for ax in figure.axes} == {("time [s]", "")}
+    assert figure.axes[0].get_ylim() == figure.axes[2].get_ylim() != figure.axes[3].get_ylim()
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["wanted", "rl"]
     first = figures.kinematics.tool_position(BROKK_170, start)
     for i in range(3):
         above, below = lines(figure.axes[i]), lines(figure.axes[3 + i])
