@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -177,16 +178,26 @@ def test_it_is_served_until_it_is_told_to_stop() -> None:
         send=lambda *a: sent.append(a),
         recv=lambda wait: waits.append(wait) or frames.pop(0),
     )
+    raw = encoder_raw(BROKK_170, np.rint(np.array(START) / BROKK_170.encoder_step).astype(int)).tolist()
     serve(Machine(), line, lambda: bool(frames))
-    assert [can_id for can_id, _ in sent] == [0x700 + node for node in NODES] + [
-        0x180 + node for node in NODES[:-1]
+    assert sent == [(0x700 + node, b"\x00") for node in NODES] + [
+        (0x180 + node, struct.pack("<I", r)) for node, r in zip(NODES[:-1], raw, strict=True)
     ]
     assert waits == pytest.approx([0.004] * 3)
+    sent.clear()
+    frames[:] = [Frame(100.0, bus.NMT, b"\x81\x02")]  # heartbeats that are due come with the answer
+    late: Any = SimpleNamespace(now=lambda: 100.0 + bus.BEAT + 1e-6, send=line.send, recv=line.recv)
+    serve(Machine(), late, lambda: bool(frames))
+    assert [can_id for can_id, _ in sent[6:]] == [*(0x700 + node for node in NODES), 0x702]
 
 
 def test_it_starts_where_it_is_told_to_if_it_can() -> None:
     np.testing.assert_array_equal(start_pose(BROKK_170, ()), START)
     np.testing.assert_array_equal(start_pose(BROKK_170, [0.1, 0.5, 0.5, 1.5, 1.0]), [0.1, 0.5, 0.5, 1.5, 1.0])
+    low, high = BROKK_170.column("q_min"), BROKK_170.column("q_max")
+    for end in (low, high):
+        np.testing.assert_array_equal(start_pose(BROKK_170, end.tolist()), end)
+    np.testing.assert_allclose(start_pose(replace(BROKK_170, name="other"), ()), (low + high) / 2)
     for wrong in ([9.0, 0.5, 0.5, 1.5, 1.0], [0.0, 0.5]):
         with pytest.raises(
             ValueError, match=r"^start: expected 5 angles within the joints' ranges, got \["
