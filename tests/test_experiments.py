@@ -6,8 +6,9 @@ import html
 import itertools
 import json
 import re
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -681,3 +682,162 @@ def test_variations_by_hand() -> None:
     assert [name for name, sensor in sensors.items() if sensor is not variations.exact] == [
         "encoder noise of a count", "one sample in 20 lost",
     ]  # fmt: skip
+
+
+# --- the chain, its parts made up -------------------------------------------------------------------------
+
+
+class Parts:
+    """Functions of modules replaced by ones that keep what they were asked and say what they are told to."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.patch, self.asked = monkeypatch, dict[str, list[tuple[Any, ...]]]()
+
+    def __call__(self, module: Any, name: str, answer: Any = None) -> None:
+        def instead(*a: Any, **more: Any) -> Any:
+            self.asked.setdefault(name, []).append((*a, more) if more else a)
+            return answer(*a, **more) if callable(answer) else answer
+
+        self.patch.setattr(module, name, instead)
+
+
+def test_the_chain_hands_each_stage_what_the_one_before_made(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    from brokk_min import ppo
+
+    part, asked = (p := Parts(monkeypatch)), p.asked
+    out, effort = tmp_path / "a" / "b", replace(TINY, train_steps=64)
+    net, driven = random_net(np.random.default_rng(0)), net_of_driven_joints()
+    policy = SimpleNamespace(net=driven)
+    part(chain, "read_seeds", {"meta": {}, "table": "seeds"})
+    part(chain, "seeds_of", {"rl": "over seeds"})
+    part(chain, "record", ["log", "test"])
+    part(chain, "fitted", (net, "by the paper"))
+    part(ppo, "train", policy)
+    part(chain, "tuned_baselines", ("tuned", "how"))
+    part(chain, "PolicyController", lambda machine, learned: ("controller of", learned))
+    part(chain, "measure", ({"task_space": "compared"}, "traces"))
+    part(chain, "plain_gains", lambda tuned: f"plain {tuned}")
+    for name in ("write_gains", "save_policy"):
+        part(chain, name)
+    part(chain, "told", lambda policy, results, seed: ("told", policy, seed))
+    part(report, "net_parts", ["nets"])
+    part(report, "found", "found")
+    part(report, "task_parts", ["task", "lists"])
+    part(figures, "write_report")
+    results = chain.reproduce(BROKK_170, out, effort, 3, Path("sweep.json"))
+    assert asked["read_seeds"] == [(Path("sweep.json"),)]
+    assert asked["record"] == [(BROKK_170, out, effort, 3)]
+    assert asked["fitted"] == [(BROKK_170, out, "log", "test", effort, 3)]
+    machine, selected, seeds = asked["seeds_of"][0]
+    assert (machine, selected.joints, seeds["table"]) == (BROKK_170, ("q1", "q3", "q4", "q5"), "seeds")
+    machine, nets, task, config, seed, path, more = asked["train"][0]
+    assert (machine, task, config, seed, path) == (
+        BROKK_170,
+        TaskConfig(),
+        ppo.PPOConfig(total_steps=64),
+        3,
+        out / "policy.npz",
+    )
+    assert more == {"resume": True} and nets.joints == ("q1", "q3", "q4", "q5")
+    machine, nets, spent, seed = asked["tuned_baselines"][0]
+    assert (machine, nets.joints, spent, seed) == (BROKK_170, ("q1", "q3", "q4", "q5"), effort, 3)
+    assert asked["measure"] == [(BROKK_170, net, "test", ("controller of", policy), "tuned", effort, 3)]
+    about = experiments.meta(BROKK_170, 3) | experiments.tuned_for(BROKK_170, driven)
+    wanted = {
+        "meta": about | {"effort": asdict(effort)},
+        "paper_recipe": "by the paper", "task_space": "compared", "gains": "plain tuned", "tuning": "how",
+        "training_seeds": {"rl": "over seeds"},
+    }  # fmt: skip
+    assert results == wanted == json.loads((out / "results.json").read_text())
+    assert asked["write_gains"] == [(out / "gains.json", "tuned", wanted["meta"])]
+    assert asked["save_policy"] == [(out / "policy.npz", ("told", policy, 3))]
+    clock = json.loads((out / "timing.json").read_text())
+    assert list(clock) == ["record", "fit", "train", "tune", "evaluate", "draw"]
+    *first, trained = asked["net_parts"][0]
+    assert first == [BROKK_170, net, "test", wanted, 3, out / "policy.npz.csv"] and trained == clock["train"]
+    assert asked["task_parts"] == [(BROKK_170, wanted, "traces")]
+    path, pages, seconds = asked["write_report"][0]
+    assert (path, pages, seconds) == (out / "report.html", ["found", "nets", "task", "lists"], clock)
+    assert (
+        chain.reproduce(BROKK_170, out, effort, 3)["training_seeds"] == {} and len(asked["read_seeds"]) == 1
+    )
+
+
+def test_nets_of_the_chain_are_ours_and_the_papers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    part, asked = (p := Parts(monkeypatch)), p.asked
+    net = random_net(np.random.default_rng(0))
+    part(chain.fitting, "fit", net)
+    part(chain.preliminary, "paper_recipe", "recipe")
+    machine = replace(BROKK_170, dead_zone=0.09, history=11)
+    log: Any = "log"
+    assert chain.fitted(machine, tmp_path, log, "test", TINY, 4) == (net, "recipe")  # type: ignore[arg-type]
+    config = chain.fitting.FitConfig(steps=60, history=11, dead_zone=0.09)
+    assert asked["fit"] == [("log", config, 4, 4, "brokk170")]
+    assert asked["paper_recipe"] == [(machine, "test", 0.02, replace(config, steps=30), 4)]
+    assert fingerprint(load_net(tmp_path / "net.npz")) == fingerprint(net)
+
+
+def test_logs_of_the_chain_are_written_and_read_back(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    part, asked = (p := Parts(monkeypatch)), p.asked
+    part(chain.excitation, "collect", lambda machine, hours, kind, rng: f"{kind} {rng.integers(10**9)}")
+    part(
+        chain.excitation,
+        "task_log",
+        lambda machine, runs, seconds, rng: f"{runs} {seconds} {rng.integers(10**9)}",
+    )
+    part(chain.logs, "write_log")
+    part(chain.logs, "read_log", lambda files, samples, rate: (files, samples, rate))
+    found = chain.record(BROKK_170, tmp_path, TINY, 4)
+    assert found == [([tmp_path / name], 4, 20.0) for name in ("log.npz", "log_test.npz")]
+    drawn = [np.random.default_rng(seed).integers(10**9) for seed in (4, 5)]
+    wanted = [("log.npz", f"rich {drawn[0]}"), ("log_test.npz", f"20 40.0 {drawn[1]}")]
+    assert asked["write_log"] == [(tmp_path / name, log) for name, log in wanted]
+    assert asked["collect"][0][:2] == (BROKK_170, 0.02)
+
+
+def test_what_is_measured_of_nets_policy_and_baselines(monkeypatch: pytest.MonkeyPatch) -> None:
+    part, asked = (p := Parts(monkeypatch)), p.asked
+    goals = np.tile([[0.1, 0.0, 0.0]], (20, 2, 1))
+    kinds = ["workspace", "limits", "workspace"]
+    compared = {"task_space": {}, "starts": [[1.0], [2.0], [3.0]], "start_kinds": kinds}
+    part(chain, "comparison", (compared, {"all": "every"}))
+    part(chain, "task_space", (["run"], {}))
+    part(chain, "summary", {"rl": "on nets"})
+    part(chain, "driven_log", "driven")
+    part(chain.scores, "score", lambda net, log: f"score of {log}")
+    part(chain.preliminary, "run", "before")
+    part(chain.claims, "net_claims", lambda before: f"claims of {before}")
+    part(chain, "tuning_goals", (np.array([[0.5], [0.25]]), goals))
+    rl: Any = SimpleNamespace(policy=SimpleNamespace(net="its nets"))
+    found, traces = chain.measure(BROKK_170, "net", "test", rl, {"pid": "p"}, TINY, 6)  # type: ignore[arg-type, dict-item]
+    assert traces == {"all": "every"} and asked["comparison"] == [
+        (BROKK_170, {"rl": rl, "pid": "p"}, TINY, 6)
+    ]
+    assert found["actuator"] == {"test": "score of test", "driven_by_policy": "score of driven"}
+    assert (found["preliminary"], found["net_claims"]) == ("before", "claims of before")
+    assert asked["run"] == [(BROKK_170, "net", 6)] and asked["driven_log"] == [(BROKK_170, "every", "rl")]
+    assert asked["tuning_goals"] == [(BROKK_170, 2, 12.0, 1006)]
+    assert found["tuning_runs"] == [{"start": [s], "goals": [[1.0, 0.1, 0.0, 0.0]]} for s in (0.5, 0.25)]
+    machine, who, sequences, starts, seed, moves = asked["task_space"][0]
+    assert (machine, who, starts.tolist(), seed, moves) == (
+        BROKK_170,
+        {"rl": rl},
+        [[1.0], [3.0]],
+        6,
+        "its nets",
+    )
+    assert [(s.name, len(s.goals)) for s in sequences] == [("x", 360), ("y", 360), ("z", 360)]
+    assert found["task_space"] == {"rl_on_nets": "on nets"} and asked["summary"] == [(["run"],)]
+
+
+def test_a_policy_is_told_what_made_it_and_how_well_it_does() -> None:
+    @dataclass(frozen=True)
+    class Made:
+        training: dict[str, Any]
+
+    means = {c: {"all": {"velocity_error_mean": e}} for c, e in (("rl", 0.5), ("pid", 0.75))}
+    policy: Any = chain.told(Made({"seed": 1}), {"task_space": {"summary": means}}, 9)  # type: ignore[arg-type]
+    said = {"command": "brokk-min reproduce --seed 9", "velocity_error_mean": {"rl": 0.5, "pid": 0.75}}
+    assert policy.training == {"seed": 1, **said}

@@ -55,8 +55,8 @@ def made_up() -> dict[str, Any]:
     }
     return {
         "meta": {"effort": {"train_steps": 6_000_000}},
-        "starts": [POSE, [0.5, *POSE[1:]], [-1.0, 0.5, 0.1, 2.3, 2.0]],
-        "start_kinds": ["limits", "workspace", "extended"],
+        "starts": [POSE, [0.5, *POSE[1:]], [-1.0, 0.5, 0.1, 2.3, 2.0], [-1.0, 0.5, 0.2, 2.4, 2.0]],
+        "start_kinds": ["limits", "workspace", "extended", "extended"],
         "task_space": {
             "summary": summary, "intervals": spread, "rl_less": less,
             "by_kind": {"workspace": of_kind, "limits": of_kind, "extended": of_kind},
@@ -74,12 +74,12 @@ def made_up() -> dict[str, Any]:
         },
         "singular": {
             "summary": singular, "claims": [claim("near", True)],
-            "w0": 0.8, "manipulability": [0.5], "least": [0.125],
+            "w0": 0.8, "manipulability": [0.5, 0.25], "least": [0.125, 0.375],
         },
         "net_claims": [claim("past", True), claim("coupling", False), claim("gap", None)],
         "claims": [
-            claim("still", True), claim("slow", False, stronger=stronger), claim("near", True),
-            claim("track", None), claim("along z", True), claim("last", False),
+            claim("still", True), claim("slow", False, stronger=stronger), claim("turn", True),
+            claim("near", True), claim("track", None), claim("along z", True), claim("last", False),
         ],
         "actuator": {"test": tested},
         "preliminary": {"sim_to_real": gap},
@@ -103,7 +103,9 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> None:
     ):
         monkeypatch.setattr(figures, name, lambda *a, name=name: (name, *a))
     plots = {"preliminary": "figure 2", "sim_to_real": "figure 5"}
-    monkeypatch.setattr(preliminary, "plots", lambda machine, net, seed: plots if seed == 4 else {})
+    monkeypatch.setattr(
+        preliminary, "plots", lambda *a: plots if (a[0], a[2]) == (BROKK_170, 4) and a[1] else {}
+    )
 
 
 def quote(paper: str, answer: str, *more: tuple[str, str]) -> Quote:
@@ -120,13 +122,24 @@ def test_what_was_found_comes_first() -> None:
     assert title == "What was found" and "all sequences [m/s]: rl 0.0200, pid 0.0500. A" in text
     assert "left with 0.0050 (" in text and "or with 0.0080 if it leaves" in text
     said, beside = "what the paper says", "for a baseline with feed-forward"
-    assert list(rows) == ["past", "coupling", "gap", "still", "slow", "near", "track", "along z", "last"]
+    assert list(rows) == [
+        "past",
+        "coupling",
+        "gap",
+        "still",
+        "slow",
+        "turn",
+        "near",
+        "track",
+        "along z",
+        "last",
+    ]
     assert rows["slow"] == {said: "does not hold here", beside: "was not measured"}
     assert rows["still"] == {said: "holds here", beside: ""} and rows["gap"][said] == "was not measured"
 
 
 def test_parts_on_the_nets_by_hand(drawn: None) -> None:
-    net, test, curve = object(), object(), Path("curve.csv")
+    net, test, curve = "nets", "log", Path("curve.csv")
     parts = report.net_parts(BROKK_170, net, test, made_up(), 4, curve, 3600.0)  # type: ignore[arg-type]
     papers, table, recipes, free, learned, gap = parts
     assert [part[0].split(" (")[0] for part in parts] == [
@@ -146,7 +159,7 @@ def test_parts_on_the_nets_by_hand(drawn: None) -> None:
 def test_parts_on_the_task_stand_with_their_sentences_and_figures(drawn: None) -> None:
     results, traces = (
         made_up(),
-        {"all": {}, "singular": {("rl", "least_half"): SimpleNamespace(q=np.zeros((7, 1)))}},
+        {"all": {}, "singular": {("rl", "least_half"): SimpleNamespace(q=np.zeros((50, 2)))}},
     )
     parts = report.task_parts(BROKK_170, results, traces)  # type: ignore[arg-type]
     by_title = {part[0].split(" (")[0]: part for part in parts}
@@ -157,28 +170,30 @@ def test_parts_on_the_task_stand_with_their_sentences_and_figures(drawn: None) -
         "Regret", "Robustness", "Scored sequences", "Scored starts", "Tuning of the baselines", "Tuning runs",
     ]  # fmt: skip
     first = by_title["Start configurations"]
-    assert first[1].startswith("1 limits, 1 workspace, 1 extended. ")
+    assert first[1].startswith("1 limits, 1 workspace, 2 extended. ")
     name, machine, starts, kinds = first[2]
     np.testing.assert_array_equal(starts, results["starts"])
     assert (name, machine, kinds) == ("plot_starts", BROKK_170, results["start_kinds"])
     stronger = (report.BESIDE + "less 0.5 [s]", UNKNOWN)
     *still, along_x, rates = by_title["Motion along x"][2:]
-    assert still == [quote("still", HOLDS), quote("slow", NOT, stronger)]
+    assert still == [quote("still", HOLDS), quote("slow", NOT, stronger), quote("turn", HOLDS)]
+    assert all(isinstance(part[1], str) for part in parts)
     for axis, (kind, machine, shown, sequence, start, run) in enumerate(
         (along_x, by_title["Motion along y"][-1], by_title["Motion along z"][-1])
     ):
         assert (kind, machine, shown, sequence.name, run) == ("plot_sequence", BROKK_170, {}, "xyz"[axis], 1)
         np.testing.assert_array_equal(start, results["starts"][1])
-    assert (rates[0], *rates[2:3], rates[3].name, rates[4]) == ("plot_joint_rates", {}, "x", 1)
+    assert (*rates[:3], rates[3].name, rates[4]) == ("plot_joint_rates", BROKK_170, {}, "x", 1)
     assert by_title["Motion along y"][2] == quote("track", UNKNOWN)
     assert by_title["Motion along z"][2] == quote("along z", HOLDS)
     singular = by_title["Near the singularity"]
-    assert "manipulability 0.50 to 0.50, damping sets in below 0.80; least" in singular[1]
-    assert "0.12 to 0.12 m/rad" in singular[1] and singular[2] == quote("near", HOLDS)
-    _, _, _, half, start, run = singular[3]
-    wanted = least_motion(BROKK_170, np.array(results["starts"][2:]))[0].goals[:7]
+    assert "manipulability 0.25 to 0.50, damping sets in below 0.80; least" in singular[1]
+    assert "0.12 to 0.38 m/rad" in singular[1] and singular[2] == quote("near", HOLDS)
+    name, machine, shown, half, start, run = singular[3]
+    assert (name, machine, shown) == ("plot_sequence", BROKK_170, traces["singular"])
+    wanted = least_motion(BROKK_170, np.array(results["starts"][2:]))[0].goals[:50]
     np.testing.assert_array_equal(half.goals, wanted)
-    assert start.tolist() == results["starts"][2] and run == 0
+    assert start.tolist() == results["starts"][3] and run == 1  # nearest to a singularity
     units = {f"{ERROR} [m/s]": 0.03, "jerk_rms [m/s^3]": 1.0, f"{DRIFT} [m]": 0.1, "time_at_limits [s]": 2.0}
     assert singular[4]["pid"] == units and by_title["Figures of merit"][2] == quote("last", NOT)
     assert len(report.task_parts(BROKK_170, results, traces | {"singular": {}})) == len(parts) - 1  # type: ignore[arg-type, operator]
@@ -318,6 +333,9 @@ def test_motion_along_a_sequence_is_drawn_from_where_it_began() -> None:
     time = 0.05 * np.arange(1, 361)
     labels = ["x - x(0) [m]", "y - y(0) [m]", "z - z(0) [m]", *(f"velocity {a} [m/s]" for a in "xyz")]
     assert [ax.get_ylabel() for ax in figure.axes] == labels
+    assert {(ax.get_xlabel(), ax.get_title()) for ax in figure.axes} == {("time [s]", "")}
+    assert figure.axes[0].get_ylim() == figure.axes[2].get_ylim() != figure.axes[3].get_ylim()
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["wanted", "rl"]
     first = figures.kinematics.tool_position(BROKK_170, start)
     for i in range(3):
         above, below = lines(figure.axes[i]), lines(figure.axes[3 + i])

@@ -243,6 +243,25 @@ def test_margins_of_what_is_feasible_by_hand() -> None:
             assert can(ordinary, np.tile(slewing, (2, 1, 1)), replace(BROKK_170, rate=100.0)) == good
 
 
+def test_a_path_is_feasible_only_if_all_of_it_is() -> None:
+    """Too fast for a tick, then at rest where all is well; each start by itself."""
+    start = np.tile([0.0, 0.5, 0.58, 1.71, 1.24], (3, 1))
+    goals = np.zeros((4, 3, 3))
+    goals[0, 0, 1], goals[0, 1, 1] = 0.7, 0.1
+    machine = replace(BROKK_170, rate=100.0)
+    assert sequences.feasible(machine, start, goals).tolist() == [False, True, True]
+
+
+def test_a_machine_without_a_file_draws_starts_of_a_seed_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    other, asked = replace(BROKK_170, name="other"), []
+    monkeypatch.setattr(sequences, "draw_starts", lambda *a: asked.append(a) or "drawn")
+    found, starts = sequences.goals_and_starts(other, None, None, 3, 7)
+    machine, goals, num, rng = asked[0]
+    assert starts == "drawn" and (machine, num) == (other, 3)
+    assert [s.name for s in goals] == [s.name for s in found] and len(found) == 9
+    assert rng.integers(10**9) == np.random.default_rng(9).integers(10**9)
+
+
 def test_commands_of_a_file_by_hand(tmp_path: Path) -> None:
     """Values count from their row on, to the tick; a sequence lasts a tick or more."""
     path = tmp_path / "c.csv"

@@ -392,3 +392,146 @@ def test_a_window_needs_a_display(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SDL_VIDEODRIVER", "nonsense")
     with pytest.raises(ValueError, match="window: expected a display"):
         window.Window(SIZE, "none")
+
+
+# --- shapes by hand ---------------------------------------------------------------------------------------
+
+
+def listed(shapes: list[view.Shape]) -> list[tuple[object, ...]]:
+    """Shapes as plain values, rounded to a thousandth of a pixel."""
+    plain = lambda x: np.round(x, 3).tolist() if isinstance(x, np.ndarray | float | tuple) else x  # noqa: E731
+    return [(type(s).__name__, *map(plain, s)) for s in shapes]
+
+
+def test_the_backdrop_by_hand() -> None:
+    """20 px a metre, the origin at (50, 80) of a box of 100 by 100 px: the ground lies 80 px down."""
+    flat = np.array([[1.0, 0, 0], [0, 0, 1.0]])
+    camera = looks.Camera(np.array([50.0, 80.0]), 20.0, flat)
+    box = (0.0, 0.0, 100.0, 100.0)
+    grid = [("Line", [[x, 1], [x, 100]], list(view.GRID), 1) for x in (10, 30, 50, 70, 90)]
+    grid += [("Line", [[0, y], [100, y]], list(view.GRID), 1) for y in (0, 20, 40, 60, 80, 100)]
+    soil = [
+        ("Polygon", [[0, 80], [100, 80], [100, 100], [0, 100]], list(view.SOIL)),
+        ("Line", [[0, 80], [100, 80]], list(view.STEEL), 2),
+    ]
+    said = [("Text", [14, 14], "side view, grid 1 m", 11, list(view.MUTED), 0.0)]
+    assert listed(view._backdrop(BROKK_170, camera, box, "side")) == grid + soil + said
+    below = replace(BROKK_170, ground=-1.5)  # 110 px down: not seen
+    assert listed(view._backdrop(below, camera, box, "side")) == grid + said
+    top = listed(view._backdrop(BROKK_170, camera._replace(scale=2.0), box, "top"))
+    assert top[-1][2] == "top view, grid 10 m" and [s[1][0][0] for s in top[:5]] == [10, 30, 50, 70, 90]
+    assert (
+        listed(view._backdrop(BROKK_170, camera._replace(scale=200.0), box, "top"))[-1][2]
+        == "top view, grid 0.1 m"
+    )
+
+
+def test_an_arm_by_hand() -> None:
+    """Two links of 1 m, 0.2 m apart, seen from the side at 100 px a metre; links grow thinner."""
+    joints = [replace(j, a=1.0, d=0.2, alpha=0.0, theta=0.0) for j in BROKK_170.joints[:2]]
+    arm = replace(BROKK_170, joints=tuple(joints))
+    side = np.array([[1.0, 0, 0], [0, 0, 1.0]])
+    camera = looks.Camera(np.array([10.0, 90.0]), 100.0, side)
+    thick = 0.032 * looks.extent(arm).reach * 100
+    assert 5 < thick < 7
+    s = np.array([*np.linspace(thick, 0.45 * thick, 5)[:4], 0.12 * thick])
+    seen = scene(np.zeros(2), colour=(10, 20, 30))
+    base, *links = (shape for shape in view._arm(arm, camera, seen, np.array([False, True])))
+    assert isinstance(base, Polygon) and base.colour == view.STEEL
+    np.testing.assert_allclose((base.points - [10, 90]) / thick, [[-2, -0.9], [2, -0.9], [2.3, 0], [-2.3, 0]])
+    corners = np.array([[10, 90], [10, 70], [110, 70], [110, 50], [210, 50]])
+    across = np.array([[1, 0], [0, 1], [1, 0], [0, 1]])  # a quarter turn from along
+    for i, link in enumerate(links[:4]):
+        a, b, w = corners[i], corners[i + 1], across[i]
+        wanted = [a + s[i] * w, b + s[i + 1] * w, b - s[i + 1] * w, a - s[i] * w]
+        assert isinstance(link, Polygon) and link.colour == (view.STEEL if i == 0 else (10, 20, 30))
+        np.testing.assert_allclose(link.points, wanted)
+    pale = tuple(round(c + 0.15 * (p - c)) for c, p in zip((10, 20, 30), view.PAPER, strict=True))
+    for i, (size, ring, colour) in enumerate(((s[0], 1.1, pale), (max(4.0, s[2]), 1.5, view.WARNING))):
+        outer, inner = links[4 + 2 * i : 6 + 2 * i]
+        assert isinstance(outer, Circle) and isinstance(inner, Circle)
+        assert (outer.radius, outer.colour) == (pytest.approx(ring * size), colour)
+        assert (inner.radius, inner.colour) == (pytest.approx(0.5 * size), view.PAPER)
+        np.testing.assert_allclose([outer.centre, inner.centre], [corners[2 * i]] * 2)
+    assert len(links) == 8
+    above = looks.Camera(np.array([10.0, 90.0]), 100.0, looks.ABOVE)
+    plinth, *flat = view._arm(arm, above, seen, np.zeros(2, bool))
+    assert isinstance(plinth, Polygon) and len(flat) == 6  # links along the view are points
+    np.testing.assert_allclose(
+        (plinth.points - [10, 90]) / thick, [[-1.8, -2.4], [1.8, -2.4], [1.8, 2.4], [-1.8, 2.4]]
+    )
+
+
+def test_rows_of_joints_by_hand() -> None:
+    """On 344 px: 46 for names, 58 and 40 for digits, 100 for each bar; q3 near its limit, q2 locked."""
+    low, high = BROKK_170.column("q_min"), BROKK_170.column("q_max")
+    q = 0.75 * low + 0.25 * high
+    q[2], q[4] = high[2], np.nan
+    u = np.array([0.0, 0.3, 40.0, -80.0, 0.0]) / 127
+    shapes = listed(view._rows(BROKK_170, scene(q, u=u, colour=(1, 2, 3)), (10.0, 100.0, 344.0, 0.0)))
+    track, ink, muted, warning = (list(c) for c in (view.TRACK, view.INK, view.MUTED, view.WARNING))
+
+    def bar(x0: float, x1: float, y: float, half: float, colour: object) -> tuple[object, ...]:
+        return ("Polygon", [[x0, y - half], [x1, y - half], [x1, y + half], [x0, y + half]], colour)
+
+    wanted: list[tuple[object, ...]] = [
+        ("Text", [56, 106], "angle [rad]", 11, muted, 0.0),
+        ("Text", [214, 106], "valve of 80", 11, muted, 0.0),
+    ]
+    for i, name in enumerate(BROKK_170.names):
+        y, colour = 126 + 22 * i, muted if i == 1 else warning if i == 2 else ink
+        wanted += [("Text", [10, y], name, 13, colour, 0.0), bar(56, 156, y, 2, track)]
+        if i < 4:
+            at = 156 if i == 2 else 81
+            wanted += [bar(at - 3, at + 3, y, 8, colour), ("Text", [164, y], f"{q[i]:+.2f}", 12, colour, 0.0)]
+        if i == 1:
+            wanted += [("Text", [214, y], "locked", 12, muted, 0.0)]
+            continue
+        counts = round(127 * u[i])
+        wanted += [bar(214, 314, y, 6, track)]
+        wanted += [bar(264, 264 + 50 * counts / 80, y, 6, [1, 2, 3])] if counts else []
+        wanted += [bar(263, 265, y, 8, ink), ("Text", [354, y], f"{counts:+d}", 12, ink, 1.0)]
+    assert shapes == wanted
+
+
+def test_arrows_rings_and_pale_colours_by_hand() -> None:
+    shaft, head = listed(view._arrow(np.array([0.0, 0]), np.array([30.0, 40]), (1, 2, 3)))
+    assert shaft == ("Line", [[0, 0], [23.4, 31.2]], [1, 2, 3], 3)  # a head of 11 px of 50
+    assert head == ("Polygon", [[30, 40], [19.44, 34.17], [27.36, 28.23]], [1, 2, 3])
+    short = listed(view._arrow(np.array([0.0, 0]), np.array([5.0, 0]), (1, 2, 3)))
+    assert short[0][1] == [[0, 0], [1.5, 0]] and view._arrow(np.zeros(2), np.array([4.0, 0]), (1, 2, 3)) == []
+    ring = view._ring(np.array([5.0, 7.0]), 2.0)
+    np.testing.assert_allclose(ring[[0, 6, 12, 24]], [[7, 7], [5, 9], [3, 7], [7, 7]], atol=1e-12)
+    assert view._pale((50, 100, 247)) == (140, 168, 247) and view._pale((250, 0, 0), 1.0) == view.PAPER
+
+
+def test_where_things_are_on_a_wide_and_on_a_tall_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: dict[str, tuple[object, ...]] = {}
+    monkeypatch.setattr(view, "_views", lambda machine, scene, *boxes: asked.update(views=boxes) or [])
+    monkeypatch.setattr(view, "_rows", lambda machine, scene, box: asked.update(rows=box) or [])
+    seen = scene(title="a title", status="going", mood="ready", colour=(1, 2, 3), notes=["one", "two"])
+
+    def heading(left: float, width: float) -> list[tuple[object, ...]]:
+        title = ("Text", [left + 36, 21], "a title", 18, list(view.INK), 0.0)
+        status = ("Text", [left + width - 16, 21], "going", 14, list(view.MOODS["ready"]), 1.0)
+        return [("Circle", [left + 22, 21], 7, [1, 2, 3]), title, status]
+
+    def notes(x: float, y: float) -> list[tuple[object, ...]]:
+        said = enumerate(("one", "two"))
+        return [("Text", [x, y + 18 * i], text, 12, list(view.INK), 0.0) for i, text in said]
+
+    wide = listed(view._panel(BROKK_170, seen, (100.0, 0.0, 1000.0, 600.0)))  # 136 px below for five joints
+    assert asked["views"] == ((100, 40, 600, 424), (700, 40, 400, 424))
+    assert asked["rows"] == (116, 470, 520, 136) and wide == heading(100, 1000) + notes(656, 478)
+    tall = listed(view._panel(BROKK_170, seen, (0.0, 0.0, 500.0, 800.0)))
+    assert asked["views"] == ((0, 40, 500, 440), (0, 480, 190, 320))
+    assert asked["rows"] == (198, 486, 294, 320) and tall == heading(0, 500) + notes(16, 74)
+    many = seen._replace(notes=["n"] * 10)
+    view._panel(BROKK_170, many, (0.0, 0.0, 1000.0, 600.0))
+    assert asked["rows"] == (16, 420, 520, 186)
+    unknown = listed(view._panel(BROKK_170, seen._replace(q=np.full(5, np.nan)), (0.0, 0.0, 1000.0, 600.0)))
+    assert unknown[3] == ("Text", [500, 252], "no positions", 20, list(view.WARNING), 0.5)
+    long = listed(view._heading(seen._replace(title="x" * 40), (0.0, 0.0, 500.0, 0.0)))
+    assert long[1][3] == int((500 - 60 - 45) / 28)
+    two = listed(view.draw(BROKK_170, [seen, seen], (800, 300)))
+    assert two.count(("Line", [[400, 12], [400, 288]], list(view.TRACK), 2)) == 1
