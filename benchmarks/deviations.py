@@ -1,7 +1,7 @@
 """What the deviations and assumptions of PAPER.md change, measured.
 
 Each function returns the figures of one entry; `python -m benchmarks.deviations` prints them. D4, D5, D7,
-D10 to D12, A4 and A5 fit nets and train policies: `python -m benchmarks.deviations --train`, some 25 minutes.
+D10 to D14, A4 and A5 fit nets and train policies: `python -m benchmarks.deviations --train`, some 25 minutes.
 An entry's name prints that entry alone: `python -m benchmarks.deviations d4`.
 """
 
@@ -34,7 +34,7 @@ from brokk_min import (
 from brokk_min.env import TaskConfig, rollout, terminated
 from brokk_min.environments import TaskVectorEnv
 from brokk_min.jacobian import JacobianController
-from brokk_min.machine import BROKK_170, PWM_MAX
+from brokk_min.machine import BROKK_170, PWM_MAX, read_encoder
 from brokk_min.options import SHIPPED
 from brokk_min.policy import PolicyController, load_policy
 
@@ -177,7 +177,7 @@ def fitted(kind: str, noise: float, seed: int) -> dict[str, float]:
 def trained(
     task: TaskConfig, critic: bool = False, net: actuator.ActuatorNet | None = None
 ) -> dict[str, float]:
-    """A policy trained on the package's nets, or others; there and on the plant: error [m/s], valve travel.
+    """A policy trained on the package's nets, or others: error [m/s], drift [m], valve travel, there and on the plant.
 
     Along x, y and z.
     """
@@ -192,7 +192,7 @@ def trained(
     result = {}
     for name, moves in (("nets", net), ("plant", None)):
         runs, _ = experiments.task_space(M, controller, axes, starts, 0, moves)
-        for key in ("velocity_error_mean", "valve_travel"):
+        for key in ("velocity_error_mean", "off_axis_drift_max", "valve_travel"):
             result[f"{name}, {key}"] = float(np.mean([run[key] for run in runs]))
     return result
 
@@ -225,8 +225,17 @@ def d5() -> dict[str, float]:
 
 
 def d7() -> dict[str, float]:
-    """A policy trained as in the paper: its observation, reward and critic."""
-    return beside(paper=trained(TaskConfig(paper=True)), ours=as_it_is())
+    """Policies with the paper's observation, reward and critic, and with newest angles instead of all samples."""
+    ours, paper = as_it_is(), trained(TaskConfig(paper=True))
+    angles = env._angles
+
+    def newest(machine: machine.Machine, values: env.Array) -> env.Array:
+        q = angles(machine, values)
+        q[..., machine.driven] = env._samples(machine, values)[..., 0, -1]
+        return q
+
+    with mock.patch.object(env, "_angles", newest):
+        return beside(paper=paper, **{"newest angles": trained(TaskConfig())}, ours=ours)
 
 
 def d10() -> dict[str, float]:
@@ -251,6 +260,22 @@ def d12() -> dict[str, float]:
         return beside(**{"from 0": trained(TaskConfig())}, ours=ours)
 
 
+def d13() -> dict[str, float]:
+    """A policy that pays nothing for what the tool stays behind."""
+    return beside(**{"no cost": trained(TaskConfig(lag_cost=0.0))}, ours=as_it_is())
+
+
+def d14() -> dict[str, float]:
+    """A policy trained on nets that go on from what encoders say."""
+    ours, push = as_it_is(), env.push_motion
+
+    def stepwise(machine: machine.Machine, history: env.Array, q: env.Array) -> env.Array:
+        return push(machine, history, read_encoder(machine, q))
+
+    with mock.patch.object(env, "push_motion", stepwise):
+        return beside(**{"encoder steps": trained(TaskConfig())}, ours=ours)
+
+
 def a5() -> dict[str, float]:
     """A policy that sees velocities in the base frame instead of along the tool's heading."""
     ours = as_it_is()
@@ -259,7 +284,7 @@ def a5() -> dict[str, float]:
 
 
 ENTRIES: tuple[Callable[[], dict[str, float]], ...] = (a1, d1, d3, d6, a6, a7, a9, a11, stand)
-TRAINED: tuple[Callable[[], dict[str, float]], ...] = (d4, a4, d5, d7, d10, d11, d12, a5)
+TRAINED: tuple[Callable[[], dict[str, float]], ...] = (d4, a4, d5, d7, d10, d11, d12, d13, d14, a5)
 
 
 def main() -> None:
