@@ -36,7 +36,7 @@ from brokk_min.environments import TaskVectorEnv
 from brokk_min.jacobian import JacobianController
 from brokk_min.machine import BROKK_170, PWM_MAX, read_encoder
 from brokk_min.options import SHIPPED
-from brokk_min.policy import PolicyController, load_policy
+from brokk_min.policy import STAND, PolicyController, load_policy
 
 M = BROKK_170
 LOW, HIGH = M.column("q_min"), M.column("q_max")
@@ -128,7 +128,7 @@ def a11() -> dict[str, float]:
 
 
 def stand() -> dict[str, float]:
-    """Way [m] of the tool from 0.5 to 3 s after a stop, when valves close; dead zone as told, and less."""
+    """Way [m] of the tool from 0.5 s after a stop until valves close; dead zone as told, and less."""
     starts = sequences.scored_starts(M, 64, sequences.task_sequences(M), 2)
     starts = starts[np.array(sequences.start_kinds(M, starts)) == "workspace"]
     policy = PolicyController(M, load_policy(SHIPPED / M.name / "policy.npz", M))
@@ -139,7 +139,7 @@ def stand() -> dict[str, float]:
             goals = np.zeros((110, len(starts), 3))
             goals[:40] = 2 / 3 * M.tool_speed * direction
             p = rollout(plant, policy, starts, goals, TaskConfig(), np.random.default_rng(0)).p_tool
-            ways.append(np.linalg.norm(p[99] - p[49], axis=-1))
+            ways.append(np.linalg.norm(p[39 + round(STAND * M.rate)] - p[49], axis=-1))
         result |= {f"{dead_zone:.2f}, median": np.median(ways), f"{dead_zone:.2f}, most": np.max(ways)}
     return {name: float(way) for name, way in result.items()}
 
@@ -177,7 +177,7 @@ def fitted(kind: str, noise: float, seed: int) -> dict[str, float]:
 def trained(
     task: TaskConfig, critic: bool = False, net: actuator.ActuatorNet | None = None
 ) -> dict[str, float]:
-    """A policy trained on the package's nets, or others: error [m/s], drift [m], valve travel, there and on the plant.
+    """Error [m/s], drift [m] and travel of a policy trained on given nets, on these and on the plant.
 
     Along x, y and z.
     """
@@ -225,7 +225,7 @@ def d5() -> dict[str, float]:
 
 
 def d7() -> dict[str, float]:
-    """Policies with the paper's observation, reward and critic, and with newest angles instead of all samples."""
+    """Policies with the paper's observation, reward and critic, and with newest angles instead of all."""
     ours, paper = as_it_is(), trained(TaskConfig(paper=True))
     angles = env._angles
 

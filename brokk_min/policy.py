@@ -17,7 +17,7 @@ from brokk_min.logs import expect_same, load_arrays, whole_file
 from brokk_min.machine import Machine
 
 Array = NDArray[np.floating[Any]]
-STAND = 3.0  # s, assumed: valves close when the tool was to stand still for longer
+STAND = 2.0  # s, assumed: valves close when the tool was to stand still for longer
 FORMAT = 2  # of policy files; 1: actions in units of the command limit, dead zone and all
 
 

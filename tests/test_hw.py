@@ -123,7 +123,7 @@ def test_the_policy_is_told_how_far_the_tool_stays_behind() -> None:
     assert checked > 100
 
 
-def test_valves_close_on_the_bus_when_the_tool_was_to_stand_for_three_seconds() -> None:
+def test_valves_close_on_the_bus_when_the_tool_was_to_stand_for_two_seconds() -> None:
     hand = Hand()
     world = World(PolicyController(BROKK_170, load_policy(SHIPPED, BROKK_170)), hand)
     sent: list[list[int]] = []

@@ -127,7 +127,7 @@ PLANTED: list[tuple[str, str, str, str]] = [
     ("logs", "unknown = samples - 1 if part", "unknown = samples - 2 if part",
      "logs::a_joint_in_motion_behind_a_gap_is_never_taken_to_rest"),
     ("policy", "np.where(moves, 0, memory + 1)", "memory + 1",
-     "policy::valves_close_when_the_tool_was_to_stand_for_three_seconds"),
+     "policy::valves_close_when_the_tool_was_to_stand_for_two_seconds"),
     # the task
     ("env", "1 / (1 + np.sqrt(np.sum(difference * difference, axis=-1)))",
      "1 / (1 + np.sum(difference * difference, axis=-1))", "env::reward_by_hand"),

@@ -123,8 +123,8 @@ def test_the_controller_sends_what_the_policy_says(policy):
     assert len(np.unique(u[:, 0])) > 1
 
 
-def test_valves_close_when_the_tool_was_to_stand_for_three_seconds():
-    """One tool is asked to move once, the other never: for 60 ticks their valves may be kept awake."""
+def test_valves_close_when_the_tool_was_to_stand_for_two_seconds():
+    """One tool is asked to move once, the other never: for 40 ticks their valves may be kept awake."""
     controller, seen = PolicyController(BROKK_170, trained()[1]), np.full((2, 171), 0.5, np.float32)
     memory, awake = controller.start(2), []
     for tick in range(130):
@@ -132,8 +132,8 @@ def test_valves_close_when_the_tool_was_to_stand_for_three_seconds():
         u, memory = controller(seen, memory)
         awake.append(u.any(axis=1))
     first, second = np.array(awake).T
-    assert first[:111].all() and not first[111:].any()
-    assert second[:60].all() and not second[60:].any()
+    assert first[:91].all() and not first[91:].any()
+    assert second[:40].all() and not second[40:].any()
 
 
 def test_a_policy_runs_without_torch_and_scipy(saved):
