@@ -127,12 +127,12 @@ def test_valves_close_when_the_tool_was_to_stand_for_two_seconds():
     """One tool is asked to move once, the other never: for 40 ticks their valves may be kept awake."""
     controller, seen = PolicyController(BROKK_170, trained()[1]), np.full((2, 171), 0.5, np.float32)
     memory, awake = controller.start(2), []
-    for tick in range(130):
-        seen[:, :3] = [[0.0, 0.0, 0.1 * (tick == 50)], [0.0, 0.0, 0.0]]
+    for tick in range(100):
+        seen[:, :3] = [[0.0, 0.0, 0.1 * (tick == 30)], [0.0, 0.0, 0.0]]
         u, memory = controller(seen, memory)
         awake.append(u.any(axis=1))
     first, second = np.array(awake).T
-    assert first[:91].all() and not first[91:].any()
+    assert first[:71].all() and not first[71:].any()
     assert second[:40].all() and not second[40:].any()
 
 
