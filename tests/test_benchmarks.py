@@ -79,11 +79,11 @@ def test_deviations_train_and_compare_what_they_name(monkeypatch: pytest.MonkeyP
 
     def runs(machine: object, controllers: object, sequences: list[object], starts: np.ndarray, *_: object):
         seen.append((len(sequences), len(starts), env._turn is turn))
-        return [{"velocity_error_mean": 0.1, "valve_travel": 20.0}], {}
+        return [{"velocity_error_mean": 0.1, "off_axis_drift_max": 0.02, "valve_travel": 20.0}], {}
 
     monkeypatch.setattr(deviations, "STEPS", 256 * 32)
     monkeypatch.setattr(experiments, "task_space", runs)
     monkeypatch.setattr(deviations, "as_it_is", dict)
     found = deviations.a5()
-    assert found["base frame, plant, valve_travel"] == 20.0 and len(found) == 4
+    assert found["base frame, plant, valve_travel"] == 20.0 and len(found) == 6
     assert seen == [(3, 32, False)] * 2 and env._turn is turn

@@ -170,8 +170,9 @@ def test_a_joint_too_slow_to_come_back_does_not_keep_the_recording_waiting(monke
     assert driven == 5 * 288
 
 
-def test_recordings_have_room_for_a_window_and_the_sample_after_it_however_short_their_time():
-    log = collect(BROKK_170, 1e-6, "sine", np.random.default_rng(0), leg_s=2.0)
+def test_recordings_have_room_for_a_window_and_the_sample_after_it_however_short_their_time(monkeypatch):
+    monkeypatch.setattr(excitation, "LEG", 2.0)
+    log = collect(BROKK_170, 1e-6, "sine", np.random.default_rng(0))
     legs = {r.name: len(r.q) for r in log.recordings if not r.name.endswith("_return")}
     assert legs == {f"q{i}_000": 15 for i in range(1, 6)}
     assert log.rate == 20.0 and log.recordings[0].q_dot.shape == (15, 5)
@@ -450,7 +451,8 @@ def test_a_leg_and_its_way_back_by_hand(kind, pushed, monkeypatch):
     monkeypatch.setitem(EXCITATIONS, kind, lambda rng, machine, ticks: np.full(ticks, LIMIT))
     high, start = BROKK_170.column("q_max")[Q5], np.array([1.0, 2.0])[: 1 if kind == "sine" else 2]
     drawn = Share(np.array([0.5, 0.95]))  # of the range and an eighth more on either side
-    recorder, back, home = excitation._drive_legs(BROKK_170, np.full(len(start), Q5), kind, drawn, 240)
+    monkeypatch.setattr(excitation, "LEG", 12.0)
+    recorder, back, home = excitation._drive_legs(BROKK_170, np.full(len(start), Q5), kind, drawn)
     q, u = np.array(recorder.q), np.rint(127 * np.array(recorder.u))
     middle = read_encoder(BROKK_170, (BROKK_170.column("q_min") + BROKK_170.column("q_max")) / 2)
     assert (np.delete(q, Q5, -1) == np.delete(middle, Q5)).all()
@@ -466,5 +468,6 @@ def test_a_leg_and_its_way_back_by_hand(kind, pushed, monkeypatch):
         np.testing.assert_array_equal(counts[: len(wanted)], wanted)
         assert home[row] == len(wanted) and not counts[len(wanted) :].any()
     assert len(u) == home.max()
-    early = excitation._drive_legs(BROKK_170, np.array([Q5]), kind, Share(0.5), 20)[1]
+    monkeypatch.setattr(excitation, "LEG", 1.0)
+    early = excitation._drive_legs(BROKK_170, np.array([Q5]), kind, Share(0.5))[1]
     assert early.tolist() == [33]  # its time is over before it meets a limit

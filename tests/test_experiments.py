@@ -704,14 +704,14 @@ class Parts:
 def test_the_chain_hands_each_stage_what_the_one_before_made(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    from brokk_min import ppo
+    from brokk_min import ppo, sweep
 
     part, asked = (p := Parts(monkeypatch)), p.asked
     out, effort = tmp_path / "a" / "b", replace(TINY, train_steps=64)
     net, driven = random_net(np.random.default_rng(0)), net_of_driven_joints()
     policy = SimpleNamespace(net=driven)
-    part(chain, "read_seeds", {"meta": {}, "table": "seeds"})
-    part(chain, "seeds_of", {"rl": "over seeds"})
+    part(sweep, "read_seeds", {"meta": {}, "table": "seeds"})
+    part(sweep, "seeds_of", {"rl": "over seeds"})
     part(chain, "record", ["log", "test"])
     part(chain, "fitted", (net, "by the paper"))
     part(ppo, "train", policy)
@@ -741,10 +741,11 @@ def test_the_chain_hands_each_stage_what_the_one_before_made(
         out / "policy.npz",
     )
     assert more == {"resume": True} and nets.joints == ("q1", "q3", "q4", "q5")
-    machine, nets, spent, seed = asked["tuned_baselines"][0]
-    assert (machine, nets.joints, spent, seed) == (BROKK_170, ("q1", "q3", "q4", "q5"), effort, 3)
+    machine, nets, *spent = asked["tuned_baselines"][0]
+    assert (machine, nets.joints) == (BROKK_170, ("q1", "q3", "q4", "q5"))
+    assert spent == [effort.tuning_runs, effort.generations, 3]
     assert asked["measure"] == [(BROKK_170, net, "test", ("controller of", policy), "tuned", effort, 3)]
-    about = experiments.meta(BROKK_170, 3) | experiments.tuned_for(BROKK_170, driven)
+    about = experiments.meta(BROKK_170, 3) | baselines.tuned_for(BROKK_170, driven)
     wanted = {
         "meta": about | {"effort": asdict(effort)},
         "paper_recipe": "by the paper", "task_space": "compared", "gains": "plain tuned", "tuning": "how",
@@ -809,7 +810,7 @@ def test_what_is_measured_of_nets_policy_and_baselines(monkeypatch: pytest.Monke
     part(chain.scores, "score", lambda net, log: f"score of {log}")
     part(chain.preliminary, "run", "before")
     part(chain.claims, "net_claims", lambda before: f"claims of {before}")
-    part(chain, "tuning_goals", (np.array([[0.5], [0.25]]), goals))
+    part(chain, "tuning_set", (np.array([[0.5], [0.25]]), goals))
     rl: Any = SimpleNamespace(policy=SimpleNamespace(net="its nets"))
     found, traces = chain.measure(BROKK_170, "net", "test", rl, {"pid": "p"}, TINY, 6)  # type: ignore[arg-type, dict-item]
     assert traces == {"all": "every"} and asked["comparison"] == [
@@ -818,7 +819,7 @@ def test_what_is_measured_of_nets_policy_and_baselines(monkeypatch: pytest.Monke
     assert found["actuator"] == {"test": "score of test", "driven_by_policy": "score of driven"}
     assert (found["preliminary"], found["net_claims"]) == ("before", "claims of before")
     assert asked["run"] == [(BROKK_170, "net", 6)] and asked["driven_log"] == [(BROKK_170, "every", "rl")]
-    assert asked["tuning_goals"] == [(BROKK_170, 2, 12.0, 1006)]
+    assert asked["tuning_set"] == [(BROKK_170, 2, 6)]
     assert found["tuning_runs"] == [{"start": [s], "goals": [[1.0, 0.1, 0.0, 0.0]]} for s in (0.5, 0.25)]
     machine, who, sequences, starts, seed, moves = asked["task_space"][0]
     assert (machine, who, starts.tolist(), seed, moves) == (
