@@ -28,7 +28,7 @@ RECIPES = (
 CALIBRATED = "The analytic machine was calibrated to these figures of the paper; what is tested are the nets."
 CHOSEN = (
     "The policy of the last step is compared, none chosen by its score. But what our deviations from the "
-    "paper's learner change was measured on scored sequences while this was built (PAPER.md, D4 to D12); the "
+    "paper's learner change was measured on scored sequences while this was built (PAPER.md, D4 to D14); the "
     "baselines' gains never saw them."
 )
 BESIDE = "the same of a baseline with velocity feed-forward from the nets, which the paper does not have: "
