@@ -320,8 +320,7 @@ def command_slope(machine: Machine, u: Array) -> Array:
 def _command_range(machine: Machine) -> tuple[float, float]:
     """The dead zone, and what is left from there to the command limit, as shares of full command."""
     limit = machine.pwm_limit / PWM_MAX
-    dead = min(machine.dead_zone, limit)
-    return dead, limit - dead
+    return machine.dead_zone, limit - machine.dead_zone
 
 
 # --- the episode ------------------------------------------------------------------------------------

@@ -70,7 +70,7 @@ class PolicyController:
     def __call__(self, observation: Array, memory: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
         """Commands u (num, n) for observations (num, obs), and the next memory."""
         u = to_command(self.machine, self.policy.act(observation))
-        moves = observation[..., :3].any(axis=-1)  # the goal, of which nothing is noise
+        moves = observation[..., :3].any(axis=-1)  # no noise makes a goal of none
         stood = np.where(moves, 0, memory + 1)
         u[stood > STAND * self.machine.rate] = 0.0
         return u, stood
