@@ -186,7 +186,7 @@ def observe(
     p_tool, J = tool_jacobian(machine, _angles(machine, seen))
     given = np.empty((*batch, 3, 3), np.float32)
     given[..., 0, :], given[..., 2, :] = v_goal, lag
-    given[..., 1, :] = np.add.reduce(J * history[..., None, :, 1, -1], axis=-1)
+    given[..., 1, :] = np.einsum("...ij,...j", J, history[..., 1, -1])
     seen[..., :6] += _turn(p_tool[..., None, :], given[..., :2, :], 1).reshape(*batch, 6)
     rates = damped_rates(machine, J[..., None, :, machine.driven], given[..., ::2, :])
     seen[..., -2 * len(machine.driven) :] = rates.reshape(*batch, -1)
