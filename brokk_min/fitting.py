@@ -82,6 +82,7 @@ def _train(training: TrainingSet, config: FitConfig, seed: int, estimator: int |
     import torch
 
     n, inputs = training.input_mean.shape
+    torch.set_float32_matmul_precision("highest")  # a training of policies may have allowed less
     generator = torch.Generator().manual_seed(seed)
     weights = _first_weights(n, inputs, config.hidden, generator)
     optimizer = torch.optim.Adam(weights, lr=config.learning_rate)
