@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brokk_min.logs import load_arrays, whole_file
+from brokk_min.files import load_arrays, load_header, whole_file
 from brokk_min.machine import estimate_velocity, valve_opening
 
 Array = NDArray[np.floating[Any]]
@@ -257,15 +257,3 @@ def save_net(path: Path, net: ActuatorNet) -> None:
 def load_net(path: Path) -> ActuatorNet:
     """Read nets that `save_net` wrote; ValueError as in `net_from_arrays`."""
     return net_from_arrays(path, load_arrays(path))
-
-
-def load_header(path: Path, arrays: dict[str, Any], kind: str, version: int) -> dict[str, Any]:
-    """The JSON header of a file of ours, checked for kind and format version, without those two."""
-    try:
-        header = dict(json.loads(str(arrays["header"])))
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: expected a file with a JSON header, got {error!r}") from error
-    got = header.pop("kind", None), header.pop("format", None)
-    if got != (kind, version):
-        raise ValueError(f"{path}: expected ({kind}, format {version}), got {got}")
-    return header

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from brokk_min import jacobian
 from brokk_min.actuator import ActuatorNet, fingerprint
 from brokk_min.env import TaskConfig, rollout
+from brokk_min.files import write_json
 from brokk_min.jacobian import JacobianController
-from brokk_min.logs import write_json
 from brokk_min.machine import Machine
 from brokk_min.sequences import tuning_goals
 

@@ -17,8 +17,8 @@ from brokk_min.baselines import plain_gains, tuned_baselines, tuned_for, tuning_
 from brokk_min.env import TaskConfig
 from brokk_min.experiments import Array, Effort, Net, comparison, driven_log, meta, task_space
 from brokk_min.figures import Traces
+from brokk_min.files import write_json
 from brokk_min.jacobian import JacobianController
-from brokk_min.logs import write_json
 from brokk_min.machine import Machine
 from brokk_min.metrics import summary
 from brokk_min.policy import Policy, PolicyController, save_policy

@@ -12,8 +12,9 @@ from brokk_min import baselines, chain, experiments, figures, preliminary, trust
 from brokk_min.actuator import load_net, save_net
 from brokk_min.env import Controller, TaskConfig, fitting_nets
 from brokk_min.excitation import collect
+from brokk_min.files import write_json
 from brokk_min.fitting import PAPER_RECIPE, FitConfig, fit
-from brokk_min.logs import Log, read_log, write_json, write_log
+from brokk_min.logs import Log, read_log, write_log
 from brokk_min.machine import BROKK_170
 from brokk_min.metrics import summary
 from brokk_min.options import Command, Name, WrongUse, check, chosen_policy

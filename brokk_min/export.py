@@ -9,7 +9,7 @@ import numpy as np
 
 from brokk_min.env import RAMP
 from brokk_min.extras import need
-from brokk_min.logs import whole_file
+from brokk_min.files import whole_file
 from brokk_min.policy import STAND, Policy
 
 

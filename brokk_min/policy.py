@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min.actuator import ActuatorNet, load_header, net_arrays, net_from_arrays
+from brokk_min.actuator import ActuatorNet, net_arrays, net_from_arrays
 from brokk_min.env import fitting_nets, observation_scale, to_command
-from brokk_min.logs import expect_same, load_arrays, whole_file
+from brokk_min.files import expect_same, load_arrays, load_header, whole_file
 from brokk_min.machine import Machine
 
 Array = NDArray[np.floating[Any]]

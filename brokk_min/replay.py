@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from PIL import Image
 from tqdm import tqdm
 
-from brokk_min import baselines, experiments, logs, view
+from brokk_min import baselines, experiments, view
 from brokk_min.actuator import ActuatorNet
 from brokk_min.bus import read_frames
 from brokk_min.env import Controller, Trace
+from brokk_min.files import whole_file
 from brokk_min.kinematics import tool_position, tool_state
 from brokk_min.looks import skeleton
 from brokk_min.machine import Machine
@@ -158,7 +159,7 @@ def write_film(path: Path, machine: Machine, runs: Sequence[Run], size: tuple[in
     ticks = range(0, max(len(run.known) for run in runs), max(1, round(machine.rate / fps)))
     bar = tqdm(ticks, desc="draw", unit="picture", disable=None)
     images = (picture(film(machine, runs, tick, size), size) for tick in bar)
-    with logs.whole_file(path) as file:
+    with whole_file(path) as file:
         writers[path.suffix](file, images, size, machine.rate / ticks.step)
 
 

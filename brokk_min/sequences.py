@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
-from brokk_min import jacobian, kinematics, logs
+from brokk_min import files, jacobian, kinematics
 from brokk_min.env import TaskConfig, draw_pose, reset, terminated
 from brokk_min.machine import Machine
 from brokk_min.plant import speed_limits
@@ -112,7 +112,7 @@ def read_commands(path: Path, machine: Machine) -> list[Commands]:
 
     The last row of a sequence marks its end.
     """
-    table = logs.read_table(path, ["sequence", "time", "vx", "vy", "vz"], text=("sequence",))
+    table = files.read_table(path, ["sequence", "time", "vx", "vy", "vz"], text=("sequence",))
     result = []
     for name in dict.fromkeys(table["sequence"]):
         rows = np.flatnonzero(table["sequence"] == name)
@@ -133,7 +133,7 @@ def read_starts(path: Path, machine: Machine) -> Array:
     Raises:
         ValueError: an angle outside its joint's range or a pose in the ground, with file and row.
     """
-    table = logs.read_table(path, list(machine.names))
+    table = files.read_table(path, list(machine.names))
     starts = np.stack([table[name] for name in machine.names], axis=1)
     low, high = machine.column("q_min"), machine.column("q_max")
     for row, joint in np.argwhere((starts < low) | (starts > high)):
@@ -251,10 +251,7 @@ def goals_and_starts(
 
 def write_starts(path: Path, machine: Machine, starts: Array) -> None:
     """Write poses as `read_starts` reads them."""
-    with logs.whole_file(path, "w") as file:
-        file.write(
-            "\n".join([",".join(machine.names), *(",".join(map(str, row)) for row in starts.tolist()), ""])
-        )
+    files.write_csv(path, machine.names, starts.tolist())
 
 
 def tuning_goals(machine: Machine, runs: int, seconds: float, seed: int) -> tuple[Array, Array]:

@@ -26,7 +26,7 @@ from brokk_min.actuator import ActuatorNet
 from brokk_min.baselines import read_gains, tuned_for
 from brokk_min.env import TaskConfig
 from brokk_min.extras import need
-from brokk_min.logs import expect_same, write_json
+from brokk_min.files import expect_same, write_json
 from brokk_min.machine import Machine
 from brokk_min.metrics import by_start, mean_interval
 from brokk_min.policy import PolicyController, load_policy

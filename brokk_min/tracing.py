@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -13,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min import logs
+from brokk_min import files
 from brokk_min.kinematics import tool_position
 from brokk_min.looks import extent
 from brokk_min.machine import Machine
@@ -109,16 +108,14 @@ def read_attempts(path: Path) -> list[Attempt]:
     """
     if not path.exists():
         return []
-    table = logs.read_table(path, Attempt._fields, text=("when", "task", "mode"))
+    table = files.read_table(path, Attempt._fields, text=("when", "task", "mode"))
     return [Attempt(*row) for row in zip(*(table[name].tolist() for name in Attempt._fields), strict=True)]
 
 
 def write_attempts(path: Path, attempts: Sequence[Attempt]) -> None:
     """Write all attempts, the file whole."""
-    with logs.whole_file(path, "w") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(Attempt._fields)
-        writer.writerows([[f"{x:.6g}" if isinstance(x, float) else x for x in row] for row in attempts])
+    rows = [[f"{x:.6g}" if isinstance(x, float) else x for x in row] for row in attempts]
+    files.write_csv(path, Attempt._fields, rows)
 
 
 def attempts_table(attempts: Iterable[Attempt], task: str) -> list[str]:
