@@ -53,18 +53,11 @@ def reproduce(
     with stage("evaluate"):
         rl = PolicyController(machine, policy)
         measured, traces = measure(machine, net, test, rl, tuned, effort, seed)
-        results = {
-            "meta": meta(machine, seed) | tuned_for(machine, driven) | {"effort": asdict(effort)},
-            "paper_recipe": paper,
-            **measured,
-            "gains": plain_gains(tuned),
-            "tuning": how,
-            "training_seeds": over_seeds,
-        }
+    about = meta(machine, seed) | tuned_for(machine, driven) | {"effort": asdict(effort)}
+    results = {"meta": about, "paper_recipe": paper, **measured, "gains": plain_gains(tuned)}
+    results |= {"tuning": how, "training_seeds": over_seeds}
     with stage("draw"):
-        write_json(out / "results.json", results)
-        write_gains(out / "gains.json", tuned, results["meta"])
-        save_policy(out / "policy.npz", told(policy, results, seed))
+        write(out, results, tuned, told(policy, results, seed))
         parts = report.net_parts(machine, net, test, results, seed, out / "policy.npz.csv", clock["train"])
         parts = [report.found(results), *parts, *report.task_parts(machine, results, traces)]
         figures.write_report(out / "report.html", parts, clock)
@@ -145,6 +138,15 @@ def on_nets(
     starts = np.array(compared["starts"])[np.array(compared["start_kinds"]) == "workspace"]
     runs, _ = task_space(machine, {"rl": rl}, axis_sequences(machine), starts, seed, rl.policy.net)
     return summary(runs)["rl"]
+
+
+def write(
+    out: Path, results: Mapping[str, Any], tuned: Mapping[str, JacobianController], policy: Policy
+) -> None:
+    """What the other commands read: figures, gains of the baselines, the policy."""
+    write_json(out / "results.json", results)
+    write_gains(out / "gains.json", tuned, results["meta"])
+    save_policy(out / "policy.npz", policy)
 
 
 def told(policy: Policy, results: Mapping[str, Any], seed: int) -> Policy:

@@ -147,6 +147,19 @@ def collect(machine: Machine, hours: float, excitation: str, rng: np.random.Gene
     return Log(machine.names, kept, rate=machine.rate)
 
 
+def _leg_starts(
+    machine: Machine, joint: NDArray[np.intp], excitation: str, rng: np.random.Generator
+) -> Array:
+    """Angles (rows, n) at which legs begin: home, mid range, or if rich anywhere for `joint[k]`."""
+    low, high, row = machine.column("q_min"), machine.column("q_max"), np.arange(len(joint))
+    q = np.tile((low + high) / 2, (len(row), 1))
+    if excitation == "rich":  # a tenth of the legs begins at either stop
+        low, high = low[joint], high[joint]
+        past = (high - low) / 8
+        q[row, joint] = np.clip(rng.uniform(low - past, high + past), low, high)
+    return q
+
+
 def _drive_legs(
     machine: Machine, joint: NDArray[np.intp], excitation: str, rng: np.random.Generator
 ) -> tuple[_Recorder, NDArray[np.intp], NDArray[np.intp]]:
@@ -155,13 +168,8 @@ def _drive_legs(
     Returns:
         What was recorded, and the ticks (rows,) at which the ways back begin and end.
     """
-    low, high, row = machine.column("q_min"), machine.column("q_max"), np.arange(len(joint))
-    ticks = round(LEG * machine.rate)
-    q = np.tile((low + high) / 2, (len(row), 1))
-    low, high = low[joint], high[joint]
-    if excitation == "rich":  # a tenth of the legs begins at either stop
-        past = (high - low) / 8
-        q[row, joint] = np.clip(rng.uniform(low - past, high + past), low, high)
+    low, high, row = machine.column("q_min")[joint], machine.column("q_max")[joint], np.arange(len(joint))
+    q, ticks = _leg_starts(machine, joint, excitation, rng), round(LEG * machine.rate)
     start, near, length = q[row, joint], 2 * machine.encoder_step, machine.history + ticks
     commands = np.zeros((len(row), length))
     commands[:, machine.history :] = [EXCITATIONS[excitation](rng, machine, ticks) for _ in row]

@@ -235,6 +235,8 @@ class JacobianController:
 
 # --- tuning -----------------------------------------------------------------------------------------
 
+SEARCH: dict[str, Any] = {"mutation": (0.4, 0.9), "tol": 0, "polish": False}  # of SciPy, assumed
+
 
 def tune(
     controller: JacobianController,
@@ -246,13 +248,7 @@ def tune(
     """The controller with the gains of least cost, and the least cost after each generation.
 
     SciPy's differential evolution with 32 candidates, the first of them about the controller's own gains.
-
-    Args:
-        controller: whose gains are to be found.
-        cost: cost (candidates,) of a controller with a row of gains for each candidate.
-        seed: of the search.
-        generations: of the search.
-        label: shown at the progress bar.
+    `cost` is that (candidates,) of a controller with a row of gains for each candidate.
     """
     low, high = gain_bounds(controller.machine)
     first = np.random.default_rng(seed).normal(controller.gains, 0.15 * (high - low), (32, len(low)))
@@ -268,19 +264,9 @@ def tune(
             costs.append(float(intermediate_result.fun))
             bar.update()
 
-        result = differential_evolution(
-            objective,
-            Bounds(low, high),
-            init=np.clip(first, low, high),
-            maxiter=generations,
-            mutation=(0.4, 0.9),
-            tol=0,
-            polish=False,
-            rng=seed,
-            vectorized=True,
-            updating="deferred",
-            callback=note,
-        )
+        how = SEARCH | {"rng": seed, "maxiter": generations, "init": np.clip(first, low, high)}
+        how |= {"callback": note, "vectorized": True, "updating": "deferred"}
+        result = differential_evolution(objective, Bounds(low, high), **how)
     return replace(controller, gains=result.x), costs
 
 

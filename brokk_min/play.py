@@ -67,12 +67,7 @@ class Hands:
         if event.type == pg.QUIT or (event.type == pg.KEYDOWN and event.key == pg.K_ESCAPE):
             self.closed = True
         elif event.type == pg.KEYDOWN:
-            self.lost = False  # the keyboard takes over
-            self.held.add(event.key)
-            if event.key == pg.K_TAB:
-                self.switch()
-            tasks = {pg.K_RETURN: "next", pg.K_BACKSPACE: "again"}
-            self.task_wanted = tasks.get(event.key, self.task_wanted)
+            self._press(event.key)
         elif event.type == pg.KEYUP:
             self.held.discard(event.key)
         elif event.type == pg.WINDOWFOCUSLOST:
@@ -80,12 +75,24 @@ class Hands:
             self.held.clear()
         elif event.type == pg.WINDOWFOCUSGAINED:
             self.focus = True
-        elif event.type == pg.JOYDEVICEADDED and self.pad is None:
+        else:
+            self._hear_pad(event)
+
+    def _press(self, key: int) -> None:
+        pg = self.pygame
+        self.lost = False  # the keyboard takes over
+        self.held.add(key)
+        if key == pg.K_TAB:
+            self.switch()
+        self.task_wanted = {pg.K_RETURN: "next", pg.K_BACKSPACE: "again"}.get(key, self.task_wanted)
+
+    def _hear_pad(self, event: Any) -> None:
+        pg = self.pygame
+        if event.type == pg.JOYDEVICEADDED and self.pad is None:
             self.pad, self.lost, self.blocked = pg.joystick.Joystick(event.device_index), False, True
-        elif (
-            event.type == pg.JOYDEVICEREMOVED and self.pad and event.instance_id == self.pad.get_instance_id()
-        ):
-            self.pad, self.lost, self.blocked = None, True, True
+        elif event.type == pg.JOYDEVICEREMOVED and self.pad:
+            if event.instance_id == self.pad.get_instance_id():
+                self.pad, self.lost, self.blocked = None, True, True
         elif event.type == pg.JOYBUTTONDOWN and event.button == PAD_MODE:
             self.switch()
         elif event.type == pg.JOYBUTTONDOWN:

@@ -5,7 +5,7 @@ Sequences and starts that score are never used for tuning; `tuning_goals` makes 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -203,18 +203,8 @@ def draw_starts(machine: Machine, sequences: Sequence[Commands], num: int, rng: 
     goals = [sequence.goals[:, None] for sequence in sequences]
     with tqdm(total=num, desc="draw starts", unit="start", disable=None) as bar:
         for _ in range(200):
-            poses = draw_pose(machine, TaskConfig(), rng, 4000).round(4)
-            kinds = np.array(start_kinds(machine, poses))
-            of = {
-                kind: poses[kinds == kind][:size] for kind, size in zip(KINDS, (1500, 30, 4000), strict=True)
-            }
-            good = [feasible(machine, of["limits"], np.repeat(goal, len(of["limits"]), 1)) for goal in goals]
-            of["limits"] = of["limits"][np.mean(good, axis=0) >= 0.5]
-            for goal in goals:
-                few = of["workspace"]
-                of["workspace"] = few[feasible(machine, few, np.repeat(goal, len(few), axis=1))]
-            for kind in KINDS:
-                kept[kind] += list(of[kind])
+            for kind, poses in _by_kind(machine, draw_pose(machine, TaskConfig(), rng, 4000).round(4), goals):
+                kept[kind] += list(poses)
             found = sum(min(len(kept[kind]), order.count(kind)) for kind in KINDS)
             bar.update(found - bar.n)
             if found == num:
@@ -224,6 +214,16 @@ def draw_starts(machine: Machine, sequences: Sequence[Commands], num: int, rng: 
     except IndexError:
         wanted = f"{num} poses from which all sequences are feasible"
         raise ValueError(f"{machine.name}: expected {wanted}, got fewer in 200 draws") from None
+
+
+def _by_kind(machine: Machine, poses: Array, goals: Sequence[Array]) -> Iterator[tuple[str, Array]]:
+    """Which of `poses` (num, n) `draw_starts` may keep as starts of each kind, (k, n); `goals` (T, 1, 3)."""
+    kinds = np.array(start_kinds(machine, poses))
+    inside, near, far = (poses[kinds == kind][:n] for kind, n in zip(KINDS, (1500, 30, 4000), strict=True))
+    good = [feasible(machine, near, np.repeat(goal, len(near), axis=1)) for goal in goals]
+    for goal in goals:
+        inside = inside[feasible(machine, inside, np.repeat(goal, len(inside), axis=1))]
+    return zip(KINDS, (inside, near[np.mean(good, axis=0) >= 0.5], far), strict=True)
 
 
 def scored_starts(machine: Machine, num: int, sequences: Sequence[Commands], seed: int) -> Array:
