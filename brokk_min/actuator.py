@@ -19,9 +19,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brokk_min.files import load_arrays, load_header, whole_file
-from brokk_min.machine import estimate_velocity, valve_opening
+from brokk_min.machine import Array, estimate_velocity, valve_opening
 
-Array = NDArray[np.floating[Any]]
 FORMAT = 1  # of net files
 STILL = 0.002  # rad, assumed: little more than a step of a 12-bit encoder
 FINE = 0.02  # of full opening, assumed: below it nets see openings on a scale that is about linear

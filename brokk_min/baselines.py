@@ -9,17 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brokk_min import jacobian
 from brokk_min.actuator import ActuatorNet, fingerprint
 from brokk_min.env import TaskConfig, rollout
 from brokk_min.files import write_json
 from brokk_min.jacobian import JacobianController
-from brokk_min.machine import Machine
+from brokk_min.machine import Array, Machine
 from brokk_min.sequences import tuning_goals
 
-Array = NDArray[np.floating[Any]]
 PAPERS = ("jacobian_pid_k0.1", "jacobian_pid_k0.05")  # the paper's two baselines
 STRONGER = ("jacobian_pid_ff",)  # than the paper's: its sentences are put to it, too
 AWAKE = "jacobian_pid_ff_awake"  # the same, its valves never closed: what the policy learns to do

@@ -15,11 +15,11 @@ from tqdm import tqdm
 from brokk_min import actuator, claims, excitation, figures, fitting, logs, preliminary, report, scores
 from brokk_min.baselines import plain_gains, tuned_baselines, tuned_for, tuning_set, write_gains
 from brokk_min.env import TaskConfig
-from brokk_min.experiments import Array, Effort, Net, comparison, driven_log, meta, task_space
+from brokk_min.experiments import Effort, Net, comparison, driven_log, meta, task_space
 from brokk_min.figures import Traces
 from brokk_min.files import write_json
 from brokk_min.jacobian import JacobianController
-from brokk_min.machine import Machine
+from brokk_min.machine import Array, Machine
 from brokk_min.metrics import summary
 from brokk_min.policy import Policy, PolicyController, save_policy
 from brokk_min.sequences import axis_sequences, held_rows

@@ -10,15 +10,13 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brokk_min.env import Controller, Measured, Trace
 from brokk_min.jacobian import JacobianController, manipulability
 from brokk_min.kinematics import jacobian
-from brokk_min.machine import Machine
+from brokk_min.machine import Array, Machine
 from brokk_min.metrics import TRANSIENT, Run, by_start, interval, mean_interval, since_change
 
-Array = NDArray[np.floating[Any]]
 Claim = dict[str, Any]  # paper, measured, numbers, unit, holds (None: no such runs); see `beside`
 STILL = 0.05  # m, assumed: a tool that stays so near its line stays still across it
 SMALL = 0.05  # m, assumed: two tools so near to each other after the same commands differ little

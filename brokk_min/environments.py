@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from brokk_min import env
 from brokk_min.actuator import ActuatorNet, load_net
-from brokk_min.env import Array, Bools, State, TaskConfig
+from brokk_min.env import Bools, State, TaskConfig
 from brokk_min.kinematics import tool_position
-from brokk_min.machine import BROKK_170, Machine
+from brokk_min.machine import BROKK_170, Array, Machine
 
 
 class TaskVectorEnv(VectorEnv[Array, Array, Any]):

@@ -7,17 +7,15 @@ Nets are fitted to what `collect` records, one actuator at a time, over its whol
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
 from brokk_min.logs import RETURN, Log, Recording, velocity_of
-from brokk_min.machine import PWM_MAX, Machine, limit_command, read_encoder
+from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, read_encoder
 from brokk_min.plant import plant_reset, plant_step
 
-Array = NDArray[np.floating[Any]]
 # Shares of what rich excitation is made of, assumed.
 MIX = {"sine": 0.17, "step": 0.1, "holds": 0.17, "go": 0.21, "hover": 0.35}
 BARELY = 0.049  # of full command, assumed: a valve so far beyond its dead zone is barely open

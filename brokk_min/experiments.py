@@ -11,7 +11,6 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from brokk_min import __version__, actuator, claims, fitting, jacobian, kinematics, logs
@@ -19,7 +18,7 @@ from brokk_min.baselines import PAPERS, STRONGER
 from brokk_min.env import Controller, TaskConfig, Trace, rollout
 from brokk_min.figures import Traces
 from brokk_min.jacobian import JacobianController
-from brokk_min.machine import Machine
+from brokk_min.machine import Array, Machine
 from brokk_min.metrics import (
     Run,
     by_start,
@@ -42,7 +41,6 @@ from brokk_min.sequences import (
 )
 from brokk_min.variations import Sensor, exact, supply_demand, variations
 
-Array = NDArray[np.floating[Any]]
 Net = actuator.ActuatorNet
 
 

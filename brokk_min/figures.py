@@ -14,18 +14,16 @@ from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from brokk_min import actuator, files, kinematics, logs, scores
 from brokk_min.env import Trace
-from brokk_min.machine import Machine
+from brokk_min.machine import Array, Machine
 from brokk_min.sequences import AXES, Commands
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-Array = NDArray[np.floating[Any]]
 Traces = Mapping[tuple[str, str], Trace]  # by controller and sequence, starts as one batch
 
 plt.rcParams.update({"font.size": 10, "axes.grid": True, "grid.alpha": 0.3, "axes.axisbelow": True})

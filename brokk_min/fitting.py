@@ -15,9 +15,7 @@ from tqdm import tqdm
 
 from brokk_min.actuator import NET_ARRAYS, ActuatorNet, valve_scale
 from brokk_min.logs import Log, Recording
-from brokk_min.machine import estimate_velocity
-
-Array = NDArray[np.floating[Any]]
+from brokk_min.machine import Array, estimate_velocity
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brokk_min.machine import PWM_MAX, Machine, encode_pwm
 
-Array = NDArray[Any]
+Array = NDArray[Any]  # counts and flags, too
 
 POSITION_MASK = (1 << 26) - 1  # bits of an encoder's position that count
 OPERATIONAL = 5  # CANopen state of a node at work

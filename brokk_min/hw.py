@@ -15,17 +15,15 @@ from copy import copy
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brokk_min import bus
 from brokk_min.actuator import push_command, rest_history
 from brokk_min.env import Controller, observe, push_measured
-from brokk_min.gate import OPERATIONAL, GateInputs, encoder_counts, fault_name, gate, gate_start
+from brokk_min.gate import OPERATIONAL, Array, GateInputs, encoder_counts, fault_name, gate, gate_start
 from brokk_min.kinematics import tool_state
 from brokk_min.machine import PWM_MAX, Machine
 from brokk_min.wishes import Wish, unpack_wish
 
-Array = NDArray[Any]
 AWAKE = 0.002  # s before SYNC and after it in which the loop does not sleep (tuned)
 REHEARSALS = 4  # of a tick before it (tuned)
 WINDOW = 0.020  # s after SYNC in which the encoders must answer (assumed)

@@ -11,16 +11,14 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import Bounds, OptimizeResult, differential_evolution
 from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import Measured, measured
 from brokk_min.kinematics import jacobian
-from brokk_min.machine import PWM_MAX, Machine, limit_command, valve_opening
-
-Array = NDArray[np.floating[Any]]
+from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, valve_opening
 
 
 def dls(J: ArrayLike, W: ArrayLike, damping: ArrayLike, as_printed: bool = False) -> Array:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+Array = NDArray[np.floating[Any]]  # of any shape, float32 or float64
 SOURCES = ("paper", "maker", "assumed", "tuned")
 PWM_MAX = 127  # counts of full command; paper: [0,127] is positive, [255,128] negative
 

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from brokk_min.env import Trace
-from brokk_min.machine import Machine
+from brokk_min.machine import Array, Machine
 
-Array = NDArray[np.floating[Any]]
 T = TypeVar("T")
 Run = Mapping[str, Any]  # controller, sequence, start, kind, then the figures of `metrics`
 LABELS = ("controller", "sequence", "start", "kind")

@@ -12,20 +12,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brokk_min import tracing, view, wishes
 from brokk_min.bus import open_line
 from brokk_min.env import Controller
 from brokk_min.gate import fault_name
 from brokk_min.kinematics import tool_position
-from brokk_min.machine import Machine
+from brokk_min.machine import Array, Machine
 from brokk_min.remote import Ask, Where, control_process
 from brokk_min.ticks import Known, Ticks, unpack_known
 from brokk_min.view import TITLES
 from brokk_min.window import Window, open_window
 
-Array = NDArray[Any]
 SIZE = (1120, 680)  # of the window [px]
 RISE = 0.25  # s from a key's press to full deflection (assumed)
 

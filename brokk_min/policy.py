@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from brokk_min.actuator import ActuatorNet, net_arrays, net_from_arrays
 from brokk_min.env import fitting_nets, observation_scale, to_command
 from brokk_min.files import expect_same, load_arrays, load_header, whole_file
-from brokk_min.machine import Machine
+from brokk_min.machine import Array, Machine
 
-Array = NDArray[np.floating[Any]]
 STAND = 2.0  # s, assumed: valves close when the tool was to stand still for longer
 FORMAT = 2  # of policy files; 1: actions in units of the command limit, dead zone and all
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import IO, Any, NamedTuple, cast
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 from tqdm import tqdm
 
@@ -20,13 +19,11 @@ from brokk_min.env import Controller, Trace
 from brokk_min.files import whole_file
 from brokk_min.kinematics import tool_position, tool_state
 from brokk_min.looks import skeleton
-from brokk_min.machine import Machine
+from brokk_min.machine import Array, Machine
 from brokk_min.policy import PolicyController, load_policy
 from brokk_min.sequences import Commands, goals_and_starts, task_sequences
 from brokk_min.ticks import Known, Ticks
 from brokk_min.window import open_window, picture
-
-Array = NDArray[Any]
 
 
 class Run(NamedTuple):
@@ -163,14 +160,14 @@ def write_film(path: Path, machine: Machine, runs: Sequence[Run], size: tuple[in
         writers[path.suffix](file, images, size, machine.rate / ticks.step)
 
 
-def _write_gif(file: IO[bytes], images: Iterable[Array], size: tuple[int, int], fps: float) -> None:
+def _write_gif(file: IO[bytes], images: Iterable[Any], size: tuple[int, int], fps: float) -> None:
     films = [Image.fromarray(image) for image in images]
     flat = [image.quantize(palette=_palette(films), dither=Image.Dither.NONE) for image in films]
     duration = round(1000 / fps)
     flat[0].save(file, "GIF", save_all=True, append_images=flat[1:], duration=duration, loop=0)
 
 
-def _write_mp4(file: IO[bytes], images: Iterable[Array], size: tuple[int, int], fps: float) -> None:
+def _write_mp4(file: IO[bytes], images: Iterable[Any], size: tuple[int, int], fps: float) -> None:
     form = f"-f rawvideo -pix_fmt rgb24 -s {size[0]}x{size[1]} -r {fps} -i - -pix_fmt yuv420p"
     form += " -vf crop=trunc(iw/2)*2:trunc(ih/2)*2"  # the code knows even sizes only
     form += " -f mp4 -movflags frag_keyframe+empty_moov pipe:1"

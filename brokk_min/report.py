@@ -10,16 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brokk_min import claims, figures, preliminary
 from brokk_min.actuator import ActuatorNet
 from brokk_min.figures import Quote, Traces
 from brokk_min.logs import Log
-from brokk_min.machine import Machine
+from brokk_min.machine import Array, Machine
 from brokk_min.sequences import KINDS, axis_sequences, held_rows, least_motion, task_sequences
 
-Array = NDArray[np.floating[Any]]
 VERDICTS = {True: "holds here", False: "does not hold here", None: "was not measured"}
 RECIPES = (
     "What the nets cost on the machine when they are fitted as in the paper: errors of free runs of 10 s on "

@@ -16,8 +16,8 @@ from tqdm import tqdm
 from brokk_min.actuator import ActuatorNet
 from brokk_min.fitting import Samples, end_to_end
 from brokk_min.logs import Log, Recording
+from brokk_min.machine import Array
 
-Array = NDArray[np.floating[Any]]
 HORIZONS = (1, 5, 10, 30)  # s, of the free-run scores
 
 

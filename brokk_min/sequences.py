@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,10 +15,9 @@ from tqdm import tqdm
 
 from brokk_min import files, jacobian, kinematics
 from brokk_min.env import TaskConfig, draw_pose, reset, terminated
-from brokk_min.machine import Machine
+from brokk_min.machine import Array, Machine
 from brokk_min.plant import speed_limits
 
-Array = NDArray[np.floating[Any]]
 AXES = "xyz"
 # One axis of the paper's experiment: seconds and share of tool_speed (assumed), with changes of direction.
 PATTERN = ((1, 0.0), (4, 2 / 3), (1, 0.0), (4, -2 / 3), (1, 0.0), (3, 1 / 3), (3, -1 / 3), (1, 0.0))

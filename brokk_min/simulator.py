@@ -15,14 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from brokk_min import bus
-from brokk_min.gate import OPERATIONAL, checksum, encoder_raw
+from brokk_min.gate import OPERATIONAL, Array, checksum, encoder_raw
 from brokk_min.machine import BROKK_170, Machine, decode_pwm
 from brokk_min.plant import plant_reset, plant_step
 
-Array = NDArray[Any]
 BOOT, STOPPED, PRE_OPERATIONAL = 0, 4, 127  # CANopen states beside OPERATIONAL
 START = (0.0, 0.5, 0.58, 1.71, 1.24)  # rad, the paper's start pose, pointing forward
 WATCHDOG = 0.150  # s without valid valve frame, then the valves go neutral (assumed)

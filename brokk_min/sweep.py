@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from brokk_min import experiments
@@ -27,13 +26,12 @@ from brokk_min.baselines import read_gains, tuned_for
 from brokk_min.env import TaskConfig
 from brokk_min.extras import need
 from brokk_min.files import expect_same, write_json
-from brokk_min.machine import Machine
+from brokk_min.machine import Array, Machine
 from brokk_min.metrics import by_start, mean_interval
 from brokk_min.policy import PolicyController, load_policy
 from brokk_min.ppo import PPOConfig, identity_of, train
 from brokk_min.sequences import AXES, scored_starts, task_sequences
 
-Array = NDArray[np.floating[Any]]
 Rows = list[dict[str, Any]]  # of `experiments.task_space`
 Submit = Callable[..., "Future[Rows]"]
 

@@ -7,18 +7,16 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brokk_min import files
 from brokk_min.kinematics import tool_position
 from brokk_min.looks import extent
-from brokk_min.machine import Machine
+from brokk_min.machine import Array, Machine
 from brokk_min.ticks import Known
 
-Array = NDArray[Any]
 CAPTURE = 0.1  # m, assumed: a point of the line counts as passed nearer than this
 SPACING = 0.05  # m, assumed: between the points that must be passed
 

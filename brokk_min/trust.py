@@ -9,15 +9,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brokk_min import fitting, kinematics, scores
 from brokk_min.actuator import ActuatorNet
 from brokk_min.logs import Log
-from brokk_min.machine import Machine
+from brokk_min.machine import Array, Machine
 from brokk_min.preliminary import named_times, net_mover, plant_mover, response_times, step_commands, steps
 
-Array = NDArray[np.floating[Any]]
 ALLOWED_OUTSIDE = 0.02  # of the samples, assumed: 0.2 % of the training are outside by definition
 
 

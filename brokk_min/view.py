@@ -7,16 +7,15 @@ shapes are pixels, y down; `window` paints them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brokk_min.kinematics import tool_state
 from brokk_min.looks import Box, Camera, cameras, extent, near_limit, near_singular, skeleton
-from brokk_min.machine import PWM_MAX, Machine
+from brokk_min.machine import PWM_MAX, Array, Machine
 
-Array = NDArray[np.floating[Any]]
 Colour = tuple[int, int, int]
 
 # all assumed

@@ -13,13 +13,11 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from brokk_min.env import measured
 from brokk_min.extras import need
-from brokk_min.machine import PWM_MAX, Machine
-
-Array = NDArray[Any]
+from brokk_min.machine import PWM_MAX, Array, Machine
 
 
 class Wish(NamedTuple):
