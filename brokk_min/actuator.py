@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brokk_min.files import load_arrays, load_header, whole_file
+from brokk_min.files import expected, load_arrays, load_header, whole_file
 from brokk_min.machine import Array, estimate_velocity, valve_opening
 
 FORMAT = 1  # of net files
@@ -122,11 +122,7 @@ class ActuatorNet:
     dead_zone: float = 0.0  # of full command: they were trained on `valve_scale` of commands
 
     def select(self, joints: Sequence[str]) -> ActuatorNet:
-        """The same nets for some joints, in the order given.
-
-        Raises:
-            ValueError: a joint without a net.
-        """
+        """The same nets for some joints, in the order given; ValueError: a joint without a net."""
         if not set(joints) <= set(self.joints):
             raise ValueError(f"joints: expected nets for {list(joints)}, got {list(self.joints)}")
         index = [self.joints.index(name) for name in joints]
@@ -231,7 +227,7 @@ def fingerprint(net: ActuatorNet) -> str:
 def net_from_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> ActuatorNet:
     """Nets from `net_arrays`; ValueError, naming `path`, for another format or arrays that do not fit."""
     header = load_header(path, arrays, "actuator net", FORMAT)
-    try:
+    with expected(path, "a complete actuator net"):
         header["joints"] = tuple(header["joints"])
         weights = tuple(arrays[f"weight_{i}"] for i in range(6))
         header |= {name: arrays[name] for name in NET_ARRAYS}
@@ -242,8 +238,6 @@ def net_from_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> ActuatorNet:
         found = [array.shape for array in (*weights, *(arrays[name] for name in NET_ARRAYS))]
         if found != wanted:
             raise ValueError(f"shapes {found} instead of {wanted}")
-    except (IndexError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: expected a complete actuator net, got {error!r}") from error
     return net
 
 

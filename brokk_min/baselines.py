@@ -13,7 +13,7 @@ import numpy as np
 from brokk_min import jacobian
 from brokk_min.actuator import ActuatorNet, fingerprint
 from brokk_min.env import TaskConfig, rollout
-from brokk_min.files import write_json
+from brokk_min.files import expected, write_json
 from brokk_min.jacobian import JacobianController
 from brokk_min.machine import Array, Machine
 from brokk_min.sequences import tuning_goals
@@ -87,21 +87,17 @@ def write_gains(path: Path, controllers: Mapping[str, JacobianController], about
 def read_gains(path: Path, machine: Machine, net: ActuatorNet) -> dict[str, JacobianController]:
     """The baselines with gains that `reproduce` wrote.
 
-    Raises:
-        ValueError: no such file, or gains of other controllers or joints, tuned for another machine or with
-            other nets, whose feed-forward is another.
+    ValueError: no such file, or gains of other controllers or joints, tuned for another machine or with
+    other nets, whose feed-forward is another.
     """
     result, wanted = baselines(machine, net), tuned_for(machine, net)
-    try:
+    with expected(path, f"gains for {machine.name} with nets {wanted['actuator']}"):
         table = json.loads(path.read_text())
         found = {name: table["meta"].get(name) for name in wanted}
         if found != wanted:
             raise ValueError(f"gains for {found}")
         for name, controller in result.items():
             result[name] = replace(controller, gains=jacobian.join_gains(machine, table["gains"][name]))
-    except (AttributeError, OSError, KeyError, TypeError, ValueError) as error:
-        nets = f"{machine.name} with nets {wanted['actuator']}"
-        raise ValueError(f"{path}: expected gains for {nets}, got {error!r}") from error
     return result
 
 

@@ -11,7 +11,7 @@ from brokk_min import bus
 from brokk_min.env import Controller
 from brokk_min.gate import encoder_counts
 from brokk_min.hw import Drive
-from brokk_min.logs import Log, Recording, velocity_of
+from brokk_min.logs import Log, machine_log
 from brokk_min.machine import Machine, decode_pwm
 from brokk_min.wishes import Wish, unpack_wish
 
@@ -70,8 +70,7 @@ class Tape:
 def replay(machine: Machine, controller: Controller, frames: Sequence[bus.Frame]) -> list[bus.Frame]:
     """Run the loop on a recorded log of it; what it sends now, to be compared with what it sent then.
 
-    Raises:
-        ValueError: another program made the log.
+    ValueError: another program made the log.
     """
     tape = Tape(list(frames))
     drive = Drive(machine, controller, tape, tape.wish)
@@ -94,8 +93,7 @@ def compare(machine: Machine, frames: Sequence[bus.Frame], sent: Sequence[bus.Fr
 def driven_log(machine: Machine, frames: Iterable[bus.Frame]) -> Log:
     """What encoders said and valves got while driving, as recordings for `fit`; a gap starts a new one.
 
-    Raises:
-        ValueError: nothing was driven for long enough.
+    ValueError: nothing was driven for long enough.
     """
     nodes, parts, start, last = bus.Nodes(machine), list[list[Any]](), 0.0, -np.inf
     for frame in frames:
@@ -110,13 +108,11 @@ def driven_log(machine: Machine, frames: Iterable[bus.Frame]) -> Log:
                 last = start
         else:
             nodes.hear(frame)
-    recordings = []
+    tapes = []
     for number, part in enumerate(parts):
         if len(part) > machine.history + 1:
             u, q = map(np.array, zip(*part, strict=True))
-            recordings.append(
-                Recording(f"drive_{number:03d}", u, q, velocity_of(q, machine.velocity_samples, machine.rate))
-            )
-    if not recordings:
+            tapes.append((f"drive_{number:03d}", u, q))
+    if not tapes:
         raise ValueError(f"log: expected more than {machine.history + 1} ticks of driving in a row, got none")
-    return Log(machine.names, tuple(recordings), rate=machine.rate)
+    return machine_log(machine, tapes)

@@ -7,15 +7,17 @@ Nets are fitted to what `collect` records, one actuator at a time, over its whol
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import chain
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
-from brokk_min.logs import RETURN, Log, Recording, velocity_of
+from brokk_min.logs import RETURN, Log, machine_log
 from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, read_encoder
 from brokk_min.plant import plant_reset, plant_step
 
+Tape = tuple[str, Array, Array]  # name, commands and encoder angles (T, n)
 # Shares of what rich excitation is made of, assumed.
 MIX = {"sine": 0.17, "step": 0.1, "holds": 0.17, "go": 0.21, "hover": 0.35}
 BARELY = 0.049  # of full command, assumed: a valve so far beyond its dead zone is barely open
@@ -107,11 +109,11 @@ class _Recorder:
         self.state = plant_step(self.machine, self.state, self.u[-1])
         self.q.append(read_encoder(self.machine, self.state.q))
 
-    def recording(self, name: str, row: int, start: int = 0, end: int | None = None) -> Recording:
-        """Ticks `start` to `end` of one row, with estimated velocities."""
+    def tape(self, name: str, row: int, start: int = 0, end: int | None = None) -> Tape:
+        """Ticks `start` to `end` of one row."""
         end = len(self.u) if end is None else end
-        u, q = (np.array([tick[row] for tick in tape[start:end]]) for tape in (self.u, self.q))
-        return Recording(name, u, q, velocity_of(q, self.machine.velocity_samples, self.machine.rate))
+        u, q = (np.array([tick[row] for tick in ticks[start:end]]) for ticks in (self.u, self.q))
+        return name, u, q
 
 
 def collect(machine: Machine, hours: float, excitation: str, rng: np.random.Generator) -> Log:
@@ -129,20 +131,19 @@ def collect(machine: Machine, hours: float, excitation: str, rng: np.random.Gene
     wanted = max(machine.history + 2, round(hours * 3600 * machine.rate))  # samples of each joint
     side_by_side = int(np.clip(wanted // 300, 1, 100))
     counted = np.zeros(machine.n, int)
-    recordings: list[list[Recording]] = [[] for _ in machine.joints]
+    tapes: list[list[Tape]] = [[] for _ in machine.joints]
     with tqdm(total=wanted * machine.n, desc=f"record ({excitation})", unit="sample", disable=None) as bar:
         while counted.min() < wanted:
             joint = np.repeat(np.flatnonzero(counted < wanted), side_by_side)
             recorder, back, home = _drive_legs(machine, joint, excitation, rng)
             for row, j in enumerate(joint):
                 if leg := min(back[row], wanted - counted[j]):
-                    name = f"{machine.names[j]}_{len(recordings[j]) // 2:03d}"
-                    recordings[j].append(recorder.recording(name, row, 0, leg))
-                    recordings[j].append(recorder.recording(name + RETURN, row, back[row], home[row]))
+                    name = f"{machine.names[j]}_{len(tapes[j]) // 2:03d}"
+                    tapes[j].append(recorder.tape(name, row, 0, leg))
+                    tapes[j].append(recorder.tape(name + RETURN, row, back[row], home[row]))
                     counted[j] += leg
                     bar.update(leg)
-    kept = tuple(recording for of_joint in recordings for recording in of_joint)
-    return Log(machine.names, kept, rate=machine.rate)
+    return machine_log(machine, chain(*tapes))
 
 
 def _leg_starts(
@@ -220,6 +221,4 @@ def task_log(
         command = command + smoothing * (level - command)
         jitter = noise * rng.standard_normal(shape) * (level != 0)
         recorder.play(moving * (command + jitter))
-    return Log(
-        machine.names, tuple(recorder.recording(f"task_{i:02d}", i) for i in range(runs)), rate=machine.rate
-    )
+    return machine_log(machine, (recorder.tape(f"task_{i:02d}", i) for i in range(runs)))

@@ -19,8 +19,7 @@ def export_onnx(path: Path, policy: Policy) -> None:
     What follows is up to the other program: actions go through `env.to_command` (metadata `dead_zone`,
     `pwm_limit`, `ramp`), and valves close when the tool was to stand for `stand_s` (`policy.STAND`).
 
-    Raises:
-        ValueError: the package onnx is not there.
+    ValueError: the package onnx is not there.
     """
     onnx, checker, helper, numpy_helper = (
         need(name, "export") for name in ("onnx", "onnx.checker", "onnx.helper", "onnx.numpy_helper")

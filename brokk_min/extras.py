@@ -9,8 +9,7 @@ from typing import Any
 def need(package: str, extra: str) -> Any:
     """A module of a package that comes with an extra of ours.
 
-    Raises:
-        ValueError: it is not installed, with the extra that brings it.
+    ValueError: it is not installed, with the extra that brings it.
     """
     try:
         return import_module(package)

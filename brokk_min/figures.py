@@ -19,6 +19,7 @@ from tqdm import tqdm
 from brokk_min import actuator, files, kinematics, logs, scores
 from brokk_min.env import Trace
 from brokk_min.machine import Array, Machine
+from brokk_min.metrics import Mean
 from brokk_min.sequences import AXES, Commands
 
 matplotlib.use("Agg")
@@ -156,7 +157,7 @@ def plot_learning(curve: Path) -> Any:
     return plot_panels([[Panel("", wide, label, {"rl": (steps, table[k])}) for k, label in labels.items()]])
 
 
-Bars = Mapping[str, Mapping[str, Mapping[str, float | None]]]  # controller, sequence: "mean", "low", "high"
+Bars = Mapping[str, Mapping[str, Mean]]  # by controller and sequence
 
 
 def plot_bars(panels: Mapping[str, Bars]) -> Any:

@@ -44,6 +44,15 @@ def whole_file(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
         raise
 
 
+@contextmanager
+def expected(path: Path, what: str) -> Iterator[None]:
+    """Whatever goes wrong while the content of `path` is taken apart says that it is not `what`."""
+    try:
+        yield
+    except (AttributeError, IndexError, KeyError, OSError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: expected {what}, got {error!r}") from error
+
+
 def write_json(path: Path, value: Any) -> None:
     """Write JSON whole, floats as they are."""
     with whole_file(path, "w") as file:
@@ -54,8 +63,7 @@ def write_json(path: Path, value: Any) -> None:
 def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """All arrays of an `.npz` file; nothing in it is executed.
 
-    Raises:
-        ValueError: not there, not an `.npz`, truncated, or holding pickled objects.
+    ValueError: not there, not an `.npz`, truncated, or holding pickled objects.
     """
     try:
         with np.load(path, allow_pickle=False) as file:
@@ -66,10 +74,8 @@ def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
 def load_header(path: Path, arrays: dict[str, Any], kind: str, version: int) -> dict[str, Any]:
     """The JSON header of a file of ours, checked for kind and format version, without those two."""
-    try:
+    with expected(path, "a file with a JSON header"):
         header = dict(json.loads(str(arrays["header"])))
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: expected a file with a JSON header, got {error!r}") from error
     got = header.pop("kind", None), header.pop("format", None)
     if got != (kind, version):
         raise ValueError(f"{path}: expected ({kind}, format {version}), got {got}")
@@ -89,8 +95,7 @@ def expect_same(path: Path, found: Mapping[str, Any], wanted: Mapping[str, Any])
 def read_table(path: Path, columns: Sequence[str], text: Sequence[str] = ()) -> dict[str, NDArray[Any]]:
     """Named columns of a small CSV: finite numbers, or text where so named.
 
-    Raises:
-        ValueError: with file, row and column of the first thing that is wrong.
+    ValueError: with file, row and column of the first thing that is wrong.
     """
     table = read_csv(Path(path))
     return {

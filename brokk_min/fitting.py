@@ -52,8 +52,7 @@ def fit(log: Log, config: FitConfig, seed: int, velocity_samples: int, machine: 
     `seed` gives the same bits on the same machine. `velocity_samples` is the window of the estimator that
     supplied the velocities of `log`, `machine` a name for the file.
 
-    Raises:
-        ValueError: a joint that never moves long enough to be learned.
+    ValueError: a joint that never moves long enough to be learned.
     """
     dead_zone = config.dead_zone or 0.0
     config = replace(config, dead_zone=dead_zone)  # as it is used, for the file
@@ -218,8 +217,7 @@ class TrainingSet(NamedTuple):
 def training_set(log: Log, history: int, rollout: int = 1, dead_zone: float = 0.0) -> TrainingSet:
     """Windows of the recordings in which a joint moves; its statistics are of those alone.
 
-    Raises:
-        ValueError: a joint that never moves long enough to be learned.
+    ValueError: a joint that never moves long enough to be learned.
     """
     samples = end_to_end(log)
     every, far = (samples.starts(history - 1, ahead, 1) for ahead in (1, rollout))

@@ -59,8 +59,7 @@ class Drive:
     def begin(self) -> None:
         """Check and set up the encoders, start all nodes, and the clock.
 
-        Raises:
-            ValueError: an encoder that does not answer or has another resolution.
+        ValueError: an encoder that does not answer or has another resolution.
         """
         for joint in self.machine.joints:
             turn = bus.sdo(self.line, joint.encoder_node, bus.RESOLUTION_OBJECT)
@@ -120,13 +119,16 @@ class Drive:
             self._speak(self._gate(np.zeros(self.machine.n), counts, self.line.now()))
             raise
 
+    @property
+    def seen(self) -> Array:
+        """Newest angles [rad] and rates [rad/s], (2, n); nan: unknown."""
+        return np.full((2, self.machine.n), np.nan) if self.history is None else self.history[0, :, :2, -1].T
+
     def status(self) -> str:
         """One line: state, faults, tool velocity wanted and measured [m/s], angles [rad], lateness."""
         state = "driving" if self.gate.driving else "waiting" if self.gate.wrong else "ready"
-        q, v = np.full(self.machine.n, np.nan), np.full(3, np.nan)
-        if self.history is not None:
-            q, q_dot = self.history[0, :, 0, -1], self.history[0, :, 1, -1]
-            v = tool_state(self.machine, q, q_dot)[1]
+        q, q_dot = self.seen
+        v = tool_state(self.machine, q, q_dot)[1]
         want, have, pose = (" ".join(f"{x:+.2f}" for x in a) for a in (self.wish.v_goal, v, q))
         late = f"late {1e3 * self.lateness:.1f} ms, skipped {self.skipped}"
         reason = f" {self.reason}" if self.reason else ""

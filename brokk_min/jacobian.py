@@ -111,8 +111,7 @@ def split_gains(gains: ArrayLike) -> dict[str, Array]:
 def join_gains(machine: Machine, named: Mapping[str, ArrayLike]) -> Array:
     """`split_gains` turned round for a single vector; one number stands for all joints.
 
-    Raises:
-        ValueError: another number of gains, or not finite ones.
+    ValueError: another number of gains, or not finite ones.
     """
     sizes = [len(machine.driven)] * 3 + [1, 1]
     pairs = zip(GAINS, sizes, strict=True)

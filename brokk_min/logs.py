@@ -8,7 +8,7 @@ machine's, jitter allowed. A recording whose name ends in `_return` is a way bac
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brokk_min.files import Floats, Table, cells_of, load_arrays, numbers_of, read_csv, whole_file, write_csv
-from brokk_min.machine import estimate_velocity
+from brokk_min.machine import Array, Machine, estimate_velocity
 
 RATE = 20.0  # Hz, paper: everything runs at 20 Hz; other machines have others
 MAX_GAP = 0.25  # s, assumed: a longer hole in the time stamps starts a new recording
@@ -32,9 +32,9 @@ class Recording(NamedTuple):
     """One recording of a log: arrays (T, n) of command [-1, 1], angle [rad], velocity [rad/s]."""
 
     name: str
-    u: Floats
-    q: Floats
-    q_dot: Floats
+    u: Array
+    q: Array
+    q_dot: Array
 
 
 class Log(NamedTuple):
@@ -44,6 +44,13 @@ class Log(NamedTuple):
     recordings: tuple[Recording, ...]
     velocity_logged: bool = False
     rate: float = RATE  # Hz
+
+
+def machine_log(machine: Machine, tapes: Iterable[tuple[str, Array, Array]]) -> Log:
+    """A log of a machine from names, commands and encoder angles; velocities are estimated."""
+    how = machine.velocity_samples, machine.rate
+    recordings = tuple(Recording(name, u, q, velocity_of(q, *how)) for name, u, q in tapes)
+    return Log(machine.names, recordings, rate=machine.rate)
 
 
 def write_log(path: Path, log: Log) -> None:
@@ -85,8 +92,7 @@ def read_log(
         velocity_samples: window of `estimate_velocity`.
         joints: names that must be there, in the wanted order; None: all, in the order of the first file.
 
-    Raises:
-        ValueError: with file, row (1 is the header) and column of the first thing that is wrong.
+    ValueError: with file, row (1 is the header) and column of the first thing that is wrong.
     """
     names, recordings, logged = tuple(joints or ()), list[Recording](), set[bool]()
     for path in map(Path, paths):
@@ -172,7 +178,7 @@ def _resample(time: Floats, columns: dict[str, Floats], samples: int, rate: floa
     return columns["u"][held], q, q_dot
 
 
-def velocity_of(q: Floats, samples: int, rate: float = RATE) -> Floats:
+def velocity_of(q: Array, samples: int, rate: float = RATE) -> Floats:
     """Causal velocity [rad/s] at each row of one recording `q` [rad] (T, n), at rest before it.
 
     `rate` [Hz] is that of the rows.

@@ -15,6 +15,7 @@ from brokk_min.machine import Array, Machine
 
 T = TypeVar("T")
 Run = Mapping[str, Any]  # controller, sequence, start, kind, then the figures of `metrics`
+Mean = Mapping[str, float | None]  # "mean", and the ends of its interval, "low" and "high", or None
 LABELS = ("controller", "sequence", "start", "kind")
 CHANGE = 0.05  # share of tool_speed, assumed: a goal that jumps by more has changed
 TRANSIENT = 0.6  # s after a change, assumed: as long as the policy's memory
@@ -180,21 +181,19 @@ def intervals(runs: Sequence[Run]) -> dict[str, dict[str, dict[str, list[float |
     return _of_each(runs, interval)
 
 
-def mean_interval(values: Array) -> dict[str, float | None]:
+def mean_interval(values: Array) -> Mean:
     """Mean and ends of its `interval`: "mean", "low", "high"."""
     low, high = interval(values)
     return {"mean": _number(values), "low": low, "high": high}
 
 
-def paired(runs: Sequence[Run], one: str, other: str, key: str) -> dict[str, dict[str, float | None]]:
+def paired(runs: Sequence[Run], one: str, other: str, key: str) -> dict[str, Mean]:
     """A figure of one controller less another's on the same starts, by sequence: `mean_interval` each."""
     sequences = _named(runs)[1]
     return {s: mean_interval(by_start(runs, one, s, key) - by_start(runs, other, s, key)) for s in sequences}
 
 
-def paired_with_others(
-    runs: Sequence[Run], one: str
-) -> dict[str, dict[str, dict[str, dict[str, float | None]]]]:
+def paired_with_others(runs: Sequence[Run], one: str) -> dict[str, dict[str, dict[str, Mean]]]:
     """Every figure of one controller less each other's: `paired`, by figure and other controller."""
     controllers, _, keys = _named(runs)
     return {k: {c: paired(runs, one, c, k) for c in controllers if c != one} for k in keys}

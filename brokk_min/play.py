@@ -300,8 +300,7 @@ def _window(machine: Machine) -> AbstractContextManager[Window]:
 def play(machine: Machine, controllers: Mapping[str, Controller], where: Where, attempts: Path) -> None:
     """Drive with keyboard or gamepad: the simulated machine, or the one on a bus.
 
-    Raises:
-        ValueError: no window, no bus, or a loop that ended by itself.
+    ValueError: no window, no bus, or a loop that ended by itself.
     """
     session, chosen = Session(machine, [*controllers, "levers"], attempts), list(controllers.values())
     with _window(machine) as window, control_process(machine, chosen, where) as (asks, tells, ended):

@@ -136,13 +136,11 @@ class Loop(hw.Drive):
 
     def known(self) -> Known:
         """What is known after a tick."""
-        seen: Array = np.full((2, self.machine.n), np.nan)  # angles, rates
-        if self.history is not None:
-            seen = self.history[0, :, :2, -1].T
         u, mode = self.gate.sent[..., -1] / PWM_MAX, getattr(self.controller, "mode", 0)
         gate, v_goal = self.gate, np.array(self.wish.v_goal)
         state = bool(gate.driving), int(gate.wrong), int(gate.fault)
-        return Known(self.ticks, seen[0], seen[1], u, v_goal, *state, mode, self.lateness)
+        q, q_dot = self.seen
+        return Known(self.ticks, q, q_dot, u, v_goal, *state, mode, self.lateness)
 
 
 @dataclass(frozen=True)

@@ -55,8 +55,7 @@ def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
     between velocities as the history shows them (estimated or logged), `position_error_median` is the
     median over segments of |angle error| at their end.
 
-    Raises:
-        ValueError: joints or velocities of another kind than the nets', or no recording long enough.
+    ValueError: joints or velocities of another kind than the nets', or no recording long enough.
     """
     for name in ("joints", "rate", "velocity_logged"):
         if (found := getattr(log, name)) != (wanted := getattr(net, name)):

@@ -129,8 +129,7 @@ def read_commands(path: Path, machine: Machine) -> list[Commands]:
 def read_starts(path: Path, machine: Machine) -> Array:
     """Start poses of a CSV with one column a joint [rad], shape (starts, n).
 
-    Raises:
-        ValueError: an angle outside its joint's range or a pose in the ground, with file and row.
+    ValueError: an angle outside its joint's range or a pose in the ground, with file and row.
     """
     table = files.read_table(path, list(machine.names))
     starts = np.stack([table[name] for name in machine.names], axis=1)
@@ -194,8 +193,7 @@ def draw_starts(machine: Machine, sequences: Sequence[Commands], num: int, rng: 
     From the first kind all sequences are `feasible`, from the second at least half of them; the third leaves
     parts of them out of reach. Where a machine has no poses of a kind, "workspace" stands in.
 
-    Raises:
-        ValueError: too few poses in many draws.
+    ValueError: too few poses in many draws.
     """
     kept: dict[str, list[Array]] = {kind: [] for kind in KINDS}
     order = [KINDS[(0, 1, 0, 2)[i % 4]] for i in range(num)]
@@ -256,8 +254,7 @@ def write_starts(path: Path, machine: Machine, starts: Array) -> None:
 def tuning_goals(machine: Machine, runs: int, seconds: float, seed: int) -> tuple[Array, Array]:
     """Feasible starts (runs, n) and goals (T, runs, 3), drawn as the policy's by `reset`: for tuning only.
 
-    Raises:
-        ValueError: too few in many draws.
+    ValueError: too few in many draws.
     """
     rng, config, ticks = np.random.default_rng(seed), TaskConfig(), round(seconds * machine.rate)
     holds = int(np.ceil(seconds / config.hold_min_s))  # that many are always long enough

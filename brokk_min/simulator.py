@@ -155,8 +155,7 @@ def serve(machine: SimulatedMachine, line: Any, running: Callable[[], bool]) -> 
 def start_pose(machine: Machine, given: Sequence[float]) -> Array:
     """Angles at the start [rad] (n,): those given, or else the Brokk's `START`, or amid another's ranges.
 
-    Raises:
-        ValueError: a pose that the machine cannot take.
+    ValueError: a pose that the machine cannot take.
     """
     low, high = machine.column("q_min"), machine.column("q_max")
     q = np.array(given or (START if machine == BROKK_170 else (low + high) / 2), float)

@@ -99,11 +99,7 @@ class Tracing:
 
 
 def read_attempts(path: Path) -> list[Attempt]:
-    """Attempts so far; none if there is no file.
-
-    Raises:
-        ValueError: another kind of file.
-    """
+    """Attempts so far; none if there is no file; ValueError: another kind of file."""
     if not path.exists():
         return []
     table = files.read_table(path, Attempt._fields, text=("when", "task", "mode"))
@@ -118,13 +114,10 @@ def write_attempts(path: Path, attempts: Sequence[Attempt]) -> None:
 
 def attempts_table(attempts: Iterable[Attempt], task: str) -> list[str]:
     """Means of one task by who translated, a line each."""
-    by_mode: dict[str, list[Attempt]] = {}
-    for attempt in attempts:
-        if attempt.task == task:
-            by_mode.setdefault(attempt.mode, []).append(attempt)
-    lines = []
-    for mode, rows in by_mode.items():
-        lines.append(f"mean of {len(rows)} by {mode}: {figures(np.mean([row[3:] for row in rows], axis=0))}")
+    lines, mine = [], [attempt for attempt in attempts if attempt.task == task]
+    for mode in dict.fromkeys(attempt.mode for attempt in mine):
+        rows = [attempt[3:] for attempt in mine if attempt.mode == mode]
+        lines.append(f"mean of {len(rows)} by {mode}: {figures(np.mean(rows, axis=0))}")
     return lines
 
 

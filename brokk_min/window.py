@@ -17,11 +17,7 @@ from brokk_min.view import PAPER, Circle, Clip, Colour, Line, Polygon, Shape, Te
 
 
 def need_pygame() -> Any:
-    """pygame, which is imported only where something is painted.
-
-    Raises:
-        ValueError: it is not installed.
-    """
+    """pygame, which is imported only where something is painted; ValueError: it is not installed."""
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
     return need("pygame", "play")
 
@@ -69,11 +65,7 @@ def _canvas(size: tuple[int, int]) -> Any:
 
 
 class Window:
-    """A window for shapes.
-
-    Raises:
-        ValueError: no pygame, or no display.
-    """
+    """A window for shapes; ValueError: no pygame, or no display."""
 
     def __init__(self, size: tuple[int, int], title: str) -> None:
         self.pygame = pygame = need_pygame()
@@ -104,8 +96,7 @@ def open_window(size: tuple[int, int], title: str) -> Iterator[Window]:
 
     Without a display SDL draws unseen. That serves tests, and whoever asks for it with SDL_VIDEODRIVER.
 
-    Raises:
-        ValueError: no pygame, or no display.
+    ValueError: no pygame, or no display.
     """
     window = Window(size, title)
     try:

@@ -49,8 +49,7 @@ def unpack_wish(data: bytes) -> Wish:
 class Script:
     """Velocity goals (T, 3) [m/s] one after another, as soon as the gate is ready; then the end.
 
-    Raises:
-        ValueError: a goal faster than the machine's `tool_speed`.
+    ValueError: a goal faster than the machine's `tool_speed`.
     """
 
     def __init__(self, machine: Machine, goals: Array, patience_s: float = 5.0) -> None:
