@@ -1,7 +1,5 @@
 """The classical controllers that the policy is compared with: their settings, tuning and files of gains."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What a drive left in its log: the loop run on it again, byte by byte, and recordings for `fit`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import Any
 

@@ -3,8 +3,6 @@
 Importing this module opens nothing and does not import python-can.
 """
 
-from __future__ import annotations
-
 import select
 import signal
 import struct

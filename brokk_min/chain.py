@@ -1,7 +1,5 @@
 """The whole chain in one function: logs, nets, policy, baselines, comparison, report."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager

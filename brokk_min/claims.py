@@ -3,8 +3,6 @@
 Limits by which a verdict is given are ours (assumed); the intervals are over starts. Paper: Sec. 4.2
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any

@@ -3,8 +3,6 @@
 They keep a state, a random generator and pictures; what happens in a tick is `env.step`.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

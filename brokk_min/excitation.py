@@ -4,8 +4,6 @@ Nets are fitted to what `collect` records, one actuator at a time, over its whol
 `task_log`, which moves the joints together, as a policy does.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import chain
 

@@ -3,8 +3,6 @@
 `task_space` runs every controller on the same starts and velocity sequences on the same machine.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product

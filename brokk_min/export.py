@@ -1,7 +1,5 @@
 """A policy as an ONNX file, for those who run it elsewhere."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Packages that only some commands need (the extras of pyproject.toml), imported when one of these runs."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import Any
 

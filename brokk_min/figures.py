@@ -3,8 +3,6 @@
 Colours differ in brightness too, for paper and for the colour-blind.
 """
 
-from __future__ import annotations
-
 import base64
 import html
 import io

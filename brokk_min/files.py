@@ -4,8 +4,6 @@ A file takes the place of another only once it is complete; one that is not what
 what was expected, where, and what was found.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 import os

@@ -4,8 +4,6 @@ The gate is a pure function of state, inputs and time, for one machine or for a 
 safety function: a real machine keeps its hard-wired emergency stop (docs/hardware.md).
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

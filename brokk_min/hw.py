@@ -6,8 +6,6 @@ its logs, `simulator` is a machine to try. Nothing here is a safety function: a 
 hard-wired emergency stop (docs/hardware.md).
 """
 
-from __future__ import annotations
-
 import gc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -4,8 +4,6 @@ Read in the order of the computation: `dls` and its weights and damping give joi
 eq4), `JacobianController` turns them into commands, `tune` finds its gains on the machine.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple

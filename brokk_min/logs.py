@@ -6,8 +6,6 @@ command (held until the next row), q in rad, q_dot in rad/s. Any joints, any rat
 machine's, jitter allowed. A recording whose name ends in `_return` is a way back to the start and is dropped.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple

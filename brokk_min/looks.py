@@ -1,7 +1,5 @@
 """What a machine looks like: corners, extent, two views of it; which poses deserve a warning."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import NamedTuple
 

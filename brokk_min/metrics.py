@@ -1,7 +1,5 @@
 """Figures of merit of runs, their means with intervals over starts, and comparisons on the same starts."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar

@@ -4,8 +4,6 @@ Model-predictive control on the analytic plant. It is told no goal ahead of time
 goal lasted, like every other controller. What error it leaves is the price of delay and dead time.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import product
 from typing import NamedTuple

@@ -4,8 +4,6 @@ The learner never sees these equations, only logs of what they do. One step is o
 under a held command, as it is for the nets that learn the machine (`actuator.ActuatorNet.step`).
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -3,8 +3,6 @@
 The loop that drives is elsewhere (`remote`): the window only says what is asked for and shows what is known.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager

@@ -1,7 +1,5 @@
 """A trained policy as a file and a function; no torch, so that it runs wherever the machine is."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass

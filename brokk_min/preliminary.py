@@ -4,8 +4,6 @@ The paper's tests are put to a machine (the analytic plant) and to its nets side
 and velocities are means over a tick, without encoder and estimator: what is compared is the motion.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple

@@ -4,8 +4,6 @@ The window writes what the operator asks for and reads what the loop knows, thro
 neither side ever waits. The loop is `hw.Drive` with its gate; a window that is silent is a lost device.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 import time
 from collections.abc import Callable, Iterator, Sequence

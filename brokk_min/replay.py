@@ -1,7 +1,5 @@
 """Recorded runs, of a log or of results driven again, side by side: films of them."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 from collections.abc import Iterable, Sequence

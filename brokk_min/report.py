@@ -3,8 +3,6 @@
 Paper: Sec. 4.2
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -4,8 +4,6 @@ The error of one step says little: over 50 ms "the same velocity again" is nearl
 far nets have gone astray after seconds, because a policy that learns on them lives there.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

@@ -3,8 +3,6 @@
 Sequences and starts that score are never used for tuning; `tuning_goals` makes the others.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple

@@ -3,8 +3,6 @@
 It plays the part of a real Brokk on the bus; the program that drives it cannot tell.
 """
 
-from __future__ import annotations
-
 import gc
 import os
 import struct

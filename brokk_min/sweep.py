@@ -4,8 +4,6 @@ Each seed leaves `seed_<n>.npz`, its learning curve and, last, `seed_<n>.json`; 
 again. On a cluster the folder must be one that all workers see, and a worker runs one seed at a time.
 """
 
-from __future__ import annotations
-
 import json
 import multiprocessing
 import os

@@ -1,7 +1,5 @@
 """What is known of a machine at each tick, from the frames of a bus or of a log; it only listens."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Lines to trace with the tool, by hand: how well it was done, by whoever translated, kept in a table."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field

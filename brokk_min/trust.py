@@ -4,8 +4,6 @@ For any log: a linear model that nets must beat, creep, response times, and whet
 are scored on.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The machine and its encoders other than the controllers know them: what robustness is measured on."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -4,8 +4,6 @@
 shapes are pixels, y down; `window` paints them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Shapes onto a surface, into a window or an image: all that needs pygame (extra `play`)."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

@@ -4,8 +4,6 @@ An operator is called with what the gate says and gives a `Wish`. A script plays
 switch and all, so that it passes the same gate.
 """
 
-from __future__ import annotations
-
 import os
 import struct
 from collections.abc import Sequence
