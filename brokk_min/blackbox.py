@@ -82,9 +82,8 @@ def replay(machine: Machine, controller: Controller, frames: Sequence[bus.Frame]
 
 def compare(machine: Machine, frames: Sequence[bus.Frame], sent: Sequence[bus.Frame]) -> tuple[int, int]:
     """How many valve frames of `sent` are those of the log, byte by byte, and how many the log has."""
-    old, new = (
-        [f.data for f in side if f.sent and f.id == machine.valve_frame_id] for side in (frames, sent)
-    )
+    valves = machine.valve_frame_id
+    old, new = ([f.data for f in side if f.sent and f.id == valves] for side in (frames, sent))
     return sum(a == b for a, b in zip(old, new)), max(len(old), len(new))
 
 

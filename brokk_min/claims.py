@@ -101,11 +101,8 @@ def _faster_down(found: Mapping[str, Any]) -> Claim:
 def _later_from_idle(found: Mapping[str, Any]) -> Claim:
     times = {kind: of[found["joint"]] for kind, of in found["response_time"].items()}
     numbers = {f"{kind}, {when}": of[when]["up"] for kind, of in times.items() for when in ("idle", "moving")}
-    later = (
-        [of["idle"]["up"] >= LATER * of["moving"]["up"] for of in times.values()]
-        if all(numbers.values())
-        else []
-    )
+    answered = times.values() if all(numbers.values()) else ()
+    later = [of["idle"]["up"] >= LATER * of["moving"]["up"] for of in answered]
     paper = "The same command is answered after about 400 ms from idle and 100 ms when already moving."
     what = f"response time of {found['joint']} (to 63 %), from idle to be {LATER:g} times as long or more"
     return _claim(paper, what, "s", _single(numbers), all(later) if later else None)

@@ -46,9 +46,8 @@ def rich_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Arra
         amplitude = rng.uniform(machine.dead_zone, limit)
         if kind == "sine":
             frequency = np.exp(rng.uniform(np.log(0.05), np.log(4.0)))
-            part = rng.uniform(-0.3, 0.3) * limit + amplitude * np.sin(
-                2 * np.pi * frequency * time + rng.uniform(0, 2 * np.pi)
-            )
+            middle, phase = rng.uniform(-0.3, 0.3) * limit, rng.uniform(0, 2 * np.pi)
+            part = middle + amplitude * np.sin(2 * np.pi * frequency * time + phase)
         elif kind == "step":
             part = np.full(length, rng.choice([-1, 1]) * amplitude)
         elif kind == "holds":

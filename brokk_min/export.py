@@ -19,9 +19,8 @@ def export_onnx(path: Path, policy: Policy) -> None:
 
     ValueError: the package onnx is not there.
     """
-    onnx, checker, helper, numpy_helper = (
-        need(name, "export") for name in ("onnx", "onnx.checker", "onnx.helper", "onnx.numpy_helper")
-    )
+    names = "onnx", "onnx.checker", "onnx.helper", "onnx.numpy_helper"
+    onnx, checker, helper, numpy_helper = (need(name, "export") for name in names)
     layers = len(policy.weights) // 2
     arrays = {f"{'wb'[i % 2]}{i // 2}": weight for i, weight in enumerate(policy.weights)}
     nodes = []

@@ -1,12 +1,12 @@
 """Fitting the nets to a log: windows of its recordings, errors of one step, then of short free runs.
 
 A window never crosses the seam of two recordings, and teaches a joint only where that joint moves. The nets
-of all joints are fitted at once. `fit_linear`, on the same windows, is what they must beat.
+of all joints are fitted at once.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -277,42 +277,3 @@ def end_to_end(log: Log) -> Samples:
     lengths = [len(r.q) for r in log.recordings]
     moves = [np.ptp(r.u, axis=0) + np.ptp(r.q, axis=0) > 0 for r in log.recordings]
     return Samples(whole, target, np.repeat(moves, lengths, axis=0), lengths)
-
-
-class LinearModel(ActuatorNet):
-    """A linear model of the nets' inputs within the nets' range: what a net must beat.
-
-    Weights (n, 3 H) and (n,), for standardised inputs.
-    """
-
-    def velocity(self, history: Array) -> Array:
-        """What the model says, as `ActuatorNet.predict`."""
-        slope, offset = self.weights
-        inputs = (self.inputs(history) - self.input_mean) / self.input_scale
-        velocity = (inputs * slope).sum(axis=-1) + offset
-        return np.asarray(np.clip(velocity, self.output_low, self.output_high))
-
-
-def fit_linear(net: ActuatorNet, log: Log, penalty: float = 1e-3) -> LinearModel:
-    """Ridge regression on the inputs, targets and recordings that `net` was fitted to.
-
-    Args:
-        penalty: on squared weights, in units of the mean squared error of standardised inputs.
-    """
-    training, history = training_set(log, net.history, dead_zone=net.dead_zone), net.history
-    slopes, offsets = [], []
-    for j, ends in enumerate(training.ends):
-        size = 3 * history + 1
-        gram, moment = np.zeros((size, size)), np.zeros(size)
-        for chunk in np.array_split(ends, -(-len(ends) // 8192)):  # bounds the memory
-            x = training.series[:, j, chunk[:, None] + np.arange(1 - history, 1)].swapaxes(0, 1)
-            x = (x.reshape(len(chunk), -1) - training.input_mean[j]) / training.input_scale[j]
-            x = np.column_stack([x, np.ones(len(chunk))])
-            gram, moment = gram + x.T @ x, moment + x.T @ training.target[chunk, j]
-        ridge = penalty * len(ends) * np.eye(size)
-        ridge[-1, -1] = 0.0  # the offset is free
-        *slope, offset = np.linalg.solve(gram + ridge, moment)
-        slopes.append(slope)
-        offsets.append(offset)
-    header = {f.name: getattr(net, f.name) for f in fields(net)} | {"settings": {"penalty": penalty}}
-    return LinearModel(**header | {"weights": (np.array(slopes, np.float32), np.array(offsets, np.float32))})

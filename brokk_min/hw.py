@@ -90,9 +90,8 @@ class Drive:
         counts = encoder_counts(self.machine, self.nodes.raw)
         with self._caught():
             wanted = self._control(counts)
-        self.wish = self.wish._replace(
-            stop=self.wish.stop or bool(self.signals), error=self.wish.error or bool(self.problem)
-        )
+        stop, error = self.wish.stop or bool(self.signals), self.wish.error or bool(self.problem)
+        self.wish = self.wish._replace(stop=stop, error=error)
         frame = self._gate(wanted, counts, line.note(self.wish.pack()))
         problem, self.problem = self.problem, ""
         self._speak(frame)

@@ -43,9 +43,8 @@ def line_distance(p_tool: Array, goals: Array, start: Array) -> Array:
         anchor = np.where(anew & ~first, before, anchor)
         direction, before = np.where(anew, heading, direction), p
         away = p - anchor
-        distance.append(
-            np.linalg.norm(away - np.sum(away * direction, -1, keepdims=True) * direction, axis=-1)
-        )
+        along = np.sum(away * direction, -1, keepdims=True) * direction
+        distance.append(np.linalg.norm(away - along, axis=-1))
     return np.array(distance)
 
 
@@ -68,10 +67,8 @@ def settling_time(machine: Machine, error: Array, goals: Array) -> Array:
     Where it does not before the next change, the whole time between the changes counts. `goals` (T, num, 3).
     """
     since = since_change(machine, goals)
-    segment, last_change = (
-        np.cumsum(since == 0, axis=0),
-        np.arange(len(goals))[:, None] - np.maximum(since, 0),
-    )
+    segment = np.cumsum(since == 0, axis=0)
+    last_change = np.arange(len(goals))[:, None] - np.maximum(since, 0)
     jump = np.take_along_axis(_jumps(goals), last_change, axis=0)
     band = np.minimum(BAND * machine.tool_speed, PART * jump)
     late = np.where((error > band) & (since >= 0), since + 1, 0)

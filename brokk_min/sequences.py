@@ -72,9 +72,8 @@ def _along(machine: Machine, direction: ArrayLike) -> Array:
 def _held(machine: Machine, rows: ArrayLike) -> Array:
     """Goals [m/s] (T, 3) of rows (seconds, shares of tool_speed along x, y, z)."""
     table = np.asarray(rows, float)
-    return np.repeat(
-        machine.tool_speed * table[:, 1:], np.rint(table[:, 0] * machine.rate).astype(int), axis=0
-    )
+    ticks = np.rint(table[:, 0] * machine.rate).astype(int)
+    return np.repeat(machine.tool_speed * table[:, 1:], ticks, axis=0)
 
 
 def held_rows(machine: Machine, goals: Array) -> Array:

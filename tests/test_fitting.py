@@ -10,7 +10,7 @@ import pytest
 import torch
 from helpers_machines import line
 
-from brokk_min import fitting
+from brokk_min import fitting, trust
 from brokk_min.actuator import rest_history, valve_scale
 from brokk_min.fitting import FitConfig, fit
 from brokk_min.logs import Log, Recording, velocity_of
@@ -168,7 +168,7 @@ def test_memory_of_a_fit_grows_with_the_data_and_not_with_data_times_history():
     fitting.training_set(log, 80, 8)
     held = tracemalloc.get_traced_memory()[1]
     tracemalloc.reset_peak()
-    fitting.fit_linear(net, log)
+    trust.fit_linear(net, log)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert held < 15e6  # 250 bytes a sample
