@@ -4,8 +4,6 @@ What it reads is a history: angle, velocity and command of the last 13 samples, 
 the hardware keep. `fitting` makes nets from logs, `scores` judges them, `env` puts an arm on them.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math
@@ -13,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -121,7 +119,7 @@ class ActuatorNet:
     weights: tuple[Array, ...]
     dead_zone: float = 0.0  # of full command: they were trained on `valve_scale` of commands
 
-    def select(self, joints: Sequence[str]) -> ActuatorNet:
+    def select(self, joints: Sequence[str]) -> Self:
         """The same nets for some joints, in the order given; ValueError: a joint without a net."""
         if not set(joints) <= set(self.joints):
             raise ValueError(f"joints: expected nets for {list(joints)}, got {list(self.joints)}")

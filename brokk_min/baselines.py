@@ -21,7 +21,7 @@ from brokk_min.sequences import tuning_goals
 PAPERS = ("jacobian_pid_k0.1", "jacobian_pid_k0.05")  # the paper's two baselines
 STRONGER = ("jacobian_pid_ff",)  # than the paper's: its sentences are put to it, too
 AWAKE = "jacobian_pid_ff_awake"  # the same, its valves never closed: what the policy learns to do
-SEARCH: dict[str, Any] = {"mutation": (0.4, 0.9), "tol": 0, "polish": False}  # of SciPy, assumed
+SEARCH: dict[str, Any] = {"mutation": (0.4, 0.9), "tol": 0, "polish": False}  # of SciPy's search, assumed
 
 
 def baselines(machine: Machine, net: ActuatorNet) -> dict[str, JacobianController]:

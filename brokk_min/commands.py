@@ -1,6 +1,7 @@
 """The commands of the method: from logs to nets, policies, comparisons and the report."""
 
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -219,12 +220,12 @@ class Evaluate(Command):
             write_json(self.json, {"meta": meta, "runs": runs})
         _print_means(runs, len(sequences))
 
-    def _baselines(self, machine: Machine, net: ActuatorNet, gains: Path | None) -> dict[str, Any]:
+    def _baselines(self, machine: Machine, net: ActuatorNet, gains: Path | None) -> Mapping[str, Controller]:
         if gains:
-            return dict(baselines.read_gains(gains, machine, net))
+            return baselines.read_gains(gains, machine, net)
         effort = experiments.Effort()
-        tuned, _ = baselines.tuned_baselines(machine, net, effort.tuning_runs, effort.generations, self.seed)
-        return dict(tuned)
+        how_much = effort.tuning_runs, effort.generations
+        return baselines.tuned_baselines(machine, net, *how_much, self.seed)[0]
 
 
 def _print_means(runs: list[dict[str, Any]], sequences: int) -> None:

@@ -36,8 +36,8 @@ TUNED = (
     "gains.json."
 )
 Part = tuple[Any, ...]  # title, sentence, contents: see `figures.write_report`
-UNITS = {"velocity": "m/s", "off": "m", "position": "m", "settling": "s", "time": "s", "jerk": "m/s^3"}
 BOUNDS = ("perfect_model", "perfect_model_no_dither")  # of `experiments.bounds`
+UNITS = {"velocity": "m/s", "off": "m", "position": "m", "settling": "s", "time": "s", "jerk": "m/s^3"}
 UNITS |= {"valve": "full strokes", "reward": "1"}  # of the figures of `metrics`, by their first word
 
 
@@ -145,8 +145,7 @@ def _starts_text(kinds: Sequence[str]) -> str:
 def _singular(
     machine: Machine, found: Mapping[str, Any], traces: Traces, extended: Array, said: Sequence[Quote]
 ) -> Part:
-    run = int(np.argmin(found["manipulability"]))
-    ticks = len(next(iter(traces.values())).q)
+    run, ticks = int(np.argmin(found["manipulability"])), len(next(iter(traces.values())).q)
     half = least_motion(machine, extended)[0]
     plot = figures.plot_sequence(machine, traces, half._replace(goals=half.goals[:ticks]), extended[run], run)
     keys = ("velocity_error_mean", "jerk_rms", "off_axis_drift_max", "time_at_limits")
@@ -226,10 +225,8 @@ def _by_sequence(task: Mapping[str, Any]) -> Part:
 
 def _pairs(less: Mapping[str, Any]) -> Part:
     """RL less each baseline: every figure, then two of them by sequence."""
-    every = {
-        _named(key): {c: _with_interval(rows["all"]) for c, rows in of.items()} for key, of in less.items()
-    }
-    contents: list[Any] = ["All sequences.", every]
+    every = {_named(key): {c: rows["all"] for c, rows in of.items()} for key, of in less.items()}
+    contents: list[Any] = ["All sequences.", _cells(every)]
     for key in ("velocity_error_mean", "off_axis_drift_max"):
         contents += [f"{_named(key)} by sequence.", _turned(_cells(less[key]))]
     text = f"Differences on the same starts and noise, one value a start; {ENDS}."
@@ -298,10 +295,9 @@ def _lists(machine: Machine, results: Mapping[str, Any]) -> list[Part]:
     for row, kind in zip(scored.values(), results["start_kinds"], strict=True):
         row["kind"] = kind
     sequences = {s.name: _path(held_rows(machine, s.goals)) for s in task_sequences(machine)}
-    runs = enumerate(results["tuning_runs"])
-    tuned = {
-        f"tuning run {i}": _pose(machine, run["start"]) | _path(np.array(run["goals"])) for i, run in runs
-    }
+    tuned = {}
+    for i, run in enumerate(results["tuning_runs"]):
+        tuned[f"tuning run {i}"] = _pose(machine, run["start"]) | _path(np.array(run["goals"]))
     return [
         ("Scored sequences", "Seconds, and the goals held for them.", sequences),
         ("Scored starts", "Angles [rad].", scored),
