@@ -144,11 +144,15 @@ def kinematics(options: Options) -> dict[str, float]:
     for i in range(m.n):  # as many joints; the time does not depend on where they are
         place = pinocchio.SE3(np.eye(3), np.array([1.0, 0.0, 0.0]))
         model.addJoint(i, pinocchio.JointModelRZ(), place, f"joint_{i}")
+    tool = model.addFrame(pinocchio.Frame("tool", m.n, place, pinocchio.FrameType.OP_FRAME))
     data, q = model.createData(), np.random.default_rng(0).uniform(0, 1, (4096, m.n))
 
-    def loop() -> None:
+    def loop() -> None:  # to the same results: position and Jacobian along the base's axes
         for row in q[:1024]:
             pinocchio.computeJointJacobians(model, data, row)
+            pinocchio.updateFramePlacement(model, data, tool)
+            _ = data.oMf[tool].translation
+            pinocchio.getFrameJacobian(model, data, tool, pinocchio.ReferenceFrame.LOCAL_WORLD_ALIGNED)
 
     calls = {"tool_jacobian": lambda: tool_jacobian(m, q), "pinocchio": loop}
     found = seconds(calls, options.repeats, 0.02 if options.quick else 0.1)

@@ -94,8 +94,7 @@ class _Layout(NamedTuple):
     scale: Array
     sensed: Array  # what noise of 1 does to what sensors say, in physical units; 0 for the rest
     paper: Array  # factors that make it the paper's: weights undone, wanted rates blanked
-    turned: Array  # what velocities add to the mean of a joint's angles to make it the newest [s], (H,)
-    told: NDArray[np.intp]  # what a flattened history (n * 3 * H) gives: locked angles, driven histories
+    told: Array  # of a joint's angles and velocities [1, s], their sum tells where it is now, (2, H)
 
 
 def _layout(machine: Machine) -> _Layout:
@@ -125,10 +124,8 @@ def _layout(machine: Machine) -> _Layout:
         # velocity j is in j of H sums, and late by half its window: to it comes so often what it grew by
         late = machine.velocity_samples / 2 - 1
         turned = (np.arange(samples) - late + late * samples * (np.arange(samples) == samples - 1)) / samples
-        turned = (machine.dt * turned).astype(np.float32)
-        place = np.arange(machine.n * 3 * samples).reshape(machine.n, 3, samples)
-        told = np.concatenate([place[rest, 0, -1], place[driven].ravel()])
-        machine.__dict__["layout"] = _Layout(mean, scale, sensed * scale, paper, turned, told)
+        told = np.stack([each / samples, machine.dt * turned]).astype(np.float32)
+        machine.__dict__["layout"] = _Layout(mean, scale, sensed * scale, paper, told)
     layout: _Layout = machine.__dict__["layout"]
     return layout
 
@@ -180,18 +177,19 @@ def observe(
     Returns:
         Shape (..., 6 + locked + (3 H + 2) n_driven), float32.
     """
-    mean, scale, sensed, _, _, told = _layout(machine)
-    batch = history.shape[:-3]
+    mean, scale, sensed, _, _ = _layout(machine)
+    batch, rest = history.shape[:-3], machine.locked
     seen = np.zeros((*batch, len(mean)), np.float32)
-    seen[..., 6 : 6 + len(told)] = history.reshape(*batch, -1)[..., told]
+    seen[..., 6 : 6 + len(rest)] = history[..., rest, 0, -1]
+    _samples(machine, seen)[...] = history.take(machine.driven, axis=-3)
     seen += noise * sensed
     p_tool, J = tool_jacobian(machine, _angles(machine, seen))
     given = np.empty((*batch, 3, 3), np.float32)
     given[..., 0, :], given[..., 2, :] = v_goal, lag
-    given[..., 1, :] = np.add.reduce(J * history[..., None, :, 1, -1], axis=-1)
+    given[..., 1, :] = np.einsum("...ij,...j", J, history[..., 1, -1])
     seen[..., :6] += _turn(p_tool[..., None, :], given[..., :2, :], 1).reshape(*batch, 6)
     rates = damped_rates(machine, J[..., None, :, machine.driven], given[..., ::2, :])
-    seen[..., 6 + len(told) :] = rates.reshape(*batch, -1)
+    seen[..., -2 * len(machine.driven) :] = rates.reshape(*batch, -1)
     seen -= mean
     seen /= scale
     return seen
@@ -211,10 +209,10 @@ def _angles(machine: Machine, values: Array) -> Array:
     Each sample of a driven joint's angle says where the joint is now, once what it turned since is added. The
     mean of them all has a fraction of the newest one's noise.
     """
-    samples, turned = _samples(machine, values), _layout(machine).turned
+    moving = _samples(machine, values)[..., :2, :]
     q = np.empty((*values.shape[:-1], machine.n), values.dtype)
     q[..., machine.locked] = values[..., 6 : 6 + len(machine.locked)]
-    q[..., machine.driven] = samples[..., 0, :].mean(axis=-1) + (samples[..., 1, :] * turned).sum(axis=-1)
+    q[..., machine.driven] = np.einsum("...ks,ks", moving, _layout(machine).told)
     return q
 
 
@@ -460,8 +458,9 @@ def reset(machine: Machine, config: TaskConfig, rng: np.random.Generator, num: i
 
 def look(machine: Machine, config: TaskConfig, state: State, rng: np.random.Generator) -> Array:
     """The observation of a state, (..., obs), with fresh uniform noise. Paper: Sec. 3.4 (5 %)"""
-    draws = rng.random((*state.q.shape[:-1], len(_layout(machine).mean)), np.float32) - np.float32(0.5)
-    noise = np.float32(2 * config.noise) * draws
+    shape = (*state.q.shape[:-1], len(_layout(machine).mean))
+    steps = rng.integers(-(2**15), 2**15, shape, np.int16)  # 16 bits take half as long as a float32
+    noise = steps * np.float32(2.0**-15 * config.noise)
     seen = observe(machine, state.history, state.v_goal, state.lag, noise)
     return seen * paper_view(machine) if config.paper else seen
 

@@ -3,6 +3,8 @@
 They keep a state, a random generator and pictures; what happens in a tick is `env.step`.
 """
 
+import contextlib
+import ctypes
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +55,7 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.state: State | None = None
+        _keep_freed_memory()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -147,6 +150,18 @@ def _open(machine: Machine, actuator: ActuatorNet | Path | str) -> ActuatorNet |
         return None
     net = actuator if isinstance(actuator, ActuatorNet) else load_net(Path(actuator))
     return env.fitting_nets(machine, net)
+
+
+def _keep_freed_memory() -> None:
+    """Let the process keep the memory of arrays that it drops, 32 MB each at most, for the next ones.
+
+    glibc would hand it back and fetch it anew in each step, page by page: a seventh of the time of 256
+    environments, two fifths of 4096. Other C libraries do as they do.
+    """
+    with contextlib.suppress(AttributeError, OSError, TypeError):
+        mallopt, trim_threshold, mmap_threshold = ctypes.CDLL(None).mallopt, -1, -3
+        mallopt(trim_threshold, 2**30)
+        mallopt(mmap_threshold, 2**25)
 
 
 def _spaces(machine: Machine) -> tuple[Any, Any]:

@@ -1,9 +1,11 @@
 """Hand-written Denavit-Hartenberg kinematics: frames, tool position, Jacobian, tool velocity.
 
-One forward pass (`_chain`) serves everything. It keeps axes and origins of the frames as arrays with the 3
-coordinates first and the joints next, and turns joints with parallel axes together: few operations on whole
-arrays are several times faster than stacks of 4x4 products. All results are in the base frame, z up, origin
-on the ground under the slew axis; angles `q` [rad] are (..., n) and keep their float type.
+`frames` multiplies the DH matrices. All else is one pass (`_chain`) from the tool back to the base, over runs
+of joints with parallel axes. A run turns in a plane: the ways from its joints to its end are sums of lengths
+times cosines and sines. The tool's derivative by a joint is the way there, turned by 90 degrees. All that
+comes after a run is turned into its frame, then added. Arrays have the 3 coordinates first and the joints
+next: few operations do the work. Results are in the base frame, z up, origin on the ground under the slew
+axis; angles `q` [rad] are (..., n) and keep their float type.
 """
 
 from __future__ import annotations
@@ -19,54 +21,46 @@ Array = NDArray[np.floating[Any]]
 
 
 class Chain(NamedTuple):
-    """Axes x and z of the frames along the arm, base first, and their origins p: arrays (3, n + 1, ...)."""
+    """Ways from all joints to the tool, and derivatives of the tool by their angles: (3, n, ...) both."""
 
-    x: Array
-    z: Array
-    p: Array
-
-
-class _Run(NamedTuple):
-    """Joints `start` to `end` - 1, whose axes are parallel; their offsets and links, (joints, 1, ...)."""
-
-    start: int
-    end: int
-    theta: Array  # rad, summed from the run's first joint on
-    a: Array  # m
-    d: Array  # m
-    cos: float  # of the last joint's alpha
-    sin: float
+    levers: Array  # m
+    columns: Array  # m/rad
 
 
-def _runs(machine: Machine, dtype: Any, ndim: int) -> list[_Run]:
-    """The arm as runs of joints with parallel axes; worked out once and kept with the machine."""
-    kept = machine.__dict__.setdefault("runs", {})
-    if (dtype, ndim) not in kept:
-        ends = [i + 1 for i, joint in enumerate(machine.joints) if joint.alpha != 0.0 or i == machine.n - 1]
-        runs = []
-        for start, end in zip([0, *ends], ends, strict=False):
-            rows = [machine.column(name)[start:end] for name in ("theta", "a", "d")]
-            rows[0] = np.cumsum(rows[0])
-            theta, a, d = (row.astype(dtype).reshape(-1, *[1] * (ndim - 1)) for row in rows)
-            alpha = machine.joints[end - 1].alpha
-            runs.append(_Run(start, end, theta, a, d, float(np.cos(alpha)), float(np.sin(alpha))))
-        kept[dtype, ndim] = runs
-    result: list[_Run] = kept[dtype, ndim]
-    return result
+class _Plan(NamedTuple):
+    """What of a machine enters the arithmetic, in one float type; columns of `Chain` have zeros in it."""
+
+    inner: list[int]  # joints parallel to the one before
+    theta: Array  # (n, 2, 1), offsets summed from a run's first joint on [rad]; a quarter turn makes cosines
+    a: Array  # (n, 1, 1) [m]
+    rises: Array  # (n, 2, 1), d summed from a joint to the end of its run [m]; 0 for columns
+    bends: list[tuple[int, int, Array]]  # first joint and end of each run but the last; turn by alpha (2, 2)
+    damping: float  # of `damped_rates` [m^2]
+
+
+def _plan(machine: Machine, dtype: Any) -> _Plan:
+    """Worked out once a machine and float type; kept with the machine."""
+    kept: dict[Any, _Plan] = machine.__dict__.setdefault("plans", {})
+    if dtype not in kept:
+        a, alpha, d, theta = (machine.column(name) for name in ("a", "alpha", "d", "theta"))
+        ends = [i + 1 for i in range(machine.n - 1) if alpha[i]]  # alpha tilts the next axis
+        run = np.searchsorted(ends, np.arange(machine.n), "right")
+        before = np.tri(machine.n) * (run[:, None] == run)  # joints of the same run, up to each one
+        offsets, rises = np.add.outer(before @ theta, [np.pi / 2, 0]), np.outer(before.T @ d, [1, 0])
+        tilts = np.array([[np.cos(alpha), -np.sin(alpha)], [np.sin(alpha), np.cos(alpha)]], dtype)
+        bends = [(start, end, tilts[..., end - 1]) for start, end in zip([0, *ends], ends, strict=False)]
+        inner, length = [i for i in range(1, machine.n) if i not in ends], np.hypot(a, d).sum()
+        theta, a, rises = (each.reshape(machine.n, -1, 1).astype(dtype) for each in (offsets, a, rises))
+        kept[dtype] = _Plan(inner, theta, a, rises, bends, 1e-6 + (0.06 * length) ** 2)
+    return kept[dtype]
 
 
 def _joints_first(machine: Machine, q: ArrayLike, name: str = "q") -> Array:
-    """Checked angles or rates as (n, ...), contiguous: each joint's arithmetic then runs at full speed."""
+    """Checked angles or rates as (n, ...)."""
     angles = as_floats(q)
     if angles.ndim < 1 or angles.shape[-1] != machine.n:
         raise ValueError(f"{name}: expected (..., {machine.n}), got {angles.shape}")
-    return np.ascontiguousarray(_coordinates_first(angles))
-
-
-def _coordinates_first(array: Array, axes: int = 1) -> Array:
-    """The last `axes` axes first; `np.moveaxis` takes ten times as long."""
-    batch = array.ndim - axes
-    return array.transpose(*range(batch, array.ndim), *range(batch))
+    return angles.transpose(-1, *range(angles.ndim - 1))  # `np.moveaxis` takes ten times as long
 
 
 def _coordinates_last(array: Array, axes: int = 1) -> Array:
@@ -75,32 +69,52 @@ def _coordinates_last(array: Array, axes: int = 1) -> Array:
 
 
 def _chain(machine: Machine, q: ArrayLike) -> Chain:
-    """All frames of the arm by the DH rows, T_i = T_(i-1) Rz(q + theta) Tz(d) Tx(a) Rx(alpha)."""
-    angles = _joints_first(machine, q)
-    x, z, p = chain = Chain(*np.zeros((3, 3, machine.n + 1, *angles.shape[1:]), angles.dtype))
-    x[0, 0] = z[2, 0] = 1
-    y = np.zeros_like(x[:, :1])
-    y[1] = 1
-    for start, end, theta, a, d, cos, sin in _runs(machine, angles.dtype, angles.ndim):
-        base, axis, run = x[:, start, None], z[:, start, None], slice(start + 1, end + 1)
-        turned = np.add.accumulate(angles[start:end]) + theta
-        c, s = np.cos(turned), np.sin(turned)
-        x[:, run] = c * base + s * y
-        z[:, run] = axis
-        p[:, run] = p[:, start, None] + np.add.accumulate(a * x[:, run] + d * axis, axis=1)
-        if end < machine.n or sin:  # the next run's axis is this one's, turned around x
-            y = c[-1:] * y - s[-1:] * base
-            y, z[:, end] = cos * y + sin * axis, (cos * axis - sin * y)[:, 0]
-    return chain
+    """Levers and columns, in blocks of poses whose temporary arrays fit the processor's cache."""
+    angles, n = _joints_first(machine, q), machine.n
+    plan, poses = _plan(machine, angles.dtype), angles.reshape(n, -1)
+    result = np.empty((3, n, 2, poses.shape[1]), poses.dtype)
+    block = 8192 // poses.itemsize
+    for i in range(0, poses.shape[1], block):
+        _fill(plan, poses[:, i : i + block], result[..., i : i + block])
+    result = result.reshape(3, n, 2, *angles.shape[1:])
+    return Chain(result[:, :, 0], result[:, :, 1])
+
+
+def _fill(plan: _Plan, angles: Array, result: Array) -> None:
+    """Write levers and columns (3, n, 2, poses) for `angles` (n, poses): each run alone, then backwards."""
+    summed = angles.copy()
+    for i in plan.inner:
+        summed[i] += summed[i - 1]
+    turns = np.sin(summed[:, None] + plan.theta)  # (n, 2, poses): cosines and sines
+    links = plan.a * turns
+    for i in reversed(plan.inner):
+        links[i - 1] += links[i]
+    levers, columns = result[:, :, 0], result[:, :, 1]
+    levers[0], levers[1], result[2] = links[:, 0], links[:, 1], plan.rises
+    columns[0], columns[1] = -links[:, 1], links[:, 0]
+    for start, end, tilt in reversed(plan.bends):
+        later, (c, s) = result[:, end:], turns[end - 1]
+        x = later[0]
+        y, later[2] = (tilt @ later[1:].reshape(2, -1)).reshape(2, *x.shape)  # Rx(alpha)
+        later[1], later[0] = s * x + c * y, c * x - s * y  # Rz
+        x, y, _ = way = later[:, :1, 0]
+        levers[:, start:end] += way
+        columns[0, start:end] -= y
+        columns[1, start:end] += x
 
 
 def frames(machine: Machine, q: ArrayLike) -> Array:
     """Frames [1, m] of the base, each link's end and (last) the tool, (..., n + 1, 4, 4). Paper: Fig. 1"""
-    x, z, p = _chain(machine, q)
-    result = np.zeros((4, 4, *p.shape[1:]), p.dtype)
-    result[:3] = np.stack([x, np.cross(z, x, axis=0), z, p], axis=1)
-    result[3, 3] = 1.0
-    return np.moveaxis(result, (0, 1, 2), (-2, -1, -3))  # from (4, 4, n + 1, ...)
+    angles = _joints_first(machine, q)
+    result, turns = np.zeros((2, machine.n + 1, *angles.shape[1:], 4, 4), angles.dtype)
+    result[0] = turns[:] = np.eye(4)
+    for i, joint in enumerate(machine.joints):
+        c, s = np.cos(angles[i] + joint.theta), np.sin(angles[i] + joint.theta)
+        cos, sin = np.cos(joint.alpha), np.sin(joint.alpha)
+        turns[i, ..., 0, 0], turns[i, ..., 0, 1], turns[i, ..., 1, 0], turns[i, ..., 1, 1] = c, -s, s, c
+        row = [[1, 0, 0, joint.a], [0, cos, -sin, 0], [0, sin, cos, joint.d], [0, 0, 0, 1]]
+        result[i + 1] = result[i] @ turns[i] @ np.array(row, angles.dtype)
+    return np.moveaxis(result, 0, -3)
 
 
 def tool_position(machine: Machine, q: ArrayLike) -> Array:
@@ -112,17 +126,7 @@ def tool_position(machine: Machine, q: ArrayLike) -> Array:
         >>> round(float(np.hypot(x, y)), 2), round(float(z), 2)
         (3.05, 1.01)
     """
-    return _coordinates_last(_chain(machine, q).p[:, -1])
-
-
-def _columns(chain: Chain) -> Array:
-    """Jacobian columns z_(i-1) x (p_tool - p_(i-1)) of all joints, (3, n, ...)."""
-    z, arm = chain.z[:, :-1], chain.p[:, -1:] - chain.p[:, :-1]
-    columns = np.empty_like(arm)
-    columns[0] = z[1] * arm[2] - z[2] * arm[1]
-    columns[1] = z[2] * arm[0] - z[0] * arm[2]
-    columns[2] = z[0] * arm[1] - z[1] * arm[0]
-    return columns
+    return _coordinates_last(_chain(machine, q).levers[:, 0])
 
 
 def jacobian(machine: Machine, q: ArrayLike) -> Array:
@@ -133,7 +137,7 @@ def jacobian(machine: Machine, q: ArrayLike) -> Array:
 def tool_jacobian(machine: Machine, q: ArrayLike) -> tuple[Array, Array]:
     """Tool position [m] (..., 3) and its derivative by all joints' angles [m/rad] (..., 3, n)."""
     chain = _chain(machine, q)
-    return _coordinates_last(chain.p[:, -1]), _coordinates_last(_columns(chain), 2)
+    return _coordinates_last(chain.levers[:, 0]), _coordinates_last(chain.columns, 2)
 
 
 def tool_state(machine: Machine, q: ArrayLike, q_dot: ArrayLike) -> tuple[Array, Array, Array]:
@@ -149,8 +153,8 @@ def tool_state(machine: Machine, q: ArrayLike, q_dot: ArrayLike) -> tuple[Array,
     """
     rates = _joints_first(machine, q_dot, "q_dot")
     chain = _chain(machine, q)
-    velocity = np.add.reduce(_columns(chain) * rates, axis=1)
-    return _coordinates_last(chain.p[:, -1]), _coordinates_last(velocity), _lowest(chain)
+    velocity = np.add.reduce(chain.columns * rates, axis=1)
+    return _coordinates_last(chain.levers[:, 0]), _coordinates_last(velocity), _lowest(chain)
 
 
 def tool_velocity(machine: Machine, q: ArrayLike, q_dot: ArrayLike) -> Array:
@@ -175,12 +179,10 @@ def joint_rates(machine: Machine, q: ArrayLike, v: ArrayLike) -> Array:
 
 def damped_rates(machine: Machine, J: Array, v: ArrayLike) -> Array:
     """`joint_rates` (..., n_driven) of a known Jacobian `J` [m/rad] (..., 3, n_driven)."""
-    columns, v = _coordinates_first(J, 2), _coordinates_first(np.asarray(v, J.dtype))
-    length = np.hypot(machine.column("a"), machine.column("d")).sum()
-    damping = 1e-6 + float((0.06 * length) ** 2)
-    square = np.add.reduce(columns[:, None] * columns, axis=2)  # J J^T, (3, 3, ...)
+    columns, v = np.ascontiguousarray(J.T), np.ascontiguousarray(np.transpose(v), J.dtype)
+    square = np.add.reduce(columns[:, None] * columns[:, :, None])  # J J^T, (3, 3, ...)
+    square.reshape(9, -1)[::4] += _plan(machine, J.dtype).damping
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = square
-    xx, yy, zz = xx + damping, yy + damping, zz + damping
     # eliminate x, then y, and put back in
     by_x, bz_x = xy / xx, xz / xx
     yy, yz, zz = yy - by_x * xy, yz - by_x * xz, zz - bz_x * xz
@@ -189,7 +191,7 @@ def damped_rates(machine: Machine, J: Array, v: ArrayLike) -> Array:
     z = (v[2] - bz_x * v[0] - bz_y * y) / (zz - bz_y * yz)
     y = y / yy - bz_y * z
     x = v[0] / xx - by_x * y - bz_x * z
-    return _coordinates_last(x * columns[0] + y * columns[1] + z * columns[2])
+    return np.asarray(x * columns[:, 0] + y * columns[:, 1] + z * columns[:, 2]).T
 
 
 def lowest_point(machine: Machine, q: ArrayLike) -> Array:
@@ -204,4 +206,5 @@ def lowest_point(machine: Machine, q: ArrayLike) -> Array:
 
 
 def _lowest(chain: Chain) -> Array:
-    return np.asarray(np.minimum.reduce(chain.p[2, 1:]))
+    rises = chain.levers[2]  # the first from the ground; links end in the joints after it and in the tool
+    return np.asarray(rises[0] - np.maximum.reduce(rises[1:], initial=0))

@@ -145,8 +145,10 @@ class RowRandom:
     def standard_normal(self, size: int | tuple[int, ...]) -> np.ndarray:
         return np.concatenate([s.standard_normal(self._rows(size)) for s in self.sources])
 
-    def integers(self, low: int, high: int, size: int | tuple[int, ...]) -> np.ndarray:
-        return np.concatenate([s.integers(low, high, self._rows(size)) for s in self.sources])
+    def integers(
+        self, low: int, high: int, size: int | tuple[int, ...], dtype: type = np.int64
+    ) -> np.ndarray:
+        return np.concatenate([s.integers(low, high, self._rows(size), dtype) for s in self.sources])
 
     def uniform(self, low: float, high: float, size: int | tuple[int, ...]) -> np.ndarray:
         return np.concatenate([s.uniform(low, high, self._rows(size)) for s in self.sources])

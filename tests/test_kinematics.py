@@ -15,6 +15,7 @@ from scipy.linalg import expm
 from strategies import moving, posed, poses, reals
 
 from brokk_min.kinematics import (
+    _plan,
     frames,
     jacobian,
     joint_rates,
@@ -330,6 +331,23 @@ def test_an_empty_batch_has_empty_results():
     assert frames(BROKK_170, q).shape == (0, 6, 4, 4)
     assert jacobian(BROKK_170, q).shape == (0, 3, 4)
     assert lowest_point(BROKK_170, q).shape == (0,)
+    assert joint_rates(BROKK_170, q, np.zeros((0, 3))).shape == (0, 4)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_batch_of_several_blocks_is_its_halves(dtype):
+    """Blocks of `_chain` hold 1024 or 2048 poses; rounding does not depend on how many come together."""
+    q = np.random.default_rng(1).uniform(-1, 1, (3, 1500, 5)).astype(dtype)
+    p, J = tool_jacobian(BROKK_170, q)
+    assert J.shape == (3, 1500, 3, 5)
+    for some in (np.s_[:2], np.s_[2:], np.s_[:, 1499], np.s_[1, 700]):
+        np.testing.assert_array_equal(p[some], tool_position(BROKK_170, q[some]))
+        np.testing.assert_array_equal(J[some], tool_jacobian(BROKK_170, q[some])[1])
+
+
+def test_constants_of_a_machine_are_worked_out_once_a_float_type():
+    single, double = (_plan(BROKK_170, np.dtype(kind)) for kind in ("f4", "f8"))
+    assert single is _plan(BROKK_170, np.dtype("f4")) and single is not double
 
 
 @given(posed())

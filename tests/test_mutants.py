@@ -29,19 +29,22 @@ from brokk_min.machine import BROKK_170
 # module, right, wrong, the test that must fail: by module of the package
 PLANTED: list[tuple[str, str, str, str]] = [
     # sine for cosine in DH; hands of the axes; the row's order; the Jacobian
-    ("kinematics", "x[:, run] = c * base + s * y", "x[:, run] = s * base + c * y",
+    ("kinematics", "s * x + c * y, c * x - s * y", "c * x - s * y, s * x + c * y",
      "kinematics::closed_form_of_the_brokk"),
-    ("kinematics", "cos * y + sin * axis, (cos * axis - sin * y)[:, 0]",
-     "cos * y - sin * axis, (cos * axis + sin * y)[:, 0]",
+    ("kinematics", "np.cos(alpha), -np.sin(alpha)], [np.sin(alpha)",
+     "np.cos(alpha), np.sin(alpha)], [-np.sin(alpha)",
      "kinematics::frames_are_the_product_of_exponentials"),
-    ("kinematics", "a * x[:, run] + d * axis", "a * x[:, run] - d * axis",
-     "kinematics::the_start_pose_of_the_paper"),
-    ("kinematics", "np.add.accumulate(angles[start:end]) + theta",
-     "np.add.accumulate(angles[start:end]) - theta",
+    ("kinematics", "np.outer(before.T", "np.outer(-before.T", "kinematics::the_start_pose_of_the_paper"),
+    ("kinematics", "(before @ theta", "(-before @ theta", "kinematics::closed_form_of_the_brokk"),
+    ("kinematics", "summed[i] += summed[i - 1]", "summed[i] -= summed[i - 1]",
      "kinematics::closed_form_of_the_brokk"),
-    ("kinematics", "z[2] * arm[0] - z[0] * arm[2]", "z[0] * arm[2] - z[2] * arm[0]",
+    ("kinematics", "links[i - 1] += links[i]", "links[i] += links[i - 1]",
+     "kinematics::closed_form_of_the_brokk"),
+    ("kinematics", "run[:, None] == run", "run[:, None] >= run",
+     "kinematics::frames_are_the_product_of_exponentials"),
+    ("kinematics", "= -links[:, 1], links[:, 0]", "= links[:, 1], -links[:, 0]",
      "kinematics::jacobian_is_the_derivative_of_the_tool_position"),
-    ("kinematics", "chain.p[:, -1:] - chain.p[:, :-1]", "chain.p[:, :-1] - chain.p[:, -1:]",
+    ("kinematics", "columns[0, start:end] -= y", "columns[0, start:end] += y",
      "kinematics::tool_velocity_is_the_derivative_along_the_motion"),
     ("kinematics", "[1][..., machine.driven]", "[1][..., : len(machine.driven)]",
      "kinematics::driven_joints_move_the_tool_through_the_jacobian_and_locked_ones_add_to_it"),
@@ -49,9 +52,8 @@ PLANTED: list[tuple[str, str, str, str]] = [
      "kinematics::joint_rates_solve_the_normal_equations"),
     ("kinematics", "bz_x * v[0] - bz_y * y)", "bz_x * v[0] + bz_y * y)",
      "kinematics::joint_rates_solve_the_normal_equations"),
-    ("kinematics", "np.minimum.reduce", "np.maximum.reduce", "kinematics::lowest_point_by_hand"),
-    ("kinematics", "chain.p[2, 1:]", "chain.p[2, -1:]",
-     "kinematics::lowest_point_by_hand"),
+    ("kinematics", "np.maximum.reduce", "np.minimum.reduce", "kinematics::lowest_point_by_hand"),
+    ("kinematics", "reduce(rises[1:]", "reduce(rises[-1:]", "kinematics::lowest_point_by_hand"),
     # bytes, limit, encoder, velocity
     ("machine", "255 + counts", "256 + counts", "machine::opposite_commands_have_bytes_that_sum_to_255"),
     ("machine", "u_byte > PWM_MAX, u_byte - 255", "u_byte >= PWM_MAX, u_byte - 255",
@@ -138,7 +140,7 @@ PLANTED: list[tuple[str, str, str, str]] = [
     ("env", "-1.0, 1.0) * dead + action * beyond", "-1.0, 1.0) * 0 + action * (beyond + dead)",
      "env::to_command_by_hand"),
     ("env", "through * (dead / RAMP)", "through * dead", "env::commands_rise_with_actions_by_their_slope"),
-    ("env", "place[driven].ravel()", "place[driven, :, ::-1].ravel()",
+    ("env", "history.take(machine.driven, axis=-3)", "history.take(machine.driven, axis=-3)[..., ::-1]",
      "env::observation_by_hand"),
     ("env", "s = x / radius, sign * y / radius", "s = x / radius, -sign * y / radius",
      "env::observation_by_hand"),
@@ -150,7 +152,7 @@ PLANTED: list[tuple[str, str, str, str]] = [
      "env::scale_belongs_to_uniform_values_over_the_ranges"),
     ("env", "machine.q_dot_max / 3**0.5", "machine.q_dot_max / 4**0.5",
      "env::scale_belongs_to_uniform_values_over_the_ranges"),
-    ("env", "np.float32(2 * config.noise)", "np.float32(config.noise)",
+    ("env", "np.float32(2.0**-15 * config.noise)", "np.float32(2.0**-16 * config.noise)",
      "env::noise_is_uniform_within_five_percent_and_fresh_on_what_is_sensed"),
     ("env", "seen += noise * sensed", "seen += noise * scale",
      "env::noise_is_uniform_within_five_percent_and_fresh_on_what_is_sensed"),
@@ -297,8 +299,8 @@ def function_of(module: types.ModuleType, name: str) -> types.FunctionType | Non
 
 
 def forget() -> None:
-    """What is worked out once a machine and kept with it, see `env._layout` and `kinematics._runs`."""
-    for kept in ("layout", "runs"):
+    """What is worked out once a machine and kept with it, see `env._layout` and `kinematics._plan`."""
+    for kept in ("layout", "plans"):
         BROKK_170.__dict__.pop(kept, None)
 
 
