@@ -78,6 +78,7 @@ def _train(training: TrainingSet, config: FitConfig, seed: int, estimator: int |
     """Weights of all nets, one Adam step for all of them at a time; `estimator` as in `_rollout_loss`."""
     import torch
 
+    torch.set_float32_matmul_precision("highest")  # a training of policies may have allowed less
     tensors, generator = _as_tensors(training), torch.Generator().manual_seed(seed)
     weights = _first_weights(training, config, generator)
     optimizer = torch.optim.Adam(weights, lr=config.learning_rate)

@@ -76,6 +76,12 @@ def test_a_fit_repeats_itself_to_the_bit():
     assert not np.array_equal(one.weights[0], other.weights[0])
 
 
+def test_a_fit_is_in_float32_whatever_a_training_before_it_allowed():
+    torch.set_float32_matmul_precision("medium")
+    fit(simple_system(0, 3), FitConfig(steps=1), seed=0, velocity_samples=4)
+    assert torch.get_float32_matmul_precision() == "highest"
+
+
 def test_the_first_weights_are_hes_uniform_ones():
     net = fit(simple_system(0, 3), FitConfig(steps=0), seed=0, velocity_samples=4)
     for inputs, weights, offsets in zip((39, 32, 32), net.weights[::2], net.weights[1::2], strict=True):
