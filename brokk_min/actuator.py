@@ -4,8 +4,6 @@ What it reads is a history: angle, velocity and command of the last 13 samples, 
 the hardware keep. `fitting` makes nets from logs, `scores` judges them, `env` puts an arm on them.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math
@@ -13,15 +11,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brokk_min.logs import load_arrays, whole_file
-from brokk_min.machine import estimate_velocity, valve_opening
+from brokk_min.files import expected, load_arrays, load_header, whole_file
+from brokk_min.machine import Array, estimate_velocity, valve_opening
 
-Array = NDArray[np.floating[Any]]
 FORMAT = 1  # of net files
 STILL = 0.002  # rad, assumed: little more than a step of a 12-bit encoder
 FINE = 0.02  # of full opening, assumed: below it nets see openings on a scale that is about linear
@@ -122,12 +119,8 @@ class ActuatorNet:
     weights: tuple[Array, ...]
     dead_zone: float = 0.0  # of full command: they were trained on `valve_scale` of commands
 
-    def select(self, joints: Sequence[str]) -> ActuatorNet:
-        """The same nets for some joints, in the order given.
-
-        Raises:
-            ValueError: a joint without a net.
-        """
+    def select(self, joints: Sequence[str]) -> Self:
+        """The same nets for some joints, in the order given; ValueError: a joint without a net."""
         if not set(joints) <= set(self.joints):
             raise ValueError(f"joints: expected nets for {list(joints)}, got {list(self.joints)}")
         index = [self.joints.index(name) for name in joints]
@@ -232,7 +225,7 @@ def fingerprint(net: ActuatorNet) -> str:
 def net_from_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> ActuatorNet:
     """Nets from `net_arrays`; ValueError, naming `path`, for another format or arrays that do not fit."""
     header = load_header(path, arrays, "actuator net", FORMAT)
-    try:
+    with expected(path, "a complete actuator net"):
         header["joints"] = tuple(header["joints"])
         weights = tuple(arrays[f"weight_{i}"] for i in range(6))
         header |= {name: arrays[name] for name in NET_ARRAYS}
@@ -243,8 +236,6 @@ def net_from_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> ActuatorNet:
         found = [array.shape for array in (*weights, *(arrays[name] for name in NET_ARRAYS))]
         if found != wanted:
             raise ValueError(f"shapes {found} instead of {wanted}")
-    except (IndexError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: expected a complete actuator net, got {error!r}") from error
     return net
 
 
@@ -257,15 +248,3 @@ def save_net(path: Path, net: ActuatorNet) -> None:
 def load_net(path: Path) -> ActuatorNet:
     """Read nets that `save_net` wrote; ValueError as in `net_from_arrays`."""
     return net_from_arrays(path, load_arrays(path))
-
-
-def load_header(path: Path, arrays: dict[str, Any], kind: str, version: int) -> dict[str, Any]:
-    """The JSON header of a file of ours, checked for kind and format version, without those two."""
-    try:
-        header = dict(json.loads(str(arrays["header"])))
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: expected a file with a JSON header, got {error!r}") from error
-    got = header.pop("kind", None), header.pop("format", None)
-    if got != (kind, version):
-        raise ValueError(f"{path}: expected ({kind}, format {version}), got {got}")
-    return header

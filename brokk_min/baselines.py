@@ -1,28 +1,27 @@
 """The classical controllers that the policy is compared with: their settings, tuning and files of gains."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.optimize import Bounds, OptimizeResult, differential_evolution
+from tqdm import tqdm
 
 from brokk_min import jacobian
 from brokk_min.actuator import ActuatorNet, fingerprint
 from brokk_min.env import TaskConfig, rollout
+from brokk_min.files import expected, write_json
 from brokk_min.jacobian import JacobianController
-from brokk_min.logs import write_json
-from brokk_min.machine import Machine
+from brokk_min.machine import Array, Machine
 from brokk_min.sequences import tuning_goals
 
-Array = NDArray[np.floating[Any]]
 PAPERS = ("jacobian_pid_k0.1", "jacobian_pid_k0.05")  # the paper's two baselines
 STRONGER = ("jacobian_pid_ff",)  # than the paper's: its sentences are put to it, too
 AWAKE = "jacobian_pid_ff_awake"  # the same, its valves never closed: what the policy learns to do
+SEARCH: dict[str, Any] = {"mutation": (0.4, 0.9), "tol": 0, "polish": False}  # of SciPy's search, assumed
 
 
 def baselines(machine: Machine, net: ActuatorNet) -> dict[str, JacobianController]:
@@ -68,11 +67,57 @@ def tuned_baselines(
 
     tuned, how = {}, {}
     for name, controller in baselines(machine, net).items():
-        tuned[name], costs = jacobian.tune(controller, cost, seed, generations, name)
+        tuned[name], costs = tune(controller, cost, seed, generations, name)
         anew = float(cost(replace(tuned[name], gains=np.tile(tuned[name].gains, (16, 1)))).mean())
-        at_bound = jacobian.gains_at_bound(tuned[name])
+        at_bound = gains_at_bound(tuned[name])
         how[name] = {"seed": seed, "cost": costs, "cost_anew": anew, "at_bound": at_bound}
     return tuned, how
+
+
+def tune(
+    controller: JacobianController,
+    cost: Callable[[JacobianController], Array],
+    seed: int,
+    generations: int,
+    label: str,
+) -> tuple[JacobianController, list[float]]:
+    """The controller with the gains of least cost, and the least cost after each generation.
+
+    SciPy's differential evolution with 32 candidates, the first of them about the controller's own gains.
+    `cost` is that (candidates,) of a controller with a row of gains for each candidate.
+    """
+    low, high = gain_bounds(controller.machine)
+    first = np.random.default_rng(seed).normal(controller.gains, 0.15 * (high - low), (32, len(low)))
+    first[0] = controller.gains
+    costs: list[float] = []
+
+    def objective(vectors: Array) -> Any:  # (candidates,): SciPy's types know no vectorised search
+        return cost(replace(controller, gains=vectors.T))
+
+    with tqdm(total=generations, desc=f"tune {label}", unit="generation", disable=None) as bar:
+
+        def note(intermediate_result: OptimizeResult) -> None:
+            costs.append(float(intermediate_result.fun))
+            bar.update()
+
+        how = SEARCH | {"rng": seed, "maxiter": generations, "init": np.clip(first, low, high)}
+        how |= {"callback": note, "vectorized": True, "updating": "deferred"}
+        result = differential_evolution(objective, Bounds(low, high), **how)
+    return replace(controller, gains=result.x), costs
+
+
+def gain_bounds(machine: Machine) -> tuple[Array, Array]:
+    """Smallest and largest gains of `GAINS` as vectors."""
+    low, high = ({name: ends[i] for name, ends in jacobian.GAINS.items()} for i in (0, 1))
+    return jacobian.join_gains(machine, low), jacobian.join_gains(machine, high)
+
+
+def gains_at_bound(controller: JacobianController) -> list[str]:
+    """Gains within 1 % of an end of their range: there the range decided, not the cost."""
+    m, (low, high) = controller.machine, gain_bounds(controller.machine)
+    names = [f"{kind} {m.names[i]}" for kind in ("kp", "ki", "kd") for i in m.driven] + ["feedback", "ready"]
+    share = (controller.gains - low) / (high - low)
+    return [name for name, s in zip(names, share, strict=True) if not 0.01 < s < 0.99]
 
 
 def plain_gains(controllers: Mapping[str, JacobianController]) -> dict[str, dict[str, list[float]]]:
@@ -89,21 +134,17 @@ def write_gains(path: Path, controllers: Mapping[str, JacobianController], about
 def read_gains(path: Path, machine: Machine, net: ActuatorNet) -> dict[str, JacobianController]:
     """The baselines with gains that `reproduce` wrote.
 
-    Raises:
-        ValueError: no such file, or gains of other controllers or joints, tuned for another machine or with
-            other nets, whose feed-forward is another.
+    ValueError: no such file, or gains of other controllers or joints, tuned for another machine or with
+    other nets, whose feed-forward is another.
     """
     result, wanted = baselines(machine, net), tuned_for(machine, net)
-    try:
+    with expected(path, f"gains for {machine.name} with nets {wanted['actuator']}"):
         table = json.loads(path.read_text())
         found = {name: table["meta"].get(name) for name in wanted}
         if found != wanted:
             raise ValueError(f"gains for {found}")
         for name, controller in result.items():
             result[name] = replace(controller, gains=jacobian.join_gains(machine, table["gains"][name]))
-    except (AttributeError, OSError, KeyError, TypeError, ValueError) as error:
-        nets = f"{machine.name} with nets {wanted['actuator']}"
-        raise ValueError(f"{path}: expected gains for {nets}, got {error!r}") from error
     return result
 
 

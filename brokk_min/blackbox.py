@@ -1,7 +1,5 @@
 """What a drive left in its log: the loop run on it again, byte by byte, and recordings for `fit`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -11,7 +9,7 @@ from brokk_min import bus
 from brokk_min.env import Controller
 from brokk_min.gate import encoder_counts
 from brokk_min.hw import Drive
-from brokk_min.logs import Log, Recording, velocity_of
+from brokk_min.logs import Log, machine_log
 from brokk_min.machine import Machine, decode_pwm
 from brokk_min.wishes import Wish, unpack_wish
 
@@ -70,8 +68,7 @@ class Tape:
 def replay(machine: Machine, controller: Controller, frames: Sequence[bus.Frame]) -> list[bus.Frame]:
     """Run the loop on a recorded log of it; what it sends now, to be compared with what it sent then.
 
-    Raises:
-        ValueError: another program made the log.
+    ValueError: another program made the log.
     """
     tape = Tape(list(frames))
     drive = Drive(machine, controller, tape, tape.wish)
@@ -85,17 +82,15 @@ def replay(machine: Machine, controller: Controller, frames: Sequence[bus.Frame]
 
 def compare(machine: Machine, frames: Sequence[bus.Frame], sent: Sequence[bus.Frame]) -> tuple[int, int]:
     """How many valve frames of `sent` are those of the log, byte by byte, and how many the log has."""
-    old, new = (
-        [f.data for f in side if f.sent and f.id == machine.valve_frame_id] for side in (frames, sent)
-    )
+    valves = machine.valve_frame_id
+    old, new = ([f.data for f in side if f.sent and f.id == valves] for side in (frames, sent))
     return sum(a == b for a, b in zip(old, new)), max(len(old), len(new))
 
 
 def driven_log(machine: Machine, frames: Iterable[bus.Frame]) -> Log:
     """What encoders said and valves got while driving, as recordings for `fit`; a gap starts a new one.
 
-    Raises:
-        ValueError: nothing was driven for long enough.
+    ValueError: nothing was driven for long enough.
     """
     nodes, parts, start, last = bus.Nodes(machine), list[list[Any]](), 0.0, -np.inf
     for frame in frames:
@@ -110,13 +105,11 @@ def driven_log(machine: Machine, frames: Iterable[bus.Frame]) -> Log:
                 last = start
         else:
             nodes.hear(frame)
-    recordings = []
+    tapes = []
     for number, part in enumerate(parts):
         if len(part) > machine.history + 1:
             u, q = map(np.array, zip(*part, strict=True))
-            recordings.append(
-                Recording(f"drive_{number:03d}", u, q, velocity_of(q, machine.velocity_samples, machine.rate))
-            )
-    if not recordings:
+            tapes.append((f"drive_{number:03d}", u, q))
+    if not tapes:
         raise ValueError(f"log: expected more than {machine.history + 1} ticks of driving in a row, got none")
-    return Log(machine.names, tuple(recordings), rate=machine.rate)
+    return machine_log(machine, tapes)

@@ -3,8 +3,6 @@
 Importing this module opens nothing and does not import python-can.
 """
 
-from __future__ import annotations
-
 import select
 import signal
 import struct
@@ -18,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from brokk_min.extras import need
+from brokk_min.files import expected
 from brokk_min.machine import Machine
 
 # CANopen (CiA 301): identifiers are these plus the node's number
@@ -139,8 +138,7 @@ def _plain_id(message: Any) -> int:
 def open_line(interface: str, channel: str, log: Path | None = None) -> Iterator[Line]:
     """A bus by python-can's names, closed at the end of the block; `log` grows while it runs.
 
-    Raises:
-        ValueError: python-can is not there, finds no such bus, or fails in the block.
+    ValueError: python-can is not there, finds no such bus, or fails in the block.
     """
     can = need("can", "hw")
     try:
@@ -175,17 +173,13 @@ def read_frames(path: Path) -> Iterator[Frame]:
 
     A last line without its newline is left out: the program that wrote it was killed.
 
-    Raises:
-        ValueError: no such log, or a line that is no frame.
+    ValueError: no such log, or a line that is no frame.
     """
-    can = need("can", "hw")
-    try:
-        with open(path, encoding="utf-8") as file, can.CanutilsLogReader(file) as reader:
-            reader.file = (line for line in file if line.endswith("\n"))
-            for m in reader:
-                yield Frame(m.timestamp, _plain_id(m), bytes(m.data), not m.is_rx, str(m.channel))
-    except (OSError, ValueError, IndexError) as error:
-        raise ValueError(f"{path}: expected a candump log, got {error!r}") from error
+    reader = need("can", "hw").CanutilsLogReader
+    with expected(path, "a candump log"), open(path, encoding="utf-8") as file, reader(file) as frames:
+        frames.file = (line for line in file if line.endswith("\n"))
+        for m in frames:
+            yield Frame(m.timestamp, _plain_id(m), bytes(m.data), not m.is_rx, str(m.channel))
 
 
 class Nodes:
@@ -212,8 +206,7 @@ class Nodes:
 def sdo(line: Any, node: int, address: tuple[int, int], value: int | None = None, size: int = 4) -> int:
     """Read an object of a node by its index and subindex, or write `value` of `size` bytes to it.
 
-    Raises:
-        ValueError: the node refuses or does not answer.
+    ValueError: the node refuses or does not answer.
     """
     index, sub = address
     request = struct.pack("<BHBI", 0x40, index, sub, 0)

@@ -1,7 +1,5 @@
 """The whole chain in one function: logs, nets, policy, baselines, comparison, report."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
@@ -15,11 +13,11 @@ from tqdm import tqdm
 from brokk_min import actuator, claims, excitation, figures, fitting, logs, preliminary, report, scores
 from brokk_min.baselines import plain_gains, tuned_baselines, tuned_for, tuning_set, write_gains
 from brokk_min.env import TaskConfig
-from brokk_min.experiments import Array, Effort, Net, comparison, driven_log, meta, task_space
+from brokk_min.experiments import Effort, Net, comparison, driven_log, meta, task_space
 from brokk_min.figures import Traces
+from brokk_min.files import write_json
 from brokk_min.jacobian import JacobianController
-from brokk_min.logs import write_json
-from brokk_min.machine import Machine
+from brokk_min.machine import Array, Machine
 from brokk_min.metrics import summary
 from brokk_min.policy import Policy, PolicyController, save_policy
 from brokk_min.sequences import axis_sequences, held_rows
@@ -53,18 +51,11 @@ def reproduce(
     with stage("evaluate"):
         rl = PolicyController(machine, policy)
         measured, traces = measure(machine, net, test, rl, tuned, effort, seed)
-        results = {
-            "meta": meta(machine, seed) | tuned_for(machine, driven) | {"effort": asdict(effort)},
-            "paper_recipe": paper,
-            **measured,
-            "gains": plain_gains(tuned),
-            "tuning": how,
-            "training_seeds": over_seeds,
-        }
+    about = meta(machine, seed) | tuned_for(machine, driven) | {"effort": asdict(effort)}
+    results = {"meta": about, "paper_recipe": paper, **measured, "gains": plain_gains(tuned)}
+    results |= {"tuning": how, "training_seeds": over_seeds}
     with stage("draw"):
-        write_json(out / "results.json", results)
-        write_gains(out / "gains.json", tuned, results["meta"])
-        save_policy(out / "policy.npz", told(policy, results, seed))
+        write(out, results, tuned, told(policy, results, seed))
         parts = report.net_parts(machine, net, test, results, seed, out / "policy.npz.csv", clock["train"])
         parts = [report.found(results), *parts, *report.task_parts(machine, results, traces)]
         figures.write_report(out / "report.html", parts, clock)
@@ -145,6 +136,15 @@ def on_nets(
     starts = np.array(compared["starts"])[np.array(compared["start_kinds"]) == "workspace"]
     runs, _ = task_space(machine, {"rl": rl}, axis_sequences(machine), starts, seed, rl.policy.net)
     return summary(runs)["rl"]
+
+
+def write(
+    out: Path, results: Mapping[str, Any], tuned: Mapping[str, JacobianController], policy: Policy
+) -> None:
+    """What the other commands read: figures, gains of the baselines, the policy."""
+    write_json(out / "results.json", results)
+    write_gains(out / "gains.json", tuned, results["meta"])
+    save_policy(out / "policy.npz", policy)
 
 
 def told(policy: Policy, results: Mapping[str, Any], seed: int) -> Policy:

@@ -3,22 +3,18 @@
 Limits by which a verdict is given are ours (assumed); the intervals are over starts. Paper: Sec. 4.2
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brokk_min.env import Controller, Measured, Trace
 from brokk_min.jacobian import JacobianController, manipulability
 from brokk_min.kinematics import jacobian
-from brokk_min.machine import Machine
-from brokk_min.metrics import TRANSIENT, Run, by_start, interval, mean_interval, since_change
+from brokk_min.machine import Array, Machine
+from brokk_min.metrics import TRANSIENT, Mean, Run, by_start, interval, mean_interval, since_change
 
-Array = NDArray[np.floating[Any]]
 Claim = dict[str, Any]  # paper, measured, numbers, unit, holds (None: no such runs); see `beside`
 STILL = 0.05  # m, assumed: a tool that stays so near its line stays still across it
 SMALL = 0.05  # m, assumed: two tools so near to each other after the same commands differ little
@@ -27,7 +23,7 @@ LATER = 2.0  # assumed: a response that takes so many times as long is another
 UNLIKE = 1.25  # assumed: errors of two directions whose ratio is larger differ
 
 
-def said(numbers: Mapping[str, Mapping[str, float | None]], unit: str) -> str:
+def said(numbers: Mapping[str, Mean], unit: str) -> str:
     """Numbers as a sentence: means with their intervals."""
     cells = []
     for name, n in numbers.items():
@@ -53,11 +49,11 @@ def beside(claim: Claim, stronger: Claim) -> Claim:
     return claim if same else claim | {"stronger": {k: stronger[k] for k in ("numbers", "unit", "holds")}}
 
 
-def _below(number: Mapping[str, float | None], limit: float) -> bool | None:
+def _below(number: Mean, limit: float) -> bool | None:
     return None if number["high"] is None else number["high"] < limit
 
 
-def _above(number: Mapping[str, float | None], limit: float) -> bool | None:
+def _above(number: Mean, limit: float) -> bool | None:
     return None if number["low"] is None else number["low"] > limit
 
 
@@ -105,17 +101,14 @@ def _faster_down(found: Mapping[str, Any]) -> Claim:
 def _later_from_idle(found: Mapping[str, Any]) -> Claim:
     times = {kind: of[found["joint"]] for kind, of in found["response_time"].items()}
     numbers = {f"{kind}, {when}": of[when]["up"] for kind, of in times.items() for when in ("idle", "moving")}
-    later = (
-        [of["idle"]["up"] >= LATER * of["moving"]["up"] for of in times.values()]
-        if all(numbers.values())
-        else []
-    )
+    answered = times.values() if all(numbers.values()) else ()
+    later = [of["idle"]["up"] >= LATER * of["moving"]["up"] for of in answered]
     paper = "The same command is answered after about 400 ms from idle and 100 ms when already moving."
     what = f"response time of {found['joint']} (to 63 %), from idle to be {LATER:g} times as long or more"
     return _claim(paper, what, "s", _single(numbers), all(later) if later else None)
 
 
-def _single(numbers: Mapping[str, float | None]) -> dict[str, dict[str, float | None]]:
+def _single(numbers: Mapping[str, float | None]) -> dict[str, Mean]:
     return {name: {"mean": number, "low": None, "high": None} for name, number in numbers.items()}
 
 
@@ -154,16 +147,12 @@ def drift_claims(runs: Sequence[Run], baselines: Sequence[str]) -> list[Claim]:
 def direction_claim(machine: Machine, controller: JacobianController, trace: Trace, goals: Array) -> Claim:
     """Does the PID track joint rates as well in one direction as in the other? Paper: Fig. 6d
 
-    Args:
-        machine: n joints.
-        controller: whose runs are in `trace`; it says which rates it wanted.
-        trace: runs of one sequence.
-        goals: of this sequence [m/s], (T, 3).
+    `trace` has its runs of one sequence with these `goals` [m/s] (T, 3).
     """
     q_dot = trace.q_dot[..., machine.driven]
     v_goal = np.broadcast_to(goals[:, None], trace.v_tool.shape)
     wanted = controller.rates(Measured(v_goal, trace.v_tool, trace.q, q_dot), q_dot)
-    numbers: dict[str, dict[str, float | None]] = {}
+    numbers: dict[str, Mean] = {}
     unlike: list[bool] = []
     for i, joint in enumerate(machine.driven):
         share = []
@@ -210,9 +199,7 @@ def speed_share(machine: Machine, w0: float, trace: Trace, goals: Array) -> Arra
 def singular_claims(runs: Sequence[Run], share: Mapping[str, Array]) -> list[Claim]:
     """Does damping slow the tool near singularities, and does little damping jerk? Paper: Fig. 6e, 6f
 
-    Args:
-        runs: of `singular_controllers` from extended starts.
-        share: of `speed_share` by controller in the same runs, (starts,).
+    `runs` are those of `singular_controllers` from extended starts, `share` their `speed_share` (starts,).
     """
     jerk = {name: by_start(runs, name, "all", "jerk_rms") for name in share}
     return [_slowed(share), _jerky(jerk), _neither(share, jerk)]

@@ -1,6 +1,7 @@
 """The commands of the method: from logs to nets, policies, comparisons and the report."""
 
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -9,12 +10,13 @@ import numpy as np
 import tyro
 
 from brokk_min import baselines, chain, experiments, figures, preliminary, trust
-from brokk_min.actuator import load_net, save_net
+from brokk_min.actuator import ActuatorNet, load_net, save_net
 from brokk_min.env import Controller, TaskConfig, fitting_nets
 from brokk_min.excitation import collect
+from brokk_min.files import write_json
 from brokk_min.fitting import PAPER_RECIPE, FitConfig, fit
-from brokk_min.logs import Log, read_log, write_json, write_log
-from brokk_min.machine import BROKK_170
+from brokk_min.logs import Log, read_log, write_log
+from brokk_min.machine import BROKK_170, Machine
 from brokk_min.metrics import summary
 from brokk_min.options import Command, Name, WrongUse, check, chosen_policy
 from brokk_min.policy import PolicyController, load_policy
@@ -68,11 +70,7 @@ class Fit:
         known = machine if machine.names == log.joints else None
         if self.machine and not known:
             raise ValueError(f"LOGS: expected joints of --machine {self.machine}, got {list(log.joints)}")
-        settings = self.settings
-        if known and settings.dead_zone is None:
-            settings = replace(settings, dead_zone=known.dead_zone)
-        settings = replace(settings, **PAPER_RECIPE) if self.paper else settings
-        net = fit(log, settings, self.seed, self.velocity_samples, known.name if known else "")
+        net = fit(log, self._recipe(known), self.seed, self.velocity_samples, known.name if known else "")
         verdict = trust.judge(net, log, test, known)
         save_net(self.out, net)
         if self.json:
@@ -84,6 +82,14 @@ class Fit:
             figures.save(self.figure, figures.plot_worst_and_median(net, test))
         print(f"nets of {net.machine or 'no known machine'}, dead zone {net.dead_zone} of full command")
         _print_verdict(verdict)
+
+    def _recipe(self, known: Machine | None) -> FitConfig:
+        """The settings, by default with the known machine's dead zone; or the paper's."""
+        if self.paper:
+            return replace(self.settings, **PAPER_RECIPE)
+        if known and self.settings.dead_zone is None:
+            return replace(self.settings, dead_zone=known.dead_zone)
+        return self.settings
 
 
 def _print_verdict(verdict: dict[str, Any]) -> None:
@@ -201,13 +207,7 @@ class Evaluate(Command):
         sequences, starts = goals_and_starts(machine, self.commands, self.starts, self.num_starts, self.seed)
         print(f"gains of the baselines: {gains or 'tuned now'}", file=sys.stderr)
         controllers: dict[str, Controller] = {"rl": PolicyController(machine, policy)}
-        if gains:
-            controllers |= baselines.read_gains(gains, machine, policy.net)
-        else:
-            effort = experiments.Effort()
-            how_much = effort.tuning_runs, effort.generations
-            tuned, _ = baselines.tuned_baselines(machine, policy.net, *how_much, self.seed)
-            controllers |= tuned
+        controllers |= self._baselines(machine, policy.net, gains)
         if self.perfect_model:
             controllers |= experiments.bounds(machine, starts)
         moves = policy.net if self.plant == "net" else None
@@ -219,6 +219,13 @@ class Evaluate(Command):
             meta |= {"commands": str(self.commands or names), "starts": str(self.starts or self.num_starts)}
             write_json(self.json, {"meta": meta, "runs": runs})
         _print_means(runs, len(sequences))
+
+    def _baselines(self, machine: Machine, net: ActuatorNet, gains: Path | None) -> Mapping[str, Controller]:
+        if gains:
+            return baselines.read_gains(gains, machine, net)
+        effort = experiments.Effort()
+        how_much = effort.tuning_runs, effort.generations
+        return baselines.tuned_baselines(machine, net, *how_much, self.seed)[0]
 
 
 def _print_means(runs: list[dict[str, Any]], sequences: int) -> None:

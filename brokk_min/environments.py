@@ -3,8 +3,6 @@
 They keep a state, a random generator and pictures; what happens in a tick is `env.step`.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 from pathlib import Path
@@ -14,13 +12,13 @@ import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from brokk_min import env
 from brokk_min.actuator import ActuatorNet, load_net
-from brokk_min.env import Array, Bools, State, TaskConfig
-from brokk_min.kinematics import tool_position
-from brokk_min.machine import BROKK_170, Machine
+from brokk_min.env import Bools, State, TaskConfig
+from brokk_min.machine import BROKK_170, Array, Machine
+from brokk_min.window import Pictures
 
 
 class TaskVectorEnv(VectorEnv[Array, Array, Any]):
@@ -49,7 +47,7 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
     ) -> None:
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": round(machine.rate)}
         self.metadata["autoreset_mode"] = AutoresetMode.SAME_STEP
-        self.pictures = _Pictures(machine, render_mode, self.metadata["render_modes"])
+        self.pictures = Pictures(machine, render_mode, self.metadata["render_modes"])
         self.render_mode = render_mode
         self.num_envs, self.machine, self.config = num_envs, machine, config or TaskConfig()
         self.net = _open(machine, actuator)
@@ -107,7 +105,7 @@ class TaskEnv(gymnasium.Env[Array, Array]):
         render_mode: str | None = None,
     ) -> None:
         self.metadata = TaskEnv.metadata | {"render_fps": round(machine.rate)}
-        self.pictures = _Pictures(machine, render_mode, self.metadata["render_modes"])
+        self.pictures = Pictures(machine, render_mode, self.metadata["render_modes"])
         self.render_mode = render_mode
         self.machine, self.config = machine, config or TaskConfig()
         self.net = _open(machine, actuator)
@@ -171,52 +169,6 @@ def _spaces(machine: Machine) -> tuple[Any, Any]:
     size = len(env.observation_scale(machine)[0])
     action = gymnasium.spaces.Box(-1.0, 1.0, (len(machine.driven),), np.float32)
     return gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32), action
-
-
-class _Pictures:
-    """Frames for Gymnasium: trails of the tools since the last reset of each, and a window for `human`."""
-
-    SIZE = (960, 600)
-
-    def __init__(self, machine: Machine, mode: str | None, modes: list[str]) -> None:
-        if mode is not None and mode not in modes:
-            raise ValueError(f"render_mode: expected one of {modes}, got {mode!r}")
-        self.machine, self.mode = machine, mode
-        self.window: Any = None
-        self.trails: dict[int, list[Array]] = {}
-
-    def follow(self, state: State, fresh: ArrayLike) -> None:
-        """After a reset or a step; `fresh` are the rows that begin anew."""
-        if self.mode is not None:
-            self.trails |= {row: [] for row in np.asarray(fresh).tolist()}
-            for row, p_tool in enumerate(tool_position(self.machine, state.q)):
-                self.trails[row].append(p_tool)
-        if self.mode == "human":
-            self.take(state)
-
-    def take(self, state: State | None) -> list[NDArray[np.uint8]]:
-        """A frame (600, 960, 3) of each row, or the first row on the screen. Needs the extra `play`."""
-        from brokk_min import view, window  # pictures cost nothing where nobody looks
-
-        if state is None or self.mode is None:
-            raise ValueError(f"render: expected a render_mode and a reset before, got {self.mode}")
-        drawn = []
-        for row, trail in self.trails.items():
-            u, goal = state.history[row, :, 2, -1], state.v_goal[row]
-            scene = view.Scene(state.q[row], state.q_dot[row], u, goal, np.array(trail))
-            drawn.append(view.draw(self.machine, [scene._replace(title=self.machine.name)], self.SIZE))
-        if self.mode == "human":
-            self.window = self.window or window.Window(self.SIZE, self.machine.name)
-            self.window.pygame.event.pump()
-            self.window.show(drawn[0], self.machine.rate)
-            return []
-        return [window.picture(shapes, self.SIZE) for shapes in drawn]
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        if self.window is not None:
-            self.window.close()
-            self.window = None
 
 
 gymnasium.register(

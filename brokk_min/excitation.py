@@ -4,20 +4,18 @@ Nets are fitted to what `collect` records, one actuator at a time, over its whol
 `task_log`, which moves the joints together, as a policy does.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
-from typing import Any
+from itertools import chain
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
-from brokk_min.logs import RETURN, Log, Recording, velocity_of
-from brokk_min.machine import PWM_MAX, Machine, limit_command, read_encoder
+from brokk_min.logs import RETURN, Log, machine_log
+from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, read_encoder
 from brokk_min.plant import plant_reset, plant_step
 
-Array = NDArray[np.floating[Any]]
+Tape = tuple[str, Array, Array]  # name, commands and encoder angles (T, n)
 # Shares of what rich excitation is made of, assumed.
 MIX = {"sine": 0.17, "step": 0.1, "holds": 0.17, "go": 0.21, "hover": 0.35}
 BARELY = 0.049  # of full command, assumed: a valve so far beyond its dead zone is barely open
@@ -48,9 +46,8 @@ def rich_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Arra
         amplitude = rng.uniform(machine.dead_zone, limit)
         if kind == "sine":
             frequency = np.exp(rng.uniform(np.log(0.05), np.log(4.0)))
-            part = rng.uniform(-0.3, 0.3) * limit + amplitude * np.sin(
-                2 * np.pi * frequency * time + rng.uniform(0, 2 * np.pi)
-            )
+            middle, phase = rng.uniform(-0.3, 0.3) * limit, rng.uniform(0, 2 * np.pi)
+            part = middle + amplitude * np.sin(2 * np.pi * frequency * time + phase)
         elif kind == "step":
             part = np.full(length, rng.choice([-1, 1]) * amplitude)
         elif kind == "holds":
@@ -109,11 +106,11 @@ class _Recorder:
         self.state = plant_step(self.machine, self.state, self.u[-1])
         self.q.append(read_encoder(self.machine, self.state.q))
 
-    def recording(self, name: str, row: int, start: int = 0, end: int | None = None) -> Recording:
-        """Ticks `start` to `end` of one row, with estimated velocities."""
+    def tape(self, name: str, row: int, start: int = 0, end: int | None = None) -> Tape:
+        """Ticks `start` to `end` of one row."""
         end = len(self.u) if end is None else end
-        u, q = (np.array([tick[row] for tick in tape[start:end]]) for tape in (self.u, self.q))
-        return Recording(name, u, q, velocity_of(q, self.machine.velocity_samples, self.machine.rate))
+        u, q = (np.array([tick[row] for tick in ticks[start:end]]) for ticks in (self.u, self.q))
+        return name, u, q
 
 
 def collect(machine: Machine, hours: float, excitation: str, rng: np.random.Generator) -> Log:
@@ -131,20 +128,32 @@ def collect(machine: Machine, hours: float, excitation: str, rng: np.random.Gene
     wanted = max(machine.history + 2, round(hours * 3600 * machine.rate))  # samples of each joint
     side_by_side = int(np.clip(wanted // 300, 1, 100))
     counted = np.zeros(machine.n, int)
-    recordings: list[list[Recording]] = [[] for _ in machine.joints]
+    tapes: list[list[Tape]] = [[] for _ in machine.joints]
     with tqdm(total=wanted * machine.n, desc=f"record ({excitation})", unit="sample", disable=None) as bar:
         while counted.min() < wanted:
             joint = np.repeat(np.flatnonzero(counted < wanted), side_by_side)
             recorder, back, home = _drive_legs(machine, joint, excitation, rng)
             for row, j in enumerate(joint):
                 if leg := min(back[row], wanted - counted[j]):
-                    name = f"{machine.names[j]}_{len(recordings[j]) // 2:03d}"
-                    recordings[j].append(recorder.recording(name, row, 0, leg))
-                    recordings[j].append(recorder.recording(name + RETURN, row, back[row], home[row]))
+                    name = f"{machine.names[j]}_{len(tapes[j]) // 2:03d}"
+                    tapes[j].append(recorder.tape(name, row, 0, leg))
+                    tapes[j].append(recorder.tape(name + RETURN, row, back[row], home[row]))
                     counted[j] += leg
                     bar.update(leg)
-    kept = tuple(recording for of_joint in recordings for recording in of_joint)
-    return Log(machine.names, kept, rate=machine.rate)
+    return machine_log(machine, chain(*tapes))
+
+
+def _leg_starts(
+    machine: Machine, joint: NDArray[np.intp], excitation: str, rng: np.random.Generator
+) -> Array:
+    """Angles (rows, n) at which legs begin: home, mid range, or if rich anywhere for `joint[k]`."""
+    low, high, row = machine.column("q_min"), machine.column("q_max"), np.arange(len(joint))
+    q = np.tile((low + high) / 2, (len(row), 1))
+    if excitation == "rich":  # a tenth of the legs begins at either stop
+        low, high = low[joint], high[joint]
+        past = (high - low) / 8
+        q[row, joint] = np.clip(rng.uniform(low - past, high + past), low, high)
+    return q
 
 
 def _drive_legs(
@@ -155,13 +164,8 @@ def _drive_legs(
     Returns:
         What was recorded, and the ticks (rows,) at which the ways back begin and end.
     """
-    low, high, row = machine.column("q_min"), machine.column("q_max"), np.arange(len(joint))
-    ticks = round(LEG * machine.rate)
-    q = np.tile((low + high) / 2, (len(row), 1))
-    low, high = low[joint], high[joint]
-    if excitation == "rich":  # a tenth of the legs begins at either stop
-        past = (high - low) / 8
-        q[row, joint] = np.clip(rng.uniform(low - past, high + past), low, high)
+    low, high, row = machine.column("q_min")[joint], machine.column("q_max")[joint], np.arange(len(joint))
+    q, ticks = _leg_starts(machine, joint, excitation, rng), round(LEG * machine.rate)
     start, near, length = q[row, joint], 2 * machine.encoder_step, machine.history + ticks
     commands = np.zeros((len(row), length))
     commands[:, machine.history :] = [EXCITATIONS[excitation](rng, machine, ticks) for _ in row]
@@ -214,6 +218,4 @@ def task_log(
         command = command + smoothing * (level - command)
         jitter = noise * rng.standard_normal(shape) * (level != 0)
         recorder.play(moving * (command + jitter))
-    return Log(
-        machine.names, tuple(recorder.recording(f"task_{i:02d}", i) for i in range(runs)), rate=machine.rate
-    )
+    return machine_log(machine, (recorder.tape(f"task_{i:02d}", i) for i in range(runs)))

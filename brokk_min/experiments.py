@@ -3,29 +3,24 @@
 `task_space` runs every controller on the same starts and velocity sequences on the same machine.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
-from brokk_min import __version__, actuator, claims, fitting, jacobian, kinematics, logs
+from brokk_min import __version__, actuator, claims, fitting, jacobian, kinematics, logs, metrics
 from brokk_min.baselines import PAPERS, STRONGER
 from brokk_min.env import Controller, TaskConfig, Trace, rollout
 from brokk_min.figures import Traces
 from brokk_min.jacobian import JacobianController
-from brokk_min.machine import Machine
+from brokk_min.machine import Array, Machine
 from brokk_min.metrics import (
-    Run,
     by_start,
     intervals,
     mean_interval,
-    metrics,
     paired,
     paired_with_others,
     row_mean,
@@ -42,8 +37,9 @@ from brokk_min.sequences import (
 )
 from brokk_min.variations import Sensor, exact, supply_demand, variations
 
-Array = NDArray[np.floating[Any]]
 Net = actuator.ActuatorNet
+Controllers = Mapping[str, Controller]  # by name
+Rows = list[dict[str, Any]]  # one a run, see `metrics`
 
 
 @dataclass(frozen=True)
@@ -65,13 +61,13 @@ QUICK = Effort(0.1, 700, 200_000, 4, 4, 8, 2, 3.0)
 
 def task_space(
     machine: Machine,
-    controllers: Mapping[str, Controller],
+    controllers: Controllers,
     sequences: Sequence[Commands],
     starts: Array,
     seed: int,
     net: Net | None = None,
     sensor: Sensor = exact,
-) -> tuple[list[dict[str, Any]], Traces]:
+) -> tuple[Rows, Traces]:
     """Every controller on the same sequences, starts and noise. Paper: Sec. 4.2, Fig. 6
 
     Sequences of one length and all starts are one batch.
@@ -79,7 +75,7 @@ def task_space(
     Returns:
         One row a controller, sequence and start, see `metrics`; and the traces.
     """
-    rows: list[dict[str, Any]] = []
+    rows: Rows = []
     traces: dict[tuple[str, str], Trace] = {}
     num = len(starts)
     kinds = start_kinds(machine, starts)
@@ -90,7 +86,7 @@ def task_space(
         start, rng = np.tile(starts, (len(group), 1)), np.random.default_rng(seed)
         read = sensor(np.random.default_rng(seed + 1))
         trace = rollout(machine, controllers[name], start, goals, TaskConfig(), rng, net, read)
-        found = metrics(machine, trace, goals, kinematics.tool_position(machine, start))
+        found = metrics.metrics(machine, trace, goals, kinematics.tool_position(machine, start))
         for i, s in enumerate(group):
             mine, label = slice(i * num, (i + 1) * num), {"controller": name, "sequence": s.name}
             traces[name, s.name] = Trace(*(a[:, mine] for a in trace))
@@ -100,7 +96,7 @@ def task_space(
     return rows, traces
 
 
-def _rows(label: Mapping[str, Any], kinds: Sequence[str], found: Mapping[str, Array]) -> list[dict[str, Any]]:
+def _rows(label: Mapping[str, Any], kinds: Sequence[str], found: Mapping[str, Array]) -> Rows:
     """One row a start of figures (starts,); None where there is none."""
     plain = {key: [float(v) if np.isfinite(v) else None for v in values] for key, values in found.items()}
     rows = ({key: values[j] for key, values in plain.items()} for j in range(len(kinds)))
@@ -108,11 +104,7 @@ def _rows(label: Mapping[str, Any], kinds: Sequence[str], found: Mapping[str, Ar
 
 
 def robustness(
-    machine: Machine,
-    controllers: Mapping[str, Controller],
-    sequences: Sequence[Commands],
-    starts: Array,
-    seed: int,
+    machine: Machine, controllers: Controllers, sequences: Sequence[Commands], starts: Array, seed: int
 ) -> dict[str, dict[str, dict[str, Any]]]:
     """Mean velocity error [m/s], 95 % interval over starts, by variation and controller. Paper: Sec. 4.2
 
@@ -146,12 +138,8 @@ def bounds(machine: Machine, starts: Array) -> dict[str, Controller]:
 
 
 def regret(
-    machine: Machine,
-    controllers: Mapping[str, Controller],
-    short: Sequence[Commands],
-    starts: Array,
-    seed: int,
-) -> tuple[list[dict[str, Any]], dict[str, Any], Traces]:
+    machine: Machine, controllers: Controllers, short: Sequence[Commands], starts: Array, seed: int
+) -> tuple[Rows, dict[str, Any], Traces]:
     """Runs of all controllers and bounds, each one's velocity error less the bound's, and the traces."""
     every = {**controllers, **bounds(machine, starts)}
     runs, traces = task_space(machine, every, short, starts, seed)
@@ -159,7 +147,7 @@ def regret(
 
 
 def comparison(
-    machine: Machine, controllers: Mapping[str, Controller], effort: Effort, seed: int
+    machine: Machine, controllers: Controllers, effort: Effort, seed: int
 ) -> tuple[dict[str, Any], dict[str, Traces]]:
     """The paper's experiment and what we add to it: all of `results.json` on task space control.
 
@@ -193,11 +181,10 @@ def comparison(
     }, {"all": traces, "bound": bound, "singular": singular}
 
 
-def tables(runs: Sequence[Run], scored: Sequence[Run]) -> dict[str, Any]:
+def tables(runs: Sequence[metrics.Run], scored: Sequence[metrics.Run]) -> dict[str, Any]:
     """Runs, and figures of those that count: means, intervals, the policy's less the baselines'; for JSON."""
-    of_kind = {
-        kind: [run for run in runs if run["kind"] == kind] for kind in dict.fromkeys(r["kind"] for r in runs)
-    }
+    kinds = dict.fromkeys(run["kind"] for run in runs)
+    of_kind = {kind: [run for run in runs if run["kind"] == kind] for kind in kinds}
     return {
         "runs": runs,
         "summary": summary(scored),
@@ -209,19 +196,14 @@ def tables(runs: Sequence[Run], scored: Sequence[Run]) -> dict[str, Any]:
 
 def judged(
     machine: Machine,
-    controllers: Mapping[str, Controller],
-    runs: Sequence[Run],
+    controllers: Controllers,
+    runs: Sequence[metrics.Run],
     along_x: Mapping[str, Trace],
     goals: Array,
 ) -> list[dict[str, Any]]:
     """The paper's sentences on its baselines, each put to the stronger one, too: drift, direction, tracking.
 
-    Args:
-        machine: n joints.
-        controllers: by name.
-        runs: those that count.
-        along_x: their traces along x by controller.
-        goals: of these [m/s], (T, 3).
+    `runs` are those that count, `along_x` their traces along x with these `goals` [m/s] (T, 3).
     """
     pids = {name: pid for name, pid in controllers.items() if isinstance(pid, JacobianController)}
     of_paper, of_stronger = (
@@ -236,7 +218,7 @@ def judged(
 
 
 def singular_case(
-    machine: Machine, controllers: Mapping[str, Controller], starts: Array, seconds: float, seed: int
+    machine: Machine, controllers: Controllers, starts: Array, seconds: float, seed: int
 ) -> tuple[Traces, dict[str, Any]]:
     """k = 0.1 against 0.05 with the same gains, and RL, along the `least_motion` of extended starts.
 
@@ -262,13 +244,12 @@ def singular_case(
 
 def driven_log(machine: Machine, traces: Traces, controller: str) -> logs.Log:
     """What encoders and valves said in one controller's first 16 runs of each sequence. Paper: Sec. 4.1"""
-    recordings = []
-    for (name, sequence), trace in traces.items():
-        for i in range(min(16, trace.q.shape[1]) * (name == controller)):
+    tapes = []
+    for sequence, trace in ((s, trace) for (c, s), trace in traces.items() if c == controller):
+        for i in range(min(16, trace.q.shape[1])):
             u, q = trace.u[:, i].astype(float), trace.q_measured[:, i].astype(float)
-            velocity = logs.velocity_of(q, machine.velocity_samples, machine.rate)
-            recordings.append(logs.Recording(f"{name}_{sequence}_{i:02d}", u, q, velocity))
-    return logs.Log(machine.names, tuple(recordings), rate=machine.rate)
+            tapes.append((f"{controller}_{sequence}_{i:02d}", u, q))
+    return logs.machine_log(machine, tapes)
 
 
 def meta(machine: Machine, seed: int) -> dict[str, Any]:

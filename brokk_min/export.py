@@ -1,7 +1,5 @@
 """A policy as an ONNX file, for those who run it elsewhere."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -9,7 +7,7 @@ import numpy as np
 
 from brokk_min.env import RAMP
 from brokk_min.extras import need
-from brokk_min.logs import whole_file
+from brokk_min.files import whole_file
 from brokk_min.policy import STAND, Policy
 
 
@@ -19,12 +17,10 @@ def export_onnx(path: Path, policy: Policy) -> None:
     What follows is up to the other program: actions go through `env.to_command` (metadata `dead_zone`,
     `pwm_limit`, `ramp`), and valves close when the tool was to stand for `stand_s` (`policy.STAND`).
 
-    Raises:
-        ValueError: the package onnx is not there.
+    ValueError: the package onnx is not there.
     """
-    onnx, checker, helper, numpy_helper = (
-        need(name, "export") for name in ("onnx", "onnx.checker", "onnx.helper", "onnx.numpy_helper")
-    )
+    names = "onnx", "onnx.checker", "onnx.helper", "onnx.numpy_helper"
+    onnx, checker, helper, numpy_helper = (need(name, "export") for name in names)
     layers = len(policy.weights) // 2
     arrays = {f"{'wb'[i % 2]}{i // 2}": weight for i, weight in enumerate(policy.weights)}
     nodes = []

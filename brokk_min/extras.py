@@ -1,7 +1,5 @@
 """Packages that only some commands need (the extras of pyproject.toml), imported when one of these runs."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import Any
 
@@ -9,8 +7,7 @@ from typing import Any
 def need(package: str, extra: str) -> Any:
     """A module of a package that comes with an extra of ours.
 
-    Raises:
-        ValueError: it is not installed, with the extra that brings it.
+    ValueError: it is not installed, with the extra that brings it.
     """
     try:
         return import_module(package)

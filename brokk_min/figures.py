@@ -3,8 +3,6 @@
 Colours differ in brightness too, for paper and for the colour-blind.
 """
 
-from __future__ import annotations
-
 import base64
 import html
 import io
@@ -14,18 +12,17 @@ from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
-from brokk_min import actuator, kinematics, logs, scores
+from brokk_min import actuator, files, kinematics, logs, scores
 from brokk_min.env import Trace
-from brokk_min.machine import Machine
+from brokk_min.machine import Array, Machine
+from brokk_min.metrics import Mean
 from brokk_min.sequences import AXES, Commands
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-Array = NDArray[np.floating[Any]]
 Traces = Mapping[tuple[str, str], Trace]  # by controller and sequence, starts as one batch
 
 plt.rcParams.update({"font.size": 10, "axes.grid": True, "grid.alpha": 0.3, "axes.axisbelow": True})
@@ -153,12 +150,12 @@ def _free_run(net: actuator.ActuatorNet, recording: logs.Recording) -> Any:
 def plot_learning(curve: Path) -> Any:
     """Mean reward and velocity error of the exploring policy over environment steps."""
     labels = {"charts/reward": "reward a step [1]", "charts/velocity_error": "velocity error [m/s]"}
-    table = logs.read_table(curve, ["global_step", *labels])
+    table = files.read_table(curve, ["global_step", *labels])
     steps, wide = table["global_step"] / 1e6, "environment steps [million]"
     return plot_panels([[Panel("", wide, label, {"rl": (steps, table[k])}) for k, label in labels.items()]])
 
 
-Bars = Mapping[str, Mapping[str, Mapping[str, float | None]]]  # controller, sequence: "mean", "low", "high"
+Bars = Mapping[str, Mapping[str, Mean]]  # by controller and sequence
 
 
 def plot_bars(panels: Mapping[str, Bars]) -> Any:
@@ -214,7 +211,7 @@ def plot_worst_and_median(net: actuator.ActuatorNet, log: logs.Log) -> Any:
 
 def save(path: Path, figure: Any) -> None:
     """Write a figure as PNG, the same bytes for the same figure."""
-    with logs.whole_file(path) as file:
+    with files.whole_file(path) as file:
         figure.savefig(file, format="png", dpi=DPI, metadata={"Software": None})
     plt.close(figure)
 
@@ -249,7 +246,7 @@ def write_report(path: Path, parts: Sequence[tuple[Any, ...]], clock: Mapping[st
     for title, sentence, *contents in tqdm(parts, desc="draw", unit="part", disable=None):
         page.append(f"<h2>{html.escape(title)}</h2><p>{html.escape(sentence)}</p>")
         page += [_content(title, content) for content in contents]
-    with logs.whole_file(path, "w") as file:
+    with files.whole_file(path, "w") as file:
         file.write("\n".join(page) + "\n")
 
 

@@ -1,12 +1,12 @@
 """Fitting the nets to a log: windows of its recordings, errors of one step, then of short free runs.
 
 A window never crosses the seam of two recordings, and teaches a joint only where that joint moves. The nets
-of all joints are fitted at once. `fit_linear`, on the same windows, is what they must beat.
+of all joints are fitted at once.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,9 +15,7 @@ from tqdm import tqdm
 
 from brokk_min.actuator import NET_ARRAYS, ActuatorNet, valve_scale
 from brokk_min.logs import Log, Recording
-from brokk_min.machine import estimate_velocity
-
-Array = NDArray[np.floating[Any]]
+from brokk_min.machine import Array, estimate_velocity
 
 
 @dataclass(frozen=True)
@@ -54,8 +52,7 @@ def fit(log: Log, config: FitConfig, seed: int, velocity_samples: int, machine: 
     `seed` gives the same bits on the same machine. `velocity_samples` is the window of the estimator that
     supplied the velocities of `log`, `machine` a name for the file.
 
-    Raises:
-        ValueError: a joint that never moves long enough to be learned.
+    ValueError: a joint that never moves long enough to be learned.
     """
     dead_zone = config.dead_zone or 0.0
     config = replace(config, dead_zone=dead_zone)  # as it is used, for the file
@@ -81,10 +78,9 @@ def _train(training: TrainingSet, config: FitConfig, seed: int, estimator: int |
     """Weights of all nets, one Adam step for all of them at a time; `estimator` as in `_rollout_loss`."""
     import torch
 
-    n, inputs = training.input_mean.shape
     torch.set_float32_matmul_precision("highest")  # a training of policies may have allowed less
-    generator = torch.Generator().manual_seed(seed)
-    weights = _first_weights(n, inputs, config.hidden, generator)
+    tensors, generator = _as_tensors(training), torch.Generator().manual_seed(seed)
+    weights = _first_weights(training, config, generator)
     optimizer = torch.optim.Adam(weights, lr=config.learning_rate)
     runs_free = config.rollout > 1 and all(map(len, training.far_ends))
     turn = round(0.65 * config.steps) if runs_free else config.steps
@@ -94,17 +90,11 @@ def _train(training: TrainingSet, config: FitConfig, seed: int, estimator: int |
         return (0.5 if step < turn else 0.125) * (1 + float(np.cos(np.pi * done)))
 
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, fall)
-    arrays = (training.series, training.target.T)
-    tapes = [torch.tensor(array, dtype=torch.float32).flatten(-2) for array in arrays]  # joint after joint
-    first = torch.arange(n)[:, None] * len(training.target)
     for step in tqdm(range(config.steps), desc="fit nets", unit="step", disable=None):
         far = step >= turn
-        ends = training.far_ends if far else training.ends
-        batch = -(-config.batch_size // 4) if far else config.batch_size
-        picks = [torch.randint(len(end), (batch,), generator=generator) for end in ends]
-        at = torch.tensor(np.stack([end[pick] for end, pick in zip(ends, picks, strict=True)])) + first
+        at = _draw_windows(training, config, far, generator)
         ticks = config.rollout if far else 1
-        loss = _rollout_loss(training, config, weights, tapes, at, ticks, estimator, generator)
+        loss = _rollout_loss(tensors, config, weights, at, ticks, estimator, generator)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -114,10 +104,28 @@ def _train(training: TrainingSet, config: FitConfig, seed: int, estimator: int |
     return tuple(weight.detach().numpy() for weight in weights)
 
 
-def _first_weights(n: int, inputs: int, hidden: int, generator: Any) -> list[Any]:
-    """Weights and biases of n nets, layer by layer, as `ActuatorNet.weights` has them."""
+def _as_tensors(training: TrainingSet) -> Any:
+    """A training set with float32 tensors for arrays."""
     import torch
 
+    return TrainingSet._make(torch.tensor(a).float() if isinstance(a, np.ndarray) else a for a in training)
+
+
+def _draw_windows(training: TrainingSet, config: FitConfig, far: bool, generator: Any) -> Any:
+    """Newest samples (n, batch) of random windows of each joint; fewer, with room behind them, if `far`."""
+    import torch
+
+    ends = training.far_ends if far else training.ends
+    batch = -(-config.batch_size // 4) if far else config.batch_size
+    picks = [torch.randint(len(end), (batch,), generator=generator) for end in ends]
+    return torch.tensor(np.stack([end[pick] for end, pick in zip(ends, picks, strict=True)]))
+
+
+def _first_weights(training: TrainingSet, config: FitConfig, generator: Any) -> list[Any]:
+    """Weights and biases of all nets, layer by layer, as `ActuatorNet.weights` has them."""
+    import torch
+
+    (n, inputs), hidden = training.input_mean.shape, config.hidden
     weights: list[torch.Tensor] = []
     for rows, columns in [(inputs, hidden), (hidden, hidden), (hidden, 1)]:
         bound = (6 / rows) ** 0.5  # He's uniform bound for ReLU
@@ -127,10 +135,9 @@ def _first_weights(n: int, inputs: int, hidden: int, generator: Any) -> list[Any
 
 
 def _rollout_loss(
-    training: TrainingSet,
+    training: Any,
     config: FitConfig,
     weights: list[Any],
-    tapes: list[Any],
     at: Any,
     ticks: int,
     estimator: int | None,
@@ -142,41 +149,54 @@ def _rollout_loss(
     A joint goes no further than its stops, as in `ActuatorNet.step`.
 
     Args:
-        tapes: inputs (3, n N) and wanted velocities (n N,) [rad/s], joint after joint.
+        training: of `_as_tensors`.
         estimator: samples of the velocity estimator; None: velocities are the nets' own outputs.
     """
     import torch
 
-    series, target = tapes
-    n, history = len(at), config.history
-    mean, scale, low, high = (torch.tensor(array).float() for array in training[3:7])
-    mean, scale = mean.reshape(n, 1, 3, history), scale.reshape(n, 1, 3, history)
-    window = series.unfold(-1, history + ticks - 1, 1)[:, at - (history - 1)]  # (3, n, batch, H + ticks - 1)
-    q, q_dot, u = window[0, ..., :history], window[1, ..., :history], window[2]
-    if config.noise:
-        shape = (*at.shape, history)
-        noise = torch.randn(*shape, generator=generator) + torch.randn(*shape[:2], 1, generator=generator)
-        q_dot = q_dot + config.noise * scale[:, :, 1] * noise
-    stops = [torch.tensor(array).float()[:, None] for array in (training.q_low, training.q_high)]
+    q, q_dot, u = _windows(training, config, at, ticks, generator)
+    joint, history, rate = torch.arange(len(at))[:, None], config.history, training.rate
+    low, span = training.output_low[:, None], (training.output_high - training.output_low)[:, None]
+    mean, scale = training.input_mean[:, None], training.input_scale[:, None]
+    if estimator:
+        slope = torch.tensor(estimate_velocity(np.eye(estimator), estimator, 1 / rate)).float()
     off, loss = torch.zeros(()), torch.zeros(())
     for k in range(ticks):
-        x = (torch.stack([q, q_dot, u[..., k : k + history]], dim=2) - mean) / scale
-        x = x.flatten(2)
-        for i in (0, 2):
-            x = torch.relu(torch.baddbmm(weights[i + 1][:, None], x, weights[i]))
-        y = torch.sigmoid(torch.baddbmm(weights[5][:, None], x, weights[4]))[..., 0]
-        room = [(stop - q[..., -1]) * training.rate for stop in stops]
-        velocity = torch.clamp(low[:, None] + (high - low)[:, None] * y, *room)
-        off = off + (velocity - target[at + k]) / (high - low)[:, None]
+        x = torch.stack([q, q_dot, u[..., k : k + history]], dim=2).flatten(2)
+        room = [(stop[:, None] - q[..., -1]) * rate for stop in (training.q_low, training.q_high)]
+        velocity = torch.clamp(low + span * _outputs(weights, (x - mean) / scale), *room)
+        off = off + (velocity - training.target[at + k, joint]) / span
         loss = loss + (off**2).mean(dim=1).sum() / ticks
         if k + 1 < ticks:
-            q = torch.cat([q[..., 1:], (q[..., -1] + velocity / training.rate)[..., None]], dim=-1)
+            q = torch.cat([q[..., 1:], (q[..., -1] + velocity / rate)[..., None]], dim=-1)
             if estimator:
-                eye, dt = np.eye(estimator), 1 / training.rate
-                slope = torch.tensor(estimate_velocity(eye, estimator, dt)).float()
                 velocity = (q[..., -estimator:] * slope).sum(dim=-1)
             q_dot = torch.cat([q_dot[..., 1:], velocity[..., None]], dim=-1)
     return loss
+
+
+def _windows(training: Any, config: FitConfig, at: Any, ticks: int, generator: Any) -> tuple[Any, Any, Any]:
+    """Angles and noisy velocities (n, batch, H) of windows that end `at`, and commands `ticks` - 1 beyond."""
+    import torch
+
+    (n, batch), history = at.shape, config.history
+    series = training.series.unfold(-1, history + ticks - 1, 1)
+    q, q_dot, u = series[:, torch.arange(n)[:, None], at - (history - 1)]
+    q, q_dot = q[..., :history], q_dot[..., :history]
+    if config.noise:
+        noise = torch.randn(n, batch, history, generator=generator)
+        noise = noise + torch.randn(n, batch, 1, generator=generator)
+        q_dot = q_dot + config.noise * training.input_scale.reshape(n, 1, 3, history)[:, :, 1] * noise
+    return q, q_dot, u
+
+
+def _outputs(weights: list[Any], x: Any) -> Any:
+    """What all nets say in [0, 1] (n, batch) to standardised inputs (n, batch, 3 H)."""
+    import torch
+
+    for i in (0, 2):
+        x = torch.relu(torch.baddbmm(weights[i + 1][:, None], x, weights[i]))
+    return torch.sigmoid(torch.baddbmm(weights[5][:, None], x, weights[4]))[..., 0]
 
 
 class TrainingSet(NamedTuple):
@@ -198,8 +218,7 @@ class TrainingSet(NamedTuple):
 def training_set(log: Log, history: int, rollout: int = 1, dead_zone: float = 0.0) -> TrainingSet:
     """Windows of the recordings in which a joint moves; its statistics are of those alone.
 
-    Raises:
-        ValueError: a joint that never moves long enough to be learned.
+    ValueError: a joint that never moves long enough to be learned.
     """
     samples = end_to_end(log)
     every, far = (samples.starts(history - 1, ahead, 1) for ahead in (1, rollout))
@@ -232,6 +251,11 @@ class Samples(NamedTuple):
     moves: NDArray[np.bool_]  # (N, n): in a recording in which the joint moves or is commanded
     lengths: list[int]  # of the recordings
 
+    @property
+    def scored(self) -> NDArray[np.bool_]:
+        """Where a joint is scored (N, n): where it moves, or if it rests everywhere, at rest."""
+        return self.moves | ~self.moves.any(axis=0)
+
     def starts(self, before: int, after: int, step: int) -> NDArray[np.intp]:
         """Every `step`-th sample of each recording with `before` samples before and `after` after it."""
         seams = np.cumsum([0, *self.lengths])
@@ -254,43 +278,3 @@ def end_to_end(log: Log) -> Samples:
     lengths = [len(r.q) for r in log.recordings]
     moves = [np.ptp(r.u, axis=0) + np.ptp(r.q, axis=0) > 0 for r in log.recordings]
     return Samples(whole, target, np.repeat(moves, lengths, axis=0), lengths)
-
-
-class LinearModel(ActuatorNet):
-    """A linear model of the nets' inputs within the nets' range: what a net must beat.
-
-    Weights (n, 3 H) and (n,), for standardised inputs.
-    """
-
-    def velocity(self, history: Array) -> Array:
-        """What the model says, as `ActuatorNet.predict`."""
-        slope, offset = self.weights
-        velocity = (((self.inputs(history) - self.input_mean) / self.input_scale) * slope).sum(
-            axis=-1
-        ) + offset
-        return np.asarray(np.clip(velocity, self.output_low, self.output_high))
-
-
-def fit_linear(net: ActuatorNet, log: Log, penalty: float = 1e-3) -> LinearModel:
-    """Ridge regression on the inputs, targets and recordings that `net` was fitted to.
-
-    Args:
-        penalty: on squared weights, in units of the mean squared error of standardised inputs.
-    """
-    training, history = training_set(log, net.history, dead_zone=net.dead_zone), net.history
-    slopes, offsets = [], []
-    for j, ends in enumerate(training.ends):
-        size = 3 * history + 1
-        gram, moment = np.zeros((size, size)), np.zeros(size)
-        for chunk in np.array_split(ends, -(-len(ends) // 8192)):  # bounds the memory
-            x = training.series[:, j, chunk[:, None] + np.arange(1 - history, 1)].swapaxes(0, 1)
-            x = (x.reshape(len(chunk), -1) - training.input_mean[j]) / training.input_scale[j]
-            x = np.column_stack([x, np.ones(len(chunk))])
-            gram, moment = gram + x.T @ x, moment + x.T @ training.target[chunk, j]
-        ridge = penalty * len(ends) * np.eye(size)
-        ridge[-1, -1] = 0.0  # the offset is free
-        *slope, offset = np.linalg.solve(gram + ridge, moment)
-        slopes.append(slope)
-        offsets.append(offset)
-    header = {f.name: getattr(net, f.name) for f in fields(net)} | {"settings": {"penalty": penalty}}
-    return LinearModel(**header | {"weights": (np.array(slopes, np.float32), np.array(offsets, np.float32))})

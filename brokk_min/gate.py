@@ -4,8 +4,6 @@ The gate is a pure function of state, inputs and time, for one machine or for a 
 safety function: a real machine keeps its hard-wired emergency stop (docs/hardware.md).
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brokk_min.machine import PWM_MAX, Machine, encode_pwm
 
-Array = NDArray[Any]
+Array = NDArray[Any]  # counts and flags, too
 
 POSITION_MASK = (1 << 26) - 1  # bits of an encoder's position that count
 OPERATIONAL = 5  # CANopen state of a node at work
@@ -165,19 +163,14 @@ def gate(machine: Machine, state: GateState, inputs: GateInputs, now: ArrayLike)
     Returns:
         The next state, and the valve frame (..., 8), to be sent only if the state has `spoken`.
     """
-    now, last = np.asarray(now), state.sent[..., -1]
+    now = np.asarray(now)
     pace, due = motion_due(machine, state, inputs.counts)
     wrong = gate_wrong(machine, state, inputs, due, now)
     edge = inputs.enable & ~state.enable & inputs.centred
     driving = inputs.enable & (state.driving | edge) & np.logical_not(wrong)
     fault = np.where(driving, 0, np.where(state.driving, wrong, state.fault))
-
-    q = inputs.counts * machine.encoder_step
-    up = np.where(q < machine.column("q_max") - LIMIT_MARGIN, np.maximum(last, 0) + SLEW, 0)
-    down = np.where(q > machine.column("q_min") + LIMIT_MARGIN, np.minimum(last, 0) - SLEW, 0)
     moving = state.driving & driving  # the tick that arms is still neutral
-    m = np.where(moving[..., None], np.minimum(np.maximum(inputs.m, down), up), 0).astype(int)
-
+    m = np.where(moving[..., None], held_back(machine, state, inputs), 0).astype(int)
     counter = (state.counter + 1) % 256
     trusted = inputs.alive & ~inputs.error  # a lost device or an exception is no release of the switch
     following = GateState(
@@ -194,6 +187,14 @@ def gate(machine: Machine, state: GateState, inputs: GateInputs, now: ArrayLike)
         due=due,
     )
     return following, valve_frame(m, counter, driving)
+
+
+def held_back(machine: Machine, state: GateState, inputs: GateInputs) -> Array:
+    """Wanted commands (..., n) [counts of 127], grown by `SLEW` at most and not outward at a joint limit."""
+    last, q = state.sent[..., -1], inputs.counts * machine.encoder_step
+    up = np.where(q < machine.column("q_max") - LIMIT_MARGIN, np.maximum(last, 0) + SLEW, 0)
+    down = np.where(q > machine.column("q_min") + LIMIT_MARGIN, np.minimum(last, 0) - SLEW, 0)
+    return np.minimum(np.maximum(inputs.m, down), up)
 
 
 def motion_due(machine: Machine, state: GateState, counts: Array) -> tuple[Array, Array]:

@@ -6,8 +6,6 @@ its logs, `simulator` is a machine to try. Nothing here is a safety function: a 
 hard-wired emergency stop (docs/hardware.md).
 """
 
-from __future__ import annotations
-
 import gc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,17 +13,15 @@ from copy import copy
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brokk_min import bus
 from brokk_min.actuator import push_command, rest_history
 from brokk_min.env import Controller, observe, push_measured
-from brokk_min.gate import OPERATIONAL, GateInputs, encoder_counts, fault_name, gate, gate_start
+from brokk_min.gate import OPERATIONAL, Array, GateInputs, encoder_counts, fault_name, gate, gate_start
 from brokk_min.kinematics import tool_state
 from brokk_min.machine import PWM_MAX, Machine
 from brokk_min.wishes import Wish, unpack_wish
 
-Array = NDArray[Any]
 AWAKE = 0.002  # s before SYNC and after it in which the loop does not sleep (tuned)
 REHEARSALS = 4  # of a tick before it (tuned)
 WINDOW = 0.020  # s after SYNC in which the encoders must answer (assumed)
@@ -61,8 +57,7 @@ class Drive:
     def begin(self) -> None:
         """Check and set up the encoders, start all nodes, and the clock.
 
-        Raises:
-            ValueError: an encoder that does not answer or has another resolution.
+        ValueError: an encoder that does not answer or has another resolution.
         """
         for joint in self.machine.joints:
             turn = bus.sdo(self.line, joint.encoder_node, bus.RESOLUTION_OBJECT)
@@ -95,9 +90,8 @@ class Drive:
         counts = encoder_counts(self.machine, self.nodes.raw)
         with self._caught():
             wanted = self._control(counts)
-        self.wish = self.wish._replace(
-            stop=self.wish.stop or bool(self.signals), error=self.wish.error or bool(self.problem)
-        )
+        stop, error = self.wish.stop or bool(self.signals), self.wish.error or bool(self.problem)
+        self.wish = self.wish._replace(stop=stop, error=error)
         frame = self._gate(wanted, counts, line.note(self.wish.pack()))
         problem, self.problem = self.problem, ""
         self._speak(frame)
@@ -122,13 +116,16 @@ class Drive:
             self._speak(self._gate(np.zeros(self.machine.n), counts, self.line.now()))
             raise
 
+    @property
+    def seen(self) -> Array:
+        """Newest angles [rad] and rates [rad/s], (2, n); nan: unknown."""
+        return np.full((2, self.machine.n), np.nan) if self.history is None else self.history[0, :, :2, -1].T
+
     def status(self) -> str:
         """One line: state, faults, tool velocity wanted and measured [m/s], angles [rad], lateness."""
         state = "driving" if self.gate.driving else "waiting" if self.gate.wrong else "ready"
-        q, v = np.full(self.machine.n, np.nan), np.full(3, np.nan)
-        if self.history is not None:
-            q, q_dot = self.history[0, :, 0, -1], self.history[0, :, 1, -1]
-            v = tool_state(self.machine, q, q_dot)[1]
+        q, q_dot = self.seen
+        v = tool_state(self.machine, q, q_dot)[1]
         want, have, pose = (" ".join(f"{x:+.2f}" for x in a) for a in (self.wish.v_goal, v, q))
         late = f"late {1e3 * self.lateness:.1f} ms, skipped {self.skipped}"
         reason = f" {self.reason}" if self.reason else ""

@@ -1,26 +1,20 @@
 """The classical way: weighted damped least squares for joint rates, a PID a joint for the valves.
 
 Read in the order of the computation: `dls` and its weights and damping give joint rates (paper eq3,
-eq4), `JacobianController` turns them into commands, `tune` finds its gains on the machine.
+eq4), `JacobianController` turns them into commands; `baselines` tunes it.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import Bounds, OptimizeResult, differential_evolution
-from tqdm import tqdm
+from numpy.typing import ArrayLike
 
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import Measured, measured
 from brokk_min.kinematics import jacobian
-from brokk_min.machine import PWM_MAX, Machine, limit_command, valve_opening
-
-Array = NDArray[np.floating[Any]]
+from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, valve_opening
 
 
 def dls(J: ArrayLike, W: ArrayLike, damping: ArrayLike, as_printed: bool = False) -> Array:
@@ -87,7 +81,7 @@ def manipulability_threshold(machine: Machine) -> float:
 
 # --- from joint rates to valves ---------------------------------------------------------------------
 
-# Ranges that `tune` searches (assumed); of the first three each driven joint has its own.
+# Ranges that `baselines.tune` searches (assumed); of the first three each driven joint has its own.
 GAINS = {
     "kp": (0.0, 4.0),  # valve opening per rad/s
     "ki": (0.0, 12.0),  # valve opening per rad
@@ -113,8 +107,7 @@ def split_gains(gains: ArrayLike) -> dict[str, Array]:
 def join_gains(machine: Machine, named: Mapping[str, ArrayLike]) -> Array:
     """`split_gains` turned round for a single vector; one number stands for all joints.
 
-    Raises:
-        ValueError: another number of gains, or not finite ones.
+    ValueError: another number of gains, or not finite ones.
     """
     sizes = [len(machine.driven)] * 3 + [1, 1]
     pairs = zip(GAINS, sizes, strict=True)
@@ -231,68 +224,3 @@ class JacobianController:
         u = np.zeros((*opening.shape[:-1], m.n))
         u[..., m.driven] = np.sign(opening) * size
         return limit_command(m, u), Memory(integral, error, slope, rate)
-
-
-# --- tuning -----------------------------------------------------------------------------------------
-
-
-def tune(
-    controller: JacobianController,
-    cost: Callable[[JacobianController], Array],
-    seed: int,
-    generations: int,
-    label: str,
-) -> tuple[JacobianController, list[float]]:
-    """The controller with the gains of least cost, and the least cost after each generation.
-
-    SciPy's differential evolution with 32 candidates, the first of them about the controller's own gains.
-
-    Args:
-        controller: whose gains are to be found.
-        cost: cost (candidates,) of a controller with a row of gains for each candidate.
-        seed: of the search.
-        generations: of the search.
-        label: shown at the progress bar.
-    """
-    low, high = gain_bounds(controller.machine)
-    first = np.random.default_rng(seed).normal(controller.gains, 0.15 * (high - low), (32, len(low)))
-    first[0] = controller.gains
-    costs: list[float] = []
-
-    def objective(vectors: Array) -> Any:  # (candidates,): SciPy's types know no vectorised search
-        return cost(replace(controller, gains=vectors.T))
-
-    with tqdm(total=generations, desc=f"tune {label}", unit="generation", disable=None) as bar:
-
-        def note(intermediate_result: OptimizeResult) -> None:
-            costs.append(float(intermediate_result.fun))
-            bar.update()
-
-        result = differential_evolution(
-            objective,
-            Bounds(low, high),
-            init=np.clip(first, low, high),
-            maxiter=generations,
-            mutation=(0.4, 0.9),
-            tol=0,
-            polish=False,
-            rng=seed,
-            vectorized=True,
-            updating="deferred",
-            callback=note,
-        )
-    return replace(controller, gains=result.x), costs
-
-
-def gain_bounds(machine: Machine) -> tuple[Array, Array]:
-    """Smallest and largest gains of `GAINS` as vectors."""
-    low, high = ({name: ends[i] for name, ends in GAINS.items()} for i in (0, 1))
-    return join_gains(machine, low), join_gains(machine, high)
-
-
-def gains_at_bound(controller: JacobianController) -> list[str]:
-    """Gains within 1 % of an end of their range: there the range decided, not the cost."""
-    m, (low, high) = controller.machine, gain_bounds(controller.machine)
-    names = [f"{kind} {m.names[i]}" for kind in ("kp", "ki", "kd") for i in m.driven] + ["feedback", "ready"]
-    share = (controller.gains - low) / (high - low)
-    return [name for name, s in zip(names, share, strict=True) if not 0.01 < s < 0.99]

@@ -6,24 +6,16 @@ command (held until the next row), q in rad, q_dot in rad/s. Any joints, any rat
 machine's, jitter allowed. A recording whose name ends in `_return` is a way back to the start and is dropped.
 """
 
-from __future__ import annotations
-
-import csv
-import json
-import os
-import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min.machine import estimate_velocity
+from brokk_min.files import Floats, Table, cells_of, load_arrays, numbers_of, read_csv, whole_file, write_csv
+from brokk_min.machine import Array, Machine, estimate_velocity
 
-Floats = NDArray[np.float64]
-Table = dict[str, list[Any]]  # cells by column; row 2 of the file is cell 0
 RATE = 20.0  # Hz, paper: everything runs at 20 Hz; other machines have others
 MAX_GAP = 0.25  # s, assumed: a longer hole in the time stamps starts a new recording
 RETURN = "_return"
@@ -38,9 +30,9 @@ class Recording(NamedTuple):
     """One recording of a log: arrays (T, n) of command [-1, 1], angle [rad], velocity [rad/s]."""
 
     name: str
-    u: Floats
-    q: Floats
-    q_dot: Floats
+    u: Array
+    q: Array
+    q_dot: Array
 
 
 class Log(NamedTuple):
@@ -52,53 +44,11 @@ class Log(NamedTuple):
     rate: float = RATE  # Hz
 
 
-@contextmanager
-def whole_file(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
-    """Open a temporary file beside `path` that replaces it when the block ends without error."""
-    path = Path(path)
-    if not path.parent.is_dir():
-        raise ValueError(f"{path}: expected an existing directory, got {path.parent}")
-    newline = None if "b" in mode else ""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, mode, newline=newline) as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException as error:
-        os.unlink(temporary)
-        if isinstance(error, OSError) and error.filename is None:
-            error.filename = str(path)  # a full disk does not say which file it was
-        raise
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write JSON whole, floats as they are."""
-    with whole_file(path, "w") as file:
-        json.dump(value, file, indent=1, allow_nan=False)
-        file.write("\n")
-
-
-def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """All arrays of an `.npz` file; nothing in it is executed.
-
-    Raises:
-        ValueError: not there, not an `.npz`, truncated, or holding pickled objects.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except Exception as error:  # zipfile, zlib and NumPy raise anything on damaged files
-        raise ValueError(f"{path}: expected a readable .npz file, got {error!r}") from error
-
-
-def expect_same(path: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
-    """Refuse a file that says other than `wanted` of itself: ValueError, with the first name that differs."""
-    for name, value in wanted.items():
-        if found.get(name) != value:
-            raise ValueError(f"{path}: {name}: expected {value!r}, got {found.get(name)!r}")
+def machine_log(machine: Machine, tapes: Iterable[tuple[str, Array, Array]]) -> Log:
+    """A log of a machine from names, commands and encoder angles; velocities are estimated."""
+    how = machine.velocity_samples, machine.rate
+    recordings = tuple(Recording(name, u, q, velocity_of(q, *how)) for name, u, q in tapes)
+    return Log(machine.names, recordings, rate=machine.rate)
 
 
 def write_log(path: Path, log: Log) -> None:
@@ -120,11 +70,8 @@ def write_log(path: Path, log: Log) -> None:
         with whole_file(path) as file:
             np.savez_compressed(file, **columns)
     elif path.suffix == ".csv":
-        with whole_file(path, "w") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(columns)
-            numbers = [np.char.mod("%.7g", column) for column in list(columns.values())[1:]]
-            writer.writerows(zip(columns["run"], *numbers, strict=True))
+        numbers = [np.char.mod("%.7g", column) for column in list(columns.values())[1:]]
+        write_csv(path, columns, zip(columns["run"], *numbers, strict=True))
     else:
         raise ValueError(f"{path}: expected a name ending in .csv or .npz, got {path.suffix!r}")
 
@@ -143,12 +90,11 @@ def read_log(
         velocity_samples: window of `estimate_velocity`.
         joints: names that must be there, in the wanted order; None: all, in the order of the first file.
 
-    Raises:
-        ValueError: with file, row (1 is the header) and column of the first thing that is wrong.
+    ValueError: with file, row (1 is the header) and column of the first thing that is wrong.
     """
     names, recordings, logged = tuple(joints or ()), list[Recording](), set[bool]()
     for path in map(Path, paths):
-        table = _read_csv(path) if path.suffix.lower() == ".csv" else _read_npz(path)
+        table = read_csv(path) if path.suffix.lower() == ".csv" else _read_npz(path)
         found = _joints(path, table) if joints is None else names
         names = names or found
         if set(found) != set(names):
@@ -180,13 +126,13 @@ def _recordings(
     path: Path, table: Table, joints: Sequence[str], logged: bool, samples: int, rate: float
 ) -> Iterator[Recording]:
     """The checked recordings of one table at `rate`, in the order in which they begin."""
-    time = _numbers(path, table, "time")
+    time = numbers_of(path, table, "time")
     columns = {
-        kind: np.stack([_numbers(path, table, f"{kind}_{joint}", *unit) for joint in joints], axis=1)
+        kind: np.stack([numbers_of(path, table, f"{kind}_{joint}", *unit) for joint in joints], axis=1)
         for kind, unit in list(UNITS.items())[: 3 if logged else 2]
     }
     runs: dict[str, list[int]] = {}
-    for row, run in enumerate(_cells(path, table, "run")):
+    for row, run in enumerate(cells_of(path, table, "run")):
         if not run.strip():
             raise ValueError(f"{path}: row {row + 2}, column run: expected a name, got {run!r}")
         runs.setdefault(run, []).append(row)
@@ -230,7 +176,7 @@ def _resample(time: Floats, columns: dict[str, Floats], samples: int, rate: floa
     return columns["u"][held], q, q_dot
 
 
-def velocity_of(q: Floats, samples: int, rate: float = RATE) -> Floats:
+def velocity_of(q: Array, samples: int, rate: float = RATE) -> Floats:
     """Causal velocity [rad/s] at each row of one recording `q` [rad] (T, n), at rest before it.
 
     `rate` [Hz] is that of the rows.
@@ -244,38 +190,6 @@ def velocity_of(q: Floats, samples: int, rate: float = RATE) -> Floats:
     return np.asarray(estimate_velocity(windows, samples, 1 / rate), float)
 
 
-def read_table(path: Path, columns: Sequence[str], text: Sequence[str] = ()) -> dict[str, NDArray[Any]]:
-    """Named columns of a small CSV: finite numbers, or text where so named.
-
-    Raises:
-        ValueError: with file, row and column of the first thing that is wrong.
-    """
-    table = _read_csv(Path(path))
-    return {
-        name: np.array(_cells(path, table, name)) if name in text else _numbers(path, table, name)
-        for name in columns
-    }
-
-
-def _read_csv(path: Path) -> Table:
-    try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.reader(file))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"{path}: expected a readable CSV table, got {error}") from error
-    while rows and not rows[-1]:  # blank lines at the end
-        rows.pop()
-    if len(rows) < 2:
-        raise ValueError(f"{path}: expected a header and at least one row, got {len(rows)} rows")
-    header = [name.strip() for name in rows[0]]
-    if twice := sorted({name for name in header if header.count(name) > 1}):
-        raise ValueError(f"{path}: row 1: expected each column once, got {twice} more than once")
-    for number, row in enumerate(rows[1:], 2):
-        if len(row) != len(header):
-            raise ValueError(f"{path}: row {number}: expected {len(header)} cells, got {len(row)}")
-    return dict(zip(header, map(list, zip(*rows[1:], strict=True)), strict=True))
-
-
 def _read_npz(path: Path) -> Table:
     columns = load_arrays(path)
     shapes = {name: column.shape for name, column in columns.items()}
@@ -286,33 +200,3 @@ def _read_npz(path: Path) -> Table:
         if column.dtype.kind not in kind:
             raise ValueError(f"{path}: column {name}: expected {wanted}, got {column.dtype}")
     return {name: column.tolist() for name, column in columns.items()}
-
-
-def _cells(path: Path, table: Table, name: str) -> list[Any]:
-    if name not in table:
-        raise ValueError(f"{path}: row 1: expected a column {name}, got {list(table)}")
-    return table[name]
-
-
-def _numbers(path: Path, table: Table, name: str, bound: float = np.inf, unit: str = "") -> Floats:
-    """One column as finite numbers within +-bound; the first cell that is none is named."""
-    cells = _cells(path, table, name)
-    largest = min(bound + 1e-6, np.finfo(float).max)
-
-    def number(cell: Any) -> float:
-        try:
-            return float(cell)
-        except ValueError:
-            return np.nan
-
-    try:
-        numbers, wanted = np.array(cells, float), "a finite number"
-    except ValueError:
-        numbers, wanted = np.array([number(cell) for cell in cells]), "a number"
-    if not (good := np.abs(numbers) <= largest).all():
-        row = int(np.argmin(good))
-        limits = "" if bound == np.inf else f" in [-{bound:g}, {bound:g}] ({unit})"
-        raise ValueError(
-            f"{path}: row {row + 2}, column {name}: expected {wanted}{limits}, got {cells[row]!r}"
-        )
-    return numbers

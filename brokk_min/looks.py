@@ -1,17 +1,14 @@
 """What a machine looks like: corners, extent, two views of it; which poses deserve a warning."""
 
-from __future__ import annotations
-
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brokk_min.kinematics import frames, jacobian
-from brokk_min.machine import Machine
+from brokk_min.machine import Array, Machine
 
-Array = NDArray[np.floating[Any]]
 Box = tuple[float, float, float, float]  # left, top, width, height [px]
 ABOVE = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])  # right and up as seen from above
 

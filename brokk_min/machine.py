@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+Array = NDArray[np.floating[Any]]  # of any shape, float32 or float64
 SOURCES = ("paper", "maker", "assumed", "tuned")
 PWM_MAX = 127  # counts of full command; paper: [0,127] is positive, [255,128] negative
 
@@ -86,8 +87,7 @@ class Joint:
 class Machine:
     """Everything that distinguishes one machine from another.
 
-    Raises:
-        ValueError: on creation, for a field out of its range: its name, what is allowed and what came.
+    ValueError: on creation, for a field out of its range: its name, what is allowed and what came.
 
     Example:
         >>> BROKK_170.n, [joint.name for joint in BROKK_170.joints if joint.driven]
@@ -238,8 +238,7 @@ def encode_pwm(u: ArrayLike) -> NDArray[np.uint8]:
 
     Paper: Sec. 3.2 (the pairs 80/175 and 50/205 sum to 255)
 
-    Raises:
-        ValueError: a command outside [-1, 1] or not a number.
+    ValueError: a command outside [-1, 1] or not a number.
 
     Example:
         >>> encode_pwm(np.array([80, -80, 50, -50, 0]) / 127).tolist()

@@ -1,7 +1,5 @@
 """Figures of merit of runs, their means with intervals over starts, and comparisons on the same starts."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
@@ -11,11 +9,11 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from brokk_min.env import Trace
-from brokk_min.machine import Machine
+from brokk_min.machine import Array, Machine
 
-Array = NDArray[np.floating[Any]]
 T = TypeVar("T")
 Run = Mapping[str, Any]  # controller, sequence, start, kind, then the figures of `metrics`
+Mean = Mapping[str, float | None]  # "mean", and the ends of its interval, "low" and "high", or None
 LABELS = ("controller", "sequence", "start", "kind")
 CHANGE = 0.05  # share of tool_speed, assumed: a goal that jumps by more has changed
 TRANSIENT = 0.6  # s after a change, assumed: as long as the policy's memory
@@ -45,9 +43,8 @@ def line_distance(p_tool: Array, goals: Array, start: Array) -> Array:
         anchor = np.where(anew & ~first, before, anchor)
         direction, before = np.where(anew, heading, direction), p
         away = p - anchor
-        distance.append(
-            np.linalg.norm(away - np.sum(away * direction, -1, keepdims=True) * direction, axis=-1)
-        )
+        along = np.sum(away * direction, -1, keepdims=True) * direction
+        distance.append(np.linalg.norm(away - along, axis=-1))
     return np.array(distance)
 
 
@@ -70,10 +67,8 @@ def settling_time(machine: Machine, error: Array, goals: Array) -> Array:
     Where it does not before the next change, the whole time between the changes counts. `goals` (T, num, 3).
     """
     since = since_change(machine, goals)
-    segment, last_change = (
-        np.cumsum(since == 0, axis=0),
-        np.arange(len(goals))[:, None] - np.maximum(since, 0),
-    )
+    segment = np.cumsum(since == 0, axis=0)
+    last_change = np.arange(len(goals))[:, None] - np.maximum(since, 0)
     jump = np.take_along_axis(_jumps(goals), last_change, axis=0)
     band = np.minimum(BAND * machine.tool_speed, PART * jump)
     late = np.where((error > band) & (since >= 0), since + 1, 0)
@@ -181,21 +176,19 @@ def intervals(runs: Sequence[Run]) -> dict[str, dict[str, dict[str, list[float |
     return _of_each(runs, interval)
 
 
-def mean_interval(values: Array) -> dict[str, float | None]:
+def mean_interval(values: Array) -> Mean:
     """Mean and ends of its `interval`: "mean", "low", "high"."""
     low, high = interval(values)
     return {"mean": _number(values), "low": low, "high": high}
 
 
-def paired(runs: Sequence[Run], one: str, other: str, key: str) -> dict[str, dict[str, float | None]]:
+def paired(runs: Sequence[Run], one: str, other: str, key: str) -> dict[str, Mean]:
     """A figure of one controller less another's on the same starts, by sequence: `mean_interval` each."""
     sequences = _named(runs)[1]
     return {s: mean_interval(by_start(runs, one, s, key) - by_start(runs, other, s, key)) for s in sequences}
 
 
-def paired_with_others(
-    runs: Sequence[Run], one: str
-) -> dict[str, dict[str, dict[str, dict[str, float | None]]]]:
+def paired_with_others(runs: Sequence[Run], one: str) -> dict[str, dict[str, dict[str, Mean]]]:
     """Every figure of one controller less each other's: `paired`, by figure and other controller."""
     controllers, _, keys = _named(runs)
     return {k: {c: paired(runs, one, c, k) for c in controllers if c != one} for k in keys}

@@ -4,22 +4,18 @@ Model-predictive control on the analytic plant. It is told no goal ahead of time
 goal lasted, like every other controller. What error it leaves is the price of delay and dead time.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brokk_min.env import measured
 from brokk_min.jacobian import dls
 from brokk_min.kinematics import jacobian, tool_velocity
-from brokk_min.machine import PWM_MAX, Machine, limit_command, valve_opening
+from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, valve_opening
 from brokk_min.plant import PlantState, lever_arm, plant_reset, plant_step
 
-Array = NDArray[np.floating[Any]]
 BLOCKS = (1, 1, 2, 4, 6)  # ticks at which a plan may turn lie between; their sum is the horizon (assumed)
 STEPS = (1.0, 0.5, 0.2)  # shares of a Gauss-Newton step that are tried (assumed)
 PROBE = 0.03  # valve opening by which a plan is disturbed to see what it does (assumed)

@@ -4,16 +4,12 @@ The learner never sees these equations, only logs of what they do. One step is o
 under a held command, as it is for the nets that learn the machine (`actuator.ActuatorNet.step`).
 """
 
-from __future__ import annotations
-
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from brokk_min.machine import PWM_MAX, Machine, valve_opening
-
-Array = NDArray[np.floating[Any]]
+from brokk_min.machine import PWM_MAX, Array, Machine, valve_opening
 
 
 class PlantState(NamedTuple):

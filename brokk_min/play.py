@@ -3,8 +3,6 @@
 The loop that drives is elsewhere (`remote`): the window only says what is asked for and shows what is known.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -12,20 +10,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brokk_min import tracing, view, wishes
 from brokk_min.bus import open_line
 from brokk_min.env import Controller
 from brokk_min.gate import fault_name
 from brokk_min.kinematics import tool_position
-from brokk_min.machine import Machine
+from brokk_min.machine import Array, Machine
 from brokk_min.remote import Ask, Where, control_process
 from brokk_min.ticks import Known, Ticks, unpack_known
 from brokk_min.view import TITLES
 from brokk_min.window import Window, open_window
 
-Array = NDArray[Any]
 SIZE = (1120, 680)  # of the window [px]
 RISE = 0.25  # s from a key's press to full deflection (assumed)
 
@@ -67,12 +63,7 @@ class Hands:
         if event.type == pg.QUIT or (event.type == pg.KEYDOWN and event.key == pg.K_ESCAPE):
             self.closed = True
         elif event.type == pg.KEYDOWN:
-            self.lost = False  # the keyboard takes over
-            self.held.add(event.key)
-            if event.key == pg.K_TAB:
-                self.switch()
-            tasks = {pg.K_RETURN: "next", pg.K_BACKSPACE: "again"}
-            self.task_wanted = tasks.get(event.key, self.task_wanted)
+            self._press(event.key)
         elif event.type == pg.KEYUP:
             self.held.discard(event.key)
         elif event.type == pg.WINDOWFOCUSLOST:
@@ -80,12 +71,24 @@ class Hands:
             self.held.clear()
         elif event.type == pg.WINDOWFOCUSGAINED:
             self.focus = True
-        elif event.type == pg.JOYDEVICEADDED and self.pad is None:
+        else:
+            self._hear_pad(event)
+
+    def _press(self, key: int) -> None:
+        pg = self.pygame
+        self.lost = False  # the keyboard takes over
+        self.held.add(key)
+        if key == pg.K_TAB:
+            self.switch()
+        self.task_wanted = {pg.K_RETURN: "next", pg.K_BACKSPACE: "again"}.get(key, self.task_wanted)
+
+    def _hear_pad(self, event: Any) -> None:
+        pg = self.pygame
+        if event.type == pg.JOYDEVICEADDED and self.pad is None:
             self.pad, self.lost, self.blocked = pg.joystick.Joystick(event.device_index), False, True
-        elif (
-            event.type == pg.JOYDEVICEREMOVED and self.pad and event.instance_id == self.pad.get_instance_id()
-        ):
-            self.pad, self.lost, self.blocked = None, True, True
+        elif event.type == pg.JOYDEVICEREMOVED and self.pad:
+            if event.instance_id == self.pad.get_instance_id():
+                self.pad, self.lost, self.blocked = None, True, True
         elif event.type == pg.JOYBUTTONDOWN and event.button == PAD_MODE:
             self.switch()
         elif event.type == pg.JOYBUTTONDOWN:
@@ -295,8 +298,7 @@ def _window(machine: Machine) -> AbstractContextManager[Window]:
 def play(machine: Machine, controllers: Mapping[str, Controller], where: Where, attempts: Path) -> None:
     """Drive with keyboard or gamepad: the simulated machine, or the one on a bus.
 
-    Raises:
-        ValueError: no window, no bus, or a loop that ended by itself.
+    ValueError: no window, no bus, or a loop that ended by itself.
     """
     session, chosen = Session(machine, [*controllers, "levers"], attempts), list(controllers.values())
     with _window(machine) as window, control_process(machine, chosen, where) as (asks, tells, ended):

@@ -1,7 +1,5 @@
 """A trained policy as a file and a function; no torch, so that it runs wherever the machine is."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,12 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min.actuator import ActuatorNet, load_header, net_arrays, net_from_arrays
+from brokk_min.actuator import ActuatorNet, net_arrays, net_from_arrays
 from brokk_min.env import fitting_nets, observation_scale, to_command
-from brokk_min.logs import expect_same, load_arrays, whole_file
-from brokk_min.machine import Machine
+from brokk_min.files import expect_same, expected, load_arrays, load_header, whole_file
+from brokk_min.machine import Array, Machine
 
-Array = NDArray[np.floating[Any]]
 STAND = 2.0  # s, assumed: valves close when the tool was to stand still for longer
 FORMAT = 2  # of policy files; 1: actions in units of the command limit, dead zone and all
 
@@ -35,8 +32,7 @@ class Policy:
     def act(self, observation: Array) -> Array:
         """Actions (..., n_driven) for observations (..., obs) of `observe`; `to_command` clips them.
 
-        Raises:
-            ValueError: a wrong shape or an observation that is no number.
+        ValueError: a wrong shape or an observation that is no number.
         """
         x: Array = np.asarray(observation, np.float32)
         if x.shape[-1:] != self.mean.shape:
@@ -109,22 +105,19 @@ def save_policy(path: Path, policy: Policy) -> None:
 def load_policy(path: Path, machine: Machine) -> Policy:
     """Read a policy for `machine`.
 
-    Raises:
-        ValueError: no policy file, or one for another machine, joint order, history, rate or scale;
-            with what was wanted and what was found.
+    ValueError: no policy file, or one for another machine, joint order, history, rate or scale, with what
+    was wanted and what was found.
     """
     arrays = load_arrays(path)
     header = load_header(path, arrays, "policy", FORMAT)
     found = header.get("contract", {})
     expect_same(path, found, contract(machine))
-    try:
+    with expected(path, "a complete policy"):
         weights = tuple(arrays[f"weight_{i}"] for i in range(8))
         net = {name[4:]: array for name, array in arrays.items() if name.startswith("net_")}
         fitted = fitting_nets(machine, net_from_arrays(path, net))
         policy = Policy(found, header["training"], arrays["mean"], arrays["scale"], weights, fitted)
         action = policy.act(policy.mean)
-    except (KeyError, ValueError) as error:
-        raise ValueError(f"{path}: expected a complete policy, got {error!r}") from error
     if action.shape != machine.driven.shape or not np.isfinite(action).all():
         raise ValueError(f"{path}: weights: expected {len(machine.driven)} actions, got {action}")
     for name, value in zip(("mean", "scale"), observation_scale(machine), strict=True):

@@ -28,12 +28,12 @@ from numpy.typing import NDArray
 from torch import nn
 from tqdm import tqdm
 
-from brokk_min.actuator import ActuatorNet, fingerprint, load_header
+from brokk_min.actuator import ActuatorNet, fingerprint
 from brokk_min.adjoint import Rollout, action_gradients
 from brokk_min.env import State, TaskConfig, observation_scale, paper_view, to_command
 from brokk_min.environments import TaskVectorEnv
 from brokk_min.extras import need
-from brokk_min.logs import expect_same, load_arrays, whole_file
+from brokk_min.files import expect_same, load_arrays, load_header, whole_file
 from brokk_min.machine import Machine
 from brokk_min.policy import Policy, contract, save_policy
 

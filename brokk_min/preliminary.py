@@ -4,14 +4,11 @@ The paper's tests are put to a machine (the analytic plant) and to its nets side
 and velocities are means over a tick, without encoder and estimator: what is compared is the motion.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brokk_min import actuator, excitation, fitting, kinematics, scores
 from brokk_min.actuator import ActuatorNet
@@ -19,10 +16,9 @@ from brokk_min.env import fitting_nets
 from brokk_min.figures import Panel, plot_panels
 from brokk_min.fitting import FitConfig
 from brokk_min.logs import RETURN, Log
-from brokk_min.machine import BROKK_170, PWM_MAX, Machine, encode_pwm
+from brokk_min.machine import BROKK_170, PWM_MAX, Array, Machine, encode_pwm
 from brokk_min.plant import plant_reset, plant_step
 
-Array = NDArray[np.floating[Any]]
 Mover = Callable[[Array, Array], Array]  # angles (..., n) and commands (T, ..., n) -> angles (T+1, ..., n)
 
 STARTS = {BROKK_170.name: (1.5, 0.5, 0.58, 1.71, 1.24)}  # rad, paper: q_s; other machines start mid range

@@ -4,8 +4,6 @@ The window writes what the operator asks for and reads what the loop knows, thro
 neither side ever waits. The loop is `hw.Drive` with its gate; a window that is silent is a lost device.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -16,16 +14,14 @@ from threading import Thread
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brokk_min import hw, wishes
 from brokk_min.bus import open_line
 from brokk_min.env import Controller, to_command
-from brokk_min.machine import PWM_MAX, Machine
+from brokk_min.machine import PWM_MAX, Array, Machine
 from brokk_min.simulator import SimulatedMachine, serve, start_pose
 from brokk_min.ticks import Known
 
-Array = NDArray[Any]
 STALE = 0.2  # s without a word from the window, then the operator's device is lost (assumed)
 
 
@@ -74,7 +70,8 @@ class Levers:
     """A controller that translates nothing: each lever is one driven joint's action of `env.to_command`."""
 
     def __init__(self, machine: Machine) -> None:
-        self.machine, self.levers = machine, np.zeros(len(machine.driven))
+        self.machine = machine
+        self.levers: Array = np.zeros(len(machine.driven))
 
     def start(self, num: int) -> None:
         """Nothing to remember."""
@@ -137,12 +134,10 @@ class Loop(hw.Drive):
 
     def known(self) -> Known:
         """What is known after a tick."""
-        q, q_dot = np.full((2, self.machine.n), np.nan)
-        if self.history is not None:
-            q, q_dot = self.history[0, :, 0, -1], self.history[0, :, 1, -1]
         u, mode = self.gate.sent[..., -1] / PWM_MAX, getattr(self.controller, "mode", 0)
         gate, v_goal = self.gate, np.array(self.wish.v_goal)
         state = bool(gate.driving), int(gate.wrong), int(gate.fault)
+        q, q_dot = self.seen
         return Known(self.ticks, q, q_dot, u, v_goal, *state, mode, self.lateness)
 
 

@@ -1,7 +1,5 @@
 """Recorded runs, of a log or of results driven again, side by side: films of them."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 from collections.abc import Iterable, Sequence
@@ -9,23 +7,21 @@ from pathlib import Path
 from typing import IO, Any, NamedTuple, cast
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 from tqdm import tqdm
 
-from brokk_min import baselines, experiments, logs, view
+from brokk_min import baselines, experiments, view
 from brokk_min.actuator import ActuatorNet
 from brokk_min.bus import read_frames
 from brokk_min.env import Controller, Trace
+from brokk_min.files import expected, whole_file
 from brokk_min.kinematics import tool_position, tool_state
 from brokk_min.looks import skeleton
-from brokk_min.machine import Machine
+from brokk_min.machine import Array, Machine
 from brokk_min.policy import PolicyController, load_policy
 from brokk_min.sequences import Commands, goals_and_starts, task_sequences
 from brokk_min.ticks import Known, Ticks
 from brokk_min.window import open_window, picture
-
-Array = NDArray[Any]
 
 
 class Run(NamedTuple):
@@ -52,8 +48,7 @@ def recorded(machine: Machine, title: str, colour: view.Colour, known: Sequence[
 def run_of_log(machine: Machine, path: Path, colour: view.Colour) -> Run:
     """The ticks of a candump log from the first that drives; ticks without all positions are left out.
 
-    Raises:
-        ValueError: no log, or one in which nothing drives.
+    ValueError: no log, or one in which nothing drives.
     """
     ticks = Ticks(machine)
     known = [k for frame in read_frames(path) if (k := ticks.hear(frame)) and np.isfinite(k.q).all()]
@@ -87,10 +82,9 @@ class Results(NamedTuple):
 def read_results(machine: Machine, path: Path, controllers: Sequence[str]) -> Results:
     """A JSON file of `evaluate` or `reproduce`; its gains are read if other `controllers` than RL are wanted.
 
-    Raises:
-        ValueError: no results, or of another machine; the files that it names are not as they should be.
+    ValueError: no results, or of another machine; the files that it names are not as they should be.
     """
-    try:
+    with expected(path, "results of `evaluate`"):
         file = json.loads(path.read_text())
         beside = {"policy": str(path.with_name("policy.npz")), "gains": str(path.with_name("gains.json"))}
         told = beside | {"plant": "analytic", "commands": "", "starts": ""} | file["meta"]
@@ -98,8 +92,6 @@ def read_results(machine: Machine, path: Path, controllers: Sequence[str]) -> Re
         names, seed = ", ".join(s.name for s in task_sequences(machine)), int(told["seed"])
         num = int(told["starts"]) if told["starts"].isdigit() else 0
         given = np.array(file["starts"], float) if "starts" in file else None
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: expected results of `evaluate`, got {error!r}") from error
     if told.get("machine") != machine.name:
         raise ValueError(f"{path}: expected --machine {told.get('machine')}, got {machine.name}")
     commands = None if told["commands"] in ("", names) else Path(told["commands"])
@@ -116,11 +108,7 @@ def read_results(machine: Machine, path: Path, controllers: Sequence[str]) -> Re
 def driven_again(
     machine: Machine, results: Results, controllers: Sequence[str], sequence: str, start: int
 ) -> list[Run]:
-    """One run of each controller, simulated anew.
-
-    Raises:
-        ValueError: it is not the run that the file has.
-    """
+    """One run of each controller, simulated anew; ValueError: it is not the run that the file has."""
     chosen, every = {name: results.controllers[name] for name in controllers}, [*results.sequences.values()]
     found, traces = experiments.task_space(machine, chosen, every, results.starts, results.seed, results.net)
     for row in (r for r in found if r["start"] == start and r["sequence"] == sequence):
@@ -149,8 +137,7 @@ def film(machine: Machine, runs: Sequence[Run], tick: int, size: tuple[int, int]
 def write_film(path: Path, machine: Machine, runs: Sequence[Run], size: tuple[int, int], fps: float) -> None:
     """All runs as a GIF, or as MP4 where ffmpeg is installed.
 
-    Raises:
-        ValueError: another kind of file, or no ffmpeg that writes it.
+    ValueError: another kind of file, or no ffmpeg that writes it.
     """
     writers = {".gif": _write_gif, ".mp4": _write_mp4}
     if path.suffix not in writers:
@@ -158,18 +145,18 @@ def write_film(path: Path, machine: Machine, runs: Sequence[Run], size: tuple[in
     ticks = range(0, max(len(run.known) for run in runs), max(1, round(machine.rate / fps)))
     bar = tqdm(ticks, desc="draw", unit="picture", disable=None)
     images = (picture(film(machine, runs, tick, size), size) for tick in bar)
-    with logs.whole_file(path) as file:
+    with whole_file(path) as file:
         writers[path.suffix](file, images, size, machine.rate / ticks.step)
 
 
-def _write_gif(file: IO[bytes], images: Iterable[Array], size: tuple[int, int], fps: float) -> None:
+def _write_gif(file: IO[bytes], images: Iterable[Any], size: tuple[int, int], fps: float) -> None:
     films = [Image.fromarray(image) for image in images]
     flat = [image.quantize(palette=_palette(films), dither=Image.Dither.NONE) for image in films]
     duration = round(1000 / fps)
     flat[0].save(file, "GIF", save_all=True, append_images=flat[1:], duration=duration, loop=0)
 
 
-def _write_mp4(file: IO[bytes], images: Iterable[Array], size: tuple[int, int], fps: float) -> None:
+def _write_mp4(file: IO[bytes], images: Iterable[Any], size: tuple[int, int], fps: float) -> None:
     form = f"-f rawvideo -pix_fmt rgb24 -s {size[0]}x{size[1]} -r {fps} -i - -pix_fmt yuv420p"
     form += " -vf crop=trunc(iw/2)*2:trunc(ih/2)*2"  # the code knows even sizes only
     form += " -f mp4 -movflags frag_keyframe+empty_moov pipe:1"

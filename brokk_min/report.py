@@ -3,23 +3,20 @@
 Paper: Sec. 4.2
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brokk_min import claims, figures, preliminary
 from brokk_min.actuator import ActuatorNet
 from brokk_min.figures import Quote, Traces
 from brokk_min.logs import Log
-from brokk_min.machine import Machine
+from brokk_min.machine import Array, Machine
+from brokk_min.metrics import Mean
 from brokk_min.sequences import KINDS, axis_sequences, held_rows, least_motion, task_sequences
 
-Array = NDArray[np.floating[Any]]
 VERDICTS = {True: "holds here", False: "does not hold here", None: "was not measured"}
 RECIPES = (
     "What the nets cost on the machine when they are fitted as in the paper: errors of free runs of 10 s on "
@@ -39,8 +36,8 @@ TUNED = (
     "gains.json."
 )
 Part = tuple[Any, ...]  # title, sentence, contents: see `figures.write_report`
-UNITS = {"velocity": "m/s", "off": "m", "position": "m", "settling": "s", "time": "s", "jerk": "m/s^3"}
 BOUNDS = ("perfect_model", "perfect_model_no_dither")  # of `experiments.bounds`
+UNITS = {"velocity": "m/s", "off": "m", "position": "m", "settling": "s", "time": "s", "jerk": "m/s^3"}
 UNITS |= {"valve": "full strokes", "reward": "1"}  # of the figures of `metrics`, by their first word
 
 
@@ -113,13 +110,7 @@ def _recipes(results: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def task_parts(machine: Machine, results: Mapping[str, Any], traces: Mapping[str, Traces]) -> list[Part]:
-    """Parts of the report on task space control.
-
-    Args:
-        machine: n joints.
-        results: of `chain.reproduce`.
-        traces: of `experiments.comparison`.
-    """
+    """Parts on task space control: `results` of `chain.reproduce`, `traces` of `experiments.comparison`."""
     starts, kinds = np.array(results["starts"]), results["start_kinds"]
     said = [verdict(claim) for claim in results["claims"]]
     ahead = len(said) - 3 - len(results["singular"]["claims"])
@@ -154,8 +145,7 @@ def _starts_text(kinds: Sequence[str]) -> str:
 def _singular(
     machine: Machine, found: Mapping[str, Any], traces: Traces, extended: Array, said: Sequence[Quote]
 ) -> Part:
-    run = int(np.argmin(found["manipulability"]))
-    ticks = len(next(iter(traces.values())).q)
+    run, ticks = int(np.argmin(found["manipulability"])), len(next(iter(traces.values())).q)
     half = least_motion(machine, extended)[0]
     plot = figures.plot_sequence(machine, traces, half._replace(goals=half.goals[:ticks]), extended[run], run)
     keys = ("velocity_error_mean", "jerk_rms", "off_axis_drift_max", "time_at_limits")
@@ -186,14 +176,15 @@ def _turned(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
     return {key: {name: row[key] for name, row in rows.items()} for key in next(iter(rows.values()))}
 
 
-def _with_interval(number: Mapping[str, float | None]) -> str:
+def _with_interval(number: Mean) -> str:
     if number["mean"] is None:
         return ""
-    mean, *ends = (f"{x:.4f}" if abs(x) < 1 else f"{x:.4g}" for x in number.values() if x is not None)
+    numbers = (number[key] for key in ("mean", "low", "high"))
+    mean, *ends = (f"{x:.4f}" if abs(x) < 1 else f"{x:.4g}" for x in numbers if x is not None)
     return f"{mean} ({ends[0]} to {ends[1]})" if ends else mean
 
 
-def _cells(rows: Mapping[str, Mapping[str, Mapping[str, float | None]]]) -> dict[str, dict[str, str]]:
+def _cells(rows: Mapping[str, Mapping[str, Mean]]) -> dict[str, dict[str, str]]:
     return {name: {key: _with_interval(n) for key, n in row.items()} for name, row in rows.items()}
 
 
@@ -202,7 +193,7 @@ def _bars(task: Mapping[str, Any], key: str) -> figures.Bars:
     return {c: {s: _number(task, c, s, key) for s in rows} for c, rows in task["summary"].items()}
 
 
-def _number(task: Mapping[str, Any], controller: str, sequence: str, key: str) -> dict[str, float | None]:
+def _number(task: Mapping[str, Any], controller: str, sequence: str, key: str) -> Mean:
     low, high = task["intervals"][controller][sequence][key]
     return {"mean": task["summary"][controller][sequence][key], "low": low, "high": high}
 
@@ -210,19 +201,13 @@ def _number(task: Mapping[str, Any], controller: str, sequence: str, key: str) -
 def _tables(results: Mapping[str, Any], last: Quote) -> list[Part]:
     task = results["task_space"]
     parts = [_merit(task, last), _by_sequence(task), _pairs(task["rl_less"]), _kinds(task["by_kind"])]
-    return [
-        *parts,
-        _regret(results["regret"]),
-        _robust(results["robustness"]),
-        *_seeds(results["training_seeds"]),
-    ]
+    parts += [_regret(results["regret"]), _robust(results["robustness"])]
+    return parts + _seeds(results["training_seeds"])
 
 
 def _merit(task: Mapping[str, Any], last: Quote) -> Part:
-    merit = {
-        c: {_named(key): _number(task, c, "all", key) for key in of["all"]}
-        for c, of in task["summary"].items()
-    }
+    rows = {c: of["all"] for c, of in task["summary"].items()}
+    merit = {c: {_named(key): _number(task, c, "all", key) for key in row} for c, row in rows.items()}
     return "Figures of merit", f"Means over all sequences; {ENDS}.", last, _turned(_cells(merit))
 
 
@@ -233,21 +218,15 @@ def _by_sequence(task: Mapping[str, Any]) -> Part:
         f"{ENDS}. Drift is the distance from a straight line; where the goal turns at every tick, on the "
         "circle, it is that within a tick and says little."
     )
-    tables = (
-        "Mean velocity error [m/s].",
-        _turned(_cells(error)),
-        "Largest drift [m].",
-        _turned(_cells(drift)),
-    )
+    errors, drifts = (_turned(_cells(bars)) for bars in (error, drift))
+    tables = "Mean velocity error [m/s].", errors, "Largest drift [m].", drifts
     return "Velocity error and drift by sequence", text, *tables, plot
 
 
 def _pairs(less: Mapping[str, Any]) -> Part:
     """RL less each baseline: every figure, then two of them by sequence."""
-    every = {
-        _named(key): {c: _with_interval(rows["all"]) for c, rows in of.items()} for key, of in less.items()
-    }
-    contents: list[Any] = ["All sequences.", every]
+    every = {_named(key): {c: rows["all"] for c, rows in of.items()} for key, of in less.items()}
+    contents: list[Any] = ["All sequences.", _cells(every)]
     for key in ("velocity_error_mean", "off_axis_drift_max"):
         contents += [f"{_named(key)} by sequence.", _turned(_cells(less[key]))]
     text = f"Differences on the same starts and noise, one value a start; {ENDS}."
@@ -265,13 +244,11 @@ def _kinds(by_kind: Mapping[str, Any]) -> Part:
 
 
 def _regret(regret: Mapping[str, Any]) -> Part:
-    of = {name: regret["summary"][name] for name in BOUNDS}
-    scale = {
-        name: {f"{s} [m/s]": row["velocity_error_mean"] for s, row in rows.items()}
-        for name, rows in of.items()
-    }
-    for name, row in scale.items():
-        row["valve travel [full strokes]"] = of[name]["all"]["valve_travel"]
+    scale = {}
+    for name in BOUNDS:
+        of = regret["summary"][name]
+        scale[name] = {f"{s} [m/s]": row["velocity_error_mean"] for s, row in of.items()}
+        scale[name]["valve travel [full strokes]"] = of["all"]["valve_travel"]
     text = (
         "Mean velocity error less that of a controller that has the plant's equations and state but no "
         f"goal ahead of time: what delay and dead time leave possible; {ENDS}."
@@ -282,39 +259,28 @@ def _regret(regret: Mapping[str, Any]) -> Part:
 
 
 def _robust(robustness: Mapping[str, Any]) -> Part:
-    rows: dict[str, dict[str, str]] = {}
-    supply: dict[str, dict[str, str]] = {}
-    for variation, of in robustness.items():
+    supply, less = {}, {}
+    for name, of in robustness.items():
         most, share = (max(n[key] for n in of.values()) for key in ("supply_demand", "supply_limits"))
-        rows[variation] = {
-            c: _with_interval({k: n[k] for k in ("mean", "low", "high")}) for c, n in of.items()
-        }
-        supply[variation] = {"pump's flow asked for": f"{most:.0%}", "ticks it limits": f"{share:.1%}"}
+        supply[name] = {"pump's flow asked for": f"{most:.0%}", "ticks it limits": f"{share:.1%}"}
+        less[name] = {c: n["rl_less"] for c, n in of.items() if "rl_less" in n}
     text = f"Mean velocity error along x, y and z on a machine unlike the known one [m/s]; {ENDS}."
     asked = (
         "The most of the pump's flow that any controller asks for, and how often that is more than there is."
     )
-    less = {
-        name: {c: n["rl_less"] for c, n in of.items() if "rl_less" in n} for name, of in robustness.items()
-    }
     paired = "RL less each baseline, on the same starts [m/s]."
-    return "Robustness", text, rows, paired, _cells(less), asked, supply
+    return "Robustness", text, _cells(robustness), paired, _cells(less), asked, supply
 
 
 def _seeds(table: Mapping[str, Mapping[str, Any]]) -> list[Part]:
     """The figures of a sweep, if there is one."""
     if not table:
         return []
-    alone, less = (
-        {
-            k: {c: _with_interval(of[k]) for c, of in table.items() if ("less" in c) is paired}
-            for k in table["rl"]
-        }
-        for paired in (False, True)
-    )
+    cells, single = _cells(table), [c for c in table if "less" not in c]
+    alone = {k: {c: cells[c][k] for c in single} for k in table["rl"]}
+    less = {k: {c: cells[c][k] for c in table if c not in single} for k in table["rl"]}
     errors = [k for k in table["rl"] if k.startswith("velocity_error_")]
-    trained = {c: of for c, of in table.items() if "less" not in c}
-    bars = {c: {k.split("_", 2)[2]: of[k] for k in errors} for c, of in trained.items()}
+    bars = {c: {k.split("_", 2)[2]: table[c][k] for k in errors} for c in single}
     text = (
         "Means over training seeds on the machine, and 95 % intervals over them (Student's t; a seed counts "
         "once, with the mean over its workspace starts) [m/s, m, full strokes]. Baselines are not trained."
@@ -329,10 +295,9 @@ def _lists(machine: Machine, results: Mapping[str, Any]) -> list[Part]:
     for row, kind in zip(scored.values(), results["start_kinds"], strict=True):
         row["kind"] = kind
     sequences = {s.name: _path(held_rows(machine, s.goals)) for s in task_sequences(machine)}
-    runs = enumerate(results["tuning_runs"])
-    tuned = {
-        f"tuning run {i}": _pose(machine, run["start"]) | _path(np.array(run["goals"])) for i, run in runs
-    }
+    tuned = {}
+    for i, run in enumerate(results["tuning_runs"]):
+        tuned[f"tuning run {i}"] = _pose(machine, run["start"]) | _path(np.array(run["goals"]))
     return [
         ("Scored sequences", "Seconds, and the goals held for them.", sequences),
         ("Scored starts", "Angles [rad].", scored),

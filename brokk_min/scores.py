@@ -4,8 +4,7 @@ The error of one step says little: over 50 ms "the same velocity again" is nearl
 far nets have gone astray after seconds, because a policy that learns on them lives there.
 """
 
-from __future__ import annotations
-
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,8 @@ from tqdm import tqdm
 from brokk_min.actuator import ActuatorNet
 from brokk_min.fitting import Samples, end_to_end
 from brokk_min.logs import Log, Recording
+from brokk_min.machine import Array
 
-Array = NDArray[np.floating[Any]]
 HORIZONS = (1, 5, 10, 30)  # s, of the free-run scores
 
 
@@ -54,8 +53,7 @@ def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
     between velocities as the history shows them (estimated or logged), `position_error_median` is the
     median over segments of |angle error| at their end.
 
-    Raises:
-        ValueError: joints or velocities of another kind than the nets', or no recording long enough.
+    ValueError: joints or velocities of another kind than the nets', or no recording long enough.
     """
     for name in ("joints", "rate", "velocity_logged"):
         if (found := getattr(log, name)) != (wanted := getattr(net, name)):
@@ -67,24 +65,31 @@ def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
     result: dict[str, Any] = {name: {"free_run": {}} for name in log.joints}
     for horizon in tqdm((1 / net.rate, *HORIZONS), desc="score nets", unit="horizon", disable=None):
         ticks = round(horizon * net.rate)
-        starts = samples.starts(net.history, ticks, ticks)
-        if not len(starts):
-            continue
-        q_error, v_error = run_errors(net, samples, starts, ticks)
-        mine = samples.moves | ~samples.moves.any(axis=0)  # a joint that rests everywhere: at rest
-        for j, scored in enumerate(mine[starts].T):
-            if not scored.any():
-                continue
-            entry = result[log.joints[j]]
+        for name, figures in _after(net, samples, ticks):
             if ticks == 1:
-                error = v_error if net.velocity_logged else q_error * net.rate
-                same = samples.whole.q_dot[starts, j] - samples.target[starts, j]
-                entry |= {"one_step_rmse": _rms(error[0, scored, j]), "persistence_rmse": _rms(same[scored])}
+                result[name] |= figures
             else:
-                end = float(np.median(np.abs(q_error[-1, scored, j])))
-                run = {"velocity_rmse": _rms(v_error[:, scored, j]), "position_error_median": end}
-                entry["free_run"][str(horizon)] = run
+                result[name]["free_run"][str(horizon)] = figures
     return result
+
+
+def _after(net: ActuatorNet, samples: Samples, ticks: int) -> Iterator[tuple[str, dict[str, float]]]:
+    """Figures of free runs of `ticks`, or of one step, for each joint that has any."""
+    starts = samples.starts(net.history, ticks, ticks)
+    if not len(starts):
+        return
+    q_error, v_error = run_errors(net, samples, starts, ticks)
+    for j, scored in enumerate(samples.scored[starts].T):
+        if not scored.any():
+            continue
+        if ticks == 1:
+            error = v_error if net.velocity_logged else q_error * net.rate
+            same = samples.whole.q_dot[starts, j] - samples.target[starts, j]
+            figures = {"one_step_rmse": _rms(error[0, scored, j]), "persistence_rmse": _rms(same[scored])}
+        else:
+            end = float(np.median(np.abs(q_error[-1, scored, j])))
+            figures = {"velocity_rmse": _rms(v_error[:, scored, j]), "position_error_median": end}
+        yield net.joints[j], figures
 
 
 def run_errors(
@@ -115,8 +120,7 @@ def recording_errors(net: ActuatorNet, log: Log, seconds: float) -> Array:
     error = velocities - whole.q_dot[starts + np.arange(1, most + 1)[:, None]]
     scored = (np.arange(most)[:, None] < ticks[long])[..., None]
     rms = np.sqrt(np.sum(np.where(scored, error, 0.0) ** 2, axis=0) / ticks[long, None])
-    moves = samples.moves | ~samples.moves.any(axis=0)  # a joint that rests everywhere is scored at rest
-    result[long] = np.where(moves[starts], rms, np.nan)
+    result[long] = np.where(samples.scored[starts], rms, np.nan)
     return result
 
 

@@ -3,22 +3,19 @@
 Sequences and starts that score are never used for tuning; `tuning_goals` makes the others.
 """
 
-from __future__ import annotations
-
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
-from brokk_min import jacobian, kinematics, logs
+from brokk_min import files, jacobian, kinematics
 from brokk_min.env import TaskConfig, draw_pose, reset, terminated
-from brokk_min.machine import Machine
+from brokk_min.machine import Array, Machine
 from brokk_min.plant import speed_limits
 
-Array = NDArray[np.floating[Any]]
 AXES = "xyz"
 # One axis of the paper's experiment: seconds and share of tool_speed (assumed), with changes of direction.
 PATTERN = ((1, 0.0), (4, 2 / 3), (1, 0.0), (4, -2 / 3), (1, 0.0), (3, 1 / 3), (3, -1 / 3), (1, 0.0))
@@ -75,9 +72,8 @@ def _along(machine: Machine, direction: ArrayLike) -> Array:
 def _held(machine: Machine, rows: ArrayLike) -> Array:
     """Goals [m/s] (T, 3) of rows (seconds, shares of tool_speed along x, y, z)."""
     table = np.asarray(rows, float)
-    return np.repeat(
-        machine.tool_speed * table[:, 1:], np.rint(table[:, 0] * machine.rate).astype(int), axis=0
-    )
+    ticks = np.rint(table[:, 0] * machine.rate).astype(int)
+    return np.repeat(machine.tool_speed * table[:, 1:], ticks, axis=0)
 
 
 def held_rows(machine: Machine, goals: Array) -> Array:
@@ -112,7 +108,7 @@ def read_commands(path: Path, machine: Machine) -> list[Commands]:
 
     The last row of a sequence marks its end.
     """
-    table = logs.read_table(path, ["sequence", "time", "vx", "vy", "vz"], text=("sequence",))
+    table = files.read_table(path, ["sequence", "time", "vx", "vy", "vz"], text=("sequence",))
     result = []
     for name in dict.fromkeys(table["sequence"]):
         rows = np.flatnonzero(table["sequence"] == name)
@@ -130,10 +126,9 @@ def read_commands(path: Path, machine: Machine) -> list[Commands]:
 def read_starts(path: Path, machine: Machine) -> Array:
     """Start poses of a CSV with one column a joint [rad], shape (starts, n).
 
-    Raises:
-        ValueError: an angle outside its joint's range or a pose in the ground, with file and row.
+    ValueError: an angle outside its joint's range or a pose in the ground, with file and row.
     """
-    table = logs.read_table(path, list(machine.names))
+    table = files.read_table(path, list(machine.names))
     starts = np.stack([table[name] for name in machine.names], axis=1)
     low, high = machine.column("q_min"), machine.column("q_max")
     for row, joint in np.argwhere((starts < low) | (starts > high)):
@@ -195,26 +190,15 @@ def draw_starts(machine: Machine, sequences: Sequence[Commands], num: int, rng: 
     From the first kind all sequences are `feasible`, from the second at least half of them; the third leaves
     parts of them out of reach. Where a machine has no poses of a kind, "workspace" stands in.
 
-    Raises:
-        ValueError: too few poses in many draws.
+    ValueError: too few poses in many draws.
     """
     kept: dict[str, list[Array]] = {kind: [] for kind in KINDS}
     order = [KINDS[(0, 1, 0, 2)[i % 4]] for i in range(num)]
     goals = [sequence.goals[:, None] for sequence in sequences]
     with tqdm(total=num, desc="draw starts", unit="start", disable=None) as bar:
         for _ in range(200):
-            poses = draw_pose(machine, TaskConfig(), rng, 4000).round(4)
-            kinds = np.array(start_kinds(machine, poses))
-            of = {
-                kind: poses[kinds == kind][:size] for kind, size in zip(KINDS, (1500, 30, 4000), strict=True)
-            }
-            good = [feasible(machine, of["limits"], np.repeat(goal, len(of["limits"]), 1)) for goal in goals]
-            of["limits"] = of["limits"][np.mean(good, axis=0) >= 0.5]
-            for goal in goals:
-                few = of["workspace"]
-                of["workspace"] = few[feasible(machine, few, np.repeat(goal, len(few), axis=1))]
-            for kind in KINDS:
-                kept[kind] += list(of[kind])
+            for kind, poses in _by_kind(machine, draw_pose(machine, TaskConfig(), rng, 4000).round(4), goals):
+                kept[kind] += list(poses)
             found = sum(min(len(kept[kind]), order.count(kind)) for kind in KINDS)
             bar.update(found - bar.n)
             if found == num:
@@ -224,6 +208,16 @@ def draw_starts(machine: Machine, sequences: Sequence[Commands], num: int, rng: 
     except IndexError:
         wanted = f"{num} poses from which all sequences are feasible"
         raise ValueError(f"{machine.name}: expected {wanted}, got fewer in 200 draws") from None
+
+
+def _by_kind(machine: Machine, poses: Array, goals: Sequence[Array]) -> Iterator[tuple[str, Array]]:
+    """Which of `poses` (num, n) `draw_starts` may keep as starts of each kind, (k, n); `goals` (T, 1, 3)."""
+    kinds = np.array(start_kinds(machine, poses))
+    inside, near, far = (poses[kinds == kind][:n] for kind, n in zip(KINDS, (1500, 30, 4000), strict=True))
+    good = [feasible(machine, near, np.repeat(goal, len(near), axis=1)) for goal in goals]
+    for goal in goals:
+        inside = inside[feasible(machine, inside, np.repeat(goal, len(inside), axis=1))]
+    return zip(KINDS, (inside, near[np.mean(good, axis=0) >= 0.5], far), strict=True)
 
 
 def scored_starts(machine: Machine, num: int, sequences: Sequence[Commands], seed: int) -> Array:
@@ -251,17 +245,13 @@ def goals_and_starts(
 
 def write_starts(path: Path, machine: Machine, starts: Array) -> None:
     """Write poses as `read_starts` reads them."""
-    with logs.whole_file(path, "w") as file:
-        file.write(
-            "\n".join([",".join(machine.names), *(",".join(map(str, row)) for row in starts.tolist()), ""])
-        )
+    files.write_csv(path, machine.names, starts.tolist())
 
 
 def tuning_goals(machine: Machine, runs: int, seconds: float, seed: int) -> tuple[Array, Array]:
     """Feasible starts (runs, n) and goals (T, runs, 3), drawn as the policy's by `reset`: for tuning only.
 
-    Raises:
-        ValueError: too few in many draws.
+    ValueError: too few in many draws.
     """
     rng, config, ticks = np.random.default_rng(seed), TaskConfig(), round(seconds * machine.rate)
     holds = int(np.ceil(seconds / config.hold_min_s))  # that many are always long enough

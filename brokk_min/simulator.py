@@ -3,8 +3,6 @@
 It plays the part of a real Brokk on the bus; the program that drives it cannot tell.
 """
 
-from __future__ import annotations
-
 import gc
 import os
 import struct
@@ -15,14 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from brokk_min import bus
-from brokk_min.gate import OPERATIONAL, checksum, encoder_raw
+from brokk_min.gate import OPERATIONAL, Array, checksum, encoder_raw
 from brokk_min.machine import BROKK_170, Machine, decode_pwm
 from brokk_min.plant import plant_reset, plant_step
 
-Array = NDArray[Any]
 BOOT, STOPPED, PRE_OPERATIONAL = 0, 4, 127  # CANopen states beside OPERATIONAL
 START = (0.0, 0.5, 0.58, 1.71, 1.24)  # rad, the paper's start pose, pointing forward
 WATCHDOG = 0.150  # s without valid valve frame, then the valves go neutral (assumed)
@@ -156,8 +153,7 @@ def serve(machine: SimulatedMachine, line: Any, running: Callable[[], bool]) -> 
 def start_pose(machine: Machine, given: Sequence[float]) -> Array:
     """Angles at the start [rad] (n,): those given, or else the Brokk's `START`, or amid another's ranges.
 
-    Raises:
-        ValueError: a pose that the machine cannot take.
+    ValueError: a pose that the machine cannot take.
     """
     low, high = machine.column("q_min"), machine.column("q_max")
     q = np.array(given or (START if machine == BROKK_170 else (low + high) / 2), float)

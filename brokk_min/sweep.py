@@ -4,8 +4,6 @@ Each seed leaves `seed_<n>.npz`, its learning curve and, last, `seed_<n>.json`; 
 again. On a cluster the folder must be one that all workers see, and a worker runs one seed at a time.
 """
 
-from __future__ import annotations
-
 import json
 import multiprocessing
 import os
@@ -18,23 +16,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from brokk_min import experiments
 from brokk_min.actuator import ActuatorNet
 from brokk_min.baselines import read_gains, tuned_for
 from brokk_min.env import TaskConfig
+from brokk_min.experiments import Rows
 from brokk_min.extras import need
-from brokk_min.logs import expect_same, write_json
-from brokk_min.machine import Machine
+from brokk_min.files import expect_same, expected, write_json
+from brokk_min.machine import Array, Machine
 from brokk_min.metrics import by_start, mean_interval
 from brokk_min.policy import PolicyController, load_policy
 from brokk_min.ppo import PPOConfig, identity_of, train
 from brokk_min.sequences import AXES, scored_starts, task_sequences
 
-Array = NDArray[np.floating[Any]]
-Rows = list[dict[str, Any]]  # of `experiments.task_space`
 Submit = Callable[..., "Future[Rows]"]
 
 
@@ -58,12 +54,10 @@ def one_seed(
 
 
 def _finished(path: Path, identity: Mapping[str, Any]) -> Rows:
-    try:
+    with expected(path, "the result of a seed"):
         result: dict[str, Any] = json.loads(path.read_text())
         runs: Rows = result["runs"]
         found = result["identity"]
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: expected the result of a seed, got {error!r}") from error
     expect_same(path, found, identity)
     return runs
 
@@ -78,8 +72,7 @@ def _on_the_machine(machine: Machine, controllers: Mapping[str, Any], starts: in
 def apart(function: Callable[..., Any], *arguments: Any) -> Any:
     """`function(*arguments)` in a process of its own, once more if that process dies.
 
-    Raises:
-        ValueError: it died both times.
+    ValueError: it died both times.
     """
     for _ in range(2):
         try:
@@ -121,22 +114,11 @@ def sweep(
 ) -> dict[str, dict[str, Any]]:
     """Train and evaluate `seeds`, each on one thread, and write `sweep.json` with all runs and the table.
 
-    Args:
-        machine: what moves.
-        net: nets of its driven joints.
-        task: episodes.
-        config: settings of the learner; `threads` is 1 whatever it says.
-        seeds: of the trainings.
-        out: folder for everything.
-        starts: start poses for each scored sequence.
-        scheduler: address of a dask scheduler; None: this machine.
-        gains: tuned gains of the baselines, for rows beside.
+    All goes into the folder `out`; `starts` is how many poses each scored sequence begins from, `scheduler`
+    the address of a dask scheduler (None: this machine), `gains` a file of tuned baselines, for rows beside.
+    It gives the `table` of the seeds that came to their end, and of the baselines.
 
-    Returns:
-        `table` of the seeds that came to their end, and of the baselines.
-
-    Raises:
-        ValueError: with the seeds that failed and why, after all others are written.
+    ValueError: with the seeds that failed and why, after all others are written.
     """
     out.mkdir(parents=True, exist_ok=True)
     config, results, failed = replace(config, threads=1), dict[int, Rows](), dict[int, str]()
@@ -184,13 +166,11 @@ def table(seeds: Sequence[Rows], beside: Rows) -> dict[str, dict[str, Any]]:
 
 def read_seeds(path: Path) -> dict[str, Any]:
     """The `sweep.json` of a sweep, its "table" that of `sweep.table`; ValueError: it is none."""
-    try:
+    with expected(path, "the sweep.json of a sweep"):
         found: dict[str, Any] = json.loads(path.read_text())
         if not {"mean", "low", "high"} <= set(found["table"]["rl"]["velocity_error_all"]):
             raise ValueError(f"{found['table']['rl']}")
         dict(found["meta"])
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: expected the sweep.json of a sweep, got {error!r}") from error
     return found
 
 

@@ -1,18 +1,13 @@
 """What is known of a machine at each tick, from the frames of a bus or of a log; it only listens."""
 
-from __future__ import annotations
-
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brokk_min import wishes
 from brokk_min.bus import OPERATOR, SYNC, WISH, Frame, Nodes
 from brokk_min.gate import encoder_counts
-from brokk_min.machine import Machine, decode_pwm, estimate_velocity
-
-Array = NDArray[Any]
+from brokk_min.machine import Array, Machine, decode_pwm, estimate_velocity
 
 
 class Known(NamedTuple):

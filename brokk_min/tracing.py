@@ -1,25 +1,20 @@
 """Lines to trace with the tool, by hand: how well it was done, by whoever translated, kept in a table."""
 
-from __future__ import annotations
-
-import csv
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from brokk_min import logs
+from brokk_min import files
 from brokk_min.kinematics import tool_position
 from brokk_min.looks import extent
-from brokk_min.machine import Machine
+from brokk_min.machine import Array, Machine
 from brokk_min.ticks import Known
 
-Array = NDArray[Any]
 CAPTURE = 0.1  # m, assumed: a point of the line counts as passed nearer than this
 SPACING = 0.05  # m, assumed: between the points that must be passed
 
@@ -102,34 +97,25 @@ class Tracing:
 
 
 def read_attempts(path: Path) -> list[Attempt]:
-    """Attempts so far; none if there is no file.
-
-    Raises:
-        ValueError: another kind of file.
-    """
+    """Attempts so far; none if there is no file; ValueError: another kind of file."""
     if not path.exists():
         return []
-    table = logs.read_table(path, Attempt._fields, text=("when", "task", "mode"))
+    table = files.read_table(path, Attempt._fields, text=("when", "task", "mode"))
     return [Attempt(*row) for row in zip(*(table[name].tolist() for name in Attempt._fields), strict=True)]
 
 
 def write_attempts(path: Path, attempts: Sequence[Attempt]) -> None:
     """Write all attempts, the file whole."""
-    with logs.whole_file(path, "w") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(Attempt._fields)
-        writer.writerows([[f"{x:.6g}" if isinstance(x, float) else x for x in row] for row in attempts])
+    rows = [[f"{x:.6g}" if isinstance(x, float) else x for x in row] for row in attempts]
+    files.write_csv(path, Attempt._fields, rows)
 
 
 def attempts_table(attempts: Iterable[Attempt], task: str) -> list[str]:
     """Means of one task by who translated, a line each."""
-    by_mode: dict[str, list[Attempt]] = {}
-    for attempt in attempts:
-        if attempt.task == task:
-            by_mode.setdefault(attempt.mode, []).append(attempt)
-    lines = []
-    for mode, rows in by_mode.items():
-        lines.append(f"mean of {len(rows)} by {mode}: {figures(np.mean([row[3:] for row in rows], axis=0))}")
+    lines, mine = [], [attempt for attempt in attempts if attempt.task == task]
+    for mode in dict.fromkeys(attempt.mode for attempt in mine):
+        rows = [attempt[3:] for attempt in mine if attempt.mode == mode]
+        lines.append(f"mean of {len(rows)} by {mode}: {figures(np.mean(rows, axis=0))}")
     return lines
 
 

@@ -4,20 +4,17 @@ For any log: a linear model that nets must beat, creep, response times, and whet
 are scored on.
 """
 
-from __future__ import annotations
-
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brokk_min import fitting, kinematics, scores
 from brokk_min.actuator import ActuatorNet
 from brokk_min.logs import Log
-from brokk_min.machine import Machine
+from brokk_min.machine import Array, Machine
 from brokk_min.preliminary import named_times, net_mover, plant_mover, response_times, step_commands, steps
 
-Array = NDArray[np.floating[Any]]
 ALLOWED_OUTSIDE = 0.02  # of the samples, assumed: 0.2 % of the training are outside by definition
 
 
@@ -29,7 +26,7 @@ def judge(net: ActuatorNet, log: Log, test: Log, machine: Machine | None = None)
     `outside` as in `outside_training`. `tool`: median error at the end of free runs of a known machine [m].
     """
     joints, warnings = scores.score(net, test), []
-    floor = scores.score(fitting.fit_linear(net, log), test)
+    floor = scores.score(fit_linear(net, log), test)
     still, outside, times = creep(net), outside_training(log, test, net.history), _times(net, log, machine)
     for j, (name, found) in enumerate(joints.items()):
         found |= {"linear": floor[name], "creep": float(still[j]), **{k: t[name] for k, t in times.items()}}
@@ -113,3 +110,45 @@ def tool_errors(machine: Machine, net: ActuatorNet, test: Log) -> dict[str, floa
             apart = np.linalg.norm(next(ends) - next(ends), axis=-1)
             result[str(horizon)] = float(np.median(apart))
     return result
+
+
+# --- what nets must beat ----------------------------------------------------------------------------
+
+
+class LinearModel(ActuatorNet):
+    """A linear model of the nets' inputs within the nets' range: what a net must beat.
+
+    Weights (n, 3 H) and (n,), for standardised inputs.
+    """
+
+    def velocity(self, history: Array) -> Array:
+        """What the model says, as `ActuatorNet.predict`."""
+        slope, offset = self.weights
+        inputs = (self.inputs(history) - self.input_mean) / self.input_scale
+        velocity = (inputs * slope).sum(axis=-1) + offset
+        return np.asarray(np.clip(velocity, self.output_low, self.output_high))
+
+
+def fit_linear(net: ActuatorNet, log: Log, penalty: float = 1e-3) -> LinearModel:
+    """Ridge regression on the inputs, targets and recordings that `net` was fitted to.
+
+    Args:
+        penalty: on squared weights, in units of the mean squared error of standardised inputs.
+    """
+    training, history = fitting.training_set(log, net.history, dead_zone=net.dead_zone), net.history
+    slopes, offsets = [], []
+    for j, ends in enumerate(training.ends):
+        size = 3 * history + 1
+        gram, moment = np.zeros((size, size)), np.zeros(size)
+        for chunk in np.array_split(ends, -(-len(ends) // 8192)):  # bounds the memory
+            x = training.series[:, j, chunk[:, None] + np.arange(1 - history, 1)].swapaxes(0, 1)
+            x = (x.reshape(len(chunk), -1) - training.input_mean[j]) / training.input_scale[j]
+            x = np.column_stack([x, np.ones(len(chunk))])
+            gram, moment = gram + x.T @ x, moment + x.T @ training.target[chunk, j]
+        ridge = penalty * len(ends) * np.eye(size)
+        ridge[-1, -1] = 0.0  # the offset is free
+        *slope, offset = np.linalg.solve(gram + ridge, moment)
+        slopes.append(slope)
+        offsets.append(offset)
+    header = {f.name: getattr(net, f.name) for f in fields(net)} | {"settings": {"penalty": penalty}}
+    return LinearModel(**header | {"weights": (np.array(slopes, np.float32), np.array(offsets, np.float32))})

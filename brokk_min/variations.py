@@ -1,18 +1,13 @@
 """The machine and its encoders other than the controllers know them: what robustness is measured on."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brokk_min.env import Encoder
-from brokk_min.machine import Machine, read_encoder, valve_opening
+from brokk_min.machine import Array, Machine, read_encoder, valve_opening
 
-Array = NDArray[np.floating[Any]]
 Sensor = Callable[[np.random.Generator], Encoder]  # a fresh encoder for each rollout
 
 

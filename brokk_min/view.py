@@ -4,19 +4,16 @@
 shapes are pixels, y down; `window` paints them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brokk_min.kinematics import tool_state
 from brokk_min.looks import Box, Camera, cameras, extent, near_limit, near_singular, skeleton
-from brokk_min.machine import PWM_MAX, Machine
+from brokk_min.machine import PWM_MAX, Array, Machine
 
-Array = NDArray[np.floating[Any]]
 Colour = tuple[int, int, int]
 
 # all assumed
@@ -233,20 +230,23 @@ def _rows(machine: Machine, scene: Scene, box: Box) -> list[Shape]:
         shapes += [Text((left, y), joint.name, 13, ink), _bar(ends[0], ends[1], y, 2, TRACK)]
         if np.isfinite(scene.q[i]):
             at = ends[0] + (ends[1] - ends[0]) * float((scene.q[i] - low[i]) / (high[i] - low[i]))
-            shapes += [_bar(at - 3, at + 3, y, 8, ink)]
             angle = round(float(scene.q[i]), 2) + 0  # no -0.00
-            shapes += [Text((ends[1] + 8, y), f"{angle:+.2f}", 12, ink)]
+            shapes += [_bar(at - 3, at + 3, y, 8, ink), Text((ends[1] + 8, y), f"{angle:+.2f}", 12, ink)]
         if joint.driven:
-            zero, half = (ends[2] + ends[3]) / 2, (ends[3] - ends[2]) / 2
             counts = float(scene.u[i]) * PWM_MAX
-            shapes += [_bar(ends[2], ends[3], y, 6, TRACK)]
-            if counts:
-                shapes.append(_bar(zero, zero + half * counts / machine.pwm_limit, y, 6, scene.colour))
-            shapes += [_bar(zero - 1, zero + 1, y, 8, INK)]
-            shapes += [Text((left + width, y), f"{round(counts):+d}", 12, INK, 1.0)]
+            reach = (ends[3] - ends[2]) / 2 * counts / machine.pwm_limit
+            shapes += _valve(ends[2], ends[3], y, reach, scene.colour)
+            shapes.append(Text((left + width, y), f"{round(counts):+d}", 12, INK, 1.0))
         else:
             shapes.append(Text((ends[2], y), "locked", 12, MUTED))
     return shapes
+
+
+def _valve(x0: float, x1: float, y: float, reach: float, colour: Colour) -> list[Shape]:
+    """A command as a bar that reaches so far [px] from the middle of its track."""
+    zero = (x0 + x1) / 2
+    bar = [_bar(zero, zero + reach, y, 6, colour)] if reach else []
+    return [_bar(x0, x1, y, 6, TRACK), *bar, _bar(zero - 1, zero + 1, y, 8, INK)]
 
 
 def _bar(x0: float, x1: float, y: float, half: float, colour: Colour) -> Polygon:

@@ -1,7 +1,5 @@
 """Shapes onto a surface, into a window or an image: all that needs pygame (extra `play`)."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -10,18 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from brokk_min.extras import need
-from brokk_min.view import PAPER, Circle, Clip, Colour, Line, Polygon, Shape, Text
+from brokk_min.kinematics import tool_position
+from brokk_min.machine import Array, Machine
+from brokk_min.view import PAPER, Circle, Clip, Colour, Line, Polygon, Scene, Shape, Text, draw
 
 
 def need_pygame() -> Any:
-    """pygame, which is imported only where something is painted.
-
-    Raises:
-        ValueError: it is not installed.
-    """
+    """pygame, which is imported only where something is painted; ValueError: it is not installed."""
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
     return need("pygame", "play")
 
@@ -69,11 +65,7 @@ def _canvas(size: tuple[int, int]) -> Any:
 
 
 class Window:
-    """A window for shapes.
-
-    Raises:
-        ValueError: no pygame, or no display.
-    """
+    """A window for shapes; ValueError: no pygame, or no display."""
 
     def __init__(self, size: tuple[int, int], title: str) -> None:
         self.pygame = pygame = need_pygame()
@@ -104,8 +96,7 @@ def open_window(size: tuple[int, int], title: str) -> Iterator[Window]:
 
     Without a display SDL draws unseen. That serves tests, and whoever asks for it with SDL_VIDEODRIVER.
 
-    Raises:
-        ValueError: no pygame, or no display.
+    ValueError: no pygame, or no display.
     """
     window = Window(size, title)
     try:
@@ -123,3 +114,47 @@ def picture(shapes: Sequence[Shape], size: tuple[int, int]) -> NDArray[np.uint8]
     paint(surface, shapes)
     pixels: NDArray[np.uint8] = need_pygame().surfarray.array3d(surface)
     return np.ascontiguousarray(pixels.swapaxes(0, 1))
+
+
+class Pictures:
+    """Frames for Gymnasium: trails of the tools since the last reset of each, and a window for `human`."""
+
+    SIZE = (960, 600)
+
+    def __init__(self, machine: Machine, mode: str | None, modes: list[str]) -> None:
+        if mode is not None and mode not in modes:
+            raise ValueError(f"render_mode: expected one of {modes}, got {mode!r}")
+        self.machine, self.mode = machine, mode
+        self.window: Any = None
+        self.trails: dict[int, list[Array]] = {}
+
+    def follow(self, state: Any, fresh: ArrayLike) -> None:
+        """After a reset or a step to an `env.State`; `fresh` are the rows that begin anew."""
+        if self.mode is not None:
+            self.trails |= {row: [] for row in np.asarray(fresh).tolist()}
+            for row, p_tool in enumerate(tool_position(self.machine, state.q)):
+                self.trails[row].append(p_tool)
+        if self.mode == "human":
+            self.take(state)
+
+    def take(self, state: Any) -> list[NDArray[np.uint8]]:
+        """A frame (600, 960, 3) of each row, or the first row on the screen. Needs the extra `play`."""
+        if state is None or self.mode is None:
+            raise ValueError(f"render: expected a render_mode and a reset before, got {self.mode}")
+        drawn = []
+        for row, trail in self.trails.items():
+            u, goal = state.history[row, :, 2, -1], state.v_goal[row]
+            scene = Scene(state.q[row], state.q_dot[row], u, goal, np.array(trail))
+            drawn.append(draw(self.machine, [scene._replace(title=self.machine.name)], self.SIZE))
+        if self.mode == "human":
+            self.window = self.window or Window(self.SIZE, self.machine.name)
+            self.window.pygame.event.pump()
+            self.window.show(drawn[0], self.machine.rate)
+            return []
+        return [picture(shapes, self.SIZE) for shapes in drawn]
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self.window is not None:
+            self.window.close()
+            self.window = None

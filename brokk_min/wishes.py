@@ -4,8 +4,6 @@ An operator is called with what the gate says and gives a `Wish`. A script plays
 switch and all, so that it passes the same gate.
 """
 
-from __future__ import annotations
-
 import os
 import struct
 from collections.abc import Sequence
@@ -13,13 +11,11 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from brokk_min.env import measured
 from brokk_min.extras import need
-from brokk_min.machine import PWM_MAX, Machine
-
-Array = NDArray[Any]
+from brokk_min.machine import PWM_MAX, Array, Machine
 
 
 class Wish(NamedTuple):
@@ -51,8 +47,7 @@ def unpack_wish(data: bytes) -> Wish:
 class Script:
     """Velocity goals (T, 3) [m/s] one after another, as soon as the gate is ready; then the end.
 
-    Raises:
-        ValueError: a goal faster than the machine's `tool_speed`.
+    ValueError: a goal faster than the machine's `tool_speed`.
     """
 
     def __init__(self, machine: Machine, goals: Array, patience_s: float = 5.0) -> None:

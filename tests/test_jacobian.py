@@ -11,6 +11,7 @@ from helpers_machines import obedient_net, obedient_velocity, random_machine
 from scipy.optimize import minimize
 
 from benchmarks.rollout import random_net
+from brokk_min import baselines
 from brokk_min import jacobian as classic
 from brokk_min.actuator import ActuatorNet, rest_history
 from brokk_min.env import TaskConfig, measured, observe, rollout
@@ -468,11 +469,11 @@ def test_tune_finds_the_minimum_of_a_bowl_and_is_deterministic():
         sizes.append(len(candidates.gains))
         return sum(((g[n][:, 0] - wanted[n]) / width[n]) ** 2 for n in wanted)
 
-    found, costs = classic.tune(start, bowl, seed=0, generations=60, label="bowl")
+    found, costs = baselines.tune(start, bowl, seed=0, generations=60, label="bowl")
     for name, gain in classic.split_gains(found.gains).items():
         assert gain.item() == pytest.approx(wanted[name], abs=0.02 * width[name])
-    again, _ = classic.tune(start, bowl, seed=0, generations=60, label="bowl")
-    other, _ = classic.tune(start, bowl, seed=1, generations=60, label="bowl")
+    again, _ = baselines.tune(start, bowl, seed=0, generations=60, label="bowl")
+    other, _ = baselines.tune(start, bowl, seed=1, generations=60, label="bowl")
     assert np.array_equal(found.gains, again.gains)
     assert not np.array_equal(found.gains, other.gains)
     assert found.k == start.k
@@ -488,7 +489,7 @@ def test_tune_is_never_worse_than_the_gains_it_starts_with():
     def far(candidates):
         return np.abs(candidates.gains - start.gains).sum(axis=1)
 
-    found, costs = classic.tune(start, far, seed=0, generations=1, label="start")
+    found, costs = baselines.tune(start, far, seed=0, generations=1, label="start")
     assert costs == [0.0] and np.array_equal(found.gains, start.gains)
 
 
@@ -512,7 +513,7 @@ def test_gains_are_split_in_order_and_joined_again():
 def test_gains_at_the_ends_of_their_ranges_are_named():
     gains = classic.join_gains(BROKK_170, {"kp": 2.0, "ki": 6.0, "kd": 0.1, "feedback": 0.5, "ready": 0.0})
     gains[1], gains[4], gains[7] = 3.97, 0.11, 11.8  # of 4 and 12: within 1 %, within 1 %, not
-    found = classic.gains_at_bound(JacobianController(BROKK_170, gains, 0.1, 1.0))
+    found = baselines.gains_at_bound(JacobianController(BROKK_170, gains, 0.1, 1.0))
     assert found == ["kp q3", "ki q1", "ready"]
 
 
@@ -584,23 +585,23 @@ def test_the_steady_map_is_what_nets_say_of_a_history_that_moves_steadily():
 
 def test_gains_at_a_bound_are_all_named_whatever_the_lower_end(monkeypatch):
     monkeypatch.setitem(classic.GAINS, "kp", (1.0, 3.0))
-    low, high = classic.gain_bounds(BROKK_170)
+    low, high = baselines.gain_bounds(BROKK_170)
     every = [f"{kind} q{i}" for kind in ("kp", "ki", "kd") for i in (1, 3, 4, 5)] + ["feedback", "ready"]
     for ends in (low, high):
-        assert classic.gains_at_bound(JacobianController(BROKK_170, ends, 0.1, 1.0)) == every
+        assert baselines.gains_at_bound(JacobianController(BROKK_170, ends, 0.1, 1.0)) == every
     middle = (low + high) / 2
-    assert classic.gains_at_bound(JacobianController(BROKK_170, middle, 0.1, 1.0)) == []
+    assert baselines.gains_at_bound(JacobianController(BROKK_170, middle, 0.1, 1.0)) == []
 
 
 def test_the_search_starts_about_the_gains_it_is_given():
-    low, high = classic.gain_bounds(BROKK_170)
+    low, high = baselines.gain_bounds(BROKK_170)
     start, seen = replace(controller(), gains=(low + high) / 2), []
 
     def cost(candidates):
         seen.append(candidates.gains)
         return np.arange(float(len(candidates.gains)))
 
-    classic.tune(start, cost, seed=0, generations=1, label="start")
+    baselines.tune(start, cost, seed=0, generations=1, label="start")
     np.testing.assert_allclose(seen[0][0], start.gains)
     apart = (seen[0][1:] - start.gains) / (high - low)
     assert seen[0].shape == (32, 14) and 0.13 < apart.std() < 0.17

@@ -23,7 +23,7 @@ import torch
 from helpers_machines import obedient_net, small_net
 from torch import nn
 
-from brokk_min import logs, ppo
+from brokk_min import files, ppo
 from brokk_min.__main__ import main
 from brokk_min.actuator import save_net
 from brokk_min.env import TaskConfig, look, to_command
@@ -864,7 +864,7 @@ def fill_the_disk(monkeypatch, kept):
             return fdopen(handle, mode, **options)
         return io.BufferedWriter(Full(handle, "w"))
 
-    monkeypatch.setattr(logs.os, "fdopen", open_file)
+    monkeypatch.setattr(files.os, "fdopen", open_file)
 
 
 @pytest.mark.parametrize(("kept", "file"), [(3, "p.npz.checkpoint"), (5, "p.npz")])

@@ -321,7 +321,7 @@ def blank_net(log: Log, history: int = 5) -> ActuatorNet:
 
 def test_the_linear_model_finds_a_linear_joint():
     log = linear_log(0)
-    model = fitting.fit_linear(blank_net(log), log, penalty=1e-9)
+    model = trust.fit_linear(blank_net(log), log, penalty=1e-9)
     found = scores.score(model, linear_log(1, scale=0.3))["a"]
     assert found["one_step_rmse"] < 1e-3 < 0.1 * found["persistence_rmse"]
     assert found["free_run"]["1"]["velocity_rmse"] < 2e-3
@@ -330,7 +330,7 @@ def test_the_linear_model_finds_a_linear_joint():
 def test_the_linear_model_is_ridge_regression_on_the_nets_inputs():
     log, history = linear_log(0, 3), 4
     net = blank_net(log, history)
-    model = fitting.fit_linear(net, log, penalty=0.01)
+    model = trust.fit_linear(net, log, penalty=0.01)
     rows, targets = [], []
     for r in log.recordings:
         for k in range(history - 1, len(r.q) - 1):
@@ -563,7 +563,7 @@ def test_the_judge_puts_its_parts_together(monkeypatch):
         {"a": {"free_run": free}},
         {"a": {"free_run": {k: {"velocity_rmse": 0.15} for k in free}}},
     )
-    part(fitting, "fit_linear", lambda *a: "floor")
+    part(trust, "fit_linear", lambda *a: "floor")
     part(scores, "score", lambda model, log: of_floor if model == "floor" else of_net)
     part(trust, "creep", lambda *a: np.array([0.25]))
     part(trust, "outside_training", lambda *a: {"angle": np.array([0.02]), "command": np.array([0.031])})
