@@ -7,7 +7,7 @@ that a tick leaves behind: the angles, and the history that the nets see next.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +15,7 @@ from numpy.typing import NDArray
 from brokk_min.actuator import ActuatorNet, push_command
 from brokk_min.env import LAG_SPEED, LAG_TIME, TaskConfig, command_slope, push_lag
 from brokk_min.kinematics import tool_jacobian
-from brokk_min.machine import PWM_MAX, Machine, estimate_velocity
-
-Array = NDArray[np.floating[Any]]
+from brokk_min.machine import PWM_MAX, Array, Machine, estimate_velocity
 
 
 class Rollout(NamedTuple):

@@ -23,13 +23,20 @@ from brokk_min.kinematics import (
     tool_state,
     tool_velocity,
 )
-from brokk_min.machine import PWM_MAX, Machine, as_floats, estimate_velocity, limit_command, read_encoder
+from brokk_min.machine import (
+    PWM_MAX,
+    Array,
+    Machine,
+    as_floats,
+    estimate_velocity,
+    limit_command,
+    read_encoder,
+)
 from brokk_min.plant import PlantState, plant_reset, plant_step
 
 GROUND_MARGIN = 0.3  # m above the ground below which no goal asks the arm to sink, assumed
 LAG_TIME, LAG_SPEED = 2.0, 0.07  # s and a share of tool_speed, tuned: see `push_lag`
 RAMP = 0.01  # of the command limit, assumed: actions this small take a command through the dead zone
-Array = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]
 Encoder = Callable[[Machine, Array], Array]  # machine and true angles -> angles read
 

@@ -13,11 +13,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from brokk_min.machine import Machine, as_floats
-
-Array = NDArray[np.floating[Any]]
+from brokk_min.machine import Array, Machine, as_floats
 
 
 class Chain(NamedTuple):
