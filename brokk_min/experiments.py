@@ -48,7 +48,7 @@ class Effort:
 
     hours: float = 1.0
     fit_steps: int = fitting.FitConfig.steps
-    train_steps: int = 10_000_000  # `PPOConfig`'s, without importing torch
+    train_steps: int = 6_000_000  # `PPOConfig`'s, without importing torch
     generations: int = 45
     tuning_runs: int = 12
     starts: int = 64

@@ -47,7 +47,7 @@ STATE = [f.name for f in fields(State) if f.name != "plant"]
 class PPOConfig:
     """Settings of the learner; those that the paper names are marked."""
 
-    total_steps: int = 10_000_000
+    total_steps: int = 6_000_000
     """Environment steps in all."""
     num_envs: int = 256
     """Environments side by side (paper: 256)."""
