@@ -7,11 +7,12 @@ import io
 import json
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from conftest import Stand
 
 from brokk_min import (
     baselines,
@@ -43,27 +44,10 @@ from brokk_min.sequences import task_sequences
 POLICY = SHIPPED / "brokk170" / "policy.npz"
 GAINS = SHIPPED / "brokk170" / "gains.json"
 TUNED = baselines.read_gains(GAINS, BROKK_170, load_policy(POLICY, BROKK_170).net)["jacobian_pid_k0.1"]
-Stand = Callable[..., dict[str, tuple[Any, ...]]]
 
 
 def run(line: str, *more: object) -> int:
     return main([*line.split(), *map(str, more)])
-
-
-@pytest.fixture
-def stand(monkeypatch: pytest.MonkeyPatch) -> Stand:
-    """Puts functions of a module aside for ones that give what is told; what they were called with."""
-    calls: dict[str, tuple[Any, ...]] = {}
-
-    def instead(module: ModuleType, **results: Any) -> dict[str, tuple[Any, ...]]:
-        def stands(name: str) -> Callable[..., Any]:
-            return lambda *arguments: (calls.update({name: arguments}), results[name])[1]
-
-        for name in results:
-            monkeypatch.setattr(module, name, stands(name))
-        return calls
-
-    return instead
 
 
 # --- the command line -----------------------------------------------------------------------------------
