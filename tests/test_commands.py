@@ -71,17 +71,60 @@ def test_words_come_from_the_shell_and_other_commands_are_not_made(
         main(["starts", "--help"])
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        "collect --out",
+        "fit l.csv --out",
+        "fit l.csv --out n.npz --json",
+        "fit l.csv --out n.npz --figure",
+        "train --actuator n.npz --out",
+        "starts --out",
+        "evaluate --json",
+        "machine --interface virtual --channel c --record",
+        "drive --interface virtual --channel c --controller jog --log",
+        "convert l.log --out",
+        "export --policy p.npz --out",
+        "play --log",
+        "play --attempts",
+        "replay l.log --out",
+    ],
+)
+def test_what_cannot_be_written_is_refused_before_hours_of_work(
+    line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "missing" / "x.csv"
+    assert run(line, path) == 2
+    wanted = f"brokk-min: {path}: expected a file in an existing, writable directory\n"
+    assert capsys.readouterr().err == wanted
+
+
+class Screen(io.StringIO):
+    """A terminal, or a pipe: what a reader of it has seen is what was flushed."""
+
+    def __init__(self, terminal: bool) -> None:
+        super().__init__()
+        self.terminal, self.seen = terminal, ""
+
+    def isatty(self) -> bool:
+        return self.terminal
+
+    def flush(self) -> None:
+        self.seen = self.getvalue()
+
+
 # --- a machine on a bus -----------------------------------------------------------------------------------
 
 
 def test_a_simulated_machine_gets_its_bus_start_and_record(
-    stand: Stand, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    stand: Stand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls, record = stand(operating, simulate=None), tmp_path / "plant.csv"
+    monkeypatch.setattr("sys.stdout", pipe := Screen(terminal=False))
     assert run("machine --interface socketcan --channel can0 --start 0 0.5 0.6 1.7 1.2 --record", record) == 0
     (*given, told) = calls["simulate"]
     assert given == [BROKK_170, (0.0, 0.5, 0.6, 1.7, 1.2), "socketcan", "can0"] and told == record
-    assert capsys.readouterr().out == "brokk170 on socketcan can0; Ctrl-C ends it\n"
+    assert pipe.seen == "brokk170 on socketcan can0; Ctrl-C ends it\n"
     assert run("machine --interface socketcan --channel can0") == 0
     assert calls["simulate"][1:] == ((), "socketcan", "can0", None)
 
@@ -111,6 +154,8 @@ def test_a_log_is_compared_with_the_controller_that_is_named(
     )
     if isinstance(controller, wishes.Jog):
         assert (controller.joint, controller.counts) == ("q4", 9)
+    if isinstance(controller, PolicyController):
+        assert controller.policy.net.machine == "brokk170"
     if isinstance(controller, JacobianController):
         assert controller.k == 0.1 and (controller.gains == TUNED.gains).all()
     said = capsys.readouterr()
@@ -136,11 +181,6 @@ class Drives:
         assert self.begun
         show("driving v wanted +0.10 +0.00 +0.00")
         Drives.given[3].tick = self.ticks
-
-
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
 
 
 def test_a_drive_gets_bus_log_and_operator_and_says_how_it_ended(
@@ -169,10 +209,12 @@ def test_a_drive_gets_bus_log_and_operator_and_says_how_it_ended(
     stand(wishes, Joystick=SimpleNamespace(done=False))  # it never is, and that is no failure
     assert run(f"{jog} --axes 3 4 5 --button 2") == 0
     assert calls["Joystick"] == (BROKK_170, (3, 4, 5), 2) and calls["open_line"][2] is None
-    monkeypatch.setattr("sys.stdout", screen := Terminal())
     monkeypatch.setenv("COLUMNS", "20")
-    assert run(jog) == 0 and calls["Joystick"] == (BROKK_170, (1, 0, 4), 5)
-    assert screen.getvalue() == "\rdriving v wanted +0\033[K\n"  # one line kept up to date, then a new one
+    told = {True: "\rdriving v wanted +0\033[K", False: "driving v wanted +0.10 +0.00 +0.00\n"}
+    for terminal, seen in told.items():
+        monkeypatch.setattr("sys.stdout", screen := Screen(terminal))
+        assert run(jog) == 0 and calls["Joystick"] == (BROKK_170, (1, 0, 4), 5)
+        assert screen.seen == seen and screen.getvalue() == seen + "\n" * terminal
 
 
 @pytest.mark.parametrize("bus", ["--interface virtual", "--channel can0", ""])
@@ -215,7 +257,8 @@ def test_the_game_gets_controllers_bus_and_files(
     assert run("play") == 0
     machine, controllers, where, attempts = calls.pop("play")
     assert machine is BROKK_170 and where == Where() and attempts == Path("attempts.csv")
-    assert list(controllers) == ["rl", "jacobian"] and controllers["rl"].policy.net.machine == "brokk170"
+    assert list(controllers) == ["rl", "jacobian"] and controllers["rl"].machine is BROKK_170
+    assert controllers["rl"].policy.net.machine == "brokk170"
     assert controllers["jacobian"].k == 0.1 and (controllers["jacobian"].gains == TUNED.gains).all()
     assert capsys.readouterr().err == f"gains of the Jacobian controller: {GAINS}\n"
     (tmp_path / "p.npz").write_bytes(POLICY.read_bytes())
@@ -225,6 +268,8 @@ def test_the_game_gets_controllers_bus_and_files(
     assert where == Where("socketcan", "can0", log) and attempts == tmp_path / "a.csv"
     assert capsys.readouterr().err == "gains of the Jacobian controller: set by hand\n"
     assert by_hand["jacobian"].k == 0.1 and (by_hand["jacobian"].gains != TUNED.gains).any()
+    assert run(f"play --policy {tmp_path / 'p.npz'} --gains {GAINS}") == 0
+    assert (calls.pop("play")[1]["jacobian"].gains == TUNED.gains).all()
     assert run(f"play {bus}") == 0
     assert calls.pop("watch") == (BROKK_170, Where("socketcan", "can0", log)) and not calls
     assert run("play --start 0 0.5 0.6 1.7 1.2") == 0
@@ -293,6 +338,7 @@ def test_what_is_collected_is_what_was_asked_for(
     assert read_log([out], 2).joints == ("a", "b")
     assert capsys.readouterr().out == f"{out}: 2 recordings of a, b\n"
     assert run("collect --out", out) == 0 and calls["collect"][1:3] == (1.0, "rich")
+    assert run("collect --out", tmp_path / "log.csv") == 0
     assert run("collect --out", tmp_path / "log.txt") == 2
     assert "--out: expected a name ending in .csv or .npz, got" in capsys.readouterr().err
 
@@ -350,6 +396,14 @@ def test_a_fit_is_judged_on_other_recordings_drawn_and_written(
         ["warning:", "q1:", "creeps"],
     ]
     calls.clear()
+    (tmp_path / "slow.py").write_text(
+        "from dataclasses import replace\nfrom brokk_min.machine import BROKK_170\n"
+        "SLOW = replace(BROKK_170, name='slow', rate=10.0)\n"
+    )
+    slow = f"{tmp_path / 'slow.py'}:SLOW"
+    assert run(f"fit {log} --test {test} --machine {slow} --out {out} --json {verdict}") == 0
+    assert (calls["fit"][0].rate, calls["judge"][2].rate, calls["fit"][4]) == (10.0, 10.0, "slow")
+    assert json.loads(verdict.read_text())["meta"]["test"] == [str(test)]
     assert run(f"fit {log} --test {test} --machine brokk170 --out {out}") == 0
     assert len(calls["fit"][0].recordings) == 21 and len(calls["judge"][2].recordings) == 1
     assert calls["fit"][2:] == (0, BROKK_170.velocity_samples, "brokk170") and "save" not in calls
@@ -471,6 +525,9 @@ def test_an_evaluation_gets_what_is_named_and_says_what_it_took(
     }
     assert meta == experiments.meta(BROKK_170, 4) | about
     assert capsys.readouterr().err == "gains of the baselines: tuned now\n"
+    assert run("evaluate --perfect-model --plant net") == 2
+    wanted = "brokk-min: --perfect-model: expected --plant analytic, the plant that it knows, got net\n"
+    assert capsys.readouterr().err == wanted
     assert run("evaluate --num-starts 3", "--gains", tmp_path / "mine.json") == 0
     assert calls["read_gains"][0] == tmp_path / "mine.json" and "bound" not in calls["task_space"][1]
 
