@@ -239,6 +239,7 @@ def test_the_exported_policy_is_the_policy(policy: Policy, folder: Path) -> None
         assert np.abs(action).max() > 0.3
     model = onnx.load(folder / "p.onnx")
     assert not [t for t in model.graph.initializer if t.external_data]  # one self-contained file
+    assert [node.op_type for node in model.graph.node] == ["Gemm", "Elu"] * 3 + ["Gemm"]
     kept = {p.key: json.loads(p.value) for p in model.metadata_props}
     assert kept["driven"] == ["q1", "q3", "q4", "q5"] and kept["rate"] == 20.0
     for name in ("mean", "scale"):

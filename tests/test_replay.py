@@ -27,8 +27,8 @@ START = np.array([0.0, 0.5, 0.58, 1.71, 1.24])
 
 
 def known(ticks: int) -> list[Known]:
-    """The cabin turns at 0.1 rad/s; asked for is 0.05 m/s upward."""
-    row = np.array([0.1, 0, 0, 0, 0]), np.full(5, 0.3), np.array([0, 0, 0.05])
+    """The cabin turns at 0.1 rad/s; asked for is 0.1 m/s aside and 0.05 m/s upward."""
+    row = np.array([0.1, 0, 0, 0, 0]), np.full(5, 0.3), np.array([0, 0.1, 0.05])
     return [Known(k, START + 0.005 * k * np.eye(5)[0], *row, driving=True) for k in range(ticks)]
 
 
@@ -38,7 +38,7 @@ def test_a_run_has_the_tools_way_its_error_and_all_that_must_be_in_the_picture()
     q, q_dot = np.array([k.q for k in told]), np.array([k.q_dot for k in told])
     p_tool, v_tool, _ = tool_state(BROKK_170, q, q_dot)
     np.testing.assert_array_equal(run.p_tool, p_tool)
-    np.testing.assert_allclose(run.error, np.hypot(np.hypot(*v_tool.T[:2]), v_tool[:, 2] - 0.05))
+    np.testing.assert_allclose(run.error, np.sqrt(np.square(v_tool - [0, 0.1, 0.05]).sum(axis=1)))
     corners = skeleton(BROKK_170, q[[0, 10, 20]]).reshape(-1, 3)
     np.testing.assert_array_equal(run.hold, np.vstack([corners, path]))
     assert run[:3] == ("a", (1, 2, 3), told) and run.path is path
@@ -125,6 +125,7 @@ def test_runs_driven_again_are_those_of_the_file(stand: Stand) -> None:
 def test_a_film_goes_by_one_clock_and_what_is_over_stands_still(stand: Stand) -> None:
     calls, told = stand(view, draw="shapes"), known(5)
     long = replay.recorded(BROKK_170, "rl", (1, 2, 3), told, np.zeros((0, 3)))
+    long = long._replace(error=np.arange(5) / 7)
     short = replay.recorded(BROKK_170, "my.log", (4, 5, 6), told[:3], np.ones((2, 3)))
     assert replay.film(BROKK_170, [long, short], 4, (640, 360)) == "shapes"
     machine, (first, second), size = calls["draw"]
@@ -140,7 +141,8 @@ def test_a_film_goes_by_one_clock_and_what_is_over_stands_still(stand: Stand) ->
             f"mean so far {run.error.mean():.3f} m/s",
         ]
     replay.film(BROKK_170, [long], 1, (640, 360))
-    assert len(calls["draw"][1][0].trail) == 2
+    (scene,) = calls["draw"][1]
+    assert len(scene.trail) == 2 and scene.notes == ["velocity error 0.143 m/s", "mean so far 0.071 m/s"]
 
 
 @pytest.mark.parametrize(("fps", "ticks"), [(10.0, [0, 2, 4]), (7.0, [0, 3]), (100.0, [0, 1, 2, 3, 4])])
@@ -168,6 +170,7 @@ def test_a_gif_runs_for_ever_and_keeps_the_colours_that_warn() -> None:
     assert (film.n_frames, film.size, film.info["duration"], film.info["loop"]) == (3, (80, 60), 120, 0)
     film.seek(1)
     shown = np.array(film.convert("RGB")).astype(int)
+    assert len(np.unique(shown.reshape(-1, 3), axis=0)) <= 96
     for k, colour in enumerate([*wanted, view.MEASURED, view.PATH]):
         assert np.abs(shown[2 * k : 2 * k + 2, :9] - colour).max() < 12
 
@@ -185,23 +188,33 @@ def test_ffmpeg_is_told_what_the_pictures_are(tmp_path: Path, monkeypatch: pytes
     before, after = told[: told.index("-i")], told[told.index("-i") :]
     assert {"rawvideo", "rgb24", "5x3", "10.0"} <= set(before)  # of what comes in
     assert {"yuv420p", "crop=trunc(iw/2)*2:trunc(ih/2)*2", "mp4", "frag_keyframe+empty_moov"} <= set(after)
+    (tmp_path / "ffmpeg").write_text("#!/bin/sh\nexit 0\n")  # it ends well, but read nothing
+    large = [np.zeros((600, 600, 3), np.uint8)] * 2
+    with (tmp_path / "film").open("wb") as file:
+        with pytest.raises(ValueError, match=r"^film: expected ffmpeg to write it, got its status 1$"):
+            replay._write_mp4(file, large, (600, 600), 10.0)
+        (tmp_path / "ffmpeg").unlink()
+        monkeypatch.setenv("PATH", str(tmp_path))
+        with pytest.raises(ValueError, match=r"^film: expected ffmpeg for \.mp4, or a name ending in \.gif"):
+            replay._write_mp4(file, large, (600, 600), 10.0)
 
 
 def test_a_film_in_a_window_halts_and_moves_by_a_second(
     stand: Stand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shown: list[tuple[int, float]] = []
+    shown: list[Any] = []
     events = {3: pygame.K_SPACE, 5: pygame.K_RIGHT, 6: pygame.K_LEFT, 7: pygame.K_LEFT, 8: pygame.K_SPACE}
     events |= {9: pygame.K_RIGHT, 10: pygame.K_RIGHT, 12: pygame.K_ESCAPE}
     script = [[pygame.event.Event(pygame.KEYDOWN, key=events[k])] if k in events else [] for k in range(13)]
     monkeypatch.setattr(pygame.event, "get", lambda: script.pop(0))
     window = SimpleNamespace(pygame=pygame, show=lambda *a: shown.append(a))
-    monkeypatch.setattr(replay, "film", lambda machine, runs, tick, size: tick)
+    monkeypatch.setattr(replay, "film", lambda *a: a)
     calls = stand(replay, open_window=contextlib.nullcontext(window))
     runs = [SimpleNamespace(known=range(n)) for n in (31, 2)]
     replay.show_film(BROKK_170, runs, (640, 360))  # type: ignore[arg-type]
-    assert shown == [(tick, 20.0) for tick in (0, 1, 2, 3, 3, 23, 3, 0, 0, 21, 30, 30)]
+    ticks = 0, 1, 2, 3, 3, 23, 3, 0, 0, 21, 30, 30
+    assert shown == [((BROKK_170, runs, tick, (640, 360)), 20.0) for tick in ticks]
     assert calls["open_window"] == ((640, 360), "brokk_min replay")
     script[:] = [[], [pygame.event.Event(pygame.QUIT)]]
     replay.show_film(BROKK_170, runs, (640, 360))  # type: ignore[arg-type]
-    assert shown[12:] == [(0, 20.0)]
+    assert [picture[2] for picture, _ in shown[12:]] == [0]
