@@ -57,10 +57,10 @@ def test_words_come_from_the_shell_and_other_commands_are_not_made(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for words, first in (
-        (["starts", "--help"], "usage: brokk-min starts "),
+        (["reproduce", "--help"], "usage: brokk-min reproduce "),
         (["--help"], "usage: brokk-min [-h]"),
     ):
-        monkeypatch.setattr("sys.argv", ["brokk-min", *words])
+        monkeypatch.setattr("sys.argv", ["/somewhere/__main__.py", *words])
         with pytest.raises(SystemExit, match=r"^0$"):
             main()
         said = capsys.readouterr().out
