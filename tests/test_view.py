@@ -283,6 +283,25 @@ def test_no_text_is_cut_off_or_lies_on_another(n: int, arms: int, size: tuple[in
     assert min(track[1, 0] - track[0, 0] for track in tracks) > 10
 
 
+def test_shapes_are_painted_where_they_are_and_as_large() -> None:
+    red, blue, green, paper = (200, 0, 0), (0, 0, 200), (0, 150, 0), view.PAPER
+    corner = np.array([[5.0, 5], [5, 35], [35, 35]])
+    square = np.array([[44.0, 20], [52, 20], [52, 28], [44, 28]])
+    shapes = [Line(corner, red, 4), Circle(np.array([25.0, 15]), 5, blue), Polygon(square, green)]
+    image = picture(shapes, (60, 40))
+
+    def across(row: int, colour: tuple[int, int, int]) -> list[int]:
+        return np.flatnonzero((image[row] == colour).all(axis=-1)).tolist()
+
+    assert across(20, red) == [4, 5, 6] and across(35, red) == list(range(5, 35))  # open: no way back
+    assert across(15, blue) == list(range(20, 30)) and across(24, green) == list(range(44, 52))
+    assert (image[20, 8:44] == paper).all()
+    for anchor, left in ((0.0, 21), (0.5, 7), (1.0, 0)):  # where the word begins, its middle or its end
+        image = picture([Text((20, 20), "HHH", 12, red, anchor)], (60, 40))
+        rows, columns = (image != paper).any(axis=-1).nonzero()
+        assert columns.min() == left and (rows.min(), rows.max()) == (16, 24)
+
+
 def test_text_stays_legible_over_an_arm() -> None:
     under = view.Polygon(np.array([[0, 0], [200, 0], [200, 40], [0, 40]]), view.COLOURS["jacobian"])
     image = picture([under, Text((10, 20), "near", 13, view.WARNING)], (200, 40))
