@@ -688,6 +688,7 @@ def test_a_log_tells_what_the_loop_knew(tmp_path: Path) -> None:
     for a, b in zip(run.known, told, strict=True):
         for name in ("q", "q_dot", "u", "v_goal"):
             np.testing.assert_allclose(getattr(a, name), getattr(b, name), atol=2e-5, err_msg=name)
+    assert (run.title, run.colour, run.path.shape) == ("run.log", (1, 2, 3), (0, 3))
     assert run.error[5] > 0.15 and run.error[-5:].mean() < 0.08  # it waits for the valves, then follows
     idle = tmp_path / "idle.log"
     idle.write_text("(1.0) can0 080# R\n(1.05) can0 080# R\n")
