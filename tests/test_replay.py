@@ -168,6 +168,8 @@ def test_a_gif_runs_for_ever_and_keeps_the_colours_that_warn() -> None:
     replay._write_gif(file, pictures, (80, 60), 8.0)
     film = Image.open(file)
     assert (film.n_frames, film.size, film.info["duration"], film.info["loop"]) == (3, (80, 60), 120, 0)
+    replay._write_gif(one := io.BytesIO(), pictures[:1], (80, 60), 8.0)
+    assert Image.open(one).size == (80, 60)
     film.seek(1)
     shown = np.array(film.convert("RGB")).astype(int)
     assert len(np.unique(shown.reshape(-1, 3), axis=0)) <= 96

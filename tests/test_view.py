@@ -297,9 +297,9 @@ def test_shapes_are_painted_where_they_are_and_as_large() -> None:
     assert across(15, blue) == list(range(20, 30)) and across(24, green) == list(range(44, 52))
     assert (image[20, 8:44] == paper).all()
     for anchor, left in ((0.0, 21), (0.5, 7), (1.0, 0)):  # where the word begins, its middle or its end
-        image = picture([Text((20, 20), "HHH", 12, red, anchor)], (60, 40))
+        image = picture([Text((20, 15), "HHH", 12, red, anchor)], (60, 40))
         rows, columns = (image != paper).any(axis=-1).nonzero()
-        assert columns.min() == left and (rows.min(), rows.max()) == (16, 24)
+        assert columns.min() == left and (rows.min(), rows.max()) == (11, 19)
 
 
 def test_text_stays_legible_over_an_arm() -> None:
