@@ -378,7 +378,8 @@ def test_creep_is_the_largest_drift_of_a_joint_without_a_command(monkeypatch):
     net = random_net(np.random.default_rng(0))
 
     def drifting(q: np.ndarray, u: np.ndarray) -> np.ndarray:
-        assert not u.any()
+        assert not u.any() and u.shape == (200, 21, 5)  # 10 s
+        np.testing.assert_allclose(q, np.linspace(net.q_low, net.q_high, 21))
         return q + np.arange(len(u) + 1)[:, None, None] / 20 * 0.003 * (q == q.max(axis=0))
 
     monkeypatch.setattr(trust, "net_mover", lambda _: drifting)
@@ -396,18 +397,18 @@ def test_a_net_that_is_no_better_than_a_linear_model_is_told_so():
 
 
 def test_tool_errors_by_hand(monkeypatch):
-    """q1 off by 0.01 rad a second at 3.05 m from the slew axis."""
+    """q1 off by 0.01 rad a second at 3.05 m from the slew axis, where the tool is at the end of each run."""
     q = np.tile([1.5, 0.5, 0.58, 1.71, 1.24], (150, 1))
-    test = Log(BROKK_170.names, (Recording("x", 0 * q, q, 0 * q),))
-    error = lambda net, samples, starts, ticks: (  # noqa: E731
-        np.arange(1, ticks + 1)[:, None, None]
-        / 20
-        * np.array([0.01, 0, 0, 0, 0])
-        * np.ones((len(starts), 1)),
-        None,
-    )
+    q[:20, 3] += 0.5  # nearer at first
+    test, net = Log(BROKK_170.names, (Recording("x", 0 * q, q, 0 * q),)), random_net(np.random.default_rng(0))
+
+    def error(of: ActuatorNet, samples: fitting.Samples, starts: np.ndarray, ticks: int) -> tuple:
+        assert of is net and samples.whole.q.tolist() == q.tolist()
+        seconds = np.arange(1, ticks + 1)[:, None, None] / 20
+        return seconds * np.array([0.01, 0, 0, 0, 0]) * np.ones((len(starts), 1)), None
+
     monkeypatch.setattr(scores, "run_errors", error)
-    errors = trust.tool_errors(BROKK_170, random_net(np.random.default_rng(0)), test)
+    errors = trust.tool_errors(BROKK_170, net, test)
     assert errors == {"1": pytest.approx(0.0305, abs=2e-4), "5": pytest.approx(0.1525, abs=1e-3)}
 
 
@@ -549,6 +550,8 @@ def test_what_is_held_against_the_training_by_hand():
         assert outside["command"][0] == share, beyond
         high = np.array([*np.tile([0.5, 0.5], 6), *np.tile([1.018 + beyond, 0.5], 30)])
         assert trust.outside_training(known, taped(high, 3 + 0 * high), 12)["command"][0] == share
+        far = np.tile([3.5, 3.998 + 0.02 * 1.996 + 20 * (beyond - 0.001)], 36)  # of 2.002 to 3.998
+        assert trust.outside_training(known, taped(0.5 + 0 * far, far), 12)["angle"][0] == share
 
 
 def test_the_judge_puts_its_parts_together(monkeypatch):
