@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from conftest import Stand
 from helpers_machines import obedient_net, obedient_velocity, random_machine, small_net
 
 from benchmarks.rollout import random_net
@@ -44,6 +45,8 @@ def test_response_times_of_a_pure_delay_by_hand(late):
     assert angles.shape == (61, 2, 2, 2, 2)
     times = preliminary.response_times(angles, 20.0)
     np.testing.assert_allclose(times, (late + 0.63 - 0.5) / 20, atol=1e-9)
+    speeds = preliminary.step_velocity(angles, 20.0)
+    np.testing.assert_allclose(speeds[-1], [[[0.2, 0.2], [0.4, 0.4]]] * 2)  # positive up and down
 
 
 def test_only_the_stepping_joint_moves_away_from_the_end_behind_it():
@@ -67,6 +70,7 @@ def test_a_joint_that_does_not_answer_has_no_response_time():
     assert np.isnan(times[0, 1]).all() and np.isfinite(times[0, 0]).all()
     assert np.isnan(times[1]).all()  # it moves before the step as after it
     named = preliminary.named_times(times, ("a", "b"))
+    assert {kind for of in named.values() for kind in of} == {"idle", "moving"}
     assert named["b"]["idle"]["down"] is None and named["b"]["idle"]["up"] == pytest.approx(0.0065)
 
 
@@ -79,13 +83,18 @@ def test_the_plants_response_times_are_the_papers():
 
 
 def test_a_joint_is_brought_into_motion_beyond_its_dead_zone():
+    """Three ticks late; two dead zones, and a valve that opens with the fourth power."""
+
     def move(q: np.ndarray, u: np.ndarray) -> np.ndarray:
-        speed = np.sign(u) * np.maximum(0, np.abs(u) - np.array([0.07, 0.45]))
+        u = np.concatenate([np.zeros((3, *u.shape[1:])), u])[: len(u)]
+        beyond = np.maximum(0, np.abs(u) - np.array([0.07, 0.45, 0.0]))
+        speed = np.sign(u) * beyond ** np.array([1, 1, 4])
         return np.concatenate([q[None], q + np.cumsum(speed, axis=0) / 20])
 
-    before = preliminary.step_commands(move, -np.ones(2), np.ones(2), np.array([0.6, 1.0]), 20)
-    # tenths of the level that move by a twentieth of the full speed: 0.12 and 0.5
-    np.testing.assert_allclose(before, [(0.12 + 0.6) / 2, (0.5 + 1.0) / 2])
+    level = np.array([0.6, 1.0, 1.0])
+    before = preliminary.step_commands(move, -np.ones(3), np.ones(3), level, 20)
+    # tenths of the level that move by a twentieth of the full speed: 0.12, 0.5 and 0.5
+    np.testing.assert_allclose(before, [(0.12 + 0.6) / 2, (0.5 + 1.0) / 2, (0.5 + 1.0) / 2])
 
 
 # --- sweeps -----------------------------------------------------------------------------------------
@@ -152,6 +161,30 @@ def test_the_gap_of_a_machine_to_itself_is_none(monkeypatch):
     assert all(row["difference_rms"] == 0 for row in numbers["sweep"].values())
     assert list(numbers["sweep"]) == ["u = 50", "u = 80", "u = 175", "u = 205"]
     assert numbers["coupling_rms"]["machine"] < 0.002  # "marginal and neglectable"
+
+
+def test_the_gap_starts_where_the_papers_does_or_amid_the_ranges(stand: Stand, monkeypatch):
+    u, seen = np.random.default_rng(0).uniform(-0.3, 0.3, (25, 2, 5)), []
+    tape = Log(BROKK_170.names, tuple(Recording(str(i), row, row, row) for i, row in enumerate(u)))
+    calls = stand(excitation, task_log=tape)
+
+    def still(q: np.ndarray, u: np.ndarray) -> np.ndarray:
+        seen.append((q, u))
+        return np.repeat(q[None], len(u) + 1, axis=0)
+
+    monkeypatch.setattr(preliminary, "movers", lambda *a: {"machine": still, "nets": still})
+    net = random_net(np.random.default_rng(0))
+    starts = {"brokk170": [1.5, 0.5, 0.58, 1.71, 1.24], "other": (LOW + HIGH) / 2}
+    for name, start in starts.items():
+        machine = replace(BROKK_170, name=name)
+        preliminary.sim_to_real(machine, net, 7)
+        of, num, seconds, rng, given = calls["task_log"]
+        assert (of, num, seconds) == (machine, 25, 30.0)
+        assert rng.bit_generator.state == np.random.default_rng(7).bit_generator.state
+        np.testing.assert_array_equal(given, start)
+        np.testing.assert_array_equal(seen[-1][0], np.tile(start, (20, 1)))
+        driven = [i for i in range(25) if i % 5 < 4]  # the fifth has its locked joint move
+        np.testing.assert_array_equal(seen[-1][1], np.stack(u[driven], axis=1))
 
 
 def test_the_gap_is_between_tools_where_the_arms_end(monkeypatch):
