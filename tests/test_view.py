@@ -230,6 +230,10 @@ def test_a_limit_and_a_singularity_warn_in_red() -> None:
     )
     stretched = np.array([0.3, 0.4, 0.0, np.pi, 3 * np.pi / 4])
     shapes = draw(wide, [scene(stretched)], SIZE)
+    rings = [s for s in shapes if isinstance(s, Line) and s.colour == view.WARNING and len(s.points) == 25]
+    tips = [camera.project(tool_position(wide, stretched)) for camera in eyes(wide, stretched)]
+    np.testing.assert_allclose([ring.points[:-1].mean(axis=0) for ring in rings], tips)
+    assert not [s for s in clean if isinstance(s, Line) and s.colour == view.WARNING]
     assert "near a singularity" in words(shapes)
     value, way = looks.weakest(wide, stretched)
     outward = np.array([np.cos(0.3) * np.cos(0.4), np.sin(0.3) * np.cos(0.4), np.sin(0.4)])
@@ -249,6 +253,7 @@ def test_the_weakest_way_bounds_manipulability(seed: int) -> None:
 def test_unknown_positions_and_states_are_said() -> None:
     shapes = draw(BROKK_170, [scene(np.full(5, np.nan), status="waiting: q1: silent", mood="waiting")], SIZE)
     assert {"no positions", "waiting: q1: silent"} <= set(words(shapes))
+    assert {"side view, grid 1 m", "top view, grid 1 m"} <= set(words(draw(BROKK_170, [scene()], SIZE)))
     assert picture(shapes, SIZE).std() > 0
 
 
