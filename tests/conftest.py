@@ -1,9 +1,13 @@
-"""Hypothesis profiles: `ci` repeats itself bit for bit, `dev` explores, `deep` explores for long."""
+"""Hypothesis profiles: `ci` repeats itself bit for bit, `dev` explores, `deep` for long. Stand-ins."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
 
+import pytest
 from hypothesis import HealthCheck, settings
 
 import brokk_min  # noqa: F401, before NumPy: it settles how many threads that takes
@@ -14,3 +18,21 @@ settings.register_profile("dev", max_examples=25, deadline=None, suppress_health
 settings.register_profile("ci", settings.get_profile("dev"), derandomize=True, database=None, print_blob=True)
 settings.register_profile("deep", settings.get_profile("dev"), max_examples=1000)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
+
+Stand = Callable[..., dict[str, tuple[Any, ...]]]
+
+
+@pytest.fixture
+def stand(monkeypatch: pytest.MonkeyPatch) -> Stand:
+    """Puts functions of a module aside for ones that give what is told; what they were called with."""
+    calls: dict[str, tuple[Any, ...]] = {}
+
+    def instead(module: ModuleType, **results: Any) -> dict[str, tuple[Any, ...]]:
+        def stands(name: str) -> Callable[..., Any]:
+            return lambda *arguments: (calls.update({name: arguments}), results[name])[1]
+
+        for name in results:
+            monkeypatch.setattr(module, name, stands(name))
+        return calls
+
+    return instead

@@ -76,7 +76,7 @@ def test_the_designs_options_exist(capsys: pytest.CaptureFixture[str]) -> None:
         (["collect"], 2, "--out"),
         (["collect", "--out", "x.csv", "--machine", "digger"], 2, "brokk170"),
         (["nonsense"], 2, "nonsense"),
-        (["fit", "--out", "n.npz"], 2, "LOGS"),
+        (["fit", "--out", "n.npz"], 2, "brokk-min: LOGS: expected at least one log, got none"),
         (["fit", "missing.csv", "--out", "n.npz"], 1, "missing.csv"),
         (
             ["fit", "missing.csv", "--out", "n.npz", "--dead-zone", "1.5"],

@@ -76,16 +76,22 @@ def test_reproduce_prints_means_and_verdicts(
 
     def instead(machine: Any, out: Path, effort: Any, seed: int, sweep: Path | None) -> dict[str, Any]:
         given.update(machine=machine.name, out=out, effort=effort, seed=seed, sweep=sweep)
-        means = {"rl": {"x": {"velocity_error_mean": 0.0125}}}
+        means = {"rl": {s: {"velocity_error_mean": 0.0125} for s in "xy"}}
         return {"task_space": {"summary": means}, "claims": [{"holds": True, "paper": "It works."}]}
 
     monkeypatch.setattr(chain, "reproduce", instead)
-    for words, effort in (((), experiments.Effort()), (("--quick",), experiments.QUICK)):
-        assert run("reproduce", "--out", tmp_path, "--seed", 3, *words) == 0
-        wanted = {"machine": "brokk170", "out": tmp_path, "effort": effort, "seed": 3, "sweep": None}
+    seeds = Path("sweep.json")
+    for words, effort, file in (((), experiments.Effort(), None), (("--quick",), experiments.QUICK, seeds)):
+        more = ("--sweep", file) if file else ()
+        assert run("reproduce", "--out", tmp_path, "--seed", 3, *words, *more) == 0
+        wanted = {"machine": "brokk170", "out": tmp_path, "effort": effort, "seed": 3, "sweep": file}
         assert given == wanted
-    said = capsys.readouterr().out
-    assert "x 0.0125" in said and f"{report.VERDICTS[True]}: It works." in said and "report.html" in said
+        assert capsys.readouterr().out.splitlines() == [
+            "rl                     mean velocity error [m/s]: x 0.0125, y 0.0125",
+            f"{report.VERDICTS[True]}: It works.",
+            str(tmp_path / "report.html"),
+            str(tmp_path / "results.json"),
+        ]
 
 
 def test_an_interrupted_command_says_so(

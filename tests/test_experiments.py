@@ -97,6 +97,30 @@ def test_sequences_of_any_length_side_by_side_are_those_alone() -> None:
     assert traces["mine", "z"].v_tool.shape == (40, 2, 3)
 
 
+def test_a_rollout_gets_net_sensor_and_seeds_and_a_figure_may_be_none(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    net, asked = net_of_driven_joints(), list[Any]()
+    inner = experiments.rollout
+
+    def watched(*a: Any) -> Any:
+        asked.append((*a[5].bit_generator.state["state"].values(), *a[6:]))
+        return inner(*a)
+
+    def sensor(rng: np.random.Generator) -> Any:
+        asked.append(tuple(rng.bit_generator.state["state"].values()))
+        return read_encoder
+
+    monkeypatch.setattr(experiments, "rollout", watched)
+    short = experiments.shortened(BROKK_170, task_sequences(BROKK_170)[:1], 0.2)
+    start = np.array([[1.5, 0.5, 0.58, 1.71, 1.24]])
+    experiments.task_space(BROKK_170, {"idle": _Idle()}, short, start, 3, net, sensor)
+    three, four = (tuple(np.random.default_rng(k).bit_generator.state["state"].values()) for k in (3, 4))
+    assert asked == [four, (*three, net, read_encoder)]
+    (row,) = experiments._rows({"controller": "a"}, ["limits"], {"drift": np.array([np.nan])})
+    assert row == {"controller": "a", "start": 0, "kind": "limits", "drift": None}
+
+
 def test_sensors_of_the_robustness_table() -> None:
     q = np.cumsum(np.full((4000, 2, 5), 0.01), axis=0)
     plain = np.array([variations.exact(np.random.default_rng(0))(BROKK_170, row) for row in q])
@@ -104,10 +128,13 @@ def test_sensors_of_the_robustness_table() -> None:
     noisy = variations.noisy(np.random.default_rng(0))
     counts = (np.array([noisy(BROKK_170, row) for row in q]) - q) / BROKK_170.encoder_step
     assert counts.std() == pytest.approx(np.sqrt(1 + 1 / 12), rel=0.02)
+    together = np.corrcoef(counts.reshape(-1, 10).T) - np.eye(10)
+    assert np.abs(together).max() < 0.1  # each joint of each machine its own
     lossy = variations.lossy(np.random.default_rng(0))
     seen = np.array([lossy(BROKK_170, row) for row in q])
     lost = (seen[1:] == seen[:-1]).all(axis=-1)
     assert lost.mean() == pytest.approx(0.05, abs=0.008)
+    assert lost.all(axis=1).mean() < 0.01  # hardly ever of both machines
     np.testing.assert_array_equal(seen[1:][~lost], plain[1:][~lost])
     np.testing.assert_array_equal(seen[0], plain[0])
 
@@ -440,6 +467,7 @@ def test_the_comparison_asks_its_parts_for_what_they_are_for(monkeypatch: pytest
     found, shown = experiments.comparison(BROKK_170, controllers, effort, 7)
     every = [s.name for s in task_sequences(BROKK_170)]
     assert asked["scored_starts"][:2] == (BROKK_170, 4) and asked["scored_starts"][3] == 9
+    assert asked["start_kinds"] == (BROKK_170, starts)
     assert [s.name for s in asked["scored_starts"][2]] == every
     machine, who, sequences, where, seed = asked["task_space"]
     assert (machine, who, [s.name for s in sequences], where is starts, seed) == (
@@ -486,6 +514,7 @@ def test_regret_is_against_the_bound_and_gains_dither_only_where_they_should(
     found = experiments.bounds(BROKK_170, start)
     assert list(found) == ["perfect_model", "perfect_model_no_dither"]
     one, still = found.values()
+    assert one.poses is start and still.poses is start  # type: ignore[attr-defined]
     assert still.dither == 0.0 != one.dither and (one.machine, still.machine) == (BROKK_170, BROKK_170)  # type: ignore[attr-defined]
     rows = [
         {"controller": c, "sequence": "x", "start": i, "kind": "workspace", "velocity_error_mean": e + i * i}
@@ -495,8 +524,12 @@ def test_regret_is_against_the_bound_and_gains_dither_only_where_they_should(
     asked: list[Any] = []
     monkeypatch.setattr(experiments, "task_space", lambda *a: asked.append(a) or (rows, {"trace": 1}))
     mine: Any = {"mine": _Idle()}
-    runs, less, traces = experiments.regret(BROKK_170, mine, [], start, 5)
+    short = task_sequences(BROKK_170)[:1]
+    runs, less, traces = experiments.regret(BROKK_170, mine, short, start, 5)
     assert (runs, traces, asked[0][4]) == (rows, {"trace": 1}, 5) and asked[0][3] is start
+    assert asked[0][0] is BROKK_170 and asked[0][2] is short
+    bound = asked[0][1]["perfect_model"]
+    assert bound.machine is BROKK_170 and bound.poses is start
     assert list(asked[0][1]) == ["mine", "perfect_model", "perfect_model_no_dither"]
     assert less == {"mine": {s: {"mean": 2.0, "low": 2.0, "high": 2.0} for s in ("x", "all")}}
 
@@ -504,7 +537,10 @@ def test_regret_is_against_the_bound_and_gains_dither_only_where_they_should(
 def test_a_log_of_driven_runs_by_hand() -> None:
     trace = made_up_trace(30, 18)._replace(u=np.full((30, 18, 5), np.float32(0.1)))
     traces = {("rl", "x"): trace, ("pid", "x"): trace, ("rl", "y"): made_up_trace(30, 2)}
+    slow = experiments.driven_log(replace(BROKK_170, rate=10.0), traces, "rl")
     log = experiments.driven_log(BROKK_170, traces, "rl")
+    assert slow.rate == 10.0
+    np.testing.assert_allclose(slow.recordings[3].q_dot, log.recordings[3].q_dot / 2)
     names = [r.name for r in log.recordings]
     assert names == [f"rl_x_{i:02d}" for i in range(16)] + ["rl_y_00", "rl_y_01"]
     assert (log.joints, log.rate, log.velocity_logged) == (BROKK_170.names, 20.0, False)
@@ -562,6 +598,7 @@ def test_sentences_are_put_to_the_papers_baselines_and_to_the_stronger_one(
     assert [claim["numbers"]["n"] for claim in found] == [1, 1, 2, 3, 3, 3]
     assert [claim["stronger"]["numbers"]["n"] for claim in found] == [4, 4, 5, 6, 6, 6]
     assert asked[0] == ("drift_claims", [{"run": 1}], baselines.PAPERS)
+    assert asked[2] == ("tracking_claims", [{"run": 1}], baselines.PAPERS)
     assert asked[3][2] == baselines.STRONGER == asked[5][2]
     for i, name in ((1, "jacobian_pid_k0.1"), (4, "jacobian_pid_ff")):
         assert (

@@ -28,13 +28,13 @@ from helpers_machines import small_net
 from brokk_min import baselines, bus, hw, simulator, wishes
 from brokk_min.__main__ import main
 from brokk_min.actuator import load_net
-from brokk_min.env import observation_scale
+from brokk_min.env import RAMP, observation_scale
 from brokk_min.environments import TaskVectorEnv
 from brokk_min.export import export_onnx
 from brokk_min.gate import encoder_raw
 from brokk_min.logs import read_log
 from brokk_min.machine import BROKK_170
-from brokk_min.policy import Policy, contract, save_policy
+from brokk_min.policy import STAND, Policy, contract, save_policy
 
 GROUP = "239.74.163.2"
 
@@ -239,9 +239,16 @@ def test_the_exported_policy_is_the_policy(policy: Policy, folder: Path) -> None
         assert np.abs(action).max() > 0.3
     model = onnx.load(folder / "p.onnx")
     assert not [t for t in model.graph.initializer if t.external_data]  # one self-contained file
+    assert [node.op_type for node in model.graph.node] == ["Gemm", "Elu"] * 3 + ["Gemm"]
     kept = {p.key: json.loads(p.value) for p in model.metadata_props}
     assert kept["driven"] == ["q1", "q3", "q4", "q5"] and kept["rate"] == 20.0
-    np.testing.assert_array_equal(np.float32(kept["scale"]), policy.scale)
+    for name in ("mean", "scale"):
+        np.testing.assert_array_equal(np.float32(kept.pop(name)), getattr(policy, name))
+    assert (kept.pop("ramp"), kept.pop("stand_s")) == (RAMP, STAND) and kept == dict(policy.contract)
+    assert (model.ir_version, [(o.domain, o.version) for o in model.opset_import]) == (8, [("", 17)])
+    ends = [(end.name, end.shape, end.type) for end in (*session.get_inputs(), *session.get_outputs())]
+    sizes = {"observation": len(policy.mean), "action": 4}
+    assert ends == [(name, ["batch", size], "tensor(float)") for name, size in sizes.items()]
 
 
 def test_missing_extras_are_named(policy: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

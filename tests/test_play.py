@@ -112,6 +112,43 @@ def test_a_key_deflects_little_by_little_and_shift_by_a_third() -> None:
     assert operator.key("left shift").v_goal[0] == pytest.approx(0.1)
 
 
+def test_the_other_way_begins_in_the_middle_and_let_go_is_neutral_at_once() -> None:
+    operator = Operator()
+    assert operator.key("down", seconds=0.05).v_goal[0] == pytest.approx(-0.3 * 0.2)
+    assert operator.key("down", False, seconds=0.01).v_goal[0] == 0
+    operator.key("up")
+    pygame.event.post(pygame.event.Event(pygame.KEYUP, key=pygame.K_UP))
+    assert operator.key("down", seconds=0.05).v_goal[0] == pytest.approx(-0.3 * 0.2)  # in one picture
+
+
+def test_the_first_picture_asks_for_nothing() -> None:
+    ask = Hands(BROKK_170, pygame, MODES).ask(7.0, 0.0)
+    assert ask[:5] == (7.0, 0, False, True, False)
+    assert ask.v_goal.tolist() == [0] * 3 and ask.levers.tolist() == [0] * 4
+
+
+def test_keys_and_a_gamepad_of_few_axes_deflect_no_further_together() -> None:
+    operator, axes = Operator(["levers"]), [-1.0, -1.0, 0.0, -1.0]  # of PAD_AXES 1, 0, 4, 3: not 4
+    operator.hands.pad = SimpleNamespace(
+        get_numaxes=lambda: 4, get_axis=axes.__getitem__, get_numbuttons=lambda: play.PAD_BUTTON,
+        get_button=lambda i: 1,
+    )  # fmt: skip
+    assert operator.key("q").levers.tolist() == [1, 1, 1, 0]  # and it has no dead-man switch
+    axes[:] = [1.0, 1.0, 0.0, 0.0]
+    operator.key("q", False)
+    ask = operator.key("a")
+    assert ask.levers.tolist() == [-1, -1, 0, 0] and not ask.enable
+
+
+def test_keys_want_the_next_line_or_the_same_again_until_it_is_there() -> None:
+    operator = Operator()
+    for key, task in (("return", "next"), ("up", "next"), ("backspace", "again"), ("up", "again")):
+        operator.key(key)
+        assert operator.hands.task_wanted == task
+    operator.event(pygame.JOYBUTTONDOWN, button=9)
+    assert operator.hands.task_wanted == "again"
+
+
 def test_the_switch_counts_only_if_pressed_with_nothing_deflected() -> None:
     operator = Operator()
     assert operator.key("space").enable
@@ -544,6 +581,140 @@ def test_what_the_window_says_fits_and_tells_how_it_went(mode: str) -> None:
         assert any("rectangle by jacobian: 123.4 s" in note for note in look.notes) == bool(mode)
 
 
+def test_what_is_seen_is_what_was_heard_between_two_ticks_and_not_for_long() -> None:
+    session, q = Session(BROKK_170, MODES, None), np.array(START)
+    u, v = np.full(5, 0.1), np.array([0.1, 0.0, 0.2])
+    for hint, said in (("starting", "starting"), ("", "nothing to be heard")):
+        look = session.scene(0.0, "rl", hint)
+        assert np.isnan(look.q).all() and np.isnan(look.q_dot).all()
+        assert not look.u.any() and look.v_goal.tolist() == [0, 0, 0]
+        assert (look.status, look.mood) == (said, "waiting")
+    assert look.path.shape == look.trail.shape == (0, 3)
+    session.take(Known(0, q, 0 * q, u, v, True), 1.0)
+    np.testing.assert_array_equal(session.scene(1.02, "rl", "").q, q)
+    session.take(Known(1, q + 0.02, 0 * q + 0.4, u, v, True), 1.05)
+    for now, share in ((1.05, 0.0), (1.075, 0.5), (1.1, 1.0), (1.54, 1.0)):
+        look = session.scene(now, "rl", "")
+        np.testing.assert_allclose(look.q, q + share * 0.02)
+        assert (look.q_dot == 0.4).all() and look.u is not u and (look.u == u).all() and look.v_goal is v
+        assert (look.status, look.mood) == ("driving", "driving")
+    np.testing.assert_allclose(look.trail, [tool_position(BROKK_170, a) for a in (q, q + 0.02)])
+    late = session.scene(1.56, "rl", "")
+    assert np.isnan(late.q).all() and late.status == "nothing to be heard"
+    session.next_task()
+    look = session.scene(1.1, "rl", "")
+    tool = tool_position(BROKK_170, q + 0.02)
+    np.testing.assert_allclose(look.path, tool + tracing.task_lines(BROKK_170)["rectangle"])
+    np.testing.assert_array_equal(look.target, look.path[:1])
+    np.testing.assert_allclose(look.hold, np.vstack([look.path, tool]))
+    assert session.tracing is not None and session.tracing.task == "rectangle" and not len(look.trail)
+    session.tracing.passed = 2
+    np.testing.assert_array_equal(session.scene(1.1, "rl", "").target, look.path[2:3])
+    looks_of = {mode: session.scene(1.1, mode, "") for mode in (*MODES, "")}
+    colours = [look.colour for look in looks_of.values()]
+    assert colours == [*view.COLOURS.values(), view.STEEL]
+    assert [look.title for look in looks_of.values()] == [*(view.TITLES[mode] for mode in MODES), "brokk170"]
+
+
+@pytest.mark.parametrize(
+    ("state", "hint", "said", "mood"),
+    [
+        ({"driving": True, "wrong": 1}, "a hint", "driving", "driving"),
+        ({"wrong": 30, "fault": 1}, "a hint", "waiting: valve controller: heartbeat lost", "waiting"),
+        ({"fault": 30}, "a hint", "stopped: valve controller: heartbeat lost", "waiting"),
+        ({}, "hold SPACE", "hold SPACE", "ready"),
+        ({}, "", "ready", "ready"),
+    ],
+)
+def test_the_gates_state_is_said(state: dict[str, Any], hint: str, said: str, mood: str) -> None:
+    known = Known(0, np.array(START), *np.zeros((2, 5)), np.zeros(3), False)._replace(**state)
+    assert play._status(BROKK_170, known, hint) == (said, mood)
+
+
+def test_the_operator_is_told_what_to_do_next() -> None:
+    session, hands = Session(BROKK_170, MODES, None), Operator().hands
+    assert play._hint(session, hands) == "starting"
+    session.known = Known(0, np.array(START), *np.zeros((2, 5)), np.zeros(3), False)
+    hands.focus, hands.blocked, hands.pad = False, True, None
+    assert play._hint(session, hands) == "neutral: the window has no focus"
+    hands.focus = True
+    assert play._hint(session, hands) == "release the switch, then press it with nothing deflected"
+    hands.blocked = False
+    assert play._hint(session, hands) == "ready: hold SPACE"
+    hands.pad = object()
+    assert play._hint(session, hands) == "ready: hold SPACE or button 5"
+    watches = Session(BROKK_170, [], None)
+    assert play._hint(watches, hands) == "nobody sends SYNC: start what drives, or use --drive"
+    watches.known = session.known
+    assert play._hint(watches, hands) == "watching"
+
+
+def test_notes_tell_keys_task_and_how_it_went(tmp_path: Path) -> None:
+    session = Session(BROKK_170, MODES, tmp_path / "attempts.csv")
+    assert session.notes("") == ["only listening: nothing is sent; --drive drives", "ESC: end"]
+    keys = "SHIFT: slow  TAB: who translates  ENTER: next line  BACKSPACE: again  ESC: end"
+    assert session.notes("rl") == ["hold SPACE to drive    arrows: x, y    W/S: up, down", keys]
+    levers = "hold SPACE to drive    q/a: q1  w/s: q3  e/d: q4  r/f: q5"
+    assert session.notes("levers") == [levers, keys]
+    rest = Known(0, np.array(START), *np.zeros((2, 5)), np.zeros(3), True)
+    session.take(rest, 0.0)
+    session.next_task()
+    assert session.tracing is not None
+    session.tracing.passed, session.tracing.seconds = 3, 1.25
+    line = f"rectangle: follow the orange line to its ring, 1.2 s, 3 of {len(session.tracing.line)}"
+    assert session.notes("rl")[2:] == [line]
+    attempt = Attempt("now", "rectangle", "jacobian", 12.0, 0.01, 0.03, 7.0)
+    session.tracing = SimpleNamespace(  # type: ignore[assignment]
+        p=[], follow=lambda known: True, score=lambda mode: attempt._replace(mode=mode)
+    )
+    session.take(rest._replace(mode=1), 0.0)
+    assert session.tracing is None and session.done == attempt and session.attempts == [attempt]
+    figures = "12.0 s, off by 0.010 m, at most 0.030 m, valves 7"
+    assert session.notes("rl")[2:] == [
+        f"rectangle by jacobian: {figures}",
+        f"mean of 1 by jacobian: {figures}",
+    ]
+    assert Session(BROKK_170, MODES, tmp_path / "attempts.csv").attempts == [attempt]  # kept at once
+
+
+def test_the_window_asks_hears_and_tells_picture_by_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[remote.Ask] = []
+    shown: list[Any] = []
+    taken: list[float] = []
+    pygame.display.set_mode((10, 10))
+    pygame.event.clear()
+    window: Any = SimpleNamespace(pygame=pygame, show=lambda *a: shown.append(a))
+    session = Session(BROKK_170, MODES, None)
+    rest = Known(0, np.array(START), *np.zeros((2, 5)), np.zeros(3), False)
+    heard = [None, rest, rest, rest._replace(tick=1), rest._replace(tick=2)]
+    inner = session.take
+    monkeypatch.setattr(session, "take", lambda known, now: taken.append(known.tick) or inner(known, now))
+    monkeypatch.setattr(view, "draw", lambda machine, scenes, size: (machine, scenes[0].status, size))
+    presses = [[], [], ["return"], ["return"], ["backspace", "tab"], ["escape"]]
+    tasks: list[tuple[str, Any]] = []
+
+    def watcher(seen: Session, hands: Hands) -> bool:
+        assert seen is session
+        tasks.append((session.task, session.tracing))
+        for name in presses.pop(0):
+            pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=pygame.key.key_code(name)))
+        return bool(presses)
+
+    why: list[str | None] = [None] * 5
+    play.show(window, session, lambda: heard.pop(0), told.append, lambda: why.pop(0), watcher)
+    assert taken == [0, 1, 2] and [task for task, _ in tasks] == ["", "", "", "rectangle", "circle", "circle"]
+    assert tasks[5][1] is not tasks[4][1]  # begun again
+    hint = "ready: hold SPACE"
+    wanted = [((BROKK_170, said, play.SIZE), 60.0) for said in ("starting", hint, hint, hint, hint)]
+    assert shown == wanted
+    assert [ask.stop for ask in told] == [False] * 5 + [True]
+    assert told[4].mode == 1 and [a.time for a in told] == sorted(a.time for a in told)
+    presses[:] = [[]] * 2
+    with pytest.raises(ValueError, match=r"^play: expected a loop that runs, got its end$"):
+        play.show(window, session, lambda: None, told.append, lambda: "its end", lambda *a: True)
+    assert told[-1].stop and not told[-1].enable
+
+
 def test_a_line_is_done_when_all_its_points_were_passed_in_order() -> None:
     line = tool_position(BROKK_170, START) + np.array([[0.0, 0, 0], [0, 0.3, 0], [0, 0.6, 0]])
     work = Tracing(BROKK_170, "line", line)
@@ -688,6 +859,7 @@ def test_a_log_tells_what_the_loop_knew(tmp_path: Path) -> None:
     for a, b in zip(run.known, told, strict=True):
         for name in ("q", "q_dot", "u", "v_goal"):
             np.testing.assert_allclose(getattr(a, name), getattr(b, name), atol=2e-5, err_msg=name)
+    assert (run.title, run.colour, run.path.shape) == ("run.log", (1, 2, 3), (0, 3))
     assert run.error[5] > 0.15 and run.error[-5:].mean() < 0.08  # it waits for the valves, then follows
     idle = tmp_path / "idle.log"
     idle.write_text("(1.0) can0 080# R\n(1.05) can0 080# R\n")

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from conftest import Stand
 from helpers_machines import obedient_net, obedient_velocity, random_machine, small_net
 
 from benchmarks.rollout import random_net
@@ -44,6 +45,8 @@ def test_response_times_of_a_pure_delay_by_hand(late):
     assert angles.shape == (61, 2, 2, 2, 2)
     times = preliminary.response_times(angles, 20.0)
     np.testing.assert_allclose(times, (late + 0.63 - 0.5) / 20, atol=1e-9)
+    speeds = preliminary.step_velocity(angles, 20.0)
+    np.testing.assert_allclose(speeds[-1], [[[0.2, 0.2], [0.4, 0.4]]] * 2)  # positive up and down
 
 
 def test_only_the_stepping_joint_moves_away_from_the_end_behind_it():
@@ -67,6 +70,7 @@ def test_a_joint_that_does_not_answer_has_no_response_time():
     assert np.isnan(times[0, 1]).all() and np.isfinite(times[0, 0]).all()
     assert np.isnan(times[1]).all()  # it moves before the step as after it
     named = preliminary.named_times(times, ("a", "b"))
+    assert {kind for of in named.values() for kind in of} == {"idle", "moving"}
     assert named["b"]["idle"]["down"] is None and named["b"]["idle"]["up"] == pytest.approx(0.0065)
 
 
@@ -79,13 +83,18 @@ def test_the_plants_response_times_are_the_papers():
 
 
 def test_a_joint_is_brought_into_motion_beyond_its_dead_zone():
+    """Three ticks late; two dead zones, and a valve that opens with the fourth power."""
+
     def move(q: np.ndarray, u: np.ndarray) -> np.ndarray:
-        speed = np.sign(u) * np.maximum(0, np.abs(u) - np.array([0.07, 0.45]))
+        u = np.concatenate([np.zeros((3, *u.shape[1:])), u])[: len(u)]
+        beyond = np.maximum(0, np.abs(u) - np.array([0.07, 0.45, 0.0]))
+        speed = np.sign(u) * beyond ** np.array([1, 1, 4])
         return np.concatenate([q[None], q + np.cumsum(speed, axis=0) / 20])
 
-    before = preliminary.step_commands(move, -np.ones(2), np.ones(2), np.array([0.6, 1.0]), 20)
-    # tenths of the level that move by a twentieth of the full speed: 0.12 and 0.5
-    np.testing.assert_allclose(before, [(0.12 + 0.6) / 2, (0.5 + 1.0) / 2])
+    level = np.array([0.6, 1.0, 1.0])
+    before = preliminary.step_commands(move, -np.ones(3), np.ones(3), level, 20)
+    # tenths of the level that move by a twentieth of the full speed: 0.12, 0.5 and 0.5
+    np.testing.assert_allclose(before, [(0.12 + 0.6) / 2, (0.5 + 1.0) / 2, (0.5 + 1.0) / 2])
 
 
 # --- sweeps -----------------------------------------------------------------------------------------
@@ -152,6 +161,30 @@ def test_the_gap_of_a_machine_to_itself_is_none(monkeypatch):
     assert all(row["difference_rms"] == 0 for row in numbers["sweep"].values())
     assert list(numbers["sweep"]) == ["u = 50", "u = 80", "u = 175", "u = 205"]
     assert numbers["coupling_rms"]["machine"] < 0.002  # "marginal and neglectable"
+
+
+def test_the_gap_starts_where_the_papers_does_or_amid_the_ranges(stand: Stand, monkeypatch):
+    u, seen = np.random.default_rng(0).uniform(-0.3, 0.3, (25, 2, 5)), []
+    tape = Log(BROKK_170.names, tuple(Recording(str(i), row, row, row) for i, row in enumerate(u)))
+    calls = stand(excitation, task_log=tape)
+
+    def still(q: np.ndarray, u: np.ndarray) -> np.ndarray:
+        seen.append((q, u))
+        return np.repeat(q[None], len(u) + 1, axis=0)
+
+    monkeypatch.setattr(preliminary, "movers", lambda *a: {"machine": still, "nets": still})
+    net = random_net(np.random.default_rng(0))
+    starts = {"brokk170": [1.5, 0.5, 0.58, 1.71, 1.24], "other": (LOW + HIGH) / 2}
+    for name, start in starts.items():
+        machine = replace(BROKK_170, name=name)
+        preliminary.sim_to_real(machine, net, 7)
+        of, num, seconds, rng, given = calls["task_log"]
+        assert (of, num, seconds) == (machine, 25, 30.0)
+        assert rng.bit_generator.state == np.random.default_rng(7).bit_generator.state
+        np.testing.assert_array_equal(given, start)
+        np.testing.assert_array_equal(seen[-1][0], np.tile(start, (20, 1)))
+        driven = [i for i in range(25) if i % 5 < 4]  # the fifth has its locked joint move
+        np.testing.assert_array_equal(seen[-1][1], np.stack(u[driven], axis=1))
 
 
 def test_the_gap_is_between_tools_where_the_arms_end(monkeypatch):
@@ -378,7 +411,8 @@ def test_creep_is_the_largest_drift_of_a_joint_without_a_command(monkeypatch):
     net = random_net(np.random.default_rng(0))
 
     def drifting(q: np.ndarray, u: np.ndarray) -> np.ndarray:
-        assert not u.any()
+        assert not u.any() and u.shape == (200, 21, 5)  # 10 s
+        np.testing.assert_allclose(q, np.linspace(net.q_low, net.q_high, 21))
         return q + np.arange(len(u) + 1)[:, None, None] / 20 * 0.003 * (q == q.max(axis=0))
 
     monkeypatch.setattr(trust, "net_mover", lambda _: drifting)
@@ -396,18 +430,18 @@ def test_a_net_that_is_no_better_than_a_linear_model_is_told_so():
 
 
 def test_tool_errors_by_hand(monkeypatch):
-    """q1 off by 0.01 rad a second at 3.05 m from the slew axis."""
+    """q1 off by 0.01 rad a second at 3.05 m from the slew axis, where the tool is at the end of each run."""
     q = np.tile([1.5, 0.5, 0.58, 1.71, 1.24], (150, 1))
-    test = Log(BROKK_170.names, (Recording("x", 0 * q, q, 0 * q),))
-    error = lambda net, samples, starts, ticks: (  # noqa: E731
-        np.arange(1, ticks + 1)[:, None, None]
-        / 20
-        * np.array([0.01, 0, 0, 0, 0])
-        * np.ones((len(starts), 1)),
-        None,
-    )
+    q[:20, 3] += 0.5  # nearer at first
+    test, net = Log(BROKK_170.names, (Recording("x", 0 * q, q, 0 * q),)), random_net(np.random.default_rng(0))
+
+    def error(of: ActuatorNet, samples: fitting.Samples, starts: np.ndarray, ticks: int) -> tuple:
+        assert of is net and samples.whole.q.tolist() == q.tolist()
+        seconds = np.arange(1, ticks + 1)[:, None, None] / 20
+        return seconds * np.array([0.01, 0, 0, 0, 0]) * np.ones((len(starts), 1)), None
+
     monkeypatch.setattr(scores, "run_errors", error)
-    errors = trust.tool_errors(BROKK_170, random_net(np.random.default_rng(0)), test)
+    errors = trust.tool_errors(BROKK_170, net, test)
     assert errors == {"1": pytest.approx(0.0305, abs=2e-4), "5": pytest.approx(0.1525, abs=1e-3)}
 
 
@@ -549,6 +583,8 @@ def test_what_is_held_against_the_training_by_hand():
         assert outside["command"][0] == share, beyond
         high = np.array([*np.tile([0.5, 0.5], 6), *np.tile([1.018 + beyond, 0.5], 30)])
         assert trust.outside_training(known, taped(high, 3 + 0 * high), 12)["command"][0] == share
+        far = np.tile([3.5, 3.998 + 0.02 * 1.996 + 20 * (beyond - 0.001)], 36)  # of 2.002 to 3.998
+        assert trust.outside_training(known, taped(0.5 + 0 * far, far), 12)["angle"][0] == share
 
 
 def test_the_judge_puts_its_parts_together(monkeypatch):

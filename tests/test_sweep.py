@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from conftest import Stand
 from helpers_machines import small_net
 from helpers_sweep import die_until, refuse
 
-from brokk_min import baselines
+from brokk_min import baselines, experiments
 from brokk_min import sweep as module
 from brokk_min.__main__ import main
 from brokk_min.actuator import save_net
 from brokk_min.env import TaskConfig
 from brokk_min.machine import BROKK_170, Machine
 from brokk_min.metrics import mean_interval
+from brokk_min.policy import PolicyController
 from brokk_min.ppo import PPOConfig, train
 from brokk_min.sequences import Commands, axis_sequences
 from brokk_min.sweep import apart, one_seed, sweep, workers
@@ -82,7 +87,11 @@ def test_a_seed_counts_once_in_the_table() -> None:
     assert figures["rl"]["off_axis_drift_max"]["mean"] == 4.0
     lines = module.show(figures).splitlines()
     assert lines[1].startswith("rl ") and "2.5000 +- 12.7062" in lines[1]
-    assert "+-" not in lines[2] and "-3.0000 +- 12.7062" in lines[3]
+    columns = "x [m/s]", "y [m/s]", "z [m/s]", "all [m/s]", "drift [m]", "travel [1]"
+    assert lines[0] == f"{'mean and 95 % interval':28}" + "".join(f" {name:>18}" for name in columns)
+    pid = "5.5000", "5.5000", "5.5000", "5.5000", "10.0000", "10.0000"  # alone, so without an interval
+    assert lines[2] == f"{'pid':28}" + "".join(f" {text:>18}" for text in pid)
+    assert "-3.0000 +- 12.7062" in lines[3]
     assert list(module.table([], beside)) == ["pid"]
 
 
@@ -172,6 +181,66 @@ def test_a_policy_without_its_figures_is_driven_and_not_trained_again(
     (tmp_path / "seed_0.json").write_text("{")
     with pytest.raises(ValueError, match=r"seed_0\.json: expected the result of a seed, got JSONDec"):
         one_seed(*arguments)
+
+
+def test_a_seed_goes_on_where_it_was_left_and_its_file_says_what_it_is(stand: Stand, tmp_path: Path) -> None:
+    trained, sequences = SimpleNamespace(), [SimpleNamespace(name="x")]
+    calls = stand(module, train=trained, identity_of={"nets": "n"}, task_sequences=sequences)
+    stand(module, scored_starts="poses")
+    stand(experiments, task_space=(["run"], {}))
+    arguments = (BROKK_170, NET, TASK, TINY, 3, tmp_path, 5)
+    assert one_seed(*arguments) == ["run"]
+    assert calls["train"] == (BROKK_170, NET, TASK, TINY, 3, tmp_path / "seed_3.npz", False)
+    assert calls["scored_starts"] == (BROKK_170, 5, sequences, 2)  # those of `evaluate`, whatever the seed
+    rl = {"rl": PolicyController(BROKK_170, trained)}  # type: ignore[arg-type]
+    assert calls["task_space"] == (BROKK_170, rl, sequences, "poses", 0)
+    identity = {"nets": "n", "starts": 5, "sequences": ["x"]}
+    result = tmp_path / "seed_3.json"
+    assert json.loads(result.read_text()) == {"identity": identity, "runs": ["run"]}
+    result.unlink()
+    (tmp_path / "seed_3.npz.checkpoint").touch()
+    one_seed(*arguments)
+    assert calls["train"][6] is True
+
+
+def test_a_sweep_has_baselines_beside_and_says_what_it_is_of(
+    stand: Stand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[object] = []
+    rows: dict[int, list[dict[str, object]]] = {3: seed_rows(1.0), 4: seed_rows(3.0)}
+
+    @contextmanager
+    def at_once(scheduler: str | None) -> Iterator[Callable[..., Future[object]]]:
+        def submit(function: Callable[..., object], *arguments: object) -> Future[object]:
+            asked.append(arguments)
+            future = Future[object]()
+            try:
+                future.set_result(function(*arguments))
+            except KeyError:
+                future.set_exception(ValueError("why"))
+            return future
+
+        asked.append(scheduler)
+        yield submit
+
+    beside = [row | {"controller": "pid"} for row in seed_rows(5.0)]
+    calls = stand(module, read_gains={"pid": "tuned"}, _on_the_machine=beside)
+    monkeypatch.setattr(module, "workers", at_once)
+    monkeypatch.setattr(module, "one_seed", lambda *a: rows[a[4]])
+    out, how = tmp_path / "a" / "b", (2, "tcp://a:1", Path("g.json"))
+    figures = sweep(BROKK_170, NET, TASK, replace(TINY, threads=4), [4, 3], out, *how)
+    one = (BROKK_170, NET, TASK, TINY, 4, out.resolve(), 2)
+    assert asked == ["tcp://a:1", one, (*one[:4], 3, *one[5:])]
+    assert calls["read_gains"] == (Path("g.json"), BROKK_170, NET)
+    assert calls["_on_the_machine"] == (BROKK_170, {"pid": "tuned"}, 2)
+    written = json.loads((out / "sweep.json").read_text())
+    about = experiments.meta(BROKK_170, 3) | baselines.tuned_for(BROKK_170, NET) | {"seeds": 2, "failed": {}}
+    assert written["meta"] == about and written["table"] == figures == module.table([*rows.values()], beside)
+    assert written["runs"] == [{"seed": n} | row for n in rows for row in rows[n]] + beside
+    rows.clear()
+    with pytest.raises(ValueError, match=r"^seed 3: why; seed 4: why$"):
+        sweep(BROKK_170, NET, TASK, TINY, [4, 3], out, *how)
+    assert json.loads((out / "sweep.json").read_text())["meta"]["failed"] == {"3": "why", "4": "why"}
 
 
 def test_a_cluster_gives_the_same_files(tmp_path: Path) -> None:

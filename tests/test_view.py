@@ -230,6 +230,10 @@ def test_a_limit_and_a_singularity_warn_in_red() -> None:
     )
     stretched = np.array([0.3, 0.4, 0.0, np.pi, 3 * np.pi / 4])
     shapes = draw(wide, [scene(stretched)], SIZE)
+    rings = [s for s in shapes if isinstance(s, Line) and s.colour == view.WARNING and len(s.points) == 25]
+    tips = [camera.project(tool_position(wide, stretched)) for camera in eyes(wide, stretched)]
+    np.testing.assert_allclose([ring.points[:-1].mean(axis=0) for ring in rings], tips)
+    assert not [s for s in clean if isinstance(s, Line) and s.colour == view.WARNING]
     assert "near a singularity" in words(shapes)
     value, way = looks.weakest(wide, stretched)
     outward = np.array([np.cos(0.3) * np.cos(0.4), np.sin(0.3) * np.cos(0.4), np.sin(0.4)])
@@ -249,6 +253,7 @@ def test_the_weakest_way_bounds_manipulability(seed: int) -> None:
 def test_unknown_positions_and_states_are_said() -> None:
     shapes = draw(BROKK_170, [scene(np.full(5, np.nan), status="waiting: q1: silent", mood="waiting")], SIZE)
     assert {"no positions", "waiting: q1: silent"} <= set(words(shapes))
+    assert {"side view, grid 1 m", "top view, grid 1 m"} <= set(words(draw(BROKK_170, [scene()], SIZE)))
     assert picture(shapes, SIZE).std() > 0
 
 
@@ -281,6 +286,25 @@ def test_no_text_is_cut_off_or_lies_on_another(n: int, arms: int, size: tuple[in
         assert (one[:2] >= other[2:]).any() or (other[:2] >= one[2:]).any(), (a, b)
     tracks = [s.points for s in shapes if isinstance(s, Polygon) and s.colour == view.TRACK]
     assert min(track[1, 0] - track[0, 0] for track in tracks) > 10
+
+
+def test_shapes_are_painted_where_they_are_and_as_large() -> None:
+    red, blue, green, paper = (200, 0, 0), (0, 0, 200), (0, 150, 0), view.PAPER
+    corner = np.array([[5.0, 5], [5, 35], [35, 35]])
+    square = np.array([[44.0, 20], [52, 20], [52, 28], [44, 28]])
+    shapes = [Line(corner, red, 4), Circle(np.array([25.0, 15]), 5, blue), Polygon(square, green)]
+    image = picture(shapes, (60, 40))
+
+    def across(row: int, colour: tuple[int, int, int]) -> list[int]:
+        return np.flatnonzero((image[row] == colour).all(axis=-1)).tolist()
+
+    assert across(20, red) == [4, 5, 6] and across(35, red) == list(range(5, 35))  # open: no way back
+    assert across(15, blue) == list(range(20, 30)) and across(24, green) == list(range(44, 52))
+    assert (image[20, 8:44] == paper).all()
+    for anchor, left in ((0.0, 21), (0.5, 7), (1.0, 0)):  # where the word begins, its middle or its end
+        image = picture([Text((20, 15), "HHH", 12, red, anchor)], (60, 40))
+        rows, columns = (image != paper).any(axis=-1).nonzero()
+        assert columns.min() == left and (rows.min(), rows.max()) == (11, 19)
 
 
 def test_text_stays_legible_over_an_arm() -> None:
