@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -47,7 +48,7 @@ TUNED = baselines.read_gains(GAINS, BROKK_170, load_policy(POLICY, BROKK_170).ne
 
 
 def run(line: str, *more: object) -> int:
-    return main([*line.split(), *map(str, more)])
+    return main([*shlex.split(line), *map(str, more)])
 
 
 # --- the command line -----------------------------------------------------------------------------------
@@ -133,9 +134,9 @@ def test_a_simulated_machine_gets_its_bus_start_and_record(
     ("options", "kind"),
     [
         ("--controller jog --joint q4 --counts 9", wishes.Jog),
-        (f"--policy {POLICY}", PolicyController),
-        (f"--policy {POLICY} --controller jacobian", JacobianController),
-        (f"--policy POLICY --controller jacobian --gains {GAINS}", JacobianController),
+        (f"--policy '{POLICY}'", PolicyController),
+        (f"--policy '{POLICY}' --controller jacobian", JacobianController),
+        (f"--policy POLICY --controller jacobian --gains '{GAINS}'", JacobianController),
     ],
 )
 def test_a_log_is_compared_with_the_controller_that_is_named(
@@ -242,7 +243,7 @@ def test_what_is_exported_is_the_policy_that_is_named(
     stand: Stand, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     calls = stand(operating, export_onnx=None, load_policy="policy")
-    assert run(f"export --policy {POLICY} --out", tmp_path / "p.onnx") == 0
+    assert run(f"export --policy '{POLICY}' --out", tmp_path / "p.onnx") == 0
     assert calls == {"load_policy": (POLICY, BROKK_170), "export_onnx": (tmp_path / "p.onnx", "policy")}
     assert capsys.readouterr().out.startswith(f"{tmp_path / 'p.onnx'}: observation (batch, obs) in")
 
@@ -268,7 +269,7 @@ def test_the_game_gets_controllers_bus_and_files(
     assert where == Where("socketcan", "can0", log) and attempts == tmp_path / "a.csv"
     assert capsys.readouterr().err == "gains of the Jacobian controller: set by hand\n"
     assert by_hand["jacobian"].k == 0.1 and (by_hand["jacobian"].gains != TUNED.gains).any()
-    assert run(f"play --policy {tmp_path / 'p.npz'} --gains {GAINS}") == 0
+    assert run(f"play --policy {tmp_path / 'p.npz'} --gains '{GAINS}'") == 0
     assert (calls.pop("play")[1]["jacobian"].gains == TUNED.gains).all()
     assert run(f"play {bus}") == 0
     assert calls.pop("watch") == (BROKK_170, Where("socketcan", "can0", log)) and not calls
