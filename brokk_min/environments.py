@@ -155,8 +155,8 @@ def _open(machine: Machine, actuator: ActuatorNet | Path | str) -> ActuatorNet |
 def _keep_freed_memory() -> None:
     """Let the process keep the memory of arrays that it drops, 32 MB each at most, for the next ones.
 
-    glibc would hand it back and fetch it anew in each step, page by page: a seventh of the time of 256
-    environments, two fifths of 4096. Other C libraries do as they do.
+    glibc would hand it back and fetch it anew in each step, page by page, the more environments the more.
+    Other C libraries do as they do.
     """
     with contextlib.suppress(AttributeError, OSError, TypeError):
         mallopt, trim_threshold, mmap_threshold = ctypes.CDLL(None).mallopt, -1, -3
