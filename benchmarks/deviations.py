@@ -231,7 +231,7 @@ def d7() -> dict[str, float]:
 
     def newest(machine: machine.Machine, values: env.Array) -> env.Array:
         q = angles(machine, values)
-        q[..., machine.driven] = env._samples(machine, values)[..., 0, -1]
+        q[..., machine.driven] = env._moving(machine, values)[..., 0, -1]
         return q
 
     with mock.patch.object(env, "_angles", newest):
@@ -269,8 +269,8 @@ def d14() -> dict[str, float]:
     """A policy trained on nets that go on from what encoders say."""
     ours, push = as_it_is(), env.push_motion
 
-    def stepwise(machine: machine.Machine, history: env.Array, q: env.Array) -> env.Array:
-        return push(machine, history, read_encoder(machine, q))
+    def stepwise(machine: machine.Machine, history: env.Array, u: env.Array, q: env.Array) -> env.Array:
+        return push(machine, history, u, read_encoder(machine, q))
 
     with mock.patch.object(env, "push_motion", stepwise):
         return beside(**{"encoder steps": trained(TaskConfig())}, ours=ours)

@@ -44,21 +44,22 @@ def rest_history(q: ArrayLike, samples: int) -> Array:
 
 def push_command(history: Array, u: ArrayLike) -> Array:
     """History (..., n, 3, H) and the command `u` (..., n) of this tick: the nets' input. Paper: Table 1"""
-    result = history.copy()
+    result = history.copy(order="K")  # a choice of joints has them outermost, as products want them
     result[..., 2, :-1] = history[..., 2, 1:]
     result[..., 2, -1] = u
     return result
 
 
-def push_angle(history: Array, q: ArrayLike, velocity: Callable[[Array], Array]) -> Array:
-    """History (..., n, 3, H) of `push_command` with the next measured angle `q` (..., n) appended.
+def push(history: Array, u: ArrayLike, q: ArrayLike, velocity: Callable[[Array], Array]) -> Array:
+    """History (..., n, 3, H) a tick on: the command `u` was sent, then the angle `q` measured, (..., n) both.
 
     `velocity` turns the angles in the history (..., n, H) into the newest velocity (..., n) [rad/s].
     """
-    result = history.copy()
-    result[..., :2, :-1] = history[..., :2, 1:]
+    result = np.empty(history.shape, history.dtype)
+    result.reshape(-1)[:-1] = history.reshape(-1)[1:]  # all rows at once; their newest samples follow
     result[..., 0, -1] = q
     result[..., 1, -1] = velocity(result[..., 0, :])
+    result[..., 2, -1] = u
     return result
 
 
@@ -160,7 +161,7 @@ class ActuatorNet:
         if history.shape[-3:] != (n, 3, self.history):
             raise ValueError(f"history: expected (..., {n}, 3, {self.history}), got {history.shape}")
         if self.dead_zone:
-            history = history.copy(order="K")  # the simulation's has joints outermost, as products want them
+            history = history.copy(order="K")
             history[..., 2, :] = valve_scale(history[..., 2, :].copy(order="K"), self.dead_zone)
         return history.reshape(*history.shape[:-2], 3 * self.history)
 
@@ -189,8 +190,7 @@ class ActuatorNet:
 
         No joint goes further than it went in training.
         """
-        history = push_command(history, u)
-        predicted = self.predict(history)
+        predicted = self.predict(push_command(history, u))
         free, before = q + predicted / self.rate, q
         q = np.clip(free, np.minimum(q, self.q_low), np.maximum(q, self.q_high))
 
@@ -199,7 +199,7 @@ class ActuatorNet:
                 return np.where(q == free, predicted, (q - before) * self.rate)
             return estimate_velocity(angles, self.velocity_samples, 1 / self.rate)
 
-        return push_angle(history, q, velocity), q
+        return push(history, u, q, velocity), q
 
 
 NET_ARRAYS = ("input_mean", "input_scale", "output_low", "output_high", "q_low", "q_high")

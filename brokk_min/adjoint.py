@@ -79,7 +79,7 @@ def _each_tick(
     """What a tick does by itself, (T, num, n_driven, ...): rewards by its velocities, these by the history
     (3, H) with the new command in it, and 1 where the joint is not held by the end of its range."""
     driven = machine.driven
-    velocity, by_history = net.slope(push_command(rollout.motion, rollout.u)[..., driven, :, :])
+    velocity, by_history = net.slope(push_command(rollout.motion[..., driven, :, :], rollout.u[..., driven]))
     moved = rollout.q[..., driven] + velocity * machine.dt
     q = rollout.q.copy()
     q[..., driven] = np.clip(moved, machine.column("q_min")[driven], machine.column("q_max")[driven])

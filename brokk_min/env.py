@@ -7,14 +7,16 @@ for Gymnasium), with a plant the evaluation; `observe` and `to_command` serve th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from itertools import chain
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brokk_min.actuator import ActuatorNet, push_angle, push_command, rest_history
+from brokk_min.actuator import ActuatorNet, push, push_command, rest_history
 from brokk_min.kinematics import (
     damped_rates,
     lowest_point,
@@ -36,6 +38,7 @@ from brokk_min.plant import PlantState, plant_reset, plant_step
 
 GROUND_MARGIN = 0.3  # m above the ground below which no goal asks the arm to sink, assumed
 LAG_TIME, LAG_SPEED = 2.0, 0.07  # s and a share of tool_speed, tuned: see `push_lag`
+AXES = np.vstack([np.eye(3), -np.eye(3)])  # x, y, z, and back
 RAMP = 0.01  # of the command limit, assumed: actions this small take a command through the dead zone
 Bools = NDArray[np.bool_]
 Encoder = Callable[[Machine, Array], Array]  # machine and true angles -> angles read
@@ -95,12 +98,12 @@ class Measured(NamedTuple):
 
 
 class _Layout(NamedTuple):
-    """How a machine's observation is standardised, float32 (obs,) each; see `observation_scale`."""
+    """How a machine's observation is standardised, float32, (obs,) unless noted; see `observation_scale`."""
 
     mean: Array
     scale: Array
-    sensed: Array  # what noise of 1 does to what sensors say, in physical units; 0 for the rest
     paper: Array  # factors that make it the paper's: weights undone, wanted rates blanked
+    sensed: Array  # standard deviations of what sensors say, in physical units: all after the goal, (sensed,)
     told: Array  # of a joint's angles and velocities [1, s], their sum tells where it is now, (2, H)
 
 
@@ -111,28 +114,27 @@ def _layout(machine: Machine) -> _Layout:
         middle = (machine.column("q_min") + machine.column("q_max")) / 2
         angle, rate = _spread(machine)
         speed, command = machine.tool_speed / 3**0.5, machine.pwm_limit / PWM_MAX / 3**0.5
-        three, each, zero = np.ones(3), np.ones(samples), np.zeros(len(driven))
-        # mean, standard deviation, weight, 1 if a sensor says it
-        blocks: list[tuple[Array, Array, float, int]] = [
-            (0 * three, speed * three, 1.4, 0),
-            (0 * three, speed * three, 1.4, 1),
-            (middle[rest], angle[rest], 1.4, 1),
+        each, share = np.ones(samples), samples**-0.5
+        moving = (((middle[j], angle[j] * each, share), (0, rate[j] * each, share)) for j in driven)
+        # mean, standard deviation, weight
+        blocks: list[tuple[Any, Array, float]] = [
+            (0, np.full(3, speed), 1.4),  # goal
+            (0, np.full(3, speed), 1.4),  # tool velocity: here begins what sensors say
+            (middle[rest], angle[rest], 1.4),
+            *chain.from_iterable(moving),  # here it ends
+            (0, np.full(samples * len(driven), command), share),
+            (0, rate[driven], 4.2),
+            (0, 0.1 * rate[driven], 4.2),
         ]
-        for joint in driven:
-            blocks += [
-                (middle[joint] * each, angle[joint] * each, samples**-0.5, 1),
-                (0 * each, rate[joint] * each, samples**-0.5, 1),
-                (0 * each, command * each, samples**-0.5, 0),
-            ]
-        blocks += [(zero, rate[driven], 4.2, 0), (zero, 0.1 * rate[driven], 4.2, 0)]
-        columns = zip(*((m, d / w, w * s + 0 * m, 1 / w + 0 * m) for m, d, w, s in blocks), strict=True)
-        mean, scale, sensed, paper = (np.concatenate(a).astype(np.float32) for a in columns)
+        columns = zip(*((m + 0 * d, d / w, d, 1 / w + 0 * d) for m, d, w in blocks), strict=True)
+        mean, scale, deviation, paper = (np.concatenate(a).astype(np.float32) for a in columns)
         paper[-2 * len(driven) :] = 0
+        sensed = deviation[3 : 6 + len(rest) + 2 * samples * len(driven)]
         # velocity j is in j of H sums, and late by half its window: to it comes so often what it grew by
         late = machine.velocity_samples / 2 - 1
         turned = (np.arange(samples) - late + late * samples * (np.arange(samples) == samples - 1)) / samples
         told = np.stack([each / samples, machine.dt * turned]).astype(np.float32)
-        machine.__dict__["layout"] = _Layout(mean, scale, sensed * scale, paper, told)
+        machine.__dict__["layout"] = _Layout(mean, scale, paper, sensed, told)
     layout: _Layout = machine.__dict__["layout"]
     return layout
 
@@ -165,12 +167,13 @@ def paper_view(machine: Machine) -> Array:
 def observe(
     machine: Machine, history: Array, v_goal: ArrayLike, lag: Array, noise: Array | float = 0.0
 ) -> Array:
-    """What the policy sees: goal and tool velocity, locked angles, driven histories, wanted joint rates.
+    """What the policy sees: goal and tool velocity, locked angles, driven joints' histories, wanted rates.
 
-    Velocities are given along the tool's heading: outward from the z axis, sideways, up. What a slewing
-    arm has to do then does not depend on where it points. Wanted rates are the joint rates that would
-    give the goal velocity, and those that would make up for `lag` (both by `joint_rates`). The arm is taken
-    to stand where all that is seen of its angles says, see `_angles`.
+    Histories are angles and velocities joint by joint, then commands. Tool velocities are given along the
+    tool's heading: outward from the z axis, sideways, up. What a slewing arm has to do then does not depend
+    on where it points. Wanted rates are the joint rates that would give the goal velocity, and those that
+    would make up for `lag` (both by `joint_rates`). The arm is taken to stand where all that is seen of its
+    angles says, see `_angles`.
 
     Paper: Sec. 3.4 (present and target tool velocity, the actuator nets' inputs), Fig. 3; rates are ours
 
@@ -179,17 +182,19 @@ def observe(
         history: measured samples, shape (..., n, 3, H).
         v_goal: wanted tool velocity [m/s], base frame, shape (..., 3).
         lag: of `push_lag` [m], base frame, shape (..., 3).
-        noise: of what sensors say, in standard deviations, shape (..., obs) or a number.
+        noise: of what sensors say, in standard deviations: (..., 3 + locked + 2 H n_driven) or a number.
 
     Returns:
         Shape (..., 6 + locked + (3 H + 2) n_driven), float32.
     """
-    mean, scale, sensed, _, _ = _layout(machine)
+    mean, scale, _, sensed, _ = _layout(machine)
     batch, rest = history.shape[:-3], machine.locked
     seen = np.zeros((*batch, len(mean)), np.float32)
     seen[..., 6 : 6 + len(rest)] = history[..., rest, 0, -1]
-    _samples(machine, seen)[...] = history.take(machine.driven, axis=-3)
-    seen += noise * sensed
+    driven = history.take(machine.driven, axis=-3)
+    _moving(machine, seen)[...] = driven[..., :2, :]
+    seen[..., 3 : 3 + len(sensed)] += noise * sensed
+    seen[..., 3 + len(sensed) : -2 * len(machine.driven)] = driven[..., 2, :].reshape(*batch, -1)
     p_tool, J = tool_jacobian(machine, _angles(machine, seen))
     given = np.empty((*batch, 3, 3), np.float32)
     given[..., 0, :], given[..., 2, :] = v_goal, lag
@@ -202,12 +207,10 @@ def observe(
     return seen
 
 
-def _samples(machine: Machine, values: Array) -> Array:
-    """The driven joints' histories (..., n_driven, 3, H) in an observation in physical units (..., obs)."""
-    body, num = 6 + len(machine.locked), len(machine.driven)
-    return values[..., body : body + num * 3 * machine.history].reshape(
-        *values.shape[:-1], num, 3, machine.history
-    )
+def _moving(machine: Machine, values: Array) -> Array:
+    """Angles and velocities (..., n_driven, 2, H) in an observation in physical units (..., obs)."""
+    body, shape = 6 + len(machine.locked), (len(machine.driven), 2, machine.history)
+    return values[..., body : body + math.prod(shape)].reshape(*values.shape[:-1], *shape)
 
 
 def _angles(machine: Machine, values: Array) -> Array:
@@ -216,10 +219,9 @@ def _angles(machine: Machine, values: Array) -> Array:
     Each sample of a driven joint's angle says where the joint is now, once what it turned since is added. The
     mean of them all has a fraction of the newest one's noise.
     """
-    moving = _samples(machine, values)[..., :2, :]
     q = np.empty((*values.shape[:-1], machine.n), values.dtype)
     q[..., machine.locked] = values[..., 6 : 6 + len(machine.locked)]
-    q[..., machine.driven] = np.einsum("...ks,ks", moving, _layout(machine).told)
+    q[..., machine.driven] = np.einsum("...ks,ks", _moving(machine, values), _layout(machine).told)
     return q
 
 
@@ -241,7 +243,13 @@ def measured(machine: Machine, observation: Array) -> Measured:
     q = _angles(machine, values)
     p_tool = tool_position(machine, q)
     v_goal, v_tool = (_turn(p_tool, values[..., i : i + 3], -1) for i in (0, 3))
-    return Measured(v_goal, v_tool, q, _samples(machine, values)[..., 1, -1])
+    return Measured(v_goal, v_tool, q, _moving(machine, values)[..., 1, -1])
+
+
+def _length(vector: Array) -> Array:
+    """Of vectors (..., 3): (...)."""
+    length: Array = np.sqrt(np.add.reduce(vector * vector, axis=-1))
+    return length
 
 
 def push_lag(machine: Machine, v_tool: Array, v_goal: Array, lag: Array) -> Array:
@@ -257,25 +265,26 @@ def push_lag(machine: Machine, v_tool: Array, v_goal: Array, lag: Array) -> Arra
         lag: before the tick, (..., 3).
     """
     error = v_goal - v_tool
-    size = np.sqrt(np.add.reduce(error * error, axis=-1, keepdims=True))
     limit = np.float32(LAG_SPEED * machine.tool_speed)
-    counted = lag + error * (limit / np.maximum(size, limit)) * np.float32(machine.dt)
+    share = limit / np.maximum(_length(error), limit)
+    counted = lag + error * (share * np.float32(machine.dt))[..., None]
     return np.asarray(counted * np.float32(np.exp(-machine.dt / LAG_TIME)))
 
 
-def push_motion(machine: Machine, history: Array, q: Array) -> Array:
-    """History (..., n, 3, H) of `push_command` with the angles `q` [rad] (..., n), and their newest slope."""
-    return push_angle(history, q, lambda a: estimate_velocity(a, machine.velocity_samples, machine.dt))
+def push_motion(machine: Machine, history: Array, u: Array, q: Array) -> Array:
+    """History (..., n, 3, H) after commands `u`, with angles `q` [rad], (..., n) both, and their slope."""
+    return push(history, u, q, lambda a: estimate_velocity(a, machine.velocity_samples, machine.dt))
 
 
 def push_measured(
-    machine: Machine, history: Array, q: Array, v_goal: Array, lag: Array
+    machine: Machine, history: Array, u: Array, q: Array, v_goal: Array, lag: Array
 ) -> tuple[Array, Array]:
-    """History and lag a tick on, after the encoders said `q` [rad] (..., n): simulation and hardware.
+    """History and lag a tick on: simulation and hardware.
 
-    `history` is what `push_command` left, `v_goal` [m/s] (..., 3) what was wanted during the tick.
+    During the tick `u` (..., n) was sent and `v_goal` [m/s] (..., 3) wanted; `q` [rad] (..., n) is what the
+    encoders said after it.
     """
-    history = push_motion(machine, history, q)
+    history = push_motion(machine, history, u, q)
     v_tool = tool_velocity(machine, history[..., 0, -1], history[..., 1, -1])
     return history, push_lag(machine, v_tool, v_goal, lag)
 
@@ -373,21 +382,20 @@ def transition(
 
     Paper: Sec. 3.4 (actuator nets in the simulation), Table 1
     """
-    motion = push_command(state.motion, u)
     q, plant = state.q, None
     if state.plant is not None:
         plant = plant_step(machine, state.plant, u)
         q = plant.q
     elif net is not None:
         driven, low, high = machine.driven, machine.column("q_min"), machine.column("q_max")
-        moved = q[..., driven] + net.predict(motion[..., driven, :, :]) * machine.dt
+        seen = push_command(state.motion[..., driven, :, :], u[..., driven])
+        moved = q[..., driven] + net.predict(seen) * machine.dt
         q = q.copy()
         q[..., driven] = np.clip(moved, low[driven], high[driven])
     else:
         raise ValueError("net: expected nets for a state without a plant, got None")
 
-    history = push_command(state.history, u)
-    history, lag = push_measured(machine, history, read(machine, q), state.v_goal, state.lag)
+    history, lag = push_measured(machine, state.history, u, read(machine, q), state.v_goal, state.lag)
     return replace(
         state,
         q=q,
@@ -396,7 +404,7 @@ def transition(
         goal_ticks=state.goal_ticks - 1,
         ticks=state.ticks + 1,
         lag=lag,
-        motion=push_motion(machine, motion, q),
+        motion=push_motion(machine, state.motion, u, q),
         plant=plant,
     )
 
@@ -412,8 +420,7 @@ def reward(v_goal: Array, v_tool: Array) -> Array:
         >>> reward(np.array([0.3, 0.4, 0.0]), np.zeros(3))
         np.float64(0.6666666666666666)
     """
-    difference = v_goal - v_tool
-    result: Array = 1 / (1 + np.sqrt(np.sum(difference * difference, axis=-1)))
+    result: Array = 1 / (1 + _length(v_goal - v_tool))
     return result
 
 
@@ -442,18 +449,16 @@ def draw_pose(machine: Machine, config: TaskConfig, rng: np.random.Generator, nu
 
 def draw_goal(machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int) -> Array:
     """Random tool velocities [m/s] (num, 3): zero, along an axis, or anywhere; up to tool_speed."""
-    direction = rng.standard_normal((num, 3))
-    axis = np.vstack([np.eye(3), -np.eye(3)])[rng.integers(0, 6, num)]
-    kind = rng.random((num, 1))
+    direction, kind = rng.standard_normal((num, 3)), rng.random((num, 1))
+    axis = AXES[rng.integers(0, 6, num)]
     direction = np.where(kind < config.zero_goals + config.axis_goals, axis, direction)
-    direction = np.where(kind < config.zero_goals, 0.0, direction)
-    length = np.maximum(np.linalg.norm(direction, axis=-1, keepdims=True), 1e-12)
-    return np.asarray(direction / length * rng.uniform(0, machine.tool_speed, (num, 1)))
+    speed = rng.uniform(0, machine.tool_speed, (num, 1)) * (kind >= config.zero_goals)
+    return np.asarray(direction * (speed / _length(direction)[:, None]))
 
 
 def _draw_hold(machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int) -> NDArray[np.int64]:
-    seconds = rng.uniform(config.hold_min_s, config.hold_max_s, num)
-    return np.maximum(1, np.rint(seconds * machine.rate)).astype(np.int64)
+    low, high = (max(1, round(s * machine.rate)) for s in (config.hold_min_s, config.hold_max_s))
+    return rng.integers(low, high + 1, num)
 
 
 def reset(machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int, plant: bool) -> State:
@@ -465,7 +470,7 @@ def reset(machine: Machine, config: TaskConfig, rng: np.random.Generator, num: i
 
 def look(machine: Machine, config: TaskConfig, state: State, rng: np.random.Generator) -> Array:
     """The observation of a state, (..., obs), with fresh uniform noise. Paper: Sec. 3.4 (5 %)"""
-    shape = (*state.q.shape[:-1], len(_layout(machine).mean))
+    shape = (*state.q.shape[:-1], len(_layout(machine).sensed))
     steps = rng.integers(-(2**15), 2**15, shape, np.int16)  # 16 bits take half as long as a float32
     noise = steps * np.float32(2.0**-15 * config.noise)
     seen = observe(machine, state.history, state.v_goal, state.lag, noise)
@@ -496,14 +501,17 @@ def step(
     goal is over, or asks an arm close to the ground to sink, a new one is drawn after it. On a tick that ends
     in the ground the reward is zero.
     """
-    before, state = state, transition(machine, net, state, to_command(machine, action))
+    u = to_command(machine, action)
+    before, state = state, transition(machine, net, state, u)
     _, v_tool, lowest = tool_state(machine, state.q.astype(np.float32), state.q_dot.astype(np.float32))
     rewards = reward(state.v_goal, v_tool)
     end = terminated(machine, lowest)
     error = 1 / rewards - 1
     if not config.paper:
-        rewards = rewards - np.float32(config.valve_cost) * _travel(machine, before, state)
-        rewards = rewards - np.float32(config.lag_cost) * np.linalg.norm(state.lag, axis=-1)
+        turned = np.add.reduce(np.abs(u - before.history[..., 2, -1]), axis=-1)
+        limits = len(machine.driven) * machine.pwm_limit / PWM_MAX
+        rewards = rewards - np.float32(config.valve_cost / limits) * turned
+        rewards = rewards - np.float32(config.lag_cost) * _length(state.lag)
     state = _next_goals(machine, config, state, lowest, rng)
     observation = look(machine, config, state, rng)
     truncated = (state.ticks >= round(config.episode_s * machine.rate)) & ~end
@@ -522,12 +530,6 @@ def _next_goals(
     goals[due, 2] = np.where(low[due], np.abs(goals[due, 2]), goals[due, 2])
     holds[due] = _draw_hold(machine, config, rng, len(due))
     return replace(state, v_goal=goals, goal_ticks=holds)
-
-
-def _travel(machine: Machine, before: State, after: State) -> Array:
-    """Mean change of the driven joints' commands in one tick, in units of the command limit, (num,)."""
-    newest = [s.history[..., machine.driven, 2, -1] for s in (before, after)]
-    return np.asarray(np.abs(newest[1] - newest[0]).mean(axis=-1) * np.float32(PWM_MAX / machine.pwm_limit))
 
 
 def merge(old: State, new: State, rows: NDArray[np.intp]) -> State:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from brokk_min import bus
-from brokk_min.actuator import push_command, rest_history
+from brokk_min.actuator import rest_history
 from brokk_min.env import Controller, observe, push_measured
 from brokk_min.gate import OPERATIONAL, Array, GateInputs, encoder_counts, fault_name, gate, gate_start
 from brokk_min.kinematics import tool_state
@@ -185,7 +185,8 @@ class Drive:
         if self.history is None:
             self.history = rest_history(q, m.history)
         else:
-            self.history, self.lag = push_measured(m, self.history, q, self.asked, self.lag)
+            sent = self.gate.sent[..., -1] / PWM_MAX
+            self.history, self.lag = push_measured(m, self.history, sent, q, self.asked, self.lag)
         if not self.gate.driving:
             self.memory, self.lag = self.controller.start(1), np.zeros((1, 3), np.float32)
         self.asked = np.array([self.wish.v_goal], np.float32)
@@ -215,8 +216,6 @@ class Drive:
 
     def _remember(self, problem: str) -> None:
         """What was sent and what is wrong; forget what this tick heard."""
-        if self.history is not None:
-            self.history = push_command(self.history, self.gate.sent[..., -1] / PWM_MAX)
         stopped, wrong = (fault_name(self.machine, int(f)) for f in (self.gate.fault, self.gate.wrong))
         self.reason = f"fault: {stopped}" if stopped else wrong
         self.remark = "" if self.gate.driving else problem or self.remark

@@ -201,7 +201,7 @@ class Machine:
 def as_floats(values: ArrayLike) -> NDArray[np.floating]:
     """An array of floats; its float type is kept, whole numbers become float64."""
     array = np.asarray(values)
-    return array if np.issubdtype(array.dtype, np.floating) else array.astype(float)
+    return array if array.dtype.kind == "f" else array.astype(float)
 
 
 def limit_command(machine: Machine, u: ArrayLike) -> NDArray[np.floating]:
@@ -295,7 +295,7 @@ def estimate_velocity(q: ArrayLike, samples: int, dt: float) -> NDArray[np.float
         raise ValueError(f"q: expected at least {max(2, samples)} samples, got {q.shape}")
     lags = np.arange(samples) - (samples - 1) / 2
     weights = (lags / (lags @ lags * dt)).astype(q.dtype)
-    velocity: NDArray[np.floating] = q[..., -samples:] @ weights
+    velocity: NDArray[np.floating] = np.einsum("...t,t", q[..., -samples:], weights)
     return velocity
 
 

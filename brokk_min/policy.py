@@ -15,7 +15,7 @@ from brokk_min.files import expect_same, expected, load_arrays, load_header, who
 from brokk_min.machine import Array, Machine
 
 STAND = 2.0  # s, assumed: valves close when the tool was to stand still for longer
-FORMAT = 2  # of policy files; 1: actions in units of the command limit, dead zone and all
+FORMAT = 3  # of policy files; 1: actions without the way through the dead zone; 2: commands beside angles
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ from brokk_min.policy import Policy, contract, save_policy
 
 Array = NDArray[Any]
 Tensor = torch.Tensor
-FORMAT = 1  # of checkpoints
+FORMAT = 2  # of checkpoints; 1: observations in another order
 STATE = [f.name for f in fields(State) if f.name != "plant"]
 
 
@@ -90,7 +90,7 @@ def mlp(inputs: int, outputs: int, gain: float) -> nn.Sequential:
     """256-128-64 with ELU and a linear output, orthogonal start. Paper: Sec. 3.4"""
     sizes, layers = [inputs, 256, 128, 64], []
     for rows, columns in pairwise(sizes):
-        layers += [_orthogonal(nn.Linear(rows, columns), 2**0.5), nn.ELU()]
+        layers += [_orthogonal(nn.Linear(rows, columns), 2**0.5), nn.ELU(inplace=True)]
     return nn.Sequential(*layers, _orthogonal(nn.Linear(sizes[-1], outputs), gain))
 
 

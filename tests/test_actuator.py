@@ -13,7 +13,7 @@ from helpers_machines import constant_net, random_net
 from brokk_min.actuator import (
     ActuatorNet,
     load_net,
-    push_angle,
+    push,
     push_command,
     rest_history,
     save_net,
@@ -31,8 +31,7 @@ def test_a_history_by_hand():
     sent = push_command(h, [0.1, 0.2])
     np.testing.assert_array_equal(sent[0], [[0.5, 0.5, 0.5], [0, 0, 0], [0, 0, 0.1]])
     np.testing.assert_array_equal(sent[1], [[-1, -1, -1], [0, 0, 0], [0, 0, 0.2]])
-    sent.setflags(write=False)
-    seen = push_angle(sent, [0.6, -0.9], lambda angles: angles[..., -1] - angles[..., 0])
+    seen = push(h, [0.1, 0.2], [0.6, -0.9], lambda angles: angles[..., -1] - angles[..., 0])
     np.testing.assert_allclose(seen[0], [[0.5, 0.5, 0.6], [0, 0, 0.1], [0, 0, 0.1]])
     np.testing.assert_allclose(seen[1], [[-1, -1, -0.9], [0, 0, 0.1], [0, 0, 0.2]])
     sent = push_command(seen, [0.3, 0.4])
@@ -41,7 +40,7 @@ def test_a_history_by_hand():
 
 def test_histories_have_leading_axes_and_keep_the_float_type():
     q = np.arange(6, dtype=np.float32).reshape(3, 2)
-    h = push_angle(push_command(rest_history(q, 5), q / 10), q + 1, lambda a: a[..., -1] - a[..., -2])
+    h = push(rest_history(q, 5), q / 10, q + 1, lambda a: a[..., -1] - a[..., -2])
     assert h.shape == (3, 2, 3, 5) and h.dtype == np.float32
     np.testing.assert_array_equal(h[..., 0, -1], q + 1)
     np.testing.assert_array_equal(h[..., 0, -2], q)

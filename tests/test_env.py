@@ -213,10 +213,16 @@ def headed(machine, q, v):
 def parts(machine, seen):
     """Observations cut up: goal (3), tool velocity (3), locked angles, histories (n, 3, H), two rates."""
     rest, driven, samples = len(machine.locked), len(machine.driven), machine.history
-    cuts = np.cumsum([3, 3, rest, 3 * samples * driven, driven])
+    cuts = np.cumsum([3, 3, rest, 2 * samples * driven, samples * driven, driven])
     assert seen.shape[-1] == cuts[-1] + driven
-    goal, tool, angles, body, rates, late = np.split(seen, cuts, axis=-1)
-    return goal, tool, angles, body.reshape(*body.shape[:-1], driven, 3, samples), rates, late
+    goal, tool, angles, moving, sent, rates, late = np.split(seen, cuts, axis=-1)
+    moving, sent = (a.reshape(*a.shape[:-1], driven, -1, samples) for a in (moving, sent))
+    return goal, tool, angles, np.concatenate([moving, sent], axis=-2), rates, late
+
+
+def sensed(machine):
+    """Numbers that sensors say in an observation: tool velocity, locked angles, angles and velocities."""
+    return 3 + len(machine.locked) + 2 * machine.history * len(machine.driven)
 
 
 def test_observation_by_hand():
@@ -230,9 +236,10 @@ def test_observation_by_hand():
     np.testing.assert_allclose(seen[:3], 1.4 * 3**0.5 * np.array([1, -1 / 3, -0.5]), rtol=1e-5)
     assert seen[6] == pytest.approx(1.4 * (0.5 - 0.7) / (1.4 / 12**0.5), rel=1e-6)
     noisy = task.observe(BROKK_170, told_history(), v_goal, lag, noise=0.1)  # of a standard deviation more
-    np.testing.assert_allclose((noisy - seen)[6:33], [0.14, *([0.1 * 13**-0.5] * 26)], atol=1e-6)
+    np.testing.assert_allclose((noisy - seen)[6:111], [0.14, *([0.1 * 13**-0.5] * 104)], atol=1e-6)
     spread, lags = 12**0.5, np.arange(13)
-    q1, q3, q5 = (13**0.5 * seen[i : i + 39].reshape(3, 13) for i in (7, 46, 124))  # each weighs 13^-0.5
+    cuts = ((7, 111), (33, 124), (85, 150))  # angles with velocities, and commands; each weighs 13^-0.5
+    q1, q3, q5 = (13**0.5 * np.r_[seen[i : i + 26], seen[j : j + 13]].reshape(3, 13) for i, j in cuts)
     np.testing.assert_allclose(q1[0], (1.5 + 0.01 * (lags - 12)) / (4.28 / spread), rtol=1e-5)
     np.testing.assert_allclose(q1[1], 0.001 * lags / (0.20 / 3**0.5), rtol=1e-5, atol=1e-7)
     np.testing.assert_allclose(q1[2], 0.002 * lags / (80 / 127 / 3**0.5), rtol=1e-5, atol=1e-7)
@@ -313,9 +320,10 @@ def test_a_tick_is_measured_alike_in_simulation_and_on_hardware(machine):
     """What both call: the newest angle, its velocity, and the lag by the tool velocity of these two."""
     history, v_goal, lag = random_sight(machine, np.random.default_rng(21), (50,))
     q = history[..., 0, 0]
-    after, late = task.push_measured(machine, history, q, v_goal, lag)
-    np.testing.assert_array_equal(after[..., :2, :-1], history[..., :2, 1:])
-    np.testing.assert_array_equal(after[..., 2, :], history[..., 2, :])
+    u = history[..., 2, 0]
+    after, late = task.push_measured(machine, history, u, q, v_goal, lag)
+    np.testing.assert_array_equal(after[..., :-1], history[..., 1:])
+    np.testing.assert_array_equal(after[..., 2, -1], u)
     np.testing.assert_array_equal(after[..., 0, -1], q)
     slope = estimate_velocity(after[..., 0, :], machine.velocity_samples, machine.dt)
     np.testing.assert_array_equal(after[..., 1, -1], slope)
@@ -336,7 +344,7 @@ def test_angles_are_told_by_all_samples(machine):
     even[..., 0, :] = path[..., -H:]
     seen = task.observe(machine, even, v_goal, lag)
     np.testing.assert_allclose(task.measured(machine, seen).q, even[..., 0, -1], atol=2e-5)
-    noise = rng.uniform(-0.5, 0.5, seen.shape).astype(np.float32)
+    noise = rng.uniform(-0.5, 0.5, (300, sensed(machine))).astype(np.float32)
     error = task.measured(machine, task.observe(machine, even, v_goal, lag, noise)).q - even[..., 0, -1]
     spread = (machine.column("q_max") - machine.column("q_min")) / 12  # of a uniform half of a deviation
     share = error.std(axis=0) / spread
@@ -351,7 +359,7 @@ def test_wanted_rates_are_damped_least_squares_at_the_angles_that_are_shown(mach
     history, v_goal, lag = random_sight(machine, rng, (50,))
     nominal = machine.q_dot_max[machine.driven] / 3**0.5 / 4.2
     clean = task.observe(machine, history, v_goal, lag)
-    for noise in (0.0, rng.uniform(-0.5, 0.5, clean.shape).astype(np.float32)):
+    for noise in (0.0, rng.uniform(-0.5, 0.5, (50, sensed(machine))).astype(np.float32)):
         seen = task.observe(machine, history, v_goal, lag, noise)
         q = task.measured(machine, seen.astype(float)).q
         off = np.abs(q - told_angles(machine, history)).max()
@@ -409,15 +417,15 @@ def test_noise_is_uniform_within_five_percent_and_fresh_on_what_is_sensed(machin
     np.testing.assert_allclose(back.v_goal, v_goal, atol=1e-5)
     exact = tool_velocity(machine, back.q, history[..., 1, -1])
     tool = headed(machine, back.q, back.v_tool - exact) * 1.4 * 3**0.5 / machine.tool_speed
-    sensed = []
+    found = []
     for error, weight in ((tool, 1.4), (angles, 1.4), (body[:, :, :2], machine.history**-0.5)):
         draws = error.reshape(num, -1) / weight
         if draws.size:  # MACHINES[0] has no locked joint
             assert 0.0495 < np.abs(draws).max() < 0.05 + 1e-4
             assert stats.kstest(draws.ravel(), stats.uniform(-0.05, 0.1).cdf).pvalue > 1e-4
-        sensed.append(draws)
-    draws = np.concatenate(sensed, axis=1)
-    assert draws.shape[1] == 3 + len(machine.locked) + 2 * machine.history * len(machine.driven)
+        found.append(draws)
+    draws = np.concatenate(found, axis=1)
+    assert draws.shape[1] == sensed(machine)
     assert np.abs(np.corrcoef(draws.T) - np.eye(draws.shape[1])).max() < 0.3
     assert not np.array_equal(seen, task.look(machine, TaskConfig(), state, rng))
     assert np.array_equal(task.look(machine, QUIET, state, rng), clean)
@@ -1136,7 +1144,7 @@ def test_rollout_tells_what_happened_when():
         np.testing.assert_allclose(trace.q_measured[t], q, atol=machine.encoder_step / 2 + 1e-6)
         np.testing.assert_allclose(seen.q, trace.q_measured[t], atol=0.01)  # told by all its samples
         mean, scale = task.observation_scale(machine)
-        newest = task._samples(machine, spy.seen[t] * scale + mean)[..., 0, -1]
+        newest = task._moving(machine, spy.seen[t] * scale + mean)[..., 0, -1]
         np.testing.assert_allclose(newest, trace.q_measured[t][:, machine.driven], atol=1e-5)
         plant = plant_step(machine, plant, tape[t])
         np.testing.assert_allclose(trace.q[t], plant.q, atol=1e-12)
@@ -1225,8 +1233,8 @@ def test_the_papers_observation_has_plain_standard_deviations_and_no_wanted_rate
     q_dot = state.history[:, :, 1] / (m.q_dot_max / 3**0.5)[:, None]
     u = state.history[:, :, 2] / (80 / 127 / 3**0.5)
     np.testing.assert_allclose(seen[:, 6], q[:, 1, -1], atol=1e-5)
-    wanted = np.stack([q, q_dot, u], axis=2)[:, [0, 2, 3, 4]].reshape(3, -1)
-    np.testing.assert_allclose(seen[:, 7:-8], wanted, atol=1e-5)
+    wanted = np.stack([q, q_dot, u], axis=2)[:, [0, 2, 3, 4]]
+    np.testing.assert_allclose(parts(m, seen)[3], wanted, atol=1e-5)
     speed = np.linalg.norm(state.v_goal, axis=-1) / (m.tool_speed / 3**0.5)
     np.testing.assert_allclose(np.linalg.norm(seen[:, :3], axis=-1), speed, atol=1e-5)
 

@@ -572,7 +572,7 @@ PLANTED = (
         "1.2 if change > 1.5 else 1 / 1.2",
         lambda: test_the_learning_rate_is_lowered_while_the_policy_changes_too_much(),
     ),
-    ("nn.ELU()", "nn.ReLU()", lambda: test_the_nets_are_those_of_the_paper()),
+    ("nn.ELU(inplace=True)", "nn.ReLU()", lambda: test_the_nets_are_those_of_the_paper()),
 )
 
 
@@ -919,7 +919,7 @@ def rewrite(path, header, drop=()):
 @pytest.mark.parametrize(
     ("header", "drop", "message"),
     [
-        ({"format": 0}, (), r"expected \(checkpoint, format 1\), got \('checkpoint', 0\)"),
+        ({"format": 0}, (), r"expected \(checkpoint, format 2\), got \('checkpoint', 0\)"),
         ({}, ("env_lag",), r"expected a complete checkpoint, got KeyError\('env_lag'\)"),
         ({}, ("exp_avg_3",), r"expected a complete checkpoint, got KeyError\('exp_avg_3'\)"),
         ({"random": {}}, (), r"expected a complete checkpoint, got "),
