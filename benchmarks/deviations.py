@@ -28,6 +28,7 @@ from brokk_min import (
     kinematics,
     logs,
     machine,
+    observation,
     sequences,
     trust,
 )
@@ -227,14 +228,14 @@ def d5() -> dict[str, float]:
 def d7() -> dict[str, float]:
     """Policies with the paper's observation, reward and critic, and with newest angles instead of all."""
     ours, paper = as_it_is(), trained(TaskConfig(paper=True))
-    angles = env._angles
+    angles = observation._angles
 
     def newest(machine: machine.Machine, values: env.Array) -> env.Array:
         q = angles(machine, values)
-        q[..., machine.driven] = env._moving(machine, values)[..., 0, -1]
+        q[..., machine.driven] = observation._moving(machine, values)[..., 0, -1]
         return q
 
-    with mock.patch.object(env, "_angles", newest):
+    with mock.patch.object(observation, "_angles", newest):
         return beside(paper=paper, **{"newest angles": trained(TaskConfig())}, ours=ours)
 
 
@@ -256,7 +257,7 @@ def d11() -> dict[str, float]:
 def d12() -> dict[str, float]:
     """A policy whose actions begin at 0 counts, dead zone and all."""
     ours = as_it_is()
-    with mock.patch.object(env, "_command_range", lambda machine: (0.0, machine.pwm_limit / PWM_MAX)):
+    with mock.patch.object(observation, "_command_range", lambda machine: (0.0, machine.pwm_limit / PWM_MAX)):
         return beside(**{"from 0": trained(TaskConfig())}, ours=ours)
 
 
@@ -279,7 +280,7 @@ def d14() -> dict[str, float]:
 def a5() -> dict[str, float]:
     """A policy that sees velocities in the base frame instead of along the tool's heading."""
     ours = as_it_is()
-    with mock.patch.object(env, "_turn", lambda p_tool, vector, sign: vector.copy()):
+    with mock.patch.object(observation, "_turn", lambda p_tool, vector, sign: vector.copy()):
         return beside(**{"base frame": trained(TaskConfig()), "heading": ours})
 
 

@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brokk_min.actuator import ActuatorNet, push_command
-from brokk_min.env import LAG_SPEED, LAG_TIME, TaskConfig, command_slope, push_lag
+from brokk_min.env import TaskConfig
 from brokk_min.kinematics import tool_jacobian
 from brokk_min.machine import PWM_MAX, Array, Machine, estimate_velocity
+from brokk_min.observation import LAG_SPEED, LAG_TIME, command_slope, push_lag
 
 
 class Rollout(NamedTuple):
@@ -24,7 +25,7 @@ class Rollout(NamedTuple):
     q: Array  # true angle [rad], n
     motion: Array  # of `env.State`, (n, 3, H)
     v_goal: Array  # wanted tool velocity [m/s], 3
-    lag: Array  # of `env.push_lag` [m], 3
+    lag: Array  # of `observation.push_lag` [m], 3
     u: Array  # command, n
     ended: NDArray[np.bool_]  # did the episode end with the tick?
 
@@ -35,7 +36,7 @@ def action_gradients(
     """Derivative of the discounted rewards to come by each action, all other actions as they were.
 
     Rewards are those of `env.step`. Encoders and commands count as exact, not as whole steps, and the
-    Jacobian and `env.command_slope` as constant: in a second a joint turns little.
+    Jacobian and `observation.command_slope` as constant: in a second a joint turns little.
     Paper: Sec. 3.4 (nets in the simulation); ours
 
     Args:
@@ -46,7 +47,7 @@ def action_gradients(
         task: its costs of moving valves and of staying behind.
 
     Returns:
-        Shape (T, num, n_driven), float32, by actions as `env.to_command` takes them.
+        Shape (T, num, n_driven), float32, by actions as `observation.to_command` takes them.
     """
     driven, by_action = machine.driven, command_slope(machine, rollout.u)
     by_velocity, by_history, free = _each_tick(machine, net, rollout, gamma, task.lag_cost)
@@ -96,7 +97,7 @@ def _each_tick(
 def _by_lag(machine: Machine, rollout: Rollout, error: Array, gamma: float, cost: float) -> Array:
     """What way left behind costs in all ticks to come, by the tool's velocity in each, (T, num, 3).
 
-    `error` [m/s] (T, num, 3) is what `env.push_lag` adds up: beyond its limit only the direction counts.
+    `error` [m/s] (T, num, 3) is what `push_lag` adds up: beyond its limit only the direction counts.
     """
     limit, decay = LAG_SPEED * machine.tool_speed, np.exp(-machine.dt / LAG_TIME)
     lag = push_lag(machine, rollout.v_goal - error, rollout.v_goal, rollout.lag)

@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from brokk_min.env import Controller, Measured, Trace
+from brokk_min.env import Controller, Trace
 from brokk_min.jacobian import JacobianController, manipulability
 from brokk_min.kinematics import jacobian
 from brokk_min.machine import Array, Machine
 from brokk_min.metrics import TRANSIENT, Mean, Run, by_start, interval, mean_interval, since_change
+from brokk_min.observation import Measured
 
 Claim = dict[str, Any]  # paper, measured, numbers, unit, holds (None: no such runs); see `beside`
 STILL = 0.05  # m, assumed: a tool that stays so near its line stays still across it

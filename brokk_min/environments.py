@@ -18,15 +18,16 @@ from brokk_min import env
 from brokk_min.actuator import ActuatorNet, load_net
 from brokk_min.env import Bools, State, TaskConfig
 from brokk_min.machine import BROKK_170, Array, Machine
+from brokk_min.observation import observation_scale
 from brokk_min.window import Pictures
 
 
 class TaskVectorEnv(VectorEnv[Array, Array, Any]):
     """Many machines following random tool velocities; an ended episode starts anew at once. Paper: Fig. 4
 
-    Observation: Box, see `env.observe`. Action: Box [-1, 1] a driven joint, from closed (0) through the
-    dead zone to the command limit (1), see `env.to_command`. Reward: see `env.step`. `info["final_obs"]`
-    holds the last observation of an ended episode where `info["_final_obs"]` is set;
+    Observation: Box, see `observation.observe`. Action: Box [-1, 1] a driven joint, from closed (0) through
+    the dead zone to the command limit (1), see `observation.to_command`. Reward: see `env.step`.
+    `info["final_obs"]` holds the last observation of an ended episode where `info["_final_obs"]` is set;
     `info["velocity_error"]` is |v_goal - v_tool| [m/s].
 
     Args:
@@ -166,7 +167,7 @@ def _keep_freed_memory() -> None:
 
 def _spaces(machine: Machine) -> tuple[Any, Any]:
     """Spaces of one environment's observation and action."""
-    size = len(env.observation_scale(machine)[0])
+    size = len(observation_scale(machine)[0])
     action = gymnasium.spaces.Box(-1.0, 1.0, (len(machine.driven),), np.float32)
     return gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32), action
 

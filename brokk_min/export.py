@@ -5,16 +5,16 @@ from pathlib import Path
 
 import numpy as np
 
-from brokk_min.env import RAMP
 from brokk_min.extras import need
 from brokk_min.files import whole_file
+from brokk_min.observation import RAMP
 from brokk_min.policy import STAND, Policy
 
 
 def export_onnx(path: Path, policy: Policy) -> None:
     """Write a policy as one self-contained ONNX file: `observation` (batch, obs) in, `action` out.
 
-    What follows is up to the other program: actions go through `env.to_command` (metadata `dead_zone`,
+    What follows is up to the other program: actions go through `to_command` (metadata `dead_zone`,
     `pwm_limit`, `ramp`), and valves close when the tool was to stand for `stand_s` (`policy.STAND`).
 
     ValueError: the package onnx is not there.

@@ -16,10 +16,11 @@ import numpy as np
 
 from brokk_min import bus
 from brokk_min.actuator import rest_history
-from brokk_min.env import Controller, observe, push_measured
+from brokk_min.env import Controller
 from brokk_min.gate import OPERATIONAL, Array, GateInputs, encoder_counts, fault_name, gate, gate_start
 from brokk_min.kinematics import tool_state
 from brokk_min.machine import PWM_MAX, Machine
+from brokk_min.observation import observe, push_measured
 from brokk_min.wishes import Wish, unpack_wish
 
 AWAKE = 0.002  # s before SYNC and after it in which the loop does not sleep (tuned)

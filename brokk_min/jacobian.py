@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from brokk_min.actuator import ActuatorNet
-from brokk_min.env import Measured, measured
 from brokk_min.kinematics import jacobian
 from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, valve_opening
+from brokk_min.observation import Measured, measured
 
 
 def dls(J: ArrayLike, W: ArrayLike, damping: ArrayLike, as_printed: bool = False) -> Array:
@@ -206,7 +206,7 @@ class JacobianController:
         return np.asarray(rate / np.maximum(1.0, excess))  # slower, but in the same direction
 
     def __call__(self, observation: Array, memory: Memory) -> tuple[Array, Memory]:
-        """Commands u (..., n) for observations (..., obs) of `env.observe`, and the next memory."""
+        """Commands u (..., n) for observations (..., obs) of `observation.observe`, and the next memory."""
         m, g = self.machine, split_gains(self.gains)
         seen = measured(m, observation.astype(float))
         rate = self.rates(seen, memory.rate)

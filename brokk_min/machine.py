@@ -204,6 +204,17 @@ def as_floats(values: ArrayLike) -> NDArray[np.floating]:
     return array if array.dtype.kind == "f" else array.astype(float)
 
 
+def lengths(vectors: Array) -> Array:
+    """Euclidean lengths (...) of vectors (..., k).
+
+    Example:
+        >>> lengths(np.array([[3.0, 4.0, 0.0]]))
+        array([5.])
+    """
+    result: Array = np.sqrt(np.add.reduce(vectors * vectors, axis=-1))
+    return result
+
+
 def limit_command(machine: Machine, u: ArrayLike) -> NDArray[np.floating]:
     """The command [-1, 1] that reaches the valve: whole PWM counts, clipped to +-pwm_limit/127.
 

@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from brokk_min.env import measured
 from brokk_min.jacobian import dls
 from brokk_min.kinematics import jacobian, tool_velocity
 from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, valve_opening
+from brokk_min.observation import measured
 from brokk_min.plant import PlantState, lever_arm, plant_reset, plant_step
 
 BLOCKS = (1, 1, 2, 4, 6)  # ticks at which a plan may turn lie between; their sum is the horizon (assumed)
@@ -54,7 +54,7 @@ class PerfectModel:
         return Plan(plant_reset(self.machine, q), np.zeros((num, sum(BLOCKS), len(self.machine.driven))), 0)
 
     def __call__(self, observation: Array, memory: Plan) -> tuple[Array, Plan]:
-        """Commands u (num, n) for observations (num, obs) of `env.observe`, and the next memory."""
+        """Commands u (num, n) for observations (num, obs) of `observation.observe`, and the next memory."""
         plant, tick = memory.plant, memory.tick
         goal = measured(self.machine, observation).v_goal.astype(float)
         before = np.concatenate([memory.opening[:, 1:], memory.opening[:, -1:]], axis=1)

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brokk_min.actuator import ActuatorNet, net_arrays, net_from_arrays
-from brokk_min.env import fitting_nets, observation_scale, to_command
+from brokk_min.env import fitting_nets
 from brokk_min.files import expect_same, expected, load_arrays, load_header, whole_file
 from brokk_min.machine import Array, Machine
+from brokk_min.observation import observation_scale, to_command
 
 STAND = 2.0  # s, assumed: valves close when the tool was to stand still for longer
 FORMAT = 3  # of policy files; 1: actions without the way through the dead zone; 2: commands beside angles

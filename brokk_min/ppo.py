@@ -30,11 +30,12 @@ from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet, fingerprint
 from brokk_min.adjoint import Rollout, action_gradients
-from brokk_min.env import State, TaskConfig, observation_scale, paper_view, to_command
+from brokk_min.env import State, TaskConfig
 from brokk_min.environments import TaskVectorEnv
 from brokk_min.extras import need
 from brokk_min.files import expect_same, load_arrays, load_header, whole_file
 from brokk_min.machine import Machine
+from brokk_min.observation import observation_scale, paper_view, to_command
 from brokk_min.policy import Policy, contract, save_policy
 
 Array = NDArray[Any]

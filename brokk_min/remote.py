@@ -17,8 +17,9 @@ import numpy as np
 
 from brokk_min import hw, wishes
 from brokk_min.bus import open_line
-from brokk_min.env import Controller, to_command
+from brokk_min.env import Controller
 from brokk_min.machine import PWM_MAX, Array, Machine
+from brokk_min.observation import to_command
 from brokk_min.simulator import SimulatedMachine, serve, start_pose
 from brokk_min.ticks import Known
 
@@ -67,7 +68,7 @@ def unpack_ask(values: Array) -> Ask:
 
 
 class Levers:
-    """A controller that translates nothing: each lever is one driven joint's action of `env.to_command`."""
+    """A controller that translates nothing: each lever is a driven joint's action of `to_command`."""
 
     def __init__(self, machine: Machine) -> None:
         self.machine = machine

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brokk_min.env import measured
 from brokk_min.extras import need
 from brokk_min.machine import PWM_MAX, Array, Machine
+from brokk_min.observation import measured
 
 
 class Wish(NamedTuple):

@@ -1,4 +1,4 @@
-"""Random machines, cheap actuator nets, a recording, scripted randomness and an oracle for the tests."""
+"""Random machines, cheap actuator nets, a recording, scripted randomness and oracles for the tests."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from brokk_min.logs import Recording, velocity_of
 from brokk_min.machine import BROKK_170, Joint, Machine
 
 GAIN = 3.0  # of `obedient_net`
+POSE = np.array([1.5, 0.5, 0.58, 1.71, 1.24])  # the paper's q_s
 
 
 def random_machine(rng: np.random.Generator, n: int) -> Machine:
@@ -202,3 +203,26 @@ def constant_net(velocity: list[float], logged: bool, joints: tuple[str, ...]) -
 def line(name: str, start: float, slope: float, ticks: int, u: float = 0.5) -> Recording:
     q = np.full((ticks, 1), start) + slope * np.arange(ticks)[:, None] / 20
     return Recording(name, np.full((ticks, 1), u), q, velocity_of(q, 4))
+
+
+def closed_form(q):
+    """Tool position [m] of the Brokk in closed form, and the height of its lowest link end."""
+    q1, e2 = q[..., 0], q[..., 1]
+    e3 = e2 + q[..., 2]
+    e4 = e3 + q[..., 3] - np.pi
+    e5 = e4 + q[..., 4] - 3 * np.pi / 4
+    r, z, heights = 0.25, 0.95, [0.95 + 0 * q1]
+    for length, e in zip((1.15, 1.25, 1.15, 1.20), (e2, e3, e4, e5), strict=True):
+        r, z = r + length * np.cos(e), z + length * np.sin(e)
+        heights.append(z)
+    return np.stack([r * np.cos(q1), r * np.sin(q1), z], -1), np.min(heights, axis=0)
+
+
+def parts(machine, seen):
+    """Observations cut up: goal (3), tool velocity (3), locked angles, histories (n, 3, H), two rates."""
+    rest, driven, samples = len(machine.locked), len(machine.driven), machine.history
+    cuts = np.cumsum([3, 3, rest, 2 * samples * driven, samples * driven, driven])
+    assert seen.shape[-1] == cuts[-1] + driven
+    goal, tool, angles, moving, sent, rates, late = np.split(seen, cuts, axis=-1)
+    moving, sent = (a.reshape(*a.shape[:-1], driven, -1, samples) for a in (moving, sent))
+    return goal, tool, angles, np.concatenate([moving, sent], axis=-2), rates, late

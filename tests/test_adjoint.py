@@ -9,6 +9,7 @@ import pytest
 from helpers_machines import GAIN, obedient_net, obedient_velocity, random_machine, small_net
 
 from brokk_min import env as task
+from brokk_min import observation as sight
 from brokk_min.adjoint import Rollout, action_gradients
 from brokk_min.kinematics import jacobian, tool_velocity
 from brokk_min.machine import BROKK_170, PWM_MAX
@@ -59,9 +60,9 @@ def case(seed, machine=None):
 def by_action(machine, u):
     """Slope of the command by the action at `u`: of the line from 0 through the dead zone to the limit."""
     limit, dead = machine.pwm_limit / PWM_MAX, machine.dead_zone
-    knee = dead + task.RAMP * (limit - dead)
+    knee = dead + sight.RAMP * (limit - dead)
     u = np.abs(u[..., machine.driven])
-    return np.where(u < knee, knee / task.RAMP, (limit - knee) / (1 - task.RAMP))
+    return np.where(u < knee, knee / sight.RAMP, (limit - knee) / (1 - sight.RAMP))
 
 
 def rewards_of(machine, states, along):
@@ -170,7 +171,7 @@ def test_the_cost_of_staying_behind_is_in_it(seed):
     v_tool = np.array([tool_velocity(machine, s.q, s.q_dot) for s in states[1:]])
     middle = np.quantile(np.linalg.norm(start.v_goal - v_tool, axis=-1), 0.52)
     machine = replace(
-        machine, tool_speed=float(middle) / task.LAG_SPEED
+        machine, tool_speed=float(middle) / sight.LAG_SPEED
     )  # half of the errors are beyond the limit
     states = simulate(machine, net, start, commands)
 
@@ -179,7 +180,7 @@ def test_the_cost_of_staying_behind_is_in_it(seed):
         lag, found = start.lag, []
         for t, s in enumerate(states[1:]):
             v_tool = (J[t + 1] @ s.q_dot[..., machine.driven, None])[..., 0]
-            lag = task.push_lag(machine, v_tool, start.v_goal, lag)
+            lag = sight.push_lag(machine, v_tool, start.v_goal, lag)
             found.append(3.0 * 0.8**t * np.linalg.norm(lag, axis=-1))
         return np.array(found)
 

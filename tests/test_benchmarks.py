@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks import deviations, limits, peers
-from brokk_min import env, experiments
+from brokk_min import experiments, observation
 
 
 @pytest.mark.parametrize("learner", list(peers.LEARNERS))
@@ -75,10 +75,10 @@ def test_the_products_of_a_gradient_by_hand() -> None:
 
 def test_deviations_train_and_compare_what_they_name(monkeypatch: pytest.MonkeyPatch) -> None:
     """One update of the learner; what its policy does is not judged. The heading is back afterwards."""
-    seen, turn = [], env._turn
+    seen, turn = [], observation._turn
 
     def runs(machine: object, controllers: object, sequences: list[object], starts: np.ndarray, *_: object):
-        seen.append((len(sequences), len(starts), env._turn is turn))
+        seen.append((len(sequences), len(starts), observation._turn is turn))
         return [{"velocity_error_mean": 0.1, "off_axis_drift_max": 0.02, "valve_travel": 20.0}], {}
 
     monkeypatch.setattr(deviations, "STEPS", 256 * 32)
@@ -86,4 +86,4 @@ def test_deviations_train_and_compare_what_they_name(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(deviations, "as_it_is", dict)
     found = deviations.a5()
     assert found["base frame, plant, valve_travel"] == 20.0 and len(found) == 6
-    assert seen == [(3, 32, False)] * 2 and env._turn is turn
+    assert seen == [(3, 32, False)] * 2 and observation._turn is turn

@@ -10,8 +10,9 @@ import pytest
 from helpers_machines import obedient_net
 
 from brokk_min import baselines, claims, report
-from brokk_min.env import Measured, Trace
+from brokk_min.env import Trace
 from brokk_min.machine import BROKK_170
+from brokk_min.observation import Measured
 
 PAPERS = baselines.PAPERS
 POSE = np.array([1.5, 0.5, 0.58, 1.71, 1.24])

@@ -18,11 +18,12 @@ from matplotlib.colors import to_rgb
 from benchmarks.rollout import random_net
 from brokk_min import baselines, chain, experiments, figures, jacobian, kinematics, report, variations
 from brokk_min.actuator import ActuatorNet, fingerprint, load_net, save_net
-from brokk_min.env import Measured, TaskConfig, Trace, measured, rollout, to_command
+from brokk_min.env import TaskConfig, Trace, rollout
 from brokk_min.kinematics import joint_rates, tool_position
 from brokk_min.logs import velocity_of
 from brokk_min.machine import BROKK_170, Machine, read_encoder
 from brokk_min.metrics import metrics
+from brokk_min.observation import Measured, measured, to_command
 from brokk_min.plant import plant_reset, plant_step, speed_limits
 from brokk_min.sequences import task_sequences, tuning_goals
 

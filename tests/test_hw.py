@@ -21,13 +21,14 @@ import pytest
 from helpers_bus import START, Hand, Out, Push, World
 
 from brokk_min import blackbox, bus, hw, wishes
-from brokk_min.env import TaskConfig, measured, observation_scale, reward, rollout, to_command
+from brokk_min.env import TaskConfig, reward, rollout
 from brokk_min.experiments import axis_sequences
 from brokk_min.gate import encoder_raw, fault_name, valve_frame
 from brokk_min.jacobian import JacobianController, join_gains, manipulability_threshold
 from brokk_min.kinematics import joint_rates, tool_state
 from brokk_min.logs import read_log, write_log
 from brokk_min.machine import BROKK_170
+from brokk_min.observation import measured, observation_scale, to_command
 from brokk_min.policy import STAND, PolicyController, load_policy
 
 PUSH = (60, 0, 60, 60, 60)

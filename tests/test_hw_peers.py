@@ -28,12 +28,12 @@ from helpers_machines import small_net
 from brokk_min import baselines, bus, hw, simulator, wishes
 from brokk_min.__main__ import main
 from brokk_min.actuator import load_net
-from brokk_min.env import RAMP, observation_scale
 from brokk_min.environments import TaskVectorEnv
 from brokk_min.export import export_onnx
 from brokk_min.gate import encoder_raw
 from brokk_min.logs import read_log
 from brokk_min.machine import BROKK_170
+from brokk_min.observation import RAMP, observation_scale
 from brokk_min.policy import STAND, Policy, contract, save_policy
 
 GROUP = "239.74.163.2"
@@ -202,7 +202,8 @@ def test_our_encoders_are_canopen_nodes_to_a_canopen_master() -> None:
             assert not got  # not yet operational
             network.nmt.state = "OPERATIONAL"
             eventually(lambda: machine.nmt[5] == 5)
-            assert nodes[4].nmt.wait_for_heartbeat(10) == "OPERATIONAL"
+            # one of before may still be on its way to the master
+            eventually(lambda: nodes[4].nmt.wait_for_heartbeat(10) == "OPERATIONAL")
             network.sync.transmit()
             eventually(lambda: len(got) == 5)
             step = BROKK_170.encoder_step

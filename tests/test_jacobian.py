@@ -14,10 +14,11 @@ from benchmarks.rollout import random_net
 from brokk_min import baselines
 from brokk_min import jacobian as classic
 from brokk_min.actuator import ActuatorNet, rest_history
-from brokk_min.env import TaskConfig, measured, observe, rollout
+from brokk_min.env import TaskConfig, rollout
 from brokk_min.jacobian import JacobianController, Memory
 from brokk_min.kinematics import jacobian
 from brokk_min.machine import BROKK_170, valve_opening
+from brokk_min.observation import measured, observe
 
 POSE = np.array([1.5, 0.5, 0.58, 1.71, 1.24])  # the paper's q_s
 STRETCHED = np.array([0.3, 0.5, 0.1, np.pi, 3 * np.pi / 4])  # all links in one line

@@ -9,9 +9,10 @@ import pytest
 from helpers_machines import obedient_net
 
 from brokk_min import baselines, mpc
-from brokk_min.env import TaskConfig, observe, rest_state, rollout
+from brokk_min.env import TaskConfig, rest_state, rollout
 from brokk_min.kinematics import tool_velocity
 from brokk_min.machine import BROKK_170, limit_command
+from brokk_min.observation import observe
 from brokk_min.plant import plant_reset, plant_step
 
 POSES = np.array([[1.5, 0.5, 0.58, 1.71, 1.24], [-0.8, 0.3, 0.9, 1.5, 1.0]])

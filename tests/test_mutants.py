@@ -131,34 +131,39 @@ PLANTED: list[tuple[str, str, str, str]] = [
     ("policy", "np.where(moves, 0, memory + 1)", "memory + 1",
      "policy::valves_close_when_the_tool_was_to_stand_for_two_seconds"),
     # the task
-    ("env", "np.sqrt(np.add.reduce(vector * vector, axis=-1))", "np.add.reduce(vector * vector, axis=-1)",
-     "env::reward_by_hand"),
+    ("machine", "np.sqrt(np.add.reduce(vectors * vectors, axis=-1))",
+     "np.add.reduce(vectors * vectors, axis=-1)", "env::reward_by_hand"),
     ("env", "np.asarray(lowest < machine.ground)", "np.asarray(lowest <= machine.ground)",
      "env::ground_is_below_not_at"),
-    ("env", "u[..., machine.driven] = ", "u[..., : len(machine.driven)] = ", "env::to_command_by_hand"),
-    ("env", "np.asarray(np.clip(action, -1.0, 1.0))", "np.tanh(action)", "env::to_command_by_hand"),
-    ("env", "-1.0, 1.0) * dead + action * beyond", "-1.0, 1.0) * 0 + action * (beyond + dead)",
-     "env::to_command_by_hand"),
-    ("env", "through * (dead / RAMP)", "through * dead", "env::commands_rise_with_actions_by_their_slope"),
-    ("env", "history.take(machine.driven, axis=-3)", "history.take(machine.driven, axis=-3)[..., ::-1]",
-     "env::observation_by_hand"),
-    ("env", "s = x / radius, sign * y / radius", "s = x / radius, -sign * y / radius",
-     "env::observation_by_hand"),
-    ("env", "(middle[j], angle[j] * each", "(middle[j - 1], angle[j] * each",
-     "env::scale_belongs_to_uniform_values_over_the_ranges"),
-    ("env", "rate[j] * each, share", "angle[j] * each, share",
-     "env::scale_belongs_to_uniform_values_over_the_ranges"),
-    ("env", "/ 12**0.5, machine.q_dot_max", "/ 13**0.5, machine.q_dot_max",
-     "env::scale_belongs_to_uniform_values_over_the_ranges"),
-    ("env", "machine.q_dot_max / 3**0.5", "machine.q_dot_max / 4**0.5",
-     "env::scale_belongs_to_uniform_values_over_the_ranges"),
-    ("env", "np.float32(2.0**-15 * config.noise)", "np.float32(2.0**-16 * config.noise)",
-     "env::noise_is_uniform_within_five_percent_and_fresh_on_what_is_sensed"),
-    ("env", "noise * sensed", "noise * scale[3 : 3 + len(sensed)]",
-     "env::noise_is_uniform_within_five_percent_and_fresh_on_what_is_sensed"),
-    ("env", "error = v_goal - v_tool", "error = v_goal + v_tool",
-     "env::the_tool_velocity_counts_against_the_goal"),
-    ("env", "np.exp(-machine.dt / LAG_TIME)", "np.exp(-LAG_TIME / machine.dt)", "env::lag_by_hand"),
+    ("observation", "u[..., machine.driven] = ", "u[..., : len(machine.driven)] = ",
+     "observation::to_command_by_hand"),
+    ("observation", "np.asarray(np.clip(action, -1.0, 1.0))", "np.tanh(action)",
+     "observation::to_command_by_hand"),
+    ("observation", "-1.0, 1.0) * dead + action * beyond", "-1.0, 1.0) * 0 + action * (beyond + dead)",
+     "observation::to_command_by_hand"),
+    ("observation", "through * (dead / RAMP)", "through * dead",
+     "observation::commands_rise_with_actions_by_their_slope"),
+    ("observation", "history.take(machine.driven, axis=-3)",
+     "history.take(machine.driven, axis=-3)[..., ::-1]",
+     "observation::observation_by_hand"),
+    ("observation", "s = x / radius, sign * y / radius", "s = x / radius, -sign * y / radius",
+     "observation::observation_by_hand"),
+    ("observation", "(middle[j], angle[j] * each", "(middle[j - 1], angle[j] * each",
+     "observation::scale_belongs_to_uniform_values_over_the_ranges"),
+    ("observation", "rate[j] * each, share", "angle[j] * each, share",
+     "observation::scale_belongs_to_uniform_values_over_the_ranges"),
+    ("observation", "/ 12**0.5, machine.q_dot_max", "/ 13**0.5, machine.q_dot_max",
+     "observation::scale_belongs_to_uniform_values_over_the_ranges"),
+    ("observation", "machine.q_dot_max / 3**0.5", "machine.q_dot_max / 4**0.5",
+     "observation::scale_belongs_to_uniform_values_over_the_ranges"),
+    ("observation", "np.float32(2.0**-15 * largest)", "np.float32(2.0**-16 * largest)",
+     "observation::noise_is_uniform_within_five_percent_and_fresh_on_what_is_sensed"),
+    ("observation", "noise * sensed", "noise * scale[3 : 3 + len(sensed)]",
+     "observation::noise_is_uniform_within_five_percent_and_fresh_on_what_is_sensed"),
+    ("observation", "error = v_goal - v_tool", "error = v_goal + v_tool",
+     "observation::the_tool_velocity_counts_against_the_goal"),
+    ("observation", "np.exp(-machine.dt / LAG_TIME)", "np.exp(-LAG_TIME / machine.dt)",
+     "observation::lag_by_hand"),
     ("env", "np.clip(moved, low[driven], high[driven])", "np.clip(moved, low[driven], np.inf)",
      "env::joint_limits_hold"),
     ("env", "moved = q[..., driven] + net", "moved = q[..., driven] - net",
@@ -210,7 +215,7 @@ PLANTED: list[tuple[str, str, str, str]] = [
      "adjoint::nothing_is_earned_beyond_the_end_of_an_episode_or_by_another_environment"),
     ("adjoint", "counted * np.float32(decay * machine.dt)", "counted * np.float32(machine.dt)",
      "adjoint::the_cost_of_staying_behind_is_in_it"),
-    ("env", "/ 2 - 1\n", "/ 2\n", "env::angles_are_told_by_all_samples"),
+    ("observation", "/ 2 - 1\n", "/ 2\n", "observation::angles_are_told_by_all_samples"),
     ("env", "push_command(state.motion[", "push_command(state.history[",
      "env::what_encoders_say_moves_no_simulated_arm"),
     ("adjoint", "np.float32(gamma * decay) * ~rollout.ended[t, :, None]", "np.float32(gamma * decay)",
@@ -299,7 +304,7 @@ def function_of(module: types.ModuleType, name: str) -> types.FunctionType | Non
 
 
 def forget() -> None:
-    """What is worked out once a machine and kept with it, see `env._layout` and `kinematics._plan`."""
+    """What is worked out once a machine and kept with it: `observation._layout`, `kinematics._plan`."""
     for kept in ("layout", "plans"):
         BROKK_170.__dict__.pop(kept, None)
 
@@ -359,8 +364,8 @@ def calls(test: Callable[..., object], fixtures: dict[str, object]) -> Iterator[
 
 def test_planted_errors_are_many_and_in_every_module_that_works_out_numbers() -> None:
     assert len(PLANTED) >= 40
-    numeric = "machine kinematics logs plant excitation actuator fitting scores env ppo policy jacobian"
-    others = "sequences experiments metrics figures gate bus wishes simulator"
+    numeric = "machine kinematics logs plant excitation actuator fitting scores observation env ppo"
+    others = "policy jacobian sequences experiments metrics figures gate bus wishes simulator"
     assert {*numeric.split(), *others.split()} <= {module for module, *_ in PLANTED}
 
 

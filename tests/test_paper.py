@@ -32,11 +32,12 @@ from brokk_min import (
     scores,
     sequences,
 )
-from brokk_min.env import TaskConfig, paper_view
+from brokk_min.env import TaskConfig
 from brokk_min.environments import TaskVectorEnv
 from brokk_min.kinematics import tool_position
 from brokk_min.logs import velocity_of
 from brokk_min.machine import BROKK_170, valve_opening
+from brokk_min.observation import paper_view
 from brokk_min.plant import plant_reset, plant_step
 
 ROOT = Path(__file__).parent.parent

@@ -12,9 +12,10 @@ import pytest
 import torch
 from helpers_machines import random_machine, small_net
 
-from brokk_min.env import TaskConfig, to_command
+from brokk_min.env import TaskConfig
 from brokk_min.environments import TaskVectorEnv
 from brokk_min.machine import BROKK_170
+from brokk_min.observation import to_command
 from brokk_min.policy import Policy, PolicyController, load_policy, save_policy
 from brokk_min.ppo import PPOConfig, Training
 

@@ -26,9 +26,10 @@ from torch import nn
 from brokk_min import files, ppo
 from brokk_min.__main__ import main
 from brokk_min.actuator import save_net
-from brokk_min.env import TaskConfig, look, to_command
+from brokk_min.env import TaskConfig, look
 from brokk_min.environments import TaskVectorEnv
 from brokk_min.machine import BROKK_170
+from brokk_min.observation import to_command
 from brokk_min.policy import load_policy
 from brokk_min.ppo import Agent, PPOConfig, Training, gae, train
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from helpers_machines import small_net
 
-from brokk_min import env, gate, jacobian, kinematics, machine, metrics, sequences
+from brokk_min import env, gate, jacobian, kinematics, machine, metrics, observation, sequences
 from brokk_min.machine import BROKK_170
 
 M, RNG = BROKK_170, np.random.default_rng(0)
@@ -29,7 +29,7 @@ J = fixed(kinematics.jacobian(M, Q))
 U = fixed(machine.limit_command(M, RNG.uniform(-1, 1, (4, 5))))
 HISTORY = fixed(RNG.uniform(-0.1, 0.1, (4, 5, 3, 13)).astype(np.float32))
 LAG, V32, Q32 = fixed(np.zeros((4, 3), np.float32)), fixed(V.astype(np.float32)), fixed(Q.astype(np.float32))
-SEEN = fixed(env.observe(M, HISTORY, V32, LAG))
+SEEN = fixed(observation.observe(M, HISTORY, V32, LAG))
 GOALS = fixed(np.repeat(V[None], 30, axis=0))
 BASELINE = jacobian.JacobianController(
     M, fixed(jacobian.join_gains(M, dict.fromkeys(jacobian.GAINS, 0.01))), 0.1, 0.5
@@ -65,13 +65,14 @@ CALLS: dict[str, Callable[[], Any]] = {
     "limit_weights": lambda: jacobian.limit_weights(M, Q, RATE),
     "manipulability": lambda: jacobian.manipulability(J),
     "nakamura_damping": lambda: jacobian.nakamura_damping(fixed([0.1, 0.9]), 0.5, 0.1),
+    "lengths": lambda: machine.lengths(V),
     "valve_opening": lambda: machine.valve_opening(U, 0.07),
     "baseline": lambda: BASELINE(SEEN, jacobian.Memory(*map(fixed, BASELINE.start(4)))),
-    "observe": lambda: env.observe(M, HISTORY, V32, LAG, fixed(np.full((4, 108), 0.01, np.float32))),
-    "measured": lambda: env.measured(M, SEEN),
-    "push_lag": lambda: env.push_lag(M, V32, V32, LAG),
-    "push_measured": lambda: env.push_measured(M, HISTORY, U, Q32, V32, LAG),
-    "to_command": lambda: env.to_command(M, fixed(np.ones((4, 4), np.float32))),
+    "observe": lambda: observation.observe(M, HISTORY, V32, LAG, fixed(np.full((4, 108), 0.01, np.float32))),
+    "measured": lambda: observation.measured(M, SEEN),
+    "push_lag": lambda: observation.push_lag(M, V32, V32, LAG),
+    "push_measured": lambda: observation.push_measured(M, HISTORY, U, Q32, V32, LAG),
+    "to_command": lambda: observation.to_command(M, fixed(np.ones((4, 4), np.float32))),
     "reward": lambda: env.reward(V, fixed(np.zeros((4, 3)))),
     "terminated": lambda: env.terminated(M, fixed([-0.1, 0.1])),
     "rest_state": lambda: env.rest_state(M, Q, V32, plant=True),
