@@ -83,7 +83,7 @@ def _fill(plan: _Plan, angles: Array, result: Array) -> None:
     summed = angles.copy()
     for i in plan.inner:
         summed[i] += summed[i - 1]
-    turns = np.sin(summed[:, None] + plan.theta)  # (n, 2, poses): cosines and sines
+    turns = _turns(summed, plan.theta)
     links = plan.a * turns
     for i in reversed(plan.inner):
         links[i - 1] += links[i]
@@ -99,6 +99,18 @@ def _fill(plan: _Plan, angles: Array, result: Array) -> None:
         levers[:, start:end] += way
         columns[0, start:end] -= y
         columns[1, start:end] += x
+
+
+def _turns(angles: Array, theta: Array) -> Array:
+    """Cosines and sines (n, 2, poses) of `angles` (n, poses) and the offsets of `_Plan`.
+
+    In float32 NumPy works out many sines at once, in float64 one by one, but there many tangents at once.
+    """
+    if angles.dtype == np.float32:
+        return np.asarray(np.sin(angles[:, None] + theta))
+    tangent = np.tan((angles + theta[:, 1]) / 2)
+    share = 2 / (1 + tangent * tangent)
+    return np.stack([share - 1, tangent * share], axis=1)
 
 
 def frames(machine: Machine, q: ArrayLike) -> Array:

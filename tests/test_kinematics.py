@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from hypothesis.extra import numpy as npst
 from scipy.linalg import expm
 from strategies import moving, posed, poses, reals
 
+from brokk_min import kinematics
 from brokk_min.kinematics import (
     _plan,
     frames,
@@ -47,6 +49,20 @@ def closed_form(q: np.ndarray) -> np.ndarray:
 
 
 # --- by hand --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_cosines_and_sines_also_of_half_turns(dtype):
+    """Against the C library: where a half-angle's tangent is infinite, beyond a turn, and at random."""
+    special = np.pi * np.array([0, 1, -1, 3, 2, 0.5, -0.5, 1.5, np.nextafter(1, 2), np.nextafter(-1, 0)])
+    angles = np.concatenate([special, np.random.default_rng(0).uniform(-20, 20, 1000)]).astype(dtype)
+    theta = np.array([[[np.pi / 2 + 0.3], [0.3]]], dtype)
+    for offset in (theta, theta - dtype(0.3)):
+        cosines, sines = kinematics._turns(angles[None], offset)[0]
+        atol = 1e-15 if dtype is np.float64 else 3e-6
+        wanted = [(math.cos(a), math.sin(a)) for a in (angles + offset[0, 1]).astype(float)]
+        np.testing.assert_allclose(np.stack([cosines, sines], axis=-1), wanted, atol=atol, rtol=0)
+        assert cosines.dtype == sines.dtype == dtype
 
 
 def test_the_start_pose_of_the_paper():

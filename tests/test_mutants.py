@@ -29,6 +29,8 @@ from brokk_min.machine import BROKK_170
 # module, right, wrong, the test that must fail: by module of the package
 PLANTED: list[tuple[str, str, str, str]] = [
     # sine for cosine in DH; hands of the axes; the row's order; the Jacobian
+    ("kinematics", "[share - 1, tangent * share]", "[1 - share, tangent * share]",
+     "kinematics::cosines_and_sines_also_of_half_turns"),
     ("kinematics", "s * x + c * y, c * x - s * y", "c * x - s * y, s * x + c * y",
      "kinematics::closed_form_of_the_brokk"),
     ("kinematics", "np.cos(alpha), -np.sin(alpha)], [np.sin(alpha)",
