@@ -17,7 +17,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, cast
@@ -446,6 +446,7 @@ def train(
     """
     env = TaskVectorEnv(config.num_envs, net, machine, task)
     training = Training(env, config, seed)
+    out_of_step(env)
     identity = identity_of(machine, net, task, config, seed)
     checkpoint, curve = Path(f"{out}.checkpoint"), Path(f"{out}.csv")
     _take_up(training, checkpoint, identity, resume)
@@ -469,6 +470,15 @@ def train(
     save_policy(out, policy)
     checkpoint.unlink(missing_ok=True)
     return policy
+
+
+def out_of_step(env: TaskVectorEnv) -> None:
+    """Let the first episodes of a reset environment end one after the other.
+
+    In step, all arms start anew in the same update, and most batches have no starts, one nothing else.
+    """
+    ticks = np.arange(env.num_envs) * round(env.config.episode_s * env.machine.rate) // env.num_envs
+    env.state = replace(cast(State, env.state), ticks=ticks)
 
 
 def _take_up(training: Training, checkpoint: Path, identity: dict[str, Any], resume: bool) -> None:

@@ -360,6 +360,19 @@ def test_without_a_critic_the_deviation_falls_in_a_line():
     np.testing.assert_allclose(found, np.tile([[-1.2], [-1.45], [-1.7], [-1.95]], 4), atol=1e-6)
 
 
+def test_episodes_of_a_training_end_one_after_the_other(tmp_path, monkeypatch):
+    env = TaskVectorEnv(8, NET, BROKK_170, TaskConfig(episode_s=2.0))
+    env.reset(seed=0)
+    ppo.out_of_step(env)
+    over = np.array([env.step(np.zeros((8, 4)))[3] for _ in range(80)])
+    assert over.sum() == 16 and over.sum(axis=1).max() == 1 and (over.sum(axis=0) == 2).all()
+    assert np.diff(np.flatnonzero(over.any(axis=1))).tolist() == [5] * 15
+    called = []
+    monkeypatch.setattr(ppo, "out_of_step", lambda env: called.append(env.state.ticks.max()))
+    train(BROKK_170, NET, TASK, TINY, 0, tmp_path / "policy.npz")
+    assert called == [0]
+
+
 def test_without_a_learning_rate_nothing_changes():
     """Old and new probabilities then agree: what is stored is what the policy did."""
     training = Training(TaskVectorEnv(8, NET, BROKK_170, TASK), replace(CRITIC, learning_rate=0.0), 2)
