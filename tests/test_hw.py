@@ -157,10 +157,10 @@ def test_it_is_silent_until_armed_and_moves_a_tick_later() -> None:
     frames = [data for can_id, data in sent if can_id == 0x210]
     assert [list(f[:5]) for f in frames] == [[0] * 5, [40, 0, 40, 40, 40]]
     assert [f[7] for f in frames] == [1, 1] and frames[1][5] == frames[0][5] + 1
-    assert world.drive.history is not None  # what the controller is told of its commands
-    np.testing.assert_allclose(
-        world.drive.history[0, :, 2, -2:].T * 127, [[0] * 5, [40, 0, 40, 40, 40]], atol=1e-5
-    )
+    world.drive.tick()
+    told = world.drive.history  # of its commands the controller hears with the next angles
+    assert told is not None
+    np.testing.assert_allclose(told[0, :, 2, -2:].T * 127, [[0] * 5, [40, 0, 40, 40, 40]], atol=1e-5)
     world.close()
 
 
