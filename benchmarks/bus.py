@@ -23,10 +23,10 @@ import numpy as np
 import tyro
 
 from benchmarks.rollout import random_net
-from brokk_min.bus import Frame, read_frames
+from brokk_min.can.canopen import Frame, read_frames
+from brokk_min.learning.policy import Policy, contract, save_policy
 from brokk_min.machine import BROKK_170
 from brokk_min.observation import observation_scale
-from brokk_min.policy import Policy, contract, save_policy
 
 BUS = ["--interface", "udp_multicast", "--channel", "239.74.163.2"]
 
@@ -93,7 +93,9 @@ PERCENTILES = {"median": 50, "p99": 99, "p99.9": 99.9, "max": 100}
 
 def main(options: Options) -> None:
     run = [*["chrt", "-f", "10"] * options.realtime, sys.executable, "-m", "brokk_min"]
-    os.environ["CAN_CONFIG"] = json.dumps({"port": 43114})  # python-can's own is for users and tests
+    os.environ["CAN_CONFIG"] = json.dumps(
+        {"port": 43114}
+    )  # python-can's own is for users and tests
     with tempfile.TemporaryDirectory() as folder:
         policy, commands, log = (Path(folder) / name for name in ("policy.npz", "c.csv", "run.log"))
         save_policy(policy, random_policy(np.random.default_rng(0)))

@@ -18,26 +18,15 @@ from unittest import mock
 
 import numpy as np
 
-from brokk_min import (
-    actuator,
-    env,
-    excitation,
-    experiments,
-    fitting,
-    jacobian,
-    kinematics,
-    logs,
-    machine,
-    observation,
-    sequences,
-    trust,
-)
+from brokk_min import actuator, env, jacobian, kinematics, machine, observation
+from brokk_min.cli.options import SHIPPED
 from brokk_min.env import TaskConfig, rollout, terminated
-from brokk_min.environments import TaskVectorEnv
+from brokk_min.evaluation import experiments, sequences, trust
+from brokk_min.identification import excitation, fitting, logs
 from brokk_min.jacobian import JacobianController
+from brokk_min.learning.gym_env import TaskVectorEnv
+from brokk_min.learning.policy import STAND, PolicyController, load_policy
 from brokk_min.machine import BROKK_170, PWM_MAX, read_encoder
-from brokk_min.options import SHIPPED
-from brokk_min.policy import STAND, PolicyController, load_policy
 
 M = BROKK_170
 LOW, HIGH = M.column("q_min"), M.column("q_max")
@@ -49,7 +38,9 @@ def a1() -> dict[str, float]:
     """Share of poses off the ground in which Nakamura's damping acts; and of those beyond 2.5 m."""
     q = np.random.default_rng(0).uniform(LOW, HIGH, (20_000, M.n))
     p, _, lowest = kinematics.tool_state(M, q, 0 * q)
-    damped = jacobian.manipulability(kinematics.jacobian(M, q)) < jacobian.manipulability_threshold(M)
+    damped = jacobian.manipulability(kinematics.jacobian(M, q)) < jacobian.manipulability_threshold(
+        M
+    )
     off, far = ~terminated(M, lowest), np.hypot(p[:, 0], p[:, 1]) > 2.5
     return {"all": float(damped[off].mean()), "far": float(damped[off & far].mean())}
 
@@ -60,19 +51,26 @@ def d1() -> dict[str, float]:
     q, v = rng.uniform(LOW, HIGH, (4000, M.n)), rng.standard_normal((4000, 3))
     J = kinematics.jacobian(M, q)
     W = jacobian.limit_weights(M, q, rng.standard_normal(q.shape))[:, M.driven]
-    damping = jacobian.nakamura_damping(jacobian.manipulability(J), jacobian.manipulability_threshold(M), 0.1)
+    damping = jacobian.nakamura_damping(
+        jacobian.manipulability(J), jacobian.manipulability_threshold(M), 0.1
+    )
     result = {}
     for name, printed in (("corrected", False), ("printed", True)):
         rates = jacobian.dls(J, W, damping, printed) @ v[..., None]
         missed = np.linalg.norm((J @ rates)[..., 0] - v, axis=-1) / np.linalg.norm(v, axis=-1)
-        result |= {f"{name}, median": float(np.median(missed)), f"{name}, mean": float(missed.mean())}
+        result |= {
+            f"{name}, median": float(np.median(missed)),
+            f"{name}, mean": float(missed.mean()),
+        }
     return result
 
 
 def d3() -> dict[str, float]:
     """Deviation [rad/s] of two velocities of a joint at a steady 0.1 rad/s behind a 12-bit encoder."""
     q = machine.read_encoder(M, 0.1 * M.dt * np.arange(4000) + 1e-4)
-    slope = [machine.estimate_velocity(q[: i + 1], M.velocity_samples, M.dt) for i in range(3, len(q))]
+    slope = [
+        machine.estimate_velocity(q[: i + 1], M.velocity_samples, M.dt) for i in range(3, len(q))
+    ]
     return {"one tick": float(np.std(np.diff(q) * M.rate)), "4 samples": float(np.std(slope))}
 
 
@@ -101,7 +99,10 @@ def a9() -> dict[str, float]:
     for sequence in sequences.axis_sequences(M):
         goals = np.repeat(sequence.goals[:, None], len(q), axis=1)
         good.append(sequences.feasible(M, q, goals))
-    return {name: float(g.mean()) for name, g in zip(["x", "y", "z", "all"], [*good, np.all(good, axis=0)])}
+    return {
+        name: float(g.mean())
+        for name, g in zip(["x", "y", "z", "all"], [*good, np.all(good, axis=0)])
+    }
 
 
 def error(gains: dict[str, float], noise: float) -> float:
@@ -112,7 +113,10 @@ def error(gains: dict[str, float], noise: float) -> float:
     controller = JacobianController(M, jacobian.join_gains(M, gains), 0.1, w0)
     errors = []
     for sequence in every:
-        goals, rng = np.repeat(sequence.goals[:, None], len(starts), axis=1), np.random.default_rng(0)
+        goals, rng = (
+            np.repeat(sequence.goals[:, None], len(starts), axis=1),
+            np.random.default_rng(0),
+        )
         trace = rollout(M, controller, starts, goals, replace(TaskConfig(), noise=noise), rng)
         errors.append(np.linalg.norm(goals - trace.v_tool, axis=-1).mean())
     return float(np.mean(errors))
@@ -141,7 +145,10 @@ def stand() -> dict[str, float]:
             goals[:40] = 2 / 3 * M.tool_speed * direction
             p = rollout(plant, policy, starts, goals, TaskConfig(), np.random.default_rng(0)).p_tool
             ways.append(np.linalg.norm(p[39 + round(STAND * M.rate)] - p[49], axis=-1))
-        result |= {f"{dead_zone:.2f}, median": np.median(ways), f"{dead_zone:.2f}, most": np.max(ways)}
+        result |= {
+            f"{dead_zone:.2f}, median": np.median(ways),
+            f"{dead_zone:.2f}, most": np.max(ways),
+        }
     return {name: float(way) for name, way in result.items()}
 
 
@@ -248,16 +255,23 @@ def d11() -> dict[str, float]:
     """Policies trained on nets that see plain commands; and on such from a log in which no valve hovers."""
     driven = [M.names[i] for i in M.driven]
     plain = nets("rich", 0, dead_zone=0.0)[0].select(driven)
-    with mock.patch.object(excitation, "MIX", {"sine": 0.25, "step": 0.15, "holds": 0.25, "go": 0.35}):
+    with mock.patch.object(
+        excitation, "MIX", {"sine": 0.25, "step": 0.15, "holds": 0.25, "go": 0.35}
+    ):
         both = nets("rich", 0, dead_zone=0.0)[0].select(driven)
-    ways = {"plain": trained(TaskConfig(), net=plain), "no hovering": trained(TaskConfig(), net=both)}
+    ways = {
+        "plain": trained(TaskConfig(), net=plain),
+        "no hovering": trained(TaskConfig(), net=both),
+    }
     return beside(**ways, ours=as_it_is())
 
 
 def d12() -> dict[str, float]:
     """A policy whose actions begin at 0 counts, dead zone and all."""
     ours = as_it_is()
-    with mock.patch.object(observation, "_command_range", lambda machine: (0.0, machine.pwm_limit / PWM_MAX)):
+    with mock.patch.object(
+        observation, "_command_range", lambda machine: (0.0, machine.pwm_limit / PWM_MAX)
+    ):
         return beside(**{"from 0": trained(TaskConfig())}, ours=ours)
 
 
@@ -270,7 +284,9 @@ def d14() -> dict[str, float]:
     """A policy trained on nets that go on from what encoders say."""
     ours, push = as_it_is(), env.push_motion
 
-    def stepwise(machine: machine.Machine, history: env.Array, u: env.Array, q: env.Array) -> env.Array:
+    def stepwise(
+        machine: machine.Machine, history: env.Array, u: env.Array, q: env.Array
+    ) -> env.Array:
         return push(machine, history, u, read_encoder(machine, q))
 
     with mock.patch.object(env, "push_motion", stepwise):

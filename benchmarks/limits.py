@@ -26,8 +26,8 @@ import tyro
 
 from benchmarks.rollout import random_net
 from brokk_min.env import TaskConfig
-from brokk_min.environments import TaskVectorEnv
 from brokk_min.kinematics import tool_jacobian
+from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.machine import BROKK_170
 from brokk_min.ppo import PPOConfig, Training
 
@@ -126,7 +126,11 @@ def update(options: Options) -> dict[str, Any]:
         rates[f"products_numpy{core and '_' + core}"] = numpy_rate(core, options, work)
     best = max(rates.values())
     rate = gradients * work / found["update"] / 1e9
-    return {"gflops": rates | {"update": rate}, "seconds": found["update"], "share_of_best": rate / best}
+    return {
+        "gflops": rates | {"update": rate},
+        "seconds": found["update"],
+        "share_of_best": rate / best,
+    }
 
 
 def numpy_rate(core: str, options: Options, work: float) -> float:
@@ -152,7 +156,9 @@ def kinematics(options: Options) -> dict[str, float]:
             pinocchio.computeJointJacobians(model, data, row)
             pinocchio.updateFramePlacement(model, data, tool)
             _ = data.oMf[tool].translation
-            pinocchio.getFrameJacobian(model, data, tool, pinocchio.ReferenceFrame.LOCAL_WORLD_ALIGNED)
+            pinocchio.getFrameJacobian(
+                model, data, tool, pinocchio.ReferenceFrame.LOCAL_WORLD_ALIGNED
+            )
 
     calls = {"tool_jacobian": lambda: tool_jacobian(m, q), "pinocchio": loop}
     found = seconds(calls, options.repeats, 0.02 if options.quick else 0.1)

@@ -49,7 +49,12 @@ try:
 except ImportError:
     sys.exit("benchmarks.mutants: mutmut is missing: pip install 'mutmut==3.8.*'")
 
-LEFT_OUT = ["mutants", "walkthrough", "docs", "benchmarks"]  # they plant errors, or start other processes
+LEFT_OUT = [
+    "mutants",
+    "walkthrough",
+    "docs",
+    "benchmarks",
+]  # they plant errors, or start other processes
 QUICK = 2.5  # s; slower tests run only for functions that no quicker one calls
 reached: set[str] = set()  # functions called since it was emptied
 
@@ -150,7 +155,9 @@ class Runs:
         return [time.process_time() - start, sorted(reached)] if passed else None
 
     def each_alone(self, items: list[pytest.Item]) -> dict[str, Any]:
-        for module in [module for name, module in sys.modules.items() if name.startswith("brokk_min.")]:
+        for module in [
+            module for name, module in sys.modules.items() if name.startswith("brokk_min.")
+        ]:
             note_calls(module)
         reached.clear()  # what importing the copies called
         return {item.nodeid: in_fork(lambda item=item: self.alone(item), 6, 120) for item in items}
@@ -170,7 +177,9 @@ class Runs:
                 kept.write_text(json.dumps(notes))
                 out = [test for test, note in notes[file][1].items() if not isinstance(note, list)]
                 print(f"{file}: {len(items)} tests, left out: {out}", flush=True)
-            self.notes |= {test: note for test, note in notes[file][1].items() if isinstance(note, list)}
+            self.notes |= {
+                test: note for test, note in notes[file][1].items() if isinstance(note, list)
+            }
 
     def chosen(self, callers: list[pytest.Item], module: str, seconds: float) -> list[pytest.Item]:
         """The quickest tests, those of the module's own first, up to so many seconds in all."""
@@ -184,7 +193,9 @@ class Runs:
     def first_failure(self, items: list[pytest.Item], change: Callable[[], None]) -> str:
         change()
         pairs = zip(items, [*items[1:], None], strict=True)  # the next one may share a fixture
-        return next((item.nodeid for item, after in pairs if not self.passes(item, after)), "survived")
+        return next(
+            (item.nodeid for item, after in pairs if not self.passes(item, after)), "survived"
+        )
 
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
         for machine in [thing for thing in gc.get_objects() if type(thing) is Machine]:
@@ -216,13 +227,17 @@ class Runs:
             key, prefix = ".".join(parts), parts[0] + "." if len(parts) > 1 else ""
             right, wrong = (code[prefix + n] for n in (mutant.rpartition("_")[0] + "_orig", mutant))
             items = self.chosen(callers[f"brokk_min.{name}.{key}"], name, seconds)
-            items.sort(key=lambda item: -recent.get(item.nodeid, -1))  # what killed the last ones first
+            items.sort(
+                key=lambda item: -recent.get(item.nodeid, -1)
+            )  # what killed the last ones first
             total = sum(self.notes[item.nodeid][0] for item in items)
             change = partial(plant, module, key, right, wrong)
             start, outcome = time.perf_counter(), "not reached"
             if items:
                 outcome = in_fork(
-                    lambda items=items, c=change: self.first_failure(items, c), 2 + 3 * total, 30 + 20 * total
+                    lambda items=items, c=change: self.first_failure(items, c),
+                    2 + 3 * total,
+                    30 + 20 * total,
                 )
             recent[outcome] = number
             line = {
@@ -235,20 +250,28 @@ class Runs:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     parser.add_argument("modules", nargs="*", help="of brokk_min")
     parser.add_argument("--again", action="store_true", help="survivors too, 10 times as long")
     parser.add_argument("--show", action="store_true", help="what survivors change")
     parser.add_argument("--seconds", type=float, default=2.0, help="of the tests of a mutant")
-    parser.add_argument("--tests", nargs="*", default=["tests", "brokk_min"], help="files or folders")
+    parser.add_argument(
+        "--tests", nargs="*", default=["tests", "brokk_min"], help="files or folders"
+    )
     parser.add_argument("--out", type=Path, default=Path("mutants"))
     options = parser.parse_args()
     options.out.mkdir(exist_ok=True)
     torch.set_num_threads(1)
-    torch.optim.Adam([torch.zeros(1, requires_grad=True)])  # imports for seconds: once, not in each process
+    torch.optim.Adam(
+        [torch.zeros(1, requires_grad=True)]
+    )  # imports for seconds: once, not in each process
     profile = {"max_examples": 8, "deadline": None, "derandomize": True, "database": None}
     phases = [Phase.explicit, Phase.generate]
-    settings.register_profile("mutants", phases=phases, suppress_health_check=list(HealthCheck), **profile)
+    settings.register_profile(
+        "mutants", phases=phases, suppress_health_check=list(HealthCheck), **profile
+    )
     for path in Path("brokk_min").glob("[!_]*.py"):
         importlib.import_module(f"brokk_min.{path.stem}")
     flags = ["-s", "-o", "tmp_path_retention_policy=none"]
@@ -266,14 +289,22 @@ def tell(module: str, options: argparse.Namespace) -> None:
     lines = map(json.loads, (options.out / "mutants.jsonl").read_text().splitlines())
     outcomes = {line["mutant"]: line["outcome"] for line in lines}  # the last of each counts
     mine = {name: outcomes.get(f"{module}.{name}", "not run") for name in mutated.mutant_names}
-    count = Counter(outcome for outcome in mine.values() if outcome in ("survived", "not reached", "not run"))
+    count = Counter(
+        outcome for outcome in mine.values() if outcome in ("survived", "not reached", "not run")
+    )
     reached = len(mine) - count["not reached"] - count["not run"]
     killed = reached - count["survived"]
-    print(f"{module}: {len(mine)} mutants, {dict(count)}, {killed} killed, {killed / max(1, reached):.1%}")
+    print(
+        f"{module}: {len(mine)} mutants, {dict(count)}, {killed} killed, {killed / max(1, reached):.1%}"
+    )
     for name in (name for name in mine if mine[name] == "survived" and options.show):
-        spans = (mutated.line_span_by_function_name[n] for n in (f"{name.rpartition('_')[0]}_orig", name))
+        spans = (
+            mutated.line_span_by_function_name[n] for n in (f"{name.rpartition('_')[0]}_orig", name)
+        )
         old, new = (mutated.code.splitlines()[span.start : span.end] for span in spans)
-        print(name, *(line for line in difflib.ndiff(old[1:], new[1:]) if line[0] in "+-"), sep="\n  ")
+        print(
+            name, *(line for line in difflib.ndiff(old[1:], new[1:]) if line[0] in "+-"), sep="\n  "
+        )
 
 
 if __name__ == "__main__":

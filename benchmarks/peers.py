@@ -29,9 +29,10 @@ import tyro
 from gymnasium import spaces
 
 from benchmarks.rollout import random_net
-from brokk_min import baselines, ppo
+from brokk_min import ppo
 from brokk_min.actuator import ActuatorNet, load_net
-from brokk_min.environments import TaskVectorEnv
+from brokk_min.evaluation import baselines
+from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.machine import BROKK_170, PWM_MAX
 
 Act = Callable[[np.ndarray], np.ndarray]  # observations (num, obs) -> mean actions (num, 4)
@@ -92,7 +93,9 @@ def earned(net: ActuatorNet, act: Act, quick: bool) -> float:
 
 
 def ours(env: TaskVectorEnv, rate: float, planned: int, seed: int, threads: int) -> Iterator[Act]:
-    config = ppo.PPOConfig(num_envs=env.num_envs, learning_rate=rate, total_steps=planned, threads=threads)
+    config = ppo.PPOConfig(
+        num_envs=env.num_envs, learning_rate=rate, total_steps=planned, threads=threads
+    )
     training = ppo.Training(env, config, seed)
     while True:
         training.update()
@@ -107,7 +110,9 @@ def torch_act(actor: Callable[[torch.Tensor], torch.Tensor]) -> Act:
     return act
 
 
-def cleanrl(env: TaskVectorEnv, rate: float, planned: int, seed: int, threads: int) -> Iterator[Act]:
+def cleanrl(
+    env: TaskVectorEnv, rate: float, planned: int, seed: int, threads: int
+) -> Iterator[Act]:
     """`ppo_continuous_action` in short, with the nets, batches and discount of ours.
 
     Better than the original in two ways, or it would not get there: a truncation goes on with the value of
@@ -131,9 +136,18 @@ def cleanrl(env: TaskVectorEnv, rate: float, planned: int, seed: int, threads: i
                 following, reward, terminated, truncated, info = env.step(action.numpy())
                 reward = torch.from_numpy(reward).float()
                 if truncated.any():
-                    reward[truncated] += gamma * agent.value(torch.from_numpy(info["final_obs"][truncated]))
+                    reward[truncated] += gamma * agent.value(
+                        torch.from_numpy(info["final_obs"][truncated])
+                    )
                 end = torch.from_numpy(terminated | truncated).float()
-                row = (seen, action, normal.log_prob(action).sum(-1), agent.value(seen), reward, end)
+                row = (
+                    seen,
+                    action,
+                    normal.log_prob(action).sum(-1),
+                    agent.value(seen),
+                    reward,
+                    end,
+                )
                 for column, value in zip(kept.values(), row, strict=True):
                     column.append(value)
                 seen = torch.from_numpy(following)
@@ -176,7 +190,10 @@ def sb3(env: TaskVectorEnv, rate: float, planned: int, seed: int, threads: int) 
             infos: list[dict[str, Any]] = [{} for _ in range(env.num_envs)]
             for i in np.flatnonzero(terminated | truncated):
                 cut = bool(truncated[i] and not terminated[i])
-                infos[i] = {"terminal_observation": info["final_obs"][i], "TimeLimit.truncated": cut}
+                infos[i] = {
+                    "terminal_observation": info["final_obs"][i],
+                    "TimeLimit.truncated": cut,
+                }
             return seen, reward.astype(np.float32), terminated | truncated, infos
 
         def close(self) -> None: ...
@@ -186,7 +203,9 @@ def sb3(env: TaskVectorEnv, rate: float, planned: int, seed: int, threads: int) 
 
         def set_attr(self, name: str, value: Any, indices: Any = None) -> None: ...
 
-        def env_method(self, name: str, *args: Any, indices: Any = None, **options: Any) -> list[Any]:
+        def env_method(
+            self, name: str, *args: Any, indices: Any = None, **options: Any
+        ) -> list[Any]:
             return [None] * env.num_envs
 
         def env_is_wrapped(self, wrapper: Any, indices: Any = None) -> list[bool]:
@@ -200,7 +219,13 @@ def sb3(env: TaskVectorEnv, rate: float, planned: int, seed: int, threads: int) 
         return rate * max(0.0, 1 - steps / planned)
 
     model = PPO(
-        "MlpPolicy", Adapter(), learning_rate=falling, policy_kwargs=nets, seed=seed, device="cpu", **how
+        "MlpPolicy",
+        Adapter(),
+        learning_rate=falling,
+        policy_kwargs=nets,
+        seed=seed,
+        device="cpu",
+        **how,
     )
     torch.set_num_threads(threads)
     while True:
@@ -209,7 +234,9 @@ def sb3(env: TaskVectorEnv, rate: float, planned: int, seed: int, threads: int) 
         yield lambda x: model.predict(x, deterministic=True)[0]
 
 
-def rl_games(env: TaskVectorEnv, rate: float, planned: int, seed: int, threads: int) -> Iterator[Act]:
+def rl_games(
+    env: TaskVectorEnv, rate: float, planned: int, seed: int, threads: int
+) -> Iterator[Act]:
     from rl_games.common import env_configurations, vecenv
     from rl_games.torch_runner import Runner
 
@@ -234,7 +261,11 @@ def rl_games(env: TaskVectorEnv, rate: float, planned: int, seed: int, threads: 
     vecenv.register("BROKK", lambda name, actors, **options: Adapter(name, actors, **options))
     env_configurations.register("brokk", {"vecenv_type": "BROKK", "env_creator": lambda **_: env})
     spread = {"name": "const_initializer", "val": -1.2}
-    continuous = {"mu_activation": "None", "sigma_activation": "None", "mu_init": {"name": "default"}}
+    continuous = {
+        "mu_activation": "None",
+        "sigma_activation": "None",
+        "mu_init": {"name": "default"},
+    }
     mlp = {"units": [256, 128, 64], "activation": "elu", "initializer": {"name": "default"}}
     network = {
         "name": "actor_critic",
@@ -269,7 +300,11 @@ def rl_games(env: TaskVectorEnv, rate: float, planned: int, seed: int, threads: 
         def act(observation: np.ndarray) -> np.ndarray:
             agent.set_eval()
             with torch.no_grad():
-                seen = {"is_train": False, "obs": torch.from_numpy(observation), "prev_actions": None}
+                seen = {
+                    "is_train": False,
+                    "obs": torch.from_numpy(observation),
+                    "prev_actions": None,
+                }
                 return agent.model(seen | {"rnn_states": None})["mus"].numpy()
 
         while True:
@@ -300,7 +335,11 @@ def race(
                 break
             start = time.perf_counter()
     row = {"learner": name, "learning_rate": rate, "planned": planned, "seed": seed, "best": best}
-    return row | {"updates": updates, "trained_s": clock, "seconds": clock if best >= target else None}
+    return row | {
+        "updates": updates,
+        "trained_s": clock,
+        "seconds": clock if best >= target else None,
+    }
 
 
 def settings_of(name: str, options: Options) -> list[Setting]:
@@ -321,9 +360,19 @@ def main(options: Options) -> dict[str, Any]:
         options.planned = options.planned[-1:]
     net = load_net(options.actuator) if options.actuator else random_net(np.random.default_rng(0))
     net = net.select([BROKK_170.names[i] for i in BROKK_170.driven])
-    target = options.target if options.target is not None else earned(net, pid(net, options), options.quick)
-    missing = [name for name in options.learners if name == "rl_games" and not importlib.util.find_spec(name)]
-    tried: dict[str, list[dict[str, Any]]] = {name: [] for name in options.learners if name not in missing}
+    target = (
+        options.target
+        if options.target is not None
+        else earned(net, pid(net, options), options.quick)
+    )
+    missing = [
+        name
+        for name in options.learners
+        if name == "rl_games" and not importlib.util.find_spec(name)
+    ]
+    tried: dict[str, list[dict[str, Any]]] = {
+        name: [] for name in options.learners if name not in missing
+    }
 
     def run(name: str, setting: Setting, seed: int) -> None:
         tried[name].append(race(name, net, setting, seed, target, options))
@@ -341,7 +390,12 @@ def main(options: Options) -> dict[str, Any]:
     for name, rows in tried.items():
         seconds = [r["seconds"] for r in rows if (r["learning_rate"], r["planned"]) == chosen[name]]
         median[name] = float(np.median([np.inf if s is None else s for s in seconds]))
-    result = {"target": target, "load": os.getloadavg(), "threads": options.threads, "not_installed": missing}
+    result = {
+        "target": target,
+        "load": os.getloadavg(),
+        "threads": options.threads,
+        "not_installed": missing,
+    }
     result |= {
         "chosen": chosen,
         "median_s": {name: s if np.isfinite(s) else None for name, s in median.items()},

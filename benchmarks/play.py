@@ -19,11 +19,11 @@ import numpy as np
 import tyro
 
 from benchmarks.bus import random_policy
-from brokk_min import play
+from brokk_min.can.ticks import Known
+from brokk_min.learning.policy import PolicyController
 from brokk_min.machine import BROKK_170
-from brokk_min.policy import PolicyController
-from brokk_min.remote import Where
-from brokk_min.ticks import Known
+from brokk_min.viewer import play
+from brokk_min.viewer.remote import Where
 
 
 @dataclass
@@ -55,7 +55,9 @@ class Player:
             wanted |= {("left", "w", "right", "s")[int(now) % 4]}
         for name in self.keys ^ wanted:
             kind = hands.pygame.KEYDOWN if name in wanted else hands.pygame.KEYUP
-            hands.pygame.event.post(hands.pygame.event.Event(kind, key=hands.pygame.key.key_code(name)))
+            hands.pygame.event.post(
+                hands.pygame.event.Event(kind, key=hands.pygame.key.key_code(name))
+            )
         self.keys = wanted
         return not self.begun or now - self.begun < self.seconds
 

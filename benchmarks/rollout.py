@@ -17,7 +17,7 @@ import numpy as np
 import tyro
 
 from brokk_min.actuator import ActuatorNet, load_net
-from brokk_min.environments import TaskVectorEnv
+from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.machine import BROKK_170
 
 

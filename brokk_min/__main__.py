@@ -6,8 +6,8 @@ from typing import Any
 
 import tyro
 
-from brokk_min import commands, operating
-from brokk_min.options import WrongUse
+from brokk_min.cli import commands, operating
+from brokk_min.cli.options import WrongUse
 
 COMMANDS: dict[str, Callable[[], Any]] = {
     "collect": lambda: commands.Collect,

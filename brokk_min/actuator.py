@@ -16,7 +16,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brokk_min.files import expected, load_arrays, load_header, whole_file
+from brokk_min.identification.files import expected, load_arrays, load_header, whole_file
 from brokk_min.machine import Array, estimate_velocity, valve_opening
 
 FORMAT = 1  # of net files
@@ -56,7 +56,9 @@ def push(history: Array, u: ArrayLike, q: ArrayLike, velocity: Callable[[Array],
     `velocity` turns the angles in the history (..., n, H) into the newest velocity (..., n) [rad/s].
     """
     result = np.empty(history.shape, history.dtype)
-    result.reshape(-1)[:-1] = history.reshape(-1)[1:]  # all rows at once; their newest samples follow
+    result.reshape(-1)[:-1] = history.reshape(-1)[
+        1:
+    ]  # all rows at once; their newest samples follow
     result[..., 0, -1] = q
     result[..., 1, -1] = velocity(result[..., 0, :])
     result[..., 2, -1] = u
@@ -78,7 +80,9 @@ def valve_scale(u: ArrayLike, dead_zone: float) -> Array:
     if not dead_zone:
         return u
     opening = valve_opening(u, dead_zone)
-    scaled: Array = np.copysign(np.log(1 + np.abs(opening) / FINE) / math.log(1 + 1 / FINE), opening)
+    scaled: Array = np.copysign(
+        np.log(1 + np.abs(opening) / FINE) / math.log(1 + 1 / FINE), opening
+    )
     return scaled
 
 
@@ -159,7 +163,9 @@ class ActuatorNet:
         """What stands in a history (..., n, 3, H) as nets were shown it, in one row, (..., n, 3 H)."""
         n = len(self.joints)
         if history.shape[-3:] != (n, 3, self.history):
-            raise ValueError(f"history: expected (..., {n}, 3, {self.history}), got {history.shape}")
+            raise ValueError(
+                f"history: expected (..., {n}, 3, {self.history}), got {history.shape}"
+            )
         if self.dead_zone:
             history = history.copy(order="K")
             history[..., 2, :] = valve_scale(history[..., 2, :].copy(order="K"), self.dead_zone)
@@ -207,7 +213,9 @@ NET_ARRAYS = ("input_mean", "input_scale", "output_low", "output_high", "q_low",
 
 def net_arrays(net: ActuatorNet) -> dict[str, Any]:
     """Nets as named arrays, a JSON header among them: what a file holds."""
-    plain = {f.name: getattr(net, f.name) for f in fields(net) if f.name not in (*NET_ARRAYS, "weights")}
+    plain = {
+        f.name: getattr(net, f.name) for f in fields(net) if f.name not in (*NET_ARRAYS, "weights")
+    }
     text = json.dumps({"format": FORMAT, "kind": "actuator net", **plain})
     arrays = {name: getattr(net, name) for name in NET_ARRAYS}
     arrays |= {f"weight_{i}": weight for i, weight in enumerate(net.weights)}
@@ -231,7 +239,14 @@ def net_from_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> ActuatorNet:
         header |= {name: arrays[name] for name in NET_ARRAYS}
         net = ActuatorNet(**header, weights=weights)
         n, inputs, hidden = len(net.joints), 3 * net.history, weights[0].shape[-1]
-        wanted = [(n, inputs, hidden), (n, hidden), (n, hidden, hidden), (n, hidden), (n, hidden, 1), (n, 1)]
+        wanted = [
+            (n, inputs, hidden),
+            (n, hidden),
+            (n, hidden, hidden),
+            (n, hidden),
+            (n, hidden, 1),
+            (n, 1),
+        ]
         wanted += [(n, inputs), (n, inputs), (n,), (n,), (n,), (n,)]
         found = [array.shape for array in (*weights, *(arrays[name] for name in NET_ARRAYS))]
         if found != wanted:

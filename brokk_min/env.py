@@ -17,7 +17,14 @@ from numpy.typing import ArrayLike, NDArray
 from brokk_min.actuator import ActuatorNet, push_command, rest_history
 from brokk_min.kinematics import lowest_point, tool_state
 from brokk_min.machine import PWM_MAX, Array, Machine, lengths, read_encoder
-from brokk_min.observation import draw_noise, observe, paper_view, push_measured, push_motion, to_command
+from brokk_min.observation import (
+    draw_noise,
+    observe,
+    paper_view,
+    push_measured,
+    push_motion,
+    to_command,
+)
 from brokk_min.plant import PlantState, plant_reset, plant_step
 
 GROUND_MARGIN = 0.3  # m above the ground below which no goal asks the arm to sink, assumed
@@ -96,7 +103,9 @@ def rest_state(machine: Machine, q: ArrayLike, v_goal: ArrayLike, plant: bool) -
     never = np.full(q.shape[:-1], np.iinfo(np.int64).max)
     ticks = np.zeros(q.shape[:-1], np.int64)
     plant_state = plant_reset(machine, q) if plant else None
-    return State(q, np.zeros_like(q), history, goals, never, ticks, np.zeros_like(goals), motion, plant_state)
+    return State(
+        q, np.zeros_like(q), history, goals, never, ticks, np.zeros_like(goals), motion, plant_state
+    )
 
 
 def transition(
@@ -122,7 +131,9 @@ def transition(
     else:
         raise ValueError("net: expected nets for a state without a plant, got None")
 
-    history, lag = push_measured(machine, state.history, u, read(machine, q), state.v_goal, state.lag)
+    history, lag = push_measured(
+        machine, state.history, u, read(machine, q), state.v_goal, state.lag
+    )
     return replace(
         state,
         q=q,
@@ -170,7 +181,9 @@ def draw_pose(machine: Machine, config: TaskConfig, rng: np.random.Generator, nu
             return q
         q[bad] = rng.uniform(low, high, (int(bad.sum()), machine.n))
     if config.redraw_ground:
-        raise ValueError(f"{machine.name}: expected a pose above the ground, got none in 1000 draws")
+        raise ValueError(
+            f"{machine.name}: expected a pose above the ground, got none in 1000 draws"
+        )
     return q
 
 
@@ -183,12 +196,16 @@ def draw_goal(machine: Machine, config: TaskConfig, rng: np.random.Generator, nu
     return np.asarray(direction * (speed / lengths(direction)[:, None]))
 
 
-def _draw_hold(machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int) -> NDArray[np.int64]:
+def _draw_hold(
+    machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int
+) -> NDArray[np.int64]:
     low, high = (max(1, round(s * machine.rate)) for s in (config.hold_min_s, config.hold_max_s))
     return rng.integers(low, high + 1, num)
 
 
-def reset(machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int, plant: bool) -> State:
+def reset(
+    machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int, plant: bool
+) -> State:
     """`num` machines at rest in random poses with random goals; leading shape (num,)."""
     pose, goal = draw_pose(machine, config, rng, num), draw_goal(machine, config, rng, num)
     state = rest_state(machine, pose, goal, plant)
@@ -228,7 +245,9 @@ def step(
     """
     u = to_command(machine, action)
     before, state = state, transition(machine, net, state, u)
-    _, v_tool, lowest = tool_state(machine, state.q.astype(np.float32), state.q_dot.astype(np.float32))
+    _, v_tool, lowest = tool_state(
+        machine, state.q.astype(np.float32), state.q_dot.astype(np.float32)
+    )
     rewards = reward(state.v_goal, v_tool)
     end = terminated(machine, lowest)
     error = 1 / rewards - 1

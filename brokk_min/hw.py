@@ -14,14 +14,22 @@ from typing import Any
 
 import numpy as np
 
-from brokk_min import bus
 from brokk_min.actuator import rest_history
+from brokk_min.can import canopen as bus
+from brokk_min.can.operator_input import Wish, unpack_wish
+from brokk_min.can.safety_gate import (
+    OPERATIONAL,
+    Array,
+    GateInputs,
+    encoder_counts,
+    fault_name,
+    gate,
+    gate_start,
+)
 from brokk_min.env import Controller
-from brokk_min.gate import OPERATIONAL, Array, GateInputs, encoder_counts, fault_name, gate, gate_start
 from brokk_min.kinematics import tool_state
 from brokk_min.machine import PWM_MAX, Machine
 from brokk_min.observation import observe, push_measured
-from brokk_min.wishes import Wish, unpack_wish
 
 AWAKE = 0.002  # s before SYNC and after it in which the loop does not sleep (tuned)
 REHEARSALS = 4  # of a tick before it (tuned)
@@ -40,17 +48,30 @@ class Drive:
     """
 
     def __init__(
-        self, machine: Machine, controller: Controller, line: Any, operator: Callable[[bool, bool], Wish]
+        self,
+        machine: Machine,
+        controller: Controller,
+        line: Any,
+        operator: Callable[[bool, bool], Wish],
     ) -> None:
         if machine.n > 5:
-            raise ValueError(f"{machine.name}: expected at most 5 joints in a valve frame, got {machine.n}")
-        self.machine, self.controller, self.line, self.operator = machine, controller, line, operator
+            raise ValueError(
+                f"{machine.name}: expected at most 5 joints in a valve frame, got {machine.n}"
+            )
+        self.machine, self.controller, self.line, self.operator = (
+            machine,
+            controller,
+            line,
+            operator,
+        )
         self.nodes, self.gate, self.wish = bus.Nodes(machine), gate_start(machine), Wish()
         self.memory = controller.start(1)
         self.history: Array | None = None
         self.lag: Array = np.zeros((1, 3), np.float32)  # of `push_lag`
         self.asked = self.lag  # tool velocity wanted in the last tick [m/s]
-        self.problem = self.remark = self.reason = ""  # exception of this tick, the last one, what is wrong
+        self.problem = self.remark = self.reason = (
+            ""  # exception of this tick, the last one, what is wrong
+        )
         self.signals: list[int] = []
         self.ticks, self.skipped, self.lateness = 0, 0, 0.0
         self.begun, self.number = 0.0, 0  # the grid of deadlines, and where on it we are
@@ -83,7 +104,9 @@ class Drive:
         line, wanted = self.line, np.zeros(self.machine.n)
         with self._caught():
             wish = self.operator(bool(self.gate.driving), bool(self.gate.wrong == 0))
-            self.wish = unpack_wish(wish.pack())  # as the log has it, so that a replay gets the same
+            self.wish = unpack_wish(
+                wish.pack()
+            )  # as the log has it, so that a replay gets the same
         self.nodes.frames *= 2  # a position from before its SYNC is as wrong as a doubled one
         with self._caught():
             line.send(bus.SYNC, b"")
@@ -98,8 +121,13 @@ class Drive:
         self._speak(frame)
         self._remember(problem)
         with self._caught():
-            if not (self.wish.enable or self.gate.driving) and (self.nodes.nmt != OPERATIONAL).any():
-                line.send(bus.NMT, bytes([1, 0]))  # nodes fell back; not while the operator holds the switch
+            if (
+                not (self.wish.enable or self.gate.driving)
+                and (self.nodes.nmt != OPERATIONAL).any()
+            ):
+                line.send(
+                    bus.NMT, bytes([1, 0])
+                )  # nodes fell back; not while the operator holds the switch
             line.flush()
         return not self.wish.stop
 
@@ -120,7 +148,11 @@ class Drive:
     @property
     def seen(self) -> Array:
         """Newest angles [rad] and rates [rad/s], (2, n); nan: unknown."""
-        return np.full((2, self.machine.n), np.nan) if self.history is None else self.history[0, :, :2, -1].T
+        return (
+            np.full((2, self.machine.n), np.nan)
+            if self.history is None
+            else self.history[0, :, :2, -1].T
+        )
 
     def status(self) -> str:
         """One line: state, faults, tool velocity wanted and measured [m/s], angles [rad], lateness."""
@@ -182,7 +214,9 @@ class Drive:
         if (self.nodes.frames != 1).any():
             self.history = None  # a gap: what came before it no longer joins what comes after
             return np.zeros(m.n)
-        q = counts[None].astype(np.float32) * m.encoder_step  # as `read_encoder` gives in the simulation
+        q = (
+            counts[None].astype(np.float32) * m.encoder_step
+        )  # as `read_encoder` gives in the simulation
         if self.history is None:
             self.history = rest_history(q, m.history)
         else:
@@ -217,7 +251,9 @@ class Drive:
 
     def _remember(self, problem: str) -> None:
         """What was sent and what is wrong; forget what this tick heard."""
-        stopped, wrong = (fault_name(self.machine, int(f)) for f in (self.gate.fault, self.gate.wrong))
+        stopped, wrong = (
+            fault_name(self.machine, int(f)) for f in (self.gate.fault, self.gate.wrong)
+        )
         self.reason = f"fault: {stopped}" if stopped else wrong
         self.remark = "" if self.gate.driving else problem or self.remark
         self.reason += f" ({self.remark})" if self.remark else ""

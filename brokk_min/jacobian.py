@@ -111,7 +111,9 @@ def join_gains(machine: Machine, named: Mapping[str, ArrayLike]) -> Array:
     """
     sizes = [len(machine.driven)] * 3 + [1, 1]
     pairs = zip(GAINS, sizes, strict=True)
-    gains = np.concatenate([np.broadcast_to(np.asarray(named[name], float), size) for name, size in pairs])
+    gains = np.concatenate(
+        [np.broadcast_to(np.asarray(named[name], float), size) for name, size in pairs]
+    )
     if not np.isfinite(gains).all():
         raise ValueError(f"gains: expected finite numbers, got {gains}")
     return gains
@@ -152,14 +154,18 @@ def steady_map(machine: Machine, net: ActuatorNet) -> SteadyMap:
     """Ask the nets how fast each driven joint moves steadily under each command at each angle."""
     angles, commands = 9, 41  # assumed
     low, high = machine.column("q_min")[machine.driven], machine.column("q_max")[machine.driven]
-    inset = 0.05 * (high - low)  # assumed; at the very end a stop holds the joint, whatever the command
+    inset = 0.05 * (
+        high - low
+    )  # assumed; at the very end a stop holds the joint, whatever the command
     q = np.linspace(low + inset, high - inset, angles)[:, None]  # (a, 1, n)
     u = np.linspace(-1, 1, commands) * machine.pwm_limit / PWM_MAX
     history = np.zeros((angles, commands, len(low), 3, net.history), np.float32)
     history[..., 2, :] = u[:, None, None]
     lags, share = np.arange(1 - net.history, 1) / net.rate, np.linspace(-1, 1, commands)[:, None]
     moving = np.where(share > 0, net.output_high * share, -net.output_low * share)
-    velocity = np.tile(moving, (angles, 1, 1))  # from rest they might see a joint that stands at its stop
+    velocity = np.tile(
+        moving, (angles, 1, 1)
+    )  # from rest they might see a joint that stands at its stop
     for _ in range(60):  # fixed point: a history that moves as fast as the nets say it does
         history[..., 0, :] = q[..., None] + velocity[..., None] * lags
         history[..., 1, :] = velocity[..., None]
@@ -214,13 +220,17 @@ class JacobianController:
         slope = 0.7 * memory.slope + 0.3 * (error - memory.error) * m.rate
         opening = g["kp"] * error + memory.integral + g["kd"] * slope
         if self.feedforward is not None:
-            opening += valve_opening(self.feedforward.command(seen.q[..., m.driven], rate), m.dead_zone)
+            opening += valve_opening(
+                self.feedforward.command(seen.q[..., m.driven], rate), m.dead_zone
+            )
         room = valve_opening(m.pwm_limit / PWM_MAX, m.dead_zone)
         winding = (np.abs(opening) >= room) & (np.sign(opening) == np.sign(error))
         integral = memory.integral + np.where(winding, 0.0, g["ki"] * error * m.dt)
         moving = np.linalg.norm(seen.v_goal, axis=-1, keepdims=True) > 1e-6
         size = np.maximum(np.abs(opening), (moving | self.awake) * g["ready"])
-        size = (size >= 0.5 / PWM_MAX) * (m.dead_zone + (1 - m.dead_zone) * size)  # below half a count: idle
+        size = (size >= 0.5 / PWM_MAX) * (
+            m.dead_zone + (1 - m.dead_zone) * size
+        )  # below half a count: idle
         u = np.zeros((*opening.shape[:-1], m.n))
         u[..., m.driven] = np.sign(opening) * size
         return limit_command(m, u), Memory(integral, error, slope, rate)

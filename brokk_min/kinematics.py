@@ -32,7 +32,9 @@ class _Plan(NamedTuple):
     theta: Array  # (n, 2, 1), offsets summed from a run's first joint on [rad]; a quarter turn makes cosines
     a: Array  # (n, 1, 1) [m]
     rises: Array  # (n, 2, 1), d summed from a joint to the end of its run [m]; 0 for columns
-    bends: list[tuple[int, int, Array]]  # first joint and end of each run but the last; turn by alpha (2, 2)
+    bends: list[
+        tuple[int, int, Array]
+    ]  # first joint and end of each run but the last; turn by alpha (2, 2)
     damping: float  # of `damped_rates` [m^2]
 
 
@@ -44,11 +46,18 @@ def _plan(machine: Machine, dtype: Any) -> _Plan:
         ends = [i + 1 for i in range(machine.n - 1) if alpha[i]]  # alpha tilts the next axis
         run = np.searchsorted(ends, np.arange(machine.n), "right")
         before = np.tri(machine.n) * (run[:, None] == run)  # joints of the same run, up to each one
-        offsets, rises = np.add.outer(before @ theta, [np.pi / 2, 0]), np.outer(before.T @ d, [1, 0])
+        offsets, rises = (
+            np.add.outer(before @ theta, [np.pi / 2, 0]),
+            np.outer(before.T @ d, [1, 0]),
+        )
         tilts = np.array([[np.cos(alpha), -np.sin(alpha)], [np.sin(alpha), np.cos(alpha)]], dtype)
-        bends = [(start, end, tilts[..., end - 1]) for start, end in zip([0, *ends], ends, strict=False)]
+        bends = [
+            (start, end, tilts[..., end - 1]) for start, end in zip([0, *ends], ends, strict=False)
+        ]
         inner, length = [i for i in range(1, machine.n) if i not in ends], np.hypot(a, d).sum()
-        theta, a, rises = (each.reshape(machine.n, -1, 1).astype(dtype) for each in (offsets, a, rises))
+        theta, a, rises = (
+            each.reshape(machine.n, -1, 1).astype(dtype) for each in (offsets, a, rises)
+        )
         kept[dtype] = _Plan(inner, theta, a, rises, bends, 1e-6 + (0.06 * length) ** 2)
     return kept[dtype]
 
@@ -121,7 +130,12 @@ def frames(machine: Machine, q: ArrayLike) -> Array:
     for i, joint in enumerate(machine.joints):
         c, s = np.cos(angles[i] + joint.theta), np.sin(angles[i] + joint.theta)
         cos, sin = np.cos(joint.alpha), np.sin(joint.alpha)
-        turns[i, ..., 0, 0], turns[i, ..., 0, 1], turns[i, ..., 1, 0], turns[i, ..., 1, 1] = c, -s, s, c
+        turns[i, ..., 0, 0], turns[i, ..., 0, 1], turns[i, ..., 1, 0], turns[i, ..., 1, 1] = (
+            c,
+            -s,
+            s,
+            c,
+        )
         row = [[1, 0, 0, joint.a], [0, cos, -sin, 0], [0, sin, cos, joint.d], [0, 0, 0, 1]]
         result[i + 1] = result[i] @ turns[i] @ np.array(row, angles.dtype)
     return np.moveaxis(result, 0, -3)
@@ -216,5 +230,7 @@ def lowest_point(machine: Machine, q: ArrayLike) -> Array:
 
 
 def _lowest(chain: Chain) -> Array:
-    rises = chain.levers[2]  # the first from the ground; links end in the joints after it and in the tool
+    rises = chain.levers[
+        2
+    ]  # the first from the ground; links end in the joints after it and in the tool
     return np.asarray(rises[0] - np.maximum.reduce(rises[1:], initial=0))

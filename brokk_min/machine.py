@@ -21,7 +21,9 @@ SOURCES = ("paper", "maker", "assumed", "tuned")
 PWM_MAX = 127  # counts of full command; paper: [0,127] is positive, [255,128] negative
 
 
-def _number(unit: str, low: float = -np.inf, high: float = np.inf, default: Any = dataclasses.MISSING) -> Any:
+def _number(
+    unit: str, low: float = -np.inf, high: float = np.inf, default: Any = dataclasses.MISSING
+) -> Any:
     """A dataclass field with its unit and its range, both ends included; `int` means whole."""
     return dataclasses.field(default=default, metadata={"unit": unit, "low": low, "high": high})
 
@@ -63,7 +65,9 @@ class Joint:
     cylinder_area: float = _number("m^2", 1e-9)
     speed_positive: float = _number("m/s", 1e-9)  # of the cylinder at full command
     speed_negative: float = _number("m/s", 1e-9)
-    q_dot_up: float = _number("rad/s", 1e-9)  # fastest positive motion at the command limit, as logs show it
+    q_dot_up: float = _number(
+        "rad/s", 1e-9
+    )  # fastest positive motion at the command limit, as logs show it
     q_dot_down: float = _number("rad/s", 1e-9)  # fastest negative motion, a positive number
     encoder_node: int = _number("CANopen node id", 1, 127)
     encoder_zero: int = _number("counts", default=0)  # what the encoder says at q = 0
@@ -74,7 +78,9 @@ class Joint:
         if self.encoder_sign == 0:
             raise ValueError(f"{self.name}.encoder_sign: expected -1 or 1, got 0")
         if not self.q_min < self.q_max:
-            raise ValueError(f"{self.name}.q_max: expected above q_min = {self.q_min}, got {self.q_max!r}")
+            raise ValueError(
+                f"{self.name}.q_max: expected above q_min = {self.q_min}, got {self.q_max!r}"
+            )
         low, high = self.cylinder_angle + self.q_min, self.cylinder_angle + self.q_max
         if self.cylinder_base > 0 and not 0 < low < high < np.pi:
             raise ValueError(
@@ -98,7 +104,9 @@ class Machine:
     joints: tuple[Joint, ...]
     sources: Mapping[str, str] = dataclasses.field(hash=False)  # name of a number -> one of SOURCES
     rate: float = _number("Hz", 1e-3)  # control and logging rate
-    pwm_limit: int = _number("counts of 127", 1, PWM_MAX)  # largest command that may leave the program
+    pwm_limit: int = _number(
+        "counts of 127", 1, PWM_MAX
+    )  # largest command that may leave the program
     dead_zone: float = _number("of full command", 0, 0.99)
     delay: float = _number("s", 0)
     spool_time: float = _number("s", 1e-6)
@@ -128,7 +136,9 @@ class Machine:
             for field in _numbers(owner):
                 _check_number(field, where + field.name, getattr(owner, field.name))
                 if (source := self.sources.get(field.name)) not in SOURCES:
-                    raise ValueError(f"sources[{field.name!r}]: expected one of {SOURCES}, got {source!r}")
+                    raise ValueError(
+                        f"sources[{field.name!r}]: expected one of {SOURCES}, got {source!r}"
+                    )
         for joint in self.joints:
             joint.check_range()
         nodes = [joint.encoder_node for joint in self.joints]
@@ -136,13 +146,19 @@ class Machine:
             if len(set(values)) != len(values):
                 raise ValueError(f"joints: expected different {what}, got {values}")
         if self.controller_node in nodes:
-            raise ValueError(f"controller_node: expected none of {nodes}, got {self.controller_node}")
+            raise ValueError(
+                f"controller_node: expected none of {nodes}, got {self.controller_node}"
+            )
         if not self.dead_zone * PWM_MAX < self.pwm_limit:  # no valve would ever open
             limit = f"{self.pwm_limit}/{PWM_MAX}"
-            raise ValueError(f"dead_zone: expected below the command limit {limit}, got {self.dead_zone!r}")
+            raise ValueError(
+                f"dead_zone: expected below the command limit {limit}, got {self.dead_zone!r}"
+            )
         steps = self.dt / self.plant_dt
         if abs(steps - round(steps)) > 1e-6 or steps < 0.5:
-            raise ValueError(f"plant_dt: expected 1/rate = {self.dt} to be a multiple, got {self.plant_dt}")
+            raise ValueError(
+                f"plant_dt: expected 1/rate = {self.dt} to be a multiple, got {self.plant_dt}"
+            )
 
     @property
     def n(self) -> int:
@@ -182,7 +198,8 @@ class Machine:
     @cached_property
     def _columns(self) -> dict[str, NDArray[np.float64]]:
         columns = {
-            f.name: np.array([getattr(j, f.name) for j in self.joints], float) for f in _numbers(Joint)
+            f.name: np.array([getattr(j, f.name) for j in self.joints], float)
+            for f in _numbers(Joint)
         }
         for column in columns.values():
             column.setflags(write=False)
@@ -273,7 +290,9 @@ def decode_pwm(u_byte: ArrayLike) -> NDArray[np.float64]:
     """
     u_byte = np.asarray(u_byte).astype(int)
     if not np.all((u_byte >= 0) & (u_byte <= 255)):
-        raise ValueError(f"u_byte: expected 0 to 255, got {u_byte[(u_byte < 0) | (u_byte > 255)].flat[0]}")
+        raise ValueError(
+            f"u_byte: expected 0 to 255, got {u_byte[(u_byte < 0) | (u_byte > 255)].flat[0]}"
+        )
     counts = np.where(u_byte > PWM_MAX, u_byte - 255, u_byte)
     return np.asarray(counts / PWM_MAX, float)
 

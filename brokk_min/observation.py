@@ -15,10 +15,20 @@ from numpy.typing import ArrayLike
 
 from brokk_min.actuator import push
 from brokk_min.kinematics import damped_rates, tool_jacobian, tool_position, tool_velocity
-from brokk_min.machine import PWM_MAX, Array, Machine, as_floats, estimate_velocity, lengths, limit_command
+from brokk_min.machine import (
+    PWM_MAX,
+    Array,
+    Machine,
+    as_floats,
+    estimate_velocity,
+    lengths,
+    limit_command,
+)
 
 LAG_TIME, LAG_SPEED = 2.0, 0.07  # s and a share of tool_speed, tuned: see `push_lag`
-RAMP = 0.01  # of the command limit, assumed: actions this small take a command through the dead zone
+RAMP = (
+    0.01  # of the command limit, assumed: actions this small take a command through the dead zone
+)
 
 
 class Measured(NamedTuple):
@@ -37,7 +47,9 @@ class _Layout(NamedTuple):
     scale: Array
     paper: Array  # factors that make it the paper's: weights undone, wanted rates blanked
     sensed: Array  # standard deviations of what sensors say, in physical units: all after the goal, (sensed,)
-    told: Array  # of a joint's angles and velocities [1, s], their sum tells where it is now, (2, H)
+    told: (
+        Array  # of a joint's angles and velocities [1, s], their sum tells where it is now, (2, H)
+    )
 
 
 def _layout(machine: Machine) -> _Layout:
@@ -65,7 +77,9 @@ def _layout(machine: Machine) -> _Layout:
         sensed = deviation[3 : 6 + len(rest) + 2 * samples * len(driven)]
         # velocity j is in j of H sums, and late by half its window: to it comes so often what it grew by
         late = machine.velocity_samples / 2 - 1
-        turned = (np.arange(samples) - late + late * samples * (np.arange(samples) == samples - 1)) / samples
+        turned = (
+            np.arange(samples) - late + late * samples * (np.arange(samples) == samples - 1)
+        ) / samples
         told = np.stack([each / samples, machine.dt * turned]).astype(np.float32)
         machine.__dict__["layout"] = _Layout(mean, scale, paper, sensed, told)
     layout: _Layout = machine.__dict__["layout"]
@@ -140,10 +154,14 @@ def observe(
     return seen
 
 
-def draw_noise(machine: Machine, largest: float, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
+def draw_noise(
+    machine: Machine, largest: float, shape: tuple[int, ...], rng: np.random.Generator
+) -> Array:
     """Fresh uniform noise for `observe` of `shape` machines, in standard deviations, at most `largest`."""
     steps = rng.integers(-(2**15), 2**15, (*shape, len(_layout(machine).sensed)), np.int16)
-    return np.asarray(steps * np.float32(2.0**-15 * largest))  # 16 bits take half as long as a float32
+    return np.asarray(
+        steps * np.float32(2.0**-15 * largest)
+    )  # 16 bits take half as long as a float32
 
 
 def _moving(machine: Machine, values: Array) -> Array:

@@ -71,7 +71,10 @@ def plant_step(machine: Machine, state: PlantState, u: ArrayLike) -> PlantState:
         rate = np.where(target > ready, m.ready_up_time, m.ready_down_time)
         q_next = q + dt * speed / lever_arm(m, q)
         speed = speed + dt * (demand * supply - speed) / m.cylinder_time
-        spool, ready = (spool + dt * (opening - spool) / m.spool_time, ready + dt * (target - ready) / rate)
+        spool, ready = (
+            spool + dt * (opening - spool) / m.spool_time,
+            ready + dt * (target - ready) / rate,
+        )
         q = np.clip(q_next, q_min, q_max)
         outward = ((q >= q_max) & (speed > 0)) | ((q <= q_min) & (speed < 0))
         speed = np.where(outward, 0.0, speed)

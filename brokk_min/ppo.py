@@ -29,14 +29,14 @@ from torch import nn
 from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet, fingerprint
-from brokk_min.adjoint import Rollout, action_gradients
 from brokk_min.env import State, TaskConfig
-from brokk_min.environments import TaskVectorEnv
-from brokk_min.extras import need
-from brokk_min.files import expect_same, load_arrays, load_header, whole_file
+from brokk_min.identification.extras import need
+from brokk_min.identification.files import expect_same, load_arrays, load_header, whole_file
+from brokk_min.learning.gym_env import TaskVectorEnv
+from brokk_min.learning.policy import Policy, contract, save_policy
+from brokk_min.learning.simulation_gradient import Rollout, action_gradients
 from brokk_min.machine import Machine
 from brokk_min.observation import observation_scale, paper_view, to_command
-from brokk_min.policy import Policy, contract, save_policy
 
 Array = NDArray[Any]
 Tensor = torch.Tensor
@@ -123,7 +123,12 @@ def log_probability(action: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
 
 
 def gae(
-    rewards: Tensor, values: Tensor, next_values: Tensor, ended: Tensor, gamma: float, gae_lambda: float
+    rewards: Tensor,
+    values: Tensor,
+    next_values: Tensor,
+    ended: Tensor,
+    gamma: float,
+    gae_lambda: float,
 ) -> Tensor:
     """Generalised advantage estimates, all arguments and the result of shape (T, N).
 
@@ -199,7 +204,9 @@ class Training:
     def __init__(self, env: TaskVectorEnv, config: PPOConfig, seed: int) -> None:
         self.env, self.config, self.seed = env, config, seed
         torch.set_num_threads(config.threads)
-        torch.set_float32_matmul_precision("medium")  # oneDNN's kernels where MKL's take twice as long
+        torch.set_float32_matmul_precision(
+            "medium"
+        )  # oneDNN's kernels where MKL's take twice as long
         self.generator = torch.Generator().manual_seed(seed)
         with torch.random.fork_rng():
             torch.manual_seed(seed)
@@ -208,10 +215,17 @@ class Training:
             self.agent = Agent(seen, actions, config.log_std)
         self.critic = config.critic or env.config.paper
         self.agent.log_std.requires_grad_(self.critic)
-        self.optimizer = torch.optim.Adam(self.agent.parameters(), lr=config.learning_rate, fused=True)
+        self.optimizer = torch.optim.Adam(
+            self.agent.parameters(), lr=config.learning_rate, fused=True
+        )
         self.updates, self.learning_rate = 0, config.learning_rate
-        self.returns, self.lengths = (np.zeros(config.num_envs) for _ in range(2))  # of running episodes
-        self.episodes: tuple[float, ...] = (0.0, 0.0)  # mean return and length of the last that ended
+        self.returns, self.lengths = (
+            np.zeros(config.num_envs) for _ in range(2)
+        )  # of running episodes
+        self.episodes: tuple[float, ...] = (
+            0.0,
+            0.0,
+        )  # mean return and length of the last that ended
         self.observation = torch.from_numpy(env.reset(seed=seed)[0])
 
     @property
@@ -236,7 +250,10 @@ class Training:
         scalars |= {"charts/learning_rate": rate} | losses
         for name, value in scalars.items():
             finite(name, torch.tensor(value), self.steps)
-        for name, parameter in self.agent.named_parameters():  # a last gradient may spoil them unseen
+        for (
+            name,
+            parameter,
+        ) in self.agent.named_parameters():  # a last gradient may spoil them unseen
             finite(name, parameter, self.steps)
         return scalars
 
@@ -247,7 +264,11 @@ class Training:
         shape, std = (c.horizon, c.num_envs), torch.exp(agent.log_std)
         observations = torch.empty(*shape, self.observation.shape[-1])
         actions, means = (torch.empty(*shape, len(std)) for _ in range(2))
-        rewards, tails, ended = torch.empty(shape), torch.zeros(shape), torch.empty(shape, dtype=torch.bool)
+        rewards, tails, ended = (
+            torch.empty(shape),
+            torch.zeros(shape),
+            torch.empty(shape, dtype=torch.bool),
+        )
         ticks: list[tuple[Any, ...]] = []
         errors = []
         for t in range(c.horizon):
@@ -291,7 +312,9 @@ class Training:
         for reward, over in zip(rewards, ended, strict=True):
             self.returns, self.lengths = self.returns + reward, self.lengths + 1
             finished += list(zip(self.returns[over], self.lengths[over], strict=True))
-            self.returns, self.lengths = (np.where(over, 0, x) for x in (self.returns, self.lengths))
+            self.returns, self.lengths = (
+                np.where(over, 0, x) for x in (self.returns, self.lengths)
+            )
         if finished:
             self.episodes = tuple(map(float, np.mean(finished, axis=0)))
 
@@ -309,7 +332,9 @@ class Training:
         """Advantages (T, N): what the deviation from the mean action was worth, to first order."""
         env, net = self.env, self.env.net
         if net is None:
-            raise ValueError("actuator: expected nets, whose derivatives are known, got the analytic plant")
+            raise ValueError(
+                "actuator: expected nets, whose derivatives are known, got the analytic plant"
+            )
         rollout = Rollout(*map(np.stack, zip(*ticks, strict=True)))
         slope = action_gradients(env.machine, net, rollout, self.config.gamma, env.config)
         deviation = actions.clamp(-1, 1) - means.clamp(-1, 1)  # of what the valves got
@@ -331,7 +356,9 @@ class Training:
         names = ("policy_loss", "value_loss", "entropy", "approx_kl", "clipfrac")
         means = (total / (size * c.epochs)).tolist()
         pairs = zip(names, means, strict=True)
-        return {f"losses/{name}": mean for name, mean in pairs if self.critic or name != "value_loss"}
+        return {
+            f"losses/{name}": mean for name, mean in pairs if self.critic or name != "value_loss"
+        }
 
     def policy(self, training: dict[str, Any]) -> Policy:
         """The actor as it stands, for the machine it was trained for."""
@@ -339,7 +366,9 @@ class Training:
         if net is None:
             raise ValueError("actuator: expected a policy trained on nets, got the analytic plant")
         layers = [layer for layer in self.agent.actor if isinstance(layer, nn.Linear)]
-        arrays = (array.detach().numpy() for layer in layers for array in (layer.weight.T, layer.bias))
+        arrays = (
+            array.detach().numpy() for layer in layers for array in (layer.weight.T, layer.bias)
+        )
         first, *rest = (array.copy() for array in arrays)
         if self.env.config.paper:
             first = first * paper_view(machine)[:, None]
@@ -362,7 +391,10 @@ class Training:
             "random": self.env.np_random.bit_generator.state,
         }
         arrays = {f"env_{name}": getattr(state, name) for name in STATE}
-        arrays |= {"observation": self.observation.numpy(), "generator": self.generator.get_state().numpy()}
+        arrays |= {
+            "observation": self.observation.numpy(),
+            "generator": self.generator.get_state().numpy(),
+        }
         arrays |= {"returns": self.returns, "lengths": self.lengths}
         moments = self.optimizer.state
         for i, parameter in enumerate(self.agent.parameters()):
@@ -387,7 +419,9 @@ class Training:
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise ValueError(f"{path}: expected a complete checkpoint, got {error!r}") from error
 
-    def _restore(self, header: dict[str, Any], arrays: dict[str, Any], tensors: dict[str, Tensor]) -> None:
+    def _restore(
+        self, header: dict[str, Any], arrays: dict[str, Any], tensors: dict[str, Tensor]
+    ) -> None:
         self.updates, self.observation = header["updates"], tensors["observation"]
         self.learning_rate, self.episodes = header["learning_rate"], tuple(header["episodes"])
         self.returns, self.lengths = arrays["returns"], arrays["lengths"]
@@ -486,9 +520,13 @@ def _take_up(training: Training, checkpoint: Path, identity: dict[str, Any], res
     if resume and checkpoint.exists():
         training.load(checkpoint, identity)
     elif resume:
-        tqdm.write(f"{checkpoint}: no checkpoint, training starts from the beginning", file=sys.stderr)
+        tqdm.write(
+            f"{checkpoint}: no checkpoint, training starts from the beginning", file=sys.stderr
+        )
     elif checkpoint.exists():
-        raise ValueError(f"{checkpoint}: expected --resume or no checkpoint, got one of a broken training")
+        raise ValueError(
+            f"{checkpoint}: expected --resume or no checkpoint, got one of a broken training"
+        )
 
 
 def _read_curve(path: Path, steps: int) -> list[dict[str, Any]]:
@@ -496,7 +534,9 @@ def _read_curve(path: Path, steps: int) -> list[dict[str, Any]]:
         with open(path, newline="") as file:
             return [row for row in csv.DictReader(file) if int(row["global_step"]) <= steps]
     except (OSError, KeyError, ValueError) as error:
-        raise ValueError(f"{path}: expected the curve beside the checkpoint, got {error!r}") from error
+        raise ValueError(
+            f"{path}: expected the curve beside the checkpoint, got {error!r}"
+        ) from error
 
 
 def _write_curve(path: Path, rows: list[dict[str, Any]]) -> None:
@@ -513,4 +553,6 @@ def _tensorboard(folder: Path | None) -> Iterator[Callable[[dict[str, Any]], obj
         yield lambda row: None
         return
     with need("torch.utils.tensorboard", "tensorboard").SummaryWriter(str(folder)) as writer:
-        yield lambda row: [writer.add_scalar(k, v, row["global_step"]) for k, v in list(row.items())[1:]]
+        yield lambda row: [
+            writer.add_scalar(k, v, row["global_step"]) for k, v in list(row.items())[1:]
+        ]

@@ -92,7 +92,9 @@ BUCKET = Joint(
     encoder_node=0x24,
 )
 
-_NUMBERS = [f.name for owner in (Joint, Machine) for f in dataclasses.fields(owner) if "unit" in f.metadata]
+_NUMBERS = [
+    f.name for owner in (Joint, Machine) for f in dataclasses.fields(owner) if "unit" in f.metadata
+]
 
 MINI_EXCAVATOR = Machine(
     name="mini_excavator",

@@ -10,12 +10,12 @@ import can
 import numpy as np
 
 from brokk_min import hw
-from brokk_min.bus import Frame, Line
+from brokk_min.can.canopen import Frame, Line
+from brokk_min.can.operator_input import Wish
+from brokk_min.can.simulated_machine import SimulatedMachine
 from brokk_min.env import Controller
 from brokk_min.hw import Drive
 from brokk_min.machine import BROKK_170, Machine
-from brokk_min.simulator import SimulatedMachine
-from brokk_min.wishes import Wish
 
 hw.REHEARSALS = 1  # nothing cools down on an injected clock
 START = (0.0, 0.5, 0.58, 1.71, 1.24)
@@ -86,7 +86,9 @@ class World:
         while (message := self.far.recv(0)) is not None:
             if message.arbitration_id == 0x080:
                 self.syncs.append(self.t)
-            self.say(self.simulated.receive(Frame(self.t, message.arbitration_id, bytes(message.data))))
+            self.say(
+                self.simulated.receive(Frame(self.t, message.arbitration_id, bytes(message.data)))
+            )
 
     def say(self, frames: Out) -> None:
         for frame in frames:

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from brokk_min.actuator import ActuatorNet
+from brokk_min.identification.logs import Recording, velocity_of
 from brokk_min.kinematics import jacobian
-from brokk_min.logs import Recording, velocity_of
 from brokk_min.machine import BROKK_170, Joint, Machine
 
 GAIN = 3.0  # of `obedient_net`
@@ -60,7 +60,9 @@ def random_machine(rng: np.random.Generator, n: int) -> Machine:
     )
 
 
-def small_net(machine: Machine, rng: np.random.Generator, joints: tuple[str, ...] = ()) -> ActuatorNet:
+def small_net(
+    machine: Machine, rng: np.random.Generator, joints: tuple[str, ...] = ()
+) -> ActuatorNet:
     """Nets with random weights for `joints` (none: the driven ones): all inputs matter."""
     joints = joints or tuple(machine.names[i] for i in machine.driven)
     index = [machine.names.index(name) for name in joints]
@@ -149,7 +151,9 @@ class RowRandom:
     def integers(
         self, low: int, high: int, size: int | tuple[int, ...], dtype: type = np.int64
     ) -> np.ndarray:
-        return np.concatenate([s.integers(low, high, self._rows(size), dtype) for s in self.sources])
+        return np.concatenate(
+            [s.integers(low, high, self._rows(size), dtype) for s in self.sources]
+        )
 
     def uniform(self, low: float, high: float, size: int | tuple[int, ...]) -> np.ndarray:
         return np.concatenate([s.uniform(low, high, self._rows(size)) for s in self.sources])

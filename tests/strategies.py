@@ -90,7 +90,9 @@ def posed(draw: st.DrawFn, shapes: list[tuple[int, ...]] = SHAPES) -> tuple[Mach
 
 
 @st.composite
-def moving(draw: st.DrawFn, shapes: list[tuple[int, ...]] = SHAPES) -> tuple[Machine, np.ndarray, np.ndarray]:
+def moving(
+    draw: st.DrawFn, shapes: list[tuple[int, ...]] = SHAPES
+) -> tuple[Machine, np.ndarray, np.ndarray]:
     """A machine, angles, and angular velocities of the same shape; both arrays read-only."""
     machine, q = draw(posed(shapes))
     q_dot = draw(npst.arrays(np.float64, q.shape, elements=reals(-1.0, 1.0)))

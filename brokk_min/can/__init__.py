@@ -1,0 +1,1 @@
+"""The CAN bus: CANopen frames, safety gate, operator input, simulated machine, drive log."""

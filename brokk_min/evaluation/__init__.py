@@ -1,0 +1,1 @@
+"""The paper's experiment: controllers, sequences, figures of merit, claims, report."""

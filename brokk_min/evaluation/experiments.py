@@ -1,0 +1,288 @@
+"""The paper's experiment as numbers: the comparison, the bound, robustness, the singular case.
+
+`task_space` runs every controller on the same starts and velocity sequences on the same machine.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from brokk_min import __version__, actuator, jacobian, kinematics
+from brokk_min.env import Controller, TaskConfig, Trace, rollout
+from brokk_min.evaluation import claims, metrics
+from brokk_min.evaluation.baselines import PAPERS, STRONGER
+from brokk_min.evaluation.figures import Traces
+from brokk_min.evaluation.metrics import (
+    by_start,
+    intervals,
+    mean_interval,
+    paired,
+    paired_with_others,
+    row_mean,
+    summary,
+)
+from brokk_min.evaluation.perfect_model import PerfectModel
+from brokk_min.evaluation.robustness import Sensor, exact, supply_demand, variations
+from brokk_min.evaluation.sequences import (
+    Commands,
+    axis_sequences,
+    least_motion,
+    scored_starts,
+    start_kinds,
+    task_sequences,
+)
+from brokk_min.identification import fitting, logs
+from brokk_min.jacobian import JacobianController
+from brokk_min.machine import Array, Machine
+
+Net = actuator.ActuatorNet
+Controllers = Mapping[str, Controller]  # by name
+Rows = list[dict[str, Any]]  # one a run, see `metrics`
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much is spent; the quick chain has the same parts, smaller."""
+
+    hours: float = 1.0
+    fit_steps: int = fitting.FitConfig.steps
+    train_steps: int = 6_000_000  # `PPOConfig`'s, without importing torch
+    generations: int = 45
+    tuning_runs: int = 12
+    starts: int = 64
+    bound_starts: int = 16  # of them, for the regret
+    short_s: float = 18.0  # of each axis sequence, for regret, robustness and the singular case [s]
+
+
+QUICK = Effort(0.1, 700, 200_000, 4, 4, 8, 2, 3.0)
+
+
+def task_space(
+    machine: Machine,
+    controllers: Controllers,
+    sequences: Sequence[Commands],
+    starts: Array,
+    seed: int,
+    net: Net | None = None,
+    sensor: Sensor = exact,
+) -> tuple[Rows, Traces]:
+    """Every controller on the same sequences, starts and noise. Paper: Sec. 4.2, Fig. 6
+
+    Sequences of one length and all starts are one batch.
+
+    Returns:
+        One row a controller, sequence and start, see `metrics`; and the traces.
+    """
+    rows: Rows = []
+    traces: dict[tuple[str, str], Trace] = {}
+    num = len(starts)
+    kinds = start_kinds(machine, starts)
+    lengths = dict.fromkeys(len(sequence.goals) for sequence in sequences)
+    groups = [[s for s in sequences if len(s.goals) == length] for length in lengths]
+    for name, group in tqdm(
+        list(product(controllers, groups)), desc="evaluate", unit="batch", disable=None
+    ):
+        goals = np.concatenate([s.of_each(num) for s in group], axis=1)
+        start, rng = np.tile(starts, (len(group), 1)), np.random.default_rng(seed)
+        read = sensor(np.random.default_rng(seed + 1))
+        trace = rollout(machine, controllers[name], start, goals, TaskConfig(), rng, net, read)
+        found = metrics.metrics(machine, trace, goals, kinematics.tool_position(machine, start))
+        for i, s in enumerate(group):
+            mine, label = slice(i * num, (i + 1) * num), {"controller": name, "sequence": s.name}
+            traces[name, s.name] = Trace(*(a[:, mine] for a in trace))
+            rows += _rows(label, kinds, {key: v[mine] for key, v in found.items()})
+    names, order = list(controllers), [s.name for s in sequences]
+    rows.sort(key=lambda row: (names.index(row["controller"]), order.index(row["sequence"])))
+    return rows, traces
+
+
+def _rows(label: Mapping[str, Any], kinds: Sequence[str], found: Mapping[str, Array]) -> Rows:
+    """One row a start of figures (starts,); None where there is none."""
+    plain = {
+        key: [float(v) if np.isfinite(v) else None for v in values] for key, values in found.items()
+    }
+    rows = ({key: values[j] for key, values in plain.items()} for j in range(len(kinds)))
+    return [{**label, "start": j, "kind": kinds[j]} | row for j, row in enumerate(rows)]
+
+
+def robustness(
+    machine: Machine,
+    controllers: Controllers,
+    sequences: Sequence[Commands],
+    starts: Array,
+    seed: int,
+) -> dict[str, dict[str, dict[str, Any]]]:
+    """Mean velocity error [m/s], 95 % interval over starts, by variation and controller. Paper: Sec. 4.2
+
+    And "supply_demand", the largest share of the pump's flow that was asked for, "supply_limits", the share
+    of ticks at which it was more than all, and of baselines "rl_less", the policy's error less theirs on the
+    same starts.
+    """
+    result: dict[str, dict[str, dict[str, Any]]] = {}
+    for name, (plant, sensor) in variations(machine).items():
+        runs, traces = task_space(plant, controllers, sequences, starts, seed, sensor=sensor)
+        result[name] = {}
+        for c in controllers:
+            asked = np.array([supply_demand(plant, traces[c, s.name].u) for s in sequences])
+            errors = by_start(runs, c, "all", "velocity_error_mean")
+            result[name][c] = {**mean_interval(errors), "supply_demand": float(asked.max())}
+            result[name][c]["supply_limits"] = float((asked > 1).mean())
+            if "rl" in controllers and c != "rl":
+                result[name][c]["rl_less"] = paired(runs, "rl", c, "velocity_error_mean")["all"]
+    return result
+
+
+def shortened(machine: Machine, sequences: Sequence[Commands], seconds: float) -> list[Commands]:
+    """The first seconds of each sequence."""
+    return [s._replace(goals=s.goals[: round(seconds * machine.rate)]) for s in sequences]
+
+
+def bounds(machine: Machine, starts: Array) -> dict[str, Controller]:
+    """The bound, and the same without its trick: valves that it keeps awake by moving them at rest too."""
+    still = PerfectModel(machine, starts, dither=0.0)
+    return {"perfect_model": PerfectModel(machine, starts), "perfect_model_no_dither": still}
+
+
+def regret(
+    machine: Machine, controllers: Controllers, short: Sequence[Commands], starts: Array, seed: int
+) -> tuple[Rows, dict[str, Any], Traces]:
+    """Runs of all controllers and bounds, each one's velocity error less the bound's, and the traces."""
+    every = {**controllers, **bounds(machine, starts)}
+    runs, traces = task_space(machine, every, short, starts, seed)
+    return (
+        runs,
+        {c: paired(runs, c, "perfect_model", "velocity_error_mean") for c in controllers},
+        traces,
+    )
+
+
+def comparison(
+    machine: Machine, controllers: Controllers, effort: Effort, seed: int
+) -> tuple[dict[str, Any], dict[str, Traces]]:
+    """The paper's experiment and what we add to it: all of `results.json` on task space control.
+
+    Means, intervals and verdicts are over the "workspace" starts, from which all sequences can be followed;
+    the other kinds stand apart.
+
+    Returns:
+        For JSON; and traces of the main runs ("all"), with the bound ("bound") and near singularities
+        ("singular").
+    """
+    sequences = task_sequences(machine)
+    starts = scored_starts(machine, effort.starts, sequences, seed + 2)
+    kinds = np.array(start_kinds(machine, starts))
+    runs, traces = task_space(machine, controllers, sequences, starts, seed)
+    scored = [run for run in runs if run["kind"] == "workspace"]
+    short = shortened(machine, axis_sequences(machine), effort.short_s)
+    reachable = starts[kinds == "workspace"]
+    bounded, less, bound = regret(
+        machine, controllers, short, reachable[: effort.bound_starts], seed
+    )
+    singular, found = singular_case(
+        machine, controllers, starts[kinds == "extended"], effort.short_s, seed
+    )
+    across = {c: Trace(*(a[:, kinds == "workspace"] for a in traces[c, "x"])) for c in controllers}
+    verdicts = judged(machine, controllers, scored, across, sequences[0].goals)
+    verdicts[3:3] = found["claims"]  # the paper's order
+    return {
+        "task_space": tables(runs, scored),
+        "regret": {"summary": summary(bounded), "less_perfect_model": less},
+        "robustness": robustness(machine, controllers, short, reachable[:16], seed),
+        "singular": found,
+        "claims": verdicts,
+        "starts": starts.tolist(),
+        "start_kinds": kinds.tolist(),
+    }, {"all": traces, "bound": bound, "singular": singular}
+
+
+def tables(runs: Sequence[metrics.Run], scored: Sequence[metrics.Run]) -> dict[str, Any]:
+    """Runs, and figures of those that count: means, intervals, the policy's less the baselines'; for JSON."""
+    kinds = dict.fromkeys(run["kind"] for run in runs)
+    of_kind = {kind: [run for run in runs if run["kind"] == kind] for kind in kinds}
+    return {
+        "runs": runs,
+        "summary": summary(scored),
+        "intervals": intervals(scored),
+        "by_kind": {
+            k: {c: rows["all"] for c, rows in summary(of).items()} for k, of in of_kind.items()
+        },
+        "rl_less": paired_with_others(scored, "rl"),
+    }
+
+
+def judged(
+    machine: Machine,
+    controllers: Controllers,
+    runs: Sequence[metrics.Run],
+    along_x: Mapping[str, Trace],
+    goals: Array,
+) -> list[dict[str, Any]]:
+    """The paper's sentences on its baselines, each put to the stronger one, too: drift, direction, tracking.
+
+    `runs` are those that count, `along_x` their traces along x with these `goals` [m/s] (T, 3).
+    """
+    pids = {name: pid for name, pid in controllers.items() if isinstance(pid, JacobianController)}
+    of_paper, of_stronger = (
+        [
+            *claims.drift_claims(runs, names),
+            claims.direction_claim(machine, pids[names[0]], along_x[names[0]], goals),
+            *claims.tracking_claims(runs, names),
+        ]
+        for names in (PAPERS, STRONGER)
+    )
+    return [claims.beside(*pair) for pair in zip(of_paper, of_stronger, strict=True)]
+
+
+def singular_case(
+    machine: Machine, controllers: Controllers, starts: Array, seconds: float, seed: int
+) -> tuple[Traces, dict[str, Any]]:
+    """k = 0.1 against 0.05 with the same gains, and RL, along the `least_motion` of extended starts.
+
+    Paper: Fig. 6a, 6e, 6f
+
+    Returns:
+        Traces; and "summary", "claims", "w0" and of each start "manipulability" and "least" singular value
+        of the Jacobian [m/rad]; empty where there are no such starts.
+    """
+    if not len(starts):
+        return {}, {"summary": {}, "claims": []}
+    some = claims.singular_controllers(controllers)
+    sequences = shortened(machine, least_motion(machine, starts), seconds)
+    runs, traces = task_space(machine, some, sequences, starts, seed)
+    w0, J, share = (
+        jacobian.manipulability_threshold(machine),
+        kinematics.jacobian(machine, starts),
+        {},
+    )
+    for name in some:
+        each = [(traces[name, s.name], s.of_each(len(starts))) for s in sequences]
+        share[name] = row_mean(
+            np.array([claims.speed_share(machine, w0, *pair) for pair in each]).T
+        )
+    least = np.linalg.svd(J, compute_uv=False)[:, -1].tolist()
+    near = {"w0": w0, "manipulability": jacobian.manipulability(J).tolist(), "least": least}
+    return traces, {"summary": summary(runs), "claims": claims.singular_claims(runs, share)} | near
+
+
+def driven_log(machine: Machine, traces: Traces, controller: str) -> logs.Log:
+    """What encoders and valves said in one controller's first 16 runs of each sequence. Paper: Sec. 4.1"""
+    tapes = []
+    for sequence, trace in ((s, trace) for (c, s), trace in traces.items() if c == controller):
+        for i in range(min(16, trace.q.shape[1])):
+            u, q = trace.u[:, i].astype(float), trace.q_measured[:, i].astype(float)
+            tapes.append((f"{controller}_{sequence}_{i:02d}", u, q))
+    return logs.machine_log(machine, tapes)
+
+
+def meta(machine: Machine, seed: int) -> dict[str, Any]:
+    """What every JSON of ours says of itself."""
+    return {
+        "brokk_min": __version__,
+        "machine": machine.name,
+        "seed": seed,
+        "units": "m, m/s, s, rad",
+    }

@@ -1,0 +1,1 @@
+"""From logs to nets: log files, excitation, fitting, validation."""

@@ -1,0 +1,135 @@
+"""A trained policy as a file and a function; no torch, so that it runs wherever the machine is."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brokk_min.actuator import ActuatorNet, net_arrays, net_from_arrays
+from brokk_min.env import fitting_nets
+from brokk_min.identification.files import (
+    expect_same,
+    expected,
+    load_arrays,
+    load_header,
+    whole_file,
+)
+from brokk_min.machine import Array, Machine
+from brokk_min.observation import observation_scale, to_command
+
+STAND = 2.0  # s, assumed: valves close when the tool was to stand still for longer
+FORMAT = 3  # of policy files; 1: actions without the way through the dead zone; 2: commands beside angles
+
+
+@dataclass(frozen=True)
+class Policy:
+    """The actor: standardised observation in, mean action out. Paper: Sec. 3.4 (256-128-64, ELU)"""
+
+    contract: Mapping[str, Any]  # what training and machine must agree on, see `contract`
+    training: Mapping[str, Any]  # seed and settings that made it
+    mean: Array  # (obs,) normalisation that `observe` applied
+    scale: Array  # (obs,)
+    weights: tuple[Array, ...]  # w, b of each layer, w (inputs, outputs)
+    net: ActuatorNet  # the simulation it was trained in, kept with it
+
+    def act(self, observation: Array) -> Array:
+        """Actions (..., n_driven) for observations (..., obs) of `observe`; `to_command` clips them.
+
+        ValueError: a wrong shape or an observation that is no number.
+        """
+        x: Array = np.asarray(observation, np.float32)
+        if x.shape[-1:] != self.mean.shape:
+            raise ValueError(f"observation: expected (..., {len(self.mean)}), got {x.shape}")
+        if not np.isfinite(x).all():
+            raise ValueError("observation: expected finite numbers, got nan or inf")
+        layers = list(zip(self.weights[::2], self.weights[1::2], strict=True))
+        for w, b in layers[:-1]:
+            x = x @ w + b
+            x = np.where(x > 0, x, np.expm1(np.minimum(x, 0)))  # ELU
+        w, b = layers[-1]
+        action: Array = x @ w + b
+        return action
+
+
+@dataclass(frozen=True)
+class PolicyController:
+    """A policy as an `env.Controller`. The observation carries what it needs to remember.
+
+    Policies keep valves barely open where the tool is to stand, as if it were to move again at once. But
+    then it wanders. So the valves close when it was to stand for longer than `STAND`; that is remembered.
+    """
+
+    machine: Machine
+    policy: Policy
+
+    def start(self, num: int) -> NDArray[np.int64]:
+        """Ticks for which each of `num` tools was to stand, (num,)."""
+        return np.zeros(num, np.int64)
+
+    def __call__(
+        self, observation: Array, memory: NDArray[np.int64]
+    ) -> tuple[Array, NDArray[np.int64]]:
+        """Commands u (num, n) for observations (num, obs), and the next memory."""
+        u = to_command(self.machine, self.policy.act(observation))
+        moves = observation[..., :3].any(axis=-1)  # no noise makes a goal of none
+        stood = np.where(moves, 0, memory + 1)
+        u[stood > STAND * self.machine.rate] = 0.0
+        return u, stood
+
+
+def contract(machine: Machine) -> dict[str, Any]:
+    """What training and deployment must agree on; kept in the file and checked by `load_policy`."""
+    return {
+        "machine": machine.name,
+        "joints": list(machine.names),
+        "driven": [machine.names[i] for i in machine.driven],
+        "history": machine.history,
+        "rate": machine.rate,
+        "velocity_samples": machine.velocity_samples,
+        "pwm_limit": machine.pwm_limit,
+        "dead_zone": machine.dead_zone,
+        "geometry": [[j.a, j.alpha, j.d, j.theta, j.q_min, j.q_max] for j in machine.joints],
+    }
+
+
+def save_policy(path: Path, policy: Policy) -> None:
+    """Write a policy as one `.npz`: weights, normalisation and its nets, plus a JSON header."""
+    header = {
+        "format": FORMAT,
+        "kind": "policy",
+        "contract": dict(policy.contract),
+        "training": dict(policy.training),
+    }
+    arrays = {"header": np.array(json.dumps(header)), "mean": policy.mean, "scale": policy.scale}
+    arrays |= {f"weight_{i}": weight for i, weight in enumerate(policy.weights)}
+    arrays |= {f"net_{name}": array for name, array in net_arrays(policy.net).items()}
+    with whole_file(path) as file:
+        np.savez(file, **dict[str, Any](arrays))
+
+
+def load_policy(path: Path, machine: Machine) -> Policy:
+    """Read a policy for `machine`.
+
+    ValueError: no policy file, or one for another machine, joint order, history, rate or scale, with what
+    was wanted and what was found.
+    """
+    arrays = load_arrays(path)
+    header = load_header(path, arrays, "policy", FORMAT)
+    found = header.get("contract", {})
+    expect_same(path, found, contract(machine))
+    with expected(path, "a complete policy"):
+        weights = tuple(arrays[f"weight_{i}"] for i in range(8))
+        net = {name[4:]: array for name, array in arrays.items() if name.startswith("net_")}
+        fitted = fitting_nets(machine, net_from_arrays(path, net))
+        policy = Policy(found, header["training"], arrays["mean"], arrays["scale"], weights, fitted)
+        action = policy.act(policy.mean)
+    if action.shape != machine.driven.shape or not np.isfinite(action).all():
+        raise ValueError(f"{path}: weights: expected {len(machine.driven)} actions, got {action}")
+    for name, value in zip(("mean", "scale"), observation_scale(machine), strict=True):
+        if not np.array_equal(arrays[name], value):
+            raise ValueError(f"{path}: {name}: expected the machine's normalisation, got another")
+    return policy

@@ -1,0 +1,1 @@
+"""To see the machine and to drive it: drawings, window, play, replay, tracing."""

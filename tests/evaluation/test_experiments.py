@@ -1,0 +1,1045 @@
+"""The comparison: figures worked by hand, honest sequences and starts, the chain's repeatability."""
+
+from __future__ import annotations
+
+import html
+import itertools
+import json
+import re
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgb
+
+from benchmarks.rollout import random_net
+from brokk_min import jacobian, kinematics
+from brokk_min.actuator import ActuatorNet, fingerprint, load_net, save_net
+from brokk_min.env import TaskConfig, Trace, rollout
+from brokk_min.evaluation import baselines, experiments, figures, report
+from brokk_min.evaluation import reproduce as chain
+from brokk_min.evaluation import robustness as variations
+from brokk_min.evaluation.metrics import metrics
+from brokk_min.evaluation.sequences import task_sequences, tuning_goals
+from brokk_min.identification.logs import velocity_of
+from brokk_min.kinematics import joint_rates, tool_position
+from brokk_min.machine import BROKK_170, Machine, read_encoder
+from brokk_min.observation import Measured, measured, to_command
+from brokk_min.plant import plant_reset, plant_step, speed_limits
+
+TINY = experiments.Effort(0.02, 60, 8192, 1, 2, 4, 2, 1.0)
+
+
+class _Idle:
+    """A controller that does nothing, for machines that should stand still."""
+
+    def start(self, num: int) -> None:
+        return None
+
+    def __call__(self, observation: np.ndarray, memory: None) -> tuple[np.ndarray, None]:
+        return np.zeros((len(observation), BROKK_170.n)), None
+
+
+def test_an_idle_controller_stands_still_and_errs_by_the_goal() -> None:
+    start = np.array([[1.5, 0.5, 0.58, 1.71, 1.24]])
+    goals = np.tile([0.0, 0.0, 0.2], (20, 1, 1))
+    trace = rollout(BROKK_170, _Idle(), start, goals, TaskConfig(), np.random.default_rng(0))
+    found = metrics(BROKK_170, trace, goals, tool_position(BROKK_170, start))
+    row = {name: values[0] for name, values in found.items()}
+    assert row["velocity_error_mean"] == pytest.approx(0.2, abs=1e-6)
+    assert row["reward_mean"] == pytest.approx(1 / 1.2, abs=1e-6)
+    assert row["valve_travel"] == 0
+
+
+@dataclass(frozen=True)
+class FeedForward:
+    """Another controller, as a student would add it: the plant's steady commands for damped joint rates."""
+
+    machine: Machine
+
+    def start(self, num: int) -> None:
+        return None
+
+    def __call__(self, observation: np.ndarray, memory: None) -> tuple[np.ndarray, None]:
+        seen: Measured = measured(self.machine, observation)
+        down, up = speed_limits(self.machine, seen.q)
+        rates = joint_rates(self.machine, seen.q, seen.v_goal)
+        share = rates / np.where(
+            rates > 0, *(limit[:, self.machine.driven] for limit in (up, -down))
+        )
+        return to_command(self.machine, share), None
+
+
+def test_another_controller_takes_twenty_lines() -> None:
+    start = np.array([[1.5, 0.5, 0.58, 1.71, 1.24], [1.0, 0.5, 0.58, 1.71, 1.24]])
+    short = experiments.shortened(BROKK_170, task_sequences(BROKK_170)[:3], 4.0)
+    controllers = {"idle": _Idle(), "mine": FeedForward(BROKK_170)}
+    runs, traces = experiments.task_space(BROKK_170, controllers, short, start, 0)
+    error = {
+        c: np.mean([r["velocity_error_mean"] for r in runs if r["controller"] == c])
+        for c in controllers
+    }
+    assert error["mine"] < 0.5 * error["idle"]
+    assert set(traces) == {(c, s) for c in controllers for s in "xyz"}
+    assert [(r["controller"], r["sequence"], r["start"]) for r in runs[:3]] == [
+        ("idle", "x", 0),
+        ("idle", "x", 1),
+        ("idle", "y", 0),
+    ]
+
+
+def test_sequences_of_any_length_side_by_side_are_those_alone() -> None:
+    """One batch a length: rows stay with their names, quiet runs are the same as alone."""
+    start = np.array([[1.5, 0.5, 0.58, 1.71, 1.24], [1.0, 0.5, 0.9, 1.5, 1.0]])
+    long, short = (
+        experiments.shortened(BROKK_170, task_sequences(BROKK_170), t) for t in (2.0, 1.5)
+    )
+    mixed, mine = [long[0], short[1], long[2]], {"mine": FeedForward(BROKK_170)}
+    runs, traces = experiments.task_space(BROKK_170, mine, mixed, start, 0)
+    assert [r["sequence"] for r in runs] == ["x", "x", "y", "y", "z", "z"]
+    alone, trace = experiments.task_space(BROKK_170, mine, mixed[1:2], start, 0)
+    assert [r["velocity_error_mean"] for r in alone] == [
+        r["velocity_error_mean"] for r in runs[2:4]
+    ]
+    assert np.array_equal(trace["mine", "y"].q, traces["mine", "y"].q)
+    assert traces["mine", "z"].v_tool.shape == (40, 2, 3)
+
+
+def test_a_rollout_gets_net_sensor_and_seeds_and_a_figure_may_be_none(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    net, asked = net_of_driven_joints(), list[Any]()
+    inner = experiments.rollout
+
+    def watched(*a: Any) -> Any:
+        asked.append((*a[5].bit_generator.state["state"].values(), *a[6:]))
+        return inner(*a)
+
+    def sensor(rng: np.random.Generator) -> Any:
+        asked.append(tuple(rng.bit_generator.state["state"].values()))
+        return read_encoder
+
+    monkeypatch.setattr(experiments, "rollout", watched)
+    short = experiments.shortened(BROKK_170, task_sequences(BROKK_170)[:1], 0.2)
+    start = np.array([[1.5, 0.5, 0.58, 1.71, 1.24]])
+    experiments.task_space(BROKK_170, {"idle": _Idle()}, short, start, 3, net, sensor)
+    three, four = (
+        tuple(np.random.default_rng(k).bit_generator.state["state"].values()) for k in (3, 4)
+    )
+    assert asked == [four, (*three, net, read_encoder)]
+    (row,) = experiments._rows({"controller": "a"}, ["limits"], {"drift": np.array([np.nan])})
+    assert row == {"controller": "a", "start": 0, "kind": "limits", "drift": None}
+
+
+def test_sensors_of_the_robustness_table() -> None:
+    q = np.cumsum(np.full((4000, 2, 5), 0.01), axis=0)
+    plain = np.array([variations.exact(np.random.default_rng(0))(BROKK_170, row) for row in q])
+    np.testing.assert_array_equal(plain, read_encoder(BROKK_170, q))
+    noisy = variations.noisy(np.random.default_rng(0))
+    counts = (np.array([noisy(BROKK_170, row) for row in q]) - q) / BROKK_170.encoder_step
+    assert counts.std() == pytest.approx(np.sqrt(1 + 1 / 12), rel=0.02)
+    together = np.corrcoef(counts.reshape(-1, 10).T) - np.eye(10)
+    assert np.abs(together).max() < 0.1  # each joint of each machine its own
+    lossy = variations.lossy(np.random.default_rng(0))
+    seen = np.array([lossy(BROKK_170, row) for row in q])
+    lost = (seen[1:] == seen[:-1]).all(axis=-1)
+    assert lost.mean() == pytest.approx(0.05, abs=0.008)
+    assert lost.all(axis=1).mean() < 0.01  # hardly ever of both machines
+    np.testing.assert_array_equal(seen[1:][~lost], plain[1:][~lost])
+    np.testing.assert_array_equal(seen[0], plain[0])
+
+
+def test_variations_change_the_machine_and_not_what_its_controllers_know(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found = variations.variations(BROKK_170)
+    assert len(found) == 12 and found["nominal"][0] is BROKK_170
+    changed = [
+        name
+        for name, (plant, sensor) in found.items()
+        if plant != BROKK_170 or sensor != variations.exact
+    ]
+    assert len(changed) == 11
+    tilted = found["up -15 %, down +15 %"][0]
+    np.testing.assert_allclose(
+        tilted.column("speed_positive"), 0.85 * BROKK_170.column("speed_positive")
+    )
+    np.testing.assert_allclose(
+        tilted.column("speed_negative"), 1.15 * BROKK_170.column("speed_negative")
+    )
+    start = np.array([[1.5, 0.5, 0.58, 1.71, 1.24]] * 2)
+    short = experiments.shortened(BROKK_170, task_sequences(BROKK_170)[2:3], 3.0)
+    table = experiments.robustness(BROKK_170, {"mine": FeedForward(BROKK_170)}, short, start, 0)
+    errors = {name: row["mine"]["mean"] for name, row in table.items()}
+    assert errors["nominal"] < min(
+        errors["delay +50 ms"], errors["dead zone 10 %"], errors["valve gain -20 %"]
+    )
+    assert errors["delay +25 ms"] < errors["delay +50 ms"]
+    supply = {name: row["mine"]["supply_demand"] for name, row in table.items()}
+    assert supply["supply flow -20 %"] == pytest.approx(supply["nominal"] / 0.8, rel=0.05)
+    assert errors["supply flow -20 %"] == errors["nominal"] and supply["supply flow -20 %"] < 1
+    assert table["supply flow -20 %"]["mine"]["supply_limits"] == 0
+    weak = replace(BROKK_170, pump_flow=0.2 * BROKK_170.pump_flow)
+    monkeypatch.setattr(experiments, "variations", lambda m: {"weak": (weak, variations.exact)})
+    row = experiments.robustness(BROKK_170, {"mine": FeedForward(BROKK_170)}, short, start, 0)[
+        "weak"
+    ]["mine"]
+    assert (
+        row["supply_demand"] > 1
+        and 0 < row["supply_limits"] < 1
+        and row["mean"] > errors["nominal"]
+    )
+
+
+def test_what_valves_ask_of_the_pump_is_what_the_plant_divides_among_them() -> None:
+    """Commands held until the spools stand: cylinders reach their full speed where the share is below one."""
+    q = np.tile([0.0, 0.7, 0.6, 1.7, 1.0], (2, 1))
+    u = np.array([[0.4, 0.4, -0.4, 0.4, -0.4], [1.0, -1.0, 1.0, -1.0, 1.0]])
+    state = plant_reset(BROKK_170, q)
+    state = state._replace(ready=np.ones_like(q))
+    for _ in range(8):
+        state = plant_step(BROKK_170, state, u)
+    fastest = np.where(
+        u > 0, BROKK_170.column("speed_positive"), BROKK_170.column("speed_negative")
+    )
+    opening = np.sign(u) * (np.abs(u) - 0.07) / 0.93
+    share = variations.supply_demand(BROKK_170, u)
+    assert share[0] < 1 < share[1]
+    np.testing.assert_allclose(
+        state.speed, fastest * opening / np.maximum(1, share)[:, None], rtol=0.01
+    )
+
+
+def test_curves_of_one_plot_differ_on_grey_paper() -> None:
+    controllers = (
+        "rl",
+        "jacobian_pid_k0.1",
+        "jacobian_pid_k0.05",
+        "jacobian_pid_ff",
+        "perfect_model",
+    )
+    for group in (controllers, ("workspace", "limits", "extended")):
+        colours = np.array([to_rgb(figures.STYLES[name]["color"]) for name in group])
+        grey = np.sort(colours @ [0.299, 0.587, 0.114])
+        assert (np.diff(grey) > 0.1).all() and grey[-1] < 0.8, group
+
+
+def test_names_below_bars_do_not_touch() -> None:
+    names = [s.name for s in task_sequences(BROKK_170)]
+    number = {"mean": 0.1, "low": 0.05, "high": 0.2}
+    figure = figures.plot_bars({"error [m/s]": {"rl": dict.fromkeys([*names, "all"], number)}})
+    figure.draw_without_rendering()
+    boxes = [label.get_window_extent() for label in figure.axes[0].get_xticklabels()]
+    assert all(one.x1 + 4 < two.x0 for one, two in itertools.pairwise(boxes))
+
+
+def net_of_driven_joints() -> ActuatorNet:
+    return random_net(np.random.default_rng(0)).select(["q1", "q3", "q4", "q5"])
+
+
+def test_gains_of_another_machine_or_of_other_nets_are_refused(tmp_path: Path) -> None:
+    """What they are for is said, and what was wanted; a file that does not say it is refused as well."""
+    path, net = tmp_path / "gains.json", net_of_driven_joints()
+    tuned, about = baselines.baselines(BROKK_170, net), baselines.tuned_for(BROKK_170, net)
+    for key, value in {"machine": "digger", "actuator": "0123456789abcdef"}.items():
+        baselines.write_gains(path, tuned, about | {key: value})
+        with pytest.raises(
+            ValueError, match=rf"gains.json: expected gains for brokk170.*{value}"
+        ) as error:
+            baselines.read_gains(path, BROKK_170, net)
+        assert about["actuator"] in str(error.value)
+    baselines.write_gains(path, tuned, {"machine": "brokk170"})
+    with pytest.raises(ValueError, match=rf"nets {about['actuator']}, got .*'actuator': None"):
+        baselines.read_gains(path, BROKK_170, net)
+    path.write_text('{"meta": [], "gains": {}}')
+    with pytest.raises(ValueError, match=r"gains.json: expected gains for brokk170"):
+        baselines.read_gains(path, BROKK_170, net)
+
+
+def test_a_fingerprint_is_of_the_nets_and_survives_a_file(tmp_path: Path) -> None:
+    net = net_of_driven_joints()
+    save_net(tmp_path / "net.npz", net)
+    assert fingerprint(load_net(tmp_path / "net.npz")) == fingerprint(net)
+    weights = (net.weights[0] + 1e-6, *net.weights[1:])
+    others = (net.select(["q1"]), replace(net, rate=25.0), replace(net, weights=weights))
+    assert len({fingerprint(other) for other in (net, *others)}) == 4
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"kp": [1, 2]}, "shape"),
+        ({"ki": [1, 2, 3, float("nan")]}, "finite"),
+        ({"kd": "fast"}, "fast"),
+    ],
+)
+def test_damaged_gains_are_refused(tmp_path: Path, change: dict[str, object], message: str) -> None:
+    net, path = net_of_driven_joints(), tmp_path / "gains.json"
+    table = baselines.plain_gains(baselines.baselines(BROKK_170, net))
+    about = baselines.tuned_for(BROKK_170, net)
+    path.write_text(json.dumps({"meta": about, "gains": table}))
+    assert baselines.plain_gains(baselines.read_gains(path, BROKK_170, net)) == table
+    table["jacobian_pid_ff"] |= change
+    path.write_text(json.dumps({"meta": about, "gains": table}))
+    with pytest.raises(ValueError, match=rf"gains.json: expected gains for brokk170.*{message}"):
+        baselines.read_gains(path, BROKK_170, net)
+
+
+@pytest.fixture(scope="module")
+def twice(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    folders = (
+        tmp_path_factory.mktemp("a b"),
+        tmp_path_factory.mktemp("second"),
+    )  # a space in the path
+    for folder in folders:
+        chain.reproduce(BROKK_170, folder, TINY, 3)
+    return folders
+
+
+def test_the_chain_gives_the_same_bits_twice(twice: tuple[Path, Path]) -> None:
+    for name in ("log.npz", "net.npz", "policy.npz", "gains.json", "results.json"):
+        assert (twice[0] / name).read_bytes() == (twice[1] / name).read_bytes(), name
+
+
+def test_results_hold_every_run_with_its_figures(twice: tuple[Path, Path]) -> None:
+    results = json.loads((twice[0] / "results.json").read_text())
+    runs = results["task_space"]["runs"]
+    names = {
+        "rl",
+        "jacobian_pid_k0.1",
+        "jacobian_pid_k0.05",
+        "jacobian_pid_ff",
+        "jacobian_pid_ff_awake",
+    }
+    keys = {(r["controller"], r["sequence"], r["start"]) for r in runs}
+    sequences = [s.name for s in task_sequences(BROKK_170)]
+    assert keys == {(c, s, i) for c in names for s in sequences for i in range(4)}
+    assert all(r["velocity_rmse"] >= r["velocity_error_mean"] > 0 for r in runs)
+    assert all(0 < r["reward_mean"] < 1 for r in runs)
+    assert set(results["paper_recipe"]["test"]) == set(results["actuator"]["test"])
+    assert results["paper_recipe"]["sim_to_real"]["tool"]["position_error_mean"] > 0
+    assert results["start_kinds"] == ["workspace", "limits", "workspace", "extended"]
+    assert all(r["kind"] == results["start_kinds"][r["start"]] for r in runs)
+    scored = [r for r in runs if r["kind"] == "workspace"]
+    rl = [r["velocity_error_mean"] for r in scored if r["controller"] == "rl"]
+    assert results["task_space"]["summary"]["rl"]["all"]["velocity_error_mean"] == pytest.approx(
+        np.mean(rl)
+    )
+
+
+def test_results_answer_the_papers_question(twice: tuple[Path, Path]) -> None:
+    results = json.loads((twice[0] / "results.json").read_text())
+    assert len(results["claims"]) == 9
+    for claim in results["claims"]:
+        assert set(claim) - {"stronger"} == {"paper", "measured", "numbers", "unit", "holds"}
+        assert claim["holds"] in (True, False, None)
+    assert ["stronger" in c for c in results["claims"]] == [False, True, True] + [False] * 3 + [
+        True
+    ] * 3
+    less = results["task_space"]["rl_less"]["velocity_error_mean"]["jacobian_pid_ff"]
+    for claim, sequences in zip(results["claims"][-3:], ("xyz", "z", ["all"]), strict=True):
+        stronger = claim["stronger"]
+        assert [stronger["numbers"][f"error {s}, less jacobian_pid_ff"] for s in sequences] == [
+            less[s] for s in sequences
+        ]
+        assert stronger["holds"] is all(n["high"] < 0 for n in stronger["numbers"].values())
+    assert len(results["net_claims"]) == 4
+    less = results["regret"]["less_perfect_model"]
+    assert set(less) == set(results["gains"]) | {"rl"} and all(
+        set(rows) == {*"xyz", "all"} for rows in less.values()
+    )
+    bound, rl = (
+        results["regret"]["summary"][c]["all"]["velocity_error_mean"]
+        for c in ("perfect_model", "rl")
+    )
+    assert less["rl"]["all"]["mean"] == pytest.approx(rl - bound)
+    paired = results["task_space"]["rl_less"]["velocity_error_mean"]["jacobian_pid_ff"]["all"]
+    means = results["task_space"]["summary"]
+    difference = [means[c]["all"]["velocity_error_mean"] for c in ("rl", "jacobian_pid_ff")]
+    assert paired["mean"] == pytest.approx(difference[0] - difference[1])
+    assert paired["low"] < paired["mean"] < paired["high"]
+    low, high = results["task_space"]["intervals"]["jacobian_pid_ff"]["x"]["velocity_error_mean"]
+    assert low < means["jacobian_pid_ff"]["x"]["velocity_error_mean"] < high
+    assert set(results["robustness"]) == set(variations.variations(BROKK_170))
+    nominal = results["robustness"]["nominal"]
+    less = nominal["jacobian_pid_ff"]["rl_less"]
+    assert less["mean"] == pytest.approx(nominal["rl"]["mean"] - nominal["jacobian_pid_ff"]["mean"])
+    assert less["low"] < less["mean"] < less["high"] and "rl_less" not in nominal["rl"]
+
+
+def test_results_tell_how_the_baselines_were_tuned(twice: tuple[Path, Path]) -> None:
+    results = json.loads((twice[0] / "results.json").read_text())
+    assert set(results["tuning"]) == set(results["gains"])
+    for name, how in results["tuning"].items():
+        assert how["seed"] == 3 and len(how["cost"]) == TINY.generations
+        assert 0 < how["cost"][-1] <= how["cost"][0] < 0.3
+        assert how["cost_anew"] != how["cost"][-1]  # noise of its own
+        assert how["cost_anew"] == pytest.approx(how["cost"][-1], rel=0.2)
+        spans = jacobian.GAINS.items()
+        ends = [
+            k for k, (low, high) in spans for g in results["gains"][name][k] if g in (low, high)
+        ]
+        assert len([g for g in how["at_bound"] if g.split()[0] in ends]) >= len(ends)
+
+
+def test_the_report_is_one_file_with_its_figures(twice: tuple[Path, Path]) -> None:
+    text = (twice[0] / "report.html").read_text()
+    assert len(re.findall(r"src='data:image/png;base64,", text)) == 12
+    words = re.sub(r"base64,[^']*", "", text)  # four letters of a picture may spell anything
+    assert not re.findall(r"(?:src|href)='(?!data:)", words) and "http" not in words
+    assert "not a real Brokk 170" in text
+    results = json.loads((twice[0] / "results.json").read_text())
+    for claim in (*results["net_claims"], *results["claims"]):
+        assert html.escape(claim["measured"]) in text
+    titles = [html.unescape(title) for title in re.findall(r"<h2>(.*?)</h2>", text)]
+    assert len(titles) == len(set(titles))
+    for part in re.split("<h2>", text)[1:]:  # each of the paper's figures has its sentences beside
+        wanted = re.match(r"[^<]*Fig\. (?!6a\))|Learning", part)
+        assert ("<blockquote>" in part and "<img" in part) if wanted else True, part[:60]
+    assert "<td>rich, free runs (ours)</td>" in text and "<td>sines, one step (paper)</td>" in text
+    assert text.count("<td>start ") == 4 and text.count("<td>tuning run ") == 2
+
+
+def test_the_report_is_in_the_papers_order(twice: tuple[Path, Path]) -> None:
+    text = (twice[0] / "report.html").read_text()
+    papers = re.findall(
+        r"<h2>[^<]*\((Fig\. [^)]*)\)</h2>|<h2>(Actuator nets|Learning curve)</h2>", text
+    )
+    assert ["".join(found) for found in papers] == [
+        "Fig. 2",
+        "Actuator nets",
+        "Learning curve",
+        "Fig. 5",
+        "Fig. 6a",
+        "Fig. 6b-d",
+        "Fig. 6e, f",
+        "Fig. 6g, h",
+        "Fig. 6a, e, f",
+    ]
+
+
+def test_every_figure_of_merit_stands_with_its_interval_and_against_each_baseline(
+    twice: tuple[Path, Path],
+) -> None:
+    results = json.loads((twice[0] / "results.json").read_text())
+    task, text = results["task_space"], (twice[0] / "report.html").read_text()
+    keys = list(task["summary"]["rl"]["all"])
+    assert len(keys) == 12 and list(task["rl_less"]) == keys
+    for key in ("settling_time", "jerk_rms", "valve_travel", "time_at_limits", "reward_mean"):
+        low, high = task["intervals"]["jacobian_pid_ff"]["all"][key]
+        mean = task["summary"]["jacobian_pid_ff"]["all"][key]
+        numbers = {"mean": mean, "low": low, "high": high}
+        assert f"<td>{report._with_interval(numbers)}</td>" in text, key
+        less = task["rl_less"][key]["jacobian_pid_ff"]["all"]
+        assert less["mean"] == pytest.approx(task["summary"]["rl"]["all"][key] - mean, abs=1e-9)
+        assert f"<td>{report._with_interval(less)}</td>" in text, key
+
+
+def test_an_interval_is_written_with_digits_that_tell_it() -> None:
+    assert (
+        report._with_interval({"mean": 0.01234, "low": -0.5, "high": 0.03})
+        == "0.0123 (-0.5000 to 0.0300)"
+    )
+    assert (
+        report._with_interval({"mean": 41.267, "low": 40.0, "high": 42.5}) == "41.27 (40 to 42.5)"
+    )
+    assert report._with_interval({"mean": 0.5, "low": None, "high": None}) == "0.5000"
+    assert report._with_interval({"mean": None, "low": None, "high": None}) == ""
+
+
+def test_a_sequence_is_listed_with_the_goals_that_it_holds() -> None:
+    found = report._path(np.array([[1.0, 0.0, 0.0, 0.0], [0.85, -0.0, -0.2, 0.0]]))
+    assert list(found.values()) == [
+        1.85,
+        1,
+        0.2,
+        pytest.approx(0.17),
+        "1 s (0, 0, 0); 0.85 s (0, -0.2, 0)",
+    ]
+    assert report._path(np.ones((60, 4)))["held for, vx, vy, vz [m/s]"] == "at every tick another"
+
+
+def test_runs_of_the_tuning_are_those_of_its_seed(twice: tuple[Path, Path]) -> None:
+    found = json.loads((twice[0] / "results.json").read_text())["tuning_runs"]
+    starts, goals = tuning_goals(BROKK_170, TINY.tuning_runs, 12.0, 3 + 1000)
+    np.testing.assert_allclose([run["start"] for run in found], starts)
+    for run, wanted in zip(found, goals.swapaxes(0, 1), strict=True):
+        rows = np.array(run["goals"])
+        again = np.repeat(rows[:, 1:], np.rint(rows[:, 0] * 20).astype(int), axis=0)
+        np.testing.assert_allclose(again, wanted)
+
+
+def test_panels_have_their_legends_above_the_curves_and_units_on_every_axis() -> None:
+    x = np.linspace(0, 1, 5)
+    curves = [{f"{k}{i}": (x, x * i) for i in range(4)} for k in "ab"]
+    row = [figures.Panel(f"panel {i}", "time [s]", "speed [m/s]", c) for i, c in enumerate(curves)]
+    figure = figures.plot_panels([row])
+    figure.draw_without_rendering()
+    boxes = [ax.get_legend().get_window_extent() for ax in figure.axes]
+    assert all(
+        box.y0 >= ax.get_window_extent().y1 for box, ax in zip(boxes, figure.axes, strict=True)
+    )
+    assert boxes[0].x1 <= boxes[1].x0  # beside each other
+    for ax, box in zip(figure.axes, boxes, strict=True):
+        assert ax.title.get_window_extent().y0 >= box.y1 - 2
+    assert (
+        figure.axes[0].xaxis.label.get_fontsize() * 7 / figures.WIDTH >= 7
+    )  # on a page 7 inches wide
+
+
+def test_gains_read_back_give_the_same_controller(twice: tuple[Path, Path]) -> None:
+    from brokk_min.learning.policy import load_policy
+
+    net = load_policy(twice[0] / "policy.npz", BROKK_170).net
+    read = baselines.read_gains(twice[0] / "gains.json", BROKK_170, net)
+    written = json.loads((twice[0] / "results.json").read_text())["gains"]
+    assert baselines.plain_gains(read) == written
+
+
+def test_the_whole_chain_spends_what_fit_and_train_do_by_default():
+    from brokk_min.identification.fitting import FitConfig
+    from brokk_min.ppo import PPOConfig
+
+    effort = experiments.Effort()
+    assert (effort.fit_steps, effort.train_steps) == (FitConfig().steps, PPOConfig().total_steps)
+
+
+# --- the parts of the comparison, their inputs made up ----------------------------------------------------
+
+
+def made_up_trace(ticks: int, runs: int, seed: int = 0) -> Trace:
+    rng = np.random.default_rng(seed)
+    return Trace(
+        *(rng.normal(size=(ticks, runs, n)) for n in (5, 5, 5, 5, 3, 3)),
+        rng.normal(size=(ticks, runs)),
+    )
+
+
+def test_the_comparison_asks_its_parts_for_what_they_are_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Seeds, starts by kind, lengths, and whose traces: each part returns what it was asked."""
+    starts, kinds = np.arange(20.0).reshape(4, 5), ["limits", "workspace", "extended", "workspace"]
+    runs = [{"start": i, "kind": kind} for i, kind in enumerate(kinds)]
+    traces = {
+        (c, s): made_up_trace(6, 4, k) for k, (c, s) in enumerate(itertools.product("ab", "xy"))
+    }
+    asked: dict[str, tuple[Any, ...]] = {}
+
+    def part(name: str, answer: Any) -> None:
+        monkeypatch.setattr(experiments, name, lambda *a: asked.setdefault(name, a) and answer)
+
+    part("scored_starts", starts)
+    part("start_kinds", kinds)
+    part("task_space", (runs, traces))
+    part("regret", (runs[:1], {"less": 1}, {"bound": 2}))
+    part("singular_case", ({"trace": 3}, {"claims": ["near", "close"]}))
+    part("robustness", {"nominal": 4})
+    part("tables", {"tables": 5})
+    part("summary", {"summary": 6})
+    part("judged", ["still", "slow", "turn", "track", "along z", "last"])
+    effort = replace(experiments.Effort(), starts=4, bound_starts=1, short_s=3.0)
+    controllers: Any = {"a": _Idle(), "b": _Idle()}
+    found, shown = experiments.comparison(BROKK_170, controllers, effort, 7)
+    every = [s.name for s in task_sequences(BROKK_170)]
+    assert asked["scored_starts"][:2] == (BROKK_170, 4) and asked["scored_starts"][3] == 9
+    assert asked["start_kinds"] == (BROKK_170, starts)
+    assert [s.name for s in asked["scored_starts"][2]] == every
+    machine, who, sequences, where, seed = asked["task_space"]
+    assert (machine, who, [s.name for s in sequences], where is starts, seed) == (
+        BROKK_170,
+        controllers,
+        every,
+        True,
+        7,
+    )
+    machine, who, short, where, seed = asked["regret"]
+    assert (machine, who, where.tolist(), seed) == (BROKK_170, controllers, starts[1:2].tolist(), 7)
+    assert [(s.name, len(s.goals)) for s in short] == [("x", 60), ("y", 60), ("z", 60)]
+    machine, who, where, seconds, seed = asked["singular_case"]
+    assert (machine, who, where.tolist(), seconds, seed) == (
+        BROKK_170,
+        controllers,
+        starts[2:3].tolist(),
+        3.0,
+        7,
+    )
+    machine, who, shorter, where, seed = asked["robustness"]
+    assert (machine, who, where.tolist(), seed) == (
+        BROKK_170,
+        controllers,
+        starts[[1, 3]].tolist(),
+        7,
+    )
+    assert (
+        shorter is short
+        and asked["tables"] == (runs, [runs[1], runs[3]])
+        and asked["summary"] == (runs[:1],)
+    )
+    machine, who, scored, along, goals = asked["judged"]
+    assert (machine, who, scored, list(along)) == (
+        BROKK_170,
+        controllers,
+        [runs[1], runs[3]],
+        ["a", "b"],
+    )
+    np.testing.assert_array_equal(along["b"].q, traces["b", "x"].q[:, [1, 3]])
+    np.testing.assert_array_equal(along["b"].reward, traces["b", "x"].reward[:, [1, 3]])
+    np.testing.assert_array_equal(goals, task_sequences(BROKK_170)[0].goals)
+    assert found == {
+        "task_space": {"tables": 5}, "regret": {"summary": {"summary": 6}, "less_perfect_model": {"less": 1}},
+        "robustness": {"nominal": 4}, "singular": {"claims": ["near", "close"]},
+        "claims": ["still", "slow", "turn", "near", "close", "track", "along z", "last"],
+        "starts": starts.tolist(), "start_kinds": kinds,
+    }  # fmt: skip
+    assert shown == {"all": traces, "bound": {"bound": 2}, "singular": {"trace": 3}}
+
+
+def test_regret_is_against_the_bound_and_gains_dither_only_where_they_should(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    start = np.array([[1.5, 0.5, 0.58, 1.71, 1.24]])
+    found = experiments.bounds(BROKK_170, start)
+    assert list(found) == ["perfect_model", "perfect_model_no_dither"]
+    one, still = found.values()
+    assert one.poses is start and still.poses is start  # type: ignore[attr-defined]
+    assert still.dither == 0.0 != one.dither and (one.machine, still.machine) == (
+        BROKK_170,
+        BROKK_170,
+    )  # type: ignore[attr-defined]
+    rows = [
+        {
+            "controller": c,
+            "sequence": "x",
+            "start": i,
+            "kind": "workspace",
+            "velocity_error_mean": e + i * i,
+        }
+        for c, e in (("mine", 3.0), ("perfect_model", 1.0))
+        for i in range(2)
+    ]
+    asked: list[Any] = []
+    monkeypatch.setattr(
+        experiments, "task_space", lambda *a: asked.append(a) or (rows, {"trace": 1})
+    )
+    mine: Any = {"mine": _Idle()}
+    short = task_sequences(BROKK_170)[:1]
+    runs, less, traces = experiments.regret(BROKK_170, mine, short, start, 5)
+    assert (runs, traces, asked[0][4]) == (rows, {"trace": 1}, 5) and asked[0][3] is start
+    assert asked[0][0] is BROKK_170 and asked[0][2] is short
+    bound = asked[0][1]["perfect_model"]
+    assert bound.machine is BROKK_170 and bound.poses is start
+    assert list(asked[0][1]) == ["mine", "perfect_model", "perfect_model_no_dither"]
+    assert less == {"mine": {s: {"mean": 2.0, "low": 2.0, "high": 2.0} for s in ("x", "all")}}
+
+
+def test_a_log_of_driven_runs_by_hand() -> None:
+    trace = made_up_trace(30, 18)._replace(u=np.full((30, 18, 5), np.float32(0.1)))
+    traces = {("rl", "x"): trace, ("pid", "x"): trace, ("rl", "y"): made_up_trace(30, 2)}
+    slow = experiments.driven_log(replace(BROKK_170, rate=10.0), traces, "rl")
+    log = experiments.driven_log(BROKK_170, traces, "rl")
+    assert slow.rate == 10.0
+    np.testing.assert_allclose(slow.recordings[3].q_dot, log.recordings[3].q_dot / 2)
+    names = [r.name for r in log.recordings]
+    assert names == [f"rl_x_{i:02d}" for i in range(16)] + ["rl_y_00", "rl_y_01"]
+    assert (log.joints, log.rate, log.velocity_logged) == (BROKK_170.names, 20.0, False)
+    third = log.recordings[3]
+    np.testing.assert_array_equal(third.q, trace.q_measured[:, 3])
+    assert third.u.dtype == float and np.allclose(third.u, 0.1)
+    np.testing.assert_allclose(third.q_dot, velocity_of(trace.q_measured[:, 3], 4, 20.0))
+
+
+def test_tables_keep_the_runs_that_count_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = [
+        {
+            "controller": c,
+            "sequence": s,
+            "start": i,
+            "kind": kind,
+            "error": base + i + (kind == "limits") / 2,
+        }
+        for c, base in (("rl", 1.0), ("pid", 4.0))
+        for s in "xy"
+        for i, kind in enumerate(("workspace", "limits", "workspace"))
+    ]
+    scored = [row for row in rows if row["kind"] == "workspace"]
+    found = experiments.tables(rows, scored)
+    assert found["runs"] is rows and found["summary"]["pid"] == {
+        s: {"error": 5.0} for s in ("x", "y", "all")
+    }
+    limits = {"rl": {"error": 2.5}, "pid": {"error": 5.5}}
+    assert found["by_kind"] == {
+        "workspace": {"rl": {"error": 2.0}, "pid": {"error": 5.0}},
+        "limits": limits,
+    }
+    assert found["rl_less"] == {
+        "error": {"pid": {s: {"mean": -3.0, "low": -3.0, "high": -3.0} for s in ("x", "y", "all")}}
+    }
+    low, high = found["intervals"]["rl"]["x"]["error"]
+    assert low == pytest.approx(2 - 12.7062, abs=1e-3) and high == pytest.approx(
+        2 + 12.7062, abs=1e-3
+    )
+
+
+def test_sentences_are_put_to_the_papers_baselines_and_to_the_stronger_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    net = net_of_driven_joints()
+    pids = baselines.baselines(BROKK_170, net)
+    asked: list[Any] = []
+
+    def said(name: str, count: int) -> Any:
+        def answer(*a: Any) -> Any:
+            asked.append((name, *a))
+            many = [
+                {"paper": f"{name} {i}", "numbers": {"n": len(asked)}, "unit": "m", "holds": None}
+                for i in range(count)
+            ]
+            return many if count > 1 else many[0]
+
+        return answer
+
+    for name, count in (("drift_claims", 2), ("direction_claim", 1), ("tracking_claims", 3)):
+        monkeypatch.setattr(experiments.claims, name, said(name, count))
+    along: Any = {name: f"trace of {name}" for name in pids}
+    goals = np.zeros((2, 3))
+    found = experiments.judged(BROKK_170, {"rl": _Idle(), **pids}, [{"run": 1}], along, goals)
+    assert [claim["paper"] for claim in found] == [
+        "drift_claims 0", "drift_claims 1", "direction_claim 0", *(f"tracking_claims {i}" for i in range(3)),
+    ]  # fmt: skip
+    assert [claim["numbers"]["n"] for claim in found] == [1, 1, 2, 3, 3, 3]
+    assert [claim["stronger"]["numbers"]["n"] for claim in found] == [4, 4, 5, 6, 6, 6]
+    assert asked[0] == ("drift_claims", [{"run": 1}], baselines.PAPERS)
+    assert asked[2] == ("tracking_claims", [{"run": 1}], baselines.PAPERS)
+    assert asked[3][2] == baselines.STRONGER == asked[5][2]
+    for i, name in ((1, "jacobian_pid_k0.1"), (4, "jacobian_pid_ff")):
+        assert (
+            asked[i][:4] == ("direction_claim", BROKK_170, pids[name], f"trace of {name}")
+            and asked[i][4] is goals
+        )
+
+
+def test_damping_alone_is_compared_near_a_singularity() -> None:
+    """Half a second along what an upright arm can do least, of two baselines with the same gains."""
+    empty = experiments.singular_case(BROKK_170, {}, np.zeros((0, 5)), 1.0, 0)
+    assert empty == ({}, {"summary": {}, "claims": []})
+    start = np.array([[0.0, 1.139, 0.97, 2.804, 1.948], [1.0, 1.2, 0.9, 2.8, 1.9]])
+    pids = baselines.baselines(BROKK_170, net_of_driven_joints())
+    traces, found = experiments.singular_case(BROKK_170, {"rl": _Idle(), **pids}, start, 1.5, 3)
+    names = ("rl", "jacobian_pid_k0.1", "jacobian_pid_k0.05")
+    assert list(traces) == [(c, s) for c in names for s in ("least_half", "least_quarter")]
+    assert all(trace.q.shape == (30, 2, 5) for trace in traces.values())
+    np.testing.assert_array_equal(traces["rl", "least_half"].q[-1], start)
+    J = kinematics.jacobian(BROKK_170, start)
+    assert found["w0"] == jacobian.manipulability_threshold(BROKK_170)
+    np.testing.assert_allclose(
+        found["manipulability"], np.sqrt(np.linalg.det(J @ J.swapaxes(-1, -2)))
+    )
+    np.testing.assert_allclose(
+        found["least"], [np.sqrt(np.linalg.eigvalsh(j @ j.T)[0]) for j in J], rtol=1e-6
+    )
+    assert list(found["summary"]) == list(names) and len(found["claims"]) == 3
+    assert found["summary"]["rl"]["all"]["velocity_error_mean"] == pytest.approx(0.075 * 10 / 30)
+
+
+def test_gains_have_names_and_tuning_is_apart_from_scoring() -> None:
+    net = net_of_driven_joints()
+    pids = baselines.baselines(BROKK_170, net)
+    assert list(pids) == [*baselines.PAPERS, "jacobian_pid_ff", "jacobian_pid_ff_awake"]
+    assert [(c.k, c.awake, c.feedforward is not None) for c in pids.values()] == [
+        (0.1, False, False), (0.05, False, False), (0.1, False, True), (0.1, True, True),
+    ]  # fmt: skip
+    plain = baselines.plain_gains(pids)
+    wanted = {
+        "kp": (1.0, 0.2),
+        "ki": (8.0, 0.5),
+        "kd": (0.05, 0.02),
+        "feedback": (0.4, 0.1),
+        "ready": (0.015, 0.015),
+    }
+    for name, gains in plain.items():
+        assert {key: set(np.ravel(values).round(9)) for key, values in gains.items()} == {
+            key: {values["ff" in name]} for key, values in wanted.items()
+        }
+    found, again = baselines.tuning_set(BROKK_170, 7, 3), tuning_goals(BROKK_170, 7, 12.0, 1003)
+    assert all(map(np.array_equal, found, again))
+    about = experiments.meta(BROKK_170, 4)
+    assert about == {
+        "brokk_min": "0.1.0",
+        "machine": "brokk170",
+        "seed": 4,
+        "units": "m, m/s, s, rad",
+    }
+
+
+def test_robustness_says_what_the_policy_has_less_than_others_on_each_machine(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[Any] = []
+    trace = made_up_trace(4, 2)._replace(u=np.zeros((4, 2, 5)))
+    full = trace._replace(
+        u=np.where(np.arange(4)[:, None, None] < 1, 1.0, 0.0) * np.ones((4, 2, 5))
+    )
+
+    def driven(plant: Machine, *a: Any, **more: Any) -> Any:
+        asked.append((plant, *a, more))
+        error = plant.delay
+        rows = [
+            {
+                "controller": c,
+                "sequence": "x",
+                "start": i,
+                "kind": "k",
+                "velocity_error_mean": error + e + i,
+            }
+            for c, e in (("rl", 1.0), ("pid", 3.0))
+            for i in range(2)
+        ]
+        return rows, {("rl", "x"): trace, ("pid", "x"): full}
+
+    monkeypatch.setattr(experiments, "task_space", driven)
+    controllers: Any = {"rl": _Idle(), "pid": _Idle()}
+    short = experiments.shortened(BROKK_170, task_sequences(BROKK_170)[:1], 1.0)
+    found = experiments.robustness(BROKK_170, controllers, short, np.zeros((2, 5)), 9)
+    wanted = variations.variations(BROKK_170)
+    assert list(found) == list(wanted)
+    for (plant, sensor), call in zip(wanted.values(), asked, strict=True):
+        assert (
+            call[0] == plant
+            and call[1:3] == (controllers, short)
+            and call[4:] == (9, {"sensor": sensor})
+        )
+    late = found["delay +50 ms"]
+    assert late["rl"] == {
+        "mean": pytest.approx(1.59),  # two starts, 1.09 and 2.09: half of 12.7062 to either side
+        "low": pytest.approx(1.59 - 6.3531, abs=1e-3), "high": pytest.approx(1.59 + 6.3531, abs=1e-3),
+        "supply_demand": 0.0, "supply_limits": 0.0,
+    }  # fmt: skip
+    assert late["pid"]["rl_less"] == pytest.approx({"mean": -2.0, "low": -2.0, "high": -2.0})
+    assert late["pid"]["supply_demand"] == pytest.approx(
+        float(variations.supply_demand(BROKK_170, np.ones(5)))
+    )
+    assert late["pid"]["supply_demand"] > 1 and late["pid"]["supply_limits"] == 0.25
+    alone: Any = {"pid": _Idle()}
+    assert (
+        "rl_less"
+        not in experiments.robustness(BROKK_170, alone, short, np.zeros((2, 5)), 9)["nominal"][
+            "pid"
+        ]
+    )
+
+
+def test_variations_by_hand() -> None:
+    found = {name: plant for name, (plant, _) in variations.variations(BROKK_170).items()}
+    assert {
+        name: (m.pump_flow / BROKK_170.pump_flow, m.dead_zone, m.delay) for name, m in found.items()
+    } == {
+        name: pytest.approx(
+            (
+                {"supply flow -20 %": 0.8, "supply flow -70 %": 0.3}.get(name, 1.0),
+                {"dead zone 5 %": 0.05, "dead zone 10 %": 0.10}.get(name, 0.07),
+                {"delay +25 ms": 0.065, "delay +50 ms": 0.09}.get(name, 0.04),
+            )
+        )
+        for name in found
+    }
+    for name, share in (("valve gain -20 %", 0.8), ("valve gain +20 %", 1.2)):
+        for speed in ("speed_positive", "speed_negative"):
+            np.testing.assert_allclose(found[name].column(speed), share * BROKK_170.column(speed))
+    sensors = {name: sensor for name, (_, sensor) in variations.variations(BROKK_170).items()}
+    assert [name for name, sensor in sensors.items() if sensor is not variations.exact] == [
+        "encoder noise of a count", "one sample in 20 lost",
+    ]  # fmt: skip
+
+
+# --- the chain, its parts made up -------------------------------------------------------------------------
+
+
+class Parts:
+    """Functions of modules replaced by ones that keep what they were asked and say what they are told to."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.patch, self.asked = monkeypatch, dict[str, list[tuple[Any, ...]]]()
+
+    def __call__(self, module: Any, name: str, answer: Any = None) -> None:
+        def instead(*a: Any, **more: Any) -> Any:
+            self.asked.setdefault(name, []).append((*a, more) if more else a)
+            return answer(*a, **more) if callable(answer) else answer
+
+        self.patch.setattr(module, name, instead)
+
+
+def test_the_chain_hands_each_stage_what_the_one_before_made(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    from brokk_min import ppo
+    from brokk_min.learning import sweep
+
+    part, asked = (p := Parts(monkeypatch)), p.asked
+    out, effort = tmp_path / "a" / "b", replace(TINY, train_steps=64)
+    net, driven = random_net(np.random.default_rng(0)), net_of_driven_joints()
+    policy = SimpleNamespace(net=driven)
+    part(sweep, "read_seeds", {"meta": {}, "table": "seeds"})
+    part(sweep, "seeds_of", {"rl": "over seeds"})
+    part(chain, "record", ["log", "test"])
+    part(chain, "fitted", (net, "by the paper"))
+    part(ppo, "train", policy)
+    part(chain, "tuned_baselines", ("tuned", "how"))
+    part(chain, "PolicyController", lambda machine, learned: ("controller of", learned))
+    part(chain, "measure", ({"task_space": "compared"}, "traces"))
+    part(chain, "plain_gains", lambda tuned: f"plain {tuned}")
+    for name in ("write_gains", "save_policy"):
+        part(chain, name)
+    part(chain, "told", lambda policy, results, seed: ("told", policy, seed))
+    part(report, "net_parts", ["nets"])
+    part(report, "found", "found")
+    part(report, "task_parts", ["task", "lists"])
+    part(figures, "write_report")
+    results = chain.reproduce(BROKK_170, out, effort, 3, Path("sweep.json"))
+    assert asked["read_seeds"] == [(Path("sweep.json"),)]
+    assert asked["record"] == [(BROKK_170, out, effort, 3)]
+    assert asked["fitted"] == [(BROKK_170, out, "log", "test", effort, 3)]
+    machine, selected, seeds = asked["seeds_of"][0]
+    assert (machine, selected.joints, seeds["table"]) == (
+        BROKK_170,
+        ("q1", "q3", "q4", "q5"),
+        "seeds",
+    )
+    machine, nets, task, config, seed, path, more = asked["train"][0]
+    assert (machine, task, config, seed, path) == (
+        BROKK_170,
+        TaskConfig(),
+        ppo.PPOConfig(total_steps=64),
+        3,
+        out / "policy.npz",
+    )
+    assert more == {"resume": True} and nets.joints == ("q1", "q3", "q4", "q5")
+    machine, nets, *spent = asked["tuned_baselines"][0]
+    assert (machine, nets.joints) == (BROKK_170, ("q1", "q3", "q4", "q5"))
+    assert spent == [effort.tuning_runs, effort.generations, 3]
+    assert asked["measure"] == [
+        (BROKK_170, net, "test", ("controller of", policy), "tuned", effort, 3)
+    ]
+    about = experiments.meta(BROKK_170, 3) | baselines.tuned_for(BROKK_170, driven)
+    wanted = {
+        "meta": about | {"effort": asdict(effort)},
+        "paper_recipe": "by the paper", "task_space": "compared", "gains": "plain tuned", "tuning": "how",
+        "training_seeds": {"rl": "over seeds"},
+    }  # fmt: skip
+    assert results == wanted == json.loads((out / "results.json").read_text())
+    assert asked["write_gains"] == [(out / "gains.json", "tuned", wanted["meta"])]
+    assert asked["save_policy"] == [(out / "policy.npz", ("told", policy, 3))]
+    clock = json.loads((out / "timing.json").read_text())
+    assert list(clock) == ["record", "fit", "train", "tune", "evaluate", "draw"]
+    *first, trained = asked["net_parts"][0]
+    assert (
+        first == [BROKK_170, net, "test", wanted, 3, out / "policy.npz.csv"]
+        and trained == clock["train"]
+    )
+    assert asked["task_parts"] == [(BROKK_170, wanted, "traces")]
+    path, pages, seconds = asked["write_report"][0]
+    assert (path, pages, seconds) == (
+        out / "report.html",
+        ["found", "nets", "task", "lists"],
+        clock,
+    )
+    assert (
+        chain.reproduce(BROKK_170, out, effort, 3)["training_seeds"] == {}
+        and len(asked["read_seeds"]) == 1
+    )
+
+
+def test_nets_of_the_chain_are_ours_and_the_papers(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    part, asked = (p := Parts(monkeypatch)), p.asked
+    net = random_net(np.random.default_rng(0))
+    part(chain.fitting, "fit", net)
+    part(chain.preliminary, "paper_recipe", "recipe")
+    machine = replace(BROKK_170, dead_zone=0.09, history=11)
+    log: Any = "log"
+    assert chain.fitted(machine, tmp_path, log, "test", TINY, 4) == (net, "recipe")  # type: ignore[arg-type]
+    config = chain.fitting.FitConfig(steps=60, history=11, dead_zone=0.09)
+    assert asked["fit"] == [("log", config, 4, 4, "brokk170")]
+    assert asked["paper_recipe"] == [(machine, "test", 0.02, replace(config, steps=30), 4)]
+    assert fingerprint(load_net(tmp_path / "net.npz")) == fingerprint(net)
+
+
+def test_logs_of_the_chain_are_written_and_read_back(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    part, asked = (p := Parts(monkeypatch)), p.asked
+    part(
+        chain.excitation,
+        "collect",
+        lambda machine, hours, kind, rng: f"{kind} {rng.integers(10**9)}",
+    )
+    part(
+        chain.excitation,
+        "task_log",
+        lambda machine, runs, seconds, rng: f"{runs} {seconds} {rng.integers(10**9)}",
+    )
+    part(chain.logs, "write_log")
+    part(chain.logs, "read_log", lambda files, samples, rate: (files, samples, rate))
+    found = chain.record(BROKK_170, tmp_path, TINY, 4)
+    assert found == [([tmp_path / name], 4, 20.0) for name in ("log.npz", "log_test.npz")]
+    drawn = [np.random.default_rng(seed).integers(10**9) for seed in (4, 5)]
+    wanted = [("log.npz", f"rich {drawn[0]}"), ("log_test.npz", f"20 40.0 {drawn[1]}")]
+    assert asked["write_log"] == [(tmp_path / name, log) for name, log in wanted]
+    assert asked["collect"][0][:2] == (BROKK_170, 0.02)
+
+
+def test_what_is_measured_of_nets_policy_and_baselines(monkeypatch: pytest.MonkeyPatch) -> None:
+    part, asked = (p := Parts(monkeypatch)), p.asked
+    goals = np.tile([[0.1, 0.0, 0.0]], (20, 2, 1))
+    kinds = ["workspace", "limits", "workspace"]
+    compared = {"task_space": {}, "starts": [[1.0], [2.0], [3.0]], "start_kinds": kinds}
+    part(chain, "comparison", (compared, {"all": "every"}))
+    part(chain, "task_space", (["run"], {}))
+    part(chain, "summary", {"rl": "on nets"})
+    part(chain, "driven_log", "driven")
+    part(chain.scores, "score", lambda net, log: f"score of {log}")
+    part(chain.preliminary, "run", "before")
+    part(chain.claims, "net_claims", lambda before: f"claims of {before}")
+    part(chain, "tuning_set", (np.array([[0.5], [0.25]]), goals))
+    rl: Any = SimpleNamespace(policy=SimpleNamespace(net="its nets"))
+    found, traces = chain.measure(BROKK_170, "net", "test", rl, {"pid": "p"}, TINY, 6)  # type: ignore[arg-type, dict-item]
+    assert traces == {"all": "every"} and asked["comparison"] == [
+        (BROKK_170, {"rl": rl, "pid": "p"}, TINY, 6)
+    ]
+    assert found["actuator"] == {"test": "score of test", "driven_by_policy": "score of driven"}
+    assert (found["preliminary"], found["net_claims"]) == ("before", "claims of before")
+    assert asked["run"] == [(BROKK_170, "net", 6)] and asked["driven_log"] == [
+        (BROKK_170, "every", "rl")
+    ]
+    assert asked["tuning_set"] == [(BROKK_170, 2, 6)]
+    assert found["tuning_runs"] == [
+        {"start": [s], "goals": [[1.0, 0.1, 0.0, 0.0]]} for s in (0.5, 0.25)
+    ]
+    machine, who, sequences, starts, seed, moves = asked["task_space"][0]
+    assert (machine, who, starts.tolist(), seed, moves) == (
+        BROKK_170,
+        {"rl": rl},
+        [[1.0], [3.0]],
+        6,
+        "its nets",
+    )
+    assert [(s.name, len(s.goals)) for s in sequences] == [("x", 360), ("y", 360), ("z", 360)]
+    assert found["task_space"] == {"rl_on_nets": "on nets"} and asked["summary"] == [(["run"],)]
+
+
+def test_a_policy_is_told_what_made_it_and_how_well_it_does() -> None:
+    @dataclass(frozen=True)
+    class Made:
+        training: dict[str, Any]
+
+    means = {c: {"all": {"velocity_error_mean": e}} for c, e in (("rl", 0.5), ("pid", 0.75))}
+    policy: Any = chain.told(Made({"seed": 1}), {"task_space": {"summary": means}}, 9)  # type: ignore[arg-type]
+    said = {
+        "command": "brokk-min reproduce --seed 9",
+        "velocity_error_mean": {"rl": 0.5, "pid": 0.75},
+    }
+    assert policy.training == {"seed": 1, **said}

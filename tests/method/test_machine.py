@@ -1,0 +1,371 @@
+"""The machine as a value, the PWM code, the command limit, the encoders, the velocity estimator."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+from strategies import machines, posed, reals
+
+from brokk_min.machine import (
+    BROKK_170,
+    SOURCES,
+    Joint,
+    Machine,
+    decode_pwm,
+    encode_pwm,
+    estimate_velocity,
+    limit_command,
+    read_encoder,
+)
+
+# --- validation -----------------------------------------------------------------------------------
+
+
+def with_joint(index: int, **changes: object) -> dict[str, object]:
+    """Arguments of `replace` that change one joint of the Brokk."""
+    joints = list(BROKK_170.joints)
+    joints[index] = replace(joints[index], **changes)  # type: ignore[arg-type]
+    return {"joints": tuple(joints)}
+
+
+def with_source(field: str, source: str | None) -> dict[str, object]:
+    sources = dict(BROKK_170.sources)
+    del sources[field]
+    return {"sources": sources if source is None else sources | {field: source}}
+
+
+NAN, INF = float("nan"), float("inf")
+LOCKED = tuple(replace(joint, driven=False) for joint in BROKK_170.joints)
+BAD = [
+    ({"joints": ()}, ["joints", "at least one", "none"]),
+    ({"joints": LOCKED}, ["joints", "driven", "none"]),
+    (with_joint(1, name="q1"), ["joints", "different names", "['q1', 'q1', 'q3', 'q4', 'q5']"]),
+    (with_source("a", None), ["sources['a']", "assumed", "None"]),
+    (with_source("rate", "guess"), ["sources['rate']", "paper", "'guess'"]),
+    (with_joint(2, a=NAN), ["q3.a", "finite", "nan"]),
+    (with_joint(2, alpha=INF), ["q3.alpha", "finite", "inf"]),
+    (with_joint(0, d="0.95"), ["q1.d", "number", "'0.95'"]),
+    (with_joint(0, theta=None), ["q1.theta", "number", "None"]),
+    (with_joint(0, theta=np.zeros(2)), ["q1.theta", "number", "array"]),
+    (with_joint(3, q_min=-INF), ["q4.q_min", "finite", "-inf"]),
+    (with_joint(3, q_max=0.6), ["q4.q_max", "above q_min = 0.6", "0.6"]),
+    (with_joint(3, q_max=0.1), ["q4.q_max", "above q_min = 0.6", "0.1"]),
+    (with_joint(4, cylinder_base=-0.1), ["q5.cylinder_base", "0", "-0.1"]),
+    (with_joint(4, cylinder_rod=0.0), ["q5.cylinder_rod", "1e-06", "got 0.0"]),
+    (with_joint(4, cylinder_angle=-0.01), ["q5.cylinder_angle", "(0, pi)", "-0.010 to 1.990"]),
+    (with_joint(4, cylinder_angle=1.2), ["q5.cylinder_angle", "(0, pi)", "1.200 to 3.200"]),
+    (with_joint(4, cylinder_area=0.0), ["q5.cylinder_area", "got 0.0"]),
+    (with_joint(4, speed_positive=0.0), ["q5.speed_positive", "got 0.0"]),
+    (with_joint(4, speed_negative=-0.08), ["q5.speed_negative", "got -0.08"]),
+    (with_joint(4, q_dot_up=0.0), ["q5.q_dot_up", "got 0.0"]),
+    (with_joint(4, q_dot_down=-1.0), ["q5.q_dot_down", "got -1.0"]),
+    (with_joint(4, encoder_node=0), ["q5.encoder_node", "1 to 127", "got 0"]),
+    (with_joint(4, encoder_node=128), ["q5.encoder_node", "1 to 127", "got 128"]),
+    (with_joint(4, encoder_zero=0.5), ["q5.encoder_zero", "whole number", "got 0.5"]),
+    (with_joint(4, encoder_sign=0), ["q5.encoder_sign", "-1 or 1", "got 0"]),
+    (with_joint(4, encoder_sign=2), ["q5.encoder_sign", "-1 to 1", "got 2"]),
+    ({"rate": 0.0}, ["rate", "got 0.0"]),
+    ({"rate": -20.0}, ["rate", "got -20.0"]),
+    ({"pwm_limit": 0}, ["pwm_limit", "1 to 127", "got 0"]),
+    ({"pwm_limit": 128}, ["pwm_limit", "1 to 127", "got 128"]),
+    ({"dead_zone": -0.01}, ["dead_zone", "0 to 0.99", "got -0.01"]),
+    ({"dead_zone": 1.0}, ["dead_zone", "0 to 0.99", "got 1.0"]),
+    ({"dead_zone": 0.63}, ["dead_zone", "below the command limit 80/127", "got 0.63"]),
+    (
+        {"dead_zone": 0.125, "pwm_limit": 10},
+        ["dead_zone", "below the command limit 10/127", "got 0.125"],
+    ),
+    ({"dead_zone": 80 / 127}, ["dead_zone", "below", "got 0.629"]),
+    ({"delay": -0.04}, ["delay", "0 to inf", "got -0.04"]),
+    ({"spool_time": 0.0}, ["spool_time", "got 0.0"]),
+    ({"cylinder_time": 0.0}, ["cylinder_time", "got 0.0"]),
+    ({"ready_up_time": 0.0}, ["ready_up_time", "got 0.0"]),
+    ({"ready_down_time": 0.0}, ["ready_down_time", "got 0.0"]),
+    ({"ready_threshold": 1.0}, ["ready_threshold", "0 to 0.999", "got 1.0"]),
+    ({"spool_idle": -0.1}, ["spool_idle", "0 to 1", "got -0.1"]),
+    ({"pump_flow": 0.0}, ["pump_flow", "got 0.0"]),
+    ({"plant_dt": 0.0}, ["plant_dt", "1e-06 to 1", "got 0.0"]),
+    ({"plant_dt": 0.03}, ["plant_dt", "1/rate = 0.05 to be a multiple", "got 0.03"]),
+    ({"plant_dt": 1.0, "rate": 1e7}, ["plant_dt", "1/rate = 1e-07 to be a multiple", "got 1.0"]),
+    ({"encoder_bits": 0}, ["encoder_bits", "1 to 32", "got 0"]),
+    ({"encoder_bits": 33}, ["encoder_bits", "1 to 32", "got 33"]),
+    ({"velocity_samples": 1}, ["velocity_samples", "2 to 100", "got 1"]),
+    ({"history": 1}, ["history", "2 to 1000", "got 1"]),
+    ({"tool_speed": 0.0}, ["tool_speed", "got 0.0"]),
+    ({"ground": NAN}, ["ground", "finite", "nan"]),
+    ({"valve_frame_id": -1}, ["valve_frame_id", "0 to 2047", "got -1"]),
+    ({"valve_frame_id": 0x800}, ["valve_frame_id", "0 to 2047", "got 2048"]),
+    ({"controller_node": 128}, ["controller_node", "1 to 127", "got 128"]),
+    ({"controller_node": 3}, ["controller_node", "none of [1, 2, 3, 4, 5]", "got 3"]),
+]
+
+
+@pytest.mark.parametrize(("changes", "words"), BAD, ids=[words[0] for _, words in BAD])
+def test_a_bad_field_is_refused_by_name_with_wanted_and_got(changes, words):
+    with pytest.raises(ValueError) as caught:
+        replace(BROKK_170, **changes)
+    message = str(caught.value)
+    assert message.startswith(words[0] + ":") and "expected" in message and "got" in message
+    assert all(word in message for word in words), message
+
+
+def test_every_numeric_field_is_in_the_table_of_bad_fields():
+    tried = {words[0].split(".")[-1] for _, words in BAD}
+    assert {name for name, _ in numeric_fields()} <= tried
+
+
+def test_values_at_the_ends_of_the_allowed_ranges_are_machines():
+    replace(BROKK_170, pwm_limit=10, dead_zone=0.078)
+    replace(BROKK_170, pwm_limit=1, dead_zone=0.0, delay=0.0, velocity_samples=2, history=2)
+    replace(BROKK_170, pwm_limit=127, valve_frame_id=0x7FF, ready_threshold=0.0, encoder_bits=32)
+    replace(BROKK_170, **with_joint(0, encoder_node=127, a=0.0, d=-1.0))
+    replace(BROKK_170, plant_dt=BROKK_170.dt)
+
+
+def numeric_fields() -> list[tuple[str, dataclasses.Field]]:
+    """By the annotation, so that a number without a unit cannot hide."""
+    every = [*dataclasses.fields(Joint), *dataclasses.fields(Machine)]
+    return [(f.name, f) for f in every if f.type in ("float", "int", float, int)]
+
+
+def test_every_number_has_a_unit_and_a_source():
+    assert len(numeric_fields()) > 30
+    for name, field in numeric_fields():
+        assert field.metadata.get("unit"), f"{name} has no unit"
+        assert BROKK_170.sources[name] in SOURCES, f"{name} has no source"
+
+
+@pytest.mark.parametrize(
+    ("field", "unit", "source"),
+    [
+        ("a", "m", "assumed"),
+        ("q_max", "rad", "assumed"),
+        ("speed_positive", "m/s", "assumed"),
+        ("cylinder_area", "m^2", "assumed"),
+        ("delay", "s", "assumed"),
+        ("rate", "Hz", "paper"),
+        ("pwm_limit", "counts of 127", "paper"),
+        ("dead_zone", "of full command", "paper"),
+        ("history", "samples", "paper"),
+    ],
+)
+def test_units_and_sources_of_well_known_numbers(field, unit, source):
+    assert dict(numeric_fields())[field].metadata["unit"] == unit
+    assert BROKK_170.sources[field] == source
+
+
+def test_the_brokk_has_the_numbers_of_the_paper_and_the_design():
+    m = BROKK_170
+    assert (m.rate, m.dt, m.pwm_limit, m.dead_zone, m.history) == (20.0, 0.05, 80, 0.07, 13)
+    assert m.names == ("q1", "q2", "q3", "q4", "q5")
+    assert m.driven.tolist() == [0, 2, 3, 4] and m.locked.tolist() == [1]
+    assert m.column("q_min").tolist() == [-2.14, 0.0, -0.3, 0.6, 0.0]
+    assert m.column("q_max").tolist() == [2.14, 1.4, 1.6, 2.9, 2.0]
+    assert m.encoder_step == pytest.approx(1.534e-3, abs=5e-7)  # 12 bits
+    assert m.encoder_step * m.rate == pytest.approx(0.031, abs=5e-4)  # one count over one tick
+
+
+@given(machines())
+def test_columns_follow_the_joints_and_cannot_be_written(machine):
+    for field in ("a", "q_min", "speed_negative", "encoder_node"):
+        column = machine.column(field)
+        assert column.tolist() == [getattr(joint, field) for joint in machine.joints]
+        with pytest.raises(ValueError, match="read-only"):
+            column[0] = 1.0
+    both = np.concatenate([machine.driven, machine.locked])
+    assert sorted(both.tolist()) == list(range(machine.n))
+    assert all(machine.joints[i].driven for i in machine.driven)
+
+
+def test_a_machine_is_a_value_that_cannot_be_changed():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        BROKK_170.rate = 10.0
+    sources = dict(BROKK_170.sources)
+    machine = replace(BROKK_170, sources=sources)
+    sources["rate"] = "maker"
+    assert machine.sources["rate"] == "paper"
+    slower = replace(BROKK_170, rate=10.0)
+    assert slower.dt == 0.1 and BROKK_170.dt == 0.05
+
+
+def test_a_replaced_machine_has_columns_of_its_own():
+    BROKK_170.column("a")  # cached by now
+    machine = replace(BROKK_170, **with_joint(1, a=9.0))
+    assert machine.column("a")[1] == 9.0 and BROKK_170.column("a")[1] == 1.15
+
+
+def test_a_machine_survives_copies_and_other_processes():
+    """Gymnasium deep-copies what an environment is made with, and workers get it pickled."""
+    assert copy.deepcopy(BROKK_170) == BROKK_170
+    assert pickle.loads(pickle.dumps(BROKK_170)) == BROKK_170
+
+
+# --- the PWM byte ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("u_byte", "count"),
+    [
+        (0, 0),
+        (255, 0),
+        (80, 80),
+        (175, -80),
+        (50, 50),
+        (205, -50),
+        (127, 127),
+        (128, -127),
+        (254, -1),
+    ],
+)
+def test_bytes_of_the_paper(u_byte, count):
+    assert decode_pwm(u_byte) * 127 == pytest.approx(count, abs=1e-12)
+    assert encode_pwm(count / 127) == (0 if count == 0 else u_byte)
+
+
+def test_every_byte_is_told_by_the_rule_of_the_paper():
+    """[0, 127] is positive and [255, 128] negative, as a dictionary written from that sentence."""
+    meaning = {u_byte: u_byte for u_byte in range(128)}
+    meaning |= {u_byte: -m for m, u_byte in enumerate(range(255, 127, -1))}
+    every = np.arange(256)
+    decoded = decode_pwm(every)
+    np.testing.assert_allclose(decoded * 127, [meaning[b] for b in range(256)], atol=1e-12)
+    again = encode_pwm(decoded)
+    assert again.dtype == np.uint8
+    assert again.tolist() == [0 if u_byte == 255 else u_byte for u_byte in range(256)]
+
+
+def test_opposite_commands_have_bytes_that_sum_to_255():
+    counts = np.arange(1, 128)
+    total = encode_pwm(counts / 127).astype(int) + encode_pwm(-counts / 127)
+    assert total.tolist() == [255] * 127
+
+
+@given(npst.arrays(np.float64, npst.array_shapes(max_dims=3), elements=reals(-1.0, 1.0)))
+def test_the_code_is_off_by_half_a_count_at_most(u):
+    assert np.all(np.abs(decode_pwm(encode_pwm(u)) - u) <= 0.5 / 127 + 1e-12)
+
+
+@pytest.mark.parametrize("u", [1.01, -1.01, NAN, INF, -INF, 80.0])
+def test_commands_that_no_byte_can_carry_are_refused(u):
+    with pytest.raises(ValueError, match=r"u: expected within \[-1, 1\], got ") as caught:
+        encode_pwm([0.0, u])
+    assert str(caught.value).endswith(str(u))
+
+
+# --- the limit ------------------------------------------------------------------------------------
+
+
+def test_the_limit_is_80_counts_of_127():
+    limited = limit_command(BROKK_170, np.array([-1.0, -0.63, 0.0, 0.004, 0.1, 0.62, 0.64, 5.0]))
+    np.testing.assert_allclose(limited * 127, [-80, -80, 0, 1, 13, 79, 80, 80], atol=1e-12)
+    assert pytest.approx(0.63, abs=1e-3) == 80 / 127
+
+
+@given(
+    machines(),
+    st.sampled_from([np.float32, np.float64]).flatmap(
+        lambda kind: npst.arrays(
+            kind, npst.array_shapes(max_dims=3), elements=st.floats(-8, 8, width=32)
+        )
+    ),
+)
+def test_no_command_leaves_beyond_the_limit_or_between_counts(machine, u):
+    u.setflags(write=False)
+    limited = limit_command(machine, u)
+    assert limited.dtype == u.dtype and limited.shape == u.shape
+    counts = limited.astype(float) * 127
+    np.testing.assert_allclose(counts, np.rint(counts), atol=1e-4)
+    assert np.all(np.abs(np.rint(counts)) <= machine.pwm_limit)
+    inside = np.abs(u) * 127 <= machine.pwm_limit
+    assert np.all(np.abs(counts - u * 127.0)[inside] <= 0.5 + 1e-4)
+    assert np.all(np.rint(counts)[~inside] == machine.pwm_limit * np.sign(u[~inside]))
+    np.testing.assert_array_equal(limit_command(machine, -u), -limited)
+    np.testing.assert_array_equal(limit_command(machine, limited), limited)
+
+
+def test_whole_numbers_are_commands_and_angles_too():
+    """[1, -1] is full command both ways; that it came as integers must not make it zero."""
+    np.testing.assert_allclose(limit_command(BROKK_170, [1, -1, 0]) * 127, [80, -80, 0])
+    np.testing.assert_array_equal(
+        read_encoder(BROKK_170, [1, 2]), read_encoder(BROKK_170, [1.0, 2.0])
+    )
+    slope = estimate_velocity([0, 3, 6, 9], samples=4, dt=0.07)
+    assert slope == pytest.approx(3 / 0.07)
+
+
+# --- encoders and velocity ------------------------------------------------------------------------
+
+
+@given(posed())
+def test_encoders_report_the_nearest_count(machine_and_pose):
+    machine, q = machine_and_pose
+    step = 2 * np.pi / 2**machine.encoder_bits
+    measured = read_encoder(machine, q)
+    counts = measured / step
+    np.testing.assert_allclose(counts, np.rint(counts), atol=1e-7)
+    assert np.all(np.abs(measured - q) <= step / 2 * (1 + 1e-9))
+    np.testing.assert_array_equal(read_encoder(machine, measured), measured)
+    assert read_encoder(machine, q.astype(np.float32)).dtype == np.float32
+
+
+def test_encoder_by_hand():
+    # 1 rad = 651.9 counts of 1.53398 mrad
+    assert read_encoder(BROKK_170, np.array(1.0)) == pytest.approx(652 * 2 * np.pi / 4096)
+    assert read_encoder(BROKK_170, np.array(-0.0007)) == 0.0
+    assert read_encoder(BROKK_170, np.array(-0.0008)) == pytest.approx(-0.00153398, rel=1e-5)
+
+
+@given(
+    samples=st.integers(2, 12),
+    extra=st.integers(0, 5),
+    start=reals(-3, 3),
+    slope=reals(-2, 2),
+    dt=reals(0.005, 0.2),
+)
+def test_velocity_is_exact_on_straight_lines(samples, extra, start, slope, dt):
+    q = start + slope * dt * np.arange(samples + extra)
+    assert estimate_velocity(q, samples, dt) == pytest.approx(slope, abs=1e-9)
+
+
+@given(
+    st.integers(2, 8).flatmap(
+        lambda samples: st.tuples(
+            st.just(samples), npst.arrays(np.float64, (3, samples + 4), elements=reals(-3, 3))
+        )
+    )
+)
+def test_velocity_is_the_least_squares_slope_and_forgets_what_is_older(case):
+    samples, q = case
+    q.setflags(write=False)
+    velocity = estimate_velocity(q, samples, 0.05)
+    time = 0.05 * np.arange(samples)
+    fitted = [np.polyfit(time, row[-samples:], 1)[0] for row in q]
+    np.testing.assert_allclose(velocity, fitted, atol=1e-8)
+    other = q.copy()
+    other[:, :4] = 1e6
+    np.testing.assert_array_equal(estimate_velocity(other, samples, 0.05), velocity)
+
+
+def test_velocity_by_hand():
+    # newest of four samples moved one count: 1.5 / 5 counts a tick; two samples: one count a tick
+    step = BROKK_170.encoder_step
+    q = np.array([0.0, 0.0, 0.0, step])
+    assert estimate_velocity(q, 4, 0.05) == pytest.approx(0.3 * step / 0.05)
+    assert estimate_velocity(q, 2, 0.05) == pytest.approx(0.0307, abs=1e-4)
+    assert estimate_velocity(q.astype(np.float32), 4, 0.05).dtype == np.float32
+
+
+@pytest.mark.parametrize(("samples", "length"), [(4, 3), (1, 5), (0, 5), (2, 1)])
+def test_too_few_samples_are_refused(samples, length):
+    with pytest.raises(ValueError) as caught:
+        estimate_velocity(np.zeros((2, length)), samples, 0.05)
+    wanted = f"q: expected at least {max(2, samples)} samples, got (2, {length})"
+    assert str(caught.value) == wanted
