@@ -24,9 +24,9 @@ import tyro
 
 from benchmarks.rollout import random_net
 from brokk_min.can.canopen import Frame, read_frames
+from brokk_min.env import observation_scale
 from brokk_min.learning.policy import Policy, contract, save_policy
 from brokk_min.machine import BROKK_170
-from brokk_min.observation import observation_scale
 
 BUS = ["--interface", "udp_multicast", "--channel", "239.74.163.2"]
 

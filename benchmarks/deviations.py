@@ -20,8 +20,9 @@ import numpy as np
 
 from brokk_min import actuator, env, jacobian, kinematics, machine, observation
 from brokk_min.cli.options import SHIPPED
-from brokk_min.env import TaskConfig, rollout, terminated
+from brokk_min.env import TaskConfig, terminated
 from brokk_min.evaluation import experiments, sequences, trust
+from brokk_min.evaluation.rollout import rollout
 from brokk_min.identification import excitation, fitting, logs
 from brokk_min.jacobian import JacobianController
 from brokk_min.learning.gym_env import TaskVectorEnv
@@ -37,10 +38,11 @@ GAINS = {"kp": 1.0, "ki": 8.0, "kd": 0.05, "feedback": 0.4, "ready": 0.015}
 def a1() -> dict[str, float]:
     """Share of poses off the ground in which Nakamura's damping acts; and of those beyond 2.5 m."""
     q = np.random.default_rng(0).uniform(LOW, HIGH, (20_000, M.n))
-    p, _, lowest = kinematics.tool_state(M, q, 0 * q)
-    damped = jacobian.manipulability(kinematics.jacobian(M, q)) < jacobian.manipulability_threshold(
-        M
-    )
+    frames = kinematics.forward_kinematics(M, q)
+    p, lowest = kinematics.tool_position(frames), kinematics.lowest_point(frames)
+    damped = jacobian.manipulability(
+        kinematics.jacobian(kinematics.forward_kinematics(M, q))[..., M.driven]
+    ) < jacobian.manipulability_threshold(M)
     off, far = ~terminated(M, lowest), np.hypot(p[:, 0], p[:, 1]) > 2.5
     return {"all": float(damped[off].mean()), "far": float(damped[off & far].mean())}
 
@@ -49,7 +51,7 @@ def d1() -> dict[str, float]:
     """Share of the wanted tool velocity that both forms of eq4 miss, over random poses and directions."""
     rng = np.random.default_rng(0)
     q, v = rng.uniform(LOW, HIGH, (4000, M.n)), rng.standard_normal((4000, 3))
-    J = kinematics.jacobian(M, q)
+    J = kinematics.jacobian(kinematics.forward_kinematics(M, q))[..., M.driven]
     W = jacobian.limit_weights(M, q, rng.standard_normal(q.shape))[:, M.driven]
     damping = jacobian.nakamura_damping(
         jacobian.manipulability(J), jacobian.manipulability_threshold(M), 0.1
@@ -89,7 +91,11 @@ def d6() -> dict[str, float]:
 def a7() -> dict[str, float]:
     """Share of the poses that are uniform over the joints' ranges and reach into the ground."""
     q = np.random.default_rng(0).uniform(LOW, HIGH, (100_000, M.n))
-    return {"share": float(terminated(M, kinematics.lowest_point(M, q)).mean())}
+    return {
+        "share": float(
+            terminated(M, kinematics.lowest_point(kinematics.forward_kinematics(M, q))).mean()
+        )
+    }
 
 
 def a9() -> dict[str, float]:
@@ -277,7 +283,7 @@ def d12() -> dict[str, float]:
 
 def d13() -> dict[str, float]:
     """A policy that pays nothing for what the tool stays behind."""
-    return beside(**{"no cost": trained(TaskConfig(lag_cost=0.0))}, ours=as_it_is())
+    return beside(**{"no cost": trained(TaskConfig(integral_cost=0.0))}, ours=as_it_is())
 
 
 def d14() -> dict[str, float]:

@@ -26,7 +26,7 @@ import tyro
 
 from benchmarks.rollout import random_net
 from brokk_min.env import TaskConfig
-from brokk_min.kinematics import tool_jacobian
+from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.machine import BROKK_170
 from brokk_min.ppo import PPOConfig, Training
@@ -160,10 +160,10 @@ def kinematics(options: Options) -> dict[str, float]:
                 model, data, tool, pinocchio.ReferenceFrame.LOCAL_WORLD_ALIGNED
             )
 
-    calls = {"tool_jacobian": lambda: tool_jacobian(m, q), "pinocchio": loop}
+    calls = {"jacobian": lambda: jacobian(forward_kinematics(m, q)), "pinocchio": loop}
     found = seconds(calls, options.repeats, 0.02 if options.quick else 0.1)
     return {
-        "us_per_configuration": 1e6 * found["tool_jacobian"] / len(q),
+        "us_per_configuration": 1e6 * found["jacobian"] / len(q),
         "pinocchio_loop_us": 1e6 * found["pinocchio"] / 1024,
     }
 

@@ -30,8 +30,9 @@ from gymnasium import spaces
 
 from benchmarks.rollout import random_net
 from brokk_min import ppo
-from brokk_min.actuator import ActuatorNet, load_net
+from brokk_min.actuator import ActuatorNet
 from brokk_min.evaluation import baselines
+from brokk_min.identification.net_file import load_net
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.machine import BROKK_170, PWM_MAX
 

@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from brokk_min.actuator import ActuatorNet, load_net
+from brokk_min.actuator import ActuatorNet
+from brokk_min.identification.net_file import load_net
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.machine import BROKK_170
 

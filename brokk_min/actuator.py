@@ -1,37 +1,110 @@
-"""The learned actuators: one small net a joint, run in NumPy, that stands for the machine in the simulation.
+"""The actuators: an analytic plant that plays the hydraulics, and the nets that learn it from logs.
 
-What it reads is a history: angle, velocity and command of the last 13 samples, the same that the policy and
-the hardware keep. `fitting` makes nets from logs, `scores` judges them, `env` puts an arm on them.
+Both are integrated explicitly, one tick of 1/rate seconds at a time. The nets and the policy read
+the same history: angle, velocity and command of the last 13 samples. The learner never sees the
+plant's equations. `identification.fitting` makes nets from logs.
 """
 
-import hashlib
-import json
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
-from functools import cached_property
-from pathlib import Path
-from typing import Any, Self
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from brokk_min.identification.files import expected, load_arrays, load_header, whole_file
-from brokk_min.machine import Array, estimate_velocity, valve_opening
+from brokk_min.machine import Array, Machine, estimate_velocity, valve_opening
 
-FORMAT = 1  # of net files
-STILL = 0.002  # rad, assumed: little more than a step of a 12-bit encoder
-FINE = 0.02  # of full opening, assumed: below it nets see openings on a scale that is about linear
+STANDSTILL = 0.002  # rad, assumed: little more than one step of a 12-bit encoder
+MU = 50.0  # assumed: the mu law is about linear below 1/50 of full opening
+
+# --- the analytic plant ---------------------------------------------------------------------------
 
 
-def rest_history(q: ArrayLike, samples: int) -> Array:
-    """History of a joint that stood still at `q` [rad] (..., n): shape (..., n, 3, samples).
+class PlantState(NamedTuple):
+    """State of the analytic plant, arrays (..., n) unless noted."""
 
-    Rows: angle [rad], velocity [rad/s], command [-1, 1]; newest sample last. The newest command is
-    the one sent a tick before the newest angle was measured. Paper: Table 1
+    q: Array  # joint angle [rad]
+    v: Array  # cylinder speed [m/s]
+    s: Array  # spool position, -1..1
+    z: Array  # valve activation, 0..1: below the threshold the valve is closed
+    delayed: Array  # commands not yet at the valve, next first, (..., n, delay / plant_dt)
+
+
+def plant_reset(machine: Machine, q: ArrayLike) -> PlantState:
+    """The plant at rest at angles `q` [rad] (..., n)."""
+    q = np.array(q, float)
+    zero = np.zeros_like(q)
+    delay_steps = round(machine.delay / machine.plant_dt)
+    return PlantState(q, zero, zero, zero, np.zeros((*q.shape, delay_steps)))
+
+
+def lever_arm(machine: Machine, q: ArrayLike) -> Array:
+    """Distance from pivot to cylinder axis [m] at angles `q` [rad] (..., n). Paper: eq1 (r)
+
+    r = a b sin(gamma) / sqrt(a^2 + b^2 - 2 a b cos(gamma)), gamma = gamma_0 + q.
 
     Example:
-        >>> rest_history(np.array([0.5, 1.0]), 3)[1]
+        >>> from brokk_min.machine import BROKK_170
+        >>> lever_arm(BROKK_170, [0.0, 0.5, 0.5, 1.7, 1.0]).round(3)
+        array([0.15 , 0.337, 0.299, 0.247, 0.197])
+    """
+    a, b = machine.column("cylinder_base"), machine.column("cylinder_rod")
+    gamma = machine.column("cylinder_angle") + np.asarray(q)
+    length = np.sqrt(a**2 + b**2 - 2 * a * b * np.cos(gamma))
+    r: Array = np.where(a > 0, a * b * np.sin(gamma) / length, b)
+    return r
+
+
+def plant_step(machine: Machine, state: PlantState, u: ArrayLike) -> PlantState:
+    """One tick of the analytic plant under the held command `u` [-1, 1] (..., n), by explicit Euler.
+
+    Paper: eq1 and Sec. 3.2 (dead zone, delay, direction, coupling by the pump, past movement)
+    """
+    steps = round(machine.dt / machine.plant_dt)
+    held = np.repeat(np.asarray(u, float)[..., None], steps, axis=-1)
+    commands = np.concatenate([state.delayed, held], axis=-1)  # what the valve gets, step by step
+    openings = valve_opening(commands, machine.dead_zone)
+    for i in range(steps):
+        state = _euler_step(machine, state, openings[..., i])
+    return state._replace(delayed=commands[..., steps:])
+
+
+def _euler_step(machine: Machine, state: PlantState, opening: Array) -> PlantState:
+    """Spool, valve activation, cylinder speed and angle, `plant_dt` on."""
+    m, dt = machine, machine.plant_dt
+    q, v, s, z, _ = state
+    s_next = s + dt * (opening - s) / m.tau_spool  # s' = (u_s - s) / tau_s
+    open_valve = np.abs(s) > m.spool_threshold
+    tau = np.where(open_valve > z, m.tau_valve_up, m.tau_valve_down)
+    z_next = z + dt * (open_valve - z) / tau  # z' = (z_t - z) / tau
+    x = np.clip((z - m.valve_threshold) / (1 - m.valve_threshold), 0.0, 1.0)
+    g = np.sqrt(x * x * (3 - 2 * x))  # g = sqrt(smoothstep(x))
+    K = np.where(s > 0, m.column("speed_positive"), m.column("speed_negative"))
+    v_goal = K * s * g
+    flow = np.sum(np.abs(m.column("cylinder_area") * v_goal), axis=-1, keepdims=True)
+    pump = np.minimum(1.0, m.pump_flow / np.maximum(flow, 1e-12))  # min(1, Q / sum |A v*|)
+    q_next = q + dt * v / lever_arm(m, q)  # q' = v / r(q)
+    v_next = v + dt * (v_goal * pump - v) / m.tau_cylinder  # v' = (v* pump - v) / tau_v
+    q_next = np.clip(q_next, m.column("q_min"), m.column("q_max"))
+    at_top = (q_next >= m.column("q_max")) & (v_next > 0)
+    at_bottom = (q_next <= m.column("q_min")) & (v_next < 0)
+    v_next = np.where(at_top | at_bottom, 0.0, v_next)
+    return PlantState(q_next, v_next, s_next, z_next, state.delayed)
+
+
+# --- the history ----------------------------------------------------------------------------------
+
+
+def initial_history(q: ArrayLike, samples: int) -> Array:
+    """History of joints that stood still at `q` [rad] (..., n): (..., n, 3, samples).
+
+    Rows: angle [rad], velocity [rad/s], command [-1, 1]; newest sample last. The newest command was
+    sent one tick before the newest angle was measured. Paper: Table 1
+
+    Example:
+        >>> initial_history(np.array([0.5, 1.0]), 3)[1]
         array([[1., 1., 1.],
                [0., 0., 0.],
                [0., 0., 0.]])
@@ -42,69 +115,68 @@ def rest_history(q: ArrayLike, samples: int) -> Array:
     return history
 
 
-def push_command(history: Array, u: ArrayLike) -> Array:
-    """History (..., n, 3, H) and the command `u` (..., n) of this tick: the nets' input. Paper: Table 1"""
-    result = history.copy(order="K")  # a choice of joints has them outermost, as products want them
+def append_command(history: Array, u: ArrayLike) -> Array:
+    """History (..., n, 3, H) with the command `u` (..., n) of this tick: the nets' input."""
+    result = history.copy()
     result[..., 2, :-1] = history[..., 2, 1:]
     result[..., 2, -1] = u
     return result
 
 
-def push(history: Array, u: ArrayLike, q: ArrayLike, velocity: Callable[[Array], Array]) -> Array:
-    """History (..., n, 3, H) a tick on: the command `u` was sent, then the angle `q` measured, (..., n) both.
+def append_sample(history: Array, u: ArrayLike, q: Array, window: int, dt: float) -> Array:
+    """History (..., n, 3, H) one tick on: the command `u` was sent, then the angle `q` measured.
 
-    `velocity` turns the angles in the history (..., n, H) into the newest velocity (..., n) [rad/s].
+    `u` and `q` [rad] are (..., n); the velocity is the slope of the newest `window` angles.
     """
-    result = np.empty(history.shape, history.dtype)
-    result.reshape(-1)[:-1] = history.reshape(-1)[
-        1:
-    ]  # all rows at once; their newest samples follow
+    result = np.empty_like(history)
+    result[..., :-1] = history[..., 1:]
     result[..., 0, -1] = q
-    result[..., 1, -1] = velocity(result[..., 0, :])
+    result[..., 1, -1] = estimate_velocity(result[..., 0, :], window, dt)
     result[..., 2, -1] = u
     return result
 
 
-def valve_scale(u: ArrayLike, dead_zone: float) -> Array:
-    """Commands as nets see them: what lies beyond the dead zone, on a logarithmic scale; same shape, -1..1.
+def smooth_angles(machine: Machine, history: Array) -> Array:
+    """Present angles [rad] (..., n), from all samples of a history (..., n, 3, H).
 
-    A valve is kept awake, or goes idle, by what it is opened within a few counts of its dead zone, and these
-    are a hundredth of all commands. `dead_zone` is a share of full command; 0: `u` as it is, as the paper
-    has it. Paper: Table 1 (u), Sec. 3.2 (7 %)
+    Mean over j of q_j + dt (q_dot_{j+1} + ... + q_dot_H) + dt l (q_dot_H - q_dot_j): each sample,
+    moved on by the velocities since, which the estimator gives l ticks late. It has a fraction of
+    the newest angle's noise.
+    """
+    H = machine.history
+    late = machine.velocity_samples / 2 - 1
+    weights = np.arange(H) - late  # q_dot_j stands in j of the H sums
+    weights[-1] += H * late
+    q, q_dot = history[..., 0, :], history[..., 1, :]
+    return np.asarray(q.mean(axis=-1) + q_dot @ (weights * machine.dt / H).astype(q.dtype))
+
+
+# --- the nets -------------------------------------------------------------------------------------
+
+
+def mu_law(u: ArrayLike, dead_zone: float) -> Array:
+    """Commands as the nets read them: opening beyond the dead zone, companded by the mu law.
+
+    sign(x) ln(1 + mu |x|) / ln(1 + mu) (ITU-T G.711). A few counts beyond the dead zone decide
+    whether a valve stays open. `dead_zone` 0: `u` as it is, as in the paper. Paper: Table 1 (u)
 
     Example:
-        >>> valve_scale([-1.0, 0.07, 0.08, 0.1, 0.3], 0.07).round(2)
+        >>> mu_law([-1.0, 0.07, 0.08, 0.1, 0.3], 0.07).round(2)
         array([-1.  ,  0.  ,  0.11,  0.24,  0.66])
     """
     u = np.asarray(u)
     if not dead_zone:
         return u
-    opening = valve_opening(u, dead_zone)
-    scaled: Array = np.copysign(
-        np.log(1 + np.abs(opening) / FINE) / math.log(1 + 1 / FINE), opening
-    )
-    return scaled
+    x = valve_opening(u, dead_zone)
+    return np.asarray(np.copysign(np.log1p(MU * np.abs(x)) / math.log1p(MU), x))
 
 
-def valve_scale_slope(u: Array, dead_zone: float) -> Array:
-    """Derivative of `valve_scale` by `u`, same shape; 0 within the dead zone."""
-    if not dead_zone:
-        return np.ones_like(u)
-    opening = np.abs(valve_opening(u, dead_zone))
-    slope = (1 - dead_zone) * (FINE + opening) * math.log(1 + 1 / FINE)
-    return np.asarray((opening > 0) / slope)
-
-
-# --- nets -----------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ActuatorNet:
-    """One small net a joint, run in NumPy: history in, mean velocity over the coming tick out.
-
-    Paper: Table 1 and Sec. 3.3 (39 inputs, two hidden layers of 32, ReLU, sigmoid output)
+    """One small net per joint: history in, mean velocity over the coming tick out.
 
     Weights are stacked over joints: (n, 3 H, 32), (n, 32), (n, 32, 32), (n, 32), (n, 32, 1), (n, 1).
+    Paper: Table 1 and Sec. 3.3 (39 inputs, two hidden layers of 32, ReLU, sigmoid output)
     """
 
     joints: tuple[str, ...]
@@ -119,147 +191,88 @@ class ActuatorNet:
     input_scale: Array  # (n, 3 H)
     output_low: Array  # (n,) rad/s
     output_high: Array  # (n,) rad/s
-    q_low: Array  # (n,) rad, smallest angle of the training log: the simulation stops there
+    q_low: Array  # (n,) rad, smallest angle of the training log
     q_high: Array  # (n,) rad
     weights: tuple[Array, ...]
-    dead_zone: float = 0.0  # of full command: they were trained on `valve_scale` of commands
+    dead_zone: float = 0.0  # of full command: commands pass `mu_law`
 
     def select(self, joints: Sequence[str]) -> Self:
-        """The same nets for some joints, in the order given; ValueError: a joint without a net."""
+        """The nets of some joints, in the order given; ValueError: a joint without a net."""
         if not set(joints) <= set(self.joints):
             raise ValueError(f"joints: expected nets for {list(joints)}, got {list(self.joints)}")
         index = [self.joints.index(name) for name in joints]
-        arrays = {name: getattr(self, name)[index] for name in NET_ARRAYS}
+        names = ("input_mean", "input_scale", "output_low", "output_high", "q_low", "q_high")
+        arrays = {name: getattr(self, name)[index] for name in names}
         weights = tuple(weight[index] for weight in self.weights)
         return replace(self, joints=tuple(joints), weights=weights, **arrays)
 
     def predict(self, history: Array) -> Array:
-        """Mean velocity over the coming tick [rad/s] (..., n), so that q(t+dt) = q(t) + dt * velocity.
+        """Velocity over the coming tick [rad/s] (..., n): q(t + dt) = q(t) + dt * velocity.
 
-        `history` is what `push_command` left, (..., n, 3, H). A joint that had no command beyond the dead
-        zone and moved less than `STILL` during all of it stands, where a net alone would creep.
+        `history` is of `append_command`, (..., n, 3, H). A joint without a command beyond the dead
+        zone that moved less than `STANDSTILL` in it stands still; the net alone would creep.
         """
-        idle = (np.abs(history[..., 2, :]) <= self.dead_zone).all(axis=-1)
-        velocity = self.velocity(history)
-        velocity[idle & (np.abs(history[..., 0, -1] - history[..., 0, 0]) < STILL)] = 0.0
-        return velocity
-
-    def velocity(self, history: Array) -> Array:
-        """What the nets alone say, as `predict`."""
-        return self._layers(history)[0]
-
-    def slope(self, history: Array) -> tuple[Array, Array]:
-        """What the nets alone say, and its derivative by the history, (..., n, 3, H)."""
-        velocity, fraction, second, first = self._layers(history)
-        w1, _, w2, _, w3, _ = self._folded
-        by = (self.output_high - self.output_low)[:, None, None] * fraction * (1 - fraction)
-        by = by @ w3.swapaxes(1, 2) * (second > 0)
-        by = by @ w2.swapaxes(1, 2) * (first > 0)
-        by = (by @ w1.swapaxes(1, 2)).swapaxes(0, 1).reshape(history.shape)
-        by[..., 2, :] *= valve_scale_slope(history[..., 2, :], self.dead_zone)
-        return velocity, by
+        velocity = self.forward(history)[0]
+        no_command = (np.abs(history[..., 2, :]) <= self.dead_zone).all(axis=-1)
+        no_motion = np.abs(history[..., 0, -1] - history[..., 0, 0]) < STANDSTILL
+        return np.where(no_command & no_motion, np.float32(0), velocity)
 
     def inputs(self, history: Array) -> Array:
-        """What stands in a history (..., n, 3, H) as nets were shown it, in one row, (..., n, 3 H)."""
+        """Histories (..., n, 3, H) as the first layer reads them, (..., n, 3 H).
+
+        ValueError: a history of another shape.
+        """
         n = len(self.joints)
         if history.shape[-3:] != (n, 3, self.history):
             raise ValueError(
                 f"history: expected (..., {n}, 3, {self.history}), got {history.shape}"
             )
-        if self.dead_zone:
-            history = history.copy(order="K")
-            history[..., 2, :] = valve_scale(history[..., 2, :].copy(order="K"), self.dead_zone)
-        return history.reshape(*history.shape[:-2], 3 * self.history)
+        x = history.copy()
+        x[..., 2, :] = mu_law(x[..., 2, :], self.dead_zone)
+        return x.reshape(*x.shape[:-2], 3 * self.history)
 
-    def _layers(self, history: Array) -> tuple[Array, ...]:
-        """Velocity as `velocity`, then what the layers say, (n, batch, units), the last first."""
+    def forward(self, history: Array) -> tuple[Array, Array, Array, Array]:
+        """Velocities [rad/s] (..., n), sigmoid output and both hidden layers (n, batch, units)."""
         x = self.inputs(history)
         x = x.reshape(-1, *x.shape[-2:]).swapaxes(0, 1)  # (n, batch, 3 H)
-        w1, b1, w2, b2, w3, b3 = self._folded
-        first = np.maximum(x @ w1 + b1, 0)
-        second = np.maximum(first @ w2 + b2, 0)
-        fraction = 1 / (1 + np.exp(-(second @ w3 + b3)))
+        w1, b1, w2, b2, w3, b3 = folded_weights(self)
+        hidden1 = np.maximum(x @ w1 + b1, 0)
+        hidden2 = np.maximum(hidden1 @ w2 + b2, 0)
+        y = 1 / (1 + np.exp(-(hidden2 @ w3 + b3)))
         low, high = self.output_low[:, None], self.output_high[:, None]
-        velocity: Array = (low + (high - low) * fraction[..., 0]).T
-        return velocity.reshape(history.shape[:-2]), fraction, second, first
+        velocity: Array = (low + (high - low) * y[..., 0]).T
+        return velocity.reshape(history.shape[:-2]), y, hidden2, hidden1
 
-    @cached_property
-    def _folded(self) -> tuple[Array, ...]:
-        """Weights with the normalisation of the inputs folded into the first layer."""
-        w1, b1, w2, b2, w3, b3 = self.weights
-        scaled = w1 / self.input_scale[..., None]
-        shift = b1 - np.einsum("ni,nih->nh", self.input_mean, scaled)
-        return scaled, shift[:, None], w2, b2[:, None], w3, b3[:, None]
+    def next_angles(
+        self, history: Array, q: Array, u: ArrayLike, low: ArrayLike, high: ArrayLike
+    ) -> Array:
+        """Angles [rad] (..., n) one tick on, kept within `low` and `high`: q' = q + dt net(history, u).
 
-    def step(self, history: Array, q: Array, u: ArrayLike) -> tuple[Array, Array]:
-        """One tick of the simulation: history (..., n, 3, H), angle and command (..., n) -> the next.
-
-        No joint goes further than it went in training.
+        `history` (..., n, 3, H) is without the command `u` (..., n) of this tick.
         """
-        predicted = self.predict(push_command(history, u))
-        free, before = q + predicted / self.rate, q
-        q = np.clip(free, np.minimum(q, self.q_low), np.maximum(q, self.q_high))
-
-        def velocity(angles: Array) -> Array:
-            if self.velocity_logged:
-                return np.where(q == free, predicted, (q - before) * self.rate)
-            return estimate_velocity(angles, self.velocity_samples, 1 / self.rate)
-
-        return push(history, u, q, velocity), q
+        velocity = self.predict(append_command(history, u))
+        return np.asarray(np.clip(q + velocity / self.rate, low, high))
 
 
-NET_ARRAYS = ("input_mean", "input_scale", "output_low", "output_high", "q_low", "q_high")
+@lru_cache(maxsize=8)
+def folded_weights(net: ActuatorNet) -> tuple[Array, ...]:
+    """Weights with the normalisation of the inputs folded into the first layer."""
+    w1, b1, w2, b2, w3, b3 = net.weights
+    scaled = w1 / net.input_scale[..., None]
+    shift = b1 - np.einsum("ni,nih->nh", net.input_mean, scaled)
+    return scaled, shift[:, None], w2, b2[:, None], w3, b3[:, None]
 
 
-def net_arrays(net: ActuatorNet) -> dict[str, Any]:
-    """Nets as named arrays, a JSON header among them: what a file holds."""
-    plain = {
-        f.name: getattr(net, f.name) for f in fields(net) if f.name not in (*NET_ARRAYS, "weights")
+def select_nets(machine: Machine, net: ActuatorNet) -> ActuatorNet:
+    """The nets of the machine's driven joints; ValueError: nets of another machine or estimator."""
+    wanted = {
+        "machine": machine.name,
+        "rate": machine.rate,
+        "history": machine.history,
+        "velocity_samples": machine.velocity_samples,
+        "velocity_logged": False,  # a bus carries angles only
     }
-    text = json.dumps({"format": FORMAT, "kind": "actuator net", **plain})
-    arrays = {name: getattr(net, name) for name in NET_ARRAYS}
-    arrays |= {f"weight_{i}": weight for i, weight in enumerate(net.weights)}
-    return {"header": np.array(text), **arrays}
-
-
-def fingerprint(net: ActuatorNet) -> str:
-    """Hash of the nets, header and all: what was trained or tuned with them says so by it."""
-    digest = hashlib.sha256()
-    for name, array in net_arrays(net).items():
-        digest.update(name.encode() + np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()[:16]
-
-
-def net_from_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> ActuatorNet:
-    """Nets from `net_arrays`; ValueError, naming `path`, for another format or arrays that do not fit."""
-    header = load_header(path, arrays, "actuator net", FORMAT)
-    with expected(path, "a complete actuator net"):
-        header["joints"] = tuple(header["joints"])
-        weights = tuple(arrays[f"weight_{i}"] for i in range(6))
-        header |= {name: arrays[name] for name in NET_ARRAYS}
-        net = ActuatorNet(**header, weights=weights)
-        n, inputs, hidden = len(net.joints), 3 * net.history, weights[0].shape[-1]
-        wanted = [
-            (n, inputs, hidden),
-            (n, hidden),
-            (n, hidden, hidden),
-            (n, hidden),
-            (n, hidden, 1),
-            (n, 1),
-        ]
-        wanted += [(n, inputs), (n, inputs), (n,), (n,), (n,), (n,)]
-        found = [array.shape for array in (*weights, *(arrays[name] for name in NET_ARRAYS))]
-        if found != wanted:
-            raise ValueError(f"shapes {found} instead of {wanted}")
-    return net
-
-
-def save_net(path: Path, net: ActuatorNet) -> None:
-    """Write nets as one `.npz`: weights plus a JSON header."""
-    with whole_file(path) as file:
-        np.savez(file, **net_arrays(net))
-
-
-def load_net(path: Path) -> ActuatorNet:
-    """Read nets that `save_net` wrote; ValueError as in `net_from_arrays`."""
-    return net_from_arrays(path, load_arrays(path))
+    found = {name: getattr(net, name) for name in wanted}
+    if found != wanted:
+        raise ValueError(f"actuator: expected nets for {machine.name} with {wanted}, got {found}")
+    return net.select([machine.names[i] for i in machine.driven])

@@ -1,62 +1,243 @@
 """The task: follow a tool velocity with the driven joints. Pure functions for any number of machines.
 
-`transition` moves the machine without randomness; `observation.observe`, `reward` and `terminated` look at
-it; `step` composes them and draws noise and goals. With nets these functions are the simulation
-(`environments` for Gymnasium), with a plant the evaluation.
+`transition` moves the machine; `measure`, `features`, `reward` and `terminated` look at it. On the
+nets they are the simulation, on the plant the machine. `learning.gym_env` draws starts and goals.
+Numbers below are those of the Brokk 170: 4 driven joints, 1 locked joint, 13 samples of history.
+
+Observation: Box, float32, (171,), (x - mean) / deviation * weight of these blocks:
+
+| Num     | Observation                                          | Deviation   | Weight | Noise |
+|---------|------------------------------------------------------|-------------|--------|-------|
+| 0-2     | goal velocity of the tool, heading frame             | 0.173 m/s   | 1.4    | no    |
+| 3-5     | measured velocity of the tool, heading frame         | 0.173 m/s   | 1.4    | yes   |
+| 6       | angle of the locked joint                            | 0.404 rad   | 1.4    | yes   |
+| 7-110   | 13 angles, 13 velocities of each driven joint        | of range    | 0.277  | yes   |
+| 111-162 | 13 commands of each driven joint                     | 0.364       | 0.277  | no    |
+| 163-166 | resolved velocities of the goal (`jacobian.dls`)     | of range    | 4.2    | no    |
+| 167-170 | resolved velocities of the error integral            | 0.1 range   | 4.2    | no    |
+
+Samples run from old to new. The heading frame has x outward from the slew axis to the tool, z up.
+
+Action: Box(-1, 1, (4,)), valve opening of each driven joint, see `action_to_pwm`.
+Reward: 1 / (1 + |v_goal - v_tool|) (eq2), minus costs of valve travel and of the error integral.
+Start: at rest in a random pose above the ground, with a random goal that changes now and then.
+End: terminated, without reward, with a link in the ground; truncated after 20 s.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple, Protocol
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
+from numpy.linalg import norm
 from numpy.typing import ArrayLike, NDArray
 
-from brokk_min.actuator import ActuatorNet, push_command, rest_history
-from brokk_min.kinematics import lowest_point, tool_state
-from brokk_min.machine import PWM_MAX, Array, Machine, lengths, read_encoder
-from brokk_min.observation import (
-    draw_noise,
-    observe,
-    paper_view,
-    push_measured,
-    push_motion,
-    to_command,
-)
-from brokk_min.plant import PlantState, plant_reset, plant_step
+from brokk_min import actuator, kinematics
+from brokk_min.actuator import ActuatorNet, PlantState, append_sample, initial_history
+from brokk_min.jacobian import dls
+from brokk_min.kinematics import forward_kinematics, jacobian, tool_velocity
+from brokk_min.machine import PWM_MAX, Array, Machine, as_floats, limit_command, read_encoder
 
-GROUND_MARGIN = 0.3  # m above the ground below which no goal asks the arm to sink, assumed
-AXES = np.vstack([np.eye(3), -np.eye(3)])  # x, y, z, and back
+INTEGRAL_TIME = 2.0  # s, tuned: time constant of the error integral's leak
+INTEGRAL_LIMIT = 0.07  # of tool_speed, tuned: velocity errors count up to here
+COMPENSATION = 0.01  # of an action, assumed: over this a command crosses the dead zone
 Bools = NDArray[np.bool_]
-Encoder = Callable[[Machine, Array], Array]  # machine and true angles -> angles read
+Encoder = Callable[[Machine, Array], Array]  # machine, true angles -> measured angles
 
 
 @dataclass(frozen=True)
 class TaskConfig:
     """What an episode is. Paper: Sec. 3.4; the numbers are assumed unless they name the paper."""
 
-    episode_s: float = 20.0
-    """Length of an episode [s]; its end is a truncation, never a termination."""
-    hold_min_s: float = 0.5
-    """Shortest time for which a velocity goal holds [s]."""
-    hold_max_s: float = 3.0
-    """Longest time for which a velocity goal holds [s]."""
-    zero_goals: float = 0.15
-    """Share of goals that ask the tool to stand still."""
-    axis_goals: float = 0.4
-    """Share of goals along x, y or z; the others point anywhere."""
-    noise: float = 0.05
-    """Largest noise of the measured part of an observation, in standard deviations (paper: 5 %)."""
-    valve_cost: float = 0.05
-    """Reward lost for each change of a command by its limit, mean of the driven joints (paper: 0)."""
-    lag_cost: float = 1.0
-    """Reward lost for each metre that the tool stays behind, see `observation.push_lag` [1/m] (paper: 0)."""
-    redraw_ground: bool = True
-    """Redraw start poses in the ground; False is the paper's rule: end the episode without reward."""
-    paper: bool = False
-    """Observation (no wanted rates, no weights), reward (no costs) and critic as the paper has them."""
+    episode_s: float = 20.0  # Length of an episode [s]; its end is a truncation.
+    hold_min_s: float = 0.5  # Shortest time for which a velocity goal holds [s].
+    hold_max_s: float = 3.0  # Longest time for which a velocity goal holds [s].
+    zero_goals: float = 0.15  # Fraction of goals that ask the tool to stand still.
+    axis_goals: float = 0.4  # Fraction of goals along x, y or z; the others point anywhere.
+    noise: float = 0.05  # Largest noise of what sensors measure, in deviations (paper: 5 %).
+    valve_cost: float = 0.05  # Cost of a change of all commands by their limit (paper: 0).
+    integral_cost: float = 1.0  # Cost of the error integral [1/m] (paper: 0).
+    redraw_ground: bool = True  # Redraw start poses in the ground; the paper ends the episode.
+    paper: bool = False  # Observation, reward and critic as the paper has them.
+
+
+class Measured(NamedTuple):
+    """What sensors tell, in physical units and the base frame; classical controllers take it."""
+
+    v_goal: Array  # goal velocity of the tool [m/s], (..., 3)
+    v_tool: Array  # measured velocity of the tool [m/s], (..., 3)
+    q: Array  # angles [rad], (..., n); those of driven joints by `machine.smooth_angles`
+    q_dot: Array  # newest velocities of the driven joints [rad/s], (..., n_driven)
+    history: Array  # angles, velocities, commands of the driven joints, (..., n_driven, 3, H)
+    error_integral: Array  # of `integrate_error` [m], (..., 3)
+    frames: kinematics.Frames  # at `q`
+
+
+class Block(NamedTuple):
+    """Numbers of the observation that belong together."""
+
+    name: str
+    mean: Array  # (size,), in physical units
+    std: Array  # (size,)
+    weight: float
+    noisy: bool  # do sensors measure it?
+
+
+@lru_cache
+def observation_blocks(machine: Machine) -> tuple[Block, ...]:
+    """The observation in its order. Paper: Sec. 3.4 (normalisation)
+
+    Means and deviations are nominal: as if each quantity were uniform over its range. A quantity
+    with H samples has the weight H^-0.5, as much as one number. Tool velocities weigh more and
+    resolved velocities most: a net learns first what is large at its input.
+    """
+    driven, locked, H = machine.driven, machine.locked, machine.history
+    q_mean = (machine.column("q_min") + machine.column("q_max")) / 2
+    q_std = (machine.column("q_max") - machine.column("q_min")) / 12**0.5
+    q_dot_std = machine.q_dot_max / 3**0.5
+    v_std = np.full(3, machine.tool_speed / 3**0.5)
+    u_std = np.full(H * len(driven), machine.pwm_limit / PWM_MAX / 3**0.5)
+    zero = np.zeros(len(driven))
+    blocks = [
+        Block("v_goal", np.zeros(3), v_std, 1.4, False),
+        Block("v_tool", np.zeros(3), v_std, 1.4, True),
+        Block("q locked", q_mean[locked], q_std[locked], 1.4, True),
+    ]
+    for j in driven:
+        mean, std = np.full(H, q_mean[j]), np.full(H, q_std[j])
+        blocks.append(Block(f"q {machine.names[j]}", mean, std, H**-0.5, True))
+        std = np.full(H, q_dot_std[j])
+        blocks.append(Block(f"q_dot {machine.names[j]}", np.zeros(H), std, H**-0.5, True))
+    blocks.append(Block("u", np.zeros_like(u_std), u_std, H**-0.5, False))
+    blocks.append(Block("resolved v_goal", zero, q_dot_std[driven], 4.2, False))
+    blocks.append(Block("resolved error_integral", zero, 0.1 * q_dot_std[driven], 4.2, False))
+    return tuple(blocks)
+
+
+@lru_cache
+def observation_scale(machine: Machine) -> tuple[Array, Array]:
+    """Mean and scale = std / weight of the observation, float32 (obs,) both."""
+    blocks = observation_blocks(machine)
+    mean = np.concatenate([block.mean for block in blocks])
+    scale = np.concatenate([block.std / block.weight for block in blocks])
+    return mean.astype(np.float32), scale.astype(np.float32)
+
+
+@lru_cache
+def noise_std(machine: Machine) -> Array:
+    """Standard deviations of what sensors measure, in physical units, float32 (noisy numbers,)."""
+    noisy = [block.std for block in observation_blocks(machine) if block.noisy]
+    return np.concatenate(noisy).astype(np.float32)
+
+
+def measure(
+    machine: Machine,
+    history: Array,
+    v_goal: Array,
+    error_integral: Array,
+    noise: float = 0.0,
+    rng: np.random.Generator | None = None,
+) -> Measured:
+    """What controllers get, in training, evaluation and on the machine. Paper: Sec. 3.4, Fig. 3
+
+    Args:
+        machine: n joints.
+        history: measured samples of all joints, (..., n, 3, H).
+        v_goal: goal velocity of the tool [m/s], base frame, (..., 3).
+        error_integral: of `integrate_error` [m], base frame, (..., 3).
+        noise: amplitude of uniform noise in deviations (paper: 5 %), drawn from `rng`.
+    """
+    driven, locked = machine.driven, machine.locked
+    q, q_dot = history[..., 0, -1].copy(), history[..., 1, -1]
+    history = history.take(driven, axis=-3)
+    v_error: Array = np.zeros(3, np.float32)
+    if noise and rng:
+        std = noise_std(machine)
+        error = noise * std * (2 * rng.random((*q.shape[:-1], len(std)), np.float32) - 1)
+        v_error, q_error, history_error = np.split(error, [3, 3 + len(locked)], axis=-1)
+        q[..., locked] += q_error
+        history[..., :2, :] += history_error.reshape(history[..., :2, :].shape)
+    q[..., driven] = actuator.smooth_angles(machine, history)
+    frames = forward_kinematics(machine, q)
+    v_tool = tool_velocity(frames, q_dot) + v_error
+    return Measured(v_goal, v_tool, q, history[..., 1, -1], history, error_integral, frames)
+
+
+def features(machine: Machine, measured: Measured) -> Array:
+    """The observation of the table above, float32 (..., obs). Paper: Sec. 3.4, Fig. 3
+
+    Resolved velocities (ours) are J^T (J J^T + lambda^2 I)^-1 v with lambda = 6 % of the arm's
+    length (assumed), for v = the goal and for v = the error integral.
+    """
+    J = jacobian(measured.frames)[..., machine.driven]
+    arm = np.hypot(machine.column("a"), machine.column("d")).sum()
+    J_inv = dls(J, np.ones(len(machine.driven)), (0.06 * arm) ** 2 + 1e-6)
+    numbers = [
+        kinematics.to_heading(measured.frames, measured.v_goal),
+        kinematics.to_heading(measured.frames, measured.v_tool),
+        measured.q[..., machine.locked],
+        measured.history[..., :2, :].reshape(*J.shape[:-2], -1),
+        measured.history[..., 2, :].reshape(*J.shape[:-2], -1),
+        (J_inv @ measured.v_goal[..., None])[..., 0],
+        (J_inv @ measured.error_integral[..., None])[..., 0],
+    ]
+    mean, scale = observation_scale(machine)
+    return np.asarray((np.concatenate(numbers, axis=-1) - mean) / scale, np.float32)
+
+
+def integrate_error(machine: Machine, v_goal: Array, v_tool: Array, integral: Array) -> Array:
+    """Leaky integral of the velocity error [m] (..., 3), one tick on: the I of a PI controller.
+
+    I' = exp(-dt / T) (I + dt e), e = v_goal - v_tool cut to a short length: it shows a lasting
+    error, and the wait for a valve that opens does not fill it.
+    """
+    error = v_goal - v_tool
+    limit = np.float32(INTEGRAL_LIMIT * machine.tool_speed)
+    error = error * (limit / np.maximum(norm(error, axis=-1, keepdims=True), limit))
+    leak = np.float32(np.exp(-machine.dt / INTEGRAL_TIME))
+    return np.asarray(leak * (integral + np.float32(machine.dt) * error))
+
+
+def update_history(
+    machine: Machine, history: Array, u: Array, q: Array, v_goal: Array, integral: Array
+) -> tuple[Array, Array]:
+    """Measured history (..., n, 3, H) and error integral [m] (..., 3), one tick on.
+
+    During the tick `u` (..., n) was sent for `v_goal` [m/s] (..., 3); `q` [rad] (..., n) is what
+    the encoders said after it. Simulation and hardware both call it.
+    """
+    history = append_sample(history, u, q, machine.velocity_samples, machine.dt)
+    frames = forward_kinematics(machine, history[..., 0, -1])
+    v_tool = tool_velocity(frames, history[..., 1, -1])
+    return history, integrate_error(machine, v_goal, v_tool, integral)
+
+
+def action_to_pwm(machine: Machine, action: ArrayLike) -> Array:
+    """Commands u (..., n) of full command from actions of the driven joints (..., n_driven).
+
+    u = dead_zone clip(a / 0.01, -1, 1) + (limit - dead_zone) a, in whole PWM counts: dead-zone
+    compensation, as the PIDs have it; near a = 0 a valve is just open. Locked joints get 0.
+    ValueError: a wrong shape or a value that is not finite. Paper: Sec. 3.2, Sec. 3.4 (PWM out)
+
+    Example:
+        >>> from brokk_min.machine import BROKK_170
+        >>> action_to_pwm(BROKK_170, [1.0, -0.5, 0.0, 2.0]) * 127
+        array([ 80.,   0., -44.,   0.,  80.])
+    """
+    a = as_floats(action)
+    if a.shape[-1:] != machine.driven.shape:
+        raise ValueError(f"action: expected (..., {len(machine.driven)}), got {a.shape}")
+    if not np.isfinite(a).all():
+        raise ValueError(f"action: expected finite numbers, got {a[~np.isfinite(a)][0]}")
+    a = np.asarray(np.clip(a, -1.0, 1.0))
+    limit = machine.pwm_limit / PWM_MAX
+    crossing = np.clip(a / COMPENSATION, -1.0, 1.0)
+    u = np.zeros((*a.shape[:-1], machine.n), a.dtype)
+    u[..., machine.driven] = machine.dead_zone * crossing + (limit - machine.dead_zone) * a
+    return limit_command(machine, u)
 
 
 @dataclass(frozen=True)
@@ -66,288 +247,103 @@ class State:
     q: Array  # true angle [rad]
     q_dot: Array  # true mean velocity over the last tick [rad/s]
     history: Array  # measured angle, estimated velocity, sent command: (..., n, 3, H), float32
-    v_goal: Array  # wanted tool velocity [m/s], (..., 3)
+    true_history: Array  # the same of true angles: what the nets get
+    v_goal: Array  # goal velocity of the tool [m/s], (..., 3)
     goal_ticks: NDArray[np.int64]  # ticks until a new goal, (...)
     ticks: NDArray[np.int64]  # ticks since the reset, (...)
-    lag: Array  # see `observation.push_lag` [m], (..., 3)
-    motion: Array  # as `history`, but of true angles: what nets go on from
+    error_integral: Array  # of `integrate_error` [m], (..., 3)
     plant: PlantState | None = None  # None: the nets move the machine
 
 
-def fitting_nets(machine: Machine, net: ActuatorNet) -> ActuatorNet:
-    """The nets of the machine's driven joints.
-
-    Raises:
-        ValueError: nets that do not fit the machine, naming what was wanted and found.
-    """
-    wanted = {
-        "machine": machine.name,
-        "rate": machine.rate,
-        "history": machine.history,
-        "velocity_samples": machine.velocity_samples,
-        "velocity_logged": False,  # a bus carries angles only
-    }
-    found = {name: getattr(net, name) for name in wanted}
-    if found != wanted:
-        raise ValueError(f"actuator: expected nets for {machine.name} with {wanted}, got {found}")
-    return net.select([machine.names[i] for i in machine.driven])
-
-
-def rest_state(machine: Machine, q: ArrayLike, v_goal: ArrayLike, plant: bool) -> State:
+def initial_state(machine: Machine, q: ArrayLike, v_goal: ArrayLike, plant: bool) -> State:
     """Machines at rest at angles `q` [rad] (..., n) with goals (..., 3) [m/s] that never change."""
     q = np.array(q, float)
-    history, motion = (
-        rest_history(a.astype(np.float32), machine.history) for a in (read_encoder(machine, q), q)
-    )
-    goals = np.broadcast_to(np.asarray(v_goal, np.float32), (*q.shape[:-1], 3))
-    never = np.full(q.shape[:-1], np.iinfo(np.int64).max)
-    ticks = np.zeros(q.shape[:-1], np.int64)
-    plant_state = plant_reset(machine, q) if plant else None
+    goal = np.broadcast_to(np.asarray(v_goal, np.float32), (*q.shape[:-1], 3))
     return State(
-        q, np.zeros_like(q), history, goals, never, ticks, np.zeros_like(goals), motion, plant_state
+        q=q,
+        q_dot=np.zeros_like(q),
+        history=initial_history(read_encoder(machine, q).astype(np.float32), machine.history),
+        true_history=initial_history(q.astype(np.float32), machine.history),
+        v_goal=goal,
+        goal_ticks=np.full(q.shape[:-1], np.iinfo(np.int64).max),
+        ticks=np.zeros(q.shape[:-1], np.int64),
+        error_integral=np.zeros_like(goal),
+        plant=actuator.plant_reset(machine, q) if plant else None,
     )
 
 
 def transition(
     machine: Machine, net: ActuatorNet | None, state: State, u: Array, read: Encoder = read_encoder
 ) -> State:
-    """One tick under the command `u` (..., n), by the nets, or by the plant where the state has one.
+    """One tick under the command `u` (..., n), by the plant if the state has one, else by the nets.
 
-    `read(machine, q)` are the angles that the encoders say; they may be disturbed for a test of robustness.
-    Nets go on from the true angles, for the steps of an encoder do not move an arm.
-
-    Paper: Sec. 3.4 (actuator nets in the simulation), Table 1
+    `read(machine, q)` are the angles that the encoders give. The nets go on from true angles: the
+    steps of an encoder do not move an arm. Paper: Sec. 3.4 (actuator nets in the simulation)
     """
-    q, plant = state.q, None
+    plant = None
     if state.plant is not None:
-        plant = plant_step(machine, state.plant, u)
+        plant = actuator.plant_step(machine, state.plant, u)
         q = plant.q
     elif net is not None:
         driven, low, high = machine.driven, machine.column("q_min"), machine.column("q_max")
-        seen = push_command(state.motion[..., driven, :, :], u[..., driven])
-        moved = q[..., driven] + net.predict(seen) * machine.dt
-        q = q.copy()
-        q[..., driven] = np.clip(moved, low[driven], high[driven])
+        history = state.true_history.take(driven, axis=-3)
+        q = state.q.copy()
+        q[..., driven] = net.next_angles(
+            history, q[..., driven], u[..., driven], low[driven], high[driven]
+        )
     else:
         raise ValueError("net: expected nets for a state without a plant, got None")
-
-    history, lag = push_measured(
-        machine, state.history, u, read(machine, q), state.v_goal, state.lag
+    history, integral = update_history(
+        machine, state.history, u, read(machine, q), state.v_goal, state.error_integral
     )
+    samples, dt = machine.velocity_samples, machine.dt
     return replace(
         state,
         q=q,
-        q_dot=(q - state.q) * machine.rate,
+        q_dot=(q - state.q) / dt,
         history=history,
+        true_history=append_sample(state.true_history, u, q, samples, dt),
         goal_ticks=state.goal_ticks - 1,
         ticks=state.ticks + 1,
-        lag=lag,
-        motion=push_motion(machine, state.motion, u, q),
+        error_integral=integral,
         plant=plant,
     )
 
 
 def reward(v_goal: Array, v_tool: Array) -> Array:
-    """1 / (1 + |v_goal - v_tool|), in (0, 1]. Paper: eq2
-
-    Args:
-        v_goal: wanted tool velocity [m/s], shape (..., 3).
-        v_tool: true tool velocity [m/s], shape (..., 3).
+    """1 / (1 + |v_goal - v_tool|) (...) of velocities [m/s] (..., 3), in (0, 1]. Paper: eq2
 
     Example:
         >>> reward(np.array([0.3, 0.4, 0.0]), np.zeros(3))
         np.float64(0.6666666666666666)
     """
-    result: Array = 1 / (1 + lengths(v_goal - v_tool))
+    result: Array = 1 / (1 + norm(v_goal - v_tool, axis=-1))
     return result
 
 
 def terminated(machine: Machine, lowest: Array) -> Bools:
-    """Does the arm reach into the ground? `lowest` [m] (...) of `tool_state`. Paper: Sec. 3.4"""
+    """Is a link in the ground? `lowest` [m] (...) is `kinematics.lowest_point`. Paper: Sec. 3.4"""
     return np.asarray(lowest < machine.ground)
 
 
-def draw_pose(machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int) -> Array:
-    """Random angles within the joints' ranges [rad] (num, n), off the ground if so configured.
-
-    Raises:
-        ValueError: a machine whose arm is in the ground in every pose drawn.
-    """
-    low, high = machine.column("q_min"), machine.column("q_max")
-    q = rng.uniform(low, high, (num, machine.n))
-    for _ in range(1000 * config.redraw_ground):
-        bad = terminated(machine, lowest_point(machine, q))
-        if not bad.any():
-            return q
-        q[bad] = rng.uniform(low, high, (int(bad.sum()), machine.n))
-    if config.redraw_ground:
-        raise ValueError(
-            f"{machine.name}: expected a pose above the ground, got none in 1000 draws"
-        )
-    return q
-
-
-def draw_goal(machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int) -> Array:
-    """Random tool velocities [m/s] (num, 3): zero, along an axis, or anywhere; up to tool_speed."""
-    direction, kind = rng.standard_normal((num, 3)), rng.random((num, 1))
-    axis = AXES[rng.integers(0, 6, num)]
-    direction = np.where(kind < config.zero_goals + config.axis_goals, axis, direction)
-    speed = rng.uniform(0, machine.tool_speed, (num, 1)) * (kind >= config.zero_goals)
-    return np.asarray(direction * (speed / lengths(direction)[:, None]))
-
-
-def _draw_hold(
-    machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int
-) -> NDArray[np.int64]:
-    low, high = (max(1, round(s * machine.rate)) for s in (config.hold_min_s, config.hold_max_s))
-    return rng.integers(low, high + 1, num)
-
-
-def reset(
-    machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int, plant: bool
-) -> State:
-    """`num` machines at rest in random poses with random goals; leading shape (num,)."""
-    pose, goal = draw_pose(machine, config, rng, num), draw_goal(machine, config, rng, num)
-    state = rest_state(machine, pose, goal, plant)
-    return replace(state, goal_ticks=_draw_hold(machine, config, rng, num))
-
-
-def look(machine: Machine, config: TaskConfig, state: State, rng: np.random.Generator) -> Array:
-    """The observation of a state, (..., obs), with fresh uniform noise. Paper: Sec. 3.4 (5 %)"""
-    noise = draw_noise(machine, config.noise, state.q.shape[:-1], rng)
-    seen = observe(machine, state.history, state.v_goal, state.lag, noise)
-    return seen * paper_view(machine) if config.paper else seen
-
-
-class Outcome(NamedTuple):
-    """What one `step` yields, beside the state; arrays (num,) except `observation` (num, obs)."""
-
-    observation: Array
-    reward: Array
-    terminated: Bools
-    truncated: Bools
-    velocity_error: Array  # |v_goal - v_tool| [m/s]
-
-
 def step(
-    machine: Machine,
-    config: TaskConfig,
-    net: ActuatorNet | None,
-    state: State,
-    action: ArrayLike,
-    rng: np.random.Generator,
-) -> tuple[State, Outcome]:
-    """One tick of `num` environments, without resets: `action` (num, n_driven) in [-1, 1].
+    machine: Machine, config: TaskConfig, net: ActuatorNet | None, state: State, action: ArrayLike
+) -> tuple[State, Array, Bools, Bools, Array]:
+    """One tick of `num` environments under actions (num, n_driven), without new goals or resets.
 
-    The reward is `reward` for the goal that held during the tick less `valve_cost` and `lag_cost`; where the
-    goal is over, or asks an arm close to the ground to sink, a new one is drawn after it. On a tick that ends
-    in the ground the reward is zero.
+    The next state; reward, terminated, truncated and |v_goal - v_tool| [m/s], (num,) each.
     """
-    u = to_command(machine, action)
-    before, state = state, transition(machine, net, state, u)
-    _, v_tool, lowest = tool_state(
-        machine, state.q.astype(np.float32), state.q_dot.astype(np.float32)
-    )
+    u = action_to_pwm(machine, action)
+    last_u = state.history[..., 2, -1]
+    state = transition(machine, net, state, u)
+    frames = forward_kinematics(machine, state.q.astype(np.float32))
+    v_tool = tool_velocity(frames, state.q_dot.astype(np.float32))
     rewards = reward(state.v_goal, v_tool)
-    end = terminated(machine, lowest)
-    error = 1 / rewards - 1
     if not config.paper:
-        turned = np.add.reduce(np.abs(u - before.history[..., 2, -1]), axis=-1)
-        limits = len(machine.driven) * machine.pwm_limit / PWM_MAX
-        rewards = rewards - np.float32(config.valve_cost / limits) * turned
-        rewards = rewards - np.float32(config.lag_cost) * lengths(state.lag)
-    state = _next_goals(machine, config, state, lowest, rng)
-    observation = look(machine, config, state, rng)
+        limit = len(machine.driven) * machine.pwm_limit / PWM_MAX
+        rewards = rewards - config.valve_cost * np.abs(u - last_u).sum(axis=-1) / limit
+        rewards = rewards - config.integral_cost * norm(state.error_integral, axis=-1)
+    end = terminated(machine, kinematics.lowest_point(frames))
     truncated = (state.ticks >= round(config.episode_s * machine.rate)) & ~end
-    return state, Outcome(observation, np.where(end, 0.0, rewards), end, truncated, error)
-
-
-def _next_goals(
-    machine: Machine, config: TaskConfig, state: State, lowest: Array, rng: np.random.Generator
-) -> State:
-    low = lowest < machine.ground + GROUND_MARGIN
-    due = np.flatnonzero((state.goal_ticks <= 0) | (low & (state.v_goal[..., 2] < 0)))
-    if not len(due):
-        return state
-    goals, holds = state.v_goal.copy(), state.goal_ticks.copy()
-    goals[due] = draw_goal(machine, config, rng, len(due))
-    goals[due, 2] = np.where(low[due], np.abs(goals[due, 2]), goals[due, 2])
-    holds[due] = _draw_hold(machine, config, rng, len(due))
-    return replace(state, v_goal=goals, goal_ticks=holds)
-
-
-def merge(old: State, new: State, rows: NDArray[np.intp]) -> State:
-    """`old` with its rows `rows` replaced by the states `new`, one each."""
-
-    def put(a: Any, b: Any) -> Any:
-        a = a.copy()
-        a[rows] = b
-        return a
-
-    arrays = {f.name: put(getattr(old, f.name), getattr(new, f.name)) for f in fields(State)[:-1]}
-    if old.plant is None or new.plant is None:
-        return State(**arrays)
-    (*one, one_pending), (*other, other_pending) = old.plant, new.plant
-    plant = PlantState._make([*map(put, one, other), tuple(map(put, one_pending, other_pending))])
-    return State(**arrays, plant=plant)
-
-
-# --- a controller on given goals --------------------------------------------------------------------
-
-
-class Controller(Protocol):
-    """What can drive: a memory at rest for `num` machines, and commands from observations."""
-
-    def start(self, num: int) -> Any:
-        """Memory of `num` controllers that have just been switched on."""
-
-    def __call__(self, observation: Array, memory: Any) -> tuple[Array, Any]:
-        """Commands u (num, n) for observations (num, obs) of `observe`, and the next memory."""
-
-
-class Trace(NamedTuple):
-    """What happened, tick by tick: arrays (T, num, ...); entry t is the end of tick t."""
-
-    q: Array  # true angle [rad], n
-    q_dot: Array  # true mean velocity over the tick [rad/s], n
-    q_measured: Array  # encoder angle when the command was computed [rad], n
-    u: Array  # command during the tick, n
-    p_tool: Array  # true tool position [m], 3
-    v_tool: Array  # true tool velocity [m/s], 3
-    reward: Array
-
-
-def rollout(
-    machine: Machine,
-    controller: Controller,
-    start: ArrayLike,
-    goals: Array,
-    config: TaskConfig,
-    rng: np.random.Generator,
-    net: ActuatorNet | None = None,
-    read: Encoder = read_encoder,
-) -> Trace:
-    """Let one controller follow given goals from rest: on the plant, or on nets. Paper: Fig. 3
-
-    Args:
-        machine: n joints.
-        controller: sees noisy observations, the same for every kind.
-        start: angles [rad], (num, n).
-        goals: wanted tool velocity during each tick [m/s], (T, num, 3).
-        config: its `noise` holds; no episode ends.
-        rng: of the noise.
-        net: nets of the driven joints; None: the analytic plant.
-        read: see `transition`.
-    """
-    state = rest_state(machine, start, goals[0], plant=net is None)
-    memory = controller.start(len(state.q))
-    trace = []
-    for goal in goals:
-        state = replace(state, v_goal=np.broadcast_to(goal.astype(np.float32), state.lag.shape))
-        observation = look(machine, config, state, rng)
-        u, memory = controller(observation, memory)
-        q_measured = state.history[..., 0, -1]
-        state = transition(machine, net, state, u, read)
-        p_tool, v_tool, _ = tool_state(machine, state.q, state.q_dot)
-        trace.append((state.q, state.q_dot, q_measured, u, p_tool, v_tool, reward(goal, v_tool)))
-    return Trace(*map(np.array, zip(*trace, strict=True)))
+    error = norm(state.v_goal - v_tool, axis=-1)
+    return state, np.where(end, 0.0, rewards), end, truncated, error

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from brokk_min.actuator import rest_history
+from brokk_min.actuator import initial_history
 from brokk_min.can import canopen as bus
 from brokk_min.can.operator_input import Wish, unpack_wish
 from brokk_min.can.safety_gate import (
@@ -26,10 +26,10 @@ from brokk_min.can.safety_gate import (
     gate,
     gate_start,
 )
-from brokk_min.env import Controller
-from brokk_min.kinematics import tool_state
+from brokk_min.env import measure, update_history
+from brokk_min.evaluation.rollout import Controller
+from brokk_min.kinematics import forward_kinematics, tool_velocity
 from brokk_min.machine import PWM_MAX, Machine
-from brokk_min.observation import observe, push_measured
 
 AWAKE = 0.002  # s before SYNC and after it in which the loop does not sleep (tuned)
 REHEARSALS = 4  # of a tick before it (tuned)
@@ -67,8 +67,8 @@ class Drive:
         self.nodes, self.gate, self.wish = bus.Nodes(machine), gate_start(machine), Wish()
         self.memory = controller.start(1)
         self.history: Array | None = None
-        self.lag: Array = np.zeros((1, 3), np.float32)  # of `push_lag`
-        self.asked = self.lag  # tool velocity wanted in the last tick [m/s]
+        self.error_integral: Array = np.zeros((1, 3), np.float32)  # of `integrate_error`
+        self.v_goal = self.error_integral  # tool velocity wanted in the last tick [m/s]
         self.problem = self.remark = self.reason = (
             ""  # exception of this tick, the last one, what is wrong
         )
@@ -158,7 +158,7 @@ class Drive:
         """One line: state, faults, tool velocity wanted and measured [m/s], angles [rad], lateness."""
         state = "driving" if self.gate.driving else "waiting" if self.gate.wrong else "ready"
         q, q_dot = self.seen
-        v = tool_state(self.machine, q, q_dot)[1]
+        v = tool_velocity(forward_kinematics(self.machine, q), q_dot)
         want, have, pose = (" ".join(f"{x:+.2f}" for x in a) for a in (self.wish.v_goal, v, q))
         late = f"late {1e3 * self.lateness:.1f} ms, skipped {self.skipped}"
         reason = f" {self.reason}" if self.reason else ""
@@ -218,15 +218,20 @@ class Drive:
             counts[None].astype(np.float32) * m.encoder_step
         )  # as `read_encoder` gives in the simulation
         if self.history is None:
-            self.history = rest_history(q, m.history)
+            self.history = initial_history(q, m.history)
         else:
             sent = self.gate.sent[..., -1] / PWM_MAX
-            self.history, self.lag = push_measured(m, self.history, sent, q, self.asked, self.lag)
+            self.history, self.error_integral = update_history(
+                m, self.history, sent, q, self.v_goal, self.error_integral
+            )
         if not self.gate.driving:
-            self.memory, self.lag = self.controller.start(1), np.zeros((1, 3), np.float32)
-        self.asked = np.array([self.wish.v_goal], np.float32)
-        seen = observe(m, self.history, self.asked, self.lag)
-        u, self.memory = self.controller(seen, self.memory)
+            self.memory, self.error_integral = (
+                self.controller.start(1),
+                np.zeros((1, 3), np.float32),
+            )
+        self.v_goal = np.array([self.wish.v_goal], np.float32)
+        measured = measure(m, self.history, self.v_goal, self.error_integral)
+        u, self.memory = self.controller(measured, self.memory)
         return np.asarray(np.rint(u[0] * PWM_MAX), float)
 
     def _rehearse(self, end: float) -> None:

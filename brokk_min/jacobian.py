@@ -1,27 +1,30 @@
-"""The classical way: weighted damped least squares for joint rates, a PID a joint for the valves.
+"""The classical way: weighted damped least squares for joint velocities, one PID per joint.
 
-Read in the order of the computation: `dls` and its weights and damping give joint rates (paper eq3,
-eq4), `JacobianController` turns them into commands; `baselines` tunes it.
+Read in the order of the computation: `dls`, its weights and its damping give joint velocities
+(paper eq3, eq4); `JacobianController` turns them into commands. `evaluation.baselines` tunes it.
 """
 
-from collections.abc import Mapping
+from __future__ import annotations
+
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brokk_min.actuator import ActuatorNet
-from brokk_min.kinematics import jacobian
+from brokk_min.kinematics import cross, forward_kinematics, jacobian
 from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, valve_opening
-from brokk_min.observation import Measured, measured
+
+if TYPE_CHECKING:
+    from brokk_min.env import Measured
 
 
 def dls(J: ArrayLike, W: ArrayLike, damping: ArrayLike, as_printed: bool = False) -> Array:
-    """Weighted damped pseudo-inverse W^-1 J^T (J W^-1 J^T + lambda^2 I)^-1, (..., n, 3).
+    """Weighted damped least-squares inverse W^-1 J^T (J W^-1 J^T + lambda^2 I)^-1, (..., n, 3).
 
-    It minimises |J q_dot - v|^2 + lambda^2 q_dot^T W q_dot. The paper prints J W J^T inside the
-    bracket; that form is the minimiser only for W = I and is kept as `as_printed`. Paper: eq4
+    q_dot = dls(J, W, damping) @ v minimises |J q_dot - v|^2 + lambda^2 q_dot^T W q_dot. The paper
+    prints J W J^T in the bracket. That is the minimiser only for W = I. Paper: eq4
 
     Args:
         J: Jacobian [m/rad], (..., 3, n).
@@ -29,41 +32,62 @@ def dls(J: ArrayLike, W: ArrayLike, damping: ArrayLike, as_printed: bool = False
         damping: lambda^2, (...).
         as_printed: use the paper's printed form.
     """
-    J, W = np.asarray(J), np.asarray(W)
-    inner = (W if as_printed else 1 / W)[..., None, :]
-    square = (J * inner) @ np.swapaxes(J, -1, -2) + np.asarray(damping)[..., None, None] * np.eye(3)
-    return np.swapaxes(np.linalg.solve(square, J / W[..., None, :]), -1, -2)
+    J = np.asarray(J)
+    W = np.asarray(W, J.dtype)
+    bracket = W if as_printed else 1 / W
+    A = (J * bracket[..., None, :]) @ np.swapaxes(J, -1, -2)  # J W^-1 J^T
+    A = A + np.asarray(damping, J.dtype)[..., None, None] * np.eye(3, dtype=J.dtype)
+    W_inv_Jt = np.swapaxes(J / W[..., None, :], -1, -2)
+    return np.asarray(W_inv_Jt @ inverse_3x3(A))
+
+
+def inverse_3x3(A: Array) -> Array:
+    """Inverse of symmetric matrices (..., 3, 3): the adjugate over the determinant.
+
+    Row i of the adjugate is the cross product of the two other rows.
+
+    Example:
+        >>> inverse_3x3(np.diag([1.0, 2.0, 4.0])).diagonal()
+        array([1.  , 0.5 , 0.25])
+    """
+    adjugate = cross(A[..., [1, 2, 0], :], A[..., [2, 0, 1], :])
+    determinant = np.sum(A[..., 0, :] * adjugate[..., 0, :], axis=-1)
+    return np.asarray(adjugate / determinant[..., None, None])
 
 
 def limit_gradient(machine: Machine, q: ArrayLike) -> Array:
-    """Slope by each angle `q` [rad] of Chan and Dubey's joint-limit function, (..., n).
+    """Gradient of the joint-limit function of Chan and Dubey (1995) at angles `q` [rad], (..., n).
 
-    The function is the sum over joints of (q_max - q_min)^2 / (4 (q_max - q) (q - q_min)).
+    H(q) = sum over joints of (q_max - q_min)^2 / (4 (q_max - q) (q - q_min)).
     """
-    low, high = machine.column("q_min"), machine.column("q_max")
-    edge = 1e-3 * (high - low)  # finite at the limits and beyond
-    q = np.clip(q, low + edge, high - edge)
+    low = machine.column("q_min")
+    high = machine.column("q_max")
+    margin = 1e-3 * (high - low)  # finite at the limits and beyond
+    q = np.clip(q, low + margin, high - margin)
+    # dH/dq = (q_max - q_min)^2 (2 q - q_max - q_min) / (4 (q_max - q)^2 (q - q_min)^2)
     gradient: Array = (high - low) ** 2 * (2 * q - high - low) / (4 * ((high - q) * (q - low)) ** 2)
     return gradient
 
 
 def limit_weights(machine: Machine, q: ArrayLike, q_dot: ArrayLike) -> Array:
-    """Diagonal of W for all joints, (..., n): 1 + |gradient| while nearing a limit, otherwise 1.
+    """Diagonal of W for all joints, (..., n): 1 + |dH/dq| towards a limit, otherwise 1.
 
-    `q` are angles [rad], `q_dot` rates whose sign tells the direction. Paper: Sec. 4.2 (W)
+    `q` are angles [rad], `q_dot` velocities whose sign gives the direction. Paper: Sec. 4.2 (W)
     """
     gradient = limit_gradient(machine, q)
     return np.where(gradient * np.asarray(q_dot) > 0, 1 + np.abs(gradient), 1.0)
 
 
 def manipulability(J: ArrayLike) -> Array:
-    """sqrt(det(J J^T)) of Jacobians (..., 3, n); 0 at a singularity. Shape (...)."""
+    """w = sqrt(det(J J^T)) of Jacobians (..., 3, n), (...); 0 at a singularity. Yoshikawa (1985)"""
     J = np.asarray(J)
     return np.asarray(np.sqrt(np.maximum(np.linalg.det(J @ np.swapaxes(J, -1, -2)), 0.0)))
 
 
 def nakamura_damping(w: ArrayLike, w0: float, k: float) -> Array:
-    """lambda^2 = k (1 - w/w0)^2 below the manipulability `w0`, otherwise 0. Paper: Sec. 4.2 (lambda)
+    """lambda^2 = k (1 - w/w0)^2 for w < w0, otherwise 0. Paper: Sec. 4.2 (lambda)
+
+    Nakamura and Hanafusa (1986).
 
     Example:
         >>> nakamura_damping([0.0, 0.5, 1.0, 2.0], 1.0, 0.1)
@@ -73,164 +97,100 @@ def nakamura_damping(w: ArrayLike, w0: float, k: float) -> Array:
 
 
 def manipulability_threshold(machine: Machine) -> float:
-    """w0: a quarter of the largest manipulability over random poses (assumed)."""
+    """w0: a quarter of the largest manipulability over 2,000 random poses (assumed)."""
     low, high = machine.column("q_min"), machine.column("q_max")
     poses = np.random.default_rng(0).uniform(low, high, (2000, machine.n))
-    return 0.25 * float(manipulability(jacobian(machine, poses)).max()) + 1e-9
+    J = jacobian(forward_kinematics(machine, poses))[..., machine.driven]
+    return 0.25 * float(manipulability(J).max()) + 1e-9
 
 
-# --- from joint rates to valves ---------------------------------------------------------------------
-
-# Ranges that `baselines.tune` searches (assumed); of the first three each driven joint has its own.
-GAINS = {
-    "kp": (0.0, 4.0),  # valve opening per rad/s
-    "ki": (0.0, 12.0),  # valve opening per rad
-    "kd": (0.0, 0.3),  # valve opening per rad/s^2
-    "feedback": (0.0, 1.0),  # K = feedback * I of eq3
-    "ready": (0.0, 0.04),  # least valve opening while the tool is to move, or always
-}
-
-
-def split_gains(gains: ArrayLike) -> dict[str, Array]:
-    """Gains by name, (..., n_driven) or (..., 1) each, from vectors (..., 3 n_driven + 2).
-
-    Example:
-        >>> {name: gain.tolist() for name, gain in split_gains([1, 2, 3, 4, 5, 6, 7, 8]).items()}
-        {'kp': [1, 2], 'ki': [3, 4], 'kd': [5, 6], 'feedback': [7], 'ready': [8]}
-    """
-    gains = np.asarray(gains)
-    joints = (gains.shape[-1] - 2) // 3
-    parts = np.split(gains, [joints, 2 * joints, 3 * joints, 3 * joints + 1], axis=-1)
-    return dict(zip(GAINS, parts, strict=True))
-
-
-def join_gains(machine: Machine, named: Mapping[str, ArrayLike]) -> Array:
-    """`split_gains` turned round for a single vector; one number stands for all joints.
-
-    ValueError: another number of gains, or not finite ones.
-    """
-    sizes = [len(machine.driven)] * 3 + [1, 1]
-    pairs = zip(GAINS, sizes, strict=True)
-    gains = np.concatenate(
-        [np.broadcast_to(np.asarray(named[name], float), size) for name, size in pairs]
-    )
-    if not np.isfinite(gains).all():
-        raise ValueError(f"gains: expected finite numbers, got {gains}")
-    return gains
-
-
-class Memory(NamedTuple):
-    """What the controller remembers between ticks, (..., n_driven) each."""
-
-    integral: Array  # valve opening
-    error: Array  # last rate error [rad/s]
-    slope: Array  # filtered derivative of the error [rad/s^2]
-    rate: Array  # last wanted joint rates [rad/s]
+# --- from joint velocities to valves --------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class SteadyMap:
-    """Steady joint velocity over angle and command as the nets know it; inverted for feed-forward."""
+class Gains:
+    """Gains of the controller. Leading axes of the arrays: one row for each machine controlled."""
 
-    q: Array  # (n_driven, a) angles [rad], evenly spaced
-    u: Array  # (c,) commands
-    velocity: Array  # (n_driven, a, c) [rad/s], rising along c
-
-    def command(self, q: Array, q_dot: Array) -> Array:
-        """Command that keeps driven joints at `q` moving at `q_dot` (..., n_driven)."""
-        j = np.arange(len(self.q))
-        place = (q - self.q[:, 0]) / (self.q[:, 1] - self.q[:, 0])
-        row = np.clip(place.astype(int), 0, self.q.shape[1] - 2)
-        part = np.clip(place - row, 0, 1)[..., None]
-        curve = (1 - part) * self.velocity[j, row] + part * self.velocity[j, row + 1]
-        last = np.clip((curve <= q_dot[..., None]).sum(-1), 1, len(self.u) - 1)[..., None]
-        low, high = (np.take_along_axis(curve, last - i, -1) for i in (1, 0))
-        share = np.clip((q_dot[..., None] - low) / np.maximum(high - low, 1e-6), 0, 1)
-        command: Array = (self.u[last - 1] + share * (self.u[last] - self.u[last - 1]))[..., 0]
-        return command
+    kp: Array  # valve opening per rad/s, (..., n_driven)
+    ki: Array  # valve opening per rad, (..., n_driven)
+    kd: Array  # valve opening per rad/s^2, (..., n_driven)
+    feedback: Array  # K = feedback * I of eq3 [1], (..., 1)
+    min_opening: Array  # least valve opening while the tool is to move [1], (..., 1)
 
 
-def steady_map(machine: Machine, net: ActuatorNet) -> SteadyMap:
-    """Ask the nets how fast each driven joint moves steadily under each command at each angle."""
-    angles, commands = 9, 41  # assumed
-    low, high = machine.column("q_min")[machine.driven], machine.column("q_max")[machine.driven]
-    inset = 0.05 * (
-        high - low
-    )  # assumed; at the very end a stop holds the joint, whatever the command
-    q = np.linspace(low + inset, high - inset, angles)[:, None]  # (a, 1, n)
-    u = np.linspace(-1, 1, commands) * machine.pwm_limit / PWM_MAX
-    history = np.zeros((angles, commands, len(low), 3, net.history), np.float32)
-    history[..., 2, :] = u[:, None, None]
-    lags, share = np.arange(1 - net.history, 1) / net.rate, np.linspace(-1, 1, commands)[:, None]
-    moving = np.where(share > 0, net.output_high * share, -net.output_low * share)
-    velocity = np.tile(
-        moving, (angles, 1, 1)
-    )  # from rest they might see a joint that stands at its stop
-    for _ in range(60):  # fixed point: a history that moves as fast as the nets say it does
-        history[..., 0, :] = q[..., None] + velocity[..., None] * lags
-        history[..., 1, :] = velocity[..., None]
-        velocity = 0.5 * velocity + 0.5 * net.predict(history)
-    rising = np.maximum.accumulate(velocity.transpose(2, 0, 1), axis=-1)
-    return SteadyMap(q[:, 0].T, u, rising)
+class PIDState(NamedTuple):
+    """What the controller keeps between ticks, (..., n_driven) each."""
+
+    integral: Array  # valve opening
+    error: Array  # velocity error of the last tick [rad/s]
+    derivative: Array  # filtered derivative of the error [rad/s^2]
+    q_dot_goal: Array  # desired joint velocities of the last tick [rad/s]
 
 
 @dataclass(frozen=True)
 class JacobianController:
-    """Observation in, command out: resolved rates (eq3), then a PID a joint.
+    """Resolved rates by damped least squares (eq3), then one PID per driven joint.
 
-    Paper: eq3, Sec. 4.2
-
-    The PID acts on the valve opening beyond the dead zone; the dead zone is added after it, and the
-    integral stops where the command saturates. With `feedforward`, the steady command of the nets
-    for the wanted rate is added. While the tool is to move, no valve goes below the opening `ready`:
-    one that has gone idle answers late (paper Sec. 3.2). With `awake`, not even while it is to stand.
+    The PID gives the valve opening beyond the dead zone, which is added after it. While the tool
+    is to move, no valve goes below the opening `min_opening`: one that has closed answers late
+    (paper Sec. 3.2). Paper: eq3, Sec. 4.2
     """
 
     machine: Machine
-    gains: Array  # see `GAINS`: (3 n_driven + 2,), or a row for each machine that is driven
+    gains: Gains
     k: float  # of Nakamura's damping
     w0: float  # manipulability below which damping sets in
-    feedforward: SteadyMap | None = None
-    awake: bool = False
+    feedforward: Callable[[Array, Array], Array] | None = None  # q, q_dot (..., n_driven) -> u
+    always_open: bool = False  # `min_opening` holds while the tool is to stand still, too
 
-    def start(self, num: int) -> Memory:
-        """Memory of `num` controllers at rest."""
+    def start(self, num: int) -> PIDState:
+        """State of `num` controllers at rest."""
         zero = np.zeros((num, len(self.machine.driven)))
-        return Memory(zero, zero, zero, zero)
+        return PIDState(zero, zero, zero, zero)
 
-    def rates(self, seen: Measured, last: Array) -> Array:
-        """Wanted rates of the driven joints [rad/s], (..., n_driven); `last`: a tick ago. Paper: eq3"""
+    def desired_velocities(self, v_goal: Array, v_tool: Array, q: Array, last: Array) -> Array:
+        """Desired velocities of the driven joints [rad/s], (..., n_driven). Paper: eq3
+
+        Goal and measured tool velocity [m/s] (..., 3), angles of all joints [rad] (..., n), and the
+        desired velocities of the tick before, whose signs select the joint-limit weights.
+        """
         m, driven = self.machine, self.machine.driven
-        J, towards = jacobian(m, seen.q), np.zeros_like(seen.q)
-        towards[..., driven] = last
-        W = limit_weights(m, seen.q, towards)[..., driven]
-        inverse = dls(J, W, nakamura_damping(manipulability(J), self.w0, self.k))
-        feedback = split_gains(self.gains)["feedback"] * (seen.v_goal - seen.v_tool)
-        rate = (inverse @ (seen.v_goal + feedback)[..., None])[..., 0]
-        fastest = np.where(rate > 0, m.column("q_dot_up")[driven], m.column("q_dot_down")[driven])
-        excess = np.max(np.abs(rate) / fastest, axis=-1, keepdims=True)
-        return np.asarray(rate / np.maximum(1.0, excess))  # slower, but in the same direction
+        direction = np.zeros(q.shape)
+        direction[..., driven] = last
+        J = jacobian(forward_kinematics(m, q))[..., driven]
+        W = limit_weights(m, q, direction)[..., driven]
+        J_inv = dls(J, W, nakamura_damping(manipulability(J), self.w0, self.k))
+        v = v_goal + self.gains.feedback * (v_goal - v_tool)
+        q_dot = (J_inv @ v[..., None])[..., 0]  # q_dot = J^+ (v_d + K (v_d - v_ee))
+        fastest = np.where(q_dot > 0, m.column("q_dot_up")[driven], m.column("q_dot_down")[driven])
+        excess = np.max(np.abs(q_dot) / fastest, axis=-1, keepdims=True)
+        return np.asarray(q_dot / np.maximum(1.0, excess))  # slower, in the same direction
 
-    def __call__(self, observation: Array, memory: Memory) -> tuple[Array, Memory]:
-        """Commands u (..., n) for observations (..., obs) of `observation.observe`, and the next memory."""
-        m, g = self.machine, split_gains(self.gains)
-        seen = measured(m, observation.astype(float))
-        rate = self.rates(seen, memory.rate)
-        error = rate - seen.q_dot
-        slope = 0.7 * memory.slope + 0.3 * (error - memory.error) * m.rate
-        opening = g["kp"] * error + memory.integral + g["kd"] * slope
+    def __call__(self, measured: Measured, state: PIDState) -> tuple[Array, PIDState]:
+        """Commands u [-1, 1] (..., n), and the state of the next tick."""
+        m, gains = self.machine, self.gains
+        q = measured.q.astype(float)
+        q_dot_goal = self.desired_velocities(measured.v_goal, measured.v_tool, q, state.q_dot_goal)
+        error = q_dot_goal - measured.q_dot
+        derivative = 0.7 * state.derivative + 0.3 * (error - state.error) / m.dt
+        opening = gains.kp * error + state.integral + gains.kd * derivative  # PID
         if self.feedforward is not None:
-            opening += valve_opening(
-                self.feedforward.command(seen.q[..., m.driven], rate), m.dead_zone
-            )
-        room = valve_opening(m.pwm_limit / PWM_MAX, m.dead_zone)
-        winding = (np.abs(opening) >= room) & (np.sign(opening) == np.sign(error))
-        integral = memory.integral + np.where(winding, 0.0, g["ki"] * error * m.dt)
-        moving = np.linalg.norm(seen.v_goal, axis=-1, keepdims=True) > 1e-6
-        size = np.maximum(np.abs(opening), (moving | self.awake) * g["ready"])
-        size = (size >= 0.5 / PWM_MAX) * (
-            m.dead_zone + (1 - m.dead_zone) * size
-        )  # below half a count: idle
+            u = self.feedforward(q[..., m.driven], q_dot_goal)
+            opening = opening + valve_opening(u, m.dead_zone)
+        limit = valve_opening(m.pwm_limit / PWM_MAX, m.dead_zone)
+        saturated = (np.abs(opening) >= limit) & (np.sign(opening) == np.sign(error))
+        integral = state.integral + np.where(saturated, 0.0, gains.ki * error * m.dt)  # anti-windup
+        u = self._open_valves(opening, measured.v_goal)
+        return u, PIDState(integral, error, derivative, q_dot_goal)
+
+    def _open_valves(self, opening: Array, v_goal: Array) -> Array:
+        """Commands u (..., n) that open the valves so far beyond the dead zone (..., n_driven)."""
+        m = self.machine
+        moving = np.linalg.norm(v_goal, axis=-1, keepdims=True) > 1e-6
+        least = (moving | self.always_open) * self.gains.min_opening
+        size = np.maximum(np.abs(opening), least)
+        closed = size < 0.5 / PWM_MAX  # below half a count
+        size = np.where(closed, 0.0, m.dead_zone + (1 - m.dead_zone) * size)
         u = np.zeros((*opening.shape[:-1], m.n))
         u[..., m.driven] = np.sign(opening) * size
-        return limit_command(m, u), Memory(integral, error, slope, rate)
+        return limit_command(m, u)

@@ -109,12 +109,12 @@ class Machine:
     )  # largest command that may leave the program
     dead_zone: float = _number("of full command", 0, 0.99)
     delay: float = _number("s", 0)
-    spool_time: float = _number("s", 1e-6)
-    cylinder_time: float = _number("s", 1e-6)
-    ready_up_time: float = _number("s", 1e-6)
-    ready_down_time: float = _number("s", 1e-6)
-    ready_threshold: float = _number("1", 0, 0.999)
-    spool_idle: float = _number("of full stroke", 0, 1)
+    tau_spool: float = _number("s", 1e-6)
+    tau_cylinder: float = _number("s", 1e-6)
+    tau_valve_up: float = _number("s", 1e-6)
+    tau_valve_down: float = _number("s", 1e-6)
+    valve_threshold: float = _number("1", 0, 0.999)
+    spool_threshold: float = _number("of full stroke", 0, 1)
     pump_flow: float = _number("m^3/s", 1e-9)
     plant_dt: float = _number("s", 1e-6, 1)  # explicit Euler step of the analytic plant
     encoder_bits: int = _number("bits a turn", 1, 32)
@@ -360,12 +360,12 @@ def _brokk_170() -> Machine:
         pwm_limit=80,
         dead_zone=0.07,
         delay=0.040,
-        spool_time=0.030,
-        cylinder_time=0.030,
-        ready_up_time=0.15,
-        ready_down_time=0.40,
-        ready_threshold=0.80,
-        spool_idle=0.01,
+        tau_spool=0.030,
+        tau_cylinder=0.030,
+        tau_valve_up=0.15,
+        tau_valve_down=0.40,
+        valve_threshold=0.80,
+        spool_threshold=0.01,
         pump_flow=0.00105,
         plant_dt=0.005,
         encoder_bits=12,

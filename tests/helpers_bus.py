@@ -13,7 +13,7 @@ from brokk_min import hw
 from brokk_min.can.canopen import Frame, Line
 from brokk_min.can.operator_input import Wish
 from brokk_min.can.simulated_machine import SimulatedMachine
-from brokk_min.env import Controller
+from brokk_min.evaluation.rollout import Controller
 from brokk_min.hw import Drive
 from brokk_min.machine import BROKK_170, Machine
 

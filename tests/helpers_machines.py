@@ -8,7 +8,7 @@ import numpy as np
 
 from brokk_min.actuator import ActuatorNet
 from brokk_min.identification.logs import Recording, velocity_of
-from brokk_min.kinematics import jacobian
+from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.machine import BROKK_170, Joint, Machine
 
 GAIN = 3.0  # of `obedient_net`
@@ -120,7 +120,7 @@ def obedient_velocity(machine: Machine, u: np.ndarray) -> np.ndarray:
 
 def damped_rates(machine: Machine, q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Oracle of `joint_rates`: NumPy solves (J^T J + lambda^2 I) x = J^T v, lambda 6 % of the length."""
-    J = jacobian(machine, np.asarray(q, float))
+    J = jacobian(forward_kinematics(machine, np.asarray(q, float)))[..., machine.driven]
     damping = (0.06 * np.hypot(machine.column("a"), machine.column("d")).sum()) ** 2
     Jt = np.swapaxes(J, -1, -2)
     normal = Jt @ J + damping * np.eye(J.shape[-1])

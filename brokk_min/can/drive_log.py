@@ -8,7 +8,7 @@ import numpy as np
 from brokk_min.can import canopen as bus
 from brokk_min.can.operator_input import Wish, unpack_wish
 from brokk_min.can.safety_gate import encoder_counts
-from brokk_min.env import Controller
+from brokk_min.evaluation.rollout import Controller
 from brokk_min.hw import Drive
 from brokk_min.identification.logs import Log, machine_log
 from brokk_min.machine import Machine, decode_pwm

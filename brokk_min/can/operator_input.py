@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from brokk_min.env import Measured
 from brokk_min.identification.extras import need
 from brokk_min.machine import PWM_MAX, Array, Machine
-from brokk_min.observation import measured
 
 
 class Wish(NamedTuple):
@@ -129,9 +129,9 @@ class Jog:
     def start(self, num: int) -> None:
         """Nothing to remember."""
 
-    def __call__(self, observation: Array, memory: None) -> tuple[Array, None]:
-        """Commands u (..., n) for observations (..., obs)."""
-        v_goal = measured(self.machine, observation).v_goal[..., :1]
+    def __call__(self, measured: Measured, memory: None) -> tuple[Array, None]:
+        """Commands u (..., n)."""
+        v_goal = measured.v_goal[..., :1]
         asked = np.sign(v_goal) * (np.abs(v_goal) > 0.1 * self.machine.tool_speed)
         chosen = np.array([name == self.joint for name in self.machine.names])
         return asked * chosen * self.counts / PWM_MAX, None

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from brokk_min.actuator import plant_reset, plant_step
 from brokk_min.can import canopen as bus
 from brokk_min.can.safety_gate import OPERATIONAL, Array, checksum, encoder_raw
 from brokk_min.machine import BROKK_170, Machine, decode_pwm
-from brokk_min.plant import plant_reset, plant_step
 
 BOOT, STOPPED, PRE_OPERATIONAL = 0, 4, 127  # CANopen states beside OPERATIONAL
 START = (0.0, 0.5, 0.58, 1.71, 1.24)  # rad, the paper's start pose, pointing forward

@@ -9,13 +9,14 @@ from typing import Any, Literal
 import numpy as np
 import tyro
 
-from brokk_min.actuator import ActuatorNet, load_net, save_net
+from brokk_min.actuator import ActuatorNet, select_nets
 from brokk_min.cli.options import Command, Name, WrongUse, check, chosen_policy
-from brokk_min.env import Controller, TaskConfig, fitting_nets
+from brokk_min.env import TaskConfig
 from brokk_min.evaluation import baselines, experiments, figures, preliminary, trust
 from brokk_min.evaluation import reproduce as chain
 from brokk_min.evaluation.metrics import summary
 from brokk_min.evaluation.report import VERDICTS
+from brokk_min.evaluation.rollout import Controller
 from brokk_min.evaluation.sequences import (
     draw_starts,
     goals_and_starts,
@@ -26,6 +27,7 @@ from brokk_min.identification.excitation import collect
 from brokk_min.identification.files import write_json
 from brokk_min.identification.fitting import PAPER_RECIPE, FitConfig, fit
 from brokk_min.identification.logs import Log, read_log, write_log
+from brokk_min.identification.net_file import load_net, save_net
 from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import BROKK_170, Machine
 
@@ -143,7 +145,8 @@ def split(log: Log) -> tuple[Log, Log]:
 
 def train_command() -> Any:
     """The command `train`; made on demand, because its settings live beside torch."""
-    from brokk_min.ppo import PPOConfig, train
+    from brokk_min.learning.checkpoint import train_policy
+    from brokk_min.ppo import PPOConfig
 
     @dataclass(kw_only=True)
     class Train(Command):
@@ -152,6 +155,9 @@ def train_command() -> Any:
         actuator: Path  # Nets that `fit` wrote.
         out: Path  # Policy to write, .npz.
         resume: bool = False  # Take up OUT.checkpoint; the end is the same as without the break.
+        critic: bool = (
+            False  # Advantages by a critic, as under --paper, not by the nets' derivatives.
+        )
         tensorboard: Path | None = None  # Folder for TensorBoard (extra `tensorboard`).
         settings: tyro.conf.OmitArgPrefixes[PPOConfig] = field(
             default_factory=PPOConfig
@@ -163,14 +169,15 @@ def train_command() -> Any:
         def run(self) -> None:
             """Train and write the policy."""
             machine = check(self, self.out)
-            net = fitting_nets(machine, load_net(self.actuator))
-            train(
+            net = select_nets(machine, load_net(self.actuator))
+            train_policy(
                 machine,
                 net,
                 self.task,
                 self.settings,
                 self.seed,
                 self.out,
+                self.critic,
                 self.resume,
                 self.tensorboard,
             )
@@ -207,7 +214,7 @@ def sweep_command() -> Any:
         def run(self) -> None:
             """Sweep and print the table."""
             machine = check(self)
-            net = fitting_nets(machine, load_net(self.actuator))
+            net = select_nets(machine, load_net(self.actuator))
             seeds = range(self.seed, self.seed + self.seeds)
             of, how = self.settings, (self.poses, self.scheduler, self.gains)
             print(show(sweep(machine, net, self.task, of, seeds, self.out, *how)))

@@ -15,8 +15,8 @@ from brokk_min.can import operator_input as wishes
 from brokk_min.can.canopen import open_line, read_frames
 from brokk_min.can.simulated_machine import simulate
 from brokk_min.cli.options import Command, WrongUse, check, chosen_policy
-from brokk_min.env import Controller
 from brokk_min.evaluation import baselines
+from brokk_min.evaluation.rollout import Controller
 from brokk_min.evaluation.sequences import read_commands
 from brokk_min.identification.logs import write_log
 from brokk_min.learning.onnx import export_onnx

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from brokk_min.env import Controller, Trace
 from brokk_min.evaluation.metrics import (
     TRANSIENT,
     Mean,
@@ -19,13 +18,13 @@ from brokk_min.evaluation.metrics import (
     mean_interval,
     since_change,
 )
+from brokk_min.evaluation.rollout import Controller, Trace
 from brokk_min.jacobian import JacobianController, manipulability
-from brokk_min.kinematics import jacobian
+from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.machine import Array, Machine
-from brokk_min.observation import Measured
 
 Claim = dict[str, Any]  # paper, measured, numbers, unit, holds (None: no such runs); see `beside`
-STILL = 0.05  # m, assumed: a tool that stays so near its line stays still across it
+STANDSTILL = 0.05  # m, assumed: a tool that stays so near its line stays still across it
 SMALL = 0.05  # m, assumed: two tools so near to each other after the same commands differ little
 MARGINAL = 0.01  # rad/s, assumed: joint rates that differ by less differ marginally
 LATER = 2.0  # assumed: a response that takes so many times as long is another
@@ -158,18 +157,18 @@ def drift_claims(runs: Sequence[Run], baselines: Sequence[str]) -> list[Claim]:
     return [
         _claim(
             "RL: y and z remain stationary during motion along x.",
-            f"largest distance of the tool from its line, to be below {STILL} m",
+            f"largest distance of the tool from its line, to be below {STANDSTILL} m",
             "m",
             {"rl": numbers["rl"]},
-            _below(numbers["rl"], STILL),
+            _below(numbers["rl"], STANDSTILL),
         ),
         _claim(
             "The Jacobian-based method significantly fails to keep y and z still.",
-            f"largest distance of the tool from its line, to be above {STILL} m, and more than RL's",
+            f"largest distance of the tool from its line, to be above {STANDSTILL} m, and more than RL's",
             "m",
             others | more,
             _all(
-                *(_above(n, STILL) for n in others.values()),
+                *(_above(n, STANDSTILL) for n in others.values()),
                 *(_above(n, 0.0) for n in more.values()),
             ),
         ),
@@ -185,7 +184,7 @@ def direction_claim(
     """
     q_dot = trace.q_dot[..., machine.driven]
     v_goal = np.broadcast_to(goals[:, None], trace.v_tool.shape)
-    wanted = controller.rates(Measured(v_goal, trace.v_tool, trace.q, q_dot), q_dot)
+    wanted = controller.desired_velocities(v_goal, trace.v_tool, trace.q, q_dot)
     numbers: dict[str, Mean] = {}
     unlike: list[bool] = []
     for i, joint in enumerate(machine.driven):
@@ -226,7 +225,11 @@ def speed_share(machine: Machine, w0: float, trace: Trace, goals: Array) -> Arra
     Of ticks below the manipulability `w0` in which the goal (T, num, 3) [m/s] has lasted for `TRANSIENT`.
     """
     lasting = since_change(machine, goals) >= round(TRANSIENT * machine.rate)
-    near = lasting & (manipulability(jacobian(machine, trace.q)) < w0) & np.any(goals, axis=-1)
+    near = (
+        lasting
+        & (manipulability(jacobian(forward_kinematics(machine, trace.q))[..., machine.driven]) < w0)
+        & np.any(goals, axis=-1)
+    )
     along = np.sum(trace.v_tool * goals, axis=-1)
     square = np.sum(goals * goals, axis=-1) * near
     return np.where(near.any(0), np.sum(along * near, 0) / np.maximum(square.sum(0), 1e-12), np.nan)

@@ -12,7 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from brokk_min import __version__, actuator, jacobian, kinematics
-from brokk_min.env import Controller, TaskConfig, Trace, rollout
+from brokk_min.env import TaskConfig
 from brokk_min.evaluation import claims, metrics
 from brokk_min.evaluation.baselines import PAPERS, STRONGER
 from brokk_min.evaluation.figures import Traces
@@ -27,6 +27,7 @@ from brokk_min.evaluation.metrics import (
 )
 from brokk_min.evaluation.perfect_model import PerfectModel
 from brokk_min.evaluation.robustness import Sensor, exact, supply_demand, variations
+from brokk_min.evaluation.rollout import Controller, Trace, rollout
 from brokk_min.evaluation.sequences import (
     Commands,
     axis_sequences,
@@ -90,7 +91,12 @@ def task_space(
         start, rng = np.tile(starts, (len(group), 1)), np.random.default_rng(seed)
         read = sensor(np.random.default_rng(seed + 1))
         trace = rollout(machine, controllers[name], start, goals, TaskConfig(), rng, net, read)
-        found = metrics.metrics(machine, trace, goals, kinematics.tool_position(machine, start))
+        found = metrics.metrics(
+            machine,
+            trace,
+            goals,
+            kinematics.tool_position(kinematics.forward_kinematics(machine, start)),
+        )
         for i, s in enumerate(group):
             mine, label = slice(i * num, (i + 1) * num), {"controller": name, "sequence": s.name}
             traces[name, s.name] = Trace(*(a[:, mine] for a in trace))
@@ -255,7 +261,7 @@ def singular_case(
     runs, traces = task_space(machine, some, sequences, starts, seed)
     w0, J, share = (
         jacobian.manipulability_threshold(machine),
-        kinematics.jacobian(machine, starts),
+        kinematics.jacobian(kinematics.forward_kinematics(machine, starts))[..., machine.driven],
         {},
     )
     for name in some:

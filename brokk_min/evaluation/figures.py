@@ -15,8 +15,8 @@ import numpy as np
 from tqdm import tqdm
 
 from brokk_min import actuator, kinematics
-from brokk_min.env import Trace
 from brokk_min.evaluation.metrics import Mean
+from brokk_min.evaluation.rollout import Trace
 from brokk_min.evaluation.sequences import AXES, Commands
 from brokk_min.identification import files, logs
 from brokk_min.identification import validation as scores
@@ -133,7 +133,10 @@ def plot_sequence(
     machine: Machine, traces: Traces, sequence: Commands, start: Array, run: int
 ) -> Any:
     """Tool position and velocity along x, y, z of all controllers in one run. Paper: Fig. 6"""
-    first, goals = kinematics.tool_position(machine, start), sequence.of_each(run + 1)[:, run]
+    first, goals = (
+        kinematics.tool_position(kinematics.forward_kinematics(machine, start)),
+        sequence.of_each(run + 1)[:, run],
+    )
     p, v = {"wanted": np.cumsum(goals, axis=0) * machine.dt}, {"wanted": goals}
     for name, trace in _during(traces, sequence).items():
         p[name], v[name] = trace.p_tool[:, run] - first, trace.v_tool[:, run]
@@ -213,7 +216,7 @@ def plot_bars(panels: Mapping[str, Bars]) -> Any:
 def plot_starts(machine: Machine, starts: Array, kinds: Sequence[str]) -> Any:
     """Start configurations drawn as arms, from the side and from above. Paper: Fig. 6a"""
     figure, axes = plt.subplots(1, 2, figsize=(WIDTH, 4.6), layout="compressed")
-    points = kinematics.frames(machine, starts)[..., :3, 3]
+    points = kinematics.forward_kinematics(machine, starts).p
     heading = points[:, -1, :2] / np.maximum(
         np.linalg.norm(points[:, -1, :2], axis=-1, keepdims=True), 1e-9
     )

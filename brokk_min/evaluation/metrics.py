@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from brokk_min.env import Trace
+from brokk_min.evaluation.rollout import Trace
 from brokk_min.machine import Array, Machine
 
 T = TypeVar("T")

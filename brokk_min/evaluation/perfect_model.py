@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from brokk_min.actuator import PlantState, lever_arm, plant_reset, plant_step
+from brokk_min.env import Measured
 from brokk_min.jacobian import dls
-from brokk_min.kinematics import jacobian, tool_velocity
+from brokk_min.kinematics import forward_kinematics, jacobian, tool_velocity
 from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, valve_opening
-from brokk_min.observation import measured
-from brokk_min.plant import PlantState, lever_arm, plant_reset, plant_step
 
 BLOCKS = (
     1,
@@ -61,10 +61,10 @@ class PerfectModel:
             plant_reset(self.machine, q), np.zeros((num, sum(BLOCKS), len(self.machine.driven))), 0
         )
 
-    def __call__(self, observation: Array, memory: Plan) -> tuple[Array, Plan]:
-        """Commands u (num, n) for observations (num, obs) of `observation.observe`, and the next memory."""
+    def __call__(self, measured: Measured, memory: Plan) -> tuple[Array, Plan]:
+        """Commands u (num, n), and the next memory."""
         plant, tick = memory.plant, memory.tick
-        goal = measured(self.machine, observation).v_goal.astype(float)
+        goal = measured.v_goal.astype(float)
         before = np.concatenate([memory.opening[:, 1:], memory.opening[:, -1:]], axis=1)
         opening = self.improve(plant, before, goal, tick)
         u = self.whole_counts(plant, opening, goal, tick)
@@ -82,16 +82,15 @@ class PerfectModel:
     def errors(self, plant: PlantState, u: Array, goal: Array) -> Array:
         """Velocity errors [m/s] (num, c, ticks, 3) that commands (num, c, ticks, n) would leave."""
         m, (num, c, ticks, n) = self.machine, u.shape
-        pending = tuple(np.repeat(a, c, axis=0) for a in plant.pending)
-        q, speed, spool, ready = (np.repeat(a, c, axis=0) for a in plant[:4])
-        state = PlantState(q, speed, spool, ready, pending)
+        state = PlantState(*(np.repeat(array, c, axis=0) for array in plant))
         angles = [state.q]
         for t in range(ticks):
             state = plant_step(m, state, u[:, :, t].reshape(num * c, n))
             angles.append(state.q)
         q = np.array(angles)
         v = tool_velocity(
-            m, q[1:].astype(np.float32), (np.diff(q, axis=0) * m.rate).astype(np.float32)
+            forward_kinematics(m, q[1:].astype(np.float32)),
+            (np.diff(q, axis=0) * m.rate).astype(np.float32),
         )
         return goal[:, None, None] - np.moveaxis(v, 0, 1).reshape(num, c, ticks, 3)
 
@@ -139,7 +138,7 @@ class PerfectModel:
 
 def steady_opening(machine: Machine, q: Array, goal: Array) -> Array:
     """Openings (num, n_driven) at which the plant at angles `q` settles to the tool velocity `goal` [m/s]."""
-    J, driven = jacobian(machine, q), machine.driven
+    J, driven = jacobian(forward_kinematics(machine, q))[..., machine.driven], machine.driven
     rate = (dls(J, np.ones(len(driven)), np.full(len(q), 1e-3)) @ goal[..., None])[..., 0]
     speed = rate * lever_arm(machine, q)[:, driven]
     fastest = (machine.column(name)[driven] for name in ("speed_positive", "speed_negative"))

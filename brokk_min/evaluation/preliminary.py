@@ -11,15 +11,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from brokk_min import actuator, kinematics
-from brokk_min.actuator import ActuatorNet
-from brokk_min.env import fitting_nets
+from brokk_min.actuator import ActuatorNet, plant_reset, plant_step, select_nets
 from brokk_min.evaluation.figures import Panel, plot_panels
 from brokk_min.identification import excitation, fitting
 from brokk_min.identification import validation as scores
 from brokk_min.identification.fitting import FitConfig
 from brokk_min.identification.logs import RETURN, Log
+from brokk_min.identification.validation import net_step
 from brokk_min.machine import BROKK_170, PWM_MAX, Array, Machine, encode_pwm
-from brokk_min.plant import plant_reset, plant_step
 
 Mover = Callable[
     [Array, Array], Array
@@ -51,10 +50,10 @@ def net_mover(net: ActuatorNet) -> Mover:
     """The nets from rest."""
 
     def move(q: Array, u: Array) -> Array:
-        history = actuator.rest_history(q, net.history).astype(np.float32)
+        history = actuator.initial_history(q, net.history).astype(np.float32)
         angles = [q]
         for command in u:
-            history, q = net.step(history, q, command)
+            history, q = net_step(net, history, q, command)
             angles.append(q)
         return np.array(angles)
 
@@ -63,7 +62,7 @@ def net_mover(net: ActuatorNet) -> Mover:
 
 def driven_mover(machine: Machine, net: ActuatorNet) -> Mover:
     """Nets for the driven joints of a machine; the others rest."""
-    move = net_mover(fitting_nets(machine, net))
+    move = net_mover(select_nets(machine, net))
 
     def all_joints(q: Array, u: Array) -> Array:
         angles = np.repeat(q[None], len(u) + 1, axis=0)
@@ -199,7 +198,7 @@ def sim_to_real(machine: Machine, net: ActuatorNet, seed: int) -> Gap:
     motion = []
     for move in movers(machine, net).values():
         q = move(np.tile(start, (GAP_RUNS, 1)), u)
-        p = kinematics.tool_position(machine, q)
+        p = kinematics.tool_position(kinematics.forward_kinematics(machine, q))
         motion.append(
             (q[1:], np.diff(q, axis=0) * machine.rate, p[1:], np.diff(p, axis=0) * machine.rate)
         )

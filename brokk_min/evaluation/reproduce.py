@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from brokk_min import actuator
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation import claims, figures, preliminary, report
 from brokk_min.evaluation.baselines import (
@@ -24,7 +23,7 @@ from brokk_min.evaluation.experiments import Effort, Net, comparison, driven_log
 from brokk_min.evaluation.figures import Traces
 from brokk_min.evaluation.metrics import summary
 from brokk_min.evaluation.sequences import axis_sequences, held_rows
-from brokk_min.identification import excitation, fitting, logs
+from brokk_min.identification import excitation, fitting, logs, net_file
 from brokk_min.identification import validation as scores
 from brokk_min.identification.files import write_json
 from brokk_min.jacobian import JacobianController
@@ -40,8 +39,9 @@ def reproduce(
     `results.json` holds no clock: the same seed gives the same file on the same machine. The figures of
     training seeds in the file `sweep`, which `sweep.sweep` wrote, join the report.
     """
+    from brokk_min.learning.checkpoint import train_policy
     from brokk_min.learning.sweep import read_seeds, seeds_of
-    from brokk_min.ppo import PPOConfig, train  # torch, only where something is trained
+    from brokk_min.ppo import PPOConfig  # torch, only where something is trained
 
     seeds = read_seeds(sweep) if sweep else {}
     out.mkdir(parents=True, exist_ok=True)
@@ -54,7 +54,7 @@ def reproduce(
         over_seeds = seeds_of(machine, driven, seeds) if seeds else {}
     with stage("train"):
         learner = PPOConfig(total_steps=effort.train_steps)
-        policy = train(
+        policy = train_policy(
             machine, driven, TaskConfig(), learner, seed, out / "policy.npz", resume=True
         )
     with stage("tune"):
@@ -102,7 +102,7 @@ def fitted(
         steps=effort.fit_steps, history=machine.history, dead_zone=machine.dead_zone
     )
     net = fitting.fit(log, config, seed, machine.velocity_samples, machine.name)
-    actuator.save_net(out / "net.npz", net)
+    net_file.save_net(out / "net.npz", net)
     half = replace(config, steps=effort.fit_steps // 2)  # for time
     return net, preliminary.paper_recipe(machine, test, effort.hours, half, seed)
 

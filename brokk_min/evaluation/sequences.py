@@ -12,10 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
 from brokk_min import jacobian, kinematics
-from brokk_min.env import TaskConfig, draw_pose, reset, terminated
+from brokk_min.actuator import lever_arm
+from brokk_min.env import TaskConfig, terminated
 from brokk_min.identification import files
-from brokk_min.machine import Array, Machine
-from brokk_min.plant import speed_limits
+from brokk_min.learning.episodes import draw_pose, reset
+from brokk_min.machine import PWM_MAX, Array, Machine, valve_opening
 
 AXES = "xyz"
 # One axis of the paper's experiment: seconds and share of tool_speed (assumed), with changes of direction.
@@ -68,7 +69,9 @@ def least_motion(machine: Machine, starts: Array) -> list[Commands]:
 
     Paper: Fig. 6e, Fig. 6f
     """
-    direction = np.linalg.svd(kinematics.jacobian(machine, starts))[0][..., -1]
+    direction = np.linalg.svd(
+        kinematics.jacobian(kinematics.forward_kinematics(machine, starts))[..., machine.driven]
+    )[0][..., -1]
     largest = np.abs(direction).argmax(axis=-1)[:, None]
     direction = direction * np.sign(np.take_along_axis(direction, largest, axis=-1))
     goals = np.stack([_along(machine, towards) for towards in direction], axis=1)
@@ -150,7 +153,7 @@ def read_starts(path: Path, machine: Machine) -> Array:
     for row, joint in np.argwhere((starts < low) | (starts > high)):
         wanted = f"column {machine.names[joint]}: expected {low[joint]} to {high[joint]} rad"
         raise ValueError(f"{path}: row {row + 2}, {wanted}, got {starts[row, joint]}")
-    lowest = kinematics.lowest_point(machine, starts)
+    lowest = kinematics.lowest_point(kinematics.forward_kinematics(machine, starts))
     for row in np.flatnonzero(terminated(machine, lowest)):
         wanted = f"expected the whole arm above {machine.ground} m"
         raise ValueError(f"{path}: row {row + 2}: {wanted}, got {lowest[row]:.3f} m")
@@ -166,11 +169,14 @@ def feasible(machine: Machine, start: Array, goals: Array) -> NDArray[np.bool_]:
     """
     q, driven = np.array(start, float), machine.driven
     low, high = machine.column("q_min")[driven] + 0.05, machine.column("q_max")[driven] - 0.05
-    wanted, lowest = kinematics.tool_state(machine, q, 0 * q)[::2]
-    good, rates = lowest > machine.ground + 0.1, np.zeros_like(q)
+    frames = kinematics.forward_kinematics(machine, q)
+    wanted = kinematics.tool_position(frames)
+    good = kinematics.lowest_point(frames) > machine.ground + 0.1
+    rates = np.zeros_like(q)
     for goal in goals:
-        p, _, lowest = kinematics.tool_state(machine, q, rates)
-        J = kinematics.jacobian(machine, q)
+        frames = kinematics.forward_kinematics(machine, q)
+        p = kinematics.tool_position(frames)
+        J = kinematics.jacobian(frames)[..., driven]
         inverse = jacobian.dls(
             J, jacobian.limit_weights(machine, q, rates)[:, driven], np.full(len(q), 1e-4)
         )
@@ -181,8 +187,20 @@ def feasible(machine: Machine, start: Array, goals: Array) -> NDArray[np.bool_]:
         down, up = speed_limits(machine, q)
         slow = ((rates > 0.9 * down) & (rates < 0.9 * up))[:, driven].all(-1)
         near = np.linalg.norm(wanted - p, axis=-1) < 0.02
-        good &= inside & slow & near & (lowest > machine.ground + 0.1)
+        good &= inside & slow & near & (kinematics.lowest_point(frames) > machine.ground + 0.1)
     return good
+
+
+def speed_limits(machine: Machine, q: ArrayLike) -> tuple[Array, Array]:
+    """Fastest negative and positive velocity [rad/s] (..., n) that a joint alone can hold at angles `q`.
+
+    At the command limit. Paper: eq1
+    """
+    opening = valve_opening(machine.pwm_limit / PWM_MAX, machine.dead_zone)
+    arm = lever_arm(machine, q)
+    speeds = -machine.column("speed_negative"), machine.column("speed_positive")
+    down, up = (opening * speed / arm for speed in speeds)
+    return down, up
 
 
 def start_kinds(machine: Machine, starts: Array) -> list[str]:
@@ -192,11 +210,16 @@ def start_kinds(machine: Machine, starts: Array) -> list[str]:
     the baselines' damping acts. Limits: a driven joint within 0.15 rad of an end of its range.
     """
     low, high = machine.column("q_min"), machine.column("q_max")
-    ends = kinematics.frames(machine, starts)[..., :3, 3]
+    ends = kinematics.forward_kinematics(machine, starts).p
     reach = np.linalg.norm(ends[:, -1] - ends[:, 1], axis=-1)
     length = np.hypot(machine.column("a"), machine.column("d"))[1:].sum()
     w0 = jacobian.manipulability_threshold(machine)
-    damped = jacobian.manipulability(kinematics.jacobian(machine, starts)) < w0
+    damped = (
+        jacobian.manipulability(
+            kinematics.jacobian(kinematics.forward_kinematics(machine, starts))[..., machine.driven]
+        )
+        < w0
+    )
     room = np.minimum(starts - low, high - starts)[:, machine.driven].min(axis=-1)
     kinds = np.where((reach > 0.9 * length) & damped, 2, np.where(room < 0.15, 1, 0))
     return [KINDS[kind] for kind in kinds]

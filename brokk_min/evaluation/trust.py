@@ -133,7 +133,8 @@ def tool_errors(machine: Machine, net: ActuatorNet, test: Log) -> dict[str, floa
             q_error, _ = scores.run_errors(net, samples, starts, ticks)
             recorded = samples.whole.q[starts + ticks]
             ends = (
-                kinematics.tool_position(machine, q) for q in (recorded, recorded + q_error[-1])
+                kinematics.tool_position(kinematics.forward_kinematics(machine, q))
+                for q in (recorded, recorded + q_error[-1])
             )
             apart = np.linalg.norm(next(ends) - next(ends), axis=-1)
             result[str(horizon)] = float(np.median(apart))

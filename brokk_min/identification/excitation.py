@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
+from brokk_min.actuator import plant_reset, plant_step
 from brokk_min.identification.logs import RETURN, Log, machine_log
 from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, read_encoder
-from brokk_min.plant import plant_reset, plant_step
 
 Tape = tuple[str, Array, Array]  # name, commands and encoder angles (T, n)
 # Shares of what rich excitation is made of, assumed.
@@ -81,7 +81,7 @@ def _starts(
 
 def _rest(rng: np.random.Generator, machine: Machine, restless: float) -> Array:
     """A rest, in half of the cases until the valve is idle, with noise of size `restless`."""
-    idle, short = 5 * machine.ready_down_time, np.exp(rng.uniform(np.log(0.05), np.log(3.0)))
+    idle, short = 5 * machine.tau_valve_down, np.exp(rng.uniform(np.log(0.05), np.log(3.0)))
     ticks = int((idle if rng.random() < 0.5 else short) / machine.dt)
     return restless * rng.uniform(-1, 1, ticks)
 
@@ -184,7 +184,7 @@ def _drive_legs(
     commands = np.zeros((len(row), length))
     commands[:, machine.history :] = [EXCITATIONS[excitation](rng, machine, ticks) for _ in row]
     slow = (machine.dead_zone + machine.pwm_limit / PWM_MAX) / 2
-    rest = round(5 * machine.ready_down_time * machine.rate)  # ticks until a valve is idle again
+    rest = round(5 * machine.tau_valve_down * machine.rate)  # ticks until a valve is idle again
     back = np.full(len(row), length)  # tick at which each way back begins
     rested = np.zeros(len(row), int)  # ticks at rest after it
     met = np.zeros(len(row), int)  # ticks at a limit

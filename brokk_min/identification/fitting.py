@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from brokk_min.actuator import NET_ARRAYS, ActuatorNet, valve_scale
+from brokk_min.actuator import ActuatorNet, mu_law
 from brokk_min.identification.logs import Log, Recording
+from brokk_min.identification.net_file import NET_ARRAYS
 from brokk_min.machine import Array, estimate_velocity
 
 
@@ -37,7 +38,7 @@ class FitConfig:
     rollout: int = 8
     """Ticks that the nets run freely in the last third of the steps, which learn from that (paper: 1)."""
     dead_zone: float | None = None
-    """Command, of full command, within which no valve opens: nets then see `valve_scale` of commands.
+    """Command, of full command, within which no valve opens: nets then see `mu_law` of commands.
     None: that of the machine where it is known, otherwise 0: commands as they are (paper)."""
 
 
@@ -212,7 +213,7 @@ def _outputs(weights: list[Any], x: Any) -> Any:
 class TrainingSet(NamedTuple):
     """What models are fitted to: the windows of H samples of each joint, and their statistics."""
 
-    series: Array  # (3, n, N): angle, velocity and `valve_scale` of commands, recordings end to end
+    series: Array  # (3, n, N): angle, velocity and `mu_law` of commands, recordings end to end
     target: Array  # (N, n) rad/s, see `end_to_end`
     ends: list[NDArray[np.intp]]  # newest samples of each joint's windows
     input_mean: Array  # (n, 3 H)
@@ -239,7 +240,7 @@ def training_set(log: Log, history: int, rollout: int = 1, dead_zone: float = 0.
                 f"joint {name}: expected a recording of {history + 1} samples or more in which it "
                 "moves, got none"
             )
-    commands = valve_scale(samples.whole.u, dead_zone)
+    commands = mu_law(samples.whole.u, dead_zone)
     series = np.stack([samples.whole.q.T, samples.whole.q_dot.T, commands.T])
     mean = np.array([series[:, j, end].mean(axis=1) for j, end in enumerate(ends)])
     scale = np.array([series[:, j, end].std(axis=1) for j, end in enumerate(ends)])

@@ -11,12 +11,25 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from brokk_min.actuator import ActuatorNet
+from brokk_min.actuator import ActuatorNet, append_sample
 from brokk_min.identification.fitting import Samples, end_to_end
 from brokk_min.identification.logs import Log, Recording
 from brokk_min.machine import Array
 
 HORIZONS = (1, 5, 10, 30)  # s, of the free-run scores
+
+
+def net_step(net: ActuatorNet, history: Array, q: Array, u: Array) -> tuple[Array, Array]:
+    """History (..., n, 3, H) and angles (..., n) after one tick under `u`; the net alone moves.
+
+    No joint goes further than it went in training.
+    """
+    low, high = np.minimum(q, net.q_low), np.maximum(q, net.q_high)
+    moved = net.next_angles(history, q, u, low, high)
+    result = append_sample(history, u, moved, net.velocity_samples, 1 / net.rate)
+    if net.velocity_logged:
+        result[..., 1, -1] = (moved - q) * net.rate
+    return result, moved
 
 
 def free_run(
@@ -35,7 +48,7 @@ def free_run(
     q: Array = recording.q[starts]
     trace = []
     for k in range(ticks):
-        history, q = net.step(history, q, recording.u[starts + k])
+        history, q = net_step(net, history, q, recording.u[starts + k])
         trace.append((q, history[..., 1, -1]))
     angles, velocities = np.moveaxis(np.array(trace), 1, 0)
     return angles, velocities

@@ -15,10 +15,11 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from brokk_min import env
-from brokk_min.actuator import ActuatorNet, load_net
-from brokk_min.env import Bools, State, TaskConfig
+from brokk_min.actuator import ActuatorNet, select_nets
+from brokk_min.env import Bools, State, TaskConfig, observation_scale
+from brokk_min.identification.net_file import load_net
+from brokk_min.learning.episodes import get_obs, new_goals, replace_rows, reset
 from brokk_min.machine import BROKK_170, Array, Machine
-from brokk_min.observation import observation_scale
 from brokk_min.viewer.window import Pictures
 
 
@@ -26,7 +27,7 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
     """Many machines following random tool velocities; an ended episode starts anew at once. Paper: Fig. 4
 
     Observation: Box, see `observation.observe`. Action: Box [-1, 1] a driven joint, from closed (0) through
-    the dead zone to the command limit (1), see `observation.to_command`. Reward: see `env.step`.
+    the dead zone to the command limit (1), see `observation.action_to_pwm`. Reward: see `env.step`.
     `info["final_obs"]` holds the last observation of an ended episode where `info["_final_obs"]` is set;
     `info["velocity_error"]` is |v_goal - v_tool| [m/s].
 
@@ -63,33 +64,35 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
     ) -> tuple[Array, dict[str, Any]]:
         """Draw new episodes for all environments."""
         super().reset(seed=seed)
-        self.state = env.reset(
+        self.state = reset(
             self.machine, self.config, self.np_random, self.num_envs, self.net is None
         )
         self.pictures.follow(self.state, range(self.num_envs))
-        return env.look(self.machine, self.config, self.state, self.np_random), {}
+        return get_obs(self.machine, self.config, self.state, self.np_random), {}
 
     def step(self, actions: Array) -> tuple[Array, Array, Bools, Bools, dict[str, Any]]:
         """One tick of all environments: actions (num_envs, n_driven)."""
         if self.state is None:
             raise ValueError("step: expected a reset before the first step, got none")
-        self.state, out = env.step(
-            self.machine, self.config, self.net, self.state, actions, self.np_random
+        m, config, rng = self.machine, self.config, self.np_random
+        info: dict[str, Any] = {"state": self.state}
+        state, reward, terminated, truncated, error = env.step(
+            m, config, self.net, self.state, actions
         )
-        observation = out.observation
-        info: dict[str, Any] = {"velocity_error": out.velocity_error}
-        ended = out.terminated | out.truncated
+        info["velocity_error"] = error
+        state = new_goals(m, config, state, rng)
+        obs = get_obs(m, config, state, rng)
+        ended = terminated | truncated
         rows = np.flatnonzero(ended)
         if len(rows):
-            fresh = env.reset(
-                self.machine, self.config, self.np_random, len(rows), self.net is None
-            )
-            self.state = env.merge(self.state, fresh, rows)
-            info |= {"final_obs": observation, "_final_obs": ended}
-            observation = observation.copy()
-            observation[rows] = env.look(self.machine, self.config, fresh, self.np_random)
+            fresh = reset(m, config, rng, len(rows), self.net is None)
+            state = replace_rows(state, rows, fresh)
+            info |= {"final_obs": obs, "_final_obs": ended}
+            obs = obs.copy()
+            obs[rows] = get_obs(m, config, fresh, rng)
+        self.state = state
         self.pictures.follow(self.state, rows)
-        return observation, out.reward, out.terminated, out.truncated, info
+        return obs, reward, terminated, truncated, info
 
     def render(self) -> tuple[NDArray[np.uint8], ...]:
         """A frame (600, 960, 3) of each environment."""
@@ -124,22 +127,24 @@ class TaskEnv(gymnasium.Env[Array, Array]):
     ) -> tuple[Array, dict[str, Any]]:
         """Draw a new episode."""
         super().reset(seed=seed)
-        self.state = env.reset(self.machine, self.config, self.np_random, 1, self.net is None)
+        self.state = reset(self.machine, self.config, self.np_random, 1, self.net is None)
         self.pictures.follow(self.state, [0])
-        return env.look(self.machine, self.config, self.state, self.np_random)[0], {}
+        return get_obs(self.machine, self.config, self.state, self.np_random)[0], {}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """One tick: action (n_driven,)."""
         if self.state is None:
             raise ValueError("step: expected a reset before the first step, got none")
         action = np.asarray(action)[None]
-        self.state, out = env.step(
-            self.machine, self.config, self.net, self.state, action, self.np_random
+        m, config = self.machine, self.config
+        state, reward, terminated, truncated, error = env.step(
+            m, config, self.net, self.state, action
         )
-        info = {"velocity_error": float(out.velocity_error[0])}
-        flags = bool(out.terminated[0]), bool(out.truncated[0])
+        self.state = new_goals(m, config, state, self.np_random)
         self.pictures.follow(self.state, [])
-        return out.observation[0], float(out.reward[0]), *flags, info
+        obs = get_obs(m, config, self.state, self.np_random)[0]
+        info = {"velocity_error": float(error[0])}
+        return obs, float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
 
     def render(self) -> NDArray[np.uint8] | None:
         """The present picture (600, 960, 3), or None: it is on the screen."""
@@ -158,7 +163,7 @@ def _open(machine: Machine, actuator: ActuatorNet | Path | str) -> ActuatorNet |
     if isinstance(actuator, str) and actuator == "analytic":
         return None
     net = actuator if isinstance(actuator, ActuatorNet) else load_net(Path(actuator))
-    return env.fitting_nets(machine, net)
+    return select_nets(machine, net)
 
 
 def _keep_freed_memory() -> None:

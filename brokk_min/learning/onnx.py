@@ -5,17 +5,17 @@ from pathlib import Path
 
 import numpy as np
 
+from brokk_min.env import COMPENSATION
 from brokk_min.identification.extras import need
 from brokk_min.identification.files import whole_file
-from brokk_min.learning.policy import STAND, Policy
-from brokk_min.observation import RAMP
+from brokk_min.learning.policy import STANDSTILL_TIMEOUT, Policy
 
 
 def export_onnx(path: Path, policy: Policy) -> None:
     """Write a policy as one self-contained ONNX file: `observation` (batch, obs) in, `action` out.
 
-    What follows is up to the other program: actions go through `to_command` (metadata `dead_zone`,
-    `pwm_limit`, `ramp`), and valves close when the tool was to stand for `stand_s` (`policy.STAND`).
+    What follows is up to the other program: actions go through `action_to_pwm` (metadata `dead_zone`,
+    `pwm_limit`, `ramp`), and valves close when the tool was to stand for `stand_s` (`policy.STANDSTILL_TIMEOUT`).
 
     ValueError: the package onnx is not there.
     """
@@ -41,9 +41,9 @@ def export_onnx(path: Path, policy: Policy) -> None:
     contract = {key: json.dumps(value) for key, value in policy.contract.items()}
     scales = {"mean": json.dumps(policy.mean.tolist()), "scale": json.dumps(policy.scale.tolist())}
     after = {
-        "ramp": json.dumps(RAMP),
-        "stand_s": json.dumps(STAND),
-    }  # see `to_command`, `PolicyController`
+        "ramp": json.dumps(COMPENSATION),
+        "stand_s": json.dumps(STANDSTILL_TIMEOUT),
+    }  # see `action_to_pwm`, `PolicyController`
     helper.set_model_props(model, contract | scales | after)
     checker.check_model(model, full_check=True)
     with whole_file(path) as file:

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min.actuator import ActuatorNet, net_arrays, net_from_arrays
-from brokk_min.env import fitting_nets
+from brokk_min.actuator import ActuatorNet, select_nets
+from brokk_min.env import Measured, action_to_pwm, features, observation_scale
 from brokk_min.identification.files import (
     expect_same,
     expected,
@@ -18,10 +18,10 @@ from brokk_min.identification.files import (
     load_header,
     whole_file,
 )
+from brokk_min.identification.net_file import net_arrays, net_from_arrays
 from brokk_min.machine import Array, Machine
-from brokk_min.observation import observation_scale, to_command
 
-STAND = 2.0  # s, assumed: valves close when the tool was to stand still for longer
+STANDSTILL_TIMEOUT = 2.0  # s, assumed: valves close when the goal was zero for longer
 FORMAT = 3  # of policy files; 1: actions without the way through the dead zone; 2: commands beside angles
 
 
@@ -31,13 +31,13 @@ class Policy:
 
     contract: Mapping[str, Any]  # what training and machine must agree on, see `contract`
     training: Mapping[str, Any]  # seed and settings that made it
-    mean: Array  # (obs,) normalisation that `observe` applied
+    mean: Array  # (obs,) normalisation that `env.features` applied
     scale: Array  # (obs,)
     weights: tuple[Array, ...]  # w, b of each layer, w (inputs, outputs)
     net: ActuatorNet  # the simulation it was trained in, kept with it
 
     def act(self, observation: Array) -> Array:
-        """Actions (..., n_driven) for observations (..., obs) of `observe`; `to_command` clips them.
+        """Actions (..., n_driven) for observations (..., obs) of `env.features`; `action_to_pwm` clips them.
 
         ValueError: a wrong shape or an observation that is no number.
         """
@@ -57,28 +57,28 @@ class Policy:
 
 @dataclass(frozen=True)
 class PolicyController:
-    """A policy as an `env.Controller`. The observation carries what it needs to remember.
+    """A policy as an `evaluation.rollout.Controller`.
 
-    Policies keep valves barely open where the tool is to stand, as if it were to move again at once. But
-    then it wanders. So the valves close when it was to stand for longer than `STAND`; that is remembered.
+    A policy keeps its valves just open where the tool is to stand still, as if it were to move again
+    at once. The tool then drifts. So the valves close after `STANDSTILL_TIMEOUT` of a zero goal.
     """
 
     machine: Machine
     policy: Policy
 
     def start(self, num: int) -> NDArray[np.int64]:
-        """Ticks for which each of `num` tools was to stand, (num,)."""
+        """Ticks since the last goal other than zero, (num,)."""
         return np.zeros(num, np.int64)
 
     def __call__(
-        self, observation: Array, memory: NDArray[np.int64]
+        self, measured: Measured, ticks: NDArray[np.int64]
     ) -> tuple[Array, NDArray[np.int64]]:
-        """Commands u (num, n) for observations (num, obs), and the next memory."""
-        u = to_command(self.machine, self.policy.act(observation))
-        moves = observation[..., :3].any(axis=-1)  # no noise makes a goal of none
-        stood = np.where(moves, 0, memory + 1)
-        u[stood > STAND * self.machine.rate] = 0.0
-        return u, stood
+        """Commands u (num, n), and the ticks of `start` one tick on."""
+        u = action_to_pwm(self.machine, self.policy.act(features(self.machine, measured)))
+        moving = measured.v_goal.any(axis=-1)
+        ticks = np.where(moving, 0, ticks + 1)
+        u[ticks > STANDSTILL_TIMEOUT * self.machine.rate] = 0.0
+        return u, ticks
 
 
 def contract(machine: Machine) -> dict[str, Any]:
@@ -124,7 +124,7 @@ def load_policy(path: Path, machine: Machine) -> Policy:
     with expected(path, "a complete policy"):
         weights = tuple(arrays[f"weight_{i}"] for i in range(8))
         net = {name[4:]: array for name, array in arrays.items() if name.startswith("net_")}
-        fitted = fitting_nets(machine, net_from_arrays(path, net))
+        fitted = select_nets(machine, net_from_arrays(path, net))
         policy = Policy(found, header["training"], arrays["mean"], arrays["scale"], weights, fitted)
         action = policy.act(policy.mean)
     if action.shape != machine.driven.shape or not np.isfinite(action).all():

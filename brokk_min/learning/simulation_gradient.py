@@ -1,125 +1,194 @@
-"""Which way every action should have gone: rewards differentiated through nets and kinematics.
+"""Advantages from the simulation's derivatives: backpropagation through time instead of a critic.
 
-The simulation is made of nets, so what an action does need not be guessed from noisy returns. The adjoint
-method walks a rollout backwards, tick by tick, with the derivative of the rewards to come by everything
-that a tick leaves behind: the angles, and the history that the nets see next.
+The simulation is made of nets and kinematics, so the rewards to come can be differentiated by each
+action. With the state x_t (history, angles, error integral) and x_{t+1} = f(x_t, a_t), the costate
+
+    lambda_t = dr_t/dx_t + gamma (df/dx_t)^T lambda_{t+1}
+
+runs backwards through a rollout, and dR/da_t = dr_t/da_t + gamma (df/da_t)^T lambda_{t+1}. The advantage of an
+action is, to first order, this gradient times its deviation from the mean action. The field calls
+this a first-order or gradient-informed policy gradient: PODS (Mora et al., 2021), SHAC (Xu et al.,
+2022), GI-PPO (Son et al., 2023, arXiv 2312.08710). Here it feeds PPO's clipped loss.
+
+Encoders and commands count as exact, not as whole steps; Jacobian and dead-zone compensation count
+as constant: in one second a joint turns little.
 """
-
-from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from brokk_min.actuator import ActuatorNet, push_command
-from brokk_min.env import TaskConfig
-from brokk_min.kinematics import tool_jacobian
-from brokk_min.machine import PWM_MAX, Array, Machine, estimate_velocity
-from brokk_min.observation import LAG_SPEED, LAG_TIME, command_slope, push_lag
+from brokk_min import ppo
+from brokk_min.actuator import MU, ActuatorNet, append_command, folded_weights
+from brokk_min.env import (
+    COMPENSATION,
+    INTEGRAL_LIMIT,
+    INTEGRAL_TIME,
+    TaskConfig,
+    action_to_pwm,
+    integrate_error,
+)
+from brokk_min.kinematics import forward_kinematics, jacobian
+from brokk_min.machine import PWM_MAX, Array, Machine, estimate_velocity, valve_opening
 
 
-class Rollout(NamedTuple):
-    """What each tick of `env.step` began with, and the command it got: arrays (T, num, ...)."""
+class Ticks(NamedTuple):
+    """What each tick of `env.step` began with, and its command: arrays (T, num, ...)."""
 
     q: Array  # true angle [rad], n
-    motion: Array  # of `env.State`, (n, 3, H)
-    v_goal: Array  # wanted tool velocity [m/s], 3
-    lag: Array  # of `observation.push_lag` [m], 3
+    true_history: Array  # of `env.State`, (n, 3, H)
+    v_goal: Array  # goal velocity [m/s], 3
+    error_integral: Array  # of `env.integrate_error` [m], 3
     u: Array  # command, n
-    ended: NDArray[np.bool_]  # did the episode end with the tick?
+    done: NDArray[np.bool_]  # did the episode end with the tick?
+
+
+def gradient_advantages(machine: Machine, net: ActuatorNet, task: TaskConfig) -> ppo.Estimate:
+    """The estimate that `ppo.train` takes, for rollouts of `gym_env.TaskVectorEnv` on `net`."""
+
+    def estimate(
+        agent: ppo.Agent, rollout: ppo.Rollout, config: ppo.PPOConfig
+    ) -> dict[str, Tensor]:
+        states = [info["state"] for info in rollout.infos]
+        ticks = Ticks(
+            q=np.stack([state.q for state in states]),
+            true_history=np.stack([state.true_history for state in states]),
+            v_goal=np.stack([state.v_goal for state in states]),
+            error_integral=np.stack([state.error_integral for state in states]),
+            u=action_to_pwm(machine, rollout.actions.numpy()),
+            done=rollout.dones.numpy(),
+        )
+        gradient = torch.from_numpy(action_gradients(machine, net, ticks, config.gamma, task))
+        deviation = rollout.actions.clamp(-1, 1) - rollout.means.clamp(-1, 1)
+        return {"advantages": (gradient * deviation).sum(-1)}
+
+    return estimate
 
 
 def action_gradients(
-    machine: Machine, net: ActuatorNet, rollout: Rollout, gamma: float, task: TaskConfig
+    machine: Machine, net: ActuatorNet, ticks: Ticks, gamma: float, task: TaskConfig
 ) -> Array:
-    """Derivative of the discounted rewards to come by each action, all other actions as they were.
-
-    Rewards are those of `env.step`. Encoders and commands count as exact, not as whole steps, and the
-    Jacobian and `observation.command_slope` as constant: in a second a joint turns little.
-    Paper: Sec. 3.4 (nets in the simulation); ours
+    """dR/da_t: derivative of the discounted rewards to come by each action, all others as they were.
 
     Args:
         machine: n joints.
-        net: nets of its driven joints, that made the rollout.
-        rollout: T ticks of `num` environments; rewards after the last are not seen.
+        net: nets of its driven joints, which made the rollout.
+        ticks: T ticks of `num` environments; rewards after the last are not seen.
         gamma: discount.
-        task: its costs of moving valves and of staying behind.
+        task: its costs of valve travel and of the error integral.
 
     Returns:
-        Shape (T, num, n_driven), float32, by actions as `observation.to_command` takes them.
+        Shape (T, num, n_driven), float32, by actions as `env.action_to_pwm` takes them.
     """
-    driven, by_action = machine.driven, command_slope(machine, rollout.u)
-    by_velocity, by_history, free = _each_tick(machine, net, rollout, gamma, task.lag_cost)
-    turned = (rollout.u - rollout.motion[..., 2, -1])[..., driven]
-    cost = np.sign(turned).astype(np.float32)
-    cost *= np.float32(task.valve_cost / len(driven) * PWM_MAX / machine.pwm_limit)
-    samples = machine.velocity_samples
-    window = estimate_velocity(np.eye(samples), samples, machine.dt).astype(np.float32)
-    result = np.empty_like(by_velocity)
-    # derivatives of the rewards to come by what a tick leaves: history (num, n_driven, 3, H), angle, command
-    past, angle, turn = (np.zeros_like(a[0]) for a in (by_history, by_velocity, by_velocity))
-    for t in range(len(result) - 1, -1, -1):
-        discount = np.float32(gamma) * ~rollout.ended[t, :, None]  # (num, 1)
-        past, angle, turn = past * discount[..., None, None], angle * discount, turn * discount
-        past[..., 0, -samples:] += (
-            past[..., 1, -1:] * window
-        )  # the newest velocity is a slope of angles
-        angle = (angle + past[..., 0, -1]) * free[t]
-        before = (angle * np.float32(machine.dt) + by_velocity[t])[..., None, None] * by_history[t]
-        before[..., :2, 1:] += past[
-            ..., :2, :-1
-        ]  # each measured sample moves back to where it was,
-        before[..., 2, :] += past[..., 2, :]  # commands stand where the tick put them
-        result[t] = (before[..., 2, -1] - cost[t] + turn) * by_action[t]
-        before[..., 2, 1:] = before[..., 2, :-1]
-        before[..., 2, 0] = 0
-        past, turn = before, cost[t]
-    return result
+    du_da = compensation_derivative(machine, ticks.u)
+    dr_dq_dot, dq_dot_dh, free = local_derivatives(machine, net, ticks, gamma, task.integral_cost)
+    dc_du = valve_cost_gradient(machine, ticks, task.valve_cost)
+    window = machine.velocity_samples
+    slope = estimate_velocity(np.eye(window), window, machine.dt).astype(np.float32)  # dq_dot/dq
+    dR_da = np.empty_like(dr_dq_dot)
+    # costates of history (num, n_driven, 3, H), angle and last command (num, n_driven), at t + 1
+    h, q, u = np.zeros_like(dq_dot_dh[0]), np.zeros_like(dc_du[0]), np.zeros_like(dc_du[0])
+    for t in reversed(range(len(dR_da))):
+        discount = np.float32(gamma) * ~ticks.done[t, :, None]
+        h = h * discount[..., None, None]
+        q = q * discount
+        u = u * discount
+        h[..., 0, -window:] += h[..., 1, -1:] * slope  # the newest velocity is a slope of angles
+        q = (q + h[..., 0, -1]) * free[t]  # q_{t+1} = q_t + dt q_dot; none at a limit
+        q_dot = q * np.float32(machine.dt) + dr_dq_dot[t]
+        h_now = q_dot[..., None, None] * dq_dot_dh[t]  # (dq_dot/dh)^T
+        h_now[..., :2, 1:] += h[..., :2, :-1]  # the shift of the history, backwards
+        h_now[..., 2, :] += h[..., 2, :]  # the net reads commands already shifted
+        dR_da[t] = (h_now[..., 2, -1] - dc_du[t] + u) * du_da[t]
+        h_now[..., 2, 1:] = h_now[..., 2, :-1]
+        h_now[..., 2, 0] = 0
+        h = h_now
+        u = dc_du[t]
+    return dR_da
 
 
-def _each_tick(
-    machine: Machine, net: ActuatorNet, rollout: Rollout, gamma: float, lag_cost: float
+def valve_cost_gradient(machine: Machine, ticks: Ticks, valve_cost: float) -> Array:
+    """Derivative of the cost of valve travel by the command of the tick, (T, num, n_driven)."""
+    change = (ticks.u - ticks.true_history[..., 2, -1])[..., machine.driven]
+    limit = len(machine.driven) * machine.pwm_limit / PWM_MAX
+    return np.sign(change).astype(np.float32) * np.float32(valve_cost / limit)
+
+
+def local_derivatives(
+    machine: Machine, net: ActuatorNet, ticks: Ticks, gamma: float, integral_cost: float
 ) -> tuple[Array, Array, Array]:
-    """What a tick does by itself, (T, num, n_driven, ...): rewards by its velocities, these by the history
-    (3, H) with the new command in it, and 1 where the joint is not held by the end of its range."""
-    driven = machine.driven
-    velocity, by_history = net.slope(
-        push_command(rollout.motion[..., driven, :, :], rollout.u[..., driven])
-    )
-    moved = rollout.q[..., driven] + velocity * machine.dt
-    q = rollout.q.copy()
-    q[..., driven] = np.clip(
-        moved, machine.column("q_min")[driven], machine.column("q_max")[driven]
-    )
-    free = q[..., driven] == moved
-    J = tool_jacobian(machine, q.astype(np.float32))[1][..., driven]
-    error = rollout.v_goal - (J @ (velocity * free).astype(np.float32)[..., None])[..., 0]
-    size = np.linalg.norm(error, axis=-1, keepdims=True)
-    by_tool = error / (
-        np.maximum(size, 1e-6) * (1 + size) ** 2
-    )  # of 1 / (1 + |v_goal - v_tool|), eq2
-    by_tool += _by_lag(machine, rollout, error, gamma, lag_cost)
-    by_velocity = (by_tool[..., None, :] @ J)[..., 0, :] * free
-    return by_velocity, by_history, free.astype(np.float32)
+    """Derivatives within each tick, (T, num, n_driven, ...).
 
-
-def _by_lag(machine: Machine, rollout: Rollout, error: Array, gamma: float, cost: float) -> Array:
-    """What way left behind costs in all ticks to come, by the tool's velocity in each, (T, num, 3).
-
-    `error` [m/s] (T, num, 3) is what `push_lag` adds up: beyond its limit only the direction counts.
+    dr/dq_dot; dq_dot/dhistory (3, H) with the command of the tick in it; 1 where no limit holds.
     """
-    limit, decay = LAG_SPEED * machine.tool_speed, np.exp(-machine.dt / LAG_TIME)
-    lag = push_lag(machine, rollout.v_goal - error, rollout.v_goal, rollout.lag)
-    by_lag: Array = (
-        np.float32(cost) * lag / np.maximum(np.linalg.norm(lag, axis=-1, keepdims=True), 1e-6)
-    )
+    driven = machine.driven
+    low, high = machine.column("q_min")[driven], machine.column("q_max")[driven]
+    history = append_command(ticks.true_history[..., driven, :, :], ticks.u[..., driven])
+    velocity, dq_dot_dh = input_gradient(net, history)
+    moved = ticks.q[..., driven] + velocity * machine.dt
+    q = ticks.q.copy()
+    q[..., driven] = np.clip(moved, low, high)
+    free = q[..., driven] == moved
+    J = jacobian(forward_kinematics(machine, q.astype(np.float32)))[..., driven]
+    error = ticks.v_goal - (J @ (velocity * free).astype(np.float32)[..., None])[..., 0]
+    size = np.linalg.norm(error, axis=-1, keepdims=True)
+    # d/dv_tool of 1 / (1 + |e|), e = v_goal - v_tool: e / (|e| (1 + |e|)^2) (eq2)
+    dr_dv = error / (np.maximum(size, 1e-6) * (1 + size) ** 2)
+    dr_dv += integral_gradient(machine, ticks, error, gamma, integral_cost)
+    dr_dq_dot = (dr_dv[..., None, :] @ J)[..., 0, :] * free  # v_tool = J q_dot
+    return dr_dq_dot, dq_dot_dh, free.astype(np.float32)
+
+
+def integral_gradient(
+    machine: Machine, ticks: Ticks, error: Array, gamma: float, cost: float
+) -> Array:
+    """Derivative of the cost of the error integral, now and later, by v_tool, (T, num, 3).
+
+    I_t = exp(-dt/T) (I_{t-1} + dt cut(e_t)), cost |I_t|. Where the error [m/s] (T, num, 3) is cut,
+    only its direction counts.
+    """
+    limit = INTEGRAL_LIMIT * machine.tool_speed
+    leak = np.exp(-machine.dt / INTEGRAL_TIME)
+    I = integrate_error(machine, ticks.v_goal, ticks.v_goal - error, ticks.error_integral)  # noqa: E741
+    dc_dI = np.float32(cost) * I / np.maximum(np.linalg.norm(I, axis=-1, keepdims=True), 1e-6)
     size = np.maximum(np.linalg.norm(error, axis=-1, keepdims=True), 1e-6)
-    along = error / size
-    result, later = np.empty_like(by_lag), 0 * by_lag[0]
-    for t in range(len(by_lag) - 1, -1, -1):
-        later = by_lag[t] + np.float32(gamma * decay) * ~rollout.ended[t, :, None] * later
-        radial = np.sum(later * along[t], axis=-1, keepdims=True) * along[t]
-        counted = np.where(size[t] < limit, later, (later - radial) * limit / size[t])
-        result[t] = counted * np.float32(decay * machine.dt)
-    return result
+    direction = error / size
+    result = np.empty_like(dc_dI)
+    costate = np.zeros_like(dc_dI[0])
+    for t in reversed(range(len(result))):
+        costate = dc_dI[t] + np.float32(gamma * leak) * ~ticks.done[t, :, None] * costate
+        radial = np.sum(costate * direction[t], axis=-1, keepdims=True) * direction[t]
+        cut = (costate - radial) * limit / size[t]
+        result[t] = np.where(size[t] < limit, costate, cut) * np.float32(leak * machine.dt)
+    return np.asarray(result)
+
+
+def input_gradient(net: ActuatorNet, history: Array) -> tuple[Array, Array]:
+    """Velocity of the nets and its derivative by the history (..., n, 3, H), by backpropagation."""
+    velocity, y, hidden2, hidden1 = net.forward(history)
+    w1, _, w2, _, w3, _ = folded_weights(net)
+    gradient = (net.output_high - net.output_low)[:, None, None] * y * (1 - y)  # sigmoid
+    gradient = gradient @ w3.swapaxes(1, 2) * (hidden2 > 0)  # ReLU
+    gradient = gradient @ w2.swapaxes(1, 2) * (hidden1 > 0)
+    gradient = (gradient @ w1.swapaxes(1, 2)).swapaxes(0, 1).reshape(history.shape)
+    gradient[..., 2, :] *= mu_law_derivative(history[..., 2, :], net.dead_zone)
+    return velocity, gradient
+
+
+def mu_law_derivative(u: Array, dead_zone: float) -> Array:
+    """Derivative of `actuator.mu_law` by `u`, same shape; 0 within the dead zone."""
+    if not dead_zone:
+        return np.ones_like(u)
+    x = np.abs(valve_opening(u, dead_zone))
+    slope: Array = MU / ((1 + MU * x) * np.log1p(MU) * (1 - dead_zone))
+    return np.asarray((x > 0) * slope, u.dtype)
+
+
+def compensation_derivative(machine: Machine, u: Array) -> Array:
+    """Derivative of `env.action_to_pwm` by the action at commands `u` (..., n): (..., n_driven)."""
+    beyond = machine.pwm_limit / PWM_MAX - machine.dead_zone
+    crossing = np.abs(u[..., machine.driven]) < machine.dead_zone + COMPENSATION * beyond
+    return np.asarray((beyond + crossing * (machine.dead_zone / COMPENSATION)), np.float32)

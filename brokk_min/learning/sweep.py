@@ -27,9 +27,10 @@ from brokk_min.evaluation.metrics import by_start, mean_interval
 from brokk_min.evaluation.sequences import AXES, scored_starts, task_sequences
 from brokk_min.identification.extras import need
 from brokk_min.identification.files import expect_same, expected, write_json
+from brokk_min.learning.checkpoint import describe_training, train_policy
 from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import Array, Machine
-from brokk_min.ppo import PPOConfig, identity_of, train
+from brokk_min.ppo import PPOConfig
 
 Submit = Callable[..., "Future[Rows]"]
 
@@ -46,13 +47,13 @@ def one_seed(
     """Train a seed and drive the machine with it; takes up what an earlier call left in the folder `out`."""
     policy_file, result_file = out / f"seed_{seed}.npz", out / f"seed_{seed}.json"
     driven = {"starts": starts, "sequences": [s.name for s in task_sequences(machine)]}
-    identity = identity_of(machine, net, task, config, seed) | driven
+    identity = describe_training(machine, net, task, config, False, seed) | driven
     if result_file.exists():
         return _finished(result_file, identity)
     trained = load_policy(policy_file, machine) if policy_file.exists() else None
     if not trained or dict(trained.training) | driven != identity:
         again = Path(f"{policy_file}.checkpoint").exists()
-        trained = train(machine, net, task, config, seed, policy_file, again)
+        trained = train_policy(machine, net, task, config, seed, policy_file, resume=again)
     rl = PolicyController(machine, trained)
     runs = _on_the_machine(machine, {"rl": rl}, starts)
     write_json(result_file, {"identity": identity, "runs": runs})

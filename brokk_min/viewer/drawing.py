@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min.kinematics import tool_state
+from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocity
 from brokk_min.machine import PWM_MAX, Array, Machine
 from brokk_min.viewer.looks import Box, Camera, cameras, extent, near_limit, near_singular, skeleton
 
@@ -164,7 +164,8 @@ def _heading(scene: Scene, box: Box) -> list[Shape]:
 
 
 def _views(machine: Machine, scene: Scene, side: Box, top: Box) -> list[Shape]:
-    p_tool, v_tool, _ = tool_state(machine, scene.q, scene.q_dot)
+    frames = forward_kinematics(machine, scene.q)
+    p_tool, v_tool = tool_position(frames), tool_velocity(frames, scene.q_dot)
     low, weak = near_limit(machine, scene.q), near_singular(machine, scene.q)
     shapes: list[Shape] = []
     eyes = cameras(machine, p_tool, side, top, scene.hold)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brokk_min.kinematics import frames, jacobian
+from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.machine import Array, Machine
 
 Box = tuple[float, float, float, float]  # left, top, width, height [px]
@@ -57,8 +57,7 @@ def extent(machine: Machine) -> Extent:
 
 def skeleton(machine: Machine, q: ArrayLike) -> Array:
     """Corners of the arm [m], (..., 2 n + 1, 3): the base, then the end of each joint's d and of its a."""
-    T = frames(machine, q)
-    p, z = T[..., :3, 3], T[..., :3, 2]
+    p, z = forward_kinematics(machine, q)
     corners = np.empty((*p.shape[:-2], 2 * machine.n + 1, 3))
     corners[..., ::2, :] = p
     corners[..., 1::2, :] = p[..., :-1, :] + machine.column("d")[:, None] * z[..., :-1, :]
@@ -110,7 +109,9 @@ def weakest(machine: Machine, q: Array) -> tuple[float, Array]:
     The least singular value of the Jacobian; manipulability is the product of them all, and for a slewing
     arm says little more than how far out the tool is.
     """
-    ways, values, _ = np.linalg.svd(jacobian(machine, q), full_matrices=False)
+    ways, values, _ = np.linalg.svd(
+        jacobian(forward_kinematics(machine, q))[..., machine.driven], full_matrices=False
+    )
     return float(values[-1]), ways[:, -1]
 
 

@@ -15,8 +15,8 @@ from brokk_min.can import operator_input as wishes
 from brokk_min.can.canopen import open_line
 from brokk_min.can.safety_gate import fault_name
 from brokk_min.can.ticks import Known, Ticks, unpack_known
-from brokk_min.env import Controller
-from brokk_min.kinematics import tool_position
+from brokk_min.evaluation.rollout import Controller
+from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
 from brokk_min.viewer import drawing as view
 from brokk_min.viewer import tracing
@@ -191,7 +191,7 @@ class Session:
         self.before, self.known, self.arrived = self.known, known, now
         if not np.isfinite(known.q).all():
             return
-        self.trail = [*self.trail, tool_position(self.machine, known.q)][-600:]
+        self.trail = [*self.trail, tool_position(forward_kinematics(self.machine, known.q))][-600:]
         if self.tracing and self.tracing.p and self.before and known.mode != self.before.mode:
             self.next_task(again=True)  # another one translates
         if self.tracing and self.tracing.follow(known):
@@ -231,7 +231,7 @@ class Session:
         if self.tracing:  # near, but never so near that the tool is not seen
             passed, hold = (
                 self.tracing.passed,
-                np.vstack([self.path, tool_position(self.machine, q)]),
+                np.vstack([self.path, tool_position(forward_kinematics(self.machine, q))]),
             )
             look = look._replace(target=self.path[passed : passed + 1], hold=hold)
         colour = view.COLOURS.get(mode, view.STEEL)

@@ -20,9 +20,9 @@ from brokk_min.can import operator_input as wishes
 from brokk_min.can.canopen import open_line
 from brokk_min.can.simulated_machine import SimulatedMachine, serve, start_pose
 from brokk_min.can.ticks import Known
-from brokk_min.env import Controller
+from brokk_min.env import Measured, action_to_pwm
+from brokk_min.evaluation.rollout import Controller
 from brokk_min.machine import PWM_MAX, Array, Machine
-from brokk_min.observation import to_command
 
 STALE = 0.2  # s without a word from the window, then the operator's device is lost (assumed)
 
@@ -71,7 +71,7 @@ def unpack_ask(values: Array) -> Ask:
 
 
 class Levers:
-    """A controller that translates nothing: each lever is a driven joint's action of `to_command`."""
+    """A controller that translates nothing: each lever is a driven joint's action of `action_to_pwm`."""
 
     def __init__(self, machine: Machine) -> None:
         self.machine = machine
@@ -80,10 +80,10 @@ class Levers:
     def start(self, num: int) -> None:
         """Nothing to remember."""
 
-    def __call__(self, observation: Array, memory: None) -> tuple[Array, None]:
+    def __call__(self, measured: Measured, memory: None) -> tuple[Array, None]:
         """Commands u (num, n), whatever is observed."""
         return np.repeat(
-            to_command(self.machine, self.levers)[None], len(observation), axis=0
+            action_to_pwm(self.machine, self.levers)[None], len(measured.q), axis=0
         ), None
 
 
@@ -98,11 +98,11 @@ class Chosen:
         return self.mode, self.controllers[self.mode].start(num)
 
     def __call__(
-        self, observation: Array, memory: tuple[int, Any]
+        self, measured: Measured, memory: tuple[int, Any]
     ) -> tuple[Array, tuple[int, Any]]:
         """Commands and memory of the chosen one."""
-        mode, inner = memory if memory[0] == self.mode else self.start(len(observation))
-        u, inner = self.controllers[mode](observation, inner)
+        mode, inner = memory if memory[0] == self.mode else self.start(len(measured.q))
+        u, inner = self.controllers[mode](measured, inner)
         return u, (mode, inner)
 
 

@@ -13,11 +13,11 @@ from tqdm import tqdm
 from brokk_min.actuator import ActuatorNet
 from brokk_min.can.canopen import read_frames
 from brokk_min.can.ticks import Known, Ticks
-from brokk_min.env import Controller, Trace
 from brokk_min.evaluation import baselines, experiments
+from brokk_min.evaluation.rollout import Controller, Trace
 from brokk_min.evaluation.sequences import Commands, goals_and_starts, task_sequences
 from brokk_min.identification.files import expected, whole_file
-from brokk_min.kinematics import tool_position, tool_state
+from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocity
 from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import Array, Machine
 from brokk_min.viewer import drawing as view
@@ -44,7 +44,8 @@ def recorded(
     q, q_dot, v_goal = (
         np.array([getattr(k, name) for k in known]) for name in ("q", "q_dot", "v_goal")
     )
-    p_tool, v_tool, _ = tool_state(machine, q, q_dot)
+    frames = forward_kinematics(machine, q)
+    p_tool, v_tool = tool_position(frames), tool_velocity(frames, q_dot)
     corners = skeleton(machine, q[::10]).reshape(-1, 3)
     error = np.linalg.norm(v_goal - v_tool, axis=-1)
     return Run(title, colour, known, p_tool, error, path, np.vstack([corners, path]))
@@ -138,7 +139,10 @@ def driven_again(
             raise ValueError(
                 f"{results.path}: expected the run {row}, got {same or 'none'}: another program?"
             )
-    goals, first = results.sequences[sequence].goals, tool_position(machine, results.starts[start])
+    goals, first = (
+        results.sequences[sequence].goals,
+        tool_position(forward_kinematics(machine, results.starts[start])),
+    )
     return [
         run_of_trace(machine, name, traces[name, sequence], start, goals, first) for name in chosen
     ]

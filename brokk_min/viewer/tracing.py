@@ -11,7 +11,7 @@ import numpy as np
 
 from brokk_min.can.ticks import Known
 from brokk_min.identification import files
-from brokk_min.kinematics import tool_position
+from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
 from brokk_min.viewer.looks import extent
 
@@ -79,7 +79,7 @@ class Tracing:
         """One tick; True if it was the last."""
         if not self.p and not known.u.any():
             return False
-        p = tool_position(self.machine, known.q)
+        p = tool_position(forward_kinematics(self.machine, known.q))
         self.begun = self.begun if self.p else known.tick
         self.seconds = (known.tick - self.begun + 1) * self.machine.dt
         self.p.append(p)

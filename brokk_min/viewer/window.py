@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brokk_min.identification.extras import need
-from brokk_min.kinematics import tool_position
+from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
 from brokk_min.viewer.drawing import (
     PAPER,
@@ -145,7 +145,7 @@ class Pictures:
         """After a reset or a step to an `env.State`; `fresh` are the rows that begin anew."""
         if self.mode is not None:
             self.trails |= {row: [] for row in np.asarray(fresh).tolist()}
-            for row, p_tool in enumerate(tool_position(self.machine, state.q)):
+            for row, p_tool in enumerate(tool_position(forward_kinematics(self.machine, state.q))):
                 self.trails[row].append(p_tool)
         if self.mode == "human":
             self.take(state)

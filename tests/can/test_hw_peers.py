@@ -27,18 +27,18 @@ from helpers_machines import small_net
 
 from brokk_min import hw
 from brokk_min.__main__ import main
-from brokk_min.actuator import load_net
 from brokk_min.can import canopen as bus
 from brokk_min.can import operator_input as wishes
 from brokk_min.can import simulated_machine as simulator
 from brokk_min.can.safety_gate import encoder_raw
+from brokk_min.env import COMPENSATION_RANGE, observation_scale
 from brokk_min.evaluation import baselines
 from brokk_min.identification.logs import read_log
+from brokk_min.identification.net_file import load_net
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.onnx import export_onnx
 from brokk_min.learning.policy import STAND, Policy, contract, save_policy
 from brokk_min.machine import BROKK_170
-from brokk_min.observation import RAMP, observation_scale
 
 GROUP = "239.74.163.2"
 
@@ -269,7 +269,7 @@ def test_the_exported_policy_is_the_policy(policy: Policy, folder: Path) -> None
     assert kept["driven"] == ["q1", "q3", "q4", "q5"] and kept["rate"] == 20.0
     for name in ("mean", "scale"):
         np.testing.assert_array_equal(np.float32(kept.pop(name)), getattr(policy, name))
-    assert (kept.pop("ramp"), kept.pop("stand_s")) == (RAMP, STAND) and kept == dict(
+    assert (kept.pop("ramp"), kept.pop("stand_s")) == (COMPENSATION_RANGE, STAND) and kept == dict(
         policy.contract
     )
     assert (model.ir_version, [(o.domain, o.version) for o in model.opset_import]) == (

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from brokk_min.actuator import plant_reset, plant_step
 from brokk_min.can import canopen as bus
 from brokk_min.can.canopen import Frame
 from brokk_min.can.safety_gate import checksum, encoder_raw
 from brokk_min.can.simulated_machine import START, WATCHDOG, SimulatedMachine, serve, start_pose
 from brokk_min.machine import BROKK_170
-from brokk_min.plant import plant_reset, plant_step
 
 NODES = [*(joint.encoder_node for joint in BROKK_170.joints), BROKK_170.controller_node]
 CONTROLLER = BROKK_170.controller_node

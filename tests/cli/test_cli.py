@@ -16,11 +16,11 @@ import pytest
 
 from benchmarks.rollout import random_net
 from brokk_min.__main__ import COMMANDS, main
-from brokk_min.actuator import load_net
 from brokk_min.cli.options import SHIPPED, WrongUse, check, chosen_policy, machine_from
 from brokk_min.evaluation import baselines, experiments
 from brokk_min.evaluation.metrics import summary
 from brokk_min.identification.logs import Log, Recording, read_log, write_log
+from brokk_min.identification.net_file import load_net
 from brokk_min.learning.policy import load_policy
 from brokk_min.machine import BROKK_170
 

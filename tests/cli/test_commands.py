@@ -451,13 +451,13 @@ def test_a_fit_is_judged_on_other_recordings_drawn_and_written(
 def test_training_gets_nets_settings_task_and_files(
     stand: Stand, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    calls = stand(commands, load_net="nets", fitting_nets="driven nets")
+    calls = stand(commands, load_net="nets", select_nets="driven nets")
     stand(ppo, train=None)
     options = (
         f"--actuator n.npz --out {tmp_path / 'p.npz'} --seed 5 --total-steps 9 --zero-goals 0.5"
     )
     assert run(f"train {options}") == 0
-    assert calls["load_net"] == (Path("n.npz"),) and calls["fitting_nets"] == (BROKK_170, "nets")
+    assert calls["load_net"] == (Path("n.npz"),) and calls["select_nets"] == (BROKK_170, "nets")
     machine, net, task, settings, *rest = calls["train"]
     assert (machine, net, task.zero_goals, settings.total_steps) == (
         BROKK_170,
@@ -475,12 +475,12 @@ def test_training_gets_nets_settings_task_and_files(
 def test_a_sweep_gets_its_seeds_from_the_first_on(
     stand: Stand, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    calls = stand(commands, load_net="nets", fitting_nets="driven nets")
+    calls = stand(commands, load_net="nets", select_nets="driven nets")
     stand(sweep, sweep="table", show="a table")
     options = f"--actuator n.npz --out {tmp_path} --seed 5 --total-steps 9 --zero-goals 0.5"
     assert run(f"sweep {options}") == 0
     machine, net, task, settings, *rest = calls["sweep"]
-    assert calls["load_net"] == (Path("n.npz"),) and calls["fitting_nets"] == (BROKK_170, "nets")
+    assert calls["load_net"] == (Path("n.npz"),) and calls["select_nets"] == (BROKK_170, "nets")
     assert (machine, net, task.zero_goals, settings.total_steps) == (
         BROKK_170,
         "driven nets",

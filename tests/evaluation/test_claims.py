@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from helpers_machines import obedient_net
 
-from brokk_min.env import Trace
+from brokk_min.env import Measured
 from brokk_min.evaluation import baselines, claims, report
+from brokk_min.evaluation.rollout import Trace
 from brokk_min.machine import BROKK_170
-from brokk_min.observation import Measured
 
 PAPERS = baselines.PAPERS
 POSE = np.array([1.5, 0.5, 0.58, 1.71, 1.24])

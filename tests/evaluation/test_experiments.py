@@ -17,18 +17,18 @@ from matplotlib.colors import to_rgb
 
 from benchmarks.rollout import random_net
 from brokk_min import jacobian, kinematics
-from brokk_min.actuator import ActuatorNet, fingerprint, load_net, save_net
-from brokk_min.env import TaskConfig, Trace, rollout
+from brokk_min.actuator import ActuatorNet, plant_reset, plant_step, speed_limits
+from brokk_min.env import Measured, TaskConfig, action_to_pwm, measured
 from brokk_min.evaluation import baselines, experiments, figures, report
 from brokk_min.evaluation import reproduce as chain
 from brokk_min.evaluation import robustness as variations
 from brokk_min.evaluation.metrics import metrics
+from brokk_min.evaluation.rollout import Trace, rollout
 from brokk_min.evaluation.sequences import task_sequences, tuning_goals
 from brokk_min.identification.logs import velocity_of
-from brokk_min.kinematics import joint_rates, tool_position
+from brokk_min.identification.net_file import fingerprint, load_net, save_net
+from brokk_min.kinematics import forward_kinematics, joint_rates, tool_position
 from brokk_min.machine import BROKK_170, Machine, read_encoder
-from brokk_min.observation import Measured, measured, to_command
-from brokk_min.plant import plant_reset, plant_step, speed_limits
 
 TINY = experiments.Effort(0.02, 60, 8192, 1, 2, 4, 2, 1.0)
 
@@ -47,7 +47,7 @@ def test_an_idle_controller_stands_still_and_errs_by_the_goal() -> None:
     start = np.array([[1.5, 0.5, 0.58, 1.71, 1.24]])
     goals = np.tile([0.0, 0.0, 0.2], (20, 1, 1))
     trace = rollout(BROKK_170, _Idle(), start, goals, TaskConfig(), np.random.default_rng(0))
-    found = metrics(BROKK_170, trace, goals, tool_position(BROKK_170, start))
+    found = metrics(BROKK_170, trace, goals, tool_position(forward_kinematics(BROKK_170, start)))
     row = {name: values[0] for name, values in found.items()}
     assert row["velocity_error_mean"] == pytest.approx(0.2, abs=1e-6)
     assert row["reward_mean"] == pytest.approx(1 / 1.2, abs=1e-6)
@@ -70,7 +70,7 @@ class FeedForward:
         share = rates / np.where(
             rates > 0, *(limit[:, self.machine.driven] for limit in (up, -down))
         )
-        return to_command(self.machine, share), None
+        return action_to_pwm(self.machine, share), None
 
 
 def test_another_controller_takes_twenty_lines() -> None:
@@ -733,7 +733,7 @@ def test_damping_alone_is_compared_near_a_singularity() -> None:
     assert list(traces) == [(c, s) for c in names for s in ("least_half", "least_quarter")]
     assert all(trace.q.shape == (30, 2, 5) for trace in traces.values())
     np.testing.assert_array_equal(traces["rl", "least_half"].q[-1], start)
-    J = kinematics.jacobian(BROKK_170, start)
+    J = kinematics.jacobian(kinematics.forward_kinematics(BROKK_170, start))[..., BROKK_170.driven]
     assert found["w0"] == jacobian.manipulability_threshold(BROKK_170)
     np.testing.assert_allclose(
         found["manipulability"], np.sqrt(np.linalg.det(J @ J.swapaxes(-1, -2)))

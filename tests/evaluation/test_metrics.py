@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from brokk_min.env import Trace
 from brokk_min.evaluation import metrics as m
+from brokk_min.evaluation.rollout import Trace
 from brokk_min.machine import BROKK_170
 
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from helpers_machines import obedient_net
 
-from brokk_min.env import TaskConfig, rest_state, rollout
+from brokk_min.actuator import plant_reset, plant_step
+from brokk_min.env import TaskConfig, initial_state, observe
 from brokk_min.evaluation import baselines
 from brokk_min.evaluation import perfect_model as mpc
-from brokk_min.kinematics import tool_velocity
+from brokk_min.evaluation.rollout import rollout
+from brokk_min.kinematics import forward_kinematics, tool_velocity
 from brokk_min.machine import BROKK_170, limit_command
-from brokk_min.observation import observe
-from brokk_min.plant import plant_reset, plant_step
 
 POSES = np.array([[1.5, 0.5, 0.58, 1.71, 1.24], [-0.8, 0.3, 0.9, 1.5, 1.0]])
 
@@ -35,7 +35,7 @@ def test_predicted_errors_are_what_the_plant_then_does() -> None:
         state = plant
         for tick in range(6):
             before, state = state.q, plant_step(BROKK_170, state, u[:, candidate, tick])
-            v = tool_velocity(BROKK_170, state.q, (state.q - before) * 20)
+            v = tool_velocity(forward_kinematics(BROKK_170, state.q), (state.q - before) * 20)
             np.testing.assert_allclose(found[:, candidate, tick], goal - v, atol=1e-5)
 
 
@@ -45,7 +45,7 @@ def test_a_steady_opening_moves_the_tool_at_the_goal() -> None:
     u = bound.commands(mpc.steady_opening(BROKK_170, POSES, goal)[:, None], 0)[:, 0]
     for _ in range(20):
         before, plant = plant.q, plant_step(BROKK_170, plant, u)
-    v = tool_velocity(BROKK_170, plant.q, (plant.q - before) * 20)
+    v = tool_velocity(forward_kinematics(BROKK_170, plant.q), (plant.q - before) * 20)
     np.testing.assert_allclose(v, goal, atol=0.02)  # the arm has moved on meanwhile
 
 
@@ -102,7 +102,7 @@ def test_a_plan_begins_at_rest_and_goes_on_tick_by_tick() -> None:
     memory = bound.start(4)
     np.testing.assert_array_equal(memory.plant.q, np.concatenate([POSES, POSES]))
     assert memory.tick == 0 and not memory.opening.any()
-    state = rest_state(BROKK_170, memory.plant.q, goals, plant=True)
+    state = initial_state(BROKK_170, memory.plant.q, goals, plant=True)
     _, after = bound(observe(BROKK_170, state.history, goals, state.lag), memory)
     assert after.tick == 1 and after.opening.shape == memory.opening.shape
 

@@ -13,7 +13,6 @@ from conftest import Stand
 from helpers_machines import obedient_net, obedient_velocity, random_machine, small_net
 
 from benchmarks.rollout import random_net
-from brokk_min import actuator
 from brokk_min.__main__ import main
 from brokk_min.actuator import ActuatorNet
 from brokk_min.evaluation import preliminary, trust
@@ -21,6 +20,7 @@ from brokk_min.identification import excitation, fitting
 from brokk_min.identification import validation as scores
 from brokk_min.identification.fitting import FitConfig
 from brokk_min.identification.logs import Log, Recording, read_log, velocity_of
+from brokk_min.identification.net_file import save_net
 from brokk_min.machine import BROKK_170, Machine
 
 LOW, HIGH = BROKK_170.column("q_min"), BROKK_170.column("q_max")
@@ -216,9 +216,9 @@ def test_the_gap_is_between_tools_where_the_arms_end(monkeypatch):
     )
     gap = preliminary.sim_to_real(BROKK_170, net, 0)
     np.testing.assert_allclose(gap.q, seen["q"][0] - seen["q"][1:], atol=1e-12)
-    from brokk_min.kinematics import tool_position
+    from brokk_min.kinematics import forward_kinematics, tool_position
 
-    p = tool_position(BROKK_170, seen["q"])
+    p = tool_position(forward_kinematics(BROKK_170, seen["q"]))
     np.testing.assert_allclose(gap.p_tool, p[0] - p[1:], atol=1e-12)
     np.testing.assert_allclose(gap.q_dot, -20 * np.diff(seen["q"], axis=0), atol=1e-12)
     np.testing.assert_allclose(gap.v_tool, -20 * np.diff(p, axis=0), atol=1e-12)
@@ -250,7 +250,7 @@ def test_the_papers_recipe_is_sines_without_ways_back_and_errors_of_one_step(mon
 
 def test_the_command_writes_figures_and_numbers(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     net = replace(random_net(np.random.default_rng(0)), machine="brokk170")
-    actuator.save_net(tmp_path / "net.npz", net)
+    save_net(tmp_path / "net.npz", net)
     out = tmp_path / "a" / "b"
     assert main(["preliminary", "--actuator", str(tmp_path / "net.npz"), "--out", str(out)]) == 0
     assert sorted(p.name for p in out.iterdir()) == [
@@ -277,7 +277,7 @@ def other_plant(delay: float, rate: float) -> Machine:
     joints = [replace(BROKK_170.joints[i], name=name) for i, name in ((3, "boom"), (4, "stick"))]
     return replace(
         BROKK_170, name="other", joints=tuple(joints), dead_zone=0.45, delay=delay, rate=rate,
-        pwm_limit=127, ready_down_time=0.8,
+        pwm_limit=127, tau_valve_down=0.8,
     )  # fmt: skip
 
 

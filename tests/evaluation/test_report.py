@@ -499,7 +499,7 @@ def test_the_worst_and_the_median_recording_are_shown_by_their_worst_joint(
     )
     curves = lambda net, r: [
         ([f"{r.name} {j} {k}" for j in "ab"], {"c": np.ones((2, 2))}) for k in "qv"
-    ]  # noqa: E731
+    ]
     monkeypatch.setattr(figures, "_free_run", curves)
     monkeypatch.setattr(figures, "plot_panels", lambda rows: rows)
     worst, median = figures.plot_worst_and_median(SimpleNamespace(rate=20.0), log)  # type: ignore[arg-type]

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from brokk_min.actuator import speed_limits
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation import sequences
-from brokk_min.kinematics import jacobian, lowest_point, tool_position
+from brokk_min.kinematics import forward_kinematics, jacobian, lowest_point, tool_position
 from brokk_min.machine import BROKK_170, Machine
-from brokk_min.plant import speed_limits
 
 
 def test_the_starts_of_the_package_are_of_all_kinds_and_not_the_tuning_starts() -> None:
@@ -20,7 +20,7 @@ def test_the_starts_of_the_package_are_of_all_kinds_and_not_the_tuning_starts() 
     kinds = np.array(sequences.start_kinds(BROKK_170, starts))
     assert [np.sum(kinds == kind) for kind in sequences.KINDS] == [32, 16, 16]
     assert kinds[:4].tolist() == ["workspace", "limits", "workspace", "extended"]
-    assert (lowest_point(BROKK_170, starts) > 0).all()
+    assert (lowest_point(forward_kinematics(BROKK_170, starts)) > 0).all()
     assert len(np.unique(starts, axis=0)) == 64
     workspace = starts[kinds == "workspace"]
     for sequence in sequences.task_sequences(BROKK_170)[:3]:
@@ -214,7 +214,7 @@ def test_the_least_motion_is_the_one_that_asks_most_of_the_joints() -> None:
     towards = half.goals[30] / 0.1
     np.testing.assert_allclose(towards[0], [0, 1, 0], atol=1e-12)
     np.testing.assert_allclose(towards[1], [-np.sin(0.5), np.cos(0.5), 0], atol=1e-12)
-    inverse = np.linalg.pinv(jacobian(BROKK_170, starts))
+    inverse = np.linalg.pinv(jacobian(forward_kinematics(BROKK_170, starts))[..., BROKK_170.driven])
     hardest = np.linalg.norm((inverse @ towards[..., None])[..., 0], axis=-1)
     others = np.random.default_rng(0).normal(size=(500, 1, 3))
     others /= np.linalg.norm(others, axis=-1, keepdims=True)
@@ -257,12 +257,12 @@ def test_margins_of_what_is_feasible_by_hand() -> None:
         for end, inward in ((low, 1), (high, -1)):
             near, far = ordinary.copy(), ordinary.copy()
             near[joint], far[joint] = end[joint] + inward * 0.049, end[joint] + inward * 0.051
-            clear = lowest_point(BROKK_170, far) > 0.1
+            clear = lowest_point(forward_kinematics(BROKK_170, far)) > 0.1
             assert not can(near) and can(far) == clear, joint
-    lowest = float(lowest_point(BROKK_170, ordinary))
+    lowest = float(lowest_point(forward_kinematics(BROKK_170, ordinary)))
     for ground, good in ((lowest - 0.101, True), (lowest - 0.099, False)):
         assert can(ordinary, machine=replace(BROKK_170, ground=ground)) == good
-    radius = np.hypot(*tool_position(BROKK_170, ordinary)[:2])
+    radius = np.hypot(*tool_position(forward_kinematics(BROKK_170, ordinary))[:2])
     for way, limit in zip((-1, 1), speed_limits(BROKK_170, ordinary), strict=True):
         for share, good in ((0.89, True), (0.91, False)):
             slewing = np.array([0.0, share * abs(limit[0]) * radius * way, 0.0])

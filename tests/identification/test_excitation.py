@@ -8,11 +8,11 @@ from unittest import mock
 import numpy as np
 import pytest
 
+from brokk_min.actuator import plant_reset, plant_step
 from brokk_min.identification import excitation
 from brokk_min.identification.excitation import EXCITATIONS, collect, task_log
 from brokk_min.identification.logs import Log, Recording, read_log, velocity_of, write_log
 from brokk_min.machine import BROKK_170, read_encoder
-from brokk_min.plant import plant_reset, plant_step
 
 LIMIT = 80 / 127
 Q5 = 4

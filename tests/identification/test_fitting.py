@@ -10,7 +10,7 @@ import pytest
 import torch
 from helpers_machines import line
 
-from brokk_min.actuator import rest_history, valve_scale
+from brokk_min.actuator import initial_history, mu_law
 from brokk_min.evaluation import trust
 from brokk_min.identification import fitting
 from brokk_min.identification.fitting import FitConfig, fit
@@ -156,7 +156,7 @@ def test_a_stop_in_the_log_does_not_slow_the_nets_down_before_it(logged):
         recordings.append(Recording(f"r{run}", u, q[:160], q_dot[:160]))
     log = Log(("a",), tuple(recordings), logged)
     net = fit(log, FitConfig(steps=800, batch_size=256), seed=0, velocity_samples=4)
-    history, q, angles = rest_history(np.float32([-0.2]), 13), np.array([-0.2]), []
+    history, q, angles = initial_history(np.float32([-0.2]), 13), np.array([-0.2]), []
     for _ in range(60):
         history, q = net.step(history, q, [0.9])
         angles.append(q[0])
@@ -237,7 +237,7 @@ def test_nets_say_how_they_were_fitted():
     assert (net.machine, net.seed, net.dead_zone, net.settings) == ("toy", 7, 0.25, vars(config))
     assert not net.velocity_logged and fit(log, FitConfig(steps=0), 7, 3).machine == ""
     assert fit(log, FitConfig(steps=0), 7, 3).dead_zone == 0.0
-    commands = np.concatenate([valve_scale(r.u, 0.25)[4:-1] for r in log.recordings])
+    commands = np.concatenate([mu_law(r.u, 0.25)[4:-1] for r in log.recordings])
     np.testing.assert_allclose(
         net.input_mean[:, 10:], np.tile(commands.mean(axis=0)[:, None], 5), rtol=1e-6
     )

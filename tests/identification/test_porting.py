@@ -13,16 +13,15 @@ import pytest
 from helpers_bus import World
 
 from brokk_min.__main__ import main
-from brokk_min.actuator import load_net
+from brokk_min.actuator import select_nets, speed_limits
 from brokk_min.can import operator_input as wishes
-from brokk_min.env import fitting_nets
 from brokk_min.evaluation import baselines
 from brokk_min.evaluation.sequences import axis_sequences, draw_starts
 from brokk_min.identification.logs import read_log
+from brokk_min.identification.net_file import load_net
 from brokk_min.jacobian import JacobianController, join_gains, manipulability_threshold
-from brokk_min.kinematics import frames, tool_position
+from brokk_min.kinematics import forward_kinematics, frames, tool_position
 from brokk_min.machine import Machine
-from brokk_min.plant import speed_limits
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "porting.md").read_text()
@@ -66,7 +65,7 @@ def test_the_tool_is_where_a_tape_measure_finds_it(mini: Machine) -> None:
     lengths = np.array([1.80, 1.10, 0.60])
     r, z = 0.30 + (lengths * np.cos(e)).sum(1), 0.75 + (lengths * np.sin(e)).sum(1)
     wanted = np.stack([r * np.cos(q[:, 0]), r * np.sin(q[:, 0]), z], axis=1)
-    np.testing.assert_allclose(tool_position(mini, q), wanted, atol=1e-12)
+    np.testing.assert_allclose(tool_position(forward_kinematics(mini, q)), wanted, atol=1e-12)
     assert frames(mini, q).shape == (50, 5, 4, 4)
 
 
@@ -139,7 +138,7 @@ def test_the_commands_run_one_after_the_other(here: Path, mini: Machine) -> None
     ]
     for words in COMMANDS[:4]:
         if words[0] == "evaluate":  # gains, so that nothing is tuned
-            net = fitting_nets(mini, load_net(Path("net.npz")))
+            net = select_nets(mini, load_net(Path("net.npz")))
             about = baselines.tuned_for(mini, net)
             baselines.write_gains(Path("gains.json"), baselines.baselines(mini, net), about)
         given = [word for word in words if word not in ("--hours", "1")]
@@ -180,7 +179,9 @@ def test_it_is_driven_over_the_bus(mini: Machine) -> None:
             pass
         world.close()
         assert script.done, world.drive.reason
-        moved = tool_position(mini, world.simulated.plant.q) - tool_position(mini, start)
+        moved = tool_position(forward_kinematics(mini, world.simulated.plant.q)) - tool_position(
+            forward_kinematics(mini, start)
+        )
         assert moved[axis] > 0.15 and np.delete(np.abs(moved), axis).max() < 0.08, moved
 
 

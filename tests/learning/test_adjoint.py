@@ -10,7 +10,7 @@ from helpers_machines import GAIN, obedient_net, obedient_velocity, random_machi
 
 from brokk_min import env as task
 from brokk_min import observation as sight
-from brokk_min.kinematics import jacobian, tool_velocity
+from brokk_min.kinematics import forward_kinematics, jacobian, tool_velocity
 from brokk_min.learning.simulation_gradient import Rollout, action_gradients
 from brokk_min.machine import BROKK_170, PWM_MAX
 
@@ -23,7 +23,7 @@ def exactly(machine, q):
 
 
 def costs(valve=0.0, lag=0.0):
-    return task.TaskConfig(valve_cost=valve, lag_cost=lag)
+    return task.TaskConfig(valve_cost=valve, integral_cost=lag)
 
 
 def simulate(machine, net, state, commands):
@@ -51,7 +51,7 @@ def case(seed, machine=None):
     net = replace(net, output_low=0.3 * net.output_low, output_high=0.3 * net.output_high)
     low, high = machine.column("q_min"), machine.column("q_max")
     q = rng.uniform(0.7 * low + 0.3 * high, 0.3 * low + 0.7 * high, (NUM, machine.n))
-    state = task.rest_state(machine, q, rng.standard_normal((NUM, 3)), plant=False)
+    state = task.initial_state(machine, q, rng.standard_normal((NUM, 3)), plant=False)
     state = replace(state, history=state.history.astype(float), motion=state.motion.astype(float))
     commands = np.zeros((15 + TICKS, NUM, machine.n))
     commands[..., machine.driven] = rng.uniform(
@@ -64,14 +64,18 @@ def case(seed, machine=None):
 def by_action(machine, u):
     """Slope of the command by the action at `u`: of the line from 0 through the dead zone to the limit."""
     limit, dead = machine.pwm_limit / PWM_MAX, machine.dead_zone
-    knee = dead + sight.RAMP * (limit - dead)
+    knee = dead + sight.COMPENSATION_RANGE * (limit - dead)
     u = np.abs(u[..., machine.driven])
-    return np.where(u < knee, knee / sight.RAMP, (limit - knee) / (1 - sight.RAMP))
+    return np.where(
+        u < knee, knee / sight.COMPENSATION_RANGE, (limit - knee) / (1 - sight.COMPENSATION_RANGE)
+    )
 
 
 def rewards_of(machine, states, along):
     """Rewards (T, num) with the Jacobians of the states `along`, which count as constant."""
-    J = np.stack([jacobian(machine, s.q) for s in along[1:]])
+    J = np.stack(
+        [jacobian(forward_kinematics(machine, s.q))[..., machine.driven] for s in along[1:]]
+    )
     rates = np.stack([s.q_dot[..., machine.driven] for s in states[1:]])
     return task.reward(states[0].v_goal, (J @ rates[..., None])[..., 0])
 
@@ -119,11 +123,13 @@ def test_one_tick_by_hand():
     """Nets that obey the newest command: reward 1 / (1 + e), e = |goal - J q_dot|, one joint's command."""
     net, u = obedient_net(BROKK_170), np.zeros((1, 1, 5))
     u[..., BROKK_170.driven] = [0.3, -0.2, 0.1, 0.4]
-    state = task.rest_state(BROKK_170, [[0.0, 0.5, 0.6, 1.7, 1.2]], [0.2, 0.1, -0.1], plant=False)
+    state = task.initial_state(
+        BROKK_170, [[0.0, 0.5, 0.6, 1.7, 1.2]], [0.2, 0.1, -0.1], plant=False
+    )
     states = simulate(BROKK_170, net, state, u)
     found = action_gradients(BROKK_170, net, rollout_of(states, u), 0.9, costs())[0, 0]
     rates = obedient_velocity(BROKK_170, u[0, 0, BROKK_170.driven])
-    J = jacobian(BROKK_170, states[1].q[0])
+    J = jacobian(forward_kinematics(BROKK_170, states[1].q[0]))[..., BROKK_170.driven]
     error = state.v_goal[0] - J @ rates
     size = np.linalg.norm(error)
     fastest = 1.2 * BROKK_170.q_dot_max[BROKK_170.driven]
@@ -176,11 +182,13 @@ def test_the_cost_of_staying_behind_is_in_it(seed):
     machine, net, start, commands = case(seed, machine)
     start = replace(start, lag=rng.normal(0, 0.1, (NUM, 3)))
     states = simulate(machine, net, start, commands)
-    J = [jacobian(machine, s.q) for s in states]
-    v_tool = np.array([tool_velocity(machine, s.q, s.q_dot) for s in states[1:]])
+    J = [jacobian(forward_kinematics(machine, s.q))[..., machine.driven] for s in states]
+    v_tool = np.array(
+        [tool_velocity(forward_kinematics(machine, s.q), s.q_dot) for s in states[1:]]
+    )
     middle = np.quantile(np.linalg.norm(start.v_goal - v_tool, axis=-1), 0.52)
     machine = replace(
-        machine, tool_speed=float(middle) / sight.LAG_SPEED
+        machine, tool_speed=float(middle) / sight.INTEGRAL_SPEED
     )  # half of the errors are beyond the limit
     states = simulate(machine, net, start, commands)
 
@@ -189,7 +197,7 @@ def test_the_cost_of_staying_behind_is_in_it(seed):
         lag, found = start.lag, []
         for t, s in enumerate(states[1:]):
             v_tool = (J[t + 1] @ s.q_dot[..., machine.driven, None])[..., 0]
-            lag = sight.push_lag(machine, v_tool, start.v_goal, lag)
+            lag = sight.integrate_error(machine, v_tool, start.v_goal, lag)
             found.append(3.0 * 0.8**t * np.linalg.norm(lag, axis=-1))
         return np.array(found)
 
@@ -214,7 +222,7 @@ def test_a_joint_at_its_stop_gains_nothing_by_pushing(end, push):
     net, u = obedient_net(machine), np.zeros((3, 1, 5))
     q = (machine.column("q_min") + machine.column("q_max")) / 2
     q[4] = machine.column(end)[4]
-    state = task.rest_state(machine, q[None], [0.1, 0.1, 0.1], plant=False)
+    state = task.initial_state(machine, q[None], [0.1, 0.1, 0.1], plant=False)
     u[..., 4], u[..., 3] = push, 0.3
     found = action_gradients(
         machine, net, rollout_of(simulate(machine, net, state, u), u), 0.9, costs()

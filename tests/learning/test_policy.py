@@ -12,11 +12,10 @@ import pytest
 import torch
 from helpers_machines import random_machine, small_net
 
-from brokk_min.env import TaskConfig
+from brokk_min.env import TaskConfig, action_to_pwm
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import Policy, PolicyController, load_policy, save_policy
 from brokk_min.machine import BROKK_170
-from brokk_min.observation import to_command
 from brokk_min.ppo import PPOConfig, Training
 
 SETTINGS = PPOConfig(num_envs=2, horizon=4, total_steps=64, threads=1)
@@ -119,7 +118,7 @@ def test_the_controller_sends_what_the_policy_says(policy):
     observation = np.random.default_rng(1).normal(size=(5, 171)).astype(np.float32)
     controller = PolicyController(BROKK_170, policy)
     u, memory = controller(observation, controller.start(5))
-    assert np.array_equal(u, to_command(BROKK_170, policy.act(observation)))
+    assert np.array_equal(u, action_to_pwm(BROKK_170, policy.act(observation)))
     assert memory.tolist() == [0] * 5
     assert len(np.unique(u[:, 0])) > 1
 

@@ -17,11 +17,11 @@ from helpers_machines import small_net
 from helpers_sweep import die_until, refuse
 
 from brokk_min.__main__ import main
-from brokk_min.actuator import save_net
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation import baselines, experiments
 from brokk_min.evaluation.metrics import mean_interval
 from brokk_min.evaluation.sequences import Commands, axis_sequences
+from brokk_min.identification.net_file import save_net
 from brokk_min.learning import sweep as module
 from brokk_min.learning.policy import PolicyController
 from brokk_min.learning.sweep import apart, one_seed, sweep, workers

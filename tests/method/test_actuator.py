@@ -12,35 +12,34 @@ from helpers_machines import constant_net, random_net
 
 from brokk_min.actuator import (
     ActuatorNet,
-    load_net,
+    append_command,
+    initial_history,
+    mu_law,
+    mu_law_derivative,
     push,
-    push_command,
-    rest_history,
-    save_net,
-    valve_scale,
-    valve_scale_slope,
 )
+from brokk_min.identification.net_file import load_net, save_net
 
 # --- histories ------------------------------------------------------------------------------------
 
 
 def test_a_history_by_hand():
-    h = rest_history(np.array([0.5, -1.0]), 3)
+    h = initial_history(np.array([0.5, -1.0]), 3)
     np.testing.assert_array_equal(h[1], [[-1, -1, -1], [0, 0, 0], [0, 0, 0]])
     h.setflags(write=False)
-    sent = push_command(h, [0.1, 0.2])
+    sent = append_command(h, [0.1, 0.2])
     np.testing.assert_array_equal(sent[0], [[0.5, 0.5, 0.5], [0, 0, 0], [0, 0, 0.1]])
     np.testing.assert_array_equal(sent[1], [[-1, -1, -1], [0, 0, 0], [0, 0, 0.2]])
     seen = push(h, [0.1, 0.2], [0.6, -0.9], lambda angles: angles[..., -1] - angles[..., 0])
     np.testing.assert_allclose(seen[0], [[0.5, 0.5, 0.6], [0, 0, 0.1], [0, 0, 0.1]])
     np.testing.assert_allclose(seen[1], [[-1, -1, -0.9], [0, 0, 0.1], [0, 0, 0.2]])
-    sent = push_command(seen, [0.3, 0.4])
+    sent = append_command(seen, [0.3, 0.4])
     np.testing.assert_allclose(sent[0], [[0.5, 0.5, 0.6], [0, 0, 0.1], [0, 0.1, 0.3]])
 
 
 def test_histories_have_leading_axes_and_keep_the_float_type():
     q = np.arange(6, dtype=np.float32).reshape(3, 2)
-    h = push(rest_history(q, 5), q / 10, q + 1, lambda a: a[..., -1] - a[..., -2])
+    h = push(initial_history(q, 5), q / 10, q + 1, lambda a: a[..., -1] - a[..., -2])
     assert h.shape == (3, 2, 3, 5) and h.dtype == np.float32
     np.testing.assert_array_equal(h[..., 0, -1], q + 1)
     np.testing.assert_array_equal(h[..., 0, -2], q)
@@ -74,17 +73,17 @@ def test_what_nets_see_of_a_command_by_hand():
     u = np.array([-1.0, -0.2, 0.0, 0.1, 0.208, 0.6, 1.0])
     u.setflags(write=False)
     wanted = np.array([-1, 0, 0, 0, np.log(1.5) / np.log(51), np.log(26) / np.log(51), 1])
-    np.testing.assert_allclose(valve_scale(u, 0.2), wanted, atol=1e-12)
-    np.testing.assert_array_equal(valve_scale(u, 0.0), u)
-    np.testing.assert_array_equal(valve_scale_slope(u, 0.0), 1)
-    assert valve_scale(np.float32([0.3]), 0.2).dtype == np.float32
+    np.testing.assert_allclose(mu_law(u, 0.2), wanted, atol=1e-12)
+    np.testing.assert_array_equal(mu_law(u, 0.0), u)
+    np.testing.assert_array_equal(mu_law_derivative(u, 0.0), 1)
+    assert mu_law(np.float32([0.3]), 0.2).dtype == np.float32
 
 
 @pytest.mark.parametrize("dead_zone", [0.0, 0.07, 0.3])
 def test_the_slope_of_the_scale_is_a_difference(dead_zone):
     u = np.linspace(-0.999, 0.999, 400)
-    ends = valve_scale(u + 1e-7, dead_zone) - valve_scale(u - 1e-7, dead_zone)
-    np.testing.assert_allclose(valve_scale_slope(u, dead_zone), ends / 2e-7, rtol=1e-5, atol=1e-6)
+    ends = mu_law(u + 1e-7, dead_zone) - mu_law(u - 1e-7, dead_zone)
+    np.testing.assert_allclose(mu_law_derivative(u, dead_zone), ends / 2e-7, rtol=1e-5, atol=1e-6)
 
 
 def test_nets_that_know_a_dead_zone_are_nets_shown_other_commands():
@@ -93,7 +92,7 @@ def test_nets_that_know_a_dead_zone_are_nets_shown_other_commands():
     history = rng.uniform(-1, 1, (6, 3, 3, 5))
     history[0, :, 2] *= 0.1  # not one command that opens a valve
     other = history.copy()
-    other[:, :, 2] = valve_scale(history[:, :, 2], 0.1)
+    other[:, :, 2] = mu_law(history[:, :, 2], 0.1)
     history.setflags(write=False)
     np.testing.assert_array_equal(net.velocity(history), plain.velocity(other))
     idle = history.copy()
@@ -140,7 +139,9 @@ def test_prediction_refuses_another_shape():
 def test_a_step_of_the_simulation_by_hand():
     net = replace(constant_net([0.2, -0.4], False, ("a", "b")), velocity_samples=2)
     net = replace(net, q_low=np.float32([0.0, 0.985]), q_high=np.float32([1.0, 2.0]))
-    history, q = net.step(rest_history(np.array([0.5, 1.0]), 13), np.array([0.5, 1.0]), [0.3, -0.1])
+    history, q = net.step(
+        initial_history(np.array([0.5, 1.0]), 13), np.array([0.5, 1.0]), [0.3, -0.1]
+    )
     np.testing.assert_allclose(q, [0.51, 0.985], atol=1e-6)  # the second meets its stop
     np.testing.assert_allclose(history[:, 1, -1], [0.2, -0.3], atol=1e-5)
     np.testing.assert_allclose(history[:, 2, -2:], [[0, 0.3], [0, -0.1]])
@@ -149,14 +150,14 @@ def test_a_step_of_the_simulation_by_hand():
     np.testing.assert_allclose(outside, [1.5, 0.5], atol=1e-6)
     logged = replace(net, velocity_logged=True)
     history, _ = logged.step(
-        rest_history(np.array([0.5, 1.0]), 13), np.array([0.5, 1.0]), [0.1, 0.1]
+        initial_history(np.array([0.5, 1.0]), 13), np.array([0.5, 1.0]), [0.1, 0.1]
     )
     np.testing.assert_allclose(history[:, 1, -1], [0.2, -0.3], atol=1e-5)
 
 
 def test_a_joint_without_a_command_that_stood_still_stays():
     net = constant_net([0.2, 0.2, 0.2, 0.2], False, ("a", "b", "c", "d"))
-    history = rest_history(np.full(4, 0.5, np.float32), 13)
+    history = initial_history(np.full(4, 0.5, np.float32), 13)
     history[1, 2, 1] = 0.01  # b had a command within the history that remains
     history[2, 0, -1:] = 0.503  # c has moved
     _, q = net.step(history, np.array([0.5, 0.5, 0.503, 0.5]), [0.0, 0.0, 0.0, 0.01])
@@ -169,7 +170,7 @@ def test_a_joint_without_a_command_that_stood_still_stays():
 def test_commands_within_the_dead_zone_that_nets_know_move_nothing_that_stood_still():
     """Of 8.9 counts: 8 for the whole history are none, one of 9 is, and a joint that moved is for the net."""
     net = constant_net([0.2, 0.2, 0.2, 0.2], False, ("a", "b", "c", "d"))
-    history = rest_history(np.full(4, 0.5, np.float32), 13)
+    history = initial_history(np.full(4, 0.5, np.float32), 13)
     history[:, 2] = np.float32([[8], [-8], [8], [8]]) / np.float32(127)
     history[1, 2, 3] = -9 / 127
     history[2, 0, -1:] = 0.503

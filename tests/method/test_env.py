@@ -30,12 +30,12 @@ from scipy import stats
 from brokk_min import env as task
 from brokk_min import kinematics
 from brokk_min import observation as sight
-from brokk_min.actuator import save_net
+from brokk_min.actuator import plant_reset, plant_step
 from brokk_min.env import TaskConfig
+from brokk_min.identification.net_file import save_net
 from brokk_min.jacobian import GAINS, JacobianController, join_gains
 from brokk_min.learning.gym_env import TaskEnv, TaskVectorEnv
 from brokk_min.machine import BROKK_170, estimate_velocity, read_encoder
-from brokk_min.plant import plant_reset, plant_step
 
 FINE = replace(BROKK_170, encoder_bits=32)  # so fine that float32 rounding cannot flip a count
 LOW = replace(BROKK_170, ground=-100.0)  # no pose is in the ground
@@ -158,20 +158,20 @@ def test_a_reset_is_at_rest_and_tells_its_pose():
 def test_no_goal_asks_an_arm_close_to_the_ground_to_sink():
     pose = np.array([[0.3, 0.2, 0.3, 1.4, 1.1]])
     config = replace(QUIET, hold_min_s=5.0, hold_max_s=5.0)
-    lowest = kinematics.lowest_point(BROKK_170, pose)[0]
+    lowest = kinematics.lowest_point(kinematics.forward_kinematics(BROKK_170, pose))[0]
     for near in (True, False):
         machine = replace(
             BROKK_170, ground=float(lowest - (0.9 if near else 1.1) * task.GROUND_MARGIN)
         )
         rng = np.random.default_rng(1)
         for _ in range(20):
-            state = task.rest_state(machine, pose, [[0.1, 0.0, -0.2]], plant=True)
+            state = task.initial_state(machine, pose, [[0.1, 0.0, -0.2]], plant=True)
             state, _ = task.step(machine, config, None, state, np.zeros((1, 4)), rng)
             changed = (state.v_goal != np.float32([[0.1, 0.0, -0.2]])).any()
             assert changed == near and (state.v_goal[0, 2] >= 0) == near
             assert not near or state.goal_ticks[0] == 100
         for upward in (0.0, 0.2):  # to move level or up is no sinking
-            state = task.rest_state(machine, pose, [[0.1, 0.0, upward]], plant=True)
+            state = task.initial_state(machine, pose, [[0.1, 0.0, upward]], plant=True)
             state, _ = task.step(machine, config, None, state, np.zeros((1, 4)), rng)
             np.testing.assert_array_equal(state.v_goal, np.float32([[0.1, 0.0, upward]]))
 
@@ -191,7 +191,7 @@ def test_goals_are_redrawn_within_an_episode_and_rewards_are_for_the_old_goal():
         episode_s=60.0,
         noise=0.0,
         valve_cost=0.02,
-        lag_cost=3.0,
+        integral_cost=3.0,
     )
     env = TaskVectorEnv(4, machine=LOW, config=config)
     seen, _ = env.reset(seed=2)
@@ -230,7 +230,7 @@ def test_goals_are_redrawn_within_an_episode_and_rewards_are_for_the_old_goal():
 def test_transition_on_nets_by_hand():
     """With nets that obey the command, one tick moves each driven joint by velocity x 50 ms."""
     u = np.array([40, 0, -80, 13, 0]) / 127
-    state = task.rest_state(BROKK_170, POSE, np.zeros(3), plant=False)
+    state = task.initial_state(BROKK_170, POSE, np.zeros(3), plant=False)
     after = task.transition(BROKK_170, obedient_net(BROKK_170), state, u)
     move = np.zeros(5)
     move[[0, 2, 3, 4]] = obedient_velocity(BROKK_170, u[[0, 2, 3, 4]])
@@ -249,9 +249,9 @@ def test_transition_on_nets_by_hand():
 
 def test_what_encoders_say_moves_no_simulated_arm():
     net, rng = small_net(BROKK_170, np.random.default_rng(5)), np.random.default_rng(6)
-    right = wrong = task.rest_state(BROKK_170, POSE, np.zeros(3), plant=False)
+    right = wrong = task.initial_state(BROKK_170, POSE, np.zeros(3), plant=False)
     for _ in range(20):
-        u = sight.to_command(BROKK_170, rng.uniform(-1, 1, 4))
+        u = sight.action_to_pwm(BROKK_170, rng.uniform(-1, 1, 4))
         right = task.transition(BROKK_170, net, right, u)
         wrong = task.transition(
             BROKK_170, net, wrong, u, lambda _, q: q + rng.normal(0, 0.1, q.shape)
@@ -265,11 +265,11 @@ def test_nets_in_the_loop_agree_with_plain_loops():
     """An oracle with deques, `polyfit` and one matrix product a joint, over 60 ticks."""
     machine, rng = FINE, np.random.default_rng(7)
     net = small_net(machine, rng)
-    state = task.rest_state(machine, POSE, np.zeros(3), plant=False)
+    state = task.initial_state(machine, POSE, np.zeros(3), plant=False)
     q = POSE.copy()
     tape = {j: [deque([v] * 13, 13) for v in (q[j], 0.0, 0.0)] for j in (0, 2, 3, 4)}
     for _ in range(60):
-        u = sight.to_command(machine, rng.uniform(-1, 1, 4))
+        u = sight.action_to_pwm(machine, rng.uniform(-1, 1, 4))
         state = task.transition(machine, net, state, u)
         for row, (j, (angles, rates, commands)) in enumerate(tape.items()):
             commands.append(u[j])
@@ -299,7 +299,7 @@ def test_the_plant_in_the_environment_is_the_plant(machine):
     for _ in range(50):
         action = rng.uniform(-1, 1, (6, len(machine.driven)))
         before = plant.q
-        plant = plant_step(machine, plant, sight.to_command(machine, action))
+        plant = plant_step(machine, plant, sight.action_to_pwm(machine, action))
         env.step(action)
         angles.append(read_encoder(machine, plant.q))
         assert np.array_equal(env.state.q, plant.q)
@@ -318,8 +318,8 @@ def test_transition_is_pure(plant):
     net = None if plant else small_net(machine, rng)
     state = task.reset(machine, TaskConfig(), rng, 4, plant)
     for _ in range(5):
-        state = task.transition(machine, net, state, sight.to_command(machine, np.ones((4, 4))))
-    u = sight.to_command(machine, rng.uniform(-1, 1, (4, 4)))
+        state = task.transition(machine, net, state, sight.action_to_pwm(machine, np.ones((4, 4))))
+    u = sight.action_to_pwm(machine, rng.uniform(-1, 1, (4, 4)))
     copies = [a.copy() for a in flat(state)]
     for array in (*flat(state), u):
         array.setflags(write=False)
@@ -332,7 +332,7 @@ def test_transition_is_pure(plant):
 
 
 def test_transition_refuses_nets_that_are_missing():
-    state = task.rest_state(BROKK_170, POSE, np.zeros(3), plant=False)
+    state = task.initial_state(BROKK_170, POSE, np.zeros(3), plant=False)
     with pytest.raises(
         ValueError, match="net: expected nets for a state without a plant, got None"
     ):
@@ -345,8 +345,8 @@ def test_joint_limits_hold(machine, plant):
     net = None if plant else obedient_net(machine)
     low, high = machine.column("q_min"), machine.column("q_max")
     signs = np.where(np.arange(2)[:, None] == 0, 1.0, -1.0) * np.ones((2, len(machine.driven)))
-    state = task.rest_state(machine, np.stack([(low + high) / 2] * 2), np.zeros(3), plant)
-    u = sight.to_command(machine, signs)
+    state = task.initial_state(machine, np.stack([(low + high) / 2] * 2), np.zeros(3), plant)
+    u = sight.action_to_pwm(machine, signs)
     for _ in range(800):
         state = task.transition(machine, net, state, u)
         assert ((state.q >= low - 1e-6) & (state.q <= high + 1e-6)).all()
@@ -438,7 +438,7 @@ def test_merge_replaces_whole_rows_and_nothing_else():
     rng, machine = np.random.default_rng(17), BROKK_170
     old, new = (task.reset(machine, TaskConfig(), rng, num, True) for num in (5, 2))
     for _ in range(8):
-        old = task.transition(machine, None, old, sight.to_command(machine, np.ones((5, 4))))
+        old = task.transition(machine, None, old, sight.action_to_pwm(machine, np.ones((5, 4))))
     assert old.lag.any(axis=-1).all() and not new.lag.any()
     copies = [a.copy() for a in flat(old)]
     merged = task.merge(old, new, np.array([4, 1]))
@@ -534,7 +534,7 @@ def test_an_arm_that_is_driven_into_the_ground_terminates():
     down = np.array([0.0, -1.0, 0.0, 0.0])
     env = TaskEnv(obedient_net(machine), machine, config)
     env.reset(seed=9)
-    env.state = task.rest_state(machine, POSE[None], np.zeros((1, 3)), plant=False)
+    env.state = task.initial_state(machine, POSE[None], np.zeros((1, 3)), plant=False)
     heights = []
     for _ in range(300):
         _, reward, terminated, truncated, info = env.step(down)
@@ -716,7 +716,7 @@ class Recorder:
 
 def test_rollout_tells_what_happened_when():
     machine, rng = BROKK_170, np.random.default_rng(19)
-    tape = sight.to_command(machine, rng.uniform(-1, 1, (40, 2, 4)))
+    tape = sight.action_to_pwm(machine, rng.uniform(-1, 1, (40, 2, 4)))
     goals = np.repeat(rng.uniform(-0.3, 0.3, (4, 2, 3)), 10, axis=0)
     start = np.stack([POSE, POSE + 0.1])
     spy = Recorder(tape)
@@ -747,14 +747,14 @@ def test_rollout_tells_what_happened_when():
 
 def test_a_rollout_on_nets_moves_by_them_and_reads_the_encoders_it_is_given():
     machine, rng = BROKK_170, np.random.default_rng(20)
-    net, tape = small_net(machine, rng), sight.to_command(machine, rng.uniform(-1, 1, (8, 2, 4)))
+    net, tape = small_net(machine, rng), sight.action_to_pwm(machine, rng.uniform(-1, 1, (8, 2, 4)))
     start, goals = np.stack([POSE, POSE + 0.1]), np.zeros((8, 2, 3))
 
     def shifted(machine, q):
         return read_encoder(machine, q + 0.01)
 
     trace = task.rollout(machine, Recorder(tape), start, goals, QUIET, rng, net, shifted)
-    state = task.rest_state(machine, start, goals[0], plant=False)
+    state = task.initial_state(machine, start, goals[0], plant=False)
     for t in range(8):
         assert np.array_equal(trace.q_measured[t], state.history[..., 0, -1])
         state = task.transition(machine, net, state, tape[t], shifted)
@@ -816,8 +816,8 @@ def test_the_papers_reward_has_no_costs() -> None:
     outcomes = []
     for config in (
         TaskConfig(paper=True),
-        TaskConfig(valve_cost=0.0, lag_cost=0.0),
-        TaskConfig(lag_cost=0.0),
+        TaskConfig(valve_cost=0.0, integral_cost=0.0),
+        TaskConfig(integral_cost=0.0),
     ):
         state = task.reset(m, config, np.random.default_rng(0), 4, plant=False)
         outcomes.append(

@@ -25,14 +25,14 @@ from brokk_min.can import canopen as bus
 from brokk_min.can import drive_log as blackbox
 from brokk_min.can import operator_input as wishes
 from brokk_min.can.safety_gate import encoder_raw, fault_name, valve_frame
-from brokk_min.env import TaskConfig, reward, rollout
+from brokk_min.env import TaskConfig, action_to_pwm, measured, observation_scale, reward
 from brokk_min.evaluation.experiments import axis_sequences
+from brokk_min.evaluation.rollout import rollout
 from brokk_min.identification.logs import read_log, write_log
 from brokk_min.jacobian import JacobianController, join_gains, manipulability_threshold
 from brokk_min.kinematics import joint_rates, tool_state
 from brokk_min.learning.policy import STAND, PolicyController, load_policy
 from brokk_min.machine import BROKK_170
-from brokk_min.observation import measured, observation_scale, to_command
 
 PUSH = (60, 0, 60, 60, 60)
 BASELINE = JacobianController(
@@ -107,7 +107,7 @@ class Listener:
 
     def __call__(self, observation: np.ndarray, memory: None) -> tuple[np.ndarray, None]:
         self.told.append(observation[0].astype(float))
-        return to_command(BROKK_170, 0.2 * observation[..., -8:-4]), memory
+        return action_to_pwm(BROKK_170, 0.2 * observation[..., -8:-4]), memory
 
 
 def test_the_policy_is_told_how_far_the_tool_stays_behind() -> None:

@@ -12,13 +12,13 @@ from scipy.optimize import minimize
 
 from benchmarks.rollout import random_net
 from brokk_min import jacobian as classic
-from brokk_min.actuator import ActuatorNet, rest_history
-from brokk_min.env import TaskConfig, rollout
+from brokk_min.actuator import ActuatorNet, initial_history
+from brokk_min.env import TaskConfig, measured, observe
 from brokk_min.evaluation import baselines
+from brokk_min.evaluation.rollout import rollout
 from brokk_min.jacobian import JacobianController, Memory
-from brokk_min.kinematics import jacobian
+from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.machine import BROKK_170, valve_opening
-from brokk_min.observation import measured, observe
 
 POSE = np.array([1.5, 0.5, 0.58, 1.71, 1.24])  # the paper's q_s
 STRETCHED = np.array([0.3, 0.5, 0.1, np.pi, 3 * np.pi / 4])  # all links in one line
@@ -186,8 +186,15 @@ def test_manipulability_is_the_product_of_singular_values():
 
 
 def test_manipulability_vanishes_where_the_arm_is_straight():
-    good = classic.manipulability(jacobian(BROKK_170, POSE))
-    assert classic.manipulability(jacobian(BROKK_170, STRETCHED)) < 1e-6 * good
+    good = classic.manipulability(
+        jacobian(forward_kinematics(BROKK_170, POSE))[..., BROKK_170.driven]
+    )
+    assert (
+        classic.manipulability(
+            jacobian(forward_kinematics(BROKK_170, STRETCHED))[..., BROKK_170.driven]
+        )
+        < 1e-6 * good
+    )
     threshold = classic.manipulability_threshold(BROKK_170)
     assert 0 < threshold < 10 * good
     assert threshold == classic.manipulability_threshold(BROKK_170)
@@ -223,7 +230,7 @@ def test_rates_are_eq3():
     """x_goal + K e, least squares: an optimiser finds the same rates."""
     q_dot = np.array([0.02, 0.0, -0.03, 0.01, 0.04])
     seen = at_rest(POSE, GOAL, q_dot=q_dot)[None]
-    J, w0 = jacobian(BROKK_170, POSE), 100.0
+    J, w0 = jacobian(forward_kinematics(BROKK_170, POSE))[..., BROKK_170.driven], 100.0
     v_tool = J @ q_dot[BROKK_170.driven]
     wanted = GOAL + 0.3 * (GOAL - v_tool)
     damping = 0.1 * (1 - np.sqrt(np.linalg.det(J @ J.T)) / w0) ** 2
@@ -259,7 +266,9 @@ def test_the_rate_clip_slows_down_in_the_same_direction(pose):
 def test_the_first_tick_of_a_p_controller_by_hand():
     c = controller(kp=1.5)
     seen = at_rest(POSE, GOAL)[None]
-    rate = np.linalg.pinv(jacobian(BROKK_170, POSE)) @ GOAL  # at rest all weights are 1
+    rate = (
+        np.linalg.pinv(jacobian(forward_kinematics(BROKK_170, POSE))[..., BROKK_170.driven]) @ GOAL
+    )  # at rest all weights are 1
     u, memory = c(seen, c.start(1))
     opening = 1.5 * rate
     wanted = np.rint(127 * np.sign(opening) * (0.07 + 0.93 * np.abs(opening)))
@@ -284,7 +293,9 @@ def test_a_resting_machine_without_a_goal_stays_idle():
 def test_the_integral_and_the_derivative_by_hand():
     """Constant error e: the opening grows by ki e dt a tick; the derivative fades by 0.7 a tick."""
     seen = at_rest(POSE, 0.3 * GOAL)[None]
-    e = np.linalg.pinv(jacobian(BROKK_170, POSE)) @ (0.3 * GOAL)
+    e = np.linalg.pinv(jacobian(forward_kinematics(BROKK_170, POSE))[..., BROKK_170.driven]) @ (
+        0.3 * GOAL
+    )
     c = controller(ki=2.0)
     memory = c.start(1)
     for tick in range(6):
@@ -346,7 +357,7 @@ def test_no_valve_goes_idle_while_the_tool_is_to_move():
 
 def test_valves_that_stay_awake_are_barely_open_when_the_tool_is_to_stand():
     """A tool that sinks a little is called back with the least opening; without `awake` by closed valves."""
-    history = np.array(rest_history(POSE, 13))
+    history = np.array(initial_history(POSE, 13))
     history[..., 1, :] = [[0.001], [0.0], [-0.001], [0.001], [0.001]]
     seen = observe(BROKK_170, history, np.zeros(3), np.zeros(3))[None]
     c = controller(kp=1e-3, ready=0.03)
@@ -394,7 +405,7 @@ def test_commands_stay_within_the_limit_anywhere():
 
 @pytest.mark.parametrize("machine", [BROKK_170, *MACHINES[:3]], ids=lambda m: m.name)
 def test_the_steady_map_asks_the_nets_and_inverts_them(machine):
-    steady = classic.steady_map(machine, obedient_net(machine))
+    steady = classic.static_map(machine, obedient_net(machine))
     limit = machine.pwm_limit / 127
     u = steady.u[:, None] * np.ones(len(machine.driven))
     wanted = obedient_velocity(machine, u).T[:, None, :] * np.ones((1, steady.q.shape[1], 1))
@@ -416,7 +427,7 @@ def test_the_map_interpolates_between_angles():
     """At the upper of two angles the joint is twice as fast: halfway the speeds are averaged."""
     q, u = np.array([[0.0, 1.0]]), np.array([-1.0, 0.0, 1.0])
     velocity = np.array([[[-1.0, 0.0, 1.0], [-2.0, 0.0, 2.0]]])
-    steady = classic.SteadyMap(q, u, velocity)
+    steady = classic.StaticMap(q, u, velocity)
     for angle, speed, wanted in [
         (0.0, 0.5, 0.5),
         (1.0, 0.5, 0.25),
@@ -428,10 +439,12 @@ def test_the_map_interpolates_between_angles():
 
 
 def test_feed_forward_alone_sends_the_steady_command():
-    steady = classic.steady_map(BROKK_170, obedient_net(BROKK_170))
+    steady = classic.static_map(BROKK_170, obedient_net(BROKK_170))
     c = replace(controller(), feedforward=steady)
     u, _ = c(at_rest(POSE, 2 * GOAL)[None], c.start(1))
-    rate = np.linalg.pinv(jacobian(BROKK_170, POSE)) @ (2 * GOAL)
+    rate = np.linalg.pinv(jacobian(forward_kinematics(BROKK_170, POSE))[..., BROKK_170.driven]) @ (
+        2 * GOAL
+    )
     fastest = 1.2 * BROKK_170.q_dot_max[[0, 2, 3, 4]]
     wanted = 2 / 3 * np.arctanh(rate / fastest)  # the obedient nets turned round
     far = np.abs(wanted) > 10 / 127
@@ -548,7 +561,7 @@ def test_the_map_keeps_the_joints_apart():
     velocity = np.array(
         [[[-1.0, 0.0, 1.0], [-2.0, 0.0, 2.0]], [[-3.0, 0.0, 3.0], [-6.0, 0.0, 6.0]]]
     )
-    steady = classic.SteadyMap(
+    steady = classic.StaticMap(
         np.array([[0.0, 1.0], [0.0, 1.0]]), np.array([-1.0, 0.0, 1.0]), velocity
     )
     found = steady.command(np.array([0.5, 0.5]), np.array([0.75, 0.75]))
@@ -561,7 +574,9 @@ def test_the_map_keeps_the_joints_apart():
 def test_damping_sets_in_at_a_quarter_of_the_largest_manipulability():
     low, high = BROKK_170.column("q_min"), BROKK_170.column("q_max")
     q = np.random.default_rng(9).uniform(low, high, (20_000, 5))
-    largest = classic.manipulability(jacobian(BROKK_170, q)).max()
+    largest = classic.manipulability(
+        jacobian(forward_kinematics(BROKK_170, q))[..., BROKK_170.driven]
+    ).max()
     assert 0.24 * largest < classic.manipulability_threshold(BROKK_170) < 0.251 * largest
     stiff = [
         replace(j, a=0.0, d=0.0) for j in BROKK_170.joints
@@ -572,7 +587,7 @@ def test_damping_sets_in_at_a_quarter_of_the_largest_manipulability():
 def test_the_map_interpolates_over_several_angles_and_holds_beyond_them():
     """Speeds at full command are 1, 2 and 4 rad/s at -1, 0.5 and 2 rad."""
     scale, u = np.array([1.0, 2.0, 4.0])[None, :, None], np.array([-1.0, 0.0, 1.0])
-    steady = classic.SteadyMap(np.array([[-1.0, 0.5, 2.0]]), u, scale * u)
+    steady = classic.StaticMap(np.array([[-1.0, 0.5, 2.0]]), u, scale * u)
     for angle, speed in [(-3, 1), (-1, 1), (-0.25, 1.5), (0.5, 2), (1.25, 3), (2, 4), (9, 4)]:
         found = steady.command(np.array([float(angle)]), np.array([0.5]))
         np.testing.assert_allclose(found, [0.5 / speed], atol=1e-9)
@@ -586,7 +601,7 @@ def test_the_steady_map_is_what_nets_say_of_a_history_that_moves_steadily():
     ].copy()  # angles and velocities matter too, but a loop through them settles
     first[:, :26, 0] = 0.05 * np.random.default_rng(12).standard_normal((4, 26))
     net = replace(plain, weights=(first, *plain.weights[1:]))
-    steady = classic.steady_map(BROKK_170, net)
+    steady = classic.static_map(BROKK_170, net)
     assert steady.velocity.shape == (4, 9, 41)
     lags = np.arange(-12, 1) / 20
     for angle in (0, 8):
@@ -649,7 +664,7 @@ def test_the_slope_at_a_limit_is_that_a_thousandth_of_the_range_before_it():
 
 
 def test_feed_forward_is_added_to_the_pid():
-    steady = classic.steady_map(BROKK_170, obedient_net(BROKK_170))
+    steady = classic.static_map(BROKK_170, obedient_net(BROKK_170))
     seen = at_rest(POSE, GOAL)[None]
     plain, ahead, both = (
         c(seen, c.start(1))[0][0, BROKK_170.driven]
@@ -697,7 +712,7 @@ def test_the_steady_map_is_of_motion_even_where_nets_know_stops() -> None:
         [BROKK_170.names[i] for i in BROKK_170.driven]
     )
     stalling = Stalling(**{f.name: getattr(net, f.name) for f in fields(net)})
-    found = classic.steady_map(BROKK_170, stalling)
+    found = classic.static_map(BROKK_170, stalling)
     moving = np.abs(found.u) > 0.1
     np.testing.assert_allclose(
         found.velocity[..., moving],

@@ -18,6 +18,7 @@ from strategies import moving, posed, poses, reals
 from brokk_min import kinematics
 from brokk_min.kinematics import (
     _plan,
+    forward_kinematics,
     frames,
     jacobian,
     joint_rates,
@@ -70,7 +71,7 @@ def test_cosines_and_sines_also_of_half_turns(dtype):
 
 
 def test_the_start_pose_of_the_paper():
-    x, y, z = tool_position(BROKK_170, START)
+    x, y, z = tool_position(forward_kinematics(BROKK_170, START))
     assert np.hypot(x, y) == pytest.approx(3.05, abs=0.005)
     assert z == pytest.approx(1.01, abs=0.005)
     assert np.arctan2(y, x) == pytest.approx(1.5)
@@ -78,14 +79,20 @@ def test_the_start_pose_of_the_paper():
 
 def test_the_arm_stretched_out():
     straight = np.array([0.0, 0.0, 0.0, np.pi, 3 * np.pi / 4])
-    np.testing.assert_allclose(tool_position(BROKK_170, straight), [5.0, 0, 0.95], atol=1e-12)
+    np.testing.assert_allclose(
+        tool_position(forward_kinematics(BROKK_170, straight)), [5.0, 0, 0.95], atol=1e-12
+    )
     upright = np.add(straight, [np.pi / 2, np.pi / 2, 0, 0, 0])
-    np.testing.assert_allclose(tool_position(BROKK_170, upright), [0, 0.25, 5.7], atol=1e-12)
+    np.testing.assert_allclose(
+        tool_position(forward_kinematics(BROKK_170, upright)), [0, 0.25, 5.7], atol=1e-12
+    )
     # 1 rad/s of slew moves the tool at 5 m/s sideways; 1 rad/s of q5 lifts it at 1.2 m/s
     wanted = [[0, 0, 0, 0], [5, 0, 0, 0], [0, 3.6, 2.35, 1.2]]
-    np.testing.assert_allclose(jacobian(BROKK_170, straight), wanted, atol=1e-12)
+    np.testing.assert_allclose(
+        jacobian(forward_kinematics(BROKK_170, straight))[..., BROKK_170.driven], wanted, atol=1e-12
+    )
     # the locked joint, moved by the operator, carries the tool too: 4.75 m
-    velocity = tool_velocity(BROKK_170, straight, np.array([0, 1.0, 0, 0, 0]))
+    velocity = tool_velocity(forward_kinematics(BROKK_170, straight), np.array([0, 1.0, 0, 0, 0]))
     np.testing.assert_allclose(velocity, [0, 0, 4.75], atol=1e-12)
 
 
@@ -102,7 +109,7 @@ def test_the_arm_stretched_out():
 )
 def test_lowest_point_by_hand(bend, lowest):
     q = np.array([0.0, 0.0, 0.0, np.pi, 3 * np.pi / 4]) + bend
-    assert lowest_point(BROKK_170, q) == pytest.approx(lowest, abs=1e-12)
+    assert lowest_point(forward_kinematics(BROKK_170, q)) == pytest.approx(lowest, abs=1e-12)
 
 
 # --- independent oracles --------------------------------------------------------------------------
@@ -111,10 +118,14 @@ def test_lowest_point_by_hand(bend, lowest):
 @given(poses(BROKK_170, (20,)))
 def test_closed_form_of_the_brokk(q):
     points = closed_form(q)
-    np.testing.assert_allclose(tool_position(BROKK_170, q), points[-1], atol=1e-12)
+    np.testing.assert_allclose(
+        tool_position(forward_kinematics(BROKK_170, q)), points[-1], atol=1e-12
+    )
     origins = np.moveaxis(frames(BROKK_170, q)[..., 1:, :3, 3], -2, 0)
     np.testing.assert_allclose(origins, points, atol=1e-12)
-    np.testing.assert_allclose(lowest_point(BROKK_170, q), points[..., 2].min(axis=0), atol=1e-12)
+    np.testing.assert_allclose(
+        lowest_point(forward_kinematics(BROKK_170, q)), points[..., 2].min(axis=0), atol=1e-12
+    )
 
 
 def twist(angular: np.ndarray, linear: np.ndarray) -> np.ndarray:
@@ -147,9 +158,11 @@ def test_frames_are_the_product_of_exponentials(machine_and_pose):
     machine, q = machine_and_pose
     wanted = product_of_exponentials(machine, q)
     np.testing.assert_allclose(frames(machine, q), wanted, atol=1e-10)
-    np.testing.assert_allclose(tool_position(machine, q), wanted[-1, :3, 3], atol=1e-10)
+    np.testing.assert_allclose(
+        tool_position(forward_kinematics(machine, q)), wanted[-1, :3, 3], atol=1e-10
+    )
     lowest = wanted[1:, 2, 3].min()
-    np.testing.assert_allclose(lowest_point(machine, q), lowest, atol=1e-10)
+    np.testing.assert_allclose(lowest_point(forward_kinematics(machine, q)), lowest, atol=1e-10)
 
 
 def pinocchio_brokk() -> pin.Model:
@@ -179,26 +192,37 @@ def test_the_brokk_in_pinocchio(q, other):
     data, tool = model.createData(), model.getFrameId("tool")
     q_dot = np.array(other - q)
     pin.framesForwardKinematics(model, data, q)
-    np.testing.assert_allclose(tool_position(BROKK_170, q), data.oMf[tool].translation, atol=1e-12)
+    np.testing.assert_allclose(
+        tool_position(forward_kinematics(BROKK_170, q)), data.oMf[tool].translation, atol=1e-12
+    )
     # DH frame i sits at the end of link i, Pinocchio's joint i + 1 at its start
     pivots = [data.oMi[i].translation for i in range(2, 6)]
     np.testing.assert_allclose(frames(BROKK_170, q)[1:5, :3, 3], pivots, atol=1e-12)
     full = pin.computeFrameJacobian(model, data, q, tool, pin.LOCAL_WORLD_ALIGNED)[:3]
-    np.testing.assert_allclose(jacobian(BROKK_170, q), full[:, [0, 2, 3, 4]], atol=1e-12)
+    np.testing.assert_allclose(
+        jacobian(forward_kinematics(BROKK_170, q))[..., BROKK_170.driven],
+        full[:, [0, 2, 3, 4]],
+        atol=1e-12,
+    )
     pin.forwardKinematics(model, data, q, q_dot)
     velocity = pin.getFrameVelocity(model, data, tool, pin.LOCAL_WORLD_ALIGNED).linear
-    np.testing.assert_allclose(tool_velocity(BROKK_170, q, q_dot), velocity, atol=1e-12)
+    np.testing.assert_allclose(
+        tool_velocity(forward_kinematics(BROKK_170, q), q_dot), velocity, atol=1e-12
+    )
 
 
 @given(posed(shapes=[(), (3,)]))
 def test_jacobian_is_the_derivative_of_the_tool_position(machine_and_pose):
     machine, q = machine_and_pose
     step = 1e-6
-    J = jacobian(machine, q)
+    J = jacobian(forward_kinematics(machine, q))[..., machine.driven]
     assert J.shape == (*q.shape[:-1], 3, len(machine.driven))
     for column, joint in enumerate(machine.driven):
         nudge = step * np.eye(machine.n)[joint]
-        ahead, behind = tool_position(machine, q + nudge), tool_position(machine, q - nudge)
+        ahead, behind = (
+            tool_position(forward_kinematics(machine, q + nudge)),
+            tool_position(forward_kinematics(machine, q - nudge)),
+        )
         slope = (ahead - behind) / (2 * step)
         np.testing.assert_allclose(J[..., column], slope, atol=1e-7)
 
@@ -250,7 +274,10 @@ def test_joint_rates_are_the_least_cost(machine_and_pose, v, random):
     """|J x - v|^2 + lambda^2 |x|^2 grows by its own quadratic part however the rates are changed."""
     machine, q = machine_and_pose
     assume(arm_length(machine) > 1)
-    J, square = jacobian(machine, q), (0.06 * arm_length(machine)) ** 2
+    J, square = (
+        jacobian(forward_kinematics(machine, q))[..., machine.driven],
+        (0.06 * arm_length(machine)) ** 2,
+    )
 
     def cost(x: np.ndarray) -> float:
         return float(np.sum((J @ x - v) ** 2) + square * np.sum(x**2))
@@ -271,7 +298,9 @@ def test_joint_rates_are_bounded_and_move_the_tool_no_faster_than_wanted(machine
     v = np.broadcast_to(v, (*q.shape[:-1], 3))
     rates, speed = joint_rates(machine, q, v), np.linalg.norm(v, axis=-1)
     assert (np.linalg.norm(rates, axis=-1) <= speed / (0.12 * arm_length(machine)) + 1e-12).all()
-    moved = np.einsum("...ij,...j->...i", jacobian(machine, q), rates)
+    moved = np.einsum(
+        "...ij,...j->...i", jacobian(forward_kinematics(machine, q))[..., machine.driven], rates
+    )
     assert (np.linalg.norm(moved, axis=-1) <= speed + 1e-12).all()
     assert (np.einsum("...i,...i->...", moved, v) >= -1e-12).all()
 
@@ -280,9 +309,15 @@ def test_joint_rates_near_a_singularity_stay_small_and_follow_elsewhere():
     """Bending the stretched arm by a milliradian: undamped, q3 to q5 would race; damped, they rest."""
     bent = np.array([0.0, 0.0, 0.001, np.pi, 3 * np.pi / 4 + 0.001])
     outward = np.array([0.1, 0.0, 0.0])
-    assert np.abs(np.linalg.pinv(jacobian(BROKK_170, bent)) @ outward).max() > 10
+    assert (
+        np.abs(
+            np.linalg.pinv(jacobian(forward_kinematics(BROKK_170, bent))[..., BROKK_170.driven])
+            @ outward
+        ).max()
+        > 10
+    )
     assert np.abs(joint_rates(BROKK_170, bent, outward)).max() < 0.005
-    J = jacobian(BROKK_170, START)
+    J = jacobian(forward_kinematics(BROKK_170, START))[..., BROKK_170.driven]
     for v in 0.3 * np.eye(3):
         assert np.linalg.norm(J @ joint_rates(BROKK_170, START, v) - v) < 0.06 * 0.3
 
@@ -314,12 +349,14 @@ def test_joint_rates_of_a_batch_are_those_of_its_poses_one_by_one(case, v):
 def test_tool_velocity_is_the_derivative_along_the_motion(case):
     machine, q, q_dot = case
     step = 1e-6
-    ahead, behind = (tool_position(machine, q + s * step * q_dot) for s in (1, -1))
+    ahead, behind = (
+        tool_position(forward_kinematics(machine, q + s * step * q_dot)) for s in (1, -1)
+    )
     position, velocity, lowest = tool_state(machine, q, q_dot)
     np.testing.assert_allclose(velocity, (ahead - behind) / (2 * step), atol=1e-7)
-    np.testing.assert_array_equal(velocity, tool_velocity(machine, q, q_dot))
-    np.testing.assert_allclose(position, tool_position(machine, q), atol=1e-14)
-    np.testing.assert_allclose(lowest, lowest_point(machine, q), atol=1e-14)
+    np.testing.assert_array_equal(velocity, tool_velocity(forward_kinematics(machine, q), q_dot))
+    np.testing.assert_allclose(position, tool_position(forward_kinematics(machine, q)), atol=1e-14)
+    np.testing.assert_allclose(lowest, lowest_point(forward_kinematics(machine, q)), atol=1e-14)
 
 
 @given(moving())
@@ -327,12 +364,22 @@ def test_driven_joints_move_the_tool_through_the_jacobian_and_locked_ones_add_to
     machine, q, q_dot = case
     still = q_dot.copy()
     still[..., machine.locked] = 0.0
-    through = np.einsum("...ij,...j->...i", jacobian(machine, q), q_dot[..., machine.driven])
-    np.testing.assert_allclose(tool_velocity(machine, q, still), through, atol=1e-12)
+    through = np.einsum(
+        "...ij,...j->...i",
+        jacobian(forward_kinematics(machine, q))[..., machine.driven],
+        q_dot[..., machine.driven],
+    )
+    np.testing.assert_allclose(
+        tool_velocity(forward_kinematics(machine, q), still), through, atol=1e-12
+    )
     freed = tuple(replace(joint, driven=True) for joint in machine.joints)
-    every = jacobian(replace(machine, joints=freed), q)
+    every = jacobian(forward_kinematics(replace(machine, joints=freed), q))[
+        ..., replace(machine, joints=freed).driven
+    ]
     whole = np.einsum("...ij,...j->...i", every, q_dot)
-    np.testing.assert_allclose(tool_velocity(machine, q, q_dot), whole, atol=1e-12)
+    np.testing.assert_allclose(
+        tool_velocity(forward_kinematics(machine, q), q_dot), whole, atol=1e-12
+    )
 
 
 @given(moving(shapes=[(1,), (4,), (2, 3)]))
@@ -342,17 +389,17 @@ def test_a_batch_is_the_same_as_its_poses_one_by_one(case):
         batch = function(machine, q)
         for index in np.ndindex(q.shape[:-1]):
             np.testing.assert_allclose(batch[index], function(machine, q[index]), atol=1e-14)
-    batch = tool_velocity(machine, q, q_dot)
+    batch = tool_velocity(forward_kinematics(machine, q), q_dot)
     for index in np.ndindex(q.shape[:-1]):
-        alone = tool_velocity(machine, q[index], q_dot[index])
+        alone = tool_velocity(forward_kinematics(machine, q[index]), q_dot[index])
         np.testing.assert_allclose(batch[index], alone, atol=1e-14)
 
 
 def test_an_empty_batch_has_empty_results():
     q = np.zeros((0, 5))
     assert frames(BROKK_170, q).shape == (0, 6, 4, 4)
-    assert jacobian(BROKK_170, q).shape == (0, 3, 4)
-    assert lowest_point(BROKK_170, q).shape == (0,)
+    assert jacobian(forward_kinematics(BROKK_170, q))[..., BROKK_170.driven].shape == (0, 3, 4)
+    assert lowest_point(forward_kinematics(BROKK_170, q)).shape == (0,)
     assert joint_rates(BROKK_170, q, np.zeros((0, 3))).shape == (0, 4)
 
 
@@ -363,7 +410,9 @@ def test_a_batch_of_several_blocks_is_its_halves(dtype):
     p, J = tool_jacobian(BROKK_170, q)
     assert J.shape == (3, 1500, 3, 5)
     for some in (np.s_[:2], np.s_[2:], np.s_[:, 1499], np.s_[1, 700]):
-        np.testing.assert_array_equal(p[some], tool_position(BROKK_170, q[some]))
+        np.testing.assert_array_equal(
+            p[some], tool_position(forward_kinematics(BROKK_170, q[some]))
+        )
         np.testing.assert_array_equal(J[some], tool_jacobian(BROKK_170, q[some])[1])
 
 
@@ -406,13 +455,18 @@ def test_single_precision_stays_single_for_link_lengths_out_of_an_array():
     table = np.array([[joint.a, joint.d] for joint in BROKK_170.joints])
     joints = zip(BROKK_170.joints, table, strict=True)
     machine = replace(BROKK_170, joints=tuple(replace(j, a=a, d=d) for j, (a, d) in joints))
-    assert tool_position(machine, START.astype(np.float32)).dtype == np.float32
-    assert jacobian(machine, START.astype(np.float32)).dtype == np.float32
+    assert tool_position(forward_kinematics(machine, START.astype(np.float32))).dtype == np.float32
+    assert (
+        jacobian(forward_kinematics(machine, START.astype(np.float32)))[..., machine.driven].dtype
+        == np.float32
+    )
 
 
 def test_whole_angles_and_lists_are_angles():
-    whole = tool_position(BROKK_170, [1, 0, 1, 2, 1])
-    np.testing.assert_array_equal(whole, tool_position(BROKK_170, np.array([1.0, 0, 1, 2, 1])))
+    whole = tool_position(forward_kinematics(BROKK_170, [1, 0, 1, 2, 1]))
+    np.testing.assert_array_equal(
+        whole, tool_position(forward_kinematics(BROKK_170, np.array([1.0, 0, 1, 2, 1])))
+    )
 
 
 # --- refusals -------------------------------------------------------------------------------------
@@ -427,10 +481,15 @@ def test_position_and_jacobian_in_one_pass_are_those_alone():
     for machine in (BROKK_170, replace(BROKK_170, joints=joints)):
         q = np.random.default_rng(0).uniform(-1, 1, (4, 2, 5))
         p, J = tool_jacobian(machine, q)
-        np.testing.assert_array_equal(p, tool_position(machine, q))
-        np.testing.assert_array_equal(J[..., machine.driven], jacobian(machine, q))
+        np.testing.assert_array_equal(p, tool_position(forward_kinematics(machine, q)))
+        np.testing.assert_array_equal(
+            J[..., machine.driven], jacobian(forward_kinematics(machine, q))[..., machine.driven]
+        )
         for i in range(5):
-            ahead, behind = (tool_position(machine, q + h * np.eye(5)[i]) for h in (1e-6, -1e-6))
+            ahead, behind = (
+                tool_position(forward_kinematics(machine, q + h * np.eye(5)[i]))
+                for h in (1e-6, -1e-6)
+            )
             np.testing.assert_allclose(J[..., i], (ahead - behind) / 2e-6, atol=1e-8)
 
 

@@ -85,12 +85,12 @@ BAD = [
     ),
     ({"dead_zone": 80 / 127}, ["dead_zone", "below", "got 0.629"]),
     ({"delay": -0.04}, ["delay", "0 to inf", "got -0.04"]),
-    ({"spool_time": 0.0}, ["spool_time", "got 0.0"]),
-    ({"cylinder_time": 0.0}, ["cylinder_time", "got 0.0"]),
-    ({"ready_up_time": 0.0}, ["ready_up_time", "got 0.0"]),
-    ({"ready_down_time": 0.0}, ["ready_down_time", "got 0.0"]),
-    ({"ready_threshold": 1.0}, ["ready_threshold", "0 to 0.999", "got 1.0"]),
-    ({"spool_idle": -0.1}, ["spool_idle", "0 to 1", "got -0.1"]),
+    ({"tau_spool": 0.0}, ["tau_spool", "got 0.0"]),
+    ({"tau_cylinder": 0.0}, ["tau_cylinder", "got 0.0"]),
+    ({"tau_valve_up": 0.0}, ["tau_valve_up", "got 0.0"]),
+    ({"tau_valve_down": 0.0}, ["tau_valve_down", "got 0.0"]),
+    ({"valve_threshold": 1.0}, ["valve_threshold", "0 to 0.999", "got 1.0"]),
+    ({"spool_threshold": -0.1}, ["spool_threshold", "0 to 1", "got -0.1"]),
     ({"pump_flow": 0.0}, ["pump_flow", "got 0.0"]),
     ({"plant_dt": 0.0}, ["plant_dt", "1e-06 to 1", "got 0.0"]),
     ({"plant_dt": 0.03}, ["plant_dt", "1/rate = 0.05 to be a multiple", "got 0.03"]),
@@ -125,7 +125,7 @@ def test_every_numeric_field_is_in_the_table_of_bad_fields():
 def test_values_at_the_ends_of_the_allowed_ranges_are_machines():
     replace(BROKK_170, pwm_limit=10, dead_zone=0.078)
     replace(BROKK_170, pwm_limit=1, dead_zone=0.0, delay=0.0, velocity_samples=2, history=2)
-    replace(BROKK_170, pwm_limit=127, valve_frame_id=0x7FF, ready_threshold=0.0, encoder_bits=32)
+    replace(BROKK_170, pwm_limit=127, valve_frame_id=0x7FF, valve_threshold=0.0, encoder_bits=32)
     replace(BROKK_170, **with_joint(0, encoder_node=127, a=0.0, d=-1.0))
     replace(BROKK_170, plant_dt=BROKK_170.dt)
 

@@ -15,7 +15,7 @@ from strategies import machines
 from brokk_min import env as task
 from brokk_min import observation as sight
 from brokk_min.env import TaskConfig
-from brokk_min.kinematics import joint_rates, tool_position, tool_velocity
+from brokk_min.kinematics import forward_kinematics, joint_rates, tool_position, tool_velocity
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.machine import BROKK_170, estimate_velocity
 
@@ -30,10 +30,10 @@ MACHINES = [random_machine(np.random.default_rng(seed), 2 + seed % 5) for seed i
 def test_to_command_by_hand():
     """The dead zone has 8.89 counts, 71.11 are beyond: 8.89 + 35.56; clipped to -80; at 0.01 and 0.005."""
     action = [0.5, -3.0, -0.01, 0.005]  # the last two: 8.89 + 0.71 and half of that
-    counts = sight.to_command(BROKK_170, action) * 127
+    counts = sight.action_to_pwm(BROKK_170, action) * 127
     np.testing.assert_allclose(counts, [44, 0, -80, -10, 5], atol=1e-9)
     assert counts[1] == 0  # q2 is the operator's
-    assert not sight.to_command(BROKK_170, np.zeros(4)).any()
+    assert not sight.action_to_pwm(BROKK_170, np.zeros(4)).any()
 
 
 @given(machines(), st.floats(0, 1), st.floats(0, 1))
@@ -42,13 +42,15 @@ def test_commands_rise_with_actions_by_their_slope(machine, one, other):
     low, high = sorted([one, other])
     driven, limit = machine.driven, machine.pwm_limit / 127
     action = np.array([[low], [high], [-high], [1.0]]) * np.ones(len(driven))
-    u = sight.to_command(machine, action)[..., driven]
+    u = sight.action_to_pwm(machine, action)[..., driven]
     assert (u[0] <= u[1]).all() and np.array_equal(u[1], -u[2])
     np.testing.assert_allclose(u[3], limit, atol=1e-9)
-    slope = sight.command_slope(machine, np.array([[0.0], [limit], [-limit]]) * np.ones(machine.n))
+    slope = sight.action_to_pwm_derivative(
+        machine, np.array([[0.0], [limit], [-limit]]) * np.ones(machine.n)
+    )
     assert slope.shape == (3, len(driven)) and slope.dtype == np.float32
     if machine.dead_zone < limit - 0.01:
-        whole = slope[0] * sight.RAMP + slope[1] * (1 - sight.RAMP)
+        whole = slope[0] * sight.COMPENSATION_RANGE + slope[1] * (1 - sight.COMPENSATION_RANGE)
         np.testing.assert_allclose(whole, limit, rtol=1e-5)
         assert np.array_equal(slope[1], slope[2]) and (slope[0] >= slope[1]).all()
 
@@ -57,14 +59,17 @@ def test_commands_rise_with_actions_by_their_slope(machine, one, other):
 def test_to_command_sends_whole_counts_in_the_order_of_the_joints(machine):
     rng = np.random.default_rng(1)
     action = rng.uniform(-2, 2, (50, len(machine.driven))).astype(np.float32)
-    counts = sight.to_command(machine, action) * 127
+    counts = sight.action_to_pwm(machine, action) * 127
     np.testing.assert_allclose(counts, np.rint(counts), atol=1e-4)
     assert np.abs(counts).max() <= machine.pwm_limit + 1e-4
     wanted = np.zeros_like(counts)
     for column, joint in enumerate(machine.driven):
-        points = np.array([0, sight.RAMP, 1]), np.array([0, 0, machine.pwm_limit], float)
+        points = (
+            np.array([0, sight.COMPENSATION_RANGE, 1]),
+            np.array([0, 0, machine.pwm_limit], float),
+        )
         dead = 127 * machine.dead_zone
-        points[1][1] = dead + sight.RAMP * (machine.pwm_limit - dead)
+        points[1][1] = dead + sight.COMPENSATION_RANGE * (machine.pwm_limit - dead)
         wanted[:, joint] = np.sign(action[:, column]) * np.interp(
             np.abs(action[:, column]), *points
         )
@@ -74,21 +79,21 @@ def test_to_command_sends_whole_counts_in_the_order_of_the_joints(machine):
 
 def test_to_command_takes_whole_numbers_like_floats():
     assert np.array_equal(
-        sight.to_command(BROKK_170, [1, 0, -1, 0]),
-        sight.to_command(BROKK_170, [1.0, 0.0, -1.0, 0.0]),
+        sight.action_to_pwm(BROKK_170, [1, 0, -1, 0]),
+        sight.action_to_pwm(BROKK_170, [1.0, 0.0, -1.0, 0.0]),
     )
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_to_command_refuses_what_is_no_number(bad):
     with pytest.raises(ValueError, match=f"action: expected finite numbers, got {bad}"):
-        sight.to_command(BROKK_170, [[0.0, bad, 0.0, 0.0]])
+        sight.action_to_pwm(BROKK_170, [[0.0, bad, 0.0, 0.0]])
 
 
 @pytest.mark.parametrize("shape", [(), (1,), (3,), (5,), (4, 1)])
 def test_to_command_refuses_wrong_shapes(shape):
     with pytest.raises(ValueError, match=r"action: expected \(\.\.\., 4\), got \("):
-        sight.to_command(BROKK_170, np.zeros(shape))
+        sight.action_to_pwm(BROKK_170, np.zeros(shape))
 
 
 # --- observations ---------------------------------------------------------------------------------
@@ -105,7 +110,7 @@ def told_history():
     return history
 
 
-STILL = np.zeros(3)  # no lag, no goal
+STANDSTILL = np.zeros(3)  # no lag, no goal
 
 
 def told_angles(machine, history):
@@ -125,7 +130,7 @@ def told_angles(machine, history):
 
 def headed(machine, q, v):
     """Velocities `v` (..., 3) outward from the z axis, sideways and up, the tool being where `q` says."""
-    x, y, _ = np.moveaxis(tool_position(machine, q), -1, 0)
+    x, y, _ = np.moveaxis(tool_position(forward_kinematics(machine, q)), -1, 0)
     turn = np.exp(-1j * np.arctan2(y, x)) * (v[..., 0] + 1j * v[..., 1])
     return np.stack([turn.real, turn.imag, v[..., 2]], axis=-1)
 
@@ -189,7 +194,7 @@ def test_observed_tool_velocity_is_the_derivative_of_the_closed_form():
         radius * (np.arctan2(after[1], after[0]) - np.arctan2(before[1], before[0])) / (2 * step)
     )
     upward = (after[2] - before[2]) / (2 * step)
-    seen = sight.observe(BROKK_170, history, STILL, STILL)
+    seen = sight.observe(BROKK_170, history, STANDSTILL, STANDSTILL)
     np.testing.assert_allclose(
         seen[3:6] / 1.4 * 0.3 / 3**0.5, [outward, sideways, upward], atol=1e-6
     )
@@ -238,7 +243,8 @@ def test_measured_undoes_observe(machine):
     v_tool = sight.measured(machine, sight.observe(machine, still, v_goal, lag)).v_tool
     step = 1e-6 * still[..., 1, -1]
     ahead, behind = (
-        tool_position(machine, told_angles(machine, still) + s * step) for s in (1, -1)
+        tool_position(forward_kinematics(machine, told_angles(machine, still) + s * step))
+        for s in (1, -1)
     )
     np.testing.assert_allclose(v_tool, (ahead - behind) / 2e-6, atol=1e-5)
     alone = sight.measured(machine, sight.observe(machine, history[1, 2], v_goal[1, 2], lag[1, 2]))
@@ -259,7 +265,10 @@ def test_a_tick_is_measured_alike_in_simulation_and_on_hardware(machine):
     slope = estimate_velocity(after[..., 0, :], machine.velocity_samples, machine.dt)
     np.testing.assert_array_equal(after[..., 1, -1], slope)
     np.testing.assert_array_equal(
-        late, sight.push_lag(machine, tool_velocity(machine, q, after[..., 1, -1]), v_goal, lag)
+        late,
+        sight.integrate_error(
+            machine, tool_velocity(forward_kinematics(machine, q), after[..., 1, -1]), v_goal, lag
+        ),
     )
 
 
@@ -344,16 +353,18 @@ def test_noise_is_uniform_within_five_percent_and_fresh_on_what_is_sensed(machin
     rng, num = np.random.default_rng(4), 400
     history, v_goal, lag = random_sight(machine, rng, (num,))
     state = replace(
-        task.rest_state(machine, history[..., 0, -1], v_goal, plant=False), history=history, lag=lag
+        task.initial_state(machine, history[..., 0, -1], v_goal, plant=False),
+        history=history,
+        lag=lag,
     )
     clean = sight.observe(machine, history, v_goal, lag)
-    seen = task.look(machine, TaskConfig(), state, rng)
+    seen = task.get_obs(machine, TaskConfig(), state, rng)
     assert seen.dtype == np.float32
     *_, angles, body, _, _ = parts(machine, seen - clean)
     assert not body[:, :, 2].any()
     back = sight.measured(machine, seen)
     np.testing.assert_allclose(back.v_goal, v_goal, atol=1e-5)
-    exact = tool_velocity(machine, back.q, history[..., 1, -1])
+    exact = tool_velocity(forward_kinematics(machine, back.q), history[..., 1, -1])
     tool = headed(machine, back.q, back.v_tool - exact) * 1.4 * 3**0.5 / machine.tool_speed
     found = []
     for error, weight in ((tool, 1.4), (angles, 1.4), (body[:, :, :2], machine.history**-0.5)):
@@ -365,17 +376,17 @@ def test_noise_is_uniform_within_five_percent_and_fresh_on_what_is_sensed(machin
     draws = np.concatenate(found, axis=1)
     assert draws.shape[1] == sensed(machine)
     assert np.abs(np.corrcoef(draws.T) - np.eye(draws.shape[1])).max() < 0.3
-    assert not np.array_equal(seen, task.look(machine, TaskConfig(), state, rng))
-    assert np.array_equal(task.look(machine, QUIET, state, rng), clean)
+    assert not np.array_equal(seen, task.get_obs(machine, TaskConfig(), state, rng))
+    assert np.array_equal(task.get_obs(machine, QUIET, state, rng), clean)
 
 
 @pytest.mark.parametrize("shape", [(), (2, 3)])
 def test_states_and_looks_take_any_leading_axes_and_whole_numbers(shape):
-    state = task.rest_state(BROKK_170, np.full((*shape, 5), 1), STILL, plant=False)
+    state = task.initial_state(BROKK_170, np.full((*shape, 5), 1), STANDSTILL, plant=False)
     assert state.q.dtype == float and state.v_goal.shape == state.lag.shape == (*shape, 3)
     assert state.ticks.shape == state.goal_ticks.shape == shape
     assert state.ticks.dtype == state.goal_ticks.dtype == np.int64
-    assert task.look(BROKK_170, TaskConfig(), state, np.random.default_rng(0)).shape == (
+    assert task.get_obs(BROKK_170, TaskConfig(), state, np.random.default_rng(0)).shape == (
         *shape,
         171,
     )
@@ -390,7 +401,7 @@ def test_the_observation_of_an_environment_is_noisy_within_five_percent():
         *_, angles, body, _, _ = parts(BROKK_170, error)
         assert not body[:, :, 2].any()
         back = sight.measured(BROKK_170, seen)
-        exact = tool_velocity(BROKK_170, back.q, state.history[..., 1, -1])
+        exact = tool_velocity(forward_kinematics(BROKK_170, back.q), state.history[..., 1, -1])
         tool = headed(BROKK_170, back.q, back.v_tool - exact) * 3**0.5 / 0.3
         for noise in (tool, angles / 1.4, body[:, :, :2] * 13**0.5):
             assert 0.049 < np.abs(noise).max() < 0.05 + 2e-5
@@ -409,12 +420,12 @@ def test_lag_by_hand():
         * 0.05
         * forget
     )
-    lag = sight.push_lag(
+    lag = sight.integrate_error(
         BROKK_170, np.zeros((4, 3), np.float32), goals, np.zeros((4, 3), np.float32)
     )
     np.testing.assert_allclose(lag, wanted, rtol=1e-5, atol=1e-10)
     assert lag.dtype == np.float32
-    again = sight.push_lag(BROKK_170, np.zeros((4, 3), np.float32), goals[::-1], lag)
+    again = sight.integrate_error(BROKK_170, np.zeros((4, 3), np.float32), goals[::-1], lag)
     np.testing.assert_allclose(
         again, (wanted + wanted[::-1] / forget) * forget, rtol=1e-5, atol=1e-10
     )
@@ -426,14 +437,14 @@ def test_the_tool_velocity_counts_against_the_goal():
     ahead, behind = (closed_form(q + sign * 1e-6 * q_dot)[0] for sign in (1, -1))
     v_tool = (ahead - behind) / 2e-6
     assert np.linalg.norm(v_tool) > 0.1
-    measured = tool_velocity(BROKK_170, q, q_dot)
+    measured = tool_velocity(forward_kinematics(BROKK_170, q), q_dot)
     lag = np.array([0.01, 0.02, -0.03])
-    kept = sight.push_lag(BROKK_170, measured, v_tool, lag)
+    kept = sight.integrate_error(BROKK_170, measured, v_tool, lag)
     np.testing.assert_allclose(
         kept, lag * np.exp(-0.025), atol=1e-8
     )  # no error: forgotten, nothing more
     error = np.array([0.01, 0.0, -0.005])
-    after = sight.push_lag(BROKK_170, measured, v_tool + error, lag)
+    after = sight.integrate_error(BROKK_170, measured, v_tool + error, lag)
     np.testing.assert_allclose(after, (lag + 0.05 * error) * np.exp(-0.025), atol=1e-8)
 
 
@@ -441,14 +452,14 @@ def test_a_lasting_error_fills_the_lag_and_it_is_forgotten_within_two_seconds():
     small, still = np.array([[0.008, -0.004, 0.001]]), np.zeros((1, 3))
     lag, sums = np.zeros((1, 3)), []
     for tick in range(1, 1001):
-        lag = sight.push_lag(BROKK_170, still, small, lag)
+        lag = sight.integrate_error(BROKK_170, still, small, lag)
         sums.append(small * 0.05 * np.exp(-0.025 * np.arange(1, tick + 1)).sum())
         np.testing.assert_allclose(lag, sums[-1], rtol=1e-6)
     np.testing.assert_allclose(
         lag, 1.975 * small, rtol=1e-3
     )  # error x dt / (e^0.025 - 1), about x 2 s
     for _ in range(40):
-        lag = sight.push_lag(BROKK_170, still, np.zeros((1, 3)), lag)
+        lag = sight.integrate_error(BROKK_170, still, np.zeros((1, 3)), lag)
     np.testing.assert_allclose(lag, sums[-1] / np.e, rtol=1e-5)
 
 
@@ -458,7 +469,7 @@ def test_the_lag_is_bounded_and_points_along_the_error(machine):
     rng, limit = np.random.default_rng(21), 0.07 * machine.tool_speed
     error = rng.standard_normal((30, 3)) * 10.0 ** rng.uniform(-3, 2, (30, 1)) * limit
     size = np.linalg.norm(error, axis=-1, keepdims=True)
-    lag = sight.push_lag(machine, np.zeros((30, 3)), error, np.zeros((30, 3)))
+    lag = sight.integrate_error(machine, np.zeros((30, 3)), error, np.zeros((30, 3)))
     counted = error / size * np.minimum(size, limit) * 0.025 * np.exp(-0.0125)
     np.testing.assert_allclose(lag, counted, rtol=1e-5)
     assert (size < limit).sum() > 5 and (size > limit).sum() > 5
@@ -508,7 +519,7 @@ def test_the_papers_observation_has_plain_standard_deviations_and_no_wanted_rate
     state = replace(
         state, history=state.history + np.float32(0.01), lag=state.lag + np.float32(0.02)
     )
-    seen = task.look(m, config, state, np.random.default_rng(0))
+    seen = task.get_obs(m, config, state, np.random.default_rng(0))
     np.testing.assert_array_equal(seen[:, -8:], 0)
     middle, width = (
         (m.column("q_min") + m.column("q_max")) / 2,

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from strategies import machines, poses, reals
 
+from brokk_min.actuator import PlantState, lever_arm, plant_reset, plant_step, speed_limits
 from brokk_min.machine import BROKK_170, Machine
-from brokk_min.plant import PlantState, lever_arm, plant_reset, plant_step, speed_limits
 
 FAST = replace(BROKK_170, rate=200.0)  # a tick is one step of 5 ms
 LIMIT = 80 / 127
@@ -159,8 +159,8 @@ def slow_plant(machine: Machine, q: list[float], commands: np.ndarray) -> list[d
         wanted = []
         for joint, x in zip(m.joints, joints, strict=True):
             g = 0.0
-            if x["z"] > m.ready_threshold:
-                part = min(1.0, (x["z"] - m.ready_threshold) / (1 - m.ready_threshold))
+            if x["z"] > m.valve_threshold:
+                part = min(1.0, (x["z"] - m.valve_threshold) / (1 - m.valve_threshold))
                 g = math.sqrt(3 * part**2 - 2 * part**3)
             K = joint.speed_positive if x["s"] > 0 else joint.speed_negative
             wanted.append(K * x["s"] * g)
@@ -168,8 +168,8 @@ def slow_plant(machine: Machine, q: list[float], commands: np.ndarray) -> list[d
         share = 1.0 if flow == 0 else min(1.0, m.pump_flow / flow)
         for i, (joint, x) in enumerate(zip(m.joints, joints, strict=True)):
             us = math.copysign(max(0.0, (abs(a[i]) - m.dead_zone) / (1 - m.dead_zone)), a[i])
-            zt = 1.0 if abs(x["s"]) > m.spool_idle else 0.0
-            tau = m.ready_up_time if zt > x["z"] else m.ready_down_time
+            zt = 1.0 if abs(x["s"]) > m.spool_threshold else 0.0
+            tau = m.tau_valve_up if zt > x["z"] else m.tau_valve_down
             if joint.cylinder_base:
                 b, c, gamma = joint.cylinder_base, joint.cylinder_rod, joint.cylinder_angle + x["q"]
                 r = b * c * math.sin(gamma) / math.sqrt(b * b + c * c - 2 * b * c * math.cos(gamma))
@@ -177,8 +177,8 @@ def slow_plant(machine: Machine, q: list[float], commands: np.ndarray) -> list[d
                 r = joint.cylinder_rod
             new = {
                 "q": x["q"] + dt * x["v"] / r,
-                "v": x["v"] + dt * (wanted[i] * share - x["v"]) / m.cylinder_time,
-                "s": x["s"] + dt * (us - x["s"]) / m.spool_time,
+                "v": x["v"] + dt * (wanted[i] * share - x["v"]) / m.tau_cylinder,
+                "s": x["s"] + dt * (us - x["s"]) / m.tau_spool,
                 "z": x["z"] + dt * (zt - x["z"]) / tau,
             }
             if new["q"] >= joint.q_max:

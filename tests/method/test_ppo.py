@@ -25,13 +25,12 @@ from torch import nn
 
 from brokk_min import ppo
 from brokk_min.__main__ import main
-from brokk_min.actuator import save_net
-from brokk_min.env import TaskConfig, look
+from brokk_min.env import TaskConfig, action_to_pwm, look
 from brokk_min.identification import files
+from brokk_min.identification.net_file import save_net
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import load_policy
 from brokk_min.machine import BROKK_170
-from brokk_min.observation import to_command
 from brokk_min.ppo import Agent, PPOConfig, Training, gae, train
 
 TINY = PPOConfig(
@@ -363,7 +362,7 @@ def test_without_a_critic_an_action_is_judged_by_its_slope(monkeypatch):
     assert not none and np.any(over)
     for name in ("q", "motion", "v_goal", "lag"):
         np.testing.assert_array_equal(getattr(rollout, name), [getattr(s, name) for s in begun])
-    commands = to_command(BROKK_170, batch["action"].view(13, 8, 4).numpy())
+    commands = action_to_pwm(BROKK_170, batch["action"].view(13, 8, 4).numpy())
     np.testing.assert_array_equal(rollout.u, commands)
     np.testing.assert_array_equal(rollout.ended, over)
 

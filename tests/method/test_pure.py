@@ -27,7 +27,7 @@ def fixed(array: Any) -> Any:
 
 Q = fixed(RNG.uniform(M.column("q_min"), M.column("q_max"), (4, 5)))
 RATE, V = fixed(RNG.uniform(-0.2, 0.2, (4, 5))), fixed(RNG.uniform(-0.3, 0.3, (4, 3)))
-J = fixed(kinematics.jacobian(M, Q))
+J = fixed(kinematics.jacobian(kinematics.forward_kinematics(M, Q))[..., M.driven])
 U = fixed(machine.limit_command(M, RNG.uniform(-1, 1, (4, 5))))
 HISTORY = fixed(RNG.uniform(-0.1, 0.1, (4, 5, 3, 13)).astype(np.float32))
 LAG, V32, Q32 = (
@@ -58,14 +58,14 @@ CALLS: dict[str, Callable[[], Any]] = {
     "read_encoder": lambda: machine.read_encoder(M, Q),
     "estimate_velocity": lambda: machine.estimate_velocity(Q, 4, 0.05),
     "frames": lambda: kinematics.frames(M, Q),
-    "tool_position": lambda: kinematics.tool_position(M, Q),
-    "jacobian": lambda: kinematics.jacobian(M, Q),
+    "tool_position": lambda: kinematics.tool_position(kinematics.forward_kinematics(M, Q)),
+    "jacobian": lambda: kinematics.jacobian(kinematics.forward_kinematics(M, Q))[..., M.driven],
     "tool_jacobian": lambda: kinematics.tool_jacobian(M, Q),
     "tool_state": lambda: kinematics.tool_state(M, Q, RATE),
-    "tool_velocity": lambda: kinematics.tool_velocity(M, Q, RATE),
+    "tool_velocity": lambda: kinematics.tool_velocity(kinematics.forward_kinematics(M, Q), RATE),
     "joint_rates": lambda: kinematics.joint_rates(M, Q, V),
     "damped_rates": lambda: kinematics.damped_rates(M, J, V),
-    "lowest_point": lambda: kinematics.lowest_point(M, Q),
+    "lowest_point": lambda: kinematics.lowest_point(kinematics.forward_kinematics(M, Q)),
     "dls": lambda: jacobian.dls(J, fixed(np.ones((4, 4))), fixed(np.full(4, 0.1))),
     "limit_gradient": lambda: jacobian.limit_gradient(M, Q),
     "limit_weights": lambda: jacobian.limit_weights(M, Q, RATE),
@@ -78,12 +78,12 @@ CALLS: dict[str, Callable[[], Any]] = {
         M, HISTORY, V32, LAG, fixed(np.full((4, 108), 0.01, np.float32))
     ),
     "measured": lambda: observation.measured(M, SEEN),
-    "push_lag": lambda: observation.push_lag(M, V32, V32, LAG),
+    "integrate_error": lambda: observation.integrate_error(M, V32, V32, LAG),
     "push_measured": lambda: observation.push_measured(M, HISTORY, U, Q32, V32, LAG),
-    "to_command": lambda: observation.to_command(M, fixed(np.ones((4, 4), np.float32))),
+    "action_to_pwm": lambda: observation.action_to_pwm(M, fixed(np.ones((4, 4), np.float32))),
     "reward": lambda: env.reward(V, fixed(np.zeros((4, 3)))),
     "terminated": lambda: env.terminated(M, fixed([-0.1, 0.1])),
-    "rest_state": lambda: env.rest_state(M, Q, V32, plant=True),
+    "initial_state": lambda: env.initial_state(M, Q, V32, plant=True),
     "encoder_counts": lambda: gate.encoder_counts(M, fixed(np.arange(20).reshape(4, 5))),
     "encoder_raw": lambda: gate.encoder_raw(M, fixed(np.arange(20).reshape(4, 5))),
     "checksum": lambda: gate.checksum(fixed(np.arange(7))),

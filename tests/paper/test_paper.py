@@ -20,16 +20,15 @@ from helpers_machines import small_net
 
 import brokk_min
 from brokk_min import jacobian, ppo
-from brokk_min.env import TaskConfig
+from brokk_min.actuator import plant_reset, plant_step
+from brokk_min.env import TaskConfig, paper_view
 from brokk_min.evaluation import baselines, experiments, figures, preliminary, report, sequences
 from brokk_min.identification import excitation, fitting
 from brokk_min.identification import validation as scores
 from brokk_min.identification.logs import velocity_of
-from brokk_min.kinematics import tool_position
+from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.machine import BROKK_170, valve_opening
-from brokk_min.observation import paper_view
-from brokk_min.plant import plant_reset, plant_step
 
 ROOT = Path(__file__).parents[2]
 PAPER = (ROOT / "PAPER.md").read_text()
@@ -260,7 +259,7 @@ def test_an_idle_valve_is_what_makes_the_response_slow() -> None:
     """About 400 ms from idle, 100 ms when moving; a valve that is ready at once knows no difference."""
     assert rise_time(BROKK_170, 0) == pytest.approx(0.4, abs=0.02)
     assert rise_time(BROKK_170, 20) == pytest.approx(0.1, abs=0.02)
-    ready = replace(BROKK_170, ready_up_time=0.005)
+    ready = replace(BROKK_170, tau_valve_up=0.005)
     assert rise_time(ready, 0) == pytest.approx(0.1, abs=0.02)
 
 
@@ -306,7 +305,7 @@ def test_valve_opening_by_hand() -> None:
 def test_without_a_valve_cost_the_reward_is_eq2_alone() -> None:
     rewards = {}
     for cost in (0.0, 0.01):
-        env = TaskVectorEnv(20, config=TaskConfig(valve_cost=cost, lag_cost=0.0))
+        env = TaskVectorEnv(20, config=TaskConfig(valve_cost=cost, integral_cost=0.0))
         env.reset(seed=0)
         _, rewards[cost], ended, _, info = env.step(np.ones((20, 4), np.float32))
         assert not ended.any()
@@ -372,7 +371,7 @@ def test_figure_6_runs_every_controller_and_shows_its_panels() -> None:
 
 def test_figure_6_draws_its_starts_and_judges_singular_ones() -> None:
     figure = figures.plot_starts(BROKK_170, STARTS, ["extended", "extended"])
-    reach = np.hypot(*tool_position(BROKK_170, STARTS[1])[:2])
+    reach = np.hypot(*tool_position(forward_kinematics(BROKK_170, STARTS[1]))[:2])
     assert np.max(figure.axes[0].lines[1].get_xdata()) == pytest.approx(reach)
     plt.close("all")
     net = small_net(BROKK_170, np.random.default_rng(0))

@@ -34,7 +34,7 @@ from brokk_min.can.ticks import Known
 from brokk_min.cli.options import machine_from
 from brokk_min.evaluation import baselines
 from brokk_min.evaluation.sequences import feasible
-from brokk_min.kinematics import tool_position
+from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.learning.policy import save_policy
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer import drawing as view
@@ -453,12 +453,14 @@ def test_a_whole_traced_rectangle_is_scored() -> None:
     session.next_task()
     tracing_, first = session.tracing, loop.known[-1].q
     assert tracing_ is not None and session.task == "rectangle"
-    np.testing.assert_allclose(tracing_.line[0], tool_position(BROKK_170, first))
+    np.testing.assert_allclose(
+        tracing_.line[0], tool_position(forward_kinematics(BROKK_170, first))
+    )
     loop.go(0.2, True)
     rows: list[Known] = []
     while not session.attempts and loop.world.t < 60:
         away = tracing_.line[min(tracing_.passed + 2, len(tracing_.line) - 1)] - tool_position(
-            BROKK_170, loop.known[-1].q
+            forward_kinematics(BROKK_170, loop.known[-1].q)
         )
         loop.go(0.04, True, 0.2 * away / max(np.linalg.norm(away), 0.05))
         session.take(loop.known[-1], loop.world.t)
@@ -480,7 +482,7 @@ def test_a_whole_traced_rectangle_is_scored() -> None:
             for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)
         ]
     )
-    p = tool_position(BROKK_170, np.array([k.q for k in rows[begun:]]))
+    p = tool_position(forward_kinematics(BROKK_170, np.array([k.q for k in rows[begun:]])))
     away = np.linalg.norm(p[:, None] - fine, axis=-1).min(axis=1)
     assert attempt.mean == pytest.approx(away.mean(), abs=1e-3) and attempt.max == pytest.approx(
         away.max(), abs=1e-3
@@ -639,12 +641,14 @@ def test_what_is_seen_is_what_was_heard_between_two_ticks_and_not_for_long() -> 
             and look.v_goal is v
         )
         assert (look.status, look.mood) == ("driving", "driving")
-    np.testing.assert_allclose(look.trail, [tool_position(BROKK_170, a) for a in (q, q + 0.02)])
+    np.testing.assert_allclose(
+        look.trail, [tool_position(forward_kinematics(BROKK_170, a)) for a in (q, q + 0.02)]
+    )
     late = session.scene(1.56, "rl", "")
     assert np.isnan(late.q).all() and late.status == "nothing to be heard"
     session.next_task()
     look = session.scene(1.1, "rl", "")
-    tool = tool_position(BROKK_170, q + 0.02)
+    tool = tool_position(forward_kinematics(BROKK_170, q + 0.02))
     np.testing.assert_allclose(look.path, tool + tracing.task_lines(BROKK_170)["rectangle"])
     np.testing.assert_array_equal(look.target, look.path[:1])
     np.testing.assert_allclose(look.hold, np.vstack([look.path, tool]))
@@ -782,11 +786,13 @@ def test_the_window_asks_hears_and_tells_picture_by_picture(
 
 
 def test_a_line_is_done_when_all_its_points_were_passed_in_order() -> None:
-    line = tool_position(BROKK_170, START) + np.array([[0.0, 0, 0], [0, 0.3, 0], [0, 0.6, 0]])
+    line = tool_position(forward_kinematics(BROKK_170, START)) + np.array(
+        [[0.0, 0, 0], [0, 0.3, 0], [0, 0.6, 0]]
+    )
     work = Tracing(BROKK_170, "line", line)
     rest, open_ = Known(0, np.array(START), *np.zeros((2, 5)), np.zeros(3), True), np.full(5, 0.5)
     assert not work.follow(rest) and not work.p  # the clock waits for the first opened valve
-    radius = np.hypot(*tool_position(BROKK_170, START)[:2])
+    radius = np.hypot(*tool_position(forward_kinematics(BROKK_170, START))[:2])
     for tick, y, done in (
         (7, 0.0, 1),
         (8, 0.6, 1),

@@ -20,7 +20,7 @@ from strategies import moving
 
 from brokk_min.env import TaskConfig
 from brokk_min.jacobian import manipulability
-from brokk_min.kinematics import frames, jacobian, tool_position
+from brokk_min.kinematics import forward_kinematics, frames, jacobian, tool_position
 from brokk_min.learning.gym_env import TaskEnv
 from brokk_min.machine import BROKK_170, Machine
 from brokk_min.viewer import drawing as view
@@ -109,7 +109,7 @@ def test_views_of_the_brokk_by_hand() -> None:
     p = frames(BROKK_170, q)[:, :3, 3]
     np.testing.assert_allclose(side.project(p), side.origin + side.scale * flat * (1, -1))
     turned = np.array([np.pi / 2, 0.0, 0.0, np.pi, 3 * np.pi / 4])  # the tool points along y: left
-    away = top.project(tool_position(BROKK_170, turned)) - top.origin
+    away = top.project(tool_position(forward_kinematics(BROKK_170, turned))) - top.origin
     np.testing.assert_allclose(away, [-5.0 * top.scale, 0.0], atol=1e-9)
     side, _ = eyes(BROKK_170, turned)
     np.testing.assert_allclose(
@@ -147,7 +147,7 @@ def test_corners_of_an_arm_by_hand() -> None:
 
 
 def test_the_trail_is_painted_where_the_tool_was() -> None:
-    p = tool_position(BROKK_170, Q)
+    p = tool_position(forward_kinematics(BROKK_170, Q))
     trail = p + np.linspace(0, 1, 50)[:, None] * np.array([0.9, -0.5, 0.5])
     path = p + np.array([[0.0, 0.0, 0.0], [0.8, 0.8, -0.2]])
     shapes = draw(BROKK_170, [scene(trail=trail, path=path)], SIZE)
@@ -164,7 +164,7 @@ def test_the_trail_is_painted_where_the_tool_was() -> None:
 
 def test_views_show_what_they_are_to_hold() -> None:
     """A line near the tool, enlarged; what lies beyond a view's edge is painted over nothing else."""
-    p = tool_position(BROKK_170, Q)
+    p = tool_position(forward_kinematics(BROKK_170, Q))
     line = p + np.array([[0.0, 0, 0], [0.5, 0, 0], [0.5, 0.8, 0]])
     whole, near = (
         draw(BROKK_170, [scene(path=line, hold=hold)], SIZE) for hold in (np.zeros((0, 3)), line)
@@ -188,7 +188,7 @@ def test_views_show_what_they_are_to_hold() -> None:
 
 def test_arrows_point_along_the_velocities() -> None:
     rates = np.array([0.1, 0.0, 0.05, -0.1, 0.2])
-    J = jacobian(BROKK_170, Q) @ rates[BROKK_170.driven]
+    J = jacobian(forward_kinematics(BROKK_170, Q))[..., BROKK_170.driven] @ rates[BROKK_170.driven]
     wanted = np.array([0.1, 0.05, 0.15])
     shapes = draw(BROKK_170, [scene(q_dot=rates, v_goal=wanted)], SIZE)
     for v, colour in ((J, view.MEASURED), (wanted, view.WANTED)):
@@ -250,7 +250,10 @@ def test_a_limit_and_a_singularity_warn_in_red() -> None:
         for s in shapes
         if isinstance(s, Line) and s.colour == view.WARNING and len(s.points) == 25
     ]
-    tips = [camera.project(tool_position(wide, stretched)) for camera in eyes(wide, stretched)]
+    tips = [
+        camera.project(tool_position(forward_kinematics(wide, stretched)))
+        for camera in eyes(wide, stretched)
+    ]
     np.testing.assert_allclose([ring.points[:-1].mean(axis=0) for ring in rings], tips)
     assert not [s for s in clean if isinstance(s, Line) and s.colour == view.WARNING]
     assert "near a singularity" in words(shapes)
@@ -262,7 +265,10 @@ def test_a_limit_and_a_singularity_warn_in_red() -> None:
 @given(st.integers(0, 1000))
 def test_the_weakest_way_bounds_manipulability(seed: int) -> None:
     q = np.random.default_rng(seed).uniform(BROKK_170.column("q_min"), BROKK_170.column("q_max"))
-    J, (value, way) = jacobian(BROKK_170, q), looks.weakest(BROKK_170, q)
+    J, (value, way) = (
+        jacobian(forward_kinematics(BROKK_170, q))[..., BROKK_170.driven],
+        looks.weakest(BROKK_170, q),
+    )
     assert np.linalg.norm(way @ J) == pytest.approx(value, abs=1e-9)
     singular = np.sqrt(np.maximum(np.linalg.eigvalsh(J @ J.T), 0))
     assert np.prod(singular) == pytest.approx(manipulability(J), abs=1e-6)
@@ -347,7 +353,7 @@ def test_text_stays_legible_over_an_arm() -> None:
 
 
 def test_the_next_point_of_a_line_is_ringed() -> None:
-    p = tool_position(BROKK_170, Q) + np.array([[0.0, 0.5, 0.3]])
+    p = tool_position(forward_kinematics(BROKK_170, Q)) + np.array([[0.0, 0.5, 0.3]])
     shapes = draw(BROKK_170, [scene(target=p)], SIZE)
     rings = [s.points for s in shapes if isinstance(s, Line) and s.colour == view.PATH]
     for ring, camera in zip(rings, eyes(BROKK_170, Q), strict=True):
@@ -393,7 +399,9 @@ def test_gymnasium_renders_what_happens() -> None:
     shown = shown._replace(u=state.history[0, :, 2, -1])
     np.testing.assert_array_equal(images[-1], picture(draw(BROKK_170, [shown], SIZE), SIZE))
     assert len(shown.trail) == 13 and (images[-1] != images[0]).any()
-    np.testing.assert_allclose(shown.trail[-1], tool_position(BROKK_170, inner.state.q[0]))
+    np.testing.assert_allclose(
+        shown.trail[-1], tool_position(forward_kinematics(BROKK_170, inner.state.q[0]))
+    )
     env.reset(seed=2)
     assert len(inner.pictures.trails[0]) == 1  # a new episode leaves no trail of the old one
     env.close()

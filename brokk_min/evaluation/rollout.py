@@ -1,0 +1,76 @@
+"""Let a controller follow given tool velocities, on the analytic plant or on the nets."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from brokk_min.actuator import ActuatorNet
+from brokk_min.env import Encoder, Measured, TaskConfig, initial_state, measure, reward, transition
+from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocity
+from brokk_min.machine import Array, Machine, read_encoder
+
+
+class Controller(Protocol):
+    """What can drive a machine: a policy, the PIDs, an operator."""
+
+    def start(self, num: int) -> Any:
+        """State of `num` controllers at rest."""
+
+    def __call__(self, measured: Measured, state: Any, /) -> tuple[Array, Any]:
+        """Commands u [-1, 1] (num, n), and the controllers' state of the next tick."""
+
+
+class Trace(NamedTuple):
+    """What happened, tick by tick: arrays (T, num, ...); entry t is the end of tick t."""
+
+    q: Array  # true angle [rad], n
+    q_dot: Array  # true mean velocity over the tick [rad/s], n
+    q_measured: Array  # encoder angle when the command was computed [rad], n
+    u: Array  # command during the tick, n
+    p_tool: Array  # true tool position [m], 3
+    v_tool: Array  # true tool velocity [m/s], 3
+    reward: Array
+
+
+def rollout(
+    machine: Machine,
+    controller: Controller,
+    start: ArrayLike,
+    goals: Array,
+    config: TaskConfig,
+    rng: np.random.Generator,
+    net: ActuatorNet | None = None,
+    read: Encoder = read_encoder,
+) -> Trace:
+    """Let one controller follow given goals from rest: on the plant, or on nets. Paper: Fig. 3
+
+    Args:
+        machine: n joints.
+        controller: gets the same noisy measurements, whichever it is.
+        start: angles [rad], (num, n).
+        goals: goal velocity of the tool during each tick [m/s], (T, num, 3).
+        config: its `noise` holds; no episode ends.
+        rng: of the noise.
+        net: nets of the driven joints; None: the analytic plant.
+        read: see `transition`.
+    """
+    state = initial_state(machine, start, goals[0], plant=net is None)
+    memory = controller.start(len(state.q))
+    trace = []
+    for goal in goals:
+        v_goal = np.broadcast_to(goal.astype(np.float32), state.v_goal.shape)
+        state = replace(state, v_goal=v_goal)
+        integral = state.error_integral
+        measured = measure(machine, state.history, v_goal, integral, config.noise, rng)
+        u, memory = controller(measured, memory)
+        q_measured = state.history[..., 0, -1]
+        state = transition(machine, net, state, u, read)
+        frames = forward_kinematics(machine, state.q)
+        p_tool = tool_position(frames)
+        v_tool = tool_velocity(frames, state.q_dot)
+        trace.append((state.q, state.q_dot, q_measured, u, p_tool, v_tool, reward(goal, v_tool)))
+    return Trace(*map(np.array, zip(*trace, strict=True)))

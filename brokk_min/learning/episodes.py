@@ -1,0 +1,121 @@
+"""Episodes of training: random starts and goals, noisy observations, automatic resets. Paper: Sec. 3.4"""
+
+from dataclasses import fields, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brokk_min.actuator import PlantState
+from brokk_min.env import (
+    State,
+    TaskConfig,
+    features,
+    initial_state,
+    measure,
+    observation_blocks,
+    terminated,
+)
+from brokk_min.kinematics import forward_kinematics, lowest_point
+from brokk_min.machine import Array, Machine
+
+GROUND_MARGIN = 0.3  # m above the ground below which no goal points down, assumed
+
+
+def draw_pose(machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int) -> Array:
+    """Random angles within the joints' ranges [rad] (num, n), above the ground if so configured.
+
+    ValueError: a machine whose arm is in the ground in every pose drawn.
+    """
+    low, high = machine.column("q_min"), machine.column("q_max")
+    q = rng.uniform(low, high, (num, machine.n))
+    if not config.redraw_ground:
+        return q
+    for _ in range(1000):
+        below = terminated(machine, lowest_point(forward_kinematics(machine, q)))
+        if not below.any():
+            return q
+        q[below] = rng.uniform(low, high, (int(below.sum()), machine.n))
+    raise ValueError(f"{machine.name}: expected a pose above the ground, got none in 1000 draws")
+
+
+def draw_goal(machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int) -> Array:
+    """Random tool velocities [m/s] (num, 3): zero, along an axis, or anywhere; up to tool_speed."""
+    direction = rng.standard_normal((num, 3))
+    kind = rng.random((num, 1))
+    axis = np.vstack([np.eye(3), -np.eye(3)])[rng.integers(0, 6, num)]
+    direction = np.where(kind < config.zero_goals + config.axis_goals, axis, direction)
+    speed = rng.uniform(0, machine.tool_speed, (num, 1)) * (kind >= config.zero_goals)
+    return np.asarray(speed * direction / np.linalg.norm(direction, axis=-1, keepdims=True))
+
+
+def draw_hold(
+    machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int
+) -> NDArray[np.int64]:
+    """Random numbers of ticks for which a goal holds, (num,)."""
+    low = max(1, round(config.hold_min_s * machine.rate))
+    high = max(1, round(config.hold_max_s * machine.rate))
+    return rng.integers(low, high + 1, num)
+
+
+def reset(
+    machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int, plant: bool
+) -> State:
+    """`num` machines at rest in random poses with random goals; leading shape (num,)."""
+    pose = draw_pose(machine, config, rng, num)
+    goal = draw_goal(machine, config, rng, num)
+    state = initial_state(machine, pose, goal, plant)
+    return replace(state, goal_ticks=draw_hold(machine, config, rng, num))
+
+
+def new_goals(
+    machine: Machine, config: TaskConfig, state: State, rng: np.random.Generator
+) -> State:
+    """New goals for the machines whose goal is over, or points down close to the ground."""
+    frames = forward_kinematics(machine, state.q.astype(np.float32))
+    low = lowest_point(frames) < machine.ground + GROUND_MARGIN
+    due = np.flatnonzero((state.goal_ticks <= 0) | (low & (state.v_goal[..., 2] < 0)))
+    if not len(due):
+        return state
+    v_goal = state.v_goal.copy()
+    goal_ticks = state.goal_ticks.copy()
+    v_goal[due] = draw_goal(machine, config, rng, len(due))
+    v_goal[due, 2] = np.where(low[due], np.abs(v_goal[due, 2]), v_goal[due, 2])
+    goal_ticks[due] = draw_hold(machine, config, rng, len(due))
+    return replace(state, v_goal=v_goal, goal_ticks=goal_ticks)
+
+
+def get_obs(machine: Machine, config: TaskConfig, state: State, rng: np.random.Generator) -> Array:
+    """The observation of a state, (..., obs), with fresh noise. Paper: Sec. 3.4 (5 %)"""
+    seen = state.history, state.v_goal, state.error_integral
+    obs = features(machine, measure(machine, *seen, config.noise, rng))
+    return obs * paper_weights(machine) if config.paper else obs
+
+
+@lru_cache
+def paper_weights(machine: Machine) -> Array:
+    """Factors (obs,) that undo the weights and blank what the paper's agent does not observe."""
+    keep = [
+        np.full(block.std.shape, 0 if "resolved" in block.name else 1 / block.weight, np.float32)
+        for block in observation_blocks(machine)
+    ]
+    return np.concatenate(keep)
+
+
+def replace_rows(state: State, rows: NDArray[np.intp], fresh: State) -> State:
+    """`state` with its rows `rows` replaced by the states `fresh`, one each."""
+
+    def put(old: Array, new: Array) -> Array:
+        result = old.copy()
+        result[rows] = new
+        return result
+
+    changed: dict[str, Any] = {}
+    for field in fields(State):
+        old, new = getattr(state, field.name), getattr(fresh, field.name)
+        if isinstance(old, PlantState):
+            changed[field.name] = PlantState(*map(put, old, new))
+        elif old is not None:
+            changed[field.name] = put(old, new)
+    return State(**changed)
