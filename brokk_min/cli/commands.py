@@ -190,7 +190,7 @@ def train_command() -> Any:
 
 def sweep_command() -> Any:
     """The command `sweep`; made on demand as `train`."""
-    from brokk_min.learning.sweep import show, sweep
+    from brokk_min.evaluation.seeds import show, sweep
     from brokk_min.ppo import PPOConfig
 
     @dataclass(kw_only=True)

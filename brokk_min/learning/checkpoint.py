@@ -39,12 +39,15 @@ def describe_training(
     machine: Machine, net: ActuatorNet, task: TaskConfig, config: PPOConfig, critic: bool, seed: int
 ) -> dict[str, Any]:
     """All that decides the outcome of a training; kept in checkpoints and policies."""
+    settings = asdict(config) | {"critic": critic or task.paper}
+    if settings["critic"]:
+        settings["log_std_end"] = None
     return {
         **contract(machine),
         "actuator": fingerprint(net),
         "seed": seed,
         "task": asdict(task),
-        "settings": asdict(config) | {"critic": critic},
+        "settings": settings,
     }
 
 

@@ -1,18 +1,20 @@
 """Shapes onto a surface, into a window or an image: all that needs pygame (extra `play`)."""
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
+from brokk_min.env import State
 from brokk_min.identification.extras import need
 from brokk_min.kinematics import forward_kinematics, tool_position
-from brokk_min.machine import Array, Machine
+from brokk_min.learning.gym_env import TaskEnv, TaskVectorEnv
+from brokk_min.machine import BROKK_170, Array, Machine
 from brokk_min.viewer.drawing import (
     PAPER,
     Circle,
@@ -129,45 +131,76 @@ def picture(shapes: Sequence[Shape], size: tuple[int, int]) -> NDArray[np.uint8]
     return np.ascontiguousarray(pixels.swapaxes(0, 1))
 
 
-class Pictures:
-    """Frames for Gymnasium: trails of the tools since the last reset of each, and a window for `human`."""
+class FrameRenderer:
+    """Frames for Gymnasium, with trails of the tools since the last reset; a window for "human".
+
+    ValueError: a `mode` that is none of `modes`.
+    """
 
     SIZE = (960, 600)
 
-    def __init__(self, machine: Machine, mode: str | None, modes: list[str]) -> None:
-        if mode is not None and mode not in modes:
+    def __init__(self, machine: Machine, mode: str, modes: list[str]) -> None:
+        if mode not in modes:
             raise ValueError(f"render_mode: expected one of {modes}, got {mode!r}")
-        self.machine, self.mode = machine, mode
-        self.window: Any = None
+        self.machine = machine
+        self.mode = mode
+        self.window: Window | None = None
         self.trails: dict[int, list[Array]] = {}
 
-    def follow(self, state: Any, fresh: ArrayLike) -> None:
-        """After a reset or a step to an `env.State`; `fresh` are the rows that begin anew."""
-        if self.mode is not None:
-            self.trails |= {row: [] for row in np.asarray(fresh).tolist()}
-            for row, p_tool in enumerate(tool_position(forward_kinematics(self.machine, state.q))):
-                self.trails[row].append(p_tool)
+    def update(self, state: State, started: Iterable[int]) -> None:
+        """Extend the trails to a state; those of the rows `started` begin with it."""
+        for row in started:
+            self.trails[int(row)] = []
+        for row, p_tool in enumerate(tool_position(forward_kinematics(self.machine, state.q))):
+            self.trails[row].append(p_tool)
         if self.mode == "human":
-            self.take(state)
+            self.render(state)
 
-    def take(self, state: Any) -> list[NDArray[np.uint8]]:
-        """A frame (600, 960, 3) of each row, or the first row on the screen. Needs the extra `play`."""
-        if state is None or self.mode is None:
-            raise ValueError(f"render: expected a render_mode and a reset before, got {self.mode}")
-        drawn = []
-        for row, trail in self.trails.items():
-            u, goal = state.history[row, :, 2, -1], state.v_goal[row]
-            scene = Scene(state.q[row], state.q_dot[row], u, goal, np.array(trail))
-            drawn.append(draw(self.machine, [scene._replace(title=self.machine.name)], self.SIZE))
-        if self.mode == "human":
-            self.window = self.window or Window(self.SIZE, self.machine.name)
-            self.window.pygame.event.pump()
-            self.window.show(drawn[0], self.machine.rate)
-            return []
-        return [picture(shapes, self.SIZE) for shapes in drawn]
+    def render(self, state: State) -> list[NDArray[np.uint8]]:
+        """A frame (600, 960, 3) of each row; none for "human", which shows the first row."""
+        scenes = [
+            Scene(
+                state.q[row],
+                state.q_dot[row],
+                state.history[row, :, 2, -1],
+                state.v_goal[row],
+                np.array(trail),
+                title=self.machine.name,
+            )
+            for row, trail in self.trails.items()
+        ]
+        frames = [draw(self.machine, [scene], self.SIZE) for scene in scenes]
+        if self.mode != "human":
+            return [picture(shapes, self.SIZE) for shapes in frames]
+        if self.window is None:
+            self.window = Window(self.SIZE, self.machine.name)
+        self.window.pygame.event.pump()
+        self.window.show(frames[0], self.machine.rate)
+        return []
 
     def close(self) -> None:
         """Close the window, if there is one."""
         if self.window is not None:
             self.window.close()
             self.window = None
+
+
+class RenderedEnv(TaskEnv):
+    """What `gymnasium.make` makes: `render_mode` "human" is a window, "rgb_array" frames."""
+
+    def __init__(
+        self, machine: Machine = BROKK_170, render_mode: str | None = None, **options: Any
+    ) -> None:
+        modes = TaskEnv.metadata["render_modes"]
+        renderer = FrameRenderer(machine, render_mode, modes) if render_mode else None
+        super().__init__(machine=machine, renderer=renderer, **options)
+
+
+class RenderedVectorEnv(TaskVectorEnv):
+    """What `gymnasium.make_vec` makes: `render_mode` "rgb_array" is a frame of each machine."""
+
+    def __init__(
+        self, machine: Machine = BROKK_170, render_mode: str | None = None, **options: Any
+    ) -> None:
+        renderer = FrameRenderer(machine, render_mode, ["rgb_array"]) if render_mode else None
+        super().__init__(machine=machine, renderer=renderer, **options)
