@@ -23,7 +23,7 @@ from brokk_min.can.ticks import Known
 from brokk_min.learning.policy import PolicyController
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer import play
-from brokk_min.viewer.remote import Where
+from brokk_min.viewer.control_process import BusOptions
 
 
 @dataclass
@@ -42,7 +42,7 @@ class Player:
         self.times: list[float] = []
         self.known: dict[float, Known] = {}
 
-    def __call__(self, session: play.Session, hands: play.Hands) -> bool:
+    def __call__(self, session: play.Session, hands: play.InputHandler) -> bool:
         """One picture; False at the end."""
         now, known = time.monotonic(), session.known
         if known is None:
@@ -85,7 +85,7 @@ def main(options: Options) -> None:
     player, show = Player(options.seconds), play.show
     play.show = lambda *a: show(*a, watcher=player)  # type: ignore[assignment]
     policy = PolicyController(BROKK_170, random_policy(np.random.default_rng(0)))
-    play.play(BROKK_170, {"rl": policy}, Where(), Path(os.devnull).with_name("no attempts"))
+    play.play(BROKK_170, {"rl": policy}, BusOptions(), Path(os.devnull).with_name("no attempts"))
     result = {"seconds": options.seconds, **figures(player)}
     print(json.dumps(result, indent=1))
     if options.json:

@@ -22,8 +22,8 @@ from brokk_min.identification.logs import write_log
 from brokk_min.learning.onnx import export_onnx
 from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import Machine
+from brokk_min.viewer import control_process, play, replay
 from brokk_min.viewer import drawing as view
-from brokk_min.viewer import play, remote, replay
 
 
 @dataclass(kw_only=True)
@@ -178,7 +178,7 @@ class Play(Command):
         machine = check(self, self.attempts, self.log)
         if bool(self.interface) != bool(self.channel) or (self.drive and not self.interface):
             raise WrongUse("--interface, --channel: expected both or, without --drive, none")
-        where = remote.Where(self.interface, self.channel, self.log, self.start)
+        where = control_process.BusOptions(self.interface, self.channel, self.log, self.start)
         if self.interface and not self.drive:
             play.watch(machine, where)
             return

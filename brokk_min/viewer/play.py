@@ -20,8 +20,8 @@ from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
 from brokk_min.viewer import drawing as view
 from brokk_min.viewer import tracing
+from brokk_min.viewer.control_process import Ask, BusOptions, control_process
 from brokk_min.viewer.drawing import TITLES
-from brokk_min.viewer.remote import Ask, Where, control_process
 from brokk_min.viewer.window import Window, open_window
 
 SIZE = (1120, 680)  # of the window [px]
@@ -44,7 +44,7 @@ PAD_AXES = (
 PAD_BUTTON, PAD_MODE, PAD_NEXT, PAD_AGAIN = 5, 3, 0, 1
 
 
-class Hands:
+class InputHandler:
     """Keyboard and gamepad as one operator.
 
     The dead-man switch (space, or the gamepad's button) counts only after it was seen released since the
@@ -269,7 +269,7 @@ def _status(machine: Machine, known: Known, hint: str) -> tuple[str, str]:
     return hint or "ready", "ready"
 
 
-Watcher = Callable[[Session, Hands], bool]
+Watcher = Callable[[Session, InputHandler], bool]
 
 
 def show(
@@ -292,7 +292,7 @@ def show(
         watcher: is called at each picture; False closes the window.
     """
     pygame, modes = window.pygame, session.modes or [""]
-    hands, before = Hands(session.machine, pygame, modes), time.monotonic()
+    hands, before = InputHandler(session.machine, pygame, modes), time.monotonic()
     ask = hands.ask(before, 0.0)
     try:
         while not hands.closed and watcher(session, hands):
@@ -315,7 +315,7 @@ def show(
         tell(ask._replace(enable=False, stop=True))
 
 
-def _hint(session: Session, hands: Hands) -> str:
+def _hint(session: Session, hands: InputHandler) -> str:
     """What the operator has to do next."""
     if not session.modes:
         return (
@@ -336,7 +336,7 @@ def _window(machine: Machine) -> AbstractContextManager[Window]:
 
 
 def play(
-    machine: Machine, controllers: Mapping[str, Controller], where: Where, attempts: Path
+    machine: Machine, controllers: Mapping[str, Controller], where: BusOptions, attempts: Path
 ) -> None:
     """Drive with keyboard or gamepad: the simulated machine, or the one on a bus.
 
@@ -358,7 +358,7 @@ def play(
         show(window, session, hear, lambda ask: asks.write(np.hstack(ask)), ended)
 
 
-def watch(machine: Machine, where: Where) -> None:
+def watch(machine: Machine, where: BusOptions) -> None:
     """Look at a machine on a bus; nothing is sent."""
     session, ticks = Session(machine, [], None), Ticks(machine)
     with _window(machine) as window, open_line(where.interface, where.channel, where.log) as line:

@@ -21,7 +21,7 @@ from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocit
 from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import Array, Machine
 from brokk_min.viewer import drawing as view
-from brokk_min.viewer.looks import skeleton
+from brokk_min.viewer.drawing import skeleton
 from brokk_min.viewer.window import open_window, picture
 
 
@@ -212,7 +212,13 @@ def _write_mp4(file: IO[bytes], images: Iterable[Any], size: tuple[int, int], fp
 def _palette(films: Sequence[Image.Image]) -> Image.Image:
     """96 colours of some pictures and of all that warns or measures, however little of it there is."""
     some = [np.asarray(film) for film in films[:: max(1, len(films) // 6)]]
-    named = [*view.COLOURS.values(), *view.MOODS.values(), view.MEASURED, view.PATH, view.WARNING]
+    named = [
+        *view.COLOURS.values(),
+        *view.STATUS_COLOURS.values(),
+        view.MEASURED,
+        view.PATH,
+        view.WARNING,
+    ]
     swatches = np.repeat(np.array(named, np.uint8), 40, axis=0)[:, None].repeat(
         some[0].shape[1], axis=1
     )

@@ -13,7 +13,7 @@ from brokk_min.can.ticks import Known
 from brokk_min.identification import files
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
-from brokk_min.viewer.looks import extent
+from brokk_min.viewer.drawing import extent
 
 CAPTURE = 0.1  # m, assumed: a point of the line counts as passed nearer than this
 SPACING = 0.05  # m, assumed: between the points that must be passed

@@ -31,7 +31,7 @@ from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer import drawing as view
 from brokk_min.viewer import play, replay
-from brokk_min.viewer.remote import Where
+from brokk_min.viewer.control_process import BusOptions
 
 POLICY = SHIPPED / "brokk170" / "policy.npz"
 GAINS = SHIPPED / "brokk170" / "gains.json"
@@ -276,7 +276,7 @@ def test_the_game_gets_controllers_bus_and_files(
     calls, log = stand(play, play=None, watch=None), tmp_path / "run.log"
     assert run("play") == 0
     machine, controllers, where, attempts = calls.pop("play")
-    assert machine is BROKK_170 and where == Where() and attempts == Path("attempts.csv")
+    assert machine is BROKK_170 and where == BusOptions() and attempts == Path("attempts.csv")
     assert list(controllers) == ["rl", "jacobian"] and controllers["rl"].machine is BROKK_170
     assert controllers["rl"].policy.net.machine == "brokk170"
     assert controllers["jacobian"].k == 0.1 and (controllers["jacobian"].gains == TUNED.gains).all()
@@ -287,13 +287,13 @@ def test_the_game_gets_controllers_bus_and_files(
         run(f"play --drive {bus} --policy {tmp_path / 'p.npz'} --attempts", tmp_path / "a.csv") == 0
     )
     _, by_hand, where, attempts = calls.pop("play")
-    assert where == Where("socketcan", "can0", log) and attempts == tmp_path / "a.csv"
+    assert where == BusOptions("socketcan", "can0", log) and attempts == tmp_path / "a.csv"
     assert capsys.readouterr().err == "gains of the Jacobian controller: set by hand\n"
     assert by_hand["jacobian"].k == 0.1 and (by_hand["jacobian"].gains != TUNED.gains).any()
     assert run(f"play --policy {tmp_path / 'p.npz'} --gains '{GAINS}'") == 0
     assert (calls.pop("play")[1]["jacobian"].gains == TUNED.gains).all()
     assert run(f"play {bus}") == 0
-    assert calls.pop("watch") == (BROKK_170, Where("socketcan", "can0", log)) and not calls
+    assert calls.pop("watch") == (BROKK_170, BusOptions("socketcan", "can0", log)) and not calls
     assert run("play --start 0 0.5 0.6 1.7 1.2") == 0
     assert calls["play"][2].start == (0.0, 0.5, 0.6, 1.7, 1.2)
 

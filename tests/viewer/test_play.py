@@ -21,8 +21,8 @@ import pygame
 import pytest
 from helpers_bus import START, Push, World
 from PIL import Image
+from test_drawing import boxes_of_words
 from test_hw import BASELINE, Virtual
-from test_view import boxes_of_words
 
 from benchmarks.bus import random_policy
 from brokk_min.__main__ import main
@@ -37,10 +37,10 @@ from brokk_min.evaluation.sequences import feasible
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.learning.policy import save_policy
 from brokk_min.machine import BROKK_170
+from brokk_min.viewer import control_process, play, replay, tracing
 from brokk_min.viewer import drawing as view
-from brokk_min.viewer import looks, play, remote, replay, tracing
-from brokk_min.viewer.play import Hands, Session
-from brokk_min.viewer.remote import Chosen, Levers, Loop, Mailbox, Remote
+from brokk_min.viewer.control_process import Chosen, Levers, Loop, Mailbox, Remote
+from brokk_min.viewer.play import InputHandler, Session
 from brokk_min.viewer.tracing import Attempt, Tracing
 
 MODES = ["rl", "jacobian", "levers"]
@@ -64,26 +64,26 @@ def no_display(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 class Operator:
-    """Presses keys of `Hands` through pygame's queue; time goes on by half a second a look."""
+    """Presses keys of `InputHandler` through pygame's queue; time goes on by half a second a look."""
 
     def __init__(self, modes: list[str] = MODES) -> None:
         pygame.display.set_mode((10, 10))
         pygame.event.clear()
-        self.hands, self.now = Hands(BROKK_170, pygame, modes), 0.0
+        self.hands, self.now = InputHandler(BROKK_170, pygame, modes), 0.0
         self.look()
 
-    def look(self, seconds: float = 0.5) -> remote.Ask:
+    def look(self, seconds: float = 0.5) -> control_process.Ask:
         for event in pygame.event.get():
             self.hands.hear(event)
         self.now += seconds
         return self.hands.ask(self.now, seconds)
 
-    def key(self, name: str, down: bool = True, seconds: float = 0.5) -> remote.Ask:
+    def key(self, name: str, down: bool = True, seconds: float = 0.5) -> control_process.Ask:
         kind = pygame.KEYDOWN if down else pygame.KEYUP
         pygame.event.post(pygame.event.Event(kind, key=pygame.key.key_code(name)))
         return self.look(seconds)
 
-    def event(self, kind: int, **more: Any) -> remote.Ask:
+    def event(self, kind: int, **more: Any) -> control_process.Ask:
         pygame.event.post(pygame.event.Event(kind, **more))
         return self.look()
 
@@ -132,7 +132,7 @@ def test_the_other_way_begins_in_the_middle_and_let_go_is_neutral_at_once() -> N
 
 
 def test_the_first_picture_asks_for_nothing() -> None:
-    ask = Hands(BROKK_170, pygame, MODES).ask(7.0, 0.0)
+    ask = InputHandler(BROKK_170, pygame, MODES).ask(7.0, 0.0)
     assert ask[:5] == (7.0, 0, False, True, False)
     assert ask.v_goal.tolist() == [0] * 3 and ask.levers.tolist() == [0] * 4
 
@@ -252,7 +252,7 @@ def test_a_gamepad_that_comes_needs_a_fresh_press_and_its_triggers_are_no_levers
     device.axis(5, -1.0)
     pygame.display.set_mode((10, 10))
     operator = Operator(["levers"])
-    operator.hands = Hands(machine, pygame, ["levers"])  # it was there before the window
+    operator.hands = InputHandler(machine, pygame, ["levers"])  # it was there before the window
     ask = operator.look()
     assert operator.hands.pad is not None and not ask.levers.any() and not ask.enable
     device.button(play.PAD_BUTTON, False)
@@ -396,7 +396,7 @@ def test_a_window_that_hangs_is_a_lost_device() -> None:
     loop.world.run(0.5)
     times, commands = loop.world.commands
     late = times[(commands != 0).any(axis=1)].max() - last
-    assert 0.1 < late <= remote.STALE + 0.06
+    assert 0.1 < late <= control_process.STALE + 0.06
     assert "operator's device lost" in play._status(BROKK_170, loop.known[-1], "")[0]
     loop.go(0.5, True)
     assert not loop.known[-1].driving  # back again, but the switch was never released
@@ -411,7 +411,9 @@ def test_a_loop_whose_window_died_stops(monkeypatch: pytest.MonkeyPatch) -> None
     operator = Remote(asks, Chosen([levers]), levers, lambda: 10.0)
     assert operator(False, True) == play.wishes.Wish(alive=False)  # it has not said anything yet
     monkeypatch.setattr(
-        remote.multiprocessing, "parent_process", lambda: SimpleNamespace(is_alive=lambda: False)
+        control_process.multiprocessing,
+        "parent_process",
+        lambda: SimpleNamespace(is_alive=lambda: False),
     )
     assert operator(True, True) == play.wishes.Wish(alive=False, stop=True)
     asks.write([9.9, 0, 1, 1, 0, 0.1, 0, 0, 0, 0, 0, 0])
@@ -426,10 +428,10 @@ def test_the_loops_process_drives_a_machine_of_its_own_until_it_is_told_to_stop(
     """In this process: the window asks to stop at once; what the loop knew of its tick and the log remain."""
     asks, tells, said = Mailbox(12), Mailbox(24), list[str]()
     asks.write([time.monotonic() + 100, 1, 0, 1, 1, 0.1, 0, 0, 0, 0, 0, 0])
-    where = remote.Where(log=tmp_path / "run.log", start=tuple(START))
+    where = control_process.BusOptions(log=tmp_path / "run.log", start=tuple(START))
     modes: list[int] = []
     push = SimpleNamespace(start=modes.append)
-    remote.control(BROKK_170, [push], where, asks, tells)
+    control_process.control(BROKK_170, [push], where, asks, tells)
     told = tells.read()
     assert told is not None and (tmp_path / "run.log").stat().st_size > 0
     known = ticks.unpack_known(BROKK_170, told)
@@ -437,8 +439,10 @@ def test_the_loops_process_drives_a_machine_of_its_own_until_it_is_told_to_stop(
     assert known.mode == 1 and not known.driving and known.v_goal.tolist() == [0.1, 0, 0]
     assert not [thread for thread in threading.enumerate() if "serve" in thread.name]
     pipe = SimpleNamespace(send=said.append)
-    remote._control_process(pipe, BROKK_170, [], remote.Where("nonsense", "bus"), asks, tells)
-    remote._control_process(pipe, None, [], where, asks, tells)
+    control_process._control_process(
+        pipe, BROKK_170, [], control_process.BusOptions("nonsense", "bus"), asks, tells
+    )
+    control_process._control_process(pipe, None, [], where, asks, tells)
     assert said[0].startswith("nonsense bus: expected a CAN bus") and said[1].startswith(
         "AttributeError: "
     )
@@ -473,7 +477,7 @@ def test_a_whole_traced_rectangle_is_scored() -> None:
         tracing_.line[0]
         + 5.0
         * np.array([[0, 0, 0], [0, 0.16, 0], [0.1, 0.16, 0], [0.1, 0, 0]])
-        * looks.extent(BROKK_170).reach
+        * view.extent(BROKK_170).reach
         / 5.0
     )
     fine = np.vstack(
@@ -511,7 +515,7 @@ def test_distance_by_hand() -> None:
 
 def test_lines_to_trace_by_hand() -> None:
     """In shares of the reach: a rectangle of 0.1 by 0.16, a circle of radius 0.06, axes of 0.14."""
-    lines, reach = tracing.task_lines(BROKK_170), looks.extent(BROKK_170).reach
+    lines, reach = tracing.task_lines(BROKK_170), view.extent(BROKK_170).reach
     assert list(lines) == ["rectangle", "circle", "line x", "line y", "line z"]
     square = lines["rectangle"] / reach
     assert np.diff(square, axis=0).any(axis=1).all()
@@ -737,7 +741,7 @@ def test_notes_tell_keys_task_and_how_it_went(tmp_path: Path) -> None:
 def test_the_window_asks_hears_and_tells_picture_by_picture(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    told: list[remote.Ask] = []
+    told: list[control_process.Ask] = []
     shown: list[Any] = []
     taken: list[float] = []
     pygame.display.set_mode((10, 10))
@@ -756,7 +760,7 @@ def test_the_window_asks_hears_and_tells_picture_by_picture(
     presses = [[], [], ["return"], ["return"], ["backspace", "tab"], ["escape"]]
     tasks: list[tuple[str, Any]] = []
 
-    def watcher(seen: Session, hands: Hands) -> bool:
+    def watcher(seen: Session, hands: InputHandler) -> bool:
         assert seen is session
         tasks.append((session.task, session.tracing))
         for name in presses.pop(0):
@@ -829,7 +833,7 @@ def test_the_window_drives_a_machine_in_another_process(tmp_path: Path) -> None:
         more = {"key": pygame.key.key_code(key)} if key else {}
         pygame.event.post(pygame.event.Event(kind, **more))
 
-    def watcher(session: Session, hands: Hands) -> bool:
+    def watcher(session: Session, hands: InputHandler) -> bool:
         nonlocal at, pressed
         now, known = time.monotonic(), session.known
         assert now - start < 60, (known, at)
@@ -849,7 +853,12 @@ def test_the_window_drives_a_machine_in_another_process(tmp_path: Path) -> None:
     inner = play.show
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(play, "show", lambda *a: inner(*a, watcher=watcher))
-        play.play(BROKK_170, {}, remote.Where(log=tmp_path / "run.log"), tmp_path / "attempts.csv")
+        play.play(
+            BROKK_170,
+            {},
+            control_process.BusOptions(log=tmp_path / "run.log"),
+            tmp_path / "attempts.csv",
+        )
     assert at == len(steps)
     assert seen[-1][1].q[0] > 0.01 and not pygame.display.get_init()
     run = replay.run_of_log(BROKK_170, tmp_path / "run.log", (1, 2, 3))
@@ -858,10 +867,12 @@ def test_the_window_drives_a_machine_in_another_process(tmp_path: Path) -> None:
 
 
 def test_other_machines_start_amid_their_ranges() -> None:
-    with remote._simulated(MINI_EXCAVATOR, remote.Where(), lambda: False):
+    with control_process._simulated(MINI_EXCAVATOR, control_process.BusOptions(), lambda: False):
         pass  # it was no ValueError
     with pytest.raises(ValueError, match="start: expected 4 angles"):
-        remote._simulated(MINI_EXCAVATOR, remote.Where(start=START), lambda: False).__enter__()
+        control_process._simulated(
+            MINI_EXCAVATOR, control_process.BusOptions(start=START), lambda: False
+        ).__enter__()
 
 
 def test_nothing_reaches_a_bus_if_there_is_no_window(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -875,13 +886,13 @@ def test_nothing_reaches_a_bus_if_there_is_no_window(monkeypatch: pytest.MonkeyP
         lambda w: play.watch(BROKK_170, w),
     ):
         with pytest.raises(ValueError, match="window: expected a display"):
-            window(remote.Where("virtual", "empty"))
+            window(control_process.BusOptions("virtual", "empty"))
     assert not begun
 
 
 def test_a_loop_that_cannot_begin_ends_the_window_in_one_line() -> None:
     """Nobody answers on this bus."""
-    where = remote.Where("virtual", "empty")
+    where = control_process.BusOptions("virtual", "empty")
     with pytest.raises(ValueError, match="got node 1: object 0x6501"):
         play.play(BROKK_170, {}, where, Path("attempts.csv"))
 
@@ -902,7 +913,7 @@ def test_watching_sends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     world.close()
     shown: list[Known] = []
 
-    def watcher(session: Session, hands: Hands) -> bool:
+    def watcher(session: Session, hands: InputHandler) -> bool:
         for can_id, data in frames[:40]:
             peer.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
         del frames[:40]
@@ -915,9 +926,11 @@ def test_watching_sends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     inner = play.show
     monkeypatch.setattr(play, "show", lambda *a: inner(*a, watcher=watcher, fps=500.0))
     monkeypatch.setattr(
-        play.Hands, "ask", lambda *a: remote.Ask(0.0, 0, True, True, False, np.ones(3), np.ones(4))
+        play.InputHandler,
+        "ask",
+        lambda *a: control_process.Ask(0.0, 0, True, True, False, np.ones(3), np.ones(4)),
     )
-    play.watch(BROKK_170, remote.Where("virtual", "watched"))
+    play.watch(BROKK_170, control_process.BusOptions("virtual", "watched"))
     assert peer.recv(0.1) is None
     peer.shutdown()
     assert shown[-1].driving and shown[-1].q_dot[0] > 0.05

@@ -23,7 +23,7 @@ from brokk_min.kinematics import tool_state
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer import drawing as view
 from brokk_min.viewer import replay
-from brokk_min.viewer.looks import skeleton
+from brokk_min.viewer.drawing import skeleton
 
 START = np.array([0.0, 0.5, 0.58, 1.71, 1.24])
 
@@ -198,7 +198,7 @@ def test_a_gif_runs_for_ever_and_keeps_the_colours_that_warn() -> None:
     """Most of a picture is machine and paper; a red word is a hundred pixels, and not in every picture."""
     rng, wanted = (
         np.random.default_rng(0),
-        [*view.COLOURS.values(), *view.MOODS.values(), view.WARNING],
+        [*view.COLOURS.values(), *view.STATUS_COLOURS.values(), view.WARNING],
     )
     pictures = [rng.integers(0, 256, (60, 80, 3)).astype(np.uint8) for _ in range(3)]
     for k, colour in enumerate([*wanted, view.MEASURED, view.PATH]):

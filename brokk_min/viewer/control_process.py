@@ -154,7 +154,7 @@ class Loop(hw.Drive):
 
 
 @dataclass(frozen=True)
-class Where:
+class BusOptions:
     """The bus; an empty interface is a simulated machine in the loop's own process."""
 
     interface: str = ""
@@ -164,7 +164,11 @@ class Where:
 
 
 def control(
-    machine: Machine, controllers: Sequence[Controller], where: Where, asks: Mailbox, tells: Mailbox
+    machine: Machine,
+    controllers: Sequence[Controller],
+    where: BusOptions,
+    asks: Mailbox,
+    tells: Mailbox,
 ) -> None:
     """Drive until the window says stop; with a simulated machine of its own where there is no bus."""
     levers = Levers(machine)
@@ -185,7 +189,7 @@ def control(
 
 
 @contextmanager
-def _simulated(machine: Machine, where: Where, running: Callable[[], bool]) -> Iterator[None]:
+def _simulated(machine: Machine, where: BusOptions, running: Callable[[], bool]) -> Iterator[None]:
     """A simulated machine in a thread, if no bus is named."""
     if where.interface:
         yield
@@ -213,7 +217,7 @@ def _control_process(errors: Any, *arguments: Any) -> None:
 
 @contextmanager
 def control_process(
-    machine: Machine, controllers: Sequence[Controller], where: Where
+    machine: Machine, controllers: Sequence[Controller], where: BusOptions
 ) -> Iterator[tuple[Mailbox, Mailbox, Callable[[], str | None]]]:
     """The loop in a process of its own: where to ask, where it tells, and why it ended (None: it runs).
 
