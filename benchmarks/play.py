@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 
 from benchmarks.bus import random_policy
-from brokk_min.can.ticks import Known
+from brokk_min.can.drive_log import Telemetry
 from brokk_min.learning.policy import PolicyController
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer import play
@@ -40,7 +40,7 @@ class Player:
     def __init__(self, seconds: float) -> None:
         self.seconds, self.begun, self.keys = seconds, 0.0, set[str]()
         self.times: list[float] = []
-        self.known: dict[float, Known] = {}
+        self.known: dict[float, Telemetry] = {}
 
     def __call__(self, session: play.Session, hands: play.InputHandler) -> bool:
         """One picture; False at the end."""
@@ -48,7 +48,7 @@ class Player:
         if known is None:
             return True
         self.begun = self.begun or now * known.driving
-        wanted = {"space"} if known.driving or not known.wrong else set()
+        wanted = {"space"} if known.driving or not known.active_fault else set()
         if self.begun:
             self.times.append(now)
             self.known[known.tick] = known

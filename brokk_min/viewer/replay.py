@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet
 from brokk_min.can.canopen import read_frames
-from brokk_min.can.ticks import Known, Ticks
+from brokk_min.can.drive_log import Telemetry, TelemetryReader
 from brokk_min.evaluation import baselines, experiments
 from brokk_min.evaluation.rollout import Controller, Trace
 from brokk_min.evaluation.sequences import Commands, goals_and_starts, task_sequences
@@ -30,7 +30,7 @@ class Run(NamedTuple):
 
     title: str
     colour: view.Colour
-    known: Sequence[Known]
+    known: Sequence[Telemetry]
     p_tool: Array  # m (T, 3)
     error: Array  # |v_goal - v_tool| [m/s] (T,)
     path: Array  # where the tool was to go [m] (K, 3), or none
@@ -38,7 +38,7 @@ class Run(NamedTuple):
 
 
 def recorded(
-    machine: Machine, title: str, colour: view.Colour, known: Sequence[Known], path: Array
+    machine: Machine, title: str, colour: view.Colour, known: Sequence[Telemetry], path: Array
 ) -> Run:
     """A run from its ticks; the velocity error is that of the velocities that it holds."""
     q, q_dot, v_goal = (
@@ -56,9 +56,9 @@ def run_of_log(machine: Machine, path: Path, colour: view.Colour) -> Run:
 
     ValueError: no log, or one in which nothing drives.
     """
-    ticks = Ticks(machine)
+    ticks = TelemetryReader(machine)
     known = [
-        k for frame in read_frames(path) if (k := ticks.hear(frame)) and np.isfinite(k.q).all()
+        k for frame in read_frames(path) if (k := ticks.update(frame)) and np.isfinite(k.q).all()
     ]
     first = next((i for i, k in enumerate(known) if k.driving), None)
     if first is None:
@@ -71,7 +71,7 @@ def run_of_trace(
 ) -> Run:
     """One run of a rollout: true motion, and where the goals (T, 3) lead from the start [m] (3,)."""
     rows = zip(trace.q[:, run], trace.q_dot[:, run], trace.u[:, run], goals, strict=True)
-    known = [Known(i, *row, driving=True) for i, row in enumerate(rows)]
+    known = [Telemetry(i, *row, driving=True) for i, row in enumerate(rows)]
     path = start + np.vstack([np.zeros(3), np.cumsum(goals, axis=0)]) * machine.dt
     colour = next((c for name, c in view.COLOURS.items() if title.startswith(name)), view.STEEL)
     return recorded(machine, title, colour, known, path)

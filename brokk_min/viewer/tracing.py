@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from brokk_min.can.ticks import Known
+from brokk_min.can.drive_log import Telemetry
 from brokk_min.identification import files
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
@@ -75,7 +75,7 @@ class Tracing:
     begun: float = 0.0  # tick
     seconds: float = 0.0  # since then; by ticks, because a busy window misses some
 
-    def follow(self, known: Known) -> bool:
+    def follow(self, known: Telemetry) -> bool:
         """One tick; True if it was the last."""
         if not self.p and not known.u.any():
             return False

@@ -17,7 +17,7 @@ from conftest import Stand
 
 from brokk_min import hw, ppo
 from brokk_min.__main__ import COMMANDS, main
-from brokk_min.can import drive_log as blackbox
+from brokk_min.can import drive_log
 from brokk_min.can import operator_input as wishes
 from brokk_min.can.canopen import Frame
 from brokk_min.cli import commands, operating
@@ -100,13 +100,13 @@ class Screen(io.StringIO):
 
     def __init__(self, terminal: bool) -> None:
         super().__init__()
-        self.terminal, self.seen = terminal, ""
+        self.terminal, self.measured = terminal, ""
 
     def isatty(self) -> bool:
         return self.terminal
 
     def flush(self) -> None:
-        self.seen = self.getvalue()
+        self.measured = self.getvalue()
 
 
 # --- a machine on a bus -----------------------------------------------------------------------------------
@@ -134,7 +134,7 @@ def test_a_simulated_machine_gets_its_bus_start_and_record(
 @pytest.mark.parametrize(
     ("options", "kind"),
     [
-        ("--controller jog --joint q4 --counts 9", wishes.Jog),
+        ("--controller jog --joint q4 --counts 9", wishes.JointJog),
         (f"--policy '{POLICY}'", PolicyController),
         (f"--policy '{POLICY}' --controller jacobian", JacobianController),
         (f"--policy POLICY --controller jacobian --gains '{GAINS}'", JacobianController),
@@ -147,7 +147,7 @@ def test_a_log_is_compared_with_the_controller_that_is_named(
     options = options.replace("POLICY", str(tmp_path / "policy.npz"))
     frames, log = [Frame(0.0, 0x80, b"")], tmp_path / "run.log"
     calls = stand(operating, read_frames=iter(frames))
-    stand(blackbox, replay="sent", compare=(7, 9))
+    stand(drive_log, replay="sent", compare=(7, 9))
     assert run(f"drive {options} --replay", log) == 1
     machine, controller, tape = calls["replay"]
     assert machine is BROKK_170 and type(controller) is kind and controller.machine is BROKK_170
@@ -156,7 +156,7 @@ def test_a_log_is_compared_with_the_controller_that_is_named(
         and calls["read_frames"] == (log,)
         and calls["compare"] == (BROKK_170, frames, "sent")
     )
-    if isinstance(controller, wishes.Jog):
+    if isinstance(controller, wishes.JointJog):
         assert (controller.joint, controller.counts) == ("q4", 9)
     if isinstance(controller, PolicyController):
         assert controller.policy.net.machine == "brokk170"
@@ -166,7 +166,7 @@ def test_a_log_is_compared_with_the_controller_that_is_named(
     assert said.out == f"{log}: 7 of 9 valve frames are the same\n"
     assert said.err == f"brokk-min: {log}: expected the frames of the log, got 2 others\n"
     stand(operating, read_frames=iter(frames))
-    stand(blackbox, compare=(9, 9))
+    stand(drive_log, compare=(9, 9))
     assert run(f"drive {options} --replay", log) == 0
 
 
@@ -196,7 +196,7 @@ def test_a_drive_gets_bus_log_and_operator_and_says_how_it_ended(
     (tmp_path / "c.csv").write_text(
         "sequence,time,vx,vy,vz\nup,0,0,0,0.1\nup,1,0,0,0\nto,0,0.2,0,0\nto,1,0,0,0\n"
     )
-    calls = stand(operating, open_line=contextlib.nullcontext("the bus"))
+    calls = stand(operating, open_bus=contextlib.nullcontext("the bus"))
     monkeypatch.setattr(hw, "Drive", Drives)
     jog, log = "drive --controller jog --interface socketcan --channel can1", tmp_path / "run.log"
     script = f"{jog} --command {tmp_path / 'c.csv'} --log {log}"
@@ -209,11 +209,11 @@ def test_a_drive_gets_bus_log_and_operator_and_says_how_it_ended(
         assert run(script) == status
         said = capsys.readouterr()
         assert said.out == "driving v wanted +0.10 +0.00 +0.00\n" and said.err == error
-        assert calls["open_line"] == ("socketcan", "can1", log)
+        assert calls["open_bus"] == ("socketcan", "can1", log)
         machine, controller, line, operator = Drives.given
         assert (
             machine is BROKK_170
-            and controller == wishes.Jog(BROKK_170, "q1", 12)
+            and controller == wishes.JointJog(BROKK_170, "q1", 12)
             and line == "the bus"
         )
         assert operator.goals[0].tolist() == [0, 0, 0.1] and operator.goals[20].tolist() == [
@@ -223,7 +223,7 @@ def test_a_drive_gets_bus_log_and_operator_and_says_how_it_ended(
         ]
     stand(wishes, Joystick=SimpleNamespace(done=False))  # it never is, and that is no failure
     assert run(f"{jog} --axes 3 4 5 --button 2") == 0
-    assert calls["Joystick"] == (BROKK_170, (3, 4, 5), 2) and calls["open_line"][2] is None
+    assert calls["Joystick"] == (BROKK_170, (3, 4, 5), 2) and calls["open_bus"][2] is None
     monkeypatch.setenv("COLUMNS", "20")
     told = {True: "\rdriving v wanted +0\033[K", False: "driving v wanted +0.10 +0.00 +0.00\n"}
     for terminal, seen in told.items():
@@ -248,9 +248,9 @@ def test_a_log_of_driving_becomes_one_to_fit_to(
     q = np.cumsum(np.full((20, 2), 0.01), axis=0)
     log = Log(("a", "b"), (Recording("0", 0 * q, q, 0 * q), Recording("1", 0 * q, q, 0 * q)))
     calls = stand(operating, read_frames="frames")
-    stand(blackbox, driven_log=log)
+    stand(drive_log, log_for_fit=log)
     assert run(f"convert {tmp_path / 'run.log'} --out", tmp_path / "log.csv") == 0
-    assert calls == {"read_frames": (tmp_path / "run.log",), "driven_log": (BROKK_170, "frames")}
+    assert calls == {"read_frames": (tmp_path / "run.log",), "log_for_fit": (BROKK_170, "frames")}
     assert len(read_log([tmp_path / "log.csv"], 2).recordings) == 2
     assert capsys.readouterr().out == f"{tmp_path / 'log.csv'}: 2 recordings of a, b\n"
 
