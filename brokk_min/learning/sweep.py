@@ -20,10 +20,9 @@ from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import TaskConfig
-from brokk_min.evaluation import experiments
+from brokk_min.evaluation import metrics
 from brokk_min.evaluation.baselines import read_gains, tuned_for
-from brokk_min.evaluation.experiments import Rows
-from brokk_min.evaluation.metrics import by_start, mean_interval
+from brokk_min.evaluation.metrics import Rows, by_start, mean_interval
 from brokk_min.evaluation.sequences import AXES, scored_starts, task_sequences
 from brokk_min.identification.extras import need
 from brokk_min.identification.files import expect_same, expected, write_json
@@ -73,7 +72,7 @@ def _on_the_machine(machine: Machine, controllers: Mapping[str, Any], starts: in
     """The scored sequences and starts of `evaluate --seed 0`: the same whatever seed was trained."""
     sequences = task_sequences(machine)
     poses = scored_starts(machine, starts, sequences, 2)
-    return experiments.task_space(machine, controllers, sequences, poses, 0)[0]
+    return metrics.evaluate(machine, controllers, sequences, poses, 0)[0]
 
 
 def apart(function: Callable[..., Any], *arguments: Any) -> Any:
@@ -147,7 +146,7 @@ def sweep(
     beside = _on_the_machine(machine, others, starts)
     figures = table([results[seed] for seed in sorted(results)], beside)
     runs = [{"seed": seed} | row for seed in sorted(results) for row in results[seed]]
-    meta = experiments.meta(machine, min(seeds)) | tuned_for(machine, net)
+    meta = metrics.metadata(machine, min(seeds)) | tuned_for(machine, net)
     meta |= {"seeds": len(seeds), "failed": failed}
     write_json(out / "sweep.json", {"meta": meta, "table": figures, "runs": runs + beside})
     if failed:

@@ -13,7 +13,7 @@ from tqdm import tqdm
 from brokk_min.actuator import ActuatorNet
 from brokk_min.can.canopen import read_frames
 from brokk_min.can.drive_log import Telemetry, TelemetryReader
-from brokk_min.evaluation import baselines, experiments
+from brokk_min.evaluation import baselines, metrics
 from brokk_min.evaluation.rollout import Controller, Trace
 from brokk_min.evaluation.sequences import Commands, goals_and_starts, task_sequences
 from brokk_min.identification.files import expected, whole_file
@@ -126,7 +126,7 @@ def driven_again(
         {name: results.controllers[name] for name in controllers},
         [*results.sequences.values()],
     )
-    found, traces = experiments.task_space(
+    found, traces = metrics.evaluate(
         machine, chosen, every, results.starts, results.seed, results.net
     )
     for row in (r for r in found if r["start"] == start and r["sequence"] == sequence):

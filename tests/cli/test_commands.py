@@ -22,7 +22,7 @@ from brokk_min.can import operator_input as wishes
 from brokk_min.can.canopen import Frame
 from brokk_min.cli import commands, operating
 from brokk_min.cli.options import SHIPPED
-from brokk_min.evaluation import baselines, experiments, figures, preliminary, trust
+from brokk_min.evaluation import baselines, figures, metrics, preliminary, trust
 from brokk_min.evaluation.sequences import task_sequences
 from brokk_min.identification.logs import Log, Recording, read_log, write_log
 from brokk_min.jacobian import JacobianController
@@ -523,12 +523,13 @@ def test_an_evaluation_gets_what_is_named_and_says_what_it_took(
         commands, load_policy=SimpleNamespace(net=net), goals_and_starts=(sequences, "poses")
     )
     stand(baselines, read_gains={"pid": "tuned"}, tuned_baselines=({"pid": "tuned now"}, {}))
-    stand(experiments, task_space=(rows, {}), bounds={"bound": "b"})
+    stand(metrics, evaluate=(rows, {}))
+    stand(commands, perfect_models={"bound": "b"})
     assert run(f"evaluate --seed 4 --plant net --commands c.csv --starts s.csv --json {out}") == 0
     assert calls["load_policy"] == (POLICY, BROKK_170)
     assert calls["goals_and_starts"] == (BROKK_170, Path("c.csv"), Path("s.csv"), 16, 4)
     assert calls["read_gains"] == (GAINS, BROKK_170, net) and "tuned_baselines" not in calls
-    machine, controllers, *rest = calls["task_space"]
+    machine, controllers, *rest = calls["evaluate"]
     assert (
         rest == [sequences, "poses", 4, net]
         and machine is BROKK_170
@@ -544,7 +545,7 @@ def test_an_evaluation_gets_what_is_named_and_says_what_it_took(
         "commands": "c.csv",
         "starts": "s.csv",
     }
-    assert written["meta"] == experiments.meta(BROKK_170, 4) | about
+    assert written["meta"] == metrics.metadata(BROKK_170, 4) | about
     said = capsys.readouterr()
     assert said.err == f"gains of the baselines: {GAINS}\n"
     assert said.out.splitlines() == [
@@ -559,14 +560,13 @@ def test_an_evaluation_gets_what_is_named_and_says_what_it_took(
     assert (
         run(f"evaluate --policy {alone} --num-starts 3 --perfect-model --seed 4 --json {out}") == 0
     )
-    effort = experiments.Effort()
-    tuning = (effort.tuning_runs, effort.generations, 4)
-    assert calls["tuned_baselines"] == (BROKK_170, net, *tuning) and calls["bounds"] == (
+    tuning = (baselines.TUNING_RUNS, baselines.GENERATIONS, 4)
+    assert calls["tuned_baselines"] == (BROKK_170, net, *tuning) and calls["perfect_models"] == (
         BROKK_170,
         "poses",
     )
-    assert calls["goals_and_starts"][1:] == (None, None, 3, 4) and calls["task_space"][5] is None
-    controllers = calls["task_space"][1]
+    assert calls["goals_and_starts"][1:] == (None, None, 3, 4) and calls["evaluate"][5] is None
+    controllers = calls["evaluate"][1]
     assert list(controllers) == ["rl", "pid", "bound"] and controllers["pid"] == "tuned now"
     meta = json.loads(out.read_text())["meta"]
     about = {
@@ -576,7 +576,7 @@ def test_an_evaluation_gets_what_is_named_and_says_what_it_took(
         "commands": "up, to",
         "starts": "3",
     }
-    assert meta == experiments.meta(BROKK_170, 4) | about
+    assert meta == metrics.metadata(BROKK_170, 4) | about
     assert capsys.readouterr().err == "gains of the baselines: tuned now\n"
     assert run("evaluate --perfect-model --plant net") == 2
     wanted = (
@@ -584,9 +584,7 @@ def test_an_evaluation_gets_what_is_named_and_says_what_it_took(
     )
     assert capsys.readouterr().err == wanted
     assert run("evaluate --num-starts 3", "--gains", tmp_path / "mine.json") == 0
-    assert (
-        calls["read_gains"][0] == tmp_path / "mine.json" and "bound" not in calls["task_space"][1]
-    )
+    assert calls["read_gains"][0] == tmp_path / "mine.json" and "bound" not in calls["evaluate"][1]
 
 
 def test_preliminary_tests_are_drawn_and_written(
@@ -601,7 +599,7 @@ def test_preliminary_tests_are_drawn_and_written(
     assert calls["load_net"] == (Path("n.npz"),)
     assert calls["run"] == calls["plots"] == (BROKK_170, "nets", 3)
     assert calls["save"] == (out / "creep.png", "figure")
-    meta = experiments.meta(BROKK_170, 3) | {"actuator": "n.npz"}
+    meta = metrics.metadata(BROKK_170, 3) | {"actuator": "n.npz"}
     assert json.loads((out / "preliminary.json").read_text()) == {"meta": meta, **numbers}
     assert capsys.readouterr().out.splitlines()[-3:] == [
         str(out / "creep.png"),

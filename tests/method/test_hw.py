@@ -26,8 +26,8 @@ from brokk_min.can import drive_log
 from brokk_min.can import operator_input as wishes
 from brokk_min.can.safety_gate import encoder_raw, fault_name, valve_frame
 from brokk_min.env import TaskConfig, action_to_pwm, measured, observation_scale, reward
-from brokk_min.evaluation.experiments import axis_sequences
 from brokk_min.evaluation.rollout import rollout
+from brokk_min.evaluation.sequences import axis_sequences
 from brokk_min.identification.logs import read_log, write_log
 from brokk_min.jacobian import JacobianController, join_gains, manipulability_threshold
 from brokk_min.kinematics import joint_rates, tool_state

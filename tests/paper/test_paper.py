@@ -22,7 +22,15 @@ import brokk_min
 from brokk_min import jacobian, ppo
 from brokk_min.actuator import plant_reset, plant_step
 from brokk_min.env import TaskConfig, paper_view
-from brokk_min.evaluation import baselines, experiments, figures, preliminary, report, sequences
+from brokk_min.evaluation import (
+    baselines,
+    experiments,
+    figures,
+    metrics,
+    preliminary,
+    report,
+    sequences,
+)
 from brokk_min.identification import excitation, fitting
 from brokk_min.identification import validation as scores
 from brokk_min.identification.logs import velocity_of
@@ -334,7 +342,7 @@ STARTS = np.array([[1.5, 0.5, 0.58, 1.71, 1.24], [0.0, 0.7, 0.8, 1.5, 1.0]])
 def short_runs() -> tuple[list[sequences.Commands], list[dict[str, Any]], figures.Traces]:
     short = [s._replace(goals=s.goals[15:45]) for s in sequences.axis_sequences(BROKK_170)]
     controllers = {"rl": Steady(0.3), "jacobian_pid_k0.1": Steady(-0.2)}
-    return short, *experiments.task_space(BROKK_170, controllers, short, STARTS, 0)
+    return short, *metrics.evaluate(BROKK_170, controllers, short, STARTS, 0)
 
 
 def test_figure_6_runs_every_controller_and_shows_its_panels() -> None:

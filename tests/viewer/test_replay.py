@@ -17,7 +17,7 @@ from conftest import Stand
 from PIL import Image
 
 from brokk_min.can.drive_log import Telemetry
-from brokk_min.evaluation import baselines, experiments
+from brokk_min.evaluation import baselines, metrics
 from brokk_min.evaluation.sequences import task_sequences
 from brokk_min.kinematics import tool_state
 from brokk_min.machine import BROKK_170
@@ -120,10 +120,10 @@ def test_runs_driven_again_are_those_of_the_file(stand: Stand) -> None:
     results.controllers.update(dict.fromkeys(["more", *chosen], "drives"))  # type: ignore[arg-type]
     traces = {(name, s): trace for name in chosen for s in sequences}
     found = [row(1.0005), row(2.001, "pid"), *(r | {"velocity_rmse": 7.0} for r in other)]
-    calls = stand(experiments, task_space=(found, traces))
+    calls = stand(metrics, evaluate=(found, traces))
     runs = replay.driven_again(BROKK_170, results, chosen, "up", 1)
-    assert calls["task_space"][:2] == (BROKK_170, dict.fromkeys(chosen, "drives"))
-    assert calls["task_space"][2:] == (list(sequences.values()), results.starts, 3, "net")
+    assert calls["evaluate"][:2] == (BROKK_170, dict.fromkeys(chosen, "drives"))
+    assert calls["evaluate"][2:] == (list(sequences.values()), results.starts, 3, "net")
     assert [run.title for run in runs] == chosen
     assert [run.colour for run in runs] == [view.COLOURS["rl"], view.STEEL]
     for run in runs:
@@ -136,7 +136,7 @@ def test_runs_driven_again_are_those_of_the_file(stand: Stand) -> None:
         way = np.array([[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0.2]]) * 0.05
         np.testing.assert_allclose(run.path, tool_state(BROKK_170, START, 0 * START)[0] + way)
     for wrong, told in ((row(1.003), r"\[{.*1\.0}\]"), (row(1.0, "pd"), "none")):
-        stand(experiments, task_space=([wrong], traces))
+        stand(metrics, evaluate=([wrong], traces))
         with pytest.raises(
             ValueError, match=rf"r\.json: expected the run {{.*}}, got {told}: another program"
         ):
