@@ -1,6 +1,10 @@
 # Two commands: `make reproduce` runs the whole chain, `make test` passes the tests.
 # Both set up a virtual environment in .venv on first use and need no network after that.
-PYTHON ?= python3.11
+# PYTHON: the first Python from 3.11 on that can make one; `make PYTHON=...` names another.
+SUITABLE := import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))
+NAMES := python3.11 python3.12 python3.13 python3.14 python3 python
+PYTHON ?= $(shell for name in $(NAMES); do \
+	$$name -c '$(SUITABLE)' 2>/dev/null && echo $$name && break; done)
 OUT ?= $(if $(QUICK),results-quick,results)
 RUN := .venv/bin/python -m
 QUICK ?=
@@ -28,7 +32,8 @@ bench: .venv/installed-dev
 	$(RUN) benchmarks.rollout
 
 .venv/bin/python:
-	$(PYTHON) -m venv .venv
+	$(if $(PYTHON),,$(error PYTHON: expected Python 3.11 or newer with venv, found none of $(NAMES)))
+	"$(PYTHON)" -m venv .venv
 
 .venv/installed: pyproject.toml constraints.txt | .venv/bin/python
 	$(RUN) pip install --quiet -c constraints.txt -e .

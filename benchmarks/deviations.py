@@ -21,7 +21,7 @@ import numpy as np
 from brokk_min import actuator, env, jacobian, kinematics, machine, observation
 from brokk_min.cli.options import SHIPPED
 from brokk_min.env import TaskConfig, terminated
-from brokk_min.evaluation import experiments, sequences, trust
+from brokk_min.evaluation import metrics, sequences, trust
 from brokk_min.evaluation.rollout import rollout
 from brokk_min.identification import excitation, fitting, logs
 from brokk_min.jacobian import JacobianController
@@ -205,7 +205,7 @@ def trained(
     starts = sequences.scored_starts(M, 32, sequences.task_sequences(M), 2)
     result = {}
     for name, moves in (("nets", net), ("plant", None)):
-        runs, _ = experiments.task_space(M, controller, axes, starts, 0, moves)
+        runs, _ = metrics.evaluate(M, controller, axes, starts, 0, moves)
         for key in ("velocity_error_mean", "off_axis_drift_max", "valve_travel"):
             result[f"{name}, {key}"] = float(np.mean([run[key] for run in runs]))
     return result

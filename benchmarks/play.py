@@ -19,11 +19,11 @@ import numpy as np
 import tyro
 
 from benchmarks.bus import random_policy
-from brokk_min.can.ticks import Known
+from brokk_min.can.drive_log import Telemetry
 from brokk_min.learning.policy import PolicyController
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer import play
-from brokk_min.viewer.remote import Where
+from brokk_min.viewer.control_process import BusOptions
 
 
 @dataclass
@@ -40,15 +40,15 @@ class Player:
     def __init__(self, seconds: float) -> None:
         self.seconds, self.begun, self.keys = seconds, 0.0, set[str]()
         self.times: list[float] = []
-        self.known: dict[float, Known] = {}
+        self.known: dict[float, Telemetry] = {}
 
-    def __call__(self, session: play.Session, hands: play.Hands) -> bool:
+    def __call__(self, session: play.Session, hands: play.InputHandler) -> bool:
         """One picture; False at the end."""
         now, known = time.monotonic(), session.known
         if known is None:
             return True
         self.begun = self.begun or now * known.driving
-        wanted = {"space"} if known.driving or not known.wrong else set()
+        wanted = {"space"} if known.driving or not known.active_fault else set()
         if self.begun:
             self.times.append(now)
             self.known[known.tick] = known
@@ -85,7 +85,7 @@ def main(options: Options) -> None:
     player, show = Player(options.seconds), play.show
     play.show = lambda *a: show(*a, watcher=player)  # type: ignore[assignment]
     policy = PolicyController(BROKK_170, random_policy(np.random.default_rng(0)))
-    play.play(BROKK_170, {"rl": policy}, Where(), Path(os.devnull).with_name("no attempts"))
+    play.play(BROKK_170, {"rl": policy}, BusOptions(), Path(os.devnull).with_name("no attempts"))
     result = {"seconds": options.seconds, **figures(player)}
     print(json.dumps(result, indent=1))
     if options.json:

@@ -1,4 +1,4 @@
-"""The command line: `brokk-min COMMAND --help`. Exits 0 done, 1 failed, 2 wrong use."""
+"""The command line: `brokk-min COMMAND --help`, `--version`. Exits 0 done, 1 failed, 2 wrong use."""
 
 import sys
 from collections.abc import Callable
@@ -6,6 +6,7 @@ from typing import Any
 
 import tyro
 
+from brokk_min import __version__
 from brokk_min.cli import commands, operating
 from brokk_min.cli.options import WrongUse
 
@@ -30,6 +31,9 @@ COMMANDS: dict[str, Callable[[], Any]] = {
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; errors are one line on stderr."""
     arguments = sys.argv[1:] if arguments is None else arguments
+    if arguments == ["--version"]:
+        print(f"brokk_min {__version__}")
+        return 0
     named = [name for name in COMMANDS if name in arguments[:1]] or list(COMMANDS)
     command = tyro.extras.subcommand_cli_from_dict(
         {name: COMMANDS[name]() for name in named},

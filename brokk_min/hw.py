@@ -1,7 +1,7 @@
 """The hardware path: the 20 Hz loop that drives a machine on a CAN bus.
 
 Each tick of `Drive`: SYNC, the encoders' positions, the observation, the controller, the safety gate, the
-valve frame. `gate` decides what may reach the valves, `bus` carries frames, `blackbox` runs the loop again on
+valve frame. `gate` decides what may reach the valves, `bus` carries frames, `drive_log` runs the loop again on
 its logs, `simulator` is a machine to try. Nothing here is a safety function: a real machine keeps its
 hard-wired emergency stop (docs/hardware.md).
 """
@@ -16,16 +16,14 @@ import numpy as np
 
 from brokk_min.actuator import initial_history
 from brokk_min.can import canopen as bus
-from brokk_min.can.operator_input import Wish, unpack_wish
-from brokk_min.can.safety_gate import (
+from brokk_min.can.canopen import (
     OPERATIONAL,
     Array,
-    GateInputs,
+    OperatorInput,
     encoder_counts,
-    fault_name,
-    gate,
-    gate_start,
+    unpack_operator_input,
 )
+from brokk_min.can.safety_gate import GateInputs, fault_name, gate, gate_start
 from brokk_min.env import measure, update_history
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.kinematics import forward_kinematics, tool_velocity
@@ -43,7 +41,7 @@ class Drive:
     Args:
         machine: its joints' encoders and its valve controller are on the bus.
         controller: a policy or a baseline.
-        line: `bus.Line`, or a `blackbox.Tape` of one.
+        line: `bus.Bus`, or a `drive_log.ReplayedBus` of one.
         operator: gives the wish of a tick; it is told whether the gate drives and is ready.
     """
 
@@ -52,7 +50,7 @@ class Drive:
         machine: Machine,
         controller: Controller,
         line: Any,
-        operator: Callable[[bool, bool], Wish],
+        operator: Callable[[bool, bool], OperatorInput],
     ) -> None:
         if machine.n > 5:
             raise ValueError(
@@ -64,7 +62,11 @@ class Drive:
             line,
             operator,
         )
-        self.nodes, self.gate, self.wish = bus.Nodes(machine), gate_start(machine), Wish()
+        self.nodes, self.gate, self.operator_input = (
+            bus.Nodes(machine),
+            gate_start(machine),
+            OperatorInput(),
+        )
         self.memory = controller.start(1)
         self.history: Array | None = None
         self.error_integral: Array = np.zeros((1, 3), np.float32)  # of `integrate_error`
@@ -102,34 +104,37 @@ class Drive:
         """Wait for the deadline, then one tick; False if it was the last."""
         self._wait()
         line, wanted = self.line, np.zeros(self.machine.n)
-        with self._caught():
-            wish = self.operator(bool(self.gate.driving), bool(self.gate.wrong == 0))
-            self.wish = unpack_wish(
+        with self.catch_errors():
+            wish = self.operator(bool(self.gate.driving), bool(self.gate.active_fault == 0))
+            self.operator_input = unpack_operator_input(
                 wish.pack()
             )  # as the log has it, so that a replay gets the same
         self.nodes.frames *= 2  # a position from before its SYNC is as wrong as a doubled one
-        with self._caught():
+        with self.catch_errors():
             line.send(bus.SYNC, b"")
             self._listen(line.now() + WINDOW, AWAKE, until_complete=True)
         counts = encoder_counts(self.machine, self.nodes.raw)
-        with self._caught():
+        with self.catch_errors():
             wanted = self._control(counts)
-        stop, error = self.wish.stop or bool(self.signals), self.wish.error or bool(self.problem)
-        self.wish = self.wish._replace(stop=stop, error=error)
-        frame = self._gate(wanted, counts, line.note(self.wish.pack()))
+        stop, error = (
+            self.operator_input.stop or bool(self.signals),
+            self.operator_input.error or bool(self.problem),
+        )
+        self.operator_input = self.operator_input._replace(stop=stop, error=error)
+        frame = self._gate(wanted, counts, line.note(self.operator_input.pack()))
         problem, self.problem = self.problem, ""
         self._speak(frame)
         self._remember(problem)
-        with self._caught():
+        with self.catch_errors():
             if (
-                not (self.wish.enable or self.gate.driving)
+                not (self.operator_input.enable or self.gate.driving)
                 and (self.nodes.nmt != OPERATIONAL).any()
             ):
                 line.send(
                     bus.NMT, bytes([1, 0])
                 )  # nodes fell back; not while the operator holds the switch
             line.flush()
-        return not self.wish.stop
+        return not self.operator_input.stop
 
     def run(self, show: Callable[[str], object] = lambda text: None) -> None:
         """Tick until the operator, SIGINT or SIGTERM stops it; the last frame is neutral whatever happens."""
@@ -146,7 +151,7 @@ class Drive:
             raise
 
     @property
-    def seen(self) -> Array:
+    def measured(self) -> Array:
         """Newest angles [rad] and rates [rad/s], (2, n); nan: unknown."""
         return (
             np.full((2, self.machine.n), np.nan)
@@ -156,16 +161,18 @@ class Drive:
 
     def status(self) -> str:
         """One line: state, faults, tool velocity wanted and measured [m/s], angles [rad], lateness."""
-        state = "driving" if self.gate.driving else "waiting" if self.gate.wrong else "ready"
-        q, q_dot = self.seen
+        state = "driving" if self.gate.driving else "waiting" if self.gate.active_fault else "ready"
+        q, q_dot = self.measured
         v = tool_velocity(forward_kinematics(self.machine, q), q_dot)
-        want, have, pose = (" ".join(f"{x:+.2f}" for x in a) for a in (self.wish.v_goal, v, q))
+        want, have, pose = (
+            " ".join(f"{x:+.2f}" for x in a) for a in (self.operator_input.v_goal, v, q)
+        )
         late = f"late {1e3 * self.lateness:.1f} ms, skipped {self.skipped}"
         reason = f" {self.reason}" if self.reason else ""
         return f"{state:7}{reason} v wanted {want} is {have} q {pose} {late}"
 
     @contextmanager
-    def _caught(self) -> Iterator[None]:
+    def catch_errors(self) -> Iterator[None]:
         """Whatever is raised inside becomes the gate's business."""
         try:
             yield
@@ -180,14 +187,14 @@ class Drive:
             frame = self.line.recv(max(0.0, end - self.line.now()), awake)
             if frame is None:
                 return
-            self.nodes.hear(frame)
+            self.nodes.update(frame)
         raise OverflowError(f"bus: expected fewer than {MAX_FRAMES} frames in a row, got more")
 
     def _wait(self) -> None:
         """Listen and rehearse until the deadline."""
         line = self.line
         end = min(self.deadline, line.now() + self.machine.dt)  # the clock may have gone backwards
-        with self._caught():
+        with self.catch_errors():
             self._listen(end - AWAKE)
             line.rest(max(0.0, end - AWAKE - line.now()))
             self._rehearse(end)
@@ -229,7 +236,7 @@ class Drive:
                 self.controller.start(1),
                 np.zeros((1, 3), np.float32),
             )
-        self.v_goal = np.array([self.wish.v_goal], np.float32)
+        self.v_goal = np.array([self.operator_input.v_goal], np.float32)
         measured = measure(m, self.history, self.v_goal, self.error_integral)
         u, self.memory = self.controller(measured, self.memory)
         return np.asarray(np.rint(u[0] * PWM_MAX), float)
@@ -247,7 +254,7 @@ class Drive:
 
     def _gate(self, wanted: Array, counts: Array, now: float) -> bytes:
         """Pass the gate with what this tick knows; the valve frame."""
-        nodes, wish = self.nodes, self.wish
+        nodes, wish = self.nodes, self.operator_input
         error = wish.error or bool(self.problem)
         flags = np.array([wish.enable, not any(wish.v_goal), wish.alive, wish.stop, error])
         inputs = GateInputs(wanted, counts, nodes.frames, nodes.beat, nodes.nmt, *flags)
@@ -257,7 +264,8 @@ class Drive:
     def _remember(self, problem: str) -> None:
         """What was sent and what is wrong; forget what this tick heard."""
         stopped, wrong = (
-            fault_name(self.machine, int(f)) for f in (self.gate.fault, self.gate.wrong)
+            fault_name(self.machine, int(f))
+            for f in (self.gate.latched_fault, self.gate.active_fault)
         )
         self.reason = f"fault: {stopped}" if stopped else wrong
         self.remark = "" if self.gate.driving else problem or self.remark
@@ -266,6 +274,6 @@ class Drive:
 
     def _speak(self, frame: bytes) -> None:
         """Send the valve frame, once the gate was armed."""
-        with self._caught():
-            if self.gate.spoken:
+        with self.catch_errors():
+            if self.gate.armed_once:
                 self.line.send(self.machine.valve_frame_id, frame)

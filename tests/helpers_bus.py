@@ -11,7 +11,7 @@ import numpy as np
 
 from brokk_min import hw
 from brokk_min.can.canopen import Frame, Line
-from brokk_min.can.operator_input import Wish
+from brokk_min.can.operator_input import OperatorInput
 from brokk_min.can.simulated_machine import SimulatedMachine
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.hw import Drive
@@ -33,7 +33,7 @@ class World:
     def __init__(
         self,
         controller: Controller,
-        operator: Callable[[bool, bool], Wish],
+        operator: Callable[[bool, bool], OperatorInput],
         machine: Machine = BROKK_170,
         log: Any = None,
         start: tuple[float, ...] = START,
@@ -138,9 +138,9 @@ class Hand:
         self.pressed = False
         self.act: Callable[[], object] = lambda: None
 
-    def __call__(self, driving: bool, ready: bool) -> Wish:
+    def __call__(self, driving: bool, ready: bool) -> OperatorInput:
         self.act()
         self.pressed = self.pressed or ready
         enable = self.pressed if self.enable is None else self.enable
         v = self.v if driving else (0.0, 0.0, 0.0)
-        return Wish(v, enable=enable and self.alive, alive=self.alive, stop=self.stop)
+        return OperatorInput(v, enable=enable and self.alive, alive=self.alive, stop=self.stop)

@@ -14,16 +14,21 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from brokk_min.identification.extras import need
 from brokk_min.identification.files import expected
-from brokk_min.machine import Machine
+from brokk_min.machine import PWM_MAX, Machine, encode_pwm
+
+Array = NDArray[Any]  # counts and flags, too
 
 # CANopen (CiA 301): identifiers are these plus the node's number
 NMT, SYNC, TPDO1, SDO_ANSWER, SDO_REQUEST, HEARTBEAT = 0x000, 0x080, 0x180, 0x580, 0x600, 0x700
+POSITION_MASK = (1 << 26) - 1  # bits of an encoder's position that count
+OPERATIONAL = 5  # CANopen state of a node at work
 # objects: index, subindex
 BEAT_OBJECT, SYNC_OBJECT, RESOLUTION_OBJECT = (0x1017, 0), (0x1800, 2), (0x6501, 0)
-OPERATOR, WISH = (
+OPERATOR_CHANNEL, OPERATOR_INPUT = (
     "operator",
     0x7FF,
 )  # channel and identifier of the operator's wishes in a log, not on the bus
@@ -41,7 +46,7 @@ class Frame(NamedTuple):
     channel: str = ""
 
 
-class Line:
+class Bus:
     """A CAN bus with a monotonic clock and a black box that logs what is sent and read.
 
     Args:
@@ -108,7 +113,7 @@ class Line:
     def note(self, data: bytes) -> float:
         """Log what is not on the bus, the operator's wish, on a channel of its own; when that was [s]."""
         now = self.now()
-        self._keep(self._message(WISH, data), now, OPERATOR)
+        self._keep(self._message(OPERATOR_INPUT, data), now, OPERATOR_CHANNEL)
         return now
 
     def flush(self) -> None:
@@ -141,7 +146,7 @@ def _plain_id(message: Any) -> int:
 
 
 @contextmanager
-def open_line(interface: str, channel: str, log: Path | None = None) -> Iterator[Line]:
+def open_bus(interface: str, channel: str, log: Path | None = None) -> Iterator[Bus]:
     """A bus by python-can's names, closed at the end of the block; `log` grows while it runs.
 
     ValueError: python-can is not there, finds no such bus, or fails in the block.
@@ -152,7 +157,7 @@ def open_line(interface: str, channel: str, log: Path | None = None) -> Iterator
     except Exception as error:  # each interface has its own
         raise ValueError(f"{interface} {channel}: expected a CAN bus, got {error!r}") from error
     name = channel if interface == "socketcan" else interface
-    line = Line(
+    line = Bus(
         bus, can.CanutilsLogWriter(log) if log else None, name, echo=interface == "udp_multicast"
     )
     try:
@@ -206,7 +211,7 @@ class Nodes:
         self.raw, self.frames = np.zeros(machine.n, int), np.zeros(machine.n, int)
         self.beat, self.nmt = np.full(machine.n + 1, -np.inf), np.zeros(machine.n + 1, int)
 
-    def hear(self, frame: Frame) -> None:
+    def update(self, frame: Frame) -> None:
         """Take in one frame; foreign ones change nothing."""
         size = len(frame.data)
         if (i := self.encoders.get(frame.id)) is not None:
@@ -242,3 +247,87 @@ def sdo(
                 raise ValueError(f"{where}: expected an answer, got SDO abort 0x{answer:08X}")
             return int(answer & (1 << 8 * (4 - (frame.data[0] >> 2 & 3))) - 1)
     raise ValueError(f"{where}: expected an answer within {SDO_TIMEOUT} s, got none")
+
+
+# --- codec ------------------------------------------------------------------------------------------
+
+
+def encoder_counts(machine: Machine, raw: ArrayLike) -> Array:
+    """Joint angles in counts from raw positions (..., n): masked, zeroed, unwrapped around mid range.
+
+    Example:
+        >>> from brokk_min.machine import BROKK_170
+        >>> encoder_counts(BROKK_170, [2**26 - 1, 4095, 4096 + 7, 1000, 0])
+        array([  -1,   -1,    7, 1000,    0])
+    """
+    turn = 2**machine.encoder_bits
+    low, high, zero, sign = map(machine.column, ("q_min", "q_max", "encoder_zero", "encoder_sign"))
+    counts = sign.astype(int) * ((np.asarray(raw) & POSITION_MASK) - zero.astype(int))
+    start = np.rint((low + high) / 2 / machine.encoder_step).astype(int) - turn // 2
+    return np.asarray((counts - start) % turn + start)
+
+
+def encoder_raw(machine: Machine, counts: ArrayLike) -> Array:
+    """What encoders with 26 bits say for joint angles in counts (..., n)."""
+    zero, sign = (machine.column(name).astype(int) for name in ("encoder_zero", "encoder_sign"))
+    return np.asarray((sign * np.asarray(counts) + zero) & POSITION_MASK)
+
+
+def _crc_table() -> Array:
+    table = np.arange(256)
+    for _ in range(8):
+        table = (table << 1 ^ np.where(table & 0x80, 0x1D, 0)) & 0xFF
+    return table.astype(np.uint8)
+
+
+_CRC = _crc_table()
+
+
+def checksum(frame: ArrayLike) -> Array:
+    """CRC-8 SAE J1850 of bytes (..., k): polynomial 0x1D, start and final XOR 0xFF.
+
+    Example:
+        >>> hex(checksum(list(b"123456789")))
+        '0x4b'
+    """
+    frame = np.asarray(frame, np.uint8)
+    crc: Array = np.array(0xFF, np.uint8)
+    for byte in frame.T:
+        crc = _CRC[crc ^ byte]
+    return (crc ^ np.uint8(0xFF)).T
+
+
+def valve_frame(m: ArrayLike, counter: ArrayLike, enable: ArrayLike) -> Array:
+    """Bytes (..., 8): five PWM bytes, counter, checksum, enable; `m` [counts of 127] (..., n <= 5)."""
+    m = np.asarray(m)
+    frame = np.zeros((*m.shape[:-1], 8), np.uint8)
+    frame[..., : m.shape[-1]] = encode_pwm(m / PWM_MAX)
+    frame[..., 5], frame[..., 7] = counter, enable
+    frame[..., 6] = checksum(frame[..., [0, 1, 2, 3, 4, 5, 7]])
+    return frame
+
+
+class OperatorInput(NamedTuple):
+    """What the operator asks for at one tick."""
+
+    v_goal: tuple[float, float, float] = (0.0, 0.0, 0.0)  # tool velocity [m/s], base frame
+    enable: bool = False  # dead-man switch
+    alive: bool = True  # is the device there?
+    stop: bool = False  # end the program
+    error: bool = False  # set by the loop, so that the log tells it
+
+    def pack(self) -> bytes:
+        """As seven bytes of the log: three times 0.1 mm/s, flags."""
+        flags = self.enable | self.alive << 1 | self.stop << 2 | self.error << 3
+        return struct.pack("<hhhB", *(round(1e4 * v) for v in self.v_goal), flags)
+
+
+def unpack_operator_input(data: bytes) -> OperatorInput:
+    """What `OperatorInput.pack` packed.
+
+    Example:
+        >>> unpack_operator_input(OperatorInput((0.1, 0.0, -0.25), enable=True).pack())
+        OperatorInput(v_goal=(0.1, 0.0, -0.25), enable=True, alive=True, stop=False, error=False)
+    """
+    x, y, z, flags = struct.unpack("<hhhB", data)
+    return OperatorInput((x / 1e4, y / 1e4, z / 1e4), *(bool(flags & 1 << i) for i in range(4)))

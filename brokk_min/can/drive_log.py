@@ -1,20 +1,28 @@
 """What a drive left in its log: the loop run on it again, byte by byte, and recordings for `fit`."""
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from brokk_min.can import canopen as bus
-from brokk_min.can.operator_input import Wish, unpack_wish
-from brokk_min.can.safety_gate import encoder_counts
+from brokk_min.can.canopen import (
+    OPERATOR_CHANNEL,
+    OPERATOR_INPUT,
+    SYNC,
+    Frame,
+    Nodes,
+    OperatorInput,
+    encoder_counts,
+    unpack_operator_input,
+)
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.hw import Drive
 from brokk_min.identification.logs import Log, machine_log
-from brokk_min.machine import Machine, decode_pwm
+from brokk_min.machine import Array, Machine, decode_pwm, estimate_velocity
 
 
-class Tape:
+class ReplayedBus:
     """A recorded log in place of a `Line`: gives back what was read and compares what is sent."""
 
     def __init__(self, frames: Sequence[bus.Frame]) -> None:
@@ -50,14 +58,19 @@ class Tape:
     def note(self, data: bytes) -> float:
         """The time of the wish."""
         now = self.now()
-        self._step(bus.WISH)
+        self._step(bus.OPERATOR_INPUT)
         return now
 
-    def wish(self, driving: bool, ready: bool) -> Wish:
+    def wish(self, driving: bool, ready: bool) -> OperatorInput:
         """What the operator wished then."""
         ahead = (self.frames[i] for i in range(self.at, len(self.frames)))
         return next(
-            (unpack_wish(frame.data) for frame in ahead if frame.id == bus.WISH), Wish(stop=True)
+            (
+                unpack_operator_input(frame.data)
+                for frame in ahead
+                if frame.id == bus.OPERATOR_INPUT
+            ),
+            OperatorInput(stop=True),
         )
 
     def _step(self, can_id: int) -> None:
@@ -74,14 +87,14 @@ def replay(
 
     ValueError: another program made the log.
     """
-    tape = Tape(list(frames))
+    tape = ReplayedBus(list(frames))
     drive = Drive(machine, controller, tape, tape.wish)
     drive.begin()
     while tape.more:
         drive.tick()
     if tape.wrong:
         raise ValueError(tape.wrong)
-    return tape.sent[: sum(f.sent and f.channel != bus.OPERATOR for f in frames)]
+    return tape.sent[: sum(f.sent and f.channel != bus.OPERATOR_CHANNEL for f in frames)]
 
 
 def compare(
@@ -93,7 +106,7 @@ def compare(
     return sum(a == b for a, b in zip(old, new)), max(len(old), len(new))
 
 
-def driven_log(machine: Machine, frames: Iterable[bus.Frame]) -> Log:
+def log_for_fit(machine: Machine, frames: Iterable[bus.Frame]) -> Log:
     """What encoders said and valves got while driving, as recordings for `fit`; a gap starts a new one.
 
     ValueError: nothing was driven for long enough.
@@ -110,7 +123,7 @@ def driven_log(machine: Machine, frames: Iterable[bus.Frame]) -> Log:
                 parts[-1].append((u, encoder_counts(machine, nodes.raw) * machine.encoder_step))
                 last = start
         else:
-            nodes.hear(frame)
+            nodes.update(frame)
     tapes = []
     for number, part in enumerate(parts):
         if len(part) > machine.history + 1:
@@ -121,3 +134,68 @@ def driven_log(machine: Machine, frames: Iterable[bus.Frame]) -> Log:
             f"log: expected more than {machine.history + 1} ticks of driving in a row, got none"
         )
     return machine_log(machine, tapes)
+
+
+class Telemetry(NamedTuple):
+    """What the loop, a bus or a log tells of one tick."""
+
+    tick: float
+    q: Array  # rad (n,), nan: unknown
+    q_dot: Array  # rad/s (n,)
+    u: Array  # in [-1, 1] (n,)
+    v_goal: Array  # m/s (3,)
+    driving: bool
+    active_fault: int = 0  # of `fault_name`
+    latched_fault: int = 0
+    mode: int = 0
+    lateness: float = 0.0  # s
+
+    def pack(self) -> Array:
+        """As numbers in a row."""
+        return np.hstack([np.ravel(value) for value in self]).astype(float)
+
+
+def unpack_telemetry(machine: Machine, values: Array) -> Telemetry:
+    """What `Telemetry.pack` packed."""
+    n = machine.n
+    tick, q, q_dot, u, v, rest = np.split(values, np.cumsum([1, n, n, n, 3]))
+    driving, wrong, fault, mode = (int(x) for x in rest[:4])
+    return Telemetry(
+        float(tick[0]), q, q_dot, u, v, bool(driving), wrong, fault, mode, float(rest[4])
+    )
+
+
+class TelemetryReader:
+    """Frames of a bus or a log, one after another, as what is known at each tick."""
+
+    def __init__(self, machine: Machine) -> None:
+        self.machine, self.nodes, self.operator_input = machine, Nodes(machine), OperatorInput()
+        self.u, self.driving, self.tick = np.zeros(machine.n), False, 0
+        self.angles: list[Array] = []  # rad, as many as the velocity needs
+
+    def update(self, frame: Frame) -> Telemetry | None:
+        """Take in one frame; at a SYNC, what is known of the tick that it ends."""
+        if frame.id == SYNC:
+            known, self.nodes.frames[:] = self._known(), 0
+            self.tick += 1
+            return known
+        if frame.id == OPERATOR_INPUT and frame.channel == OPERATOR_CHANNEL:
+            self.operator_input = unpack_operator_input(frame.data)
+        elif frame.id == self.machine.valve_frame_id and len(frame.data) == 8:
+            self.u, self.driving = (
+                decode_pwm(list(frame.data[: self.machine.n])),
+                frame.data[7] == 1,
+            )
+        else:
+            self.nodes.update(frame)
+        return None
+
+    def _known(self) -> Telemetry:
+        m, v_goal = self.machine, np.array(self.operator_input.v_goal) * self.driving
+        if (self.nodes.frames != 1).any():
+            self.angles, nan = [], np.full(m.n, np.nan)
+            return Telemetry(self.tick, nan, nan, self.u, v_goal, self.driving)
+        q = encoder_counts(m, self.nodes.raw) * m.encoder_step
+        self.angles = [*(self.angles or [q] * m.velocity_samples), q][-m.velocity_samples :]
+        q_dot = estimate_velocity(np.stack(self.angles, axis=-1), m.velocity_samples, m.dt)
+        return Telemetry(self.tick, q, np.asarray(q_dot), self.u, v_goal, self.driving)

@@ -1,47 +1,21 @@
 """Who asks for motion, tick by tick: a script of velocity goals, or a hand on a joystick.
 
-An operator is called with what the gate says and gives a `Wish`. A script plays the part of a hand, dead-man
+An operator is called with what the gate says and gives a `OperatorInput`. A script plays the part of a hand, dead-man
 switch and all, so that it passes the same gate.
 """
 
 import os
-import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from brokk_min.can.canopen import OperatorInput
 from brokk_min.env import Measured
 from brokk_min.identification.extras import need
 from brokk_min.machine import PWM_MAX, Array, Machine
-
-
-class Wish(NamedTuple):
-    """What the operator asks for at one tick."""
-
-    v_goal: tuple[float, float, float] = (0.0, 0.0, 0.0)  # tool velocity [m/s], base frame
-    enable: bool = False  # dead-man switch
-    alive: bool = True  # is the device there?
-    stop: bool = False  # end the program
-    error: bool = False  # set by the loop, so that the log tells it
-
-    def pack(self) -> bytes:
-        """As seven bytes of the log: three times 0.1 mm/s, flags."""
-        flags = self.enable | self.alive << 1 | self.stop << 2 | self.error << 3
-        return struct.pack("<hhhB", *(round(1e4 * v) for v in self.v_goal), flags)
-
-
-def unpack_wish(data: bytes) -> Wish:
-    """What `Wish.pack` packed.
-
-    Example:
-        >>> unpack_wish(Wish((0.1, 0.0, -0.25), enable=True).pack())
-        Wish(v_goal=(0.1, 0.0, -0.25), enable=True, alive=True, stop=False, error=False)
-    """
-    x, y, z, flags = struct.unpack("<hhhB", data)
-    return Wish((x / 1e4, y / 1e4, z / 1e4), *(bool(flags & 1 << i) for i in range(4)))
 
 
 class Script:
@@ -59,16 +33,16 @@ class Script:
         self.goals, self.tick, self.pressed = goals, 0, False
         self.patience = round(patience_s * machine.rate)
 
-    def __call__(self, driving: bool, ready: bool) -> Wish:
+    def __call__(self, driving: bool, ready: bool) -> OperatorInput:
         """The wish of this tick; stops at the end, after a fault, or if the machine never gets ready."""
         if driving and self.tick < len(self.goals):
             x, y, z = map(float, self.goals[self.tick])
             self.tick += 1
-            return Wish((x, y, z), enable=True)
+            return OperatorInput((x, y, z), enable=True)
         if driving or self.tick or not self.patience:
-            return Wish(stop=True)
+            return OperatorInput(stop=True)
         self.pressed, self.patience = ready and not self.pressed, self.patience - 1
-        return Wish(enable=self.pressed)
+        return OperatorInput(enable=self.pressed)
 
     @property
     def done(self) -> bool:
@@ -102,7 +76,7 @@ class Joystick:
                 f"joystick: expected axes {list(axes)} and button {button}, got {found[0]} and {found[1]}"
             )
 
-    def __call__(self, driving: bool, ready: bool) -> Wish:
+    def __call__(self, driving: bool, ready: bool) -> OperatorInput:
         """The wish of this tick. A device that is gone reads zero on all axes, so its removal is told."""
         for event in self.pygame.event.get():
             if event.type == self.pygame.JOYDEVICEADDED and not self.stick:
@@ -112,14 +86,14 @@ class Joystick:
                     None if event.instance_id == self.stick.get_instance_id() else self.stick
                 )
         if not self.stick:
-            return Wish(alive=False)
+            return OperatorInput(alive=False)
         v = -shape_axis([self.stick.get_axis(i) for i in self.axes]) * self.speed
         x, y, z = map(float, v / max(1.0, float(np.linalg.norm(v)) / self.speed))
-        return Wish((x, y, z), enable=bool(self.stick.get_button(self.button)))
+        return OperatorInput((x, y, z), enable=bool(self.stick.get_button(self.button)))
 
 
 @dataclass(frozen=True)
-class Jog:
+class JointJog:
     """A controller for bringing up: a small command on one joint, its sign that of the wanted x velocity."""
 
     machine: Machine

@@ -4,17 +4,13 @@ The gate is a pure function of state, inputs and time, for one machine or for a 
 safety function: a real machine keeps its hard-wired emergency stop (docs/hardware.md).
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from brokk_min.machine import PWM_MAX, Machine, encode_pwm
-
-Array = NDArray[Any]  # counts and flags, too
-
-POSITION_MASK = (1 << 26) - 1  # bits of an encoder's position that count
-OPERATIONAL = 5  # CANopen state of a node at work
+from brokk_min.can.canopen import OPERATIONAL, Array, valve_frame
+from brokk_min.machine import PWM_MAX, Machine
 
 # all assumed
 BEAT_LOST = 0.110  # s without heartbeat, then a node is lost
@@ -28,64 +24,6 @@ IDLE = 1.5  # dead zones: a command up to this may do nothing
 SLOWEST = 0.3  # of the fastest motion: long lever arm, weak pump
 KEPT = 0.5  # of the motion before: a joint that moved goes on at least so under the same push
 PUSH = 8  # ticks of commands the same way after which a joint moves, from rest too
-
-
-# --- codec ------------------------------------------------------------------------------------------
-
-
-def encoder_counts(machine: Machine, raw: ArrayLike) -> Array:
-    """Joint angles in counts from raw positions (..., n): masked, zeroed, unwrapped around mid range.
-
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> encoder_counts(BROKK_170, [2**26 - 1, 4095, 4096 + 7, 1000, 0])
-        array([  -1,   -1,    7, 1000,    0])
-    """
-    turn = 2**machine.encoder_bits
-    low, high, zero, sign = map(machine.column, ("q_min", "q_max", "encoder_zero", "encoder_sign"))
-    counts = sign.astype(int) * ((np.asarray(raw) & POSITION_MASK) - zero.astype(int))
-    start = np.rint((low + high) / 2 / machine.encoder_step).astype(int) - turn // 2
-    return np.asarray((counts - start) % turn + start)
-
-
-def encoder_raw(machine: Machine, counts: ArrayLike) -> Array:
-    """What encoders with 26 bits say for joint angles in counts (..., n)."""
-    zero, sign = (machine.column(name).astype(int) for name in ("encoder_zero", "encoder_sign"))
-    return np.asarray((sign * np.asarray(counts) + zero) & POSITION_MASK)
-
-
-def _crc_table() -> Array:
-    table = np.arange(256)
-    for _ in range(8):
-        table = (table << 1 ^ np.where(table & 0x80, 0x1D, 0)) & 0xFF
-    return table.astype(np.uint8)
-
-
-_CRC = _crc_table()
-
-
-def checksum(frame: ArrayLike) -> Array:
-    """CRC-8 SAE J1850 of bytes (..., k): polynomial 0x1D, start and final XOR 0xFF.
-
-    Example:
-        >>> hex(checksum(list(b"123456789")))
-        '0x4b'
-    """
-    frame = np.asarray(frame, np.uint8)
-    crc: Array = np.array(0xFF, np.uint8)
-    for byte in frame.T:
-        crc = _CRC[crc ^ byte]
-    return (crc ^ np.uint8(0xFF)).T
-
-
-def valve_frame(m: ArrayLike, counter: ArrayLike, enable: ArrayLike) -> Array:
-    """Bytes (..., 8): five PWM bytes, counter, checksum, enable; `m` [counts of 127] (..., n <= 5)."""
-    m = np.asarray(m)
-    frame = np.zeros((*m.shape[:-1], 8), np.uint8)
-    frame[..., : m.shape[-1]] = encode_pwm(m / PWM_MAX)
-    frame[..., 5], frame[..., 7] = counter, enable
-    frame[..., 6] = checksum(frame[..., [0, 1, 2, 3, 4, 5, 7]])
-    return frame
 
 
 # --- the safety gate --------------------------------------------------------------------------------
@@ -111,9 +49,9 @@ class GateState(NamedTuple):
     """What the gate remembers: one or many gates, arrays (...) unless noted."""
 
     driving: Array  # may the valves move?
-    spoken: Array  # was it ever armed? before that it sends nothing
-    wrong: Array  # what is wrong at this tick, see `fault_name`; 0: ready
-    fault: Array  # what stopped it, 0: nothing; kept until it is armed again
+    armed_once: Array  # was it ever armed? before that it sends nothing
+    active_fault: Array  # what is wrong at this tick, see `fault_name`; 0: ready
+    latched_fault: Array  # what stopped it, 0: nothing; kept until it is armed again
     enable: Array  # dead-man switch at the last tick at which it could be trusted
     time: Array  # s, of the last tick
     counter: Array  # of the last valve frame
@@ -167,14 +105,14 @@ def gate(
         now: s, on the clock of the heartbeats, (...).
 
     Returns:
-        The next state, and the valve frame (..., 8), to be sent only if the state has `spoken`.
+        The next state, and the valve frame (..., 8), to be sent only if the state has `armed_once`.
     """
     now = np.asarray(now)
     pace, due = motion_due(machine, state, inputs.counts)
     wrong = gate_wrong(machine, state, inputs, due, now)
     edge = inputs.enable & ~state.enable & inputs.centred
     driving = inputs.enable & (state.driving | edge) & np.logical_not(wrong)
-    fault = np.where(driving, 0, np.where(state.driving, wrong, state.fault))
+    fault = np.where(driving, 0, np.where(state.driving, wrong, state.latched_fault))
     moving = state.driving & driving  # the tick that arms is still neutral
     m = np.where(moving[..., None], held_back(machine, state, inputs), 0).astype(int)
     counter = (state.counter + 1) % 256
@@ -183,9 +121,9 @@ def gate(
     )  # a lost device or an exception is no release of the switch
     following = GateState(
         driving=driving,
-        spoken=state.spoken | driving,
-        wrong=wrong,
-        fault=fault,
+        armed_once=state.armed_once | driving,
+        active_fault=wrong,
+        latched_fault=fault,
         enable=inputs.enable | (state.enable & ~trusted),
         time=now,
         counter=counter,

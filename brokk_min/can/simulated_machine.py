@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from brokk_min.actuator import plant_reset, plant_step
 from brokk_min.can import canopen as bus
-from brokk_min.can.safety_gate import OPERATIONAL, Array, checksum, encoder_raw
+from brokk_min.can.canopen import OPERATIONAL, Array, checksum, encoder_raw
 from brokk_min.machine import BROKK_170, Machine, decode_pwm
 
 BOOT, STOPPED, PRE_OPERATIONAL = 0, 4, 127  # CANopen states beside OPERATIONAL
@@ -186,7 +186,7 @@ def simulate(
     pose = start_pose(machine, q)
     gc.freeze()  # no long collection while the encoders should answer
     with ExitStack() as stack:
-        line = stack.enter_context(bus.open_line(interface, channel))
+        line = stack.enter_context(bus.open_bus(interface, channel))
         file = stack.enter_context(open(record or os.devnull, "w", buffering=1))
         ended = stack.enter_context(bus.stop_signals())
         start = line.now()

@@ -12,9 +12,10 @@ import tyro
 from brokk_min.actuator import ActuatorNet, select_nets
 from brokk_min.cli.options import Command, Name, WrongUse, check, chosen_policy
 from brokk_min.env import TaskConfig
-from brokk_min.evaluation import baselines, experiments, figures, preliminary, trust
+from brokk_min.evaluation import baselines, experiments, figures, metrics, preliminary, trust
 from brokk_min.evaluation import reproduce as chain
 from brokk_min.evaluation.metrics import summary
+from brokk_min.evaluation.perfect_model import perfect_models
 from brokk_min.evaluation.report import VERDICTS
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.evaluation.sequences import (
@@ -269,11 +270,11 @@ class Evaluate(Command):
         controllers: dict[str, Controller] = {"rl": PolicyController(machine, policy)}
         controllers |= self._baselines(machine, policy.net, gains)
         if self.perfect_model:
-            controllers |= experiments.bounds(machine, starts)
+            controllers |= perfect_models(machine, starts)
         moves = policy.net if self.plant == "net" else None
-        runs, _ = experiments.task_space(machine, controllers, sequences, starts, self.seed, moves)
+        runs, _ = metrics.evaluate(machine, controllers, sequences, starts, self.seed, moves)
         if self.json:
-            meta = experiments.meta(machine, self.seed)
+            meta = metrics.metadata(machine, self.seed)
             meta |= {"policy": str(path), "gains": str(gains or "tuned now"), "plant": self.plant}
             names = ", ".join(sequence.name for sequence in sequences)
             meta |= {
@@ -288,9 +289,8 @@ class Evaluate(Command):
     ) -> Mapping[str, Controller]:
         if gains:
             return baselines.read_gains(gains, machine, net)
-        effort = experiments.Effort()
-        how_much = effort.tuning_runs, effort.generations
-        return baselines.tuned_baselines(machine, net, *how_much, self.seed)[0]
+        runs, generations = baselines.TUNING_RUNS, baselines.GENERATIONS
+        return baselines.tuned_baselines(machine, net, runs, generations, self.seed)[0]
 
 
 def _print_means(runs: list[dict[str, Any]], sequences: int) -> None:
@@ -343,7 +343,7 @@ class Preliminary(Command):
         for name, figure in preliminary.plots(machine, net, self.seed).items():
             figures.save(self.out / f"{name}.png", figure)
             print(self.out / f"{name}.png")
-        meta = experiments.meta(machine, self.seed) | {"actuator": str(self.actuator)}
+        meta = metrics.metadata(machine, self.seed) | {"actuator": str(self.actuator)}
         write_json(self.out / "preliminary.json", {"meta": meta, **numbers})
         print(self.out / "preliminary.json")
         tool = numbers["sim_to_real"]["tool"]["position_error_mean"]

@@ -10,9 +10,9 @@ import numpy as np
 import tyro
 
 from brokk_min import hw
-from brokk_min.can import drive_log as blackbox
+from brokk_min.can import drive_log
 from brokk_min.can import operator_input as wishes
-from brokk_min.can.canopen import open_line, read_frames
+from brokk_min.can.canopen import open_bus, read_frames
 from brokk_min.can.simulated_machine import simulate
 from brokk_min.cli.options import Command, WrongUse, check, chosen_policy
 from brokk_min.evaluation import baselines
@@ -22,8 +22,8 @@ from brokk_min.identification.logs import write_log
 from brokk_min.learning.onnx import export_onnx
 from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import Machine
+from brokk_min.viewer import control_process, play, replay
 from brokk_min.viewer import drawing as view
-from brokk_min.viewer import play, remote, replay
 
 
 @dataclass(kw_only=True)
@@ -74,8 +74,8 @@ class Drive(Command):
         controller = self._controller(machine)
         if self.replay:
             frames = list(read_frames(self.replay))
-            same, sent = blackbox.compare(
-                machine, frames, blackbox.replay(machine, controller, frames)
+            same, sent = drive_log.compare(
+                machine, frames, drive_log.replay(machine, controller, frames)
             )
             print(f"{self.replay}: {same} of {sent} valve frames are the same")
             if same < sent:
@@ -90,7 +90,7 @@ class Drive(Command):
         else:
             sequences = read_commands(Path(self.command), machine)
             operator = wishes.Script(machine, np.concatenate([s.goals for s in sequences]))
-        with open_line(self.interface, self.channel, self.log) as line:
+        with open_bus(self.interface, self.channel, self.log) as line:
             drive = hw.Drive(machine, controller, line, operator)
             drive.begin()
             try:
@@ -109,7 +109,7 @@ class Drive(Command):
                 raise WrongUse(
                     f"--joint: expected one that may be driven, {driven}, got {self.joint}"
                 )
-            return wishes.Jog(machine, self.joint, self.counts)
+            return wishes.JointJog(machine, self.joint, self.counts)
         if not self.policy:
             raise WrongUse("--policy: expected a policy that `train` wrote, got none")
         policy = load_policy(self.policy, machine)
@@ -136,7 +136,7 @@ class Convert(Command):
 
     def run(self) -> None:
         """Write the log."""
-        log = blackbox.driven_log(check(self, self.out), read_frames(self.log))
+        log = drive_log.log_for_fit(check(self, self.out), read_frames(self.log))
         write_log(self.out, log)
         print(f"{self.out}: {len(log.recordings)} recordings of {', '.join(log.joints)}")
 
@@ -178,7 +178,7 @@ class Play(Command):
         machine = check(self, self.attempts, self.log)
         if bool(self.interface) != bool(self.channel) or (self.drive and not self.interface):
             raise WrongUse("--interface, --channel: expected both or, without --drive, none")
-        where = remote.Where(self.interface, self.channel, self.log, self.start)
+        where = control_process.BusOptions(self.interface, self.channel, self.log, self.start)
         if self.interface and not self.drive:
             play.watch(machine, where)
             return

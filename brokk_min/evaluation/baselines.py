@@ -25,6 +25,8 @@ from brokk_min.machine import Array, Machine
 PAPERS = ("jacobian_pid_k0.1", "jacobian_pid_k0.05")  # the paper's two baselines
 STRONGER = ("jacobian_pid_ff",)  # than the paper's: its sentences are put to it, too
 AWAKE = "jacobian_pid_ff_awake"  # the same, its valves never closed: what the policy learns to do
+TUNING_RUNS = 12  # of the whole chain and of `evaluate`, assumed
+GENERATIONS = 45
 SEARCH: dict[str, Any] = {
     "mutation": (0.4, 0.9),
     "tol": 0,

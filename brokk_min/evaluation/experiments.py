@@ -1,23 +1,23 @@
 """The paper's experiment as numbers: the comparison, the bound, robustness, the singular case.
 
-`task_space` runs every controller on the same starts and velocity sequences on the same machine.
+`metrics.evaluate` runs every controller on the same starts and velocity sequences on the same machine.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
-from brokk_min import __version__, actuator, jacobian, kinematics
-from brokk_min.env import TaskConfig
+from brokk_min import jacobian, kinematics
 from brokk_min.evaluation import claims, metrics
-from brokk_min.evaluation.baselines import PAPERS, STRONGER
-from brokk_min.evaluation.figures import Traces
+from brokk_min.evaluation.baselines import GENERATIONS, PAPERS, STRONGER, TUNING_RUNS
 from brokk_min.evaluation.metrics import (
+    Controllers,
+    Rows,
+    Traces,
     by_start,
+    evaluate,
     intervals,
     mean_interval,
     paired,
@@ -25,9 +25,9 @@ from brokk_min.evaluation.metrics import (
     row_mean,
     summary,
 )
-from brokk_min.evaluation.perfect_model import PerfectModel
-from brokk_min.evaluation.robustness import Sensor, exact, supply_demand, variations
-from brokk_min.evaluation.rollout import Controller, Trace, rollout
+from brokk_min.evaluation.perfect_model import perfect_models
+from brokk_min.evaluation.robustness import supply_demand, variations
+from brokk_min.evaluation.rollout import Trace
 from brokk_min.evaluation.sequences import (
     Commands,
     axis_sequences,
@@ -40,10 +40,6 @@ from brokk_min.identification import fitting, logs
 from brokk_min.jacobian import JacobianController
 from brokk_min.machine import Array, Machine
 
-Net = actuator.ActuatorNet
-Controllers = Mapping[str, Controller]  # by name
-Rows = list[dict[str, Any]]  # one a run, see `metrics`
-
 
 @dataclass(frozen=True)
 class Effort:
@@ -52,67 +48,14 @@ class Effort:
     hours: float = 1.0
     fit_steps: int = fitting.FitConfig.steps
     train_steps: int = 6_000_000  # `PPOConfig`'s, without importing torch
-    generations: int = 45
-    tuning_runs: int = 12
+    generations: int = GENERATIONS
+    tuning_runs: int = TUNING_RUNS
     starts: int = 64
     bound_starts: int = 16  # of them, for the regret
     short_s: float = 18.0  # of each axis sequence, for regret, robustness and the singular case [s]
 
 
 QUICK = Effort(0.1, 700, 200_000, 4, 4, 8, 2, 3.0)
-
-
-def task_space(
-    machine: Machine,
-    controllers: Controllers,
-    sequences: Sequence[Commands],
-    starts: Array,
-    seed: int,
-    net: Net | None = None,
-    sensor: Sensor = exact,
-) -> tuple[Rows, Traces]:
-    """Every controller on the same sequences, starts and noise. Paper: Sec. 4.2, Fig. 6
-
-    Sequences of one length and all starts are one batch.
-
-    Returns:
-        One row a controller, sequence and start, see `metrics`; and the traces.
-    """
-    rows: Rows = []
-    traces: dict[tuple[str, str], Trace] = {}
-    num = len(starts)
-    kinds = start_kinds(machine, starts)
-    lengths = dict.fromkeys(len(sequence.goals) for sequence in sequences)
-    groups = [[s for s in sequences if len(s.goals) == length] for length in lengths]
-    for name, group in tqdm(
-        list(product(controllers, groups)), desc="evaluate", unit="batch", disable=None
-    ):
-        goals = np.concatenate([s.of_each(num) for s in group], axis=1)
-        start, rng = np.tile(starts, (len(group), 1)), np.random.default_rng(seed)
-        read = sensor(np.random.default_rng(seed + 1))
-        trace = rollout(machine, controllers[name], start, goals, TaskConfig(), rng, net, read)
-        found = metrics.metrics(
-            machine,
-            trace,
-            goals,
-            kinematics.tool_position(kinematics.forward_kinematics(machine, start)),
-        )
-        for i, s in enumerate(group):
-            mine, label = slice(i * num, (i + 1) * num), {"controller": name, "sequence": s.name}
-            traces[name, s.name] = Trace(*(a[:, mine] for a in trace))
-            rows += _rows(label, kinds, {key: v[mine] for key, v in found.items()})
-    names, order = list(controllers), [s.name for s in sequences]
-    rows.sort(key=lambda row: (names.index(row["controller"]), order.index(row["sequence"])))
-    return rows, traces
-
-
-def _rows(label: Mapping[str, Any], kinds: Sequence[str], found: Mapping[str, Array]) -> Rows:
-    """One row a start of figures (starts,); None where there is none."""
-    plain = {
-        key: [float(v) if np.isfinite(v) else None for v in values] for key, values in found.items()
-    }
-    rows = ({key: values[j] for key, values in plain.items()} for j in range(len(kinds)))
-    return [{**label, "start": j, "kind": kinds[j]} | row for j, row in enumerate(rows)]
 
 
 def robustness(
@@ -130,7 +73,7 @@ def robustness(
     """
     result: dict[str, dict[str, dict[str, Any]]] = {}
     for name, (plant, sensor) in variations(machine).items():
-        runs, traces = task_space(plant, controllers, sequences, starts, seed, sensor=sensor)
+        runs, traces = evaluate(plant, controllers, sequences, starts, seed, sensor=sensor)
         result[name] = {}
         for c in controllers:
             asked = np.array([supply_demand(plant, traces[c, s.name].u) for s in sequences])
@@ -147,18 +90,12 @@ def shortened(machine: Machine, sequences: Sequence[Commands], seconds: float) -
     return [s._replace(goals=s.goals[: round(seconds * machine.rate)]) for s in sequences]
 
 
-def bounds(machine: Machine, starts: Array) -> dict[str, Controller]:
-    """The bound, and the same without its trick: valves that it keeps awake by moving them at rest too."""
-    still = PerfectModel(machine, starts, dither=0.0)
-    return {"perfect_model": PerfectModel(machine, starts), "perfect_model_no_dither": still}
-
-
 def regret(
     machine: Machine, controllers: Controllers, short: Sequence[Commands], starts: Array, seed: int
 ) -> tuple[Rows, dict[str, Any], Traces]:
     """Runs of all controllers and bounds, each one's velocity error less the bound's, and the traces."""
-    every = {**controllers, **bounds(machine, starts)}
-    runs, traces = task_space(machine, every, short, starts, seed)
+    every = {**controllers, **perfect_models(machine, starts)}
+    runs, traces = evaluate(machine, every, short, starts, seed)
     return (
         runs,
         {c: paired(runs, c, "perfect_model", "velocity_error_mean") for c in controllers},
@@ -181,7 +118,7 @@ def comparison(
     sequences = task_sequences(machine)
     starts = scored_starts(machine, effort.starts, sequences, seed + 2)
     kinds = np.array(start_kinds(machine, starts))
-    runs, traces = task_space(machine, controllers, sequences, starts, seed)
+    runs, traces = evaluate(machine, controllers, sequences, starts, seed)
     scored = [run for run in runs if run["kind"] == "workspace"]
     short = shortened(machine, axis_sequences(machine), effort.short_s)
     reachable = starts[kinds == "workspace"]
@@ -258,7 +195,7 @@ def singular_case(
         return {}, {"summary": {}, "claims": []}
     some = claims.singular_controllers(controllers)
     sequences = shortened(machine, least_motion(machine, starts), seconds)
-    runs, traces = task_space(machine, some, sequences, starts, seed)
+    runs, traces = evaluate(machine, some, sequences, starts, seed)
     w0, J, share = (
         jacobian.manipulability_threshold(machine),
         kinematics.jacobian(kinematics.forward_kinematics(machine, starts))[..., machine.driven],
@@ -282,13 +219,3 @@ def driven_log(machine: Machine, traces: Traces, controller: str) -> logs.Log:
             u, q = trace.u[:, i].astype(float), trace.q_measured[:, i].astype(float)
             tapes.append((f"{controller}_{sequence}_{i:02d}", u, q))
     return logs.machine_log(machine, tapes)
-
-
-def meta(machine: Machine, seed: int) -> dict[str, Any]:
-    """What every JSON of ours says of itself."""
-    return {
-        "brokk_min": __version__,
-        "machine": machine.name,
-        "seed": seed,
-        "units": "m, m/s, s, rad",
-    }

@@ -15,7 +15,7 @@ import numpy as np
 from tqdm import tqdm
 
 from brokk_min import actuator, kinematics
-from brokk_min.evaluation.metrics import Mean
+from brokk_min.evaluation.metrics import Mean, Traces
 from brokk_min.evaluation.rollout import Trace
 from brokk_min.evaluation.sequences import AXES, Commands
 from brokk_min.identification import files, logs
@@ -24,8 +24,6 @@ from brokk_min.machine import Array, Machine
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
-
-Traces = Mapping[tuple[str, str], Trace]  # by controller and sequence, starts as one batch
 
 plt.rcParams.update({"font.size": 10, "axes.grid": True, "grid.alpha": 0.3, "axes.axisbelow": True})
 WIDTH = (

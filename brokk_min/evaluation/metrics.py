@@ -2,16 +2,26 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from itertools import product
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
+from tqdm import tqdm
 
-from brokk_min.evaluation.rollout import Trace
-from brokk_min.machine import Array, Machine
+from brokk_min import __version__
+from brokk_min.actuator import ActuatorNet
+from brokk_min.env import Encoder, TaskConfig
+from brokk_min.evaluation.rollout import Controller, Trace, rollout
+from brokk_min.evaluation.sequences import Commands, start_kinds
+from brokk_min.kinematics import forward_kinematics, tool_position
+from brokk_min.machine import Array, Machine, read_encoder
 
 T = TypeVar("T")
+Controllers = Mapping[str, Controller]  # by name
+Traces = Mapping[tuple[str, str], Trace]  # by controller and sequence, starts as one batch
+Rows = list[dict[str, Any]]  # one per run
 Run = Mapping[str, Any]  # controller, sequence, start, kind, then the figures of `metrics`
 Mean = Mapping[str, float | None]  # "mean", and the ends of its interval, "low" and "high", or None
 LABELS = ("controller", "sequence", "start", "kind")
@@ -122,6 +132,82 @@ def _mean(values: Array, where: NDArray[np.bool_]) -> Array:
 def row_mean(values: Array) -> Array:
     """Mean of each row of (rows, n) without its NaN, (rows,); NaN: nothing left."""
     return _mean(np.nan_to_num(values).T, np.isfinite(values).T)
+
+
+# --- runs of all controllers ------------------------------------------------------------------
+
+
+def evaluate(
+    machine: Machine,
+    controllers: Controllers,
+    sequences: Sequence[Commands],
+    starts: Array,
+    seed: int,
+    net: ActuatorNet | None = None,
+    sensor: Callable[[np.random.Generator], Encoder] = lambda rng: read_encoder,
+) -> tuple[Rows, Traces]:
+    """Run every controller on the same sequences, starts and noise. Paper: Sec. 4.2, Fig. 6
+
+    Sequences of one length and all starts are one batch.
+
+    Args:
+        machine: n joints.
+        controllers: by name.
+        sequences: goals of the tool velocity.
+        starts: angles [rad], (starts, n).
+        seed: of the noise, the same for all.
+        net: nets of the driven joints; None: the analytic plant.
+        sensor: makes the encoder of each rollout.
+
+    Returns:
+        One row per controller, sequence and start, see `metrics`; and the traces.
+    """
+    rows: Rows = []
+    traces: dict[tuple[str, str], Trace] = {}
+    lengths = dict.fromkeys(len(sequence.goals) for sequence in sequences)
+    batches = [[s for s in sequences if len(s.goals) == length] for length in lengths]
+    pairs = list(product(controllers, batches))
+    for name, batch in tqdm(pairs, desc="evaluate", unit="batch", disable=None):
+        goals = np.concatenate([s.of_each(len(starts)) for s in batch], axis=1)
+        tiled = np.tile(starts, (len(batch), 1))
+        rng = np.random.default_rng(seed)
+        read = sensor(np.random.default_rng(seed + 1))
+        trace = rollout(machine, controllers[name], tiled, goals, TaskConfig(), rng, net, read)
+        p_start = tool_position(forward_kinematics(machine, tiled))
+        figures = metrics(machine, trace, goals, p_start)
+        for i, sequence in enumerate(batch):
+            part = slice(i * len(starts), (i + 1) * len(starts))
+            traces[name, sequence.name] = Trace(*(array[:, part] for array in trace))
+            of_part = {key: values[part] for key, values in figures.items()}
+            rows += _rows(machine, name, sequence.name, starts, of_part)
+    names = list(controllers)
+    order = [s.name for s in sequences]
+    rows.sort(key=lambda row: (names.index(row["controller"]), order.index(row["sequence"])))
+    return rows, traces
+
+
+def _rows(
+    machine: Machine, controller: str, sequence: str, starts: Array, figures: Mapping[str, Array]
+) -> Rows:
+    """One row per start of figures (starts,); None where there is none."""
+    rows: Rows = []
+    for i, kind in enumerate(start_kinds(machine, starts)):
+        row: dict[str, Any] = {"controller": controller, "sequence": sequence}
+        row |= {"start": i, "kind": kind}
+        for key, values in figures.items():
+            row[key] = float(values[i]) if np.isfinite(values[i]) else None
+        rows.append(row)
+    return rows
+
+
+def metadata(machine: Machine, seed: int) -> dict[str, Any]:
+    """Metadata of every JSON file of results."""
+    return {
+        "brokk_min": __version__,
+        "machine": machine.name,
+        "seed": seed,
+        "units": "m, m/s, s, rad",
+    }
 
 
 # --- over many runs -----------------------------------------------------------------------------------

@@ -144,3 +144,11 @@ def steady_opening(machine: Machine, q: Array, goal: Array) -> Array:
     fastest = (machine.column(name)[driven] for name in ("speed_positive", "speed_negative"))
     opening: Array = speed / np.where(speed > 0, *fastest)
     return opening
+
+
+def perfect_models(machine: Machine, starts: Array) -> dict[str, PerfectModel]:
+    """The bound, and the same without dither: its valves close while the tool is to stand still."""
+    return {
+        "perfect_model": PerfectModel(machine, starts),
+        "perfect_model_no_dither": PerfectModel(machine, starts, dither=0.0),
+    }

@@ -11,8 +11,8 @@ import numpy as np
 
 from brokk_min.actuator import ActuatorNet
 from brokk_min.evaluation import claims, figures, preliminary
-from brokk_min.evaluation.figures import Quote, Traces
-from brokk_min.evaluation.metrics import Mean
+from brokk_min.evaluation.figures import Quote
+from brokk_min.evaluation.metrics import Mean, Traces
 from brokk_min.evaluation.sequences import (
     KINDS,
     axis_sequences,
@@ -42,7 +42,7 @@ TUNED = (
     "gains.json."
 )
 Part = tuple[Any, ...]  # title, sentence, contents: see `figures.write_report`
-BOUNDS = ("perfect_model", "perfect_model_no_dither")  # of `experiments.bounds`
+BOUNDS = ("perfect_model", "perfect_model_no_dither")  # of `perfect_models`
 UNITS = {
     "velocity": "m/s",
     "off": "m",

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from brokk_min.actuator import ActuatorNet
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation import claims, figures, preliminary, report
 from brokk_min.evaluation.baselines import (
@@ -19,9 +20,8 @@ from brokk_min.evaluation.baselines import (
     tuning_set,
     write_gains,
 )
-from brokk_min.evaluation.experiments import Effort, Net, comparison, driven_log, meta, task_space
-from brokk_min.evaluation.figures import Traces
-from brokk_min.evaluation.metrics import summary
+from brokk_min.evaluation.experiments import Effort, comparison, driven_log
+from brokk_min.evaluation.metrics import Traces, evaluate, metadata, summary
 from brokk_min.evaluation.sequences import axis_sequences, held_rows
 from brokk_min.identification import excitation, fitting, logs, net_file
 from brokk_min.identification import validation as scores
@@ -62,7 +62,7 @@ def reproduce(
     with stage("evaluate"):
         rl = PolicyController(machine, policy)
         measured, traces = measure(machine, net, test, rl, tuned, effort, seed)
-    about = meta(machine, seed) | tuned_for(machine, driven) | {"effort": asdict(effort)}
+    about = metadata(machine, seed) | tuned_for(machine, driven) | {"effort": asdict(effort)}
     results = {"meta": about, "paper_recipe": paper, **measured, "gains": plain_gains(tuned)}
     results |= {"tuning": how, "training_seeds": over_seeds}
     with stage("draw"):
@@ -96,7 +96,7 @@ def stages(total: int) -> tuple[dict[str, float], Callable[[str], AbstractContex
 
 def fitted(
     machine: Machine, out: Path, log: logs.Log, test: logs.Log, effort: Effort, seed: int
-) -> tuple[Net, dict[str, Any]]:
+) -> tuple[ActuatorNet, dict[str, Any]]:
     """Nets of all joints, written to `net.npz`, and how those by the paper's recipe fare, for JSON."""
     config = fitting.FitConfig(
         steps=effort.fit_steps, history=machine.history, dead_zone=machine.dead_zone
@@ -109,7 +109,7 @@ def fitted(
 
 def measure(
     machine: Machine,
-    net: Net,
+    net: ActuatorNet,
     test: logs.Log,
     rl: PolicyController,
     tuned: Mapping[str, JacobianController],
@@ -152,7 +152,7 @@ def on_nets(
 ) -> dict[str, dict[str, float | None]]:
     """`summary` of the policy on its own nets, along x, y and z from the workspace starts."""
     starts = np.array(compared["starts"])[np.array(compared["start_kinds"]) == "workspace"]
-    runs, _ = task_space(machine, {"rl": rl}, axis_sequences(machine), starts, seed, rl.policy.net)
+    runs, _ = evaluate(machine, {"rl": rl}, axis_sequences(machine), starts, seed, rl.policy.net)
     return summary(runs)["rl"]
 
 

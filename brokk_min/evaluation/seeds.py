@@ -11,14 +11,13 @@ import numpy as np
 
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import TaskConfig
-from brokk_min.evaluation import experiments
-from brokk_min.evaluation.baselines import read_gains, tuned_for
-from brokk_min.evaluation.metrics import by_start, mean_interval
-from brokk_min.evaluation.rollout import Controller
-from brokk_min.evaluation.sequences import AXES, scored_starts, task_sequences
+from brokk_min.evaluation import metrics
+from brokk_min.evaluation.baselines import gains_metadata, read_gains
+from brokk_min.evaluation.metrics import Controllers, Rows, by_start, mean_interval
+from brokk_min.evaluation.sequences import AXES, evaluation_starts, task_sequences
 from brokk_min.identification.files import expected, write_json
 from brokk_min.learning.policy import Policy, PolicyController
-from brokk_min.learning.sweep import Rows, run_seed, run_seeds
+from brokk_min.learning.sweep import run_seed, run_seeds
 from brokk_min.machine import Array, Machine
 from brokk_min.ppo import PPOConfig
 
@@ -65,7 +64,7 @@ def sweep(
     finished = sorted(results)
     figures = table([results[seed] for seed in finished], baseline_rows)
     rows = [{"seed": seed} | row for seed in finished for row in results[seed]]
-    meta = experiments.meta(machine, min(seeds)) | tuned_for(machine, net)
+    meta = metrics.metadata(machine, min(seeds)) | gains_metadata(machine, net)
     meta |= {"seeds": len(seeds), "failed": failed}
     write_json(out / "sweep.json", {"meta": meta, "table": figures, "runs": rows + baseline_rows})
     if failed:
@@ -78,11 +77,11 @@ def evaluate_policy(machine: Machine, starts: int, policy: Policy) -> Rows:
     return run_scored(machine, {"rl": PolicyController(machine, policy)}, starts)
 
 
-def run_scored(machine: Machine, controllers: Mapping[str, Controller], starts: int) -> Rows:
+def run_scored(machine: Machine, controllers: Controllers, starts: int) -> Rows:
     """The scored sequences and starts of `evaluate --seed 0`: the same for every training seed."""
     sequences = task_sequences(machine)
-    poses = scored_starts(machine, starts, sequences, 2)
-    return experiments.task_space(machine, controllers, sequences, poses, 0)[0]
+    poses = evaluation_starts(machine, starts, sequences, 2)
+    return metrics.evaluate(machine, controllers, sequences, poses, 0)[0]
 
 
 def table(seeds: Sequence[Rows], baselines: Rows) -> Table:
@@ -125,7 +124,7 @@ def read_seeds(path: Path) -> dict[str, Any]:
 
 def seeds_of(machine: Machine, net: ActuatorNet, sweep: Mapping[str, Any]) -> Table:
     """The table of a sweep of `read_seeds`; ValueError: one of another machine or of other nets."""
-    expected_meta = tuned_for(machine, net)
+    expected_meta = gains_metadata(machine, net)
     found = {name: sweep["meta"].get(name) for name in expected_meta}
     if found != expected_meta:
         raise ValueError(f"sweep: expected one with {expected_meta}, got {found}")

@@ -12,16 +12,16 @@ from typing import Any
 import numpy as np
 
 from brokk_min.can import operator_input as wishes
-from brokk_min.can.canopen import open_line
+from brokk_min.can.canopen import open_bus
+from brokk_min.can.drive_log import Telemetry, TelemetryReader, unpack_telemetry
 from brokk_min.can.safety_gate import fault_name
-from brokk_min.can.ticks import Known, Ticks, unpack_known
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
 from brokk_min.viewer import drawing as view
 from brokk_min.viewer import tracing
+from brokk_min.viewer.control_process import Ask, BusOptions, control_process
 from brokk_min.viewer.drawing import TITLES
-from brokk_min.viewer.remote import Ask, Where, control_process
 from brokk_min.viewer.window import Window, open_window
 
 SIZE = (1120, 680)  # of the window [px]
@@ -44,7 +44,7 @@ PAD_AXES = (
 PAD_BUTTON, PAD_MODE, PAD_NEXT, PAD_AGAIN = 5, 3, 0, 1
 
 
-class Hands:
+class InputHandler:
     """Keyboard and gamepad as one operator.
 
     The dead-man switch (space, or the gamepad's button) counts only after it was seen released since the
@@ -182,11 +182,11 @@ class Session:
         self.tracing: tracing.Tracing | None = None
         self.path = np.zeros((0, 3))  # of the last line, m
         self.done: tracing.Attempt | None = None
-        self.before: Known | None = None
-        self.known: Known | None = None
+        self.before: Telemetry | None = None
+        self.known: Telemetry | None = None
         self.arrived, self.trail = 0.0, list[Array]()
 
-    def take(self, known: Known, now: float) -> None:
+    def take(self, known: Telemetry, now: float) -> None:
         """A new tick."""
         self.before, self.known, self.arrived = self.known, known, now
         if not np.isfinite(known.q).all():
@@ -217,7 +217,7 @@ class Session:
         """What is to be seen now; angles between the last two ticks, so that motion looks smooth."""
         known, nan = self.known, np.full(self.machine.n, np.nan)
         if known is None or now - self.arrived > 0.5:
-            known = Known(0, nan, nan, 0 * nan, np.zeros(3), False, 0)
+            known = Telemetry(0, nan, nan, 0 * nan, np.zeros(3), False, 0)
             status, mood = hint or "nothing to be heard", "waiting"
         else:
             status, mood = _status(self.machine, known, hint)
@@ -258,24 +258,24 @@ class Session:
         return lines + tracing.attempts_table(self.attempts, self.task)
 
 
-def _status(machine: Machine, known: Known, hint: str) -> tuple[str, str]:
+def _status(machine: Machine, known: Telemetry, hint: str) -> tuple[str, str]:
     """State of the gate in words, and its mood."""
     if known.driving:
         return "driving", "driving"
-    if known.wrong:
-        return f"waiting: {fault_name(machine, known.wrong)}", "waiting"
-    if known.fault:
-        return f"stopped: {fault_name(machine, known.fault)}", "waiting"
+    if known.active_fault:
+        return f"waiting: {fault_name(machine, known.active_fault)}", "waiting"
+    if known.latched_fault:
+        return f"stopped: {fault_name(machine, known.latched_fault)}", "waiting"
     return hint or "ready", "ready"
 
 
-Watcher = Callable[[Session, Hands], bool]
+Watcher = Callable[[Session, InputHandler], bool]
 
 
 def show(
     window: Window,
     session: Session,
-    hear: Callable[[], Known | None],
+    hear: Callable[[], Telemetry | None],
     tell: Callable[[Ask], object],
     ended: Callable[[], str | None],
     watcher: Watcher = lambda session, hands: True,
@@ -292,7 +292,7 @@ def show(
         watcher: is called at each picture; False closes the window.
     """
     pygame, modes = window.pygame, session.modes or [""]
-    hands, before = Hands(session.machine, pygame, modes), time.monotonic()
+    hands, before = InputHandler(session.machine, pygame, modes), time.monotonic()
     ask = hands.ask(before, 0.0)
     try:
         while not hands.closed and watcher(session, hands):
@@ -315,7 +315,7 @@ def show(
         tell(ask._replace(enable=False, stop=True))
 
 
-def _hint(session: Session, hands: Hands) -> str:
+def _hint(session: Session, hands: InputHandler) -> str:
     """What the operator has to do next."""
     if not session.modes:
         return (
@@ -336,7 +336,7 @@ def _window(machine: Machine) -> AbstractContextManager[Window]:
 
 
 def play(
-    machine: Machine, controllers: Mapping[str, Controller], where: Where, attempts: Path
+    machine: Machine, controllers: Mapping[str, Controller], where: BusOptions, attempts: Path
 ) -> None:
     """Drive with keyboard or gamepad: the simulated machine, or the one on a bus.
 
@@ -351,22 +351,22 @@ def play(
         control_process(machine, chosen, where) as (asks, tells, ended),
     ):
 
-        def hear() -> Known | None:
+        def hear() -> Telemetry | None:
             values = tells.read()
-            return None if values is None else unpack_known(machine, values)
+            return None if values is None else unpack_telemetry(machine, values)
 
         show(window, session, hear, lambda ask: asks.write(np.hstack(ask)), ended)
 
 
-def watch(machine: Machine, where: Where) -> None:
+def watch(machine: Machine, where: BusOptions) -> None:
     """Look at a machine on a bus; nothing is sent."""
-    session, ticks = Session(machine, [], None), Ticks(machine)
-    with _window(machine) as window, open_line(where.interface, where.channel, where.log) as line:
+    session, ticks = Session(machine, [], None), TelemetryReader(machine)
+    with _window(machine) as window, open_bus(where.interface, where.channel, where.log) as line:
 
-        def hear() -> Known | None:
+        def hear() -> Telemetry | None:
             known = None
             while (frame := line.recv(0)) is not None:
-                known = ticks.hear(frame) or known
+                known = ticks.update(frame) or known
             return known
 
         show(window, session, hear, lambda ask: None, lambda: None)

@@ -12,8 +12,8 @@ from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet
 from brokk_min.can.canopen import read_frames
-from brokk_min.can.ticks import Known, Ticks
-from brokk_min.evaluation import baselines, experiments
+from brokk_min.can.drive_log import Telemetry, TelemetryReader
+from brokk_min.evaluation import baselines, metrics
 from brokk_min.evaluation.rollout import Controller, Trace
 from brokk_min.evaluation.sequences import Commands, goals_and_starts, task_sequences
 from brokk_min.identification.files import expected, whole_file
@@ -21,7 +21,7 @@ from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocit
 from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import Array, Machine
 from brokk_min.viewer import drawing as view
-from brokk_min.viewer.looks import skeleton
+from brokk_min.viewer.drawing import skeleton
 from brokk_min.viewer.window import open_window, picture
 
 
@@ -30,7 +30,7 @@ class Run(NamedTuple):
 
     title: str
     colour: view.Colour
-    known: Sequence[Known]
+    known: Sequence[Telemetry]
     p_tool: Array  # m (T, 3)
     error: Array  # |v_goal - v_tool| [m/s] (T,)
     path: Array  # where the tool was to go [m] (K, 3), or none
@@ -38,7 +38,7 @@ class Run(NamedTuple):
 
 
 def recorded(
-    machine: Machine, title: str, colour: view.Colour, known: Sequence[Known], path: Array
+    machine: Machine, title: str, colour: view.Colour, known: Sequence[Telemetry], path: Array
 ) -> Run:
     """A run from its ticks; the velocity error is that of the velocities that it holds."""
     q, q_dot, v_goal = (
@@ -56,9 +56,9 @@ def run_of_log(machine: Machine, path: Path, colour: view.Colour) -> Run:
 
     ValueError: no log, or one in which nothing drives.
     """
-    ticks = Ticks(machine)
+    ticks = TelemetryReader(machine)
     known = [
-        k for frame in read_frames(path) if (k := ticks.hear(frame)) and np.isfinite(k.q).all()
+        k for frame in read_frames(path) if (k := ticks.update(frame)) and np.isfinite(k.q).all()
     ]
     first = next((i for i, k in enumerate(known) if k.driving), None)
     if first is None:
@@ -71,7 +71,7 @@ def run_of_trace(
 ) -> Run:
     """One run of a rollout: true motion, and where the goals (T, 3) lead from the start [m] (3,)."""
     rows = zip(trace.q[:, run], trace.q_dot[:, run], trace.u[:, run], goals, strict=True)
-    known = [Known(i, *row, driving=True) for i, row in enumerate(rows)]
+    known = [Telemetry(i, *row, driving=True) for i, row in enumerate(rows)]
     path = start + np.vstack([np.zeros(3), np.cumsum(goals, axis=0)]) * machine.dt
     colour = next((c for name, c in view.COLOURS.items() if title.startswith(name)), view.STEEL)
     return recorded(machine, title, colour, known, path)
@@ -126,7 +126,7 @@ def driven_again(
         {name: results.controllers[name] for name in controllers},
         [*results.sequences.values()],
     )
-    found, traces = experiments.task_space(
+    found, traces = metrics.evaluate(
         machine, chosen, every, results.starts, results.seed, results.net
     )
     for row in (r for r in found if r["start"] == start and r["sequence"] == sequence):
@@ -212,7 +212,13 @@ def _write_mp4(file: IO[bytes], images: Iterable[Any], size: tuple[int, int], fp
 def _palette(films: Sequence[Image.Image]) -> Image.Image:
     """96 colours of some pictures and of all that warns or measures, however little of it there is."""
     some = [np.asarray(film) for film in films[:: max(1, len(films) // 6)]]
-    named = [*view.COLOURS.values(), *view.MOODS.values(), view.MEASURED, view.PATH, view.WARNING]
+    named = [
+        *view.COLOURS.values(),
+        *view.STATUS_COLOURS.values(),
+        view.MEASURED,
+        view.PATH,
+        view.WARNING,
+    ]
     swatches = np.repeat(np.array(named, np.uint8), 40, axis=0)[:, None].repeat(
         some[0].shape[1], axis=1
     )

@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from brokk_min.can.ticks import Known
+from brokk_min.can.drive_log import Telemetry
 from brokk_min.identification import files
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
-from brokk_min.viewer.looks import extent
+from brokk_min.viewer.drawing import extent
 
 CAPTURE = 0.1  # m, assumed: a point of the line counts as passed nearer than this
 SPACING = 0.05  # m, assumed: between the points that must be passed
@@ -75,7 +75,7 @@ class Tracing:
     begun: float = 0.0  # tick
     seconds: float = 0.0  # since then; by ticks, because a busy window misses some
 
-    def follow(self, known: Known) -> bool:
+    def follow(self, known: Telemetry) -> bool:
         """One tick; True if it was the last."""
         if not self.p and not known.u.any():
             return False

@@ -223,7 +223,7 @@ def plain_gate(
             m[j] = up if wanted > up else down if wanted < down else wanted
             if (m[j] > 0 and q >= joint.q_max - 0.02) or (m[j] < 0 and q <= joint.q_min + 0.02):
                 m[j] = 0
-    fault = 0 if driving else wrong if s.driving else int(s.fault)
+    fault = 0 if driving else wrong if s.driving else int(s.latched_fault)
     trusted = i.alive and not i.error
     enable = bool(i.enable) if trusted else bool(i.enable or s.enable)
     counter = 0 if s.counter == 255 else int(s.counter) + 1
@@ -233,7 +233,7 @@ def plain_gate(
     )
     owed = zip(*(plain_due(machine, s, int(c), j) for j, c in enumerate(i.counts)))
     state = GateState(
-        driving, bool(s.spoken) or driving, wrong, fault, enable, now, counter, *tapes, *owed
+        driving, bool(s.armed_once) or driving, wrong, fault, enable, now, counter, *tapes, *owed
     )
     body = bytes([*((x if x >= 0 else 255 + x) for x in m), counter, int(driving)])
     return state, body[:6] + bytes([bitwise_crc(body)]) + body[6:]
@@ -382,7 +382,7 @@ def test_the_gate_is_what_its_promises_say(machine: Machine, seed: int) -> None:
     agrees(gate_module, machine, given, wanted, (3000,))
     agrees(gate_module, machine, given, wanted, (4, 750))
     agrees(gate_module, machine, given, wanted, (3, 10, 100))
-    seen = {(s.wrong - 1) // 6 for s, _ in wanted if s.wrong}
+    seen = {(s.active_fault - 1) // 6 for s, _ in wanted if s.active_fault}
     assert seen == set(range(len(FAULTS))), "each fault comes up"
     moving = [f for s, f in wanted if s.driving and any(f[:5])]
     assert len(moving) > 300
@@ -397,7 +397,7 @@ def test_one_gate_alone_gives_what_many_give() -> None:
         assert (
             bytes_.tobytes() == frame
             and found.driving == after.driving
-            and found.wrong == after.wrong
+            and found.active_fault == after.active_fault
         )
         assert found.sent.dtype == found.counts.dtype == int
 
@@ -408,14 +408,14 @@ def test_a_gate_starts_silent() -> None:
         assert s.counts.shape == (*shape, 5, 2) and s.sent.shape == (*shape, 5, 8)
         assert (
             not np.any(s.driving)
-            and not np.any(s.spoken)
+            and not np.any(s.armed_once)
             and np.all(s.enable)
-            and np.all(s.wrong == 1)
+            and np.all(s.active_fault == 1)
         )
-        assert np.all(s.time == -np.inf) and not np.any(s.fault) and not np.any(s.counter)
+        assert np.all(s.time == -np.inf) and not np.any(s.latched_fault) and not np.any(s.counter)
         assert not np.any(s.counts) and not np.any(s.sent)
-        assert all(f.shape == shape and f.dtype == bool for f in (s.driving, s.spoken, s.enable))
-        assert all(f.shape == shape and f.dtype == int for f in (s.wrong, s.fault, s.counter))
+        assert all(f.shape == shape and f.dtype == bool for f in (s.driving, s.armed_once, s.enable))
+        assert all(f.shape == shape and f.dtype == int for f in (s.active_fault, s.latched_fault, s.counter))
         assert s.counts.dtype == s.sent.dtype == int
         assert (
             s.pace.shape == s.due.shape == (*shape, 5) and not np.any(s.pace) and not np.any(s.due)
@@ -517,9 +517,9 @@ def sequences(num: int, ticks: int, seed: int) -> dict[str, int]:
         assert not (enabled & latched & ~edge).any(), "latched"
         latched = ~enabled
         assert (frame[:, 5] == (counter + 1) % 256).all(), "counter"
-        assert not (state.spoken & ~before.spoken & ~armed).any(), "silent until armed"
+        assert not (state.armed_once & ~before.armed_once & ~armed).any(), "silent until armed"
         faulted = before.driving & ~enabled & ~sound
-        assert (state.fault[faulted] > 0).all() and (state.fault[enabled] == 0).all()
+        assert (state.latched_fault[faulted] > 0).all() and (state.latched_fault[enabled] == 0).all()
         trusted_enable = np.where(inputs.alive & ~inputs.error, pressed, pressed | trusted_enable)
         counter = frame[:, 5].astype(int)
         found = (

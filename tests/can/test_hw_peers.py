@@ -30,7 +30,7 @@ from brokk_min.__main__ import main
 from brokk_min.can import canopen as bus
 from brokk_min.can import operator_input as wishes
 from brokk_min.can import simulated_machine as simulator
-from brokk_min.can.safety_gate import encoder_raw
+from brokk_min.can.canopen import encoder_raw
 from brokk_min.env import COMPENSATION_RANGE, observation_scale
 from brokk_min.evaluation import baselines
 from brokk_min.identification.logs import read_log
@@ -142,7 +142,7 @@ def test_our_loop_drives_five_canopen_encoders() -> None:
     beat = controller.send_periodic(
         can.Message(arbitration_id=0x710, data=[5], is_extended_id=False), 0.03
     )
-    line = bus.Line(can.Bus("peers", interface="virtual"))
+    line = bus.Bus(can.Bus("peers", interface="virtual"))
     try:
         drive = hw.Drive(BROKK_170, Push(0, 0, 0, 0, 0), line, hand := Hand())
         drive.begin()
@@ -173,7 +173,7 @@ def test_our_loop_drives_five_canopen_encoders() -> None:
 @contextmanager
 def served(channel: str) -> Iterator[simulator.SimulatedMachine]:
     """Our simulated machine in a thread on a virtual bus."""
-    line = bus.Line(can.Bus(channel, interface="virtual"))
+    line = bus.Bus(can.Bus(channel, interface="virtual"))
     machine = simulator.SimulatedMachine(BROKK_170, START, line.now())
     running = [1]
     thread = threading.Thread(target=simulator.serve, args=(machine, line, lambda: bool(running)))
@@ -308,7 +308,7 @@ def own_port(monkeypatch: pytest.MonkeyPatch) -> None:
 def multicast() -> bool:
     """Does this machine route multicast at all?"""
     try:
-        with bus.open_line("udp_multicast", GROUP) as a, bus.open_line("udp_multicast", GROUP) as b:
+        with bus.open_bus("udp_multicast", GROUP) as a, bus.open_bus("udp_multicast", GROUP) as b:
             a.send(0x123, b"")
             return b.recv(1.0) is not None
     except ValueError:
@@ -321,8 +321,8 @@ needs_multicast = pytest.mark.skipif(not multicast(), reason="no multicast route
 @needs_multicast
 def test_a_udp_bus_gives_back_no_echo(tmp_path: Path) -> None:
     with (
-        bus.open_line("udp_multicast", GROUP, tmp_path / "a.log") as a,
-        bus.open_line("udp_multicast", GROUP) as b,
+        bus.open_bus("udp_multicast", GROUP, tmp_path / "a.log") as a,
+        bus.open_bus("udp_multicast", GROUP) as b,
     ):
         a.send(0x5A5, b"\x01")
         first = [a.recv(1.0), b.recv(1.0)]
@@ -338,7 +338,7 @@ def test_a_udp_bus_gives_back_no_echo(tmp_path: Path) -> None:
 def test_no_such_bus_is_one_line() -> None:
     with (
         pytest.raises(ValueError, match=r"socketcan nosuch0: expected a CAN bus, got"),
-        bus.open_line("socketcan", "nosuch0"),
+        bus.open_bus("socketcan", "nosuch0"),
     ):
         pass
 

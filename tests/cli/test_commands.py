@@ -17,12 +17,12 @@ from conftest import Stand
 
 from brokk_min import hw, ppo
 from brokk_min.__main__ import COMMANDS, main
-from brokk_min.can import drive_log as blackbox
+from brokk_min.can import drive_log
 from brokk_min.can import operator_input as wishes
 from brokk_min.can.canopen import Frame
 from brokk_min.cli import commands, operating
 from brokk_min.cli.options import SHIPPED
-from brokk_min.evaluation import baselines, experiments, figures, preliminary, trust
+from brokk_min.evaluation import baselines, figures, metrics, preliminary, trust
 from brokk_min.evaluation.sequences import task_sequences
 from brokk_min.identification.logs import Log, Recording, read_log, write_log
 from brokk_min.jacobian import JacobianController
@@ -31,7 +31,7 @@ from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer import drawing as view
 from brokk_min.viewer import play, replay
-from brokk_min.viewer.remote import Where
+from brokk_min.viewer.control_process import BusOptions
 
 POLICY = SHIPPED / "brokk170" / "policy.npz"
 GAINS = SHIPPED / "brokk170" / "gains.json"
@@ -100,13 +100,13 @@ class Screen(io.StringIO):
 
     def __init__(self, terminal: bool) -> None:
         super().__init__()
-        self.terminal, self.seen = terminal, ""
+        self.terminal, self.measured = terminal, ""
 
     def isatty(self) -> bool:
         return self.terminal
 
     def flush(self) -> None:
-        self.seen = self.getvalue()
+        self.measured = self.getvalue()
 
 
 # --- a machine on a bus -----------------------------------------------------------------------------------
@@ -134,7 +134,7 @@ def test_a_simulated_machine_gets_its_bus_start_and_record(
 @pytest.mark.parametrize(
     ("options", "kind"),
     [
-        ("--controller jog --joint q4 --counts 9", wishes.Jog),
+        ("--controller jog --joint q4 --counts 9", wishes.JointJog),
         (f"--policy '{POLICY}'", PolicyController),
         (f"--policy '{POLICY}' --controller jacobian", JacobianController),
         (f"--policy POLICY --controller jacobian --gains '{GAINS}'", JacobianController),
@@ -147,7 +147,7 @@ def test_a_log_is_compared_with_the_controller_that_is_named(
     options = options.replace("POLICY", str(tmp_path / "policy.npz"))
     frames, log = [Frame(0.0, 0x80, b"")], tmp_path / "run.log"
     calls = stand(operating, read_frames=iter(frames))
-    stand(blackbox, replay="sent", compare=(7, 9))
+    stand(drive_log, replay="sent", compare=(7, 9))
     assert run(f"drive {options} --replay", log) == 1
     machine, controller, tape = calls["replay"]
     assert machine is BROKK_170 and type(controller) is kind and controller.machine is BROKK_170
@@ -156,7 +156,7 @@ def test_a_log_is_compared_with_the_controller_that_is_named(
         and calls["read_frames"] == (log,)
         and calls["compare"] == (BROKK_170, frames, "sent")
     )
-    if isinstance(controller, wishes.Jog):
+    if isinstance(controller, wishes.JointJog):
         assert (controller.joint, controller.counts) == ("q4", 9)
     if isinstance(controller, PolicyController):
         assert controller.policy.net.machine == "brokk170"
@@ -166,7 +166,7 @@ def test_a_log_is_compared_with_the_controller_that_is_named(
     assert said.out == f"{log}: 7 of 9 valve frames are the same\n"
     assert said.err == f"brokk-min: {log}: expected the frames of the log, got 2 others\n"
     stand(operating, read_frames=iter(frames))
-    stand(blackbox, compare=(9, 9))
+    stand(drive_log, compare=(9, 9))
     assert run(f"drive {options} --replay", log) == 0
 
 
@@ -196,7 +196,7 @@ def test_a_drive_gets_bus_log_and_operator_and_says_how_it_ended(
     (tmp_path / "c.csv").write_text(
         "sequence,time,vx,vy,vz\nup,0,0,0,0.1\nup,1,0,0,0\nto,0,0.2,0,0\nto,1,0,0,0\n"
     )
-    calls = stand(operating, open_line=contextlib.nullcontext("the bus"))
+    calls = stand(operating, open_bus=contextlib.nullcontext("the bus"))
     monkeypatch.setattr(hw, "Drive", Drives)
     jog, log = "drive --controller jog --interface socketcan --channel can1", tmp_path / "run.log"
     script = f"{jog} --command {tmp_path / 'c.csv'} --log {log}"
@@ -209,11 +209,11 @@ def test_a_drive_gets_bus_log_and_operator_and_says_how_it_ended(
         assert run(script) == status
         said = capsys.readouterr()
         assert said.out == "driving v wanted +0.10 +0.00 +0.00\n" and said.err == error
-        assert calls["open_line"] == ("socketcan", "can1", log)
+        assert calls["open_bus"] == ("socketcan", "can1", log)
         machine, controller, line, operator = Drives.given
         assert (
             machine is BROKK_170
-            and controller == wishes.Jog(BROKK_170, "q1", 12)
+            and controller == wishes.JointJog(BROKK_170, "q1", 12)
             and line == "the bus"
         )
         assert operator.goals[0].tolist() == [0, 0, 0.1] and operator.goals[20].tolist() == [
@@ -223,7 +223,7 @@ def test_a_drive_gets_bus_log_and_operator_and_says_how_it_ended(
         ]
     stand(wishes, Joystick=SimpleNamespace(done=False))  # it never is, and that is no failure
     assert run(f"{jog} --axes 3 4 5 --button 2") == 0
-    assert calls["Joystick"] == (BROKK_170, (3, 4, 5), 2) and calls["open_line"][2] is None
+    assert calls["Joystick"] == (BROKK_170, (3, 4, 5), 2) and calls["open_bus"][2] is None
     monkeypatch.setenv("COLUMNS", "20")
     told = {True: "\rdriving v wanted +0\033[K", False: "driving v wanted +0.10 +0.00 +0.00\n"}
     for terminal, seen in told.items():
@@ -248,9 +248,9 @@ def test_a_log_of_driving_becomes_one_to_fit_to(
     q = np.cumsum(np.full((20, 2), 0.01), axis=0)
     log = Log(("a", "b"), (Recording("0", 0 * q, q, 0 * q), Recording("1", 0 * q, q, 0 * q)))
     calls = stand(operating, read_frames="frames")
-    stand(blackbox, driven_log=log)
+    stand(drive_log, log_for_fit=log)
     assert run(f"convert {tmp_path / 'run.log'} --out", tmp_path / "log.csv") == 0
-    assert calls == {"read_frames": (tmp_path / "run.log",), "driven_log": (BROKK_170, "frames")}
+    assert calls == {"read_frames": (tmp_path / "run.log",), "log_for_fit": (BROKK_170, "frames")}
     assert len(read_log([tmp_path / "log.csv"], 2).recordings) == 2
     assert capsys.readouterr().out == f"{tmp_path / 'log.csv'}: 2 recordings of a, b\n"
 
@@ -276,7 +276,7 @@ def test_the_game_gets_controllers_bus_and_files(
     calls, log = stand(play, play=None, watch=None), tmp_path / "run.log"
     assert run("play") == 0
     machine, controllers, where, attempts = calls.pop("play")
-    assert machine is BROKK_170 and where == Where() and attempts == Path("attempts.csv")
+    assert machine is BROKK_170 and where == BusOptions() and attempts == Path("attempts.csv")
     assert list(controllers) == ["rl", "jacobian"] and controllers["rl"].machine is BROKK_170
     assert controllers["rl"].policy.net.machine == "brokk170"
     assert controllers["jacobian"].k == 0.1 and (controllers["jacobian"].gains == TUNED.gains).all()
@@ -287,13 +287,13 @@ def test_the_game_gets_controllers_bus_and_files(
         run(f"play --drive {bus} --policy {tmp_path / 'p.npz'} --attempts", tmp_path / "a.csv") == 0
     )
     _, by_hand, where, attempts = calls.pop("play")
-    assert where == Where("socketcan", "can0", log) and attempts == tmp_path / "a.csv"
+    assert where == BusOptions("socketcan", "can0", log) and attempts == tmp_path / "a.csv"
     assert capsys.readouterr().err == "gains of the Jacobian controller: set by hand\n"
     assert by_hand["jacobian"].k == 0.1 and (by_hand["jacobian"].gains != TUNED.gains).any()
     assert run(f"play --policy {tmp_path / 'p.npz'} --gains '{GAINS}'") == 0
     assert (calls.pop("play")[1]["jacobian"].gains == TUNED.gains).all()
     assert run(f"play {bus}") == 0
-    assert calls.pop("watch") == (BROKK_170, Where("socketcan", "can0", log)) and not calls
+    assert calls.pop("watch") == (BROKK_170, BusOptions("socketcan", "can0", log)) and not calls
     assert run("play --start 0 0.5 0.6 1.7 1.2") == 0
     assert calls["play"][2].start == (0.0, 0.5, 0.6, 1.7, 1.2)
 
@@ -523,12 +523,13 @@ def test_an_evaluation_gets_what_is_named_and_says_what_it_took(
         commands, load_policy=SimpleNamespace(net=net), goals_and_starts=(sequences, "poses")
     )
     stand(baselines, read_gains={"pid": "tuned"}, tuned_baselines=({"pid": "tuned now"}, {}))
-    stand(experiments, task_space=(rows, {}), bounds={"bound": "b"})
+    stand(metrics, evaluate=(rows, {}))
+    stand(commands, perfect_models={"bound": "b"})
     assert run(f"evaluate --seed 4 --plant net --commands c.csv --starts s.csv --json {out}") == 0
     assert calls["load_policy"] == (POLICY, BROKK_170)
     assert calls["goals_and_starts"] == (BROKK_170, Path("c.csv"), Path("s.csv"), 16, 4)
     assert calls["read_gains"] == (GAINS, BROKK_170, net) and "tuned_baselines" not in calls
-    machine, controllers, *rest = calls["task_space"]
+    machine, controllers, *rest = calls["evaluate"]
     assert (
         rest == [sequences, "poses", 4, net]
         and machine is BROKK_170
@@ -544,7 +545,7 @@ def test_an_evaluation_gets_what_is_named_and_says_what_it_took(
         "commands": "c.csv",
         "starts": "s.csv",
     }
-    assert written["meta"] == experiments.meta(BROKK_170, 4) | about
+    assert written["meta"] == metrics.metadata(BROKK_170, 4) | about
     said = capsys.readouterr()
     assert said.err == f"gains of the baselines: {GAINS}\n"
     assert said.out.splitlines() == [
@@ -559,14 +560,13 @@ def test_an_evaluation_gets_what_is_named_and_says_what_it_took(
     assert (
         run(f"evaluate --policy {alone} --num-starts 3 --perfect-model --seed 4 --json {out}") == 0
     )
-    effort = experiments.Effort()
-    tuning = (effort.tuning_runs, effort.generations, 4)
-    assert calls["tuned_baselines"] == (BROKK_170, net, *tuning) and calls["bounds"] == (
+    tuning = (baselines.TUNING_RUNS, baselines.GENERATIONS, 4)
+    assert calls["tuned_baselines"] == (BROKK_170, net, *tuning) and calls["perfect_models"] == (
         BROKK_170,
         "poses",
     )
-    assert calls["goals_and_starts"][1:] == (None, None, 3, 4) and calls["task_space"][5] is None
-    controllers = calls["task_space"][1]
+    assert calls["goals_and_starts"][1:] == (None, None, 3, 4) and calls["evaluate"][5] is None
+    controllers = calls["evaluate"][1]
     assert list(controllers) == ["rl", "pid", "bound"] and controllers["pid"] == "tuned now"
     meta = json.loads(out.read_text())["meta"]
     about = {
@@ -576,7 +576,7 @@ def test_an_evaluation_gets_what_is_named_and_says_what_it_took(
         "commands": "up, to",
         "starts": "3",
     }
-    assert meta == experiments.meta(BROKK_170, 4) | about
+    assert meta == metrics.metadata(BROKK_170, 4) | about
     assert capsys.readouterr().err == "gains of the baselines: tuned now\n"
     assert run("evaluate --perfect-model --plant net") == 2
     wanted = (
@@ -584,9 +584,7 @@ def test_an_evaluation_gets_what_is_named_and_says_what_it_took(
     )
     assert capsys.readouterr().err == wanted
     assert run("evaluate --num-starts 3", "--gains", tmp_path / "mine.json") == 0
-    assert (
-        calls["read_gains"][0] == tmp_path / "mine.json" and "bound" not in calls["task_space"][1]
-    )
+    assert calls["read_gains"][0] == tmp_path / "mine.json" and "bound" not in calls["evaluate"][1]
 
 
 def test_preliminary_tests_are_drawn_and_written(
@@ -601,7 +599,7 @@ def test_preliminary_tests_are_drawn_and_written(
     assert calls["load_net"] == (Path("n.npz"),)
     assert calls["run"] == calls["plots"] == (BROKK_170, "nets", 3)
     assert calls["save"] == (out / "creep.png", "figure")
-    meta = experiments.meta(BROKK_170, 3) | {"actuator": "n.npz"}
+    meta = metrics.metadata(BROKK_170, 3) | {"actuator": "n.npz"}
     assert json.loads((out / "preliminary.json").read_text()) == {"meta": meta, **numbers}
     assert capsys.readouterr().out.splitlines()[-3:] == [
         str(out / "creep.png"),

@@ -18,7 +18,7 @@ from helpers_sweep import die_until, refuse
 
 from brokk_min.__main__ import main
 from brokk_min.env import TaskConfig
-from brokk_min.evaluation import baselines, experiments
+from brokk_min.evaluation import baselines, metrics
 from brokk_min.evaluation.metrics import mean_interval
 from brokk_min.evaluation.sequences import Commands, axis_sequences
 from brokk_min.identification.net_file import save_net
@@ -224,7 +224,7 @@ def test_a_seed_goes_on_where_it_was_left_and_its_file_says_what_it_is(
     trained, sequences = SimpleNamespace(), [SimpleNamespace(name="x")]
     calls = stand(module, train=trained, identity_of={"nets": "n"}, task_sequences=sequences)
     stand(module, scored_starts="poses")
-    stand(experiments, task_space=(["run"], {}))
+    stand(metrics, evaluate=(["run"], {}))
     arguments = (BROKK_170, NET, TASK, TINY, 3, tmp_path, 5)
     assert one_seed(*arguments) == ["run"]
     assert calls["train"] == (BROKK_170, NET, TASK, TINY, 3, tmp_path / "seed_3.npz", False)
@@ -235,7 +235,7 @@ def test_a_seed_goes_on_where_it_was_left_and_its_file_says_what_it_is(
         2,
     )  # those of `evaluate`, whatever the seed
     rl = {"rl": PolicyController(BROKK_170, trained)}  # type: ignore[arg-type]
-    assert calls["task_space"] == (BROKK_170, rl, sequences, "poses", 0)
+    assert calls["evaluate"] == (BROKK_170, rl, sequences, "poses", 0)
     identity = {"nets": "n", "starts": 5, "sequences": ["x"]}
     result = tmp_path / "seed_3.json"
     assert json.loads(result.read_text()) == {"identity": identity, "runs": ["run"]}
@@ -277,7 +277,7 @@ def test_a_sweep_has_baselines_beside_and_says_what_it_is_of(
     assert calls["_on_the_machine"] == (BROKK_170, {"pid": "tuned"}, 2)
     written = json.loads((out / "sweep.json").read_text())
     about = (
-        experiments.meta(BROKK_170, 3)
+        metrics.metadata(BROKK_170, 3)
         | baselines.tuned_for(BROKK_170, NET)
         | {"seeds": 2, "failed": {}}
     )

@@ -22,12 +22,12 @@ from helpers_bus import START, Hand, Out, Push, World
 
 from brokk_min import hw
 from brokk_min.can import canopen as bus
-from brokk_min.can import drive_log as blackbox
+from brokk_min.can import drive_log
 from brokk_min.can import operator_input as wishes
 from brokk_min.can.safety_gate import encoder_raw, fault_name, valve_frame
 from brokk_min.env import TaskConfig, action_to_pwm, measured, observation_scale, reward
-from brokk_min.evaluation.experiments import axis_sequences
 from brokk_min.evaluation.rollout import rollout
+from brokk_min.evaluation.sequences import axis_sequences
 from brokk_min.identification.logs import read_log, write_log
 from brokk_min.jacobian import JacobianController, join_gains, manipulability_threshold
 from brokk_min.kinematics import joint_rates, tool_state
@@ -164,7 +164,7 @@ def test_it_is_silent_until_armed_and_moves_a_tick_later() -> None:
     world.downward = lambda can_id, data: (sent.append((can_id, data)), [(can_id, data)])[1]
     world.drive.begin()
     world.run(1.0)
-    assert world.drive.gate.wrong == 0 and not [f for f in sent if f[0] == 0x210]
+    assert world.drive.gate.active_fault == 0 and not [f for f in sent if f[0] == 0x210]
     hand.enable, hand.v = True, (0.0, 0.0, 0.0)
     world.drive.tick()
     world.drive.tick()
@@ -587,8 +587,8 @@ def test_a_fault_is_left_by_a_new_edge_only() -> None:
     assert world.drive.gate.driving and world.drive.reason == ""
     assert world.drive.status().startswith("driving v wanted +0.10 +0.00 +0.00 is ")
     assert world.commands[1][-1].tolist() == list(PUSH)
-    noted, note = list[wishes.Wish](), world.line.note
-    world.line.note = lambda data: (noted.append(wishes.unpack_wish(data)), note(data))[1]  # type: ignore
+    noted, note = list[OperatorInput](), world.line.note
+    world.line.note = lambda data: (noted.append(unpack_operator_input(data)), note(data))[1]  # type: ignore
     hand.act, hand.enable = raises(OSError("gone")), False
     world.run(0.1)
     assert noted[-1].error  # so that a replay of the log gets the same
@@ -666,13 +666,13 @@ def test_nodes_that_fell_back_are_started_once_the_switch_is_released() -> None:
     sent.clear()
     world.simulated.nmt[4] = 127
     world.run(0.4)
-    assert world.drive.reason == "fault: q4: not operational" and world.drive.gate.wrong
+    assert world.drive.reason == "fault: q4: not operational" and world.drive.gate.active_fault
     assert 0x000 not in dict(sent) and {data for can_id, data in sent if can_id == 0x080} == {b""}
     hand.enable = False
     world.run(0.2)
     assert {data for can_id, data in sent if can_id == 0x000} == {
         b"\x01\x00"
-    } and not world.drive.gate.wrong
+    } and not world.drive.gate.active_fault
     sent.clear()
     world.run(0.2)
     assert 0x000 not in dict(sent) and world.drive.status().startswith("ready")
@@ -703,7 +703,7 @@ def test_the_status_by_hand() -> None:
     drive.history = np.full((1, 5, 3, 13), 9.0)
     drive.history[0, :, :2, -1] = np.transpose([[0, 0, 0, np.pi, 3 * np.pi / 4], [0.1, 0, 0, 0, 0]])
     drive.lateness, drive.skipped = 0.5, 7
-    drive.wish = wishes.Wish((0.1, -0.2, 0.25))
+    drive.operator_input = OperatorInput((0.1, -0.2, 0.25))
     said = "waiting v wanted +0.10 -0.20 +0.25 is +0.00 +0.50 +0.00 q +0.00 +0.00 +0.00 +3.14 +2.36"
     assert drive.status().replace("-0.00", "+0.00") == said + " late 500.0 ms, skipped 7"
     world.close()
@@ -793,7 +793,7 @@ class ClockBus:
 
 
 def test_a_wait_does_not_follow_the_time_of_day(monkeypatch: pytest.MonkeyPatch) -> None:
-    line = bus.Line(ClockBus(monkeypatch))
+    line = bus.Bus(ClockBus(monkeypatch))
     begun = time.monotonic()
     assert line.recv(0.02) is None
     assert 0.015 < time.monotonic() - begun < 5.0
@@ -823,7 +823,7 @@ def test_a_wait_sleeps_only_after_the_time_it_is_told_to_be_awake(
     awake: tuple[float, ...], slept: list[float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     silent = SelectBus()
-    line = bus.Line(silent, clock=lambda: silent.t)
+    line = bus.Bus(silent, clock=lambda: silent.t)
     monkeypatch.setattr("brokk_min.can.canopen.select.select", silent.select)
     assert line.recv(0.020, *awake) is None
     assert [wait for wait in silent.waits if wait] == pytest.approx(slept)
@@ -980,7 +980,7 @@ def test_sdo_reads_small_objects_and_skips_foreign_answers() -> None:
 def test_a_line_tells_our_frames_from_others_and_logs_all() -> None:
     here, there = (can.Bus("line", interface="virtual") for _ in range(2))
     text = io.StringIO()
-    line = bus.Line(here, can.CanutilsLogWriter(text), "can0", echo=True, clock=lambda: 1.0)
+    line = bus.Bus(here, can.CanutilsLogWriter(text), "can0", echo=True, clock=lambda: 1.0)
     line.send(0x123, b"\x01\x02")
     there.send(
         can.Message(arbitration_id=0x123, data=b"\x01\x02", is_extended_id=False)
@@ -1004,7 +1004,7 @@ def test_a_line_tells_our_frames_from_others_and_logs_all() -> None:
     assert re.fullmatch(r"\(\d+\.\d{6}\) can0 123#0102 T", lines[0])
     assert re.fullmatch(r"\(\d+\.\d{6}\) can0 123#0102 R", lines[1])
     assert re.fullmatch(r"\(\d+\.\d{6}\) operator 7FF#09 T", lines[-1])
-    plain = bus.Line(
+    plain = bus.Bus(
         here
     )  # of a bus that gives back nothing: what looks like ours is somebody else's
     plain.send(0x123, b"\x01\x02")
@@ -1028,7 +1028,7 @@ def test_a_line_that_is_closed_has_written_all_and_one_without_log_closes(tmp_pa
             self.t = -1.0
 
     for log in (None, can.CanutilsLogWriter(tmp_path / "a.log")):
-        line = bus.Line(here := Quick(), log, "can0", clock=lambda: 1e6 + 0.12345678)
+        line = bus.Bus(here := Quick(), log, "can0", clock=lambda: 1e6 + 0.12345678)
         assert abs(line.now() - time.time()) < 60
         line.start = 0.0
         line.send(0x123, b"\x01")
@@ -1060,40 +1060,40 @@ def drive_logged(path: Path, seconds: float = 4.0) -> World:
 def test_a_recorded_log_replays_to_the_same_bytes(tmp_path: Path) -> None:
     drive_logged(tmp_path / "run.log")
     frames = list(bus.read_frames(tmp_path / "run.log"))
-    again = blackbox.replay(BROKK_170, BASELINE, frames)
+    again = drive_log.replay(BROKK_170, BASELINE, frames)
     sent = [f for f in frames if f.sent and f.channel != "operator"]
     assert [(f.id, f.data) for f in again] == [(f.id, f.data) for f in sent]
     valves = [f.data for f in sent if f.id == 0x210]
     assert len(valves) > 60 and len({v[:5] for v in valves}) > 30
-    assert blackbox.compare(BROKK_170, frames, again) == (len(valves), len(valves))
-    other = blackbox.compare(
-        BROKK_170, frames, blackbox.replay(BROKK_170, Push(0, 0, 0, 0, 0), frames)
+    assert drive_log.compare(BROKK_170, frames, again) == (len(valves), len(valves))
+    other = drive_log.compare(
+        BROKK_170, frames, drive_log.replay(BROKK_170, Push(0, 0, 0, 0, 0), frames)
     )
     assert other[0] < 0.5 * other[1]
     cut = frames[: len(frames) * 2 // 3]  # as after a SIGKILL
-    assert [f.data for f in blackbox.replay(BROKK_170, BASELINE, cut)] == [
+    assert [f.data for f in drive_log.replay(BROKK_170, BASELINE, cut)] == [
         f.data for f in cut if f.sent and f.channel != "operator"
     ]
     with pytest.raises(ValueError, match=r"log: expected \w+ sent at .*, got"):
-        blackbox.replay(BROKK_170, BASELINE, [f for f in frames if f.id != 0x210])
+        drive_log.replay(BROKK_170, BASELINE, [f for f in frames if f.id != 0x210])
 
 
 def test_a_tape_by_hand() -> None:
-    read, wish = bus.Frame(1.1, 0x181, b"\x07"), wishes.Wish((0.1, 0.0, 0.0), enable=True)
+    read, wish = bus.Frame(1.1, 0x181, b"\x07"), OperatorInput((0.1, 0.0, 0.0), enable=True)
     sync, noted = (
         bus.Frame(1.0, 0x080, b"", True),
-        bus.Frame(1.2, bus.WISH, wish.pack(), True, bus.OPERATOR),
+        bus.Frame(1.2, bus.OPERATOR_INPUT, wish.pack(), True, bus.OPERATOR_CHANNEL),
     )
     last = bus.Frame(1.3, 0x182, b"\x08")
-    tape = blackbox.Tape([sync, read, noted, last])
-    assert tape.recv(0.1) is None and tape.wish(True, True) == wish  # SYNC is to be sent first
+    tape = drive_log.ReplayedBus([sync, read, noted, last])
+    assert tape.recv(0.1) is None and tape.operator_input(True, True) == wish  # SYNC is to be sent first
     tape.send(0x080, b"")
     assert tape.sent == [sync] and tape.recv(0.1) is read and tape.recv(0.1) is None
     assert tape.note(b"") == 1.2 and tape.now() == 1.3 and tape.recv(0.1) is last
     assert not tape.more and not tape.wrong and tape.recv(0.1) is None and tape.now() == 1.3
-    assert tape.wish(True, True) == wishes.Wish(stop=True)
+    assert tape.operator_input(True, True) == OperatorInput(stop=True)
     for found in (sync._replace(id=0x210), sync._replace(sent=False)):  # another was sent, or none
-        tape = blackbox.Tape([found, read])
+        tape = drive_log.ReplayedBus([found, read])
         tape.send(0x080, b"")
         assert (
             tape.wrong == f"log: expected 080 sent at 1.000000, got {found.id:03X}"
@@ -1103,7 +1103,7 @@ def test_a_tape_by_hand() -> None:
 
 def test_a_log_of_a_drive_reads_back_as_a_log_of_the_machine(tmp_path: Path) -> None:
     world = drive_logged(tmp_path / "run.log")
-    log = blackbox.driven_log(BROKK_170, bus.read_frames(tmp_path / "run.log"))
+    log = drive_log.log_for_fit(BROKK_170, bus.read_frames(tmp_path / "run.log"))
     assert log.joints == BROKK_170.names and [r.name for r in log.recordings] == [
         "drive_000",
         "drive_001",
@@ -1129,11 +1129,11 @@ def test_a_log_of_a_drive_reads_back_as_a_log_of_the_machine(tmp_path: Path) -> 
     with pytest.raises(
         ValueError, match="expected more than 14 ticks of driving in a row, got none"
     ):
-        blackbox.driven_log(BROKK_170, list(bus.read_frames(tmp_path / "run.log"))[:200])
+        drive_log.log_for_fit(BROKK_170, list(bus.read_frames(tmp_path / "run.log"))[:200])
 
 
 def test_a_log_by_hand_gives_commands_and_angles_tick_by_tick() -> None:
-    """Ticks are missing; a foreign frame and a cut one in each change nothing; 14 ticks are too few."""
+    """TelemetryReader are missing; a foreign frame and a cut one in each change nothing; 14 ticks are too few."""
     machine, frames = replace(BROKK_170, rate=10.0), list[bus.Frame]()
     parts = range(15), range(16, 36), range(37, 51)
     for k in (k for part in parts for k in part):
@@ -1145,7 +1145,7 @@ def test_a_log_by_hand_gives_commands_and_angles_tick_by_tick() -> None:
         frames.append(bus.Frame(t, 0x555, b"\x01" * 8))
         frames.append(bus.Frame(t, 0x210, valve_frame([80, 0, -80, 1, 0], k, 1).tobytes(), True))
         frames.append(bus.Frame(t, 0x210, b"\x01" * 7, True))
-    log = blackbox.driven_log(machine, frames)
+    log = drive_log.log_for_fit(machine, frames)
     assert log.rate == 10 and [len(r.q) for r in log.recordings] == [15, 20]
     for recording, ticks in zip(log.recordings, parts):
         counts = 100 * np.arange(1, 6) + np.array(ticks)[:, None]
@@ -1159,8 +1159,8 @@ def test_a_gap_in_a_log_starts_a_new_recording(tmp_path: Path) -> None:
     frames = list(bus.read_frames(tmp_path / "run.log"))
     middle = frames[0].time + 1.6
     holed = [f for f in frames if not middle < f.time < middle + 0.12]
-    lengths = [len(r.q) for r in blackbox.driven_log(BROKK_170, holed).recordings]
-    whole = [len(r.q) for r in blackbox.driven_log(BROKK_170, frames).recordings]
+    lengths = [len(r.q) for r in drive_log.log_for_fit(BROKK_170, holed).recordings]
+    whole = [len(r.q) for r in drive_log.log_for_fit(BROKK_170, frames).recordings]
     assert len(lengths) == len(whole) + 1 and sum(whole) - 4 <= sum(lengths) < sum(whole)
 
 
@@ -1202,22 +1202,22 @@ def test_a_plain_candump_log_is_read_too(tmp_path: Path) -> None:
 
 def test_wishes_survive_the_log_to_a_tenth_of_a_millimetre() -> None:
     for flags in range(16):
-        wish = wishes.Wish((0.3, -0.12345, 3.2), *(bool(flags & 1 << i) for i in range(4)))
-        assert wishes.unpack_wish(wish.pack()) == wish._replace(v_goal=(0.3, -0.1234, 3.2))
+        wish = OperatorInput((0.3, -0.12345, 3.2), *(bool(flags & 1 << i) for i in range(4)))
+        assert unpack_operator_input(wish.pack()) == wish._replace(v_goal=(0.3, -0.1234, 3.2))
 
 
 def test_a_script_waits_presses_plays_and_ends() -> None:
     script = wishes.Script(BROKK_170, np.array([[0.1, 0, 0], [0, 0.2, 0]]))
-    assert script(False, False) == wishes.Wish() and script(False, True) == wishes.Wish(enable=True)
-    assert script(False, True) == wishes.Wish()  # it did not work: let go, and press again
-    assert script(False, True) == wishes.Wish(enable=True)
-    assert script(True, True) == wishes.Wish((0.1, 0.0, 0.0), enable=True)
+    assert script(False, False) == OperatorInput() and script(False, True) == OperatorInput(enable=True)
+    assert script(False, True) == OperatorInput()  # it did not work: let go, and press again
+    assert script(False, True) == OperatorInput(enable=True)
+    assert script(True, True) == OperatorInput((0.1, 0.0, 0.0), enable=True)
     assert not script.done
-    assert script(True, True) == wishes.Wish((0.0, 0.2, 0.0), enable=True)
+    assert script(True, True) == OperatorInput((0.0, 0.2, 0.0), enable=True)
     assert script.done and script(True, True).stop
     faulted = wishes.Script(BROKK_170, np.array([[0.1, 0, 0], [0, 0.2, 0]]))
     assert faulted(False, True).enable and faulted(True, True).enable  # it does not wait to press
-    assert faulted(False, True) == wishes.Wish(stop=True) and not faulted.done
+    assert faulted(False, True) == OperatorInput(stop=True) and not faulted.done
     never = wishes.Script(BROKK_170, np.zeros((1, 3)), patience_s=0.2)
     assert [never(False, False).stop for _ in range(5)] == [False] * 4 + [True]
     assert not wishes.Script(BROKK_170, np.array([[0.0, 0.0, 0.3]])).done  # no faster than allowed
@@ -1269,7 +1269,7 @@ def test_joystick_through_a_virtual_device() -> None:
         wishes.Joystick(BROKK_170)
     device = Virtual()
     stick = wishes.Joystick(BROKK_170)
-    assert stick(False, False) == wishes.Wish((0.0, 0.0, 0.0))
+    assert stick(False, False) == OperatorInput((0.0, 0.0, 0.0))
     device.button(5, True)
     device.axis(1, -1.0)
     device.axis(0, 0.1)  # within the dead zone
@@ -1287,11 +1287,11 @@ def test_joystick_through_a_virtual_device() -> None:
     assert not stick(True, True).enable
     device.button(5, True)
     device.unplug()
-    assert stick(True, True) == wishes.Wish(alive=False)
-    assert stick(True, True) == wishes.Wish(alive=False)
+    assert stick(True, True) == OperatorInput(alive=False)
+    assert stick(True, True) == OperatorInput(alive=False)
     again = Virtual()
     again.button(5, True)
-    assert stick(False, True) == wishes.Wish((0.0, 0.0, 0.0), enable=True)
+    assert stick(False, True) == OperatorInput((0.0, 0.0, 0.0), enable=True)
     other = Virtual()
     again.axis(1, -1.0)
     assert stick(True, True).v_goal[0] > 0.299  # one more device changes nothing
@@ -1304,7 +1304,7 @@ def test_joystick_through_a_virtual_device() -> None:
     other.unplug()
     assert stick(True, True).alive
     again.unplug()
-    assert stick(True, True) == wishes.Wish(alive=False)
+    assert stick(True, True) == OperatorInput(alive=False)
 
 
 def test_a_joystick_needs_pygame_but_no_window(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -1324,7 +1324,7 @@ def test_a_joystick_needs_pygame_but_no_window(monkeypatch: pytest.MonkeyPatch) 
 
 def test_jog_moves_one_joint_the_way_the_stick_points() -> None:
     hand = Hand()
-    world = World(wishes.Jog(BROKK_170, "q4", 14), hand)
+    world = World(wishes.JointJog(BROKK_170, "q4", 14), hand)
     world.drive.begin()
     world.run(1.5)
     assert world.commands[1][-1].tolist() == [0, 0, 0, 14, 0]
@@ -1387,7 +1387,7 @@ def test_an_error_of_the_program_itself_ends_it_neutral() -> None:
         0x210,
         valve_frame([0] * 5, counter, 0).tobytes(),
     )  # a whole frame, that says so
-    assert fault_name(BROKK_170, int(world.drive.gate.fault)) == "error"
+    assert fault_name(BROKK_170, int(world.drive.gate.latched_fault)) == "error"
     world.rest(0.01)
     assert not world.commands[1][-1].any()
     silent = World(Push(*PUSH), Hand())
@@ -1414,5 +1414,5 @@ def test_more_frames_than_a_bus_can_carry_are_a_fault() -> None:
 
 
 def test_wishes_are_rounded_not_cut() -> None:
-    wish = wishes.unpack_wish(wishes.Wish((0.00019, -0.00019, 0.00011)).pack())
+    wish = unpack_operator_input(OperatorInput((0.00019, -0.00019, 0.00011)).pack())
     assert wish.v_goal == (0.0002, -0.0002, 0.0001)

@@ -11,6 +11,7 @@ import pytest
 from helpers_machines import small_net
 
 from brokk_min import env, jacobian, kinematics, machine, observation
+from brokk_min.can import canopen
 from brokk_min.can import safety_gate as gate
 from brokk_min.evaluation import metrics, sequences
 from brokk_min.machine import BROKK_170
@@ -84,10 +85,10 @@ CALLS: dict[str, Callable[[], Any]] = {
     "reward": lambda: env.reward(V, fixed(np.zeros((4, 3)))),
     "terminated": lambda: env.terminated(M, fixed([-0.1, 0.1])),
     "initial_state": lambda: env.initial_state(M, Q, V32, plant=True),
-    "encoder_counts": lambda: gate.encoder_counts(M, fixed(np.arange(20).reshape(4, 5))),
-    "encoder_raw": lambda: gate.encoder_raw(M, fixed(np.arange(20).reshape(4, 5))),
-    "checksum": lambda: gate.checksum(fixed(np.arange(7))),
-    "valve_frame": lambda: gate.valve_frame(fixed(np.arange(20).reshape(4, 5)), 1, 1),
+    "encoder_counts": lambda: canopen.encoder_counts(M, fixed(np.arange(20).reshape(4, 5))),
+    "encoder_raw": lambda: canopen.encoder_raw(M, fixed(np.arange(20).reshape(4, 5))),
+    "checksum": lambda: canopen.checksum(fixed(np.arange(7))),
+    "valve_frame": lambda: canopen.valve_frame(fixed(np.arange(20).reshape(4, 5)), 1, 1),
     "line_distance": lambda: metrics.line_distance(GOALS, GOALS, V),
     "since_change": lambda: metrics.since_change(M, GOALS),
     "row_mean": lambda: metrics.row_mean(V),

@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks import deviations, limits, peers
 from brokk_min import observation
-from brokk_min.evaluation import experiments
+from brokk_min.evaluation import metrics
 
 
 @pytest.mark.parametrize("learner", list(peers.LEARNERS))
@@ -106,7 +106,7 @@ def test_deviations_train_and_compare_what_they_name(monkeypatch: pytest.MonkeyP
         return [{"velocity_error_mean": 0.1, "off_axis_drift_max": 0.02, "valve_travel": 20.0}], {}
 
     monkeypatch.setattr(deviations, "STEPS", 256 * 32)
-    monkeypatch.setattr(experiments, "task_space", runs)
+    monkeypatch.setattr(metrics, "evaluate", runs)
     monkeypatch.setattr(deviations, "as_it_is", dict)
     found = deviations.a5()
     assert found["base frame, plant, valve_travel"] == 20.0 and len(found) == 6

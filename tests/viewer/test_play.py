@@ -21,26 +21,32 @@ import pygame
 import pytest
 from helpers_bus import START, Push, World
 from PIL import Image
+from test_drawing import boxes_of_words
 from test_hw import BASELINE, Virtual
-from test_view import boxes_of_words
 
 from benchmarks.bus import random_policy
 from brokk_min.__main__ import main
-from brokk_min.can import operator_input as wishes
-from brokk_min.can import ticks
-from brokk_min.can.canopen import OPERATOR, SYNC, TPDO1, WISH, Frame
-from brokk_min.can.safety_gate import encoder_raw
-from brokk_min.can.ticks import Known
+from brokk_min.can import drive_log
+from brokk_min.can.canopen import (
+    OPERATOR_CHANNEL,
+    OPERATOR_INPUT,
+    SYNC,
+    TPDO1,
+    Frame,
+    OperatorInput,
+    encoder_raw,
+)
+from brokk_min.can.drive_log import Telemetry
 from brokk_min.cli.options import machine_from
 from brokk_min.evaluation import baselines
 from brokk_min.evaluation.sequences import feasible
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.learning.policy import save_policy
 from brokk_min.machine import BROKK_170
+from brokk_min.viewer import control_process, play, replay, tracing
 from brokk_min.viewer import drawing as view
-from brokk_min.viewer import looks, play, remote, replay, tracing
-from brokk_min.viewer.play import Hands, Session
-from brokk_min.viewer.remote import Chosen, Levers, Loop, Mailbox, Remote
+from brokk_min.viewer.control_process import Chosen, Levers, Loop, Mailbox, Remote
+from brokk_min.viewer.play import InputHandler, Session
 from brokk_min.viewer.tracing import Attempt, Tracing
 
 MODES = ["rl", "jacobian", "levers"]
@@ -64,26 +70,26 @@ def no_display(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 class Operator:
-    """Presses keys of `Hands` through pygame's queue; time goes on by half a second a look."""
+    """Presses keys of `InputHandler` through pygame's queue; time goes on by half a second a look."""
 
     def __init__(self, modes: list[str] = MODES) -> None:
         pygame.display.set_mode((10, 10))
         pygame.event.clear()
-        self.hands, self.now = Hands(BROKK_170, pygame, modes), 0.0
+        self.hands, self.now = InputHandler(BROKK_170, pygame, modes), 0.0
         self.look()
 
-    def look(self, seconds: float = 0.5) -> remote.Ask:
+    def look(self, seconds: float = 0.5) -> control_process.Ask:
         for event in pygame.event.get():
             self.hands.hear(event)
         self.now += seconds
         return self.hands.ask(self.now, seconds)
 
-    def key(self, name: str, down: bool = True, seconds: float = 0.5) -> remote.Ask:
+    def key(self, name: str, down: bool = True, seconds: float = 0.5) -> control_process.Ask:
         kind = pygame.KEYDOWN if down else pygame.KEYUP
         pygame.event.post(pygame.event.Event(kind, key=pygame.key.key_code(name)))
         return self.look(seconds)
 
-    def event(self, kind: int, **more: Any) -> remote.Ask:
+    def event(self, kind: int, **more: Any) -> control_process.Ask:
         pygame.event.post(pygame.event.Event(kind, **more))
         return self.look()
 
@@ -132,7 +138,7 @@ def test_the_other_way_begins_in_the_middle_and_let_go_is_neutral_at_once() -> N
 
 
 def test_the_first_picture_asks_for_nothing() -> None:
-    ask = Hands(BROKK_170, pygame, MODES).ask(7.0, 0.0)
+    ask = InputHandler(BROKK_170, pygame, MODES).ask(7.0, 0.0)
     assert ask[:5] == (7.0, 0, False, True, False)
     assert ask.v_goal.tolist() == [0] * 3 and ask.levers.tolist() == [0] * 4
 
@@ -252,7 +258,7 @@ def test_a_gamepad_that_comes_needs_a_fresh_press_and_its_triggers_are_no_levers
     device.axis(5, -1.0)
     pygame.display.set_mode((10, 10))
     operator = Operator(["levers"])
-    operator.hands = Hands(machine, pygame, ["levers"])  # it was there before the window
+    operator.hands = InputHandler(machine, pygame, ["levers"])  # it was there before the window
     ask = operator.look()
     assert operator.hands.pad is not None and not ask.levers.any() and not ask.enable
     device.button(play.PAD_BUTTON, False)
@@ -292,8 +298,8 @@ def test_a_mailbox_gives_the_newest_values_or_none() -> None:
 
 def test_what_is_known_survives_the_mailbox() -> None:
     rng = np.random.default_rng(0)
-    known = Known(7, *rng.normal(size=(3, 5)), rng.normal(size=3), True, 3, 4, 2, 0.001)
-    back = ticks.unpack_known(BROKK_170, known.pack())
+    known = Telemetry(7, *rng.normal(size=(3, 5)), rng.normal(size=3), True, 3, 4, 2, 0.001)
+    back = drive_log.unpack_telemetry(BROKK_170, known.pack())
     assert back._replace(q=0, q_dot=0, u=0, v_goal=0) == known._replace(q=0, q_dot=0, u=0, v_goal=0)
     for name in ("q", "q_dot", "u", "v_goal"):
         np.testing.assert_array_equal(getattr(back, name), getattr(known, name))
@@ -301,26 +307,31 @@ def test_what_is_known_survives_the_mailbox() -> None:
 
 def test_ticks_of_a_bus_by_hand() -> None:
     """Angles are known once every encoder spoke; goals count while driving; other frames say nothing."""
-    heard = ticks.Ticks(BROKK_170)
+    heard = drive_log.TelemetryReader(BROKK_170)
     wish, nonsense = (
-        wishes.Wish((0.1, 0.0, -0.2), enable=True).pack(),
+        OperatorInput((0.1, 0.0, -0.2), enable=True).pack(),
         bytes([80, 0, 0, 0, 0, 0, 0, 1]),
     )
-    assert heard.hear(Frame(0.0, WISH, wish, channel=OPERATOR)) is None
-    assert heard.hear(Frame(0.0, WISH, wishes.Wish((0.3, 0.0, 0.0)).pack(), channel="can0")) is None
-    heard.hear(Frame(0.0, BROKK_170.valve_frame_id + 1, nonsense))
-    heard.hear(Frame(0.0, BROKK_170.valve_frame_id, nonsense[:7]))
-    first = heard.hear(Frame(0.0, SYNC, b""))
+    assert heard.update(Frame(0.0, OPERATOR_INPUT, wish, channel=OPERATOR_CHANNEL)) is None
+    assert (
+        heard.update(
+            Frame(0.0, OPERATOR_INPUT, OperatorInput((0.3, 0.0, 0.0)).pack(), channel="can0")
+        )
+        is None
+    )
+    heard.update(Frame(0.0, BROKK_170.valve_frame_id + 1, nonsense))
+    heard.update(Frame(0.0, BROKK_170.valve_frame_id, nonsense[:7]))
+    first = heard.update(Frame(0.0, SYNC, b""))
     assert first is not None and (first.tick, first.driving) == (0, False)
     assert np.isnan(first.q).all() and np.isnan(first.q_dot).all()
     assert not first.u.any() and not first.v_goal.any()
-    heard.hear(Frame(0.05, BROKK_170.valve_frame_id, nonsense))
+    heard.update(Frame(0.05, BROKK_170.valve_frame_id, nonsense))
     for tick, q1 in ((1, 0.0), (2, 0.1)):
         angles = np.array([q1, *START[1:]])
         raw = encoder_raw(BROKK_170, np.rint(angles / BROKK_170.encoder_step).astype(int))
         for joint, count in zip(BROKK_170.joints, raw.tolist(), strict=True):
-            heard.hear(Frame(0.05, TPDO1 + joint.encoder_node, struct.pack("<I", count)))
-        known = heard.hear(Frame(0.05, SYNC, b""))
+            heard.update(Frame(0.05, TPDO1 + joint.encoder_node, struct.pack("<I", count)))
+        known = heard.update(Frame(0.05, SYNC, b""))
         assert known is not None and (known.tick, known.driving) == (tick, True)
         np.testing.assert_allclose(known.q, angles, atol=BROKK_170.encoder_step / 2)
         np.testing.assert_array_equal(known.v_goal, [0.1, 0.0, -0.2])
@@ -353,7 +364,7 @@ class Remoted:
             self.chosen, Remote(self.asks, self.chosen, levers, lambda: self.world.t), log=log
         )
         self.world.drive.__class__ = Loop
-        self.known: list[Known] = []
+        self.known: list[Telemetry] = []
         self.world.drive.tell = self.known.append  # type: ignore[attr-defined]
         self.ask(False)
         self.world.drive.begin()
@@ -396,7 +407,7 @@ def test_a_window_that_hangs_is_a_lost_device() -> None:
     loop.world.run(0.5)
     times, commands = loop.world.commands
     late = times[(commands != 0).any(axis=1)].max() - last
-    assert 0.1 < late <= remote.STALE + 0.06
+    assert 0.1 < late <= control_process.STALE + 0.06
     assert "operator's device lost" in play._status(BROKK_170, loop.known[-1], "")[0]
     loop.go(0.5, True)
     assert not loop.known[-1].driving  # back again, but the switch was never released
@@ -409,15 +420,17 @@ def test_a_window_that_hangs_is_a_lost_device() -> None:
 def test_a_loop_whose_window_died_stops(monkeypatch: pytest.MonkeyPatch) -> None:
     asks, levers = Mailbox(12), Levers(BROKK_170)
     operator = Remote(asks, Chosen([levers]), levers, lambda: 10.0)
-    assert operator(False, True) == play.wishes.Wish(alive=False)  # it has not said anything yet
+    assert operator(False, True) == OperatorInput(alive=False)  # it has not said anything yet
     monkeypatch.setattr(
-        remote.multiprocessing, "parent_process", lambda: SimpleNamespace(is_alive=lambda: False)
+        control_process.multiprocessing,
+        "parent_process",
+        lambda: SimpleNamespace(is_alive=lambda: False),
     )
-    assert operator(True, True) == play.wishes.Wish(alive=False, stop=True)
+    assert operator(True, True) == OperatorInput(alive=False, stop=True)
     asks.write([9.9, 0, 1, 1, 0, 0.1, 0, 0, 0, 0, 0, 0])
-    assert operator(True, True) == play.wishes.Wish((0.1, 0.0, 0.0), enable=True)
+    assert operator(True, True) == OperatorInput((0.1, 0.0, 0.0), enable=True)
     asks.write([10.0, 0, 0, 1, 1, 0, 0, 0, 0, 0, 0, 0])
-    assert operator(True, True) == play.wishes.Wish(stop=True)
+    assert operator(True, True) == OperatorInput(stop=True)
 
 
 def test_the_loops_process_drives_a_machine_of_its_own_until_it_is_told_to_stop(
@@ -426,19 +439,21 @@ def test_the_loops_process_drives_a_machine_of_its_own_until_it_is_told_to_stop(
     """In this process: the window asks to stop at once; what the loop knew of its tick and the log remain."""
     asks, tells, said = Mailbox(12), Mailbox(24), list[str]()
     asks.write([time.monotonic() + 100, 1, 0, 1, 1, 0.1, 0, 0, 0, 0, 0, 0])
-    where = remote.Where(log=tmp_path / "run.log", start=tuple(START))
+    where = control_process.BusOptions(log=tmp_path / "run.log", start=tuple(START))
     modes: list[int] = []
     push = SimpleNamespace(start=modes.append)
-    remote.control(BROKK_170, [push], where, asks, tells)
+    control_process.control(BROKK_170, [push], where, asks, tells)
     told = tells.read()
     assert told is not None and (tmp_path / "run.log").stat().st_size > 0
-    known = ticks.unpack_known(BROKK_170, told)
+    known = drive_log.unpack_telemetry(BROKK_170, told)
     np.testing.assert_allclose(known.q, START, atol=BROKK_170.encoder_step)
     assert known.mode == 1 and not known.driving and known.v_goal.tolist() == [0.1, 0, 0]
     assert not [thread for thread in threading.enumerate() if "serve" in thread.name]
     pipe = SimpleNamespace(send=said.append)
-    remote._control_process(pipe, BROKK_170, [], remote.Where("nonsense", "bus"), asks, tells)
-    remote._control_process(pipe, None, [], where, asks, tells)
+    control_process._control_process(
+        pipe, BROKK_170, [], control_process.BusOptions("nonsense", "bus"), asks, tells
+    )
+    control_process._control_process(pipe, None, [], where, asks, tells)
     assert said[0].startswith("nonsense bus: expected a CAN bus") and said[1].startswith(
         "AttributeError: "
     )
@@ -457,7 +472,7 @@ def test_a_whole_traced_rectangle_is_scored() -> None:
         tracing_.line[0], tool_position(forward_kinematics(BROKK_170, first))
     )
     loop.go(0.2, True)
-    rows: list[Known] = []
+    rows: list[Telemetry] = []
     while not session.attempts and loop.world.t < 60:
         away = tracing_.line[min(tracing_.passed + 2, len(tracing_.line) - 1)] - tool_position(
             forward_kinematics(BROKK_170, loop.known[-1].q)
@@ -473,7 +488,7 @@ def test_a_whole_traced_rectangle_is_scored() -> None:
         tracing_.line[0]
         + 5.0
         * np.array([[0, 0, 0], [0, 0.16, 0], [0.1, 0.16, 0], [0.1, 0, 0]])
-        * looks.extent(BROKK_170).reach
+        * view.extent(BROKK_170).reach
         / 5.0
     )
     fine = np.vstack(
@@ -511,7 +526,7 @@ def test_distance_by_hand() -> None:
 
 def test_lines_to_trace_by_hand() -> None:
     """In shares of the reach: a rectangle of 0.1 by 0.16, a circle of radius 0.06, axes of 0.14."""
-    lines, reach = tracing.task_lines(BROKK_170), looks.extent(BROKK_170).reach
+    lines, reach = tracing.task_lines(BROKK_170), view.extent(BROKK_170).reach
     assert list(lines) == ["rectangle", "circle", "line x", "line y", "line z"]
     square = lines["rectangle"] / reach
     assert np.diff(square, axis=0).any(axis=1).all()
@@ -567,7 +582,7 @@ def test_attempts_are_kept_and_tabled(tmp_path: Path) -> None:
 def test_the_same_line_again_by_another_translator() -> None:
     """Changing who translates begins the line again; before the first opened valve it changes nothing."""
     session = Session(BROKK_170, MODES, None)
-    rest = Known(0, np.array(START), *np.zeros((2, 5)), np.zeros(3), True)
+    rest = Telemetry(0, np.array(START), *np.zeros((2, 5)), np.zeros(3), True)
     session.take(rest, 0.0)
     session.next_task(again=True)
     first = session.tracing
@@ -586,7 +601,7 @@ def test_the_same_line_again_by_another_translator() -> None:
 
 def test_the_tool_stays_in_view_however_far_off_the_line() -> None:
     session = Session(BROKK_170, MODES, None)
-    rest = Known(0, np.array(START), *np.zeros((2, 5)), np.zeros(3), True)
+    rest = Telemetry(0, np.array(START), *np.zeros((2, 5)), np.zeros(3), True)
     session.take(rest, 0.0)
     session.next_task()
     far = np.array([-1.5, *START[1:]])
@@ -604,7 +619,7 @@ def test_what_the_window_says_fits_and_tells_how_it_went(mode: str) -> None:
     for machine in (BROKK_170, MINI_EXCAVATOR):
         session = Session(machine, MODES, None)
         q = (machine.column("q_min") + machine.column("q_max")) / 2
-        session.take(Known(0, q, *np.zeros((2, machine.n)), np.zeros(3), True), 0.0)
+        session.take(Telemetry(0, q, *np.zeros((2, machine.n)), np.zeros(3), True), 0.0)
         session.next_task()
         session.attempts = [
             Attempt("", "rectangle", mode, 123.4, 0.123, 0.456, 123.0) for mode in MODES
@@ -628,9 +643,9 @@ def test_what_is_seen_is_what_was_heard_between_two_ticks_and_not_for_long() -> 
         assert not look.u.any() and look.v_goal.tolist() == [0, 0, 0]
         assert (look.status, look.mood) == (said, "waiting")
     assert look.path.shape == look.trail.shape == (0, 3)
-    session.take(Known(0, q, 0 * q, u, v, True), 1.0)
+    session.take(Telemetry(0, q, 0 * q, u, v, True), 1.0)
     np.testing.assert_array_equal(session.scene(1.02, "rl", "").q, q)
-    session.take(Known(1, q + 0.02, 0 * q + 0.4, u, v, True), 1.05)
+    session.take(Telemetry(1, q + 0.02, 0 * q + 0.4, u, v, True), 1.05)
     for now, share in ((1.05, 0.0), (1.075, 0.5), (1.1, 1.0), (1.54, 1.0)):
         look = session.scene(now, "rl", "")
         np.testing.assert_allclose(look.q, q + share * 0.02)
@@ -682,14 +697,14 @@ def test_what_is_seen_is_what_was_heard_between_two_ticks_and_not_for_long() -> 
     ],
 )
 def test_the_gates_state_is_said(state: dict[str, Any], hint: str, said: str, mood: str) -> None:
-    known = Known(0, np.array(START), *np.zeros((2, 5)), np.zeros(3), False)._replace(**state)
+    known = Telemetry(0, np.array(START), *np.zeros((2, 5)), np.zeros(3), False)._replace(**state)
     assert play._status(BROKK_170, known, hint) == (said, mood)
 
 
 def test_the_operator_is_told_what_to_do_next() -> None:
     session, hands = Session(BROKK_170, MODES, None), Operator().hands
     assert play._hint(session, hands) == "starting"
-    session.known = Known(0, np.array(START), *np.zeros((2, 5)), np.zeros(3), False)
+    session.known = Telemetry(0, np.array(START), *np.zeros((2, 5)), np.zeros(3), False)
     hands.focus, hands.blocked, hands.pad = False, True, None
     assert play._hint(session, hands) == "neutral: the window has no focus"
     hands.focus = True
@@ -711,7 +726,7 @@ def test_notes_tell_keys_task_and_how_it_went(tmp_path: Path) -> None:
     assert session.notes("rl") == ["hold SPACE to drive    arrows: x, y    W/S: up, down", keys]
     levers = "hold SPACE to drive    q/a: q1  w/s: q3  e/d: q4  r/f: q5"
     assert session.notes("levers") == [levers, keys]
-    rest = Known(0, np.array(START), *np.zeros((2, 5)), np.zeros(3), True)
+    rest = Telemetry(0, np.array(START), *np.zeros((2, 5)), np.zeros(3), True)
     session.take(rest, 0.0)
     session.next_task()
     assert session.tracing is not None
@@ -737,14 +752,14 @@ def test_notes_tell_keys_task_and_how_it_went(tmp_path: Path) -> None:
 def test_the_window_asks_hears_and_tells_picture_by_picture(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    told: list[remote.Ask] = []
+    told: list[control_process.Ask] = []
     shown: list[Any] = []
     taken: list[float] = []
     pygame.display.set_mode((10, 10))
     pygame.event.clear()
     window: Any = SimpleNamespace(pygame=pygame, show=lambda *a: shown.append(a))
     session = Session(BROKK_170, MODES, None)
-    rest = Known(0, np.array(START), *np.zeros((2, 5)), np.zeros(3), False)
+    rest = Telemetry(0, np.array(START), *np.zeros((2, 5)), np.zeros(3), False)
     heard = [None, rest, rest, rest._replace(tick=1), rest._replace(tick=2)]
     inner = session.take
     monkeypatch.setattr(
@@ -756,7 +771,7 @@ def test_the_window_asks_hears_and_tells_picture_by_picture(
     presses = [[], [], ["return"], ["return"], ["backspace", "tab"], ["escape"]]
     tasks: list[tuple[str, Any]] = []
 
-    def watcher(seen: Session, hands: Hands) -> bool:
+    def watcher(seen: Session, hands: InputHandler) -> bool:
         assert seen is session
         tasks.append((session.task, session.tracing))
         for name in presses.pop(0):
@@ -790,7 +805,10 @@ def test_a_line_is_done_when_all_its_points_were_passed_in_order() -> None:
         [[0.0, 0, 0], [0, 0.3, 0], [0, 0.6, 0]]
     )
     work = Tracing(BROKK_170, "line", line)
-    rest, open_ = Known(0, np.array(START), *np.zeros((2, 5)), np.zeros(3), True), np.full(5, 0.5)
+    rest, open_ = (
+        Telemetry(0, np.array(START), *np.zeros((2, 5)), np.zeros(3), True),
+        np.full(5, 0.5),
+    )
     assert not work.follow(rest) and not work.p  # the clock waits for the first opened valve
     radius = np.hypot(*tool_position(forward_kinematics(BROKK_170, START))[:2])
     for tick, y, done in (
@@ -815,8 +833,8 @@ def test_the_window_drives_a_machine_in_another_process(tmp_path: Path) -> None:
 
     On a busy computer the gate may refuse or stop for a late tick: then the switch is pressed anew.
     """
-    seen: list[tuple[float, Known]] = []
-    steps: list[tuple[Callable[[Known], bool], int, str]] = [
+    seen: list[tuple[float, Telemetry]] = []
+    steps: list[tuple[Callable[[Telemetry], bool], int, str]] = [
         (lambda k: k.wrong == 0, pygame.KEYDOWN, "space"),
         (lambda k: k.driving, pygame.KEYDOWN, "q"),
         (lambda k: k.q_dot[0] > 0.1, pygame.WINDOWFOCUSLOST, ""),
@@ -829,7 +847,7 @@ def test_the_window_drives_a_machine_in_another_process(tmp_path: Path) -> None:
         more = {"key": pygame.key.key_code(key)} if key else {}
         pygame.event.post(pygame.event.Event(kind, **more))
 
-    def watcher(session: Session, hands: Hands) -> bool:
+    def watcher(session: Session, hands: InputHandler) -> bool:
         nonlocal at, pressed
         now, known = time.monotonic(), session.known
         assert now - start < 60, (known, at)
@@ -849,7 +867,12 @@ def test_the_window_drives_a_machine_in_another_process(tmp_path: Path) -> None:
     inner = play.show
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(play, "show", lambda *a: inner(*a, watcher=watcher))
-        play.play(BROKK_170, {}, remote.Where(log=tmp_path / "run.log"), tmp_path / "attempts.csv")
+        play.play(
+            BROKK_170,
+            {},
+            control_process.BusOptions(log=tmp_path / "run.log"),
+            tmp_path / "attempts.csv",
+        )
     assert at == len(steps)
     assert seen[-1][1].q[0] > 0.01 and not pygame.display.get_init()
     run = replay.run_of_log(BROKK_170, tmp_path / "run.log", (1, 2, 3))
@@ -858,10 +881,12 @@ def test_the_window_drives_a_machine_in_another_process(tmp_path: Path) -> None:
 
 
 def test_other_machines_start_amid_their_ranges() -> None:
-    with remote._simulated(MINI_EXCAVATOR, remote.Where(), lambda: False):
+    with control_process._simulated(MINI_EXCAVATOR, control_process.BusOptions(), lambda: False):
         pass  # it was no ValueError
     with pytest.raises(ValueError, match="start: expected 4 angles"):
-        remote._simulated(MINI_EXCAVATOR, remote.Where(start=START), lambda: False).__enter__()
+        control_process._simulated(
+            MINI_EXCAVATOR, control_process.BusOptions(start=START), lambda: False
+        ).__enter__()
 
 
 def test_nothing_reaches_a_bus_if_there_is_no_window(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -869,19 +894,19 @@ def test_nothing_reaches_a_bus_if_there_is_no_window(monkeypatch: pytest.MonkeyP
     pygame.display.quit()
     monkeypatch.setenv("SDL_VIDEODRIVER", "nonsense")
     monkeypatch.setattr(play, "control_process", lambda *a: begun.append("loop"))
-    monkeypatch.setattr(play, "open_line", lambda *a: begun.append("bus"))
+    monkeypatch.setattr(play, "open_bus", lambda *a: begun.append("bus"))
     for window in (
         lambda w: play.play(BROKK_170, {}, w, Path("none")),
         lambda w: play.watch(BROKK_170, w),
     ):
         with pytest.raises(ValueError, match="window: expected a display"):
-            window(remote.Where("virtual", "empty"))
+            window(control_process.BusOptions("virtual", "empty"))
     assert not begun
 
 
 def test_a_loop_that_cannot_begin_ends_the_window_in_one_line() -> None:
     """Nobody answers on this bus."""
-    where = remote.Where("virtual", "empty")
+    where = control_process.BusOptions("virtual", "empty")
     with pytest.raises(ValueError, match="got node 1: object 0x6501"):
         play.play(BROKK_170, {}, where, Path("attempts.csv"))
 
@@ -891,7 +916,7 @@ def test_watching_sends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     peer = can.Bus("watched", interface="virtual")
     world = World(
         Push(60, 0, 60, 60, 60),
-        lambda driving, ready: play.wishes.Wish((0.1, 0, 0) if driving else (0, 0, 0), ready),
+        lambda driving, ready: OperatorInput((0.1, 0, 0) if driving else (0, 0, 0), ready),
     )
     frames: list[tuple[int, bytes]] = []
     world.upward = world.downward = lambda can_id, data: (
@@ -900,9 +925,9 @@ def test_watching_sends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     world.drive.begin()
     world.run(1.5)
     world.close()
-    shown: list[Known] = []
+    shown: list[Telemetry] = []
 
-    def watcher(session: Session, hands: Hands) -> bool:
+    def watcher(session: Session, hands: InputHandler) -> bool:
         for can_id, data in frames[:40]:
             peer.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
         del frames[:40]
@@ -915,9 +940,11 @@ def test_watching_sends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     inner = play.show
     monkeypatch.setattr(play, "show", lambda *a: inner(*a, watcher=watcher, fps=500.0))
     monkeypatch.setattr(
-        play.Hands, "ask", lambda *a: remote.Ask(0.0, 0, True, True, False, np.ones(3), np.ones(4))
+        play.InputHandler,
+        "ask",
+        lambda *a: control_process.Ask(0.0, 0, True, True, False, np.ones(3), np.ones(4)),
     )
-    play.watch(BROKK_170, remote.Where("virtual", "watched"))
+    play.watch(BROKK_170, control_process.BusOptions("virtual", "watched"))
     assert peer.recv(0.1) is None
     peer.shutdown()
     assert shown[-1].driving and shown[-1].q_dot[0] > 0.05
@@ -1006,7 +1033,7 @@ def test_a_film_is_shown_and_closed(results: Path) -> None:
     run = replay.Run(
         "a",
         (1, 2, 3),
-        [Known(0, np.array(START), *np.zeros((2, 5)), np.zeros(3), True)] * 3,
+        [Telemetry(0, np.array(START), *np.zeros((2, 5)), np.zeros(3), True)] * 3,
         np.zeros((3, 3)),
         np.zeros(3),
         np.zeros((0, 3)),

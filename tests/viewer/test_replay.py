@@ -16,22 +16,22 @@ import pytest
 from conftest import Stand
 from PIL import Image
 
-from brokk_min.can.ticks import Known
-from brokk_min.evaluation import baselines, experiments
+from brokk_min.can.drive_log import Telemetry
+from brokk_min.evaluation import baselines, metrics
 from brokk_min.evaluation.sequences import task_sequences
 from brokk_min.kinematics import tool_state
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer import drawing as view
 from brokk_min.viewer import replay
-from brokk_min.viewer.looks import skeleton
+from brokk_min.viewer.drawing import skeleton
 
 START = np.array([0.0, 0.5, 0.58, 1.71, 1.24])
 
 
-def known(ticks: int) -> list[Known]:
+def known(ticks: int) -> list[Telemetry]:
     """The cabin turns at 0.1 rad/s; asked for is 0.1 m/s aside and 0.05 m/s upward."""
     row = np.array([0.1, 0, 0, 0, 0]), np.full(5, 0.3), np.array([0, 0.1, 0.05])
-    return [Known(k, START + 0.005 * k * np.eye(5)[0], *row, driving=True) for k in range(ticks)]
+    return [Telemetry(k, START + 0.005 * k * np.eye(5)[0], *row, driving=True) for k in range(ticks)]
 
 
 def test_a_run_has_the_tools_way_its_error_and_all_that_must_be_in_the_picture() -> None:
@@ -120,10 +120,10 @@ def test_runs_driven_again_are_those_of_the_file(stand: Stand) -> None:
     results.controllers.update(dict.fromkeys(["more", *chosen], "drives"))  # type: ignore[arg-type]
     traces = {(name, s): trace for name in chosen for s in sequences}
     found = [row(1.0005), row(2.001, "pid"), *(r | {"velocity_rmse": 7.0} for r in other)]
-    calls = stand(experiments, task_space=(found, traces))
+    calls = stand(metrics, evaluate=(found, traces))
     runs = replay.driven_again(BROKK_170, results, chosen, "up", 1)
-    assert calls["task_space"][:2] == (BROKK_170, dict.fromkeys(chosen, "drives"))
-    assert calls["task_space"][2:] == (list(sequences.values()), results.starts, 3, "net")
+    assert calls["evaluate"][:2] == (BROKK_170, dict.fromkeys(chosen, "drives"))
+    assert calls["evaluate"][2:] == (list(sequences.values()), results.starts, 3, "net")
     assert [run.title for run in runs] == chosen
     assert [run.colour for run in runs] == [view.COLOURS["rl"], view.STEEL]
     for run in runs:
@@ -136,7 +136,7 @@ def test_runs_driven_again_are_those_of_the_file(stand: Stand) -> None:
         way = np.array([[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0.2]]) * 0.05
         np.testing.assert_allclose(run.path, tool_state(BROKK_170, START, 0 * START)[0] + way)
     for wrong, told in ((row(1.003), r"\[{.*1\.0}\]"), (row(1.0, "pd"), "none")):
-        stand(experiments, task_space=([wrong], traces))
+        stand(metrics, evaluate=([wrong], traces))
         with pytest.raises(
             ValueError, match=rf"r\.json: expected the run {{.*}}, got {told}: another program"
         ):
@@ -198,7 +198,7 @@ def test_a_gif_runs_for_ever_and_keeps_the_colours_that_warn() -> None:
     """Most of a picture is machine and paper; a red word is a hundred pixels, and not in every picture."""
     rng, wanted = (
         np.random.default_rng(0),
-        [*view.COLOURS.values(), *view.MOODS.values(), view.WARNING],
+        [*view.COLOURS.values(), *view.STATUS_COLOURS.values(), view.WARNING],
     )
     pictures = [rng.integers(0, 256, (60, 80, 3)).astype(np.uint8) for _ in range(3)]
     for k, colour in enumerate([*wanted, view.MEASURED, view.PATH]):

@@ -24,7 +24,7 @@ from brokk_min.kinematics import forward_kinematics, frames, jacobian, tool_posi
 from brokk_min.learning.gym_env import TaskEnv
 from brokk_min.machine import BROKK_170, Machine
 from brokk_min.viewer import drawing as view
-from brokk_min.viewer import looks, window
+from brokk_min.viewer import window
 from brokk_min.viewer.drawing import Circle, Line, Polygon, Scene, Text, draw
 from brokk_min.viewer.window import picture
 
@@ -41,10 +41,10 @@ def words(shapes: list[view.Shape]) -> list[str]:
     return [shape.text for shape in shapes if isinstance(shape, Text)]
 
 
-def eyes(machine: Machine, q: np.ndarray) -> tuple[looks.Camera, looks.Camera]:
+def eyes(machine: Machine, q: np.ndarray) -> tuple[view.Camera, view.Camera]:
     """The cameras of a picture of one arm, which `draw` alone lays out."""
-    seen: list[tuple[looks.Camera, looks.Camera]] = []
-    inner = looks.cameras
+    seen: list[tuple[view.Camera, view.Camera]] = []
+    inner = view.cameras
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(view, "cameras", lambda *a: seen.append(inner(*a)) or seen[-1])
         draw(machine, [scene(q)], SIZE)
@@ -120,10 +120,10 @@ def test_views_of_the_brokk_by_hand() -> None:
 def test_cameras_by_hand() -> None:
     """A view of 400 by 200 px at (10, 20), 14 px of soil: what is held fills 0.92 of 400 or of 172 px."""
     side, top = (10.0, 20.0, 400.0, 200.0), (0.0, 0.0, 100.0, 100.0)
-    reach, p_tool = looks.extent(BROKK_170).reach, np.array([0.0, 3.0, 1.0])
+    reach, p_tool = view.extent(BROKK_170).reach, np.array([0.0, 3.0, 1.0])
     assert 4.5 < reach < 5.0  # of 5 m; drawn poses come near it
     hold = np.array([[0.0, 1.0, 0.5], [0.0, 2.0, 0.75]])
-    one, other = looks.cameras(BROKK_170, p_tool, side, top, hold)
+    one, other = view.cameras(BROKK_170, p_tool, side, top, hold)
     margin = 0.06 * reach
     assert one.scale == pytest.approx(0.92 * min(400 / (1 + 2 * margin), 172 / (0.25 + 2 * margin)))
     middle, low = np.array([0.0, 1.5, 0.0]), np.array([0.0, 1.0, 0.5 - margin])
@@ -132,7 +132,7 @@ def test_cameras_by_hand() -> None:
     )
     assert other.scale == pytest.approx(0.92 * min(100 / (1 + 2 * margin), 86 / (2 * margin)))
     assert other.project(middle)[0] == pytest.approx(50) and other.project([2.0, 0, 0])[1] < 50
-    right = looks._side_axes(np.array([[3.0, 4.0, 1.0], [0.0, 0.0, 2.0], [0.0, -0.5, 0.0]]))
+    right = view._side_axes(np.array([[3.0, 4.0, 1.0], [0.0, 0.0, 2.0], [0.0, -0.5, 0.0]]))
     np.testing.assert_allclose(right[:, 0], [[0.6, 0.8, 0], [1, 0, 0], [0, -1, 0]])
     np.testing.assert_allclose(right[:, 1], [[0, 0, 1]] * 3)
 
@@ -141,7 +141,7 @@ def test_corners_of_an_arm_by_hand() -> None:
     """Two links that turn about z, each 0.2 m above the one before and 1 m long."""
     joints = [replace(j, a=1.0, d=0.2, alpha=0.0, theta=0.0) for j in BROKK_170.joints[:2]]
     arm = replace(BROKK_170, joints=tuple(joints))
-    found = looks.skeleton(arm, np.array([0.0, np.pi / 2]))
+    found = view.skeleton(arm, np.array([0.0, np.pi / 2]))
     wanted = [[0, 0, 0], [0, 0, 0.2], [1, 0, 0.2], [1, 0, 0.4], [1, 1, 0.4]]
     np.testing.assert_allclose(found, wanted, atol=1e-12)
 
@@ -257,7 +257,7 @@ def test_a_limit_and_a_singularity_warn_in_red() -> None:
     np.testing.assert_allclose([ring.points[:-1].mean(axis=0) for ring in rings], tips)
     assert not [s for s in clean if isinstance(s, Line) and s.colour == view.WARNING]
     assert "near a singularity" in words(shapes)
-    value, way = looks.weakest(wide, stretched)
+    value, way = view.weakest(wide, stretched)
     outward = np.array([np.cos(0.3) * np.cos(0.4), np.sin(0.3) * np.cos(0.4), np.sin(0.4)])
     assert value == pytest.approx(0, abs=1e-9) and abs(way @ outward) == pytest.approx(1)
 
@@ -267,7 +267,7 @@ def test_the_weakest_way_bounds_manipulability(seed: int) -> None:
     q = np.random.default_rng(seed).uniform(BROKK_170.column("q_min"), BROKK_170.column("q_max"))
     J, (value, way) = (
         jacobian(forward_kinematics(BROKK_170, q))[..., BROKK_170.driven],
-        looks.weakest(BROKK_170, q),
+        view.weakest(BROKK_170, q),
     )
     assert np.linalg.norm(way @ J) == pytest.approx(value, abs=1e-9)
     singular = np.sqrt(np.maximum(np.linalg.eigvalsh(J @ J.T), 0))
@@ -485,7 +485,7 @@ def listed(shapes: list[view.Shape]) -> list[tuple[object, ...]]:
 def test_the_backdrop_by_hand() -> None:
     """20 px a metre, the origin at (50, 80) of a box of 100 by 100 px: the ground lies 80 px down."""
     flat = np.array([[1.0, 0, 0], [0, 0, 1.0]])
-    camera = looks.Camera(np.array([50.0, 80.0]), 20.0, flat)
+    camera = view.Camera(np.array([50.0, 80.0]), 20.0, flat)
     box = (0.0, 0.0, 100.0, 100.0)
     grid = [("Line", [[x, 1], [x, 100]], list(view.GRID), 1) for x in (10, 30, 50, 70, 90)]
     grid += [("Line", [[0, y], [100, y]], list(view.GRID), 1) for y in (0, 20, 40, 60, 80, 100)]
@@ -516,8 +516,8 @@ def test_an_arm_by_hand() -> None:
     joints = [replace(j, a=1.0, d=0.2, alpha=0.0, theta=0.0) for j in BROKK_170.joints[:2]]
     arm = replace(BROKK_170, joints=tuple(joints))
     side = np.array([[1.0, 0, 0], [0, 0, 1.0]])
-    camera = looks.Camera(np.array([10.0, 90.0]), 100.0, side)
-    thick = 0.032 * looks.extent(arm).reach * 100
+    camera = view.Camera(np.array([10.0, 90.0]), 100.0, side)
+    thick = 0.032 * view.extent(arm).reach * 100
     assert 5 < thick < 7
     s = np.array([*np.linspace(thick, 0.45 * thick, 5)[:4], 0.12 * thick])
     seen = scene(np.zeros(2), colour=(10, 20, 30))
@@ -543,7 +543,7 @@ def test_an_arm_by_hand() -> None:
         assert (inner.radius, inner.colour) == (pytest.approx(0.5 * size), view.PAPER)
         np.testing.assert_allclose([outer.centre, inner.centre], [corners[2 * i]] * 2)
     assert len(links) == 8
-    above = looks.Camera(np.array([10.0, 90.0]), 100.0, looks.ABOVE)
+    above = view.Camera(np.array([10.0, 90.0]), 100.0, view.ABOVE)
     plinth, *flat = view._arm(arm, above, seen, np.zeros(2, bool))
     assert isinstance(plinth, Polygon) and len(flat) == 6  # links along the view are points
     np.testing.assert_allclose(
@@ -616,7 +616,14 @@ def test_where_things_are_on_a_wide_and_on_a_tall_picture(monkeypatch: pytest.Mo
 
     def heading(left: float, width: float) -> list[tuple[object, ...]]:
         title = ("Text", [left + 36, 21], "a title", 18, list(view.INK), 0.0)
-        status = ("Text", [left + width - 16, 21], "going", 14, list(view.MOODS["ready"]), 1.0)
+        status = (
+            "Text",
+            [left + width - 16, 21],
+            "going",
+            14,
+            list(view.STATUS_COLOURS["ready"]),
+            1.0,
+        )
         return [("Circle", [left + 22, 21], 7, [1, 2, 3]), title, status]
 
     def notes(x: float, y: float) -> list[tuple[object, ...]]:

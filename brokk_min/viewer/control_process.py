@@ -16,10 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from brokk_min import hw
-from brokk_min.can import operator_input as wishes
-from brokk_min.can.canopen import open_line
+from brokk_min.can.canopen import OperatorInput, open_bus
+from brokk_min.can.drive_log import Telemetry
 from brokk_min.can.simulated_machine import SimulatedMachine, serve, start_pose
-from brokk_min.can.ticks import Known
 from brokk_min.env import Measured, action_to_pwm
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.machine import PWM_MAX, Array, Machine
@@ -119,42 +118,42 @@ class Remote:
         self.asks, self.chosen, self.levers, self.clock = asks, chosen, levers, clock
         self.ask: Ask | None = None
 
-    def __call__(self, driving: bool, ready: bool) -> wishes.Wish:
+    def __call__(self, driving: bool, ready: bool) -> OperatorInput:
         """The wish of this tick."""
         if (values := self.asks.read()) is not None:
             self.ask = unpack_ask(values)
         ask = self.ask
         if ask is None or self.clock() - ask.time > STALE:
             parent = multiprocessing.parent_process()
-            return wishes.Wish(alive=False, stop=parent is not None and not parent.is_alive())
+            return OperatorInput(alive=False, stop=parent is not None and not parent.is_alive())
         self.chosen.mode, self.levers.levers = ask.mode, ask.levers
         x, y, z = map(float, ask.v_goal)
-        return wishes.Wish((x, y, z), ask.enable, ask.alive, ask.stop)
+        return OperatorInput((x, y, z), ask.enable, ask.alive, ask.stop)
 
 
 class Loop(hw.Drive):
     """The 20 Hz loop, which says after each tick what it knows."""
 
-    tell: Callable[[Known], object] = staticmethod(lambda known: None)
+    tell: Callable[[Telemetry], object] = staticmethod(lambda known: None)
 
     def tick(self) -> bool:
         """One tick."""
         more = super().tick()
-        with self._caught():
+        with self.catch_errors():
             self.tell(self.known())
         return more
 
-    def known(self) -> Known:
+    def known(self) -> Telemetry:
         """What is known after a tick."""
         u, mode = self.gate.sent[..., -1] / PWM_MAX, getattr(self.controller, "mode", 0)
-        gate, v_goal = self.gate, np.array(self.wish.v_goal)
-        state = bool(gate.driving), int(gate.wrong), int(gate.fault)
-        q, q_dot = self.seen
-        return Known(self.ticks, q, q_dot, u, v_goal, *state, mode, self.lateness)
+        gate, v_goal = self.gate, np.array(self.operator_input.v_goal)
+        state = bool(gate.driving), int(gate.active_fault), int(gate.latched_fault)
+        q, q_dot = self.measured
+        return Telemetry(self.ticks, q, q_dot, u, v_goal, *state, mode, self.lateness)
 
 
 @dataclass(frozen=True)
-class Where:
+class BusOptions:
     """The bus; an empty interface is a simulated machine in the loop's own process."""
 
     interface: str = ""
@@ -164,7 +163,11 @@ class Where:
 
 
 def control(
-    machine: Machine, controllers: Sequence[Controller], where: Where, asks: Mailbox, tells: Mailbox
+    machine: Machine,
+    controllers: Sequence[Controller],
+    where: BusOptions,
+    asks: Mailbox,
+    tells: Mailbox,
 ) -> None:
     """Drive until the window says stop; with a simulated machine of its own where there is no bus."""
     levers = Levers(machine)
@@ -172,7 +175,7 @@ def control(
     interface, channel = where.interface or "virtual", where.channel or "brokk_min play"
     running = True
     with (
-        open_line(interface, channel, where.log) as line,
+        open_bus(interface, channel, where.log) as line,
         _simulated(machine, where, lambda: running),
     ):
         try:
@@ -185,13 +188,13 @@ def control(
 
 
 @contextmanager
-def _simulated(machine: Machine, where: Where, running: Callable[[], bool]) -> Iterator[None]:
+def _simulated(machine: Machine, where: BusOptions, running: Callable[[], bool]) -> Iterator[None]:
     """A simulated machine in a thread, if no bus is named."""
     if where.interface:
         yield
         return
     q = start_pose(machine, where.start)
-    with open_line("virtual", "brokk_min play") as line:
+    with open_bus("virtual", "brokk_min play") as line:
         simulated = SimulatedMachine(machine, q, line.now())
         thread = Thread(target=serve, args=(simulated, line, running))
         thread.start()
@@ -213,7 +216,7 @@ def _control_process(errors: Any, *arguments: Any) -> None:
 
 @contextmanager
 def control_process(
-    machine: Machine, controllers: Sequence[Controller], where: Where
+    machine: Machine, controllers: Sequence[Controller], where: BusOptions
 ) -> Iterator[tuple[Mailbox, Mailbox, Callable[[], str | None]]]:
     """The loop in a process of its own: where to ask, where it tells, and why it ended (None: it runs).
 
