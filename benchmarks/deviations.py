@@ -140,7 +140,7 @@ def a11() -> dict[str, float]:
 
 def stand() -> dict[str, float]:
     """Way [m] of the tool from 0.5 s after a stop until valves close; dead zone as told, and less."""
-    starts = sequences.scored_starts(M, 64, sequences.task_sequences(M), 2)
+    starts = sequences.evaluation_starts(M, 64, sequences.task_sequences(M), 2)
     starts = starts[np.array(sequences.start_kinds(M, starts)) == "workspace"]
     policy = PolicyController(M, load_policy(SHIPPED / M.name / "policy.npz", M))
     result = {}
@@ -202,7 +202,7 @@ def trained(
         config = PPOConfig(total_steps=STEPS, critic=critic, threads=1)
         policy = train(M, net, task, config, 0, Path(folder) / "policy.npz")
     axes, controller = sequences.axis_sequences(M), {"rl": PolicyController(M, policy)}
-    starts = sequences.scored_starts(M, 32, sequences.task_sequences(M), 2)
+    starts = sequences.evaluation_starts(M, 32, sequences.task_sequences(M), 2)
     result = {}
     for name, moves in (("nets", net), ("plant", None)):
         runs, _ = metrics.evaluate(M, controller, axes, starts, 0, moves)

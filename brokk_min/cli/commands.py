@@ -290,7 +290,7 @@ class Evaluate(Command):
         if gains:
             return baselines.read_gains(gains, machine, net)
         runs, generations = baselines.TUNING_RUNS, baselines.GENERATIONS
-        return baselines.tuned_baselines(machine, net, runs, generations, self.seed)[0]
+        return baselines.tune_baselines(machine, net, runs, generations, self.seed)[0]
 
 
 def _print_means(runs: list[dict[str, Any]], sequences: int) -> None:

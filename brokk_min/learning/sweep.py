@@ -21,9 +21,9 @@ from tqdm import tqdm
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation import metrics
-from brokk_min.evaluation.baselines import read_gains, tuned_for
+from brokk_min.evaluation.baselines import gains_metadata, read_gains
 from brokk_min.evaluation.metrics import Rows, by_start, mean_interval
-from brokk_min.evaluation.sequences import AXES, scored_starts, task_sequences
+from brokk_min.evaluation.sequences import AXES, evaluation_starts, task_sequences
 from brokk_min.identification.extras import need
 from brokk_min.identification.files import expect_same, expected, write_json
 from brokk_min.learning.checkpoint import describe_training, train_policy
@@ -71,7 +71,7 @@ def _finished(path: Path, identity: Mapping[str, Any]) -> Rows:
 def _on_the_machine(machine: Machine, controllers: Mapping[str, Any], starts: int) -> Rows:
     """The scored sequences and starts of `evaluate --seed 0`: the same whatever seed was trained."""
     sequences = task_sequences(machine)
-    poses = scored_starts(machine, starts, sequences, 2)
+    poses = evaluation_starts(machine, starts, sequences, 2)
     return metrics.evaluate(machine, controllers, sequences, poses, 0)[0]
 
 
@@ -146,7 +146,7 @@ def sweep(
     beside = _on_the_machine(machine, others, starts)
     figures = table([results[seed] for seed in sorted(results)], beside)
     runs = [{"seed": seed} | row for seed in sorted(results) for row in results[seed]]
-    meta = metrics.metadata(machine, min(seeds)) | tuned_for(machine, net)
+    meta = metrics.metadata(machine, min(seeds)) | gains_metadata(machine, net)
     meta |= {"seeds": len(seeds), "failed": failed}
     write_json(out / "sweep.json", {"meta": meta, "table": figures, "runs": runs + beside})
     if failed:
@@ -191,7 +191,7 @@ def seeds_of(
     machine: Machine, net: ActuatorNet, sweep: Mapping[str, Any]
 ) -> dict[str, dict[str, Any]]:
     """The table of a sweep that `read_seeds` read; ValueError: one of another machine or with other nets."""
-    wanted = tuned_for(machine, net)
+    wanted = gains_metadata(machine, net)
     found = {name: sweep["meta"].get(name) for name in wanted}
     if found != wanted:
         raise ValueError(f"sweep: expected one with {wanted}, got {found}")

@@ -522,13 +522,13 @@ def test_an_evaluation_gets_what_is_named_and_says_what_it_took(
     calls = stand(
         commands, load_policy=SimpleNamespace(net=net), goals_and_starts=(sequences, "poses")
     )
-    stand(baselines, read_gains={"pid": "tuned"}, tuned_baselines=({"pid": "tuned now"}, {}))
+    stand(baselines, read_gains={"pid": "tuned"}, tune_baselines=({"pid": "tuned now"}, {}))
     stand(metrics, evaluate=(rows, {}))
     stand(commands, perfect_models={"bound": "b"})
     assert run(f"evaluate --seed 4 --plant net --commands c.csv --starts s.csv --json {out}") == 0
     assert calls["load_policy"] == (POLICY, BROKK_170)
     assert calls["goals_and_starts"] == (BROKK_170, Path("c.csv"), Path("s.csv"), 16, 4)
-    assert calls["read_gains"] == (GAINS, BROKK_170, net) and "tuned_baselines" not in calls
+    assert calls["read_gains"] == (GAINS, BROKK_170, net) and "tune_baselines" not in calls
     machine, controllers, *rest = calls["evaluate"]
     assert (
         rest == [sequences, "poses", 4, net]
@@ -561,7 +561,7 @@ def test_an_evaluation_gets_what_is_named_and_says_what_it_took(
         run(f"evaluate --policy {alone} --num-starts 3 --perfect-model --seed 4 --json {out}") == 0
     )
     tuning = (baselines.TUNING_RUNS, baselines.GENERATIONS, 4)
-    assert calls["tuned_baselines"] == (BROKK_170, net, *tuning) and calls["perfect_models"] == (
+    assert calls["tune_baselines"] == (BROKK_170, net, *tuning) and calls["perfect_models"] == (
         BROKK_170,
         "poses",
     )
