@@ -124,6 +124,7 @@ class Machine:
     ground: float = _number("m")  # height of the ground in the base frame
     valve_frame_id: int = _number("CAN id", 0, 0x7FF)
     controller_node: int = _number("CANopen node id", 1, 127)  # of the valve controller
+    q_start: tuple[float, ...] = ()  # rad, where experiments start; empty: the middle of the ranges
 
     def __post_init__(self) -> None:
         """Refuse what cannot be a machine, naming field, wanted and got."""
@@ -375,6 +376,7 @@ def _brokk_170() -> Machine:
         ground=0.0,
         valve_frame_id=0x210,
         controller_node=0x10,
+        q_start=(1.5, 0.5, 0.58, 1.71, 1.24),  # paper: q_s
     )
 
 

@@ -1,59 +1,131 @@
-"""README is true: counts and examples. PAPER.md has test_paper.py."""
+"""README and pages are true: examples run, commands exist, links resolve, tables count right.
+
+`python tests/paper/test_docs.py` writes the line counts of the README. PAPER.md has test_paper.py.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import doctest
+import io
 import re
 import shlex
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from gymnasium.spaces import Box
 
 from brokk_min.__main__ import COMMANDS, main
+from brokk_min.learning.gym_env import TaskVectorEnv
 
 ROOT = Path(__file__).parents[2]
-README = (ROOT / "README.md").read_text()
+README = ROOT / "README.md"
+PAGES = [README, ROOT / "PAPER.md", *sorted((ROOT / "docs").glob("*.md"))]
+NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
+METHOD = ["__init__", "machine", "kinematics", "actuator", "env", "ppo", "jacobian", "hw"]
+ROW = re.compile(r"^\| \[`(\w+)\.py`\]\(brokk_min/\1\.py\) \| (\d+) \|", re.M)
 
 
-def test_the_module_table_counts_the_lines_of_every_module() -> None:
-    table = dict(re.findall(r"^\| `(\w+)\.py` \| (\d+) \|", README, re.M))
-    modules = {
-        p.stem: str(len(p.read_text().splitlines())) for p in (ROOT / "brokk_min").glob("*.py")
-    }
-    assert table == modules
+def line_counts() -> list[tuple[str, str]]:
+    """The files of the method in the order in which they are read, with their lines."""
+    texts = [(ROOT / "brokk_min" / f"{name}.py").read_text() for name in METHOD]
+    return [(name, str(text.count("\n"))) for name, text in zip(METHOD, texts, strict=True)]
 
 
-def test_readme_examples_run() -> None:
-    failed, run = doctest.testfile(str(ROOT / "README.md"), module_relative=False)
-    assert run >= 4 and failed == 0
+def test_readme__lists_the_files_of_the_method_with_their_lines() -> None:
+    assert ROW.findall(README.read_text()) == line_counts(), "run `python tests/paper/test_docs.py`"
 
 
-def test_the_benchmark_of_rollouts_runs() -> None:
-    command = [sys.executable, "-m", "benchmarks.rollout", "--num-envs", "4", "--ticks", "2"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0 and "steps" in done.stdout, done.stderr
+def test_readme__lists_the_wings() -> None:
+    wings = {path.parent.name for path in (ROOT / "brokk_min").glob("*/__init__.py")}
+    assert set(re.findall(r"^- `(\w+)/`: ", README.read_text(), re.M)) == wings
 
 
-PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+def test_readme__is_short() -> None:
+    assert len(README.read_text().splitlines()) <= 130
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_pages__have_lines_of_at_most_100_columns(name: str) -> None:
+    """Tables and definitions of links may be wider."""
+    lines = (ROOT / name).read_text().splitlines()
+    wide = [line for line in lines if len(line) > 100 and not re.match(r"\||\[.*\]: ", line)]
+    assert not wide
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_links__resolve(name: str) -> None:
+    page = ROOT / name
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.M | re.S)
+    targets = re.findall(r"\]\(([^)#\s]+)[^)]*\)", text)
+    targets += re.findall(r"^\[[^]]+\]: ([^#\s]+)", text, re.M)
+    missing = [t for t in targets if "://" not in t and not (page.parent / t).exists()]
+    assert not missing
+
+
+def test_readme__examples_run() -> None:
+    failed, run = doctest.testfile(str(README), module_relative=False)
+    assert run >= 10
+    assert failed == 0
+
+
+def test_readme__has_the_sizes_of_observation_and_action() -> None:
+    rows = re.findall(r"^\| ?(\w*) \| .* \| ([\dx ]+) \|$", README.read_text(), re.M)
+    sizes = [(name, int(np.prod([int(n) for n in text.split("x")]))) for name, text in rows]
+    env = TaskVectorEnv(1)
+    observation, action = env.single_observation_space, env.single_action_space
+    assert isinstance(observation, Box)
+    assert isinstance(action, Box)
+    assert sum(size for name, size in sizes if name in ("observation", "")) == observation.shape[0]
+    assert [size for name, size in sizes if name == "action"] == [action.shape[0]]
+
+
+# --- commands -------------------------------------------------------------------------------------
+
 LINE = re.compile(r"^ *brokk-min (.*?)(?: {2,}#.*)?$", re.M)
-LINES = {line for page in PAGES for line in LINE.findall(page.read_text())}
+LINES = sorted({line for page in PAGES for line in LINE.findall(page.read_text())})
 
 
-@pytest.mark.parametrize("line", sorted(LINES))
-def test_every_command_line_of_the_documents_is_one(
-    line: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its options are read; what the commands do has tests of its own (`test_cli.py`, `test_porting.py`)."""
-    words, ran = shlex.split(line), []
+@pytest.mark.parametrize("line", LINES)
+def test_command_lines__are_understood(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their options are read; what the commands do has tests of its own."""
+    words = shlex.split(line)
+    ran: list[object] = []
     command = COMMANDS[words[0]]()
     monkeypatch.setattr(command, "run", lambda self: ran.append(self))
     monkeypatch.setitem(COMMANDS, words[0], lambda: command)
-    assert main(words) == 0 and len(ran) == 1
+    assert main(words) == 0
+    assert len(ran) == 1
 
 
-def test_make_knows_the_targets_of_the_readme() -> None:
-    for target in sorted(set(re.findall(r"^make (\w+)", README, re.M))):
+OPTION = re.compile(rf"`(?:brokk-min )?({'|'.join(COMMANDS)}) (--[\w-]+)")
+OPTIONS = sorted({option for page in PAGES for option in OPTION.findall(page.read_text())})
+
+
+@pytest.mark.parametrize(("command", "option"), OPTIONS)
+def test_options_in_the_text__exist(command: str, option: str) -> None:
+    with contextlib.redirect_stdout(io.StringIO()) as printed, pytest.raises(SystemExit):
+        main([command, "--help"])
+    assert re.search(rf"{option}\b", printed.getvalue())
+
+
+def test_make__has_the_targets_of_the_readme() -> None:
+    targets = set(re.findall(r"`make (\w+)", README.read_text()))
+    assert len(targets) == 2
+    for target in targets:
         done = subprocess.run(["make", "-n", target], cwd=ROOT, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
+
+
+def write() -> None:
+    """Put the line counts into the table of the README."""
+    counts = dict(line_counts())
+    text = ROW.sub(lambda m: m[0].replace(f"| {m[2]} |", f"| {counts[m[1]]} |"), README.read_text())
+    README.write_text(text)
+
+
+if __name__ == "__main__":
+    sys.exit(write())
