@@ -20,7 +20,7 @@ class StaticMap:
     velocity: Array  # [rad/s], rising with the command, (n_driven, angles, commands)
 
     def command(self, q: Array, q_dot: Array) -> Array:
-        """Commands that keep driven joints moving at `q_dot` [rad/s] at `q` [rad], (..., n_driven)."""
+        """Commands that keep driven joints at `q` [rad] moving at `q_dot` [rad/s], (..., n)."""
         # velocity over command at the angle q, interpolated between the angles i and i + 1
         joint = np.arange(len(self.q))
         position = (q - self.q[:, 0]) / (self.q[:, 1] - self.q[:, 0])
