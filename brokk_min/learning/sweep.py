@@ -24,8 +24,7 @@ from brokk_min.evaluation import metrics
 from brokk_min.evaluation.baselines import gains_metadata, read_gains
 from brokk_min.evaluation.metrics import Rows, by_start, mean_interval
 from brokk_min.evaluation.sequences import AXES, evaluation_starts, task_sequences
-from brokk_min.identification.extras import need
-from brokk_min.identification.files import expect_same, expected, write_json
+from brokk_min.identification.files import expect_same, expected, require, write_json
 from brokk_min.learning.checkpoint import describe_training, train_policy
 from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import Array, Machine
@@ -98,7 +97,7 @@ def workers(scheduler: str | None) -> Iterator[Submit]:
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             yield lambda function, *arguments: pool.submit(apart, function, *arguments)
         return
-    with need("distributed", "sweep").Client(
+    with require("distributed", "sweep").Client(
         scheduler, timeout=10
     ) as client:  # dask itself runs again what a dead worker had
         threads = {worker["nthreads"] for worker in client.scheduler_info(-1)["workers"].values()}

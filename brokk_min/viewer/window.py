@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brokk_min.identification.extras import need
+from brokk_min.identification.files import require
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
 from brokk_min.viewer.drawing import (
@@ -30,7 +30,7 @@ from brokk_min.viewer.drawing import (
 def need_pygame() -> Any:
     """pygame, which is imported only where something is painted; ValueError: it is not installed."""
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    return need("pygame", "play")
+    return require("pygame", "play")
 
 
 @lru_cache(maxsize=1024)
