@@ -21,9 +21,9 @@ import numpy as np
 from brokk_min import actuator, env, jacobian, kinematics, machine, observation
 from brokk_min.cli.options import SHIPPED
 from brokk_min.env import TaskConfig, terminated
-from brokk_min.evaluation import metrics, sequences, trust
+from brokk_min.evaluation import metrics, sequences
 from brokk_min.evaluation.rollout import rollout
-from brokk_min.identification import excitation, fitting, logs
+from brokk_min.identification import excitation, fitting, logs, validation
 from brokk_min.jacobian import JacobianController
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import STAND, PolicyController, load_policy
@@ -140,7 +140,7 @@ def a11() -> dict[str, float]:
 
 def stand() -> dict[str, float]:
     """Way [m] of the tool from 0.5 s after a stop until valves close; dead zone as told, and less."""
-    starts = sequences.scored_starts(M, 64, sequences.task_sequences(M), 2)
+    starts = sequences.evaluation_starts(M, 64, sequences.task_sequences(M), 2)
     starts = starts[np.array(sequences.start_kinds(M, starts)) == "workspace"]
     policy = PolicyController(M, load_policy(SHIPPED / M.name / "policy.npz", M))
     result = {}
@@ -179,7 +179,7 @@ def fitted(kind: str, noise: float, seed: int) -> dict[str, float]:
     """Nets of the driven joints, on drives like a policy's: the worst joint."""
     net, log = nets(kind, seed, noise=noise)
     test = excitation.task_log(M, 20, 40.0, np.random.default_rng(seed + 1))
-    verdict = trust.judge(net, log, test, M)
+    verdict = validation.validate(net, log, test, M)
     rows = [verdict["joints"][M.names[i]] for i in M.driven]
     return {
         "10 s [rad/s]": max(row["free_run"]["10"]["velocity_rmse"] for row in rows),
@@ -202,7 +202,7 @@ def trained(
         config = PPOConfig(total_steps=STEPS, critic=critic, threads=1)
         policy = train(M, net, task, config, 0, Path(folder) / "policy.npz")
     axes, controller = sequences.axis_sequences(M), {"rl": PolicyController(M, policy)}
-    starts = sequences.scored_starts(M, 32, sequences.task_sequences(M), 2)
+    starts = sequences.evaluation_starts(M, 32, sequences.task_sequences(M), 2)
     result = {}
     for name, moves in (("nets", net), ("plant", None)):
         runs, _ = metrics.evaluate(M, controller, axes, starts, 0, moves)

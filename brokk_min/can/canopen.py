@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brokk_min.identification.extras import need
-from brokk_min.identification.files import expected
+from brokk_min.identification.files import expected, require
 from brokk_min.machine import PWM_MAX, Machine, encode_pwm
 
 Array = NDArray[Any]  # counts and flags, too
@@ -68,7 +67,7 @@ class Bus:
         rest: Callable[[float], object] = time.sleep,
     ) -> None:
         self.bus, self.log, self.name, self.clock, self.rest = bus, log, name, clock, rest
-        self.message = need("can", "hw").Message
+        self.message = require("can", "hw").Message
         self.kept: deque[Any] = deque()  # messages on their way into the log
         self.start = time.time() - clock()  # candump logs carry the time of day, but it may be set
         self.echo: deque[tuple[int, bytes]] | None = deque(maxlen=64) if echo else None
@@ -151,7 +150,7 @@ def open_bus(interface: str, channel: str, log: Path | None = None) -> Iterator[
 
     ValueError: python-can is not there, finds no such bus, or fails in the block.
     """
-    can = need("can", "hw")
+    can = require("can", "hw")
     try:
         bus = can.Bus(interface=interface, channel=channel)
     except Exception as error:  # each interface has its own
@@ -190,7 +189,7 @@ def read_frames(path: Path) -> Iterator[Frame]:
 
     ValueError: no such log, or a line that is no frame.
     """
-    reader = need("can", "hw").CanutilsLogReader
+    reader = require("can", "hw").CanutilsLogReader
     with (
         expected(path, "a candump log"),
         open(path, encoding="utf-8") as file,

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from brokk_min.can.canopen import OperatorInput
 from brokk_min.env import Measured
-from brokk_min.identification.extras import need
+from brokk_min.identification.files import require
 from brokk_min.machine import PWM_MAX, Array, Machine
 
 
@@ -63,7 +63,7 @@ class Joystick:
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # events need a window, or this
         os.environ.setdefault("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")
-        pygame = need("pygame", "play")
+        pygame = require("pygame", "play")
         pygame.display.init()
         pygame.joystick.init()
         if not pygame.joystick.get_count():

@@ -16,15 +16,17 @@ from brokk_min.actuator import ActuatorNet
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation import feedforward
 from brokk_min.evaluation.rollout import rollout
-from brokk_min.evaluation.sequences import tuning_goals
+from brokk_min.evaluation.sequences import tuning_set
 from brokk_min.identification.files import expected, write_json
 from brokk_min.identification.net_file import fingerprint
 from brokk_min.jacobian import Gains, JacobianController
 from brokk_min.machine import Array, Machine
 
-PAPERS = ("jacobian_pid_k0.1", "jacobian_pid_k0.05")  # the paper's two baselines
+PAPER_BASELINES = ("jacobian_pid_k0.1", "jacobian_pid_k0.05")  # the paper's two baselines
 STRONGER = ("jacobian_pid_ff",)  # than the paper's: its sentences are put to it, too
-AWAKE = "jacobian_pid_ff_awake"  # the same, its valves never closed: what the policy learns to do
+ALWAYS_OPEN = (
+    "jacobian_pid_ff_awake"  # the same, its valves never closed: what the policy learns to do
+)
 TUNING_RUNS = 12  # of the whole chain and of `evaluate`, assumed
 GENERATIONS = 45
 SEARCH: dict[str, Any] = {
@@ -88,16 +90,11 @@ def baselines(machine: Machine, net: ActuatorNet) -> dict[str, JacobianControlle
         "jacobian_pid_k0.1": JacobianController(machine, pid, 0.1, w0),
         "jacobian_pid_k0.05": JacobianController(machine, pid, 0.05, w0),
         "jacobian_pid_ff": JacobianController(machine, mild, 0.1, w0, static_map),
-        AWAKE: JacobianController(machine, mild, 0.1, w0, static_map, always_open=True),
+        ALWAYS_OPEN: JacobianController(machine, mild, 0.1, w0, static_map, always_open=True),
     }
 
 
-def tuning_set(machine: Machine, runs: int, seed: int) -> tuple[Array, Array]:
-    """Starts and goals of `runs` runs that the baselines are tuned on: apart from all that scores."""
-    return tuning_goals(machine, runs, 12.0, seed + 1000)
-
-
-def tuned_baselines(
+def tune_baselines(
     machine: Machine, net: ActuatorNet, runs: int, generations: int, seed: int
 ) -> tuple[dict[str, JacobianController], dict[str, dict[str, Any]]]:
     """The baselines, each tuned on the machine itself, and how their tuning went, for JSON.
@@ -176,7 +173,7 @@ def gains_at_bound(controller: JacobianController) -> list[str]:
     return [name for name, x in zip(names, fraction, strict=True) if not 0.01 < x < 0.99]
 
 
-def plain_gains(controllers: Mapping[str, JacobianController]) -> dict[str, dict[str, list[float]]]:
+def gains_table(controllers: Mapping[str, JacobianController]) -> dict[str, dict[str, list[float]]]:
     """Gains of each baseline by name, for JSON."""
     return {
         name: {key: array.tolist() for key, array in asdict(controller.gains).items()}
@@ -188,7 +185,7 @@ def write_gains(
     path: Path, controllers: Mapping[str, JacobianController], about: Mapping[str, Any]
 ) -> None:
     """Write the baselines' gains as `read_gains` reads them; `about` is the `meta` of their tuning."""
-    write_json(path, {"meta": about, "gains": plain_gains(controllers)})
+    write_json(path, {"meta": about, "gains": gains_table(controllers)})
 
 
 def read_gains(path: Path, machine: Machine, net: ActuatorNet) -> dict[str, JacobianController]:
@@ -197,7 +194,7 @@ def read_gains(path: Path, machine: Machine, net: ActuatorNet) -> dict[str, Jaco
     ValueError: no such file, or gains of other controllers or joints, tuned for another machine or with
     other nets, whose feed-forward is another.
     """
-    result, wanted = baselines(machine, net), tuned_for(machine, net)
+    result, wanted = baselines(machine, net), gains_metadata(machine, net)
     with expected(path, f"gains for {machine.name} with nets {wanted['actuator']}"):
         table = json.loads(path.read_text())
         found = {name: table["meta"].get(name) for name in wanted}
@@ -211,6 +208,6 @@ def read_gains(path: Path, machine: Machine, net: ActuatorNet) -> dict[str, Jaco
     return result
 
 
-def tuned_for(machine: Machine, net: ActuatorNet) -> dict[str, str]:
+def gains_metadata(machine: Machine, net: ActuatorNet) -> dict[str, str]:
     """What gains and sweeps belong to: the machine's name and the fingerprint of its driven joints' nets."""
     return {"machine": machine.name, "actuator": fingerprint(net)}

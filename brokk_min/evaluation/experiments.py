@@ -11,28 +11,26 @@ import numpy as np
 
 from brokk_min import jacobian, kinematics
 from brokk_min.evaluation import claims, metrics
-from brokk_min.evaluation.baselines import GENERATIONS, PAPERS, STRONGER, TUNING_RUNS
+from brokk_min.evaluation.baselines import GENERATIONS, PAPER_BASELINES, STRONGER, TUNING_RUNS
 from brokk_min.evaluation.metrics import (
     Controllers,
     Rows,
     Traces,
-    by_start,
     evaluate,
     intervals,
-    mean_interval,
-    paired,
-    paired_with_others,
+    paired_difference,
+    paired_differences,
     row_mean,
     summary,
 )
 from brokk_min.evaluation.perfect_model import perfect_models
-from brokk_min.evaluation.robustness import supply_demand, variations
+from brokk_min.evaluation.robustness import robustness
 from brokk_min.evaluation.rollout import Trace
 from brokk_min.evaluation.sequences import (
     Commands,
     axis_sequences,
-    least_motion,
-    scored_starts,
+    evaluation_starts,
+    singular_sequences,
     start_kinds,
     task_sequences,
 )
@@ -58,33 +56,6 @@ class Effort:
 QUICK = Effort(0.1, 700, 200_000, 4, 4, 8, 2, 3.0)
 
 
-def robustness(
-    machine: Machine,
-    controllers: Controllers,
-    sequences: Sequence[Commands],
-    starts: Array,
-    seed: int,
-) -> dict[str, dict[str, dict[str, Any]]]:
-    """Mean velocity error [m/s], 95 % interval over starts, by variation and controller. Paper: Sec. 4.2
-
-    And "supply_demand", the largest share of the pump's flow that was asked for, "supply_limits", the share
-    of ticks at which it was more than all, and of baselines "rl_less", the policy's error less theirs on the
-    same starts.
-    """
-    result: dict[str, dict[str, dict[str, Any]]] = {}
-    for name, (plant, sensor) in variations(machine).items():
-        runs, traces = evaluate(plant, controllers, sequences, starts, seed, sensor=sensor)
-        result[name] = {}
-        for c in controllers:
-            asked = np.array([supply_demand(plant, traces[c, s.name].u) for s in sequences])
-            errors = by_start(runs, c, "all", "velocity_error_mean")
-            result[name][c] = {**mean_interval(errors), "supply_demand": float(asked.max())}
-            result[name][c]["supply_limits"] = float((asked > 1).mean())
-            if "rl" in controllers and c != "rl":
-                result[name][c]["rl_less"] = paired(runs, "rl", c, "velocity_error_mean")["all"]
-    return result
-
-
 def shortened(machine: Machine, sequences: Sequence[Commands], seconds: float) -> list[Commands]:
     """The first seconds of each sequence."""
     return [s._replace(goals=s.goals[: round(seconds * machine.rate)]) for s in sequences]
@@ -98,7 +69,10 @@ def regret(
     runs, traces = evaluate(machine, every, short, starts, seed)
     return (
         runs,
-        {c: paired(runs, c, "perfect_model", "velocity_error_mean") for c in controllers},
+        {
+            c: paired_difference(runs, c, "perfect_model", "velocity_error_mean")
+            for c in controllers
+        },
         traces,
     )
 
@@ -116,7 +90,7 @@ def comparison(
         ("singular").
     """
     sequences = task_sequences(machine)
-    starts = scored_starts(machine, effort.starts, sequences, seed + 2)
+    starts = evaluation_starts(machine, effort.starts, sequences, seed + 2)
     kinds = np.array(start_kinds(machine, starts))
     runs, traces = evaluate(machine, controllers, sequences, starts, seed)
     scored = [run for run in runs if run["kind"] == "workspace"]
@@ -153,7 +127,7 @@ def tables(runs: Sequence[metrics.Run], scored: Sequence[metrics.Run]) -> dict[s
         "by_kind": {
             k: {c: rows["all"] for c, rows in summary(of).items()} for k, of in of_kind.items()
         },
-        "rl_less": paired_with_others(scored, "rl"),
+        "rl_less": paired_differences(scored, "rl"),
     }
 
 
@@ -175,7 +149,7 @@ def judged(
             claims.direction_claim(machine, pids[names[0]], along_x[names[0]], goals),
             *claims.tracking_claims(runs, names),
         ]
-        for names in (PAPERS, STRONGER)
+        for names in (PAPER_BASELINES, STRONGER)
     )
     return [claims.beside(*pair) for pair in zip(of_paper, of_stronger, strict=True)]
 
@@ -183,7 +157,7 @@ def judged(
 def singular_case(
     machine: Machine, controllers: Controllers, starts: Array, seconds: float, seed: int
 ) -> tuple[Traces, dict[str, Any]]:
-    """k = 0.1 against 0.05 with the same gains, and RL, along the `least_motion` of extended starts.
+    """k = 0.1 against 0.05 with the same gains, and RL, along the `singular_sequences` of extended starts.
 
     Paper: Fig. 6a, 6e, 6f
 
@@ -194,7 +168,7 @@ def singular_case(
     if not len(starts):
         return {}, {"summary": {}, "claims": []}
     some = claims.singular_controllers(controllers)
-    sequences = shortened(machine, least_motion(machine, starts), seconds)
+    sequences = shortened(machine, singular_sequences(machine, starts), seconds)
     runs, traces = evaluate(machine, some, sequences, starts, seed)
     w0, J, share = (
         jacobian.manipulability_threshold(machine),
@@ -202,7 +176,7 @@ def singular_case(
         {},
     )
     for name in some:
-        each = [(traces[name, s.name], s.of_each(len(starts))) for s in sequences]
+        each = [(traces[name, s.name], s.for_starts(len(starts))) for s in sequences]
         share[name] = row_mean(
             np.array([claims.speed_share(machine, w0, *pair) for pair in each]).T
         )

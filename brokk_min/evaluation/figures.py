@@ -133,7 +133,7 @@ def plot_sequence(
     """Tool position and velocity along x, y, z of all controllers in one run. Paper: Fig. 6"""
     first, goals = (
         kinematics.tool_position(kinematics.forward_kinematics(machine, start)),
-        sequence.of_each(run + 1)[:, run],
+        sequence.for_starts(run + 1)[:, run],
     )
     p, v = {"wanted": np.cumsum(goals, axis=0) * machine.dt}, {"wanted": goals}
     for name, trace in _during(traces, sequence).items():

@@ -168,7 +168,7 @@ def evaluate(
     batches = [[s for s in sequences if len(s.goals) == length] for length in lengths]
     pairs = list(product(controllers, batches))
     for name, batch in tqdm(pairs, desc="evaluate", unit="batch", disable=None):
-        goals = np.concatenate([s.of_each(len(starts)) for s in batch], axis=1)
+        goals = np.concatenate([s.for_starts(len(starts)) for s in batch], axis=1)
         tiled = np.tile(starts, (len(batch), 1))
         rng = np.random.default_rng(seed)
         read = sensor(np.random.default_rng(seed + 1))
@@ -274,7 +274,7 @@ def mean_interval(values: Array) -> Mean:
     return {"mean": _number(values), "low": low, "high": high}
 
 
-def paired(runs: Sequence[Run], one: str, other: str, key: str) -> dict[str, Mean]:
+def paired_difference(runs: Sequence[Run], one: str, other: str, key: str) -> dict[str, Mean]:
     """A figure of one controller less another's on the same starts, by sequence: `mean_interval` each."""
     sequences = _named(runs)[1]
     return {
@@ -283,7 +283,9 @@ def paired(runs: Sequence[Run], one: str, other: str, key: str) -> dict[str, Mea
     }
 
 
-def paired_with_others(runs: Sequence[Run], one: str) -> dict[str, dict[str, dict[str, Mean]]]:
+def paired_differences(runs: Sequence[Run], one: str) -> dict[str, dict[str, dict[str, Mean]]]:
     """Every figure of one controller less each other's: `paired`, by figure and other controller."""
     controllers, _, keys = _named(runs)
-    return {k: {c: paired(runs, one, c, k) for c in controllers if c != one} for k in keys}
+    return {
+        k: {c: paired_difference(runs, one, c, k) for c in controllers if c != one} for k in keys
+    }

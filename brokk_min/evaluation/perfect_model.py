@@ -67,7 +67,7 @@ class PerfectModel:
         goal = measured.v_goal.astype(float)
         before = np.concatenate([memory.opening[:, 1:], memory.opening[:, -1:]], axis=1)
         opening = self.improve(plant, before, goal, tick)
-        u = self.whole_counts(plant, opening, goal, tick)
+        u = self.quantise(plant, opening, goal, tick)
         return u, Plan(plant_step(self.machine, plant, u), opening, tick + 1)
 
     def commands(self, opening: Array, tick: int) -> Array:
@@ -122,7 +122,7 @@ class PerfectModel:
         )  # of equals the smaller
         return np.asarray(options[np.arange(num), cost.argmin(axis=1)])
 
-    def whole_counts(self, plant: PlantState, opening: Array, goal: Array, tick: int) -> Array:
+    def quantise(self, plant: PlantState, opening: Array, goal: Array, tick: int) -> Array:
         """The plan's first commands (num, n) in whole counts: the best of all ways to round them."""
         m, driven = self.machine, self.machine.driven
         planned = self.commands(opening[:, :ROUNDING], tick)

@@ -16,8 +16,8 @@ from brokk_min.evaluation.metrics import Mean, Traces
 from brokk_min.evaluation.sequences import (
     KINDS,
     axis_sequences,
-    held_rows,
-    least_motion,
+    hold_table,
+    singular_sequences,
     task_sequences,
 )
 from brokk_min.identification.logs import Log
@@ -191,7 +191,7 @@ def _singular(
     said: Sequence[Quote],
 ) -> Part:
     run, ticks = int(np.argmin(found["manipulability"])), len(next(iter(traces.values())).q)
-    half = least_motion(machine, extended)[0]
+    half = singular_sequences(machine, extended)[0]
     plot = figures.plot_sequence(
         machine, traces, half._replace(goals=half.goals[:ticks]), extended[run], run
     )
@@ -358,7 +358,7 @@ def _lists(machine: Machine, results: Mapping[str, Any]) -> list[Part]:
     scored = {f"start {i}": _pose(machine, pose) for i, pose in enumerate(results["starts"])}
     for row, kind in zip(scored.values(), results["start_kinds"], strict=True):
         row["kind"] = kind
-    sequences = {s.name: _path(held_rows(machine, s.goals)) for s in task_sequences(machine)}
+    sequences = {s.name: _path(hold_table(machine, s.goals)) for s in task_sequences(machine)}
     tuned = {}
     for i, run in enumerate(results["tuning_runs"]):
         tuned[f"tuning run {i}"] = _pose(machine, run["start"]) | _path(np.array(run["goals"]))
@@ -388,7 +388,7 @@ def _pose(machine: Machine, pose: Array) -> dict[str, Any]:
 
 
 def _path(rows: Array) -> dict[str, Any]:
-    """Length and goals of a sequence of `held_rows`; of one that turns at every tick no goals."""
+    """Length and goals of a sequence of `hold_table`; of one that turns at every tick no goals."""
     seconds, speed = rows[:, 0], np.linalg.norm(rows[:, 1:], axis=-1)
     held = "; ".join(f"{s:g} s ({x:.3g}, {y:.3g}, {z:.3g})" for s, x, y, z in rows + 0.0)  # no -0
     figures = {

@@ -13,16 +13,10 @@ from tqdm import tqdm
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation import claims, figures, preliminary, report
-from brokk_min.evaluation.baselines import (
-    plain_gains,
-    tuned_baselines,
-    tuned_for,
-    tuning_set,
-    write_gains,
-)
+from brokk_min.evaluation.baselines import gains_metadata, gains_table, tune_baselines, write_gains
 from brokk_min.evaluation.experiments import Effort, comparison, driven_log
 from brokk_min.evaluation.metrics import Traces, evaluate, metadata, summary
-from brokk_min.evaluation.sequences import axis_sequences, held_rows
+from brokk_min.evaluation.sequences import axis_sequences, hold_table, tuning_set
 from brokk_min.identification import excitation, fitting, logs, net_file
 from brokk_min.identification import validation as scores
 from brokk_min.identification.files import write_json
@@ -58,12 +52,12 @@ def reproduce(
             machine, driven, TaskConfig(), learner, seed, out / "policy.npz", resume=True
         )
     with stage("tune"):
-        tuned, how = tuned_baselines(machine, driven, effort.tuning_runs, effort.generations, seed)
+        tuned, how = tune_baselines(machine, driven, effort.tuning_runs, effort.generations, seed)
     with stage("evaluate"):
         rl = PolicyController(machine, policy)
         measured, traces = measure(machine, net, test, rl, tuned, effort, seed)
-    about = metadata(machine, seed) | tuned_for(machine, driven) | {"effort": asdict(effort)}
-    results = {"meta": about, "paper_recipe": paper, **measured, "gains": plain_gains(tuned)}
+    about = metadata(machine, seed) | gains_metadata(machine, driven) | {"effort": asdict(effort)}
+    results = {"meta": about, "paper_recipe": paper, **measured, "gains": gains_table(tuned)}
     results |= {"tuning": how, "training_seeds": over_seeds}
     with stage("draw"):
         write(out, results, tuned, told(policy, results, seed))
@@ -134,9 +128,9 @@ def measure(
 
 
 def tuning_runs(machine: Machine, starts: Array, goals: Array) -> list[dict[str, Any]]:
-    """Each run that the baselines were tuned on, for JSON: "start" [rad] and "goals", see `held_rows`."""
+    """Each run that the baselines were tuned on, for JSON: "start" [rad] and "goals", see `hold_table`."""
     runs = zip(starts, goals.swapaxes(0, 1), strict=True)
-    return [{"start": s.tolist(), "goals": held_rows(machine, run).tolist()} for s, run in runs]
+    return [{"start": s.tolist(), "goals": hold_table(machine, run).tolist()} for s, run in runs]
 
 
 def record(machine: Machine, out: Path, effort: Effort, seed: int) -> list[logs.Log]:

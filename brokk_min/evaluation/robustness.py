@@ -1,72 +1,126 @@
-"""The machine and its encoders other than the controllers know them: what robustness is measured on."""
+"""Robustness: controllers on machines and encoders other than those they were made for."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from brokk_min.env import Encoder
+from brokk_min.evaluation.metrics import (
+    Controllers,
+    by_start,
+    evaluate,
+    mean_interval,
+    paired_difference,
+)
+from brokk_min.evaluation.sequences import Commands
 from brokk_min.machine import Array, Machine, read_encoder, valve_opening
 
-Sensor = Callable[[np.random.Generator], Encoder]  # a fresh encoder for each rollout
+Sensor = Callable[[np.random.Generator], Encoder]  # makes the encoders of one rollout
 
 
-def exact(rng: np.random.Generator) -> Encoder:
+def exact_encoder(rng: np.random.Generator) -> Encoder:
     """Encoders as they are: whole counts."""
     return read_encoder
 
 
-def noisy(rng: np.random.Generator) -> Encoder:
+def noisy_encoder(rng: np.random.Generator) -> Encoder:
     """Encoders with normal noise of one count."""
-    return lambda machine, q: read_encoder(
-        machine, q + machine.encoder_step * rng.standard_normal(q.shape)
-    )
-
-
-def lossy(rng: np.random.Generator) -> Encoder:
-    """Encoders of which one sample in 20, of all joints of a machine, is lost: the last one stands again."""
-    last: list[Array] = []
 
     def read(machine: Machine, q: Array) -> Array:
-        lost = rng.random((*q.shape[:-1], 1)) < 0.05 * len(last)
-        last[:] = [np.where(lost, last[0] if last else q, read_encoder(machine, q))]
-        return last[0]
+        noise = machine.encoder_step * rng.standard_normal(q.shape)
+        return read_encoder(machine, q + noise)
 
     return read
 
 
+def lossy_encoder(rng: np.random.Generator) -> Encoder:
+    """Encoders that lose one sample in 20 of all joints of a machine: the last one stays."""
+    last: Array | None = None
+
+    def read(machine: Machine, q: Array) -> Array:
+        nonlocal last
+        lost = rng.random((*q.shape[:-1], 1)) < 0.05
+        angles = read_encoder(machine, q)
+        last = angles if last is None else np.where(lost, last, angles)
+        return last
+
+    return read
+
+
+def scale_valves(machine: Machine, positive: float, negative: float) -> Machine:
+    """The machine with other cylinder speeds in the positive and the negative direction."""
+    joints = []
+    for joint in machine.joints:
+        up = positive * joint.speed_positive
+        down = negative * joint.speed_negative
+        joints.append(replace(joint, speed_positive=up, speed_negative=down))
+    return replace(machine, joints=tuple(joints))
+
+
 def variations(machine: Machine) -> dict[str, tuple[Machine, Sensor]]:
-    """The machine other than its controllers know it; all figures assumed."""
-
-    def valves(up: float, down: float) -> Machine:
-        speeds = [(up * j.speed_positive, down * j.speed_negative) for j in machine.joints]
-        joints = zip(machine.joints, speeds, strict=True)
-        faster = (replace(j, speed_positive=a, speed_negative=b) for j, (a, b) in joints)
-        return replace(machine, joints=tuple(faster))
-
-    return {
-        "nominal": (machine, exact),
-        "supply flow -20 %": (replace(machine, pump_flow=0.8 * machine.pump_flow), exact),
-        "supply flow -70 %": (replace(machine, pump_flow=0.3 * machine.pump_flow), exact),
-        "valve gain -20 %": (valves(0.8, 0.8), exact),
-        "valve gain +20 %": (valves(1.2, 1.2), exact),
-        "up -15 %, down +15 %": (valves(0.85, 1.15), exact),
-        "dead zone 5 %": (replace(machine, dead_zone=0.05), exact),
-        "dead zone 10 %": (replace(machine, dead_zone=0.10), exact),
-        "delay +25 ms": (replace(machine, delay=machine.delay + 0.025), exact),
-        "delay +50 ms": (replace(machine, delay=machine.delay + 0.050), exact),
-        "encoder noise of a count": (machine, noisy),
-        "one sample in 20 lost": (machine, lossy),
+    """Machines and encoders unknown to the controllers, by name; all numbers assumed."""
+    pump, delay = machine.pump_flow, machine.delay
+    machines = {
+        "nominal": machine,
+        "supply flow -20 %": replace(machine, pump_flow=0.8 * pump),
+        "supply flow -70 %": replace(machine, pump_flow=0.3 * pump),
+        "valve gain -20 %": scale_valves(machine, 0.8, 0.8),
+        "valve gain +20 %": scale_valves(machine, 1.2, 1.2),
+        "up -15 %, down +15 %": scale_valves(machine, 0.85, 1.15),
+        "dead zone 5 %": replace(machine, dead_zone=0.05),
+        "dead zone 10 %": replace(machine, dead_zone=0.10),
+        "delay +25 ms": replace(machine, delay=delay + 0.025),
+        "delay +50 ms": replace(machine, delay=delay + 0.050),
     }
+    result: dict[str, tuple[Machine, Sensor]] = {}
+    for name, varied in machines.items():
+        result[name] = (varied, exact_encoder)
+    result["encoder noise of a count"] = (machine, noisy_encoder)
+    result["one sample in 20 lost"] = (machine, lossy_encoder)
+    return result
 
 
-def supply_demand(machine: Machine, u: Array) -> Array:
-    """Flow that commands (..., n) ask of the pump once spools follow, as a share of its own, (...).
+def pump_flow_ratio(machine: Machine, u: Array) -> Array:
+    """Flow that commands (..., n) demand once spools follow, over the pump's flow, (...).
 
     Paper: Sec. 4.2
     """
     opening = valve_opening(u, machine.dead_zone)
-    fastest = (machine.column(name) for name in ("speed_positive", "speed_negative"))
-    flow = np.abs(machine.column("cylinder_area") * np.where(opening > 0, *fastest) * opening)
-    share: Array = flow.sum(axis=-1) / machine.pump_flow
-    return share
+    K = np.where(opening > 0, machine.column("speed_positive"), machine.column("speed_negative"))
+    flow = np.abs(machine.column("cylinder_area") * K * opening).sum(axis=-1)  # sum |A v*|
+    ratio: Array = flow / machine.pump_flow
+    return ratio
+
+
+def robustness(
+    machine: Machine,
+    controllers: Controllers,
+    sequences: Sequence[Commands],
+    starts: Array,
+    seed: int,
+) -> dict[str, dict[str, dict[str, Any]]]:
+    """Mean velocity error [m/s] with its interval, by variation and controller. Paper: Sec. 4.2
+
+    Also "supply_demand", the largest `pump_flow_ratio`; "supply_limits", the fraction of ticks
+    at which it is above 1; "rl_less", the policy's error less a baseline's on the same starts.
+    """
+    result: dict[str, dict[str, dict[str, Any]]] = {}
+    for name, (plant, sensor) in variations(machine).items():
+        runs, traces = evaluate(plant, controllers, sequences, starts, seed, sensor=sensor)
+        result[name] = {}
+        for controller in controllers:
+            u = np.array([traces[controller, sequence.name].u for sequence in sequences])
+            ratio = pump_flow_ratio(plant, u)
+            row: dict[str, Any] = dict(
+                mean_interval(by_start(runs, controller, "all", "velocity_error_mean"))
+            )
+            row["supply_demand"] = float(ratio.max())
+            row["supply_limits"] = float((ratio > 1).mean())
+            if "rl" in controllers and controller != "rl":
+                row["rl_less"] = paired_difference(runs, "rl", controller, "velocity_error_mean")[
+                    "all"
+                ]
+            result[name][controller] = row
+    return result

@@ -1,4 +1,4 @@
-"""Let a controller follow given tool velocities, on the analytic plant or on the nets."""
+"""A controller follows given tool velocities, on the analytic plant or on the nets."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Controller(Protocol):
 
 
 class Trace(NamedTuple):
-    """What happened, tick by tick: arrays (T, num, ...); entry t is the end of tick t."""
+    """A recorded rollout: arrays (T, num, ...); entry t is at the end of tick t."""
 
     q: Array  # true angle [rad], n
     q_dot: Array  # true mean velocity over the tick [rad/s], n
@@ -50,7 +50,7 @@ def rollout(
 
     Args:
         machine: n joints.
-        controller: gets the same noisy measurements, whichever it is.
+        controller: gets measurements with noise.
         start: angles [rad], (num, n).
         goals: goal velocity of the tool during each tick [m/s], (T, num, 3).
         config: its `noise` holds; no episode ends.
@@ -59,18 +59,18 @@ def rollout(
         read: see `transition`.
     """
     state = initial_state(machine, start, goals[0], plant=net is None)
-    memory = controller.start(len(state.q))
-    trace = []
+    controller_state = controller.start(len(state.q))
+    ticks = []
     for goal in goals:
         v_goal = np.broadcast_to(goal.astype(np.float32), state.v_goal.shape)
-        state = replace(state, v_goal=v_goal)
         integral = state.error_integral
         measured = measure(machine, state.history, v_goal, integral, config.noise, rng)
-        u, memory = controller(measured, memory)
+        u, controller_state = controller(measured, controller_state)
         q_measured = state.history[..., 0, -1]
-        state = transition(machine, net, state, u, read)
+        state = transition(machine, net, replace(state, v_goal=v_goal), u, read)
         frames = forward_kinematics(machine, state.q)
-        p_tool = tool_position(frames)
         v_tool = tool_velocity(frames, state.q_dot)
-        trace.append((state.q, state.q_dot, q_measured, u, p_tool, v_tool, reward(goal, v_tool)))
-    return Trace(*map(np.array, zip(*trace, strict=True)))
+        p_tool = tool_position(frames)
+        rewards = reward(goal, v_tool)
+        ticks.append(Trace(state.q, state.q_dot, q_measured, u, p_tool, v_tool, rewards))
+    return Trace(*(np.array(arrays) for arrays in zip(*ticks, strict=True)))

@@ -21,8 +21,13 @@ from tqdm import tqdm
 from brokk_min import ppo
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import State, TaskConfig, observation_scale
-from brokk_min.identification.extras import need
-from brokk_min.identification.files import expect_same, load_arrays, load_header, whole_file
+from brokk_min.identification.files import (
+    expect_same,
+    load_arrays,
+    load_header,
+    require,
+    whole_file,
+)
 from brokk_min.identification.net_file import fingerprint
 from brokk_min.learning.episodes import paper_weights
 from brokk_min.learning.gym_env import TaskVectorEnv
@@ -270,7 +275,7 @@ def tensorboard_writer(folder: Path | None) -> Iterator[Callable[[dict[str, Any]
     if folder is None:
         yield lambda row: None
         return
-    with need("torch.utils.tensorboard", "tensorboard").SummaryWriter(str(folder)) as writer:
+    with require("torch.utils.tensorboard", "tensorboard").SummaryWriter(str(folder)) as writer:
 
         def write(row: dict[str, Any]) -> None:
             for name, value in row.items():

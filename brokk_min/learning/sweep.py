@@ -13,8 +13,7 @@ from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import TaskConfig
-from brokk_min.identification.extras import need
-from brokk_min.identification.files import expect_same, expected, write_json
+from brokk_min.identification.files import expect_same, expected, require, write_json
 from brokk_min.learning.checkpoint import describe_training, train_policy
 from brokk_min.learning.policy import Policy, load_policy
 from brokk_min.machine import Machine
@@ -81,7 +80,7 @@ def run_seeds(
     worker dies is run again. ValueError: workers of several threads; torch's settings are those of
     a process.
     """
-    distributed = need("distributed", "sweep")
+    distributed = require("distributed", "sweep")
     options = {"address": scheduler, "timeout": 10}
     if scheduler is None:
         options = {"threads_per_worker": 1, "memory_limit": None, "dashboard_address": None}

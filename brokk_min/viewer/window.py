@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brokk_min.env import State
-from brokk_min.identification.extras import need
+from brokk_min.identification.files import require
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.learning.gym_env import TaskEnv, TaskVectorEnv
 from brokk_min.machine import BROKK_170, Array, Machine
@@ -32,7 +32,7 @@ from brokk_min.viewer.drawing import (
 def need_pygame() -> Any:
     """pygame, which is imported only where something is painted; ValueError: it is not installed."""
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    return need("pygame", "play")
+    return require("pygame", "play")
 
 
 @lru_cache(maxsize=1024)

@@ -67,7 +67,7 @@ def folder(policy: Policy, tmp_path: Path) -> Path:
     }
     names = ("jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff", "jacobian_pid_ff_awake")
     table = {
-        "meta": baselines.tuned_for(BROKK_170, policy.net),
+        "meta": baselines.gains_metadata(BROKK_170, policy.net),
         "gains": dict.fromkeys(names, gains),
     }
     (tmp_path / "gains.json").write_text(json.dumps(table))

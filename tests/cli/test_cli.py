@@ -255,7 +255,7 @@ def test_collect_fit_train_resume_evaluate(
     starts.write_text("q1,q2,q3,q4,q5\n0,0.5,0.58,1.71,1.24\n")
     gains = {k: [0.5] * 4 for k in ("kp", "ki", "kd")} | {"feedback": [0.1], "ready": [0.01]}
     names = ("jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff", "jacobian_pid_ff_awake")
-    about = baselines.tuned_for(BROKK_170, load_policy(policy, BROKK_170).net)
+    about = baselines.gains_metadata(BROKK_170, load_policy(policy, BROKK_170).net)
     table = {"meta": about, "gains": dict.fromkeys(names, gains)}
     (tmp_path / "gains.json").write_text(json.dumps(table))
     for plant in ("analytic", "net"):

@@ -233,7 +233,7 @@ def test_a_machine_that_can_follow_nothing_has_no_starts(monkeypatch: pytest.Mon
     ):
         sequences.draw_starts(BROKK_170, task_sequences(BROKK_170)[:1], 2, rng)
     with pytest.raises(ValueError, match="brokk170: expected 2 feasible runs to tune on, got 0"):
-        sequences.tuning_goals(BROKK_170, 2, 1.0, 0)
+        sequences.tuning_set(BROKK_170, 2, 0, 1.0)
 
 
 def test_damping_is_compared_between_controllers_that_have_one() -> None:

@@ -14,7 +14,7 @@ from brokk_min.evaluation import baselines, claims, report
 from brokk_min.evaluation.rollout import Trace
 from brokk_min.machine import BROKK_170
 
-PAPERS = baselines.PAPERS
+PAPER_BASELINES = baselines.PAPER_BASELINES
 POSE = np.array([1.5, 0.5, 0.58, 1.71, 1.24])
 
 
@@ -40,7 +40,7 @@ def test_numbers_are_said_with_their_intervals() -> None:
 
 def runs_with(key: str, **values: float) -> list[dict[str, Any]]:
     """Six starts along x with a figure about a value by controller; starts differ, controllers too."""
-    names = {"rl": "rl", "high": PAPERS[0], "low": PAPERS[1]}
+    names = {"rl": "rl", "high": PAPER_BASELINES[0], "low": PAPER_BASELINES[1]}
     return [
         {
             "controller": names[c],
@@ -64,7 +64,7 @@ def runs_with(key: str, **values: float) -> list[dict[str, Any]]:
     ],
 )
 def test_drift(rl: float, high: float, low: float, holds: list[bool]) -> None:
-    found = claims.drift_claims(runs_with("off_axis_drift_max", rl=rl, high=high, low=low), PAPERS)
+    found = claims.drift_claims(runs_with("off_axis_drift_max", rl=rl, high=high, low=low), PAPER_BASELINES)
     assert judged(found) == holds
     assert f"{rl + 0.001:.3g}" in found[0]["measured"]
 
@@ -75,7 +75,7 @@ def test_one_start_gives_no_verdict() -> None:
         for run in runs_with("off_axis_drift_max", rl=0.1, high=0.2, low=0.2)
         if run["start"] == 0
     ]
-    found = claims.drift_claims(runs, PAPERS)
+    found = claims.drift_claims(runs, PAPER_BASELINES)
     assert judged(found) == [None, None]
     assert report.verdict(found[0]).lines == ((found[0]["measured"], "This was not measured."),)
 
@@ -101,7 +101,7 @@ def test_tracking(x: float, z: float, drift: float, holds: list[bool]) -> None:
         errors = runs_with("velocity_error_mean", rl=rl, high=0.02, low=0.02 - 0.005 * (rl > 0.02))
         drifts = runs_with("off_axis_drift_max", rl=drift, high=0.2, low=0.2)
         runs += [a | b | {"sequence": sequence} for a, b in zip(errors, drifts, strict=True)]
-    found = claims.tracking_claims(runs, PAPERS)
+    found = claims.tracking_claims(runs, PAPER_BASELINES)
     assert judged(found) == holds
     assert found[1]["numbers"]["drift z, less jacobian_pid_k0.1"]["mean"] == pytest.approx(
         drift - 0.2
@@ -231,7 +231,7 @@ def test_training_lasts_as_long_as_the_papers_or_not(hours: float, holds: bool) 
 def test_a_stronger_baseline_stands_beside_the_papers() -> None:
     runs = runs_with("off_axis_drift_max", rl=0.02, high=0.2, low=0.3)
     runs += [run | {"controller": "strong", "off_axis_drift_max": 0.03} for run in runs[:6]]
-    of_paper, of_strong = (claims.drift_claims(runs, names) for names in (PAPERS, ["strong"]))
+    of_paper, of_strong = (claims.drift_claims(runs, names) for names in (PAPER_BASELINES, ["strong"]))
     still, fails = (claims.beside(*pair) for pair in zip(of_paper, of_strong, strict=True))
     assert "stronger" not in still  # a sentence on RL alone
     assert fails["holds"] is True and fails["stronger"]["holds"] is False

@@ -206,7 +206,7 @@ def test_what_valves_ask_of_the_pump_is_what_the_plant_divides_among_them() -> N
         u > 0, BROKK_170.column("speed_positive"), BROKK_170.column("speed_negative")
     )
     opening = np.sign(u) * (np.abs(u) - 0.07) / 0.93
-    share = variations.supply_demand(BROKK_170, u)
+    share = variations.pump_flow_ratio(BROKK_170, u)
     assert share[0] < 1 < share[1]
     np.testing.assert_allclose(
         state.speed, fastest * opening / np.maximum(1, share)[:, None], rtol=0.01
@@ -243,7 +243,7 @@ def net_of_driven_joints() -> ActuatorNet:
 def test_gains_of_another_machine_or_of_other_nets_are_refused(tmp_path: Path) -> None:
     """What they are for is said, and what was wanted; a file that does not say it is refused as well."""
     path, net = tmp_path / "gains.json", net_of_driven_joints()
-    tuned, about = baselines.baselines(BROKK_170, net), baselines.tuned_for(BROKK_170, net)
+    tuned, about = baselines.baselines(BROKK_170, net), baselines.gains_metadata(BROKK_170, net)
     for key, value in {"machine": "digger", "actuator": "0123456789abcdef"}.items():
         baselines.write_gains(path, tuned, about | {key: value})
         with pytest.raises(
@@ -278,10 +278,10 @@ def test_a_fingerprint_is_of_the_nets_and_survives_a_file(tmp_path: Path) -> Non
 )
 def test_damaged_gains_are_refused(tmp_path: Path, change: dict[str, object], message: str) -> None:
     net, path = net_of_driven_joints(), tmp_path / "gains.json"
-    table = baselines.plain_gains(baselines.baselines(BROKK_170, net))
-    about = baselines.tuned_for(BROKK_170, net)
+    table = baselines.gains_table(baselines.baselines(BROKK_170, net))
+    about = baselines.gains_metadata(BROKK_170, net)
     path.write_text(json.dumps({"meta": about, "gains": table}))
-    assert baselines.plain_gains(baselines.read_gains(path, BROKK_170, net)) == table
+    assert baselines.gains_table(baselines.read_gains(path, BROKK_170, net)) == table
     table["jacobian_pid_ff"] |= change
     path.write_text(json.dumps({"meta": about, "gains": table}))
     with pytest.raises(ValueError, match=rf"gains.json: expected gains for brokk170.*{message}"):
@@ -496,7 +496,7 @@ def test_gains_read_back_give_the_same_controller(twice: tuple[Path, Path]) -> N
     net = load_policy(twice[0] / "policy.npz", BROKK_170).net
     read = baselines.read_gains(twice[0] / "gains.json", BROKK_170, net)
     written = json.loads((twice[0] / "results.json").read_text())["gains"]
-    assert baselines.plain_gains(read) == written
+    assert baselines.gains_table(read) == written
 
 
 def test_the_whole_chain_spends_what_fit_and_train_do_by_default():
@@ -532,7 +532,7 @@ def test_the_comparison_asks_its_parts_for_what_they_are_for(
     def part(name: str, answer: Any) -> None:
         monkeypatch.setattr(experiments, name, lambda *a: asked.setdefault(name, a) and answer)
 
-    part("scored_starts", starts)
+    part("evaluation_starts", starts)
     part("start_kinds", kinds)
     part("task_space", (runs, traces))
     part("regret", (runs[:1], {"less": 1}, {"bound": 2}))
@@ -545,9 +545,9 @@ def test_the_comparison_asks_its_parts_for_what_they_are_for(
     controllers: Any = {"a": _Idle(), "b": _Idle()}
     found, shown = experiments.comparison(BROKK_170, controllers, effort, 7)
     every = [s.name for s in task_sequences(BROKK_170)]
-    assert asked["scored_starts"][:2] == (BROKK_170, 4) and asked["scored_starts"][3] == 9
+    assert asked["evaluation_starts"][:2] == (BROKK_170, 4) and asked["evaluation_starts"][3] == 9
     assert asked["start_kinds"] == (BROKK_170, starts)
-    assert [s.name for s in asked["scored_starts"][2]] == every
+    assert [s.name for s in asked["evaluation_starts"][2]] == every
     machine, who, sequences, where, seed = asked["task_space"]
     assert (machine, who, [s.name for s in sequences], where is starts, seed) == (
         BROKK_170,
@@ -712,8 +712,8 @@ def test_sentences_are_put_to_the_papers_baselines_and_to_the_stronger_one(
     ]  # fmt: skip
     assert [claim["numbers"]["n"] for claim in found] == [1, 1, 2, 3, 3, 3]
     assert [claim["stronger"]["numbers"]["n"] for claim in found] == [4, 4, 5, 6, 6, 6]
-    assert asked[0] == ("drift_claims", [{"run": 1}], baselines.PAPERS)
-    assert asked[2] == ("tracking_claims", [{"run": 1}], baselines.PAPERS)
+    assert asked[0] == ("drift_claims", [{"run": 1}], baselines.PAPER_BASELINES)
+    assert asked[2] == ("tracking_claims", [{"run": 1}], baselines.PAPER_BASELINES)
     assert asked[3][2] == baselines.STRONGER == asked[5][2]
     for i, name in ((1, "jacobian_pid_k0.1"), (4, "jacobian_pid_ff")):
         assert (
@@ -748,11 +748,11 @@ def test_damping_alone_is_compared_near_a_singularity() -> None:
 def test_gains_have_names_and_tuning_is_apart_from_scoring() -> None:
     net = net_of_driven_joints()
     pids = baselines.baselines(BROKK_170, net)
-    assert list(pids) == [*baselines.PAPERS, "jacobian_pid_ff", "jacobian_pid_ff_awake"]
+    assert list(pids) == [*baselines.PAPER_BASELINES, "jacobian_pid_ff", "jacobian_pid_ff_awake"]
     assert [(c.k, c.awake, c.feedforward is not None) for c in pids.values()] == [
         (0.1, False, False), (0.05, False, False), (0.1, False, True), (0.1, True, True),
     ]  # fmt: skip
-    plain = baselines.plain_gains(pids)
+    plain = baselines.gains_table(pids)
     wanted = {
         "kp": (1.0, 0.2),
         "ki": (8.0, 0.5),
@@ -820,7 +820,7 @@ def test_robustness_says_what_the_policy_has_less_than_others_on_each_machine(
     }  # fmt: skip
     assert late["pid"]["rl_less"] == pytest.approx({"mean": -2.0, "low": -2.0, "high": -2.0})
     assert late["pid"]["supply_demand"] == pytest.approx(
-        float(variations.supply_demand(BROKK_170, np.ones(5)))
+        float(variations.pump_flow_ratio(BROKK_170, np.ones(5)))
     )
     assert late["pid"]["supply_demand"] > 1 and late["pid"]["supply_limits"] == 0.25
     alone: Any = {"pid": _Idle()}
@@ -876,7 +876,7 @@ def test_the_chain_hands_each_stage_what_the_one_before_made(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     from brokk_min import ppo
-    from brokk_min.learning import sweep
+    from brokk_min.evaluation import seeds as sweep
 
     part, asked = (p := Parts(monkeypatch)), p.asked
     out, effort = tmp_path / "a" / "b", replace(TINY, train_steps=64)
@@ -887,10 +887,10 @@ def test_the_chain_hands_each_stage_what_the_one_before_made(
     part(chain, "record", ["log", "test"])
     part(chain, "fitted", (net, "by the paper"))
     part(ppo, "train", policy)
-    part(chain, "tuned_baselines", ("tuned", "how"))
+    part(chain, "tune_baselines", ("tuned", "how"))
     part(chain, "PolicyController", lambda machine, learned: ("controller of", learned))
     part(chain, "measure", ({"task_space": "compared"}, "traces"))
-    part(chain, "plain_gains", lambda tuned: f"plain {tuned}")
+    part(chain, "gains_table", lambda tuned: f"plain {tuned}")
     for name in ("write_gains", "save_policy"):
         part(chain, name)
     part(chain, "told", lambda policy, results, seed: ("told", policy, seed))
@@ -917,13 +917,13 @@ def test_the_chain_hands_each_stage_what_the_one_before_made(
         out / "policy.npz",
     )
     assert more == {"resume": True} and nets.joints == ("q1", "q3", "q4", "q5")
-    machine, nets, *spent = asked["tuned_baselines"][0]
+    machine, nets, *spent = asked["tune_baselines"][0]
     assert (machine, nets.joints) == (BROKK_170, ("q1", "q3", "q4", "q5"))
     assert spent == [effort.tuning_runs, effort.generations, 3]
     assert asked["measure"] == [
         (BROKK_170, net, "test", ("controller of", policy), "tuned", effort, 3)
     ]
-    about = experiments.meta(BROKK_170, 3) | baselines.tuned_for(BROKK_170, driven)
+    about = experiments.meta(BROKK_170, 3) | baselines.gains_metadata(BROKK_170, driven)
     wanted = {
         "meta": about | {"effort": asdict(effort)},
         "paper_recipe": "by the paper", "task_space": "compared", "gains": "plain tuned", "tuning": "how",

@@ -169,7 +169,7 @@ def test_pairs_are_compared_on_the_same_start() -> None:
     base = {0: 1.0, 1: 5.0, 2: 9.0}
     runs = [run("a", s, i, e + 0.1 * i) for s in "xy" for i, e in reversed(base.items())]
     runs += [run("b", s, i, e + (0.2 if s == "x" else 0.4)) for s in "xy" for i, e in base.items()]
-    found = m.paired(runs, "b", "a", "error")
+    found = m.paired_difference(runs, "b", "a", "error")
     assert found["x"]["mean"] == pytest.approx(0.1) and found["y"]["mean"] == pytest.approx(0.3)
     assert found["all"]["mean"] == pytest.approx(0.2)
     np.testing.assert_allclose(
@@ -183,10 +183,10 @@ def test_one_is_compared_with_all_others_in_every_figure() -> None:
         for c, e in {"a": 1.0, "b": 3.0, "c": 7.0}.items()
         for i in (0, 1)
     ]
-    found = m.paired_with_others(runs, "b")
+    found = m.paired_differences(runs, "b")
     assert list(found) == ["error", "other"] and list(found["error"]) == ["a", "c"]
     assert [found["other"][c]["all"]["mean"] for c in "ac"] == [4.0, -8.0]
-    assert found["error"]["a"] == m.paired(runs, "b", "a", "error")
+    assert found["error"]["a"] == m.paired_difference(runs, "b", "a", "error")
 
 
 def test_a_summary_leaves_out_what_was_not_measured() -> None:

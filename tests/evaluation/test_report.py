@@ -12,7 +12,7 @@ import pytest
 
 from brokk_min.evaluation import figures, preliminary, report
 from brokk_min.evaluation.figures import Panel, Quote
-from brokk_min.evaluation.sequences import axis_sequences, least_motion
+from brokk_min.evaluation.sequences import axis_sequences, singular_sequences
 from brokk_min.machine import BROKK_170
 
 ERROR, DRIFT = "velocity_error_mean", "off_axis_drift_max"
@@ -203,7 +203,7 @@ def test_parts_on_the_task_stand_with_their_sentences_and_figures(drawn: None) -
     assert "0.12 to 0.38 m/rad" in singular[1] and singular[2] == quote("near", HOLDS)
     name, machine, shown, half, start, run = singular[3]
     assert (name, machine, shown) == ("plot_sequence", BROKK_170, traces["singular"])
-    wanted = least_motion(BROKK_170, np.array(results["starts"][2:]))[0].goals[:50]
+    wanted = singular_sequences(BROKK_170, np.array(results["starts"][2:]))[0].goals[:50]
     np.testing.assert_array_equal(half.goals, wanted)
     assert start.tolist() == results["starts"][3] and run == 1  # nearest to a singularity
     units = {

@@ -16,7 +16,7 @@ from brokk_min.machine import BROKK_170, Machine
 
 
 def test_the_starts_of_the_package_are_of_all_kinds_and_not_the_tuning_starts() -> None:
-    starts = sequences.scored_starts(BROKK_170, 64, [], 0)
+    starts = sequences.evaluation_starts(BROKK_170, 64, [], 0)
     kinds = np.array(sequences.start_kinds(BROKK_170, starts))
     assert [np.sum(kinds == kind) for kind in sequences.KINDS] == [32, 16, 16]
     assert kinds[:4].tolist() == ["workspace", "limits", "workspace", "extended"]
@@ -26,7 +26,7 @@ def test_the_starts_of_the_package_are_of_all_kinds_and_not_the_tuning_starts() 
     for sequence in sequences.task_sequences(BROKK_170)[:3]:
         goals = np.repeat(sequence.goals[:, None], len(workspace), axis=1)
         assert sequences.feasible(BROKK_170, workspace, goals).all(), sequence.name
-    tuning, goals = sequences.tuning_goals(BROKK_170, 4, 6.0, 1000)
+    tuning, goals = sequences.tuning_set(BROKK_170, 4, 1000, 6.0)
     assert np.abs(tuning[:, None] - starts[None]).max(-1).min() > 1e-3
     goals_scored = {
         tuple(row) for s in sequences.task_sequences(BROKK_170) for row in s.goals if row.any()
@@ -39,33 +39,33 @@ def test_the_starts_of_the_package_are_those_of_their_seed() -> None:
     """`brokk-min starts` draws the file; its first ones in a tenth of the time."""
     every = sequences.task_sequences(BROKK_170)
     drawn = sequences.draw_starts(BROKK_170, every, 4, np.random.default_rng(2))
-    np.testing.assert_array_equal(drawn, sequences.scored_starts(BROKK_170, 4, [], 0))
+    np.testing.assert_array_equal(drawn, sequences.evaluation_starts(BROKK_170, 4, [], 0))
 
 
 def test_held_rows_are_what_is_held() -> None:
     for sequence in sequences.task_sequences(BROKK_170):
-        rows = sequences.held_rows(BROKK_170, sequence.goals)
+        rows = sequences.hold_table(BROKK_170, sequence.goals)
         ticks = np.rint(rows[:, 0] * 20).astype(int)
         np.testing.assert_array_equal(np.repeat(rows[:, 1:], ticks, axis=0), sequence.goals)
         assert (np.diff(rows[:, 1:], axis=0) != 0).any(axis=1).all()
-    first = sequences.held_rows(BROKK_170, sequences.task_sequences(BROKK_170)[0].goals)
+    first = sequences.hold_table(BROKK_170, sequences.task_sequences(BROKK_170)[0].goals)
     np.testing.assert_allclose(first[:3], [[1, 0, 0, 0], [4, 0.2, 0, 0], [1, 0, 0, 0]])
 
 
 def test_more_starts_than_the_package_has_are_refused() -> None:
     with pytest.raises(ValueError, match=r"starts.csv: expected at most 64 starts, got 65"):
-        sequences.scored_starts(BROKK_170, 65, [], 0)
+        sequences.evaluation_starts(BROKK_170, 65, [], 0)
 
 
 def test_another_machine_draws_its_starts(tmp_path: Path) -> None:
     other = replace(BROKK_170, name="other")
     slow = sequences.task_sequences(other)[-1:]
-    starts = sequences.scored_starts(other, 5, slow, 3)
+    starts = sequences.evaluation_starts(other, 5, slow, 3)
     kinds = sequences.start_kinds(other, starts)
     assert kinds == ["workspace", "limits", "workspace", "extended", "workspace"]
     feasible = sequences.feasible(other, starts, np.repeat(slow[0].goals[:, None], 5, axis=1))
     assert feasible[[0, 1, 2, 4]].all()
-    np.testing.assert_array_equal(starts, sequences.scored_starts(other, 5, slow, 3))
+    np.testing.assert_array_equal(starts, sequences.evaluation_starts(other, 5, slow, 3))
     sequences.write_starts(tmp_path / "s.csv", other, starts)
     np.testing.assert_array_equal(sequences.read_starts(tmp_path / "s.csv", other), starts)
 
@@ -179,7 +179,7 @@ def test_starts_in_the_ground_are_refused(tmp_path: Path) -> None:
 
 def test_tuning_runs_are_drawn_like_the_policys_episodes() -> None:
     config = TaskConfig()
-    starts, goals = sequences.tuning_goals(BROKK_170, 8, 12.0, 7)
+    starts, goals = sequences.tuning_set(BROKK_170, 8, 7, 12.0)
     assert starts.shape == (8, 5) and goals.shape == (240, 8, 3)
     assert np.linalg.norm(goals, axis=-1).max() <= BROKK_170.tool_speed + 1e-6
     holds = []
@@ -188,7 +188,7 @@ def test_tuning_runs_are_drawn_like_the_policys_episodes() -> None:
         holds += list(np.diff([0, *changes]))  # the last hold is cut short
     assert min(holds) >= config.hold_min_s * 20
     assert max(holds) > 40 and np.mean(holds) < config.hold_max_s * 20
-    again = sequences.tuning_goals(BROKK_170, 8, 12.0, 7)
+    again = sequences.tuning_set(BROKK_170, 8, 7, 12.0)
     assert np.array_equal(starts, again[0]) and np.array_equal(goals, again[1])
 
 
@@ -206,7 +206,7 @@ def test_the_least_motion_is_the_one_that_asks_most_of_the_joints() -> None:
     """By hand: beside the slew axis sideways motion is the hardest; and of all directions none needs more."""
     upright = [0.0, 1.139, 0.97, 2.804, 1.948]  # tool 0.1 m from the slew axis
     starts = np.array([upright, [0.5, *upright[1:]], [1.5, 0.5, 0.58, 1.71, 1.24]])
-    half, quarter = sequences.least_motion(BROKK_170, starts)
+    half, quarter = sequences.singular_sequences(BROKK_170, starts)
     assert half.goals.shape == (360, 3, 3)
     np.testing.assert_allclose(half.goals, 2 * quarter.goals)
     speeds = np.linalg.norm(half.goals, axis=-1)
@@ -223,8 +223,8 @@ def test_the_least_motion_is_the_one_that_asks_most_of_the_joints() -> None:
 
 def test_goals_for_all_starts_or_each() -> None:
     goals = np.arange(12.0).reshape(2, 2, 3)
-    np.testing.assert_array_equal(sequences.Commands("each", goals).of_each(2), goals)
-    one = sequences.Commands("one", goals[:, 0]).of_each(3)
+    np.testing.assert_array_equal(sequences.Commands("each", goals).for_starts(2), goals)
+    one = sequences.Commands("one", goals[:, 0]).for_starts(3)
     np.testing.assert_array_equal(one, np.stack([goals[:, 0]] * 3, axis=1))
 
 
@@ -241,7 +241,7 @@ def test_directions_and_names_of_the_sequences() -> None:
     np.testing.assert_allclose(found["diagonal_flat"][30], 0.2 * np.array([1, 1, 0]) / 2**0.5)
     np.testing.assert_allclose(found["diagonal_rise"][30], 0.2 * np.array([1, -1, 1]) / 3**0.5)
     np.testing.assert_allclose(found["circle"][[20, 100]], [[0.15, 0, 0], [0, 0, 0.15]], atol=1e-12)
-    least = sequences.least_motion(BROKK_170, np.array([[0.0, 1.139, 0.97, 2.804, 1.948]]))
+    least = sequences.singular_sequences(BROKK_170, np.array([[0.0, 1.139, 0.97, 2.804, 1.948]]))
     assert [s.name for s in least] == ["least_half", "least_quarter"]
 
 
@@ -371,7 +371,7 @@ def test_tuning_runs_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
         return np.arange(200) % 100 == 7
 
     monkeypatch.setattr(sequences, "feasible", able)
-    starts, goals = sequences.tuning_goals(BROKK_170, 3, 1.5, 5)
+    starts, goals = sequences.tuning_set(BROKK_170, 3, 5, 1.5)
     assert len(seen) == 2 and goals.shape == (30, 3, 3)
     for k, (draw, row) in enumerate(((0, 7), (0, 107), (1, 7))):
         np.testing.assert_array_equal(starts[k], seen[draw][0][row])
@@ -389,7 +389,7 @@ def test_tuning_runs_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(
         ValueError, match=r"^brokk170: expected 61 feasible runs to tune on, got 60$"
     ):
-        sequences.tuning_goals(BROKK_170, 61, 0.1, 5)
+        sequences.tuning_set(BROKK_170, 61, 5, 0.1)
 
 
 def test_a_file_of_starts_by_hand(tmp_path: Path) -> None:
@@ -404,5 +404,5 @@ def test_a_file_of_starts_by_hand(tmp_path: Path) -> None:
     assert [s.name for s in found] == ["a"] and starts.tolist()[1] == [-0.25, 0.5, 0.1, 2.0, 1.0]
     found, starts = sequences.goals_and_starts(BROKK_170, None, None, 3, 0)
     assert len(found) == 9 and np.array_equal(
-        starts, sequences.scored_starts(BROKK_170, 3, found, 2)
+        starts, sequences.evaluation_starts(BROKK_170, 3, found, 2)
     )

@@ -139,7 +139,7 @@ def test_the_commands_run_one_after_the_other(here: Path, mini: Machine) -> None
     for words in COMMANDS[:4]:
         if words[0] == "evaluate":  # gains, so that nothing is tuned
             net = select_nets(mini, load_net(Path("net.npz")))
-            about = baselines.tuned_for(mini, net)
+            about = baselines.gains_metadata(mini, net)
             baselines.write_gains(Path("gains.json"), baselines.baselines(mini, net), about)
         given = [word for word in words if word not in ("--hours", "1")]
         assert main([*given, *QUICK[words[0]].split()]) == 0, words

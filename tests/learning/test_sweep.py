@@ -41,7 +41,7 @@ def short(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> No
         pose = np.array([1.5, 0.5, 0.58, 1.71, 1.24])
         monkeypatch.setattr(
             module,
-            "scored_starts",
+            "evaluation_starts",
             lambda m, num, s, seed: pose + 0.1 * np.random.default_rng(seed).random((num, 5)),
         )
         monkeypatch.setattr(
@@ -112,7 +112,7 @@ def test_a_seed_counts_once_in_the_table() -> None:
 def test_a_table_is_read_for_the_report_and_other_files_are_not(tmp_path: Path) -> None:
     path = tmp_path / "sweep.json"
     figures = module.table([seed_rows(1.0), seed_rows(3.0)], [])
-    about = baselines.tuned_for(BROKK_170, NET)
+    about = baselines.gains_metadata(BROKK_170, NET)
     path.write_text(json.dumps({"meta": about, "table": figures}))
     assert module.seeds_of(BROKK_170, NET, module.read_seeds(path)) == figures
     other = replace(NET, output_high=2 * NET.output_high)
@@ -223,12 +223,12 @@ def test_a_seed_goes_on_where_it_was_left_and_its_file_says_what_it_is(
 ) -> None:
     trained, sequences = SimpleNamespace(), [SimpleNamespace(name="x")]
     calls = stand(module, train=trained, identity_of={"nets": "n"}, task_sequences=sequences)
-    stand(module, scored_starts="poses")
+    stand(module, evaluation_starts="poses")
     stand(metrics, evaluate=(["run"], {}))
     arguments = (BROKK_170, NET, TASK, TINY, 3, tmp_path, 5)
     assert one_seed(*arguments) == ["run"]
     assert calls["train"] == (BROKK_170, NET, TASK, TINY, 3, tmp_path / "seed_3.npz", False)
-    assert calls["scored_starts"] == (
+    assert calls["evaluation_starts"] == (
         BROKK_170,
         5,
         sequences,
@@ -278,7 +278,7 @@ def test_a_sweep_has_baselines_beside_and_says_what_it_is_of(
     written = json.loads((out / "sweep.json").read_text())
     about = (
         metrics.metadata(BROKK_170, 3)
-        | baselines.tuned_for(BROKK_170, NET)
+        | baselines.gains_metadata(BROKK_170, NET)
         | {"seeds": 2, "failed": {}}
     )
     assert written["meta"] == about and written["table"] == figures == module.table(

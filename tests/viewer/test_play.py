@@ -984,7 +984,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("results")
     policy = random_policy(np.random.default_rng(0))
     save_policy(folder / "policy.npz", policy)
-    about = baselines.tuned_for(BROKK_170, policy.net)
+    about = baselines.gains_metadata(BROKK_170, policy.net)
     baselines.write_gains(folder / "gains.json", baselines.baselines(BROKK_170, policy.net), about)
     (folder / "commands.csv").write_text(
         "sequence,time,vx,vy,vz\nside,0,0,0.2,0\nside,1.5,0,0,0\nside,2,0,0,0\n"

@@ -85,7 +85,7 @@ def test_commands_are_rounded_in_the_best_of_all_ways() -> None:
             u[:, k, 0, joint] = way(u[:, k, 0, joint] * 127) / 127
     cost = np.linalg.norm(bound.errors(plant, u, goal), axis=-1).mean(axis=2)
     assert (np.ptp(cost, axis=1) > 0).all()
-    found = bound.whole_counts(plant, opening, goal, 5)
+    found = bound.quantise(plant, opening, goal, 5)
     np.testing.assert_allclose(found, [u[row, cost[row].argmin(), 0] for row in (0, 1)], atol=1e-9)
 
 
