@@ -1,4 +1,4 @@
-"""Derivatives of the rewards by every action: against finite differences of rollouts, and by hand."""
+"""Derivatives of the rewards by the actions: against finite differences, and by hand."""
 
 from __future__ import annotations
 
