@@ -28,17 +28,9 @@ ABOVE = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])  # right and up, seen from
 MUTED, GRID, TRACK = (120, 128, 138), (228, 230, 232), (212, 216, 221)
 SOIL, STEEL, WARNING = (214, 203, 186), (74, 80, 88), (208, 28, 28)
 GOAL, MEASURED, PATH = INK, (0, 158, 115), (230, 159, 0)
-COLOURS: dict[str, Colour] = {
-    "rl": (0, 114, 178),
-    "jacobian": (213, 94, 0),
-    "levers": (124, 87, 148),
-}
-STATUS_COLOURS: dict[str, Colour] = {
-    "driving": (0, 130, 90),
-    "ready": (0, 100, 170),
-    "waiting": WARNING,
-    "": MUTED,
-}
+DRIVING, READY = (0, 130, 90), (0, 100, 170)  # status colours
+SMALL_COLOURS = (INK, MUTED, TRACK, SOIL, STEEL, WARNING, MEASURED, PATH, DRIVING, READY)
+COLOURS = {"rl": (0, 114, 178), "jacobian": (213, 94, 0), "levers": (124, 87, 148)}
 TITLES = {
     "rl": "RL policy",
     "jacobian": "Jacobian + PID",
@@ -61,7 +53,7 @@ class Scene(NamedTuple):
     target: Array = NO_POINTS  # its next point [m], (1, 3) or none
     title: str = ""
     status: str = ""
-    state: str = ""  # of `STATUS_COLOURS`
+    status_colour: Colour = MUTED
     colour: Colour = COLOURS["rl"]
     notes: Sequence[str] = ()
     in_view: Array = NO_POINTS  # points that the views show [m] (K, 3); none: the whole reach
@@ -223,7 +215,7 @@ def _panel(canvas: Canvas, machine: Machine, scene: Scene, box: Box) -> None:
     title_size = int(np.clip(room / (0.7 * max(1, len(scene.title))), 8, 18))
     canvas.circle(np.array([left + 22.0, 21.0]), 7, scene.colour)
     canvas.text(left + 36, 21, scene.title, title_size)
-    canvas.text(left + width - 16, 21, scene.status, 14, STATUS_COLOURS[scene.state], 1.0)
+    canvas.text(left + width - 16, 21, scene.status, 14, scene.status_colour, 1.0)
     if np.isfinite(scene.q).all():
         _views(canvas, machine, scene, layout)
     else:
@@ -248,12 +240,12 @@ def _views(canvas: Canvas, machine: Machine, scene: Scene, layout: Layout) -> No
         (f"goal {np.linalg.norm(scene.v_goal):.2f} m/s", GOAL),
         (f"measured {np.linalg.norm(tool_velocity(frames, scene.q_dot)):.2f} m/s", MEASURED),
     ]
-    for i in np.flatnonzero(near_limit(machine, scene.q)):
-        legend.append((f"{machine.names[i]} near its limit", WARNING))
+    warned = np.flatnonzero(near_limit(machine, scene.q))
+    legend += [(f"{machine.names[i]} near its limit", WARNING) for i in warned]
     if near_singular(machine, scene.q):
         legend.append(("near a singularity", WARNING))
-    for i, (text, colour) in enumerate(legend):
-        canvas.text(layout.side[0] + layout.side[2] - 14, HEAD + 14 + 18 * i, text, 12, colour, 1.0)
+    for i, (text, ink) in enumerate(legend):
+        canvas.text(layout.side[0] + layout.side[2] - 14, HEAD + 14 + 18 * i, text, 12, ink, 1.0)
 
 
 def _backdrop(canvas: Canvas, machine: Machine, camera: Camera, box: Box, label: str) -> None:

@@ -6,19 +6,17 @@ The window sends requests to the loop (`control_process`) and shows the telemetr
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from brokk_min.can.canopen import open_bus
 from brokk_min.can.drive_log import Telemetry, TelemetryReader
-from brokk_min.can.operator_input import shape_axis
 from brokk_min.can.safety_gate import fault_name
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
 from brokk_min.viewer import tracing
-from brokk_min.viewer.canvas import Canvas
+from brokk_min.viewer.canvas import Canvas, Colour
 from brokk_min.viewer.control_process import (
     BusOptions,
     Request,
@@ -26,145 +24,23 @@ from brokk_min.viewer.control_process import (
     receive_telemetry,
     send_request,
 )
-from brokk_min.viewer.drawing import COLOURS, NO_POINTS, STEEL, TITLES, Scene, draw
+from brokk_min.viewer.drawing import (
+    COLOURS,
+    DRIVING,
+    NO_POINTS,
+    READY,
+    STEEL,
+    TITLES,
+    WARNING,
+    Scene,
+    draw,
+)
+from brokk_min.viewer.input_handler import LEVER_KEYS, PAD_SWITCH, InputHandler
 from brokk_min.viewer.window import Window, open_window
 
 SIZE = (1120, 680)  # of the window [px]
-RISE = 0.25  # s from a key's press to full deflection (assumed)
 STALE = 0.5  # s without telemetry, then angles count as unknown (assumed)
 TRAIL = 600  # tool positions
-
-# plus and minus of x, y, z, as the top view shows them; of the driven joints
-VELOCITY_KEYS = (("up", "down"), ("left", "right"), ("w", "s"))
-LEVER_KEYS = (("q", "a"), ("w", "s"), ("e", "d"), ("r", "f"), ("t", "g"), ("y", "h"))
-PAD_AXES = (1, 0, 4, 3)  # 2 and 5 are triggers, which do not rest in the middle
-PAD_SWITCH, PAD_MODE, PAD_NEXT, PAD_AGAIN = 5, 3, 0, 1
-
-
-class InputHandler:
-    """Keyboard and gamepad as one operator.
-
-    The dead-man switch (space, or the gamepad's button) counts only if it is pressed with nothing
-    deflected. It must be released first after a loss of focus or gamepad and a change of mode.
-
-    Args:
-        machine: its driven joints have a lever each.
-        pygame: the module, with a window.
-        modes: names of the controllers, the last one "levers".
-    """
-
-    def __init__(self, machine: Machine, pygame: Any, modes: Sequence[str]) -> None:
-        self.machine = machine
-        self.pygame = pygame
-        self.modes = modes
-        self.mode = 0
-        self.held = set[int]()  # keys
-        self.focus = True
-        self.blocked = True  # must the switch be released first?
-        self.enable = False
-        self.lost = False  # gamepad unplugged?
-        self.closed = False
-        self.task = ""  # "next" or "again"
-        self.deflection: Array = np.zeros(3)
-        pygame.joystick.init()
-        self.pad: Any = pygame.joystick.Joystick(0) if pygame.joystick.get_count() else None
-
-    @property
-    def levers(self) -> bool:
-        """Does the operator move the joints one by one?"""
-        return self.modes[self.mode] == "levers"
-
-    def handle(self, event: Any) -> None:
-        """Take in one event of pygame."""
-        pg = self.pygame
-        match event.type:
-            case pg.QUIT:
-                self.closed = True
-            case pg.KEYDOWN:
-                self._press_key(event.key)
-            case pg.KEYUP:
-                self.held.discard(event.key)
-            case pg.WINDOWFOCUSLOST:
-                self.focus = False
-                self.blocked = True
-                self.held.clear()
-            case pg.WINDOWFOCUSGAINED:
-                self.focus = True
-            case pg.JOYBUTTONDOWN:
-                self._press_button(event.button)
-            case pg.JOYDEVICEADDED if self.pad is None:
-                self._change_pad(pg.joystick.Joystick(event.device_index))
-            case pg.JOYDEVICEREMOVED:
-                if self.pad and event.instance_id == self.pad.get_instance_id():
-                    self._change_pad(None)
-
-    def _press_key(self, key: int) -> None:
-        pg = self.pygame
-        self.held.add(key)
-        self.lost = False  # the keyboard takes over
-        self.closed |= key == pg.K_ESCAPE
-        if key == pg.K_TAB:
-            self._next_mode()
-        elif key in (pg.K_RETURN, pg.K_BACKSPACE):
-            self.task = "next" if key == pg.K_RETURN else "again"
-
-    def _press_button(self, button: int) -> None:
-        if button == PAD_MODE:
-            self._next_mode()
-        elif button in (PAD_NEXT, PAD_AGAIN):
-            self.task = "next" if button == PAD_NEXT else "again"
-
-    def _change_pad(self, pad: Any) -> None:
-        self.pad = pad
-        self.lost = pad is None
-        self.blocked = True
-
-    def _next_mode(self) -> None:
-        self.mode = (self.mode + 1) % len(self.modes)
-        self.blocked = True
-
-    def request(self, seconds: float) -> Request:
-        """The operator's input, `seconds` after the last time."""
-        target = self._target()
-        if self.deflection.shape != target.shape:
-            self.deflection = np.zeros_like(target)
-        last = np.where(target * self.deflection < 0, 0.0, self.deflection)
-        step = seconds / RISE
-        ramp = last + np.clip(target - last, -step, step)
-        self.deflection = np.where(target == 0, 0.0, ramp)  # released: neutral at once
-        self._update_switch(bool(target.any()))
-        v_goal, levers = np.zeros(3), np.zeros(len(self.machine.driven))
-        if self.levers:
-            levers = self.deflection
-        else:
-            length = float(np.linalg.norm(self.deflection))
-            v_goal = self.machine.tool_speed * self.deflection / max(1.0, length)
-        return Request(self.mode, self.enable, not self.lost, v_goal, levers)
-
-    def _target(self) -> Array:
-        """Deflections of stick or levers in [-1, 1]; keys give a third of it with shift."""
-        key_code = self.pygame.key.key_code
-        pairs = LEVER_KEYS[: len(self.machine.driven)] if self.levers else VELOCITY_KEYS
-        held = [[key_code(name) in self.held for name in pair] for pair in pairs]
-        target = np.array([float(plus) - float(minus) for plus, minus in held])
-        if not self.focus:
-            return np.zeros_like(target)
-        if self.held & {self.pygame.K_LSHIFT, self.pygame.K_RSHIFT}:
-            target /= 3
-        if self.pad is not None:
-            axes = [i for i in PAD_AXES[: len(target)] if i < self.pad.get_numaxes()]
-            target[: len(axes)] -= shape_axis([self.pad.get_axis(i) for i in axes])
-        return np.asarray(np.clip(target, -1, 1))
-
-    def _update_switch(self, deflected: bool) -> None:
-        has_button = self.pad is not None and self.pad.get_numbuttons() > PAD_SWITCH
-        button = has_button and self.pad.get_button(PAD_SWITCH)
-        pressed = self.focus and (self.pygame.K_SPACE in self.held or bool(button))
-        if pressed and deflected and not self.enable:
-            self.blocked = True
-        elif self.focus and not pressed:
-            self.blocked = False
-        self.enable = pressed and not self.blocked
 
 
 class Session:
@@ -224,10 +100,10 @@ class Session:
         """What the window shows now; angles between the last two ticks, for smooth motion."""
         unknown = np.full(self.machine.n, np.nan)
         telemetry = Telemetry(0, unknown, unknown, np.zeros(self.machine.n), np.zeros(3), False)
-        status, state = hint or "no telemetry", "waiting"
+        status, colour = hint or "no telemetry", WARNING
         if self.telemetry is not None and now - self.arrived <= STALE:
             telemetry = self.telemetry
-            status, state = gate_status(self.machine, telemetry, hint)
+            status, colour = gate_status(self.machine, telemetry, hint)
         scene = Scene(
             self._interpolate(telemetry.q, now),
             telemetry.q_dot,
@@ -237,7 +113,7 @@ class Session:
             path=self.path,
             title=TITLES.get(mode, self.machine.name),
             status=status,
-            state=state,
+            status_colour=colour,
             colour=COLOURS.get(mode, STEEL),
             notes=self.notes(mode),
         )
@@ -275,15 +151,15 @@ class Session:
         return notes + tracing.attempts_table(self.attempts, self.task)
 
 
-def gate_status(machine: Machine, telemetry: Telemetry, hint: str) -> tuple[str, str]:
-    """Status of the gate as text, and its state, of `drawing.STATUS_COLOURS`."""
+def gate_status(machine: Machine, telemetry: Telemetry, hint: str) -> tuple[str, Colour]:
+    """Status of the gate as text, and its colour."""
     if telemetry.driving:
-        return "driving", "driving"
+        return "driving", DRIVING
     if telemetry.active_fault:
-        return f"waiting: {fault_name(machine, telemetry.active_fault)}", "waiting"
+        return f"waiting: {fault_name(machine, telemetry.active_fault)}", WARNING
     if telemetry.latched_fault:
-        return f"stopped: {fault_name(machine, telemetry.latched_fault)}", "waiting"
-    return hint or "ready", "ready"
+        return f"stopped: {fault_name(machine, telemetry.latched_fault)}", WARNING
+    return hint or "ready", READY
 
 
 def next_step(session: Session, handler: InputHandler) -> str:

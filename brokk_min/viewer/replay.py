@@ -221,20 +221,9 @@ def _write_gif(file: IO[bytes], images: Images, size: tuple[int, int], fps: floa
 
 def _palette() -> Image.Image:
     """All colours of a picture, mixed with the background as on smooth edges."""
-    colours = np.array(
-        [
-            *drawing.COLOURS.values(),
-            *drawing.STATUS_COLOURS.values(),
-            drawing.INK,
-            drawing.MEASURED,
-            drawing.PATH,
-            drawing.STEEL,
-            drawing.SOIL,
-            drawing.TRACK,
-        ]
-    )
+    colours = np.array([*drawing.COLOURS.values(), *drawing.SMALL_COLOURS])
     fractions = np.linspace(0, 0.85, 14)[:, None, None]
-    mixed = colours + fractions * (np.array(BACKGROUND) - colours)
+    mixed = colours + fractions * np.subtract(BACKGROUND, colours)
     palette = Image.new("P", (1, 1))
     palette.putpalette([*BACKGROUND, *np.rint(mixed).astype(int).ravel().tolist()])
     return palette
@@ -247,8 +236,7 @@ def _write_mp4(file: IO[bytes], images: Images, size: tuple[int, int], fps: floa
             assert process.stdin is not None
             process.stdin.writelines(image.tobytes() for image in images)
     except FileNotFoundError as error:
-        wanted = "ffmpeg for .mp4, or a name ending in .gif"
-        raise ValueError(f"film: expected {wanted}, got none") from error
+        raise ValueError("film: expected ffmpeg for .mp4, or a name in .gif, got none") from error
     except BrokenPipeError as error:
         raise ValueError("film: expected ffmpeg to read all pictures, got its end") from error
     if process.returncode:
