@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brokk_min.kinematics import forward_kinematics, jacobian, tool_position, tool_velocity
 from brokk_min.machine import PWM_MAX, Array, Machine
-from brokk_min.viewer.canvas import BACKGROUND, INK, Box, Canvas, Colour
+from brokk_min.viewer.window import BACKGROUND, INK, Box, Canvas, Colour
 
 # all assumed
 NEAR_LIMIT = 0.05  # of a joint's range: nearer to its end is a warning

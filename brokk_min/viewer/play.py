@@ -16,7 +16,6 @@ from brokk_min.evaluation.rollout import Controller
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
 from brokk_min.viewer import tracing
-from brokk_min.viewer.canvas import Canvas, Colour
 from brokk_min.viewer.control_process import (
     BusOptions,
     Request,
@@ -36,7 +35,7 @@ from brokk_min.viewer.drawing import (
     draw,
 )
 from brokk_min.viewer.input_handler import LEVER_KEYS, PAD_SWITCH, InputHandler
-from brokk_min.viewer.window import Window, open_window
+from brokk_min.viewer.window import Canvas, Colour, Window, open_window
 
 SIZE = (1120, 680)  # of the window [px]
 STALE = 0.5  # s without telemetry, then angles count as unknown (assumed)

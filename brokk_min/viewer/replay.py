@@ -24,8 +24,7 @@ from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocit
 from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import Array, Machine
 from brokk_min.viewer import drawing
-from brokk_min.viewer.canvas import BACKGROUND, Canvas, Colour
-from brokk_min.viewer.window import open_window
+from brokk_min.viewer.window import BACKGROUND, Canvas, Colour, open_window
 
 FFMPEG = (  # raw pictures in, MP4 of even width and height out
     "ffmpeg -loglevel error -f rawvideo -pix_fmt rgb24 -s {0}x{1} -r {2} -i - -pix_fmt yuv420p "
