@@ -21,9 +21,9 @@ import numpy as np
 from brokk_min import actuator, env, jacobian, kinematics, machine, observation
 from brokk_min.cli.options import SHIPPED
 from brokk_min.env import TaskConfig, terminated
-from brokk_min.evaluation import metrics, sequences, trust
+from brokk_min.evaluation import metrics, sequences
 from brokk_min.evaluation.rollout import rollout
-from brokk_min.identification import excitation, fitting, logs
+from brokk_min.identification import excitation, fitting, logs, validation
 from brokk_min.jacobian import JacobianController
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import STAND, PolicyController, load_policy
@@ -179,7 +179,7 @@ def fitted(kind: str, noise: float, seed: int) -> dict[str, float]:
     """Nets of the driven joints, on drives like a policy's: the worst joint."""
     net, log = nets(kind, seed, noise=noise)
     test = excitation.task_log(M, 20, 40.0, np.random.default_rng(seed + 1))
-    verdict = trust.judge(net, log, test, M)
+    verdict = validation.validate(net, log, test, M)
     rows = [verdict["joints"][M.names[i]] for i in M.driven]
     return {
         "10 s [rad/s]": max(row["free_run"]["10"]["velocity_rmse"] for row in rows),

@@ -12,7 +12,7 @@ import tyro
 from brokk_min.actuator import ActuatorNet, select_nets
 from brokk_min.cli.options import Command, Name, WrongUse, check, chosen_policy
 from brokk_min.env import TaskConfig
-from brokk_min.evaluation import baselines, experiments, figures, metrics, preliminary, trust
+from brokk_min.evaluation import baselines, experiments, figures, metrics, preliminary
 from brokk_min.evaluation import reproduce as chain
 from brokk_min.evaluation.metrics import summary
 from brokk_min.evaluation.perfect_model import perfect_models
@@ -24,6 +24,7 @@ from brokk_min.evaluation.sequences import (
     task_sequences,
     write_starts,
 )
+from brokk_min.identification import validation
 from brokk_min.identification.excitation import collect
 from brokk_min.identification.files import write_json
 from brokk_min.identification.fitting import PAPER_RECIPE, FitConfig, fit
@@ -94,7 +95,7 @@ class Fit:
         net = fit(
             log, self._recipe(known), self.seed, self.velocity_samples, known.name if known else ""
         )
-        verdict = trust.judge(net, log, test, known)
+        verdict = validation.validate(net, log, test, known)
         save_net(self.out, net)
         if self.json:
             meta: dict[str, Any] = {"seed": self.seed, "rate": net.rate, "history": net.history}
@@ -191,7 +192,7 @@ def train_command() -> Any:
 
 def sweep_command() -> Any:
     """The command `sweep`; made on demand as `train`."""
-    from brokk_min.learning.sweep import show, sweep
+    from brokk_min.evaluation.seeds import show, sweep
     from brokk_min.ppo import PPOConfig
 
     @dataclass(kw_only=True)

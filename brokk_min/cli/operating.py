@@ -239,4 +239,4 @@ class Replay(Command):
                 f"--sequence, --controllers, --start: expected some of {named}, of {known} "
                 f"and below {num}, got {self.sequence}, {list(self.controllers)}, {self.start}"
             )
-        return replay.driven_again(machine, results, self.controllers, sequence, self.start)
+        return replay.simulate_again(machine, results, self.controllers, sequence, self.start)

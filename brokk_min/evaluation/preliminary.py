@@ -4,65 +4,40 @@ The paper's tests are put to a machine (the analytic plant) and to its nets side
 and velocities are means over a tick, without encoder and estimator: what is compared is the motion.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from brokk_min import actuator, kinematics
-from brokk_min.actuator import ActuatorNet, plant_reset, plant_step, select_nets
+from brokk_min import kinematics
+from brokk_min.actuator import ActuatorNet, select_nets
 from brokk_min.evaluation.figures import Panel, plot_panels
 from brokk_min.identification import excitation, fitting
 from brokk_min.identification import validation as scores
 from brokk_min.identification.fitting import FitConfig
 from brokk_min.identification.logs import RETURN, Log
-from brokk_min.identification.validation import net_step
+from brokk_min.identification.validation import (
+    Simulator,
+    named_times,
+    net_simulator,
+    plant_simulator,
+    response_times,
+    step_velocity,
+    steps,
+)
 from brokk_min.machine import BROKK_170, PWM_MAX, Array, Machine, encode_pwm
-
-Mover = Callable[
-    [Array, Array], Array
-]  # angles (..., n) and commands (T, ..., n) -> angles (T+1, ..., n)
 
 STARTS = {
     BROKK_170.name: (1.5, 0.5, 0.58, 1.71, 1.24)
 }  # rad, paper: q_s; other machines start mid range
 SWEEP_S = 40.0  # s, assumed: long enough for the slower sweep of the Brokk's slowest joint
-RISE = 0.63  # paper's response times: 0.4 s and 0.1 s, read as the time to 63 % of the change
 GAP_S, GAP_RUNS = 30.0, 20  # s, paper; sequences that the figure's one is compared with
 
 
-def plant_mover(machine: Machine) -> Mover:
-    """The analytic plant from rest."""
-
-    def move(q: Array, u: Array) -> Array:
-        state = plant_reset(machine, q)
-        angles = [state.q]
-        for command in u:
-            state = plant_step(machine, state, command)
-            angles.append(state.q)
-        return np.array(angles)
-
-    return move
-
-
-def net_mover(net: ActuatorNet) -> Mover:
-    """The nets from rest."""
-
-    def move(q: Array, u: Array) -> Array:
-        history = actuator.initial_history(q, net.history).astype(np.float32)
-        angles = [q]
-        for command in u:
-            history, q = net_step(net, history, q, command)
-            angles.append(q)
-        return np.array(angles)
-
-    return move
-
-
-def driven_mover(machine: Machine, net: ActuatorNet) -> Mover:
+def driven_mover(machine: Machine, net: ActuatorNet) -> Simulator:
     """Nets for the driven joints of a machine; the others rest."""
-    move = net_mover(select_nets(machine, net))
+    move = net_simulator(select_nets(machine, net))
 
     def all_joints(q: Array, u: Array) -> Array:
         angles = np.repeat(q[None], len(u) + 1, axis=0)
@@ -72,15 +47,15 @@ def driven_mover(machine: Machine, net: ActuatorNet) -> Mover:
     return all_joints
 
 
-def movers(machine: Machine, net: ActuatorNet) -> dict[str, Mover]:
+def movers(machine: Machine, net: ActuatorNet) -> dict[str, Simulator]:
     """Both, by the names they have in figures."""
-    return {"machine": plant_mover(machine), "nets": driven_mover(machine, net)}
+    return {"machine": plant_simulator(machine), "nets": driven_mover(machine, net)}
 
 
 # --- preliminary tests ------------------------------------------------------------------------------
 
 
-def sweeps(machine: Machine, move: Mover, joint: int, u: Array) -> list[Array]:
+def sweeps(machine: Machine, move: Simulator, joint: int, u: Array) -> list[Array]:
     """A joint from stop to stop under each row of constant commands `u` (k, n), the others from mid range.
 
     Returns:
@@ -105,74 +80,6 @@ def other_commands(machine: Machine, joint: int) -> Array:
     u[others] = -machine.pwm_limit / PWM_MAX
     u[others[-1:]] *= -1
     return u
-
-
-def steps(
-    move: Mover, q_low: Array, q_high: Array, level: Array, before: Array, wait: int
-) -> Array:
-    """Angles (2 wait + 1, 2, 2, n, n) around a step of each joint alone to the command `level` (n,).
-
-    Axes: tick; from idle, or out of a motion under `before` (n,); up, down; stepping joint; joint. The
-    step comes after `wait` ticks. A joint begins a tenth of its range off the end behind it.
-    Paper: Sec. 3.2 (past movement)
-    """
-    n = len(level)
-    sign, own = np.array([1, -1])[:, None, None], np.eye(n, dtype=bool)
-    behind = np.where(sign > 0, 0.9 * q_low + 0.1 * q_high, 0.1 * q_low + 0.9 * q_high)
-    q = np.broadcast_to(np.where(own, behind, (q_low + q_high) / 2), (2, 2, n, n))
-    u = np.zeros((2 * wait, 2, 2, n, n))
-    u[:wait, 1] = sign * own * before
-    u[wait:] = sign * own * level
-    return move(q, u)
-
-
-def step_velocity(angles: Array, rate: float) -> Array:
-    """Velocity of each stepping joint in its direction [rad/s] (2 wait, 2, 2, n): positive in both."""
-    return np.asarray(
-        np.diff(np.diagonal(angles, axis1=3, axis2=4), axis=0) * rate * np.array([[1], [-1]])
-    )
-
-
-def response_times(angles: Array, rate: float) -> Array:
-    """Time [s] from the step to 63 % of the change of velocity, (2, 2, n) as in `steps`; nan: no change.
-
-    Velocities are means over a tick and stand at its middle; between ticks the curve is a line.
-    """
-    wait = (len(angles) - 1) // 2
-    after = step_velocity(angles, rate)[wait - 1 :]
-    change = after.max(axis=0) - after[0]
-    done = (after - after[0]) / np.where(change > 1e-3, change, np.nan)
-    at = np.maximum(
-        np.argmax(done >= RISE, axis=0), 1
-    )  # row k is the tick that begins k - 1 after the step
-    high, low = (np.take_along_axis(done, k[None], axis=0)[0] for k in (at, at - 1))
-    times: Array = (at - 0.5 - (high - RISE) / (high - low)) / rate
-    return times
-
-
-def step_commands(move: Mover, q_low: Array, q_high: Array, level: Array, wait: int) -> Array:
-    """Commands (n,) half way to `level` from the least tenth of it at which a joint moves, up and down."""
-    shares, speeds = np.arange(1, 11) / 10, []
-    for share in shares:
-        angles = steps(move, q_low, q_high, share * level, share * level, wait)
-        speeds.append(step_velocity(angles, 1.0)[wait:, 0].max(axis=0).min(axis=0))  # (n,)
-    moves = np.array(speeds) > 0.05 * speeds[-1]
-    return np.asarray((shares[np.argmax(moves, axis=0)] + 1) / 2 * level)
-
-
-def named_times(times: Array, joints: Sequence[str]) -> dict[str, Any]:
-    """Response times by joint, for JSON: {joint: {"idle": {"up", "down"}, "moving": {...}}} [s or None]."""
-
-    def plain(time: float) -> float | None:
-        return None if np.isnan(time) else float(time)
-
-    return {
-        name: {
-            kind: {"up": plain(up), "down": plain(down)}
-            for kind, (up, down) in zip(("idle", "moving"), times[..., j], strict=True)
-        }
-        for j, name in enumerate(joints)
-    }
 
 
 # --- sim-to-real gap --------------------------------------------------------------------------------
@@ -217,7 +124,7 @@ class Tests(NamedTuple):
     angles: Array  # around steps of the driven joints, see `steps`
 
 
-def preliminary_tests(machine: Machine, move: Mover) -> Tests:
+def preliminary_tests(machine: Machine, move: Simulator) -> Tests:
     """All preliminary tests with the last driven joint, the paper's q5. Paper: Sec. 3.2, Fig. 2"""
     joint, limit = int(machine.driven[-1]), machine.pwm_limit
     slow, level = (

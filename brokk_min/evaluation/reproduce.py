@@ -34,7 +34,7 @@ def reproduce(
     training seeds in the file `sweep`, which `sweep.sweep` wrote, join the report.
     """
     from brokk_min.learning.checkpoint import train_policy
-    from brokk_min.learning.sweep import read_seeds, seeds_of
+    from brokk_min.evaluation.seeds import read_seeds, seeds_of
     from brokk_min.ppo import PPOConfig  # torch, only where something is trained
 
     seeds = read_seeds(sweep) if sweep else {}

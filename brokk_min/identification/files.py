@@ -10,6 +10,7 @@ import os
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import IO, Any
 
@@ -20,6 +21,19 @@ Floats = NDArray[np.float64]
 # a folder a machine: policy and gains of `make reproduce`, start poses
 SHIPPED = Path(__file__).parents[1] / "shipped"
 Table = dict[str, list[Any]]  # cells by column; row 2 of the file is cell 0
+
+
+def require(package: str, extra: str) -> Any:
+    """Import a package that comes with an extra of pyproject.toml.
+
+    ValueError: it is not installed, with the extra that brings it.
+    """
+    try:
+        return import_module(package)
+    except ImportError as error:
+        raise ValueError(
+            f"{package}: expected the extra brokk_min[{extra}], got {error}"
+        ) from error
 
 
 @contextmanager

@@ -21,8 +21,13 @@ from tqdm import tqdm
 from brokk_min import ppo
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import State, TaskConfig, observation_scale
-from brokk_min.identification.extras import need
-from brokk_min.identification.files import expect_same, load_arrays, load_header, whole_file
+from brokk_min.identification.files import (
+    expect_same,
+    load_arrays,
+    load_header,
+    require,
+    whole_file,
+)
 from brokk_min.identification.net_file import fingerprint
 from brokk_min.learning.episodes import paper_weights
 from brokk_min.learning.gym_env import TaskVectorEnv
@@ -39,12 +44,15 @@ def describe_training(
     machine: Machine, net: ActuatorNet, task: TaskConfig, config: PPOConfig, critic: bool, seed: int
 ) -> dict[str, Any]:
     """All that decides the outcome of a training; kept in checkpoints and policies."""
+    settings = asdict(config) | {"critic": critic or task.paper}
+    if settings["critic"]:
+        settings["log_std_end"] = None
     return {
         **contract(machine),
         "actuator": fingerprint(net),
         "seed": seed,
         "task": asdict(task),
-        "settings": asdict(config) | {"critic": critic},
+        "settings": settings,
     }
 
 
@@ -267,7 +275,7 @@ def tensorboard_writer(folder: Path | None) -> Iterator[Callable[[dict[str, Any]
     if folder is None:
         yield lambda row: None
         return
-    with need("torch.utils.tensorboard", "tensorboard").SummaryWriter(str(folder)) as writer:
+    with require("torch.utils.tensorboard", "tensorboard").SummaryWriter(str(folder)) as writer:
 
         def write(row: dict[str, Any]) -> None:
             for name, value in row.items():

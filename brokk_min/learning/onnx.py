@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from brokk_min.env import COMPENSATION
-from brokk_min.identification.extras import need
-from brokk_min.identification.files import whole_file
+from brokk_min.identification.files import require, whole_file
 from brokk_min.learning.policy import STANDSTILL_TIMEOUT, Policy
 
 
@@ -20,7 +19,7 @@ def export_onnx(path: Path, policy: Policy) -> None:
     ValueError: the package onnx is not there.
     """
     names = "onnx", "onnx.checker", "onnx.helper", "onnx.numpy_helper"
-    onnx, checker, helper, numpy_helper = (need(name, "export") for name in names)
+    onnx, checker, helper, numpy_helper = (require(name, "export") for name in names)
     layers = len(policy.weights) // 2
     arrays = {f"{'wb'[i % 2]}{i // 2}": weight for i, weight in enumerate(policy.weights)}
     nodes = []

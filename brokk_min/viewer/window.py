@@ -1,98 +1,125 @@
-"""Shapes onto a surface, into a window or an image: all that needs pygame (extra `play`)."""
+"""Canvas and window of pygame (extra `play`), which is imported when the first one is made."""
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from brokk_min.identification.extras import need
-from brokk_min.kinematics import forward_kinematics, tool_position
-from brokk_min.machine import Array, Machine
-from brokk_min.viewer.drawing import (
-    PAPER,
-    Circle,
-    Clip,
-    Colour,
-    Line,
-    Polygon,
-    Scene,
-    Shape,
-    Text,
-    draw,
-)
+from brokk_min.identification.files import require
+from brokk_min.machine import Array
+
+Colour = tuple[int, int, int]
+Box = tuple[float, float, float, float]  # left, top, width, height [px]
+BACKGROUND, INK = (250, 250, 247), (33, 37, 43)
 
 
-def need_pygame() -> Any:
-    """pygame, which is imported only where something is painted; ValueError: it is not installed."""
+def require_pygame() -> Any:
+    """The module pygame; ValueError: it is not installed."""
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    return need("pygame", "play")
+    return require("pygame", "play")
+
+
+class Canvas:
+    """A picture that is drawn twice as large and scaled down, for smooth edges; text lies on top.
+
+    Coordinates are pixels, y down; points are (k, 2). Only one canvas of a size at a time.
+    """
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        self.size = size
+        self.draw = require_pygame().draw
+        self.large = _large_surface(size)
+        self.large.set_clip(None)
+        self.large.fill(BACKGROUND)
+        self.texts: list[tuple[Any, tuple[float, float]]] = []
+
+    def clip(self, box: Box | None) -> None:
+        """Cut off what follows at this box; text is not cut."""
+        self.large.set_clip(None if box is None else [round(2 * edge) for edge in box])
+
+    def line(self, points: Array, colour: Colour, width: int = 1) -> None:
+        """A line through points."""
+        self.draw.lines(self.large, colour, False, (2 * points).tolist(), 2 * width)
+
+    def polygon(self, points: Array, colour: Colour) -> None:
+        """A filled polygon."""
+        self.draw.polygon(self.large, colour, (2 * points).tolist())
+
+    def circle(self, centre: Array, radius: float, colour: Colour, width: int = 0) -> None:
+        """A filled circle, or a ring of some width."""
+        self.draw.circle(self.large, colour, (2 * centre).tolist(), 2 * radius, 2 * width)
+
+    def bar(self, x0: float, x1: float, y: float, half: float, colour: Colour) -> None:
+        """A filled rectangle from x0 to x1, `half` of it above y."""
+        corners = [[x0, y - half], [x1, y - half], [x1, y + half], [x0, y + half]]
+        self.polygon(np.array(corners), colour)
+
+    def text(
+        self,
+        x: float,
+        y: float,
+        text: str,
+        size: int = 13,
+        colour: Colour = INK,
+        anchor: float = 0.0,
+    ) -> None:
+        """Text at half its height; `anchor` 0 puts its left end at x, 1 its right end."""
+        word = _word(text, size, colour)
+        self.texts.append((word, (x - anchor * word.get_width(), y - word.get_height() / 2)))
+
+    def surface(self) -> Any:
+        """The finished picture as a pygame surface."""
+        surface = require_pygame().transform.smoothscale(self.large, self.size)
+        surface.blits(self.texts)
+        return surface
+
+    def image(self) -> NDArray[np.uint8]:
+        """The finished picture as an image (height, width, 3); needs no display."""
+        pixels: NDArray[np.uint8] = require_pygame().surfarray.array3d(self.surface())
+        return np.ascontiguousarray(pixels.swapaxes(0, 1))
+
+
+@lru_cache(maxsize=2)
+def _large_surface(size: tuple[int, int]) -> Any:
+    return require_pygame().Surface((2 * size[0], 2 * size[1]), depth=32)
 
 
 @lru_cache(maxsize=1024)
 def _word(text: str, size: int, colour: Colour) -> Any:
-    """Text as a surface, on the paper's colour so that it stays legible over an arm."""
-    return _font(size).render(text, True, colour, PAPER)
+    """Text as a surface, on the background's colour so that it is legible over an arm."""
+    return _font(size).render(text, True, colour, BACKGROUND)
 
 
 @lru_cache(maxsize=16)
 def _font(size: int) -> Any:
     """The typeface that matplotlib brings: the same everywhere."""
-    import matplotlib
-
-    pygame = need_pygame()
+    pygame = require_pygame()
     pygame.font.init()
     return pygame.font.Font(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf", size)
 
 
-def paint(surface: Any, shapes: Sequence[Shape]) -> None:
-    """Shapes on a pygame surface, edges smoothed: drawn twice as large and scaled down; text lies on top."""
-    pygame, twice = need_pygame(), _canvas((2 * surface.get_width(), 2 * surface.get_height()))
-    twice.set_clip(None)
-    twice.fill(PAPER)
-    for shape in shapes:
-        match shape:
-            case Line(points, colour, width):
-                pygame.draw.lines(twice, colour, False, (2 * points).tolist(), 2 * width)
-            case Polygon(points, colour):
-                pygame.draw.polygon(twice, colour, (2 * points).tolist())
-            case Circle(centre, radius, colour):
-                pygame.draw.circle(twice, colour, (2 * centre).tolist(), 2 * radius)
-            case Clip(box):
-                twice.set_clip([round(2 * edge) for edge in box])
-    pygame.transform.smoothscale(twice, surface.get_size(), surface)
-    for at, text, size, colour, anchor in (shape for shape in shapes if isinstance(shape, Text)):
-        word = _word(text, size, colour)
-        surface.blit(word, (at[0] - anchor * word.get_width(), at[1] - word.get_height() / 2))
-
-
-@lru_cache(maxsize=2)
-def _canvas(size: tuple[int, int]) -> Any:
-    return need_pygame().Surface(size, depth=32)
-
-
 class Window:
-    """A window for shapes; ValueError: no pygame, or no display."""
+    """A window for canvases; ValueError: no pygame, or no display."""
 
     def __init__(self, size: tuple[int, int], title: str) -> None:
-        self.pygame = pygame = need_pygame()
+        self.pygame = require_pygame()
         try:
-            pygame.display.init()
-            self.surface = pygame.display.set_mode(size)
-        except pygame.error as error:
-            raise ValueError(
-                f"window: expected a display (SDL_VIDEODRIVER=dummy draws unseen), got {error}"
-            ) from error
-        pygame.display.set_caption(title)
-        self.clock = pygame.time.Clock()
+            self.pygame.display.init()
+            self.surface = self.pygame.display.set_mode(size)
+        except self.pygame.error as error:
+            raise _no_display(str(error)) from error
+        self.pygame.display.set_caption(title)
+        self.clock = self.pygame.time.Clock()
 
-    def show(self, shapes: Sequence[Shape], fps: float) -> None:
-        """Show shapes, not before 1 / `fps` after the last ones."""
-        paint(self.surface, shapes)
+    def show(self, canvas: Canvas, fps: float) -> None:
+        """Show a canvas, not before 1 / `fps` after the last one."""
+        self.surface.blit(canvas.surface(), (0, 0))
         self.pygame.display.flip()
         self.clock.tick(fps)
 
@@ -101,73 +128,23 @@ class Window:
         self.pygame.display.quit()
 
 
+def _no_display(got: str) -> ValueError:
+    return ValueError(f"window: expected a display (SDL_VIDEODRIVER=dummy draws unseen), got {got}")
+
+
 @contextmanager
 def open_window(size: tuple[int, int], title: str) -> Iterator[Window]:
-    """A window for somebody to look at, closed at the end of the block.
+    """A window that is closed at the end of the block.
 
-    Without a display SDL draws unseen. That serves tests, and whoever asks for it with SDL_VIDEODRIVER.
+    Without a display SDL would draw unseen; that is refused unless SDL_VIDEODRIVER asks for it.
 
     ValueError: no pygame, or no display.
     """
     window = Window(size, title)
     try:
-        driver = window.pygame.display.get_driver()
-        if driver in ("offscreen", "dummy") and not os.environ.get("SDL_VIDEODRIVER"):
-            raise ValueError(
-                "window: expected a display (SDL_VIDEODRIVER=dummy draws unseen), got none"
-            )
+        unseen = window.pygame.display.get_driver() in ("offscreen", "dummy")
+        if unseen and not os.environ.get("SDL_VIDEODRIVER"):
+            raise _no_display("none")
         yield window
     finally:
         window.close()
-
-
-def picture(shapes: Sequence[Shape], size: tuple[int, int]) -> NDArray[np.uint8]:
-    """Shapes as an image (height, width, 3); needs no display."""
-    surface = need_pygame().Surface(size, depth=32)
-    paint(surface, shapes)
-    pixels: NDArray[np.uint8] = need_pygame().surfarray.array3d(surface)
-    return np.ascontiguousarray(pixels.swapaxes(0, 1))
-
-
-class Pictures:
-    """Frames for Gymnasium: trails of the tools since the last reset of each, and a window for `human`."""
-
-    SIZE = (960, 600)
-
-    def __init__(self, machine: Machine, mode: str | None, modes: list[str]) -> None:
-        if mode is not None and mode not in modes:
-            raise ValueError(f"render_mode: expected one of {modes}, got {mode!r}")
-        self.machine, self.mode = machine, mode
-        self.window: Any = None
-        self.trails: dict[int, list[Array]] = {}
-
-    def follow(self, state: Any, fresh: ArrayLike) -> None:
-        """After a reset or a step to an `env.State`; `fresh` are the rows that begin anew."""
-        if self.mode is not None:
-            self.trails |= {row: [] for row in np.asarray(fresh).tolist()}
-            for row, p_tool in enumerate(tool_position(forward_kinematics(self.machine, state.q))):
-                self.trails[row].append(p_tool)
-        if self.mode == "human":
-            self.take(state)
-
-    def take(self, state: Any) -> list[NDArray[np.uint8]]:
-        """A frame (600, 960, 3) of each row, or the first row on the screen. Needs the extra `play`."""
-        if state is None or self.mode is None:
-            raise ValueError(f"render: expected a render_mode and a reset before, got {self.mode}")
-        drawn = []
-        for row, trail in self.trails.items():
-            u, goal = state.history[row, :, 2, -1], state.v_goal[row]
-            scene = Scene(state.q[row], state.q_dot[row], u, goal, np.array(trail))
-            drawn.append(draw(self.machine, [scene._replace(title=self.machine.name)], self.SIZE))
-        if self.mode == "human":
-            self.window = self.window or Window(self.SIZE, self.machine.name)
-            self.window.pygame.event.pump()
-            self.window.show(drawn[0], self.machine.rate)
-            return []
-        return [picture(shapes, self.SIZE) for shapes in drawn]
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        if self.window is not None:
-            self.window.close()
-            self.window = None

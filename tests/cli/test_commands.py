@@ -22,11 +22,12 @@ from brokk_min.can import operator_input as wishes
 from brokk_min.can.canopen import Frame
 from brokk_min.cli import commands, operating
 from brokk_min.cli.options import SHIPPED
-from brokk_min.evaluation import baselines, figures, metrics, preliminary, trust
+from brokk_min.evaluation import baselines, figures, metrics, preliminary
 from brokk_min.evaluation.sequences import task_sequences
+from brokk_min.identification import validation
 from brokk_min.identification.logs import Log, Recording, read_log, write_log
 from brokk_min.jacobian import JacobianController
-from brokk_min.learning import sweep
+from brokk_min.evaluation import seeds as sweep
 from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer import drawing as view
@@ -382,20 +383,20 @@ def test_a_fit_is_judged_on_other_recordings_drawn_and_written(
     joint = one | runs | {"linear": {"one_step_rmse": 0.03, "free_run": {}}, "creep": 1e-3}
     found = {"joints": {"q1": joint}, "tool": {}, "warnings": ["q1: creeps"]}
     calls = stand(commands, fit=net, save_net=None)
-    stand(trust, judge=found)
+    stand(validation, validate=found)
     stand(figures, plot_worst_and_median="figure", save=None)
     files = f"--out {out} --json {verdict} --figure {picture}"
     assert run(f"fit {log} --steps 7 --seed 4 --velocity-samples 13 {files}") == 0
     fitted, settings, *rest = calls["fit"]
     assert rest == [4, 13, "brokk170"] and settings.steps == 7 and settings.dead_zone == 0.07
-    assert calls["judge"][0] is net and calls["judge"][3] is BROKK_170
+    assert calls["validate"][0] is net and calls["validate"][3] is BROKK_170
     held_out = ["0", "10", "20"]
-    assert [r.name for r in calls["judge"][2].recordings] == held_out
+    assert [r.name for r in calls["validate"][2].recordings] == held_out
     assert [r.name for r in fitted.recordings] == [
         str(i) for i in range(21) if str(i) not in held_out
     ]
-    assert calls["judge"][1] is fitted and calls["save_net"] == (out, net)
-    assert calls["plot_worst_and_median"] == (net, calls["judge"][2]) and calls["save"] == (
+    assert calls["validate"][1] is fitted and calls["save_net"] == (out, net)
+    assert calls["plot_worst_and_median"] == (net, calls["validate"][2]) and calls["save"] == (
         picture,
         "figure",
     )
@@ -434,15 +435,15 @@ def test_a_fit_is_judged_on_other_recordings_drawn_and_written(
     )
     slow = f"{tmp_path / 'slow.py'}:SLOW"
     assert run(f"fit {log} --test {test} --machine {slow} --out {out} --json {verdict}") == 0
-    assert (calls["fit"][0].rate, calls["judge"][2].rate, calls["fit"][4]) == (10.0, 10.0, "slow")
+    assert (calls["fit"][0].rate, calls["validate"][2].rate, calls["fit"][4]) == (10.0, 10.0, "slow")
     assert json.loads(verdict.read_text())["meta"]["test"] == [str(test)]
     assert run(f"fit {log} --test {test} --machine brokk170 --out {out}") == 0
-    assert len(calls["fit"][0].recordings) == 21 and len(calls["judge"][2].recordings) == 1
+    assert len(calls["fit"][0].recordings) == 21 and len(calls["validate"][2].recordings) == 1
     assert calls["fit"][2:] == (0, BROKK_170.velocity_samples, "brokk170") and "save" not in calls
     small_log(log, ("a", "b"))
     net.machine = ""
     assert run(f"fit {log} --out {out}") == 0
-    assert calls["fit"][4] == "" and calls["judge"][3] is None
+    assert calls["fit"][4] == "" and calls["validate"][3] is None
     assert "nets of no known machine, dead zone" in capsys.readouterr().out
     assert run(f"fit {log} --machine brokk170 --out {out}") == 1
     assert "LOGS: expected joints of --machine brokk170, got ['a', 'b']" in capsys.readouterr().err

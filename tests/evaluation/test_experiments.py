@@ -876,7 +876,7 @@ def test_the_chain_hands_each_stage_what_the_one_before_made(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     from brokk_min import ppo
-    from brokk_min.learning import sweep
+    from brokk_min.evaluation import seeds as sweep
 
     part, asked = (p := Parts(monkeypatch)), p.asked
     out, effort = tmp_path / "a" / "b", replace(TINY, train_steps=64)

@@ -11,8 +11,7 @@ import torch
 from helpers_machines import line
 
 from brokk_min.actuator import initial_history, mu_law
-from brokk_min.evaluation import trust
-from brokk_min.identification import fitting
+from brokk_min.identification import fitting, validation
 from brokk_min.identification.fitting import FitConfig, fit
 from brokk_min.identification.logs import Log, Recording, velocity_of
 from brokk_min.identification.validation import score
@@ -190,7 +189,7 @@ def test_memory_of_a_fit_grows_with_the_data_and_not_with_data_times_history():
     fitting.training_set(log, 80, 8)
     held = tracemalloc.get_traced_memory()[1]
     tracemalloc.reset_peak()
-    trust.fit_linear(net, log)
+    validation.fit_linear(net, log)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert held < 15e6  # 250 bytes a sample

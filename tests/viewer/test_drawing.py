@@ -57,7 +57,7 @@ def test_importing_needs_neither_pygame_nor_physics() -> None:
         "'matplotlib', 'gymnasium') or m.startswith('brokk_min.')])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    pure = ("window", "view", "looks", "kinematics", "machine", "extras")
+    pure = ("window", "view", "looks", "kinematics", "machine")
     assert set(eval(done.stdout)) == {f"brokk_min.{name}" for name in pure}
 
 

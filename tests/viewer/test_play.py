@@ -19,10 +19,9 @@ import can
 import numpy as np
 import pygame
 import pytest
-from helpers_bus import START, Push, World
+from helpers_bus import BASELINE, START, Push, Virtual, World
 from PIL import Image
 from test_drawing import boxes_of_words
-from test_hw import BASELINE, Virtual
 
 from benchmarks.bus import random_policy
 from brokk_min.__main__ import main
@@ -960,7 +959,7 @@ def test_a_log_tells_what_the_loop_knew(tmp_path: Path) -> None:
     loop.go(0.5, False)
     loop.go(0.2, True)
     loop.go(2.0, True, (0.0, 0.2, 0.1))
-    loop.world.line.close()
+    loop.world.bus.close()
     loop.world.close()
     run = replay.run_of_log(BROKK_170, path, (1, 2, 3))
     told = [k for k in loop.known if k.driving][: len(run.known)]
@@ -1083,7 +1082,7 @@ def test_a_log_and_results_beside_one_another(
     loop = Remoted(Push(60, 0, 0, 0, 0), log=can.CanutilsLogWriter(tmp_path / "run.log"))
     loop.go(0.5, False)
     loop.go(0.5, True)
-    loop.world.line.close()
+    loop.world.bus.close()
     loop.world.close()
     shown: list[list[str]] = []
     monkeypatch.setattr(
@@ -1151,7 +1150,7 @@ def test_where_there_is_no_display_sdl_does_not_draw_unseen(tmp_path: Path) -> N
     loop = Remoted(Push(60, 0, 0, 0, 0), log=can.CanutilsLogWriter(log))
     loop.go(0.5, False)
     loop.go(0.5, True)
-    loop.world.line.close()
+    loop.world.bus.close()
     loop.world.close()
     code = (
         "import os, sys, pygame; from brokk_min.viewer import replay; from brokk_min.__main__ import main; "

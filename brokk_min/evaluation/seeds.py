@@ -1,0 +1,147 @@
+"""Training seeds on the machine: what `brokk-min sweep` runs, writes and prints."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from brokk_min.actuator import ActuatorNet
+from brokk_min.env import TaskConfig
+from brokk_min.evaluation import metrics
+from brokk_min.evaluation.baselines import gains_metadata, read_gains
+from brokk_min.evaluation.metrics import Controllers, Rows, by_start, mean_interval
+from brokk_min.evaluation.sequences import AXES, evaluation_starts, task_sequences
+from brokk_min.identification.files import expected, write_json
+from brokk_min.learning.policy import Policy, PolicyController
+from brokk_min.learning.sweep import run_seed, run_seeds
+from brokk_min.machine import Array, Machine
+from brokk_min.ppo import PPOConfig
+
+Table = dict[str, dict[str, Any]]  # mean and interval of each figure, by controller
+
+
+def sweep(
+    machine: Machine,
+    net: ActuatorNet,
+    task: TaskConfig,
+    config: PPOConfig,
+    seeds: Sequence[int],
+    out: Path,
+    starts: int,
+    scheduler: str | None = None,
+    gains: Path | None = None,
+) -> Table:
+    """Train and evaluate `seeds`, each on one thread; all runs and the table go to `sweep.json`.
+
+    Args:
+        machine: n joints.
+        net: nets of its driven joints.
+        task: episodes.
+        config: settings of the learner.
+        seeds: of the trainings.
+        out: folder of all files.
+        starts: number of poses from which each scored sequence begins.
+        scheduler: address of a dask scheduler; None: this machine.
+        gains: file of tuned baselines, for further rows.
+
+    Returns:
+        `table` of the seeds that came to their end, and of the baselines.
+
+    ValueError: with the seeds that failed and why, after all others are written.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    about = {"starts": starts, "sequences": [s.name for s in task_sequences(machine)]}
+    config = replace(config, threads=1)
+    evaluate = partial(evaluate_policy, machine, starts)
+    job = partial(run_seed, machine, net, task, config, out.resolve(), evaluate, about)
+    results, failed = run_seeds(job, seeds, scheduler)
+    baselines = read_gains(gains, machine, net) if gains else {}
+    baseline_rows = run_scored(machine, baselines, starts)
+    finished = sorted(results)
+    figures = table([results[seed] for seed in finished], baseline_rows)
+    rows = [{"seed": seed} | row for seed in finished for row in results[seed]]
+    meta = metrics.metadata(machine, min(seeds)) | gains_metadata(machine, net)
+    meta |= {"seeds": len(seeds), "failed": failed}
+    write_json(out / "sweep.json", {"meta": meta, "table": figures, "runs": rows + baseline_rows})
+    if failed:
+        raise ValueError("; ".join(f"seed {seed}: {failed[seed]}" for seed in sorted(failed)))
+    return figures
+
+
+def evaluate_policy(machine: Machine, starts: int, policy: Policy) -> Rows:
+    """Figures of a policy on the machine."""
+    return run_scored(machine, {"rl": PolicyController(machine, policy)}, starts)
+
+
+def run_scored(machine: Machine, controllers: Controllers, starts: int) -> Rows:
+    """The scored sequences and starts of `evaluate --seed 0`: the same for every training seed."""
+    sequences = task_sequences(machine)
+    poses = evaluation_starts(machine, starts, sequences, 2)
+    return metrics.evaluate(machine, controllers, sequences, poses, 0)[0]
+
+
+def table(seeds: Sequence[Rows], baselines: Rows) -> Table:
+    """Velocity error by sequence and of all [m/s], drift [m], travel [full strokes] by controller.
+
+    A seed counts once, with the mean over its workspace starts; intervals are over seeds. Baselines
+    have no seeds and so no interval, but the differences ("rl less ...") have one again.
+    """
+    runs = [*baselines, *(row for rows in seeds for row in rows)]
+    sequences = list(dict.fromkeys(run["sequence"] for run in runs))
+    columns = {f"velocity_error_{s}": (s, "velocity_error_mean") for s in (*sequences, "all")}
+    columns |= {name: ("all", name) for name in ("off_axis_drift_max", "valve_travel")}
+
+    def means(runs: Rows, controller: str) -> Array:
+        scored = [run for run in runs if run["kind"] == "workspace"]
+        return np.array([by_start(scored, controller, *what).mean() for what in columns.values()])
+
+    rows = {}
+    if seeds:
+        rows["rl"] = np.array([means(runs, "rl") for runs in seeds])
+    for name in dict.fromkeys(run["controller"] for run in baselines):
+        rows[name] = means(baselines, name)[None]
+        if seeds:
+            rows[f"rl less {name}"] = rows["rl"] - rows[name]
+    return {
+        controller: dict(zip(columns, map(mean_interval, values.T), strict=True))
+        for controller, values in rows.items()
+    }
+
+
+def read_seeds(path: Path) -> dict[str, Any]:
+    """The `sweep.json` of a sweep; its "table" is that of `table`. ValueError: another file."""
+    with expected(path, "the sweep.json of a sweep"):
+        found: dict[str, Any] = json.loads(path.read_text())
+        if not {"mean", "low", "high"} <= set(found["table"]["rl"]["velocity_error_all"]):
+            raise ValueError(f"{found['table']['rl']}")
+        dict(found["meta"])
+    return found
+
+
+def seeds_of(machine: Machine, net: ActuatorNet, sweep: Mapping[str, Any]) -> Table:
+    """The table of a sweep of `read_seeds`; ValueError: one of another machine or of other nets."""
+    expected_meta = gains_metadata(machine, net)
+    found = {name: sweep["meta"].get(name) for name in expected_meta}
+    if found != expected_meta:
+        raise ValueError(f"sweep: expected one with {expected_meta}, got {found}")
+    return dict(sweep["table"])
+
+
+def show(figures: Mapping[str, Mapping[str, Any]]) -> str:
+    """The table as text: one line per controller."""
+    columns = {f"velocity_error_{s}": f"{s} [m/s]" for s in (*AXES, "all")}
+    columns |= {"off_axis_drift_max": "drift [m]", "valve_travel": "travel [1]"}
+    header = "".join(f" {name:>18}" for name in columns.values())
+    lines = [f"{'mean and 95 % interval':28}" + header]
+    for controller, row in figures.items():
+        line = f"{controller:28}"
+        for name in columns:
+            mean, high = row[name]["mean"], row[name]["high"]
+            half = "" if high is None else f" +- {high - mean:.4f}"
+            line += f" {f'{mean:.4f}{half}':>18}"
+        lines.append(line)
+    return "\n".join(lines)
