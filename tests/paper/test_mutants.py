@@ -1,8 +1,8 @@
 """Planted errors: the test that promises a property must find each, by an assertion.
 
-A planted error replaces one piece of a module's source. The changed function's code takes the place
-of the right one in the same function object, so everybody who imported it runs the wrong code. The
-safety gate has planted errors of its own (`tests/can/`).
+`planted.txt` has below each test the errors that it must find, `module: right => wrong`. The
+changed function's code takes the place of the right one in the same function object, so everybody
+who imported it runs the wrong code. The safety gate has planted errors of its own (`tests/can/`).
 """
 
 from __future__ import annotations
@@ -24,9 +24,22 @@ import numpy as np
 import pytest
 from hypothesis import Phase, settings
 
-TESTS = Path(__file__).parents[1]
-PLANTED: dict[str, list[tuple[str, str, str]]] = {  # test: module, right, wrong
-}
+TABLE = Path(__file__).with_name("planted.txt")
+FILES = sorted(Path(__file__).parents[1].rglob("test_*.py"))
+
+
+def planted_errors() -> list[tuple[str, str, str, str]]:
+    """Test, module, right and wrong source of each planted error."""
+    errors = []
+    test = ""
+    for line in TABLE.read_text().splitlines():
+        if line.startswith("test_"):
+            test = line
+        elif line:
+            module, _, change = line.strip().partition(": ")
+            right, _, wrong = change.partition(" => ")
+            errors.append((test, module, right, wrong))
+    return errors
 
 
 def functions(code: types.CodeType) -> Iterator[tuple[str, types.CodeType]]:
@@ -78,52 +91,42 @@ def planted(name: str, right: str, wrong: str) -> Iterator[None]:
 
 
 @cache
-def copy_of(path: Path) -> types.ModuleType:
-    """A test file imported once more; its properties stop at the first failure."""
-    spec = importlib.util.spec_from_file_location(f"copy_of_{path.stem}", path)
-    assert spec
-    assert spec.loader
-    module = importlib.util.module_from_spec(spec)
-    loaded = settings.get_current_profile_name()
-    settings.register_profile("planted", settings.default, phases=[Phase.generate], print_blob=False)
-    settings.load_profile("planted")
-    try:
-        spec.loader.exec_module(module)
-    finally:
-        settings.load_profile(loaded)
-    return module
+def copy_of(test: str) -> Any:
+    """A test function, from its file imported once more; a property stops at the first failure."""
+    (path,) = [path for path in FILES if f"\ndef {test}(" in path.read_text()]
+    name = f"copy_of_{path.stem}"
+    if name not in sys.modules:
+        spec = importlib.util.spec_from_file_location(name, path)
+        assert spec
+        assert spec.loader
+        sys.modules[name] = importlib.util.module_from_spec(spec)
+        loaded = settings.get_current_profile_name()
+        settings.register_profile("planted", settings.default, phases=[Phase.generate])
+        settings.load_profile("planted")
+        try:
+            spec.loader.exec_module(sys.modules[name])
+        finally:
+            settings.load_profile(loaded)
+    return getattr(sys.modules[name], test)
 
 
-@cache
-def files() -> dict[str, Path]:
-    """The file of each test function that the table names."""
-    texts = {path: path.read_text() for path in TESTS.rglob("test_*.py")}
-    found = {name: [p for p, text in texts.items() if f"\ndef {name}(" in text] for name in PLANTED}
-    return {name: paths[0] for name, paths in found.items() if len(paths) == 1}
-
-
-def cases(test: Any, tmp_path: Path) -> Iterator[dict[str, object]]:
+def cases(test: Any) -> Iterator[dict[str, object]]:
     """Arguments of each case of a parametrised test."""
     axes = []
     for mark in getattr(test, "pytestmark", []):
-        if mark.name == "parametrize":
-            names = mark.args[0]
-            names = [n.strip() for n in names.split(",")] if isinstance(names, str) else names
-            values = [getattr(value, "values", value) for value in mark.args[1]]
-            one = len(names) == 1
-            axes.append([dict(zip(names, [v] if one else v, strict=True)) for v in values])
+        names, values = mark.args[:2]
+        names = [n.strip() for n in names.split(",")] if isinstance(names, str) else names
+        rows = [[value] if len(names) == 1 else value for value in values]
+        axes.append([dict(zip(names, row, strict=True)) for row in rows])
     for combination in itertools.product(*axes):
-        arguments = {name: value for case in combination for name, value in case.items()}
-        if "tmp_path" in inspect.signature(test).parameters:
-            arguments["tmp_path"] = tmp_path
-        yield arguments
+        yield {name: value for case in combination for name, value in case.items()}
 
 
-def finds_an_error(test: Any, tmp_path: Path) -> bool:
+def finds_an_error(test: Any) -> bool:
     """Does the test fail by an assertion?"""
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
-        for arguments in cases(test, tmp_path):
+        for arguments in cases(test):
             try:
                 test(**arguments)
             except (AssertionError, pytest.fail.Exception):
@@ -132,19 +135,13 @@ def finds_an_error(test: Any, tmp_path: Path) -> bool:
 
 
 def test_planted_errors__are_in_every_file_of_the_method() -> None:
-    modules = {module for errors in PLANTED.values() for module, _, _ in errors}
-    assert sum(len(errors) for errors in PLANTED.values()) >= 50
+    errors = planted_errors()
+    modules = {module for _, module, _, _ in errors}
+    assert len(errors) >= 60
     assert {"machine", "kinematics", "actuator", "env", "ppo", "jacobian"} <= modules
 
 
-@pytest.mark.parametrize(
-    ("test", "module", "right", "wrong"),
-    [(test, *error) for test, errors in PLANTED.items() for error in errors],
-    ids=lambda text: text[:40],
-)
-def test_planted_error__is_found(
-    test: str, module: str, right: str, wrong: str, tmp_path: Path
-) -> None:
-    check = getattr(copy_of(files()[test]), test)
+@pytest.mark.parametrize(("test", "module", "right", "wrong"), planted_errors())
+def test_planted_error__is_found(test: str, module: str, right: str, wrong: str) -> None:
     with planted(module, right, wrong):
-        assert finds_an_error(check, tmp_path), f"{test} passes with {wrong!r} in {module}.py"
+        assert finds_an_error(copy_of(test)), f"{test} passes with {wrong!r} in {module}.py"
