@@ -156,7 +156,7 @@ def test_fields_that_name_the_paper__have_a_row() -> None:
         r"^    (\w+)=.*; paper: ", (ROOT / "brokk_min/machine.py").read_text(), re.M
     )
     found = {f"machine.Machine.{field}" for field in values}
-    for path in (ROOT / "brokk_min").rglob("*.py"):
+    for path in set((ROOT / "brokk_min").rglob("*.py")) - set((ROOT / "brokk_min/cli").iterdir()):
         lines = path.read_text().splitlines()
         for owner in (node for node in parsed(path).body if isinstance(node, ast.ClassDef)):
             for field, note in pairwise([*owner.body, ast.Pass()]):
