@@ -22,7 +22,7 @@ from benchmarks.bus import random_policy
 from brokk_min.can.drive_log import Telemetry
 from brokk_min.learning.policy import PolicyController
 from brokk_min.machine import BROKK_170
-from brokk_min.viewer import play
+from brokk_min.viewer import input_handler, play
 from brokk_min.viewer.control_process import BusOptions
 
 
@@ -42,9 +42,9 @@ class Player:
         self.times: list[float] = []
         self.known: dict[float, Telemetry] = {}
 
-    def __call__(self, session: play.Session, hands: play.InputHandler) -> bool:
+    def __call__(self, session: play.Session, hands: input_handler.InputHandler) -> bool:
         """One picture; False at the end."""
-        now, known = time.monotonic(), session.known
+        now, known = time.monotonic(), session.telemetry
         if known is None:
             return True
         self.begun = self.begun or now * known.driving
@@ -82,10 +82,10 @@ def figures(player: Player) -> dict[str, Any]:
 
 def main(options: Options) -> None:
     os.environ["SDL_VIDEODRIVER"] = "dummy"
-    player, show = Player(options.seconds), play.show
-    play.show = lambda *a: show(*a, watcher=player)  # type: ignore[assignment]
+    player = Player(options.seconds)
     policy = PolicyController(BROKK_170, random_policy(np.random.default_rng(0)))
-    play.play(BROKK_170, {"rl": policy}, BusOptions(), Path(os.devnull).with_name("no attempts"))
+    attempts = Path(os.devnull).with_name("no attempts")
+    play.play(BROKK_170, {"rl": policy}, BusOptions(), attempts, player)
     result = {"seconds": options.seconds, **figures(player)}
     print(json.dumps(result, indent=1))
     if options.json:

@@ -2,32 +2,71 @@
 
 from __future__ import annotations
 
+import ctypes
 import itertools
+import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import can
 import numpy as np
 
-from brokk_min import hw
-from brokk_min.can.canopen import Frame, Line
-from brokk_min.can.operator_input import OperatorInput
+from brokk_min.can.canopen import Bus, Frame, OperatorInput
 from brokk_min.can.simulated_machine import SimulatedMachine
+from brokk_min.env import Measured
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.hw import Drive
+from brokk_min.jacobian import Gains, JacobianController, manipulability_threshold
 from brokk_min.machine import BROKK_170, Machine
 
-hw.REHEARSALS = 1  # nothing cools down on an injected clock
 START = (0.0, 0.5, 0.58, 1.71, 1.24)
-_channels = itertools.count()
+FOUR = np.ones(4)
+BASELINE = JacobianController(
+    BROKK_170,
+    Gains(1.0 * FOUR, 3.0 * FOUR, 0.0 * FOUR, np.array([0.3]), np.array([0.0])),
+    0.1,
+    manipulability_threshold(BROKK_170),
+)
 Out = list[tuple[int, bytes]]
+Change = Callable[[int, bytes], Out]
+_channels = itertools.count()
+
+
+def unchanged(can_id: int, data: bytes) -> Out:
+    return [(can_id, data)]
+
+
+def only(changed_id: int, act: Callable[[bytes], list[bytes]]) -> Change:
+    """Change the frames of one identifier."""
+    return lambda can_id, data: [
+        (can_id, d) for d in (act(data) if can_id == changed_id else [data])
+    ]
+
+
+def once(act: Callable[[bytes], list[bytes]]) -> Callable[[bytes], list[bytes]]:
+    """Change the first frame alone."""
+    acts = iter([act])
+    return lambda data: next(acts, lambda data: [data])(data)
+
+
+def recording(out: Out) -> Change:
+    """Append the frames that pass to `out`."""
+    return lambda can_id, data: out.append((can_id, data)) or [(can_id, data)]  # type: ignore
+
+
+def raises(error: Exception) -> Callable[..., Any]:
+    def act(*_: object, **__: object) -> None:
+        raise error
+
+    return act
 
 
 class World:
-    """A simulated machine and a `Drive` on python-can's virtual bus; time passes while the program waits.
+    """A simulated machine and a `Drive` on python-can's virtual bus; time passes while it waits.
 
-    The bus of the program is this object: it lets the machine live while `recv` waits, and `upward` and
-    `downward` may tamper with what machine and program send.
+    The bus of the program is this object: it lets the machine live while `recv` waits, and `upward`
+    and `downward` may tamper with what machine and program send.
     """
 
     def __init__(
@@ -39,21 +78,20 @@ class World:
         start: tuple[float, ...] = START,
     ) -> None:
         channel = f"world {next(_channels)}"
-        self.near, self.far = (can.Bus(channel, interface="virtual") for _ in range(2))
-        self.t, self.step, self.offset = (
-            0.0,
-            0.001,
-            0.0,
-        )  # the world's clock [s]; how far the program's is off
-        self.upward: Callable[[int, bytes], Out] = lambda can_id, data: [(can_id, data)]
-        self.downward = self.upward
+        self.near = can.Bus(channel, interface="virtual")
+        self.far = can.Bus(channel, interface="virtual")
+        self.t = 0.0  # s
+        self.step = 0.001  # s
+        self.offset = 0.0  # s, of the program's clock
+        self.upward: Change = unchanged
+        self.downward: Change = unchanged
         self.noise: Callable[[], Out] = list  # foreign frames of the next millisecond
         self.record: list[tuple[float, np.ndarray, np.ndarray, float]] = []
         self.syncs: list[float] = []
         self.simulated = SimulatedMachine(machine, start, 0.0, lambda *row: self.record.append(row))
-        self.line = Line(self, log, clock=lambda: self.t + self.offset, rest=self.rest)
-        self.line.start = 1.8e9  # s; a fixed time of day, so that roundings repeat themselves
-        self.drive = Drive(machine, controller, self.line, operator)
+        self.bus = Bus(self, log, clock=lambda: self.t + self.offset, sleep=self.sleep)
+        self.bus.start = 1.8e9  # s; a fixed time of day, so that roundings repeat themselves
+        self.drive = Drive(machine, controller, self.bus, operator)
         self.say(self.simulated.boot())
 
     def fileno(self) -> int:
@@ -71,7 +109,7 @@ class World:
             self.live()
         return message
 
-    def rest(self, seconds: float) -> None:
+    def sleep(self, seconds: float) -> None:
         end = self.t + seconds
         while self.t < end:
             self.t = min(end, self.t + self.step)
@@ -86,9 +124,8 @@ class World:
         while (message := self.far.recv(0)) is not None:
             if message.arbitration_id == 0x080:
                 self.syncs.append(self.t)
-            self.say(
-                self.simulated.receive(Frame(self.t, message.arbitration_id, bytes(message.data)))
-            )
+            frame = Frame(self.t, message.arbitration_id, bytes(message.data))
+            self.say(self.simulated.receive(frame))
 
     def say(self, frames: Out) -> None:
         for frame in frames:
@@ -109,13 +146,13 @@ class World:
 
     @property
     def commands(self) -> tuple[np.ndarray, np.ndarray]:
-        """Times [s] and commands in force at the valves in counts (T, n), by the plant's own record."""
+        """Times [s] and commands in force in counts (T, n), by the plant's own record."""
         times, u, *_ = zip(*self.record, strict=True)
         return np.array(times), np.rint(np.array(u) * 127).astype(int)
 
 
 class Push:
-    """A controller that gives constant commands [counts] and does as it is told."""
+    """A controller that gives constant commands [counts of 127]."""
 
     def __init__(self, *m: float) -> None:
         self.m = np.array(m, float)
@@ -124,17 +161,19 @@ class Push:
     def start(self, num: int) -> None:
         return None
 
-    def __call__(self, observation: np.ndarray, memory: None) -> tuple[np.ndarray, None]:
+    def __call__(self, measured: Measured, state: None) -> tuple[np.ndarray, None]:
         self.act()
         return self.m[None] / 127, None
 
 
 class Hand:
-    """An operator who presses as soon as he may, then asks for motion; what he does can be set."""
+    """An operator who presses as soon as the gate is ready, then asks for motion."""
 
     def __init__(self) -> None:
         self.enable: bool | None = None  # None: pressed when ready, and held from then on
-        self.alive, self.stop, self.v = True, False, (0.1, 0.0, 0.0)
+        self.alive = True
+        self.stop = False
+        self.v = (0.1, 0.0, 0.0)
         self.pressed = False
         self.act: Callable[[], object] = lambda: None
 
@@ -143,4 +182,32 @@ class Hand:
         self.pressed = self.pressed or ready
         enable = self.pressed if self.enable is None else self.enable
         v = self.v if driving else (0.0, 0.0, 0.0)
-        return OperatorInput(v, enable=enable and self.alive, alive=self.alive, stop=self.stop)
+        return OperatorInput(v, enable and self.alive, self.alive, self.stop)
+
+
+class Virtual:
+    """SDL's virtual joystick: a device without a device."""
+
+    def __init__(self, axes: int = 6, buttons: int = 8) -> None:
+        import pygame
+
+        os.environ["SDL_VIDEODRIVER"] = "dummy"
+        pygame.display.init()
+        pygame.joystick.init()
+        folder = Path(pygame.__file__).parent.parent / "pygame.libs"
+        self.sdl = ctypes.CDLL(str(next(folder.glob("libSDL2-2*"))))
+        self.sdl.SDL_JoystickOpen.restype = ctypes.c_void_p
+        pointer, number = ctypes.c_void_p, ctypes.c_int
+        self.sdl.SDL_JoystickSetVirtualAxis.argtypes = [pointer, number, ctypes.c_int16]
+        self.sdl.SDL_JoystickSetVirtualButton.argtypes = [pointer, number, ctypes.c_uint8]
+        self.index = self.sdl.SDL_JoystickAttachVirtual(4, axes, buttons, 0)
+        self.handle = self.sdl.SDL_JoystickOpen(self.index)
+
+    def axis(self, axis: int, value: float) -> None:
+        assert self.sdl.SDL_JoystickSetVirtualAxis(self.handle, axis, round(32767 * value)) == 0
+
+    def button(self, button: int, held: bool) -> None:
+        assert self.sdl.SDL_JoystickSetVirtualButton(self.handle, button, held) == 0
+
+    def unplug(self) -> None:
+        assert self.sdl.SDL_JoystickDetachVirtual(self.index) == 0

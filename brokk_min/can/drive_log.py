@@ -1,21 +1,15 @@
-"""What a drive left in its log: the loop run on it again, byte by byte, and recordings for `fit`."""
+"""The log of a drive: the loop run on it again, recordings for `fit`, and telemetry.
+
+Telemetry is the state of one tick, from the frames of a bus or of a log.
+"""
 
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from brokk_min.can import canopen as bus
-from brokk_min.can.canopen import (
-    OPERATOR_CHANNEL,
-    OPERATOR_INPUT,
-    SYNC,
-    Frame,
-    Nodes,
-    OperatorInput,
-    encoder_counts,
-    unpack_operator_input,
-)
+from brokk_min.can import canopen
+from brokk_min.can.canopen import OPERATOR_CHANNEL, Frame, Nodes, OperatorInput
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.hw import Drive
 from brokk_min.identification.logs import Log, machine_log
@@ -23,121 +17,126 @@ from brokk_min.machine import Array, Machine, decode_pwm, estimate_velocity
 
 
 class ReplayedBus:
-    """A recorded log in place of a `Line`: gives back what was read and compares what is sent."""
+    """A recorded log in place of a `Bus`: gives what was read and compares what is sent."""
 
-    def __init__(self, frames: Sequence[bus.Frame]) -> None:
-        self.frames, self.at, self.sent, self.wrong = frames, 0, list[bus.Frame](), ""
+    def __init__(self, frames: Sequence[Frame]) -> None:
+        self.frames = frames
+        self.position = 0
+        self.sent: list[Frame] = []
+        self.mismatch = ""
 
     @property
     def more(self) -> bool:
         """Is there anything left?"""
-        return self.at < len(self.frames)
+        return self.position < len(self.frames)
 
     def now(self) -> float:
-        """When the next thing happened [s]."""
-        return self.frames[min(self.at, len(self.frames) - 1)].time
+        """Time of the next frame [s]."""
+        return self.frames[min(self.position, len(self.frames) - 1)].time
 
-    def rest(self, seconds: float) -> None:
-        """A tape does not wait."""
+    def sleep(self, seconds: float) -> None:
+        """A replay does not wait."""
 
     def flush(self) -> None:
-        """Nor does it write."""
+        """Nothing is written."""
 
-    def recv(self, timeout: float, awake: float = 0.0) -> bus.Frame | None:
+    def recv(self, timeout: float, busy_wait: float = 0.0) -> Frame | None:
         """The next frame that was read before anything was sent."""
-        if not self.more or self.frames[self.at].sent:
+        if not self.more or self.frames[self.position].sent:
             return None
-        self.at += 1
-        return self.frames[self.at - 1]
+        self.position += 1
+        return self.frames[self.position - 1]
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Keep what is sent, and step over what was sent then."""
-        self.sent.append(bus.Frame(self.now(), can_id, data, True))
-        self._step(can_id)
+        """Keep what is sent, and go past what was sent then."""
+        self.sent.append(Frame(self.now(), can_id, data, True))
+        self._go_past(can_id)
 
-    def note(self, data: bytes) -> float:
-        """The time of the wish."""
+    def log_input(self, data: bytes) -> float:
+        """The time of the operator's input."""
         now = self.now()
-        self._step(bus.OPERATOR_INPUT)
+        self._go_past(canopen.OPERATOR_INPUT)
         return now
 
-    def wish(self, driving: bool, ready: bool) -> OperatorInput:
-        """What the operator wished then."""
-        ahead = (self.frames[i] for i in range(self.at, len(self.frames)))
-        return next(
-            (
-                unpack_operator_input(frame.data)
-                for frame in ahead
-                if frame.id == bus.OPERATOR_INPUT
-            ),
-            OperatorInput(stop=True),
-        )
+    def operator(self, driving: bool, ready: bool) -> OperatorInput:
+        """The operator's next input of the log."""
+        for i in range(self.position, len(self.frames)):
+            if self.frames[i].id == canopen.OPERATOR_INPUT:
+                return canopen.unpack_operator_input(self.frames[i].data)
+        return OperatorInput(stop=True)
 
-    def _step(self, can_id: int) -> None:
-        if self.more and (not (at := self.frames[self.at]).sent or at.id != can_id):
-            self.wrong = f"log: expected {can_id:03X} sent at {at.time:.6f}, got {at.id:03X}"
-            self.at = len(self.frames)
-        self.at += 1
+    def _go_past(self, can_id: int) -> None:
+        if self.more:
+            frame = self.frames[self.position]
+            if not frame.sent or frame.id != can_id:
+                self.mismatch = f"{can_id:03X} sent at {frame.time:.6f}, got {frame.id:03X}"
+                self.position = len(self.frames)
+        self.position += 1
 
 
-def replay(
-    machine: Machine, controller: Controller, frames: Sequence[bus.Frame]
-) -> list[bus.Frame]:
-    """Run the loop on a recorded log of it; what it sends now, to be compared with what it sent then.
+def replay(machine: Machine, controller: Controller, frames: Sequence[Frame]) -> list[Frame]:
+    """Run the loop on a log of it; the frames that it sends now.
 
     ValueError: another program made the log.
     """
-    tape = ReplayedBus(list(frames))
-    drive = Drive(machine, controller, tape, tape.wish)
+    bus = ReplayedBus(list(frames))
+    drive = Drive(machine, controller, bus, bus.operator)
     drive.begin()
-    while tape.more:
+    while bus.more:
         drive.tick()
-    if tape.wrong:
-        raise ValueError(tape.wrong)
-    return tape.sent[: sum(f.sent and f.channel != bus.OPERATOR_CHANNEL for f in frames)]
+    if bus.mismatch:
+        raise ValueError(f"log: expected {bus.mismatch}")
+    return bus.sent[: sum(frame.sent and frame.channel != OPERATOR_CHANNEL for frame in frames)]
 
 
-def compare(
-    machine: Machine, frames: Sequence[bus.Frame], sent: Sequence[bus.Frame]
-) -> tuple[int, int]:
-    """How many valve frames of `sent` are those of the log, byte by byte, and how many the log has."""
+def compare(machine: Machine, frames: Sequence[Frame], sent: Sequence[Frame]) -> tuple[int, int]:
+    """How many valve frames of `sent` are those of the log, byte by byte, and how many it has."""
     valves = machine.valve_frame_id
-    old, new = ([f.data for f in side if f.sent and f.id == valves] for side in (frames, sent))
+    old = [frame.data for frame in frames if frame.sent and frame.id == valves]
+    new = [frame.data for frame in sent if frame.id == valves]
     return sum(a == b for a, b in zip(old, new)), max(len(old), len(new))
 
 
-def log_for_fit(machine: Machine, frames: Iterable[bus.Frame]) -> Log:
-    """What encoders said and valves got while driving, as recordings for `fit`; a gap starts a new one.
+def log_for_fit(machine: Machine, frames: Iterable[Frame]) -> Log:
+    """Angles and commands while driving, as recordings for `fit`; a gap starts a new one.
 
     ValueError: nothing was driven for long enough.
     """
-    nodes, parts, start, last = bus.Nodes(machine), list[list[Any]](), 0.0, -np.inf
+    nodes = Nodes(machine)
+    recordings: list[list[tuple[Array, Array]]] = []
+    start = 0.0  # of the tick [s]
+    last = -np.inf  # start of the last tick that is recorded
     for frame in frames:
-        if frame.id == bus.SYNC:
-            nodes.frames[:], start = 0, frame.time
+        nodes.update(frame)
+        if frame.id == canopen.SYNC:
+            nodes.frames[:] = 0
+            start = frame.time
         elif frame.id == machine.valve_frame_id and len(frame.data) == 8:
-            if frame.data[7] == 1 and (nodes.frames == 1).all():
+            u, driving = _read_valve_frame(machine, frame.data)
+            if driving and (nodes.frames == 1).all():
                 if not 0.5 < (start - last) * machine.rate < 1.5:
-                    parts.append([])
-                u = decode_pwm(list(frame.data[: machine.n]))
-                parts[-1].append((u, encoder_counts(machine, nodes.raw) * machine.encoder_step))
+                    recordings.append([])
+                recordings[-1].append((u, nodes.counts() * machine.encoder_step))
                 last = start
-        else:
-            nodes.update(frame)
-    tapes = []
-    for number, part in enumerate(parts):
-        if len(part) > machine.history + 1:
-            u, q = map(np.array, zip(*part, strict=True))
-            tapes.append((f"drive_{number:03d}", u, q))
-    if not tapes:
+    named = []
+    for number, recording in enumerate(recordings):
+        if len(recording) > machine.history + 1:
+            commands, angles = map(np.array, zip(*recording, strict=True))
+            named.append((f"drive_{number:03d}", commands, angles))
+    if not named:
         raise ValueError(
             f"log: expected more than {machine.history + 1} ticks of driving in a row, got none"
         )
-    return machine_log(machine, tapes)
+    return machine_log(machine, named)
+
+
+def _read_valve_frame(machine: Machine, data: bytes) -> tuple[Array, bool]:
+    """Commands u (n,), and whether the valves may move."""
+    return decode_pwm(list(data[: machine.n])), data[7] == 1
 
 
 class Telemetry(NamedTuple):
-    """What the loop, a bus or a log tells of one tick."""
+    """State of the loop after one tick, or what a bus or a log shows of it."""
 
     tick: float
     q: Array  # rad (n,), nan: unknown
@@ -145,9 +144,9 @@ class Telemetry(NamedTuple):
     u: Array  # in [-1, 1] (n,)
     v_goal: Array  # m/s (3,)
     driving: bool
-    active_fault: int = 0  # of `fault_name`
+    active_fault: int = 0  # see `safety_gate.fault_name`
     latched_fault: int = 0
-    mode: int = 0
+    mode: int = 0  # which controller
     lateness: float = 0.0  # s
 
     def pack(self) -> Array:
@@ -156,46 +155,50 @@ class Telemetry(NamedTuple):
 
 
 def unpack_telemetry(machine: Machine, values: Array) -> Telemetry:
-    """What `Telemetry.pack` packed."""
+    """The inverse of `Telemetry.pack`."""
     n = machine.n
     tick, q, q_dot, u, v, rest = np.split(values, np.cumsum([1, n, n, n, 3]))
-    driving, wrong, fault, mode = (int(x) for x in rest[:4])
-    return Telemetry(
-        float(tick[0]), q, q_dot, u, v, bool(driving), wrong, fault, mode, float(rest[4])
-    )
+    driving, active, latched, mode = (int(x) for x in rest[:4])
+    late = float(rest[4])
+    return Telemetry(float(tick[0]), q, q_dot, u, v, bool(driving), active, latched, mode, late)
 
 
 class TelemetryReader:
-    """Frames of a bus or a log, one after another, as what is known at each tick."""
+    """Turns the frames of a bus or a log, one after another, into telemetry."""
 
     def __init__(self, machine: Machine) -> None:
-        self.machine, self.nodes, self.operator_input = machine, Nodes(machine), OperatorInput()
-        self.u, self.driving, self.tick = np.zeros(machine.n), False, 0
-        self.angles: list[Array] = []  # rad, as many as the velocity needs
+        self.machine = machine
+        self.nodes = Nodes(machine)
+        self.operator_input = OperatorInput()
+        self.u: Array = np.zeros(machine.n)
+        self.driving = False
+        self.tick = 0
+        self.angles: list[Array] = []  # rad (n,), as many as the velocity needs
 
     def update(self, frame: Frame) -> Telemetry | None:
-        """Take in one frame; at a SYNC, what is known of the tick that it ends."""
-        if frame.id == SYNC:
-            known, self.nodes.frames[:] = self._known(), 0
+        """Take in one frame; at a SYNC, telemetry of the tick that it ends."""
+        self.nodes.update(frame)
+        if frame.id == canopen.SYNC:
+            telemetry = self._telemetry()
+            self.nodes.frames[:] = 0
             self.tick += 1
-            return known
-        if frame.id == OPERATOR_INPUT and frame.channel == OPERATOR_CHANNEL:
-            self.operator_input = unpack_operator_input(frame.data)
+            return telemetry
+        if frame.id == canopen.OPERATOR_INPUT and frame.channel == OPERATOR_CHANNEL:
+            self.operator_input = canopen.unpack_operator_input(frame.data)
         elif frame.id == self.machine.valve_frame_id and len(frame.data) == 8:
-            self.u, self.driving = (
-                decode_pwm(list(frame.data[: self.machine.n])),
-                frame.data[7] == 1,
-            )
-        else:
-            self.nodes.update(frame)
+            self.u, self.driving = _read_valve_frame(self.machine, frame.data)
         return None
 
-    def _known(self) -> Telemetry:
-        m, v_goal = self.machine, np.array(self.operator_input.v_goal) * self.driving
-        if (self.nodes.frames != 1).any():
-            self.angles, nan = [], np.full(m.n, np.nan)
-            return Telemetry(self.tick, nan, nan, self.u, v_goal, self.driving)
-        q = encoder_counts(m, self.nodes.raw) * m.encoder_step
-        self.angles = [*(self.angles or [q] * m.velocity_samples), q][-m.velocity_samples :]
-        q_dot = estimate_velocity(np.stack(self.angles, axis=-1), m.velocity_samples, m.dt)
-        return Telemetry(self.tick, q, np.asarray(q_dot), self.u, v_goal, self.driving)
+    def _telemetry(self) -> Telemetry:
+        m = self.machine
+        q = np.full(m.n, np.nan)
+        q_dot = q
+        if (self.nodes.frames == 1).all():
+            q = self.nodes.counts() * m.encoder_step
+            angles = [*(self.angles or [q] * m.velocity_samples), q]
+            self.angles = angles[-m.velocity_samples :]
+            q_dot = estimate_velocity(np.stack(self.angles, axis=-1), m.velocity_samples, m.dt)
+        else:
+            self.angles = []
+        v_goal = np.array(self.operator_input.v_goal) * self.driving
+        return Telemetry(self.tick, q, q_dot, self.u, v_goal, self.driving)

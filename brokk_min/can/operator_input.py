@@ -1,7 +1,7 @@
-"""Who asks for motion, tick by tick: a script of velocity goals, or a hand on a joystick.
+"""Operators: a script of velocity goals, or a joystick; and a controller that jogs one joint.
 
-An operator is called with what the gate says and gives a `OperatorInput`. A script plays the part of a hand, dead-man
-switch and all, so that it passes the same gate.
+An operator takes whether the gate drives and whether it is ready (no fault), and gives the input
+of the tick. A script holds the dead-man switch, too, so that it passes the same gate.
 """
 
 import os
@@ -30,18 +30,21 @@ class Script:
             raise ValueError(
                 f"command: expected at most {machine.tool_speed} m/s, got {fastest:.3g} m/s"
             )
-        self.goals, self.tick, self.pressed = goals, 0, False
-        self.patience = round(patience_s * machine.rate)
+        self.goals = goals
+        self.tick = 0
+        self.pressed = False
+        self.patience = round(patience_s * machine.rate)  # ticks until it gives up
 
     def __call__(self, driving: bool, ready: bool) -> OperatorInput:
-        """The wish of this tick; stops at the end, after a fault, or if the machine never gets ready."""
-        if driving and self.tick < len(self.goals):
+        """Stops at the end, after a fault, or if the machine never gets ready."""
+        if driving and not self.done:
             x, y, z = map(float, self.goals[self.tick])
             self.tick += 1
             return OperatorInput((x, y, z), enable=True)
         if driving or self.tick or not self.patience:
             return OperatorInput(stop=True)
-        self.pressed, self.patience = ready and not self.pressed, self.patience - 1
+        self.pressed = ready and not self.pressed
+        self.patience -= 1
         return OperatorInput(enable=self.pressed)
 
     @property
@@ -51,73 +54,78 @@ class Script:
 
 
 class Joystick:
-    """A joystick through pygame: a button held is the dead-man switch, three axes are the tool velocity.
+    """A joystick through pygame: a button is the dead-man switch, three axes the tool velocity.
 
     Args:
-        machine: whose `tool_speed` full deflection asks for.
+        machine: full deflection is its `tool_speed`.
         axes: of the stick, for x, y and z; each counts negative forward, left and up.
         button: dead-man switch.
+
+    ValueError: no pygame, no joystick, or one without these axes and button.
     """
 
     def __init__(self, machine: Machine, axes: Sequence[int] = (1, 0, 4), button: int = 5) -> None:
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # events need a window, or this
         os.environ.setdefault("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")
-        pygame = require("pygame", "play")
-        pygame.display.init()
-        pygame.joystick.init()
-        if not pygame.joystick.get_count():
+        self.pygame = require("pygame", "play")
+        self.pygame.display.init()
+        self.pygame.joystick.init()
+        if not self.pygame.joystick.get_count():
             raise ValueError("joystick: expected one, got none")
-        self.pygame, self.speed, self.axes, self.button = pygame, machine.tool_speed, axes, button
-        self.stick: Any = pygame.joystick.Joystick(0)
-        found = self.stick.get_numaxes(), self.stick.get_numbuttons()
-        if max(axes) >= found[0] or button >= found[1]:
+        self.speed = machine.tool_speed
+        self.axes = axes
+        self.button = button
+        self.stick: Any = self.pygame.joystick.Joystick(0)
+        num_axes = self.stick.get_numaxes()
+        num_buttons = self.stick.get_numbuttons()
+        if max(axes) >= num_axes or button >= num_buttons:
             raise ValueError(
-                f"joystick: expected axes {list(axes)} and button {button}, got {found[0]} and {found[1]}"
+                f"joystick: expected axes {list(axes)} and button {button}, "
+                f"got {num_axes} and {num_buttons}"
             )
 
     def __call__(self, driving: bool, ready: bool) -> OperatorInput:
-        """The wish of this tick. A device that is gone reads zero on all axes, so its removal is told."""
+        """Velocity and switch; a device that is gone reads zero, so its removal is an event."""
         for event in self.pygame.event.get():
             if event.type == self.pygame.JOYDEVICEADDED and not self.stick:
                 self.stick = self.pygame.joystick.Joystick(event.device_index)
-            elif event.type == self.pygame.JOYDEVICEREMOVED and self.stick:
-                self.stick = (
-                    None if event.instance_id == self.stick.get_instance_id() else self.stick
-                )
+            removed = event.type == self.pygame.JOYDEVICEREMOVED
+            if removed and self.stick and event.instance_id == self.stick.get_instance_id():
+                self.stick = None
         if not self.stick:
             return OperatorInput(alive=False)
-        v = -shape_axis([self.stick.get_axis(i) for i in self.axes]) * self.speed
-        x, y, z = map(float, v / max(1.0, float(np.linalg.norm(v)) / self.speed))
+        deflection = -shape_axis([self.stick.get_axis(i) for i in self.axes])
+        x, y, z = map(float, self.speed * deflection / max(1.0, float(np.linalg.norm(deflection, axis=-1))))
         return OperatorInput((x, y, z), enable=bool(self.stick.get_button(self.button)))
+
+
+def shape_axis(axis: ArrayLike) -> Array:
+    """Deflection in [-1, 1]: dead zone of 12 %, beyond it (1 - 0.6) s + 0.6 s^3 (assumed).
+
+    Example:
+        >>> shape_axis([-1.0, 0.1, 0.56, 1.0])
+        array([-1.   ,  0.   ,  0.275,  1.   ])
+    """
+    axis = np.asarray(axis, float)
+    s = np.sign(axis) * np.maximum(0.0, np.abs(axis) - 0.12) / (1 - 0.12)
+    return np.asarray((1 - 0.6) * s + 0.6 * s**3)
 
 
 @dataclass(frozen=True)
 class JointJog:
-    """A controller for bringing up: a small command on one joint, its sign that of the wanted x velocity."""
+    """A controller that gives one joint a small command, with the sign of the goal's x velocity."""
 
     machine: Machine
     joint: str
     counts: int  # of 127
 
     def start(self, num: int) -> None:
-        """Nothing to remember."""
+        """It has no state."""
 
-    def __call__(self, measured: Measured, memory: None) -> tuple[Array, None]:
+    def __call__(self, measured: Measured, state: None) -> tuple[Array, None]:
         """Commands u (..., n)."""
-        v_goal = measured.v_goal[..., :1]
-        asked = np.sign(v_goal) * (np.abs(v_goal) > 0.1 * self.machine.tool_speed)
+        v_x = measured.v_goal[..., :1]
+        side = np.sign(v_x) * (np.abs(v_x) > 0.1 * self.machine.tool_speed)
         chosen = np.array([name == self.joint for name in self.machine.names])
-        return asked * chosen * self.counts / PWM_MAX, None
-
-
-def shape_axis(axis: ArrayLike) -> Array:
-    """Deflection in [-1, 1] with a dead zone of 12 %, and flatter near the middle: (1 - expo) s + expo s^3.
-
-    Example:
-        >>> shape_axis([-1.0, 0.1, 0.56, 1.0])
-        array([-1.   ,  0.   ,  0.275,  1.   ])
-    """
-    axis, dead, expo = np.asarray(axis, float), 0.12, 0.6  # assumed
-    s = np.sign(axis) * np.maximum(0.0, np.abs(axis) - dead) / (1 - dead)
-    return np.asarray((1 - expo) * s + expo * s**3)
+        return side * chosen * self.counts / PWM_MAX, None

@@ -16,7 +16,7 @@ from brokk_min.evaluation.metrics import (
     by_start,
     interval,
     mean_interval,
-    since_change,
+    ticks_since_change,
 )
 from brokk_min.evaluation.rollout import Controller, Trace
 from brokk_min.jacobian import JacobianController, manipulability
@@ -224,7 +224,7 @@ def speed_share(machine: Machine, w0: float, trace: Trace, goals: Array) -> Arra
 
     Of ticks below the manipulability `w0` in which the goal (T, num, 3) [m/s] has lasted for `TRANSIENT`.
     """
-    lasting = since_change(machine, goals) >= round(TRANSIENT * machine.rate)
+    lasting = ticks_since_change(machine, goals) >= round(TRANSIENT * machine.rate)
     near = (
         lasting
         & (manipulability(jacobian(forward_kinematics(machine, trace.q))[..., machine.driven]) < w0)

@@ -1,7 +1,7 @@
-"""A bound: what a controller reaches that knows the plant's equations and its exact state.
+"""A bound: the error that a controller leaves which has the plant's equations and its exact state.
 
-Model-predictive control on the analytic plant. It is told no goal ahead of time: it plans as if the present
-goal lasted, like every other controller. What error it leaves is the price of delay and dead time.
+Model-predictive control on the analytic plant. Like every other controller it gets no goal ahead
+of time: it plans as if the present goal lasted. Its error is the price of delay and dead time.
 """
 
 from dataclasses import dataclass
@@ -16,21 +16,15 @@ from brokk_min.jacobian import dls
 from brokk_min.kinematics import forward_kinematics, jacobian, tool_velocity
 from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, valve_opening
 
-BLOCKS = (
-    1,
-    1,
-    2,
-    4,
-    6,
-)  # ticks at which a plan may turn lie between; their sum is the horizon (assumed)
-STEPS = (1.0, 0.5, 0.2)  # shares of a Gauss-Newton step that are tried (assumed)
-PROBE = 0.03  # valve opening by which a plan is disturbed to see what it does (assumed)
-SOFT = 0.01  # m/s, errors below it weigh as squares, above it by their size (assumed)
-ROUNDING = 5  # ticks over which the choice of whole counts is judged (assumed)
+BLOCKS = (1, 1, 2, 4, 6)  # ticks between changes of a plan; their sum is the horizon (assumed)
+STEPS = (1.0, 0.5, 0.2)  # fractions of a Gauss-Newton step that are tried (assumed)
+PROBE = 0.03  # valve opening of the finite differences (assumed)
+SOFT = 0.01  # m/s: smaller errors weigh as squares, larger ones by their size (assumed)
+ROUNDING = 5  # ticks over which roundings to whole counts are compared (assumed)
 
 
 class Plan(NamedTuple):
-    """Memory of the bound: the plant as it is, and what it means to do."""
+    """State of the controller: the plant as it is, and the plan."""
 
     plant: PlantState
     opening: Array  # valve openings beyond the dead zone, (num, horizon, n_driven)
@@ -39,13 +33,11 @@ class Plan(NamedTuple):
 
 @dataclass(frozen=True)
 class PerfectModel:
-    """The bound as an `env.Controller`: Gauss-Newton on a plan of valve openings at every tick.
+    """The bound as a `Controller`: Gauss-Newton on a plan of valve openings at every tick.
 
-    It follows the plant by its own commands, so that its state (spools, readiness, delayed commands) is
-    exact; observations tell it the goal alone. Valves that are hardly open go to and fro by `dither`, which
-    keeps them ready. It drives the machine as it is known, no other.
-
-    Paper: Sec. 4.2 (nothing: beyond it)
+    It simulates the plant under its own commands, so its state (spools, valve activation, delayed
+    commands) is exact; of the measurements it reads the goal alone. Openings near zero alternate
+    by `dither`, which keeps the valves open. It drives the nominal machine only.
     """
 
     machine: Machine
@@ -57,77 +49,83 @@ class PerfectModel:
         if num % len(self.poses):
             raise ValueError(f"poses: expected {num} or a part of it, got {len(self.poses)}")
         q = np.tile(self.poses, (num // len(self.poses), 1))
-        return Plan(
-            plant_reset(self.machine, q), np.zeros((num, sum(BLOCKS), len(self.machine.driven))), 0
-        )
+        closed = np.zeros((num, sum(BLOCKS), len(self.machine.driven)))
+        return Plan(plant_reset(self.machine, q), closed, 0)
 
-    def __call__(self, measured: Measured, memory: Plan) -> tuple[Array, Plan]:
-        """Commands u (num, n), and the next memory."""
-        plant, tick = memory.plant, memory.tick
+    def __call__(self, measured: Measured, plan: Plan) -> tuple[Array, Plan]:
+        """Commands u (num, n), and the plan for the next tick."""
         goal = measured.v_goal.astype(float)
-        before = np.concatenate([memory.opening[:, 1:], memory.opening[:, -1:]], axis=1)
-        opening = self.improve(plant, before, goal, tick)
-        u = self.quantise(plant, opening, goal, tick)
-        return u, Plan(plant_step(self.machine, plant, u), opening, tick + 1)
+        shifted = np.concatenate([plan.opening[:, 1:], plan.opening[:, -1:]], axis=1)
+        opening = self.improve(plan.plant, shifted, goal, plan.tick)
+        u = self.quantise(plan.plant, opening, goal, plan.tick)
+        return u, Plan(plant_step(self.machine, plan.plant, u), opening, plan.tick + 1)
 
     def commands(self, opening: Array, tick: int) -> Array:
-        """Commands (..., ticks, n) for planned openings (..., ticks, n_driven) from a tick on."""
+        """Commands (..., T, n) of planned openings (..., T, n_driven) from a tick on."""
         m = self.machine
-        wave = self.dither * (-1.0) ** (tick + np.arange(opening.shape[-2]))[:, None]
-        opening = opening + wave * np.maximum(0, 1 - np.abs(opening) / (2 * self.dither + 1e-9))
+        sign = (-1.0) ** (tick + np.arange(opening.shape[-2]))[:, None]
+        near_zero = np.maximum(0, 1 - np.abs(opening) / (2 * self.dither + 1e-9))
+        opening = opening + self.dither * sign * near_zero
         u = np.zeros((*opening.shape[:-1], m.n))
         u[..., m.driven] = np.sign(opening) * (m.dead_zone + (1 - m.dead_zone) * np.abs(opening))
         return u
 
     def errors(self, plant: PlantState, u: Array, goal: Array) -> Array:
-        """Velocity errors [m/s] (num, c, ticks, 3) that commands (num, c, ticks, n) would leave."""
-        m, (num, c, ticks, n) = self.machine, u.shape
-        state = PlantState(*(np.repeat(array, c, axis=0) for array in plant))
+        """Velocity errors [m/s] (num, plans, T, 3) under commands (num, plans, T, n)."""
+        m = self.machine
+        num, plans, ticks, n = u.shape
+        state = PlantState(*(np.repeat(array, plans, axis=0) for array in plant))
         angles = [state.q]
         for t in range(ticks):
-            state = plant_step(m, state, u[:, :, t].reshape(num * c, n))
+            state = plant_step(m, state, u[:, :, t].reshape(num * plans, n))
             angles.append(state.q)
-        q = np.array(angles)
-        v = tool_velocity(
-            forward_kinematics(m, q[1:].astype(np.float32)),
-            (np.diff(q, axis=0) * m.rate).astype(np.float32),
-        )
-        return goal[:, None, None] - np.moveaxis(v, 0, 1).reshape(num, c, ticks, 3)
+        q = np.stack(angles, axis=1)  # (num * plans, T + 1, n)
+        q_dot = np.diff(q, axis=1) * m.rate
+        frames = forward_kinematics(m, q[:, 1:].astype(np.float32))
+        v = tool_velocity(frames, q_dot.astype(np.float32)).reshape(num, plans, ticks, 3)
+        return goal[:, None, None] - v
 
     def improve(self, plant: PlantState, opening: Array, goal: Array, tick: int) -> Array:
-        """The best of a plan (num, horizon, n_driven), Gauss-Newton steps from it and steady openings."""
-        m, (num, horizon, n) = self.machine, opening.shape
-        room = valve_opening(m.pwm_limit / PWM_MAX, m.dead_zone)
-        later = np.repeat(
-            np.triu(np.ones((len(BLOCKS),) * 2)), BLOCKS, axis=1
-        )  # from a tick to the end
-        basis = np.einsum("bh,jn->bjhn", later, np.eye(n)).reshape(-1, horizon, n)
-        plans = np.concatenate([opening[:, None], opening[:, None] + PROBE * basis], axis=1)
-        probed = self.errors(plant, self.commands(np.clip(plans, -room, room), tick), goal)
-        weight = 1 / np.sqrt(np.linalg.norm(probed[:, :1], axis=-1, keepdims=True) + SOFT)
-        here = (probed[:, 0] * weight[:, 0]).reshape(num, -1)
-        slope = ((probed[:, 1:] - probed[:, :1]) * weight).reshape(num, len(basis), -1) / PROBE
-        square = slope @ slope.swapaxes(1, 2) + 1e-3 * np.eye(len(basis))
-        change = np.linalg.solve(square, -(slope @ here[..., None]))[..., 0]
-        steps = np.array(STEPS)[:, None, None] * np.einsum("rk,khn->rhn", change, basis)[:, None]
-        steady = np.broadcast_to(
-            steady_opening(m, plant.q, goal)[:, None, None], (num, 1, horizon, n)
-        )
-        tried = np.clip(np.concatenate([opening[:, None] + steps, steady], axis=1), -room, room)
-        after = self.errors(plant, self.commands(tried, tick), goal)
-        options = np.concatenate([opening[:, None], tried], axis=1)
-        size = np.linalg.norm(np.concatenate([probed[:, :1], after], axis=1), axis=-1)
-        cost = size.mean(axis=-1) + 1e-4 * np.square(options).mean(
-            axis=(-1, -2)
-        )  # of equals the smaller
-        return np.asarray(options[np.arange(num), cost.argmin(axis=1)])
+        """The best of a plan (num, horizon, n_driven), Gauss-Newton steps, and steady openings."""
+        m = self.machine
+        step = self.gauss_newton_step(plant, opening, goal, tick)
+        steady = steady_opening(m, plant.q, goal)[:, None]
+        tried = [opening, *(opening + fraction * step for fraction in STEPS)]
+        tried.append(np.broadcast_to(steady, opening.shape))
+        limit = valve_opening(m.pwm_limit / PWM_MAX, m.dead_zone)
+        plans = np.clip(np.stack(tried, axis=1), -limit, limit)  # (num, plans, horizon, n_driven)
+        error = np.linalg.norm(self.errors(plant, self.commands(plans, tick), goal), axis=-1)
+        size = np.square(plans).mean(axis=(-1, -2))
+        cost = error.mean(axis=-1) + 1e-4 * size  # of equal plans the smaller
+        return np.asarray(plans[np.arange(len(plans)), cost.argmin(axis=1)])
+
+    def gauss_newton_step(self, plant: PlantState, opening: Array, goal: Array, tick: int) -> Array:
+        """Change of a plan (num, horizon, n_driven) that lessens its velocity errors most.
+
+        A parameter is the opening of one joint from the start of one block to the horizon.
+        """
+        m = self.machine
+        num, horizon, n = opening.shape
+        from_block = np.repeat(np.triu(np.ones((len(BLOCKS), len(BLOCKS)))), BLOCKS, axis=1)
+        basis = np.einsum("bt,jk->bjtk", from_block, np.eye(n)).reshape(-1, horizon, n)
+        plans = opening[:, None] + PROBE * np.concatenate([np.zeros((1, horizon, n)), basis])
+        limit = valve_opening(m.pwm_limit / PWM_MAX, m.dead_zone)
+        u = self.commands(np.clip(plans, -limit, limit), tick)
+        error = self.errors(plant, u, goal)  # (num, 1 + parameters, horizon, 3)
+        size = np.linalg.norm(error[:, :1], axis=-1, keepdims=True)
+        weight = 1 / np.sqrt(size + SOFT)
+        r = (error[:, 0] * weight[:, 0]).reshape(num, -1)  # residuals
+        J_t = ((error[:, 1:] - error[:, :1]) * weight).reshape(num, len(basis), -1) / PROBE
+        A = J_t @ J_t.swapaxes(1, 2) + 1e-3 * np.eye(len(basis))  # J^T J + regularisation
+        x = np.linalg.solve(A, -(J_t @ r[..., None]))[..., 0]  # A x = -J^T r
+        return np.asarray(np.einsum("np,pth->nth", x, basis))
 
     def quantise(self, plant: PlantState, opening: Array, goal: Array, tick: int) -> Array:
-        """The plan's first commands (num, n) in whole counts: the best of all ways to round them."""
+        """First commands (num, n) of a plan in whole counts, by the best of all roundings."""
         m, driven = self.machine, self.machine.driven
-        planned = self.commands(opening[:, :ROUNDING], tick)
-        up = np.array(list(product((False, True), repeat=len(driven))))
-        u = np.repeat(planned[:, None], len(up), axis=1)
+        up = np.array(list(product((False, True), repeat=len(driven))))  # (2^n_driven, n_driven)
+        u = self.commands(opening[:, :ROUNDING], tick)
+        u = np.repeat(u[:, None], len(up), axis=1)  # (num, 2^n_driven, ROUNDING, n)
         counts = u[:, :, 0, driven] * PWM_MAX
         u[:, :, 0, driven] = np.where(up, np.ceil(counts), np.floor(counts)) / PWM_MAX
         u[:, :, 0] = limit_command(m, u[:, :, 0])
@@ -137,12 +135,16 @@ class PerfectModel:
 
 
 def steady_opening(machine: Machine, q: Array, goal: Array) -> Array:
-    """Openings (num, n_driven) at which the plant at angles `q` settles to the tool velocity `goal` [m/s]."""
-    J, driven = jacobian(forward_kinematics(machine, q))[..., machine.driven], machine.driven
-    rate = (dls(J, np.ones(len(driven)), np.full(len(q), 1e-3)) @ goal[..., None])[..., 0]
-    speed = rate * lever_arm(machine, q)[:, driven]
-    fastest = (machine.column(name)[driven] for name in ("speed_positive", "speed_negative"))
-    opening: Array = speed / np.where(speed > 0, *fastest)
+    """Openings (num, n_driven) that hold the tool velocity `goal` [m/s] at angles `q` [rad]."""
+    driven = machine.driven
+    J = jacobian(forward_kinematics(machine, q))[..., driven]
+    J_inv = dls(J, np.ones(len(driven)), np.full(len(q), 1e-3))
+    q_dot = (J_inv @ goal[..., None])[..., 0]
+    v = q_dot * lever_arm(machine, q)[:, driven]  # of the cylinders [m/s]
+    K = np.where(
+        v > 0, machine.column("speed_positive")[driven], machine.column("speed_negative")[driven]
+    )
+    opening: Array = v / K
     return opening
 
 

@@ -21,32 +21,14 @@ from brokk_min.machine import PWM_MAX, Array, Machine, valve_opening
 
 AXES = "xyz"
 KINDS = ("workspace", "limits", "extended")  # of starts, see `start_kinds`
-# Tables of seconds and velocity in fractions of tool_speed, 18 s each (assumed).
-# One axis of the paper's experiment, with changes of direction:
+# Rows of seconds and velocity in fractions of tool_speed, 18 s in all (assumed).
+# On one axis, as in the paper, with changes of direction:
 AXIS = ((1, 0), (4, 2 / 3), (1, 0), (4, -2 / 3), (1, 0), (3, 1 / 3), (3, -1 / 3), (1, 0))
 # Along x, y and z:
-RECTANGLE = (
-    (1, 0, 0, 0),
-    (5, 0, 0.5, 0),
-    (3, 0, 0, 0.5),
-    (5, 0, -0.5, 0),
-    (3, 0, 0, -0.5),
-    (1, 0, 0, 0),
-)
-STOP_AND_GO = (
-    (1, 0, 0, 0),
-    *((1, 2 / 3, 0, 0), (1, 0, 0, 0)) * 4,
-    *((1, -2 / 3, 0, 0), (1, 0, 0, 0)) * 4,
-    (1, 0, 0, 0),
-)
-SLOW = (
-    (1, 0, 0, 0),
-    (4, 0.1, 0, 0),
-    (4, -0.1, 0, 0),
-    (4, 0, 0, 0.1),
-    (4, 0, 0, -0.1),
-    (1, 0, 0, 0),
-)
+REST = (1, 0, 0, 0)
+RECTANGLE = (REST, (5, 0, 0.5, 0), (3, 0, 0, 0.5), (5, 0, -0.5, 0), (3, 0, 0, -0.5), REST)
+STOP_AND_GO = (REST, *((1, 2 / 3, 0, 0), REST) * 4, *((1, -2 / 3, 0, 0), REST) * 4, REST)
+SLOW = (REST, (4, 0.1, 0, 0), (4, -0.1, 0, 0), (4, 0, 0, 0.1), (4, 0, 0, -0.1), REST)
 
 
 class Commands(NamedTuple):
@@ -327,20 +309,19 @@ def tuning_set(machine: Machine, num: int, seed: int, seconds: float = 12.0) -> 
     """
     rng = np.random.default_rng(seed + 1000)
     config = TaskConfig()
-    ticks = round(seconds * machine.rate)
-    holds = int(np.ceil(seconds / config.hold_min_s))  # goals that last long enough
+    holds = int(np.ceil(seconds / config.hold_min_s))  # goals of a run: enough, however short
     starts: list[Array] = []
     kept: list[Array] = []
     with tqdm(total=num, desc="draw tuning runs", unit="run", disable=None) as bar:
         for _ in range(60):
             drawn = reset(machine, config, rng, 200 * holds, plant=False)
-            runs = []
-            for i in range(0, 200 * holds, holds):
-                run = slice(i, i + holds)
-                runs.append(np.repeat(drawn.v_goal[run], drawn.goal_ticks[run], axis=0)[:ticks])
-            goals = np.stack(runs, axis=1)
-            good = feasible(machine, drawn.q[::holds], goals)
-            starts += list(drawn.q[::holds][good])
+            v_goal = np.repeat(drawn.v_goal, drawn.goal_ticks, axis=0)
+            first = np.concatenate([[0], np.cumsum(drawn.goal_ticks)])[: 200 * holds : holds]
+            tick = np.arange(round(seconds * machine.rate))[:, None]
+            goals = v_goal[first + tick]  # (T, 200, 3)
+            q = drawn.q[::holds]
+            good = feasible(machine, q, goals)
+            starts += list(q[good])
             kept += list(goals[:, good].swapaxes(0, 1))
             bar.update(min(num, len(starts)) - bar.n)
             if len(starts) >= num:

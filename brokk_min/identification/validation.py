@@ -13,7 +13,14 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from brokk_min import kinematics
-from brokk_min.actuator import ActuatorNet, append_sample, initial_history, plant_reset, plant_step
+from brokk_min.actuator import (
+    ActuatorNet,
+    append_command,
+    append_sample,
+    initial_history,
+    plant_reset,
+    plant_step,
+)
 from brokk_min.identification.fitting import Samples, end_to_end, training_set
 from brokk_min.identification.logs import Log, Recording
 from brokk_min.machine import Array, Machine
@@ -31,7 +38,7 @@ def net_step(net: ActuatorNet, history: Array, q: Array, u: Array) -> tuple[Arra
     No joint goes further than it went in training.
     """
     low, high = np.minimum(q, net.q_low), np.maximum(q, net.q_high)
-    moved = net.next_angles(history, q, u, low, high)
+    moved = np.clip(q + net.predict(append_command(history, u)) / net.rate, low, high)
     result = append_sample(history, u, moved, net.velocity_samples, 1 / net.rate)
     if net.velocity_logged:
         result[..., 1, -1] = (moved - q) * net.rate
@@ -251,7 +258,9 @@ def named_times(times: Array, joints: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def validate(net: ActuatorNet, log: Log, test: Log, machine: Machine | None = None) -> dict[str, Any]:
+def validate(
+    net: ActuatorNet, log: Log, test: Log, machine: Machine | None = None
+) -> dict[str, Any]:
     """Scores of nets fitted to `log` on unseen recordings `test`, as in the fit JSON, with warnings.
 
     Each joint: what `score` says of the nets and, as `linear`, of the linear model; `creep` at

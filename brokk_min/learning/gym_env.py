@@ -28,7 +28,7 @@ Frame = NDArray[np.uint8]  # (height, width, 3)
 
 
 class Renderer(Protocol):
-    """Draws states of environments; `viewer.window.FrameRenderer` is one."""
+    """Draws states of environments; `viewer.rendered_env.FrameRenderer` is one."""
 
     mode: str  # Gymnasium's render_mode
 
@@ -194,6 +194,6 @@ def load_actuator(machine: Machine, actuator: ActuatorNet | Path | str) -> Actua
 
 gymnasium.register(
     "brokk_min/Brokk170-v0",
-    entry_point="brokk_min.viewer.window:RenderedEnv",
-    vector_entry_point="brokk_min.viewer.window:RenderedVectorEnv",
+    entry_point="brokk_min.viewer.rendered_env:RenderedEnv",
+    vector_entry_point="brokk_min.viewer.rendered_env:RenderedVectorEnv",
 )

@@ -1,87 +1,93 @@
-"""Recorded runs, of a log or of results driven again, side by side: films of them."""
+"""Recorded runs side by side, of logs or of results simulated again: in a window or as a film."""
 
 import json
 import subprocess
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import IO, Any, NamedTuple, cast
+from typing import IO, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet
 from brokk_min.can.canopen import read_frames
-from brokk_min.can.drive_log import Telemetry, TelemetryReader
+from brokk_min.can.drive_log import TelemetryReader
 from brokk_min.evaluation import baselines, metrics
-from brokk_min.evaluation.rollout import Controller, Trace
+from brokk_min.evaluation.rollout import Controller
 from brokk_min.evaluation.sequences import Commands, goals_and_starts, task_sequences
 from brokk_min.identification.files import expected, whole_file
 from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocity
 from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import Array, Machine
-from brokk_min.viewer import drawing as view
-from brokk_min.viewer.drawing import skeleton
-from brokk_min.viewer.window import open_window, picture
+from brokk_min.viewer import drawing
+from brokk_min.viewer.window import BACKGROUND, Canvas, Colour, open_window
+
+FFMPEG = (  # raw pictures in, MP4 of even width and height out
+    "ffmpeg -loglevel error -f rawvideo -pix_fmt rgb24 -s {0}x{1} -r {2} -i - -pix_fmt yuv420p "
+    "-vf crop=trunc(iw/2)*2:trunc(ih/2)*2 -f mp4 -movflags frag_keyframe+empty_moov pipe:1"
+)
+Images = Iterable[NDArray[np.uint8]]
 
 
-class Run(NamedTuple):
-    """A recorded run: what was known tick by tick, and the tool's."""
+@dataclass
+class Run:
+    """A recorded run of T ticks."""
 
+    machine: Machine
     title: str
-    colour: view.Colour
-    known: Sequence[Telemetry]
-    p_tool: Array  # m (T, 3)
-    error: Array  # |v_goal - v_tool| [m/s] (T,)
-    path: Array  # where the tool was to go [m] (K, 3), or none
-    hold: Array  # corners of the arm on the way [m] (K, 3)
+    colour: Colour
+    q: Array  # rad (T, n)
+    q_dot: Array  # rad/s (T, n)
+    u: Array  # in [-1, 1] (T, n)
+    v_goal: Array  # m/s (T, 3)
+    path: Array  # line that the tool should follow [m] (K, 3), or no points
+
+    @cached_property
+    def p_tool(self) -> Array:
+        """Tool positions [m], (T, 3)."""
+        return tool_position(forward_kinematics(self.machine, self.q))
+
+    @cached_property
+    def error(self) -> Array:
+        """Velocity error |v_goal - v_tool| [m/s], (T,)."""
+        v_tool = tool_velocity(forward_kinematics(self.machine, self.q), self.q_dot)
+        return np.asarray(np.linalg.norm(self.v_goal - v_tool, axis=-1))
+
+    @cached_property
+    def in_view(self) -> Array:
+        """Points that a picture must show [m], (K, 3): the path, and the arm twice a second."""
+        corners = drawing.skeleton(self.machine, self.q[::10]).reshape(-1, 3)
+        return np.vstack([corners, self.path])
 
 
-def recorded(
-    machine: Machine, title: str, colour: view.Colour, known: Sequence[Telemetry], path: Array
-) -> Run:
-    """A run from its ticks; the velocity error is that of the velocities that it holds."""
-    q, q_dot, v_goal = (
-        np.array([getattr(k, name) for k in known]) for name in ("q", "q_dot", "v_goal")
-    )
-    frames = forward_kinematics(machine, q)
-    p_tool, v_tool = tool_position(frames), tool_velocity(frames, q_dot)
-    corners = skeleton(machine, q[::10]).reshape(-1, 3)
-    error = np.linalg.norm(v_goal - v_tool, axis=-1)
-    return Run(title, colour, known, p_tool, error, path, np.vstack([corners, path]))
-
-
-def run_of_log(machine: Machine, path: Path, colour: view.Colour) -> Run:
-    """The ticks of a candump log from the first that drives; ticks without all positions are left out.
+def run_of_log(machine: Machine, path: Path, colour: Colour) -> Run:
+    """Ticks of a candump log from the first driven one; ticks without all positions are left out.
 
     ValueError: no log, or one in which nothing drives.
     """
-    ticks = TelemetryReader(machine)
-    known = [
-        k for frame in read_frames(path) if (k := ticks.update(frame)) and np.isfinite(k.q).all()
-    ]
-    first = next((i for i, k in enumerate(known) if k.driving), None)
-    if first is None:
+    reader = TelemetryReader(machine)
+    updates = [reader.update(frame) for frame in read_frames(path)]
+    ticks = [t for t in updates if t is not None and np.isfinite(t.q).all()]
+    driving = [t.driving for t in ticks]
+    if not any(driving):
         raise ValueError(f"{path}: expected a log in which the valves are driven, got none")
-    return recorded(machine, path.name, colour, known[first:], np.zeros((0, 3)))
+    ticks = ticks[driving.index(True) :]
+    columns = {k: np.array([getattr(t, k) for t in ticks]) for k in ("q", "q_dot", "u", "v_goal")}
+    return Run(machine, path.name, colour, **columns, path=drawing.NO_POINTS)
 
 
-def run_of_trace(
-    machine: Machine, title: str, trace: Trace, run: int, goals: Array, start: Array
-) -> Run:
-    """One run of a rollout: true motion, and where the goals (T, 3) lead from the start [m] (3,)."""
-    rows = zip(trace.q[:, run], trace.q_dot[:, run], trace.u[:, run], goals, strict=True)
-    known = [Telemetry(i, *row, driving=True) for i, row in enumerate(rows)]
-    path = start + np.vstack([np.zeros(3), np.cumsum(goals, axis=0)]) * machine.dt
-    colour = next((c for name, c in view.COLOURS.items() if title.startswith(name)), view.STEEL)
-    return recorded(machine, title, colour, known, path)
+# --- results --------------------------------------------------------------------------------------
 
 
 class Results(NamedTuple):
-    """What a results file says of itself, and what it takes to drive its runs again."""
+    """A file of results, and what it takes to simulate its runs again."""
 
     path: Path
-    runs: list[dict[str, Any]]  # its rows
+    rows: list[dict[str, Any]]
     sequences: dict[str, Commands]
     starts: Array  # rad (starts, n)
     controllers: dict[str, Controller]
@@ -90,81 +96,100 @@ class Results(NamedTuple):
 
 
 def read_results(machine: Machine, path: Path, controllers: Sequence[str]) -> Results:
-    """A JSON file of `evaluate` or `reproduce`; its gains are read if other `controllers` than RL are wanted.
+    """A JSON file of `evaluate` or `reproduce`; `controllers` are needed from its gains file.
 
-    ValueError: no results, or of another machine; the files that it names are not as they should be.
+    ValueError: no results, or of another machine, or the files named in it are wrong.
     """
     with expected(path, "results of `evaluate`"):
         file = json.loads(path.read_text())
-        beside = {
-            "policy": str(path.with_name("policy.npz")),
-            "gains": str(path.with_name("gains.json")),
-        }
-        told = beside | {"plant": "analytic", "commands": "", "starts": ""} | file["meta"]
+        meta = {"plant": "analytic", "commands": "", "starts": "", **file["meta"]}
         rows = file.get("task_space", file)["runs"]
-        names, seed = ", ".join(s.name for s in task_sequences(machine)), int(told["seed"])
-        num = int(told["starts"]) if told["starts"].isdigit() else 0
-        given = np.array(file["starts"], float) if "starts" in file else None
-    if told.get("machine") != machine.name:
-        raise ValueError(f"{path}: expected --machine {told.get('machine')}, got {machine.name}")
-    commands = None if told["commands"] in ("", names) else Path(told["commands"])
-    poses = None if num or not told["starts"] else Path(told["starts"])
-    sequences, starts = goals_and_starts(machine, commands, poses, num, seed)
-    policy = load_policy(Path(told["policy"]), machine)
-    known: dict[str, Controller] = {"rl": PolicyController(machine, policy)}
+        seed = int(meta["seed"])
+        num = int(meta["starts"]) if meta["starts"].isdigit() else 0
+        starts = np.array(file["starts"], float) if "starts" in file else None
+    if meta.get("machine") != machine.name:
+        raise ValueError(f"{path}: expected --machine {meta.get('machine')}, got {machine.name}")
+    own = ", ".join(sequence.name for sequence in task_sequences(machine))
+    commands = None if meta["commands"] in ("", own) else Path(meta["commands"])
+    poses = None if num or not meta["starts"] else Path(meta["starts"])
+    sequences, drawn = goals_and_starts(machine, commands, poses, num, seed)
+    policy = load_policy(Path(meta.get("policy", path.with_name("policy.npz"))), machine)
+    named: dict[str, Controller] = {"rl": PolicyController(machine, policy)}
     if set(controllers) - {"rl"}:
-        known |= baselines.read_gains(Path(told["gains"]), machine, policy.net)
-    net, named = policy.net if told["plant"] == "net" else None, {s.name: s for s in sequences}
-    return Results(path, rows, named, starts if given is None else given, known, net, seed)
+        gains = Path(meta.get("gains", path.with_name("gains.json")))
+        named |= baselines.read_gains(gains, machine, policy.net)
+    return Results(
+        path,
+        rows,
+        {sequence.name: sequence for sequence in sequences},
+        drawn if starts is None else starts,
+        named,
+        policy.net if meta["plant"] == "net" else None,
+        seed,
+    )
 
 
-def driven_again(
+def simulate_again(
     machine: Machine, results: Results, controllers: Sequence[str], sequence: str, start: int
 ) -> list[Run]:
-    """One run of each controller, simulated anew; ValueError: it is not the run that the file has."""
-    chosen, every = (
-        {name: results.controllers[name] for name in controllers},
-        [*results.sequences.values()],
+    """One run of each controller; ValueError: it is not the run of the file."""
+    chosen = {name: results.controllers[name] for name in controllers}
+    sequences = list(results.sequences.values())
+    rows, traces = metrics.evaluate(
+        machine, chosen, sequences, results.starts, results.seed, results.net
     )
-    found, traces = metrics.evaluate(
-        machine, chosen, every, results.starts, results.seed, results.net
-    )
-    for row in (r for r in found if r["start"] == start and r["sequence"] == sequence):
-        same = [
-            r
-            for r in results.runs
-            if all(r[k] == row[k] for k in ("controller", "sequence", "start"))
-        ]
-        if not same or not np.isclose(same[0]["velocity_rmse"], row["velocity_rmse"], rtol=1e-3):
-            raise ValueError(
-                f"{results.path}: expected the run {row}, got {same or 'none'}: another program?"
-            )
-    goals, first = (
-        results.sequences[sequence].goals,
-        tool_position(forward_kinematics(machine, results.starts[start])),
-    )
-    return [
-        run_of_trace(machine, name, traces[name, sequence], start, goals, first) for name in chosen
-    ]
+    for row in rows:
+        if row["start"] == start and row["sequence"] == sequence:
+            _check_row(results, row)
+    goals = results.sequences[sequence].goals
+    p_start = tool_position(forward_kinematics(machine, results.starts[start]))
+    path = p_start + np.vstack([np.zeros(3), np.cumsum(goals, axis=0)]) * machine.dt
+    runs = []
+    for name in chosen:
+        q, q_dot, u = (getattr(traces[name, sequence], k)[:, start] for k in ("q", "q_dot", "u"))
+        colour = drawing.COLOURS.get(name.split("_")[0], drawing.STEEL)
+        runs.append(Run(machine, name, colour, q, q_dot, u, goals, path))
+    return runs
 
 
-def film(
-    machine: Machine, runs: Sequence[Run], tick: int, size: tuple[int, int]
-) -> list[view.Shape]:
-    """The picture of one tick of all runs, by the same clock; what is over stands still."""
-    scenes, hold = [], np.vstack([run.hold for run in runs])
+def _check_row(results: Results, row: dict[str, Any]) -> None:
+    """Refuse a simulated row that differs from the file's."""
+    keys = ("controller", "sequence", "start")
+    same = [other for other in results.rows if all(other[key] == row[key] for key in keys)]
+    if not same or not np.isclose(same[0]["velocity_rmse"], row["velocity_rmse"], rtol=1e-3):
+        got = f"{same or 'none'}: another program?"
+        raise ValueError(f"{results.path}: expected the run {row}, got {got}")
+
+
+# --- films ----------------------------------------------------------------------------------------
+
+
+def film(runs: Sequence[Run], tick: int, size: tuple[int, int]) -> Canvas:
+    """The picture of one tick of all runs; a run that is over stands still."""
+    in_view = np.vstack([run.in_view for run in runs])
+    scenes = []
     for run in runs:
-        at = min(tick, len(run.known) - 1)
-        known, mean = run.known[at], run.error[: at + 1].mean()
-        title, status = view.TITLES.get(run.title, run.title), f"{at * machine.dt:.1f} s"
-        scene = view.Scene(
-            known.q, known.q_dot, known.u, known.v_goal, run.p_tool[: at + 1], run.path
+        at = min(tick, len(run.q) - 1)
+        scene = drawing.Scene(
+            run.q[at],
+            run.q_dot[at],
+            run.u[at],
+            run.v_goal[at],
+            trail=run.p_tool[: at + 1],
+            path=run.path,
+            title=drawing.TITLES.get(run.title, run.title),
+            status=f"{at * run.machine.dt:.1f} s",
+            colour=run.colour,
+            notes=[
+                f"velocity error {run.error[at]:.3f} m/s",
+                f"mean so far {run.error[: at + 1].mean():.3f} m/s",
+            ],
+            in_view=in_view,
         )
-        notes = [f"velocity error {run.error[at]:.3f} m/s", f"mean so far {mean:.3f} m/s"]
-        scenes.append(
-            scene._replace(title=title, status=status, colour=run.colour, notes=notes, hold=hold)
-        )
-    return view.draw(machine, scenes, size)
+        scenes.append(scene)
+    canvas = Canvas(size)
+    drawing.draw(canvas, runs[0].machine, scenes)
+    return canvas
 
 
 def write_film(
@@ -177,68 +202,62 @@ def write_film(
     writers = {".gif": _write_gif, ".mp4": _write_mp4}
     if path.suffix not in writers:
         raise ValueError(f"{path}: expected a name ending in .gif or .mp4, got {path.suffix!r}")
-    ticks = range(0, max(len(run.known) for run in runs), max(1, round(machine.rate / fps)))
-    bar = tqdm(ticks, desc="draw", unit="picture", disable=None)
-    images = (picture(film(machine, runs, tick, size), size) for tick in bar)
+    step = max(1, round(machine.rate / fps))
+    ticks = range(0, max(len(run.q) for run in runs), step)
+    bar = tqdm(ticks, desc="draw", unit="frame", disable=None)
+    images = (film(runs, tick, size).image() for tick in bar)
     with whole_file(path) as file:
-        writers[path.suffix](file, images, size, machine.rate / ticks.step)
+        writers[path.suffix](file, images, size, machine.rate / step)
 
 
-def _write_gif(file: IO[bytes], images: Iterable[Any], size: tuple[int, int], fps: float) -> None:
-    films = [Image.fromarray(image) for image in images]
-    flat = [image.quantize(palette=_palette(films), dither=Image.Dither.NONE) for image in films]
+def _write_gif(file: IO[bytes], images: Images, size: tuple[int, int], fps: float) -> None:
+    palette = _palette()
+    none = Image.Dither.NONE
+    frames = [Image.fromarray(image).quantize(palette=palette, dither=none) for image in images]
     duration = round(1000 / fps)
-    flat[0].save(file, "GIF", save_all=True, append_images=flat[1:], duration=duration, loop=0)
+    frames[0].save(file, "GIF", save_all=True, append_images=frames[1:], duration=duration, loop=0)
 
 
-def _write_mp4(file: IO[bytes], images: Iterable[Any], size: tuple[int, int], fps: float) -> None:
-    form = f"-f rawvideo -pix_fmt rgb24 -s {size[0]}x{size[1]} -r {fps} -i - -pix_fmt yuv420p"
-    form += " -vf crop=trunc(iw/2)*2:trunc(ih/2)*2"  # the code knows even sizes only
-    form += " -f mp4 -movflags frag_keyframe+empty_moov pipe:1"
-    command = ["ffmpeg", "-loglevel", "error", *form.split()]
+def _palette() -> Image.Image:
+    """All colours of a picture, mixed with the background as on smooth edges."""
+    colours = np.array([*drawing.COLOURS.values(), *drawing.SMALL_COLOURS])
+    fractions = np.linspace(0, 0.85, 14)[:, None, None]
+    mixed = colours + fractions * np.subtract(BACKGROUND, colours)
+    palette = Image.new("P", (1, 1))
+    palette.putpalette([*BACKGROUND, *np.rint(mixed).astype(int).ravel().tolist()])
+    return palette
+
+
+def _write_mp4(file: IO[bytes], images: Images, size: tuple[int, int], fps: float) -> None:
+    command = FFMPEG.format(*size, fps).split()
     try:
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=file) as process:
-            cast(IO[bytes], process.stdin).writelines(image.tobytes() for image in images)
+            assert process.stdin is not None
+            process.stdin.writelines(image.tobytes() for image in images)
     except FileNotFoundError as error:
-        raise ValueError(
-            "film: expected ffmpeg for .mp4, or a name ending in .gif, got none"
-        ) from error
-    except BrokenPipeError:
-        process.returncode = process.returncode or 1  # it did not read all pictures
+        raise ValueError("film: expected ffmpeg for .mp4, or a name in .gif, got none") from error
+    except BrokenPipeError as error:
+        raise ValueError("film: expected ffmpeg to read all pictures, got its end") from error
     if process.returncode:
         raise ValueError(f"film: expected ffmpeg to write it, got its status {process.returncode}")
 
 
-def _palette(films: Sequence[Image.Image]) -> Image.Image:
-    """96 colours of some pictures and of all that warns or measures, however little of it there is."""
-    some = [np.asarray(film) for film in films[:: max(1, len(films) // 6)]]
-    named = [
-        *view.COLOURS.values(),
-        *view.STATUS_COLOURS.values(),
-        view.MEASURED,
-        view.PATH,
-        view.WARNING,
-    ]
-    swatches = np.repeat(np.array(named, np.uint8), 40, axis=0)[:, None].repeat(
-        some[0].shape[1], axis=1
-    )
-    return Image.fromarray(np.vstack([*some, swatches])).quantize(96)
-
-
 def show_film(machine: Machine, runs: Sequence[Run], size: tuple[int, int]) -> None:
     """All runs in a window, in real time; space halts, left and right move by a second."""
-    at, going, last = 0, True, max(len(run.known) for run in runs) - 1
+    last = max(len(run.q) for run in runs) - 1
+    second = round(machine.rate)
+    tick = 0
+    playing = True
     with open_window(size, "brokk_min replay") as window:
         pg = window.pygame
+        steps = {pg.K_RIGHT: second, pg.K_LEFT: -second}
         while True:
             for event in pg.event.get():
-                if event.type == pg.QUIT or (event.type == pg.KEYDOWN and event.key == pg.K_ESCAPE):
+                key = event.key if event.type == pg.KEYDOWN else None
+                if event.type == pg.QUIT or key == pg.K_ESCAPE:
                     return
-                if event.type == pg.KEYDOWN:
-                    going ^= event.key == pg.K_SPACE
-                    at += round(machine.rate) * (
-                        (event.key == pg.K_RIGHT) - (event.key == pg.K_LEFT)
-                    )
-            at = min(max(at, 0), last)
-            window.show(film(machine, runs, at, size), machine.rate)
-            at += going
+                playing ^= key == pg.K_SPACE
+                tick += steps.get(key, 0)
+            tick = min(max(tick, 0), last)
+            window.show(film(runs, tick, size), machine.rate)
+            tick += playing

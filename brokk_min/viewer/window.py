@@ -1,100 +1,125 @@
-"""Shapes onto a surface, into a window or an image: all that needs pygame (extra `play`)."""
+"""Canvas and window of pygame (extra `play`), which is imported when the first one is made."""
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min.env import State
 from brokk_min.identification.files import require
-from brokk_min.kinematics import forward_kinematics, tool_position
-from brokk_min.learning.gym_env import TaskEnv, TaskVectorEnv
-from brokk_min.machine import BROKK_170, Array, Machine
-from brokk_min.viewer.drawing import (
-    PAPER,
-    Circle,
-    Clip,
-    Colour,
-    Line,
-    Polygon,
-    Scene,
-    Shape,
-    Text,
-    draw,
-)
+from brokk_min.machine import Array
+
+Colour = tuple[int, int, int]
+Box = tuple[float, float, float, float]  # left, top, width, height [px]
+BACKGROUND, INK = (250, 250, 247), (33, 37, 43)
 
 
-def need_pygame() -> Any:
-    """pygame, which is imported only where something is painted; ValueError: it is not installed."""
+def require_pygame() -> Any:
+    """The module pygame; ValueError: it is not installed."""
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
     return require("pygame", "play")
 
 
+class Canvas:
+    """A picture that is drawn twice as large and scaled down, for smooth edges; text lies on top.
+
+    Coordinates are pixels, y down; points are (k, 2). Only one canvas of a size at a time.
+    """
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        self.size = size
+        self.draw = require_pygame().draw
+        self.large = _large_surface(size)
+        self.large.set_clip(None)
+        self.large.fill(BACKGROUND)
+        self.texts: list[tuple[Any, tuple[float, float]]] = []
+
+    def clip(self, box: Box | None) -> None:
+        """Cut off what follows at this box; text is not cut."""
+        self.large.set_clip(None if box is None else [round(2 * edge) for edge in box])
+
+    def line(self, points: Array, colour: Colour, width: int = 1) -> None:
+        """A line through points."""
+        self.draw.lines(self.large, colour, False, (2 * points).tolist(), 2 * width)
+
+    def polygon(self, points: Array, colour: Colour) -> None:
+        """A filled polygon."""
+        self.draw.polygon(self.large, colour, (2 * points).tolist())
+
+    def circle(self, centre: Array, radius: float, colour: Colour, width: int = 0) -> None:
+        """A filled circle, or a ring of some width."""
+        self.draw.circle(self.large, colour, (2 * centre).tolist(), 2 * radius, 2 * width)
+
+    def bar(self, x0: float, x1: float, y: float, half: float, colour: Colour) -> None:
+        """A filled rectangle from x0 to x1, `half` of it above y."""
+        corners = [[x0, y - half], [x1, y - half], [x1, y + half], [x0, y + half]]
+        self.polygon(np.array(corners), colour)
+
+    def text(
+        self,
+        x: float,
+        y: float,
+        text: str,
+        size: int = 13,
+        colour: Colour = INK,
+        anchor: float = 0.0,
+    ) -> None:
+        """Text at half its height; `anchor` 0 puts its left end at x, 1 its right end."""
+        word = _word(text, size, colour)
+        self.texts.append((word, (x - anchor * word.get_width(), y - word.get_height() / 2)))
+
+    def surface(self) -> Any:
+        """The finished picture as a pygame surface."""
+        surface = require_pygame().transform.smoothscale(self.large, self.size)
+        surface.blits(self.texts)
+        return surface
+
+    def image(self) -> NDArray[np.uint8]:
+        """The finished picture as an image (height, width, 3); needs no display."""
+        pixels: NDArray[np.uint8] = require_pygame().surfarray.array3d(self.surface())
+        return np.ascontiguousarray(pixels.swapaxes(0, 1))
+
+
+@lru_cache(maxsize=2)
+def _large_surface(size: tuple[int, int]) -> Any:
+    return require_pygame().Surface((2 * size[0], 2 * size[1]), depth=32)
+
+
 @lru_cache(maxsize=1024)
 def _word(text: str, size: int, colour: Colour) -> Any:
-    """Text as a surface, on the paper's colour so that it stays legible over an arm."""
-    return _font(size).render(text, True, colour, PAPER)
+    """Text as a surface, on the background's colour so that it is legible over an arm."""
+    return _font(size).render(text, True, colour, BACKGROUND)
 
 
 @lru_cache(maxsize=16)
 def _font(size: int) -> Any:
     """The typeface that matplotlib brings: the same everywhere."""
-    import matplotlib
-
-    pygame = need_pygame()
+    pygame = require_pygame()
     pygame.font.init()
     return pygame.font.Font(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf", size)
 
 
-def paint(surface: Any, shapes: Sequence[Shape]) -> None:
-    """Shapes on a pygame surface, edges smoothed: drawn twice as large and scaled down; text lies on top."""
-    pygame, twice = need_pygame(), _canvas((2 * surface.get_width(), 2 * surface.get_height()))
-    twice.set_clip(None)
-    twice.fill(PAPER)
-    for shape in shapes:
-        match shape:
-            case Line(points, colour, width):
-                pygame.draw.lines(twice, colour, False, (2 * points).tolist(), 2 * width)
-            case Polygon(points, colour):
-                pygame.draw.polygon(twice, colour, (2 * points).tolist())
-            case Circle(centre, radius, colour):
-                pygame.draw.circle(twice, colour, (2 * centre).tolist(), 2 * radius)
-            case Clip(box):
-                twice.set_clip([round(2 * edge) for edge in box])
-    pygame.transform.smoothscale(twice, surface.get_size(), surface)
-    for at, text, size, colour, anchor in (shape for shape in shapes if isinstance(shape, Text)):
-        word = _word(text, size, colour)
-        surface.blit(word, (at[0] - anchor * word.get_width(), at[1] - word.get_height() / 2))
-
-
-@lru_cache(maxsize=2)
-def _canvas(size: tuple[int, int]) -> Any:
-    return need_pygame().Surface(size, depth=32)
-
-
 class Window:
-    """A window for shapes; ValueError: no pygame, or no display."""
+    """A window for canvases; ValueError: no pygame, or no display."""
 
     def __init__(self, size: tuple[int, int], title: str) -> None:
-        self.pygame = pygame = need_pygame()
+        self.pygame = require_pygame()
         try:
-            pygame.display.init()
-            self.surface = pygame.display.set_mode(size)
-        except pygame.error as error:
-            raise ValueError(
-                f"window: expected a display (SDL_VIDEODRIVER=dummy draws unseen), got {error}"
-            ) from error
-        pygame.display.set_caption(title)
-        self.clock = pygame.time.Clock()
+            self.pygame.display.init()
+            self.surface = self.pygame.display.set_mode(size)
+        except self.pygame.error as error:
+            raise _no_display(str(error)) from error
+        self.pygame.display.set_caption(title)
+        self.clock = self.pygame.time.Clock()
 
-    def show(self, shapes: Sequence[Shape], fps: float) -> None:
-        """Show shapes, not before 1 / `fps` after the last ones."""
-        paint(self.surface, shapes)
+    def show(self, canvas: Canvas, fps: float) -> None:
+        """Show a canvas, not before 1 / `fps` after the last one."""
+        self.surface.blit(canvas.surface(), (0, 0))
         self.pygame.display.flip()
         self.clock.tick(fps)
 
@@ -103,104 +128,23 @@ class Window:
         self.pygame.display.quit()
 
 
+def _no_display(got: str) -> ValueError:
+    return ValueError(f"window: expected a display (SDL_VIDEODRIVER=dummy draws unseen), got {got}")
+
+
 @contextmanager
 def open_window(size: tuple[int, int], title: str) -> Iterator[Window]:
-    """A window for somebody to look at, closed at the end of the block.
+    """A window that is closed at the end of the block.
 
-    Without a display SDL draws unseen. That serves tests, and whoever asks for it with SDL_VIDEODRIVER.
+    Without a display SDL would draw unseen; that is refused unless SDL_VIDEODRIVER asks for it.
 
     ValueError: no pygame, or no display.
     """
     window = Window(size, title)
     try:
-        driver = window.pygame.display.get_driver()
-        if driver in ("offscreen", "dummy") and not os.environ.get("SDL_VIDEODRIVER"):
-            raise ValueError(
-                "window: expected a display (SDL_VIDEODRIVER=dummy draws unseen), got none"
-            )
+        unseen = window.pygame.display.get_driver() in ("offscreen", "dummy")
+        if unseen and not os.environ.get("SDL_VIDEODRIVER"):
+            raise _no_display("none")
         yield window
     finally:
         window.close()
-
-
-def picture(shapes: Sequence[Shape], size: tuple[int, int]) -> NDArray[np.uint8]:
-    """Shapes as an image (height, width, 3); needs no display."""
-    surface = need_pygame().Surface(size, depth=32)
-    paint(surface, shapes)
-    pixels: NDArray[np.uint8] = need_pygame().surfarray.array3d(surface)
-    return np.ascontiguousarray(pixels.swapaxes(0, 1))
-
-
-class FrameRenderer:
-    """Frames for Gymnasium, with trails of the tools since the last reset; a window for "human".
-
-    ValueError: a `mode` that is none of `modes`.
-    """
-
-    SIZE = (960, 600)
-
-    def __init__(self, machine: Machine, mode: str, modes: list[str]) -> None:
-        if mode not in modes:
-            raise ValueError(f"render_mode: expected one of {modes}, got {mode!r}")
-        self.machine = machine
-        self.mode = mode
-        self.window: Window | None = None
-        self.trails: dict[int, list[Array]] = {}
-
-    def update(self, state: State, started: Iterable[int]) -> None:
-        """Extend the trails to a state; those of the rows `started` begin with it."""
-        for row in started:
-            self.trails[int(row)] = []
-        for row, p_tool in enumerate(tool_position(forward_kinematics(self.machine, state.q))):
-            self.trails[row].append(p_tool)
-        if self.mode == "human":
-            self.render(state)
-
-    def render(self, state: State) -> list[NDArray[np.uint8]]:
-        """A frame (600, 960, 3) of each row; none for "human", which shows the first row."""
-        scenes = [
-            Scene(
-                state.q[row],
-                state.q_dot[row],
-                state.history[row, :, 2, -1],
-                state.v_goal[row],
-                np.array(trail),
-                title=self.machine.name,
-            )
-            for row, trail in self.trails.items()
-        ]
-        frames = [draw(self.machine, [scene], self.SIZE) for scene in scenes]
-        if self.mode != "human":
-            return [picture(shapes, self.SIZE) for shapes in frames]
-        if self.window is None:
-            self.window = Window(self.SIZE, self.machine.name)
-        self.window.pygame.event.pump()
-        self.window.show(frames[0], self.machine.rate)
-        return []
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        if self.window is not None:
-            self.window.close()
-            self.window = None
-
-
-class RenderedEnv(TaskEnv):
-    """What `gymnasium.make` makes: `render_mode` "human" is a window, "rgb_array" frames."""
-
-    def __init__(
-        self, machine: Machine = BROKK_170, render_mode: str | None = None, **options: Any
-    ) -> None:
-        modes = TaskEnv.metadata["render_modes"]
-        renderer = FrameRenderer(machine, render_mode, modes) if render_mode else None
-        super().__init__(machine=machine, renderer=renderer, **options)
-
-
-class RenderedVectorEnv(TaskVectorEnv):
-    """What `gymnasium.make_vec` makes: `render_mode` "rgb_array" is a frame of each machine."""
-
-    def __init__(
-        self, machine: Machine = BROKK_170, render_mode: str | None = None, **options: Any
-    ) -> None:
-        renderer = FrameRenderer(machine, render_mode, ["rgb_array"]) if render_mode else None
-        super().__init__(machine=machine, renderer=renderer, **options)

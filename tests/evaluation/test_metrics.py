@@ -134,9 +134,9 @@ def test_a_slow_goal_is_not_met_by_standing_still() -> None:
 def test_a_goal_that_turns_slowly_is_no_change() -> None:
     turn = np.linspace(0, 2 * np.pi, 320)
     goals = 0.15 * np.stack([np.cos(turn), 0 * turn, np.sin(turn)], axis=1)
-    since = m.since_change(BROKK_170, goals[:, None])
+    since = m.ticks_since_change(BROKK_170, goals[:, None])
     np.testing.assert_array_equal(since[:, 0], np.arange(320))  # the start is the only change
-    assert (m.since_change(BROKK_170, np.zeros((4, 1, 3))) == -1).all()
+    assert (m.ticks_since_change(BROKK_170, np.zeros((4, 1, 3))) == -1).all()
     still = figures(np.zeros((4, 3)), np.zeros((4, 3)))
     assert np.isnan(still["settling_time"]) and np.isnan(still["velocity_error_transient"])
 

@@ -90,7 +90,7 @@ CALLS: dict[str, Callable[[], Any]] = {
     "checksum": lambda: canopen.checksum(fixed(np.arange(7))),
     "valve_frame": lambda: canopen.valve_frame(fixed(np.arange(20).reshape(4, 5)), 1, 1),
     "line_distance": lambda: metrics.line_distance(GOALS, GOALS, V),
-    "since_change": lambda: metrics.since_change(M, GOALS),
+    "ticks_since_change": lambda: metrics.ticks_since_change(M, GOALS),
     "row_mean": lambda: metrics.row_mean(V),
     "interval": lambda: metrics.interval(fixed([1.0, np.nan, 3.0])),
     "feasible": lambda: sequences.feasible(M, Q, GOALS),

@@ -19,10 +19,9 @@ import can
 import numpy as np
 import pygame
 import pytest
-from helpers_bus import START, Push, World
+from helpers_bus import BASELINE, START, Push, Virtual, World
 from PIL import Image
 from test_drawing import boxes_of_words
-from test_hw import BASELINE, Virtual
 
 from benchmarks.bus import random_policy
 from brokk_min.__main__ import main
@@ -37,7 +36,7 @@ from brokk_min.can.canopen import (
     encoder_raw,
 )
 from brokk_min.can.drive_log import Telemetry
-from brokk_min.cli.options import machine_from
+from brokk_min.cli.options import find_machine
 from brokk_min.evaluation import baselines
 from brokk_min.evaluation.sequences import feasible
 from brokk_min.kinematics import forward_kinematics, tool_position
@@ -50,7 +49,7 @@ from brokk_min.viewer.play import InputHandler, Session
 from brokk_min.viewer.tracing import Attempt, Tracing
 
 MODES = ["rl", "jacobian", "levers"]
-MINI_EXCAVATOR = machine_from(
+MINI_EXCAVATOR = find_machine(
     f"{Path(__file__).parents[2]}/examples/mini_excavator.py:MINI_EXCAVATOR"
 )
 
@@ -960,7 +959,7 @@ def test_a_log_tells_what_the_loop_knew(tmp_path: Path) -> None:
     loop.go(0.5, False)
     loop.go(0.2, True)
     loop.go(2.0, True, (0.0, 0.2, 0.1))
-    loop.world.line.close()
+    loop.world.bus.close()
     loop.world.close()
     run = replay.run_of_log(BROKK_170, path, (1, 2, 3))
     told = [k for k in loop.known if k.driving][: len(run.known)]
@@ -1083,7 +1082,7 @@ def test_a_log_and_results_beside_one_another(
     loop = Remoted(Push(60, 0, 0, 0, 0), log=can.CanutilsLogWriter(tmp_path / "run.log"))
     loop.go(0.5, False)
     loop.go(0.5, True)
-    loop.world.line.close()
+    loop.world.bus.close()
     loop.world.close()
     shown: list[list[str]] = []
     monkeypatch.setattr(
@@ -1151,7 +1150,7 @@ def test_where_there_is_no_display_sdl_does_not_draw_unseen(tmp_path: Path) -> N
     loop = Remoted(Push(60, 0, 0, 0, 0), log=can.CanutilsLogWriter(log))
     loop.go(0.5, False)
     loop.go(0.5, True)
-    loop.world.line.close()
+    loop.world.bus.close()
     loop.world.close()
     code = (
         "import os, sys, pygame; from brokk_min.viewer import replay; from brokk_min.__main__ import main; "

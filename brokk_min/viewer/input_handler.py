@@ -1,0 +1,142 @@
+"""Keyboard and gamepad as one operator, for the window of `play`."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from brokk_min.can.operator_input import shape_axis
+from brokk_min.machine import Array, Machine
+from brokk_min.viewer.control_process import Request
+
+RISE = 0.25  # s from a key's press to full deflection (assumed)
+# plus and minus of x, y, z, as the top view shows them; of the driven joints
+VELOCITY_KEYS = (("up", "down"), ("left", "right"), ("w", "s"))
+LEVER_KEYS = (("q", "a"), ("w", "s"), ("e", "d"), ("r", "f"), ("t", "g"), ("y", "h"))
+PAD_AXES = (1, 0, 4, 3)  # 2 and 5 are triggers, which do not rest in the middle
+PAD_SWITCH, PAD_MODE, PAD_NEXT, PAD_AGAIN = 5, 3, 0, 1
+
+
+class InputHandler:
+    """Keyboard and gamepad as one operator.
+
+    The dead-man switch (space, or the gamepad's button) counts only if it is pressed with nothing
+    deflected. It must be released first after a loss of focus or gamepad and a change of mode.
+
+    Args:
+        machine: its driven joints have a lever each.
+        pygame: the module, with a window.
+        modes: names of the controllers, the last one "levers".
+    """
+
+    def __init__(self, machine: Machine, pygame: Any, modes: Sequence[str]) -> None:
+        self.machine = machine
+        self.pygame = pygame
+        self.modes = modes
+        self.mode = 0
+        self.held = set[int]()  # keys
+        self.focus = True
+        self.blocked = True  # must the switch be released first?
+        self.enable = False
+        self.lost = False  # gamepad unplugged?
+        self.closed = False
+        self.task = ""  # "next" or "again"
+        self.deflection: Array = np.zeros(3)
+        pygame.joystick.init()
+        self.pad: Any = pygame.joystick.Joystick(0) if pygame.joystick.get_count() else None
+
+    @property
+    def levers(self) -> bool:
+        """Does the operator move the joints one by one?"""
+        return self.modes[self.mode] == "levers"
+
+    def handle(self, event: Any) -> None:
+        """Take in one event of pygame."""
+        pg = self.pygame
+        match event.type:
+            case pg.QUIT:
+                self.closed = True
+            case pg.KEYDOWN:
+                self._press_key(event.key)
+            case pg.KEYUP:
+                self.held.discard(event.key)
+            case pg.WINDOWFOCUSLOST:
+                self.focus = False
+                self.blocked = True
+                self.held.clear()
+            case pg.WINDOWFOCUSGAINED:
+                self.focus = True
+            case pg.JOYBUTTONDOWN:
+                self._press_button(event.button)
+            case pg.JOYDEVICEADDED if self.pad is None:
+                self._change_pad(pg.joystick.Joystick(event.device_index))
+            case pg.JOYDEVICEREMOVED:
+                if self.pad and event.instance_id == self.pad.get_instance_id():
+                    self._change_pad(None)
+
+    def _press_key(self, key: int) -> None:
+        pg = self.pygame
+        self.held.add(key)
+        self.lost = False  # the keyboard takes over
+        self.closed |= key == pg.K_ESCAPE
+        if key == pg.K_TAB:
+            self._next_mode()
+        elif key in (pg.K_RETURN, pg.K_BACKSPACE):
+            self.task = "next" if key == pg.K_RETURN else "again"
+
+    def _press_button(self, button: int) -> None:
+        if button == PAD_MODE:
+            self._next_mode()
+        elif button in (PAD_NEXT, PAD_AGAIN):
+            self.task = "next" if button == PAD_NEXT else "again"
+
+    def _change_pad(self, pad: Any) -> None:
+        self.pad = pad
+        self.lost = pad is None
+        self.blocked = True
+
+    def _next_mode(self) -> None:
+        self.mode = (self.mode + 1) % len(self.modes)
+        self.blocked = True
+
+    def request(self, seconds: float) -> Request:
+        """The operator's input, `seconds` after the last time."""
+        target = self._target()
+        if self.deflection.shape != target.shape:
+            self.deflection = np.zeros_like(target)
+        last = np.where(target * self.deflection < 0, 0.0, self.deflection)
+        step = seconds / RISE
+        ramp = last + np.clip(target - last, -step, step)
+        self.deflection = np.where(target == 0, 0.0, ramp)  # released: neutral at once
+        self._update_switch(bool(target.any()))
+        alive = not self.lost
+        if self.levers:
+            return Request(self.mode, self.enable, alive, np.zeros(3), self.deflection)
+        length = float(np.linalg.norm(self.deflection))
+        v_goal = self.machine.tool_speed * self.deflection / max(1.0, length)
+        return Request(self.mode, self.enable, alive, v_goal, np.zeros(len(self.machine.driven)))
+
+    def _target(self) -> Array:
+        """Deflections of stick or levers in [-1, 1]; keys give a third of it with shift."""
+        key_code = self.pygame.key.key_code
+        pairs = LEVER_KEYS[: len(self.machine.driven)] if self.levers else VELOCITY_KEYS
+        held = [[key_code(name) in self.held for name in pair] for pair in pairs]
+        target = np.array([float(plus) - float(minus) for plus, minus in held])
+        if not self.focus:
+            return np.zeros_like(target)
+        if self.held & {self.pygame.K_LSHIFT, self.pygame.K_RSHIFT}:
+            target /= 3
+        if self.pad is not None:
+            axes = [i for i in PAD_AXES[: len(target)] if i < self.pad.get_numaxes()]
+            target[: len(axes)] -= shape_axis([self.pad.get_axis(i) for i in axes])
+        return np.asarray(np.clip(target, -1, 1))
+
+    def _update_switch(self, deflected: bool) -> None:
+        has_button = self.pad is not None and self.pad.get_numbuttons() > PAD_SWITCH
+        button = has_button and self.pad.get_button(PAD_SWITCH)
+        pressed = self.focus and (self.pygame.K_SPACE in self.held or bool(button))
+        if pressed and deflected and not self.enable:
+            self.blocked = True
+        elif self.focus and not pressed:
+            self.blocked = False
+        self.enable = pressed and not self.blocked
