@@ -27,11 +27,8 @@ def export_onnx(path: Path, policy: Policy) -> None:
     source = "observation"
     last = len(policy.weights) // 2 - 1
     for i in range(last + 1):
-        for name, weight in (
-            (f"w{i}", policy.weights[2 * i]),
-            (f"b{i}", policy.weights[2 * i + 1]),
-        ):
-            arrays.append(from_array(weight.astype(np.float32), f"{letter}{i}"))
+        arrays.append(from_array(policy.weights[2 * i].astype(np.float32), f"w{i}"))
+        arrays.append(from_array(policy.weights[2 * i + 1].astype(np.float32), f"b{i}"))
         target = "action" if i == last else f"x{i}"
         nodes.append(helper.make_node("Gemm", [source, f"w{i}", f"b{i}"], [target]))
         if i < last:

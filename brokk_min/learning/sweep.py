@@ -81,9 +81,10 @@ def run_seeds(
     a process.
     """
     distributed = require("distributed", "sweep")
-    options = {"address": scheduler, "timeout": 10}
+    options: dict[str, Any] = {"address": scheduler, "timeout": 10}
     if scheduler is None:
-        options = {"threads_per_worker": 1, "memory_limit": None, "dashboard_address": None}
+        options = {"threads_per_worker": 1, "memory_limit": None, "dashboard_address": ":0"}
+        options |= {"env": {"TQDM_DISABLE": "1"}}  # one bar for all of them
     results: dict[int, Rows] = {}
     failed: dict[int, str] = {}
     with distributed.Client(**options) as client:
