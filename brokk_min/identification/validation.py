@@ -80,7 +80,7 @@ def _warnings(joints: dict[str, Any]) -> list[str]:
 # --- free runs ------------------------------------------------------------------------------------
 
 
-def net_step(
+def free_run_step(
     net: ActuatorNet, history: Array, q: Array, u: Array, predict: Predictor | None = None
 ) -> tuple[Array, Array]:
     """History (..., n, 3, H) and angles [rad] (..., n) after one tick under `u`.
@@ -113,7 +113,7 @@ def free_run(
     q: Array = recording.q[starts]
     angles, velocities = [], []
     for k in range(ticks):
-        history, q = net_step(net, history, q, recording.u[starts + k], predict)
+        history, q = free_run_step(net, history, q, recording.u[starts + k], predict)
         angles.append(q)
         velocities.append(history[..., 1, -1])
     return np.array(angles), np.array(velocities)
@@ -323,7 +323,7 @@ def net_simulator(net: ActuatorNet) -> Simulator:
         history = initial_history(q, net.history).astype(np.float32)
         angles = [q]
         for command in u:
-            history, q = net_step(net, history, q, command)
+            history, q = free_run_step(net, history, q, command)
             angles.append(q)
         return np.array(angles)
 
