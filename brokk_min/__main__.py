@@ -1,4 +1,4 @@
-"""The command line: `brokk-min COMMAND --help`, `--version`. Exits 0 done, 1 failed, 2 wrong use."""
+"""The command line: `brokk-min COMMAND --help`. Exits 0 done, 1 failed, 2 wrong use."""
 
 import sys
 from collections.abc import Callable
@@ -10,21 +10,21 @@ from brokk_min import __version__
 from brokk_min.cli import commands, operating
 from brokk_min.cli.options import WrongUse
 
-COMMANDS: dict[str, Callable[[], Any]] = {
-    "collect": lambda: commands.Collect,
-    "fit": lambda: commands.Fit,
-    "preliminary": lambda: commands.Preliminary,
-    "train": commands.train_command,
-    "sweep": commands.sweep_command,
-    "starts": lambda: commands.Starts,
-    "evaluate": lambda: commands.Evaluate,
-    "reproduce": lambda: commands.Reproduce,
-    "machine": lambda: operating.Simulate,
-    "drive": lambda: operating.Drive,
-    "convert": lambda: operating.Convert,
-    "export": lambda: operating.Export,
-    "play": lambda: operating.Play,
-    "replay": lambda: operating.Replay,
+COMMANDS: dict[str, Callable[..., Any]] = {
+    "collect": commands.Collect,
+    "fit": commands.Fit,
+    "preliminary": commands.Preliminary,
+    "train": commands.Train,
+    "sweep": commands.Sweep,
+    "starts": commands.Starts,
+    "evaluate": commands.Evaluate,
+    "reproduce": commands.Reproduce,
+    "machine": operating.Simulate,
+    "drive": operating.Drive,
+    "convert": operating.Convert,
+    "export": operating.Export,
+    "play": operating.Play,
+    "replay": operating.Replay,
 }
 
 
@@ -34,16 +34,15 @@ def main(arguments: list[str] | None = None) -> int:
     if arguments == ["--version"]:
         print(f"brokk_min {__version__}")
         return 0
-    named = [name for name in COMMANDS if name in arguments[:1]] or list(COMMANDS)
     command = tyro.extras.subcommand_cli_from_dict(
-        {name: COMMANDS[name]() for name in named},
+        COMMANDS,
         prog="brokk-min",
         description=__doc__,
         args=arguments,
         config=(tyro.conf.FlagCreatePairsOff,),
     )
     try:
-        command.run()
+        command()
     except WrongUse as error:
         print(f"brokk-min: {error}", file=sys.stderr)
         return 2

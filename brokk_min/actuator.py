@@ -58,7 +58,7 @@ def lever_arm(machine: Machine, q: ArrayLike) -> Array:
 
 
 def plant_step(machine: Machine, state: PlantState, u: ArrayLike) -> PlantState:
-    """One tick of the analytic plant under the held command `u` [-1, 1] (..., n), by explicit Euler.
+    """One tick of the analytic plant under the held command `u` [-1, 1] (..., n): explicit Euler.
 
     Paper: eq1 and Sec. 3.2 (dead zone, delay, direction, coupling by the pump, past movement)
     """
@@ -147,8 +147,8 @@ def smooth_angles(machine: Machine, history: Array) -> Array:
     late = machine.velocity_samples / 2 - 1
     weights = np.arange(H) - late  # q_dot_j stands in j of the H sums
     weights[-1] += H * late
-    q, q_dot = history[..., 0, :], history[..., 1, :]
-    return np.asarray(q.mean(axis=-1) + q_dot @ (weights * machine.dt / H).astype(q.dtype))
+    weights = np.stack([np.ones(H) / H, weights * machine.dt / H]).astype(history.dtype)
+    return np.asarray(np.einsum("...kh,kh->...", history[..., :2, :], weights))
 
 
 # --- the nets -------------------------------------------------------------------------------------
@@ -175,7 +175,8 @@ def mu_law(u: ArrayLike, dead_zone: float) -> Array:
 class ActuatorNet:
     """One small net per joint: history in, mean velocity over the coming tick out.
 
-    Weights are stacked over joints: (n, 3 H, 32), (n, 32), (n, 32, 32), (n, 32), (n, 32, 1), (n, 1).
+    Weights are stacked over joints: (n, 3 H, 32), (n, 32), (n, 32, 32), (n, 32), (n, 32, 1) and
+    (n, 1).
     Paper: Table 1 and Sec. 3.3 (39 inputs, two hidden layers of 32, ReLU, sigmoid output)
     """
 
@@ -243,16 +244,6 @@ class ActuatorNet:
         velocity: Array = (low + (high - low) * y[..., 0]).T
         return velocity.reshape(history.shape[:-2]), y, hidden2, hidden1
 
-    def next_angles(
-        self, history: Array, q: Array, u: ArrayLike, low: ArrayLike, high: ArrayLike
-    ) -> Array:
-        """Angles [rad] (..., n) one tick on, kept within `low` and `high`: q' = q + dt net(history, u).
-
-        `history` (..., n, 3, H) is without the command `u` (..., n) of this tick.
-        """
-        velocity = self.predict(append_command(history, u))
-        return np.asarray(np.clip(q + velocity / self.rate, low, high))
-
 
 @lru_cache(maxsize=8)
 def folded_weights(net: ActuatorNet) -> tuple[Array, ...]:
@@ -276,3 +267,18 @@ def select_nets(machine: Machine, net: ActuatorNet) -> ActuatorNet:
     if found != wanted:
         raise ValueError(f"actuator: expected nets for {machine.name} with {wanted}, got {found}")
     return net.select([machine.names[i] for i in machine.driven])
+
+
+def net_step(machine: Machine, net: ActuatorNet, history: Array, q: Array, u: Array) -> Array:
+    """Angles [rad] (..., n) of a machine whose driven joints the nets move, one tick on.
+
+    q' = q + dt net(history, u), within the joints' ranges; `history` (..., n, 3, H) is without the
+    command `u` (..., n) of this tick.
+    """
+    driven = machine.driven
+    inputs = append_command(history.take(driven, axis=-3), u[..., driven])
+    moved = q[..., driven] + machine.dt * net.predict(inputs)
+    low, high = machine.column("q_min")[driven], machine.column("q_max")[driven]
+    q = q.copy()
+    q[..., driven] = np.clip(moved, low, high)
+    return q

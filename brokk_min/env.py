@@ -1,8 +1,7 @@
-"""The task: follow a tool velocity with the driven joints. Pure functions for any number of machines.
+"""The task: follow a tool velocity with the driven joints. Pure functions for any batch.
 
-`transition` moves the machine; `measure`, `features`, `reward` and `terminated` look at it. On the
-nets they are the simulation, on the plant the machine. `learning.gym_env` draws starts and goals.
-Numbers below are those of the Brokk 170: 4 driven joints, 1 locked joint, 13 samples of history.
+On the nets these functions are the simulation, on the plant the machine. `learning.episodes` draws
+starts and goals. The numbers below are of the Brokk 170: 4 driven joints, 1 locked joint, H = 13.
 
 Observation: Box, float32, (171,), (x - mean) / deviation * weight of these blocks:
 
@@ -16,7 +15,7 @@ Observation: Box, float32, (171,), (x - mean) / deviation * weight of these bloc
 | 163-166 | resolved velocities of the goal (`jacobian.dls`)     | of range    | 4.2    | no    |
 | 167-170 | resolved velocities of the error integral            | 0.1 range   | 4.2    | no    |
 
-Samples run from old to new. The heading frame has x outward from the slew axis to the tool, z up.
+The newest sample is the last. The heading frame has x outward from the slew axis to the tool.
 
 Action: Box(-1, 1, (4,)), valve opening of each driven joint, see `action_to_pwm`.
 Reward: 1 / (1 + |v_goal - v_tool|) (eq2), minus costs of valve travel and of the error integral.
@@ -32,7 +31,6 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.linalg import norm
 from numpy.typing import ArrayLike, NDArray
 
 from brokk_min import actuator, kinematics
@@ -69,7 +67,7 @@ class Measured(NamedTuple):
 
     v_goal: Array  # goal velocity of the tool [m/s], (..., 3)
     v_tool: Array  # measured velocity of the tool [m/s], (..., 3)
-    q: Array  # angles [rad], (..., n); those of driven joints by `machine.smooth_angles`
+    q: Array  # angles [rad], (..., n); those of driven joints by `smooth_angles`
     q_dot: Array  # newest velocities of the driven joints [rad/s], (..., n_driven)
     history: Array  # angles, velocities, commands of the driven joints, (..., n_driven, 3, H)
     error_integral: Array  # of `integrate_error` [m], (..., 3)
@@ -80,7 +78,7 @@ class Block(NamedTuple):
     """Numbers of the observation that belong together."""
 
     name: str
-    mean: Array  # (size,), in physical units
+    mean: ArrayLike  # in physical units, a number or (size,)
     std: Array  # (size,)
     weight: float
     noisy: bool  # do sensors measure it?
@@ -90,30 +88,29 @@ class Block(NamedTuple):
 def observation_blocks(machine: Machine) -> tuple[Block, ...]:
     """The observation in its order. Paper: Sec. 3.4 (normalisation)
 
-    Means and deviations are nominal: as if each quantity were uniform over its range. A quantity
-    with H samples has the weight H^-0.5, as much as one number. Tool velocities weigh more and
-    resolved velocities most: a net learns first what is large at its input.
+    Means and deviations are those of uniform distributions over the ranges. H samples weigh as much
+    as one number. Resolved velocities weigh most: a net learns first what is large at its input.
     """
-    driven, locked, H = machine.driven, machine.locked, machine.history
+    H = machine.history
     q_mean = (machine.column("q_min") + machine.column("q_max")) / 2
     q_std = (machine.column("q_max") - machine.column("q_min")) / 12**0.5
     q_dot_std = machine.q_dot_max / 3**0.5
     v_std = np.full(3, machine.tool_speed / 3**0.5)
-    u_std = np.full(H * len(driven), machine.pwm_limit / PWM_MAX / 3**0.5)
-    zero = np.zeros(len(driven))
+    u_std = np.full(H * len(machine.driven), machine.pwm_limit / PWM_MAX / 3**0.5)
     blocks = [
-        Block("v_goal", np.zeros(3), v_std, 1.4, False),
-        Block("v_tool", np.zeros(3), v_std, 1.4, True),
-        Block("q locked", q_mean[locked], q_std[locked], 1.4, True),
+        Block("v_goal", 0.0, v_std, 1.4, False),
+        Block("v_tool", 0.0, v_std, 1.4, True),
+        Block("q locked", q_mean[machine.locked], q_std[machine.locked], 1.4, True),
     ]
-    for j in driven:
-        mean, std = np.full(H, q_mean[j]), np.full(H, q_std[j])
-        blocks.append(Block(f"q {machine.names[j]}", mean, std, H**-0.5, True))
-        std = np.full(H, q_dot_std[j])
-        blocks.append(Block(f"q_dot {machine.names[j]}", np.zeros(H), std, H**-0.5, True))
-    blocks.append(Block("u", np.zeros_like(u_std), u_std, H**-0.5, False))
-    blocks.append(Block("resolved v_goal", zero, q_dot_std[driven], 4.2, False))
-    blocks.append(Block("resolved error_integral", zero, 0.1 * q_dot_std[driven], 4.2, False))
+    for j in machine.driven:
+        name = machine.names[j]
+        blocks.append(Block(f"q {name}", q_mean[j], np.full(H, q_std[j]), H**-0.5, True))
+        blocks.append(Block(f"q_dot {name}", 0.0, np.full(H, q_dot_std[j]), H**-0.5, True))
+    blocks += [
+        Block("u", 0.0, u_std, H**-0.5, False),
+        Block("resolved v_goal", 0.0, q_dot_std[machine.driven], 4.2, False),
+        Block("resolved error_integral", 0.0, 0.1 * q_dot_std[machine.driven], 4.2, False),
+    ]
     return tuple(blocks)
 
 
@@ -121,7 +118,7 @@ def observation_blocks(machine: Machine) -> tuple[Block, ...]:
 def observation_scale(machine: Machine) -> tuple[Array, Array]:
     """Mean and scale = std / weight of the observation, float32 (obs,) both."""
     blocks = observation_blocks(machine)
-    mean = np.concatenate([block.mean for block in blocks])
+    mean = np.concatenate([np.broadcast_to(block.mean, block.std.shape) for block in blocks])
     scale = np.concatenate([block.std / block.weight for block in blocks])
     return mean.astype(np.float32), scale.astype(np.float32)
 
@@ -143,24 +140,20 @@ def measure(
 ) -> Measured:
     """What controllers get, in training, evaluation and on the machine. Paper: Sec. 3.4, Fig. 3
 
-    Args:
-        machine: n joints.
-        history: measured samples of all joints, (..., n, 3, H).
-        v_goal: goal velocity of the tool [m/s], base frame, (..., 3).
-        error_integral: of `integrate_error` [m], base frame, (..., 3).
-        noise: amplitude of uniform noise in deviations (paper: 5 %), drawn from `rng`.
+    From the measured history (..., n, 3, H), the goal velocity [m/s] and the error integral [m]
+    (..., 3), both in the base frame. With `rng`: uniform noise of amplitude `noise` deviations.
     """
-    driven, locked = machine.driven, machine.locked
-    q, q_dot = history[..., 0, -1].copy(), history[..., 1, -1]
-    history = history.take(driven, axis=-3)
+    q = history[..., 0, -1].copy()
+    q_dot = history[..., 1, -1]
+    history = history.take(machine.driven, axis=-3)
     v_error: Array = np.zeros(3, np.float32)
-    if noise and rng:
+    if rng is not None:
         std = noise_std(machine)
         error = noise * std * (2 * rng.random((*q.shape[:-1], len(std)), np.float32) - 1)
-        v_error, q_error, history_error = np.split(error, [3, 3 + len(locked)], axis=-1)
-        q[..., locked] += q_error
+        v_error, q_error, history_error = np.split(error, [3, 3 + len(machine.locked)], axis=-1)
+        q[..., machine.locked] += q_error
         history[..., :2, :] += history_error.reshape(history[..., :2, :].shape)
-    q[..., driven] = actuator.smooth_angles(machine, history)
+    q[..., machine.driven] = actuator.smooth_angles(machine, history)
     frames = forward_kinematics(machine, q)
     v_tool = tool_velocity(frames, q_dot) + v_error
     return Measured(v_goal, v_tool, q, history[..., 1, -1], history, error_integral, frames)
@@ -169,20 +162,20 @@ def measure(
 def features(machine: Machine, measured: Measured) -> Array:
     """The observation of the table above, float32 (..., obs). Paper: Sec. 3.4, Fig. 3
 
-    Resolved velocities (ours) are J^T (J J^T + lambda^2 I)^-1 v with lambda = 6 % of the arm's
-    length (assumed), for v = the goal and for v = the error integral.
+    Resolved velocities (ours): J^T (J J^T + lambda^2 I)^-1 v, lambda = 6 % of the arm (assumed).
     """
     J = jacobian(measured.frames)[..., machine.driven]
     arm = np.hypot(machine.column("a"), machine.column("d")).sum()
     J_inv = dls(J, np.ones(len(machine.driven)), (0.06 * arm) ** 2 + 1e-6)
+    resolved = J_inv @ np.stack([measured.v_goal, measured.error_integral], axis=-1)
     numbers = [
         kinematics.to_heading(measured.frames, measured.v_goal),
         kinematics.to_heading(measured.frames, measured.v_tool),
         measured.q[..., machine.locked],
         measured.history[..., :2, :].reshape(*J.shape[:-2], -1),
         measured.history[..., 2, :].reshape(*J.shape[:-2], -1),
-        (J_inv @ measured.v_goal[..., None])[..., 0],
-        (J_inv @ measured.error_integral[..., None])[..., 0],
+        resolved[..., 0],
+        resolved[..., 1],
     ]
     mean, scale = observation_scale(machine)
     return np.asarray((np.concatenate(numbers, axis=-1) - mean) / scale, np.float32)
@@ -191,12 +184,11 @@ def features(machine: Machine, measured: Measured) -> Array:
 def integrate_error(machine: Machine, v_goal: Array, v_tool: Array, integral: Array) -> Array:
     """Leaky integral of the velocity error [m] (..., 3), one tick on: the I of a PI controller.
 
-    I' = exp(-dt / T) (I + dt e), e = v_goal - v_tool cut to a short length: it shows a lasting
-    error, and the wait for a valve that opens does not fill it.
+    I' = exp(-dt / T) (I + dt e), with e = v_goal - v_tool cut to a short length.
     """
     error = v_goal - v_tool
     limit = np.float32(INTEGRAL_LIMIT * machine.tool_speed)
-    error = error * (limit / np.maximum(norm(error, axis=-1, keepdims=True), limit))
+    error = error * (limit / np.maximum(np.linalg.norm(error, axis=-1, keepdims=True), limit))
     leak = np.float32(np.exp(-machine.dt / INTEGRAL_TIME))
     return np.asarray(leak * (integral + np.float32(machine.dt) * error))
 
@@ -206,8 +198,7 @@ def update_history(
 ) -> tuple[Array, Array]:
     """Measured history (..., n, 3, H) and error integral [m] (..., 3), one tick on.
 
-    During the tick `u` (..., n) was sent for `v_goal` [m/s] (..., 3); `q` [rad] (..., n) is what
-    the encoders said after it. Simulation and hardware both call it.
+    `u` (..., n) was sent for `v_goal` [m/s] (..., 3), then the encoders gave `q` [rad] (..., n).
     """
     history = append_sample(history, u, q, machine.velocity_samples, machine.dt)
     frames = forward_kinematics(machine, history[..., 0, -1])
@@ -218,9 +209,8 @@ def update_history(
 def action_to_pwm(machine: Machine, action: ArrayLike) -> Array:
     """Commands u (..., n) of full command from actions of the driven joints (..., n_driven).
 
-    u = dead_zone clip(a / 0.01, -1, 1) + (limit - dead_zone) a, in whole PWM counts: dead-zone
-    compensation, as the PIDs have it; near a = 0 a valve is just open. Locked joints get 0.
-    ValueError: a wrong shape or a value that is not finite. Paper: Sec. 3.2, Sec. 3.4 (PWM out)
+    u = dead_zone clip(a / 0.01, -1, 1) + (limit - dead_zone) a: dead-zone compensation, as the PIDs
+    have it. ValueError: a wrong shape, a number that is not finite. Paper: Sec. 3.2, Sec. 3.4
 
     Example:
         >>> from brokk_min.machine import BROKK_170
@@ -246,6 +236,8 @@ class State:
 
     q: Array  # true angle [rad]
     q_dot: Array  # true mean velocity over the last tick [rad/s]
+    v_tool: Array  # true mean velocity of the tool [m/s], (..., 3)
+    lowest: Array  # height of the lowest point of a link [m], (...)
     history: Array  # measured angle, estimated velocity, sent command: (..., n, 3, H), float32
     true_history: Array  # the same of true angles: what the nets get
     v_goal: Array  # goal velocity of the tool [m/s], (..., 3)
@@ -262,6 +254,8 @@ def initial_state(machine: Machine, q: ArrayLike, v_goal: ArrayLike, plant: bool
     return State(
         q=q,
         q_dot=np.zeros_like(q),
+        v_tool=np.zeros_like(goal),
+        lowest=kinematics.lowest_point(forward_kinematics(machine, q)),
         history=initial_history(read_encoder(machine, q).astype(np.float32), machine.history),
         true_history=initial_history(q.astype(np.float32), machine.history),
         v_goal=goal,
@@ -277,32 +271,29 @@ def transition(
 ) -> State:
     """One tick under the command `u` (..., n), by the plant if the state has one, else by the nets.
 
-    `read(machine, q)` are the angles that the encoders give. The nets go on from true angles: the
-    steps of an encoder do not move an arm. Paper: Sec. 3.4 (actuator nets in the simulation)
+    `read(machine, q)` gives the encoders' angles; the nets go on from true ones. Paper: Sec. 3.4
     """
-    plant = None
     if state.plant is not None:
         plant = actuator.plant_step(machine, state.plant, u)
         q = plant.q
     elif net is not None:
-        driven, low, high = machine.driven, machine.column("q_min"), machine.column("q_max")
-        history = state.true_history.take(driven, axis=-3)
-        q = state.q.copy()
-        q[..., driven] = net.next_angles(
-            history, q[..., driven], u[..., driven], low[driven], high[driven]
-        )
+        plant = None
+        q = actuator.net_step(machine, net, state.true_history, state.q, u)
     else:
         raise ValueError("net: expected nets for a state without a plant, got None")
     history, integral = update_history(
         machine, state.history, u, read(machine, q), state.v_goal, state.error_integral
     )
-    samples, dt = machine.velocity_samples, machine.dt
+    q_dot = (q - state.q) / machine.dt
+    frames = forward_kinematics(machine, q.astype(np.float32))
     return replace(
         state,
         q=q,
-        q_dot=(q - state.q) / dt,
+        q_dot=q_dot,
+        v_tool=tool_velocity(frames, q_dot.astype(np.float32)),
+        lowest=kinematics.lowest_point(frames),
         history=history,
-        true_history=append_sample(state.true_history, u, q, samples, dt),
+        true_history=append_sample(state.true_history, u, q, machine.velocity_samples, machine.dt),
         goal_ticks=state.goal_ticks - 1,
         ticks=state.ticks + 1,
         error_integral=integral,
@@ -311,14 +302,8 @@ def transition(
 
 
 def reward(v_goal: Array, v_tool: Array) -> Array:
-    """1 / (1 + |v_goal - v_tool|) (...) of velocities [m/s] (..., 3), in (0, 1]. Paper: eq2
-
-    Example:
-        >>> reward(np.array([0.3, 0.4, 0.0]), np.zeros(3))
-        np.float64(0.6666666666666666)
-    """
-    result: Array = 1 / (1 + norm(v_goal - v_tool, axis=-1))
-    return result
+    """1 / (1 + |v_goal - v_tool|) (...) of velocities [m/s] (..., 3), in (0, 1]. Paper: eq2"""
+    return np.asarray(1 / (1 + np.linalg.norm(v_goal - v_tool, axis=-1)))
 
 
 def terminated(machine: Machine, lowest: Array) -> Bools:
@@ -334,16 +319,14 @@ def step(
     The next state; reward, terminated, truncated and |v_goal - v_tool| [m/s], (num,) each.
     """
     u = action_to_pwm(machine, action)
-    last_u = state.history[..., 2, -1]
     state = transition(machine, net, state, u)
-    frames = forward_kinematics(machine, state.q.astype(np.float32))
-    v_tool = tool_velocity(frames, state.q_dot.astype(np.float32))
-    rewards = reward(state.v_goal, v_tool)
+    rewards = reward(state.v_goal, state.v_tool)
+    error = np.linalg.norm(state.v_goal - state.v_tool, axis=-1)
     if not config.paper:
+        change = np.abs(u - state.history[..., 2, -2])
         limit = len(machine.driven) * machine.pwm_limit / PWM_MAX
-        rewards = rewards - config.valve_cost * np.abs(u - last_u).sum(axis=-1) / limit
-        rewards = rewards - config.integral_cost * norm(state.error_integral, axis=-1)
-    end = terminated(machine, kinematics.lowest_point(frames))
+        rewards = rewards - config.valve_cost * change.sum(axis=-1) / limit
+        rewards = rewards - config.integral_cost * np.linalg.norm(state.error_integral, axis=-1)
+    end = terminated(machine, state.lowest)
     truncated = (state.ticks >= round(config.episode_s * machine.rate)) & ~end
-    error = norm(state.v_goal - v_tool, axis=-1)
     return state, np.where(end, 0.0, rewards), end, truncated, error

@@ -1,7 +1,7 @@
 """Hand-written Denavit-Hartenberg kinematics: frames, tool position, Jacobian, tool velocity.
 
-One forward kinematics gives the frames of a pose; all else is worked out from these frames. The base
-frame has z up and its origin on the ground under the first axis. Paper: Fig. 1, eq3
+One forward kinematics gives the frames of a pose; all else is worked out from these frames. The
+base frame has z up and its origin on the ground under the first axis. Paper: Fig. 1, eq3
 
 Example:
     >>> from brokk_min.machine import BROKK_170
@@ -37,33 +37,31 @@ def forward_kinematics(machine: Machine, q: ArrayLike) -> Frames:
     q = as_floats(q)
     if q.ndim < 1 or q.shape[-1] != machine.n:
         raise ValueError(f"q: expected (..., {machine.n}), got {q.shape}")
-    # coordinates come first in here: c * x scales a vector x (3, ...) at each pose of a batch
-    x, y, z = np.eye(3, dtype=q.dtype).reshape(3, 3, *[1] * (q.ndim - 1))
+    # vectors (3, ...) have their coordinates first in here: c * x scales x at each pose of a batch
+    identity = np.eye(3, dtype=q.dtype).reshape(3, 3, *[1] * (q.ndim - 1))
+    x, y, z = np.broadcast_to(identity, (3, 3, *q.shape[:-1]))
     p = np.zeros_like(x)
     origins = [p]
     axes = [z]
     for i, joint in enumerate(machine.joints):
         angle = q[..., i] + joint.theta
-        x, y = _rotate(x, y, np.cos(angle), np.sin(angle))  # Rz(q + theta)
+        x, y = rotate(x, y, np.cos(angle), np.sin(angle))  # Rz(q + theta)
         p = p + joint.d * z + joint.a * x  # Tz(d), Tx(a)
         if joint.alpha:
-            y, z = _rotate(y, z, math.cos(joint.alpha), math.sin(joint.alpha))  # Rx(alpha)
+            y, z = rotate(y, z, math.cos(joint.alpha), math.sin(joint.alpha))  # Rx(alpha)
         origins.append(p)
         axes.append(z)
-    return Frames(_stack(origins, q), _stack(axes, q))
+    return Frames(coordinates_last(np.stack(origins, 1)), coordinates_last(np.stack(axes, 1)))
 
 
-def _rotate(a: Array, b: Array, c: Array | float, s: Array | float) -> tuple[Array, Array]:
-    """The axes `a` and `b`, turned in their plane by an angle with cosine `c` and sine `s`."""
+def rotate(a: Array, b: Array, c: Array | float, s: Array | float) -> tuple[Array, Array]:
+    """The vectors `a` and `b`, turned in their plane by an angle with cosine `c` and sine `s`."""
     return c * a + s * b, c * b - s * a
 
 
-def _stack(vectors: list[Array], q: Array) -> Array:
-    """Vectors (3, ...) of the n + 1 frames as one array (..., n + 1, 3)."""
-    stacked = np.empty((3, len(vectors), *q.shape[:-1]), q.dtype)
-    for i, vector in enumerate(vectors):
-        stacked[:, i] = vector
-    return np.moveaxis(stacked, (0, 1), (-1, -2))
+def coordinates_last(vectors: Array) -> Array:
+    """Vectors (3, k, ...) as (..., k, 3)."""
+    return vectors.transpose(*range(2, vectors.ndim), 1, 0)
 
 
 def tool_position(frames: Frames) -> Array:
@@ -87,10 +85,9 @@ def cross(a: Array, b: Array) -> Array:
         >>> cross(np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]))
         array([0., 0., 1.])
     """
-    ax, ay, az = np.moveaxis(a, -1, 0)
-    bx, by, bz = np.moveaxis(b, -1, 0)
-    products = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
-    return np.moveaxis(products, 0, -1)
+    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
+    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
 
 
 def tool_velocity(frames: Frames, q_dot: ArrayLike) -> Array:
@@ -123,7 +120,8 @@ def lowest_point(frames: Frames) -> Array:
 
 def to_heading(frames: Frames, v: Array) -> Array:
     """A vector (..., 3) of the base frame in the heading frame: x outward to the tool, z up."""
-    x, y, _ = np.moveaxis(tool_position(frames), -1, 0)
-    radius = np.maximum(np.hypot(x, y), 1e-6)
-    c, s = x / radius, y / radius
+    p = tool_position(frames)
+    radius = np.maximum(np.hypot(p[..., 0], p[..., 1]), 1e-6)
+    c = p[..., 0] / radius
+    s = p[..., 1] / radius
     return np.stack([c * v[..., 0] + s * v[..., 1], c * v[..., 1] - s * v[..., 0], v[..., 2]], -1)

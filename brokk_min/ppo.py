@@ -1,10 +1,9 @@
 """Proximal Policy Optimization (Schulman et al., 2017) in one file, to be read from top to bottom.
 
-Paper: Sec. 3.4 (PPO, 256 environments). It trains on any Gymnasium vector environment that resets in
-the same step. A truncated episode did not fail: its return goes on with the value of its own last
-observation. At a termination it stops. Names are those of CleanRL.
-
+It trains on any Gymnasium vector environment that resets in the same step. A truncated episode did
+not fail: its return goes on with the value of its own last observation. At a termination it stops.
 Advantages come from a critic, as in the paper, or from a function that is passed to `train`.
+Names are those of CleanRL. Paper: Sec. 3.4 (PPO, 256 environments)
 """
 
 from __future__ import annotations
@@ -45,9 +44,6 @@ class PPOConfig:
     threads: int = 2  # Threads of torch; the last bits depend on it.
 
 
-# --- nets -----------------------------------------------------------------------------------------
-
-
 def layer_init(layer: nn.Linear, std: float) -> nn.Linear:
     """Orthogonal weights with gain `std`, biases 0."""
     nn.init.orthogonal_(layer.weight, std)
@@ -66,7 +62,7 @@ def mlp(inputs: int, outputs: int, std: float) -> nn.Sequential:
 
 
 class Agent(nn.Module):
-    """Actor, logarithm of the actions' standard deviation and, unless advantages need none, critic."""
+    """Actor, logarithm of the actions' standard deviation and, if advantages need one, critic."""
 
     def __init__(self, obs: int, actions: int, log_std: float, critic: bool) -> None:
         super().__init__()
@@ -75,13 +71,10 @@ class Agent(nn.Module):
         self.critic = mlp(obs, 1, 1.0) if critic else None
 
     def value(self, obs: Tensor) -> Tensor:
-        """Value (...) of observations (..., obs), in units of the mean reward: return * (1 - gamma)."""
+        """Value (...) of observations (..., obs), in units of the reward: (1 - gamma) * return."""
         assert self.critic is not None
         value: Tensor = self.critic(obs)[..., 0]
         return value
-
-
-# --- the pieces of the algorithm ------------------------------------------------------------------
 
 
 class Rollout(NamedTuple):
@@ -149,16 +142,13 @@ def critic_advantages(agent: Agent, rollout: Rollout, config: PPOConfig) -> dict
 
 
 def policy_loss(ratio: Tensor, advantages: Tensor, clip: float) -> Tensor:
-    """Clipped surrogate loss of probability ratios and advantages, both (B,); the mean over B.
-
-    L = -E[min(ratio A, clip(ratio, 1 - eps, 1 + eps) A)].
-    """
+    """-E[min(ratio A, clip(ratio, 1 - eps, 1 + eps) A)] of ratios and advantages (B,)."""
     clipped = torch.clamp(ratio, 1 - clip, 1 + clip)
     return -torch.min(ratio * advantages, clipped * advantages).mean()
 
 
 def ppo_loss(agent: Agent, mb: dict[str, Tensor], config: PPOConfig) -> tuple[Tensor, Tensor]:
-    """Loss of a minibatch, and its parts for the log, (5,): policy, value, entropy, KL, clip fraction."""
+    """Loss of a minibatch, and (5,) for the log: policy, value, entropy, KL, clip fraction."""
     newlogprob = log_probability(mb["actions"], agent.actor(mb["obs"]), agent.log_std)
     logratio = newlogprob - mb["logprobs"]
     ratio = logratio.exp()
@@ -184,9 +174,6 @@ def check_finite(name: str, values: Tensor, step: int) -> Tensor:
         got = values[tuple(place)].item()
         raise ValueError(f"{name}{place or ''}: expected a finite number at step {step}, got {got}")
     return values
-
-
-# --- training -------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -266,7 +253,7 @@ def anneal(learner: Learner, config: PPOConfig) -> None:
 
 
 def adapt_learning_rate(learner: Learner, config: PPOConfig, approx_kl: float) -> None:
-    """Less after a large change of the policy, more after a small one (as rl_games; factors ours)."""
+    """Less after a large change of the policy, more after a small one, as rl_games does."""
     if approx_kl > 1.5 * config.target_kl:
         learner.learning_rate /= 1.2
     elif approx_kl < 0.7 * config.target_kl:

@@ -5,8 +5,6 @@ downward and inward, against the Brokk's sense, because their axes point the oth
 behind the swing). At q = 0 the arm lies stretched out level. The pit is 1 m deep.
 """
 
-import dataclasses
-
 import numpy as np
 
 from brokk_min.machine import Joint, Machine
@@ -92,14 +90,10 @@ BUCKET = Joint(
     encoder_node=0x24,
 )
 
-_NUMBERS = [
-    f.name for owner in (Joint, Machine) for f in dataclasses.fields(owner) if "unit" in f.metadata
-]
 
 MINI_EXCAVATOR = Machine(
     name="mini_excavator",
     joints=(SWING, BOOM, ARM, BUCKET),
-    sources=dict.fromkeys(_NUMBERS, "assumed"),
     rate=25.0,  # Hz; logs may be faster, not slower
     pwm_limit=95,  # counts of 127
     dead_zone=0.12,

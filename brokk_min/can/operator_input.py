@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from brokk_min.can.canopen import OperatorInput
 from brokk_min.env import Measured
 from brokk_min.identification.files import require
-from brokk_min.machine import PWM_MAX, Array, Machine, lengths
+from brokk_min.machine import PWM_MAX, Array, Machine
 
 
 class Script:
@@ -96,7 +96,7 @@ class Joystick:
         if not self.stick:
             return OperatorInput(alive=False)
         deflection = -shape_axis([self.stick.get_axis(i) for i in self.axes])
-        x, y, z = map(float, self.speed * deflection / max(1.0, float(lengths(deflection))))
+        x, y, z = map(float, self.speed * deflection / max(1.0, float(np.linalg.norm(deflection, axis=-1))))
         return OperatorInput((x, y, z), enable=bool(self.stick.get_button(self.button)))
 
 

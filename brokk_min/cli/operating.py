@@ -4,17 +4,17 @@ import shutil
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
-import tyro
+from tyro.conf import Positional
 
 from brokk_min import hw
 from brokk_min.can import drive_log
-from brokk_min.can import operator_input as wishes
 from brokk_min.can.canopen import open_bus, read_frames
+from brokk_min.can.operator_input import JointJog, Joystick, Script
 from brokk_min.can.simulated_machine import simulate
-from brokk_min.cli.options import Command, WrongUse, check, chosen_policy
+from brokk_min.cli.options import Command, Range, WrongUse, default_policy
 from brokk_min.evaluation import baselines
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.evaluation.sequences import read_commands
@@ -22,24 +22,20 @@ from brokk_min.identification.logs import write_log
 from brokk_min.learning.onnx import export_onnx
 from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import Machine
-from brokk_min.viewer import control_process, play, replay
-from brokk_min.viewer import drawing as view
+from brokk_min.viewer import control_process, drawing, play, replay
 
 
 @dataclass(kw_only=True)
 class Simulate(Command):
-    """Put a simulated machine on a CAN bus: encoders, valve controller, the analytic plant behind them."""
+    """Put a simulated machine on a CAN bus: encoders, valve controller, the analytic plant."""
 
     interface: str  # python-can's name of the bus, udp_multicast for a try without hardware.
     channel: str  # Channel of the interface, for udp_multicast 239.74.163.2.
-    start: tuple[float, ...] = ()
-    """Angles at the start [rad]; by default the paper's, pointing forward, or amid the ranges."""
-    record: Path | None = None
-    """Also log command in force and true angles at every step of the plant here, .csv."""
+    start: tuple[float, ...] = ()  # First angles [rad]; by default the paper's, or mid-range.
+    record: Path | None = None  # Also log commands and true angles of each plant step, .csv.
 
-    def run(self) -> None:
-        """Run until SIGINT or SIGTERM."""
-        machine = check(self, self.record)
+    def __call__(self) -> None:
+        machine = self.check(self.record)
         print(f"{self.machine} on {self.interface} {self.channel}; Ctrl-C ends it", flush=True)
         simulate(machine, self.start, self.interface, self.channel, self.record)
 
@@ -51,65 +47,42 @@ class Drive(Command):
     policy: Path | None = None  # Policy that `train` wrote.
     interface: str = ""  # python-can's name of the bus: socketcan, udp_multicast, ...
     channel: str = ""  # Channel of the interface: can0, 239.74.163.2, ...
-    command: str = "joystick"
-    """joystick, or velocity sequences, CSV: sequence,time,vx,vy,vz [s, m/s]; all of them, one by one."""
-    controller: Literal["rl", "jacobian", "jog"] = "rl"
-    """The policy, the paper's baseline (k = 0.1), or one joint alone, for bringing up."""
+    command: str = "joystick"  # Or velocity sequences, CSV: sequence,time,vx,vy,vz [s, m/s].
+    controller: Literal["rl", "jacobian", "jog"] = "rl"  # Policy, baseline (k = 0.1), one joint.
     joint: str = "q1"  # Joint that jogs, forward and backward with x.
-    counts: int = 12  # Its command, of 127.
-    gains: Path | None = None
-    """Tuned gains of the baseline that `reproduce` wrote; by default gains.json beside POLICY."""
+    counts: Annotated[int, Range(1, 127)] = 12  # Its command, of 127.
+    gains: Path | None = None  # Tuned gains; by default gains.json in the folder of POLICY.
     axes: tuple[int, int, int] = (1, 0, 4)  # Axes of the joystick for x, y and z.
     button: int = 5  # Button of the joystick that must be held.
     log: Path | None = None  # Also log every frame here, candump format.
-    replay: Path | None = (
-        None  # No bus: run on this log and compare the valve frames with those in it.
-    )
+    replay: Path | None = None  # No bus: run on this log and compare its valve frames.
 
-    def run(self) -> None:
-        """Drive until the sequences or the operator end it, or compare a log."""
-        machine = check(self, self.log)
+    def __call__(self) -> None:
+        machine = self.check(self.log)
         if not self.replay and not (self.interface and self.channel):
             raise WrongUse("--interface, --channel: expected a CAN bus, or --replay, got none")
         controller = self._controller(machine)
         if self.replay:
-            frames = list(read_frames(self.replay))
-            same, sent = drive_log.compare(
-                machine, frames, drive_log.replay(machine, controller, frames)
-            )
-            print(f"{self.replay}: {same} of {sent} valve frames are the same")
-            if same < sent:
-                raise ValueError(
-                    f"{self.replay}: expected the frames of the log, got {sent - same} others"
-                )
+            compare(machine, controller, self.replay)
             return
-        if self.command == "joystick":
-            operator: wishes.Joystick | wishes.Script = wishes.Joystick(
-                machine, self.axes, self.button
-            )
-        else:
-            sequences = read_commands(Path(self.command), machine)
-            operator = wishes.Script(machine, np.concatenate([s.goals for s in sequences]))
-        with open_bus(self.interface, self.channel, self.log) as line:
-            drive = hw.Drive(machine, controller, line, operator)
+        operator = self._operator(machine)
+        with open_bus(self.interface, self.channel, self.log) as bus:
+            drive = hw.Drive(machine, controller, bus, operator)
             drive.begin()
             try:
-                drive.run(_show)
+                drive.run(show_line)
             finally:
                 print(end="\n" if sys.stdout.isatty() else "")
-        if isinstance(operator, wishes.Script) and not operator.done:
-            raise ValueError(
-                f"drive: expected to play all sequences, got {drive.reason or 'a stop'}"
-            )
+        if isinstance(operator, Script) and not operator.done:
+            reason = drive.reason or "a stop"
+            raise ValueError(f"drive: expected to play all sequences, got {reason}")
 
     def _controller(self, machine: Machine) -> Controller:
         if self.controller == "jog":
             driven = [machine.names[i] for i in machine.driven]
             if self.joint not in driven:
-                raise WrongUse(
-                    f"--joint: expected one that may be driven, {driven}, got {self.joint}"
-                )
-            return wishes.JointJog(machine, self.joint, self.counts)
+                raise WrongUse(f"--joint: expected a driven one of {driven}, got {self.joint}")
+            return JointJog(machine, self.joint, self.counts)
         if not self.policy:
             raise WrongUse("--policy: expected a policy that `train` wrote, got none")
         policy = load_policy(self.policy, machine)
@@ -118,25 +91,41 @@ class Drive(Command):
         gains = self.gains or self.policy.with_name("gains.json")
         return baselines.read_gains(gains, machine, policy.net)["jacobian_pid_k0.1"]
 
+    def _operator(self, machine: Machine) -> Joystick | Script:
+        if self.command == "joystick":
+            return Joystick(machine, self.axes, self.button)
+        sequences = read_commands(Path(self.command), machine)
+        return Script(machine, np.concatenate([sequence.goals for sequence in sequences]))
 
-def _show(text: str) -> None:
-    """Keep one line of a terminal up to date, cut to its width; elsewhere write a line each time."""
+
+def compare(machine: Machine, controller: Controller, log: Path) -> None:
+    """Run a controller on a log; ValueError: not all its valve frames are those of the log."""
+    frames = list(read_frames(log))
+    sent_now = drive_log.replay(machine, controller, frames)
+    same, sent = drive_log.compare(machine, frames, sent_now)
+    print(f"{log}: {same} of {sent} valve frames are the same")
+    if same < sent:
+        raise ValueError(f"{log}: expected the frames of the log, got {sent - same} others")
+
+
+def show_line(text: str) -> None:
+    """Rewrite one line of a terminal, cut to its width; elsewhere print a line each time."""
     if sys.stdout.isatty():
-        print(f"\r{text[: shutil.get_terminal_size().columns - 1]}\033[K", end="", flush=True)
+        columns = shutil.get_terminal_size().columns
+        print(f"\r{text[: columns - 1]}\033[K", end="", flush=True)
     else:
         print(text, flush=True)
 
 
 @dataclass(kw_only=True)
 class Convert(Command):
-    """Turn a log of `drive` into one that `fit` reads: a recording for each stretch driven without a gap."""
+    """Turn a log of `drive` into one for `fit`: one recording per stretch without a gap."""
 
-    log: tyro.conf.Positional[Path]  # Log that `drive --log` or candump wrote.
+    log: Positional[Path]  # Log that `drive --log` or candump wrote.
     out: Path  # Log to write, .csv or .npz.
 
-    def run(self) -> None:
-        """Write the log."""
-        log = drive_log.log_for_fit(check(self, self.out), read_frames(self.log))
+    def __call__(self) -> None:
+        log = drive_log.log_for_fit(self.check(self.out), read_frames(self.log))
         write_log(self.out, log)
         print(f"{self.out}: {len(log.recordings)} recordings of {', '.join(log.joints)}")
 
@@ -148,9 +137,8 @@ class Export(Command):
     policy: Path  # Policy that `train` wrote.
     out: Path  # File to write, .onnx.
 
-    def run(self) -> None:
-        """Write the file."""
-        export_onnx(self.out, load_policy(self.policy, check(self, self.out)))
+    def __call__(self) -> None:
+        export_onnx(self.out, load_policy(self.policy, self.check(self.out)))
         print(f"{self.out}: observation (batch, obs) in, action (batch, driven joints) out")
 
 
@@ -158,85 +146,84 @@ class Export(Command):
 class Play(Command):
     """Drive with keyboard or gamepad in a window, and trace lines; see docs/play.md."""
 
-    policy: Path | None = None
-    """Policy that `train` wrote; by default the one that comes with the package; without any, levers only."""
-    gains: Path | None = (
-        None  # Tuned gains of the Jacobian controller; by default gains.json beside POLICY.
-    )
-    interface: str = (
-        ""  # python-can's name of a bus; without one a simulated machine stands behind.
-    )
+    policy: Path | None = None  # By default the package's; a machine without one has levers only.
+    gains: Path | None = None  # Tuned gains; by default gains.json in the folder of POLICY.
+    interface: str = ""  # python-can's name of a bus; by default a simulated machine.
     channel: str = ""  # Channel of the interface.
     drive: bool = False  # Drive the machine on the bus; without it, nothing is sent there.
     attempts: Path = Path("attempts.csv")  # Table of the traced lines, kept.
     log: Path | None = None  # Also log every frame here, candump format.
-    start: tuple[float, ...] = ()
-    """Angles of the simulated machine at the start [rad]; by default the paper's, or amid the ranges."""
+    start: tuple[float, ...] = ()  # First angles [rad] of the simulated machine.
 
-    def run(self) -> None:
-        """Open the window until it is closed."""
-        machine = check(self, self.attempts, self.log)
+    def __call__(self) -> None:
+        machine = self.check(self.attempts, self.log)
         if bool(self.interface) != bool(self.channel) or (self.drive and not self.interface):
             raise WrongUse("--interface, --channel: expected both or, without --drive, none")
-        where = control_process.BusOptions(self.interface, self.channel, self.log, self.start)
+        bus = control_process.BusOptions(self.interface, self.channel, self.log, self.start)
         if self.interface and not self.drive:
-            play.watch(machine, where)
-            return
-        controllers: dict[str, Controller] = {}
-        path, gains = chosen_policy(machine, self.policy, self.gains)
-        if self.policy or path.exists():
-            policy = load_policy(path, machine)
-            known = baselines.read_gains(gains, machine, policy.net) if gains else None
-            known = known or baselines.baselines(machine, policy.net)
-            controllers = {
-                "rl": PolicyController(machine, policy),
-                "jacobian": known["jacobian_pid_k0.1"],
-            }
-            print(f"gains of the Jacobian controller: {gains or 'set by hand'}", file=sys.stderr)
-        play.play(machine, controllers, where, self.attempts)
+            play.watch(machine, bus)
+        else:
+            play.play(machine, self._controllers(machine), bus, self.attempts)
+
+    def _controllers(self, machine: Machine) -> dict[str, Controller]:
+        path, gains = default_policy(machine, self.policy, self.gains)
+        if not self.policy and not path.exists():
+            return {}
+        policy = load_policy(path, machine)
+        print(f"gains of the Jacobian controller: {gains or 'set by hand'}", file=sys.stderr)
+        if gains:
+            known = baselines.read_gains(gains, machine, policy.net)
+        else:
+            known = baselines.baselines(machine, policy.net)
+        rl = PolicyController(machine, policy)
+        return {"rl": rl, "jacobian": known["jacobian_pid_k0.1"]}
 
 
 @dataclass(kw_only=True)
 class Replay(Command):
-    """Watch recorded runs side by side: logs of `drive`, or runs of `evaluate`, driven again."""
+    """Watch recorded runs at once: logs of `drive`, or runs of `evaluate`, simulated again."""
 
-    logs: tyro.conf.Positional[tuple[Path, ...]]  # One or two: candump logs, or JSON of results.
+    logs: Positional[tuple[Path, ...]]  # One or two: candump logs, or JSON of results.
     out: Path | None = None  # Write a film, .gif or .mp4, instead of opening a window.
-    fps: float = 10.0  # Pictures a second of the film.
+    fps: Annotated[float, Range(0.1, 100)] = 10.0  # Pictures per second of the film.
     size: tuple[int, int] = (960, 540)  # Of the picture [px], 320 to 4000 both ways for each arm.
     controllers: tuple[str, ...] = ("rl", "jacobian_pid_k0.1")  # Whose runs of the results.
     sequence: str = ""  # Which sequence of the results; by default the first.
     start: int = 0  # Which start of the results.
 
-    def run(self) -> None:
-        """Open the window until it is closed, or write the film."""
-        machine, colours = check(self, self.out), view.COLOURS.values()
+    def __call__(self) -> None:
+        machine = self.check(self.out)
         if not 1 <= len(self.logs) <= 2:
             raise WrongUse(f"LOGS: expected one or two, got {len(self.logs)}")
-        arms = sum(len(self.controllers) if log.suffix == ".json" else 1 for log in self.logs)
-        if not arms or not 320 * arms <= self.size[0] <= 4000 or not 320 <= self.size[1] <= 4000:
-            raise WrongUse(
-                f"--controllers, --size: expected some and {320 * arms} 320 to 4000 4000, "
-                f"got {arms} and {self.size[0]} {self.size[1]}"
-            )
-        runs = list[replay.Run]()
-        for log, colour in zip(self.logs, colours, strict=False):
-            again = log.suffix == ".json"
-            runs += (
-                self._again(machine, log) if again else [replay.run_of_log(machine, log, colour)]
-            )
+        self._check_size()
+        runs: list[replay.Run] = []
+        for log, colour in zip(self.logs, drawing.COLOURS.values(), strict=False):
+            if log.suffix == ".json":
+                runs += self._simulate_again(machine, log)
+            else:
+                runs.append(replay.run_of_log(machine, log, colour))
         if self.out:
             replay.write_film(self.out, machine, runs, self.size, self.fps)
         else:
             replay.show_film(machine, runs, self.size)
 
-    def _again(self, machine: Machine, path: Path) -> list[replay.Run]:
+    def _check_size(self) -> None:
+        arms = sum(len(self.controllers) if log.suffix == ".json" else 1 for log in self.logs)
+        width, height = self.size
+        if not arms or not 320 * arms <= width <= 4000 or not 320 <= height <= 4000:
+            expected = f"expected some and {320 * arms} 320 to 4000 4000"
+            got = f"got {arms} and {width} {height}"
+            raise WrongUse(f"--controllers, --size: {expected}, {got}")
+
+    def _simulate_again(self, machine: Machine, path: Path) -> list[replay.Run]:
         results = replay.read_results(machine, path, self.controllers)
-        named, known, num = list(results.sequences), list(results.controllers), len(results.starts)
-        sequence = self.sequence or named[0]
-        if sequence not in named or set(self.controllers) - set(known) or not 0 <= self.start < num:
-            raise WrongUse(
-                f"--sequence, --controllers, --start: expected some of {named}, of {known} "
-                f"and below {num}, got {self.sequence}, {list(self.controllers)}, {self.start}"
-            )
+        sequences = list(results.sequences)
+        known = list(results.controllers)
+        num = len(results.starts)
+        sequence = self.sequence or sequences[0]
+        unknown = sequence not in sequences or not set(self.controllers) <= set(known)
+        if unknown or not 0 <= self.start < num:
+            expected = f"expected some of {sequences}, of {known} and below {num}"
+            got = f"got {self.sequence}, {list(self.controllers)}, {self.start}"
+            raise WrongUse(f"--sequence, --controllers, --start: {expected}, {got}")
         return replay.simulate_again(machine, results, self.controllers, sequence, self.start)

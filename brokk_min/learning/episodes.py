@@ -73,8 +73,7 @@ def new_goals(
     machine: Machine, config: TaskConfig, state: State, rng: np.random.Generator
 ) -> State:
     """New goals for the machines whose goal is over, or points down close to the ground."""
-    frames = forward_kinematics(machine, state.q.astype(np.float32))
-    low = lowest_point(frames) < machine.ground + GROUND_MARGIN
+    low = state.lowest < machine.ground + GROUND_MARGIN
     due = np.flatnonzero((state.goal_ticks <= 0) | (low & (state.v_goal[..., 2] < 0)))
     if not len(due):
         return state

@@ -36,7 +36,7 @@ from brokk_min.can.canopen import (
     encoder_raw,
 )
 from brokk_min.can.drive_log import Telemetry
-from brokk_min.cli.options import machine_from
+from brokk_min.cli.options import find_machine
 from brokk_min.evaluation import baselines
 from brokk_min.evaluation.sequences import feasible
 from brokk_min.kinematics import forward_kinematics, tool_position
@@ -49,7 +49,7 @@ from brokk_min.viewer.play import InputHandler, Session
 from brokk_min.viewer.tracing import Attempt, Tracing
 
 MODES = ["rl", "jacobian", "levers"]
-MINI_EXCAVATOR = machine_from(
+MINI_EXCAVATOR = find_machine(
     f"{Path(__file__).parents[2]}/examples/mini_excavator.py:MINI_EXCAVATOR"
 )
 

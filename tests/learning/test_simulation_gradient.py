@@ -1,0 +1,315 @@
+"""Derivatives of the rewards by the actions: against finite differences, and by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import strategies
+import torch
+from helpers_machines import GAIN, POSE, obedient_net, obedient_velocity, small_net
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from brokk_min import env
+from brokk_min.actuator import append_command
+from brokk_min.env import TaskConfig, integrate_error
+from brokk_min.kinematics import forward_kinematics, jacobian
+from brokk_min.learning.gym_env import TaskVectorEnv
+from brokk_min.learning.simulation_gradient import (
+    Ticks,
+    action_gradients,
+    compensation_derivative,
+    gradient_advantages,
+    input_gradient,
+)
+from brokk_min.machine import BROKK_170, PWM_MAX
+from brokk_min.ppo import PPOConfig, Rollout, collect, make_learner
+
+NUM, TICKS = 3, 9
+
+
+def exact(machine, q):
+    """Encoders without steps: differences show what a derivative is."""
+    return q
+
+
+def costs(valve=0.0, integral=0.0):
+    return TaskConfig(valve_cost=valve, integral_cost=integral)
+
+
+def simulate(machine, net, state, commands):
+    """States (T + 1) of `env.transition` under `commands` (T, num, n), in double precision."""
+    states = [state]
+    for u in commands:
+        states.append(env.transition(machine, net, states[-1], u, exact))
+    return states
+
+
+def ticks_of(states, commands, done=None):
+    names = ("q", "true_history", "v_goal", "error_integral")
+    arrays = [np.stack([getattr(s, name) for s in states[:-1]]) for name in names]
+    return Ticks(*arrays, commands, np.zeros(commands.shape[:2], bool) if done is None else done)
+
+
+def moving_case(machine, seed):
+    """Nets in double precision, a state in motion and commands, no joint near its limits."""
+    rng = np.random.default_rng(seed)
+    net = small_net(machine, rng)
+    net = replace(
+        net,
+        weights=tuple(weight.astype(float) for weight in net.weights),
+        output_low=0.3 * net.output_low,
+        output_high=0.3 * net.output_high,
+        dead_zone=machine.dead_zone * (seed % 2),  # 0: commands as they are
+    )
+    middle = (machine.column("q_min") + machine.column("q_max")) / 2
+    quarter = (machine.column("q_max") - machine.column("q_min")) / 4
+    q = middle + quarter * rng.uniform(-0.5, 0.5, (NUM, machine.n))
+    state = env.initial_state(machine, q, rng.standard_normal((NUM, 3)), plant=False)
+    state = replace(
+        state,
+        history=state.history.astype(float),
+        true_history=state.true_history.astype(float),
+        error_integral=rng.normal(0, 0.1, (NUM, 3)),
+    )
+    commands = np.zeros((15 + TICKS, NUM, machine.n))
+    shape = (*commands.shape[:2], len(machine.driven))
+    commands[..., machine.driven] = rng.uniform(-0.6, 0.6, shape)
+    state = simulate(machine, net, state, commands[:15])[-1]
+    return net, state, commands[15:]
+
+
+def tool_velocities(machine, states, jacobians_of):
+    """v_tool (T, num, 3) with the Jacobians of the states `jacobians_of`."""
+    q = np.stack([s.q for s in jacobians_of[1:]])
+    J = jacobian(forward_kinematics(machine, q))[..., machine.driven]
+    q_dot = np.stack([s.q_dot[..., machine.driven] for s in states[1:]])
+    return (J @ q_dot[..., None])[..., 0]
+
+
+def rewards_of(machine, states, jacobians_of):
+    return env.reward(states[0].v_goal, tool_velocities(machine, states, jacobians_of))
+
+
+def integral_costs(machine, states, jacobians_of):
+    """|I| (T, num) of integrals that take each tick's own velocity."""
+    integral = states[0].error_integral
+    result = []
+    for v_tool in tool_velocities(machine, states, jacobians_of):
+        integral = integrate_error(machine, states[0].v_goal, v_tool, integral)
+        result.append(np.linalg.norm(integral, axis=-1))
+    return np.array(result)
+
+
+def finite_differences(machine, net, start, commands, gamma, figure):
+    """d/da (T, num, n_driven) of the discounted sum of a figure (T, num), by the actions."""
+    states = simulate(machine, net, start, commands)
+    discounts = gamma ** np.arange(TICKS)[:, None]
+    result = np.zeros((*commands.shape[:2], len(machine.driven)))
+    step = 1e-5
+    for t in range(TICKS):
+        for k, joint in enumerate(machine.driven):
+            sums = []
+            for sign in (1, -1):
+                other = commands.copy()
+                other[t, :, joint] += sign * step
+                values = figure(machine, simulate(machine, net, start, other), states)
+                sums.append((discounts[: TICKS - t] * values[t:]).sum(axis=0))
+            result[t, :, k] = (sums[0] - sums[1]) / (2 * step)
+    return result * command_per_action(machine, commands)
+
+
+def command_per_action(machine, u):
+    """du/da of the two lines of `env.action_to_pwm`, by their end points."""
+    beyond = machine.pwm_limit / PWM_MAX - machine.dead_zone
+    corner = machine.dead_zone + env.COMPENSATION * beyond
+    inner = np.abs(u[..., machine.driven]) < corner
+    return np.where(inner, corner / env.COMPENSATION, beyond)
+
+
+cases = given(strategies.machines(), st.integers(0, 999))
+
+
+@settings(max_examples=5)
+@given(strategies.machines(2, 5), st.integers(0, 999), st.sampled_from([0.0, 0.8, 1.0]))
+def test_action_gradients__equal_finite_differences_of_rollouts(machine, seed, gamma):
+    net, start, commands = moving_case(machine, seed)
+    ticks = ticks_of(simulate(machine, net, start, commands), commands)
+    gradient = action_gradients(machine, net, ticks, gamma, costs())
+    difference = finite_differences(machine, net, start, commands, gamma, rewards_of)
+    size = np.abs(difference).max()
+    np.testing.assert_allclose(gradient, difference, rtol=2e-3, atol=1e-4 * size + 1e-6)
+
+
+@settings(max_examples=5)
+@given(strategies.machines(2, 5), st.integers(0, 999), st.floats(0.2, 0.8))
+def test_action_gradients__include_the_cost_of_the_error_integral(machine, seed, quantile):
+    net, start, commands = moving_case(machine, seed)
+    states = simulate(machine, net, start, commands)
+    error = np.linalg.norm(start.v_goal - tool_velocities(machine, states, states), axis=-1)
+    limit = float(np.quantile(error, quantile)) + 1e-4  # some errors are cut, some are not
+    machine = replace(machine, tool_speed=limit / env.INTEGRAL_LIMIT)
+    ticks = ticks_of(states, commands)
+    free = action_gradients(machine, net, ticks, 0.8, costs())
+    ticks = integrals_of(machine, ticks, states)
+    costly = action_gradients(machine, net, ticks, 0.8, costs(integral=3.0))
+    difference = -3 * finite_differences(machine, net, start, commands, 0.8, integral_costs)
+    size = np.abs(difference).max()
+    np.testing.assert_allclose(costly - free, difference, rtol=5e-3, atol=1e-3 * size + 1e-5)
+
+
+def integrals_of(machine, ticks, states):
+    """Ticks whose error integrals took each tick's own velocity."""
+    integral = states[0].error_integral
+    result = []
+    for v_tool in tool_velocities(machine, states, states):
+        result.append(integral)
+        integral = integrate_error(machine, states[0].v_goal, v_tool, integral)
+    return ticks._replace(error_integral=np.stack(result))
+
+
+@cases
+def test_action_gradients__include_the_cost_of_valve_travel(machine, seed):
+    """A command is moved to (now) and away from (one tick later, discounted)."""
+    net, start, commands = moving_case(machine, seed)
+    ticks = ticks_of(simulate(machine, net, start, commands), commands)
+    free = action_gradients(machine, net, ticks, 0.8, costs())
+    costly = action_gradients(machine, net, ticks, 0.8, costs(valve=0.05))
+    last = np.concatenate([start.history[None, ..., 2, -1], commands[:-1]])
+    sign = np.sign(commands - last)[..., machine.driven]
+    sign_next = np.concatenate([sign[1:], 0 * sign[:1]])
+    limit = len(machine.driven) * machine.pwm_limit / PWM_MAX
+    by_command = -0.05 / limit * (sign - 0.8 * sign_next)
+    expected = by_command * command_per_action(machine, commands)
+    np.testing.assert_allclose(costly - free, expected, rtol=1e-3, atol=1e-5 * np.abs(free).max())
+
+
+def test_action_gradients__lose_little_by_a_constant_jacobian():
+    """What is left out, the turn of the arm within the horizon, on the machine of the paper."""
+    net, start, commands = moving_case(BROKK_170, 1)
+    ticks = ticks_of(simulate(BROKK_170, net, start, commands), commands)
+    gradient = action_gradients(BROKK_170, net, ticks, 0.9, costs())
+
+    def true_rewards(machine, states, _):
+        return rewards_of(machine, states, states)
+
+    difference = finite_differences(BROKK_170, net, start, commands, 0.9, true_rewards)
+    assert np.linalg.norm(gradient - difference) < 0.05 * np.linalg.norm(difference)
+
+
+def test_action_gradients__one_tick_by_hand():
+    """Nets that obey the newest command: reward 1 / (1 + |e|), e = v_goal - J q_dot."""
+    driven = BROKK_170.driven
+    net = obedient_net(BROKK_170)
+    u = np.zeros((1, 1, 5))
+    u[..., driven] = [0.3, -0.2, 0.1, 0.4]
+    state = env.initial_state(BROKK_170, POSE[None], [0.2, 0.1, -0.1], plant=False)
+    states = simulate(BROKK_170, net, state, u)
+    gradient = action_gradients(BROKK_170, net, ticks_of(states, u), 0.9, costs())[0, 0]
+    q_dot = obedient_velocity(BROKK_170, u[0, 0, driven])
+    J = jacobian(forward_kinematics(BROKK_170, states[1].q[0]))[..., driven]
+    error = state.v_goal[0] - J @ q_dot
+    size = np.linalg.norm(error)
+    fastest = 1.2 * BROKK_170.q_dot_max[driven]
+    y = (q_dot / fastest + 1) / 2  # of the sigmoid
+    by_command = 2 * fastest * GAIN * y * (1 - y)
+    expected = (error / size) @ J / (1 + size) ** 2 * by_command * (80 / 127 - 0.07)
+    np.testing.assert_allclose(gradient, expected, rtol=1e-4)
+
+
+def test_action_gradients__stop_at_the_end_of_an_episode():
+    machine = BROKK_170
+    net, start, commands = moving_case(machine, 2)
+    states = simulate(machine, net, start, commands)
+    done = np.zeros((TICKS, NUM), bool)
+    done[4, 1] = True
+
+    def gradients(ticks):
+        return action_gradients(machine, net, ticks, 0.9, costs(0.01, 2.0))
+
+    whole = gradients(ticks_of(states, commands))
+    cut = gradients(ticks_of(states, commands, done))
+    first = gradients(ticks_of(states[:6], commands[:5]))
+    np.testing.assert_array_equal(cut[5:], whole[5:])
+    np.testing.assert_array_equal(cut[:, [0, 2]], whole[:, [0, 2]])
+    np.testing.assert_array_equal(cut[:5, 1], first[:, 1])
+    assert (cut[:4, 1] != whole[:4, 1]).any()
+
+
+@pytest.mark.parametrize(("limit", "u_q5"), [("q_max", 0.4), ("q_min", -0.4)])
+def test_action_gradients__are_zero_for_a_joint_pushed_into_its_limit(limit, u_q5):
+    net = obedient_net(BROKK_170)
+    u = np.zeros((3, 1, 5))
+    u[..., 4] = u_q5
+    u[..., 3] = 0.3
+    q = (BROKK_170.column("q_min") + BROKK_170.column("q_max")) / 2
+    q[4] = BROKK_170.column(limit)[4]
+    state = env.initial_state(BROKK_170, q[None], [0.1, 0.1, 0.1], plant=False)
+    ticks = ticks_of(simulate(BROKK_170, net, state, u), u)
+    gradient = action_gradients(BROKK_170, net, ticks, 0.9, costs())[:, 0]
+    assert not gradient[:, 3].any()
+    assert gradient[:, 2].all()
+
+
+def test_action_gradients__take_read_only_arrays_and_give_the_same_bits_again():
+    net, start, commands = moving_case(BROKK_170, 4)
+    ticks = ticks_of(simulate(BROKK_170, net, start, commands), commands)
+    for array in ticks:
+        array.setflags(write=False)
+    first = action_gradients(BROKK_170, net, ticks, 0.9, costs(0.01, 2.0))
+    second = action_gradients(BROKK_170, net, ticks, 0.9, costs(0.01, 2.0))
+    np.testing.assert_array_equal(first, second)
+    assert first.dtype == np.float32
+    assert np.isfinite(first).all()
+
+
+@cases
+def test_input_gradient__equals_finite_differences(machine, seed):
+    net, state, commands = moving_case(machine, seed)
+    driven = machine.driven
+    history = append_command(state.true_history[:, driven], commands[0][:, driven])
+    velocity, gradient = input_gradient(net, history)
+    np.testing.assert_allclose(velocity, net.forward(history)[0])
+    direction = np.random.default_rng(seed).standard_normal(history.shape)
+    direction[..., 2, :] *= np.abs(np.abs(history[..., 2, :]) - net.dead_zone) > 1e-3
+    step = 1e-6 * direction
+    difference = (net.forward(history + step)[0] - net.forward(history - step)[0]) / 2e-6
+    np.testing.assert_allclose((gradient * direction).sum((-1, -2)), difference, atol=1e-5)
+
+
+def test_compensation_derivative__has_two_slopes():
+    u = np.zeros((2, 5))
+    u[0, BROKK_170.driven] = [0.0, 0.07, -0.075, 0.3]
+    u[1, BROKK_170.driven] = [-0.3, 80 / 127, -80 / 127, 0.08]
+    beyond = 80 / 127 - 0.07
+    steep = beyond + 0.07 / 0.01
+    expected = [[steep, steep, steep, beyond], [beyond] * 4]
+    np.testing.assert_allclose(compensation_derivative(BROKK_170, u), expected, rtol=1e-6)
+
+
+def test_gradient_advantages__are_gradient_times_deviation():
+    """Deviations count within [-1, 1]; ticks are those of the rollout, episodes end within it."""
+    net = small_net(BROKK_170, np.random.default_rng(0))
+    task = TaskConfig(episode_s=0.6, valve_cost=0.02)
+    config = PPOConfig(num_envs=8, horizon=13, log_std=-0.5, threads=1)
+    vector = TaskVectorEnv(8, net, BROKK_170, task)
+    learner = make_learner(vector, config, 1, critic=False)
+    learner.agent.actor[-1].bias.data += torch.tensor([1.1, -0.9, 0.3, 0.0])  # beyond the limit
+    rollout = collect(vector, learner, config)
+    batch = gradient_advantages(BROKK_170, net, task)(learner.agent, rollout, config)
+    assert list(batch) == ["advantages"]
+    expected = expected_advantages(net, task, rollout, config.gamma)
+    np.testing.assert_allclose(batch["advantages"], expected, rtol=1e-4, atol=1e-6)
+    assert rollout.dones.any()
+    assert rollout.means.abs().max() > 1
+
+
+def expected_advantages(net, task, rollout: Rollout, gamma):
+    states = [info["state"] for info in rollout.infos]
+    commands = env.action_to_pwm(BROKK_170, rollout.actions.numpy())
+    ticks = ticks_of([*states, states[-1]], commands, rollout.dones.numpy())
+    gradient = action_gradients(BROKK_170, net, ticks, gamma, task)
+    deviation = rollout.actions.numpy().clip(-1, 1) - rollout.means.numpy().clip(-1, 1)
+    return (gradient * deviation).sum(-1)
