@@ -31,7 +31,9 @@ START = np.array([0.0, 0.5, 0.58, 1.71, 1.24])
 def known(ticks: int) -> list[Telemetry]:
     """The cabin turns at 0.1 rad/s; asked for is 0.1 m/s aside and 0.05 m/s upward."""
     row = np.array([0.1, 0, 0, 0, 0]), np.full(5, 0.3), np.array([0, 0.1, 0.05])
-    return [Telemetry(k, START + 0.005 * k * np.eye(5)[0], *row, driving=True) for k in range(ticks)]
+    return [
+        Telemetry(k, START + 0.005 * k * np.eye(5)[0], *row, driving=True) for k in range(ticks)
+    ]
 
 
 def test_a_run_has_the_tools_way_its_error_and_all_that_must_be_in_the_picture() -> None:
