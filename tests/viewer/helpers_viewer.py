@@ -57,11 +57,11 @@ class Operator:
 
 
 class PipedLoop:
-    """The loop of a window on a bus with an injected clock; this is the window's end of the pipe."""
+    """The loop of a window on an injected clock, and the window's end of its pipe."""
 
     def __init__(self, *controllers: Any, log: Any = None) -> None:
         self.connection, there = multiprocessing.Pipe()
-        self.world = World(Push(0, 0, 0, 0, 0), lambda driving, ready: None, log=log)  # type: ignore
+        self.world = World(Push(), lambda driving, ready: None, log=log)  # type: ignore
         operator = WindowOperator(BROKK_170, there, lambda: self.world.t)
         self.world.drive = WindowDrive(BROKK_170, controllers, self.world.bus, operator)
         self.ticks: list[Telemetry] = []
