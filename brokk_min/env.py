@@ -71,7 +71,8 @@ class Measured(NamedTuple):
     q_dot: Array  # newest velocities of the driven joints [rad/s], (..., n_driven)
     history: Array  # angles, velocities, commands of the driven joints, (..., n_driven, 3, H)
     error_integral: Array  # of `integrate_error` [m], (..., 3)
-    frames: kinematics.Frames  # at `q`
+    p_tool: Array  # position of the tool at `q` [m], (..., 3)
+    J: Array  # Jacobian of the tool by all joints at `q` [m/rad], (..., 3, n)
 
 
 class Block(NamedTuple):
@@ -131,32 +132,26 @@ def noise_std(machine: Machine) -> Array:
 
 
 def measure(
-    machine: Machine,
-    history: Array,
-    v_goal: Array,
-    error_integral: Array,
-    noise: float = 0.0,
-    rng: np.random.Generator | None = None,
+    machine: Machine, history: Array, v_goal: Array, integral: Array, noise: Array | float = 0.0
 ) -> Measured:
     """What controllers get, in training, evaluation and on the machine. Paper: Sec. 3.4, Fig. 3
 
     From the measured history (..., n, 3, H), the goal velocity [m/s] and the error integral [m]
-    (..., 3), both in the base frame. With `rng`: uniform noise of amplitude `noise` deviations.
+    (..., 3), both in the base frame; `noise` of what sensors measure, in deviations (..., noisy).
     """
     q = history[..., 0, -1].copy()
     q_dot = history[..., 1, -1]
     history = history.take(machine.driven, axis=-3)
-    v_error: Array = np.zeros(3, np.float32)
-    if rng is not None:
-        std = noise_std(machine)
-        error = noise * std * (2 * rng.random((*q.shape[:-1], len(std)), np.float32) - 1)
-        v_error, q_error, history_error = np.split(error, [3, 3 + len(machine.locked)], axis=-1)
-        q[..., machine.locked] += q_error
-        history[..., :2, :] += history_error.reshape(history[..., :2, :].shape)
+    error = np.asarray(noise * noise_std(machine))
+    v_error, q_error, history_error = np.split(error, [3, 3 + len(machine.locked)], axis=-1)
+    q[..., machine.locked] += q_error
+    history[..., :2, :] += history_error.reshape(*error.shape[:-1], -1, 2, machine.history)
     q[..., machine.driven] = actuator.smooth_angles(machine, history)
     frames = forward_kinematics(machine, q)
-    v_tool = tool_velocity(frames, q_dot) + v_error
-    return Measured(v_goal, v_tool, q, history[..., 1, -1], history, error_integral, frames)
+    p_tool = kinematics.tool_position(frames)
+    J = jacobian(frames)
+    v_tool = (J @ q_dot[..., None])[..., 0] + v_error  # v = J q_dot
+    return Measured(v_goal, v_tool, q, history[..., 1, -1], history, integral, p_tool, J)
 
 
 def features(machine: Machine, measured: Measured) -> Array:
@@ -164,13 +159,13 @@ def features(machine: Machine, measured: Measured) -> Array:
 
     Resolved velocities (ours): J^T (J J^T + lambda^2 I)^-1 v, lambda = 6 % of the arm (assumed).
     """
-    J = jacobian(measured.frames)[..., machine.driven]
+    J = measured.J[..., machine.driven]
     arm = np.hypot(machine.column("a"), machine.column("d")).sum()
     J_inv = dls(J, np.ones(len(machine.driven)), (0.06 * arm) ** 2 + 1e-6)
     resolved = J_inv @ np.stack([measured.v_goal, measured.error_integral], axis=-1)
     numbers = [
-        kinematics.to_heading(measured.frames, measured.v_goal),
-        kinematics.to_heading(measured.frames, measured.v_tool),
+        kinematics.to_heading(measured.p_tool, measured.v_goal),
+        kinematics.to_heading(measured.p_tool, measured.v_tool),
         measured.q[..., machine.locked],
         measured.history[..., :2, :].reshape(*J.shape[:-2], -1),
         measured.history[..., 2, :].reshape(*J.shape[:-2], -1),

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brokk_min.kinematics import cross, forward_kinematics, jacobian
+from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, valve_opening
 
 if TYPE_CHECKING:
@@ -34,25 +34,11 @@ def dls(J: ArrayLike, W: ArrayLike, damping: ArrayLike, as_printed: bool = False
     """
     J = np.asarray(J)
     W = np.asarray(W, J.dtype)
-    bracket = W if as_printed else 1 / W
-    A = (J * bracket[..., None, :]) @ np.swapaxes(J, -1, -2)  # J W^-1 J^T
-    A = A + np.asarray(damping, J.dtype)[..., None, None] * np.eye(3, dtype=J.dtype)
-    W_inv_Jt = np.swapaxes(J / W[..., None, :], -1, -2)
-    return np.asarray(W_inv_Jt @ inverse_3x3(A))
-
-
-def inverse_3x3(A: Array) -> Array:
-    """Inverse of symmetric matrices (..., 3, 3): the adjugate over the determinant.
-
-    Row i of the adjugate is the cross product of the two other rows.
-
-    Example:
-        >>> inverse_3x3(np.diag([1.0, 2.0, 4.0])).diagonal()
-        array([1.  , 0.5 , 0.25])
-    """
-    adjugate = cross(A[..., [1, 2, 0], :], A[..., [2, 0, 1], :])
-    determinant = np.sum(A[..., 0, :] * adjugate[..., 0, :], axis=-1)
-    return np.asarray(adjugate / determinant[..., None, None])
+    inner = W if as_printed else 1 / W
+    A = (J * inner[..., None, :]) @ np.swapaxes(J, -1, -2)  # J W^-1 J^T
+    A = A + np.asarray(damping)[..., None, None] * np.eye(3)  # + lambda^2 I, in float64
+    transposed = np.linalg.solve(A, J / W[..., None, :])  # A = A^T: (A^-1 J W^-1)^T = W^-1 J^T A^-1
+    return np.swapaxes(transposed, -1, -2).astype(J.dtype)
 
 
 def limit_gradient(machine: Machine, q: ArrayLike) -> Array:

@@ -38,30 +38,24 @@ def forward_kinematics(machine: Machine, q: ArrayLike) -> Frames:
     if q.ndim < 1 or q.shape[-1] != machine.n:
         raise ValueError(f"q: expected (..., {machine.n}), got {q.shape}")
     # vectors (3, ...) have their coordinates first in here: c * x scales x at each pose of a batch
-    identity = np.eye(3, dtype=q.dtype).reshape(3, 3, *[1] * (q.ndim - 1))
-    x, y, z = np.broadcast_to(identity, (3, 3, *q.shape[:-1]))
-    p = np.zeros_like(x)
-    origins = [p]
-    axes = [z]
+    p = np.zeros((machine.n + 1, 3, *q.shape[:-1]), q.dtype)
+    axes = np.zeros_like(p)
+    x, y, z = np.eye(3, dtype=q.dtype).reshape(3, 3, *[1] * (q.ndim - 1))
+    axes[0] = z
     for i, joint in enumerate(machine.joints):
         angle = q[..., i] + joint.theta
         x, y = rotate(x, y, np.cos(angle), np.sin(angle))  # Rz(q + theta)
-        p = p + joint.d * z + joint.a * x  # Tz(d), Tx(a)
+        p[i + 1] = p[i] + joint.d * z + joint.a * x  # Tz(d), Tx(a)
         if joint.alpha:
             y, z = rotate(y, z, math.cos(joint.alpha), math.sin(joint.alpha))  # Rx(alpha)
-        origins.append(p)
-        axes.append(z)
-    return Frames(coordinates_last(np.stack(origins, 1)), coordinates_last(np.stack(axes, 1)))
+        axes[i + 1] = z
+    last = (*range(2, p.ndim), 0, 1)
+    return Frames(p.transpose(last), axes.transpose(last))
 
 
 def rotate(a: Array, b: Array, c: Array | float, s: Array | float) -> tuple[Array, Array]:
     """The vectors `a` and `b`, turned in their plane by an angle with cosine `c` and sine `s`."""
     return c * a + s * b, c * b - s * a
-
-
-def coordinates_last(vectors: Array) -> Array:
-    """Vectors (3, k, ...) as (..., k, 3)."""
-    return vectors.transpose(*range(2, vectors.ndim), 1, 0)
 
 
 def tool_position(frames: Frames) -> Array:
@@ -118,9 +112,8 @@ def lowest_point(frames: Frames) -> Array:
     return np.asarray(heights.min(axis=-1))
 
 
-def to_heading(frames: Frames, v: Array) -> Array:
-    """A vector (..., 3) of the base frame in the heading frame: x outward to the tool, z up."""
-    p = tool_position(frames)
+def to_heading(p: Array, v: Array) -> Array:
+    """Vector `v` (..., 3) in the heading frame of the tool at `p` [m]: x outward to it, z up."""
     radius = np.maximum(np.hypot(p[..., 0], p[..., 1]), 1e-6)
     c = p[..., 0] / radius
     s = p[..., 1] / radius

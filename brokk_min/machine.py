@@ -137,7 +137,7 @@ class Machine:
             raise ValueError(f"plant_dt: expected a part of {self.dt} s, got {self.plant_dt}")
 
     def __hash__(self) -> int:
-        """By name, so that `lru_cache` finds what was worked out for a machine at once."""
+        """By name: fast, for what `lru_cache` keeps per machine."""
         return hash(self.name)
 
     @property
@@ -197,9 +197,7 @@ def as_floats(values: ArrayLike) -> NDArray[np.floating]:
 
 
 def limit_command(machine: Machine, u: ArrayLike) -> NDArray[np.floating]:
-    """The command [-1, 1] that reaches the valve: whole PWM counts, clipped to +-pwm_limit/127.
-
-    Shape and float type of `u`. Paper: Sec. 3.2 (65 %)
+    """The command that reaches the valve: whole PWM counts, clipped to the limit. Paper: Sec. 3.2
 
     Example:
         >>> limit_command(BROKK_170, [-1.0, 0.1]) * 127

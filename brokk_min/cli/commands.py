@@ -15,7 +15,7 @@ from brokk_min.actuator import select_nets
 from brokk_min.cli.options import Command, MachineName, Range, Seed, WrongUse, default_policy
 from brokk_min.cli.settings import Count, FitSettings, LearnerSettings, Samples, TaskSettings
 from brokk_min.evaluation import baselines, figures, metrics, perfect_model, sequences
-from brokk_min.evaluation.report import VERDICTS
+from brokk_min.evaluation.claims import VERDICTS
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.identification import excitation, validation
 from brokk_min.identification.files import write_json
@@ -263,10 +263,9 @@ class Reproduce(Command):
     sweep: Path | None = None  # sweep.json on these nets: intervals over its seeds in the report.
 
     def __call__(self) -> None:
-        from brokk_min.evaluation.experiments import QUICK, Effort
-        from brokk_min.evaluation.reproduce import reproduce
+        from brokk_min.evaluation.reproduce import QUICK, Budget, reproduce
 
-        budget = QUICK if self.quick else Effort()
+        budget = QUICK if self.quick else Budget()
         results = reproduce(self.check(), self.out, budget, self.seed, self.sweep)
         for name, rows in results["task_space"]["summary"].items():
             errors = ", ".join(f"{s} {row['velocity_error_mean']:.4f}" for s, row in rows.items())
@@ -289,9 +288,12 @@ class Preliminary(Command):
 
         machine = self.check()
         net = load_net(self.actuator)
-        numbers = preliminary.run(machine, net, self.seed)
+        measured = preliminary.run(machine, net, self.seed)
+        numbers = preliminary.numbers(machine, measured)
         self.out.mkdir(parents=True, exist_ok=True)
-        for name, figure in preliminary.plots(machine, net, self.seed).items():
+        plots = {"preliminary": figures.plot_tests(machine, measured.tests)}
+        plots["sim_to_real"] = figures.plot_gap(machine, measured.gap)
+        for name, figure in plots.items():
             figures.save(self.out / f"{name}.png", figure)
             print(self.out / f"{name}.png")
         meta = metrics.metadata(machine, self.seed) | {"actuator": str(self.actuator)}

@@ -1,14 +1,17 @@
-"""What the paper says of task space control, each sentence as numbers and a verdict.
+"""Sentences of the paper, each with what was measured of it and a verdict, in the paper's order.
 
-Limits by which a verdict is given are ours (assumed); the intervals are over starts. Paper: Sec. 4.2
+The limits of the verdicts are assumed. Intervals are over starts. Paper: Sec. 3.2, 4.1, 4.2
 """
 
-from collections.abc import Mapping, Sequence
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from brokk_min.evaluation.baselines import PAPER_BASELINES, STRONGER
 from brokk_min.evaluation.metrics import (
     TRANSIENT,
     Mean,
@@ -23,288 +26,352 @@ from brokk_min.jacobian import JacobianController, manipulability
 from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.machine import Array, Machine
 
-Claim = dict[str, Any]  # paper, measured, numbers, unit, holds (None: no such runs); see `beside`
-STANDSTILL = 0.05  # m, assumed: a tool that stays so near its line stays still across it
-SMALL = 0.05  # m, assumed: two tools so near to each other after the same commands differ little
-MARGINAL = 0.01  # rad/s, assumed: joint rates that differ by less differ marginally
-LATER = 2.0  # assumed: a response that takes so many times as long is another
-UNLIKE = 1.25  # assumed: errors of two directions whose ratio is larger differ
+ON_LINE = 0.05  # m: a tool that stays so near to its line stays still across it
+SMALL_GAP = 0.05  # m: two tools so near to each other after the same commands differ little
+MARGINAL = 0.01  # rad/s: joint velocities that differ by less differ marginally
+FACTOR = 2.0  # times that differ by a larger factor differ
+UNLIKE = 1.25  # errors that differ by a larger factor differ
+STRONG, WEAK = PAPER_BASELINES  # damping
+VERDICTS = {True: "holds here", False: "does not hold here", None: "was not measured"}
+
+# The figure of the paper, its sentence, what is measured, and the unit.
+TEXTS = {
+    "gravity": (
+        "Fig. 2",
+        "The velocity is larger when rotating towards gravity: 0.24 rad/s one way, 0.47 the other.",
+        "peak speed of the last driven joint at both command limits, to be larger down than up",
+        "rad/s",
+    ),
+    "idle": (
+        "Fig. 2",
+        "The same command is answered after about 400 ms from idle and 100 ms when already moving.",
+        f"response time (to 63 %), from idle to be {FACTOR:g} times as long or more",
+        "s",
+    ),
+    "coupling": (
+        "Fig. 2",
+        "When other joints move as well, the difference is marginal and negligible.",
+        f"velocity of a joint alone less that with the others (RMS), to be below {MARGINAL}",
+        "rad/s",
+    ),
+    "gap": (
+        "Fig. 5",
+        "Over 30 s the discrepancy between simulation and machine remains reasonably small.",
+        f"mean distance of the tools under the same commands, to be below {SMALL_GAP}",
+        "m",
+    ),
+    "training": (
+        "Sec. 3.4",
+        "The training process takes around 2.5 hours to converge.",
+        f"time of all environment steps, to be within a factor of {FACTOR:g} of that",
+        "h",
+    ),
+    "still": (
+        "Fig. 6b-d",
+        "RL: y and z remain stationary during motion along x.",
+        f"largest distance of the tool from its line, to be below {ON_LINE} m",
+        "m",
+    ),
+    "drift": (
+        "Fig. 6b-d",
+        "The Jacobian-based method significantly fails to keep y and z still.",
+        f"largest distance of the tool from its line, to be above {ON_LINE} m, and more than RL's",
+        "m",
+    ),
+    "direction": (
+        "Fig. 6b-d",
+        "The fine-tuned PID yields varying results depending on the direction of movement.",
+        "error of the PID's joint velocities as a fraction of the desired, to differ by a factor "
+        f"of {UNLIKE} at a joint",
+        "1",
+    ),
+    "slowed": (
+        "Fig. 6a, e, f",
+        "Near a singularity the damping impedes accurate task space control: it slows the tool.",
+        "speed along the goal over the goal's, k = 0.1 to be below k = 0.05 with the same gains",
+        "1",
+    ),
+    "jerky": (
+        "Fig. 6a, e, f",
+        "With less damping (k = 0.05 instead of 0.1) the system moves jerkily near the "
+        "singularity.",
+        "jerk, k = 0.05 to be above k = 0.1 with the same gains",
+        "m/s^3",
+    ),
+    "neither": (
+        "Fig. 6a, e, f",
+        "RL is more robust there: neither slowed nor jerky.",
+        "speed over the goal's to be above that of k = 0.05, jerk [m/s^3] below that of k = 0.1",
+        "1",
+    ),
+    "tracking": (
+        "Fig. 6e, f",
+        "RL tracks the velocity robustly, along x, y and z (Fig. 6c, 6f, 6h).",
+        "RL's mean velocity error less a baseline's, to be below 0",
+        "m/s",
+    ),
+    "along z": (
+        "Fig. 6g, h",
+        "RL is more robust in motion along z, too (Fig. 6g, 6h).",
+        "RL's mean velocity error [m/s] and largest drift [m] less a baseline's, to be below 0",
+        "m/s, m",
+    ),
+    "outperforms": (
+        "Sec. 5",
+        "The proposed method outperforms the Jacobian-based approach.",
+        "RL's mean velocity error less a baseline's, to be below 0",
+        "m/s",
+    ),
+}
 
 
-def said(numbers: Mapping[str, Mean], unit: str) -> str:
-    """Numbers as a sentence: means with their intervals."""
-    cells = []
-    for name, n in numbers.items():
-        ends = "" if n["low"] is None else f" ({n['low']:.3g} to {n['high']:.3g})"
-        cells.append(f"{name} none" if n["mean"] is None else f"{name} {n['mean']:.3g}{ends}")
-    return "; ".join(cells) + f" [{unit}]"
+class Claim(NamedTuple):
+    """A sentence of the paper, and what was measured of it."""
+
+    name: str  # in `TEXTS`
+    numbers: Mapping[str, Mean]
+    holds: bool | None  # None: it was not measured
+    stronger: Claim | None = None  # the same of a baseline that the paper does not have
+
+    def to_json(self) -> dict[str, Any]:
+        """The claim as in `results.json`."""
+        figure, sentence, what, unit = TEXTS[self.name]
+        result = {
+            "figure": figure,
+            "paper": sentence,
+            "measured": f"{what}: {format_numbers(self.numbers, unit)}",
+            "numbers": self.numbers,
+            "unit": unit,
+            "holds": self.holds,
+        }
+        if self.stronger:
+            result["stronger"] = self.stronger.to_json()
+        return result
 
 
-def _claim(
-    paper: str, what: str, unit: str, numbers: Mapping[str, Any], holds: bool | None
-) -> Claim:
-    measured = f"{what}: {said(numbers, unit)}"
-    return {"paper": paper, "measured": measured, "numbers": numbers, "unit": unit, "holds": holds}
-
-
-def beside(claim: Claim, stronger: Claim) -> Claim:
-    """A claim, and as "stronger" how it fares against a baseline that the paper does not have.
+def format_numbers(numbers: Mapping[str, Mean], unit: str) -> str:
+    """Means with their intervals as text.
 
     Example:
-        >>> claim, other = ({"numbers": {c: 1}, "unit": "m", "holds": c} for c in (True, False))
-        >>> beside(claim, other)["stronger"]["holds"], "stronger" in beside(claim, claim)
-        (False, False)
+        >>> format_numbers({"rl": {"mean": 1.0, "low": 0.5, "high": 1.5}}, "m")
+        'rl 1 (0.5 to 1.5) [m]'
     """
-    same = claim["numbers"] == stronger["numbers"]  # of RL alone
-    return (
-        claim
-        if same
-        else claim | {"stronger": {k: stronger[k] for k in ("numbers", "unit", "holds")}}
-    )
+    texts = []
+    for name, number in numbers.items():
+        mean = "none" if number["mean"] is None else f"{number['mean']:.3g}"
+        ends = "" if number["low"] is None else f" ({number['low']:.3g} to {number['high']:.3g})"
+        texts.append(f"{name} {mean}{ends}")
+    return f"{'; '.join(texts)} [{unit}]"
 
 
-def _below(number: Mean, limit: float) -> bool | None:
-    return None if number["high"] is None else number["high"] < limit
+def _below(limit: float, *numbers: Mean) -> bool | None:
+    """Are all intervals below a limit? None: a number has no interval."""
+    highs = [number["high"] for number in numbers if number["high"] is not None]
+    return max(highs) < limit if len(highs) == len(numbers) else None
 
 
-def _above(number: Mean, limit: float) -> bool | None:
-    return None if number["low"] is None else number["low"] > limit
+def _above(limit: float, *numbers: Mean) -> bool | None:
+    lows = [number["low"] for number in numbers if number["low"] is not None]
+    return min(lows) > limit if len(lows) == len(numbers) else None
 
 
-def _all(*verdicts: bool | None) -> bool | None:
-    return None if None in verdicts else all(verdicts)
+def _both(one: bool | None, other: bool | None) -> bool | None:
+    return None if one is None or other is None else one and other
+
+
+# --- machine, nets, training ----------------------------------------------------------------------
 
 
 def net_claims(found: Mapping[str, Any]) -> list[Claim]:
-    """Are machine and nets as the paper found its own (Fig. 2 and 5)? Paper: Sec. 3.2
+    """Do machine and nets behave as the paper's? `found` is of `preliminary.numbers`.
 
-    Single tests, so without intervals. `found`: of `preliminary.run`.
+    Single tests, so without intervals. Paper: Sec. 3.2 and 4.1, Fig. 2 and 5
     """
-    gap = found["sim_to_real"]
-    apart = {"in the figure": gap["tool"]["position_error_mean"]}
-    apart["median of runs"] = gap["tool_position_error_mean_of_runs"]["median"]
+    kinds = ("machine", "nets")
+    up, down = list(found["sweep"])[1:3]  # at the limit
+    sweep = found["sweep"]
+    peaks = {f"{kind}, {u}": sweep[u][f"{kind}_peak"] for kind in kinds for u in (up, down)}
+    faster = all(peaks[f"{kind}, {down}"] > peaks[f"{kind}, {up}"] for kind in kinds)
+    times = {}
+    for kind in kinds:
+        for start, of_start in found["response_time"][kind][found["joint"]].items():
+            times[f"{kind}, {start}"] = of_start["up"]
+    slower = None
+    if all(times.values()):
+        slower = all(times[f"{k}, idle"] >= FACTOR * times[f"{k}, moving"] for k in kinds)
+    coupling = found["coupling_rms"]
+    spread = found["sim_to_real"]["tool_position_error_mean_of_runs"]
+    gap = {"in the figure": found["sim_to_real"]["tool"]["position_error_mean"]}
+    gap["median of runs"] = spread["median"]
     return [
-        _faster_down(found),
-        _later_from_idle(found),
-        _claim(
-            "When other joints move as well, the difference is marginal and negligible.",
-            f"velocity of {found['joint']} alone less that with the others (RMS), to be below {MARGINAL}",
-            "rad/s",
-            _single(found["coupling_rms"]),
-            max(found["coupling_rms"].values()) < MARGINAL,
-        ),
-        _claim(
-            "Over 30 s the discrepancy between simulation and machine remains reasonably small.",
-            f"mean distance of the tools under the same commands, to be below {SMALL}",
-            "m",
-            _single(apart),
-            max(apart.values()) < SMALL,
-        ),
+        Claim("gravity", _exact(peaks), faster),
+        Claim("idle", _exact(times), slower),
+        Claim("coupling", _exact(coupling), max(coupling.values()) < MARGINAL),
+        Claim("gap", _exact(gap), max(gap.values()) < SMALL_GAP),
     ]
 
 
-def _faster_down(found: Mapping[str, Any]) -> Claim:
-    (up, rising), (down, falling) = list(found["sweep"].items())[1:3]  # at the limit, either way
-    peaks = {
-        kind: (rising[f"{kind}_peak"], falling[f"{kind}_peak"]) for kind in ("machine", "nets")
-    }
-    numbers = {
-        f"{kind}, {u}": v for kind, of in peaks.items() for u, v in zip((up, down), of, strict=True)
-    }
-    paper = (
-        "The velocity is larger when rotating towards gravity: 0.24 rad/s one way, 0.47 the other."
-    )
-    what = f"peak speed of {found['joint']}, under {down} to be above that under {up}"
-    return _claim(
-        paper, what, "rad/s", _single(numbers), all(slow < fast for slow, fast in peaks.values())
-    )
-
-
-def _later_from_idle(found: Mapping[str, Any]) -> Claim:
-    times = {kind: of[found["joint"]] for kind, of in found["response_time"].items()}
-    numbers = {
-        f"{kind}, {when}": of[when]["up"]
-        for kind, of in times.items()
-        for when in ("idle", "moving")
-    }
-    answered = times.values() if all(numbers.values()) else ()
-    later = [of["idle"]["up"] >= LATER * of["moving"]["up"] for of in answered]
-    paper = (
-        "The same command is answered after about 400 ms from idle and 100 ms when already moving."
-    )
-    what = f"response time of {found['joint']} (to 63 %), from idle to be {LATER:g} times as long or more"
-    return _claim(paper, what, "s", _single(numbers), all(later) if later else None)
-
-
-def _single(numbers: Mapping[str, float | None]) -> dict[str, Mean]:
+def _exact(numbers: Mapping[str, float | None]) -> dict[str, Mean]:
     return {name: {"mean": number, "low": None, "high": None} for name, number in numbers.items()}
 
 
 def training_claim(seconds: float, steps: int) -> Claim:
-    """Does training take as long as the paper's? Its clock, so for the report alone. Paper: Sec. 3.4"""
+    """Does training take as long as the paper's? For the report alone. Paper: Sec. 3.4"""
     hours = seconds / 3600
-    paper = "The training process takes around 2.5 hours to converge."
-    what = f"time of {steps:,} environment steps, to be within a factor of {LATER:g} of that"
-    return _claim(paper, what, "h", _single({"here": hours}), 1 / LATER < hours / 2.5 < LATER)
+    holds = 1 / FACTOR < hours / 2.5 < FACTOR
+    return Claim("training", _exact({f"{steps:,} steps here": hours}), holds)
 
 
-def drift_claims(runs: Sequence[Run], baselines: Sequence[str]) -> list[Claim]:
-    """Do y and z stay still while the tool moves along x? Paper: Fig. 6b"""
-    drift = {c: by_start(runs, c, "x", "off_axis_drift_max") for c in ("rl", *baselines)}
-    numbers = {name: mean_interval(values) for name, values in drift.items()}
-    others = {name: numbers[name] for name in baselines}
-    more = {f"{name} less rl": mean_interval(drift[name] - drift["rl"]) for name in baselines}
+# --- task-space control ---------------------------------------------------------------------------
+
+
+def task_claims(
+    machine: Machine,
+    pids: Mapping[str, JacobianController],
+    runs: Sequence[Run],
+    along_x: Mapping[str, Trace],
+    goals: Array,
+    singular: Sequence[Claim],
+) -> list[Claim]:
+    """The claims on task-space control; those on baselines also of a stronger one.
+
+    `runs` are those that count, `along_x` their traces along x by controller with these `goals`
+    [m/s] (T, 3), `singular` is of `singular_claims`. Paper: Sec. 4.2, Fig. 6
+    """
+
+    def direction(names: Sequence[str]) -> Claim:
+        return direction_claim(machine, pids[names[0]], along_x[names[0]], goals)
+
+    def of_baselines(claim: Callable[[Sequence[str]], Claim]) -> Claim:
+        return claim(PAPER_BASELINES)._replace(stronger=claim(STRONGER))
+
+    along_z = ["velocity_error_mean", "off_axis_drift_max"]
     return [
-        _claim(
-            "RL: y and z remain stationary during motion along x.",
-            f"largest distance of the tool from its line, to be below {STANDSTILL} m",
-            "m",
-            {"rl": numbers["rl"]},
-            _below(numbers["rl"], STANDSTILL),
-        ),
-        _claim(
-            "The Jacobian-based method significantly fails to keep y and z still.",
-            f"largest distance of the tool from its line, to be above {STANDSTILL} m, and more than RL's",
-            "m",
-            others | more,
-            _all(
-                *(_above(n, STANDSTILL) for n in others.values()),
-                *(_above(n, 0.0) for n in more.values()),
-            ),
-        ),
+        still_claim(runs),
+        of_baselines(lambda names: drift_claim(runs, names)),
+        of_baselines(direction),
+        *singular,
+        of_baselines(lambda names: less_claim("tracking", runs, names, "xyz")),
+        of_baselines(lambda names: less_claim("along z", runs, names, "z", along_z)),
+        of_baselines(lambda names: less_claim("outperforms", runs, names, ["all"])),
     ]
+
+
+def still_claim(runs: Sequence[Run]) -> Claim:
+    """Do y and z stay still while the policy moves the tool along x? Paper: Fig. 6b"""
+    drift = mean_interval(by_start(runs, "rl", "x", "off_axis_drift_max"))
+    return Claim("still", {"rl": drift}, _below(ON_LINE, drift))
+
+
+def drift_claim(runs: Sequence[Run], baselines: Sequence[str]) -> Claim:
+    """Do y and z move while baselines move the tool along x? Paper: Fig. 6b"""
+    rl = by_start(runs, "rl", "x", "off_axis_drift_max")
+    drift = {c: by_start(runs, c, "x", "off_axis_drift_max") for c in baselines}
+    means = {c: mean_interval(values) for c, values in drift.items()}
+    more = {f"{c} less rl": mean_interval(values - rl) for c, values in drift.items()}
+    holds = _both(_above(ON_LINE, *means.values()), _above(0.0, *more.values()))
+    return Claim("drift", means | more, holds)
 
 
 def direction_claim(
     machine: Machine, controller: JacobianController, trace: Trace, goals: Array
 ) -> Claim:
-    """Does the PID track joint rates as well in one direction as in the other? Paper: Fig. 6d
+    """Does the PID track joint velocities as well in one direction as in the other? Paper: Fig. 6d
 
-    `trace` has its runs of one sequence with these `goals` [m/s] (T, 3).
+    `trace` has the runs of one sequence with these `goals` [m/s] (T, 3).
     """
     q_dot = trace.q_dot[..., machine.driven]
     v_goal = np.broadcast_to(goals[:, None], trace.v_tool.shape)
-    wanted = controller.desired_velocities(v_goal, trace.v_tool, trace.q, q_dot)
+    desired = controller.desired_velocities(v_goal, trace.v_tool, trace.q, q_dot)
     numbers: dict[str, Mean] = {}
-    unlike: list[bool] = []
+    verdicts = []
     for i, joint in enumerate(machine.driven):
-        share = []
-        for sign in (1, -1):
-            moving = sign * wanted[..., i] > 0.02  # rad/s, assumed: well above the encoder's steps
-            error = np.sum(np.abs(wanted - q_dot)[..., i] * moving, axis=0)
-            share.append(error / np.maximum(np.sum(np.abs(wanted)[..., i] * moving, axis=0), 1e-9))
-            share[-1] = np.where(moving.sum(axis=0) > 10, share[-1], np.nan)
-        up, down = mean_interval(share[0]), mean_interval(share[1])
-        numbers |= {f"{machine.names[joint]} up": up, f"{machine.names[joint]} down": down}
-        low, high = interval(share[0] - share[1])
-        if low is not None and high is not None and up["mean"] and down["mean"]:
-            ratio = max(up["mean"], down["mean"]) / min(up["mean"], down["mean"])
-            unlike.append(ratio > UNLIKE and not low < 0 < high)
-    what = (
-        f"error of the PID's joint rates as a share of the wanted, to differ by {UNLIKE} at a joint"
-    )
-    paper = "The fine-tuned PID yields varying results depending on the direction of movement."
-    return _claim(paper, what, "1", numbers, any(unlike) if unlike else None)
+        up = _relative_error(q_dot[..., i], desired[..., i])
+        down = _relative_error(-q_dot[..., i], -desired[..., i])
+        numbers[f"{machine.names[joint]} up"] = mean_interval(up)
+        numbers[f"{machine.names[joint]} down"] = mean_interval(down)
+        verdicts.append(_differ(up, down))
+    measured = [verdict for verdict in verdicts if verdict is not None]
+    return Claim("direction", numbers, any(measured) if measured else None)
 
 
-def singular_controllers(controllers: Mapping[str, Controller]) -> dict[str, Controller]:
-    """RL and the baseline with k = 0.1, and the same gains with k = 0.05: damping alone differs."""
-    damped = controllers["jacobian_pid_k0.1"]
-    if not isinstance(damped, JacobianController):
-        raise ValueError(f"jacobian_pid_k0.1: expected a JacobianController, got {type(damped)}")
-    return {
-        "rl": controllers["rl"],
-        "jacobian_pid_k0.1": damped,
-        "jacobian_pid_k0.05": replace(damped, k=0.05),
-    }
+def _relative_error(q_dot: Array, desired: Array) -> Array:
+    """Error over desired velocity, of (T, starts) while that is positive, (starts,); NaN: never."""
+    moving = desired > 0.02  # rad/s, assumed: well above the encoder's steps
+    error = np.sum(np.abs(desired - q_dot) * moving, axis=0)
+    total = np.sum(desired * moving, axis=0)
+    return np.where(moving.sum(axis=0) > 10, error / np.maximum(total, 1e-9), np.nan)
 
 
-def speed_share(machine: Machine, w0: float, trace: Trace, goals: Array) -> Array:
-    """Speed along the goal as a share of it near singularities, (num,); NaN: never there.
-
-    Of ticks below the manipulability `w0` in which the goal (T, num, 3) [m/s] has lasted for `TRANSIENT`.
-    """
-    lasting = ticks_since_change(machine, goals) >= round(TRANSIENT * machine.rate)
-    near = (
-        lasting
-        & (manipulability(jacobian(forward_kinematics(machine, trace.q))[..., machine.driven]) < w0)
-        & np.any(goals, axis=-1)
-    )
-    along = np.sum(trace.v_tool * goals, axis=-1)
-    square = np.sum(goals * goals, axis=-1) * near
-    return np.where(near.any(0), np.sum(along * near, 0) / np.maximum(square.sum(0), 1e-12), np.nan)
+def _differ(up: Array, down: Array) -> bool | None:
+    """Do two values per start (starts,) differ by a factor? None: too few values."""
+    low, high = interval(up - down)
+    means = [mean_interval(values)["mean"] for values in (up, down)]
+    found = [mean for mean in means if mean]
+    if low is None or high is None or len(found) < 2:
+        return None
+    return max(found) / min(found) > UNLIKE and not low < 0 < high
 
 
-def singular_claims(runs: Sequence[Run], share: Mapping[str, Array]) -> list[Claim]:
-    """Does damping slow the tool near singularities, and does little damping jerk? Paper: Fig. 6e, 6f
-
-    `runs` are those of `singular_controllers` from extended starts, `share` their `speed_share` (starts,).
-    """
-    jerk = {name: by_start(runs, name, "all", "jerk_rms") for name in share}
-    return [_slowed(share), _jerky(jerk), _neither(share, jerk)]
-
-
-def _slowed(share: Mapping[str, Array]) -> Claim:
-    high, low = share["jacobian_pid_k0.1"], share["jacobian_pid_k0.05"]
-    less = mean_interval(high - low)
-    numbers = {
-        "k 0.1": mean_interval(high),
-        "k 0.05": mean_interval(low),
-        "k 0.1 less k 0.05": less,
-    }
-    paper = "Near a singularity the damping impedes accurate task space control: it slows the tool."
-    what = "speed along the goal as a share of it, k = 0.1 to be below k = 0.05 with the same gains"
-    return _claim(paper, what, "1", numbers, _below(less, 0.0))
-
-
-def _jerky(jerk: Mapping[str, Array]) -> Claim:
-    high, low = jerk["jacobian_pid_k0.1"], jerk["jacobian_pid_k0.05"]
-    more = mean_interval(low - high)
-    numbers = {
-        "k 0.1": mean_interval(high),
-        "k 0.05": mean_interval(low),
-        "k 0.05 less k 0.1": more,
-    }
-    paper = (
-        "With less damping (k = 0.05 instead of 0.1) the system moves jerkily near the singularity."
-    )
-    what = "jerk, k = 0.05 to be above k = 0.1 with the same gains"
-    return _claim(paper, what, "m/s^3", numbers, _above(more, 0.0))
-
-
-def _neither(share: Mapping[str, Array], jerk: Mapping[str, Array]) -> Claim:
-    faster = mean_interval(share["rl"] - share["jacobian_pid_k0.05"])
-    smoother = mean_interval(jerk["rl"] - jerk["jacobian_pid_k0.1"])
-    numbers = {"rl share": mean_interval(share["rl"]), "less k 0.05": faster}
-    numbers |= {"rl jerk": mean_interval(jerk["rl"]), "less k 0.1": smoother}
-    paper = "RL is more robust there: neither slowed nor jerky."
-    what = "share of the wanted speed to be above that of k = 0.05, and jerk [m/s^3] below that of k = 0.1"
-    return _claim(paper, what, "1", numbers, _all(_above(faster, 0.0), _below(smoother, 0.0)))
-
-
-def tracking_claims(runs: Sequence[Run], baselines: Sequence[str]) -> list[Claim]:
-    """Does the policy track better than the Jacobian-based method?
-
-    Paper: Fig. 6c, Fig. 6f, Fig. 6h, Sec. 5
-    """
-    said = {
-        "RL tracks the velocity robustly, along x, y and z (Fig. 6c, 6f, 6h).": [
-            (s, "error") for s in "xyz"
-        ],
-        "RL is more robust in motion along z, too (Fig. 6g, 6h).": [("z", "error"), ("z", "drift")],
-        "The proposed method outperforms the Jacobian-based approach.": [("all", "error")],
-    }
-    keys = {"error": "velocity_error_mean", "drift": "off_axis_drift_max"}
-    found = []
-    for paper, figures in said.items():
-        numbers = {}
-        for s, what in figures:
-            rl = by_start(runs, "rl", s, keys[what])
+def less_claim(
+    name: str,
+    runs: Sequence[Run],
+    baselines: Sequence[str],
+    sequences: Sequence[str],
+    keys: Sequence[str] = ("velocity_error_mean",),
+) -> Claim:
+    """Are figures of the policy less than those of all baselines? Paper: Fig. 6c, 6f, 6h, Sec. 5"""
+    labels = {"velocity_error_mean": "error", "off_axis_drift_max": "drift"}
+    numbers = {}
+    for key in keys:
+        for s in sequences:
+            rl = by_start(runs, "rl", s, key)
             for c in baselines:
-                numbers[f"{what} {s}, less {c}"] = mean_interval(
-                    rl - by_start(runs, c, s, keys[what])
-                )
-        holds = _all(*(_below(n, 0.0) for n in numbers.values()))
-        what = "RL's mean velocity error [m/s] (largest drift [m]) less a baseline's, to be below 0"
-        found.append(_claim(paper, what, "m/s, m", numbers, holds))
-    return found
+                less = mean_interval(rl - by_start(runs, c, s, key))
+                numbers[f"{labels[key]} {s}, less {c}"] = less
+    return Claim(name, numbers, _below(0.0, *numbers.values()))
+
+
+# --- near singularities ---------------------------------------------------------------------------
+
+
+def singular_controllers(
+    rl: Controller, pids: Mapping[str, JacobianController]
+) -> dict[str, Controller]:
+    """RL, and one baseline with strong and with weak damping and the same gains."""
+    return {"rl": rl, STRONG: pids[STRONG], WEAK: replace(pids[STRONG], k=0.05)}
+
+
+def speed_fraction(machine: Machine, w0: float, trace: Trace, goals: Array) -> Array:
+    """Speed along the goal over the goal's near singularities, (num,); NaN: never there.
+
+    Of ticks below the manipulability `w0` at which the goal [m/s] (T, num, 3) held for `TRANSIENT`.
+    """
+    steady = ticks_since_change(machine, goals) >= round(TRANSIENT * machine.rate)
+    J = jacobian(forward_kinematics(machine, trace.q))[..., machine.driven]
+    near = steady & (manipulability(J) < w0) & np.any(goals, axis=-1)
+    along = np.sum(np.sum(trace.v_tool * goals, axis=-1) * near, axis=0)
+    square = np.sum(np.sum(goals * goals, axis=-1) * near, axis=0)
+    return np.where(near.any(axis=0), along / np.maximum(square, 1e-12), np.nan)
+
+
+def singular_claims(runs: Sequence[Run], speed: Mapping[str, Array]) -> list[Claim]:
+    """Does damping slow the tool near singularities, and does little damping jerk?
+
+    `runs` are of `singular_controllers`, `speed` is their `speed_fraction` (starts,).
+    Paper: Fig. 6a, 6e, 6f
+    """
+    jerk = {name: by_start(runs, name, "all", "jerk_rms") for name in speed}
+    slower = mean_interval(speed[STRONG] - speed[WEAK])
+    jerkier = mean_interval(jerk[WEAK] - jerk[STRONG])
+    faster = mean_interval(speed["rl"] - speed[WEAK])
+    smoother = mean_interval(jerk["rl"] - jerk[STRONG])
+    speeds = {"k 0.1": mean_interval(speed[STRONG]), "k 0.05": mean_interval(speed[WEAK])}
+    jerks = {"k 0.1": mean_interval(jerk[STRONG]), "k 0.05": mean_interval(jerk[WEAK])}
+    rl = {"rl speed": mean_interval(speed["rl"]), "speed less k 0.05": faster}
+    rl |= {"rl jerk": mean_interval(jerk["rl"]), "jerk less k 0.1": smoother}
+    return [
+        Claim("slowed", speeds | {"k 0.1 less k 0.05": slower}, _below(0.0, slower)),
+        Claim("jerky", jerks | {"k 0.05 less k 0.1": jerkier}, _above(0.0, jerkier)),
+        Claim("neither", rl, _both(_above(0.0, faster), _below(0.0, smoother))),
+    ]

@@ -1,168 +1,314 @@
-"""The whole chain in one function: logs, nets, policy, baselines, comparison, report."""
+"""The whole chain: logs, nets, policy, baselines, comparison, report."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
-from dataclasses import asdict, replace
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
-from brokk_min.actuator import ActuatorNet
+from brokk_min.actuator import ActuatorNet, select_nets
 from brokk_min.env import TaskConfig
-from brokk_min.evaluation import claims, figures, preliminary, report
-from brokk_min.evaluation.baselines import gains_metadata, gains_table, tune_baselines, write_gains
-from brokk_min.evaluation.experiments import Effort, comparison, driven_log
-from brokk_min.evaluation.metrics import Traces, evaluate, metadata, summary
-from brokk_min.evaluation.sequences import axis_sequences, hold_table, tuning_set
-from brokk_min.identification import excitation, fitting, logs, net_file
-from brokk_min.identification import validation as scores
+from brokk_min.evaluation import baselines, claims, metrics, preliminary, report, sequences
+from brokk_min.evaluation.metrics import Controllers, Run, Traces, evaluate, summary
+from brokk_min.evaluation.perfect_model import perfect_models
+from brokk_min.evaluation.robustness import robustness
+from brokk_min.evaluation.rollout import Controller, Trace
+from brokk_min.evaluation.seeds import read_seeds, seeds_of
+from brokk_min.evaluation.sequences import Commands
+from brokk_min.identification import fitting, logs, validation
+from brokk_min.identification.excitation import collect, task_log
 from brokk_min.identification.files import write_json
-from brokk_min.jacobian import JacobianController
+from brokk_min.identification.fitting import FitConfig
+from brokk_min.identification.logs import Log
+from brokk_min.identification.net_file import save_net
+from brokk_min.jacobian import JacobianController, manipulability, manipulability_threshold
+from brokk_min.kinematics import forward_kinematics, jacobian
+from brokk_min.learning.checkpoint import train_policy
 from brokk_min.learning.policy import Policy, PolicyController, save_policy
 from brokk_min.machine import Array, Machine
+from brokk_min.ppo import PPOConfig
+
+Pids = Mapping[str, JacobianController]  # baselines by name
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How much each stage may spend."""
+
+    hours: float = 1.0  # driving time of each actuator that is recorded
+    fit_steps: int = FitConfig.steps
+    train_steps: int = PPOConfig.total_steps
+    generations: int = baselines.GENERATIONS  # of the tuning
+    tuning_runs: int = baselines.TUNING_RUNS
+    starts: int = 64
+    bound_starts: int = 16  # of them, for the regret
+    short_s: float = 18.0  # s of each sequence for regret, robustness and singularities
+
+
+QUICK = Budget(0.1, 700, 200_000, 4, 4, 8, 2, 3.0)
 
 
 def reproduce(
-    machine: Machine, out: Path, effort: Effort, seed: int, sweep: Path | None = None
+    machine: Machine, out: Path, budget: Budget, seed: int, sweep: Path | None = None
 ) -> dict[str, Any]:
-    """Logs, nets, policy, baselines, comparison, `results.json` and `report.html` in the folder `out`.
+    """Run the chain; logs, nets, policy, gains, `results.json` and `report.html` go to `out`.
 
-    `results.json` holds no clock: the same seed gives the same file on the same machine. The figures of
-    training seeds in the file `sweep`, which `sweep.sweep` wrote, join the report.
+    `results.json` has no times: the same seed gives the same file on the same computer. `sweep` is
+    a file of `brokk-min sweep`, whose training seeds the report shows.
     """
-    from brokk_min.learning.checkpoint import train_policy
-    from brokk_min.evaluation.seeds import read_seeds, seeds_of
-    from brokk_min.ppo import PPOConfig  # torch, only where something is trained
-
     seeds = read_seeds(sweep) if sweep else {}
     out.mkdir(parents=True, exist_ok=True)
-    clock, stage = stages(6)
-    with stage("record"):
-        log, test = record(machine, out, effort, seed)
-    with stage("fit"):
-        net, paper = fitted(machine, out, log, test, effort, seed)
-        driven = net.select([machine.names[i] for i in machine.driven])
-        over_seeds = seeds_of(machine, driven, seeds) if seeds else {}
-    with stage("train"):
-        learner = PPOConfig(total_steps=effort.train_steps)
-        policy = train_policy(
-            machine, driven, TaskConfig(), learner, seed, out / "policy.npz", resume=True
-        )
-    with stage("tune"):
-        tuned, how = tune_baselines(machine, driven, effort.tuning_runs, effort.generations, seed)
-    with stage("evaluate"):
-        rl = PolicyController(machine, policy)
-        measured, traces = measure(machine, net, test, rl, tuned, effort, seed)
-    about = metadata(machine, seed) | gains_metadata(machine, driven) | {"effort": asdict(effort)}
-    results = {"meta": about, "paper_recipe": paper, **measured, "gains": gains_table(tuned)}
-    results |= {"tuning": how, "training_seeds": over_seeds}
-    with stage("draw"):
-        write(out, results, tuned, told(policy, results, seed))
-        parts = report.net_parts(
-            machine, net, test, results, seed, out / "policy.npz.csv", clock["train"]
-        )
-        parts = [report.found(results), *parts, *report.task_parts(machine, results, traces)]
-        figures.write_report(out / "report.html", parts, clock)
+    clock: dict[str, float] = {}
+    with tqdm(total=6, desc="stages done", unit="stage", position=1, disable=None) as bar:
+        stage = partial(_stage, clock, bar)
+        with stage("record"):
+            log, test = record(machine, out, budget, seed)
+        with stage("fit"):
+            net, recipe = fit_nets(machine, out, log, test, budget, seed)
+            driven = select_nets(machine, net)
+            training_seeds = seeds_of(machine, driven, seeds) if seeds else {}
+        with stage("train"):
+            learner = PPOConfig(total_steps=budget.train_steps)
+            file = out / "policy.npz"
+            policy = train_policy(machine, driven, TaskConfig(), learner, seed, file, resume=True)
+        with stage("tune"):
+            runs, generations = budget.tuning_runs, budget.generations
+            pids, tuning = baselines.tune_baselines(machine, driven, runs, generations, seed)
+        with stage("evaluate"):
+            results, shown = measure(machine, net, test, policy, pids, budget, seed)
+        with stage("draw"):
+            results |= {"paper_recipe": recipe, "training_seeds": training_seeds}
+            results |= {"gains": baselines.gains_table(pids), "tuning": tuning}
+            write(out, results, policy, pids)
+            report.write_report(machine, out, results, shown, clock)
     write_json(out / "timing.json", clock)
     return results
 
 
-def stages(total: int) -> tuple[dict[str, float], Callable[[str], AbstractContextManager[None]]]:
-    """Seconds by stage, filled in as `total` stages end, and what each stage is to run in."""
-    clock: dict[str, float] = {}
-    bar = tqdm(total=total, desc="stages done", unit="stage", position=1, disable=None)
-
-    @contextmanager
-    def stage(name: str) -> Iterator[None]:
-        begun = time.perf_counter()
-        yield
-        clock[name] = time.perf_counter() - begun
-        bar.set_postfix_str(name)
-        bar.update()
-        if len(clock) == total:
-            bar.close()
-
-    return clock, stage
+@contextmanager
+def _stage(clock: dict[str, float], bar: Any, name: str) -> Iterator[None]:
+    """Measure the seconds of a stage."""
+    start = time.perf_counter()
+    yield
+    clock[name] = time.perf_counter() - start
+    bar.set_postfix_str(name)
+    bar.update()
 
 
-def fitted(
-    machine: Machine, out: Path, log: logs.Log, test: logs.Log, effort: Effort, seed: int
+# --- logs and nets --------------------------------------------------------------------------------
+
+
+def record(machine: Machine, out: Path, budget: Budget, seed: int) -> list[Log]:
+    """Logs to fit nets to and to score them on, written and read back as a user's."""
+    rng = np.random.default_rng
+    logs.write_log(out / "log.npz", collect(machine, budget.hours, "rich", rng(seed)))
+    logs.write_log(out / "log_test.npz", task_log(machine, 20, 40.0, rng(seed + 1)))
+    files = [out / "log.npz", out / "log_test.npz"]
+    return [logs.read_log([file], machine.velocity_samples, rate=machine.rate) for file in files]
+
+
+def fit_nets(
+    machine: Machine, out: Path, log: Log, test: Log, budget: Budget, seed: int
 ) -> tuple[ActuatorNet, dict[str, Any]]:
-    """Nets of all joints, written to `net.npz`, and how those by the paper's recipe fare, for JSON."""
-    config = fitting.FitConfig(
-        steps=effort.fit_steps, history=machine.history, dead_zone=machine.dead_zone
-    )
+    """Nets of all joints, and the errors of nets by the paper's recipe, for JSON."""
+    config = FitConfig(budget.fit_steps, history=machine.history, dead_zone=machine.dead_zone)
     net = fitting.fit(log, config, seed, machine.velocity_samples, machine.name)
-    net_file.save_net(out / "net.npz", net)
-    half = replace(config, steps=effort.fit_steps // 2)  # for time
-    return net, preliminary.paper_recipe(machine, test, effort.hours, half, seed)
+    save_net(out / "net.npz", net)
+    half = replace(config, steps=budget.fit_steps // 2)  # to save time
+    return net, paper_recipe(machine, test, budget.hours, half, seed)
+
+
+def paper_recipe(
+    machine: Machine, test: Log, hours: float, config: FitConfig, seed: int
+) -> dict[str, Any]:
+    """Scores and gap of nets by the paper's recipe: sines, errors of one step. Paper: Sec. 3.3"""
+    log = collect(machine, hours, "sine", np.random.default_rng(seed))
+    recordings = tuple(r for r in log.recordings if not r.name.endswith(logs.RETURN))
+    log = log._replace(recordings=recordings)
+    config = replace(config, **fitting.PAPER_RECIPE)
+    net = fitting.fit(log, config, seed, machine.velocity_samples, machine.name)
+    gap = preliminary.gap_numbers(machine, preliminary.sim_to_real(machine, net, seed))
+    return {"test": validation.score(net, test), "sim_to_real": gap}
+
+
+# --- measurements ---------------------------------------------------------------------------------
 
 
 def measure(
     machine: Machine,
     net: ActuatorNet,
-    test: logs.Log,
-    rl: PolicyController,
-    tuned: Mapping[str, JacobianController],
-    effort: Effort,
+    test: Log,
+    policy: Policy,
+    pids: Pids,
+    budget: Budget,
     seed: int,
-) -> tuple[dict[str, Any], dict[str, Traces]]:
-    """All that is measured of nets, policy and baselines: `results.json`, and traces of `comparison`."""
-    compared, traces = comparison(machine, {"rl": rl, **tuned}, effort, seed)
-    compared["task_space"]["rl_on_nets"] = on_nets(machine, rl, compared, seed)
-    driven = scores.score(net, driven_log(machine, traces["all"], "rl"))
-    before, tuning = (
-        preliminary.run(machine, net, seed),
-        tuning_set(machine, effort.tuning_runs, seed),
-    )
-    return {
-        "actuator": {"test": scores.score(net, test), "driven_by_policy": driven},
-        "preliminary": before,
-        "net_claims": claims.net_claims(before),
-        **compared,
-        "tuning_runs": tuning_runs(machine, *tuning),
-    }, traces
-
-
-def tuning_runs(machine: Machine, starts: Array, goals: Array) -> list[dict[str, Any]]:
-    """Each run that the baselines were tuned on, for JSON: "start" [rad] and "goals", see `hold_table`."""
-    runs = zip(starts, goals.swapaxes(0, 1), strict=True)
-    return [{"start": s.tolist(), "goals": hold_table(machine, run).tolist()} for s, run in runs]
-
-
-def record(machine: Machine, out: Path, effort: Effort, seed: int) -> list[logs.Log]:
-    """Logs to fit nets to and to score them on, written and read back as anybody's."""
-    files, rng = (out / "log.npz", out / "log_test.npz"), np.random.default_rng
-    logs.write_log(files[0], excitation.collect(machine, effort.hours, "rich", rng(seed)))
-    logs.write_log(files[1], excitation.task_log(machine, 20, 40.0, rng(seed + 1)))
-    return [logs.read_log([file], machine.velocity_samples, rate=machine.rate) for file in files]
-
-
-def on_nets(
-    machine: Machine, rl: PolicyController, compared: Mapping[str, Any], seed: int
-) -> dict[str, dict[str, float | None]]:
-    """`summary` of the policy on its own nets, along x, y and z from the workspace starts."""
+) -> tuple[dict[str, Any], report.Shown]:
+    """All measurements of nets, policy and baselines, for JSON and for the figures."""
+    rl = PolicyController(machine, policy)
+    compared, task, singular = compare(machine, rl, pids, budget, seed)
     starts = np.array(compared["starts"])[np.array(compared["start_kinds"]) == "workspace"]
-    runs, _ = evaluate(machine, {"rl": rl}, axis_sequences(machine), starts, seed, rl.policy.net)
-    return summary(runs)["rl"]
-
-
-def write(
-    out: Path, results: Mapping[str, Any], tuned: Mapping[str, JacobianController], policy: Policy
-) -> None:
-    """What the other commands read: figures, gains of the baselines, the policy."""
-    write_json(out / "results.json", results)
-    write_gains(out / "gains.json", tuned, results["meta"])
-    save_policy(out / "policy.npz", policy)
-
-
-def told(policy: Policy, results: Mapping[str, Any], seed: int) -> Policy:
-    """The policy with the command that made it and its figures in its file's header."""
-    errors = {
-        c: of["all"]["velocity_error_mean"] for c, of in results["task_space"]["summary"].items()
+    axes = sequences.axis_sequences(machine)
+    on_nets, _ = evaluate(machine, {"rl": rl}, axes, starts, seed, policy.net)
+    compared["task_space"]["rl_on_nets"] = summary(on_nets)["rl"]
+    measured = preliminary.run(machine, net, seed)
+    numbers = preliminary.numbers(machine, measured)
+    meta = metrics.metadata(machine, seed) | baselines.gains_metadata(machine, policy.net)
+    actuator = {
+        "test": validation.score(net, test),
+        "driven_by_policy": validation.score(net, driven_log(machine, task, "rl")),
     }
-    said = {"command": f"brokk-min reproduce --seed {seed}", "velocity_error_mean": errors}
-    return replace(policy, training={**policy.training, **said})
+    results = {
+        "meta": meta | {"effort": asdict(budget)},
+        "actuator": actuator,
+        "preliminary": numbers,
+        "net_claims": [claim.to_json() for claim in claims.net_claims(numbers)],
+        "tuning_runs": tuning_runs(machine, budget.tuning_runs, seed),
+    }
+    return results | compared, report.Shown(net, test, measured, task, singular)
+
+
+def compare(
+    machine: Machine, rl: Controller, pids: Pids, budget: Budget, seed: int
+) -> tuple[dict[str, Any], Traces, Traces]:
+    """The paper's experiment, regret and robustness: JSON, all traces, those near singularities.
+
+    Means, intervals and verdicts are over the "workspace" starts, from which all sequences can be
+    followed. Paper: Sec. 4.2
+    """
+    controllers: Controllers = {"rl": rl, **pids}
+    commands = sequences.task_sequences(machine)
+    starts = sequences.evaluation_starts(machine, budget.starts, commands, seed + 2)
+    kinds = np.array(sequences.start_kinds(machine, starts))
+    workspace = kinds == "workspace"
+    reachable = starts[workspace]
+    runs, traces = evaluate(machine, controllers, commands, starts, seed)
+    scored = [run for run in runs if run["kind"] == "workspace"]
+    damped = claims.singular_controllers(rl, pids)
+    singular, singular_claims, singular_traces = near_singularities(
+        machine, damped, starts[kinds == "extended"], budget.short_s, seed
+    )
+    along_x = {c: Trace(*(array[:, workspace] for array in traces[c, "x"])) for c in pids}
+    task_claims = claims.task_claims(
+        machine, pids, scored, along_x, commands[0].goals, singular_claims
+    )
+    short = shorten(machine, sequences.axis_sequences(machine), budget.short_s)
+    results = {
+        "task_space": tables(runs, scored),
+        "regret": regret(machine, controllers, short, reachable[: budget.bound_starts], seed),
+        "robustness": robustness(machine, controllers, short, reachable[:16], seed),
+        "singular": singular,
+        "claims": [claim.to_json() for claim in task_claims],
+        "starts": starts.tolist(),
+        "start_kinds": kinds.tolist(),
+    }
+    return results, traces, singular_traces
+
+
+def shorten(machine: Machine, commands: Sequence[Commands], seconds: float) -> list[Commands]:
+    """The first seconds of each sequence."""
+    ticks = round(seconds * machine.rate)
+    return [sequence._replace(goals=sequence.goals[:ticks]) for sequence in commands]
+
+
+def tables(runs: Sequence[Run], scored: Sequence[Run]) -> dict[str, Any]:
+    """All runs, and means and intervals of those that count, RL less each baseline."""
+    by_kind = {}
+    for kind in dict.fromkeys(run["kind"] for run in runs):
+        means = summary([run for run in runs if run["kind"] == kind])
+        by_kind[kind] = {controller: rows["all"] for controller, rows in means.items()}
+    return {
+        "runs": runs,
+        "summary": summary(scored),
+        "intervals": metrics.intervals(scored),
+        "by_kind": by_kind,
+        "rl_less": metrics.paired_differences(scored, "rl"),
+    }
+
+
+def regret(
+    machine: Machine,
+    controllers: Controllers,
+    commands: Sequence[Commands],
+    starts: Array,
+    seed: int,
+) -> dict[str, Any]:
+    """Mean errors, and velocity errors less that of a controller that knows the plant."""
+    every = {**controllers, **perfect_models(machine, starts)}
+    runs, _ = evaluate(machine, every, commands, starts, seed)
+    less = {}
+    for name in controllers:
+        error = "velocity_error_mean"
+        less[name] = metrics.paired_difference(runs, name, "perfect_model", error)
+    return {"summary": summary(runs), "less_perfect_model": less}
+
+
+def near_singularities(
+    machine: Machine, controllers: Controllers, starts: Array, seconds: float, seed: int
+) -> tuple[dict[str, Any], list[claims.Claim], Traces]:
+    """Runs of `claims.singular_controllers` from extended starts: JSON, claims and traces.
+
+    The JSON has the "manipulability" and the "least" singular value [m/rad] at each start. All are
+    empty without starts. Paper: Fig. 6a, 6e, 6f
+    """
+    if not len(starts):
+        return {"summary": {}, "claims": []}, [], {}
+    commands = shorten(machine, sequences.singular_sequences(machine, starts), seconds)
+    runs, traces = evaluate(machine, controllers, commands, starts, seed)
+    w0 = manipulability_threshold(machine)
+    J = jacobian(forward_kinematics(machine, starts))[..., machine.driven]
+    speed = {}
+    for name in controllers:
+        fractions = []
+        for sequence in commands:
+            goals = sequence.for_starts(len(starts))
+            trace = traces[name, sequence.name]
+            fractions.append(claims.speed_fraction(machine, w0, trace, goals))
+        speed[name] = metrics.row_mean(np.stack(fractions, axis=1))
+    found = claims.singular_claims(runs, speed)
+    results = {
+        "summary": summary(runs),
+        "claims": [claim.to_json() for claim in found],
+        "w0": w0,
+        "manipulability": manipulability(J).tolist(),
+        "least": np.linalg.svd(J, compute_uv=False)[:, -1].tolist(),
+    }
+    return results, found, traces
+
+
+def driven_log(machine: Machine, traces: Traces, controller: str) -> Log:
+    """Commands and encoder angles of a controller's first 16 runs of each sequence."""
+    recordings = []
+    for (name, sequence), trace in traces.items():
+        for i in range(min(16, trace.q.shape[1]) if name == controller else 0):
+            run = (trace.u[:, i].astype(float), trace.q_measured[:, i].astype(float))
+            recordings.append((f"{controller}_{sequence}_{i:02d}", *run))
+    return logs.machine_log(machine, recordings)
+
+
+def tuning_runs(machine: Machine, num: int, seed: int) -> list[dict[str, Any]]:
+    """Each run on which the baselines were tuned: "start" [rad] and "goals", see `hold_table`."""
+    starts, goals = sequences.tuning_set(machine, num, seed)
+    runs = []
+    for i, start in enumerate(starts):
+        table = sequences.hold_table(machine, goals[:, i])
+        runs.append({"start": start.tolist(), "goals": table.tolist()})
+    return runs
+
+
+# --- files ----------------------------------------------------------------------------------------
+
+
+def write(out: Path, results: Mapping[str, Any], policy: Policy, pids: Pids) -> None:
+    """Write what other commands read: results, gains, the policy with its errors as metadata."""
+    write_json(out / "results.json", results)
+    baselines.write_gains(out / "gains.json", pids, results["meta"])
+    means = results["task_space"]["summary"]
+    errors = {controller: rows["all"]["velocity_error_mean"] for controller, rows in means.items()}
+    command = f"brokk-min reproduce --seed {results['meta']['seed']}"
+    made = {"command": command, "velocity_error_mean": errors}
+    save_policy(out / "policy.npz", replace(policy, training={**policy.training, **made}))

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import Encoder, Measured, TaskConfig, initial_state, measure, reward, transition
 from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocity
+from brokk_min.learning.episodes import draw_noise
 from brokk_min.machine import Array, Machine, read_encoder
 
 
@@ -64,7 +65,8 @@ def rollout(
     for goal in goals:
         v_goal = np.broadcast_to(goal.astype(np.float32), state.v_goal.shape)
         integral = state.error_integral
-        measured = measure(machine, state.history, v_goal, integral, config.noise, rng)
+        noise = draw_noise(machine, config.noise, len(state.q), rng)
+        measured = measure(machine, state.history, v_goal, integral, noise)
         u, controller_state = controller(measured, controller_state)
         q_measured = state.history[..., 0, -1]
         state = transition(machine, net, replace(state, v_goal=v_goal), u, read)

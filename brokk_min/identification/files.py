@@ -1,13 +1,14 @@
-"""Files, whole or not at all: small tables, JSON, and arrays with a header that says what they are.
+"""Files and optional packages: tables, JSON, arrays with a header.
 
-A file takes the place of another only once it is complete; one that is not what it should be is refused with
-what was expected, where, and what was found.
+A new file replaces the old one only once it is complete. A file with other content than expected is
+refused with its path, the place, what was expected and what was found.
 """
 
 import csv
 import json
 import os
 import tempfile
+import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import import_module
@@ -18,15 +19,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
-# a folder a machine: policy and gains of `make reproduce`, start poses
+Table = dict[str, Any]  # sequence of cells by column; row 2 of the file is cell 0
+# a folder per machine: policy and gains of `make reproduce`, start poses
 SHIPPED = Path(__file__).parents[1] / "shipped"
-Table = dict[str, list[Any]]  # cells by column; row 2 of the file is cell 0
+UNPACKED_MIN = 2**24  # bytes that any archive may unpack to
+UNPACKED_RATIO = 300  # assumed: no log of ours is compressed further
 
 
 def require(package: str, extra: str) -> Any:
     """Import a package that comes with an extra of pyproject.toml.
 
-    ValueError: it is not installed, with the extra that brings it.
+    ValueError: it is not installed; names the extra.
     """
     try:
         return import_module(package)
@@ -38,7 +41,7 @@ def require(package: str, extra: str) -> Any:
 
 @contextmanager
 def whole_file(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
-    """Open a temporary file beside `path` that replaces it when the block ends without error."""
+    """Open a temporary file that replaces `path` when the block ends without an error."""
     path = Path(path)
     if not path.parent.is_dir():
         raise ValueError(f"{path}: expected an existing directory, got {path.parent}")
@@ -54,13 +57,13 @@ def whole_file(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
     except BaseException as error:
         os.unlink(temporary)
         if isinstance(error, OSError) and error.filename is None:
-            error.filename = str(path)  # a full disk does not say which file it was
+            error.filename = str(path)  # the error of a full disk has no file name
         raise
 
 
 @contextmanager
 def expected(path: Path, what: str) -> Iterator[None]:
-    """Whatever goes wrong while the content of `path` is taken apart says that it is not `what`."""
+    """Turn any error of the block into a ValueError: the content of `path` is not `what`."""
     try:
         yield
     except (AttributeError, IndexError, KeyError, OSError, TypeError, ValueError) as error:
@@ -68,7 +71,7 @@ def expected(path: Path, what: str) -> Iterator[None]:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON whole, floats as they are."""
+    """Write JSON with all digits; ValueError for nan and inf."""
     with whole_file(path, "w") as file:
         json.dump(value, file, indent=1, allow_nan=False)
         file.write("\n")
@@ -77,17 +80,23 @@ def write_json(path: Path, value: Any) -> None:
 def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """All arrays of an `.npz` file; nothing in it is executed.
 
-    ValueError: not there, not an `.npz`, truncated, or holding pickled objects.
+    ValueError: not there, not an `.npz`, damaged, with pickled objects, or compressed so far that
+    its size does not justify the memory.
     """
     try:
+        with zipfile.ZipFile(path) as archive:
+            unpacked = sum(member.file_size for member in archive.infolist())
+        allowed = max(UNPACKED_MIN, UNPACKED_RATIO * os.path.getsize(path))
+        if unpacked > allowed:
+            raise ValueError(f"{unpacked} bytes unpacked, more than {allowed}")
         with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
+            return {name: np.asarray(file[name]) for name in file.files}
     except Exception as error:  # zipfile, zlib and NumPy raise anything on damaged files
         raise ValueError(f"{path}: expected a readable .npz file, got {error!r}") from error
 
 
 def load_header(path: Path, arrays: dict[str, Any], kind: str, version: int) -> dict[str, Any]:
-    """The JSON header of a file of ours, checked for kind and format version, without those two."""
+    """The JSON header of a file, without `kind` and `format`; ValueError where these differ."""
     with expected(path, "a file with a JSON header"):
         header = dict(json.loads(str(arrays["header"])))
     got = header.pop("kind", None), header.pop("format", None)
@@ -96,30 +105,31 @@ def load_header(path: Path, arrays: dict[str, Any], kind: str, version: int) -> 
     return header
 
 
-def expect_same(path: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
-    """Refuse a file that says other than `wanted` of itself: ValueError, with the first name that differs."""
-    for name, value in wanted.items():
-        if found.get(name) != value:
-            raise ValueError(f"{path}: {name}: expected {value!r}, got {found.get(name)!r}")
+def expect_same(path: Path, header: Mapping[str, Any], required: Mapping[str, Any]) -> None:
+    """ValueError for the first entry of `header` that is not the required one."""
+    for name, value in required.items():
+        if header.get(name) != value:
+            raise ValueError(f"{path}: {name}: expected {value!r}, got {header.get(name)!r}")
 
 
-# --- tables ----------------------------------------------------------------------------------------
+# --- tables ---------------------------------------------------------------------------------------
 
 
 def read_table(
     path: Path, columns: Sequence[str], text: Sequence[str] = ()
 ) -> dict[str, NDArray[Any]]:
-    """Named columns of a small CSV: finite numbers, or text where so named.
+    """Named columns of a CSV: finite numbers, or text for the columns `text`.
 
-    ValueError: with file, row and column of the first thing that is wrong.
+    ValueError: with file, row and column of the first error.
     """
     table = read_csv(Path(path))
-    return {
-        name: np.array(cells_of(path, table, name))
-        if name in text
-        else numbers_of(path, table, name)
-        for name in columns
-    }
+    result: dict[str, NDArray[Any]] = {}
+    for name in columns:
+        if name in text:
+            result[name] = np.array(cells_of(path, table, name))
+        else:
+            result[name] = numbers_of(path, table, name)
+    return result
 
 
 def write_csv(path: Path, columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
@@ -131,7 +141,7 @@ def write_csv(path: Path, columns: Iterable[str], rows: Iterable[Iterable[Any]])
 
 
 def read_csv(path: Path) -> Table:
-    """All cells of a CSV with a header, as text; ValueError, with the row, for what is no table."""
+    """All cells of a CSV with a header, as text; ValueError, with the row, for no such table."""
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
             rows = list(csv.reader(file))
@@ -142,16 +152,17 @@ def read_csv(path: Path) -> Table:
     if len(rows) < 2:
         raise ValueError(f"{path}: expected a header and at least one row, got {len(rows)} rows")
     header = [name.strip() for name in rows[0]]
-    if twice := sorted({name for name in header if header.count(name) > 1}):
-        raise ValueError(f"{path}: row 1: expected each column once, got {twice} more than once")
+    repeated = sorted({name for name in header if header.count(name) > 1})
+    if repeated:
+        raise ValueError(f"{path}: row 1: expected each column once, got {repeated} repeatedly")
     for number, row in enumerate(rows[1:], 2):
         if len(row) != len(header):
             raise ValueError(f"{path}: row {number}: expected {len(header)} cells, got {len(row)}")
-    return dict(zip(header, map(list, zip(*rows[1:], strict=True)), strict=True))
+    return dict(zip(header, zip(*rows[1:], strict=True), strict=True))
 
 
-def cells_of(path: Path, table: Table, name: str) -> list[Any]:
-    """One column; ValueError where there is none of that name."""
+def cells_of(path: Path, table: Table, name: str) -> Any:
+    """One column; ValueError if it is missing."""
     if name not in table:
         raise ValueError(f"{path}: row 1: expected a column {name}, got {list(table)}")
     return table[name]
@@ -160,24 +171,22 @@ def cells_of(path: Path, table: Table, name: str) -> list[Any]:
 def numbers_of(
     path: Path, table: Table, name: str, bound: float = np.inf, unit: str = ""
 ) -> Floats:
-    """One column as finite numbers within +-bound; the first cell that is none is named."""
+    """One column as finite numbers within +-bound; ValueError with the first other cell."""
     cells = cells_of(path, table, name)
-    largest = min(bound + 1e-6, np.finfo(float).max)
-
-    def number(cell: Any) -> float:
-        try:
-            return float(cell)
-        except ValueError:
-            return np.nan
-
-    try:
-        numbers, wanted = np.array(cells, float), "a finite number"
-    except ValueError:
-        numbers, wanted = np.array([number(cell) for cell in cells]), "a number"
-    if not (good := np.abs(numbers) <= largest).all():
+    numbers = np.array([_number(cell) for cell in cells])
+    good = np.isfinite(numbers) & (np.abs(numbers) <= bound + 1e-6)
+    if not good.all():
         row = int(np.argmin(good))
         limits = "" if bound == np.inf else f" in [-{bound:g}, {bound:g}] ({unit})"
         raise ValueError(
-            f"{path}: row {row + 2}, column {name}: expected {wanted}{limits}, got {cells[row]!r}"
+            f"{path}: row {row + 2}, column {name}: expected a number, finite{limits}, "
+            f"got {cells[row]!r}"
         )
     return numbers
+
+
+def _number(cell: Any) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        return np.nan

@@ -1,9 +1,9 @@
 """Logs of a machine: one table on disk, recordings at one rate in memory.
 
-Columns `run,time,u_<joint>...,q_<joint>...[,q_dot_<joint>...]`, one row a sample; `.csv`, or `.npz`
-with the same columns as arrays. `run` names the recording, time is in s, u in [-1, 1] of full
-command (held until the next row), q in rad, q_dot in rad/s. Any joints, any rate not below the
-machine's, jitter allowed. A recording whose name ends in `_return` is a way back to the start and is dropped.
+Columns `run,time,u_<joint>...,q_<joint>...[,q_dot_<joint>...]`, one row per sample; `.csv`, or
+`.npz` with the same columns as arrays. `run` is the name of the recording, time is in s, u in
+[-1, 1] of full command (held until the next row), q in rad, q_dot in rad/s. Any joints, any rate
+not below the machine's, jitter allowed. Recordings whose name ends in `_return` are dropped.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -26,9 +26,9 @@ from brokk_min.identification.files import (
 from brokk_min.machine import Array, Machine, estimate_velocity
 
 RATE = 20.0  # Hz, paper: everything runs at 20 Hz; other machines have others
-MAX_GAP = 0.25  # s, assumed: a longer hole in the time stamps starts a new recording
+MAX_GAP = 0.25  # s, assumed: a longer gap between time stamps starts a new recording
 RETURN = "_return"
-UNITS = {  # largest value of a column and its unit; what is larger has been logged in another one
+UNITS = {  # largest value of a column and its unit; larger values are in another unit
     "u": (1.0, "of full command, not percent or bytes"),
     "q": (62.8, "rad, not degrees"),  # ten turns, assumed
     "q_dot": (62.8, "rad/s, not degrees/s"),
@@ -45,7 +45,7 @@ class Recording(NamedTuple):
 
 
 class Log(NamedTuple):
-    """Recordings of the same joints; `velocity_logged` says where q_dot came from."""
+    """Recordings of the same joints; `velocity_logged`: q_dot is measured, not estimated."""
 
     joints: tuple[str, ...]
     recordings: tuple[Recording, ...]
@@ -53,11 +53,76 @@ class Log(NamedTuple):
     rate: float = RATE  # Hz
 
 
-def machine_log(machine: Machine, tapes: Iterable[tuple[str, Array, Array]]) -> Log:
-    """A log of a machine from names, commands and encoder angles; velocities are estimated."""
-    how = machine.velocity_samples, machine.rate
-    recordings = tuple(Recording(name, u, q, velocity_of(q, *how)) for name, u, q in tapes)
-    return Log(machine.names, recordings, rate=machine.rate)
+def machine_log(machine: Machine, recordings: Iterable[tuple[str, Array, Array]]) -> Log:
+    """A log from names, commands and encoder angles (T, n) [rad]; velocities are estimated."""
+    samples, rate = machine.velocity_samples, machine.rate
+    result = [Recording(name, u, q, velocity_of(q, samples, rate)) for name, u, q in recordings]
+    return Log(machine.names, tuple(result), rate=rate)
+
+
+def velocity_of(q: Array, samples: int, rate: float = RATE) -> Floats:
+    """Causal velocity [rad/s] at each row of a recording `q` [rad] (T, n), at rest before it.
+
+    `samples` is the window of `estimate_velocity`, `rate` [Hz] that of the rows.
+
+    Example:
+        >>> velocity_of(np.array([[0.0], [0.0], [0.3], [0.6]]), samples=2).ravel().tolist()
+        [0.0, 0.0, 6.0, 6.0]
+    """
+    padded = np.concatenate([np.repeat(q[:1], samples - 1, axis=0), q])
+    windows = np.lib.stride_tricks.sliding_window_view(padded, samples, axis=0)
+    return np.asarray(estimate_velocity(windows, samples, 1 / rate), float)
+
+
+# --- samples for fitting and validation -----------------------------------------------------------
+
+
+class Samples(NamedTuple):
+    """The recordings of a log joined, N samples in all; a window must not cross their seams."""
+
+    joined: Recording
+    target: Array  # (N, n) rad/s, output of the nets, see `join_recordings`
+    moves: NDArray[np.bool_]  # (N, n): the joint moves or has a command in this recording
+    lengths: list[int]  # of the recordings
+
+    @property
+    def scored(self) -> NDArray[np.bool_]:
+        """Where a joint is scored (N, n): where it moves; if it never moves, everywhere."""
+        return self.moves | ~self.moves.any(axis=0)
+
+    def starts(self, before: int, after: int, step: int) -> NDArray[np.intp]:
+        """Every `step`-th sample with `before` and `after` samples around it in its recording."""
+        result = []
+        seam = 0
+        for length in self.lengths:
+            result.append(seam + np.arange(before, length - after, step))
+            seam += length
+        return np.concatenate(result)
+
+    def windows(self, history: int, ticks: int) -> list[NDArray[np.intp]]:
+        """Newest samples of windows of `history` samples, `ticks` before an end, of each joint."""
+        ends = self.starts(history - 1, ticks, 1)
+        return [ends[moves] for moves in self.moves[ends].T]
+
+
+def join_recordings(log: Log) -> Samples:
+    """Join the recordings of a log and add the target velocity of each sample.
+
+    The target is the mean velocity of the coming tick, (q(t+dt) - q(t)) / dt; for logged velocities
+    it is q_dot(t+dt). The last sample of a recording has none.
+    """
+    u = np.concatenate([recording.u for recording in log.recordings])
+    q = np.concatenate([recording.q for recording in log.recordings])
+    q_dot = np.concatenate([recording.q_dot for recording in log.recordings])
+    target = np.diff(q, axis=0, append=0) * log.rate
+    if log.velocity_logged:
+        target = np.roll(q_dot, -1, axis=0)
+    lengths = [len(recording.q) for recording in log.recordings]
+    moves = [np.ptp(r.u, axis=0) + np.ptp(r.q, axis=0) > 0 for r in log.recordings]
+    return Samples(Recording("", u, q, q_dot), target, np.repeat(moves, lengths, axis=0), lengths)
+
+
+# --- files ----------------------------------------------------------------------------------------
 
 
 def write_log(path: Path, log: Log) -> None:
@@ -67,12 +132,9 @@ def write_log(path: Path, log: Log) -> None:
         raise ValueError(f"{path}: expected at least one recording to write, got none")
     names = [recording.name for recording in log.recordings]
     lengths = [len(recording.u) for recording in log.recordings]
-    columns: dict[str, Any] = {
-        "run": np.repeat(names, lengths),
-        "time": np.concatenate([np.arange(length) / log.rate for length in lengths]),
-    }
-    kinds = ("u", "q", "q_dot") if log.velocity_logged else ("u", "q")
-    for kind in kinds:
+    time = np.concatenate([np.arange(length) / log.rate for length in lengths])
+    columns: dict[str, Any] = {"run": np.repeat(names, lengths), "time": time}
+    for kind in ("u", "q", "q_dot") if log.velocity_logged else ("u", "q"):
         values = np.concatenate([getattr(recording, kind) for recording in log.recordings])
         columns |= {f"{kind}_{name}": values[:, i] for i, name in enumerate(log.joints)}
     if path.suffix == ".npz":
@@ -91,38 +153,52 @@ def read_log(
     joints: Sequence[str] | None = None,
     rate: float = RATE,
 ) -> Log:
-    """Read tables of one machine, check them, and bring them to one `rate` [Hz].
+    """Read and check tables of one machine and resample them at `rate` [Hz].
 
-    Command held, angle interpolated. A gap longer than `MAX_GAP` cuts a
-    recording in two. Without q_dot columns the causal estimator supplies velocities: a recording is
-    taken to start at rest; what follows a gap is not, and loses the rows that would need samples of it.
+    The command is held, the angle interpolated. A gap longer than `MAX_GAP` cuts a recording.
+    Without q_dot columns velocities are estimated: a recording starts at rest; after a gap, the
+    rows that would need samples of the gap are left out.
 
     Args:
         paths: tables of the same joints.
         velocity_samples: window of `estimate_velocity`.
-        joints: names that must be there, in the wanted order; None: all, in the order of the first file.
+        joints: names and order of the joints; None: all, in the order of the first file.
+        rate: of the result [Hz].
 
-    ValueError: with file, row (1 is the header) and column of the first thing that is wrong.
+    ValueError: with file, row (1 is the header) and column of the first error.
     """
-    names, recordings, logged = tuple(joints or ()), list[Recording](), set[bool]()
+    names = tuple(joints or ())
+    recordings: list[Recording] = []
+    logged: set[bool] = set()
     for path in map(Path, paths):
         table = read_csv(path) if path.suffix.lower() == ".csv" else _read_npz(path)
-        found = _joints(path, table) if joints is None else names
-        names = names or found
-        if set(found) != set(names):
-            raise ValueError(f"{path}: row 1: expected joints {list(names)}, got {list(found)}")
-        has_velocity = any(f"q_dot_{joint}" in table for joint in names)
-        logged.add(has_velocity)
+        got = names if joints else _joints(path, table)
+        names = names or got
+        if set(got) != set(names):
+            raise ValueError(f"{path}: row 1: expected joints {list(names)}, got {list(got)}")
+        logged.add(any(f"q_dot_{joint}" in table for joint in names))
         if len(logged) > 1:
             raise ValueError(f"{path}: expected q_dot columns in all files or none, got a mixture")
-        recordings += _recordings(path, table, names, has_velocity, velocity_samples, rate)
+        recordings += _recordings(path, table, names, True in logged, velocity_samples, rate)
     if not recordings:
         raise ValueError(f"{', '.join(map(str, paths))}: expected at least one recording, got none")
     return Log(names, tuple(recordings), True in logged, rate)
 
 
+def _read_npz(path: Path) -> Table:
+    columns = load_arrays(path)
+    shapes = {name: column.shape for name, column in columns.items()}
+    if len(set(shapes.values())) != 1 or len(next(iter(shapes.values()))) != 1:
+        raise ValueError(f"{path}: expected columns of one length, got {shapes}")
+    for name, column in columns.items():
+        content, kinds = ("text", "U") if name == "run" else ("numbers", "iuf")
+        if column.dtype.kind not in kinds:
+            raise ValueError(f"{path}: column {name}: expected {content}, got {column.dtype}")
+    return {name: column.tolist() for name, column in columns.items()}
+
+
 def _joints(path: Path, table: Table) -> tuple[str, ...]:
-    """Joints of a table by its u columns; an angle or a velocity without a command is refused."""
+    """Joints of a table by its u columns; ValueError: an angle or a velocity without a command."""
     joints = tuple(name[2:] for name in table if name.startswith("u_"))
     if not joints:
         raise ValueError(f"{path}: row 1: expected columns u_<joint>, got {list(table)}")
@@ -131,7 +207,7 @@ def _joints(path: Path, table: Table) -> tuple[str, ...]:
         if name.startswith("q_") and name not in known:
             missing = "u_" + name.removeprefix("q_").removeprefix("dot_")
             raise ValueError(
-                f"{path}: row 1: expected a column {missing} beside {name}, got {list(table)}"
+                f"{path}: row 1: expected a column {missing} for {name}, got {list(table)}"
             )
     return joints
 
@@ -141,31 +217,34 @@ def _recordings(
 ) -> Iterator[Recording]:
     """The checked recordings of one table at `rate`, in the order in which they begin."""
     time = numbers_of(path, table, "time")
-    columns = {
-        kind: np.stack(
-            [numbers_of(path, table, f"{kind}_{joint}", *unit) for joint in joints], axis=1
-        )
-        for kind, unit in list(UNITS.items())[: 3 if logged else 2]
-    }
+    columns: dict[str, Floats] = {}
+    for kind in ("u", "q", "q_dot") if logged else ("u", "q"):
+        numbers = [numbers_of(path, table, f"{kind}_{joint}", *UNITS[kind]) for joint in joints]
+        columns[kind] = np.stack(numbers, axis=1)
+    for run, rows in _runs(path, table).items():
+        gaps = _gaps(path, run, rows, time[rows], rate)
+        pieces = [] if run.endswith(RETURN) else np.split(rows, gaps)
+        for part, piece in enumerate(pieces):
+            selected = {kind: values[piece] for kind, values in columns.items()}
+            u, q, q_dot = _resample(time[piece], selected, samples, rate)
+            first = samples - 1 if part and not logged else 0  # rows before it need the gap
+            if len(u) > first:
+                name = f"{run}#{part + 1}" if part else run
+                yield Recording(name, u[first:], q[first:], q_dot[first:])
+
+
+def _runs(path: Path, table: Table) -> dict[str, list[int]]:
+    """Rows of each recording."""
     runs: dict[str, list[int]] = {}
     for row, run in enumerate(cells_of(path, table, "run")):
         if not run.strip():
             raise ValueError(f"{path}: row {row + 2}, column run: expected a name, got {run!r}")
         runs.setdefault(run, []).append(row)
-    for run, rows in runs.items():
-        gaps = _gaps(path, run, rows, time[rows], rate)
-        for part, piece in enumerate(np.split(rows, gaps) if not run.endswith(RETURN) else ()):
-            arrays = _resample(
-                time[piece], {k: c[piece] for k, c in columns.items()}, samples, rate
-            )
-            unknown = samples - 1 if part and not logged else 0  # rows that need samples of the gap
-            if len(arrays[0]) > unknown:
-                name = f"{run}#{part + 1}" if part else run
-                yield Recording(name, *(array[unknown:] for array in arrays))
+    return runs
 
 
 def _gaps(path: Path, run: str, rows: Sequence[int], time: Floats, rate: float) -> NDArray[np.intp]:
-    """Where a recording is to be cut; time stamps that do not rise fast enough are refused."""
+    """Where to cut a recording; ValueError: time stamps that do not rise, or rise too slowly."""
     step = np.diff(time)
     if not (step > 0).all():
         late = int(np.argmin(step > 0)) + 1
@@ -183,40 +262,17 @@ def _gaps(path: Path, run: str, rows: Sequence[int], time: Floats, rate: float) 
 
 def _resample(
     time: Floats, columns: dict[str, Floats], samples: int, rate: float
-) -> tuple[Floats, ...]:
+) -> tuple[Floats, Floats, Floats]:
     """u held, q and q_dot interpolated at `rate`; q_dot estimated where the log has none."""
     grid = time[0] + np.arange(int((time[-1] - time[0]) * rate + 1e-6) + 1) / rate
     held = np.searchsorted(time, grid + 1e-6, side="right") - 1
-
-    def between(values: Floats) -> Floats:
-        return np.stack([np.interp(grid, time, column) for column in values.T], axis=1)
-
-    q = between(columns["q"])
-    q_dot = between(columns["q_dot"]) if "q_dot" in columns else velocity_of(q, samples, rate)
+    q = _interpolate(grid, time, columns["q"])
+    if "q_dot" in columns:
+        q_dot = _interpolate(grid, time, columns["q_dot"])
+    else:
+        q_dot = velocity_of(q, samples, rate)
     return columns["u"][held], q, q_dot
 
 
-def velocity_of(q: Array, samples: int, rate: float = RATE) -> Floats:
-    """Causal velocity [rad/s] at each row of one recording `q` [rad] (T, n), at rest before it.
-
-    `rate` [Hz] is that of the rows.
-
-    Example:
-        >>> velocity_of(np.array([[0.0], [0.0], [0.3], [0.6]]), samples=2).ravel().tolist()
-        [0.0, 0.0, 6.0, 6.0]
-    """
-    padded = np.concatenate([np.repeat(q[:1], samples - 1, axis=0), q])
-    windows = np.lib.stride_tricks.sliding_window_view(padded, samples, axis=0)
-    return np.asarray(estimate_velocity(windows, samples, 1 / rate), float)
-
-
-def _read_npz(path: Path) -> Table:
-    columns = load_arrays(path)
-    shapes = {name: column.shape for name, column in columns.items()}
-    if len(set(shapes.values())) != 1 or len(next(iter(shapes.values()))) != 1:
-        raise ValueError(f"{path}: expected columns of one length, got {shapes}")
-    for name, column in columns.items():
-        wanted, kind = ("text", "U") if name == "run" else ("numbers", "iuf")
-        if column.dtype.kind not in kind:
-            raise ValueError(f"{path}: column {name}: expected {wanted}, got {column.dtype}")
-    return {name: column.tolist() for name, column in columns.items()}
+def _interpolate(grid: Floats, time: Floats, values: Floats) -> Floats:
+    return np.stack([np.interp(grid, time, column) for column in values.T], axis=1)

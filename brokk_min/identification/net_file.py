@@ -17,18 +17,18 @@ NET_ARRAYS = ("input_mean", "input_scale", "output_low", "output_high", "q_low",
 
 
 def net_arrays(net: ActuatorNet) -> dict[str, Any]:
-    """Nets as named arrays, a JSON header among them: what a file holds."""
-    plain = {
-        f.name: getattr(net, f.name) for f in fields(net) if f.name not in (*NET_ARRAYS, "weights")
-    }
-    text = json.dumps({"format": FORMAT, "kind": "actuator net", **plain})
-    arrays = {name: getattr(net, name) for name in NET_ARRAYS}
-    arrays |= {f"weight_{i}": weight for i, weight in enumerate(net.weights)}
-    return {"header": np.array(text), **arrays}
+    """Nets as named arrays, as in the file; one of them is the JSON header."""
+    header: dict[str, Any] = {"format": FORMAT, "kind": "actuator net"}
+    for field in fields(net):
+        if field.name not in (*NET_ARRAYS, "weights"):
+            header[field.name] = getattr(net, field.name)
+    arrays = {"header": np.array(json.dumps(header))}
+    arrays |= {name: getattr(net, name) for name in NET_ARRAYS}
+    return arrays | {f"weight_{i}": weight for i, weight in enumerate(net.weights)}
 
 
 def fingerprint(net: ActuatorNet) -> str:
-    """Hash of the nets, header and all: what was trained or tuned with them says so by it."""
+    """Hash of header and arrays of the nets; files of policies and gains hold it."""
     digest = hashlib.sha256()
     for name, array in net_arrays(net).items():
         digest.update(name.encode() + np.ascontiguousarray(array).tobytes())
@@ -36,7 +36,7 @@ def fingerprint(net: ActuatorNet) -> str:
 
 
 def net_from_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> ActuatorNet:
-    """Nets from `net_arrays`; ValueError, naming `path`, for another format or arrays that do not fit."""
+    """Nets from `net_arrays`; ValueError, with `path`, for another format or shape."""
     header = load_header(path, arrays, "actuator net", FORMAT)
     with expected(path, "a complete actuator net"):
         header["joints"] = tuple(header["joints"])
@@ -44,18 +44,11 @@ def net_from_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> ActuatorNet:
         header |= {name: arrays[name] for name in NET_ARRAYS}
         net = ActuatorNet(**header, weights=weights)
         n, inputs, hidden = len(net.joints), 3 * net.history, weights[0].shape[-1]
-        wanted = [
-            (n, inputs, hidden),
-            (n, hidden),
-            (n, hidden, hidden),
-            (n, hidden),
-            (n, hidden, 1),
-            (n, 1),
-        ]
-        wanted += [(n, inputs), (n, inputs), (n,), (n,), (n,), (n,)]
-        found = [array.shape for array in (*weights, *(arrays[name] for name in NET_ARRAYS))]
-        if found != wanted:
-            raise ValueError(f"shapes {found} instead of {wanted}")
+        shapes = [(n, inputs, hidden), (n, hidden), (n, hidden, hidden), (n, hidden)]
+        shapes += [(n, hidden, 1), (n, 1), (n, inputs), (n, inputs), (n,), (n,), (n,), (n,)]
+        got = [array.shape for array in (*weights, *(arrays[name] for name in NET_ARRAYS))]
+        if got != shapes:
+            raise ValueError(f"shapes {got} instead of {shapes}")
     return net
 
 

@@ -14,6 +14,7 @@ from brokk_min.env import (
     features,
     initial_state,
     measure,
+    noise_std,
     observation_blocks,
     terminated,
 )
@@ -85,11 +86,16 @@ def new_goals(
     return replace(state, v_goal=v_goal, goal_ticks=goal_ticks)
 
 
+def draw_noise(machine: Machine, largest: float, num: int, rng: np.random.Generator) -> Array:
+    """Uniform noise of `env.measure`, in deviations, float32 (num, noisy). Paper: Sec. 3.4 (5 %)"""
+    noise = rng.random((num, len(noise_std(machine))), np.float32)
+    return np.float32(largest) * (2 * noise - 1)
+
+
 def get_obs(machine: Machine, config: TaskConfig, state: State, rng: np.random.Generator) -> Array:
     """The observation of a state, (..., obs), with fresh noise. Paper: Sec. 3.4 (5 %)"""
-    measured = measure(
-        machine, state.history, state.v_goal, state.error_integral, config.noise, rng
-    )
+    noise = draw_noise(machine, config.noise, len(state.q), rng)
+    measured = measure(machine, state.history, state.v_goal, state.error_integral, noise)
     obs = features(machine, measured)
     return obs * paper_weights(machine) if config.paper else obs
 

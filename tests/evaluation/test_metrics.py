@@ -1,65 +1,69 @@
-"""Figures of merit worked by hand; intervals against SciPy; the same starts compared."""
+"""Figures of merit worked by hand; intervals against SciPy; controllers on the same starts."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers_machines import obedient_net
 from scipy import stats
 
+from brokk_min.env import Measured
 from brokk_min.evaluation import metrics as m
+from brokk_min.evaluation.baselines import baselines
 from brokk_min.evaluation.rollout import Trace
-from brokk_min.machine import BROKK_170
+from brokk_min.evaluation.sequences import Commands, task_sequences
+from brokk_min.kinematics import forward_kinematics, tool_position
+from brokk_min.machine import BROKK_170, Array
+
+MIDDLE = (BROKK_170.column("q_min") + BROKK_170.column("q_max")) / 2
 
 
-def line_distance(p: np.ndarray, goals: np.ndarray) -> np.ndarray:
-    return m.line_distance(p[:, None], goals[:, None], np.zeros((1, 3)))[:, 0]
-
-
-def test_line_distance_of_a_hand_worked_drift() -> None:
-    # along x with 0.3 m to the side after the second tick; the stop and the way back keep the line
-    goals = np.array([[0.2, 0, 0], [0.2, 0, 0], [0, 0, 0], [-0.1, 0, 0]])
-    p = np.array([[1.0, 0, 0], [2.0, 0.3, 0.4], [2.0, 0.3, 0.0], [1.0, 0.0, 0.1]])
-    assert line_distance(p, goals) == pytest.approx([0.0, 0.5, 0.3, 0.1])
-
-
-def test_line_distance_starts_a_new_line_when_the_direction_turns() -> None:
-    goals = np.array([[0.2, 0, 0], [0, 0.2, 0]])
-    p = np.array([[1.0, 0.1, 0], [1.2, 5.0, 0]])  # second line through (1, 0.1) along y
-    assert line_distance(p, goals) == pytest.approx([0.1, 0.2])
-
-
-def test_line_distance_before_the_first_motion_is_from_the_start() -> None:
-    goals = np.array([[0.0, 0, 0], [0, 0, 0.1]])
-    p = np.array([[0.0, 0.3, 0.4], [0.1, 0.0, 7.0]])
-    assert line_distance(p, goals) == pytest.approx([0.5, 0.1])
-
-
-def test_line_distance_of_a_batch_is_that_of_its_runs() -> None:
-    rng = np.random.default_rng(0)
-    goals = np.repeat(rng.integers(-1, 2, (6, 4, 3)) * 0.1, 5, axis=0)
-    goals[:10, 0] = 0.0  # one rests while the others move
-    p, start = rng.normal(size=(30, 4, 3)), rng.normal(size=(4, 3))
-    whole = m.line_distance(p, goals, start)
-    for i in range(4):
-        alone = m.line_distance(p[:, i : i + 1], goals[:, i : i + 1], start[i : i + 1])
-        np.testing.assert_allclose(whole[:, i], alone[:, 0])
-
-
-def trace_of(v: np.ndarray, q: np.ndarray | None = None, u: np.ndarray | None = None) -> Trace:
+def trace_of(v: Array, q: Array | None = None, u: Array | None = None) -> Trace:
     """One run with tool velocities v (T, 3) from the origin."""
-    middle = (BROKK_170.column("q_min") + BROKK_170.column("q_max")) / 2
-    q = np.tile(middle, (len(v), 1)) if q is None else q
+    q = np.tile(MIDDLE, (len(v), 1)) if q is None else q
     u = np.zeros((len(v), 5)) if u is None else u
+    p_tool = np.cumsum(v, axis=0) * 0.05
     rewards = 1 / (1 + np.arange(len(v)))
-    return Trace(*(a[:, None] for a in (q, 0 * q, q, u, np.cumsum(v, axis=0) * 0.05, v, rewards)))
+    return Trace(*(a[:, None] for a in (q, 0 * q, q, u, p_tool, v, rewards)))
 
 
-def figures(v: np.ndarray, goals: np.ndarray, **more: np.ndarray) -> dict[str, float]:
+def figures(v: Array, goals: Array, **more: Array) -> dict[str, float]:
     found = m.metrics(BROKK_170, trace_of(v, **more), goals[:, None], np.zeros((1, 3)))
     return {name: float(value[0]) for name, value in found.items()}
 
 
-def test_metrics_by_hand() -> None:
+# --- one run --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("goals", "p_tool", "expected"),
+    [
+        (  # along x; the stop and the motion back keep the line
+            [[0.2, 0, 0], [0.2, 0, 0], [0, 0, 0], [-0.1, 0, 0]],
+            [[1.0, 0, 0], [2.0, 0.3, 0.4], [2.0, 0.3, 0.0], [1.0, 0.0, 0.1]],
+            [0.0, 0.5, 0.3, 0.1],
+        ),
+        (  # a second line through (1, 0.1) along y
+            [[0.2, 0, 0], [0, 0.2, 0]],
+            [[1.0, 0.1, 0], [1.2, 5.0, 0]],
+            [0.1, 0.2],
+        ),
+        (  # before the first motion from the start
+            [[0.0, 0, 0], [0, 0, 0.1]],
+            [[0.0, 0.3, 0.4], [0.1, 0.0, 7.0]],
+            [0.5, 0.1],
+        ),
+    ],
+    ids=["line", "turn", "rest"],
+)
+def test_line_distance__by_hand(
+    goals: list[list[float]], p_tool: list[list[float]], expected: list[float]
+) -> None:
+    found = m.line_distance(np.array(p_tool)[:, None], np.array(goals)[:, None], np.zeros((1, 3)))
+    assert found[:, 0] == pytest.approx(expected)
+
+
+def test_metrics__by_hand() -> None:
     v = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.3, 0, 0]])
     u = np.array([[0.0, 0.5], [0.2, 0.5], [0.2, -0.5]])
     row = figures(v, np.tile([0.1, 0.0, 0.0], (3, 1)), u=u)
@@ -69,142 +73,10 @@ def test_metrics_by_hand() -> None:
     assert row["jerk_rms"] == pytest.approx(0.1 * 400)  # second difference 0.1 m/s at 20 Hz
     assert row["reward_mean"] == pytest.approx((1 + 1 / 2 + 1 / 3) / 3)
     assert row["off_axis_drift_max"] == pytest.approx(0.0)
-    assert row["position_error_mean"] == pytest.approx(
-        (0.005 + 0.005 + 0.005) / 3
-    )  # behind, behind, ahead
+    assert row["position_error_mean"] == pytest.approx(0.005)  # behind, behind, ahead
 
 
-def test_figures_of_a_batch_are_those_of_its_runs() -> None:
-    rng = np.random.default_rng(0)
-    goals, start = (
-        np.repeat(rng.integers(-1, 2, (3, 4, 3)) * 0.1, 10, axis=0),
-        rng.normal(size=(4, 3)),
-    )
-    kinds = (rng.normal(0, 0.1, (30, 4, size)) for size in (5, 5, 5, 5, 3, 3))
-    trace = Trace(*kinds, rng.random((30, 4)))
-    whole = m.metrics(BROKK_170, trace, goals, start)
-    for i in range(4):
-        one = slice(i, i + 1)
-        alone = m.metrics(BROKK_170, Trace(*(a[:, one] for a in trace)), goals[:, one], start[one])
-        for name, value in whole.items():
-            np.testing.assert_allclose(value[one], alone[name], err_msg=name)
-    jerk = np.diff(trace.v_tool, n=2, axis=0) * 400
-    np.testing.assert_allclose(whole["jerk_rms"] ** 2, (jerk**2).sum(axis=(0, 2)) / 28)
-
-
-def test_errors_near_a_change_of_goal_are_transient() -> None:
-    """Rest for 10 ticks, then 0.2 m/s for 30: 12 ticks of 0.1 m/s error, 18 of 0.01; 0.05 at rest."""
-    goals = np.zeros((40, 3))
-    goals[10:, 0] = 0.2
-    v = goals.copy()
-    v[:10, 1], v[10:22, 0], v[22:, 0] = 0.05, 0.1, 0.19
-    row = figures(v, goals)
-    assert row["velocity_error_transient"] == pytest.approx(0.1)
-    assert row["velocity_error_steady"] == pytest.approx((10 * 0.05 + 18 * 0.01) / 28)
-    assert row["settling_time"] == pytest.approx(12 * 0.05)  # below 0.03 m/s from then on
-
-
-def test_a_run_that_does_not_settle_counts_to_the_next_change() -> None:
-    goals = np.zeros((30, 3))
-    goals[:20, 2] = 0.2  # the first goal is a change too: the machine comes from rest
-    v = np.zeros((30, 3))
-    v[5:10, 2] = 0.2  # near for a while, then away again
-    assert figures(v, goals)["settling_time"] == pytest.approx((20 * 0.05 + 0) / 2)
-
-
-def test_a_change_at_the_last_tick_counts_too() -> None:
-    goals = np.zeros((10, 3))
-    goals[9:, 1] = 0.2
-    assert figures(np.zeros((10, 3)), goals)["settling_time"] == pytest.approx(0.05)
-    goals[5:9, 1] = 0.1  # a change that is all but met at once, and that one
-    v = np.where(goals == 0.2, 0.0, 0.9 * goals)
-    assert figures(v, goals)["settling_time"] == pytest.approx((0 + 0.05) / 2)
-
-
-def test_a_slow_goal_is_not_met_by_standing_still() -> None:
-    """0.03 m/s, a tenth of the tool's speed: an error of 0.02 is no settling, one of 0.01 is."""
-    goals = np.zeros((40, 3))
-    goals[10:, 0] = 0.03
-    assert figures(np.zeros((40, 3)), goals)["settling_time"] == pytest.approx(30 * 0.05)
-    v = goals.copy()
-    v[10:20, 0], v[20:, 0] = 0.01, 0.02
-    assert figures(v, goals)["settling_time"] == pytest.approx(10 * 0.05)
-
-
-def test_a_goal_that_turns_slowly_is_no_change() -> None:
-    turn = np.linspace(0, 2 * np.pi, 320)
-    goals = 0.15 * np.stack([np.cos(turn), 0 * turn, np.sin(turn)], axis=1)
-    since = m.ticks_since_change(BROKK_170, goals[:, None])
-    np.testing.assert_array_equal(since[:, 0], np.arange(320))  # the start is the only change
-    assert (m.ticks_since_change(BROKK_170, np.zeros((4, 1, 3))) == -1).all()
-    still = figures(np.zeros((4, 3)), np.zeros((4, 3)))
-    assert np.isnan(still["settling_time"]) and np.isnan(still["velocity_error_transient"])
-
-
-def test_time_at_limits_counts_driven_joints_alone() -> None:
-    q = np.tile((BROKK_170.column("q_min") + BROKK_170.column("q_max")) / 2, (8, 1))
-    q[:, 1] = BROKK_170.column("q_max")[1]  # locked
-    q[2:5, 3] = BROKK_170.column("q_max")[3] - 0.005
-    q[4:6, 0] = BROKK_170.column("q_min")[0] + 0.005
-    assert figures(np.zeros((8, 3)), np.zeros((8, 3)), q=q)["time_at_limits"] == pytest.approx(
-        4 * 0.05
-    )
-
-
-def test_intervals_are_students() -> None:
-    values = np.random.default_rng(1).normal(2.0, 0.3, 12)
-    expected = stats.ttest_1samp(values, 0).confidence_interval(0.95)
-    np.testing.assert_allclose(m.interval(np.append(values, np.nan)), expected)
-    assert m.interval(np.array([1.0, np.nan])) == [None, None]
-    assert m.interval(np.array([1.0, 3.0])) == pytest.approx([2 - 12.7062, 2 + 12.7062], abs=1e-4)
-
-
-def run(controller: str, sequence: str, start: int, error: float | None) -> dict[str, object]:
-    labels = {"controller": controller, "sequence": sequence, "start": start, "kind": "workspace"}
-    return labels | {"error": error}
-
-
-def test_pairs_are_compared_on_the_same_start() -> None:
-    """Starts differ far more than controllers: the paired interval sees the difference, means do not."""
-    base = {0: 1.0, 1: 5.0, 2: 9.0}
-    runs = [run("a", s, i, e + 0.1 * i) for s in "xy" for i, e in reversed(base.items())]
-    runs += [run("b", s, i, e + (0.2 if s == "x" else 0.4)) for s in "xy" for i, e in base.items()]
-    found = m.paired_difference(runs, "b", "a", "error")
-    assert found["x"]["mean"] == pytest.approx(0.1) and found["y"]["mean"] == pytest.approx(0.3)
-    assert found["all"]["mean"] == pytest.approx(0.2)
-    np.testing.assert_allclose(
-        [found["x"]["low"], found["x"]["high"]], m.interval(np.array([0.2, 0.1, 0.0]))
-    )
-
-
-def test_one_is_compared_with_all_others_in_every_figure() -> None:
-    runs = [
-        run(c, "x", i, e) | {"other": 2 * e}
-        for c, e in {"a": 1.0, "b": 3.0, "c": 7.0}.items()
-        for i in (0, 1)
-    ]
-    found = m.paired_differences(runs, "b")
-    assert list(found) == ["error", "other"] and list(found["error"]) == ["a", "c"]
-    assert [found["other"][c]["all"]["mean"] for c in "ac"] == [4.0, -8.0]
-    assert found["error"]["a"] == m.paired_difference(runs, "b", "a", "error")
-
-
-def test_a_summary_leaves_out_what_was_not_measured() -> None:
-    runs = [
-        run("a", "x", 0, 1.0),
-        run("a", "y", 0, None),
-        run("a", "x", 1, 3.0),
-        run("a", "y", 1, None),
-    ]
-    found = m.summary(runs)["a"]
-    assert (
-        found["x"]["error"] == 2.0 and found["y"]["error"] is None and found["all"]["error"] == 2.0
-    )
-    assert m.intervals(runs)["a"]["y"]["error"] == [None, None]
-    assert m.intervals(runs)["a"]["x"]["error"] == m.interval(np.array([1.0, 3.0]))
-
-
-def test_drift_is_the_largest_and_the_mean_distance_from_the_line() -> None:
+def test_metrics__drift_is_the_distance_from_the_line() -> None:
     """Off the line by 0, then 3 mm and 4 mm across, then 0 again."""
     v = 20 * np.array([[0.01, 0.0, 0.0], [0.01, 0.003, 0.004], [0.01, -0.003, -0.004]])
     row = figures(v, np.tile([0.1, 0.0, 0.0], (3, 1)))
@@ -212,8 +84,194 @@ def test_drift_is_the_largest_and_the_mean_distance_from_the_line() -> None:
     assert row["off_axis_drift_mean"] == pytest.approx(0.005 / 3)
 
 
-def test_the_mean_of_a_row_leaves_out_what_is_no_number() -> None:
+def test_metrics__of_a_batch_are_those_of_its_runs() -> None:
+    rng = np.random.default_rng(0)
+    goals = np.repeat(rng.integers(-1, 2, (3, 4, 3)) * 0.1, 10, axis=0)
+    goals[:10, 0] = 0.0  # one rests while the others move
+    start = rng.normal(size=(4, 3))
+    arrays = [rng.normal(0, 0.1, (30, 4, size)) for size in (5, 5, 5, 5, 3, 3)]
+    trace = Trace(*arrays, rng.random((30, 4)))
+    batch = m.metrics(BROKK_170, trace, goals, start)
+    for i in range(4):
+        run = slice(i, i + 1)
+        of_run = Trace(*(array[:, run] for array in trace))
+        for name, value in m.metrics(BROKK_170, of_run, goals[:, run], start[run]).items():
+            np.testing.assert_allclose(batch[name][run], value, err_msg=name)
+    jerk = np.diff(trace.v_tool, n=2, axis=0) * 400
+    np.testing.assert_allclose(batch["jerk_rms"] ** 2, (jerk**2).sum(axis=(0, 2)) / 28)
+
+
+def test_metrics__errors_after_a_change_of_goal_are_transient() -> None:
+    """At rest an error of 0.05 m/s, then at 0.2 m/s 12 ticks of 0.1 m/s and 18 of 0.01 m/s."""
+    goals = np.zeros((40, 3))
+    goals[10:, 0] = 0.2
+    v = goals.copy()
+    v[:10, 1] = 0.05
+    v[10:22, 0] = 0.1
+    v[22:, 0] = 0.19
+    row = figures(v, goals)
+    assert row["velocity_error_transient"] == pytest.approx(0.1)
+    assert row["velocity_error_steady"] == pytest.approx((10 * 0.05 + 18 * 0.01) / 28)
+    assert row["settling_time"] == pytest.approx(12 * 0.05)  # below 0.03 m/s from then on
+
+
+def test_metrics__time_at_limits_is_of_driven_joints() -> None:
+    low, high = BROKK_170.column("q_min"), BROKK_170.column("q_max")
+    q = np.tile(MIDDLE, (8, 1))
+    q[:, 1] = high[1]  # locked
+    q[2:5, 3] = high[3] - 0.005
+    q[4:6, 0] = low[0] + 0.005
+    still = np.zeros((8, 3))
+    assert figures(still, still, q=q)["time_at_limits"] == pytest.approx(4 * 0.05)
+
+
+def test_metrics__are_nan_where_nothing_can_be_averaged() -> None:
+    row = figures(np.zeros((4, 3)), np.zeros((4, 3)))
+    assert np.isnan(row["settling_time"]) and np.isnan(row["velocity_error_transient"])
+
+
+def held(*parts: tuple[int, float]) -> Array:
+    """Velocities along z, (T, 3), each held for some ticks."""
+    z = np.concatenate([np.full(ticks, value) for ticks, value in parts])
+    return np.stack([0 * z, 0 * z, z], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("goals", "v", "expected"),
+    [
+        # the first goal is a change, too: the machine comes from rest; near the goal for a while
+        (held((20, 0.2), (10, 0.0)), held((5, 0.0), (5, 0.2), (20, 0.0)), (20 * 0.05 + 0) / 2),
+        (held((9, 0.0), (1, 0.2)), held((10, 0.0)), 0.05),  # a change at the last tick
+        (held((5, 0.0), (4, 0.1), (1, 0.2)), held((5, 0.0), (4, 0.09), (1, 0.0)), (0 + 0.05) / 2),
+        # 0.03 m/s, a tenth of the tool's speed: an error of 0.02 is too much, one of 0.01 is not
+        (held((10, 0.0), (30, 0.03)), held((40, 0.0)), 30 * 0.05),
+        (held((10, 0.0), (30, 0.03)), held((10, 0.0), (10, 0.01), (20, 0.02)), 10 * 0.05),
+    ],
+)
+def test_settling_time__by_hand(goals: Array, v: Array, expected: float) -> None:
+    assert figures(v, goals)["settling_time"] == pytest.approx(expected)
+
+
+def test_ticks_since_change__ignores_a_goal_that_turns_slowly() -> None:
+    angle = np.linspace(0, 2 * np.pi, 320)
+    goals = 0.15 * np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1)
+    ticks = m.ticks_since_change(BROKK_170, goals[:, None])
+    np.testing.assert_array_equal(ticks[:, 0], np.arange(320))  # the start is the only change
+    assert (m.ticks_since_change(BROKK_170, np.zeros((4, 1, 3))) == -1).all()
+
+
+def test_row_mean__leaves_out_nan() -> None:
     assert m.row_mean(np.array([[1.0, np.nan, 4.0], [2.0, 3.0, 7.0]])).tolist() == [2.5, 4.0]
-    assert m.row_mean(np.array([[np.nan, 3.0]])) == 3.0 and np.isnan(
-        m.row_mean(np.full((1, 2), np.nan))
-    )
+    assert np.isnan(m.row_mean(np.full((1, 2), np.nan))).all()
+
+
+# --- runs of all controllers ----------------------------------------------------------------------
+
+
+class Idle:
+    """A controller that sends nothing."""
+
+    def start(self, num: int) -> None:
+        return None
+
+    def __call__(self, measured: Measured, state: None) -> tuple[Array, None]:
+        return np.zeros((len(measured.q), BROKK_170.n)), None
+
+
+STARTS = np.array([BROKK_170.q_start, [1.0, 0.5, 0.9, 1.5, 1.0]])
+PID = baselines(BROKK_170, obedient_net(BROKK_170))["jacobian_pid_k0.1"]
+
+
+def shortened(ticks: int) -> list[Commands]:
+    return [s._replace(goals=s.goals[10 : 10 + ticks]) for s in task_sequences(BROKK_170)[:3]]
+
+
+def test_evaluate__gives_rows_in_order_with_their_figures() -> None:
+    controllers = {"pid": PID, "idle": Idle()}
+    rows, traces = m.evaluate(BROKK_170, controllers, shortened(50), STARTS, 0)
+    labels = [(c, s, i, "workspace") for c in controllers for s in "xyz" for i in (0, 1)]
+    assert [tuple(row[key] for key in m.LABELS) for row in rows] == labels
+    assert set(traces) == {(c, s) for c in controllers for s in "xyz"}
+    p_start = tool_position(forward_kinematics(BROKK_170, STARTS))
+    goals = shortened(50)[1].for_starts(2)
+    expected = m.metrics(BROKK_170, traces["pid", "y"], goals, p_start)
+    for row in rows[2:4]:
+        figures_of_row = {key: row[key] for key in expected}
+        assert figures_of_row == {key: values[row["start"]] for key, values in expected.items()}
+    error = m.summary(rows)
+    assert error["pid"]["all"]["velocity_error_mean"] < error["idle"]["all"]["velocity_error_mean"]
+
+
+def test_evaluate__gives_each_length_of_sequences_the_same_noise() -> None:
+    """One batch per length: rows stay with their names."""
+    long, short = shortened(40), shortened(30)
+    mixed = [long[0], short[1], long[2]]
+    rows, traces = m.evaluate(BROKK_170, {"pid": PID}, mixed, STARTS, 0)
+    assert [row["sequence"] for row in rows] == ["x", "x", "y", "y", "z", "z"]
+    alone, trace = m.evaluate(BROKK_170, {"pid": PID}, mixed[1:2], STARTS, 0)
+    assert [row["velocity_error_mean"] for row in alone] == [
+        row["velocity_error_mean"] for row in rows[2:4]
+    ]
+    np.testing.assert_array_equal(trace["pid", "y"].q, traces["pid", "y"].q)
+    assert traces["pid", "z"].v_tool.shape == (40, 2, 3)
+
+
+def test_evaluate__has_none_for_figures_without_a_value() -> None:
+    rest = [Commands("rest", np.zeros((5, 3)))]
+    rows, _ = m.evaluate(BROKK_170, {"idle": Idle()}, rest, STARTS, 0, obedient_net(BROKK_170))
+    assert [row["settling_time"] for row in rows] == [None, None]
+    assert [row["velocity_error_mean"] for row in rows] == [0.0, 0.0]
+
+
+# --- over many runs -------------------------------------------------------------------------------
+
+
+def run(controller: str, sequence: str, start: int, error: float | None) -> dict[str, object]:
+    labels = {"controller": controller, "sequence": sequence, "start": start, "kind": "workspace"}
+    return labels | {"error": error}
+
+
+def test_interval__is_students() -> None:
+    values = np.random.default_rng(1).normal(2.0, 0.3, 12)
+    expected = stats.ttest_1samp(values, 0).confidence_interval(0.95)
+    np.testing.assert_allclose(m.interval(np.append(values, np.nan)), expected)
+    assert m.interval(np.array([1.0, np.nan])) == [None, None]
+    assert m.interval(np.array([1.0, 3.0])) == pytest.approx([2 - 12.7062, 2 + 12.7062], abs=1e-4)
+
+
+def test_paired_difference__is_of_the_same_starts() -> None:
+    """Starts differ far more than controllers: the paired interval is narrow."""
+    error = {0: 1.0, 1: 5.0, 2: 9.0}
+    runs = [run("a", s, i, e + 0.1 * i) for s in "xy" for i, e in reversed(error.items())]
+    runs += [run("b", "x", i, e + 0.2) for i, e in error.items()]
+    runs += [run("b", "y", i, e + 0.4) for i, e in error.items()]
+    found = m.paired_difference(runs, "b", "a", "error")
+    assert found["x"]["mean"] == pytest.approx(0.1) and found["y"]["mean"] == pytest.approx(0.3)
+    assert found["all"]["mean"] == pytest.approx(0.2)
+    ends = m.interval(np.array([0.2, 0.1, 0.0]))
+    np.testing.assert_allclose([found["x"]["low"], found["x"]["high"]], ends)
+
+
+def test_paired_differences__are_to_all_others_in_every_figure() -> None:
+    errors = {"a": 1.0, "b": 3.0, "c": 7.0}
+    runs = [run(c, "x", i, e) | {"other": 2 * e} for c, e in errors.items() for i in (0, 1)]
+    found = m.paired_differences(runs, "b")
+    assert list(found) == ["error", "other"] and list(found["error"]) == ["a", "c"]
+    assert [found["other"][c]["all"]["mean"] for c in "ac"] == [4.0, -8.0]
+    assert found["error"]["a"] == m.paired_difference(runs, "b", "a", "error")
+
+
+def test_summary__leaves_out_what_was_not_measured() -> None:
+    runs = [run("a", "x", i, e) for i, e in ((0, 1.0), (1, 3.0))]
+    runs += [run("a", "y", i, None) for i in (0, 1)]
+    found = m.summary(runs)["a"]
+    assert {s: found[s]["error"] for s in found} == {"x": 2.0, "y": None, "all": 2.0}
+    intervals = m.intervals(runs)["a"]
+    assert intervals["y"]["error"] == [None, None]
+    assert intervals["x"]["error"] == m.interval(np.array([1.0, 3.0]))
+
+
+def test_metadata__names_program_machine_and_seed() -> None:
+    found = m.metadata(BROKK_170, 4)
+    assert list(found) == ["brokk_min", "machine", "seed", "units"]
+    assert (found["machine"], found["seed"]) == ("brokk170", 4)

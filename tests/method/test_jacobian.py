@@ -403,41 +403,6 @@ def test_commands_stay_within_the_limit_anywhere():
 # --- feed-forward ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("machine", [BROKK_170, *MACHINES[:3]], ids=lambda m: m.name)
-def test_the_steady_map_asks_the_nets_and_inverts_them(machine):
-    steady = classic.static_map(machine, obedient_net(machine))
-    limit = machine.pwm_limit / 127
-    u = steady.u[:, None] * np.ones(len(machine.driven))
-    wanted = obedient_velocity(machine, u).T[:, None, :] * np.ones((1, steady.q.shape[1], 1))
-    np.testing.assert_allclose(steady.velocity, wanted, atol=1e-5)
-    assert steady.u[0] == pytest.approx(-limit)
-    assert steady.u[-1] == pytest.approx(limit)
-    rng = np.random.default_rng(6)
-    low, high = machine.column("q_min")[machine.driven], machine.column("q_max")[machine.driven]
-    asked = rng.uniform(-limit, limit, (40, len(machine.driven)))
-    q = rng.uniform(low, high, asked.shape)
-    found = steady.command(q, obedient_velocity(machine, asked))
-    np.testing.assert_allclose(found, asked, atol=0.01)
-    faster = steady.command(q, np.full(asked.shape, 99.0))
-    np.testing.assert_allclose(faster, limit)
-    np.testing.assert_allclose(steady.command(q, np.full(asked.shape, -99.0)), -limit)
-
-
-def test_the_map_interpolates_between_angles():
-    """At the upper of two angles the joint is twice as fast: halfway the speeds are averaged."""
-    q, u = np.array([[0.0, 1.0]]), np.array([-1.0, 0.0, 1.0])
-    velocity = np.array([[[-1.0, 0.0, 1.0], [-2.0, 0.0, 2.0]]])
-    steady = classic.StaticMap(q, u, velocity)
-    for angle, speed, wanted in [
-        (0.0, 0.5, 0.5),
-        (1.0, 0.5, 0.25),
-        (0.5, 0.75, 0.5),
-        (2.0, -1, -0.5),
-    ]:
-        found = steady.command(np.array([angle]), np.array([speed]))
-        np.testing.assert_allclose(found, [wanted], atol=1e-9)
-
-
 def test_feed_forward_alone_sends_the_steady_command():
     steady = classic.static_map(BROKK_170, obedient_net(BROKK_170))
     c = replace(controller(), feedforward=steady)
@@ -471,103 +436,6 @@ def test_the_plant_is_driven_towards_the_goal(axis, sign):
     assert np.abs(np.delete(moved, axis)).max() < 0.1
 
 
-# --- tuning ---------------------------------------------------------------------------------------
-
-
-def single_joint():
-    joints = [replace(j, driven=j.name == "q3") for j in BROKK_170.joints]
-    return replace(BROKK_170, joints=tuple(joints))
-
-
-def test_tune_finds_the_minimum_of_a_bowl_and_is_deterministic():
-    machine = single_joint()
-    start, sizes = controller(machine=machine), []
-    wanted = {"kp": 1.0, "ki": 7.0, "kd": 0.12, "feedback": 0.4, "ready": 0.03}
-    width = {name: high - low for name, (low, high) in classic.GAINS.items()}
-
-    def bowl(candidates):
-        g = classic.split_gains(candidates.gains)
-        sizes.append(len(candidates.gains))
-        return sum(((g[n][:, 0] - wanted[n]) / width[n]) ** 2 for n in wanted)
-
-    found, costs = baselines.tune(start, bowl, seed=0, generations=60, label="bowl")
-    for name, gain in classic.split_gains(found.gains).items():
-        assert gain.item() == pytest.approx(wanted[name], abs=0.02 * width[name])
-    again, _ = baselines.tune(start, bowl, seed=0, generations=60, label="bowl")
-    other, _ = baselines.tune(start, bowl, seed=1, generations=60, label="bowl")
-    assert np.array_equal(found.gains, again.gains)
-    assert not np.array_equal(found.gains, other.gains)
-    assert found.k == start.k
-    assert not start.gains.any()
-    assert min(sizes) > 1  # whole generations at once
-    assert len(costs) == 60 and (np.diff(costs) <= 0).all()
-    assert costs[-1] == bowl(replace(found, gains=found.gains[None]))[0] < 0.01 * costs[0]
-
-
-def test_tune_is_never_worse_than_the_gains_it_starts_with():
-    start = controller(machine=single_joint(), kp=1.0, ki=7.0, kd=0.12, feedback=0.4, ready=0.03)
-
-    def far(candidates):
-        return np.abs(candidates.gains - start.gains).sum(axis=1)
-
-    found, costs = baselines.tune(start, far, seed=0, generations=1, label="start")
-    assert costs == [0.0] and np.array_equal(found.gains, start.gains)
-
-
-def test_gains_are_split_in_order_and_joined_again():
-    vectors = np.arange(28).reshape(2, 14)
-    found = classic.split_gains(vectors)
-    assert found["kp"].tolist() == [[0, 1, 2, 3], [14, 15, 16, 17]]
-    assert found["ki"][0].tolist() == [4, 5, 6, 7]
-    assert found["kd"][1].tolist() == [22, 23, 24, 25]
-    assert found["feedback"].tolist() == [[12], [26]]
-    assert found["ready"].tolist() == [[13], [27]]
-    one = classic.split_gains(vectors[1])
-    assert classic.join_gains(BROKK_170, one).tolist() == vectors[1].tolist()
-    for name in ("kp", "ready"):
-        with pytest.raises(ValueError):
-            classic.join_gains(BROKK_170, one | {name: [1.0, 2.0]})
-        with pytest.raises(ValueError, match="finite"):
-            classic.join_gains(BROKK_170, one | {name: np.nan})
-
-
-def test_gains_at_the_ends_of_their_ranges_are_named():
-    gains = classic.join_gains(
-        BROKK_170, {"kp": 2.0, "ki": 6.0, "kd": 0.1, "feedback": 0.5, "ready": 0.0}
-    )
-    gains[1], gains[4], gains[7] = 3.97, 0.11, 11.8  # of 4 and 12: within 1 %, within 1 %, not
-    found = baselines.gains_at_bound(JacobianController(BROKK_170, gains, 0.1, 1.0))
-    assert found == ["kp q3", "ki q1", "ready"]
-
-
-def test_candidates_side_by_side_are_the_single_controllers():
-    """Gains with a leading axis of candidates drive as each candidate would alone."""
-    rng = np.random.default_rng(7)
-    many = rng.uniform(0, 1, (3, 14)) * ([2] * 4 + [8] * 4 + [0.2] * 4 + [1, 0.02])
-    goals = np.repeat(rng.uniform(-0.2, 0.2, (2, 3, 3)), 10, axis=0)
-    goals[:] = goals[:, :1]
-    c = replace(controller(0.5), gains=many)
-    quiet = TaskConfig(noise=0.0)
-    whole = rollout(BROKK_170, c, np.stack([POSE] * 3), goals, quiet, rng)
-    for i in range(3):
-        one = replace(c, gains=many[i])
-        alone = rollout(BROKK_170, one, POSE[None], goals[:, :1], quiet, rng)
-        np.testing.assert_allclose(whole.u[:, i], alone.u[:, 0], atol=1e-9)
-        np.testing.assert_allclose(whole.q[:, i], alone.q[:, 0], atol=1e-6)
-
-
-def test_the_map_keeps_the_joints_apart():
-    """Halfway between its angles the first joint moves at 1.5 rad/s under full command, the second at 4.5."""
-    velocity = np.array(
-        [[[-1.0, 0.0, 1.0], [-2.0, 0.0, 2.0]], [[-3.0, 0.0, 3.0], [-6.0, 0.0, 6.0]]]
-    )
-    steady = classic.StaticMap(
-        np.array([[0.0, 1.0], [0.0, 1.0]]), np.array([-1.0, 0.0, 1.0]), velocity
-    )
-    found = steady.command(np.array([0.5, 0.5]), np.array([0.75, 0.75]))
-    np.testing.assert_allclose(found, [0.75 / 1.5, 0.75 / 4.5], atol=1e-9)
-
-
 # --- what a mutation tool had changed unseen -------------------------------------------------------
 
 
@@ -582,66 +450,6 @@ def test_damping_sets_in_at_a_quarter_of_the_largest_manipulability():
         replace(j, a=0.0, d=0.0) for j in BROKK_170.joints
     ]  # no reach: 0, but something to divide by
     assert 0 < classic.manipulability_threshold(replace(BROKK_170, joints=tuple(stiff))) < 1e-6
-
-
-def test_the_map_interpolates_over_several_angles_and_holds_beyond_them():
-    """Speeds at full command are 1, 2 and 4 rad/s at -1, 0.5 and 2 rad."""
-    scale, u = np.array([1.0, 2.0, 4.0])[None, :, None], np.array([-1.0, 0.0, 1.0])
-    steady = classic.StaticMap(np.array([[-1.0, 0.5, 2.0]]), u, scale * u)
-    for angle, speed in [(-3, 1), (-1, 1), (-0.25, 1.5), (0.5, 2), (1.25, 3), (2, 4), (9, 4)]:
-        found = steady.command(np.array([float(angle)]), np.array([0.5]))
-        np.testing.assert_allclose(found, [0.5 / speed], atol=1e-9)
-
-
-def test_the_steady_map_is_what_nets_say_of_a_history_that_moves_steadily():
-    """Each entry is a fixed point, found here by a plain loop of one joint at one angle under one command."""
-    plain = obedient_net(BROKK_170)
-    first = plain.weights[
-        0
-    ].copy()  # angles and velocities matter too, but a loop through them settles
-    first[:, :26, 0] = 0.05 * np.random.default_rng(12).standard_normal((4, 26))
-    net = replace(plain, weights=(first, *plain.weights[1:]))
-    steady = classic.static_map(BROKK_170, net)
-    assert steady.velocity.shape == (4, 9, 41)
-    lags = np.arange(-12, 1) / 20
-    for angle in (0, 8):
-        speeds = np.zeros((41, 4))
-        for c, u in enumerate(steady.u):
-            for _ in range(200):
-                v, q = speeds[c], steady.q[:, angle]
-                rows = [[q[j] + v[j] * lags, np.full(13, v[j]), np.full(13, u)] for j in range(4)]
-                speeds[c] = 0.5 * v + 0.5 * net.predict(np.array(rows, np.float32)[None])[0]
-        rising = np.maximum.accumulate(speeds, axis=0).T
-        np.testing.assert_allclose(steady.velocity[:, angle], rising, atol=1e-5)
-        assert (rising[:, -1] - rising[:, 0] > 0.1).all()
-
-
-def test_gains_at_a_bound_are_all_named_whatever_the_lower_end(monkeypatch):
-    monkeypatch.setitem(classic.GAINS, "kp", (1.0, 3.0))
-    low, high = baselines.gain_bounds(BROKK_170)
-    every = [f"{kind} q{i}" for kind in ("kp", "ki", "kd") for i in (1, 3, 4, 5)] + [
-        "feedback",
-        "ready",
-    ]
-    for ends in (low, high):
-        assert baselines.gains_at_bound(JacobianController(BROKK_170, ends, 0.1, 1.0)) == every
-    middle = (low + high) / 2
-    assert baselines.gains_at_bound(JacobianController(BROKK_170, middle, 0.1, 1.0)) == []
-
-
-def test_the_search_starts_about_the_gains_it_is_given():
-    low, high = baselines.gain_bounds(BROKK_170)
-    start, seen = replace(controller(), gains=(low + high) / 2), []
-
-    def cost(candidates):
-        seen.append(candidates.gains)
-        return np.arange(float(len(candidates.gains)))
-
-    baselines.tune(start, cost, seed=0, generations=1, label="start")
-    np.testing.assert_allclose(seen[0][0], start.gains)
-    apart = (seen[0][1:] - start.gains) / (high - low)
-    assert seen[0].shape == (32, 14) and 0.13 < apart.std() < 0.17
-    assert all(((gains >= low) & (gains <= high)).all() for gains in seen)
 
 
 def test_the_weights_of_a_tick_follow_the_rates_of_the_tick_before():
@@ -694,29 +502,3 @@ def test_a_single_observation_gives_the_command_of_a_batch_of_one():
     for _ in range(3):
         (u, memory), (one, alone) = c(seen[None], memory), c(seen, alone)
         np.testing.assert_allclose(one, u[0], atol=1e-12)
-
-
-def test_joined_gains_are_floats():
-    assert classic.join_gains(BROKK_170, dict.fromkeys(classic.GAINS, 1)).dtype == float
-
-
-def test_the_steady_map_is_of_motion_even_where_nets_know_stops() -> None:
-    """A net that has seen a pushed joint stand at its stop must not be asked about one that stands."""
-
-    class Stalling(ActuatorNet):
-        def predict(self, history):  # 0.3 rad/s a unit of command, but what stands, stands
-            speed = 0.3 * history[..., 2, -1]
-            return np.where(np.abs(history[..., 1, -1]) < 0.01, 0.0, speed)
-
-    net = random_net(np.random.default_rng(0)).select(
-        [BROKK_170.names[i] for i in BROKK_170.driven]
-    )
-    stalling = Stalling(**{f.name: getattr(net, f.name) for f in fields(net)})
-    found = classic.static_map(BROKK_170, stalling)
-    moving = np.abs(found.u) > 0.1
-    np.testing.assert_allclose(
-        found.velocity[..., moving],
-        np.broadcast_to(0.3 * found.u[moving], (4, 9, moving.sum())),
-        atol=1e-4,
-    )
-    assert (found.q[:, 0] > BROKK_170.column("q_min")[BROKK_170.driven]).all()

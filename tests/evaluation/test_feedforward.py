@@ -1,0 +1,95 @@
+"""Feed-forward: the static map is what the nets say of steady motion, and its inverse undoes it."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from helpers_machines import obedient_net, obedient_velocity, small_net
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import machines
+
+from brokk_min.actuator import ActuatorNet
+from brokk_min.evaluation.feedforward import StaticMap, static_map
+from brokk_min.machine import BROKK_170, Machine
+
+
+@settings(max_examples=5)
+@given(machines(), st.integers(0, 2**31))
+def test_command__inverts_the_velocity_of_the_nets(machine: Machine, seed: int) -> None:
+    steady = static_map(machine, obedient_net(machine))
+    limit = machine.pwm_limit / 127
+    assert (steady.u[0], steady.u[-1]) == pytest.approx((-limit, limit))
+    velocity = obedient_velocity(machine, steady.u[:, None] * np.ones(len(machine.driven)))
+    expected = np.repeat(velocity.T[:, None, :], steady.q.shape[1], axis=1)
+    np.testing.assert_allclose(steady.velocity, expected, atol=1e-5)
+    rng = np.random.default_rng(seed)
+    u = rng.uniform(-limit, limit, (40, len(machine.driven)))
+    low, high = machine.column("q_min")[machine.driven], machine.column("q_max")[machine.driven]
+    q = rng.uniform(low, high, u.shape)
+    np.testing.assert_allclose(steady.command(q, obedient_velocity(machine, u)), u, atol=0.02)
+    np.testing.assert_allclose(steady.command(q, np.full(u.shape, 99.0)), limit)
+    np.testing.assert_allclose(steady.command(q, np.full(u.shape, -99.0)), -limit)
+
+
+@pytest.mark.parametrize(
+    ("angle", "speed"), [(-3, 1), (-1, 1), (-0.25, 1.5), (0.5, 2), (1.25, 3), (2, 4), (9, 4)]
+)
+def test_command__interpolates_between_angles_and_holds_beyond_them(
+    angle: float, speed: float
+) -> None:
+    """Speeds at full command are 1, 2 and 4 rad/s at -1, 0.5 and 2 rad."""
+    scale, u = np.array([1.0, 2.0, 4.0])[None, :, None], np.array([-1.0, 0.0, 1.0])
+    steady = StaticMap(np.array([[-1.0, 0.5, 2.0]]), u, scale * u)
+    for q_dot in (0.5, -0.25):
+        found = steady.command(np.array([float(angle)]), np.array([q_dot]))
+        np.testing.assert_allclose(found, [q_dot / speed], atol=1e-9)
+
+
+def test_command__takes_each_joint_by_its_own_map() -> None:
+    """Halfway between its angles the first joint moves at 1.5 rad/s, the second at 4.5."""
+    u = np.array([-1.0, 0.0, 1.0])
+    velocity = np.array([[u, 2 * u], [3 * u, 6 * u]])
+    steady = StaticMap(np.array([[0.0, 1.0], [0.0, 1.0]]), u, velocity)
+    found = steady.command(np.array([0.5, 0.5]), np.array([0.75, 0.75]))
+    np.testing.assert_allclose(found, [0.75 / 1.5, 0.75 / 4.5], atol=1e-9)
+
+
+def test_static_map__is_the_fixed_point_of_steady_motion() -> None:
+    """Found here by a plain loop, one joint at one angle under one command."""
+    net = obedient_net(BROKK_170)
+    first = net.weights[0].copy()  # angles and velocities matter, too
+    first[:, :26, 0] = 0.05 * np.random.default_rng(12).standard_normal((4, 26))
+    net = replace(net, weights=(first, *net.weights[1:]))
+    steady = static_map(BROKK_170, net)
+    assert steady.velocity.shape == (4, 9, 41)
+    time = np.arange(-12, 1) / 20
+    for angle in (0, 8):
+        q = steady.q[:, angle]
+        speeds = np.zeros((41, 4))
+        for c, u in enumerate(steady.u):
+            for _ in range(200):
+                v = speeds[c]
+                rows = [[q[j] + v[j] * time, np.full(13, v[j]), np.full(13, u)] for j in range(4)]
+                speeds[c] = 0.5 * v + 0.5 * net.predict(np.array(rows, np.float32)[None])[0]
+        rising = np.maximum.accumulate(speeds, axis=0).T
+        np.testing.assert_allclose(steady.velocity[:, angle], rising, atol=1e-5)
+        assert (rising[:, -1] - rising[:, 0] > 0.1).all()
+
+
+def test_static_map__is_of_motion_even_if_the_nets_know_stops() -> None:
+    """A net that was trained on joints at their stop predicts standstill for joints that stand."""
+
+    class Stalling(ActuatorNet):
+        def predict(self, history: np.ndarray) -> np.ndarray:
+            speed = 0.3 * history[..., 2, -1]
+            return np.where(np.abs(history[..., 1, -1]) < 0.01, 0.0, speed)
+
+    net = small_net(BROKK_170, np.random.default_rng(0))
+    found = static_map(BROKK_170, Stalling(**{f.name: getattr(net, f.name) for f in fields(net)}))
+    moving = np.abs(found.u) > 0.1
+    expected = np.broadcast_to(0.3 * found.u[moving], (4, 9, moving.sum()))
+    np.testing.assert_allclose(found.velocity[..., moving], expected, atol=1e-4)
+    assert (found.q[:, 0] > BROKK_170.column("q_min")[BROKK_170.driven]).all()

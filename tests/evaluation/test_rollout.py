@@ -1,0 +1,117 @@
+"""Rollouts: what a controller gets, what moves the machine, and what is recorded when."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers_machines import closed_form, small_net
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import machines
+
+from brokk_min.actuator import plant_reset, plant_step
+from brokk_min.env import Measured, TaskConfig, initial_state, transition
+from brokk_min.evaluation.baselines import make_gains
+from brokk_min.evaluation.rollout import rollout
+from brokk_min.jacobian import JacobianController
+from brokk_min.machine import BROKK_170, Machine, limit_command, read_encoder
+
+START = np.array([BROKK_170.q_start, np.add(BROKK_170.q_start, 0.1)])
+QUIET = TaskConfig(noise=0.0)
+
+
+class Playback:
+    """Sends given commands (T, num, n) and keeps what it measured."""
+
+    def __init__(self, commands: np.ndarray) -> None:
+        self.commands = commands
+        self.measured: list[Measured] = []
+
+    def start(self, num: int) -> int:
+        return 0
+
+    def __call__(self, measured: Measured, tick: int) -> tuple[np.ndarray, int]:
+        self.measured.append(measured)
+        return self.commands[tick], tick + 1
+
+
+def random_commands(rng: np.random.Generator, ticks: int) -> np.ndarray:
+    return limit_command(BROKK_170, rng.uniform(-1, 1, (ticks, 2, 5)))
+
+
+def test_rollout__records_each_tick_of_the_plant() -> None:
+    rng = np.random.default_rng(19)
+    controller = Playback(random_commands(rng, 40))
+    goals = np.repeat(rng.uniform(-0.3, 0.3, (4, 2, 3)), 10, axis=0)
+    trace = rollout(BROKK_170, controller, START, goals, QUIET, rng)
+    plant = plant_reset(BROKK_170, START)
+    for t in range(40):
+        measured = controller.measured[t]
+        np.testing.assert_allclose(measured.v_goal, goals[t], atol=1e-6)
+        np.testing.assert_allclose(trace.q_measured[t], read_encoder(BROKK_170, plant.q), atol=1e-6)
+        np.testing.assert_allclose(measured.q, plant.q, atol=0.01)
+        q_before = plant.q
+        plant = plant_step(BROKK_170, plant, controller.commands[t])
+        np.testing.assert_allclose(trace.q[t], plant.q, atol=1e-12)
+        np.testing.assert_allclose(trace.q_dot[t], (plant.q - q_before) * 20, atol=1e-10)
+        np.testing.assert_allclose(trace.p_tool[t], closed_form(plant.q)[0], atol=1e-12)
+        error = np.linalg.norm(goals[t] - trace.v_tool[t], axis=-1)
+        np.testing.assert_allclose(trace.reward[t], 1 / (1 + error), atol=1e-12)
+    np.testing.assert_array_equal(trace.u, controller.commands)
+    moved = np.diff(trace.p_tool, axis=0)[20:] * 20
+    np.testing.assert_allclose(moved, trace.v_tool[21:], atol=0.01)
+
+
+def test_rollout__moves_by_nets_and_reads_the_given_encoders() -> None:
+    rng = np.random.default_rng(20)
+    net = small_net(BROKK_170, rng)
+    controller = Playback(random_commands(rng, 8))
+    goals = np.zeros((8, 2, 3))
+
+    def shifted(machine: Machine, q: np.ndarray) -> np.ndarray:
+        return read_encoder(machine, q + 0.01)
+
+    trace = rollout(BROKK_170, controller, START, goals, QUIET, rng, net, shifted)
+    state = initial_state(BROKK_170, START, goals[0], plant=False)
+    for t in range(8):
+        np.testing.assert_array_equal(trace.q_measured[t], state.history[..., 0, -1])
+        state = transition(BROKK_170, net, state, controller.commands[t], shifted)
+        np.testing.assert_array_equal(trace.q[t], state.q)
+    assert np.abs(trace.q[-1] - START).max() > 0.01
+
+
+def test_rollout__gives_noisy_measurements_that_a_seed_repeats() -> None:
+    measured = []
+    for config, seed in ((TaskConfig(), 1), (TaskConfig(), 1), (QUIET, 1)):
+        controller = Playback(np.zeros((30, 2, 5)))
+        goals = np.zeros((30, 2, 3))
+        rollout(BROKK_170, controller, START, goals, config, np.random.default_rng(seed))
+        measured.append(np.array([m.v_tool for m in controller.measured]))
+    np.testing.assert_array_equal(measured[0], measured[1])
+    assert not measured[2].any()
+    largest = 0.05 * BROKK_170.tool_speed / 3**0.5  # 5 % of a standard deviation
+    assert 0.9 * largest < np.abs(measured[0]).max() <= largest * 1.0001
+
+
+@settings(max_examples=10)
+@given(machines(), st.integers(0, 2**31))
+def test_rollout__keeps_commands_of_any_machine_within_its_limit(
+    machine: Machine, seed: int
+) -> None:
+    gains = make_gains(machine, kp=1.0, ki=1.0, kd=0.0, feedback=0.2, min_opening=0.0)
+    controller = JacobianController(machine, gains, 0.1, 0.1)
+    start = np.tile((machine.column("q_min") + machine.column("q_max")) / 2, (3, 1))
+    goals = np.full((20, 3, 3), 0.05)
+    trace = rollout(machine, controller, start, goals, TaskConfig(), np.random.default_rng(seed))
+    assert np.isfinite(trace.v_tool).all()
+    assert np.abs(trace.u).max() <= machine.pwm_limit / 127 + 1e-9
+    assert not trace.u[..., machine.locked].any()
+    assert ((trace.reward > 0) & (trace.reward <= 1)).all()
+
+
+def test_rollout__a_controller_without_commands_stands_still() -> None:
+    controller = Playback(np.zeros((20, 2, 5)))
+    goals = np.tile([0.0, 0.0, 0.2], (20, 2, 1))
+    trace = rollout(BROKK_170, controller, START, goals, TaskConfig(), np.random.default_rng(0))
+    np.testing.assert_array_equal(trace.q, np.tile(START, (20, 1, 1)))
+    assert trace.reward == pytest.approx(1 / 1.2)
