@@ -11,7 +11,7 @@ import pytest
 from helpers_cli import run
 
 from brokk_min.cli.commands import print_means, print_scores, split
-from brokk_min.evaluation import baselines, experiments, reproduce
+from brokk_min.evaluation import baselines, reproduce
 from brokk_min.evaluation.metrics import summary
 from brokk_min.evaluation.report import VERDICTS
 from brokk_min.evaluation.sequences import read_starts, start_kinds
@@ -332,7 +332,7 @@ def test_reproduce__prints_means_verdicts_and_files(
 ) -> None:
     def chain(machine: Any, out: Path, budget: Any, seed: int, sweep: Any) -> dict[str, Any]:
         assert (machine, out, seed, sweep) == (BROKK_170, tmp_path, 3, Path("sweep.json"))
-        assert budget == (experiments.QUICK if quick else experiments.Effort())
+        assert budget == (reproduce.QUICK if quick else reproduce.Budget())
         means = {"rl": {s: {"velocity_error_mean": 0.0125} for s in "xy"}}
         return {"task_space": {"summary": means}, "claims": [{"holds": True, "paper": "It works."}]}
 
