@@ -202,6 +202,8 @@ def make_learner(
     mode = env.metadata.get("autoreset_mode")
     if mode != AutoresetMode.SAME_STEP:
         raise ValueError(f"env: expected autoreset mode {AutoresetMode.SAME_STEP}, got {mode}")
+    torch.set_num_threads(config.threads)
+    torch.set_float32_matmul_precision("medium")  # oneDNN's kernels where MKL's take twice as long
     obs_size = math.prod(env.single_observation_space.shape or ())
     action_size = math.prod(env.single_action_space.shape or ())
     with torch.random.fork_rng():
@@ -300,8 +302,6 @@ def train(
 
     ValueError: a number that is not finite, with its place and step.
     """
-    torch.set_num_threads(config.threads)
-    torch.set_float32_matmul_precision("medium")  # oneDNN's kernels where MKL's take twice as long
     learner = learner or make_learner(env, config, seed, critic=estimate is None)
     estimate = estimate or critic_advantages
     while learner.global_step < config.total_steps:

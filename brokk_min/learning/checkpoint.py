@@ -1,14 +1,11 @@
-"""Training of a policy with files: checkpoint, learning curve, TensorBoard, policy.
-
-A checkpoint holds all that `ppo.train` and the environment change, as arrays; nothing is pickled.
-"""
+"""Training of a policy with files: checkpoint, learning curve, TensorBoard, policy."""
 
 import csv
+import io
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
@@ -21,13 +18,7 @@ from tqdm import tqdm
 from brokk_min import ppo
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import State, TaskConfig, observation_scale
-from brokk_min.identification.files import (
-    expect_same,
-    load_arrays,
-    load_header,
-    require,
-    whole_file,
-)
+from brokk_min.identification.files import expect_same, expected, require, whole_file
 from brokk_min.identification.net_file import fingerprint
 from brokk_min.learning.episodes import paper_weights
 from brokk_min.learning.gym_env import TaskVectorEnv
@@ -36,7 +27,7 @@ from brokk_min.learning.simulation_gradient import gradient_advantages
 from brokk_min.machine import Machine
 from brokk_min.ppo import Agent, Learner, PPOConfig, Rollout
 
-FORMAT = 3
+FORMAT = 4  # of checkpoints
 STATE = [field.name for field in fields(State) if field.name != "plant"]
 
 
@@ -75,9 +66,9 @@ def train_policy(
         task: episodes.
         config: settings of the learner.
         seed: of everything random; the same seed gives the same bits on the same machine.
-        out: policy file; `<out>.checkpoint` and the curve `<out>.csv` stand beside it.
+        out: policy file, with its checkpoint `<out>.checkpoint` and its curve `<out>.csv`.
         critic: advantages by a critic (always with `task.paper`), not by the nets' derivatives.
-        resume: go on from the checkpoint if there is one; the end is the same as without the break.
+        resume: continue from the checkpoint; the result is the same as without interruption.
         tensorboard: folder for the scalars of the curve (needs the extra `tensorboard`).
 
     Raises:
@@ -92,27 +83,23 @@ def train_policy(
     env = TaskVectorEnv(config.num_envs, net, machine, task)
     learner = ppo.make_learner(env, config, seed, critic)
     stagger_episodes(env)
-    checkpoint, curve = Path(f"{out}.checkpoint"), Path(f"{out}.csv")
-    log = TrainingLog(env, config, checkpoint, curve, about)
+    log = TrainingLog(env, config, out, about, tensorboard)
     log.begin(learner, resume)
     estimate = None if critic else gradient_advantages(machine, net, task)
-    with log.bar, tensorboard_writer(tensorboard) as log.write:
+    with log.bar, closing(log):
         agent = ppo.train(env, config, seed, log.on_update, estimate, learner)
     log.write_curve()
     policy = export_policy(machine, net, agent, task, about)
     save_policy(out, policy)
-    checkpoint.unlink(missing_ok=True)
+    log.checkpoint.unlink(missing_ok=True)
     return policy
 
 
 def stagger_episodes(env: TaskVectorEnv) -> None:
-    """Let the first episodes of a reset environment end one after the other.
-
-    Otherwise all arms start anew in the same update; most batches have no starts, one nothing else.
-    """
+    """Let the first episodes end one after the other: every batch then has some starts."""
     assert env.state is not None
-    ticks = np.arange(env.num_envs) * round(env.config.episode_s * env.machine.rate) // env.num_envs
-    env.state = replace(env.state, ticks=ticks)
+    episode_ticks = round(env.config.episode_s * env.machine.rate)
+    env.state = replace(env.state, ticks=np.arange(env.num_envs) * episode_ticks // env.num_envs)
 
 
 def export_policy(
@@ -135,47 +122,54 @@ class TrainingLog:
         self,
         env: TaskVectorEnv,
         config: PPOConfig,
-        checkpoint: Path,
-        curve: Path,
+        out: Path,
         about: dict[str, Any],
+        tensorboard: Path | None,
     ) -> None:
-        self.env, self.config, self.about = env, config, about
-        self.checkpoint, self.curve = checkpoint, curve
+        self.env = env
+        self.config = config
+        self.about = about
+        self.checkpoint = Path(f"{out}.checkpoint")
+        self.curve = Path(f"{out}.csv")
         self.rows: list[dict[str, Any]] = []
         self.returns = np.zeros(env.num_envs)  # of running episodes
         self.lengths = np.zeros(env.num_envs)
-        self.episodes = (0.0, 0.0)  # mean return and length of those that ended last
-        self.write: Callable[[dict[str, Any]], object] = lambda row: None
+        self.episodes = {"charts/episodic_return": 0.0, "charts/episodic_length": 0.0}  # last ended
+        self.writer = None
+        if tensorboard is not None:
+            module = require("torch.utils.tensorboard", "tensorboard")
+            self.writer = module.SummaryWriter(str(tensorboard))
 
     def begin(self, learner: Learner, resume: bool) -> None:
-        """Go on from the checkpoint where that is wanted; refuse to begin over one."""
-        if resume and self.checkpoint.exists():
+        """Continue from the checkpoint; ValueError: it exists, but not to be resumed."""
+        exists = self.checkpoint.exists()
+        if exists and not resume:
+            expectation = "expected --resume or no checkpoint"
+            raise ValueError(f"{self.checkpoint}: {expectation}, got one of a broken training")
+        if exists:
             self.load(learner)
             self.rows = read_curve(self.curve, learner.global_step)
         elif resume:
             text = "no checkpoint, training starts from the beginning"
             tqdm.write(f"{self.checkpoint}: {text}", file=sys.stderr)
-        elif self.checkpoint.exists():
-            raise ValueError(
-                f"{self.checkpoint}: expected --resume or no checkpoint, got one of a broken training"
-            )
+        self.first_step = learner.global_step
+        self.start = time.perf_counter()
         total = self.config.total_steps
-        done = learner.global_step
-        self.bar = tqdm(total=total, initial=done, desc="train", unit="step", disable=None)
-        self.first, self.start = done, time.perf_counter()
+        self.bar = tqdm(
+            total=total, initial=self.first_step, desc="train", unit="step", disable=None
+        )
 
     def on_update(self, learner: Learner, rollout: Rollout, metrics: dict[str, float]) -> None:
-        """One more row of the curve; now and then a checkpoint."""
+        """Add a row to the curve; every `checkpoint_every` updates write a checkpoint."""
         self.count_episodes(rollout.rewards.numpy(), rollout.dones.numpy())
         error = float(np.mean([info["velocity_error"].mean() for info in rollout.infos]))
-        speed = (learner.global_step - self.first) / (time.perf_counter() - self.start)
-        episodes = dict(
-            zip(("charts/episodic_return", "charts/episodic_length"), self.episodes, strict=True)
-        )
-        row = {"global_step": learner.global_step, **episodes, **metrics}
-        row |= {"charts/velocity_error": error, "charts/SPS": round(speed)}
-        self.rows.append(row)
-        self.write(row)
+        seconds = time.perf_counter() - self.start
+        speed = round((learner.global_step - self.first_step) / seconds)
+        scalars = {**self.episodes, **metrics, "charts/velocity_error": error, "charts/SPS": speed}
+        self.rows.append({"global_step": learner.global_step, **scalars})
+        if self.writer is not None:
+            for name, value in scalars.items():
+                self.writer.add_scalar(name, value, learner.global_step)
         self.bar.update(learner.global_step - self.bar.n)
         self.bar.set_postfix_str(f"reward {metrics['charts/reward']:.3f}, error {error:.3f} m/s")
         if learner.updates % self.config.checkpoint_every == 0:
@@ -188,12 +182,12 @@ class TrainingLog:
         for reward, done in zip(rewards, dones, strict=True):
             self.returns += reward
             self.lengths += 1
-            ended += list(zip(self.returns[done], self.lengths[done], strict=True))
+            ended.append(np.stack([self.returns[done], self.lengths[done]]))
             self.returns[done] = 0
             self.lengths[done] = 0
-        if ended:
-            mean_return, mean_length = np.mean(ended, axis=0)
-            self.episodes = float(mean_return), float(mean_length)
+        means = np.concatenate(ended, axis=1)
+        if means.size:
+            self.episodes = dict(zip(self.episodes, means.mean(axis=1).tolist(), strict=True))
 
     def write_curve(self) -> None:
         """Write the curve whole."""
@@ -202,84 +196,64 @@ class TrainingLog:
             writer.writeheader()
             writer.writerows(self.rows)
 
+    def close(self) -> None:
+        """Close the files of TensorBoard."""
+        if self.writer is not None:
+            self.writer.close()
+
     def save(self, learner: Learner) -> None:
-        """Write a checkpoint from which `load` continues to the same bits."""
-        header = {
-            "format": FORMAT,
-            "kind": "checkpoint",
-            "identity": self.about,
-            "updates": learner.updates,
-            "global_step": learner.global_step,
+        """Write a checkpoint from which a training continues to the same bits."""
+        header = {"format": FORMAT, "identity": self.about}
+        content = {
+            "header": json.dumps(header),
+            "agent": learner.agent.state_dict(),
+            "optimizer": learner.optimizer.state_dict(),
+            "generator": learner.generator.get_state(),
+            "obs": learner.obs,
             "learning_rate": learner.learning_rate,
-            "episodes": self.episodes,
+            "global_step": learner.global_step,
+            "updates": learner.updates,
+            "env": {name: torch.tensor(getattr(self.env.state, name)) for name in STATE},
             "random": self.env.np_random.bit_generator.state,
+            "returns": torch.tensor(self.returns),
+            "lengths": torch.tensor(self.lengths),
+            "episodes": self.episodes,
         }
-        arrays: dict[str, Any] = {f"env_{name}": getattr(self.env.state, name) for name in STATE}
-        arrays |= {"obs": learner.obs.numpy(), "generator": learner.generator.get_state().numpy()}
-        arrays |= {"returns": self.returns, "lengths": self.lengths}
-        for i, parameter in enumerate(learner.agent.parameters()):
-            arrays[f"parameter_{i}"] = parameter.detach().numpy()
-            for name, value in learner.optimizer.state.get(parameter, {}).items():
-                arrays[f"{name}_{i}"] = value.numpy()
+        buffer = io.BytesIO()
+        torch.save(content, buffer)
         with whole_file(self.checkpoint) as file:
-            np.savez(file, header=np.array(json.dumps(header)), **arrays)
+            file.write(buffer.getvalue())
 
     def load(self, learner: Learner) -> None:
-        """Go on from the checkpoint of the same training.
+        """Restore learner and environment from a checkpoint of the same training.
 
-        ValueError: a file that is no checkpoint, or one of another training, with the difference.
+        ValueError: not a checkpoint, or one of another training, with the difference.
         """
-        path = self.checkpoint
-        arrays = load_arrays(path)
-        header = load_header(path, arrays, "checkpoint", FORMAT)
-        expect_same(path, header.get("identity", {}), self.about)
         try:
-            self.restore(learner, header, arrays)
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:
-            raise ValueError(f"{path}: expected a complete checkpoint, got {error!r}") from error
+            content = torch.load(self.checkpoint, weights_only=True)  # executes nothing
+            header = json.loads(content["header"])
+        except Exception as error:  # zipfile, pickle and torch raise anything on damaged files
+            raise ValueError(
+                f"{self.checkpoint}: expected a readable checkpoint, got {error!r}"
+            ) from error
+        expect_same(self.checkpoint, header, {"format": FORMAT})
+        expect_same(self.checkpoint, header["identity"], self.about)
+        with expected(self.checkpoint, "a complete checkpoint"):
+            learner.agent.load_state_dict(content["agent"])
+            learner.optimizer.load_state_dict(content["optimizer"])
+            learner.generator.set_state(content["generator"])
+            learner.obs = content["obs"]
+            learner.learning_rate = content["learning_rate"]
+            learner.global_step = content["global_step"]
+            learner.updates = content["updates"]
+            self.env.state = State(**{name: content["env"][name].numpy() for name in STATE})
+            self.env.np_random.bit_generator.state = content["random"]
+            self.returns = content["returns"].numpy()
+            self.lengths = content["lengths"].numpy()
+            self.episodes = content["episodes"]
 
-    def restore(self, learner: Learner, header: dict[str, Any], arrays: dict[str, Any]) -> None:
-        """Put everything back in place."""
-        tensors = {name: torch.from_numpy(a) for name, a in arrays.items() if name != "header"}
-        learner.updates, learner.global_step = header["updates"], header["global_step"]
-        learner.learning_rate, learner.obs = header["learning_rate"], tensors["obs"]
-        learner.generator.set_state(tensors["generator"])
-        self.episodes = tuple(header["episodes"])
-        self.returns, self.lengths = arrays["returns"], arrays["lengths"]
-        self.env.state = State(**{name: arrays[f"env_{name}"] for name in STATE})
-        self.env.np_random.bit_generator.state = header["random"]
-        with torch.no_grad():
-            for i, parameter in enumerate(learner.agent.parameters()):
-                parameter.copy_(tensors[f"parameter_{i}"])
-                if f"step_{i}" in tensors:
-                    moments = {
-                        name: tensors[f"{name}_{i}"] for name in ("step", "exp_avg", "exp_avg_sq")
-                    }
-                    learner.optimizer.state[parameter] = moments
 
-
-def read_curve(path: Path, steps: int) -> list[dict[str, Any]]:
+def read_curve(path: Path, last_step: int) -> list[dict[str, Any]]:
     """Rows of a curve up to a step; ValueError: no such file, or another one."""
-    try:
-        with open(path, newline="") as file:
-            return [row for row in csv.DictReader(file) if int(row["global_step"]) <= steps]
-    except (OSError, KeyError, ValueError) as error:
-        raise ValueError(
-            f"{path}: expected the curve beside the checkpoint, got {error!r}"
-        ) from error
-
-
-@contextmanager
-def tensorboard_writer(folder: Path | None) -> Iterator[Callable[[dict[str, Any]], object]]:
-    """What writes rows of the curve to a folder for TensorBoard, or, without a folder, nowhere."""
-    if folder is None:
-        yield lambda row: None
-        return
-    with require("torch.utils.tensorboard", "tensorboard").SummaryWriter(str(folder)) as writer:
-
-        def write(row: dict[str, Any]) -> None:
-            for name, value in row.items():
-                if name != "global_step":
-                    writer.add_scalar(name, value, row["global_step"])
-
-        yield write
+    with expected(path, "the curve of the checkpoint"), open(path, newline="") as file:
+        return [row for row in csv.DictReader(file) if int(row["global_step"]) <= last_step]

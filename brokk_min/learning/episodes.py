@@ -1,4 +1,4 @@
-"""Episodes of training: random starts and goals, noisy observations, automatic resets. Paper: Sec. 3.4"""
+"""Episodes of training: random starts and goals, noisy observations. Paper: Sec. 3.4"""
 
 from dataclasses import fields, replace
 from functools import lru_cache
@@ -73,16 +73,16 @@ def reset(
 def new_goals(
     machine: Machine, config: TaskConfig, state: State, rng: np.random.Generator
 ) -> State:
-    """New goals for the machines whose goal is over, or points down close to the ground."""
+    """New goals where the time of a goal is over, or it points down close to the ground."""
     low = state.lowest < machine.ground + GROUND_MARGIN
-    due = np.flatnonzero((state.goal_ticks <= 0) | (low & (state.v_goal[..., 2] < 0)))
-    if not len(due):
+    rows = np.flatnonzero((state.goal_ticks <= 0) | (low & (state.v_goal[..., 2] < 0)))
+    if not len(rows):
         return state
     v_goal = state.v_goal.copy()
     goal_ticks = state.goal_ticks.copy()
-    v_goal[due] = draw_goal(machine, config, rng, len(due))
-    v_goal[due, 2] = np.where(low[due], np.abs(v_goal[due, 2]), v_goal[due, 2])
-    goal_ticks[due] = draw_hold(machine, config, rng, len(due))
+    v_goal[rows] = draw_goal(machine, config, rng, len(rows))
+    v_goal[rows, 2] = np.where(low[rows], np.abs(v_goal[rows, 2]), v_goal[rows, 2])
+    goal_ticks[rows] = draw_hold(machine, config, rng, len(rows))
     return replace(state, v_goal=v_goal, goal_ticks=goal_ticks)
 
 
@@ -94,20 +94,20 @@ def draw_noise(machine: Machine, largest: float, num: int, rng: np.random.Genera
 
 def get_obs(machine: Machine, config: TaskConfig, state: State, rng: np.random.Generator) -> Array:
     """The observation of a state, (..., obs), with fresh noise. Paper: Sec. 3.4 (5 %)"""
-    seen = state.history, state.v_goal, state.error_integral
     noise = draw_noise(machine, config.noise, len(state.q), rng)
-    obs = features(machine, measure(machine, *seen, noise))
+    measured = measure(machine, state.history, state.v_goal, state.error_integral, noise)
+    obs = features(machine, measured)
     return obs * paper_weights(machine) if config.paper else obs
 
 
 @lru_cache
 def paper_weights(machine: Machine) -> Array:
-    """Factors (obs,) that undo the weights and blank what the paper's agent does not observe."""
-    keep = [
-        np.full(block.std.shape, 0 if "resolved" in block.name else 1 / block.weight, np.float32)
-        for block in observation_blocks(machine)
-    ]
-    return np.concatenate(keep)
+    """Factors (obs,) that undo the weights; 0 for what the paper's agent does not observe."""
+    factors = []
+    for block in observation_blocks(machine):
+        factor = 0 if "resolved" in block.name else 1 / block.weight
+        factors.append(np.full(block.std.shape, factor, np.float32))
+    return np.concatenate(factors)
 
 
 def replace_rows(state: State, rows: NDArray[np.intp], fresh: State) -> State:

@@ -11,39 +11,42 @@ from brokk_min.learning.policy import STANDSTILL_TIMEOUT, Policy
 
 
 def export_onnx(path: Path, policy: Policy) -> None:
-    """Write a policy as one self-contained ONNX file: `observation` (batch, obs) in, `action` out.
+    """Write a policy as one ONNX file: `observation` (batch, obs) in, `action` out.
 
-    What follows is up to the other program: actions go through `action_to_pwm` (metadata `dead_zone`,
-    `pwm_limit`, `ramp`), and valves close when the tool was to stand for `stand_s` (`policy.STANDSTILL_TIMEOUT`).
+    The other program does the rest, with the numbers in the metadata: `env.action_to_pwm`
+    (`dead_zone`, `pwm_limit`, `ramp`) and closed valves after `stand_s` of a zero goal.
 
-    ValueError: the package onnx is not there.
+    ValueError: the package onnx is not installed.
     """
-    names = "onnx", "onnx.checker", "onnx.helper", "onnx.numpy_helper"
-    onnx, checker, helper, numpy_helper = (require(name, "export") for name in names)
-    layers = len(policy.weights) // 2
-    arrays = {f"{'wb'[i % 2]}{i // 2}": weight for i, weight in enumerate(policy.weights)}
+    onnx = require("onnx", "export")
+    helper = require("onnx.helper", "export")
+    checker = require("onnx.checker", "export")
+    from_array = require("onnx.numpy_helper", "export").from_array
     nodes = []
-    for i in range(layers):
-        source = "observation" if i == 0 else f"y{i - 1}"
-        target = "action" if i == layers - 1 else f"x{i}"
+    arrays = []
+    source = "observation"
+    last = len(policy.weights) // 2 - 1
+    for i in range(last + 1):
+        arrays.append(from_array(policy.weights[2 * i].astype(np.float32), f"w{i}"))
+        arrays.append(from_array(policy.weights[2 * i + 1].astype(np.float32), f"b{i}"))
+        target = "action" if i == last else f"x{i}"
         nodes.append(helper.make_node("Gemm", [source, f"w{i}", f"b{i}"], [target]))
-        if i < layers - 1:
-            nodes.append(helper.make_node("Elu", [target], [f"y{i}"]))
-    sizes = {"observation": len(policy.mean), "action": policy.weights[-1].shape[-1]}
-    info = helper.make_tensor_value_info
-    ends = [info(name, onnx.TensorProto.FLOAT, ["batch", size]) for name, size in sizes.items()]
-    values = [
-        numpy_helper.from_array(array.astype(np.float32), name) for name, array in arrays.items()
-    ]
-    graph = helper.make_graph(nodes, "policy", ends[:1], ends[1:], values)
+        if i < last:
+            source = f"y{i}"
+            nodes.append(helper.make_node("Elu", [target], [source]))
+    ends = []
+    for name, size in (("observation", len(policy.mean)), ("action", len(policy.weights[-1]))):
+        ends.append(helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["batch", size]))
+    graph = helper.make_graph(nodes, "policy", ends[:1], ends[1:], arrays)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    contract = {key: json.dumps(value) for key, value in policy.contract.items()}
-    scales = {"mean": json.dumps(policy.mean.tolist()), "scale": json.dumps(policy.scale.tolist())}
-    after = {
-        "ramp": json.dumps(COMPENSATION),
-        "stand_s": json.dumps(STANDSTILL_TIMEOUT),
-    }  # see `action_to_pwm`, `PolicyController`
-    helper.set_model_props(model, contract | scales | after)
+    metadata = {
+        **policy.contract,
+        "mean": policy.mean.tolist(),
+        "scale": policy.scale.tolist(),
+        "ramp": COMPENSATION,
+        "stand_s": STANDSTILL_TIMEOUT,
+    }
+    helper.set_model_props(model, {name: json.dumps(value) for name, value in metadata.items()})
     checker.check_model(model, full_check=True)
     with whole_file(path) as file:
         file.write(model.SerializeToString())

@@ -22,7 +22,7 @@ from brokk_min.identification.net_file import net_arrays, net_from_arrays
 from brokk_min.machine import Array, Machine
 
 STANDSTILL_TIMEOUT = 2.0  # s, assumed: valves close when the goal was zero for longer
-FORMAT = 3  # of policy files; 1: actions without the way through the dead zone; 2: commands beside angles
+FORMAT = 3  # of policy files
 
 
 @dataclass(frozen=True)
@@ -37,9 +37,9 @@ class Policy:
     net: ActuatorNet  # the simulation it was trained in, kept with it
 
     def act(self, observation: Array) -> Array:
-        """Actions (..., n_driven) for observations (..., obs) of `env.features`; `action_to_pwm` clips them.
+        """Actions (..., n_driven), not clipped, for observations (..., obs) of `env.features`.
 
-        ValueError: a wrong shape or an observation that is no number.
+        ValueError: a wrong shape, or an observation that is not finite.
         """
         x: Array = np.asarray(observation, np.float32)
         if x.shape[-1:] != self.mean.shape:
@@ -59,8 +59,8 @@ class Policy:
 class PolicyController:
     """A policy as an `evaluation.rollout.Controller`.
 
-    A policy keeps its valves just open where the tool is to stand still, as if it were to move again
-    at once. The tool then drifts. So the valves close after `STANDSTILL_TIMEOUT` of a zero goal.
+    At a zero goal a policy keeps the valves just open, ready for the next goal, and the tool
+    drifts. So the valves close after `STANDSTILL_TIMEOUT` of a zero goal.
     """
 
     machine: Machine
@@ -114,8 +114,8 @@ def save_policy(path: Path, policy: Policy) -> None:
 def load_policy(path: Path, machine: Machine) -> Policy:
     """Read a policy for `machine`.
 
-    ValueError: no policy file, or one for another machine, joint order, history, rate or scale, with what
-    was wanted and what was found.
+    ValueError: not a policy file, or one for another machine, joint order, history, rate or scale,
+    with what was expected and what was found.
     """
     arrays = load_arrays(path)
     header = load_header(path, arrays, "policy", FORMAT)

@@ -1,17 +1,20 @@
 """Advantages from the simulation's derivatives: backpropagation through time instead of a critic.
 
-The simulation is made of nets and kinematics, so the rewards to come can be differentiated by each
-action. With the state x_t (history, angles, error integral) and x_{t+1} = f(x_t, a_t), the costate
+The simulation consists of nets and kinematics, so its rewards can be differentiated by the actions.
+With the state x_t (history, angles, error integral) and x_{t+1} = f(x_t, a_t), the costate
 
     lambda_t = dr_t/dx_t + gamma (df/dx_t)^T lambda_{t+1}
 
-runs backwards through a rollout, and dR/da_t = dr_t/da_t + gamma (df/da_t)^T lambda_{t+1}. The advantage of an
-action is, to first order, this gradient times its deviation from the mean action. The field calls
-this a first-order or gradient-informed policy gradient: PODS (Mora et al., 2021), SHAC (Xu et al.,
-2022), GI-PPO (Son et al., 2023, arXiv 2312.08710). Here it feeds PPO's clipped loss.
+runs backwards through a rollout; it gives the derivative of the discounted rewards to come,
 
-Encoders and commands count as exact, not as whole steps; Jacobian and dead-zone compensation count
-as constant: in one second a joint turns little.
+    dR_t/da_t = dr_t/da_t + gamma (df/da_t)^T lambda_{t+1}.
+
+The advantage of an action is, to first order, this gradient times its deviation from the mean. The
+field calls it a first-order or gradient-informed policy gradient: PODS (Mora et al., 2021), SHAC
+(Xu et al., 2022), GI-PPO (Son et al., 2023, arXiv 2312.08710). Here it feeds PPO's clipped loss.
+
+Angles and commands count as exact, not rounded; the error integral takes each tick's own velocity;
+Jacobians count as constant: in one second a joint turns little.
 """
 
 from typing import NamedTuple
@@ -71,47 +74,45 @@ def gradient_advantages(machine: Machine, net: ActuatorNet, task: TaskConfig) ->
 def action_gradients(
     machine: Machine, net: ActuatorNet, ticks: Ticks, gamma: float, task: TaskConfig
 ) -> Array:
-    """dR/da_t: derivative of the discounted rewards to come by each action, all others as they were.
+    """dR_t/da_t: derivative of the discounted rewards to come by each action.
 
     Args:
         machine: n joints.
         net: nets of its driven joints, which made the rollout.
-        ticks: T ticks of `num` environments; rewards after the last are not seen.
+        ticks: T ticks of `num` environments; rewards after the last do not count.
         gamma: discount.
         task: its costs of valve travel and of the error integral.
 
     Returns:
         Shape (T, num, n_driven), float32, by actions as `env.action_to_pwm` takes them.
     """
-    du_da = compensation_derivative(machine, ticks.u)
     dr_dq_dot, dq_dot_dh, free = local_derivatives(machine, net, ticks, gamma, task.integral_cost)
     dc_du = valve_cost_gradient(machine, ticks, task.valve_cost)
     window = machine.velocity_samples
     slope = estimate_velocity(np.eye(window), window, machine.dt).astype(np.float32)  # dq_dot/dq
-    dR_da = np.empty_like(dr_dq_dot)
-    # costates of history (num, n_driven, 3, H), angle and last command (num, n_driven), at t + 1
-    h, q, u = np.zeros_like(dq_dot_dh[0]), np.zeros_like(dc_du[0]), np.zeros_like(dc_du[0])
-    for t in reversed(range(len(dR_da))):
+    dR_du = np.empty_like(dr_dq_dot)
+    h = np.zeros_like(dq_dot_dh[0])  # costate of the history, (num, n_driven, 3, H)
+    q = np.zeros_like(dc_du[0])  # of the angle, (num, n_driven)
+    u = np.zeros_like(dc_du[0])  # of the last command
+    for t in reversed(range(len(dR_du))):
         discount = np.float32(gamma) * ~ticks.done[t, :, None]
-        h = h * discount[..., None, None]
-        q = q * discount
-        u = u * discount
+        h = discount[..., None, None] * h
         h[..., 0, -window:] += h[..., 1, -1:] * slope  # the newest velocity is a slope of angles
-        q = (q + h[..., 0, -1]) * free[t]  # q_{t+1} = q_t + dt q_dot; none at a limit
-        q_dot = q * np.float32(machine.dt) + dr_dq_dot[t]
-        h_now = q_dot[..., None, None] * dq_dot_dh[t]  # (dq_dot/dh)^T
+        q = free[t] * (discount * q + h[..., 0, -1])  # q_{t+1} = q_t + dt q_dot; none at a limit
+        q_dot = np.float32(machine.dt) * q + dr_dq_dot[t]
+        h_now = q_dot[..., None, None] * dq_dot_dh[t]  # (dq_dot/dh)^T q_dot
         h_now[..., :2, 1:] += h[..., :2, :-1]  # the shift of the history, backwards
         h_now[..., 2, :] += h[..., 2, :]  # the net reads commands already shifted
-        dR_da[t] = (h_now[..., 2, -1] - dc_du[t] + u) * du_da[t]
+        dR_du[t] = h_now[..., 2, -1] + discount * u - dc_du[t]
         h_now[..., 2, 1:] = h_now[..., 2, :-1]
         h_now[..., 2, 0] = 0
         h = h_now
         u = dc_du[t]
-    return dR_da
+    return dR_du * compensation_derivative(machine, ticks.u)
 
 
 def valve_cost_gradient(machine: Machine, ticks: Ticks, valve_cost: float) -> Array:
-    """Derivative of the cost of valve travel by the command of the tick, (T, num, n_driven)."""
+    """dc_t/du_t = -dc_t/du_{t-1} of the cost c_t of valve travel, (T, num, n_driven)."""
     change = (ticks.u - ticks.true_history[..., 2, -1])[..., machine.driven]
     limit = len(machine.driven) * machine.pwm_limit / PWM_MAX
     return np.sign(change).astype(np.float32) * np.float32(valve_cost / limit)
@@ -120,18 +121,18 @@ def valve_cost_gradient(machine: Machine, ticks: Ticks, valve_cost: float) -> Ar
 def local_derivatives(
     machine: Machine, net: ActuatorNet, ticks: Ticks, gamma: float, integral_cost: float
 ) -> tuple[Array, Array, Array]:
-    """Derivatives within each tick, (T, num, n_driven, ...).
+    """Derivatives within each tick, (T, num, n_driven, ...), and 1 where no limit holds.
 
-    dr/dq_dot; dq_dot/dhistory (3, H) with the command of the tick in it; 1 where no limit holds.
+    dr/dq_dot; dq_dot/dh (3, H) for the history h with the command of the tick in it.
     """
     driven = machine.driven
     low, high = machine.column("q_min")[driven], machine.column("q_max")[driven]
     history = append_command(ticks.true_history[..., driven, :, :], ticks.u[..., driven])
     velocity, dq_dot_dh = input_gradient(net, history)
-    moved = ticks.q[..., driven] + velocity * machine.dt
+    q_next = ticks.q[..., driven] + velocity * machine.dt
+    free = (low <= q_next) & (q_next <= high)
     q = ticks.q.copy()
-    q[..., driven] = np.clip(moved, low, high)
-    free = q[..., driven] == moved
+    q[..., driven] = np.clip(q_next, low, high)
     J = jacobian(forward_kinematics(machine, q.astype(np.float32)))[..., driven]
     error = ticks.v_goal - (J @ (velocity * free).astype(np.float32)[..., None])[..., 0]
     size = np.linalg.norm(error, axis=-1, keepdims=True)
@@ -145,10 +146,10 @@ def local_derivatives(
 def integral_gradient(
     machine: Machine, ticks: Ticks, error: Array, gamma: float, cost: float
 ) -> Array:
-    """Derivative of the cost of the error integral, now and later, by v_tool, (T, num, 3).
+    """Derivative of -cost |I_t|, now and later, by v_tool (T, num, 3); `error` e_t [m/s] the same.
 
-    I_t = exp(-dt/T) (I_{t-1} + dt cut(e_t)), cost |I_t|. Where the error [m/s] (T, num, 3) is cut,
-    only its direction counts.
+    I_t = exp(-dt/T) (I_{t-1} + dt cut(e_t)), e_t = v_goal - v_tool. Where e_t is cut, only its
+    direction counts.
     """
     limit = INTEGRAL_LIMIT * machine.tool_speed
     leak = np.exp(-machine.dt / INTEGRAL_TIME)

@@ -41,6 +41,7 @@ class BusOptions:
 class Request(NamedTuple):
     """Input of the operator at the window."""
 
+    time: float  # of the window's monotonic clock [s]
     mode: int  # index of the controller; the last one is the levers
     enable: bool  # dead-man switch
     alive: bool  # is the input device there?
@@ -56,20 +57,19 @@ class WindowOperator:
     ) -> None:
         self.connection = connection
         self.clock = clock
-        self.request = Request(0, False, False, np.zeros(3), np.zeros(len(machine.driven)))
-        self.time = clock()  # of the newest request [s]
+        none = np.zeros(len(machine.driven))
+        self.request = Request(-np.inf, 0, False, False, np.zeros(3), none)
 
     @property
     def silent(self) -> bool:
         """Has there been no request for `SILENCE`?"""
-        return self.clock() - self.time > SILENCE
+        return self.clock() - self.request.time > SILENCE
 
     def __call__(self, driving: bool, ready: bool) -> OperatorInput:
         """The operator's input in this tick."""
         try:
             while self.connection.poll():
                 self.request = self.connection.recv()
-                self.time = self.clock()
         except (EOFError, OSError):
             return OperatorInput(stop=True)
         if self.silent:
@@ -130,18 +130,12 @@ class WindowDrive(Drive):
     def telemetry(self) -> Telemetry:
         """State after a tick."""
         q, q_dot = self.measured
-        return Telemetry(
-            tick=self.ticks,
-            q=q,
-            q_dot=q_dot,
-            u=self.gate.sent[..., -1] / PWM_MAX,
-            v_goal=np.array(self.operator_input.v_goal),
-            driving=bool(self.gate.driving),
-            active_fault=int(self.gate.active_fault),
-            latched_fault=int(self.gate.latched_fault),
-            mode=self.window.request.mode,
-            lateness=self.lateness,
-        )
+        u = self.gate.sent[..., -1] / PWM_MAX
+        v_goal = np.array(self.operator_input.v_goal)
+        gate = self.gate
+        flags = (bool(gate.driving), int(gate.active_fault), int(gate.latched_fault))
+        mode = self.window.request.mode
+        return Telemetry(self.ticks, q, q_dot, u, v_goal, *flags, mode, self.lateness)
 
 
 def control(
@@ -155,7 +149,7 @@ def control(
             operator = WindowOperator(machine, connection)
             drive = WindowDrive(machine, controllers, bus, operator)
             drive.begin()
-            operator.time = operator.clock()
+            connection.send(drive.telemetry())  # from now on the window sends requests
             drive.run()
     except Exception as error:
         text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"

@@ -111,14 +111,6 @@ class Camera(NamedTuple):
         return self.origin + self.scale * (np.asarray(p) @ self.axes.T) * (1, -1)
 
 
-class Extent(NamedTuple):
-    """Space that an arm takes: low and high ends (2, 2) of right and up in both views [m]."""
-
-    side: Array
-    top: Array
-    reach: float  # m
-
-
 def skeleton(machine: Machine, q: ArrayLike) -> Array:
     """Corners of the arm [m], (..., 2 n + 1, 3): base, then the ends of each joint's d and a."""
     p, z = forward_kinematics(machine, q)
@@ -129,8 +121,11 @@ def skeleton(machine: Machine, q: ArrayLike) -> Array:
 
 
 @lru_cache(maxsize=32)
-def extent(machine: Machine) -> Extent:
-    """Extent of 2,000 random poses, no lower than the ground if the arm reaches it."""
+def extent(machine: Machine) -> tuple[Array, Array, float]:
+    """Space that 2,000 random poses take, no lower than the ground if the arm reaches it.
+
+    Low and high ends (2, 2) of right and up from the side and from above; the reach [m].
+    """
     low, high = machine.column("q_min"), machine.column("q_max")
     p = skeleton(machine, np.random.default_rng(0).uniform(low, high, (2000, machine.n)))
     reach = float(np.hypot(p[..., 0], p[..., 1]).max()) + 1e-3
@@ -138,14 +133,13 @@ def extent(machine: Machine) -> Extent:
     top = _bounds(p @ ABOVE.T, 0.2 * reach)
     if side[0, 1] - 0.2 * reach < machine.ground < side[1, 1]:
         side[0, 1] = machine.ground
-    return Extent(side, top, reach)
+    return side, top, reach
 
 
-def _bounds(flat: Array, smallest: float) -> Array:
-    """Low and high ends (2, 2) of projected points (..., 2), at least `smallest` apart."""
-    points = flat.reshape(-1, 2)
-    low = points.min(axis=0)
-    return np.stack([low, np.maximum(points.max(axis=0), low + smallest)])
+def _bounds(points: Array, smallest: float) -> Array:
+    """Low and high ends (2, 2) of points (..., 2), at least `smallest` apart."""
+    low = points.reshape(-1, 2).min(axis=0)
+    return np.stack([low, np.maximum(points.reshape(-1, 2).max(axis=0), low + smallest)])
 
 
 def _side_axes(p_tool: Array) -> Array:
@@ -158,30 +152,28 @@ def _side_axes(p_tool: Array) -> Array:
     return axes
 
 
-def cameras(
-    machine: Machine, p_tool: Array, layout: Layout, in_view: Array
-) -> tuple[Camera, Camera]:
+def cameras(machine: Machine, p_tool: Array, layout: Layout, in_view: Array) -> list[Camera]:
     """From the side, in the vertical plane of the tool, and from above with x up and y left.
 
     They show the whole reach, or what lies around the points `in_view` [m] (K, 3), if any.
     """
-    arm = extent(machine)
+    side, top, reach = extent(machine)
     axes = _side_axes(p_tool)
-    bounds = [arm.side, arm.top]
     if len(in_view):
-        border = MARGIN * arm.reach * np.array([[-1], [1]])
-        bounds = [_bounds(in_view @ a.T, 0.0) + border for a in (axes, ABOVE)]
-    return _fit(layout.side, bounds[0], axes), _fit(layout.top, bounds[1], ABOVE)
+        border = MARGIN * reach * np.array([[-1], [1]])
+        side = _bounds(in_view @ axes.T, 0.0) + border
+        top = _bounds(in_view @ ABOVE.T, 0.0) + border
+    return [_fit(layout.side, side, axes), _fit(layout.top, top, ABOVE)]
 
 
 def _fit(box: Box, bounds: Array, axes: Array) -> Camera:
     """The camera that shows the bounds [m] (2, 2) in a box, above a strip of soil."""
     left, upper, width, height = box
     low, high = bounds
-    span = high - low
     soil = 0.07 * height
+    span = high - low
     scale = 0.92 * float(min(width / span[0], (height - 2 * soil) / span[1]))
-    x = left + width / 2 - scale * (low + high)[0] / 2
+    x = left + width / 2 - scale * (low[0] + high[0]) / 2
     return Camera(np.array([x, upper + height - soil + scale * low[1]]), scale, axes)
 
 
@@ -271,7 +263,8 @@ def _arm(canvas: Canvas, machine: Machine, camera: Camera, scene: Scene) -> None
     """Links that taper towards the tool, joints at their frames; near a limit red and larger."""
     corners = camera.project(skeleton(machine, scene.q))
     warned = near_limit(machine, scene.q)
-    thick = min(30.0, max(3.0, 0.032 * extent(machine).reach * camera.scale))
+    _, _, reach = extent(machine)
+    thick = float(np.clip(0.032 * reach * camera.scale, 3.0, 30.0))
     sizes = np.linspace(thick, 0.45 * thick, 2 * machine.n + 1)
     sizes[-1] = 0.12 * thick
     base = [[-2.0, -0.9], [2.0, -0.9], [2.3, 0.0], [-2.3, 0.0]]

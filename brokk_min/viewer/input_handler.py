@@ -1,5 +1,6 @@
 """Keyboard and gamepad as one operator, for the window of `play`."""
 
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -34,6 +35,7 @@ class InputHandler:
         self.pygame = pygame
         self.modes = modes
         self.mode = 0
+        self.time = time.monotonic()  # of the last request [s]
         self.held = set[int]()  # keys
         self.focus = True
         self.blocked = True  # must the switch be released first?
@@ -99,22 +101,25 @@ class InputHandler:
         self.mode = (self.mode + 1) % len(self.modes)
         self.blocked = True
 
-    def request(self, seconds: float) -> Request:
-        """The operator's input, `seconds` after the last time."""
+    def request(self, now: float) -> Request:
+        """The operator's input at a time [s]."""
         target = self._target()
         if self.deflection.shape != target.shape:
             self.deflection = np.zeros_like(target)
         last = np.where(target * self.deflection < 0, 0.0, self.deflection)
-        step = seconds / RISE
+        step = (now - self.time) / RISE
+        self.time = now
         ramp = last + np.clip(target - last, -step, step)
         self.deflection = np.where(target == 0, 0.0, ramp)  # released: neutral at once
         self._update_switch(bool(target.any()))
         alive = not self.lost
         if self.levers:
-            return Request(self.mode, self.enable, alive, np.zeros(3), self.deflection)
+            return Request(now, self.mode, self.enable, alive, np.zeros(3), self.deflection)
         length = float(np.linalg.norm(self.deflection))
         v_goal = self.machine.tool_speed * self.deflection / max(1.0, length)
-        return Request(self.mode, self.enable, alive, v_goal, np.zeros(len(self.machine.driven)))
+        return Request(
+            now, self.mode, self.enable, alive, v_goal, np.zeros(len(self.machine.driven))
+        )
 
     def _target(self) -> Array:
         """Deflections of stick or levers in [-1, 1]; keys give a third of it with shift."""

@@ -196,13 +196,11 @@ def show(
     """
     modes = session.modes or [""]
     handler = InputHandler(session.machine, window.pygame, modes)
-    before = time.monotonic()
     while not handler.closed and each_frame(session, handler):
         for event in window.pygame.event.get():
             handler.handle(event)
         now = time.monotonic()
-        request = handler.request(now - before)
-        before = now
+        request = handler.request(now)
         for telemetry in receive():
             session.update(telemetry, now)
         if session.telemetry is not None:

@@ -24,7 +24,7 @@ def task_lines(machine: Machine) -> dict[str, Array]:
 
     A level rectangle, an upright circle, lines along the axes; none goes below its start.
     """
-    reach = extent(machine).reach
+    _, _, reach = extent(machine)
     angle = np.linspace(0, 2 * np.pi, 60)
     rectangle = np.array([[0, 0, 0], [0, 0.16, 0], [0.1, 0.16, 0], [0.1, 0, 0], [0, 0, 0]])
     circle = 0.06 * np.stack([np.sin(angle), 0 * angle, 1 - np.cos(angle)], axis=1)

@@ -61,13 +61,7 @@ class Canvas:
         self.polygon(np.array(corners), colour)
 
     def text(
-        self,
-        x: float,
-        y: float,
-        text: str,
-        size: int = 13,
-        colour: Colour = INK,
-        anchor: float = 0.0,
+        self, x: float, y: float, text: str, size: int, colour: Colour = INK, anchor: float = 0.0
     ) -> None:
         """Text at half its height; `anchor` 0 puts its left end at x, 1 its right end."""
         word = _word(text, size, colour)

@@ -253,7 +253,9 @@ def test_make_learner__starts_from_the_seed_alone(log_std_end):
     config = replace(SMALL, log_std_end=log_std_end)
     tape = Tape()
     before = torch.get_rng_state()
+    torch.set_num_threads(2)  # nets of another number of threads differ in the last bits
     first = ppo.make_learner(tape, config, 5, critic=True)
+    assert torch.get_num_threads() == 1
     assert torch.equal(torch.get_rng_state(), before)  # of torch's own generator
     torch.rand(1)
     second = ppo.make_learner(tape, config, 5, critic=True)
@@ -420,7 +422,6 @@ def test_train__takes_another_estimate_and_goes_on_with_a_learner():
         logged.append(metrics)
 
     agent = ppo.train(tape, config, 0, on_update, rewards_as_advantages, learner)
-    assert torch.get_num_threads() == 1
     assert agent is learner.agent
     assert learner.global_step == 96
     assert [metrics["losses/value_loss"] for metrics in logged] == [0.0, 0.0]

@@ -94,7 +94,7 @@ def planted(name: str, right: str, wrong: str) -> Iterator[None]:
 def copy_of(test: str) -> Any:
     """A test function, from its file imported once more; a property stops at the first failure."""
     (path,) = [path for path in FILES if f"\ndef {test}(" in path.read_text()]
-    name = f"copy_of_{path.stem}"
+    name = f"copy_of_{path.parent.name}_{path.stem}"
     if name not in sys.modules:
         spec = importlib.util.spec_from_file_location(name, path)
         assert spec

@@ -1,286 +1,328 @@
-"""Recorded runs: what results files tell, runs driven again, and the films of them, with stand-ins beside."""
+"""Recorded runs: of logs, of results simulated again, and films of them."""
 
 from __future__ import annotations
 
-import contextlib
 import io
 import json
-from itertools import pairwise
+import os
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
+import can
 import numpy as np
 import pygame
 import pytest
-from conftest import Stand
+from helpers_bus import BASELINE, START, Push
+from helpers_viewer import PipedLoop, post_key
 from PIL import Image
 
-from brokk_min.can.drive_log import Telemetry
-from brokk_min.evaluation import baselines, metrics
+from benchmarks.bus import random_policy
+from brokk_min.__main__ import main
+from brokk_min.evaluation import baselines
 from brokk_min.evaluation.sequences import task_sequences
-from brokk_min.kinematics import tool_state
+from brokk_min.kinematics import forward_kinematics, jacobian, tool_position
+from brokk_min.learning.policy import save_policy
 from brokk_min.machine import BROKK_170
-from brokk_min.viewer import drawing as view
-from brokk_min.viewer import replay
-from brokk_min.viewer.drawing import skeleton
+from brokk_min.viewer import drawing, replay
+from brokk_min.viewer.replay import Run
 
-START = np.array([0.0, 0.5, 0.58, 1.71, 1.24])
-
-
-def known(ticks: int) -> list[Telemetry]:
-    """The cabin turns at 0.1 rad/s; asked for is 0.1 m/s aside and 0.05 m/s upward."""
-    row = np.array([0.1, 0, 0, 0, 0]), np.full(5, 0.3), np.array([0, 0.1, 0.05])
-    return [Telemetry(k, START + 0.005 * k * np.eye(5)[0], *row, driving=True) for k in range(ticks)]
+COLOUR = (1, 2, 3)
 
 
-def test_a_run_has_the_tools_way_its_error_and_all_that_must_be_in_the_picture() -> None:
-    told, path = known(25), np.array([[9.0, 0, 0], [9, 1, 0]])
-    run = replay.recorded(BROKK_170, "a", (1, 2, 3), told, path)
-    q, q_dot = np.array([k.q for k in told]), np.array([k.q_dot for k in told])
-    p_tool, v_tool, _ = tool_state(BROKK_170, q, q_dot)
-    np.testing.assert_array_equal(run.p_tool, p_tool)
-    np.testing.assert_allclose(run.error, np.sqrt(np.square(v_tool - [0, 0.1, 0.05]).sum(axis=1)))
-    corners = skeleton(BROKK_170, q[[0, 10, 20]]).reshape(-1, 3)
-    np.testing.assert_array_equal(run.hold, np.vstack([corners, path]))
-    assert run[:3] == ("a", (1, 2, 3), told) and run.path is path
+@pytest.fixture(autouse=True)
+def no_display(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    pygame.display.init()
+    pygame.event.clear()
 
 
-# --- results ----------------------------------------------------------------------------------------------
+def run_of(ticks: int, title: str = "a", path: np.ndarray = drawing.NO_POINTS) -> Run:
+    """The cabin turns at 0.1 rad/s; the goal is 0.1 m/s to the left and 0.05 m/s upward."""
+    q = np.array(START) + 0.005 * np.arange(ticks)[:, None] * np.eye(5)[0]
+    q_dot = np.tile([0.1, 0, 0, 0, 0], (ticks, 1))
+    v_goal = np.tile([0, 0.1, 0.05], (ticks, 1))
+    return Run(BROKK_170, title, COLOUR, q, q_dot, np.full((ticks, 5), 0.3), v_goal, path)
 
 
-def test_results_name_what_it_takes_to_drive_them_again(stand: Stand, tmp_path: Path) -> None:
-    path, sequence = tmp_path / "r.json", SimpleNamespace(name="up")
-    drawn = np.ones((3, 5))
-    calls = stand(
-        replay, load_policy=SimpleNamespace(net="nets"), goals_and_starts=([sequence], drawn)
-    )
-    stand(baselines, read_gains={"pid": "tuned"})
-    meta: dict[str, Any] = {"machine": "brokk170", "seed": 4}
-    path.write_text(json.dumps({"meta": meta, "task_space": {"runs": [1]}, "starts": [[1, 2]]}))
-    of_reproduce = replay.read_results(BROKK_170, path, ["pid", "rl"])
-    assert of_reproduce[:3] == (path, [1], {"up": sequence}) and of_reproduce[5:] == (None, 4)
-    assert of_reproduce.starts.tolist() == [[1, 2]] and of_reproduce.starts.dtype == float
-    assert (
-        list(of_reproduce.controllers) == ["rl", "pid"]
-        and of_reproduce.controllers["pid"] == "tuned"
-    )
-    assert calls.pop("goals_and_starts") == (BROKK_170, None, None, 0, 4)
-    assert calls.pop("load_policy") == (tmp_path / "policy.npz", BROKK_170)
-    assert calls.pop("read_gains") == (tmp_path / "gains.json", BROKK_170, "nets")
-    meta |= {
-        "plant": "net",
-        "commands": "c.csv",
-        "starts": "s.csv",
-        "policy": "p.npz",
-        "gains": "g.json",
-    }
-    path.write_text(json.dumps({"meta": meta, "runs": [2]}))
-    found = replay.read_results(BROKK_170, path, ["rl"])
-    assert found.runs == [2] and found.starts is drawn and found.net == "nets"
-    assert calls["goals_and_starts"] == (BROKK_170, Path("c.csv"), Path("s.csv"), 0, 4)
-    assert calls["load_policy"][0] == Path("p.npz") and "read_gains" not in calls
-    replay.read_results(BROKK_170, path, ["pid"])
-    assert calls["read_gains"][0] == Path("g.json")
-    own = ", ".join(s.name for s in task_sequences(BROKK_170))
-    path.write_text(json.dumps({"meta": meta | {"commands": own, "starts": "3"}, "runs": [2]}))
-    replay.read_results(BROKK_170, path, ["rl"])
-    assert calls["goals_and_starts"][1:] == (None, None, 3, 4)
-    path.write_text(json.dumps({"meta": meta | {"machine": "mini"}, "runs": []}))
-    with pytest.raises(ValueError, match=r"r\.json: expected --machine mini, got brokk170$"):
-        replay.read_results(BROKK_170, path, ["rl"])
-    path.write_text("{}")
-    with pytest.raises(
-        ValueError, match=r"r\.json: expected results of `evaluate`, got KeyError\('meta'\)"
-    ):
-        replay.read_results(BROKK_170, path, ["rl"])
+def recorded_log(path: Path, controller: Any, seconds: float, v: Any) -> PipedLoop:
+    """A loop that has stood for 0.5 s and driven for some more, with a log of it."""
+    loop = PipedLoop(controller, log=can.CanutilsLogWriter(path))
+    loop.go(0.5, False)
+    loop.go(0.2, True)
+    loop.go(seconds, True, v)
+    loop.close()
+    return loop
 
 
-def test_runs_driven_again_are_those_of_the_file(stand: Stand) -> None:
-    def row(
-        rmse: float, controller: str = "rl", sequence: str = "up", start: int = 1
-    ) -> dict[str, Any]:
-        return {
-            "controller": controller,
-            "sequence": sequence,
-            "start": start,
-            "velocity_rmse": rmse,
-        }
+# --- runs -----------------------------------------------------------------------------------------
 
-    goals = np.array([[0.1, 0, 0], [0.1, 0, 0.2]])
-    sequences = {"up": SimpleNamespace(goals=goals), "to": SimpleNamespace(goals=2 * goals)}
-    arrays = np.arange(2 * 2 * 5).reshape(2, 2, 5) / 100
-    trace = SimpleNamespace(q=START + arrays, q_dot=arrays + 1, u=arrays + 2)
-    other = [row(5.0, start=0), row(5.0, sequence="to"), row(5.0, start=0, sequence="to")]
-    chosen = ["rl", "pid"]
-    stored = [row(1.0), row(2.0, "pid"), *other]
-    results = replay.Results(
-        Path("r.json"), stored, sequences, np.stack([START + 1, START]), {}, "net", 3
-    )  # type: ignore[arg-type]
-    results.controllers.update(dict.fromkeys(["more", *chosen], "drives"))  # type: ignore[arg-type]
-    traces = {(name, s): trace for name in chosen for s in sequences}
-    found = [row(1.0005), row(2.001, "pid"), *(r | {"velocity_rmse": 7.0} for r in other)]
-    calls = stand(metrics, evaluate=(found, traces))
-    runs = replay.driven_again(BROKK_170, results, chosen, "up", 1)
-    assert calls["evaluate"][:2] == (BROKK_170, dict.fromkeys(chosen, "drives"))
-    assert calls["evaluate"][2:] == (list(sequences.values()), results.starts, 3, "net")
-    assert [run.title for run in runs] == chosen
-    assert [run.colour for run in runs] == [view.COLOURS["rl"], view.STEEL]
+
+def test_run__has_tool_positions_velocity_error_and_all_that_must_be_in_view() -> None:
+    path = np.array([[9.0, 0, 0], [9, 1, 0]])
+    run = run_of(25, path=path)
+    frames = forward_kinematics(BROKK_170, run.q)
+    np.testing.assert_array_equal(run.p_tool, tool_position(frames))
+    v_tool = np.einsum("tij,tj->ti", jacobian(frames), run.q_dot)
+    expected = np.sqrt(np.square(v_tool - [0, 0.1, 0.05]).sum(axis=1))
+    np.testing.assert_allclose(run.error, expected)
+    corners = drawing.skeleton(BROKK_170, run.q[[0, 10, 20]]).reshape(-1, 3)
+    np.testing.assert_array_equal(run.in_view, np.vstack([corners, path]))
+
+
+def test_run_of_log__has_the_telemetry_of_the_loop_from_the_first_driven_tick(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "run.log"
+    loop = recorded_log(path, BASELINE, 2.0, (0.0, 0.2, 0.1))
+    run = replay.run_of_log(BROKK_170, path, COLOUR)
+    driven = [t for t in loop.ticks if t.driving][: len(run.q)]
+    assert len(run.q) >= 40
+    for name in ("q", "q_dot", "u", "v_goal"):
+        expected = np.array([getattr(t, name) for t in driven])
+        np.testing.assert_allclose(getattr(run, name), expected, atol=2e-5, err_msg=name)
+    assert (run.title, run.colour, run.path.shape) == ("run.log", COLOUR, (0, 3))
+    assert run.error[5] > 0.15  # it waits for the valves, then follows
+    assert run.error[-5:].mean() < 0.08
+
+
+def test_run_of_log__refuses_a_log_in_which_nothing_drives(tmp_path: Path) -> None:
+    idle = tmp_path / "idle.log"
+    idle.write_text("(1.0) can0 080# R\n(1.05) can0 080# R\n")
+    with pytest.raises(ValueError, match="expected a log in which the valves are driven, got none"):
+        replay.run_of_log(BROKK_170, idle, COLOUR)
+
+
+# --- results --------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What `evaluate` writes, of a policy and gains that nobody tuned."""
+    folder = tmp_path_factory.mktemp("results")
+    policy = random_policy(np.random.default_rng(0))
+    save_policy(folder / "policy.npz", policy)
+    about = baselines.gains_metadata(BROKK_170, policy.net)
+    baselines.write_gains(folder / "gains.json", baselines.baselines(BROKK_170, policy.net), about)
+    rows = "side,0,0,0.2,0\nside,1.5,0,0,0\nside,2,0,0,0\n"
+    (folder / "commands.csv").write_text(f"sequence,time,vx,vy,vz\n{rows}")
+    starts = "0,0.5,0.58,1.71,1.24\n0.5,0.5,0.58,1.71,1.24\n"
+    (folder / "starts.csv").write_text(f"q1,q2,q3,q4,q5\n{starts}")
+    files = ("policy", "policy.npz"), ("commands", "commands.csv"), ("starts", "starts.csv")
+    arguments = [f"--{option}={folder / name}" for option, name in files]
+    assert main(["evaluate", *arguments, f"--json={folder / 'runs.json'}"]) == 0
+    return folder / "runs.json"
+
+
+def test_simulate_again__gives_the_runs_of_the_file_along_the_goals(results: Path) -> None:
+    names = ["rl", "jacobian_pid_k0.1"]
+    read = replay.read_results(BROKK_170, results, names)
+    runs = replay.simulate_again(BROKK_170, read, names, "side", 1)
+    assert [run.title for run in runs] == names
+    assert [run.colour for run in runs] == [drawing.COLOURS["rl"], drawing.COLOURS["jacobian"]]
+    p_start = tool_position(forward_kinematics(BROKK_170, np.array([0.5, *START[1:]])))
+    rows = {row["controller"]: row for row in json.loads(results.read_text())["runs"][1::2]}
     for run in runs:
-        assert [k.tick for k in run.known] == [0, 1] and all(k.driving for k in run.known)
-        for k, one in enumerate(run.known):
-            np.testing.assert_array_equal(
-                np.stack(one[1:4]), [trace.q[k, 1], trace.q_dot[k, 1], trace.u[k, 1]]
-            )
-            np.testing.assert_array_equal(one.v_goal, goals[k])
-        way = np.array([[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0.2]]) * 0.05
-        np.testing.assert_allclose(run.path, tool_state(BROKK_170, START, 0 * START)[0] + way)
-    for wrong, told in ((row(1.003), r"\[{.*1\.0}\]"), (row(1.0, "pd"), "none")):
-        stand(metrics, evaluate=([wrong], traces))
-        with pytest.raises(
-            ValueError, match=rf"r\.json: expected the run {{.*}}, got {told}: another program"
-        ):
-            replay.driven_again(BROKK_170, results, chosen, "up", 1)
-
-
-# --- films --------------------------------------------------------------------------------------------------
-
-
-def test_a_film_goes_by_one_clock_and_what_is_over_stands_still(stand: Stand) -> None:
-    calls, told = stand(view, draw="shapes"), known(5)
-    long = replay.recorded(BROKK_170, "rl", (1, 2, 3), told, np.zeros((0, 3)))
-    long = long._replace(error=np.arange(5) / 7)
-    short = replay.recorded(BROKK_170, "my.log", (4, 5, 6), told[:3], np.ones((2, 3)))
-    assert replay.film(BROKK_170, [long, short], 4, (640, 360)) == "shapes"
-    machine, (first, second), size = calls["draw"]
-    assert machine is BROKK_170 and size == (640, 360)
-    assert (first.title, first.status, first.colour) == ("RL policy", "0.2 s", (1, 2, 3))
-    assert (second.title, second.status, second.colour) == ("my.log", "0.1 s", (4, 5, 6))
-    for scene, run, at in ((first, long, 4), (second, short, 2)):
-        assert scene[:4] == run.known[at][1:5] and scene.path is run.path
-        np.testing.assert_array_equal(scene.trail, run.p_tool)
-        np.testing.assert_array_equal(scene.hold, np.vstack([long.hold, short.hold]))
-        assert scene.notes == [
-            f"velocity error {run.error[at]:.3f} m/s",
-            f"mean so far {run.error.mean():.3f} m/s",
-        ]
-    replay.film(BROKK_170, [long], 1, (640, 360))
-    (scene,) = calls["draw"][1]
-    assert len(scene.trail) == 2 and scene.notes == [
-        "velocity error 0.143 m/s",
-        "mean so far 0.071 m/s",
-    ]
+        np.testing.assert_allclose(run.path[0], p_start)
+        np.testing.assert_allclose(run.path[-1], p_start + np.array([0, 0.3, 0]), atol=1e-6)
+        rmse = np.sqrt(np.mean(run.error**2))
+        assert rmse == pytest.approx(rows[run.title]["velocity_rmse"], rel=1e-3)
 
 
 @pytest.mark.parametrize(
-    ("fps", "ticks"), [(10.0, [0, 2, 4]), (7.0, [0, 3]), (100.0, [0, 1, 2, 3, 4])]
+    ("change", "message"),
+    [
+        (lambda f: f["runs"][1].update(velocity_rmse=9.0), r"the run {.*}, got \[{.*another prog"),
+        (lambda f: f["runs"][1].update(controller="other"), r"the run {.*}, got none: another"),
+        (lambda f: f["meta"].update(machine="mini"), "--machine mini, got brokk170"),
+        (lambda f: f.pop("meta"), r"results of `evaluate`, got KeyError\('meta'\)"),
+        (lambda f: f["meta"].update(policy="missing.npz"), "missing.npz"),
+        (lambda f: f["meta"].update(plant="net"), "expected the run"),
+    ],
 )
-def test_a_film_has_as_many_pictures_a_second_as_ticks_allow(
-    fps: float, ticks: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_results__that_are_not_those_of_the_file_are_refused(
+    change: Any, message: str, results: Path, tmp_path: Path
 ) -> None:
-    written: list[Any] = []
-    run = replay.recorded(BROKK_170, "rl", (1, 2, 3), known(5), np.zeros((0, 3)))
-    monkeypatch.setattr(replay, "film", lambda machine, runs, tick, size: (tick, size))
-    monkeypatch.setattr(replay, "picture", lambda shapes, size: (*shapes, size))
-    monkeypatch.setattr(
-        replay, "_write_gif", lambda file, images, *how: written.extend([list(images), how])
-    )
-    replay.write_film(
-        tmp_path / "f.gif", BROKK_170, [run, run._replace(known=known(2))], (64, 36), fps
-    )
-    assert written == [
-        [(k, (64, 36), (64, 36)) for k in ticks],
-        ((64, 36), 20.0 / (ticks[1] - ticks[0])),
-    ]
+    file = json.loads(results.read_text())
+    change(file)
+    wrong = tmp_path / "wrong.json"
+    wrong.write_text(json.dumps(file))
+    with pytest.raises(ValueError, match=message):
+        read = replay.read_results(BROKK_170, wrong, ["rl"])
+        replay.simulate_again(BROKK_170, read, ["rl"], "side", 1)
 
 
-def test_a_gif_runs_for_ever_and_keeps_the_colours_that_warn() -> None:
-    """Most of a picture is machine and paper; a red word is a hundred pixels, and not in every picture."""
-    rng, wanted = (
-        np.random.default_rng(0),
-        [*view.COLOURS.values(), *view.STATUS_COLOURS.values(), view.WARNING],
-    )
-    pictures = [rng.integers(0, 256, (60, 80, 3)).astype(np.uint8) for _ in range(3)]
-    for k, colour in enumerate([*wanted, view.MEASURED, view.PATH]):
-        pictures[1][2 * k : 2 * k + 2, :9] = colour
+def test_read_results__takes_files_of_reproduce_with_policy_and_gains_beside_them(
+    results: Path,
+) -> None:
+    file = json.loads(results.read_text())
+    meta = {key: file["meta"][key] for key in ("machine", "seed")}
+    whole = results.with_name("results.json")
+    starts = [list(START), [0.1, *START[1:]]]
+    content = {"meta": meta, "task_space": {"runs": file["runs"]}, "starts": starts}
+    whole.write_text(json.dumps(content))
+    read = replay.read_results(BROKK_170, whole, ["rl", "jacobian_pid_ff"])
+    assert read.rows == file["runs"]
+    assert read.starts.tolist() == starts
+    assert list(read.sequences) == [sequence.name for sequence in task_sequences(BROKK_170)]
+    assert {"rl", "jacobian_pid_ff"} <= set(read.controllers)
+    assert set(replay.read_results(BROKK_170, whole, ["rl"]).controllers) == {"rl"}
+
+
+# --- films ----------------------------------------------------------------------------------------
+
+
+def test_film__goes_by_one_clock_and_a_run_that_is_over_stands_still() -> None:
+    long, short = run_of(31, "rl"), run_of(11, "my.log")
+    images = {t: replay.film([long, short], t, (640, 360)).image() for t in (0, 10, 20, 30)}
+    title = np.s_[42:360, 320:540]  # without the clock above it
+    for tick in (20, 30):
+        np.testing.assert_array_equal(images[tick][:, 320:], images[10][:, 320:])
+        assert (images[tick][:, :320] != images[tick - 10][:, :320]).any()
+    assert (images[0][title] != images[10][title]).any()
+
+
+def test_write_film__simulates_results_again_into_a_gif(
+    results: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = results.with_name("film.gif")
+    command = ["replay", str(results), "--out", str(out), "--start", "1", "--size", "640", "360"]
+    assert main(command) == 0
+    film = Image.open(out)
+    assert (film.n_frames, film.size, film.info["duration"]) == (20, (640, 360), 100)  # type: ignore[attr-defined]
+    first = np.array(film.convert("RGB")).astype(int)
+    film.seek(19)
+    last = np.array(film.convert("RGB")).astype(int)
+    for half, colour in ((np.s_[:, :320], "rl"), (np.s_[:, 320:], "jacobian")):
+        error = np.abs(last[half] - drawing.COLOURS[colour]).sum(axis=-1)
+        assert (error < 12).sum() > 300
+        assert (first[half] != last[half]).any()
+
+
+@pytest.mark.parametrize(("fps", "frames"), [(10.0, 3), (7.0, 2), (100.0, 5)])
+def test_write_film__has_as_many_frames_a_second_as_ticks_allow(
+    fps: float, frames: int, tmp_path: Path
+) -> None:
+    replay.write_film(tmp_path / "f.gif", BROKK_170, [run_of(5), run_of(2)], (640, 360), fps)
+    film = Image.open(tmp_path / "f.gif")
+    assert film.n_frames == frames  # type: ignore[attr-defined]
+    assert film.info["duration"] == 50 * {3: 2, 2: 3, 5: 1}[frames]
+    assert film.info["loop"] == 0
+    with pytest.raises(ValueError, match=r"expected a name ending in .gif or .mp4, got '.avi'"):
+        replay.write_film(tmp_path / "f.avi", BROKK_170, [run_of(5)], (640, 360), fps)
+
+
+def test_gif__keeps_the_colours_that_warn_and_measure() -> None:
+    colours = [*drawing.COLOURS.values(), *drawing.SMALL_COLOURS, drawing.BACKGROUND]
+    image = np.full((60, 80, 3), 250, np.uint8)
+    for k, colour in enumerate(colours):
+        image[2 * k : 2 * k + 2, :9] = colour
     file = io.BytesIO()
-    replay._write_gif(file, pictures, (80, 60), 8.0)
-    film = Image.open(file)
-    assert (film.n_frames, film.size, film.info["duration"], film.info["loop"]) == (
-        3,
-        (80, 60),
-        120,
-        0,
-    )
-    replay._write_gif(one := io.BytesIO(), pictures[:1], (80, 60), 8.0)
-    assert Image.open(one).size == (80, 60)
-    film.seek(1)
-    shown = np.array(film.convert("RGB")).astype(int)
-    assert len(np.unique(shown.reshape(-1, 3), axis=0)) <= 96
-    for k, colour in enumerate([*wanted, view.MEASURED, view.PATH]):
-        assert np.abs(shown[2 * k : 2 * k + 2, :9] - colour).max() < 12
+    replay._write_gif(file, [image], (80, 60), 8.0)
+    shown = np.array(Image.open(file).convert("RGB")).astype(int)
+    for k, colour in enumerate(colours):
+        assert np.abs(shown[2 * k : 2 * k + 2, :9] - colour).max() <= 1
 
 
-def test_ffmpeg_is_told_what_the_pictures_are(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("script", "message"),
+    [
+        ('echo "$@" > told; cat > raw; echo film', ""),
+        ("exit 3", "film: expected ffmpeg to"),
+        ("cat > raw; exit 3", "film: expected ffmpeg to write it, got its status 3"),
+        (None, "film: expected ffmpeg for .mp4, or a name in .gif, got none"),
+    ],
+)
+def test_write_film__hands_raw_pictures_to_ffmpeg(
+    script: str | None, message: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    (tmp_path / "ffmpeg").write_text(f'#!/bin/sh\necho "$@" > {tmp_path}/told\ncat\n')
-    (tmp_path / "ffmpeg").chmod(0o755)
-    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
-    with (tmp_path / "film").open("wb") as file:
-        replay._write_mp4(file, [np.full((3, 5, 3), 7, np.uint8)] * 2, (5, 3), 10.0)
-    assert (tmp_path / "film").read_bytes() == bytes([7]) * 2 * 3 * 5 * 3
-    told = (tmp_path / "told").read_text().split()
-    options = {a: b for a, b in pairwise(told) if a.startswith("-")}
-    assert told[-1] == "pipe:1" and options["-loglevel"] == "error" and options["-i"] == "-"
-    before, after = told[: told.index("-i")], told[told.index("-i") :]
-    assert {"rawvideo", "rgb24", "5x3", "10.0"} <= set(before)  # of what comes in
-    assert {
-        "yuv420p",
-        "crop=trunc(iw/2)*2:trunc(ih/2)*2",
-        "mp4",
-        "frag_keyframe+empty_moov",
-    } <= set(after)
-    (tmp_path / "ffmpeg").write_text("#!/bin/sh\nexit 0\n")  # it ends well, but read nothing
-    large = [np.zeros((600, 600, 3), np.uint8)] * 2
-    with (tmp_path / "film").open("wb") as file:
-        with pytest.raises(
-            ValueError, match=r"^film: expected ffmpeg to write it, got its status 1$"
-        ):
-            replay._write_mp4(file, large, (600, 600), 10.0)
-        (tmp_path / "ffmpeg").unlink()
-        monkeypatch.setenv("PATH", str(tmp_path))
-        with pytest.raises(
-            ValueError, match=r"^film: expected ffmpeg for \.mp4, or a name ending in \.gif"
-        ):
-            replay._write_mp4(file, large, (600, 600), 10.0)
+    """Another ffmpeg: it keeps what it gets, ends early, fails, or is not there."""
+    monkeypatch.chdir(tmp_path)
+    if script is not None:
+        (tmp_path / "ffmpeg").write_text(f"#!/bin/sh\n{script}\n")
+        (tmp_path / "ffmpeg").chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}" if script else str(tmp_path))
+    out = tmp_path / "film.mp4"
+    if message:
+        with pytest.raises(ValueError, match=message):
+            replay.write_film(out, BROKK_170, [run_of(5)], (641, 361), 20.0)
+        assert not out.exists()
+        return
+    replay.write_film(out, BROKK_170, [run_of(5)], (641, 361), 20.0)
+    assert out.read_text() == "film\n"
+    assert (tmp_path / "raw").stat().st_size == 5 * 641 * 361 * 3
+    options = (tmp_path / "told").read_text().split()
+    before, after = options[: options.index("-i")], options[options.index("-i") :]
+    assert {"rawvideo", "rgb24", "641x361", "20.0"} <= set(before)  # of what comes in
+    assert {"yuv420p", "crop=trunc(iw/2)*2:trunc(ih/2)*2", "mp4", "pipe:1"} <= set(after)
 
 
-def test_a_film_in_a_window_halts_and_moves_by_a_second(
-    stand: Stand, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    shown: list[Any] = []
-    events = {
-        3: pygame.K_SPACE,
-        5: pygame.K_RIGHT,
-        6: pygame.K_LEFT,
-        7: pygame.K_LEFT,
-        8: pygame.K_SPACE,
+def test_show_film__halts_and_moves_by_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    keys = {
+        3: "space",
+        5: "right",
+        6: "left",
+        7: "left",
+        8: "space",
+        9: "right",
+        10: "right",
+        12: "escape",
     }
-    events |= {9: pygame.K_RIGHT, 10: pygame.K_RIGHT, 12: pygame.K_ESCAPE}
-    script = [
-        [pygame.event.Event(pygame.KEYDOWN, key=events[k])] if k in events else []
-        for k in range(13)
-    ]
-    monkeypatch.setattr(pygame.event, "get", lambda: script.pop(0))
-    window = SimpleNamespace(pygame=pygame, show=lambda *a: shown.append(a))
-    monkeypatch.setattr(replay, "film", lambda *a: a)
-    calls = stand(replay, open_window=contextlib.nullcontext(window))
-    runs = [SimpleNamespace(known=range(n)) for n in (31, 2)]
-    replay.show_film(BROKK_170, runs, (640, 360))  # type: ignore[arg-type]
-    ticks = 0, 1, 2, 3, 3, 23, 3, 0, 0, 21, 30, 30
-    assert shown == [((BROKK_170, runs, tick, (640, 360)), 20.0) for tick in ticks]
-    assert calls["open_window"] == ((640, 360), "brokk_min replay")
-    script[:] = [[], [pygame.event.Event(pygame.QUIT)]]
-    replay.show_film(BROKK_170, runs, (640, 360))  # type: ignore[arg-type]
-    assert [picture[2] for picture, _ in shown[12:]] == [0]
+    ticks: list[int] = []
+    film = replay.film
+
+    def pressing(runs: Any, tick: int, size: Any) -> Any:
+        ticks.append(tick)
+        if len(ticks) in keys:
+            post_key(keys[len(ticks)])
+        return film(runs, tick, size)
+
+    monkeypatch.setattr(replay, "film", pressing)
+    replay.show_film(BROKK_170, [run_of(31), run_of(2)], (640, 360))
+    assert ticks == [0, 1, 2, 3, 3, 23, 3, 0, 0, 21, 30, 30]
+    assert not pygame.display.get_init()
+
+
+def test_show_film__ends_when_the_window_is_closed() -> None:
+    pygame.event.post(pygame.event.Event(pygame.QUIT))
+    replay.show_film(BROKK_170, [run_of(3)], (640, 360))
+    assert not pygame.display.get_init()
+
+
+def test_replay__shows_logs_and_results_side_by_side(
+    results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = tmp_path / "run.log"
+    recorded_log(log, Push(60, 0, 0, 0, 0), 0.3, (0.0, 0.0, 0.0))
+    for others in ([log, results], [results, results]):
+        out = tmp_path / "film.gif"
+        arguments = [*map(str, others), "--controllers", "rl", "--out", str(out), "--fps", "1"]
+        assert main(["replay", *arguments]) == 0
+        image = np.array(Image.open(out).convert("RGB")).astype(int)
+        for half in (image[:, :480], image[:, 480:]):
+            blue = np.abs(half - drawing.COLOURS["rl"]).sum(axis=-1) < 12
+            orange = np.abs(half - drawing.COLOURS["jacobian"]).sum(axis=-1) < 12
+            assert blue.sum() + orange.sum() > 300
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "message"),
+    [
+        ([], 2, "LOGS"),
+        (["a", "b", "c"], 2, "LOGS"),
+        (["missing.log"], 1, "missing.log"),
+        (["missing.json"], 1, "missing.json"),
+        (["missing.json", "--fps", "0"], 2, "--fps"),
+        (["missing.log", "--size", "0", "0"], 2, "--size: expected some and 320 320"),
+        (["missing.json", "--size", "639", "360"], 2, "--size: expected some and 640 320"),
+        (["missing.json", "--size", "640", "9999"], 2, "--size"),
+        (["missing.json", "--controllers"], 2, "--controllers"),
+    ],
+)
+def test_replay__refuses_wrong_use_in_one_line(
+    arguments: list[str], status: int, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    try:
+        assert main(["replay", *arguments]) == status
+    except SystemExit as stop:
+        assert stop.code == status
+    assert message in capsys.readouterr().err

@@ -1,0 +1,310 @@
+"""Training with files: the same bits after an interruption, curves, refusals, a full disk."""
+
+from __future__ import annotations
+
+import csv
+import errno
+import io
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from helpers_machines import obedient_net, small_net
+
+from brokk_min.env import TaskConfig
+from brokk_min.identification import files
+from brokk_min.learning.checkpoint import TrainingLog, export_policy, stagger_episodes, train_policy
+from brokk_min.learning.episodes import get_obs
+from brokk_min.learning.gym_env import TaskVectorEnv
+from brokk_min.learning.policy import load_policy
+from brokk_min.machine import BROKK_170
+from brokk_min.ppo import PPOConfig, make_learner
+
+TINY = PPOConfig(
+    num_envs=8,
+    horizon=8,
+    epochs=2,
+    minibatch_size=32,
+    total_steps=4 * 64,
+    checkpoint_every=2,
+    threads=1,
+)
+TASK = TaskConfig(episode_s=0.6)  # 12 ticks: episodes end within the first updates
+NET = small_net(BROKK_170, np.random.default_rng(0))
+
+
+def run(path, machine=BROKK_170, net=NET, task=TASK, config=TINY, seed=5, **options):
+    return train_policy(machine, net, task, config, seed, path, **options)
+
+
+def read_curve(path):
+    with open(f"{path}.csv", newline="") as file:
+        return [
+            {name: value for name, value in row.items() if name != "charts/SPS"}
+            for row in csv.DictReader(file)
+        ]
+
+
+def fail_at_tick(patch, tick, change):
+    """Change the result of the environment's step at one tick of a training."""
+    step, ticks = TaskVectorEnv.step, [0]
+
+    def changed(self, actions):
+        ticks[0] += 1
+        result = step(self, actions)
+        return change(*result) if ticks[0] == tick else result
+
+    patch.setattr(TaskVectorEnv, "step", changed)
+
+
+def interrupt(*_):
+    raise KeyboardInterrupt
+
+
+@pytest.fixture(scope="module")
+def straight(tmp_path_factory):
+    path = tmp_path_factory.mktemp("straight") / "p.npz"
+    run(path)
+    return path
+
+
+@pytest.fixture
+def broken(tmp_path, monkeypatch):
+    """A training that was interrupted in its fourth update, two after its checkpoint."""
+    with monkeypatch.context() as patch:
+        fail_at_tick(patch, 30, interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            run(tmp_path / "p.npz")
+    assert sorted(os.listdir(tmp_path)) == ["p.npz.checkpoint", "p.npz.csv"]
+    return tmp_path / "p.npz"
+
+
+# --- what a training writes -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("critic", [False, True])
+def test_train_policy__writes_a_policy_and_its_curve(tmp_path, critic):
+    policy = run(tmp_path / "p.npz", critic=critic)
+    again = load_policy(tmp_path / "p.npz", BROKK_170)
+    assert all(map(np.array_equal, policy.weights, again.weights))
+    assert again.training["seed"] == 5
+    assert again.training["task"]["episode_s"] == 0.6
+    settings = again.training["settings"]
+    assert (settings["horizon"], settings["critic"]) == (8, critic)
+    assert settings["log_std_end"] == (None if critic else -4.5)
+    curve = read_curve(tmp_path / "p.npz")
+    assert [row["global_step"] for row in curve] == ["64", "128", "192", "256"]
+    names = {"policy_loss", "value_loss", "entropy", "approx_kl", "clipfrac"}
+    names |= {"explained_variance"} if critic else set()
+    charts = {"reward", "velocity_error", "learning_rate", "episodic_return", "episodic_length"}
+    columns = {f"losses/{name}" for name in names} | {f"charts/{name}" for name in charts}
+    assert set(curve[0]) == columns | {"global_step"}
+    assert all(np.isfinite(float(value)) for row in curve for value in row.values())
+    assert sorted(os.listdir(tmp_path)) == ["p.npz", "p.npz.csv"]
+
+
+def test_export_policy__paper_policy_takes_every_observation():
+    """Trained on a part of the observation, it acts the same on all of it."""
+    task = replace(TASK, paper=True)
+    env = TaskVectorEnv(8, NET, BROKK_170, task)
+    agent = make_learner(env, TINY, 0, critic=True).agent
+    agent.actor[-1].weight.data *= 100
+    policy = export_policy(BROKK_170, NET, agent, task, {})
+    obs = get_obs(BROKK_170, TASK, env.state, np.random.default_rng(7))
+    paper_obs = get_obs(BROKK_170, task, env.state, np.random.default_rng(7))
+    expected = agent.actor(torch.from_numpy(paper_obs)).detach().numpy()
+    np.testing.assert_allclose(policy.act(obs), expected, atol=1e-5)
+    assert np.abs(expected).max() > 0.1
+    obs[:, -8:] += 1.0  # resolved velocities
+    np.testing.assert_allclose(policy.act(obs), expected, atol=1e-5)
+
+
+def test_train_policy__learns_a_little(tmp_path):
+    """On nets that obey at once, some thousand steps already beat the start."""
+    config = replace(
+        TINY,
+        num_envs=64,
+        horizon=16,
+        minibatch_size=256,
+        epochs=4,
+        total_steps=25 * 1024,
+        learning_rate=2e-3,
+        gamma=0.5,
+    )
+    net, task = obedient_net(BROKK_170), TaskConfig(episode_s=5.0)
+    run(tmp_path / "p.npz", net=net, config=config, task=task)
+    errors = [float(row["charts/velocity_error"]) for row in read_curve(tmp_path / "p.npz")]
+    assert np.mean(errors[-4:]) < 0.85 * np.mean(errors[:2]), errors
+
+
+def test_stagger_episodes__ends_them_one_after_the_other():
+    env = TaskVectorEnv(8, NET, BROKK_170, TaskConfig(episode_s=2.0))
+    env.reset(seed=0)
+    stagger_episodes(env)
+    ended = np.array([env.step(np.zeros((8, 4)))[3] for _ in range(80)])
+    assert ended.sum(axis=0).tolist() == [2] * 8
+    assert ended.sum(axis=1).max() == 1
+    assert np.diff(np.flatnonzero(ended.any(axis=1))).tolist() == [5] * 15
+
+
+def test_count_episodes__means_return_and_length_of_those_that_ended(tmp_path):
+    log = TrainingLog(TaskVectorEnv(2, NET), TINY, tmp_path / "p.npz", {}, None)
+    rewards = np.array([[1.0, 10.0], [2.0, 20.0], [4.0, 40.0]])
+    log.count_episodes(rewards, np.array([[False, False], [True, False], [False, True]]))
+    assert log.episodes == {"charts/episodic_return": 36.5, "charts/episodic_length": 2.5}
+    log.count_episodes(rewards[:1], np.zeros((1, 2), bool))
+    assert log.episodes["charts/episodic_return"] == 36.5  # none ended
+    log.count_episodes(rewards[:1], np.array([[True, False]]))
+    assert log.episodes == {"charts/episodic_return": 6.0, "charts/episodic_length": 3.0}
+
+
+def test_train_policy__writes_for_tensorboard_or_says_what_is_missing(tmp_path, monkeypatch):
+    pytest.importorskip("tensorboard")
+    run(tmp_path / "p.npz", tensorboard=tmp_path / "board")
+    (events,) = (tmp_path / "board").iterdir()
+    assert b"charts/reward" in events.read_bytes()
+    monkeypatch.setitem(os.sys.modules, "torch.utils.tensorboard", None)
+    with pytest.raises(ValueError, match=r"brokk_min\[tensorboard\]"):
+        run(tmp_path / "p.npz", tensorboard=tmp_path / "board")
+
+
+# --- interruptions --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("tick", "critic"), [(4, False), (17, False), (30, False), (30, True)])
+def test_train_policy__resumes_to_the_same_bytes(tmp_path, monkeypatch, straight, tick, critic):
+    if critic:
+        straight = tmp_path / "straight.npz"
+        run(straight, critic=True)
+    path = tmp_path / "p.npz"
+    with monkeypatch.context() as patch:
+        fail_at_tick(patch, tick, interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            run(path, critic=critic)
+    assert not path.exists()
+    assert (tmp_path / "p.npz.checkpoint").exists() == (tick > 16)
+    run(path, critic=critic, resume=True)
+    assert path.read_bytes() == straight.read_bytes()
+    assert read_curve(path) == read_curve(straight)
+    assert not (tmp_path / "p.npz.checkpoint").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seed": 6}, r"seed: expected 6, got 5"),
+        ({"machine": replace(BROKK_170, dead_zone=0.05)}, r"dead_zone: expected 0\.05, got 0\.07"),
+        ({"config": replace(TINY, gamma=0.5)}, r"settings: expected .*'gamma': 0\.5.*got .*gamma"),
+        ({"task": TaskConfig(episode_s=0.7)}, r"task: expected .*0\.7.*, got .*0\.6"),
+        ({"critic": True}, r"settings: expected .*'critic': True.*got .*'critic': False"),
+        (
+            {"net": replace(NET, output_high=2 * NET.output_high)},
+            r"actuator: expected '\w+', got '\w+'",
+        ),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
+)
+def test_train_policy__refuses_the_checkpoint_of_another_training(broken, change, message):
+    checkpoint = broken.with_name("p.npz.checkpoint")
+    data = checkpoint.read_bytes()
+    with pytest.raises(ValueError, match=r"p\.npz\.checkpoint: " + message):
+        run(broken, resume=True, **change)
+    assert checkpoint.read_bytes() == data
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.5, 0.999])
+def test_train_policy__refuses_a_truncated_checkpoint(broken, fraction):
+    checkpoint = broken.with_name("p.npz.checkpoint")
+    data = checkpoint.read_bytes()
+    checkpoint.write_bytes(data[: int(fraction * len(data))])
+    with pytest.raises(ValueError, match=r"checkpoint: expected a readable checkpoint, got"):
+        run(broken, resume=True)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("header", '{"format": 0, "identity": {}}', "format: expected 4, got 0"),
+        ("generator", None, "expected a complete checkpoint, got TypeError"),
+        ("random", {}, "expected a complete checkpoint, got"),
+    ],
+)
+def test_train_policy__refuses_a_checkpoint_with_other_content(broken, name, value, message):
+    checkpoint = broken.with_name("p.npz.checkpoint")
+    content = torch.load(checkpoint, weights_only=True)
+    torch.save(content | {name: value}, checkpoint)
+    with pytest.raises(ValueError, match=rf"p\.npz\.checkpoint: {message}"):
+        run(broken, resume=True)
+
+
+def test_train_policy__refuses_a_policy_as_checkpoint(tmp_path, straight):
+    (tmp_path / "q.npz.checkpoint").write_bytes(straight.read_bytes())
+    with pytest.raises(ValueError, match=r"checkpoint: expected a readable checkpoint, got"):
+        run(tmp_path / "q.npz", resume=True)
+
+
+def test_train_policy__wants_the_curve_of_the_checkpoint(broken):
+    broken.with_name("p.npz.csv").unlink()
+    with pytest.raises(ValueError, match=r"p\.npz\.csv: expected the curve of the checkpoint, got"):
+        run(broken, resume=True)
+
+
+def test_train_policy__does_not_overwrite_a_checkpoint(broken):
+    with pytest.raises(ValueError, match=r"checkpoint: expected --resume or no checkpoint, got"):
+        run(broken)
+    assert not broken.exists()
+
+
+def test_train_policy__says_that_there_is_nothing_to_resume(tmp_path, capsys):
+    run(tmp_path / "p.npz", resume=True)
+    assert "p.npz.checkpoint: no checkpoint, training starts from" in capsys.readouterr().err
+
+
+def test_train_policy__stops_at_nan_and_keeps_the_checkpoint(tmp_path, monkeypatch, straight):
+    def poison(obs, reward, *rest):
+        reward[5] = np.nan
+        return obs, reward, *rest
+
+    path = tmp_path / "p.npz"
+    with monkeypatch.context() as patch:
+        fail_at_tick(patch, 19, poison)
+        with pytest.raises(ValueError, match=r"reward\[5\]: expected .* step 144, got nan"):
+            run(path)
+    assert not path.exists()
+    run(path, resume=True)
+    assert path.read_bytes() == straight.read_bytes()
+
+
+def fill_the_disk(patch, kept):
+    """Files after the first `kept` have room for 100,000 bytes and then none, as a full disk."""
+
+    class Full(io.FileIO):
+        def write(self, data):
+            if self.tell() + len(data) > 100_000:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            return super().write(data)
+
+    opened, fdopen = [0], os.fdopen
+
+    def open_file(handle, mode, **options):
+        opened[0] += 1
+        if opened[0] <= kept or "b" not in mode:
+            return fdopen(handle, mode, **options)
+        return io.BufferedWriter(Full(handle, "w"))
+
+    patch.setattr(files.os, "fdopen", open_file)
+
+
+@pytest.mark.parametrize(("kept", "file"), [(3, "p.npz.checkpoint"), (5, "p.npz")])
+def test_train_policy__names_the_file_on_a_full_disk(tmp_path, monkeypatch, straight, kept, file):
+    """Curve and checkpoint after updates 2 and 4, curve and policy at the end: six files."""
+    path = tmp_path / "p.npz"
+    with monkeypatch.context() as patch:
+        fill_the_disk(patch, kept)
+        with pytest.raises(OSError, match=rf"No space left on device: '.*/{file}'"):
+            run(path)
+    assert sorted(os.listdir(tmp_path)) == ["p.npz.checkpoint", "p.npz.csv"]
+    run(path, resume=True)
+    assert path.read_bytes() == straight.read_bytes()

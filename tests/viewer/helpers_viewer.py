@@ -1,0 +1,87 @@
+"""What several tests of the window need: keys, and the loop behind a pipe on an injected clock."""
+
+from __future__ import annotations
+
+import multiprocessing
+from typing import Any
+
+import numpy as np
+import pygame
+from helpers_bus import START, Push, World
+
+from brokk_min.can.drive_log import Telemetry
+from brokk_min.machine import BROKK_170
+from brokk_min.viewer.control_process import Request, WindowDrive, WindowOperator, receive_telemetry
+from brokk_min.viewer.input_handler import InputHandler
+
+MODES = ["rl", "jacobian", "levers"]
+
+
+def post(kind: int, **more: Any) -> None:
+    pygame.event.post(pygame.event.Event(kind, **more))
+
+
+def post_key(name: str, down: bool = True) -> None:
+    post(pygame.KEYDOWN if down else pygame.KEYUP, key=pygame.key.key_code(name))
+
+
+def telemetry(tick: int = 0, q: Any = START, **more: Any) -> Telemetry:
+    """A machine at rest that is driven with closed valves."""
+    zero = np.zeros(len(q))
+    return Telemetry(tick, np.array(q), zero, zero, np.zeros(3), True)._replace(**more)
+
+
+class Operator:
+    """Presses keys of an `InputHandler` through pygame's queue; its clock stands at `now`."""
+
+    def __init__(self, modes: list[str] = MODES) -> None:
+        pygame.display.set_mode((10, 10))
+        pygame.event.clear()
+        self.handler = InputHandler(BROKK_170, pygame, modes)
+        self.handler.time = self.now = 0.0
+        self.look()
+
+    def look(self, seconds: float = 0.5) -> Request:
+        for event in pygame.event.get():
+            self.handler.handle(event)
+        self.now += seconds
+        return self.handler.request(self.now)
+
+    def key(self, name: str, down: bool = True, seconds: float = 0.5) -> Request:
+        post_key(name, down)
+        return self.look(seconds)
+
+    def event(self, kind: int, **more: Any) -> Request:
+        post(kind, **more)
+        return self.look()
+
+
+class PipedLoop:
+    """The loop of a window on an injected clock, and the window's end of its pipe."""
+
+    def __init__(self, *controllers: Any, log: Any = None) -> None:
+        self.connection, there = multiprocessing.Pipe()
+        self.world = World(Push(), lambda driving, ready: None, log=log)  # type: ignore
+        operator = WindowOperator(BROKK_170, there, lambda: self.world.t)
+        self.world.drive = WindowDrive(BROKK_170, controllers, self.world.bus, operator)
+        self.ticks: list[Telemetry] = []
+        self.request(False)
+        self.world.drive.begin()
+
+    def request(
+        self, enable: bool, v: Any = (0, 0, 0), mode: int = 0, levers: Any = (0, 0, 0, 0)
+    ) -> None:
+        request = Request(self.world.t, mode, enable, True, np.array(v), np.array(levers))
+        self.connection.send(request)
+
+    def go(self, seconds: float, enable: bool, v: Any = (0, 0, 0), **more: Any) -> None:
+        """Send requests and receive telemetry for some seconds."""
+        end = self.world.t + seconds
+        while self.world.t < end - 1e-9:
+            self.request(enable, v, **more)
+            self.world.run(0.04)
+            self.ticks += receive_telemetry(self.connection)
+
+    def close(self) -> None:
+        self.world.bus.close()
+        self.world.close()

@@ -1,0 +1,163 @@
+"""The loop behind a pipe: requests reach the gate, telemetry comes back, silence stops it."""
+
+from __future__ import annotations
+
+import multiprocessing
+import threading
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers_bus import START, Push
+from helpers_viewer import PipedLoop
+
+from brokk_min.can.canopen import OperatorInput
+from brokk_min.machine import BROKK_170
+from brokk_min.viewer import control_process
+from brokk_min.viewer.control_process import (
+    BusOptions,
+    Request,
+    SelectedController,
+    WindowOperator,
+    control,
+    receive_telemetry,
+    send_request,
+)
+from brokk_min.viewer.play import gate_status
+
+REQUEST = Request(10.0, 0, True, True, np.array([0.1, 0.0, 0.0]), np.zeros(4))
+
+
+def measured(num: int) -> SimpleNamespace:
+    return SimpleNamespace(q=np.zeros((num, 5)))
+
+
+def test_selected_controller__moves_levers_and_starts_another_controller_from_rest() -> None:
+    starts = list[int]()
+
+    class Counting:
+        def start(self, num: int) -> str:
+            starts.append(num)
+            return "at rest"
+
+        def __call__(self, seen: object, state: str) -> tuple[str, str]:
+            return f"from {state}", "moving"
+
+    operator = SimpleNamespace(request=REQUEST._replace(mode=1, levers=np.array([1.0, 0, -1, 0])))
+    selected = SelectedController(BROKK_170, [Counting()], operator)  # type: ignore[list-item, arg-type]
+    state = selected.start(3)
+    u, state = selected(measured(3), state)  # type: ignore[arg-type]
+    np.testing.assert_allclose(u * 127, np.tile([80, 0, 0, -80, 0], (3, 1)), atol=1e-9)
+    assert not starts
+    operator.request = REQUEST
+    for expected in ("from at rest", "from moving"):
+        u, state = selected(measured(3), state)  # type: ignore[arg-type]
+        assert u == expected
+    assert starts == [3]
+
+
+def test_operator__gives_the_newest_request_until_it_is_too_old() -> None:
+    here, there = multiprocessing.Pipe()
+    now = 10.0
+    operator = WindowOperator(BROKK_170, there, lambda: now)
+    assert operator(False, True) == OperatorInput(alive=False)  # no request yet
+    here.send(REQUEST._replace(v_goal=np.ones(3)))
+    here.send(REQUEST)
+    assert operator(False, True) == OperatorInput((0.1, 0.0, 0.0), enable=True)
+    now = 10.19
+    assert operator(True, True) == OperatorInput((0.1, 0.0, 0.0), enable=True)
+    now = 10.21
+    assert operator(True, True) == OperatorInput(alive=False)
+    here.send(REQUEST._replace(time=10.2, alive=False, enable=False))
+    assert operator(True, True) == OperatorInput((0.1, 0.0, 0.0), alive=False)
+    here.close()
+    assert operator(True, True) == OperatorInput(stop=True)
+
+
+def test_loop__drives_levers_one_joint_each_and_changes_the_controller_while_driving() -> None:
+    loop = PipedLoop(Push(60, 0, 0, 0, 0))
+    loop.go(0.5, False, mode=1)
+    loop.go(0.2, True, mode=1)
+    assert loop.ticks[-1].driving
+    assert loop.ticks[-1].mode == 1
+    loop.go(0.6, True, mode=1, levers=(0, 0, -1, 0))
+    last = loop.ticks[-1]
+    np.testing.assert_allclose(last.u * 127, [0, 0, 0, -80, 0], atol=1e-9)
+    assert last.q_dot[3] < -0.1
+    assert abs(last.q_dot[0]) < 1e-3
+    loop.go(0.1, True, mode=0)
+    np.testing.assert_allclose(loop.ticks[-1].u * 127, [60, 0, 0, 0, 0], atol=1e-9)
+    loop.go(0.1, False)
+    assert not loop.ticks[-1].driving
+    assert not loop.ticks[-1].u.any()
+    assert [t.tick for t in loop.ticks] == list(range(1, len(loop.ticks) + 1))
+    loop.close()
+
+
+def test_loop__closes_the_valves_and_sends_nothing_while_the_window_is_silent() -> None:
+    loop = PipedLoop(Push(60, 0, 0, 0, 0))
+    loop.go(0.5, False)
+    loop.go(0.4, True)
+    assert loop.ticks[-1].driving
+    last = loop.world.t
+    loop.world.run(60.0)  # much more than a pipe holds
+    silent = list(receive_telemetry(loop.connection))
+    assert 1 <= len(silent) <= 4
+    times, commands = loop.world.commands
+    late = times[(commands != 0).any(axis=1)].max() - last
+    assert 0.1 < late <= control_process.SILENCE + 0.06
+    loop.go(0.06, True)
+    assert "device lost" in gate_status(BROKK_170, loop.ticks[-1], "")[0]
+    loop.go(0.5, True)
+    assert not loop.ticks[-1].driving  # the switch was never released
+    loop.go(0.1, False)
+    loop.go(0.1, True)
+    assert loop.ticks[-1].driving
+    loop.close()
+
+
+def test_control__drives_a_machine_of_its_own_until_the_window_closes_the_pipe(
+    tmp_path: Path,
+) -> None:
+    here, there = multiprocessing.Pipe()
+    options = BusOptions(log=tmp_path / "run.log", start=START)
+    thread = threading.Thread(target=here.close)  # as soon as the loop runs
+    poll = there.poll
+
+    def poll_once() -> bool:
+        thread.start()
+        thread.join()
+        return poll()
+
+    there.poll = poll_once  # type: ignore[assignment]
+    control(BROKK_170, [], options, there)
+    assert (tmp_path / "run.log").stat().st_size > 0
+    assert not [thread for thread in threading.enumerate() if "serve" in thread.name]
+
+
+@pytest.mark.parametrize(
+    ("machine", "options", "message"),
+    [
+        (BROKK_170, BusOptions("nonsense", "bus"), "got nonsense bus: expected a CAN bus"),
+        (BROKK_170, BusOptions(start=(0.0, 9.0)), "got start: expected 5 angles"),
+        (None, BusOptions(start=START), "got AttributeError: "),
+    ],
+)
+def test_receive_telemetry__says_why_the_loop_ended(
+    machine: object, options: BusOptions, message: str
+) -> None:
+    here, there = multiprocessing.Pipe()
+    control(machine, [], options, there)  # type: ignore[arg-type]
+    there.close()
+    send_request(here, REQUEST)  # no error: the next line reports it
+    with pytest.raises(ValueError, match=f"^play: expected a loop that runs, {message}"):
+        list(receive_telemetry(here))
+    with pytest.raises(ValueError, match=r"^play: .* runs, got its sudden end"):
+        list(receive_telemetry(here))
+
+
+def test_control__survives_a_window_that_is_gone_before_the_error() -> None:
+    here, there = multiprocessing.Pipe()
+    here.close()
+    control(BROKK_170, [], BusOptions("nonsense", "bus"), there)

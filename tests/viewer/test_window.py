@@ -1,0 +1,96 @@
+"""The canvas paints what it is asked to; the window needs a display."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+
+from brokk_min.viewer.window import BACKGROUND, Canvas, Window, open_window
+
+RED, BLUE, GREEN = (200, 0, 0), (0, 0, 200), (0, 150, 0)
+
+
+def columns(image: np.ndarray, row: int, colour: tuple[int, int, int]) -> list[int]:
+    return np.flatnonzero((image[row] == colour).all(axis=-1)).tolist()
+
+
+def test_canvas__paints_shapes_where_they_are_and_as_large() -> None:
+    canvas = Canvas((60, 40))
+    canvas.line(np.array([[5.0, 5], [5, 35], [35, 35]]), RED, 4)
+    canvas.circle(np.array([25.0, 15]), 5, BLUE)
+    canvas.bar(44.0, 52.0, 24.0, 4.0, GREEN)
+    image = canvas.image()
+    assert image.shape == (40, 60, 3)
+    assert image.dtype == np.uint8
+    assert columns(image, 20, RED) == [4, 5, 6]
+    assert columns(image, 35, RED) == list(range(5, 35))  # open: no line back to the start
+    assert columns(image, 15, BLUE) == list(range(20, 30))
+    assert columns(image, 24, GREEN) == list(range(44, 52))
+    assert (image[20, 8:44] == BACKGROUND).all()
+    canvas.circle(np.array([25.0, 15]), 5, RED, 2)
+    assert columns(canvas.image(), 15, BLUE) == list(range(22, 28))  # a ring around it
+
+
+def test_canvas__cuts_shapes_but_not_text_at_the_clip() -> None:
+    canvas = Canvas((60, 40))
+    canvas.clip((0.0, 0.0, 30.0, 40.0))
+    canvas.bar(10.0, 50.0, 20.0, 5.0, RED)
+    canvas.text(35, 20, "HHH", 12, BLUE)
+    image = canvas.image()
+    assert columns(image, 20, RED) == list(range(10, 30))
+    assert (image[:, 35:] != BACKGROUND).any()
+    again = Canvas((60, 40))  # begins without clip and empty
+    again.bar(10.0, 50.0, 20.0, 5.0, RED)
+    assert columns(again.image(), 20, RED) == list(range(10, 50))
+
+
+@pytest.mark.parametrize(("anchor", "left"), [(0.0, 21), (0.5, 7), (1.0, 0)])
+def test_canvas__anchors_text_at_its_left_end_middle_or_right_end(anchor: float, left: int) -> None:
+    canvas = Canvas((60, 40))
+    canvas.text(20, 15, "HHH", 12, RED, anchor)
+    rows, found = (canvas.image() != BACKGROUND).any(axis=-1).nonzero()
+    assert found.min() == left
+    assert (rows.min(), rows.max()) == (11, 19)
+
+
+def test_canvas__keeps_text_legible_over_an_arm() -> None:
+    canvas = Canvas((200, 40))
+    canvas.bar(0, 200, 20, 20, RED)
+    canvas.text(10, 20, "near", 13, BLUE)
+    assert (canvas.image()[20, 10:30] == BACKGROUND).all(axis=-1).any()
+
+
+def test_canvas__asks_for_pygame_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    with pytest.raises(ValueError, match=r"pygame: expected the extra brokk_min\[play\], got"):
+        Canvas((60, 40))
+
+
+def test_window__shows_a_canvas(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    canvas = Canvas((60, 40))
+    canvas.bar(10.0, 50.0, 20.0, 5.0, RED)
+    with open_window((60, 40), "a title") as window:
+        window.show(canvas, 1000.0)
+        pixels = window.pygame.surfarray.array3d(window.surface)
+        np.testing.assert_array_equal(pixels.swapaxes(0, 1), canvas.image())
+        assert window.pygame.display.get_caption()[0] == "a title"
+    assert not window.pygame.display.get_init()
+
+
+def test_window__refuses_a_computer_without_display(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "nonsense")
+    with pytest.raises(ValueError, match="window: expected a display"):
+        Window((60, 40), "none")
+
+
+def test_open_window__draws_unseen_only_if_asked_to(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "XDG_RUNTIME_DIR", "SDL_VIDEODRIVER"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(ValueError, match="window: expected a display"), open_window((9, 9), "none"):
+        pass
+    monkeypatch.setenv("SDL_VIDEODRIVER", "offscreen")
+    with open_window((9, 9), "unseen") as window:
+        assert window.pygame.display.get_init()
