@@ -174,7 +174,7 @@ def simulated_machine(machine: Machine, start: tuple[float, ...]) -> Iterator[No
 
 
 @contextmanager
-def control_process(
+def start(
     machine: Machine, controllers: Sequence[Controller], options: BusOptions
 ) -> Iterator[Connection]:
     """`control` in a process of its own, at the other end of this pipe; ends with the block."""

@@ -29,7 +29,6 @@ MUTED, GRID, TRACK = (120, 128, 138), (228, 230, 232), (212, 216, 221)
 SOIL, STEEL, WARNING = (214, 203, 186), (74, 80, 88), (208, 28, 28)
 GOAL, MEASURED, PATH = INK, (0, 158, 115), (230, 159, 0)
 DRIVING, READY = (0, 130, 90), (0, 100, 170)  # status colours
-SMALL_COLOURS = (INK, MUTED, TRACK, SOIL, STEEL, WARNING, MEASURED, PATH, DRIVING, READY)
 COLOURS = {"rl": (0, 114, 178), "jacobian": (213, 94, 0), "levers": (124, 87, 148)}
 TITLES = {
     "rl": "RL policy",
