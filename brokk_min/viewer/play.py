@@ -82,7 +82,8 @@ class Session:
         """What the window shows now; angles between the last two ticks, for smooth motion."""
         unknown = np.full(self.machine.n, np.nan)
         telemetry = Telemetry(0, unknown, unknown, np.zeros(self.machine.n), np.zeros(3), False)
-        status, colour = hint or "no telemetry", drawing.WARNING
+        status = hint or "no telemetry"
+        colour = drawing.WARNING
         if self.telemetry is not None and now - self.arrived <= STALE:
             telemetry = self.telemetry
             status, colour = gate_status(self.machine, telemetry, hint)
@@ -124,8 +125,9 @@ class Session:
             f"hold SPACE to drive    {keys}",
             "SHIFT: slow  TAB: next controller  ENTER: next line  BACKSPACE: again  ESC: end",
         ]
-        work, done = self.tracing, self.finished
-        if work:
+        done = self.finished
+        if self.tracing:
+            work = self.tracing
             passed = f"{work.seconds:.1f} s, {work.passed} of {len(work.line)}"
             notes.append(f"{self.task}: follow the orange line to its ring, {passed}")
         elif done:
@@ -160,17 +162,12 @@ def next_step(session: Session, handler: InputHandler) -> str:
 FrameHook = Callable[[Session, InputHandler], bool]  # called each frame; False closes the window
 
 
-def go_on(session: Session, handler: InputHandler) -> bool:
-    """The window stays open until the user closes it."""
-    return True
-
-
 def show(
     window: Window,
     session: Session,
     receive: Callable[[], Iterable[Telemetry]],
     send: Callable[[Request], object],
-    each_frame: FrameHook = go_on,
+    each_frame: FrameHook = lambda session, handler: True,
     fps: float = 60.0,
 ) -> None:
     """The window until it is closed: input, telemetry, one picture, `fps` times a second.
@@ -202,7 +199,7 @@ def play(
     controllers: Mapping[str, Controller],
     options: BusOptions,
     attempts: Path,
-    each_frame: FrameHook = go_on,
+    each_frame: FrameHook = lambda session, handler: True,
 ) -> None:
     """Drive with keyboard or gamepad: the simulated machine, or the one on a bus.
 
@@ -224,7 +221,9 @@ def play(
         )
 
 
-def watch(machine: Machine, options: BusOptions, each_frame: FrameHook = go_on) -> None:
+def watch(
+    machine: Machine, options: BusOptions, each_frame: FrameHook = lambda session, handler: True
+) -> None:
     """Show a machine on a bus; nothing is sent."""
     session = Session(machine, [], None)
     reader = TelemetryReader(machine)

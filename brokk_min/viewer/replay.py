@@ -24,7 +24,7 @@ from brokk_min.identification.files import expected, whole_file
 from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocity
 from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import Array, Machine
-from brokk_min.viewer import drawing
+from brokk_min.viewer import camera, drawing
 from brokk_min.viewer.window import Canvas, Colour, open_window
 
 FFMPEG = (  # raw pictures in, MP4 of even width and height out
@@ -61,7 +61,7 @@ class Run:
     @cached_property
     def in_view(self) -> Array:
         """Points that a picture must show [m], (K, 3): the path, and the arm twice a second."""
-        corners = drawing.skeleton(self.machine, self.q[::10]).reshape(-1, 3)
+        corners = camera.skeleton(self.machine, self.q[::10]).reshape(-1, 3)
         return np.vstack([corners, self.path])
 
 
@@ -119,15 +119,9 @@ def read_results(machine: Machine, path: Path, controllers: Sequence[str]) -> Re
     if set(controllers) - {"rl"}:
         gains = Path(meta.get("gains", path.with_name("gains.json")))
         named |= baselines.read_gains(gains, machine, policy.net)
-    return Results(
-        path,
-        rows,
-        {sequence.name: sequence for sequence in sequences},
-        drawn if starts is None else starts,
-        named,
-        policy.net if meta["plant"] == "net" else None,
-        seed,
-    )
+    starts = drawn if starts is None else starts
+    net = policy.net if meta["plant"] == "net" else None
+    return Results(path, rows, {s.name: s for s in sequences}, starts, named, net, seed)
 
 
 def simulate_again(

@@ -24,6 +24,7 @@ from brokk_min.kinematics import forward_kinematics, jacobian, tool_position
 from brokk_min.learning.policy import save_policy
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer import drawing, replay
+from brokk_min.viewer.camera import skeleton
 from brokk_min.viewer.replay import Run
 
 COLOUR = (1, 2, 3)
@@ -65,7 +66,7 @@ def test_run__has_tool_positions_velocity_error_and_all_that_must_be_in_view() -
     v_tool = np.einsum("tij,tj->ti", jacobian(frames), run.q_dot)
     expected = np.sqrt(np.square(v_tool - [0, 0.1, 0.05]).sum(axis=1))
     np.testing.assert_allclose(run.error, expected)
-    corners = drawing.skeleton(BROKK_170, run.q[[0, 10, 20]]).reshape(-1, 3)
+    corners = skeleton(BROKK_170, run.q[[0, 10, 20]]).reshape(-1, 3)
     np.testing.assert_array_equal(run.in_view, np.vstack([corners, path]))
 
 
