@@ -149,6 +149,7 @@ def test_next_step__says_what_the_operator_has_to_do() -> None:
     assert play.next_step(session, handler) == "starting"
     session.telemetry = telemetry()
     handler.pad = None
+    handler.blocked = True
     handler.focus = False
     assert play.next_step(session, handler) == "neutral: the window has no focus"
     handler.focus = True
