@@ -3,7 +3,7 @@
 Telemetry is the state of one tick, from the frames of a bus or of a log.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -98,26 +98,17 @@ def compare(machine: Machine, frames: Sequence[Frame], sent: Sequence[Frame]) ->
 
 
 def log_for_fit(machine: Machine, frames: Iterable[Frame]) -> Log:
-    """Angles and commands while driving, as recordings for `fit`; a gap starts a new one.
+    """Commands and angles while driving, as recordings for `fit`; a gap starts a new one.
 
     ValueError: nothing was driven for long enough.
     """
-    nodes = Nodes(machine)
     recordings: list[list[tuple[Array, Array]]] = []
-    start = 0.0  # of the tick [s]
-    last = -np.inf  # start of the last tick that is recorded
-    for frame in frames:
-        nodes.update(frame)
-        if frame.id == canopen.SYNC:
-            nodes.frames[:] = 0
-            start = frame.time
-        elif frame.id == machine.valve_frame_id and len(frame.data) == 8:
-            u, driving = _read_valve_frame(machine, frame.data)
-            if driving and (nodes.frames == 1).all():
-                if not 0.5 < (start - last) * machine.rate < 1.5:
-                    recordings.append([])
-                recordings[-1].append((u, nodes.counts() * machine.encoder_step))
-                last = start
+    last = -np.inf
+    for start, u, q in _driven_ticks(machine, frames):
+        if not 0.5 < (start - last) * machine.rate < 1.5:
+            recordings.append([])
+        recordings[-1].append((u, q))
+        last = start
     named = []
     for number, recording in enumerate(recordings):
         if len(recording) > machine.history + 1:
@@ -128,6 +119,23 @@ def log_for_fit(machine: Machine, frames: Iterable[Frame]) -> Log:
             f"log: expected more than {machine.history + 1} ticks of driving in a row, got none"
         )
     return machine_log(machine, named)
+
+
+def _driven_ticks(
+    machine: Machine, frames: Iterable[Frame]
+) -> Iterator[tuple[float, Array, Array]]:
+    """Start [s], commands u (n,) and angles [rad] (n,) of ticks with all positions."""
+    nodes = Nodes(machine)
+    start = 0.0
+    for frame in frames:
+        nodes.update(frame)
+        if frame.id == canopen.SYNC:
+            nodes.frames[:] = 0
+            start = frame.time
+        elif frame.id == machine.valve_frame_id and len(frame.data) == 8:
+            u, driving = _read_valve_frame(machine, frame.data)
+            if driving and (nodes.frames == 1).all():
+                yield start, u, nodes.counts() * machine.encoder_step
 
 
 def _read_valve_frame(machine: Machine, data: bytes) -> tuple[Array, bool]:
