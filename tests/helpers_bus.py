@@ -4,22 +4,29 @@ from __future__ import annotations
 
 import ctypes
 import itertools
+import json
 import os
-from collections.abc import Callable
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import can
 import numpy as np
+import pytest
 
-from brokk_min.can.canopen import Bus, Frame, OperatorInput
-from brokk_min.can.simulated_machine import SimulatedMachine
+from brokk_min.can.canopen import Bus, Frame, OperatorInput, open_bus
+from brokk_min.can.simulated_machine import SimulatedMachine, serve
 from brokk_min.env import Measured
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.hw import Drive
 from brokk_min.jacobian import Gains, JacobianController, manipulability_threshold
 from brokk_min.machine import BROKK_170, Machine
 
+MULTICAST = "239.74.163.2"
 START = (0.0, 0.5, 0.58, 1.71, 1.24)
 FOUR = np.ones(4)
 BASELINE = JacobianController(
@@ -183,6 +190,49 @@ class Hand:
         enable = self.pressed if self.enable is None else self.enable
         v = self.v if driving else (0.0, 0.0, 0.0)
         return OperatorInput(v, enable and self.alive, self.alive, self.stop)
+
+
+def eventually(condition: Callable[[], bool], seconds: float = 20.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "not within the time"
+        time.sleep(0.01)
+
+
+def recorded_rows(path: Path) -> np.ndarray:
+    """Complete rows of a record that is being written: time, commands, last valid frame's time."""
+    lines = path.read_text().splitlines()[1:-1] if path.exists() else []
+    cells = [line.split(",") for line in lines]
+    return np.array([[float(x) for x in (*row[1:7], row[12])] for row in cells]).reshape(-1, 7)
+
+
+@contextmanager
+def served(channel: str) -> Iterator[SimulatedMachine]:
+    """Our simulated machine in a thread on a virtual bus."""
+    end = threading.Event()
+    with open_bus("virtual", channel) as bus:
+        machine = SimulatedMachine(BROKK_170, START, bus.now())
+        thread = threading.Thread(target=serve, args=(machine, bus, lambda: not end.is_set()))
+        thread.start()
+        try:
+            yield machine
+        finally:
+            end.set()
+            thread.join()
+
+
+def own_multicast_port(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Groups with one port are one bus: take a port of our own. Skips where nothing is routed."""
+    monkeypatch.setenv("CAN_CONFIG", json.dumps({"port": 43200 + os.getpid() % 10_000}))
+    bus = partial(open_bus, "udp_multicast", MULTICAST)
+    try:
+        with bus() as a, bus() as b:
+            a.send(0x123, b"")
+            if b.recv(1.0) is not None:
+                return
+    except ValueError:
+        pass
+    pytest.skip("no multicast route on this machine")
 
 
 class Virtual:

@@ -157,19 +157,6 @@ class Telemetry(NamedTuple):
     mode: int = 0  # which controller
     lateness: float = 0.0  # s
 
-    def pack(self) -> Array:
-        """As numbers in a row."""
-        return np.hstack([np.ravel(value) for value in self]).astype(float)
-
-
-def unpack_telemetry(machine: Machine, values: Array) -> Telemetry:
-    """The inverse of `Telemetry.pack`."""
-    n = machine.n
-    tick, q, q_dot, u, v, rest = np.split(values, np.cumsum([1, n, n, n, 3]))
-    driving, active, latched, mode = (int(x) for x in rest[:4])
-    late = float(rest[4])
-    return Telemetry(float(tick[0]), q, q_dot, u, v, bool(driving), active, latched, mode, late)
-
 
 class TelemetryReader:
     """Turns the frames of a bus or a log, one after another, into telemetry."""
