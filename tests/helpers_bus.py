@@ -17,6 +17,7 @@ from typing import Any
 import can
 import numpy as np
 import pytest
+from canopen.objectdictionary import ObjectDictionary, ODArray, ODRecord, ODVariable, datatypes
 
 from brokk_min.can.canopen import Bus, Frame, OperatorInput, open_bus
 from brokk_min.can.simulated_machine import SimulatedMachine, serve
@@ -233,6 +234,33 @@ def own_multicast_port(monkeypatch: pytest.MonkeyPatch) -> None:
     except ValueError:
         pass
     pytest.skip("no multicast route on this machine")
+
+
+def dictionary() -> ObjectDictionary:
+    """As much of CiA 406 as an encoder with one mapped position needs."""
+    u8, u16, u32 = datatypes.UNSIGNED8, datatypes.UNSIGNED16, datatypes.UNSIGNED32
+    objects = ObjectDictionary()
+    communication = ODRecord("TPDO1", 0x1800)
+    mapping = ODArray("TPDO1 mapping", 0x1A00)
+    for owner, name, index, sub, kind, value in (
+        (objects, "device type", 0x1000, 0, u32, 406),
+        (objects, "heartbeat", 0x1017, 0, u16, 0),
+        (objects, "position", 0x6004, 0, u32, 0),
+        (objects, "units per revolution", 0x6501, 0, u32, 4096),
+        (communication, "highest", 0x1800, 0, u8, 2),
+        (communication, "identifier", 0x1800, 1, u32, 0x180),
+        (communication, "type", 0x1800, 2, u8, 254),
+        (mapping, "number", 0x1A00, 0, u8, 1),
+        (mapping, "first", 0x1A00, 1, u32, 0x60040020),
+    ):
+        entry = ODVariable(name, index, sub)
+        entry.data_type = kind
+        entry.default = value
+        entry.pdo_mappable = True
+        (owner.add_object if owner is objects else owner.add_member)(entry)
+    objects.add_object(communication)
+    objects.add_object(mapping)
+    return objects
 
 
 class Virtual:

@@ -18,7 +18,6 @@ import can
 import canopen
 import numpy as np
 import pytest
-from canopen.objectdictionary import ObjectDictionary, ODArray, ODRecord, ODVariable, datatypes
 from helpers_bus import (
     MULTICAST,
     START,
@@ -26,6 +25,7 @@ from helpers_bus import (
     Out,
     Push,
     World,
+    dictionary,
     own_multicast_port,
     raises,
     recording,
@@ -384,36 +384,6 @@ def test_recv__of_a_bus_without_descriptor_waits_by_python_can(
 
 
 # --- a peer: the canopen library -----------------------------------------------------------------
-
-
-def dictionary() -> ObjectDictionary:
-    """As much of CiA 406 as an encoder with one mapped position needs."""
-
-    def variable(
-        owner: Any, name: str, index: int, sub: int, kind: int, value: int, access: str = "rw"
-    ) -> None:
-        entry = ODVariable(name, index, sub)
-        entry.data_type = kind
-        entry.default = value
-        entry.access_type = access
-        entry.pdo_mappable = True
-        (owner.add_object if owner is objects else owner.add_member)(entry)
-
-    objects = ObjectDictionary()
-    u8, u16, u32 = datatypes.UNSIGNED8, datatypes.UNSIGNED16, datatypes.UNSIGNED32
-    variable(objects, "device type", 0x1000, 0, u32, 406, "ro")
-    variable(objects, "heartbeat", 0x1017, 0, u16, 0)
-    variable(objects, "position", 0x6004, 0, u32, 0, "ro")
-    variable(objects, "units per revolution", 0x6501, 0, u32, 4096, "ro")
-    communication, mapping = ODRecord("TPDO1", 0x1800), ODArray("TPDO1 mapping", 0x1A00)
-    variable(communication, "highest", 0x1800, 0, u8, 2)
-    variable(communication, "identifier", 0x1800, 1, u32, 0x180)
-    variable(communication, "type", 0x1800, 2, u8, 254)
-    variable(mapping, "number", 0x1A00, 0, u8, 1)
-    variable(mapping, "first", 0x1A00, 1, u32, 0x60040020)
-    objects.add_object(communication)
-    objects.add_object(mapping)
-    return objects
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -243,11 +244,16 @@ class Cases:
         return state._replace(expected_motion=motion)
 
 
+@cache
+def cases_of(machine: Machine, seed: int) -> Cases:
+    return Cases(machine, 3000, seed)
+
+
 @pytest.mark.parametrize(
     ("machine", "seed"), [(BROKK_170, 0), (tight_machine(), 1), (tight_machine(), 2)]
 )
 def test_gate__is_what_its_promises_say_in_any_leading_shape(machine: Machine, seed: int) -> None:
-    cases = Cases(machine, 3000, seed)
+    cases = cases_of(machine, seed)
     for shape in ((3000,), (4, 750), (3, 10, 100)):
         given = [
             type(part)(*(np.reshape(field, (*shape, *np.shape(field)[1:])) for field in part))

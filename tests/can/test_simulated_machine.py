@@ -16,8 +16,7 @@ from typing import Any
 import canopen
 import numpy as np
 import pytest
-from helpers_bus import START, Out, eventually, recorded_rows, served
-from test_canopen import dictionary
+from helpers_bus import START, Out, dictionary, eventually, recorded_rows, served
 
 from brokk_min.actuator import plant_reset, plant_step
 from brokk_min.can.canopen import HEARTBEAT_PERIOD, Frame, encoder_raw, valve_frame
