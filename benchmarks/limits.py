@@ -1,14 +1,14 @@
-"""How far from what the machine could do: environment, PPO update and kinematics beside their limits.
+"""How far from what the computer can do: environment, PPO gradient and kinematics.
 
     python -m benchmarks.limits [--threads 2] [--json F] [--quick]
 
-Environment: step with observation and resets, beside the bare products and activations of its nets. Update:
-operations of the matrix products a second, beside the best rate of any backend here on the same shapes.
+Environment: a step with observation and resets, compared with the products of its nets alone. PPO:
+operations per second of the matrix products in a gradient, compared with the best rate of any
+backend on the same shapes. Kinematics: compared with a loop over pinocchio.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -24,168 +24,180 @@ import pinocchio
 import torch
 import tyro
 
-from benchmarks.rollout import random_net
-from brokk_min.env import TaskConfig
+from benchmarks.rollout import random_net, write
+from brokk_min import ppo
 from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.machine import BROKK_170
-from brokk_min.ppo import PPOConfig, Training
 
 
 @dataclass
 class Options:
-    threads: int = 2
-    """Threads of torch and OpenBLAS."""
-    repeats: int = 15
-    """Timed blocks; what is compared is timed in turn, and the least time counts."""
-    num_envs: tuple[int, ...] = (64, 256, 1024, 4096)
-    """Environments side by side."""
-    quick: bool = False
-    """One short block each: to see that it runs."""
-    numpy_products: bool = False
-    """Only print NumPy's rate on the update's shapes; the program calls itself so."""
-    json: Path | None = None
-    """Also write the figures here."""
+    threads: int = 2  # Threads of torch and OpenBLAS.
+    repeats: int = 15  # Timed blocks; what is compared is timed in turn, the least time counts.
+    num_envs: tuple[int, ...] = (64, 256, 1024, 4096)  # Environments side by side.
+    quick: bool = False  # One short block each: to see that it runs.
+    numpy_products: bool = False  # Only print NumPy's time; the program calls itself so.
+    json: Path | None = None  # Also write the figures here.
+
+    @property
+    def block_s(self) -> float:
+        return 0.02 if self.quick else 0.1
 
 
-def seconds(calls: dict[str, Callable[[], Any]], repeats: int, block: float) -> dict[str, float]:
-    """Least time of each call [s], all timed in turn: other work on the machine can only add to it."""
-    counts, times = {}, {name: [] for name in calls}
+def seconds(calls: dict[str, Callable[[], Any]], options: Options) -> dict[str, float]:
+    """Least time of each call [s], all timed in turn: other work can only add to it."""
+    counts = {}
+    times: dict[str, list[float]] = {name: [] for name in calls}
     for name, call in calls.items():
         call()
         start = time.perf_counter()
         call()
-        counts[name] = max(1, round(block / (time.perf_counter() - start)))
-    for _ in range(repeats):
+        counts[name] = max(1, round(options.block_s / (time.perf_counter() - start)))
+    for _ in range(options.repeats):
         for name, call in calls.items():
             start = time.perf_counter()
             for _ in range(counts[name]):
                 call()
             times[name].append((time.perf_counter() - start) / counts[name])
-    return {name: float(min(found)) for name, found in times.items()}
+    return {name: min(of_call) for name, of_call in times.items()}
 
 
 def shapes(inputs: int, outputs: tuple[int, ...], batch: int) -> list[tuple[int, int, int]]:
-    """(m, k, n) of all products in one gradient of nets with these outputs: forward, by weight, by input."""
+    """(m, k, n) of all products in a gradient of nets: forward, by weights, by inputs."""
     result = []
     for last in outputs:
         for i, (a, b) in enumerate(pairwise((inputs, 256, 128, 64, last))):
-            result += [(batch, a, b), (a, batch, b)] + ([(batch, b, a)] if i else [])
+            result += [(batch, a, b), (a, batch, b)]
+            if i:
+                result.append((batch, b, a))
     return result
 
 
 def products(kind: str, sizes: list[tuple[int, int, int]]) -> Callable[[], Any]:
     """A call that does all products of `sizes` in float32."""
     rng = np.random.default_rng(0)
-    pairs = [(rng.normal(size=(m, k)), rng.normal(size=(k, n))) for m, k, n in sizes]
-    pairs = [(a.astype(np.float32), b.astype(np.float32)) for a, b in pairs]
+    pairs = []
+    for m, k, n in sizes:
+        a = rng.normal(size=(m, k)).astype(np.float32)
+        b = rng.normal(size=(k, n)).astype(np.float32)
+        pairs.append((a, b))
     if kind == "numpy":
         return lambda: [a @ b for a, b in pairs]
     tensors = [(torch.from_numpy(a), torch.from_numpy(b)) for a, b in pairs]
     if kind == "torch":
         return lambda: [a @ b for a, b in tensors]
-    turned = [(a, b.T.contiguous()) for a, b in tensors]
+    transposed = [(a, b.T.contiguous()) for a, b in tensors]
     linear = torch.ops.mkldnn._linear_pointwise
-    return lambda: [linear(a, b, None, "none", [], "") for a, b in turned]
+    return lambda: [linear(a, b, None, "none", [], "") for a, b in transposed]
 
 
 def environment(num: int, options: Options) -> dict[str, float]:
     env = TaskVectorEnv(num, random_net(np.random.default_rng(0)))
     env.reset(seed=0)
+    assert env.state is not None and env.net is not None
+    net = env.net
     actions = np.random.default_rng(0).uniform(-1, 1, (num, 4)).astype(np.float32)
-    inputs = env.state.history[:, env.machine.driven]
-    calls = {"step": lambda: env.step(actions), "products": lambda: env.net.predict(inputs)}
-    found = seconds(calls, options.repeats, 0.02 if options.quick else 0.1)
+    history = env.state.history[:, env.machine.driven]
+    calls = {"step": lambda: env.step(actions), "products": lambda: net.predict(history)}
+    times = seconds(calls, options)
     return {
-        "step_us": 1e6 * found["step"],
-        "products_us": 1e6 * found["products"],
-        "steps_per_second": num / found["step"],
-        "step_over_products": found["step"] / found["products"],
+        "step_us": 1e6 * times["step"],
+        "products_us": 1e6 * times["products"],
+        "steps_per_second": num / times["step"],
+        "step_over_products": times["step"] / times["products"],
     }
 
 
-def update(options: Options) -> dict[str, Any]:
-    config = PPOConfig(threads=options.threads, horizon=8 if options.quick else 32)
-    env = TaskVectorEnv(config.num_envs, random_net(np.random.default_rng(0)), config=TaskConfig())
-    training = Training(env, config, 0)
-    batch, _ = training._collect()
-    rows = min(config.minibatch_size, len(batch["action"]))
-    outputs = (4, 1) if training.critic else (4,)
-    sizes = shapes(batch["observation"].shape[1], outputs, rows)
-    gradients = config.epochs * len(batch["action"]) / rows
-    work = sum(2 * m * k * n for m, k, n in sizes)
-    calls = {"update": lambda: training._learn(batch), "torch": products("torch", sizes)}
+def gradient(options: Options) -> dict[str, Any]:
+    """One minibatch of `ppo.train`: loss, gradient, step of Adam."""
+    batch = ppo.PPOConfig.minibatch_size
+    agent = ppo.Agent(171, 4, -1.8, critic=False)
+    optimizer = torch.optim.Adam(agent.parameters(), fused=True)
+    mb = {"obs": torch.randn(batch, 171), "actions": torch.randn(batch, 4)}
+    mb |= {"logprobs": torch.zeros(batch), "advantages": torch.randn(batch)}
+
+    def step() -> None:
+        loss, _ = ppo.ppo_loss(agent, mb, ppo.PPOConfig())
+        optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(agent.parameters(), 1.0)
+        optimizer.step()
+
+    sizes = shapes(171, (4,), batch)
+    work = sum(2 * m * k * n for m, k, n in sizes) / 1e9
+    calls: dict[str, Callable[[], Any]] = {"gradient": step, "torch": products("torch", sizes)}
     try:
         calls["onednn"] = products("onednn", sizes)
         calls["onednn"]()
     except (AttributeError, RuntimeError):  # a torch without it
         calls.pop("onednn", None)
-    found = seconds(calls, options.repeats, 0.02 if options.quick else 0.1)
-    rates = {f"products_{name}": work / found[name] / 1e9 for name in list(calls)[1:]}
-    for core in ("",) if options.quick else ("", "Haswell", "SkylakeX"):
-        rates[f"products_numpy{core and '_' + core}"] = numpy_rate(core, options, work)
-    best = max(rates.values())
-    rate = gradients * work / found["update"] / 1e9
+    times = seconds(calls, options)
+    rates = {name: work / times[name] for name in calls}
+    for core in [""] if options.quick else ["", "Haswell", "SkylakeX"]:
+        rates[f"numpy {core}".strip()] = numpy_rate(core, options, work)
+    best = max(rate for name, rate in rates.items() if name != "gradient")
     return {
-        "gflops": rates | {"update": rate},
-        "seconds": found["update"],
-        "share_of_best": rate / best,
+        "gflops": rates,
+        "seconds": times["gradient"],
+        "fraction_of_best": rates["gradient"] / best,
     }
 
 
 def numpy_rate(core: str, options: Options, work: float) -> float:
-    """GFLOP/s of NumPy with OpenBLAS's kernels for `core`; they are chosen at its start. 0: it cannot."""
+    """GFLOP/s of NumPy with OpenBLAS's kernels for `core`, chosen at its start; 0: none."""
     variables = os.environ | {"OPENBLAS_NUM_THREADS": str(options.threads)}
-    variables |= {"OPENBLAS_CORETYPE": core} if core else {}
-    arguments = [sys.executable, "-m", "benchmarks.limits", "--numpy-products"]
-    arguments += ["--quick"] * options.quick + ["--repeats", str(options.repeats)]
-    done = subprocess.run(arguments, env=variables, capture_output=True, text=True)
-    return work / float(done.stdout) / 1e9 if done.returncode == 0 else 0.0
+    if core:
+        variables["OPENBLAS_CORETYPE"] = core
+    words = [sys.executable, "-m", "benchmarks.limits", "--numpy-products"]
+    words += ["--repeats", str(options.repeats), *["--quick"] * options.quick]
+    done = subprocess.run(words, env=variables, capture_output=True, text=True)
+    return work / float(done.stdout) if done.returncode == 0 else 0.0
 
 
 def kinematics(options: Options) -> dict[str, float]:
-    m, model = BROKK_170, pinocchio.Model()
-    for i in range(m.n):  # as many joints; the time does not depend on where they are
-        place = pinocchio.SE3(np.eye(3), np.array([1.0, 0.0, 0.0]))
+    model = pinocchio.Model()
+    place = pinocchio.SE3(np.eye(3), np.array([1.0, 0.0, 0.0]))
+    for i in range(BROKK_170.n):  # as many joints; the time does not depend on where they are
         model.addJoint(i, pinocchio.JointModelRZ(), place, f"joint_{i}")
-    tool = model.addFrame(pinocchio.Frame("tool", m.n, place, pinocchio.FrameType.OP_FRAME))
-    data, q = model.createData(), np.random.default_rng(0).uniform(0, 1, (4096, m.n))
+    frame = pinocchio.Frame("tool", BROKK_170.n, place, pinocchio.FrameType.OP_FRAME)
+    tool = model.addFrame(frame)
+    data = model.createData()
+    axes = pinocchio.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    q = np.random.default_rng(0).uniform(0, 1, (4096, BROKK_170.n))
 
-    def loop() -> None:  # to the same results: position and Jacobian along the base's axes
+    def loop() -> None:
         for row in q[:1024]:
             pinocchio.computeJointJacobians(model, data, row)
             pinocchio.updateFramePlacement(model, data, tool)
-            _ = data.oMf[tool].translation
-            pinocchio.getFrameJacobian(
-                model, data, tool, pinocchio.ReferenceFrame.LOCAL_WORLD_ALIGNED
-            )
+            pinocchio.getFrameJacobian(model, data, tool, axes)
 
-    calls = {"jacobian": lambda: jacobian(forward_kinematics(m, q)), "pinocchio": loop}
-    found = seconds(calls, options.repeats, 0.02 if options.quick else 0.1)
+    def ours() -> None:
+        jacobian(forward_kinematics(BROKK_170, q))
+
+    times = seconds({"jacobian": ours, "pinocchio": loop}, options)
     return {
-        "us_per_configuration": 1e6 * found["jacobian"] / len(q),
-        "pinocchio_loop_us": 1e6 * found["pinocchio"] / 1024,
+        "us_per_configuration": 1e6 * times["jacobian"] / len(q),
+        "pinocchio_loop_us": 1e6 * times["pinocchio"] / 1024,
     }
 
 
 def main(options: Options) -> dict[str, Any]:
     torch.set_num_threads(options.threads)
     if options.quick:
-        options.repeats, options.num_envs = 1, options.num_envs[:2]
+        options.repeats = 1
     if options.numpy_products:
-        call = products("numpy", shapes(171, (4,), PPOConfig.minibatch_size))
-        print(seconds({"numpy": call}, options.repeats, 0.02 if options.quick else 0.1)["numpy"])
+        call = products("numpy", shapes(171, (4,), ppo.PPOConfig.minibatch_size))
+        print(seconds({"numpy": call}, options)["numpy"])
         return {}
     result = {
         "threads": options.threads,
         "load": os.getloadavg(),
         "environment": {str(num): environment(num, options) for num in options.num_envs},
-        "update": update(options),
+        "gradient": gradient(options),
         "kinematics": kinematics(options),
     }
-    print(json.dumps(result, indent=1))
-    if options.json:
-        options.json.write_text(json.dumps(result, indent=1) + "\n")
+    write(result, options.json)
     return result
 
 

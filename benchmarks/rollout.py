@@ -1,16 +1,16 @@
-"""Environment steps a second on the nets with 256 environments; ratio to the bare net products.
+"""Environment steps per second on the nets, and their ratio to the bare products of the nets.
 
-    python -m benchmarks.rollout [--actuator NET] [--json F]
+    python -m benchmarks.rollout [--actuator NET] [--num-envs 256] [--json F]
 
-The nets' speed does not depend on what they learned, so without NET random nets are used that
-know the dead zone, as fitted ones do.
+The speed of nets does not depend on what they learned: without NET they have random weights and the
+machine's dead zone.
 """
 
 from __future__ import annotations
 
 import json
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -24,41 +24,51 @@ from brokk_min.machine import BROKK_170
 
 @dataclass
 class Options:
-    actuator: Path | None = None
-    """Nets that `brokk-min fit` wrote; without them random ones."""
-    num_envs: int = 256
-    """Environments side by side."""
-    ticks: int = 400
-    """Ticks in each of the five timed runs."""
-    json: Path | None = None
-    """Also write the figures here."""
+    actuator: Path | None = None  # Nets that `brokk-min fit` wrote; by default random ones.
+    num_envs: int = 256  # Environments side by side.
+    ticks: int = 400  # Ticks in each of the five timed runs.
+    json: Path | None = None  # Also write the figures here.
 
 
-def random_net(rng: np.random.Generator) -> ActuatorNet:
-    m, h = BROKK_170, BROKK_170.history
-    sizes = [(3 * h, 32), (32, 32), (32, 1)]
+def random_net(rng: np.random.Generator, dead_zone: float = 0.0) -> ActuatorNet:
+    """One net per joint, with random weights."""
+    m = BROKK_170
+    inputs = 3 * m.history
     weights = []
-    for rows, columns in sizes:
+    for rows, columns in ((inputs, 32), (32, 32), (32, 1)):
         weights.append(rng.normal(0, rows**-0.5, (m.n, rows, columns)).astype(np.float32))
         weights.append(np.zeros((m.n, columns), np.float32))
-    one = np.ones((m.n, 3 * h), np.float32)
-    speed = m.q_dot_max.astype(np.float32)
-    low, high = m.column("q_min").astype(np.float32), m.column("q_max").astype(np.float32)
+    q_dot_max = m.q_dot_max.astype(np.float32)
     return ActuatorNet(
-        m.names, h, m.rate, m.velocity_samples, False, m.name, 0, {}, 0 * one, one, -speed, speed,
-        low, high, tuple(weights),
-    )  # fmt: skip
+        joints=m.names,
+        history=m.history,
+        rate=m.rate,
+        velocity_samples=m.velocity_samples,
+        velocity_logged=False,
+        machine=m.name,
+        seed=0,
+        settings={},
+        input_mean=np.zeros((m.n, inputs), np.float32),
+        input_scale=np.ones((m.n, inputs), np.float32),
+        output_low=-q_dot_max,
+        output_high=q_dot_max,
+        q_low=m.column("q_min").astype(np.float32),
+        q_high=m.column("q_max").astype(np.float32),
+        weights=tuple(weights),
+        dead_zone=dead_zone,
+    )
 
 
 def main(options: Options) -> None:
     rng = np.random.default_rng(0)
-    random = replace(random_net(rng), dead_zone=BROKK_170.dead_zone)
-    net = load_net(options.actuator) if options.actuator else random
-    env = TaskVectorEnv(options.num_envs, net)
+    net = random_net(rng, BROKK_170.dead_zone)
+    env = TaskVectorEnv(options.num_envs, load_net(options.actuator) if options.actuator else net)
     env.reset(seed=0)
-    actions = rng.uniform(-1, 1, (32, options.num_envs, len(env.machine.driven))).astype(np.float32)
-    steps, products = [], []
-    inputs = env.state.history[:, env.machine.driven]
+    assert env.state is not None and env.net is not None
+    actions = rng.uniform(-1, 1, (32, options.num_envs, 4)).astype(np.float32)
+    history = env.state.history[:, env.machine.driven]
+    steps = []
+    products = []
     for _ in range(5):
         start = time.perf_counter()
         for k in range(options.ticks):
@@ -66,7 +76,7 @@ def main(options: Options) -> None:
         steps.append(options.ticks * options.num_envs / (time.perf_counter() - start))
         start = time.perf_counter()
         for _ in range(options.ticks):
-            env.net.predict(inputs)
+            env.net.predict(history)
         products.append(options.ticks * options.num_envs / (time.perf_counter() - start))
     result = {
         "num_envs": options.num_envs,
@@ -74,9 +84,15 @@ def main(options: Options) -> None:
         "net_products_per_second": float(np.median(products)),
         "step_over_products": float(np.median(products) / np.median(steps)),
     }
-    print(json.dumps(result, indent=1))
-    if options.json:
-        options.json.write_text(json.dumps(result, indent=1) + "\n")
+    write(result, options.json)
+
+
+def write(result: object, path: Path | None) -> None:
+    """Print a result, and write it to a file."""
+    text = json.dumps(result, indent=1)
+    print(text)
+    if path:
+        path.write_text(text + "\n")
 
 
 if __name__ == "__main__":

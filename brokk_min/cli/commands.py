@@ -121,7 +121,7 @@ def print_scores(scores: dict[str, Any]) -> None:
     print(row.format("joint", "one step", "same as last", free_runs, "creep [rad/s]"))
     for name, net in scores["joints"].items():
         for label, model in ((name, net), ("  linear", net["linear"])):
-            one_step = f"{model['one_step_rmse']:.4f}"
+            one_step = f"{model.get('one_step_rmse', np.nan):.4f}"
             persistence = f"{model.get('persistence_rmse', np.nan):.4f}"
             free = ", ".join(f"{run['velocity_rmse']:.4f}" for run in model["free_run"].values())
             creep = f"{net['creep']:.5f}" if label == name else ""

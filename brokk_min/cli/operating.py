@@ -163,9 +163,9 @@ class Play(Command):
         if self.interface and not self.drive:
             play.watch(machine, bus)
         else:
-            play.play(machine, self._controllers(machine), bus, self.attempts)
+            play.play(machine, self.controllers(machine), bus, self.attempts)
 
-    def _controllers(self, machine: Machine) -> dict[str, Controller]:
+    def controllers(self, machine: Machine) -> dict[str, Controller]:
         path, gains = default_policy(machine, self.policy, self.gains)
         if not self.policy and not path.exists():
             return {}

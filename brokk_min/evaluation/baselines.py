@@ -26,6 +26,8 @@ PAPER_BASELINES = ("jacobian_pid_k0.1", "jacobian_pid_k0.05")
 STRONGER = ("jacobian_pid_ff",)  # than the paper's: its claims are tested against this one, too
 TUNING_RUNS = 12  # of the whole chain and of `evaluate`, assumed
 GENERATIONS = 45
+SEARCH: dict[str, Any] = {"mutation": (0.4, 0.9), "tol": 0, "polish": False}  # assumed
+SEARCH |= {"vectorized": True, "updating": "deferred"}  # a whole generation at once
 RANGES = {  # that `tune` searches (assumed); each driven joint has its own kp, ki and kd
     "kp": (0.0, 4.0),  # valve opening per rad/s
     "ki": (0.0, 12.0),  # valve opening per rad
@@ -38,7 +40,7 @@ RANGES = {  # that `tune` searches (assumed); each driven joint has its own kp, 
 def baselines(machine: Machine, net: ActuatorNet) -> dict[str, JacobianController]:
     """The paper's two baselines and two with feed-forward, with gains set by hand. Paper: Sec. 4.2
 
-    The last one keeps its valves open even while the tool is to stand still.
+    The last one keeps its valves open while the tool is to stand still.
     """
     w0 = manipulability_threshold(machine)
     pid = make_gains(machine, kp=1.0, ki=8.0, kd=0.05, feedback=0.4, min_opening=0.015)
@@ -164,19 +166,9 @@ def tune(
             costs.append(float(intermediate_result.fun))
             bar.update()
 
-        result = differential_evolution(
-            objective,
-            Bounds(low, high),
-            init=np.clip(first, low, high),
-            maxiter=generations,
-            mutation=(0.4, 0.9),  # assumed
-            tol=0,
-            polish=False,
-            vectorized=True,
-            updating="deferred",
-            callback=record,
-            rng=seed,
-        )
+        options = SEARCH | {"init": np.clip(first, low, high), "maxiter": generations, "rng": seed}
+        bounds = Bounds(low, high)
+        result = differential_evolution(objective, bounds, callback=record, **options)
     return replace(controller, gains=split_vector(result.x)), costs
 
 
@@ -206,16 +198,15 @@ def write_gains(
 def read_gains(path: Path, machine: Machine, net: ActuatorNet) -> dict[str, JacobianController]:
     """The baselines with gains that `reproduce` wrote.
 
-    ValueError: no such file, or gains of other controllers or joints, for another machine, or with
-    other nets, whose feed-forward differs.
+    ValueError: no such file, or gains of other controllers, of another machine, or of other nets.
     """
     controllers = baselines(machine, net)
-    wanted = gains_metadata(machine, net)
-    with expected(path, f"gains for {machine.name} with nets {wanted['actuator']}"):
+    own = gains_metadata(machine, net)
+    with expected(path, f"gains for {machine.name} with nets {own['actuator']}"):
         file = json.loads(path.read_text())
-        got = {name: file["meta"].get(name) for name in wanted}
-        if got != wanted:
-            raise ValueError(f"gains for {got}")
+        meta = {name: file["meta"].get(name) for name in own}
+        if meta != own:
+            raise ValueError(f"gains for {meta}")
         for name, controller in controllers.items():
             gains = file["gains"][name]
             if "ready" in gains:  # its name in older files

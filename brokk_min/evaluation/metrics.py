@@ -178,21 +178,19 @@ def evaluate(
         p_start = tool_position(forward_kinematics(machine, q))
         figures = metrics(machine, trace, goals, p_start)
         for i, sequence in enumerate(batch):
-            run = slice(i * num, (i + 1) * num)
-            traces[name, sequence.name] = Trace(*(array[:, run] for array in trace))
-            of_sequence = {key: values[run] for key, values in figures.items()}
-            rows[name, sequence.name] = _rows(name, sequence.name, kinds, of_sequence)
-    ordered = [rows[name, sequence.name] for name in controllers for sequence in sequences]
-    return list(chain.from_iterable(ordered)), traces
+            pair = name, sequence.name
+            part = slice(i * num, (i + 1) * num)
+            traces[pair] = Trace(*(array[:, part] for array in trace))
+            rows[pair] = _rows(pair, kinds, {key: v[part] for key, v in figures.items()})
+    order = product(controllers, [sequence.name for sequence in sequences])
+    return list(chain.from_iterable(rows[pair] for pair in order)), traces
 
 
-def _rows(
-    controller: str, sequence: str, kinds: Sequence[str], figures: Mapping[str, Array]
-) -> Rows:
-    """One row per start of figures (starts,); None where there is none."""
-    rows: Rows = []
+def _rows(pair: tuple[str, str], kinds: Sequence[str], figures: Mapping[str, Array]) -> Rows:
+    """One row per start of the figures (starts,) of a controller and sequence."""
+    rows = []
     for i, kind in enumerate(kinds):
-        row = dict(zip(LABELS, (controller, sequence, i, kind), strict=True))
+        row: dict[str, Any] = dict(zip(LABELS, (*pair, i, kind), strict=True))
         for key, values in figures.items():
             row[key] = float(values[i]) if np.isfinite(values[i]) else None
         rows.append(row)
@@ -255,12 +253,10 @@ def _names(runs: Sequence[Run], label: str) -> list[str]:
 
 def _table(runs: Sequence[Run], statistic: Callable[[Array], T]) -> dict[str, Any]:
     """A statistic of the starts' values, by controller, sequence (also "all") and figure."""
-    table: dict[str, dict[str, dict[str, T]]] = {}
+    table: dict[str, dict[str, dict[str, T]]] = {c: {} for c in _names(runs, "controller")}
     figures = [key for key in runs[0] if key not in LABELS]
-    for c in _names(runs, "controller"):
-        table[c] = {}
-        for s in [*_names(runs, "sequence"), "all"]:
-            table[c][s] = {key: statistic(by_start(runs, c, s, key)) for key in figures}
+    for c, s in product(table, [*_names(runs, "sequence"), "all"]):
+        table[c][s] = {key: statistic(by_start(runs, c, s, key)) for key in figures}
     return table
 
 
@@ -275,7 +271,7 @@ def intervals(runs: Sequence[Run]) -> dict[str, dict[str, dict[str, list[float |
 
 
 def paired_difference(runs: Sequence[Run], one: str, other: str, key: str) -> dict[str, Mean]:
-    """`mean_interval` of a figure of one controller less another's on the same starts, by sequence."""
+    """A figure of one controller less another's on the same starts: mean, interval, by sequence."""
     result = {}
     for s in [*_names(runs, "sequence"), "all"]:
         result[s] = mean_interval(by_start(runs, one, s, key) - by_start(runs, other, s, key))

@@ -61,18 +61,17 @@ def scale_valves(machine: Machine, positive: float, negative: float) -> Machine:
 
 def variations(machine: Machine) -> dict[str, tuple[Machine, Sensor]]:
     """Machines and encoders unknown to the controllers, by name; all numbers assumed."""
-    pump, delay = machine.pump_flow, machine.delay
     machines = {
         "nominal": machine,
-        "supply flow -20 %": replace(machine, pump_flow=0.8 * pump),
-        "supply flow -70 %": replace(machine, pump_flow=0.3 * pump),
+        "supply flow -20 %": replace(machine, pump_flow=0.8 * machine.pump_flow),
+        "supply flow -70 %": replace(machine, pump_flow=0.3 * machine.pump_flow),
         "valve gain -20 %": scale_valves(machine, 0.8, 0.8),
         "valve gain +20 %": scale_valves(machine, 1.2, 1.2),
         "up -15 %, down +15 %": scale_valves(machine, 0.85, 1.15),
         "dead zone 5 %": replace(machine, dead_zone=0.05),
         "dead zone 10 %": replace(machine, dead_zone=0.10),
-        "delay +25 ms": replace(machine, delay=delay + 0.025),
-        "delay +50 ms": replace(machine, delay=delay + 0.050),
+        "delay +25 ms": replace(machine, delay=machine.delay + 0.025),
+        "delay +50 ms": replace(machine, delay=machine.delay + 0.050),
     }
     result: dict[str, tuple[Machine, Sensor]] = {}
     for name, varied in machines.items():

@@ -124,8 +124,8 @@ def read_commands(path: Path, machine: Machine) -> list[Commands]:
         if len(time) < 2 or not (np.diff(time) > 0).all():
             raise ValueError(f"{path}: sequence {name}: expected two or more rows with rising time")
         if ticks < 1 or name == "all":
-            wanted = "expected a tick or more and another name than all"
-            raise ValueError(f"{path}: sequence {name}: {wanted}")
+            expected = "expected a tick or more and another name than all"
+            raise ValueError(f"{path}: sequence {name}: {expected}")
         row = np.searchsorted(time, np.arange(ticks) / machine.rate + 1e-6, "right") - 1
         result.append(Commands(str(name), velocity[rows][row]))
     return result
@@ -140,12 +140,12 @@ def read_starts(path: Path, machine: Machine) -> Array:
     starts = np.stack([table[name] for name in machine.names], axis=1)
     low, high = machine.column("q_min"), machine.column("q_max")
     for row, joint in np.argwhere((starts < low) | (starts > high)):
-        wanted = f"column {machine.names[joint]}: expected {low[joint]} to {high[joint]} rad"
-        raise ValueError(f"{path}: row {row + 2}, {wanted}, got {starts[row, joint]}")
+        expected = f"column {machine.names[joint]}: expected {low[joint]} to {high[joint]} rad"
+        raise ValueError(f"{path}: row {row + 2}, {expected}, got {starts[row, joint]}")
     lowest = lowest_point(forward_kinematics(machine, starts))
     for row in np.flatnonzero(terminated(machine, lowest)):
-        wanted = f"expected the whole arm above {machine.ground} m"
-        raise ValueError(f"{path}: row {row + 2}: {wanted}, got {lowest[row]:.3f} m")
+        expected = f"expected the whole arm above {machine.ground} m"
+        raise ValueError(f"{path}: row {row + 2}: {expected}, got {lowest[row]:.3f} m")
     return starts
 
 
@@ -227,8 +227,8 @@ def draw_starts(
     for kind in order:
         available = kept[kind] or kept["workspace"]
         if not available:
-            wanted = f"{num} poses from which all sequences are feasible"
-            raise ValueError(f"{machine.name}: expected {wanted}, got fewer in 200 draws")
+            expected = f"expected {num} poses from which all sequences are feasible"
+            raise ValueError(f"{machine.name}: {expected}, got fewer in 200 draws")
         starts.append(available.pop(0))
     return np.array(starts)
 
@@ -301,29 +301,24 @@ def speed_limits(machine: Machine, q: ArrayLike) -> tuple[Array, Array]:
 
 
 def tuning_set(machine: Machine, num: int, seed: int, seconds: float = 12.0) -> tuple[Array, Array]:
-    """Starts [rad] (num, n) and goals [m/s] (T, num, 3) on which the baselines are tuned.
+    """`feasible` starts [rad] (num, n) and goals [m/s] (T, num, 3) for tuning the baselines.
 
-    `learning.episodes.reset` draws them, as those of the policy. All are `feasible`.
-
-    ValueError: too few in 60 draws.
+    `learning.episodes.reset` draws them, as for the policy. ValueError: too few in 60 draws.
     """
     rng = np.random.default_rng(seed + 1000)
     config = TaskConfig()
     holds = int(np.ceil(seconds / config.hold_min_s))  # goals of a run: enough, however short
-    starts: list[Array] = []
-    kept: list[Array] = []
-    with tqdm(total=num, desc="draw tuning runs", unit="run", disable=None) as bar:
-        for _ in range(60):
-            drawn = reset(machine, config, rng, 200 * holds, plant=False)
-            v_goal = np.repeat(drawn.v_goal, drawn.goal_ticks, axis=0)
-            first = np.concatenate([[0], np.cumsum(drawn.goal_ticks)])[: 200 * holds : holds]
-            tick = np.arange(round(seconds * machine.rate))[:, None]
-            goals = v_goal[first + tick]  # (T, 200, 3)
-            q = drawn.q[::holds]
-            good = feasible(machine, q, goals)
-            starts += list(q[good])
-            kept += list(goals[:, good].swapaxes(0, 1))
-            bar.update(min(num, len(starts)) - bar.n)
-            if len(starts) >= num:
-                return np.array(starts[:num]), np.stack(kept[:num], axis=1)
+    tick = np.arange(round(seconds * machine.rate))[:, None]
+    starts = np.empty((0, machine.n))
+    goals = np.empty((len(tick), 0, 3), np.float32)
+    for _ in range(60):
+        drawn = reset(machine, config, rng, 200 * holds, plant=False)
+        first = np.concatenate([[0], np.cumsum(drawn.goal_ticks)])[:-1:holds]  # tick of each run
+        v_goal = np.repeat(drawn.v_goal, drawn.goal_ticks, axis=0)[first + tick]  # (T, 200, 3)
+        q = drawn.q[::holds]
+        good = feasible(machine, q, v_goal)
+        starts = np.concatenate([starts, q[good]])
+        goals = np.concatenate([goals, v_goal[:, good]], axis=1)
+        if len(starts) >= num:
+            return starts[:num], goals[:, :num]
     raise ValueError(f"{machine.name}: expected {num} feasible runs to tune on, got {len(starts)}")

@@ -42,12 +42,12 @@ def vector(controller: JacobianController) -> Array:
 
 
 def test_baselines__are_the_papers_two_and_two_with_feedforward() -> None:
-    found = baselines.baselines(BROKK_170, NET)
-    assert list(found) == NAMES == [*baselines.PAPER_BASELINES, *NAMES[2:]]
-    assert [c.k for c in found.values()] == [0.1, 0.05, 0.1, 0.1]
-    assert [c.always_open for c in found.values()] == [False, False, False, True]
-    assert [c.feedforward is not None for c in found.values()] == [False, False, True, True]
-    table = baselines.gains_table(found)
+    result = baselines.baselines(BROKK_170, NET)
+    assert list(result) == NAMES == [*baselines.PAPER_BASELINES, *NAMES[2:]]
+    assert [c.k for c in result.values()] == [0.1, 0.05, 0.1, 0.1]
+    assert [c.always_open for c in result.values()] == [False, False, False, True]
+    assert [c.feedforward is not None for c in result.values()] == [False, False, True, True]
+    table = baselines.gains_table(result)
     assert table["jacobian_pid_k0.1"] == table["jacobian_pid_k0.05"]
     assert table["jacobian_pid_k0.1"] == {
         "kp": [1.0] * 4,
@@ -96,8 +96,8 @@ def test_gains_at_bound__names_gains_within_a_hundredth_of_their_range() -> None
     start = controller(kp=2.0, ki=6.0, kd=0.1, feedback=0.5, min_opening=0.0)
     changed = vector(start).copy()
     changed[[1, 4, 7]] = [3.97, 0.11, 11.8]  # of 4 and 12: within 1 %, within 1 %, not
-    found = baselines.gains_at_bound(replace(start, gains=baselines.split_vector(changed)))
-    assert found == ["kp q3", "ki q1", "min_opening"]
+    result = baselines.gains_at_bound(replace(start, gains=baselines.split_vector(changed)))
+    assert result == ["kp q3", "ki q1", "min_opening"]
 
 
 # --- tuning ---------------------------------------------------------------------------------------
@@ -111,16 +111,16 @@ def test_tune__finds_the_minimum_of_a_bowl_and_repeats_itself() -> None:
     def bowl(candidates: JacobianController) -> Array:
         return np.sum(((vector(candidates) - goal) / (high - low)) ** 2, axis=-1)
 
-    found, costs = baselines.tune(start, bowl, seed=0, generations=60, label="bowl")
-    np.testing.assert_allclose(vector(found), goal, atol=0.02 * (high - low).max())
-    assert (np.abs(vector(found) - goal) < 0.02 * (high - low)).all()
+    result, costs = baselines.tune(start, bowl, seed=0, generations=60, label="bowl")
+    np.testing.assert_allclose(vector(result), goal, atol=0.02 * (high - low).max())
+    assert (np.abs(vector(result) - goal) < 0.02 * (high - low)).all()
     again, _ = baselines.tune(start, bowl, seed=0, generations=60, label="bowl")
     other, _ = baselines.tune(start, bowl, seed=1, generations=60, label="bowl")
-    np.testing.assert_array_equal(vector(found), vector(again))
-    assert not np.array_equal(vector(found), vector(other))
-    assert found.k == start.k and not vector(start).any()
+    np.testing.assert_array_equal(vector(result), vector(again))
+    assert not np.array_equal(vector(result), vector(other))
+    assert result.k == start.k and not vector(start).any()
     assert len(costs) == 60 and (np.diff(costs) <= 0).all()
-    assert costs[-1] == bowl(found) < 0.01 * costs[0]
+    assert costs[-1] == bowl(result) < 0.01 * costs[0]
 
 
 def test_tune__is_never_worse_than_the_gains_it_starts_with() -> None:
@@ -129,9 +129,9 @@ def test_tune__is_never_worse_than_the_gains_it_starts_with() -> None:
     def distance(candidates: JacobianController) -> Array:
         return np.abs(vector(candidates) - vector(start)).sum(axis=-1)
 
-    found, costs = baselines.tune(start, distance, seed=0, generations=1, label="start")
+    result, costs = baselines.tune(start, distance, seed=0, generations=1, label="start")
     assert costs == [0.0]
-    np.testing.assert_array_equal(vector(found), vector(start))
+    np.testing.assert_array_equal(vector(result), vector(start))
 
 
 def test_tune__searches_near_its_start_within_the_ranges() -> None:
@@ -161,8 +161,8 @@ def test_tuning_cost__of_many_candidates_is_that_of_each() -> None:
         one = replace(controller(), gains=baselines.split_vector(row))
         trace = rollout(BROKK_170, one, start, goals, config, rng)
         single.append(np.linalg.norm(goals - trace.v_tool, axis=-1).mean())
-    found = baselines.tuning_cost(many, start, goals, 0)  # with measurement noise
-    np.testing.assert_allclose(found, single, rtol=0.05)
+    result = baselines.tuning_cost(many, start, goals, 0)  # with measurement noise
+    np.testing.assert_allclose(result, single, rtol=0.05)
 
 
 def test_tune_baselines__lowers_each_cost_and_records_it() -> None:
@@ -189,8 +189,8 @@ def test_read_gains__reads_what_write_gains_wrote(tmp_path: Path) -> None:
     gains = Gains(np.arange(4.0), np.arange(4.0), np.zeros(4), np.ones(1), np.zeros(1))
     written["jacobian_pid_ff"] = replace(written["jacobian_pid_ff"], gains=gains)
     baselines.write_gains(path, written, baselines.gains_metadata(BROKK_170, NET) | {"seed": 3})
-    found = baselines.read_gains(path, BROKK_170, NET)
-    assert baselines.gains_table(found) == baselines.gains_table(written)
+    result = baselines.read_gains(path, BROKK_170, NET)
+    assert baselines.gains_table(result) == baselines.gains_table(written)
 
 
 def test_read_gains__reads_the_files_of_the_package_and_their_older_names(tmp_path: Path) -> None:

@@ -44,8 +44,8 @@ def test_command__interpolates_between_angles_and_holds_beyond_them(
     scale, u = np.array([1.0, 2.0, 4.0])[None, :, None], np.array([-1.0, 0.0, 1.0])
     steady = StaticMap(np.array([[-1.0, 0.5, 2.0]]), u, scale * u)
     for q_dot in (0.5, -0.25):
-        found = steady.command(np.array([float(angle)]), np.array([q_dot]))
-        np.testing.assert_allclose(found, [q_dot / speed], atol=1e-9)
+        result = steady.command(np.array([float(angle)]), np.array([q_dot]))
+        np.testing.assert_allclose(result, [q_dot / speed], atol=1e-9)
 
 
 def test_command__takes_each_joint_by_its_own_map() -> None:
@@ -53,8 +53,8 @@ def test_command__takes_each_joint_by_its_own_map() -> None:
     u = np.array([-1.0, 0.0, 1.0])
     velocity = np.array([[u, 2 * u], [3 * u, 6 * u]])
     steady = StaticMap(np.array([[0.0, 1.0], [0.0, 1.0]]), u, velocity)
-    found = steady.command(np.array([0.5, 0.5]), np.array([0.75, 0.75]))
-    np.testing.assert_allclose(found, [0.75 / 1.5, 0.75 / 4.5], atol=1e-9)
+    result = steady.command(np.array([0.5, 0.5]), np.array([0.75, 0.75]))
+    np.testing.assert_allclose(result, [0.75 / 1.5, 0.75 / 4.5], atol=1e-9)
 
 
 def test_static_map__is_the_fixed_point_of_steady_motion() -> None:
@@ -88,8 +88,8 @@ def test_static_map__is_of_motion_even_if_the_nets_know_stops() -> None:
             return np.where(np.abs(history[..., 1, -1]) < 0.01, 0.0, speed)
 
     net = small_net(BROKK_170, np.random.default_rng(0))
-    found = static_map(BROKK_170, Stalling(**{f.name: getattr(net, f.name) for f in fields(net)}))
-    moving = np.abs(found.u) > 0.1
-    expected = np.broadcast_to(0.3 * found.u[moving], (4, 9, moving.sum()))
-    np.testing.assert_allclose(found.velocity[..., moving], expected, atol=1e-4)
-    assert (found.q[:, 0] > BROKK_170.column("q_min")[BROKK_170.driven]).all()
+    result = static_map(BROKK_170, Stalling(**{f.name: getattr(net, f.name) for f in fields(net)}))
+    moving = np.abs(result.u) > 0.1
+    expected = np.broadcast_to(0.3 * result.u[moving], (4, 9, moving.sum()))
+    np.testing.assert_allclose(result.velocity[..., moving], expected, atol=1e-4)
+    assert (result.q[:, 0] > BROKK_170.column("q_min")[BROKK_170.driven]).all()

@@ -28,8 +28,8 @@ def trace_of(v: Array, q: Array | None = None, u: Array | None = None) -> Trace:
 
 
 def figures(v: Array, goals: Array, **more: Array) -> dict[str, float]:
-    found = m.metrics(BROKK_170, trace_of(v, **more), goals[:, None], np.zeros((1, 3)))
-    return {name: float(value[0]) for name, value in found.items()}
+    result = m.metrics(BROKK_170, trace_of(v, **more), goals[:, None], np.zeros((1, 3)))
+    return {name: float(value[0]) for name, value in result.items()}
 
 
 # --- one run --------------------------------------------------------------------------------------
@@ -59,8 +59,8 @@ def figures(v: Array, goals: Array, **more: Array) -> dict[str, float]:
 def test_line_distance__by_hand(
     goals: list[list[float]], p_tool: list[list[float]], expected: list[float]
 ) -> None:
-    found = m.line_distance(np.array(p_tool)[:, None], np.array(goals)[:, None], np.zeros((1, 3)))
-    assert found[:, 0] == pytest.approx(expected)
+    result = m.line_distance(np.array(p_tool)[:, None], np.array(goals)[:, None], np.zeros((1, 3)))
+    assert result[:, 0] == pytest.approx(expected)
 
 
 def test_metrics__by_hand() -> None:
@@ -245,33 +245,33 @@ def test_paired_difference__is_of_the_same_starts() -> None:
     runs = [run("a", s, i, e + 0.1 * i) for s in "xy" for i, e in reversed(error.items())]
     runs += [run("b", "x", i, e + 0.2) for i, e in error.items()]
     runs += [run("b", "y", i, e + 0.4) for i, e in error.items()]
-    found = m.paired_difference(runs, "b", "a", "error")
-    assert found["x"]["mean"] == pytest.approx(0.1) and found["y"]["mean"] == pytest.approx(0.3)
-    assert found["all"]["mean"] == pytest.approx(0.2)
+    result = m.paired_difference(runs, "b", "a", "error")
+    assert result["x"]["mean"] == pytest.approx(0.1) and result["y"]["mean"] == pytest.approx(0.3)
+    assert result["all"]["mean"] == pytest.approx(0.2)
     ends = m.interval(np.array([0.2, 0.1, 0.0]))
-    np.testing.assert_allclose([found["x"]["low"], found["x"]["high"]], ends)
+    np.testing.assert_allclose([result["x"]["low"], result["x"]["high"]], ends)
 
 
 def test_paired_differences__are_to_all_others_in_every_figure() -> None:
     errors = {"a": 1.0, "b": 3.0, "c": 7.0}
     runs = [run(c, "x", i, e) | {"other": 2 * e} for c, e in errors.items() for i in (0, 1)]
-    found = m.paired_differences(runs, "b")
-    assert list(found) == ["error", "other"] and list(found["error"]) == ["a", "c"]
-    assert [found["other"][c]["all"]["mean"] for c in "ac"] == [4.0, -8.0]
-    assert found["error"]["a"] == m.paired_difference(runs, "b", "a", "error")
+    result = m.paired_differences(runs, "b")
+    assert list(result) == ["error", "other"] and list(result["error"]) == ["a", "c"]
+    assert [result["other"][c]["all"]["mean"] for c in "ac"] == [4.0, -8.0]
+    assert result["error"]["a"] == m.paired_difference(runs, "b", "a", "error")
 
 
 def test_summary__leaves_out_what_was_not_measured() -> None:
     runs = [run("a", "x", i, e) for i, e in ((0, 1.0), (1, 3.0))]
     runs += [run("a", "y", i, None) for i in (0, 1)]
-    found = m.summary(runs)["a"]
-    assert {s: found[s]["error"] for s in found} == {"x": 2.0, "y": None, "all": 2.0}
+    result = m.summary(runs)["a"]
+    assert {s: result[s]["error"] for s in result} == {"x": 2.0, "y": None, "all": 2.0}
     intervals = m.intervals(runs)["a"]
     assert intervals["y"]["error"] == [None, None]
     assert intervals["x"]["error"] == m.interval(np.array([1.0, 3.0]))
 
 
 def test_metadata__names_program_machine_and_seed() -> None:
-    found = m.metadata(BROKK_170, 4)
-    assert list(found) == ["brokk_min", "machine", "seed", "units"]
-    assert (found["machine"], found["seed"]) == ("brokk170", 4)
+    result = m.metadata(BROKK_170, 4)
+    assert list(result) == ["brokk_min", "machine", "seed", "units"]
+    assert (result["machine"], result["seed"]) == ("brokk170", 4)

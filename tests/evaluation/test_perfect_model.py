@@ -41,15 +41,15 @@ def test_errors__are_those_that_the_plant_then_has() -> None:
     plant = plant_in_motion(rng)
     u = np.repeat(rng.uniform(-0.6, 0.6, (2, 3, 2, 5)), 3, axis=2)
     goal = rng.uniform(-0.2, 0.2, (2, 3))
-    found = BOUND.errors(plant, u, goal)
-    assert found.shape == (2, 3, 6, 3)
+    result = BOUND.errors(plant, u, goal)
+    assert result.shape == (2, 3, 6, 3)
     for plan in range(3):
         state = plant
         for tick in range(6):
             q_before = state.q
             state = plant_step(BROKK_170, state, u[:, plan, tick])
             v = tool_velocity(forward_kinematics(BROKK_170, state.q), (state.q - q_before) * 20)
-            np.testing.assert_allclose(found[:, plan, tick], goal - v, atol=1e-5)
+            np.testing.assert_allclose(result[:, plan, tick], goal - v, atol=1e-5)
 
 
 def test_steady_opening__moves_the_tool_at_the_goal() -> None:
@@ -106,9 +106,9 @@ def test_commands__alternate_about_openings_near_zero() -> None:
     u = BOUND.commands(np.tile([0.0, 0.04, 0.08, -0.3], (4, 1)), 3)
     assert not u[:, BROKK_170.locked].any()
     u = u[:, BROKK_170.driven]
-    found = np.sign(u) * (np.abs(u) - BROKK_170.dead_zone) / (1 - BROKK_170.dead_zone)
+    result = np.sign(u) * (np.abs(u) - BROKK_170.dead_zone) / (1 - BROKK_170.dead_zone)
     expected = [[-0.04, 0.02, 0.08, -0.3], [0.04, 0.06, 0.08, -0.3]]
-    np.testing.assert_allclose(found, expected * 2, atol=1e-8)
+    np.testing.assert_allclose(result, expected * 2, atol=1e-8)
 
 
 def test_start__is_the_plant_at_rest_at_its_poses() -> None:

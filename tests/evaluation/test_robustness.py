@@ -37,20 +37,20 @@ def test_noisy_encoder__has_independent_noise_of_a_count() -> None:
 def test_lossy_encoder__repeats_one_sample_in_20_of_all_joints_of_a_machine() -> None:
     read = module.lossy_encoder(np.random.default_rng(0))
     exact = read_encoder(BROKK_170, Q)
-    found = np.array([read(BROKK_170, q) for q in Q])
-    lost = (found[1:] == found[:-1]).all(axis=-1)
+    result = np.array([read(BROKK_170, q) for q in Q])
+    lost = (result[1:] == result[:-1]).all(axis=-1)
     assert lost.mean() == pytest.approx(0.05, abs=0.008)
     assert lost.all(axis=1).mean() < 0.01  # rarely of both machines
-    np.testing.assert_array_equal(found[1:][~lost], exact[1:][~lost])
-    np.testing.assert_array_equal(found[0], exact[0])
+    np.testing.assert_array_equal(result[1:][~lost], exact[1:][~lost])
+    np.testing.assert_array_equal(result[0], exact[0])
 
 
 def test_variations__change_one_thing_each() -> None:
-    found = variations(BROKK_170)
-    assert len(found) == 12 and found["nominal"][0] is BROKK_170
-    sensors = [name for name, (_, sensor) in found.items() if sensor is not module.exact_encoder]
+    result = variations(BROKK_170)
+    assert len(result) == 12 and result["nominal"][0] is BROKK_170
+    sensors = [name for name, (_, sensor) in result.items() if sensor is not module.exact_encoder]
     assert sensors == ["encoder noise of a count", "one sample in 20 lost"]
-    assert all(found[name][0] is BROKK_170 for name in sensors)
+    assert all(result[name][0] is BROKK_170 for name in sensors)
     changed = {
         "supply flow -20 %": {"pump_flow": 0.8 * BROKK_170.pump_flow},
         "supply flow -70 %": {"pump_flow": 0.3 * BROKK_170.pump_flow},
@@ -60,13 +60,13 @@ def test_variations__change_one_thing_each() -> None:
         "delay +50 ms": {"delay": BROKK_170.delay + 0.05},
     }
     for name, fields in changed.items():
-        assert found[name][0] == replace(BROKK_170, **fields)
+        assert result[name][0] == replace(BROKK_170, **fields)
     for name, up, down in (
         ("valve gain -20 %", 0.8, 0.8),
         ("valve gain +20 %", 1.2, 1.2),
         ("up -15 %, down +15 %", 0.85, 1.15),
     ):
-        machine = found[name][0]
+        machine = result[name][0]
         for field, factor in (("speed_positive", up), ("speed_negative", down)):
             np.testing.assert_allclose(machine.column(field), factor * BROKK_170.column(field))
 

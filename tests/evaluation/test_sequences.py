@@ -242,8 +242,8 @@ def test_draw_starts__refuses_a_machine_that_can_follow_nothing(
 ) -> None:
     monkeypatch.setattr(s, "draw_pose", lambda *_: np.tile(START, (3, 1)))  # faster
     sequences = [s.Commands("fast", np.full((2, 3), 9.0))]
-    wanted = "^brokk170: expected 2 poses from which all .* feasible, got fewer in 200 draws$"
-    with pytest.raises(ValueError, match=wanted):
+    message = "^brokk170: expected 2 poses from which all .* feasible, got fewer in 200 draws$"
+    with pytest.raises(ValueError, match=message):
         s.draw_starts(BROKK_170, sequences, 2, np.random.default_rng(0))
 
 
@@ -321,8 +321,8 @@ def test_feasible__needs_all_of_a_path() -> None:
     goals[0, 0, 1] = 0.7
     goals[0, 1, 1] = 0.1
     start = np.tile([0.0, *START[1:]], (3, 1))
-    found = s.feasible(replace(BROKK_170, rate=100.0), start, goals)
-    assert found.tolist() == [False, True, True]
+    result = s.feasible(replace(BROKK_170, rate=100.0), start, goals)
+    assert result.tolist() == [False, True, True]
 
 
 @given(machines(), st.data())
@@ -340,10 +340,10 @@ def test_speed_limits__are_where_the_plant_settles(machine: Machine, data: st.Da
     state = state._replace(z=np.ones(machine.n), s=opening, v=speed * np.abs(opening))
     state = state._replace(delayed=np.repeat(u[:, None], state.delayed.shape[-1], axis=1))
     after = plant_step(machine, state, u)
-    found = s.speed_limits(machine, np.stack([state.q, after.q]))[side][:, joint]
+    result = s.speed_limits(machine, np.stack([state.q, after.q]))[side][:, joint]
     q_dot = (after.q - state.q)[joint] * machine.rate
     if low[joint] < after.q[joint] < high[joint]:
-        assert min(found) - 1e-3 * abs(q_dot) <= q_dot <= max(found) + 1e-3 * abs(q_dot)
+        assert min(result) - 1e-3 * abs(q_dot) <= q_dot <= max(result) + 1e-3 * abs(q_dot)
 
 
 # --- tuning ---------------------------------------------------------------------------------------

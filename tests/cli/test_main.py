@@ -1,0 +1,180 @@
+"""The command line as a user meets it: help, version, refusals in one line, exit statuses."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from helpers_cli import MINI, run
+
+import brokk_min
+from brokk_min.__main__ import COMMANDS
+
+ROOT = Path(__file__).parents[2]
+OPTIONS = {
+    "collect": "--out --hours --excitation --machine",
+    "fit": "--out --test --json --figure --velocity-samples --history --dead-zone --paper",
+    "preliminary": "--actuator --out",
+    "train": "--actuator --out --total-steps --num-envs --resume --paper --critic --lag-cost",
+    "sweep": "--actuator --out --seeds --poses --scheduler --gains --total-steps --paper",
+    "starts": "--out --num",
+    "evaluate": "--policy --commands --starts --num-starts --perfect-model --plant --json --gains",
+    "reproduce": "--out --quick --sweep",
+    "machine": "--interface --channel --start --record",
+    "drive": "--policy --interface --channel --command --controller --counts --log --replay",
+    "convert": "--out",
+    "export": "--policy --out",
+    "play": "--policy --gains --interface --channel --drive --attempts --log --start",
+    "replay": "--out --fps --size --controllers --sequence --start",
+}
+
+
+def test_help__names_all_commands(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("--help") == 0
+    printed = capsys.readouterr().out
+    assert "Exits 0 done, 1 failed, 2 wrong use." in printed
+    assert all(f"• {command} " in printed for command in OPTIONS)
+    assert list(COMMANDS) == list(OPTIONS)
+
+
+@pytest.mark.parametrize("command", list(COMMANDS))
+def test_help__names_all_options(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(f"{command} --help") == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith(f"usage: brokk-min {command} ")
+    assert set(f"--seed {OPTIONS[command]}".split()) <= set(re.findall(r"--[\w-]+", printed))
+    assert "--no-resume" not in printed
+
+
+HELP = """
+import contextlib, io, sys
+from brokk_min.__main__ import COMMANDS, main
+for words in (["--version"], ["--help"], *([command, "--help"] for command in COMMANDS)):
+    with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()) as printed:
+        main(words)
+    assert printed.getvalue(), words
+print("torch" in sys.modules)
+"""
+
+
+def test_help__does_not_import_torch() -> None:
+    done = subprocess.run([sys.executable, "-c", HELP], capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("False\n", "")
+
+
+def test_version__is_that_of_the_project_and_of_its_citation(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert run("--version") == 0
+    assert capsys.readouterr().out == f"brokk_min {brokk_min.__version__}\n"
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["version"] == brokk_min.__version__
+    citation = (ROOT / "CITATION.cff").read_text()
+    assert f"\nversion: {brokk_min.__version__}\n" in citation
+
+
+DRIVE = "drive --interface virtual --channel 0"
+TRAIN = "train --actuator missing.npz --out p.npz"
+
+
+@pytest.mark.parametrize(
+    ("line", "status", "message"),
+    [
+        ("", 2, "collect"),
+        ("nonsense", 2, "nonsense"),
+        ("collect", 2, "--out"),
+        ("collect --out x.csv --hours 0", 2, "--hours: expected 0.0001 to 100, got 0.0"),
+        ("collect --out x.txt", 2, "--out: expected a name ending in .csv or .npz, got x.txt"),
+        ("collect --out x.csv --machine digger", 2, "brokk170"),
+        ("fit --out n.npz", 2, "LOGS: expected at least one log, got none"),
+        ("fit missing.csv --out n.npz", 1, "missing.csv"),
+        ("fit missing.csv --out n.npz --dead-zone 1.5", 2, "--dead-zone: expected 0 to 0.99"),
+        ("fit a.csv --out n.npz --velocity-samples 20", 2, "expected at most --history, got 20"),
+        (TRAIN, 1, "missing.npz"),
+        (f"{TRAIN} --num-envs 0", 2, "--num-envs: expected 1 to 1000000, got 0"),
+        (f"{TRAIN} --hold-min-s 9", 2, "--hold-max-s: expected --hold-min-s or more, got 3.0"),
+        ("sweep --actuator missing.npz --out s", 1, "missing.npz"),
+        ("sweep --actuator missing.npz --out s --seeds 0", 2, "--seeds: expected 1 to 10000"),
+        ("evaluate --policy missing.npz", 1, "missing.npz"),
+        ("evaluate --policy missing.npz --plant net --perfect-model", 2, "--perfect-model"),
+        ("evaluate --policy missing.npz --num-starts 0", 2, "--num-starts: expected 1 to 1000000"),
+        (f"evaluate --machine '{MINI}'", 1, "policy.npz"),
+        ("preliminary --actuator missing.npz", 1, "missing.npz"),
+        ("machine --interface nonsense --channel 0", 1, "nonsense"),
+        ("machine --interface virtual --channel 0 --start 9 9", 1, "start"),
+        ("drive --policy missing.npz", 2, "--interface, --channel: expected a CAN bus"),
+        ("drive --controller jog --interface virtual", 2, "--interface, --channel: expected a CAN"),
+        ("drive --controller jog --channel can0", 2, "--interface, --channel: expected a CAN bus"),
+        (f"{DRIVE} --policy missing.npz", 1, "missing.npz"),
+        (DRIVE, 2, "--policy: expected a policy that `train` wrote, got none"),
+        (f"{DRIVE} --controller jog --joint q9", 2, "['q1', 'q3', 'q4', 'q5'], got q9"),
+        (f"{DRIVE} --controller jog --command c.csv", 1, "c.csv"),
+        ("convert missing.log --out log.csv", 1, "missing.log"),
+        ("export --policy missing.npz --out p.onnx", 1, "missing.npz"),
+        ("play --drive", 2, "--interface, --channel: expected both"),
+        ("play --interface virtual", 2, "--interface, --channel: expected both"),
+        ("replay", 2, "LOGS"),
+        ("replay a.log b.log c.log", 2, "LOGS: expected one or two, got 3"),
+        ("replay a.log b.log --size 639 540", 2, "expected some and 640 320 to 4000 4000, got 2 "),
+        ("replay a.log --size 960 319", 2, "got 1 and 960 319"),
+        ("replay a.json --controllers rl --size 4001 540", 2, "got 1 and 4001 540"),
+    ],
+)
+def test_wrong_use__is_refused_in_one_line(
+    line: str,
+    status: int,
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(line) == status
+    printed = capsys.readouterr()
+    assert message in printed.err + printed.out
+    assert "Traceback" not in printed.err
+    assert printed.err.count("\n") == 1 or not printed.err.startswith("brokk-min: ")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "collect --out",
+        "fit l.csv --out",
+        "fit l.csv --out n.npz --json",
+        "fit l.csv --out n.npz --figure",
+        "train --actuator n.npz --out",
+        "starts --out",
+        "evaluate --json",
+        "machine --interface virtual --channel c --record",
+        "drive --interface virtual --channel c --controller jog --log",
+        "convert l.log --out",
+        "export --policy p.npz --out",
+        "play --log",
+        "play --attempts",
+        "replay l.log --out",
+    ],
+)
+def test_outputs__that_cannot_be_written_are_refused_before_any_work(
+    line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "missing" / "x.csv"
+    assert run(line, path) == 2
+    expected = f"brokk-min: {path}: expected a file in an existing, writable directory\n"
+    assert capsys.readouterr().err == expected
+
+
+def test_interrupt__is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt(command: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(COMMANDS["starts"], "__call__", interrupt)
+    assert run("starts --out s.csv") == 1
+    assert capsys.readouterr().err == "brokk-min: stopped\n"

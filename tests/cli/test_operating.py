@@ -1,0 +1,213 @@
+"""The commands at a machine: logs that are compared and converted, the window, films."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import can
+import numpy as np
+import pytest
+from helpers_bus import Hand, World
+from helpers_cli import MINI, run
+
+from brokk_min.can.operator_input import JointJog
+from brokk_min.cli.operating import Play, show_line
+from brokk_min.evaluation import baselines
+from brokk_min.identification.files import SHIPPED
+from brokk_min.identification.logs import read_log
+from brokk_min.jacobian import JacobianController
+from brokk_min.learning.policy import PolicyController, load_policy
+from brokk_min.machine import BROKK_170
+from brokk_min.viewer import play, replay
+from brokk_min.viewer.control_process import BusOptions
+
+POLICY = SHIPPED / "brokk170" / "policy.npz"
+GAINS = SHIPPED / "brokk170" / "gains.json"
+
+
+# --- logs of `drive` ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Joint q4 jogs for two seconds, on a simulated machine and an injected clock."""
+    path = tmp_path_factory.mktemp("drive") / "run.log"
+    writer = can.CanutilsLogWriter(path, channel="can0")
+    world = World(JointJog(BROKK_170, "q4", 30), Hand(), log=writer)
+    world.drive.begin()
+    world.run(2.0)
+    world.close()
+    writer.stop()
+    return path
+
+
+def test_drive__sends_the_frames_of_a_log_again(
+    log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    jog = "drive --controller jog --joint q4 --counts"
+    assert run(f"{jog} 30 --replay", log) == 0
+    printed = capsys.readouterr().out
+    same, of, sent = printed.removeprefix(f"{log}: ").split()[:3]
+    assert (same, of) == (sent, "of")
+    assert int(sent) > 30
+    assert run(f"{jog} 31 --replay", log) == 1
+    assert "expected the frames of the log, got " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("options", ["", "--controller jacobian", f"--gains '{GAINS}'"])
+def test_drive__compares_policy_and_baseline_too(
+    options: str, log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    policy = tmp_path / "policy.npz" if "gains" in options else POLICY
+    policy.write_bytes(POLICY.read_bytes()) if policy != POLICY else None
+    assert run(f"drive --policy '{policy}' {options} --replay", log) == 1
+    assert capsys.readouterr().err.endswith(" others\n")
+
+
+def test_convert__makes_a_log_for_fit(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "log.csv"
+    assert run(f"convert '{log}' --out", out) == 0
+    (recording,) = read_log([out], 4).recordings
+    assert np.abs(recording.u[:, 3]).max() == pytest.approx(30 / 127)
+    assert not recording.u[:, :3].any()
+    assert capsys.readouterr().out == f"{out}: 1 recordings of q1, q2, q3, q4, q5\n"
+
+
+def test_export__writes_an_onnx_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "p.onnx"
+    assert run(f"export --policy '{POLICY}' --out", out) == 0
+    assert b"observation" in out.read_bytes()
+    assert capsys.readouterr().out.startswith(f"{out}: observation (batch, obs) in")
+
+
+@pytest.mark.parametrize(
+    ("terminal", "expected"),
+    [(True, "\rdriving v wanted +0\033[K"), (False, "driving v wanted +0.10 +0.00 +0.00\n")],
+)
+def test_show_line__keeps_to_one_line_of_a_terminal(
+    terminal: bool, expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    screen = io.StringIO()
+    monkeypatch.setattr(screen, "isatty", lambda: terminal)
+    monkeypatch.setattr("sys.stdout", screen)
+    monkeypatch.setenv("COLUMNS", "20")
+    show_line("driving v wanted +0.10 +0.00 +0.00")
+    assert screen.getvalue() == expected
+
+
+# --- windows and films ----------------------------------------------------------------------------
+
+
+def test_play__has_policy_and_tuned_baseline(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    net = load_policy(POLICY, BROKK_170).net
+    tuned = baselines.read_gains(GAINS, BROKK_170, net)["jacobian_pid_k0.1"]
+    copy = tmp_path / "p.npz"
+    copy.write_bytes(POLICY.read_bytes())
+    for command, gains in (
+        (Play(), GAINS),
+        (Play(policy=copy), None),
+        (Play(policy=copy, gains=GAINS), GAINS),
+    ):
+        controllers = command.controllers(BROKK_170)
+        rl = controllers["rl"]
+        jacobian = controllers["jacobian"]
+        assert isinstance(rl, PolicyController)
+        assert isinstance(jacobian, JacobianController)
+        assert jacobian.k == 0.1
+        assert np.array_equal(jacobian.gains.kp, tuned.gains.kp) == (gains is not None)
+        expected = f"gains of the Jacobian controller: {gains or 'set by hand'}\n"
+        assert capsys.readouterr().err == expected
+
+
+def test_play__drives_a_simulated_machine_or_a_bus_and_watches_a_bus(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    windows: list[tuple[Any, ...]] = []
+    monkeypatch.setattr(play, "play", lambda *arguments: windows.append(("play", *arguments)))
+    monkeypatch.setattr(play, "watch", lambda *arguments: windows.append(("watch", *arguments)))
+    monkeypatch.chdir(tmp_path)
+    bus = "--interface socketcan --channel can0"
+    assert run("play --start 0 0.5 0.6 1.7 1.2") == 0
+    assert run(f"play --drive {bus} --log a.log --attempts b.csv") == 0
+    assert run(f"play {bus}") == 0
+    assert run(f"play --machine '{MINI}'") == 0
+    simulated, drives, watches, other = windows
+    start = (0.0, 0.5, 0.6, 1.7, 1.2)
+    assert simulated[:2] == ("play", BROKK_170)
+    assert simulated[3:] == (BusOptions(start=start), Path("attempts.csv"))
+    assert drives[3:] == (BusOptions("socketcan", "can0", Path("a.log")), Path("b.csv"))
+    assert watches == ("watch", BROKK_170, BusOptions("socketcan", "can0"))
+    assert other[2] == {}  # no policy comes with it
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Half a second of the package's policy and gains, from one of the machine's own starts."""
+    folder = tmp_path_factory.mktemp("runs")
+    (folder / "c.csv").write_text("sequence,time,vx,vy,vz\nup,0,0,0,0.1\nup,0.5,0,0,0\n")
+    out = folder / "runs.json"
+    assert run(f"evaluate --commands '{folder}/c.csv' --num-starts 1 --json", out) == 0
+    return out
+
+
+def test_replay__shows_results_and_logs(
+    results: Path, log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[Any] = []
+    monkeypatch.setattr(replay, "show_film", lambda machine, runs, size: shown.append((runs, size)))
+    assert run(f"replay '{results}' --controllers rl") == 0
+    assert run(f"replay '{results}' '{log}' --controllers rl --size 800 600") == 0
+    assert [len(runs) for runs, _ in shown] == [1, 2]
+    assert [size for _, size in shown] == [(960, 540), (800, 600)]
+
+
+def test_replay__refuses_runs_that_the_results_do_not_have(
+    results: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for wrong in ("--sequence down", "--start 1", "--start -1"):
+        assert run(f"replay '{results}' --controllers rl {wrong}") == 2
+        assert "expected some of ['up'], of ['rl'] and below 1, got " in capsys.readouterr().err
+    table = json.loads(results.read_text())
+    table["starts"] = [[1.0, 0.9, 1.2, 1.2, 0.3]]
+    other = results.with_name("other.json")
+    other.write_text(json.dumps(table))
+    assert run(f"replay '{other}' --controllers rl") == 1
+    assert "expected the run" in capsys.readouterr().err
+    table["meta"]["machine"] = "mini"
+    other.write_text(json.dumps(table))
+    assert run(f"replay '{other}'") == 1
+    assert "expected --machine mini, got brokk170" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("status", [0, 3])
+def test_replay__sends_pictures_to_ffmpeg(
+    status: int,
+    results: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """An ffmpeg that copies its input: 5 raw pictures of half a second, 3 bytes a pixel."""
+    (tmp_path / "ffmpeg").write_text(f"#!/bin/sh\ncat\nexit {status}\n")
+    (tmp_path / "ffmpeg").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+    film = tmp_path / "f.mp4"
+    assert run(f"replay '{results}' --controllers rl --size 320 320 --out", film) == bool(status)
+    if status:
+        assert "expected ffmpeg to write it, got its status 3" in capsys.readouterr().err
+        assert not film.exists()
+    else:
+        assert film.stat().st_size == 5 * 320 * 320 * 3
+
+
+def test_replay__writes_gif_or_mp4(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    film = results.with_suffix(".avi")
+    assert run(f"replay '{results}' --controllers rl --out", film) == 1
+    assert "expected a name ending in .gif or .mp4" in capsys.readouterr().err

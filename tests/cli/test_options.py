@@ -1,0 +1,97 @@
+"""Ranges, machines, policies and gains by default."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import pytest
+from helpers_cli import MINI
+
+from brokk_min.cli.options import (
+    Command,
+    Range,
+    WrongUse,
+    check_ranges,
+    default_policy,
+    find_machine,
+)
+from brokk_min.identification.files import SHIPPED
+from brokk_min.machine import BROKK_170
+
+
+@dataclass
+class Inner:
+    num_envs: Annotated[int, Range(1, 1e6)] = 1
+
+
+@dataclass
+class Outer:
+    counts: Annotated[int, Range(1, 127)] = 1
+    dead_zone: Annotated[float | None, Range(0, 0.99)] = None
+    inner: Inner = field(default_factory=Inner)
+    free: int = 10**9
+
+
+@pytest.mark.parametrize(
+    "options",
+    [Outer(), Outer(1, 0.0), Outer(127, 0.99), Outer(inner=Inner(10**6)), Outer(free=-(10**9))],
+)
+def test_check_ranges__allows_both_ends_and_none(options: Outer) -> None:
+    check_ranges(options)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (Outer(0), "--counts: expected 1 to 127, got 0"),
+        (Outer(128), "--counts: expected 1 to 127, got 128"),
+        (Outer(1, 1.0), "--dead-zone: expected 0 to 0.99, got 1.0"),
+        (Outer(dead_zone=float("nan")), "--dead-zone: expected 0 to 0.99, got nan"),
+        (Outer(inner=Inner(0)), "--num-envs: expected 1 to 1000000, got 0"),
+    ],
+)
+def test_check_ranges__names_option_range_and_value(options: Outer, message: str) -> None:
+    with pytest.raises(WrongUse, match=f"^{message}$"):
+        check_ranges(options)
+
+
+def test_check__gives_the_machine_if_outputs_can_be_written(tmp_path: Path) -> None:
+    assert Command().check(tmp_path / "new.csv", None) is BROKK_170
+    assert Command(machine="").check() is BROKK_170
+    assert Command(seed=2**31 - 1).check() is BROKK_170
+    with pytest.raises(WrongUse, match=r"^--seed: expected 0 to 2147483647, got -1$"):
+        Command(seed=-1).check()
+    for path in (tmp_path, tmp_path / "missing" / "new.csv"):
+        with pytest.raises(WrongUse, match=f"^{re.escape(str(path))}: expected a file in an exist"):
+            Command().check(None, path)
+
+
+def test_find_machine__runs_a_file(tmp_path: Path) -> None:
+    assert find_machine("brokk170") is BROKK_170
+    assert find_machine(MINI).name == "mini_excavator"
+    file = tmp_path / "a:b.py"
+    file.write_text("from brokk_min.machine import BROKK_170 as MINE\nNONE = 3\n")
+    assert find_machine(f"{file}:MINE") == BROKK_170
+    with pytest.raises(WrongUse, match=r"^--machine: expected a Machine NONE in .*a:b.py, got 3$"):
+        find_machine(f"{file}:NONE")
+    with pytest.raises(WrongUse, match=r"one of \['brokk170'\] or FILE.py:NAME, got digger$"):
+        find_machine("digger")
+    file.write_text("raise KeyError('no')")
+    with pytest.raises(ValueError, match=r"expected .*a:b.py to run, got KeyError\('no'\)$"):
+        find_machine(f"{file}:MINE")
+
+
+def test_default_policy__takes_gains_from_the_folder_of_the_policy(tmp_path: Path) -> None:
+    shipped = SHIPPED / "brokk170"
+    expected = (shipped / "policy.npz", shipped / "gains.json")
+    assert default_policy(BROKK_170, None, None) == expected
+    policy = tmp_path / "p.npz"
+    gains = tmp_path / "gains.json"
+    other = tmp_path / "other.json"
+    assert default_policy(BROKK_170, policy, None) == (policy, None)
+    gains.touch()
+    assert default_policy(BROKK_170, policy, None) == (policy, gains)
+    assert default_policy(BROKK_170, policy, other) == (policy, other)

@@ -1,0 +1,18 @@
+"""The command line in this process."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+from brokk_min.__main__ import main
+
+MINI = f"{Path(__file__).parents[1] / 'examples' / 'mini_excavator.py'}:MINI_EXCAVATOR"
+
+
+def run(line: str, *more: object) -> int:
+    """Exit status of a command; tyro leaves by SystemExit on wrong use and help."""
+    try:
+        return main([*shlex.split(line), *map(str, more)])
+    except SystemExit as stop:
+        return int(stop.code or 0)
