@@ -1,10 +1,11 @@
 """Many seeds of one training: on this machine's cores, or on a cluster, through dask.distributed.
 
-Each seed leaves `seed_<n>.npz`, its learning curve and, last, `seed_<n>.json`; what is there is not
-run again. On a cluster all workers must have the folder, and run one seed at a time.
+Each seed writes `seed_<n>.npz`, its learning curve and, last, `seed_<n>.json`; what exists is not
+computed again. On a cluster all workers must have the folder, and run one seed at a time.
 """
 
 import json
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -33,17 +34,10 @@ def run_seed(
     about: Mapping[str, Any],
     seed: int,
 ) -> Rows:
-    """Train one seed and evaluate its policy, or go on from what the folder `out` holds of it.
+    """Train one seed and evaluate its policy, or continue from what the folder `out` holds of it.
 
-    Args:
-        machine: n joints.
-        net: nets of its driven joints.
-        task: episodes.
-        config: settings of the learner.
-        out: folder of the sweep.
-        evaluate: figures of a policy.
-        about: what decides the evaluation, for the header of the result.
-        seed: of the training.
+    `evaluate` gives the figures of a policy; `about` is what decides them, for the header of the
+    result. The other arguments are those of `train_policy`.
 
     ValueError: a result of another training or evaluation.
     """
@@ -74,16 +68,17 @@ def read_result(path: Path, identity: Mapping[str, Any]) -> Rows:
 def run_seeds(
     job: Callable[[int], Rows], seeds: Sequence[int], scheduler: str | None = None
 ) -> tuple[dict[int, Rows], dict[int, str]]:
-    """Results of `job` by seed, and why it failed by seed; a failed seed leaves the others alone.
+    """Results of `job`, and messages of failures, by seed.
 
-    A core each here, or a worker each of the dask scheduler at the address `scheduler`. A job whose
-    worker dies is run again. ValueError: workers of several threads; torch's settings are those of
-    a process.
+    Each job runs on one core here, or on one worker of the dask scheduler at the address
+    `scheduler`; dask repeats it if the worker dies. ValueError: workers of several threads, which
+    would share torch's settings.
     """
     distributed = require("distributed", "sweep")
     options: dict[str, Any] = {"address": scheduler, "timeout": 10}
     if scheduler is None:
         options = {"threads_per_worker": 1, "memory_limit": None, "dashboard_address": ":0"}
+        options["silence_logs"] = logging.ERROR
     environ = "distributed.nanny.pre-spawn-environ"  # of the processes that run the jobs
     settings = {
         f"{environ}.TQDM_DISABLE": 1,

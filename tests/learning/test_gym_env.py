@@ -164,6 +164,44 @@ def test_step__refuses_to_begin_without_a_reset(make):
         make().render()
 
 
+class Recorder:
+    """A renderer that notes what it gets."""
+
+    mode = "rgb_array"
+
+    def __init__(self):
+        self.started = []
+        self.open = True
+
+    def update(self, state, started):
+        self.started.append(list(started))
+
+    def render(self, state):
+        return [np.full((2, 3, 3), i, np.uint8) for i in range(len(state.q))]
+
+    def close(self):
+        self.open = False
+
+
+def test_render__draws_each_row_and_begins_anew_where_an_episode_ended():
+    many = TaskVectorEnv(2, NET, LOW, SHORT, Recorder())
+    one = TaskEnv(NET, LOW, SHORT, Recorder())
+    assert many.render_mode == one.render_mode == "rgb_array"
+    many.reset(seed=0)
+    one.reset(seed=0)
+    many.state = replace(many.state, ticks=np.array([0, 19]))
+    many.step(np.zeros((2, 4)))
+    one.step(np.zeros(4))
+    assert many.renderer.started == [[0, 1], [1]]
+    assert one.vector.renderer.started == [[0], []]
+    assert [frame.max() for frame in many.render()] == [0, 1]
+    assert one.render().shape == (2, 3, 3)
+    many.close()
+    one.close()
+    assert not many.renderer.open
+    assert not one.vector.renderer.open
+
+
 @pytest.mark.parametrize("shape", [(2, 5), (2,), (2, 3)])
 def test_step__refuses_wrong_actions(shape):
     env = TaskVectorEnv(2)
