@@ -269,9 +269,3 @@ def test_summary__leaves_out_what_was_not_measured() -> None:
     intervals = m.intervals(runs)["a"]
     assert intervals["y"]["error"] == [None, None]
     assert intervals["x"]["error"] == m.interval(np.array([1.0, 3.0]))
-
-
-def test_metadata__names_program_machine_and_seed() -> None:
-    result = m.metadata(BROKK_170, 4)
-    assert list(result) == ["brokk_min", "machine", "seed", "units"]
-    assert (result["machine"], result["seed"]) == ("brokk170", 4)

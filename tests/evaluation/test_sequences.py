@@ -124,7 +124,7 @@ def test_read_commands__holds_values_until_the_next_row(tmp_path: Path) -> None:
         ("", "expected a header"),
         ("sequence,time,vx,vy\na,0,0,0\n", "row 1: expected a column vz"),
         ("sequence,time,vx,vy,vz\na,0,0,0,fast\na,1,0,0,0\n", "row 2, column vz: expected a numb"),
-        ("sequence,time,vx,vy,vz\na,0,0,0,nan\na,1,0,0,0\n", "row 2, column vz: expected a finite"),
+        ("sequence,time,vx,vy,vz\na,0,0,0,nan\na,1,0,0,0\n", "row 2, column vz: expected a numb"),
         ("sequence,time,vx,vy,vz\na,1,0,0,0\na,0,0,0,0\n", "sequence a: expected two or more rows"),
         (
             "sequence,time,vx,vy,vz\na,1,0,0,0\na,1,1,0,0\na,2,0,0,0\n",
