@@ -13,7 +13,7 @@ import numpy as np
 
 from brokk_min.actuator import initial_history
 from brokk_min.can import canopen
-from brokk_min.can.canopen import Array, OperatorInput
+from brokk_min.can.canopen import Array, Operator, OperatorInput
 from brokk_min.can.safety_gate import GateInputs, fault_name, gate, gate_start
 from brokk_min.env import measure, update_history
 from brokk_min.kinematics import forward_kinematics, tool_velocity
@@ -34,17 +34,7 @@ class Drive:
         operator: takes whether the gate drives and whether it is ready; gives the tick's input.
     """
 
-    def __init__(
-        self,
-        machine: Machine,
-        controller: Any,
-        bus: Any,
-        operator: Callable[[bool, bool], OperatorInput],
-    ) -> None:
-        if machine.n > 5:
-            raise ValueError(
-                f"{machine.name}: expected at most 5 joints in a valve frame, got {machine.n}"
-            )
+    def __init__(self, machine: Machine, controller: Any, bus: Any, operator: Operator) -> None:
         self.machine = machine
         self.controller = controller
         self.bus = bus
@@ -54,7 +44,8 @@ class Drive:
         self.gate = gate_start(machine)
         self.history: Array | None = None  # None after a gap
         self.v_goal: Array = np.zeros((1, 3), np.float32)  # m/s, of the last tick
-        self.reset_controller()
+        self.error_integral: Array = np.zeros((1, 3), np.float32)
+        self.controller_state = controller.start(1)
         self.exception = ""  # of this tick
         self.last_exception = ""  # since it drove
         self.reason = ""  # why it does not drive
@@ -64,11 +55,6 @@ class Drive:
         self.ticks = 0
         self.skipped = 0
         self.lateness = 0.0  # s
-
-    def reset_controller(self) -> None:
-        """State of the controller and error integral at rest."""
-        self.controller_state = self.controller.start(1)
-        self.error_integral: Array = np.zeros((1, 3), np.float32)
 
     def begin(self) -> None:
         """Set up and start the nodes, and start the clock. ValueError: an encoder does not fit."""
@@ -85,8 +71,7 @@ class Drive:
                         show(self.status())
         except BaseException:
             self.exception = "the loop ended"
-            counts = self.nodes.counts()
-            self.send_command(np.zeros(self.machine.n), counts, self.bus.now())
+            self.send_command(np.zeros(self.machine.n), self.nodes.counts(), self.bus.now())
             raise
 
     def tick(self) -> bool:
@@ -132,7 +117,8 @@ class Drive:
                 m, self.history, u, q, self.v_goal, self.error_integral
             )
         if not self.gate.driving:
-            self.reset_controller()
+            self.error_integral = np.zeros((1, 3), np.float32)
+            self.controller_state = self.controller.start(1)
         self.v_goal = np.array([self.operator_input.v_goal], np.float32)
         measured = measure(m, self.history, self.v_goal, self.error_integral)
         u, self.controller_state = self.controller(measured, self.controller_state)
@@ -224,7 +210,7 @@ class Drive:
 
     def status(self) -> str:
         """One line: state, faults, goal and measured tool velocity [m/s], angles [rad]."""
-        state = "waiting" if self.gate.active_fault else "ready"
+        state = "waiting" if self.gate.active_fault else "ready  "
         state = "driving" if self.gate.driving else state
         reason = f" {self.reason}" if self.reason else ""
         q, q_dot = self.measured
@@ -232,4 +218,4 @@ class Drive:
         vectors = (self.operator_input.v_goal, v, q)
         goal, measured, pose = (" ".join(f"{x:+.2f}" for x in vector) for vector in vectors)
         late = f"late {1e3 * self.lateness:.1f} ms, skipped {self.skipped}"
-        return f"{state:7}{reason} v goal {goal} measured {measured} q {pose} {late}"
+        return f"{state}{reason} v goal {goal} measured {measured} q {pose} {late}"

@@ -4,22 +4,30 @@ from __future__ import annotations
 
 import ctypes
 import itertools
+import json
 import os
-from collections.abc import Callable
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import can
 import numpy as np
+import pytest
+from canopen.objectdictionary import ObjectDictionary, ODArray, ODRecord, ODVariable, datatypes
 
-from brokk_min.can.canopen import Bus, Frame, OperatorInput
-from brokk_min.can.simulated_machine import SimulatedMachine
+from brokk_min.can.canopen import Bus, Frame, OperatorInput, open_bus
+from brokk_min.can.simulated_machine import SimulatedMachine, serve
 from brokk_min.env import Measured
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.hw import Drive
 from brokk_min.jacobian import Gains, JacobianController, manipulability_threshold
 from brokk_min.machine import BROKK_170, Machine
 
+MULTICAST = "239.74.163.2"
 START = (0.0, 0.5, 0.58, 1.71, 1.24)
 FOUR = np.ones(4)
 BASELINE = JacobianController(
@@ -183,6 +191,76 @@ class Hand:
         enable = self.pressed if self.enable is None else self.enable
         v = self.v if driving else (0.0, 0.0, 0.0)
         return OperatorInput(v, enable and self.alive, self.alive, self.stop)
+
+
+def eventually(condition: Callable[[], bool], seconds: float = 20.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "not within the time"
+        time.sleep(0.01)
+
+
+def recorded_rows(path: Path) -> np.ndarray:
+    """Complete rows of a record that is being written: time, commands, last valid frame's time."""
+    lines = path.read_text().splitlines()[1:-1] if path.exists() else []
+    cells = [line.split(",") for line in lines]
+    return np.array([[float(x) for x in (*row[1:7], row[12])] for row in cells]).reshape(-1, 7)
+
+
+@contextmanager
+def served(channel: str) -> Iterator[SimulatedMachine]:
+    """Our simulated machine in a thread on a virtual bus."""
+    end = threading.Event()
+    with open_bus("virtual", channel) as bus:
+        machine = SimulatedMachine(BROKK_170, START, bus.now())
+        thread = threading.Thread(target=serve, args=(machine, bus, lambda: not end.is_set()))
+        thread.start()
+        try:
+            yield machine
+        finally:
+            end.set()
+            thread.join()
+
+
+def own_multicast_port(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Groups with one port are one bus: take a port of our own. Skips where nothing is routed."""
+    monkeypatch.setenv("CAN_CONFIG", json.dumps({"port": 43200 + os.getpid() % 10_000}))
+    bus = partial(open_bus, "udp_multicast", MULTICAST)
+    try:
+        with bus() as a, bus() as b:
+            a.send(0x123, b"")
+            if b.recv(1.0) is not None:
+                return
+    except ValueError:
+        pass
+    pytest.skip("no multicast route on this machine")
+
+
+def dictionary() -> ObjectDictionary:
+    """As much of CiA 406 as an encoder with one mapped position needs."""
+    u8, u16, u32 = datatypes.UNSIGNED8, datatypes.UNSIGNED16, datatypes.UNSIGNED32
+    objects = ObjectDictionary()
+    communication = ODRecord("TPDO1", 0x1800)
+    mapping = ODArray("TPDO1 mapping", 0x1A00)
+    for owner, name, index, sub, kind, value in (
+        (objects, "device type", 0x1000, 0, u32, 406),
+        (objects, "heartbeat", 0x1017, 0, u16, 0),
+        (objects, "position", 0x6004, 0, u32, 0),
+        (objects, "units per revolution", 0x6501, 0, u32, 4096),
+        (communication, "highest", 0x1800, 0, u8, 2),
+        (communication, "identifier", 0x1800, 1, u32, 0x180),
+        (communication, "type", 0x1800, 2, u8, 254),
+        (mapping, "number", 0x1A00, 0, u8, 1),
+        (mapping, "first", 0x1A00, 1, u32, 0x60040020),
+    ):
+        entry = ODVariable(name, index, sub)
+        entry.data_type = kind
+        entry.default = value
+        entry.pdo_mappable = True
+        (owner.add_object if owner is objects else owner.add_member)(entry)
+    objects.add_object(communication)
+    objects.add_object(mapping)
+    return objects
 
 
 class Virtual:

@@ -53,15 +53,10 @@ class Frame(NamedTuple):
 
 
 class Bus:
-    """A CAN bus with a monotonic clock and a log of what is sent and read.
+    """A CAN bus of python-can with a monotonic clock [s] and a log of what is sent and read.
 
-    Args:
-        bus: of python-can, without filters.
-        writer: python-can's candump writer; None: no log.
-        name: of the bus in the log.
-        echo: does the bus give back what we send?
-        clock: monotonic [s].
-        sleep: sleeps for some seconds.
+    `bus` has no filters; `writer` is python-can's candump writer, `name` that of the bus in the
+    log. `echo`: the bus gives back what we send.
     """
 
     def __init__(
@@ -247,8 +242,12 @@ class Nodes:
 def set_up_nodes(bus: Any, machine: Machine) -> None:
     """Check the encoders, set their heartbeats, let them answer each SYNC, and start all nodes.
 
-    ValueError: an encoder that does not answer or has another resolution.
+    ValueError: an encoder that does not answer or has another resolution, or too many joints.
     """
+    if machine.n > 5:
+        raise ValueError(
+            f"{machine.name}: expected at most 5 joints in a valve frame, got {machine.n}"
+        )
     for joint in machine.joints:
         node = joint.encoder_node
         resolution = sdo(bus, node, RESOLUTION_OBJECT)
@@ -360,6 +359,9 @@ class OperatorInput(NamedTuple):
         """Seven bytes for the log: three velocities in 0.1 mm/s, flags."""
         flags = self.enable | self.alive << 1 | self.stop << 2 | self.error << 3
         return struct.pack("<hhhB", *(round(1e4 * v) for v in self.v_goal), flags)
+
+
+Operator = Callable[[bool, bool], OperatorInput]  # does the gate drive, is it ready -> the input
 
 
 def unpack_operator_input(data: bytes) -> OperatorInput:

@@ -3,7 +3,7 @@
 Telemetry is the state of one tick, from the frames of a bus or of a log.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -98,26 +98,17 @@ def compare(machine: Machine, frames: Sequence[Frame], sent: Sequence[Frame]) ->
 
 
 def log_for_fit(machine: Machine, frames: Iterable[Frame]) -> Log:
-    """Angles and commands while driving, as recordings for `fit`; a gap starts a new one.
+    """Commands and angles while driving, as recordings for `fit`; a gap starts a new one.
 
     ValueError: nothing was driven for long enough.
     """
-    nodes = Nodes(machine)
     recordings: list[list[tuple[Array, Array]]] = []
-    start = 0.0  # of the tick [s]
-    last = -np.inf  # start of the last tick that is recorded
-    for frame in frames:
-        nodes.update(frame)
-        if frame.id == canopen.SYNC:
-            nodes.frames[:] = 0
-            start = frame.time
-        elif frame.id == machine.valve_frame_id and len(frame.data) == 8:
-            u, driving = _read_valve_frame(machine, frame.data)
-            if driving and (nodes.frames == 1).all():
-                if not 0.5 < (start - last) * machine.rate < 1.5:
-                    recordings.append([])
-                recordings[-1].append((u, nodes.counts() * machine.encoder_step))
-                last = start
+    last = -np.inf
+    for start, u, q in _driven_ticks(machine, frames):
+        if not 0.5 < (start - last) * machine.rate < 1.5:
+            recordings.append([])
+        recordings[-1].append((u, q))
+        last = start
     named = []
     for number, recording in enumerate(recordings):
         if len(recording) > machine.history + 1:
@@ -128,6 +119,23 @@ def log_for_fit(machine: Machine, frames: Iterable[Frame]) -> Log:
             f"log: expected more than {machine.history + 1} ticks of driving in a row, got none"
         )
     return machine_log(machine, named)
+
+
+def _driven_ticks(
+    machine: Machine, frames: Iterable[Frame]
+) -> Iterator[tuple[float, Array, Array]]:
+    """Start [s], commands u (n,) and angles [rad] (n,) of ticks with all positions."""
+    nodes = Nodes(machine)
+    start = 0.0
+    for frame in frames:
+        nodes.update(frame)
+        if frame.id == canopen.SYNC:
+            nodes.frames[:] = 0
+            start = frame.time
+        elif frame.id == machine.valve_frame_id and len(frame.data) == 8:
+            u, driving = _read_valve_frame(machine, frame.data)
+            if driving and (nodes.frames == 1).all():
+                yield start, u, nodes.counts() * machine.encoder_step
 
 
 def _read_valve_frame(machine: Machine, data: bytes) -> tuple[Array, bool]:
@@ -148,19 +156,6 @@ class Telemetry(NamedTuple):
     latched_fault: int = 0
     mode: int = 0  # which controller
     lateness: float = 0.0  # s
-
-    def pack(self) -> Array:
-        """As numbers in a row."""
-        return np.hstack([np.ravel(value) for value in self]).astype(float)
-
-
-def unpack_telemetry(machine: Machine, values: Array) -> Telemetry:
-    """The inverse of `Telemetry.pack`."""
-    n = machine.n
-    tick, q, q_dot, u, v, rest = np.split(values, np.cumsum([1, n, n, n, 3]))
-    driving, active, latched, mode = (int(x) for x in rest[:4])
-    late = float(rest[4])
-    return Telemetry(float(tick[0]), q, q_dot, u, v, bool(driving), active, latched, mode, late)
 
 
 class TelemetryReader:

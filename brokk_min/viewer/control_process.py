@@ -79,7 +79,7 @@ class WindowOperator:
 
 
 class SelectedController:
-    """The controller that the operator selects; it starts from rest. The last mode is levers."""
+    """The controller that the operator selects, at rest when it takes over; the last is levers."""
 
     def __init__(
         self, machine: Machine, controllers: Sequence[Controller], operator: WindowOperator
@@ -143,7 +143,8 @@ def control(
 ) -> None:
     """Drive until the window closes the pipe; errors go through it as text."""
     simulated = nullcontext() if options.interface else simulated_machine(machine, options.start)
-    interface, channel = options.interface or "virtual", options.channel or CHANNEL
+    interface = options.interface or "virtual"
+    channel = options.channel or CHANNEL
     try:
         with simulated, open_bus(interface, channel, options.log) as bus:
             operator = WindowOperator(machine, connection)
@@ -174,7 +175,7 @@ def simulated_machine(machine: Machine, start: tuple[float, ...]) -> Iterator[No
 
 
 @contextmanager
-def control_process(
+def start(
     machine: Machine, controllers: Sequence[Controller], options: BusOptions
 ) -> Iterator[Connection]:
     """`control` in a process of its own, at the other end of this pipe; ends with the block."""

@@ -6,30 +6,34 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from brokk_min.kinematics import forward_kinematics, jacobian, tool_position, tool_velocity
 from brokk_min.machine import PWM_MAX, Array, Machine
+from brokk_min.viewer.camera import ABOVE, Camera, cameras, extent, skeleton
 from brokk_min.viewer.window import BACKGROUND, INK, Box, Canvas, Colour
 
 # all assumed
 NEAR_LIMIT = 0.05  # of a joint's range: nearer to its end is a warning
 NEAR_SINGULAR = 0.1  # of the arm's length [1/rad]: a smaller singular value is a warning
-MARGIN = 0.06  # of the reach: border around the points of a close-up
 ARROW = 0.2  # of a view's smaller side: an arrow of the machine's tool speed
 HEAD = 40.0  # px above the views
 
 NO_POINTS = np.zeros((0, 3))
-ABOVE = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])  # right and up, seen from above
-MUTED, GRID, TRACK = (120, 128, 138), (228, 230, 232), (212, 216, 221)
-SOIL, STEEL, WARNING = (214, 203, 186), (74, 80, 88), (208, 28, 28)
-GOAL, MEASURED, PATH = INK, (0, 158, 115), (230, 159, 0)
-DRIVING, READY = (0, 130, 90), (0, 100, 170)  # status colours
-SMALL_COLOURS = (INK, MUTED, TRACK, SOIL, STEEL, WARNING, MEASURED, PATH, DRIVING, READY)
+MUTED = (120, 128, 138)
+GRID = (228, 230, 232)
+TRACK = (212, 216, 221)
+SOIL = (214, 203, 186)
+STEEL = (74, 80, 88)
+WARNING = (208, 28, 28)
+DRIVING = (0, 130, 90)
+READY = (0, 100, 170)
+GOAL = INK
+MEASURED = (0, 158, 115)
+PATH = (230, 159, 0)
 COLOURS = {"rl": (0, 114, 178), "jacobian": (213, 94, 0), "levers": (124, 87, 148)}
 TITLES = {
     "rl": "RL policy",
@@ -61,14 +65,15 @@ class Scene(NamedTuple):
 
 def draw(canvas: Canvas, machine: Machine, scenes: Sequence[Scene]) -> None:
     """Draw one or more arms side by side."""
-    width, height = canvas.size[0] / len(scenes), float(canvas.size[1])
+    width = canvas.size[0] / len(scenes)
+    height = float(canvas.size[1])
     for i, scene in enumerate(scenes):
         _panel(canvas, machine, scene, (i * width, 0.0, width, height))
         if i > 0:
             canvas.line(np.array([[i * width, 12], [i * width, height - 12]]), TRACK, 2)
 
 
-# --- layout and cameras ---------------------------------------------------------------------------
+# --- layout and warnings --------------------------------------------------------------------------
 
 
 class Layout(NamedTuple):
@@ -99,87 +104,10 @@ def _layout(box: Box, joints: int, notes: int) -> Layout:
     return Layout(side, top, rows, (left + 16, HEAD + 34))
 
 
-class Camera(NamedTuple):
-    """An orthographic view: pixel of the base frame's origin, scale, directions right and up."""
-
-    origin: Array  # px (2,)
-    scale: float  # px/m
-    axes: Array  # (2, 3)
-
-    def project(self, p: ArrayLike) -> Array:
-        """Pixels (..., 2) of points (..., 3) [m]."""
-        return self.origin + self.scale * (np.asarray(p) @ self.axes.T) * (1, -1)
-
-
-def skeleton(machine: Machine, q: ArrayLike) -> Array:
-    """Corners of the arm [m], (..., 2 n + 1, 3): base, then the ends of each joint's d and a."""
-    p, z = forward_kinematics(machine, q)
-    corners = np.empty((*p.shape[:-2], 2 * machine.n + 1, 3))
-    corners[..., ::2, :] = p
-    corners[..., 1::2, :] = p[..., :-1, :] + machine.column("d")[:, None] * z[..., :-1, :]
-    return corners
-
-
-@lru_cache(maxsize=32)
-def extent(machine: Machine) -> tuple[Array, Array, float]:
-    """Space that 2,000 random poses take, no lower than the ground if the arm reaches it.
-
-    Low and high ends (2, 2) of right and up from the side and from above; the reach [m].
-    """
-    low, high = machine.column("q_min"), machine.column("q_max")
-    p = skeleton(machine, np.random.default_rng(0).uniform(low, high, (2000, machine.n)))
-    reach = float(np.hypot(p[..., 0], p[..., 1]).max()) + 1e-3
-    side = _bounds(p @ np.swapaxes(_side_axes(p[:, -1]), -1, -2), 0.2 * reach)
-    top = _bounds(p @ ABOVE.T, 0.2 * reach)
-    if side[0, 1] - 0.2 * reach < machine.ground < side[1, 1]:
-        side[0, 1] = machine.ground
-    return side, top, reach
-
-
-def _bounds(points: Array, smallest: float) -> Array:
-    """Low and high ends (2, 2) of points (..., 2), at least `smallest` apart."""
-    low = points.reshape(-1, 2).min(axis=0)
-    return np.stack([low, np.maximum(points.reshape(-1, 2).max(axis=0), low + smallest)])
-
-
-def _side_axes(p_tool: Array) -> Array:
-    """Directions right (towards the tool) and up, (..., 2, 3), for tool positions (..., 3)."""
-    heading = np.arctan2(p_tool[..., 1], p_tool[..., 0])
-    axes = np.zeros((*heading.shape, 2, 3))
-    axes[..., 0, 0] = np.cos(heading)
-    axes[..., 0, 1] = np.sin(heading)
-    axes[..., 1, 2] = 1.0
-    return axes
-
-
-def cameras(machine: Machine, p_tool: Array, layout: Layout, in_view: Array) -> list[Camera]:
-    """From the side, in the vertical plane of the tool, and from above with x up and y left.
-
-    They show the whole reach, or what lies around the points `in_view` [m] (K, 3), if any.
-    """
-    side, top, reach = extent(machine)
-    axes = _side_axes(p_tool)
-    if len(in_view):
-        border = MARGIN * reach * np.array([[-1], [1]])
-        side = _bounds(in_view @ axes.T, 0.0) + border
-        top = _bounds(in_view @ ABOVE.T, 0.0) + border
-    return [_fit(layout.side, side, axes), _fit(layout.top, top, ABOVE)]
-
-
-def _fit(box: Box, bounds: Array, axes: Array) -> Camera:
-    """The camera that shows the bounds [m] (2, 2) in a box, above a strip of soil."""
-    left, upper, width, height = box
-    low, high = bounds
-    soil = 0.07 * height
-    span = high - low
-    scale = 0.92 * float(min(width / span[0], (height - 2 * soil) / span[1]))
-    x = left + width / 2 - scale * (low[0] + high[0]) / 2
-    return Camera(np.array([x, upper + height - soil + scale * low[1]]), scale, axes)
-
-
 def near_limit(machine: Machine, q: Array) -> NDArray[np.bool_]:
     """Is each driven joint within `NEAR_LIMIT` of an end of its range? (..., n)"""
-    low, high = machine.column("q_min"), machine.column("q_max")
+    low = machine.column("q_min")
+    high = machine.column("q_max")
     margin = NEAR_LIMIT * (high - low)
     driven = [joint.driven for joint in machine.joints]
     return np.asarray(((q < low + margin) | (q > high - margin)) & driven)
@@ -221,12 +149,12 @@ def _panel(canvas: Canvas, machine: Machine, scene: Scene, box: Box) -> None:
 def _views(canvas: Canvas, machine: Machine, scene: Scene, layout: Layout) -> None:
     """The arm from both sides; goal and measured speed, warnings."""
     frames = forward_kinematics(machine, scene.q)
-    side, top = cameras(machine, tool_position(frames), layout, scene.in_view)
-    for camera, box, label in ((side, layout.side, "side"), (top, layout.top, "top")):
-        canvas.clip(box)
-        _backdrop(canvas, machine, camera, box, label)
+    p_tool = tool_position(frames)
+    for camera in cameras(machine, p_tool, layout.side, layout.top, scene.in_view):
+        canvas.clip(camera.box)
+        _backdrop(canvas, machine, camera)
         _arm(canvas, machine, camera, scene)
-        _tool(canvas, machine, camera, scene, min(box[2:]))
+        _tool(canvas, machine, camera, scene)
     canvas.clip(None)
     legend = [
         (f"goal {np.linalg.norm(scene.v_goal):.2f} m/s", GOAL),
@@ -240,10 +168,11 @@ def _views(canvas: Canvas, machine: Machine, scene: Scene, layout: Layout) -> No
         canvas.text(layout.side[0] + layout.side[2] - 14, HEAD + 14 + 18 * i, text, 12, ink, 1.0)
 
 
-def _backdrop(canvas: Canvas, machine: Machine, camera: Camera, box: Box, label: str) -> None:
+def _backdrop(canvas: Canvas, machine: Machine, camera: Camera) -> None:
     """Grid of 1 m (or a power of ten that fits), the ground, and the name of the view."""
-    left, upper, width, height = box
-    right, lower = left + width, upper + height
+    left, upper, width, height = camera.box
+    right = left + width
+    lower = upper + height
     x0, y0 = camera.origin
     metres = next(m for m in 10.0 ** np.arange(-1, 20) if m * camera.scale > 12)
     step = camera.scale * metres
@@ -252,11 +181,12 @@ def _backdrop(canvas: Canvas, machine: Machine, camera: Camera, box: Box, label:
     for y in y0 + step * np.arange(np.ceil((upper - y0) / step), (lower - y0) // step + 1):
         canvas.line(np.array([[left, y], [right, y]]), GRID)
     ground = y0 - camera.scale * machine.ground
-    if label == "side" and ground < lower:
+    if camera.label == "side" and ground < lower:
         soil = np.array([[left, ground], [right, ground], [right, lower], [left, lower]])
         canvas.polygon(soil, SOIL)
         canvas.line(soil[:2], STEEL, 2)
-    canvas.text(left + 14, upper + 14, f"{label} view, grid {metres:g} m", 11, MUTED)
+    label = f"{camera.label} view, grid {metres:g} m"
+    canvas.text(left + 14, upper + 14, label, 11, MUTED)
 
 
 def _arm(canvas: Canvas, machine: Machine, camera: Camera, scene: Scene) -> None:
@@ -276,7 +206,8 @@ def _arm(canvas: Canvas, machine: Machine, camera: Camera, scene: Scene) -> None
         length = np.hypot(*(end - start))
         if length > 0.5:
             across = np.array([start[1] - end[1], end[0] - start[0]]) / length
-            first, last = across * sizes[i], across * sizes[i + 1]
+            first = across * sizes[i]
+            last = across * sizes[i + 1]
             link = np.array([start + first, end + last, end - last, start - first])
             canvas.polygon(link, scene.colour if i > 0 else STEEL)
     for i in range(machine.n):
@@ -286,8 +217,8 @@ def _arm(canvas: Canvas, machine: Machine, camera: Camera, scene: Scene) -> None
         canvas.circle(corners[2 * i], 0.5 * size, BACKGROUND)
 
 
-def _tool(canvas: Canvas, machine: Machine, camera: Camera, scene: Scene, size: float) -> None:
-    """Path, trail, next target, tool tip, and its velocities, in a view of `size` px."""
+def _tool(canvas: Canvas, machine: Machine, camera: Camera, scene: Scene) -> None:
+    """Path, trail, next target, tool tip, and its velocities."""
     if len(scene.path) > 1:
         canvas.line(camera.project(scene.path), PATH, 3)
     if len(scene.trail) > 1:
@@ -299,7 +230,7 @@ def _tool(canvas: Canvas, machine: Machine, camera: Camera, scene: Scene, size: 
     canvas.circle(tip, 4.0, INK)
     if near_singular(machine, scene.q):
         canvas.circle(tip, 16.0, WARNING, 2)
-    scale = ARROW * size / machine.tool_speed
+    scale = ARROW * min(camera.box[2:]) / machine.tool_speed
     for v, colour in ((tool_velocity(frames, scene.q_dot), MEASURED), (scene.v_goal, GOAL)):
         _arrow(canvas, tip, scale * (camera.axes @ v) * (1, -1), colour)
 
@@ -328,10 +259,10 @@ def _joint_rows(canvas: Canvas, machine: Machine, scene: Scene, box: Box) -> Non
     angle = left + max(46.0, 9.0 * max(map(len, machine.names)))  # left end of the angle bars
     length = (left + width - angle - 58 - 40) / 2  # 58 px for digits of the angle, 40 of the valve
     valve = angle + length + 58
-    warned = near_limit(machine, scene.q)
     canvas.text(angle, upper + 6, "angle [rad]", 11, MUTED)
     header = f"valve of {machine.pwm_limit}"
     canvas.text(min(valve, left + width - 66), upper + 6, header, 11, MUTED)
+    warned = near_limit(machine, scene.q)
     for i, joint in enumerate(machine.joints):
         y = upper + 26 + 22 * i
         colour = WARNING if warned[i] else INK if joint.driven else MUTED
@@ -343,10 +274,17 @@ def _joint_rows(canvas: Canvas, machine: Machine, scene: Scene, box: Box) -> Non
             canvas.text(angle + length + 8, y, f"{scene.q[i]:+z.2f}", 12, colour)
         if joint.driven:
             counts = float(scene.u[i]) * PWM_MAX
-            zero = valve + length / 2
-            canvas.bar(valve, valve + length, y, 6, TRACK)
-            canvas.bar(zero, zero + length / 2 * counts / machine.pwm_limit, y, 6, scene.colour)
-            canvas.bar(zero - 1, zero + 1, y, 8, INK)
+            _valve_bar(canvas, valve, length, y, counts / machine.pwm_limit, scene.colour)
             canvas.text(left + width, y, f"{round(counts):+d}", 12, INK, 1.0)
         else:
             canvas.text(valve, y, "locked", 12, MUTED)
+
+
+def _valve_bar(
+    canvas: Canvas, left: float, length: float, y: float, fraction: float, colour: Colour
+) -> None:
+    """A command, as a fraction of the limit, from the middle of its track."""
+    zero = left + length / 2
+    canvas.bar(left, left + length, y, 6, TRACK)
+    canvas.bar(zero, zero + fraction * length / 2, y, 6, colour)
+    canvas.bar(zero - 1, zero + 1, y, 8, INK)

@@ -15,7 +15,10 @@ RISE = 0.25  # s from a key's press to full deflection (assumed)
 VELOCITY_KEYS = (("up", "down"), ("left", "right"), ("w", "s"))
 LEVER_KEYS = (("q", "a"), ("w", "s"), ("e", "d"), ("r", "f"), ("t", "g"), ("y", "h"))
 PAD_AXES = (1, 0, 4, 3)  # 2 and 5 are triggers, which do not rest in the middle
-PAD_SWITCH, PAD_MODE, PAD_NEXT, PAD_AGAIN = 5, 3, 0, 1
+PAD_SWITCH = 5
+PAD_MODE = 3
+PAD_NEXT = 0
+PAD_AGAIN = 1
 
 
 class InputHandler:

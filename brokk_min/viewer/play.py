@@ -15,25 +15,8 @@ from brokk_min.can.safety_gate import fault_name
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
-from brokk_min.viewer import tracing
-from brokk_min.viewer.control_process import (
-    BusOptions,
-    Request,
-    control_process,
-    receive_telemetry,
-    send_request,
-)
-from brokk_min.viewer.drawing import (
-    COLOURS,
-    DRIVING,
-    NO_POINTS,
-    READY,
-    STEEL,
-    TITLES,
-    WARNING,
-    Scene,
-    draw,
-)
+from brokk_min.viewer import control_process, drawing, tracing
+from brokk_min.viewer.control_process import BusOptions, Request
 from brokk_min.viewer.input_handler import LEVER_KEYS, PAD_SWITCH, InputHandler
 from brokk_min.viewer.window import Canvas, Colour, Window, open_window
 
@@ -52,7 +35,7 @@ class Session:
         self.attempts = tracing.read_attempts(file) if file else []
         self.lines = tracing.task_lines(machine)
         self.task = ""
-        self.path: Array = NO_POINTS  # of the last line [m]
+        self.path: Array = drawing.NO_POINTS  # of the last line [m]
         self.tracing: tracing.Tracing | None = None
         self.finished: tracing.Attempt | None = None
         self.previous: Telemetry | None = None
@@ -95,25 +78,26 @@ class Session:
         self.trail = []
         self.finished = None
 
-    def scene(self, now: float, mode: str, hint: str) -> Scene:
+    def scene(self, now: float, mode: str, hint: str) -> drawing.Scene:
         """What the window shows now; angles between the last two ticks, for smooth motion."""
         unknown = np.full(self.machine.n, np.nan)
         telemetry = Telemetry(0, unknown, unknown, np.zeros(self.machine.n), np.zeros(3), False)
-        status, colour = hint or "no telemetry", WARNING
+        status = hint or "no telemetry"
+        colour = drawing.WARNING
         if self.telemetry is not None and now - self.arrived <= STALE:
             telemetry = self.telemetry
             status, colour = gate_status(self.machine, telemetry, hint)
-        scene = Scene(
+        scene = drawing.Scene(
             self._interpolate(telemetry.q, now),
             telemetry.q_dot,
             telemetry.u,
             telemetry.v_goal,
             trail=np.array(self.trail).reshape(-1, 3),
             path=self.path,
-            title=TITLES.get(mode, self.machine.name),
+            title=drawing.TITLES.get(mode, self.machine.name),
             status=status,
             status_colour=colour,
-            colour=COLOURS.get(mode, STEEL),
+            colour=drawing.COLOURS.get(mode, drawing.STEEL),
             notes=self.notes(mode),
         )
         if self.tracing is None:
@@ -141,8 +125,9 @@ class Session:
             f"hold SPACE to drive    {keys}",
             "SHIFT: slow  TAB: next controller  ENTER: next line  BACKSPACE: again  ESC: end",
         ]
-        work, done = self.tracing, self.finished
-        if work:
+        done = self.finished
+        if self.tracing:
+            work = self.tracing
             passed = f"{work.seconds:.1f} s, {work.passed} of {len(work.line)}"
             notes.append(f"{self.task}: follow the orange line to its ring, {passed}")
         elif done:
@@ -153,12 +138,12 @@ class Session:
 def gate_status(machine: Machine, telemetry: Telemetry, hint: str) -> tuple[str, Colour]:
     """Status of the gate as text, and its colour."""
     if telemetry.driving:
-        return "driving", DRIVING
+        return "driving", drawing.DRIVING
     if telemetry.active_fault:
-        return f"waiting: {fault_name(machine, telemetry.active_fault)}", WARNING
+        return f"waiting: {fault_name(machine, telemetry.active_fault)}", drawing.WARNING
     if telemetry.latched_fault:
-        return f"stopped: {fault_name(machine, telemetry.latched_fault)}", WARNING
-    return hint or "ready", READY
+        return f"stopped: {fault_name(machine, telemetry.latched_fault)}", drawing.WARNING
+    return hint or "ready", drawing.READY
 
 
 def next_step(session: Session, handler: InputHandler) -> str:
@@ -177,17 +162,12 @@ def next_step(session: Session, handler: InputHandler) -> str:
 FrameHook = Callable[[Session, InputHandler], bool]  # called each frame; False closes the window
 
 
-def go_on(session: Session, handler: InputHandler) -> bool:
-    """The window stays open until the user closes it."""
-    return True
-
-
 def show(
     window: Window,
     session: Session,
     receive: Callable[[], Iterable[Telemetry]],
     send: Callable[[Request], object],
-    each_frame: FrameHook = go_on,
+    each_frame: FrameHook = lambda session, handler: True,
     fps: float = 60.0,
 ) -> None:
     """The window until it is closed: input, telemetry, one picture, `fps` times a second.
@@ -210,7 +190,7 @@ def show(
         handler.task = ""
         canvas = Canvas(SIZE)
         scene = session.scene(now, modes[handler.mode], next_step(session, handler))
-        draw(canvas, session.machine, [scene])
+        drawing.draw(canvas, session.machine, [scene])
         window.show(canvas, fps)
 
 
@@ -219,7 +199,7 @@ def play(
     controllers: Mapping[str, Controller],
     options: BusOptions,
     attempts: Path,
-    each_frame: FrameHook = go_on,
+    each_frame: FrameHook = lambda session, handler: True,
 ) -> None:
     """Drive with keyboard or gamepad: the simulated machine, or the one on a bus.
 
@@ -230,18 +210,20 @@ def play(
     session = Session(machine, [*controllers, "levers"], attempts)
     with (
         open_window(SIZE, f"brokk_min: {machine.name}") as window,
-        control_process(machine, list(controllers.values()), options) as connection,
+        control_process.start(machine, list(controllers.values()), options) as connection,
     ):
         show(
             window,
             session,
-            lambda: receive_telemetry(connection),
-            lambda request: send_request(connection, request),
+            lambda: control_process.receive_telemetry(connection),
+            lambda request: control_process.send_request(connection, request),
             each_frame,
         )
 
 
-def watch(machine: Machine, options: BusOptions, each_frame: FrameHook = go_on) -> None:
+def watch(
+    machine: Machine, options: BusOptions, each_frame: FrameHook = lambda session, handler: True
+) -> None:
     """Show a machine on a bus; nothing is sent."""
     session = Session(machine, [], None)
     reader = TelemetryReader(machine)

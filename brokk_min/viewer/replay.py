@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import IO, Any, NamedTuple
 
 import numpy as np
@@ -23,8 +24,8 @@ from brokk_min.identification.files import expected, whole_file
 from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocity
 from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import Array, Machine
-from brokk_min.viewer import drawing
-from brokk_min.viewer.window import BACKGROUND, Canvas, Colour, open_window
+from brokk_min.viewer import camera, drawing
+from brokk_min.viewer.window import Canvas, Colour, open_window
 
 FFMPEG = (  # raw pictures in, MP4 of even width and height out
     "ffmpeg -loglevel error -f rawvideo -pix_fmt rgb24 -s {0}x{1} -r {2} -i - -pix_fmt yuv420p "
@@ -60,7 +61,7 @@ class Run:
     @cached_property
     def in_view(self) -> Array:
         """Points that a picture must show [m], (K, 3): the path, and the arm twice a second."""
-        corners = drawing.skeleton(self.machine, self.q[::10]).reshape(-1, 3)
+        corners = camera.skeleton(self.machine, self.q[::10]).reshape(-1, 3)
         return np.vstack([corners, self.path])
 
 
@@ -118,15 +119,9 @@ def read_results(machine: Machine, path: Path, controllers: Sequence[str]) -> Re
     if set(controllers) - {"rl"}:
         gains = Path(meta.get("gains", path.with_name("gains.json")))
         named |= baselines.read_gains(gains, machine, policy.net)
-    return Results(
-        path,
-        rows,
-        {sequence.name: sequence for sequence in sequences},
-        drawn if starts is None else starts,
-        named,
-        policy.net if meta["plant"] == "net" else None,
-        seed,
-    )
+    starts = drawn if starts is None else starts
+    net = policy.net if meta["plant"] == "net" else None
+    return Results(path, rows, {s.name: s for s in sequences}, starts, named, net, seed)
 
 
 def simulate_again(
@@ -211,35 +206,25 @@ def write_film(
 
 
 def _write_gif(file: IO[bytes], images: Images, size: tuple[int, int], fps: float) -> None:
-    palette = _palette()
-    none = Image.Dither.NONE
-    frames = [Image.fromarray(image).quantize(palette=palette, dither=none) for image in images]
-    duration = round(1000 / fps)
-    frames[0].save(file, "GIF", save_all=True, append_images=frames[1:], duration=duration, loop=0)
-
-
-def _palette() -> Image.Image:
-    """All colours of a picture, mixed with the background as on smooth edges."""
-    colours = np.array([*drawing.COLOURS.values(), *drawing.SMALL_COLOURS])
-    fractions = np.linspace(0, 0.85, 14)[:, None, None]
-    mixed = colours + fractions * np.subtract(BACKGROUND, colours)
-    palette = Image.new("P", (1, 1))
-    palette.putpalette([*BACKGROUND, *np.rint(mixed).astype(int).ravel().tolist()])
-    return palette
+    octree = Image.Quantize.FASTOCTREE  # keeps the red of a short warning
+    frames = [Image.fromarray(image).quantize(256, octree) for image in images]
+    more = frames[1:]
+    frames[0].save(
+        file, "GIF", save_all=True, append_images=more, duration=round(1000 / fps), loop=0
+    )
 
 
 def _write_mp4(file: IO[bytes], images: Images, size: tuple[int, int], fps: float) -> None:
-    command = FFMPEG.format(*size, fps).split()
-    try:
-        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=file) as process:
-            assert process.stdin is not None
-            process.stdin.writelines(image.tobytes() for image in images)
-    except FileNotFoundError as error:
-        raise ValueError("film: expected ffmpeg for .mp4, or a name in .gif, got none") from error
-    except BrokenPipeError as error:
-        raise ValueError("film: expected ffmpeg to read all pictures, got its end") from error
-    if process.returncode:
-        raise ValueError(f"film: expected ffmpeg to write it, got its status {process.returncode}")
+    with TemporaryFile() as raw:
+        raw.writelines(image.tobytes() for image in images)
+        raw.seek(0)
+        try:
+            done = subprocess.run(FFMPEG.format(*size, fps).split(), stdin=raw, stdout=file)
+        except FileNotFoundError as error:
+            message = "film: expected ffmpeg for .mp4, or a name in .gif, got none"
+            raise ValueError(message) from error
+    if done.returncode:
+        raise ValueError(f"film: expected ffmpeg to write it, got its status {done.returncode}")
 
 
 def show_film(machine: Machine, runs: Sequence[Run], size: tuple[int, int]) -> None:

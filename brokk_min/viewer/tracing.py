@@ -13,7 +13,7 @@ from brokk_min.can.drive_log import Telemetry
 from brokk_min.identification import files
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
-from brokk_min.viewer.drawing import extent
+from brokk_min.viewer.camera import extent
 
 CAPTURE = 0.1  # m, assumed: a point of the line counts as passed if the tool is nearer
 SPACING = 0.05  # m, assumed: largest distance between the points

@@ -16,7 +16,8 @@ from brokk_min.machine import Array
 
 Colour = tuple[int, int, int]
 Box = tuple[float, float, float, float]  # left, top, width, height [px]
-BACKGROUND, INK = (250, 250, 247), (33, 37, 43)
+BACKGROUND = (250, 250, 247)
+INK = (33, 37, 43)
 
 
 def require_pygame() -> Any:

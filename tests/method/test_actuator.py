@@ -1,45 +1,329 @@
-"""Histories, nets, and files of nets."""
+"""The plant: its calibration and its equations. The history. The nets against a plain loop."""
 
 from __future__ import annotations
 
-import json
-from dataclasses import fields, replace
+import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from helpers_machines import constant_net, random_net
+from helpers_machines import (
+    POSE,
+    constant_net,
+    obedient_net,
+    obedient_velocity,
+    random_net,
+    small_net,
+)
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+from strategies import machines, poses, reals
 
 from brokk_min.actuator import (
-    ActuatorNet,
+    PlantState,
     append_command,
+    append_sample,
     initial_history,
+    lever_arm,
     mu_law,
-    mu_law_derivative,
-    push,
+    net_step,
+    plant_reset,
+    plant_step,
+    select_nets,
+    smooth_angles,
 )
-from brokk_min.identification.net_file import load_net, save_net
+from brokk_min.machine import BROKK_170, Machine
+
+FAST = replace(BROKK_170, rate=200.0)  # a tick is one step of 5 ms
+LIMIT = 80 / 127
+MIDDLE = np.array([0.0, 0.5, 0.5, 1.7, 1.0])
+Q5 = 4
+
+
+def record(
+    machine: Machine, q: np.ndarray, u: np.ndarray
+) -> tuple[PlantState, np.ndarray, np.ndarray]:
+    """Last state, joint velocities and cylinder speeds (ticks, ..., n) under commands `u`."""
+    state = plant_reset(machine, q)
+    velocities, speeds = [], []
+    for command in u:
+        state = plant_step(machine, state, command)
+        velocities.append(state.v / lever_arm(machine, state.q))
+        speeds.append(state.v)
+    return state, np.array(velocities), np.array(speeds)
+
+
+def only(joint: int, u: np.ndarray | list[float]) -> np.ndarray:
+    """Commands (ticks, 5) for one joint."""
+    commands = np.zeros((len(u), 5))
+    commands[:, joint] = u
+    return commands
+
+
+# --- the plant's calibration, measured as on a machine --------------------------------------------
+
+
+def rise_time(before: float, ticks_before: int) -> float:
+    """Time from the step to 80 counts until 63 % of the change in cylinder speed of q5 is done."""
+    u = only(Q5, [before] * ticks_before + [LIMIT] * 250)
+    _, _, speeds = record(FAST, np.array([0, 0.5, 0.5, 1.7, 0.0]), u)
+    speed = np.concatenate([[0.0], speeds[:, Q5]])[ticks_before:]
+    done = (speed - speed[0]) / (speed[-1] - speed[0])
+    return int(np.argmax(done >= 0.63)) * FAST.dt
+
+
+def test_plant_step__rises_to_63_percent_in_0_398_s_from_idle_and_0_102_s_moving():
+    assert rise_time(0.0, 100) == pytest.approx(0.398, abs=0.02)
+    assert rise_time(40 / 127, 200) == pytest.approx(0.102, abs=0.02)
+
+
+def test_plant_step__has_the_peak_speeds_of_the_machine():
+    """Ten sweeps at once: each joint alone from stop to stop, up and down."""
+    goal = np.array([[0.20, 0.15, 0.17, 0.22, 0.240], [0.20, 0.22, 0.28, 0.38, 0.453]])
+    tolerance = np.where(np.arange(5) == Q5, 0.001, 0.05 * goal)
+    q_min, q_max = BROKK_170.column("q_min"), BROKK_170.column("q_max")
+    own = np.eye(5, dtype=bool)
+    start = np.stack([np.where(own, q_min, MIDDLE), np.where(own, q_max, MIDDLE)])
+    u = LIMIT * np.stack([np.eye(5), -np.eye(5)])
+    state, velocities, _ = record(FAST, start, np.broadcast_to(u, (4600, 2, 5, 5)))
+    speeds = velocities[..., own] * np.array([[1], [-1]])  # (steps, 2, 5): of the swept joint
+    np.testing.assert_array_equal(state.q[:, own], [q_max, q_min])  # all got through
+    assert np.all(speeds >= 0)
+    assert np.all(np.abs(speeds.max(axis=0) - goal) < tolerance), speeds.max(axis=0)
+
+
+def test_lever_arm__varies_by_one_and_a_half_to_two_and_a_half():
+    q_min, q_max = BROKK_170.column("q_min"), BROKK_170.column("q_max")
+    arms = lever_arm(BROKK_170, np.linspace(q_min, q_max, 500))
+    ratio = arms.max(axis=0) / arms.min(axis=0)
+    assert ratio[0] == 1.0
+    assert np.all((ratio[1:] > 1.5) & (ratio[1:] < 2.5)), ratio
+
+
+def test_plant_step__moves_nothing_in_the_dead_zone():
+    for sign in (1, -1):
+        state, velocities, _ = record(BROKK_170, MIDDLE, np.full((200, 5), sign * 8 / 127))
+        np.testing.assert_array_equal(state.q, MIDDLE)
+        assert not velocities.any()
+        state, velocities, _ = record(BROKK_170, MIDDLE, np.full((100, 5), sign * 20 / 127))
+        assert np.all(sign * velocities[-1] > 1e-3)
+
+
+def test_plant_step__has_pump_enough_at_the_limit_and_too_little_at_full_command():
+    q = np.array([0.0, 0.5, 1.4, 2.6, 1.8])
+    falling = -(np.arange(5) != 1).astype(float)  # the driven joints where they need most oil
+
+    def loss(level: float) -> float:
+        _, _, alone = record(BROKK_170, q, only(Q5, np.full(25, -level)))
+        _, _, together = record(BROKK_170, q, np.tile(level * falling, (25, 1)))
+        return 1 - together[-1, Q5] / alone[-1, Q5]
+
+    assert abs(loss(LIMIT)) < 0.02
+    assert loss(1.0) > 0.05
+
+
+def test_plant_step__gives_each_machine_a_pump():
+    starts = MIDDLE + 0.1 * np.arange(3)[:, None]
+    batch, one = plant_reset(BROKK_170, starts), plant_reset(BROKK_170, starts[1])
+    for _ in range(12):
+        batch, one = (plant_step(BROKK_170, s, np.ones_like(s.q)) for s in (batch, one))
+    np.testing.assert_allclose(batch.q[1], one.q, atol=1e-12)
+
+
+def test_plant_step__delays_commands_by_the_delay():
+    state = plant_reset(FAST, MIDDLE)
+    for tick in range(12):
+        assert not state.s.any() or tick > 8
+        state = plant_step(FAST, state, only(Q5, [1.0 if tick == 0 else 0.0])[0])
+        assert (state.s[Q5] > 0) == (tick >= 8), tick  # 8 steps of 5 ms
+    # at 20 Hz the spool has two steps of the tick left: 1 - (1 - 1/6)^2
+    state = plant_step(BROKK_170, plant_reset(BROKK_170, MIDDLE), np.ones(5))
+    np.testing.assert_allclose(state.s, 1 - (5 / 6) ** 2, atol=1e-12)
+
+
+@pytest.mark.parametrize("rate", [10.0, 20.0, 25.0, 30.0, 40.0, 60.0])
+def test_plant_step__lasts_one_over_the_rate(rate):
+    """Or a machine whose tick is no multiple of the plant's step is refused."""
+    try:
+        machine = replace(BROKK_170, rate=rate)
+    except ValueError:
+        return
+    state, _, _ = record(machine, MIDDLE, only(0, np.full(round(1.5 * rate), LIMIT)))
+    following = plant_step(machine, state, only(0, [LIMIT])[0])
+    speed = (state.v / lever_arm(machine, state.q))[0]  # of the slew drive: steady by now
+    assert following.q[0] - state.q[0] == pytest.approx(speed / rate, rel=1e-3)
+
+
+def test_plant_step__holds_at_a_stop_and_lets_go():
+    for sign, stop in ((1, BROKK_170.column("q_max")), (-1, BROKK_170.column("q_min"))):
+        state, _, _ = record(BROKK_170, stop - sign * 0.02, np.full((60, 5), sign * 1.0))
+        np.testing.assert_array_equal(state.q, stop)
+        np.testing.assert_array_equal(state.v, 0.0)
+        for _ in range(40):
+            state = plant_step(BROKK_170, state, np.full(5, -sign * LIMIT))
+        assert np.all(sign * (stop - state.q) > 0.02)
+
+
+# --- the plant's equations ------------------------------------------------------------------------
+
+
+def slow_plant(machine: Machine, q: list[float], commands: np.ndarray) -> list[dict[str, float]]:
+    """The equations read line by line: one joint, one 5 ms step, one number at a time."""
+    m, dt = machine, machine.plant_dt
+    joints = [{"q": float(a), "v": 0.0, "s": 0.0, "z": 0.0} for a in q]
+    per_tick, late = round(1 / m.rate / dt), round(m.delay / dt)
+    for step in range(len(commands) * per_tick):
+        at = step - late
+        a = [0.0] * m.n if at < 0 else commands[at // per_tick].tolist()
+        goal = []
+        for joint, x in zip(m.joints, joints, strict=True):
+            g = 0.0
+            if x["z"] > m.valve_threshold:
+                part = min(1.0, (x["z"] - m.valve_threshold) / (1 - m.valve_threshold))
+                g = math.sqrt(3 * part**2 - 2 * part**3)
+            K = joint.speed_positive if x["s"] > 0 else joint.speed_negative
+            goal.append(K * x["s"] * g)
+        flow = sum(abs(j.cylinder_area * v) for j, v in zip(m.joints, goal, strict=True))
+        pump = 1.0 if flow == 0 else min(1.0, m.pump_flow / flow)
+        for i, (joint, x) in enumerate(zip(m.joints, joints, strict=True)):
+            us = math.copysign(max(0.0, (abs(a[i]) - m.dead_zone) / (1 - m.dead_zone)), a[i])
+            zt = 1.0 if abs(x["s"]) > m.spool_threshold else 0.0
+            tau = m.tau_valve_up if zt > x["z"] else m.tau_valve_down
+            if joint.cylinder_base:
+                b, c, gamma = joint.cylinder_base, joint.cylinder_rod, joint.cylinder_angle + x["q"]
+                r = b * c * math.sin(gamma) / math.sqrt(b * b + c * c - 2 * b * c * math.cos(gamma))
+            else:
+                r = joint.cylinder_rod
+            new = {
+                "q": x["q"] + dt * x["v"] / r,
+                "v": x["v"] + dt * (goal[i] * pump - x["v"]) / m.tau_cylinder,
+                "s": x["s"] + dt * (us - x["s"]) / m.tau_spool,
+                "z": x["z"] + dt * (zt - x["z"]) / tau,
+            }
+            if new["q"] >= joint.q_max:
+                new |= {"q": joint.q_max, "v": min(new["v"], 0.0)}
+            if new["q"] <= joint.q_min:
+                new |= {"q": joint.q_min, "v": max(new["v"], 0.0)}
+            joints[i] = new
+    return joints
+
+
+@st.composite
+def driven_machines(draw: st.DrawFn) -> tuple[Machine, np.ndarray, np.ndarray]:
+    machine = draw(machines())
+    shape = (draw(st.integers(1, 15)), machine.n)
+    u = draw(npst.arrays(np.float64, shape, elements=reals(-1, 1)))
+    return machine, draw(poses(machine)), np.repeat(u, 2, axis=0)
+
+
+@given(driven_machines())
+def test_plant_step__is_its_equations(case):
+    machine, q, u = case
+    state, velocities, _ = record(machine, q, u)
+    goal = slow_plant(machine, q, u)
+    for name, values in (("q", state.q), ("v", state.v), ("s", state.s), ("z", state.z)):
+        np.testing.assert_allclose(values, [x[name] for x in goal], atol=1e-12, err_msg=name)
+    arms = lever_arm(machine, state.q)
+    np.testing.assert_allclose(velocities[-1], [x["v"] for x in goal] / arms, atol=1e-12)
+    assert np.all(state.q >= machine.column("q_min")) and np.all(state.q <= machine.column("q_max"))
+
+
+@given(driven_machines())
+def test_lever_arm__is_the_derivative_of_the_cylinder_length(case):
+    machine, q, _ = case
+    base, rod, angle = (machine.column(f"cylinder_{name}") for name in ("base", "rod", "angle"))
+    arm = lever_arm(machine, q)
+    length = lambda x: np.sqrt((base - rod * np.cos(x)) ** 2 + (rod * np.sin(x)) ** 2)  # noqa: E731
+    slope = (length(angle + q + 1e-6) - length(angle + q - 1e-6)) / 2e-6
+    np.testing.assert_allclose(arm, np.where(base > 0, slope, rod), atol=1e-8)
+    assert np.all(arm > 0)
+
+
+def test_lever_arm__of_q5_at_a_right_angle():
+    # a right angle: legs 0.6 and 0.2, hypotenuse 0.6325, height 0.12 / 0.6325
+    q = MIDDLE.copy()
+    q[Q5] = np.pi / 2 - 0.4
+    assert lever_arm(BROKK_170, q)[Q5] == pytest.approx(0.18974, abs=1e-5)
+    assert lever_arm(BROKK_170, q)[0] == 0.15
+
+
+def frozen(state: PlantState) -> PlantState:
+    for array in state:
+        array.setflags(write=False)
+    return state
+
+
+def test_plant_step__changes_nothing_that_it_was_given():
+    rng = np.random.default_rng(0)
+    state = plant_reset(BROKK_170, np.tile(MIDDLE, (3, 1)))
+    u = rng.uniform(-1, 1, (3, 5))
+    for _ in range(20):
+        before = [array.copy() for array in state]
+        following = plant_step(BROKK_170, frozen(state), u)
+        for array, copy in zip(state, before, strict=True):
+            np.testing.assert_array_equal(array, copy)
+        again = plant_step(BROKK_170, state, u)
+        np.testing.assert_array_equal(again.q, following.q)
+        state = following
+    # a caller that reuses its arrays does not reach into the plant
+    q, late = MIDDLE.copy(), np.ones(5)
+    state = plant_reset(BROKK_170, q)
+    q[:] = 0.0
+    np.testing.assert_array_equal(state.q, MIDDLE)
+    state = plant_step(BROKK_170, state, late)
+    kept = plant_step(BROKK_170, state, np.zeros(5))
+    late[:] = -1.0
+    np.testing.assert_array_equal(plant_step(BROKK_170, state, np.zeros(5)).s, kept.s)
+
+
+def test_plant_step__of_a_batch_is_that_of_its_rows():
+    rng = np.random.default_rng(1)
+    q = rng.uniform(BROKK_170.column("q_min"), BROKK_170.column("q_max"), (2, 3, 5))
+    u = np.repeat(rng.uniform(-1, 1, (10, 2, 3, 5)), 6, axis=0)
+    batch, velocities, _ = record(BROKK_170, q, u)
+    for index in np.ndindex(2, 3):
+        alone, own, _ = record(BROKK_170, q[index], u[:, *index])
+        np.testing.assert_allclose(batch.q[index], alone.q, atol=1e-13)
+        np.testing.assert_allclose(velocities[:, *index], own, atol=1e-13)
+
+
+def test_lever_arm__of_q5_at_an_acute_angle():
+    # sides 0.6 and 0.2 under 60 degrees: third side sqrt(0.28)
+    arm = lever_arm(BROKK_170, np.full(5, np.pi / 3 - 0.4))
+    assert arm[Q5] == pytest.approx(0.19640, abs=1e-5)
+
+
+def test_plant_step__first_moves_at_eleven_counts():
+    """8.9 counts of dead zone; the next 1.2 open the spool by less than 1 %."""
+    for sign in (1, -1):
+        _, velocities, _ = record(BROKK_170, MIDDLE, np.full((100, 5), sign * 10 / 127))
+        assert not velocities.any()
+        _, velocities, _ = record(BROKK_170, MIDDLE, np.full((100, 5), sign * 11 / 127))
+        assert np.all(sign * velocities[-1] > 1e-4)
+
 
 # --- histories ------------------------------------------------------------------------------------
 
 
-def test_a_history_by_hand():
+def test_append_sample__and_append_command_by_hand():
     h = initial_history(np.array([0.5, -1.0]), 3)
     np.testing.assert_array_equal(h[1], [[-1, -1, -1], [0, 0, 0], [0, 0, 0]])
     h.setflags(write=False)
     sent = append_command(h, [0.1, 0.2])
     np.testing.assert_array_equal(sent[0], [[0.5, 0.5, 0.5], [0, 0, 0], [0, 0, 0.1]])
     np.testing.assert_array_equal(sent[1], [[-1, -1, -1], [0, 0, 0], [0, 0, 0.2]])
-    seen = push(h, [0.1, 0.2], [0.6, -0.9], lambda angles: angles[..., -1] - angles[..., 0])
-    np.testing.assert_allclose(seen[0], [[0.5, 0.5, 0.6], [0, 0, 0.1], [0, 0, 0.1]])
-    np.testing.assert_allclose(seen[1], [[-1, -1, -0.9], [0, 0, 0.1], [0, 0, 0.2]])
+    seen = append_sample(h, [0.1, 0.2], np.array([0.6, -0.9]), 2, 0.05)
+    np.testing.assert_allclose(seen[0], [[0.5, 0.5, 0.6], [0, 0, 2], [0, 0, 0.1]])
+    np.testing.assert_allclose(seen[1], [[-1, -1, -0.9], [0, 0, 2], [0, 0, 0.2]])
     sent = append_command(seen, [0.3, 0.4])
-    np.testing.assert_allclose(sent[0], [[0.5, 0.5, 0.6], [0, 0, 0.1], [0, 0.1, 0.3]])
+    np.testing.assert_allclose(sent[0], [[0.5, 0.5, 0.6], [0, 0, 2], [0, 0.1, 0.3]])
 
 
-def test_histories_have_leading_axes_and_keep_the_float_type():
+def test_append_sample__keeps_leading_axes_and_the_float_type():
     q = np.arange(6, dtype=np.float32).reshape(3, 2)
-    h = push(initial_history(q, 5), q / 10, q + 1, lambda a: a[..., -1] - a[..., -2])
+    h = append_sample(initial_history(q, 5), q / 10, q + 1, 2, 1.0)
     assert h.shape == (3, 2, 3, 5) and h.dtype == np.float32
     np.testing.assert_array_equal(h[..., 0, -1], q + 1)
     np.testing.assert_array_equal(h[..., 0, -2], q)
@@ -48,7 +332,7 @@ def test_histories_have_leading_axes_and_keep_the_float_type():
 
 
 @pytest.mark.parametrize("leading", [(), (1,), (7,), (2, 3)])
-def test_prediction_against_a_loop_in_double_precision(leading):
+def test_forward__is_a_loop_in_double_precision(leading):
     net = random_net(seed=len(leading), history=5, hidden=8)
     rng = np.random.default_rng(9)
     history = rng.uniform(-1, 1, (*leading, 3, 3, 5)).astype(np.float32)
@@ -68,25 +352,17 @@ def test_prediction_against_a_loop_in_double_precision(leading):
             assert low <= got[index][j] <= high
 
 
-def test_what_nets_see_of_a_command_by_hand():
+def test_mu_law__by_hand():
     """Openings 0.01 and 0.5 beyond a dead zone of 0.2: ln(1.5) and ln(26) of ln(51)."""
     u = np.array([-1.0, -0.2, 0.0, 0.1, 0.208, 0.6, 1.0])
     u.setflags(write=False)
-    wanted = np.array([-1, 0, 0, 0, np.log(1.5) / np.log(51), np.log(26) / np.log(51), 1])
-    np.testing.assert_allclose(mu_law(u, 0.2), wanted, atol=1e-12)
+    expected = np.array([-1, 0, 0, 0, np.log(1.5) / np.log(51), np.log(26) / np.log(51), 1])
+    np.testing.assert_allclose(mu_law(u, 0.2), expected, atol=1e-12)
     np.testing.assert_array_equal(mu_law(u, 0.0), u)
-    np.testing.assert_array_equal(mu_law_derivative(u, 0.0), 1)
     assert mu_law(np.float32([0.3]), 0.2).dtype == np.float32
 
 
-@pytest.mark.parametrize("dead_zone", [0.0, 0.07, 0.3])
-def test_the_slope_of_the_scale_is_a_difference(dead_zone):
-    u = np.linspace(-0.999, 0.999, 400)
-    ends = mu_law(u + 1e-7, dead_zone) - mu_law(u - 1e-7, dead_zone)
-    np.testing.assert_allclose(mu_law_derivative(u, dead_zone), ends / 2e-7, rtol=1e-5, atol=1e-6)
-
-
-def test_nets_that_know_a_dead_zone_are_nets_shown_other_commands():
+def test_forward__with_a_dead_zone_reads_companded_commands():
     plain = random_net(history=5)
     net, rng = replace(plain, dead_zone=0.1), np.random.default_rng(2)
     history = rng.uniform(-1, 1, (6, 3, 3, 5))
@@ -94,41 +370,14 @@ def test_nets_that_know_a_dead_zone_are_nets_shown_other_commands():
     other = history.copy()
     other[:, :, 2] = mu_law(history[:, :, 2], 0.1)
     history.setflags(write=False)
-    np.testing.assert_array_equal(net.velocity(history), plain.velocity(other))
+    np.testing.assert_array_equal(net.forward(history)[0], plain.forward(other)[0])
     idle = history.copy()
     idle[0, :, 2] = 0.0
-    np.testing.assert_array_equal(net.velocity(history)[0], net.velocity(idle)[0])
-    assert (net.velocity(history)[1:] != plain.velocity(history)[1:]).all()
+    np.testing.assert_array_equal(net.forward(history)[0][0], net.forward(idle)[0][0])
+    assert (net.forward(history)[0][1:] != plain.forward(history)[0][1:]).all()
 
 
-def test_a_file_from_before_dead_zones_holds_nets_that_see_plain_commands(tmp_path):
-    net = replace(random_net(history=5), dead_zone=0.1)
-    save_net(tmp_path / "net.npz", net)
-    assert load_net(tmp_path / "net.npz").dead_zone == 0.1
-    arrays = dict(np.load(tmp_path / "net.npz"))
-    header = json.loads(str(arrays["header"]))
-    del header["dead_zone"]
-    np.savez(tmp_path / "old.npz", **arrays | {"header": np.array(json.dumps(header))})
-    assert load_net(tmp_path / "old.npz").dead_zone == 0.0
-
-
-def test_the_slope_of_nets_that_know_a_dead_zone_is_a_difference():
-    net = random_net(history=4)
-    net = replace(net, dead_zone=0.1, weights=tuple(w.astype(float) for w in net.weights))
-    history = np.random.default_rng(3).uniform(-1, 1, (5, 3, 3, 4))
-    slope = net.slope(history)[1]
-    for kind in range(3):
-        for sample in range(4):
-            ends = []
-            for step in (1e-6, -1e-6):
-                other = history.copy()
-                other[..., kind, sample] += step
-                ends.append(net.velocity(other))
-            difference = (ends[0] - ends[1]) / 2e-6
-            np.testing.assert_allclose(slope[..., kind, sample], difference, rtol=1e-4, atol=1e-6)
-
-
-def test_prediction_refuses_another_shape():
+def test_predict__refuses_another_shape():
     with pytest.raises(ValueError) as caught:
         random_net().predict(np.zeros((4, 2, 3, 13), np.float32))
     assert str(caught.value) == "history: expected (..., 3, 3, 13), got (4, 2, 3, 13)"
@@ -136,39 +385,54 @@ def test_prediction_refuses_another_shape():
         random_net().predict(np.zeros((3, 3, 12), np.float32))
 
 
-def test_a_step_of_the_simulation_by_hand():
-    net = replace(constant_net([0.2, -0.4], False, ("a", "b")), velocity_samples=2)
-    net = replace(net, q_low=np.float32([0.0, 0.985]), q_high=np.float32([1.0, 2.0]))
-    history, q = net.step(
-        initial_history(np.array([0.5, 1.0]), 13), np.array([0.5, 1.0]), [0.3, -0.1]
-    )
-    np.testing.assert_allclose(q, [0.51, 0.985], atol=1e-6)  # the second meets its stop
-    np.testing.assert_allclose(history[:, 1, -1], [0.2, -0.3], atol=1e-5)
-    np.testing.assert_allclose(history[:, 2, -2:], [[0, 0.3], [0, -0.1]])
-    # beyond what training saw it may stay or come back, but go no further
-    _, outside = net.step(history, np.array([1.5, 0.5]), [0.0, 0.0])
-    np.testing.assert_allclose(outside, [1.5, 0.5], atol=1e-6)
-    logged = replace(net, velocity_logged=True)
-    history, _ = logged.step(
-        initial_history(np.array([0.5, 1.0]), 13), np.array([0.5, 1.0]), [0.1, 0.1]
-    )
-    np.testing.assert_allclose(history[:, 1, -1], [0.2, -0.3], atol=1e-5)
-
-
-def test_a_joint_without_a_command_that_stood_still_stays():
+def test_predict__holds_a_joint_without_a_command_that_stood_still():
+    """No command at all, one command in the history, an angle that moved, a command now."""
     net = constant_net([0.2, 0.2, 0.2, 0.2], False, ("a", "b", "c", "d"))
     history = initial_history(np.full(4, 0.5, np.float32), 13)
-    history[1, 2, 1] = 0.01  # b had a command within the history that remains
-    history[2, 0, -1:] = 0.503  # c has moved
-    _, q = net.step(history, np.array([0.5, 0.5, 0.503, 0.5]), [0.0, 0.0, 0.0, 0.01])
-    np.testing.assert_allclose(q, [0.5, 0.51, 0.513, 0.51], atol=1e-6)
-    history[1, 2, 1], history[1, 2, 0] = 0.0, 0.01  # a tick later it is past
-    _, q = net.step(history, np.full(4, 0.5), [0.0, 0.0, 0.0, 0.0])
-    assert q[1] == 0.5
+    history[1, 2, 0] = 0.01
+    history[2, 0, -1] = 0.503
+    history[3, 2, -1] = 0.01
+    np.testing.assert_allclose(net.predict(history), [0, 0.2, 0.2, 0.2], atol=1e-6)
+    history[2, 0, -1] = 0.501  # less than the threshold of 2 mrad
+    assert net.predict(history)[2] == 0
 
 
-def test_commands_within_the_dead_zone_that_nets_know_move_nothing_that_stood_still():
-    """Of 8.9 counts: 8 for the whole history are none, one of 9 is, and a joint that moved is for the net."""
+def test_smooth_angles__is_exact_on_steady_motion():
+    """q = q_H + v t: every sample, moved on, gives the same angle."""
+    for samples in (2, 4, 5):
+        machine = replace(BROKK_170, velocity_samples=samples)
+        t = 0.05 * np.arange(-12, 1)
+        history = np.zeros((2, 3, 13))
+        history[:, 0] = np.array([[0.5], [1.0]]) + np.outer([0.2, -0.1], t)
+        history[:, 1] = [[0.2], [-0.1]]
+        np.testing.assert_allclose(smooth_angles(machine, history), [0.5, 1.0], atol=1e-12)
+
+
+def test_smooth_angles__by_hand():
+    """Weights: angles 1/H; velocity j, dt (j - l) / H with l = 1, the newest dt l more."""
+    machine = replace(BROKK_170, history=3, velocity_samples=4)
+    history = np.zeros((1, 3, 3))
+    history[0, 0] = [0.3, 0.6, 0.9]
+    history[0, 1] = [1.0, 2.0, 4.0]
+    expected = 0.6 + 0.05 * (-1 * 1.0 + 0 * 2.0 + (1 + 3) * 4.0) / 3
+    np.testing.assert_allclose(smooth_angles(machine, history), [expected], atol=1e-12)
+
+
+def test_net_step__moves_driven_joints_by_the_net_and_stops_at_the_ends():
+    net = obedient_net(BROKK_170)
+    u = np.array([40, 99, -80, 13, 80]) / 127
+    history = initial_history(POSE.astype(np.float32), 13)
+    q = net_step(BROKK_170, net, history, POSE, u)
+    move = np.zeros(5)
+    move[[0, 2, 3, 4]] = obedient_velocity(BROKK_170, u[[0, 2, 3, 4]])
+    np.testing.assert_allclose(q, POSE + 0.05 * move, atol=1e-8)
+    top = BROKK_170.column("q_max")
+    held = net_step(BROKK_170, net, history, top - 1e-4, np.full(5, 0.6))
+    np.testing.assert_allclose(held, np.where([1, 0, 1, 1, 1], top, top - 1e-4), atol=1e-12)
+
+
+def test_predict__holds_joints_under_commands_within_the_dead_zone():
+    """Of 8.9 counts: 8 for the whole history are none, one of 9 is one."""
     net = constant_net([0.2, 0.2, 0.2, 0.2], False, ("a", "b", "c", "d"))
     history = initial_history(np.full(4, 0.5, np.float32), 13)
     history[:, 2] = np.float32([[8], [-8], [8], [8]]) / np.float32(127)
@@ -180,7 +444,7 @@ def test_commands_within_the_dead_zone_that_nets_know_move_nothing_that_stood_st
     np.testing.assert_allclose(net.predict(history), 0.2, atol=1e-6)  # these know none
 
 
-def test_selected_nets_are_the_same_nets_in_another_order():
+def test_select__gives_the_same_nets_in_another_order():
     net = random_net()
     history = np.random.default_rng(2).uniform(-1, 1, (6, 3, 3, 13)).astype(np.float32)
     every = net.predict(history)  # before: a cache of the whole must not leak into the part
@@ -192,104 +456,12 @@ def test_selected_nets_are_the_same_nets_in_another_order():
         net.select(["j0", "q9"])
 
 
-# --- files ----------------------------------------------------------------------------------------
-
-
-def test_a_net_survives_its_file(tmp_path):
-    net = random_net()
-    history = np.random.default_rng(2).uniform(-1, 1, (6, 3, 3, 13)).astype(np.float32)
-    wanted = net.predict(history)  # fills whatever is cached, which must not be written
-    save_net(tmp_path / "net.npz", net)
-    again = load_net(tmp_path / "net.npz")
-    for field in fields(ActuatorNet):
-        one, two = getattr(net, field.name), getattr(again, field.name)
-        if field.name == "weights":
-            assert all(
-                np.array_equal(a, b) and a.dtype == b.dtype for a, b in zip(one, two, strict=True)
-            )
-        else:
-            assert np.array_equal(one, two), field.name
-    np.testing.assert_array_equal(again.predict(history), wanted)
-
-
-def saved(tmp_path, **changes):
-    """A net file with some arrays changed (None: left out)."""
-    path = tmp_path / "net.npz"
-    save_net(path, random_net())
-    with np.load(path) as file:
-        arrays = dict(file)
-    arrays |= changes
-    np.savez(path, **{name: array for name, array in arrays.items() if array is not None})
-    return path, arrays
-
-
-def header(tmp_path, **changes) -> np.ndarray:
-    _, arrays = saved(tmp_path)
-    values = json.loads(str(arrays["header"])) | changes
-    return np.array(json.dumps({k: v for k, v in values.items() if v is not None}))
-
-
-def refusal(path) -> str:
-    with pytest.raises(ValueError) as caught:
-        load_net(path)
-    message = str(caught.value)
-    assert message.startswith(f"{path}: ") and "expected" in message and "got" in message
-    return message
-
-
-def test_files_that_are_no_net_are_refused_with_wanted_and_got(tmp_path):
-    path = tmp_path / "net.npz"
-    refusal(path)  # not there
-    path.write_text("run,time\n")
-    assert "readable .npz" in refusal(path)
-    save_net(path, random_net())
-    whole = path.read_bytes()
-    for length in (0, 10, len(whole) // 2, len(whole) - 30):
-        path.write_bytes(whole[:length])
-        refusal(path)
-    np.savez(path, time=np.arange(3))
-    assert "header" in refusal(path)
-
-
-@pytest.mark.parametrize("name", ["weight_0", "weight_5", "input_scale", "q_high", "header"])
-def test_a_net_with_a_missing_array_is_refused_by_its_name(tmp_path, name):
-    path, _ = saved(tmp_path, **{name: None})
-    assert name in refusal(path)
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"format": 99}, ["actuator net", "99"]),
-        ({"format": None}, ["actuator net", "None"]),
-        ({"kind": "policy"}, ["actuator net", "policy"]),
-        ({"history": None}, ["history"]),
-        ({"joints": None}, ["joints"]),
-        ({"history": 7}, []),
-        ({"joints": ["a", "b"]}, []),
-        ({"colour": "red"}, ["colour"]),
-    ],
-)
-def test_a_header_that_does_not_fit_is_refused(tmp_path, changes, words):
-    path, _ = saved(tmp_path, header=header(tmp_path, **changes))
-    message = refusal(path)
-    assert all(word in message for word in words), message
-
-
-@pytest.mark.parametrize("text", ["", "{", "3", "null", "[1, 2]", '"text"', "[]"])
-def test_a_header_that_is_no_table_is_refused(tmp_path, text):
-    path, _ = saved(tmp_path, header=np.array(text))
-    refusal(path)
-
-
-@pytest.mark.parametrize(
-    ("name", "shape"),
-    [
-        ("weight_0", (3, 39, 31)), ("weight_1", (3, 31)), ("weight_2", (2, 32, 32)),
-        ("weight_4", (3, 32, 2)), ("weight_5", (1, 1)), ("input_mean", (3, 38)),
-        ("input_scale", (39,)), ("output_low", (2,)), ("q_low", (2,)), ("q_high", ()),
-    ],
-)  # fmt: skip
-def test_arrays_of_another_shape_are_refused(tmp_path, name, shape):
-    path, _ = saved(tmp_path, **{name: np.ones(shape, np.float32)})
-    refusal(path)
+def test_select_nets__refuses_nets_of_another_machine_rate_or_estimator():
+    net = small_net(BROKK_170, np.random.default_rng(0), BROKK_170.names)
+    assert select_nets(BROKK_170, net).joints == ("q1", "q3", "q4", "q5")
+    changes = {"machine": "other", "rate": 25.0, "history": 12, "velocity_samples": 3}
+    for name, value in (changes | {"velocity_logged": True}).items():
+        with pytest.raises(ValueError, match=f"actuator: expected nets for brokk170.*{value!r}"):
+            select_nets(BROKK_170, replace(net, **{name: value}))
+    with pytest.raises(ValueError, match=r"joints: expected nets for \['q1', 'q3', 'q4', 'q5'\]"):
+        select_nets(BROKK_170, net.select(["q1", "q3"]))

@@ -2,7 +2,7 @@
 
 `planted.txt` has below each test the errors that it must find, `module: right => wrong`. The
 changed function's code takes the place of the right one in the same function object, so everybody
-who imported it runs the wrong code. The safety gate has planted errors of its own (`tests/can/`).
+who imported it runs the wrong code.
 """
 
 from __future__ import annotations

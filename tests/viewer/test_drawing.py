@@ -16,7 +16,8 @@ from strategies import moving
 from brokk_min.kinematics import forward_kinematics, jacobian, tool_position
 from brokk_min.machine import BROKK_170, Machine
 from brokk_min.viewer import drawing
-from brokk_min.viewer.drawing import NO_POINTS, Camera, Scene
+from brokk_min.viewer.camera import Camera, cameras
+from brokk_min.viewer.drawing import NO_POINTS, Scene
 
 Q = np.array([0.4, 0.5, 0.58, 1.71, 1.24])
 STRETCHED = np.array([0.0, 0.0, 0.0, np.pi, 3 * np.pi / 4])  # all links horizontal
@@ -34,13 +35,13 @@ def drawn(*scenes: Scene, machine: Machine = BROKK_170, size: tuple[int, int] = 
     return canvas
 
 
-def cameras(
+def views(
     machine: Machine, q: np.ndarray, in_view: np.ndarray = NO_POINTS
 ) -> tuple[Camera, Camera]:
     """The cameras of a picture of one arm."""
     layout = drawing._layout((0.0, 0.0, *map(float, SIZE)), machine.n, 0)
     p_tool = tool_position(forward_kinematics(machine, q))
-    side, top = drawing.cameras(machine, p_tool, layout, in_view)
+    side, top = cameras(machine, p_tool, layout.side, layout.top, in_view)
     return side, top
 
 
@@ -76,56 +77,13 @@ def test_draw__puts_the_joints_of_any_machine_where_kinematics_say(
         assert np.sum(expected**2) < 1e-9 or scale > 1
 
 
-def test_cameras__see_the_brokk_as_worked_out_by_hand() -> None:
-    side, top = cameras(BROKK_170, STRETCHED)
-    flat = np.array([[0, 0], [0.25, 0.95], [1.4, 0.95], [2.65, 0.95], [3.8, 0.95], [5.0, 0.95]])
-    p = forward_kinematics(BROKK_170, STRETCHED).p
-    np.testing.assert_allclose(side.project(p), side.origin + side.scale * flat * (1, -1))
-    along_y = STRETCHED + np.array([np.pi / 2, 0, 0, 0, 0])  # the tool points to the left
-    np.testing.assert_allclose(
-        top.project(tool(along_y)) - top.origin, [-5.0 * top.scale, 0.0], atol=1e-9
-    )
-    side, _ = cameras(BROKK_170, along_y)
-    np.testing.assert_allclose(
-        side.project(tool(along_y)), side.origin + side.scale * np.array([5.0, -0.95])
-    )
-
-
-def test_cameras__fit_given_points_into_the_box_as_worked_out_by_hand() -> None:
-    """400 x 200 px at (10, 20), 14 px of soil: the points fill 0.92 of 400 or of 172 px."""
-    layout = drawing.Layout((10, 20, 400, 200), (0, 0, 100, 100), (0, 0, 0, 0), (0, 0))
-    _, _, reach = drawing.extent(BROKK_170)
-    assert 4.5 < reach < 5.0  # of 5 m; random poses come near it
-    points = np.array([[0.0, 1.0, 0.5], [0.0, 2.0, 0.75]])
-    side, top = drawing.cameras(BROKK_170, np.array([0.0, 3.0, 1.0]), layout, points)
-    border = 0.06 * reach
-    assert side.scale == pytest.approx(
-        0.92 * min(400 / (1 + 2 * border), 172 / (0.25 + 2 * border))
-    )
-    assert top.scale == pytest.approx(0.92 * min(100 / (1 + 2 * border), 86 / (2 * border)))
-    middle = np.array([0.0, 1.5, 0.0])
-    assert side.project(middle)[0] == pytest.approx(210)
-    assert side.project([0.0, 1.0, 0.5 - border])[1] == pytest.approx(206)
-    assert top.project(middle)[0] == pytest.approx(50)
-    assert top.project([2.0, 0, 0])[1] < 50
-
-
-def test_skeleton__has_the_ends_of_d_and_a_of_two_links_by_hand() -> None:
-    """Two links that turn about z, each 0.2 m above the one before and 1 m long."""
-    joints = [replace(j, a=1.0, d=0.2, alpha=0.0, theta=0.0) for j in BROKK_170.joints[:2]]
-    arm = replace(BROKK_170, joints=tuple(joints))
-    expected = [[0, 0, 0], [0, 0, 0.2], [1, 0, 0.2], [1, 0, 0.4], [1, 1, 0.4]]
-    np.testing.assert_allclose(
-        drawing.skeleton(arm, np.array([0.0, np.pi / 2])), expected, atol=1e-12
-    )
-
-
 def test_backdrop__has_a_grid_and_the_ground_as_worked_out_by_hand() -> None:
     """20 px a metre, the origin at (50, 80) of a box of 100 x 100 px: the ground is 80 px down."""
     box = (0.0, 0.0, 100.0, 100.0)
-    camera = Camera(np.array([50.0, 80.0]), 20.0, np.array([[1.0, 0, 0], [0, 0, 1.0]]))
+    axes = np.array([[1.0, 0, 0], [0, 0, 1.0]])
+    camera = Camera("side", box, np.array([50.0, 80.0]), 20.0, axes)
     canvas = Recorder((100, 100))
-    drawing._backdrop(canvas, BROKK_170, camera, box, "side")
+    drawing._backdrop(canvas, BROKK_170, camera)
     grid = [line.points.tolist() for line in canvas.lines if line.colour == drawing.GRID]
     assert grid[:5] == [[[x, 1], [x, 100]] for x in (10, 30, 50, 70, 90)]
     assert grid[5:] == [[[0, y], [100, y]] for y in (0, 20, 40, 60, 80, 100)]
@@ -133,8 +91,8 @@ def test_backdrop__has_a_grid_and_the_ground_as_worked_out_by_hand() -> None:
     assert soil.points.tolist() == [[0, 80], [100, 80], [100, 100], [0, 100]]
     assert canvas.texts_drawn == ["side view, grid 1 m"]
     below = Recorder((100, 100))
-    drawing._backdrop(below, replace(BROKK_170, ground=-1.5), camera, box, "side")
-    drawing._backdrop(below, BROKK_170, camera._replace(scale=2.0), box, "top")
+    drawing._backdrop(below, replace(BROKK_170, ground=-1.5), camera)
+    drawing._backdrop(below, BROKK_170, camera._replace(label="top", scale=2.0))
     assert below.polygons == []
     assert below.texts_drawn == ["side view, grid 1 m", "top view, grid 10 m"]
 
@@ -146,7 +104,7 @@ def test_draw__paints_trail_and_path_and_nothing_else() -> None:
     pale = next(line.colour for line in canvas.lines if len(line.points) == 50)
     image = canvas.image().astype(int)
     bare = drawn(scene()).image()
-    for camera in cameras(BROKK_170, Q):
+    for camera in views(BROKK_170, Q):
         for points, colour in ((trail[15:-1:5], pale), ((path[1:] + path[:1]) / 2, drawing.PATH)):
             for x, y in np.rint(camera.project(points)).astype(int):
                 error = np.abs(image[y - 1 : y + 2, x - 1 : x + 2] - colour).sum(axis=-1)
@@ -178,7 +136,7 @@ def test_draw__points_arrows_along_goal_and_measured_velocity() -> None:
     canvas = drawn(scene(q_dot=q_dot, v_goal=goal))
     for v, colour in ((v_tool, drawing.MEASURED), (goal, drawing.GOAL)):
         shafts = [s.points for s in canvas.lines if s.colour == colour and s.width == 3]
-        for camera, shaft in zip(cameras(BROKK_170, Q), shafts, strict=True):
+        for camera, shaft in zip(views(BROKK_170, Q), shafts, strict=True):
             along = shaft[1] - shaft[0]
             flat = camera.axes @ v * (1, -1)
             np.testing.assert_allclose(along / np.hypot(*along), flat / np.hypot(*flat), atol=1e-6)
@@ -198,7 +156,8 @@ def test_arrow__has_shaft_and_head_as_worked_out_by_hand(
     canvas = Recorder((10, 10))
     drawing._arrow(canvas, np.zeros(2), np.array([4.0, 0]), (1, 2, 3))  # too short
     drawing._arrow(canvas, np.zeros(2), np.array(along), (1, 2, 3))
-    (line,), (polygon,) = canvas.lines, canvas.polygons
+    (line,) = canvas.lines
+    (polygon,) = canvas.polygons
     np.testing.assert_allclose(line.points, shaft)
     np.testing.assert_allclose(polygon.points, head)
 
@@ -206,7 +165,7 @@ def test_arrow__has_shaft_and_head_as_worked_out_by_hand(
 def test_draw__rings_the_next_point_of_a_line() -> None:
     target = tool() + np.array([[0.0, 0.5, 0.3]])
     rings = [c for c in drawn(scene(target=target)).circles if c.colour == drawing.PATH]
-    for ring, camera in zip(rings, cameras(BROKK_170, Q), strict=True):
+    for ring, camera in zip(rings, views(BROKK_170, Q), strict=True):
         np.testing.assert_allclose(ring.points, camera.project(target[0]))
         assert ring.width == 3
 
@@ -243,7 +202,7 @@ def test_draw__rings_the_tool_in_red_near_a_singularity() -> None:
     machine = replace(BROKK_170, joints=tuple(wide))
     canvas = drawn(scene(STRETCHED), machine=machine)
     rings = [c for c in canvas.circles if c.colour == drawing.WARNING and c.width]
-    for ring, camera in zip(rings, cameras(machine, STRETCHED), strict=True):
+    for ring, camera in zip(rings, views(machine, STRETCHED), strict=True):
         np.testing.assert_allclose(ring.points, camera.project(tool(STRETCHED)))
     assert "near a singularity" in canvas.texts_drawn
     assert not [c for c in drawn(scene()).circles if c.colour == drawing.WARNING]
@@ -327,7 +286,8 @@ def test_draw__cuts_off_no_text_and_puts_none_on_another(
 
 
 def test_draw__keeps_two_arms_apart() -> None:
-    left, right = (1, 2, 3), (4, 5, 6)
+    left = (1, 2, 3)
+    right = (4, 5, 6)
     canvas = drawn(scene(colour=left), scene(colour=right))
     for colour, start in ((left, 0), (right, 480)):
         links = np.vstack([p.points for p in canvas.polygons if p.colour == colour])

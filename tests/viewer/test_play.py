@@ -65,7 +65,8 @@ def test_scene__interpolates_between_two_ticks_and_forgets_them_after_half_a_sec
         assert scene.path.shape == scene.trail.shape == (0, 3)
     session.update(telemetry(0, q), 1.0)
     np.testing.assert_array_equal(session.scene(1.02, "rl", "").q, q)
-    u, v = np.full(5, 0.1), np.array([0.1, 0.0, 0.2])
+    u = np.full(5, 0.1)
+    v = np.array([0.1, 0.0, 0.2])
     session.update(telemetry(1, q + 0.02, q_dot=0 * q + 0.4, u=u, v_goal=v), 1.05)
     for now, fraction in ((1.05, 0.0), (1.075, 0.5), (1.1, 1.0), (1.54, 1.0)):
         scene = session.scene(now, "rl", "")
@@ -147,7 +148,9 @@ def test_next_step__says_what_the_operator_has_to_do() -> None:
     handler = Operator().handler
     assert play.next_step(session, handler) == "starting"
     session.telemetry = telemetry()
-    handler.focus, handler.blocked, handler.pad = False, True, None
+    handler.pad = None
+    handler.blocked = True
+    handler.focus = False
     assert play.next_step(session, handler) == "neutral: the window has no focus"
     handler.focus = True
     expected = "release the switch, then press it with nothing deflected"
@@ -173,7 +176,8 @@ def test_notes__have_keys_task_and_figures_and_attempts_are_kept_at_once(tmp_pat
     session.next_task()
     work = session.tracing
     assert work is not None
-    work.passed, work.seconds = 3, 1.25
+    work.passed = 3
+    work.seconds = 1.25
     line = f"rectangle: follow the orange line to its ring, 1.2 s, 3 of {len(work.line)}"
     assert session.notes("rl")[2:] == [line]
     work.passed = len(work.line) - 1

@@ -16,7 +16,7 @@ from brokk_min.evaluation.sequences import feasible
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer import tracing
-from brokk_min.viewer.drawing import extent
+from brokk_min.viewer.camera import extent
 from brokk_min.viewer.play import Session
 from brokk_min.viewer.tracing import Attempt, Tracing
 

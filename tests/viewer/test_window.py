@@ -9,7 +9,9 @@ import pytest
 
 from brokk_min.viewer.window import BACKGROUND, Canvas, Window, open_window
 
-RED, BLUE, GREEN = (200, 0, 0), (0, 0, 200), (0, 150, 0)
+RED = (200, 0, 0)
+BLUE = (0, 0, 200)
+GREEN = (0, 150, 0)
 
 
 def columns(image: np.ndarray, row: int, colour: tuple[int, int, int]) -> list[int]:

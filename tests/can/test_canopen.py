@@ -1,0 +1,438 @@
+"""Bytes by hand and on all values, python-can's buses and logs, and the canopen library as peer."""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import struct
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import can
+import canopen
+import numpy as np
+import pytest
+from helpers_bus import (
+    MULTICAST,
+    START,
+    Hand,
+    Out,
+    Push,
+    World,
+    dictionary,
+    own_multicast_port,
+    raises,
+    recording,
+)
+
+from brokk_min import hw
+from brokk_min.can.canopen import (
+    Bus,
+    Frame,
+    OperatorInput,
+    checksum,
+    encoder_counts,
+    encoder_raw,
+    open_bus,
+    read_frames,
+    sdo,
+    unpack_operator_input,
+    valve_frame,
+)
+from brokk_min.machine import BROKK_170
+
+STEP = BROKK_170.encoder_step
+
+# --- bytes ---------------------------------------------------------------------------------------
+
+
+def bitwise_crc(data: bytes) -> int:
+    """CRC-8 SAE J1850 straight from its definition, bit by bit."""
+    crc = 0xFF
+    for byte in data:
+        for i in range(7, -1, -1):
+            top = crc >> 7
+            crc = crc << 1 & 0xFF
+            if top ^ (byte >> i & 1):
+                crc ^= 0x1D
+    return crc ^ 0xFF
+
+
+def test_checksum__is_crc8_j1850() -> None:
+    assert bitwise_crc(b"123456789") == checksum(list(b"123456789")) == 0x4B
+    rows = np.random.default_rng(0).integers(0, 256, (300, 7))
+    assert checksum(rows).tolist() == [bitwise_crc(bytes(row.tolist())) for row in rows]
+    every = np.arange(256)[:, None]
+    assert checksum(every).tolist() == [bitwise_crc(bytes([byte])) for byte in range(256)]
+
+
+def test_checksum__finds_every_error_of_one_or_two_bits() -> None:
+    frame = np.array([80, 0, 175, 12, 0, 7, 1], np.uint8)
+    bits = np.unpackbits(frame)
+    for flipped in (np.arange(56)[:, None], np.argwhere(np.triu(np.ones((56, 56)), 1))):
+        wrong = np.tile(bits, (len(flipped), 1))
+        wrong[np.arange(len(flipped))[:, None], flipped] ^= 1
+        assert (checksum(np.packbits(wrong, axis=-1)) != checksum(frame)).all()
+
+
+def test_valve_frame__by_hand() -> None:
+    body = [80, 0, 175, 50, 205, 9]
+    frame = valve_frame([80, 0, -80, 50, -50], 9, True)
+    assert frame.tolist() == [*body, bitwise_crc(bytes([*body, 1])), 1]
+    two = valve_frame([[1, -1], [0, 2]], [3, 4], [False, True])
+    assert two[:, :6].tolist() == [[1, 254, 0, 0, 0, 3], [0, 2, 0, 0, 0, 4]]
+    assert two[:, 7].tolist() == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("raw", "counts"),
+    [(1, 1), (0, 0), (2**26 - 1, -1), (2**26 - 2, -2), (4095, -1), (5 | 1 << 29, 5)],
+)
+def test_encoder_counts__unwraps_about_zero_and_masks(raw: int, counts: int) -> None:
+    found = encoder_counts(BROKK_170, [raw, 0, 0, 1000, 0])
+    assert found.dtype == int
+    assert found.tolist() == [counts, 0, 0, 1000, 0]
+
+
+def test_encoder_counts__unwraps_half_a_turn_from_mid_range() -> None:
+    q4 = encoder_counts(BROKK_170, np.full((3, 5), [[100], [3188], [3189]]))[:, 3]
+    assert q4.tolist() == [100, 3188, 3189 - 4096]  # the middle is 1141
+
+
+def test_encoder_counts__is_the_inverse_of_encoder_raw_however_mounted() -> None:
+    mountings = zip(BROKK_170.joints, (100, 4000, -7, 2**26 - 1, 0), (1, -1, -1, 1, 1), strict=True)
+    joints = [replace(joint, encoder_zero=zero, encoder_sign=s) for joint, zero, s in mountings]
+    machine = replace(BROKK_170, joints=tuple(joints))
+    assert encoder_counts(machine, [101, 3999, 2**26 - 9, 999, 3]).tolist() == [1, 1, 2, 1000, 3]
+    q = np.linspace(machine.column("q_min"), machine.column("q_max"), 501)
+    counts = np.rint(q / STEP).astype(int)
+    raw = encoder_raw(machine, counts)
+    assert ((raw >= 0) & (raw < 2**26)).all()
+    np.testing.assert_array_equal(encoder_counts(machine, raw), counts)
+    np.testing.assert_array_equal(encoder_counts(machine, raw % 4096), counts)
+
+
+@pytest.mark.parametrize("flags", range(16))
+def test_operator_input__survives_the_log_to_a_tenth_of_a_millimetre(flags: int) -> None:
+    given = OperatorInput((0.3, -0.12345, 3.2), *(bool(flags & 1 << i) for i in range(4)))
+    data = given.pack()
+    assert data == struct.pack("<hhhB", 3000, -1234, 32000, flags)
+    assert unpack_operator_input(data) == given._replace(v_goal=(0.3, -0.1234, 3.2))
+    rounded = unpack_operator_input(OperatorInput((0.00019, -0.00019, 0.00011)).pack())
+    assert rounded.v_goal == (0.0002, -0.0002, 0.0001)  # not cut
+
+
+# --- buses and logs ------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def buses() -> Iterator[tuple[can.BusABC, can.BusABC]]:
+    here, there = (can.Bus("canopen", interface="virtual") for _ in range(2))
+    yield here, there
+    here.shutdown()
+    there.shutdown()
+
+
+def test_bus__marks_foreign_frames_and_echoes_and_logs_all_but_echoes(
+    buses: tuple[can.BusABC, can.BusABC],
+) -> None:
+    text = io.StringIO()
+    bus = Bus(buses[0], can.CanutilsLogWriter(text), "can0", echo=True, clock=lambda: 1.0)
+    bus.send(0x123, b"\x01\x02")
+    for fields in (
+        {"arbitration_id": 0x123, "data": b"\x01\x02"},  # the echo
+        {"arbitration_id": 0x123, "data": b"\x01\x02"},  # somebody else
+        {"arbitration_id": 0x123, "data": b"\x01", "is_extended_id": True},
+        {"arbitration_id": 0x124, "is_remote_frame": True},
+        {"arbitration_id": 0x125, "is_error_frame": True},
+        {"arbitration_id": 0x126, "is_fd": True, "data": bytes(12)},
+    ):
+        buses[1].send(can.Message(**({"is_extended_id": False} | fields)))  # type: ignore[arg-type]
+    frames = [bus.recv(0.5) for _ in range(6)]
+    assert [frame and frame.id for frame in frames] == [-1, 0x123, -1, -1, -1, -1]
+    assert frames[0] == Frame(bus.now(), -1, b"\x01\x02")
+    assert bus.recv(0.0) is None
+    bus.log_input(b"\x09")
+    assert not text.getvalue()  # writing waits until there is time
+    bus.flush()
+    lines = text.getvalue().splitlines()
+    assert len(lines) == 7
+    assert re.fullmatch(r"\(\d+\.\d{6}\) can0 123#0102 T", lines[0])
+    assert re.fullmatch(r"\(\d+\.\d{6}\) can0 123#0102 R", lines[1])
+    assert re.fullmatch(r"\(\d+\.\d{6}\) operator 7FF#09 T", lines[-1])
+
+
+def test_bus__without_echo_takes_what_looks_like_ours_for_somebody_elses(
+    buses: tuple[can.BusABC, can.BusABC],
+) -> None:
+    bus = Bus(buses[0])
+    bus.send(0x123, b"\x01\x02")
+    buses[1].send(can.Message(arbitration_id=0x123, data=b"\x01\x02", is_extended_id=False))
+    frame = bus.recv(0.5)
+    assert frame and frame.id == 0x123
+
+
+class SelectBus:
+    """A silent bus; a wait on it takes as long as the wait says, or a millisecond."""
+
+    def __init__(self) -> None:
+        self.t = 7.0
+        self.waits: list[float] = []
+        self.ready: list[int] = []
+
+    def fileno(self) -> int:
+        return 7
+
+    def recv(self, timeout: float) -> None:
+        assert timeout == 0.0  # python-can's own timeout follows the time of day
+
+    def send(self, message: can.Message, timeout: float) -> None:
+        assert 0 < timeout <= 0.02  # a full buffer must not hold up the tick
+
+    def shutdown(self) -> None:
+        self.t = -1.0
+
+    def select(self, read: list[int], *rest: Any) -> tuple[list[int], list[int], list[int]]:
+        assert read == [7]
+        self.waits.append(rest[-1])
+        self.t += rest[-1] or 0.001
+        return self.ready, [], []
+
+
+@pytest.mark.parametrize(("busy", "slept"), [(0.0, [0.019]), (0.004, [0.016]), (0.020, [])])
+def test_recv__sleeps_only_after_its_busy_wait(
+    busy: float, slept: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    silent = SelectBus()
+    bus = Bus(silent, clock=lambda: silent.t)
+    monkeypatch.setattr("select.select", silent.select)
+    assert bus.recv(0.020, busy) is None
+    assert [wait for wait in silent.waits if wait] == pytest.approx(slept, abs=1.1e-3)
+    assert 0.020 <= silent.t - 7.0 < 0.0225
+    silent.t = 7.0
+    silent.ready = [7]
+    bus.recv(0.020, busy)
+    assert silent.t < 7.002  # what is there is read at once
+
+
+def test_recv__does_not_follow_the_time_of_day(monkeypatch: pytest.MonkeyPatch) -> None:
+    silent = SelectBus()
+    read, _ = os.pipe()
+    silent.fileno = lambda: read  # type: ignore[method-assign]
+    bus = Bus(silent)
+    real = time.time
+    monkeypatch.setattr("time.time", lambda: real() - 3600)
+    begun = time.monotonic()
+    assert bus.recv(0.02) is None
+    assert 0.015 < time.monotonic() - begun < 5.0
+
+
+@pytest.mark.parametrize("logged", [True, False])
+def test_close__has_written_all(logged: bool, tmp_path: Path) -> None:
+    writer = can.CanutilsLogWriter(tmp_path / "a.log") if logged else None
+    raw = SelectBus()
+    bus = Bus(raw, writer, "can0", clock=lambda: 1e6 + 0.12345678)
+    assert abs(bus.now() - time.time()) < 60
+    bus.start = 0.0
+    bus.send(0x123, b"\x01")
+    bus.close()
+    assert raw.t == -1.0
+    if logged:
+        assert (tmp_path / "a.log").read_text() == "(1000000.123457) can0 123#01 T\n"
+
+
+def test_open_bus__refuses_a_bus_that_is_not_there_or_fails() -> None:
+    refusal = r"socketcan nosuch0: expected a CAN bus, got"
+    with pytest.raises(ValueError, match=refusal), open_bus("socketcan", "nosuch0"):
+        pass
+    refusal = r"virtual v: expected a CAN bus that works, got CanOperationError\('full'\)"
+    with pytest.raises(ValueError, match=refusal), open_bus("virtual", "v"):
+        raise can.CanOperationError("full")
+
+
+@pytest.mark.parametrize("text", ["nonsense\n", "(1.0) can0 12#zz\n", "(x) can0 123#00 R\n"])
+def test_read_frames__refuses_what_is_no_log(text: str, tmp_path: Path) -> None:
+    (tmp_path / "bad.log").write_text(text)
+    with pytest.raises(ValueError, match=r"bad\.log: expected a candump log, got"):
+        list(read_frames(tmp_path / "bad.log"))
+
+
+def test_read_frames__reads_a_cut_log_up_to_its_last_whole_line(tmp_path: Path) -> None:
+    text = "(1.000000) can0 123#0102 R\n(2.000000) can0 080#AABB T\n"
+    for size in range(len(text) + 1):
+        (tmp_path / "cut.log").write_text(text[:size])
+        times = [frame.time for frame in read_frames(tmp_path / "cut.log")]
+        assert times == [1.0, 2.0][: text[:size].count("\n")]
+
+
+def test_read_frames__reads_a_plain_candump_log_too(tmp_path: Path) -> None:
+    lines = ["(1.0) can0 123#0102\n", "(2.0) can0 12345678#\n", "(3.0) can0 080# T\n"]
+    (tmp_path / "can.log").write_text("".join(lines))
+    assert list(read_frames(tmp_path / "can.log")) == [
+        Frame(1.0, 0x123, b"\x01\x02", False, "can0"),
+        Frame(2.0, -1, b"", False, "can0"),
+        Frame(3.0, 0x80, b"", True, "can0"),
+    ]
+
+
+def test_read_frames__names_the_missing_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "can", None)
+    with pytest.raises(ValueError, match=r"^can: expected the extra brokk_min\[hw\], got"):
+        list(read_frames(Path("a.log")))
+
+
+def test_open_bus__gives_back_no_echo_over_udp(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own_multicast_port(monkeypatch)
+    with (
+        open_bus("udp_multicast", MULTICAST, tmp_path / "a.log") as a,
+        open_bus("udp_multicast", MULTICAST) as b,
+    ):
+        a.send(0x5A5, b"\x01")
+        first = [a.recv(1.0), b.recv(1.0)]
+        assert [f and (f.id, f.data) for f in first] == [(-1, b"\x01"), (0x5A5, b"\x01")]
+        b.send(0x5A5, b"\x01")
+        answer = a.recv(1.0)
+        assert answer and answer.id == 0x5A5
+    lines = (tmp_path / "a.log").read_text().splitlines()
+    assert [line.partition(") ")[2] for line in lines] == [
+        "udp_multicast 5A5#01 T",
+        "udp_multicast 5A5#01 R",
+    ]
+
+
+# --- encoders ------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def world() -> Iterator[World]:
+    world = World(Push(0, 0, 0, 0, 0), Hand())
+    yield world
+    world.close()
+
+
+def test_set_up_nodes__sets_up_the_encoders_and_starts_the_nodes(world: World) -> None:
+    world.simulated.objects[3, 0x1017, 0] = 0
+    world.simulated.objects[3, 0x1800, 2] = 254
+    out: Out = []
+    world.downward = recording(out)
+    world.drive.begin()
+    assert [data.hex(" ") for can_id, data in out if can_id == 0x603] == [
+        "40 01 65 00 00 00 00 00",  # read the resolution
+        "2b 17 10 00 32 00 00 00",  # two bytes: a heartbeat every 50 ms
+        "2f 00 18 02 01 00 00 00",  # one byte: a position at every SYNC
+    ]
+    assert out[-1] == (0x000, b"\x01\x00")
+    world.sleep(0.01)
+    assert world.simulated.objects[3, 0x1017, 0] == 50
+    assert world.simulated.objects[3, 0x1800, 2] == 1
+    assert set(world.simulated.nmt.values()) == {5}
+
+
+def test_set_up_nodes__refuses_what_does_not_fit(world: World) -> None:
+    world.simulated.objects[4, 0x6501, 0] = 8192
+    with pytest.raises(ValueError, match=r"q4: expected 4096 counts a turn .* node 4 .*got 8192"):
+        world.drive.begin()
+    del world.simulated.objects[4, 0x6501, 0]
+    with pytest.raises(ValueError, match=r"node 4: object 0x6501:00: .*abort 0x06020000"):
+        world.drive.begin()
+    world.upward = lambda can_id, data: []
+    begun = world.t
+    refusal = r"node 1: object 0x6501:00: expected an answer within 0.5 s, got none"
+    with pytest.raises(ValueError, match=refusal):
+        world.drive.begin()
+    assert world.t - begun == pytest.approx(0.5, abs=0.002)
+    six = (*BROKK_170.joints, replace(BROKK_170.joints[4], name="q6", encoder_node=6))
+    machine = replace(BROKK_170, name="6_joints", joints=six, q_start=())
+    with pytest.raises(ValueError, match=r"6_joints: expected at most 5 joints"):
+        hw.Drive(machine, Push(*np.zeros(6)), world.bus, Hand()).begin()
+
+
+def test_sdo__reads_small_objects_and_skips_foreign_answers(world: World) -> None:
+    answers = {
+        0x1017: bytes([0x4B, 0x17, 0x10, 0, 0x34, 0x12, 0xFF, 0xFF]),
+        0x1018: bytes([0x4F, 0x18, 0x10, 0, 7, 9, 9, 9]),
+    }
+
+    def up(can_id: int, data: bytes) -> Out:
+        index = struct.unpack_from("<H", data, 1)[0] if can_id == 0x581 else 0
+        if index not in answers:
+            return [(can_id, data)]
+        foreign = [(0x582, data), (0x581, data[:7]), (0x581, bytes([0x43, 1, 2, 3, 4, 5, 6, 7]))]
+        return [*foreign, (can_id, answers[index])]
+
+    world.upward = up
+    assert sdo(world.bus, 1, (0x1017, 0)) == 0x1234
+    assert sdo(world.bus, 1, (0x1018, 0)) == 7
+    assert sdo(world.bus, 1, (0x1000, 0)) == 406
+    with pytest.raises(ValueError, match="0x06010000"):
+        sdo(world.bus, 1, (0x1000, 0), 5)
+
+
+def test_recv__of_a_bus_without_descriptor_waits_by_python_can(
+    buses: tuple[can.BusABC, can.BusABC], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("select.select", raises(OSError("no descriptor to wait on")))
+    assert Bus(buses[0]).recv(0.01) is None
+
+
+# --- a peer: the canopen library -----------------------------------------------------------------
+
+
+@contextmanager
+def canopen_encoders(channel: str) -> Iterator[list[canopen.LocalNode]]:
+    """Five encoders of the canopen library, and a heartbeat of the valve controller."""
+    positions = encoder_raw(BROKK_170, np.rint(np.array(START) / STEP).astype(int)).tolist()
+    network = canopen.Network()
+    network.connect(interface="virtual", channel=channel)
+    nodes = [canopen.LocalNode(joint.encoder_node, dictionary()) for joint in BROKK_170.joints]
+    for node, position in zip(nodes, positions, strict=True):
+        network.add_node(node)
+        node.nmt.state = "INITIALISING"
+        node.nmt.state = "PRE-OPERATIONAL"
+        node.set_data(0x6004, 0, struct.pack("<I", position))
+
+    def on_sync(can_id: int, data: bytes, timestamp: float) -> None:
+        for node in nodes:
+            if node.nmt.state == "OPERATIONAL":
+                network.send_message(0x180 + node.id, node.get_data(0x6004, 0))
+
+    network.subscribe(0x080, on_sync)
+    heartbeat = network.send_periodic(0x710, b"\x05", 0.03)
+    try:
+        yield nodes
+    finally:
+        heartbeat.stop()
+        network.disconnect()
+
+
+def test_drive__drives_five_encoders_of_the_canopen_library() -> None:
+    """SDO, heartbeat, NMT and TPDO are the library's; only the valve controller is ours."""
+    with canopen_encoders("peers") as nodes, open_bus("virtual", "peers") as bus:
+        hand = Hand()
+        drive = hw.Drive(BROKK_170, Push(0, 0, 0, 0, 0), bus, hand)
+        drive.begin()
+        assert [node.get_data(0x1017, 0) for node in nodes] == [b"\x32\x00"] * 5
+        assert [node.get_data(0x1800, 2) for node in nodes] == [b"\x01"] * 5
+        end = time.monotonic() + 20
+        while not drive.gate.driving and time.monotonic() < end:  # a late answer: another edge
+            hand.enable = False if hand.enable is None and hand.pressed else None
+            drive.tick()
+            drive.tick()
+        assert drive.gate.driving, drive.reason
+        assert {node.nmt.state for node in nodes} == {"OPERATIONAL"}
+        np.testing.assert_allclose(drive.measured[0], START, atol=STEP / 1.9)
+        nodes[2].nmt.stop_heartbeat()
+        hand.enable = False  # so that the present fault is shown, not a late tick
+        end = time.monotonic() + 20
+        while "q3: heartbeat lost" not in drive.reason and time.monotonic() < end:
+            drive.tick()
+        assert drive.reason.endswith("q3: heartbeat lost")
+        assert not drive.gate.driving

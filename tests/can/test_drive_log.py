@@ -1,0 +1,174 @@
+"""Logs of drives: run again to the same bytes, read as recordings, and read as telemetry."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+from helpers_bus import BASELINE, Hand, Push, World, once, only
+
+from brokk_min.can.canopen import (
+    OPERATOR_CHANNEL,
+    OPERATOR_INPUT,
+    Frame,
+    OperatorInput,
+    encoder_raw,
+    read_frames,
+    valve_frame,
+)
+from brokk_min.can.drive_log import ReplayedBus, TelemetryReader, compare, log_for_fit, replay
+from brokk_min.identification.logs import read_log, write_log
+from brokk_min.machine import BROKK_170, estimate_velocity
+
+STEP = BROKK_170.encoder_step
+
+
+def drive_logged(path: Path, seconds: float = 4.0) -> World:
+    """A drive with a fault in its midst, logged."""
+    hand = Hand()
+    world = World(BASELINE, hand, log=can.CanutilsLogWriter(path, channel="can0"))
+    world.drive.begin()
+    world.run(seconds / 2)
+    world.upward = only(0x185, once(lambda data: []))
+    world.run(0.3)
+    hand.enable = False
+    world.run(0.1)
+    hand.enable = True
+    hand.v = (0.0, 0.1, 0.05)
+    world.run(seconds / 2)
+    world.drive.signals.append(2)
+    world.run(1.0)
+    world.bus.close()
+    world.far.shutdown()
+    return world
+
+
+def sent(frames: list[Frame]) -> list[tuple[int, bytes]]:
+    return [(f.id, f.data) for f in frames if f.sent and f.channel != OPERATOR_CHANNEL]
+
+
+def test_replay__of_a_recorded_log_sends_the_same_bytes(tmp_path: Path) -> None:
+    drive_logged(tmp_path / "run.log")
+    frames = list(read_frames(tmp_path / "run.log"))
+    again = replay(BROKK_170, BASELINE, frames)
+    assert [(frame.id, frame.data) for frame in again] == sent(frames)
+    valves = [data for can_id, data in sent(frames) if can_id == 0x210]
+    assert len(valves) > 60
+    assert len({data[:5] for data in valves}) > 30
+    assert compare(BROKK_170, frames, again) == (len(valves), len(valves))
+    same, total = compare(BROKK_170, frames, replay(BROKK_170, Push(0, 0, 0, 0, 0), frames))
+    assert same < 0.5 * total
+    cut = frames[: len(frames) * 2 // 3]  # as after a SIGKILL
+    assert [(frame.id, frame.data) for frame in replay(BROKK_170, BASELINE, cut)] == sent(cut)
+    with pytest.raises(ValueError, match=r"log: expected \w+ sent at .*, got"):
+        replay(BROKK_170, BASELINE, [frame for frame in frames if frame.id != 0x210])
+
+
+def test_replayed_bus__by_hand() -> None:
+    operator_input = OperatorInput((0.1, 0.0, 0.0), enable=True)
+    sync = Frame(1.0, 0x080, b"", True)
+    read = Frame(1.1, 0x181, b"\x07")
+    logged = Frame(1.2, OPERATOR_INPUT, operator_input.pack(), True, OPERATOR_CHANNEL)
+    last = Frame(1.3, 0x182, b"\x08")
+    bus = ReplayedBus([sync, read, logged, last])
+    assert bus.recv(0.1) is None  # SYNC is to be sent first
+    assert bus.operator(True, True) == operator_input
+    bus.send(0x080, b"")
+    assert bus.sent == [sync]
+    assert [bus.recv(0.1), bus.recv(0.1)] == [read, None]
+    assert bus.log_input(b"") == 1.2
+    assert bus.now() == 1.3
+    assert [bus.recv(0.1), bus.recv(0.1)] == [last, None]
+    assert not bus.more and not bus.mismatch and bus.now() == 1.3
+    assert bus.operator(True, True) == OperatorInput(stop=True)
+
+
+@pytest.mark.parametrize("changed", [{"id": 0x210}, {"sent": False}])
+def test_replayed_bus__ends_where_another_frame_or_none_was_sent(changed: dict[str, int]) -> None:
+    found = Frame(1.0, 0x080, b"", True)._replace(**changed)  # type: ignore[arg-type]
+    bus = ReplayedBus([found, Frame(1.1, 0x181, b"\x07")])
+    bus.send(0x080, b"")
+    assert bus.mismatch == f"080 sent at 1.000000, got {found.id:03X}"
+    assert not bus.more
+
+
+def test_log_for_fit__holds_what_the_machine_did(tmp_path: Path) -> None:
+    world = drive_logged(tmp_path / "run.log")
+    log = log_for_fit(BROKK_170, read_frames(tmp_path / "run.log"))
+    assert log.joints == BROKK_170.names
+    assert [recording.name for recording in log.recordings] == ["drive_000", "drive_001"]
+    write_log(tmp_path / "log.csv", log)
+    copies = read_log([tmp_path / "log.csv"], BROKK_170.velocity_samples).recordings
+    times, m = world.commands
+    q = np.array([row[2] for row in world.record])
+    begins = np.array(world.syncs)
+    for recording, copy in zip(log.recordings, copies, strict=True):
+        np.testing.assert_allclose(copy.q, recording.q, atol=1e-6)
+        np.testing.assert_allclose(copy.u, recording.u, atol=1e-6)
+        # it begins at some SYNC, which may fall on the border of two of the plant's steps
+        length = len(recording.q)
+        steps = [
+            np.searchsorted(times, begins[k : k + length]) for k in range(len(begins) - length)
+        ]
+        errors = [min(np.abs(q[step - k] - recording.q).max() for k in (1, 2)) for step in steps]
+        assert min(errors) < 0.51 * STEP
+        inside = np.searchsorted(times, begins[np.argmin(errors) :][:length] + 0.03)
+        np.testing.assert_allclose(m[inside], recording.u * 127, atol=1e-6)  # the next command
+
+
+def test_log_for_fit__by_hand() -> None:
+    """Ticks are missing; a foreign frame and a cut one change nothing; 14 ticks are too few."""
+    machine = replace(BROKK_170, rate=10.0)
+    frames: list[Frame] = []
+    parts = [range(15), range(16, 36), range(37, 51)]
+    for k in (k for part in parts for k in part):
+        t = 100 + k / 10
+        frames.append(Frame(t, 0x080, b"", True))
+        for node in range(1, 6):
+            frames.append(Frame(t, 0x180 + node, struct.pack("<I", 100 * node + k)))
+        frames.append(Frame(t, 0x555, b"\x01" * 8))
+        frames.append(Frame(t, 0x210, valve_frame([80, 0, -80, 1, 0], k, 1).tobytes(), True))
+        frames.append(Frame(t, 0x210, b"\x01" * 7, True))
+    log = log_for_fit(machine, frames)
+    assert log.rate == 10
+    assert [len(recording.q) for recording in log.recordings] == [15, 20]
+    for recording, ticks in zip(log.recordings, parts, strict=False):
+        counts = 100 * np.arange(1, 6) + np.array(ticks)[:, None]
+        np.testing.assert_allclose(recording.q, counts * STEP, atol=1e-12)
+        np.testing.assert_allclose(recording.q_dot[4:], 10 * STEP, atol=1e-12)
+        np.testing.assert_allclose(recording.u * 127, len(ticks) * [[80, 0, -80, 1, 0]], atol=1e-9)
+    with pytest.raises(ValueError, match="expected more than 14 ticks of driving in a row"):
+        log_for_fit(machine, frames[:100])
+
+
+def test_telemetry_reader__gives_at_each_sync_the_tick_before() -> None:
+    reader = TelemetryReader(BROKK_170)
+    goal = OperatorInput((0.1, 0.0, -0.2), enable=True).pack()
+    q = np.array([0.0, 0.5, 0.6, 1.7, 1.2])
+    measured = []
+    for k in range(6):
+        counts = np.rint((q + 0.01 * k) / STEP).astype(int)
+        measured.append(counts * STEP)
+        telemetry = reader.update(Frame(0.0, 0x080, b""))
+        for node, raw in enumerate(encoder_raw(BROKK_170, counts).tolist(), 1):
+            assert reader.update(Frame(0.0, 0x180 + node, struct.pack("<I", raw))) is None
+        reader.update(Frame(0.0, OPERATOR_INPUT, goal, channel=OPERATOR_CHANNEL))
+        reader.update(Frame(0.0, OPERATOR_INPUT, bytes(7), channel="can0"))  # somebody else's
+        reader.update(Frame(0.0, 0x210, valve_frame([50, 0, -80, 0, 0], k, k > 0).tobytes()))
+    assert telemetry is not None and (telemetry.tick, telemetry.driving) == (5, True)
+    np.testing.assert_array_equal(telemetry.q, measured[4])
+    newest = np.stack(measured[1:5], axis=-1)
+    np.testing.assert_allclose(telemetry.q_dot, estimate_velocity(newest, 4, 0.05))
+    np.testing.assert_allclose(telemetry.u * 127, [50, 0, -80, 0, 0])
+    np.testing.assert_allclose(telemetry.v_goal, [0.1, 0.0, -0.2])
+    reader.update(Frame(0.0, 0x210, valve_frame([0, 0, 0, 0, 0], 7, 0).tobytes()))
+    reader.update(Frame(0.0, 0x080, b""))
+    reader.update(Frame(0.0, 0x181, struct.pack("<I", 3)))  # the others are missing
+    gap = reader.update(Frame(0.0, 0x080, b""))
+    assert gap is not None and gap.tick == 7 and not gap.driving
+    assert np.isnan(gap.q).all() and np.isnan(gap.q_dot).all()
+    assert not gap.v_goal.any()

@@ -1,0 +1,140 @@
+"""Script, joystick and joint jog; the joystick is SDL's virtual one."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+import numpy as np
+import pytest
+from helpers_bus import START, Hand, Virtual, World
+
+from brokk_min.can.canopen import OperatorInput
+from brokk_min.can.operator_input import JointJog, Joystick, Script, shape_axis
+from brokk_min.machine import BROKK_170
+
+TWO_GOALS = np.array([[0.1, 0, 0], [0, 0.2, 0]])
+
+
+def test_script__waits_presses_plays_and_ends() -> None:
+    script = Script(BROKK_170, TWO_GOALS)
+    assert script(False, False) == OperatorInput()
+    assert script(False, True) == OperatorInput(enable=True)
+    assert script(False, True) == OperatorInput()  # it did not arm: let go, and press again
+    assert script(False, True) == OperatorInput(enable=True)
+    assert script(True, True) == OperatorInput((0.1, 0.0, 0.0), enable=True)
+    assert not script.done
+    assert script(True, True) == OperatorInput((0.0, 0.2, 0.0), enable=True)
+    assert script.done
+    assert script(True, True).stop
+
+
+def test_script__stops_after_a_fault() -> None:
+    script = Script(BROKK_170, TWO_GOALS)
+    assert script(False, True).enable and script(True, True).enable
+    assert script(False, True) == OperatorInput(stop=True)
+    assert not script.done
+
+
+def test_script__stops_if_the_machine_never_gets_ready() -> None:
+    script = Script(BROKK_170, np.zeros((1, 3)), patience_s=0.2)
+    assert [script(False, False).stop for _ in range(5)] == [False] * 4 + [True]
+
+
+@pytest.mark.parametrize("goal", [(0.3, 0.4, 0.0), (np.nan, 0.0, 0.0)])
+def test_script__refuses_goals_that_are_too_fast(goal: tuple[float, ...]) -> None:
+    Script(BROKK_170, np.array([[0.0, 0.0, 0.3]]))
+    with pytest.raises(ValueError, match=r"command: expected at most 0.3 m/s, got (0.5|nan) m/s"):
+        Script(BROKK_170, np.array([goal]))
+
+
+def test_joystick__gives_switch_and_velocity_of_a_virtual_device() -> None:
+    device = Virtual()
+    stick = Joystick(BROKK_170)
+    assert stick(False, False) == OperatorInput()
+    device.button(5, True)
+    device.axis(1, -1.0)
+    device.axis(0, 0.1)  # within the dead zone
+    found = stick(True, True)
+    assert found.enable
+    assert found.v_goal == pytest.approx((0.3, 0.0, 0.0), abs=1e-4)
+    device.axis(1, -0.56)
+    assert stick(True, True).v_goal == pytest.approx((0.275 * 0.3, 0.0, 0.0), abs=1e-4)
+    device.axis(1, -1.0)
+    device.axis(0, 1.0)
+    device.axis(4, -0.56)
+    x, y, z = stick(True, True).v_goal
+    assert np.linalg.norm((x, y, z)) == pytest.approx(0.3)  # no faster in a corner
+    assert x == pytest.approx(-y, rel=1e-3)
+    assert z / x == pytest.approx(0.275, abs=1e-3)
+    device.button(5, False)
+    assert not stick(True, True).enable
+    device.unplug()
+
+
+def test_joystick__notices_that_its_device_goes_and_another_comes() -> None:
+    device = Virtual()
+    stick = Joystick(BROKK_170)
+    device.button(5, True)
+    device.unplug()
+    assert stick(True, True) == OperatorInput(alive=False)
+    assert stick(True, True) == OperatorInput(alive=False)
+    again = Virtual()
+    again.button(5, True)
+    assert stick(False, True) == OperatorInput(enable=True)
+    other = Virtual()
+    again.axis(1, -1.0)
+    assert stick(True, True).v_goal[0] > 0.299  # one more device changes nothing
+    other.unplug()
+    assert stick(True, True).alive
+    again.unplug()
+    assert stick(True, True) == OperatorInput(alive=False)
+
+
+def test_joystick__refuses_a_device_without_its_axes_or_button() -> None:
+    with pytest.raises(ValueError, match="joystick: expected one, got none"):
+        Joystick(BROKK_170)
+    device = Virtual()
+    refusal = r"joystick: expected axes \[1, 0, 6\] and button 5, got 6 and 8"
+    with pytest.raises(ValueError, match=refusal):
+        Joystick(BROKK_170, axes=(1, 0, 6))
+    with pytest.raises(ValueError, match="button 8"):
+        Joystick(BROKK_170, button=8)
+    device.unplug()
+
+
+def test_joystick__needs_pygame_but_no_window(monkeypatch: pytest.MonkeyPatch) -> None:
+    names = ("SDL_VIDEODRIVER", "SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS")
+    for name in names:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("pygame.joystick.get_count", lambda: 0)
+    with pytest.raises(ValueError, match=r"^joystick: expected one, got none$"):
+        Joystick(BROKK_170)
+    assert [os.environ[name] for name in names] == ["dummy", "1"]
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    with pytest.raises(ValueError, match=r"pygame: expected the extra brokk_min\[play\], got"):
+        Joystick(BROKK_170)
+
+
+def test_joint_jog__moves_one_joint_with_the_sign_of_x() -> None:
+    hand = Hand()
+    world = World(JointJog(BROKK_170, "q4", 14), hand)
+    world.drive.begin()
+    world.run(1.5)
+    assert world.commands[1][-1].tolist() == [0, 0, 0, 14, 0]
+    assert world.simulated.plant.q[3] > START[3] + 0.003
+    for v, command in (((-0.2, 0.1, 0.1), -14), ((0.02, 0.2, -0.2), 0)):
+        hand.v = v
+        world.run(0.2)
+        assert world.commands[1][-1].tolist() == [0, 0, 0, command, 0]
+    world.close()
+
+
+def test_shape_axis__is_odd_rising_and_flat_near_the_middle() -> None:
+    axis = np.linspace(-1, 1, 201)
+    shaped = shape_axis(axis)
+    np.testing.assert_allclose(shaped, -shaped[::-1], atol=1e-12)
+    assert (np.diff(shaped) >= 0).all()
+    assert not shaped[np.abs(axis) < 0.12].any()
+    assert shaped.max() == 1.0
+    assert shaped[150] < 0.5 * axis[150]

@@ -1,0 +1,410 @@
+"""The gate against a plain rewriting of its promises, and its promises over sequences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from brokk_min.can.canopen import checksum
+from brokk_min.can.safety_gate import Fault, GateInputs, GateState, fault_name, gate, gate_start
+from brokk_min.machine import BROKK_170, Machine, decode_pwm
+
+STEP = BROKK_170.encoder_step
+DT = 0.05
+DRIVEN = np.array([joint.driven for joint in BROKK_170.joints])
+
+
+def test_fault_name__gives_node_and_text() -> None:
+    names = [fault_name(BROKK_170, code) for code in range(len(Fault) * 6 + 1)]
+    assert names[0] == ""
+    assert names[1] == "error"
+    assert names[1 + 2 * 6] == "operator's device lost"
+    assert names[1 + 3 * 6] == "q1: never seen"
+    assert names[1 + 3 * 6 + 5] == "valve controller: never seen"
+    assert names[1 + 10 * 6 + 2] == "q3: frozen, or the joint does not move"
+    assert names[1 + 11 * 6 + 4] == "q5: no valid command"
+    assert names[1 + 12 * 6] == "stop asked for"
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (2, 2)])
+def test_gate_start__is_silent_and_holds_the_switch_for_pressed(shape: tuple[int, ...]) -> None:
+    state = gate_start(BROKK_170, shape)
+    assert state.counts.shape == (*shape, 5, 2)
+    assert state.sent.shape == (*shape, 5, 8)
+    assert state.measured_motion.shape == state.expected_motion.shape == (*shape, 5)
+    assert np.all(state.enable) and np.all(state.active_fault == 1)
+    assert np.all(state.time == -np.inf)
+    rest = state._replace(enable=0, active_fault=0, time=0)
+    assert not any(np.any(field) for field in rest)
+    assert all(np.shape(field)[: len(shape)] == shape for field in state)
+
+
+# --- a plain rewriting ---------------------------------------------------------------------------
+
+
+def tight_machine() -> Machine:
+    """The Brokk with ranges and speeds such that whole counts hit the gate's borders exactly."""
+
+    def edge(near: float, margin: float) -> float:
+        """A limit near `near` to which adding `margin` gives a whole number of counts."""
+        whole = (np.arange(3000) - 1500) * STEP
+        limits = whole - margin
+        hits = limits[limits + margin == whole]
+        return float(hits[np.argmin(np.abs(hits - near))])
+
+    speeds = np.arange(4, 30) * STEP / (2 * DT)
+    speed = float(speeds[(2.0 * speeds * DT / STEP + 4) % 1 == 0][0])
+    margins = [(-0.05, 0.05), (-0.05, 0.05), (0.02, -0.02), (-0.05, -0.02), (0.02, 0.05)]
+    joints = tuple(
+        replace(
+            joint,
+            q_min=edge(joint.q_min, low),
+            q_max=edge(joint.q_max, high),
+            cylinder_base=0.0,
+            q_dot_up=speed,
+            q_dot_down=speed * (0.8 if joint.a < 1.2 else 1.0),
+        )
+        for joint, (low, high) in zip(BROKK_170.joints, margins, strict=True)
+    )
+    zones = 12 / (1.5 * 127) * (1 + np.finfo(float).eps * np.arange(-8, 8))
+    whole = next(float(zone) for zone in zones if 1.5 * zone * 127 == 12.0)
+    return replace(BROKK_170, joints=joints, dead_zone=whole)
+
+
+def plain_motion(machine: Machine, s: GateState, count: int, j: int) -> tuple[float, float]:
+    """Measured and expected motion of joint `j`."""
+    joint = machine.joints[j]
+    sent = s.sent[j].tolist()
+    before, last = s.counts[j].tolist()
+    sign = 1 if sent[7] > 0 else -1
+    push = [sign * m - 1.5 * machine.dead_zone * 127 for m in sent]
+    weakest = min(push)
+    if sent[7] == 0 or weakest <= 0:  # some command of the last 0.4 s may have done nothing
+        return 0.0, 0.0
+    if count != last:
+        return max(sign * (count - before) - 1, 0) / 2, 0.0
+    measured = float(s.measured_motion[j])
+    slower = min(joint.q_dot_up, joint.q_dot_down)
+    at_least = 0.3 * slower * DT / STEP / (80 - 1.5 * machine.dead_zone * 127) * weakest
+    continued = 0.5 * measured * weakest / max(push)
+    return measured, float(s.expected_motion[j]) + max(at_least, continued)
+
+
+def plain_fault(machine: Machine, s: GateState, i: GateInputs, now: float) -> int:
+    """The first fault of one gate, with the promised numbers written out."""
+    faults = {
+        (0, 0): i.error,
+        (1, 0): not 0.5 * DT <= now - s.time <= 1.5 * DT,
+        (2, 0): not i.alive,
+        (12, 0): i.stop,
+    }
+    for node in range(6):
+        faults[3, node] = i.heartbeat[node] == -np.inf
+        faults[4, node] = now - i.heartbeat[node] > 0.110
+        faults[5, node] = i.nmt[node] != 5
+    for j, joint in enumerate(machine.joints):
+        c, old = int(i.counts[j]), int(s.counts[j][1])
+        fastest = 2 * max(joint.q_dot_up, joint.q_dot_down) * DT / STEP + 4
+        limit = 80 if joint.driven else 0
+        faults[6, j] = i.frames[j] == 0
+        faults[7, j] = i.frames[j] >= 2
+        faults[8, j] = not joint.q_min - 0.05 <= c * STEP <= joint.q_max + 0.05
+        faults[9, j] = abs(c - old) > fastest
+        faults[10, j] = plain_motion(machine, s, c, j)[1] > 1.0
+        faults[11, j] = not -limit <= i.command[j] <= limit
+    return min((1 + kind * 6 + node for (kind, node), found in faults.items() if found), default=0)
+
+
+def plain_gate(
+    machine: Machine, s: GateState, i: GateInputs, now: float
+) -> tuple[GateState, list[int]]:
+    """One gate, written as its promises read; the frame without its checksum."""
+    fault = plain_fault(machine, s, i, now)
+    fresh_edge = bool(i.enable and not s.enable and i.centred)
+    driving = not fault and bool(i.enable) and (bool(s.driving) or fresh_edge)
+    m = [0] * 5
+    for j, joint in enumerate(machine.joints):
+        if driving and s.driving:
+            last, q = int(s.sent[j][7]), i.counts[j] * STEP
+            m[j] = min(max(int(i.command[j]), min(last, 0) - 40), max(last, 0) + 40)
+            if (m[j] > 0 and q >= joint.q_max - 0.02) or (m[j] < 0 and q <= joint.q_min + 0.02):
+                m[j] = 0
+    trusted = i.alive and not i.error
+    counter = 0 if s.counter == 255 else int(s.counter) + 1
+    motion = [plain_motion(machine, s, int(c), j) for j, c in enumerate(i.counts)]
+    state = GateState(
+        driving=driving,
+        armed_once=bool(s.armed_once) or driving,
+        active_fault=fault,
+        latched_fault=0 if driving else fault if s.driving else int(s.latched_fault),
+        enable=bool(i.enable) if trusted else bool(i.enable or s.enable),
+        time=now,
+        counter=counter,
+        counts=[[old[1], new] for old, new in zip(s.counts, i.counts, strict=True)],
+        sent=[[*old[1:], new] for old, new in zip(s.sent, m, strict=True)],
+        measured_motion=[measured for measured, _ in motion],
+        expected_motion=[expected for _, expected in motion],
+    )
+    return state, [*(x if x >= 0 else 255 + x for x in m), counter, int(driving)]
+
+
+def row(value: tuple[np.ndarray, ...], k: int) -> list[np.ndarray]:
+    return [np.asarray(field)[k] for field in value]
+
+
+# --- cases that lie on the borders ---------------------------------------------------------------
+
+
+class Cases:
+    """Random states and inputs, mostly sound, each with about one value on or next to a border."""
+
+    def __init__(self, machine: Machine, num: int, seed: int) -> None:
+        self.machine, self.num, self.rng = machine, num, np.random.default_rng(seed)
+        self.inputs = self.draw_inputs()
+        self.now = np.zeros(num)
+        self.state = self.draw_state()
+        self.expected = [
+            plain_gate(machine, GateState(*row(self.state, k)), GateInputs(*row(self.inputs, k)), 0)
+            for k in range(num)
+        ]
+
+    def some(self, p: float, *shape: int) -> np.ndarray:
+        return self.rng.random((self.num, *shape)) < p
+
+    def put(self, array: np.ndarray, p: float, *values: float) -> np.ndarray:
+        chosen = self.rng.choice(values, array.shape)
+        return np.where(self.some(p, *array.shape[1:]), chosen, array)
+
+    def draw_inputs(self) -> GateInputs:
+        rng, num, n = self.rng, self.num, self.machine.n
+        low, high = self.machine.column("q_min"), self.machine.column("q_max")
+        borders = [np.rint(x / STEP) for x in (low - 0.05, low + 0.02, high - 0.02, high + 0.05)]
+        near = np.stack(borders, -1)[np.arange(n), rng.integers(0, 4, (num, n))]
+        near = near + rng.integers(-2, 3, (num, n))
+        middle = np.rint((low + high) / 2 / STEP) + rng.integers(-9, 10, (num, n))
+        m = np.where(self.some(0.5, n), rng.integers(-80, 81, (num, n)), 0).astype(float)
+        m = self.put(m, 0.3, -80, 80)
+        m[:, self.machine.locked] = 0
+        heartbeat = -rng.uniform(0, 0.1, (num, n + 1))
+        return GateInputs(
+            command=self.put(m, 0.01, np.nan, np.inf, -np.inf, 81, -81, 80.5, 1, -1),
+            counts=np.where(self.some(0.3, n), near, middle).astype(int),
+            frames=self.put(np.ones((num, n), int), 0.01, 0, 2, 3),
+            heartbeat=self.put(heartbeat, 0.01, -0.110, -0.110 - 1e-9, -0.2, -np.inf, 1.0),
+            nmt=self.put(np.full((num, n + 1), 5), 0.01, 0, 4, 6, 127),
+            enable=self.some(0.8),
+            centred=self.some(0.7),
+            alive=~self.some(0.03),
+            stop=self.some(0.03),
+            error=self.some(0.03),
+        )
+
+    def draw_state(self) -> GateState:
+        rng, num, n = self.rng, self.num, self.machine.n
+        # two angles: running, standing, or before a jump
+        fastest = np.floor(2 * self.machine.q_dot_max * DT / STEP + 4).astype(int)
+        jump = rng.choice([-1, 1], (num, n)) * (fastest + rng.integers(-1, 2, (num, n)))
+        speed = np.where(self.some(0.5, n), 0, rng.integers(-3, 4, (num, n)))
+        last = self.inputs.counts - np.where(self.some(0.03, n), jump, speed)
+        first = last - np.where(self.some(0.3, n), 0, rng.integers(-7, 8, (num, n)))
+        # commands: to one side for some ticks, or not; now and then one to the other side
+        odds = [0.01, 0.3, 0.19, 0.3, 0.2]
+        push = rng.choice([-1, 1], (num, n, 1)) * rng.choice(
+            [12, 13, 14, 40, 80], (num, n, 8), p=odds
+        )
+        pushed = np.arange(8, 0, -1) <= rng.choice([0, 6, 7, 8], (num, n, 1))
+        sent = np.where(pushed, push, rng.integers(-80, 81, (num, n, 8)))
+        late = (0.5 * DT, 0.5 * DT - 1e-9, 1.5 * DT + 1e-9, 0.074, 0.026, np.inf, -1.0)
+        state = GateState(
+            driving=self.some(0.6),
+            armed_once=self.some(0.5),
+            active_fault=rng.integers(0, 79, num),
+            latched_fault=rng.integers(0, 79, num),
+            enable=self.some(0.5),
+            time=-self.put(np.full(num, DT), 0.1, *late),
+            counter=rng.choice([0, 1, 127, 254, 255], num),
+            counts=np.stack([first, last], axis=-1),
+            sent=np.where(self.some(0.02, n, 8), -sent, sent),
+            measured_motion=np.where(self.some(0.4, n), 0.0, rng.uniform(0, 3, (num, n))),
+            expected_motion=rng.choice([0.0, 0.5, 0.9], (num, n), p=[0.7, 0.2, 0.1]),
+        )
+        # now and then as much motion as may be expected, to the bit, or a bit more
+        due = np.zeros((num, n))
+        for k, j in np.ndindex(num, n):
+            s = GateState(*row(state, k))
+            due[k, j] = plain_motion(self.machine, s, self.inputs.counts[k, j], j)[1]
+        rest = 1.0 - (due - state.expected_motion)
+        bit = np.nextafter(rest, rng.choice([-9.0, 9.0], (num, n)))
+        border = np.where(self.some(0.5, n), rest, bit)
+        motion = np.where(self.some(0.8, n), state.expected_motion, border)
+        return state._replace(expected_motion=motion)
+
+
+@cache
+def cases_of(machine: Machine, seed: int) -> Cases:
+    return Cases(machine, 3000, seed)
+
+
+@pytest.mark.parametrize(
+    ("machine", "seed"), [(BROKK_170, 0), (tight_machine(), 1), (tight_machine(), 2)]
+)
+def test_gate__is_what_its_promises_say_in_any_leading_shape(machine: Machine, seed: int) -> None:
+    cases = cases_of(machine, seed)
+    for shape in ((3000,), (4, 750), (3, 10, 100)):
+        given = [
+            type(part)(*(np.reshape(field, (*shape, *np.shape(field)[1:])) for field in part))
+            for part in (cases.state, cases.inputs)
+        ]
+        state, frame = gate(machine, *given, cases.now.reshape(shape))  # type: ignore[arg-type]
+        assert frame.dtype == np.uint8 and frame.shape == (*shape, 8)
+        frame = frame.reshape(3000, 8)
+        np.testing.assert_array_equal(np.delete(frame, 6, axis=1), [f for _, f in cases.expected])
+        np.testing.assert_array_equal(frame[:, 6], checksum(np.delete(frame, 6, axis=1)))
+        for name, found in zip(GateState._fields, state, strict=True):
+            expected = np.array([getattr(s, name) for s, _ in cases.expected])
+            assert np.shape(found) == (*shape, *expected.shape[1:]), name
+            np.testing.assert_array_equal(np.reshape(found, expected.shape), expected, name)
+    faults = {(s.active_fault - 1) // 6 for s, _ in cases.expected if s.active_fault}
+    assert faults == set(range(13)), "each fault comes up"
+    assert sum(bool(s.driving and any(f[:5])) for s, f in cases.expected) > 300
+
+
+def test_gate__of_one_machine_alone_is_the_same() -> None:
+    cases = Cases(BROKK_170, 50, 5)
+    for k, (expected, frame) in enumerate(cases.expected):
+        state = GateState(*row(cases.state, k))
+        found, data = gate(BROKK_170, state, GateInputs(*row(cases.inputs, k)), 0.0)
+        assert np.delete(data, 6).tolist() == frame
+        assert found.driving == expected.driving
+        assert found.active_fault == expected.active_fault
+        assert found.sent.dtype == found.counts.dtype == int
+
+
+def test_gate__never_raises_and_closes_the_valves_on_nonsense() -> None:
+    rng = np.random.default_rng(4)
+    values: dict[type, list[Any]] = {
+        float: [np.nan, np.inf, -np.inf, 1e300, -1e300, 0.0, -1.0, 5e-324],
+        int: [0, -1, 2**62, -(2**62), 2**31, 255, 128],
+        bool: [True, False],
+    }
+    cases = Cases(BROKK_170, 2000, 6)
+    inputs = cases.inputs
+
+    def spoil(field: np.ndarray) -> np.ndarray:
+        chosen = rng.choice(np.array(values[field.dtype.type(0).item().__class__]), field.shape)
+        return np.where(rng.random(field.shape) < 0.05, chosen.astype(field.dtype), field)
+
+    for _ in range(20):
+        inputs = GateInputs(*map(spoil, inputs))
+        state = GateState(*map(spoil, cases.state))
+        state = state._replace(counter=rng.integers(0, 256, 2000), sent=cases.state.sent)
+        with np.errstate(all="ignore"):
+            _, frame = gate(BROKK_170, state, inputs, spoil(cases.now))
+        assert frame.dtype == np.uint8 and frame.shape == (2000, 8)
+        m = np.rint(decode_pwm(frame[:, :5]) * 127)
+        assert (np.abs(m) <= 80 * DRIVEN).all()
+        assert not m[frame[:, 7] == 0].any()
+        assert set(np.unique(frame[:, 7])) <= {0, 1}
+        sound = np.isfinite(inputs.command).all(1) & (inputs.frames == 1).all(1)
+        assert not (frame[:, 7] == 1)[~(sound & (inputs.nmt == 5).all(1))].any()
+
+
+# --- promises over sequences ---------------------------------------------------------------------
+
+
+def draw_tick(rng: np.random.Generator, now: np.ndarray, counts: np.ndarray) -> GateInputs:
+    """Inputs of many gates, each of them sound most of the time."""
+    num, n = counts.shape
+
+    def rare(p: float, *shape: int) -> np.ndarray:
+        return rng.random((num, *shape)) < p
+
+    m = np.where(DRIVEN, rng.integers(-80, 81, (num, n)), 0).astype(float)
+    old = rng.choice([-np.inf, -9.0], (num, n + 1))
+    return GateInputs(
+        command=np.where(rare(0.01, n), rng.choice([np.nan, 81.0, -1e9, np.inf], (num, n)), m),
+        counts=counts,
+        frames=np.where(rare(0.01, n), rng.integers(0, 4, (num, n)), 1),
+        heartbeat=np.where(rare(0.01, n + 1), old, now[:, None] - 0.02),
+        nmt=np.where(rare(0.01, n + 1), rng.integers(0, 128, (num, n + 1)), 5),
+        enable=rare(0.5),
+        centred=rare(0.6),
+        alive=~rare(0.01),
+        stop=rare(0.01),
+        error=rare(0.01),
+    )
+
+
+def is_sound(i: GateInputs, q: np.ndarray, now: np.ndarray, last: np.ndarray) -> np.ndarray:
+    low, high = BROKK_170.column("q_min"), BROKK_170.column("q_max")
+    sound = i.alive & ~i.stop & ~i.error & (np.abs(now - last - DT) < 0.0251)
+    sound &= (i.frames == 1).all(1) & (i.nmt == 5).all(1)
+    sound &= (now[:, None] - i.heartbeat <= 0.11).all(1)
+    sound &= np.isfinite(i.command).all(1) & (np.abs(i.command) <= 80 * DRIVEN).all(1)
+    return np.asarray(sound & (q > low - 0.051).all(1) & (q < high + 0.051).all(1))
+
+
+def check_sequences(num: int, ticks: int, seed: int) -> dict[str, int]:
+    """Run gates on random inputs and check every promise at every tick; how often what came up."""
+    rng, n = np.random.default_rng(seed), BROKK_170.n
+    low, high = BROKK_170.column("q_min"), BROKK_170.column("q_max")
+    state = gate_start(BROKK_170, (num,))
+    counts = np.rint(rng.uniform(low + 0.01, high - 0.01, (num, n)) / STEP).astype(int)
+    now, pressed, trusted = np.zeros(num), np.zeros(num, bool), np.ones(num, bool)
+    seen = dict.fromkeys(["drove", "armed", "faulted", "released", "moved", "at_limit"], 0)
+    for _ in range(ticks):
+        odd = rng.choice([0.0, -1.0, 0.02, 0.08, 3.0], num)
+        now = now + np.where(rng.random(num) < 0.02, odd, rng.uniform(0.03, 0.07, num))
+        pressed = np.where(rng.random(num) < 0.3, ~pressed, pressed)
+        far = rng.integers(-200, 200, (num, n))
+        near = rng.integers(-3, 4, (num, n))
+        counts = counts + np.where(rng.random((num, n)) < 0.01, far, near)
+        inputs = draw_tick(rng, now, counts)._replace(enable=pressed)
+        before, last, m = state, state.sent[..., -1], inputs.command
+        state, frame = gate(BROKK_170, state, inputs, now)
+        sent = np.rint(decode_pwm(frame[:, :5]) * 127).astype(int)
+        q = counts * STEP
+        sound = is_sound(inputs, q, now, before.time)
+        enabled = frame[:, 7] == 1
+        assert not (enabled & ~sound).any(), "any fault means neutral"
+        assert not sent[~enabled].any(), "not enabled means neutral"
+        assert (np.abs(sent) <= 80 * DRIVEN).all(), "limit, and locked joints stay"
+        base = np.where(np.sign(sent) == np.sign(last), np.abs(last), 0)
+        assert (np.abs(sent) <= base + 40).all(), "slew"
+        outward = ((sent > 0) & (q >= high - 0.02)) | ((sent < 0) & (q <= low + 0.02))
+        assert not outward.any(), "end stops"
+        most = np.maximum(np.abs(last), np.nan_to_num(np.abs(m), posinf=1e9))
+        assert (np.abs(sent) <= most).all(), "no more than commanded"
+        assert not sent[(m == 0) & enabled[:, None]].any(), "zero at once"
+        edge = pressed & ~trusted & inputs.centred
+        armed = enabled & ~before.driving
+        assert not (armed & ~edge).any(), "latched until a fresh edge with centred stick"
+        assert not sent[armed].any(), "the tick that arms is neutral"
+        assert not (enabled & ~pressed).any(), "dead-man switch"
+        assert (frame[:, 5] == (before.counter + 1) % 256).all(), "counter"
+        assert not (state.armed_once & ~before.armed_once & ~armed).any(), "silent until armed"
+        faulted = before.driving & ~enabled & ~sound
+        assert (state.latched_fault[faulted] > 0).all()
+        assert (state.latched_fault[enabled] == 0).all()
+        trusted = np.where(inputs.alive & ~inputs.error, pressed, pressed | trusted)
+        released = before.driving & ~pressed & sound
+        at_limit = (q >= high - 0.02).any(1) & enabled
+        found = (enabled, armed, faulted, released, sent.any(1), at_limit)
+        for name, flags in zip(seen, found, strict=True):
+            seen[name] += int(flags.sum())
+    return seen
+
+
+def test_gate__keeps_every_promise_in_twenty_thousand_sequences() -> None:
+    seen = check_sequences(20_000, 25, 0)
+    assert min(seen.values()) > 500, seen  # the promises were put to the test
+
+
+@pytest.mark.slow
+def test_gate__keeps_every_promise_in_a_million_sequences() -> None:
+    for seed in range(1, 51):
+        check_sequences(20_000, 25, seed)

@@ -1,0 +1,271 @@
+"""The simulated machine frame by frame on a clock of its own, and before a master of canopen."""
+
+from __future__ import annotations
+
+import os
+import signal
+import struct
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import canopen
+import numpy as np
+import pytest
+from helpers_bus import START, Out, dictionary, eventually, recorded_rows, served
+
+from brokk_min.actuator import plant_reset, plant_step
+from brokk_min.can.canopen import HEARTBEAT_PERIOD, Frame, encoder_raw, valve_frame
+from brokk_min.can.simulated_machine import WATCHDOG, SimulatedMachine, serve, simulate, start_pose
+from brokk_min.identification.logs import read_log
+from brokk_min.machine import BROKK_170
+
+NODES = [1, 2, 3, 4, 5, 16]
+CONTROLLER = 16
+RAW = encoder_raw(BROKK_170, np.rint(np.array(START) / BROKK_170.encoder_step).astype(int)).tolist()
+
+
+class Machine(SimulatedMachine):
+    """It begins at 100 s and keeps what it records."""
+
+    def __init__(self) -> None:
+        self.rows: list[tuple[Any, ...]] = []
+        super().__init__(BROKK_170, START, 100.0, lambda *row: self.rows.append(row))
+
+    def nmt_(self, command: int, node: int = 0) -> Out:
+        return self.receive(Frame(100.0, 0x000, bytes([command, node])))
+
+    def valves(self, counter: int, *counts: int, enable: int = 1, now: float = 100.0) -> list[int]:
+        """Send a valve frame; the commands in force [counts]."""
+        data = valve_frame([*counts, *[0] * (5 - len(counts))], counter, enable).tobytes()
+        assert self.receive(Frame(now, BROKK_170.valve_frame_id, data)) == []
+        return np.rint(127 * self.u).astype(int).tolist()
+
+
+def driving() -> Machine:
+    machine = Machine()
+    machine.nmt_(1)
+    machine.valves(7)
+    assert machine.valves(8, 80, 0, -40) == [80, 0, -40, 0, 0]
+    return machine
+
+
+def test_advance__moves_and_beats_by_its_own_clock() -> None:
+    machine = Machine()
+    assert machine.boot() == [(0x700 + node, b"\x00") for node in NODES]
+    waits = [machine.wait(100.0 + s) for s in (0.0, 0.004, 0.5)]
+    assert waits == pytest.approx([0.005, 0.001, 0.0])
+    assert machine.advance(100.0 + 0.9 * HEARTBEAT_PERIOD) == []
+    first = machine.advance(100.0 + HEARTBEAT_PERIOD + 1e-6)
+    assert first == [(0x700 + node, bytes([127])) for node in NODES]
+    machine.nmt_(1, NODES[1])
+    beats = machine.advance(100.0 + 3 * HEARTBEAT_PERIOD + 1e-6)
+    assert beats == 2 * [first[0], (0x702, bytes([5])), *first[2:]]
+    times, commands, angles, valid = zip(*machine.rows, strict=True)
+    np.testing.assert_allclose(times, 100.0 + 0.005 * np.arange(1, 31))
+    assert not np.any(commands) and set(valid) == {100.0} and np.allclose(angles, START)
+
+
+def test_receive__opens_valves_after_a_start_and_a_neutral_frame() -> None:
+    machine = Machine()
+    neutral = [0, 0, 0, 0, 0]
+    assert machine.valves(3) == machine.valves(4, 50) == neutral  # not started yet
+    machine.nmt_(1)
+    assert machine.valves(255, 50) == neutral and not machine.enabled  # no neutral frame came
+    assert machine.valves(0) == neutral and machine.enabled  # 255, then 0
+    assert machine.valves(1, 50, 0, 0, 0, -80) == [50, 0, 0, 0, -80]
+    assert machine.valves(2, 50, enable=0) == machine.valves(3, 50) == neutral  # neutral first
+    assert machine.valves(4) == neutral and any(machine.valves(5, 50))
+    machine.nmt_(1)  # to start what runs changes nothing
+    assert machine.u.any() and machine.valves(6, 30)[0] == 30
+
+
+def watchdog(machine: Machine) -> None:
+    machine.valves(9, 80, now=100.01)
+    machine.advance(100.01 + WATCHDOG - 0.001)
+    assert machine.u.any()
+    machine.advance(100.01 + WATCHDOG + 0.005)
+
+
+FRAME = valve_frame([80, 0, 0, 0, 0], 9, 1).tobytes()
+
+
+@pytest.mark.parametrize(
+    ("act", "state"),
+    [
+        (lambda machine: machine.valves(10, 80), 127),
+        (lambda machine: machine.receive(Frame(100.0, 0x210, FRAME[:6] + b"\x00\x01")), 127),
+        (lambda machine: machine.receive(Frame(100.0, 0x210, FRAME[:7])), 127),
+        (lambda machine: machine.nmt_(2, CONTROLLER), 4),
+        (watchdog, 127),
+    ],
+    ids=["counter", "checksum", "short", "stopped", "watchdog"],
+)
+def test_receive__closes_valves_until_a_start_and_a_neutral_frame(
+    act: Callable[[Machine], object], state: int
+) -> None:
+    machine = driving()
+    act(machine)
+    assert not machine.u.any() and not machine.enabled
+    assert machine.nmt[CONTROLLER] == state
+    assert not any(machine.valves(77)) and not any(machine.valves(78, 80))  # nobody started it
+    machine.nmt_(1, CONTROLLER)
+    assert not any(machine.valves(200, 80)) and not any(machine.valves(201))  # any counter begins
+    assert any(machine.valves(202, 80))
+
+
+@pytest.mark.parametrize(
+    ("command", "state", "boots"), [(2, 4, 0), (128, 127, 0), (129, 127, 1), (130, 127, 1)]
+)
+def test_receive__changes_states_of_nodes_alone_or_together(
+    command: int, state: int, boots: int
+) -> None:
+    machine = Machine()
+    assert machine.nmt_(1) == [] and set(machine.nmt.values()) == {5}
+    assert machine.nmt_(command, 3) == boots * [(0x703, b"\x00")]
+    assert machine.nmt == dict.fromkeys(NODES, 5) | {3: state}
+    assert machine.nmt_(7) == [] and machine.nmt[1] == 5  # no command
+    assert machine.receive(Frame(100.0, 0x000, b"\x02")) == [] and machine.nmt[1] == 5
+    assert machine.nmt_(command) == [(0x700 + node, b"\x00") for node in boots * NODES]
+
+
+def test_receive__answers_a_sync_with_the_counts_of_running_encoders() -> None:
+    machine = Machine()
+    assert machine.receive(Frame(100.0, 0x080, b"")) == []
+    machine.nmt_(1, 1)
+    machine.nmt_(1, 4)
+    answers = [(0x180 + node, struct.pack("<I", RAW[node - 1])) for node in (1, 4)]
+    assert machine.receive(Frame(100.0, 0x080, b"")) == answers
+
+
+@pytest.mark.parametrize(
+    ("command", "address", "value", "answer"),
+    [
+        (0x40, (0x1000, 0), 0, (0x43, 406)),
+        (0x40, (0x1017, 0), 0, (0x43, 50)),
+        (0x40, (0x1800, 2), 0, (0x43, 1)),
+        (0x40, (0x6501, 0), 0, (0x43, 4096)),
+        (0x40, (0x2000, 1), 0, (0x80, 0x06020000)),
+        (0x23, (0x2000, 1), 3, (0x80, 0x06020000)),
+        (0x23, (0x1017, 0), 1234, (0x60, 0)),  # four bytes
+        (0x2B, (0x1017, 0), 77, (0x60, 0)),  # two
+        (0x2F, (0x1800, 2), 9, (0x60, 0)),  # one
+        (0x23, (0x6501, 0), 8, (0x80, 0x06010000)),
+        (0x60, (0x1017, 0), 0, (0x80, 0x06010000)),
+    ],
+)
+def test_receive__reads_and_writes_objects(
+    command: int, address: tuple[int, int], value: int, answer: tuple[int, int]
+) -> None:
+    machine = Machine()
+    before = dict(machine.objects)
+    request = struct.pack("<BHBI", command, *address, value)
+    data = struct.pack("<BHBI", answer[0], *address, answer[1])
+    assert machine.receive(Frame(0.0, 0x602, request)) == [(0x582, data)]
+    written = {(2, *address): value} if answer[0] == 0x60 else {}
+    assert machine.objects == before | written  # of this node alone
+    assert machine.receive(Frame(0.0, 0x602, bytes(7))) == []
+    assert machine.receive(Frame(0.0, 0x600 + CONTROLLER, bytes(8))) == []
+
+
+def test_advance__moves_the_plant_under_the_command_in_force() -> None:
+    machine = driving()
+    machine.advance(100.1001)
+    state = plant_reset(BROKK_170, np.array(START))
+    for _ in range(2):
+        state = plant_step(BROKK_170, state, np.array([80, 0, -40, 0, 0]) / 127)
+    np.testing.assert_allclose(machine.plant.q, state.q, atol=1e-12)
+    assert len(machine.rows) == 20 and machine.rows[-1][1][0] == pytest.approx(80 / 127)
+
+
+def test_serve__answers_until_it_is_to_stop() -> None:
+    sent: Out = []
+    frames = [Frame(100.0, 0x000, b"\x01\x00"), None, Frame(100.0, 0x080, b"")]
+    waits: list[float] = []
+    bus: Any = SimpleNamespace(
+        now=lambda: 100.001,
+        send=lambda *frame: sent.append(frame),
+        recv=lambda wait: waits.append(wait) or frames.pop(0),
+    )
+    serve(Machine(), bus, lambda: bool(frames))
+    answers = [(0x180 + i, struct.pack("<I", raw)) for i, raw in enumerate(RAW, 1)]
+    assert sent == [*((0x700 + node, b"\x00") for node in NODES), *answers]
+    assert waits == pytest.approx([0.004] * 3)
+
+
+def test_start_pose__is_the_given_one_the_machines_or_the_middle() -> None:
+    low, high = BROKK_170.column("q_min"), BROKK_170.column("q_max")
+    np.testing.assert_array_equal(start_pose(BROKK_170, ()), START)
+    for pose in ([0.1, 0.5, 0.5, 1.5, 1.0], low.tolist(), high.tolist()):
+        np.testing.assert_array_equal(start_pose(BROKK_170, pose), pose)
+    other = replace(BROKK_170, q_start=())
+    np.testing.assert_allclose(start_pose(other, ()), (low + high) / 2)
+
+
+@pytest.mark.parametrize("pose", [[9.0, 0.5, 0.5, 1.5, 1.0], [0.0, 0.5]])
+def test_start_pose__refuses_what_the_machine_cannot_take(pose: list[float]) -> None:
+    with pytest.raises(ValueError, match=r"start: expected 5 angles within .*, got") as e:
+        start_pose(BROKK_170, pose)
+    assert str(pose) in str(e.value)
+
+
+# --- as others see it ----------------------------------------------------------------------------
+
+
+def test_simulate__serves_until_a_signal_and_records_every_step(tmp_path: Path) -> None:
+    def end() -> None:
+        eventually(lambda: len(recorded_rows(tmp_path / "plant.csv")) > 60, 60)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    thread = threading.Thread(target=end)
+    thread.start()
+    simulate(BROKK_170, START, "virtual", "recorded", tmp_path / "plant.csv")
+    thread.join()
+    (recording,) = read_log([tmp_path / "plant.csv"], 4).recordings
+    assert not recording.u.any()
+    np.testing.assert_allclose(recording.q, np.tile(START, (len(recording.q), 1)))
+    times = recorded_rows(tmp_path / "plant.csv")[:, 0]
+    np.testing.assert_allclose(times, 0.005 * np.arange(1, len(times) + 1), atol=0.0006)
+
+
+def test_serve__is_five_encoders_to_a_master_of_the_canopen_library() -> None:
+    with served("master") as machine:
+        network = canopen.Network()
+        network.connect(interface="virtual", channel="master")
+        nodes = [canopen.RemoteNode(n, dictionary()) for n in (1, 2, 3, 4, 5)]
+        positions: dict[int, int] = {}
+        for node in nodes:
+            network.add_node(node)
+            network.subscribe(
+                0x180 + node.id,
+                lambda i, data, t: positions.update({i: struct.unpack("<I", data)[0]}),
+            )
+        try:
+            assert [node.sdo["units per revolution"].raw for node in nodes] == [4096] * 5
+            assert nodes[0].sdo["device type"].raw == 406
+            nodes[1].sdo["heartbeat"].raw = 100
+            assert nodes[1].sdo["heartbeat"].raw == 100
+            with pytest.raises(canopen.SdoAbortedError) as refused:
+                nodes[0].sdo["position"].raw  # noqa: B018
+            assert refused.value.code == 0x06020000
+            assert nodes[3].nmt.wait_for_heartbeat(10) == "PRE-OPERATIONAL"
+            network.sync.transmit()
+            time.sleep(0.05)
+            assert not positions  # not yet operational
+            network.nmt.state = "OPERATIONAL"
+            eventually(lambda: machine.nmt[5] == 5)
+            # one of before may still be on its way to the master
+            eventually(lambda: nodes[4].nmt.wait_for_heartbeat(10) == "OPERATIONAL")
+            network.sync.transmit()
+            eventually(lambda: len(positions) == 5)
+            assert [positions[0x180 + n] for n in (1, 2, 3, 4, 5)] == RAW
+            nodes[0].nmt.state = "STOPPED"
+            eventually(lambda: machine.nmt[1] == 4 and machine.nmt[2] == 5)
+            nodes[0].nmt.state = "RESET"
+            eventually(lambda: machine.nmt[1] == 127)
+        finally:
+            network.disconnect()

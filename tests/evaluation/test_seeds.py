@@ -1,0 +1,128 @@
+"""Training seeds on the machine: the table, its intervals, `sweep.json`, refusals."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers_machines import POSE, small_net
+
+from brokk_min.env import TaskConfig
+from brokk_min.evaluation import seeds
+from brokk_min.evaluation.baselines import gains_metadata
+from brokk_min.evaluation.sequences import axis_sequences
+from brokk_min.machine import BROKK_170
+from brokk_min.ppo import PPOConfig
+
+TINY = PPOConfig(num_envs=4, horizon=4, epochs=1, minibatch_size=16, total_steps=32)
+NET = small_net(BROKK_170, np.random.default_rng(0))
+
+
+def rows(error, controller="rl"):
+    """Three sequences from three starts, of which two count."""
+    figures = {"off_axis_drift_max": 2.0 * error, "valve_travel": 10.0}
+    starts = (("workspace", error), ("limits", 99.0), ("workspace", error + 1))
+    return [
+        {"controller": controller, "sequence": s, "start": i, "kind": kind}
+        | {"velocity_error_mean": e, **figures}
+        for s in "xyz"
+        for i, (kind, e) in enumerate(starts)
+    ]
+
+
+def test_table__counts_a_seed_once():
+    figures = seeds.table([rows(1.0), rows(3.0)], rows(5.0, "pid"))
+    assert list(figures) == ["rl", "pid", "rl less pid"]
+    for name in ("velocity_error_x", "velocity_error_all"):
+        # two seeds, 1.5 and 3.5: half of 12.7062 x sqrt(2) / sqrt(2) x 2
+        expected = {"mean": 2.5, "low": -10.2062, "high": 15.2062}
+        assert figures["rl"][name] == pytest.approx(expected, abs=1e-4)
+        assert figures["pid"][name] == {"mean": 5.5, "low": None, "high": None}
+        assert figures["rl less pid"][name]["mean"] == -3.0
+        assert figures["rl less pid"][name]["high"] == pytest.approx(12.7062 - 3.0, abs=1e-4)
+    assert figures["rl"]["off_axis_drift_max"]["mean"] == 4.0
+    assert list(seeds.table([], rows(5.0, "pid"))) == ["pid"]
+
+
+def test_show__has_one_line_per_controller():
+    header, rl, pid, less = seeds.show(
+        seeds.table([rows(1.0), rows(3.0)], rows(5.0, "pid"))
+    ).splitlines()
+    names = "x [m/s]", "y [m/s]", "z [m/s]", "all [m/s]", "drift [m]", "travel [1]"
+    assert header == f"{'mean and 95 % interval':28}" + "".join(f" {name:>18}" for name in names)
+    assert rl.startswith("rl ")
+    assert "2.5000 +- 12.7062" in rl
+    cells = ("5.5000", "5.5000", "5.5000", "5.5000", "10.0000", "10.0000")
+    assert pid == f"{'pid':28}" + "".join(f" {cell:>18}" for cell in cells)
+    assert "-3.0000 +- 12.7062" in less
+
+
+def test_read_seeds__reads_what_a_sweep_wrote(tmp_path):
+    path = tmp_path / "sweep.json"
+    figures = seeds.table([rows(1.0), rows(3.0)], [])
+    path.write_text(json.dumps({"meta": gains_metadata(BROKK_170, NET), "table": figures}))
+    assert seeds.seeds_of(BROKK_170, NET, seeds.read_seeds(path)) == figures
+    other = replace(NET, output_high=2 * NET.output_high)
+    with pytest.raises(ValueError, match=r"sweep: expected one with .*got "):
+        seeds.seeds_of(BROKK_170, other, seeds.read_seeds(path))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{",
+        "[]",
+        '{"table": {"rl": {"velocity_error_all": {"mean": 1, "low": 0, "high": 2}}}}',
+        '{"meta": {}, "table": {"rl": {"velocity_error_all": {"mean": 1}}}}',
+    ],
+)
+def test_read_seeds__refuses_other_files(tmp_path, text):
+    path = tmp_path / "sweep.json"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=r"sweep\.json: expected the sweep\.json of a sweep, got "):
+        seeds.read_seeds(path)
+
+
+@pytest.fixture
+def short(monkeypatch):
+    """Sequences of half a second, from poses that need no search."""
+    poses = POSE + 0.1 * np.random.default_rng(0).random((2, 5))
+    sequences = [s._replace(goals=s.goals[15:25]) for s in axis_sequences(BROKK_170)]
+    monkeypatch.setattr(seeds, "evaluation_starts", lambda *_: poses)
+    monkeypatch.setattr(seeds, "task_sequences", lambda machine: sequences)
+
+
+def test_sweep__writes_all_runs_and_does_nothing_twice(tmp_path, short):
+    distributed = pytest.importorskip("distributed")
+    options = {"n_workers": 1, "processes": False, "dashboard_address": ":0", "protocol": "tcp"}
+    task = TaskConfig(episode_s=0.6)
+    with distributed.LocalCluster(threads_per_worker=1, **options) as cluster:
+
+        def sweep(config: PPOConfig, out: Path):
+            address = cluster.scheduler_address
+            return seeds.sweep(BROKK_170, NET, task, config, range(3, 5), out, 2, address)
+
+        figures = sweep(TINY, tmp_path / "a" / "b")
+        folder = tmp_path / "a" / "b"
+        names = [f"seed_{n}.{end}" for n in (3, 4) for end in ("json", "npz", "npz.csv")]
+        assert sorted(path.name for path in folder.iterdir()) == [*names, "sweep.json"]
+        times = [(folder / name).stat().st_mtime_ns for name in names]
+        assert sweep(TINY, folder) == figures
+        assert [(folder / name).stat().st_mtime_ns for name in names] == times
+        with pytest.raises(ValueError, match=r"^seed 3: .*seed_3\.json: settings: .*; seed 4: "):
+            sweep(replace(TINY, gamma=0.5), folder)
+        (folder / "seed_3.json").write_text("{")
+        with pytest.raises(ValueError, match=r"^seed 3: .*expected the result of a seed, got "):
+            sweep(TINY, folder)
+    written = json.loads((folder / "sweep.json").read_text())
+    assert written["meta"]["seeds"] == 2
+    assert list(written["meta"]["failed"]) == ["3"]
+    assert {row["seed"] for row in written["runs"]} == {4}
+    assert len(written["runs"]) == 3 * 2
+    assert written["table"]["rl"]["valve_travel"]["mean"] > 0
+    identity = json.loads((folder / "seed_4.json").read_text())["identity"]
+    assert identity["settings"]["threads"] == 1
+    assert (identity["starts"], identity["sequences"]) == (2, ["x", "y", "z"])

@@ -1,0 +1,245 @@
+"""The Gymnasium environments: resets in the same step, final observations, registration."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import warnings
+from dataclasses import fields, replace
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+from helpers_machines import POSE, closed_form, obedient_net, small_net
+
+from brokk_min import env as task
+from brokk_min.env import TaskConfig
+from brokk_min.identification.net_file import save_net
+from brokk_min.learning.gym_env import TaskEnv, TaskVectorEnv
+from brokk_min.machine import BROKK_170
+
+LOW = replace(BROKK_170, ground=-100.0)  # no pose is in the ground
+SHORT = TaskConfig(episode_s=1.0, noise=0.0)
+NET = small_net(BROKK_170, np.random.default_rng(0))
+ID = "brokk_min.learning.gym_env:brokk_min/Brokk170-v0"
+
+
+def rows_of(state, rows):
+    """Rows of all arrays of a state without a plant."""
+    names = [field.name for field in fields(state) if field.name != "plant"]
+    return np.concatenate([getattr(state, name)[rows].ravel() for name in names])
+
+
+@pytest.mark.parametrize("net", ["analytic", obedient_net(LOW)], ids=["plant", "nets"])
+def test_step__final_obs_is_the_last_of_the_old_episode(net):
+    """A twin with longer episodes goes on: its observation is the other one's `final_obs`."""
+    short = TaskVectorEnv(4, net, LOW, TaskConfig(episode_s=1.0))
+    long = TaskVectorEnv(4, net, LOW, TaskConfig(episode_s=9.0))
+    obs, _ = short.reset(seed=5)
+    twin_obs, _ = long.reset(seed=5)
+    rng = np.random.default_rng(18)
+    for tick in range(1, 21):
+        assert np.array_equal(obs, twin_obs)
+        action = rng.uniform(-1, 1, (4, 4)).astype(np.float32)
+        obs, reward, terminated, truncated, info = short.step(action)
+        twin_obs, twin_reward, *_, twin_info = long.step(action)
+        assert np.array_equal(reward, twin_reward)  # the last tick is rewarded as any other
+        assert np.array_equal(info["velocity_error"], twin_info["velocity_error"])
+        assert not terminated.any()
+        assert truncated.all() == (tick == 20)
+        assert ("final_obs" in info) == (tick == 20)
+    assert info["_final_obs"].tolist() == [True] * 4
+    assert np.array_equal(info["final_obs"], twin_obs)
+    assert np.abs(obs - info["final_obs"]).max(axis=1).min() > 1e-3
+    assert short.state.ticks.tolist() == [0] * 4
+
+
+def test_step__resets_only_the_rows_that_ended():
+    env = TaskVectorEnv(3, NET, LOW, SHORT)
+    env.reset(seed=6)
+    env.state = replace(env.state, ticks=np.array([0, 19, 5]))
+    before = env.state
+    obs, _, _, truncated, info = env.step(np.ones((3, 4), np.float32))
+    assert truncated.tolist() == info["_final_obs"].tolist() == [False, True, False]
+    assert env.state.ticks.tolist() == [1, 0, 6]
+    assert info["state"] is before
+    assert np.array_equal(obs[[0, 2]], info["final_obs"][[0, 2]])
+    assert not np.array_equal(obs[1], info["final_obs"][1])
+    np.testing.assert_allclose(env.state.q[[0, 2]], before.q[[0, 2]], atol=0.05)
+
+
+def test_step__leaks_nothing_between_rows():
+    config = TaskConfig(episode_s=60.0, hold_min_s=60, hold_max_s=60)
+    left = TaskVectorEnv(6, NET, LOW, config)
+    right = TaskVectorEnv(6, NET, LOW, config)
+    left.reset(seed=13)
+    right.reset(seed=13)
+    others = [0, 1, 3, 4, 5]
+    rng = np.random.default_rng(15)
+    for _ in range(30):
+        action = rng.uniform(-1, 1, (6, 4)).astype(np.float32)
+        changed = action.copy()
+        changed[2] = -changed[2]
+        obs, reward, *_ = left.step(action)
+        obs_right, reward_right, *_ = right.step(changed)
+        assert np.array_equal(rows_of(left.state, others), rows_of(right.state, others))
+        assert np.array_equal(obs[others], obs_right[others])
+        assert np.array_equal(reward[others], reward_right[others])
+    assert not np.array_equal(rows_of(left.state, [2]), rows_of(right.state, [2]))
+
+
+@pytest.mark.parametrize("ticks", [20.0, 1.0])
+def test_step__a_pose_in_the_ground_terminates_without_reward(ticks):
+    """Termination and truncation are never both, also in the tick of the time limit."""
+    config = TaskConfig(redraw_ground=False, episode_s=ticks / 20)
+    env = TaskVectorEnv(400, config=config)
+    env.reset(seed=7)
+    buried = closed_form(env.state.q)[1] < 0
+    assert 8 < buried.sum() < 392
+    _, reward, terminated, truncated, info = env.step(np.zeros((400, 4), np.float32))
+    assert np.array_equal(terminated, buried)
+    assert np.array_equal(truncated, ~buried & (ticks == 1))
+    assert not reward[buried].any()
+    assert (reward[~buried] > 0).all()
+    assert np.array_equal(info["_final_obs"], terminated | truncated)
+
+
+def test_step__an_arm_driven_into_the_ground_terminates():
+    env = TaskEnv(obedient_net(BROKK_170), config=TaskConfig(noise=0.0))
+    env.reset(seed=9)
+    env.vector.state = task.initial_state(BROKK_170, POSE[None], np.zeros((1, 3)), plant=False)
+    down = np.array([0.0, -1.0, 0.0, 0.0])
+    for _ in range(300):
+        _, reward, terminated, truncated, info = env.step(down)
+        height = closed_form(env.vector.state.q)[1][0]
+        assert terminated == (height < 0)
+        assert not truncated
+        if terminated:
+            break
+    assert terminated
+    assert reward == 0
+    assert info["velocity_error"] > 0
+
+
+@pytest.mark.parametrize("make", [lambda: TaskVectorEnv(3), TaskEnv], ids=["vector", "single"])
+def test_reset__reproduces_by_its_seed(make):
+    def run(seed):
+        env = make()
+        rng = np.random.default_rng(0)
+        tape = [env.reset(seed=seed)[0]]
+        for _ in range(30):
+            action = rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
+            tape.append(env.step(action)[0])
+        return np.array(tape)
+
+    assert np.array_equal(run(3), run(3))
+    assert not np.allclose(run(3)[0], run(4)[0], atol=0.2)
+
+
+def test_task_env__is_one_row_of_the_vector():
+    one = TaskEnv(NET, LOW, SHORT)
+    many = TaskVectorEnv(1, NET, LOW, SHORT)
+    obs, _ = one.reset(seed=3)
+    rows, _ = many.reset(seed=3)
+    assert np.array_equal(obs, rows[0])
+    for _ in range(19):
+        obs, *results, info = one.step(np.full(4, 0.3))
+        rows, *vectors, infos = many.step(np.full((1, 4), 0.3))
+        assert np.array_equal(obs, rows[0])
+        assert results == [vector[0] for vector in vectors]
+        assert [type(result) for result in results] == [float, bool, bool]
+        assert info == {"velocity_error": infos["velocity_error"][0]}
+    for _ in range(2):  # the caller resets
+        *_, truncated, _ = one.step(np.full(4, 0.3))
+        assert truncated
+
+
+@pytest.mark.parametrize("make", [lambda: TaskVectorEnv(2), TaskEnv], ids=["vector", "single"])
+def test_step__refuses_to_begin_without_a_reset(make):
+    with pytest.raises(ValueError, match="step: expected a reset before the first step, got none"):
+        make().step(np.zeros((2, 4), np.float32))
+    with pytest.raises(ValueError, match="render: expected a render_mode and a reset before"):
+        make().render()
+
+
+@pytest.mark.parametrize("shape", [(2, 5), (2,), (2, 3)])
+def test_step__refuses_wrong_actions(shape):
+    env = TaskVectorEnv(2)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"action: expected \(\.\.\., 4\), got \(2"):
+        env.step(np.zeros(shape, np.float32))
+
+
+# --- nets -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("net", "message"),
+    [
+        (replace(NET, rate=10.0), "actuator: expected nets for brokk170 .*got .*'rate': 10.0"),
+        (replace(NET, velocity_samples=3), "actuator: expected .*got .*'velocity_samples': 3"),
+        (replace(NET, velocity_logged=True), "actuator: expected .*got .*'velocity_logged': True"),
+        (replace(NET, machine="other"), "actuator: expected .*got .*'machine': 'other'"),
+        (NET.select(["q1", "q3"]), r"joints: expected nets for \['q1', .*'q5'\], got \['q1'"),
+    ],
+)
+def test_task_vector_env__refuses_nets_that_do_not_fit(net, message):
+    with pytest.raises(ValueError, match=message):
+        TaskVectorEnv(1, net)
+
+
+def test_task_vector_env__takes_a_file_and_selects_driven_joints(tmp_path):
+    names = BROKK_170.names
+    net = small_net(BROKK_170, np.random.default_rng(0), joints=names)
+    save_net(tmp_path / "net.npz", net)
+    env = TaskVectorEnv(1, tmp_path / "net.npz")
+    assert env.net.joints == ("q1", "q3", "q4", "q5")
+    assert TaskVectorEnv(1, str(tmp_path / "net.npz")).net.joints == env.net.joints
+    assert TaskVectorEnv(1).net is None
+
+
+# --- Gymnasium ------------------------------------------------------------------------------------
+
+
+def test_make__gives_an_environment_that_gymnasium_and_stable_baselines_accept():
+    from stable_baselines3.common.env_checker import check_env as check_sb3
+
+    env = gymnasium.make(ID)
+    assert isinstance(env.unwrapped, TaskEnv)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*Box observation space.*infinity.*")
+        check_env(env.unwrapped, skip_render_check=True)
+    check_sb3(env.unwrapped)
+    assert env.observation_space.shape == (171,)
+    assert env.action_space == gymnasium.spaces.Box(-1, 1, (4,), np.float32)
+
+
+def test_make_vec__gives_the_vector_class():
+    env = gymnasium.make_vec(ID, num_envs=256, config=SHORT)
+    assert isinstance(env.unwrapped, TaskVectorEnv)
+    assert env.unwrapped.config == SHORT
+    assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    obs, _ = env.reset(seed=0)
+    assert env.observation_space.contains(obs)
+    assert len(np.unique(obs[:, 7])) > 200  # different poses
+    obs, *vectors, info = env.step(env.action_space.sample())
+    assert env.observation_space.contains(obs)
+    assert {vector.shape for vector in (*vectors, info["velocity_error"])} == {(256,)}
+
+
+def test_metadata__has_the_rate_of_the_machine():
+    fast = replace(BROKK_170, rate=50.0)
+    assert TaskEnv(machine=fast).metadata["render_fps"] == 50
+    assert TaskVectorEnv(2, machine=fast).metadata["render_fps"] == 50
+    assert TaskEnv.metadata["render_fps"] == 20
+
+
+def test_import__of_the_environments_needs_neither_viewer_nor_torch():
+    code = (
+        "import sys, brokk_min.learning.gym_env;"
+        "print([m for m in sys.modules if m in ('torch', 'pygame') or 'brokk_min.viewer' in m])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

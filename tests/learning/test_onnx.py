@@ -1,0 +1,64 @@
+"""An exported policy before onnxruntime, which nobody here wrote."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from brokk_min.env import COMPENSATION
+from brokk_min.identification.files import SHIPPED
+from brokk_min.learning.onnx import export_onnx
+from brokk_min.learning.policy import STANDSTILL_TIMEOUT, Policy, load_policy
+from brokk_min.machine import BROKK_170
+
+
+@pytest.fixture(scope="module")
+def policy() -> Policy:
+    return load_policy(SHIPPED / "brokk170" / "policy.npz", BROKK_170)
+
+
+@pytest.mark.parametrize("batch", [1, 256])
+def test_export_onnx__computes_the_actions_of_the_policy(
+    batch: int, policy: Policy, tmp_path: Path
+) -> None:
+    onnxruntime = pytest.importorskip("onnxruntime")
+    export_onnx(tmp_path / "p.onnx", policy)
+    session = onnxruntime.InferenceSession(tmp_path / "p.onnx", providers=["CPUExecutionProvider"])
+    rng = np.random.default_rng(1)
+    obs = rng.normal(0, 1.5, (batch, len(policy.mean))).astype(np.float32)
+    (action,) = session.run(None, {"observation": obs})
+    assert np.abs(action - policy.act(obs)).max() < 1e-5
+    assert np.abs(action).max() > 0.3
+    ends = [(e.name, e.shape, e.type) for e in (*session.get_inputs(), *session.get_outputs())]
+    sizes = {"observation": len(policy.mean), "action": 4}
+    assert ends == [(name, ["batch", size], "tensor(float)") for name, size in sizes.items()]
+
+
+def test_export_onnx__is_one_file_with_what_the_other_program_needs(
+    policy: Policy, tmp_path: Path
+) -> None:
+    onnx = pytest.importorskip("onnx")
+    export_onnx(tmp_path / "p.onnx", policy)
+    model = onnx.load(tmp_path / "p.onnx")
+    assert not [tensor for tensor in model.graph.initializer if tensor.external_data]
+    assert [node.op_type for node in model.graph.node] == ["Gemm", "Elu"] * 3 + ["Gemm"]
+    assert model.ir_version == 8
+    assert [(o.domain, o.version) for o in model.opset_import] == [("", 17)]
+    metadata = {prop.key: json.loads(prop.value) for prop in model.metadata_props}
+    for name in ("mean", "scale"):
+        np.testing.assert_array_equal(np.float32(metadata.pop(name)), getattr(policy, name))
+    assert (metadata.pop("ramp"), metadata.pop("stand_s")) == (COMPENSATION, STANDSTILL_TIMEOUT)
+    assert metadata == dict(policy.contract)
+    assert metadata["driven"] == ["q1", "q3", "q4", "q5"] and metadata["rate"] == 20.0
+
+
+def test_export_onnx__names_the_missing_extra(
+    policy: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    with pytest.raises(ValueError, match=r"onnx: expected the extra brokk_min\[export\]"):
+        export_onnx(tmp_path / "p.onnx", policy)
