@@ -150,7 +150,8 @@ def test_tuning_cost__of_many_candidates_is_that_of_each() -> None:
     start, goals = tuning_set(BROKK_170, 2, 7, seconds=1.0)
     vectors = np.random.default_rng(7).uniform(*baselines.gain_bounds(BROKK_170), (3, 14))
     many = replace(controller(), gains=baselines.split_vector(vectors))
-    config, rng = TaskConfig(noise=0.0), np.random.default_rng(0)
+    config = TaskConfig(noise=0.0)
+    rng = np.random.default_rng(0)
     single = []
     for row in vectors:
         one = replace(controller(), gains=baselines.split_vector(row))

@@ -41,7 +41,8 @@ def test_command__interpolates_between_angles_and_holds_beyond_them(
     angle: float, speed: float
 ) -> None:
     """Speeds at full command are 1, 2 and 4 rad/s at -1, 0.5 and 2 rad."""
-    scale, u = np.array([1.0, 2.0, 4.0])[None, :, None], np.array([-1.0, 0.0, 1.0])
+    u = np.array([-1.0, 0.0, 1.0])
+    scale = np.array([1.0, 2.0, 4.0])[None, :, None]
     steady = StaticMap(np.array([[-1.0, 0.5, 2.0]]), u, scale * u)
     for q_dot in (0.5, -0.25):
         result = steady.command(np.array([float(angle)]), np.array([q_dot]))
