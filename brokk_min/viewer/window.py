@@ -7,7 +7,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
@@ -94,6 +93,8 @@ def _word(text: str, size: int, colour: Colour) -> Any:
 @lru_cache(maxsize=16)
 def _font(size: int) -> Any:
     """The typeface that matplotlib brings: the same everywhere."""
+    import matplotlib
+
     pygame = require_pygame()
     pygame.font.init()
     return pygame.font.Font(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf", size)
