@@ -7,6 +7,7 @@ import runpy
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from brokk_min.viewer.control_process import BusOptions, Request
 from brokk_min.viewer.input_handler import InputHandler
 from brokk_min.viewer.play import Session
 from brokk_min.viewer.tracing import Attempt
-from brokk_min.viewer.window import open_window
+from brokk_min.viewer.window import Window
 
 REPOSITORY = Path(__file__).parents[2]
 MINI_EXCAVATOR = runpy.run_path(f"{REPOSITORY}/examples/mini_excavator.py")["MINI_EXCAVATOR"]
@@ -229,7 +230,7 @@ def test_show__sends_requests_once_there_is_telemetry_and_takes_keys_frame_by_fr
             post_key(name)
         return bool(presses)
 
-    with open_window(play.SIZE, "test") as window:
+    with closing(Window(play.SIZE, "test")) as window:
         play.show(window, session, lambda: frames.pop(0), sent.append, each_frame, fps=500.0)
     assert [task for task, _ in tasks] == ["", "", "", "rectangle", "circle", "circle"]
     assert tasks[5][1] is not tasks[4][1]  # begun again
