@@ -35,7 +35,7 @@ class Sweep(NamedTuple):
     q_dot: Array  # rad/s
 
 
-class Tests(NamedTuple):
+class SimulatorTests(NamedTuple):
     """The preliminary tests of one simulator with its last driven joint."""
 
     sweeps: dict[str, Sweep]  # by PWM byte
@@ -56,7 +56,7 @@ class Motion(NamedTuple):
 class Preliminary(NamedTuple):
     """All preliminary measurements."""
 
-    tests: dict[str, Tests]  # of machine and nets
+    tests: dict[str, SimulatorTests]  # of machine and nets
     gap: Motion  # nets less machine
 
 
@@ -80,7 +80,7 @@ def simulators(machine: Machine, net: ActuatorNet) -> dict[str, Simulator]:
     return {"machine": plant_simulator(machine), "nets": nets}
 
 
-def preliminary_tests(machine: Machine, simulate: Simulator) -> Tests:
+def preliminary_tests(machine: Machine, simulate: Simulator) -> SimulatorTests:
     """Range and direction, coupling, past movement. Paper: Sec. 3.2, Fig. 2"""
     joint = int(machine.driven[-1])
     limit = machine.pwm_limit / PWM_MAX
@@ -99,7 +99,7 @@ def preliminary_tests(machine: Machine, simulate: Simulator) -> Tests:
     from_idle, moving = step_velocity(angles, machine.rate)[:, :, 0, joint].T
     time = (np.arange(2 * wait) + 0.5 - wait) * machine.dt
     times = response_times(angles, machine.rate)[..., machine.driven]
-    return Tests(
+    return SimulatorTests(
         dict(zip(names, alone, strict=True)),
         {"alone": alone[1], "with the others": together},
         {"from idle": (time, from_idle), "while moving": (time, moving)},
