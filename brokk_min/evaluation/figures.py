@@ -74,7 +74,8 @@ def plot_panels(
             if one_legend:
                 ax.set_title(panel.title, fontsize="medium")
             else:
-                place = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncol": 2}
+                place: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0)}
+                place["ncol"] = 2 if len(row) > 2 else 4
                 ax.legend(title=panel.title, frameon=False, **place)
         for ax in axes[len(row) :]:
             ax.remove()
