@@ -14,7 +14,7 @@ from matplotlib.colors import to_rgb, to_rgba
 
 from brokk_min.evaluation import figures
 from brokk_min.evaluation.figures import Panel
-from brokk_min.evaluation.preliminary import Motion, Sweep, SimulatorTests
+from brokk_min.evaluation.preliminary import Motion, SimulatorTests, Sweep
 from brokk_min.evaluation.sequences import axis_sequences, task_sequences
 from brokk_min.identification import validation
 from brokk_min.identification.logs import Log, Recording
@@ -89,8 +89,8 @@ def test_plot_tests__shows_machine_above_nets() -> None:
     x = np.arange(3.0)
     rows = {}
     for k, kind in enumerate(("machine", "nets"), 1):
-        sweeps = {"u = 50": Sweep(x, k * x)}
-        rows[kind] = SimulatorTests(sweeps, {"alone": Sweep(x, -k * x)}, {"from idle": (x, k + x)}, {})
+        sweeps, coupling = {"u = 50": Sweep(x, k * x)}, {"alone": Sweep(x, -k * x)}
+        rows[kind] = SimulatorTests(sweeps, coupling, {"from idle": (x, k + x)}, {})
     figure = figures.plot_tests(BROKK_170, rows)
     assert ylabels(figure) == ["velocity q5 [rad/s]"] * 6
     assert [ax.get_xlabel() for ax in figure.axes[:3]] == [
