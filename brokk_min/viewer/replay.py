@@ -16,8 +16,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet
-from brokk_min.can.canopen import read_frames
-from brokk_min.can.drive_log import TelemetryReader
+from brokk_min.can.drive_log import TelemetryReader, read_frames
 from brokk_min.evaluation import baselines, metrics
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.evaluation.sequences import Commands, goals_and_starts, task_sequences
