@@ -23,7 +23,8 @@ import numpy as np
 import tyro
 
 from benchmarks.rollout import random_net, write
-from brokk_min.can.canopen import Frame, read_frames
+from brokk_min.can.canopen import Frame
+from brokk_min.can.drive_log import read_frames
 from brokk_min.env import observation_scale
 from brokk_min.learning.policy import Policy, contract, save_policy
 from brokk_min.machine import BROKK_170
