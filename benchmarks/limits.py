@@ -10,8 +10,6 @@ backend on the same shapes. Kinematics: compared with a loop over pinocchio.
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -37,7 +35,6 @@ class Options:
     repeats: int = 15  # Timed blocks; what is compared is timed in turn, the least time counts.
     num_envs: tuple[int, ...] = (64, 256, 1024, 4096)  # Environments side by side.
     quick: bool = False  # One short block each: to see that it runs.
-    numpy_products: bool = False  # Only print NumPy's time; the program calls itself so.
     json: Path | None = None  # Also write the figures here.
 
     @property
@@ -127,6 +124,7 @@ def gradient(options: Options) -> dict[str, Any]:
     sizes = shapes(171, (4,), batch)
     work = sum(2 * m * k * n for m, k, n in sizes) / 1e9
     calls: dict[str, Callable[[], Any]] = {"gradient": step, "torch": products("torch", sizes)}
+    calls["numpy"] = products("numpy", sizes)
     try:
         calls["onednn"] = products("onednn", sizes)
         calls["onednn"]()
@@ -134,25 +132,12 @@ def gradient(options: Options) -> dict[str, Any]:
         calls.pop("onednn", None)
     times = seconds(calls, options)
     rates = {name: work / times[name] for name in calls}
-    for core in [""] if options.quick else ["", "Haswell", "SkylakeX"]:
-        rates[f"numpy {core}".strip()] = numpy_rate(core, options, work)
     best = max(rate for name, rate in rates.items() if name != "gradient")
     return {
         "gflops": rates,
         "seconds": times["gradient"],
         "fraction_of_best": rates["gradient"] / best,
     }
-
-
-def numpy_rate(core: str, options: Options, work: float) -> float:
-    """GFLOP/s of NumPy with OpenBLAS's kernels for `core`, chosen at its start; 0: none."""
-    variables = os.environ | {"OPENBLAS_NUM_THREADS": str(options.threads)}
-    if core:
-        variables["OPENBLAS_CORETYPE"] = core
-    words = [sys.executable, "-m", "benchmarks.limits", "--numpy-products"]
-    words += ["--repeats", str(options.repeats), *["--quick"] * options.quick]
-    done = subprocess.run(words, env=variables, capture_output=True, text=True)
-    return work / float(done.stdout) if done.returncode == 0 else 0.0
 
 
 def kinematics(options: Options) -> dict[str, float]:
@@ -186,10 +171,6 @@ def main(options: Options) -> dict[str, Any]:
     torch.set_num_threads(options.threads)
     if options.quick:
         options.repeats = 1
-    if options.numpy_products:
-        call = products("numpy", shapes(171, (4,), ppo.PPOConfig.minibatch_size))
-        print(seconds({"numpy": call}, options)["numpy"])
-        return {}
     result = {
         "threads": options.threads,
         "load": os.getloadavg(),

@@ -250,7 +250,7 @@ def initial_state(machine: Machine, q: ArrayLike, v_goal: ArrayLike, plant: bool
         q=q,
         q_dot=np.zeros_like(q),
         v_tool=np.zeros_like(goal),
-        lowest=kinematics.lowest_point(forward_kinematics(machine, q)),
+        lowest=kinematics.lowest_point(forward_kinematics(machine, q.astype(np.float32))),
         history=initial_history(read_encoder(machine, q).astype(np.float32), machine.history),
         true_history=initial_history(q.astype(np.float32), machine.history),
         v_goal=goal,

@@ -10,13 +10,14 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brokk_min.identification.files import expected, require
+from brokk_min.identification.files import require
 from brokk_min.machine import PWM_MAX, Machine, encode_pwm
 
 Array = NDArray[Any]  # counts and flags, too
@@ -52,33 +53,25 @@ class Frame(NamedTuple):
     channel: str = ""
 
 
+@dataclass
 class Bus:
-    """A CAN bus of python-can with a monotonic clock [s] and a log of what is sent and read.
+    """A CAN bus with a monotonic clock and a log of what is sent and read."""
 
-    `bus` has no filters; `writer` is python-can's candump writer, `name` that of the bus in the
-    log. `echo`: the bus gives back what we send.
-    """
+    bus: Any  # of python-can, without filters
+    writer: Any = None  # python-can's candump writer
+    name: str = "can"  # of the bus in the log
+    echo: bool = False  # does the bus give back what we send?
+    clock: Callable[[], float] = time.monotonic  # s
+    sleep: Callable[[float], object] = time.sleep
 
-    def __init__(
-        self,
-        bus: Any,
-        writer: Any = None,
-        name: str = "can",
-        echo: bool = False,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], object] = time.sleep,
-    ) -> None:
-        self.bus = bus
-        self.writer = writer
-        self.name = name
-        self.clock = clock
-        self.sleep = sleep
-        self.start = time.time() - clock()  # the log has the time of day, but that may be set
-        self.echoes: deque[tuple[int, bytes]] = deque(maxlen=64 if echo else 0)
+    def __post_init__(self) -> None:
+        """Find the descriptor to wait on, if the bus has one."""
+        self.start = time.time() - self.clock()  # the log has the time of day, but it may be set
+        self.echoes: deque[tuple[int, bytes]] = deque(maxlen=64 if self.echo else 0)
         self.unwritten: deque[Any] = deque()  # messages for the log
         self.message = require("can", "hw").Message
         try:
-            self.file = bus.fileno()
+            self.file = self.bus.fileno()
         except NotImplementedError:
             self.file = -1
 
@@ -100,7 +93,7 @@ class Bus:
             self.echoes.remove((message.arbitration_id, data))
             return Frame(now, -1, data)
         self._log(message, now, self.name)
-        return Frame(now, _standard_id(message), data)
+        return Frame(now, standard_id(message), data)
 
     def _wait(self, timeout: float, busy_wait: float) -> None:
         """Until there is something to read, or the time is over."""
@@ -149,7 +142,8 @@ class Bus:
             self.writer.stop()
 
 
-def _standard_id(message: Any) -> int:
+def standard_id(message: Any) -> int:
+    """Identifier of a data frame with 11 bits; -1 for any other frame."""
     flags = message.is_extended_id, message.is_remote_frame, message.is_error_frame, message.is_fd
     return -1 if any(flags) else int(message.arbitration_id)
 
@@ -188,21 +182,6 @@ def stop_signals() -> Iterator[list[int]]:
     finally:
         for number, handler in zip(numbers, handlers, strict=True):
             signal.signal(number, handler)
-
-
-def read_frames(path: Path) -> Iterator[Frame]:
-    """The frames of a candump log, one by one: a day of driving has millions.
-
-    A last line without its newline is left out: the program that wrote it was killed.
-
-    ValueError: no such log, or a line that is no frame.
-    """
-    reader = require("can", "hw").CanutilsLogReader
-    log = "a candump log"
-    with expected(path, log), open(path, encoding="utf-8") as file, reader(file) as messages:
-        messages.file = (line for line in file if line.endswith("\n"))
-        for m in messages:
-            yield Frame(m.timestamp, _standard_id(m), bytes(m.data), not m.is_rx, str(m.channel))
 
 
 # --- encoders ------------------------------------------------------------------------------------
@@ -297,8 +276,7 @@ def encoder_counts(machine: Machine, raw: ArrayLike) -> Array:
         array([  -1,   -1,    7, 1000,    0])
     """
     turn = 2**machine.encoder_bits
-    zero = machine.column("encoder_zero").astype(int)
-    sign = machine.column("encoder_sign").astype(int)
+    zero, sign = (machine.column(name).astype(int) for name in ("encoder_zero", "encoder_sign"))
     middle = (machine.column("q_min") + machine.column("q_max")) / 2
     lowest = np.rint(middle / machine.encoder_step).astype(int) - turn // 2
     counts = sign * ((np.asarray(raw) & POSITION_MASK) - zero)
@@ -307,8 +285,7 @@ def encoder_counts(machine: Machine, raw: ArrayLike) -> Array:
 
 def encoder_raw(machine: Machine, counts: ArrayLike) -> Array:
     """Raw positions of encoders with 26 bits at joint angles [counts] (..., n)."""
-    zero = machine.column("encoder_zero").astype(int)
-    sign = machine.column("encoder_sign").astype(int)
+    zero, sign = (machine.column(name).astype(int) for name in ("encoder_zero", "encoder_sign"))
     return np.asarray((sign * np.asarray(counts) + zero) & POSITION_MASK)
 
 

@@ -1,9 +1,11 @@
-"""The log of a drive: the loop run on it again, recordings for `fit`, and telemetry.
+"""The log of a drive: its frames, the loop run on it again, recordings for `fit`, telemetry.
 
 Telemetry is the state of one tick, from the frames of a bus or of a log.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -12,18 +14,34 @@ from brokk_min.can import canopen
 from brokk_min.can.canopen import OPERATOR_CHANNEL, Frame, Nodes, OperatorInput
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.hw import Drive
+from brokk_min.identification.files import expected, require
 from brokk_min.identification.logs import Log, machine_log
 from brokk_min.machine import Array, Machine, decode_pwm, estimate_velocity
 
 
+def read_frames(path: Path) -> Iterator[Frame]:
+    """The frames of a candump log, one by one: a day of driving has millions.
+
+    A last line without its newline is left out: the program that wrote it was killed.
+
+    ValueError: no such log, or a line that is no frame.
+    """
+    reader = require("can", "hw").CanutilsLogReader
+    with expected(path, "a candump log"), open(path) as file, reader(file) as messages:
+        messages.file = (line for line in file if line.endswith("\n"))
+        for m in messages:
+            can_id = canopen.standard_id(m)
+            yield Frame(m.timestamp, can_id, bytes(m.data), not m.is_rx, str(m.channel))
+
+
+@dataclass
 class ReplayedBus:
     """A recorded log in place of a `Bus`: gives what was read and compares what is sent."""
 
-    def __init__(self, frames: Sequence[Frame]) -> None:
-        self.frames = frames
-        self.position = 0
-        self.sent: list[Frame] = []
-        self.mismatch = ""
+    frames: Sequence[Frame]
+    position: int = 0
+    sent: list[Frame] = field(default_factory=list)
+    mismatch: str = ""
 
     @property
     def more(self) -> bool:

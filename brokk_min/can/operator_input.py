@@ -96,7 +96,9 @@ class Joystick:
         if not self.stick:
             return OperatorInput(alive=False)
         deflection = -shape_axis([self.stick.get_axis(i) for i in self.axes])
-        x, y, z = map(float, self.speed * deflection / max(1.0, float(np.linalg.norm(deflection, axis=-1))))
+        x, y, z = map(
+            float, self.speed * deflection / max(1.0, float(np.linalg.norm(deflection, axis=-1)))
+        )
         return OperatorInput((x, y, z), enable=bool(self.stick.get_button(self.button)))
 
 

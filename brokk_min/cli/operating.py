@@ -11,7 +11,8 @@ from tyro.conf import Positional
 
 from brokk_min import hw
 from brokk_min.can import drive_log
-from brokk_min.can.canopen import open_bus, read_frames
+from brokk_min.can.canopen import open_bus
+from brokk_min.can.drive_log import read_frames
 from brokk_min.can.operator_input import JointJog, Joystick, Script
 from brokk_min.can.simulated_machine import simulate
 from brokk_min.cli.options import Command, Range, WrongUse, default_policy

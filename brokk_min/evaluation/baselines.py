@@ -113,7 +113,8 @@ def tune_baselines(
     """
     start, goals = tuning_set(machine, runs, seed)
     cost = partial(tuning_cost, start=start, goals=goals, seed=seed)
-    tuned, record = {}, {}
+    tuned = {}
+    record = {}
     for name, controller in baselines(machine, net).items():
         tuned[name], costs = tune(controller, cost, seed, generations, name)
         copies = np.tile(gains_vector(tuned[name].gains), (16, 1))
@@ -129,7 +130,8 @@ def tuning_cost(controller: JacobianController, start: Array, goals: Array, seed
     `start` [rad] (runs, n) and `goals` [m/s] (T, runs, 3) are of `tuning_set`.
     """
     vectors = gains_vector(controller.gains)
-    candidates, runs = len(vectors), len(start)
+    runs = len(start)
+    candidates = len(vectors)
     batch = replace(controller, gains=split_vector(np.repeat(vectors, runs, axis=0)))
     start = np.tile(start, (candidates, 1))
     goals = np.tile(goals, (1, candidates, 1))

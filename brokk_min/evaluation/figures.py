@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from brokk_min.actuator import ActuatorNet
 from brokk_min.evaluation.metrics import Mean, Traces
-from brokk_min.evaluation.preliminary import Motion, Tests
+from brokk_min.evaluation.preliminary import Motion, SimulatorTests
 from brokk_min.evaluation.sequences import AXES, Commands
 from brokk_min.identification import validation
 from brokk_min.identification.files import read_table, whole_file
@@ -74,7 +74,8 @@ def plot_panels(
             if one_legend:
                 ax.set_title(panel.title, fontsize="medium")
             else:
-                place = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncol": 2}
+                place: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0)}
+                place["ncol"] = 2 if len(row) > 2 else 4
                 ax.legend(title=panel.title, frameon=False, **place)
         for ax in axes[len(row) :]:
             ax.remove()
@@ -100,7 +101,7 @@ def _time_panels(dt: float, labels: Sequence[str], curves: Mapping[str, Array]) 
 # --- preliminary tests ----------------------------------------------------------------------------
 
 
-def plot_tests(machine: Machine, tests: Mapping[str, Tests]) -> Figure:
+def plot_tests(machine: Machine, tests: Mapping[str, SimulatorTests]) -> Figure:
     """Range and direction, coupling, and past movement; machine above nets. Paper: Fig. 2"""
     name = machine.names[machine.driven[-1]]
     angle = f"{name} [rad]"

@@ -41,15 +41,14 @@ def metrics(machine: Machine, trace: Trace, goals: Array, start: Array) -> dict[
     m, m/s, m/s^3, s; valve travel in full strokes; reward 1. `goals` [m/s] (T, num, 3), `start`
     tool positions before the first tick [m] (num, 3).
     """
-    dt, driven = machine.dt, machine.driven
     error = norm(goals - trace.v_tool, axis=-1)
     drift = line_distance(trace.p_tool, goals, start)
     jerk = np.diff(trace.v_tool, n=2, axis=0) * machine.rate**2
     ticks = ticks_since_change(machine, goals)
     transient = (ticks >= 0) & (ticks < round(TRANSIENT * machine.rate))
-    position_error = start + np.cumsum(goals, axis=0) * dt - trace.p_tool
+    position_error = start + np.cumsum(goals, axis=0) * machine.dt - trace.p_tool
     margin = np.minimum(trace.q - machine.column("q_min"), machine.column("q_max") - trace.q)
-    at_limit = margin[..., driven].min(axis=-1) < AT_LIMIT
+    at_limit = margin[..., machine.driven].min(axis=-1) < AT_LIMIT
     return {
         "velocity_rmse": np.sqrt(np.mean(error**2, axis=0)),
         "velocity_error_mean": error.mean(axis=0),
@@ -61,7 +60,7 @@ def metrics(machine: Machine, trace: Trace, goals: Array, start: Array) -> dict[
         "position_error_mean": norm(position_error, axis=-1).mean(axis=0),
         "jerk_rms": np.sqrt(np.sum(jerk**2, axis=-1).sum(axis=0) / max(1, len(jerk))),
         "valve_travel": np.abs(np.diff(trace.u, axis=0, prepend=0 * trace.u[:1])).sum(axis=(0, 2)),
-        "time_at_limits": at_limit.sum(axis=0) * dt,
+        "time_at_limits": at_limit.sum(axis=0) * machine.dt,
         "reward_mean": trace.reward.mean(axis=0),
     }
 

@@ -106,8 +106,10 @@ class PerfectModel:
         """
         m = self.machine
         num, horizon, n = opening.shape
-        from_block = np.repeat(np.triu(np.ones((len(BLOCKS), len(BLOCKS)))), BLOCKS, axis=1)
-        basis = np.einsum("bt,jk->bjtk", from_block, np.eye(n)).reshape(-1, horizon, n)
+        blocks = len(BLOCKS)
+        from_block = np.repeat(np.triu(np.ones((blocks, blocks))), BLOCKS, axis=1)
+        basis = from_block[:, None, :, None] * np.eye(n)[:, None]  # (blocks, n, horizon, n)
+        basis = basis.reshape(blocks * n, horizon, n)  # (parameters, horizon, n_driven)
         plans = opening[:, None] + PROBE * np.concatenate([np.zeros((1, horizon, n)), basis])
         limit = valve_opening(m.pwm_limit / PWM_MAX, m.dead_zone)
         u = self.commands(np.clip(plans, -limit, limit), tick)
@@ -118,16 +120,16 @@ class PerfectModel:
         J_t = ((error[:, 1:] - error[:, :1]) * weight).reshape(num, len(basis), -1) / PROBE
         A = J_t @ J_t.swapaxes(1, 2) + 1e-3 * np.eye(len(basis))  # J^T J + regularisation
         x = np.linalg.solve(A, -(J_t @ r[..., None]))[..., 0]  # A x = -J^T r
-        return np.asarray(np.einsum("np,pth->nth", x, basis))
+        return np.asarray(np.einsum("rp,ptj->rtj", x, basis))  # run, parameter, tick, joint
 
     def quantise(self, plant: PlantState, opening: Array, goal: Array, tick: int) -> Array:
         """First commands (num, n) of a plan in whole counts, by the best of all roundings."""
-        m, driven = self.machine, self.machine.driven
-        up = np.array(list(product((False, True), repeat=len(driven))))  # (2^n_driven, n_driven)
+        m = self.machine
+        up = np.array(list(product((False, True), repeat=len(m.driven))))  # (2^n_driven, n_driven)
         u = self.commands(opening[:, :ROUNDING], tick)
         u = np.repeat(u[:, None], len(up), axis=1)  # (num, 2^n_driven, ROUNDING, n)
-        counts = u[:, :, 0, driven] * PWM_MAX
-        u[:, :, 0, driven] = np.where(up, np.ceil(counts), np.floor(counts)) / PWM_MAX
+        counts = u[:, :, 0, m.driven] * PWM_MAX
+        u[:, :, 0, m.driven] = np.where(up, np.ceil(counts), np.floor(counts)) / PWM_MAX
         u[:, :, 0] = limit_command(m, u[:, :, 0])
         cost = np.linalg.norm(self.errors(plant, u, goal), axis=-1).mean(axis=-1)
         best: Array = u[np.arange(len(u)), cost.argmin(axis=1), 0]
@@ -139,12 +141,11 @@ def steady_opening(machine: Machine, q: Array, goal: Array) -> Array:
     driven = machine.driven
     J = jacobian(forward_kinematics(machine, q))[..., driven]
     J_inv = dls(J, np.ones(len(driven)), np.full(len(q), 1e-3))
-    q_dot = (J_inv @ goal[..., None])[..., 0]
-    v = q_dot * lever_arm(machine, q)[:, driven]  # of the cylinders [m/s]
-    K = np.where(
-        v > 0, machine.column("speed_positive")[driven], machine.column("speed_negative")[driven]
-    )
-    opening: Array = v / K
+    q_dot = np.zeros_like(q)
+    q_dot[:, driven] = (J_inv @ goal[..., None])[..., 0]
+    v = q_dot * lever_arm(machine, q)  # of the cylinders [m/s]
+    K = np.where(v > 0, machine.column("speed_positive"), machine.column("speed_negative"))
+    opening: Array = (v / K)[:, driven]
     return opening
 
 

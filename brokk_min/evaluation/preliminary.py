@@ -3,6 +3,7 @@
 Angles are exact and velocities are means over a tick: encoders and estimators play no part.
 """
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,7 +35,7 @@ class Sweep(NamedTuple):
     q_dot: Array  # rad/s
 
 
-class Tests(NamedTuple):
+class SimulatorTests(NamedTuple):
     """The preliminary tests of one simulator with its last driven joint."""
 
     sweeps: dict[str, Sweep]  # by PWM byte
@@ -55,30 +56,31 @@ class Motion(NamedTuple):
 class Preliminary(NamedTuple):
     """All preliminary measurements."""
 
-    tests: dict[str, Tests]  # of machine and nets
+    tests: dict[str, SimulatorTests]  # of machine and nets
     gap: Motion  # nets less machine
 
 
 def run(machine: Machine, net: ActuatorNet, seed: int) -> Preliminary:
     """Test the machine and its nets, and compare them. Paper: Sec. 3.2 and 4.1"""
-    simulators = {"machine": plant_simulator(machine), "nets": driven_nets(machine, net)}
-    tests = {name: preliminary_tests(machine, move) for name, move in simulators.items()}
-    return Preliminary(tests, sim_to_real(machine, net, seed))
+    both = simulators(machine, net)
+    tests = {name: preliminary_tests(machine, simulate) for name, simulate in both.items()}
+    return Preliminary(tests, sim_to_real(machine, both, seed))
 
 
-def driven_nets(machine: Machine, net: ActuatorNet) -> Simulator:
-    """Nets for the driven joints of a machine, whose locked joints rest."""
+def simulators(machine: Machine, net: ActuatorNet) -> dict[str, Simulator]:
+    """The "machine", and the "nets" of its driven joints, under which locked joints rest."""
+    driven = machine.driven
     simulate = net_simulator(select_nets(machine, net))
 
-    def all_joints(q: Array, u: Array) -> Array:
+    def nets(q: Array, u: Array) -> Array:
         angles = np.repeat(q[None], len(u) + 1, axis=0)
-        angles[..., machine.driven] = simulate(q[..., machine.driven], u[..., machine.driven])
+        angles[..., driven] = simulate(q[..., driven], u[..., driven])
         return angles
 
-    return all_joints
+    return {"machine": plant_simulator(machine), "nets": nets}
 
 
-def preliminary_tests(machine: Machine, simulate: Simulator) -> Tests:
+def preliminary_tests(machine: Machine, simulate: Simulator) -> SimulatorTests:
     """Range and direction, coupling, past movement. Paper: Sec. 3.2, Fig. 2"""
     joint = int(machine.driven[-1])
     limit = machine.pwm_limit / PWM_MAX
@@ -97,7 +99,7 @@ def preliminary_tests(machine: Machine, simulate: Simulator) -> Tests:
     from_idle, moving = step_velocity(angles, machine.rate)[:, :, 0, joint].T
     time = (np.arange(2 * wait) + 0.5 - wait) * machine.dt
     times = response_times(angles, machine.rate)[..., machine.driven]
-    return Tests(
+    return SimulatorTests(
         dict(zip(names, alone, strict=True)),
         {"alone": alone[1], "with the others": together},
         {"from idle": (time, from_idle), "while moving": (time, moving)},
@@ -132,7 +134,7 @@ def sweeps(machine: Machine, simulate: Simulator, joint: int, u: Array) -> list[
     return result
 
 
-def sim_to_real(machine: Machine, net: ActuatorNet, seed: int) -> Motion:
+def sim_to_real(machine: Machine, both: Mapping[str, Simulator], seed: int) -> Motion:
     """Nets less machine under commands that move several joints. Paper: Sec. 4.1, Fig. 5"""
     middle = (machine.column("q_min") + machine.column("q_max")) / 2
     start = np.array(machine.q_start or middle)
@@ -141,8 +143,8 @@ def sim_to_real(machine: Machine, net: ActuatorNet, seed: int) -> Motion:
     driven = [r.u for r in log.recordings if r.u[:, machine.driven].any()]
     u = np.stack(driven[:GAP_RUNS], axis=1)
     q = np.tile(start, (GAP_RUNS, 1))
-    real = _motion(machine, plant_simulator(machine)(q, u))
-    simulated = _motion(machine, driven_nets(machine, net)(q, u))
+    real = _motion(machine, both["machine"](q, u))
+    simulated = _motion(machine, both["nets"](q, u))
     return Motion(*(one - other for one, other in zip(simulated, real, strict=True)))
 
 

@@ -132,7 +132,8 @@ def paper_recipe(
     log = log._replace(recordings=recordings)
     config = replace(config, **fitting.PAPER_RECIPE)
     net = fitting.fit(log, config, seed, machine.velocity_samples, machine.name)
-    gap = preliminary.gap_numbers(machine, preliminary.sim_to_real(machine, net, seed))
+    both = preliminary.simulators(machine, net)
+    gap = preliminary.gap_numbers(machine, preliminary.sim_to_real(machine, both, seed))
     return {"test": validation.score(net, test), "sim_to_real": gap}
 
 

@@ -64,9 +64,8 @@ def rollout(
     ticks = []
     for goal in goals:
         v_goal = np.broadcast_to(goal.astype(np.float32), state.v_goal.shape)
-        integral = state.error_integral
         noise = draw_noise(machine, config.noise, len(state.q), rng)
-        measured = measure(machine, state.history, v_goal, integral, noise)
+        measured = measure(machine, state.history, v_goal, state.error_integral, noise)
         u, controller_state = controller(measured, controller_state)
         q_measured = state.history[..., 0, -1]
         state = transition(machine, net, replace(state, v_goal=v_goal), u, read)

@@ -109,10 +109,10 @@ def hold_table(machine: Machine, goals: Array) -> Array:
 
 
 def read_commands(path: Path, machine: Machine) -> list[Commands]:
-    """Sequences of a CSV `sequence,time,vx,vy,vz` [s, m/s], each value held until the next row.
+    """Sequences of a CSV `sequence,time,vx,vy,vz` [s, m/s]; values hold until the next row.
 
-    The last row of a sequence marks its end. ValueError: fewer than two rows, times that do not
-    rise, less than a tick, or the name "all".
+    The last row of a sequence marks its end. ValueError: no such table, times that do not rise,
+    less than a tick, or the name "all".
     """
     table = files.read_table(path, ["sequence", "time", "vx", "vy", "vz"], text=("sequence",))
     velocity = np.stack([table["vx"], table["vy"], table["vz"]], axis=1)
@@ -254,10 +254,10 @@ def feasible(machine: Machine, start: Array, goals: Array) -> NDArray[np.bool_]:
     """
     q = np.array(start, float)
     q_dot = np.zeros_like(q)
-    frames = forward_kinematics(machine, q)
-    p_goal = tool_position(frames)
-    result = np.asarray(lowest_point(frames) > machine.ground + 0.1)
+    p_goal = tool_position(forward_kinematics(machine, q))
+    result = np.ones(len(q), bool)
     for v_goal in goals:
+        frames = forward_kinematics(machine, q)
         p = tool_position(frames)
         J = jacobian(frames)[..., machine.driven]
         W = classic.limit_weights(machine, q, q_dot)[:, machine.driven]
@@ -270,7 +270,6 @@ def feasible(machine: Machine, start: Array, goals: Array) -> NDArray[np.bool_]:
         on_path = np.linalg.norm(p_goal - p, axis=-1) < 0.02
         above_ground = lowest_point(frames) > machine.ground + 0.1
         result &= on_path & above_ground & _within_limits(machine, q, q_dot)
-        frames = forward_kinematics(machine, q)
     return result
 
 

@@ -109,22 +109,14 @@ class SelectedController:
 class WindowDrive(Drive):
     """The 20 Hz loop, which sends telemetry to the window after each tick."""
 
-    def __init__(
-        self,
-        machine: Machine,
-        controllers: Sequence[Controller],
-        bus: Any,
-        operator: WindowOperator,
-    ) -> None:
-        super().__init__(machine, SelectedController(machine, controllers, operator), bus, operator)
-        self.window = operator
+    operator: WindowOperator
 
     def tick(self) -> bool:
         """One tick; a window that is silent gets nothing, because a full pipe would block."""
         more = super().tick()
         with self.catch_errors():
-            if more and not self.window.silent:
-                self.window.connection.send(self.telemetry())
+            if more and not self.operator.silent:
+                self.operator.connection.send(self.telemetry())
         return more
 
     def telemetry(self) -> Telemetry:
@@ -134,7 +126,7 @@ class WindowDrive(Drive):
         v_goal = np.array(self.operator_input.v_goal)
         gate = self.gate
         flags = (bool(gate.driving), int(gate.active_fault), int(gate.latched_fault))
-        mode = self.window.request.mode
+        mode = self.operator.request.mode
         return Telemetry(self.ticks, q, q_dot, u, v_goal, *flags, mode, self.lateness)
 
 
@@ -148,7 +140,8 @@ def control(
     try:
         with simulated, open_bus(interface, channel, options.log) as bus:
             operator = WindowOperator(machine, connection)
-            drive = WindowDrive(machine, controllers, bus, operator)
+            selected = SelectedController(machine, controllers, operator)
+            drive = WindowDrive(machine, selected, bus, operator)
             drive.begin()
             connection.send(drive.telemetry())  # from now on the window sends requests
             drive.run()

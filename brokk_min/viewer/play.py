@@ -5,6 +5,7 @@ The window sends requests to the loop (`control_process`) and shows the telemetr
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from brokk_min.machine import Array, Machine
 from brokk_min.viewer import control_process, drawing, tracing
 from brokk_min.viewer.control_process import BusOptions, Request
 from brokk_min.viewer.input_handler import LEVER_KEYS, PAD_SWITCH, InputHandler
-from brokk_min.viewer.window import Canvas, Colour, Window, open_window
+from brokk_min.viewer.window import Canvas, Colour, Window
 
 SIZE = (1120, 680)  # of the window [px]
 STALE = 0.5  # s without telemetry, then angles count as unknown (assumed)
@@ -209,7 +210,7 @@ def play(
     """
     session = Session(machine, [*controllers, "levers"], attempts)
     with (
-        open_window(SIZE, f"brokk_min: {machine.name}") as window,
+        closing(Window(SIZE, f"brokk_min: {machine.name}")) as window,
         control_process.start(machine, list(controllers.values()), options) as connection,
     ):
         show(
@@ -228,7 +229,7 @@ def watch(
     session = Session(machine, [], None)
     reader = TelemetryReader(machine)
     with (
-        open_window(SIZE, f"brokk_min: {machine.name}") as window,
+        closing(Window(SIZE, f"brokk_min: {machine.name}")) as window,
         open_bus(options.interface, options.channel, options.log) as bus,
     ):
 

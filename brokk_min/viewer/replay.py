@@ -3,6 +3,7 @@
 import json
 import subprocess
 from collections.abc import Iterable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,8 +16,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet
-from brokk_min.can.canopen import read_frames
-from brokk_min.can.drive_log import TelemetryReader
+from brokk_min.can.drive_log import TelemetryReader, read_frames
 from brokk_min.evaluation import baselines, metrics
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.evaluation.sequences import Commands, goals_and_starts, task_sequences
@@ -25,7 +25,7 @@ from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocit
 from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import Array, Machine
 from brokk_min.viewer import camera, drawing
-from brokk_min.viewer.window import Canvas, Colour, open_window
+from brokk_min.viewer.window import Canvas, Colour, Window
 
 FFMPEG = (  # raw pictures in, MP4 of even width and height out
     "ffmpeg -loglevel error -f rawvideo -pix_fmt rgb24 -s {0}x{1} -r {2} -i - -pix_fmt yuv420p "
@@ -233,7 +233,7 @@ def show_film(machine: Machine, runs: Sequence[Run], size: tuple[int, int]) -> N
     second = round(machine.rate)
     tick = 0
     playing = True
-    with open_window(size, "brokk_min replay") as window:
+    with closing(Window(size, "brokk_min replay")) as window:
         pg = window.pygame
         steps = {pg.K_RIGHT: second, pg.K_LEFT: -second}
         while True:

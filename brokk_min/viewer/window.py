@@ -1,13 +1,10 @@
 """Canvas and window of pygame (extra `play`), which is imported when the first one is made."""
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
@@ -94,21 +91,34 @@ def _word(text: str, size: int, colour: Colour) -> Any:
 @lru_cache(maxsize=16)
 def _font(size: int) -> Any:
     """The typeface that matplotlib brings: the same everywhere."""
+    import matplotlib
+
     pygame = require_pygame()
     pygame.font.init()
     return pygame.font.Font(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf", size)
 
 
 class Window:
-    """A window for canvases; ValueError: no pygame, or no display."""
+    """A window for canvases.
+
+    Without a display SDL would draw unseen; that is refused unless SDL_VIDEODRIVER asks for it.
+
+    ValueError: no pygame, or no display.
+    """
 
     def __init__(self, size: tuple[int, int], title: str) -> None:
         self.pygame = require_pygame()
         try:
             self.pygame.display.init()
             self.surface = self.pygame.display.set_mode(size)
+            unseen = self.pygame.display.get_driver() in ("offscreen", "dummy")
+            problem = "none" if unseen and not os.environ.get("SDL_VIDEODRIVER") else ""
         except self.pygame.error as error:
-            raise _no_display(str(error)) from error
+            problem = str(error)
+        if problem:
+            self.close()
+            hint = "SDL_VIDEODRIVER=dummy draws unseen"
+            raise ValueError(f"window: expected a display ({hint}), got {problem}")
         self.pygame.display.set_caption(title)
         self.clock = self.pygame.time.Clock()
 
@@ -121,25 +131,3 @@ class Window:
     def close(self) -> None:
         """Close the window; what else uses pygame goes on."""
         self.pygame.display.quit()
-
-
-def _no_display(got: str) -> ValueError:
-    return ValueError(f"window: expected a display (SDL_VIDEODRIVER=dummy draws unseen), got {got}")
-
-
-@contextmanager
-def open_window(size: tuple[int, int], title: str) -> Iterator[Window]:
-    """A window that is closed at the end of the block.
-
-    Without a display SDL would draw unseen; that is refused unless SDL_VIDEODRIVER asks for it.
-
-    ValueError: no pygame, or no display.
-    """
-    window = Window(size, title)
-    try:
-        unseen = window.pygame.display.get_driver() in ("offscreen", "dummy")
-        if unseen and not os.environ.get("SDL_VIDEODRIVER"):
-            raise _no_display("none")
-        yield window
-    finally:
-        window.close()

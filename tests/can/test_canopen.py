@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import io
-import os
 import re
 import struct
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -27,7 +25,6 @@ from helpers_bus import (
     World,
     dictionary,
     own_multicast_port,
-    raises,
     recording,
 )
 
@@ -40,7 +37,6 @@ from brokk_min.can.canopen import (
     encoder_counts,
     encoder_raw,
     open_bus,
-    read_frames,
     sdo,
     unpack_operator_input,
     valve_frame,
@@ -221,18 +217,6 @@ def test_recv__sleeps_only_after_its_busy_wait(
     assert silent.t < 7.002  # what is there is read at once
 
 
-def test_recv__does_not_follow_the_time_of_day(monkeypatch: pytest.MonkeyPatch) -> None:
-    silent = SelectBus()
-    read, _ = os.pipe()
-    silent.fileno = lambda: read  # type: ignore[method-assign]
-    bus = Bus(silent)
-    real = time.time
-    monkeypatch.setattr("time.time", lambda: real() - 3600)
-    begun = time.monotonic()
-    assert bus.recv(0.02) is None
-    assert 0.015 < time.monotonic() - begun < 5.0
-
-
 @pytest.mark.parametrize("logged", [True, False])
 def test_close__has_written_all(logged: bool, tmp_path: Path) -> None:
     writer = can.CanutilsLogWriter(tmp_path / "a.log") if logged else None
@@ -254,37 +238,6 @@ def test_open_bus__refuses_a_bus_that_is_not_there_or_fails() -> None:
     refusal = r"virtual v: expected a CAN bus that works, got CanOperationError\('full'\)"
     with pytest.raises(ValueError, match=refusal), open_bus("virtual", "v"):
         raise can.CanOperationError("full")
-
-
-@pytest.mark.parametrize("text", ["nonsense\n", "(1.0) can0 12#zz\n", "(x) can0 123#00 R\n"])
-def test_read_frames__refuses_what_is_no_log(text: str, tmp_path: Path) -> None:
-    (tmp_path / "bad.log").write_text(text)
-    with pytest.raises(ValueError, match=r"bad\.log: expected a candump log, got"):
-        list(read_frames(tmp_path / "bad.log"))
-
-
-def test_read_frames__reads_a_cut_log_up_to_its_last_whole_line(tmp_path: Path) -> None:
-    text = "(1.000000) can0 123#0102 R\n(2.000000) can0 080#AABB T\n"
-    for size in range(len(text) + 1):
-        (tmp_path / "cut.log").write_text(text[:size])
-        times = [frame.time for frame in read_frames(tmp_path / "cut.log")]
-        assert times == [1.0, 2.0][: text[:size].count("\n")]
-
-
-def test_read_frames__reads_a_plain_candump_log_too(tmp_path: Path) -> None:
-    lines = ["(1.0) can0 123#0102\n", "(2.0) can0 12345678#\n", "(3.0) can0 080# T\n"]
-    (tmp_path / "can.log").write_text("".join(lines))
-    assert list(read_frames(tmp_path / "can.log")) == [
-        Frame(1.0, 0x123, b"\x01\x02", False, "can0"),
-        Frame(2.0, -1, b"", False, "can0"),
-        Frame(3.0, 0x80, b"", True, "can0"),
-    ]
-
-
-def test_read_frames__names_the_missing_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "can", None)
-    with pytest.raises(ValueError, match=r"^can: expected the extra brokk_min\[hw\], got"):
-        list(read_frames(Path("a.log")))
 
 
 def test_open_bus__gives_back_no_echo_over_udp(
@@ -374,13 +327,6 @@ def test_sdo__reads_small_objects_and_skips_foreign_answers(world: World) -> Non
     assert sdo(world.bus, 1, (0x1000, 0)) == 406
     with pytest.raises(ValueError, match="0x06010000"):
         sdo(world.bus, 1, (0x1000, 0), 5)
-
-
-def test_recv__of_a_bus_without_descriptor_waits_by_python_can(
-    buses: tuple[can.BusABC, can.BusABC], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("select.select", raises(OSError("no descriptor to wait on")))
-    assert Bus(buses[0]).recv(0.01) is None
 
 
 # --- a peer: the canopen library -----------------------------------------------------------------

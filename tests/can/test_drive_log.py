@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,10 +18,16 @@ from brokk_min.can.canopen import (
     Frame,
     OperatorInput,
     encoder_raw,
-    read_frames,
     valve_frame,
 )
-from brokk_min.can.drive_log import ReplayedBus, TelemetryReader, compare, log_for_fit, replay
+from brokk_min.can.drive_log import (
+    ReplayedBus,
+    TelemetryReader,
+    compare,
+    log_for_fit,
+    read_frames,
+    replay,
+)
 from brokk_min.identification.logs import read_log, write_log
 from brokk_min.machine import BROKK_170, estimate_velocity
 
@@ -49,6 +56,37 @@ def drive_logged(path: Path, seconds: float = 4.0) -> World:
 
 def sent(frames: list[Frame]) -> list[tuple[int, bytes]]:
     return [(f.id, f.data) for f in frames if f.sent and f.channel != OPERATOR_CHANNEL]
+
+
+@pytest.mark.parametrize("text", ["nonsense\n", "(1.0) can0 12#zz\n", "(x) can0 123#00 R\n"])
+def test_read_frames__refuses_what_is_no_log(text: str, tmp_path: Path) -> None:
+    (tmp_path / "bad.log").write_text(text)
+    with pytest.raises(ValueError, match=r"bad\.log: expected a candump log, got"):
+        list(read_frames(tmp_path / "bad.log"))
+
+
+def test_read_frames__reads_a_cut_log_up_to_its_last_whole_line(tmp_path: Path) -> None:
+    text = "(1.000000) can0 123#0102 R\n(2.000000) can0 080#AABB T\n"
+    for size in range(len(text) + 1):
+        (tmp_path / "cut.log").write_text(text[:size])
+        times = [frame.time for frame in read_frames(tmp_path / "cut.log")]
+        assert times == [1.0, 2.0][: text[:size].count("\n")]
+
+
+def test_read_frames__reads_a_plain_candump_log_too(tmp_path: Path) -> None:
+    lines = ["(1.0) can0 123#0102\n", "(2.0) can0 12345678#\n", "(3.0) can0 080# T\n"]
+    (tmp_path / "can.log").write_text("".join(lines))
+    assert list(read_frames(tmp_path / "can.log")) == [
+        Frame(1.0, 0x123, b"\x01\x02", False, "can0"),
+        Frame(2.0, -1, b"", False, "can0"),
+        Frame(3.0, 0x80, b"", True, "can0"),
+    ]
+
+
+def test_read_frames__names_the_missing_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "can", None)
+    with pytest.raises(ValueError, match=r"^can: expected the extra brokk_min\[hw\], got"):
+        list(read_frames(Path("a.log")))
 
 
 def test_replay__of_a_recorded_log_sends_the_same_bytes(tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import canopen
@@ -20,7 +19,7 @@ from helpers_bus import START, Out, dictionary, eventually, recorded_rows, serve
 
 from brokk_min.actuator import plant_reset, plant_step
 from brokk_min.can.canopen import HEARTBEAT_PERIOD, Frame, encoder_raw, valve_frame
-from brokk_min.can.simulated_machine import WATCHDOG, SimulatedMachine, serve, simulate, start_pose
+from brokk_min.can.simulated_machine import WATCHDOG, SimulatedMachine, simulate, start_pose
 from brokk_min.identification.logs import read_log
 from brokk_min.machine import BROKK_170
 
@@ -180,21 +179,6 @@ def test_advance__moves_the_plant_under_the_command_in_force() -> None:
         state = plant_step(BROKK_170, state, np.array([80, 0, -40, 0, 0]) / 127)
     np.testing.assert_allclose(machine.plant.q, state.q, atol=1e-12)
     assert len(machine.rows) == 20 and machine.rows[-1][1][0] == pytest.approx(80 / 127)
-
-
-def test_serve__answers_until_it_is_to_stop() -> None:
-    sent: Out = []
-    frames = [Frame(100.0, 0x000, b"\x01\x00"), None, Frame(100.0, 0x080, b"")]
-    waits: list[float] = []
-    bus: Any = SimpleNamespace(
-        now=lambda: 100.001,
-        send=lambda *frame: sent.append(frame),
-        recv=lambda wait: waits.append(wait) or frames.pop(0),
-    )
-    serve(Machine(), bus, lambda: bool(frames))
-    answers = [(0x180 + i, struct.pack("<I", raw)) for i, raw in enumerate(RAW, 1)]
-    assert sent == [*((0x700 + node, b"\x00") for node in NODES), *answers]
-    assert waits == pytest.approx([0.004] * 3)
 
 
 def test_start_pose__is_the_given_one_the_machines_or_the_middle() -> None:

@@ -14,7 +14,7 @@ import pytest
 from helpers_bus import MULTICAST, START, eventually, own_multicast_port, recorded_rows, served
 
 from brokk_min.__main__ import main
-from brokk_min.can.canopen import read_frames
+from brokk_min.can.drive_log import read_frames
 from brokk_min.identification.files import SHIPPED
 from brokk_min.identification.logs import read_log
 

@@ -41,20 +41,12 @@ def test_command__interpolates_between_angles_and_holds_beyond_them(
     angle: float, speed: float
 ) -> None:
     """Speeds at full command are 1, 2 and 4 rad/s at -1, 0.5 and 2 rad."""
-    scale, u = np.array([1.0, 2.0, 4.0])[None, :, None], np.array([-1.0, 0.0, 1.0])
+    u = np.array([-1.0, 0.0, 1.0])
+    scale = np.array([1.0, 2.0, 4.0])[None, :, None]
     steady = StaticMap(np.array([[-1.0, 0.5, 2.0]]), u, scale * u)
     for q_dot in (0.5, -0.25):
         result = steady.command(np.array([float(angle)]), np.array([q_dot]))
         np.testing.assert_allclose(result, [q_dot / speed], atol=1e-9)
-
-
-def test_command__takes_each_joint_by_its_own_map() -> None:
-    """Halfway between its angles the first joint moves at 1.5 rad/s, the second at 4.5."""
-    u = np.array([-1.0, 0.0, 1.0])
-    velocity = np.array([[u, 2 * u], [3 * u, 6 * u]])
-    steady = StaticMap(np.array([[0.0, 1.0], [0.0, 1.0]]), u, velocity)
-    result = steady.command(np.array([0.5, 0.5]), np.array([0.75, 0.75]))
-    np.testing.assert_allclose(result, [0.75 / 1.5, 0.75 / 4.5], atol=1e-9)
 
 
 def test_static_map__is_the_fixed_point_of_steady_motion() -> None:

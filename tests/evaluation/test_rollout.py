@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from helpers_machines import closed_form, small_net
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -107,11 +106,3 @@ def test_rollout__keeps_commands_of_any_machine_within_its_limit(
     assert np.abs(trace.u).max() <= machine.pwm_limit / 127 + 1e-9
     assert not trace.u[..., machine.locked].any()
     assert ((trace.reward > 0) & (trace.reward <= 1)).all()
-
-
-def test_rollout__a_controller_without_commands_stands_still() -> None:
-    controller = Playback(np.zeros((20, 2, 5)))
-    goals = np.tile([0.0, 0.0, 0.2], (20, 2, 1))
-    trace = rollout(BROKK_170, controller, START, goals, TaskConfig(), np.random.default_rng(0))
-    np.testing.assert_array_equal(trace.q, np.tile(START, (20, 1, 1)))
-    assert trace.reward == pytest.approx(1 / 1.2)

@@ -124,7 +124,7 @@ def test_read_commands__holds_values_until_the_next_row(tmp_path: Path) -> None:
         ("", "expected a header"),
         ("sequence,time,vx,vy\na,0,0,0\n", "row 1: expected a column vz"),
         ("sequence,time,vx,vy,vz\na,0,0,0,fast\na,1,0,0,0\n", "row 2, column vz: expected a numb"),
-        ("sequence,time,vx,vy,vz\na,0,0,0,nan\na,1,0,0,0\n", "row 2, column vz: expected a finite"),
+        ("sequence,time,vx,vy,vz\na,0,0,0,nan\na,1,0,0,0\n", "row 2, column vz: expected a numb"),
         ("sequence,time,vx,vy,vz\na,1,0,0,0\na,0,0,0,0\n", "sequence a: expected two or more rows"),
         (
             "sequence,time,vx,vy,vz\na,1,0,0,0\na,1,1,0,0\na,2,0,0,0\n",
@@ -173,7 +173,8 @@ def test_read_starts__refuses_poses_out_of_range_or_in_the_ground(
 
 
 def test_goals_and_starts__are_of_the_files_or_the_machines_own(tmp_path: Path) -> None:
-    starts_file, commands_file = tmp_path / "s.csv", tmp_path / "c.csv"
+    starts_file = tmp_path / "s.csv"
+    commands_file = tmp_path / "c.csv"
     s.write_starts(starts_file, BROKK_170, START[None])
     commands_file.write_text("sequence,time,vx,vy,vz\na,0,0.1,0,0\na,1,0,0,0\n")
     commands, starts = s.goals_and_starts(BROKK_170, commands_file, starts_file, 9, 0)
@@ -291,7 +292,8 @@ def test_feasible__refuses_a_path_through_a_singularity() -> None:
 @pytest.mark.parametrize("end", ["q_min", "q_max"])
 def test_feasible__keeps_a_margin_to_joint_limits(joint: int, end: str) -> None:
     inward = 1 if end == "q_min" else -1
-    near, far = np.array([0.0, *START[1:]]), np.array([0.0, *START[1:]])
+    near = np.array([0.0, *START[1:]])
+    far = near.copy()
     near[joint] = BROKK_170.column(end)[joint] + inward * 0.049
     far[joint] = BROKK_170.column(end)[joint] + inward * 0.051
     high_enough = lowest_point(forward_kinematics(BROKK_170, far)) > 0.1

@@ -7,6 +7,7 @@ import runpy
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +19,16 @@ from helpers_bus import START, Push, World, recording
 from helpers_canvas import Recorder
 from helpers_viewer import MODES, Operator, post, post_key, telemetry
 
-from brokk_min.__main__ import main
 from brokk_min.can.canopen import OperatorInput
 from brokk_min.can.drive_log import Telemetry
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170, Machine
-from brokk_min.viewer import drawing, play, replay, tracing
+from brokk_min.viewer import drawing, play, replay
 from brokk_min.viewer.control_process import BusOptions, Request
 from brokk_min.viewer.input_handler import InputHandler
 from brokk_min.viewer.play import Session
 from brokk_min.viewer.tracing import Attempt
-from brokk_min.viewer.window import open_window
+from brokk_min.viewer.window import Window
 
 REPOSITORY = Path(__file__).parents[2]
 MINI_EXCAVATOR = runpy.run_path(f"{REPOSITORY}/examples/mini_excavator.py")["MINI_EXCAVATOR"]
@@ -230,7 +230,7 @@ def test_show__sends_requests_once_there_is_telemetry_and_takes_keys_frame_by_fr
             post_key(name)
         return bool(presses)
 
-    with open_window(play.SIZE, "test") as window:
+    with closing(Window(play.SIZE, "test")) as window:
         play.show(window, session, lambda: frames.pop(0), sent.append, each_frame, fps=500.0)
     assert [task for task, _ in tasks] == ["", "", "", "rectangle", "circle", "circle"]
     assert tasks[5][1] is not tasks[4][1]  # begun again
@@ -332,45 +332,8 @@ def test_watch__shows_another_programs_drive_and_sends_nothing() -> None:
     np.testing.assert_allclose(seen[-1].u[0] * 127, 60)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "status", "message"),
-    [
-        (["--interface", "virtual"], 2, "--interface, --channel"),
-        (["--drive"], 2, "--interface, --channel"),
-        (["--policy", "missing.npz"], 1, "missing.npz"),
-        (["--start", "0", "9"], 1, "start: expected 5 angles within the joints' ranges"),
-    ],
-)
-def test_play__refuses_wrong_use_in_one_line(
-    arguments: list[str], status: int, message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["play", *arguments]) == status
-    assert message in capsys.readouterr().err
-
-
-def test_play__says_that_there_is_no_display(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    pygame.display.quit()
-    monkeypatch.setenv("SDL_VIDEODRIVER", "nonsense")
-    assert main(["play", "--interface", "virtual", "--channel", "none"]) == 1
-    assert "window: expected a display" in capsys.readouterr().err
-
-
 def test_benchmark_of_the_window__runs() -> None:
     command = [sys.executable, "-m", "benchmarks.play", "--seconds", "0.3"]
     done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["ticks"] >= 2
-
-
-def test_tasks__are_all_offered_one_after_the_other() -> None:
-    session = Session(BROKK_170, MODES, None)
-    session.update(telemetry(), 0.0)
-    tasks = []
-    for _ in range(6):
-        session.next_task()
-        session.update(telemetry(), 0.0)
-        tasks.append(session.task)
-    names = list(tracing.task_lines(BROKK_170))
-    assert tasks == [*names, names[0]]

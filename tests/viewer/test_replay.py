@@ -12,7 +12,7 @@ import can
 import numpy as np
 import pygame
 import pytest
-from helpers_bus import BASELINE, START, Push
+from helpers_bus import BASELINE, START
 from helpers_viewer import PipedLoop, post_key
 from PIL import Image
 
@@ -183,23 +183,6 @@ def test_film__goes_by_one_clock_and_a_run_that_is_over_stands_still() -> None:
     assert (images[0][title] != images[10][title]).any()
 
 
-def test_write_film__simulates_results_again_into_a_gif(
-    results: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = results.with_name("film.gif")
-    command = ["replay", str(results), "--out", str(out), "--start", "1", "--size", "640", "360"]
-    assert main(command) == 0
-    film = Image.open(out)
-    assert (film.n_frames, film.size, film.info["duration"]) == (20, (640, 360), 100)  # type: ignore[attr-defined]
-    first = np.array(film.convert("RGB")).astype(int)
-    film.seek(19)
-    last = np.array(film.convert("RGB")).astype(int)
-    for half, colour in ((np.s_[:, :320], "rl"), (np.s_[:, 320:], "jacobian")):
-        error = np.abs(last[half] - drawing.COLOURS[colour]).sum(axis=-1)
-        assert (error < 12).sum() > 300
-        assert (first[half] != last[half]).any()
-
-
 @pytest.mark.parametrize(("fps", "frames"), [(10.0, 3), (7.0, 2), (100.0, 5)])
 def test_write_film__has_as_many_frames_a_second_as_ticks_allow(
     fps: float, frames: int, tmp_path: Path
@@ -287,43 +270,3 @@ def test_show_film__ends_when_the_window_is_closed() -> None:
     pygame.event.post(pygame.event.Event(pygame.QUIT))
     replay.show_film(BROKK_170, [run_of(3)], (640, 360))
     assert not pygame.display.get_init()
-
-
-def test_replay__shows_logs_and_results_side_by_side(
-    results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    log = tmp_path / "run.log"
-    recorded_log(log, Push(60, 0, 0, 0, 0), 0.3, (0.0, 0.0, 0.0))
-    for others in ([log, results], [results, results]):
-        out = tmp_path / "film.gif"
-        arguments = [*map(str, others), "--controllers", "rl", "--out", str(out), "--fps", "1"]
-        assert main(["replay", *arguments]) == 0
-        image = np.array(Image.open(out).convert("RGB")).astype(int)
-        for half in (image[:, :480], image[:, 480:]):
-            blue = np.abs(half - drawing.COLOURS["rl"]).sum(axis=-1) < 12
-            orange = np.abs(half - drawing.COLOURS["jacobian"]).sum(axis=-1) < 12
-            assert blue.sum() + orange.sum() > 300
-
-
-@pytest.mark.parametrize(
-    ("arguments", "status", "message"),
-    [
-        ([], 2, "LOGS"),
-        (["a", "b", "c"], 2, "LOGS"),
-        (["missing.log"], 1, "missing.log"),
-        (["missing.json"], 1, "missing.json"),
-        (["missing.json", "--fps", "0"], 2, "--fps"),
-        (["missing.log", "--size", "0", "0"], 2, "--size: expected some and 320 320"),
-        (["missing.json", "--size", "639", "360"], 2, "--size: expected some and 640 320"),
-        (["missing.json", "--size", "640", "9999"], 2, "--size"),
-        (["missing.json", "--controllers"], 2, "--controllers"),
-    ],
-)
-def test_replay__refuses_wrong_use_in_one_line(
-    arguments: list[str], status: int, message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    try:
-        assert main(["replay", *arguments]) == status
-    except SystemExit as stop:
-        assert stop.code == status
-    assert message in capsys.readouterr().err

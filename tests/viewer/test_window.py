@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import sys
+from contextlib import closing
 
 import numpy as np
 import pytest
 
-from brokk_min.viewer.window import BACKGROUND, Canvas, Window, open_window
+from brokk_min.viewer.window import BACKGROUND, Canvas, Window
 
 RED = (200, 0, 0)
 BLUE = (0, 0, 200)
@@ -74,7 +75,7 @@ def test_window__shows_a_canvas(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     canvas = Canvas((60, 40))
     canvas.bar(10.0, 50.0, 20.0, 5.0, RED)
-    with open_window((60, 40), "a title") as window:
+    with closing(Window((60, 40), "a title")) as window:
         window.show(canvas, 1000.0)
         pixels = window.pygame.surfarray.array3d(window.surface)
         np.testing.assert_array_equal(pixels.swapaxes(0, 1), canvas.image())
@@ -88,11 +89,11 @@ def test_window__refuses_a_computer_without_display(monkeypatch: pytest.MonkeyPa
         Window((60, 40), "none")
 
 
-def test_open_window__draws_unseen_only_if_asked_to(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_window__draws_unseen_only_if_asked_to(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "XDG_RUNTIME_DIR", "SDL_VIDEODRIVER"):
         monkeypatch.delenv(name, raising=False)
-    with pytest.raises(ValueError, match="window: expected a display"), open_window((9, 9), "none"):
-        pass
+    with pytest.raises(ValueError, match="window: expected a display"):
+        Window((9, 9), "none")
     monkeypatch.setenv("SDL_VIDEODRIVER", "offscreen")
-    with open_window((9, 9), "unseen") as window:
+    with closing(Window((9, 9), "unseen")) as window:
         assert window.pygame.display.get_init()

@@ -11,7 +11,13 @@ from helpers_bus import START, Push, World
 
 from brokk_min.can.drive_log import Telemetry
 from brokk_min.machine import BROKK_170
-from brokk_min.viewer.control_process import Request, WindowDrive, WindowOperator, receive_telemetry
+from brokk_min.viewer.control_process import (
+    Request,
+    SelectedController,
+    WindowDrive,
+    WindowOperator,
+    receive_telemetry,
+)
 from brokk_min.viewer.input_handler import InputHandler
 
 MODES = ["rl", "jacobian", "levers"]
@@ -63,7 +69,8 @@ class PipedLoop:
         self.connection, there = multiprocessing.Pipe()
         self.world = World(Push(), lambda driving, ready: None, log=log)  # type: ignore
         operator = WindowOperator(BROKK_170, there, lambda: self.world.t)
-        self.world.drive = WindowDrive(BROKK_170, controllers, self.world.bus, operator)
+        selected = SelectedController(BROKK_170, controllers, operator)
+        self.world.drive = WindowDrive(BROKK_170, selected, self.world.bus, operator)
         self.ticks: list[Telemetry] = []
         self.request(False)
         self.world.drive.begin()

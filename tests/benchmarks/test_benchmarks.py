@@ -1,0 +1,105 @@
+"""The benchmarks run: learners train, figures are numbers. What they measure is not tested."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks import deviations, limits, peers
+from benchmarks.rollout import random_net
+from brokk_min import kinematics
+from brokk_min.env import action_to_pwm
+from brokk_min.evaluation import metrics
+from brokk_min.learning.gym_env import TaskVectorEnv
+from brokk_min.machine import BROKK_170
+
+
+@pytest.mark.parametrize("learner", list(peers.LEARNERS))
+def test_peers__train_on_the_environment(learner: str, tmp_path: Path) -> None:
+    if learner == "rl_games" and not importlib.util.find_spec("rl_games"):
+        pytest.skip("rl_games is not installed")
+    out = tmp_path / "p.json"
+    options = peers.Options(learners=(learner,), target=9.0, threads=1, quick=True, json=out)
+    (row,) = peers.main(options)["runs"]
+    assert (row["learner"], row["updates"], row["seconds"]) == (learner, 2, None)
+    assert 0.3 < row["best"] < 1
+    assert row["trained_s"] > 0
+    assert json.loads(out.read_text())["runs"] == [row]
+
+
+def test_pid__gives_actions_for_its_commands() -> None:
+    env = TaskVectorEnv(3, random_net(np.random.default_rng(0)))
+    obs, _ = env.reset(seed=0)
+    assert env.state is not None
+    actions = peers.pid(env.net, None)(env, obs)
+    u = action_to_pwm(BROKK_170, actions)[:, BROKK_170.driven]
+    assert (abs(u) >= BROKK_170.dead_zone - 1e-9).any()
+    assert (np.sign(u) == np.sign(actions)).all()
+
+
+def test_best_setting__is_the_fastest_or_the_closest() -> None:
+    def row(rate: float, seconds: float | None, best: float) -> dict[str, Any]:
+        return {"learning_rate": rate, "planned": 100, "seconds": seconds, "best": best}
+
+    rows = [row(1e-3, None, 0.7), row(2e-3, None, 0.8)]
+    assert peers.best_setting(rows) == (2e-3, 100)
+    rows += [row(3e-3, 9.0, 0.9), row(4e-3, 8.0, 0.9)]
+    assert peers.best_setting(rows) == (4e-3, 100)
+
+
+def test_limits__are_measured(tmp_path: Path) -> None:
+    out = tmp_path / "l.json"
+    options = limits.Options(quick=True, threads=1, num_envs=(4, 8), json=out)
+    result = limits.main(options)
+    assert list(result["environment"]) == ["4", "8"]
+    assert all(row["step_over_products"] > 0 for row in result["environment"].values())
+    assert result["gradient"]["fraction_of_best"] > 0
+    assert result["kinematics"]["us_per_configuration"] > 0
+    assert json.loads(out.read_text())["gradient"] == result["gradient"]
+
+
+def test_shapes__are_the_products_of_a_gradient() -> None:
+    """171-256-128-64-4: forward and by weights everywhere, by inputs from the second layer on."""
+    actor, critic = (171 * 256 + 256 * 128 + 128 * 64 + 64 * last for last in (4, 1))
+    for outputs, both in (((4,), actor), ((4, 1), actor + critic)):
+        work = sum(m * k * n for m, k, n in limits.shapes(171, outputs, 10))
+        assert work == 10 * (3 * both - len(outputs) * 171 * 256)
+
+
+@pytest.mark.parametrize("kind", ["torch", "onednn"])
+def test_products__agree_with_numpy(kind: str) -> None:
+    sizes = limits.shapes(171, (4, 1), 10)
+    try:
+        products = limits.products(kind, sizes)()
+    except (AttributeError, RuntimeError):
+        pytest.skip(f"no {kind}")
+    for a, b in zip(limits.products("numpy", sizes)(), products, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-2)
+
+
+@pytest.mark.parametrize("entry", [deviations.a1, deviations.d3])
+def test_deviations__are_fractions_or_small_numbers(entry: Any) -> None:
+    assert all(0 <= value < 1 for value in entry().values())
+
+
+@pytest.mark.parametrize("entry", [deviations.a5, deviations.d7, deviations.d12, deviations.d14])
+def test_deviations__train_and_compare(entry: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One update of 64 ticks; what the policy does is not tested. All is as before afterwards."""
+
+    def evaluate(*_: object) -> tuple[list[dict[str, float]], None]:
+        row = {"velocity_error_mean": 0.1, "off_axis_drift_max": 0.02, "valve_travel": 20.0}
+        return [row], None
+
+    monkeypatch.setattr(deviations, "STEPS", 1)
+    monkeypatch.setattr(metrics, "evaluate", evaluate)
+    monkeypatch.setattr(deviations, "default_training", dict)
+    to_heading = kinematics.to_heading
+    table = entry()
+    assert len(table) in (6, 12)
+    assert set(table.values()) == {0.1, 0.02, 20.0}
+    assert kinematics.to_heading is to_heading

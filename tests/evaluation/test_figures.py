@@ -1,0 +1,248 @@
+"""Figures show the curves that they are given, with units, and legends that hide none."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers_machines import constant_net, line, small_net
+from matplotlib.colors import to_rgb, to_rgba
+
+from brokk_min.evaluation import figures
+from brokk_min.evaluation.figures import Panel
+from brokk_min.evaluation.preliminary import Motion, SimulatorTests, Sweep
+from brokk_min.evaluation.sequences import axis_sequences, task_sequences
+from brokk_min.identification import validation
+from brokk_min.identification.logs import Log, Recording
+from brokk_min.kinematics import forward_kinematics, tool_position
+from brokk_min.machine import BROKK_170
+
+POSE = list(BROKK_170.q_start)
+RNG = np.random.default_rng(0)
+
+
+def curves(ax: Any) -> dict[str, np.ndarray]:
+    return {curve.get_label(): np.array(curve.get_data()) for curve in ax.get_lines()}
+
+
+def ylabels(figure: Any) -> list[str]:
+    return [ax.get_ylabel() for ax in figure.axes]
+
+
+# --- panels ---------------------------------------------------------------------------------------
+
+
+def test_plot_panels__have_one_legend_and_the_scales_asked_for() -> None:
+    x = np.arange(3.0)
+    one, two, far = ({"rl": (x, k * x), "other": (x, k + x)} for k in (1, 2, 9))
+    rows = [[Panel("a", "t", "v", one), Panel("b", "t", "w", far)], [Panel("c", "t", "v", two)]]
+    figure = figures.plot_panels(rows, sharey="col")
+    assert [ax.get_title() for ax in figure.axes] == ["a", "b", "c"] and len(figure.legends) == 1
+    assert ylabels(figure) == ["v", "w", "v"] and figure.axes[0].get_xlabel() == "t"
+    np.testing.assert_array_equal(curves(figure.axes[1])["rl"], [x, 9 * x])
+    np.testing.assert_array_equal(curves(figure.axes[2])["other"], [x, 2 + x])
+    colors = [curve.get_color() for curve in figure.axes[0].get_lines()]
+    assert colors == [figures.STYLES["rl"]["color"], figures.OTHER_STYLES[1]["color"]]
+    limits = [ax.get_ylim() for ax in figure.axes]
+    assert limits[0] == limits[2] != limits[1]
+    assert tuple(figure.get_size_inches()) == (10.0, pytest.approx(5.5))
+    row = figures.plot_panels(rows[:1], sharey="row")
+    assert row.axes[0].get_ylim() == row.axes[1].get_ylim()
+
+
+def test_plot_panels__have_their_own_legends_above_the_curves() -> None:
+    x = np.linspace(0, 1, 5)
+    shown = [{f"{k}{i}": (x, x * i) for i in range(4)} for k in "ab"]
+    row = [Panel(f"panel {i}", "time [s]", "speed [m/s]", c) for i, c in enumerate(shown)]
+    figure = figures.plot_panels([row])
+    figure.draw_without_rendering()
+    left, right = (ax.get_legend().get_window_extent() for ax in figure.axes)
+    assert left.x1 <= right.x0 and not figure.legends
+    for ax, box in zip(figure.axes, (left, right), strict=True):
+        assert box.y0 >= ax.get_window_extent().y1 - 1
+    assert figure.axes[1].get_legend().get_title().get_text() == "panel 1"
+    letters = figure.axes[0].xaxis.label.get_fontsize()
+    assert letters * 7 / figures.WIDTH >= 7  # points, on a page 7 inches wide
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["rl", "jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff", "perfect_model"],
+        ["workspace", "limits", "extended"],
+    ],
+)
+def test_styles__differ_on_grey_paper(names: list[str]) -> None:
+    colors = np.array([to_rgb(figures.STYLES[name]["color"]) for name in names])
+    grey = np.sort(colors @ [0.299, 0.587, 0.114])
+    assert (np.diff(grey) > 0.1).all() and grey[-1] < 0.8
+
+
+# --- preliminary tests ----------------------------------------------------------------------------
+
+
+def test_plot_tests__shows_machine_above_nets() -> None:
+    x = np.arange(3.0)
+    rows = {}
+    for k, kind in enumerate(("machine", "nets"), 1):
+        sweeps, coupling = {"u = 50": Sweep(x, k * x)}, {"alone": Sweep(x, -k * x)}
+        rows[kind] = SimulatorTests(sweeps, coupling, {"from idle": (x, k + x)}, {})
+    figure = figures.plot_tests(BROKK_170, rows)
+    assert ylabels(figure) == ["velocity q5 [rad/s]"] * 6
+    assert [ax.get_xlabel() for ax in figure.axes[:3]] == [
+        "q5 [rad]", "q5 [rad]", "time after the step [s]"
+    ]  # fmt: skip
+    titles = [ax.get_legend().get_title().get_text() for ax in figure.axes[2:4]]
+    assert titles == ["machine: past movement", "nets: range and direction"]
+    np.testing.assert_array_equal(curves(figure.axes[3])["u = 50"], [x, 2 * x])
+    np.testing.assert_array_equal(curves(figure.axes[4])["alone"], [x, -2 * x])
+    np.testing.assert_array_equal(curves(figure.axes[5])["from idle"], [x, 2 + x])
+
+
+def test_plot_gap__shows_the_first_run_of_tool_and_driven_joints() -> None:
+    gap = Motion(*(RNG.normal(size=(4, 2, n)) for n in (5, 5, 3, 3)))
+    figure = figures.plot_gap(BROKK_170, gap)
+    assert ylabels(figure) == [
+        "tool velocity [m/s]", "tool position [m]", "joint velocity [rad/s]", "joint angle [rad]"
+    ]  # fmt: skip
+    time = [0.05, 0.1, 0.15, 0.2]
+    np.testing.assert_allclose(curves(figure.axes[0])["y"], [time, gap.v_tool[:, 0, 1]])
+    np.testing.assert_allclose(curves(figure.axes[1])["z"], [time, gap.p_tool[:, 0, 2]])
+    np.testing.assert_allclose(curves(figure.axes[2])["q3"], [time, gap.q_dot[:, 0, 2]])
+    np.testing.assert_allclose(curves(figure.axes[3])["q5"], [time, gap.q[:, 0, 4]])
+    assert list(curves(figure.axes[3])) == ["q1", "q3", "q4", "q5"]
+
+
+# --- nets and training ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("samples", "ticks"), [(40, 26), (700, 600)])
+def test_plot_free_run__begins_after_a_history_and_lasts_30_s_or_to_the_end(
+    samples: int, ticks: int
+) -> None:
+    net = small_net(BROKK_170, np.random.default_rng(1), ("q4", "q5"))
+    q = RNG.normal(size=(samples, 2))
+    recording = Recording("r", np.tile([0.0, 0.2], (samples, 1)), q, -q)
+    figure = figures.plot_free_run(net, Log(("q4", "q5"), (recording,)))
+    assert ylabels(figure) == ["q5 [rad]", "q5 [rad/s]"]  # q4 has no command
+    time = 0.05 * np.arange(1, ticks + 1)
+    angle, velocity = (curves(ax) for ax in figure.axes)
+    np.testing.assert_allclose(angle["measured"], [time, q[14 : 14 + ticks, 1]])
+    np.testing.assert_allclose(velocity["measured"], [time, -q[14 : 14 + ticks, 1]])
+    own_q, own_q_dot = validation.free_run(net, recording, np.array([13]), ticks)
+    np.testing.assert_allclose(angle["free run"][1], own_q[:, 0, 1])
+    np.testing.assert_allclose(velocity["free run"][1], own_q_dot[:, 0, 1])
+
+
+def test_plot_worst_and_median__are_of_the_largest_error_of_a_joint() -> None:
+    """Nets that predict 0.1 rad/s; recordings that move at 0.1, 0.3 and 0.2 rad/s."""
+    net = constant_net([0.1], logged=False, joints=("a",))
+    speeds = {"exact": 0.1, "worst one": 0.3, "median one": 0.2}
+    recordings = tuple(line(name, 0.0, speed, 60) for name, speed in speeds.items())
+    figure = figures.plot_worst_and_median(net, Log(("a",), recordings))
+    titles = [ax.get_title() for ax in figure.axes]
+    assert titles == ["worst: worst one"] * 2 + ["median: median one"] * 2
+    assert ylabels(figure)[:2] == ["a [rad]", "a [rad/s]"]
+
+
+def test_plot_learning__is_over_millions_of_steps(tmp_path: Path) -> None:
+    path = tmp_path / "c.csv"
+    path.write_text(
+        "global_step,charts/reward,charts/velocity_error\n1000000,0.5,0.1\n3000000,0.75,0.05\n"
+    )
+    reward, error = figures.plot_learning(path).axes
+    np.testing.assert_array_equal(curves(reward)["rl"], [[1, 3], [0.5, 0.75]])
+    np.testing.assert_array_equal(curves(error)["rl"], [[1, 3], [0.1, 0.05]])
+    assert reward.get_xlabel() == "environment steps [million]"
+
+
+# --- task-space control ---------------------------------------------------------------------------
+
+
+def test_plot_sequence__is_relative_to_where_the_tool_began() -> None:
+    sequence = axis_sequences(BROKK_170)[0]
+    sizes = {"p_tool": 3, "v_tool": 3, "q_dot": 5}
+    trace = SimpleNamespace(**{name: RNG.normal(size=(360, 2, n)) for name, n in sizes.items()})
+    traces: Any = {("rl", "x"): trace, ("pid", "y"): None}
+    figure = figures.plot_sequence(BROKK_170, traces, sequence, np.array(POSE), 1)
+    time = 0.05 * np.arange(1, 361)
+    positions = [f"{axis} - {axis}(0) [m]" for axis in "xyz"]
+    assert ylabels(figure) == positions + [f"velocity {axis} [m/s]" for axis in "xyz"]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["goal", "rl"]
+    p_start = tool_position(forward_kinematics(BROKK_170, POSE))
+    for i in range(3):
+        above, below = curves(figure.axes[i]), curves(figure.axes[3 + i])
+        np.testing.assert_allclose(above["rl"], [time, trace.p_tool[:, 1, i] - p_start[i]])
+        np.testing.assert_allclose(above["goal"], [time, 0.05 * np.cumsum(sequence.goals[:, i])])
+        np.testing.assert_allclose(below["rl"], [time, trace.v_tool[:, 1, i]])
+        np.testing.assert_allclose(below["goal"], [time, sequence.goals[:, i]])
+    joints = figures.plot_joint_velocities(BROKK_170, traces, "x", 1)
+    assert ylabels(joints) == [f"velocity q{i} [rad/s]" for i in (1, 3, 4, 5)]
+    np.testing.assert_array_equal(curves(joints.axes[2])["rl"], [time, trace.q_dot[:, 1, 3]])
+
+
+def number(mean: float | None, low: float | None = None, high: float | None = None) -> Any:
+    return {"mean": mean, "low": low, "high": high}
+
+
+def test_plot_bars__stand_side_by_side_with_their_intervals() -> None:
+    bars = {
+        "rl": {"x": number(2.0, 1.5, 4.0), "a_b": number(1.0)},
+        "jacobian_pid_ff": {"x": number(3.0, 2.0, 3.5), "a_b": number(None)},
+    }
+    figure = figures.plot_bars({"error [m]": bars, "more": bars})
+    upper = figure.axes[0]
+    assert ylabels(figure) == ["error [m]", "more"] and len(figure.legends) == 1
+    drawn: dict[str, Any] = {c.get_label(): c for c in upper.containers if hasattr(c, "patches")}
+    for name, middle in {"rl": -0.2, "jacobian_pid_ff": 0.2}.items():
+        patches = drawn[name].patches
+        assert [p.get_x() + p.get_width() / 2 for p in patches] == pytest.approx(
+            [middle, 1 + middle]
+        )
+        assert patches[0].get_height() == bars[name]["x"]["mean"]
+        assert patches[0].get_facecolor() == to_rgba(figures.STYLES[name]["color"])
+    ends = drawn["rl"].errorbar.lines[2][0].get_segments()
+    np.testing.assert_allclose(ends[0][:, 1], [1.5, 4.0])
+    assert [text.get_text() for text in upper.get_xticklabels()] == ["x", "a\nb"]
+
+
+def test_plot_bars__names_of_sequences_do_not_touch() -> None:
+    names = [sequence.name for sequence in task_sequences(BROKK_170)]
+    bars = {"rl": dict.fromkeys([*names, "all"], number(0.1, 0.05, 0.2))}
+    figure = figures.plot_bars({"error [m/s]": bars})
+    figure.draw_without_rendering()
+    boxes = [text.get_window_extent() for text in figure.axes[0].get_xticklabels()]
+    assert all(one.x1 + 4 < two.x0 for one, two in itertools.pairwise(boxes))
+
+
+def test_plot_starts__draws_arms_from_the_side_and_from_above() -> None:
+    starts = np.array([[0.5 * np.pi, *POSE[1:]], [0.0, *POSE[1:]], POSE])
+    kinds = ["limits", "workspace", "limits"]
+    figure = figures.plot_starts(BROKK_170, starts, kinds)
+    side, top = ([np.array(arm.get_data()) for arm in ax.get_lines()] for ax in figure.axes)
+    for arm in side[:3]:
+        np.testing.assert_allclose(arm, side[0], atol=1e-9)  # turned arms look the same
+        np.testing.assert_allclose(arm[:, -1], [3.05, 1.01], atol=0.01)
+    assert side[3][1].tolist() == [0, 0]  # the ground
+    ends = [(0, 3.05), (3.05, 0), (3.05 * np.cos(1.5), 3.05 * np.sin(1.5))]
+    for arm, end in zip(top, ends, strict=True):
+        np.testing.assert_allclose(arm[:, -1], end, atol=0.01)
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["limits", "workspace"]
+    assert [ax.get_aspect() for ax in figure.axes] == [1.0, 1.0]
+    colors = [arm.get_color() for arm in figure.axes[1].get_lines()]
+    assert colors == [figures.STYLES[kind]["color"] for kind in kinds]
+
+
+def test_save__writes_the_same_bytes_for_the_same_figure(tmp_path: Path) -> None:
+    pages = []
+    for name in ("a.png", "b.png"):
+        figure = figures.Figure(figsize=(1.0, 0.5))
+        figure.add_subplot().plot([0, 1])
+        figures.save(tmp_path / name, figure)
+        pages.append((tmp_path / name).read_bytes())
+    assert pages[0] == pages[1] == figures.png(figure) and b"Software" not in pages[0]
+    assert pages[0][:4] == b"\x89PNG" and pages[0][16:24] == bytes([0, 0, 0, 150, 0, 0, 0, 75])

@@ -1,0 +1,242 @@
+"""The chain, small but whole: the same bits twice, every run with its numbers, one page."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers_machines import small_net
+from numpy.typing import NDArray
+
+from brokk_min import kinematics
+from brokk_min.evaluation import baselines, reproduce
+from brokk_min.evaluation.reproduce import QUICK, Budget
+from brokk_min.evaluation.robustness import variations
+from brokk_min.evaluation.rollout import Trace
+from brokk_min.evaluation.sequences import axis_sequences, task_sequences, tuning_set
+from brokk_min.identification import validation
+from brokk_min.identification.fitting import FitConfig
+from brokk_min.identification.logs import read_log, velocity_of
+from brokk_min.identification.net_file import load_net
+from brokk_min.learning.policy import load_policy
+from brokk_min.machine import BROKK_170
+from brokk_min.ppo import PPOConfig
+
+TINY = Budget(0.02, 60, 8192, 1, 2, 4, 2, 1.0)
+ERROR = "velocity_error_mean"
+PIDS = ["jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff", "jacobian_pid_ff_awake"]
+Results = dict[str, Any]
+
+
+class Idle:
+    """A controller that sends no commands."""
+
+    def start(self, num: int) -> None:
+        return None
+
+    def __call__(self, measured: Any, state: None) -> tuple[NDArray[np.float64], None]:
+        return np.zeros((len(measured.q), BROKK_170.n)), None
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Two runs of the chain; a space in a path."""
+    both = (tmp_path_factory.mktemp("a b"), tmp_path_factory.mktemp("second"))
+    for folder in both:
+        reproduce.reproduce(BROKK_170, folder / "new", TINY, 3)
+    return both[0] / "new", both[1] / "new"
+
+
+@pytest.fixture(scope="module")
+def results(folders: tuple[Path, Path]) -> Results:
+    loaded: Results = json.loads((folders[0] / "results.json").read_text())
+    return loaded
+
+
+# --- the chain ------------------------------------------------------------------------------------
+
+
+def test_reproduce__gives_the_same_bits_twice(folders: tuple[Path, Path]) -> None:
+    for name in ("log.npz", "net.npz", "policy.npz", "gains.json", "results.json"):
+        assert (folders[0] / name).read_bytes() == (folders[1] / name).read_bytes(), name
+    clock = json.loads((folders[0] / "timing.json").read_text())
+    assert list(clock) == ["record", "fit", "train", "tune", "evaluate", "draw"]
+
+
+def test_reproduce__writes_files_that_the_other_commands_read(
+    folders: tuple[Path, Path], results: Results
+) -> None:
+    folder = folders[0]
+    log = read_log([folder / "log.npz"], BROKK_170.velocity_samples, rate=20.0)
+    assert log.joints == load_net(folder / "net.npz").joints == BROKK_170.names
+    policy = load_policy(folder / "policy.npz", BROKK_170)
+    assert policy.training["command"] == "brokk-min reproduce --seed 3"
+    means = results["task_space"]["summary"]
+    errors = {controller: rows["all"][ERROR] for controller, rows in means.items()}
+    assert policy.training["velocity_error_mean"] == errors
+    pids = baselines.read_gains(folder / "gains.json", BROKK_170, policy.net)
+    assert baselines.gains_table(pids) == results["gains"]
+    assert results["meta"]["seed"] == 3 and results["meta"]["machine"] == "brokk170"
+    assert results["meta"]["effort"]["train_steps"] == 8192
+
+
+def test_reproduce__results_hold_every_run_with_its_figures(results: Results) -> None:
+    runs = results["task_space"]["runs"]
+    sequences = [sequence.name for sequence in task_sequences(BROKK_170)]
+    keys = {(run["controller"], run["sequence"], run["start"]) for run in runs}
+    assert keys == {(c, s, i) for c in ("rl", *PIDS) for s in sequences for i in range(4)}
+    assert all(
+        run["velocity_rmse"] >= run[ERROR] > 0 and 0 < run["reward_mean"] < 1 for run in runs
+    )
+    assert results["start_kinds"] == ["workspace", "limits", "workspace", "extended"]
+    assert all(run["kind"] == results["start_kinds"][run["start"]] for run in runs)
+    scored = [run for run in runs if run["kind"] == "workspace" and run["controller"] == "rl"]
+    mean = results["task_space"]["summary"]["rl"]["all"][ERROR]
+    assert mean == pytest.approx(np.mean([run[ERROR] for run in scored]))
+    assert set(results["paper_recipe"]["test"]) == set(results["actuator"]["test"])
+    assert set(results["task_space"]["rl_on_nets"]) == {*"xyz", "all"}
+
+
+def test_reproduce__results_answer_the_papers_sentences(results: Results) -> None:
+    assert len(results["net_claims"]) == 4
+    assert [claim["figure"] for claim in results["claims"]] == [
+        *["Fig. 6b-d"] * 3, *["Fig. 6a, e, f"] * 3, "Fig. 6e, f", "Fig. 6g, h", "Sec. 5"
+    ]  # fmt: skip
+    assert results["claims"][3:6] == results["singular"]["claims"]
+    both = ["stronger" in claim for claim in results["claims"]]
+    assert both == [False, True, True, False, False, False, True, True, True]
+    less = results["task_space"]["rl_less"][ERROR]["jacobian_pid_ff"]
+    for claim, sequences in zip(results["claims"][-3:], ("xyz", "z", ["all"]), strict=True):
+        numbers = claim["stronger"]["numbers"]
+        for s in sequences:
+            assert numbers[f"error {s}, less jacobian_pid_ff"] == less[s]
+        assert claim["stronger"]["holds"] is all(n["high"] < 0 for n in numbers.values())
+
+
+def test_reproduce__results_compare_with_the_bound_and_on_other_machines(results: Results) -> None:
+    less = results["regret"]["less_perfect_model"]
+    assert set(less) == {"rl", *PIDS} and set(less["rl"]) == {*"xyz", "all"}
+    means = results["regret"]["summary"]
+    difference = means["rl"]["all"][ERROR] - means["perfect_model"]["all"][ERROR]
+    assert less["rl"]["all"]["mean"] == pytest.approx(difference)
+    assert "perfect_model_no_dither" in means
+    assert set(results["robustness"]) == set(variations(BROKK_170))
+    assert set(results["robustness"]["nominal"]) == {"rl", *PIDS}
+
+
+def test_reproduce__results_record_the_tuning(results: Results) -> None:
+    assert set(results["tuning"]) == set(results["gains"]) == set(PIDS)
+    starts, goals = tuning_set(BROKK_170, TINY.tuning_runs, 3)
+    np.testing.assert_allclose([run["start"] for run in results["tuning_runs"]], starts)
+    for i, run in enumerate(results["tuning_runs"]):
+        table = np.array(run["goals"])
+        ticks = np.rint(table[:, 0] * 20).astype(int)
+        np.testing.assert_allclose(np.repeat(table[:, 1:], ticks, axis=0), goals[:, i])
+
+
+def test_reproduce__report_is_one_file_with_its_figures(
+    folders: tuple[Path, Path], results: Results
+) -> None:
+    page = (folders[0] / "report.html").read_text()
+    assert len(re.findall(r'src="data:image/png;base64,iVBOR', page)) == 12
+    text = re.sub(r'base64,[^"]*', "", page)  # letters of an image may spell anything
+    assert not re.findall(r'(?:src|href)="(?!data:)', text) and "http" not in text
+    for claim in (*results["net_claims"], *results["claims"]):
+        assert html.escape(claim["measured"], quote=False) in text.replace("&#39;", "'")
+    assert text.count("<td>start ") == 4 and text.count("<td>tuning run ") == 2
+
+
+# --- stages ---------------------------------------------------------------------------------------
+
+
+def test_budget__is_what_fit_and_train_spend_by_default() -> None:
+    assert (Budget().fit_steps, Budget().train_steps) == (
+        FitConfig().steps,
+        PPOConfig().total_steps,
+    )
+    assert all(vars(QUICK)[name] < value for name, value in vars(Budget()).items())
+
+
+def test_paper_recipe__is_scored_on_the_test_log(folders: tuple[Path, Path]) -> None:
+    test = read_log([folders[0] / "log_test.npz"], 4, rate=20.0)
+    config = FitConfig(steps=3, batch_size=8)
+    found = reproduce.paper_recipe(BROKK_170, test, 0.02, config, 0)
+    assert set(found["test"]) == set(BROKK_170.names) and "10" in found["test"]["q5"]["free_run"]
+    assert found["sim_to_real"]["tool_position_error_mean_of_runs"]["runs"] == 20
+
+
+def test_driven_log__has_commands_and_encoder_angles_of_one_controller() -> None:
+    rng = np.random.default_rng(0)
+
+    def trace(runs: int) -> Trace:
+        arrays = [rng.normal(size=(30, runs, n)) for n in (5, 5, 5, 5, 3, 3)]
+        return Trace(*arrays, rng.normal(size=(30, runs)))
+
+    traces = {("rl", "x"): trace(18), ("pid", "x"): trace(18), ("rl", "y"): trace(2)}
+    log = reproduce.driven_log(replace(BROKK_170, rate=10.0), traces, "rl")
+    names = [recording.name for recording in log.recordings]
+    assert names == [f"rl_x_{i:02d}" for i in range(16)] + ["rl_y_00", "rl_y_01"]
+    assert (log.joints, log.rate, log.velocity_logged) == (BROKK_170.names, 10.0, False)
+    third = log.recordings[3]
+    np.testing.assert_array_equal(third.q, traces["rl", "x"].q_measured[:, 3])
+    np.testing.assert_array_equal(third.u, traces["rl", "x"].u[:, 3])
+    np.testing.assert_allclose(third.q_dot, velocity_of(third.q, 4, 10.0))
+
+
+def test_tables__keep_kinds_of_starts_apart() -> None:
+    rows = []
+    for controller, base in (("rl", 1.0), ("pid", 4.0)):
+        for sequence in "xy":
+            for i, kind in enumerate(("workspace", "limits", "workspace")):
+                row = {"controller": controller, "sequence": sequence, "start": i, "kind": kind}
+                rows.append(row | {"error": base + i + (kind == "limits") / 2})
+    found = reproduce.tables(rows, [row for row in rows if row["kind"] == "workspace"])
+    assert found["runs"] is rows
+    assert found["summary"]["pid"] == {s: {"error": 5.0} for s in ("x", "y", "all")}
+    limits = {"rl": {"error": 2.5}, "pid": {"error": 5.5}}
+    workspace = {"rl": {"error": 2.0}, "pid": {"error": 5.0}}
+    assert found["by_kind"] == {"workspace": workspace, "limits": limits}
+    less = found["rl_less"]["error"]["pid"]["all"]
+    assert less == {"mean": -3.0, "low": -3.0, "high": -3.0}
+    low, high = found["intervals"]["rl"]["x"]["error"]
+    assert (low, high) == pytest.approx((2 - 12.7062, 2 + 12.7062), abs=1e-3)
+
+
+def test_shorten__keeps_the_first_seconds() -> None:
+    short = reproduce.shorten(BROKK_170, axis_sequences(BROKK_170), 3.0)
+    assert [(s.name, len(s.goals)) for s in short] == [("x", 60), ("y", 60), ("z", 60)]
+
+
+def test_near_singularities__drives_along_what_an_upright_arm_can_do_least() -> None:
+    machine = BROKK_170
+    starts = np.array([[0.0, 1.139, 0.97, 2.804, 1.948], [1.0, 1.2, 0.9, 2.8, 1.9]])
+    net = small_net(machine, np.random.default_rng(0))
+    pids = baselines.baselines(machine, net)
+    controllers = {"rl": Idle(), **{name: pids[name] for name in baselines.PAPER_BASELINES}}
+    found, claims, traces = reproduce.near_singularities(machine, controllers, starts, 1.5, 3)
+    halves = ("least_half", "least_quarter")
+    assert list(traces) == [(c, s) for c in controllers for s in halves]
+    assert all(trace.q.shape == (30, 2, 5) for trace in traces.values())
+    np.testing.assert_array_equal(traces["rl", "least_half"].q[-1], starts)
+    frames = kinematics.forward_kinematics(machine, starts)
+    J = kinematics.jacobian(frames)[..., machine.driven]
+    JJt = J @ J.swapaxes(-1, -2)
+    np.testing.assert_allclose(found["manipulability"], np.sqrt(np.linalg.det(JJt)))
+    np.testing.assert_allclose(found["least"], np.sqrt(np.linalg.eigvalsh(JJt)[:, 0]), rtol=1e-6)
+    assert list(found["summary"]) == list(controllers)
+    assert found["summary"]["rl"]["all"][ERROR] == pytest.approx(0.075 * 10 / 30)
+    assert found["claims"] == [claim.to_json() for claim in claims] and len(claims) == 3
+    none = reproduce.near_singularities(machine, controllers, starts[:0], 1.5, 3)
+    assert none == ({"summary": {}, "claims": []}, [], {})
+
+
+def test_driven_log__scores_nets_on_a_controllers_own_runs(results: Results) -> None:
+    driven = results["actuator"]["driven_by_policy"]
+    assert set(driven) == set(BROKK_170.names)
+    assert set(driven["q5"]["free_run"]) <= {str(horizon) for horizon in validation.HORIZONS}
