@@ -115,19 +115,19 @@ def table(seeds: Sequence[Rows], baselines: Rows) -> Table:
 def read_seeds(path: Path) -> dict[str, Any]:
     """The `sweep.json` of a sweep; its "table" is that of `table`. ValueError: another file."""
     with expected(path, "the sweep.json of a sweep"):
-        found: dict[str, Any] = json.loads(path.read_text())
-        if not {"mean", "low", "high"} <= set(found["table"]["rl"]["velocity_error_all"]):
-            raise ValueError(f"{found['table']['rl']}")
-        dict(found["meta"])
-    return found
+        content: dict[str, Any] = json.loads(path.read_text())
+        if not {"mean", "low", "high"} <= set(content["table"]["rl"]["velocity_error_all"]):
+            raise ValueError(f"{content['table']['rl']}")
+        dict(content["meta"])
+    return content
 
 
 def seeds_of(machine: Machine, net: ActuatorNet, sweep: Mapping[str, Any]) -> Table:
     """The table of a sweep of `read_seeds`; ValueError: one of another machine or of other nets."""
     expected_meta = gains_metadata(machine, net)
-    found = {name: sweep["meta"].get(name) for name in expected_meta}
-    if found != expected_meta:
-        raise ValueError(f"sweep: expected one with {expected_meta}, got {found}")
+    recorded = {name: sweep["meta"].get(name) for name in expected_meta}
+    if recorded != expected_meta:
+        raise ValueError(f"sweep: expected one with {expected_meta}, got {recorded}")
     return dict(sweep["table"])
 
 

@@ -62,7 +62,7 @@ def train_policy(
 
     Args:
         machine: what moves.
-        net: nets of its driven joints; the only thing known of its hydraulics.
+        net: nets of its driven joints.
         task: episodes.
         config: settings of the learner.
         seed: of everything random; the same seed gives the same bits on the same machine.

@@ -119,13 +119,18 @@ def load_policy(path: Path, machine: Machine) -> Policy:
     """
     arrays = load_arrays(path)
     header = load_header(path, arrays, "policy", FORMAT)
-    found = header.get("contract", {})
-    expect_same(path, found, contract(machine))
+    recorded = header.get("contract", {})
+    expect_same(path, recorded, contract(machine))
     with expected(path, "a complete policy"):
-        weights = tuple(arrays[f"weight_{i}"] for i in range(8))
         net = {name[4:]: array for name, array in arrays.items() if name.startswith("net_")}
-        fitted = select_nets(machine, net_from_arrays(path, net))
-        policy = Policy(found, header["training"], arrays["mean"], arrays["scale"], weights, fitted)
+        policy = Policy(
+            contract=recorded,
+            training=header["training"],
+            mean=arrays["mean"],
+            scale=arrays["scale"],
+            weights=tuple(arrays[f"weight_{i}"] for i in range(8)),
+            net=select_nets(machine, net_from_arrays(path, net)),
+        )
         action = policy.act(policy.mean)
     if action.shape != machine.driven.shape or not np.isfinite(action).all():
         raise ValueError(f"{path}: weights: expected {len(machine.driven)} actions, got {action}")

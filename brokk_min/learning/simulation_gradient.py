@@ -113,9 +113,9 @@ def action_gradients(
 
 def valve_cost_gradient(machine: Machine, ticks: Ticks, valve_cost: float) -> Array:
     """dc_t/du_t = -dc_t/du_{t-1} of the cost c_t of valve travel, (T, num, n_driven)."""
-    change = (ticks.u - ticks.true_history[..., 2, -1])[..., machine.driven]
+    travel = (ticks.u - ticks.true_history[..., 2, -1])[..., machine.driven]
     limit = len(machine.driven) * machine.pwm_limit / PWM_MAX
-    return np.sign(change).astype(np.float32) * np.float32(valve_cost / limit)
+    return np.sign(travel).astype(np.float32) * np.float32(valve_cost / limit)
 
 
 def local_derivatives(

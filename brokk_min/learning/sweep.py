@@ -60,8 +60,8 @@ def read_result(path: Path, identity: Mapping[str, Any]) -> Rows:
     with expected(path, "the result of a seed"):
         result: dict[str, Any] = json.loads(path.read_text())
         rows: Rows = result["runs"]
-        found = result["identity"]
-    expect_same(path, found, identity)
+        recorded = result["identity"]
+    expect_same(path, recorded, identity)
     return rows
 
 
