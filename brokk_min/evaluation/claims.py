@@ -1,12 +1,15 @@
 """Sentences of the paper, each with what was measured of it and a verdict, in the paper's order.
 
-The limits of the verdicts are assumed. Intervals are over starts. Paper: Sec. 3.2, 4.1, 4.2
+`claims.toml` has the sentences and the limits of the verdicts. Intervals are over starts.
+Paper: Sec. 3.2, 3.4, 4.1, 4.2, 5
 """
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,122 +29,30 @@ from brokk_min.jacobian import JacobianController, manipulability
 from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.machine import Array, Machine
 
-ON_LINE = 0.05  # m: a tool that stays so near to its line stays still across it
-SMALL_GAP = 0.05  # m: two tools so near to each other after the same commands differ little
-MARGINAL = 0.01  # rad/s: joint velocities that differ by less differ marginally
-FACTOR = 2.0  # times that differ by a larger factor differ
-UNLIKE = 1.25  # errors that differ by a larger factor differ
+FILE = Path(__file__).with_name("claims.toml")
+TEXTS: dict[str, dict[str, Any]] = tomllib.loads(FILE.read_text(encoding="utf-8"))
 STRONG, WEAK = PAPER_BASELINES  # damping
 VERDICTS = {True: "holds here", False: "does not hold here", None: "was not measured"}
-
-# The figure of the paper, its sentence, what is measured, and the unit.
-TEXTS = {
-    "gravity": (
-        "Fig. 2",
-        "The velocity is larger when rotating towards gravity: 0.24 rad/s one way, 0.47 the other.",
-        "peak speed of the last driven joint at both command limits, to be larger down than up",
-        "rad/s",
-    ),
-    "idle": (
-        "Fig. 2",
-        "The same command is answered after about 400 ms from idle and 100 ms when already moving.",
-        f"response time (to 63 %), from idle to be {FACTOR:g} times as long or more",
-        "s",
-    ),
-    "coupling": (
-        "Fig. 2",
-        "When other joints move as well, the difference is marginal and negligible.",
-        f"velocity of a joint alone less that with the others (RMS), to be below {MARGINAL}",
-        "rad/s",
-    ),
-    "gap": (
-        "Fig. 5",
-        "Over 30 s the discrepancy between simulation and machine remains reasonably small.",
-        f"mean distance of the tools under the same commands, to be below {SMALL_GAP}",
-        "m",
-    ),
-    "training": (
-        "Sec. 3.4",
-        "The training process takes around 2.5 hours to converge.",
-        f"time of all environment steps, to be within a factor of {FACTOR:g} of that",
-        "h",
-    ),
-    "still": (
-        "Fig. 6b-d",
-        "RL: y and z remain stationary during motion along x.",
-        f"largest distance of the tool from its line, to be below {ON_LINE} m",
-        "m",
-    ),
-    "drift": (
-        "Fig. 6b-d",
-        "The Jacobian-based method significantly fails to keep y and z still.",
-        f"largest distance of the tool from its line, to be above {ON_LINE} m, and more than RL's",
-        "m",
-    ),
-    "direction": (
-        "Fig. 6b-d",
-        "The fine-tuned PID yields varying results depending on the direction of movement.",
-        "error of the PID's joint velocities as a fraction of the desired, to differ by a factor "
-        f"of {UNLIKE} at a joint",
-        "1",
-    ),
-    "slowed": (
-        "Fig. 6a, e, f",
-        "Near a singularity the damping impedes accurate task space control: it slows the tool.",
-        "speed along the goal over the goal's, k = 0.1 to be below k = 0.05 with the same gains",
-        "1",
-    ),
-    "jerky": (
-        "Fig. 6a, e, f",
-        "With less damping (k = 0.05 instead of 0.1) the system moves jerkily near the "
-        "singularity.",
-        "jerk, k = 0.05 to be above k = 0.1 with the same gains",
-        "m/s^3",
-    ),
-    "neither": (
-        "Fig. 6a, e, f",
-        "RL is more robust there: neither slowed nor jerky.",
-        "speed over the goal's to be above that of k = 0.05, jerk [m/s^3] below that of k = 0.1",
-        "1",
-    ),
-    "tracking": (
-        "Fig. 6e, f",
-        "RL tracks the velocity robustly, along x, y and z (Fig. 6c, 6f, 6h).",
-        "RL's mean velocity error less a baseline's, to be below 0",
-        "m/s",
-    ),
-    "along z": (
-        "Fig. 6g, h",
-        "RL is more robust in motion along z, too (Fig. 6g, 6h).",
-        "RL's mean velocity error [m/s] and largest drift [m] less a baseline's, to be below 0",
-        "m/s, m",
-    ),
-    "outperforms": (
-        "Sec. 5",
-        "The proposed method outperforms the Jacobian-based approach.",
-        "RL's mean velocity error less a baseline's, to be below 0",
-        "m/s",
-    ),
-}
 
 
 class Claim(NamedTuple):
     """A sentence of the paper, and what was measured of it."""
 
-    name: str  # in `TEXTS`
+    name: str  # in `claims.toml`
     numbers: Mapping[str, Mean]
     holds: bool | None  # None: it was not measured
     stronger: Claim | None = None  # the same of a baseline that the paper does not have
 
     def to_json(self) -> dict[str, Any]:
         """The claim as in `results.json`."""
-        figure, sentence, what, unit = TEXTS[self.name]
+        text = TEXTS[self.name]
+        measure = text["measure"].format(limit=text.get("limit"))
         result = {
-            "figure": figure,
-            "paper": sentence,
-            "measured": f"{what}: {format_numbers(self.numbers, unit)}",
+            "figure": text["figure"],
+            "paper": text["paper"],
+            "measured": f"{measure}: {format_numbers(self.numbers, text['unit'])}",
             "numbers": self.numbers,
-            "unit": unit,
+            "unit": text["unit"],
             "holds": self.holds,
         }
         if self.stronger:
@@ -175,6 +86,10 @@ def _above(limit: float, *numbers: Mean) -> bool | None:
     return min(lows) > limit if len(lows) == len(numbers) else None
 
 
+def _limit(name: str) -> float:
+    return float(TEXTS[name]["limit"])
+
+
 def _both(one: bool | None, other: bool | None) -> bool | None:
     return None if one is None or other is None else one and other
 
@@ -198,7 +113,8 @@ def net_claims(found: Mapping[str, Any]) -> list[Claim]:
             times[f"{kind}, {start}"] = of_start["up"]
     slower = None
     if all(times.values()):
-        slower = all(times[f"{k}, idle"] >= FACTOR * times[f"{k}, moving"] for k in kinds)
+        limit = _limit("idle")
+        slower = all(times[f"{k}, idle"] >= limit * times[f"{k}, moving"] for k in kinds)
     coupling = found["coupling_rms"]
     spread = found["sim_to_real"]["tool_position_error_mean_of_runs"]
     gap = {"in the figure": found["sim_to_real"]["tool"]["position_error_mean"]}
@@ -206,8 +122,8 @@ def net_claims(found: Mapping[str, Any]) -> list[Claim]:
     return [
         Claim("gravity", _exact(peaks), faster),
         Claim("idle", _exact(times), slower),
-        Claim("coupling", _exact(coupling), max(coupling.values()) < MARGINAL),
-        Claim("gap", _exact(gap), max(gap.values()) < SMALL_GAP),
+        Claim("coupling", _exact(coupling), max(coupling.values()) < _limit("coupling")),
+        Claim("gap", _exact(gap), max(gap.values()) < _limit("gap")),
     ]
 
 
@@ -218,7 +134,7 @@ def _exact(numbers: Mapping[str, float | None]) -> dict[str, Mean]:
 def training_claim(seconds: float, steps: int) -> Claim:
     """Does training take as long as the paper's? For the report alone. Paper: Sec. 3.4"""
     hours = seconds / 3600
-    holds = 1 / FACTOR < hours / 2.5 < FACTOR
+    holds = 1 / _limit("training") < hours / 2.5 < _limit("training")
     return Claim("training", _exact({f"{steps:,} steps here": hours}), holds)
 
 
@@ -260,7 +176,7 @@ def task_claims(
 def still_claim(runs: Sequence[Run]) -> Claim:
     """Do y and z stay still while the policy moves the tool along x? Paper: Fig. 6b"""
     drift = mean_interval(by_start(runs, "rl", "x", "off_axis_drift_max"))
-    return Claim("still", {"rl": drift}, _below(ON_LINE, drift))
+    return Claim("still", {"rl": drift}, _below(_limit("still"), drift))
 
 
 def drift_claim(runs: Sequence[Run], baselines: Sequence[str]) -> Claim:
@@ -269,7 +185,7 @@ def drift_claim(runs: Sequence[Run], baselines: Sequence[str]) -> Claim:
     drift = {c: by_start(runs, c, "x", "off_axis_drift_max") for c in baselines}
     means = {c: mean_interval(values) for c, values in drift.items()}
     more = {f"{c} less rl": mean_interval(values - rl) for c, values in drift.items()}
-    holds = _both(_above(ON_LINE, *means.values()), _above(0.0, *more.values()))
+    holds = _both(_above(_limit("drift"), *means.values()), _above(0.0, *more.values()))
     return Claim("drift", means | more, holds)
 
 
@@ -310,7 +226,7 @@ def _differ(up: Array, down: Array) -> bool | None:
     found = [mean for mean in means if mean]
     if low is None or high is None or len(found) < 2:
         return None
-    return max(found) / min(found) > UNLIKE and not low < 0 < high
+    return max(found) / min(found) > _limit("direction") and not low < 0 < high
 
 
 def less_claim(

@@ -64,8 +64,7 @@ def write_report(
 
 def draw(machine: Machine, results: Results, shown: Shown, curve: Path) -> dict[str, Figure]:
     """All figures of the page by name; `curve` is the file of the learning curve."""
-    starts = np.array(results["starts"])
-    kinds = results["start_kinds"]
+    starts, kinds = np.array(results["starts"]), results["start_kinds"]
     run = kinds.index("workspace")
     bars = {
         "mean velocity error [m/s]": with_intervals(results, "velocity_error_mean"),

@@ -62,7 +62,6 @@ def reproduce(
     a file of `brokk-min sweep`, whose training seeds the report shows.
     """
     seeds = read_seeds(sweep) if sweep else {}
-    out.mkdir(parents=True, exist_ok=True)
     clock: dict[str, float] = {}
     with tqdm(total=6, desc="stages done", unit="stage", position=1, disable=None) as bar:
         stage = partial(_stage, clock, bar)
@@ -82,8 +81,7 @@ def reproduce(
         with stage("evaluate"):
             results, shown = measure(machine, net, test, policy, pids, budget, seed)
         with stage("draw"):
-            results |= {"paper_recipe": recipe, "training_seeds": training_seeds}
-            results |= {"gains": baselines.gains_table(pids), "tuning": tuning}
+            results |= {"paper_recipe": recipe, "tuning": tuning, "training_seeds": training_seeds}
             write(out, results, policy, pids)
             report.write_report(machine, out, results, shown, clock)
     write_json(out / "timing.json", clock)
@@ -105,6 +103,7 @@ def _stage(clock: dict[str, float], bar: Any, name: str) -> Iterator[None]:
 
 def record(machine: Machine, out: Path, budget: Budget, seed: int) -> list[Log]:
     """Logs to fit nets to and to score them on, written and read back as a user's."""
+    out.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng
     logs.write_log(out / "log.npz", collect(machine, budget.hours, "rich", rng(seed)))
     logs.write_log(out / "log_test.npz", task_log(machine, 20, 40.0, rng(seed + 1)))
@@ -168,6 +167,7 @@ def measure(
         "actuator": actuator,
         "preliminary": numbers,
         "net_claims": [claim.to_json() for claim in claims.net_claims(numbers)],
+        "gains": baselines.gains_table(pids),
         "tuning_runs": tuning_runs(machine, budget.tuning_runs, seed),
     }
     return results | compared, report.Shown(net, test, measured, task, singular)
@@ -190,24 +190,23 @@ def compare(
     runs, traces = evaluate(machine, controllers, commands, starts, seed)
     scored = [run for run in runs if run["kind"] == "workspace"]
     damped = claims.singular_controllers(rl, pids)
-    singular, singular_claims, singular_traces = near_singularities(
-        machine, damped, starts[kinds == "extended"], budget.short_s, seed
+    extended = starts[kinds == "extended"]
+    singular, near, near_traces = near_singularities(
+        machine, damped, extended, budget.short_s, seed
     )
     along_x = {c: Trace(*(array[:, workspace] for array in traces[c, "x"])) for c in pids}
-    task_claims = claims.task_claims(
-        machine, pids, scored, along_x, commands[0].goals, singular_claims
-    )
+    every = claims.task_claims(machine, pids, scored, along_x, commands[0].goals, near)
     short = shorten(machine, sequences.axis_sequences(machine), budget.short_s)
     results = {
         "task_space": tables(runs, scored),
         "regret": regret(machine, controllers, short, reachable[: budget.bound_starts], seed),
         "robustness": robustness(machine, controllers, short, reachable[:16], seed),
         "singular": singular,
-        "claims": [claim.to_json() for claim in task_claims],
+        "claims": [claim.to_json() for claim in every],
         "starts": starts.tolist(),
         "start_kinds": kinds.tolist(),
     }
-    return results, traces, singular_traces
+    return results, traces, near_traces
 
 
 def shorten(machine: Machine, commands: Sequence[Commands], seconds: float) -> list[Commands]:

@@ -134,7 +134,7 @@ def test_render__answers_the_papers_sentences_first() -> None:
     assert len(answers) == 8 and header[0] == "the paper says"
     assert answers[1][1:] == ["was not measured", ""]
     assert answers[3] == [
-        claims.TEXTS["drift"][1], "does not hold here", "was not measured"
+        claims.TEXTS["drift"]["paper"], "does not hold here", "was not measured"
     ]  # fmt: skip
 
 

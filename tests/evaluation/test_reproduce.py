@@ -20,7 +20,6 @@ from brokk_min.evaluation.reproduce import QUICK, Budget
 from brokk_min.evaluation.robustness import variations
 from brokk_min.evaluation.rollout import Trace
 from brokk_min.evaluation.sequences import axis_sequences, task_sequences, tuning_set
-from brokk_min.identification import validation
 from brokk_min.identification.fitting import FitConfig
 from brokk_min.identification.logs import read_log, velocity_of
 from brokk_min.identification.net_file import load_net
@@ -45,34 +44,33 @@ class Idle:
 
 
 @pytest.fixture(scope="module")
-def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Two runs of the chain; a space in a path."""
-    both = (tmp_path_factory.mktemp("a b"), tmp_path_factory.mktemp("second"))
-    for folder in both:
-        reproduce.reproduce(BROKK_170, folder / "new", TINY, 3)
-    return both[0] / "new", both[1] / "new"
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What one run of the chain wrote."""
+    out = tmp_path_factory.mktemp("a b") / "new"  # a space in the path
+    reproduce.reproduce(BROKK_170, out, TINY, 3)
+    return out
 
 
 @pytest.fixture(scope="module")
-def results(folders: tuple[Path, Path]) -> Results:
-    loaded: Results = json.loads((folders[0] / "results.json").read_text())
+def results(folder: Path) -> Results:
+    loaded: Results = json.loads((folder / "results.json").read_text())
     return loaded
 
 
 # --- the chain ------------------------------------------------------------------------------------
 
 
-def test_reproduce__gives_the_same_bits_twice(folders: tuple[Path, Path]) -> None:
+def test_reproduce__gives_the_same_bits_twice(folder: Path, tmp_path: Path) -> None:
+    reproduce.reproduce(BROKK_170, tmp_path, TINY, 3)
     for name in ("log.npz", "net.npz", "policy.npz", "gains.json", "results.json"):
-        assert (folders[0] / name).read_bytes() == (folders[1] / name).read_bytes(), name
-    clock = json.loads((folders[0] / "timing.json").read_text())
+        assert (folder / name).read_bytes() == (tmp_path / name).read_bytes(), name
+    clock = json.loads((folder / "timing.json").read_text())
     assert list(clock) == ["record", "fit", "train", "tune", "evaluate", "draw"]
 
 
 def test_reproduce__writes_files_that_the_other_commands_read(
-    folders: tuple[Path, Path], results: Results
+    folder: Path, results: Results
 ) -> None:
-    folder = folders[0]
     log = read_log([folder / "log.npz"], BROKK_170.velocity_samples, rate=20.0)
     assert log.joints == load_net(folder / "net.npz").joints == BROKK_170.names
     policy = load_policy(folder / "policy.npz", BROKK_170)
@@ -140,10 +138,8 @@ def test_reproduce__results_record_the_tuning(results: Results) -> None:
         np.testing.assert_allclose(np.repeat(table[:, 1:], ticks, axis=0), goals[:, i])
 
 
-def test_reproduce__report_is_one_file_with_its_figures(
-    folders: tuple[Path, Path], results: Results
-) -> None:
-    page = (folders[0] / "report.html").read_text()
+def test_reproduce__report_is_one_file_with_its_figures(folder: Path, results: Results) -> None:
+    page = (folder / "report.html").read_text()
     assert len(re.findall(r'src="data:image/png;base64,iVBOR', page)) == 12
     text = re.sub(r'base64,[^"]*', "", page)  # letters of an image may spell anything
     assert not re.findall(r'(?:src|href)="(?!data:)', text) and "http" not in text
@@ -163,8 +159,8 @@ def test_budget__is_what_fit_and_train_spend_by_default() -> None:
     assert all(vars(QUICK)[name] < value for name, value in vars(Budget()).items())
 
 
-def test_paper_recipe__is_scored_on_the_test_log(folders: tuple[Path, Path]) -> None:
-    test = read_log([folders[0] / "log_test.npz"], 4, rate=20.0)
+def test_paper_recipe__is_scored_on_the_test_log(folder: Path) -> None:
+    test = read_log([folder / "log_test.npz"], 4, rate=20.0)
     config = FitConfig(steps=3, batch_size=8)
     found = reproduce.paper_recipe(BROKK_170, test, 0.02, config, 0)
     assert set(found["test"]) == set(BROKK_170.names) and "10" in found["test"]["q5"]["free_run"]
@@ -234,9 +230,3 @@ def test_near_singularities__drives_along_what_an_upright_arm_can_do_least() -> 
     assert found["claims"] == [claim.to_json() for claim in claims] and len(claims) == 3
     none = reproduce.near_singularities(machine, controllers, starts[:0], 1.5, 3)
     assert none == ({"summary": {}, "claims": []}, [], {})
-
-
-def test_driven_log__scores_nets_on_a_controllers_own_runs(results: Results) -> None:
-    driven = results["actuator"]["driven_by_policy"]
-    assert set(driven) == set(BROKK_170.names)
-    assert set(driven["q5"]["free_run"]) <= {str(horizon) for horizon in validation.HORIZONS}
