@@ -1,13 +1,16 @@
 """A policy as an ONNX file, for those who run it elsewhere."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from brokk_min.env import COMPENSATION
 from brokk_min.identification.files import require, whole_file
 from brokk_min.learning.policy import STANDSTILL_TIMEOUT, Policy
+from brokk_min.machine import Array
 
 
 def export_onnx(path: Path, policy: Policy) -> None:
@@ -18,26 +21,13 @@ def export_onnx(path: Path, policy: Policy) -> None:
 
     ValueError: the package onnx is not installed.
     """
-    onnx = require("onnx", "export")
     helper = require("onnx.helper", "export")
-    checker = require("onnx.checker", "export")
-    from_array = require("onnx.numpy_helper", "export").from_array
-    nodes = []
-    arrays = []
-    source = "observation"
-    last = len(policy.weights) // 2 - 1
-    for i in range(last + 1):
-        arrays.append(from_array(policy.weights[2 * i].astype(np.float32), f"w{i}"))
-        arrays.append(from_array(policy.weights[2 * i + 1].astype(np.float32), f"b{i}"))
-        target = "action" if i == last else f"x{i}"
-        nodes.append(helper.make_node("Gemm", [source, f"w{i}", f"b{i}"], [target]))
-        if i < last:
-            source = f"y{i}"
-            nodes.append(helper.make_node("Elu", [target], [source]))
-    ends = []
-    for name, size in (("observation", len(policy.mean)), ("action", len(policy.weights[-1]))):
-        ends.append(helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["batch", size]))
-    graph = helper.make_graph(nodes, "policy", ends[:1], ends[1:], arrays)
+    info = helper.make_tensor_value_info
+    float32 = require("onnx", "export").TensorProto.FLOAT
+    obs = info("observation", float32, ["batch", len(policy.mean)])
+    action = info("action", float32, ["batch", len(policy.weights[-1])])
+    nodes, arrays = layers(policy.weights)
+    graph = helper.make_graph(nodes, "policy", [obs], [action], arrays)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     metadata = {
         **policy.contract,
@@ -47,6 +37,25 @@ def export_onnx(path: Path, policy: Policy) -> None:
         "stand_s": STANDSTILL_TIMEOUT,
     }
     helper.set_model_props(model, {name: json.dumps(value) for name, value in metadata.items()})
-    checker.check_model(model, full_check=True)
+    require("onnx.checker", "export").check_model(model, full_check=True)
     with whole_file(path) as file:
         file.write(model.SerializeToString())
+
+
+def layers(weights: Sequence[Array]) -> tuple[list[Any], list[Any]]:
+    """Nodes and weights of x W + b, with ELU between layers, from w, b of each layer."""
+    make_node = require("onnx.helper", "export").make_node
+    from_array = require("onnx.numpy_helper", "export").from_array
+    nodes = []
+    arrays = []
+    source = "observation"
+    last = len(weights) // 2 - 1
+    for i in range(last + 1):
+        arrays.append(from_array(weights[2 * i].astype(np.float32), f"w{i}"))
+        arrays.append(from_array(weights[2 * i + 1].astype(np.float32), f"b{i}"))
+        target = "action" if i == last else f"x{i}"
+        nodes.append(make_node("Gemm", [source, f"w{i}", f"b{i}"], [target]))
+        if i < last:
+            source = f"y{i}"
+            nodes.append(make_node("Elu", [target], [source]))
+    return nodes, arrays

@@ -74,7 +74,28 @@ def run_seeds(
     `scheduler`; dask repeats it if the worker dies. ValueError: workers of several threads, which
     would share torch's settings.
     """
-    distributed = require("distributed", "sweep")
+    results: dict[int, Rows] = {}
+    failed: dict[int, str] = {}
+    with connect(scheduler) as client:
+        workers = client.scheduler_info(n_workers=-1)["workers"].values()
+        threads = {worker["nthreads"] for worker in workers}
+        if threads - {1}:
+            raise ValueError(
+                f"{scheduler}: expected workers with --nthreads 1, got {sorted(threads)}"
+            )
+        futures = {client.submit(job, seed, pure=False): seed for seed in seeds}
+        done = require("distributed", "sweep").as_completed(futures)
+        for future in tqdm(done, total=len(futures), desc="sweep", unit="seed", disable=None):
+            seed = futures[future]
+            if future.status == "finished":
+                results[seed] = future.result()
+            else:
+                failed[seed] = str(future.exception())
+    return results, failed
+
+
+def connect(scheduler: str | None) -> Any:
+    """A dask client of the scheduler at an address, or of one process per core of this machine."""
     options: dict[str, Any] = {"address": scheduler, "timeout": 10}
     if scheduler is None:
         options = {"threads_per_worker": 1, "memory_limit": None, "dashboard_address": ":0"}
@@ -84,22 +105,6 @@ def run_seeds(
         f"{environ}.TQDM_DISABLE": 1,
         f"{environ}.MALLOC_TRIM_THRESHOLD_": 2**30,  # with dask's 64 kB a training takes 1.4 times
     }
-    results: dict[int, Rows] = {}
-    failed: dict[int, str] = {}
+    client = require("distributed", "sweep").Client
     with require("dask", "sweep").config.set(settings):
-        client = distributed.Client(**options)
-    with client:
-        workers = client.scheduler_info(n_workers=-1)["workers"].values()
-        threads = {worker["nthreads"] for worker in workers}
-        if threads - {1}:
-            got = sorted(threads)
-            raise ValueError(f"{scheduler}: expected workers with --nthreads 1, got {got}")
-        futures = [client.submit(job, seed, pure=False, key=f"seed-{seed}") for seed in seeds]
-        done = distributed.as_completed(futures)
-        for future in tqdm(done, total=len(futures), desc="sweep", unit="seed", disable=None):
-            seed = int(future.key.removeprefix("seed-"))
-            if future.status == "finished":
-                results[seed] = future.result()
-            else:
-                failed[seed] = str(future.exception())
-    return results, failed
+        return client(**options)
