@@ -80,6 +80,7 @@ def test_fit__states_how_the_nets_were_fitted():
     np.testing.assert_allclose(net.input_scale[:, 14], u.std(axis=0), rtol=1e-6)
     plain = fit(log, FitConfig(steps=0), 7, 3)
     assert (plain.machine, plain.dead_zone, plain.settings["dead_zone"]) == ("", 0.0, 0.0)
+    assert fit(log._replace(rate=50.0), FitConfig(steps=0), 7, 3).rate == 50.0
 
 
 def test_fit__starts_from_hes_uniform_weights():

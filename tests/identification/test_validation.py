@@ -11,7 +11,6 @@ from helpers_machines import constant_net, line, random_net
 
 from brokk_min.actuator import ActuatorNet
 from brokk_min.identification import validation
-from brokk_min.identification.excitation import collect
 from brokk_min.identification.fitting import FitConfig, fit
 from brokk_min.identification.logs import Log, Recording, join_recordings, read_log, velocity_of
 from brokk_min.identification.validation import (
@@ -117,16 +116,6 @@ def test_score__counts_each_joint_where_it_moves_and_everywhere_if_it_never_does
 def test_score__refuses_a_log_of_another_kind(log, message):
     with pytest.raises(ValueError, match=message):
         score(constant_net([0.2], True, ("a",)), log)
-
-
-def test_score__is_at_the_rate_of_the_machine():
-    machine, config = replace(BROKK_170, rate=50.0), FitConfig(steps=12, rollout=2, hidden=4)
-    log = collect(machine, 0.001, "sine", np.random.default_rng(0))
-    net = fit(log, config, 0, 4, machine.name)
-    assert net.rate == log.rate == 50
-    q, q_dot = log.recordings[0].q, log.recordings[0].q_dot
-    slope = [estimate_velocity(q[i - 3 : i + 1].T, 4, 0.02) for i in range(4, len(q))]
-    np.testing.assert_allclose(q_dot[4:], slope, atol=1e-12)
 
 
 def test_free_run__has_the_history_of_the_log_and_then_its_own():
@@ -283,25 +272,25 @@ def test_validate__warns_of_nets_no_better_than_linear_and_of_tests_outside_the_
 # --- logs of another plant ------------------------------------------------------------------------
 
 
-def other_plant(delay: float) -> Machine:
+def other_plant() -> Machine:
     """Two joints with 45 % dead zone and a long dead time, at 100 Hz."""
     joints = [replace(BROKK_170.joints[i], name=name) for i, name in ((3, "boom"), (4, "stick"))]
     return replace(
-        BROKK_170, name="other", joints=tuple(joints), dead_zone=0.45, delay=delay, rate=100.0,
+        BROKK_170, name="other", joints=tuple(joints), dead_zone=0.45, delay=1.0, rate=100.0,
         pwm_limit=127, tau_valve_down=0.8,
     )  # fmt: skip
 
 
-def other_log(path: Path, delay: float, seed: int, runs: int, alone: bool) -> Log:
+def other_log(path: Path, seed: int, runs: int) -> Log:
     """Encoder angles with jitter, read at 20 Hz; every recording meets a stop.
 
-    Speed grows with the power 2.5 of the command beyond the dead zone. `alone`: one joint each.
+    Speed grows with the power 2.5 of the command beyond the dead zone; one joint moves in each.
     """
-    machine, rng, ticks = other_plant(delay), np.random.default_rng(seed), 2500
+    machine, rng, ticks = other_plant(), np.random.default_rng(seed), 2500
     u = np.zeros((ticks, runs, 2))
     for run, joint in np.ndindex(runs, 2):
         at = 0
-        while at < ticks and not (alone and run % 2 != joint):
+        while at < ticks and run % 2 == joint:
             hold = round(100 * (7.0 if at == 0 else rng.uniform(0.5, 4.0)))  # first to a stop
             u[at : at + hold, run, joint] = rng.choice([-1, 1]) if at == 0 else rng.uniform(-1, 1)
             at += hold
@@ -318,11 +307,10 @@ def other_log(path: Path, delay: float, seed: int, runs: int, alone: bool) -> Lo
     return read_log([path], 4)
 
 
-@pytest.mark.parametrize(("delay", "alone"), [(0.3, False), (1.0, True)])
-def test_validate__finds_nets_of_another_plant_better_than_linear(tmp_path, delay, alone):
-    log = other_log(tmp_path / "log.npz", delay, 0, 24, alone)
-    test = other_log(tmp_path / "test.npz", delay, 1, 8, alone)
-    net = fit(log, FitConfig(history=30, steps=1500), 0, 4)
+def test_validate__finds_nets_of_another_plant_better_than_linear(tmp_path):
+    log = other_log(tmp_path / "log.npz", 0, 24)
+    test = other_log(tmp_path / "test.npz", 1, 8)
+    net = fit(log, FitConfig(history=30, steps=1000, batch_size=256), 0, 4)
     result = validate(net, log, test)
     for joint in result["joints"].values():
         assert joint["one_step_rmse"] < joint["persistence_rmse"]
