@@ -220,8 +220,9 @@ def parts(path: Path) -> dict[str, ast.stmt]:
 
 
 def names_used(path: Path, test: str) -> set[str]:
-    """Names and words in a test, and in all that it calls of its file and of helpers."""
-    names: set[str] = set()
+    """Names and words in a test and in all that it calls of its file and of helpers; imported modules."""
+    imports = re.findall(r"^(?:from|import) brokk_min(.*)", path.read_text(), re.M)
+    names = set(re.findall(r"\w+", " ".join(imports))) & {s for s in LABELS if "." not in s}
     ahead = [test]
     while ahead:
         for node in ast.walk(parts(path)[ahead.pop()]):
