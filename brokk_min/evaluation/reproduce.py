@@ -179,7 +179,7 @@ def compare(
     """The paper's experiment, regret and robustness: JSON, all traces, those near singularities.
 
     Means, intervals and verdicts are over the "workspace" starts, from which all sequences can be
-    followed. Paper: Sec. 4.2
+    followed.
     """
     controllers: Controllers = {"rl": rl, **pids}
     commands = sequences.task_sequences(machine)
