@@ -162,7 +162,8 @@ class Drive:
         with self.catch_errors():
             self.listen(end - BUSY_WAIT)
             self.bus.sleep(max(0.0, end - BUSY_WAIT - self.bus.now()))
-            if self.history is not None and self.bus.now() < end:  # warm-up after sleep
+            # warm-up: caches are cold after sleep, and the first computation takes longer
+            if self.history is not None and self.bus.now() < end:
                 measured = measure(self.machine, self.history, self.v_goal, self.error_integral)
                 self.controller(measured, self.controller_state)
             self.listen(end, BUSY_WAIT)

@@ -1,7 +1,7 @@
 """Hand-written Denavit-Hartenberg kinematics: frames, tool position, Jacobian, tool velocity.
 
 One forward kinematics gives the frames of a pose; all else is worked out from these frames. The
-base frame has z up and its origin on the ground under the first axis. Paper: Fig. 1, eq3
+base frame has z up and its origin on the ground under the first axis. Paper: Fig. 1
 
 Example:
     >>> from brokk_min.machine import BROKK_170

@@ -159,7 +159,7 @@ class World:
         return np.array(times), np.rint(np.array(u) * 127).astype(int)
 
 
-class Push:
+class ConstantCommand:
     """A controller that gives constant commands [counts of 127]."""
 
     def __init__(self, *m: float) -> None:
@@ -174,7 +174,7 @@ class Push:
         return self.m[None] / 127, None
 
 
-class Hand:
+class HoldingOperator:
     """An operator who presses as soon as the gate is ready, then asks for motion."""
 
     def __init__(self) -> None:
@@ -279,13 +279,13 @@ class Virtual:
         self.sdl.SDL_JoystickSetVirtualAxis.argtypes = [pointer, number, ctypes.c_int16]
         self.sdl.SDL_JoystickSetVirtualButton.argtypes = [pointer, number, ctypes.c_uint8]
         self.index = self.sdl.SDL_JoystickAttachVirtual(4, axes, buttons, 0)
-        self.handle = self.sdl.SDL_JoystickOpen(self.index)
+        self.operatorle = self.sdl.SDL_JoystickOpen(self.index)
 
     def axis(self, axis: int, value: float) -> None:
-        assert self.sdl.SDL_JoystickSetVirtualAxis(self.handle, axis, round(32767 * value)) == 0
+        assert self.sdl.SDL_JoystickSetVirtualAxis(self.operatorle, axis, round(32767 * value)) == 0
 
     def button(self, button: int, held: bool) -> None:
-        assert self.sdl.SDL_JoystickSetVirtualButton(self.handle, button, held) == 0
+        assert self.sdl.SDL_JoystickSetVirtualButton(self.operatorle, button, held) == 0
 
     def unplug(self) -> None:
         assert self.sdl.SDL_JoystickDetachVirtual(self.index) == 0

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pygame
-from helpers_bus import START, Push, World
+from helpers_bus import START, ConstantCommand, World
 
 from brokk_min.can.drive_log import Telemetry
 from brokk_min.machine import BROKK_170
@@ -67,7 +67,7 @@ class PipedLoop:
 
     def __init__(self, *controllers: Any, log: Any = None) -> None:
         self.connection, there = multiprocessing.Pipe()
-        self.world = World(Push(), lambda driving, ready: None, log=log)  # type: ignore
+        self.world = World(ConstantCommand(), lambda driving, ready: None, log=log)  # type: ignore
         operator = WindowOperator(BROKK_170, there, lambda: self.world.t)
         selected = SelectedController(BROKK_170, controllers, operator)
         self.world.drive = WindowDrive(BROKK_170, selected, self.world.bus, operator)

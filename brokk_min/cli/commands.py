@@ -135,6 +135,7 @@ class Training(Command):
     """Options of trainings."""
 
     actuator: Path  # Nets that `fit` wrote.
+    critic: bool = False  # Advantages by a critic (as --paper), not by derivatives of the nets.
     settings: OmitArgPrefixes[LearnerSettings] = field(default_factory=LearnerSettings)
     task: OmitArgPrefixes[TaskSettings] = field(default_factory=TaskSettings)
 
@@ -145,7 +146,6 @@ class Train(Training):
 
     out: Path  # Policy to write, .npz.
     resume: bool = False  # Go on from OUT.checkpoint; the end is the same as without the break.
-    critic: bool = False  # Advantages by a critic (as --paper), not by derivatives of the nets.
     tensorboard: Path | None = None  # Folder for TensorBoard (extra `tensorboard`).
 
     def __call__(self) -> None:
@@ -180,7 +180,7 @@ class Sweep(Training):
         net = select_nets(machine, load_net(self.actuator))
         config = PPOConfig(**vars(self.settings))
         seeds = range(self.seed, self.seed + self.seeds)
-        options = (self.poses, self.scheduler, self.gains)
+        options = (self.poses, self.scheduler, self.gains, self.critic)
         print(show(sweep(machine, net, task, config, seeds, self.out, *options)))
 
 

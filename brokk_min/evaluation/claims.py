@@ -97,27 +97,27 @@ def _both(one: bool | None, other: bool | None) -> bool | None:
 # --- machine, nets, training ----------------------------------------------------------------------
 
 
-def net_claims(found: Mapping[str, Any]) -> list[Claim]:
-    """Do machine and nets behave as the paper's? `found` is of `preliminary.numbers`.
+def net_claims(numbers: Mapping[str, Any]) -> list[Claim]:
+    """Do machine and nets behave as the paper's? `numbers` is of `preliminary.numbers`.
 
     Single tests, so without intervals. Paper: Sec. 3.2 and 4.1, Fig. 2 and 5
     """
     kinds = ("machine", "nets")
-    up, down = list(found["sweep"])[1:3]  # at the limit
-    sweep = found["sweep"]
+    up, down = list(numbers["sweep"])[1:3]  # at the limit
+    sweep = numbers["sweep"]
     peaks = {f"{kind}, {u}": sweep[u][f"{kind}_peak"] for kind in kinds for u in (up, down)}
     faster = all(peaks[f"{kind}, {down}"] > peaks[f"{kind}, {up}"] for kind in kinds)
     times = {}
     for kind in kinds:
-        for start, of_start in found["response_time"][kind][found["joint"]].items():
+        for start, of_start in numbers["response_time"][kind][numbers["joint"]].items():
             times[f"{kind}, {start}"] = of_start["up"]
     slower = None
     if all(times.values()):
         limit = _limit("idle")
         slower = all(times[f"{k}, idle"] >= limit * times[f"{k}, moving"] for k in kinds)
-    coupling = found["coupling_rms"]
-    spread = found["sim_to_real"]["tool_position_error_mean_of_runs"]
-    gap = {"in the figure": found["sim_to_real"]["tool"]["position_error_mean"]}
+    coupling = numbers["coupling_rms"]
+    spread = numbers["sim_to_real"]["tool_position_error_mean_of_runs"]
+    gap = {"in the figure": numbers["sim_to_real"]["tool"]["position_error_mean"]}
     gap["median of runs"] = spread["median"]
     return [
         Claim("gravity", _exact(peaks), faster),
@@ -223,10 +223,10 @@ def _differ(up: Array, down: Array) -> bool | None:
     """Do two values per start (starts,) differ by a factor? None: too few values."""
     low, high = interval(up - down)
     means = [mean_interval(values)["mean"] for values in (up, down)]
-    found = [mean for mean in means if mean]
-    if low is None or high is None or len(found) < 2:
+    sizes = [mean for mean in means if mean]
+    if low is None or high is None or len(sizes) < 2:
         return None
-    return max(found) / min(found) > _limit("direction") and not low < 0 < high
+    return max(sizes) / min(sizes) > _limit("direction") and not low < 0 < high
 
 
 def less_claim(

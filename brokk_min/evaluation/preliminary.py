@@ -68,7 +68,7 @@ def run(machine: Machine, net: ActuatorNet, seed: int) -> Preliminary:
 
 
 def simulators(machine: Machine, net: ActuatorNet) -> dict[str, Simulator]:
-    """The "machine", and the "nets" of its driven joints, under which locked joints rest."""
+    """The "machine", and the "nets" of its driven joints, under which locked joints stand."""
     driven = machine.driven
     simulate = net_simulator(select_nets(machine, net))
 

@@ -179,7 +179,7 @@ def compare(
     """The paper's experiment, regret and robustness: JSON, all traces, those near singularities.
 
     Means, intervals and verdicts are over the "workspace" starts, from which all sequences can be
-    followed. Paper: Sec. 4.2
+    followed.
     """
     controllers: Controllers = {"rl": rl, **pids}
     commands = sequences.task_sequences(machine)
@@ -269,15 +269,15 @@ def near_singularities(
             trace = traces[name, sequence.name]
             fractions.append(claims.speed_fraction(machine, w0, trace, goals))
         speed[name] = metrics.row_mean(np.stack(fractions, axis=1))
-    found = claims.singular_claims(runs, speed)
+    singular = claims.singular_claims(runs, speed)
     results = {
         "summary": summary(runs),
-        "claims": [claim.to_json() for claim in found],
+        "claims": [claim.to_json() for claim in singular],
         "w0": w0,
         "manipulability": manipulability(J).tolist(),
         "least": np.linalg.svd(J, compute_uv=False)[:, -1].tolist(),
     }
-    return results, found, traces
+    return results, singular, traces
 
 
 def driven_log(machine: Machine, traces: Traces, controller: str) -> Log:

@@ -34,6 +34,7 @@ def sweep(
     starts: int,
     scheduler: str | None = None,
     gains: Path | None = None,
+    critic: bool = False,
 ) -> Table:
     """Train and evaluate `seeds`, each on one thread; all runs and the table go to `sweep.json`.
 
@@ -47,6 +48,7 @@ def sweep(
         starts: number of poses from which each scored sequence begins.
         scheduler: address of a dask scheduler; None: this machine.
         gains: file of tuned baselines, for further rows.
+        critic: see `train_policy`.
 
     Returns:
         `table` of the seeds that came to their end, and of the baselines.
@@ -57,7 +59,9 @@ def sweep(
     about = {"starts": starts, "sequences": [s.name for s in task_sequences(machine)]}
     config = replace(config, threads=1)
     evaluate = partial(evaluate_policy, machine, starts)
-    job = partial(run_seed, machine, net, task, config, out.resolve(), evaluate, about)
+    job = partial(
+        run_seed, machine, net, task, config, out.resolve(), evaluate, about, critic=critic
+    )
     results, failed = run_seeds(job, seeds, scheduler)
     baselines = read_gains(gains, machine, net) if gains else {}
     baseline_rows = run_scored(machine, baselines, starts)

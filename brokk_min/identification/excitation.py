@@ -80,7 +80,7 @@ def _starts(
 ) -> Array:
     """Levels up to `limit` for 0.1 to 1 s, each after a `wait`, (length,)."""
     parts: list[Array] = []
-    noise = rng.choice([0, 1]) * rng.uniform(0, machine.dead_zone)  # of a hand at rest
+    noise = rng.choice([0, 1]) * rng.uniform(0, machine.dead_zone)  # of an operator's hand
     while sum(map(len, parts)) < length:
         ticks = int(rng.uniform(0.1, 1.0) / machine.dt)
         parts.append(wait(rng, machine, noise))

@@ -1,4 +1,4 @@
-"""Fitting one actuator net per joint to a log. Paper: Sec. 3.3 (MSE, Adam)
+"""Fitting one actuator net per joint to a log.
 
 Training minimises errors of one step first, then the errors that add up over several steps of the
 nets on their own outputs: there a bias adds up and the noise of encoders does not. The nets of all
@@ -47,12 +47,12 @@ PAPER_RECIPE: dict[str, Any] = {"noise": 0.0, "rollout": 1, "dead_zone": 0.0}  #
 def fit(
     log: Log, config: FitConfig, seed: int, velocity_samples: int, machine: str = ""
 ) -> ActuatorNet:
-    """Fit one net per joint to a log; one `seed` gives the same nets on the same computer.
+    """Fit one net per joint to a log. Paper: Sec. 3.3 (MSE, Adam)
 
     Args:
         log: recordings of n joints.
         config: settings.
-        seed: of weights, windows and noise.
+        seed: of weights, windows and noise; it repeats the nets to the bit on one computer.
         velocity_samples: window of the estimator that made the velocities of `log`.
         machine: its name, for the file.
 
@@ -180,9 +180,8 @@ def cosine_decay(step: int, switch_step: int, steps: int) -> float:
 
 def draw_windows(windows: list[NDArray[np.intp]], batch: int, generator: Generator) -> Tensor:
     """Newest samples (n, batch) of random windows of each joint."""
-    drawn = []
-    for window in windows:
-        drawn.append(window[torch.randint(len(window), (batch,), generator=generator)])
+    picks = [torch.randint(len(window), (batch,), generator=generator) for window in windows]
+    drawn = [window[pick] for window, pick in zip(windows, picks, strict=True)]
     return torch.tensor(np.stack(drawn))
 
 

@@ -46,9 +46,11 @@ def net_from_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> ActuatorNet:
         n, inputs, hidden = len(net.joints), 3 * net.history, weights[0].shape[-1]
         shapes = [(n, inputs, hidden), (n, hidden), (n, hidden, hidden), (n, hidden)]
         shapes += [(n, hidden, 1), (n, 1), (n, inputs), (n, inputs), (n,), (n,), (n,), (n,)]
-        got = [array.shape for array in (*weights, *(arrays[name] for name in NET_ARRAYS))]
-        if got != shapes:
-            raise ValueError(f"shapes {got} instead of {shapes}")
+        numbers = (*weights, *(arrays[name] for name in NET_ARRAYS))
+        got = [array.shape for array in numbers]
+        if got != shapes or any(array.dtype.kind != "f" for array in numbers):
+            types = sorted({str(array.dtype) for array in numbers})
+            raise ValueError(f"shapes {got} of {types} instead of {shapes} of floats")
     return net
 
 

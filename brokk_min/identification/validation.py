@@ -263,13 +263,11 @@ def outside_training(log: Log, test: Log, history: int) -> dict[str, Array]:
     Kinds: command, change of command over a tick, mean command over a history, angle. Only samples
     count in which the joint moves.
     """
-    training_signals = _signals(log, history)
-    test_signals = _signals(test, history)
-    result = {}
-    for kind, training in training_signals.items():
-        pairs = zip(training, test_signals[kind], strict=True)
-        result[kind] = np.array([_fraction_outside(*pair) for pair in pairs])
-    return result
+    tested = _signals(test, history)
+    return {
+        kind: np.array(list(map(_fraction_outside, training, tested[kind])))
+        for kind, training in _signals(log, history).items()
+    }
 
 
 def _fraction_outside(training: Array, test: Array) -> float:
@@ -398,12 +396,10 @@ def named_times(times: Array, joints: Sequence[str]) -> dict[str, Any]:
     """Response times for JSON: {joint: {"idle": {"up", "down"}, "moving": {...}}} [s or None]."""
     result: dict[str, Any] = {}
     for j, name in enumerate(joints):
-        plain = [[None if np.isnan(t) else float(t) for t in row] for row in times[..., j]]
-        (idle_up, idle_down), (moving_up, moving_down) = plain
-        result[name] = {
-            "idle": {"up": idle_up, "down": idle_down},
-            "moving": {"up": moving_up, "down": moving_down},
-        }
+        result[name] = {}
+        for kind, row in zip(("idle", "moving"), times[..., j], strict=True):
+            up, down = (None if np.isnan(time) else float(time) for time in row)
+            result[name][kind] = {"up": up, "down": down}
     return result
 
 

@@ -87,7 +87,7 @@ def new_goals(
 
 
 def draw_noise(machine: Machine, largest: float, num: int, rng: np.random.Generator) -> Array:
-    """Uniform noise of `env.measure`, in deviations, float32 (num, noisy). Paper: Sec. 3.4 (5 %)"""
+    """Uniform noise of `env.measure`, in deviations, float32 (num, noisy)."""
     noise = rng.random((num, len(noise_std(machine))), np.float32)
     return np.float32(largest) * (2 * noise - 1)
 

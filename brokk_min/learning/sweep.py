@@ -33,6 +33,7 @@ def run_seed(
     evaluate: Evaluate,
     about: Mapping[str, Any],
     seed: int,
+    critic: bool = False,
 ) -> Rows:
     """Train one seed and evaluate its policy, or continue from what the folder `out` holds of it.
 
@@ -43,13 +44,13 @@ def run_seed(
     """
     policy_file = out / f"seed_{seed}.npz"
     result_file = out / f"seed_{seed}.json"
-    identity = describe_training(machine, net, task, config, False, seed)
+    identity = describe_training(machine, net, task, config, critic, seed)
     if result_file.exists():
         return read_result(result_file, {**identity, **about})
     policy = load_policy(policy_file, machine) if policy_file.exists() else None
     if policy is None or dict(policy.training) != identity:
         resume = Path(f"{policy_file}.checkpoint").exists()
-        policy = train_policy(machine, net, task, config, seed, policy_file, resume=resume)
+        policy = train_policy(machine, net, task, config, seed, policy_file, critic, resume)
     rows = evaluate(policy)
     write_json(result_file, {"identity": {**identity, **about}, "runs": rows})
     return rows

@@ -19,9 +19,9 @@ import pytest
 from helpers_bus import (
     MULTICAST,
     START,
-    Hand,
+    ConstantCommand,
+    HoldingOperator,
     Out,
-    Push,
     World,
     dictionary,
     own_multicast_port,
@@ -266,7 +266,7 @@ def test_open_bus__gives_back_no_echo_over_udp(
 
 @pytest.fixture
 def world() -> Iterator[World]:
-    world = World(Push(0, 0, 0, 0, 0), Hand())
+    world = World(ConstantCommand(0, 0, 0, 0, 0), HoldingOperator())
     yield world
     world.close()
 
@@ -305,7 +305,7 @@ def test_set_up_nodes__refuses_what_does_not_fit(world: World) -> None:
     six = (*BROKK_170.joints, replace(BROKK_170.joints[4], name="q6", encoder_node=6))
     machine = replace(BROKK_170, name="6_joints", joints=six, q_start=())
     with pytest.raises(ValueError, match=r"6_joints: expected at most 5 joints"):
-        hw.Drive(machine, Push(*np.zeros(6)), world.bus, Hand()).begin()
+        hw.Drive(machine, ConstantCommand(*np.zeros(6)), world.bus, HoldingOperator()).begin()
 
 
 def test_sdo__reads_small_objects_and_skips_foreign_answers(world: World) -> None:
@@ -362,21 +362,21 @@ def canopen_encoders(channel: str) -> Iterator[list[canopen.LocalNode]]:
 def test_drive__drives_five_encoders_of_the_canopen_library() -> None:
     """SDO, heartbeat, NMT and TPDO are the library's; only the valve controller is ours."""
     with canopen_encoders("peers") as nodes, open_bus("virtual", "peers") as bus:
-        hand = Hand()
-        drive = hw.Drive(BROKK_170, Push(0, 0, 0, 0, 0), bus, hand)
+        operator = HoldingOperator()
+        drive = hw.Drive(BROKK_170, ConstantCommand(0, 0, 0, 0, 0), bus, operator)
         drive.begin()
         assert [node.get_data(0x1017, 0) for node in nodes] == [b"\x32\x00"] * 5
         assert [node.get_data(0x1800, 2) for node in nodes] == [b"\x01"] * 5
         end = time.monotonic() + 20
         while not drive.gate.driving and time.monotonic() < end:  # a late answer: another edge
-            hand.enable = False if hand.enable is None and hand.pressed else None
+            operator.enable = False if operator.enable is None and operator.pressed else None
             drive.tick()
             drive.tick()
         assert drive.gate.driving, drive.reason
         assert {node.nmt.state for node in nodes} == {"OPERATIONAL"}
         np.testing.assert_allclose(drive.measured[0], START, atol=STEP / 1.9)
         nodes[2].nmt.stop_heartbeat()
-        hand.enable = False  # so that the present fault is shown, not a late tick
+        operator.enable = False  # so that the present fault is shown, not a late tick
         end = time.monotonic() + 20
         while "q3: heartbeat lost" not in drive.reason and time.monotonic() < end:
             drive.tick()

@@ -10,7 +10,7 @@ from pathlib import Path
 import can
 import numpy as np
 import pytest
-from helpers_bus import BASELINE, Hand, Push, World, once, only
+from helpers_bus import BASELINE, ConstantCommand, HoldingOperator, World, once, only
 
 from brokk_min.can.canopen import (
     OPERATOR_CHANNEL,
@@ -36,16 +36,16 @@ STEP = BROKK_170.encoder_step
 
 def drive_logged(path: Path, seconds: float = 4.0) -> World:
     """A drive with a fault in its midst, logged."""
-    hand = Hand()
-    world = World(BASELINE, hand, log=can.CanutilsLogWriter(path, channel="can0"))
+    operator = HoldingOperator()
+    world = World(BASELINE, operator, log=can.CanutilsLogWriter(path, channel="can0"))
     world.drive.begin()
     world.run(seconds / 2)
     world.upward = only(0x185, once(lambda data: []))
     world.run(0.3)
-    hand.enable = False
+    operator.enable = False
     world.run(0.1)
-    hand.enable = True
-    hand.v = (0.0, 0.1, 0.05)
+    operator.enable = True
+    operator.v = (0.0, 0.1, 0.05)
     world.run(seconds / 2)
     world.drive.signals.append(2)
     world.run(1.0)
@@ -98,7 +98,9 @@ def test_replay__of_a_recorded_log_sends_the_same_bytes(tmp_path: Path) -> None:
     assert len(valves) > 60
     assert len({data[:5] for data in valves}) > 30
     assert compare(BROKK_170, frames, again) == (len(valves), len(valves))
-    same, total = compare(BROKK_170, frames, replay(BROKK_170, Push(0, 0, 0, 0, 0), frames))
+    same, total = compare(
+        BROKK_170, frames, replay(BROKK_170, ConstantCommand(0, 0, 0, 0, 0), frames)
+    )
     assert same < 0.5 * total
     cut = frames[: len(frames) * 2 // 3]  # as after a SIGKILL
     assert [(frame.id, frame.data) for frame in replay(BROKK_170, BASELINE, cut)] == sent(cut)

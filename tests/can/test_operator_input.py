@@ -7,7 +7,7 @@ import sys
 
 import numpy as np
 import pytest
-from helpers_bus import START, Hand, Virtual, World
+from helpers_bus import START, HoldingOperator, Virtual, World
 
 from brokk_min.can.canopen import OperatorInput
 from brokk_min.can.operator_input import JointJog, Joystick, Script, shape_axis
@@ -117,14 +117,14 @@ def test_joystick__needs_pygame_but_no_window(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_joint_jog__moves_one_joint_with_the_sign_of_x() -> None:
-    hand = Hand()
-    world = World(JointJog(BROKK_170, "q4", 14), hand)
+    operator = HoldingOperator()
+    world = World(JointJog(BROKK_170, "q4", 14), operator)
     world.drive.begin()
     world.run(1.5)
     assert world.commands[1][-1].tolist() == [0, 0, 0, 14, 0]
     assert world.simulated.plant.q[3] > START[3] + 0.003
     for v, command in (((-0.2, 0.1, 0.1), -14), ((0.02, 0.2, -0.2), 0)):
-        hand.v = v
+        operator.v = v
         world.run(0.2)
         assert world.commands[1][-1].tolist() == [0, 0, 0, command, 0]
     world.close()

@@ -11,7 +11,7 @@ import pytest
 from helpers_cli import run
 
 from brokk_min.cli.commands import print_means, print_scores, split
-from brokk_min.evaluation import baselines, reproduce
+from brokk_min.evaluation import baselines, reproduce, seeds
 from brokk_min.evaluation.metrics import summary
 from brokk_min.evaluation.report import VERDICTS
 from brokk_min.evaluation.sequences import read_starts, start_kinds
@@ -348,11 +348,19 @@ def test_reproduce__prints_means_verdicts_and_files(
 
 
 def test_sweep__trains_seeds_from_the_first_on(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    options = f"--actuator '{folder}/net.npz' --seed 5 --seeds 1 --poses 1 {SMALL}"
+    def sweep(machine: Any, net: Any, task: Any, config: Any, *rest: Any) -> dict[str, Any]:
+        assert net.joints == ("q1", "q3", "q4", "q5")
+        assert (task.zero_goals, config.total_steps) == (0.5, 9)
+        assert rest == (range(5, 7), tmp_path, 3, "tcp://a:1", Path("gains.json"), True)
+        return {}
+
+    monkeypatch.setattr(seeds, "sweep", sweep)
+    options = "--seed 5 --seeds 2 --poses 3 --scheduler tcp://a:1 --gains gains.json --critic"
+    options += f" --actuator '{folder}/net.npz' --total-steps 9 --zero-goals 0.5"
     assert run(f"sweep {options} --out", tmp_path) == 0
-    assert (tmp_path / "seed_5.npz").exists()
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("mean and 95 % interval")
-    assert lines[1].split()[0] == "rl"
+    assert capsys.readouterr().out.startswith("mean and 95 % interval")

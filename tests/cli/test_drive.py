@@ -1,8 +1,7 @@
-"""The command `drive`: as a process on a real bus, on a terminal, and where it cannot go on."""
+"""The command `drive`: as a process on a real bus, and where it cannot go on."""
 
 from __future__ import annotations
 
-import io
 import signal
 import subprocess
 import sys
@@ -11,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers_bus import MULTICAST, START, eventually, own_multicast_port, recorded_rows, served
+from helpers_bus import MULTICAST, START, eventually, own_multicast_port, recorded_rows
 
 from brokk_min.__main__ import main
 from brokk_min.can.drive_log import read_frames
@@ -89,32 +88,6 @@ def test_drive__replays_converts_and_survives_a_kill_as_a_process_of_its_own(
         machine.kill()
         machine.communicate()
     assert list(read_frames(log))  # what a killed program left can be read
-
-
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
-
-
-def test_drive__keeps_its_status_on_one_line_of_a_terminal(
-    commands: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """The reason comes before what may be cut; the prompt begins a new line."""
-    command = ["drive", "--policy", POLICY, "--command", commands]
-    monkeypatch.setenv("COLUMNS", "60")
-    with served("status") as machine, monkeypatch.context() as patch:
-        receive = machine.receive
-        silent = lambda frame: [] if frame.id == 0x80 else receive(frame)  # noqa: E731
-        patch.setattr(machine, "receive", silent)
-        patch.setattr("sys.stdout", screen := Terminal())
-        assert run(*command, "--interface", "virtual", "--channel", "status") == 1
-    assert "expected to play all sequences, got q1: silent" in capsys.readouterr().err
-    *shown, last = screen.getvalue().split("\r")[1:]
-    assert len(shown) > 10
-    assert last.endswith("\033[K\n") and "waiting q1: silent v goal" in last
-    for line in shown:
-        text = line.removesuffix("\033[K")
-        assert len(text) == 59 and "\n" not in line
 
 
 def test_drive__refuses_in_one_line_to_drive_without_machine_joystick_or_slow_goals(

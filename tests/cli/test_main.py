@@ -20,7 +20,7 @@ OPTIONS = {
     "fit": "--out --test --json --figure --velocity-samples --history --dead-zone --paper",
     "preliminary": "--actuator --out",
     "train": "--actuator --out --total-steps --num-envs --resume --paper --critic --lag-cost",
-    "sweep": "--actuator --out --seeds --poses --scheduler --gains --total-steps --paper",
+    "sweep": "--critic --actuator --out --seeds --poses --scheduler --gains --total-steps --paper",
     "starts": "--out --num",
     "evaluate": "--policy --commands --starts --num-starts --perfect-model --plant --json --gains",
     "reproduce": "--out --quick --sweep",

@@ -10,7 +10,7 @@ from typing import Any
 import can
 import numpy as np
 import pytest
-from helpers_bus import Hand, World
+from helpers_bus import HoldingOperator, World
 from helpers_cli import MINI, run
 
 from brokk_min.can.operator_input import JointJog
@@ -36,7 +36,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Joint q4 jogs for two seconds, on a simulated machine and an injected clock."""
     path = tmp_path_factory.mktemp("drive") / "run.log"
     writer = can.CanutilsLogWriter(path, channel="can0")
-    world = World(JointJog(BROKK_170, "q4", 30), Hand(), log=writer)
+    world = World(JointJog(BROKK_170, "q4", 30), HoldingOperator(), log=writer)
     world.drive.begin()
     world.run(2.0)
     world.close()

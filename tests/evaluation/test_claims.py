@@ -18,8 +18,8 @@ STRONGER = baselines.STRONGER[0]
 POSE = np.array(BROKK_170.q_start)
 
 
-def verdicts(found: list[Claim]) -> list[bool | None]:
-    return [claim.holds for claim in found]
+def verdicts(result: list[Claim]) -> list[bool | None]:
+    return [claim.holds for claim in result]
 
 
 def runs_with(key: str, sequence: str = "x", **values: float) -> list[dict[str, Any]]:
@@ -111,11 +111,11 @@ def nets_from_idle(seconds: float | None) -> dict[str, Any]:
 def test_net_claims__hold_where_machine_and_nets_behave_as_the_papers(
     change: dict[str, Any], holds: list[bool | None]
 ) -> None:
-    found = claims.net_claims(preliminary_numbers(**change))
-    assert verdicts(found) == holds
-    assert [claim.to_json()["figure"] for claim in found] == ["Fig. 2"] * 3 + ["Fig. 5"]
+    result = claims.net_claims(preliminary_numbers(**change))
+    assert verdicts(result) == holds
+    assert [claim.to_json()["figure"] for claim in result] == ["Fig. 2"] * 3 + ["Fig. 5"]
     if holds[1] is None:
-        assert "nets, idle none; nets, moving 0.1" in found[1].to_json()["measured"]
+        assert "nets, idle none; nets, moving 0.1" in result[1].to_json()["measured"]
 
 
 @pytest.mark.parametrize(("hours", "holds"), [(0.1, False), (2.0, True), (4.0, True), (6.0, False)])
@@ -141,10 +141,10 @@ def test_drift_claim__is_of_all_baselines(
     rl: float, high: float, low: float, holds: list[bool]
 ) -> None:
     runs = runs_with("off_axis_drift_max", rl=rl, high=high, low=low)
-    found = [claims.still_claim(runs), claims.drift_claim(runs, (HIGH, LOW))]
-    assert verdicts(found) == holds
-    assert found[0].numbers["rl"]["mean"] == pytest.approx(rl + 0.001)
-    assert found[1].numbers[f"{HIGH} less rl"]["mean"] == pytest.approx(high - rl)
+    result = [claims.still_claim(runs), claims.drift_claim(runs, (HIGH, LOW))]
+    assert verdicts(result) == holds
+    assert result[0].numbers["rl"]["mean"] == pytest.approx(rl + 0.001)
+    assert result[1].numbers[f"{HIGH} less rl"]["mean"] == pytest.approx(high - rl)
 
 
 def test_drift_claim__of_one_start_has_no_verdict() -> None:
@@ -174,13 +174,13 @@ def test_less_claim__is_of_each_sequence_and_figure(
         runs += [a | b for a, b in zip(errors, drifts, strict=True)]
     names = (HIGH, LOW)
     both = ("velocity_error_mean", "off_axis_drift_max")
-    found = [
+    result = [
         claims.less_claim("tracking", runs, names, "xyz"),
         claims.less_claim("along z", runs, names, "z", both),
         claims.less_claim("outperforms", runs, names, ["all"]),
     ]
-    assert verdicts(found) == holds
-    less = found[1].numbers["drift z, less jacobian_pid_k0.1"]["mean"]
+    assert verdicts(result) == holds
+    less = result[1].numbers["drift z, less jacobian_pid_k0.1"]["mean"]
     assert less == pytest.approx(drift - 0.2)
 
 
@@ -221,12 +221,12 @@ def test_task_claims__are_in_the_papers_order_and_of_a_stronger_baseline_too() -
     trace = trace_of(np.tile(POSE, (2, 1)), np.zeros(3), np.zeros(5), 20)
     singular = [Claim("slowed", {}, None), Claim("jerky", {}, True)]
     along_x = dict.fromkeys(pids, trace)
-    found = claims.task_claims(BROKK_170, pids, runs, along_x, np.zeros((20, 3)), singular)
+    result = claims.task_claims(BROKK_170, pids, runs, along_x, np.zeros((20, 3)), singular)
     expected = ["still", "drift", "direction", "slowed", "jerky", "tracking", "along z"]
-    assert [claim.name for claim in found] == [*expected, "outperforms"]
+    assert [claim.name for claim in result] == [*expected, "outperforms"]
     assert set(expected) < set(claims.TEXTS)
-    assert verdicts(found) == [True, True, None, None, True, True, True, True]
-    stronger = [claim.stronger for claim in found if claim.stronger]
+    assert verdicts(result) == [True, True, None, None, True, True, True, True]
+    stronger = [claim.stronger for claim in result if claim.stronger]
     assert verdicts(stronger) == [False, None, False, False, False]
     assert list(stronger[-1].numbers) == [f"error all, less {STRONGER}"]
 

@@ -143,12 +143,12 @@ def test_numbers__of_another_machine_are_json() -> None:
     machine = MINI_EXCAVATOR
     net = small_net(machine, np.random.default_rng(0), machine.names)
     measured = preliminary.run(machine, net, 0)
-    found = preliminary.numbers(machine, measured)
-    json.dumps(found, allow_nan=False)
+    result = preliminary.numbers(machine, measured)
+    json.dumps(result, allow_nan=False)
     driven = [machine.names[i] for i in machine.driven]
-    assert found["joint"] == driven[-1] and len(found["sweep"]) == 4
-    assert list(found["sim_to_real"]["joints"]) == driven
-    assert set(found["response_time"]) == set(found["coupling_rms"]) == {"machine", "nets"}
+    assert result["joint"] == driven[-1] and len(result["sweep"]) == 4
+    assert list(result["sim_to_real"]["joints"]) == driven
+    assert set(result["response_time"]) == set(result["coupling_rms"]) == {"machine", "nets"}
     assert measured.gap.q.shape == (30 * machine.rate, 20, machine.n)
     assert not measured.gap.q[..., machine.locked].any()
 
@@ -156,9 +156,9 @@ def test_numbers__of_another_machine_are_json() -> None:
 def test_sweep_numbers__are_peaks_and_a_difference_without_the_outer_twentieths() -> None:
     q = np.linspace(0.0, 1.0, 201)
     ends = np.where((q < 0.03) | (q > 0.97), 7.0, 0.3)
-    found = preliminary.sweep_numbers(Sweep(q[::-1], -0.5 + 0 * q), Sweep(q, ends))
+    result = preliminary.sweep_numbers(Sweep(q[::-1], -0.5 + 0 * q), Sweep(q, ends))
     difference = pytest.approx(0.8)
-    assert found == {"machine_peak": 0.5, "nets_peak": 7.0, "difference_rms": difference}
+    assert result == {"machine_peak": 0.5, "nets_peak": 7.0, "difference_rms": difference}
     wider = np.where(np.abs(q - 0.5) < 0.4251, 0.3, 7.0)  # differs at 0.06 and 0.94
     assert preliminary.sweep_rms(Sweep(q, 0.3 + 0 * q), Sweep(q, wider)) > 0.1
 
@@ -168,15 +168,15 @@ def test_gap_numbers__by_hand() -> None:
     size = np.arange(1, 4)[:, None]
     q = np.array([0.1, -0.3])[:, None, None] * size * np.array([1.0, 9, 2, 3, 4])
     p = np.array([0.3, 0.5])[:, None, None] * size * np.array([0.6, 0.8, 0.0])
-    found = preliminary.gap_numbers(BROKK_170, Motion(q, 2 * q, p, 2 * p))
-    assert found["tool"] == {
+    result = preliminary.gap_numbers(BROKK_170, Motion(q, 2 * q, p, 2 * p))
+    assert result["tool"] == {
         "position_error_mean": pytest.approx(0.4),
         "velocity_rmse": pytest.approx(2 * np.sqrt((0.09 + 0.25) / 2)),
     }
     spread = {"median": pytest.approx(0.8), "max": pytest.approx(1.2), "runs": 3}
-    assert found["tool_position_error_mean_of_runs"] == spread
-    assert list(found["joints"]) == ["q1", "q3", "q4", "q5"]
-    assert found["joints"]["q4"] == {
+    assert result["tool_position_error_mean_of_runs"] == spread
+    assert list(result["joints"]) == ["q1", "q3", "q4", "q5"]
+    assert result["joints"]["q4"] == {
         "velocity_rmse": pytest.approx(2 * 3 * np.sqrt((0.01 + 0.09) / 2)),
         "position_error_mean": pytest.approx(3 * 0.2),
         "position_error_max": pytest.approx(3 * 0.3),

@@ -49,8 +49,8 @@ def made_up() -> dict[str, Any]:
     weak = number(0.05) | {"supply_demand": 1.25, "supply_limits": 0.125, "rl_less": number(-0.03)}
     tuning = {"seed": 3, "cost": [0.5, 0.25], "cost_anew": 0.3, "at_bound": ["kp q1"]}
     stronger = Claim("drift", {"less": number(0.5)}, None)
-    found = [Claim("still", {"rl": number(0.1)}, True), Claim("drift", {}, False, stronger)]
-    found += [Claim(name, {}, True) for name in ("slowed", "tracking", "along z", "outperforms")]
+    result = [Claim("still", {"rl": number(0.1)}, True), Claim("drift", {}, False, stronger)]
+    result += [Claim(name, {}, True) for name in ("slowed", "tracking", "along z", "outperforms")]
     net_claims = [Claim("coupling", {}, True), Claim("gap", {}, None)]
     return {
         "meta": {"machine": "digger <1>", "effort": {"train_steps": 6_000_000}},
@@ -68,7 +68,7 @@ def made_up() -> dict[str, Any]:
         "singular": {"summary": {"rl": jerk}, "w0": 0.8, "manipulability": [0.5, 0.25],
                      "least": [0.125, 0.375]},
         "net_claims": [claim.to_json() for claim in net_claims],
-        "claims": [claim.to_json() for claim in found],
+        "claims": [claim.to_json() for claim in result],
         "actuator": {"test": nets},
         "preliminary": {"sim_to_real": gap},
         "paper_recipe": {"test": nets, "sim_to_real": gap},
@@ -95,16 +95,16 @@ def sections(results: dict[str, Any], left_out: str = "") -> dict[str, str]:
 
 def rows(section: str) -> list[list[str]]:
     """Cells of all tables of a section."""
-    found = []
+    result = []
     for line in re.findall(r"<tr>(.*?)</tr>", section, re.DOTALL):
         cells = re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", line)
-        found.append([html.unescape(cell.replace("<wbr>", "")) for cell in cells])
-    return found
+        result.append([html.unescape(cell.replace("<wbr>", "")) for cell in cells])
+    return result
 
 
 def test_render__has_the_papers_figures_in_order() -> None:
-    found = sections(made_up())
-    numbered = [title for title in found if "(Fig." in title or title == "Learning curve"]
+    result = sections(made_up())
+    numbered = [title for title in result if "(Fig." in title or title == "Learning curve"]
     assert numbered == [
         "Preliminary tests (Fig. 2)", "Learning curve", "Sim-to-real gap (Fig. 5)",
         "Start configurations (Fig. 6a)", "Motion along x (Fig. 6b-d)",
@@ -112,8 +112,8 @@ def test_render__has_the_papers_figures_in_order() -> None:
         "Near the singularity (Fig. 6a, e, f)",
     ]  # fmt: skip
     for title in numbered:  # each figure stands with its sentences
-        assert "<img" in found[title] and ("<blockquote>" in found[title] or "6a)" in title)
-    assert "Training seeds" not in found
+        assert "<img" in result[title] and ("<blockquote>" in result[title] or "6a)" in title)
+    assert "Training seeds" not in result
     assert not any("singularity" in title for title in sections(made_up(), left_out="singular"))
 
 
@@ -139,65 +139,65 @@ def test_render__answers_the_papers_sentences_first() -> None:
 
 
 def test_render__quotes_each_claim_below_its_figure() -> None:
-    found = sections(made_up())
-    quotes = {title: text.count("<blockquote>") for title, text in found.items()}
+    result = sections(made_up())
+    quotes = {title: text.count("<blockquote>") for title, text in result.items()}
     assert quotes["Motion along x (Fig. 6b-d)"] == 2 and quotes["Figures of merit"] == 1
     assert sum(quotes.values()) == 9  # with the training
-    assert "6,000,000 steps here 1 [h]. <b>This does not hold" in found["Learning curve"]
-    along_x = html.unescape(found["Motion along x (Fig. 6b-d)"])
+    assert "6,000,000 steps here 1 [h]. <b>This does not hold" in result["Learning curve"]
+    along_x = html.unescape(result["Motion along x (Fig. 6b-d)"])
     assert "to be below 0.05 m: rl 0.1 [m]. <b>This holds here.</b>" in along_x
     assert "does not have: largest distance" in along_x
     assert "RL's: less 0.5 [m]. <b>This was not measured.</b>" in along_x
-    assert found["Motion along x (Fig. 6b-d)"].count("<img") == 2
-    singular = found["Near the singularity (Fig. 6a, e, f)"]
+    assert result["Motion along x (Fig. 6b-d)"].count("<img") == 2
+    singular = result["Near the singularity (Fig. 6a, e, f)"]
     assert "manipulability 0.25 to 0.50, damping begins below 0.80" in singular
     assert "0.12 to 0.38 m/rad" in singular
     assert rows(singular)[1] == ["rl", "0.3", "1.5", "0.1", "2"]
 
 
 def test_render__has_the_tables_of_nets_and_of_the_comparison() -> None:
-    found = {title: rows(text)[1:] for title, text in sections(made_up()).items()}
+    result = {title: rows(text)[1:] for title, text in sections(made_up()).items()}
     error, drift = f"{ERROR} [m/s]", f"{DRIFT} [m]"
-    assert found["Actuator nets"] == [
+    assert result["Actuator nets"] == [
         ["q1", "0.1", "0.2", "", ""],
         ["q5", "0.1", "0.2", "0.3", "0.4"],
     ]
     recipe = ["", "0.3", "0.015", "0.025"]
-    assert [row[1:] for row in found["Two recipes"]] == [recipe, recipe]
+    assert [row[1:] for row in result["Two recipes"]] == [recipe, recipe]
     rl, pid = "0.0200 (0.0190 to 0.0220)", "0.0500 (0.0490 to 0.0520)"
-    assert found["Figures of merit"] == [[error, rl, pid], [drift, "0.2000", "0.5000"]]
+    assert result["Figures of merit"] == [[error, rl, pid], [drift, "0.2000", "0.5000"]]
     along = ["x", "0.0100 (0.0090 to 0.0120)", "0.0300 (0.0290 to 0.0320)"]
-    by_sequence = found["Velocity error and drift by sequence"]
+    by_sequence = result["Velocity error and drift by sequence"]
     assert by_sequence[:2] == [along, ["all", rl, pid]] and by_sequence[3] == [
         "x",
         "0.1000",
         "0.3000",
     ]
-    less = found["RL less each baseline"]
+    less = result["RL less each baseline"]
     assert less[:2] == [
         [error, "-0.0400 (-0.5000 to -0.2500)"], [drift, "-4 (-0.5000 to -0.2500)"]
     ]  # fmt: skip
     assert less[3] == ["x", "-0.0200 (-0.5000 to -0.2500)"] and len(less) == 8
     others = [[error, "0.01", "0.03"], ["time_at_limits [s]", "", ""]]
-    assert found["Starts of other kinds"] == others
-    regret = found["Regret"]
+    assert result["Starts of other kinds"] == others
+    regret = result["Regret"]
     assert regret[:2] == [
         ["perfect_model", "0.004", "0.005", "7"], ["perfect_model_no_dither", "0.006", "0.008", "5"]
     ]  # fmt: skip
     assert regret[3] == ["rl", "0.0070", "0.0080"]
-    robust = found["Robustness"]
+    robust = result["Robustness"]
     assert robust[0] == ["nominal", "0.0200 (0.0100 to 0.0300)", "0.0500"]
     assert robust[2] == ["nominal", "-0.0300"] and robust[4] == ["nominal", "125 %", "12.5 %"]
 
 
 def test_render__lists_what_was_scored_and_tuned_on() -> None:
-    found = {title: rows(text) for title, text in sections(made_up()).items()}
-    assert [row[0] for row in found["Scored sequences"][1:4]] == ["x", "y", "z"]
-    assert found["Scored sequences"][1][1] == "18"
-    starts = found["Scored starts"]
+    result = {title: rows(text) for title, text in sections(made_up()).items()}
+    assert [row[0] for row in result["Scored sequences"][1:4]] == ["x", "y", "z"]
+    assert result["Scored sequences"][1][1] == "18"
+    starts = result["Scored starts"]
     assert starts[1] == ["start 0", "1.5", "0.5", "0.58", "1.71", "1.24", "limits"]
-    assert found["Tuning of the baselines"][1] == ["p_d", "3", "0.5", "0.25", "0.3", "kp q1"]
-    run = found["Tuning runs"][1]
+    assert result["Tuning of the baselines"][1] == ["p_d", "3", "0.5", "0.25", "0.3", "kp q1"]
+    run = result["Tuning runs"][1]
     assert run[:2] == ["tuning run 0", "1.5"] and run[6:10] == ["3", "1", "0.5", "1"]
     assert run[10] == "1 s (0, 0, 0); 2 s (0.3, 0, 0.4)"
 

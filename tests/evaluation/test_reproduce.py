@@ -162,9 +162,9 @@ def test_budget__is_what_fit_and_train_spend_by_default() -> None:
 def test_paper_recipe__is_scored_on_the_test_log(folder: Path) -> None:
     test = read_log([folder / "log_test.npz"], 4, rate=20.0)
     config = FitConfig(steps=3, batch_size=8)
-    found = reproduce.paper_recipe(BROKK_170, test, 0.02, config, 0)
-    assert set(found["test"]) == set(BROKK_170.names) and "10" in found["test"]["q5"]["free_run"]
-    assert found["sim_to_real"]["tool_position_error_mean_of_runs"]["runs"] == 20
+    result = reproduce.paper_recipe(BROKK_170, test, 0.02, config, 0)
+    assert set(result["test"]) == set(BROKK_170.names) and "10" in result["test"]["q5"]["free_run"]
+    assert result["sim_to_real"]["tool_position_error_mean_of_runs"]["runs"] == 20
 
 
 def test_driven_log__has_commands_and_encoder_angles_of_one_controller() -> None:
@@ -192,15 +192,15 @@ def test_tables__keep_kinds_of_starts_apart() -> None:
             for i, kind in enumerate(("workspace", "limits", "workspace")):
                 row = {"controller": controller, "sequence": sequence, "start": i, "kind": kind}
                 rows.append(row | {"error": base + i + (kind == "limits") / 2})
-    found = reproduce.tables(rows, [row for row in rows if row["kind"] == "workspace"])
-    assert found["runs"] is rows
-    assert found["summary"]["pid"] == {s: {"error": 5.0} for s in ("x", "y", "all")}
+    result = reproduce.tables(rows, [row for row in rows if row["kind"] == "workspace"])
+    assert result["runs"] is rows
+    assert result["summary"]["pid"] == {s: {"error": 5.0} for s in ("x", "y", "all")}
     limits = {"rl": {"error": 2.5}, "pid": {"error": 5.5}}
     workspace = {"rl": {"error": 2.0}, "pid": {"error": 5.0}}
-    assert found["by_kind"] == {"workspace": workspace, "limits": limits}
-    less = found["rl_less"]["error"]["pid"]["all"]
+    assert result["by_kind"] == {"workspace": workspace, "limits": limits}
+    less = result["rl_less"]["error"]["pid"]["all"]
     assert less == {"mean": -3.0, "low": -3.0, "high": -3.0}
-    low, high = found["intervals"]["rl"]["x"]["error"]
+    low, high = result["intervals"]["rl"]["x"]["error"]
     assert (low, high) == pytest.approx((2 - 12.7062, 2 + 12.7062), abs=1e-3)
 
 
@@ -215,7 +215,7 @@ def test_near_singularities__drives_along_what_an_upright_arm_can_do_least() -> 
     net = small_net(machine, np.random.default_rng(0))
     pids = baselines.baselines(machine, net)
     controllers = {"rl": Idle(), **{name: pids[name] for name in baselines.PAPER_BASELINES}}
-    found, claims, traces = reproduce.near_singularities(machine, controllers, starts, 1.5, 3)
+    result, claims, traces = reproduce.near_singularities(machine, controllers, starts, 1.5, 3)
     halves = ("least_half", "least_quarter")
     assert list(traces) == [(c, s) for c in controllers for s in halves]
     assert all(trace.q.shape == (30, 2, 5) for trace in traces.values())
@@ -223,10 +223,10 @@ def test_near_singularities__drives_along_what_an_upright_arm_can_do_least() -> 
     frames = kinematics.forward_kinematics(machine, starts)
     J = kinematics.jacobian(frames)[..., machine.driven]
     JJt = J @ J.swapaxes(-1, -2)
-    np.testing.assert_allclose(found["manipulability"], np.sqrt(np.linalg.det(JJt)))
-    np.testing.assert_allclose(found["least"], np.sqrt(np.linalg.eigvalsh(JJt)[:, 0]), rtol=1e-6)
-    assert list(found["summary"]) == list(controllers)
-    assert found["summary"]["rl"]["all"][ERROR] == pytest.approx(0.075 * 10 / 30)
-    assert found["claims"] == [claim.to_json() for claim in claims] and len(claims) == 3
+    np.testing.assert_allclose(result["manipulability"], np.sqrt(np.linalg.det(JJt)))
+    np.testing.assert_allclose(result["least"], np.sqrt(np.linalg.eigvalsh(JJt)[:, 0]), rtol=1e-6)
+    assert list(result["summary"]) == list(controllers)
+    assert result["summary"]["rl"]["all"][ERROR] == pytest.approx(0.075 * 10 / 30)
+    assert result["claims"] == [claim.to_json() for claim in claims] and len(claims) == 3
     none = reproduce.near_singularities(machine, controllers, starts[:0], 1.5, 3)
     assert none == ({"summary": {}, "claims": []}, [], {})

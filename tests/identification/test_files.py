@@ -1,15 +1,25 @@
-"""Files: small tables are read with names for what is wrong, and nothing is ever half written."""
+"""Files: errors have a place, nothing is half written, and nothing is executed."""
 
 from __future__ import annotations
 
+import os
+import zipfile
+
+import numpy as np
 import pytest
 
-from brokk_min.identification.files import read_table, whole_file, write_csv, write_json
+from brokk_min.identification.files import (
+    expect_same,
+    load_arrays,
+    read_table,
+    require,
+    whole_file,
+    write_csv,
+    write_json,
+)
 
-# --- small tables ---------------------------------------------------------------------------------
 
-
-def test_a_table_of_commands(tmp_path):
+def test_read_table__reads_numbers_and_text(tmp_path):
     path = tmp_path / "commands.csv"
     path.write_text("sequence,time,vx\nup,0,0.1\nup,2.5,-1e-1\n")
     columns = read_table(path, ["sequence", "time", "vx"], text=["sequence"])
@@ -26,7 +36,7 @@ def test_a_table_of_commands(tmp_path):
         ("sequence,time,vx\nup,0\n", ["row 2", "3 cells", "got 2"]),
     ],
 )
-def test_a_bad_table_is_refused_by_file_row_and_column(tmp_path, text, words):
+def test_read_table__names_file_row_and_column_of_an_error(tmp_path, text, words):
     path = tmp_path / "commands.csv"
     path.write_text(text)
     with pytest.raises(ValueError) as caught:
@@ -35,11 +45,16 @@ def test_a_bad_table_is_refused_by_file_row_and_column(tmp_path, text, words):
     assert message.startswith(f"{path}: ") and all(word in message for word in words), message
 
 
-# --- whole files ----------------------------------------------------------------------------------
+def test_write_csv__reads_back(tmp_path):
+    rows = [["a", 0.1, 1e-17], ["b, c", -2.0, 1 / 3]]
+    write_csv(tmp_path / "a.csv", ["name", "x", "y"], rows)
+    assert (tmp_path / "a.csv").read_text() == f'name,x,y\na,0.1,1e-17\n"b, c",-2.0,{1 / 3}\n'
+    back = read_table(tmp_path / "a.csv", ["name", "x", "y"], text=["name"])
+    assert [list(row) for row in zip(*back.values(), strict=True)] == rows
 
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit])
-def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, error):
+def test_whole_file__leaves_the_old_file_when_writing_fails(tmp_path, error):
     path = tmp_path / "policy.npz"
     path.write_bytes(b"old")
     with pytest.raises(error), whole_file(path) as file:
@@ -51,7 +66,13 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, error
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_write_that_ends_replaces_the_file(tmp_path):
+def test_whole_file__names_the_file_of_a_full_disk(tmp_path):
+    with pytest.raises(OSError) as caught, whole_file(tmp_path / "log.csv"):
+        raise OSError(28, "No space left on device")
+    assert caught.value.filename == str(tmp_path / "log.csv")
+
+
+def test_whole_file__replaces_the_file_at_the_end(tmp_path):
     path = tmp_path / "table.csv"
     path.write_text("old and much longer than the new one")
     with whole_file(path, "w") as file:
@@ -62,24 +83,55 @@ def test_a_write_that_ends_replaces_the_file(tmp_path):
     assert path.stat().st_mode & 0o777 == 0o644
 
 
-def test_a_folder_that_is_not_there_is_named(tmp_path):
+def test_whole_file__names_a_missing_folder(tmp_path):
     path = tmp_path / "nowhere" / "log.csv"
     with pytest.raises(ValueError) as caught, whole_file(path):
         pass
-    wanted = f"{path}: expected an existing directory, got {path.parent}"
-    assert str(caught.value) == wanted
+    assert str(caught.value) == f"{path}: expected an existing directory, got {path.parent}"
 
 
-def test_json_has_all_digits_and_no_nan(tmp_path):
+def test_write_json__keeps_all_digits_and_refuses_nan(tmp_path):
     write_json(tmp_path / "a.json", {"b": [0.1]})
     assert (tmp_path / "a.json").read_text() == '{\n "b": [\n  0.1\n ]\n}\n'
     with pytest.raises(ValueError, match="not JSON compliant"):
         write_json(tmp_path / "a.json", {"b": float("nan")})
 
 
-def test_a_table_that_is_written_reads_back(tmp_path):
-    rows = [["a", 0.1, 1e-17], ["b, c", -2.0, 1 / 3]]
-    write_csv(tmp_path / "a.csv", ["name", "x", "y"], rows)
-    assert (tmp_path / "a.csv").read_text() == f'name,x,y\na,0.1,1e-17\n"b, c",-2.0,{1 / 3}\n'
-    back = read_table(tmp_path / "a.csv", ["name", "x", "y"], text=["name"])
-    assert [list(row) for row in zip(*back.values(), strict=True)] == rows
+class Bomb:
+    def __reduce__(self):
+        return os.mkdir, (os.environ["BOMB"],)
+
+
+def test_load_arrays__executes_nothing(tmp_path, monkeypatch):
+    monkeypatch.setenv("BOMB", str(tmp_path / "went off"))
+    array = np.empty(1, object)
+    array[0] = Bomb()
+    np.savez(tmp_path / "bomb.npz", run=array)
+    with pytest.raises(ValueError, match=r"bomb\.npz: expected a readable \.npz file"):
+        load_arrays(tmp_path / "bomb.npz")
+    assert not (tmp_path / "went off").exists()
+
+
+def test_load_arrays__takes_no_memory_that_the_file_size_does_not_justify(tmp_path):
+    path = tmp_path / "bomb.npz"
+    np.savez_compressed(path, zeros=np.zeros(2**22))  # 32 MiB in some 30 kB
+    with pytest.raises(ValueError, match="33554560 bytes unpacked, more than 16777216"):
+        load_arrays(path)
+    with zipfile.ZipFile(path, "w") as archive, archive.open("a.npy", "w") as file:
+        header = {"descr": "<f8", "fortran_order": False, "shape": (2**40,)}
+        np.lib.format.write_array_header_1_0(file, header)  # 8 TiB announced, none there
+    with pytest.raises(ValueError, match="expected a readable"):
+        load_arrays(path)
+
+
+def test_expect_same__names_the_first_entry_that_differs(tmp_path):
+    header = {"machine": "brokk170", "rate": 20.0}
+    expect_same(tmp_path, header, header)
+    with pytest.raises(ValueError, match=r"rate: expected 25\.0, got 20\.0"):
+        expect_same(tmp_path, header, {"machine": "brokk170", "rate": 25.0})
+
+
+def test_require__names_the_extra_that_brings_a_missing_package():
+    assert require("json", "hw").loads("[1]") == [1]
+    with pytest.raises(ValueError, match=r"no_such_package: expected the extra brokk_min\[hw\]"):
+        require("no_such_package", "hw")

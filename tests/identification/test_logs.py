@@ -1,10 +1,9 @@
-"""Logs: what is written reads back, any rate becomes 20 Hz, and whatever is wrong is named."""
+"""Logs: what is written reads back, any rate becomes the machine's, and errors have a place."""
 
 from __future__ import annotations
 
 import gzip
 import io
-import os
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +11,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from brokk_min.__main__ import main
-from brokk_min.identification.files import load_arrays
-from brokk_min.identification.logs import Log, Recording, read_log, velocity_of, write_log
+from brokk_min.identification.logs import (
+    Log,
+    Recording,
+    join_recordings,
+    read_log,
+    velocity_of,
+    write_log,
+)
 
 Columns = dict[str, np.ndarray]
 
@@ -24,10 +28,9 @@ def write(path: Path, columns: Columns) -> Path:
     if path.suffix == ".npz":
         np.savez(path, **columns)
     else:
-        rows = zip(
-            *([str(cell) for cell in column.tolist()] for column in columns.values()), strict=True
-        )
-        path.write_text("\n".join([",".join(columns), *map(",".join, rows)]) + "\n")
+        cells = [map(str, column.tolist()) for column in columns.values()]
+        rows = map(",".join, zip(*cells, strict=True))
+        path.write_text("\n".join([",".join(columns), *rows]) + "\n")
     return path
 
 
@@ -44,20 +47,18 @@ def both(first: Columns, second: Columns) -> Columns:
     return {name: np.concatenate([first[name], second[name]]) for name in first}
 
 
-def at_20_hz(columns: Columns, joint: str) -> tuple[np.ndarray, np.ndarray]:
-    """Command held and angle interpolated, sample by sample."""
+def resampled(columns: Columns, joint: str) -> tuple[list[float], list[float]]:
+    """Command held and angle interpolated at 20 Hz, sample by sample."""
     time, u, q = (columns[name].tolist() for name in ("time", f"u_{joint}", f"q_{joint}"))
-    held, between = [], []
-    tick = 0
-    while (now := time[0] + tick * 0.05) <= time[-1] + 1e-9:
+    commands, angles = [], []
+    while (now := time[0] + len(angles) * 0.05) <= time[-1] + 1e-9:
         last = max(i for i in range(len(time)) if time[i] <= now + 1e-9)
         following = min(last + 1, len(time) - 1)
         gap = time[following] - time[last]
-        part = (now - time[last]) / gap if gap else 0.0
-        held.append(u[last])
-        between.append(q[last] + part * (q[following] - q[last]))
-        tick += 1
-    return np.array(held), np.array(between)
+        fraction = (now - time[last]) / gap if gap else 0.0
+        commands.append(u[last])
+        angles.append(q[last] + fraction * (q[following] - q[last]))
+    return commands, angles
 
 
 # --- round trips ----------------------------------------------------------------------------------
@@ -74,49 +75,45 @@ def some_log(velocity_logged: bool, lengths: tuple[int, ...] = (30, 1, 7)) -> Lo
 
 @pytest.mark.parametrize("suffix", [".csv", ".npz"])
 @pytest.mark.parametrize("velocity_logged", [False, True])
-def test_what_is_written_reads_back(tmp_path, suffix, velocity_logged):
+def test_write_log__reads_back(tmp_path, suffix, velocity_logged):
     log = some_log(velocity_logged)
     write_log(tmp_path / f"log{suffix}", log)
     again = read_log([tmp_path / f"log{suffix}"], velocity_samples=4)
     assert again.joints == log.joints and again.velocity_logged == velocity_logged
     assert [r.name for r in again.recordings] == [r.name for r in log.recordings]
     tolerance = 1e-12 if suffix == ".npz" else 2e-6
-    for got, wanted in zip(again.recordings, log.recordings, strict=True):
-        np.testing.assert_allclose(got.u, wanted.u, atol=tolerance)
-        np.testing.assert_allclose(got.q, wanted.q, atol=tolerance)
-        q_dot = wanted.q_dot if velocity_logged else velocity_of(wanted.q, 4)
+    for got, written in zip(again.recordings, log.recordings, strict=True):
+        np.testing.assert_allclose(got.u, written.u, atol=tolerance)
+        np.testing.assert_allclose(got.q, written.q, atol=tolerance)
+        q_dot = written.q_dot if velocity_logged else velocity_of(written.q, 4)
         np.testing.assert_allclose(got.q_dot, q_dot, atol=max(tolerance, 1e-12) * 30)
 
 
-def test_an_hour_keeps_its_time_stamps_in_csv(tmp_path):
+def test_write_log__keeps_the_time_stamps_of_an_hour_and_any_name(tmp_path):
     rng = np.random.default_rng(0)
     u, q = rng.uniform(-0.6, 0.6, (72_000, 1)), rng.uniform(-1, 1, (72_000, 1))
-    write_log(tmp_path / "hour.csv", Log(("a",), (Recording("hour", u, q, q),)))
+    write_log(tmp_path / "hour.csv", Log(("a",), (Recording('Tuesday, "wet"', u, q, q),)))
     (again,) = read_log([tmp_path / "hour.csv"], 4).recordings
+    assert again.name == 'Tuesday, "wet"'
     np.testing.assert_allclose(again.u, u, atol=2e-6)
     np.testing.assert_allclose(again.q, q, atol=2e-6)
+    assert b"\r" not in (tmp_path / "hour.csv").read_bytes()  # one line end on all systems
 
 
 @pytest.mark.parametrize("name", ["log.txt", "log", "log.npz.gz"])
-def test_a_log_has_one_of_two_forms(tmp_path, name):
+def test_write_log__refuses_another_suffix_and_an_empty_log(tmp_path, name):
     with pytest.raises(ValueError, match=r"\.csv or \.npz") as caught:
         write_log(tmp_path / name, some_log(False))
     assert str(tmp_path / name) in str(caught.value)
+    with pytest.raises(ValueError, match="at least one recording to write"):
+        write_log(tmp_path / "log.csv", some_log(False, ()))
     assert not list(tmp_path.iterdir())
-
-
-def test_a_recording_may_be_called_anything(tmp_path):
-    log = some_log(False, (5,))
-    named = log._replace(recordings=(log.recordings[0]._replace(name='Tuesday, "wet"'),))
-    write_log(tmp_path / "log.csv", named)
-    assert read_log([tmp_path / "log.csv"], 4).recordings[0].name == 'Tuesday, "wet"'
-    assert b"\r" not in (tmp_path / "log.csv").read_bytes()  # one kind of line end on all systems
 
 
 # --- resampling -----------------------------------------------------------------------------------
 
 
-def test_a_jittering_log_by_hand(tmp_path):
+def test_read_log__resamples_a_jittering_log_by_hand(tmp_path):
     path = tmp_path / "log.csv"
     path.write_text(
         "run,time,u_arm,q_arm\nx,10.00,0.1,1.0\nx,10.03,0.2,1.3\nx,10.06,0.3,1.6\nx,10.11,0.4,2.6\n"
@@ -128,46 +125,23 @@ def test_a_jittering_log_by_hand(tmp_path):
     np.testing.assert_allclose(recording.q_dot[:, 0], [0.0, 10.0, 18.0])
 
 
-@pytest.mark.parametrize("suffix", [".csv", ".npz"])
-@pytest.mark.parametrize("rate", [20.0, 33.0, 100.0])
-def test_several_recordings_with_jitter_are_resampled_each_for_itself(tmp_path, suffix, rate):
-    rng = np.random.default_rng(3)
-
-    def stamps(start: float, n: int) -> np.ndarray:
-        return start + (np.arange(n) + rng.uniform(-0.2, 0.2, n)) / rate
-
-    first, second = table("first", stamps(100.0, 150), 1), table("second", stamps(3.0, 90), 2)
-    path = write(tmp_path / f"log{suffix}", both(first, second))
-    log = read_log([path], velocity_samples=4)
-    assert [r.name for r in log.recordings] == ["first", "second"]
-    assert log.joints == ("a", "b") and not log.velocity_logged
-    for recording, columns in zip(log.recordings, (first, second), strict=True):
-        for i, joint in enumerate(log.joints):
-            u, q = at_20_hz(columns, joint)
-            np.testing.assert_allclose(recording.u[:, i], u, atol=1e-12)
-            np.testing.assert_allclose(recording.q[:, i], q, atol=1e-9)
-        np.testing.assert_allclose(recording.q_dot, velocity_of(recording.q, 4), atol=1e-12)
-
-
 @given(st.lists(st.floats(0.004, 0.05), min_size=2, max_size=60), st.integers(0, 2**16))
-def test_resampling_against_a_loop(tmp_path_factory, steps, seed):
+def test_read_log__resamples_as_a_loop_does(tmp_path_factory, steps, seed):
     time = np.concatenate([[7.0], 7.0 + np.cumsum(steps)])
-    # stamps within a microsecond of a tick may go either way: keep off them
-    time = np.where(
-        np.abs((time - 7.0) * 20 - np.rint((time - 7.0) * 20)) < 1e-3, time + 1e-3, time
-    )
+    ticks = (time - 7.0) * 20  # stamps within a microsecond of a tick may go either way: shift them
+    time = np.where(np.abs(ticks - np.rint(ticks)) < 1e-3, time + 1e-3, time)
     time[0] = 7.0
     columns = table("x", time, seed, ("a",))
     path = write(tmp_path_factory.getbasetemp() / "looped.npz", columns)
     (recording,) = read_log([path], 4).recordings
-    u, q = at_20_hz(columns, "a")
+    u, q = resampled(columns, "a")
     np.testing.assert_array_equal(recording.u[:, 0], u)
     np.testing.assert_allclose(recording.q[:, 0], q, atol=1e-9)
 
 
 @pytest.mark.parametrize("rate", [10.0, 25.0, 50.0])
-def test_a_log_is_brought_to_the_rate_that_is_asked_for(tmp_path, rate):
-    """A log at 100 Hz: 0.2 rad/s for 3 s, the command from 1 s on; slower logs than the rate are refused."""
+def test_read_log__has_the_requested_rate_and_refuses_slower_logs(tmp_path, rate):
+    """A log at 100 Hz: 0.2 rad/s for 3 s, the command from 1 s on."""
     rows = [f"a,{i / 100},{float(i >= 100)},{0.2 * i / 100}" for i in range(301)]
     (tmp_path / "log.csv").write_text("\n".join(["run,time,u_a,q_a", *rows]) + "\n")
     log = read_log([tmp_path / "log.csv"], 4, rate=rate)
@@ -183,44 +157,23 @@ def test_a_log_is_brought_to_the_rate_that_is_asked_for(tmp_path, rate):
         read_log([tmp_path / "log.csv"], 4, rate=200.0)
 
 
-def test_a_straight_motion_has_its_velocity_at_any_rate(tmp_path):
-    time = np.arange(200) / 100
-    columns = table("x", time, 0, ("a",)) | {"q_a": 0.3 * time}
-    (recording,) = read_log([write(tmp_path / "log.npz", columns)], 4).recordings
-    np.testing.assert_allclose(recording.q_dot[3:, 0], 0.3, atol=1e-9)
-
-
 @pytest.mark.parametrize("start", [0.0, 1e5, 1.7e9])
-def test_clock_time_is_as_good_as_time_from_zero(tmp_path, start):
+def test_read_log__takes_clock_time_as_well_as_time_from_zero(tmp_path, start):
     columns = table("x", start + np.arange(101) / 20)
     (recording,) = read_log([write(tmp_path / "log.npz", columns)], 4).recordings
-    assert len(recording.u) == 101
     np.testing.assert_allclose(recording.u[:, 0], columns["u_a"])
     np.testing.assert_allclose(recording.q[:, 0], columns["q_a"], atol=1e-5)
 
 
-def test_logged_velocities_are_used_and_estimated_ones_are_causal(tmp_path):
-    columns = table("x", np.arange(40) / 20) | {"q_dot_a": np.arange(40.0), "q_dot_b": -np.ones(40)}
-    log = read_log([write(tmp_path / "with.csv", columns)], 4)
-    assert log.velocity_logged
-    np.testing.assert_allclose(log.recordings[0].q_dot[:, 0], np.arange(40.0), atol=1e-9)
-    np.testing.assert_allclose(log.recordings[0].q_dot[:, 1], -1.0)
-    del columns["q_dot_a"], columns["q_dot_b"]
-    before = read_log([write(tmp_path / "without.npz", columns)], 4).recordings[0].q_dot
-    columns["q_a"] = np.where(np.arange(40) < 20, columns["q_a"], 50.0)
-    after = read_log([write(tmp_path / "without.npz", columns)], 4).recordings[0].q_dot
-    np.testing.assert_array_equal(before[:20], after[:20])
-    assert np.abs(after[20, 0]) > 100
-
-
-def test_logged_velocities_are_interpolated(tmp_path):
+def test_read_log__interpolates_logged_velocities(tmp_path):
     time = np.array([0.0, 0.03, 0.06, 0.09, 0.12])
-    columns = table("x", time, 0, ("a",)) | {"q_dot_a": 10 * time}
-    (recording,) = read_log([write(tmp_path / "log.npz", columns)], 4).recordings
-    np.testing.assert_allclose(recording.q_dot[:, 0], [0.0, 0.5, 1.0])
+    columns = table("x", time) | {"q_dot_a": 10 * time, "q_dot_b": -np.ones(5)}
+    log = read_log([write(tmp_path / "log.csv", columns)], 4)
+    assert log.velocity_logged
+    np.testing.assert_allclose(log.recordings[0].q_dot, [[0.0, -1], [0.5, -1], [1.0, -1]])
 
 
-def test_velocity_of_a_recording_by_hand():
+def test_velocity_of__is_causal_and_right_by_hand():
     q = np.array([[0.0, 1.0], [0.1, 1.0], [0.3, 0.0]])
     # two samples: plain differences at 20 Hz, at rest before the first
     np.testing.assert_allclose(velocity_of(q, 2), [[0, 0], [2, 0], [4, -20]], atol=1e-12)
@@ -231,26 +184,20 @@ def test_velocity_of_a_recording_by_hand():
 # --- which recordings, which joints ---------------------------------------------------------------
 
 
-def test_ways_back_are_dropped(tmp_path):
+def test_read_log__drops_returns(tmp_path):
     time = np.arange(30) / 20
-    columns = both(
-        table("q1_00", time, 1), both(table("q1_00_return", time, 2), table("q1_01", time, 3))
-    )
-    log = read_log([write(tmp_path / "log.csv", columns)], 4)
+    returned = both(table("q1_00_return", time, 2), table("q1_01", time, 3))
+    path = write(tmp_path / "log.csv", both(table("q1_00", time, 1), returned))
+    log = read_log([path], 4)
     assert [r.name for r in log.recordings] == ["q1_00", "q1_01"]
     np.testing.assert_allclose(log.recordings[1].q[:, 0], table("", time, 3)["q_a"], atol=1e-9)
+    path = write(tmp_path / "log.csv", table("x_return", time))
+    for paths in ([path], []):
+        with pytest.raises(ValueError, match="expected at least one recording, got none"):
+            read_log(paths, 4)
 
 
-def test_a_log_of_nothing_but_ways_back_is_refused(tmp_path):
-    path = write(tmp_path / "log.csv", table("x_return", np.arange(30) / 20))
-    with pytest.raises(ValueError, match="expected at least one recording, got none") as caught:
-        read_log([path], 4)
-    assert str(path) in str(caught.value)
-    with pytest.raises(ValueError, match="at least one recording"):
-        read_log([], 4)
-
-
-def test_gaps_cut_a_recording(tmp_path):
+def test_read_log__cuts_a_recording_at_gaps(tmp_path):
     time = np.arange(90) / 20
     time[30:] += 0.15  # 0.2 s between samples: bridged
     time[60:] += 0.25  # 0.3 s: cut
@@ -259,24 +206,24 @@ def test_gaps_cut_a_recording(tmp_path):
     assert first.name == "x" and second.name == "x#2"
     np.testing.assert_allclose(second.q[:, 0], columns["q_a"][63:], atol=1e-9)
     assert len(first.q) == len(first.q_dot) == 60 + 3
-    np.testing.assert_allclose(first.u[29:33, 0], columns["u_a"][29])  # held over the hole
+    np.testing.assert_allclose(first.u[29:33, 0], columns["u_a"][29])  # held over the gap
 
 
 @pytest.mark.parametrize("samples", [2, 4, 7])
-def test_a_joint_in_motion_behind_a_gap_is_never_taken_to_rest(tmp_path, samples):
+def test_read_log__does_not_assume_rest_after_a_gap(tmp_path, samples):
     time = np.arange(90) / 20
     time[60:] += 1.0
     columns = table("x", time, 0, ("a",)) | {"q_a": 0.3 * time, "u_a": np.arange(90) / 90}
     first, second = read_log([write(tmp_path / "log.npz", columns)], samples).recordings
     np.testing.assert_allclose(second.q_dot, 0.3, atol=1e-9)
     np.testing.assert_allclose(second.u[:, 0], columns["u_a"][59 + samples :])
-    assert first.q_dot[0, 0] == 0.0  # a recording is taken to start at rest
+    assert first.q_dot[0, 0] == 0.0  # but before a recording
     logged = columns | {"q_dot_a": np.full(90, 0.3)}
     _, whole = read_log([write(tmp_path / "log.npz", logged)], samples).recordings
     assert len(whole.q) == 30  # nothing is unknown
 
 
-def test_too_little_between_two_gaps_is_left_out(tmp_path):
+def test_read_log__leaves_out_pieces_between_gaps_that_are_too_short(tmp_path):
     time = np.arange(40) / 20
     time[20:] += 1.0
     time[23:] += 1.0
@@ -285,17 +232,23 @@ def test_too_little_between_two_gaps_is_left_out(tmp_path):
     assert [len(r.q) for r in read_log([path], 3).recordings] == [20, 1, 15]
 
 
-def test_interleaved_recordings_are_told_apart(tmp_path):
-    first, second = table("y", np.arange(40) / 20, 1), table("x", 50 + np.arange(40) / 20, 2)
+@pytest.mark.parametrize("suffix", [".csv", ".npz"])
+def test_read_log__separates_interleaved_recordings(tmp_path, suffix):
+    rng = np.random.default_rng(3)
+    stamps = (np.arange(40) + rng.uniform(-0.2, 0.2, (2, 40))) / 33
+    first, second = table("y", 100 + stamps[0], 1), table("x", 3 + stamps[1], 2)
     order = np.argsort(np.tile(np.arange(40), 2), kind="stable")
     mixed = {name: column[order] for name, column in both(first, second).items()}
-    log = read_log([write(tmp_path / "log.npz", mixed)], 4)
+    log = read_log([write(tmp_path / f"log{suffix}", mixed)], 4)
     assert [r.name for r in log.recordings] == ["y", "x"]
-    np.testing.assert_allclose(log.recordings[0].q[:, 0], first["q_a"], atol=1e-9)
-    np.testing.assert_allclose(log.recordings[1].q[:, 1], second["q_b"], atol=1e-9)
+    for recording, columns in zip(log.recordings, (first, second), strict=True):
+        for i, joint in enumerate(log.joints):
+            u, q = resampled(columns, joint)
+            np.testing.assert_allclose(recording.u[:, i], u, atol=1e-12)
+            np.testing.assert_allclose(recording.q[:, i], q, atol=1e-9)
 
 
-def test_asked_for_joints_come_in_the_asked_order(tmp_path):
+def test_read_log__has_the_requested_joints_in_the_requested_order(tmp_path):
     columns = table("x", np.arange(30) / 20, 0, ("swing", "boom", "stick"))
     path = write(tmp_path / "log.csv", columns)
     assert read_log([path], 4).joints == ("swing", "boom", "stick")
@@ -303,9 +256,11 @@ def test_asked_for_joints_come_in_the_asked_order(tmp_path):
     assert log.joints == ("stick", "swing")
     np.testing.assert_allclose(log.recordings[0].q[:, 0], columns["q_stick"], atol=1e-9)
     np.testing.assert_allclose(log.recordings[0].u[:, 1], columns["u_swing"], atol=1e-12)
+    with pytest.raises(ValueError, match=r"log\.csv: .*expected a column u_bucket"):
+        read_log([path], 4, joints=["swing", "bucket"])
 
 
-def test_several_files_make_one_log_in_the_order_of_the_first(tmp_path):
+def test_read_log__joins_files_of_the_same_joints_only(tmp_path):
     time = np.arange(30) / 20
     first, second = table("x", time, 1), table("z", time, 2)
     swapped = {name: second[name] for name in ("run", "q_b", "q_a", "time", "u_b", "u_a")}
@@ -313,22 +268,50 @@ def test_several_files_make_one_log_in_the_order_of_the_first(tmp_path):
     log = read_log(paths, 4)
     assert log.joints == ("a", "b") and [r.name for r in log.recordings] == ["x", "z"]
     np.testing.assert_allclose(log.recordings[1].q[:, 0], second["q_a"], atol=1e-9)
+    with_velocity = write(
+        tmp_path / "3.csv", first | {"q_dot_a": np.zeros(30), "q_dot_b": np.zeros(30)}
+    )
+    with pytest.raises(ValueError, match=r"3\.csv: expected q_dot columns in all files or none"):
+        read_log([*paths, with_velocity], 4)
+    more = write(tmp_path / "4.csv", table("x", time, 0, ("a", "b", "c")))
+    with pytest.raises(ValueError, match=r"4\.csv: .*joints \['a', 'b'\], got \['a', 'b', 'c'\]"):
+        read_log([*paths, more], 4)
+    assert read_log([*paths, more], 4, joints=["a"]).joints == ("a",)
 
 
-def test_files_with_and_without_velocities_do_not_mix(tmp_path):
-    columns = table("x", np.arange(30) / 20, 0, ("a",))
-    paths = [write(tmp_path / "1.csv", columns)]
-    paths.append(write(tmp_path / "2.csv", columns | {"q_dot_a": np.zeros(30)}))
-    with pytest.raises(ValueError, match="q_dot columns in all files or none") as caught:
-        read_log(paths, 4)
-    assert str(paths[1]) in str(caught.value)
+@pytest.mark.parametrize("kind", ["q", "q_dot"])
+def test_read_log__refuses_an_angle_without_a_command_unless_joints_are_given(tmp_path, kind):
+    columns = table("x", np.arange(30) / 20) | {"q_dot_a": np.zeros(30), "q_dot_b": np.zeros(30)}
+    path = write(tmp_path / "log.npz", columns | {f"{kind}_boom": np.zeros(30)})
+    with pytest.raises(ValueError, match=f"a column u_boom for {kind}_boom") as caught:
+        read_log([path], 4)
+    assert str(path) in str(caught.value)
+    assert read_log([path], 4, joints=["b"]).joints == ("b",)
 
 
-def test_spaces_in_the_header_and_a_byte_order_mark_do_no_harm(tmp_path):
-    path = tmp_path / "log.csv"
-    path.write_bytes(b"\xef\xbb\xbfrun, time, u_a, q_a\r\nx,0,0.5,1\r\nx,0.05,0.5,2\r\n")
-    (recording,) = read_log([path], 4).recordings
-    np.testing.assert_allclose(recording.q[:, 0], [1, 2])
+# --- joined recordings ----------------------------------------------------------------------------
+
+
+def test_join_recordings__marks_recordings_in_which_a_joint_moves_or_has_a_command():
+    still, ramp = np.zeros(6), np.arange(6) / 10
+    u, q = np.stack([still, still, ramp], 1), np.stack([ramp, still, still], 1)
+    recordings = (Recording("angle too", u, q, q), Recording("command alone", u, 0 * q, q))
+    samples = join_recordings(Log(("a", "b", "c"), recordings))
+    assert samples.moves.tolist() == [[True, False, True]] * 6 + [[False, False, True]] * 6
+    assert samples.scored.tolist() == [[True, True, True]] * 6 + [[False, True, True]] * 6
+    assert [w.tolist() for w in samples.windows(3, 2)] == [[2, 3], [], [2, 3, 8, 9]]
+    np.testing.assert_allclose(samples.target[:5, 0], 2.0)  # 0.1 rad in 0.05 s
+
+
+@given(st.lists(st.integers(1, 40), min_size=1, max_size=5), st.integers(0, 8), st.integers(0, 8))
+def test_starts__keeps_the_required_samples_around_within_one_recording(lengths, before, after):
+    log = Log(("a",), tuple(Recording("", *np.zeros((3, length, 1))) for length in lengths))
+    owner = np.repeat(np.arange(len(lengths)), lengths)
+    total = len(owner)
+    expected = [
+        i for i in range(before, total - after) if owner[i - before] == owner[i] == owner[i + after]
+    ]
+    assert join_recordings(log).starts(before, after, 1).tolist() == expected
 
 
 # --- bad logs -------------------------------------------------------------------------------------
@@ -342,106 +325,56 @@ x,0.15,0.4,1.3
 BAD_CSV = {
     "empty file": ("", ["header and at least one row", "got 0 rows"]),
     "header alone": ("run,time,u_a,q_a\n", ["header and at least one row", "got 1 rows"]),
-    "no run": (
-        "\n".join(line.partition(",")[2] for line in GOOD.splitlines()),
-        ["row 1", "a column run", "['time', 'u_a', 'q_a']"],
-    ),
-    "no time": (
-        GOOD.replace("time", "t"),
-        ["row 1", "a column time", "['run', 't', 'u_a', 'q_a']"],
-    ),
+    "no run": ("\n".join(line.partition(",")[2] for line in GOOD.splitlines()),
+        ["row 1", "a column run", "['time', 'u_a', 'q_a']"]),
+    "no time": (GOOD.replace("time", "t"),
+        ["row 1", "a column time", "['run', 't', 'u_a', 'q_a']"]),
     "no command": (GOOD.replace("u_a", "a"), ["row 1", "u_<joint>", "['run', 'time', 'a', 'q_a']"]),
     "no angle": (GOOD.replace("q_a", "angle"), ["row 1", "a column q_a", "'angle'"]),
-    "angle of another joint": (
-        GOOD.replace("q_a", "q_b"),
-        ["row 1", "a column u_b beside q_b", "'u_a'"],
-    ),
-    "velocity of another joint": (
-        "run,time,u_a,q_a,q_dot_b\nx,0,0,0,0\nx,0.05,0,0,0\n",
-        ["row 1", "a column u_b beside q_dot_b"],
-    ),
+    "angle of another joint": (GOOD.replace("q_a", "q_b"),
+        ["row 1", "a column u_b for q_b", "'u_a'"]),
+    "velocity of another joint": ("run,time,u_a,q_a,q_dot_b\nx,0,0,0,0\nx,0.05,0,0,0\n",
+        ["row 1", "a column u_b for q_dot_b"]),
     "text in a cell": (GOOD.replace("0.3", "off"), ["row 4", "column u_a", "number", "'off'"]),
     "empty cell": (GOOD.replace("1.1", ""), ["row 3", "column q_a", "number", "''"]),
     "decimal comma": (GOOD.replace("1.2", "1,2"), ["row 4", "expected 4 cells", "got 5"]),
     "NaN angle": (GOOD.replace("1.3", "nan"), ["row 5", "column q_a", "finite", "nan"]),
-    "infinite angle": (GOOD.replace("1.0", "-inf"), ["row 2", "column q_a", "finite", "-inf"]),
-    "NaN time": (GOOD.replace("0.10", "NaN"), ["row 4", "column time", "finite", "NaN"]),
     "NaN command": (GOOD.replace("0.3", "nan"), ["row 4", "column u_a", "[-1, 1]", "nan"]),
-    "repeated time": (
-        GOOD.replace("0.10", "0.05"),
-        ["row 4", "column time", "later than 0.05", "'x'"],
-    ),
-    "backward time": (
-        GOOD.replace("0.15", "0.02"),
-        ["row 5", "column time", "later than 0.1", "0.02"],
-    ),
+    "repeated time": (GOOD.replace("0.10", "0.05"),
+        ["row 4", "column time", "later than 0.05", "'x'"]),
+    "backward time": (GOOD.replace("0.15", "0.02"),
+        ["row 5", "column time", "later than 0.1", "0.02"]),
     "command in percent": (GOOD.replace("0.2", "63"), ["row 3", "column u_a", "[-1, 1]", "63"]),
-    "command below -1": (GOOD.replace("0.4", "-1.01"), ["row 5", "column u_a", "[-1, 1]", "-1.01"]),
     "wrong delimiter": (GOOD.replace(",", ";"), ["row 1", "u_<joint>", "run;time;u_a;q_a"]),
-    "truncated row": (GOOD[:-9], ["row 5", "expected 4 cells", "got 2"]),
-    "long row": (GOOD.replace("0.3,1.2", "0.3,1.2,9"), ["row 4", "expected 4 cells", "got 5"]),
     "column twice": (GOOD.replace("q_a", "u_a", 1), ["row 1", "once", "['u_a']"]),
     "header twice": (GOOD + GOOD, ["row 6", "column time", "number", "'time'"]),
     "too slow": (
         "run,time,u_a,q_a\nfast,0,0,0\nfast,0.05,0,0\nslow,0,0,0\nslow,0.1,0,0\nslow,0.2,0,0\n",
-        ["row 4", "column time", "20 Hz", "'slow'", "10 Hz"],
-    ),
-    "half the velocities": (
-        "run,time,u_a,u_b,q_a,q_b,q_dot_a\nx,0,0,0,0,0,0\nx,0.05,0,0,0,0,0\n",
-        ["row 1", "a column q_dot_b"],
-    ),
-    "command as PWM byte": (
-        GOOD.replace("0.4", "175"),
-        ["row 5", "column u_a", "not percent or bytes", "175"],
-    ),
-    "angle in degrees": (
-        GOOD.replace("1.2", "68.8"),
-        ["row 4", "column q_a", "rad, not degrees", "68.8"],
-    ),
-    "time in milliseconds": (
-        "run,time,u_a,q_a\nx,0,0,0\nx,50,0,0\nx,100,0,0\n",
-        ["row 2", "column time", "20 Hz", "0.02 Hz"],
-    ),
-    "time of day": (
-        GOOD.replace("0.05", "12:30:05"),
-        ["row 3", "column time", "number", "'12:30:05'"],
-    ),
+        ["row 4", "column time", "20 Hz", "'slow'", "10 Hz"]),
+    "half the velocities": ("run,time,u_a,u_b,q_a,q_b,q_dot_a\nx,0,0,0,0,0,0\nx,0.05,0,0,0,0,0\n",
+        ["row 1", "a column q_dot_b"]),
+    "command as PWM byte": (GOOD.replace("0.4", "175"),
+        ["row 5", "column u_a", "not percent or bytes", "175"]),
+    "angle in degrees": (GOOD.replace("1.2", "68.8"),
+        ["row 4", "column q_a", "rad, not degrees", "68.8"]),
+    "time in milliseconds": ("run,time,u_a,q_a\nx,0,0,0\nx,50,0,0\nx,100,0,0\n",
+        ["row 2", "column time", "20 Hz", "0.02 Hz"]),
+    "time of day": (GOOD.replace("0.05", "12:30:05"),
+        ["row 3", "column time", "number", "'12:30:05'"]),
     "no name": (GOOD.replace("x,0.10", " ,0.10"), ["row 4", "column run", "a name", "' '"]),
     "line of units": (GOOD.replace("x,0.00", "-,s,-,rad\nx,0.00"), ["row 2", "column time", "'s'"]),
     "remark": (GOOD.replace("x,0.10", "# pause\nx,0.10"), ["row 4", "expected 4 cells", "got 1"]),
     "blank line": (GOOD.replace("x,0.10", "\nx,0.10"), ["row 4", "expected 4 cells", "got 0"]),
-    "open quote": (GOOD.replace("x,0.10", '"x,0.10'), ["row 4", "expected 4 cells", "got 1"]),
     "tabs": (GOOD.replace(",", "\t"), ["row 1", "u_<joint>"]),
-    "no header": (GOOD.partition("\n")[2], ["row 1", "u_<joint>", "'0.00'"]),
     "overflow": (GOOD.replace("1.3", "1e999"), ["row 5", "column q_a", "finite", "'1e999'"]),
-    "two files in one": (
-        GOOD + GOOD.partition("\n")[2],
-        ["row 6", "column time", "later than 0.15"],
-    ),
-    "velocity in degrees": (
-        "run,time,u_a,q_a,q_dot_a\nx,0,0,0,0\nx,0.05,0,0,-90\n",
-        ["row 3", "column q_dot_a", "rad/s, not degrees/s", "-90"],
-    ),
-    "velocity not finite": (
-        "run,time,u_a,q_a,q_dot_a\nx,0,0,0,0\nx,0.05,0,0,inf\n",
-        ["row 3", "column q_dot_a", "finite", "inf"],
-    ),
-}
+    "velocity in degrees": ("run,time,u_a,q_a,q_dot_a\nx,0,0,0,0\nx,0.05,0,0,-90\n",
+        ["row 3", "column q_dot_a", "rad/s, not degrees/s", "-90"]),
+    "earlier in its own recording": (
+        "run,time,u_a,q_a\nx,1.00,0,0\ny,7.00,0,0\nx,1.05,0,0\ny,7.05,0,0\nx,1.02,0,0\n",
+        ["row 6", "column time", "later than 1.05", "'x'", "got 1.02"]),
+}  # fmt: skip
 
-
-@pytest.mark.parametrize("case", BAD_CSV)
-def test_a_bad_csv_is_refused_by_file_row_and_column(tmp_path, case):
-    text, words = BAD_CSV[case]
-    path = tmp_path / "bad.csv"
-    path.write_text(text)
-    with pytest.raises(ValueError) as caught:
-        read_log([path], 4)
-    message = str(caught.value)
-    assert message.startswith(f"{path}: ") and "expected" in message and "got" in message
-    assert all(word in message for word in words), message
-
-
-NO_TEXT = {
+BAD_BYTES = {
     "UTF-16": GOOD.encode("utf-16"),
     "Latin-1": GOOD.replace("x", "Gr\xfcn").encode("latin-1"),
     "zeros": GOOD.encode() + bytes(40),
@@ -450,79 +383,28 @@ NO_TEXT = {
 }
 
 
-@pytest.mark.parametrize("case", [*BAD_CSV, *NO_TEXT])
-def test_fit_refuses_a_bad_log_in_one_line_and_writes_nothing(tmp_path, capsys, case):
-    path, words = tmp_path / "bad.csv", []
-    if case in NO_TEXT:
-        path.write_bytes(NO_TEXT[case])
-    else:
-        path.write_text(BAD_CSV[case][0])
-        words = BAD_CSV[case][1]
-    options = [
-        "--out",
-        tmp_path / "n.npz",
-        "--json",
-        tmp_path / "f.json",
-        "--figure",
-        tmp_path / "f.png",
-    ]
-    assert main([str(a) for a in ("fit", path, *options)]) == 1
-    said = capsys.readouterr()
-    assert said.out == "" and said.err.count("\n") == 1
-    assert (
-        said.err.startswith(f"brokk-min: {path}: ") and "expected" in said.err and "got" in said.err
-    )
-    assert all(word in said.err for word in words), said.err
-    assert [p.name for p in tmp_path.iterdir()] == ["bad.csv"]
-
-
-def test_the_good_log_of_the_table_above_is_good(tmp_path):
-    (tmp_path / "good.csv").write_text(GOOD)
-    (recording,) = read_log([tmp_path / "good.csv"], 4).recordings
-    np.testing.assert_allclose(recording.u[:, 0], [0.1, 0.2, 0.3, 0.4])
-
-
-def test_a_backward_time_stamp_is_compared_within_its_own_recording(tmp_path):
-    path = tmp_path / "bad.csv"
-    path.write_text(
-        "run,time,u_a,q_a\nx,1.00,0,0\ny,7.00,0,0\nx,1.05,0,0\ny,7.05,0,0\nx,1.02,0,0\n"
-    )
+def refusal(path: Path, content: bytes) -> str:
+    path.write_bytes(content)
     with pytest.raises(ValueError) as caught:
         read_log([path], 4)
     message = str(caught.value)
-    assert "row 6, column time" in message and "'x'" in message and "got 1.02" in message
-    assert "later than 1.05" in message, message
+    assert message.startswith(f"{path}: ") and "expected" in message and "got" in message
+    return message
 
 
-def test_a_joint_that_is_not_logged_is_refused(tmp_path):
-    path = write(tmp_path / "log.npz", table("x", np.arange(30) / 20))
-    with pytest.raises(ValueError, match="expected a column u_boom") as caught:
-        read_log([path], 4, joints=["a", "boom"])
-    assert str(path) in str(caught.value)
+@pytest.mark.parametrize("case", [*BAD_CSV, *BAD_BYTES])
+def test_read_log__names_file_row_and_column_of_a_bad_csv(tmp_path, case):
+    text, words = BAD_CSV.get(case, ("", []))
+    message = refusal(tmp_path / "bad.csv", BAD_BYTES.get(case, text.encode()))
+    assert all(word in message for word in words), message
 
 
-@pytest.mark.parametrize("suffix", [".csv", ".npz"])
-@pytest.mark.parametrize("kind", ["q", "q_dot"])
-def test_a_joint_without_a_command_is_refused_unless_others_were_asked_for(tmp_path, suffix, kind):
-    columns = table("x", np.arange(30) / 20) | {"q_dot_a": np.zeros(30), "q_dot_b": np.zeros(30)}
-    path = write(tmp_path / f"log{suffix}", columns | {f"{kind}_boom": np.zeros(30)})
-    with pytest.raises(
-        ValueError, match=f"row 1: expected a column u_boom beside {kind}_boom"
-    ) as caught:
-        read_log([path], 4)
-    assert str(path) in str(caught.value)
-    assert read_log([path], 4, joints=["b"]).joints == ("b",)
-
-
-def test_a_joint_more_in_a_later_file_is_refused(tmp_path):
-    time = np.arange(30) / 20
-    paths = [
-        write(tmp_path / f"{len(j)}.csv", table("x", time, 0, j)) for j in (("a",), ("a", "b"))
-    ]
-    with pytest.raises(ValueError, match=r"expected joints \['a'\], got \['a', 'b'\]") as caught:
-        read_log(paths, 4)
-    assert str(paths[1]) in str(caught.value)
-    assert read_log(paths, 4, joints=["a"]).joints == ("a",)
+def test_read_log__accepts_the_table_above_also_with_spaces_and_a_byte_order_mark(tmp_path):
+    content = b"\xef\xbb\xbf" + GOOD.replace(",u_a,", ", u_a, ").replace("\n", "\r\n").encode()
+    for text in (GOOD.encode(), content):
+        (tmp_path / "good.csv").write_bytes(text)
+        (recording,) = read_log([tmp_path / "good.csv"], 4).recordings
+        np.testing.assert_allclose(recording.u[:, 0], [0.1, 0.2, 0.3, 0.4])
 
 
 def npz(**columns: np.ndarray) -> bytes:
@@ -560,39 +442,19 @@ BAD_NPZ = {
 
 
 @pytest.mark.parametrize("case", BAD_NPZ)
-def test_a_bad_npz_is_refused_by_file_and_column(tmp_path, case):
+def test_read_log__names_file_and_column_of_a_bad_npz(tmp_path, case):
     content, words = BAD_NPZ[case]
-    path = tmp_path / "bad.npz"
-    path.write_bytes(content)
-    with pytest.raises(ValueError) as caught:
-        read_log([path], 4)
-    message = str(caught.value)
-    assert message.startswith(f"{path}: ") and "expected" in message and "got" in message
+    message = refusal(tmp_path / "bad.npz", content)
     assert all(word in message for word in words), message
 
 
-class Bomb:
-    def __reduce__(self):
-        return os.mkdir, (os.environ["BOMB"],)
-
-
-def test_nothing_in_a_log_is_executed(tmp_path, monkeypatch):
-    monkeypatch.setenv("BOMB", str(tmp_path / "went off"))
-    array = np.empty(1, object)
-    array[0] = Bomb()
-    (tmp_path / "bomb.npz").write_bytes(npz(run=array))
-    with pytest.raises(ValueError):
-        load_arrays(tmp_path / "bomb.npz")
-    assert not (tmp_path / "went off").exists()
-
-
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
-def test_flipped_bytes_are_read_or_refused_but_never_another_error(tmp_path, save):
+def test_read_log__reads_or_refuses_a_file_with_a_flipped_byte(tmp_path, save):
     path = tmp_path / "log.npz"
     save(path, **FINE)
     whole = path.read_bytes()
     rng = np.random.default_rng(0)
-    refused, others = 0, set()
+    refused = 0
     for _ in range(400):
         damaged = bytearray(whole)
         damaged[rng.integers(len(whole))] ^= int(rng.integers(1, 256))
@@ -602,39 +464,20 @@ def test_flipped_bytes_are_read_or_refused_but_never_another_error(tmp_path, sav
         except ValueError as error:
             refused += 1
             assert str(path) in str(error)
-        except Exception as error:
-            others.add(f"{type(error).__module__}.{type(error).__name__}: {error}"[:60])
     assert refused > 100
-    assert not others
-
-
-@pytest.mark.parametrize("name", ["missing.csv", "missing.npz"])
-def test_a_missing_file_is_refused(tmp_path, name):
-    with pytest.raises(ValueError, match="expected a readable") as caught:
-        read_log([tmp_path / name], 4)
-    assert str(tmp_path / name) in str(caught.value)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".npz"])
-def test_a_directory_is_refused(tmp_path, suffix):
-    path = tmp_path / f"folder{suffix}"
-    path.mkdir()
-    with pytest.raises(ValueError, match="expected a readable") as caught:
-        read_log([path], 4)
-    assert str(path) in str(caught.value)
-
-
-@pytest.mark.parametrize("content", [b"\x00\x01\x02\xff\xfe" * 100, b"\x89PNG\r\n\x1a\n\xf0\xf1"])
-def test_a_binary_file_is_no_csv(tmp_path, content):
-    path = tmp_path / "picture.csv"
-    path.write_bytes(content)
-    with pytest.raises(ValueError) as caught:
-        read_log([path], 4)
-    assert str(caught.value).startswith(f"{path}: expected")
+def test_read_log__refuses_a_missing_file_and_a_folder(tmp_path, suffix):
+    (tmp_path / f"folder{suffix}").mkdir()
+    for name in ("missing", "folder"):
+        with pytest.raises(ValueError, match="expected a readable") as caught:
+            read_log([tmp_path / f"{name}{suffix}"], 4)
+        assert str(tmp_path / f"{name}{suffix}") in str(caught.value)
 
 
 @given(st.binary(max_size=200) | st.text(max_size=200).map(str.encode))
-def test_any_bytes_at_all_are_refused_with_the_name_of_the_file(tmp_path_factory, content):
+def test_read_log__refuses_any_bytes_with_the_name_of_the_file(tmp_path_factory, content):
     for name in ("any.csv", "any.npz"):
         path = tmp_path_factory.getbasetemp() / name
         path.write_bytes(content)

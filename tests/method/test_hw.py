@@ -9,7 +9,9 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from itertools import pairwise
+from operator import attrgetter
 from pathlib import Path
+from typing import Any
 
 import can
 import numpy as np
@@ -17,9 +19,9 @@ import pytest
 from helpers_bus import (
     BASELINE,
     START,
-    Hand,
+    ConstantCommand,
+    HoldingOperator,
     Out,
-    Push,
     World,
     once,
     only,
@@ -49,19 +51,19 @@ def policy() -> PolicyController:
 
 
 @pytest.fixture
-def hand() -> Hand:
-    return Hand()
+def operator() -> HoldingOperator:
+    return HoldingOperator()
 
 
 @pytest.fixture
-def push() -> Push:
-    return Push(*COMMAND)
+def controller() -> ConstantCommand:
+    return ConstantCommand(*COMMAND)
 
 
 @pytest.fixture
-def world(push: Push, hand: Hand) -> Iterator[World]:
+def world(controller: ConstantCommand, operator: HoldingOperator) -> Iterator[World]:
     """A constant command, an operator, and nodes that are started."""
-    world = World(push, hand)
+    world = World(controller, operator)
     world.drive.begin()
     yield world
     world.close()
@@ -109,7 +111,7 @@ def test_run__earns_over_the_bus_the_reward_of_evaluate(axis: int, name: str) ->
     assert trace.reward[half_second].mean() < 0.99  # there was something to lose
 
 
-class Listener(Push):
+class Listener(ConstantCommand):
     """Drives with constant commands and keeps what is measured at each tick after the warm-up."""
 
     def __init__(self) -> None:
@@ -127,7 +129,7 @@ class Listener(Push):
 def test_control__measures_histories_and_error_integral_of_its_own_ticks() -> None:
     """Every second call is the warm-up with the tick before."""
     listener = Listener()
-    world = World(listener, Hand())
+    world = World(listener, HoldingOperator())
     world.drive.begin()
     world.run(3.0)
     world.close()
@@ -144,15 +146,15 @@ def test_control__measures_histories_and_error_integral_of_its_own_ticks() -> No
 
 
 def test_run__closes_valves_when_the_goal_stands_still_for_long() -> None:
-    hand, out = Hand(), Out()
-    world = World(policy(), hand)
+    operator, out = HoldingOperator(), Out()
+    world = World(policy(), operator)
     world.downward = recording(out)
     world.drive.begin()
     ticks = []
     for v, seconds in (
-        (hand.v, 1.5), ((0.0, 0.0, 0.0), STANDSTILL_TIMEOUT + 1.0), ((0.0, 0.1, 0.0), 1.0),
+        (operator.v, 1.5), ((0.0, 0.0, 0.0), STANDSTILL_TIMEOUT + 1.0), ((0.0, 0.1, 0.0), 1.0),
     ):  # fmt: skip
-        hand.v = v
+        operator.v = v
         world.run(seconds)
         ticks.append(sum(can_id == 0x210 for can_id, _ in out))
     world.close()
@@ -164,14 +166,14 @@ def test_run__closes_valves_when_the_goal_stands_still_for_long() -> None:
 
 
 def test_tick__is_silent_until_armed_and_opens_valves_a_tick_later(
-    world: World, hand: Hand
+    world: World, operator: HoldingOperator
 ) -> None:
-    hand.enable, out = False, Out()
+    operator.enable, out = False, Out()
     world.downward = recording(out)
     world.run(1.0)
     assert world.drive.gate.active_fault == 0
     assert not [frame for frame in out if frame[0] == 0x210]
-    hand.enable, hand.v = True, (0.0, 0.0, 0.0)
+    operator.enable, operator.v = True, (0.0, 0.0, 0.0)
     world.drive.tick()
     world.drive.tick()
     frames = [data for can_id, data in out if can_id == 0x210]
@@ -183,8 +185,10 @@ def test_tick__is_silent_until_armed_and_opens_valves_a_tick_later(
     np.testing.assert_allclose(newest, [[0] * 5, [40, 0, 40, 40, 40]], atol=1e-5)
 
 
-def test_tick__does_not_arm_while_the_stick_is_not_centred(push: Push, hand: Hand) -> None:
-    world = World(push, lambda driving, ready: hand(True, ready))
+def test_tick__does_not_arm_while_the_stick_is_not_centred(
+    controller: ConstantCommand, operator: HoldingOperator
+) -> None:
+    world = World(controller, lambda driving, ready: operator(True, ready))
     world.drive.begin()
     world.run(1.0)
     assert not world.drive.gate.driving and not world.commands[1].any()
@@ -197,23 +201,31 @@ def test_tick__does_not_arm_while_the_stick_is_not_centred(push: Push, hand: Han
 class Fault:
     """What goes wrong in a world, from now on."""
 
-    def __init__(self, world: World, hand: Hand, push: Push) -> None:
-        self.world, self.hand, self.push = world, hand, push
+    def __init__(
+        self, world: World, operator: HoldingOperator, controller: ConstantCommand
+    ) -> None:
+        self.world, self.operator, self.controller = world, operator, controller
+
+
+def put(name: str, value: Any) -> Callable[[Fault], None]:
+    """Set an attribute of something in the world."""
+    owner, _, attribute = name.rpartition(".")
+    return lambda f: setattr(attrgetter(owner)(f), attribute, value)
 
 
 def up(can_id: int, act: Callable[[bytes], list[bytes]]) -> Callable[[Fault], None]:
     """Change frames of one identifier from the machine."""
-    return lambda f: setattr(f.world, "upward", only(can_id, act))
+    return put("world.upward", only(can_id, act))
 
 
 def up_once(can_id: int, act: Callable[[bytes], list[bytes]]) -> Callable[[Fault], None]:
     """Change the first of them."""
-    return lambda f: setattr(f.world, "upward", only(can_id, once(act)))
+    return lambda f: up(can_id, once(act))(f)
 
 
-def down(act: Callable[[bytes], list[bytes]]) -> Callable[[Fault], None]:
+def down_once(act: Callable[[bytes], list[bytes]]) -> Callable[[Fault], None]:
     """Change the first valve frame."""
-    return lambda f: setattr(f.world, "downward", only(0x210, once(act)))
+    return lambda f: put("world.downward", only(0x210, once(act)))(f)
 
 
 def moved(add: int) -> Callable[[bytes], list[bytes]]:
@@ -246,8 +258,8 @@ def delay(f: Fault, node: int, draw: Callable[[], float]) -> None:
 def late(f: Fault, node: int) -> None:
     """Constantly late positions, and an operator who presses again and again."""
     delay(f, node, lambda: 0.030)
-    f.hand.act = lambda: setattr(
-        f.hand, "enable", bool(f.world.drive.gate.driving or not f.hand.enable)
+    f.operator.act = lambda: setattr(
+        f.operator, "enable", bool(f.world.drive.gate.driving or not f.operator.enable)
     )
 
 
@@ -323,13 +335,13 @@ def send_error(f: Fault, valves_only: bool) -> None:
 def stall(seconds: float) -> Callable[[Fault], None]:
     def cause(f: Fault) -> None:
         stalls = [seconds]
-        f.push.act = lambda: f.world.sleep(stalls.pop()) if stalls else None
+        f.controller.act = lambda: f.world.sleep(stalls.pop()) if stalls else None
 
     return cause
 
 
 def command(joint: int, value: float) -> Callable[[Fault], None]:
-    return lambda f: f.push.m.__setitem__(joint, value)
+    return lambda f: f.controller.m.__setitem__(joint, value)
 
 
 NOT_OPERATIONAL = "valve controller: not operational"
@@ -345,26 +357,23 @@ FAULTS: dict[str, tuple[Callable[[Fault], object], str]] = {
     "bus closed": (close_bus, "error (CanOperationError: closed)"),
     "send error of all frames": (lambda f: send_error(f, False), "error (CanOperationError"),
     "send error of valve frames": (lambda f: send_error(f, True), ""),
-    "valve frame lost": (down(lambda d: []), NOT_OPERATIONAL),
-    "valve frame doubled": (down(lambda d: [d, d]), NOT_OPERATIONAL),
-    "valve frame's bit flipped": (down(lambda d: [bytes([d[0] ^ 4, *d[1:]])]), "valve controller"),
-    "valve frame cut": (down(lambda d: [d[:7]]), NOT_OPERATIONAL),
-    "all valve frames lost": (
-        lambda f: setattr(f.world, "downward", only(0x210, lambda d: [])),
-        NOT_OPERATIONAL,
+    "valve frame lost": (down_once(lambda d: []), NOT_OPERATIONAL),
+    "valve frame doubled": (down_once(lambda d: [d, d]), NOT_OPERATIONAL),
+    "valve frame's bit flipped": (
+        down_once(lambda d: [bytes([d[0] ^ 4, *d[1:]])]),
+        "valve controller",
     ),
-    "joystick unplugged": (lambda f: setattr(f.hand, "alive", False), "operator's device lost"),
-    "joystick raises": (
-        lambda f: setattr(f.hand, "act", raises(OSError("gone"))),
-        "error (OSError: gone)",
-    ),
-    "enable released": (lambda f: setattr(f.hand, "enable", False), ""),
+    "valve frame cut": (down_once(lambda d: [d[:7]]), NOT_OPERATIONAL),
+    "all valve frames lost": (put("world.downward", only(0x210, lambda d: [])), NOT_OPERATIONAL),
+    "joystick unplugged": (put("operator.alive", False), "operator's device lost"),
+    "joystick raises": (put("operator.act", raises(OSError("gone"))), "error (OSError: gone)"),
+    "enable released": (put("operator.enable", False), ""),
     "SIGTERM": (lambda f: f.world.drive.signals.append(15), "stop asked for"),
-    "operator stops": (lambda f: setattr(f.hand, "stop", True), "stop asked for"),
-    "clock stepped forward": (lambda f: setattr(f.world, "offset", 3600.0), "tick late, or the"),
-    "clock stepped back": (lambda f: setattr(f.world, "offset", -3600.0), "tick late, or the"),
+    "operator stops": (put("operator.stop", True), "stop asked for"),
+    "clock stepped forward": (put("world.offset", 3600.0), "tick late, or the"),
+    "clock stepped back": (put("world.offset", -3600.0), "tick late, or the"),
     "log cannot be written": (
-        lambda f: setattr(f.world.bus, "flush", raises(OSError("no space"))),
+        put("world.bus.flush", raises(OSError("no space"))),
         "error (OSError: no space)",
     ),
     "late tick": (stall(0.08), "tick late"),
@@ -374,11 +383,11 @@ FAULTS: dict[str, tuple[Callable[[Fault], object], str]] = {
     "policy beyond the limit": (command(4, 81), "q5: no valid command"),
     "policy moves the locked joint": (command(1, 20), "q2: no valid command"),
     "policy raises": (
-        lambda f: setattr(f.push, "act", raises(RuntimeError("boom"))),
+        put("controller.act", raises(RuntimeError("boom"))),
         "error (RuntimeError: boom)",
     ),
     "encoders all silent": (
-        lambda f: setattr(f.world, "upward", lambda i, d: [] if 0x180 < i < 0x190 else [(i, d)]),
+        put("world.upward", lambda i, d: [] if 0x180 < i < 0x190 else [(i, d)]),
         "q1: silent",
     ),
 }
@@ -410,14 +419,14 @@ def test_tick__ends_neutral_and_latched_within_175_ms_of_every_fault(
 ) -> None:
     """By the plant's own record, whenever in a tick it comes, though the operator holds on."""
     cause, reason = FAULTS[name]
-    hand, push = Hand(), Push(*COMMAND)
-    world = World(push, hand)
+    operator, controller = HoldingOperator(), ConstantCommand(*COMMAND)
+    world = World(controller, operator)
     world.drive.begin()
     world.run(1.2)
     world.sleep(max(0.0, world.syncs[-1] + phase - world.t))
     assert world.commands[1][-1].tolist() == list(COMMAND), "it drove"
     begun = world.t
-    cause(Fault(world, hand, push))
+    cause(Fault(world, operator, controller))
     world.run(0.8)
     first = world.drive.reason
     world.sleep(max(0.0, begun + 1.2 - world.t))
@@ -439,15 +448,20 @@ def closes_within(world: World, begun: float, seconds: float) -> bool:
     ("counts", "bound"), [(80, 0.175), (40, 0.175), (-40, 0.175), (20, 0.45), (16, 0.85)]
 )
 def test_tick__finds_a_frozen_encoder_at_small_commands_too(
-    node: int, counts: int, bound: float, world: World, push: Push, hand: Hand
+    node: int,
+    counts: int,
+    bound: float,
+    world: World,
+    controller: ConstantCommand,
+    operator: HoldingOperator,
 ) -> None:
     """The table of docs/hardware.md: the smaller the command, the longer it takes."""
-    push.m = counts * (np.arange(1, 6) == node)
+    controller.m = counts * (np.arange(1, 6) == node)
     world.run(1.6)
     world.sleep(0.0215)
     begun = world.t
     assert world.commands[1][-1].any()
-    freeze(Fault(world, hand, push), node)
+    freeze(Fault(world, operator, controller), node)
     world.run(1.2)
     assert closes_within(world, begun, bound)
     assert world.drive.reason == f"fault: q{node}: frozen, or the joint does not move"
@@ -455,28 +469,30 @@ def test_tick__finds_a_frozen_encoder_at_small_commands_too(
 
 @pytest.mark.parametrize(("counts", "bound"), [(80, 0.55), (-40, 0.55), (20, 0.8), (16, 1.25)])
 def test_tick__finds_an_encoder_that_is_frozen_from_the_start(
-    counts: int, bound: float, world: World, push: Push, hand: Hand
+    counts: int, bound: float, world: World, controller: ConstantCommand, operator: HoldingOperator
 ) -> None:
     """A joint at rest may take 0.4 s to move, so that this takes longer than the 175 ms."""
-    push.m = np.zeros(5)
+    controller.m = np.zeros(5)
     world.run(0.6)
-    freeze(Fault(world, hand, push), 3)
-    push.m[2] = counts
+    freeze(Fault(world, operator, controller), 3)
+    controller.m[2] = counts
     begun = world.t
     world.run(1.6)
     assert world.commands[1].any() and closes_within(world, begun, bound)
     assert world.drive.reason == "fault: q3: frozen, or the joint does not move"
 
 
-def test_tick__takes_nothing_for_frozen_that_is_not(world: World, push: Push) -> None:
+def test_tick__takes_nothing_for_frozen_that_is_not(
+    world: World, controller: ConstantCommand
+) -> None:
     """Reversals, stops and small commands at random are no fault."""
     rng = np.random.default_rng(3)
 
     def change() -> None:
         if rng.random() < 0.15:
-            push.m = rng.choice([-80.0, -40, -20, 0, 0, 20, 40, 80], 5) * (np.arange(5) != 1)
+            controller.m = rng.choice([-80.0, -40, -20, 0, 0, 20, 40, 80], 5) * (np.arange(5) != 1)
 
-    push.act = change
+    controller.act = change
     world.run(60.0)
     assert world.drive.reason == "" and world.drive.gate.driving
     assert np.abs(np.diff(world.commands[1], axis=0)).sum() > 2000
@@ -496,21 +512,21 @@ def test_watchdog__closes_the_valves_of_a_program_that_is_killed(world: World) -
 
 
 def test_tick__opens_no_valve_again_on_frames_of_any_identifier_and_length(
-    world: World, push: Push, hand: Hand
+    world: World, controller: ConstantCommand, operator: HoldingOperator
 ) -> None:
     world.run(1.2)
     begun = world.t
     assert world.commands[1][-1].any()
-    seen, pairs = flood(Fault(world, hand, push))
+    seen, pairs = flood(Fault(world, operator, controller))
     world.run(9.3)
     assert len(seen) == pairs == 2048 * 9
     assert closes_within(world, begun, 0.175)
 
 
 def test_tick__drives_on_fresh_positions_among_2000_foreign_frames_a_second(
-    world: World, push: Push, hand: Hand
+    world: World, controller: ConstantCommand, operator: HoldingOperator
 ) -> None:
-    seen, pairs = flood(Fault(world, hand, push), foreign=True)
+    seen, pairs = flood(Fault(world, operator, controller), foreign=True)
     ages: list[float] = []
     update = world.drive.nodes.update
 
@@ -527,17 +543,17 @@ def test_tick__drives_on_fresh_positions_among_2000_foreign_frames_a_second(
     assert len(ages) > 175 and max(ages) < 0.6 * STEP + 1e-3
 
 
-def test_tick__leaves_a_fault_by_a_new_edge_only(world: World, hand: Hand) -> None:
+def test_tick__leaves_a_fault_by_a_new_edge_only(world: World, operator: HoldingOperator) -> None:
     drive = world.drive
     world.run(0.6)
     world.upward = only(0x183, once(lambda d: []))
     world.run(0.5)
     assert drive.reason == "fault: q3: silent" and not drive.gate.driving
     assert drive.status().startswith("ready   fault: q3: silent v goal ")
-    hand.enable = False
+    operator.enable = False
     world.run(0.2)
     assert drive.reason == "fault: q3: silent"
-    hand.enable = True
+    operator.enable = True
     world.run(0.4)
     assert drive.gate.driving and drive.reason == ""
     assert drive.status().startswith("driving v goal +0.10 +0.00 +0.00 measured ")
@@ -545,17 +561,17 @@ def test_tick__leaves_a_fault_by_a_new_edge_only(world: World, hand: Hand) -> No
 
 
 def test_tick__logs_an_exception_and_keeps_its_text_until_it_drives(
-    world: World, hand: Hand
+    world: World, operator: HoldingOperator
 ) -> None:
     world.run(0.6)
-    hand.act, hand.enable = raises(OSError("gone")), False
+    operator.act, operator.enable = raises(OSError("gone")), False
     world.run(0.1)
     assert world.drive.operator_input.error  # in the log, so that a replay gets the same
-    hand.act = lambda: None
+    operator.act = lambda: None
     world.run(0.1)
     assert not world.drive.operator_input.error
     assert world.drive.reason == "fault: error (OSError: gone)"
-    hand.enable = True
+    operator.enable = True
     world.run(0.2)
     assert world.drive.gate.driving and world.drive.reason == ""
 
@@ -565,19 +581,26 @@ def test_tick__logs_an_exception_and_keeps_its_text_until_it_drives(
     [(5, 5, 0), (15, 15, 0), (25, 25, 1), (45, 45, 1), (0, 15, 0), (0, 60, 1)],
 )
 def test_tick__finds_positions_later_than_20_ms(
-    low: int, high: int, found: int, world: World, push: Push, hand: Hand
+    low: int,
+    high: int,
+    found: int,
+    world: World,
+    controller: ConstantCommand,
+    operator: HoldingOperator,
 ) -> None:
     """Constantly, or by chance between two bounds [ms]."""
     rng = np.random.default_rng(0)
     world.run(0.8)
     begun = world.t
-    delay(Fault(world, hand, push), 3, lambda: rng.uniform(low, high) / 1e3)
+    delay(Fault(world, operator, controller), 3, lambda: rng.uniform(low, high) / 1e3)
     world.run(1.0)
     assert world.drive.reason == found * "fault: q3: silent"
     assert closes_within(world, begun, 0.175) == bool(found)
 
 
-def test_tick__finds_a_delay_of_a_whole_tick_only_when_it_begins(world: World, hand: Hand) -> None:
+def test_tick__finds_a_delay_of_a_whole_tick_only_when_it_begins(
+    world: World, operator: HoldingOperator
+) -> None:
     """A position has neither time nor number: the limit of what can be found, see docs."""
     held: list[bytes] = []
 
@@ -590,15 +613,15 @@ def test_tick__finds_a_delay_of_a_whole_tick_only_when_it_begins(world: World, h
     world.upward = only(0x183, hold)
     world.run(0.3)
     assert world.drive.reason == "fault: q3: silent" and closes_within(world, begun, 0.175)
-    hand.enable = False
+    operator.enable = False
     world.run(0.1)
-    hand.enable = None
+    operator.enable = None
     world.run(0.2)
     assert world.drive.gate.driving
 
 
 def test_tick__starts_nodes_that_fell_back_once_the_switch_is_released(
-    world: World, hand: Hand
+    world: World, operator: HoldingOperator
 ) -> None:
     out = Out()
     world.run(0.6)
@@ -607,7 +630,7 @@ def test_tick__starts_nodes_that_fell_back_once_the_switch_is_released(
     world.run(0.4)
     assert world.drive.reason == "fault: q4: not operational" and world.drive.gate.active_fault
     assert 0x000 not in dict(out)
-    hand.enable = False
+    operator.enable = False
     world.run(0.2)
     assert {data for can_id, data in out if can_id == 0x000} == {b"\x01\x00"}
     assert not world.drive.gate.active_fault
@@ -616,9 +639,11 @@ def test_tick__starts_nodes_that_fell_back_once_the_switch_is_released(
     assert 0x000 not in dict(out) and world.drive.status().startswith("ready")
 
 
-def test_tick__takes_a_lost_joystick_for_no_release_of_the_switch(world: World, hand: Hand) -> None:
+def test_tick__takes_a_lost_joystick_for_no_release_of_the_switch(
+    world: World, operator: HoldingOperator
+) -> None:
     for alive in (True, False, True):
-        hand.alive = alive
+        operator.alive = alive
         world.run(0.6)
     assert not world.drive.gate.driving and "device lost" in world.drive.reason
 
@@ -667,8 +692,10 @@ def busy(world: World, seconds: float) -> Callable[[int, bytes], Out]:
     return send
 
 
-def test_wait__keeps_an_absolute_grid_and_skips_missed_ticks(world: World, push: Push) -> None:
-    push.m = np.zeros(5)
+def test_wait__keeps_an_absolute_grid_and_skips_missed_ticks(
+    world: World, controller: ConstantCommand
+) -> None:
+    controller.m = np.zeros(5)
     world.step = 0.0007  # does not divide a tick
     begun = world.t
     for k in range(120):
@@ -727,14 +754,16 @@ def test_wait__begins_a_new_grid_after_a_small_step_back_of_the_clock(world: Wor
     assert np.diff(world.syncs)[-15:] == pytest.approx([0.05] * 15, abs=5e-4)
 
 
-def test_wait__warms_up_once_before_sync_if_there_is_time(world: World, push: Push) -> None:
+def test_wait__warms_up_once_before_sync_if_there_is_time(
+    world: World, controller: ConstantCommand
+) -> None:
     calls: list[float] = []
-    push.act = lambda: calls.append(world.t)
+    controller.act = lambda: calls.append(world.t)
     world.run(1.0)
     calls.clear()
     world.drive.tick()
     assert len(calls) == 2 and calls[0] < world.syncs[-1] <= calls[1]
-    push.act = lambda: world.sleep(0.010)  # a slow controller
+    controller.act = lambda: world.sleep(0.010)  # a slow controller
     world.run(1.0)
     assert world.drive.gate.driving and world.drive.skipped == 0
 
@@ -743,10 +772,12 @@ def test_wait__warms_up_once_before_sync_if_there_is_time(world: World, push: Pu
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_run__ends_on_a_signal_with_a_neutral_frame(number: int, world: World, hand: Hand) -> None:
+def test_run__ends_on_a_signal_with_a_neutral_frame(
+    number: int, world: World, operator: HoldingOperator
+) -> None:
     out, shown = Out(), list[tuple[int, str]]()
     world.downward = recording(out)
-    hand.act = lambda: os.kill(os.getpid(), number) if world.drive.ticks == 20 else None
+    operator.act = lambda: os.kill(os.getpid(), number) if world.drive.ticks == 20 else None
     handler = signal.getsignal(number)
     world.drive.run(lambda text: shown.append((world.drive.ticks, text)))
     assert world.drive.ticks in (20, 21) and signal.getsignal(number) is handler

@@ -170,6 +170,9 @@ def test_fields_that_name_the_paper__have_a_row() -> None:
 # --- docstrings -----------------------------------------------------------------------------------
 
 
+SEVERAL = r"(Fig\.|Sec\.) ((?:\d[\d.a-h]*(?:, | and )?)+)"
+
+
 def documented() -> Iterator[tuple[str, str]]:
     """Symbol and tag of each docstring of the package that names a place of the paper.
 
@@ -182,8 +185,11 @@ def documented() -> Iterator[tuple[str, str]]:
         for symbol, node in nodes:
             text = inspect.cleandoc(ast.get_docstring(node) or "")
             for tagged in re.findall(r"Paper: (.*?)(?:\n\s*\n|$)", text, re.S):
-                for tag in re.findall(r"eq\d|Table \d|Fig\. \d[a-h]?|Sec\. \d(?:\.\d)?", tagged):
+                for tag in re.findall(r"eq\d|Table \d", tagged):
                     yield symbol, tag
+                for kind, numbers in re.findall(SEVERAL, tagged):
+                    for number in re.findall(r"\d[a-h]?(?:\.\d)?", numbers):
+                        yield symbol, f"{kind} {number}"
             parts = [part for part in node.body if isinstance(part, ast.FunctionDef | ast.ClassDef)]
             nodes += [(f"{symbol}.{part.name}", part) for part in parts]
 
@@ -194,7 +200,9 @@ IN_CONSTANTS = {(row[1], symbol) for row in CONSTANT for symbol in labels(row[-3
 
 @pytest.mark.parametrize(("symbol", "tag"), sorted(set(documented())))
 def test_tags_of_docstrings__have_a_row(symbol: str, tag: str) -> None:
-    assert any(name == symbol and row.startswith(tag) for row, name in IN_ROWS | IN_CONSTANTS)
+    """The tag of a module stands for one of its functions."""
+    named = {name for row, name in IN_ROWS | IN_CONSTANTS if row.startswith(tag)}
+    assert symbol in named or ("." not in symbol and f"{symbol}." in " ".join(named))
 
 
 @pytest.mark.parametrize(("row", "symbol"), sorted(IN_ROWS))
@@ -220,8 +228,9 @@ def parts(path: Path) -> dict[str, ast.stmt]:
 
 
 def names_used(path: Path, test: str) -> set[str]:
-    """Names and words in a test, and in all that it calls of its file and of helpers."""
-    names: set[str] = set()
+    """Names in a test and in all that it calls of its file and of helpers; imported modules."""
+    imports = re.findall(r"^(?:from|import) brokk_min(.*)", path.read_text(), re.M)
+    names = set(re.findall(r"\w+", " ".join(imports))) & {s for s in LABELS if "." not in s}
     ahead = [test]
     while ahead:
         for node in ast.walk(parts(path)[ahead.pop()]):

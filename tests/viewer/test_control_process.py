@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers_bus import START, Push
+from helpers_bus import START, ConstantCommand
 from helpers_viewer import PipedLoop
 
 from brokk_min.can.canopen import OperatorInput
@@ -76,7 +76,7 @@ def test_operator__gives_the_newest_request_until_it_is_too_old() -> None:
 
 
 def test_loop__drives_levers_one_joint_each_and_changes_the_controller_while_driving() -> None:
-    loop = PipedLoop(Push(60, 0, 0, 0, 0))
+    loop = PipedLoop(ConstantCommand(60, 0, 0, 0, 0))
     loop.go(0.5, False, mode=1)
     loop.go(0.2, True, mode=1)
     assert loop.ticks[-1].driving
@@ -96,7 +96,7 @@ def test_loop__drives_levers_one_joint_each_and_changes_the_controller_while_dri
 
 
 def test_loop__closes_the_valves_and_sends_nothing_while_the_window_is_silent() -> None:
-    loop = PipedLoop(Push(60, 0, 0, 0, 0))
+    loop = PipedLoop(ConstantCommand(60, 0, 0, 0, 0))
     loop.go(0.5, False)
     loop.go(0.4, True)
     assert loop.ticks[-1].driving

@@ -15,7 +15,7 @@ import can
 import numpy as np
 import pygame
 import pytest
-from helpers_bus import START, Push, World, recording
+from helpers_bus import START, ConstantCommand, World, recording
 from helpers_canvas import Recorder
 from helpers_viewer import MODES, Operator, post, post_key, telemetry
 
@@ -305,7 +305,7 @@ def test_watch__shows_another_programs_drive_and_sends_nothing() -> None:
     def operator(driving: bool, ready: bool) -> OperatorInput:
         return OperatorInput((0.1, 0, 0) if driving else (0, 0, 0), ready)
 
-    world = World(Push(60, 0, 60, 60, 60), operator)
+    world = World(ConstantCommand(60, 0, 60, 60, 60), operator)
     frames: list[tuple[int, bytes]] = []
     world.upward = world.downward = recording(frames)
     world.drive.begin()
