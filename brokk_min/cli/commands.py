@@ -211,12 +211,12 @@ class Evaluate(Command):
     json: Path | None = None  # Also write all runs here.
     gains: Path | None = None  # Tuned gains; by default gains.json in the folder of POLICY.
     num_starts: Count = 16  # Without --starts: how many of the machine's start poses.
-    perfect_model: bool = False  # Also a controller that knows the plant, as a bound (minutes).
+    perfect_model: bool = False  # Also a bound: a controller with the plant as its model (minutes).
 
     def __call__(self) -> None:
         machine = self.check(self.json)
         if self.perfect_model and self.plant == "net":
-            raise WrongUse("--perfect-model: expected --plant analytic, which it knows, got net")
+            raise WrongUse("--perfect-model: expected --plant analytic, its model, got net")
         path, gains = default_policy(machine, self.policy, self.gains)
         policy = load_policy(path, machine)
         inputs = (self.commands, self.starts, self.num_starts, self.seed)

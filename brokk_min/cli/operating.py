@@ -187,7 +187,7 @@ class Replay(Command):
     logs: Positional[tuple[Path, ...]]  # One or two: candump logs, or JSON of results.
     out: Path | None = None  # Write a film, .gif or .mp4, instead of opening a window.
     fps: Annotated[float, Range(0.1, 100)] = 10.0  # Pictures per second of the film.
-    size: tuple[int, int] = (960, 540)  # Of the picture [px], 320 to 4000 both ways for each arm.
+    size: tuple[int, int] = (960, 540)  # Width and height [px], 320 to 4000 for each arm.
     controllers: tuple[str, ...] = ("rl", "jacobian_pid_k0.1")  # Whose runs of the results.
     sequence: str = ""  # Which sequence of the results; by default the first.
     start: int = 0  # Which start of the results.

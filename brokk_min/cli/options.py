@@ -1,4 +1,4 @@
-"""What the commands share: ranges of options, the machine, the policy and gains by default."""
+"""What the commands have in common: ranges of options, the machine, the policy and gains by default."""
 
 import os
 import runpy

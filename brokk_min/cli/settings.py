@@ -67,7 +67,7 @@ class TaskSettings:
     episode_s: Annotated[float, Range(0.05, 1e6)] = 20.0  # Length of an episode [s].
     hold_min_s: Duration = 0.5  # Shortest time for which a velocity goal holds [s].
     hold_max_s: Duration = 3.0  # Longest time for which a velocity goal holds [s].
-    zero_goals: Fraction = 0.15  # Fraction of goals that ask the tool to stand still.
+    zero_goals: Fraction = 0.15  # Fraction of goals of zero velocity.
     axis_goals: Fraction = 0.4  # Fraction of goals along x, y or z; the others point anywhere.
     noise: Cost = 0.05  # Largest sensor noise, in deviations (paper: 5 %).
     valve_cost: Cost = 0.05  # Cost of a change of all commands by their limit (paper: 0).

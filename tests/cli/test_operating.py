@@ -87,7 +87,7 @@ def test_export__writes_an_onnx_file(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 @pytest.mark.parametrize(
     ("terminal", "expected"),
-    [(True, "\rdriving v wanted +0\033[K"), (False, "driving v wanted +0.10 +0.00 +0.00\n")],
+    [(True, "\rdriving v_goal +0.1\033[K"), (False, "driving v_goal +0.10 +0.00 +0.00\n")],
 )
 def test_show_line__keeps_to_one_line_of_a_terminal(
     terminal: bool, expected: str, monkeypatch: pytest.MonkeyPatch
@@ -96,7 +96,7 @@ def test_show_line__keeps_to_one_line_of_a_terminal(
     monkeypatch.setattr(screen, "isatty", lambda: terminal)
     monkeypatch.setattr("sys.stdout", screen)
     monkeypatch.setenv("COLUMNS", "20")
-    show_line("driving v wanted +0.10 +0.00 +0.00")
+    show_line("driving v_goal +0.10 +0.00 +0.00")
     assert screen.getvalue() == expected
 
 
