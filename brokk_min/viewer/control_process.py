@@ -173,16 +173,16 @@ def start(
 ) -> Iterator[Connection]:
     """`control` in a process of its own, at the other end of this pipe; ends with the block."""
     context = multiprocessing.get_context("spawn")
-    here, there = context.Pipe()
+    window_end, loop_end = context.Pipe()
     process = context.Process(
-        target=control, args=(machine, controllers, options, there), daemon=True
+        target=control, args=(machine, controllers, options, loop_end), daemon=True
     )
     process.start()
-    there.close()
+    loop_end.close()
     try:
-        yield here
+        yield window_end
     finally:
-        here.close()
+        window_end.close()
         process.join(3)
         process.terminate()
 

@@ -53,7 +53,8 @@ class Session:
             return
         p_tool = tool_position(forward_kinematics(self.machine, telemetry.q))
         self.trail = [*self.trail, p_tool][-TRAIL:]
-        if self.tracing and self.tracing.p and telemetry.mode != self._last_mode():
+        mode_changed = self.previous is not None and self.previous.mode != telemetry.mode
+        if mode_changed and self.tracing and self.tracing.p:
             self.next_task(again=True)
         if self.tracing and self.tracing.update(telemetry):
             self.finished = self.tracing.attempt(self.modes[telemetry.mode])
@@ -61,9 +62,6 @@ class Session:
             self.attempts.append(self.finished)
             if self.file:
                 tracing.write_attempts(self.file, self.attempts)
-
-    def _last_mode(self) -> int | None:
-        return self.previous.mode if self.previous else None
 
     def next_task(self, again: bool = False) -> None:
         """The next line, or the same one again, from where the tool is."""

@@ -71,7 +71,7 @@ def run_of_log(machine: Machine, path: Path, colour: Colour) -> Run:
     ValueError: no log, or one in which nothing drives.
     """
     reader = TelemetryReader(machine)
-    updates = [reader.update(frame) for frame in read_frames(path)]
+    updates = (reader.update(frame) for frame in read_frames(path))
     ticks = [t for t in updates if t is not None and np.isfinite(t.q).all()]
     driving = [t.driving for t in ticks]
     if not any(driving):
