@@ -16,7 +16,6 @@ from helpers_bus import START, ConstantCommand, World, recording
 from helpers_canvas import Recorder
 from helpers_viewer import MODES, Operator, post, post_key, telemetry
 
-from benchmarks import play as window_benchmark
 from brokk_min.can.canopen import OperatorInput
 from brokk_min.can.drive_log import Telemetry
 from brokk_min.kinematics import forward_kinematics, tool_position
@@ -328,17 +327,3 @@ def test_watch__shows_another_programs_drive_and_sends_nothing() -> None:
     assert seen[-1].driving
     assert seen[-1].q_dot[0] > 0.05
     np.testing.assert_allclose(seen[-1].u[0] * 127, 60)
-
-
-def test_benchmark_of_the_window__counts_frames_and_ticks() -> None:
-    player = window_benchmark.Player(60.0)
-    session = Session(BROKK_170, MODES, None)
-    handler = Operator().handler
-    assert player(session, handler)
-    for tick in (3, 4, 6):
-        session.update(telemetry(tick, lateness=0.001), 0.0)
-        assert player(session, handler)
-    figures = window_benchmark.figures(player)
-    assert (figures["ticks"], figures["ticks_not_seen"], figures["driving"]) == (3, 1, 1.0)
-    assert figures["lateness"]["p99"] == 1.0
-    assert handler.pygame.event.peek(handler.pygame.KEYDOWN)
