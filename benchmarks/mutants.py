@@ -250,7 +250,7 @@ class Mutation:
 
 
 def report(module: str, out: Path, show: bool) -> None:
-    """Print the score of a module, and with `show` the changes that no test found."""
+    """Print the score of a module, and with `show` the changes that no test detects."""
     outcomes = json.loads(out.read_text())["outcomes"]
     count = Counter(outcome for outcome in outcomes.values() if outcome in UNKILLED)
     reached = len(outcomes) - count["not reached"]
@@ -304,7 +304,7 @@ def main() -> None:
     parser.add_argument("modules", nargs="+", help="of brokk_min")
     parser.add_argument("--tests", nargs="*", help="files or folders, instead of the module's own")
     parser.add_argument("--seconds", type=float, default=2.0, help="of the tests of one mutant")
-    parser.add_argument("--show", action="store_true", help="print what no test found")
+    parser.add_argument("--show", action="store_true", help="print changes that no test detects")
     options = parser.parse_args()
     Path("mutants").mkdir(exist_ok=True)
     for module in options.modules:

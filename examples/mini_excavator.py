@@ -1,8 +1,8 @@
 """A mini-excavator of the 2-tonne class: swing, boom, arm, bucket. See docs/porting.md.
 
 Every number is assumed: typical of the class, no maker's data. Boom, arm and bucket count positive
-downward and inward, against the Brokk's sense, because their axes point the other way (alpha = -90 degrees
-behind the swing). At q = 0 the arm lies stretched out level. The pit is 1 m deep.
+downward and inward, against the sense of the Brokk: their axes point the other way, since alpha is
+-90 degrees after the swing. At q = 0 the arm is straight and level. The pit is 1 m deep.
 """
 
 import numpy as np
@@ -107,7 +107,7 @@ MINI_EXCAVATOR = Machine(
     pump_flow=0.0006,  # m^3/s, 36 litres a minute
     plant_dt=0.005,
     encoder_bits=14,
-    velocity_samples=5,  # finer encoders would do with fewer; here because another number must do too
+    velocity_samples=5,  # another number than the Brokk's must do too
     history=14,  # samples: 0.52 s, enough for its quicker valves
     tool_speed=0.4,  # m/s
     ground=-1.0,

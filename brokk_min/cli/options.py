@@ -1,4 +1,4 @@
-"""What the commands have in common: ranges of options, the machine, the policy and gains by default."""
+"""Common to the commands: ranges of options, the machine, default policy and gains."""
 
 import os
 import runpy
