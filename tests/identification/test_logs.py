@@ -345,6 +345,7 @@ BAD_CSV = {
     "backward time": (GOOD.replace("0.15", "0.02"),
         ["row 5", "column time", "later than 0.1", "0.02"]),
     "command in percent": (GOOD.replace("0.2", "63"), ["row 3", "column u_a", "[-1, 1]", "63"]),
+    "command below -1": (GOOD.replace("0.4", "-1.01"), ["row 5", "column u_a", "[-1, 1]", "-1.01"]),
     "wrong delimiter": (GOOD.replace(",", ";"), ["row 1", "u_<joint>", "run;time;u_a;q_a"]),
     "column twice": (GOOD.replace("q_a", "u_a", 1), ["row 1", "once", "['u_a']"]),
     "header twice": (GOOD + GOOD, ["row 6", "column time", "number", "'time'"]),
@@ -399,8 +400,12 @@ def test_read_log__names_file_row_and_column_of_a_bad_csv(tmp_path, case):
     assert all(word in message for word in words), message
 
 
-def test_read_log__accepts_the_table_above_also_with_spaces_and_a_byte_order_mark(tmp_path):
-    content = b"\xef\xbb\xbf" + GOOD.replace(",u_a,", ", u_a, ").replace("\n", "\r\n").encode()
+def test_read_log__accepts_the_table_above_also_with_spaces_blank_lines_and_a_byte_order_mark(
+    tmp_path,
+):
+    content = (
+        b"\xef\xbb\xbf" + GOOD.replace(",u_a,", ", u_a, ").replace("\n", "\r\n").encode() + b"\r\n"
+    )
     for text in (GOOD.encode(), content):
         (tmp_path / "good.csv").write_bytes(text)
         (recording,) = read_log([tmp_path / "good.csv"], 4).recordings
