@@ -86,7 +86,7 @@ def draw(machine: Machine, results: Results, shown: Shown, curve: Path) -> dict[
     if shown.singular:
         drawn["singular"] = _draw_singular(machine, results, shown.singular)
     if results["training_seeds"]:
-        seeds = {"mean velocity error [m/s]": _seed_bars(results["training_seeds"])}
+        seeds = {"mean velocity error [m/s]": seed_bars(results["training_seeds"])}
         drawn["seeds"] = figures.plot_bars(seeds)
     return drawn
 
@@ -101,7 +101,7 @@ def _draw_singular(machine: Machine, results: Results, traces: Traces) -> Figure
     return figures.plot_sequence(machine, traces, half, starts[run], run)
 
 
-def _seed_bars(table: Mapping[str, Mapping[str, Mean]]) -> Bars:
+def seed_bars(table: Mapping[str, Mapping[str, Mean]]) -> Bars:
     """Velocity error over training seeds by controller and sequence."""
     bars = {}
     for controller, row in table.items():

@@ -230,3 +230,9 @@ def test_path_row__lists_the_goals_that_hold() -> None:
     assert numbers == pytest.approx([1.85, 1, 0.2, 0.17])
     assert goals == "1 s (0, 0, 0); 0.85 s (0, -0.2, 0)"
     assert report.path_row(np.ones((60, 4)))["held for, vx, vy, vz [m/s]"] == "new at every tick"
+
+
+def test_seed_bars__are_velocity_errors_of_controllers_by_sequence() -> None:
+    row = {"velocity_error_to_go": number(0.5, 0.25, 0.75), "valve_travel": number(9.0)}
+    bars = report.seed_bars({"rl": row, "pid": row, "rl less pid": row})
+    assert bars == dict.fromkeys(("rl", "pid"), {"to_go": row["velocity_error_to_go"]})
