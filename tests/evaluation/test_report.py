@@ -235,4 +235,5 @@ def test_path_row__lists_the_goals_that_hold() -> None:
 def test_seed_bars__are_velocity_errors_of_controllers_by_sequence() -> None:
     row = {"velocity_error_to_go": number(0.5, 0.25, 0.75), "valve_travel": number(9.0)}
     bars = report.seed_bars({"rl": row, "pid": row, "rl less pid": row})
-    assert bars == dict.fromkeys(("rl", "pid"), {"to_go": row["velocity_error_to_go"]})
+    errors = {"to_go": row["velocity_error_to_go"]}
+    assert bars == {"rl": errors, "pid": errors}
