@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from tyro.conf import OmitArgPrefixes, Positional
 
-from brokk_min.actuator import select_nets
+from brokk_min.actuator import ActuatorNet, select_nets
 from brokk_min.cli.options import Command, MachineName, Range, Seed, WrongUse, default_policy
 from brokk_min.cli.settings import Count, FitSettings, LearnerSettings, Samples, TaskSettings
 from brokk_min.evaluation import baselines, figures, metrics, perfect_model, sequences
@@ -21,7 +21,7 @@ from brokk_min.identification import excitation, validation
 from brokk_min.identification.files import write_json
 from brokk_min.identification.logs import Log, read_log, write_log
 from brokk_min.identification.net_file import load_net, save_net
-from brokk_min.learning.policy import PolicyController, load_policy
+from brokk_min.learning.policy import Policy, PolicyController, load_policy
 from brokk_min.machine import Machine
 
 
@@ -74,11 +74,7 @@ class Fit(Command):
         scores = validation.validate(net, log, test, known)
         save_net(self.out, net)
         if self.json:
-            meta: dict[str, Any] = {"seed": self.seed, "rate": net.rate, "history": net.history}
-            meta |= {"machine": net.machine, "dead_zone": net.dead_zone}
-            meta |= {"logs": [str(path) for path in self.logs]}
-            meta |= {"test": [str(path) for path in self.test]}
-            write_json(self.json, {"meta": meta, **scores})
+            write_json(self.json, {"meta": self._meta(net), **scores})
         if self.figure:
             figures.save(self.figure, figures.plot_worst_and_median(net, test))
         name = net.machine or "no known machine"
@@ -93,6 +89,11 @@ class Fit(Command):
         if self.test:
             return log, read_log(self.test, samples, log.joints, log.rate)
         return split(log)
+
+    def _meta(self, net: ActuatorNet) -> dict[str, Any]:
+        meta = {"seed": self.seed, "rate": net.rate, "history": net.history}
+        files = {"logs": list(map(str, self.logs)), "test": list(map(str, self.test))}
+        return {**meta, "machine": net.machine, "dead_zone": net.dead_zone, **files}
 
     def _settings(self, known: Machine | None) -> dict[str, Any]:
         """The settings, by default with the known machine's dead zone; or the paper's."""
@@ -222,12 +223,7 @@ class Evaluate(Command):
         inputs = (self.commands, self.starts, self.num_starts, self.seed)
         driven, starts = sequences.goals_and_starts(machine, *inputs)
         print(f"gains of the baselines: {gains or 'tuned now'}", file=sys.stderr)
-        controllers: dict[str, Controller] = {"rl": PolicyController(machine, policy)}
-        if gains:
-            controllers |= baselines.read_gains(gains, machine, policy.net)
-        else:
-            budget = (baselines.TUNING_RUNS, baselines.GENERATIONS)
-            controllers |= baselines.tune_baselines(machine, policy.net, *budget, self.seed)[0]
+        controllers = self._controllers(machine, policy, gains)
         if self.perfect_model:
             controllers |= perfect_model.perfect_models(machine, starts)
         net = policy.net if self.plant == "net" else None
@@ -239,6 +235,16 @@ class Evaluate(Command):
             meta["starts"] = str(self.starts or self.num_starts)
             write_json(self.json, {"meta": meta, "runs": runs})
         print_means(runs, len(driven))
+
+    def _controllers(
+        self, machine: Machine, policy: Policy, gains: Path | None
+    ) -> dict[str, Controller]:
+        rl = PolicyController(machine, policy)
+        if gains:
+            return {"rl": rl, **baselines.read_gains(gains, machine, policy.net)}
+        budget = (baselines.TUNING_RUNS, baselines.GENERATIONS)
+        tuned, _ = baselines.tune_baselines(machine, policy.net, *budget, self.seed)
+        return {"rl": rl, **tuned}
 
 
 def print_means(runs: list[dict[str, Any]], sequences: int) -> None:
