@@ -143,12 +143,18 @@ def smooth_angles(machine: Machine, history: Array) -> Array:
     moved on by the velocities since, which the estimator gives l ticks late. It has a fraction of
     the newest angle's noise.
     """
+    weights = smoothing_weights(machine).astype(history.dtype)
+    return np.asarray(np.einsum("...kh,kh->...", history[..., :2, :], weights))
+
+
+@lru_cache
+def smoothing_weights(machine: Machine) -> Array:
+    """Weights (2, H) of angles and velocities in the mean of `smooth_angles`."""
     H = machine.history
     late = machine.velocity_samples / 2 - 1
-    weights = np.arange(H) - late  # q_dot_j stands in j of the H sums
-    weights[-1] += H * late
-    weights = np.stack([np.ones(H) / H, weights * machine.dt / H]).astype(history.dtype)
-    return np.asarray(np.einsum("...kh,kh->...", history[..., :2, :], weights))
+    count = np.arange(H) - late  # q_dot_j stands in j of the H sums
+    count[-1] += H * late
+    return np.stack([np.ones(H), machine.dt * count]) / H
 
 
 # --- the nets -------------------------------------------------------------------------------------
@@ -269,12 +275,16 @@ def select_nets(machine: Machine, net: ActuatorNet) -> ActuatorNet:
     return net.select([machine.names[i] for i in machine.driven])
 
 
-def net_step(machine: Machine, net: ActuatorNet, history: Array, q: Array, u: Array) -> Array:
+def net_step(
+    machine: Machine, net: ActuatorNet | None, history: Array, q: Array, u: Array
+) -> Array:
     """Angles [rad] (..., n) of a machine whose driven joints the nets move, one tick on.
 
     q' = q + dt net(history, u), within the joints' ranges; `history` (..., n, 3, H) is without the
-    command `u` (..., n) of this tick.
+    command `u` (..., n) of this tick. ValueError: no nets.
     """
+    if net is None:
+        raise ValueError("net: expected nets for a state without a plant, got None")
     driven = machine.driven
     inputs = append_command(history.take(driven, axis=-3), u[..., driven])
     moved = q[..., driven] + machine.dt * net.predict(inputs)

@@ -173,7 +173,10 @@ def features(machine: Machine, measured: Measured) -> Array:
         resolved[..., 1],
     ]
     mean, scale = observation_scale(machine)
-    return np.asarray((np.concatenate(numbers, axis=-1) - mean) / scale, np.float32)
+    obs = np.concatenate(numbers, axis=-1, dtype=np.float32)
+    obs -= mean
+    obs /= scale
+    return obs
 
 
 def integrate_error(machine: Machine, v_goal: Array, v_tool: Array, integral: Array) -> Array:
@@ -268,30 +271,26 @@ def transition(
 
     `read(machine, q)` gives the encoders' angles; the nets go on from true ones. Paper: Sec. 3.4
     """
-    if state.plant is not None:
-        plant = actuator.plant_step(machine, state.plant, u)
-        q = plant.q
-    elif net is not None:
-        plant = None
-        q = actuator.net_step(machine, net, state.true_history, state.q, u)
-    else:
-        raise ValueError("net: expected nets for a state without a plant, got None")
-    history, integral = update_history(
-        machine, state.history, u, read(machine, q), state.v_goal, state.error_integral
-    )
+    plant = state.plant and actuator.plant_step(machine, state.plant, u)
+    q = plant.q if plant else actuator.net_step(machine, net, state.true_history, state.q, u)
+    window = machine.velocity_samples, machine.dt
+    history = append_sample(state.history, u, read(machine, q), *window)
     q_dot = (q - state.q) / machine.dt
-    frames = forward_kinematics(machine, q.astype(np.float32))
+    poses = np.stack([q, history[..., 0, -1]], dtype=np.float32)  # true and measured
+    velocities = np.stack([q_dot, history[..., 1, -1]], dtype=np.float32)
+    frames = forward_kinematics(machine, poses)
+    v_tool, v_measured = tool_velocity(frames, velocities)
     return replace(
         state,
         q=q,
         q_dot=q_dot,
-        v_tool=tool_velocity(frames, q_dot.astype(np.float32)),
-        lowest=kinematics.lowest_point(frames),
+        v_tool=v_tool,
+        lowest=kinematics.lowest_point(frames)[0],
         history=history,
-        true_history=append_sample(state.true_history, u, q, machine.velocity_samples, machine.dt),
+        true_history=append_sample(state.true_history, u, q, *window),
         goal_ticks=state.goal_ticks - 1,
         ticks=state.ticks + 1,
-        error_integral=integral,
+        error_integral=integrate_error(machine, state.v_goal, v_measured, state.error_integral),
         plant=plant,
     )
 

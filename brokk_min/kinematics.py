@@ -42,9 +42,11 @@ def forward_kinematics(machine: Machine, q: ArrayLike) -> Frames:
     axes = np.zeros_like(p)
     x, y, z = np.eye(3, dtype=q.dtype).reshape(3, 3, *[1] * (q.ndim - 1))
     axes[0] = z
+    angles = np.moveaxis(q + machine.column("theta").astype(q.dtype), -1, 0)
+    c = np.cos(angles)
+    s = np.sin(angles)
     for i, joint in enumerate(machine.joints):
-        angle = q[..., i] + joint.theta
-        x, y = rotate(x, y, np.cos(angle), np.sin(angle))  # Rz(q + theta)
+        x, y = rotate(x, y, c[i], s[i])  # Rz(q + theta)
         p[i + 1] = p[i] + joint.d * z + joint.a * x  # Tz(d), Tx(a)
         if joint.alpha:
             y, z = rotate(y, z, math.cos(joint.alpha), math.sin(joint.alpha))  # Rx(alpha)

@@ -88,8 +88,8 @@ def new_goals(
 
 def draw_noise(machine: Machine, largest: float, num: int, rng: np.random.Generator) -> Array:
     """Uniform noise of `env.measure`, in deviations, float32 (num, noisy)."""
-    noise = rng.random((num, len(noise_std(machine))), np.float32)
-    return np.float32(largest) * (2 * noise - 1)
+    steps = rng.integers(-(2**15), 2**15, (num, len(noise_std(machine))), np.int16)
+    return steps * np.float32(largest / 2**15)
 
 
 def get_obs(machine: Machine, config: TaskConfig, state: State, rng: np.random.Generator) -> Array:
