@@ -135,6 +135,8 @@ cases = given(strategies.machines(), st.integers(0, 999))
 @settings(max_examples=5)
 @given(strategies.machines(2, 5), st.integers(0, 999), st.sampled_from([0.0, 0.8, 1.0]))
 def test_action_gradients__equal_finite_differences_of_rollouts(machine, seed, gamma):
+    """Rollouts are longer than the history."""
+    machine = replace(machine, history=5)
     net, start, commands = moving_case(machine, seed)
     ticks = ticks_of(simulate(machine, net, start, commands), commands)
     gradient = action_gradients(machine, net, ticks, gamma, costs())
