@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from types import ModuleType
 from typing import Any
 
 import pytest
@@ -25,12 +24,12 @@ Stand = Callable[..., dict[str, tuple[Any, ...]]]
 
 
 @pytest.fixture
-def stand(monkeypatch: pytest.MonkeyPatch) -> Stand:
+def stand(monkeypatch):
     """Puts functions of a module aside for ones that give what is told; what they were called with."""
-    calls: dict[str, tuple[Any, ...]] = {}
+    calls = {}
 
-    def instead(module: ModuleType, **results: Any) -> dict[str, tuple[Any, ...]]:
-        def stands(name: str) -> Callable[..., Any]:
+    def instead(module, **results):
+        def stands(name):
             return lambda *arguments: (calls.update({name: arguments}), results[name])[1]
 
         for name in results:

@@ -8,11 +8,10 @@ import json
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import can
 import numpy as np
@@ -21,11 +20,9 @@ from canopen.objectdictionary import ObjectDictionary, ODArray, ODRecord, ODVari
 
 from brokk_min.can.canopen import Bus, Frame, OperatorInput, open_bus
 from brokk_min.can.simulated_machine import SimulatedMachine, serve
-from brokk_min.env import Measured
-from brokk_min.evaluation.rollout import Controller
 from brokk_min.hw import Drive
 from brokk_min.jacobian import Gains, JacobianController, manipulability_threshold
-from brokk_min.machine import BROKK_170, Machine
+from brokk_min.machine import BROKK_170
 
 MULTICAST = "239.74.163.2"
 START = (0.0, 0.5, 0.58, 1.71, 1.24)
@@ -41,30 +38,30 @@ Change = Callable[[int, bytes], Out]
 _channels = itertools.count()
 
 
-def unchanged(can_id: int, data: bytes) -> Out:
+def unchanged(can_id, data):
     return [(can_id, data)]
 
 
-def only(changed_id: int, act: Callable[[bytes], list[bytes]]) -> Change:
+def only(changed_id, act):
     """Change the frames of one identifier."""
     return lambda can_id, data: [
         (can_id, d) for d in (act(data) if can_id == changed_id else [data])
     ]
 
 
-def once(act: Callable[[bytes], list[bytes]]) -> Callable[[bytes], list[bytes]]:
+def once(act):
     """Change the first frame alone."""
     acts = iter([act])
     return lambda data: next(acts, lambda data: [data])(data)
 
 
-def recording(out: Out) -> Change:
+def recording(out):
     """Append the frames that pass to `out`."""
-    return lambda can_id, data: out.append((can_id, data)) or [(can_id, data)]  # type: ignore
+    return lambda can_id, data: out.append((can_id, data)) or [(can_id, data)]
 
 
-def raises(error: Exception) -> Callable[..., Any]:
-    def act(*_: object, **__: object) -> None:
+def raises(error):
+    def act(*_, **__):
         raise error
 
     return act
@@ -77,53 +74,46 @@ class World:
     and `downward` may tamper with what machine and program send.
     """
 
-    def __init__(
-        self,
-        controller: Controller,
-        operator: Callable[[bool, bool], OperatorInput],
-        machine: Machine = BROKK_170,
-        log: Any = None,
-        start: tuple[float, ...] = START,
-    ) -> None:
+    def __init__(self, controller, operator, machine=BROKK_170, log=None, start=START):
         channel = f"world {next(_channels)}"
         self.near = can.Bus(channel, interface="virtual")
         self.far = can.Bus(channel, interface="virtual")
         self.t = 0.0  # s
         self.step = 0.001  # s
         self.offset = 0.0  # s, of the program's clock
-        self.upward: Change = unchanged
-        self.downward: Change = unchanged
-        self.noise: Callable[[], Out] = list  # foreign frames of the next millisecond
-        self.record: list[tuple[float, np.ndarray, np.ndarray, float]] = []
-        self.syncs: list[float] = []
+        self.upward = unchanged
+        self.downward = unchanged
+        self.noise = list  # foreign frames of the next millisecond
+        self.record = []
+        self.syncs = []
         self.simulated = SimulatedMachine(machine, start, 0.0, lambda *row: self.record.append(row))
         self.bus = Bus(self, log, clock=lambda: self.t + self.offset, sleep=self.sleep)
         self.bus.start = 1.8e9  # s; a fixed time of day, so that roundings repeat themselves
         self.drive = Drive(machine, controller, self.bus, operator)
         self.say(self.simulated.boot())
 
-    def fileno(self) -> int:
+    def fileno(self):
         raise NotImplementedError
 
-    def send(self, message: can.Message, timeout: float | None = None) -> None:
+    def send(self, message, timeout=None):
         for can_id, data in self.downward(message.arbitration_id, bytes(message.data)):
             self.near.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
         self.live()
 
-    def recv(self, timeout: float) -> can.Message | None:
+    def recv(self, timeout):
         end = self.t + timeout
         while (message := self.near.recv(0)) is None and self.t < end:
             self.t = min(end, self.t + self.step)
             self.live()
         return message
 
-    def sleep(self, seconds: float) -> None:
+    def sleep(self, seconds):
         end = self.t + seconds
         while self.t < end:
             self.t = min(end, self.t + self.step)
             self.live()
 
-    def live(self) -> None:
+    def live(self):
         """The machine's side up to now."""
         self.say(self.simulated.advance(self.t))
         for can_id, data in self.noise():
@@ -135,25 +125,25 @@ class World:
             frame = Frame(self.t, message.arbitration_id, bytes(message.data))
             self.say(self.simulated.receive(frame))
 
-    def say(self, frames: Out) -> None:
+    def say(self, frames):
         for frame in frames:
             for can_id, data in self.upward(*frame):
                 self.far.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
 
-    def run(self, seconds: float) -> None:
+    def run(self, seconds):
         end = self.t + seconds
         while self.t < end and self.drive.tick():
             pass
 
-    def close(self) -> None:
+    def close(self):
         self.near.shutdown()
         self.far.shutdown()
 
-    def shutdown(self) -> None:
+    def shutdown(self):
         self.near.shutdown()
 
     @property
-    def commands(self) -> tuple[np.ndarray, np.ndarray]:
+    def commands(self):
         """Times [s] and commands in force in counts (T, n), by the plant's own record."""
         times, u, *_ = zip(*self.record, strict=True)
         return np.array(times), np.rint(np.array(u) * 127).astype(int)
@@ -162,14 +152,14 @@ class World:
 class ConstantCommand:
     """A controller that gives constant commands [counts of 127]."""
 
-    def __init__(self, *m: float) -> None:
+    def __init__(self, *m):
         self.m = np.array(m, float)
-        self.act: Callable[[], object] = lambda: None
+        self.act = lambda: None
 
-    def start(self, num: int) -> None:
+    def start(self, num):
         return None
 
-    def __call__(self, measured: Measured, state: None) -> tuple[np.ndarray, None]:
+    def __call__(self, measured, state):
         self.act()
         return self.m[None] / 127, None
 
@@ -177,15 +167,15 @@ class ConstantCommand:
 class HoldingOperator:
     """An operator who presses as soon as the gate is ready, then asks for motion."""
 
-    def __init__(self) -> None:
-        self.enable: bool | None = None  # None: pressed when ready, and held from then on
+    def __init__(self):
+        self.enable = None  # None: pressed when ready, and held from then on
         self.alive = True
         self.stop = False
         self.v = (0.1, 0.0, 0.0)
         self.pressed = False
-        self.act: Callable[[], object] = lambda: None
+        self.act = lambda: None
 
-    def __call__(self, driving: bool, ready: bool) -> OperatorInput:
+    def __call__(self, driving, ready):
         self.act()
         self.pressed = self.pressed or ready
         enable = self.pressed if self.enable is None else self.enable
@@ -193,14 +183,14 @@ class HoldingOperator:
         return OperatorInput(v, enable and self.alive, self.alive, self.stop)
 
 
-def eventually(condition: Callable[[], bool], seconds: float = 20.0) -> None:
+def eventually(condition, seconds=20.0):
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "not within the time"
         time.sleep(0.01)
 
 
-def recorded_rows(path: Path) -> np.ndarray:
+def recorded_rows(path):
     """Complete rows of a record that is being written: time, commands, last valid frame's time."""
     lines = path.read_text().splitlines()[1:-1] if path.exists() else []
     cells = [line.split(",") for line in lines]
@@ -208,7 +198,7 @@ def recorded_rows(path: Path) -> np.ndarray:
 
 
 @contextmanager
-def served(channel: str) -> Iterator[SimulatedMachine]:
+def served(channel):
     """Our simulated machine in a thread on a virtual bus."""
     end = threading.Event()
     with open_bus("virtual", channel) as bus:
@@ -222,7 +212,7 @@ def served(channel: str) -> Iterator[SimulatedMachine]:
             thread.join()
 
 
-def own_multicast_port(monkeypatch: pytest.MonkeyPatch) -> None:
+def own_multicast_port(monkeypatch):
     """Groups with one port are one bus: take a port of our own. Skips where nothing is routed."""
     monkeypatch.setenv("CAN_CONFIG", json.dumps({"port": 43200 + os.getpid() % 10_000}))
     bus = partial(open_bus, "udp_multicast", MULTICAST)
@@ -236,7 +226,7 @@ def own_multicast_port(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.skip("no multicast route on this machine")
 
 
-def dictionary() -> ObjectDictionary:
+def dictionary():
     """As much of CiA 406 as an encoder with one mapped position needs."""
     u8, u16, u32 = datatypes.UNSIGNED8, datatypes.UNSIGNED16, datatypes.UNSIGNED32
     objects = ObjectDictionary()
@@ -266,7 +256,7 @@ def dictionary() -> ObjectDictionary:
 class Virtual:
     """SDL's virtual joystick: a device without a device."""
 
-    def __init__(self, axes: int = 6, buttons: int = 8) -> None:
+    def __init__(self, axes=6, buttons=8):
         import pygame
 
         os.environ["SDL_VIDEODRIVER"] = "dummy"
@@ -281,11 +271,11 @@ class Virtual:
         self.index = self.sdl.SDL_JoystickAttachVirtual(4, axes, buttons, 0)
         self.operatorle = self.sdl.SDL_JoystickOpen(self.index)
 
-    def axis(self, axis: int, value: float) -> None:
+    def axis(self, axis, value):
         assert self.sdl.SDL_JoystickSetVirtualAxis(self.operatorle, axis, round(32767 * value)) == 0
 
-    def button(self, button: int, held: bool) -> None:
+    def button(self, button, held):
         assert self.sdl.SDL_JoystickSetVirtualButton(self.operatorle, button, held) == 0
 
-    def unplug(self) -> None:
+    def unplug(self):
         assert self.sdl.SDL_JoystickDetachVirtual(self.index) == 0

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from brokk_min.viewer.window import Box, Canvas, Colour
+from brokk_min.viewer.window import Canvas, Colour
 
 
 class Shape(NamedTuple):
@@ -19,36 +19,36 @@ class Shape(NamedTuple):
 class Recorder(Canvas):
     """Lines, polygons (bars too), circles, clips; text, colour and box of each word."""
 
-    def __init__(self, size: tuple[int, int]) -> None:
+    def __init__(self, size):
         super().__init__(size)
-        self.lines: list[Shape] = []
-        self.polygons: list[Shape] = []
-        self.circles: list[Shape] = []
-        self.clips: list[Box] = []
-        self.words: list[tuple[str, Colour, np.ndarray]] = []
+        self.lines = []
+        self.polygons = []
+        self.circles = []
+        self.clips = []
+        self.words = []
 
-    def clip(self, box: Box | None) -> None:
+    def clip(self, box):
         super().clip(box)
         self.clips += [] if box is None else [box]
 
-    def line(self, points: Any, colour: Colour, width: int = 1) -> None:
+    def line(self, points, colour, width=1):
         super().line(points, colour, width)
         self.lines.append(Shape(points, colour, width))
 
-    def polygon(self, points: Any, colour: Colour) -> None:
+    def polygon(self, points, colour):
         super().polygon(points, colour)
         self.polygons.append(Shape(points, colour))
 
-    def circle(self, centre: Any, radius: float, colour: Colour, width: int = 0) -> None:
+    def circle(self, centre, radius, colour, width=0):
         super().circle(centre, radius, colour, width)
         self.circles.append(Shape(centre, colour, width, radius))
 
-    def text(self, x: float, y: float, text: str, size: int, *more: Any) -> None:  # type: ignore[override]
+    def text(self, x, y, text, size, *more):
         super().text(x, y, text, size, *more)
         word, (left, upper) = self.texts[-1]
         box = np.array([left, upper, left + word.get_width(), upper + word.get_height()])
         self.words.append((text, more[0] if more else (33, 37, 43), box))
 
     @property
-    def texts_drawn(self) -> list[str]:
+    def texts_drawn(self):
         return [text for text, _, _ in self.words]

@@ -10,7 +10,7 @@ from brokk_min.__main__ import main
 MINI = f"{Path(__file__).parents[1] / 'examples' / 'mini_excavator.py'}:MINI_EXCAVATOR"
 
 
-def run(line: str, *more: object) -> int:
+def run(line, *more):
     """Exit status of a command; tyro leaves by SystemExit on wrong use and help."""
     try:
         return main([*shlex.split(line), *map(str, more)])

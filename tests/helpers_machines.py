@@ -9,13 +9,13 @@ import numpy as np
 from brokk_min.actuator import ActuatorNet
 from brokk_min.identification.logs import Recording, velocity_of
 from brokk_min.kinematics import forward_kinematics, jacobian
-from brokk_min.machine import BROKK_170, Joint, Machine
+from brokk_min.machine import BROKK_170, Joint
 
 GAIN = 3.0  # of `obedient_net`
 POSE = np.array([1.5, 0.5, 0.58, 1.71, 1.24])  # the paper's q_s
 
 
-def random_machine(rng: np.random.Generator, n: int) -> Machine:
+def random_machine(rng, n):
     """A machine of `n` joints with at least one driven, far above the ground, of any geometry."""
     driven = rng.random(n) < 0.7
     driven[rng.integers(n)] = True
@@ -60,9 +60,7 @@ def random_machine(rng: np.random.Generator, n: int) -> Machine:
     )
 
 
-def small_net(
-    machine: Machine, rng: np.random.Generator, joints: tuple[str, ...] = ()
-) -> ActuatorNet:
+def small_net(machine, rng, joints=()):
     """Nets with random weights for `joints` (none: the driven ones): all inputs matter."""
     joints = joints or tuple(machine.names[i] for i in machine.driven)
     index = [machine.names.index(name) for name in joints]
@@ -99,7 +97,7 @@ def small_net(
     )
 
 
-def obedient_net(machine: Machine) -> ActuatorNet:
+def obedient_net(machine):
     """Nets whose velocity depends on the newest command alone, see `obedient_velocity`."""
     net = small_net(machine, np.random.default_rng(0))
     weights = [np.zeros_like(weight) for weight in net.weights]
@@ -112,13 +110,13 @@ def obedient_net(machine: Machine) -> ActuatorNet:
     )
 
 
-def obedient_velocity(machine: Machine, u: np.ndarray) -> np.ndarray:
+def obedient_velocity(machine, u):
     """What `obedient_net` says for commands `u` (..., n_driven), worked out by hand."""
     fastest = 1.2 * machine.q_dot_max[machine.driven]
     return fastest * (2 / (1 + np.exp(-GAIN * np.asarray(u, float))) - 1)
 
 
-def damped_rates(machine: Machine, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+def damped_rates(machine, q, v):
     """Oracle of `joint_rates`: NumPy solves (J^T J + lambda^2 I) x = J^T v, lambda 6 % of the length."""
     J = jacobian(forward_kinematics(machine, np.asarray(q, float)))[..., machine.driven]
     damping = (0.06 * np.hypot(machine.column("a"), machine.column("d")).sum()) ** 2
@@ -133,37 +131,35 @@ class RowRandom:
     Right only where every draw is for all rows at once; it refuses any other.
     """
 
-    def __init__(self, sources: list[np.random.Generator]) -> None:
+    def __init__(self, sources):
         self.sources = sources
 
-    def _rows(self, shape: int | tuple[int, ...]) -> tuple[int, ...]:
+    def _rows(self, shape):
         shape = (shape,) if isinstance(shape, int) else tuple(shape)
         if shape[0] != len(self.sources):
             raise AssertionError(f"a draw for {shape[0]} of {len(self.sources)} rows")
         return (1, *shape[1:])
 
-    def random(self, size: int | tuple[int, ...], dtype: type = np.float64) -> np.ndarray:
+    def random(self, size, dtype=np.float64):
         return np.concatenate([s.random(self._rows(size), dtype) for s in self.sources])
 
-    def standard_normal(self, size: int | tuple[int, ...]) -> np.ndarray:
+    def standard_normal(self, size):
         return np.concatenate([s.standard_normal(self._rows(size)) for s in self.sources])
 
-    def integers(
-        self, low: int, high: int, size: int | tuple[int, ...], dtype: type = np.int64
-    ) -> np.ndarray:
+    def integers(self, low, high, size, dtype=np.int64):
         return np.concatenate(
             [s.integers(low, high, self._rows(size), dtype) for s in self.sources]
         )
 
-    def uniform(self, low: float, high: float, size: int | tuple[int, ...]) -> np.ndarray:
+    def uniform(self, low, high, size):
         return np.concatenate([s.uniform(low, high, self._rows(size)) for s in self.sources])
 
 
-def random_net(seed: int = 0, n: int = 3, history: int = 13, hidden: int = 32) -> ActuatorNet:
+def random_net(seed=0, n=3, history=13, hidden=32):
     rng = np.random.default_rng(seed)
     inputs = 3 * history
 
-    def draw(*shape: int) -> np.ndarray:
+    def draw(*shape):
         return (rng.standard_normal(shape) / shape[1] ** 0.5).astype(np.float32)
 
     return ActuatorNet(
@@ -188,7 +184,7 @@ def random_net(seed: int = 0, n: int = 3, history: int = 13, hidden: int = 32) -
     )  # fmt: skip
 
 
-def constant_net(velocity: list[float], logged: bool, joints: tuple[str, ...]) -> ActuatorNet:
+def constant_net(velocity, logged, joints):
     """Nets that say `velocity` whatever they see: no weights, sigmoid(0) = 1/2, the middle."""
     middle = np.array(velocity, np.float32)
     net = random_net(n=len(velocity))
@@ -204,7 +200,7 @@ def constant_net(velocity: list[float], logged: bool, joints: tuple[str, ...]) -
     )
 
 
-def line(name: str, start: float, slope: float, ticks: int, u: float = 0.5) -> Recording:
+def line(name, start, slope, ticks, u=0.5):
     q = np.full((ticks, 1), start) + slope * np.arange(ticks)[:, None] / 20
     return Recording(name, np.full((ticks, 1), u), q, velocity_of(q, 4))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-from typing import Any
 
 import numpy as np
 import pygame
@@ -23,15 +22,15 @@ from brokk_min.viewer.input_handler import InputHandler
 MODES = ["rl", "jacobian", "levers"]
 
 
-def post(kind: int, **more: Any) -> None:
+def post(kind, **more):
     pygame.event.post(pygame.event.Event(kind, **more))
 
 
-def post_key(name: str, down: bool = True) -> None:
+def post_key(name, down=True):
     post(pygame.KEYDOWN if down else pygame.KEYUP, key=pygame.key.key_code(name))
 
 
-def telemetry(tick: int = 0, q: Any = START, **more: Any) -> Telemetry:
+def telemetry(tick=0, q=START, **more):
     """A machine at rest that is driven with closed valves."""
     zero = np.zeros(len(q))
     return Telemetry(tick, np.array(q), zero, zero, np.zeros(3), True)._replace(**more)
@@ -40,24 +39,24 @@ def telemetry(tick: int = 0, q: Any = START, **more: Any) -> Telemetry:
 class Operator:
     """Presses keys of an `InputHandler` through pygame's queue; its clock stands at `now`."""
 
-    def __init__(self, modes: list[str] = MODES) -> None:
+    def __init__(self, modes=MODES):
         pygame.display.set_mode((10, 10))
         pygame.event.clear()
         self.handler = InputHandler(BROKK_170, pygame, modes)
         self.handler.time = self.now = 0.0
         self.look()
 
-    def look(self, seconds: float = 0.5) -> Request:
+    def look(self, seconds=0.5):
         for event in pygame.event.get():
             self.handler.handle(event)
         self.now += seconds
         return self.handler.request(self.now)
 
-    def key(self, name: str, down: bool = True, seconds: float = 0.5) -> Request:
+    def key(self, name, down=True, seconds=0.5):
         post_key(name, down)
         return self.look(seconds)
 
-    def event(self, kind: int, **more: Any) -> Request:
+    def event(self, kind, **more):
         post(kind, **more)
         return self.look()
 
@@ -65,23 +64,21 @@ class Operator:
 class PipedLoop:
     """The loop of a window on an injected clock, and the window's end of its pipe."""
 
-    def __init__(self, *controllers: Any, log: Any = None) -> None:
+    def __init__(self, *controllers, log=None):
         self.connection, there = multiprocessing.Pipe()
-        self.world = World(ConstantCommand(), lambda driving, ready: None, log=log)  # type: ignore
+        self.world = World(ConstantCommand(), lambda driving, ready: None, log=log)
         operator = WindowOperator(BROKK_170, there, lambda: self.world.t)
         selected = SelectedController(BROKK_170, controllers, operator)
         self.world.drive = WindowDrive(BROKK_170, selected, self.world.bus, operator)
-        self.ticks: list[Telemetry] = []
+        self.ticks = []
         self.request(False)
         self.world.drive.begin()
 
-    def request(
-        self, enable: bool, v: Any = (0, 0, 0), mode: int = 0, levers: Any = (0, 0, 0, 0)
-    ) -> None:
+    def request(self, enable, v=(0, 0, 0), mode=0, levers=(0, 0, 0, 0)):
         request = Request(self.world.t, mode, enable, True, np.array(v), np.array(levers))
         self.connection.send(request)
 
-    def go(self, seconds: float, enable: bool, v: Any = (0, 0, 0), **more: Any) -> None:
+    def go(self, seconds, enable, v=(0, 0, 0), **more):
         """Send requests and receive telemetry for some seconds."""
         end = self.world.t + seconds
         while self.world.t < end - 1e-9:
@@ -89,6 +86,6 @@ class PipedLoop:
             self.world.run(0.04)
             self.ticks += receive_telemetry(self.connection)
 
-    def close(self) -> None:
+    def close(self):
         self.world.bus.close()
         self.world.close()

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +18,7 @@ from brokk_min.machine import BROKK_170
 
 
 @pytest.mark.parametrize("learner", list(peers.LEARNERS))
-def test_peers__train_on_the_environment(learner: str, tmp_path: Path) -> None:
+def test_peers__train_on_the_environment(learner, tmp_path):
     if learner == "rl_games" and not importlib.util.find_spec("rl_games"):
         pytest.skip("rl_games is not installed")
     out = tmp_path / "p.json"
@@ -32,7 +30,7 @@ def test_peers__train_on_the_environment(learner: str, tmp_path: Path) -> None:
     assert json.loads(out.read_text())["runs"] == [row]
 
 
-def test_pid__gives_actions_for_its_commands() -> None:
+def test_pid__gives_actions_for_its_commands():
     env = TaskVectorEnv(3, random_net(np.random.default_rng(0)))
     obs, _ = env.reset(seed=0)
     assert env.state is not None
@@ -42,8 +40,8 @@ def test_pid__gives_actions_for_its_commands() -> None:
     assert (np.sign(u) == np.sign(actions)).all()
 
 
-def test_best_setting__is_the_fastest_or_the_closest() -> None:
-    def row(rate: float, seconds: float | None, best: float) -> dict[str, Any]:
+def test_best_setting__is_the_fastest_or_the_closest():
+    def row(rate, seconds, best):
         return {"learning_rate": rate, "planned": 100, "seconds": seconds, "best": best}
 
     rows = [row(1e-3, None, 0.7), row(2e-3, None, 0.8)]
@@ -52,7 +50,7 @@ def test_best_setting__is_the_fastest_or_the_closest() -> None:
     assert peers.best_setting(rows) == (4e-3, 100)
 
 
-def test_limits__are_measured(tmp_path: Path) -> None:
+def test_limits__are_measured(tmp_path):
     out = tmp_path / "l.json"
     options = limits.Options(quick=True, threads=1, num_envs=(4, 8), json=out)
     result = limits.main(options)
@@ -63,7 +61,7 @@ def test_limits__are_measured(tmp_path: Path) -> None:
     assert json.loads(out.read_text())["gradient"] == result["gradient"]
 
 
-def test_shapes__are_the_products_of_a_gradient() -> None:
+def test_shapes__are_the_products_of_a_gradient():
     """171-256-128-64-4: forward and by weights everywhere, by inputs from the second layer on."""
     actor, critic = (171 * 256 + 256 * 128 + 128 * 64 + 64 * last for last in (4, 1))
     for outputs, both in (((4,), actor), ((4, 1), actor + critic)):
@@ -72,7 +70,7 @@ def test_shapes__are_the_products_of_a_gradient() -> None:
 
 
 @pytest.mark.parametrize("kind", ["torch", "onednn"])
-def test_products__agree_with_numpy(kind: str) -> None:
+def test_products__agree_with_numpy(kind):
     sizes = limits.shapes(171, (4, 1), 10)
     try:
         products = limits.products(kind, sizes)()
@@ -83,15 +81,15 @@ def test_products__agree_with_numpy(kind: str) -> None:
 
 
 @pytest.mark.parametrize("entry", [deviations.a1, deviations.d3])
-def test_deviations__are_fractions_or_small_numbers(entry: Any) -> None:
+def test_deviations__are_fractions_or_small_numbers(entry):
     assert all(0 <= value < 1 for value in entry().values())
 
 
 @pytest.mark.parametrize("entry", [deviations.a5, deviations.d7, deviations.d12, deviations.d14])
-def test_deviations__train_and_compare(entry: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_deviations__train_and_compare(entry, monkeypatch):
     """One update of 64 ticks; what the policy does is not tested. All is as before afterwards."""
 
-    def evaluate(*_: object) -> tuple[list[dict[str, float]], None]:
+    def evaluate(*_):
         row = {"velocity_error_mean": 0.1, "off_axis_drift_max": 0.02, "valve_travel": 20.0}
         return [row], None
 

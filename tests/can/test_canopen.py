@@ -6,11 +6,8 @@ import io
 import re
 import struct
 import time
-from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import can
 import canopen
@@ -21,7 +18,6 @@ from helpers_bus import (
     START,
     ConstantCommand,
     HoldingOperator,
-    Out,
     World,
     dictionary,
     own_multicast_port,
@@ -48,7 +44,7 @@ STEP = BROKK_170.encoder_step
 # --- bytes ---------------------------------------------------------------------------------------
 
 
-def bitwise_crc(data: bytes) -> int:
+def bitwise_crc(data):
     """CRC-8 SAE J1850 straight from its definition, bit by bit."""
     crc = 0xFF
     for byte in data:
@@ -60,7 +56,7 @@ def bitwise_crc(data: bytes) -> int:
     return crc ^ 0xFF
 
 
-def test_checksum__is_crc8_j1850() -> None:
+def test_checksum__is_crc8_j1850():
     assert bitwise_crc(b"123456789") == checksum(list(b"123456789")) == 0x4B
     rows = np.random.default_rng(0).integers(0, 256, (300, 7))
     assert checksum(rows).tolist() == [bitwise_crc(bytes(row.tolist())) for row in rows]
@@ -68,7 +64,7 @@ def test_checksum__is_crc8_j1850() -> None:
     assert checksum(every).tolist() == [bitwise_crc(bytes([byte])) for byte in range(256)]
 
 
-def test_checksum__finds_every_error_of_one_or_two_bits() -> None:
+def test_checksum__finds_every_error_of_one_or_two_bits():
     frame = np.array([80, 0, 175, 12, 0, 7, 1], np.uint8)
     bits = np.unpackbits(frame)
     for flipped in (np.arange(56)[:, None], np.argwhere(np.triu(np.ones((56, 56)), 1))):
@@ -77,7 +73,7 @@ def test_checksum__finds_every_error_of_one_or_two_bits() -> None:
         assert (checksum(np.packbits(wrong, axis=-1)) != checksum(frame)).all()
 
 
-def test_valve_frame__by_hand() -> None:
+def test_valve_frame__by_hand():
     body = [80, 0, 175, 50, 205, 9]
     frame = valve_frame([80, 0, -80, 50, -50], 9, True)
     assert frame.tolist() == [*body, bitwise_crc(bytes([*body, 1])), 1]
@@ -90,18 +86,18 @@ def test_valve_frame__by_hand() -> None:
     ("raw", "counts"),
     [(1, 1), (0, 0), (2**26 - 1, -1), (2**26 - 2, -2), (4095, -1), (5 | 1 << 29, 5)],
 )
-def test_encoder_counts__unwraps_about_zero_and_masks(raw: int, counts: int) -> None:
+def test_encoder_counts__unwraps_about_zero_and_masks(raw, counts):
     found = encoder_counts(BROKK_170, [raw, 0, 0, 1000, 0])
     assert found.dtype == int
     assert found.tolist() == [counts, 0, 0, 1000, 0]
 
 
-def test_encoder_counts__unwraps_half_a_turn_from_mid_range() -> None:
+def test_encoder_counts__unwraps_half_a_turn_from_mid_range():
     q4 = encoder_counts(BROKK_170, np.full((3, 5), [[100], [3188], [3189]]))[:, 3]
     assert q4.tolist() == [100, 3188, 3189 - 4096]  # the middle is 1141
 
 
-def test_encoder_counts__is_the_inverse_of_encoder_raw_however_mounted() -> None:
+def test_encoder_counts__is_the_inverse_of_encoder_raw_however_mounted():
     mountings = zip(BROKK_170.joints, (100, 4000, -7, 2**26 - 1, 0), (1, -1, -1, 1, 1), strict=True)
     joints = [replace(joint, encoder_zero=zero, encoder_sign=s) for joint, zero, s in mountings]
     machine = replace(BROKK_170, joints=tuple(joints))
@@ -115,7 +111,7 @@ def test_encoder_counts__is_the_inverse_of_encoder_raw_however_mounted() -> None
 
 
 @pytest.mark.parametrize("flags", range(16))
-def test_operator_input__survives_the_log_to_a_tenth_of_a_millimetre(flags: int) -> None:
+def test_operator_input__survives_the_log_to_a_tenth_of_a_millimetre(flags):
     given = OperatorInput((0.3, -0.12345, 3.2), *(bool(flags & 1 << i) for i in range(4)))
     data = given.pack()
     assert data == struct.pack("<hhhB", 3000, -1234, 32000, flags)
@@ -128,16 +124,14 @@ def test_operator_input__survives_the_log_to_a_tenth_of_a_millimetre(flags: int)
 
 
 @pytest.fixture
-def buses() -> Iterator[tuple[can.BusABC, can.BusABC]]:
+def buses():
     here, there = (can.Bus("canopen", interface="virtual") for _ in range(2))
     yield here, there
     here.shutdown()
     there.shutdown()
 
 
-def test_bus__marks_foreign_frames_and_echoes_and_logs_all_but_echoes(
-    buses: tuple[can.BusABC, can.BusABC],
-) -> None:
+def test_bus__marks_foreign_frames_and_echoes_and_logs_all_but_echoes(buses):
     text = io.StringIO()
     bus = Bus(buses[0], can.CanutilsLogWriter(text), "can0", echo=True, clock=lambda: 1.0)
     bus.send(0x123, b"\x01\x02")
@@ -149,7 +143,7 @@ def test_bus__marks_foreign_frames_and_echoes_and_logs_all_but_echoes(
         {"arbitration_id": 0x125, "is_error_frame": True},
         {"arbitration_id": 0x126, "is_fd": True, "data": bytes(12)},
     ):
-        buses[1].send(can.Message(**({"is_extended_id": False} | fields)))  # type: ignore[arg-type]
+        buses[1].send(can.Message(**({"is_extended_id": False} | fields)))
     frames = [bus.recv(0.5) for _ in range(6)]
     assert [frame and frame.id for frame in frames] == [-1, 0x123, -1, -1, -1, -1]
     assert frames[0] == Frame(bus.now(), -1, b"\x01\x02")
@@ -164,9 +158,7 @@ def test_bus__marks_foreign_frames_and_echoes_and_logs_all_but_echoes(
     assert re.fullmatch(r"\(\d+\.\d{6}\) operator 7FF#09 T", lines[-1])
 
 
-def test_bus__without_echo_takes_what_looks_like_ours_for_somebody_elses(
-    buses: tuple[can.BusABC, can.BusABC],
-) -> None:
+def test_bus__without_echo_takes_what_looks_like_ours_for_somebody_elses(buses):
     bus = Bus(buses[0])
     bus.send(0x123, b"\x01\x02")
     buses[1].send(can.Message(arbitration_id=0x123, data=b"\x01\x02", is_extended_id=False))
@@ -177,24 +169,24 @@ def test_bus__without_echo_takes_what_looks_like_ours_for_somebody_elses(
 class SelectBus:
     """A silent bus; a wait on it takes as long as the wait says, or a millisecond."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.t = 7.0
-        self.waits: list[float] = []
-        self.ready: list[int] = []
+        self.waits = []
+        self.ready = []
 
-    def fileno(self) -> int:
+    def fileno(self):
         return 7
 
-    def recv(self, timeout: float) -> None:
+    def recv(self, timeout):
         assert timeout == 0.0  # python-can's own timeout follows the time of day
 
-    def send(self, message: can.Message, timeout: float) -> None:
+    def send(self, message, timeout):
         assert 0 < timeout <= 0.02  # a full buffer must not hold up the tick
 
-    def shutdown(self) -> None:
+    def shutdown(self):
         self.t = -1.0
 
-    def select(self, read: list[int], *rest: Any) -> tuple[list[int], list[int], list[int]]:
+    def select(self, read, *rest):
         assert read == [7]
         self.waits.append(rest[-1])
         self.t += rest[-1] or 0.001
@@ -202,9 +194,7 @@ class SelectBus:
 
 
 @pytest.mark.parametrize(("busy", "slept"), [(0.0, [0.019]), (0.004, [0.016]), (0.020, [])])
-def test_recv__sleeps_only_after_its_busy_wait(
-    busy: float, slept: list[float], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_recv__sleeps_only_after_its_busy_wait(busy, slept, monkeypatch):
     silent = SelectBus()
     bus = Bus(silent, clock=lambda: silent.t)
     monkeypatch.setattr("select.select", silent.select)
@@ -218,7 +208,7 @@ def test_recv__sleeps_only_after_its_busy_wait(
 
 
 @pytest.mark.parametrize("logged", [True, False])
-def test_close__has_written_all(logged: bool, tmp_path: Path) -> None:
+def test_close__has_written_all(logged, tmp_path):
     writer = can.CanutilsLogWriter(tmp_path / "a.log") if logged else None
     raw = SelectBus()
     bus = Bus(raw, writer, "can0", clock=lambda: 1e6 + 0.12345678)
@@ -231,7 +221,7 @@ def test_close__has_written_all(logged: bool, tmp_path: Path) -> None:
         assert (tmp_path / "a.log").read_text() == "(1000000.123457) can0 123#01 T\n"
 
 
-def test_open_bus__refuses_a_bus_that_is_not_there_or_fails() -> None:
+def test_open_bus__refuses_a_bus_that_is_not_there_or_fails():
     refusal = r"socketcan nosuch0: expected a CAN bus, got"
     with pytest.raises(ValueError, match=refusal), open_bus("socketcan", "nosuch0"):
         pass
@@ -240,9 +230,7 @@ def test_open_bus__refuses_a_bus_that_is_not_there_or_fails() -> None:
         raise can.CanOperationError("full")
 
 
-def test_open_bus__gives_back_no_echo_over_udp(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_open_bus__gives_back_no_echo_over_udp(tmp_path, monkeypatch):
     own_multicast_port(monkeypatch)
     with (
         open_bus("udp_multicast", MULTICAST, tmp_path / "a.log") as a,
@@ -265,16 +253,16 @@ def test_open_bus__gives_back_no_echo_over_udp(
 
 
 @pytest.fixture
-def world() -> Iterator[World]:
+def world():
     world = World(ConstantCommand(0, 0, 0, 0, 0), HoldingOperator())
     yield world
     world.close()
 
 
-def test_set_up_nodes__sets_up_the_encoders_and_starts_the_nodes(world: World) -> None:
+def test_set_up_nodes__sets_up_the_encoders_and_starts_the_nodes(world):
     world.simulated.objects[3, 0x1017, 0] = 0
     world.simulated.objects[3, 0x1800, 2] = 254
-    out: Out = []
+    out = []
     world.downward = recording(out)
     world.drive.begin()
     assert [data.hex(" ") for can_id, data in out if can_id == 0x603] == [
@@ -289,7 +277,7 @@ def test_set_up_nodes__sets_up_the_encoders_and_starts_the_nodes(world: World) -
     assert set(world.simulated.nmt.values()) == {5}
 
 
-def test_set_up_nodes__refuses_what_does_not_fit(world: World) -> None:
+def test_set_up_nodes__refuses_what_does_not_fit(world):
     world.simulated.objects[4, 0x6501, 0] = 8192
     with pytest.raises(ValueError, match=r"q4: expected 4096 counts a turn .* node 4 .*got 8192"):
         world.drive.begin()
@@ -308,13 +296,13 @@ def test_set_up_nodes__refuses_what_does_not_fit(world: World) -> None:
         hw.Drive(machine, ConstantCommand(*np.zeros(6)), world.bus, HoldingOperator()).begin()
 
 
-def test_sdo__reads_small_objects_and_skips_foreign_answers(world: World) -> None:
+def test_sdo__reads_small_objects_and_skips_foreign_answers(world):
     answers = {
         0x1017: bytes([0x4B, 0x17, 0x10, 0, 0x34, 0x12, 0xFF, 0xFF]),
         0x1018: bytes([0x4F, 0x18, 0x10, 0, 7, 9, 9, 9]),
     }
 
-    def up(can_id: int, data: bytes) -> Out:
+    def up(can_id, data):
         index = struct.unpack_from("<H", data, 1)[0] if can_id == 0x581 else 0
         if index not in answers:
             return [(can_id, data)]
@@ -333,7 +321,7 @@ def test_sdo__reads_small_objects_and_skips_foreign_answers(world: World) -> Non
 
 
 @contextmanager
-def canopen_encoders(channel: str) -> Iterator[list[canopen.LocalNode]]:
+def canopen_encoders(channel):
     """Five encoders of the canopen library, and a heartbeat of the valve controller."""
     positions = encoder_raw(BROKK_170, np.rint(np.array(START) / STEP).astype(int)).tolist()
     network = canopen.Network()
@@ -345,7 +333,7 @@ def canopen_encoders(channel: str) -> Iterator[list[canopen.LocalNode]]:
         node.nmt.state = "PRE-OPERATIONAL"
         node.set_data(0x6004, 0, struct.pack("<I", position))
 
-    def on_sync(can_id: int, data: bytes, timestamp: float) -> None:
+    def on_sync(can_id, data, timestamp):
         for node in nodes:
             if node.nmt.state == "OPERATIONAL":
                 network.send_message(0x180 + node.id, node.get_data(0x6004, 0))
@@ -359,7 +347,7 @@ def canopen_encoders(channel: str) -> Iterator[list[canopen.LocalNode]]:
         network.disconnect()
 
 
-def test_drive__drives_five_encoders_of_the_canopen_library() -> None:
+def test_drive__drives_five_encoders_of_the_canopen_library():
     """SDO, heartbeat, NMT and TPDO are the library's; only the valve controller is ours."""
     with canopen_encoders("peers") as nodes, open_bus("virtual", "peers") as bus:
         operator = HoldingOperator()

@@ -34,7 +34,7 @@ from brokk_min.machine import BROKK_170, estimate_velocity
 STEP = BROKK_170.encoder_step
 
 
-def drive_logged(path: Path, seconds: float = 4.0) -> World:
+def drive_logged(path, seconds=4.0):
     """A drive with a fault in its midst, logged."""
     operator = HoldingOperator()
     world = World(BASELINE, operator, log=can.CanutilsLogWriter(path, channel="can0"))
@@ -54,18 +54,18 @@ def drive_logged(path: Path, seconds: float = 4.0) -> World:
     return world
 
 
-def sent(frames: list[Frame]) -> list[tuple[int, bytes]]:
+def sent(frames):
     return [(f.id, f.data) for f in frames if f.sent and f.channel != OPERATOR_CHANNEL]
 
 
 @pytest.mark.parametrize("text", ["nonsense\n", "(1.0) can0 12#zz\n", "(x) can0 123#00 R\n"])
-def test_read_frames__refuses_what_is_no_log(text: str, tmp_path: Path) -> None:
+def test_read_frames__refuses_what_is_no_log(text, tmp_path):
     (tmp_path / "bad.log").write_text(text)
     with pytest.raises(ValueError, match=r"bad\.log: expected a candump log, got"):
         list(read_frames(tmp_path / "bad.log"))
 
 
-def test_read_frames__reads_a_cut_log_up_to_its_last_whole_line(tmp_path: Path) -> None:
+def test_read_frames__reads_a_cut_log_up_to_its_last_whole_line(tmp_path):
     text = "(1.000000) can0 123#0102 R\n(2.000000) can0 080#AABB T\n"
     for size in range(len(text) + 1):
         (tmp_path / "cut.log").write_text(text[:size])
@@ -73,7 +73,7 @@ def test_read_frames__reads_a_cut_log_up_to_its_last_whole_line(tmp_path: Path) 
         assert times == [1.0, 2.0][: text[:size].count("\n")]
 
 
-def test_read_frames__reads_a_plain_candump_log_too(tmp_path: Path) -> None:
+def test_read_frames__reads_a_plain_candump_log_too(tmp_path):
     lines = ["(1.0) can0 123#0102\n", "(2.0) can0 12345678#\n", "(3.0) can0 080# T\n"]
     (tmp_path / "can.log").write_text("".join(lines))
     assert list(read_frames(tmp_path / "can.log")) == [
@@ -83,13 +83,13 @@ def test_read_frames__reads_a_plain_candump_log_too(tmp_path: Path) -> None:
     ]
 
 
-def test_read_frames__names_the_missing_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_read_frames__names_the_missing_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "can", None)
     with pytest.raises(ValueError, match=r"^can: expected the extra brokk_min\[hw\], got"):
         list(read_frames(Path("a.log")))
 
 
-def test_replay__of_a_recorded_log_sends_the_same_bytes(tmp_path: Path) -> None:
+def test_replay__of_a_recorded_log_sends_the_same_bytes(tmp_path):
     drive_logged(tmp_path / "run.log")
     frames = list(read_frames(tmp_path / "run.log"))
     again = replay(BROKK_170, BASELINE, frames)
@@ -108,7 +108,7 @@ def test_replay__of_a_recorded_log_sends_the_same_bytes(tmp_path: Path) -> None:
         replay(BROKK_170, BASELINE, [frame for frame in frames if frame.id != 0x210])
 
 
-def test_replayed_bus__by_hand() -> None:
+def test_replayed_bus__by_hand():
     operator_input = OperatorInput((0.1, 0.0, 0.0), enable=True)
     sync = Frame(1.0, 0x080, b"", True)
     read = Frame(1.1, 0x181, b"\x07")
@@ -128,15 +128,15 @@ def test_replayed_bus__by_hand() -> None:
 
 
 @pytest.mark.parametrize("changed", [{"id": 0x210}, {"sent": False}])
-def test_replayed_bus__ends_where_another_frame_or_none_was_sent(changed: dict[str, int]) -> None:
-    found = Frame(1.0, 0x080, b"", True)._replace(**changed)  # type: ignore[arg-type]
+def test_replayed_bus__ends_where_another_frame_or_none_was_sent(changed):
+    found = Frame(1.0, 0x080, b"", True)._replace(**changed)
     bus = ReplayedBus([found, Frame(1.1, 0x181, b"\x07")])
     bus.send(0x080, b"")
     assert bus.mismatch == f"080 sent at 1.000000, got {found.id:03X}"
     assert not bus.more
 
 
-def test_log_for_fit__holds_what_the_machine_did(tmp_path: Path) -> None:
+def test_log_for_fit__holds_what_the_machine_did(tmp_path):
     world = drive_logged(tmp_path / "run.log")
     log = log_for_fit(BROKK_170, read_frames(tmp_path / "run.log"))
     assert log.joints == BROKK_170.names
@@ -160,10 +160,10 @@ def test_log_for_fit__holds_what_the_machine_did(tmp_path: Path) -> None:
         np.testing.assert_allclose(m[inside], recording.u * 127, atol=1e-6)  # the next command
 
 
-def test_log_for_fit__by_hand() -> None:
+def test_log_for_fit__by_hand():
     """Ticks are missing; a foreign frame and a cut one change nothing; 14 ticks are too few."""
     machine = replace(BROKK_170, rate=10.0)
-    frames: list[Frame] = []
+    frames = []
     parts = [range(15), range(16, 36), range(37, 51)]
     for k in (k for part in parts for k in part):
         t = 100 + k / 10
@@ -185,7 +185,7 @@ def test_log_for_fit__by_hand() -> None:
         log_for_fit(machine, frames[:100])
 
 
-def test_telemetry_reader__gives_at_each_sync_the_tick_before() -> None:
+def test_telemetry_reader__gives_at_each_sync_the_tick_before():
     reader = TelemetryReader(BROKK_170)
     goal = OperatorInput((0.1, 0.0, -0.2), enable=True).pack()
     q = np.array([0.0, 0.5, 0.6, 1.7, 1.2])

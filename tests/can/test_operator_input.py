@@ -16,7 +16,7 @@ from brokk_min.machine import BROKK_170
 TWO_GOALS = np.array([[0.1, 0, 0], [0, 0.2, 0]])
 
 
-def test_script__waits_presses_plays_and_ends() -> None:
+def test_script__waits_presses_plays_and_ends():
     script = Script(BROKK_170, TWO_GOALS)
     assert script(False, False) == OperatorInput()
     assert script(False, True) == OperatorInput(enable=True)
@@ -29,26 +29,26 @@ def test_script__waits_presses_plays_and_ends() -> None:
     assert script(True, True).stop
 
 
-def test_script__stops_after_a_fault() -> None:
+def test_script__stops_after_a_fault():
     script = Script(BROKK_170, TWO_GOALS)
     assert script(False, True).enable and script(True, True).enable
     assert script(False, True) == OperatorInput(stop=True)
     assert not script.done
 
 
-def test_script__stops_if_the_machine_never_gets_ready() -> None:
+def test_script__stops_if_the_machine_never_gets_ready():
     script = Script(BROKK_170, np.zeros((1, 3)), patience_s=0.2)
     assert [script(False, False).stop for _ in range(5)] == [False] * 4 + [True]
 
 
 @pytest.mark.parametrize("goal", [(0.3, 0.4, 0.0), (np.nan, 0.0, 0.0)])
-def test_script__refuses_goals_that_are_too_fast(goal: tuple[float, ...]) -> None:
+def test_script__refuses_goals_that_are_too_fast(goal):
     Script(BROKK_170, np.array([[0.0, 0.0, 0.3]]))
     with pytest.raises(ValueError, match=r"command: expected at most 0.3 m/s, got (0.5|nan) m/s"):
         Script(BROKK_170, np.array([goal]))
 
 
-def test_joystick__gives_switch_and_velocity_of_a_virtual_device() -> None:
+def test_joystick__gives_switch_and_velocity_of_a_virtual_device():
     device = Virtual()
     stick = Joystick(BROKK_170)
     assert stick(False, False) == OperatorInput()
@@ -72,7 +72,7 @@ def test_joystick__gives_switch_and_velocity_of_a_virtual_device() -> None:
     device.unplug()
 
 
-def test_joystick__notices_that_its_device_goes_and_another_comes() -> None:
+def test_joystick__notices_that_its_device_goes_and_another_comes():
     device = Virtual()
     stick = Joystick(BROKK_170)
     device.button(5, True)
@@ -91,7 +91,7 @@ def test_joystick__notices_that_its_device_goes_and_another_comes() -> None:
     assert stick(True, True) == OperatorInput(alive=False)
 
 
-def test_joystick__refuses_a_device_without_its_axes_or_button() -> None:
+def test_joystick__refuses_a_device_without_its_axes_or_button():
     with pytest.raises(ValueError, match="joystick: expected one, got none"):
         Joystick(BROKK_170)
     device = Virtual()
@@ -103,7 +103,7 @@ def test_joystick__refuses_a_device_without_its_axes_or_button() -> None:
     device.unplug()
 
 
-def test_joystick__needs_pygame_but_no_window(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_joystick__needs_pygame_but_no_window(monkeypatch):
     names = ("SDL_VIDEODRIVER", "SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS")
     for name in names:
         monkeypatch.delenv(name, raising=False)
@@ -116,7 +116,7 @@ def test_joystick__needs_pygame_but_no_window(monkeypatch: pytest.MonkeyPatch) -
         Joystick(BROKK_170)
 
 
-def test_joint_jog__moves_one_joint_with_the_sign_of_x() -> None:
+def test_joint_jog__moves_one_joint_with_the_sign_of_x():
     operator = HoldingOperator()
     world = World(JointJog(BROKK_170, "q4", 14), operator)
     world.drive.begin()
@@ -130,7 +130,7 @@ def test_joint_jog__moves_one_joint_with_the_sign_of_x() -> None:
     world.close()
 
 
-def test_shape_axis__is_odd_rising_and_flat_near_the_middle() -> None:
+def test_shape_axis__is_odd_rising_and_flat_near_the_middle():
     axis = np.linspace(-1, 1, 201)
     shaped = shape_axis(axis)
     np.testing.assert_allclose(shaped, -shaped[::-1], atol=1e-12)

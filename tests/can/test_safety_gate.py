@@ -4,21 +4,20 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
 
 from brokk_min.can.canopen import checksum
 from brokk_min.can.safety_gate import Fault, GateInputs, GateState, fault_name, gate, gate_start
-from brokk_min.machine import BROKK_170, Machine, decode_pwm
+from brokk_min.machine import BROKK_170, decode_pwm
 
 STEP = BROKK_170.encoder_step
 DT = 0.05
 DRIVEN = np.array([joint.driven for joint in BROKK_170.joints])
 
 
-def test_fault_name__gives_node_and_text() -> None:
+def test_fault_name__gives_node_and_text():
     names = [fault_name(BROKK_170, code) for code in range(len(Fault) * 6 + 1)]
     assert names[0] == ""
     assert names[1] == "error"
@@ -31,7 +30,7 @@ def test_fault_name__gives_node_and_text() -> None:
 
 
 @pytest.mark.parametrize("shape", [(), (3,), (2, 2)])
-def test_gate_start__is_silent_and_holds_the_switch_for_pressed(shape: tuple[int, ...]) -> None:
+def test_gate_start__is_silent_and_holds_the_switch_for_pressed(shape):
     state = gate_start(BROKK_170, shape)
     assert state.counts.shape == (*shape, 5, 2)
     assert state.sent.shape == (*shape, 5, 8)
@@ -46,10 +45,10 @@ def test_gate_start__is_silent_and_holds_the_switch_for_pressed(shape: tuple[int
 # --- a plain rewriting ---------------------------------------------------------------------------
 
 
-def tight_machine() -> Machine:
+def tight_machine():
     """The Brokk with ranges and speeds such that whole counts hit the gate's borders exactly."""
 
-    def edge(near: float, margin: float) -> float:
+    def edge(near, margin):
         """A limit near `near` to which adding `margin` gives a whole number of counts."""
         whole = (np.arange(3000) - 1500) * STEP
         limits = whole - margin
@@ -75,7 +74,7 @@ def tight_machine() -> Machine:
     return replace(BROKK_170, joints=joints, dead_zone=whole)
 
 
-def plain_motion(machine: Machine, s: GateState, count: int, j: int) -> tuple[float, float]:
+def plain_motion(machine, s, count, j):
     """Measured and expected motion of joint `j`."""
     joint = machine.joints[j]
     sent = s.sent[j].tolist()
@@ -94,7 +93,7 @@ def plain_motion(machine: Machine, s: GateState, count: int, j: int) -> tuple[fl
     return measured, float(s.expected_motion[j]) + max(at_least, continued)
 
 
-def plain_fault(machine: Machine, s: GateState, i: GateInputs, now: float) -> int:
+def plain_fault(machine, s, i, now):
     """The first fault of one gate, with the promised numbers written out."""
     faults = {
         (0, 0): i.error,
@@ -119,9 +118,7 @@ def plain_fault(machine: Machine, s: GateState, i: GateInputs, now: float) -> in
     return min((1 + kind * 6 + node for (kind, node), found in faults.items() if found), default=0)
 
 
-def plain_gate(
-    machine: Machine, s: GateState, i: GateInputs, now: float
-) -> tuple[GateState, list[int]]:
+def plain_gate(machine, s, i, now):
     """One gate, written as its promises read; the frame without its checksum."""
     fault = plain_fault(machine, s, i, now)
     fresh_edge = bool(i.enable and not s.enable and i.centred)
@@ -152,7 +149,7 @@ def plain_gate(
     return state, [*(x if x >= 0 else 255 + x for x in m), counter, int(driving)]
 
 
-def row(value: tuple[np.ndarray, ...], k: int) -> list[np.ndarray]:
+def row(value, k):
     return [np.asarray(field)[k] for field in value]
 
 
@@ -162,7 +159,7 @@ def row(value: tuple[np.ndarray, ...], k: int) -> list[np.ndarray]:
 class Cases:
     """Random states and inputs, mostly sound, each with about one value on or next to a border."""
 
-    def __init__(self, machine: Machine, num: int, seed: int) -> None:
+    def __init__(self, machine, num, seed):
         self.machine, self.num, self.rng = machine, num, np.random.default_rng(seed)
         self.inputs = self.draw_inputs()
         self.now = np.zeros(num)
@@ -172,14 +169,14 @@ class Cases:
             for k in range(num)
         ]
 
-    def some(self, p: float, *shape: int) -> np.ndarray:
+    def some(self, p, *shape):
         return self.rng.random((self.num, *shape)) < p
 
-    def put(self, array: np.ndarray, p: float, *values: float) -> np.ndarray:
+    def put(self, array, p, *values):
         chosen = self.rng.choice(values, array.shape)
         return np.where(self.some(p, *array.shape[1:]), chosen, array)
 
-    def draw_inputs(self) -> GateInputs:
+    def draw_inputs(self):
         rng, num, n = self.rng, self.num, self.machine.n
         low, high = self.machine.column("q_min"), self.machine.column("q_max")
         borders = [np.rint(x / STEP) for x in (low - 0.05, low + 0.02, high - 0.02, high + 0.05)]
@@ -203,7 +200,7 @@ class Cases:
             error=self.some(0.03),
         )
 
-    def draw_state(self) -> GateState:
+    def draw_state(self):
         rng, num, n = self.rng, self.num, self.machine.n
         # two angles: running, standing, or before a jump
         fastest = np.floor(2 * self.machine.q_dot_max * DT / STEP + 4).astype(int)
@@ -245,21 +242,21 @@ class Cases:
 
 
 @cache
-def cases_of(machine: Machine, seed: int) -> Cases:
+def cases_of(machine, seed):
     return Cases(machine, 3000, seed)
 
 
 @pytest.mark.parametrize(
     ("machine", "seed"), [(BROKK_170, 0), (tight_machine(), 1), (tight_machine(), 2)]
 )
-def test_gate__is_what_its_promises_say_in_any_leading_shape(machine: Machine, seed: int) -> None:
+def test_gate__is_what_its_promises_say_in_any_leading_shape(machine, seed):
     cases = cases_of(machine, seed)
     for shape in ((3000,), (4, 750), (3, 10, 100)):
         given = [
             type(part)(*(np.reshape(field, (*shape, *np.shape(field)[1:])) for field in part))
             for part in (cases.state, cases.inputs)
         ]
-        state, frame = gate(machine, *given, cases.now.reshape(shape))  # type: ignore[arg-type]
+        state, frame = gate(machine, *given, cases.now.reshape(shape))
         assert frame.dtype == np.uint8 and frame.shape == (*shape, 8)
         frame = frame.reshape(3000, 8)
         np.testing.assert_array_equal(np.delete(frame, 6, axis=1), [f for _, f in cases.expected])
@@ -273,7 +270,7 @@ def test_gate__is_what_its_promises_say_in_any_leading_shape(machine: Machine, s
     assert sum(bool(s.driving and any(f[:5])) for s, f in cases.expected) > 300
 
 
-def test_gate__of_one_machine_alone_is_the_same() -> None:
+def test_gate__of_one_machine_alone_is_the_same():
     cases = Cases(BROKK_170, 50, 5)
     for k, (expected, frame) in enumerate(cases.expected):
         state = GateState(*row(cases.state, k))
@@ -284,9 +281,9 @@ def test_gate__of_one_machine_alone_is_the_same() -> None:
         assert found.sent.dtype == found.counts.dtype == int
 
 
-def test_gate__never_raises_and_closes_the_valves_on_nonsense() -> None:
+def test_gate__never_raises_and_closes_the_valves_on_nonsense():
     rng = np.random.default_rng(4)
-    values: dict[type, list[Any]] = {
+    values = {
         float: [np.nan, np.inf, -np.inf, 1e300, -1e300, 0.0, -1.0, 5e-324],
         int: [0, -1, 2**62, -(2**62), 2**31, 255, 128],
         bool: [True, False],
@@ -294,7 +291,7 @@ def test_gate__never_raises_and_closes_the_valves_on_nonsense() -> None:
     cases = Cases(BROKK_170, 2000, 6)
     inputs = cases.inputs
 
-    def spoil(field: np.ndarray) -> np.ndarray:
+    def spoil(field):
         chosen = rng.choice(np.array(values[field.dtype.type(0).item().__class__]), field.shape)
         return np.where(rng.random(field.shape) < 0.05, chosen.astype(field.dtype), field)
 
@@ -316,11 +313,11 @@ def test_gate__never_raises_and_closes_the_valves_on_nonsense() -> None:
 # --- promises over sequences ---------------------------------------------------------------------
 
 
-def draw_tick(rng: np.random.Generator, now: np.ndarray, counts: np.ndarray) -> GateInputs:
+def draw_tick(rng, now, counts):
     """Inputs of many gates, each of them sound most of the time."""
     num, n = counts.shape
 
-    def rare(p: float, *shape: int) -> np.ndarray:
+    def rare(p, *shape):
         return rng.random((num, *shape)) < p
 
     m = np.where(DRIVEN, rng.integers(-80, 81, (num, n)), 0).astype(float)
@@ -339,7 +336,7 @@ def draw_tick(rng: np.random.Generator, now: np.ndarray, counts: np.ndarray) -> 
     )
 
 
-def is_sound(i: GateInputs, q: np.ndarray, now: np.ndarray, last: np.ndarray) -> np.ndarray:
+def is_sound(i, q, now, last):
     low, high = BROKK_170.column("q_min"), BROKK_170.column("q_max")
     sound = i.alive & ~i.stop & ~i.error & (np.abs(now - last - DT) < 0.0251)
     sound &= (i.frames == 1).all(1) & (i.nmt == 5).all(1)
@@ -348,7 +345,7 @@ def is_sound(i: GateInputs, q: np.ndarray, now: np.ndarray, last: np.ndarray) ->
     return np.asarray(sound & (q > low - 0.051).all(1) & (q < high + 0.051).all(1))
 
 
-def check_sequences(num: int, ticks: int, seed: int) -> dict[str, int]:
+def check_sequences(num, ticks, seed):
     """Run gates on random inputs and check every promise at every tick; how often what came up."""
     rng, n = np.random.default_rng(seed), BROKK_170.n
     low, high = BROKK_170.column("q_min"), BROKK_170.column("q_max")
@@ -399,12 +396,12 @@ def check_sequences(num: int, ticks: int, seed: int) -> dict[str, int]:
     return seen
 
 
-def test_gate__keeps_every_promise_in_twenty_thousand_sequences() -> None:
+def test_gate__keeps_every_promise_in_twenty_thousand_sequences():
     seen = check_sequences(20_000, 25, 0)
     assert min(seen.values()) > 500, seen  # the promises were put to the test
 
 
 @pytest.mark.slow
-def test_gate__keeps_every_promise_in_a_million_sequences() -> None:
+def test_gate__keeps_every_promise_in_a_million_sequences():
     for seed in range(1, 51):
         check_sequences(20_000, 25, seed)

@@ -7,15 +7,12 @@ import signal
 import struct
 import threading
 import time
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import canopen
 import numpy as np
 import pytest
-from helpers_bus import START, Out, dictionary, eventually, recorded_rows, served
+from helpers_bus import START, dictionary, eventually, recorded_rows, served
 
 from brokk_min.actuator import plant_reset, plant_step
 from brokk_min.can.canopen import HEARTBEAT_PERIOD, Frame, encoder_raw, valve_frame
@@ -31,21 +28,21 @@ RAW = encoder_raw(BROKK_170, np.rint(np.array(START) / BROKK_170.encoder_step).a
 class Machine(SimulatedMachine):
     """It begins at 100 s and keeps what it records."""
 
-    def __init__(self) -> None:
-        self.rows: list[tuple[Any, ...]] = []
+    def __init__(self):
+        self.rows = []
         super().__init__(BROKK_170, START, 100.0, lambda *row: self.rows.append(row))
 
-    def nmt_(self, command: int, node: int = 0) -> Out:
+    def nmt_(self, command, node=0):
         return self.receive(Frame(100.0, 0x000, bytes([command, node])))
 
-    def valves(self, counter: int, *counts: int, enable: int = 1, now: float = 100.0) -> list[int]:
+    def valves(self, counter, *counts, enable=1, now=100.0):
         """Send a valve frame; the commands in force [counts]."""
         data = valve_frame([*counts, *[0] * (5 - len(counts))], counter, enable).tobytes()
         assert self.receive(Frame(now, BROKK_170.valve_frame_id, data)) == []
         return np.rint(127 * self.u).astype(int).tolist()
 
 
-def driving() -> Machine:
+def driving():
     machine = Machine()
     machine.nmt_(1)
     machine.valves(7)
@@ -53,7 +50,7 @@ def driving() -> Machine:
     return machine
 
 
-def test_advance__moves_and_beats_by_its_own_clock() -> None:
+def test_advance__moves_and_beats_by_its_own_clock():
     machine = Machine()
     assert machine.boot() == [(0x700 + node, b"\x00") for node in NODES]
     waits = [machine.wait(100.0 + s) for s in (0.0, 0.004, 0.5)]
@@ -69,7 +66,7 @@ def test_advance__moves_and_beats_by_its_own_clock() -> None:
     assert not np.any(commands) and set(valid) == {100.0} and np.allclose(angles, START)
 
 
-def test_receive__opens_valves_after_a_start_and_a_neutral_frame() -> None:
+def test_receive__opens_valves_after_a_start_and_a_neutral_frame():
     machine = Machine()
     neutral = [0, 0, 0, 0, 0]
     assert machine.valves(3) == machine.valves(4, 50) == neutral  # not started yet
@@ -83,7 +80,7 @@ def test_receive__opens_valves_after_a_start_and_a_neutral_frame() -> None:
     assert machine.u.any() and machine.valves(6, 30)[0] == 30
 
 
-def watchdog(machine: Machine) -> None:
+def watchdog(machine):
     machine.valves(9, 80, now=100.01)
     machine.advance(100.01 + WATCHDOG - 0.001)
     assert machine.u.any()
@@ -104,9 +101,7 @@ FRAME = valve_frame([80, 0, 0, 0, 0], 9, 1).tobytes()
     ],
     ids=["counter", "checksum", "short", "stopped", "watchdog"],
 )
-def test_receive__closes_valves_until_a_start_and_a_neutral_frame(
-    act: Callable[[Machine], object], state: int
-) -> None:
+def test_receive__closes_valves_until_a_start_and_a_neutral_frame(act, state):
     machine = driving()
     act(machine)
     assert not machine.u.any() and not machine.enabled
@@ -120,9 +115,7 @@ def test_receive__closes_valves_until_a_start_and_a_neutral_frame(
 @pytest.mark.parametrize(
     ("command", "state", "boots"), [(2, 4, 0), (128, 127, 0), (129, 127, 1), (130, 127, 1)]
 )
-def test_receive__changes_states_of_nodes_alone_or_together(
-    command: int, state: int, boots: int
-) -> None:
+def test_receive__changes_states_of_nodes_alone_or_together(command, state, boots):
     machine = Machine()
     assert machine.nmt_(1) == [] and set(machine.nmt.values()) == {5}
     assert machine.nmt_(command, 3) == boots * [(0x703, b"\x00")]
@@ -132,7 +125,7 @@ def test_receive__changes_states_of_nodes_alone_or_together(
     assert machine.nmt_(command) == [(0x700 + node, b"\x00") for node in boots * NODES]
 
 
-def test_receive__answers_a_sync_with_the_counts_of_running_encoders() -> None:
+def test_receive__answers_a_sync_with_the_counts_of_running_encoders():
     machine = Machine()
     assert machine.receive(Frame(100.0, 0x080, b"")) == []
     machine.nmt_(1, 1)
@@ -157,9 +150,7 @@ def test_receive__answers_a_sync_with_the_counts_of_running_encoders() -> None:
         (0x60, (0x1017, 0), 0, (0x80, 0x06010000)),
     ],
 )
-def test_receive__reads_and_writes_objects(
-    command: int, address: tuple[int, int], value: int, answer: tuple[int, int]
-) -> None:
+def test_receive__reads_and_writes_objects(command, address, value, answer):
     machine = Machine()
     before = dict(machine.objects)
     request = struct.pack("<BHBI", command, *address, value)
@@ -171,7 +162,7 @@ def test_receive__reads_and_writes_objects(
     assert machine.receive(Frame(0.0, 0x600 + CONTROLLER, bytes(8))) == []
 
 
-def test_advance__moves_the_plant_under_the_command_in_force() -> None:
+def test_advance__moves_the_plant_under_the_command_in_force():
     machine = driving()
     machine.advance(100.1001)
     state = plant_reset(BROKK_170, np.array(START))
@@ -181,7 +172,7 @@ def test_advance__moves_the_plant_under_the_command_in_force() -> None:
     assert len(machine.rows) == 20 and machine.rows[-1][1][0] == pytest.approx(80 / 127)
 
 
-def test_start_pose__is_the_given_one_the_machines_or_the_middle() -> None:
+def test_start_pose__is_the_given_one_the_machines_or_the_middle():
     low, high = BROKK_170.column("q_min"), BROKK_170.column("q_max")
     np.testing.assert_array_equal(start_pose(BROKK_170, ()), START)
     for pose in ([0.1, 0.5, 0.5, 1.5, 1.0], low.tolist(), high.tolist()):
@@ -191,7 +182,7 @@ def test_start_pose__is_the_given_one_the_machines_or_the_middle() -> None:
 
 
 @pytest.mark.parametrize("pose", [[9.0, 0.5, 0.5, 1.5, 1.0], [0.0, 0.5]])
-def test_start_pose__refuses_what_the_machine_cannot_take(pose: list[float]) -> None:
+def test_start_pose__refuses_what_the_machine_cannot_take(pose):
     with pytest.raises(ValueError, match=r"start: expected 5 angles within .*, got") as e:
         start_pose(BROKK_170, pose)
     assert str(pose) in str(e.value)
@@ -200,8 +191,8 @@ def test_start_pose__refuses_what_the_machine_cannot_take(pose: list[float]) -> 
 # --- as others see it ----------------------------------------------------------------------------
 
 
-def test_simulate__serves_until_a_signal_and_records_every_step(tmp_path: Path) -> None:
-    def end() -> None:
+def test_simulate__serves_until_a_signal_and_records_every_step(tmp_path):
+    def end():
         eventually(lambda: len(recorded_rows(tmp_path / "plant.csv")) > 60, 60)
         os.kill(os.getpid(), signal.SIGTERM)
 
@@ -216,12 +207,12 @@ def test_simulate__serves_until_a_signal_and_records_every_step(tmp_path: Path) 
     np.testing.assert_allclose(times, 0.005 * np.arange(1, len(times) + 1), atol=0.0006)
 
 
-def test_serve__is_five_encoders_to_a_master_of_the_canopen_library() -> None:
+def test_serve__is_five_encoders_to_a_master_of_the_canopen_library():
     with served("master") as machine:
         network = canopen.Network()
         network.connect(interface="virtual", channel="master")
         nodes = [canopen.RemoteNode(n, dictionary()) for n in (1, 2, 3, 4, 5)]
-        positions: dict[int, int] = {}
+        positions = {}
         for node in nodes:
             network.add_node(node)
             network.subscribe(

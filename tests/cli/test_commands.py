@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -28,7 +27,7 @@ SHIPPED_GAINS = SHIPPED / "brokk170" / "gains.json"
 # --- fit ------------------------------------------------------------------------------------------
 
 
-def foreign_log(path: Path, seed: int, runs: int) -> None:
+def foreign_log(path, seed, runs):
     """Another machine at 100 Hz with jitter: first-order joints, other names, angles only."""
     rng = np.random.default_rng(seed)
     lines = ["run,time,u_boom,u_arm,q_boom,q_arm"]
@@ -47,13 +46,13 @@ def foreign_log(path: Path, seed: int, runs: int) -> None:
     path.write_text("\n".join(lines) + "\n")
 
 
-def steady_log(joints: tuple[str, ...], recordings: int) -> Log:
+def steady_log(joints, recordings):
     """Angles that go up by 0.01 rad a tick."""
     q = np.cumsum(np.full((40, len(joints)), 0.01), axis=0)
     return Log(joints, tuple(Recording(str(i), 0 * q, q, 0 * q) for i in range(recordings)))
 
 
-def test_fit__takes_a_foreign_log_and_beats_persistence(tmp_path: Path) -> None:
+def test_fit__takes_a_foreign_log_and_beats_persistence(tmp_path):
     foreign_log(tmp_path / "log.csv", 0, 24)
     foreign_log(tmp_path / "test.csv", 1, 2)
     files = ["--test", tmp_path / "test.csv", "--json", tmp_path / "f.json"]
@@ -75,7 +74,7 @@ def test_fit__takes_a_foreign_log_and_beats_persistence(tmp_path: Path) -> None:
         assert joint["free_run"]["10"]["velocity_rmse"] < 0.05
 
 
-def test_fit__has_the_papers_recipe_as_one_option(tmp_path: Path) -> None:
+def test_fit__has_the_papers_recipe_as_one_option(tmp_path):
     foreign_log(tmp_path / "log.csv", 0, 2)
     files = [tmp_path / "log.csv", "--out", tmp_path / "n.npz", "--json", tmp_path / "f.json"]
     assert run("fit --steps 3 --paper", *files) == 0
@@ -87,7 +86,7 @@ def test_fit__has_the_papers_recipe_as_one_option(tmp_path: Path) -> None:
     assert all(set(joint) == set(keys.split()) for joint in scores["joints"].values())
 
 
-def test_fit__scores_a_joint_that_rests_or_moves_shortly(tmp_path: Path) -> None:
+def test_fit__scores_a_joint_that_rests_or_moves_shortly(tmp_path):
     foreign_log(tmp_path / "log.csv", 0, 2)
     rest = [f"still,{k / 20},0,0,0.1,0.2" for k in range(200)]
     short = [f"short,{k / 20},0.5,0,{k / 100},0.2" for k in range(8)]
@@ -105,9 +104,7 @@ def test_fit__scores_a_joint_that_rests_or_moves_shortly(tmp_path: Path) -> None
     assert (tmp_path / "f.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_fit__writes_nothing_for_a_bad_log(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_fit__writes_nothing_for_a_bad_log(tmp_path, capsys):
     path = tmp_path / "log.csv"
     foreign_log(path, 0, 1)
     lines = path.read_text().splitlines()
@@ -131,13 +128,8 @@ def test_fit__writes_nothing_for_a_bad_log(
     ],
 )
 def test_fit__uses_the_dead_zone_of_a_known_machine_or_the_one_given(
-    joints: tuple[str, ...],
-    options: str,
-    machine: str,
-    dead_zone: float,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    joints, options, machine, dead_zone, tmp_path, capsys
+):
     write_log(tmp_path / "log.csv", steady_log(joints, 3))
     out = tmp_path / "n.npz"
     assert run(f"fit {options} --steps 1 --batch-size 8", tmp_path / "log.csv", "--out", out) == 0
@@ -147,7 +139,7 @@ def test_fit__uses_the_dead_zone_of_a_known_machine_or_the_one_given(
     assert capsys.readouterr().out.startswith(expected)
 
 
-def test_fit__takes_rate_and_velocity_window_of_the_machine(tmp_path: Path) -> None:
+def test_fit__takes_rate_and_velocity_window_of_the_machine(tmp_path):
     write_log(tmp_path / "log.csv", steady_log(BROKK_170.names, 4))
     (tmp_path / "slow.py").write_text(
         "from dataclasses import replace\nfrom brokk_min.machine import BROKK_170\n"
@@ -161,15 +153,13 @@ def test_fit__takes_rate_and_velocity_window_of_the_machine(tmp_path: Path) -> N
     assert load_net(tmp_path / "n.npz").velocity_samples == 5
 
 
-def test_fit__refuses_the_log_of_another_machine(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_fit__refuses_the_log_of_another_machine(tmp_path, capsys):
     write_log(tmp_path / "log.csv", steady_log(("a", "b"), 2))
     assert run(f"fit '{tmp_path}/log.csv' --machine brokk170 --out '{tmp_path}/n.npz'") == 1
     assert "LOGS: expected joints of --machine brokk170, got ['a', 'b']" in capsys.readouterr().err
 
 
-def test_split__holds_out_every_tenth_recording() -> None:
+def test_split__holds_out_every_tenth_recording():
     kept, held_out = split(steady_log(("a",), 21))
     assert [recording.name for recording in held_out.recordings] == ["0", "10", "20"]
     assert len(kept.recordings) == 18
@@ -177,11 +167,9 @@ def test_split__holds_out_every_tenth_recording() -> None:
         split(steady_log(("a",), 1))
 
 
-def test_print_scores__has_a_row_per_net_and_per_linear_model(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_print_scores__has_a_row_per_net_and_per_linear_model(capsys):
     free_run = {"1": {"velocity_rmse": 0.1}, "5": {"velocity_rmse": 0.2}}
-    joint: dict[str, Any] = {"one_step_rmse": 0.01, "persistence_rmse": 0.02, "free_run": free_run}
+    joint = {"one_step_rmse": 0.01, "persistence_rmse": 0.02, "free_run": free_run}
     joint |= {"linear": {"one_step_rmse": 0.03, "free_run": {}}, "creep": 1e-3}
     print_scores({"joints": {"q1": joint}, "warnings": ["q1: creeps"]})
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
@@ -198,7 +186,7 @@ SMALL = "--total-steps 512 --num-envs 16 --horizon 16 --minibatch-size 128"
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """A log, nets and a policy of the Brokk, made by the commands."""
     folder = tmp_path_factory.mktemp("chain")
     net = folder / "net.npz"
@@ -211,7 +199,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def write_gains(folder: Path) -> list[str]:
+def write_gains(folder):
     """Gains for the nets of the policy in `folder`; the names of the controllers."""
     row = {key: [0.5] * 4 for key in ("kp", "ki", "kd")} | {"feedback": [0.1], "ready": [0.01]}
     names = ["jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff", "jacobian_pid_ff_awake"]
@@ -222,7 +210,7 @@ def write_gains(folder: Path) -> list[str]:
     return names
 
 
-def test_train__writes_policy_and_curve(folder: Path) -> None:
+def test_train__writes_policy_and_curve(folder):
     assert read_log([folder / "log.csv"], 4).joints == ("q1", "q2", "q3", "q4", "q5")
     assert (folder / "policy.npz.csv").read_text().startswith("global_step,charts/")
     training = load_policy(folder / "policy.npz", BROKK_170).training
@@ -232,7 +220,7 @@ def test_train__writes_policy_and_curve(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("option", ["--critic", "--paper"])
-def test_train__can_use_a_critic(option: str, folder: Path, tmp_path: Path) -> None:
+def test_train__can_use_a_critic(option, folder, tmp_path):
     out = tmp_path / "p.npz"
     assert run(f"train --actuator '{folder}/net.npz' {option} {SMALL} --seed 5 --out", out) == 0
     training = load_policy(out, BROKK_170).training
@@ -241,7 +229,7 @@ def test_train__can_use_a_critic(option: str, folder: Path, tmp_path: Path) -> N
     assert training["seed"] == 5
 
 
-def test_evaluate__writes_what_it_used(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_evaluate__writes_what_it_used(folder, capsys):
     names = write_gains(folder)
     files = {"policy": "policy.npz", "commands": "c.csv", "starts": "s.csv"}
     line = " ".join(f"--{option} '{folder}/{file}'" for option, file in files.items())
@@ -269,9 +257,7 @@ def test_evaluate__writes_what_it_used(folder: Path, capsys: pytest.CaptureFixtu
     assert "policy" in capsys.readouterr().err
 
 
-def test_evaluate__tunes_baselines_without_gains(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_evaluate__tunes_baselines_without_gains(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(baselines, "TUNING_RUNS", 1)
     monkeypatch.setattr(baselines, "GENERATIONS", 1)
     (tmp_path / "p.npz").write_bytes(SHIPPED_POLICY.read_bytes())
@@ -283,7 +269,7 @@ def test_evaluate__tunes_baselines_without_gains(
     assert (meta["gains"], meta["commands"], meta["starts"]) == ("tuned now", names, "1")
 
 
-def test_shipped_policy__beats_the_papers_controllers(tmp_path: Path) -> None:
+def test_shipped_policy__beats_the_papers_controllers(tmp_path):
     """Its file holds what made it and how good it was; on the plant it is so again."""
     training = load_policy(SHIPPED_POLICY, BROKK_170).training
     before = training["velocity_error_mean"]
@@ -298,10 +284,8 @@ def test_shipped_policy__beats_the_papers_controllers(tmp_path: Path) -> None:
         assert 0 < errors["rl"] < min(errors["jacobian_pid_k0.1"], errors["jacobian_pid_k0.05"])
 
 
-def test_print_means__are_by_kind_of_start_and_controller(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    rows: list[dict[str, Any]] = []
+def test_print_means__are_by_kind_of_start_and_controller(capsys):
+    rows = []
     for start, kind in enumerate(["workspace", "limits", "workspace"]):
         for travel, name in ((3.0, "rl"), (None, "pid")):
             row = {"controller": name, "sequence": "up", "start": start, "kind": kind}
@@ -317,7 +301,7 @@ def test_print_means__are_by_kind_of_start_and_controller(
     ]
 
 
-def test_starts__are_drawn_into_a_file_that_reads_back(tmp_path: Path) -> None:
+def test_starts__are_drawn_into_a_file_that_reads_back(tmp_path):
     assert run("starts --num 4 --out", tmp_path / "s.csv") == 0
     starts = read_starts(tmp_path / "s.csv", BROKK_170)
     assert start_kinds(BROKK_170, starts) == ["workspace", "limits", "workspace", "extended"]
@@ -327,10 +311,8 @@ def test_starts__are_drawn_into_a_file_that_reads_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("quick", [False, True])
-def test_reproduce__prints_means_verdicts_and_files(
-    quick: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def chain(machine: Any, out: Path, budget: Any, seed: int, sweep: Any) -> dict[str, Any]:
+def test_reproduce__prints_means_verdicts_and_files(quick, monkeypatch, tmp_path, capsys):
+    def chain(machine, out, budget, seed, sweep):
         assert (machine, out, seed, sweep) == (BROKK_170, tmp_path, 3, Path("sweep.json"))
         assert budget == (reproduce.QUICK if quick else reproduce.Budget())
         means = {"rl": {s: {"velocity_error_mean": 0.0125} for s in "xy"}}
@@ -347,13 +329,8 @@ def test_reproduce__prints_means_verdicts_and_files(
     ]
 
 
-def test_sweep__trains_seeds_from_the_first_on(
-    folder: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    def sweep(machine: Any, net: Any, task: Any, config: Any, *rest: Any) -> dict[str, Any]:
+def test_sweep__trains_seeds_from_the_first_on(folder, monkeypatch, tmp_path, capsys):
+    def sweep(machine, net, task, config, *rest):
         assert net.joints == ("q1", "q3", "q4", "q5")
         assert (task.zero_goals, config.total_steps) == (0.5, 9)
         assert rest == (range(5, 7), tmp_path, 3, "tcp://a:1", Path("gains.json"), True)

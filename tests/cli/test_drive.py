@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,28 +20,25 @@ POLICY = str(SHIPPED / "brokk170" / "policy.npz")
 
 
 @pytest.fixture
-def commands(tmp_path: Path) -> Path:
+def commands(tmp_path):
     rows = ["up,0,0,0,0.2", "up,1.0,0,0,0", "side,0,0,0.1,0", "side,0.4,0,0,0"]
     path = tmp_path / "c.csv"
     path.write_text("\n".join(["sequence,time,vx,vy,vz", *rows, ""]))
     return path
 
 
-def run(*arguments: object) -> int:
+def run(*arguments):
     return main([str(argument) for argument in arguments])
 
 
-def process(*arguments: object) -> subprocess.Popen[str]:
+def process(*arguments):
     command = [sys.executable, "-m", "brokk_min", *map(str, arguments)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def test_drive__replays_converts_and_survives_a_kill_as_a_process_of_its_own(
-    tmp_path: Path,
-    commands: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    tmp_path, commands, capsys, monkeypatch
+):
     """On a loaded machine a tick may be late; then the drive stops, which is right: once more."""
     own_multicast_port(monkeypatch)
     where = ["--interface", "udp_multicast", "--channel", MULTICAST]
@@ -91,8 +87,8 @@ def test_drive__replays_converts_and_survives_a_kill_as_a_process_of_its_own(
 
 
 def test_drive__refuses_in_one_line_to_drive_without_machine_joystick_or_slow_goals(
-    tmp_path: Path, commands: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+    tmp_path, commands, capsys
+):
     drive = ["drive", "--policy", POLICY, "--interface", "virtual", "--channel", "empty"]
     fast = tmp_path / "fast.csv"
     fast.write_text("sequence,time,vx,vy,vz\nf,0,1,0,0\nf,1,0,0,0\n")

@@ -33,7 +33,7 @@ OPTIONS = {
 }
 
 
-def test_help__names_all_commands(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help__names_all_commands(capsys):
     assert run("--help") == 0
     printed = capsys.readouterr().out
     assert "Exits 0 done, 1 failed, 2 wrong use." in printed
@@ -42,7 +42,7 @@ def test_help__names_all_commands(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize("command", list(COMMANDS))
-def test_help__names_all_options(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help__names_all_options(command, capsys):
     assert run(f"{command} --help") == 0
     printed = capsys.readouterr().out
     assert printed.startswith(f"usage: brokk-min {command} ")
@@ -61,14 +61,12 @@ print("torch" in sys.modules)
 """
 
 
-def test_help__does_not_import_torch() -> None:
+def test_help__does_not_import_torch():
     done = subprocess.run([sys.executable, "-c", HELP], capture_output=True, text=True)
     assert (done.stdout, done.stderr) == ("False\n", "")
 
 
-def test_version__is_that_of_the_project_and_of_its_citation(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_version__is_that_of_the_project_and_of_its_citation(capsys):
     assert run("--version") == 0
     assert capsys.readouterr().out == f"brokk_min {brokk_min.__version__}\n"
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -124,14 +122,7 @@ TRAIN = "train --actuator missing.npz --out p.npz"
         ("replay a.json --controllers rl --size 4001 540", 2, "got 1 and 4001 540"),
     ],
 )
-def test_wrong_use__is_refused_in_one_line(
-    line: str,
-    status: int,
-    message: str,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_wrong_use__is_refused_in_one_line(line, status, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert run(line) == status
     printed = capsys.readouterr()
@@ -160,19 +151,15 @@ def test_wrong_use__is_refused_in_one_line(
         "replay l.log --out",
     ],
 )
-def test_outputs__that_cannot_be_written_are_refused_before_any_work(
-    line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_outputs__that_cannot_be_written_are_refused_before_any_work(line, tmp_path, capsys):
     path = tmp_path / "missing" / "x.csv"
     assert run(line, path) == 2
     expected = f"brokk-min: {path}: expected a file in an existing, writable directory\n"
     assert capsys.readouterr().err == expected
 
 
-def test_interrupt__is_one_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def interrupt(command: object) -> None:
+def test_interrupt__is_one_line(monkeypatch, capsys):
+    def interrupt(command):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(COMMANDS["starts"], "__call__", interrupt)

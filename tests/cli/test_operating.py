@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 from pathlib import Path
-from typing import Any
 
 import can
 import numpy as np
@@ -32,7 +31,7 @@ GAINS = SHIPPED / "brokk170" / "gains.json"
 
 
 @pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def log(tmp_path_factory):
     """Joint q4 jogs for two seconds, on a simulated machine and an injected clock."""
     path = tmp_path_factory.mktemp("drive") / "run.log"
     writer = can.CanutilsLogWriter(path, channel="can0")
@@ -44,9 +43,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_drive__sends_the_frames_of_a_log_again(
-    log: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_drive__sends_the_frames_of_a_log_again(log, capsys):
     jog = "drive --controller jog --joint q4 --counts"
     assert run(f"{jog} 30 --replay", log) == 0
     printed = capsys.readouterr().out
@@ -58,18 +55,14 @@ def test_drive__sends_the_frames_of_a_log_again(
 
 
 @pytest.mark.parametrize("options", ["", "--controller jacobian", f"--gains '{GAINS}'"])
-def test_drive__compares_policy_and_baseline_too(
-    options: str, log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_drive__compares_policy_and_baseline_too(options, log, tmp_path, capsys):
     policy = tmp_path / "policy.npz" if "gains" in options else POLICY
     policy.write_bytes(POLICY.read_bytes()) if policy != POLICY else None
     assert run(f"drive --policy '{policy}' {options} --replay", log) == 1
     assert capsys.readouterr().err.endswith(" others\n")
 
 
-def test_convert__makes_a_log_for_fit(
-    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_convert__makes_a_log_for_fit(log, tmp_path, capsys):
     out = tmp_path / "log.csv"
     assert run(f"convert '{log}' --out", out) == 0
     (recording,) = read_log([out], 4).recordings
@@ -78,7 +71,7 @@ def test_convert__makes_a_log_for_fit(
     assert capsys.readouterr().out == f"{out}: 1 recordings of q1, q2, q3, q4, q5\n"
 
 
-def test_export__writes_an_onnx_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export__writes_an_onnx_file(tmp_path, capsys):
     out = tmp_path / "p.onnx"
     assert run(f"export --policy '{POLICY}' --out", out) == 0
     assert b"observation" in out.read_bytes()
@@ -89,9 +82,7 @@ def test_export__writes_an_onnx_file(tmp_path: Path, capsys: pytest.CaptureFixtu
     ("terminal", "expected"),
     [(True, "\rdriving v_goal +0.1\033[K"), (False, "driving v_goal +0.10 +0.00 +0.00\n")],
 )
-def test_show_line__keeps_to_one_line_of_a_terminal(
-    terminal: bool, expected: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_show_line__keeps_to_one_line_of_a_terminal(terminal, expected, monkeypatch):
     screen = io.StringIO()
     monkeypatch.setattr(screen, "isatty", lambda: terminal)
     monkeypatch.setattr("sys.stdout", screen)
@@ -103,9 +94,7 @@ def test_show_line__keeps_to_one_line_of_a_terminal(
 # --- windows and films ----------------------------------------------------------------------------
 
 
-def test_play__has_policy_and_tuned_baseline(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_play__has_policy_and_tuned_baseline(tmp_path, capsys):
     net = load_policy(POLICY, BROKK_170).net
     tuned = baselines.read_gains(GAINS, BROKK_170, net)["jacobian_pid_k0.1"]
     copy = tmp_path / "p.npz"
@@ -126,10 +115,8 @@ def test_play__has_policy_and_tuned_baseline(
         assert capsys.readouterr().err == expected
 
 
-def test_play__drives_a_simulated_machine_or_a_bus_and_watches_a_bus(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    windows: list[tuple[Any, ...]] = []
+def test_play__drives_a_simulated_machine_or_a_bus_and_watches_a_bus(tmp_path, monkeypatch):
+    windows = []
     monkeypatch.setattr(play, "play", lambda *arguments: windows.append(("play", *arguments)))
     monkeypatch.setattr(play, "watch", lambda *arguments: windows.append(("watch", *arguments)))
     monkeypatch.chdir(tmp_path)
@@ -148,7 +135,7 @@ def test_play__drives_a_simulated_machine_or_a_bus_and_watches_a_bus(
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def results(tmp_path_factory):
     """Half a second of the package's policy and gains, from one of the machine's own starts."""
     folder = tmp_path_factory.mktemp("runs")
     (folder / "c.csv").write_text("sequence,time,vx,vy,vz\nup,0,0,0,0.1\nup,0.5,0,0,0\n")
@@ -157,10 +144,8 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_replay__shows_results_and_logs(
-    results: Path, log: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    shown: list[Any] = []
+def test_replay__shows_results_and_logs(results, log, monkeypatch):
+    shown = []
     monkeypatch.setattr(replay, "show_film", lambda machine, runs, size: shown.append((runs, size)))
     assert run(f"replay '{results}' --controllers rl") == 0
     assert run(f"replay '{results}' '{log}' --controllers rl --size 800 600") == 0
@@ -168,9 +153,7 @@ def test_replay__shows_results_and_logs(
     assert [size for _, size in shown] == [(960, 540), (800, 600)]
 
 
-def test_replay__refuses_runs_that_the_results_do_not_have(
-    results: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_replay__refuses_runs_that_the_results_do_not_have(results, capsys):
     for wrong in ("--sequence down", "--start 1", "--start -1"):
         assert run(f"replay '{results}' --controllers rl {wrong}") == 2
         assert "expected some of ['up'], of ['rl'] and below 1, got " in capsys.readouterr().err
@@ -187,13 +170,7 @@ def test_replay__refuses_runs_that_the_results_do_not_have(
 
 
 @pytest.mark.parametrize("status", [0, 3])
-def test_replay__sends_pictures_to_ffmpeg(
-    status: int,
-    results: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_replay__sends_pictures_to_ffmpeg(status, results, monkeypatch, tmp_path, capsys):
     """An ffmpeg that copies its input: 5 raw pictures of half a second, 3 bytes a pixel."""
     (tmp_path / "ffmpeg").write_text(f"#!/bin/sh\ncat\nexit {status}\n")
     (tmp_path / "ffmpeg").chmod(0o755)
@@ -207,7 +184,7 @@ def test_replay__sends_pictures_to_ffmpeg(
         assert film.stat().st_size == 5 * 320 * 320 * 3
 
 
-def test_replay__writes_gif_or_mp4(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_replay__writes_gif_or_mp4(results, capsys):
     film = results.with_suffix(".avi")
     assert run(f"replay '{results}' --controllers rl --out", film) == 1
     assert "expected a name ending in .gif or .mp4" in capsys.readouterr().err

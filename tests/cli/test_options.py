@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Annotated
 
 import pytest
@@ -39,7 +38,7 @@ class Outer:
     "options",
     [Outer(), Outer(1, 0.0), Outer(127, 0.99), Outer(inner=Inner(10**6)), Outer(free=-(10**9))],
 )
-def test_check_ranges__allows_both_ends_and_none(options: Outer) -> None:
+def test_check_ranges__allows_both_ends_and_none(options):
     check_ranges(options)
 
 
@@ -53,12 +52,12 @@ def test_check_ranges__allows_both_ends_and_none(options: Outer) -> None:
         (Outer(inner=Inner(0)), "--num-envs: expected 1 to 1000000, got 0"),
     ],
 )
-def test_check_ranges__names_option_range_and_value(options: Outer, message: str) -> None:
+def test_check_ranges__names_option_range_and_value(options, message):
     with pytest.raises(WrongUse, match=f"^{message}$"):
         check_ranges(options)
 
 
-def test_check__gives_the_machine_if_outputs_can_be_written(tmp_path: Path) -> None:
+def test_check__gives_the_machine_if_outputs_can_be_written(tmp_path):
     assert Command().check(tmp_path / "new.csv", None) is BROKK_170
     assert Command(machine="").check() is BROKK_170
     assert Command(seed=2**31 - 1).check() is BROKK_170
@@ -69,7 +68,7 @@ def test_check__gives_the_machine_if_outputs_can_be_written(tmp_path: Path) -> N
             Command().check(None, path)
 
 
-def test_find_machine__runs_a_file(tmp_path: Path) -> None:
+def test_find_machine__runs_a_file(tmp_path):
     assert find_machine("brokk170") is BROKK_170
     assert find_machine(MINI).name == "mini_excavator"
     file = tmp_path / "a:b.py"
@@ -84,7 +83,7 @@ def test_find_machine__runs_a_file(tmp_path: Path) -> None:
         find_machine(f"{file}:MINE")
 
 
-def test_default_policy__takes_gains_from_the_folder_of_the_policy(tmp_path: Path) -> None:
+def test_default_policy__takes_gains_from_the_folder_of_the_policy(tmp_path):
     shipped = SHIPPED / "brokk170"
     expected = (shipped / "policy.npz", shipped / "gains.json")
     assert default_policy(BROKK_170, None, None) == expected

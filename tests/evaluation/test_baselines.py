@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,28 +19,28 @@ from brokk_min.identification.files import SHIPPED
 from brokk_min.identification.net_file import fingerprint, load_net, save_net
 from brokk_min.jacobian import Gains, JacobianController
 from brokk_min.learning.policy import load_policy
-from brokk_min.machine import BROKK_170, Array, Machine
+from brokk_min.machine import BROKK_170
 
 NET = obedient_net(BROKK_170)
 GAINS = {"kp": 1.0, "ki": 7.0, "kd": 0.12, "feedback": 0.4, "min_opening": 0.03}
 NAMES = ["jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff", "jacobian_pid_ff_awake"]
 
 
-def controller(machine: Machine = BROKK_170, **gains: float) -> JacobianController:
+def controller(machine=BROKK_170, **gains):
     zero = dict.fromkeys(baselines.RANGES, 0.0)
     return JacobianController(machine, baselines.make_gains(machine, **zero | gains), 0.1, 0.5)
 
 
-def machine_with_one_valve() -> Machine:
+def machine_with_one_valve():
     joints = [replace(joint, driven=joint.name == "q3") for joint in BROKK_170.joints]
     return replace(BROKK_170, joints=tuple(joints))
 
 
-def vector(controller: JacobianController) -> Array:
+def vector(controller):
     return baselines.gains_vector(controller.gains)
 
 
-def test_baselines__are_the_papers_two_and_two_with_feedforward() -> None:
+def test_baselines__are_the_papers_two_and_two_with_feedforward():
     result = baselines.baselines(BROKK_170, NET)
     assert list(result) == NAMES == [*baselines.PAPER_BASELINES, *NAMES[2:]]
     assert [c.k for c in result.values()] == [0.1, 0.05, 0.1, 0.1]
@@ -63,7 +62,7 @@ def test_baselines__are_the_papers_two_and_two_with_feedforward() -> None:
 # --- gains ----------------------------------------------------------------------------------------
 
 
-def test_split_vector__orders_gains_by_name_and_joint() -> None:
+def test_split_vector__orders_gains_by_name_and_joint():
     gains = baselines.split_vector(np.arange(28).reshape(2, 14))
     assert gains.kp.tolist() == [[0, 1, 2, 3], [14, 15, 16, 17]]
     assert gains.ki[0].tolist() == [4, 5, 6, 7]
@@ -73,21 +72,19 @@ def test_split_vector__orders_gains_by_name_and_joint() -> None:
 
 
 @given(st.integers(1, 6), st.integers(0, 3), st.integers(0, 2**31))
-def test_split_vector__is_the_inverse_of_gains_vector(n: int, rows: int, seed: int) -> None:
+def test_split_vector__is_the_inverse_of_gains_vector(n, rows, seed):
     vectors = np.random.default_rng(seed).normal(size=(rows, 3 * n + 2))
     np.testing.assert_array_equal(baselines.gains_vector(baselines.split_vector(vectors)), vectors)
 
 
 @pytest.mark.parametrize("name", ["kp", "min_opening"])
 @pytest.mark.parametrize("value", [[1.0, 2.0], np.nan, np.inf, "fast"])
-def test_make_gains__refuses_other_numbers_of_gains_and_what_is_not_finite(
-    name: str, value: object
-) -> None:
+def test_make_gains__refuses_other_numbers_of_gains_and_what_is_not_finite(name, value):
     with pytest.raises(ValueError):
         baselines.make_gains(BROKK_170, **GAINS | {name: value})
 
 
-def test_gains_at_bound__names_gains_within_a_hundredth_of_their_range() -> None:
+def test_gains_at_bound__names_gains_within_a_hundredth_of_their_range():
     start = controller(kp=2.0, ki=6.0, kd=0.1, feedback=0.5, min_opening=0.0)
     changed = vector(start).copy()
     changed[[1, 4, 7]] = [3.97, 0.11, 11.8]  # of 4 and 12: within 1 %, within 1 %, not
@@ -98,12 +95,12 @@ def test_gains_at_bound__names_gains_within_a_hundredth_of_their_range() -> None
 # --- tuning ---------------------------------------------------------------------------------------
 
 
-def test_tune__finds_the_minimum_of_a_bowl_and_repeats_itself() -> None:
+def test_tune__finds_the_minimum_of_a_bowl_and_repeats_itself():
     start = controller(machine_with_one_valve())
     low, high = baselines.gain_bounds(start.machine)
     goal = np.array(list(GAINS.values()))
 
-    def bowl(candidates: JacobianController) -> Array:
+    def bowl(candidates):
         return np.sum(((vector(candidates) - goal) / (high - low)) ** 2, axis=-1)
 
     result, costs = baselines.tune(start, bowl, seed=0, generations=60, label="bowl")
@@ -118,10 +115,10 @@ def test_tune__finds_the_minimum_of_a_bowl_and_repeats_itself() -> None:
     assert costs[-1] == bowl(result) < 0.01 * costs[0]
 
 
-def test_tune__is_never_worse_than_the_gains_it_starts_with() -> None:
+def test_tune__is_never_worse_than_the_gains_it_starts_with():
     start = controller(machine_with_one_valve(), **GAINS)
 
-    def distance(candidates: JacobianController) -> Array:
+    def distance(candidates):
         return np.abs(vector(candidates) - vector(start)).sum(axis=-1)
 
     result, costs = baselines.tune(start, distance, seed=0, generations=1, label="start")
@@ -129,12 +126,12 @@ def test_tune__is_never_worse_than_the_gains_it_starts_with() -> None:
     np.testing.assert_array_equal(vector(result), vector(start))
 
 
-def test_tune__searches_near_its_start_within_the_ranges() -> None:
+def test_tune__searches_near_its_start_within_the_ranges():
     low, high = baselines.gain_bounds(BROKK_170)
     start = replace(controller(), gains=baselines.split_vector((low + high) / 2))
-    searched: list[Array] = []
+    searched = []
 
-    def cost(candidates: JacobianController) -> Array:
+    def cost(candidates):
         searched.append(vector(candidates))
         return np.arange(float(len(searched[-1])))
 
@@ -146,7 +143,7 @@ def test_tune__searches_near_its_start_within_the_ranges() -> None:
     assert all(((rows >= low) & (rows <= high)).all() for rows in searched)
 
 
-def test_tuning_cost__of_many_candidates_is_that_of_each() -> None:
+def test_tuning_cost__of_many_candidates_is_that_of_each():
     start, goals = tuning_set(BROKK_170, 2, 7, seconds=1.0)
     vectors = np.random.default_rng(7).uniform(*baselines.gain_bounds(BROKK_170), (3, 14))
     many = replace(controller(), gains=baselines.split_vector(vectors))
@@ -161,7 +158,7 @@ def test_tuning_cost__of_many_candidates_is_that_of_each() -> None:
     np.testing.assert_allclose(result, single, rtol=0.05)
 
 
-def test_tune_baselines__lowers_each_cost_and_records_it() -> None:
+def test_tune_baselines__lowers_each_cost_and_records_it():
     machine = replace(BROKK_170, rate=5.0, plant_dt=0.02)  # faster to simulate
     net = obedient_net(machine)
     tuned, record = baselines.tune_baselines(machine, net, runs=2, generations=1, seed=3)
@@ -179,7 +176,7 @@ def test_tune_baselines__lowers_each_cost_and_records_it() -> None:
 # --- files ----------------------------------------------------------------------------------------
 
 
-def test_read_gains__reads_what_write_gains_wrote(tmp_path: Path) -> None:
+def test_read_gains__reads_what_write_gains_wrote(tmp_path):
     path = tmp_path / "gains.json"
     written = baselines.baselines(BROKK_170, NET)
     gains = Gains(np.arange(4.0), np.arange(4.0), np.zeros(4), np.ones(1), np.zeros(1))
@@ -189,7 +186,7 @@ def test_read_gains__reads_what_write_gains_wrote(tmp_path: Path) -> None:
     assert baselines.gains_table(result) == baselines.gains_table(written)
 
 
-def test_read_gains__reads_the_files_of_the_package_and_their_older_names(tmp_path: Path) -> None:
+def test_read_gains__reads_the_files_of_the_package_and_their_older_names(tmp_path):
     folder = SHIPPED / BROKK_170.name
     net = load_policy(folder / "policy.npz", BROKK_170).net
     expected = baselines.gains_table(baselines.read_gains(folder / "gains.json", BROKK_170, net))
@@ -208,9 +205,7 @@ def test_read_gains__reads_the_files_of_the_package_and_their_older_names(tmp_pa
         ({"actuator": None}, "'actuator': None"),
     ],
 )
-def test_read_gains__refuses_gains_of_another_machine_or_other_nets(
-    tmp_path: Path, meta: dict[str, str], message: str
-) -> None:
+def test_read_gains__refuses_gains_of_another_machine_or_other_nets(tmp_path, meta, message):
     path = tmp_path / "gains.json"
     own = baselines.gains_metadata(BROKK_170, NET)
     baselines.write_gains(path, baselines.baselines(BROKK_170, NET), own | meta)
@@ -227,9 +222,7 @@ def test_read_gains__refuses_gains_of_another_machine_or_other_nets(
         ({"kd": "fast"}, "fast"),
     ],
 )
-def test_read_gains__refuses_damaged_gains(
-    tmp_path: Path, change: dict[str, object], message: str
-) -> None:
+def test_read_gains__refuses_damaged_gains(tmp_path, change, message):
     path = tmp_path / "gains.json"
     table = baselines.gains_table(baselines.baselines(BROKK_170, NET))
     table["jacobian_pid_ff"] |= change
@@ -239,7 +232,7 @@ def test_read_gains__refuses_damaged_gains(
         baselines.read_gains(path, BROKK_170, NET)
 
 
-def test_gains_metadata__changes_with_the_nets_and_survives_a_file(tmp_path: Path) -> None:
+def test_gains_metadata__changes_with_the_nets_and_survives_a_file(tmp_path):
     save_net(tmp_path / "net.npz", NET)
     assert fingerprint(load_net(tmp_path / "net.npz")) == fingerprint(NET)
     weights = (NET.weights[0] + 1e-6, *NET.weights[1:])

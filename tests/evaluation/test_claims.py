@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from helpers_machines import obedient_net
@@ -18,11 +16,11 @@ STRONGER = baselines.STRONGER[0]
 POSE = np.array(BROKK_170.q_start)
 
 
-def verdicts(result: list[Claim]) -> list[bool | None]:
+def verdicts(result):
     return [claim.holds for claim in result]
 
 
-def runs_with(key: str, sequence: str = "x", **values: float) -> list[dict[str, Any]]:
+def runs_with(key, sequence="x", **values):
     """Six starts with a figure around a value by controller."""
     names = {"rl": "rl", "high": HIGH, "low": LOW, "stronger": STRONGER}
     rows = []
@@ -33,7 +31,7 @@ def runs_with(key: str, sequence: str = "x", **values: float) -> list[dict[str, 
     return rows
 
 
-def trace_of(q: np.ndarray, v: np.ndarray, q_dot: np.ndarray, ticks: int) -> Trace:
+def trace_of(q, v, q_dot, ticks):
     zero = np.zeros((ticks, len(q), 5))
     v_tool = zero[..., :3] + v
     return Trace(zero + q, zero + q_dot, zero, zero, zero[..., :3], v_tool, zero[..., 0])
@@ -42,8 +40,8 @@ def trace_of(q: np.ndarray, v: np.ndarray, q_dot: np.ndarray, ticks: int) -> Tra
 # --- records --------------------------------------------------------------------------------------
 
 
-def test_format_numbers__gives_means_with_their_intervals() -> None:
-    numbers: dict[str, Any] = {
+def test_format_numbers__gives_means_with_their_intervals():
+    numbers = {
         "a": {"mean": 1.0, "low": 0.5, "high": 1.5},
         "b": {"mean": 2.0, "low": None, "high": None},
         "c": {"mean": None, "low": None, "high": None},
@@ -51,7 +49,7 @@ def test_format_numbers__gives_means_with_their_intervals() -> None:
     assert claims.format_numbers(numbers, "m") == "a 1 (0.5 to 1.5); b 2; c none [m]"
 
 
-def test_claim__is_json_with_sentence_measurement_and_verdict() -> None:
+def test_claim__is_json_with_sentence_measurement_and_verdict():
     number = {"mean": 0.25, "low": None, "high": None}
     stronger = Claim("drift", {"strong": number}, None)
     record = Claim("drift", {"rl": number}, False, stronger).to_json()
@@ -68,7 +66,7 @@ def test_claim__is_json_with_sentence_measurement_and_verdict() -> None:
 # --- machine, nets, training ----------------------------------------------------------------------
 
 
-def preliminary_numbers(**change: Any) -> dict[str, Any]:
+def preliminary_numbers(**change):
     """Numbers of a machine that behaves as the paper's and of nets that behave as the machine."""
     times = {"q5": {"idle": {"up": 0.4, "down": 0.4}, "moving": {"up": 0.1, "down": 0.1}}}
     peaks = {"u = 50": 0.1, "u = 80": 0.24, "u = 175": 0.45, "u = 205": 0.3}
@@ -91,7 +89,7 @@ FAR_RUNS = GOOD["sim_to_real"] | {"tool_position_error_mean_of_runs": {"median":
 FAR_FIGURE = GOOD["sim_to_real"] | {"tool": {"position_error_mean": 0.06}}
 
 
-def nets_from_idle(seconds: float | None) -> dict[str, Any]:
+def nets_from_idle(seconds):
     times = {"q5": {"idle": {"up": seconds, "down": 0.4}, "moving": {"up": 0.1, "down": 0.1}}}
     return GOOD["response_time"] | {"nets": times}
 
@@ -108,9 +106,7 @@ def nets_from_idle(seconds: float | None) -> dict[str, Any]:
         ({"sim_to_real": FAR_FIGURE}, [True, True, True, False]),
     ],
 )
-def test_net_claims__hold_where_machine_and_nets_behave_as_the_papers(
-    change: dict[str, Any], holds: list[bool | None]
-) -> None:
+def test_net_claims__hold_where_machine_and_nets_behave_as_the_papers(change, holds):
     result = claims.net_claims(preliminary_numbers(**change))
     assert verdicts(result) == holds
     assert [claim.to_json()["figure"] for claim in result] == ["Fig. 2"] * 3 + ["Fig. 5"]
@@ -119,7 +115,7 @@ def test_net_claims__hold_where_machine_and_nets_behave_as_the_papers(
 
 
 @pytest.mark.parametrize(("hours", "holds"), [(0.1, False), (2.0, True), (4.0, True), (6.0, False)])
-def test_training_claim__allows_a_factor_of_two(hours: float, holds: bool) -> None:
+def test_training_claim__allows_a_factor_of_two(hours, holds):
     claim = claims.training_claim(hours * 3600, 8_000_000)
     assert claim.holds is holds
     assert f"8,000,000 steps here {hours:g} [h]" in claim.to_json()["measured"]
@@ -137,9 +133,7 @@ def test_training_claim__allows_a_factor_of_two(hours: float, holds: bool) -> No
         (0.09, 0.06, 0.30, [False, False]),  # one baseline drifts less than RL
     ],
 )
-def test_drift_claim__is_of_all_baselines(
-    rl: float, high: float, low: float, holds: list[bool]
-) -> None:
+def test_drift_claim__is_of_all_baselines(rl, high, low, holds):
     runs = runs_with("off_axis_drift_max", rl=rl, high=high, low=low)
     result = [claims.still_claim(runs), claims.drift_claim(runs, (HIGH, LOW))]
     assert verdicts(result) == holds
@@ -147,7 +141,7 @@ def test_drift_claim__is_of_all_baselines(
     assert result[1].numbers[f"{HIGH} less rl"]["mean"] == pytest.approx(high - rl)
 
 
-def test_drift_claim__of_one_start_has_no_verdict() -> None:
+def test_drift_claim__of_one_start_has_no_verdict():
     runs = runs_with("off_axis_drift_max", rl=0.1, high=0.2, low=0.2)
     one = [run for run in runs if run["start"] == 0]
     assert verdicts([claims.still_claim(one), claims.drift_claim(one, (HIGH, LOW))]) == [None, None]
@@ -163,9 +157,7 @@ def test_drift_claim__of_one_start_has_no_verdict() -> None:
         (0.04, 0.03, 0.1, [False, False, False]),
     ],
 )
-def test_less_claim__is_of_each_sequence_and_figure(
-    x: float, z: float, drift: float, holds: list[bool]
-) -> None:
+def test_less_claim__is_of_each_sequence_and_figure(x, z, drift, holds):
     runs = []
     for sequence, rl in {"x": x, "y": 0.01, "z": z}.items():
         low = 0.02 - 0.005 * (rl > 0.02)
@@ -187,9 +179,7 @@ def test_less_claim__is_of_each_sequence_and_figure(
 @pytest.mark.parametrize(
     ("down", "holds"), [(0.9, False), (0.5, True), ((0.9, 0.9, 0.9, 0.1), False)]
 )
-def test_direction_claim__compares_both_directions(
-    down: float | tuple[float, ...], holds: bool
-) -> None:
+def test_direction_claim__compares_both_directions(down, holds):
     """Joints follow 90 % of the desired velocity forwards, and `down` of it backwards.
 
     One run that goes back badly is not certain to be more than chance.
@@ -211,7 +201,7 @@ def test_direction_claim__compares_both_directions(
     assert claims.direction_claim(BROKK_170, pid, first, goals).holds is None
 
 
-def test_task_claims__are_in_the_papers_order_and_of_a_stronger_baseline_too() -> None:
+def test_task_claims__are_in_the_papers_order_and_of_a_stronger_baseline_too():
     runs = []
     for sequence in "xyz":
         drift = runs_with("off_axis_drift_max", sequence, rl=0.02, high=0.2, low=0.3, stronger=0.03)
@@ -234,14 +224,14 @@ def test_task_claims__are_in_the_papers_order_and_of_a_stronger_baseline_too() -
 # --- near singularities ---------------------------------------------------------------------------
 
 
-def test_singular_controllers__differ_in_damping_alone() -> None:
+def test_singular_controllers__differ_in_damping_alone():
     pids = baselines.baselines(BROKK_170, obedient_net(BROKK_170))
     rl, strong, weak = claims.singular_controllers(pids[STRONGER], pids).values()
     assert rl is pids[STRONGER] and strong is pids[HIGH]
     assert (strong.k, weak.k) == (0.1, 0.05) and weak.gains is strong.gains
 
 
-def test_speed_fraction__is_of_goals_that_last_near_singularities() -> None:
+def test_speed_fraction__is_of_goals_that_last_near_singularities():
     """Stretched and ordinary arms, and a goal that ends early; the first 0.6 s do not count."""
     stretched = np.array([0.3, 0.5, 0.1, np.pi, 3 * np.pi / 4])
     goals = np.zeros((30, 4, 3))
@@ -263,9 +253,7 @@ def test_speed_fraction__is_of_goals_that_last_near_singularities() -> None:
         ((0.9, 0.5, 0.7), (4.5, 4.0, 4.6), [True, True, False]),  # RL jerks
     ],
 )
-def test_singular_claims__compare_speed_and_jerk(
-    speed: tuple[float, ...], jerk: tuple[float, ...], holds: list[bool]
-) -> None:
+def test_singular_claims__compare_speed_and_jerk(speed, jerk, holds):
     spread = 0.01 * np.array([0, 1, 2, 0, 1, 2])
     speeds = {c: s + spread for c, s in zip(("rl", HIGH, LOW), speed, strict=True)}
     rl, high, low = jerk

@@ -13,12 +13,12 @@ from strategies import machines
 
 from brokk_min.actuator import ActuatorNet
 from brokk_min.evaluation.feedforward import StaticMap, static_map
-from brokk_min.machine import BROKK_170, Machine
+from brokk_min.machine import BROKK_170
 
 
 @settings(max_examples=5)
 @given(machines(), st.integers(0, 2**31))
-def test_command__inverts_the_velocity_of_the_nets(machine: Machine, seed: int) -> None:
+def test_command__inverts_the_velocity_of_the_nets(machine, seed):
     steady = static_map(machine, obedient_net(machine))
     limit = machine.pwm_limit / 127
     assert (steady.u[0], steady.u[-1]) == pytest.approx((-limit, limit))
@@ -37,9 +37,7 @@ def test_command__inverts_the_velocity_of_the_nets(machine: Machine, seed: int) 
 @pytest.mark.parametrize(
     ("angle", "speed"), [(-3, 1), (-1, 1), (-0.25, 1.5), (0.5, 2), (1.25, 3), (2, 4), (9, 4)]
 )
-def test_command__interpolates_between_angles_and_holds_beyond_them(
-    angle: float, speed: float
-) -> None:
+def test_command__interpolates_between_angles_and_holds_beyond_them(angle, speed):
     """Speeds at full command are 1, 2 and 4 rad/s at -1, 0.5 and 2 rad."""
     u = np.array([-1.0, 0.0, 1.0])
     scale = np.array([1.0, 2.0, 4.0])[None, :, None]
@@ -49,7 +47,7 @@ def test_command__interpolates_between_angles_and_holds_beyond_them(
         np.testing.assert_allclose(result, [q_dot / speed], atol=1e-9)
 
 
-def test_static_map__is_the_fixed_point_of_steady_motion() -> None:
+def test_static_map__is_the_fixed_point_of_steady_motion():
     """Found here by a plain loop, one joint at one angle under one command."""
     net = obedient_net(BROKK_170)
     first = net.weights[0].copy()  # angles and velocities matter, too
@@ -71,11 +69,11 @@ def test_static_map__is_the_fixed_point_of_steady_motion() -> None:
         assert (rising[:, -1] - rising[:, 0] > 0.1).all()
 
 
-def test_static_map__is_of_motion_even_if_the_nets_know_stops() -> None:
+def test_static_map__is_of_motion_even_if_the_nets_know_stops():
     """A net that was trained on joints at their stop predicts standstill for joints that stand."""
 
     class Stalling(ActuatorNet):
-        def predict(self, history: np.ndarray) -> np.ndarray:
+        def predict(self, history):
             speed = 0.3 * history[..., 2, -1]
             return np.where(np.abs(history[..., 1, -1]) < 0.01, 0.0, speed)
 

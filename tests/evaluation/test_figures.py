@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,18 +23,18 @@ POSE = list(BROKK_170.q_start)
 RNG = np.random.default_rng(0)
 
 
-def curves(ax: Any) -> dict[str, np.ndarray]:
+def curves(ax):
     return {curve.get_label(): np.array(curve.get_data()) for curve in ax.get_lines()}
 
 
-def ylabels(figure: Any) -> list[str]:
+def ylabels(figure):
     return [ax.get_ylabel() for ax in figure.axes]
 
 
 # --- panels ---------------------------------------------------------------------------------------
 
 
-def test_plot_panels__have_one_legend_and_the_scales_asked_for() -> None:
+def test_plot_panels__have_one_legend_and_the_scales_asked_for():
     x = np.arange(3.0)
     one, two, far = ({"rl": (x, k * x), "other": (x, k + x)} for k in (1, 2, 9))
     rows = [[Panel("a", "t", "v", one), Panel("b", "t", "w", far)], [Panel("c", "t", "v", two)]]
@@ -54,7 +52,7 @@ def test_plot_panels__have_one_legend_and_the_scales_asked_for() -> None:
     assert row.axes[0].get_ylim() == row.axes[1].get_ylim()
 
 
-def test_plot_panels__have_their_own_legends_above_the_curves() -> None:
+def test_plot_panels__have_their_own_legends_above_the_curves():
     x = np.linspace(0, 1, 5)
     shown = [{f"{k}{i}": (x, x * i) for i in range(4)} for k in "ab"]
     row = [Panel(f"panel {i}", "time [s]", "speed [m/s]", c) for i, c in enumerate(shown)]
@@ -76,7 +74,7 @@ def test_plot_panels__have_their_own_legends_above_the_curves() -> None:
         ["workspace", "limits", "extended"],
     ],
 )
-def test_styles__differ_on_grey_paper(names: list[str]) -> None:
+def test_styles__differ_on_grey_paper(names):
     colors = np.array([to_rgb(figures.STYLES[name]["color"]) for name in names])
     grey = np.sort(colors @ [0.299, 0.587, 0.114])
     assert (np.diff(grey) > 0.1).all() and grey[-1] < 0.8
@@ -85,7 +83,7 @@ def test_styles__differ_on_grey_paper(names: list[str]) -> None:
 # --- preliminary tests ----------------------------------------------------------------------------
 
 
-def test_plot_tests__shows_machine_above_nets() -> None:
+def test_plot_tests__shows_machine_above_nets():
     x = np.arange(3.0)
     rows = {}
     for k, kind in enumerate(("machine", "nets"), 1):
@@ -103,7 +101,7 @@ def test_plot_tests__shows_machine_above_nets() -> None:
     np.testing.assert_array_equal(curves(figure.axes[5])["from idle"], [x, 2 + x])
 
 
-def test_plot_gap__shows_the_first_run_of_tool_and_driven_joints() -> None:
+def test_plot_gap__shows_the_first_run_of_tool_and_driven_joints():
     gap = Motion(*(RNG.normal(size=(4, 2, n)) for n in (5, 5, 3, 3)))
     figure = figures.plot_gap(BROKK_170, gap)
     assert ylabels(figure) == [
@@ -121,9 +119,7 @@ def test_plot_gap__shows_the_first_run_of_tool_and_driven_joints() -> None:
 
 
 @pytest.mark.parametrize(("samples", "ticks"), [(40, 26), (700, 600)])
-def test_plot_free_run__begins_after_a_history_and_lasts_30_s_or_to_the_end(
-    samples: int, ticks: int
-) -> None:
+def test_plot_free_run__begins_after_a_history_and_lasts_30_s_or_to_the_end(samples, ticks):
     net = small_net(BROKK_170, np.random.default_rng(1), ("q4", "q5"))
     q = RNG.normal(size=(samples, 2))
     recording = Recording("r", np.tile([0.0, 0.2], (samples, 1)), q, -q)
@@ -138,7 +134,7 @@ def test_plot_free_run__begins_after_a_history_and_lasts_30_s_or_to_the_end(
     np.testing.assert_allclose(velocity["free run"][1], own_q_dot[:, 0, 1])
 
 
-def test_plot_worst_and_median__are_of_the_largest_error_of_a_joint() -> None:
+def test_plot_worst_and_median__are_of_the_largest_error_of_a_joint():
     """Nets that predict 0.1 rad/s; recordings that move at 0.1, 0.3 and 0.2 rad/s."""
     net = constant_net([0.1], logged=False, joints=("a",))
     speeds = {"exact": 0.1, "worst one": 0.3, "median one": 0.2}
@@ -149,7 +145,7 @@ def test_plot_worst_and_median__are_of_the_largest_error_of_a_joint() -> None:
     assert ylabels(figure)[:2] == ["a [rad]", "a [rad/s]"]
 
 
-def test_plot_learning__is_over_millions_of_steps(tmp_path: Path) -> None:
+def test_plot_learning__is_over_millions_of_steps(tmp_path):
     path = tmp_path / "c.csv"
     path.write_text(
         "global_step,charts/reward,charts/velocity_error\n1000000,0.5,0.1\n3000000,0.75,0.05\n"
@@ -163,11 +159,11 @@ def test_plot_learning__is_over_millions_of_steps(tmp_path: Path) -> None:
 # --- task-space control ---------------------------------------------------------------------------
 
 
-def test_plot_sequence__is_relative_to_where_the_tool_began() -> None:
+def test_plot_sequence__is_relative_to_where_the_tool_began():
     sequence = axis_sequences(BROKK_170)[0]
     sizes = {"p_tool": 3, "v_tool": 3, "q_dot": 5}
     trace = SimpleNamespace(**{name: RNG.normal(size=(360, 2, n)) for name, n in sizes.items()})
-    traces: Any = {("rl", "x"): trace, ("pid", "y"): None}
+    traces = {("rl", "x"): trace, ("pid", "y"): None}
     figure = figures.plot_sequence(BROKK_170, traces, sequence, np.array(POSE), 1)
     time = 0.05 * np.arange(1, 361)
     positions = [f"{axis} - {axis}(0) [m]" for axis in "xyz"]
@@ -185,11 +181,11 @@ def test_plot_sequence__is_relative_to_where_the_tool_began() -> None:
     np.testing.assert_array_equal(curves(joints.axes[2])["rl"], [time, trace.q_dot[:, 1, 3]])
 
 
-def number(mean: float | None, low: float | None = None, high: float | None = None) -> Any:
+def number(mean, low=None, high=None):
     return {"mean": mean, "low": low, "high": high}
 
 
-def test_plot_bars__stand_side_by_side_with_their_intervals() -> None:
+def test_plot_bars__stand_side_by_side_with_their_intervals():
     bars = {
         "rl": {"x": number(2.0, 1.5, 4.0), "a_b": number(1.0)},
         "jacobian_pid_ff": {"x": number(3.0, 2.0, 3.5), "a_b": number(None)},
@@ -197,7 +193,7 @@ def test_plot_bars__stand_side_by_side_with_their_intervals() -> None:
     figure = figures.plot_bars({"error [m]": bars, "more": bars})
     upper = figure.axes[0]
     assert ylabels(figure) == ["error [m]", "more"] and len(figure.legends) == 1
-    drawn: dict[str, Any] = {c.get_label(): c for c in upper.containers if hasattr(c, "patches")}
+    drawn = {c.get_label(): c for c in upper.containers if hasattr(c, "patches")}
     for name, middle in {"rl": -0.2, "jacobian_pid_ff": 0.2}.items():
         patches = drawn[name].patches
         assert [p.get_x() + p.get_width() / 2 for p in patches] == pytest.approx(
@@ -210,7 +206,7 @@ def test_plot_bars__stand_side_by_side_with_their_intervals() -> None:
     assert [text.get_text() for text in upper.get_xticklabels()] == ["x", "a\nb"]
 
 
-def test_plot_bars__names_of_sequences_do_not_touch() -> None:
+def test_plot_bars__names_of_sequences_do_not_touch():
     names = [sequence.name for sequence in task_sequences(BROKK_170)]
     bars = {"rl": dict.fromkeys([*names, "all"], number(0.1, 0.05, 0.2))}
     figure = figures.plot_bars({"error [m/s]": bars})
@@ -219,7 +215,7 @@ def test_plot_bars__names_of_sequences_do_not_touch() -> None:
     assert all(one.x1 + 4 < two.x0 for one, two in itertools.pairwise(boxes))
 
 
-def test_plot_starts__draws_arms_from_the_side_and_from_above() -> None:
+def test_plot_starts__draws_arms_from_the_side_and_from_above():
     starts = np.array([[0.5 * np.pi, *POSE[1:]], [0.0, *POSE[1:]], POSE])
     kinds = ["limits", "workspace", "limits"]
     figure = figures.plot_starts(BROKK_170, starts, kinds)
@@ -237,7 +233,7 @@ def test_plot_starts__draws_arms_from_the_side_and_from_above() -> None:
     assert colors == [figures.STYLES[kind]["color"] for kind in kinds]
 
 
-def test_save__writes_the_same_bytes_for_the_same_figure(tmp_path: Path) -> None:
+def test_save__writes_the_same_bytes_for_the_same_figure(tmp_path):
     pages = []
     for name in ("a.png", "b.png"):
         figure = figures.Figure(figsize=(1.0, 0.5))

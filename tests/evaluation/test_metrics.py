@@ -7,18 +7,17 @@ import pytest
 from helpers_machines import obedient_net
 from scipy import stats
 
-from brokk_min.env import Measured
 from brokk_min.evaluation import metrics as m
 from brokk_min.evaluation.baselines import baselines
 from brokk_min.evaluation.rollout import Trace
 from brokk_min.evaluation.sequences import Commands, task_sequences
 from brokk_min.kinematics import forward_kinematics, tool_position
-from brokk_min.machine import BROKK_170, Array
+from brokk_min.machine import BROKK_170
 
 MIDDLE = (BROKK_170.column("q_min") + BROKK_170.column("q_max")) / 2
 
 
-def trace_of(v: Array, q: Array | None = None, u: Array | None = None) -> Trace:
+def trace_of(v, q=None, u=None):
     """One run with tool velocities v (T, 3) from the origin."""
     q = np.tile(MIDDLE, (len(v), 1)) if q is None else q
     u = np.zeros((len(v), 5)) if u is None else u
@@ -27,7 +26,7 @@ def trace_of(v: Array, q: Array | None = None, u: Array | None = None) -> Trace:
     return Trace(*(a[:, None] for a in (q, 0 * q, q, u, p_tool, v, rewards)))
 
 
-def figures(v: Array, goals: Array, **more: Array) -> dict[str, float]:
+def figures(v, goals, **more):
     result = m.metrics(BROKK_170, trace_of(v, **more), goals[:, None], np.zeros((1, 3)))
     return {name: float(value[0]) for name, value in result.items()}
 
@@ -56,14 +55,12 @@ def figures(v: Array, goals: Array, **more: Array) -> dict[str, float]:
     ],
     ids=["line", "turn", "rest"],
 )
-def test_line_distance__by_hand(
-    goals: list[list[float]], p_tool: list[list[float]], expected: list[float]
-) -> None:
+def test_line_distance__by_hand(goals, p_tool, expected):
     result = m.line_distance(np.array(p_tool)[:, None], np.array(goals)[:, None], np.zeros((1, 3)))
     assert result[:, 0] == pytest.approx(expected)
 
 
-def test_metrics__by_hand() -> None:
+def test_metrics__by_hand():
     v = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.3, 0, 0]])
     u = np.array([[0.0, 0.5], [0.2, 0.5], [0.2, -0.5]])
     row = figures(v, np.tile([0.1, 0.0, 0.0], (3, 1)), u=u)
@@ -76,7 +73,7 @@ def test_metrics__by_hand() -> None:
     assert row["position_error_mean"] == pytest.approx(0.005)  # behind, behind, ahead
 
 
-def test_metrics__drift_is_the_distance_from_the_line() -> None:
+def test_metrics__drift_is_the_distance_from_the_line():
     """Off the line by 0, then 3 mm and 4 mm across, then 0 again."""
     v = 20 * np.array([[0.01, 0.0, 0.0], [0.01, 0.003, 0.004], [0.01, -0.003, -0.004]])
     row = figures(v, np.tile([0.1, 0.0, 0.0], (3, 1)))
@@ -84,7 +81,7 @@ def test_metrics__drift_is_the_distance_from_the_line() -> None:
     assert row["off_axis_drift_mean"] == pytest.approx(0.005 / 3)
 
 
-def test_metrics__of_a_batch_are_those_of_its_runs() -> None:
+def test_metrics__of_a_batch_are_those_of_its_runs():
     rng = np.random.default_rng(0)
     goals = np.repeat(rng.integers(-1, 2, (3, 4, 3)) * 0.1, 10, axis=0)
     goals[:10, 0] = 0.0  # one rests while the others move
@@ -101,7 +98,7 @@ def test_metrics__of_a_batch_are_those_of_its_runs() -> None:
     np.testing.assert_allclose(batch["jerk_rms"] ** 2, (jerk**2).sum(axis=(0, 2)) / 28)
 
 
-def test_metrics__errors_after_a_change_of_goal_are_transient() -> None:
+def test_metrics__errors_after_a_change_of_goal_are_transient():
     """At rest an error of 0.05 m/s, then at 0.2 m/s 12 ticks of 0.1 m/s and 18 of 0.01 m/s."""
     goals = np.zeros((40, 3))
     goals[10:, 0] = 0.2
@@ -115,7 +112,7 @@ def test_metrics__errors_after_a_change_of_goal_are_transient() -> None:
     assert row["settling_time"] == pytest.approx(12 * 0.05)  # below 0.03 m/s from then on
 
 
-def test_metrics__time_at_limits_is_of_driven_joints() -> None:
+def test_metrics__time_at_limits_is_of_driven_joints():
     low, high = BROKK_170.column("q_min"), BROKK_170.column("q_max")
     q = np.tile(MIDDLE, (8, 1))
     q[:, 1] = high[1]  # locked
@@ -125,12 +122,12 @@ def test_metrics__time_at_limits_is_of_driven_joints() -> None:
     assert figures(still, still, q=q)["time_at_limits"] == pytest.approx(4 * 0.05)
 
 
-def test_metrics__are_nan_where_nothing_can_be_averaged() -> None:
+def test_metrics__are_nan_where_nothing_can_be_averaged():
     row = figures(np.zeros((4, 3)), np.zeros((4, 3)))
     assert np.isnan(row["settling_time"]) and np.isnan(row["velocity_error_transient"])
 
 
-def held(*parts: tuple[int, float]) -> Array:
+def held(*parts):
     """Velocities along z, (T, 3), each held for some ticks."""
     z = np.concatenate([np.full(ticks, value) for ticks, value in parts])
     return np.stack([0 * z, 0 * z, z], axis=1)
@@ -148,11 +145,11 @@ def held(*parts: tuple[int, float]) -> Array:
         (held((10, 0.0), (30, 0.03)), held((10, 0.0), (10, 0.01), (20, 0.02)), 10 * 0.05),
     ],
 )
-def test_settling_time__by_hand(goals: Array, v: Array, expected: float) -> None:
+def test_settling_time__by_hand(goals, v, expected):
     assert figures(v, goals)["settling_time"] == pytest.approx(expected)
 
 
-def test_ticks_since_change__ignores_a_goal_that_turns_slowly() -> None:
+def test_ticks_since_change__ignores_a_goal_that_turns_slowly():
     angle = np.linspace(0, 2 * np.pi, 320)
     goals = 0.15 * np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1)
     ticks = m.ticks_since_change(BROKK_170, goals[:, None])
@@ -160,7 +157,7 @@ def test_ticks_since_change__ignores_a_goal_that_turns_slowly() -> None:
     assert (m.ticks_since_change(BROKK_170, np.zeros((4, 1, 3))) == -1).all()
 
 
-def test_row_mean__leaves_out_nan() -> None:
+def test_row_mean__leaves_out_nan():
     assert m.row_mean(np.array([[1.0, np.nan, 4.0], [2.0, 3.0, 7.0]])).tolist() == [2.5, 4.0]
     assert np.isnan(m.row_mean(np.full((1, 2), np.nan))).all()
 
@@ -171,10 +168,10 @@ def test_row_mean__leaves_out_nan() -> None:
 class Idle:
     """A controller that sends nothing."""
 
-    def start(self, num: int) -> None:
+    def start(self, num):
         return None
 
-    def __call__(self, measured: Measured, state: None) -> tuple[Array, None]:
+    def __call__(self, measured, state):
         return np.zeros((len(measured.q), BROKK_170.n)), None
 
 
@@ -182,11 +179,11 @@ STARTS = np.array([BROKK_170.q_start, [1.0, 0.5, 0.9, 1.5, 1.0]])
 PID = baselines(BROKK_170, obedient_net(BROKK_170))["jacobian_pid_k0.1"]
 
 
-def shortened(ticks: int) -> list[Commands]:
+def shortened(ticks):
     return [s._replace(goals=s.goals[10 : 10 + ticks]) for s in task_sequences(BROKK_170)[:3]]
 
 
-def test_evaluate__gives_rows_in_order_with_their_figures() -> None:
+def test_evaluate__gives_rows_in_order_with_their_figures():
     controllers = {"pid": PID, "idle": Idle()}
     rows, traces = m.evaluate(BROKK_170, controllers, shortened(50), STARTS, 0)
     labels = [(c, s, i, "workspace") for c in controllers for s in "xyz" for i in (0, 1)]
@@ -202,7 +199,7 @@ def test_evaluate__gives_rows_in_order_with_their_figures() -> None:
     assert error["pid"]["all"]["velocity_error_mean"] < error["idle"]["all"]["velocity_error_mean"]
 
 
-def test_evaluate__gives_each_length_of_sequences_the_same_noise() -> None:
+def test_evaluate__gives_each_length_of_sequences_the_same_noise():
     """One batch per length: rows stay with their names."""
     mixed = shortened(40)
     mixed[1] = shortened(30)[1]
@@ -216,7 +213,7 @@ def test_evaluate__gives_each_length_of_sequences_the_same_noise() -> None:
     assert traces["pid", "z"].v_tool.shape == (40, 2, 3)
 
 
-def test_evaluate__has_none_for_figures_without_a_value() -> None:
+def test_evaluate__has_none_for_figures_without_a_value():
     rest = [Commands("rest", np.zeros((5, 3)))]
     rows, _ = m.evaluate(BROKK_170, {"idle": Idle()}, rest, STARTS, 0, obedient_net(BROKK_170))
     assert [row["settling_time"] for row in rows] == [None, None]
@@ -226,12 +223,12 @@ def test_evaluate__has_none_for_figures_without_a_value() -> None:
 # --- over many runs -------------------------------------------------------------------------------
 
 
-def run(controller: str, sequence: str, start: int, error: float | None) -> dict[str, object]:
+def run(controller, sequence, start, error):
     labels = {"controller": controller, "sequence": sequence, "start": start, "kind": "workspace"}
     return labels | {"error": error}
 
 
-def test_interval__is_students() -> None:
+def test_interval__is_students():
     values = np.random.default_rng(1).normal(2.0, 0.3, 12)
     expected = stats.ttest_1samp(values, 0).confidence_interval(0.95)
     np.testing.assert_allclose(m.interval(np.append(values, np.nan)), expected)
@@ -239,7 +236,7 @@ def test_interval__is_students() -> None:
     assert m.interval(np.array([1.0, 3.0])) == pytest.approx([2 - 12.7062, 2 + 12.7062], abs=1e-4)
 
 
-def test_paired_difference__is_of_the_same_starts() -> None:
+def test_paired_difference__is_of_the_same_starts():
     """Starts differ far more than controllers: the paired interval is narrow."""
     error = {0: 1.0, 1: 5.0, 2: 9.0}
     runs = [run("a", s, i, e + 0.1 * i) for s in "xy" for i, e in reversed(error.items())]
@@ -252,7 +249,7 @@ def test_paired_difference__is_of_the_same_starts() -> None:
     np.testing.assert_allclose([result["x"]["low"], result["x"]["high"]], ends)
 
 
-def test_paired_differences__are_to_all_others_in_every_figure() -> None:
+def test_paired_differences__are_to_all_others_in_every_figure():
     errors = {"a": 1.0, "b": 3.0, "c": 7.0}
     runs = [run(c, "x", i, e) | {"other": 2 * e} for c, e in errors.items() for i in (0, 1)]
     result = m.paired_differences(runs, "b")
@@ -261,7 +258,7 @@ def test_paired_differences__are_to_all_others_in_every_figure() -> None:
     assert result["error"]["a"] == m.paired_difference(runs, "b", "a", "error")
 
 
-def test_summary__leaves_out_what_was_not_measured() -> None:
+def test_summary__leaves_out_what_was_not_measured():
     runs = [run("a", "x", i, e) for i, e in ((0, 1.0), (1, 3.0))]
     runs += [run("a", "y", i, None) for i in (0, 1)]
     result = m.summary(runs)["a"]

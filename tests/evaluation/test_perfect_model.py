@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers_machines import obedient_net
 
-from brokk_min.actuator import PlantState, plant_reset, plant_step
+from brokk_min.actuator import plant_reset, plant_step
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation.baselines import baselines
 from brokk_min.evaluation.perfect_model import (
@@ -20,14 +20,14 @@ from brokk_min.evaluation.perfect_model import (
 )
 from brokk_min.evaluation.rollout import rollout
 from brokk_min.kinematics import forward_kinematics, tool_velocity
-from brokk_min.machine import BROKK_170, Array, limit_command
+from brokk_min.machine import BROKK_170, limit_command
 
 POSES = np.array([BROKK_170.q_start, [-0.8, 0.3, 0.9, 1.5, 1.0]])
 BOUND = PerfectModel(BROKK_170, POSES)
 HORIZON = sum(BLOCKS)
 
 
-def plant_in_motion(rng: np.random.Generator) -> PlantState:
+def plant_in_motion(rng):
     """Spools, valve activation and delayed commands matter."""
     plant = plant_reset(BROKK_170, POSES)
     for _ in range(12):
@@ -36,7 +36,7 @@ def plant_in_motion(rng: np.random.Generator) -> PlantState:
     return plant
 
 
-def test_errors__are_those_that_the_plant_then_has() -> None:
+def test_errors__are_those_that_the_plant_then_has():
     rng = np.random.default_rng(1)
     plant = plant_in_motion(rng)
     u = np.repeat(rng.uniform(-0.6, 0.6, (2, 3, 2, 5)), 3, axis=2)
@@ -52,7 +52,7 @@ def test_errors__are_those_that_the_plant_then_has() -> None:
             np.testing.assert_allclose(result[:, plan, tick], goal - v, atol=1e-5)
 
 
-def test_steady_opening__moves_the_tool_at_the_goal() -> None:
+def test_steady_opening__moves_the_tool_at_the_goal():
     goal = np.array([[0.05, -0.1, 0.02], [0.0, 0.05, -0.08]])
     opening = steady_opening(BROKK_170, POSES, goal)
     u = PerfectModel(BROKK_170, POSES, dither=0.0).commands(opening[:, None], 0)[:, 0]
@@ -64,12 +64,12 @@ def test_steady_opening__moves_the_tool_at_the_goal() -> None:
     np.testing.assert_allclose(v, goal, atol=0.02)  # the arm has moved on meanwhile
 
 
-def test_improve__lowers_the_cost_of_a_plan_within_the_command_limit() -> None:
+def test_improve__lowers_the_cost_of_a_plan_within_the_command_limit():
     rng = np.random.default_rng(2)
     plant = plant_reset(BROKK_170, POSES)
     goal = rng.uniform(-0.2, 0.2, (2, 3))
 
-    def cost(opening: Array) -> Array:
+    def cost(opening):
         errors = BOUND.errors(plant, BOUND.commands(opening, 0)[:, None], goal)
         return np.linalg.norm(errors, axis=-1).mean(axis=(1, 2))
 
@@ -86,7 +86,7 @@ def test_improve__lowers_the_cost_of_a_plan_within_the_command_limit() -> None:
     assert np.abs(BOUND.improve(plant, plan, 9 * goal, 0)).max() == pytest.approx(limit)
 
 
-def test_quantise__takes_the_best_of_all_roundings() -> None:
+def test_quantise__takes_the_best_of_all_roundings():
     rng = np.random.default_rng(3)
     plant = plant_in_motion(rng)
     goal = rng.uniform(-0.2, 0.2, (2, 3))
@@ -101,7 +101,7 @@ def test_quantise__takes_the_best_of_all_roundings() -> None:
     np.testing.assert_allclose(BOUND.quantise(plant, opening, goal, 5), expected, atol=1e-9)
 
 
-def test_commands__alternate_about_openings_near_zero() -> None:
+def test_commands__alternate_about_openings_near_zero():
     """By the dither of 0.04, less half the opening; from 0.08 on not at all."""
     u = BOUND.commands(np.tile([0.0, 0.04, 0.08, -0.3], (4, 1)), 3)
     assert not u[:, BROKK_170.locked].any()
@@ -111,7 +111,7 @@ def test_commands__alternate_about_openings_near_zero() -> None:
     np.testing.assert_allclose(result, expected * 2, atol=1e-8)
 
 
-def test_start__is_the_plant_at_rest_at_its_poses() -> None:
+def test_start__is_the_plant_at_rest_at_its_poses():
     plan = BOUND.start(4)
     np.testing.assert_array_equal(plan.plant.q, np.concatenate([POSES, POSES]))
     assert plan.tick == 0 and not plan.opening.any()
@@ -119,7 +119,7 @@ def test_start__is_the_plant_at_rest_at_its_poses() -> None:
         BOUND.start(3)
 
 
-def test_perfect_model__leaves_less_error_than_a_pid() -> None:
+def test_perfect_model__leaves_less_error_than_a_pid():
     goals = np.zeros((50, 2, 3))
     goals[10:30, :, 2] = 0.15
     goals[30:, :, 1] = -0.1

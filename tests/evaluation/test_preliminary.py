@@ -11,9 +11,9 @@ from helpers_machines import small_net
 
 from brokk_min.evaluation import preliminary
 from brokk_min.evaluation.preliminary import Motion, Sweep
-from brokk_min.identification.validation import Simulator, net_simulator, plant_simulator
+from brokk_min.identification.validation import net_simulator, plant_simulator
 from brokk_min.kinematics import forward_kinematics, tool_position
-from brokk_min.machine import BROKK_170, Machine
+from brokk_min.machine import BROKK_170
 from examples.mini_excavator import MINI_EXCAVATOR
 
 LOW, HIGH = BROKK_170.column("q_min"), BROKK_170.column("q_max")
@@ -21,24 +21,24 @@ PLANT = plant_simulator(BROKK_170)
 DRIVEN = [0, 2, 3, 4]
 
 
-def two_speeds(up: float, down: float) -> Simulator:
+def two_speeds(up, down):
     """Joints that move at one speed in each direction, whatever the command."""
 
-    def simulate(q: np.ndarray, u: np.ndarray) -> np.ndarray:
+    def simulate(q, u):
         speed = np.where(u > 0, up, np.where(u < 0, -down, 0.0))
         return np.concatenate([q[None], q + np.cumsum(speed, axis=0) / 20])
 
     return simulate
 
 
-def standing(q: np.ndarray, u: np.ndarray) -> np.ndarray:
+def standing(q, u):
     return np.repeat(q[None], len(u) + 1, axis=0)
 
 
 # --- tests of one simulator -----------------------------------------------------------------------
 
 
-def test_sweeps__go_from_stop_to_stop_at_the_papers_speeds() -> None:
+def test_sweeps__go_from_stop_to_stop_at_the_papers_speeds():
     u = np.zeros((2, 5))
     u[:, 4] = [80 / 127, -80 / 127]
     up, down = preliminary.sweeps(BROKK_170, PLANT, 4, u)
@@ -49,20 +49,20 @@ def test_sweeps__go_from_stop_to_stop_at_the_papers_speeds() -> None:
         np.testing.assert_allclose(np.diff(sweep.q) * 20, sweep.q_dot[1:], atol=1e-9)
 
 
-def test_sweeps__of_a_joint_that_never_moves_have_one_sample() -> None:
+def test_sweeps__of_a_joint_that_never_moves_have_one_sample():
     (sweep,) = preliminary.sweeps(BROKK_170, standing, 4, np.zeros((1, 5)))
     assert sweep.q.tolist() == [HIGH[4]] and sweep.q_dot.tolist() == [0]
 
 
-def test_other_commands__are_those_of_the_paper() -> None:
+def test_other_commands__are_those_of_the_paper():
     u = preliminary.other_commands(BROKK_170, 4) * 127
     np.testing.assert_allclose(u, [-80, 0, -80, 80, 0])  # u1 and u3 175, u4 80
 
 
-def test_preliminary_tests__move_the_last_driven_joint_at_two_levels() -> None:
+def test_preliminary_tests__move_the_last_driven_joint_at_two_levels():
     calls = []
 
-    def simulate(q: np.ndarray, u: np.ndarray) -> np.ndarray:
+    def simulate(q, u):
         calls.append((q, u))
         return two_speeds(0.25, 0.5)(q, u)
 
@@ -85,7 +85,7 @@ def test_preliminary_tests__move_the_last_driven_joint_at_two_levels() -> None:
     assert list(tests.response_time) == ["q1", "q3", "q4", "q5"]
 
 
-def test_preliminary_tests__of_the_plant_have_the_papers_response_times() -> None:
+def test_preliminary_tests__of_the_plant_have_the_papers_response_times():
     tests = preliminary.preliminary_tests(BROKK_170, PLANT)
     for joint in tests.response_time.values():
         assert joint["idle"]["up"] == pytest.approx(0.40, abs=0.01)
@@ -94,7 +94,7 @@ def test_preliminary_tests__of_the_plant_have_the_papers_response_times() -> Non
     assert together < 0.002  # "marginal and neglectable"
 
 
-def test_simulators__leave_locked_joints_where_they_are() -> None:
+def test_simulators__leave_locked_joints_where_they_are():
     net = small_net(BROKK_170, np.random.default_rng(0), BROKK_170.names)
     both = preliminary.simulators(BROKK_170, net)
     q, u = np.tile((LOW + HIGH) / 2, (2, 1)), np.full((3, 2, 5), 0.5)
@@ -108,17 +108,17 @@ def test_simulators__leave_locked_joints_where_they_are() -> None:
 # --- the gap --------------------------------------------------------------------------------------
 
 
-def test_sim_to_real__of_a_machine_to_itself_is_zero() -> None:
+def test_sim_to_real__of_a_machine_to_itself_is_zero():
     gap = preliminary.sim_to_real(BROKK_170, {"machine": PLANT, "nets": PLANT}, 0)
     assert not any(array.any() for array in gap)
 
 
 @pytest.mark.parametrize("machine", [BROKK_170, replace(BROKK_170, q_start=())])
-def test_sim_to_real__is_between_tools_where_the_arms_end(machine: Machine) -> None:
+def test_sim_to_real__is_between_tools_where_the_arms_end(machine):
     """Nets that stand still: the gap is what the machine moved, from its own start pose."""
     calls = {}
 
-    def plant(q: np.ndarray, u: np.ndarray) -> np.ndarray:
+    def plant(q, u):
         calls["u"] = u
         calls["q"] = PLANT(q, u)
         return calls["q"]
@@ -139,7 +139,7 @@ def test_sim_to_real__is_between_tools_where_the_arms_end(machine: Machine) -> N
 # --- numbers --------------------------------------------------------------------------------------
 
 
-def test_numbers__of_another_machine_are_json() -> None:
+def test_numbers__of_another_machine_are_json():
     machine = MINI_EXCAVATOR
     net = small_net(machine, np.random.default_rng(0), machine.names)
     measured = preliminary.run(machine, net, 0)
@@ -153,7 +153,7 @@ def test_numbers__of_another_machine_are_json() -> None:
     assert not measured.gap.q[..., machine.locked].any()
 
 
-def test_sweep_numbers__are_peaks_and_a_difference_without_the_outer_twentieths() -> None:
+def test_sweep_numbers__are_peaks_and_a_difference_without_the_outer_twentieths():
     q = np.linspace(0.0, 1.0, 201)
     ends = np.where((q < 0.03) | (q > 0.97), 7.0, 0.3)
     result = preliminary.sweep_numbers(Sweep(q[::-1], -0.5 + 0 * q), Sweep(q, ends))
@@ -163,7 +163,7 @@ def test_sweep_numbers__are_peaks_and_a_difference_without_the_outer_twentieths(
     assert preliminary.sweep_rms(Sweep(q, 0.3 + 0 * q), Sweep(q, wider)) > 0.1
 
 
-def test_gap_numbers__by_hand() -> None:
+def test_gap_numbers__by_hand():
     """Two ticks, three runs; run k is off by k + 1 as much, and the first counts for joints."""
     size = np.arange(1, 4)[:, None]
     q = np.array([0.1, -0.3])[:, None, None] * size * np.array([1.0, 9, 2, 3, 4])

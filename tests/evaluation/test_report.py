@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 import re
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,13 +17,11 @@ POSE = list(BROKK_170.q_start)
 CLOCK = {"fit": 12.4, "train": 3600.0}
 
 
-def number(
-    mean: float | None, low: float | None = None, high: float | None = None
-) -> dict[str, Any]:
+def number(mean, low=None, high=None):
     return {"mean": mean, "low": low, "high": high}
 
 
-def made_up() -> dict[str, Any]:
+def made_up():
     """Results with two controllers, two sequences, and one number of each kind."""
     means = {"rl": (0.01, 0.02), "p_d": (0.03, 0.05)}
     both = [(s, i) for i, s in enumerate(("x", "all"))]
@@ -83,7 +80,7 @@ IMAGES = ["tests", "free_run", "learning", "gap", "starts", "x", "y", "z", "join
 IMAGES += ["by_sequence", "regret", "singular", "seeds"]
 
 
-def sections(results: dict[str, Any], left_out: str = "") -> dict[str, str]:
+def sections(results, left_out=""):
     """Sections of the page by their titles, each image as its name."""
     images = {name: name for name in IMAGES if name != left_out}
     page = report.render(BROKK_170, results, images, CLOCK)
@@ -93,7 +90,7 @@ def sections(results: dict[str, Any], left_out: str = "") -> dict[str, str]:
     return {"": first} | dict(zip(titles, parts, strict=True))
 
 
-def rows(section: str) -> list[list[str]]:
+def rows(section):
     """Cells of all tables of a section."""
     result = []
     for line in re.findall(r"<tr>(.*?)</tr>", section, re.DOTALL):
@@ -102,7 +99,7 @@ def rows(section: str) -> list[list[str]]:
     return result
 
 
-def test_render__has_the_papers_figures_in_order() -> None:
+def test_render__has_the_papers_figures_in_order():
     result = sections(made_up())
     numbered = [title for title in result if "(Fig." in title or title == "Learning curve"]
     assert numbered == [
@@ -117,7 +114,7 @@ def test_render__has_the_papers_figures_in_order() -> None:
     assert not any("singularity" in title for title in sections(made_up(), left_out="singular"))
 
 
-def test_render__is_one_file_and_escapes_names() -> None:
+def test_render__is_one_file_and_escapes_names():
     page = report.render(BROKK_170, made_up(), dict.fromkeys(IMAGES, "QUJD"), CLOCK)
     assert page.startswith("<!doctype html>") and page.rstrip().endswith("</html>")
     assert page.count('src="data:image/png;base64,QUJD"') == 12
@@ -126,7 +123,7 @@ def test_render__is_one_file_and_escapes_names() -> None:
     assert "Time of each stage [s]: fit 12, train 3600." in page
 
 
-def test_render__answers_the_papers_sentences_first() -> None:
+def test_render__answers_the_papers_sentences_first():
     text = sections(made_up())["Results"]
     assert "all sequences [m/s]: rl 0.0200, p_d 0.0500." in text
     assert "an error of 0.0050 m/s" in text and "It has 0.0080 m/s if" in text
@@ -138,7 +135,7 @@ def test_render__answers_the_papers_sentences_first() -> None:
     ]  # fmt: skip
 
 
-def test_render__quotes_each_claim_below_its_figure() -> None:
+def test_render__quotes_each_claim_below_its_figure():
     result = sections(made_up())
     quotes = {title: text.count("<blockquote>") for title, text in result.items()}
     assert quotes["Motion along x (Fig. 6b-d)"] == 2 and quotes["Figures of merit"] == 1
@@ -155,7 +152,7 @@ def test_render__quotes_each_claim_below_its_figure() -> None:
     assert rows(singular)[1] == ["rl", "0.3", "1.5", "0.1", "2"]
 
 
-def test_render__has_the_tables_of_nets_and_of_the_comparison() -> None:
+def test_render__has_the_tables_of_nets_and_of_the_comparison():
     result = {title: rows(text)[1:] for title, text in sections(made_up()).items()}
     error, drift = f"{ERROR} [m/s]", f"{DRIFT} [m]"
     assert result["Actuator nets"] == [
@@ -190,7 +187,7 @@ def test_render__has_the_tables_of_nets_and_of_the_comparison() -> None:
     assert robust[2] == ["nominal", "-0.0300"] and robust[4] == ["nominal", "125 %", "12.5 %"]
 
 
-def test_render__lists_what_was_scored_and_tuned_on() -> None:
+def test_render__lists_what_was_scored_and_tuned_on():
     result = {title: rows(text) for title, text in sections(made_up()).items()}
     assert [row[0] for row in result["Scored sequences"][1:4]] == ["x", "y", "z"]
     assert result["Scored sequences"][1][1] == "18"
@@ -202,7 +199,7 @@ def test_render__lists_what_was_scored_and_tuned_on() -> None:
     assert run[10] == "1 s (0, 0, 0); 2 s (0.3, 0, 0.4)"
 
 
-def test_render__shows_training_seeds() -> None:
+def test_render__shows_training_seeds():
     row = {"velocity_error_x": number(0.5, 0.25, 0.75), "valve_travel": number(9.0)}
     less = {"velocity_error_x": number(-0.5), "valve_travel": number(1.0)}
     text = sections(made_up() | {"training_seeds": {"rl": row, "rl less p_d": less}})
@@ -220,11 +217,11 @@ def test_render__shows_training_seeds() -> None:
         (number(None), ""),
     ],
 )
-def test_interval_text__has_digits_that_tell_it(value: Any, text: str) -> None:
+def test_interval_text__has_digits_that_tell_it(value, text):
     assert report.interval_text(value) == text
 
 
-def test_path_row__lists_the_goals_that_hold() -> None:
+def test_path_row__lists_the_goals_that_hold():
     row = report.path_row(np.array([[1.0, 0.0, 0.0, 0.0], [0.85, -0.0, -0.2, 0.0]]))
     *numbers, goals = row.values()
     assert numbers == pytest.approx([1.85, 1, 0.2, 0.17])
@@ -232,7 +229,7 @@ def test_path_row__lists_the_goals_that_hold() -> None:
     assert report.path_row(np.ones((60, 4)))["held for, vx, vy, vz [m/s]"] == "new at every tick"
 
 
-def test_seed_bars__are_velocity_errors_of_controllers_by_sequence() -> None:
+def test_seed_bars__are_velocity_errors_of_controllers_by_sequence():
     row = {"velocity_error_to_go": number(0.5, 0.25, 0.75), "valve_travel": number(9.0)}
     bars = report.seed_bars({"rl": row, "pid": row, "rl less pid": row})
     errors = {"to_go": row["velocity_error_to_go"]}

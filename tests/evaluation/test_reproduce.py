@@ -6,13 +6,11 @@ import html
 import json
 import re
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from helpers_machines import small_net
-from numpy.typing import NDArray
 
 from brokk_min import kinematics
 from brokk_min.evaluation import baselines, reproduce
@@ -36,15 +34,15 @@ Results = dict[str, Any]
 class Idle:
     """A controller that sends no commands."""
 
-    def start(self, num: int) -> None:
+    def start(self, num):
         return None
 
-    def __call__(self, measured: Any, state: None) -> tuple[NDArray[np.float64], None]:
+    def __call__(self, measured, state):
         return np.zeros((len(measured.q), BROKK_170.n)), None
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """What one run of the chain wrote."""
     out = tmp_path_factory.mktemp("a b") / "new"  # a space in the path
     reproduce.reproduce(BROKK_170, out, TINY, 3)
@@ -52,15 +50,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def results(folder: Path) -> Results:
-    loaded: Results = json.loads((folder / "results.json").read_text())
+def results(folder):
+    loaded = json.loads((folder / "results.json").read_text())
     return loaded
 
 
 # --- the chain ------------------------------------------------------------------------------------
 
 
-def test_reproduce__gives_the_same_bits_twice(folder: Path, tmp_path: Path) -> None:
+def test_reproduce__gives_the_same_bits_twice(folder, tmp_path):
     reproduce.reproduce(BROKK_170, tmp_path, TINY, 3)
     for name in ("log.npz", "net.npz", "policy.npz", "gains.json", "results.json"):
         assert (folder / name).read_bytes() == (tmp_path / name).read_bytes(), name
@@ -68,9 +66,7 @@ def test_reproduce__gives_the_same_bits_twice(folder: Path, tmp_path: Path) -> N
     assert list(clock) == ["record", "fit", "train", "tune", "evaluate", "draw"]
 
 
-def test_reproduce__writes_files_that_the_other_commands_read(
-    folder: Path, results: Results
-) -> None:
+def test_reproduce__writes_files_that_the_other_commands_read(folder, results):
     log = read_log([folder / "log.npz"], BROKK_170.velocity_samples, rate=20.0)
     assert log.joints == load_net(folder / "net.npz").joints == BROKK_170.names
     policy = load_policy(folder / "policy.npz", BROKK_170)
@@ -84,7 +80,7 @@ def test_reproduce__writes_files_that_the_other_commands_read(
     assert results["meta"]["effort"]["train_steps"] == 8192
 
 
-def test_reproduce__results_hold_every_run_with_its_figures(results: Results) -> None:
+def test_reproduce__results_hold_every_run_with_its_figures(results):
     runs = results["task_space"]["runs"]
     sequences = [sequence.name for sequence in task_sequences(BROKK_170)]
     keys = {(run["controller"], run["sequence"], run["start"]) for run in runs}
@@ -101,7 +97,7 @@ def test_reproduce__results_hold_every_run_with_its_figures(results: Results) ->
     assert set(results["task_space"]["rl_on_nets"]) == {*"xyz", "all"}
 
 
-def test_reproduce__results_answer_the_papers_sentences(results: Results) -> None:
+def test_reproduce__results_answer_the_papers_sentences(results):
     assert len(results["net_claims"]) == 4
     assert [claim["figure"] for claim in results["claims"]] == [
         *["Fig. 6b-d"] * 3, *["Fig. 6a, e, f"] * 3, "Fig. 6e, f", "Fig. 6g, h", "Sec. 5"
@@ -117,7 +113,7 @@ def test_reproduce__results_answer_the_papers_sentences(results: Results) -> Non
         assert claim["stronger"]["holds"] is all(n["high"] < 0 for n in numbers.values())
 
 
-def test_reproduce__results_compare_with_the_bound_and_on_other_machines(results: Results) -> None:
+def test_reproduce__results_compare_with_the_bound_and_on_other_machines(results):
     less = results["regret"]["less_perfect_model"]
     assert set(less) == {"rl", *PIDS} and set(less["rl"]) == {*"xyz", "all"}
     means = results["regret"]["summary"]
@@ -128,7 +124,7 @@ def test_reproduce__results_compare_with_the_bound_and_on_other_machines(results
     assert set(results["robustness"]["nominal"]) == {"rl", *PIDS}
 
 
-def test_reproduce__results_record_the_tuning(results: Results) -> None:
+def test_reproduce__results_record_the_tuning(results):
     assert set(results["tuning"]) == set(results["gains"]) == set(PIDS)
     starts, goals = tuning_set(BROKK_170, TINY.tuning_runs, 3)
     np.testing.assert_allclose([run["start"] for run in results["tuning_runs"]], starts)
@@ -138,7 +134,7 @@ def test_reproduce__results_record_the_tuning(results: Results) -> None:
         np.testing.assert_allclose(np.repeat(table[:, 1:], ticks, axis=0), goals[:, i])
 
 
-def test_reproduce__report_is_one_file_with_its_figures(folder: Path, results: Results) -> None:
+def test_reproduce__report_is_one_file_with_its_figures(folder, results):
     page = (folder / "report.html").read_text()
     assert len(re.findall(r'src="data:image/png;base64,iVBOR', page)) == 12
     text = re.sub(r'base64,[^"]*', "", page)  # letters of an image may spell anything
@@ -151,7 +147,7 @@ def test_reproduce__report_is_one_file_with_its_figures(folder: Path, results: R
 # --- stages ---------------------------------------------------------------------------------------
 
 
-def test_budget__is_what_fit_and_train_spend_by_default() -> None:
+def test_budget__is_what_fit_and_train_spend_by_default():
     assert (Budget().fit_steps, Budget().train_steps) == (
         FitConfig().steps,
         PPOConfig().total_steps,
@@ -159,7 +155,7 @@ def test_budget__is_what_fit_and_train_spend_by_default() -> None:
     assert all(vars(QUICK)[name] < value for name, value in vars(Budget()).items())
 
 
-def test_paper_recipe__is_scored_on_the_test_log(folder: Path) -> None:
+def test_paper_recipe__is_scored_on_the_test_log(folder):
     test = read_log([folder / "log_test.npz"], 4, rate=20.0)
     config = FitConfig(steps=3, batch_size=8)
     result = reproduce.paper_recipe(BROKK_170, test, 0.02, config, 0)
@@ -167,10 +163,10 @@ def test_paper_recipe__is_scored_on_the_test_log(folder: Path) -> None:
     assert result["sim_to_real"]["tool_position_error_mean_of_runs"]["runs"] == 20
 
 
-def test_driven_log__has_commands_and_encoder_angles_of_one_controller() -> None:
+def test_driven_log__has_commands_and_encoder_angles_of_one_controller():
     rng = np.random.default_rng(0)
 
-    def trace(runs: int) -> Trace:
+    def trace(runs):
         arrays = [rng.normal(size=(30, runs, n)) for n in (5, 5, 5, 5, 3, 3)]
         return Trace(*arrays, rng.normal(size=(30, runs)))
 
@@ -185,7 +181,7 @@ def test_driven_log__has_commands_and_encoder_angles_of_one_controller() -> None
     np.testing.assert_allclose(third.q_dot, velocity_of(third.q, 4, 10.0))
 
 
-def test_tables__keep_kinds_of_starts_apart() -> None:
+def test_tables__keep_kinds_of_starts_apart():
     rows = []
     for controller, base in (("rl", 1.0), ("pid", 4.0)):
         for sequence in "xy":
@@ -204,12 +200,12 @@ def test_tables__keep_kinds_of_starts_apart() -> None:
     assert (low, high) == pytest.approx((2 - 12.7062, 2 + 12.7062), abs=1e-3)
 
 
-def test_shorten__keeps_the_first_seconds() -> None:
+def test_shorten__keeps_the_first_seconds():
     short = reproduce.shorten(BROKK_170, axis_sequences(BROKK_170), 3.0)
     assert [(s.name, len(s.goals)) for s in short] == [("x", 60), ("y", 60), ("z", 60)]
 
 
-def test_near_singularities__drives_along_what_an_upright_arm_can_do_least() -> None:
+def test_near_singularities__drives_along_what_an_upright_arm_can_do_least():
     machine = BROKK_170
     starts = np.array([[0.0, 1.139, 0.97, 2.804, 1.948], [1.0, 1.2, 0.9, 2.8, 1.9]])
     net = small_net(machine, np.random.default_rng(0))

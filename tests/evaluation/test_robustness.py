@@ -22,19 +22,19 @@ STARTS = np.tile(BROKK_170.q_start, (2, 1))
 ALONG_Z = task_sequences(BROKK_170)[2]
 
 
-def test_exact_encoder__gives_whole_counts() -> None:
+def test_exact_encoder__gives_whole_counts():
     read = module.exact_encoder(np.random.default_rng(0))
     np.testing.assert_array_equal(read(BROKK_170, Q), read_encoder(BROKK_170, Q))
 
 
-def test_noisy_encoder__has_independent_noise_of_a_count() -> None:
+def test_noisy_encoder__has_independent_noise_of_a_count():
     read = module.noisy_encoder(np.random.default_rng(0))
     counts = (np.array([read(BROKK_170, q) for q in Q]) - Q) / BROKK_170.encoder_step
     assert counts.std() == pytest.approx(np.sqrt(1 + 1 / 12), rel=0.02)
     assert np.abs(np.corrcoef(counts.reshape(-1, 10).T) - np.eye(10)).max() < 0.1
 
 
-def test_lossy_encoder__repeats_one_sample_in_20_of_all_joints_of_a_machine() -> None:
+def test_lossy_encoder__repeats_one_sample_in_20_of_all_joints_of_a_machine():
     read = module.lossy_encoder(np.random.default_rng(0))
     exact = read_encoder(BROKK_170, Q)
     result = np.array([read(BROKK_170, q) for q in Q])
@@ -45,7 +45,7 @@ def test_lossy_encoder__repeats_one_sample_in_20_of_all_joints_of_a_machine() ->
     np.testing.assert_array_equal(result[0], exact[0])
 
 
-def test_variations__change_one_thing_each() -> None:
+def test_variations__change_one_thing_each():
     result = variations(BROKK_170)
     assert len(result) == 12 and result["nominal"][0] is BROKK_170
     sensors = [name for name, (_, sensor) in result.items() if sensor is not module.exact_encoder]
@@ -71,7 +71,7 @@ def test_variations__change_one_thing_each() -> None:
             np.testing.assert_allclose(machine.column(field), factor * BROKK_170.column(field))
 
 
-def test_pump_flow_ratio__is_what_the_plant_divides_among_the_valves() -> None:
+def test_pump_flow_ratio__is_what_the_plant_divides_among_the_valves():
     """With valves open and spools settled, cylinders are as fast as the pump lets them be."""
     u = np.array([[0.4, 0.4, -0.4, 0.4, -0.4], [1.0, -1.0, 1.0, -1.0, 1.0]])
     state = plant_reset(BROKK_170, np.tile([0.0, 0.7, 0.6, 1.7, 1.0], (2, 1)))
@@ -86,7 +86,7 @@ def test_pump_flow_ratio__is_what_the_plant_divides_among_the_valves() -> None:
     np.testing.assert_allclose(state.v, expected, rtol=0.01)
 
 
-def test_robustness__has_a_row_for_each_variation_and_controller() -> None:
+def test_robustness__has_a_row_for_each_variation_and_controller():
     short = [ALONG_Z._replace(goals=ALONG_Z.goals[15:45])]
     controllers = {"rl": PIDS["jacobian_pid_ff_awake"], "pid": PIDS["jacobian_pid_ff"]}
     table = robustness(BROKK_170, controllers, short, STARTS, 0)
@@ -109,7 +109,7 @@ def test_robustness__has_a_row_for_each_variation_and_controller() -> None:
     assert demand["supply flow -20 %"] == pytest.approx(demand["nominal"] / 0.8)
 
 
-def test_robustness__shows_how_often_the_pump_is_the_limit() -> None:
+def test_robustness__shows_how_often_the_pump_is_the_limit():
     weak = replace(BROKK_170, pump_flow=0.1 * BROKK_170.pump_flow)
     short = [ALONG_Z._replace(goals=ALONG_Z.goals[15:45])]
     row = robustness(weak, {"pid": PIDS["jacobian_pid_ff"]}, short, STARTS[:1], 0)["nominal"]["pid"]

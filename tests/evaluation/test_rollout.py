@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from strategies import machines
 
 from brokk_min.actuator import plant_reset, plant_step
-from brokk_min.env import Measured, TaskConfig, initial_state, transition
+from brokk_min.env import TaskConfig, initial_state, transition
 from brokk_min.evaluation.baselines import make_gains
 from brokk_min.evaluation.rollout import rollout
 from brokk_min.jacobian import JacobianController
-from brokk_min.machine import BROKK_170, Machine, limit_command, read_encoder
+from brokk_min.machine import BROKK_170, limit_command, read_encoder
 
 START = np.array([BROKK_170.q_start, np.add(BROKK_170.q_start, 0.1)])
 QUIET = TaskConfig(noise=0.0)
@@ -22,23 +22,23 @@ QUIET = TaskConfig(noise=0.0)
 class Playback:
     """Sends given commands (T, num, n) and keeps what it measured."""
 
-    def __init__(self, commands: np.ndarray) -> None:
+    def __init__(self, commands):
         self.commands = commands
-        self.measured: list[Measured] = []
+        self.measured = []
 
-    def start(self, num: int) -> int:
+    def start(self, num):
         return 0
 
-    def __call__(self, measured: Measured, tick: int) -> tuple[np.ndarray, int]:
+    def __call__(self, measured, tick):
         self.measured.append(measured)
         return self.commands[tick], tick + 1
 
 
-def random_commands(rng: np.random.Generator, ticks: int) -> np.ndarray:
+def random_commands(rng, ticks):
     return limit_command(BROKK_170, rng.uniform(-1, 1, (ticks, 2, 5)))
 
 
-def test_rollout__records_each_tick_of_the_plant() -> None:
+def test_rollout__records_each_tick_of_the_plant():
     rng = np.random.default_rng(19)
     controller = Playback(random_commands(rng, 40))
     goals = np.repeat(rng.uniform(-0.3, 0.3, (4, 2, 3)), 10, axis=0)
@@ -61,13 +61,13 @@ def test_rollout__records_each_tick_of_the_plant() -> None:
     np.testing.assert_allclose(moved, trace.v_tool[21:], atol=0.01)
 
 
-def test_rollout__moves_by_nets_and_reads_the_given_encoders() -> None:
+def test_rollout__moves_by_nets_and_reads_the_given_encoders():
     rng = np.random.default_rng(20)
     net = small_net(BROKK_170, rng)
     controller = Playback(random_commands(rng, 8))
     goals = np.zeros((8, 2, 3))
 
-    def shifted(machine: Machine, q: np.ndarray) -> np.ndarray:
+    def shifted(machine, q):
         return read_encoder(machine, q + 0.01)
 
     trace = rollout(BROKK_170, controller, START, goals, QUIET, rng, net, shifted)
@@ -79,7 +79,7 @@ def test_rollout__moves_by_nets_and_reads_the_given_encoders() -> None:
     assert np.abs(trace.q[-1] - START).max() > 0.01
 
 
-def test_rollout__gives_noisy_measurements_that_a_seed_repeats() -> None:
+def test_rollout__gives_noisy_measurements_that_a_seed_repeats():
     measured = []
     for config, seed in ((TaskConfig(), 1), (TaskConfig(), 1), (QUIET, 1)):
         controller = Playback(np.zeros((30, 2, 5)))
@@ -94,9 +94,7 @@ def test_rollout__gives_noisy_measurements_that_a_seed_repeats() -> None:
 
 @settings(max_examples=10)
 @given(machines(), st.integers(0, 2**31))
-def test_rollout__keeps_commands_of_any_machine_within_its_limit(
-    machine: Machine, seed: int
-) -> None:
+def test_rollout__keeps_commands_of_any_machine_within_its_limit(machine, seed):
     gains = make_gains(machine, kp=1.0, ki=1.0, kd=0.0, feedback=0.2, min_opening=0.0)
     controller = JacobianController(machine, gains, 0.1, 0.1)
     start = np.tile((machine.column("q_min") + machine.column("q_max")) / 2, (3, 1))

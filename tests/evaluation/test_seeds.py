@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -101,7 +100,7 @@ def test_sweep__writes_all_runs_and_does_nothing_twice(tmp_path, short):
     task = TaskConfig(episode_s=0.6)
     with distributed.LocalCluster(threads_per_worker=1, **options) as cluster:
 
-        def sweep(config: PPOConfig, out: Path):
+        def sweep(config, out):
             address = cluster.scheduler_address
             return seeds.sweep(BROKK_170, NET, task, config, range(3, 5), out, 2, address)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,14 +15,14 @@ from brokk_min.env import TaskConfig
 from brokk_min.evaluation import sequences as s
 from brokk_min.kinematics import forward_kinematics, jacobian, lowest_point, tool_position
 from brokk_min.learning.episodes import draw_pose
-from brokk_min.machine import BROKK_170, Array, Machine, valve_opening
+from brokk_min.machine import BROKK_170, valve_opening
 
 START = np.array(BROKK_170.q_start)
 UPRIGHT = [0.0, 1.139, 0.97, 2.804, 1.948]  # tool 0.1 m from the slew axis
 STILL = np.zeros((2, 1, 3))
 
 
-def goals_by_name(machine: Machine) -> dict[str, Array]:
+def goals_by_name(machine):
     return {sequence.name: sequence.goals for sequence in s.task_sequences(machine)}
 
 
@@ -31,7 +30,7 @@ def goals_by_name(machine: Machine) -> dict[str, Array]:
 
 
 @pytest.mark.parametrize("tool_speed", [0.3, 0.6])
-def test_axis_sequences__move_along_one_axis_and_back(tool_speed: float) -> None:
+def test_axis_sequences__move_along_one_axis_and_back(tool_speed):
     """At two thirds and one third of the largest tool speed."""
     fast = tool_speed * 2 / 3
     for i, sequence in enumerate(s.axis_sequences(replace(BROKK_170, tool_speed=tool_speed))):
@@ -40,7 +39,7 @@ def test_axis_sequences__move_along_one_axis_and_back(tool_speed: float) -> None
         np.testing.assert_allclose(speeds, [-fast, -fast / 2, 0, fast / 2, fast])
 
 
-def test_task_sequences__last_18_seconds_and_end_at_rest_where_they_began() -> None:
+def test_task_sequences__last_18_seconds_and_end_at_rest_where_they_began():
     for name, goals in goals_by_name(BROKK_170).items():
         assert goals.shape == (360, 3), name
         assert not goals[:20].any() and not goals[-20:].any()
@@ -48,7 +47,7 @@ def test_task_sequences__last_18_seconds_and_end_at_rest_where_they_began() -> N
         assert np.linalg.norm(goals, axis=-1).max() <= BROKK_170.tool_speed
 
 
-def test_task_sequences__by_hand() -> None:
+def test_task_sequences__by_hand():
     goals = goals_by_name(BROKK_170)
     assert list(goals)[:3] == ["x", "y", "z"]
     assert list(goals)[3:6] == ["diagonal_flat", "diagonal_rise", "circle"]
@@ -68,7 +67,7 @@ def test_task_sequences__by_hand() -> None:
     assert np.sum(np.diff(moving.astype(int)) == 1) == 8
 
 
-def test_singular_sequences__move_where_the_joints_must_move_most() -> None:
+def test_singular_sequences__move_where_the_joints_must_move_most():
     """By hand: close to the slew axis sideways motion is the hardest."""
     starts = np.array([UPRIGHT, [0.5, *UPRIGHT[1:]], START])
     half, quarter = s.singular_sequences(BROKK_170, starts)
@@ -88,7 +87,7 @@ def test_singular_sequences__move_where_the_joints_must_move_most() -> None:
     assert (np.linalg.norm((J_inv @ others[..., None])[..., 0], axis=-1) <= hardest + 1e-9).all()
 
 
-def test_for_starts__takes_goals_of_all_starts_or_of_each() -> None:
+def test_for_starts__takes_goals_of_all_starts_or_of_each():
     goals = np.arange(12.0).reshape(2, 2, 3)
     np.testing.assert_array_equal(s.Commands("each", goals).for_starts(2), goals)
     np.testing.assert_array_equal(s.Commands("each", goals).for_starts(1), goals[:, :1])
@@ -97,7 +96,7 @@ def test_for_starts__takes_goals_of_all_starts_or_of_each() -> None:
 
 
 @given(st.lists(st.tuples(st.integers(1, 9), st.integers(-3, 3)), min_size=1))
-def test_hold_table__held_again_gives_the_goals(parts: list[tuple[int, int]]) -> None:
+def test_hold_table__held_again_gives_the_goals(parts):
     goals = np.concatenate([np.full((ticks, 3), value / 10) for ticks, value in parts])
     table = s.hold_table(BROKK_170, goals)
     ticks = np.rint(table[:, 0] * 20).astype(int)
@@ -108,7 +107,7 @@ def test_hold_table__held_again_gives_the_goals(parts: list[tuple[int, int]]) ->
 # --- files ----------------------------------------------------------------------------------------
 
 
-def test_read_commands__holds_values_until_the_next_row(tmp_path: Path) -> None:
+def test_read_commands__holds_values_until_the_next_row(tmp_path):
     path = tmp_path / "c.csv"
     rows = "a,5,1,2,3\na,5.1,4,5,6\na,5.15,0,0,0\nb,0,7,8,9\nb,0.05,0,0,0\n"
     path.write_text(f"sequence,time,vx,vy,vz\n{rows}")
@@ -138,9 +137,7 @@ def test_read_commands__holds_values_until_the_next_row(tmp_path: Path) -> None:
         ("sequence,time,vx,vy,vz\nall,1,0,0,0\nall,2,0,0,0\n", "another name than all"),
     ],
 )
-def test_read_commands__refuses_what_is_no_sequence(
-    tmp_path: Path, text: str, message: str
-) -> None:
+def test_read_commands__refuses_what_is_no_sequence(tmp_path, text, message):
     path = tmp_path / "c.csv"
     path.write_text(text)
     with pytest.raises(ValueError, match=message) as error:
@@ -148,7 +145,7 @@ def test_read_commands__refuses_what_is_no_sequence(
     assert str(path) in str(error.value)
 
 
-def test_read_starts__reads_what_write_starts_wrote(tmp_path: Path) -> None:
+def test_read_starts__reads_what_write_starts_wrote(tmp_path):
     path = tmp_path / "s.csv"
     starts = np.array([[0.5, 0.5, 0.58, 1.71, 1.24], [-0.25, 0.5, 0.1, 2.0, 1.0]])
     s.write_starts(path, BROKK_170, starts)
@@ -163,16 +160,14 @@ def test_read_starts__reads_what_write_starts_wrote(tmp_path: Path) -> None:
         ("0,0,-0.3,2.5,1.2", r"s.csv: row 3: expected the whole arm above 0.0 m, got -"),
     ],
 )
-def test_read_starts__refuses_poses_out_of_range_or_in_the_ground(
-    tmp_path: Path, row: str, message: str
-) -> None:
+def test_read_starts__refuses_poses_out_of_range_or_in_the_ground(tmp_path, row, message):
     path = tmp_path / "s.csv"
     path.write_text(f"q1,q2,q3,q4,q5\n0,0.5,0.5,1.7,1.2\n{row}\n")
     with pytest.raises(ValueError, match=message):
         s.read_starts(path, BROKK_170)
 
 
-def test_goals_and_starts__are_of_the_files_or_the_machines_own(tmp_path: Path) -> None:
+def test_goals_and_starts__are_of_the_files_or_the_machines_own(tmp_path):
     starts_file = tmp_path / "s.csv"
     commands_file = tmp_path / "c.csv"
     s.write_starts(starts_file, BROKK_170, START[None])
@@ -188,7 +183,7 @@ def test_goals_and_starts__are_of_the_files_or_the_machines_own(tmp_path: Path) 
 # --- start poses ----------------------------------------------------------------------------------
 
 
-def test_evaluation_starts__of_the_package_are_of_all_kinds() -> None:
+def test_evaluation_starts__of_the_package_are_of_all_kinds():
     starts = s.evaluation_starts(BROKK_170, 64, [], 0)
     kinds = np.array(s.start_kinds(BROKK_170, starts))
     assert [np.sum(kinds == kind) for kind in s.KINDS] == [32, 16, 16]
@@ -202,9 +197,7 @@ def test_evaluation_starts__of_the_package_are_of_all_kinds() -> None:
         s.evaluation_starts(BROKK_170, 65, [], 0)
 
 
-def test_evaluation_starts__of_the_package_are_those_of_their_seed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_evaluation_starts__of_the_package_are_those_of_their_seed(monkeypatch):
     """`brokk-min starts` draws the file; here its first ones, from a part of the poses."""
     starts = s.evaluation_starts(BROKK_170, 4, [], 0)
     poses = draw_pose(BROKK_170, TaskConfig(), np.random.default_rng(2), 4000).round(4)
@@ -216,7 +209,7 @@ def test_evaluation_starts__of_the_package_are_those_of_their_seed(
     np.testing.assert_array_equal(drawn, starts)
 
 
-def test_evaluation_starts__of_another_machine_are_drawn() -> None:
+def test_evaluation_starts__of_another_machine_are_drawn():
     other = replace(BROKK_170, name="other")
     sequences = [s.Commands("z", s.axis_sequences(other)[2].goals[15:40])]
     starts = s.evaluation_starts(other, 5, sequences, 3)
@@ -227,9 +220,7 @@ def test_evaluation_starts__of_another_machine_are_drawn() -> None:
     np.testing.assert_array_equal(starts, drawn)
 
 
-def test_draw_starts__replaces_a_kind_without_poses_by_workspace(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_draw_starts__replaces_a_kind_without_poses_by_workspace(monkeypatch):
     joints = [replace(j, q_max=1.8) if j.name == "q4" else j for j in BROKK_170.joints]
     folded = replace(BROKK_170, joints=tuple(joints))  # never stretched
     monkeypatch.setattr(s, "draw_pose", lambda *arguments: draw_pose(*arguments[:3], 50))  # faster
@@ -238,9 +229,7 @@ def test_draw_starts__replaces_a_kind_without_poses_by_workspace(
     assert s.start_kinds(folded, starts) == ["workspace", "limits", "workspace", "workspace"]
 
 
-def test_draw_starts__refuses_a_machine_that_can_follow_nothing(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_draw_starts__refuses_a_machine_that_can_follow_nothing(monkeypatch):
     monkeypatch.setattr(s, "draw_pose", lambda *_: np.tile(START, (3, 1)))  # faster
     sequences = [s.Commands("fast", np.full((2, 3), 9.0))]
     message = "^brokk170: expected 2 poses from which all .* feasible, got fewer in 200 draws$"
@@ -260,25 +249,25 @@ def test_draw_starts__refuses_a_machine_that_can_follow_nothing(
         ([0.0, 1.4, 0.5, 2.7, 1.9], "extended"),  # 4.5 of 4.75 m, 0.8 m from the slew axis
     ],
 )
-def test_start_kinds__by_hand(pose: list[float], kind: str) -> None:
+def test_start_kinds__by_hand(pose, kind):
     assert s.start_kinds(BROKK_170, np.array([pose])) == [kind]
 
 
 # --- feasibility ----------------------------------------------------------------------------------
 
 
-def feasible(start: Array, goals: Array = STILL, machine: Machine = BROKK_170) -> bool:
+def feasible(start, goals=STILL, machine=BROKK_170):
     return bool(s.feasible(machine, start[None], goals)[0])
 
 
-def test_feasible__refuses_a_path_out_of_reach() -> None:
+def test_feasible__refuses_a_path_out_of_reach():
     start = np.array([0.0, *START[1:]])
     outward = np.tile([0.2, 0.0, 0.0], (400, 1, 1))  # 4 m further out than 3.05 m: beyond 5 m
     assert not feasible(start, outward)
     assert feasible(start, np.zeros((400, 1, 3)))
 
 
-def test_feasible__refuses_a_path_through_a_singularity() -> None:
+def test_feasible__refuses_a_path_through_a_singularity():
     """Stretched out straight no joint can move the tool outward: it leaves its path."""
     wide = [replace(j, cylinder_base=0.0, q_min=-3.0, q_max=4.0) for j in BROKK_170.joints]
     machine = replace(BROKK_170, joints=tuple(wide))
@@ -290,7 +279,7 @@ def test_feasible__refuses_a_path_through_a_singularity() -> None:
 
 @pytest.mark.parametrize("joint", BROKK_170.driven)
 @pytest.mark.parametrize("end", ["q_min", "q_max"])
-def test_feasible__keeps_a_margin_to_joint_limits(joint: int, end: str) -> None:
+def test_feasible__keeps_a_margin_to_joint_limits(joint, end):
     inward = 1 if end == "q_min" else -1
     near = np.array([0.0, *START[1:]])
     far = near.copy()
@@ -300,14 +289,14 @@ def test_feasible__keeps_a_margin_to_joint_limits(joint: int, end: str) -> None:
     assert not feasible(near) and feasible(far) == high_enough
 
 
-def test_feasible__keeps_a_margin_to_the_ground() -> None:
+def test_feasible__keeps_a_margin_to_the_ground():
     lowest = float(lowest_point(forward_kinematics(BROKK_170, START)))
     assert feasible(START, machine=replace(BROKK_170, ground=lowest - 0.101))
     assert not feasible(START, machine=replace(BROKK_170, ground=lowest - 0.099))
 
 
 @pytest.mark.parametrize("direction", [-1, 1])
-def test_feasible__keeps_a_margin_to_the_speed_limits(direction: int) -> None:
+def test_feasible__keeps_a_margin_to_the_speed_limits(direction):
     start = np.array([0.0, *START[1:]])
     limit = s.speed_limits(BROKK_170, start)[0 if direction < 0 else 1][0]
     radius = np.hypot(*tool_position(forward_kinematics(BROKK_170, start))[:2])
@@ -317,7 +306,7 @@ def test_feasible__keeps_a_margin_to_the_speed_limits(direction: int) -> None:
         assert feasible(start, slewing, machine) == expected
 
 
-def test_feasible__needs_all_of_a_path() -> None:
+def test_feasible__needs_all_of_a_path():
     """Too fast for a tick, then at rest; each start by itself."""
     goals = np.zeros((4, 3, 3))
     goals[0, 0, 1] = 0.7
@@ -328,7 +317,7 @@ def test_feasible__needs_all_of_a_path() -> None:
 
 
 @given(machines(), st.data())
-def test_speed_limits__are_where_the_plant_settles(machine: Machine, data: st.DataObject) -> None:
+def test_speed_limits__are_where_the_plant_settles(machine, data):
     """One joint alone at the command limit, with a pump that suffices."""
     machine = replace(machine, pump_flow=1.0)
     low, high = machine.column("q_min"), machine.column("q_max")
@@ -351,7 +340,7 @@ def test_speed_limits__are_where_the_plant_settles(machine: Machine, data: st.Da
 # --- tuning ---------------------------------------------------------------------------------------
 
 
-def test_tuning_set__is_drawn_like_the_policys_episodes() -> None:
+def test_tuning_set__is_drawn_like_the_policys_episodes():
     config = TaskConfig()
     starts, goals = s.tuning_set(BROKK_170, 8, 7)
     assert starts.shape == (8, 5) and goals.shape == (240, 8, 3)
@@ -368,7 +357,7 @@ def test_tuning_set__is_drawn_like_the_policys_episodes() -> None:
     np.testing.assert_array_equal(goals, again[1])
 
 
-def test_tuning_set__is_apart_from_the_evaluation() -> None:
+def test_tuning_set__is_apart_from_the_evaluation():
     starts, goals = s.tuning_set(BROKK_170, 4, 0, 6.0)
     of_evaluation = s.evaluation_starts(BROKK_170, 64, [], 0)
     assert np.abs(starts[:, None] - of_evaluation).max(axis=-1).min() > 1e-3
@@ -377,7 +366,7 @@ def test_tuning_set__is_apart_from_the_evaluation() -> None:
     assert np.abs(moving[:, None] - np.unique(velocities, axis=0)).max(axis=-1).min() > 1e-6
 
 
-def test_tuning_set__refuses_a_machine_that_can_follow_nothing() -> None:
+def test_tuning_set__refuses_a_machine_that_can_follow_nothing():
     machine = replace(BROKK_170, ground=0.9)  # most arms are too low
     with pytest.raises(ValueError, match=r"brokk170: expected 99999 feasible runs to tune on, got"):
         s.tuning_set(machine, 99999, 0, 0.1)

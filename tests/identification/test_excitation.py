@@ -19,7 +19,7 @@ from brokk_min.identification.excitation import (
     sine_command,
     task_log,
 )
-from brokk_min.identification.logs import Log, Recording, read_log, velocity_of, write_log
+from brokk_min.identification.logs import read_log, velocity_of, write_log
 from brokk_min.machine import BROKK_170, read_encoder
 
 LIMIT = 80 / 127
@@ -31,7 +31,7 @@ LOW, HIGH = BROKK_170.column("q_min"), BROKK_170.column("q_max")
 class Fraction(np.random.Generator):
     """Draws nothing: whatever is uniform lies at `fraction` of its interval, normal draws are 1."""
 
-    def __init__(self, fraction: float | np.ndarray, kind: str = "", sign: int = 1) -> None:
+    def __init__(self, fraction, kind="", sign=1):
         super().__init__(np.random.PCG64(0))
         self.fraction, self.kind, self.sign = fraction, kind, sign
 
@@ -118,7 +118,7 @@ def test_rich_command__by_hand_for_starts_and_dither():
     np.testing.assert_allclose(u[21:36], 0.5 * TOP, atol=1e-12)
 
 
-def held_levels(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def held_levels(u):
     """Levels that follow one another, and the ticks for which each is held."""
     at = np.flatnonzero(np.abs(np.diff(u, prepend=np.nan)) > 1e-9)
     return u[at[:-1]], np.diff(at)
@@ -157,18 +157,18 @@ def test_rich_command__starts_after_pauses_up_to_idle():
 
 
 @pytest.fixture(scope="module")
-def collected() -> dict[str, Log]:
+def collected():
     return {kind: collect(BROKK_170, 0.05, kind, np.random.default_rng(7)) for kind in EXCITATIONS}
 
 
-def segments(log: Log) -> list[tuple[int, Recording, Recording]]:
+def segments(log):
     """Joint, segment and return; the last segment of each joint is cut where the time is over."""
     named = {recording.name: recording for recording in log.recordings}
     names = [name for name in named if not name.endswith("_return")]
     return [(log.joints.index(name[:2]), named[name], named[name + "_return"]) for name in names]
 
 
-def uncut(log: Log) -> list[tuple[int, Recording, Recording]]:
+def uncut(log):
     pairs = segments(log)
     return [pair for pair, after in pairwise(pairs) if pair[0] == after[0]]
 

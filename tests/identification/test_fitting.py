@@ -9,14 +9,14 @@ import pytest
 import torch
 from helpers_machines import line
 
-from brokk_min.actuator import ActuatorNet, initial_history, mu_law
+from brokk_min.actuator import initial_history, mu_law
 from brokk_min.identification import fitting
 from brokk_min.identification.fitting import FitConfig, fit, training_set
 from brokk_min.identification.logs import Log, Recording, join_recordings, velocity_of
 from brokk_min.identification.validation import free_run_step, score
 
 
-def simple_system(seed: int, recordings: int, ticks: int = 300, logged: bool = False) -> Log:
+def simple_system(seed, recordings, ticks=300, logged=False):
     """Two first-order joints, q_ddot = (gain u - q_dot) / tau, turned back at +-0.8 rad."""
     rng = np.random.default_rng(seed)
     gain, tau, shape = np.array([0.5, 1.0]), np.array([0.15, 0.3]), (recordings, 2)
@@ -34,7 +34,7 @@ def simple_system(seed: int, recordings: int, ticks: int = 300, logged: bool = F
     return Log(("boom", "stick"), tuple(result), logged)
 
 
-def same_weights(one: ActuatorNet, two: ActuatorNet) -> bool:
+def same_weights(one, two):
     return all(np.array_equal(a, b) for a, b in zip(one.weights, two.weights, strict=True))
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gzip
 import io
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,7 +22,7 @@ from brokk_min.identification.logs import (
 Columns = dict[str, np.ndarray]
 
 
-def write(path: Path, columns: Columns) -> Path:
+def write(path, columns):
     """A table written without the package: `.csv` with all digits, or `.npz`."""
     if path.suffix == ".npz":
         np.savez(path, **columns)
@@ -34,20 +33,18 @@ def write(path: Path, columns: Columns) -> Path:
     return path
 
 
-def table(
-    run: str, time: np.ndarray, seed: int = 0, joints: tuple[str, ...] = ("a", "b")
-) -> Columns:
+def table(run, time, seed=0, joints=("a", "b")):
     rng = np.random.default_rng(seed)
-    columns: Columns = {"run": np.array([run] * len(time)), "time": np.asarray(time, float)}
+    columns = {"run": np.array([run] * len(time)), "time": np.asarray(time, float)}
     columns |= {f"u_{joint}": rng.uniform(-1, 1, len(time)) for joint in joints}
     return columns | {f"q_{j}": np.cumsum(rng.uniform(-0.1, 0.1, len(time))) for j in joints}
 
 
-def both(first: Columns, second: Columns) -> Columns:
+def both(first, second):
     return {name: np.concatenate([first[name], second[name]]) for name in first}
 
 
-def resampled(columns: Columns, joint: str) -> tuple[list[float], list[float]]:
+def resampled(columns, joint):
     """Command held and angle interpolated at 20 Hz, sample by sample."""
     time, u, q = (columns[name].tolist() for name in ("time", f"u_{joint}", f"q_{joint}"))
     commands, angles = [], []
@@ -64,7 +61,7 @@ def resampled(columns: Columns, joint: str) -> tuple[list[float], list[float]]:
 # --- round trips ----------------------------------------------------------------------------------
 
 
-def some_log(velocity_logged: bool, lengths: tuple[int, ...] = (30, 1, 7)) -> Log:
+def some_log(velocity_logged, lengths=(30, 1, 7)):
     rng = np.random.default_rng(5)
     recordings = []
     for i, length in enumerate(lengths):
@@ -384,7 +381,7 @@ BAD_BYTES = {
 }
 
 
-def refusal(path: Path, content: bytes) -> str:
+def refusal(path, content):
     path.write_bytes(content)
     with pytest.raises(ValueError) as caught:
         read_log([path], 4)
@@ -412,13 +409,13 @@ def test_read_log__accepts_the_table_above_also_with_spaces_blank_lines_and_a_by
         np.testing.assert_allclose(recording.u[:, 0], [0.1, 0.2, 0.3, 0.4])
 
 
-def npz(**columns: np.ndarray) -> bytes:
+def npz(**columns):
     file = io.BytesIO()
     np.savez(file, allow_pickle=True, **columns)
     return file.getvalue()
 
 
-def npy(array: np.ndarray) -> bytes:
+def npy(array):
     file = io.BytesIO()
     np.save(file, array)
     return file.getvalue()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import fields, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from brokk_min.actuator import ActuatorNet
 from brokk_min.identification.net_file import fingerprint, load_net, save_net
 
 
-def saved(path: Path, entries: dict | str | None = None, **changes: np.ndarray | None) -> Path:
+def saved(path, entries=None, **changes):
     """A net file with some arrays or header entries changed (None: left out)."""
     save_net(path, random_net())
     with np.load(path) as file:
@@ -29,7 +28,7 @@ def saved(path: Path, entries: dict | str | None = None, **changes: np.ndarray |
     return path
 
 
-def refusal(path: Path) -> str:
+def refusal(path):
     with pytest.raises(ValueError) as caught:
         load_net(path)
     message = str(caught.value)

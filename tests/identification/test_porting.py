@@ -21,7 +21,6 @@ from brokk_min.identification.logs import read_log
 from brokk_min.identification.net_file import load_net
 from brokk_min.jacobian import Gains, JacobianController, manipulability_threshold
 from brokk_min.kinematics import forward_kinematics, tool_position
-from brokk_min.machine import Machine
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "porting.md").read_text()
@@ -36,7 +35,7 @@ QUICK = {
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("port")
     source = (ROOT / "examples" / "mini_excavator.py").read_text()
     (path / "mini_excavator.py").write_text(source)
@@ -44,20 +43,20 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def mini() -> Machine:
-    namespace: dict[str, Machine] = {}
+def mini():
+    namespace = {}
     exec(compile((ROOT / "examples" / "mini_excavator.py").read_text(), "mini", "exec"), namespace)
     return namespace["MINI_EXCAVATOR"]
 
 
 @pytest.fixture
-def here(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def here(folder, monkeypatch):
     monkeypatch.chdir(folder)
     monkeypatch.syspath_prepend(str(folder))
     return folder
 
 
-def test_example__has_the_geometry_and_the_speeds_of_its_drawing(mini: Machine) -> None:
+def test_example__has_the_geometry_and_the_speeds_of_its_drawing(mini):
     """Closed form: elevations are minus the sums of the angles, as positive is downward."""
     q = np.random.default_rng(0).uniform(mini.column("q_min"), mini.column("q_max"), (50, 4))
     e = -np.cumsum(q[:, 1:], axis=1)
@@ -71,9 +70,7 @@ def test_example__has_the_geometry_and_the_speeds_of_its_drawing(mini: Machine) 
     np.testing.assert_allclose(-down.min(axis=0), mini.column("q_dot_down"), atol=0.01)
 
 
-def test_page__has_blocks_of_python_that_run(
-    here: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_page__has_blocks_of_python_that_run(here, capsys):
     rng, names = np.random.default_rng(0), ["swing", "boom", "arm", "bucket"]
     with open("theirs.csv", "w", newline="") as file:
         table = csv.writer(file)
@@ -94,7 +91,7 @@ def test_page__has_blocks_of_python_that_run(
     assert log.recordings[0].u[0, 3] == pytest.approx(float(first["bucket_permille"]) / 1000)
 
 
-def test_page__has_commands_that_run_one_after_the_other(here: Path, mini: Machine) -> None:
+def test_page__has_commands_that_run_one_after_the_other(here, mini):
     start = draw_starts(mini, axis_sequences(mini), 1, np.random.default_rng(0))[0]
     Path("starts.csv").write_text(",".join(mini.names) + "\n" + ",".join(map(str, start)) + "\n")
     Path("commands.csv").write_text("sequence,time,vx,vy,vz\nout,0,0.2,0,0\nout,1,0,0,0\n")
@@ -114,7 +111,7 @@ def test_page__has_commands_that_run_one_after_the_other(here: Path, mini: Machi
     assert all(np.isfinite(run["velocity_rmse"]) for run in results["runs"])
 
 
-def test_page__has_commands_of_the_bus(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_page__has_commands_of_the_bus(here, capsys):
     """They need two programs; here the options are read, and what they name is not there."""
     for words in COMMANDS[4:]:
         assert main(["nonsense" if word == "udp_multicast" else word for word in words]) == 1
@@ -123,7 +120,7 @@ def test_page__has_commands_of_the_bus(here: Path, capsys: pytest.CaptureFixture
 
 
 @pytest.mark.parametrize("axis", range(3))
-def test_example__is_driven_over_the_bus(mini: Machine, axis: int) -> None:
+def test_example__is_driven_over_the_bus(mini, axis):
     """Its own identifiers, zeros and signs: the tool moves at 0.15 m/s outward, sideways or up."""
     one, feedback, min_opening = np.ones(4), np.array([0.3]), np.zeros(1)
     gains = Gains(one, 3 * one, 0 * one, feedback, min_opening)
@@ -155,18 +152,14 @@ def test_example__is_driven_over_the_bus(mini: Machine, axis: int) -> None:
         ("mini_excavator.py", 2, "or FILE.py:NAME"),
     ],
 )
-def test_machine_option__refuses_files_without_a_machine(
-    name: str, status: int, message: str, here: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_machine_option__refuses_files_without_a_machine(name, status, message, here, capsys):
     Path("broken.py").write_text("1 / 0\n")
     assert main(["collect", "--machine", name, "--out", "x.csv"]) == status
     assert message in capsys.readouterr().err
     assert not Path("x.csv").exists()
 
 
-def test_fit__refuses_logs_without_the_joints_of_the_machine(
-    here: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_fit__refuses_logs_without_the_joints_of_the_machine(here, capsys):
     rows = [f"x,{i / 25},0.5,{i / 50}" for i in range(40)]
     Path("foreign.csv").write_text("\n".join(["run,time,u_a,q_a", *rows]) + "\n")
     options = ["--machine", "mini_excavator.py:MINI_EXCAVATOR", "--out", "n.npz"]

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers_machines import constant_net, line, random_net
 
-from brokk_min.actuator import ActuatorNet
 from brokk_min.identification import validation
 from brokk_min.identification.fitting import FitConfig, fit
 from brokk_min.identification.logs import Log, Recording, join_recordings, read_log, velocity_of
@@ -27,12 +25,12 @@ from brokk_min.identification.validation import (
     steps,
     validate,
 )
-from brokk_min.machine import BROKK_170, Machine, estimate_velocity
+from brokk_min.machine import BROKK_170, estimate_velocity
 
 LOW, HIGH = BROKK_170.column("q_min"), BROKK_170.column("q_max")
 
 
-def one_joint(u: np.ndarray, q: np.ndarray | None = None) -> Log:
+def one_joint(u, q=None):
     q = np.zeros((len(u), 1)) if q is None else q[:, None]
     return Log(("a",), (Recording("x", u[:, None], q, velocity_of(q, 2)),))
 
@@ -175,7 +173,7 @@ def test_tool_errors__by_hand():
 # --- the linear reference and the range of the training -------------------------------------------
 
 
-def linear_log(seed: int, runs: int = 12, scale: float = 1.0) -> Log:
+def linear_log(seed, runs=12, scale=1.0):
     """A joint whose next velocity is 0.8 times the newest difference plus 0.1 u, exactly."""
     rng, recordings = np.random.default_rng(seed), []
     for run in range(runs):
@@ -187,7 +185,7 @@ def linear_log(seed: int, runs: int = 12, scale: float = 1.0) -> Log:
     return Log(("a",), tuple(recordings))
 
 
-def blank_net(log: Log, history: int = 5) -> ActuatorNet:
+def blank_net(log, history=5):
     config = FitConfig(steps=1, batch_size=8, history=history)
     return fit(log, config, seed=0, velocity_samples=2)
 
@@ -224,7 +222,7 @@ def test_outside_training__by_hand():
     time = np.arange(1000) / 20
     known = one_joint(np.sin(2 * np.pi * 0.2 * time), 0.5 * np.cos(time))
 
-    def fractions(u: np.ndarray, q: float = 0.0) -> dict[str, float]:
+    def fractions(u, q=0.0):
         outside = outside_training(known, one_joint(u, q + 0 * u), 13)
         return {kind: float(fraction[0]) for kind, fraction in outside.items()}
 
@@ -272,7 +270,7 @@ def test_validate__warns_of_nets_no_better_than_linear_and_of_tests_outside_the_
 # --- logs of another plant ------------------------------------------------------------------------
 
 
-def other_plant() -> Machine:
+def other_plant():
     """Two joints with 45 % dead zone and a long dead time, at 100 Hz."""
     joints = [replace(BROKK_170.joints[i], name=name) for i, name in ((3, "boom"), (4, "stick"))]
     return replace(
@@ -281,7 +279,7 @@ def other_plant() -> Machine:
     )  # fmt: skip
 
 
-def other_log(path: Path, seed: int, runs: int) -> Log:
+def other_log(path, seed, runs):
     """Encoder angles with jitter, read at 20 Hz; every recording meets a stop.
 
     Speed grows with the power 2.5 of the command beyond the dead zone; one joint moves in each.
@@ -324,10 +322,10 @@ def test_validate__finds_nets_of_another_plant_better_than_linear(tmp_path):
 # --- step responses -------------------------------------------------------------------------------
 
 
-def constant_simulator(speed_up: float, speed_down: float, late: int):
+def constant_simulator(speed_up, speed_down, late):
     """Joints that move at one speed `late` ticks after a command, whatever its size."""
 
-    def simulate(q: np.ndarray, u: np.ndarray) -> np.ndarray:
+    def simulate(q, u):
         sent = np.concatenate([np.zeros((late, *u.shape[1:])), u])[: len(u)]
         speed = np.where(sent > 0, speed_up, np.where(sent < 0, -speed_down, 0.0))
         return np.concatenate([q[None], q + np.cumsum(speed, axis=0) / 20])
@@ -387,7 +385,7 @@ def test_steps__move_only_the_stepping_joint_away_from_the_end_behind_it():
 def test_step_commands__move_a_joint_beyond_its_dead_zone():
     """Three ticks late; two dead zones, and a valve that opens with the fourth power."""
 
-    def simulate(q: np.ndarray, u: np.ndarray) -> np.ndarray:
+    def simulate(q, u):
         u = np.concatenate([np.zeros((3, *u.shape[1:])), u])[: len(u)]
         beyond = np.maximum(0, np.abs(u) - np.array([0.07, 0.45, 0.0]))
         speed = np.sign(u) * beyond ** np.array([1, 1, 4])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,19 +11,17 @@ import pytest
 from brokk_min.env import COMPENSATION
 from brokk_min.identification.files import SHIPPED
 from brokk_min.learning.onnx import export_onnx
-from brokk_min.learning.policy import STANDSTILL_TIMEOUT, Policy, load_policy
+from brokk_min.learning.policy import STANDSTILL_TIMEOUT, load_policy
 from brokk_min.machine import BROKK_170
 
 
 @pytest.fixture(scope="module")
-def policy() -> Policy:
+def policy():
     return load_policy(SHIPPED / "brokk170" / "policy.npz", BROKK_170)
 
 
 @pytest.mark.parametrize("batch", [1, 256])
-def test_export_onnx__computes_the_actions_of_the_policy(
-    batch: int, policy: Policy, tmp_path: Path
-) -> None:
+def test_export_onnx__computes_the_actions_of_the_policy(batch, policy, tmp_path):
     onnxruntime = pytest.importorskip("onnxruntime")
     export_onnx(tmp_path / "p.onnx", policy)
     session = onnxruntime.InferenceSession(tmp_path / "p.onnx", providers=["CPUExecutionProvider"])
@@ -38,9 +35,7 @@ def test_export_onnx__computes_the_actions_of_the_policy(
     assert ends == [(name, ["batch", size], "tensor(float)") for name, size in sizes.items()]
 
 
-def test_export_onnx__is_one_file_with_what_the_other_program_needs(
-    policy: Policy, tmp_path: Path
-) -> None:
+def test_export_onnx__is_one_file_with_what_the_other_program_needs(policy, tmp_path):
     onnx = pytest.importorskip("onnx")
     export_onnx(tmp_path / "p.onnx", policy)
     model = onnx.load(tmp_path / "p.onnx")
@@ -56,9 +51,7 @@ def test_export_onnx__is_one_file_with_what_the_other_program_needs(
     assert metadata["driven"] == ["q1", "q3", "q4", "q5"] and metadata["rate"] == 20.0
 
 
-def test_export_onnx__names_the_missing_extra(
-    policy: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_export_onnx__names_the_missing_extra(policy, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnx", None)
     with pytest.raises(ValueError, match=r"onnx: expected the extra brokk_min\[export\]"):
         export_onnx(tmp_path / "p.onnx", policy)

@@ -25,7 +25,7 @@ from brokk_min.learning.simulation_gradient import (
     input_gradient,
 )
 from brokk_min.machine import BROKK_170, PWM_MAX
-from brokk_min.ppo import PPOConfig, Rollout, collect, make_learner
+from brokk_min.ppo import PPOConfig, collect, make_learner
 
 NUM, TICKS = 3, 9
 
@@ -308,7 +308,7 @@ def test_gradient_advantages__are_gradient_times_deviation():
     assert rollout.means.abs().max() > 1
 
 
-def expected_advantages(net, task, rollout: Rollout, gamma):
+def expected_advantages(net, task, rollout, gamma):
     states = [info["state"] for info in rollout.infos]
     commands = env.action_to_pwm(BROKK_170, rollout.actions.numpy())
     ticks = ticks_of([*states, states[-1]], commands, rollout.dones.numpy())

@@ -7,11 +7,9 @@ import signal
 import struct
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from itertools import pairwise
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
 
 import can
 import numpy as np
@@ -31,10 +29,10 @@ from helpers_bus import (
 )
 
 from brokk_min import hw
-from brokk_min.can.canopen import Frame, OperatorInput, encoder_raw, valve_frame
+from brokk_min.can.canopen import OperatorInput, encoder_raw, valve_frame
 from brokk_min.can.operator_input import Script
 from brokk_min.can.safety_gate import fault_name
-from brokk_min.env import Measured, TaskConfig, reward
+from brokk_min.env import TaskConfig, reward
 from brokk_min.evaluation.rollout import rollout
 from brokk_min.evaluation.sequences import axis_sequences
 from brokk_min.kinematics import forward_kinematics, tool_velocity
@@ -46,22 +44,22 @@ SHIPPED = Path(hw.__file__).with_name("shipped") / BROKK_170.name / "policy.npz"
 STEP = BROKK_170.encoder_step
 
 
-def policy() -> PolicyController:
+def policy():
     return PolicyController(BROKK_170, load_policy(SHIPPED, BROKK_170))
 
 
 @pytest.fixture
-def operator() -> HoldingOperator:
+def operator():
     return HoldingOperator()
 
 
 @pytest.fixture
-def controller() -> ConstantCommand:
+def controller():
     return ConstantCommand(*COMMAND)
 
 
 @pytest.fixture
-def world(controller: ConstantCommand, operator: HoldingOperator) -> Iterator[World]:
+def world(controller, operator):
     """A constant command, an operator, and nodes that are started."""
     world = World(controller, operator)
     world.drive.begin()
@@ -69,7 +67,7 @@ def world(controller: ConstantCommand, operator: HoldingOperator) -> Iterator[Wo
     world.close()
 
 
-def test_hw__imports_no_learning_library_and_opens_nothing() -> None:
+def test_hw__imports_no_learning_library_and_opens_nothing():
     code = (
         "import sys; import brokk_min.hw, brokk_min.can.simulated_machine;"
         "heavy = {'can', 'pygame', 'torch', 'onnx', 'matplotlib', 'gymnasium', 'scipy'};"
@@ -83,14 +81,14 @@ def test_hw__imports_no_learning_library_and_opens_nothing() -> None:
 
 
 @pytest.mark.parametrize(("axis", "name"), [(0, "rl"), (1, "rl"), (2, "rl"), (2, "jacobian")])
-def test_run__earns_over_the_bus_the_reward_of_evaluate(axis: int, name: str) -> None:
+def test_run__earns_over_the_bus_the_reward_of_evaluate(axis, name):
     """Within 0.2 %, with 2 ms of bus and machine between SYNC and valve frame."""
     sequence = axis_sequences(BROKK_170)[axis]
     controller = policy() if name == "rl" else BASELINE
     script = Script(BROKK_170, sequence.goals)
     world = World(controller, script)
 
-    def operator(driving: bool, ready: bool) -> OperatorInput:
+    def operator(driving, ready):
         world.sleep(0.002)
         return script(driving, ready)
 
@@ -114,19 +112,19 @@ def test_run__earns_over_the_bus_the_reward_of_evaluate(axis: int, name: str) ->
 class Listener(ConstantCommand):
     """Drives with constant commands and keeps what is measured at each tick after the warm-up."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__(*COMMAND)
-        self.measured: list[Measured] = []
+        self.measured = []
 
-    def start(self, num: int) -> None:
+    def start(self, num):
         self.measured.clear()
 
-    def __call__(self, measured: Measured, state: None) -> tuple[np.ndarray, None]:
+    def __call__(self, measured, state):
         self.measured.append(measured)
         return super().__call__(measured, state)
 
 
-def test_control__measures_histories_and_error_integral_of_its_own_ticks() -> None:
+def test_control__measures_histories_and_error_integral_of_its_own_ticks():
     """Every second call is the warm-up with the tick before."""
     listener = Listener()
     world = World(listener, HoldingOperator())
@@ -145,7 +143,7 @@ def test_control__measures_histories_and_error_integral_of_its_own_ticks() -> No
     assert (np.rint(ticks[-1].history[0, :, 2] * 127) == 60).all()
 
 
-def test_run__closes_valves_when_the_goal_stands_still_for_long() -> None:
+def test_run__closes_valves_when_the_goal_stands_still_for_long():
     operator, out = HoldingOperator(), Out()
     world = World(policy(), operator)
     world.downward = recording(out)
@@ -165,9 +163,7 @@ def test_run__closes_valves_when_the_goal_stands_still_for_long() -> None:
     assert not opened[closed + 1 : ticks[1]].any()
 
 
-def test_tick__is_silent_until_armed_and_opens_valves_a_tick_later(
-    world: World, operator: HoldingOperator
-) -> None:
+def test_tick__is_silent_until_armed_and_opens_valves_a_tick_later(world, operator):
     operator.enable, out = False, Out()
     world.downward = recording(out)
     world.run(1.0)
@@ -185,9 +181,7 @@ def test_tick__is_silent_until_armed_and_opens_valves_a_tick_later(
     np.testing.assert_allclose(newest, [[0] * 5, [40, 0, 40, 40, 40]], atol=1e-5)
 
 
-def test_tick__does_not_arm_while_the_stick_is_not_centred(
-    controller: ConstantCommand, operator: HoldingOperator
-) -> None:
+def test_tick__does_not_arm_while_the_stick_is_not_centred(controller, operator):
     world = World(controller, lambda driving, ready: operator(True, ready))
     world.drive.begin()
     world.run(1.0)
@@ -201,52 +195,50 @@ def test_tick__does_not_arm_while_the_stick_is_not_centred(
 class Fault:
     """What goes wrong in a world, from now on."""
 
-    def __init__(
-        self, world: World, operator: HoldingOperator, controller: ConstantCommand
-    ) -> None:
+    def __init__(self, world, operator, controller):
         self.world, self.operator, self.controller = world, operator, controller
 
 
-def put(name: str, value: Any) -> Callable[[Fault], None]:
+def put(name, value):
     """Set an attribute of something in the world."""
     owner, _, attribute = name.rpartition(".")
     return lambda f: setattr(attrgetter(owner)(f), attribute, value)
 
 
-def up(can_id: int, act: Callable[[bytes], list[bytes]]) -> Callable[[Fault], None]:
+def up(can_id, act):
     """Change frames of one identifier from the machine."""
     return put("world.upward", only(can_id, act))
 
 
-def up_once(can_id: int, act: Callable[[bytes], list[bytes]]) -> Callable[[Fault], None]:
+def up_once(can_id, act):
     """Change the first of them."""
     return lambda f: up(can_id, once(act))(f)
 
 
-def down_once(act: Callable[[bytes], list[bytes]]) -> Callable[[Fault], None]:
+def down_once(act):
     """Change the first valve frame."""
     return lambda f: put("world.downward", only(0x210, once(act)))(f)
 
 
-def moved(add: int) -> Callable[[bytes], list[bytes]]:
+def moved(add):
     return lambda data: [struct.pack("<I", (struct.unpack("<I", data)[0] + add) % 2**26)]
 
 
-def freeze(f: Fault, node: int) -> None:
+def freeze(f, node):
     counts = np.rint(f.world.simulated.plant.q / STEP).astype(int)
     data = struct.pack("<I", encoder_raw(BROKK_170, counts)[node - 1])
     up(0x180 + node, lambda _: [data])(f)
 
 
-def delay(f: Fault, node: int, draw: Callable[[], float]) -> None:
+def delay(f, node, draw):
     """Positions come `draw()` seconds late."""
-    held: list[tuple[float, bytes]] = []
+    held = []
 
-    def hold(data: bytes) -> list[bytes]:
+    def hold(data):
         held.append((f.world.t + draw(), data))
         return []
 
-    def noise() -> Out:
+    def noise():
         due = [data for then, data in held if then <= f.world.t]
         held[:] = [item for item in held if item[0] > f.world.t]
         return [(0x180 + node, data) for data in due]
@@ -255,7 +247,7 @@ def delay(f: Fault, node: int, draw: Callable[[], float]) -> None:
     f.world.noise = noise
 
 
-def late(f: Fault, node: int) -> None:
+def late(f, node):
     """Constantly late positions, and an operator who presses again and again."""
     delay(f, node, lambda: 0.030)
     f.operator.act = lambda: setattr(
@@ -263,11 +255,11 @@ def late(f: Fault, node: int) -> None:
     )
 
 
-def reorder(f: Fault, node: int) -> None:
+def reorder(f, node):
     """Every second position comes after the next one."""
-    held: list[bytes] = []
+    held = []
 
-    def act(data: bytes) -> list[bytes]:
+    def act(data):
         if held:
             return [data, held.pop()]
         held.append(data)
@@ -276,17 +268,17 @@ def reorder(f: Fault, node: int) -> None:
     up(0x180 + node, act)(f)
 
 
-def flood(f: Fault, foreign: bool = False) -> tuple[set[tuple[int, int]], int]:
+def flood(f, foreign=False):
     """2,000 frames a second; pairs of identifier and length that came, and how many there are."""
     rng = np.random.default_rng(0)
     nodes = (1, 2, 3, 4, 5, 16)
     ours = {0, 0x80, 0x210, *(base + n for base in (0x180, 0x580, 0x600, 0x700) for n in nodes)}
     ids = rng.permutation([i for i in range(2048) if not foreign or i not in ours])
     assert len(ids) % 3  # no factor in common with the nine lengths: each pair has its turn
-    seen: set[tuple[int, int]] = set()
+    seen = set()
     begun, count = f.world.t, 0
 
-    def noise() -> Out:
+    def noise():
         nonlocal count
         out = []
         while begun + 0.0005 * count < f.world.t:
@@ -299,11 +291,11 @@ def flood(f: Fault, foreign: bool = False) -> tuple[set[tuple[int, int]], int]:
     return seen, 9 * len(ids)
 
 
-def second_master(f: Fault) -> None:
+def second_master(f):
     """Somebody else sends valid valve frames of his own."""
     begun, count = f.world.t, 0
 
-    def noise() -> Out:
+    def noise():
         nonlocal count
         if f.world.t < begun + 0.05 * (count + 1):
             return []
@@ -313,39 +305,39 @@ def second_master(f: Fault) -> None:
     f.world.noise = noise
 
 
-def foreign_nmt(data: bytes) -> Callable[[Fault], None]:
-    def cause(f: Fault) -> None:
+def foreign_nmt(data):
+    def cause(f):
         frames = [(0x000, data)]
         f.world.noise = lambda: [frames.pop()] if frames else []
 
     return cause
 
 
-def close_bus(f: Fault) -> None:
+def close_bus(f):
     f.world.near.shutdown()
-    f.world.recv = raises(can.CanOperationError("closed"))  # type: ignore[method-assign]
-    f.world.send = raises(can.CanOperationError("closed"))  # type: ignore[method-assign]
+    f.world.recv = raises(can.CanOperationError("closed"))
+    f.world.send = raises(can.CanOperationError("closed"))
 
 
-def send_error(f: Fault, valves_only: bool) -> None:
+def send_error(f, valves_only):
     fail = raises(can.CanOperationError("no buffer space"))
     f.world.downward = only(0x210, fail) if valves_only else fail
 
 
-def stall(seconds: float) -> Callable[[Fault], None]:
-    def cause(f: Fault) -> None:
+def stall(seconds):
+    def cause(f):
         stalls = [seconds]
         f.controller.act = lambda: f.world.sleep(stalls.pop()) if stalls else None
 
     return cause
 
 
-def command(joint: int, value: float) -> Callable[[Fault], None]:
+def command(joint, value):
     return lambda f: f.controller.m.__setitem__(joint, value)
 
 
 NOT_OPERATIONAL = "valve controller: not operational"
-FAULTS: dict[str, tuple[Callable[[Fault], object], str]] = {
+FAULTS = {
     "controller silent": (up(0x710, lambda d: []), "valve controller: heartbeat lost"),
     "controller stopped": (up(0x710, lambda d: [b"\x04"]), NOT_OPERATIONAL),
     "controller's heartbeat malformed": (up(0x710, lambda d: [d * 2]), "heartbeat lost"),
@@ -414,9 +406,7 @@ for node in range(1, 6):
 
 @pytest.mark.parametrize("phase", [0.0005, 0.0215, 0.0485])
 @pytest.mark.parametrize("name", list(FAULTS))
-def test_tick__ends_neutral_and_latched_within_175_ms_of_every_fault(
-    name: str, phase: float
-) -> None:
+def test_tick__ends_neutral_and_latched_within_175_ms_of_every_fault(name, phase):
     """By the plant's own record, whenever in a tick it comes, though the operator holds on."""
     cause, reason = FAULTS[name]
     operator, controller = HoldingOperator(), ConstantCommand(*COMMAND)
@@ -438,7 +428,7 @@ def test_tick__ends_neutral_and_latched_within_175_ms_of_every_fault(
     world.close()
 
 
-def closes_within(world: World, begun: float, seconds: float) -> bool:
+def closes_within(world, begun, seconds):
     times, m = world.commands
     return not m[times > begun + seconds].any()
 
@@ -448,13 +438,8 @@ def closes_within(world: World, begun: float, seconds: float) -> bool:
     ("counts", "bound"), [(80, 0.175), (40, 0.175), (-40, 0.175), (20, 0.45), (16, 0.85)]
 )
 def test_tick__finds_a_frozen_encoder_at_small_commands_too(
-    node: int,
-    counts: int,
-    bound: float,
-    world: World,
-    controller: ConstantCommand,
-    operator: HoldingOperator,
-) -> None:
+    node, counts, bound, world, controller, operator
+):
     """The table of docs/hardware.md: the smaller the command, the longer it takes."""
     controller.m = counts * (np.arange(1, 6) == node)
     world.run(1.6)
@@ -469,8 +454,8 @@ def test_tick__finds_a_frozen_encoder_at_small_commands_too(
 
 @pytest.mark.parametrize(("counts", "bound"), [(80, 0.55), (-40, 0.55), (20, 0.8), (16, 1.25)])
 def test_tick__finds_an_encoder_that_is_frozen_from_the_start(
-    counts: int, bound: float, world: World, controller: ConstantCommand, operator: HoldingOperator
-) -> None:
+    counts, bound, world, controller, operator
+):
     """A joint at rest may take 0.4 s to move, so that this takes longer than the 175 ms."""
     controller.m = np.zeros(5)
     world.run(0.6)
@@ -482,13 +467,11 @@ def test_tick__finds_an_encoder_that_is_frozen_from_the_start(
     assert world.drive.reason == "fault: q3: frozen, or the joint does not move"
 
 
-def test_tick__takes_nothing_for_frozen_that_is_not(
-    world: World, controller: ConstantCommand
-) -> None:
+def test_tick__takes_nothing_for_frozen_that_is_not(world, controller):
     """Reversals, stops and small commands at random are no fault."""
     rng = np.random.default_rng(3)
 
-    def change() -> None:
+    def change():
         if rng.random() < 0.15:
             controller.m = rng.choice([-80.0, -40, -20, 0, 0, 20, 40, 80], 5) * (np.arange(5) != 1)
 
@@ -498,7 +481,7 @@ def test_tick__takes_nothing_for_frozen_that_is_not(
     assert np.abs(np.diff(world.commands[1], axis=0)).sum() > 2000
 
 
-def test_watchdog__closes_the_valves_of_a_program_that_is_killed(world: World) -> None:
+def test_watchdog__closes_the_valves_of_a_program_that_is_killed(world):
     """SIGKILL: no more ticks; a resumed frame does not open the valves again."""
     world.run(1.2)
     killed = world.t
@@ -512,8 +495,8 @@ def test_watchdog__closes_the_valves_of_a_program_that_is_killed(world: World) -
 
 
 def test_tick__opens_no_valve_again_on_frames_of_any_identifier_and_length(
-    world: World, controller: ConstantCommand, operator: HoldingOperator
-) -> None:
+    world, controller, operator
+):
     world.run(1.2)
     begun = world.t
     assert world.commands[1][-1].any()
@@ -524,26 +507,26 @@ def test_tick__opens_no_valve_again_on_frames_of_any_identifier_and_length(
 
 
 def test_tick__drives_on_fresh_positions_among_2000_foreign_frames_a_second(
-    world: World, controller: ConstantCommand, operator: HoldingOperator
-) -> None:
+    world, controller, operator
+):
     seen, pairs = flood(Fault(world, operator, controller), foreign=True)
-    ages: list[float] = []
+    ages = []
     update = world.drive.nodes.update
 
-    def listen(frame: Frame) -> None:
+    def listen(frame):
         update(frame)
         if frame.id == 0x183:
             q = struct.unpack("<I", frame.data)[0] * STEP
             ages.append(abs(q - world.simulated.plant.q[2]))
 
-    world.drive.nodes.update = listen  # type: ignore[method-assign]
+    world.drive.nodes.update = listen
     world.run(9.3)
     assert world.drive.gate.driving and world.drive.reason == "" and world.drive.skipped == 0
     assert len(seen) == pairs > 18_000
     assert len(ages) > 175 and max(ages) < 0.6 * STEP + 1e-3
 
 
-def test_tick__leaves_a_fault_by_a_new_edge_only(world: World, operator: HoldingOperator) -> None:
+def test_tick__leaves_a_fault_by_a_new_edge_only(world, operator):
     drive = world.drive
     world.run(0.6)
     world.upward = only(0x183, once(lambda d: []))
@@ -560,9 +543,7 @@ def test_tick__leaves_a_fault_by_a_new_edge_only(world: World, operator: Holding
     assert world.commands[1][-1].tolist() == list(COMMAND)
 
 
-def test_tick__logs_an_exception_and_keeps_its_text_until_it_drives(
-    world: World, operator: HoldingOperator
-) -> None:
+def test_tick__logs_an_exception_and_keeps_its_text_until_it_drives(world, operator):
     world.run(0.6)
     operator.act, operator.enable = raises(OSError("gone")), False
     world.run(0.1)
@@ -580,14 +561,7 @@ def test_tick__logs_an_exception_and_keeps_its_text_until_it_drives(
     ("low", "high", "found"),
     [(5, 5, 0), (15, 15, 0), (25, 25, 1), (45, 45, 1), (0, 15, 0), (0, 60, 1)],
 )
-def test_tick__finds_positions_later_than_20_ms(
-    low: int,
-    high: int,
-    found: int,
-    world: World,
-    controller: ConstantCommand,
-    operator: HoldingOperator,
-) -> None:
+def test_tick__finds_positions_later_than_20_ms(low, high, found, world, controller, operator):
     """Constantly, or by chance between two bounds [ms]."""
     rng = np.random.default_rng(0)
     world.run(0.8)
@@ -598,13 +572,11 @@ def test_tick__finds_positions_later_than_20_ms(
     assert closes_within(world, begun, 0.175) == bool(found)
 
 
-def test_tick__finds_a_delay_of_a_whole_tick_only_when_it_begins(
-    world: World, operator: HoldingOperator
-) -> None:
+def test_tick__finds_a_delay_of_a_whole_tick_only_when_it_begins(world, operator):
     """A position has neither time nor number: the limit of what can be found, see docs."""
-    held: list[bytes] = []
+    held = []
 
-    def hold(data: bytes) -> list[bytes]:
+    def hold(data):
         held.append(data)
         return held[-2:-1]
 
@@ -620,9 +592,7 @@ def test_tick__finds_a_delay_of_a_whole_tick_only_when_it_begins(
     assert world.drive.gate.driving
 
 
-def test_tick__starts_nodes_that_fell_back_once_the_switch_is_released(
-    world: World, operator: HoldingOperator
-) -> None:
+def test_tick__starts_nodes_that_fell_back_once_the_switch_is_released(world, operator):
     out = Out()
     world.run(0.6)
     world.downward = recording(out)
@@ -639,23 +609,21 @@ def test_tick__starts_nodes_that_fell_back_once_the_switch_is_released(
     assert 0x000 not in dict(out) and world.drive.status().startswith("ready")
 
 
-def test_tick__takes_a_lost_joystick_for_no_release_of_the_switch(
-    world: World, operator: HoldingOperator
-) -> None:
+def test_tick__takes_a_lost_joystick_for_no_release_of_the_switch(world, operator):
     for alive in (True, False, True):
         operator.alive = alive
         world.run(0.6)
     assert not world.drive.gate.driving and "device lost" in world.drive.reason
 
 
-def test_tick__names_nodes_that_were_never_there(world: World) -> None:
+def test_tick__names_nodes_that_were_never_there(world):
     world.upward = only(0x704, lambda d: [])
     world.drive.nodes.heartbeat[:] = -np.inf
     world.run(0.4)
     assert world.drive.reason == "q4: never seen" and world.drive.status().startswith("waiting")
 
 
-def test_listen__takes_more_frames_than_a_bus_can_carry_for_a_fault(world: World) -> None:
+def test_listen__takes_more_frames_than_a_bus_can_carry_for_a_fault(world):
     world.run(1.0)
     for _ in range(2100):
         world.far.send(can.Message(arbitration_id=0x555, is_extended_id=False))
@@ -663,7 +631,7 @@ def test_listen__takes_more_frames_than_a_bus_can_carry_for_a_fault(world: World
     assert "expected fewer than 2000 frames" in world.drive.reason and not world.drive.gate.driving
 
 
-def test_status__by_hand(world: World) -> None:
+def test_status__by_hand(world):
     """A straight level arm, 5 m from the slew axis, that slews at 0.1 rad/s."""
     drive, no = world.drive, " ".join(["+nan"] * 3)
     start = f"waiting v goal +0.00 +0.00 +0.00 measured {no} q {no} +nan +nan"
@@ -682,19 +650,17 @@ def test_status__by_hand(world: World) -> None:
 # --- the clock -----------------------------------------------------------------------------------
 
 
-def busy(world: World, seconds: float) -> Callable[[int, bytes], Out]:
+def busy(world, seconds):
     """Sending a valve frame takes some time."""
 
-    def send(can_id: int, data: bytes) -> Out:
+    def send(can_id, data):
         world.sleep(seconds * (can_id == 0x210))
         return [(can_id, data)]
 
     return send
 
 
-def test_wait__keeps_an_absolute_grid_and_skips_missed_ticks(
-    world: World, controller: ConstantCommand
-) -> None:
+def test_wait__keeps_an_absolute_grid_and_skips_missed_ticks(world, controller):
     controller.m = np.zeros(5)
     world.step = 0.0007  # does not divide a tick
     begun = world.t
@@ -709,33 +675,33 @@ def test_wait__keeps_an_absolute_grid_and_skips_missed_ticks(
     assert world.drive.skipped == 5 and round(ticks[-1]) == 119 + 5  # none was made up for
 
 
-def test_wait__does_not_drift_by_rounding(world: World) -> None:
+def test_wait__does_not_drift_by_rounding(world):
     """Hours of deadlines on a clock that shows the time of day, whose last bit is 0.2 us."""
     drive = world.drive
     drive.start_time, drive.deadline_number, ticks = 1.8e9, 0, 200_000
-    drive.bus.now = lambda: 1.8e9  # type: ignore[method-assign]
+    drive.bus.now = lambda: 1.8e9
     for _ in range(ticks):
         drive.count_tick(1e-6)
-    drive.bus.now = lambda: 1.8e9 + ticks * 0.05 + 0.01  # type: ignore[method-assign]
-    drive.bus.recv = lambda *_: None  # type: ignore[method-assign]
+    drive.bus.now = lambda: 1.8e9 + ticks * 0.05 + 0.01
+    drive.bus.recv = lambda *_: None
     drive.wait()
     assert drive.lateness == pytest.approx(0.01, abs=1e-6) and drive.skipped == 0
 
 
-def test_wait__sleeps_but_not_just_before_sync_nor_while_encoders_answer(world: World) -> None:
+def test_wait__sleeps_but_not_just_before_sync_nor_while_encoders_answer(world):
     """A wait may sleep from `busy_wait` after its begin to its end."""
-    waits: list[tuple[float, float]] = []
+    waits = []
     recv, sleep = world.bus.recv, world.bus.sleep
 
-    def pause(seconds: float) -> None:
+    def pause(seconds):
         waits.append((world.t, world.t + seconds))
         sleep(seconds)
 
-    def wait(timeout: float, busy_wait: float = 0.0) -> Frame | None:
+    def wait(timeout, busy_wait=0.0):
         waits.append((world.t + busy_wait, world.t + timeout))
         return recv(timeout, busy_wait)
 
-    world.bus.recv, world.bus.sleep = wait, pause  # type: ignore[method-assign]
+    world.bus.recv, world.bus.sleep = wait, pause
     world.run(1.0)
     assert world.drive.reason == "" and world.drive.gate.driving
     asleep = np.array([w for w in waits if w[1] > w[0] + 1e-5])
@@ -746,7 +712,7 @@ def test_wait__sleeps_but_not_just_before_sync_nor_while_encoders_answer(world: 
         assert len(answers) and (answers > sync + hw.BUSY_WAIT - 1e-5).all()
 
 
-def test_wait__begins_a_new_grid_after_a_small_step_back_of_the_clock(world: World) -> None:
+def test_wait__begins_a_new_grid_after_a_small_step_back_of_the_clock(world):
     world.downward = busy(world, 0.004)
     world.run(0.5)
     world.offset = -1.0
@@ -754,10 +720,8 @@ def test_wait__begins_a_new_grid_after_a_small_step_back_of_the_clock(world: Wor
     assert np.diff(world.syncs)[-15:] == pytest.approx([0.05] * 15, abs=5e-4)
 
 
-def test_wait__warms_up_once_before_sync_if_there_is_time(
-    world: World, controller: ConstantCommand
-) -> None:
-    calls: list[float] = []
+def test_wait__warms_up_once_before_sync_if_there_is_time(world, controller):
+    calls = []
     controller.act = lambda: calls.append(world.t)
     world.run(1.0)
     calls.clear()
@@ -772,9 +736,7 @@ def test_wait__warms_up_once_before_sync_if_there_is_time(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_run__ends_on_a_signal_with_a_neutral_frame(
-    number: int, world: World, operator: HoldingOperator
-) -> None:
+def test_run__ends_on_a_signal_with_a_neutral_frame(number, world, operator):
     out, shown = Out(), list[tuple[int, str]]()
     world.downward = recording(out)
     operator.act = lambda: os.kill(os.getpid(), number) if world.drive.ticks == 20 else None
@@ -786,7 +748,7 @@ def test_run__ends_on_a_signal_with_a_neutral_frame(
     assert any(before[:5]) and not any(last[:5]) and last[7] == 0
 
 
-def test_run__ends_neutral_on_an_error_of_the_program_itself(world: World) -> None:
+def test_run__ends_neutral_on_an_error_of_the_program_itself(world):
     world.run(1.0)
     out = Out()
     world.downward = recording(out)
@@ -800,10 +762,10 @@ def test_run__ends_neutral_on_an_error_of_the_program_itself(world: World) -> No
     assert not world.commands[1][-1].any()
 
 
-def test_run__stays_silent_on_an_error_before_it_was_armed(world: World) -> None:
+def test_run__stays_silent_on_an_error_before_it_was_armed(world):
     out = Out()
     world.downward = recording(out)
-    world.bus.log_input = raises(OSError("disk full"))  # type: ignore[method-assign]
+    world.bus.log_input = raises(OSError("disk full"))
     with pytest.raises(OSError, match="disk full"):
         world.drive.run()
     assert 0x210 not in dict(out)

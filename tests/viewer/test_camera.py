@@ -16,11 +16,11 @@ STRETCHED = np.array([0.0, 0.0, 0.0, np.pi, 3 * np.pi / 4])  # all links horizon
 BOXES = ((10.0, 20.0, 400.0, 200.0), (0.0, 0.0, 100.0, 100.0))  # side, top [px]
 
 
-def tool(q: np.ndarray) -> np.ndarray:
+def tool(q):
     return tool_position(forward_kinematics(BROKK_170, q))
 
 
-def test_cameras__see_the_brokk_as_worked_out_by_hand() -> None:
+def test_cameras__see_the_brokk_as_worked_out_by_hand():
     side, top = cameras(BROKK_170, tool(STRETCHED), *BOXES, NO_POINTS)
     flat = np.array([[0, 0], [0.25, 0.95], [1.4, 0.95], [2.65, 0.95], [3.8, 0.95], [5.0, 0.95]])
     p = forward_kinematics(BROKK_170, STRETCHED).p
@@ -35,7 +35,7 @@ def test_cameras__see_the_brokk_as_worked_out_by_hand() -> None:
     )
 
 
-def test_cameras__fit_given_points_into_the_box_as_worked_out_by_hand() -> None:
+def test_cameras__fit_given_points_into_the_box_as_worked_out_by_hand():
     """400 x 200 px at (10, 20), 14 px of soil: the points fill 0.92 of 400 or of 172 px."""
     _, _, reach = extent(BROKK_170)
     assert 4.5 < reach < 5.0  # of 5 m; random poses come near it
@@ -53,7 +53,7 @@ def test_cameras__fit_given_points_into_the_box_as_worked_out_by_hand() -> None:
     assert top.project([2.0, 0, 0])[1] < 50
 
 
-def test_skeleton__has_the_ends_of_d_and_a_of_two_links_by_hand() -> None:
+def test_skeleton__has_the_ends_of_d_and_a_of_two_links_by_hand():
     """Two links that turn about z, each 0.2 m above the one before and 1 m long."""
     joints = [replace(j, a=1.0, d=0.2, alpha=0.0, theta=0.0) for j in BROKK_170.joints[:2]]
     arm = replace(BROKK_170, joints=tuple(joints))

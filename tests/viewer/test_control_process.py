@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import threading
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -29,35 +28,35 @@ from brokk_min.viewer.play import gate_status
 REQUEST = Request(10.0, 0, True, True, np.array([0.1, 0.0, 0.0]), np.zeros(4))
 
 
-def measured(num: int) -> SimpleNamespace:
+def measured(num):
     return SimpleNamespace(q=np.zeros((num, 5)))
 
 
-def test_selected_controller__moves_levers_and_starts_another_controller_from_rest() -> None:
+def test_selected_controller__moves_levers_and_starts_another_controller_from_rest():
     starts = list[int]()
 
     class Counting:
-        def start(self, num: int) -> str:
+        def start(self, num):
             starts.append(num)
             return "at rest"
 
-        def __call__(self, seen: object, state: str) -> tuple[str, str]:
+        def __call__(self, seen, state):
             return f"from {state}", "moving"
 
     operator = SimpleNamespace(request=REQUEST._replace(mode=1, levers=np.array([1.0, 0, -1, 0])))
-    selected = SelectedController(BROKK_170, [Counting()], operator)  # type: ignore[list-item, arg-type]
+    selected = SelectedController(BROKK_170, [Counting()], operator)
     state = selected.start(3)
-    u, state = selected(measured(3), state)  # type: ignore[arg-type]
+    u, state = selected(measured(3), state)
     np.testing.assert_allclose(u * 127, np.tile([80, 0, 0, -80, 0], (3, 1)), atol=1e-9)
     assert not starts
     operator.request = REQUEST
     for expected in ("from at rest", "from moving"):
-        u, state = selected(measured(3), state)  # type: ignore[arg-type]
+        u, state = selected(measured(3), state)
         assert u == expected
     assert starts == [3]
 
 
-def test_operator__gives_the_newest_request_until_it_is_too_old() -> None:
+def test_operator__gives_the_newest_request_until_it_is_too_old():
     here, there = multiprocessing.Pipe()
     now = 10.0
     operator = WindowOperator(BROKK_170, there, lambda: now)
@@ -75,7 +74,7 @@ def test_operator__gives_the_newest_request_until_it_is_too_old() -> None:
     assert operator(True, True) == OperatorInput(stop=True)
 
 
-def test_loop__drives_levers_one_joint_each_and_changes_the_controller_while_driving() -> None:
+def test_loop__drives_levers_one_joint_each_and_changes_the_controller_while_driving():
     loop = PipedLoop(ConstantCommand(60, 0, 0, 0, 0))
     loop.go(0.5, False, mode=1)
     loop.go(0.2, True, mode=1)
@@ -95,7 +94,7 @@ def test_loop__drives_levers_one_joint_each_and_changes_the_controller_while_dri
     loop.close()
 
 
-def test_loop__closes_the_valves_and_sends_nothing_while_the_window_is_silent() -> None:
+def test_loop__closes_the_valves_and_sends_nothing_while_the_window_is_silent():
     loop = PipedLoop(ConstantCommand(60, 0, 0, 0, 0))
     loop.go(0.5, False)
     loop.go(0.4, True)
@@ -117,20 +116,18 @@ def test_loop__closes_the_valves_and_sends_nothing_while_the_window_is_silent() 
     loop.close()
 
 
-def test_control__drives_a_machine_of_its_own_until_the_window_closes_the_pipe(
-    tmp_path: Path,
-) -> None:
+def test_control__drives_a_machine_of_its_own_until_the_window_closes_the_pipe(tmp_path):
     here, there = multiprocessing.Pipe()
     options = BusOptions(log=tmp_path / "run.log", start=START)
     thread = threading.Thread(target=here.close)  # as soon as the loop runs
     poll = there.poll
 
-    def poll_once() -> bool:
+    def poll_once():
         thread.start()
         thread.join()
         return poll()
 
-    there.poll = poll_once  # type: ignore[assignment]
+    there.poll = poll_once
     control(BROKK_170, [], options, there)
     assert (tmp_path / "run.log").stat().st_size > 0
     assert not [thread for thread in threading.enumerate() if "serve" in thread.name]
@@ -144,11 +141,9 @@ def test_control__drives_a_machine_of_its_own_until_the_window_closes_the_pipe(
         (None, BusOptions(start=START), "got AttributeError: "),
     ],
 )
-def test_receive_telemetry__says_why_the_loop_ended(
-    machine: object, options: BusOptions, message: str
-) -> None:
+def test_receive_telemetry__says_why_the_loop_ended(machine, options, message):
     here, there = multiprocessing.Pipe()
-    control(machine, [], options, there)  # type: ignore[arg-type]
+    control(machine, [], options, there)
     there.close()
     send_request(here, REQUEST)  # no error: the next line reports it
     with pytest.raises(ValueError, match=f"^play: expected a loop that runs, {message}"):
@@ -157,7 +152,7 @@ def test_receive_telemetry__says_why_the_loop_ended(
         list(receive_telemetry(here))
 
 
-def test_control__survives_a_window_that_is_gone_before_the_error() -> None:
+def test_control__survives_a_window_that_is_gone_before_the_error():
     here, there = multiprocessing.Pipe()
     here.close()
     control(BROKK_170, [], BusOptions("nonsense", "bus"), there)

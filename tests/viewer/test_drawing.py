@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from hypothesis import strategies as st
 from strategies import moving
 
 from brokk_min.kinematics import forward_kinematics, jacobian, tool_position
-from brokk_min.machine import BROKK_170, Machine
+from brokk_min.machine import BROKK_170
 from brokk_min.viewer import drawing
 from brokk_min.viewer.camera import Camera, cameras
 from brokk_min.viewer.drawing import NO_POINTS, Scene
@@ -24,20 +23,18 @@ STRETCHED = np.array([0.0, 0.0, 0.0, np.pi, 3 * np.pi / 4])  # all links horizon
 SIZE = (960, 600)
 
 
-def scene(q: np.ndarray = Q, **more: Any) -> Scene:
+def scene(q=Q, **more):
     still = np.zeros(len(q))
     return Scene(q, still, still, np.zeros(3))._replace(**more)
 
 
-def drawn(*scenes: Scene, machine: Machine = BROKK_170, size: tuple[int, int] = SIZE) -> Recorder:
+def drawn(*scenes, machine=BROKK_170, size=SIZE):
     canvas = Recorder(size)
     drawing.draw(canvas, machine, scenes)
     return canvas
 
 
-def views(
-    machine: Machine, q: np.ndarray, in_view: np.ndarray = NO_POINTS
-) -> tuple[Camera, Camera]:
+def views(machine, q, in_view=NO_POINTS):
     """The cameras of a picture of one arm."""
     layout = drawing._layout((0.0, 0.0, *map(float, SIZE)), machine.n, 0)
     p_tool = tool_position(forward_kinematics(machine, q))
@@ -45,7 +42,7 @@ def views(
     return side, top
 
 
-def tool(q: np.ndarray = Q) -> np.ndarray:
+def tool(q=Q):
     return tool_position(forward_kinematics(BROKK_170, q))
 
 
@@ -53,9 +50,7 @@ def tool(q: np.ndarray = Q) -> np.ndarray:
 
 
 @given(moving([()]), st.sampled_from([(960, 600), (480, 560), (1500, 300)]))
-def test_draw__puts_the_joints_of_any_machine_where_kinematics_say(
-    machine_moving: tuple[Machine, np.ndarray, np.ndarray], size: tuple[int, int]
-) -> None:
+def test_draw__puts_the_joints_of_any_machine_where_kinematics_say(machine_moving, size):
     machine, q, q_dot = machine_moving
     goal = np.array([0.1, -0.2, 0.05])
     canvas = drawn(scene(q, q_dot=q_dot, v_goal=goal), machine=machine, size=size)
@@ -77,7 +72,7 @@ def test_draw__puts_the_joints_of_any_machine_where_kinematics_say(
         assert np.sum(expected**2) < 1e-9 or scale > 1
 
 
-def test_backdrop__has_a_grid_and_the_ground_as_worked_out_by_hand() -> None:
+def test_backdrop__has_a_grid_and_the_ground_as_worked_out_by_hand():
     """20 px a metre, the origin at (50, 80) of a box of 100 x 100 px: the ground is 80 px down."""
     box = (0.0, 0.0, 100.0, 100.0)
     axes = np.array([[1.0, 0, 0], [0, 0, 1.0]])
@@ -97,7 +92,7 @@ def test_backdrop__has_a_grid_and_the_ground_as_worked_out_by_hand() -> None:
     assert below.texts_drawn == ["side view, grid 1 m", "top view, grid 10 m"]
 
 
-def test_draw__paints_trail_and_path_and_nothing_else() -> None:
+def test_draw__paints_trail_and_path_and_nothing_else():
     trail = tool() + np.linspace(0, 1, 50)[:, None] * np.array([0.9, -0.5, 0.5])
     path = tool() + np.array([[0.0, 0.0, 0.0], [0.8, 0.8, -0.2]])
     canvas = drawn(scene(trail=trail, path=path))
@@ -113,7 +108,7 @@ def test_draw__paints_trail_and_path_and_nothing_else() -> None:
     assert 300 < changed.sum() < 6000
 
 
-def test_draw__enlarges_points_in_view_and_cuts_off_what_lies_beyond() -> None:
+def test_draw__enlarges_points_in_view_and_cuts_off_what_lies_beyond():
     line = tool() + np.array([[0.0, 0, 0], [0.5, 0, 0], [0.5, 0.8, 0]])
     spans = []
     for in_view in (NO_POINTS, line):
@@ -129,7 +124,7 @@ def test_draw__enlarges_points_in_view_and_cuts_off_what_lies_beyond() -> None:
     assert (image[33:39, :576] == drawing.BACKGROUND).all()
 
 
-def test_draw__points_arrows_along_goal_and_measured_velocity() -> None:
+def test_draw__points_arrows_along_goal_and_measured_velocity():
     q_dot = np.array([0.1, 0.0, 0.05, -0.1, 0.2])
     v_tool = jacobian(forward_kinematics(BROKK_170, Q)) @ q_dot
     goal = np.array([0.1, 0.05, 0.15])
@@ -150,9 +145,7 @@ def test_draw__points_arrows_along_goal_and_measured_velocity() -> None:
         ([5.0, 0], [[0, 0], [1.5, 0]], [[5, 0], [1.5, 1.575], [1.5, -1.575]]),
     ],
 )
-def test_arrow__has_shaft_and_head_as_worked_out_by_hand(
-    along: list[float], shaft: Any, head: Any
-) -> None:
+def test_arrow__has_shaft_and_head_as_worked_out_by_hand(along, shaft, head):
     canvas = Recorder((10, 10))
     drawing._arrow(canvas, np.zeros(2), np.array([4.0, 0]), (1, 2, 3))  # too short
     drawing._arrow(canvas, np.zeros(2), np.array(along), (1, 2, 3))
@@ -162,7 +155,7 @@ def test_arrow__has_shaft_and_head_as_worked_out_by_hand(
     np.testing.assert_allclose(polygon.points, head)
 
 
-def test_draw__rings_the_next_point_of_a_line() -> None:
+def test_draw__rings_the_next_point_of_a_line():
     target = tool() + np.array([[0.0, 0.5, 0.3]])
     rings = [c for c in drawn(scene(target=target)).circles if c.colour == drawing.PATH]
     for ring, camera in zip(rings, views(BROKK_170, Q), strict=True):
@@ -173,7 +166,7 @@ def test_draw__rings_the_next_point_of_a_line() -> None:
 # --- warnings, rows, layout -----------------------------------------------------------------------
 
 
-def red_pixels(canvas: Recorder) -> int:
+def red_pixels(canvas):
     return int((np.abs(canvas.image().astype(int) - drawing.WARNING).sum(axis=-1) < 30).sum())
 
 
@@ -186,9 +179,7 @@ def red_pixels(canvas: Recorder) -> int:
         (1, 0.0, False),  # at its limit, but locked
     ],
 )
-def test_draw__warns_in_red_of_a_driven_joint_near_its_limit(
-    joint: int, angle: float, warned: bool
-) -> None:
+def test_draw__warns_in_red_of_a_driven_joint_near_its_limit(joint, angle, warned):
     q = Q.copy()
     q[joint] = angle
     canvas = drawn(scene(q, status="driving", status_colour=drawing.DRIVING))
@@ -197,7 +188,7 @@ def test_draw__warns_in_red_of_a_driven_joint_near_its_limit(
     assert (red_pixels(canvas) > 50) == warned
 
 
-def test_draw__rings_the_tool_in_red_near_a_singularity() -> None:
+def test_draw__rings_the_tool_in_red_near_a_singularity():
     wide = [replace(j, q_min=-3.0, q_max=3.2, cylinder_base=0.0) for j in BROKK_170.joints]
     machine = replace(BROKK_170, joints=tuple(wide))
     canvas = drawn(scene(STRETCHED), machine=machine)
@@ -208,7 +199,7 @@ def test_draw__rings_the_tool_in_red_near_a_singularity() -> None:
     assert not [c for c in drawn(scene()).circles if c.colour == drawing.WARNING]
 
 
-def test_near_singular__compares_the_least_singular_value_with_the_arms_length() -> None:
+def test_near_singular__compares_the_least_singular_value_with_the_arms_length():
     length = 0.95 + 0.25 + 1.15 + 1.25 + 1.15 + 1.2
     length += np.hypot(0.25, 0.95) - 0.25 - 0.95
     for q3 in np.linspace(-0.3, 1.6, 20):
@@ -219,7 +210,7 @@ def test_near_singular__compares_the_least_singular_value_with_the_arms_length()
 
 
 @pytest.mark.parametrize(("counts", "fraction"), [(80, 1.0), (-40, -0.5), (0, 0.0)])
-def test_joint_rows__have_valve_bars_as_long_as_the_command(counts: int, fraction: float) -> None:
+def test_joint_rows__have_valve_bars_as_long_as_the_command(counts, fraction):
     u = np.zeros(5)
     u[3] = counts / 127
     canvas = drawn(scene(u=u))
@@ -236,7 +227,7 @@ def test_joint_rows__have_valve_bars_as_long_as_the_command(counts: int, fractio
 
 
 @pytest.mark.parametrize(("angle", "text"), [(-0.004, "+0.00"), (0.586, "+0.59"), (-0.3, "-0.30")])
-def test_joint_rows__mark_angles_and_write_them_without_minus_zero(angle: float, text: str) -> None:
+def test_joint_rows__mark_angles_and_write_them_without_minus_zero(angle, text):
     q = np.array([0.0, 0.5, angle, 1.71, 1.24])
     canvas = drawn(scene(q))
     assert text in canvas.texts_drawn
@@ -248,7 +239,7 @@ def test_joint_rows__mark_angles_and_write_them_without_minus_zero(angle: float,
     assert marks[row][:2, 0].mean() == pytest.approx(x)
 
 
-def test_draw__says_that_positions_are_unknown() -> None:
+def test_draw__says_that_positions_are_unknown():
     canvas = drawn(scene(np.full(5, np.nan), status="waiting: q1: silent"))
     assert {"no positions", "waiting: q1: silent"} <= set(canvas.texts_drawn)
     known = {"side view, grid 1 m", "top view, grid 1 m"}
@@ -260,9 +251,7 @@ def test_draw__says_that_positions_are_unknown() -> None:
     ("arms", "size"), [(1, (1120, 680)), (1, SIZE), (2, (900, 480)), (3, (960, 540))]
 )
 @pytest.mark.parametrize("n", [2, 3, 5])
-def test_draw__cuts_off_no_text_and_puts_none_on_another(
-    n: int, arms: int, size: tuple[int, int]
-) -> None:
+def test_draw__cuts_off_no_text_and_puts_none_on_another(n, arms, size):
     name = "bucke" if arms > 1 else "cylinder_"
     joints = [replace(joint, name=f"{name}{i}") for i, joint in enumerate(BROKK_170.joints[:n])]
     machine = replace(BROKK_170, joints=tuple(joints))
@@ -285,7 +274,7 @@ def test_draw__cuts_off_no_text_and_puts_none_on_another(
     assert min(np.ptp(track[:, 0]) for track in tracks) > 10
 
 
-def test_draw__keeps_two_arms_apart() -> None:
+def test_draw__keeps_two_arms_apart():
     left = (1, 2, 3)
     right = (4, 5, 6)
     canvas = drawn(scene(colour=left), scene(colour=right))

@@ -17,7 +17,7 @@ from brokk_min.viewer.input_handler import InputHandler
 
 
 @pytest.fixture(autouse=True)
-def no_display(monkeypatch: pytest.MonkeyPatch) -> None:
+def no_display(monkeypatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     monkeypatch.setenv("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")  # unseen: never has the focus
     pygame.display.init()
@@ -37,9 +37,7 @@ def no_display(monkeypatch: pytest.MonkeyPatch) -> None:
         ("w s", (0, 0, 0)),
     ],
 )
-def test_request__asks_for_at_most_tool_speed_and_for_nothing_once_released(
-    keys: str, direction: tuple[float, ...]
-) -> None:
+def test_request__asks_for_at_most_tool_speed_and_for_nothing_once_released(keys, direction):
     operator = Operator()
     request = [operator.key(key) for key in keys.split()][-1]
     np.testing.assert_allclose(request.v_goal, 0.3 * np.array(direction), atol=1e-12)
@@ -49,7 +47,7 @@ def test_request__asks_for_at_most_tool_speed_and_for_nothing_once_released(
     assert not request.v_goal.any()
 
 
-def test_request__ramps_over_a_quarter_of_a_second_and_shift_gives_a_third() -> None:
+def test_request__ramps_over_a_quarter_of_a_second_and_shift_gives_a_third():
     operator = Operator()
     speeds = [operator.key("up", seconds=0.05), operator.look(0.05), operator.look(1.0)]
     assert [r.v_goal[0] for r in speeds] == pytest.approx([0.3 * 0.2, 0.3 * 0.4, 0.3])
@@ -59,21 +57,21 @@ def test_request__ramps_over_a_quarter_of_a_second_and_shift_gives_a_third() -> 
     assert operator.key("down", seconds=0.05).v_goal[0] == pytest.approx(-0.3 * 0.2)
 
 
-def test_request__starts_from_zero_when_the_direction_changes_within_a_frame() -> None:
+def test_request__starts_from_zero_when_the_direction_changes_within_a_frame():
     operator = Operator()
     operator.key("up")
     pygame.event.post(pygame.event.Event(pygame.KEYUP, key=pygame.K_UP))
     assert operator.key("down", seconds=0.05).v_goal[0] == pytest.approx(-0.3 * 0.2)
 
 
-def test_request__asks_for_nothing_at_first() -> None:
+def test_request__asks_for_nothing_at_first():
     request = InputHandler(BROKK_170, pygame, MODES).request(7.0)
     assert request[:4] == (7.0, 0, False, True)
     assert request.v_goal.tolist() == [0] * 3
     assert request.levers.tolist() == [0] * 4
 
 
-def test_request__has_a_lever_for_each_driven_joint_and_modes_go_round() -> None:
+def test_request__has_a_lever_for_each_driven_joint_and_modes_go_round():
     operator = Operator()
     operator.key("tab")
     operator.key("tab")
@@ -88,7 +86,7 @@ def test_request__has_a_lever_for_each_driven_joint_and_modes_go_round() -> None
     assert operator.key("tab").mode == 0
 
 
-def test_request__adds_keys_to_a_gamepad_of_few_axes_up_to_full_deflection() -> None:
+def test_request__adds_keys_to_a_gamepad_of_few_axes_up_to_full_deflection():
     operator = Operator(["levers"])
     axes = [-1.0, -1.0, 0.0, -1.0]  # of PAD_AXES 1, 0, 4, 3: there is no 4
     operator.handler.pad = SimpleNamespace(
@@ -105,7 +103,7 @@ def test_request__adds_keys_to_a_gamepad_of_few_axes_up_to_full_deflection() -> 
     assert operator.key("a").levers.tolist() == [-1, -1, 0, 0]
 
 
-def test_switch__counts_only_if_pressed_with_nothing_deflected() -> None:
+def test_switch__counts_only_if_pressed_with_nothing_deflected():
     operator = Operator()
     assert operator.key("space").enable
     assert operator.key("up").enable  # deflected later
@@ -117,7 +115,7 @@ def test_switch__counts_only_if_pressed_with_nothing_deflected() -> None:
 
 
 @pytest.mark.parametrize("loss", ["focus", "mode"])
-def test_switch__needs_a_fresh_press_after_loss_of_focus_and_change_of_mode(loss: str) -> None:
+def test_switch__needs_a_fresh_press_after_loss_of_focus_and_change_of_mode(loss):
     operator = Operator()
     operator.key("space")
     assert operator.key("up").enable
@@ -138,7 +136,7 @@ def test_switch__needs_a_fresh_press_after_loss_of_focus_and_change_of_mode(loss
     assert operator.key("space").enable
 
 
-def test_handle__keeps_the_requested_task_and_closes() -> None:
+def test_handle__keeps_the_requested_task_and_closes():
     operator = Operator()
     for key, task in (("return", "next"), ("up", "next"), ("backspace", "again"), ("up", "again")):
         operator.key(key)
@@ -153,7 +151,7 @@ def test_handle__keeps_the_requested_task_and_closes() -> None:
     assert other.handler.closed
 
 
-def test_gamepad__drives_until_it_is_unplugged_then_the_keyboard_does() -> None:
+def test_gamepad__drives_until_it_is_unplugged_then_the_keyboard_does():
     operator = Operator()
     device = Virtual()
     operator.look()
@@ -183,7 +181,7 @@ def test_gamepad__drives_until_it_is_unplugged_then_the_keyboard_does() -> None:
     assert operator.key("space").enable
 
 
-def test_gamepad__that_comes_needs_a_fresh_press_and_its_triggers_are_no_levers() -> None:
+def test_gamepad__that_comes_needs_a_fresh_press_and_its_triggers_are_no_levers():
     joints = [replace(joint, driven=True, q_dot_up=0.2) for joint in BROKK_170.joints]
     machine = replace(BROKK_170, joints=tuple(joints))
     device = Virtual()

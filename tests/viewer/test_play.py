@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import runpy
-from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import can
 import numpy as np
@@ -17,12 +15,10 @@ from helpers_canvas import Recorder
 from helpers_viewer import MODES, Operator, post, post_key, telemetry
 
 from brokk_min.can.canopen import OperatorInput
-from brokk_min.can.drive_log import Telemetry
 from brokk_min.kinematics import forward_kinematics, tool_position
-from brokk_min.machine import BROKK_170, Machine
+from brokk_min.machine import BROKK_170
 from brokk_min.viewer import drawing, play, replay
-from brokk_min.viewer.control_process import BusOptions, Request
-from brokk_min.viewer.input_handler import InputHandler
+from brokk_min.viewer.control_process import BusOptions
 from brokk_min.viewer.play import Session
 from brokk_min.viewer.tracing import Attempt
 from brokk_min.viewer.window import Window
@@ -33,7 +29,7 @@ ATTEMPT = Attempt("now", "rectangle", "jacobian", 12.0, 0.01, 0.03, 7.0)
 
 
 @pytest.fixture(autouse=True)
-def no_display(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def no_display(monkeypatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     pygame.display.init()
     pygame.event.clear()
@@ -43,14 +39,14 @@ def no_display(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     pygame.event.clear()
 
 
-def tool(q: Any) -> np.ndarray:
+def tool(q):
     return tool_position(forward_kinematics(BROKK_170, np.array(q)))
 
 
 # --- what is shown --------------------------------------------------------------------------------
 
 
-def test_scene__interpolates_between_two_ticks_and_forgets_them_after_half_a_second() -> None:
+def test_scene__interpolates_between_two_ticks_and_forgets_them_after_half_a_second():
     session = Session(BROKK_170, MODES, None)
     q = np.array(START)
     for hint, status in (("starting", "starting"), ("", "no telemetry")):
@@ -78,7 +74,7 @@ def test_scene__interpolates_between_two_ticks_and_forgets_them_after_half_a_sec
     assert late.status == "no telemetry"
 
 
-def test_scene__shows_the_line_its_next_point_and_the_tool_however_far_off() -> None:
+def test_scene__shows_the_line_its_next_point_and_the_tool_however_far_off():
     session = Session(BROKK_170, MODES, None)
     session.next_task()
     assert session.tracing is None  # the tool is nowhere yet
@@ -102,7 +98,7 @@ def test_scene__shows_the_line_its_next_point_and_the_tool_however_far_off() -> 
 
 @pytest.mark.parametrize("mode", [*MODES, ""])
 @pytest.mark.parametrize("machine", [BROKK_170, MINI_EXCAVATOR])
-def test_scene__fits_the_window_in_every_mode(machine: Machine, mode: str) -> None:
+def test_scene__fits_the_window_in_every_mode(machine, mode):
     session = Session(machine, MODES, None)
     q = (machine.column("q_min") + machine.column("q_max")) / 2
     session.update(telemetry(0, q), 0.0)
@@ -131,16 +127,14 @@ def test_scene__fits_the_window_in_every_mode(machine: Machine, mode: str) -> No
         ({}, "", ("ready", drawing.READY)),
     ],
 )
-def test_gate_status__names_the_fault_or_else_hints(
-    state: dict[str, Any], hint: str, status: tuple[str, Any]
-) -> None:
+def test_gate_status__names_the_fault_or_else_hints(state, hint, status):
     text, colour = play.gate_status(BROKK_170, telemetry(driving=False)._replace(**state), hint)
     expected, _, fault = text.partition(": ")
     assert (expected, colour) == status
     assert fault == ("valve controller: heartbeat lost" if 30 in state.values() else "")
 
 
-def test_next_step__says_what_the_operator_has_to_do() -> None:
+def test_next_step__says_what_the_operator_has_to_do():
     session = Session(BROKK_170, MODES, None)
     handler = Operator().handler
     assert play.next_step(session, handler) == "starting"
@@ -162,7 +156,7 @@ def test_next_step__says_what_the_operator_has_to_do() -> None:
     assert play.next_step(watching, handler) == "watching"
 
 
-def test_notes__have_keys_task_and_figures_and_attempts_are_kept_at_once(tmp_path: Path) -> None:
+def test_notes__have_keys_task_and_figures_and_attempts_are_kept_at_once(tmp_path):
     session = Session(BROKK_170, MODES, tmp_path / "attempts.csv")
     assert session.notes("") == ["only listening: nothing is sent; --drive drives", "ESC: end"]
     first, keys = session.notes("rl")
@@ -190,7 +184,7 @@ def test_notes__have_keys_task_and_figures_and_attempts_are_kept_at_once(tmp_pat
     assert session.notes("rl")[2:] == expected
 
 
-def test_session__begins_a_line_again_when_the_mode_changes_on_the_way() -> None:
+def test_session__begins_a_line_again_when_the_mode_changes_on_the_way():
     session = Session(BROKK_170, MODES, None)
     session.update(telemetry(), 0.0)
     session.next_task(again=True)
@@ -213,14 +207,14 @@ def test_session__begins_a_line_again_when_the_mode_changes_on_the_way() -> None
 # --- the window -----------------------------------------------------------------------------------
 
 
-def test_show__sends_requests_once_there_is_telemetry_and_takes_keys_frame_by_frame() -> None:
+def test_show__sends_requests_once_there_is_telemetry_and_takes_keys_frame_by_frame():
     session = Session(BROKK_170, MODES, None)
     frames = [[], [telemetry(0)], [telemetry(1)], [telemetry(2), telemetry(3)], [telemetry(4)]]
     presses = [[], [], ["return"], ["return"], ["backspace", "tab"], ["escape"]]
-    sent: list[Request] = []
-    tasks: list[tuple[str, Any]] = []
+    sent = []
+    tasks = []
 
-    def each_frame(seen: Session, handler: InputHandler) -> bool:
+    def each_frame(seen, handler):
         assert seen is session
         tasks.append((session.task, session.tracing))
         for name in presses.pop(0):
@@ -236,13 +230,13 @@ def test_show__sends_requests_once_there_is_telemetry_and_takes_keys_frame_by_fr
     assert session.previous.tick == 3
 
 
-def test_play__drives_a_machine_in_another_process(tmp_path: Path) -> None:
+def test_play__drives_a_machine_in_another_process(tmp_path):
     """In real time: keys, the loop's process, the plant behind the bus; then focus and closing.
 
     On a busy computer the gate may stop for a late tick: then the switch is pressed anew.
     """
-    seen: list[Telemetry] = []
-    steps: list[tuple[Callable[[Telemetry], bool], int, dict[str, int]]] = [
+    seen = []
+    steps = [
         (lambda t: t.active_fault == 0, pygame.KEYDOWN, {"key": pygame.K_SPACE}),
         (lambda t: t.driving, pygame.KEYDOWN, {"key": pygame.K_q}),
         (lambda t: bool(t.q_dot[0] > 0.1), pygame.WINDOWFOCUSLOST, {}),
@@ -251,7 +245,7 @@ def test_play__drives_a_machine_in_another_process(tmp_path: Path) -> None:
     ]
     at = frames = 0
 
-    def each_frame(session: Session, handler: InputHandler) -> bool:
+    def each_frame(session, handler):
         nonlocal at, frames
         frames += 1
         assert frames < 3600, (session.telemetry, at)
@@ -279,9 +273,7 @@ def test_play__drives_a_machine_in_another_process(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("interface", ["", "virtual"])
-def test_play__reaches_no_bus_without_a_window(
-    interface: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_play__reaches_no_bus_without_a_window(interface, monkeypatch, tmp_path):
     pygame.display.quit()
     monkeypatch.setenv("SDL_VIDEODRIVER", "nonsense")
     options = BusOptions(interface, "empty", log=tmp_path / "run.log")
@@ -292,26 +284,26 @@ def test_play__reaches_no_bus_without_a_window(
     assert not list(tmp_path.iterdir())
 
 
-def test_play__ends_with_the_reason_of_a_loop_that_cannot_begin(tmp_path: Path) -> None:
+def test_play__ends_with_the_reason_of_a_loop_that_cannot_begin(tmp_path):
     options = BusOptions("virtual", "empty")  # nobody answers
     with pytest.raises(ValueError, match="got node 1: object 0x6501"):
         play.play(BROKK_170, {}, options, tmp_path / "attempts.csv")
 
 
-def test_watch__shows_another_programs_drive_and_sends_nothing() -> None:
-    def operator(driving: bool, ready: bool) -> OperatorInput:
+def test_watch__shows_another_programs_drive_and_sends_nothing():
+    def operator(driving, ready):
         return OperatorInput((0.1, 0, 0) if driving else (0, 0, 0), ready)
 
     world = World(ConstantCommand(60, 0, 60, 60, 60), operator)
-    frames: list[tuple[int, bytes]] = []
+    frames = []
     world.upward = world.downward = recording(frames)
     world.drive.begin()
     world.run(1.5)
     world.close()
     peer = can.Bus("watched", interface="virtual")
-    seen: list[Telemetry] = []
+    seen = []
 
-    def each_frame(session: Session, handler: InputHandler) -> bool:
+    def each_frame(session, handler):
         for can_id, data in frames[:40]:
             peer.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
         if session.telemetry is not None:

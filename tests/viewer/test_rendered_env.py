@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -22,13 +21,13 @@ from brokk_min.viewer.window import Canvas
 NAME = "brokk_min/Brokk170-v0"
 
 
-def renderer_of(env: object) -> FrameRenderer:
-    renderer = env.vector.renderer  # type: ignore[attr-defined]
+def renderer_of(env):
+    renderer = env.vector.renderer
     assert isinstance(renderer, FrameRenderer)
     return renderer
 
 
-def test_rendered_env__gives_frames_of_its_state_and_the_trail_since_the_reset() -> None:
+def test_rendered_env__gives_frames_of_its_state_and_the_trail_since_the_reset():
     made = gymnasium.make(NAME, render_mode="rgb_array")
     check_env(made.unwrapped)
     env = RenderCollection(made, pop_frames=False)
@@ -39,7 +38,7 @@ def test_rendered_env__gives_frames_of_its_state_and_the_trail_since_the_reset()
     assert isinstance(frames, list)
     assert len(frames) == 13
     assert (frames[-1] != frames[0]).any()
-    state = env.unwrapped.vector.state  # type: ignore[attr-defined]
+    state = env.unwrapped.vector.state
     trail = np.array(renderer_of(env.unwrapped).trails[0])
     assert len(trail) == 13
     p_tool = tool_position(forward_kinematics(BROKK_170, state.q[0]))
@@ -54,7 +53,7 @@ def test_rendered_env__gives_frames_of_its_state_and_the_trail_since_the_reset()
     env.close()
 
 
-def test_rendered_env__shows_a_window_for_people(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rendered_env__shows_a_window_for_people(monkeypatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     env = gymnasium.make(NAME, render_mode="human")
     env.reset(seed=1)
@@ -69,7 +68,7 @@ def test_rendered_env__shows_a_window_for_people(monkeypatch: pytest.MonkeyPatch
     assert not window.pygame.display.get_init()
 
 
-def test_rendered_vector_env__gives_a_frame_of_each_machine() -> None:
+def test_rendered_vector_env__gives_a_frame_of_each_machine():
     config = TaskConfig(episode_s=0.2)
     envs = gymnasium.make_vec(NAME, num_envs=2, config=config, render_mode="rgb_array")
     envs.reset(seed=0)
@@ -79,12 +78,12 @@ def test_rendered_vector_env__gives_a_frame_of_each_machine() -> None:
     assert isinstance(frames, tuple)
     assert [frame.shape for frame in frames] == [(600, 960, 3)] * 2
     assert (frames[0] != frames[1]).any()
-    trails = envs.unwrapped.renderer.trails  # type: ignore[attr-defined]
+    trails = envs.unwrapped.renderer.trails
     assert [len(trail) for trail in trails.values()] == [3, 3]  # of the reset in step 4, then two
     envs.close()
 
 
-def test_rendered_env__serves_gymnasiums_video_recorder(tmp_path: Path) -> None:
+def test_rendered_env__serves_gymnasiums_video_recorder(tmp_path):
     pytest.importorskip("moviepy")
     made = gymnasium.make(NAME, render_mode="rgb_array")
     env = RecordVideo(made, str(tmp_path), video_length=5)
@@ -95,7 +94,7 @@ def test_rendered_env__serves_gymnasiums_video_recorder(tmp_path: Path) -> None:
     assert next(tmp_path.glob("*.mp4")).stat().st_size > 1000
 
 
-def test_rendered_env__refuses_what_it_cannot_do(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rendered_env__refuses_what_it_cannot_do(monkeypatch):
     with pytest.raises(ValueError, match=r"render_mode: expected one of .* got 'ansi'"):
         RenderedEnv(render_mode="ansi")
     for env in (RenderedEnv(render_mode="rgb_array"), RenderedEnv()):

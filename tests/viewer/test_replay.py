@@ -5,8 +5,6 @@ from __future__ import annotations
 import io
 import json
 import os
-from pathlib import Path
-from typing import Any
 
 import can
 import numpy as np
@@ -31,13 +29,13 @@ COLOUR = (1, 2, 3)
 
 
 @pytest.fixture(autouse=True)
-def no_display(monkeypatch: pytest.MonkeyPatch) -> None:
+def no_display(monkeypatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     pygame.display.init()
     pygame.event.clear()
 
 
-def run_of(ticks: int, title: str = "a", path: np.ndarray = drawing.NO_POINTS) -> Run:
+def run_of(ticks, title="a", path=drawing.NO_POINTS):
     """The cabin turns at 0.1 rad/s; the goal is 0.1 m/s to the left and 0.05 m/s upward."""
     q = np.array(START) + 0.005 * np.arange(ticks)[:, None] * np.eye(5)[0]
     q_dot = np.tile([0.1, 0, 0, 0, 0], (ticks, 1))
@@ -45,7 +43,7 @@ def run_of(ticks: int, title: str = "a", path: np.ndarray = drawing.NO_POINTS) -
     return Run(BROKK_170, title, COLOUR, q, q_dot, np.full((ticks, 5), 0.3), v_goal, path)
 
 
-def recorded_log(path: Path, controller: Any, seconds: float, v: Any) -> PipedLoop:
+def recorded_log(path, controller, seconds, v):
     """A loop that has stood for 0.5 s and driven for some more, with a log of it."""
     loop = PipedLoop(controller, log=can.CanutilsLogWriter(path))
     loop.go(0.5, False)
@@ -58,7 +56,7 @@ def recorded_log(path: Path, controller: Any, seconds: float, v: Any) -> PipedLo
 # --- runs -----------------------------------------------------------------------------------------
 
 
-def test_run__has_tool_positions_velocity_error_and_all_that_must_be_in_view() -> None:
+def test_run__has_tool_positions_velocity_error_and_all_that_must_be_in_view():
     path = np.array([[9.0, 0, 0], [9, 1, 0]])
     run = run_of(25, path=path)
     frames = forward_kinematics(BROKK_170, run.q)
@@ -70,9 +68,7 @@ def test_run__has_tool_positions_velocity_error_and_all_that_must_be_in_view() -
     np.testing.assert_array_equal(run.in_view, np.vstack([corners, path]))
 
 
-def test_run_of_log__has_the_telemetry_of_the_loop_from_the_first_driven_tick(
-    tmp_path: Path,
-) -> None:
+def test_run_of_log__has_the_telemetry_of_the_loop_from_the_first_driven_tick(tmp_path):
     path = tmp_path / "run.log"
     loop = recorded_log(path, BASELINE, 2.0, (0.0, 0.2, 0.1))
     run = replay.run_of_log(BROKK_170, path, COLOUR)
@@ -86,7 +82,7 @@ def test_run_of_log__has_the_telemetry_of_the_loop_from_the_first_driven_tick(
     assert run.error[-5:].mean() < 0.08
 
 
-def test_run_of_log__refuses_a_log_in_which_nothing_drives(tmp_path: Path) -> None:
+def test_run_of_log__refuses_a_log_in_which_nothing_drives(tmp_path):
     idle = tmp_path / "idle.log"
     idle.write_text("(1.0) can0 080# R\n(1.05) can0 080# R\n")
     with pytest.raises(ValueError, match="expected a log in which the valves are driven, got none"):
@@ -97,7 +93,7 @@ def test_run_of_log__refuses_a_log_in_which_nothing_drives(tmp_path: Path) -> No
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def results(tmp_path_factory):
     """What `evaluate` writes, of a policy and gains that nobody tuned."""
     folder = tmp_path_factory.mktemp("results")
     policy = random_policy(np.random.default_rng(0))
@@ -114,7 +110,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "runs.json"
 
 
-def test_simulate_again__gives_the_runs_of_the_file_along_the_goals(results: Path) -> None:
+def test_simulate_again__gives_the_runs_of_the_file_along_the_goals(results):
     names = ["rl", "jacobian_pid_k0.1"]
     read = replay.read_results(BROKK_170, results, names)
     runs = replay.simulate_again(BROKK_170, read, names, "side", 1)
@@ -140,9 +136,7 @@ def test_simulate_again__gives_the_runs_of_the_file_along_the_goals(results: Pat
         (lambda f: f["meta"].update(plant="net"), "expected the run"),
     ],
 )
-def test_results__that_are_not_those_of_the_file_are_refused(
-    change: Any, message: str, results: Path, tmp_path: Path
-) -> None:
+def test_results__that_are_not_those_of_the_file_are_refused(change, message, results, tmp_path):
     file = json.loads(results.read_text())
     change(file)
     wrong = tmp_path / "wrong.json"
@@ -152,9 +146,7 @@ def test_results__that_are_not_those_of_the_file_are_refused(
         replay.simulate_again(BROKK_170, read, ["rl"], "side", 1)
 
 
-def test_read_results__takes_files_of_reproduce_with_policy_and_gains_beside_them(
-    results: Path,
-) -> None:
+def test_read_results__takes_files_of_reproduce_with_policy_and_gains_beside_them(results):
     file = json.loads(results.read_text())
     meta = {key: file["meta"][key] for key in ("machine", "seed")}
     whole = results.with_name("results.json")
@@ -172,7 +164,7 @@ def test_read_results__takes_files_of_reproduce_with_policy_and_gains_beside_the
 # --- films ----------------------------------------------------------------------------------------
 
 
-def test_film__goes_by_one_clock_and_a_run_that_is_over_stands_still() -> None:
+def test_film__goes_by_one_clock_and_a_run_that_is_over_stands_still():
     long = run_of(31, "rl")
     short = run_of(11, "my.log")
     images = {t: replay.film([long, short], t, (640, 360)).image() for t in (0, 10, 20, 30)}
@@ -184,19 +176,17 @@ def test_film__goes_by_one_clock_and_a_run_that_is_over_stands_still() -> None:
 
 
 @pytest.mark.parametrize(("fps", "frames"), [(10.0, 3), (7.0, 2), (100.0, 5)])
-def test_write_film__has_as_many_frames_a_second_as_ticks_allow(
-    fps: float, frames: int, tmp_path: Path
-) -> None:
+def test_write_film__has_as_many_frames_a_second_as_ticks_allow(fps, frames, tmp_path):
     replay.write_film(tmp_path / "f.gif", BROKK_170, [run_of(5), run_of(2)], (640, 360), fps)
     film = Image.open(tmp_path / "f.gif")
-    assert film.n_frames == frames  # type: ignore[attr-defined]
+    assert film.n_frames == frames
     assert film.info["duration"] == 50 * {3: 2, 2: 3, 5: 1}[frames]
     assert film.info["loop"] == 0
     with pytest.raises(ValueError, match=r"expected a name ending in .gif or .mp4, got '.avi'"):
         replay.write_film(tmp_path / "f.avi", BROKK_170, [run_of(5)], (640, 360), fps)
 
 
-def test_gif__keeps_the_colours_that_warn_and_measure() -> None:
+def test_gif__keeps_the_colours_that_warn_and_measure():
     colours = [*drawing.COLOURS.values(), drawing.WARNING, drawing.MEASURED, drawing.PATH]
     image = replay.film([run_of(5)], 0, (640, 360)).image()
     for k, colour in enumerate(colours):
@@ -216,9 +206,7 @@ def test_gif__keeps_the_colours_that_warn_and_measure() -> None:
         (None, "film: expected ffmpeg for .mp4, or a name in .gif, got none"),
     ],
 )
-def test_write_film__hands_raw_pictures_to_ffmpeg(
-    script: str | None, message: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_write_film__hands_raw_pictures_to_ffmpeg(script, message, monkeypatch, tmp_path):
     """Another ffmpeg: it keeps what it gets, ends early, fails, or is not there."""
     monkeypatch.chdir(tmp_path)
     if script is not None:
@@ -240,7 +228,7 @@ def test_write_film__hands_raw_pictures_to_ffmpeg(
     assert {"yuv420p", "crop=trunc(iw/2)*2:trunc(ih/2)*2", "mp4"} <= set(options[pipe:])
 
 
-def test_show_film__halts_and_moves_by_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_show_film__halts_and_moves_by_a_second(monkeypatch):
     keys = {
         3: "space",
         5: "right",
@@ -251,10 +239,10 @@ def test_show_film__halts_and_moves_by_a_second(monkeypatch: pytest.MonkeyPatch)
         10: "right",
         12: "escape",
     }
-    ticks: list[int] = []
+    ticks = []
     film = replay.film
 
-    def pressing(runs: Any, tick: int, size: Any) -> Any:
+    def pressing(runs, tick, size):
         ticks.append(tick)
         if len(ticks) in keys:
             post_key(keys[len(ticks)])
@@ -266,7 +254,7 @@ def test_show_film__halts_and_moves_by_a_second(monkeypatch: pytest.MonkeyPatch)
     assert not pygame.display.get_init()
 
 
-def test_show_film__ends_when_the_window_is_closed() -> None:
+def test_show_film__ends_when_the_window_is_closed():
     pygame.event.post(pygame.event.Event(pygame.QUIT))
     replay.show_film(BROKK_170, [run_of(3)], (640, 360))
     assert not pygame.display.get_init()

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import time
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers_bus import BASELINE, START
 from helpers_viewer import PipedLoop, telemetry
 
-from brokk_min.can.drive_log import Telemetry
 from brokk_min.evaluation.sequences import feasible
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
@@ -25,11 +23,11 @@ REACH = extent(BROKK_170)[2]
 RECTANGLE = [[0, 0, 0], [0, 0.16, 0], [0.1, 0.16, 0], [0.1, 0, 0], [0, 0, 0]]
 
 
-def tool(q: object) -> np.ndarray:
+def tool(q):
     return tool_position(forward_kinematics(BROKK_170, np.array(q)))
 
 
-def test_task_lines__are_as_worked_out_by_hand_in_fractions_of_the_reach() -> None:
+def test_task_lines__are_as_worked_out_by_hand_in_fractions_of_the_reach():
     assert list(LINES) == ["rectangle", "circle", "line x", "line y", "line z"]
     rectangle = LINES["rectangle"] / REACH
     turns = np.abs(np.diff(rectangle, n=2, axis=0)).max(axis=1) > 1e-9
@@ -45,7 +43,7 @@ def test_task_lines__are_as_worked_out_by_hand_in_fractions_of_the_reach() -> No
 
 
 @pytest.mark.parametrize("task", LINES)
-def test_task_lines__are_dense_and_feasible_from_the_start_pose(task: str) -> None:
+def test_task_lines__are_dense_and_feasible_from_the_start_pose(task):
     line = LINES[task]
     steps = np.diff(line, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
@@ -55,13 +53,13 @@ def test_task_lines__are_dense_and_feasible_from_the_start_pose(task: str) -> No
     assert feasible(BROKK_170, np.array([START]), goals).all()
 
 
-def test_distance__is_that_of_the_nearest_segment_by_hand() -> None:
+def test_distance__is_that_of_the_nearest_segment_by_hand():
     line = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0]])
     p = np.array([[0.5, 0.0, 0.2], [-3.0, 4.0, 0.0], [1.2, 0.5, 0.0], [1.0, 1.0, 0.0]])
     np.testing.assert_allclose(tracing.distance(line, p), [0.2, 5.0, 0.2, 0.0], atol=1e-12)
 
 
-def test_tracing__ends_when_all_points_were_passed_in_order() -> None:
+def test_tracing__ends_when_all_points_were_passed_in_order():
     line = tool(START) + np.array([[0.0, 0, 0], [0, 0.3, 0], [0, 0.6, 0]])
     work = Tracing(BROKK_170, "line", line)
     assert not work.update(telemetry(2))  # the clock waits for the first opened valve
@@ -78,7 +76,7 @@ def test_tracing__ends_when_all_points_were_passed_in_order() -> None:
     assert abs(written - time.time()) < 60
 
 
-def test_attempt__agrees_with_a_driven_rectangle_worked_out_apart() -> None:
+def test_attempt__agrees_with_a_driven_rectangle_worked_out_apart():
     """The operator steers to the next point of the line, through the gate and the plant."""
     loop = PipedLoop(BASELINE)
     loop.go(0.4, False)
@@ -89,7 +87,7 @@ def test_attempt__agrees_with_a_driven_rectangle_worked_out_apart() -> None:
     assert work is not None
     np.testing.assert_allclose(work.line[0], tool(loop.ticks[-1].q))
     loop.go(0.2, True)
-    rows: list[Telemetry] = []
+    rows = []
     while not session.attempts and loop.world.t < 60:
         away = work.line[min(work.passed + 2, len(work.line) - 1)] - tool(loop.ticks[-1].q)
         loop.go(0.04, True, 0.2 * away / max(np.linalg.norm(away), 0.05))
@@ -115,7 +113,7 @@ def test_attempt__agrees_with_a_driven_rectangle_worked_out_apart() -> None:
     assert notes[1].startswith("mean of 1 by jacobian: ")
 
 
-def test_attempts__are_kept_in_a_table_and_averaged_by_mode(tmp_path: Path) -> None:
+def test_attempts__are_kept_in_a_table_and_averaged_by_mode(tmp_path):
     path = tmp_path / "attempts.csv"
     assert tracing.read_attempts(path) == []
     when = "2026-01-01T00:00:00"

@@ -15,11 +15,11 @@ BLUE = (0, 0, 200)
 GREEN = (0, 150, 0)
 
 
-def columns(image: np.ndarray, row: int, colour: tuple[int, int, int]) -> list[int]:
+def columns(image, row, colour):
     return np.flatnonzero((image[row] == colour).all(axis=-1)).tolist()
 
 
-def test_canvas__paints_shapes_where_they_are_and_as_large() -> None:
+def test_canvas__paints_shapes_where_they_are_and_as_large():
     canvas = Canvas((60, 40))
     canvas.line(np.array([[5.0, 5], [5, 35], [35, 35]]), RED, 4)
     canvas.circle(np.array([25.0, 15]), 5, BLUE)
@@ -36,7 +36,7 @@ def test_canvas__paints_shapes_where_they_are_and_as_large() -> None:
     assert columns(canvas.image(), 15, BLUE) == list(range(22, 28))  # a ring around it
 
 
-def test_canvas__cuts_shapes_but_not_text_at_the_clip() -> None:
+def test_canvas__cuts_shapes_but_not_text_at_the_clip():
     canvas = Canvas((60, 40))
     canvas.clip((0.0, 0.0, 30.0, 40.0))
     canvas.bar(10.0, 50.0, 20.0, 5.0, RED)
@@ -50,7 +50,7 @@ def test_canvas__cuts_shapes_but_not_text_at_the_clip() -> None:
 
 
 @pytest.mark.parametrize(("anchor", "left"), [(0.0, 21), (0.5, 7), (1.0, 0)])
-def test_canvas__anchors_text_at_its_left_end_middle_or_right_end(anchor: float, left: int) -> None:
+def test_canvas__anchors_text_at_its_left_end_middle_or_right_end(anchor, left):
     canvas = Canvas((60, 40))
     canvas.text(20, 15, "HHH", 12, RED, anchor)
     rows, found = (canvas.image() != BACKGROUND).any(axis=-1).nonzero()
@@ -58,20 +58,20 @@ def test_canvas__anchors_text_at_its_left_end_middle_or_right_end(anchor: float,
     assert (rows.min(), rows.max()) == (11, 19)
 
 
-def test_canvas__keeps_text_legible_over_an_arm() -> None:
+def test_canvas__keeps_text_legible_over_an_arm():
     canvas = Canvas((200, 40))
     canvas.bar(0, 200, 20, 20, RED)
     canvas.text(10, 20, "near", 13, BLUE)
     assert (canvas.image()[20, 10:30] == BACKGROUND).all(axis=-1).any()
 
 
-def test_canvas__asks_for_pygame_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_canvas__asks_for_pygame_in_one_sentence(monkeypatch):
     monkeypatch.setitem(sys.modules, "pygame", None)
     with pytest.raises(ValueError, match=r"pygame: expected the extra brokk_min\[play\], got"):
         Canvas((60, 40))
 
 
-def test_window__shows_a_canvas(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_window__shows_a_canvas(monkeypatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     canvas = Canvas((60, 40))
     canvas.bar(10.0, 50.0, 20.0, 5.0, RED)
@@ -83,13 +83,13 @@ def test_window__shows_a_canvas(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not window.pygame.display.get_init()
 
 
-def test_window__refuses_a_computer_without_display(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_window__refuses_a_computer_without_display(monkeypatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "nonsense")
     with pytest.raises(ValueError, match="window: expected a display"):
         Window((60, 40), "none")
 
 
-def test_window__draws_unseen_only_if_asked_to(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_window__draws_unseen_only_if_asked_to(monkeypatch):
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "XDG_RUNTIME_DIR", "SDL_VIDEODRIVER"):
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(ValueError, match="window: expected a display"):
