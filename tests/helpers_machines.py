@@ -1,4 +1,4 @@
-"""Random machines, cheap actuator nets, a recording, scripted randomness and oracles for the tests."""
+"""Cheap actuator nets, a recording and oracles for the tests."""
 
 from __future__ import annotations
 
@@ -8,56 +8,9 @@ import numpy as np
 
 from brokk_min.actuator import ActuatorNet
 from brokk_min.identification.logs import Recording, velocity_of
-from brokk_min.kinematics import forward_kinematics, jacobian
-from brokk_min.machine import BROKK_170, Joint
 
 GAIN = 3.0  # of `obedient_net`
 POSE = np.array([1.5, 0.5, 0.58, 1.71, 1.24])  # the paper's q_s
-
-
-def random_machine(rng, n):
-    """A machine of `n` joints with at least one driven, far above the ground, of any geometry."""
-    driven = rng.random(n) < 0.7
-    driven[rng.integers(n)] = True
-    joints = []
-    for i in range(n):
-        low, width = rng.uniform(-1.5, 0.5), rng.uniform(0.8, 2.0)
-        slew = rng.random() < 0.3
-        speed = rng.uniform(0.02, 0.1, 2)
-        joints.append(
-            Joint(
-                name=f"axis_{i}",
-                driven=bool(driven[i]),
-                a=rng.uniform(0.1, 1.5),
-                alpha=float(rng.choice([0.0, np.pi / 2, -np.pi / 2, 0.3])),
-                d=rng.uniform(-0.2, 0.5),
-                theta=rng.uniform(-np.pi, np.pi),
-                q_min=low,
-                q_max=low + width,
-                cylinder_base=0.0 if slew else rng.uniform(0.5, 1.0),
-                cylinder_rod=rng.uniform(0.15, 0.35),
-                cylinder_angle=rng.uniform(0.3, 2.8 - width) - low,
-                cylinder_area=0.005,
-                speed_positive=speed[0],
-                speed_negative=speed[1],
-                q_dot_up=rng.uniform(0.1, 0.8),
-                q_dot_down=rng.uniform(0.1, 0.8),
-                encoder_node=i + 1,
-            )
-        )
-    history = int(rng.integers(3, 14))
-    return replace(
-        BROKK_170,
-        name=f"random{n}",
-        joints=tuple(joints),
-        history=history,
-        velocity_samples=int(rng.integers(2, min(history, 5) + 1)),
-        dead_zone=rng.uniform(0.0, 0.15),
-        pwm_limit=int(rng.integers(40, 128)),
-        delay=float(rng.choice([0.0, 0.02, 0.04, 0.12])),
-        tool_speed=rng.uniform(0.1, 0.6),
-        ground=-100.0,
-    )
 
 
 def small_net(machine, rng, joints=()):
@@ -114,45 +67,6 @@ def obedient_velocity(machine, u):
     """What `obedient_net` says for commands `u` (..., n_driven), worked out by hand."""
     fastest = 1.2 * machine.q_dot_max[machine.driven]
     return fastest * (2 / (1 + np.exp(-GAIN * np.asarray(u, float))) - 1)
-
-
-def damped_rates(machine, q, v):
-    """Oracle of `joint_rates`: NumPy solves (J^T J + lambda^2 I) x = J^T v, lambda 6 % of the length."""
-    J = jacobian(forward_kinematics(machine, np.asarray(q, float)))[..., machine.driven]
-    damping = (0.06 * np.hypot(machine.column("a"), machine.column("d")).sum()) ** 2
-    Jt = np.swapaxes(J, -1, -2)
-    normal = Jt @ J + damping * np.eye(J.shape[-1])
-    return np.linalg.solve(normal, (Jt @ np.asarray(v, float)[..., None]))[..., 0]
-
-
-class RowRandom:
-    """A generator with one source a row, so that a batch draws what its rows would draw alone.
-
-    Right only where every draw is for all rows at once; it refuses any other.
-    """
-
-    def __init__(self, sources):
-        self.sources = sources
-
-    def _rows(self, shape):
-        shape = (shape,) if isinstance(shape, int) else tuple(shape)
-        if shape[0] != len(self.sources):
-            raise AssertionError(f"a draw for {shape[0]} of {len(self.sources)} rows")
-        return (1, *shape[1:])
-
-    def random(self, size, dtype=np.float64):
-        return np.concatenate([s.random(self._rows(size), dtype) for s in self.sources])
-
-    def standard_normal(self, size):
-        return np.concatenate([s.standard_normal(self._rows(size)) for s in self.sources])
-
-    def integers(self, low, high, size, dtype=np.int64):
-        return np.concatenate(
-            [s.integers(low, high, self._rows(size), dtype) for s in self.sources]
-        )
-
-    def uniform(self, low, high, size):
-        return np.concatenate([s.uniform(low, high, self._rows(size)) for s in self.sources])
 
 
 def random_net(seed=0, n=3, history=13, hidden=32):
@@ -216,13 +130,3 @@ def closed_form(q):
         r, z = r + length * np.cos(e), z + length * np.sin(e)
         heights.append(z)
     return np.stack([r * np.cos(q1), r * np.sin(q1), z], -1), np.min(heights, axis=0)
-
-
-def parts(machine, seen):
-    """Observations cut up: goal (3), tool velocity (3), locked angles, histories (n, 3, H), two rates."""
-    rest, driven, samples = len(machine.locked), len(machine.driven), machine.history
-    cuts = np.cumsum([3, 3, rest, 2 * samples * driven, samples * driven, driven])
-    assert seen.shape[-1] == cuts[-1] + driven
-    goal, tool, angles, moving, sent, rates, late = np.split(seen, cuts, axis=-1)
-    moving, sent = (a.reshape(*a.shape[:-1], driven, -1, samples) for a in (moving, sent))
-    return goal, tool, angles, np.concatenate([moving, sent], axis=-2), rates, late

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
-
 import numpy as np
 import pytest
 from helpers_bus import START, HoldingOperator, Virtual, World
@@ -101,19 +98,6 @@ def test_joystick__refuses_a_device_without_its_axes_or_button():
     with pytest.raises(ValueError, match="button 8"):
         Joystick(BROKK_170, button=8)
     device.unplug()
-
-
-def test_joystick__needs_pygame_but_no_window(monkeypatch):
-    names = ("SDL_VIDEODRIVER", "SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS")
-    for name in names:
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr("pygame.joystick.get_count", lambda: 0)
-    with pytest.raises(ValueError, match=r"^joystick: expected one, got none$"):
-        Joystick(BROKK_170)
-    assert [os.environ[name] for name in names] == ["dummy", "1"]
-    monkeypatch.setitem(sys.modules, "pygame", None)
-    with pytest.raises(ValueError, match=r"pygame: expected the extra brokk_min\[play\], got"):
-        Joystick(BROKK_170)
 
 
 def test_joint_jog__moves_one_joint_with_the_sign_of_x():

@@ -29,19 +29,6 @@ def test_fault_name__gives_node_and_text():
     assert names[1 + 12 * 6] == "stop asked for"
 
 
-@pytest.mark.parametrize("shape", [(), (3,), (2, 2)])
-def test_gate_start__is_silent_and_holds_the_switch_for_pressed(shape):
-    state = gate_start(BROKK_170, shape)
-    assert state.counts.shape == (*shape, 5, 2)
-    assert state.sent.shape == (*shape, 5, 8)
-    assert state.measured_motion.shape == state.expected_motion.shape == (*shape, 5)
-    assert np.all(state.enable) and np.all(state.active_fault == 1)
-    assert np.all(state.time == -np.inf)
-    rest = state._replace(enable=0, active_fault=0, time=0)
-    assert not any(np.any(field) for field in rest)
-    assert all(np.shape(field)[: len(shape)] == shape for field in state)
-
-
 # --- a plain rewriting ---------------------------------------------------------------------------
 
 
@@ -268,17 +255,6 @@ def test_gate__is_what_its_promises_say_in_any_leading_shape(machine, seed):
     faults = {(s.active_fault - 1) // 6 for s, _ in cases.expected if s.active_fault}
     assert faults == set(range(13)), "each fault comes up"
     assert sum(bool(s.driving and any(f[:5])) for s, f in cases.expected) > 300
-
-
-def test_gate__of_one_machine_alone_is_the_same():
-    cases = Cases(BROKK_170, 50, 5)
-    for k, (expected, frame) in enumerate(cases.expected):
-        state = GateState(*row(cases.state, k))
-        found, data = gate(BROKK_170, state, GateInputs(*row(cases.inputs, k)), 0.0)
-        assert np.delete(data, 6).tolist() == frame
-        assert found.driving == expected.driving
-        assert found.active_fault == expected.active_fault
-        assert found.sent.dtype == found.counts.dtype == int
 
 
 def test_gate__never_raises_and_closes_the_valves_on_nonsense():

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers_cli import run
 
-from brokk_min.cli.commands import print_means, print_scores, split
-from brokk_min.evaluation import baselines, reproduce, seeds
+from brokk_min.cli.commands import split
+from brokk_min.evaluation import baselines
 from brokk_min.evaluation.metrics import summary
-from brokk_min.evaluation.report import VERDICTS
-from brokk_min.evaluation.sequences import read_starts, start_kinds
 from brokk_min.identification.files import SHIPPED
 from brokk_min.identification.logs import Log, Recording, read_log, write_log
 from brokk_min.identification.net_file import load_net
@@ -167,19 +164,6 @@ def test_split__holds_out_every_tenth_recording():
         split(steady_log(("a",), 1))
 
 
-def test_print_scores__has_a_row_per_net_and_per_linear_model(capsys):
-    free_run = {"1": {"velocity_rmse": 0.1}, "5": {"velocity_rmse": 0.2}}
-    joint = {"one_step_rmse": 0.01, "persistence_rmse": 0.02, "free_run": free_run}
-    joint |= {"linear": {"one_step_rmse": 0.03, "free_run": {}}, "creep": 1e-3}
-    print_scores({"joints": {"q1": joint}, "warnings": ["q1: creeps"]})
-    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
-    assert lines[1:] == [
-        ["q1", "0.0100", "0.0200", "0.1000,", "0.2000", "0.00100"],
-        ["linear", "0.0300", "nan"],
-        ["warning:", "q1:", "creeps"],
-    ]
-
-
 # --- collect, train, starts, evaluate -------------------------------------------------------------
 
 SMALL = "--total-steps 512 --num-envs 16 --horizon 16 --minibatch-size 128"
@@ -282,62 +266,3 @@ def test_shipped_policy__beats_the_papers_controllers(tmp_path):
     now = {name: row["all"]["velocity_error_mean"] for name, row in rows.items()}
     for errors in (before, now):
         assert 0 < errors["rl"] < min(errors["jacobian_pid_k0.1"], errors["jacobian_pid_k0.05"])
-
-
-def test_print_means__are_by_kind_of_start_and_controller(capsys):
-    rows = []
-    for start, kind in enumerate(["workspace", "limits", "workspace"]):
-        for travel, name in ((3.0, "rl"), (None, "pid")):
-            row = {"controller": name, "sequence": "up", "start": start, "kind": kind}
-            rows.append(row | {"velocity_error_mean": 0.0125 * start, "valve_travel": travel})
-    print_means(rows, 1)
-    assert capsys.readouterr().out.splitlines() == [
-        "workspace starts (2), means over 1 sequences",
-        "  rl                     velocity_error_mean 0.0125, valve_travel 3.0000",
-        "  pid                    velocity_error_mean 0.0125, valve_travel none",
-        "limits starts (1), means over 1 sequences",
-        "  rl                     velocity_error_mean 0.0125, valve_travel 3.0000",
-        "  pid                    velocity_error_mean 0.0125, valve_travel none",
-    ]
-
-
-def test_starts__are_drawn_into_a_file_that_reads_back(tmp_path):
-    assert run("starts --num 4 --out", tmp_path / "s.csv") == 0
-    starts = read_starts(tmp_path / "s.csv", BROKK_170)
-    assert start_kinds(BROKK_170, starts) == ["workspace", "limits", "workspace", "extended"]
-
-
-# --- hours of work, replaced ----------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("quick", [False, True])
-def test_reproduce__prints_means_verdicts_and_files(quick, monkeypatch, tmp_path, capsys):
-    def chain(machine, out, budget, seed, sweep):
-        assert (machine, out, seed, sweep) == (BROKK_170, tmp_path, 3, Path("sweep.json"))
-        assert budget == (reproduce.QUICK if quick else reproduce.Budget())
-        means = {"rl": {s: {"velocity_error_mean": 0.0125} for s in "xy"}}
-        return {"task_space": {"summary": means}, "claims": [{"holds": True, "paper": "It works."}]}
-
-    monkeypatch.setattr(reproduce, "reproduce", chain)
-    options = "--quick" * quick
-    assert run(f"reproduce --seed 3 --sweep sweep.json {options} --out", tmp_path) == 0
-    assert capsys.readouterr().out.splitlines() == [
-        "rl                     mean velocity error [m/s]: x 0.0125, y 0.0125",
-        f"{VERDICTS[True]}: It works.",
-        str(tmp_path / "report.html"),
-        str(tmp_path / "results.json"),
-    ]
-
-
-def test_sweep__trains_seeds_from_the_first_on(folder, monkeypatch, tmp_path, capsys):
-    def sweep(machine, net, task, config, *rest):
-        assert net.joints == ("q1", "q3", "q4", "q5")
-        assert (task.zero_goals, config.total_steps) == (0.5, 9)
-        assert rest == (range(5, 7), tmp_path, 3, "tcp://a:1", Path("gains.json"), True)
-        return {}
-
-    monkeypatch.setattr(seeds, "sweep", sweep)
-    options = "--seed 5 --seeds 2 --poses 3 --scheduler tcp://a:1 --gains gains.json --critic"
-    options += f" --actuator '{folder}/net.npz' --total-steps 9 --zero-goals 0.5"
-    assert run(f"sweep {options} --out", tmp_path) == 0
-    assert capsys.readouterr().out.startswith("mean and 95 % interval")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from helpers_bus import HoldingOperator, World
 from helpers_cli import MINI, run
 
 from brokk_min.can.operator_input import JointJog
-from brokk_min.cli.operating import Play, show_line
+from brokk_min.cli.operating import Play
 from brokk_min.evaluation import baselines
 from brokk_min.identification.files import SHIPPED
 from brokk_min.identification.logs import read_log
@@ -76,19 +75,6 @@ def test_export__writes_an_onnx_file(tmp_path, capsys):
     assert run(f"export --policy '{POLICY}' --out", out) == 0
     assert b"observation" in out.read_bytes()
     assert capsys.readouterr().out.startswith(f"{out}: observation (batch, obs) in")
-
-
-@pytest.mark.parametrize(
-    ("terminal", "expected"),
-    [(True, "\rdriving v_goal +0.1\033[K"), (False, "driving v_goal +0.10 +0.00 +0.00\n")],
-)
-def test_show_line__keeps_to_one_line_of_a_terminal(terminal, expected, monkeypatch):
-    screen = io.StringIO()
-    monkeypatch.setattr(screen, "isatty", lambda: terminal)
-    monkeypatch.setattr("sys.stdout", screen)
-    monkeypatch.setenv("COLUMNS", "20")
-    show_line("driving v_goal +0.10 +0.00 +0.00")
-    assert screen.getvalue() == expected
 
 
 # --- windows and films ----------------------------------------------------------------------------
@@ -167,24 +153,3 @@ def test_replay__refuses_runs_that_the_results_do_not_have(results, capsys):
     other.write_text(json.dumps(table))
     assert run(f"replay '{other}'") == 1
     assert "expected --machine mini, got brokk170" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("status", [0, 3])
-def test_replay__sends_pictures_to_ffmpeg(status, results, monkeypatch, tmp_path, capsys):
-    """An ffmpeg that copies its input: 5 raw pictures of half a second, 3 bytes a pixel."""
-    (tmp_path / "ffmpeg").write_text(f"#!/bin/sh\ncat\nexit {status}\n")
-    (tmp_path / "ffmpeg").chmod(0o755)
-    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
-    film = tmp_path / "f.mp4"
-    assert run(f"replay '{results}' --controllers rl --size 320 320 --out", film) == bool(status)
-    if status:
-        assert "expected ffmpeg to write it, got its status 3" in capsys.readouterr().err
-        assert not film.exists()
-    else:
-        assert film.stat().st_size == 5 * 320 * 320 * 3
-
-
-def test_replay__writes_gif_or_mp4(results, capsys):
-    film = results.with_suffix(".avi")
-    assert run(f"replay '{results}' --controllers rl --out", film) == 1
-    assert "expected a name ending in .gif or .mp4" in capsys.readouterr().err

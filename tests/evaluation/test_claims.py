@@ -37,32 +37,6 @@ def trace_of(q, v, q_dot, ticks):
     return Trace(zero + q, zero + q_dot, zero, zero, zero[..., :3], v_tool, zero[..., 0])
 
 
-# --- records --------------------------------------------------------------------------------------
-
-
-def test_format_numbers__gives_means_with_their_intervals():
-    numbers = {
-        "a": {"mean": 1.0, "low": 0.5, "high": 1.5},
-        "b": {"mean": 2.0, "low": None, "high": None},
-        "c": {"mean": None, "low": None, "high": None},
-    }
-    assert claims.format_numbers(numbers, "m") == "a 1 (0.5 to 1.5); b 2; c none [m]"
-
-
-def test_claim__is_json_with_sentence_measurement_and_verdict():
-    number = {"mean": 0.25, "low": None, "high": None}
-    stronger = Claim("drift", {"strong": number}, None)
-    record = Claim("drift", {"rl": number}, False, stronger).to_json()
-    assert set(record) == {
-        "figure", "paper", "measured", "numbers", "unit", "holds", "stronger"
-    }  # fmt: skip
-    assert record["figure"] == "Fig. 6b-d" and record["unit"] == "m"
-    assert record["paper"].startswith("The Jacobian-based method")
-    assert record["measured"].endswith("more than RL's: rl 0.25 [m]") and record["holds"] is False
-    assert record["stronger"]["numbers"] == {"strong": number}
-    assert "stronger" not in stronger.to_json() and stronger.to_json()["holds"] is None
-
-
 # --- machine, nets, training ----------------------------------------------------------------------
 
 
@@ -222,13 +196,6 @@ def test_task_claims__are_in_the_papers_order_and_of_a_stronger_baseline_too():
 
 
 # --- near singularities ---------------------------------------------------------------------------
-
-
-def test_singular_controllers__differ_in_damping_alone():
-    pids = baselines.baselines(BROKK_170, obedient_net(BROKK_170))
-    rl, strong, weak = claims.singular_controllers(pids[STRONGER], pids).values()
-    assert rl is pids[STRONGER] and strong is pids[HIGH]
-    assert (strong.k, weak.k) == (0.1, 0.05) and weak.gains is strong.gains
 
 
 def test_speed_fraction__is_of_goals_that_last_near_singularities():

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import itertools
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers_machines import constant_net, line, small_net
-from matplotlib.colors import to_rgb, to_rgba
+from helpers_machines import small_net
+from matplotlib.colors import to_rgba
 
 from brokk_min.evaluation import figures
-from brokk_min.evaluation.figures import Panel
 from brokk_min.evaluation.preliminary import Motion, SimulatorTests, Sweep
-from brokk_min.evaluation.sequences import axis_sequences, task_sequences
+from brokk_min.evaluation.sequences import axis_sequences
 from brokk_min.identification import validation
 from brokk_min.identification.logs import Log, Recording
 from brokk_min.kinematics import forward_kinematics, tool_position
@@ -29,55 +27,6 @@ def curves(ax):
 
 def ylabels(figure):
     return [ax.get_ylabel() for ax in figure.axes]
-
-
-# --- panels ---------------------------------------------------------------------------------------
-
-
-def test_plot_panels__have_one_legend_and_the_scales_asked_for():
-    x = np.arange(3.0)
-    one, two, far = ({"rl": (x, k * x), "other": (x, k + x)} for k in (1, 2, 9))
-    rows = [[Panel("a", "t", "v", one), Panel("b", "t", "w", far)], [Panel("c", "t", "v", two)]]
-    figure = figures.plot_panels(rows, sharey="col")
-    assert [ax.get_title() for ax in figure.axes] == ["a", "b", "c"] and len(figure.legends) == 1
-    assert ylabels(figure) == ["v", "w", "v"] and figure.axes[0].get_xlabel() == "t"
-    np.testing.assert_array_equal(curves(figure.axes[1])["rl"], [x, 9 * x])
-    np.testing.assert_array_equal(curves(figure.axes[2])["other"], [x, 2 + x])
-    colors = [curve.get_color() for curve in figure.axes[0].get_lines()]
-    assert colors == [figures.STYLES["rl"]["color"], figures.OTHER_STYLES[1]["color"]]
-    limits = [ax.get_ylim() for ax in figure.axes]
-    assert limits[0] == limits[2] != limits[1]
-    assert tuple(figure.get_size_inches()) == (10.0, pytest.approx(5.5))
-    row = figures.plot_panels(rows[:1], sharey="row")
-    assert row.axes[0].get_ylim() == row.axes[1].get_ylim()
-
-
-def test_plot_panels__have_their_own_legends_above_the_curves():
-    x = np.linspace(0, 1, 5)
-    shown = [{f"{k}{i}": (x, x * i) for i in range(4)} for k in "ab"]
-    row = [Panel(f"panel {i}", "time [s]", "speed [m/s]", c) for i, c in enumerate(shown)]
-    figure = figures.plot_panels([row])
-    figure.draw_without_rendering()
-    left, right = (ax.get_legend().get_window_extent() for ax in figure.axes)
-    assert left.x1 <= right.x0 and not figure.legends
-    for ax, box in zip(figure.axes, (left, right), strict=True):
-        assert box.y0 >= ax.get_window_extent().y1 - 1
-    assert figure.axes[1].get_legend().get_title().get_text() == "panel 1"
-    letters = figure.axes[0].xaxis.label.get_fontsize()
-    assert letters * 7 / figures.WIDTH >= 7  # points, on a page 7 inches wide
-
-
-@pytest.mark.parametrize(
-    "names",
-    [
-        ["rl", "jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff", "perfect_model"],
-        ["workspace", "limits", "extended"],
-    ],
-)
-def test_styles__differ_on_grey_paper(names):
-    colors = np.array([to_rgb(figures.STYLES[name]["color"]) for name in names])
-    grey = np.sort(colors @ [0.299, 0.587, 0.114])
-    assert (np.diff(grey) > 0.1).all() and grey[-1] < 0.8
 
 
 # --- preliminary tests ----------------------------------------------------------------------------
@@ -134,28 +83,6 @@ def test_plot_free_run__begins_after_a_history_and_lasts_30_s_or_to_the_end(samp
     np.testing.assert_allclose(velocity["free run"][1], own_q_dot[:, 0, 1])
 
 
-def test_plot_worst_and_median__are_of_the_largest_error_of_a_joint():
-    """Nets that predict 0.1 rad/s; recordings that move at 0.1, 0.3 and 0.2 rad/s."""
-    net = constant_net([0.1], logged=False, joints=("a",))
-    speeds = {"exact": 0.1, "worst one": 0.3, "median one": 0.2}
-    recordings = tuple(line(name, 0.0, speed, 60) for name, speed in speeds.items())
-    figure = figures.plot_worst_and_median(net, Log(("a",), recordings))
-    titles = [ax.get_title() for ax in figure.axes]
-    assert titles == ["worst: worst one"] * 2 + ["median: median one"] * 2
-    assert ylabels(figure)[:2] == ["a [rad]", "a [rad/s]"]
-
-
-def test_plot_learning__is_over_millions_of_steps(tmp_path):
-    path = tmp_path / "c.csv"
-    path.write_text(
-        "global_step,charts/reward,charts/velocity_error\n1000000,0.5,0.1\n3000000,0.75,0.05\n"
-    )
-    reward, error = figures.plot_learning(path).axes
-    np.testing.assert_array_equal(curves(reward)["rl"], [[1, 3], [0.5, 0.75]])
-    np.testing.assert_array_equal(curves(error)["rl"], [[1, 3], [0.1, 0.05]])
-    assert reward.get_xlabel() == "environment steps [million]"
-
-
 # --- task-space control ---------------------------------------------------------------------------
 
 
@@ -204,15 +131,6 @@ def test_plot_bars__stand_side_by_side_with_their_intervals():
     ends = drawn["rl"].errorbar.lines[2][0].get_segments()
     np.testing.assert_allclose(ends[0][:, 1], [1.5, 4.0])
     assert [text.get_text() for text in upper.get_xticklabels()] == ["x", "a\nb"]
-
-
-def test_plot_bars__names_of_sequences_do_not_touch():
-    names = [sequence.name for sequence in task_sequences(BROKK_170)]
-    bars = {"rl": dict.fromkeys([*names, "all"], number(0.1, 0.05, 0.2))}
-    figure = figures.plot_bars({"error [m/s]": bars})
-    figure.draw_without_rendering()
-    boxes = [text.get_window_extent() for text in figure.axes[0].get_xticklabels()]
-    assert all(one.x1 + 4 < two.x0 for one, two in itertools.pairwise(boxes))
 
 
 def test_plot_starts__draws_arms_from_the_side_and_from_above():

@@ -49,11 +49,6 @@ def test_sweeps__go_from_stop_to_stop_at_the_papers_speeds():
         np.testing.assert_allclose(np.diff(sweep.q) * 20, sweep.q_dot[1:], atol=1e-9)
 
 
-def test_sweeps__of_a_joint_that_never_moves_have_one_sample():
-    (sweep,) = preliminary.sweeps(BROKK_170, standing, 4, np.zeros((1, 5)))
-    assert sweep.q.tolist() == [HIGH[4]] and sweep.q_dot.tolist() == [0]
-
-
 def test_other_commands__are_those_of_the_paper():
     u = preliminary.other_commands(BROKK_170, 4) * 127
     np.testing.assert_allclose(u, [-80, 0, -80, 80, 0])  # u1 and u3 175, u4 80

@@ -22,11 +22,6 @@ STARTS = np.tile(BROKK_170.q_start, (2, 1))
 ALONG_Z = task_sequences(BROKK_170)[2]
 
 
-def test_exact_encoder__gives_whole_counts():
-    read = module.exact_encoder(np.random.default_rng(0))
-    np.testing.assert_array_equal(read(BROKK_170, Q), read_encoder(BROKK_170, Q))
-
-
 def test_noisy_encoder__has_independent_noise_of_a_count():
     read = module.noisy_encoder(np.random.default_rng(0))
     counts = (np.array([read(BROKK_170, q) for q in Q]) - Q) / BROKK_170.encoder_step

@@ -46,19 +46,6 @@ def test_table__counts_a_seed_once():
     assert list(seeds.table([], rows(5.0, "pid"))) == ["pid"]
 
 
-def test_show__has_one_line_per_controller():
-    header, rl, pid, less = seeds.show(
-        seeds.table([rows(1.0), rows(3.0)], rows(5.0, "pid"))
-    ).splitlines()
-    names = "x [m/s]", "y [m/s]", "z [m/s]", "all [m/s]", "drift [m]", "travel [1]"
-    assert header == f"{'mean and 95 % interval':28}" + "".join(f" {name:>18}" for name in names)
-    assert rl.startswith("rl ")
-    assert "2.5000 +- 12.7062" in rl
-    cells = ("5.5000", "5.5000", "5.5000", "5.5000", "10.0000", "10.0000")
-    assert pid == f"{'pid':28}" + "".join(f" {cell:>18}" for cell in cells)
-    assert "-3.0000 +- 12.7062" in less
-
-
 def test_read_seeds__reads_what_a_sweep_wrote(tmp_path):
     path = tmp_path / "sweep.json"
     figures = seeds.table([rows(1.0), rows(3.0)], [])

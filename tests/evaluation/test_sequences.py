@@ -87,14 +87,6 @@ def test_singular_sequences__move_where_the_joints_must_move_most():
     assert (np.linalg.norm((J_inv @ others[..., None])[..., 0], axis=-1) <= hardest + 1e-9).all()
 
 
-def test_for_starts__takes_goals_of_all_starts_or_of_each():
-    goals = np.arange(12.0).reshape(2, 2, 3)
-    np.testing.assert_array_equal(s.Commands("each", goals).for_starts(2), goals)
-    np.testing.assert_array_equal(s.Commands("each", goals).for_starts(1), goals[:, :1])
-    one = s.Commands("one", goals[:, 0]).for_starts(3)
-    np.testing.assert_array_equal(one, np.stack([goals[:, 0]] * 3, axis=1))
-
-
 @given(st.lists(st.tuples(st.integers(1, 9), st.integers(-3, 3)), min_size=1))
 def test_hold_table__held_again_gives_the_goals(parts):
     goals = np.concatenate([np.full((ticks, 3), value / 10) for ticks, value in parts])
@@ -167,19 +159,6 @@ def test_read_starts__refuses_poses_out_of_range_or_in_the_ground(tmp_path, row,
         s.read_starts(path, BROKK_170)
 
 
-def test_goals_and_starts__are_of_the_files_or_the_machines_own(tmp_path):
-    starts_file = tmp_path / "s.csv"
-    commands_file = tmp_path / "c.csv"
-    s.write_starts(starts_file, BROKK_170, START[None])
-    commands_file.write_text("sequence,time,vx,vy,vz\na,0,0.1,0,0\na,1,0,0,0\n")
-    commands, starts = s.goals_and_starts(BROKK_170, commands_file, starts_file, 9, 0)
-    assert [sequence.name for sequence in commands] == ["a"]
-    np.testing.assert_array_equal(starts, START[None])
-    commands, starts = s.goals_and_starts(BROKK_170, None, None, 3, 0)
-    assert [sequence.name for sequence in commands] == list(goals_by_name(BROKK_170))
-    np.testing.assert_array_equal(starts, s.evaluation_starts(BROKK_170, 3, commands, 2))
-
-
 # --- start poses ----------------------------------------------------------------------------------
 
 
@@ -195,18 +174,6 @@ def test_evaluation_starts__of_the_package_are_of_all_kinds():
         assert s.feasible(BROKK_170, workspace, sequence.for_starts(32)).all(), sequence.name
     with pytest.raises(ValueError, match=r"starts.csv: expected at most 64 starts, got 65"):
         s.evaluation_starts(BROKK_170, 65, [], 0)
-
-
-def test_evaluation_starts__of_the_package_are_those_of_their_seed(monkeypatch):
-    """`brokk-min starts` draws the file; here its first ones, from a part of the poses."""
-    starts = s.evaluation_starts(BROKK_170, 4, [], 0)
-    poses = draw_pose(BROKK_170, TaskConfig(), np.random.default_rng(2), 4000).round(4)
-    rows = [np.flatnonzero((poses == start).all(axis=1))[0] for start in starts]
-    part = np.unique([*rows, *range(0, max(rows), 40)])
-    monkeypatch.setattr(s, "draw_pose", lambda *_: poses[part])
-    rng = np.random.default_rng(2)
-    drawn = s.draw_starts(BROKK_170, s.task_sequences(BROKK_170), 4, rng)
-    np.testing.assert_array_equal(drawn, starts)
 
 
 def test_evaluation_starts__of_another_machine_are_drawn():

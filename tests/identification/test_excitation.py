@@ -28,33 +28,6 @@ Q5 = 4
 LOW, HIGH = BROKK_170.column("q_min"), BROKK_170.column("q_max")
 
 
-class Fraction(np.random.Generator):
-    """Draws nothing: whatever is uniform lies at `fraction` of its interval, normal draws are 1."""
-
-    def __init__(self, fraction, kind="", sign=1):
-        super().__init__(np.random.PCG64(0))
-        self.fraction, self.kind, self.sign = fraction, kind, sign
-
-    def uniform(self, low=0.0, high=1.0, size=None):
-        middle = (1 - self.fraction) * np.asarray(low) + self.fraction * np.asarray(high)
-        return middle + np.zeros(size or ())
-
-    def random(self, size=None):
-        return self.uniform(size=size)
-
-    def integers(self, low, high):
-        return low + int(self.fraction * (high - low))
-
-    def standard_normal(self, size):
-        return np.ones(size)
-
-    def choice(self, a, p=None):
-        if "sine" in a:
-            assert p == list(MIX.values())
-            return self.kind
-        return self.sign if -1 in a else a[int(self.fraction * len(a))]
-
-
 # --- commands -------------------------------------------------------------------------------------
 
 
@@ -72,12 +45,6 @@ def test_sine_command__has_amplitudes_from_dead_zone_to_limit_and_random_frequen
     assert 0.02 <= min(frequencies) < 0.03 and 0.47 < max(frequencies) <= 0.5
 
 
-def test_sine_command__by_hand():
-    """A quarter of 0.02 to 0.5 Hz, phase pi / 2."""
-    u = (0.07 + 0.25 * (LIMIT - 0.07)) * np.cos(2 * np.pi * 0.14 * 0.05 * np.arange(40))
-    np.testing.assert_allclose(sine_command(Fraction(0.25), BROKK_170, 40), u, atol=1e-12)
-
-
 def test_rich_command__has_pauses_jumps_and_holds_and_the_requested_length():
     rng = np.random.default_rng(0)
     parts = [rich_command(rng, BROKK_170, 600) for _ in range(40)]
@@ -87,35 +54,6 @@ def test_rich_command__has_pauses_jumps_and_holds_and_the_requested_length():
     assert np.sum(np.abs(np.diff(u)) > 0.5) > 50  # jumps
     assert np.mean((np.diff(u) == 0) & (u[1:] != 0)) > 0.1  # holds
     assert sum(MIX.values()) == pytest.approx(1)
-
-
-def test_rich_command__by_hand_for_sines_steps_and_holds():
-    """A quarter of each interval: 1.375 s of 0.5 to 4 s, 2.875 s of 0.5 to 10 s; noise 0.02."""
-    level, noise = 0.07 + 0.25 * (TOP - 0.07), 0.25 * 0.08
-    time = 0.05 * np.arange(27)
-    sine = -0.15 * TOP + level * np.cos(2 * np.pi * 0.05 * 80**0.25 * time)
-    u = rich_command(Fraction(0.25, "sine"), BROKK_170, 27)
-    np.testing.assert_allclose(u, sine + noise, atol=1e-12)
-    time = 0.05 * np.arange(45)
-    sine = -(0.07 + TOP) / 2 * np.sin(2 * np.pi * 0.05 * 80**0.5 * time)  # mean 0, no noise
-    u = rich_command(Fraction(0.5, "sine"), BROKK_170, 45)
-    np.testing.assert_allclose(u, sine, atol=1e-12)
-    u = rich_command(Fraction(0.25, "step", sign=-1), BROKK_170, 57)
-    np.testing.assert_allclose(u, noise - level, atol=1e-12)
-    u = rich_command(Fraction(0.25, "holds"), BROKK_170, 27)
-    np.testing.assert_allclose(u, noise - 0.5 * TOP, atol=1e-12)
-
-
-def test_rich_command__by_hand_for_starts_and_dither():
-    u = rich_command(Fraction(0.25, "dither", sign=-1), BROKK_170, 26)
-    pattern = np.array([-1, -1, 1, 1, -1, -1, 1, 1, -1, -1, 1, 1, -1])  # 0.65 s
-    dither = (0.9 * 0.07 + 0.25 * (0.1 * 0.07 + 0.049)) * pattern
-    np.testing.assert_allclose(u[:13], dither, atol=1e-12)
-    np.testing.assert_allclose(u[13:19], -0.5 * TOP, atol=1e-12)  # 0.325 s, then the next wait
-    np.testing.assert_allclose(u[19:], dither[:7], atol=1e-12)
-    u = rich_command(Fraction(0.75, "start"), BROKK_170, 60)
-    np.testing.assert_allclose(u[:21], 0.5 * 0.75 * 0.07)  # exp(0.25 ln 0.05 + 0.75 ln 3) s
-    np.testing.assert_allclose(u[21:36], 0.5 * TOP, atol=1e-12)
 
 
 def held_levels(u):
@@ -217,36 +155,6 @@ def test_collect__returns_from_the_end_of_a_segment_to_its_start_until_idle(coll
         assert not back.u[-40:].any() and len(back.u) >= 40  # 2 s, 5 times 0.4 s
 
 
-@pytest.mark.parametrize(("kind", "pushed"), [("sine", 0), ("rich", 20)])
-def test_collect__drives_a_segment_and_its_return_by_hand(kind, pushed, monkeypatch):
-    """Full command up: q5 to its stop, perhaps pushing there for a second, and back."""
-    monkeypatch.setitem(EXCITATIONS, kind, lambda rng, machine, ticks: np.full(ticks, LIMIT))
-    monkeypatch.setattr(excitation, "MAX_SEGMENT", 12.0)
-    log = collect(BROKK_170, 1.0 / 180, kind, Fraction(0.5))
-    segment, back = next(pair for pair in segments(log) if pair[0] == Q5)[1:]
-    angles = np.concatenate([segment.q[:, Q5], back.q[:, Q5]])
-    counts = np.concatenate([segment.u[:, Q5], back.u[:, Q5]])
-    at_stop = np.flatnonzero(angles > HIGH[Q5] - 2 * BROKK_170.encoder_step)
-    turn = max(at_stop[pushed], 34)  # after 13 samples at rest and more than a second
-    assert len(segment.q) == turn
-    arrival = turn + np.flatnonzero(np.abs(angles[turn:] - angles[0]) < 0.06)[0]
-    expected = [0] * 13 + [80] * (turn - 13) + [-44] * (arrival - turn) + [0] * 40
-    np.testing.assert_array_equal(np.rint(127 * counts), expected)  # 44 = 127 (0.07 + limit) / 2
-
-
-def test_collect__stops_a_return_that_takes_too_long(monkeypatch):
-    monkeypatch.setattr(excitation, "MAX_RETURN", 1.0)
-    log = collect(BROKK_170, 0.004, "sine", np.random.default_rng(0))
-    assert max(len(r.q) for r in log.recordings if r.name.endswith("_return")) <= 600 + 20
-    assert sum(len(segment.q) for _, segment, _ in segments(log)) == 5 * 288
-
-
-def test_collect__records_at_least_one_window_and_its_target(monkeypatch):
-    monkeypatch.setattr(excitation, "MAX_SEGMENT", 2.0)
-    log = collect(BROKK_170, 1e-6, "sine", np.random.default_rng(0))
-    assert [len(segment.q) for _, segment, _ in segments(log)] == [15] * 5
-
-
 def test_collect__records_angles_that_a_replay_of_the_commands_gives(collected):
     for kind, log in collected.items():
         _, first, _ = next(pair for pair in segments(log) if pair[0] == Q5)
@@ -309,29 +217,6 @@ def test_task_log__moves_driven_or_locked_joints_within_the_limits():
         for u in recording.u:
             state = plant_step(BROKK_170, state, u)
         assert np.abs(state.q - recording.q[-1]).max() < 0.02
-
-
-def test_task_log__has_levels_smoothing_and_noise_by_hand():
-    """Draws of a quarter: from 0.35 of the range down at a quarter of the limit, for 1.625 s.
-
-    The chance to go up there is 1 - (1.5 * 0.35 - 0.25) = 0.725, at a third of the range 0.75.
-    """
-    log = task_log(BROKK_170, 5, 4.0, Fraction(0.25))
-    assert [recording.name for recording in log.recordings] == [f"task_0{i}" for i in range(5)]
-    for i, recording in enumerate(log.recordings):
-        first = read_encoder(BROKK_170, 0.65 * LOW + 0.35 * HIGH)
-        np.testing.assert_array_equal(recording.q[0], first)
-        moving = np.array([i == 4 if joint == 1 else i < 4 for joint in range(5)])
-        command = np.zeros(5)
-        for tick, (q, u) in enumerate(zip(recording.q, recording.u, strict=True)):
-            if tick % 33 == 0:  # 1.625 s are over after 32.5 ticks
-                level = 0.25 * LIMIT * np.where((q - LOW) / (HIGH - LOW) < 1 / 3, 1, -1)
-                assert tick or (level < 0).all()
-            command = command + (0.05 + 0.25 * 0.55) * (level - command)
-            counts = np.rint(127 * (command + 0.25 * 0.06)) * moving
-            np.testing.assert_allclose(127 * u, counts, atol=1e-9)
-        assert (level > 0)[moving].any()
-    assert not task_log(BROKK_170, 1, 0.5, Fraction(0.9)).recordings[0].u.any()  # 15 % are pauses
 
 
 def test_task_log__starts_at_given_angles():

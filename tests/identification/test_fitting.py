@@ -83,16 +83,6 @@ def test_fit__states_how_the_nets_were_fitted():
     assert fit(log._replace(rate=50.0), FitConfig(steps=0), 7, 3).rate == 50.0
 
 
-def test_fit__starts_from_hes_uniform_weights():
-    net = fit(simple_system(0, 3), FitConfig(steps=0), seed=0, velocity_samples=4)
-    layers = zip((39, 32, 32), net.weights[::2], net.weights[1::2], strict=True)
-    for inputs, weights, biases in layers:
-        bound = np.sqrt(6 / inputs)
-        assert weights.shape[1] == inputs and not biases.any()
-        assert 0.9 * bound < weights.max() <= bound and -0.9 * bound > weights.min() >= -bound
-        assert weights.std() == pytest.approx(bound / np.sqrt(3), rel=0.15)
-
-
 @pytest.mark.parametrize("logged", [False, True])
 def test_fit__does_not_learn_to_brake_before_a_stop(logged):
     """A joint that goes at 0.3 u until it hits a hard stop: the nets keep its speed up to there."""
@@ -195,16 +185,3 @@ def test_input_windows__have_noise_per_sample_and_per_window_in_units_of_the_vel
     noise = ((noisy - exact) / data.input_scale[:, None, 13:14]).numpy()
     assert noise.std() == pytest.approx(0.1 * 2**0.5, rel=0.02)
     assert noise.mean(axis=-1).std() == pytest.approx(0.1 * (1 + 1 / 13) ** 0.5, rel=0.02)
-
-
-def test_draw_windows__are_windows_of_their_joint():
-    windows = [np.arange(5), np.arange(100, 103)]
-    drawn = fitting.draw_windows(windows, 200, torch.Generator().manual_seed(0)).numpy()
-    assert set(drawn[0]) == set(windows[0]) and set(drawn[1]) == set(windows[1])
-
-
-def test_cosine_decay__falls_from_one_and_again_from_a_quarter():
-    rates = [fitting.cosine_decay(step, 13, 20) for step in range(20)]
-    expected = [0.5 * (1 + np.cos(np.pi * k / 13)) for k in range(13)]
-    expected += [0.125 * (1 + np.cos(np.pi * k / 7)) for k in range(7)]
-    np.testing.assert_allclose(rates, expected)

@@ -19,8 +19,6 @@ from brokk_min.identification.logs import (
     write_log,
 )
 
-Columns = dict[str, np.ndarray]
-
 
 def write(path, columns):
     """A table written without the package: `.csv` with all digits, or `.npz`."""
@@ -476,13 +474,3 @@ def test_read_log__refuses_a_missing_file_and_a_folder(tmp_path, suffix):
         with pytest.raises(ValueError, match="expected a readable") as caught:
             read_log([tmp_path / f"{name}{suffix}"], 4)
         assert str(tmp_path / f"{name}{suffix}") in str(caught.value)
-
-
-@given(st.binary(max_size=200) | st.text(max_size=200).map(str.encode))
-def test_read_log__refuses_any_bytes_with_the_name_of_the_file(tmp_path_factory, content):
-    for name in ("any.csv", "any.npz"):
-        path = tmp_path_factory.getbasetemp() / name
-        path.write_bytes(content)
-        with pytest.raises(ValueError) as caught:
-            read_log([path], 4)
-        assert str(path) in str(caught.value)

@@ -139,29 +139,3 @@ def test_example__is_driven_over_the_bus(mini, axis):
     )
     moved = p - p_start
     assert moved[axis] > 0.15 and np.delete(np.abs(moved), axis).max() < 0.08, moved
-
-
-@pytest.mark.parametrize(
-    ("name", "status", "message"),
-    [
-        ("digger", 2, "expected one of ['brokk170'"),
-        ("missing.py:MINI", 1, "missing.py"),
-        ("broken.py:MINI", 1, "ZeroDivisionError"),
-        ("mini_excavator.py:MAXI", 2, "expected a Machine MAXI in mini_excavator.py, got None"),
-        ("mini_excavator.py:np", 2, "expected a Machine np"),
-        ("mini_excavator.py", 2, "or FILE.py:NAME"),
-    ],
-)
-def test_machine_option__refuses_files_without_a_machine(name, status, message, here, capsys):
-    Path("broken.py").write_text("1 / 0\n")
-    assert main(["collect", "--machine", name, "--out", "x.csv"]) == status
-    assert message in capsys.readouterr().err
-    assert not Path("x.csv").exists()
-
-
-def test_fit__refuses_logs_without_the_joints_of_the_machine(here, capsys):
-    rows = [f"x,{i / 25},0.5,{i / 50}" for i in range(40)]
-    Path("foreign.csv").write_text("\n".join(["run,time,u_a,q_a", *rows]) + "\n")
-    options = ["--machine", "mini_excavator.py:MINI_EXCAVATOR", "--out", "n.npz"]
-    assert main(["fit", "foreign.csv", "--test", "foreign.csv", *options]) == 1
-    assert "expected joints of --machine" in capsys.readouterr().err

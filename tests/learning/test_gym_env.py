@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import warnings
 from dataclasses import fields, replace
 
@@ -164,44 +162,6 @@ def test_step__refuses_to_begin_without_a_reset(make):
         make().render()
 
 
-class Recorder:
-    """A renderer that notes what it gets."""
-
-    mode = "rgb_array"
-
-    def __init__(self):
-        self.started = []
-        self.open = True
-
-    def update(self, state, started):
-        self.started.append(list(started))
-
-    def render(self, state):
-        return [np.full((2, 3, 3), i, np.uint8) for i in range(len(state.q))]
-
-    def close(self):
-        self.open = False
-
-
-def test_render__draws_each_row_and_begins_anew_where_an_episode_ended():
-    many = TaskVectorEnv(2, NET, LOW, SHORT, Recorder())
-    one = TaskEnv(NET, LOW, SHORT, Recorder())
-    assert many.render_mode == one.render_mode == "rgb_array"
-    many.reset(seed=0)
-    one.reset(seed=0)
-    many.state = replace(many.state, ticks=np.array([0, 19]))
-    many.step(np.zeros((2, 4)))
-    one.step(np.zeros(4))
-    assert many.renderer.started == [[0, 1], [1]]
-    assert one.vector.renderer.started == [[0], []]
-    assert [frame.max() for frame in many.render()] == [0, 1]
-    assert one.render().shape == (2, 3, 3)
-    many.close()
-    one.close()
-    assert not many.renderer.open
-    assert not one.vector.renderer.open
-
-
 @pytest.mark.parametrize("shape", [(2, 5), (2,), (2, 3)])
 def test_step__refuses_wrong_actions(shape):
     env = TaskVectorEnv(2)
@@ -265,19 +225,3 @@ def test_make_vec__gives_the_vector_class():
     obs, *vectors, info = env.step(env.action_space.sample())
     assert env.observation_space.contains(obs)
     assert {vector.shape for vector in (*vectors, info["velocity_error"])} == {(256,)}
-
-
-def test_metadata__has_the_rate_of_the_machine():
-    fast = replace(BROKK_170, rate=50.0)
-    assert TaskEnv(machine=fast).metadata["render_fps"] == 50
-    assert TaskVectorEnv(2, machine=fast).metadata["render_fps"] == 50
-    assert TaskEnv.metadata["render_fps"] == 20
-
-
-def test_import__of_the_environments_needs_neither_viewer_nor_torch():
-    code = (
-        "import sys, brokk_min.learning.gym_env;"
-        "print([m for m in sys.modules if m in ('torch', 'pygame') or 'brokk_min.viewer' in m])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"

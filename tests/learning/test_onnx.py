@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 
 import numpy as np
 import pytest
@@ -49,9 +48,3 @@ def test_export_onnx__is_one_file_with_what_the_other_program_needs(policy, tmp_
     assert (metadata.pop("ramp"), metadata.pop("stand_s")) == (COMPENSATION, STANDSTILL_TIMEOUT)
     assert metadata == dict(policy.contract)
     assert metadata["driven"] == ["q1", "q3", "q4", "q5"] and metadata["rate"] == 20.0
-
-
-def test_export_onnx__names_the_missing_extra(policy, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "onnx", None)
-    with pytest.raises(ValueError, match=r"onnx: expected the extra brokk_min\[export\]"):
-        export_onnx(tmp_path / "p.onnx", policy)

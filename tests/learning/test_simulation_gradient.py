@@ -255,18 +255,6 @@ def test_action_gradients__are_zero_for_a_joint_pushed_into_its_limit(limit, u_q
     assert gradient[:, 2].all()
 
 
-def test_action_gradients__take_read_only_arrays_and_give_the_same_bits_again():
-    net, start, commands = moving_case(BROKK_170, 4)
-    ticks = ticks_of(simulate(BROKK_170, net, start, commands), commands)
-    for array in ticks:
-        array.setflags(write=False)
-    first = action_gradients(BROKK_170, net, ticks, 0.9, costs(0.01, 2.0))
-    second = action_gradients(BROKK_170, net, ticks, 0.9, costs(0.01, 2.0))
-    np.testing.assert_array_equal(first, second)
-    assert first.dtype == np.float32
-    assert np.isfinite(first).all()
-
-
 @cases
 def test_input_gradient__equals_finite_differences(machine, seed):
     net, state, commands = moving_case(machine, seed)

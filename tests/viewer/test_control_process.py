@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import threading
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +16,6 @@ from brokk_min.viewer import control_process
 from brokk_min.viewer.control_process import (
     BusOptions,
     Request,
-    SelectedController,
     WindowOperator,
     control,
     receive_telemetry,
@@ -26,34 +24,6 @@ from brokk_min.viewer.control_process import (
 from brokk_min.viewer.play import gate_status
 
 REQUEST = Request(10.0, 0, True, True, np.array([0.1, 0.0, 0.0]), np.zeros(4))
-
-
-def measured(num):
-    return SimpleNamespace(q=np.zeros((num, 5)))
-
-
-def test_selected_controller__moves_levers_and_starts_another_controller_from_rest():
-    starts = list[int]()
-
-    class Counting:
-        def start(self, num):
-            starts.append(num)
-            return "at rest"
-
-        def __call__(self, seen, state):
-            return f"from {state}", "moving"
-
-    operator = SimpleNamespace(request=REQUEST._replace(mode=1, levers=np.array([1.0, 0, -1, 0])))
-    selected = SelectedController(BROKK_170, [Counting()], operator)
-    state = selected.start(3)
-    u, state = selected(measured(3), state)
-    np.testing.assert_allclose(u * 127, np.tile([80, 0, 0, -80, 0], (3, 1)), atol=1e-9)
-    assert not starts
-    operator.request = REQUEST
-    for expected in ("from at rest", "from moving"):
-        u, state = selected(measured(3), state)
-        assert u == expected
-    assert starts == [3]
 
 
 def test_operator__gives_the_newest_request_until_it_is_too_old():
@@ -150,9 +120,3 @@ def test_receive_telemetry__says_why_the_loop_ended(machine, options, message):
         list(receive_telemetry(here))
     with pytest.raises(ValueError, match=r"^play: .* runs, got its sudden end"):
         list(receive_telemetry(here))
-
-
-def test_control__survives_a_window_that_is_gone_before_the_error():
-    here, there = multiprocessing.Pipe()
-    here.close()
-    control(BROKK_170, [], BusOptions("nonsense", "bus"), there)

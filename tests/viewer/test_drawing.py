@@ -15,7 +15,7 @@ from strategies import moving
 from brokk_min.kinematics import forward_kinematics, jacobian, tool_position
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer import drawing
-from brokk_min.viewer.camera import Camera, cameras
+from brokk_min.viewer.camera import cameras
 from brokk_min.viewer.drawing import NO_POINTS, Scene
 
 Q = np.array([0.4, 0.5, 0.58, 1.71, 1.24])
@@ -72,42 +72,6 @@ def test_draw__puts_the_joints_of_any_machine_where_kinematics_say(machine_movin
         assert np.sum(expected**2) < 1e-9 or scale > 1
 
 
-def test_backdrop__has_a_grid_and_the_ground_as_worked_out_by_hand():
-    """20 px a metre, the origin at (50, 80) of a box of 100 x 100 px: the ground is 80 px down."""
-    box = (0.0, 0.0, 100.0, 100.0)
-    axes = np.array([[1.0, 0, 0], [0, 0, 1.0]])
-    camera = Camera("side", box, np.array([50.0, 80.0]), 20.0, axes)
-    canvas = Recorder((100, 100))
-    drawing._backdrop(canvas, BROKK_170, camera)
-    grid = [line.points.tolist() for line in canvas.lines if line.colour == drawing.GRID]
-    assert grid[:5] == [[[x, 1], [x, 100]] for x in (10, 30, 50, 70, 90)]
-    assert grid[5:] == [[[0, y], [100, y]] for y in (0, 20, 40, 60, 80, 100)]
-    (soil,) = canvas.polygons
-    assert soil.points.tolist() == [[0, 80], [100, 80], [100, 100], [0, 100]]
-    assert canvas.texts_drawn == ["side view, grid 1 m"]
-    below = Recorder((100, 100))
-    drawing._backdrop(below, replace(BROKK_170, ground=-1.5), camera)
-    drawing._backdrop(below, BROKK_170, camera._replace(label="top", scale=2.0))
-    assert below.polygons == []
-    assert below.texts_drawn == ["side view, grid 1 m", "top view, grid 10 m"]
-
-
-def test_draw__paints_trail_and_path_and_nothing_else():
-    trail = tool() + np.linspace(0, 1, 50)[:, None] * np.array([0.9, -0.5, 0.5])
-    path = tool() + np.array([[0.0, 0.0, 0.0], [0.8, 0.8, -0.2]])
-    canvas = drawn(scene(trail=trail, path=path))
-    pale = next(line.colour for line in canvas.lines if len(line.points) == 50)
-    image = canvas.image().astype(int)
-    bare = drawn(scene()).image()
-    for camera in views(BROKK_170, Q):
-        for points, colour in ((trail[15:-1:5], pale), ((path[1:] + path[:1]) / 2, drawing.PATH)):
-            for x, y in np.rint(camera.project(points)).astype(int):
-                error = np.abs(image[y - 1 : y + 2, x - 1 : x + 2] - colour).sum(axis=-1)
-                assert error.min() < 40, (x, y)
-    changed = np.abs(image - bare).sum(axis=-1) > 0
-    assert 300 < changed.sum() < 6000
-
-
 def test_draw__enlarges_points_in_view_and_cuts_off_what_lies_beyond():
     line = tool() + np.array([[0.0, 0, 0], [0.5, 0, 0], [0.5, 0.8, 0]])
     spans = []
@@ -136,31 +100,6 @@ def test_draw__points_arrows_along_goal_and_measured_velocity():
             flat = camera.axes @ v * (1, -1)
             np.testing.assert_allclose(along / np.hypot(*along), flat / np.hypot(*flat), atol=1e-6)
     assert not [line for line in drawn(scene()).lines if line.width == 3]
-
-
-@pytest.mark.parametrize(
-    ("along", "shaft", "head"),
-    [
-        ([30.0, 40], [[0, 0], [23.4, 31.2]], [[30, 40], [19.44, 34.17], [27.36, 28.23]]),
-        ([5.0, 0], [[0, 0], [1.5, 0]], [[5, 0], [1.5, 1.575], [1.5, -1.575]]),
-    ],
-)
-def test_arrow__has_shaft_and_head_as_worked_out_by_hand(along, shaft, head):
-    canvas = Recorder((10, 10))
-    drawing._arrow(canvas, np.zeros(2), np.array([4.0, 0]), (1, 2, 3))  # too short
-    drawing._arrow(canvas, np.zeros(2), np.array(along), (1, 2, 3))
-    (line,) = canvas.lines
-    (polygon,) = canvas.polygons
-    np.testing.assert_allclose(line.points, shaft)
-    np.testing.assert_allclose(polygon.points, head)
-
-
-def test_draw__rings_the_next_point_of_a_line():
-    target = tool() + np.array([[0.0, 0.5, 0.3]])
-    rings = [c for c in drawn(scene(target=target)).circles if c.colour == drawing.PATH]
-    for ring, camera in zip(rings, views(BROKK_170, Q), strict=True):
-        np.testing.assert_allclose(ring.points, camera.project(target[0]))
-        assert ring.width == 3
 
 
 # --- warnings, rows, layout -----------------------------------------------------------------------
@@ -226,27 +165,6 @@ def test_joint_rows__have_valve_bars_as_long_as_the_command(counts, fraction):
     assert "locked" in canvas.texts_drawn
 
 
-@pytest.mark.parametrize(("angle", "text"), [(-0.004, "+0.00"), (0.586, "+0.59"), (-0.3, "-0.30")])
-def test_joint_rows__mark_angles_and_write_them_without_minus_zero(angle, text):
-    q = np.array([0.0, 0.5, angle, 1.71, 1.24])
-    canvas = drawn(scene(q))
-    assert text in canvas.texts_drawn
-    row = 2
-    marks = [p.points for p in canvas.polygons if np.ptp(p.points[:, 0]) == pytest.approx(6)]
-    tracks = [p.points for p in canvas.polygons if np.ptp(p.points[:, 1]) == pytest.approx(4)]
-    left, right = tracks[row][:2, 0]
-    x = left + (right - left) * (angle + 0.3) / 1.9
-    assert marks[row][:2, 0].mean() == pytest.approx(x)
-
-
-def test_draw__says_that_positions_are_unknown():
-    canvas = drawn(scene(np.full(5, np.nan), status="waiting: q1: silent"))
-    assert {"no positions", "waiting: q1: silent"} <= set(canvas.texts_drawn)
-    known = {"side view, grid 1 m", "top view, grid 1 m"}
-    assert known <= set(drawn(scene()).texts_drawn)
-    assert not known & set(canvas.texts_drawn)
-
-
 @pytest.mark.parametrize(
     ("arms", "size"), [(1, (1120, 680)), (1, SIZE), (2, (900, 480)), (3, (960, 540))]
 )
@@ -272,13 +190,3 @@ def test_draw__cuts_off_no_text_and_puts_none_on_another(n, arms, size):
         assert (one[:2] >= other[2:]).any() or (other[:2] >= one[2:]).any()
     tracks = [p.points for p in canvas.polygons if p.colour == drawing.TRACK]
     assert min(np.ptp(track[:, 0]) for track in tracks) > 10
-
-
-def test_draw__keeps_two_arms_apart():
-    left = (1, 2, 3)
-    right = (4, 5, 6)
-    canvas = drawn(scene(colour=left), scene(colour=right))
-    for colour, start in ((left, 0), (right, 480)):
-        links = np.vstack([p.points for p in canvas.polygons if p.colour == colour])
-        assert (links[:, 0] >= start).all()
-        assert (links[:, 0] <= start + 480).all()

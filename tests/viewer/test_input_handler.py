@@ -9,7 +9,7 @@ import numpy as np
 import pygame
 import pytest
 from helpers_bus import Virtual
-from helpers_viewer import MODES, Operator
+from helpers_viewer import Operator
 
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer import input_handler
@@ -55,20 +55,6 @@ def test_request__ramps_over_a_quarter_of_a_second_and_shift_gives_a_third():
     operator.key("left shift", False)
     operator.key("up", False)
     assert operator.key("down", seconds=0.05).v_goal[0] == pytest.approx(-0.3 * 0.2)
-
-
-def test_request__starts_from_zero_when_the_direction_changes_within_a_frame():
-    operator = Operator()
-    operator.key("up")
-    pygame.event.post(pygame.event.Event(pygame.KEYUP, key=pygame.K_UP))
-    assert operator.key("down", seconds=0.05).v_goal[0] == pytest.approx(-0.3 * 0.2)
-
-
-def test_request__asks_for_nothing_at_first():
-    request = InputHandler(BROKK_170, pygame, MODES).request(7.0)
-    assert request[:4] == (7.0, 0, False, True)
-    assert request.v_goal.tolist() == [0] * 3
-    assert request.levers.tolist() == [0] * 4
 
 
 def test_request__has_a_lever_for_each_driven_joint_and_modes_go_round():

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import runpy
 from contextlib import closing
-from pathlib import Path
 
 import can
 import numpy as np
@@ -23,8 +21,6 @@ from brokk_min.viewer.play import Session
 from brokk_min.viewer.tracing import Attempt
 from brokk_min.viewer.window import Window
 
-REPOSITORY = Path(__file__).parents[2]
-MINI_EXCAVATOR = runpy.run_path(f"{REPOSITORY}/examples/mini_excavator.py")["MINI_EXCAVATOR"]
 ATTEMPT = Attempt("now", "rectangle", "jacobian", 12.0, 0.01, 0.03, 7.0)
 
 
@@ -94,44 +90,6 @@ def test_scene__shows_the_line_its_next_point_and_the_tool_however_far_off():
     for (left, upper, width, height), (x, y) in zip(canvas.clips, dots, strict=True):
         assert left < x < left + width
         assert upper < y < upper + height
-
-
-@pytest.mark.parametrize("mode", [*MODES, ""])
-@pytest.mark.parametrize("machine", [BROKK_170, MINI_EXCAVATOR])
-def test_scene__fits_the_window_in_every_mode(machine, mode):
-    session = Session(machine, MODES, None)
-    q = (machine.column("q_min") + machine.column("q_max")) / 2
-    session.update(telemetry(0, q), 0.0)
-    session.next_task()
-    session.attempts = [Attempt("", "rectangle", m, 123.4, 0.123, 0.456, 123.0) for m in MODES]
-    for work, finished in ((session.tracing, None), (None, session.attempts[1])):
-        session.tracing = work
-        session.finished = finished
-        scene = session.scene(0.1, mode, "ready: hold SPACE or button 5")
-        canvas = Recorder(play.SIZE)
-        drawing.draw(canvas, machine, [scene])
-        boxes = np.array([box for _, _, box in canvas.words])
-        assert boxes.min() >= 0
-        assert (boxes[:, 2:] <= play.SIZE).all()
-    assert scene.title == drawing.TITLES.get(mode, machine.name)
-    assert scene.colour == drawing.COLOURS.get(mode, drawing.STEEL)
-
-
-@pytest.mark.parametrize(
-    ("state", "hint", "status"),
-    [
-        ({"driving": True, "active_fault": 1}, "a hint", ("driving", drawing.DRIVING)),
-        ({"active_fault": 30, "latched_fault": 1}, "a hint", ("waiting", drawing.WARNING)),
-        ({"latched_fault": 30}, "a hint", ("stopped", drawing.WARNING)),
-        ({}, "hold SPACE", ("hold SPACE", drawing.READY)),
-        ({}, "", ("ready", drawing.READY)),
-    ],
-)
-def test_gate_status__names_the_fault_or_else_hints(state, hint, status):
-    text, colour = play.gate_status(BROKK_170, telemetry(driving=False)._replace(**state), hint)
-    expected, _, fault = text.partition(": ")
-    assert (expected, colour) == status
-    assert fault == ("valve controller: heartbeat lost" if 30 in state.values() else "")
 
 
 def test_next_step__says_what_the_operator_has_to_do():
