@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import collections
 import html
 import json
 import re
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
+from helpers_cli import run
 from helpers_machines import small_net
 
 from brokk_min import kinematics
-from brokk_min.evaluation import baselines, reproduce
-from brokk_min.evaluation.reproduce import QUICK, Budget
+from brokk_min.evaluation import baselines, report, reproduce
+from brokk_min.evaluation.claims import VERDICTS
+from brokk_min.evaluation.reproduce import Budget
 from brokk_min.evaluation.robustness import variations
 from brokk_min.evaluation.rollout import Trace
 from brokk_min.evaluation.sequences import axis_sequences, task_sequences, tuning_set
@@ -23,12 +25,10 @@ from brokk_min.identification.logs import read_log, velocity_of
 from brokk_min.identification.net_file import load_net
 from brokk_min.learning.policy import load_policy
 from brokk_min.machine import BROKK_170
-from brokk_min.ppo import PPOConfig
 
-TINY = Budget(0.02, 60, 8192, 1, 2, 4, 2, 1.0)
+TINY = Budget(0.004, 20, 4096, 1, 1, 4, 2, 0.5)
 ERROR = "velocity_error_mean"
 PIDS = ["jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff", "jacobian_pid_ff_awake"]
-Results = dict[str, Any]
 
 
 class Idle:
@@ -58,12 +58,16 @@ def results(folder):
 # --- the chain ------------------------------------------------------------------------------------
 
 
-def test_reproduce__gives_the_same_bits_twice(folder, tmp_path):
-    reproduce.reproduce(BROKK_170, tmp_path, TINY, 3)
+def test_reproduce__gives_the_same_bits_twice(folder, tmp_path, monkeypatch, capsys):
+    """The second time by its command, as `--quick`."""
+    monkeypatch.setattr(reproduce, "QUICK", TINY)
+    assert run("reproduce --quick --seed 3 --out", tmp_path) == 0
     for name in ("log.npz", "net.npz", "policy.npz", "gains.json", "results.json"):
         assert (folder / name).read_bytes() == (tmp_path / name).read_bytes(), name
     clock = json.loads((folder / "timing.json").read_text())
     assert list(clock) == ["record", "fit", "train", "tune", "evaluate", "draw"]
+    printed = capsys.readouterr().out
+    assert printed.startswith("rl ") and printed.endswith(f"{tmp_path / 'results.json'}\n")
 
 
 def test_reproduce__writes_files_that_the_other_commands_read(folder, results):
@@ -77,7 +81,7 @@ def test_reproduce__writes_files_that_the_other_commands_read(folder, results):
     pids = baselines.read_gains(folder / "gains.json", BROKK_170, policy.net)
     assert baselines.gains_table(pids) == results["gains"]
     assert results["meta"]["seed"] == 3 and results["meta"]["machine"] == "brokk170"
-    assert results["meta"]["effort"]["train_steps"] == 8192
+    assert results["meta"]["effort"]["train_steps"] == TINY.train_steps
 
 
 def test_reproduce__results_hold_every_run_with_its_figures(results):
@@ -128,8 +132,8 @@ def test_reproduce__results_record_the_tuning(results):
     assert set(results["tuning"]) == set(results["gains"]) == set(PIDS)
     starts, goals = tuning_set(BROKK_170, TINY.tuning_runs, 3)
     np.testing.assert_allclose([run["start"] for run in results["tuning_runs"]], starts)
-    for i, run in enumerate(results["tuning_runs"]):
-        table = np.array(run["goals"])
+    for i, tuning_run in enumerate(results["tuning_runs"]):
+        table = np.array(tuning_run["goals"])
         ticks = np.rint(table[:, 0] * 20).astype(int)
         np.testing.assert_allclose(np.repeat(table[:, 1:], ticks, axis=0), goals[:, i])
 
@@ -141,18 +145,40 @@ def test_reproduce__report_is_one_file_with_its_figures(folder, results):
     assert not re.findall(r'(?:src|href)="(?!data:)', text) and "http" not in text
     for claim in (*results["net_claims"], *results["claims"]):
         assert html.escape(claim["measured"], quote=False) in text.replace("&#39;", "'")
-    assert text.count("<td>start ") == 4 and text.count("<td>tuning run ") == 2
+    assert text.count("<td>start ") == 4 and text.count("<td>tuning run ") == TINY.tuning_runs
+
+
+def page_sections(page):
+    """Sections of a page by their titles."""
+    return dict(re.findall(r"<h2>(.*?)</h2>(.*?)(?=<h2>|</body>)", page, re.S))
+
+
+def test_render__answers_the_papers_sentences_first(folder, results):
+    sections = page_sections((folder / "report.html").read_text())
+    assert next(iter(sections)) == "Results"
+    rows = re.findall(r"<tr>(.*?)</tr>", sections["Results"], re.S)
+    answers = [re.findall(r"<td[^>]*>(.*?)</td>", row, re.S) for row in rows[1:]]
+    claims = [c for c in (*results["net_claims"], *results["claims"]) if c["figure"] != "Sec. 3.4"]
+    assert len(answers) == len(claims)
+    for claim, (sentence, verdict, _) in zip(claims, answers, strict=True):
+        assert html.unescape(sentence) == claim["paper"]
+        assert verdict == VERDICTS[claim["holds"]]
+    for title, text in sections.items():
+        if "(Fig." in title:  # each figure of the paper stands with its sentences
+            assert "<img" in text and ("<blockquote>" in text or "6a)" in title), title
+
+
+def test_render__escapes_names_and_shows_training_seeds(results):
+    row = {"velocity_error_x": {"mean": 0.5, "low": 0.25, "high": 0.75}}
+    meta = results["meta"] | {"machine": "digger <1>"}
+    changed = results | {"meta": meta, "training_seeds": {"rl": row}}
+    images = collections.defaultdict(lambda: "QUJD")
+    page = report.render(BROKK_170, changed, images, {"train": 3600.0})
+    assert "digger &lt;1&gt;) is an analytic plant, not a real machine" in page
+    assert "0.5000 (0.2500 to 0.7500)" in page_sections(page)["Training seeds"]
 
 
 # --- stages ---------------------------------------------------------------------------------------
-
-
-def test_budget__is_what_fit_and_train_spend_by_default():
-    assert (Budget().fit_steps, Budget().train_steps) == (
-        FitConfig().steps,
-        PPOConfig().total_steps,
-    )
-    assert all(vars(QUICK)[name] < value for name, value in vars(Budget()).items())
 
 
 def test_paper_recipe__is_scored_on_the_test_log(folder):

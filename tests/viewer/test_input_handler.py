@@ -17,8 +17,7 @@ from brokk_min.viewer.input_handler import InputHandler
 
 
 @pytest.fixture(autouse=True)
-def no_display(monkeypatch):
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+def background_events(monkeypatch):
     monkeypatch.setenv("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")  # unseen: never has the focus
     pygame.display.init()
     pygame.joystick.quit()

@@ -24,17 +24,6 @@ from brokk_min.viewer.window import Window
 ATTEMPT = Attempt("now", "rectangle", "jacobian", 12.0, 0.01, 0.03, 7.0)
 
 
-@pytest.fixture(autouse=True)
-def no_display(monkeypatch):
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    pygame.display.init()
-    pygame.event.clear()
-    yield
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    pygame.display.init()
-    pygame.event.clear()
-
-
 def tool(q):
     return tool_position(forward_kinematics(BROKK_170, np.array(q)))
 

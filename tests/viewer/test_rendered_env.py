@@ -53,8 +53,7 @@ def test_rendered_env__gives_frames_of_its_state_and_the_trail_since_the_reset()
     env.close()
 
 
-def test_rendered_env__shows_a_window_for_people(monkeypatch):
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+def test_rendered_env__shows_a_window_for_people():
     env = gymnasium.make(NAME, render_mode="human")
     env.reset(seed=1)
     env.step(np.zeros(4, np.float32))

@@ -27,13 +27,6 @@ from brokk_min.viewer.replay import Run
 COLOUR = (1, 2, 3)
 
 
-@pytest.fixture(autouse=True)
-def no_display(monkeypatch):
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    pygame.display.init()
-    pygame.event.clear()
-
-
 def run_of(ticks, title="a", path=drawing.NO_POINTS):
     """The cabin turns at 0.1 rad/s; the goal is 0.1 m/s to the left and 0.05 m/s upward."""
     q = np.array(START) + 0.005 * np.arange(ticks)[:, None] * np.eye(5)[0]

@@ -48,8 +48,7 @@ def test_canvas__cuts_shapes_but_not_text_at_the_clip():
     assert columns(again.image(), 20, RED) == list(range(10, 50))
 
 
-def test_window__shows_a_canvas(monkeypatch):
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+def test_window__shows_a_canvas():
     canvas = Canvas((60, 40))
     canvas.bar(10.0, 50.0, 20.0, 5.0, RED)
     with closing(Window((60, 40), "a title")) as window:
