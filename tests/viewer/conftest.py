@@ -1,0 +1,13 @@
+"""No display: SDL draws unseen."""
+
+from __future__ import annotations
+
+import pygame
+import pytest
+
+
+@pytest.fixture(autouse=True)
+def no_display(monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    pygame.display.init()
+    pygame.event.clear()
