@@ -115,6 +115,9 @@ TRAIN = "train --actuator missing.npz --out p.npz"
         ("export --policy missing.npz --out p.onnx", 1, "missing.npz"),
         ("play --drive", 2, "--interface, --channel: expected both"),
         ("play --interface virtual", 2, "--interface, --channel: expected both"),
+        ("play --interface nonsense --channel 0", 1, "nonsense 0: expected a CAN bus"),
+        ("play --drive --interface nonsense --channel 0 --log a.log", 1, "nonsense 0: expected a"),
+        (f"play --machine '{MINI}' --start 9 9 9 9", 1, "start: expected 4 angles"),
         ("replay", 2, "LOGS"),
         ("replay a.log b.log c.log", 2, "LOGS: expected one or two, got 3"),
         ("replay a.log b.log --size 639 540", 2, "expected some and 640 320 to 4000 4000, got 2 "),
@@ -124,6 +127,7 @@ TRAIN = "train --actuator missing.npz --out p.npz"
 )
 def test_wrong_use__is_refused_in_one_line(line, status, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     assert run(line) == status
     printed = capsys.readouterr()
     assert message in printed.err + printed.out

@@ -10,7 +10,7 @@ from helpers_machines import constant_net, line, random_net
 
 from brokk_min.identification import validation
 from brokk_min.identification.fitting import FitConfig, fit
-from brokk_min.identification.logs import Log, Recording, join_recordings, read_log, velocity_of
+from brokk_min.identification.logs import Log, Recording, join_recordings, velocity_of
 from brokk_min.identification.validation import (
     creep,
     fit_linear,
@@ -247,58 +247,6 @@ def test_validate__warns_of_nets_no_better_than_linear_and_of_tests_outside_the_
     jumps = tuple(r._replace(u=-np.abs(r.u) - 0.2) for r in test.recordings)
     warnings = validate(blank_net(log), log, Log(("a",), jumps))["warnings"]
     assert any(warning.startswith("a: command outside") for warning in warnings)
-
-
-# --- logs of another plant ------------------------------------------------------------------------
-
-
-def other_plant():
-    """Two joints with 45 % dead zone and a long dead time, at 100 Hz."""
-    joints = [replace(BROKK_170.joints[i], name=name) for i, name in ((3, "boom"), (4, "stick"))]
-    return replace(
-        BROKK_170, name="other", joints=tuple(joints), dead_zone=0.45, delay=1.0, rate=100.0,
-        pwm_limit=127, tau_valve_down=0.8,
-    )  # fmt: skip
-
-
-def other_log(path, seed, runs):
-    """Encoder angles with jitter, read at 20 Hz; every recording meets a stop.
-
-    Speed grows with the power 2.5 of the command beyond the dead zone; one joint moves in each.
-    """
-    machine, rng, ticks = other_plant(), np.random.default_rng(seed), 2500
-    u = np.zeros((ticks, runs, 2))
-    for run, joint in np.ndindex(runs, 2):
-        at = 0
-        while at < ticks and run % 2 == joint:
-            hold = round(100 * (7.0 if at == 0 else rng.uniform(0.5, 4.0)))  # first to a stop
-            u[at : at + hold, run, joint] = rng.choice([-1, 1]) if at == 0 else rng.uniform(-1, 1)
-            at += hold
-    beyond = np.maximum(0, np.abs(u) - 0.45) / 0.55
-    valve = np.sign(u) * (0.45 * (beyond > 0) + 0.55 * beyond**2.5)
-    start = rng.uniform(machine.column("q_min"), machine.column("q_max"), (runs, 2))
-    q = validation.plant_simulator(machine)(start, valve)[:-1]
-    q = np.rint(q / machine.encoder_step) * machine.encoder_step
-    time = (np.arange(ticks)[:, None] + rng.uniform(-0.2, 0.2, (ticks, runs))) / 100
-    columns = {"run": np.repeat([f"take {run}" for run in range(runs)], ticks), "time": time.T}
-    columns |= {f"u_{name}": u[..., j].T for j, name in enumerate(machine.names)}
-    columns |= {f"q_{name}": q[..., j].T for j, name in enumerate(machine.names)}
-    np.savez(path, **{name: column.ravel() for name, column in columns.items()})
-    return read_log([path], 4)
-
-
-def test_validate__finds_nets_of_another_plant_better_than_linear(tmp_path):
-    log = other_log(tmp_path / "log.npz", 0, 24)
-    test = other_log(tmp_path / "test.npz", 1, 8)
-    net = fit(log, FitConfig(history=30, steps=1000, batch_size=256), 0, 4)
-    result = validate(net, log, test)
-    for joint in result["joints"].values():
-        assert joint["one_step_rmse"] < joint["persistence_rmse"]
-        for horizon in ("5", "10"):
-            linear = joint["linear"]["free_run"][horizon]["velocity_rmse"]
-            assert joint["free_run"][horizon]["velocity_rmse"] < 0.9 * linear, horizon
-        assert joint["creep"] < 5e-4
-    assert not [w for w in result["warnings"] if "linear" in w or "command" in w]
 
 
 # --- step responses -------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import strategies
 import torch
-from helpers_machines import GAIN, POSE, obedient_net, obedient_velocity, small_net
+from helpers_machines import obedient_net, small_net
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -20,7 +20,6 @@ from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.simulation_gradient import (
     Ticks,
     action_gradients,
-    compensation_derivative,
     gradient_advantages,
     input_gradient,
 )
@@ -201,26 +200,6 @@ def test_action_gradients__lose_little_by_a_constant_jacobian():
     assert np.linalg.norm(gradient - difference) < 0.05 * np.linalg.norm(difference)
 
 
-def test_action_gradients__one_tick_by_hand():
-    """Nets that obey the newest command: reward 1 / (1 + |e|), e = v_goal - J q_dot."""
-    driven = BROKK_170.driven
-    net = obedient_net(BROKK_170)
-    u = np.zeros((1, 1, 5))
-    u[..., driven] = [0.3, -0.2, 0.1, 0.4]
-    state = env.initial_state(BROKK_170, POSE[None], [0.2, 0.1, -0.1], plant=False)
-    states = simulate(BROKK_170, net, state, u)
-    gradient = action_gradients(BROKK_170, net, ticks_of(states, u), 0.9, costs())[0, 0]
-    q_dot = obedient_velocity(BROKK_170, u[0, 0, driven])
-    J = jacobian(forward_kinematics(BROKK_170, states[1].q[0]))[..., driven]
-    error = state.v_goal[0] - J @ q_dot
-    size = np.linalg.norm(error)
-    fastest = 1.2 * BROKK_170.q_dot_max[driven]
-    y = (q_dot / fastest + 1) / 2  # of the sigmoid
-    by_command = 2 * fastest * GAIN * y * (1 - y)
-    expected = (error / size) @ J / (1 + size) ** 2 * by_command * (80 / 127 - 0.07)
-    np.testing.assert_allclose(gradient, expected, rtol=1e-4)
-
-
 def test_action_gradients__stop_at_the_end_of_an_episode():
     machine = BROKK_170
     net, start, commands = moving_case(machine, 2)
@@ -267,16 +246,6 @@ def test_input_gradient__equals_finite_differences(machine, seed):
     step = 1e-6 * direction
     difference = (net.forward(history + step)[0] - net.forward(history - step)[0]) / 2e-6
     np.testing.assert_allclose((gradient * direction).sum((-1, -2)), difference, atol=1e-5)
-
-
-def test_compensation_derivative__has_two_slopes():
-    u = np.zeros((2, 5))
-    u[0, BROKK_170.driven] = [0.0, 0.07, -0.075, 0.3]
-    u[1, BROKK_170.driven] = [-0.3, 80 / 127, -80 / 127, 0.08]
-    beyond = 80 / 127 - 0.07
-    steep = beyond + 0.07 / 0.01
-    expected = [[steep, steep, steep, beyond], [beyond] * 4]
-    np.testing.assert_allclose(compensation_derivative(BROKK_170, u), expected, rtol=1e-6)
 
 
 def test_gradient_advantages__are_gradient_times_deviation():

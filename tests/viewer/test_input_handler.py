@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pygame
@@ -69,23 +68,6 @@ def test_request__has_a_lever_for_each_driven_joint_and_modes_go_round():
         np.testing.assert_array_equal(operator.key(minus).levers, -np.eye(4)[i])
         operator.key(minus, False)
     assert operator.key("tab").mode == 0
-
-
-def test_request__adds_keys_to_a_gamepad_of_few_axes_up_to_full_deflection():
-    operator = Operator(["levers"])
-    axes = [-1.0, -1.0, 0.0, -1.0]  # of PAD_AXES 1, 0, 4, 3: there is no 4
-    operator.handler.pad = SimpleNamespace(
-        get_numaxes=lambda: 4,
-        get_axis=axes.__getitem__,
-        get_numbuttons=lambda: input_handler.PAD_SWITCH,
-        get_button=lambda i: 1,
-    )
-    request = operator.key("q")
-    assert request.levers.tolist() == [1, 1, 1, 0]
-    assert not request.enable  # it has too few buttons for a dead-man switch
-    axes[:] = [1.0, 1.0, 0.0, 0.0]
-    operator.key("q", False)
-    assert operator.key("a").levers.tolist() == [-1, -1, 0, 0]
 
 
 def test_switch__counts_only_if_pressed_with_nothing_deflected():

@@ -9,8 +9,7 @@ import numpy as np
 import pygame
 import pytest
 from helpers_bus import START, ConstantCommand, World, recording
-from helpers_canvas import Recorder
-from helpers_viewer import MODES, Operator, post, post_key, telemetry
+from helpers_viewer import MODES, post, post_key, telemetry
 
 from brokk_min.can.canopen import OperatorInput
 from brokk_min.kinematics import forward_kinematics, tool_position
@@ -18,10 +17,7 @@ from brokk_min.machine import BROKK_170
 from brokk_min.viewer import drawing, play, replay
 from brokk_min.viewer.control_process import BusOptions
 from brokk_min.viewer.play import Session
-from brokk_min.viewer.tracing import Attempt
 from brokk_min.viewer.window import Window
-
-ATTEMPT = Attempt("now", "rectangle", "jacobian", 12.0, 0.01, 0.03, 7.0)
 
 
 def tool(q):
@@ -57,78 +53,6 @@ def test_scene__interpolates_between_two_ticks_and_forgets_them_after_half_a_sec
     late = session.scene(1.56, "rl", "")
     assert np.isnan(late.q).all()
     assert late.status == "no telemetry"
-
-
-def test_scene__shows_the_line_its_next_point_and_the_tool_however_far_off():
-    session = Session(BROKK_170, MODES, None)
-    session.next_task()
-    assert session.tracing is None  # the tool is nowhere yet
-    session.update(telemetry(), 0.0)
-    session.next_task()
-    assert session.tracing is not None
-    far = np.array([-1.5, *START[1:]])
-    session.update(telemetry(1, far), 1.0)
-    session.tracing.passed = 2
-    scene = session.scene(1.2, "levers", "")
-    np.testing.assert_allclose(scene.path, tool(START) + session.lines["rectangle"])
-    np.testing.assert_array_equal(scene.target, scene.path[2:3])
-    np.testing.assert_allclose(scene.in_view, np.vstack([scene.path, tool(far)]))
-    canvas = Recorder(play.SIZE)
-    drawing.draw(canvas, BROKK_170, [scene])
-    dots = [c.points for c in canvas.circles if c.colour == drawing.INK]
-    for (left, upper, width, height), (x, y) in zip(canvas.clips, dots, strict=True):
-        assert left < x < left + width
-        assert upper < y < upper + height
-
-
-def test_next_step__says_what_the_operator_has_to_do():
-    session = Session(BROKK_170, MODES, None)
-    handler = Operator().handler
-    assert play.next_step(session, handler) == "starting"
-    session.telemetry = telemetry()
-    handler.pad = None
-    handler.blocked = True
-    handler.focus = False
-    assert play.next_step(session, handler) == "neutral: the window has no focus"
-    handler.focus = True
-    expected = "release the switch, then press it with nothing deflected"
-    assert play.next_step(session, handler) == expected
-    handler.blocked = False
-    assert play.next_step(session, handler) == "ready: hold SPACE"
-    handler.pad = object()
-    assert play.next_step(session, handler) == "ready: hold SPACE or button 5"
-    watching = Session(BROKK_170, [], None)
-    assert play.next_step(watching, handler) == "no SYNC: start what drives, or use --drive"
-    watching.telemetry = session.telemetry
-    assert play.next_step(watching, handler) == "watching"
-
-
-def test_notes__have_keys_task_and_figures_and_attempts_are_kept_at_once(tmp_path):
-    session = Session(BROKK_170, MODES, tmp_path / "attempts.csv")
-    assert session.notes("") == ["only listening: nothing is sent; --drive drives", "ESC: end"]
-    first, keys = session.notes("rl")
-    assert first == "hold SPACE to drive    arrows: x, y    W/S: up, down"
-    levers = "hold SPACE to drive    q/a: q1  w/s: q3  e/d: q4  r/f: q5"
-    assert session.notes("levers") == [levers, keys]
-    session.update(telemetry(), 0.0)
-    session.next_task()
-    work = session.tracing
-    assert work is not None
-    work.passed = 3
-    work.seconds = 1.25
-    line = f"rectangle: follow the orange line to its ring, 1.2 s, 3 of {len(work.line)}"
-    assert session.notes("rl")[2:] == [line]
-    work.passed = len(work.line) - 1
-    work.line[-1] = tool(START)
-    session.update(telemetry(1, u=np.full(5, 0.5), mode=1), 0.1)
-    assert session.tracing is None
-    (attempt,) = Session(BROKK_170, MODES, tmp_path / "attempts.csv").attempts
-    assert (attempt.task, attempt.mode, attempt.seconds) == ("rectangle", "jacobian", 0.05)
-    session.finished = ATTEMPT
-    session.attempts = [ATTEMPT]
-    figures = "12.0 s, off by 0.010 m, at most 0.030 m, valves 7"
-    expected = [f"rectangle by jacobian: {figures}", f"mean of 1 by jacobian: {figures}"]
-    assert session.notes("rl")[2:] == expected
 
 
 def test_session__begins_a_line_again_when_the_mode_changes_on_the_way():
