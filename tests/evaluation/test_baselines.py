@@ -11,9 +11,7 @@ from helpers_machines import obedient_net
 from hypothesis import given
 from hypothesis import strategies as st
 
-from brokk_min.env import TaskConfig
 from brokk_min.evaluation import baselines
-from brokk_min.evaluation.rollout import rollout
 from brokk_min.evaluation.sequences import tuning_set
 from brokk_min.identification.files import SHIPPED
 from brokk_min.jacobian import Gains, JacobianController
@@ -123,21 +121,6 @@ def test_tune__is_never_worse_than_the_gains_it_starts_with():
     result, costs = baselines.tune(start, distance, seed=0, generations=1, label="start")
     assert costs == [0.0]
     np.testing.assert_array_equal(vector(result), vector(start))
-
-
-def test_tuning_cost__of_many_candidates_is_that_of_each():
-    start, goals = tuning_set(BROKK_170, 2, 7, seconds=1.0)
-    vectors = np.random.default_rng(7).uniform(*baselines.gain_bounds(BROKK_170), (3, 14))
-    many = replace(controller(), gains=baselines.split_vector(vectors))
-    config = TaskConfig(noise=0.0)
-    rng = np.random.default_rng(0)
-    single = []
-    for row in vectors:
-        one = replace(controller(), gains=baselines.split_vector(row))
-        trace = rollout(BROKK_170, one, start, goals, config, rng)
-        single.append(np.linalg.norm(goals - trace.v_tool, axis=-1).mean())
-    result = baselines.tuning_cost(many, start, goals, 0)  # with measurement noise
-    np.testing.assert_allclose(result, single, rtol=0.05)
 
 
 def test_tune_baselines__lowers_each_cost_and_records_it():
