@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from helpers_bus import START, dictionary, eventually, recorded_rows, served
 
-from brokk_min.actuator import plant_reset, plant_step
 from brokk_min.can.canopen import HEARTBEAT_PERIOD, Frame, encoder_raw, valve_frame
 from brokk_min.can.simulated_machine import WATCHDOG, SimulatedMachine, simulate, start_pose
 from brokk_min.identification.logs import read_log
@@ -160,16 +159,6 @@ def test_receive__reads_and_writes_objects(command, address, value, answer):
     assert machine.objects == before | written  # of this node alone
     assert machine.receive(Frame(0.0, 0x602, bytes(7))) == []
     assert machine.receive(Frame(0.0, 0x600 + CONTROLLER, bytes(8))) == []
-
-
-def test_advance__moves_the_plant_under_the_command_in_force():
-    machine = driving()
-    machine.advance(100.1001)
-    state = plant_reset(BROKK_170, np.array(START))
-    for _ in range(2):
-        state = plant_step(BROKK_170, state, np.array([80, 0, -40, 0, 0]) / 127)
-    np.testing.assert_allclose(machine.plant.q, state.q, atol=1e-12)
-    assert len(machine.rows) == 20 and machine.rows[-1][1][0] == pytest.approx(80 / 127)
 
 
 def test_start_pose__is_the_given_one_the_machines_or_the_middle():

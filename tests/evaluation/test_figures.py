@@ -7,7 +7,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers_machines import small_net
-from matplotlib.colors import to_rgba
 
 from brokk_min.evaluation import figures
 from brokk_min.evaluation.preliminary import Motion, SimulatorTests, Sweep
@@ -106,31 +105,6 @@ def test_plot_sequence__is_relative_to_where_the_tool_began():
     joints = figures.plot_joint_velocities(BROKK_170, traces, "x", 1)
     assert ylabels(joints) == [f"velocity q{i} [rad/s]" for i in (1, 3, 4, 5)]
     np.testing.assert_array_equal(curves(joints.axes[2])["rl"], [time, trace.q_dot[:, 1, 3]])
-
-
-def number(mean, low=None, high=None):
-    return {"mean": mean, "low": low, "high": high}
-
-
-def test_plot_bars__stand_side_by_side_with_their_intervals():
-    bars = {
-        "rl": {"x": number(2.0, 1.5, 4.0), "a_b": number(1.0)},
-        "jacobian_pid_ff": {"x": number(3.0, 2.0, 3.5), "a_b": number(None)},
-    }
-    figure = figures.plot_bars({"error [m]": bars, "more": bars})
-    upper = figure.axes[0]
-    assert ylabels(figure) == ["error [m]", "more"] and len(figure.legends) == 1
-    drawn = {c.get_label(): c for c in upper.containers if hasattr(c, "patches")}
-    for name, middle in {"rl": -0.2, "jacobian_pid_ff": 0.2}.items():
-        patches = drawn[name].patches
-        assert [p.get_x() + p.get_width() / 2 for p in patches] == pytest.approx(
-            [middle, 1 + middle]
-        )
-        assert patches[0].get_height() == bars[name]["x"]["mean"]
-        assert patches[0].get_facecolor() == to_rgba(figures.STYLES[name]["color"])
-    ends = drawn["rl"].errorbar.lines[2][0].get_segments()
-    np.testing.assert_allclose(ends[0][:, 1], [1.5, 4.0])
-    assert [text.get_text() for text in upper.get_xticklabels()] == ["x", "a\nb"]
 
 
 def test_plot_starts__draws_arms_from_the_side_and_from_above():

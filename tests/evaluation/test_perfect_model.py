@@ -52,18 +52,6 @@ def test_errors__are_those_that_the_plant_then_has():
             np.testing.assert_allclose(result[:, plan, tick], goal - v, atol=1e-5)
 
 
-def test_steady_opening__moves_the_tool_at_the_goal():
-    goal = np.array([[0.05, -0.1, 0.02], [0.0, 0.05, -0.08]])
-    opening = steady_opening(BROKK_170, POSES, goal)
-    u = PerfectModel(BROKK_170, POSES, dither=0.0).commands(opening[:, None], 0)[:, 0]
-    plant = plant_reset(BROKK_170, POSES)
-    for _ in range(20):
-        q_before = plant.q
-        plant = plant_step(BROKK_170, plant, u)
-    v = tool_velocity(forward_kinematics(BROKK_170, plant.q), (plant.q - q_before) * 20)
-    np.testing.assert_allclose(v, goal, atol=0.02)  # the arm has moved on meanwhile
-
-
 def test_improve__lowers_the_cost_of_a_plan_within_the_command_limit():
     rng = np.random.default_rng(2)
     plant = plant_reset(BROKK_170, POSES)
@@ -109,14 +97,6 @@ def test_commands__alternate_about_openings_near_zero():
     result = np.sign(u) * (np.abs(u) - BROKK_170.dead_zone) / (1 - BROKK_170.dead_zone)
     expected = [[-0.04, 0.02, 0.08, -0.3], [0.04, 0.06, 0.08, -0.3]]
     np.testing.assert_allclose(result, expected * 2, atol=1e-8)
-
-
-def test_start__is_the_plant_at_rest_at_its_poses():
-    plan = BOUND.start(4)
-    np.testing.assert_array_equal(plan.plant.q, np.concatenate([POSES, POSES]))
-    assert plan.tick == 0 and not plan.opening.any()
-    with pytest.raises(ValueError, match="poses: expected 3 or a part of it, got 2"):
-        BOUND.start(3)
 
 
 def test_perfect_model__leaves_less_error_than_a_pid():

@@ -7,16 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers_cli import run
 from helpers_machines import POSE, small_net
 
-from brokk_min.env import TaskConfig
 from brokk_min.evaluation import seeds
 from brokk_min.evaluation.baselines import gains_metadata
 from brokk_min.evaluation.sequences import axis_sequences
+from brokk_min.identification.net_file import save_net
 from brokk_min.machine import BROKK_170
-from brokk_min.ppo import PPOConfig
 
-TINY = PPOConfig(num_envs=4, horizon=4, epochs=1, minibatch_size=16, total_steps=32)
 NET = small_net(BROKK_170, np.random.default_rng(0))
 
 
@@ -81,28 +80,25 @@ def short(monkeypatch):
     monkeypatch.setattr(seeds, "task_sequences", lambda machine: sequences)
 
 
-def test_sweep__writes_all_runs_and_does_nothing_twice(tmp_path, short):
+def test_sweep__writes_all_runs_and_does_nothing_twice(tmp_path, short, capsys):
     distributed = pytest.importorskip("distributed")
+    save_net(tmp_path / "net.npz", NET)
+    folder = tmp_path / "a" / "b"
+    names = [f"seed_{n}.{end}" for n in (3, 4) for end in ("json", "npz", "npz.csv")]
+    line = f"sweep --actuator '{tmp_path}/net.npz' --seed 3 --seeds 2 --poses 2 --episode-s 0.6"
+    line += " --total-steps 32 --num-envs 4 --horizon 4 --epochs 1 --minibatch-size 16 --scheduler"
     options = {"n_workers": 1, "processes": False, "dashboard_address": ":0", "protocol": "tcp"}
-    task = TaskConfig(episode_s=0.6)
     with distributed.LocalCluster(threads_per_worker=1, **options) as cluster:
-
-        def sweep(config, out):
-            address = cluster.scheduler_address
-            return seeds.sweep(BROKK_170, NET, task, config, range(3, 5), out, 2, address)
-
-        figures = sweep(TINY, tmp_path / "a" / "b")
-        folder = tmp_path / "a" / "b"
-        names = [f"seed_{n}.{end}" for n in (3, 4) for end in ("json", "npz", "npz.csv")]
+        sweep = [f"{line} {cluster.scheduler_address} --out", folder]
+        assert run(*sweep) == 0
+        assert capsys.readouterr().out.startswith("mean and 95 % interval")
         assert sorted(path.name for path in folder.iterdir()) == [*names, "sweep.json"]
         times = [(folder / name).stat().st_mtime_ns for name in names]
-        assert sweep(TINY, folder) == figures
+        assert run(*sweep) == 0
         assert [(folder / name).stat().st_mtime_ns for name in names] == times
-        with pytest.raises(ValueError, match=r"^seed 3: .*seed_3\.json: settings: .*; seed 4: "):
-            sweep(replace(TINY, gamma=0.5), folder)
         (folder / "seed_3.json").write_text("{")
-        with pytest.raises(ValueError, match=r"^seed 3: .*expected the result of a seed, got "):
-            sweep(TINY, folder)
+        assert run(*sweep) == 1
+        assert "seed_3.json: expected the result of a seed, got " in capsys.readouterr().err
     written = json.loads((folder / "sweep.json").read_text())
     assert written["meta"]["seeds"] == 2
     assert list(written["meta"]["failed"]) == ["3"]

@@ -121,21 +121,6 @@ def test_step__an_arm_driven_into_the_ground_terminates():
     assert info["velocity_error"] > 0
 
 
-@pytest.mark.parametrize("make", [lambda: TaskVectorEnv(3), TaskEnv], ids=["vector", "single"])
-def test_reset__reproduces_by_its_seed(make):
-    def run(seed):
-        env = make()
-        rng = np.random.default_rng(0)
-        tape = [env.reset(seed=seed)[0]]
-        for _ in range(30):
-            action = rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
-            tape.append(env.step(action)[0])
-        return np.array(tape)
-
-    assert np.array_equal(run(3), run(3))
-    assert not np.allclose(run(3)[0], run(4)[0], atol=0.2)
-
-
 def test_task_env__is_one_row_of_the_vector():
     one = TaskEnv(NET, LOW, SHORT)
     many = TaskVectorEnv(1, NET, LOW, SHORT)

@@ -72,22 +72,6 @@ def test_draw__puts_the_joints_of_any_machine_where_kinematics_say(machine_movin
         assert np.sum(expected**2) < 1e-9 or scale > 1
 
 
-def test_draw__enlarges_points_in_view_and_cuts_off_what_lies_beyond():
-    line = tool() + np.array([[0.0, 0, 0], [0.5, 0, 0], [0.5, 0.8, 0]])
-    spans = []
-    for in_view in (NO_POINTS, line):
-        canvas = drawn(scene(path=line, in_view=in_view))
-        paths = [shape.points for shape in canvas.lines if shape.colour == drawing.PATH]
-        for (left, upper, width, height), points in zip(canvas.clips, paths, strict=True):
-            assert (points > (left, upper)).all()
-            assert (points < (left + width, upper + height)).all()
-        spans.append([np.ptp(points, axis=0).max() for points in paths])
-    assert (np.array(spans[1]) > 2 * np.array(spans[0])).all()
-    image = canvas.image()
-    assert (image[42, :576] == drawing.COLOURS["rl"]).all(axis=-1).any()  # a link leaves the view
-    assert (image[33:39, :576] == drawing.BACKGROUND).all()
-
-
 def test_draw__points_arrows_along_goal_and_measured_velocity():
     q_dot = np.array([0.1, 0.0, 0.05, -0.1, 0.2])
     v_tool = jacobian(forward_kinematics(BROKK_170, Q)) @ q_dot

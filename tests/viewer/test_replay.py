@@ -17,11 +17,10 @@ from benchmarks.bus import random_policy
 from brokk_min.__main__ import main
 from brokk_min.evaluation import baselines
 from brokk_min.evaluation.sequences import task_sequences
-from brokk_min.kinematics import forward_kinematics, jacobian, tool_position
+from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.learning.policy import save_policy
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer import drawing, replay
-from brokk_min.viewer.camera import skeleton
 from brokk_min.viewer.replay import Run
 
 COLOUR = (1, 2, 3)
@@ -46,18 +45,6 @@ def recorded_log(path, controller, seconds, v):
 
 
 # --- runs -----------------------------------------------------------------------------------------
-
-
-def test_run__has_tool_positions_velocity_error_and_all_that_must_be_in_view():
-    path = np.array([[9.0, 0, 0], [9, 1, 0]])
-    run = run_of(25, path=path)
-    frames = forward_kinematics(BROKK_170, run.q)
-    np.testing.assert_array_equal(run.p_tool, tool_position(frames))
-    v_tool = np.einsum("tij,tj->ti", jacobian(frames), run.q_dot)
-    expected = np.sqrt(np.square(v_tool - [0, 0.1, 0.05]).sum(axis=1))
-    np.testing.assert_allclose(run.error, expected)
-    corners = skeleton(BROKK_170, run.q[[0, 10, 20]]).reshape(-1, 3)
-    np.testing.assert_array_equal(run.in_view, np.vstack([corners, path]))
 
 
 def test_run_of_log__has_the_telemetry_of_the_loop_from_the_first_driven_tick(tmp_path):

@@ -27,21 +27,6 @@ def tool(q):
     return tool_position(forward_kinematics(BROKK_170, np.array(q)))
 
 
-def test_task_lines__are_as_worked_out_by_hand_in_fractions_of_the_reach():
-    assert list(LINES) == ["rectangle", "circle", "line x", "line y", "line z"]
-    rectangle = LINES["rectangle"] / REACH
-    turns = np.abs(np.diff(rectangle, n=2, axis=0)).max(axis=1) > 1e-9
-    corners = rectangle[[0, *(np.flatnonzero(turns) + 1), -1]]
-    np.testing.assert_allclose(corners, RECTANGLE, atol=1e-9)
-    circle = LINES["circle"] / REACH
-    np.testing.assert_allclose(np.hypot(circle[:, 0], circle[:, 2] - 0.06), 0.06, atol=1e-9)
-    assert not circle[:, 1].any()
-    assert circle[15, 0] > 0.059  # outward, then up
-    assert circle[30, 2] > 0.119
-    for i, axis in enumerate("xyz"):
-        np.testing.assert_allclose(LINES[f"line {axis}"][-1], 0.14 * REACH * np.eye(3)[i])
-
-
 @pytest.mark.parametrize("task", LINES)
 def test_task_lines__are_dense_and_feasible_from_the_start_pose(task):
     line = LINES[task]
