@@ -195,7 +195,7 @@ def blank_net(log: Log, history: int = 5) -> ActuatorNet:
 def test_fit_linear__finds_a_linear_joint():
     log = linear_log(0)
     net = blank_net(log)
-    result = score(net, linear_log(1, scale=0.3), fit_linear(net, log, penalty=1e-9))["a"]
+    result = score(fit_linear(net, log, penalty=1e-9), linear_log(1, scale=0.3))["a"]
     assert result["one_step_rmse"] < 1e-3 < 0.1 * result["persistence_rmse"]
     assert result["free_run"]["1"]["velocity_rmse"] < 2e-3
 
@@ -203,7 +203,7 @@ def test_fit_linear__finds_a_linear_joint():
 def test_fit_linear__solves_the_normal_equations_of_ridge_regression():
     log, history = linear_log(0, 3), 4
     net = blank_net(log, history)
-    predict = fit_linear(net, log, penalty=0.01)
+    predict = fit_linear(net, log, penalty=0.01).predict
     windows, targets = [], []
     for r in log.recordings:
         for k in range(history - 1, len(r.q) - 1):
