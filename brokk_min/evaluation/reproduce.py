@@ -158,13 +158,9 @@ def measure(
     measured = preliminary.run(machine, net, seed)
     numbers = preliminary.numbers(machine, measured)
     meta = metrics.metadata(machine, seed) | baselines.gains_metadata(machine, policy.net)
-    actuator = {
-        "test": validation.score(net, test),
-        "driven_by_policy": validation.score(net, driven_log(machine, task, "rl")),
-    }
     results = {
         "meta": meta | {"effort": asdict(budget)},
-        "actuator": actuator,
+        "actuator": {"test": validation.score(net, test)},
         "preliminary": numbers,
         "net_claims": [claim.to_json() for claim in claims.net_claims(numbers)],
         "gains": baselines.gains_table(pids),
@@ -189,10 +185,9 @@ def compare(
     reachable = starts[workspace]
     runs, traces = evaluate(machine, controllers, commands, starts, seed)
     scored = [run for run in runs if run["kind"] == "workspace"]
-    damped = claims.singular_controllers(rl, pids)
     extended = starts[kinds == "extended"]
     singular, near, near_traces = near_singularities(
-        machine, damped, extended, budget.short_s, seed
+        machine, claims.singular_controllers(rl, pids), extended, budget.short_s, seed
     )
     along_x = {c: Trace(*(array[:, workspace] for array in traces[c, "x"])) for c in pids}
     every = claims.task_claims(machine, pids, scored, along_x, commands[0].goals, near)
@@ -240,10 +235,8 @@ def regret(
     """Mean errors, and velocity errors less that of a controller that knows the plant."""
     every = {**controllers, **perfect_models(machine, starts)}
     runs, _ = evaluate(machine, every, commands, starts, seed)
-    less = {}
-    for name in controllers:
-        error = "velocity_error_mean"
-        less[name] = metrics.paired_difference(runs, name, "perfect_model", error)
+    error = "velocity_error_mean"
+    less = {c: metrics.paired_difference(runs, c, "perfect_model", error) for c in controllers}
     return {"summary": summary(runs), "less_perfect_model": less}
 
 
@@ -263,11 +256,10 @@ def near_singularities(
     J = jacobian(forward_kinematics(machine, starts))[..., machine.driven]
     speed = {}
     for name in controllers:
-        fractions = []
-        for sequence in commands:
-            goals = sequence.for_starts(len(starts))
-            trace = traces[name, sequence.name]
-            fractions.append(claims.speed_fraction(machine, w0, trace, goals))
+        fractions = [
+            claims.speed_fraction(machine, w0, traces[name, s.name], s.for_starts(len(starts)))
+            for s in commands
+        ]
         speed[name] = metrics.row_mean(np.stack(fractions, axis=1))
     singular = claims.singular_claims(runs, speed)
     results = {
@@ -278,16 +270,6 @@ def near_singularities(
         "least": np.linalg.svd(J, compute_uv=False)[:, -1].tolist(),
     }
     return results, singular, traces
-
-
-def driven_log(machine: Machine, traces: Traces, controller: str) -> Log:
-    """Commands and encoder angles of a controller's first 16 runs of each sequence."""
-    recordings = []
-    for (name, sequence), trace in traces.items():
-        for i in range(min(16, trace.q.shape[1]) if name == controller else 0):
-            run = (trace.u[:, i].astype(float), trace.q_measured[:, i].astype(float))
-            recordings.append((f"{controller}_{sequence}_{i:02d}", *run))
-    return logs.machine_log(machine, recordings)
 
 
 def tuning_runs(machine: Machine, num: int, seed: int) -> list[dict[str, Any]]:

@@ -259,13 +259,8 @@ def task_log(
 
     In every fifth recording the locked joints move instead. Commands are smoothed random levels
     held for 0.5 to 5 s, less often towards the nearer end of the range. For validation only.
-
-    Args:
-        machine: n joints.
-        recordings: their number.
-        seconds: length of each [s].
-        rng: source of all draws.
-        start: angles (n,) [rad] at which all begin; None: random ones.
+    `recordings` is their number, `seconds` the length of each [s]. All begin at the angles `start`
+    (n,) [rad]; None: at random ones.
     """
     q_min, q_max = machine.column("q_min"), machine.column("q_max")
     shape, limit = (recordings, machine.n), machine.pwm_limit / PWM_MAX

@@ -29,9 +29,7 @@ class FitConfig:
 
     steps: int = 16000  # Adam steps.
     batch_size: int = 512  # Windows per joint in each step; a quarter of it for several ticks.
-    learning_rate: float = (
-        4e-3  # Of Adam; falls to zero along a cosine, again from a quarter of it.
-    )
+    learning_rate: float = 4e-3  # Of Adam; falls to zero along a cosine, twice.
     noise: float = 0.1  # Standard deviation of noise on velocity inputs, in their own deviations.
     hidden: int = 32  # Units in each of the two hidden layers (paper: 32).
     history: int = 13  # Samples of angle, velocity and command in the input (paper: 13).
@@ -49,12 +47,8 @@ def fit(
 ) -> ActuatorNet:
     """Fit one net per joint to a log. Paper: Sec. 3.3 (MSE, Adam)
 
-    Args:
-        log: recordings of n joints.
-        config: settings.
-        seed: of weights, windows and noise; it repeats the nets to the bit on one computer.
-        velocity_samples: window of the estimator that made the velocities of `log`.
-        machine: its name, for the file.
+    `seed` repeats the nets to the bit on one computer; `velocity_samples` is the window of the
+    estimator that made the velocities of `log`; `machine` is a name, for the file.
 
     ValueError: a joint that never moves long enough, or weights that are not finite at the end.
     """

@@ -159,11 +159,8 @@ def read_log(
     Without q_dot columns velocities are estimated: a recording starts at rest; after a gap, the
     rows that would need samples of the gap are left out.
 
-    Args:
-        paths: tables of the same joints.
-        velocity_samples: window of `estimate_velocity`.
-        joints: names and order of the joints; None: all, in the order of the first file.
-        rate: of the result [Hz].
+    `velocity_samples` is the window of `estimate_velocity`; `joints` are the names and order of the
+    joints (None: all, in the order of the first file).
 
     ValueError: with file, row (1 is the header) and column of the first error.
     """

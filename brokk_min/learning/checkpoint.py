@@ -60,21 +60,14 @@ def train_policy(
 ) -> Policy:
     """Train a policy on the nets and write it to `out`.
 
-    Args:
-        machine: what moves.
-        net: nets of its driven joints.
-        task: episodes.
-        config: settings of the learner.
-        seed: of everything random; the same seed gives the same bits on the same machine.
-        out: policy file, with its checkpoint `<out>.checkpoint` and its curve `<out>.csv`.
-        critic: advantages by a critic (always with `task.paper`), not by the nets' derivatives.
-        resume: continue from the checkpoint; the result is the same as without interruption.
-        tensorboard: folder for the scalars of the curve (needs the extra `tensorboard`).
+    `net` has the nets of the driven joints. The same `seed` gives the same bits on the same
+    computer. Its checkpoint `<out>.checkpoint` and its curve `<out>.csv` lie next to the policy.
+    `critic`: advantages by a critic (always with `task.paper`), not by the nets' derivatives.
+    `resume`: continue from the checkpoint; the result is the same as without interruption.
+    `tensorboard`: folder for the scalars of the curve (needs the extra `tensorboard`).
 
-    Raises:
-        ValueError: settings that do not fit, a checkpoint of another training, or a number that is
-            not finite, with its place (the last checkpoint stays).
-        OSError: a file that cannot be written (the last checkpoint stays).
+    ValueError: settings that do not fit, a checkpoint of another training, or a number that is not
+    finite. OSError: a file that cannot be written. The last checkpoint stays.
     """
     critic = critic or task.paper
     if critic:

@@ -22,11 +22,6 @@ STARTS = np.tile(BROKK_170.q_start, (2, 1))
 ALONG_Z = task_sequences(BROKK_170)[2]
 
 
-def test_exact_encoder__gives_whole_counts() -> None:
-    read = module.exact_encoder(np.random.default_rng(0))
-    np.testing.assert_array_equal(read(BROKK_170, Q), read_encoder(BROKK_170, Q))
-
-
 def test_noisy_encoder__has_independent_noise_of_a_count() -> None:
     read = module.noisy_encoder(np.random.default_rng(0))
     counts = (np.array([read(BROKK_170, q) for q in Q]) - Q) / BROKK_170.encoder_step
@@ -48,7 +43,8 @@ def test_lossy_encoder__repeats_one_sample_in_20_of_all_joints_of_a_machine() ->
 def test_variations__change_one_thing_each() -> None:
     result = variations(BROKK_170)
     assert len(result) == 12 and result["nominal"][0] is BROKK_170
-    sensors = [name for name, (_, sensor) in result.items() if sensor is not module.exact_encoder]
+    rng = np.random.default_rng(0)
+    sensors = [name for name, (_, sensor) in result.items() if sensor(rng) is not read_encoder]
     assert sensors == ["encoder noise of a count", "one sample in 20 lost"]
     assert all(result[name][0] is BROKK_170 for name in sensors)
     changed = {
