@@ -94,9 +94,6 @@ def _both(one: bool | None, other: bool | None) -> bool | None:
     return None if one is None or other is None else one and other
 
 
-# --- machine, nets, training ----------------------------------------------------------------------
-
-
 def net_claims(numbers: Mapping[str, Any]) -> list[Claim]:
     """Do machine and nets behave as the paper's? `numbers` is of `preliminary.numbers`.
 
@@ -136,9 +133,6 @@ def training_claim(seconds: float, steps: int) -> Claim:
     hours = seconds / 3600
     holds = 1 / _limit("training") < hours / 2.5 < _limit("training")
     return Claim("training", _exact({f"{steps:,} steps here": hours}), holds)
-
-
-# --- task-space control ---------------------------------------------------------------------------
 
 
 def task_claims(
@@ -246,9 +240,6 @@ def less_claim(
                 less = mean_interval(rl - by_start(runs, c, s, key))
                 numbers[f"{labels[key]} {s}, less {c}"] = less
     return Claim(name, numbers, _below(0.0, *numbers.values()))
-
-
-# --- near singularities ---------------------------------------------------------------------------
 
 
 def singular_controllers(

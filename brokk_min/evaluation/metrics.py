@@ -130,9 +130,6 @@ def row_mean(values: Array) -> Array:
     return _mean(np.nan_to_num(values).T, np.isfinite(values).T)
 
 
-# --- runs of all controllers ----------------------------------------------------------------------
-
-
 def evaluate(
     machine: Machine,
     controllers: Controllers,
@@ -191,9 +188,6 @@ def metadata(machine: Machine, seed: int) -> dict[str, Any]:
         "seed": seed,
         "units": "m, m/s, s, rad",
     }
-
-
-# --- over many runs -------------------------------------------------------------------------------
 
 
 def by_start(runs: Sequence[Run], controller: str, sequence: str, key: str) -> Array:

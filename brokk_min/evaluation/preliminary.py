@@ -156,9 +156,6 @@ def _motion(machine: Machine, q: Array) -> Motion:
     )
 
 
-# --- as numbers -----------------------------------------------------------------------------------
-
-
 def numbers(machine: Machine, measured: Preliminary) -> dict[str, Any]:
     """Numbers of both figures, for JSON [rad/s, s, rad, m, m/s]."""
     plant, nets = measured.tests["machine"], measured.tests["nets"]

@@ -138,9 +138,6 @@ def render(
     )
 
 
-# --- cells and tables -----------------------------------------------------------------------------
-
-
 def interval_text(number: Mean) -> str:
     """A mean with its interval.
 

@@ -98,9 +98,6 @@ def _stage(clock: dict[str, float], bar: Any, name: str) -> Iterator[None]:
     bar.update()
 
 
-# --- logs and nets --------------------------------------------------------------------------------
-
-
 def record(machine: Machine, out: Path, budget: Budget, seed: int) -> list[Log]:
     """Logs to fit nets to and to score them on, written and read back as a user's."""
     out.mkdir(parents=True, exist_ok=True)
@@ -134,9 +131,6 @@ def paper_recipe(
     both = preliminary.simulators(machine, net)
     gap = preliminary.gap_numbers(machine, preliminary.sim_to_real(machine, both, seed))
     return {"test": validation.score(net, test), "sim_to_real": gap}
-
-
-# --- measurements ---------------------------------------------------------------------------------
 
 
 def measure(
@@ -280,9 +274,6 @@ def tuning_runs(machine: Machine, num: int, seed: int) -> list[dict[str, Any]]:
         table = sequences.hold_table(machine, goals[:, i])
         runs.append({"start": start.tolist(), "goals": table.tolist()})
     return runs
-
-
-# --- files ----------------------------------------------------------------------------------------
 
 
 def write(out: Path, results: Mapping[str, Any], policy: Policy, pids: Pids) -> None:

@@ -77,10 +77,7 @@ def variations(machine: Machine) -> dict[str, tuple[Machine, Sensor]]:
 
 
 def pump_flow_ratio(machine: Machine, u: Array) -> Array:
-    """Flow that commands (..., n) demand once spools follow, over the pump's flow, (...).
-
-    Paper: Sec. 4.2
-    """
+    """Flow that commands (..., n) demand, over the pump's flow, (...). Paper: Sec. 4.2"""
     opening = valve_opening(u, machine.dead_zone)
     K = np.where(opening > 0, machine.column("speed_positive"), machine.column("speed_negative"))
     flow = np.abs(machine.column("cylinder_area") * K * opening).sum(axis=-1)  # sum |A v*|

@@ -274,10 +274,7 @@ def feasible(machine: Machine, start: Array, goals: Array) -> NDArray[np.bool_]:
 
 
 def _within_limits(machine: Machine, q: Array, q_dot: Array) -> NDArray[np.bool_]:
-    """Are driven joints 0.05 rad off their limits, and slower than 0.9 of `speed_limits`? (num,)
-
-    A controller needs room to correct (assumed).
-    """
+    """Are driven joints 0.05 rad off their limits, below 0.9 of `speed_limits` (assumed)? (num,)"""
     low, high = machine.column("q_min") + 0.05, machine.column("q_max") - 0.05
     down, up = speed_limits(machine, q)
     within = (q > low) & (q < high) & (q_dot > 0.9 * down) & (q_dot < 0.9 * up)

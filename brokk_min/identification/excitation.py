@@ -23,8 +23,6 @@ BARELY_OPEN = 0.049  # of full command beyond the dead zone, assumed: largest di
 MAX_SEGMENT = 30.0  # s, assumed: longest motion that is recorded in one piece
 MAX_RETURN = 300.0  # s, assumed: a longer return to the start is stopped
 
-# --- commands -------------------------------------------------------------------------------------
-
 
 def sine_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Array:
     """One sine of random amplitude (dead zone to limit) and frequency, (ticks,). Paper: Sec. 3.3"""
@@ -105,8 +103,6 @@ def _dither(rng: np.random.Generator, machine: Machine, _: float) -> Array:
 
 
 EXCITATIONS = {"sine": sine_command, "rich": rich_command}
-
-# --- recording ------------------------------------------------------------------------------------
 
 
 class _Recorder:

@@ -87,10 +87,7 @@ class TrainingSet(NamedTuple):
 
 
 def training_set(log: Log, config: FitConfig) -> TrainingSet:
-    """Windows of the recordings in which a joint moves; its statistics are of those alone.
-
-    ValueError: a joint that never moves long enough.
-    """
+    """Windows in which a joint moves, and their statistics; ValueError: one that never moves."""
     samples = join_recordings(log)
     q, q_dot, u = samples.joined.q, samples.joined.q_dot, samples.joined.u
     windows = samples.windows(config.history, 1)
@@ -140,11 +137,12 @@ def train(data: TrainingSet, config: FitConfig, seed: int, estimator: int | None
     )
     for step in tqdm(range(config.steps), desc="fit nets", unit="step", disable=None):
         if step < switch_step:
+            settings = replace(config, rollout=1)
             at = draw_windows(data.windows, config.batch_size, generator)
-            loss = one_step_loss(data, config, weights, at, generator)
         else:
+            settings = config
             at = draw_windows(data.multi_step_windows, math.ceil(config.batch_size / 4), generator)
-            loss = multi_step_loss(data, config, weights, at, estimator, generator)
+        loss = multi_step_loss(data, settings, weights, at, estimator, generator)
         optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
@@ -179,15 +177,6 @@ def draw_windows(windows: list[NDArray[np.intp]], batch: int, generator: Generat
     return torch.tensor(np.stack(drawn))
 
 
-def one_step_loss(
-    data: TrainingSet, config: FitConfig, weights: list[Tensor], at: Tensor, generator: Generator
-) -> Tensor:
-    """Mean square of (velocity - target) / range, summed over joints, for windows that end `at`."""
-    q, q_dot, u = input_windows(data, config, at, 1, generator)
-    error = normalised_error(data, predict(data, weights, q, q_dot, u), at)
-    return (error**2).mean(dim=1).sum()
-
-
 def multi_step_loss(
     data: TrainingSet,
     config: FitConfig,
@@ -199,7 +188,8 @@ def multi_step_loss(
     """Mean square of the accumulated error over `rollout` ticks of the nets on their own outputs.
 
     L = 1/K sum_k |sum_{i<=k} (velocity_i - target_i) / range|^2, for windows that end `at`
-    (n, batch). `estimator`: samples of the velocity estimator; None: velocities are the outputs.
+    (n, batch); summed over joints. A `rollout` of 1 is the paper's error of one step. `estimator`:
+    samples of the velocity estimator; None: velocities are the outputs.
     """
     ticks, history = config.rollout, config.history
     q, q_dot, u = input_windows(data, config, at, ticks, generator)

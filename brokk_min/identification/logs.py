@@ -74,9 +74,6 @@ def velocity_of(q: Array, samples: int, rate: float = RATE) -> Floats:
     return np.asarray(estimate_velocity(windows, samples, 1 / rate), float)
 
 
-# --- samples for fitting and validation -----------------------------------------------------------
-
-
 class Samples(NamedTuple):
     """The recordings of a log joined, N samples in all; a window must not cross their seams."""
 
@@ -120,9 +117,6 @@ def join_recordings(log: Log) -> Samples:
     lengths = [len(recording.q) for recording in log.recordings]
     moves = [np.ptp(r.u, axis=0) + np.ptp(r.q, axis=0) > 0 for r in log.recordings]
     return Samples(Recording("", u, q, q_dot), target, np.repeat(moves, lengths, axis=0), lengths)
-
-
-# --- files ----------------------------------------------------------------------------------------
 
 
 def write_log(path: Path, log: Log) -> None:

@@ -80,10 +80,7 @@ def _warnings(joints: dict[str, Any]) -> list[str]:
 
 
 def free_run_step(net: ActuatorNet, history: Array, q: Array, u: Array) -> tuple[Array, Array]:
-    """History (..., n, 3, H) and angles [rad] (..., n) after one tick under `u`.
-
-    No joint leaves the range of the training.
-    """
+    """History and angles [rad] after a tick under `u`; no joint leaves the training's range."""
     velocity = net.predict(append_command(history, u))
     low, high = np.minimum(q, net.q_low), np.maximum(q, net.q_high)
     q_next = np.clip(q + velocity / net.rate, low, high)
@@ -229,10 +226,7 @@ class LinearNet(ActuatorNet):
 
 
 def fit_linear(net: ActuatorNet, log: Log, penalty: float = 1e-3) -> LinearNet:
-    """Ridge regression on the inputs and targets of the nets: the reference that nets must beat.
-
-    Minimises mean |x w + b - target|^2 + penalty |w|^2.
-    """
+    """The reference that nets must beat: min mean |x w + b - target|^2 + penalty |w|^2."""
     samples = join_recordings(log)
     signals = np.stack(
         [samples.joined.q, samples.joined.q_dot, mu_law(samples.joined.u, net.dead_zone)]

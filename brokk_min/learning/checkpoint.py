@@ -28,6 +28,7 @@ from brokk_min.machine import Machine
 from brokk_min.ppo import Agent, Learner, PPOConfig, Rollout
 
 FORMAT = 4  # of checkpoints
+LEARNER = ("obs", "learning_rate", "global_step", "updates")  # attributes in checkpoints
 STATE = [field.name for field in fields(State) if field.name != "plant"]
 
 
@@ -202,10 +203,7 @@ class TrainingLog:
             "agent": learner.agent.state_dict(),
             "optimizer": learner.optimizer.state_dict(),
             "generator": learner.generator.get_state(),
-            "obs": learner.obs,
-            "learning_rate": learner.learning_rate,
-            "global_step": learner.global_step,
-            "updates": learner.updates,
+            **{name: getattr(learner, name) for name in LEARNER},
             "env": {name: torch.tensor(getattr(self.env.state, name)) for name in STATE},
             "random": self.env.np_random.bit_generator.state,
             "returns": torch.tensor(self.returns),
@@ -226,19 +224,16 @@ class TrainingLog:
             content = torch.load(self.checkpoint, weights_only=True)  # executes nothing
             header = json.loads(content["header"])
         except Exception as error:  # zipfile, pickle and torch raise anything on damaged files
-            raise ValueError(
-                f"{self.checkpoint}: expected a readable checkpoint, got {error!r}"
-            ) from error
+            text = f"expected a readable checkpoint, got {error!r}"
+            raise ValueError(f"{self.checkpoint}: {text}") from error
         expect_same(self.checkpoint, header, {"format": FORMAT})
         expect_same(self.checkpoint, header["identity"], self.about)
         with expected(self.checkpoint, "a complete checkpoint"):
             learner.agent.load_state_dict(content["agent"])
             learner.optimizer.load_state_dict(content["optimizer"])
             learner.generator.set_state(content["generator"])
-            learner.obs = content["obs"]
-            learner.learning_rate = content["learning_rate"]
-            learner.global_step = content["global_step"]
-            learner.updates = content["updates"]
+            for name in LEARNER:
+                setattr(learner, name, content[name])
             self.env.state = State(**{name: content["env"][name].numpy() for name in STATE})
             self.env.np_random.bit_generator.state = content["random"]
             self.returns = content["returns"].numpy()
