@@ -1,10 +1,10 @@
-"""How far from what the computer can do: environment, PPO gradient and kinematics.
+"""How far from what the computer can do: PPO gradient and kinematics.
 
-    python -m benchmarks.limits [--threads 2] [--json F] [--quick]
+    python -m benchmarks.limits [--threads 2] [--json F]
 
-Environment: a step with observation and resets, compared with the products of its nets alone. PPO:
-operations per second of the matrix products in a gradient, compared with the best rate of any
-backend on the same shapes. Kinematics: compared with a loop over pinocchio.
+PPO: operations per second of the matrix products in a gradient, compared with the better rate of
+torch and NumPy on the same shapes. Kinematics: compared with a loop over pinocchio. For the
+environment see `benchmarks.rollout`.
 """
 
 from __future__ import annotations
@@ -22,10 +22,9 @@ import pinocchio
 import torch
 import tyro
 
-from benchmarks.rollout import random_net, write
+from benchmarks.rollout import write
 from brokk_min import ppo
 from brokk_min.kinematics import forward_kinematics, jacobian
-from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.machine import BROKK_170
 
 
@@ -33,13 +32,8 @@ from brokk_min.machine import BROKK_170
 class Options:
     threads: int = 2  # Threads of torch and OpenBLAS.
     repeats: int = 15  # Timed blocks; what is compared is timed in turn, the least time counts.
-    num_envs: tuple[int, ...] = (64, 256, 1024, 4096)  # Environments side by side.
-    quick: bool = False  # One short block each: to see that it runs.
+    block_s: float = 0.1  # Length of a block [s].
     json: Path | None = None  # Also write the figures here.
-
-    @property
-    def block_s(self) -> float:
-        return 0.02 if self.quick else 0.1
 
 
 def seconds(calls: dict[str, Callable[[], Any]], options: Options) -> dict[str, float]:
@@ -60,50 +54,14 @@ def seconds(calls: dict[str, Callable[[], Any]], options: Options) -> dict[str, 
     return {name: min(of_call) for name, of_call in times.items()}
 
 
-def shapes(inputs: int, outputs: tuple[int, ...], batch: int) -> list[tuple[int, int, int]]:
-    """(m, k, n) of all products in a gradient of nets: forward, by weights, by inputs."""
+def shapes(widths: tuple[int, ...], batch: int) -> list[tuple[int, int, int]]:
+    """(m, k, n) of all products in a gradient of a net: forward, by weights, by inputs."""
     result = []
-    for last in outputs:
-        for i, (a, b) in enumerate(pairwise((inputs, 256, 128, 64, last))):
-            result += [(batch, a, b), (a, batch, b)]
-            if i:
-                result.append((batch, b, a))
+    for i, (a, b) in enumerate(pairwise(widths)):
+        result += [(batch, a, b), (a, batch, b)]
+        if i:
+            result.append((batch, b, a))
     return result
-
-
-def products(kind: str, sizes: list[tuple[int, int, int]]) -> Callable[[], Any]:
-    """A call that does all products of `sizes` in float32."""
-    rng = np.random.default_rng(0)
-    pairs = []
-    for m, k, n in sizes:
-        a = rng.normal(size=(m, k)).astype(np.float32)
-        b = rng.normal(size=(k, n)).astype(np.float32)
-        pairs.append((a, b))
-    if kind == "numpy":
-        return lambda: [a @ b for a, b in pairs]
-    tensors = [(torch.from_numpy(a), torch.from_numpy(b)) for a, b in pairs]
-    if kind == "torch":
-        return lambda: [a @ b for a, b in tensors]
-    transposed = [(a, b.T.contiguous()) for a, b in tensors]
-    linear = torch.ops.mkldnn._linear_pointwise
-    return lambda: [linear(a, b, None, "none", [], "") for a, b in transposed]
-
-
-def environment(num: int, options: Options) -> dict[str, float]:
-    env = TaskVectorEnv(num, random_net(np.random.default_rng(0)))
-    env.reset(seed=0)
-    assert env.state is not None and env.net is not None
-    net = env.net
-    actions = np.random.default_rng(0).uniform(-1, 1, (num, 4)).astype(np.float32)
-    history = env.state.history[:, env.machine.driven]
-    calls = {"step": lambda: env.step(actions), "products": lambda: net.predict(history)}
-    times = seconds(calls, options)
-    return {
-        "step_us": 1e6 * times["step"],
-        "products_us": 1e6 * times["products"],
-        "steps_per_second": num / times["step"],
-        "step_over_products": times["step"] / times["products"],
-    }
 
 
 def gradient(options: Options) -> dict[str, Any]:
@@ -121,22 +79,26 @@ def gradient(options: Options) -> dict[str, Any]:
         torch.nn.utils.clip_grad_norm_(agent.parameters(), 1.0)
         optimizer.step()
 
-    sizes = shapes(171, (4,), batch)
-    work = sum(2 * m * k * n for m, k, n in sizes) / 1e9
-    calls: dict[str, Callable[[], Any]] = {"gradient": step, "torch": products("torch", sizes)}
-    calls["numpy"] = products("numpy", sizes)
-    try:
-        calls["onednn"] = products("onednn", sizes)
-        calls["onednn"]()
-    except (AttributeError, RuntimeError):  # a torch without it
-        calls.pop("onednn", None)
+    sizes = shapes((171, 256, 128, 64, 4), batch)
+    rng = np.random.default_rng(0)
+    arrays = []
+    for m, k, n in sizes:
+        a = rng.normal(size=(m, k)).astype(np.float32)
+        b = rng.normal(size=(k, n)).astype(np.float32)
+        arrays.append((a, b))
+    tensors = [(torch.from_numpy(a), torch.from_numpy(b)) for a, b in arrays]
+    calls = {
+        "gradient": step,
+        "torch": lambda: [a @ b for a, b in tensors],
+        "numpy": lambda: [a @ b for a, b in arrays],
+    }
     times = seconds(calls, options)
-    rates = {name: work / times[name] for name in calls}
-    best = max(rate for name, rate in rates.items() if name != "gradient")
+    work = sum(2 * m * k * n for m, k, n in sizes) / 1e9
+    rates = {name: work / time for name, time in times.items()}
     return {
         "gflops": rates,
         "seconds": times["gradient"],
-        "fraction_of_best": rates["gradient"] / best,
+        "fraction_of_best": rates["gradient"] / max(rates["torch"], rates["numpy"]),
     }
 
 
@@ -169,12 +131,9 @@ def kinematics(options: Options) -> dict[str, float]:
 
 def main(options: Options) -> dict[str, Any]:
     torch.set_num_threads(options.threads)
-    if options.quick:
-        options.repeats = 1
     result = {
         "threads": options.threads,
         "load": os.getloadavg(),
-        "environment": {str(num): environment(num, options) for num in options.num_envs},
         "gradient": gradient(options),
         "kinematics": kinematics(options),
     }

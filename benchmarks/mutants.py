@@ -1,27 +1,22 @@
 """Mutants of a module: does a test fail where mutmut changes its code?
 
     pip install 'mutmut==3.8.*'
-    python -m benchmarks.mutants kinematics can.canopen [--show] [--seconds 2] [--tests FILE ...]
+    python -m benchmarks.mutants can.canopen
 
 A mutant may write anywhere: run this in a copy of the project. First each test runs once, which
 gives its time and the functions that it calls. Then each mutant runs in a process against the
-quickest tests of its function, `--seconds` in all, up to the first failure. The tests are those
-of `test_<module>.py`, of `tests/properties` and of the module's docstrings. Outcomes are kept in
-`mutants/<module>.json`: the next run repeats only tests of files that changed and mutants that no
-test killed. A change of the module starts anew.
+quickest tests of its function, `SECONDS` in all, up to the first failure. The tests are those
+of `test_<module>.py`, of `tests/properties` and of the module's docstrings. Changes that no test
+detects are printed.
 """
 
 from __future__ import annotations
 
-import argparse
-import contextlib
 import difflib
 import functools
 import gc
-import hashlib
 import importlib
 import inspect
-import json
 import multiprocessing
 import os
 import resource
@@ -31,6 +26,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from types import FrameType, FunctionType, ModuleType
 from typing import Any
@@ -38,6 +34,7 @@ from typing import Any
 os.environ["HYPOTHESIS_PROFILE"] = "mutants"
 os.environ["OMP_NUM_THREADS"] = "1"
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import HealthCheck, Phase, settings
@@ -48,37 +45,36 @@ try:
 except ImportError:
     sys.exit("benchmarks.mutants: mutmut is missing: pip install 'mutmut==3.8.*'")
 
-SLOWEST = 10.0  # s: slower tests are left out
+SECONDS = 2.0  # of the tests of one mutant
+SLOWEST = 30.0  # s: slower tests are left out
 UNKILLED = ("survived", "not reached")
 
 
-def in_fork(work: Callable[[], Any], cpu_s: float, wall_s: float) -> Any:
+def in_fork(work: Callable[[], Any], limit_s: float) -> Any:
     """What `work` returns in a forked, silent process; "time" if that ran out, else "died"."""
-    get, put = os.pipe()
-    child = os.fork()
-    if child == 0:
-        try:
-            os.setpgid(0, 0)
-            resource.setrlimit(resource.RLIMIT_CPU, (int(cpu_s), int(cpu_s) + 1))
-            resource.setrlimit(resource.RLIMIT_DATA, (8 << 30, 8 << 30))
-            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-            signal.alarm(int(wall_s))
-            null = os.open(os.devnull, os.O_RDWR)
-            for stream in (0, 1, 2):
-                os.dup2(null, stream)
-            os.write(put, json.dumps(work()).encode())
-        finally:
-            os._exit(0)
-    os.close(put)
-    with open(get, "rb") as pipe:
-        text = pipe.read()
-    status = os.waitpid(child, 0)[1]
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(child, signal.SIGKILL)  # processes that a test started
-    if text:
-        return json.loads(text)
-    timeout = os.WIFSIGNALED(status) and os.WTERMSIG(status) in (signal.SIGXCPU, signal.SIGALRM)
-    return "time" if timeout else "died"
+    context = multiprocessing.get_context("fork")
+    get, put = context.Pipe(duplex=False)
+
+    def run() -> None:
+        os.setpgid(0, 0)
+        resource.setrlimit(resource.RLIMIT_DATA, (8 << 30, 8 << 30))
+        null = os.open(os.devnull, os.O_RDWR)
+        for stream in (0, 1, 2):
+            os.dup2(null, stream)
+        put.send(work())
+
+    process = context.Process(target=run)
+    process.start()
+    put.close()
+    try:
+        return get.recv() if get.poll(limit_s) else "time"
+    except EOFError:
+        return "died"
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid or 0, signal.SIGKILL)  # and processes that a test started
+        process.join()
+        get.close()
 
 
 # --- functions of a module, right and wrong -------------------------------------------------------
@@ -134,17 +130,12 @@ def function_of(mutant: str) -> tuple[str, str]:
 class Mutation:
     """A pytest plugin: instead of a run of all tests, each test alone, then all mutants."""
 
-    def __init__(self, module: str, seconds: float, out: Path) -> None:
+    def __init__(self, module: str) -> None:
         self.module = importlib.import_module(f"brokk_min.{module}")
-        self.source = inspect.getsource(self.module)
-        self.seconds = seconds
-        self.out = out
+        self.mutated = mutate_file_contents(self.module.__file__, inspect.getsource(self.module))
         self.failed = False
-        self.recent: list[str] = []  # tests that killed, the last one last
-        digest = hashlib.sha256(self.source.encode()).hexdigest()
-        self.kept: dict[str, Any] = {"source": digest, "files": {}, "outcomes": {}}
-        if out.exists() and json.loads(out.read_text())["source"] == digest:
-            self.kept = json.loads(out.read_text())
+        self.notes: dict[pytest.Item, tuple[float, set[str]]] = {}  # time [s], called functions
+        self.outcomes: dict[str, str] = {}
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         self.failed |= report.failed
@@ -162,27 +153,18 @@ class Mutation:
                 for thing in vars(loaded).values():
                     getattr(thing, "cache_clear", int)()  # or mutants hide behind it
         gc.freeze()
-        self.note_tests(session.items)
-        self.run_mutants(session.items)
+        for item in tqdm(session.items, "tests", disable=None):
+            note = in_fork(functools.partial(self.trace, item), SLOWEST)
+            if isinstance(note, tuple):
+                self.notes[item] = note
+            else:
+                tqdm.write(f"{item.nodeid}: left out, {note}")
+        self.run_mutants()
+        self.report()
         return True
 
-    def note_tests(self, items: list[pytest.Item]) -> None:
-        """Time [s] and called functions of each test, as noted where its file did not change."""
-        for item in tqdm(items, "tests", disable=None):
-            file = item.nodeid.split("::")[0]
-            digest = hashlib.sha256(Path(file).read_bytes()).hexdigest()
-            noted = self.kept["files"].get(file)
-            if noted is None or noted["digest"] != digest:
-                noted = {"digest": digest, "tests": {}}
-                self.kept["files"][file] = noted
-            if item.nodeid not in noted["tests"]:
-                result = in_fork(functools.partial(self.trace, item), SLOWEST, 120)
-                noted["tests"][item.nodeid] = result
-                if not isinstance(result, list):
-                    tqdm.write(f"{item.nodeid}: left out, {result or 'failed'}")
-
-    def trace(self, item: pytest.Item) -> list[Any] | None:
-        """Time [s] and called functions of a test; None: it failed."""
+    def trace(self, item: pytest.Item) -> tuple[float, set[str]] | str:
+        """Time [s] and called functions of a test."""
         called: set[str] = set()
         own = self.module.__name__
 
@@ -195,45 +177,26 @@ class Mutation:
         start = time.process_time()
         passed = self.passes(item)
         sys.setprofile(None)
-        return [time.process_time() - start, sorted(called)] if passed else None
+        return (time.process_time() - start, called) if passed else "failed"
 
-    def chosen(self, items: list[pytest.Item], function: str) -> tuple[list[pytest.Item], float]:
-        """The quickest tests of a function, recent killers first, and their time [s]."""
-        times = {}
-        for item in items:
-            note = self.kept["files"][item.nodeid.split("::")[0]]["tests"][item.nodeid]
-            if isinstance(note, list) and function in note[1]:
-                times[item] = note[0]
-        total = 0.0
-        result = []
-        for item in sorted(times, key=times.__getitem__):
-            if result and total + times[item] > self.seconds:
-                break
-            result.append(item)
-            total += times[item]
-        rank = {test: place for place, test in enumerate(self.recent)}
-        return sorted(result, key=lambda item: -rank.get(item.nodeid, -1)), total
+    def chosen(self, function: str) -> list[pytest.Item]:
+        """The quickest tests of a function, in `SECONDS` together."""
+        of_function = [item for item, (_, called) in self.notes.items() if function in called]
+        of_function.sort(key=lambda item: self.notes[item][0])
+        total = np.cumsum([self.notes[item][0] for item in of_function])
+        return of_function[: max(1, int((total <= SECONDS).sum()))]
 
-    def run_mutants(self, items: list[pytest.Item]) -> None:
-        """Outcome of each mutant that was not killed before."""
-        mutated = mutate_file_contents(str(self.module.__file__), self.source)
-        code = compiled(self.module, mutated.code)
-        outcomes = {name: self.kept["outcomes"].get(name) for name in mutated.mutant_names}
-        self.kept["outcomes"] = outcomes
-        for mutant in tqdm(outcomes, "mutants", disable=None):
-            if outcomes[mutant] not in (None, *UNKILLED):
-                continue
+    def run_mutants(self) -> None:
+        """Outcome of each mutant."""
+        code = compiled(self.module, self.mutated.code)
+        for mutant in tqdm(self.mutated.mutant_names, "mutants", disable=None):
             key, prefix = function_of(mutant)
             right = code[f"{prefix}{mutant.rpartition('_')[0]}_orig"]
             wrong = code[prefix + mutant]
-            tests, seconds = self.chosen(items, key)
-            outcome = "not reached"
-            if tests:
-                work = functools.partial(self.first_failure, tests, key, right, wrong)
-                outcome = in_fork(work, 3 + 3 * seconds, 30 + 20 * seconds)
-            outcomes[mutant] = outcome
-            self.recent.append(outcome)
-            self.out.write_text(json.dumps(self.kept))
+            tests = self.chosen(key)
+            work = functools.partial(self.first_failure, tests, key, right, wrong)
+            limit_s = 10 + 20 * sum(self.notes[item][0] for item in tests)
+            self.outcomes[mutant] = in_fork(work, limit_s) if tests else "not reached"
 
     def first_failure(
         self, tests: list[pytest.Item], key: str, right: FunctionType, wrong: FunctionType
@@ -245,38 +208,25 @@ class Mutation:
                 return item.nodeid
         return "survived"
 
-
-# --- report ---------------------------------------------------------------------------------------
-
-
-def report(module: str, out: Path, show: bool) -> None:
-    """Print the score of a module, and with `show` the changes that no test detects."""
-    outcomes = json.loads(out.read_text())["outcomes"]
-    count = Counter(outcome for outcome in outcomes.values() if outcome in UNKILLED)
-    reached = len(outcomes) - count["not reached"]
-    killed = reached - count["survived"]
-    print(
-        f"{module}: {len(outcomes)} mutants, {count['not reached']} not reached, {killed} killed, "
-    )
-    print(
-        f"    {killed / max(1, reached):.1%} of those reached, {killed / len(outcomes):.1%} of all"
-    )
-    if not show:
-        return
-    path = Path("brokk_min", *module.split(".")).with_suffix(".py")
-    mutated = mutate_file_contents(str(path), path.read_text())
-    lines = mutated.code.splitlines()
-    spans = mutated.line_span_by_function_name
-    for name, outcome in outcomes.items():
-        if outcome in UNKILLED:
-            old = spans[f"{name.rpartition('_')[0]}_orig"]
-            new = spans[name]
-            changes = difflib.ndiff(lines[old.start + 1 : old.end], lines[new.start + 1 : new.end])
-            print(name, outcome, *(line for line in changes if line[0] in "+-"), sep="\n  ")
+    def report(self) -> None:
+        """Print the changes that no test detects, and the score."""
+        lines = self.mutated.code.splitlines()
+        spans = self.mutated.line_span_by_function_name
+        for name, outcome in self.outcomes.items():
+            if outcome in UNKILLED:
+                old = spans[f"{name.rpartition('_')[0]}_orig"]
+                new = spans[name]
+                diff = difflib.ndiff(lines[old.start + 1 : old.end], lines[new.start + 1 : new.end])
+                print(name, outcome, *(line for line in diff if line[0] in "+-"), sep="\n  ")
+        count = Counter(outcome for outcome in self.outcomes.values() if outcome in UNKILLED)
+        number = len(self.outcomes)
+        killed = number - count.total()
+        missed = count["not reached"]
+        print(f"{self.module.__name__}: {number} mutants, {missed} not reached, {killed} killed")
 
 
-def run(module: str, options: argparse.Namespace, out: Path) -> None:
-    """Mutants of one module, in a process of its own."""
+def main() -> None:
+    (module,) = sys.argv[1:]
     torch.set_num_threads(1)
     torch.optim.Adam([torch.zeros(1, requires_grad=True)])  # slow imports: once, not in each fork
     settings.register_profile(
@@ -289,32 +239,10 @@ def run(module: str, options: argparse.Namespace, out: Path) -> None:
         suppress_health_check=list(HealthCheck),
     )
     path = Path("brokk_min", *module.split(".")).with_suffix(".py")
-    tests = options.tests or [*Path("tests").rglob(f"test_{path.stem}.py"), path]
-    tests += [] if options.tests else Path("tests").glob("properties/*.py")
+    tests = {*Path("tests").rglob(f"test_{path.stem}.py"), *Path("tests/properties").glob("*.py")}
     flags = ["-s", "-otmp_path_retention_policy=none", "-oconsole_output_style=classic"]
     flags += [f"-pno:{plugin}" for plugin in ("cacheprovider", "xdist", "faulthandler")]
-    files = sorted({str(test) for test in tests})
-    pytest.main([*files, *flags], plugins=[Mutation(module, options.seconds, out)])
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("modules", nargs="+", help="of brokk_min")
-    parser.add_argument("--tests", nargs="*", help="files or folders, instead of the module's own")
-    parser.add_argument("--seconds", type=float, default=2.0, help="of the tests of one mutant")
-    parser.add_argument("--show", action="store_true", help="print changes that no test detects")
-    options = parser.parse_args()
-    Path("mutants").mkdir(exist_ok=True)
-    for module in options.modules:
-        out = Path("mutants", f"{module}.json")
-        process = multiprocessing.get_context("fork").Process(
-            target=run, args=(module, options, out)
-        )
-        process.start()
-        process.join()
-        report(module, out, options.show)
+    pytest.main([*sorted(map(str, {path, *tests})), *flags], plugins=[Mutation(module)])
 
 
 if __name__ == "__main__":

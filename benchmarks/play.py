@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import tyro
 
-from benchmarks.bus import random_policy
+from benchmarks.bus import percentiles, random_policy
 from benchmarks.rollout import write
 from brokk_min.can.drive_log import Telemetry
 from brokk_min.learning.policy import PolicyController
@@ -79,10 +79,6 @@ class Player:
             "driving": round(float(np.mean(driving)), 3),
             "lateness": percentiles(late),
         }
-
-
-def percentiles(values: Any) -> dict[str, float]:
-    return {f"p{p}": round(float(np.percentile(values, p)), 2) for p in (50, 99, 100)}
 
 
 def main(options: Options) -> None:

@@ -10,14 +10,15 @@ Observation: Box, float32, (171,), (x - mean) / deviation * weight of these bloc
 | 0-2     | goal velocity of the tool, heading frame             | 0.173 m/s   | 1.4    | no    |
 | 3-5     | measured velocity of the tool, heading frame         | 0.173 m/s   | 1.4    | yes   |
 | 6       | angle of the locked joint                            | 0.404 rad   | 1.4    | yes   |
-| 7-110   | 13 angles, 13 velocities of each driven joint        | of range    | 0.277  | yes   |
+| 7-110   | 13 angles, 13 velocities of each driven joint        | uniform     | 0.277  | yes   |
 | 111-162 | 13 commands of each driven joint                     | 0.364       | 0.277  | no    |
-| 163-166 | resolved velocities of the goal (`jacobian.dls`)     | of range    | 4.2    | no    |
-| 167-170 | resolved velocities of the error integral            | 0.1 range   | 4.2    | no    |
+| 163-166 | resolved velocities of the goal (`jacobian.dls`)     | uniform     | 4.2    | no    |
+| 167-170 | resolved velocities of the error integral            | 0.1 uniform | 4.2    | no    |
 
-The newest sample is the last. The heading frame has x outward from the slew axis to the tool.
+"Uniform": over the range of the joint or its velocity. The newest sample is the last. The heading
+frame has x outward from the slew axis to the tool.
 
-Action: Box(-1, 1, (4,)), valve opening of each driven joint, see `action_to_pwm`.
+Action: Box(-1, 1, (4,)), of the largest command of each driven joint, see `action_to_pwm`.
 Reward: 1 / (1 + |v_goal - v_tool|) (eq2), minus costs of valve travel and of the error integral.
 Start: at rest in a random pose above the ground, with a random goal that changes now and then.
 End: terminated, without reward, with a link in the ground; truncated after 20 s.
@@ -63,7 +64,7 @@ class TaskConfig:
 
 
 class Measured(NamedTuple):
-    """What sensors tell, in physical units and the base frame; classical controllers take it."""
+    """What controllers get, in physical units and the base frame."""
 
     v_goal: Array  # goal velocity of the tool [m/s], (..., 3)
     v_tool: Array  # measured velocity of the tool [m/s], (..., 3)
@@ -89,8 +90,8 @@ class Block(NamedTuple):
 def observation_blocks(machine: Machine) -> tuple[Block, ...]:
     """The observation in its order. Paper: Sec. 3.4 (normalisation)
 
-    Means and deviations are those of uniform distributions over the ranges. H samples weigh as much
-    as one number. Resolved velocities weigh most: a net learns first what is large at its input.
+    Means and deviations are those of uniform distributions over the ranges. H samples (H^-0.5 each)
+    weigh as much as one number; resolved velocities most: a net learns first what is large.
     """
     H = machine.history
     q_mean = (machine.column("q_min") + machine.column("q_max")) / 2
@@ -125,8 +126,8 @@ def observation_scale(machine: Machine) -> tuple[Array, Array]:
 
 
 @lru_cache
-def noise_std(machine: Machine) -> Array:
-    """Standard deviations of what sensors measure, in physical units, float32 (noisy numbers,)."""
+def sensor_std(machine: Machine) -> Array:
+    """Deviations of what sensors measure, the unit of its noise, float32 (noisy numbers,)."""
     noisy = [block.std for block in observation_blocks(machine) if block.noisy]
     return np.concatenate(noisy).astype(np.float32)
 
@@ -134,7 +135,7 @@ def noise_std(machine: Machine) -> Array:
 def measure(
     machine: Machine, history: Array, v_goal: Array, integral: Array, noise: Array | float = 0.0
 ) -> Measured:
-    """What controllers get, in training, evaluation and on the machine. Paper: Sec. 3.4, Fig. 3
+    """Measurements for training, evaluation and the machine. Paper: Sec. 3.4, Fig. 3
 
     From the measured history (..., n, 3, H), the goal velocity [m/s] and the error integral [m]
     (..., 3), both in the base frame; `noise` of what sensors measure, in deviations (..., noisy).
@@ -142,7 +143,7 @@ def measure(
     q = history[..., 0, -1].copy()
     q_dot = history[..., 1, -1]
     history = history.take(machine.driven, axis=-3)
-    error = np.asarray(noise * noise_std(machine))
+    error = np.asarray(noise * sensor_std(machine))
     v_error, q_error, history_error = np.split(error, [3, 3 + len(machine.locked)], axis=-1)
     q[..., machine.locked] += q_error
     history[..., :2, :] += history_error.reshape(*error.shape[:-1], -1, 2, machine.history)
@@ -157,7 +158,7 @@ def measure(
 def features(machine: Machine, measured: Measured) -> Array:
     """The observation of the table above, float32 (..., obs). Paper: Sec. 3.4, Fig. 3
 
-    Resolved velocities (ours): J^T (J J^T + lambda^2 I)^-1 v, lambda = 6 % of the arm (assumed).
+    Resolved velocities (ours): `dls` with W = 1, lambda = 6 % of the links' lengths (assumed).
     """
     J = measured.J[..., machine.driven]
     arm = np.hypot(machine.column("a"), machine.column("d")).sum()
@@ -182,7 +183,7 @@ def features(machine: Machine, measured: Measured) -> Array:
 def integrate_error(machine: Machine, v_goal: Array, v_tool: Array, integral: Array) -> Array:
     """Leaky integral of the velocity error [m] (..., 3), one tick on: the I of a PI controller.
 
-    I' = exp(-dt / T) (I + dt e), with e = v_goal - v_tool cut to a short length.
+    I_{t+1} = exp(-dt / T) (I_t + dt e), e = v_goal - v_tool, cut to 7 % of the tool speed.
     """
     error = v_goal - v_tool
     limit = np.float32(INTEGRAL_LIMIT * machine.tool_speed)
@@ -234,7 +235,7 @@ class State:
 
     q: Array  # true angle [rad]
     q_dot: Array  # true mean velocity over the last tick [rad/s]
-    v_tool: Array  # true mean velocity of the tool [m/s], (..., 3)
+    v_tool: Array  # true velocity J(q) q_dot of the tool [m/s], (..., 3)
     lowest: Array  # height of the lowest point of a link [m], (...)
     history: Array  # measured angle, estimated velocity, sent command: (..., n, 3, H), float32
     true_history: Array  # the same of true angles: what the nets get
@@ -308,7 +309,7 @@ def terminated(machine: Machine, lowest: Array) -> Bools:
 def step(
     machine: Machine, config: TaskConfig, net: ActuatorNet | None, state: State, action: ArrayLike
 ) -> tuple[State, Array, Bools, Bools, Array]:
-    """One tick of `num` environments under actions (num, n_driven), without new goals or resets.
+    """One tick under actions (num, n_driven) of `num` machines, without new goals or resets.
 
     The next state; reward, terminated, truncated and |v_goal - v_tool| [m/s], (num,) each.
     """

@@ -1,7 +1,7 @@
 """The 20 Hz loop that drives a machine on a CAN bus. Paper: Sec. 2
 
-One tick: SYNC, encoder positions, observation, controller, safety gate, valve frame. Nothing here
-is a safety function: a real machine keeps its hard-wired emergency stop (docs/hardware.md).
+One tick: the operator's goal, SYNC, encoder positions, measurements, controller, gate, valve
+frame. Nothing here is a safety function: keep the hard-wired emergency stop (docs/hardware.md).
 """
 
 import gc

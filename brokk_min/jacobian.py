@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -82,6 +83,7 @@ def nakamura_damping(w: ArrayLike, w0: float, k: float) -> Array:
     return k * np.maximum(0.0, 1 - np.asarray(w) / w0) ** 2
 
 
+@lru_cache
 def manipulability_threshold(machine: Machine) -> float:
     """w0: a quarter of the largest manipulability over 2,000 random poses (assumed)."""
     low, high = machine.column("q_min"), machine.column("q_max")
@@ -117,7 +119,7 @@ class PIDState(NamedTuple):
 class JacobianController:
     """Resolved rates by damped least squares (eq3), then one PID per driven joint.
 
-    The PID gives the valve opening beyond the dead zone, which is added after it. While the tool
+    The PID gives the valve opening; the dead zone is added afterwards. While the tool
     is to move, no valve goes below the opening `min_opening`: one that has closed answers late
     (paper Sec. 3.2). Paper: eq3, Sec. 4.2
     """
@@ -158,7 +160,7 @@ class JacobianController:
         q = measured.q.astype(float)
         q_dot_goal = self.desired_velocities(measured.v_goal, measured.v_tool, q, state.q_dot_goal)
         error = q_dot_goal - measured.q_dot
-        derivative = 0.7 * state.derivative + 0.3 * (error - state.error) / m.dt
+        derivative = 0.7 * state.derivative + 0.3 * (error - state.error) / m.dt  # filtered
         opening = gains.kp * error + state.integral + gains.kd * derivative  # PID
         if self.feedforward is not None:
             u = self.feedforward(q[..., m.driven], q_dot_goal)

@@ -24,7 +24,7 @@ class Frames(NamedTuple):
     """Frame 0 is the base, frame i moves with joint i, frame n is at the tool tip."""
 
     p: Array  # origins p_0 .. p_n [m], (..., n + 1, 3)
-    z: Array  # unit vectors z_0 .. z_n along the joints' axes, (..., n + 1, 3)
+    z: Array  # unit vectors z_0 .. z_n, (..., n + 1, 3); z_{i-1} is the axis of joint i
 
 
 def forward_kinematics(machine: Machine, q: ArrayLike) -> Frames:
@@ -37,7 +37,7 @@ def forward_kinematics(machine: Machine, q: ArrayLike) -> Frames:
     q = as_floats(q)
     if q.ndim < 1 or q.shape[-1] != machine.n:
         raise ValueError(f"q: expected (..., {machine.n}), got {q.shape}")
-    # vectors (3, ...) have their coordinates first in here: c * x scales x at each pose of a batch
+    # in here vectors are (3, ...), coordinates first: c * x scales x at each pose of a batch
     p = np.zeros((machine.n + 1, 3, *q.shape[:-1]), q.dtype)
     axes = np.zeros_like(p)
     x, y, z = np.eye(3, dtype=q.dtype).reshape(3, 3, *[1] * (q.ndim - 1))
@@ -102,7 +102,7 @@ def tool_velocity(frames: Frames, q_dot: ArrayLike) -> Array:
 
 
 def lowest_point(frames: Frames) -> Array:
-    """Height of the lowest end of a link [m], (...); links are straight between their frames.
+    """Height of the lowest of the origins p_1 .. p_n, the ends of the links [m], (...).
 
     Example:
         >>> from brokk_min.machine import BROKK_170

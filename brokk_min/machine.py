@@ -19,9 +19,10 @@ Array = NDArray[np.floating[Any]]  # of any shape, float32 or float64
 PWM_MAX = 127  # counts of full command; paper: [0,127] is positive, [255,128] negative
 
 
-def number(unit: str, low: float = -np.inf, high: float = np.inf, default: Any = None) -> Any:
+def number(
+    unit: str, low: float = -np.inf, high: float = np.inf, default: Any = dataclasses.MISSING
+) -> Any:
     """A field with its unit and its range, both ends included."""
-    default = dataclasses.MISSING if default is None else default
     return dataclasses.field(default=default, metadata={"unit": unit, "low": low, "high": high})
 
 
@@ -87,12 +88,7 @@ class Joint:
 
 @dataclass(frozen=True)
 class Machine:
-    """Everything that distinguishes one machine from another.
-
-    Example:
-        >>> BROKK_170.n, [joint.name for joint in BROKK_170.joints if joint.driven]
-        (5, ['q1', 'q3', 'q4', 'q5'])
-    """
+    """Everything that distinguishes one machine from another."""
 
     name: str
     joints: tuple[Joint, ...]
@@ -132,6 +128,8 @@ class Machine:
         if not self.dead_zone * PWM_MAX < self.pwm_limit:  # no valve would ever open
             limit = f"{self.pwm_limit}/{PWM_MAX}"
             raise ValueError(f"dead_zone: expected below {limit}, got {self.dead_zone!r}")
+        if self.q_start and len(self.q_start) != self.n:
+            raise ValueError(f"q_start: expected {self.n} angles or none, got {self.q_start}")
         steps = self.dt / self.plant_dt
         if abs(steps - round(steps)) > 1e-6 or steps < 0.5:
             raise ValueError(f"plant_dt: expected a part of {self.dt} s, got {self.plant_dt}")
@@ -211,7 +209,7 @@ def limit_command(machine: Machine, u: ArrayLike) -> NDArray[np.floating]:
 def valve_opening(u: ArrayLike, dead_zone: float) -> NDArray[np.floating]:
     """Opening of a valve in [-1, 1] under a command `u`: what lies beyond the dead zone.
 
-    Shape and float type of `u`; `dead_zone` is a fraction of full command. Paper: Sec. 3.2 (7 %)
+    Shape and float type of `u`; `dead_zone` is a fraction of full command. Paper: Sec. 3.3 (7 %)
 
     Example:
         >>> valve_opening([-1.0, 0.05, 0.535], 0.07).round(3)
@@ -309,7 +307,7 @@ BROKK_170 = Machine(
     joints=tuple(Joint(*dh, *drive) for dh, drive in zip(_DH, _DRIVES, strict=True)),  # type: ignore[arg-type]
     rate=20.0,  # Hz; paper: Sec. 3.3
     pwm_limit=80,  # counts of 127; paper: Sec. 3.2
-    dead_zone=0.07,  # of full command; paper: Sec. 3.2
+    dead_zone=0.07,  # of full command; paper: Sec. 3.3
     delay=0.040,  # s; assumed
     tau_spool=0.030,  # s; assumed
     tau_cylinder=0.030,  # s; assumed

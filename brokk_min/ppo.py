@@ -3,7 +3,8 @@
 It trains on any Gymnasium vector environment that resets in the same step. A truncated episode did
 not fail: its return goes on with the value of its own last observation. At a termination it stops.
 Advantages come from a critic, as in the paper, or from a function that is passed to `train`.
-Names are those of CleanRL. Paper: Sec. 3.4 (PPO, 256 environments)
+Names are CleanRL's, but horizon is its num_steps and target_kl steers the learning rate.
+Paper: Sec. 3.4 (PPO, 256 environments)
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ class PPOConfig:
     target_kl: float = 0.3  # KL divergence of an update at which the learning rate stays as it is.
     gamma: float = 0.95  # Discount a tick: 0.95 looks 20 ticks (1 s) ahead.
     gae_lambda: float = 0.95  # Weight of longer returns in the advantage.
-    clip: float = 0.2  # Largest change of a probability ratio that still earns.
+    clip: float = 0.2  # Change of a probability ratio beyond which gains do not count.
     entropy: float = 0.0  # Coefficient of the entropy bonus.
     max_grad_norm: float = 1.0  # Gradients are scaled down to this norm.
     log_std: float = -1.8  # Logarithm of the actions' standard deviation at the start.
@@ -255,7 +256,7 @@ def anneal(learner: Learner, config: PPOConfig) -> None:
 
 
 def adapt_learning_rate(learner: Learner, config: PPOConfig, approx_kl: float) -> None:
-    """Less after a large change of the policy, more after a small one, as rl_games does."""
+    """Less after a large change of the policy, more after a small one (rl_games, other factors)."""
     if approx_kl > 1.5 * config.target_kl:
         learner.learning_rate /= 1.2
     elif approx_kl < 0.7 * config.target_kl:

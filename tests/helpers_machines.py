@@ -48,6 +48,7 @@ def random_machine(rng: np.random.Generator, n: int) -> Machine:
     history = int(rng.integers(3, 14))
     return replace(
         BROKK_170,
+        q_start=(),
         name=f"random{n}",
         joints=tuple(joints),
         history=history,

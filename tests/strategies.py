@@ -56,6 +56,7 @@ def machines(draw: st.DrawFn, min_joints: int = 2, max_joints: int = 6) -> Machi
         BROKK_170,
         name="drawn",
         joints=tuple(draw(joints(i, drives)) for i, drives in enumerate(driven)),
+        q_start=(),
         rate=draw(st.sampled_from([10.0, 20.0, 25.0, 50.0])),
         pwm_limit=pwm_limit,
         dead_zone=draw(reals(0.0, min(0.3, 0.9 * pwm_limit / 127))),

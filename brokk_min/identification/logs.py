@@ -66,8 +66,8 @@ def velocity_of(q: Array, samples: int, rate: float = RATE) -> Floats:
     `samples` is the window of `estimate_velocity`, `rate` [Hz] that of the rows.
 
     Example:
-        >>> velocity_of(np.array([[0.0], [0.0], [0.3], [0.6]]), samples=2).ravel().tolist()
-        [0.0, 0.0, 6.0, 6.0]
+        >>> velocity_of(np.array([[0.0], [0.0], [0.25], [0.5]]), samples=2).round(6).ravel()
+        array([0., 0., 5., 5.])
     """
     padded = np.concatenate([np.repeat(q[:1], samples - 1, axis=0), q])
     windows = np.lib.stride_tricks.sliding_window_view(padded, samples, axis=0)

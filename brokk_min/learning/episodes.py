@@ -14,8 +14,8 @@ from brokk_min.env import (
     features,
     initial_state,
     measure,
-    noise_std,
     observation_blocks,
+    sensor_std,
     terminated,
 )
 from brokk_min.kinematics import forward_kinematics, lowest_point
@@ -88,7 +88,7 @@ def new_goals(
 
 def draw_noise(machine: Machine, largest: float, num: int, rng: np.random.Generator) -> Array:
     """Uniform noise of `env.measure`, in deviations, float32 (num, noisy)."""
-    steps = rng.integers(-(2**15), 2**15, (num, len(noise_std(machine))), np.int16)
+    steps = rng.integers(-(2**15), 2**15, (num, len(sensor_std(machine))), np.int16)
     return steps * np.float32(largest / 2**15)
 
 

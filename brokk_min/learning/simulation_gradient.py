@@ -13,8 +13,10 @@ The advantage of an action is, to first order, this gradient times its deviation
 field calls it a first-order or gradient-informed policy gradient: PODS (Mora et al., 2021), SHAC
 (Xu et al., 2022), GI-PPO (Son et al., 2023, arXiv 2312.08710). Here it feeds PPO's clipped loss.
 
-Angles and commands count as exact, not rounded; the error integral takes each tick's own velocity;
-Jacobians count as constant: in one second a joint turns little.
+Simplifications: angles and commands count as exact, not rounded; the error integral takes the true
+velocity of the tick; Jacobians count as constant, for in one second a joint turns little; joints at
+rest count without the standstill rule; a tick into the ground counts as any other; nothing counts
+after the end of an episode; later actions count as given (SHAC differentiates the policy, too).
 """
 
 from typing import NamedTuple
@@ -85,23 +87,24 @@ def action_gradients(
     window = machine.velocity_samples
     slope = estimate_velocity(np.eye(window), window, machine.dt).astype(np.float32)  # dq_dot/dq
     dR_du = np.empty_like(dr_dq_dot)
-    h = np.zeros_like(dq_dot_dh[0])  # costate of the history, (num, n_driven, 3, H)
-    q = np.zeros_like(dc_du[0])  # of the angle, (num, n_driven)
-    u = np.zeros_like(dc_du[0])  # of the last command
+    # costates: derivatives of the rewards to come by the state after the tick
+    dR_dh = np.zeros_like(dq_dot_dh[0])  # history, (num, n_driven, 3, H)
+    dR_dq = np.zeros_like(dc_du[0])  # angle, (num, n_driven)
+    dR_dlast = np.zeros_like(dc_du[0])  # command of the tick, by the cost of the next one
     for t in reversed(range(len(dR_du))):
         discount = np.float32(gamma) * ~ticks.done[t, :, None]
-        h = discount[..., None, None] * h
-        h[..., 0, -window:] += h[..., 1, -1:] * slope  # the newest velocity is a slope of angles
-        q = free[t] * (discount * q + h[..., 0, -1])  # q_{t+1} = q_t + dt q_dot; none at a limit
-        q_dot = np.float32(machine.dt) * q + dr_dq_dot[t]
-        h_now = q_dot[..., None, None] * dq_dot_dh[t]  # (dq_dot/dh)^T q_dot
-        h_now[..., :2, 1:] += h[..., :2, :-1]  # the shift of the history, backwards
-        h_now[..., 2, :] += h[..., 2, :]  # the net reads commands already shifted
-        dR_du[t] = h_now[..., 2, -1] + discount * u - dc_du[t]
-        h_now[..., 2, 1:] = h_now[..., 2, :-1]
-        h_now[..., 2, 0] = 0
-        h = h_now
-        u = dc_du[t]
+        dR_dh = discount[..., None, None] * dR_dh
+        dR_dh[..., 0, -window:] += dR_dh[..., 1, -1:] * slope  # the newest q_dot is a slope of q
+        dR_dq = free[t] * (discount * dR_dq + dR_dh[..., 0, -1])  # none at a limit
+        dR_dq_dot = np.float32(machine.dt) * dR_dq + dr_dq_dot[t]  # q_{t+1} = q_t + dt q_dot
+        before = dR_dq_dot[..., None, None] * dq_dot_dh[t]
+        before[..., :2, 1:] += dR_dh[..., :2, :-1]  # the shift of the history, backwards
+        before[..., 2, :] += dR_dh[..., 2, :]  # the net reads commands already shifted
+        dR_du[t] = before[..., 2, -1] + discount * dR_dlast - dc_du[t]
+        before[..., 2, 1:] = before[..., 2, :-1]
+        before[..., 2, 0] = 0
+        dR_dh = before
+        dR_dlast = dc_du[t]
     return dR_du * compensation_derivative(machine, ticks.u)
 
 

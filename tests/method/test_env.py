@@ -23,10 +23,10 @@ from brokk_min.env import (
     initial_state,
     integrate_error,
     measure,
-    noise_std,
     observation_blocks,
     observation_scale,
     reward,
+    sensor_std,
     step,
     terminated,
     transition,
@@ -197,7 +197,7 @@ def test_measure__adds_noise_to_what_sensors_measure_in_deviations():
     history = numbered_history()
     clean = measure(BROKK_170, history, ZERO, ZERO)
     kept = history.copy()
-    noise = np.full(len(noise_std(BROKK_170)), 0.1, np.float32)
+    noise = np.full(len(sensor_std(BROKK_170)), 0.1, np.float32)
     noisy = measure(BROKK_170, history, ZERO, ZERO, noise)
     np.testing.assert_array_equal(history, kept)
     error = noisy.history - clean.history

@@ -159,7 +159,7 @@ def opened(opening: np.ndarray) -> np.ndarray:
 
 
 def test_desired_velocities__are_eq3():
-    """v_d + K (v_d - v_ee), weighted least squares: an optimiser finds the same joint velocities."""
+    """v_d + K (v_d - v_ee) by weighted least squares: an optimiser finds the same."""
     v_tool = np.array([0.01, 0.02, -0.03])
     w0 = 100.0
     damping = 0.1 * (1 - np.sqrt(np.linalg.det(J @ J.T)) / w0) ** 2

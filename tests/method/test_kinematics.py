@@ -36,7 +36,7 @@ def test_tool_position__of_the_papers_start_pose():
 def test_tool_position__of_the_arm_stretched_out():
     level = tool_position(forward_kinematics(BROKK_170, STRAIGHT))
     np.testing.assert_allclose(level, [0.25 + 1.15 + 1.25 + 1.15 + 1.2, 0, 0.95], atol=1e-12)
-    upright = STRAIGHT + [np.pi / 2, np.pi / 2, 0, 0, 0]
+    upright = np.add(STRAIGHT, [np.pi / 2, np.pi / 2, 0, 0, 0])
     tool = tool_position(forward_kinematics(BROKK_170, upright))
     np.testing.assert_allclose(tool, [0, 0.25, 5.7], atol=1e-12)
 

@@ -104,6 +104,7 @@ BAD = [
     ({"valve_frame_id": -1}, ["valve_frame_id", "0 to 2047", "got -1"]),
     ({"valve_frame_id": 0x800}, ["valve_frame_id", "0 to 2047", "got 2048"]),
     ({"controller_node": 128}, ["controller_node", "1 to 127", "got 128"]),
+    ({"q_start": (0.0, 1.0)}, ["q_start", "5 angles or none", "(0.0, 1.0)"]),
     ({"controller_node": 3}, ["controller_node", "none of [1, 2, 3, 4, 5]", "got 3"]),
 ]
 
