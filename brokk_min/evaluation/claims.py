@@ -29,8 +29,7 @@ from brokk_min.jacobian import JacobianController, manipulability
 from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.machine import Array, Machine
 
-FILE = Path(__file__).with_name("claims.toml")
-TEXTS: dict[str, dict[str, Any]] = tomllib.loads(FILE.read_text(encoding="utf-8"))
+TEXTS: dict[str, dict[str, Any]] = tomllib.loads(Path(__file__).with_suffix(".toml").read_text())
 STRONG, WEAK = PAPER_BASELINES  # damping
 VERDICTS = {True: "holds here", False: "does not hold here", None: "was not measured"}
 

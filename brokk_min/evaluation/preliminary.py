@@ -90,7 +90,6 @@ def preliminary_tests(machine: Machine, simulate: Simulator) -> SimulatorTests:
     u[4] += other_commands(machine, joint)
     *alone, together = sweeps(machine, simulate, joint, u)
     names = [f"u = {encode_pwm(level)}" for level in u[:4, joint]]
-
     low, high = machine.column("q_min"), machine.column("q_max")
     level = np.full(machine.n, limit)
     before = (level + machine.dead_zone) / 2

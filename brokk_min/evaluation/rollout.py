@@ -1,7 +1,5 @@
 """A controller follows given tool velocities, on the analytic plant or on the nets."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
 

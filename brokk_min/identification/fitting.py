@@ -5,8 +5,6 @@ nets on their own outputs: there a bias adds up and the noise of encoders does n
 joints are trained at once, each on the recordings in which its joint moves.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
