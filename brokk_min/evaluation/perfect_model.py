@@ -130,8 +130,7 @@ class PerfectModel:
         u[:, :, 0, m.driven] = np.where(up, np.ceil(counts), np.floor(counts)) / PWM_MAX
         u[:, :, 0] = limit_command(m, u[:, :, 0])
         cost = np.linalg.norm(self.errors(plant, u, goal), axis=-1).mean(axis=-1)
-        best: Array = u[np.arange(len(u)), cost.argmin(axis=1), 0]
-        return best
+        return np.asarray(u[np.arange(len(u)), cost.argmin(axis=1), 0])
 
 
 def steady_opening(machine: Machine, q: Array, goal: Array) -> Array:
@@ -143,8 +142,7 @@ def steady_opening(machine: Machine, q: Array, goal: Array) -> Array:
     q_dot[:, driven] = (J_inv @ goal[..., None])[..., 0]
     v = q_dot * lever_arm(machine, q)  # of the cylinders [m/s]
     K = np.where(v > 0, machine.column("speed_positive"), machine.column("speed_negative"))
-    opening: Array = (v / K)[:, driven]
-    return opening
+    return np.asarray((v / K)[:, driven])
 
 
 def perfect_models(machine: Machine, starts: Array) -> dict[str, PerfectModel]:

@@ -81,8 +81,7 @@ def pump_flow_ratio(machine: Machine, u: Array) -> Array:
     opening = valve_opening(u, machine.dead_zone)
     K = np.where(opening > 0, machine.column("speed_positive"), machine.column("speed_negative"))
     flow = np.abs(machine.column("cylinder_area") * K * opening).sum(axis=-1)  # sum |A v*|
-    ratio: Array = flow / machine.pump_flow
-    return ratio
+    return np.asarray(flow / machine.pump_flow)
 
 
 def robustness(

@@ -168,10 +168,8 @@ def numbers_of(
     if not good.all():
         row = int(np.argmin(good))
         limits = "" if bound == np.inf else f" in [-{bound:g}, {bound:g}] ({unit})"
-        raise ValueError(
-            f"{path}: row {row + 2}, column {name}: expected a number, finite{limits}, "
-            f"got {cells[row]!r}"
-        )
+        place = f"{path}: row {row + 2}, column {name}"
+        raise ValueError(f"{place}: expected a number, finite{limits}, got {cells[row]!r}")
     return numbers
 
 

@@ -116,10 +116,8 @@ def training_set(log: Log, config: FitConfig) -> TrainingSet:
 def _check_targets(log: Log, targets: list[Array], history: int) -> None:
     for name, target in zip(log.joints, targets, strict=True):
         if not len(target) or np.ptp(target) == 0:
-            raise ValueError(
-                f"joint {name}: expected a recording of {history + 1} samples or more in "
-                "which it moves, got none"
-            )
+            expected = f"expected a recording of {history + 1} samples or more in which it moves"
+            raise ValueError(f"joint {name}: {expected}, got none")
 
 
 def train(data: TrainingSet, config: FitConfig, seed: int, estimator: int | None) -> list[Tensor]:

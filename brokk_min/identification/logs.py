@@ -197,9 +197,8 @@ def _joints(path: Path, table: Table) -> tuple[str, ...]:
     for name in table:
         if name.startswith("q_") and name not in known:
             missing = "u_" + name.removeprefix("q_").removeprefix("dot_")
-            raise ValueError(
-                f"{path}: row 1: expected a column {missing} for {name}, got {list(table)}"
-            )
+            expected = f"expected a column {missing} for {name}"
+            raise ValueError(f"{path}: row 1: {expected}, got {list(table)}")
     return joints
 
 
@@ -239,15 +238,12 @@ def _gaps(path: Path, run: str, rows: Sequence[int], time: Floats, rate: float) 
     step = np.diff(time)
     if not (step > 0).all():
         late = int(np.argmin(step > 0)) + 1
-        raise ValueError(
-            f"{path}: row {rows[late] + 2}, column time: expected later than {time[late - 1]} "
-            f"within run {run!r}, got {time[late]}"
-        )
+        expected = f"expected later than {time[late - 1]} within run {run!r}"
+        raise ValueError(f"{path}: row {rows[late] + 2}, column time: {expected}, got {time[late]}")
     if len(step) and np.median(step) > 1.05 / rate:
-        raise ValueError(
-            f"{path}: row {rows[0] + 2}, column time: expected {rate:g} Hz or more in run "
-            f"{run!r}, got {1 / np.median(step):.3g} Hz"
-        )
+        expected = f"expected {rate:g} Hz or more in run {run!r}"
+        got = f"got {1 / np.median(step):.3g} Hz"
+        raise ValueError(f"{path}: row {rows[0] + 2}, column time: {expected}, {got}")
     return np.flatnonzero(step > MAX_GAP) + 1
 
 

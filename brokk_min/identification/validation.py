@@ -61,15 +61,13 @@ def _warnings(joints: dict[str, Any]) -> list[str]:
             error = run["velocity_rmse"]
             reference = scores["linear"]["free_run"][horizon]["velocity_rmse"]
             if error >= reference:
-                warnings.append(
-                    f"{name}: the error of a free run of {horizon} s is {error:.4f} rad/s, that of "
-                    f"a linear model {reference:.4f}: the net is no better"
-                )
+                of_net = f"the error of a free run of {horizon} s is {error:.4f} rad/s"
+                of_linear = f"that of a linear model {reference:.4f}"
+                warnings.append(f"{name}: {of_net}, {of_linear}: the net is no better")
         for kind, fraction in scores["outside"].items():
             if fraction > ALLOWED_OUTSIDE:
-                warnings.append(
-                    f"{name}: {kind} outside the training's range in {fraction:.0%} of the test"
-                )
+                where = f"outside the training's range in {fraction:.0%} of the test"
+                warnings.append(f"{name}: {kind} {where}")
     return warnings
 
 
@@ -359,8 +357,7 @@ def response_times(angles: Array, rate: float) -> Array:
     at = np.maximum(np.argmax(rise >= RISE, axis=0), 1)  # row k: the tick k - 1 after the step
     high = np.take_along_axis(rise, at[None], axis=0)[0]
     low = np.take_along_axis(rise, at[None] - 1, axis=0)[0]
-    times: Array = (at - 0.5 - (high - RISE) / (high - low)) / rate
-    return times
+    return np.asarray((at - 0.5 - (high - RISE) / (high - low)) / rate)
 
 
 def named_times(times: Array, joints: Sequence[str]) -> dict[str, Any]:

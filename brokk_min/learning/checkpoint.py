@@ -18,7 +18,7 @@ from tqdm import tqdm
 from brokk_min import ppo
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import State, TaskConfig, observation_scale
-from brokk_min.identification.files import expect_same, expected, require, whole_file
+from brokk_min.identification.files import expect_same, expected, require, whole_file, write_csv
 from brokk_min.identification.net_file import fingerprint
 from brokk_min.learning.episodes import paper_weights
 from brokk_min.learning.gym_env import TaskVectorEnv
@@ -185,10 +185,7 @@ class TrainingLog:
 
     def write_curve(self) -> None:
         """Write the curve whole."""
-        with whole_file(self.curve, "w") as file:
-            writer = csv.DictWriter(file, self.rows[0].keys(), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(self.rows)
+        write_csv(self.curve, self.rows[0], [row.values() for row in self.rows])
 
     def close(self) -> None:
         """Close the files of TensorBoard."""
