@@ -42,7 +42,6 @@ def sweep(
     files, `starts` the number of poses from which each scored sequence begins, `scheduler` the
     address of a dask scheduler (None: this machine), `gains` a file of tuned baselines, for
     further rows. Returns the `table` of the seeds that came to their end, and of the baselines.
-
     ValueError: with the seeds that failed and why, after all others are written.
     """
     out.mkdir(parents=True, exist_ok=True)

@@ -47,7 +47,6 @@ def fit(
 
     `seed` repeats the nets to the bit on one computer; `velocity_samples` is the window of the
     estimator that made the velocities of `log`; `machine` is a name, for the file.
-
     ValueError: a joint that never moves long enough, or weights that are not finite at the end.
     """
     config = replace(config, dead_zone=config.dead_zone or 0.0)

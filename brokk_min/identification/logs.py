@@ -155,7 +155,6 @@ def read_log(
 
     `velocity_samples` is the window of `estimate_velocity`; `joints` are the names and order of the
     joints (None: all, in the order of the first file).
-
     ValueError: with file, row (1 is the header) and column of the first error.
     """
     names = tuple(joints or ())

@@ -71,9 +71,6 @@ def _warnings(joints: dict[str, Any]) -> list[str]:
     return warnings
 
 
-# --- free runs ------------------------------------------------------------------------------------
-
-
 def free_run_step(net: ActuatorNet, history: Array, q: Array, u: Array) -> tuple[Array, Array]:
     """History and angles [rad] after a tick under `u`; no joint leaves the training's range."""
     velocity = net.predict(append_command(history, u))
@@ -123,7 +120,6 @@ def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
     `join_recordings`), `persistence_rmse` that of the newest velocity in the history. Free runs
     start every `horizon` seconds: `velocity_rmse` is over all samples, `position_error_median` over
     their ends.
-
     ValueError: other joints, rate or kind of velocity than the nets', or no recording long enough.
     """
     for name in ("joints", "rate", "velocity_logged"):
@@ -203,9 +199,6 @@ def tool_errors(machine: Machine, net: ActuatorNet, test: Log) -> dict[str, floa
     return result
 
 
-# --- the linear reference and the range of the training -------------------------------------------
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LinearNet(ActuatorNet):
     """A linear model x w + b of the standardised inputs x; its output has the nets' range."""
@@ -278,9 +271,6 @@ def _signals(log: Log, history: int) -> dict[str, list[Array]]:
         kind: [column[moving] for column, moving in zip(values.T, moves, strict=True)]
         for kind, values in kinds.items()
     }
-
-
-# --- step responses -------------------------------------------------------------------------------
 
 
 def plant_simulator(machine: Machine) -> Simulator:

@@ -66,7 +66,6 @@ def train_policy(
     `critic`: advantages by a critic (always with `task.paper`), not by the nets' derivatives.
     `resume`: continue from the checkpoint; the result is the same as without interruption.
     `tensorboard`: folder for the scalars of the curve (needs the extra `tensorboard`).
-
     ValueError: settings that do not fit, a checkpoint of another training, or a number that is not
     finite. OSError: a file that cannot be written. The last checkpoint stays.
     """

@@ -39,7 +39,6 @@ def run_seed(
 
     `evaluate` gives the figures of a policy; `about` is what decides them, for the header of the
     result. The other arguments are those of `train_policy`.
-
     ValueError: a result of another training or evaluation.
     """
     policy_file = out / f"seed_{seed}.npz"
