@@ -39,16 +39,19 @@ def validate(
     """Scores of nets fitted to `log` on unseen recordings `test`, as in the fit JSON.
 
     Each joint: `score` of the nets and, as `linear`, of a linear model; `creep` [rad/s];
-    `outside` as in `outside_training`. `tool`: `tool_errors` of a known machine [m].
+    `response_time` of the nets and `machine_response_time` of a known machine [s]; `outside` as in
+    `outside_training`. `tool`: `tool_errors` of a known machine [m].
     """
     joints = score(net, test)
     linear = score(fit_linear(net, log), test)
     speed = creep(net)
     outside = outside_training(log, test, net.history)
+    times = log_response_times(net, log, machine)
     for j, name in enumerate(net.joints):
         joints[name]["linear"] = linear[name]
         joints[name]["creep"] = float(speed[j])
         joints[name]["outside"] = {kind: float(fraction[j]) for kind, fraction in outside.items()}
+        joints[name] |= {kind: of_joint[name] for kind, of_joint in times.items()}
     tool = tool_errors(machine, net, test) if machine else {}
     return {"joints": joints, "tool": tool, "warnings": _warnings(joints)}
 
@@ -350,6 +353,20 @@ def response_times(angles: Array, rate: float) -> Array:
     return np.asarray((at - 0.5 - (high - RISE) / (high - low)) / rate)
 
 
+def step_commands(
+    simulate: Simulator, q_low: Array, q_high: Array, level: Array, wait: int
+) -> Array:
+    """Commands (n,) half way to `level` from the least tenth of it that moves a joint."""
+    fractions = np.arange(1, 11) / 10
+    speeds = []
+    for fraction in fractions:
+        command = fraction * level
+        velocity = step_velocity(steps(simulate, q_low, q_high, command, command, wait), 1.0)
+        speeds.append(velocity[wait:, 0].max(axis=0).min(axis=0))  # (n,)
+    moves = np.array(speeds) > 0.05 * speeds[-1]
+    return np.asarray((fractions[np.argmax(moves, axis=0)] + 1) / 2 * level)
+
+
 def named_times(times: Array, joints: Sequence[str]) -> dict[str, Any]:
     """Response times for JSON: {joint: {"idle": {"up", "down"}, "moving": {...}}} [s or None]."""
     result: dict[str, Any] = {}
@@ -358,4 +375,22 @@ def named_times(times: Array, joints: Sequence[str]) -> dict[str, Any]:
         for kind, row in zip(("idle", "moving"), times[..., j], strict=True):
             up, down = (None if np.isnan(time) else float(time) for time in row)
             result[name][kind] = {"up": up, "down": down}
+    return result
+
+
+def log_response_times(
+    net: ActuatorNet, log: Log, machine: Machine | None
+) -> dict[str, dict[str, Any]]:
+    """`named_times` to the largest command of a log, of the nets and of a known machine."""
+    level = np.abs(np.concatenate([recording.u for recording in log.recordings])).max(axis=0)
+    wait = max(round(1.5 * net.rate), 2 * net.history)
+    simulators = {"response_time": net_simulator(net)}
+    if machine:
+        simulators["machine_response_time"] = plant_simulator(machine)
+    low, high = net.q_low, net.q_high
+    before = step_commands(simulators["response_time"], low, high, level, wait)
+    result = {}
+    for name, simulate in simulators.items():
+        angles = steps(simulate, low, high, level, before, wait)
+        result[name] = named_times(response_times(angles, net.rate), net.joints)
     return result

@@ -83,7 +83,7 @@ def test_fit__has_the_papers_recipe_as_one_option(tmp_path: Path) -> None:
     assert (settings["noise"], settings["rollout"], settings["steps"]) == (0, 1, 3)
     scores = json.loads((tmp_path / "f.json").read_text())
     assert set(scores) == {"meta", "joints", "tool", "warnings"}
-    keys = "one_step_rmse persistence_rmse free_run linear creep outside"
+    keys = "one_step_rmse persistence_rmse free_run linear creep response_time outside"
     assert all(set(joint) == set(keys.split()) for joint in scores["joints"].values())
 
 
