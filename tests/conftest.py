@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 
+import pytest
+import torch
 from hypothesis import HealthCheck, settings
 
 import brokk_min  # noqa: F401, before NumPy: it settles how many threads that takes
@@ -16,3 +18,9 @@ settings.register_profile(
 )
 settings.register_profile("deep", settings.get_profile("dev"), max_examples=1000)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """Small nets are fitted fastest on one thread."""
+    torch.set_num_threads(1)

@@ -9,7 +9,7 @@ import struct
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -70,10 +70,9 @@ class Bus:
         self.echoes: deque[tuple[int, bytes]] = deque(maxlen=64 if self.echo else 0)
         self.unwritten: deque[Any] = deque()  # messages for the log
         self.message = require("can", "hw").Message
-        try:
+        self.file = -1
+        with suppress(NotImplementedError):
             self.file = self.bus.fileno()
-        except NotImplementedError:
-            self.file = -1
 
     def now(self) -> float:
         """Time of day at the start plus monotonic time since [s], in whole microseconds."""
@@ -82,7 +81,12 @@ class Bus:
     def recv(self, timeout: float, busy_wait: float = 0.0) -> Frame | None:
         """The next frame within `timeout` [s], or None; it sleeps only after `busy_wait` [s]."""
         if self.file >= 0 and timeout > 0:  # python-can's own timeout follows the time of day
-            self._wait(timeout, busy_wait)
+            start = self.clock()
+            elapsed = 0.0
+            while elapsed < timeout and not select.select([self.file], [], [], 0)[0]:
+                if elapsed >= busy_wait:
+                    select.select([self.file], [], [], timeout - elapsed)
+                elapsed = self.clock() - start
             timeout = 0.0
         message = self.bus.recv(timeout)
         if message is None:
@@ -94,15 +98,6 @@ class Bus:
             return Frame(now, -1, data)
         self._log(message, now, self.name)
         return Frame(now, standard_id(message), data)
-
-    def _wait(self, timeout: float, busy_wait: float) -> None:
-        """Until there is something to read, or the time is over."""
-        start = self.clock()
-        elapsed = 0.0
-        while elapsed < timeout and not select.select([self.file], [], [], 0)[0]:
-            if elapsed >= busy_wait:
-                select.select([self.file], [], [], timeout - elapsed)
-            elapsed = self.clock() - start
 
     def send(self, can_id: int, data: bytes) -> None:
         """Send one frame, once; never periodically: the kernel would go on after a hang."""
@@ -247,19 +242,16 @@ def sdo(
 
     ValueError: the node refuses or does not answer.
     """
-    index, sub = address
-    request = struct.pack("<BHBI", 0x40, index, sub, 0)
-    if value is not None:
-        request = struct.pack("<BHBI", 0x23 | (4 - size) << 2, index, sub, value)
-    where = f"node {node}: object 0x{index:04X}:{sub:02X}: expected an answer"
+    command = 0x40 if value is None else 0x23 | (4 - size) << 2
+    request = struct.pack("<BHBI", command, *address, value or 0)
+    where = "node {}: object 0x{:04X}:{:02X}: expected an answer".format(node, *address)
     bus.send(SDO_REQUEST + node, request)
     end = bus.now() + SDO_TIMEOUT
     while bus.now() < end and (frame := bus.recv(max(0.0, end - bus.now()))):
-        if frame.id != SDO_ANSWER + node or len(frame.data) != 8:
+        other = frame.id != SDO_ANSWER + node or frame.data[1:4] != request[1:4]
+        if other or len(frame.data) != 8:
             continue
-        command, *multiplexer, answer = struct.unpack("<B3BI", frame.data)
-        if bytes(multiplexer) != request[1:4]:
-            continue
+        command, answer = struct.unpack("<B3xI", frame.data)
         if command == 0x80:
             raise ValueError(f"{where}, got SDO abort 0x{answer:08X}")
         unused = command >> 2 & 3  # of four bytes
@@ -268,13 +260,7 @@ def sdo(
 
 
 def encoder_counts(machine: Machine, raw: ArrayLike) -> Array:
-    """Joint angles [counts] from raw positions (..., n): masked, zeroed, unwrapped about mid range.
-
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> encoder_counts(BROKK_170, [2**26 - 1, 4095, 4096 + 7, 1000, 0])
-        array([  -1,   -1,    7, 1000,    0])
-    """
+    """Joint angles [counts] of raw positions (..., n): masked, zeroed, unwrapped at mid range."""
     turn = 2**machine.encoder_bits
     zero, sign = (machine.column(name).astype(int) for name in ("encoder_zero", "encoder_sign"))
     middle = (machine.column("q_min") + machine.column("q_max")) / 2
@@ -297,12 +283,7 @@ for _ in range(8):
 
 
 def checksum(frame: ArrayLike) -> Array:
-    """CRC-8 SAE J1850 of bytes (..., k), (...): polynomial 0x1D, start and final XOR 0xFF.
-
-    Example:
-        >>> hex(checksum(list(b"123456789")))
-        '0x4b'
-    """
+    """CRC-8 SAE J1850 of bytes (..., k), (...): polynomial 0x1D, start and final XOR 0xFF."""
     crc: Array = np.array(0xFF)
     for byte in np.moveaxis(np.asarray(frame, np.uint8), -1, 0):
         crc = CRC_TABLE[crc ^ byte]
@@ -342,11 +323,6 @@ Operator = Callable[[bool, bool], OperatorInput]  # does the gate drive, is it r
 
 
 def unpack_operator_input(data: bytes) -> OperatorInput:
-    """The inverse of `OperatorInput.pack`.
-
-    Example:
-        >>> unpack_operator_input(OperatorInput((0.1, 0.0, -0.25), enable=True).pack())
-        OperatorInput(v_goal=(0.1, 0.0, -0.25), enable=True, alive=True, stop=False, error=False)
-    """
+    """The inverse of `OperatorInput.pack`."""
     x, y, z, flags = struct.unpack("<hhhB", data)
     return OperatorInput((x / 1e4, y / 1e4, z / 1e4), *(bool(flags & 1 << i) for i in range(4)))

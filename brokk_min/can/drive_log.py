@@ -97,7 +97,7 @@ def replay(machine: Machine, controller: Controller, frames: Sequence[Frame]) ->
 
     ValueError: another program made the log.
     """
-    bus = ReplayedBus(list(frames))
+    bus = ReplayedBus(frames)
     drive = Drive(machine, controller, bus, bus.operator)
     drive.begin()
     while bus.more:
@@ -130,7 +130,7 @@ def log_for_fit(machine: Machine, frames: Iterable[Frame]) -> Log:
     named = []
     for number, recording in enumerate(recordings):
         if len(recording) > machine.history + 1:
-            commands, angles = map(np.array, zip(*recording, strict=True))
+            commands, angles = map(np.array, zip(*recording))
             named.append((f"drive_{number:03d}", commands, angles))
     if not named:
         raise ValueError(

@@ -38,7 +38,7 @@ class Script:
     def __call__(self, driving: bool, ready: bool) -> OperatorInput:
         """Stops at the end, after a fault, or if the machine never gets ready."""
         if driving and not self.done:
-            x, y, z = map(float, self.goals[self.tick])
+            x, y, z = self.goals[self.tick].tolist()
             self.tick += 1
             return OperatorInput((x, y, z), enable=True)
         if driving or self.tick or not self.patience:
@@ -80,10 +80,8 @@ class Joystick:
         num_axes = self.stick.get_numaxes()
         num_buttons = self.stick.get_numbuttons()
         if max(axes) >= num_axes or button >= num_buttons:
-            raise ValueError(
-                f"joystick: expected axes {list(axes)} and button {button}, "
-                f"got {num_axes} and {num_buttons}"
-            )
+            expected = f"expected axes {list(axes)} and button {button}"
+            raise ValueError(f"joystick: {expected}, got {num_axes} and {num_buttons}")
 
     def __call__(self, driving: bool, ready: bool) -> OperatorInput:
         """Velocity and switch; a device that is gone reads zero, so its removal is an event."""
@@ -96,19 +94,13 @@ class Joystick:
         if not self.stick:
             return OperatorInput(alive=False)
         deflection = -shape_axis([self.stick.get_axis(i) for i in self.axes])
-        x, y, z = map(
-            float, self.speed * deflection / max(1.0, float(np.linalg.norm(deflection, axis=-1)))
-        )
+        length = max(1.0, float(np.linalg.norm(deflection)))
+        x, y, z = (self.speed * deflection / length).tolist()
         return OperatorInput((x, y, z), enable=bool(self.stick.get_button(self.button)))
 
 
 def shape_axis(axis: ArrayLike) -> Array:
-    """Deflection in [-1, 1]: dead zone of 12 %, beyond it (1 - 0.6) s + 0.6 s^3 (assumed).
-
-    Example:
-        >>> shape_axis([-1.0, 0.1, 0.56, 1.0])
-        array([-1.   ,  0.   ,  0.275,  1.   ])
-    """
+    """Deflection in [-1, 1]: dead zone of 12 %, beyond it (1 - 0.6) s + 0.6 s^3 (assumed)."""
     axis = np.asarray(axis, float)
     s = np.sign(axis) * np.maximum(0.0, np.abs(axis) - 0.12) / (1 - 0.12)
     return np.asarray((1 - 0.6) * s + 0.6 * s**3)

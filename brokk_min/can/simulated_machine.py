@@ -114,12 +114,9 @@ class SimulatedMachine:
 
     def _positions(self) -> Frames:
         counts = np.rint(self.plant.q / self.machine.encoder_step).astype(int)
-        pairs = zip(self.encoders, encoder_raw(self.machine, counts).tolist(), strict=True)
-        return [
-            (canopen.TPDO1 + node, struct.pack("<I", raw))
-            for node, raw in pairs
-            if self.nmt[node] == OPERATIONAL
-        ]
+        raw = encoder_raw(self.machine, counts).astype("<u4")
+        pairs = zip(self.encoders, raw)
+        return [(canopen.TPDO1 + i, x.tobytes()) for i, x in pairs if self.nmt[i] == OPERATIONAL]
 
     def _on_nmt(self, command: int, node: int) -> Frames:
         states = {1: OPERATIONAL, 2: STOPPED} | dict.fromkeys((128, 129, 130), PRE_OPERATIONAL)

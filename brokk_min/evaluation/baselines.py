@@ -55,9 +55,6 @@ def baselines(machine: Machine, net: ActuatorNet) -> dict[str, JacobianControlle
     }
 
 
-# --- gains ----------------------------------------------------------------------------------------
-
-
 def make_gains(machine: Machine, **gains: ArrayLike) -> Gains:
     """Gains by the names of `RANGES`; one number stands for all joints.
 
@@ -98,9 +95,6 @@ def gains_at_bound(controller: JacobianController) -> list[str]:
     names += ["feedback", "min_opening"]
     fraction = (gains_vector(controller.gains) - low) / (high - low)
     return [name for name, x in zip(names, fraction, strict=True) if not 0.01 < x < 0.99]
-
-
-# --- tuning ---------------------------------------------------------------------------------------
 
 
 def tune_baselines(
@@ -172,9 +166,6 @@ def tune(
         bounds = Bounds(low, high)
         result = differential_evolution(objective, bounds, callback=record, **options)
     return replace(controller, gains=split_vector(result.x)), costs
-
-
-# --- files ----------------------------------------------------------------------------------------
 
 
 def gains_table(controllers: Mapping[str, JacobianController]) -> dict[str, dict[str, list[float]]]:

@@ -29,8 +29,7 @@ from brokk_min.jacobian import JacobianController, manipulability
 from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.machine import Array, Machine
 
-FILE = Path(__file__).with_name("claims.toml")
-TEXTS: dict[str, dict[str, Any]] = tomllib.loads(FILE.read_text(encoding="utf-8"))
+TEXTS: dict[str, dict[str, Any]] = tomllib.loads(Path(__file__).with_suffix(".toml").read_text())
 STRONG, WEAK = PAPER_BASELINES  # damping
 VERDICTS = {True: "holds here", False: "does not hold here", None: "was not measured"}
 
@@ -94,9 +93,6 @@ def _both(one: bool | None, other: bool | None) -> bool | None:
     return None if one is None or other is None else one and other
 
 
-# --- machine, nets, training ----------------------------------------------------------------------
-
-
 def net_claims(numbers: Mapping[str, Any]) -> list[Claim]:
     """Do machine and nets behave as the paper's? `numbers` is of `preliminary.numbers`.
 
@@ -136,9 +132,6 @@ def training_claim(seconds: float, steps: int) -> Claim:
     hours = seconds / 3600
     holds = 1 / _limit("training") < hours / 2.5 < _limit("training")
     return Claim("training", _exact({f"{steps:,} steps here": hours}), holds)
-
-
-# --- task-space control ---------------------------------------------------------------------------
 
 
 def task_claims(
@@ -246,9 +239,6 @@ def less_claim(
                 less = mean_interval(rl - by_start(runs, c, s, key))
                 numbers[f"{labels[key]} {s}, less {c}"] = less
     return Claim(name, numbers, _below(0.0, *numbers.values()))
-
-
-# --- near singularities ---------------------------------------------------------------------------
 
 
 def singular_controllers(

@@ -34,8 +34,7 @@ class StaticMap:
         slower = np.take_along_axis(curve, k - 1, axis=-1)
         faster = np.take_along_axis(curve, k, axis=-1)
         weight = np.clip((goal - slower) / np.maximum(faster - slower, 1e-6), 0, 1)
-        u: Array = self.u[k - 1] + weight * (self.u[k] - self.u[k - 1])
-        return u[..., 0]
+        return np.asarray(self.u[k - 1] + weight * (self.u[k] - self.u[k - 1]))[..., 0]
 
 
 def static_map(machine: Machine, net: ActuatorNet) -> StaticMap:

@@ -98,9 +98,6 @@ def _time_panels(dt: float, labels: Sequence[str], curves: Mapping[str, Array]) 
     return panels
 
 
-# --- preliminary tests ----------------------------------------------------------------------------
-
-
 def plot_tests(machine: Machine, tests: Mapping[str, SimulatorTests]) -> Figure:
     """Range and direction, coupling, and past movement; machine above nets. Paper: Fig. 2"""
     name = machine.names[machine.driven[-1]]
@@ -133,9 +130,6 @@ def plot_gap(machine: Machine, gap: Motion) -> Figure:
         curves = {name: (time, values[:, 0, i]) for i, name in enumerate(columns)}
         panels.append(Panel("nets - machine", "time [s]", label, curves))
     return plot_panels([panels[:2], panels[2:]])
-
-
-# --- nets and training ----------------------------------------------------------------------------
 
 
 def plot_free_run(net: ActuatorNet, log: Log) -> Figure:
@@ -178,9 +172,6 @@ def plot_learning(curve: Path) -> Figure:
     xlabel = "environment steps [million]"
     panels = [Panel("", xlabel, label, {"rl": (steps, table[k])}) for k, label in labels.items()]
     return plot_panels([panels])
-
-
-# --- task-space control ---------------------------------------------------------------------------
 
 
 def plot_starts(machine: Machine, starts: Array, kinds: Sequence[str]) -> Figure:

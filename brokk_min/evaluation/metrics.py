@@ -29,9 +29,7 @@ LABELS = ("controller", "sequence", "start", "kind")
 CHANGE = 0.05  # of tool_speed, assumed: a goal that jumps by more has changed
 TRANSIENT = 0.6  # s after a change, assumed: as long as the policy's history
 BAND = 0.1  # of tool_speed, assumed: the tool has settled while its error stays below this,
-BAND_OF_CHANGE = (
-    0.5  # and below this fraction of the change, assumed: or standstill meets slow goals
-)
+BAND_OF_CHANGE = 0.5  # and this fraction of the change, assumed: or standstill meets slow goals
 AT_LIMIT = 0.01  # rad, assumed: a joint so near an end of its range is at its limit
 
 
@@ -70,11 +68,8 @@ def line_distance(p_tool: Array, goals: Array, start: Array) -> Array:
 
     The line starts where the tool was when the goal's direction last changed (to stop or to go
     back along the line is no change). On a curve the direction changes at every tick.
-
-    Args:
-        p_tool: tool position at the end of each tick [m], (T, num, 3).
-        goals: goal velocity during each tick [m/s], (T, num, 3).
-        start: tool position before the first tick [m], (num, 3).
+    `p_tool` are positions at the end of each tick [m] (T, num, 3), `goals` as in `metrics`, `start`
+    positions before the first tick [m] (num, 3).
     """
     origin = start  # of the line
     direction = np.zeros_like(start)  # of the line; 0 before the first motion
@@ -135,9 +130,6 @@ def row_mean(values: Array) -> Array:
     return _mean(np.nan_to_num(values).T, np.isfinite(values).T)
 
 
-# --- runs of all controllers ----------------------------------------------------------------------
-
-
 def evaluate(
     machine: Machine,
     controllers: Controllers,
@@ -149,17 +141,9 @@ def evaluate(
 ) -> tuple[Rows, Traces]:
     """Run every controller on the same sequences, starts and noise. Paper: Sec. 4.2, Fig. 6
 
-    Args:
-        machine: n joints.
-        controllers: by name.
-        sequences: goals of the tool velocity; those of one length and all starts are one batch.
-        starts: angles [rad], (starts, n).
-        seed: of the noise, the same for all.
-        net: nets of the driven joints; None: the analytic plant.
-        sensor: makes the encoders of each rollout.
-
-    Returns:
-        One row per controller, sequence and start, see `metrics`; and the traces.
+    `starts` are angles [rad] (starts, n); all starts and all sequences of one length are a batch.
+    `net` has the nets of the driven joints (None: the analytic plant), `sensor` makes the encoders
+    of each rollout. Returns one row per controller, sequence and start, see `metrics`; and traces.
     """
     num = len(starts)
     kinds = start_kinds(machine, starts)
@@ -204,9 +188,6 @@ def metadata(machine: Machine, seed: int) -> dict[str, Any]:
         "seed": seed,
         "units": "m, m/s, s, rad",
     }
-
-
-# --- over many runs -------------------------------------------------------------------------------
 
 
 def by_start(runs: Sequence[Run], controller: str, sequence: str, key: str) -> Array:

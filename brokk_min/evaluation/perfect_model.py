@@ -45,9 +45,7 @@ class PerfectModel:
     dither: float = 0.04  # valve opening (tuned)
 
     def start(self, num: int) -> Plan:
-        """The plant at rest at `poses`, valves closed; ValueError: no multiple of their number."""
-        if num % len(self.poses):
-            raise ValueError(f"poses: expected {num} or a part of it, got {len(self.poses)}")
+        """The plant at rest at `poses`, valves closed; `num` is a multiple of their number."""
         q = np.tile(self.poses, (num // len(self.poses), 1))
         closed = np.zeros((num, sum(BLOCKS), len(self.machine.driven)))
         return Plan(plant_reset(self.machine, q), closed, 0)
@@ -132,8 +130,7 @@ class PerfectModel:
         u[:, :, 0, m.driven] = np.where(up, np.ceil(counts), np.floor(counts)) / PWM_MAX
         u[:, :, 0] = limit_command(m, u[:, :, 0])
         cost = np.linalg.norm(self.errors(plant, u, goal), axis=-1).mean(axis=-1)
-        best: Array = u[np.arange(len(u)), cost.argmin(axis=1), 0]
-        return best
+        return np.asarray(u[np.arange(len(u)), cost.argmin(axis=1), 0])
 
 
 def steady_opening(machine: Machine, q: Array, goal: Array) -> Array:
@@ -145,8 +142,7 @@ def steady_opening(machine: Machine, q: Array, goal: Array) -> Array:
     q_dot[:, driven] = (J_inv @ goal[..., None])[..., 0]
     v = q_dot * lever_arm(machine, q)  # of the cylinders [m/s]
     K = np.where(v > 0, machine.column("speed_positive"), machine.column("speed_negative"))
-    opening: Array = (v / K)[:, driven]
-    return opening
+    return np.asarray((v / K)[:, driven])
 
 
 def perfect_models(machine: Machine, starts: Array) -> dict[str, PerfectModel]:

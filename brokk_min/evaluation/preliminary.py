@@ -90,7 +90,6 @@ def preliminary_tests(machine: Machine, simulate: Simulator) -> SimulatorTests:
     u[4] += other_commands(machine, joint)
     *alone, together = sweeps(machine, simulate, joint, u)
     names = [f"u = {encode_pwm(level)}" for level in u[:4, joint]]
-
     low, high = machine.column("q_min"), machine.column("q_max")
     level = np.full(machine.n, limit)
     before = (level + machine.dead_zone) / 2
@@ -154,9 +153,6 @@ def _motion(machine: Machine, q: Array) -> Motion:
     return Motion(
         q[1:], np.diff(q, axis=0) * machine.rate, p[1:], np.diff(p, axis=0) * machine.rate
     )
-
-
-# --- as numbers -----------------------------------------------------------------------------------
 
 
 def numbers(machine: Machine, measured: Preliminary) -> dict[str, Any]:

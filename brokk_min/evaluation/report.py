@@ -37,7 +37,6 @@ UNITS = {
     "valve": "full strokes",
     "reward": "1",
 }  # of the figures of merit, by their first word
-INTERVALS = "95 % intervals over starts in brackets"
 
 
 class Shown(NamedTuple):
@@ -118,9 +117,7 @@ def render(
     folder = Path(__file__).parent
     page = Environment(loader=FileSystemLoader(folder), autoescape=True, undefined=StrictUndefined)
     page.filters["interval"] = interval_text
-    page.filters["label"] = label
-    page.filters["transpose"] = transpose
-    page.filters["with_intervals"] = with_intervals
+    page.filters.update(label=label, transpose=transpose, with_intervals=with_intervals)
     training = training_claim(clock["train"], results["meta"]["effort"]["train_steps"])
     sequences = {}
     for sequence in task_sequences(machine):
@@ -131,14 +128,11 @@ def render(
         images=images,
         clock=clock,
         verdicts=VERDICTS,
-        intervals=INTERVALS,
+        intervals="95 % intervals over starts in brackets",
         joints=machine.names,
         sequences=sequences,
         tuning_paths=[path_row(np.array(run["goals"])) for run in results["tuning_runs"]],
     )
-
-
-# --- cells and tables -----------------------------------------------------------------------------
 
 
 def interval_text(number: Mean) -> str:

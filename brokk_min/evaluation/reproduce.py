@@ -98,9 +98,6 @@ def _stage(clock: dict[str, float], bar: Any, name: str) -> Iterator[None]:
     bar.update()
 
 
-# --- logs and nets --------------------------------------------------------------------------------
-
-
 def record(machine: Machine, out: Path, budget: Budget, seed: int) -> list[Log]:
     """Logs to fit nets to and to score them on, written and read back as a user's."""
     out.mkdir(parents=True, exist_ok=True)
@@ -136,9 +133,6 @@ def paper_recipe(
     return {"test": validation.score(net, test), "sim_to_real": gap}
 
 
-# --- measurements ---------------------------------------------------------------------------------
-
-
 def measure(
     machine: Machine,
     net: ActuatorNet,
@@ -158,13 +152,9 @@ def measure(
     measured = preliminary.run(machine, net, seed)
     numbers = preliminary.numbers(machine, measured)
     meta = metrics.metadata(machine, seed) | baselines.gains_metadata(machine, policy.net)
-    actuator = {
-        "test": validation.score(net, test),
-        "driven_by_policy": validation.score(net, driven_log(machine, task, "rl")),
-    }
     results = {
         "meta": meta | {"effort": asdict(budget)},
-        "actuator": actuator,
+        "actuator": {"test": validation.score(net, test)},
         "preliminary": numbers,
         "net_claims": [claim.to_json() for claim in claims.net_claims(numbers)],
         "gains": baselines.gains_table(pids),
@@ -189,10 +179,9 @@ def compare(
     reachable = starts[workspace]
     runs, traces = evaluate(machine, controllers, commands, starts, seed)
     scored = [run for run in runs if run["kind"] == "workspace"]
-    damped = claims.singular_controllers(rl, pids)
     extended = starts[kinds == "extended"]
     singular, near, near_traces = near_singularities(
-        machine, damped, extended, budget.short_s, seed
+        machine, claims.singular_controllers(rl, pids), extended, budget.short_s, seed
     )
     along_x = {c: Trace(*(array[:, workspace] for array in traces[c, "x"])) for c in pids}
     every = claims.task_claims(machine, pids, scored, along_x, commands[0].goals, near)
@@ -240,10 +229,8 @@ def regret(
     """Mean errors, and velocity errors less that of a controller that knows the plant."""
     every = {**controllers, **perfect_models(machine, starts)}
     runs, _ = evaluate(machine, every, commands, starts, seed)
-    less = {}
-    for name in controllers:
-        error = "velocity_error_mean"
-        less[name] = metrics.paired_difference(runs, name, "perfect_model", error)
+    error = "velocity_error_mean"
+    less = {c: metrics.paired_difference(runs, c, "perfect_model", error) for c in controllers}
     return {"summary": summary(runs), "less_perfect_model": less}
 
 
@@ -263,11 +250,10 @@ def near_singularities(
     J = jacobian(forward_kinematics(machine, starts))[..., machine.driven]
     speed = {}
     for name in controllers:
-        fractions = []
-        for sequence in commands:
-            goals = sequence.for_starts(len(starts))
-            trace = traces[name, sequence.name]
-            fractions.append(claims.speed_fraction(machine, w0, trace, goals))
+        fractions = [
+            claims.speed_fraction(machine, w0, traces[name, s.name], s.for_starts(len(starts)))
+            for s in commands
+        ]
         speed[name] = metrics.row_mean(np.stack(fractions, axis=1))
     singular = claims.singular_claims(runs, speed)
     results = {
@@ -280,16 +266,6 @@ def near_singularities(
     return results, singular, traces
 
 
-def driven_log(machine: Machine, traces: Traces, controller: str) -> Log:
-    """Commands and encoder angles of a controller's first 16 runs of each sequence."""
-    recordings = []
-    for (name, sequence), trace in traces.items():
-        for i in range(min(16, trace.q.shape[1]) if name == controller else 0):
-            run = (trace.u[:, i].astype(float), trace.q_measured[:, i].astype(float))
-            recordings.append((f"{controller}_{sequence}_{i:02d}", *run))
-    return logs.machine_log(machine, recordings)
-
-
 def tuning_runs(machine: Machine, num: int, seed: int) -> list[dict[str, Any]]:
     """Each run on which the baselines were tuned: "start" [rad] and "goals", see `hold_table`."""
     starts, goals = sequences.tuning_set(machine, num, seed)
@@ -298,9 +274,6 @@ def tuning_runs(machine: Machine, num: int, seed: int) -> list[dict[str, Any]]:
         table = sequences.hold_table(machine, goals[:, i])
         runs.append({"start": start.tolist(), "goals": table.tolist()})
     return runs
-
-
-# --- files ----------------------------------------------------------------------------------------
 
 
 def write(out: Path, results: Mapping[str, Any], policy: Policy, pids: Pids) -> None:

@@ -20,11 +20,6 @@ from brokk_min.machine import Array, Machine, read_encoder, valve_opening
 Sensor = Callable[[np.random.Generator], Encoder]  # makes the encoders of one rollout
 
 
-def exact_encoder(rng: np.random.Generator) -> Encoder:
-    """Encoders as they are: whole counts."""
-    return read_encoder
-
-
 def noisy_encoder(rng: np.random.Generator) -> Encoder:
     """Encoders with normal noise of one count."""
 
@@ -75,22 +70,18 @@ def variations(machine: Machine) -> dict[str, tuple[Machine, Sensor]]:
     }
     result: dict[str, tuple[Machine, Sensor]] = {}
     for name, varied in machines.items():
-        result[name] = (varied, exact_encoder)
+        result[name] = (varied, lambda rng: read_encoder)
     result["encoder noise of a count"] = (machine, noisy_encoder)
     result["one sample in 20 lost"] = (machine, lossy_encoder)
     return result
 
 
 def pump_flow_ratio(machine: Machine, u: Array) -> Array:
-    """Flow that commands (..., n) demand once spools follow, over the pump's flow, (...).
-
-    Paper: Sec. 4.2
-    """
+    """Flow that commands (..., n) demand, over the pump's flow, (...). Paper: Sec. 4.2"""
     opening = valve_opening(u, machine.dead_zone)
     K = np.where(opening > 0, machine.column("speed_positive"), machine.column("speed_negative"))
     flow = np.abs(machine.column("cylinder_area") * K * opening).sum(axis=-1)  # sum |A v*|
-    ratio: Array = flow / machine.pump_flow
-    return ratio
+    return np.asarray(flow / machine.pump_flow)
 
 
 def robustness(
@@ -105,6 +96,7 @@ def robustness(
     Also "supply_demand", the largest `pump_flow_ratio`; "supply_limits", the fraction of ticks
     at which it is above 1; "rl_less", the policy's error less a baseline's on the same starts.
     """
+    error = "velocity_error_mean"
     result: dict[str, dict[str, dict[str, Any]]] = {}
     for name, (plant, sensor) in variations(machine).items():
         runs, traces = evaluate(plant, controllers, sequences, starts, seed, sensor=sensor)
@@ -112,14 +104,10 @@ def robustness(
         for controller in controllers:
             u = np.array([traces[controller, sequence.name].u for sequence in sequences])
             ratio = pump_flow_ratio(plant, u)
-            row: dict[str, Any] = dict(
-                mean_interval(by_start(runs, controller, "all", "velocity_error_mean"))
-            )
+            row: dict[str, Any] = dict(mean_interval(by_start(runs, controller, "all", error)))
             row["supply_demand"] = float(ratio.max())
             row["supply_limits"] = float((ratio > 1).mean())
             if "rl" in controllers and controller != "rl":
-                row["rl_less"] = paired_difference(runs, "rl", controller, "velocity_error_mean")[
-                    "all"
-                ]
+                row["rl_less"] = paired_difference(runs, "rl", controller, error)["all"]
             result[name][controller] = row
     return result

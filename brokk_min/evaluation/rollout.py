@@ -1,7 +1,5 @@
 """A controller follows given tool velocities, on the analytic plant or on the nets."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
 
@@ -49,15 +47,9 @@ def rollout(
 ) -> Trace:
     """Let one controller follow given goals from rest: on the plant, or on nets. Paper: Fig. 3
 
-    Args:
-        machine: n joints.
-        controller: gets measurements with noise.
-        start: angles [rad], (num, n).
-        goals: goal velocity of the tool during each tick [m/s], (T, num, 3).
-        config: its `noise` holds; no episode ends.
-        rng: of the noise.
-        net: nets of the driven joints; None: the analytic plant.
-        read: see `transition`.
+    `start` are angles [rad] (num, n), `goals` tool velocities during each tick [m/s] (T, num, 3).
+    Of `config` the noise holds; no episode ends. `net` has the nets of the driven joints (None:
+    the analytic plant); `read`: see `transition`.
     """
     state = initial_state(machine, start, goals[0], plant=net is None)
     controller_state = controller.start(len(state.q))

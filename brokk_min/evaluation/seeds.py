@@ -38,21 +38,10 @@ def sweep(
 ) -> Table:
     """Train and evaluate `seeds`, each on one thread; all runs and the table go to `sweep.json`.
 
-    Args:
-        machine: n joints.
-        net: nets of its driven joints.
-        task: episodes.
-        config: settings of the learner.
-        seeds: of the trainings.
-        out: folder of all files.
-        starts: number of poses from which each scored sequence begins.
-        scheduler: address of a dask scheduler; None: this machine.
-        gains: file of tuned baselines, for further rows.
-        critic: see `train_policy`.
-
-    Returns:
-        `table` of the seeds that came to their end, and of the baselines.
-
+    `net`, `task`, `config` and `critic` are those of `train_policy`. `out` is the folder of all
+    files, `starts` the number of poses from which each scored sequence begins, `scheduler` the
+    address of a dask scheduler (None: this machine), `gains` a file of tuned baselines, for
+    further rows. Returns the `table` of the seeds that came to their end, and of the baselines.
     ValueError: with the seeds that failed and why, after all others are written.
     """
     out.mkdir(parents=True, exist_ok=True)

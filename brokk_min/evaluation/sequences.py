@@ -105,9 +105,6 @@ def hold_table(machine: Machine, goals: Array) -> Array:
     return np.concatenate([seconds[:, None], goals[first]], axis=1)
 
 
-# --- the user's files -----------------------------------------------------------------------------
-
-
 def read_commands(path: Path, machine: Machine) -> list[Commands]:
     """Sequences of a CSV `sequence,time,vx,vy,vz` [s, m/s]; values hold until the next row.
 
@@ -166,9 +163,6 @@ def goals_and_starts(
     return read_commands(commands, machine) if commands else own, poses
 
 
-# --- start poses ----------------------------------------------------------------------------------
-
-
 def evaluation_starts(
     machine: Machine, num: int, sequences: Sequence[Commands], seed: int
 ) -> Array:
@@ -209,7 +203,6 @@ def draw_starts(
 
     All sequences are `feasible` from the first kind, at least half of them from the second.
     Where a machine has no poses of a kind, "workspace" ones replace them. Paper: Fig. 6a
-
     ValueError: too few poses in 200 draws.
     """
     order = [("workspace", "limits", "workspace", "extended")[i % 4] for i in range(num)]
@@ -274,10 +267,7 @@ def feasible(machine: Machine, start: Array, goals: Array) -> NDArray[np.bool_]:
 
 
 def _within_limits(machine: Machine, q: Array, q_dot: Array) -> NDArray[np.bool_]:
-    """Are driven joints 0.05 rad off their limits, and slower than 0.9 of `speed_limits`? (num,)
-
-    A controller needs room to correct (assumed).
-    """
+    """Are driven joints 0.05 rad off their limits, below 0.9 of `speed_limits` (assumed)? (num,)"""
     low, high = machine.column("q_min") + 0.05, machine.column("q_max") - 0.05
     down, up = speed_limits(machine, q)
     within = (q > low) & (q < high) & (q_dot > 0.9 * down) & (q_dot < 0.9 * up)
@@ -294,9 +284,6 @@ def speed_limits(machine: Machine, q: ArrayLike) -> tuple[Array, Array]:
     down = -opening * machine.column("speed_negative") / r
     up = opening * machine.column("speed_positive") / r
     return down, up
-
-
-# --- tuning ---------------------------------------------------------------------------------------
 
 
 def tuning_set(machine: Machine, num: int, seed: int, seconds: float = 12.0) -> tuple[Array, Array]:

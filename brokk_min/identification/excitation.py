@@ -23,8 +23,6 @@ BARELY_OPEN = 0.049  # of full command beyond the dead zone, assumed: largest di
 MAX_SEGMENT = 30.0  # s, assumed: longest motion that is recorded in one piece
 MAX_RETURN = 300.0  # s, assumed: a longer return to the start is stopped
 
-# --- commands -------------------------------------------------------------------------------------
-
 
 def sine_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Array:
     """One sine of random amplitude (dead zone to limit) and frequency, (ticks,). Paper: Sec. 3.3"""
@@ -106,8 +104,6 @@ def _dither(rng: np.random.Generator, machine: Machine, _: float) -> Array:
 
 EXCITATIONS = {"sine": sine_command, "rich": rich_command}
 
-# --- recording ------------------------------------------------------------------------------------
-
 
 class _Recorder:
     """The analytic plant with a logger: commands and encoder angles (rows, n) of each tick."""
@@ -139,13 +135,7 @@ def collect(machine: Machine, hours: float, excitation: str, rng: np.random.Gene
     A segment begins with `history` samples of an idle valve. The return to its start is recorded as
     `..._return`; `read_log` drops it. Sines start at mid range, as in the paper, rich excitation at
     random angles. Paper: Sec. 3.3
-
-    ValueError: another excitation, or hours that are not positive.
     """
-    if excitation not in EXCITATIONS:
-        raise ValueError(f"excitation: expected one of {list(EXCITATIONS)}, got {excitation!r}")
-    if not 0 < hours < np.inf:
-        raise ValueError(f"hours: expected above 0, got {hours}")
     goal = max(machine.history + 2, round(hours * 3600 * machine.rate))  # samples per joint
     rows = int(np.clip(goal // 300, 1, 100))  # segments of a joint that are simulated at once
     count = np.zeros(machine.n, int)
@@ -259,13 +249,8 @@ def task_log(
 
     In every fifth recording the locked joints move instead. Commands are smoothed random levels
     held for 0.5 to 5 s, less often towards the nearer end of the range. For validation only.
-
-    Args:
-        machine: n joints.
-        recordings: their number.
-        seconds: length of each [s].
-        rng: source of all draws.
-        start: angles (n,) [rad] at which all begin; None: random ones.
+    `recordings` is their number, `seconds` the length of each [s]. All begin at the angles `start`
+    (n,) [rad]; None: at random ones.
     """
     q_min, q_max = machine.column("q_min"), machine.column("q_max")
     shape, limit = (recordings, machine.n), machine.pwm_limit / PWM_MAX

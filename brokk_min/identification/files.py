@@ -27,16 +27,12 @@ UNPACKED_RATIO = 300  # assumed: no log of ours is compressed further
 
 
 def require(package: str, extra: str) -> Any:
-    """Import a package that comes with an extra of pyproject.toml.
-
-    ValueError: it is not installed; names the extra.
-    """
+    """Import a package of an extra of pyproject.toml; ValueError: it is not installed."""
     try:
         return import_module(package)
     except ImportError as error:
-        raise ValueError(
-            f"{package}: expected the extra brokk_min[{extra}], got {error}"
-        ) from error
+        expectation = f"expected the extra brokk_min[{extra}]"
+        raise ValueError(f"{package}: {expectation}, got {error}") from error
 
 
 @contextmanager
@@ -112,16 +108,10 @@ def expect_same(path: Path, header: Mapping[str, Any], required: Mapping[str, An
             raise ValueError(f"{path}: {name}: expected {value!r}, got {header.get(name)!r}")
 
 
-# --- tables ---------------------------------------------------------------------------------------
-
-
 def read_table(
     path: Path, columns: Sequence[str], text: Sequence[str] = ()
 ) -> dict[str, NDArray[Any]]:
-    """Named columns of a CSV: finite numbers, or text for the columns `text`.
-
-    ValueError: with file, row and column of the first error.
-    """
+    """Columns of a CSV: those of `text`, else finite numbers; ValueError with the place."""
     table = read_csv(Path(path))
     result: dict[str, NDArray[Any]] = {}
     for name in columns:
@@ -178,10 +168,8 @@ def numbers_of(
     if not good.all():
         row = int(np.argmin(good))
         limits = "" if bound == np.inf else f" in [-{bound:g}, {bound:g}] ({unit})"
-        raise ValueError(
-            f"{path}: row {row + 2}, column {name}: expected a number, finite{limits}, "
-            f"got {cells[row]!r}"
-        )
+        place = f"{path}: row {row + 2}, column {name}"
+        raise ValueError(f"{place}: expected a number, finite{limits}, got {cells[row]!r}")
     return numbers
 
 

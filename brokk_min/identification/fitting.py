@@ -5,8 +5,6 @@ nets on their own outputs: there a bias adds up and the noise of encoders does n
 joints are trained at once, each on the recordings in which its joint moves.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
@@ -29,9 +27,7 @@ class FitConfig:
 
     steps: int = 16000  # Adam steps.
     batch_size: int = 512  # Windows per joint in each step; a quarter of it for several ticks.
-    learning_rate: float = (
-        4e-3  # Of Adam; falls to zero along a cosine, again from a quarter of it.
-    )
+    learning_rate: float = 4e-3  # Of Adam; falls to zero along a cosine, twice.
     noise: float = 0.1  # Standard deviation of noise on velocity inputs, in their own deviations.
     hidden: int = 32  # Units in each of the two hidden layers (paper: 32).
     history: int = 13  # Samples of angle, velocity and command in the input (paper: 13).
@@ -49,13 +45,8 @@ def fit(
 ) -> ActuatorNet:
     """Fit one net per joint to a log. Paper: Sec. 3.3 (MSE, Adam)
 
-    Args:
-        log: recordings of n joints.
-        config: settings.
-        seed: of weights, windows and noise; it repeats the nets to the bit on one computer.
-        velocity_samples: window of the estimator that made the velocities of `log`.
-        machine: its name, for the file.
-
+    `seed` repeats the nets to the bit on one computer; `velocity_samples` is the window of the
+    estimator that made the velocities of `log`; `machine` is a name, for the file.
     ValueError: a joint that never moves long enough, or weights that are not finite at the end.
     """
     config = replace(config, dead_zone=config.dead_zone or 0.0)
@@ -93,10 +84,7 @@ class TrainingSet(NamedTuple):
 
 
 def training_set(log: Log, config: FitConfig) -> TrainingSet:
-    """Windows of the recordings in which a joint moves; its statistics are of those alone.
-
-    ValueError: a joint that never moves long enough.
-    """
+    """Windows in which a joint moves, and their statistics; ValueError: one that never moves."""
     samples = join_recordings(log)
     q, q_dot, u = samples.joined.q, samples.joined.q_dot, samples.joined.u
     windows = samples.windows(config.history, 1)
@@ -127,10 +115,8 @@ def training_set(log: Log, config: FitConfig) -> TrainingSet:
 def _check_targets(log: Log, targets: list[Array], history: int) -> None:
     for name, target in zip(log.joints, targets, strict=True):
         if not len(target) or np.ptp(target) == 0:
-            raise ValueError(
-                f"joint {name}: expected a recording of {history + 1} samples or more in "
-                "which it moves, got none"
-            )
+            expected = f"expected a recording of {history + 1} samples or more in which it moves"
+            raise ValueError(f"joint {name}: {expected}, got none")
 
 
 def train(data: TrainingSet, config: FitConfig, seed: int, estimator: int | None) -> list[Tensor]:
@@ -146,11 +132,12 @@ def train(data: TrainingSet, config: FitConfig, seed: int, estimator: int | None
     )
     for step in tqdm(range(config.steps), desc="fit nets", unit="step", disable=None):
         if step < switch_step:
+            settings = replace(config, rollout=1)
             at = draw_windows(data.windows, config.batch_size, generator)
-            loss = one_step_loss(data, config, weights, at, generator)
         else:
+            settings = config
             at = draw_windows(data.multi_step_windows, math.ceil(config.batch_size / 4), generator)
-            loss = multi_step_loss(data, config, weights, at, estimator, generator)
+        loss = multi_step_loss(data, settings, weights, at, estimator, generator)
         optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
@@ -185,15 +172,6 @@ def draw_windows(windows: list[NDArray[np.intp]], batch: int, generator: Generat
     return torch.tensor(np.stack(drawn))
 
 
-def one_step_loss(
-    data: TrainingSet, config: FitConfig, weights: list[Tensor], at: Tensor, generator: Generator
-) -> Tensor:
-    """Mean square of (velocity - target) / range, summed over joints, for windows that end `at`."""
-    q, q_dot, u = input_windows(data, config, at, 1, generator)
-    error = normalised_error(data, predict(data, weights, q, q_dot, u), at)
-    return (error**2).mean(dim=1).sum()
-
-
 def multi_step_loss(
     data: TrainingSet,
     config: FitConfig,
@@ -205,7 +183,8 @@ def multi_step_loss(
     """Mean square of the accumulated error over `rollout` ticks of the nets on their own outputs.
 
     L = 1/K sum_k |sum_{i<=k} (velocity_i - target_i) / range|^2, for windows that end `at`
-    (n, batch). `estimator`: samples of the velocity estimator; None: velocities are the outputs.
+    (n, batch); summed over joints. A `rollout` of 1 is the paper's error of one step. `estimator`:
+    samples of the velocity estimator; None: velocities are the outputs.
     """
     ticks, history = config.rollout, config.history
     q, q_dot, u = input_windows(data, config, at, ticks, generator)

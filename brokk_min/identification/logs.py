@@ -74,9 +74,6 @@ def velocity_of(q: Array, samples: int, rate: float = RATE) -> Floats:
     return np.asarray(estimate_velocity(windows, samples, 1 / rate), float)
 
 
-# --- samples for fitting and validation -----------------------------------------------------------
-
-
 class Samples(NamedTuple):
     """The recordings of a log joined, N samples in all; a window must not cross their seams."""
 
@@ -122,9 +119,6 @@ def join_recordings(log: Log) -> Samples:
     return Samples(Recording("", u, q, q_dot), target, np.repeat(moves, lengths, axis=0), lengths)
 
 
-# --- files ----------------------------------------------------------------------------------------
-
-
 def write_log(path: Path, log: Log) -> None:
     """Write recordings as one table, `.csv` or `.npz` by the name; read it with `read_log`."""
     path = Path(path)
@@ -159,12 +153,8 @@ def read_log(
     Without q_dot columns velocities are estimated: a recording starts at rest; after a gap, the
     rows that would need samples of the gap are left out.
 
-    Args:
-        paths: tables of the same joints.
-        velocity_samples: window of `estimate_velocity`.
-        joints: names and order of the joints; None: all, in the order of the first file.
-        rate: of the result [Hz].
-
+    `velocity_samples` is the window of `estimate_velocity`; `joints` are the names and order of the
+    joints (None: all, in the order of the first file).
     ValueError: with file, row (1 is the header) and column of the first error.
     """
     names = tuple(joints or ())
@@ -206,9 +196,8 @@ def _joints(path: Path, table: Table) -> tuple[str, ...]:
     for name in table:
         if name.startswith("q_") and name not in known:
             missing = "u_" + name.removeprefix("q_").removeprefix("dot_")
-            raise ValueError(
-                f"{path}: row 1: expected a column {missing} for {name}, got {list(table)}"
-            )
+            expected = f"expected a column {missing} for {name}"
+            raise ValueError(f"{path}: row 1: {expected}, got {list(table)}")
     return joints
 
 
@@ -248,15 +237,12 @@ def _gaps(path: Path, run: str, rows: Sequence[int], time: Floats, rate: float) 
     step = np.diff(time)
     if not (step > 0).all():
         late = int(np.argmin(step > 0)) + 1
-        raise ValueError(
-            f"{path}: row {rows[late] + 2}, column time: expected later than {time[late - 1]} "
-            f"within run {run!r}, got {time[late]}"
-        )
+        expected = f"expected later than {time[late - 1]} within run {run!r}"
+        raise ValueError(f"{path}: row {rows[late] + 2}, column time: {expected}, got {time[late]}")
     if len(step) and np.median(step) > 1.05 / rate:
-        raise ValueError(
-            f"{path}: row {rows[0] + 2}, column time: expected {rate:g} Hz or more in run "
-            f"{run!r}, got {1 / np.median(step):.3g} Hz"
-        )
+        expected = f"expected {rate:g} Hz or more in run {run!r}"
+        got = f"got {1 / np.median(step):.3g} Hz"
+        raise ValueError(f"{path}: row {rows[0] + 2}, column time: {expected}, {got}")
     return np.flatnonzero(step > MAX_GAP) + 1
 
 

@@ -6,6 +6,7 @@ policy trains on free runs of the nets, so their error after seconds is what cou
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -28,8 +29,6 @@ from brokk_min.machine import Array, Machine
 ALLOWED_OUTSIDE = 0.02  # of the samples, assumed: 0.2 % of the training are outside by definition
 RISE = 0.63  # paper's response times: 0.4 s and 0.1 s, read as the time to 63 % of the change
 HORIZONS = (1, 5, 10, 30)  # s, of the free runs
-# history with the command of this tick (..., n, 3, H) -> velocity over the tick [rad/s] (..., n)
-Predictor = Callable[[Array], Array]
 # angles (..., n) and commands (T, ..., n) -> angles (T+1, ..., n)
 Simulator = Callable[[Array, Array], Array]
 
@@ -44,7 +43,7 @@ def validate(
     `outside_training`. `tool`: `tool_errors` of a known machine [m].
     """
     joints = score(net, test)
-    linear = score(net, test, fit_linear(net, log))
+    linear = score(fit_linear(net, log), test)
     speed = creep(net)
     outside = outside_training(log, test, net.history)
     times = log_response_times(net, log, machine)
@@ -65,29 +64,19 @@ def _warnings(joints: dict[str, Any]) -> list[str]:
             error = run["velocity_rmse"]
             reference = scores["linear"]["free_run"][horizon]["velocity_rmse"]
             if error >= reference:
-                warnings.append(
-                    f"{name}: the error of a free run of {horizon} s is {error:.4f} rad/s, that of "
-                    f"a linear model {reference:.4f}: the net is no better"
-                )
+                of_net = f"the error of a free run of {horizon} s is {error:.4f} rad/s"
+                of_linear = f"that of a linear model {reference:.4f}"
+                warnings.append(f"{name}: {of_net}, {of_linear}: the net is no better")
         for kind, fraction in scores["outside"].items():
             if fraction > ALLOWED_OUTSIDE:
-                warnings.append(
-                    f"{name}: {kind} outside the training's range in {fraction:.0%} of the test"
-                )
+                where = f"outside the training's range in {fraction:.0%} of the test"
+                warnings.append(f"{name}: {kind} {where}")
     return warnings
 
 
-# --- free runs ------------------------------------------------------------------------------------
-
-
-def free_run_step(
-    net: ActuatorNet, history: Array, q: Array, u: Array, predict: Predictor | None = None
-) -> tuple[Array, Array]:
-    """History (..., n, 3, H) and angles [rad] (..., n) after one tick under `u`.
-
-    No joint leaves the range of the training. `predict` replaces the nets' own.
-    """
-    velocity = (predict or net.predict)(append_command(history, u))
+def free_run_step(net: ActuatorNet, history: Array, q: Array, u: Array) -> tuple[Array, Array]:
+    """History and angles [rad] after a tick under `u`; no joint leaves the training's range."""
+    velocity = net.predict(append_command(history, u))
     low, high = np.minimum(q, net.q_low), np.maximum(q, net.q_high)
     q_next = np.clip(q + velocity / net.rate, low, high)
     history = append_sample(history, u, q_next, net.velocity_samples, 1 / net.rate)
@@ -97,11 +86,7 @@ def free_run_step(
 
 
 def free_run(
-    net: ActuatorNet,
-    recording: Recording,
-    starts: NDArray[np.intp],
-    ticks: int,
-    predict: Predictor | None = None,
+    net: ActuatorNet, recording: Recording, starts: NDArray[np.intp], ticks: int
 ) -> tuple[Array, Array]:
     """Angles [rad] and velocities [rad/s] (ticks, s, n) of nets on their own outputs.
 
@@ -113,49 +98,44 @@ def free_run(
     q: Array = recording.q[starts]
     angles, velocities = [], []
     for k in range(ticks):
-        history, q = free_run_step(net, history, q, recording.u[starts + k], predict)
+        history, q = free_run_step(net, history, q, recording.u[starts + k])
         angles.append(q)
         velocities.append(history[..., 1, -1])
     return np.array(angles), np.array(velocities)
 
 
 def run_errors(
-    net: ActuatorNet,
-    samples: Samples,
-    starts: NDArray[np.intp],
-    ticks: int,
-    predict: Predictor | None = None,
+    net: ActuatorNet, samples: Samples, starts: NDArray[np.intp], ticks: int
 ) -> tuple[Array, Array]:
     """Errors of angle [rad] and velocity [rad/s] (ticks, s, n) in free runs from `starts` (s,)."""
     chunks = np.array_split(starts, math.ceil(len(starts) / 8192))  # bounds the memory
-    runs = [free_run(net, samples.joined, chunk, ticks, predict) for chunk in chunks]
+    runs = [free_run(net, samples.joined, chunk, ticks) for chunk in chunks]
     q = np.concatenate([angles for angles, _ in runs], axis=1)
     q_dot = np.concatenate([velocities for _, velocities in runs], axis=1)
     after = starts + np.arange(1, ticks + 1)[:, None]
     return q - samples.joined.q[after], q_dot - samples.joined.q_dot[after]
 
 
-def score(net: ActuatorNet, log: Log, predict: Predictor | None = None) -> dict[str, Any]:
+def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
     """One-step, persistence and free-run errors on recordings, as in the fit JSON.
 
     Each joint is scored where it moves. `one_step_rmse` is the error of the predicted target (see
     `join_recordings`), `persistence_rmse` that of the newest velocity in the history. Free runs
     start every `horizon` seconds: `velocity_rmse` is over all samples, `position_error_median` over
-    their ends. `predict` replaces the nets' own.
-
+    their ends.
     ValueError: other joints, rate or kind of velocity than the nets', or no recording long enough.
     """
     for name in ("joints", "rate", "velocity_logged"):
         if getattr(log, name) != getattr(net, name):
             raise ValueError(f"{name}: expected {getattr(net, name)}, got {getattr(log, name)}")
     samples = join_recordings(log)
-    result = _one_step_scores(net, samples, predict)
+    result = _one_step_scores(net, samples)
     for horizon in tqdm(HORIZONS, desc="score nets", unit="horizon", disable=None):
         ticks = round(horizon * net.rate)
         starts = samples.starts(net.history, ticks, ticks)
         if not len(starts):
             break
-        q_error, v_error = run_errors(net, samples, starts, ticks, predict)
+        q_error, v_error = run_errors(net, samples, starts, ticks)
         for j, name in enumerate(log.joints):
             scored = samples.scored[starts, j]
             if scored.any():
@@ -166,14 +146,12 @@ def score(net: ActuatorNet, log: Log, predict: Predictor | None = None) -> dict[
     return result
 
 
-def _one_step_scores(
-    net: ActuatorNet, samples: Samples, predict: Predictor | None
-) -> dict[str, Any]:
+def _one_step_scores(net: ActuatorNet, samples: Samples) -> dict[str, Any]:
     starts = samples.starts(net.history, 1, 1)
     if not len(starts):
         got = samples.lengths[:9]
         raise ValueError(f"log: expected a recording above {net.history + 1} samples, got {got}")
-    q_error, v_error = run_errors(net, samples, starts, 1, predict)
+    q_error, v_error = run_errors(net, samples, starts, 1)
     error = v_error[0] if net.velocity_logged else q_error[0] * net.rate
     persistence = samples.joined.q_dot[starts] - samples.target[starts]
     result: dict[str, Any] = {}
@@ -224,15 +202,22 @@ def tool_errors(machine: Machine, net: ActuatorNet, test: Log) -> dict[str, floa
     return result
 
 
-# --- the linear reference and the range of the training -------------------------------------------
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LinearNet(ActuatorNet):
+    """A linear model x w + b of the standardised inputs x; its output has the nets' range."""
+
+    slopes: Array  # w, (n, 3 H)
+    offsets: Array  # b, (n,)
+
+    def predict(self, history: Array) -> Array:
+        """Velocity over the coming tick, as `ActuatorNet.predict`."""
+        x = (self.inputs(history) - self.input_mean) / self.input_scale
+        velocity = (x * self.slopes).sum(axis=-1) + self.offsets
+        return np.asarray(np.clip(velocity, self.output_low, self.output_high))
 
 
-def fit_linear(net: ActuatorNet, log: Log, penalty: float = 1e-3) -> Predictor:
-    """Ridge regression on the inputs and targets of the nets: the reference that nets must beat.
-
-    Minimises mean |x w + b - target|^2 + penalty |w|^2 over the standardised inputs x. Its output
-    has the range of the nets'.
-    """
+def fit_linear(net: ActuatorNet, log: Log, penalty: float = 1e-3) -> LinearNet:
+    """The reference that nets must beat: min mean |x w + b - target|^2 + penalty |w|^2."""
     samples = join_recordings(log)
     signals = np.stack(
         [samples.joined.q, samples.joined.q_dot, mu_law(samples.joined.u, net.dead_zone)]
@@ -248,13 +233,7 @@ def fit_linear(net: ActuatorNet, log: Log, penalty: float = 1e-3) -> Predictor:
         solution, *_ = np.linalg.lstsq(np.vstack([x, ridge]), y, rcond=None)
         slopes.append(solution[:-1])
         offsets.append(solution[-1])
-
-    def predict(history: Array) -> Array:
-        x = (net.inputs(history) - net.input_mean) / net.input_scale
-        velocity = (x * np.array(slopes)).sum(axis=-1) + np.array(offsets)
-        return np.asarray(np.clip(velocity, net.output_low, net.output_high))
-
-    return predict
+    return LinearNet(**vars(net), slopes=np.array(slopes), offsets=np.array(offsets))
 
 
 def outside_training(log: Log, test: Log, history: int) -> dict[str, Array]:
@@ -295,9 +274,6 @@ def _signals(log: Log, history: int) -> dict[str, list[Array]]:
         kind: [column[moving] for column, moving in zip(values.T, moves, strict=True)]
         for kind, values in kinds.items()
     }
-
-
-# --- step responses -------------------------------------------------------------------------------
 
 
 def plant_simulator(machine: Machine) -> Simulator:
@@ -374,8 +350,7 @@ def response_times(angles: Array, rate: float) -> Array:
     at = np.maximum(np.argmax(rise >= RISE, axis=0), 1)  # row k: the tick k - 1 after the step
     high = np.take_along_axis(rise, at[None], axis=0)[0]
     low = np.take_along_axis(rise, at[None] - 1, axis=0)[0]
-    times: Array = (at - 0.5 - (high - RISE) / (high - low)) / rate
-    return times
+    return np.asarray((at - 0.5 - (high - RISE) / (high - low)) / rate)
 
 
 def step_commands(

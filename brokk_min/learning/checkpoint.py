@@ -18,7 +18,7 @@ from tqdm import tqdm
 from brokk_min import ppo
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import State, TaskConfig, observation_scale
-from brokk_min.identification.files import expect_same, expected, require, whole_file
+from brokk_min.identification.files import expect_same, expected, require, whole_file, write_csv
 from brokk_min.identification.net_file import fingerprint
 from brokk_min.learning.episodes import paper_weights
 from brokk_min.learning.gym_env import TaskVectorEnv
@@ -28,6 +28,7 @@ from brokk_min.machine import Machine
 from brokk_min.ppo import Agent, Learner, PPOConfig, Rollout
 
 FORMAT = 4  # of checkpoints
+LEARNER = ("obs", "learning_rate", "global_step", "updates")  # attributes in checkpoints
 STATE = [field.name for field in fields(State) if field.name != "plant"]
 
 
@@ -60,21 +61,13 @@ def train_policy(
 ) -> Policy:
     """Train a policy on the nets and write it to `out`.
 
-    Args:
-        machine: what moves.
-        net: nets of its driven joints.
-        task: episodes.
-        config: settings of the learner.
-        seed: of everything random; the same seed gives the same bits on the same machine.
-        out: policy file, with its checkpoint `<out>.checkpoint` and its curve `<out>.csv`.
-        critic: advantages by a critic (always with `task.paper`), not by the nets' derivatives.
-        resume: continue from the checkpoint; the result is the same as without interruption.
-        tensorboard: folder for the scalars of the curve (needs the extra `tensorboard`).
-
-    Raises:
-        ValueError: settings that do not fit, a checkpoint of another training, or a number that is
-            not finite, with its place (the last checkpoint stays).
-        OSError: a file that cannot be written (the last checkpoint stays).
+    `net` has the nets of the driven joints. The same `seed` gives the same bits on the same
+    computer. Its checkpoint `<out>.checkpoint` and its curve `<out>.csv` lie next to the policy.
+    `critic`: advantages by a critic (always with `task.paper`), not by the nets' derivatives.
+    `resume`: continue from the checkpoint; the result is the same as without interruption.
+    `tensorboard`: folder for the scalars of the curve (needs the extra `tensorboard`).
+    ValueError: settings that do not fit, a checkpoint of another training, or a number that is not
+    finite. OSError: a file that cannot be written. The last checkpoint stays.
     """
     critic = critic or task.paper
     if critic:
@@ -191,10 +184,7 @@ class TrainingLog:
 
     def write_curve(self) -> None:
         """Write the curve whole."""
-        with whole_file(self.curve, "w") as file:
-            writer = csv.DictWriter(file, self.rows[0].keys(), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(self.rows)
+        write_csv(self.curve, self.rows[0], [row.values() for row in self.rows])
 
     def close(self) -> None:
         """Close the files of TensorBoard."""
@@ -209,10 +199,7 @@ class TrainingLog:
             "agent": learner.agent.state_dict(),
             "optimizer": learner.optimizer.state_dict(),
             "generator": learner.generator.get_state(),
-            "obs": learner.obs,
-            "learning_rate": learner.learning_rate,
-            "global_step": learner.global_step,
-            "updates": learner.updates,
+            **{name: getattr(learner, name) for name in LEARNER},
             "env": {name: torch.tensor(getattr(self.env.state, name)) for name in STATE},
             "random": self.env.np_random.bit_generator.state,
             "returns": torch.tensor(self.returns),
@@ -233,19 +220,16 @@ class TrainingLog:
             content = torch.load(self.checkpoint, weights_only=True)  # executes nothing
             header = json.loads(content["header"])
         except Exception as error:  # zipfile, pickle and torch raise anything on damaged files
-            raise ValueError(
-                f"{self.checkpoint}: expected a readable checkpoint, got {error!r}"
-            ) from error
+            text = f"expected a readable checkpoint, got {error!r}"
+            raise ValueError(f"{self.checkpoint}: {text}") from error
         expect_same(self.checkpoint, header, {"format": FORMAT})
         expect_same(self.checkpoint, header["identity"], self.about)
         with expected(self.checkpoint, "a complete checkpoint"):
             learner.agent.load_state_dict(content["agent"])
             learner.optimizer.load_state_dict(content["optimizer"])
             learner.generator.set_state(content["generator"])
-            learner.obs = content["obs"]
-            learner.learning_rate = content["learning_rate"]
-            learner.global_step = content["global_step"]
-            learner.updates = content["updates"]
+            for name in LEARNER:
+                setattr(learner, name, content[name])
             self.env.state = State(**{name: content["env"][name].numpy() for name in STATE})
             self.env.np_random.bit_generator.state = content["random"]
             self.returns = content["returns"].numpy()

@@ -113,16 +113,13 @@ def paper_weights(machine: Machine) -> Array:
 def replace_rows(state: State, rows: NDArray[np.intp], fresh: State) -> State:
     """`state` with its rows `rows` replaced by the states `fresh`, one each."""
 
-    def put(old: Array, new: Array) -> Array:
+    def put(old: Any, new: Any) -> Any:
+        if old is None:
+            return None
+        if isinstance(old, PlantState):
+            return PlantState(*map(put, old, new))
         result = old.copy()
         result[rows] = new
         return result
 
-    changed: dict[str, Any] = {}
-    for field in fields(State):
-        old, new = getattr(state, field.name), getattr(fresh, field.name)
-        if isinstance(old, PlantState):
-            changed[field.name] = PlantState(*map(put, old, new))
-        elif old is not None:
-            changed[field.name] = put(old, new)
-    return State(**changed)
+    return State(*(put(getattr(state, f.name), getattr(fresh, f.name)) for f in fields(State)))

@@ -47,14 +47,8 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
 
     `info["final_obs"]` holds the last observation of an episode where `info["_final_obs"]` is set,
     `info["velocity_error"]` |v_goal - v_tool| [m/s], `info["state"]` the state before the step.
-    Paper: Fig. 4
-
-    Args:
-        num_envs: number of machines.
-        actuator: nets (object or file) or "analytic" for the plant.
-        machine: what moves.
-        config: what an episode is.
-        renderer: what draws the machines; None: nothing does.
+    `actuator` are nets (object or file) or "analytic" for the plant, `config` is what an episode
+    is, `renderer` what draws the machines (None: nothing does). Paper: Fig. 4
     """
 
     def __init__(

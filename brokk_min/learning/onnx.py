@@ -18,7 +18,6 @@ def export_onnx(path: Path, policy: Policy) -> None:
 
     The other program does the rest, with the numbers in the metadata: `env.action_to_pwm`
     (`dead_zone`, `pwm_limit`, `ramp`) and closed valves after `stand_s` of a zero goal.
-
     ValueError: the package onnx is not installed.
     """
     helper = require("onnx.helper", "export")

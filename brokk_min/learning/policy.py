@@ -51,8 +51,7 @@ class Policy:
             x = x @ w + b
             x = np.where(x > 0, x, np.expm1(np.minimum(x, 0)))  # ELU
         w, b = layers[-1]
-        action: Array = x @ w + b
-        return action
+        return np.asarray(x @ w + b)
 
 
 @dataclass(frozen=True)

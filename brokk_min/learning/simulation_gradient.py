@@ -78,15 +78,9 @@ def action_gradients(
 ) -> Array:
     """dR_t/da_t: derivative of the discounted rewards to come by each action.
 
-    Args:
-        machine: n joints.
-        net: nets of its driven joints, which made the rollout.
-        ticks: T ticks of `num` environments; rewards after the last do not count.
-        gamma: discount.
-        task: its costs of valve travel and of the error integral.
-
-    Returns:
-        Shape (T, num, n_driven), float32, by actions as `env.action_to_pwm` takes them.
+    `net` are the nets of the driven joints, which made the rollout. Rewards after the last tick do
+    not count. Of `task` the costs of valve travel and of the error integral hold. Returns
+    (T, num, n_driven), float32, by actions as `env.action_to_pwm` takes them.
     """
     dr_dq_dot, dq_dot_dh, free = local_derivatives(machine, net, ticks, gamma, task.integral_cost)
     dc_du = valve_cost_gradient(machine, ticks, task.valve_cost)

@@ -39,30 +39,24 @@ def run_seed(
 
     `evaluate` gives the figures of a policy; `about` is what decides them, for the header of the
     result. The other arguments are those of `train_policy`.
-
     ValueError: a result of another training or evaluation.
     """
     policy_file = out / f"seed_{seed}.npz"
     result_file = out / f"seed_{seed}.json"
     identity = describe_training(machine, net, task, config, critic, seed)
     if result_file.exists():
-        return read_result(result_file, {**identity, **about})
+        with expected(result_file, "the result of a seed"):
+            result: dict[str, Any] = json.loads(result_file.read_text())
+            rows: Rows = result["runs"]
+            recorded = result["identity"]
+        expect_same(result_file, recorded, {**identity, **about})
+        return rows
     policy = load_policy(policy_file, machine) if policy_file.exists() else None
     if policy is None or dict(policy.training) != identity:
         resume = Path(f"{policy_file}.checkpoint").exists()
         policy = train_policy(machine, net, task, config, seed, policy_file, critic, resume)
     rows = evaluate(policy)
     write_json(result_file, {"identity": {**identity, **about}, "runs": rows})
-    return rows
-
-
-def read_result(path: Path, identity: Mapping[str, Any]) -> Rows:
-    """Rows of a seed that is finished; ValueError: of another training or evaluation."""
-    with expected(path, "the result of a seed"):
-        result: dict[str, Any] = json.loads(path.read_text())
-        rows: Rows = result["runs"]
-        recorded = result["identity"]
-    expect_same(path, recorded, identity)
     return rows
 
 
@@ -81,9 +75,8 @@ def run_seeds(
         workers = client.scheduler_info(n_workers=-1)["workers"].values()
         threads = {worker["nthreads"] for worker in workers}
         if threads - {1}:
-            raise ValueError(
-                f"{scheduler}: expected workers with --nthreads 1, got {sorted(threads)}"
-            )
+            got = sorted(threads)
+            raise ValueError(f"{scheduler}: expected workers with --nthreads 1, got {got}")
         futures = {client.submit(job, seed, pure=False): seed for seed in seeds}
         done = require("distributed", "sweep").as_completed(futures)
         for future in tqdm(done, total=len(futures), desc="sweep", unit="seed", disable=None):

@@ -16,9 +16,8 @@ VELOCITY_KEYS = (("up", "down"), ("left", "right"), ("w", "s"))
 LEVER_KEYS = (("q", "a"), ("w", "s"), ("e", "d"), ("r", "f"), ("t", "g"), ("y", "h"))
 PAD_AXES = (1, 0, 4, 3)  # 2 and 5 are triggers, which do not rest in the middle
 PAD_SWITCH = 5
-PAD_MODE = 3
-PAD_NEXT = 0
-PAD_AGAIN = 1
+PAD_BUTTONS = {3: "mode", 0: "next", 1: "again"}
+KEYS = {"escape": "close", "tab": "mode", "return": "next", "backspace": "again"}
 
 
 class InputHandler:
@@ -39,7 +38,7 @@ class InputHandler:
         self.modes = modes
         self.mode = 0
         self.time = time.monotonic()  # of the last request [s]
-        self.held = set[int]()  # keys
+        self.held = set[str]()  # keys
         self.focus = True
         self.blocked = True  # must the switch be released first?
         self.enable = False
@@ -62,9 +61,12 @@ class InputHandler:
             case pg.QUIT:
                 self.closed = True
             case pg.KEYDOWN:
-                self._press_key(event.key)
+                key = pg.key.name(event.key)
+                self.held.add(key)
+                self.lost = False  # the keyboard takes over
+                self._press(KEYS.get(key, ""))
             case pg.KEYUP:
-                self.held.discard(event.key)
+                self.held.discard(pg.key.name(event.key))
             case pg.WINDOWFOCUSLOST:
                 self.focus = False
                 self.blocked = True
@@ -72,36 +74,26 @@ class InputHandler:
             case pg.WINDOWFOCUSGAINED:
                 self.focus = True
             case pg.JOYBUTTONDOWN:
-                self._press_button(event.button)
+                self._press(PAD_BUTTONS.get(event.button, ""))
             case pg.JOYDEVICEADDED if self.pad is None:
                 self._change_pad(pg.joystick.Joystick(event.device_index))
             case pg.JOYDEVICEREMOVED:
                 if self.pad and event.instance_id == self.pad.get_instance_id():
                     self._change_pad(None)
 
-    def _press_key(self, key: int) -> None:
-        pg = self.pygame
-        self.held.add(key)
-        self.lost = False  # the keyboard takes over
-        self.closed |= key == pg.K_ESCAPE
-        if key == pg.K_TAB:
-            self._next_mode()
-        elif key in (pg.K_RETURN, pg.K_BACKSPACE):
-            self.task = "next" if key == pg.K_RETURN else "again"
-
-    def _press_button(self, button: int) -> None:
-        if button == PAD_MODE:
-            self._next_mode()
-        elif button in (PAD_NEXT, PAD_AGAIN):
-            self.task = "next" if button == PAD_NEXT else "again"
+    def _press(self, meaning: str) -> None:
+        """A key or button that means something besides motion."""
+        if meaning == "close":
+            self.closed = True
+        elif meaning == "mode":
+            self.mode = (self.mode + 1) % len(self.modes)
+            self.blocked = True
+        elif meaning:
+            self.task = meaning
 
     def _change_pad(self, pad: Any) -> None:
         self.pad = pad
         self.lost = pad is None
-        self.blocked = True
-
-    def _next_mode(self) -> None:
-        self.mode = (self.mode + 1) % len(self.modes)
         self.blocked = True
 
     def request(self, now: float) -> Request:
@@ -115,24 +107,22 @@ class InputHandler:
         ramp = last + np.clip(target - last, -step, step)
         self.deflection = np.where(target == 0, 0.0, ramp)  # released: neutral at once
         self._update_switch(bool(target.any()))
-        alive = not self.lost
+        v_goal: Array = np.zeros(3)
+        levers: Array = np.zeros(len(self.machine.driven))
         if self.levers:
-            return Request(now, self.mode, self.enable, alive, np.zeros(3), self.deflection)
-        length = float(np.linalg.norm(self.deflection))
-        v_goal = self.machine.tool_speed * self.deflection / max(1.0, length)
-        return Request(
-            now, self.mode, self.enable, alive, v_goal, np.zeros(len(self.machine.driven))
-        )
+            levers = self.deflection
+        else:
+            length = float(np.linalg.norm(self.deflection))
+            v_goal = self.machine.tool_speed * self.deflection / max(1.0, length)
+        return Request(now, self.mode, self.enable, not self.lost, v_goal, levers)
 
     def _target(self) -> Array:
         """Deflections of stick or levers in [-1, 1]; keys give a third of it with shift."""
-        key_code = self.pygame.key.key_code
         pairs = LEVER_KEYS[: len(self.machine.driven)] if self.levers else VELOCITY_KEYS
-        held = [[key_code(name) in self.held for name in pair] for pair in pairs]
-        target = np.array([float(plus) - float(minus) for plus, minus in held])
+        target = np.array([float(p in self.held) - float(m in self.held) for p, m in pairs])
         if not self.focus:
             return np.zeros_like(target)
-        if self.held & {self.pygame.K_LSHIFT, self.pygame.K_RSHIFT}:
+        if self.held & {"left shift", "right shift"}:
             target /= 3
         if self.pad is not None:
             axes = [i for i in PAD_AXES[: len(target)] if i < self.pad.get_numaxes()]
@@ -142,7 +132,7 @@ class InputHandler:
     def _update_switch(self, deflected: bool) -> None:
         has_button = self.pad is not None and self.pad.get_numbuttons() > PAD_SWITCH
         button = has_button and self.pad.get_button(PAD_SWITCH)
-        pressed = self.focus and (self.pygame.K_SPACE in self.held or bool(button))
+        pressed = self.focus and ("space" in self.held or bool(button))
         if pressed and deflected and not self.enable:
             self.blocked = True
         elif self.focus and not pressed:

@@ -4,8 +4,9 @@ The window sends requests to the loop (`control_process`) and shows the telemetr
 """
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +36,7 @@ class Session:
         self.file = file  # of the attempts
         self.attempts = tracing.read_attempts(file) if file else []
         self.lines = tracing.task_lines(machine)
+        self.names = cycle(self.lines)
         self.task = ""
         self.path: Array = drawing.NO_POINTS  # of the last line [m]
         self.tracing: tracing.Tracing | None = None
@@ -67,11 +69,8 @@ class Session:
         """The next line, or the same one again, from where the tool is."""
         if not self.trail:
             return
-        names = list(self.lines)
-        if not self.task:
-            self.task = names[0]
-        elif not again:
-            self.task = names[(names.index(self.task) + 1) % len(names)]
+        if not (again and self.task):
+            self.task = next(self.names)
         self.path = self.trail[-1] + self.lines[self.task]
         self.tracing = tracing.Tracing(self.machine, self.task, self.path)
         self.trail = []
@@ -231,10 +230,7 @@ def watch(
         open_bus(options.interface, options.channel, options.log) as bus,
     ):
 
-        def receive() -> Iterator[Telemetry]:
-            while (frame := bus.recv(0)) is not None:
-                telemetry = reader.update(frame)
-                if telemetry is not None:
-                    yield telemetry
+        def receive() -> Iterable[Telemetry]:
+            return filter(None, map(reader.update, iter(lambda: bus.recv(0), None)))
 
         show(window, session, receive, lambda request: None, each_frame)

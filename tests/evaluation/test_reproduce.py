@@ -6,7 +6,6 @@ import collections
 import html
 import json
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,10 +17,9 @@ from brokk_min.evaluation import baselines, report, reproduce
 from brokk_min.evaluation.claims import VERDICTS
 from brokk_min.evaluation.reproduce import Budget
 from brokk_min.evaluation.robustness import variations
-from brokk_min.evaluation.rollout import Trace
 from brokk_min.evaluation.sequences import axis_sequences, task_sequences, tuning_set
 from brokk_min.identification.fitting import FitConfig
-from brokk_min.identification.logs import read_log, velocity_of
+from brokk_min.identification.logs import read_log
 from brokk_min.identification.net_file import load_net
 from brokk_min.learning.policy import load_policy
 from brokk_min.machine import BROKK_170
@@ -187,24 +185,6 @@ def test_paper_recipe__is_scored_on_the_test_log(folder):
     result = reproduce.paper_recipe(BROKK_170, test, 0.004, config, 0)
     assert set(result["test"]) == set(BROKK_170.names) and "10" in result["test"]["q5"]["free_run"]
     assert result["sim_to_real"]["tool_position_error_mean_of_runs"]["runs"] == 20
-
-
-def test_driven_log__has_commands_and_encoder_angles_of_one_controller():
-    rng = np.random.default_rng(0)
-
-    def trace(runs):
-        arrays = [rng.normal(size=(30, runs, n)) for n in (5, 5, 5, 5, 3, 3)]
-        return Trace(*arrays, rng.normal(size=(30, runs)))
-
-    traces = {("rl", "x"): trace(18), ("pid", "x"): trace(18), ("rl", "y"): trace(2)}
-    log = reproduce.driven_log(replace(BROKK_170, rate=10.0), traces, "rl")
-    names = [recording.name for recording in log.recordings]
-    assert names == [f"rl_x_{i:02d}" for i in range(16)] + ["rl_y_00", "rl_y_01"]
-    assert (log.joints, log.rate, log.velocity_logged) == (BROKK_170.names, 10.0, False)
-    third = log.recordings[3]
-    np.testing.assert_array_equal(third.q, traces["rl", "x"].q_measured[:, 3])
-    np.testing.assert_array_equal(third.u, traces["rl", "x"].u[:, 3])
-    np.testing.assert_allclose(third.q_dot, velocity_of(third.q, 4, 10.0))
 
 
 def test_tables__keep_kinds_of_starts_apart():

@@ -191,15 +191,6 @@ def test_collect__reads_back_from_a_file_without_the_returns(collected, tmp_path
         np.testing.assert_allclose(got.q, segment.q, atol=1e-12)
 
 
-def test_collect__refuses_another_excitation_and_no_time():
-    rng = np.random.default_rng(0)
-    with pytest.raises(ValueError, match=r"excitation: expected .*sine.*rich.*, got 'square'"):
-        collect(BROKK_170, 1.0, "square", rng)
-    for hours in (0.0, -1.0, float("nan"), float("inf")):
-        with pytest.raises(ValueError, match=f"hours: expected above 0, got {hours}"):
-            collect(BROKK_170, hours, "sine", rng)
-
-
 # --- recordings for validation --------------------------------------------------------------------
 
 

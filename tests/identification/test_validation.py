@@ -193,7 +193,7 @@ def blank_net(log, history=5):
 def test_fit_linear__solves_the_normal_equations_of_ridge_regression():
     log, history = linear_log(0, 3), 4
     net = blank_net(log, history)
-    predict = fit_linear(net, log, penalty=0.01)
+    predict = fit_linear(net, log, penalty=0.01).predict
     windows, targets = [], []
     for r in log.recordings:
         for k in range(history - 1, len(r.q) - 1):

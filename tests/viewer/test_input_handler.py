@@ -128,7 +128,7 @@ def test_gamepad__drives_until_it_is_unplugged_then_the_keyboard_does():
     device.axis(4, 1.0)
     expected = 0.3 * np.array([1, 0, -1]) / 2**0.5
     np.testing.assert_allclose(operator.look().v_goal, expected, atol=1e-6)
-    device.button(input_handler.PAD_MODE, True)
+    device.button(3, True)
     request = operator.look()
     assert request.mode == 1
     assert not request.enable
