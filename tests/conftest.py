@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 
 import pytest
-import torch
 from hypothesis import HealthCheck, settings
 
 import brokk_min  # noqa: F401, before NumPy: it settles how many threads that takes
@@ -23,4 +22,6 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
 @pytest.fixture(scope="module", autouse=True)
 def one_thread():
     """Small nets are fitted fastest on one thread."""
+    import torch
+
     torch.set_num_threads(1)
