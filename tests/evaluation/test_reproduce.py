@@ -182,7 +182,7 @@ def test_render__escapes_names_and_shows_training_seeds(results):
 def test_paper_recipe__is_scored_on_the_test_log(folder):
     test = read_log([folder / "log_test.npz"], 4, rate=20.0)
     config = FitConfig(steps=3, batch_size=8)
-    result = reproduce.paper_recipe(BROKK_170, test, 0.004, config, 0)
+    result = reproduce.paper_recipe(BROKK_170, test, 0.004, config, 3)
     assert set(result["test"]) == set(BROKK_170.names) and "10" in result["test"]["q5"]["free_run"]
     assert result["sim_to_real"]["tool_position_error_mean_of_runs"]["runs"] == 20
 
