@@ -276,8 +276,8 @@ def other_plant() -> Machine:
     """Two joints with 45 % dead zone and a long dead time, at 100 Hz."""
     joints = [replace(BROKK_170.joints[i], name=name) for i, name in ((3, "boom"), (4, "stick"))]
     return replace(
-        BROKK_170, name="other", joints=tuple(joints), q_start=(), dead_zone=0.45, delay=1.0, rate=100.0,
-        pwm_limit=127, tau_valve_down=0.8,
+        BROKK_170, name="other", joints=tuple(joints), q_start=(), dead_zone=0.45, delay=1.0,
+        rate=100.0, pwm_limit=127, tau_valve_down=0.8,
     )  # fmt: skip
 
 
