@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import sys
+from collections import deque
 from dataclasses import replace
 from pathlib import Path
 
@@ -114,7 +115,7 @@ def test_replayed_bus__by_hand() -> None:
     read = Frame(1.1, 0x181, b"\x07")
     logged = Frame(1.2, OPERATOR_INPUT, operator_input.pack(), True, OPERATOR_CHANNEL)
     last = Frame(1.3, 0x182, b"\x08")
-    bus = ReplayedBus([sync, read, logged, last])
+    bus = ReplayedBus(deque([sync, read, logged, last]))
     assert bus.recv(0.1) is None  # SYNC is to be sent first
     assert bus.operator(True, True) == operator_input
     bus.send(0x080, b"")
@@ -123,17 +124,17 @@ def test_replayed_bus__by_hand() -> None:
     assert bus.log_input(b"") == 1.2
     assert bus.now() == 1.3
     assert [bus.recv(0.1), bus.recv(0.1)] == [last, None]
-    assert not bus.more and not bus.mismatch and bus.now() == 1.3
+    assert not bus.frames and not bus.mismatch and bus.now() == 1.3
     assert bus.operator(True, True) == OperatorInput(stop=True)
 
 
 @pytest.mark.parametrize("changed", [{"id": 0x210}, {"sent": False}])
 def test_replayed_bus__ends_where_another_frame_or_none_was_sent(changed: dict[str, int]) -> None:
     found = Frame(1.0, 0x080, b"", True)._replace(**changed)  # type: ignore[arg-type]
-    bus = ReplayedBus([found, Frame(1.1, 0x181, b"\x07")])
+    bus = ReplayedBus(deque([found, Frame(1.1, 0x181, b"\x07")]))
     bus.send(0x080, b"")
     assert bus.mismatch == f"080 sent at 1.000000, got {found.id:03X}"
-    assert not bus.more
+    assert not bus.frames
 
 
 def test_log_for_fit__holds_what_the_machine_did(tmp_path: Path) -> None:
