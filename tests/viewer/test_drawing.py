@@ -39,9 +39,9 @@ def views(
     machine: Machine, q: np.ndarray, in_view: np.ndarray = NO_POINTS
 ) -> tuple[Camera, Camera]:
     """The cameras of a picture of one arm."""
-    layout = drawing._layout((0.0, 0.0, *map(float, SIZE)), machine.n, 0)
+    side_box, top_box, *_ = drawing._layout((0.0, 0.0, *map(float, SIZE)), machine.n, 0)
     p_tool = tool_position(forward_kinematics(machine, q))
-    side, top = cameras(machine, p_tool, layout.side, layout.top, in_view)
+    side, top = cameras(machine, p_tool, side_box, top_box, in_view)
     return side, top
 
 
@@ -265,7 +265,7 @@ def test_draw__cuts_off_no_text_and_puts_none_on_another(
 ) -> None:
     name = "bucke" if arms > 1 else "cylinder_"
     joints = [replace(joint, name=f"{name}{i}") for i, joint in enumerate(BROKK_170.joints[:n])]
-    machine = replace(BROKK_170, joints=tuple(joints))
+    machine = replace(BROKK_170, joints=tuple(joints), q_start=())
     at_limits = scene(
         machine.column("q_max"),
         title="drive_of_the_long_name_2026-11-21.log",
