@@ -55,33 +55,25 @@ def figures(frames: list[Frame]) -> dict[str, Any]:
     """Times in ms. Lateness is that of SYNC on the grid of the first one, drift included."""
     begin = next(k for k, frame in enumerate(frames) if frame.id == 0x210)
     frames = frames[begin:]
-    syncs = np.array([frame.time for frame in frames if frame.id == 0x080])
+    times = np.array([frame.time for frame in frames])
+    ids = np.array([frame.id for frame in frames])
+    syncs = times[ids == 0x080]
+    positions = times[(ids >= 0x181) & (ids <= 0x185)]
+    valves = times[(ids == 0x210) & (times > syncs[0])]
+    last_position = positions[np.searchsorted(positions, valves, "right") - 1]
+    last_sync = syncs[np.searchsorted(syncs, valves, "right") - 1]
     ticks = np.floor((syncs - syncs[0]) / 0.05 + 0.1)  # up to 45 ms late is not the next tick
     late = 1e3 * (syncs - syncs[0] - ticks * 0.05)
-    since_position = []
-    since_sync = []
-    positions = 0
-    last_position = 0.0
-    sync = 0.0
-    for frame in frames:
-        if frame.id == 0x080:
-            sync = frame.time
-        elif 0x181 <= frame.id <= 0x185:
-            positions += 1
-            last_position = frame.time
-        elif frame.id == 0x210 and sync:
-            since_position.append(1e3 * (frame.time - last_position))
-            since_sync.append(1e3 * (frame.time - sync))
     counters = np.array([frame.data[5] for frame in frames if frame.id == 0x210])
     return {
         "ticks": len(syncs),
         "skipped": int(ticks[-1] + 1 - len(syncs)),
-        "positions_lost": 5 * len(syncs) - positions,
+        "positions_lost": 5 * len(syncs) - len(positions),
         "valve_frames_lost": int((np.diff(counters) % 256 != 1).sum()),
         "ended_by_itself": frames[-1].data[-1:] == b"\x00",
         "lateness": percentiles(late - min(0.0, late.min())),
-        "last_position_to_valve_frame": percentiles(since_position),
-        "sync_to_valve_frame": percentiles(since_sync),
+        "last_position_to_valve_frame": percentiles(1e3 * (valves - last_position)),
+        "sync_to_valve_frame": percentiles(1e3 * (valves - last_sync)),
         "drift": round(float(np.median(late[-100:]) - np.median(late[:100])), 3),
     }
 

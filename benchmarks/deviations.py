@@ -174,7 +174,6 @@ def fit_nets(kind: str, seed: int, **settings: Any) -> tuple[actuator.ActuatorNe
     return fitting.fit(log, config, seed, M.velocity_samples, M.name), log
 
 
-@cache
 def fit_scores(kind: str, seed: int, **settings: Any) -> Figures:
     """Nets of the driven joints, on motions like a policy's: the worst joint."""
     net, log = fit_nets(kind, seed, **settings)

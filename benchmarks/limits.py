@@ -10,7 +10,7 @@ environment see `benchmarks.rollout`.
 from __future__ import annotations
 
 import os
-import time
+import timeit
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -38,20 +38,13 @@ class Options:
 
 def seconds(calls: dict[str, Callable[[], Any]], options: Options) -> dict[str, float]:
     """Least time of each call [s], all timed in turn: other work can only add to it."""
-    counts = {}
-    times: dict[str, list[float]] = {name: [] for name in calls}
-    for name, call in calls.items():
-        call()
-        start = time.perf_counter()
-        call()
-        counts[name] = max(1, round(options.block_s / (time.perf_counter() - start)))
+    timers = {name: timeit.Timer(call) for name, call in calls.items()}
+    least = dict.fromkeys(calls, np.inf)
     for _ in range(options.repeats):
-        for name, call in calls.items():
-            start = time.perf_counter()
-            for _ in range(counts[name]):
-                call()
-            times[name].append((time.perf_counter() - start) / counts[name])
-    return {name: min(of_call) for name, of_call in times.items()}
+        for name, timer in timers.items():
+            number = max(1, round(options.block_s / min(timer.repeat(2, 1))))
+            least[name] = min(least[name], timer.timeit(number) / number)
+    return least
 
 
 def shapes(widths: tuple[int, ...], batch: int) -> list[tuple[int, int, int]]:

@@ -3,6 +3,7 @@
 Telemetry is the state of one tick, from the frames of a bus or of a log.
 """
 
+from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -38,19 +39,16 @@ def read_frames(path: Path) -> Iterator[Frame]:
 class ReplayedBus:
     """A recorded log in place of a `Bus`: gives what was read and compares what is sent."""
 
-    frames: Sequence[Frame]
-    position: int = 0
+    frames: deque[Frame]  # those that are to come
     sent: list[Frame] = field(default_factory=list)
     mismatch: str = ""
-
-    @property
-    def more(self) -> bool:
-        """Is there anything left?"""
-        return self.position < len(self.frames)
+    time: float = 0.0  # s
 
     def now(self) -> float:
         """Time of the next frame [s]."""
-        return self.frames[min(self.position, len(self.frames) - 1)].time
+        if self.frames:
+            self.time = self.frames[0].time
+        return self.time
 
     def sleep(self, seconds: float) -> None:
         """A replay does not wait."""
@@ -60,10 +58,9 @@ class ReplayedBus:
 
     def recv(self, timeout: float, busy_wait: float = 0.0) -> Frame | None:
         """The next frame that was read before anything was sent."""
-        if not self.more or self.frames[self.position].sent:
+        if not self.frames or self.frames[0].sent:
             return None
-        self.position += 1
-        return self.frames[self.position - 1]
+        return self.frames.popleft()
 
     def send(self, can_id: int, data: bytes) -> None:
         """Keep what is sent, and go past what was sent then."""
@@ -78,18 +75,17 @@ class ReplayedBus:
 
     def operator(self, driving: bool, ready: bool) -> OperatorInput:
         """The operator's next input of the log."""
-        for i in range(self.position, len(self.frames)):
-            if self.frames[i].id == canopen.OPERATOR_INPUT:
-                return canopen.unpack_operator_input(self.frames[i].data)
+        for frame in self.frames:
+            if frame.id == canopen.OPERATOR_INPUT:
+                return canopen.unpack_operator_input(frame.data)
         return OperatorInput(stop=True)
 
     def _go_past(self, can_id: int) -> None:
-        if self.more:
-            frame = self.frames[self.position]
+        if self.frames:
+            frame = self.frames.popleft()
             if not frame.sent or frame.id != can_id:
                 self.mismatch = f"{can_id:03X} sent at {frame.time:.6f}, got {frame.id:03X}"
-                self.position = len(self.frames)
-        self.position += 1
+                self.frames.clear()
 
 
 def replay(machine: Machine, controller: Controller, frames: Sequence[Frame]) -> list[Frame]:
@@ -97,10 +93,10 @@ def replay(machine: Machine, controller: Controller, frames: Sequence[Frame]) ->
 
     ValueError: another program made the log.
     """
-    bus = ReplayedBus(frames)
+    bus = ReplayedBus(deque(frames))
     drive = Drive(machine, controller, bus, bus.operator)
     drive.begin()
-    while bus.more:
+    while bus.frames:
         drive.tick()
     if bus.mismatch:
         raise ValueError(f"log: expected {bus.mismatch}")

@@ -205,13 +205,7 @@ def active_fault(
 
 
 def fault_name(machine: Machine, code: int) -> str:
-    """Node and text of a code of `active_fault`.
-
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> fault_name(BROKK_170, 1 + 4 * 6 + 5), fault_name(BROKK_170, 1), fault_name(BROKK_170, 0)
-        ('valve controller: heartbeat lost', 'error', '')
-    """
+    """Node and text of a code of `active_fault`; empty for no fault."""
     if not code:
         return ""
     number, node = divmod(code - 1, machine.n + 1)

@@ -81,7 +81,7 @@ def train_policy(
     estimate = None if critic else gradient_advantages(machine, net, task)
     with log.bar, closing(log):
         agent = ppo.train(env, config, seed, log.on_update, estimate, learner)
-    log.write_curve()
+    write_csv(log.curve, log.rows[0], [row.values() for row in log.rows])
     policy = export_policy(machine, net, agent, task, about)
     save_policy(out, policy)
     log.checkpoint.unlink(missing_ok=True)
@@ -166,7 +166,7 @@ class TrainingLog:
         self.bar.update(learner.global_step - self.bar.n)
         self.bar.set_postfix_str(f"reward {metrics['charts/reward']:.3f}, error {error:.3f} m/s")
         if learner.updates % self.config.checkpoint_every == 0:
-            self.write_curve()
+            write_csv(self.curve, self.rows[0], [row.values() for row in self.rows])
             self.save(learner)
 
     def count_episodes(self, rewards: np.ndarray, dones: np.ndarray) -> None:
@@ -181,10 +181,6 @@ class TrainingLog:
         means = np.concatenate(ended, axis=1)
         if means.size:
             self.episodes = dict(zip(self.episodes, means.mean(axis=1).tolist(), strict=True))
-
-    def write_curve(self) -> None:
-        """Write the curve whole."""
-        write_csv(self.curve, self.rows[0], [row.values() for row in self.rows])
 
     def close(self) -> None:
         """Close the files of TensorBoard."""

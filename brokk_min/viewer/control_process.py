@@ -74,7 +74,7 @@ class WindowOperator:
             return OperatorInput(stop=True)
         if self.silent:
             return OperatorInput(alive=False)
-        x, y, z = map(float, self.request.v_goal)
+        x, y, z = self.request.v_goal.tolist()
         return OperatorInput((x, y, z), self.request.enable, self.request.alive)
 
 

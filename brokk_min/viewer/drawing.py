@@ -76,17 +76,11 @@ def draw(canvas: Canvas, machine: Machine, scenes: Sequence[Scene]) -> None:
 # --- layout and warnings --------------------------------------------------------------------------
 
 
-class Layout(NamedTuple):
-    """Where the parts of a panel are [px]."""
+def _layout(box: Box, joints: int, notes: int) -> tuple[Box, Box, Box, tuple[float, float]]:
+    """Boxes of side view, top view and joint rows, and the corner of the notes [px].
 
-    side: Box
-    top: Box
-    rows: Box
-    notes: tuple[float, float]
-
-
-def _layout(box: Box, joints: int, notes: int) -> Layout:
-    """Wide: both views above the rows. Tall: the side view above, top view and rows below."""
+    Wide: both views above the rows. Tall: the side view above, top view and rows below.
+    """
     left, _, width, height = box
     foot = 26.0 + 22 * joints
     if width > 1.3 * height:
@@ -95,13 +89,13 @@ def _layout(box: Box, joints: int, notes: int) -> Layout:
         side = (left, HEAD, 0.6 * width, upper - HEAD)
         top = (left + 0.6 * width, HEAD, 0.4 * width, upper - HEAD)
         rows = (left + 16, upper + 6, 0.52 * width, foot)
-        return Layout(side, top, rows, (left + 0.52 * width + 36, upper + 14))
+        return side, top, rows, (left + 0.52 * width + 36, upper + 14)
     foot = max(foot, 0.4 * height)
     upper = height - foot
     side = (left, HEAD, width, upper - HEAD)
     top = (left, upper, 0.38 * width, foot)
     rows = (left + 0.38 * width + 8, upper + 6, 0.62 * width - 16, foot)
-    return Layout(side, top, rows, (left + 16, HEAD + 34))
+    return side, top, rows, (left + 16, HEAD + 34)
 
 
 def near_limit(machine: Machine, q: Array) -> NDArray[np.bool_]:
@@ -130,27 +124,27 @@ def near_singular(machine: Machine, q: Array) -> bool:
 def _panel(canvas: Canvas, machine: Machine, scene: Scene, box: Box) -> None:
     """One arm: title and status, both views, a row for each joint, notes."""
     left, _, width, _ = box
-    layout = _layout(box, machine.n, len(scene.notes))
+    side, top, rows, (x_notes, y_notes) = _layout(box, machine.n, len(scene.notes))
     room = width - 60 - 9 * len(scene.status)  # px that the status leaves for the title
     title_size = int(np.clip(room / (0.7 * max(1, len(scene.title))), 8, 18))
     canvas.circle(np.array([left + 22.0, 21.0]), 7, scene.colour)
     canvas.text(left + 36, 21, scene.title, title_size)
     canvas.text(left + width - 16, 21, scene.status, 14, scene.status_colour, 1.0)
     if np.isfinite(scene.q).all():
-        _views(canvas, machine, scene, layout)
+        _views(canvas, machine, scene, side, top)
     else:
-        middle = layout.side[1] + layout.side[3] / 2
+        middle = side[1] + side[3] / 2
         canvas.text(left + width / 2, middle, "no positions", 20, WARNING, 0.5)
-    _joint_rows(canvas, machine, scene, layout.rows)
+    _joint_rows(canvas, machine, scene, rows)
     for i, note in enumerate(scene.notes):
-        canvas.text(layout.notes[0], layout.notes[1] + 18 * i, note, 12)
+        canvas.text(x_notes, y_notes + 18 * i, note, 12)
 
 
-def _views(canvas: Canvas, machine: Machine, scene: Scene, layout: Layout) -> None:
+def _views(canvas: Canvas, machine: Machine, scene: Scene, side: Box, top: Box) -> None:
     """The arm from both sides; goal and measured speed, warnings."""
     frames = forward_kinematics(machine, scene.q)
     p_tool = tool_position(frames)
-    for camera in cameras(machine, p_tool, layout.side, layout.top, scene.in_view):
+    for camera in cameras(machine, p_tool, side, top, scene.in_view):
         canvas.clip(camera.box)
         _backdrop(canvas, machine, camera)
         _arm(canvas, machine, camera, scene)
@@ -165,7 +159,7 @@ def _views(canvas: Canvas, machine: Machine, scene: Scene, layout: Layout) -> No
     if near_singular(machine, scene.q):
         legend.append(("near a singularity", WARNING))
     for i, (text, ink) in enumerate(legend):
-        canvas.text(layout.side[0] + layout.side[2] - 14, HEAD + 14 + 18 * i, text, 12, ink, 1.0)
+        canvas.text(side[0] + side[2] - 14, HEAD + 14 + 18 * i, text, 12, ink, 1.0)
 
 
 def _backdrop(canvas: Canvas, machine: Machine, camera: Camera) -> None:

@@ -26,14 +26,13 @@ def require_pygame() -> Any:
 class Canvas:
     """A picture that is drawn twice as large and scaled down, for smooth edges; text lies on top.
 
-    Coordinates are pixels, y down; points are (k, 2). Only one canvas of a size at a time.
+    Coordinates are pixels, y down; points are (k, 2).
     """
 
     def __init__(self, size: tuple[int, int]) -> None:
         self.size = size
         self.draw = require_pygame().draw
-        self.large = _large_surface(size)
-        self.large.set_clip(None)
+        self.large = require_pygame().Surface((2 * size[0], 2 * size[1]), depth=32)
         self.large.fill(BACKGROUND)
         self.texts: list[tuple[Any, tuple[float, float]]] = []
 
@@ -75,11 +74,6 @@ class Canvas:
         """The finished picture as an image (height, width, 3); needs no display."""
         pixels: NDArray[np.uint8] = require_pygame().surfarray.array3d(self.surface())
         return np.ascontiguousarray(pixels.swapaxes(0, 1))
-
-
-@lru_cache(maxsize=2)
-def _large_surface(size: tuple[int, int]) -> Any:
-    return require_pygame().Surface((2 * size[0], 2 * size[1]), depth=32)
 
 
 @lru_cache(maxsize=1024)

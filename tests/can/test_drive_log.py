@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections import deque
 from dataclasses import replace
 
 import can
@@ -103,10 +104,10 @@ def test_replay__of_a_recorded_log_sends_the_same_bytes(tmp_path):
 @pytest.mark.parametrize("changed", [{"id": 0x210}, {"sent": False}])
 def test_replayed_bus__ends_where_another_frame_or_none_was_sent(changed):
     found = Frame(1.0, 0x080, b"", True)._replace(**changed)
-    bus = ReplayedBus([found, Frame(1.1, 0x181, b"\x07")])
+    bus = ReplayedBus(deque([found, Frame(1.1, 0x181, b"\x07")]))
     bus.send(0x080, b"")
     assert bus.mismatch == f"080 sent at 1.000000, got {found.id:03X}"
-    assert not bus.more
+    assert not bus.frames
 
 
 def test_log_for_fit__holds_what_the_machine_did(tmp_path):

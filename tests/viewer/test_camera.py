@@ -37,6 +37,6 @@ def test_cameras__see_the_brokk_as_worked_out_by_hand():
 def test_skeleton__has_the_ends_of_d_and_a_of_two_links_by_hand():
     """Two links that turn about z, each 0.2 m above the one before and 1 m long."""
     joints = [replace(j, a=1.0, d=0.2, alpha=0.0, theta=0.0) for j in BROKK_170.joints[:2]]
-    arm = replace(BROKK_170, joints=tuple(joints))
+    arm = replace(BROKK_170, joints=tuple(joints), q_start=())
     expected = [[0, 0, 0], [0, 0, 0.2], [1, 0, 0.2], [1, 0, 0.4], [1, 1, 0.4]]
     np.testing.assert_allclose(skeleton(arm, np.array([0.0, np.pi / 2])), expected, atol=1e-12)

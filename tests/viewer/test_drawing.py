@@ -36,9 +36,9 @@ def drawn(*scenes, machine=BROKK_170, size=SIZE):
 
 def views(machine, q, in_view=NO_POINTS):
     """The cameras of a picture of one arm."""
-    layout = drawing._layout((0.0, 0.0, *map(float, SIZE)), machine.n, 0)
+    side_box, top_box, *_ = drawing._layout((0.0, 0.0, *map(float, SIZE)), machine.n, 0)
     p_tool = tool_position(forward_kinematics(machine, q))
-    side, top = cameras(machine, p_tool, layout.side, layout.top, in_view)
+    side, top = cameras(machine, p_tool, side_box, top_box, in_view)
     return side, top
 
 
@@ -156,7 +156,7 @@ def test_joint_rows__have_valve_bars_as_long_as_the_command(counts, fraction):
 def test_draw__cuts_off_no_text_and_puts_none_on_another(n, arms, size):
     name = "bucke" if arms > 1 else "cylinder_"
     joints = [replace(joint, name=f"{name}{i}") for i, joint in enumerate(BROKK_170.joints[:n])]
-    machine = replace(BROKK_170, joints=tuple(joints))
+    machine = replace(BROKK_170, joints=tuple(joints), q_start=())
     at_limits = scene(
         machine.column("q_max"),
         title="drive_of_the_long_name_2026-11-21.log",
