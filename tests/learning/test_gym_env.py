@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
-from helpers_machines import POSE, closed_form, obedient_net, small_net
+from helpers_machines import closed_form, obedient_net, small_net
 
-from brokk_min import env as task
 from brokk_min.env import TaskConfig
 from brokk_min.identification.net_file import save_net
 from brokk_min.learning.gym_env import TaskEnv, TaskVectorEnv
@@ -102,23 +101,6 @@ def test_step__a_pose_in_the_ground_terminates_without_reward(ticks):
     assert not reward[buried].any()
     assert (reward[~buried] > 0).all()
     assert np.array_equal(info["_final_obs"], terminated | truncated)
-
-
-def test_step__an_arm_driven_into_the_ground_terminates():
-    env = TaskEnv(obedient_net(BROKK_170), config=TaskConfig(noise=0.0))
-    env.reset(seed=9)
-    env.vector.state = task.initial_state(BROKK_170, POSE[None], np.zeros((1, 3)), plant=False)
-    down = np.array([0.0, -1.0, 0.0, 0.0])
-    for _ in range(300):
-        _, reward, terminated, truncated, info = env.step(down)
-        height = closed_form(env.vector.state.q)[1][0]
-        assert terminated == (height < 0)
-        assert not truncated
-        if terminated:
-            break
-    assert terminated
-    assert reward == 0
-    assert info["velocity_error"] > 0
 
 
 def test_task_env__is_one_row_of_the_vector():

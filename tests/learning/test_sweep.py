@@ -113,16 +113,6 @@ def test_run_seeds__a_failed_seed_leaves_the_others_alone(cluster):
     assert failed == {3: "losses/policy_loss: nan"}
 
 
-def test_run_seeds__on_a_cluster_give_the_same_files(cluster, tmp_path):
-    (tmp_path / "near").mkdir()
-    (tmp_path / "far").mkdir()
-    rows = seed_job(tmp_path / "near")(0)
-    results, failed = run_seeds(seed_job(tmp_path / "far"), [0], cluster)
-    assert (results, failed) == ({0: rows}, {})
-    for name in ("seed_0.npz", "seed_0.json"):
-        assert (tmp_path / "near" / name).read_bytes() == (tmp_path / "far" / name).read_bytes()
-
-
 def test_run_seeds__refuse_workers_of_several_threads():
     options = {"n_workers": 1, "processes": False, "dashboard_address": ":0", "protocol": "tcp"}
     with distributed.LocalCluster(threads_per_worker=2, **options) as cluster:
