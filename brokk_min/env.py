@@ -221,7 +221,6 @@ def action_to_pwm(machine: Machine, action: ArrayLike) -> Array:
         raise ValueError(f"action: expected (..., {len(machine.driven)}), got {a.shape}")
     if not np.isfinite(a).all():
         raise ValueError(f"action: expected finite numbers, got {a[~np.isfinite(a)][0]}")
-    a = np.asarray(np.clip(a, -1.0, 1.0))
     limit = machine.pwm_limit / PWM_MAX
     crossing = np.clip(a / COMPENSATION, -1.0, 1.0)
     u = np.zeros((*a.shape[:-1], machine.n), a.dtype)
