@@ -209,7 +209,7 @@ def action_to_pwm(machine: Machine, action: ArrayLike) -> Array:
     """Commands u (..., n) of full command from actions of the driven joints (..., n_driven).
 
     u = dead_zone clip(a / 0.01, -1, 1) + (limit - dead_zone) a: dead-zone compensation, as the PIDs
-    have it. ValueError: a wrong shape, a number that is not finite. Paper: Sec. 3.2, Sec. 3.4
+    have it. ValueError: a wrong shape, a number that is not finite. Paper: Sec. 3.3, Sec. 3.4
 
     Example:
         >>> from brokk_min.machine import BROKK_170
