@@ -209,7 +209,7 @@ def action_to_pwm(machine: Machine, action: ArrayLike) -> Array:
     """Commands u (..., n) of full command from actions of the driven joints (..., n_driven).
 
     u = dead_zone clip(a / 0.01, -1, 1) + (limit - dead_zone) a: dead-zone compensation, as the PIDs
-    have it. ValueError: a wrong shape, a number that is not finite. Paper: Sec. 3.2, Sec. 3.4
+    have it. ValueError: a wrong shape, a number that is not finite. Paper: Sec. 3.3, Sec. 3.4
 
     Example:
         >>> from brokk_min.machine import BROKK_170
@@ -221,7 +221,6 @@ def action_to_pwm(machine: Machine, action: ArrayLike) -> Array:
         raise ValueError(f"action: expected (..., {len(machine.driven)}), got {a.shape}")
     if not np.isfinite(a).all():
         raise ValueError(f"action: expected finite numbers, got {a[~np.isfinite(a)][0]}")
-    a = np.asarray(np.clip(a, -1.0, 1.0))
     limit = machine.pwm_limit / PWM_MAX
     crossing = np.clip(a / COMPENSATION, -1.0, 1.0)
     u = np.zeros((*a.shape[:-1], machine.n), a.dtype)

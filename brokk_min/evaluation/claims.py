@@ -29,7 +29,9 @@ from brokk_min.jacobian import JacobianController, manipulability
 from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.machine import Array, Machine
 
-TEXTS: dict[str, dict[str, Any]] = tomllib.loads(Path(__file__).with_suffix(".toml").read_text())
+TEXTS: dict[str, dict[str, Any]] = tomllib.loads(
+    Path(__file__).with_suffix(".toml").read_text("utf-8")
+)
 STRONG, WEAK = PAPER_BASELINES  # damping
 VERDICTS = {True: "holds here", False: "does not hold here", None: "was not measured"}
 

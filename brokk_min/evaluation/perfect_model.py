@@ -45,7 +45,9 @@ class PerfectModel:
     dither: float = 0.04  # valve opening (tuned)
 
     def start(self, num: int) -> Plan:
-        """The plant at rest at `poses`, valves closed; `num` is a multiple of their number."""
+        """The plant at rest at `poses`, valves closed; ValueError: no multiple of their number."""
+        if num % len(self.poses):
+            raise ValueError(f"poses: expected {num} or a part of it, got {len(self.poses)}")
         q = np.tile(self.poses, (num // len(self.poses), 1))
         closed = np.zeros((num, sum(BLOCKS), len(self.machine.driven)))
         return Plan(plant_reset(self.machine, q), closed, 0)

@@ -133,6 +133,16 @@ def paper_recipe(
     return {"test": validation.score(net, test), "sim_to_real": gap}
 
 
+def driven_log(machine: Machine, traces: Traces, controller: str) -> Log:
+    """Commands and encoder angles of a controller's first 16 runs of each sequence."""
+    recordings = []
+    for (name, sequence), trace in traces.items():
+        for i in range(min(16, trace.q.shape[1]) if name == controller else 0):
+            run = (trace.u[:, i].astype(float), trace.q_measured[:, i].astype(float))
+            recordings.append((f"{controller}_{sequence}_{i:02d}", *run))
+    return logs.machine_log(machine, recordings)
+
+
 def measure(
     machine: Machine,
     net: ActuatorNet,
@@ -154,7 +164,10 @@ def measure(
     meta = metrics.metadata(machine, seed) | baselines.gains_metadata(machine, policy.net)
     results = {
         "meta": meta | {"effort": asdict(budget)},
-        "actuator": {"test": validation.score(net, test)},
+        "actuator": {
+            "test": validation.score(net, test),
+            "driven_by_policy": validation.score(net, driven_log(machine, task, "rl")),
+        },
         "preliminary": numbers,
         "net_claims": [claim.to_json() for claim in claims.net_claims(numbers)],
         "gains": baselines.gains_table(pids),

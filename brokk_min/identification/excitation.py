@@ -134,8 +134,12 @@ def collect(machine: Machine, hours: float, excitation: str, rng: np.random.Gene
 
     A segment begins with `history` samples of an idle valve. The return to its start is recorded as
     `..._return`; `read_log` drops it. Sines start at mid range, as in the paper, rich excitation at
-    random angles. Paper: Sec. 3.3
+    random angles. ValueError: another excitation, or hours that are not positive. Paper: Sec. 3.3
     """
+    if excitation not in EXCITATIONS:
+        raise ValueError(f"excitation: expected one of {list(EXCITATIONS)}, got {excitation!r}")
+    if not 0 < hours < np.inf:
+        raise ValueError(f"hours: expected above 0, got {hours}")
     goal = max(machine.history + 2, round(hours * 3600 * machine.rate))  # samples per joint
     rows = int(np.clip(goal // 300, 1, 100))  # segments of a joint that are simulated at once
     count = np.zeros(machine.n, int)

@@ -412,6 +412,47 @@ def test_transition__on_the_plant_is_the_plant(machine, seed):
         np.testing.assert_array_equal(state.history[..., 2, -1], u.astype(np.float32))
 
 
+@pytest.mark.parametrize("plant", [True, False])
+def test_transition__measures_and_integrates_as_the_hardware_does(plant):
+    """`update_history` of the encoder angles; velocity and lowest point of the true pose."""
+    machine = replace(BROKK_170, encoder_bits=8)  # measured and true pose differ
+    rng = np.random.default_rng(11)
+    net = None if plant else small_net(machine, rng)
+    state = initial_state(machine, np.stack([POSE, POSE + 0.05]), rng.normal(size=(2, 3)), plant)
+    for _ in range(12):
+        u = action_to_pwm(machine, rng.uniform(-1, 1, (2, 4)).astype(np.float32))
+        assert u.dtype == np.float32
+        after = transition(machine, net, state, u)
+        q = read_encoder(machine, after.q)
+        seen = state.history, u, q, state.v_goal, state.error_integral
+        history, integral = update_history(machine, *seen)
+        np.testing.assert_array_equal(after.history, history)
+        np.testing.assert_allclose(after.error_integral, integral, atol=1e-8)
+        ahead, behind = (closed_form(after.q + s * 1e-6 * after.q_dot) for s in (1, -1))
+        np.testing.assert_allclose(after.v_tool, (ahead[0] - behind[0]) / 2e-6, atol=1e-5)
+        np.testing.assert_allclose(after.lowest, closed_form(after.q)[1], atol=1e-5)
+        for name in ("history", "true_history", "v_goal", "v_tool", "error_integral", "lowest"):
+            assert getattr(after, name).dtype == getattr(state, name).dtype == np.float32, name
+        assert after.ticks.dtype == state.ticks.dtype == np.int64
+        assert after.q.dtype == after.q_dot.dtype == state.q_dot.dtype == np.float64
+        state = after
+    assert np.abs(state.q - POSE).max() > 0.01
+
+
+def test_measure__of_a_batch_gives_each_row_its_own_noise():
+    rng = np.random.default_rng(12)
+    history = np.stack([numbered_history(), numbered_history() + np.float32(0.02)])
+    noise = rng.uniform(-0.1, 0.1, (2, len(sensor_std(BROKK_170)))).astype(np.float32)
+    zero = np.zeros((2, 3), np.float32)
+    batch = measure(BROKK_170, history, zero, zero, noise)
+    for i in range(2):
+        alone = measure(BROKK_170, history[i], ZERO, ZERO, noise[i])
+        for together, single in zip(batch, alone, strict=True):
+            np.testing.assert_allclose(together[i], single, atol=1e-6)
+    in_float64 = measure(BROKK_170, history.astype(float), zero, zero, noise)
+    assert features(BROKK_170, in_float64).dtype == np.float32
+
+
 def test_transition__refuses_a_state_without_plant_and_nets():
     state = initial_state(BROKK_170, POSE, ZERO, plant=False)
     with pytest.raises(

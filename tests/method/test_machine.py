@@ -64,6 +64,9 @@ BAD = [
     (with_joint(4, cylinder_base=-0.1), ["q5.cylinder_base", "0", "-0.1"]),
     (with_joint(4, cylinder_rod=0.0), ["q5.cylinder_rod", "1e-06", "got 0.0"]),
     (with_joint(4, cylinder_angle=-0.01), ["q5.cylinder_angle", "(0, pi)", "-0.010 to 1.990"]),
+    (with_joint(4, cylinder_angle=0.0), ["q5.cylinder_angle", "(0, pi)", "0.000 to 2.000"]),
+    (with_joint(4, q_max=np.pi - 0.4), ["q5.cylinder_angle", "(0, pi)", "0.400 to 3.142"]),
+    (with_joint(1, encoder_node=1), ["joints", "different encoder nodes", "[1, 1, 3, 4, 5]"]),
     (with_joint(4, cylinder_angle=1.2), ["q5.cylinder_angle", "(0, pi)", "1.200 to 3.200"]),
     (with_joint(4, cylinder_area=0.0), ["q5.cylinder_area", "got 0.0"]),
     (with_joint(4, speed_positive=0.0), ["q5.speed_positive", "got 0.0"]),
@@ -256,6 +259,13 @@ def test_commands_that_no_byte_can_carry_are_refused(u):
     with pytest.raises(ValueError, match=r"u: expected within \[-1, 1\], got ") as caught:
         encode_pwm([0.0, u])
     assert str(caught.value).endswith(str(u))
+
+
+@pytest.mark.parametrize("u_byte", [-1, 256, 300])
+def test_decode_pwm__refuses_what_is_no_byte(u_byte):
+    with pytest.raises(ValueError) as caught:
+        decode_pwm([0, u_byte])
+    assert str(caught.value) == f"u_byte: expected 0 to 255, got {u_byte}"
 
 
 # --- the limit ------------------------------------------------------------------------------------

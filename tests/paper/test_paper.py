@@ -83,7 +83,7 @@ def place_of_code(symbol: str) -> str:
 
 
 @cache
-def tests() -> dict[str, list[Path]]:
+def all_tests() -> dict[str, list[Path]]:
     """Files of each test function of the suite."""
     found: dict[str, list[Path]] = {}
     for path in sorted((ROOT / "tests").rglob("test_*.py")):
@@ -94,7 +94,7 @@ def tests() -> dict[str, list[Path]]:
 
 
 def file_of_test(name: str) -> Path:
-    paths = tests().get(name, [])
+    paths = all_tests().get(name, [])
     if len(paths) != 1:
         raise ValueError(f"{name}: expected one test of this name, got {paths}")
     return paths[0]
