@@ -11,6 +11,7 @@ from helpers_cli import run
 from brokk_min.cli.commands import split
 from brokk_min.evaluation import baselines
 from brokk_min.evaluation.metrics import summary
+from brokk_min.evaluation.sequences import read_starts, start_kinds
 from brokk_min.identification.files import SHIPPED
 from brokk_min.identification.logs import Log, Recording, read_log, write_log
 from brokk_min.identification.net_file import load_net
@@ -254,3 +255,9 @@ def test_shipped_policy__beats_the_papers_controllers(tmp_path):
     now = {name: row["all"]["velocity_error_mean"] for name, row in rows.items()}
     for errors in (before, now):
         assert 0 < errors["rl"] < min(errors["jacobian_pid_k0.1"], errors["jacobian_pid_k0.05"])
+
+
+def test_starts__are_drawn_into_a_file_that_reads_back(tmp_path):
+    assert run("starts --num 4 --out", tmp_path / "s.csv") == 0
+    starts = read_starts(tmp_path / "s.csv", BROKK_170)
+    assert start_kinds(BROKK_170, starts) == ["workspace", "limits", "workspace", "extended"]
