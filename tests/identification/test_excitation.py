@@ -215,3 +215,16 @@ def test_task_log__starts_at_given_angles():
     log = task_log(BROKK_170, 2, 0.1, np.random.default_rng(0), pose)
     for recording in log.recordings:
         np.testing.assert_array_equal(recording.q[0], read_encoder(BROKK_170, pose))
+
+
+@pytest.mark.parametrize(
+    ("hours", "excitation", "message"),
+    [
+        (0.0, "sine", "hours: expected above 0, got 0.0"),
+        (np.inf, "rich", "hours: expected above 0, got inf"),
+        (1.0, "noise", r"excitation: expected one of \['sine', 'rich'\], got 'noise'"),
+    ],
+)
+def test_collect__refuses_hours_and_excitations_that_are_none(hours, excitation, message):
+    with pytest.raises(ValueError, match=message):
+        collect(BROKK_170, hours, excitation, np.random.default_rng(0))
