@@ -14,7 +14,7 @@ from brokk_min.evaluation.metrics import summary
 from brokk_min.evaluation.sequences import read_starts, start_kinds
 from brokk_min.identification.files import SHIPPED
 from brokk_min.identification.logs import Log, Recording, read_log, write_log
-from brokk_min.identification.net_file import load_net
+from brokk_min.identification.net_file import load_net, save_net
 from brokk_min.learning.policy import load_policy
 from brokk_min.machine import BROKK_170
 
@@ -261,3 +261,16 @@ def test_starts__are_drawn_into_a_file_that_reads_back(tmp_path):
     assert run("starts --num 4 --out", tmp_path / "s.csv") == 0
     starts = read_starts(tmp_path / "s.csv", BROKK_170)
     assert start_kinds(BROKK_170, starts) == ["workspace", "limits", "workspace", "extended"]
+
+
+def test_preliminary__writes_figures_and_numbers(tmp_path):
+    net = load_policy(SHIPPED / "brokk170" / "policy.npz", BROKK_170).net
+    save_net(tmp_path / "net.npz", net)
+    assert (
+        run("preliminary", "--actuator", tmp_path / "net.npz", "--out", tmp_path / "a" / "b") == 0
+    )
+    found = json.loads((tmp_path / "a" / "b" / "preliminary.json").read_text())
+    assert found["meta"]["actuator"] == str(tmp_path / "net.npz")
+    assert found["sim_to_real"]["tool"]["position_error_mean"] == pytest.approx(0.018, abs=0.001)
+    figures = {path.name for path in (tmp_path / "a" / "b").glob("*.png")}
+    assert figures == {"preliminary.png", "sim_to_real.png"}
