@@ -20,24 +20,26 @@ PWM_MAX = 127  # counts of full command; paper: [0,127] is positive, [255,128] n
 
 
 def number(
-    unit: str, low: float = -np.inf, high: float = np.inf, default: Any = dataclasses.MISSING
+    unit: str, low: float | str = -np.inf, high: float = np.inf, default: Any = dataclasses.MISSING
 ) -> Any:
-    """A field with its unit and its range, both ends included."""
+    """A field with its unit and its range, both ends included; `low` may name another field."""
     return dataclasses.field(default=default, metadata={"unit": unit, "low": low, "high": high})
 
 
-def check_numbers(owner: Machine | Joint, label: str) -> None:
+def check_numbers(owner: Any, label: str = "") -> None:
     """ValueError: a number that is not finite, not whole where it must be, or out of its range."""
     for field in dataclasses.fields(owner):
-        if "unit" not in field.metadata:
-            continue
         value = getattr(owner, field.name)
-        whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-        if not ((whole or isinstance(value, float | np.floating)) and np.isfinite(value)):
-            raise ValueError(f"{label}{field.name}: expected a finite number, got {value!r}")
-        if field.type == "int" and not whole:
-            raise ValueError(f"{label}{field.name}: expected a whole number, got {value!r}")
+        if field.type == "bool" and not isinstance(value, bool):
+            raise ValueError(f"{label}{field.name}: expected True or False, got {value!r}")
+        if "unit" not in field.metadata or (value is None and "None" in field.type):
+            continue
+        kind = "whole" if field.type == "int" else "finite"
+        types: Any = (int, np.integer) if kind == "whole" else (int, float, np.integer, np.floating)
+        if isinstance(value, bool) or not isinstance(value, types) or not abs(value) < np.inf:
+            raise ValueError(f"{label}{field.name}: expected a {kind} number, got {value!r}")
         low, high = field.metadata["low"], field.metadata["high"]
+        low = getattr(owner, low) if isinstance(low, str) else low
         if not low <= value <= high:
             raise ValueError(f"{label}{field.name}: expected {low} to {high}, got {value!r}")
 
@@ -80,10 +82,8 @@ class Joint:
         low = self.cylinder_angle + self.q_min
         high = self.cylinder_angle + self.q_max
         if self.cylinder_base > 0 and not 0 < low < high < np.pi:
-            raise ValueError(
-                f"{self.name}.cylinder_angle: expected the triangle's angle within (0, pi) "
-                f"over the joint's range, got {low:.3f} to {high:.3f}"
-            )
+            expected = "expected the triangle's angle within (0, pi) over the joint's range"
+            raise ValueError(f"{self.name}.cylinder_angle: {expected}, got {low:.3f} to {high:.3f}")
 
 
 @dataclass(frozen=True)
