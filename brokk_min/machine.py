@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,15 +28,17 @@ def number(
 
 def check_numbers(owner: Any, label: str = "") -> None:
     """ValueError: a number that is not finite, not whole where it must be, or out of its range."""
+    hints = get_type_hints(type(owner))
     for field in dataclasses.fields(owner):
-        value = getattr(owner, field.name)
-        if field.type == "bool" and not isinstance(value, bool):
-            raise ValueError(f"{label}{field.name}: expected True or False, got {value!r}")
-        if "unit" not in field.metadata or (value is None and "None" in field.type):
+        value, hint = getattr(owner, field.name), hints[field.name]
+        values = (True, False) if hint is bool else get_args(hint)
+        if get_origin(hint) in (None, Literal) and values and value not in values:
+            raise ValueError(f"{label}{field.name}: expected one of {values}, got {value!r}")
+        if "unit" not in field.metadata or (value is None and type(None) in values):
             continue
-        kind = "whole" if field.type == "int" else "finite"
-        types: Any = (int, np.integer) if kind == "whole" else (int, float, np.integer, np.floating)
+        types: Any = (int, np.integer) if hint is int else (int, float, np.integer, np.floating)
         if isinstance(value, bool) or not isinstance(value, types) or not abs(value) < np.inf:
+            kind = "whole" if hint is int else "finite"
             raise ValueError(f"{label}{field.name}: expected a {kind} number, got {value!r}")
         low, high = field.metadata["low"], field.metadata["high"]
         low = getattr(owner, low) if isinstance(low, str) else low
