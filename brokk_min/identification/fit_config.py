@@ -15,7 +15,7 @@ class FitConfig:
     steps: int = number("steps", 0, 10**12, 16000)  # Adam steps.
     batch_size: int = number("1", 1, 10**6, 512)  # Windows per joint in each step.
     learning_rate: float = number("1", 1e-9, 1, 4e-3)  # Of Adam; falls to zero twice, by a cosine.
-    noise: float = number("1", 0, 1000, 0.1)  # Of velocity inputs, in deviations (paper: 0).
+    noise: float = number("1", 0, 1000, 0.1)  # Of velocity inputs, in their deviations.
     hidden: int = number("1", 1, 10**4, 32)  # Units in each of the two hidden layers (paper: 32).
     history: int = number("samples", 2, 1000, 13)  # Of angle, velocity and command (paper: 13).
     rollout: int = number("ticks", 1, 10**6, 8)  # Of the errors in the last third (paper: 1).
