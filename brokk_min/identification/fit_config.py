@@ -20,7 +20,7 @@ class FitConfig:
     history: int = number("samples", 2, 1000, 13)  # Of angle, velocity and command (paper: 13).
     rollout: int = number("ticks", 1, 10**6, 8)  # Of the errors in the last third (paper: 1).
     dead_zone: float | None = number("1", 0, 0.99, None)
-    """Command within which no valve opens; by default the known machine's, else 0, as in the paper."""
+    """Command within which no valve opens; by default the known machine's, else 0."""
     __post_init__ = check_numbers  # type: ignore[misc]
 
 
