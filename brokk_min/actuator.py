@@ -12,10 +12,11 @@ from functools import lru_cache
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from brokk_min.machine import Array, Machine, estimate_velocity, valve_opening
 
+CLOSE_AFTER = 0.5  # s of a zero goal, assumed: then the valves close
 STANDSTILL = 0.002  # rad, assumed: little more than one step of a 12-bit encoder
 MU = 50.0  # assumed: the mu law is about linear below 1/50 of full opening
 
@@ -84,9 +85,7 @@ def _euler_step(machine: Machine, state: PlantState, opening: Array) -> PlantSta
     K = np.where(s > 0, m.column("speed_positive"), m.column("speed_negative"))
     v_steady = K * s * g  # of the cylinder, were it alone
     flow = np.sum(np.abs(m.column("cylinder_area") * v_steady), axis=-1, keepdims=True)
-    pump = np.minimum(
-        1.0, m.pump_flow / np.maximum(flow, 1e-12)
-    )  # share of the flow: min(1, Q / sum |A v_steady|)
+    pump = np.minimum(1.0, m.pump_flow / np.maximum(flow, 1e-12))  # min(1, Q / sum |A v_steady|)
     q_next = q + dt * v / lever_arm(m, q)  # dq/dt = v / r(q)
     v_next = v + dt * (v_steady * pump - v) / m.tau_cylinder  # dv/dt = (v_steady pump - v) / tau_v
     q_next = np.clip(q_next, m.column("q_min"), m.column("q_max"))
@@ -123,6 +122,19 @@ def append_command(history: Array, u: ArrayLike) -> Array:
     result[..., 2, :-1] = history[..., 2, 1:]
     result[..., 2, -1] = u
     return result
+
+
+def close_valves(
+    machine: Machine, valves: str, u: Array, v_goal: Array, rest_ticks: NDArray[np.int64]
+) -> tuple[Array, NDArray[np.int64]]:
+    """Commands u (..., n): 0 after `CLOSE_AFTER` of a zero goal if `valves` are to be "closed".
+
+    Then the joints stand, but the next motion begins 0.3 s later. `rest_ticks` (...) counts the
+    ticks of a zero goal (..., 3) before this one; it is returned with this one counted.
+    """
+    rest_ticks = np.where(v_goal.any(axis=-1), 0, rest_ticks + 1)
+    resting = (valves == "closed") & (rest_ticks > CLOSE_AFTER * machine.rate)
+    return np.where(resting[..., None], np.zeros_like(u), u), rest_ticks
 
 
 def append_sample(history: Array, u: ArrayLike, q: Array, window: int, dt: float) -> Array:
@@ -233,9 +245,8 @@ class ActuatorNet:
         """
         n = len(self.joints)
         if history.shape[-3:] != (n, 3, self.history):
-            raise ValueError(
-                f"history: expected (..., {n}, 3, {self.history}), got {history.shape}"
-            )
+            expected = f"expected (..., {n}, 3, {self.history})"
+            raise ValueError(f"history: {expected}, got {history.shape}")
         x = history.copy()
         x[..., 2, :] = mu_law(x[..., 2, :], self.dead_zone)
         return x.reshape(*x.shape[:-2], 3 * self.history)
