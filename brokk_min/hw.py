@@ -66,7 +66,7 @@ class Drive:
 
     def run(self, show: Callable[[str], object] = lambda text: None) -> None:
         """Tick until the operator, SIGINT or SIGTERM stops it; the last frame is always neutral."""
-        gc.freeze()  # no long garbage collection in the middle of a tick
+        gc.disable()  # no garbage collection in the middle of a tick
         try:
             with stop_signals() as self.signals:
                 while self.tick():
@@ -76,6 +76,8 @@ class Drive:
             self.exception = "the loop ended"
             self.send_command(np.zeros(self.machine.n), self.nodes.counts(), self.bus.now())
             raise
+        finally:
+            gc.enable()
 
     def tick(self) -> bool:
         """Wait for the deadline, then one tick; False if it was the last."""
@@ -86,12 +88,8 @@ class Drive:
         self.nodes.frames *= 2  # a position from before its SYNC is as wrong as a doubled one
         with self.catch_errors():
             self.bus.send(canopen.SYNC, b"")
-            self.nodes.listen(
-                self.bus,
-                self.bus.now() + ANSWER_TIME * self.machine.dt,
-                BUSY_WAIT,
-                until_complete=True,
-            )
+            answer_by = self.bus.now() + ANSWER_TIME * self.machine.dt
+            self.nodes.listen(self.bus, answer_by, BUSY_WAIT, until_complete=True)
         counts = self.nodes.counts()
         command = np.zeros(self.machine.n)
         with self.catch_errors():

@@ -128,10 +128,9 @@ class Machine:
         node = self.controller_node
         if node in nodes:
             raise ValueError(f"controller_node: expected none of {nodes}, got {node}")
-        for zone in ("dead_zone", "largest_dead_zone"):
-            if not getattr(self, zone) * PWM_MAX < self.pwm_limit:  # no valve would ever open
-                limit = f"{self.pwm_limit}/{PWM_MAX}"
-                raise ValueError(f"{zone}: expected below {limit}, got {getattr(self, zone)!r}")
+        zone = max(self.dead_zone, self.largest_dead_zone)
+        if not zone * PWM_MAX < self.pwm_limit:  # no valve would ever open
+            raise ValueError(f"dead_zone: expected below {self.pwm_limit}/{PWM_MAX}, got {zone!r}")
         if self.q_start and len(self.q_start) != self.n:
             raise ValueError(f"q_start: expected {self.n} angles or none, got {self.q_start}")
         steps = self.dt / self.plant_dt
@@ -285,8 +284,7 @@ def estimate_velocity(q: ArrayLike, samples: int, dt: float) -> NDArray[np.float
     return velocity
 
 
-# Joints of the Brokk 170. Sources: a, alpha, d, theta and ranges assumed, cylinders assumed; of the
-# fastest motions those of q5 are the paper's (Sec. 3.2), the others assumed.
+# Joints of the Brokk 170. Sources: all assumed, but the fastest motions of q5 (paper, Sec. 3.2).
 # fmt: off
 _DH = [
     # name driven  a [m]  alpha [rad]  d [m]  theta [rad]    q_min, q_max [rad]

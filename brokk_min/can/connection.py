@@ -1,7 +1,10 @@
 """The CAN bus through python-can, and its log; python-can is imported when a bus is opened."""
 
+import ctypes
+import os
 import select
 import signal
+import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -144,3 +147,15 @@ def stop_signals() -> Iterator[list[int]]:
     finally:
         for number, handler in zip(numbers, handlers, strict=True):
             signal.signal(number, handler)
+
+
+def lock_memory() -> bool:
+    """Keep the pages of this process in memory from when they are used; False: not allowed."""
+    flags = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT of Linux
+    return sys.platform == "linux" and bool(ctypes.CDLL(None).mlockall(flags) == 0)
+
+
+def has_real_time_priority() -> bool:
+    """Does the system prefer this process to all ordinary ones? (Linux)"""
+    real_time = [getattr(os, name, None) for name in ("SCHED_FIFO", "SCHED_RR")]
+    return sys.platform == "linux" and os.sched_getscheduler(0) in real_time
