@@ -39,6 +39,8 @@ while True:
         can_id = 0x300 + sent % 256
         bus.send(can.Message(arbitration_id=can_id, data=bytes(8), is_extended_id=False))
         sent += 1
+        if sent % 500 == 0:
+            print(sent / (time.monotonic() - start), flush=True)
     time.sleep(0.001)
 """
 PERCENTILES = {"median": 50, "p99": 99, "p99.9": 99.9, "max": 100}
@@ -113,7 +115,7 @@ def main(options: Options) -> None:
                 processes.append(subprocess.Popen([sys.executable, "-c", "while True: pass"]))
         if options.foreign:
             sender = [sys.executable, "-c", SENDER, *BUS, str(options.foreign)]
-            processes.append(subprocess.Popen(sender))
+            processes.append(subprocess.Popen(sender, stdout=(Path(folder) / "rate").open("w")))
         try:
             time.sleep(10)
             ended = subprocess.run(
@@ -124,8 +126,9 @@ def main(options: Options) -> None:
             for process in processes:
                 process.kill()
                 process.wait()
+        rates = (Path(folder) / "rate").read_text().split() if options.foreign else ["0"]
     result: dict[str, Any] = {"seconds": options.seconds, "busy": options.busy}
-    result |= {"realtime": options.realtime, "foreign": options.foreign, "exit": ended.returncode}
+    result |= {"realtime": options.realtime, "foreign": float(rates[-1]), "exit": ended.returncode}
     result |= {"said": ended.stderr.strip()[-300:], **figures(frames)}
     write(result, options.json)
 

@@ -331,19 +331,19 @@ class Outcome(NamedTuple):
     commands: tuple[np.ndarray, np.ndarray]  # `World.commands` since the fault
 
 
-def measure(cause: Callable[[Fault], Any], phase: float, seconds: float = 0.8) -> Outcome:
-    """Drive for 1.2 s, let it go wrong `phase` [s] after a SYNC, and go on for `seconds`."""
+def measure(cause: Callable[[Fault], Any], phase: float, seconds: float = 0.6) -> Outcome:
+    """Drive for a second, let it go wrong `phase` [s] after a SYNC, and go on for `seconds`."""
     operator, controller = HoldingOperator(), ConstantCommand(*COMMAND)
     world = World(controller, operator)
     world.drive.begin()
-    world.run(1.2)
+    world.run(1.0)
     world.sleep(max(0.0, world.syncs[-1] + phase - world.t))
     assert world.commands[1][-1].tolist() == list(COMMAND), "it drove"
     begun = world.t
     cause(Fault(world, operator, controller))
     world.run(seconds)
     end, words = world.t, world.drive.reason
-    world.sleep(max(0.0, begun + seconds + 0.4 - world.t))
+    world.sleep(max(0.0, begun + seconds + 0.3 - world.t))
     world.close()
     times, m = world.commands
     times, m = times[times > begun], m[times > begun]
