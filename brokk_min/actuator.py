@@ -130,8 +130,7 @@ def append_sample(history: Array, u: ArrayLike, q: Array, window: int, dt: float
 
     The velocity is the slope of the newest `window` angles.
     """
-    result = np.empty_like(history)
-    result[..., :-1] = history[..., 1:]
+    result = np.roll(history, -1)  # of all rows at once: the newest samples follow
     result[..., 0, -1] = q
     result[..., 1, -1] = estimate_velocity(result[..., 0, :], window, dt)
     result[..., 2, -1] = u
@@ -222,9 +221,10 @@ class ActuatorNet:
         zone that moved less than `STANDSTILL` in it stands still; the net alone would creep.
         """
         velocity = self.forward(history)[0]
-        no_command = (np.abs(history[..., 2, :]) <= self.dead_zone).all(axis=-1)
         no_motion = np.abs(history[..., 0, -1] - history[..., 0, 0]) < STANDSTILL
-        return np.where(no_command & no_motion, np.float32(0), velocity)
+        command = (np.abs(history[no_motion][:, 2]) > self.dead_zone).any(axis=-1)
+        velocity[no_motion] = np.where(command, velocity[no_motion], 0)
+        return velocity
 
     def inputs(self, history: Array) -> Array:
         """Histories (..., n, 3, H) as the first layer reads them, (..., n, 3 H).
@@ -237,7 +237,7 @@ class ActuatorNet:
                 f"history: expected (..., {n}, 3, {self.history}), got {history.shape}"
             )
         x = history.copy()
-        x[..., 2, :] = mu_law(x[..., 2, :], self.dead_zone)
+        x[..., 2, :] = mu_law(x[..., 2, :].copy(), self.dead_zone)  # contiguous: half the time
         return x.reshape(*x.shape[:-2], 3 * self.history)
 
     def forward(self, history: Array) -> tuple[Array, Array, Array, Array]:
@@ -245,8 +245,12 @@ class ActuatorNet:
         x = self.inputs(history)
         x = x.reshape(-1, *x.shape[-2:]).swapaxes(0, 1)  # (n, batch, 3 H)
         w1, b1, w2, b2, w3, b3 = folded_weights(self)
-        hidden1 = np.maximum(x @ w1 + b1, 0)
-        hidden2 = np.maximum(hidden1 @ w2 + b2, 0)
+        hidden1 = x @ w1
+        hidden1 += b1
+        np.maximum(hidden1, 0, out=hidden1)
+        hidden2 = hidden1 @ w2
+        hidden2 += b2
+        np.maximum(hidden2, 0, out=hidden2)
         y = 1 / (1 + np.exp(-(hidden2 @ w3 + b3)))
         low, high = self.output_low[:, None], self.output_high[:, None]
         velocity: Array = (low + (high - low) * y[..., 0]).T
@@ -282,14 +286,13 @@ def net_step(
 ) -> Array:
     """Angles [rad] (..., n) of a machine whose driven joints the nets move, one tick on.
 
-    q_{t+1} = q_t + dt net(history, u), within the joints' ranges; `history` (..., n, 3, H) is
-    without the command `u` (..., n) of this tick. ValueError: no nets.
+    q_{t+1} = q_t + dt net(history, u), within the joints' ranges; `history` of the driven joints
+    (..., n_driven, 3, H) is without the command `u` (..., n) of this tick. ValueError: no nets.
     """
     if net is None:
         raise ValueError("net: expected nets for a state without a plant, got None")
     driven = machine.driven
-    inputs = append_command(history.take(driven, axis=-3), u[..., driven])
-    moved = q[..., driven] + machine.dt * net.predict(inputs)
+    moved = q[..., driven] + machine.dt * net.predict(append_command(history, u[..., driven]))
     low, high = machine.column("q_min")[driven], machine.column("q_max")[driven]
     q = q.copy()
     q[..., driven] = np.clip(moved, low, high)
