@@ -105,7 +105,8 @@ def export_policy(
             weights += [layer.weight.T.detach().numpy().copy(), layer.bias.detach().numpy().copy()]
     if task.paper:
         weights[0] = weights[0] * paper_weights(machine)[:, None]
-    return Policy(contract(machine), about, *observation_scale(machine), tuple(weights), net)
+    scale = observation_scale(machine)
+    return Policy(contract(machine), about, *scale, tuple(weights), net, task.valves)
 
 
 class TrainingLog:
