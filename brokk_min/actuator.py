@@ -85,9 +85,7 @@ def _euler_step(machine: Machine, state: PlantState, opening: Array) -> PlantSta
     K = np.where(s > 0, m.column("speed_positive"), m.column("speed_negative"))
     v_steady = K * s * g  # of the cylinder, were it alone
     flow = np.sum(np.abs(m.column("cylinder_area") * v_steady), axis=-1, keepdims=True)
-    pump = np.minimum(
-        1.0, m.pump_flow / np.maximum(flow, 1e-12)
-    )  # share of the flow: min(1, Q / sum |A v_steady|)
+    pump = np.minimum(1.0, m.pump_flow / np.maximum(flow, 1e-12))  # min(1, Q / sum |A v_steady|)
     q_next = q + dt * v / lever_arm(m, q)  # dq/dt = v / r(q)
     v_next = v + dt * (v_steady * pump - v) / m.tau_cylinder  # dv/dt = (v_steady pump - v) / tau_v
     q_next = np.clip(q_next, m.column("q_min"), m.column("q_max"))
@@ -196,8 +194,7 @@ def mu_law(u: ArrayLike, dead_zone: float) -> Array:
 class ActuatorNet:
     """One small net per joint: history in, mean velocity over the coming tick out.
 
-    Weights are stacked over joints: (n, 3 H, 32), (n, 32), (n, 32, 32), (n, 32), (n, 32, 1) and
-    (n, 1).
+    Weights, joint by joint: (n, 3 H, 32), (n, 32), (n, 32, 32), (n, 32), (n, 32, 1) and (n, 1).
     Paper: Table 1 and Sec. 3.3 (39 inputs, two hidden layers of 32, ReLU, sigmoid output)
     """
 
@@ -259,12 +256,8 @@ class ActuatorNet:
         x = self.inputs(history)
         x = x.reshape(-1, *x.shape[-2:]).swapaxes(0, 1)  # (n, batch, 3 H)
         w1, b1, w2, b2, w3, b3 = folded_weights(self)
-        hidden1 = x @ w1
-        hidden1 += b1
-        np.maximum(hidden1, 0, out=hidden1)
-        hidden2 = hidden1 @ w2
-        hidden2 += b2
-        np.maximum(hidden2, 0, out=hidden2)
+        hidden1 = np.maximum(x @ w1 + b1, 0)
+        hidden2 = np.maximum(hidden1 @ w2 + b2, 0)
         y = 1 / (1 + np.exp(-(hidden2 @ w3 + b3)))
         low, high = self.output_low[:, None], self.output_high[:, None]
         velocity: Array = (low + (high - low) * y[..., 0]).T
