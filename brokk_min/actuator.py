@@ -244,9 +244,8 @@ class ActuatorNet:
         """
         n = len(self.joints)
         if history.shape[-3:] != (n, 3, self.history):
-            raise ValueError(
-                f"history: expected (..., {n}, 3, {self.history}), got {history.shape}"
-            )
+            expected = f"expected (..., {n}, 3, {self.history})"
+            raise ValueError(f"history: {expected}, got {history.shape}")
         x = history.copy()
         x[..., 2, :] = mu_law(x[..., 2, :].copy(), self.dead_zone)  # contiguous: half the time
         return x.reshape(*x.shape[:-2], 3 * self.history)
