@@ -54,8 +54,7 @@ def lever_arm(machine: Machine, q: ArrayLike) -> Array:
     a, b = machine.column("cylinder_base"), machine.column("cylinder_rod")
     gamma = machine.column("cylinder_angle") + np.asarray(q)
     length = np.sqrt(a**2 + b**2 - 2 * a * b * np.cos(gamma))
-    r: Array = np.where(a > 0, a * b * np.sin(gamma) / length, b)
-    return r
+    return np.where(a > 0, a * b * np.sin(gamma) / length, b)
 
 
 def plant_step(machine: Machine, state: PlantState, u: ArrayLike) -> PlantState:
@@ -232,9 +231,8 @@ class ActuatorNet:
         zone that moved less than `STANDSTILL` in it stands still; the net alone would creep.
         """
         velocity = self.forward(history)[0]
-        no_motion = np.abs(history[..., 0, -1] - history[..., 0, 0]) < STANDSTILL
-        command = (np.abs(history[no_motion][:, 2]) > self.dead_zone).any(axis=-1)
-        velocity[no_motion] = np.where(command, velocity[no_motion], 0)
+        still = np.abs(history[..., 0, -1] - history[..., 0, 0]) < STANDSTILL
+        velocity[still] *= (np.abs(history[still][:, 2]) > self.dead_zone).any(axis=-1)
         return velocity
 
     def inputs(self, history: Array) -> Array:

@@ -99,8 +99,7 @@ def tool_velocity(frames: Frames, q_dot: ArrayLike) -> Array:
         >>> tool_velocity(frames, [1.0, 0.0, 0.0, 0.0, 0.0]).round(2) + 0.0
         array([0.  , 2.35, 0.  ])
     """
-    velocity: Array = (jacobian(frames) @ np.asarray(q_dot)[..., None])[..., 0]  # v = J q_dot
-    return velocity
+    return np.asarray((jacobian(frames) @ np.asarray(q_dot)[..., None])[..., 0])  # v = J q_dot
 
 
 def lowest_point(frames: Frames) -> Array:
