@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,24 +20,28 @@ PWM_MAX = 127  # counts of full command; paper: [0,127] is positive, [255,128] n
 
 
 def number(
-    unit: str, low: float = -np.inf, high: float = np.inf, default: Any = dataclasses.MISSING
+    unit: str, low: float | str = -np.inf, high: float = np.inf, default: Any = dataclasses.MISSING
 ) -> Any:
-    """A field with its unit and its range, both ends included."""
+    """A field with its unit and its range, both ends included; `low` may name another field."""
     return dataclasses.field(default=default, metadata={"unit": unit, "low": low, "high": high})
 
 
-def check_numbers(owner: Machine | Joint, label: str) -> None:
+def check_numbers(owner: Any, label: str = "") -> None:
     """ValueError: a number that is not finite, not whole where it must be, or out of its range."""
+    hints = get_type_hints(type(owner))
     for field in dataclasses.fields(owner):
-        if "unit" not in field.metadata:
+        value, hint = getattr(owner, field.name), hints[field.name]
+        values = (True, False) if hint is bool else get_args(hint)
+        if get_origin(hint) in (None, Literal) and values and value not in values:
+            raise ValueError(f"{label}{field.name}: expected one of {values}, got {value!r}")
+        if "unit" not in field.metadata or (value is None and type(None) in values):
             continue
-        value = getattr(owner, field.name)
-        whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-        if not ((whole or isinstance(value, float | np.floating)) and np.isfinite(value)):
-            raise ValueError(f"{label}{field.name}: expected a finite number, got {value!r}")
-        if field.type == "int" and not whole:
-            raise ValueError(f"{label}{field.name}: expected a whole number, got {value!r}")
+        types: Any = (int, np.integer) if hint is int else (int, float, np.integer, np.floating)
+        if isinstance(value, bool) or not isinstance(value, types) or not abs(value) < np.inf:
+            kind = "whole" if hint is int else "finite"
+            raise ValueError(f"{label}{field.name}: expected a {kind} number, got {value!r}")
         low, high = field.metadata["low"], field.metadata["high"]
+        low = getattr(owner, low) if isinstance(low, str) else low
         if not low <= value <= high:
             raise ValueError(f"{label}{field.name}: expected {low} to {high}, got {value!r}")
 
@@ -80,10 +84,8 @@ class Joint:
         low = self.cylinder_angle + self.q_min
         high = self.cylinder_angle + self.q_max
         if self.cylinder_base > 0 and not 0 < low < high < np.pi:
-            raise ValueError(
-                f"{self.name}.cylinder_angle: expected the triangle's angle within (0, pi) "
-                f"over the joint's range, got {low:.3f} to {high:.3f}"
-            )
+            expected = "expected the triangle's angle within (0, pi) over the joint's range"
+            raise ValueError(f"{self.name}.cylinder_angle: {expected}, got {low:.3f} to {high:.3f}")
 
 
 @dataclass(frozen=True)
@@ -111,6 +113,7 @@ class Machine:
     ground: float = number("m")  # height of the ground in the base frame
     valve_frame_id: int = number("CAN id", 0, 0x7FF)
     controller_node: int = number("CANopen node id", 1, 127)  # of the valve controller
+    largest_dead_zone: float = number("of full command", 0, 0.99, default=0.0)  # 0: 1.5 dead zones
     q_start: tuple[float, ...] = ()  # rad, where experiments start; empty: the middle of the ranges
 
     def __post_init__(self) -> None:
@@ -125,9 +128,9 @@ class Machine:
         node = self.controller_node
         if node in nodes:
             raise ValueError(f"controller_node: expected none of {nodes}, got {node}")
-        if not self.dead_zone * PWM_MAX < self.pwm_limit:  # no valve would ever open
-            limit = f"{self.pwm_limit}/{PWM_MAX}"
-            raise ValueError(f"dead_zone: expected below {limit}, got {self.dead_zone!r}")
+        zone = max(self.dead_zone, self.largest_dead_zone)
+        if not zone * PWM_MAX < self.pwm_limit:  # no valve would ever open
+            raise ValueError(f"dead_zone: expected below {self.pwm_limit}/{PWM_MAX}, got {zone!r}")
         if self.q_start and len(self.q_start) != self.n:
             raise ValueError(f"q_start: expected {self.n} angles or none, got {self.q_start}")
         steps = self.dt / self.plant_dt
@@ -281,8 +284,7 @@ def estimate_velocity(q: ArrayLike, samples: int, dt: float) -> NDArray[np.float
     return velocity
 
 
-# Joints of the Brokk 170. Sources: a, alpha, d, theta and ranges assumed, cylinders assumed; of the
-# fastest motions those of q5 are the paper's (Sec. 3.2), the others assumed.
+# Joints of the Brokk 170. Sources: all assumed, but the fastest motions of q5 (paper, Sec. 3.2).
 # fmt: off
 _DH = [
     # name driven  a [m]  alpha [rad]  d [m]  theta [rad]    q_min, q_max [rad]
