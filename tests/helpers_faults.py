@@ -342,11 +342,11 @@ def measure(cause: Callable[[Fault], Any], phase: float, seconds: float = 0.6) -
     begun = world.t
     cause(Fault(world, operator, controller))
     world.run(seconds)
-    end, words = world.t, world.drive.reason
+    words = world.drive.reason
     world.sleep(max(0.0, begun + seconds + 0.3 - world.t))
     world.close()
     times, m = world.commands
     times, m = times[times > begun], m[times > begun]
     is_open = m.any(axis=1)
     last = float(times[is_open][-1]) if is_open.any() else begun
-    return Outcome(last - begun, last < end - 0.2, words, (times, m))
+    return Outcome(last - begun, last < begun + seconds - 0.2, words, (times, m))
