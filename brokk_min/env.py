@@ -87,8 +87,8 @@ class Block(NamedTuple):
 
 
 @lru_cache
-def observation_blocks(machine: Machine) -> tuple[Block, ...]:
-    """The observation in its order. Paper: Sec. 3.4 (normalisation)
+def observation_blocks(machine: Machine, paper: bool = False) -> tuple[Block, ...]:
+    """The observation, ours or the paper's, in its order. Paper: Sec. 3.4 (normalisation)
 
     Means and deviations are those of uniform distributions over the ranges. H samples (H^-0.5 each)
     weigh as much as one number; resolved velocities most: a net learns first what is large.
@@ -108,8 +108,10 @@ def observation_blocks(machine: Machine) -> tuple[Block, ...]:
         name = machine.names[j]
         blocks.append(Block(f"q {name}", q_mean[j], np.full(H, q_std[j]), H**-0.5, True))
         blocks.append(Block(f"q_dot {name}", 0.0, np.full(H, q_dot_std[j]), H**-0.5, True))
+    blocks.append(Block("u", 0.0, u_std, H**-0.5, False))
+    if paper:
+        return tuple(block._replace(weight=1.0) for block in blocks)
     blocks += [
-        Block("u", 0.0, u_std, H**-0.5, False),
         Block("resolved v_goal", 0.0, q_dot_std[machine.driven], 4.2, False),
         Block("resolved error_integral", 0.0, 0.1 * q_dot_std[machine.driven], 4.2, False),
     ]
@@ -117,9 +119,9 @@ def observation_blocks(machine: Machine) -> tuple[Block, ...]:
 
 
 @lru_cache
-def observation_scale(machine: Machine) -> tuple[Array, Array]:
+def observation_scale(machine: Machine, paper: bool = False) -> tuple[Array, Array]:
     """Mean and scale = std / weight of the observation, float32 (obs,) both."""
-    blocks = observation_blocks(machine)
+    blocks = observation_blocks(machine, paper)
     mean = np.concatenate([np.broadcast_to(block.mean, block.std.shape) for block in blocks])
     scale = np.concatenate([block.std / block.weight for block in blocks])
     return mean.astype(np.float32), scale.astype(np.float32)
@@ -155,25 +157,28 @@ def measure(
     return Measured(v_goal, v_tool, q, history[..., 1, -1], history, integral, p_tool, J)
 
 
-def features(machine: Machine, measured: Measured) -> Array:
-    """The observation of the table above, float32 (..., obs). Paper: Sec. 3.4, Fig. 3
+def features(machine: Machine, measured: Measured, paper: bool = False) -> Array:
+    """The observation of the table above, ours or the paper's, float32 (..., obs). Paper: Sec. 3.4
 
     Resolved velocities (ours): `dls` with W = 1, lambda = 6 % of the links' lengths (assumed).
     """
-    J = measured.J[..., machine.driven]
-    arm = np.hypot(machine.column("a"), machine.column("d")).sum()
-    J_inv = dls(J, np.ones(len(machine.driven)), (0.06 * arm) ** 2 + 1e-6)
-    resolved = J_inv @ np.stack([measured.v_goal, measured.error_integral], axis=-1)
+    velocities = [measured.v_goal, measured.v_tool]
+    resolved = np.empty((0, *measured.q.shape[:-1], len(machine.driven)))
+    if not paper:
+        velocities = [kinematics.to_heading(measured.p_tool, v) for v in velocities]
+        J = measured.J[..., machine.driven]
+        arm = np.hypot(machine.column("a"), machine.column("d")).sum()
+        J_inv = dls(J, np.ones(len(machine.driven)), (0.06 * arm) ** 2 + 1e-6)
+        resolved = J_inv @ np.stack([measured.v_goal, measured.error_integral], axis=-1)
+        resolved = np.moveaxis(resolved, -1, 0)
     numbers = [
-        kinematics.to_heading(measured.p_tool, measured.v_goal),
-        kinematics.to_heading(measured.p_tool, measured.v_tool),
+        *velocities,
         measured.q[..., machine.locked],
-        measured.history[..., :2, :].reshape(*J.shape[:-2], -1),
-        measured.history[..., 2, :].reshape(*J.shape[:-2], -1),
-        resolved[..., 0],
-        resolved[..., 1],
+        measured.history[..., :2, :].reshape(*measured.q.shape[:-1], -1),
+        measured.history[..., 2, :].reshape(*measured.q.shape[:-1], -1),
+        *resolved,
     ]
-    mean, scale = observation_scale(machine)
+    mean, scale = observation_scale(machine, paper)
     obs = np.concatenate(numbers, axis=-1, dtype=np.float32)
     obs -= mean
     obs /= scale
@@ -205,11 +210,11 @@ def update_history(
     return history, integrate_error(machine, v_goal, v_tool, integral)
 
 
-def action_to_pwm(machine: Machine, action: ArrayLike) -> Array:
+def action_to_pwm(machine: Machine, action: ArrayLike, paper: bool = False) -> Array:
     """Commands u (..., n) of full command from actions of the driven joints (..., n_driven).
 
     u = dead_zone clip(a / 0.01, -1, 1) + (limit - dead_zone) a: dead-zone compensation, as the PIDs
-    have it. ValueError: a wrong shape, a number that is not finite. Paper: Sec. 3.3, Sec. 3.4
+    have it; of the paper's agent u = limit a. ValueError: a wrong shape, a number that is not finite. Paper: Sec. 3.3, Sec. 3.4
 
     Example:
         >>> from brokk_min.machine import BROKK_170
@@ -222,9 +227,10 @@ def action_to_pwm(machine: Machine, action: ArrayLike) -> Array:
     if not np.isfinite(a).all():
         raise ValueError(f"action: expected finite numbers, got {a[~np.isfinite(a)][0]}")
     limit = machine.pwm_limit / PWM_MAX
+    dead_zone = 0.0 if paper else machine.dead_zone
     crossing = np.clip(a / COMPENSATION, -1.0, 1.0)
     u = np.zeros((*a.shape[:-1], machine.n), a.dtype)
-    u[..., machine.driven] = machine.dead_zone * crossing + (limit - machine.dead_zone) * a
+    u[..., machine.driven] = dead_zone * crossing + (limit - dead_zone) * a
     return limit_command(machine, u)
 
 
@@ -312,7 +318,7 @@ def step(
 
     The next state; reward, terminated, truncated and |v_goal - v_tool| [m/s], (num,) each.
     """
-    u = action_to_pwm(machine, action)
+    u = action_to_pwm(machine, action, config.paper)
     state = transition(machine, net, state, u)
     rewards = reward(state.v_goal, state.v_tool)
     error = np.linalg.norm(state.v_goal - state.v_tool, axis=-1)
@@ -322,5 +328,7 @@ def step(
         rewards = rewards - config.valve_cost * change.sum(axis=-1) / limit
         rewards = rewards - config.integral_cost * np.linalg.norm(state.error_integral, axis=-1)
     end = terminated(machine, state.lowest)
+    if config.paper:
+        end = end & (state.ticks == 1)  # the start was in the ground
     truncated = (state.ticks >= round(config.episode_s * machine.rate)) & ~end
     return state, np.where(end, 0.0, rewards), end, truncated, error

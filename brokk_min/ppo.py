@@ -62,6 +62,27 @@ def mlp(inputs: int, outputs: int, std: float) -> nn.Sequential:
     return nn.Sequential(*layers, layer_init(nn.Linear(sizes[-1], outputs), std))
 
 
+class RunningScale(nn.Module):
+    """Mean and variance of all numbers so far (rl_games' RunningMeanStd)."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count: Tensor
+        self.mean: Tensor
+        self.var: Tensor
+        for name, number in (("count", 0.0), ("mean", 0.0), ("var", 1.0)):
+            self.register_buffer(name, torch.tensor(number))
+
+    def update(self, x: Tensor) -> None:
+        """Count the numbers `x` in."""
+        total = self.count + x.numel()
+        delta = x.mean() - self.mean
+        fraction = x.numel() / total
+        self.var += fraction * (x.var() - self.var + (1 - fraction) * delta**2)
+        self.mean += fraction * delta
+        self.count = total
+
+
 class Agent(nn.Module):
     """Actor, logarithm of the actions' standard deviation and, if advantages need one, critic."""
 
@@ -70,11 +91,12 @@ class Agent(nn.Module):
         self.actor = mlp(obs, actions, 0.01)
         self.log_std = nn.Parameter(torch.full((actions,), log_std))
         self.critic = mlp(obs, 1, 1.0) if critic else None
+        self.returns = RunningScale()  # the critic's unit
 
     def value(self, obs: Tensor) -> Tensor:
         """Value (...) of observations (..., obs), in units of the reward: (1 - gamma) * return."""
         assert self.critic is not None
-        value: Tensor = self.critic(obs)[..., 0]
+        value: Tensor = self.returns.mean + self.returns.var.sqrt() * self.critic(obs)[..., 0]
         return value
 
 
@@ -139,6 +161,7 @@ def critic_advantages(agent: Agent, rollout: Rollout, config: PPOConfig) -> dict
     rewards = rollout.rewards * (1 - config.gamma)
     dones = rollout.dones.float()
     advantages = gae(rewards, values, next_values, dones, config.gamma, config.gae_lambda)
+    agent.returns.update(advantages + values)
     return {"advantages": advantages, "returns": advantages + values}
 
 
@@ -158,7 +181,7 @@ def ppo_loss(agent: Agent, mb: dict[str, Tensor], config: PPOConfig) -> tuple[Te
     pg_loss = policy_loss(ratio, advantages, config.clip)
     v_loss = torch.zeros(())
     if "returns" in mb:
-        v_loss = ((agent.value(mb["obs"]) - mb["returns"]) ** 2).mean()
+        v_loss = ((agent.value(mb["obs"]) - mb["returns"]) ** 2).mean() / agent.returns.var
     entropy = (agent.log_std + 0.5 * math.log(2 * math.pi * math.e)).sum()
     loss = pg_loss + v_loss - config.entropy * entropy
     with torch.no_grad():

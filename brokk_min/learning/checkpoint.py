@@ -20,7 +20,6 @@ from brokk_min.actuator import ActuatorNet
 from brokk_min.env import State, TaskConfig, observation_scale
 from brokk_min.identification.files import expect_same, expected, require, whole_file, write_csv
 from brokk_min.identification.net_file import fingerprint
-from brokk_min.learning.episodes import paper_weights
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import Policy, contract, save_policy
 from brokk_min.learning.simulation_gradient import gradient_advantages
@@ -40,7 +39,7 @@ def describe_training(
     if settings["critic"]:
         settings["log_std_end"] = None
     return {
-        **contract(machine),
+        **contract(machine, task.paper),
         "actuator": fingerprint(net),
         "seed": seed,
         "task": asdict(task),
@@ -98,14 +97,13 @@ def stagger_episodes(env: TaskVectorEnv) -> None:
 def export_policy(
     machine: Machine, net: ActuatorNet, agent: Agent, task: TaskConfig, about: dict[str, Any]
 ) -> Policy:
-    """The actor as it stands; what the paper's agent does not observe has zero weights."""
+    """The actor as it stands."""
     weights = []
     for layer in agent.actor:
         if isinstance(layer, nn.Linear):
             weights += [layer.weight.T.detach().numpy().copy(), layer.bias.detach().numpy().copy()]
-    if task.paper:
-        weights[0] = weights[0] * paper_weights(machine)[:, None]
-    return Policy(contract(machine), about, *observation_scale(machine), tuple(weights), net)
+    scale = observation_scale(machine, task.paper)
+    return Policy(contract(machine, task.paper), about, *scale, tuple(weights), net)
 
 
 class TrainingLog:

@@ -36,6 +36,11 @@ class Policy:
     weights: tuple[Array, ...]  # w, b of each layer, w (inputs, outputs)
     net: ActuatorNet  # the simulation it was trained in, kept with it
 
+    @property
+    def paper(self) -> bool:
+        """Does it take the observation and the actions of the paper's agent?"""
+        return bool(self.contract.get("paper", False))
+
     def act(self, observation: Array) -> Array:
         """Actions (..., n_driven), not clipped, for observations (..., obs) of `env.features`.
 
@@ -73,16 +78,20 @@ class PolicyController:
         self, measured: Measured, ticks: NDArray[np.int64]
     ) -> tuple[Array, NDArray[np.int64]]:
         """Commands u (num, n), and the ticks of `start` one tick on."""
-        u = action_to_pwm(self.machine, self.policy.act(features(self.machine, measured)))
+        machine, paper = self.machine, self.policy.paper
+        action = self.policy.act(features(machine, measured, paper))
+        u = action_to_pwm(machine, action, paper)
         moving = measured.v_goal.any(axis=-1)
         ticks = np.where(moving, 0, ticks + 1)
-        u[ticks > STANDSTILL_TIMEOUT * self.machine.rate] = 0.0
+        if not paper:
+            u[ticks > STANDSTILL_TIMEOUT * machine.rate] = 0.0
         return u, ticks
 
 
-def contract(machine: Machine) -> dict[str, Any]:
+def contract(machine: Machine, paper: bool = False) -> dict[str, Any]:
     """What training and deployment must agree on; kept in the file and checked by `load_policy`."""
     return {
+        "paper": paper,
         "machine": machine.name,
         "joints": list(machine.names),
         "driven": [machine.names[i] for i in machine.driven],
@@ -118,8 +127,9 @@ def load_policy(path: Path, machine: Machine) -> Policy:
     """
     arrays = load_arrays(path)
     header = load_header(path, arrays, "policy", FORMAT)
-    recorded = header.get("contract", {})
-    expect_same(path, recorded, contract(machine))
+    recorded = {"paper": False, **(header.get("contract") or {})}
+    paper = bool(recorded["paper"])
+    expect_same(path, recorded, contract(machine, paper))
     with expected(path, "a complete policy"):
         net = {name[4:]: array for name, array in arrays.items() if name.startswith("net_")}
         policy = Policy(
@@ -133,7 +143,7 @@ def load_policy(path: Path, machine: Machine) -> Policy:
         action = policy.act(policy.mean)
     if action.shape != machine.driven.shape or not np.isfinite(action).all():
         raise ValueError(f"{path}: weights: expected {len(machine.driven)} actions, got {action}")
-    for name, value in zip(("mean", "scale"), observation_scale(machine), strict=True):
+    for name, value in zip(("mean", "scale"), observation_scale(machine, paper), strict=True):
         if not np.array_equal(arrays[name], value):
             raise ValueError(f"{path}: {name}: expected the machine's normalisation, got another")
     return policy
