@@ -145,7 +145,7 @@ def stand() -> Figures:
     starts = starts[np.array(sequences.start_kinds(M, starts)) == "workspace"]
     shipped = policy.load_policy(SHIPPED / M.name / "policy.npz", M)
     controller = policy.PolicyController(M, shipped)
-    closed = 39 + round(policy.STANDSTILL_TIMEOUT * M.rate)  # tick
+    closed = 39 + round(actuator.CLOSE_AFTER * M.rate)  # tick
     result = {}
     for dead_zone in (M.dead_zone, M.dead_zone - 0.02):
         plant = replace(M, dead_zone=dead_zone)

@@ -12,10 +12,11 @@ from functools import lru_cache
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from brokk_min.machine import Array, Machine, estimate_velocity, valve_opening
 
+CLOSE_AFTER = 0.5  # s of a zero goal, assumed: then the valves close
 STANDSTILL = 0.002  # rad, assumed: little more than one step of a 12-bit encoder
 MU = 50.0  # assumed: the mu law is about linear below 1/50 of full opening
 
@@ -123,6 +124,19 @@ def append_command(history: Array, u: ArrayLike) -> Array:
     result[..., 2, :-1] = history[..., 2, 1:]
     result[..., 2, -1] = u
     return result
+
+
+def close_valves(
+    machine: Machine, valves: str, u: Array, v_goal: Array, rest_ticks: NDArray[np.int64]
+) -> tuple[Array, NDArray[np.int64]]:
+    """Commands u (..., n): 0 after `CLOSE_AFTER` of a zero goal if `valves` are to be "closed".
+
+    Then the joints stand, but the next motion begins 0.3 s later. `rest_ticks` (...) counts the
+    ticks of a zero goal (..., 3) before this one; it is returned with this one counted.
+    """
+    rest_ticks = np.where(v_goal.any(axis=-1), 0, rest_ticks + 1)
+    resting = (valves == "closed") & (rest_ticks > CLOSE_AFTER * machine.rate)
+    return np.where(resting[..., None], np.zeros_like(u), u), rest_ticks
 
 
 def append_sample(history: Array, u: ArrayLike, q: Array, window: int, dt: float) -> Array:

@@ -29,13 +29,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brokk_min import actuator, kinematics
-from brokk_min.actuator import ActuatorNet, PlantState, append_sample, initial_history
+from brokk_min.actuator import ActuatorNet, PlantState, append_sample, close_valves, initial_history
 from brokk_min.jacobian import dls
 from brokk_min.kinematics import forward_kinematics, jacobian, tool_velocity
 from brokk_min.machine import PWM_MAX, Array, Machine, as_floats, limit_command, read_encoder
@@ -59,6 +59,7 @@ class TaskConfig:
     noise: float = 0.05  # Largest noise of what sensors measure, in deviations (paper: 5 %).
     valve_cost: float = 0.05  # Cost of a change of all commands by their limit (paper: 0).
     integral_cost: float = 1.0  # Cost of the error integral [1/m] (paper: 0).
+    valves: Literal["closed", "open"] = "closed"  # While the tool rests, see `close_valves`.
     redraw_ground: bool = True  # Redraw start poses in the ground; the paper ends the episode.
     paper: bool = False  # Observation, reward and critic as the paper has them.
 
@@ -247,6 +248,7 @@ class State:
     v_goal: Array  # goal velocity of the tool [m/s], (..., 3)
     goal_ticks: NDArray[np.int64]  # ticks until a new goal, (...)
     ticks: NDArray[np.int64]  # ticks since the reset, (...)
+    rest_ticks: NDArray[np.int64]  # ticks for which the goal has been zero, (...)
     error_integral: Array  # of `integrate_error` [m], (..., 3)
     plant: PlantState | None = None  # None: the nets move the machine
 
@@ -265,6 +267,7 @@ def initial_state(machine: Machine, q: ArrayLike, v_goal: ArrayLike, plant: bool
         v_goal=goal,
         goal_ticks=np.full(q.shape[:-1], np.iinfo(np.int64).max),
         ticks=np.zeros(q.shape[:-1], np.int64),
+        rest_ticks=np.zeros(q.shape[:-1], np.int64),
         error_integral=np.zeros_like(goal),
         plant=actuator.plant_reset(machine, q) if plant else None,
     )
@@ -319,6 +322,9 @@ def step(
     The next state; reward, terminated, truncated and |v_goal - v_tool| [m/s], (num,) each.
     """
     u = action_to_pwm(machine, action, config.paper)
+    if not config.paper:
+        u, rest = close_valves(machine, config.valves, u, state.v_goal, state.rest_ticks)
+        state = replace(state, rest_ticks=rest)
     state = transition(machine, net, state, u)
     rewards = reward(state.v_goal, state.v_tool)
     error = np.linalg.norm(state.v_goal - state.v_tool, axis=-1)

@@ -5,7 +5,7 @@ command line: help must not wait for torch, which two of those modules import. A
 """
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -73,6 +73,7 @@ class TaskSettings:
     valve_cost: Cost = 0.05  # Cost of a change of all commands by their limit (paper: 0).
     integral_cost: Annotated[Cost, tyro.conf.arg(aliases=["--lag-cost"])] = 1.0
     """Cost of the error integral [1/m] (paper: 0)."""
+    valves: Literal["closed", "open"] = "closed"  # While the tool rests.
     redraw_ground: bool = True  # Redraw start poses in the ground; the paper ends the episode.
     paper: bool = False  # Observation, reward and critic as the paper has them.
 

@@ -147,7 +147,7 @@ def task_claims(
     """The claims on task-space control; those on baselines also of a stronger one.
 
     `runs` are those that count, `along_x` their traces along x by controller with these `goals`
-    [m/s] (T, 3), `singular` is of `singular_claims`. Paper: Sec. 4.2, Fig. 6
+    [m/s] (T, num, 3), `singular` is of `singular_claims`. Paper: Sec. 4.2, Fig. 6
     """
 
     def direction(names: Sequence[str]) -> Claim:
@@ -189,11 +189,10 @@ def direction_claim(
 ) -> Claim:
     """Does the PID track joint velocities as well in one direction as in the other? Paper: Fig. 6d
 
-    `trace` has the runs of one sequence with these `goals` [m/s] (T, 3).
+    `trace` has the runs of one sequence with these `goals` [m/s] (T, num, 3).
     """
     q_dot = trace.q_dot[..., machine.driven]
-    v_goal = np.broadcast_to(goals[:, None], trace.v_tool.shape)
-    desired = controller.desired_velocities(v_goal, trace.v_tool, trace.q, q_dot)
+    desired = controller.desired_velocities(goals, trace.v_tool, trace.q, q_dot)
     numbers: dict[str, Mean] = {}
     verdicts = []
     for i, joint in enumerate(machine.driven):

@@ -198,7 +198,8 @@ def plot_sequence(
     machine: Machine, traces: Traces, sequence: Commands, start: Array, run: int
 ) -> Figure:
     """Tool position and velocity along x, y, z of all controllers in one run. Paper: Fig. 6"""
-    goals = sequence.for_starts(run + 1)[:, run]
+    starts = np.tile(start, (run + 1, 1))
+    goals = sequence.for_starts(machine, starts)[:, run]
     p_start = tool_position(forward_kinematics(machine, start))
     positions = {"goal": machine.dt * np.cumsum(goals, axis=0)}
     velocities = {"goal": goals}

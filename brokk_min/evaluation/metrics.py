@@ -30,6 +30,7 @@ CHANGE = 0.05  # of tool_speed, assumed: a goal that jumps by more has changed
 TRANSIENT = 0.6  # s after a change, assumed: as long as the policy's history
 BAND = 0.1  # of tool_speed, assumed: the tool has settled while its error stays below this,
 BAND_OF_CHANGE = 0.5  # and this fraction of the change, assumed: or standstill meets slow goals
+AFTER_STOP = 1.0  # s, assumed: what moves later in a rest moves by itself
 AT_LIMIT = 0.01  # rad, assumed: a joint so near an end of its range is at its limit
 
 
@@ -45,6 +46,9 @@ def metrics(machine: Machine, trace: Trace, goals: Array, start: Array) -> dict[
     ticks = ticks_since_change(machine, goals)
     transient = (ticks >= 0) & (ticks < round(TRANSIENT * machine.rate))
     position_error = start + np.cumsum(goals, axis=0) * machine.dt - trace.p_tool
+    moving = np.asarray(goals.any(axis=-1))
+    creep_mean, creep_max = motion_at_rest(machine, goals, trace.p_tool, 2)
+    joint_motion, _ = motion_at_rest(machine, goals, trace.q[..., machine.driven], np.inf)
     margin = np.minimum(trace.q - machine.column("q_min"), machine.column("q_max") - trace.q)
     at_limit = margin[..., machine.driven].min(axis=-1) < AT_LIMIT
     return {
@@ -52,15 +56,40 @@ def metrics(machine: Machine, trace: Trace, goals: Array, start: Array) -> dict[
         "velocity_error_mean": error.mean(axis=0),
         "velocity_error_transient": _mean(error, transient),
         "velocity_error_steady": _mean(error, ~transient),
+        "velocity_error_moves": _mean(error, moving),
+        "velocity_error_rests": _mean(error, ~moving),
         "settling_time": settling_time(machine, error, goals),
         "off_axis_drift_max": drift.max(axis=0),
         "off_axis_drift_mean": drift.mean(axis=0),
         "position_error_mean": norm(position_error, axis=-1).mean(axis=0),
+        "creep_mean": creep_mean,
+        "creep_max": creep_max,
+        "joint_motion_at_rest": joint_motion,
         "jerk_rms": np.sqrt(np.sum(jerk**2, axis=-1).sum(axis=0) / max(1, len(jerk))),
         "valve_travel": np.abs(np.diff(trace.u, axis=0, prepend=0 * trace.u[:1])).sum(axis=(0, 2)),
         "time_at_limits": at_limit.sum(axis=0) * machine.dt,
         "reward_mean": trace.reward.mean(axis=0),
     }
+
+
+def motion_at_rest(machine: Machine, goals: Array, x: Array, order: float) -> tuple[Array, Array]:
+    """How far x (T, num, k) goes in a rest from where it was `AFTER_STOP`: mean, largest (num,).
+
+    Distances are norms of an `order`. Counted are rests after a motion of the goals [m/s]
+    (T, num, 3), if they last longer than `AFTER_STOP`. NaN: there is none.
+    """
+    settle = round(AFTER_STOP * machine.rate)
+    result = np.full((2, x.shape[1]), np.nan)
+    for run in range(x.shape[1]):
+        moving = goals[:, run].any(axis=-1)
+        change = np.diff(moving.astype(int), prepend=0, append=1)
+        stops = np.flatnonzero(change == -1)
+        ends = [t + np.flatnonzero(change[t + 1 :] == 1)[0] + 1 for t in stops]
+        rests = [x[t + settle - 1 : end, run] for t, end in zip(stops, ends, strict=True)]
+        far = [norm(rest - rest[0], order, axis=-1).max() for rest in rests if len(rest) > 1]
+        if far:
+            result[:, run] = np.mean(far), np.max(far)
+    return result[0], result[1]
 
 
 def line_distance(p_tool: Array, goals: Array, start: Array) -> Array:
@@ -138,14 +167,17 @@ def evaluate(
     seed: int,
     net: ActuatorNet | None = None,
     sensor: Callable[[np.random.Generator], Encoder] = lambda rng: read_encoder,
+    config: TaskConfig | None = None,
 ) -> tuple[Rows, Traces]:
     """Run every controller on the same sequences, starts and noise. Paper: Sec. 4.2, Fig. 6
 
     `starts` are angles [rad] (starts, n); all starts and all sequences of one length are a batch.
     `net` has the nets of the driven joints (None: the analytic plant), `sensor` makes the encoders
-    of each rollout. Returns one row per controller, sequence and start, see `metrics`; and traces.
+    of each rollout, `config` has the noise. Returns one row per controller, sequence and start,
+    see `metrics`; and traces.
     """
     num = len(starts)
+    config = config or TaskConfig()
     kinds = start_kinds(machine, starts)
     traces: dict[tuple[str, str], Trace] = {}
     rows: dict[tuple[str, str], Rows] = {}
@@ -153,11 +185,11 @@ def evaluate(
     batches = [[s for s in sequences if len(s.goals) == length] for length in lengths]
     pairs = list(product(controllers, batches))
     for name, batch in tqdm(pairs, desc="evaluate", unit="batch", disable=None):
-        goals = np.concatenate([sequence.for_starts(num) for sequence in batch], axis=1)
+        goals = np.concatenate([sequence.for_starts(machine, starts) for sequence in batch], axis=1)
         q = np.tile(starts, (len(batch), 1))
         rng = np.random.default_rng(seed)
         read = sensor(np.random.default_rng(seed + 1))
-        trace = rollout(machine, controllers[name], q, goals, TaskConfig(), rng, net, read)
+        trace = rollout(machine, controllers[name], q, goals, config, rng, net, read)
         p_start = tool_position(forward_kinematics(machine, q))
         figures = metrics(machine, trace, goals, p_start)
         for i, sequence in enumerate(batch):

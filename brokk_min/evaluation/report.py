@@ -33,6 +33,8 @@ UNITS = {
     "position": "m",
     "settling": "s",
     "time": "s",
+    "creep": "m",
+    "joint": "rad",
     "jerk": "m/s^3",
     "valve": "full strokes",
     "reward": "1",

@@ -197,7 +197,8 @@ def compare(
         machine, claims.singular_controllers(rl, pids), extended, budget.short_s, seed
     )
     along_x = {c: Trace(*(array[:, workspace] for array in traces[c, "x"])) for c in pids}
-    every = claims.task_claims(machine, pids, scored, along_x, commands[0].goals, near)
+    goals = commands[0].for_starts(machine, reachable)
+    every = claims.task_claims(machine, pids, scored, along_x, goals, near)
     short = shorten(machine, sequences.axis_sequences(machine), budget.short_s)
     results = {
         "task_space": tables(runs, scored),
@@ -264,7 +265,7 @@ def near_singularities(
     speed = {}
     for name in controllers:
         fractions = [
-            claims.speed_fraction(machine, w0, traces[name, s.name], s.for_starts(len(starts)))
+            claims.speed_fraction(machine, w0, traces[name, s.name], s.for_starts(machine, starts))
             for s in commands
         ]
         speed[name] = metrics.row_mean(np.stack(fractions, axis=1))

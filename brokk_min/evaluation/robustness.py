@@ -1,4 +1,4 @@
-"""Robustness: controllers on machines and encoders other than those they were made for."""
+"""Robustness: controllers on other machines and encoders, and after rests of other lengths."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -6,15 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from brokk_min.env import Encoder
+from brokk_min.env import Encoder, TaskConfig
 from brokk_min.evaluation.metrics import (
     Controllers,
     by_start,
     evaluate,
     mean_interval,
     paired_difference,
+    summary,
 )
-from brokk_min.evaluation.sequences import Commands
+from brokk_min.evaluation.sequences import RESTS, Commands, rest_sequences
 from brokk_min.machine import Array, Machine, read_encoder, valve_opening
 
 Sensor = Callable[[np.random.Generator], Encoder]  # makes the encoders of one rollout
@@ -110,4 +111,20 @@ def robustness(
             if "rl" in controllers and controller != "rl":
                 row["rl_less"] = paired_difference(runs, "rl", controller, error)["all"]
             result[name][controller] = row
+    return result
+
+
+def by_length_of_rest(
+    machine: Machine,
+    controllers: Controllers,
+    starts: Array,
+    seed: int,
+    config: TaskConfig | None = None,
+) -> dict[str, dict[str, dict[str, float | None]]]:
+    """Means of all figures of `metrics` on the axes, by seconds of each rest and controller."""
+    result = {}
+    for seconds in RESTS:
+        commands = rest_sequences(machine, seconds)
+        runs, _ = evaluate(machine, controllers, commands, starts, seed, config=config)
+        result[f"{seconds:g}"] = {name: rows["all"] for name, rows in summary(runs).items()}
     return result

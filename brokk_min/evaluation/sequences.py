@@ -1,6 +1,7 @@
 """Velocity sequences and start poses: of the evaluation, of the user's files, and for tuning.
 
-Sequences and starts of the evaluation are never used for tuning: `tuning_set` draws others.
+Tuning never opens what is scored: only `task_sequences` has the seed of the scored rests, only
+`evaluation_starts` opens the file of scored starts, and `tuning_set` draws other starts and goals.
 """
 
 from collections.abc import Sequence
@@ -21,13 +22,17 @@ from brokk_min.machine import PWM_MAX, Array, Machine, valve_opening
 
 AXES = "xyz"
 KINDS = ("workspace", "limits", "extended")  # of starts, see `start_kinds`
-# Rows of seconds and velocity in fractions of tool_speed, 18 s in all (assumed).
+REST_SEED = 2026  # of the scored rests; nothing else draws from it
+SECONDS = 26.0  # of a scored sequence, assumed
+SHORTEST_REST, LONGEST_REST = 0.5, 10.0  # s, assumed
+RESTS = (0.5, 1.0, 2.0, 2.5, 4.0, 5.0, 10.0)  # s, of `rest_sequences`, assumed
+# Rows of seconds and velocity in fractions of tool_speed (assumed).
 # On one axis, as in the paper, with changes of direction:
 AXIS = ((1, 0), (4, 2 / 3), (1, 0), (4, -2 / 3), (1, 0), (3, 1 / 3), (3, -1 / 3), (1, 0))
 # Along x, y and z:
 REST = (1, 0, 0, 0)
 RECTANGLE = (REST, (5, 0, 0.5, 0), (3, 0, 0, 0.5), (5, 0, -0.5, 0), (3, 0, 0, -0.5), REST)
-STOP_AND_GO = (REST, *((1, 2 / 3, 0, 0), REST) * 4, *((1, -2 / 3, 0, 0), REST) * 4, REST)
+STOP_AND_GO = (*(REST, (1, 2 / 3, 0, 0)) * 4, *(REST, (1, -2 / 3, 0, 0)) * 4, REST)
 SLOW = (REST, (4, 0.1, 0, 0), (4, -0.1, 0, 0), (4, 0, 0, 0.1), (4, 0, 0, -0.1), REST)
 
 
@@ -36,17 +41,27 @@ class Commands(NamedTuple):
 
     name: str
     goals: Array  # (T, 3), or (T, starts, 3) if each start has its own
+    inward: bool = False  # +x and +y mean towards the slew axis, see `for_starts`
 
-    def for_starts(self, num: int) -> Array:
-        """Goals of the first `num` starts [m/s], (T, num, 3)."""
-        if self.goals.ndim == 3:
-            return self.goals[:, :num]
-        return np.repeat(self.goals[:, None], num, axis=1)
+    def for_starts(self, machine: Machine, starts: Array) -> Array:
+        """Goals [m/s] (T, num, 3) from the starts [rad] (num, n).
+
+        Inward ones have x, y reversed where the tool starts at positive x, y. Otherwise the first
+        moves along +x and +y fit into the arm's reach only from one side of the slew range.
+        """
+        num = len(starts)
+        each = self.goals.ndim == 3
+        goals = self.goals[:, :num] if each else np.repeat(self.goals[:, None], num, axis=1)
+        if not self.inward:
+            return goals
+        sign = np.where(tool_position(forward_kinematics(machine, starts)) > 0, -1.0, 1.0)
+        sign[:, 2] = 1.0
+        return sign * goals
 
 
 def axis_sequences(machine: Machine) -> list[Commands]:
     """One sequence along x, one along y, one along z. Paper: Fig. 6"""
-    return [Commands(name, _along(machine, np.eye(3)[i])) for i, name in enumerate(AXES)]
+    return task_sequences(machine)[:3]
 
 
 def singular_sequences(machine: Machine, starts: Array) -> list[Commands]:
@@ -60,7 +75,7 @@ def singular_sequences(machine: Machine, starts: Array) -> list[Commands]:
     direction = np.linalg.svd(J).U[..., -1]  # (starts, 3)
     largest = np.abs(direction).argmax(axis=-1)[:, None]
     direction = direction * np.sign(np.take_along_axis(direction, largest, axis=-1))
-    goals = np.stack([_along(machine, vector) for vector in direction], axis=1)
+    goals = np.stack([_goals(machine, _along(vector)) for vector in direction], axis=1)
     return [Commands("least_half", 0.5 * goals), Commands("least_quarter", 0.25 * goals)]
 
 
@@ -68,31 +83,64 @@ def task_sequences(machine: Machine) -> list[Commands]:
     """All sequences of the evaluation: the paper's three axes and six of ours. Paper: Sec. 4.2
 
     Two diagonals; a circle (x-z) and a rectangle (y-z) at half the tool speed; stop and go along
-    x; slow motion near the dead zone along x and z. All begin and end at rest.
+    x; slow motion near the dead zone along x and z. All begin and end at rest and last `SECONDS`.
     """
     angle = np.linspace(0, 2 * np.pi, round(16 * machine.rate), endpoint=False)
-    circle = np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1)
-    rest = np.zeros((round(machine.rate), 3))
-    circle = np.concatenate([rest, 0.5 * machine.tool_speed * circle, rest])
+    circle = [(machine.dt, 0.5 * np.cos(x), 0, 0.5 * np.sin(x)) for x in angle]
+    moves = {name: _along(np.eye(3)[i]) for i, name in enumerate(AXES)}
+    moves |= {
+        "diagonal_flat": _along([0.5**0.5, 0.5**0.5, 0]),
+        "diagonal_rise": _along([3**-0.5, -(3**-0.5), 3**-0.5]),
+        "circle": np.array([REST, *circle, REST]),
+        "rectangle": np.array(RECTANGLE),
+        "stop_and_go": np.array(STOP_AND_GO),
+        "slow": np.array(SLOW),
+    }
+    rng = np.random.default_rng(REST_SEED)
     return [
-        *axis_sequences(machine),
-        Commands("diagonal_flat", _along(machine, [0.5**0.5, 0.5**0.5, 0])),
-        Commands("diagonal_rise", _along(machine, [3**-0.5, -(3**-0.5), 3**-0.5])),
-        Commands("circle", circle),
-        Commands("rectangle", _goals(machine, RECTANGLE)),
-        Commands("stop_and_go", _goals(machine, STOP_AND_GO)),
-        Commands("slow", _goals(machine, SLOW)),
+        Commands(name, _goals(machine, _with_rests(rows, _draw_rests(rows, rng))), inward=True)
+        for name, rows in moves.items()
     ]
 
 
-def _along(machine: Machine, direction: ArrayLike) -> Array:
-    """Goals [m/s] (T, 3) of the pattern `AXIS` along a unit vector (3,)."""
-    return _goals(machine, [(t, *(v * np.asarray(direction, float))) for t, v in AXIS])
+def rest_sequences(machine: Machine, seconds: float) -> list[Commands]:
+    """The moves of `axis_sequences` with every rest equally long [s]."""
+    return [
+        Commands(name, _goals(machine, _with_rests(_along(np.eye(3)[i]), seconds)), inward=True)
+        for i, name in enumerate(AXES)
+    ]
 
 
-def _goals(machine: Machine, rows: ArrayLike) -> Array:
+def _draw_rests(rows: Array, rng: np.random.Generator) -> Array:
+    """Random seconds of each rest of rows, such that all rows last `SECONDS`."""
+    at_rest = ~rows[:, 1:].any(axis=1)
+    total = SECONDS - rows[~at_rest, 0].sum()
+    while True:
+        seconds = _log_uniform(rng, at_rest.sum()).round(1)
+        seconds[-1] = total - seconds[:-1].sum()
+        if SHORTEST_REST <= seconds[-1] <= LONGEST_REST:
+            return rng.permutation(seconds)
+
+
+def _log_uniform(rng: np.random.Generator, num: int) -> Array:
+    """Random lengths of rests [s], (num,)."""
+    return np.exp(rng.uniform(np.log(SHORTEST_REST), np.log(LONGEST_REST), num))
+
+
+def _with_rests(rows: Array, seconds: ArrayLike) -> Array:
+    """Rows with other seconds of the rests."""
+    rows = rows.astype(float)
+    rows[~rows[:, 1:].any(axis=1), 0] = seconds
+    return rows
+
+
+def _along(direction: ArrayLike) -> Array:
+    """Rows of the pattern `AXIS` along a unit vector (3,)."""
+    return np.array([(t, *(v * np.asarray(direction, float))) for t, v in AXIS])
+
+
+def _goals(machine: Machine, rows: Array) -> Array:
     """Goals [m/s] (T, 3) of rows of seconds and fractions of tool_speed along x, y, z."""
-    rows = np.asarray(rows, float)
     ticks = np.rint(rows[:, 0] * machine.rate).astype(int)
     return np.repeat(machine.tool_speed * rows[:, 1:], ticks, axis=0)
 
@@ -233,8 +281,8 @@ def _select(machine: Machine, poses: Array, sequences: Sequence[Commands]) -> di
     limits = poses[kinds == "limits"][:30]
     feasible_sequences = np.zeros(len(limits))
     for sequence in sequences:
-        workspace = workspace[feasible(machine, workspace, sequence.for_starts(len(workspace)))]
-        feasible_sequences += feasible(machine, limits, sequence.for_starts(len(limits)))
+        workspace = workspace[feasible(machine, workspace, sequence.for_starts(machine, workspace))]
+        feasible_sequences += feasible(machine, limits, sequence.for_starts(machine, limits))
     limits = limits[feasible_sequences >= 0.5 * len(sequences)]
     return {"workspace": workspace, "limits": limits, "extended": poses[kinds == "extended"]}
 
@@ -286,21 +334,24 @@ def speed_limits(machine: Machine, q: ArrayLike) -> tuple[Array, Array]:
     return down, up
 
 
-def tuning_set(machine: Machine, num: int, seed: int, seconds: float = 12.0) -> tuple[Array, Array]:
+def tuning_set(machine: Machine, num: int, seed: int, seconds: float = 20.0) -> tuple[Array, Array]:
     """`feasible` starts [rad] (num, n) and goals [m/s] (T, num, 3) for tuning the baselines.
 
-    `learning.episodes.reset` draws them, as for the policy. ValueError: too few in 60 draws.
+    `learning.episodes.reset` draws them, as for the policy; but half of the time the tool rests,
+    and rests are as long as scored ones. ValueError: too few in 60 draws.
     """
     rng = np.random.default_rng(seed + 1000)
-    config = TaskConfig()
+    config = TaskConfig(zero_goals=0.3)
     holds = int(np.ceil(seconds / config.hold_min_s))  # goals of a run: enough, however short
     tick = np.arange(round(seconds * machine.rate))[:, None]
     starts = np.empty((0, machine.n))
     goals = np.empty((len(tick), 0, 3), np.float32)
     for _ in range(60):
         drawn = reset(machine, config, rng, 200 * holds, plant=False)
-        first = np.concatenate([[0], np.cumsum(drawn.goal_ticks)])[:-1:holds]  # tick of each run
-        v_goal = np.repeat(drawn.v_goal, drawn.goal_ticks, axis=0)[first + tick]  # (T, 200, 3)
+        rests = np.rint(_log_uniform(rng, 200 * holds) * machine.rate).astype(int)
+        ticks = np.where(drawn.v_goal.any(axis=-1), drawn.goal_ticks, rests)
+        first = np.concatenate([[0], np.cumsum(ticks)])[:-1:holds]  # tick of each run
+        v_goal = np.repeat(drawn.v_goal, ticks, axis=0)[first + tick]  # (T, 200, 3)
         q = drawn.q[::holds]
         good = feasible(machine, q, v_goal)
         starts = np.concatenate([starts, q[good]])

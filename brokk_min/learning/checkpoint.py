@@ -102,8 +102,10 @@ def export_policy(
     for layer in agent.actor:
         if isinstance(layer, nn.Linear):
             weights += [layer.weight.T.detach().numpy().copy(), layer.bias.detach().numpy().copy()]
+    about_task = contract(machine, task.paper)
     scale = observation_scale(machine, task.paper)
-    return Policy(contract(machine, task.paper), about, *scale, tuple(weights), net)
+    valves = "open" if task.paper else task.valves
+    return Policy(about_task, about, *scale, tuple(weights), net, valves)
 
 
 class TrainingLog:

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from brokk_min.actuator import CLOSE_AFTER
 from brokk_min.env import COMPENSATION
 from brokk_min.identification.files import require, whole_file
-from brokk_min.learning.policy import STANDSTILL_TIMEOUT, Policy
+from brokk_min.learning.policy import Policy
 from brokk_min.machine import Array
 
 
@@ -17,7 +18,8 @@ def export_onnx(path: Path, policy: Policy) -> None:
     """Write a policy as one ONNX file: `observation` (batch, obs) in, `action` out.
 
     The other program does the rest, with the numbers in the metadata: `env.action_to_pwm`
-    (`dead_zone`, `pwm_limit`, `ramp`) and closed valves after `stand_s` of a zero goal.
+    (`dead_zone`, `pwm_limit`, `ramp`) and closed valves after `stand_s` of a zero
+    goal (null: open valves).
     ValueError: the package onnx is not installed.
     """
     helper = require("onnx.helper", "export")
@@ -33,7 +35,7 @@ def export_onnx(path: Path, policy: Policy) -> None:
         "mean": policy.mean.tolist(),
         "scale": policy.scale.tolist(),
         "ramp": COMPENSATION,
-        "stand_s": STANDSTILL_TIMEOUT,
+        "stand_s": CLOSE_AFTER if policy.valves == "closed" else None,
     }
     helper.set_model_props(model, {name: json.dumps(value) for name, value in metadata.items()})
     require("onnx.checker", "export").check_model(model, full_check=True)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min.actuator import ActuatorNet, select_nets
+from brokk_min.actuator import ActuatorNet, close_valves, select_nets
 from brokk_min.env import Measured, action_to_pwm, features, observation_scale
 from brokk_min.identification.files import (
     expect_same,
@@ -21,7 +21,6 @@ from brokk_min.identification.files import (
 from brokk_min.identification.net_file import net_arrays, net_from_arrays
 from brokk_min.machine import Array, Machine
 
-STANDSTILL_TIMEOUT = 2.0  # s, assumed: valves close when the goal was zero for longer
 FORMAT = 3  # of policy files
 
 
@@ -35,6 +34,7 @@ class Policy:
     scale: Array  # (obs,)
     weights: tuple[Array, ...]  # w, b of each layer, w (inputs, outputs)
     net: ActuatorNet  # the simulation it was trained in, kept with it
+    valves: str = "closed"  # or "open", while the tool rests; see `actuator.close_valves`
 
     @property
     def paper(self) -> bool:
@@ -63,15 +63,14 @@ class Policy:
 class PolicyController:
     """A policy as an `evaluation.rollout.Controller`.
 
-    At a zero goal a policy keeps the valves just open, ready for the next goal, and the tool
-    drifts. So the valves close after `STANDSTILL_TIMEOUT` of a zero goal.
+    Its valves close while the tool rests (`actuator.close_valves`), unless trained otherwise.
     """
 
     machine: Machine
     policy: Policy
 
     def start(self, num: int) -> NDArray[np.int64]:
-        """Ticks since the last goal other than zero, (num,)."""
+        """Ticks for which the goal has been zero, (num,)."""
         return np.zeros(num, np.int64)
 
     def __call__(
@@ -81,11 +80,7 @@ class PolicyController:
         machine, paper = self.machine, self.policy.paper
         action = self.policy.act(features(machine, measured, paper))
         u = action_to_pwm(machine, action, paper)
-        moving = measured.v_goal.any(axis=-1)
-        ticks = np.where(moving, 0, ticks + 1)
-        if not paper:
-            u[ticks > STANDSTILL_TIMEOUT * machine.rate] = 0.0
-        return u, ticks
+        return close_valves(machine, self.policy.valves, u, measured.v_goal, ticks)
 
 
 def contract(machine: Machine, paper: bool = False) -> dict[str, Any]:
@@ -111,6 +106,7 @@ def save_policy(path: Path, policy: Policy) -> None:
         "kind": "policy",
         "contract": dict(policy.contract),
         "training": dict(policy.training),
+        "valves": policy.valves,
     }
     arrays = {"header": np.array(json.dumps(header)), "mean": policy.mean, "scale": policy.scale}
     arrays |= {f"weight_{i}": weight for i, weight in enumerate(policy.weights)}
@@ -139,6 +135,7 @@ def load_policy(path: Path, machine: Machine) -> Policy:
             scale=arrays["scale"],
             weights=tuple(arrays[f"weight_{i}"] for i in range(8)),
             net=select_nets(machine, net_from_arrays(path, net)),
+            valves=header.get("valves", "closed"),
         )
         action = policy.act(policy.mean)
     if action.shape != machine.driven.shape or not np.isfinite(action).all():

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from brokk_min import ppo
-from brokk_min.actuator import MU, ActuatorNet, append_command, folded_weights
+from brokk_min.actuator import MU, ActuatorNet, append_command, close_valves, folded_weights
 from brokk_min.env import (
     COMPENSATION,
     INTEGRAL_LIMIT,
@@ -48,6 +48,7 @@ class Ticks(NamedTuple):
     v_goal: Array  # goal velocity [m/s], 3
     error_integral: Array  # of `env.integrate_error` [m], 3
     u: Array  # command, n
+    follows: Array  # 1, or 0 where the valves were closed whatever the action, n
     done: NDArray[np.bool_]  # did the episode end with the tick?
 
 
@@ -58,12 +59,17 @@ def gradient_advantages(machine: Machine, net: ActuatorNet, task: TaskConfig) ->
         agent: ppo.Agent, rollout: ppo.Rollout, config: ppo.PPOConfig
     ) -> dict[str, Tensor]:
         states = [info["state"] for info in rollout.infos]
+        v_goal = np.stack([state.v_goal for state in states])
+        rest_ticks = np.stack([state.rest_ticks for state in states])
+        u = action_to_pwm(machine, rollout.actions.numpy())
+        follows, _ = close_valves(machine, task.valves, np.ones_like(u), v_goal, rest_ticks)
         ticks = Ticks(
             q=np.stack([state.q for state in states]),
             true_history=np.stack([state.true_history for state in states]),
-            v_goal=np.stack([state.v_goal for state in states]),
+            v_goal=v_goal,
             error_integral=np.stack([state.error_integral for state in states]),
-            u=action_to_pwm(machine, rollout.actions.numpy()),
+            u=follows * u,
+            follows=follows,
             done=rollout.dones.numpy(),
         )
         gradient = torch.from_numpy(action_gradients(machine, net, ticks, config.gamma, task))
@@ -105,7 +111,8 @@ def action_gradients(
         before[..., 2, 0] = 0
         dR_dh = before
         dR_dlast = dc_du[t]
-    return dR_du * compensation_derivative(machine, ticks.u)
+    follows = ticks.follows[..., machine.driven].astype(np.float32)
+    return dR_du * follows * compensation_derivative(machine, ticks.u)
 
 
 def valve_cost_gradient(machine: Machine, ticks: Ticks, valve_cost: float) -> Array:

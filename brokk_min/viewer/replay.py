@@ -136,7 +136,7 @@ def simulate_again(
     for row in rows:
         if row["start"] == start and row["sequence"] == sequence:
             _check_row(results, row)
-    goals = results.sequences[sequence].goals
+    goals = results.sequences[sequence].for_starts(machine, results.starts)[:, start]
     p_start = tool_position(forward_kinematics(machine, results.starts[start]))
     path = p_start + np.vstack([np.zeros(3), np.cumsum(goals, axis=0)]) * machine.dt
     runs = []

@@ -160,8 +160,9 @@ def test_direction_claim__compares_both_directions(down, holds):
     """
     pid = baselines.baselines(BROKK_170, obedient_net(BROKK_170))[HIGH]
     goals = np.repeat([[0.2, 0.0, 0.0], [-0.2, 0.0, 0.0]], 20, axis=0)
-    trace = trace_of(POSE + 0.02 * np.arange(4)[:, None], goals[:, None], np.zeros(5), 40)
-    fraction = np.where(goals[:, None, :1] > 0, 0.9, np.reshape(down, (-1, 1)))
+    goals = np.repeat(goals[:, None], 4, axis=1)
+    trace = trace_of(POSE + 0.02 * np.arange(4)[:, None], goals, np.zeros(5), 40)
+    fraction = np.where(goals[..., :1] > 0, 0.9, np.reshape(down, (-1, 1)))
     driven = BROKK_170.driven
     for _ in range(30):  # weights depend on the direction of motion: find the fixed point
         q_dot = trace.q_dot[..., driven]
@@ -172,7 +173,7 @@ def test_direction_claim__compares_both_directions(down, holds):
     means = {round(n["mean"], 2) for n in claim.numbers.values() if n["mean"] is not None}
     assert means == {0.1, round(1 - float(np.mean(down)), 2)}
     first = Trace(*(array[:, :1] for array in trace))
-    assert claims.direction_claim(BROKK_170, pid, first, goals).holds is None
+    assert claims.direction_claim(BROKK_170, pid, first, goals[:, :1]).holds is None
 
 
 def test_task_claims__are_in_the_papers_order_and_of_a_stronger_baseline_too():
@@ -185,7 +186,7 @@ def test_task_claims__are_in_the_papers_order_and_of_a_stronger_baseline_too():
     trace = trace_of(np.tile(POSE, (2, 1)), np.zeros(3), np.zeros(5), 20)
     singular = [Claim("slowed", {}, None), Claim("jerky", {}, True)]
     along_x = dict.fromkeys(pids, trace)
-    result = claims.task_claims(BROKK_170, pids, runs, along_x, np.zeros((20, 3)), singular)
+    result = claims.task_claims(BROKK_170, pids, runs, along_x, np.zeros((20, 2, 3)), singular)
     expected = ["still", "drift", "direction", "slowed", "jerky", "tracking", "along z"]
     assert [claim.name for claim in result] == [*expected, "outperforms"]
     assert set(expected) < set(claims.TEXTS)

@@ -88,10 +88,11 @@ def test_plot_free_run__begins_after_a_history_and_lasts_30_s_or_to_the_end(samp
 def test_plot_sequence__is_relative_to_where_the_tool_began():
     sequence = axis_sequences(BROKK_170)[0]
     sizes = {"p_tool": 3, "v_tool": 3, "q_dot": 5}
-    trace = SimpleNamespace(**{name: RNG.normal(size=(360, 2, n)) for name, n in sizes.items()})
+    trace = SimpleNamespace(**{name: RNG.normal(size=(520, 2, n)) for name, n in sizes.items()})
     traces = {("rl", "x"): trace, ("pid", "y"): None}
     figure = figures.plot_sequence(BROKK_170, traces, sequence, np.array(POSE), 1)
-    time = 0.05 * np.arange(1, 361)
+    goals = sequence.for_starts(BROKK_170, np.tile(POSE, (2, 1)))[:, 1]
+    time = 0.05 * np.arange(1, 521)
     positions = [f"{axis} - {axis}(0) [m]" for axis in "xyz"]
     assert ylabels(figure) == positions + [f"velocity {axis} [m/s]" for axis in "xyz"]
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["goal", "rl"]
@@ -99,9 +100,9 @@ def test_plot_sequence__is_relative_to_where_the_tool_began():
     for i in range(3):
         above, below = curves(figure.axes[i]), curves(figure.axes[3 + i])
         np.testing.assert_allclose(above["rl"], [time, trace.p_tool[:, 1, i] - p_start[i]])
-        np.testing.assert_allclose(above["goal"], [time, 0.05 * np.cumsum(sequence.goals[:, i])])
+        np.testing.assert_allclose(above["goal"], [time, 0.05 * np.cumsum(goals[:, i])])
         np.testing.assert_allclose(below["rl"], [time, trace.v_tool[:, 1, i]])
-        np.testing.assert_allclose(below["goal"], [time, sequence.goals[:, i]])
+        np.testing.assert_allclose(below["goal"], [time, goals[:, i]])
     joints = figures.plot_joint_velocities(BROKK_170, traces, "x", 1)
     assert ylabels(joints) == [f"velocity q{i} [rad/s]" for i in (1, 3, 4, 5)]
     np.testing.assert_array_equal(curves(joints.axes[2])["rl"], [time, trace.q_dot[:, 1, 3]])

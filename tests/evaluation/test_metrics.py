@@ -114,6 +114,35 @@ def test_metrics__time_at_limits_is_of_driven_joints():
     assert figures(still, still, q=q)["time_at_limits"] == pytest.approx(4 * 0.05)
 
 
+def test_metrics__errors_in_moves_and_in_rests():
+    goals = np.zeros((40, 3))
+    goals[10:30, 2] = 0.2
+    v = goals.copy()
+    v[[5, 35], 0] = 0.1
+    v[20, 2] = 0.0
+    row = figures(v, goals)
+    assert row["velocity_error_moves"] == pytest.approx(0.2 / 20)
+    assert row["velocity_error_rests"] == pytest.approx(0.2 / 20)
+
+
+def test_motion_at_rest__by_hand():
+    """Rests of 2, 1.5 and 1 s: what moves in the first second of each does not count."""
+    moving = np.repeat([0, 1, 0, 1, 0, 1, 0], [50, 10, 40, 10, 30, 10, 20])
+    goals = np.stack([0.1 * moving, 0 * moving, 0 * moving], axis=1)[:, None]
+    x = np.zeros((170, 1, 2))
+    x[:60] = 9.0  # before the first stop
+    x[60:79] = 7.0  # in its first second
+    x[79:90] = [0.1, 0.1]
+    x[90:95] = [0.4, 0.5]
+    x[95:100] = [0.1, 0.2]
+    x[135:140, 0, 1] = 0.1
+    mean, largest = m.motion_at_rest(BROKK_170, goals, x, 2)
+    assert mean == pytest.approx([0.3]) and largest == pytest.approx([0.5])
+    mean, largest = m.motion_at_rest(BROKK_170, goals, x, np.inf)
+    assert mean == pytest.approx([0.25]) and largest == pytest.approx([0.4])
+    assert np.isnan(m.motion_at_rest(BROKK_170, 0 * goals, x, 2)).all()
+
+
 def held(*parts):
     """Velocities along z, (T, 3), each held for some ticks."""
     z = np.concatenate([np.full(ticks, value) for ticks, value in parts])
@@ -162,7 +191,10 @@ PID = baselines(BROKK_170, obedient_net(BROKK_170))["jacobian_pid_k0.1"]
 
 
 def shortened(ticks):
-    return [s._replace(goals=s.goals[10 : 10 + ticks]) for s in task_sequences(BROKK_170)[:3]]
+    """From 0.5 s before the first move."""
+    axes = task_sequences(BROKK_170)[:3]
+    first = [np.flatnonzero(s.goals.any(axis=1))[0] - 10 for s in axes]
+    return [s._replace(goals=s.goals[t : t + ticks]) for s, t in zip(axes, first, strict=True)]
 
 
 def test_evaluate__gives_rows_in_order_with_their_figures():
@@ -172,11 +204,12 @@ def test_evaluate__gives_rows_in_order_with_their_figures():
     assert [tuple(row[key] for key in m.LABELS) for row in rows] == labels
     assert set(traces) == {(c, s) for c in controllers for s in "xyz"}
     p_start = tool_position(forward_kinematics(BROKK_170, STARTS))
-    goals = shortened(50)[1].for_starts(2)
+    goals = shortened(50)[1].for_starts(BROKK_170, STARTS)
     expected = m.metrics(BROKK_170, traces["pid", "y"], goals, p_start)
     for row in rows[2:4]:
-        figures_of_row = {key: row[key] for key in expected}
-        assert figures_of_row == {key: values[row["start"]] for key, values in expected.items()}
+        for key, values in expected.items():
+            figure = np.nan if row[key] is None else row[key]
+            np.testing.assert_array_equal(figure, values[row["start"]], err_msg=key)
     error = m.summary(rows)
     assert error["pid"]["all"]["velocity_error_mean"] < error["idle"]["all"]["velocity_error_mean"]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -26,6 +27,12 @@ def goals_by_name(machine):
     return {sequence.name: sequence.goals for sequence in s.task_sequences(machine)}
 
 
+def rests_of(goals):
+    """Seconds of each rest."""
+    table = s.hold_table(BROKK_170, goals)
+    return table[~table[:, 1:].any(axis=1), 0]
+
+
 # --- sequences ------------------------------------------------------------------------------------
 
 
@@ -39,16 +46,48 @@ def test_axis_sequences__move_along_one_axis_and_back(tool_speed):
         np.testing.assert_allclose(speeds, [-fast, -fast / 2, 0, fast / 2, fast])
 
 
-def test_task_sequences__last_18_seconds_and_end_at_rest_where_they_began():
+def test_task_sequences__last_26_seconds_and_end_at_rest_where_they_began():
     for name, goals in goals_by_name(BROKK_170).items():
-        assert goals.shape == (360, 3), name
-        assert not goals[:20].any() and not goals[-20:].any()
+        assert goals.shape == (520, 3), name
         np.testing.assert_allclose(goals.sum(axis=0), 0, atol=1e-9)
         assert np.linalg.norm(goals, axis=-1).max() <= BROKK_170.tool_speed
+        rests = rests_of(goals)
+        assert min(rests) >= 0.5 and max(rests) <= 10 and not goals[:10].any()
+
+
+def test_task_sequences__rests_are_of_all_lengths():
+    every = np.concatenate([rests_of(goals) for goals in goals_by_name(BROKK_170).values()])
+    below = [np.sum(every < seconds) for seconds in (1, 2, 4, 11)]
+    assert below[-1] == 35 and np.diff([0, *below]).min() >= 5
+
+
+@pytest.mark.parametrize("seconds", s.RESTS)
+def test_rest_sequences__have_equal_rests_and_the_moves_of_the_axes(seconds):
+    axes = s.axis_sequences(BROKK_170)
+    for sequence, scored in zip(s.rest_sequences(BROKK_170, seconds), axes, strict=True):
+        assert sequence.name == scored.name
+        assert rests_of(sequence.goals).tolist() == pytest.approx([seconds] * 4)
+        moves = [commands.goals[commands.goals.any(axis=1)] for commands in (sequence, scored)]
+        np.testing.assert_array_equal(*moves)
+
+
+def test_for_starts__reverses_inward_goals_by_the_quadrant_of_the_tool():
+    goals = np.array([[0.1, 0.2, 0.3]])
+    q1 = np.array([0.5, 2.0, -0.5, -2.0])  # of the four quadrants
+    starts = np.column_stack([q1, np.tile(START[1:], (4, 1))])
+    signs = np.array([[-1, -1, 1], [1, -1, 1], [-1, 1, 1], [1, 1, 1]])
+    inward = s.Commands("a", goals, inward=True).for_starts(BROKK_170, starts)
+    np.testing.assert_allclose(inward, goals * signs[None])
+    of_a_file = s.Commands("a", goals).for_starts(BROKK_170, starts)
+    np.testing.assert_array_equal(of_a_file, np.tile(goals, (1, 4, 1)))
 
 
 def test_task_sequences__by_hand():
-    goals = goals_by_name(BROKK_170)
+    goals = {}
+    for name, scored in goals_by_name(BROKK_170).items():  # with rests of a second
+        rows = s.hold_table(BROKK_170, scored)
+        rows[~rows[:, 1:].any(axis=1), 0] = 1.0
+        goals[name] = np.repeat(rows[:, 1:], np.rint(20 * rows[:, 0]).astype(int), axis=0)
     assert list(goals)[:3] == ["x", "y", "z"]
     assert list(goals)[3:6] == ["diagonal_flat", "diagonal_rise", "circle"]
     assert list(goals)[6:] == ["rectangle", "stop_and_go", "slow"]
@@ -170,8 +209,11 @@ def test_evaluation_starts__of_the_package_are_of_all_kinds():
     assert (lowest_point(forward_kinematics(BROKK_170, starts)) > 0).all()
     assert len(np.unique(starts, axis=0)) == 64
     workspace = starts[kinds == "workspace"]
+    assert np.histogram(workspace[:, 0], [-2.14, -0.7, 0.7, 2.14])[0].min() >= 5
     for sequence in s.axis_sequences(BROKK_170):
-        assert s.feasible(BROKK_170, workspace, sequence.for_starts(32)).all(), sequence.name
+        assert s.feasible(BROKK_170, workspace, sequence.for_starts(BROKK_170, workspace)).all(), (
+            sequence.name
+        )
     with pytest.raises(ValueError, match=r"starts.csv: expected at most 64 starts, got 65"):
         s.evaluation_starts(BROKK_170, 65, [], 0)
 
@@ -182,7 +224,7 @@ def test_evaluation_starts__of_another_machine_are_drawn():
     starts = s.evaluation_starts(other, 5, sequences, 3)
     kinds = s.start_kinds(other, starts)
     assert kinds == ["workspace", "limits", "workspace", "extended", "workspace"]
-    assert s.feasible(other, starts, sequences[0].for_starts(5))[[0, 1, 2, 4]].all()
+    assert s.feasible(other, starts, sequences[0].for_starts(other, starts))[[0, 1, 2, 4]].all()
     drawn = s.draw_starts(other, sequences, 5, np.random.default_rng(3))
     np.testing.assert_array_equal(starts, drawn)
 
@@ -293,15 +335,16 @@ def test_speed_limits__are_where_the_plant_settles(machine, data):
 def test_tuning_set__is_drawn_like_the_policys_episodes():
     config = TaskConfig()
     starts, goals = s.tuning_set(BROKK_170, 8, 7)
-    assert starts.shape == (8, 5) and goals.shape == (240, 8, 3)
+    assert starts.shape == (8, 5) and goals.shape == (400, 8, 3)
     assert s.feasible(BROKK_170, starts, goals).all()
     assert np.linalg.norm(goals, axis=-1).max() <= BROKK_170.tool_speed + 1e-6
-    holds = []
+    holds, rests = [], []
     for run in goals.swapaxes(0, 1):
         changes = np.flatnonzero(np.abs(np.diff(run, axis=0)).max(axis=1)) + 1
-        holds += list(np.diff([0, *changes]))  # the last hold is cut short
-    assert min(holds) >= config.hold_min_s * 20
-    assert max(holds) > 40 and np.mean(holds) < config.hold_max_s * 20
+        for begin, end in pairwise([0, *changes]):  # the last hold is cut short
+            (holds if run[begin].any() else rests).append((end - begin) / 20)
+    assert min(holds) >= config.hold_min_s and min(rests) >= 0.5
+    assert 2 < max(holds) <= config.hold_max_s and max(rests) > 5  # two rests may be one
     again = s.tuning_set(BROKK_170, 8, 7)
     np.testing.assert_array_equal(starts, again[0])
     np.testing.assert_array_equal(goals, again[1])

@@ -7,10 +7,11 @@ import json
 import numpy as np
 import pytest
 
+from brokk_min.actuator import CLOSE_AFTER
 from brokk_min.env import COMPENSATION
 from brokk_min.identification.files import SHIPPED
 from brokk_min.learning.onnx import export_onnx
-from brokk_min.learning.policy import STANDSTILL_TIMEOUT, load_policy
+from brokk_min.learning.policy import load_policy
 from brokk_min.machine import BROKK_170
 
 
@@ -45,6 +46,6 @@ def test_export_onnx__is_one_file_with_what_the_other_program_needs(policy, tmp_
     metadata = {prop.key: json.loads(prop.value) for prop in model.metadata_props}
     for name in ("mean", "scale"):
         np.testing.assert_array_equal(np.float32(metadata.pop(name)), getattr(policy, name))
-    assert (metadata.pop("ramp"), metadata.pop("stand_s")) == (COMPENSATION, STANDSTILL_TIMEOUT)
+    assert (metadata.pop("ramp"), metadata.pop("stand_s")) == (COMPENSATION, CLOSE_AFTER)
     assert metadata == dict(policy.contract)
     assert metadata["driven"] == ["q1", "q3", "q4", "q5"] and metadata["rate"] == 20.0

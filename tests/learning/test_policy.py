@@ -116,9 +116,10 @@ def test_controller__sends_the_actions_of_the_policy(policy):
     assert len(np.unique(u[:, 0])) > 1
 
 
-def test_controller__closes_valves_two_seconds_after_the_goal_became_zero(policy):
-    """Goals of both machines are zero but for one tick of the first: 40 ticks later, u = 0."""
-    controller = PolicyController(BROKK_170, policy)
+@pytest.mark.parametrize("valves", ["closed", "open"])
+def test_controller__closes_valves_half_a_second_after_the_goal_became_zero(policy, valves):
+    """Goals of both machines are zero but for one tick of the first: 10 ticks later, u = 0."""
+    controller = PolicyController(BROKK_170, replace(policy, valves=valves))
     ticks = controller.start(2)
     is_open = []
     for tick in range(100):
@@ -127,10 +128,10 @@ def test_controller__closes_valves_two_seconds_after_the_goal_became_zero(policy
         u, ticks = controller(measured(v_goal), ticks)
         is_open.append(u.any(axis=1))
     first, second = np.array(is_open).T
-    assert first[:71].all()
-    assert not first[71:].any()
-    assert second[:40].all()
-    assert not second[40:].any()
+    assert first[30:41].all()
+    assert first[41:].any() == (valves == "open")
+    assert second[:10].all()
+    assert second[10:].any() == (valves == "open")
 
 
 def test_controller__of_the_papers_agent_takes_its_observation_and_sends_plain_actions():

@@ -49,7 +49,8 @@ def simulate(machine, net, state, commands):
 def ticks_of(states, commands, done=None):
     names = ("q", "true_history", "v_goal", "error_integral")
     arrays = [np.stack([getattr(s, name) for s in states[:-1]]) for name in names]
-    return Ticks(*arrays, commands, np.zeros(commands.shape[:2], bool) if done is None else done)
+    done = np.zeros(commands.shape[:2], bool) if done is None else done
+    return Ticks(*arrays, commands, np.ones_like(commands), done)
 
 
 def moving_case(machine, seed):
