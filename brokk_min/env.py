@@ -2,7 +2,6 @@
 
 On the nets these functions are the simulation, on the plant the machine. `learning.episodes` draws
 starts and goals. The numbers below are of the Brokk 170: 4 driven joints, 1 locked joint, H = 13.
-
 Observation: Box, float32, (171,), (x - mean) / deviation * weight of these blocks:
 
 | Num     | Observation                                          | Deviation   | Weight | Noise |
@@ -15,16 +14,17 @@ Observation: Box, float32, (171,), (x - mean) / deviation * weight of these bloc
 | 163-166 | resolved velocities of the goal (`jacobian.dls`)     | uniform     | 4.2    | no    |
 | 167-170 | resolved velocities of the error integral            | 0.1 uniform | 4.2    | no    |
 
-"Uniform": over the range of the joint or its velocity. The newest sample is the last. The heading
-frame has x outward from the slew axis to the tool.
+"Uniform": over the range of the joint or its velocity. The newest sample is the last. Heading
+frame: x from the slew axis to the tool.
 
 Action: Box(-1, 1, (4,)), of the largest command of each driven joint, see `action_to_pwm`.
 Reward: 1 / (1 + |v_goal - v_tool|) (eq2), minus costs of valve travel and of the error integral.
 Start: at rest in a random pose above the ground, with a random goal that changes now and then.
 End: terminated, without reward, with a link in the ground; truncated after 20 s.
-"""
 
-from __future__ import annotations
+The paper's agent (`TaskConfig.paper`) observes 0-162 in the base frame, with weights 1. Its actions
+are linear, its reward is eq2 alone. Only a start in the ground terminates. No rule closes valves.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -61,7 +61,7 @@ class TaskConfig:
     integral_cost: float = 1.0  # Cost of the error integral [1/m] (paper: 0).
     valves: Literal["closed", "open"] = "closed"  # While the tool rests, see `close_valves`.
     redraw_ground: bool = True  # Redraw start poses in the ground; the paper ends the episode.
-    paper: bool = False  # Observation, reward and critic as the paper has them.
+    paper: bool = False  # The paper's agent: observation, action, reward, start and end, see above.
 
 
 class Measured(NamedTuple):
@@ -163,27 +163,19 @@ def features(machine: Machine, measured: Measured, paper: bool = False) -> Array
 
     Resolved velocities (ours): `dls` with W = 1, lambda = 6 % of the links' lengths (assumed).
     """
-    velocities = [measured.v_goal, measured.v_tool]
-    resolved = np.empty((0, *measured.q.shape[:-1], len(machine.driven)))
+    signals = measured.history[..., :2, :].reshape(*measured.q.shape[:-1], -1)
+    commands = measured.history[..., 2, :].reshape(*measured.q.shape[:-1], -1)
+    q_locked = measured.q[..., machine.locked]
+    numbers = [measured.v_goal, measured.v_tool, q_locked, signals, commands]
     if not paper:
-        velocities = [kinematics.to_heading(measured.p_tool, v) for v in velocities]
+        numbers[:2] = [kinematics.to_heading(measured.p_tool, v) for v in numbers[:2]]
         J = measured.J[..., machine.driven]
         arm = np.hypot(machine.column("a"), machine.column("d")).sum()
         J_inv = dls(J, np.ones(len(machine.driven)), (0.06 * arm) ** 2 + 1e-6)
         resolved = J_inv @ np.stack([measured.v_goal, measured.error_integral], axis=-1)
-        resolved = np.moveaxis(resolved, -1, 0)
-    numbers = [
-        *velocities,
-        measured.q[..., machine.locked],
-        measured.history[..., :2, :].reshape(*measured.q.shape[:-1], -1),
-        measured.history[..., 2, :].reshape(*measured.q.shape[:-1], -1),
-        *resolved,
-    ]
+        numbers += [resolved[..., 0], resolved[..., 1]]
     mean, scale = observation_scale(machine, paper)
-    obs = np.concatenate(numbers, axis=-1, dtype=np.float32)
-    obs -= mean
-    obs /= scale
-    return obs
+    return (np.concatenate(numbers, axis=-1, dtype=np.float32) - mean) / scale
 
 
 def integrate_error(machine: Machine, v_goal: Array, v_tool: Array, integral: Array) -> Array:
@@ -215,7 +207,8 @@ def action_to_pwm(machine: Machine, action: ArrayLike, paper: bool = False) -> A
     """Commands u (..., n) of full command from actions of the driven joints (..., n_driven).
 
     u = dead_zone clip(a / 0.01, -1, 1) + (limit - dead_zone) a: dead-zone compensation, as the PIDs
-    have it; of the paper's agent u = limit a. ValueError: a wrong shape, a number that is not finite. Paper: Sec. 3.3, Sec. 3.4
+    have it. The paper's agent has none: u = limit a. Paper: Sec. 3.3, Sec. 3.4
+    ValueError: a wrong shape, a number that is not finite.
 
     Example:
         >>> from brokk_min.machine import BROKK_170
@@ -322,10 +315,9 @@ def step(
     The next state; reward, terminated, truncated and |v_goal - v_tool| [m/s], (num,) each.
     """
     u = action_to_pwm(machine, action, config.paper)
-    if not config.paper:
-        u, rest = close_valves(machine, config.valves, u, state.v_goal, state.rest_ticks)
-        state = replace(state, rest_ticks=rest)
-    state = transition(machine, net, state, u)
+    valves = "open" if config.paper else config.valves
+    u, rest = close_valves(machine, valves, u, state.v_goal, state.rest_ticks)
+    state = replace(transition(machine, net, state, u), rest_ticks=rest)
     rewards = reward(state.v_goal, state.v_tool)
     error = np.linalg.norm(state.v_goal - state.v_tool, axis=-1)
     if not config.paper:
@@ -333,8 +325,6 @@ def step(
         limit = len(machine.driven) * machine.pwm_limit / PWM_MAX
         rewards = rewards - config.valve_cost * change.sum(axis=-1) / limit
         rewards = rewards - config.integral_cost * np.linalg.norm(state.error_integral, axis=-1)
-    end = terminated(machine, state.lowest)
-    if config.paper:
-        end = end & (state.ticks == 1)  # the start was in the ground
+    end = terminated(machine, state.lowest) & ((state.ticks == 1) | (not config.paper))
     truncated = (state.ticks >= round(config.episode_s * machine.rate)) & ~end
     return state, np.where(end, 0.0, rewards), end, truncated, error
