@@ -139,23 +139,36 @@ def a11() -> Figures:
     return {"open": baseline_error(0.015, 0.05), "closed": baseline_error(0.0, 0.05)}
 
 
+def levels() -> Figures:
+    """Fractions of samples: in the dead zone, and about the threshold of the valves."""
+    result = {}
+    for kind in excitation.EXCITATIONS:
+        log = excitation.collect(M, 0.5, kind, np.random.default_rng(0))
+        driven = [r for r in log.recordings if not r.name.endswith(logs.RETURN)]
+        size = np.concatenate([np.abs(r.u).max(axis=1)[M.history :] for r in driven])
+        counts = (size * PWM_MAX).round()
+        result[f"{kind}, in the dead zone"] = np.mean(size <= M.dead_zone)
+        result[f"{kind}, 8 to 15 counts"] = np.mean((counts >= 8) & (counts <= 15))
+    return result
+
+
 def stand() -> Figures:
-    """Path [m] from 0.5 s after a stop until valves close; true dead zone as known, and smaller."""
+    """Path [m] from 0.5 to 2 s after a stop with open valves; dead zone as known, and smaller."""
     starts = sequences.evaluation_starts(M, 64, sequences.task_sequences(M), 2)
     starts = starts[np.array(sequences.start_kinds(M, starts)) == "workspace"]
     shipped = policy.load_policy(SHIPPED / M.name / "policy.npz", M)
+    shipped = replace(shipped, valves="open")
     controller = policy.PolicyController(M, shipped)
-    closed = 39 + round(actuator.CLOSE_AFTER * M.rate)  # tick
     result = {}
     for dead_zone in (M.dead_zone, M.dead_zone - 0.02):
         plant = replace(M, dead_zone=dead_zone)
         paths = []
         for direction in np.concatenate([np.eye(3), -np.eye(3)]):
-            goals = np.zeros((110, len(starts), 3))
+            goals = np.zeros((80, len(starts), 3))
             goals[:40] = 2 / 3 * M.tool_speed * direction
             rng = np.random.default_rng(0)
             p = rollout(plant, controller, starts, goals, TaskConfig(), rng).p_tool
-            paths.append(norm(p[closed] - p[49], axis=-1))
+            paths.append(norm(p[79] - p[49], axis=-1))
         result[f"{dead_zone:.2f}, median"] = np.median(paths)
         result[f"{dead_zone:.2f}, most"] = np.max(paths)
     return result
@@ -308,7 +321,7 @@ def a5() -> Figures:
     return compare(base_frame=base_frame, heading=default_training())
 
 
-MEASURED: tuple[Callable[[], Figures], ...] = (a1, d1, d3, d6, a6, a7, a9, a11, stand)
+MEASURED: tuple[Callable[[], Figures], ...] = (a1, d1, d3, d6, a6, a7, a9, a11, levels, stand)
 TRAINED: tuple[Callable[[], Figures], ...] = (d4, a4, d5, d7, d10, d11, d12, d13, d14, a5)
 
 

@@ -85,9 +85,7 @@ def _euler_step(machine: Machine, state: PlantState, opening: Array) -> PlantSta
     K = np.where(s > 0, m.column("speed_positive"), m.column("speed_negative"))
     v_steady = K * s * g  # of the cylinder, were it alone
     flow = np.sum(np.abs(m.column("cylinder_area") * v_steady), axis=-1, keepdims=True)
-    pump = np.minimum(
-        1.0, m.pump_flow / np.maximum(flow, 1e-12)
-    )  # share of the flow: min(1, Q / sum |A v_steady|)
+    pump = np.minimum(1.0, m.pump_flow / np.maximum(flow, 1e-12))  # min(1, Q / sum |A v_steady|)
     q_next = q + dt * v / lever_arm(m, q)  # dq/dt = v / r(q)
     v_next = v + dt * (v_steady * pump - v) / m.tau_cylinder  # dv/dt = (v_steady pump - v) / tau_v
     q_next = np.clip(q_next, m.column("q_min"), m.column("q_max"))
@@ -247,9 +245,8 @@ class ActuatorNet:
         """
         n = len(self.joints)
         if history.shape[-3:] != (n, 3, self.history):
-            raise ValueError(
-                f"history: expected (..., {n}, 3, {self.history}), got {history.shape}"
-            )
+            expected = f"expected (..., {n}, 3, {self.history})"
+            raise ValueError(f"history: {expected}, got {history.shape}")
         x = history.copy()
         x[..., 2, :] = mu_law(x[..., 2, :], self.dead_zone)
         return x.reshape(*x.shape[:-2], 3 * self.history)

@@ -34,7 +34,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brokk_min import actuator, kinematics
+from brokk_min import actuator, kinematics, machine
 from brokk_min.actuator import ActuatorNet, PlantState, append_sample, close_valves, initial_history
 from brokk_min.jacobian import dls
 from brokk_min.kinematics import forward_kinematics, jacobian, tool_velocity
@@ -51,17 +51,18 @@ Encoder = Callable[[Machine, Array], Array]  # machine, true angles -> measured 
 class TaskConfig:
     """What an episode is. Paper: Sec. 3.4; the numbers are assumed unless they name the paper."""
 
-    episode_s: float = 20.0  # Length of an episode [s]; its end is a truncation.
-    hold_min_s: float = 0.5  # Shortest time for which a velocity goal holds [s].
-    hold_max_s: float = 3.0  # Longest time for which a velocity goal holds [s].
-    zero_goals: float = 0.15  # Fraction of goals that ask the tool to stand still.
-    axis_goals: float = 0.4  # Fraction of goals along x, y or z; the others point anywhere.
-    noise: float = 0.05  # Largest noise of what sensors measure, in deviations (paper: 5 %).
-    valve_cost: float = 0.05  # Cost of a change of all commands by their limit (paper: 0).
-    integral_cost: float = 1.0  # Cost of the error integral [1/m] (paper: 0).
+    episode_s: float = machine.number("s", 0.05, 1e6, 20.0)  # Length of an episode [s].
+    hold_min_s: float = machine.number("s", 0, 1e6, 0.5)  # Shortest time of a velocity goal [s].
+    hold_max_s: float = machine.number("s", "hold_min_s", 1e6, 3.0)  # Longest time of a goal [s].
+    zero_goals: float = machine.number("1", 0, 1, 0.15)  # Fraction of goals of zero velocity.
+    axis_goals: float = machine.number("1", 0, 1, 0.4)  # Fraction along x, y or z; others anywhere.
+    noise: float = machine.number("1", 0, 1000, 0.05)  # Of sensors, in deviations (paper: 5 %).
+    valve_cost: float = machine.number("1", 0, 1000, 0.05)  # Of a full change of all (paper: 0).
+    integral_cost: float = machine.number("1/m", 0, 1000, 1.0)  # Of the error integral (paper: 0).
     valves: Literal["closed", "open"] = "closed"  # While the tool rests, see `close_valves`.
     redraw_ground: bool = True  # Redraw start poses in the ground; the paper ends the episode.
     paper: bool = False  # The paper's agent: observation, action, reward, start and end, see above.
+    __post_init__ = machine.check_numbers  # type: ignore[misc]
 
 
 class Measured(NamedTuple):
@@ -131,8 +132,7 @@ def observation_scale(machine: Machine, paper: bool = False) -> tuple[Array, Arr
 @lru_cache
 def sensor_std(machine: Machine) -> Array:
     """Deviations of what sensors measure, the unit of its noise, float32 (noisy numbers,)."""
-    noisy = [block.std for block in observation_blocks(machine) if block.noisy]
-    return np.concatenate(noisy).astype(np.float32)
+    return np.concatenate([b.std for b in observation_blocks(machine) if b.noisy], dtype=np.float32)
 
 
 def measure(

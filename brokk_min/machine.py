@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,24 +20,28 @@ PWM_MAX = 127  # counts of full command; paper: [0,127] is positive, [255,128] n
 
 
 def number(
-    unit: str, low: float = -np.inf, high: float = np.inf, default: Any = dataclasses.MISSING
+    unit: str, low: float | str = -np.inf, high: float = np.inf, default: Any = dataclasses.MISSING
 ) -> Any:
-    """A field with its unit and its range, both ends included."""
+    """A field with its unit and its range, both ends included; `low` may name another field."""
     return dataclasses.field(default=default, metadata={"unit": unit, "low": low, "high": high})
 
 
-def check_numbers(owner: Machine | Joint, label: str) -> None:
+def check_numbers(owner: Any, label: str = "") -> None:
     """ValueError: a number that is not finite, not whole where it must be, or out of its range."""
+    hints = get_type_hints(type(owner))
     for field in dataclasses.fields(owner):
-        if "unit" not in field.metadata:
+        value, hint = getattr(owner, field.name), hints[field.name]
+        values = (True, False) if hint is bool else get_args(hint)
+        if get_origin(hint) in (None, Literal) and values and value not in values:
+            raise ValueError(f"{label}{field.name}: expected one of {values}, got {value!r}")
+        if "unit" not in field.metadata or (value is None and type(None) in values):
             continue
-        value = getattr(owner, field.name)
-        whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-        if not ((whole or isinstance(value, float | np.floating)) and np.isfinite(value)):
-            raise ValueError(f"{label}{field.name}: expected a finite number, got {value!r}")
-        if field.type == "int" and not whole:
-            raise ValueError(f"{label}{field.name}: expected a whole number, got {value!r}")
+        types: Any = (int, np.integer) if hint is int else (int, float, np.integer, np.floating)
+        if isinstance(value, bool) or not isinstance(value, types) or not abs(value) < np.inf:
+            kind = "whole" if hint is int else "finite"
+            raise ValueError(f"{label}{field.name}: expected a {kind} number, got {value!r}")
         low, high = field.metadata["low"], field.metadata["high"]
+        low = getattr(owner, low) if isinstance(low, str) else low
         if not low <= value <= high:
             raise ValueError(f"{label}{field.name}: expected {low} to {high}, got {value!r}")
 
@@ -80,10 +84,8 @@ class Joint:
         low = self.cylinder_angle + self.q_min
         high = self.cylinder_angle + self.q_max
         if self.cylinder_base > 0 and not 0 < low < high < np.pi:
-            raise ValueError(
-                f"{self.name}.cylinder_angle: expected the triangle's angle within (0, pi) "
-                f"over the joint's range, got {low:.3f} to {high:.3f}"
-            )
+            expected = "expected the triangle's angle within (0, pi) over the joint's range"
+            raise ValueError(f"{self.name}.cylinder_angle: {expected}, got {low:.3f} to {high:.3f}")
 
 
 @dataclass(frozen=True)

@@ -20,29 +20,30 @@ import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 from torch import Tensor, nn
 
+from brokk_min.machine import check_numbers, number
+
 
 @dataclass(frozen=True)
 class PPOConfig:
     """Settings of the learner; those that the paper names are marked."""
 
-    total_steps: int = 6_000_000  # Environment steps in all.
-    num_envs: int = 256  # Environments side by side (paper: 256).
-    horizon: int = 32  # Ticks of every environment between two updates.
-    epochs: int = 4  # Passes over the collected steps in each update.
-    minibatch_size: int = 2048  # Steps in one gradient.
-    learning_rate: float = (
-        4e-3  # Of Adam, at most: falls to zero at the end, less after a large KL.
-    )
-    target_kl: float = 0.3  # KL divergence of an update at which the learning rate stays as it is.
-    gamma: float = 0.95  # Discount a tick: 0.95 looks 20 ticks (1 s) ahead.
-    gae_lambda: float = 0.95  # Weight of longer returns in the advantage.
-    clip: float = 0.2  # Change of a probability ratio beyond which gains do not count.
-    entropy: float = 0.0  # Coefficient of the entropy bonus.
-    max_grad_norm: float = 1.0  # Gradients are scaled down to this norm.
-    log_std: float = -1.8  # Logarithm of the actions' standard deviation at the start.
-    log_std_end: float | None = -4.5  # The same at the end, linear between; None: learned.
-    checkpoint_every: int = 50  # Updates between two checkpoints.
-    threads: int = 2  # Threads of torch; the last bits depend on it.
+    total_steps: int = number("steps", 1, 10**12, 6_000_000)  # Environment steps in all.
+    num_envs: int = number("1", 1, 10**6, 256)  # Environments side by side (paper: 256).
+    horizon: int = number("ticks", 1, 10**6, 32)  # Ticks of each environment between two updates.
+    epochs: int = number("1", 1, 10**6, 4)  # Passes over the collected steps in each update.
+    minibatch_size: int = number("steps", 2, 10**7, 2048)  # Steps in one gradient.
+    learning_rate: float = number("1", 1e-9, 1, 4e-3)  # Of Adam, at most; falls to zero.
+    target_kl: float = number("1", 1e-9, 1e9, 0.3)  # KL divergence that keeps the learning rate.
+    gamma: float = number("1", 0, 0.9999, 0.95)  # Discount a tick: 0.95 looks 20 ticks ahead.
+    gae_lambda: float = number("1", 0, 1, 0.95)  # Weight of longer returns in the advantage.
+    clip: float = number("1", 1e-9, 1e9, 0.2)  # Largest rewarded change of a probability ratio.
+    entropy: float = number("1", 0, 1000, 0.0)  # Coefficient of the entropy bonus.
+    max_grad_norm: float = number("1", 1e-9, 1e9, 1.0)  # Gradients are scaled down to this norm.
+    log_std: float = number("1", -10, 3, -1.8)  # Log of the actions' deviation at the start.
+    log_std_end: float | None = number("1", -10, 3, -4.5)  # At the end, linear; None: learned.
+    checkpoint_every: int = number("updates", 1, 10**12, 50)  # Updates between two checkpoints.
+    threads: int = number("1", 1, 10**6, 2)  # Threads of torch; the last bits depend on it.
+    __post_init__ = check_numbers  # type: ignore[misc]
 
 
 def layer_init(layer: nn.Linear, std: float) -> nn.Linear:

@@ -12,13 +12,24 @@ import numpy as np
 from tyro.conf import OmitArgPrefixes, Positional
 
 from brokk_min.actuator import ActuatorNet, select_nets
-from brokk_min.cli.options import Command, MachineName, Range, Seed, WrongUse, default_policy
-from brokk_min.cli.settings import Count, FitSettings, LearnerSettings, Samples, TaskSettings
+from brokk_min.cli.options import (
+    Command,
+    Count,
+    MachineName,
+    Range,
+    Samples,
+    Seed,
+    WrongUse,
+    default_policy,
+)
+from brokk_min.cli.settings import FitSettings, LearnerSettings, TaskSettings, make_config
+from brokk_min.env import TaskConfig
 from brokk_min.evaluation import baselines, figures, metrics, perfect_model, sequences
 from brokk_min.evaluation.claims import VERDICTS
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.identification import excitation, validation
 from brokk_min.identification.files import write_json
+from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
 from brokk_min.identification.logs import Log, read_log, write_log
 from brokk_min.identification.net_file import load_net, save_net
 from brokk_min.learning.policy import Policy, PolicyController, load_policy
@@ -58,18 +69,19 @@ class Fit(Command):
     settings: OmitArgPrefixes[FitSettings] = field(default_factory=FitSettings)
 
     def __call__(self) -> None:
-        from brokk_min.identification.fitting import FitConfig, fit
+        from brokk_min.identification.fitting import fit
 
         if not self.logs:
             raise WrongUse("LOGS: expected at least one log, got none")
         machine = self.check(self.out, self.json, self.figure)
+        make_config(FitConfig, vars(self.settings))  # before the logs are read
         samples = self.velocity_samples or machine.velocity_samples
         log, test = self._read(machine, samples)
         known = machine if machine.names == log.joints else None
         if self.machine and not known:
             expected = f"joints of --machine {self.machine}"
             raise ValueError(f"LOGS: expected {expected}, got {list(log.joints)}")
-        config = FitConfig(**self._settings(known))
+        config = make_config(FitConfig, self._settings(known))
         net = fit(log, config, self.seed, samples, known.name if known else "")
         scores = validation.validate(net, log, test, known)
         save_net(self.out, net)
@@ -97,8 +109,6 @@ class Fit(Command):
 
     def _settings(self, known: Machine | None) -> dict[str, Any]:
         """The settings, by default with the known machine's dead zone; or the paper's."""
-        from brokk_min.identification.fitting import PAPER_RECIPE
-
         settings = dict(vars(self.settings))
         if self.paper:
             settings |= PAPER_RECIPE
@@ -154,9 +164,9 @@ class Train(Training):
         from brokk_min.ppo import PPOConfig
 
         machine = self.check(self.out)
-        task = self.task.config()
+        task = make_config(TaskConfig, vars(self.task))
+        config = make_config(PPOConfig, vars(self.settings))
         net = select_nets(machine, load_net(self.actuator))
-        config = PPOConfig(**vars(self.settings))
         files = (self.out, self.critic, self.resume, self.tensorboard)
         train_policy(machine, net, task, config, self.seed, *files)
         print(f"{self.out}: trained for {config.total_steps} steps; curve in {self.out}.csv")
@@ -177,9 +187,9 @@ class Sweep(Training):
         from brokk_min.ppo import PPOConfig
 
         machine = self.check()
-        task = self.task.config()
+        task = make_config(TaskConfig, vars(self.task))
+        config = make_config(PPOConfig, vars(self.settings))
         net = select_nets(machine, load_net(self.actuator))
-        config = PPOConfig(**vars(self.settings))
         seeds = range(self.seed, self.seed + self.seeds)
         options = (self.poses, self.scheduler, self.gains, self.critic)
         print(show(sweep(machine, net, task, config, seeds, self.out, *options)))

@@ -28,6 +28,8 @@ class Range:
 
 
 Seed = Annotated[int, Range(0, 2**31 - 1)]
+Count = Annotated[int, Range(1, 10**6)]
+Samples = Annotated[int, Range(2, 100)]
 
 
 def check_ranges(options: Any) -> None:

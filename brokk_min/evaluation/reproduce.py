@@ -115,8 +115,7 @@ def fit_nets(
     config = FitConfig(budget.fit_steps, history=machine.history, dead_zone=machine.dead_zone)
     net = fitting.fit(log, config, seed, machine.velocity_samples, machine.name)
     save_net(out / "net.npz", net)
-    half = replace(config, steps=budget.fit_steps // 2)  # to save time
-    return net, paper_recipe(machine, test, budget.hours, half, seed)
+    return net, paper_recipe(machine, test, budget.hours, config, seed)
 
 
 def paper_recipe(

@@ -6,8 +6,8 @@ joints are trained at once, each on the recordings in which its joint moves.
 """
 
 import math
-from dataclasses import asdict, dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import asdict, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,28 +16,12 @@ from torch import Generator, Tensor
 from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet, mu_law
+from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
 from brokk_min.identification.logs import Log, join_recordings
 from brokk_min.identification.net_file import NET_ARRAYS
 from brokk_min.machine import Array, estimate_velocity
 
-
-@dataclass(frozen=True)
-class FitConfig:
-    """Settings of the fit."""
-
-    steps: int = 16000  # Adam steps.
-    batch_size: int = 512  # Windows per joint in each step; a quarter of it for several ticks.
-    learning_rate: float = 4e-3  # Of Adam; falls to zero along a cosine, twice.
-    noise: float = 0.1  # Standard deviation of noise on velocity inputs, in their own deviations.
-    hidden: int = 32  # Units in each of the two hidden layers (paper: 32).
-    history: int = 13  # Samples of angle, velocity and command in the input (paper: 13).
-    rollout: int = 8  # Ticks of the multi-step errors in the last third of the steps (paper: 1).
-    # Command, of full command, within which no valve opens; the inputs are `mu_law` of commands.
-    # None: that of a known machine, otherwise 0: commands as they are (paper).
-    dead_zone: float | None = None
-
-
-PAPER_RECIPE: dict[str, Any] = {"noise": 0.0, "rollout": 1, "dead_zone": 0.0}  # Sec. 3.3
+__all__ = ["PAPER_RECIPE", "FitConfig", "fit"]
 
 
 def fit(

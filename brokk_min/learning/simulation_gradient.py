@@ -9,14 +9,28 @@ runs backwards through a rollout; it gives the derivative of the discounted rewa
 
     dR_t/da_t = dr_t/da_t + gamma (df/da_t)^T lambda_{t+1}.
 
-The advantage of an action is, to first order, this gradient times its deviation from the mean. The
-field calls it a first-order or gradient-informed policy gradient: PODS (Mora et al., 2021), SHAC
-(Xu et al., 2022), GI-PPO (Son et al., 2023, arXiv 2312.08710). Here it feeds PPO's clipped loss.
+The advantage of an action is, to first order, this gradient times its deviation from the mean,
+
+    A_t = (dR_t/da_t)^T (a_t - mean_t),
+
+and PPO's clipped loss takes it: PPO around a first-order (pathwise) policy gradient. It is open
+loop: later actions count as given. No value stands at the end of the window, so the last actions of
+a window, which move the tool after it, get little credit. None of this is new. Nearest are:
+
+- PODS (Mora et al., 2021): this gradient of the return by the actions, in a differentiable
+  simulator and without a value function, for deterministic policies.
+- SVG (Heess et al., 2015, arXiv 1510.09142): backpropagation through learned dynamics, policy too.
+- Q-Prop (Gu et al., 2017, arXiv 1611.02247): the same Taylor expansion of the advantage, but of a
+  learned critic, as a control variate of sampled returns.
+- SHAC (Xu et al., 2022, arXiv 2204.07137): short windows of a differentiable simulation, through
+  the policy, with a critic's value at their end.
+- GI-PPO (Son et al., 2023, arXiv 2312.08710): PPO with analytic gradients, weighted.
+- RPO (Zhong et al., 2025, arXiv 2508.06214): PPO's clip and its epochs for pathwise gradients.
 
 Simplifications: angles and commands count as exact, not rounded; the error integral takes the true
 velocity of the tick; Jacobians count as constant, for in one second a joint turns little; joints at
 rest count without the standstill rule; a tick into the ground counts as any other; nothing counts
-after the end of an episode; later actions count as given (SHAC differentiates the policy, too).
+after the end of an episode, not even where it only ran out of time.
 """
 
 from typing import NamedTuple

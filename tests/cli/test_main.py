@@ -94,7 +94,7 @@ TRAIN = "train --actuator missing.npz --out p.npz"
         ("fit a.csv --out n.npz --velocity-samples 20", 2, "expected at most --history, got 20"),
         (TRAIN, 1, "missing.npz"),
         (f"{TRAIN} --num-envs 0", 2, "--num-envs: expected 1 to 1000000, got 0"),
-        (f"{TRAIN} --hold-min-s 9", 2, "--hold-max-s: expected --hold-min-s or more, got 3.0"),
+        (f"{TRAIN} --hold-min-s 9", 2, "--hold-max-s: expected 9.0 to 1000000.0, got 3.0"),
         ("sweep --actuator missing.npz --out s", 1, "missing.npz"),
         ("sweep --actuator missing.npz --out s --seeds 0", 2, "--seeds: expected 1 to 10000"),
         ("evaluate --policy missing.npz", 1, "missing.npz"),

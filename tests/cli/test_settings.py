@@ -2,42 +2,54 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, get_args, get_origin, get_type_hints
+from dataclasses import fields
+from typing import get_type_hints
 
 import pytest
 import tyro
 
-from brokk_min.cli.options import Range, WrongUse, check_ranges
-from brokk_min.cli.settings import FitSettings, LearnerSettings, TaskSettings
+from brokk_min.cli.options import WrongUse
+from brokk_min.cli.settings import FitSettings, LearnerSettings, TaskSettings, make_config
 from brokk_min.env import TaskConfig
 from brokk_min.identification.fitting import FitConfig
 from brokk_min.ppo import PPOConfig
 
 PAIRS = [(FitSettings, FitConfig), (LearnerSettings, PPOConfig), (TaskSettings, TaskConfig)]
+FIELDS = [(config, field) for _, config in PAIRS for field in fields(config)]
 
 
 @pytest.mark.parametrize(("settings", "config"), PAIRS)
 def test_settings__have_the_fields_types_and_defaults_of_the_config(settings, config):
     assert get_type_hints(settings) == get_type_hints(config)
     assert vars(settings()) == vars(config())
-    assert config(**vars(settings())) == config()
+    assert make_config(config, vars(settings())) == config()
 
 
-@pytest.mark.parametrize("settings", [pair[0] for pair in PAIRS])
-def test_settings__have_one_range_per_number(settings):
-    check_ranges(settings())
-    for name, hint in get_type_hints(settings, include_extras=True).items():
-        if hint is not bool and get_origin(hint) is not Literal:
-            assert get_origin(hint) is Annotated, name
-            assert sum(isinstance(extra, Range) for extra in get_args(hint)) == 1, name
+@pytest.mark.parametrize(("config", "field"), FIELDS, ids=lambda x: getattr(x, "name", ""))
+def test_configs__refuse_what_no_setting_can_be(config, field):
+    """Each field: text, nan and infinity; below, at and above the ends of its range."""
+    bad = ["a", float("nan"), float("inf"), 10**400, [1], 1j]
+    if field.metadata:
+        low, high = field.metadata["low"], field.metadata["high"]
+        low = 0.5 if low == "hold_min_s" else low  # the default of that field
+        bad += [True, low - 1e-3 if field.type == "float" else low - 1, 1.01 * high + 1]
+        bad += [low + 0.5] if field.type == "int" else []
+        ends = (low, high) if field.name != "hold_min_s" else (low, 3.0)
+        assert [getattr(config(**{field.name: end}), field.name) for end in ends] == [*ends]
+    bad += [] if "None" in field.type else [None]
+    for value in bad:
+        with pytest.raises(ValueError, match=f"^{field.name}: expected .*, got "):
+            config(**{field.name: value})
 
 
-def test_task_settings__need_a_longest_time_above_the_shortest():
-    assert TaskSettings(hold_min_s=2.0, hold_max_s=2.0).config().hold_max_s == 2.0
-    with pytest.raises(WrongUse, match=r"^--hold-max-s: expected --hold-min-s or more, got 0.5$"):
-        TaskSettings(hold_min_s=0.75, hold_max_s=0.5).config()
+def test_make_config__names_the_option():
+    with pytest.raises(WrongUse, match=r"^--valve-cost: expected 0 to 1000, got -1\.0$"):
+        make_config(TaskConfig, vars(TaskSettings(valve_cost=-1.0)))
+    with pytest.raises(WrongUse, match=r"^--hold-max-s: expected 0\.75 to 1000000\.0, got 0\.5$"):
+        make_config(TaskConfig, vars(TaskSettings(hold_min_s=0.75, hold_max_s=0.5)))
 
 
 @pytest.mark.parametrize("option", ["--integral-cost", "--lag-cost"])
 def test_task_settings__keep_the_old_name_of_an_option(option):
-    assert tyro.cli(TaskSettings, args=[option, "2.5"]).config() == TaskConfig(integral_cost=2.5)
+    settings = tyro.cli(TaskSettings, args=[option, "2.5"])
+    assert make_config(TaskConfig, vars(settings)) == TaskConfig(integral_cost=2.5)

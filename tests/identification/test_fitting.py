@@ -123,7 +123,8 @@ def test_fit__refuses_what_cannot_be_learned():
     with pytest.raises(ValueError, match="joint stick"):
         fit(Log(("boom", "stick"), (still,)), FitConfig(steps=1), 0, 4)
     with pytest.raises(ValueError, match="weights: expected finite numbers"):
-        fit(simple_system(0, 3), FitConfig(steps=4, learning_rate=1e35, rollout=1), 0, 4)
+        big = still._replace(q=1e39 * moving.q, u=moving.u)  # infinite as float32
+        fit(Log(("boom", "stick"), (big,)), FitConfig(steps=4, rollout=1), 0, 4)
 
 
 # --- windows and losses ---------------------------------------------------------------------------

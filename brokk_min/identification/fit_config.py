@@ -1,0 +1,27 @@
+"""Settings of the fit, apart from it: the command line reads them without torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from brokk_min.machine import check_numbers, number
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """How the nets are fitted."""
+
+    steps: int = number("steps", 0, 10**12, 16000)  # Adam steps.
+    batch_size: int = number("1", 1, 10**6, 512)  # Windows per joint in each step.
+    learning_rate: float = number("1", 1e-9, 1, 4e-3)  # Of Adam; falls to zero twice, by a cosine.
+    noise: float = number("1", 0, 1000, 0.1)  # Of velocity inputs, in their deviations.
+    hidden: int = number("1", 1, 10**4, 32)  # Units in each of the two hidden layers (paper: 32).
+    history: int = number("samples", 2, 1000, 13)  # Of angle, velocity and command (paper: 13).
+    rollout: int = number("ticks", 1, 10**6, 8)  # Of the errors in the last third (paper: 1).
+    dead_zone: float | None = number("1", 0, 0.99, None)
+    """Command within which no valve opens; by default the known machine's, else 0."""
+    __post_init__ = check_numbers  # type: ignore[misc]
+
+
+PAPER_RECIPE: dict[str, Any] = {"noise": 0.0, "rollout": 1, "dead_zone": 0.0}  # Sec. 3.3
