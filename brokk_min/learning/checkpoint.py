@@ -26,7 +26,7 @@ from brokk_min.learning.simulation_gradient import gradient_advantages
 from brokk_min.machine import Machine
 from brokk_min.ppo import Agent, Learner, PPOConfig, Rollout
 
-FORMAT = 4  # of checkpoints
+FORMAT = 5  # of checkpoints
 LEARNER = ("obs", "learning_rate", "global_step", "updates")  # attributes in checkpoints
 STATE = [field.name for field in fields(State) if field.name != "plant"]
 
