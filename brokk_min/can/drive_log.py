@@ -13,6 +13,7 @@ import numpy as np
 
 from brokk_min.can import canopen
 from brokk_min.can.canopen import OPERATOR_CHANNEL, Frame, Nodes, OperatorInput
+from brokk_min.can.connection import standard_id
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.hw import Drive
 from brokk_min.identification.files import expected, require
@@ -31,7 +32,7 @@ def read_frames(path: Path) -> Iterator[Frame]:
     with expected(path, "a candump log"), open(path) as file, reader(file) as messages:
         messages.file = (line for line in file if line.endswith("\n"))
         for m in messages:
-            can_id = canopen.standard_id(m)
+            can_id = standard_id(m)
             yield Frame(m.timestamp, can_id, bytes(m.data), not m.is_rx, str(m.channel))
 
 
@@ -144,7 +145,7 @@ def _driven_ticks(
     for frame in frames:
         nodes.update(frame)
         if frame.id == canopen.SYNC:
-            nodes.frames[:] = 0
+            nodes.start_tick()
             start = frame.time
         elif frame.id == machine.valve_frame_id and len(frame.data) == 8:
             u, driving = _read_valve_frame(machine, frame.data)
@@ -189,7 +190,7 @@ class TelemetryReader:
         self.nodes.update(frame)
         if frame.id == canopen.SYNC:
             telemetry = self._telemetry()
-            self.nodes.frames[:] = 0
+            self.nodes.start_tick()
             self.tick += 1
             return telemetry
         if frame.id == canopen.OPERATOR_INPUT and frame.channel == OPERATOR_CHANNEL:
