@@ -14,8 +14,7 @@ Observation: Box, float32, (171,), (x - mean) / deviation * weight of these bloc
 | 163-166 | resolved velocities of the goal (`jacobian.dls`)     | uniform     | 4.2    | no    |
 | 167-170 | resolved velocities of the error integral            | 0.1 uniform | 4.2    | no    |
 
-"Uniform": over the range of the joint or its velocity. The newest sample is the last. Heading
-frame: x from the slew axis to the tool.
+"Uniform": over its range. The newest sample is last. Heading frame: x from slew axis to tool.
 
 Action: Box(-1, 1, (4,)), of the largest command of each driven joint, see `action_to_pwm`.
 Reward: 1 / (1 + |v_goal - v_tool|) (eq2), minus costs of valve travel and of the error integral.
@@ -25,6 +24,8 @@ End: terminated, without reward, with a link in the ground; truncated after 20 s
 The paper's agent (`TaskConfig.paper`) observes 0-162 in the base frame, with weights 1. Its actions
 are linear, its reward is eq2 alone. Only a start in the ground terminates. No rule closes valves.
 """
+
+from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -165,8 +166,7 @@ def features(machine: Machine, measured: Measured, paper: bool = False) -> Array
     """
     signals = measured.history[..., :2, :].reshape(*measured.q.shape[:-1], -1)
     commands = measured.history[..., 2, :].reshape(*measured.q.shape[:-1], -1)
-    q_locked = measured.q[..., machine.locked]
-    numbers = [measured.v_goal, measured.v_tool, q_locked, signals, commands]
+    numbers = [measured.v_goal, measured.v_tool, measured.q[..., machine.locked], signals, commands]
     if not paper:
         numbers[:2] = [kinematics.to_heading(measured.p_tool, v) for v in numbers[:2]]
         J = measured.J[..., machine.driven]

@@ -220,7 +220,7 @@ def test_train_policy__refuses_a_truncated_checkpoint(broken, fraction):
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("header", '{"format": 0, "identity": {}}', "format: expected 4, got 0"),
+        ("header", '{"format": 0, "identity": {}}', "format: expected 5, got 0"),
         ("generator", None, "expected a complete checkpoint, got TypeError"),
         ("random", {}, "expected a complete checkpoint, got"),
     ],
