@@ -172,8 +172,9 @@ def features(machine: Machine, measured: Measured, paper: bool = False) -> Array
         J = measured.J[..., machine.driven]
         arm = np.hypot(machine.column("a"), machine.column("d")).sum()
         J_inv = dls(J, np.ones(len(machine.driven)), (0.06 * arm) ** 2 + 1e-6)
-        resolved = J_inv @ np.stack([measured.v_goal, measured.error_integral], axis=-1)
-        numbers += [resolved[..., 0], resolved[..., 1]]
+        numbers += [
+            (J_inv @ v[..., None])[..., 0] for v in (measured.v_goal, measured.error_integral)
+        ]
     mean, scale = observation_scale(machine, paper)
     return (np.concatenate(numbers, axis=-1, dtype=np.float32) - mean) / scale
 
@@ -237,7 +238,7 @@ class State:
     v_tool: Array  # true velocity J(q) q_dot of the tool [m/s], (..., 3)
     lowest: Array  # height of the lowest point of a link [m], (...)
     history: Array  # measured angle, estimated velocity, sent command: (..., n, 3, H), float32
-    true_history: Array  # the same of true angles: what the nets get
+    true_history: Array  # the same of the driven joints, of true angles: what the nets get
     v_goal: Array  # goal velocity of the tool [m/s], (..., 3)
     goal_ticks: NDArray[np.int64]  # ticks until a new goal, (...)
     ticks: NDArray[np.int64]  # ticks since the reset, (...)
@@ -256,7 +257,7 @@ def initial_state(machine: Machine, q: ArrayLike, v_goal: ArrayLike, plant: bool
         v_tool=np.zeros_like(goal),
         lowest=kinematics.lowest_point(forward_kinematics(machine, q.astype(np.float32))),
         history=initial_history(read_encoder(machine, q).astype(np.float32), machine.history),
-        true_history=initial_history(q.astype(np.float32), machine.history),
+        true_history=initial_history(q[..., machine.driven].astype(np.float32), machine.history),
         v_goal=goal,
         goal_ticks=np.full(q.shape[:-1], np.iinfo(np.int64).max),
         ticks=np.zeros(q.shape[:-1], np.int64),
@@ -275,6 +276,7 @@ def transition(
     """
     plant = state.plant and actuator.plant_step(machine, state.plant, u)
     q = plant.q if plant else actuator.net_step(machine, net, state.true_history, state.q, u)
+    driven = machine.driven
     window = machine.velocity_samples, machine.dt
     history = append_sample(state.history, u, read(machine, q), *window)
     q_dot = (q - state.q) / machine.dt
@@ -289,7 +291,7 @@ def transition(
         v_tool=v_tool,
         lowest=kinematics.lowest_point(frames)[0],
         history=history,
-        true_history=append_sample(state.true_history, u, q, *window),
+        true_history=append_sample(state.true_history, u[..., driven], q[..., driven], *window),
         goal_ticks=state.goal_ticks - 1,
         ticks=state.ticks + 1,
         error_integral=integrate_error(machine, state.v_goal, v_measured, state.error_integral),

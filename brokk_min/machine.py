@@ -280,8 +280,7 @@ def estimate_velocity(q: ArrayLike, samples: int, dt: float) -> NDArray[np.float
         raise ValueError(f"q: expected at least {max(2, samples)} samples, got {q.shape}")
     t = dt * (np.arange(samples) - (samples - 1) / 2)
     weights = (t / (t @ t)).astype(q.dtype)  # slope = sum t_i q_i / sum t_i^2
-    velocity: NDArray[np.floating] = np.einsum("...t,t", q[..., -samples:], weights)
-    return velocity
+    return np.asarray(np.einsum("...t,t", q[..., -samples:], weights))
 
 
 # Joints of the Brokk 170. Sources: all assumed, but the fastest motions of q5 (paper, Sec. 3.2).

@@ -88,7 +88,7 @@ def test_the_top__has_the_method_files_alone():
 def test_sizes__of_the_method_files():
     lines = [len((PACKAGE / f"{name}.py").read_text().splitlines()) for name in METHOD]
     assert max(lines) <= 330
-    assert sum(lines) <= 1870
+    assert sum(lines) <= 1890
 
 
 def code_lines(path: Path) -> set[int]:
