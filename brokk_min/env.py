@@ -172,9 +172,8 @@ def features(machine: Machine, measured: Measured, paper: bool = False) -> Array
         J = measured.J[..., machine.driven]
         arm = np.hypot(machine.column("a"), machine.column("d")).sum()
         J_inv = dls(J, np.ones(len(machine.driven)), (0.06 * arm) ** 2 + 1e-6)
-        numbers += [
-            (J_inv @ v[..., None])[..., 0] for v in (measured.v_goal, measured.error_integral)
-        ]
+        vectors = measured.v_goal, measured.error_integral
+        numbers += [(J_inv @ v[..., None])[..., 0] for v in vectors]
     mean, scale = observation_scale(machine, paper)
     return (np.concatenate(numbers, axis=-1, dtype=np.float32) - mean) / scale
 
