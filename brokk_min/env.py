@@ -169,11 +169,10 @@ def features(machine: Machine, measured: Measured, paper: bool = False) -> Array
     numbers = [measured.v_goal, measured.v_tool, measured.q[..., machine.locked], signals, commands]
     if not paper:
         numbers[:2] = [kinematics.to_heading(measured.p_tool, v) for v in numbers[:2]]
-        J = measured.J[..., machine.driven]
+        J, integral = measured.J[..., machine.driven], measured.error_integral
         arm = np.hypot(machine.column("a"), machine.column("d")).sum()
         J_inv = dls(J, np.ones(len(machine.driven)), (0.06 * arm) ** 2 + 1e-6)
-        vectors = measured.v_goal, measured.error_integral
-        numbers += [(J_inv @ v[..., None])[..., 0] for v in vectors]
+        numbers += [(J_inv @ v[..., None])[..., 0] for v in (measured.v_goal, integral)]
     mean, scale = observation_scale(machine, paper)
     return (np.concatenate(numbers, axis=-1, dtype=np.float32) - mean) / scale
 
