@@ -36,6 +36,11 @@ class Policy:
     net: ActuatorNet  # the simulation it was trained in, kept with it
     valves: str = "closed"  # or "open", while the tool rests; see `actuator.close_valves`
 
+    @property
+    def paper(self) -> bool:
+        """Does it take the observation and the actions of the paper's agent?"""
+        return bool(self.contract.get("paper", False))
+
     def act(self, observation: Array) -> Array:
         """Actions (..., n_driven), not clipped, for observations (..., obs) of `env.features`.
 
@@ -72,13 +77,16 @@ class PolicyController:
         self, measured: Measured, ticks: NDArray[np.int64]
     ) -> tuple[Array, NDArray[np.int64]]:
         """Commands u (num, n), and the ticks of `start` one tick on."""
-        u = action_to_pwm(self.machine, self.policy.act(features(self.machine, measured)))
-        return close_valves(self.machine, self.policy.valves, u, measured.v_goal, ticks)
+        machine, paper = self.machine, self.policy.paper
+        action = self.policy.act(features(machine, measured, paper))
+        u = action_to_pwm(machine, action, paper)
+        return close_valves(machine, self.policy.valves, u, measured.v_goal, ticks)
 
 
-def contract(machine: Machine) -> dict[str, Any]:
+def contract(machine: Machine, paper: bool = False) -> dict[str, Any]:
     """What training and deployment must agree on; kept in the file and checked by `load_policy`."""
     return {
+        "paper": paper,
         "machine": machine.name,
         "joints": list(machine.names),
         "driven": [machine.names[i] for i in machine.driven],
@@ -115,8 +123,9 @@ def load_policy(path: Path, machine: Machine) -> Policy:
     """
     arrays = load_arrays(path)
     header = load_header(path, arrays, "policy", FORMAT)
-    recorded = header.get("contract", {})
-    expect_same(path, recorded, contract(machine))
+    recorded = {"paper": False, **(header.get("contract") or {})}
+    paper = bool(recorded["paper"])
+    expect_same(path, recorded, contract(machine, paper))
     with expected(path, "a complete policy"):
         net = {name[4:]: array for name, array in arrays.items() if name.startswith("net_")}
         policy = Policy(
@@ -131,7 +140,7 @@ def load_policy(path: Path, machine: Machine) -> Policy:
         action = policy.act(policy.mean)
     if action.shape != machine.driven.shape or not np.isfinite(action).all():
         raise ValueError(f"{path}: weights: expected {len(machine.driven)} actions, got {action}")
-    for name, value in zip(("mean", "scale"), observation_scale(machine), strict=True):
+    for name, value in zip(("mean", "scale"), observation_scale(machine, paper), strict=True):
         if not np.array_equal(arrays[name], value):
             raise ValueError(f"{path}: {name}: expected the machine's normalisation, got another")
     return policy
