@@ -152,6 +152,7 @@ def test_set_up_nodes__refuses_what_does_not_fit(world):
     slow = replace(BROKK_170, name="slow", rate=5.0)
     with pytest.raises(ValueError, match=r"slow: expected a rate of 10 Hz or more, .* got 5 Hz"):
         hw.Drive(slow, ConstantCommand(*np.zeros(5)), world.bus, HoldingOperator()).begin()
+    SimulatedMachine(replace(slow, rate=10.0), START, 0.0)
     for unfit in (machine, slow):
         with pytest.raises(ValueError, match="expected"):
             SimulatedMachine(unfit, np.zeros(unfit.n), 0.0)
