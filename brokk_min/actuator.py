@@ -54,8 +54,7 @@ def lever_arm(machine: Machine, q: ArrayLike) -> Array:
     a, b = machine.column("cylinder_base"), machine.column("cylinder_rod")
     gamma = machine.column("cylinder_angle") + np.asarray(q)
     length = np.sqrt(a**2 + b**2 - 2 * a * b * np.cos(gamma))
-    r: Array = np.where(a > 0, a * b * np.sin(gamma) / length, b)
-    return r
+    return np.where(a > 0, a * b * np.sin(gamma) / length, b)
 
 
 def plant_step(machine: Machine, state: PlantState, u: ArrayLike) -> PlantState:
@@ -142,8 +141,7 @@ def append_sample(history: Array, u: ArrayLike, q: Array, window: int, dt: float
 
     The velocity is the slope of the newest `window` angles.
     """
-    result = np.empty_like(history)
-    result[..., :-1] = history[..., 1:]
+    result = np.roll(history, -1)  # of all rows at once: the newest samples follow
     result[..., 0, -1] = q
     result[..., 1, -1] = estimate_velocity(result[..., 0, :], window, dt)
     result[..., 2, -1] = u
@@ -195,8 +193,7 @@ def mu_law(u: ArrayLike, dead_zone: float) -> Array:
 class ActuatorNet:
     """One small net per joint: history in, mean velocity over the coming tick out.
 
-    Weights are stacked over joints: (n, 3 H, 32), (n, 32), (n, 32, 32), (n, 32), (n, 32, 1) and
-    (n, 1).
+    Weights, joint by joint: (n, 3 H, 32), (n, 32), (n, 32, 32), (n, 32), (n, 32, 1) and (n, 1).
     Paper: Table 1 and Sec. 3.3 (39 inputs, two hidden layers of 32, ReLU, sigmoid output)
     """
 
@@ -234,9 +231,9 @@ class ActuatorNet:
         zone that moved less than `STANDSTILL` in it stands still; the net alone would creep.
         """
         velocity = self.forward(history)[0]
-        no_command = (np.abs(history[..., 2, :]) <= self.dead_zone).all(axis=-1)
-        no_motion = np.abs(history[..., 0, -1] - history[..., 0, 0]) < STANDSTILL
-        return np.where(no_command & no_motion, np.float32(0), velocity)
+        still = np.abs(history[..., 0, -1] - history[..., 0, 0]) < STANDSTILL
+        velocity[still] *= (np.abs(history[still][:, 2]) > self.dead_zone).any(axis=-1)
+        return velocity
 
     def inputs(self, history: Array) -> Array:
         """Histories (..., n, 3, H) as the first layer reads them, (..., n, 3 H).
@@ -248,7 +245,7 @@ class ActuatorNet:
             expected = f"expected (..., {n}, 3, {self.history})"
             raise ValueError(f"history: {expected}, got {history.shape}")
         x = history.copy()
-        x[..., 2, :] = mu_law(x[..., 2, :], self.dead_zone)
+        x[..., 2, :] = mu_law(x[..., 2, :].copy(), self.dead_zone)  # contiguous: half the time
         return x.reshape(*x.shape[:-2], 3 * self.history)
 
     def forward(self, history: Array) -> tuple[Array, Array, Array, Array]:
@@ -293,14 +290,13 @@ def net_step(
 ) -> Array:
     """Angles [rad] (..., n) of a machine whose driven joints the nets move, one tick on.
 
-    q_{t+1} = q_t + dt net(history, u), within the joints' ranges; `history` (..., n, 3, H) is
-    without the command `u` (..., n) of this tick. ValueError: no nets.
+    q_{t+1} = q_t + dt net(history, u), within the joints' ranges; `history` of the driven joints
+    (..., n_driven, 3, H) is without the command `u` (..., n) of this tick. ValueError: no nets.
     """
     if net is None:
         raise ValueError("net: expected nets for a state without a plant, got None")
     driven = machine.driven
-    inputs = append_command(history.take(driven, axis=-3), u[..., driven])
-    moved = q[..., driven] + machine.dt * net.predict(inputs)
+    moved = q[..., driven] + machine.dt * net.predict(append_command(history, u[..., driven]))
     low, high = machine.column("q_min")[driven], machine.column("q_max")[driven]
     q = q.copy()
     q[..., driven] = np.clip(moved, low, high)

@@ -164,15 +164,14 @@ def features(machine: Machine, measured: Measured) -> Array:
     J = measured.J[..., machine.driven]
     arm = np.hypot(machine.column("a"), machine.column("d")).sum()
     J_inv = dls(J, np.ones(len(machine.driven)), (0.06 * arm) ** 2 + 1e-6)
-    resolved = J_inv @ np.stack([measured.v_goal, measured.error_integral], axis=-1)
     numbers = [
         kinematics.to_heading(measured.p_tool, measured.v_goal),
         kinematics.to_heading(measured.p_tool, measured.v_tool),
         measured.q[..., machine.locked],
         measured.history[..., :2, :].reshape(*J.shape[:-2], -1),
         measured.history[..., 2, :].reshape(*J.shape[:-2], -1),
-        resolved[..., 0],
-        resolved[..., 1],
+        (J_inv @ measured.v_goal[..., None])[..., 0],
+        (J_inv @ measured.error_integral[..., None])[..., 0],
     ]
     mean, scale = observation_scale(machine)
     obs = np.concatenate(numbers, axis=-1, dtype=np.float32)
@@ -238,7 +237,7 @@ class State:
     v_tool: Array  # true velocity J(q) q_dot of the tool [m/s], (..., 3)
     lowest: Array  # height of the lowest point of a link [m], (...)
     history: Array  # measured angle, estimated velocity, sent command: (..., n, 3, H), float32
-    true_history: Array  # the same of true angles: what the nets get
+    true_history: Array  # the same of the driven joints, of true angles: what the nets get
     v_goal: Array  # goal velocity of the tool [m/s], (..., 3)
     goal_ticks: NDArray[np.int64]  # ticks until a new goal, (...)
     ticks: NDArray[np.int64]  # ticks since the reset, (...)
@@ -257,7 +256,7 @@ def initial_state(machine: Machine, q: ArrayLike, v_goal: ArrayLike, plant: bool
         v_tool=np.zeros_like(goal),
         lowest=kinematics.lowest_point(forward_kinematics(machine, q.astype(np.float32))),
         history=initial_history(read_encoder(machine, q).astype(np.float32), machine.history),
-        true_history=initial_history(q.astype(np.float32), machine.history),
+        true_history=initial_history(q[..., machine.driven].astype(np.float32), machine.history),
         v_goal=goal,
         goal_ticks=np.full(q.shape[:-1], np.iinfo(np.int64).max),
         ticks=np.zeros(q.shape[:-1], np.int64),
@@ -276,6 +275,7 @@ def transition(
     """
     plant = state.plant and actuator.plant_step(machine, state.plant, u)
     q = plant.q if plant else actuator.net_step(machine, net, state.true_history, state.q, u)
+    driven = machine.driven
     window = machine.velocity_samples, machine.dt
     history = append_sample(state.history, u, read(machine, q), *window)
     q_dot = (q - state.q) / machine.dt
@@ -290,7 +290,7 @@ def transition(
         v_tool=v_tool,
         lowest=kinematics.lowest_point(frames)[0],
         history=history,
-        true_history=append_sample(state.true_history, u, q, *window),
+        true_history=append_sample(state.true_history, u[..., driven], q[..., driven], *window),
         goal_ticks=state.goal_ticks - 1,
         ticks=state.ticks + 1,
         error_integral=integrate_error(machine, state.v_goal, v_measured, state.error_integral),

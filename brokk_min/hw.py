@@ -1,7 +1,10 @@
 """The 20 Hz loop that drives a machine on a CAN bus. Paper: Sec. 2
 
-One tick: the operator's goal, SYNC, encoder positions, measurements, controller, gate, valve
-frame. Nothing here is a safety function: keep the hard-wired emergency stop (docs/hardware.md).
+One tick: the operator's goal, SYNC, encoder positions, measurements, controller, gate, valve frame.
+Each encoder answers the frame SYNC with its position; `canopen.Nodes` keeps the newest position,
+heartbeat and state of each node. `safety_gate.gate` lets a command pass, or closes the valves on
+any fault until the operator releases the dead-man switch and presses it again ("arms").
+Nothing here is a safety function: keep the hard-wired emergency stop (docs/hardware.md).
 """
 
 import gc
@@ -14,14 +17,14 @@ import numpy as np
 from brokk_min.actuator import initial_history
 from brokk_min.can import canopen
 from brokk_min.can.canopen import Array, Operator, OperatorInput
+from brokk_min.can.connection import stop_signals
 from brokk_min.can.safety_gate import GateInputs, fault_name, gate, gate_start
 from brokk_min.env import measure, update_history
 from brokk_min.kinematics import forward_kinematics, tool_velocity
 from brokk_min.machine import PWM_MAX, Machine
 
 BUSY_WAIT = 0.002  # s before and after SYNC in which the loop does not sleep (tuned)
-ANSWER_TIME = 0.020  # s after SYNC in which the encoders must answer (assumed)
-MAX_FRAMES = 2000  # read in a row; more than a bus can carry in a tick
+ANSWER_TIME = 0.4  # of a tick after SYNC, in which the encoders must answer (assumed)
 
 
 class Drive:
@@ -30,7 +33,7 @@ class Drive:
     Args:
         machine: its encoders and its valve controller are on the bus.
         controller: a policy or a baseline, `evaluation.rollout.Controller`.
-        bus: `canopen.Bus`, or a `drive_log.ReplayedBus`.
+        bus: `connection.Bus`, or a `drive_log.ReplayedBus`.
         operator: takes whether the gate drives and whether it is ready; gives the tick's input.
     """
 
@@ -63,9 +66,9 @@ class Drive:
 
     def run(self, show: Callable[[str], object] = lambda text: None) -> None:
         """Tick until the operator, SIGINT or SIGTERM stops it; the last frame is always neutral."""
-        gc.freeze()  # no long garbage collection in the middle of a tick
+        gc.disable()  # no garbage collection in the middle of a tick
         try:
-            with canopen.stop_signals() as self.signals:
+            with stop_signals() as self.signals:
                 while self.tick():
                     if self.ticks % 5 == 0:
                         show(self.status())
@@ -73,6 +76,8 @@ class Drive:
             self.exception = "the loop ended"
             self.send_command(np.zeros(self.machine.n), self.nodes.counts(), self.bus.now())
             raise
+        finally:
+            gc.enable()
 
     def tick(self) -> bool:
         """Wait for the deadline, then one tick; False if it was the last."""
@@ -83,7 +88,8 @@ class Drive:
         self.nodes.frames *= 2  # a position from before its SYNC is as wrong as a doubled one
         with self.catch_errors():
             self.bus.send(canopen.SYNC, b"")
-            self.listen(self.bus.now() + ANSWER_TIME, BUSY_WAIT, until_complete=True)
+            answer_by = self.bus.now() + ANSWER_TIME * self.machine.dt
+            self.nodes.listen(self.bus, answer_by, BUSY_WAIT, until_complete=True)
         counts = self.nodes.counts()
         command = np.zeros(self.machine.n)
         with self.catch_errors():
@@ -94,7 +100,7 @@ class Drive:
         )
         now = self.bus.log_input(self.operator_input.pack())
         self.send_command(command, counts, now)
-        self.nodes.frames[:] = 0
+        self.nodes.start_tick()
         with self.catch_errors():
             released = not (self.operator_input.enable or self.gate.driving)
             if released and (self.nodes.nmt != canopen.OPERATIONAL).any():
@@ -138,6 +144,8 @@ class Drive:
             alive=np.array(entered.alive),
             stop=np.array(entered.stop),
             error=np.array(entered.error or bool(self.exception)),
+            flooded=np.array(self.nodes.received >= canopen.MAX_FRAMES),
+            other_sender=np.array(self.nodes.others > 0),
         )
         self.gate, frame = gate(self.machine, self.gate, inputs, now)
         self.explain()
@@ -160,13 +168,13 @@ class Drive:
         deadline = self.start_time + self.deadline_number * self.machine.dt  # no sum: no drift
         end = min(deadline, self.bus.now() + self.machine.dt)  # the clock may have gone backwards
         with self.catch_errors():
-            self.listen(end - BUSY_WAIT)
+            self.nodes.listen(self.bus, end - BUSY_WAIT)
             self.bus.sleep(max(0.0, end - BUSY_WAIT - self.bus.now()))
             # warm-up: caches are cold after sleep, and the first computation takes longer
             if self.history is not None and self.bus.now() < end:
                 measured = measure(self.machine, self.history, self.v_goal, self.error_integral)
                 self.controller(measured, self.controller_state)
-            self.listen(end, BUSY_WAIT)
+            self.nodes.listen(self.bus, end, BUSY_WAIT)
         self.bus.sleep(max(0.0, end - self.bus.now()))  # a broken bus does not wait
         self.count_tick(self.bus.now() - deadline)
 
@@ -182,17 +190,6 @@ class Drive:
         self.skipped += missed
         self.deadline_number += 1 + missed
         self.ticks += 1
-
-    def listen(self, end: float, busy_wait: float = 0.0, until_complete: bool = False) -> None:
-        """Read until `end` [s] and the bus is empty, or until every encoder has answered."""
-        for _ in range(MAX_FRAMES):
-            if until_complete and (self.nodes.frames > 0).all():
-                return
-            frame = self.bus.recv(max(0.0, end - self.bus.now()), busy_wait)
-            if frame is None:
-                return
-            self.nodes.update(frame)
-        raise OverflowError(f"bus: expected fewer than {MAX_FRAMES} frames in a row, got more")
 
     @contextmanager
     def catch_errors(self) -> Iterator[None]:

@@ -7,13 +7,14 @@ Read in the order of the computation: `dls`, its weights and its damping give jo
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from brokk_min.actuator import close_valves
 from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, valve_opening
 
@@ -36,10 +37,20 @@ def dls(J: ArrayLike, W: ArrayLike, damping: ArrayLike, as_printed: bool = False
     J = np.asarray(J)
     W = np.asarray(W, J.dtype)
     inner = W if as_printed else 1 / W
-    A = (J * inner[..., None, :]) @ np.swapaxes(J, -1, -2)  # J W^-1 J^T
+    A = np.einsum("...ik,...jk->...ij", J * inner[..., None, :], J)  # J W^-1 J^T
     A = A + np.asarray(damping)[..., None, None] * np.eye(3)  # + lambda^2 I, in float64
-    transposed = np.linalg.solve(A, J / W[..., None, :])  # A = A^T: (A^-1 J W^-1)^T = W^-1 J^T A^-1
+    transposed = solve(A, J / W[..., None, :])  # A = A^T: (A^-1 J W^-1)^T = W^-1 J^T A^-1
     return np.swapaxes(transposed, -1, -2).astype(J.dtype)
+
+
+def solve(A: Array, B: Array) -> Array:
+    """X of A X = B for many positive definite A (..., m, m), all at once: Gauss-Jordan."""
+    rows = np.moveaxis(np.concatenate([A, B], axis=-1), (-2, -1), (0, 1)).copy()
+    for i in range(len(rows)):
+        pivot = rows[i] / rows[i, i]
+        rows -= rows[:, i, None] * pivot  # 0 in column i
+        rows[i] = pivot
+    return np.moveaxis(rows[:, len(rows) :], (0, 1), (-2, -1))
 
 
 def limit_gradient(machine: Machine, q: ArrayLike) -> Array:
@@ -104,15 +115,18 @@ class Gains:
     kd: Array  # valve opening per rad/s^2, (..., n_driven)
     feedback: Array  # K = feedback * I of eq3 [1], (..., 1)
     min_opening: Array  # least valve opening while the tool is to move [1], (..., 1)
+    # K_I of the error integral beside eq3 [1/s], (..., 1):
+    integral_feedback: Array = field(default_factory=lambda: np.zeros(1))
 
 
 class PIDState(NamedTuple):
-    """What the controller keeps between ticks, (..., n_driven) each."""
+    """What the controller keeps between ticks, (..., n_driven) unless noted."""
 
     integral: Array  # valve opening
     error: Array  # velocity error of the last tick [rad/s]
     derivative: Array  # filtered derivative of the error [rad/s^2]
     q_dot_goal: Array  # desired joint velocities of the last tick [rad/s]
+    rest_ticks: NDArray[np.int64]  # of `close_valves`, (...)
 
 
 @dataclass(frozen=True)
@@ -121,7 +135,8 @@ class JacobianController:
 
     The PID gives the valve opening; the dead zone is added afterwards. While the tool
     is to move, no valve goes below the opening `min_opening`: one that has closed answers late
-    (paper Sec. 3.2). Paper: eq3, Sec. 4.2
+    (paper Sec. 3.2). At rest `close_valves` closes all, unless they are to stay "open".
+    Paper: eq3, Sec. 4.2
     """
 
     machine: Machine
@@ -129,18 +144,21 @@ class JacobianController:
     k: float  # of Nakamura's damping
     w0: float  # manipulability below which damping sets in
     feedforward: Callable[[Array, Array], Array] | None = None  # q, q_dot (..., n_driven) -> u
-    always_open: bool = False  # `min_opening` holds while the tool is to stand still, too
+    valves: str = "closed"  # or "open": `min_opening` holds while the tool rests, too
 
     def start(self, num: int) -> PIDState:
         """State of `num` controllers at rest."""
         zero = np.zeros((num, len(self.machine.driven)))
-        return PIDState(zero, zero, zero, zero)
+        return PIDState(zero, zero, zero, zero, np.zeros(num, np.int64))
 
-    def desired_velocities(self, v_goal: Array, v_tool: Array, q: Array, last: Array) -> Array:
+    def desired_velocities(
+        self, v_goal: Array, v_tool: Array, q: Array, last: Array, integral: Array | float = 0.0
+    ) -> Array:
         """Desired velocities of the driven joints [rad/s], (..., n_driven). Paper: eq3
 
-        Goal and measured tool velocity [m/s] (..., 3), angles of all joints [rad] (..., n), and the
-        desired velocities of the tick before, whose signs select the joint-limit weights.
+        Goal and measured tool velocity [m/s] (..., 3), angles of all joints [rad] (..., n), the
+        desired velocities of the tick before, whose signs select the joint-limit weights, and the
+        policy's integral of the velocity error [m] (..., 3), which eq3 does not have.
         """
         m, driven = self.machine, self.machine.driven
         direction = np.zeros(q.shape)
@@ -149,7 +167,8 @@ class JacobianController:
         W = limit_weights(m, q, direction)[..., driven]
         J_inv = dls(J, W, nakamura_damping(manipulability(J), self.w0, self.k))
         v = v_goal + self.gains.feedback * (v_goal - v_tool)
-        q_dot = (J_inv @ v[..., None])[..., 0]  # q_dot = J^+ (v_d + K (v_d - v_ee))
+        v = v + self.gains.integral_feedback * integral  # v_d + K (v_d - v_ee) + K_I integral
+        q_dot = (J_inv @ v[..., None])[..., 0]
         fastest = np.where(q_dot > 0, m.column("q_dot_up")[driven], m.column("q_dot_down")[driven])
         excess = np.max(np.abs(q_dot) / fastest, axis=-1, keepdims=True)
         return np.asarray(q_dot / np.maximum(1.0, excess))  # slower, in the same direction
@@ -158,7 +177,10 @@ class JacobianController:
         """Commands u [-1, 1] (..., n), and the state of the next tick."""
         m, gains = self.machine, self.gains
         q = measured.q.astype(float)
-        q_dot_goal = self.desired_velocities(measured.v_goal, measured.v_tool, q, state.q_dot_goal)
+        velocities = measured.v_goal, measured.v_tool
+        q_dot_goal = self.desired_velocities(
+            *velocities, q, state.q_dot_goal, measured.error_integral
+        )
         error = q_dot_goal - measured.q_dot
         derivative = 0.7 * state.derivative + 0.3 * (error - state.error) / m.dt  # filtered
         opening = gains.kp * error + state.integral + gains.kd * derivative  # PID
@@ -167,15 +189,18 @@ class JacobianController:
             opening = opening + valve_opening(u, m.dead_zone)
         limit = valve_opening(m.pwm_limit / PWM_MAX, m.dead_zone)
         saturated = (np.abs(opening) >= limit) & (np.sign(opening) == np.sign(error))
-        integral = state.integral + np.where(saturated, 0.0, gains.ki * error * m.dt)  # anti-windup
-        u = self._open_valves(opening, measured.v_goal)
-        return u, PIDState(integral, error, derivative, q_dot_goal)
+        may_open, rest_ticks = close_valves(
+            m, self.valves, np.ones_like(opening), measured.v_goal, state.rest_ticks
+        )
+        step = np.where(saturated, 0.0, may_open * gains.ki * error * m.dt)  # anti-windup
+        u = self._open_valves(may_open * opening, measured.v_goal)
+        return u, PIDState(state.integral + step, error, derivative, q_dot_goal, rest_ticks)
 
     def _open_valves(self, opening: Array, v_goal: Array) -> Array:
         """Commands u (..., n) that open the valves so far beyond the dead zone (..., n_driven)."""
         m = self.machine
         moving = np.linalg.norm(v_goal, axis=-1, keepdims=True) > 1e-6
-        least = (moving | self.always_open) * self.gains.min_opening
+        least = (moving | (self.valves == "open")) * self.gains.min_opening
         size = np.maximum(np.abs(opening), least)
         closed = size < 0.5 / PWM_MAX  # below half a count
         size = np.where(closed, 0.0, m.dead_zone + (1 - m.dead_zone) * size)

@@ -43,11 +43,13 @@ def forward_kinematics(machine: Machine, q: ArrayLike) -> Frames:
     x, y, z = np.eye(3, dtype=q.dtype).reshape(3, 3, *[1] * (q.ndim - 1))
     axes[0] = z
     angles = np.moveaxis(q + machine.column("theta").astype(q.dtype), -1, 0)
-    c = np.cos(angles)
-    s = np.sin(angles)
+    c = np.ascontiguousarray(np.cos(angles))
+    s = np.ascontiguousarray(np.sin(angles))
     for i, joint in enumerate(machine.joints):
         x, y = rotate(x, y, c[i], s[i])  # Rz(q + theta)
-        p[i + 1] = p[i] + joint.d * z + joint.a * x  # Tz(d), Tx(a)
+        p[i + 1] = p[i] + joint.a * x  # Tx(a)
+        if joint.d:
+            p[i + 1] += joint.d * z  # Tz(d)
         if joint.alpha:
             y, z = rotate(y, z, math.cos(joint.alpha), math.sin(joint.alpha))  # Rx(alpha)
         axes[i + 1] = z
@@ -81,9 +83,9 @@ def cross(a: Array, b: Array) -> Array:
         >>> cross(np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]))
         array([0., 0., 1.])
     """
-    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
-    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
+    yzx = [1, 2, 0]
+    zxy = [2, 0, 1]
+    return a[..., yzx] * b[..., zxy] - a[..., zxy] * b[..., yzx]
 
 
 def tool_velocity(frames: Frames, q_dot: ArrayLike) -> Array:
@@ -97,8 +99,7 @@ def tool_velocity(frames: Frames, q_dot: ArrayLike) -> Array:
         >>> tool_velocity(frames, [1.0, 0.0, 0.0, 0.0, 0.0]).round(2) + 0.0
         array([0.  , 2.35, 0.  ])
     """
-    velocity: Array = (jacobian(frames) @ np.asarray(q_dot)[..., None])[..., 0]  # v = J q_dot
-    return velocity
+    return np.asarray((jacobian(frames) @ np.asarray(q_dot)[..., None])[..., 0])  # v = J q_dot
 
 
 def lowest_point(frames: Frames) -> Array:

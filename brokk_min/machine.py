@@ -113,6 +113,7 @@ class Machine:
     ground: float = number("m")  # height of the ground in the base frame
     valve_frame_id: int = number("CAN id", 0, 0x7FF)
     controller_node: int = number("CANopen node id", 1, 127)  # of the valve controller
+    largest_dead_zone: float = number("of full command", 0, 0.99, default=0.0)  # 0: 1.5 dead zones
     q_start: tuple[float, ...] = ()  # rad, where experiments start; empty: the middle of the ranges
 
     def __post_init__(self) -> None:
@@ -127,9 +128,9 @@ class Machine:
         node = self.controller_node
         if node in nodes:
             raise ValueError(f"controller_node: expected none of {nodes}, got {node}")
-        if not self.dead_zone * PWM_MAX < self.pwm_limit:  # no valve would ever open
-            limit = f"{self.pwm_limit}/{PWM_MAX}"
-            raise ValueError(f"dead_zone: expected below {limit}, got {self.dead_zone!r}")
+        zone = max(self.dead_zone, self.largest_dead_zone)
+        if not zone * PWM_MAX < self.pwm_limit:  # no valve would ever open
+            raise ValueError(f"dead_zone: expected below {self.pwm_limit}/{PWM_MAX}, got {zone!r}")
         if self.q_start and len(self.q_start) != self.n:
             raise ValueError(f"q_start: expected {self.n} angles or none, got {self.q_start}")
         steps = self.dt / self.plant_dt
@@ -279,12 +280,10 @@ def estimate_velocity(q: ArrayLike, samples: int, dt: float) -> NDArray[np.float
         raise ValueError(f"q: expected at least {max(2, samples)} samples, got {q.shape}")
     t = dt * (np.arange(samples) - (samples - 1) / 2)
     weights = (t / (t @ t)).astype(q.dtype)  # slope = sum t_i q_i / sum t_i^2
-    velocity: NDArray[np.floating] = np.einsum("...t,t", q[..., -samples:], weights)
-    return velocity
+    return np.asarray(np.einsum("...t,t", q[..., -samples:], weights))
 
 
-# Joints of the Brokk 170. Sources: a, alpha, d, theta and ranges assumed, cylinders assumed; of the
-# fastest motions those of q5 are the paper's (Sec. 3.2), the others assumed.
+# Joints of the Brokk 170. Sources: all assumed, but the fastest motions of q5 (paper, Sec. 3.2).
 # fmt: off
 _DH = [
     # name driven  a [m]  alpha [rad]  d [m]  theta [rad]    q_min, q_max [rad]

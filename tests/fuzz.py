@@ -32,7 +32,7 @@ from brokk_min.__main__ import LONGEST
 from brokk_min.can.drive_log import read_frames
 from brokk_min.cli.options import find_machine
 from brokk_min.env import TaskConfig
-from brokk_min.evaluation.baselines import gains_metadata, read_gains
+from brokk_min.evaluation.baselines import baselines, gains_metadata, gains_table, read_gains
 from brokk_min.evaluation.seeds import read_seeds
 from brokk_min.evaluation.sequences import read_commands, read_starts
 from brokk_min.identification import formats
@@ -135,10 +135,8 @@ def column_fields(content: Content) -> dict[Place, Field]:
 
 
 def gains(net: Any) -> Content:
-    row = {key: [0.5] * 4 for key in ("kp", "ki", "kd")} | {"feedback": [0.1]}
-    names = ["jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff", "jacobian_pid_ff_awake"]
-    rows = {name: row | {"min_opening": [0.01]} for name in names}
-    return {"meta": gains_metadata(BROKK_170, net), "gains": rows}
+    known = baselines(BROKK_170, net)
+    return {"meta": gains_metadata(BROKK_170, net), "gains": gains_table(known)}
 
 
 def sweep() -> Content:
@@ -203,7 +201,13 @@ def all_formats(folder: Path) -> Iterator[Format]:
     yield Format("log.npz", log, encode_npz, read, column_fields(log))
     table = gains(net)
     read = partial(read_gains, machine=BROKK_170, net=net)
-    yield Format("gains.json", table, encode_json, read, places(formats.GAINS, table))
+    yield Format(
+        "gains.json",
+        table,
+        encode_json,
+        read,
+        places({"meta": formats.META, "gains": {"*": formats.GAINS}}, table),
+    )
     yield Format("sweep.json", sweep(), encode_json, read_seeds, places(formats.SWEEP, sweep()))
     goals = {"sequence": ["up"] * 3, "time": [0.0, 1.0, 2.0]} | {f"v{x}": [0.1] * 3 for x in "xyz"}
     commands = partial(read_commands, machine=BROKK_170)

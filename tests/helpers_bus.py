@@ -18,7 +18,8 @@ import numpy as np
 import pytest
 from canopen.objectdictionary import ObjectDictionary, ODArray, ODRecord, ODVariable, datatypes
 
-from brokk_min.can.canopen import Bus, Frame, OperatorInput, open_bus
+from brokk_min.can.canopen import Frame, OperatorInput
+from brokk_min.can.connection import Bus, open_bus
 from brokk_min.can.simulated_machine import SimulatedMachine, serve
 from brokk_min.hw import Drive
 from brokk_min.jacobian import Gains, JacobianController, manipulability_threshold

@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "brokk_min"
 METHOD = ("__init__", "machine", "kinematics", "actuator", "env", "ppo", "jacobian", "hw")
 WINGS = ("identification", "learning", "evaluation", "can", "viewer", "cli")
-BYTES = {"can.canopen", "can.safety_gate"}  # what hw.py may import besides the top files
+BYTES = {"can.canopen", "can.connection", "can.safety_gate"}  # what hw.py may import as well
 MODULES = sorted(PACKAGE.rglob("*.py"))
 TREES = {path: ast.parse(path.read_text()) for path in MODULES}
 
@@ -88,7 +88,7 @@ def test_the_top__has_the_method_files_alone():
 def test_sizes__of_the_method_files():
     lines = [len((PACKAGE / f"{name}.py").read_text().splitlines()) for name in METHOD]
     assert max(lines) <= 330
-    assert sum(lines) <= 1870
+    assert sum(lines) <= 1890
 
 
 def code_lines(path: Path) -> set[int]:

@@ -1,23 +1,12 @@
-"""CAN frames and their bytes: the bus and its log, CANopen's encoders, valve frame, operator input.
+"""CAN frames and their bytes: CANopen's encoders (CiA 301 and 406), valve frame, operator input."""
 
-Encoders speak CANopen (CiA 301 and 406). python-can is imported when a bus or a log is opened.
-"""
-
-import select
-import signal
 import struct
-import time
-from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brokk_min.identification.files import require
 from brokk_min.machine import PWM_MAX, Machine, encode_pwm
 
 Array = NDArray[Any]  # counts and flags, too
@@ -35,9 +24,13 @@ SYNC_OBJECT = (0x1800, 2)  # after how many SYNCs a position is sent
 RESOLUTION_OBJECT = (0x6501, 0)  # counts per turn
 OPERATIONAL = 5  # NMT state
 START_ALL = bytes([1, 0])  # NMT command
-POSITION_MASK = (1 << 26) - 1  # the bits of a position that count
+POSITION_BITS = 26  # of the encoders that we simulate
+NO_POSITION = 0xFFFFFFFF  # what many encoders send when they fail
 HEARTBEAT_PERIOD = 0.050  # s, set in the encoders (assumed)
 SDO_TIMEOUT = 0.5  # s (assumed)
+MAX_FRAMES = 256  # read in a tick; with more the bus is flooded
+WATCHDOG = 0.150  # s without valid valve frame, then the controller closes the valves (assumed)
+MAX_JOINTS = 5  # in a valve frame
 # the operator's input is logged as frames that are never on the bus
 OPERATOR_CHANNEL = "operator"
 OPERATOR_INPUT = 0x7FF
@@ -53,132 +46,6 @@ class Frame(NamedTuple):
     channel: str = ""
 
 
-@dataclass
-class Bus:
-    """A CAN bus with a monotonic clock and a log of what is sent and read."""
-
-    bus: Any  # of python-can, without filters
-    writer: Any = None  # python-can's candump writer
-    name: str = "can"  # of the bus in the log
-    echo: bool = False  # does the bus give back what we send?
-    clock: Callable[[], float] = time.monotonic  # s
-    sleep: Callable[[float], object] = time.sleep
-
-    def __post_init__(self) -> None:
-        """Find the descriptor to wait on, if the bus has one."""
-        self.start = time.time() - self.clock()  # the log has the time of day, but it may be set
-        self.echoes: deque[tuple[int, bytes]] = deque(maxlen=64 if self.echo else 0)
-        self.unwritten: deque[Any] = deque()  # messages for the log
-        self.message = require("can", "hw").Message
-        self.file = -1
-        with suppress(NotImplementedError):
-            self.file = self.bus.fileno()
-
-    def now(self) -> float:
-        """Time of day at the start plus monotonic time since [s], in whole microseconds."""
-        return round(self.start + self.clock(), 6)
-
-    def recv(self, timeout: float, busy_wait: float = 0.0) -> Frame | None:
-        """The next frame within `timeout` [s], or None; it sleeps only after `busy_wait` [s]."""
-        if self.file >= 0 and timeout > 0:  # python-can's own timeout follows the time of day
-            start = self.clock()
-            elapsed = 0.0
-            while elapsed < timeout and not select.select([self.file], [], [], 0)[0]:
-                if elapsed >= busy_wait:
-                    select.select([self.file], [], [], timeout - elapsed)
-                elapsed = self.clock() - start
-            timeout = 0.0
-        message = self.bus.recv(timeout)
-        if message is None:
-            return None
-        now = self.now()
-        data = bytes(message.data)
-        if (message.arbitration_id, data) in self.echoes:
-            self.echoes.remove((message.arbitration_id, data))
-            return Frame(now, -1, data)
-        self._log(message, now, self.name)
-        return Frame(now, standard_id(message), data)
-
-    def send(self, can_id: int, data: bytes) -> None:
-        """Send one frame, once; never periodically: the kernel would go on after a hang."""
-        message = self._message(can_id, data)
-        self.bus.send(message, timeout=0.01)
-        self.echoes.append((can_id, data))
-        self._log(message, self.now(), self.name)
-
-    def log_input(self, data: bytes) -> float:
-        """Log the operator's input, which is not on the bus; the time of it [s]."""
-        now = self.now()
-        self._log(self._message(OPERATOR_INPUT, data), now, OPERATOR_CHANNEL)
-        return now
-
-    def flush(self) -> None:
-        """Write the log on, so that it survives the program's sudden end."""
-        while self.unwritten:
-            self.writer.on_message_received(self.unwritten.popleft())
-        if self.writer is not None:
-            self.writer.file.flush()
-
-    def _message(self, can_id: int, data: bytes) -> Any:
-        return self.message(arbitration_id=can_id, data=data, is_extended_id=False, is_rx=False)
-
-    def _log(self, message: Any, now: float, channel: str) -> None:
-        """Keep for `flush`: writing waits until there is time."""
-        if self.writer is not None:
-            message.timestamp = now
-            message.channel = channel
-            self.unwritten.append(message)
-
-    def close(self) -> None:
-        """Close bus and log."""
-        self.bus.shutdown()
-        if self.writer is not None:
-            self.flush()
-            self.writer.stop()
-
-
-def standard_id(message: Any) -> int:
-    """Identifier of a data frame with 11 bits; -1 for any other frame."""
-    flags = message.is_extended_id, message.is_remote_frame, message.is_error_frame, message.is_fd
-    return -1 if any(flags) else int(message.arbitration_id)
-
-
-@contextmanager
-def open_bus(interface: str, channel: str, log: Path | None = None) -> Iterator[Bus]:
-    """A bus by python-can's names, closed at the end of the block; `log` grows while it runs.
-
-    ValueError: python-can is not installed, finds no such bus, or fails in the block.
-    """
-    can = require("can", "hw")
-    where = f"{interface} {channel}: expected a CAN bus"
-    try:
-        raw = can.Bus(interface=interface, channel=channel)
-    except Exception as error:  # each interface has its own
-        raise ValueError(f"{where}, got {error!r}") from error
-    name = channel if interface == "socketcan" else interface
-    writer = can.CanutilsLogWriter(log) if log else None
-    bus = Bus(raw, writer, name, echo=interface == "udp_multicast")
-    try:
-        yield bus
-    except can.CanError as error:
-        raise ValueError(f"{where} that works, got {error!r}") from error
-    finally:
-        bus.close()
-
-
-@contextmanager
-def stop_signals() -> Iterator[list[int]]:
-    """A list to which SIGINT and SIGTERM are appended, instead of ending the program."""
-    received: list[int] = []
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    handlers = [signal.signal(n, lambda number, _: received.append(number)) for n in numbers]
-    try:
-        yield received
-    finally:
-        for number, handler in zip(numbers, handlers, strict=True):
-            signal.signal(number, handler)
-
-
 # --- encoders ------------------------------------------------------------------------------------
 
 
@@ -188,29 +55,84 @@ class Nodes:
     def __init__(self, machine: Machine) -> None:
         nodes = [*(joint.encoder_node for joint in machine.joints), machine.controller_node]
         self.machine = machine
+        self.ours = (NMT, SYNC, machine.valve_frame_id)  # only this program sends them
+        self.received = 0  # frames of this tick
+        self.others = 0  # of them, frames that only this program may send
         self.position_index = {TPDO1 + node: i for i, node in enumerate(nodes[:-1])}
         self.heartbeat_index = {HEARTBEAT + node: i for i, node in enumerate(nodes)}
-        self.raw = np.zeros(machine.n, int)
+        self.raw = np.full(machine.n, -1)  # -1: none yet
         self.frames = np.zeros(machine.n, int)  # positions of this tick; a malformed one counts 2
         self.heartbeat = np.full(machine.n + 1, -np.inf)  # s, -inf: never
         self.nmt = np.zeros(machine.n + 1, int)
 
+    def listen(
+        self, bus: Any, end: float, busy_wait: float = 0.0, until_complete: bool = False
+    ) -> None:
+        """Read until `end` [s] and the bus is empty, or until every encoder has answered."""
+        while self.received < MAX_FRAMES and not (until_complete and (self.frames > 0).all()):
+            frame = bus.recv(max(0.0, end - bus.now()), busy_wait)
+            if frame is None:
+                return
+            self.update(frame)
+
+    def start_tick(self) -> None:
+        """Forget how many frames came."""
+        self.frames[:] = 0
+        self.received = 0
+        self.others = 0
+
     def update(self, frame: Frame) -> None:
         """Take in one frame; those of others change nothing."""
         size = len(frame.data)
+        self.received += 1
+        self.others += frame.id in self.ours and not frame.sent
         if frame.id in self.position_index:
             i = self.position_index[frame.id]
-            self.frames[i] += 1 if size == 4 else 2
+            raw = int.from_bytes(frame.data, "little")
+            sound = size == 4 and raw != NO_POSITION and not self._skips_turns(i, raw)
+            self.frames[i] += 1 if sound else 2
             if size == 4:
-                (self.raw[i],) = struct.unpack("<I", frame.data)
+                self.raw[i] = raw
         elif frame.id in self.heartbeat_index and size == 1:
             i = self.heartbeat_index[frame.id]
             self.heartbeat[i] = frame.time
             self.nmt[i] = frame.data[0] & 0x7F
 
+    def _skips_turns(self, i: int, raw: int) -> bool:
+        """Are there whole turns between two positions, other than where an encoder starts again?
+
+        Of 12 bits: 5 -> 4101 skips one; 4095 -> 0 of a single turn and 2**26 - 1 -> 0 do not.
+        """
+        last = int(self.raw[i])
+        turn = 2**self.machine.encoder_bits
+        step = (raw - last + turn // 2) % turn - turn // 2
+        return last >= 0 and 0 < abs(raw - last - step) <= max(raw, last)
+
     def counts(self) -> Array:
         """Newest joint angles [counts], (n,)."""
         return encoder_counts(self.machine, self.raw)
+
+
+def check_bus(machine: Machine) -> None:
+    """ValueError: more joints than a valve frame has, or ticks that the watchdog does not allow."""
+    if machine.n > MAX_JOINTS:
+        raise ValueError(
+            f"{machine.name}: expected at most {MAX_JOINTS} joints in a valve frame, "
+            f"got {machine.n}"
+        )
+    if 1.5 * machine.dt > WATCHDOG:  # a tick may be late by half
+        slowest = 1.5 / WATCHDOG
+        raise ValueError(
+            f"{machine.name}: expected a rate of {slowest:g} Hz or more, for the valve "
+            f"controller's watchdog of {WATCHDOG} s, got {machine.rate:g} Hz"
+        )
+
+
+def used_ids(machine: Machine) -> list[int]:
+    """CAN identifiers of all frames that concern the program that drives."""
+    nodes = [*(joint.encoder_node for joint in machine.joints), machine.controller_node]
+    bases = (TPDO1, SDO_ANSWER, HEARTBEAT)
+    return [NMT, SYNC, machine.valve_frame_id, *(base + n for n in nodes for base in bases)]
 
 
 def set_up_nodes(bus: Any, machine: Machine) -> None:
@@ -218,10 +140,7 @@ def set_up_nodes(bus: Any, machine: Machine) -> None:
 
     ValueError: an encoder that does not answer or has another resolution, or too many joints.
     """
-    if machine.n > 5:
-        raise ValueError(
-            f"{machine.name}: expected at most 5 joints in a valve frame, got {machine.n}"
-        )
+    check_bus(machine)
     for joint in machine.joints:
         node = joint.encoder_node
         resolution = sdo(bus, node, RESOLUTION_OBJECT)
@@ -260,19 +179,19 @@ def sdo(
 
 
 def encoder_counts(machine: Machine, raw: ArrayLike) -> Array:
-    """Joint angles [counts] of raw positions (..., n): masked, zeroed, unwrapped at mid range."""
+    """Joint angles [counts] of raw positions (..., n): zeroed, unwrapped at mid range."""
     turn = 2**machine.encoder_bits
     zero, sign = (machine.column(name).astype(int) for name in ("encoder_zero", "encoder_sign"))
     middle = (machine.column("q_min") + machine.column("q_max")) / 2
     lowest = np.rint(middle / machine.encoder_step).astype(int) - turn // 2
-    counts = sign * ((np.asarray(raw) & POSITION_MASK) - zero)
+    counts = sign * (np.asarray(raw) - zero)
     return np.asarray((counts - lowest) % turn + lowest)
 
 
 def encoder_raw(machine: Machine, counts: ArrayLike) -> Array:
     """Raw positions of encoders with 26 bits at joint angles [counts] (..., n)."""
     zero, sign = (machine.column(name).astype(int) for name in ("encoder_zero", "encoder_sign"))
-    return np.asarray((sign * np.asarray(counts) + zero) & POSITION_MASK)
+    return np.asarray((sign * np.asarray(counts) + zero) % 2**POSITION_BITS)
 
 
 # --- valve frame and operator input --------------------------------------------------------------
@@ -293,9 +212,11 @@ def checksum(frame: ArrayLike) -> Array:
 def valve_frame(command: ArrayLike, counter: ArrayLike, enable: ArrayLike) -> Array:
     """Bytes (..., 8): five PWM bytes, counter, checksum, enable.
 
-    `command` [counts of 127] is (..., n) of n <= 5 joints. Paper: Sec. 3.2 (PWM bytes)
+    `command` [counts of 127] is (..., n). ValueError: n > 5. Paper: Sec. 3.2 (PWM bytes)
     """
     command = np.asarray(command)
+    if command.shape[-1] > MAX_JOINTS:  # the sixth would overwrite the counter
+        raise ValueError(f"command: expected at most {MAX_JOINTS} joints, got {command.shape[-1]}")
     frame = np.zeros((*command.shape[:-1], 8), np.uint8)
     frame[..., : command.shape[-1]] = encode_pwm(command / PWM_MAX)
     frame[..., 5] = counter

@@ -14,6 +14,7 @@ import numpy as np
 
 from brokk_min.can import canopen
 from brokk_min.can.canopen import OPERATOR_CHANNEL, Frame, Nodes, OperatorInput
+from brokk_min.can.connection import standard_id
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.hw import Drive
 from brokk_min.identification.files import expected, open_regular, require
@@ -36,9 +37,7 @@ def read_frames(path: Path) -> Iterator[Frame]:
         lines = iter(lambda: file.readline(LONGEST_LINE), b"")
         reader.file = (line.decode() for line in lines if line.endswith(b"\n") or _too_long(line))
         for m in reader:
-            frame = Frame(
-                m.timestamp, canopen.standard_id(m), bytes(m.data), not m.is_rx, str(m.channel)
-            )
+            frame = Frame(m.timestamp, standard_id(m), bytes(m.data), not m.is_rx, str(m.channel))
             if not 0 <= frame.time < 1e12:
                 raise ValueError(f"a time of {frame.time}")
             if frame.id == canopen.OPERATOR_INPUT and frame.channel == OPERATOR_CHANNEL:
@@ -162,7 +161,7 @@ def _driven_ticks(
     for frame in frames:
         nodes.update(frame)
         if frame.id == canopen.SYNC:
-            nodes.frames[:] = 0
+            nodes.start_tick()
             start = frame.time
         elif frame.id == machine.valve_frame_id and len(frame.data) == 8:
             u, driving = _read_valve_frame(machine, frame.data)
@@ -207,7 +206,7 @@ class TelemetryReader:
         self.nodes.update(frame)
         if frame.id == canopen.SYNC:
             telemetry = self._telemetry()
-            self.nodes.frames[:] = 0
+            self.nodes.start_tick()
             self.tick += 1
             return telemetry
         if frame.id == canopen.OPERATOR_INPUT and frame.channel == OPERATOR_CHANNEL:

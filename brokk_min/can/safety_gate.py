@@ -19,13 +19,12 @@ SLEW = 40  # counts of 127 per tick by which a command may grow
 END_STOP_MARGIN = 0.02  # rad before a joint's limit, from where no command goes outward
 RANGE_MARGIN = 0.05  # rad beyond a joint's limit, then the encoder is wrong
 JUMP_FACTOR = 2.0  # times the fastest motion,
-JUMP_COUNTS = 4  # plus so many counts: a larger step is a jump
-# an encoder is frozen if its count stands still while more motion is expected than this
-FROZEN_COUNTS = 1.0
-PUSH_TICKS = 8  # of commands to the same side, after which a joint moves even from rest
-IDLE_ZONES = 1.5  # dead zones: a command up to this may do nothing
-SLOWEST = 0.3  # of the fastest motion: long lever arm, weak pump
-CONTINUED = 0.5  # of the measured motion that goes on at least under the same command
+JUMP_ANGLE = 0.0045  # rad, plus this and one count: a larger step is a jump
+# an encoder is frozen if it stands still while the joint must have turned by this, or by one count
+FROZEN_ANGLE = 0.0015  # rad
+OPENING_TIME = 0.45  # s of commands to one side, after which a joint moves even from rest
+IDLE_ZONES = 1.5  # dead zones: the default of `Machine.largest_dead_zone`
+SLOWEST = 0.4  # of the fastest motion: long lever arm, weak pump
 
 
 class Fault(IntEnum):
@@ -41,18 +40,20 @@ class Fault(IntEnum):
         return fault
 
     ERROR = 0, "error"
-    LATE = 1, "tick late, or the clock was set"
-    OPERATOR_LOST = 2, "operator's device lost"
-    NEVER_SEEN = 3, "never seen"
-    HEARTBEAT_LOST = 4, "heartbeat lost"
-    NOT_OPERATIONAL = 5, "not operational"
-    SILENT = 6, "silent"
-    MALFORMED = 7, "doubled or malformed position"
-    OUT_OF_RANGE = 8, "out of range"
-    JUMPED = 9, "jumped"
-    FROZEN = 10, "frozen, or the joint does not move"
-    NO_COMMAND = 11, "no valid command"
-    STOP = 12, "stop asked for"
+    FLOODED = 1, "bus flooded"
+    OTHER_SENDER = 2, "SYNC, NMT or valve frame of another sender"
+    LATE = 3, "tick late, or the clock was set"
+    OPERATOR_LOST = 4, "operator's device lost"
+    NEVER_SEEN = 5, "never seen"
+    HEARTBEAT_LOST = 6, "heartbeat lost"
+    NOT_OPERATIONAL = 7, "not operational"
+    SILENT = 8, "silent"
+    MALFORMED = 9, "doubled or malformed position"
+    OUT_OF_RANGE = 10, "out of range"
+    JUMPED = 11, "jumped"
+    FROZEN = 12, "frozen, or the joint does not move"
+    NO_COMMAND = 13, "no valid command"
+    STOP = 14, "stop asked for"
 
 
 class GateState(NamedTuple):
@@ -65,10 +66,9 @@ class GateState(NamedTuple):
     enable: Array  # dead-man switch at the last tick with device and without error
     time: Array  # s, of the last tick
     counter: Array  # of the last valve frame
-    counts: Array  # newest two angles, newest last [encoder counts], (..., n, 2)
-    sent: Array  # newest commands, newest last [counts of 127], (..., n, PUSH_TICKS)
-    measured_motion: Array  # when the count last changed [encoder counts per tick], (..., n)
-    expected_motion: Array  # since the count last changed [encoder counts], (..., n)
+    counts: Array  # newest angles [encoder counts], (..., n)
+    sent: Array  # commands of `OPENING_TIME`, newest last [counts of 127], (..., n, ticks)
+    expected_motion: Array  # at least, since the count last changed [rad], (..., n)
 
 
 class GateInputs(NamedTuple):
@@ -84,6 +84,8 @@ class GateInputs(NamedTuple):
     alive: Array  # is the operator's device there?
     stop: Array  # must the program end?
     error: Array  # was an exception raised?
+    flooded: Array  # more frames in the tick than the loop reads?
+    other_sender: Array  # SYNC, NMT or valve frames that the loop did not send?
 
 
 def gate_start(machine: Machine, shape: tuple[int, ...] = ()) -> GateState:
@@ -98,9 +100,8 @@ def gate_start(machine: Machine, shape: tuple[int, ...] = ()) -> GateState:
         enable=~no,
         time=np.full(shape, -np.inf),
         counter=zero,
-        counts=np.zeros((*shape, machine.n, 2), int),
-        sent=np.zeros((*shape, machine.n, PUSH_TICKS), int),
-        measured_motion=np.zeros((*shape, machine.n)),
+        counts=np.zeros((*shape, machine.n), int),
+        sent=np.zeros((*shape, machine.n, int(np.ceil(OPENING_TIME * machine.rate))), int),
         expected_motion=np.zeros((*shape, machine.n)),
     )
 
@@ -115,7 +116,7 @@ def gate(
     clock of the heartbeats.
     """
     now = np.asarray(now)
-    measured, expected = motion(machine, state, inputs.counts)
+    expected = expected_motion(machine, state, inputs.counts)
     fault = active_fault(machine, state, inputs, expected, now)
     edge = inputs.enable & ~state.enable & inputs.centred
     driving = inputs.enable & (state.driving | edge) & (fault == 0)
@@ -132,9 +133,8 @@ def gate(
         enable=inputs.enable | (state.enable & ~trusted),
         time=now,
         counter=counter,
-        counts=np.concatenate([state.counts[..., 1:], inputs.counts[..., None]], axis=-1),
+        counts=inputs.counts,
         sent=np.concatenate([state.sent[..., 1:], command[..., None]], axis=-1),
-        measured_motion=measured,
         expected_motion=expected,
     )
     return state, valve_frame(command, counter, driving)
@@ -151,28 +151,30 @@ def limit_slew(machine: Machine, state: GateState, inputs: GateInputs) -> Array:
     return np.minimum(np.maximum(inputs.command, lowest), highest)
 
 
-def motion(machine: Machine, state: GateState, counts: Array) -> tuple[Array, Array]:
-    """Motion of each joint, measured and expected at least, (..., n) both, for the next state.
+def expected_motion(machine: Machine, state: GateState, counts: Array) -> Array:
+    """Angle [rad] (..., n) by which each joint must have turned since its count last changed.
 
-    While all commands of `PUSH_TICKS` go to one side beyond the dead zone, a joint is expected to
-    move at `SLOWEST` of its fastest motion, in proportion to the weakest command. It also keeps
-    `CONTINUED` of its measured motion, in proportion of the weakest to the strongest command.
+    Once all commands of `OPENING_TIME` went to one side beyond the largest dead zone, the joint
+    turns at least at `SLOWEST` of its fastest motion, in proportion to the smallest command. With
+    the Brokk's dead zone of 0.105 (13.3 counts of 127) and joint q1 (0.20 rad/s):
+
+    | commands of 0.45 s | angle   | turns in this tick at least by                              |
+    | ------------------ | ------- | ----------------------------------------------------------- |
+    | all 80             | same    | 0.4 * 0.20 * 0.05 = 4.0 mrad                                |
+    | 80, but one is 30  | same    | 0.4 * 0.20 * 0.05 * (30 - 13.3) / (80 - 13.3) = 1.0 mrad    |
+    | 80, but one is 13  | same    | 0, and starts again from 0: the valve may have closed       |
+    | 80, but one is -30 | same    | 0, and starts again from 0: the valve may have closed       |
+    | any                | another | 0, and starts again from 0: the encoder shows motion        |
     """
-    idle = IDLE_ZONES * machine.dead_zone * PWM_MAX
-    side = np.sign(state.sent.sum(axis=-1))
-    push = state.sent * side[..., None] - idle
-    weakest = push.min(axis=-1)
-    strongest = push.max(axis=-1)
-    pushed = weakest > 0
-    moved = counts != state.counts[..., 1]
+    idle = machine.largest_dead_zone or IDLE_ZONES * machine.dead_zone
+    limit = machine.pwm_limit / PWM_MAX
+    side = np.sign(state.sent[..., -1:])
+    smallest = (side * state.sent).min(axis=-1) / PWM_MAX
+    opening = np.maximum(smallest - idle, 0.0) / max(limit - idle, 1 / PWM_MAX)
     slower = np.minimum(machine.column("q_dot_up"), machine.column("q_dot_down"))
-    slowest = SLOWEST * slower * machine.dt / machine.encoder_step
-    slowest = slowest / (machine.pwm_limit - idle) * weakest
-    last_motion = np.maximum(side * (counts - state.counts[..., 0]) - 1, 0) / 2  # in two ticks
-    measured = np.where(moved, last_motion, state.measured_motion)
-    continued = CONTINUED * measured * weakest / np.where(pushed, strongest, np.inf)
-    expected = state.expected_motion + np.maximum(slowest, continued)
-    return np.where(pushed, measured, 0.0), np.where(pushed & ~moved, expected, 0.0)
+    q_dot = SLOWEST * slower * opening
+    still = (q_dot > 0) & (counts == state.counts)
+    return np.where(still, state.expected_motion + machine.dt * q_dot, 0.0)
 
 
 def active_fault(
@@ -183,11 +185,13 @@ def active_fault(
     q = inputs.counts * machine.encoder_step
     low = machine.column("q_min") - RANGE_MARGIN
     high = machine.column("q_max") + RANGE_MARGIN
-    fastest = JUMP_FACTOR * machine.q_dot_max * machine.dt / machine.encoder_step + JUMP_COUNTS
+    jump = JUMP_FACTOR * machine.q_dot_max * machine.dt + JUMP_ANGLE + machine.encoder_step
     limit = np.zeros(n)
     limit[machine.driven] = machine.pwm_limit
     faults = np.zeros((*now.shape, len(Fault), n + 1), bool)
     faults[..., Fault.ERROR, 0] = inputs.error
+    faults[..., Fault.FLOODED, 0] = inputs.flooded
+    faults[..., Fault.OTHER_SENDER, 0] = inputs.other_sender
     faults[..., Fault.LATE, 0] = np.abs(now - state.time - machine.dt) > machine.dt / 2
     faults[..., Fault.OPERATOR_LOST, 0] = ~inputs.alive
     faults[..., Fault.NEVER_SEEN, :] = np.isneginf(inputs.heartbeat)
@@ -196,8 +200,8 @@ def active_fault(
     faults[..., Fault.SILENT, :n] = inputs.frames < 1
     faults[..., Fault.MALFORMED, :n] = inputs.frames > 1
     faults[..., Fault.OUT_OF_RANGE, :n] = (q < low) | (q > high)
-    faults[..., Fault.JUMPED, :n] = np.abs(inputs.counts - state.counts[..., 1]) > fastest
-    faults[..., Fault.FROZEN, :n] = expected > FROZEN_COUNTS
+    faults[..., Fault.JUMPED, :n] = np.abs(q - state.counts * machine.encoder_step) > jump
+    faults[..., Fault.FROZEN, :n] = expected > max(FROZEN_ANGLE, machine.encoder_step)
     faults[..., Fault.NO_COMMAND, :n] = ~(np.abs(inputs.command) <= limit)  # nan, too
     faults[..., Fault.STOP, 0] = inputs.stop
     faults = faults.reshape(*now.shape, -1)

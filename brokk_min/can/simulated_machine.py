@@ -17,22 +17,24 @@ from numpy.typing import ArrayLike
 
 from brokk_min.actuator import plant_reset, plant_step
 from brokk_min.can import canopen
-from brokk_min.can.canopen import OPERATIONAL, Array, Frame, checksum, encoder_raw
+from brokk_min.can.canopen import OPERATIONAL, WATCHDOG, Array, Frame, checksum, encoder_raw
+from brokk_min.can.connection import open_bus, stop_signals
 from brokk_min.machine import Machine, decode_pwm
 
 # NMT states besides OPERATIONAL
 BOOT = 0
 STOPPED = 4
 PRE_OPERATIONAL = 127
-WATCHDOG = 0.150  # s without valid valve frame, then the valves close (assumed)
 Frames = list[tuple[int, bytes]]  # identifiers and data
 
 
 class SimulatedMachine:
     """CiA 406 encoders and a valve controller on one bus, the analytic plant behind them.
 
-    The plant moves by its own clock. The valves close after `WATCHDOG` without a valid valve frame,
-    or on one with a wrong counter, checksum or length, until an NMT start and a neutral frame.
+    The plant moves by its own clock. A valve frame is refused if its counter, checksum or length is
+    wrong, or if it is not the first since a SYNC. The valves close on a refused frame, on two SYNCs
+    without a frame between, and after `WATCHDOG` without a valid frame. They stay closed until an
+    NMT start and a neutral frame.
 
     Args:
         machine: what moves.
@@ -40,6 +42,9 @@ class SimulatedMachine:
         now: s.
         record: called every plant step with time [s], command in force and true angles [rad] (n,),
             and the time of the last valid valve frame [s].
+        report: called with the reason when the valve controller stops.
+
+    ValueError: a machine that does not fit the bus, see `check_bus`.
     """
 
     def __init__(
@@ -48,9 +53,12 @@ class SimulatedMachine:
         q: ArrayLike,
         now: float,
         record: Callable[[float, Array, Array, float], object] = lambda *_: None,
+        report: Callable[[str], object] = lambda reason: None,
     ) -> None:
+        canopen.check_bus(machine)
         self.machine = machine
         self.record = record
+        self.report = report
         self.fine = replace(machine, rate=1 / machine.plant_dt)  # a tick is one Euler step
         self.plant = plant_reset(self.fine, q)
         self.start = now
@@ -72,6 +80,7 @@ class SimulatedMachine:
         self.u: Array = np.zeros(machine.n)
         self.enabled = False  # by a neutral frame with the enable byte, until the byte is cleared
         self.counter = -1  # of the last valve frame; -1: the next may have any
+        self.expects_frame = False  # was there a SYNC since the last valve frame?
 
     def boot(self) -> Frames:
         """The boot-up messages of all nodes."""
@@ -89,7 +98,7 @@ class SimulatedMachine:
         out: Frames = []
         while (then := self._next_step()) <= now:
             if self.enabled and then - self.valid >= WATCHDOG:
-                self._trip()
+                self._trip(f"no valve frame for {WATCHDOG} s")
             self.plant = plant_step(self.fine, self.plant, self.u)
             self.steps += 1
             self.record(then, self.u, self.plant.q, self.valid)
@@ -105,6 +114,9 @@ class SimulatedMachine:
         if frame.id == canopen.NMT and len(frame.data) == 2:
             return self._on_nmt(*frame.data)
         if frame.id == canopen.SYNC:
+            if self.enabled and self.expects_frame:
+                self._trip("no valve frame between two SYNCs")
+            self.expects_frame = True
             return self._positions()
         if frame.id == self.machine.valve_frame_id:
             self._on_valve_frame(frame)
@@ -130,14 +142,16 @@ class SimulatedMachine:
     def _on_valve_frame(self, frame: Frame) -> None:
         data = np.frombuffer(frame.data, np.uint8)
         if len(data) != 8 or checksum(np.delete(data, 6)) != data[6]:
-            self._trip()
+            self._trip("valve frame with a wrong length or checksum")
             return
         counter = int(data[5])
-        in_order = self.counter in (-1, (counter - 1) % 256)
-        self.counter = counter
+        before, self.counter = self.counter, counter
+        first, self.expects_frame = self.expects_frame, False
         self.valid = frame.time
-        if not in_order:
-            self._trip()
+        if before not in (-1, (counter - 1) % 256):
+            self._trip(f"valve frame with counter {counter} after {before}")
+        elif not first:
+            self._trip(f"second valve frame after a SYNC, counter {counter}")
         elif self.nmt[self.machine.controller_node] == OPERATIONAL:
             u = decode_pwm(data[: self.machine.n])
             self.enabled = data[7] == 1 and (self.enabled or not u.any())
@@ -148,7 +162,9 @@ class SimulatedMachine:
         self.enabled = False
         self.counter = -1
 
-    def _trip(self) -> None:
+    def _trip(self, reason: str) -> None:
+        if self.nmt[self.machine.controller_node] == OPERATIONAL:
+            self.report(reason)
         self._close_valves()
         self.nmt[self.machine.controller_node] = PRE_OPERATIONAL
 
@@ -200,14 +216,19 @@ def simulate(
 ) -> None:
     """Run a simulated machine on a bus until SIGINT or SIGTERM; `record` logs all its Euler steps.
 
-    It starts at `start_pose(machine, q)`. ValueError: no such bus, or no such pose.
+    It starts at `start_pose(machine, q)` and prints why its valve controller stops.
+
+    ValueError: no such bus, or no such pose.
     """
     pose = start_pose(machine, q)
+    nodes = [joint.encoder_node for joint in machine.joints]
+    ids = [canopen.NMT, canopen.SYNC, machine.valve_frame_id]
+    ids += [canopen.SDO_REQUEST + node for node in nodes]
     gc.freeze()  # no long garbage collection while the encoders should answer
     with ExitStack() as stack:
-        bus = stack.enter_context(canopen.open_bus(interface, channel))
+        bus = stack.enter_context(open_bus(interface, channel, ids=ids))
         file = stack.enter_context(open(record or os.devnull, "w", buffering=1))
-        signals = stack.enter_context(canopen.stop_signals())
+        signals = stack.enter_context(stop_signals())
         start = bus.now()
         names = [f"{kind}_{name}" for kind in "uq" for name in machine.names]
         print("run", "time", *names, "valid", sep=",", file=file)
@@ -216,4 +237,7 @@ def simulate(
             numbers = [*(f"{x:.7g}" for x in (*u, *q)), f"{valid - start:.6f}"]
             print("plant", f"{now - start:.3f}", *numbers, sep=",", file=file)
 
-        serve(SimulatedMachine(machine, pose, start, write), bus, lambda: not signals)
+        def report(reason: str) -> None:
+            print(f"{bus.now() - start:.3f} s, valve controller stops: {reason}", flush=True)
+
+        serve(SimulatedMachine(machine, pose, start, write, report), bus, lambda: not signals)

@@ -11,7 +11,8 @@ from tyro.conf import Positional
 
 from brokk_min import hw
 from brokk_min.can import drive_log
-from brokk_min.can.canopen import open_bus
+from brokk_min.can.canopen import used_ids
+from brokk_min.can.connection import has_real_time_priority, lock_memory, open_bus
 from brokk_min.can.drive_log import read_frames
 from brokk_min.can.operator_input import JointJog, Joystick, Script
 from brokk_min.can.simulated_machine import simulate
@@ -68,9 +69,12 @@ class Drive(Command):
             compare(machine, controller, self.replay)
             return
         operator = self._operator(machine)
-        with open_bus(self.interface, self.channel, self.log) as bus:
+        with open_bus(self.interface, self.channel, self.log, used_ids(machine)) as bus:
             drive = hw.Drive(machine, controller, bus, operator)
             drive.begin()
+            if not (lock_memory() and has_real_time_priority()):
+                warning = "other work may make ticks late and end the drive (docs/hardware.md)"
+                print(f"drive: no real-time priority: {warning}", file=sys.stderr)
             try:
                 drive.run(show_line)
             finally:

@@ -35,6 +35,8 @@ STYLES: dict[str, dict[str, Any]] = {
     "jacobian_pid_k0.05": {"color": "#f0b84a", "linestyle": "--"},
     "jacobian_pid_ff": {"color": "#00886a", "linestyle": "-."},
     "jacobian_pid_ff_awake": {"color": "#6fbf9b", "linestyle": (0, (4, 1, 1, 1))},
+    "jacobian_pid_ff_integral": {"color": "#7a4fa3", "linestyle": "-."},
+    "jacobian_pid_ff_integral_awake": {"color": "#b39ad0", "linestyle": (0, (4, 1, 1, 1))},
     "perfect_model": {"color": "#c987b7"},
     "workspace": {"color": "#08306b"},
     "limits": {"color": "#d9661a"},

@@ -9,8 +9,9 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from brokk_min.actuator import PlantState, lever_arm, plant_reset, plant_step
+from brokk_min.actuator import PlantState, close_valves, lever_arm, plant_reset, plant_step
 from brokk_min.env import Measured
 from brokk_min.jacobian import dls
 from brokk_min.kinematics import forward_kinematics, jacobian, tool_velocity
@@ -29,6 +30,7 @@ class Plan(NamedTuple):
     plant: PlantState
     opening: Array  # valve openings beyond the dead zone, (num, horizon, n_driven)
     tick: int
+    rest_ticks: NDArray[np.int64]  # of `close_valves`, (num,)
 
 
 @dataclass(frozen=True)
@@ -37,11 +39,13 @@ class PerfectModel:
 
     It simulates the plant under its own commands, so its state (spools, valve activation, delayed
     commands) is exact; of the measurements it reads the goal alone. Openings near zero alternate
-    by `dither`, which keeps the valves open. It drives the nominal machine only.
+    by `dither`, which keeps the valves open. At rest `close_valves` closes them, unless they are to
+    stay "open". It drives the nominal machine only.
     """
 
     machine: Machine
     poses: Array  # start angles [rad] (k, n); a batch is these, repeated
+    valves: str = "closed"  # or "open", while the tool rests
     dither: float = 0.04  # valve opening (tuned)
 
     def start(self, num: int) -> Plan:
@@ -50,7 +54,7 @@ class PerfectModel:
             raise ValueError(f"poses: expected {num} or a part of it, got {len(self.poses)}")
         q = np.tile(self.poses, (num // len(self.poses), 1))
         closed = np.zeros((num, sum(BLOCKS), len(self.machine.driven)))
-        return Plan(plant_reset(self.machine, q), closed, 0)
+        return Plan(plant_reset(self.machine, q), closed, 0, np.zeros(num, np.int64))
 
     def __call__(self, measured: Measured, plan: Plan) -> tuple[Array, Plan]:
         """Commands u (num, n), and the plan for the next tick."""
@@ -58,7 +62,8 @@ class PerfectModel:
         shifted = np.concatenate([plan.opening[:, 1:], plan.opening[:, -1:]], axis=1)
         opening = self.improve(plan.plant, shifted, goal, plan.tick)
         u = self.quantise(plan.plant, opening, goal, plan.tick)
-        return u, Plan(plant_step(self.machine, plan.plant, u), opening, plan.tick + 1)
+        u, rest = close_valves(self.machine, self.valves, u, measured.v_goal, plan.rest_ticks)
+        return u, Plan(plant_step(self.machine, plan.plant, u), opening, plan.tick + 1, rest)
 
     def commands(self, opening: Array, tick: int) -> Array:
         """Commands (..., T, n) of planned openings (..., T, n_driven) from a tick on."""
@@ -148,8 +153,8 @@ def steady_opening(machine: Machine, q: Array, goal: Array) -> Array:
 
 
 def perfect_models(machine: Machine, starts: Array) -> dict[str, PerfectModel]:
-    """The bound, and the same without dither: its valves close while the tool is to stand still."""
+    """The bounds: with valves open while the tool rests, and with closed ones."""
     return {
-        "perfect_model": PerfectModel(machine, starts),
-        "perfect_model_no_dither": PerfectModel(machine, starts, dither=0.0),
+        "perfect_model": PerfectModel(machine, starts, "open"),
+        "perfect_model_closed": PerfectModel(machine, starts, "closed"),
     }

@@ -4,7 +4,7 @@ Sizes are numbers or names; a name stands for the same number in all fields of a
 """
 
 from collections.abc import Mapping, MutableMapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -117,17 +117,13 @@ COMMANDS: dict[str, Field] = {
 }
 META: Fields = {"machine": Field("text", 1, 200), "actuator": Field("text", 1, 200)}
 GAIN = Field("float", 0, 1e6, ("driven",))
-GAINS: Fields = {
-    "meta": META,
-    "gains": {
-        "*": {
-            "kp": GAIN,
-            "ki": GAIN,
-            "kd": GAIN,
-            "feedback": Field("float", 0, 1e6, (1,)),
-            "min_opening": Field("float", 0, 1, (1,)),
-        }
-    },
+GAINS: Fields = {  # of one controller
+    "kp": GAIN,
+    "ki": GAIN,
+    "kd": GAIN,
+    "feedback": Field("float", 0, 1e6, (1,)),
+    "min_opening": Field("float", 0, 1, (1,)),
+    "integral_feedback": Field("float", 0, 1e6, (1,), required=False),
 }
 MEAN: Fields = {
     "mean": Field("float"),
@@ -193,6 +189,7 @@ def check(
     place = f"{name}{list(at) or ''}"
     if field.shape == ("rows",):
         place = f"row {at[0] + 2}, column {name}"
+        wanted = replace(field, shape=()).wanted(sizes)
     raise ValueError(f"{path}: {place}: expected {wanted}, got {got}")
 
 

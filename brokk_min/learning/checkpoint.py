@@ -234,7 +234,9 @@ class TrainingLog:
                 file.seek(0)
                 content = torch.load(file, weights_only=True)  # executes nothing
             header = parse_json(content["header"])
-        expect_same(self.checkpoint, header, {"format": FORMAT, "identity": self.about})
+            identity = dict(header["identity"])
+        expect_same(self.checkpoint, header, {"format": FORMAT})
+        expect_same(self.checkpoint, identity, self.about)
         like = self.content(learner)
         with expected(self.checkpoint, "a complete checkpoint"):
             moments = {}

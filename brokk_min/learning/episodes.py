@@ -21,6 +21,7 @@ from brokk_min.env import (
 from brokk_min.kinematics import forward_kinematics, lowest_point
 from brokk_min.machine import Array, Machine
 
+AXES = np.vstack([np.eye(3), -np.eye(3)])
 GROUND_MARGIN = 0.3  # m above the ground below which no goal points down, assumed
 
 
@@ -45,7 +46,7 @@ def draw_goal(machine: Machine, config: TaskConfig, rng: np.random.Generator, nu
     """Random tool velocities [m/s] (num, 3): zero, along an axis, or anywhere; up to tool_speed."""
     direction = rng.standard_normal((num, 3))
     kind = rng.random((num, 1))
-    axis = np.vstack([np.eye(3), -np.eye(3)])[rng.integers(0, 6, num)]
+    axis = AXES[rng.integers(0, 6, num)]
     direction = np.where(kind < config.zero_goals + config.axis_goals, axis, direction)
     speed = rng.uniform(0, machine.tool_speed, (num, 1)) * (kind >= config.zero_goals)
     return np.asarray(speed * direction / np.linalg.norm(direction, axis=-1, keepdims=True))

@@ -58,7 +58,7 @@ class Ticks(NamedTuple):
     """What each tick of `env.step` began with, and its command: arrays (T, num, ...)."""
 
     q: Array  # true angle [rad], n
-    true_history: Array  # of `env.State`, (n, 3, H)
+    true_history: Array  # of `env.State`, (n_driven, 3, H)
     v_goal: Array  # goal velocity [m/s], 3
     error_integral: Array  # of `env.integrate_error` [m], 3
     u: Array  # command, n
@@ -131,7 +131,7 @@ def action_gradients(
 
 def valve_cost_gradient(machine: Machine, ticks: Ticks, valve_cost: float) -> Array:
     """dc_t/du_t = -dc_t/du_{t-1} of the cost c_t of valve travel, (T, num, n_driven)."""
-    travel = (ticks.u - ticks.true_history[..., 2, -1])[..., machine.driven]
+    travel = ticks.u[..., machine.driven] - ticks.true_history[..., 2, -1]
     limit = len(machine.driven) * machine.pwm_limit / PWM_MAX
     return np.sign(travel).astype(np.float32) * np.float32(valve_cost / limit)
 
@@ -145,7 +145,7 @@ def local_derivatives(
     """
     driven = machine.driven
     low, high = machine.column("q_min")[driven], machine.column("q_max")[driven]
-    history = append_command(ticks.true_history[..., driven, :, :], ticks.u[..., driven])
+    history = append_command(ticks.true_history, ticks.u[..., driven])
     velocity, dq_dot_dh = input_gradient(net, history)
     q_next = ticks.q[..., driven] + velocity * machine.dt
     free = (low <= q_next) & (q_next <= high)

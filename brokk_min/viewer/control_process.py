@@ -16,7 +16,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from brokk_min.can.canopen import OperatorInput, open_bus
+from brokk_min.can.canopen import OperatorInput, used_ids
+from brokk_min.can.connection import lock_memory, open_bus
 from brokk_min.can.drive_log import Telemetry
 from brokk_min.can.simulated_machine import SimulatedMachine, serve, start_pose
 from brokk_min.env import Measured, action_to_pwm
@@ -137,8 +138,9 @@ def control(
     simulated = nullcontext() if options.interface else simulated_machine(machine, options.start)
     interface = options.interface or "virtual"
     channel = options.channel or CHANNEL
+    lock_memory()
     try:
-        with simulated, open_bus(interface, channel, options.log) as bus:
+        with simulated, open_bus(interface, channel, options.log, used_ids(machine)) as bus:
             operator = WindowOperator(machine, connection)
             selected = SelectedController(machine, controllers, operator)
             drive = WindowDrive(machine, selected, bus, operator)

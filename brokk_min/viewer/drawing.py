@@ -42,6 +42,8 @@ TITLES = {
     "jacobian_pid_k0.1": "Jacobian + PID",
     "jacobian_pid_ff": "Jacobian + PID with feed-forward",
     "jacobian_pid_ff_awake": "the same, valves kept open",
+    "jacobian_pid_ff_integral": "Jacobian + PID with feed-forward and integral",
+    "jacobian_pid_ff_integral_awake": "the same, valves kept open",
 }
 
 

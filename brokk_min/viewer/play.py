@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from brokk_min.can.canopen import open_bus
+from brokk_min.can.connection import open_bus
 from brokk_min.can.drive_log import Telemetry, TelemetryReader
 from brokk_min.can.safety_gate import fault_name
 from brokk_min.evaluation.rollout import Controller

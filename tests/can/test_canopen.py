@@ -26,17 +26,19 @@ from helpers_bus import (
 
 from brokk_min import hw
 from brokk_min.can.canopen import (
-    Bus,
     Frame,
+    Nodes,
     OperatorInput,
     checksum,
     encoder_counts,
     encoder_raw,
-    open_bus,
     sdo,
     unpack_operator_input,
+    used_ids,
     valve_frame,
 )
+from brokk_min.can.connection import Bus, open_bus
+from brokk_min.can.simulated_machine import SimulatedMachine
 from brokk_min.machine import BROKK_170
 
 STEP = BROKK_170.encoder_step
@@ -77,7 +79,7 @@ def test_valve_frame__by_hand():
     ("raw", "counts"),
     [(1, 1), (0, 0), (2**26 - 1, -1), (2**26 - 2, -2), (4095, -1), (5 | 1 << 29, 5)],
 )
-def test_encoder_counts__unwraps_about_zero_and_masks(raw, counts):
+def test_encoder_counts__unwraps_about_zero(raw, counts):
     found = encoder_counts(BROKK_170, [raw, 0, 0, 1000, 0])
     assert found.dtype == int
     assert found.tolist() == [counts, 0, 0, 1000, 0]
@@ -156,12 +158,14 @@ class SelectBus:
         self.t = 7.0
         self.waits = []
         self.ready = []
+        self.messages = []
 
     def fileno(self):
         return 7
 
     def recv(self, timeout):
         assert timeout == 0.0  # python-can's own timeout follows the time of day
+        return self.messages.pop() if self.messages else None  # None: the filter took it
 
     def send(self, message, timeout):
         assert 0 < timeout <= 0.02  # a full buffer must not hold up the tick
@@ -172,7 +176,7 @@ class SelectBus:
     def select(self, read, *rest):
         assert read == [7]
         self.waits.append(rest[-1])
-        self.t += rest[-1] or 0.001
+        self.t += rest[-1] + 1e-6 if rest[-1] and not self.ready else 0.001
         return self.ready, [], []
 
 
@@ -186,8 +190,9 @@ def test_recv__sleeps_only_after_its_busy_wait(busy, slept, monkeypatch):
     assert 0.020 <= silent.t - 7.0 < 0.0225
     silent.t = 7.0
     silent.ready = [7]
-    bus.recv(0.020, busy)
-    assert silent.t < 7.002  # what is there is read at once
+    silent.messages = [can.Message(arbitration_id=0x181, is_extended_id=False), None, None]
+    assert bus.recv(0.020, busy).id == 0x181
+    assert silent.t < 7.004  # what is there is read at once, and frames that a filter took
 
 
 def test_open_bus__refuses_a_bus_that_is_not_there_or_fails():
@@ -263,6 +268,59 @@ def test_set_up_nodes__refuses_what_does_not_fit(world):
     machine = replace(BROKK_170, name="6_joints", joints=six, q_start=())
     with pytest.raises(ValueError, match=r"6_joints: expected at most 5 joints"):
         hw.Drive(machine, ConstantCommand(*np.zeros(6)), world.bus, HoldingOperator()).begin()
+    with pytest.raises(ValueError, match="command: expected at most 5 joints, got 6"):
+        valve_frame([0, 0, 0, 0, 0, 77], 9, 1)  # would be the counter
+    slow = replace(BROKK_170, name="slow", rate=5.0)
+    with pytest.raises(ValueError, match=r"slow: expected a rate of 10 Hz or more, .* got 5 Hz"):
+        hw.Drive(slow, ConstantCommand(*np.zeros(5)), world.bus, HoldingOperator()).begin()
+    for unfit in (machine, slow):
+        with pytest.raises(ValueError, match="expected"):
+            SimulatedMachine(unfit, np.zeros(unfit.n), 0.0)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "sound"),
+    [
+        (5, 9, True),
+        (5, 5 + 4096, False),  # a turn
+        (5 + 3 * 4096, 2, False),  # three turns
+        (4095, 0, True),  # an encoder of a single turn starts again
+        (0, 4095, True),
+        (2**26 - 1, 0, True),  # of 26 bits
+        (2, 2**24 - 3, True),  # of 24 bits
+        (4095, 4097, True),  # into the next turn
+        (3, 0xFFFFFFFF, False),
+        (0, 0xFFFFFFFE, True),  # of 32 bits
+    ],
+)
+def test_update__counts_a_position_twice_that_skips_turns_or_is_none(first, second, sound):
+    nodes = Nodes(BROKK_170)
+    nodes.update(Frame(0.0, 0x183, struct.pack("<I", first)))
+    assert nodes.frames.tolist() == [0, 0, 1, 0, 0]
+    nodes.start_tick()
+    nodes.update(Frame(0.05, 0x183, struct.pack("<I", second)))
+    assert nodes.frames[2] == (1 if sound else 2)
+
+
+def test_update__counts_frames_and_those_that_only_the_program_may_send():
+    nodes = Nodes(BROKK_170)
+    for can_id, sent in (
+        (0x080, False),
+        (0x080, True),
+        (0x210, False),
+        (0x123, False),
+        (-1, False),
+    ):
+        nodes.update(Frame(0.0, can_id, b"", sent))
+    assert (nodes.received, nodes.others) == (5, 2)
+    nodes.start_tick()
+    assert (nodes.received, nodes.others) == (0, 0)
+
+
+def test_used_ids__are_those_that_the_loop_reads_or_sends():
+    ids = used_ids(BROKK_170)
+    assert {0x000, 0x080, 0x210, 0x181, 0x185, 0x581, 0x701, 0x710} <= set(ids)
+    assert len(set(ids)) == len(ids) == 3 + 3 * 6
 
 
 def test_sdo__reads_small_objects_and_skips_foreign_answers(world):

@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 
 from brokk_min.can.canopen import checksum
-from brokk_min.can.safety_gate import Fault, GateInputs, GateState, fault_name, gate, gate_start
+from brokk_min.can.safety_gate import (
+    Fault,
+    GateInputs,
+    GateState,
+    expected_motion,
+    fault_name,
+    gate,
+    gate_start,
+)
 from brokk_min.machine import BROKK_170, decode_pwm
 
 STEP = BROKK_170.encoder_step
@@ -21,12 +29,60 @@ def test_fault_name__gives_node_and_text():
     names = [fault_name(BROKK_170, code) for code in range(len(Fault) * 6 + 1)]
     assert names[0] == ""
     assert names[1] == "error"
-    assert names[1 + 2 * 6] == "operator's device lost"
-    assert names[1 + 3 * 6] == "q1: never seen"
-    assert names[1 + 3 * 6 + 5] == "valve controller: never seen"
-    assert names[1 + 10 * 6 + 2] == "q3: frozen, or the joint does not move"
-    assert names[1 + 11 * 6 + 4] == "q5: no valid command"
-    assert names[1 + 12 * 6] == "stop asked for"
+    assert names[1 + 1 * 6] == "bus flooded"
+    assert names[1 + 4 * 6] == "operator's device lost"
+    assert names[1 + 5 * 6] == "q1: never seen"
+    assert names[1 + 5 * 6 + 5] == "valve controller: never seen"
+    assert names[1 + 12 * 6 + 2] == "q3: frozen, or the joint does not move"
+    assert names[1 + 13 * 6 + 4] == "q5: no valid command"
+    assert names[1 + 14 * 6] == "stop asked for"
+
+
+@pytest.mark.parametrize(
+    ("commands", "moved", "mrad"),
+    [
+        ([80] * 9, 0, 4.0),
+        ([-80] * 9, 0, 4.0),
+        ([80] * 4 + [30] + [80] * 4, 0, 1.0),
+        ([80] * 4 + [13] + [80] * 4, 0, 0.0),
+        ([80] * 4 + [-30] + [80] * 4, 0, 0.0),
+        ([80] * 9, 1, 0.0),
+        ([0] * 9, 0, 0.0),
+    ],
+)
+def test_expected_motion__of_q1_by_hand(commands, moved, mrad):
+    """The table of its docstring; dead zone 1.5 * 7 % = 13.3 counts of 127, fastest 0.20 rad/s."""
+    state = gate_start(BROKK_170)
+    state.sent[0] = commands
+    counts = np.array([moved, 0, 0, 0, 0])
+    assert expected_motion(BROKK_170, state, counts)[0] == pytest.approx(1e-3 * mrad, abs=1e-5)
+    state.expected_motion[0] = 0.001
+    again = expected_motion(BROKK_170, state, counts)[0]
+    assert again == pytest.approx(1e-3 * (mrad + 1) if mrad else 0.0, abs=1e-5)
+
+
+def test_expected_motion__counts_from_the_machines_own_largest_dead_zone():
+    state = gate_start(BROKK_170)
+    state.sent[0] = 30
+    wide = replace(BROKK_170, name="wide", largest_dead_zone=0.24)  # 30.5 of 127
+    assert not expected_motion(wide, state, np.zeros(5, int)).any()
+    narrow = replace(wide, largest_dead_zone=0.07)
+    expected = expected_motion(narrow, state, np.zeros(5, int))[0]
+    assert expected == pytest.approx(0.4 * 0.2 * 0.05 * (30 - 8.89) / (80 - 8.89), rel=1e-3)
+
+
+@pytest.mark.parametrize(("bits", "rate"), [(12, 20.0), (18, 20.0), (12, 50.0), (20, 10.0)])
+def test_gate__finds_a_frozen_encoder_in_radians_and_seconds(bits, rate):
+    """A joint that stands still under full command: the time hangs on neither counts nor ticks."""
+    machine = replace(BROKK_170, name="other", encoder_bits=bits, rate=rate)
+    state = gate_start(machine)
+    ticks = 0
+    while not (expected := state.expected_motion).max() > 0.0015 and ticks < 100:
+        state.sent[0, -min(ticks, state.sent.shape[-1]) :] = 80 if ticks else 0
+        state = state._replace(expected_motion=expected_motion(machine, state, state.counts))
+        ticks += 1
+    assert expected[0] > 0
+    assert 0.45 <= ticks / rate <= 0.45 + 0.05 + 1.5 / rate
 
 
 # --- a plain rewriting ---------------------------------------------------------------------------
@@ -42,8 +98,12 @@ def tight_machine():
         hits = limits[limits + margin == whole]
         return float(hits[np.argmin(np.abs(hits - near))])
 
-    speeds = np.arange(4, 30) * STEP / (2 * DT)
-    speed = float(speeds[(2.0 * speeds * DT / STEP + 4) % 1 == 0][0])
+    def jump(speed):
+        return 2.0 * speed * DT + 0.0045 + STEP
+
+    near = (np.arange(8, 40) * STEP - 0.0045 - STEP) / (2 * DT)
+    speeds = [x * (1 + np.finfo(float).eps * k) for x in near for k in range(-8, 9)]
+    speed = next(float(x) for x in speeds if jump(x) in np.arange(8, 40) * STEP)
     margins = [(-0.05, 0.05), (-0.05, 0.05), (0.02, -0.02), (-0.05, -0.02), (0.02, 0.05)]
     joints = tuple(
         replace(
@@ -57,51 +117,47 @@ def tight_machine():
         for joint, (low, high) in zip(BROKK_170.joints, margins, strict=True)
     )
     zones = 12 / (1.5 * 127) * (1 + np.finfo(float).eps * np.arange(-8, 8))
-    whole = next(float(zone) for zone in zones if 1.5 * zone * 127 == 12.0)
+    whole = next(float(zone) for zone in zones if 1.5 * zone == 12 / 127)
     return replace(BROKK_170, joints=joints, dead_zone=whole)
 
 
-def plain_motion(machine, s, count, j):
-    """Measured and expected motion of joint `j`."""
+def plain_expected_motion(machine, s, count, j):
+    """Motion [rad] that is expected at least of joint `j`."""
     joint = machine.joints[j]
     sent = s.sent[j].tolist()
-    before, last = s.counts[j].tolist()
-    sign = 1 if sent[7] > 0 else -1
-    push = [sign * m - 1.5 * machine.dead_zone * 127 for m in sent]
-    weakest = min(push)
-    if sent[7] == 0 or weakest <= 0:  # some command of the last 0.4 s may have done nothing
-        return 0.0, 0.0
-    if count != last:
-        return max(sign * (count - before) - 1, 0) / 2, 0.0
-    measured = float(s.measured_motion[j])
-    slower = min(joint.q_dot_up, joint.q_dot_down)
-    at_least = 0.3 * slower * DT / STEP / (80 - 1.5 * machine.dead_zone * 127) * weakest
-    continued = 0.5 * measured * weakest / max(push)
-    return measured, float(s.expected_motion[j]) + max(at_least, continued)
+    idle = 1.5 * machine.dead_zone
+    smallest = min(sent) / 127 if sent[-1] > 0 else -max(sent) / 127
+    if smallest <= idle or count != s.counts[j]:  # a command may have done nothing, or it moved
+        return 0.0
+    opening = (smallest - idle) / (80 / 127 - idle)
+    q_dot = 0.4 * min(joint.q_dot_up, joint.q_dot_down) * opening
+    return float(s.expected_motion[j]) + DT * q_dot
 
 
 def plain_fault(machine, s, i, now):
     """The first fault of one gate, with the promised numbers written out."""
     faults = {
         (0, 0): i.error,
-        (1, 0): not 0.5 * DT <= now - s.time <= 1.5 * DT,
-        (2, 0): not i.alive,
-        (12, 0): i.stop,
+        (1, 0): i.flooded,
+        (2, 0): i.other_sender,
+        (3, 0): not 0.5 * DT <= now - s.time <= 1.5 * DT,
+        (4, 0): not i.alive,
+        (14, 0): i.stop,
     }
     for node in range(6):
-        faults[3, node] = i.heartbeat[node] == -np.inf
-        faults[4, node] = now - i.heartbeat[node] > 0.110
-        faults[5, node] = i.nmt[node] != 5
+        faults[5, node] = i.heartbeat[node] == -np.inf
+        faults[6, node] = now - i.heartbeat[node] > 0.110
+        faults[7, node] = i.nmt[node] != 5
     for j, joint in enumerate(machine.joints):
-        c, old = int(i.counts[j]), int(s.counts[j][1])
-        fastest = 2 * max(joint.q_dot_up, joint.q_dot_down) * DT / STEP + 4
+        c, old = int(i.counts[j]), int(s.counts[j])
+        jump = 2 * max(joint.q_dot_up, joint.q_dot_down) * DT + 0.0045 + STEP
         limit = 80 if joint.driven else 0
-        faults[6, j] = i.frames[j] == 0
-        faults[7, j] = i.frames[j] >= 2
-        faults[8, j] = not joint.q_min - 0.05 <= c * STEP <= joint.q_max + 0.05
-        faults[9, j] = abs(c - old) > fastest
-        faults[10, j] = plain_motion(machine, s, c, j)[1] > 1.0
-        faults[11, j] = not -limit <= i.command[j] <= limit
+        faults[8, j] = i.frames[j] == 0
+        faults[9, j] = i.frames[j] >= 2
+        faults[10, j] = not joint.q_min - 0.05 <= c * STEP <= joint.q_max + 0.05
+        faults[11, j] = abs(c * STEP - old * STEP) > jump
+        faults[12, j] = plain_expected_motion(machine, s, c, j) > max(0.0015, STEP)
+        faults[13, j] = not -limit <= i.command[j] <= limit
     return min((1 + kind * 6 + node for (kind, node), found in faults.items() if found), default=0)
 
 
@@ -113,13 +169,13 @@ def plain_gate(machine, s, i, now):
     m = [0] * 5
     for j, joint in enumerate(machine.joints):
         if driving and s.driving:
-            last, q = int(s.sent[j][7]), i.counts[j] * STEP
+            last, q = int(s.sent[j][-1]), i.counts[j] * STEP
             m[j] = min(max(int(i.command[j]), min(last, 0) - 40), max(last, 0) + 40)
             if (m[j] > 0 and q >= joint.q_max - 0.02) or (m[j] < 0 and q <= joint.q_min + 0.02):
                 m[j] = 0
     trusted = i.alive and not i.error
     counter = 0 if s.counter == 255 else int(s.counter) + 1
-    motion = [plain_motion(machine, s, int(c), j) for j, c in enumerate(i.counts)]
+    motion = [plain_expected_motion(machine, s, int(c), j) for j, c in enumerate(i.counts)]
     state = GateState(
         driving=driving,
         armed_once=bool(s.armed_once) or driving,
@@ -128,10 +184,9 @@ def plain_gate(machine, s, i, now):
         enable=bool(i.enable) if trusted else bool(i.enable or s.enable),
         time=now,
         counter=counter,
-        counts=[[old[1], new] for old, new in zip(s.counts, i.counts, strict=True)],
+        counts=i.counts,
         sent=[[*old[1:], new] for old, new in zip(s.sent, m, strict=True)],
-        measured_motion=[measured for measured, _ in motion],
-        expected_motion=[expected for _, expected in motion],
+        expected_motion=motion,
     )
     return state, [*(x if x >= 0 else 255 + x for x in m), counter, int(driving)]
 
@@ -185,43 +240,42 @@ class Cases:
             alive=~self.some(0.03),
             stop=self.some(0.03),
             error=self.some(0.03),
+            flooded=self.some(0.02),
+            other_sender=self.some(0.02),
         )
 
     def draw_state(self):
         rng, num, n = self.rng, self.num, self.machine.n
-        # two angles: running, standing, or before a jump
-        fastest = np.floor(2 * self.machine.q_dot_max * DT / STEP + 4).astype(int)
+        fastest = np.floor((2 * self.machine.q_dot_max * DT + 0.0045) / STEP + 1).astype(int)
         jump = rng.choice([-1, 1], (num, n)) * (fastest + rng.integers(-1, 2, (num, n)))
-        speed = np.where(self.some(0.5, n), 0, rng.integers(-3, 4, (num, n)))
-        last = self.inputs.counts - np.where(self.some(0.03, n), jump, speed)
-        first = last - np.where(self.some(0.3, n), 0, rng.integers(-7, 8, (num, n)))
+        step = np.where(self.some(0.5, n), 0, rng.integers(-3, 4, (num, n)))
+        last = self.inputs.counts - np.where(self.some(0.03, n), jump, step)
         # commands: to one side for some ticks, or not; now and then one to the other side
         odds = [0.01, 0.3, 0.19, 0.3, 0.2]
         push = rng.choice([-1, 1], (num, n, 1)) * rng.choice(
-            [12, 13, 14, 40, 80], (num, n, 8), p=odds
+            [12, 13, 14, 40, 80], (num, n, 9), p=odds
         )
-        pushed = np.arange(8, 0, -1) <= rng.choice([0, 6, 7, 8], (num, n, 1))
-        sent = np.where(pushed, push, rng.integers(-80, 81, (num, n, 8)))
+        pushed = np.arange(9, 0, -1) <= rng.choice([0, 7, 8, 9], (num, n, 1))
+        sent = np.where(pushed, push, rng.integers(-80, 81, (num, n, 9)))
         late = (0.5 * DT, 0.5 * DT - 1e-9, 1.5 * DT + 1e-9, 0.074, 0.026, np.inf, -1.0)
         state = GateState(
             driving=self.some(0.6),
             armed_once=self.some(0.5),
-            active_fault=rng.integers(0, 79, num),
-            latched_fault=rng.integers(0, 79, num),
+            active_fault=rng.integers(0, 91, num),
+            latched_fault=rng.integers(0, 91, num),
             enable=self.some(0.5),
             time=-self.put(np.full(num, DT), 0.1, *late),
             counter=rng.choice([0, 1, 127, 254, 255], num),
-            counts=np.stack([first, last], axis=-1),
-            sent=np.where(self.some(0.02, n, 8), -sent, sent),
-            measured_motion=np.where(self.some(0.4, n), 0.0, rng.uniform(0, 3, (num, n))),
-            expected_motion=rng.choice([0.0, 0.5, 0.9], (num, n), p=[0.7, 0.2, 0.1]),
+            counts=last,
+            sent=np.where(self.some(0.02, n, 9), -sent, sent),
+            expected_motion=STEP * rng.choice([0.0, 0.5, 0.9], (num, n), p=[0.7, 0.2, 0.1]),
         )
         # now and then as much motion as may be expected, to the bit, or a bit more
         due = np.zeros((num, n))
         for k, j in np.ndindex(num, n):
             s = GateState(*row(state, k))
-            due[k, j] = plain_motion(self.machine, s, self.inputs.counts[k, j], j)[1]
-        rest = 1.0 - (due - state.expected_motion)
+            due[k, j] = plain_expected_motion(self.machine, s, self.inputs.counts[k, j], j)
+        rest = STEP - (due - state.expected_motion)
         bit = np.nextafter(rest, rng.choice([-9.0, 9.0], (num, n)))
         border = np.where(self.some(0.5, n), rest, bit)
         motion = np.where(self.some(0.8, n), state.expected_motion, border)
@@ -253,7 +307,7 @@ def test_gate__is_what_its_promises_say_in_any_leading_shape(machine, seed):
             assert np.shape(found) == (*shape, *expected.shape[1:]), name
             np.testing.assert_array_equal(np.reshape(found, expected.shape), expected, name)
     faults = {(s.active_fault - 1) // 6 for s, _ in cases.expected if s.active_fault}
-    assert faults == set(range(13)), "each fault comes up"
+    assert faults == set(range(15)), "each fault comes up"
     assert sum(bool(s.driving and any(f[:5])) for s, f in cases.expected) > 300
 
 
@@ -309,12 +363,18 @@ def draw_tick(rng, now, counts):
         alive=~rare(0.01),
         stop=rare(0.01),
         error=rare(0.01),
+        flooded=rare(0.01),
+        other_sender=rare(0.01),
     )
 
 
 def is_sound(i, q, now, last):
     low, high = BROKK_170.column("q_min"), BROKK_170.column("q_max")
-    sound = i.alive & ~i.stop & ~i.error & (np.abs(now - last - DT) < 0.0251)
+    sound = (
+        i.alive
+        & ~(i.stop | i.error | i.flooded | i.other_sender)
+        & (np.abs(now - last - DT) < 0.0251)
+    )
     sound &= (i.frames == 1).all(1) & (i.nmt == 5).all(1)
     sound &= (now[:, None] - i.heartbeat <= 0.11).all(1)
     sound &= np.isfinite(i.command).all(1) & (np.abs(i.command) <= 80 * DRIVEN).all(1)

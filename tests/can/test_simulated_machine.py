@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from helpers_bus import START, dictionary, eventually, recorded_rows, served
 
-from brokk_min.can.canopen import HEARTBEAT_PERIOD, Frame, encoder_raw, valve_frame
-from brokk_min.can.simulated_machine import WATCHDOG, SimulatedMachine, simulate, start_pose
+from brokk_min.can.canopen import HEARTBEAT_PERIOD, WATCHDOG, Frame, encoder_raw, valve_frame
+from brokk_min.can.simulated_machine import SimulatedMachine, simulate, start_pose
 from brokk_min.identification.logs import read_log
 from brokk_min.machine import BROKK_170
 
@@ -29,13 +29,17 @@ class Machine(SimulatedMachine):
 
     def __init__(self):
         self.rows = []
-        super().__init__(BROKK_170, START, 100.0, lambda *row: self.rows.append(row))
+        self.reasons = []
+        record = lambda *row: self.rows.append(row)  # noqa: E731
+        super().__init__(BROKK_170, START, 100.0, record, self.reasons.append)
 
     def nmt_(self, command, node=0):
         return self.receive(Frame(100.0, 0x000, bytes([command, node])))
 
-    def valves(self, counter, *counts, enable=1, now=100.0):
-        """Send a valve frame; the commands in force [counts]."""
+    def valves(self, counter, *counts, enable=1, now=100.0, sync=True):
+        """Send SYNC and a valve frame; the commands in force [counts]."""
+        if sync:
+            self.receive(Frame(now, 0x080, b""))
         data = valve_frame([*counts, *[0] * (5 - len(counts))], counter, enable).tobytes()
         assert self.receive(Frame(now, BROKK_170.valve_frame_id, data)) == []
         return np.rint(127 * self.u).astype(int).tolist()
@@ -90,19 +94,38 @@ FRAME = valve_frame([80, 0, 0, 0, 0], 9, 1).tobytes()
 
 
 @pytest.mark.parametrize(
-    ("act", "state"),
+    ("act", "state", "reason"),
     [
-        (lambda machine: machine.valves(10, 80), 127),
-        (lambda machine: machine.receive(Frame(100.0, 0x210, FRAME[:6] + b"\x00\x01")), 127),
-        (lambda machine: machine.receive(Frame(100.0, 0x210, FRAME[:7])), 127),
-        (lambda machine: machine.nmt_(2, CONTROLLER), 4),
-        (watchdog, 127),
+        (lambda machine: machine.valves(10, 80), 127, "valve frame with counter 10 after 8"),
+        (
+            lambda machine: machine.receive(Frame(100.0, 0x210, FRAME[:6] + b"\x00\x01")),
+            127,
+            "valve frame with a wrong length or checksum",
+        ),
+        (
+            lambda machine: machine.receive(Frame(100.0, 0x210, FRAME[:7])),
+            127,
+            "valve frame with a wrong length or checksum",
+        ),
+        (
+            lambda machine: machine.valves(9, 77, sync=False),
+            127,
+            "second valve frame after a SYNC, counter 9",
+        ),
+        (
+            lambda machine: [machine.receive(Frame(100.0, 0x080, b"")) for _ in range(2)],
+            127,
+            "no valve frame between two SYNCs",
+        ),
+        (lambda machine: machine.nmt_(2, CONTROLLER), 4, None),
+        (watchdog, 127, "no valve frame for 0.15 s"),
     ],
-    ids=["counter", "checksum", "short", "stopped", "watchdog"],
+    ids=["counter", "checksum", "short", "second", "missing", "stopped", "watchdog"],
 )
-def test_receive__closes_valves_until_a_start_and_a_neutral_frame(act, state):
+def test_receive__closes_valves_until_a_start_and_a_neutral_frame(act, state, reason):
     machine = driving()
     act(machine)
+    assert machine.reasons == [reason] * (reason is not None)
     assert not machine.u.any() and not machine.enabled
     assert machine.nmt[CONTROLLER] == state
     assert not any(machine.valves(77)) and not any(machine.valves(78, 80))  # nobody started it

@@ -179,6 +179,7 @@ def write_gains(folder):
     """Gains for the nets of the policy in `folder`; the names of the controllers."""
     row = {key: [0.5] * 4 for key in ("kp", "ki", "kd")} | {"feedback": [0.1], "ready": [0.01]}
     names = ["jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff", "jacobian_pid_ff_awake"]
+    names += ["jacobian_pid_ff_integral", "jacobian_pid_ff_integral_awake"]
     net = load_policy(folder / "policy.npz", BROKK_170).net
     meta = baselines.gains_metadata(BROKK_170, net)
     table = {"meta": meta, "gains": dict.fromkeys(names, row)}
@@ -222,7 +223,7 @@ def test_evaluate__writes_what_it_used(folder, capsys):
     assert run(f"evaluate {line} --perfect-model --json", out) == 0
     runs = json.loads(out.read_text())["runs"]
     best = sorted(runs, key=lambda run: run["velocity_error_mean"])[:2]
-    assert [run["controller"] for run in best] == ["perfect_model", "perfect_model_no_dither"]
+    assert [run["controller"] for run in best] == ["perfect_model", "perfect_model_closed"]
     capsys.readouterr()
     assert run(f"evaluate {line} --gains", SHIPPED_GAINS) == 1  # gains for other nets
     assert "gains for" in capsys.readouterr().err

@@ -100,9 +100,9 @@ def test_commands__alternate_about_openings_near_zero():
 
 
 def test_perfect_model__leaves_less_error_than_a_pid():
-    goals = np.zeros((50, 2, 3))
-    goals[10:30, :, 2] = 0.15
-    goals[30:, :, 1] = -0.1
+    goals = np.zeros((52, 2, 3))
+    goals[12:32, :, 2] = 0.15
+    goals[32:, :, 1] = -0.1
     pid = baselines(BROKK_170, obedient_net(BROKK_170))["jacobian_pid_k0.1"]
     controllers = {**perfect_models(BROKK_170, POSES), "pid": pid}
     errors = {}
@@ -114,5 +114,5 @@ def test_perfect_model__leaves_less_error_than_a_pid():
         np.testing.assert_allclose(counts, np.rint(counts), atol=1e-9)
         assert np.abs(counts).max() <= 80 and not trace.u[..., BROKK_170.locked].any()
     assert errors["perfect_model"].mean() < 0.7 * errors["pid"].mean()
-    assert errors["perfect_model"][22:30].mean() < 0.006
-    assert errors["perfect_model"].mean() < errors["perfect_model_no_dither"].mean()
+    assert errors["perfect_model"][24:32].mean() < 0.006
+    assert errors["perfect_model"].mean() < errors["perfect_model_closed"].mean()

@@ -27,6 +27,7 @@ from brokk_min.machine import BROKK_170
 TINY = Budget(0.004, 20, 4096, 1, 1, 4, 2, 0.5)
 ERROR = "velocity_error_mean"
 PIDS = ["jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff", "jacobian_pid_ff_awake"]
+PIDS += ["jacobian_pid_ff_integral", "jacobian_pid_ff_integral_awake"]
 
 
 class Idle:
@@ -121,7 +122,7 @@ def test_reproduce__results_compare_with_the_bound_and_on_other_machines(results
     means = results["regret"]["summary"]
     difference = means["rl"]["all"][ERROR] - means["perfect_model"]["all"][ERROR]
     assert less["rl"]["all"]["mean"] == pytest.approx(difference)
-    assert "perfect_model_no_dither" in means
+    assert "perfect_model_closed" in means
     assert set(results["robustness"]) == set(variations(BROKK_170))
     assert set(results["robustness"]["nominal"]) == {"rl", *PIDS}
 

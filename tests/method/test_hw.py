@@ -323,16 +323,17 @@ def command(joint, value):
 
 
 PHASES = (0.0005, 0.0215, 0.0485)  # s after SYNC, one a fault
+OTHER_SENDER = "SYNC, NMT or valve frame of another sender"
 NOT_OPERATIONAL = "valve controller: not operational"
 FAULTS = {
     "controller silent": (up(0x710, lambda d: []), "valve controller: heartbeat lost"),
     "controller stopped": (up(0x710, lambda d: [b"\x04"]), NOT_OPERATIONAL),
     "controller's heartbeat malformed": (up(0x710, lambda d: [d * 2]), "heartbeat lost"),
     "flood on all identifiers": (flood, ""),
-    "second master": (second_master, NOT_OPERATIONAL),
-    "foreign NMT stop of all": (foreign_nmt(b"\x02\x00"), ""),
-    "foreign NMT reset of q4": (foreign_nmt(b"\x81\x04"), "q4"),
-    "foreign NMT stop of the controller": (foreign_nmt(b"\x02\x10"), NOT_OPERATIONAL),
+    "second master": (second_master, OTHER_SENDER),
+    "foreign NMT stop of all": (foreign_nmt(b"\x02\x00"), OTHER_SENDER),
+    "foreign NMT reset of q4": (foreign_nmt(b"\x81\x04"), OTHER_SENDER),
+    "foreign NMT stop of the controller": (foreign_nmt(b"\x02\x10"), OTHER_SENDER),
     "bus closed": (close_bus, "error (CanOperationError: closed)"),
     "send error of all frames": (lambda f: send_error(f, False), "error (CanOperationError"),
     "send error of valve frames": (lambda f: send_error(f, True), ""),

@@ -175,6 +175,12 @@ def test_desired_velocities__are_eq3():
     c = controller(w0, feedback=0.3)
     found = c.desired_velocities(GOAL, v_tool, POSE, last)
     np.testing.assert_allclose(found, best, atol=1e-5)
+    integral = np.array([0.01, 0.0, -0.02])
+    with_integral = replace(c.gains, feedback=np.zeros(1), integral_feedback=np.full(1, 2.0))
+    found = replace(c, gains=with_integral).desired_velocities(GOAL, v_tool, POSE, last, integral)
+    same = controller(w0).desired_velocities(GOAL + 2 * integral, v_tool, POSE, last)
+    np.testing.assert_allclose(found, same, atol=1e-12)
+    found = c.desired_velocities(GOAL, v_tool, POSE, last)
     other = c.desired_velocities(GOAL, v_tool, POSE, -last)
     assert np.abs(other - found).max() > 1e-3  # the last direction decides the weights
 
@@ -267,12 +273,29 @@ def test_controller__least_opening_while_the_tool_is_to_move():
     drift = [0.001, 0.0, -0.001, 0.001, 0.001]
     u, _ = c(measured(POSE, np.zeros(3), drift), c.start(1))
     assert not u.any()
-    u, _ = replace(c, always_open=True)(measured(POSE, np.zeros(3), drift), c.start(1))
+    u, _ = replace(c, valves="open")(measured(POSE, np.zeros(3), drift), c.start(1))
     assert np.rint(u[0] * 127).tolist() == [-least, 0, least, -least, -least]
     more, _ = controller(kp=1.5, min_opening=0.03)(measured(POSE, GOAL), c.start(1))
     same, _ = controller(kp=1.5)(measured(POSE, GOAL), c.start(1))
     beyond = np.abs(same) > least / 127
     assert beyond.any() and (more[beyond] == same[beyond]).all()  # a least opening, not one more
+
+
+def test_controller__closes_its_valves_half_a_second_after_the_stop():
+    """The arm still moves: the PID brakes for ten ticks, then its integral stands."""
+    c = controller(kp=2.0, ki=5.0)
+    drift = [0.05, 0.0, -0.05, 0.05, 0.05]
+    state = {valves: c.start(1) for valves in ("closed", "open")}
+    sent = {valves: [] for valves in state}
+    for v_goal in [GOAL, *[0 * GOAL] * 14]:
+        for valves, last in state.items():
+            of_class = replace(c, valves=valves)
+            u, state[valves] = of_class(measured(POSE, v_goal, drift), last)
+            sent[valves].append(u[0])
+    assert np.array(sent["closed"]).any(axis=1).tolist() == [True] * 11 + [False] * 4
+    assert np.array(sent["open"]).any(axis=1).all()
+    grown = np.abs(state["open"].integral - state["closed"].integral)
+    np.testing.assert_allclose(grown[0], 4 * 5.0 * 0.05 * 0.05, rtol=1e-2)
 
 
 def test_controller__at_rest_without_a_goal_keeps_valves_closed():

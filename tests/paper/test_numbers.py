@@ -30,7 +30,7 @@ def test_constants__are_the_papers() -> None:
     layers = [layer.out_features for layer in mlp(7, 1, 1.0) if isinstance(layer, nn.Linear)]
     assert layers == [256, 128, 64, 1]
     assert excitation.EXCITATIONS["sine"] is excitation.sine_command
-    assert baselines.RANGES["feedback"] == (0.0, 1.0)
+    assert baselines.RANGES["feedback"] == (0.01, 1.0)
 
 
 def test_valve_opening__by_hand() -> None:

@@ -1,0 +1,161 @@
+"""The CAN bus through python-can, and its log; python-can is imported when a bus is opened."""
+
+import ctypes
+import os
+import select
+import signal
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from brokk_min.can.canopen import OPERATOR_CHANNEL, OPERATOR_INPUT, Frame
+from brokk_min.identification.files import require
+
+
+@dataclass
+class Bus:
+    """A CAN bus with a monotonic clock and a log of what is sent and read."""
+
+    bus: Any  # of python-can, without filters
+    writer: Any = None  # python-can's candump writer
+    name: str = "can"  # of the bus in the log
+    echo: bool = False  # does the bus give back what we send?
+    clock: Callable[[], float] = time.monotonic  # s
+    sleep: Callable[[float], object] = time.sleep
+
+    def __post_init__(self) -> None:
+        """Find the descriptor to wait on, if the bus has one."""
+        self.start = time.time() - self.clock()  # the log has the time of day, but it may be set
+        self.echoes: deque[tuple[int, bytes]] = deque(maxlen=64 if self.echo else 0)
+        self.unwritten: deque[Any] = deque()  # messages for the log
+        self.message = require("can", "hw").Message
+        self.file = -1
+        with suppress(NotImplementedError):
+            self.file = self.bus.fileno()
+
+    def now(self) -> float:
+        """Time of day at the start plus monotonic time since [s], in whole microseconds."""
+        return round(self.start + self.clock(), 6)
+
+    def recv(self, timeout: float, busy_wait: float = 0.0) -> Frame | None:
+        """The next frame within `timeout` [s], or None; it sleeps only after `busy_wait` [s]."""
+        start = self.clock()
+        elapsed = 0.0
+        message = None
+        while self.file >= 0 and elapsed < timeout:  # python-can's timeout follows the time of day
+            wait = timeout - elapsed if elapsed >= busy_wait else 0.0
+            if select.select([self.file], [], [], wait)[0] and (message := self.bus.recv(0.0)):
+                break
+            elapsed = self.clock() - start
+        else:
+            message = self.bus.recv(timeout if self.file < 0 else 0.0)
+        if message is None:
+            return None
+        now = self.now()
+        data = bytes(message.data)
+        if (message.arbitration_id, data) in self.echoes:
+            self.echoes.remove((message.arbitration_id, data))
+            return Frame(now, -1, data)
+        self._log(message, now, self.name)
+        return Frame(now, standard_id(message), data)
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """Send one frame, once; never periodically: the kernel would go on after a hang."""
+        message = self._message(can_id, data)
+        self.bus.send(message, timeout=0.01)
+        self.echoes.append((can_id, data))
+        self._log(message, self.now(), self.name)
+
+    def log_input(self, data: bytes) -> float:
+        """Log the operator's input, which is not on the bus; the time of it [s]."""
+        now = self.now()
+        self._log(self._message(OPERATOR_INPUT, data), now, OPERATOR_CHANNEL)
+        return now
+
+    def flush(self) -> None:
+        """Write the log on, so that it survives the program's sudden end."""
+        while self.unwritten:
+            self.writer.on_message_received(self.unwritten.popleft())
+        if self.writer is not None:
+            self.writer.file.flush()
+
+    def _message(self, can_id: int, data: bytes) -> Any:
+        return self.message(arbitration_id=can_id, data=data, is_extended_id=False, is_rx=False)
+
+    def _log(self, message: Any, now: float, channel: str) -> None:
+        """Keep for `flush`: writing waits until there is time."""
+        if self.writer is not None:
+            message.timestamp = now
+            message.channel = channel
+            self.unwritten.append(message)
+
+    def close(self) -> None:
+        """Close bus and log."""
+        self.bus.shutdown()
+        if self.writer is not None:
+            self.flush()
+            self.writer.stop()
+
+
+def standard_id(message: Any) -> int:
+    """Identifier of a data frame with 11 bits; -1 for any other frame."""
+    flags = message.is_extended_id, message.is_remote_frame, message.is_error_frame, message.is_fd
+    return -1 if any(flags) else int(message.arbitration_id)
+
+
+@contextmanager
+def open_bus(
+    interface: str, channel: str, log: Path | None = None, ids: Sequence[int] = ()
+) -> Iterator[Bus]:
+    """A bus by python-can's names, closed at the end of the block; `log` grows while it runs.
+
+    Kernel or adapter keep away frames of other identifiers than `ids`; empty: all frames come.
+
+    ValueError: python-can is not installed, finds no such bus, or fails in the block.
+    """
+    can = require("can", "hw")
+    where = f"{interface} {channel}: expected a CAN bus"
+    filters = [{"can_id": i, "can_mask": 0x7FF, "extended": False} for i in ids]
+    try:
+        raw = can.Bus(interface=interface, channel=channel, can_filters=filters or None)
+    except Exception as error:  # each interface has its own
+        raise ValueError(f"{where}, got {error!r}") from error
+    name = channel if interface == "socketcan" else interface
+    writer = can.CanutilsLogWriter(log) if log else None
+    bus = Bus(raw, writer, name, echo=interface == "udp_multicast")
+    try:
+        yield bus
+    except can.CanError as error:
+        raise ValueError(f"{where} that works, got {error!r}") from error
+    finally:
+        bus.close()
+
+
+@contextmanager
+def stop_signals() -> Iterator[list[int]]:
+    """A list to which SIGINT and SIGTERM are appended, instead of ending the program."""
+    received: list[int] = []
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    handlers = [signal.signal(n, lambda number, _: received.append(number)) for n in numbers]
+    try:
+        yield received
+    finally:
+        for number, handler in zip(numbers, handlers, strict=True):
+            signal.signal(number, handler)
+
+
+def lock_memory() -> bool:
+    """Keep the pages of this process in memory from when they are used; False: not allowed."""
+    flags = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT of Linux
+    return sys.platform == "linux" and bool(ctypes.CDLL(None).mlockall(flags) == 0)
+
+
+def has_real_time_priority() -> bool:
+    """Does the system prefer this process to all ordinary ones? (Linux)"""
+    real_time = [getattr(os, name, None) for name in ("SCHED_FIFO", "SCHED_RR")]
+    return sys.platform == "linux" and os.sched_getscheduler(0) in real_time
