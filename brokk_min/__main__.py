@@ -41,8 +41,9 @@ def main(arguments: list[str] | None = None) -> int:
     if arguments == ["--version"]:
         print(f"brokk_min {__version__}")
         return 0
+    paper = {"train": commands.PaperTrain, "sweep": commands.PaperSweep}
     command = tyro.extras.subcommand_cli_from_dict(
-        COMMANDS,
+        COMMANDS | paper if "--paper" in arguments else COMMANDS,
         prog="brokk-min",
         description=__doc__,
         args=arguments,

@@ -45,7 +45,8 @@ def dls(J: ArrayLike, W: ArrayLike, damping: ArrayLike, as_printed: bool = False
 
 def solve(A: Array, B: Array) -> Array:
     """X of A X = B for many positive definite A (..., m, m), all at once: Gauss-Jordan."""
-    rows = np.moveaxis(np.concatenate([A, B], axis=-1), (-2, -1), (0, 1)).copy()
+    rows = np.concatenate([A, B], axis=-1)
+    rows = np.ascontiguousarray(np.moveaxis(rows, (-2, -1), (0, 1)))
     for i in range(len(rows)):
         pivot = rows[i] / rows[i, i]
         rows -= rows[:, i, None] * pivot  # 0 in column i

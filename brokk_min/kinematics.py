@@ -37,24 +37,23 @@ def forward_kinematics(machine: Machine, q: ArrayLike) -> Frames:
     q = as_floats(q)
     if q.ndim < 1 or q.shape[-1] != machine.n:
         raise ValueError(f"q: expected (..., {machine.n}), got {q.shape}")
-    # in here vectors are (3, ...), coordinates first: c * x scales x at each pose of a batch
-    p = np.zeros((machine.n + 1, 3, *q.shape[:-1]), q.dtype)
+    # in here all axes are reversed, vectors are (3, ...): c * x scales x at each pose of a batch
+    angles = np.ascontiguousarray((q + machine.column("theta").astype(q.dtype)).T)
+    c = np.cos(angles)
+    s = np.sin(angles)
+    p = np.zeros((3, machine.n + 1, *c.shape[1:]), q.dtype)
     axes = np.zeros_like(p)
     x, y, z = np.eye(3, dtype=q.dtype).reshape(3, 3, *[1] * (q.ndim - 1))
-    axes[0] = z
-    angles = np.moveaxis(q + machine.column("theta").astype(q.dtype), -1, 0)
-    c = np.ascontiguousarray(np.cos(angles))
-    s = np.ascontiguousarray(np.sin(angles))
+    axes[:, 0] = z
     for i, joint in enumerate(machine.joints):
         x, y = rotate(x, y, c[i], s[i])  # Rz(q + theta)
-        p[i + 1] = p[i] + joint.a * x  # Tx(a)
+        p[:, i + 1] = p[:, i] + joint.a * x  # Tx(a)
         if joint.d:
-            p[i + 1] += joint.d * z  # Tz(d)
+            p[:, i + 1] += joint.d * z  # Tz(d)
         if joint.alpha:
             y, z = rotate(y, z, math.cos(joint.alpha), math.sin(joint.alpha))  # Rx(alpha)
-        axes[i + 1] = z
-    last = (*range(2, p.ndim), 0, 1)
-    return Frames(p.transpose(last), axes.transpose(last))
+        axes[:, i + 1] = z
+    return Frames(p.T, axes.T)
 
 
 def rotate(a: Array, b: Array, c: Array | float, s: Array | float) -> tuple[Array, Array]:

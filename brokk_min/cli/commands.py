@@ -22,7 +22,13 @@ from brokk_min.cli.options import (
     WrongUse,
     default_policy,
 )
-from brokk_min.cli.settings import FitSettings, LearnerSettings, TaskSettings, make_config
+from brokk_min.cli.settings import (
+    FitSettings,
+    LearnerSettings,
+    PaperDefaults,
+    TaskSettings,
+    make_config,
+)
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation import baselines, figures, metrics, perfect_model, sequences
 from brokk_min.evaluation.claims import VERDICTS
@@ -196,6 +202,16 @@ class Sweep(Training):
         seeds = range(self.seed, self.seed + self.seeds)
         options = (self.poses, self.scheduler, self.gains, self.critic)
         print(show(sweep(machine, net, task, config, seeds, self.out, *options)))
+
+
+@dataclass(kw_only=True)
+class PaperTrain(PaperDefaults, Train):
+    """Train the paper's agent with PPO on the nets."""
+
+
+@dataclass(kw_only=True)
+class PaperSweep(PaperDefaults, Sweep):
+    """Train and evaluate many seeds of the paper's agent; finished seeds are not run again."""
 
 
 @dataclass(kw_only=True)

@@ -84,7 +84,7 @@ NET_ARRAYS: dict[str, Field] = {
     "weight_5": Field("float", -LARGE, LARGE, ("n", 1)),
 }
 POLICY_HEADER: Fields = {
-    "contract": Field("object"),
+    "contract": {"paper": Field("truth value", required=False)},  # see `policy.contract`
     "training": Field("object"),
     "valves": Field("text", required=False, among=("closed", "open")),
 }

@@ -32,14 +32,13 @@ from brokk_min.identification.files import (
     write_csv,
 )
 from brokk_min.identification.net_file import fingerprint
-from brokk_min.learning.episodes import paper_weights
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import Policy, contract, save_policy
 from brokk_min.learning.simulation_gradient import gradient_advantages
 from brokk_min.machine import Machine
 from brokk_min.ppo import Agent, Learner, PPOConfig, Rollout
 
-FORMAT = 4  # of checkpoints
+FORMAT = 5  # of checkpoints
 LEARNER = ("obs", "learning_rate", "global_step", "updates")  # attributes in checkpoints
 STATE = [field.name for field in fields(State) if field.name != "plant"]
 
@@ -52,7 +51,7 @@ def describe_training(
     if settings["critic"]:
         settings["log_std_end"] = None
     return {
-        **contract(machine),
+        **contract(machine, task.paper),
         "actuator": fingerprint(net),
         "seed": seed,
         "task": asdict(task),
@@ -110,15 +109,15 @@ def stagger_episodes(env: TaskVectorEnv) -> None:
 def export_policy(
     machine: Machine, net: ActuatorNet, agent: Agent, task: TaskConfig, about: dict[str, Any]
 ) -> Policy:
-    """The actor as it stands; what the paper's agent does not observe has zero weights."""
+    """The actor as it stands."""
     weights = []
     for layer in agent.actor:
         if isinstance(layer, nn.Linear):
             weights += [layer.weight.T.detach().numpy().copy(), layer.bias.detach().numpy().copy()]
-    if task.paper:
-        weights[0] = weights[0] * paper_weights(machine)[:, None]
-    scale = observation_scale(machine)
-    return Policy(contract(machine), about, *scale, tuple(weights), net, task.valves)
+    about_task = contract(machine, task.paper)
+    scale = observation_scale(machine, task.paper)
+    valves = "open" if task.paper else task.valves
+    return Policy(about_task, about, *scale, tuple(weights), net, valves)
 
 
 class TrainingLog:

@@ -37,6 +37,11 @@ class Policy:
     net: ActuatorNet  # the simulation it was trained in, kept with it
     valves: str = "closed"  # or "open", while the tool rests; see `actuator.close_valves`
 
+    @property
+    def paper(self) -> bool:
+        """Does it take the observation and the actions of the paper's agent?"""
+        return bool(self.contract.get("paper", False))
+
     def act(self, observation: Array) -> Array:
         """Actions (..., n_driven), not clipped, for observations (..., obs) of `env.features`.
 
@@ -73,13 +78,16 @@ class PolicyController:
         self, measured: Measured, ticks: NDArray[np.int64]
     ) -> tuple[Array, NDArray[np.int64]]:
         """Commands u (num, n), and the ticks of `start` one tick on."""
-        u = action_to_pwm(self.machine, self.policy.act(features(self.machine, measured)))
-        return close_valves(self.machine, self.policy.valves, u, measured.v_goal, ticks)
+        machine, paper = self.machine, self.policy.paper
+        action = self.policy.act(features(machine, measured, paper))
+        u = action_to_pwm(machine, action, paper)
+        return close_valves(machine, self.policy.valves, u, measured.v_goal, ticks)
 
 
-def contract(machine: Machine) -> dict[str, Any]:
+def contract(machine: Machine, paper: bool = False) -> dict[str, Any]:
     """What training and deployment must agree on; kept in the file and checked by `load_policy`."""
     return {
+        "paper": paper,
         "machine": machine.name,
         "joints": list(machine.names),
         "driven": [machine.names[i] for i in machine.driven],
@@ -117,18 +125,19 @@ def load_policy(path: Path, machine: Machine) -> Policy:
     arrays = load_arrays(path, largest=LARGEST_NET)
     header = load_header(path, arrays, "policy", FORMAT)
     check_fields(path, header, POLICY_HEADER, {})
-    expect_same(path, header["contract"], contract(machine))
-    scales = dict(zip(("mean", "scale"), observation_scale(machine), strict=True))
-    check_fields(
-        path, arrays, POLICY_ARRAYS, {"obs": len(scales["mean"]), "driven": len(machine.driven)}
-    )
+    recorded = {"paper": False, **header["contract"]}
+    paper = recorded["paper"]
+    expect_same(path, recorded, contract(machine, paper))
+    scales = dict(zip(("mean", "scale"), observation_scale(machine, paper), strict=True))
+    sizes = {"obs": len(scales["mean"]), "driven": len(machine.driven)}
+    check_fields(path, arrays, POLICY_ARRAYS, sizes)
     for name, value in scales.items():
         if not np.array_equal(arrays[name], value):
             raise ValueError(f"{path}: {name}: expected the machine's normalisation, got another")
     net = {name[4:]: array for name, array in arrays.items() if name.startswith("net_")}
     with located(path):
         return Policy(
-            contract=header["contract"],
+            contract=recorded,
             training=header["training"],
             mean=arrays["mean"],
             scale=arrays["scale"],

@@ -12,7 +12,7 @@ from helpers_machines import POSE, small_net
 
 from brokk_min.env import TaskConfig, action_to_pwm, features, initial_state, measure
 from brokk_min.learning.checkpoint import export_policy
-from brokk_min.learning.policy import Policy, PolicyController, load_policy, save_policy
+from brokk_min.learning.policy import Policy, PolicyController, contract, load_policy, save_policy
 from brokk_min.machine import BROKK_170
 from brokk_min.ppo import Agent
 
@@ -134,6 +134,19 @@ def test_controller__closes_valves_half_a_second_after_the_goal_became_zero(poli
     assert second[10:].any() == (valves == "open")
 
 
+def test_controller__of_the_papers_agent_takes_its_observation_and_sends_plain_actions():
+    agent = Agent(163, 4, -1.0, critic=True)
+    agent.actor[-1].weight.data *= 100
+    paper = export_policy(BROKK_170, NET, agent, TaskConfig(paper=True), {})
+    controller = PolicyController(BROKK_170, paper)
+    v_goal = np.random.default_rng(1).normal(0, 0.2, (5, 3))
+    v_goal[0] = 0
+    u, _ = controller(measured(v_goal), controller.start(5) + 1000)
+    action = paper.act(features(BROKK_170, measured(v_goal), paper=True))
+    assert np.array_equal(u, action_to_pwm(BROKK_170, action, paper=True))
+    assert np.abs(u[0]).max() > 0.1  # valves stay as the policy has them
+
+
 # --- the file -------------------------------------------------------------------------------------
 
 
@@ -196,6 +209,14 @@ def test_load_policy__refuses_one_for_something_else(saved, machine, message):
         ),
         ({"header": {"contract": {}}}, "machine: expected 'brokk170', got None"),
         ({"header": {"training": None}}, "training: expected object, got none"),
+        (
+            {"header": {"contract": {**contract(BROKK_170), "paper": True}}},
+            "mean: expected finite float in .*, got float32, shape",
+        ),
+        (
+            {"header": {"contract": {**contract(BROKK_170), "paper": 1}}},
+            "contract.paper: expected truth value, got 1",
+        ),
     ],
 )
 def test_load_policy__refuses_a_changed_file(saved, changes, message):
