@@ -201,9 +201,9 @@ def test_train_policy__resumes_to_the_same_bytes(tmp_path, monkeypatch, straight
     [
         ({"seed": 6}, r"seed: expected 6, got 5"),
         ({"machine": replace(BROKK_170, dead_zone=0.05)}, r"dead_zone: expected 0\.05, got 0\.07"),
-        ({"config": replace(TINY, gamma=0.5)}, r"settings: expected .*'gamma': 0\.5.*got .*gamma"),
-        ({"task": TaskConfig(episode_s=0.7)}, r"task: expected .*0\.7.*, got .*0\.6"),
-        ({"critic": True}, r"settings: expected .*'critic': True.*got .*'critic': False"),
+        ({"config": replace(TINY, gamma=0.5)}, r"settings\.gamma: expected 0\.5, got 0\.95"),
+        ({"task": TaskConfig(episode_s=0.7)}, r"task\.episode_s: expected 0\.7, got 0\.6"),
+        ({"critic": True}, r"settings\.log_std_end: expected None, got -4\.5"),
         (
             {"net": replace(NET, output_high=2 * NET.output_high)},
             r"actuator: expected '\w+', got '\w+'",
@@ -232,8 +232,8 @@ def test_train_policy__refuses_a_truncated_checkpoint(broken, fraction):
     ("name", "value", "message"),
     [
         ("header", '{"format": 0, "identity": {}}', "format: expected 5, got 0"),
-        ("generator", None, "expected a complete checkpoint, got TypeError"),
-        ("random", {}, "expected a complete checkpoint, got"),
+        ("generator", None, "content.generator: expected Tensor, got NoneType"),
+        ("random", {}, "content.random: expected "),
     ],
 )
 def test_train_policy__refuses_a_checkpoint_with_other_content(broken, name, value, message):
