@@ -10,6 +10,7 @@ from brokk_min import __version__
 from brokk_min.cli import commands, operating
 from brokk_min.cli.options import WrongUse
 
+LONGEST = 300  # characters of an error
 COMMANDS: dict[str, Callable[..., Any]] = {
     "collect": commands.Collect,
     "fit": commands.Fit,
@@ -26,6 +27,12 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "play": operating.Play,
     "replay": operating.Replay,
 }
+
+
+def one_line(text: str) -> str:
+    """Text without line ends and control characters, of at most 300 characters."""
+    text = "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 105]} ... {text[-100:]}"
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -45,10 +52,10 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         command()
     except WrongUse as error:
-        print(f"brokk-min: {error}", file=sys.stderr)
+        print(one_line(f"brokk-min: {error}"), file=sys.stderr)
         return 2
-    except (ValueError, OSError) as error:
-        print(f"brokk-min: {error}", file=sys.stderr)
+    except (ValueError, OSError, MemoryError) as error:
+        print(one_line(f"brokk-min: {error or 'out of memory'}"), file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("brokk-min: stopped", file=sys.stderr)

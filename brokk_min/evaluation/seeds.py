@@ -1,6 +1,5 @@
 """Training seeds on the machine: what `brokk-min sweep` runs, writes and prints."""
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -15,7 +14,8 @@ from brokk_min.evaluation import metrics
 from brokk_min.evaluation.baselines import gains_metadata, read_gains
 from brokk_min.evaluation.metrics import Controllers, Rows, by_start, mean_interval
 from brokk_min.evaluation.sequences import AXES, evaluation_starts, task_sequences
-from brokk_min.identification.files import expected, write_json
+from brokk_min.identification.files import brief, read_json, write_json
+from brokk_min.identification.formats import SWEEP, check_fields
 from brokk_min.learning.policy import Policy, PolicyController
 from brokk_min.learning.sweep import run_seed, run_seeds
 from brokk_min.machine import Array, Machine
@@ -107,11 +107,12 @@ def table(seeds: Sequence[Rows], baselines: Rows) -> Table:
 
 def read_seeds(path: Path) -> dict[str, Any]:
     """The `sweep.json` of a sweep; its "table" is that of `table`. ValueError: another file."""
-    with expected(path, "the sweep.json of a sweep"):
-        content: dict[str, Any] = json.loads(path.read_text())
-        if not {"mean", "low", "high"} <= set(content["table"]["rl"]["velocity_error_all"]):
-            raise ValueError(f"{content['table']['rl']}")
-        dict(content["meta"])
+    content: dict[str, Any] = read_json(path, "the sweep.json of a sweep")
+    check_fields(path, content, SWEEP, {})
+    for name, row in content["table"].items():
+        if row.keys() != content["table"]["rl"].keys():
+            wanted = brief(list(content["table"]["rl"]))
+            raise ValueError(f"{path}: table.{name}: expected {wanted}, got {brief(list(row))}")
     return content
 
 

@@ -13,12 +13,13 @@ from brokk_min.actuator import ActuatorNet, close_valves, select_nets
 from brokk_min.env import Measured, action_to_pwm, features, observation_scale
 from brokk_min.identification.files import (
     expect_same,
-    expected,
     load_arrays,
     load_header,
+    located,
     whole_file,
 )
-from brokk_min.identification.net_file import net_arrays, net_from_arrays
+from brokk_min.identification.formats import POLICY_ARRAYS, POLICY_HEADER, check_fields
+from brokk_min.identification.net_file import LARGEST_NET, net_arrays, net_from_arrays
 from brokk_min.machine import Array, Machine
 
 FORMAT = 3  # of policy files
@@ -121,26 +122,26 @@ def load_policy(path: Path, machine: Machine) -> Policy:
     ValueError: not a policy file, or one for another machine, joint order, history, rate or scale,
     with what was expected and what was found.
     """
-    arrays = load_arrays(path)
+    arrays = load_arrays(path, largest=LARGEST_NET)
     header = load_header(path, arrays, "policy", FORMAT)
-    recorded = {"paper": False, **(header.get("contract") or {})}
-    paper = bool(recorded["paper"])
+    check_fields(path, header, POLICY_HEADER, {})
+    recorded = {"paper": False, **header["contract"]}
+    paper = recorded["paper"]
     expect_same(path, recorded, contract(machine, paper))
-    with expected(path, "a complete policy"):
-        net = {name[4:]: array for name, array in arrays.items() if name.startswith("net_")}
-        policy = Policy(
+    scales = dict(zip(("mean", "scale"), observation_scale(machine, paper), strict=True))
+    sizes = {"obs": len(scales["mean"]), "driven": len(machine.driven)}
+    check_fields(path, arrays, POLICY_ARRAYS, sizes)
+    for name, value in scales.items():
+        if not np.array_equal(arrays[name], value):
+            raise ValueError(f"{path}: {name}: expected the machine's normalisation, got another")
+    net = {name[4:]: array for name, array in arrays.items() if name.startswith("net_")}
+    with located(path):
+        return Policy(
             contract=recorded,
             training=header["training"],
             mean=arrays["mean"],
             scale=arrays["scale"],
             weights=tuple(arrays[f"weight_{i}"] for i in range(8)),
-            net=select_nets(machine, net_from_arrays(path, net)),
+            net=select_nets(machine, net_from_arrays(path, net, "net_")),
             valves=header.get("valves", "closed"),
         )
-        action = policy.act(policy.mean)
-    if action.shape != machine.driven.shape or not np.isfinite(action).all():
-        raise ValueError(f"{path}: weights: expected {len(machine.driven)} actions, got {action}")
-    for name, value in zip(("mean", "scale"), observation_scale(machine, paper), strict=True):
-        if not np.array_equal(arrays[name], value):
-            raise ValueError(f"{path}: {name}: expected the machine's normalisation, got another")
-    return policy

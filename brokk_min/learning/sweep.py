@@ -4,7 +4,6 @@ Each seed writes `seed_<n>.npz`, its learning curve and, last, `seed_<n>.json`; 
 computed again. On a cluster all workers must have the folder, and run one seed at a time.
 """
 
-import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -14,7 +13,7 @@ from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import TaskConfig
-from brokk_min.identification.files import expect_same, expected, require, write_json
+from brokk_min.identification.files import expect_same, expected, read_json, require, write_json
 from brokk_min.learning.checkpoint import describe_training, train_policy
 from brokk_min.learning.policy import Policy, load_policy
 from brokk_min.machine import Machine
@@ -46,7 +45,7 @@ def run_seed(
     identity = describe_training(machine, net, task, config, critic, seed)
     if result_file.exists():
         with expected(result_file, "the result of a seed"):
-            result: dict[str, Any] = json.loads(result_file.read_text())
+            result: dict[str, Any] = read_json(result_file, "the result of a seed")
             rows: Rows = result["runs"]
             recorded = result["identity"]
         expect_same(result_file, recorded, {**identity, **about})

@@ -99,10 +99,10 @@ def test_fit__writes_nothing_for_a_bad_log(tmp_path, capsys):
     foreign_log(path, 0, 1)
     lines = path.read_text().splitlines()
     lines[16] = lines[16].replace("take 0,", "take 0,x", 1)
-    path.write_text("\n".join(lines))
+    path.write_text("\n".join([*lines, ""]))
     files = ["--out", tmp_path / "n.npz", "--json", tmp_path / "f.json"]
     assert run("fit", path, *files) == 1
-    assert "row 17, column time: expected a number" in capsys.readouterr().err
+    assert "row 17, column time: expected finite number" in capsys.readouterr().err
     assert [p.name for p in tmp_path.iterdir()] == ["log.csv"]
 
 
@@ -146,14 +146,17 @@ def test_fit__takes_rate_and_velocity_window_of_the_machine(tmp_path):
 def test_fit__refuses_the_log_of_another_machine(tmp_path, capsys):
     write_log(tmp_path / "log.csv", steady_log(("a", "b"), 2))
     assert run(f"fit '{tmp_path}/log.csv' --machine brokk170 --out '{tmp_path}/n.npz'") == 1
-    assert "LOGS: expected joints of --machine brokk170, got ['a', 'b']" in capsys.readouterr().err
+    assert (
+        "log.csv: joints: expected those of --machine brokk170, got ('a', 'b')"
+        in capsys.readouterr().err
+    )
 
 
 def test_split__holds_out_every_tenth_recording():
     kept, held_out = split(steady_log(("a",), 21))
     assert [recording.name for recording in held_out.recordings] == ["0", "10", "20"]
     assert len(kept.recordings) == 18
-    with pytest.raises(ValueError, match=r"^LOGS: expected two or more recordings, or --test"):
+    with pytest.raises(ValueError, match=r"^recordings: expected two or more, or --test"):
         split(steady_log(("a",), 1))
 
 

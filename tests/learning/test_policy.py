@@ -184,8 +184,8 @@ def reordered():
         (replace(BROKK_170, rate=40.0), r"rate: expected 40.0, got 20.0"),
         (replace(BROKK_170, velocity_samples=3), r"velocity_samples: expected 3, got 4"),
         (replace(BROKK_170, pwm_limit=60), r"pwm_limit: expected 60, got 80"),
-        (change_joint(2, q_max=1.5), r"geometry: expected .*1\.5.*got .*1\.6"),
-        (change_joint(2, a=1.5), r"geometry: expected .*1\.5.*got .*1\.25"),
+        (change_joint(2, q_max=1.5), r"geometry\[2\]\[5\]: expected 1\.5, got 1\.6"),
+        (change_joint(2, a=1.5), r"geometry\[2\]\[0\]: expected 1\.5, got 1\.25"),
         (change_joint(2, q_dot_down=0.5), r"scale: expected the machine's normalisation, got"),
         (replace(BROKK_170, tool_speed=0.4), r"scale: expected the machine's normalisation, got"),
     ],
@@ -200,22 +200,23 @@ def test_load_policy__refuses_one_for_something_else(saved, machine, message):
     ("changes", "message"),
     [
         ({"mean": np.zeros(171)}, "mean: expected the machine's normalisation, got another"),
-        ({"drop": ("weight_7",)}, "expected a complete policy, .*weight_7"),
-        ({"drop": ("scale",)}, "expected a complete policy, .*scale"),
-        ({"weight_2": np.zeros((256, 127))}, "expected a complete policy, got"),
-        ({"weight_6": np.zeros((64, 3)), "weight_7": np.zeros(3)}, "weights: expected 4 actions, "),
-        ({"weight_7": np.full(4, np.nan)}, r"weights: expected 4 actions, got \[nan"),
+        ({"weight_7": np.zeros(3)}, r"weight_7: expected .*\(4,\), got float64, shape \(3,\)"),
+        ({"weight_7": np.ones(4) * 1j}, "weight_7: expected finite float .*, got complex128"),
         ({"header": {"format": 99}}, r"expected \(policy, format 3\), got .*99"),
         (
             {"header": {"kind": "actuator net"}},
             r"expected \(policy, format 3\), got .*actuator net",
         ),
-        ({"header": {"contract": None}}, "machine: expected 'brokk170', got None"),
+        ({"header": {"contract": {}}}, "machine: expected 'brokk170', got None"),
+        ({"header": {"training": None}}, "training: expected object, got none"),
         (
             {"header": {"contract": {**contract(BROKK_170), "paper": True}}},
-            "mean: expected the machine's normalisation, got another",
+            "mean: expected finite float in .*, got float32, shape",
         ),
-        ({"header": {"training": None}}, "expected a complete policy, got KeyError"),
+        (
+            {"header": {"contract": {**contract(BROKK_170), "paper": 1}}},
+            "contract.paper: expected truth value, got 1",
+        ),
     ],
 )
 def test_load_policy__refuses_a_changed_file(saved, changes, message):

@@ -97,7 +97,7 @@ def test_run_seed__trains_again_over_another_training_and_resumes_its_own(tmp_pa
 def test_run_seed__refuses_results_of_something_else(tmp_path):
     seed_job(tmp_path)(4)
     other = PPOConfig(num_envs=4, horizon=8, total_steps=32)
-    with pytest.raises(ValueError, match=r"seed_4\.json: settings: expected \{"):
+    with pytest.raises(ValueError, match=r"seed_4\.json: settings.horizon: expected 8, got 4"):
         seed_job(tmp_path, config=other)(4)
     (tmp_path / "seed_4.json").write_text("{")
     with pytest.raises(ValueError, match=r"seed_4\.json: expected the result of a seed, got JSOND"):
