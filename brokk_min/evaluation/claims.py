@@ -138,13 +138,14 @@ def training_claim(seconds: float, steps: int) -> Claim:
 
 def task_claims(
     machine: Machine,
+    policy: str,
     pids: Mapping[str, JacobianController],
     runs: Sequence[Run],
     along_x: Mapping[str, Trace],
     goals: Array,
     singular: Sequence[Claim],
 ) -> list[Claim]:
-    """The claims on task-space control; those on baselines also of a stronger one.
+    """The claims on task-space control, of a policy; those on baselines also of a stronger one.
 
     `runs` are those that count, `along_x` their traces along x by controller with these `goals`
     [m/s] (T, num, 3), `singular` is of `singular_claims`. Paper: Sec. 4.2, Fig. 6
@@ -158,28 +159,28 @@ def task_claims(
 
     along_z = ["velocity_error_mean", "off_axis_drift_max"]
     return [
-        still_claim(runs),
-        of_baselines(lambda names: drift_claim(runs, names)),
+        still_claim(runs, policy),
+        of_baselines(lambda names: drift_claim(runs, policy, names)),
         of_baselines(direction),
         *singular,
-        of_baselines(lambda names: less_claim("tracking", runs, names, "xyz")),
-        of_baselines(lambda names: less_claim("along z", runs, names, "z", along_z)),
-        of_baselines(lambda names: less_claim("outperforms", runs, names, ["all"])),
+        of_baselines(lambda names: less_claim("tracking", runs, policy, names, "xyz")),
+        of_baselines(lambda names: less_claim("along z", runs, policy, names, "z", along_z)),
+        of_baselines(lambda names: less_claim("outperforms", runs, policy, names, ["all"])),
     ]
 
 
-def still_claim(runs: Sequence[Run]) -> Claim:
+def still_claim(runs: Sequence[Run], policy: str) -> Claim:
     """Do y and z stay still while the policy moves the tool along x? Paper: Fig. 6b"""
-    drift = mean_interval(by_start(runs, "rl", "x", "off_axis_drift_max"))
-    return Claim("still", {"rl": drift}, _below(_limit("still"), drift))
+    drift = mean_interval(by_start(runs, policy, "x", "off_axis_drift_max"))
+    return Claim("still", {policy: drift}, _below(_limit("still"), drift))
 
 
-def drift_claim(runs: Sequence[Run], baselines: Sequence[str]) -> Claim:
+def drift_claim(runs: Sequence[Run], policy: str, baselines: Sequence[str]) -> Claim:
     """Do y and z move while baselines move the tool along x? Paper: Fig. 6b"""
-    rl = by_start(runs, "rl", "x", "off_axis_drift_max")
+    own = by_start(runs, policy, "x", "off_axis_drift_max")
     drift = {c: by_start(runs, c, "x", "off_axis_drift_max") for c in baselines}
     means = {c: mean_interval(values) for c, values in drift.items()}
-    more = {f"{c} less rl": mean_interval(values - rl) for c, values in drift.items()}
+    more = {f"{c} less {policy}": mean_interval(values - own) for c, values in drift.items()}
     holds = _both(_above(_limit("drift"), *means.values()), _above(0.0, *more.values()))
     return Claim("drift", means | more, holds)
 
@@ -226,6 +227,7 @@ def _differ(up: Array, down: Array) -> bool | None:
 def less_claim(
     name: str,
     runs: Sequence[Run],
+    policy: str,
     baselines: Sequence[str],
     sequences: Sequence[str],
     keys: Sequence[str] = ("velocity_error_mean",),
@@ -235,18 +237,18 @@ def less_claim(
     numbers = {}
     for key in keys:
         for s in sequences:
-            rl = by_start(runs, "rl", s, key)
+            own = by_start(runs, policy, s, key)
             for c in baselines:
-                less = mean_interval(rl - by_start(runs, c, s, key))
+                less = mean_interval(own - by_start(runs, c, s, key))
                 numbers[f"{labels[key]} {s}, less {c}"] = less
     return Claim(name, numbers, _below(0.0, *numbers.values()))
 
 
 def singular_controllers(
-    rl: Controller, pids: Mapping[str, JacobianController]
+    policies: Mapping[str, Controller], pids: Mapping[str, JacobianController]
 ) -> dict[str, Controller]:
-    """RL, and one baseline with strong and with weak damping and the same gains."""
-    return {"rl": rl, STRONG: pids[STRONG], WEAK: replace(pids[STRONG], k=0.05)}
+    """Policies, and one baseline with strong and with weak damping and the same gains."""
+    return {**policies, STRONG: pids[STRONG], WEAK: replace(pids[STRONG], k=0.05)}
 
 
 def speed_fraction(machine: Machine, w0: float, trace: Trace, goals: Array) -> Array:
@@ -262,7 +264,7 @@ def speed_fraction(machine: Machine, w0: float, trace: Trace, goals: Array) -> A
     return np.where(near.any(axis=0), along / np.maximum(square, 1e-12), np.nan)
 
 
-def singular_claims(runs: Sequence[Run], speed: Mapping[str, Array]) -> list[Claim]:
+def singular_claims(policy: str, runs: Sequence[Run], speed: Mapping[str, Array]) -> list[Claim]:
     """Does damping slow the tool near singularities, and does little damping jerk?
 
     `runs` are of `singular_controllers`, `speed` is their `speed_fraction` (starts,).
@@ -271,14 +273,14 @@ def singular_claims(runs: Sequence[Run], speed: Mapping[str, Array]) -> list[Cla
     jerk = {name: by_start(runs, name, "all", "jerk_rms") for name in speed}
     slower = mean_interval(speed[STRONG] - speed[WEAK])
     jerkier = mean_interval(jerk[WEAK] - jerk[STRONG])
-    faster = mean_interval(speed["rl"] - speed[WEAK])
-    smoother = mean_interval(jerk["rl"] - jerk[STRONG])
+    faster = mean_interval(speed[policy] - speed[WEAK])
+    smoother = mean_interval(jerk[policy] - jerk[STRONG])
     speeds = {"k 0.1": mean_interval(speed[STRONG]), "k 0.05": mean_interval(speed[WEAK])}
     jerks = {"k 0.1": mean_interval(jerk[STRONG]), "k 0.05": mean_interval(jerk[WEAK])}
-    rl = {"rl speed": mean_interval(speed["rl"]), "speed less k 0.05": faster}
-    rl |= {"rl jerk": mean_interval(jerk["rl"]), "jerk less k 0.1": smoother}
+    own = {f"{policy} speed": mean_interval(speed[policy]), "speed less k 0.05": faster}
+    own |= {f"{policy} jerk": mean_interval(jerk[policy]), "jerk less k 0.1": smoother}
     return [
         Claim("slowed", speeds | {"k 0.1 less k 0.05": slower}, _below(0.0, slower)),
         Claim("jerky", jerks | {"k 0.05 less k 0.1": jerkier}, _above(0.0, jerkier)),
-        Claim("neither", rl, _both(_above(0.0, faster), _below(0.0, smoother))),
+        Claim("neither", own, _both(_above(0.0, faster), _below(0.0, smoother))),
     ]

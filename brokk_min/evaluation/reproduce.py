@@ -1,7 +1,11 @@
 """The whole chain: logs, nets, policy, baselines, comparison, report."""
 
+import multiprocessing
+import os
+import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -9,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet, select_nets
@@ -29,11 +34,14 @@ from brokk_min.identification.net_file import save_net
 from brokk_min.jacobian import JacobianController, manipulability, manipulability_threshold
 from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.learning.checkpoint import train_policy
+from brokk_min.learning.episodes import PAPER_LEARNER, PAPER_TASK
 from brokk_min.learning.policy import Policy, PolicyController, save_policy
 from brokk_min.machine import Array, Machine
 from brokk_min.ppo import PPOConfig
 
 Pids = Mapping[str, JacobianController]  # baselines by name
+# Files of the policies: ours with valves closed or open while the tool rests, and the paper's.
+POLICIES = {"rl": "policy.npz", "rl_open": "policy_open.npz", "rl_paper": "policy_paper.npz"}
 
 
 @dataclass(frozen=True)
@@ -47,7 +55,7 @@ class Budget:
     tuning_runs: int = baselines.TUNING_RUNS
     starts: int = 64
     bound_starts: int = 16  # of them, for the regret
-    short_s: float = 18.0  # s of each sequence for regret, robustness and singularities
+    short_s: float = 26.0  # s of each sequence for regret, robustness and singularities
 
 
 QUICK = Budget(0.1, 700, 200_000, 4, 4, 8, 2, 3.0)
@@ -63,26 +71,35 @@ def reproduce(
     """
     seeds = read_seeds(sweep) if sweep else {}
     clock: dict[str, float] = {}
-    with tqdm(total=6, desc="stages done", unit="stage", position=1, disable=None) as bar:
+    with tqdm(total=5, desc="stages done", unit="stage", position=1, disable=None) as bar:
         stage = partial(_stage, clock, bar)
         with stage("record"):
-            log, test = record(machine, out, budget, seed)
+            log, paper_log, test = record(machine, out, budget, seed)
         with stage("fit"):
-            net, recipe = fit_nets(machine, out, log, test, budget, seed)
+            ours = partial(fit_net, machine, out / "net.npz", log, budget, {}, seed)
+            recipe = fitting.PAPER_RECIPE
+            theirs = partial(
+                fit_net, machine, out / "net_paper.npz", paper_log, budget, recipe, seed
+            )
+            net, paper_net = side_by_side({"fit net": ours, "fit net_paper": theirs}, clock)
             driven = select_nets(machine, net)
             training_seeds = seeds_of(machine, driven, seeds) if seeds else {}
-        with stage("train"):
-            learner = PPOConfig(total_steps=budget.train_steps)
-            file = out / "policy.npz"
-            policy = train_policy(machine, driven, TaskConfig(), learner, seed, file, resume=True)
-        with stage("tune"):
-            runs, generations = budget.tuning_runs, budget.generations
-            pids, tuning = baselines.tune_baselines(machine, driven, runs, generations, seed)
+        with stage("train and tune"):
+            nets = {"rl": driven, "rl_open": driven, "rl_paper": select_nets(machine, paper_net)}
+            jobs: dict[str, Any] = {
+                f"train {name}": partial(train, machine, out, name, nets[name], budget, seed)
+                for name in POLICIES
+            }
+            settings = budget.tuning_runs, budget.generations, seed
+            jobs["tune"] = partial(baselines.tune_baselines, machine, driven, *settings)
+            *trained, (pids, tuning) = side_by_side(jobs, clock)
+            policies = dict(zip(POLICIES, trained, strict=True))
         with stage("evaluate"):
-            results, shown = measure(machine, net, test, policy, pids, budget, seed)
+            results, shown = measure(machine, net, test, policies, pids, budget, seed)
+            results["paper_recipe"] = net_errors(machine, paper_net, test, seed)
         with stage("draw"):
-            results |= {"paper_recipe": recipe, "tuning": tuning, "training_seeds": training_seeds}
-            write(out, results, policy, pids)
+            results |= {"tuning": tuning, "training_seeds": training_seeds}
+            write(out, results, policies, pids)
             report.write_report(machine, out, results, shown, clock)
     write_json(out / "timing.json", clock)
     return results
@@ -98,38 +115,79 @@ def _stage(clock: dict[str, float], bar: Any, name: str) -> Iterator[None]:
     bar.update()
 
 
+def side_by_side(calls: Mapping[str, Callable[[], Any]], clock: dict[str, float]) -> list[Any]:
+    """Results of independent calls, each in a process of one thread, as many at once as cores.
+
+    `clock` gets the seconds of each. The first exception is raised.
+    """
+    cores = len(os.sched_getaffinity(0))
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(cores, len(calls)), context, _one_thread) as pool:
+        done = list(pool.map(_timed, calls.values()))
+    clock |= {name: seconds for name, (seconds, _) in zip(calls, done, strict=True)}
+    return [result for _, result in done]
+
+
+def _one_thread() -> None:
+    torch.set_num_threads(1)
+    sys.stderr = open(os.devnull, "w")  # noqa: SIM115  # bars of several processes would mix
+
+
+def _timed(call: Callable[[], Any]) -> tuple[float, Any]:
+    start = time.perf_counter()
+    result = call()
+    return time.perf_counter() - start, result
+
+
 def record(machine: Machine, out: Path, budget: Budget, seed: int) -> list[Log]:
-    """Logs to fit nets to and to score them on, written and read back as a user's."""
+    """Logs to fit nets to, rich ones and the paper's sines, and to score them on.
+
+    They are written and read back as a user's.
+    """
     out.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng
-    logs.write_log(out / "log.npz", collect(machine, budget.hours, "rich", rng(seed)))
-    logs.write_log(out / "log_test.npz", task_log(machine, 20, 40.0, rng(seed + 1)))
-    files = [out / "log.npz", out / "log_test.npz"]
-    return [logs.read_log([file], machine.velocity_samples, rate=machine.rate) for file in files]
+    recorded = {
+        "log": collect(machine, budget.hours, "rich", rng(seed)),
+        "log_paper": collect(machine, budget.hours, "sine", rng(seed)),
+        "log_test": task_log(machine, 20, 40.0, rng(seed + 1)),
+    }
+    read = []
+    for name, log in recorded.items():
+        file = out / f"{name}.npz"
+        logs.write_log(file, log)
+        read.append(logs.read_log([file], machine.velocity_samples, rate=machine.rate))
+    return read
 
 
-def fit_nets(
-    machine: Machine, out: Path, log: Log, test: Log, budget: Budget, seed: int
-) -> tuple[ActuatorNet, dict[str, Any]]:
-    """Nets of all joints, and the errors of nets by the paper's recipe, for JSON."""
+def fit_net(
+    machine: Machine, file: Path, log: Log, budget: Budget, recipe: Mapping[str, Any], seed: int
+) -> ActuatorNet:
+    """Nets of all joints by our settings but for those of `recipe`, written to `file`."""
     config = FitConfig(budget.fit_steps, history=machine.history, dead_zone=machine.dead_zone)
+    config = replace(config, **recipe)
     net = fitting.fit(log, config, seed, machine.velocity_samples, machine.name)
-    save_net(out / "net.npz", net)
-    return net, paper_recipe(machine, test, budget.hours, config, seed)
+    save_net(file, net)
+    return net
 
 
-def paper_recipe(
-    machine: Machine, test: Log, hours: float, config: FitConfig, seed: int
-) -> dict[str, Any]:
-    """Scores and gap of nets by the paper's recipe: sines, errors of one step. Paper: Sec. 3.3"""
-    log = collect(machine, hours, "sine", np.random.default_rng(seed))
-    recordings = tuple(r for r in log.recordings if not r.name.endswith(logs.RETURN))
-    log = log._replace(recordings=recordings)
-    config = replace(config, **fitting.PAPER_RECIPE)
-    net = fitting.fit(log, config, seed, machine.velocity_samples, machine.name)
+def net_errors(machine: Machine, net: ActuatorNet, test: Log, seed: int) -> dict[str, Any]:
+    """Scores of nets on a log, and their distance from the machine in the paper's experiment."""
     both = preliminary.simulators(machine, net)
     gap = preliminary.gap_numbers(machine, preliminary.sim_to_real(machine, both, seed))
     return {"test": validation.score(net, test), "sim_to_real": gap}
+
+
+def train(
+    machine: Machine, out: Path, name: str, net: ActuatorNet, budget: Budget, seed: int
+) -> Policy:
+    """One of `POLICIES`: ours, ours with open valves, or the paper's, by its own settings."""
+    task, learner = TaskConfig(), PPOConfig(total_steps=budget.train_steps, threads=1)
+    if name == "rl_open":
+        task = TaskConfig(valves="open")
+    if name == "rl_paper":
+        task = TaskConfig(paper=True, **PAPER_TASK)
+        learner = replace(learner, **PAPER_LEARNER)
+    return train_policy(machine, net, task, learner, seed, out / POLICIES[name], resume=True)
 
 
 def driven_log(machine: Machine, traces: Traces, controller: str) -> Log:
@@ -146,21 +204,22 @@ def measure(
     machine: Machine,
     net: ActuatorNet,
     test: Log,
-    policy: Policy,
+    policies: Mapping[str, Policy],
     pids: Pids,
     budget: Budget,
     seed: int,
 ) -> tuple[dict[str, Any], report.Shown]:
-    """All measurements of nets, policy and baselines, for JSON and for the figures."""
-    rl = PolicyController(machine, policy)
-    compared, task, singular = compare(machine, rl, pids, budget, seed)
+    """All measurements of nets, policies and baselines, for JSON and for the figures."""
+    controllers = {name: PolicyController(machine, policy) for name, policy in policies.items()}
+    compared, task, singular = compare(machine, controllers, pids, budget, seed)
     starts = np.array(compared["starts"])[np.array(compared["start_kinds"]) == "workspace"]
     axes = sequences.axis_sequences(machine)
-    on_nets, _ = evaluate(machine, {"rl": rl}, axes, starts, seed, policy.net)
+    rl = {"rl": controllers["rl"]}
+    on_nets, _ = evaluate(machine, rl, axes, starts, seed, policies["rl"].net)
     compared["task_space"]["rl_on_nets"] = summary(on_nets)["rl"]
     measured = preliminary.run(machine, net, seed)
     numbers = preliminary.numbers(machine, measured)
-    meta = metrics.metadata(machine, seed) | baselines.gains_metadata(machine, policy.net)
+    meta = metrics.metadata(machine, seed) | baselines.gains_metadata(machine, policies["rl"].net)
     results = {
         "meta": meta | {"effort": asdict(budget)},
         "actuator": {
@@ -176,14 +235,14 @@ def measure(
 
 
 def compare(
-    machine: Machine, rl: Controller, pids: Pids, budget: Budget, seed: int
+    machine: Machine, policies: Mapping[str, Controller], pids: Pids, budget: Budget, seed: int
 ) -> tuple[dict[str, Any], Traces, Traces]:
     """The paper's experiment, regret and robustness: JSON, all traces, those near singularities.
 
     Means, intervals and verdicts are over the "workspace" starts, from which all sequences can be
     followed.
     """
-    controllers: Controllers = {"rl": rl, **pids}
+    controllers: Controllers = {**policies, **pids}
     commands = sequences.task_sequences(machine)
     starts = sequences.evaluation_starts(machine, budget.starts, commands, seed + 2)
     kinds = np.array(sequences.start_kinds(machine, starts))
@@ -193,18 +252,20 @@ def compare(
     scored = [run for run in runs if run["kind"] == "workspace"]
     extended = starts[kinds == "extended"]
     singular, near, near_traces = near_singularities(
-        machine, claims.singular_controllers(rl, pids), extended, budget.short_s, seed
+        machine, claims.singular_controllers(policies, pids), extended, budget.short_s, seed
     )
     along_x = {c: Trace(*(array[:, workspace] for array in traces[c, "x"])) for c in pids}
     goals = commands[0].for_starts(machine, reachable)
-    every = claims.task_claims(machine, pids, scored, along_x, goals, near)
+    claim = partial(claims.task_claims, machine)
+    theirs = claim("rl_paper", pids, scored, along_x, goals, near["rl_paper"])
+    ours = claim("rl", pids, scored, along_x, goals, near["rl"])
     short = shorten(machine, sequences.axis_sequences(machine), budget.short_s)
     results = {
         "task_space": tables(runs, scored),
         "regret": regret(machine, controllers, short, reachable[: budget.bound_starts], seed),
         "robustness": robustness(machine, controllers, short, reachable[:16], seed),
         "singular": singular,
-        "claims": [claim.to_json() for claim in every],
+        "claims": [a.to_json() | {"ours": b.to_json()} for a, b in zip(theirs, ours, strict=True)],
         "starts": starts.tolist(),
         "start_kinds": kinds.tolist(),
     }
@@ -249,14 +310,14 @@ def regret(
 
 def near_singularities(
     machine: Machine, controllers: Controllers, starts: Array, seconds: float, seed: int
-) -> tuple[dict[str, Any], list[claims.Claim], Traces]:
+) -> tuple[dict[str, Any], dict[str, list[claims.Claim]], Traces]:
     """Runs of `claims.singular_controllers` from extended starts: JSON, claims and traces.
 
     The JSON has the "manipulability" and the "least" singular value [m/rad] at each start. All are
     empty without starts. Paper: Fig. 6a, 6e, 6f
     """
     if not len(starts):
-        return {"summary": {}, "claims": []}, [], {}
+        return {"summary": {}, "claims": {}}, {"rl": [], "rl_paper": []}, {}
     commands = shorten(machine, sequences.singular_sequences(machine, starts), seconds)
     runs, traces = evaluate(machine, controllers, commands, starts, seed)
     w0 = manipulability_threshold(machine)
@@ -268,10 +329,10 @@ def near_singularities(
             for s in commands
         ]
         speed[name] = metrics.row_mean(np.stack(fractions, axis=1))
-    singular = claims.singular_claims(runs, speed)
+    singular = {name: claims.singular_claims(name, runs, speed) for name in ("rl", "rl_paper")}
     results = {
         "summary": summary(runs),
-        "claims": [claim.to_json() for claim in singular],
+        "claims": {name: [c.to_json() for c in every] for name, every in singular.items()},
         "w0": w0,
         "manipulability": manipulability(J).tolist(),
         "least": np.linalg.svd(J, compute_uv=False)[:, -1].tolist(),
@@ -289,12 +350,15 @@ def tuning_runs(machine: Machine, num: int, seed: int) -> list[dict[str, Any]]:
     return runs
 
 
-def write(out: Path, results: Mapping[str, Any], policy: Policy, pids: Pids) -> None:
-    """Write what other commands read: results, gains, the policy with its errors as metadata."""
+def write(
+    out: Path, results: Mapping[str, Any], policies: Mapping[str, Policy], pids: Pids
+) -> None:
+    """Write what other commands read: results, gains, policies with the errors as metadata."""
     write_json(out / "results.json", results)
     baselines.write_gains(out / "gains.json", pids, results["meta"])
     means = results["task_space"]["summary"]
     errors = {controller: rows["all"]["velocity_error_mean"] for controller, rows in means.items()}
     command = f"brokk-min reproduce --seed {results['meta']['seed']}"
     made = {"command": command, "velocity_error_mean": errors}
-    save_policy(out / "policy.npz", replace(policy, training={**policy.training, **made}))
+    for name, policy in policies.items():
+        save_policy(out / POLICIES[name], replace(policy, training={**policy.training, **made}))
