@@ -281,7 +281,7 @@ def d12() -> Figures:
     """A policy whose actions have no dead-zone compensation."""
     limit = M.pwm_limit / PWM_MAX
 
-    def action_to_pwm(m: machine.Machine, action: Array) -> Array:
+    def action_to_pwm(m: machine.Machine, action: Array, paper: bool = False) -> Array:
         u = np.zeros((*action.shape[:-1], m.n), action.dtype)
         u[..., m.driven] = limit * np.clip(action, -1, 1)
         return machine.limit_command(m, u)

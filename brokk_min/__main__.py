@@ -10,6 +10,7 @@ from brokk_min import __version__
 from brokk_min.cli import commands, operating
 from brokk_min.cli.options import WrongUse
 
+LONGEST = 300  # characters of an error
 COMMANDS: dict[str, Callable[..., Any]] = {
     "collect": commands.Collect,
     "fit": commands.Fit,
@@ -28,14 +29,21 @@ COMMANDS: dict[str, Callable[..., Any]] = {
 }
 
 
+def one_line(text: str) -> str:
+    """Text without line ends and control characters, of at most 300 characters."""
+    text = "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 105]} ... {text[-100:]}"
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; errors are one line on stderr."""
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments == ["--version"]:
         print(f"brokk_min {__version__}")
         return 0
+    paper = {"train": commands.PaperTrain, "sweep": commands.PaperSweep}
     command = tyro.extras.subcommand_cli_from_dict(
-        COMMANDS,
+        COMMANDS | paper if "--paper" in arguments else COMMANDS,
         prog="brokk-min",
         description=__doc__,
         args=arguments,
@@ -44,10 +52,10 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         command()
     except WrongUse as error:
-        print(f"brokk-min: {error}", file=sys.stderr)
+        print(one_line(f"brokk-min: {error}"), file=sys.stderr)
         return 2
-    except (ValueError, OSError) as error:
-        print(f"brokk-min: {error}", file=sys.stderr)
+    except (ValueError, OSError, MemoryError) as error:
+        print(one_line(f"brokk-min: {error or 'out of memory'}"), file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("brokk-min: stopped", file=sys.stderr)

@@ -2,7 +2,6 @@
 
 On the nets these functions are the simulation, on the plant the machine. `learning.episodes` draws
 starts and goals. The numbers below are of the Brokk 170: 4 driven joints, 1 locked joint, H = 13.
-
 Observation: Box, float32, (171,), (x - mean) / deviation * weight of these blocks:
 
 | Num     | Observation                                          | Deviation   | Weight | Noise |
@@ -15,13 +14,15 @@ Observation: Box, float32, (171,), (x - mean) / deviation * weight of these bloc
 | 163-166 | resolved velocities of the goal (`jacobian.dls`)     | uniform     | 4.2    | no    |
 | 167-170 | resolved velocities of the error integral            | 0.1 uniform | 4.2    | no    |
 
-"Uniform": over the range of the joint or its velocity. The newest sample is the last. The heading
-frame has x outward from the slew axis to the tool.
+"Uniform": over its range. The newest sample is last. Heading frame: x from slew axis to tool.
 
 Action: Box(-1, 1, (4,)), of the largest command of each driven joint, see `action_to_pwm`.
 Reward: 1 / (1 + |v_goal - v_tool|) (eq2), minus costs of valve travel and of the error integral.
 Start: at rest in a random pose above the ground, with a random goal that changes now and then.
 End: terminated, without reward, with a link in the ground; truncated after 20 s.
+
+The paper's agent (`TaskConfig.paper`) observes 0-162 in the base frame, with weights 1. Its actions
+are linear, its reward is eq2 alone. Only a start in the ground terminates. No rule closes valves.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ class TaskConfig:
     integral_cost: float = machine.number("1/m", 0, 1000, 1.0)  # Of the error integral (paper: 0).
     valves: Literal["closed", "open"] = "closed"  # While the tool rests, see `close_valves`.
     redraw_ground: bool = True  # Redraw start poses in the ground; the paper ends the episode.
-    paper: bool = False  # Observation, reward and critic as the paper has them.
+    paper: bool = False  # The paper's agent: observation, action, reward, start and end, see above.
     __post_init__ = machine.check_numbers  # type: ignore[misc]
 
 
@@ -89,8 +90,8 @@ class Block(NamedTuple):
 
 
 @lru_cache
-def observation_blocks(machine: Machine) -> tuple[Block, ...]:
-    """The observation in its order. Paper: Sec. 3.4 (normalisation)
+def observation_blocks(machine: Machine, paper: bool = False) -> tuple[Block, ...]:
+    """The observation, ours or the paper's, in its order. Paper: Sec. 3.4 (normalisation)
 
     Means and deviations are those of uniform distributions over the ranges. H samples (H^-0.5 each)
     weigh as much as one number; resolved velocities most: a net learns first what is large.
@@ -110,8 +111,10 @@ def observation_blocks(machine: Machine) -> tuple[Block, ...]:
         name = machine.names[j]
         blocks.append(Block(f"q {name}", q_mean[j], np.full(H, q_std[j]), H**-0.5, True))
         blocks.append(Block(f"q_dot {name}", 0.0, np.full(H, q_dot_std[j]), H**-0.5, True))
+    blocks.append(Block("u", 0.0, u_std, H**-0.5, False))
+    if paper:
+        return tuple(block._replace(weight=1.0) for block in blocks)
     blocks += [
-        Block("u", 0.0, u_std, H**-0.5, False),
         Block("resolved v_goal", 0.0, q_dot_std[machine.driven], 4.2, False),
         Block("resolved error_integral", 0.0, 0.1 * q_dot_std[machine.driven], 4.2, False),
     ]
@@ -119,9 +122,9 @@ def observation_blocks(machine: Machine) -> tuple[Block, ...]:
 
 
 @lru_cache
-def observation_scale(machine: Machine) -> tuple[Array, Array]:
+def observation_scale(machine: Machine, paper: bool = False) -> tuple[Array, Array]:
     """Mean and scale = std / weight of the observation, float32 (obs,) both."""
-    blocks = observation_blocks(machine)
+    blocks = observation_blocks(machine, paper)
     mean = np.concatenate([np.broadcast_to(block.mean, block.std.shape) for block in blocks])
     scale = np.concatenate([block.std / block.weight for block in blocks])
     return mean.astype(np.float32), scale.astype(np.float32)
@@ -156,28 +159,22 @@ def measure(
     return Measured(v_goal, v_tool, q, history[..., 1, -1], history, integral, p_tool, J)
 
 
-def features(machine: Machine, measured: Measured) -> Array:
-    """The observation of the table above, float32 (..., obs). Paper: Sec. 3.4, Fig. 3
+def features(machine: Machine, measured: Measured, paper: bool = False) -> Array:
+    """The observation of the table above, ours or the paper's, float32 (..., obs). Paper: Sec. 3.4
 
     Resolved velocities (ours): `dls` with W = 1, lambda = 6 % of the links' lengths (assumed).
     """
-    J = measured.J[..., machine.driven]
-    arm = np.hypot(machine.column("a"), machine.column("d")).sum()
-    J_inv = dls(J, np.ones(len(machine.driven)), (0.06 * arm) ** 2 + 1e-6)
-    numbers = [
-        kinematics.to_heading(measured.p_tool, measured.v_goal),
-        kinematics.to_heading(measured.p_tool, measured.v_tool),
-        measured.q[..., machine.locked],
-        measured.history[..., :2, :].reshape(*J.shape[:-2], -1),
-        measured.history[..., 2, :].reshape(*J.shape[:-2], -1),
-        (J_inv @ measured.v_goal[..., None])[..., 0],
-        (J_inv @ measured.error_integral[..., None])[..., 0],
-    ]
-    mean, scale = observation_scale(machine)
-    obs = np.concatenate(numbers, axis=-1, dtype=np.float32)
-    obs -= mean
-    obs /= scale
-    return obs
+    signals = measured.history[..., :2, :].reshape(*measured.q.shape[:-1], -1)
+    commands = measured.history[..., 2, :].reshape(*measured.q.shape[:-1], -1)
+    numbers = [measured.v_goal, measured.v_tool, measured.q[..., machine.locked], signals, commands]
+    if not paper:
+        numbers[:2] = [kinematics.to_heading(measured.p_tool, v) for v in numbers[:2]]
+        J, integral = measured.J[..., machine.driven], measured.error_integral
+        arm = np.hypot(machine.column("a"), machine.column("d")).sum()
+        J_inv = dls(J, np.ones(len(machine.driven)), (0.06 * arm) ** 2 + 1e-6)
+        numbers += [(J_inv @ v[..., None])[..., 0] for v in (measured.v_goal, integral)]
+    mean, scale = observation_scale(machine, paper)
+    return (np.concatenate(numbers, axis=-1, dtype=np.float32) - mean) / scale
 
 
 def integrate_error(machine: Machine, v_goal: Array, v_tool: Array, integral: Array) -> Array:
@@ -205,11 +202,12 @@ def update_history(
     return history, integrate_error(machine, v_goal, v_tool, integral)
 
 
-def action_to_pwm(machine: Machine, action: ArrayLike) -> Array:
+def action_to_pwm(machine: Machine, action: ArrayLike, paper: bool = False) -> Array:
     """Commands u (..., n) of full command from actions of the driven joints (..., n_driven).
 
     u = dead_zone clip(a / 0.01, -1, 1) + (limit - dead_zone) a: dead-zone compensation, as the PIDs
-    have it. ValueError: a wrong shape, a number that is not finite. Paper: Sec. 3.3, Sec. 3.4
+    have it. The paper's agent has none: u = limit a. Paper: Sec. 3.3, Sec. 3.4
+    ValueError: a wrong shape, a number that is not finite.
 
     Example:
         >>> from brokk_min.machine import BROKK_170
@@ -222,9 +220,10 @@ def action_to_pwm(machine: Machine, action: ArrayLike) -> Array:
     if not np.isfinite(a).all():
         raise ValueError(f"action: expected finite numbers, got {a[~np.isfinite(a)][0]}")
     limit = machine.pwm_limit / PWM_MAX
+    dead_zone = 0.0 if paper else machine.dead_zone
     crossing = np.clip(a / COMPENSATION, -1.0, 1.0)
     u = np.zeros((*a.shape[:-1], machine.n), a.dtype)
-    u[..., machine.driven] = machine.dead_zone * crossing + (limit - machine.dead_zone) * a
+    u[..., machine.driven] = dead_zone * crossing + (limit - dead_zone) * a
     return limit_command(machine, u)
 
 
@@ -315,8 +314,9 @@ def step(
 
     The next state; reward, terminated, truncated and |v_goal - v_tool| [m/s], (num,) each.
     """
-    u = action_to_pwm(machine, action)
-    u, rest = close_valves(machine, config.valves, u, state.v_goal, state.rest_ticks)
+    u = action_to_pwm(machine, action, config.paper)
+    valves = "open" if config.paper else config.valves
+    u, rest = close_valves(machine, valves, u, state.v_goal, state.rest_ticks)
     state = replace(transition(machine, net, state, u), rest_ticks=rest)
     rewards = reward(state.v_goal, state.v_tool)
     error = np.linalg.norm(state.v_goal - state.v_tool, axis=-1)
@@ -325,6 +325,6 @@ def step(
         limit = len(machine.driven) * machine.pwm_limit / PWM_MAX
         rewards = rewards - config.valve_cost * change.sum(axis=-1) / limit
         rewards = rewards - config.integral_cost * np.linalg.norm(state.error_integral, axis=-1)
-    end = terminated(machine, state.lowest)
+    end = terminated(machine, state.lowest) & ((state.ticks == 1) | (not config.paper))
     truncated = (state.ticks >= round(config.episode_s * machine.rate)) & ~end
     return state, np.where(end, 0.0, rewards), end, truncated, error

@@ -64,18 +64,24 @@ def mlp(inputs: int, outputs: int, std: float) -> nn.Sequential:
 
 
 class Agent(nn.Module):
-    """Actor, logarithm of the actions' standard deviation and, if advantages need one, critic."""
+    """Actor, logarithm of the actions' standard deviation and, if advantages need one, critic.
+
+    The critic's output is in deviations of the returns so far from their mean, as in rl_games
+    (`normalize_value`; compare PopArt, van Hasselt et al., 2016).
+    """
 
     def __init__(self, obs: int, actions: int, log_std: float, critic: bool) -> None:
         super().__init__()
         self.actor = mlp(obs, actions, 0.01)
         self.log_std = nn.Parameter(torch.full((actions,), log_std))
         self.critic = mlp(obs, 1, 1.0) if critic else None
+        self.returns: Any = nn.BatchNorm1d(1, momentum=None, affine=False)  # running statistics
 
     def value(self, obs: Tensor) -> Tensor:
         """Value (...) of observations (..., obs), in units of the reward: (1 - gamma) * return."""
         assert self.critic is not None
-        value: Tensor = self.critic(obs)[..., 0]
+        mean, var = self.returns.running_mean, self.returns.running_var
+        value: Tensor = mean + var.sqrt() * self.critic(obs)[..., 0]
         return value
 
 
@@ -108,15 +114,8 @@ def gae(
     """Generalised advantage estimates (Schulman et al., 2016), all tensors of shape (T, N).
 
     delta_t = r_t + gamma V(s_{t+1}) - V(s_t);  A_t = delta_t + gamma lambda (1 - done_t) A_{t+1}.
-
-    Args:
-        rewards: reward of tick t.
-        values: value of the observation before tick t.
-        next_values: value of the observation after tick t: 0 where the episode terminated, that of
-            its own last observation where it was truncated.
-        dones: 1 where the episode terminated or was truncated at tick t.
-        gamma: discount.
-        lam: weight of longer returns.
+    `values` are V(s_t), `next_values` V(s_{t+1}): 0 where the episode terminated, that of its own
+    last observation where it was truncated. `dones` is 1 where it terminated or was truncated.
 
     Example:
         >>> one = torch.ones(2, 1)
@@ -140,6 +139,7 @@ def critic_advantages(agent: Agent, rollout: Rollout, config: PPOConfig) -> dict
     rewards = rollout.rewards * (1 - config.gamma)
     dones = rollout.dones.float()
     advantages = gae(rewards, values, next_values, dones, config.gamma, config.gae_lambda)
+    agent.returns((advantages + values).reshape(-1, 1))  # updates its statistics
     return {"advantages": advantages, "returns": advantages + values}
 
 
@@ -159,7 +159,7 @@ def ppo_loss(agent: Agent, mb: dict[str, Tensor], config: PPOConfig) -> tuple[Te
     pg_loss = policy_loss(ratio, advantages, config.clip)
     v_loss = torch.zeros(())
     if "returns" in mb:
-        v_loss = ((agent.value(mb["obs"]) - mb["returns"]) ** 2).mean()
+        v_loss = ((agent.value(mb["obs"]) - mb["returns"]) ** 2 / agent.returns.running_var).mean()
     entropy = (agent.log_std + 0.5 * math.log(2 * math.pi * math.e)).sum()
     loss = pg_loss + v_loss - config.entropy * entropy
     with torch.no_grad():

@@ -6,6 +6,7 @@ Telemetry is the state of one tick, from the frames of a bus or of a log.
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from io import StringIO
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,9 +17,12 @@ from brokk_min.can.canopen import OPERATOR_CHANNEL, Frame, Nodes, OperatorInput
 from brokk_min.can.connection import standard_id
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.hw import Drive
-from brokk_min.identification.files import expected, require
+from brokk_min.identification.files import expected, open_regular, require
 from brokk_min.identification.logs import Log, machine_log
 from brokk_min.machine import Array, Machine, decode_pwm, estimate_velocity
+
+LONGEST_LINE = 1000  # bytes
+LARGEST_LOG = 2**40  # bytes: frames are read one by one
 
 
 def read_frames(path: Path) -> Iterator[Frame]:
@@ -28,12 +32,24 @@ def read_frames(path: Path) -> Iterator[Frame]:
 
     ValueError: no such log, or a line that is no frame.
     """
-    reader = require("can", "hw").CanutilsLogReader
-    with expected(path, "a candump log"), open(path) as file, reader(file) as messages:
-        messages.file = (line for line in file if line.endswith("\n"))
-        for m in messages:
-            can_id = standard_id(m)
-            yield Frame(m.timestamp, can_id, bytes(m.data), not m.is_rx, str(m.channel))
+    reader = require("can", "hw").CanutilsLogReader(StringIO())
+    with expected(path, "a candump log"), open_regular(path, LARGEST_LOG) as file:
+        lines = iter(lambda: file.readline(LONGEST_LINE), b"")
+        reader.file = (line.decode() for line in lines if line.endswith(b"\n") or _too_long(line))
+        for m in reader:
+            frame = Frame(m.timestamp, standard_id(m), bytes(m.data), not m.is_rx, str(m.channel))
+            if not 0 <= frame.time < 1e12:
+                raise ValueError(f"a time of {frame.time}")
+            if frame.id == canopen.OPERATOR_INPUT and frame.channel == OPERATOR_CHANNEL:
+                canopen.unpack_operator_input(frame.data)
+            yield frame
+
+
+def _too_long(line: bytes) -> bool:
+    """ValueError: a line that is longer than any frame's; False: the last one is cut."""
+    if len(line) == LONGEST_LINE:
+        raise ValueError(f"a line of {LONGEST_LINE} bytes or more")
+    return False
 
 
 @dataclass
@@ -77,7 +93,7 @@ class ReplayedBus:
     def operator(self, driving: bool, ready: bool) -> OperatorInput:
         """The operator's next input of the log."""
         for frame in self.frames:
-            if frame.id == canopen.OPERATOR_INPUT:
+            if frame.id == canopen.OPERATOR_INPUT and frame.channel == OPERATOR_CHANNEL:
                 return canopen.unpack_operator_input(frame.data)
         return OperatorInput(stop=True)
 

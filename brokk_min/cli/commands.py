@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from tyro.conf import OmitArgPrefixes, Positional
 
-from brokk_min.actuator import ActuatorNet, select_nets
+from brokk_min.actuator import ActuatorNet
 from brokk_min.cli.options import (
     Command,
     Count,
@@ -22,13 +22,19 @@ from brokk_min.cli.options import (
     WrongUse,
     default_policy,
 )
-from brokk_min.cli.settings import FitSettings, LearnerSettings, TaskSettings, make_config
+from brokk_min.cli.settings import (
+    FitSettings,
+    LearnerSettings,
+    PaperDefaults,
+    TaskSettings,
+    make_config,
+)
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation import baselines, figures, metrics, perfect_model, sequences
 from brokk_min.evaluation.claims import VERDICTS
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.identification import excitation, validation
-from brokk_min.identification.files import write_json
+from brokk_min.identification.files import brief, located, write_json
 from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
 from brokk_min.identification.logs import Log, read_log, write_log
 from brokk_min.identification.net_file import load_net, save_net
@@ -45,7 +51,7 @@ class Collect(Command):
     excitation: Literal["sine", "rich"] = "rich"  # The paper's sines, or steps and holds too.
 
     def __call__(self) -> None:
-        machine = self.check(self.out)
+        machine = self.check(out="log")
         if self.out.suffix not in (".csv", ".npz"):
             raise WrongUse(f"--out: expected a name ending in .csv or .npz, got {self.out}")
         rng = np.random.default_rng(self.seed)
@@ -73,17 +79,19 @@ class Fit(Command):
 
         if not self.logs:
             raise WrongUse("LOGS: expected at least one log, got none")
-        machine = self.check(self.out, self.json, self.figure)
+        machine = self.check(out="nets", json="scores", figure="picture")
         make_config(FitConfig, vars(self.settings))  # before the logs are read
         samples = self.velocity_samples or machine.velocity_samples
         log, test = self._read(machine, samples)
         known = machine if machine.names == log.joints else None
         if self.machine and not known:
-            expected = f"joints of --machine {self.machine}"
-            raise ValueError(f"LOGS: expected {expected}, got {list(log.joints)}")
+            expected = f"expected those of --machine {self.machine}"
+            raise ValueError(f"{self.logs[0]}: joints: {expected}, got {brief(log.joints)}")
         config = make_config(FitConfig, self._settings(known))
-        net = fit(log, config, self.seed, samples, known.name if known else "")
-        scores = validation.validate(net, log, test, known)
+        with located(*self.logs):
+            net = fit(log, config, self.seed, samples, known.name if known else "")
+        with located(*self.test, *self.logs):
+            scores = validation.validate(net, log, test, known)
         save_net(self.out, net)
         if self.json:
             write_json(self.json, {"meta": self._meta(net), **scores})
@@ -100,7 +108,8 @@ class Fit(Command):
         log = read_log(self.logs, samples, rate=machine.rate)
         if self.test:
             return log, read_log(self.test, samples, log.joints, log.rate)
-        return split(log)
+        with located(*self.logs):
+            return split(log)
 
     def _meta(self, net: ActuatorNet) -> dict[str, Any]:
         meta = {"seed": self.seed, "rate": net.rate, "history": net.history}
@@ -120,7 +129,7 @@ class Fit(Command):
 def split(log: Log) -> tuple[Log, Log]:
     """Recordings to fit to, and every tenth, to score on; ValueError: a single one."""
     if len(log.recordings) < 2:
-        raise ValueError("LOGS: expected two or more recordings, or --test, to score on; got one")
+        raise ValueError("recordings: expected two or more, or --test, to score on, got one")
     kept = tuple(recording for i, recording in enumerate(log.recordings) if i % 10)
     return log._replace(recordings=kept), log._replace(recordings=log.recordings[::10])
 
@@ -163,10 +172,10 @@ class Train(Training):
         from brokk_min.learning.checkpoint import train_policy
         from brokk_min.ppo import PPOConfig
 
-        machine = self.check(self.out)
+        machine = self.check({Path(f"{self.out}.csv"): "curve"}, out="policy")
         task = make_config(TaskConfig, vars(self.task))
         config = make_config(PPOConfig, vars(self.settings))
-        net = select_nets(machine, load_net(self.actuator))
+        net = load_net(self.actuator, machine)
         files = (self.out, self.critic, self.resume, self.tensorboard)
         train_policy(machine, net, task, config, self.seed, *files)
         print(f"{self.out}: trained for {config.total_steps} steps; curve in {self.out}.csv")
@@ -186,13 +195,23 @@ class Sweep(Training):
         from brokk_min.evaluation.seeds import show, sweep
         from brokk_min.ppo import PPOConfig
 
-        machine = self.check()
+        machine = self.check({self.out / "sweep.json": "sweep"})
         task = make_config(TaskConfig, vars(self.task))
         config = make_config(PPOConfig, vars(self.settings))
-        net = select_nets(machine, load_net(self.actuator))
+        net = load_net(self.actuator, machine)
         seeds = range(self.seed, self.seed + self.seeds)
         options = (self.poses, self.scheduler, self.gains, self.critic)
         print(show(sweep(machine, net, task, config, seeds, self.out, *options)))
+
+
+@dataclass(kw_only=True)
+class PaperTrain(PaperDefaults, Train):
+    """Train the paper's agent with PPO on the nets."""
+
+
+@dataclass(kw_only=True)
+class PaperSweep(PaperDefaults, Sweep):
+    """Train and evaluate many seeds of the paper's agent; finished seeds are not run again."""
 
 
 @dataclass(kw_only=True)
@@ -204,7 +223,7 @@ class Starts(Command):
     seed: Seed = 2  # Of the poses.
 
     def __call__(self) -> None:
-        machine = self.check(self.out)
+        machine = self.check(out="starts")
         rng = np.random.default_rng(self.seed)
         poses = sequences.draw_starts(machine, sequences.task_sequences(machine), self.num, rng)
         sequences.write_starts(self.out, machine, poses)
@@ -225,7 +244,7 @@ class Evaluate(Command):
     perfect_model: bool = False  # Also a bound: a controller with the plant as its model (minutes).
 
     def __call__(self) -> None:
-        machine = self.check(self.json)
+        machine = self.check(json="runs")
         if self.perfect_model and self.plant == "net":
             raise WrongUse("--perfect-model: expected --plant analytic, its model, got net")
         path, gains = default_policy(machine, self.policy, self.gains)
@@ -270,6 +289,17 @@ def print_means(runs: list[dict[str, Any]], sequences: int) -> None:
             print(f"  {name:22} " + ", ".join(cells))
 
 
+CHAIN = {  # files of `reproduce`
+    "log.npz": "log",
+    "log_test.npz": "log",
+    "net.npz": "nets",
+    "policy.npz": "policy",
+    "policy.npz.csv": "curve",
+    "gains.json": "gains",
+    "results.json": "results",
+}
+
+
 @dataclass(kw_only=True)
 class Reproduce(Command):
     """The whole chain: logs, nets, policy, baselines, comparison, report.html and results.json."""
@@ -282,7 +312,8 @@ class Reproduce(Command):
         from brokk_min.evaluation.reproduce import QUICK, Budget, reproduce
 
         budget = QUICK if self.quick else Budget()
-        results = reproduce(self.check(), self.out, budget, self.seed, self.sweep)
+        machine = self.check({self.out / name: kind for name, kind in CHAIN.items()})
+        results = reproduce(machine, self.out, budget, self.seed, self.sweep)
         for name, rows in results["task_space"]["summary"].items():
             errors = ", ".join(f"{s} {row['velocity_error_mean']:.4f}" for s, row in rows.items())
             print(f"{name:22} mean velocity error [m/s]: {errors}")
@@ -302,9 +333,9 @@ class Preliminary(Command):
     def __call__(self) -> None:
         from brokk_min.evaluation import preliminary
 
-        machine = self.check()
-        net = load_net(self.actuator)
-        measured = preliminary.run(machine, net, self.seed)
+        machine = self.check({self.out / "preliminary.json": "preliminary"})
+        with located(self.actuator):
+            measured = preliminary.run(machine, load_net(self.actuator), self.seed)
         numbers = preliminary.numbers(machine, measured)
         self.out.mkdir(parents=True, exist_ok=True)
         plots = {"preliminary": figures.plot_tests(machine, measured.tests)}

@@ -20,6 +20,7 @@ from brokk_min.cli.options import Command, Range, WrongUse, default_policy
 from brokk_min.evaluation import baselines
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.evaluation.sequences import read_commands
+from brokk_min.identification.files import located
 from brokk_min.identification.logs import write_log
 from brokk_min.learning.onnx import export_onnx
 from brokk_min.learning.policy import PolicyController, load_policy
@@ -37,7 +38,7 @@ class Simulate(Command):
     record: Path | None = None  # Also log commands and true angles of each plant step, .csv.
 
     def __call__(self) -> None:
-        machine = self.check(self.record)
+        machine = self.check(record="plant record")
         print(f"{self.machine} on {self.interface} {self.channel}; Ctrl-C ends it", flush=True)
         simulate(machine, self.start, self.interface, self.channel, self.record)
 
@@ -60,7 +61,7 @@ class Drive(Command):
     replay: Path | None = None  # No bus: run on this log and compare its valve frames.
 
     def __call__(self) -> None:
-        machine = self.check(self.log)
+        machine = self.check(log="drive log")
         if not self.replay and not (self.interface and self.channel):
             raise WrongUse("--interface, --channel: expected a CAN bus, or --replay, got none")
         controller = self._controller(machine)
@@ -106,7 +107,8 @@ class Drive(Command):
 def compare(machine: Machine, controller: Controller, log: Path) -> None:
     """Run a controller on a log; ValueError: not all its valve frames are those of the log."""
     frames = list(read_frames(log))
-    sent_now = drive_log.replay(machine, controller, frames)
+    with located(log):
+        sent_now = drive_log.replay(machine, controller, frames)
     same, sent = drive_log.compare(machine, frames, sent_now)
     print(f"{log}: {same} of {sent} valve frames are the same")
     if same < sent:
@@ -130,7 +132,9 @@ class Convert(Command):
     out: Path  # Log to write, .csv or .npz.
 
     def __call__(self) -> None:
-        log = drive_log.log_for_fit(self.check(self.out), read_frames(self.log))
+        machine = self.check(out="log")
+        with located(self.log):
+            log = drive_log.log_for_fit(machine, read_frames(self.log))
         write_log(self.out, log)
         print(f"{self.out}: {len(log.recordings)} recordings of {', '.join(log.joints)}")
 
@@ -143,7 +147,7 @@ class Export(Command):
     out: Path  # File to write, .onnx.
 
     def __call__(self) -> None:
-        export_onnx(self.out, load_policy(self.policy, self.check(self.out)))
+        export_onnx(self.out, load_policy(self.policy, self.check(out="ONNX")))
         print(f"{self.out}: observation (batch, obs) in, action (batch, driven joints) out")
 
 
@@ -161,7 +165,7 @@ class Play(Command):
     start: tuple[float, ...] = ()  # First angles [rad] of the simulated machine.
 
     def __call__(self) -> None:
-        machine = self.check(self.attempts, self.log)
+        machine = self.check(attempts="attempts", log="drive log")
         if bool(self.interface) != bool(self.channel) or (self.drive and not self.interface):
             raise WrongUse("--interface, --channel: expected both or, without --drive, none")
         bus = control_process.BusOptions(self.interface, self.channel, self.log, self.start)
@@ -197,7 +201,7 @@ class Replay(Command):
     start: int = 0  # Which start of the results.
 
     def __call__(self) -> None:
-        machine = self.check(self.out)
+        machine = self.check(out="film")
         if not 1 <= len(self.logs) <= 2:
             raise WrongUse(f"LOGS: expected one or two, got {len(self.logs)}")
         self._check_size()

@@ -2,13 +2,14 @@
 
 import os
 import runpy
+from collections.abc import Mapping
 from dataclasses import dataclass, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
 import tyro
 
-from brokk_min.identification.files import SHIPPED
+from brokk_min.identification.files import SHIPPED, brief, names_in, open_regular
 from brokk_min.machine import BROKK_170, Machine
 
 MACHINES = {BROKK_170.name: BROKK_170}
@@ -46,20 +47,71 @@ def check_ranges(options: Any) -> None:
                 raise WrongUse(f"--{name.replace('_', '-')}: expected {expected}, got {value}")
 
 
+# What a file of each kind that commands write holds: columns, arrays, keys, or see `names_in`.
+CONTENTS = {
+    "log": {"run", "time"},
+    "nets": {"header", "input_mean"},
+    "policy": {"header", "net_header"},
+    "curve": {"global_step"},
+    "scores": {"meta", "joints"},
+    "runs": {"meta", "runs"},
+    "gains": {"meta", "gains"},
+    "sweep": {"meta", "table"},
+    "results": {"meta", "task_space"},
+    "preliminary": {"meta", "sim_to_real"},
+    "attempts": {"when", "task", "mode"},
+    "plant record": {"time", "valid"},
+    "drive log": {"candump"},
+    "picture": {"PNG"},
+    "film": {"film"},
+    "ONNX": {"ONNX"},
+}
+
+
 @dataclass(kw_only=True)
 class Command:
     """Options of every command."""
 
     machine: MachineName = BROKK_170.name  # Which one; FILE.py:NAME runs a file that you trust.
     seed: Seed = 0  # Of everything random.
+    force: bool = False  # Write over files of another kind, too; never over an input.
 
-    def check(self, *outputs: Path | None) -> Machine:
-        """The machine; WrongUse: an option out of range or an output that cannot be written."""
+    def check(self, others: Mapping[Path, str] | None = None, /, **outputs: str) -> Machine:
+        """The machine; WrongUse: an option out of range or an output that must not be written.
+
+        `outputs` are the kinds, as in `CONTENTS`, of options that name files to write; `others`
+        those of files that are written without an option of their own.
+        """
         check_ranges(self)
-        for path in outputs:
-            if path and (path.is_dir() or not os.access(path.parent, os.W_OK)):
-                raise WrongUse(f"{path}: expected a file in an existing, writable directory")
-        return find_machine(self.machine or BROKK_170.name)
+        machine = find_machine(self.machine or BROKK_170.name)
+        inputs = []
+        for name, value in vars(self).items():
+            values = value if isinstance(value, tuple) else (value,)
+            words = [str(word) for word in values if isinstance(word, Path | str)]
+            inputs += [Path(word) for word in words if word and name not in outputs]
+        files = {getattr(self, name): kind for name, kind in outputs.items()}
+        if len(files) < len(outputs) and None not in files:
+            raise WrongUse(f"--{', --'.join(outputs)}: expected different files, got the same")
+        existing = {path: kind for path, kind in (others or {}).items() if path.exists()}
+        for path, kind in (files | existing).items():
+            if path:
+                check_output(path, CONTENTS.get(kind) or set(machine.names), kind, self.force)
+                for one in inputs:
+                    if path.exists() and one.exists() and path.samefile(one):
+                        raise WrongUse(f"{path}: expected another file than an input to write")
+        return machine
+
+
+def check_output(path: Path, names: set[str], kind: str, force: bool) -> None:
+    """WrongUse: a file that cannot be written, or, without `force`, one of another kind."""
+    if path.is_dir() or not os.access(path.parent, os.W_OK):
+        raise WrongUse(f"{path}: expected a file in an existing, writable directory")
+    if not path.exists() or (path.is_file() and (force or not path.stat().st_size)):
+        return
+    if not path.is_file() or not names <= names_in(path):
+        got = "it has " + brief(sorted(names_in(path))) if path.is_file() else "no regular file"
+        expected = f"expected no file, or one of kind {kind} (--force writes over others)"
+        raise WrongUse(f"{path}: {expected}, got another: {got}")
 
 
 def find_machine(name: str) -> Machine:
@@ -70,11 +122,12 @@ def find_machine(name: str) -> Machine:
     if not path.endswith(".py"):
         raise WrongUse(f"--machine: expected one of {list(MACHINES)} or FILE.py:NAME, got {name}")
     try:
-        machine = runpy.run_path(path).get(symbol)
-    except Exception as error:  # whatever the file does
-        raise ValueError(f"--machine: expected {path} to run, got {error!r}") from error
+        with open_regular(Path(path), 2**20):
+            machine = runpy.run_path(path).get(symbol)
+    except (Exception, SystemExit) as error:  # whatever the file does
+        raise ValueError(f"--machine: expected {path} to run, got {brief(error)}") from error
     if not isinstance(machine, Machine):
-        raise WrongUse(f"--machine: expected a Machine {symbol} in {path}, got {machine!r}")
+        raise WrongUse(f"--machine: expected a Machine {symbol} in {path}, got {brief(machine)}")
     return machine
 
 

@@ -5,7 +5,7 @@ one line. `PPOConfig` is repeated, since its module imports torch, for which hel
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, TypeVar
 
 import tyro
@@ -13,6 +13,7 @@ import tyro
 from brokk_min.cli.options import WrongUse
 from brokk_min.env import TaskConfig
 from brokk_min.identification.fit_config import FitConfig
+from brokk_min.learning.episodes import PAPER_LEARNER, PAPER_TASK
 
 T = TypeVar("T")
 
@@ -66,3 +67,15 @@ class LearnerSettings:
     log_std_end: float | None = -4.5  # At the end, linear; None: learned.
     checkpoint_every: int = 50  # Updates between two checkpoints.
     threads: int = 2  # Threads of torch; the last bits depend on it.
+
+
+@dataclass(kw_only=True)
+class PaperDefaults:
+    """Options of trainings with --paper: its own defaults."""
+
+    settings: tyro.conf.OmitArgPrefixes[LearnerSettings] = field(
+        default_factory=lambda: LearnerSettings(**PAPER_LEARNER)
+    )
+    task: tyro.conf.OmitArgPrefixes[TaskSettings] = field(
+        default_factory=lambda: TaskSettings(**PAPER_TASK)
+    )

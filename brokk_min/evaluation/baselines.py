@@ -1,6 +1,5 @@
 """The classical controllers that the policy is compared with: gains, tuning, and files of gains."""
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from functools import partial
@@ -17,7 +16,8 @@ from brokk_min.env import TaskConfig
 from brokk_min.evaluation.feedforward import static_map
 from brokk_min.evaluation.rollout import rollout
 from brokk_min.evaluation.sequences import tuning_set
-from brokk_min.identification.files import expected, write_json
+from brokk_min.identification.files import brief, expect_same, read_json, write_json
+from brokk_min.identification.formats import GAINS, META, Field, check_fields
 from brokk_min.identification.net_file import fingerprint
 from brokk_min.jacobian import Gains, JacobianController, manipulability_threshold
 from brokk_min.machine import Array, Machine
@@ -245,18 +245,19 @@ def read_gains(path: Path, machine: Machine, net: ActuatorNet) -> dict[str, Jaco
     ValueError: no such file, or gains of other controllers, of another machine, or of other nets.
     """
     controllers = baselines(machine, net)
-    own = gains_metadata(machine, net)
-    with expected(path, f"gains for {machine.name} with nets {own['actuator']}"):
-        file = json.loads(path.read_text())
-        meta = {name: file["meta"].get(name) for name in own}
-        if meta != own:
-            raise ValueError(f"gains for {meta}")
-        missing = [name for name in controllers if name not in file["gains"]]
-        if missing:
-            raise ValueError(f"no gains of {missing}: tune again")
-        for name, controller in controllers.items():
-            gains = file["gains"][name]
-            if "ready" in gains:  # its name in older files
-                gains["min_opening"] = gains.pop("ready")
-            controllers[name] = replace(controller, gains=make_gains(machine, **gains))
+    file = read_json(path, "gains of `reproduce`")
+    check_fields(path, file, {"meta": META}, {})
+    expect_same(path, file["meta"], gains_metadata(machine, net))
+    check_fields(path, file, {"gains": Field("object")}, {})
+    for name, controller in controllers.items():
+        row = file["gains"].get(name)
+        if not isinstance(row, dict):
+            got = brief(row if name in file["gains"] else list(file["gains"]))
+            raise ValueError(f"{path}: gains.{name}: expected gains: tune again, got {got}")
+        row = {"min_opening" if key == "ready" else key: row[key] for key in row}  # older files
+        for key, value in row.items():  # one number stands for all joints
+            if isinstance(value, float | int):
+                row[key] = [value] * (len(machine.driven) if key in ("kp", "ki", "kd") else 1)
+        check_fields(path, row, GAINS, {"driven": len(machine.driven)}, f"gains.{name}.")
+        controllers[name] = replace(controller, gains=make_gains(machine, **row))
     return controllers

@@ -17,7 +17,8 @@ from brokk_min.evaluation.metrics import Mean, Traces
 from brokk_min.evaluation.preliminary import Motion, SimulatorTests
 from brokk_min.evaluation.sequences import AXES, Commands
 from brokk_min.identification import validation
-from brokk_min.identification.files import read_table, whole_file
+from brokk_min.identification.files import whole_file
+from brokk_min.identification.formats import read_table
 from brokk_min.identification.logs import Log, Recording
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine

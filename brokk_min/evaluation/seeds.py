@@ -5,7 +5,6 @@ They run on this machine's cores, or on a cluster, through dask.distributed. Eac
 On a cluster all workers must have the folder, and run one seed at a time.
 """
 
-import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -22,7 +21,15 @@ from brokk_min.evaluation import metrics
 from brokk_min.evaluation.baselines import gains_metadata, read_gains
 from brokk_min.evaluation.metrics import Controllers, Rows, by_start, mean_interval
 from brokk_min.evaluation.sequences import AXES, evaluation_starts, task_sequences
-from brokk_min.identification.files import expect_same, expected, require, write_json
+from brokk_min.identification.files import (
+    brief,
+    expect_same,
+    expected,
+    read_json,
+    require,
+    write_json,
+)
+from brokk_min.identification.formats import SWEEP, check_fields
 from brokk_min.learning.checkpoint import describe_training, train_policy
 from brokk_min.learning.policy import Policy, PolicyController, load_policy
 from brokk_min.machine import Array, Machine
@@ -94,7 +101,7 @@ def run_seed(
     identity = describe_training(machine, net, task, config, critic, seed)
     if result_file.exists():
         with expected(result_file, "the result of a seed"):
-            result: dict[str, Any] = json.loads(result_file.read_text())
+            result: dict[str, Any] = read_json(result_file, "the result of a seed")
             rows: Rows = result["runs"]
             recorded = result["identity"]
         expect_same(result_file, recorded, {**identity, **about})
@@ -194,11 +201,12 @@ def table(seeds: Sequence[Rows], baselines: Rows) -> Table:
 
 def read_seeds(path: Path) -> dict[str, Any]:
     """The `sweep.json` of a sweep; its "table" is that of `table`. ValueError: another file."""
-    with expected(path, "the sweep.json of a sweep"):
-        content: dict[str, Any] = json.loads(path.read_text())
-        if not {"mean", "low", "high"} <= set(content["table"]["rl"]["velocity_error_all"]):
-            raise ValueError(f"{content['table']['rl']}")
-        dict(content["meta"])
+    content: dict[str, Any] = read_json(path, "the sweep.json of a sweep")
+    check_fields(path, content, SWEEP, {})
+    for name, row in content["table"].items():
+        if row.keys() != content["table"]["rl"].keys():
+            wanted = brief(list(content["table"]["rl"]))
+            raise ValueError(f"{path}: table.{name}: expected {wanted}, got {brief(list(row))}")
     return content
 
 

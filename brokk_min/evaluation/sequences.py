@@ -16,11 +16,13 @@ from brokk_min import jacobian as classic
 from brokk_min.actuator import lever_arm
 from brokk_min.env import TaskConfig, terminated
 from brokk_min.identification import files
+from brokk_min.identification.formats import COMMANDS, read_table, starts_of
 from brokk_min.kinematics import forward_kinematics, jacobian, lowest_point, tool_position
 from brokk_min.learning.episodes import draw_pose, reset
 from brokk_min.machine import PWM_MAX, Array, Machine, valve_opening
 
 AXES = "xyz"
+LONGEST = 3600.0  # s of a sequence of a file, assumed
 KINDS = ("workspace", "limits", "extended")  # of starts, see `start_kinds`
 REST_SEED = 2026  # of the scored rests; nothing else draws from it
 SECONDS = 26.0  # of a scored sequence, assumed
@@ -159,7 +161,7 @@ def read_commands(path: Path, machine: Machine) -> list[Commands]:
     The last row of a sequence marks its end. ValueError: no such table, times that do not rise,
     less than a tick, or the name "all".
     """
-    table = files.read_table(path, ["sequence", "time", "vx", "vy", "vz"], text=("sequence",))
+    table = read_table(path, COMMANDS)
     velocity = np.stack([table["vx"], table["vy"], table["vz"]], axis=1)
     result = []
     for name in dict.fromkeys(table["sequence"]):
@@ -167,10 +169,12 @@ def read_commands(path: Path, machine: Machine) -> list[Commands]:
         time = table["time"][rows] - table["time"][rows][0]
         ticks = round(time[-1] * machine.rate)
         if len(time) < 2 or not (np.diff(time) > 0).all():
-            raise ValueError(f"{path}: sequence {name}: expected two or more rows with rising time")
-        if ticks < 1 or name == "all":
-            expected = "expected a tick or more and another name than all"
-            raise ValueError(f"{path}: sequence {name}: {expected}")
+            got = f"got {files.brief(time.tolist())}"
+            expected = "expected two or more rows with rising time"
+            raise ValueError(f"{path}: sequence {name}: {expected}, {got}")
+        if not 1 <= ticks <= LONGEST * machine.rate or name == "all":
+            expected = f"expected a tick to {LONGEST:g} s and another name than all"
+            raise ValueError(f"{path}: sequence {name}: {expected}, got {time[-1]:g} s")
         row = np.searchsorted(time, np.arange(ticks) / machine.rate + 1e-6, "right") - 1
         result.append(Commands(str(name), velocity[rows][row]))
     return result
@@ -181,12 +185,8 @@ def read_starts(path: Path, machine: Machine) -> Array:
 
     ValueError: an angle outside its joint's range or a pose in the ground, with file and row.
     """
-    table = files.read_table(path, list(machine.names))
+    table = read_table(path, starts_of(machine))
     starts = np.stack([table[name] for name in machine.names], axis=1)
-    low, high = machine.column("q_min"), machine.column("q_max")
-    for row, joint in np.argwhere((starts < low) | (starts > high)):
-        expected = f"column {machine.names[joint]}: expected {low[joint]} to {high[joint]} rad"
-        raise ValueError(f"{path}: row {row + 2}, {expected}, got {starts[row, joint]}")
     lowest = lowest_point(forward_kinematics(machine, starts))
     for row in np.flatnonzero(terminated(machine, lowest)):
         expected = f"expected the whole arm above {machine.ground} m"

@@ -18,7 +18,7 @@ from tqdm import tqdm
 from brokk_min.actuator import ActuatorNet, mu_law
 from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
 from brokk_min.identification.logs import Log, join_recordings
-from brokk_min.identification.net_file import NET_ARRAYS
+from brokk_min.identification.net_file import STATISTICS
 from brokk_min.machine import Array, estimate_velocity
 
 __all__ = ["PAPER_RECIPE", "FitConfig", "fit"]
@@ -47,7 +47,7 @@ def fit(
         settings=asdict(config),
         weights=tuple(weight.detach().numpy() for weight in weights),
         dead_zone=config.dead_zone or 0.0,
-        **{name: getattr(data, name).numpy() for name in NET_ARRAYS},
+        **{name: getattr(data, name).numpy() for name in STATISTICS},
     )
 
 

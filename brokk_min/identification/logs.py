@@ -6,7 +6,7 @@ Columns `run,time,u_<joint>...,q_<joint>...[,q_dot_<joint>...]`, one row per sam
 not below the machine's, jitter allowed. Recordings whose name ends in `_return` are dropped.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,24 +15,19 @@ from numpy.typing import NDArray
 
 from brokk_min.identification.files import (
     Floats,
-    Table,
-    cells_of,
+    brief,
     load_arrays,
-    numbers_of,
     read_csv,
     whole_file,
     write_csv,
 )
+from brokk_min.identification.formats import LOG, check_columns
 from brokk_min.machine import Array, Machine, estimate_velocity
 
 RATE = 20.0  # Hz, paper: everything runs at 20 Hz; other machines have others
 MAX_GAP = 0.25  # s, assumed: a longer gap between time stamps starts a new recording
 RETURN = "_return"
-UNITS = {  # largest value of a column and its unit; larger values are in another unit
-    "u": (1.0, "of full command, not percent or bytes"),
-    "q": (62.8, "rad, not degrees"),  # ten turns, assumed
-    "q_dot": (62.8, "rad/s, not degrees/s"),
-}
+Columns = Mapping[str, Any]
 
 
 class Recording(NamedTuple):
@@ -161,11 +156,13 @@ def read_log(
     recordings: list[Recording] = []
     logged: set[bool] = set()
     for path in map(Path, paths):
-        table = read_csv(path) if path.suffix.lower() == ".csv" else _read_npz(path)
+        table: Columns = read_csv(path, ["run"]) if path.suffix.lower() == ".csv" else {}
+        table = table or _read_npz(path)
         got = names if joints else _joints(path, table)
         names = names or got
         if set(got) != set(names):
-            raise ValueError(f"{path}: row 1: expected joints {list(names)}, got {list(got)}")
+            wanted = f"expected joints {brief(list(names))}"
+            raise ValueError(f"{path}: row 1: {wanted}, got {brief(list(got))}")
         logged.add(any(f"q_dot_{joint}" in table for joint in names))
         if len(logged) > 1:
             raise ValueError(f"{path}: expected q_dot columns in all files or none, got a mixture")
@@ -175,72 +172,76 @@ def read_log(
     return Log(names, tuple(recordings), True in logged, rate)
 
 
-def _read_npz(path: Path) -> Table:
-    columns = load_arrays(path)
-    shapes = {name: column.shape for name, column in columns.items()}
-    if len(set(shapes.values())) != 1 or len(next(iter(shapes.values()))) != 1:
-        raise ValueError(f"{path}: expected columns of one length, got {shapes}")
-    for name, column in columns.items():
-        content, kinds = ("text", "U") if name == "run" else ("numbers", "iuf")
-        if column.dtype.kind not in kinds:
-            raise ValueError(f"{path}: column {name}: expected {content}, got {column.dtype}")
-    return {name: column.tolist() for name, column in columns.items()}
+def _read_npz(path: Path) -> Columns:
+    """Columns of an `.npz`, once run and time are those of a log: they justify the others."""
+    narrow = load_arrays(path, ["run", "time"])
+    check_columns(path, narrow, {name: LOG[name] for name in ("run", "time")})
+    _runs(path, narrow["run"].tolist(), narrow["time"])
+    table: dict[str, Any] = load_arrays(path)
+    return table | {"run": table["run"].tolist()}
 
 
-def _joints(path: Path, table: Table) -> tuple[str, ...]:
+def _joints(path: Path, table: Columns) -> tuple[str, ...]:
     """Joints of a table by its u columns; ValueError: an angle or a velocity without a command."""
     joints = tuple(name[2:] for name in table if name.startswith("u_"))
     if not joints:
-        raise ValueError(f"{path}: row 1: expected columns u_<joint>, got {list(table)}")
+        raise ValueError(f"{path}: row 1: expected columns u_<joint>, got {brief(list(table))}")
     known = {kind + joint for kind in ("q_", "q_dot_") for joint in joints}
     for name in table:
         if name.startswith("q_") and name not in known:
             missing = "u_" + name.removeprefix("q_").removeprefix("dot_")
             expected = f"expected a column {missing} for {name}"
-            raise ValueError(f"{path}: row 1: {expected}, got {list(table)}")
+            raise ValueError(f"{path}: row 1: {expected}, got {brief(list(table))}")
     return joints
 
 
 def _recordings(
-    path: Path, table: Table, joints: Sequence[str], logged: bool, samples: int, rate: float
+    path: Path, table: Columns, joints: Sequence[str], logged: bool, samples: int, rate: float
 ) -> Iterator[Recording]:
     """The checked recordings of one table at `rate`, in the order in which they begin."""
-    time = numbers_of(path, table, "time")
-    columns: dict[str, Floats] = {}
-    for kind in ("u", "q", "q_dot") if logged else ("u", "q"):
-        numbers = [numbers_of(path, table, f"{kind}_{joint}", *UNITS[kind]) for joint in joints]
-        columns[kind] = np.stack(numbers, axis=1)
-    for run, rows in _runs(path, table).items():
+    kinds = ("u_", "q_", "q_dot_") if logged else ("u_", "q_")
+    fields = {name: LOG[name] for name in ("run", "time")}
+    fields |= {kind + joint: LOG[kind] for kind in kinds for joint in joints}
+    check_columns(path, table, fields)
+    time = np.asarray(table["time"], float)
+    for run, rows in _runs(path, table["run"], time).items():
         gaps = _gaps(path, run, rows, time[rows], rate)
         pieces = [] if run.endswith(RETURN) else np.split(rows, gaps)
         for part, piece in enumerate(pieces):
-            selected = {kind: values[piece] for kind, values in columns.items()}
-            u, q, q_dot = _resample(time[piece], selected, samples, rate)
+            columns = {}
+            for kind in kinds:
+                numbers = [np.asarray(table[kind + joint])[piece] for joint in joints]
+                columns[kind] = np.stack(numbers, axis=1, dtype=float)
+            u, q, q_dot = _resample(time[piece], columns, samples, rate)
             first = samples - 1 if part and not logged else 0  # rows before it need the gap
             if len(u) > first:
                 name = f"{run}#{part + 1}" if part else run
                 yield Recording(name, u[first:], q[first:], q_dot[first:])
 
 
-def _runs(path: Path, table: Table) -> dict[str, list[int]]:
-    """Rows of each recording."""
-    runs: dict[str, list[int]] = {}
-    for row, run in enumerate(cells_of(path, table, "run")):
-        if not run.strip():
-            raise ValueError(f"{path}: row {row + 2}, column run: expected a name, got {run!r}")
-        runs.setdefault(run, []).append(row)
-    return runs
+def _runs(path: Path, names: Sequence[str], time: Floats) -> dict[str, NDArray[np.intp]]:
+    """Rows of each recording; ValueError: time stamps that do not rise in one of them."""
+    numbers: dict[str, int] = {}
+    number = np.array([numbers.setdefault(name, len(numbers)) for name in names], np.intp)
+    order = np.argsort(number, kind="stable")
+    rows = np.split(order, np.flatnonzero(np.diff(number[order])) + 1)
+    for one in rows:
+        falls = np.flatnonzero(~(np.diff(time[one]) > 0))
+        if len(falls):
+            at, later = one[falls[0]], one[falls[0] + 1]
+            expected = f"expected later than {time[at]} within run {brief(names[at])}"
+            place = f"{path}: row {later + 2}, column time"
+            raise ValueError(f"{place}: {expected}, got {time[later]}")
+    return dict(zip(numbers, rows, strict=True))
 
 
-def _gaps(path: Path, run: str, rows: Sequence[int], time: Floats, rate: float) -> NDArray[np.intp]:
-    """Where to cut a recording; ValueError: time stamps that do not rise, or rise too slowly."""
+def _gaps(
+    path: Path, run: str, rows: NDArray[np.intp], time: Floats, rate: float
+) -> NDArray[np.intp]:
+    """Where to cut a recording; ValueError: time stamps that rise too slowly."""
     step = np.diff(time)
-    if not (step > 0).all():
-        late = int(np.argmin(step > 0)) + 1
-        expected = f"expected later than {time[late - 1]} within run {run!r}"
-        raise ValueError(f"{path}: row {rows[late] + 2}, column time: {expected}, got {time[late]}")
     if len(step) and np.median(step) > 1.05 / rate:
-        expected = f"expected {rate:g} Hz or more in run {run!r}"
+        expected = f"expected {rate:g} Hz or more in run {brief(run)}"
         got = f"got {1 / np.median(step):.3g} Hz"
         raise ValueError(f"{path}: row {rows[0] + 2}, column time: {expected}, {got}")
     return np.flatnonzero(step > MAX_GAP) + 1
@@ -252,12 +253,12 @@ def _resample(
     """u held, q and q_dot interpolated at `rate`; q_dot estimated where the log has none."""
     grid = time[0] + np.arange(int((time[-1] - time[0]) * rate + 1e-6) + 1) / rate
     held = np.searchsorted(time, grid + 1e-6, side="right") - 1
-    q = _interpolate(grid, time, columns["q"])
-    if "q_dot" in columns:
-        q_dot = _interpolate(grid, time, columns["q_dot"])
+    q = _interpolate(grid, time, columns["q_"])
+    if "q_dot_" in columns:
+        q_dot = _interpolate(grid, time, columns["q_dot_"])
     else:
         q_dot = velocity_of(q, samples, rate)
-    return columns["u"][held], q, q_dot
+    return columns["u_"][held], q, q_dot
 
 
 def _interpolate(grid: Floats, time: Floats, values: Floats) -> Floats:

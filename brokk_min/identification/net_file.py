@@ -9,21 +9,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min.actuator import ActuatorNet
-from brokk_min.identification.files import expected, load_arrays, load_header, whole_file
+from brokk_min.actuator import ActuatorNet, select_nets
+from brokk_min.identification.files import expected, load_arrays, load_header, located, whole_file
+from brokk_min.identification.formats import NET_ARRAYS, NET_HEADER, check_fields
+from brokk_min.machine import Machine
 
 FORMAT = 1
-NET_ARRAYS = ("input_mean", "input_scale", "output_low", "output_high", "q_low", "q_high")
+LARGEST_NET = 2**26  # bytes of a file
+STATISTICS = [name for name in NET_ARRAYS if not name.startswith("weight_")]
 
 
 def net_arrays(net: ActuatorNet) -> dict[str, Any]:
     """Nets as named arrays, as in the file; one of them is the JSON header."""
     header: dict[str, Any] = {"format": FORMAT, "kind": "actuator net"}
     for field in fields(net):
-        if field.name not in (*NET_ARRAYS, "weights"):
+        if field.name not in (*STATISTICS, "weights"):
             header[field.name] = getattr(net, field.name)
     arrays = {"header": np.array(json.dumps(header))}
-    arrays |= {name: getattr(net, name) for name in NET_ARRAYS}
+    arrays |= {name: getattr(net, name) for name in STATISTICS}
     return arrays | {f"weight_{i}": weight for i, weight in enumerate(net.weights)}
 
 
@@ -35,23 +38,24 @@ def fingerprint(net: ActuatorNet) -> str:
     return digest.hexdigest()[:16]
 
 
-def net_from_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> ActuatorNet:
-    """Nets from `net_arrays`; ValueError, with `path`, for another format or shape."""
+def net_from_arrays(path: Path, arrays: dict[str, NDArray[Any]], prefix: str = "") -> ActuatorNet:
+    """Nets from `net_arrays`; ValueError, with `path` and field, for what is no net.
+
+    `prefix` is that of the names of the arrays in the file.
+    """
     header = load_header(path, arrays, "actuator net", FORMAT)
+    sizes: dict[str, int] = {}
+    check_fields(path, header, NET_HEADER, sizes, prefix)
+    sizes["3 history"] = 3 * header["history"]
+    check_fields(path, arrays, NET_ARRAYS, sizes, prefix)
+    for name in ("output", "q"):
+        if not (arrays[f"{name}_low"] < arrays[f"{name}_high"]).all():
+            low, high = (arrays[f"{name}_{end}"].tolist() for end in ("low", "high"))
+            raise ValueError(f"{path}: {prefix}{name}_high: expected above {low}, got {high}")
     with expected(path, "a complete actuator net"):
         header["joints"] = tuple(header["joints"])
-        weights = tuple(arrays[f"weight_{i}"] for i in range(6))
-        header |= {name: arrays[name] for name in NET_ARRAYS}
-        net = ActuatorNet(**header, weights=weights)
-        n, inputs, hidden = len(net.joints), 3 * net.history, weights[0].shape[-1]
-        shapes = [(n, inputs, hidden), (n, hidden), (n, hidden, hidden), (n, hidden)]
-        shapes += [(n, hidden, 1), (n, 1), (n, inputs), (n, inputs), (n,), (n,), (n,), (n,)]
-        numbers = (*weights, *(arrays[name] for name in NET_ARRAYS))
-        got = [array.shape for array in numbers]
-        if got != shapes or any(array.dtype.kind != "f" for array in numbers):
-            types = sorted({str(array.dtype) for array in numbers})
-            raise ValueError(f"shapes {got} of {types} instead of {shapes} of floats")
-    return net
+        header |= {name: arrays[name] for name in STATISTICS}
+        return ActuatorNet(**header, weights=tuple(arrays[f"weight_{i}"] for i in range(6)))
 
 
 def save_net(path: Path, net: ActuatorNet) -> None:
@@ -60,6 +64,11 @@ def save_net(path: Path, net: ActuatorNet) -> None:
         np.savez(file, **net_arrays(net))
 
 
-def load_net(path: Path) -> ActuatorNet:
-    """Read nets that `save_net` wrote; ValueError as in `net_from_arrays`."""
-    return net_from_arrays(path, load_arrays(path))
+def load_net(path: Path, machine: Machine | None = None) -> ActuatorNet:
+    """Read nets that `save_net` wrote; for a `machine`: those of its driven joints.
+
+    ValueError as in `net_from_arrays`, or nets that are not for the machine.
+    """
+    with located(path):
+        net = net_from_arrays(path, load_arrays(path, largest=LARGEST_NET))
+        return select_nets(machine, net) if machine else net

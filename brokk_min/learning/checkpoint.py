@@ -1,10 +1,10 @@
 """Training of a policy with files: checkpoint, learning curve, TensorBoard, policy."""
 
-import csv
 import io
 import json
 import sys
 import time
+import zipfile
 from contextlib import closing
 from dataclasses import asdict, fields, replace
 from pathlib import Path
@@ -18,16 +18,27 @@ from tqdm import tqdm
 from brokk_min import ppo
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import State, TaskConfig, observation_scale
-from brokk_min.identification.files import expect_same, expected, require, whole_file, write_csv
+from brokk_min.identification.files import (
+    LARGEST,
+    LONGEST_LINE,
+    brief,
+    expect_same,
+    expected,
+    open_regular,
+    parse_json,
+    read_csv,
+    require,
+    whole_file,
+    write_csv,
+)
 from brokk_min.identification.net_file import fingerprint
-from brokk_min.learning.episodes import paper_weights
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import Policy, contract, save_policy
 from brokk_min.learning.simulation_gradient import gradient_advantages
 from brokk_min.machine import Machine
 from brokk_min.ppo import Agent, Learner, PPOConfig, Rollout
 
-FORMAT = 4  # of checkpoints
+FORMAT = 5  # of checkpoints
 LEARNER = ("obs", "learning_rate", "global_step", "updates")  # attributes in checkpoints
 STATE = [field.name for field in fields(State) if field.name != "plant"]
 
@@ -40,7 +51,7 @@ def describe_training(
     if settings["critic"]:
         settings["log_std_end"] = None
     return {
-        **contract(machine),
+        **contract(machine, task.paper),
         "actuator": fingerprint(net),
         "seed": seed,
         "task": asdict(task),
@@ -98,15 +109,15 @@ def stagger_episodes(env: TaskVectorEnv) -> None:
 def export_policy(
     machine: Machine, net: ActuatorNet, agent: Agent, task: TaskConfig, about: dict[str, Any]
 ) -> Policy:
-    """The actor as it stands; what the paper's agent does not observe has zero weights."""
+    """The actor as it stands."""
     weights = []
     for layer in agent.actor:
         if isinstance(layer, nn.Linear):
             weights += [layer.weight.T.detach().numpy().copy(), layer.bias.detach().numpy().copy()]
-    if task.paper:
-        weights[0] = weights[0] * paper_weights(machine)[:, None]
-    scale = observation_scale(machine)
-    return Policy(contract(machine), about, *scale, tuple(weights), net, task.valves)
+    about_task = contract(machine, task.paper)
+    scale = observation_scale(machine, task.paper)
+    valves = "open" if task.paper else task.valves
+    return Policy(about_task, about, *scale, tuple(weights), net, valves)
 
 
 class TrainingLog:
@@ -188,11 +199,10 @@ class TrainingLog:
         if self.writer is not None:
             self.writer.close()
 
-    def save(self, learner: Learner) -> None:
-        """Write a checkpoint from which a training continues to the same bits."""
-        header = {"format": FORMAT, "identity": self.about}
-        content = {
-            "header": json.dumps(header),
+    def content(self, learner: Learner) -> dict[str, Any]:
+        """What a checkpoint holds."""
+        return {
+            "header": json.dumps({"format": FORMAT, "identity": self.about}),
             "agent": learner.agent.state_dict(),
             "optimizer": learner.optimizer.state_dict(),
             "generator": learner.generator.get_state(),
@@ -203,8 +213,11 @@ class TrainingLog:
             "lengths": torch.tensor(self.lengths),
             "episodes": self.episodes,
         }
+
+    def save(self, learner: Learner) -> None:
+        """Write a checkpoint from which a training continues to the same bits."""
         buffer = io.BytesIO()
-        torch.save(content, buffer)
+        torch.save(self.content(learner), buffer)
         with whole_file(self.checkpoint) as file:
             file.write(buffer.getvalue())
 
@@ -213,15 +226,26 @@ class TrainingLog:
 
         ValueError: not a checkpoint, or one of another training, with the difference.
         """
-        try:
-            content = torch.load(self.checkpoint, weights_only=True)  # executes nothing
-            header = json.loads(content["header"])
-        except Exception as error:  # zipfile, pickle and torch raise anything on damaged files
-            text = f"expected a readable checkpoint, got {error!r}"
-            raise ValueError(f"{self.checkpoint}: {text}") from error
+        with expected(self.checkpoint, "a readable checkpoint"):
+            with open_regular(self.checkpoint, LARGEST) as file, zipfile.ZipFile(file) as archive:
+                if any(member.compress_size != member.file_size for member in archive.infolist()):
+                    raise ValueError("compressed members")
+                file.seek(0)
+                content = torch.load(file, weights_only=True)  # executes nothing
+            header = parse_json(content["header"])
+            identity = dict(header["identity"])
         expect_same(self.checkpoint, header, {"format": FORMAT})
-        expect_same(self.checkpoint, header["identity"], self.about)
+        expect_same(self.checkpoint, identity, self.about)
+        like = self.content(learner)
         with expected(self.checkpoint, "a complete checkpoint"):
+            moments = {}
+            parameters = learner.optimizer.param_groups[0]["params"]
+            for i in content["optimizer"]["state"]:
+                parameter = parameters[i].detach()
+                moments[i] = {"step": torch.zeros(()), "exp_avg": parameter}
+                moments[i]["exp_avg_sq"] = parameter
+            like["optimizer"]["state"] = moments
+            check_like(self.checkpoint, "content", content, like)
             learner.agent.load_state_dict(content["agent"])
             learner.optimizer.load_state_dict(content["optimizer"])
             learner.generator.set_state(content["generator"])
@@ -234,7 +258,31 @@ class TrainingLog:
             self.episodes = content["episodes"]
 
 
+def check_like(path: Path, place: str, value: Any, like: Any) -> None:
+    """ValueError: `value` has other keys, types or shapes than `like`, or is not finite."""
+    wanted, got = type(like).__name__, type(value).__name__
+    if isinstance(like, torch.Tensor) and isinstance(value, torch.Tensor):
+        wanted, got = (f"{list(x.shape)} of {x.dtype}" for x in (like, value))
+        if value.shape == like.shape and value.is_floating_point() == like.is_floating_point():
+            got = wanted if torch.isfinite(value).all() else "nan or inf"
+    elif isinstance(like, dict) and isinstance(value, dict):
+        wanted, got = brief(sorted(map(str, like))), brief(sorted(map(str, value)))
+        for key in like if value.keys() == like.keys() else ():
+            check_like(path, f"{place}.{key}", value[key], like[key])
+    elif isinstance(like, list | tuple) and type(value) is type(like) and len(value) == len(like):
+        for i, pair in enumerate(zip(value, like, strict=True)):
+            check_like(path, f"{place}[{i}]", *pair)
+    elif isinstance(value, float) and not np.isfinite(value):
+        got = str(value)
+    if got != wanted:
+        raise ValueError(f"{path}: {place}: expected {wanted}, got {got}")
+
+
 def read_curve(path: Path, last_step: int) -> list[dict[str, Any]]:
     """Rows of a curve up to a step; ValueError: no such file, or another one."""
-    with expected(path, "the curve of the checkpoint"), open(path, newline="") as file:
-        return [row for row in csv.DictReader(file) if int(row["global_step"]) <= last_step]
+    with expected(path, "the curve of the checkpoint"):
+        with open_regular(path) as file:
+            columns = file.readline(LONGEST_LINE).decode().strip().split(",")
+        table = read_csv(path, columns)
+        rows = [dict(zip(columns, row, strict=True)) for row in zip(*table.values(), strict=True)]
+        return [row for row in rows if int(row["global_step"]) <= last_step]

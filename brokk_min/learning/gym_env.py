@@ -70,7 +70,7 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         self.net = load_actuator(machine, actuator)
         self.renderer = renderer
         self.render_mode = renderer.mode if renderer else None
-        size = len(observation_scale(machine)[0])
+        size = len(observation_scale(machine, self.config.paper)[0])
         self.single_observation_space = Box(-np.inf, np.inf, (size,), np.float32)
         self.single_action_space = Box(-1.0, 1.0, (len(machine.driven),), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)

@@ -13,12 +13,13 @@ from brokk_min.actuator import ActuatorNet, close_valves, select_nets
 from brokk_min.env import Measured, action_to_pwm, features, observation_scale
 from brokk_min.identification.files import (
     expect_same,
-    expected,
     load_arrays,
     load_header,
+    located,
     whole_file,
 )
-from brokk_min.identification.net_file import net_arrays, net_from_arrays
+from brokk_min.identification.formats import POLICY_ARRAYS, POLICY_HEADER, check_fields
+from brokk_min.identification.net_file import LARGEST_NET, net_arrays, net_from_arrays
 from brokk_min.machine import Array, Machine
 
 FORMAT = 3  # of policy files
@@ -35,6 +36,11 @@ class Policy:
     weights: tuple[Array, ...]  # w, b of each layer, w (inputs, outputs)
     net: ActuatorNet  # the simulation it was trained in, kept with it
     valves: str = "closed"  # or "open", while the tool rests; see `actuator.close_valves`
+
+    @property
+    def paper(self) -> bool:
+        """Does it take the observation and the actions of the paper's agent?"""
+        return bool(self.contract.get("paper", False))
 
     def act(self, observation: Array) -> Array:
         """Actions (..., n_driven), not clipped, for observations (..., obs) of `env.features`.
@@ -72,13 +78,16 @@ class PolicyController:
         self, measured: Measured, ticks: NDArray[np.int64]
     ) -> tuple[Array, NDArray[np.int64]]:
         """Commands u (num, n), and the ticks of `start` one tick on."""
-        u = action_to_pwm(self.machine, self.policy.act(features(self.machine, measured)))
-        return close_valves(self.machine, self.policy.valves, u, measured.v_goal, ticks)
+        machine, paper = self.machine, self.policy.paper
+        action = self.policy.act(features(machine, measured, paper))
+        u = action_to_pwm(machine, action, paper)
+        return close_valves(machine, self.policy.valves, u, measured.v_goal, ticks)
 
 
-def contract(machine: Machine) -> dict[str, Any]:
+def contract(machine: Machine, paper: bool = False) -> dict[str, Any]:
     """What training and deployment must agree on; kept in the file and checked by `load_policy`."""
     return {
+        "paper": paper,
         "machine": machine.name,
         "joints": list(machine.names),
         "driven": [machine.names[i] for i in machine.driven],
@@ -113,25 +122,26 @@ def load_policy(path: Path, machine: Machine) -> Policy:
     ValueError: not a policy file, or one for another machine, joint order, history, rate or scale,
     with what was expected and what was found.
     """
-    arrays = load_arrays(path)
+    arrays = load_arrays(path, largest=LARGEST_NET)
     header = load_header(path, arrays, "policy", FORMAT)
-    recorded = header.get("contract", {})
-    expect_same(path, recorded, contract(machine))
-    with expected(path, "a complete policy"):
-        net = {name[4:]: array for name, array in arrays.items() if name.startswith("net_")}
-        policy = Policy(
+    check_fields(path, header, POLICY_HEADER, {})
+    recorded = {"paper": False, **header["contract"]}
+    paper = recorded["paper"]
+    expect_same(path, recorded, contract(machine, paper))
+    scales = dict(zip(("mean", "scale"), observation_scale(machine, paper), strict=True))
+    sizes = {"obs": len(scales["mean"]), "driven": len(machine.driven)}
+    check_fields(path, arrays, POLICY_ARRAYS, sizes)
+    for name, value in scales.items():
+        if not np.array_equal(arrays[name], value):
+            raise ValueError(f"{path}: {name}: expected the machine's normalisation, got another")
+    net = {name[4:]: array for name, array in arrays.items() if name.startswith("net_")}
+    with located(path):
+        return Policy(
             contract=recorded,
             training=header["training"],
             mean=arrays["mean"],
             scale=arrays["scale"],
             weights=tuple(arrays[f"weight_{i}"] for i in range(8)),
-            net=select_nets(machine, net_from_arrays(path, net)),
+            net=select_nets(machine, net_from_arrays(path, net, "net_")),
             valves=header.get("valves", "closed"),
         )
-        action = policy.act(policy.mean)
-    if action.shape != machine.driven.shape or not np.isfinite(action).all():
-        raise ValueError(f"{path}: weights: expected {len(machine.driven)} actions, got {action}")
-    for name, value in zip(("mean", "scale"), observation_scale(machine), strict=True):
-        if not np.array_equal(arrays[name], value):
-            raise ValueError(f"{path}: {name}: expected the machine's normalisation, got another")
-    return policy

@@ -1,6 +1,5 @@
 """Recorded runs side by side, of logs or of results simulated again: in a window or as a film."""
 
-import json
 import subprocess
 from collections.abc import Iterable, Sequence
 from contextlib import closing
@@ -20,7 +19,7 @@ from brokk_min.can.drive_log import TelemetryReader, read_frames
 from brokk_min.evaluation import baselines, metrics
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.evaluation.sequences import Commands, goals_and_starts, task_sequences
-from brokk_min.identification.files import expected, whole_file
+from brokk_min.identification.files import expected, read_json, whole_file
 from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocity
 from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import Array, Machine
@@ -102,7 +101,7 @@ def read_results(machine: Machine, path: Path, controllers: Sequence[str]) -> Re
     ValueError: no results, or of another machine, or the files named in it are wrong.
     """
     with expected(path, "results of `evaluate`"):
-        file = json.loads(path.read_text())
+        file = read_json(path, "results of `evaluate`")
         meta = {"plant": "analytic", "commands": "", "starts": "", **file["meta"]}
         rows = file.get("task_space", file)["runs"]
         seed = int(meta["seed"])

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 
 import numpy as np
 import pytest
 from helpers_cli import run
 
 from brokk_min.cli.commands import split
+from brokk_min.env import TaskConfig
 from brokk_min.evaluation import baselines
 from brokk_min.evaluation.metrics import summary
 from brokk_min.evaluation.sequences import read_starts, start_kinds
 from brokk_min.identification.files import SHIPPED
 from brokk_min.identification.logs import Log, Recording, read_log, write_log
 from brokk_min.identification.net_file import load_net, save_net
+from brokk_min.learning.episodes import PAPER_LEARNER, PAPER_TASK
 from brokk_min.learning.policy import load_policy
 from brokk_min.machine import BROKK_170
+from brokk_min.ppo import PPOConfig
 
 SHIPPED_POLICY = SHIPPED / "brokk170" / "policy.npz"
 SHIPPED_GAINS = SHIPPED / "brokk170" / "gains.json"
@@ -95,10 +99,10 @@ def test_fit__writes_nothing_for_a_bad_log(tmp_path, capsys):
     foreign_log(path, 0, 1)
     lines = path.read_text().splitlines()
     lines[16] = lines[16].replace("take 0,", "take 0,x", 1)
-    path.write_text("\n".join(lines))
+    path.write_text("\n".join([*lines, ""]))
     files = ["--out", tmp_path / "n.npz", "--json", tmp_path / "f.json"]
     assert run("fit", path, *files) == 1
-    assert "row 17, column time: expected a number" in capsys.readouterr().err
+    assert "row 17, column time: expected finite number" in capsys.readouterr().err
     assert [p.name for p in tmp_path.iterdir()] == ["log.csv"]
 
 
@@ -142,14 +146,17 @@ def test_fit__takes_rate_and_velocity_window_of_the_machine(tmp_path):
 def test_fit__refuses_the_log_of_another_machine(tmp_path, capsys):
     write_log(tmp_path / "log.csv", steady_log(("a", "b"), 2))
     assert run(f"fit '{tmp_path}/log.csv' --machine brokk170 --out '{tmp_path}/n.npz'") == 1
-    assert "LOGS: expected joints of --machine brokk170, got ['a', 'b']" in capsys.readouterr().err
+    assert (
+        "log.csv: joints: expected those of --machine brokk170, got ('a', 'b')"
+        in capsys.readouterr().err
+    )
 
 
 def test_split__holds_out_every_tenth_recording():
     kept, held_out = split(steady_log(("a",), 21))
     assert [recording.name for recording in held_out.recordings] == ["0", "10", "20"]
     assert len(kept.recordings) == 18
-    with pytest.raises(ValueError, match=r"^LOGS: expected two or more recordings, or --test"):
+    with pytest.raises(ValueError, match=r"^recordings: expected two or more, or --test"):
         split(steady_log(("a",), 1))
 
 
@@ -201,6 +208,11 @@ def test_train__can_use_a_critic(option, folder, tmp_path):
     assert training["settings"]["critic"] is True
     assert training["settings"]["log_std_end"] is None
     assert training["seed"] == 5
+    assert training["settings"]["total_steps"] == 512  # options given count
+    defaults = asdict(PPOConfig()) | (PAPER_LEARNER if option == "--paper" else {})
+    assert training["settings"]["gamma"] == defaults["gamma"]
+    hold = PAPER_TASK["hold_min_s"] if option == "--paper" else TaskConfig().hold_min_s
+    assert training["task"]["hold_min_s"] == hold
 
 
 def test_evaluate__writes_what_it_used(folder, capsys):

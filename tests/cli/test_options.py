@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated
 
 import pytest
@@ -57,15 +58,47 @@ def test_check_ranges__names_option_range_and_value(options, message):
         check_ranges(options)
 
 
+@dataclass(kw_only=True)
+class Convert(Command):
+    """A command with an input, an output and a second one."""
+
+    logs: tuple[Path, ...] = ()
+    out: Path
+    json: Path | None = None
+
+
 def test_check__gives_the_machine_if_outputs_can_be_written(tmp_path):
-    assert Command().check(tmp_path / "new.csv", None) is BROKK_170
+    assert Convert(out=tmp_path / "new.csv").check(out="log", json="scores") is BROKK_170
     assert Command(machine="").check() is BROKK_170
     assert Command(seed=2**31 - 1).check() is BROKK_170
     with pytest.raises(WrongUse, match=r"^--seed: expected 0 to 2147483647, got -1$"):
         Command(seed=-1).check()
     for path in (tmp_path, tmp_path / "missing" / "new.csv"):
         with pytest.raises(WrongUse, match=f"^{re.escape(str(path))}: expected a file in an exist"):
-            Command().check(None, path)
+            Convert(out=path).check(out="log")
+
+
+def test_check__writes_over_no_input_and_over_no_other_kind(tmp_path):
+    """A log may replace a log; a table, a picture and a device only an empty or forced file."""
+    log, table = tmp_path / "log.csv", tmp_path / "table.csv"
+    log.write_text("run,time,u_a,q_a\n")
+    table.write_text("year,income\n")
+    (tmp_path / "empty").touch()
+    (tmp_path / "link").symlink_to(log)
+    (tmp_path / "null").symlink_to("/dev/null")
+    for path in (log, tmp_path / "empty"):
+        Convert(out=path).check(out="log")
+    Convert(out=table, force=True).check(out="log")
+    for path, message in ((table, "['income', 'year']"), (tmp_path / "null", "no regular file")):
+        with pytest.raises(WrongUse, match=re.escape(f"{path}: expected no file, or one of kind")):
+            Convert(out=path).check(out="log")
+        with pytest.raises(WrongUse, match=re.escape(message)):
+            Convert(out=path, force="null" in path.name).check(out="log")
+    for path in (log, tmp_path / "link"):
+        with pytest.raises(WrongUse, match="expected another file than an input to write"):
+            Convert(logs=(table, log), out=path, force=True).check(out="log")
+    with pytest.raises(WrongUse, match="--out, --json: expected different files"):
+        Convert(out=log, json=log).check(out="log", json="scores")
 
 
 def test_find_machine__runs_a_file(tmp_path):
@@ -79,7 +112,7 @@ def test_find_machine__runs_a_file(tmp_path):
     with pytest.raises(WrongUse, match=r"one of \['brokk170'\] or FILE.py:NAME, got digger$"):
         find_machine("digger")
     file.write_text("raise KeyError('no')")
-    with pytest.raises(ValueError, match=r"expected .*a:b.py to run, got KeyError\('no'\)$"):
+    with pytest.raises(ValueError, match=r"expected .*a:b.py to run, got KeyError: 'no'$"):
         find_machine(f"{file}:MINE")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -193,40 +192,21 @@ def test_read_gains__refuses_a_file_without_the_gains_of_a_baseline(tmp_path):
     older = baselines.baselines(BROKK_170, NET)
     del older["jacobian_pid_ff_integral"]
     baselines.write_gains(path, older, meta)
-    with pytest.raises(ValueError, match=r"no gains of \['jacobian_pid_ff_integral'\]: tune again"):
+    with pytest.raises(ValueError, match=r"gains\.jacobian_pid_ff_integral: .* tune again"):
         baselines.read_gains(path, BROKK_170, NET)
 
 
 @pytest.mark.parametrize(
     ("meta", "message"),
     [
-        ({"machine": "digger"}, "digger"),
-        ({"actuator": "0123456789abcdef"}, "0123456789abcdef"),
-        ({"actuator": None}, "'actuator': None"),
+        ({"machine": "digger"}, "machine: expected 'brokk170', got 'digger'"),
+        ({"actuator": "0123456789abcdef"}, r"actuator: expected '\w+', got '0123456789abcdef'"),
+        ({"actuator": None}, "meta.actuator: expected text of .*, got None"),
     ],
 )
 def test_read_gains__refuses_gains_of_another_machine_or_other_nets(tmp_path, meta, message):
     path = tmp_path / "gains.json"
     own = baselines.gains_metadata(BROKK_170, NET)
     baselines.write_gains(path, baselines.baselines(BROKK_170, NET), own | meta)
-    expected = rf"gains.json: expected gains for brokk170 with nets {own['actuator']}.*{message}"
-    with pytest.raises(ValueError, match=expected):
-        baselines.read_gains(path, BROKK_170, NET)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"kp": [1, 2]}, "shape"),
-        ({"ki": [1, 2, 3, float("nan")]}, "finite"),
-        ({"kd": "fast"}, "fast"),
-    ],
-)
-def test_read_gains__refuses_damaged_gains(tmp_path, change, message):
-    path = tmp_path / "gains.json"
-    table = baselines.gains_table(baselines.baselines(BROKK_170, NET))
-    table["jacobian_pid_ff"] |= change
-    meta = baselines.gains_metadata(BROKK_170, NET)
-    path.write_text(json.dumps({"meta": meta, "gains": table}))
-    with pytest.raises(ValueError, match=rf"gains.json: expected gains for brokk170.*{message}"):
+    with pytest.raises(ValueError, match=rf"gains\.json: {message}"):
         baselines.read_gains(path, BROKK_170, NET)

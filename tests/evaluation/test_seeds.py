@@ -103,7 +103,7 @@ def test_run_seed__trains_again_over_another_training_and_resumes_its_own(tmp_pa
 def test_run_seed__refuses_results_of_something_else(tmp_path):
     seed_job(tmp_path)(4)
     other = PPOConfig(num_envs=4, horizon=8, total_steps=32)
-    with pytest.raises(ValueError, match=r"seed_4\.json: settings: expected \{"):
+    with pytest.raises(ValueError, match=r"seed_4\.json: settings.horizon: expected 8, got 4"):
         seed_job(tmp_path, config=other)(4)
     (tmp_path / "seed_4.json").write_text("{")
     with pytest.raises(ValueError, match=r"seed_4\.json: expected the result of a seed, got JSOND"):
@@ -180,18 +180,18 @@ def test_read_seeds__reads_what_a_sweep_wrote(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "text",
+    ("text", "message"),
     [
-        "{",
-        "[]",
-        '{"table": {"rl": {"velocity_error_all": {"mean": 1, "low": 0, "high": 2}}}}',
-        '{"meta": {}, "table": {"rl": {"velocity_error_all": {"mean": 1}}}}',
+        ("{", r"expected the sweep\.json of a sweep, got JSONDecodeError"),
+        ("[]", r"content: expected names \['meta', 'table'\], got \[\]"),
+        ('{"meta": {"machine": "m"}}', "meta.actuator: expected text of 1 to 200 char.*, got none"),
     ],
 )
-def test_read_seeds__refuses_other_files(tmp_path, text):
+def test_read_seeds__refuses_other_files(tmp_path, text, message):
+    """`tests/fuzz.py` makes the others, from the description of the fields."""
     path = tmp_path / "sweep.json"
     path.write_text(text)
-    with pytest.raises(ValueError, match=r"sweep\.json: expected the sweep\.json of a sweep, got "):
+    with pytest.raises(ValueError, match=rf"sweep\.json: {message}"):
         seeds.read_seeds(path)
 
 

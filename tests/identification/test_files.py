@@ -11,12 +11,15 @@ import pytest
 from brokk_min.identification.files import (
     expect_same,
     load_arrays,
-    read_table,
+    located,
+    names_in,
+    parse_json,
     require,
     whole_file,
     write_csv,
     write_json,
 )
+from brokk_min.identification.formats import read_table
 
 
 def test_read_table__reads_numbers_and_text(tmp_path):
@@ -118,11 +121,62 @@ def test_load_arrays__takes_no_memory_that_the_file_size_does_not_justify(tmp_pa
         load_arrays(path)
 
 
+@pytest.mark.parametrize("name", ["pipe", "zero", "folder"])
+def test_load_arrays__reads_regular_files_only(tmp_path, name):
+    os.mkfifo(tmp_path / "pipe.npz")
+    (tmp_path / "zero.npz").symlink_to("/dev/zero")
+    (tmp_path / "folder.npz").mkdir()
+    with pytest.raises(ValueError, match=rf"{name}\.npz: expected a readable, regular file"):
+        load_arrays(tmp_path / f"{name}.npz")
+
+
+def test_whole_file__does_not_replace_a_device(tmp_path):
+    (tmp_path / "null").symlink_to("/dev/null")
+    with pytest.raises(ValueError, match="null: expected a regular file to replace"):
+        write_json(tmp_path / "null", 1)
+
+
+def test_parse_json__refuses_deep_and_repeated_content():
+    assert parse_json('{"a": [1, 2.5, null]}') == {"a": [1, 2.5, None]}
+    for text, message in (
+        ("[" * 40 + "]" * 40, "at most 32"),
+        ('{"a": 1, "a": 2}', "each key once"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            parse_json(text)
+
+
+def test_names_in__tells_kinds_of_files_apart(tmp_path):
+    contents = {
+        b"run,time\n": {"run", "time"},
+        b'{"meta": 1, "runs": []}': {"meta", "runs"},
+        b"\x89PNG\r\n": {"PNG"},
+        b"(1.0) can0 080#\n": {"candump"},
+        b"PK\x03\x04": set(),
+        b"{": set(),
+    }
+    for content, names in contents.items():
+        (tmp_path / "file").write_bytes(content)
+        assert names_in(tmp_path / "file") == names
+
+
+def test_located__puts_the_file_in_front_once(tmp_path):
+    for text in ("joint a: expected", "a.csv: joint a: expected"):
+        match = r"^a\.csv( and 1 more)?: joint a: expected$"
+        with pytest.raises(ValueError, match=match), located("a.csv", "b.csv"):
+            raise ValueError(text)
+
+
 def test_expect_same__names_the_first_entry_that_differs(tmp_path):
-    header = {"machine": "brokk170", "rate": 20.0}
+    header = {"machine": "brokk170", "rate": 20.0, "task": {"noise": 0.1}, "table": [[1], [2]]}
     expect_same(tmp_path, header, header)
-    with pytest.raises(ValueError, match=r"rate: expected 25\.0, got 20\.0"):
-        expect_same(tmp_path, header, {"machine": "brokk170", "rate": 25.0})
+    for name, value, message in (
+        ("rate", 25.0, r"rate: expected 25\.0, got 20\.0"),
+        ("task", {"noise": 0.2}, r"task\.noise: expected 0\.2, got 0\.1"),
+        ("table", [[1], [3]], r"table\[1\]: expected \[3\], got \[2\]"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            expect_same(tmp_path, header, header | {name: value})
 
 
 def test_require__names_the_extra_that_brings_a_missing_package():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import io
 
 import numpy as np
 import pytest
@@ -309,7 +308,7 @@ def test_starts__keeps_the_required_samples_around_within_one_recording(lengths,
     assert join_recordings(log).starts(before, after, 1).tolist() == expected
 
 
-# --- bad logs -------------------------------------------------------------------------------------
+# --- bad logs: `tests/fuzz.py` makes more, from the description of the columns --------------------
 
 GOOD = """run,time,u_a,q_a
 x,0.00,0.1,1.0
@@ -318,66 +317,52 @@ x,0.10,0.3,1.2
 x,0.15,0.4,1.3
 """
 BAD_CSV = {
-    "empty file": ("", ["header and at least one row", "got 0 rows"]),
-    "no run": ("\n".join(line.partition(",")[2] for line in GOOD.splitlines()),
-        ["row 1", "a column run", "['time', 'u_a', 'q_a']"]),
-    "no time": (GOOD.replace("time", "t"),
-        ["row 1", "a column time", "['run', 't', 'u_a', 'q_a']"]),
-    "no command": (GOOD.replace("u_a", "a"), ["row 1", "u_<joint>", "['run', 'time', 'a', 'q_a']"]),
-    "no angle": (GOOD.replace("q_a", "angle"), ["row 1", "a column q_a", "'angle'"]),
-    "velocity of another joint": ("run,time,u_a,q_a,q_dot_b\nx,0,0,0,0\nx,0.05,0,0,0\n",
-        ["row 1", "a column u_b for q_dot_b"]),
-    "text in a cell": (GOOD.replace("0.3", "off"), ["row 4", "column u_a", "number", "'off'"]),
-    "empty cell": (GOOD.replace("1.1", ""), ["row 3", "column q_a", "number", "''"]),
-    "decimal comma": (GOOD.replace("1.2", "1,2"), ["row 4", "expected 4 cells", "got 5"]),
-    "NaN angle": (GOOD.replace("1.3", "nan"), ["row 5", "column q_a", "finite", "nan"]),
-    "repeated time": (GOOD.replace("0.10", "0.05"),
-        ["row 4", "column time", "later than 0.05", "'x'"]),
-    "command in percent": (GOOD.replace("0.2", "63"), ["row 3", "column u_a", "[-1, 1]", "63"]),
-    "wrong delimiter": (GOOD.replace(",", ";"), ["row 1", "u_<joint>", "run;time;u_a;q_a"]),
-    "column twice": (GOOD.replace("q_a", "u_a", 1), ["row 1", "once", "['u_a']"]),
-    "too slow": (
-        "run,time,u_a,q_a\nfast,0,0,0\nfast,0.05,0,0\nslow,0,0,0\nslow,0.1,0,0\nslow,0.2,0,0\n",
-        ["row 4", "column time", "20 Hz", "'slow'", "10 Hz"]),
-    "half the velocities": ("run,time,u_a,u_b,q_a,q_b,q_dot_a\nx,0,0,0,0,0,0\nx,0.05,0,0,0,0,0\n",
-        ["row 1", "a column q_dot_b"]),
-    "command as PWM byte": (GOOD.replace("0.4", "175"),
-        ["row 5", "column u_a", "not percent or bytes", "175"]),
-    "angle in degrees": (GOOD.replace("1.2", "68.8"),
-        ["row 4", "column q_a", "rad, not degrees", "68.8"]),
-    "time in milliseconds": ("run,time,u_a,q_a\nx,0,0,0\nx,50,0,0\nx,100,0,0\n",
-        ["row 2", "column time", "20 Hz", "0.02 Hz"]),
-    "no name": (GOOD.replace("x,0.10", " ,0.10"), ["row 4", "column run", "a name", "' '"]),
-    "velocity in degrees": ("run,time,u_a,q_a,q_dot_a\nx,0,0,0,0\nx,0.05,0,0,-90\n",
-        ["row 3", "column q_dot_a", "rad/s, not degrees/s", "-90"]),
+    "empty file": ("", "header and at least one row, got 0 rows"),
+    "no run": (GOOD.replace("run", "r"), "row 1: expected a column run, got ['r', 'time'"),
+    "no angle": (GOOD.replace("q_a", "angle"), "row 1: expected a column q_a, got"),
+    "text in a cell": (GOOD.replace("0.3", "off"), "row 4, column u_a: expected finite number"),
+    "decimal comma": (GOOD.replace("1.2", "1,2"), "row 4: expected 4 cells, got 5"),
+    "blank line": (GOOD.replace("x,0.10", "\nx,0.10"), "row 4: expected 4 cells, got 0"),
+    "repeated time": (GOOD.replace("0.10", "0.05"), "row 4, column time: expected later than 0.05"),
+    "percent": (GOOD.replace("0.2", "63"), "not percent or bytes), got 63"),
+    "degrees": (GOOD.replace("1.2", "68.8"), "(rad, not degrees), got 68.8"),
+    "wrong delimiter": (GOOD.replace(",", ";"), "row 1: expected columns u_<joint>"),
+    "column twice": (GOOD.replace("q_a", "u_a", 1), "expected each column once, got ['u_a']"),
+    "too slow": ("run,time,u_a,q_a\nslow,0,0,0\nslow,0.1,0,0\nslow,0.2,0,0\n",
+        "row 2, column time: expected 20 Hz or more in run 'slow', got 10 Hz"),
+    "half the velocities": ("run,time,u_a,u_b,q_a,q_b,q_dot_a\nx,0,0,0,0,0,0\n",
+        "row 1: expected a column q_dot_b"),
+    "no name": (GOOD.replace("x,0.10", " ,0.10"), "row 4, column run: expected text of 1 to 200"),
     "earlier in its own recording": (
         "run,time,u_a,q_a\nx,1.00,0,0\ny,7.00,0,0\nx,1.05,0,0\ny,7.05,0,0\nx,1.02,0,0\n",
-        ["row 6", "column time", "later than 1.05", "'x'", "got 1.02"]),
+        "row 6, column time: expected later than 1.05 within run 'x', got 1.02"),
+    "fewer digits": (GOOD[:-2], "expected a newline at its end, got a cut row: 'x,0.15,0.4,1.'"),
+    "endless line": ("run,time," + 2**20 * "a", "row 1: expected shorter lines, got 1048576 bytes"),
 }  # fmt: skip
 
-BAD_BYTES = {
-    "UTF-16": GOOD.encode("utf-16"),
-    "Latin-1": GOOD.replace("x", "Gr\xfcn").encode("latin-1"),
-    "zeros": GOOD.encode() + bytes(40),
-    "picture": b"\x89PNG\r\n\x1a\n\xf0\xf1",
-    "gzip": gzip.compress(GOOD.encode()),
-}
 
-
-def refusal(path, content):
-    path.write_bytes(content)
+@pytest.mark.parametrize("case", BAD_CSV)
+def test_read_log__names_file_and_place_of_a_bad_csv(tmp_path, case):
+    text, message = BAD_CSV[case]
+    (tmp_path / "bad.csv").write_text(text)
     with pytest.raises(ValueError) as caught:
-        read_log([path], 4)
-    message = str(caught.value)
-    assert message.startswith(f"{path}: ") and "expected" in message and "got" in message
-    return message
+        read_log([tmp_path / "bad.csv"], 4)
+    assert str(caught.value).startswith(f"{tmp_path / 'bad.csv'}: ")
+    assert message in str(caught.value)
 
 
-@pytest.mark.parametrize("case", [*BAD_CSV, *BAD_BYTES])
-def test_read_log__names_file_row_and_column_of_a_bad_csv(tmp_path, case):
-    text, words = BAD_CSV.get(case, ("", []))
-    message = refusal(tmp_path / "bad.csv", BAD_BYTES.get(case, text.encode()))
-    assert all(word in message for word in words), message
+@pytest.mark.parametrize(
+    "content",
+    [
+        GOOD.encode("utf-16"),
+        GOOD.replace("x", "\xfc").encode("latin-1"),
+        gzip.compress(b"run,time"),
+    ],
+)
+def test_read_log__refuses_what_is_no_utf_8_text(tmp_path, content):
+    (tmp_path / "bad.csv").write_bytes(content)
+    with pytest.raises(ValueError, match=r"bad\.csv: expected a readable CSV table, got Unicode"):
+        read_log([tmp_path / "bad.csv"], 4)
 
 
 def test_read_log__accepts_the_table_above_also_with_spaces_blank_lines_and_a_byte_order_mark(
@@ -392,64 +377,25 @@ def test_read_log__accepts_the_table_above_also_with_spaces_blank_lines_and_a_by
         np.testing.assert_allclose(recording.u[:, 0], [0.1, 0.2, 0.3, 0.4])
 
 
-def npz(**columns):
-    file = io.BytesIO()
-    np.savez(file, allow_pickle=True, **columns)
-    return file.getvalue()
-
-
-def npy(array):
-    file = io.BytesIO()
-    np.save(file, array)
-    return file.getvalue()
-
-
 TIMES = np.arange(6) / 20
 FINE = {"run": np.array(["x"] * 6), "time": TIMES, "u_a": TIMES, "q_a": TIMES}
-BAD_NPZ = {
-    "empty file": (b"", []),
-    "text": (GOOD.encode(), []),
-    "truncated": (npz(**FINE)[:-40], []),
-    "cut in half": (npz(**FINE)[: len(npz(**FINE)) // 2], []),
-    "no arrays": (npz(), ["columns"]),
-    "lengths differ": (npz(**FINE | {"q_a": TIMES[:-1]}), ["one length", "(5,)", "(6,)"]),
-    "two dimensions": (npz(**{k: v[:, None] for k, v in FINE.items()}), ["one length", "(6, 1)"]),
-    "objects": (npz(**FINE | {"run": np.array(["x"] * 6, object)}), ["pickle"]),
-    "text for numbers": (npz(**FINE | {"u_a": FINE["run"]}), ["column u_a", "numbers", "<U1"]),
-    "complex": (npz(**FINE | {"q_a": TIMES + 0j}), ["column q_a", "numbers", "complex128"]),
-    "numbers for runs": (npz(**FINE | {"run": TIMES}), ["column run", "text", "float64"]),
-    "no time": (npz(**{k: v for k, v in FINE.items() if k != "time"}), ["column time"]),
-    "no run": (npz(**{k: v for k, v in FINE.items() if k != "run"}), ["column run"]),
-    "not a number": (npz(**FINE | {"q_a": TIMES + np.nan}), ["column q_a", "finite", "nan"]),
-    "no rows": (npz(**{k: v[:0] for k, v in FINE.items()}), ["at least one recording"]),
-    "one array, not a table": (npy(TIMES), []),
-}
 
 
-@pytest.mark.parametrize("case", BAD_NPZ)
-def test_read_log__names_file_and_column_of_a_bad_npz(tmp_path, case):
-    content, words = BAD_NPZ[case]
-    message = refusal(tmp_path / "bad.npz", content)
-    assert all(word in message for word in words), message
-
-
-@pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
-def test_read_log__reads_or_refuses_a_file_with_a_flipped_byte(tmp_path, save):
-    path = tmp_path / "log.npz"
-    save(path, **FINE)
-    whole = path.read_bytes()
-    rng = np.random.default_rng(0)
-    refused = 0
-    for _ in range(400):
-        damaged = bytearray(whole)
-        damaged[rng.integers(len(whole))] ^= int(rng.integers(1, 256))
-        path.write_bytes(damaged)
-        try:
-            read_log([path], 4)
-        except ValueError as error:
-            refused += 1
-            assert str(path) in str(error)
-    assert refused > 100
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({}, "row 1: expected a column run, got []"),
+        (FINE | {"q_a": TIMES[:-1]}, "q_a: expected"),
+        (FINE | {"u_a": FINE["run"]}, "u_a: expected"),
+        (FINE | {"q_a": TIMES + np.nan}, "row 2, column q_a: expected finite"),
+        ({k: v[:0] for k, v in FINE.items()}, "expected at least one row, got none"),
+    ],
+)
+def test_read_log__names_file_and_column_of_a_bad_npz(tmp_path, columns, message):
+    np.savez(tmp_path / "bad.npz", **columns)
+    with pytest.raises(ValueError) as caught:
+        read_log([tmp_path / "bad.npz"], 4)
+    assert str(caught.value).startswith(f"{tmp_path / 'bad.npz'}: {message}")
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".npz"])

@@ -103,6 +103,23 @@ def test_step__a_pose_in_the_ground_terminates_without_reward(ticks):
     assert np.array_equal(info["_final_obs"], terminated | truncated)
 
 
+def test_step__of_the_paper_terminates_for_a_start_in_the_ground_alone():
+    """An arm that is moved into the ground goes on; one that starts there ends, unrewarded."""
+    env = TaskVectorEnv(400, config=TaskConfig(paper=True))
+    env.reset(seed=7)
+    buried = closed_form(env.state.q)[1] < 0
+    _, reward, terminated, *_ = env.step(np.zeros((400, 4), np.float32))
+    assert np.array_equal(terminated, buried)
+    assert not reward[buried].any()
+    started = env.state.ticks == 0
+    for _ in range(40):
+        below = env.state.lowest < BROKK_170.ground
+        _, reward, terminated, _, _ = env.step(np.full((400, 4), -1.0, np.float32))
+        assert np.array_equal(terminated, started & below)
+        started = terminated
+    assert (below & ~terminated).any() and (reward[below & ~terminated] > 0).all()
+
+
 def test_task_env__is_one_row_of_the_vector():
     one = TaskEnv(NET, LOW, SHORT)
     many = TaskVectorEnv(1, NET, LOW, SHORT)

@@ -76,6 +76,8 @@ def test_action_to_pwm__by_hand():
     np.testing.assert_array_equal(
         action_to_pwm(BROKK_170, [1, 0, -1, 0]) * 127, [80.0, 0, 0, -80, 0]
     )
+    counts = action_to_pwm(BROKK_170, [0.5, -3.0, -0.01, 0.02], paper=True) * 127
+    np.testing.assert_allclose(counts, [40, 0, -80, -1, 2], atol=1e-9)  # 80 a
 
 
 @given(machines(), st.lists(st.floats(-2, 2), min_size=2, max_size=2))
@@ -155,6 +157,12 @@ def test_features__by_hand():
     nominal = np.array([0.20, 0.28, 0.38, 0.47]) / 3**0.5 / 4.2
     np.testing.assert_allclose(obs[163:167], solution @ v_goal / nominal, rtol=1e-4)
     np.testing.assert_allclose(obs[167:], solution @ integral / (0.1 * nominal), rtol=1e-4)
+    paper = features(BROKK_170, measured, paper=True)
+    assert paper.shape == (163,) and paper.dtype == np.float32
+    np.testing.assert_allclose(paper[:3], v_goal * 3**0.5 / 0.3, rtol=1e-5)  # base frame
+    np.testing.assert_allclose(paper[3:6], measured.v_tool * 3**0.5 / 0.3, rtol=1e-5)
+    np.testing.assert_allclose(paper[6], obs[6] / 1.4, rtol=1e-5)
+    np.testing.assert_allclose(paper[7:], obs[7:163] / weight, rtol=1e-5)
 
 
 def test_features__of_a_turned_arm_differ_in_the_slew_angle_alone():

@@ -261,7 +261,7 @@ def test_the_code_is_off_by_half_a_count_at_most(u):
 @pytest.mark.parametrize("u", [1.01, -1.01, NAN, INF, -INF, 80.0])
 def test_commands_that_no_byte_can_carry_are_refused(u):
     with pytest.raises(ValueError, match=r"u: expected within \[-1, 1\], got ") as caught:
-        encode_pwm([0.0, u])
+        encode_pwm([-1.0, 1.0, u])
     assert str(caught.value).endswith(str(u))
 
 

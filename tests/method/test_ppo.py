@@ -297,23 +297,31 @@ def test_adapt_learning_rate__follows_the_change_of_the_policy(kl, before, after
     assert learner.learning_rate == pytest.approx(after)
 
 
-def reference_update(tape, config, agent, optimizer, generator, update, learning_rate):
-    """One update, written once more with torch's own normal distribution."""
+def reference_update(tape, config, agent, optimizer, generator, update, learning_rate, seen):
+    """One update, written once more with torch's own normal distribution.
+
+    `seen` are returns of the updates before: the critic's unit is the mean of their means and the
+    root of the mean of their variances.
+    """
+    mean, std = scale_of(seen)
     ticks = slice(config.horizon * update, config.horizon * (update + 1))
     obs = torch.from_numpy(tape.obs[ticks])
     with torch.no_grad():
         noise = torch.stack([torch.randn(6, 3, generator=generator) for _ in range(config.horizon)])
         actions = agent.actor(obs) + agent.log_std.exp() * noise
         logprobs = Normal(agent.actor(obs), agent.log_std.exp()).log_prob(actions).sum(-1)
-        values = agent.critic(torch.from_numpy(tape.obs))[..., 0].numpy()
-        last_values = agent.critic(torch.from_numpy(tape.last_obs))[..., 0].numpy()
+        values = mean + std * agent.critic(torch.from_numpy(tape.obs))[..., 0].numpy()
+        last_values = mean + std * agent.critic(torch.from_numpy(tape.last_obs))[..., 0].numpy()
     values = values[ticks.start : ticks.stop + 1]
     part = Tape()
     part.rewards = (1 - config.gamma) * tape.rewards[ticks]
     part.terminated = tape.terminated[ticks]
     part.truncated = tape.truncated[ticks]
     found = lambda_return_advantages(part, values, last_values[ticks], config)
-    batch = [obs, actions, logprobs, torch.tensor(found), torch.tensor(found + values[:-1])]
+    seen.append(found + values[:-1])
+    mean, std = scale_of(seen)
+    returns = (seen[-1] - mean) / std
+    batch = [obs, actions, logprobs, torch.tensor(found), torch.tensor(returns)]
     batch = [tensor.flatten(0, 1).float() for tensor in batch]
     optimizer.param_groups[0]["lr"] = learning_rate * (1 - ticks.start * 6 / config.total_steps)
     parts = []
@@ -322,10 +330,16 @@ def reference_update(tape, config, agent, optimizer, generator, update, learning
             parts.append(reference_step(config, agent, optimizer, [x[rows] for x in batch]))
     names = ["policy_loss", "value_loss", "entropy", "approx_kl", "clipfrac"]
     metrics = {f"losses/{name}": x for name, x in zip(names, np.mean(parts, axis=0), strict=True)}
-    metrics["losses/explained_variance"] = 1 - float(batch[3].var() / batch[4].var())
+    metrics["losses/explained_variance"] = 1 - np.var(found) / np.var(seen[-1])
     metrics["charts/reward"] = tape.rewards[ticks].mean()
     metrics["charts/learning_rate"] = optimizer.param_groups[0]["lr"]
     return metrics
+
+
+def scale_of(seen):
+    if not seen:
+        return 0.0, 1.0
+    return np.mean([x.mean() for x in seen]), np.mean([x.var(ddof=1) for x in seen]) ** 0.5
 
 
 def reference_step(config, agent, optimizer, minibatch):
@@ -362,8 +376,10 @@ def test_train__is_the_algorithm_of_the_paper():
     optimizer = torch.optim.Adam(twin.parameters(), lr=1.0)
     generator = torch.Generator().manual_seed(7)
     learning_rate = config.learning_rate
+    seen = []
     for update in range(2):
-        metrics = reference_update(tape, config, twin, optimizer, generator, update, learning_rate)
+        learned = twin, optimizer, generator
+        metrics = reference_update(tape, config, *learned, update, learning_rate, seen)
         learning_rate /= 1.2
         updates, step, rate, logged = found[update]
         assert (updates, step) == (update + 1, 48 * (update + 1))

@@ -1,0 +1,405 @@
+"""Bad files of every format, made from the description of the formats, and read under limits.
+
+Each field is removed, retyped, reshaped, made infinite, taken out of its range, repeated and nested
+a thousand deep; bytes are cut, flipped, zeroed and put in. Every file must be read, if the change
+was one of bytes, or refused by a ValueError: one line of at most 300 characters, with the file and,
+for a changed field, its name. Memory (1 GiB more than at the start) and time (10 s) are limited.
+
+    python tests/fuzz.py --files 500        # 500 files of each format
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+import json
+import resource
+import signal
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import fields, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from helpers_machines import obedient_net, random_net
+
+from brokk_min.__main__ import LONGEST
+from brokk_min.can.drive_log import read_frames
+from brokk_min.cli.options import find_machine
+from brokk_min.env import TaskConfig
+from brokk_min.evaluation.baselines import baselines, gains_metadata, gains_table, read_gains
+from brokk_min.evaluation.seeds import read_seeds
+from brokk_min.evaluation.sequences import read_commands, read_starts
+from brokk_min.identification import formats
+from brokk_min.identification.files import SHIPPED
+from brokk_min.identification.formats import Field
+from brokk_min.identification.logs import read_log
+from brokk_min.identification.net_file import load_net, net_arrays
+from brokk_min.learning.checkpoint import TrainingLog, describe_training
+from brokk_min.learning.gym_env import TaskVectorEnv
+from brokk_min.learning.policy import load_policy
+from brokk_min.machine import BROKK_170, Machine
+from brokk_min.ppo import PPOConfig, make_learner
+
+MEMORY = 2**30  # bytes
+SECONDS = 10
+REMOVED = object()
+NESTED = "nested a thousand deep"
+SHIPPED_POLICY = SHIPPED / "brokk170" / "policy.npz"
+Content = dict[str, Any]
+Place = tuple[str, ...]
+
+
+class Format(NamedTuple):
+    """A format: its file name, a good content, how it is written and read, its fields."""
+
+    name: str
+    content: Content
+    encode: Callable[[Content], bytes]
+    read: Callable[[Path], object]
+    fields: dict[Place, Field]
+
+
+class Change(NamedTuple):
+    """A change of a good file, its bytes, and a word of the refusal; none: it may be read."""
+
+    label: str
+    data: Callable[[], bytes]
+    word: str | None
+
+
+# --- contents -------------------------------------------------------------------------------------
+
+
+def encode_json(content: Content) -> bytes:
+    deep = "[" * 1000 + "]" * 1000
+    return json.dumps(content).replace(json.dumps(NESTED), deep).encode()
+
+
+def encode_npz(content: Content) -> bytes:
+    arrays = {name: value for name, value in content.items() if not name.endswith("header")}
+    for name in content.keys() - arrays.keys():
+        arrays[name] = np.array(encode_json(content[name]).decode())
+    file = io.BytesIO()
+    np.savez(file, allow_pickle=True, **arrays)
+    return file.getvalue()
+
+
+def encode_csv(content: Content) -> bytes:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(content)
+    writer.writerows(zip(*(np.ravel(column).tolist() for column in content.values())))
+    return text.getvalue().encode()
+
+
+def encode_torch(content: Content) -> bytes:
+    file = io.BytesIO()
+    torch.save(content, file)
+    return file.getvalue()
+
+
+def decode_npz(path: Path) -> Content:
+    with np.load(path) as file:
+        content = dict(file)
+    headers = {name: json.loads(str(content[name])) for name in content if name.endswith("header")}
+    return content | headers
+
+
+def places(table: Any, content: Any, within: Place = ()) -> dict[Place, Field]:
+    """Fields by their place in a content."""
+    if isinstance(table, Field):
+        return {within: table}
+    found = {}
+    for name in content:
+        if name in table or "*" in table:
+            found |= places(table.get(name, table.get("*")), content[name], (*within, name))
+    return found
+
+
+def columns(rows: int) -> Content:
+    rng = np.random.default_rng(0)
+    numbers = {name: rng.uniform(-0.5, 0.5, rows) for name in ("u_a", "q_a", "q_dot_a")}
+    return {"run": np.array(["x"] * rows), "time": np.arange(rows) / 20, **numbers}
+
+
+def column_fields(content: Content) -> dict[Place, Field]:
+    prefixes = ("run", "time", "u_", "q_dot_", "q_")
+    found = {(n,): next(formats.LOG[p] for p in prefixes if n.startswith(p)) for n in content}
+    return found | {("q_dot_a",): replace(formats.LOG["q_dot_"], required=False)}
+
+
+def gains(net: Any) -> Content:
+    known = baselines(BROKK_170, net)
+    return {"meta": gains_metadata(BROKK_170, net), "gains": gains_table(known)}
+
+
+def sweep() -> Content:
+    mean = {"mean": 0.1, "low": 0.05, "high": 0.15}
+    row = {"velocity_error_all": mean, "off_axis_drift_max": mean, "valve_travel": mean}
+    return {"meta": {"machine": "m", "actuator": "a"}, "table": {"rl": row, "pid": row}}
+
+
+def checkpoint(folder: Path) -> tuple[Content, Callable[[Path], object]]:
+    """The content of a checkpoint after one step of its optimizer, and how it is loaded."""
+    net, task = obedient_net(BROKK_170), TaskConfig()
+    config = PPOConfig(num_envs=2, horizon=2, threads=1)
+    env = TaskVectorEnv(2, net, BROKK_170, task)
+    about = describe_training(BROKK_170, net, task, config, True, 0)
+    learner = make_learner(env, config, 0, critic=True)
+    for parameter in learner.agent.parameters():
+        parameter.grad = torch.zeros_like(parameter) if parameter.requires_grad else None
+    learner.optimizer.step()
+    log = TrainingLog(env, config, folder / "policy.npz", about, None)
+
+    def load(path: Path) -> None:
+        log.checkpoint = path
+        log.load(learner)
+
+    return torch.load(io.BytesIO(encode_torch(log.content(learner))), weights_only=True), load
+
+
+def leaves(content: Any, within: Place = ()) -> dict[Place, Field]:
+    """Places of a checkpoint that hold a value."""
+    if not isinstance(content, dict):
+        number = isinstance(content, torch.Tensor) and content.is_floating_point()
+        return {within: Field("float" if number else "object")}
+    found: dict[Place, Field] = {}
+    for name, value in content.items():
+        found |= leaves(value, (*within, name))
+    return found
+
+
+MACHINE = "from dataclasses import replace\nfrom brokk_min.machine import BROKK_170\n"
+
+
+def encode_machine(content: Content) -> bytes:
+    values = ", ".join(f"{name}={value!r}" for name, value in content.items())
+    values = values.replace("nan", "float('nan')").replace("inf", "float('inf')")
+    return f"{MACHINE}M = replace(BROKK_170, {values.replace(repr(NESTED), '[3]')})\n".encode()
+
+
+def all_formats(folder: Path) -> Iterator[Format]:
+    """Every format with a good content."""
+    net = load_policy(SHIPPED_POLICY, BROKK_170).net
+    arrays = net_arrays(random_net())
+    arrays["header"] = json.loads(str(arrays["header"]))
+    found = places({"header": formats.NET_HEADER, **formats.NET_ARRAYS}, arrays)
+    yield Format("net.npz", arrays, encode_npz, load_net, found)
+    policy = decode_npz(SHIPPED_POLICY)
+    found = places({"header": formats.POLICY_HEADER, **formats.POLICY_ARRAYS}, policy)
+    found |= {(f"net_{name}",): field for name, field in formats.NET_ARRAYS.items()}
+    yield Format("policy.npz", policy, encode_npz, partial(load_policy, machine=BROKK_170), found)
+    read = lambda path: read_log([path], 4, ["a"] if "q_dot" in path.name else None)  # noqa: E731
+    log = columns(30)
+    yield Format("log.csv", log, encode_csv, read, column_fields(log))
+    yield Format("log.npz", log, encode_npz, read, column_fields(log))
+    table = gains(net)
+    read = partial(read_gains, machine=BROKK_170, net=net)
+    yield Format(
+        "gains.json",
+        table,
+        encode_json,
+        read,
+        places({"meta": formats.META, "gains": {"*": formats.GAINS}}, table),
+    )
+    yield Format("sweep.json", sweep(), encode_json, read_seeds, places(formats.SWEEP, sweep()))
+    goals = {"sequence": ["up"] * 3, "time": [0.0, 1.0, 2.0]} | {f"v{x}": [0.1] * 3 for x in "xyz"}
+    commands = partial(read_commands, machine=BROKK_170)
+    yield Format("c.csv", goals, encode_csv, commands, places(formats.COMMANDS, goals))
+    poses = {name: [q] * 3 for name, q in zip(BROKK_170.names, BROKK_170.q_start, strict=True)}
+    starts = formats.starts_of(BROKK_170)
+    read = partial(read_starts, machine=BROKK_170)
+    yield Format("s.csv", poses, encode_csv, read, places(starts, poses))
+    content, load = checkpoint(folder)
+    yield Format("policy.npz.checkpoint", content, encode_torch, load, leaves(content))
+    frames = {str(i): f"({i}.5) can0 18{i}#0001020304" for i in range(1, 9)}
+    drive = lambda path: list(read_frames(path))  # noqa: E731
+    encode = lambda content: "".join(f"{line}\n" for line in content.values()).encode()  # noqa: E731
+    yield Format("drive.log", frames, encode, drive, {})
+    numbers = [f for f in fields(Machine) if "unit" in f.metadata]
+    found = {(f.name,): Field("float", f.metadata["low"], f.metadata["high"]) for f in numbers}
+    values = {f.name: getattr(BROKK_170, f.name) for f in numbers}
+    find = lambda path: find_machine(f"{path}:M")  # noqa: E731
+    yield Format("machine.py", values, encode_machine, find, found)
+
+
+# --- changes --------------------------------------------------------------------------------------
+
+
+def with_value(content: Content, place: Place, value: Any) -> Content:
+    """A copy of a content with another value at one place."""
+    name, *rest = place
+    result = dict(content)
+    if rest:
+        result[name] = with_value(content[name], tuple(rest), value)
+    elif value is REMOVED:
+        del result[name]
+    else:
+        result[name] = value
+    return result
+
+
+def bad_values(value: Any, field: Field, rng: np.random.Generator) -> Iterator[tuple[str, Any]]:
+    """Values that the field must not have, by kind of change."""
+    if field.required:
+        yield "removed", REMOVED
+    if isinstance(value, torch.Tensor):
+        yield from {"retyped": "a", "reshaped": value[None], "nested": [[[]]]}.items()
+        if field.kind == "float":
+            yield "infinite", torch.full_like(value, rng.choice([np.nan, np.inf, -np.inf]))
+        return
+    array = np.array(value)
+    if isinstance(value, np.ndarray):
+        yield (
+            "retyped to text",
+            np.zeros(array.shape) if field.kind == "text" else array.astype(str),
+        )
+        yield "retyped to complex", np.zeros(array.shape, complex)
+        yield "retyped to objects", array.astype(object)
+        yield "reshaped", array[None]
+        yield "cut", array[:-1]
+    else:
+        other = 3 if field.kind in ("text", "object", "truth value") else "a"
+        yield "retyped", [other] * len(array) if field.shape == ("rows",) else other
+        if field.shape != ("rows",):
+            yield "nested", NESTED
+            yield "reshaped", [value]
+    if field.kind in ("float", "number", "whole number"):
+        low, high = float(field.low), float(field.high)
+        for bad in (np.nan, np.inf, -np.inf, low - 1, high + 1 + abs(high)):
+            if not np.isfinite(bad) or np.isfinite([low, high]).all():
+                changed = array.astype(float)
+                changed[tuple(rng.integers(array.shape))] = bad
+                yield (
+                    f"set to {bad}",
+                    changed if isinstance(value, np.ndarray) else changed.tolist(),
+                )
+    if field.unique:
+        yield "repeated", [value[0], *value[:-1]]
+
+
+def field_changes(form: Format, rng: np.random.Generator) -> Iterator[Change]:
+    """Every field, changed in every way."""
+    for place, field in form.fields.items():
+        value: Any = form.content
+        for name in place:
+            value = value[name]
+        if form.encode is encode_csv:
+            value = np.array(value)
+        for label, bad in bad_values(value, field, rng):
+            if form.encode is encode_csv and label in ("reshaped", "retyped to objects"):
+                continue
+            if form.encode is encode_csv and field.kind == "text" and "retyped" in label:
+                continue  # all cells of a CSV are text
+            if form.encode is encode_csv and label == "retyped to text":
+                bad = np.array([*value[:-1].tolist(), "a"], object)
+            if form.encode is encode_machine and label in ("removed", "reshaped"):
+                continue
+            if form.encode is encode_csv and label == "cut":
+                bad = np.array([*value[:-1].tolist(), ""], object)
+            word = place[-1][:2] if label == "removed" else place[-1]  # of a log: u_<joint>
+            if label in ("cut", "reshaped", "nested") or form.encode is encode_torch:
+                word = ""
+            encode = partial(form.encode, with_value(form.content, place, bad))
+            yield Change(f"{'.'.join(map(str, place))} {label}", encode, word)
+
+
+def byte_change(data: bytes, rng: np.random.Generator) -> Change:
+    """A region of bytes cut, flipped, zeroed, repeated, or junk put in."""
+    start = int(rng.integers(len(data)))
+    length = int(min(2 ** rng.uniform(0, 12), len(data) - start))
+    region = np.frombuffer(data[start : start + length], np.uint8)
+    junk = rng.integers(0, 256, length, np.uint8)
+    what = str(rng.choice(["cut off", "cut out", "flipped", "zeroed", "put in", "repeated"]))
+    new = {
+        "cut out": b"",
+        "flipped": (region ^ np.uint8(2 ** rng.integers(8))).tobytes(),
+        "zeroed": bytes(length),
+        "put in": junk.tobytes() + region.tobytes(),
+        "repeated": 2 * region.tobytes(),
+    }
+    if what == "cut off":
+        return Change(f"cut off at {start}", lambda: data[:start], None)
+    changed = data[:start] + new[what] + data[start + length :]
+    return Change(f"{length} bytes at {start} {what}", lambda: changed, None)
+
+
+# --- reading --------------------------------------------------------------------------------------
+
+
+class TooLong(BaseException):
+    """Reading took longer than `SECONDS`."""
+
+
+def out_of_time(*_: object) -> None:
+    raise TooLong
+
+
+def complaint(form: Format, change: Change, path: Path) -> str:
+    """What is wrong with how a changed file is read; empty: nothing."""
+    data = change.data()
+    path.write_bytes(data)
+    signal.alarm(SECONDS)
+    try:
+        form.read(path)
+        found = "" if change.word is None else "read"
+    except ValueError as error:
+        text = str(error)
+        found = "" if (change.word or "") in text else f"not named: {text}"
+        if "\n" in text or len(text) > LONGEST or str(path) not in text:
+            found = f"refused by: {text}"
+    except BaseException as error:
+        found = f"{type(error).__name__}: {error}"
+    signal.alarm(0)
+    return found if path.read_bytes() == data else "the file is another one now"
+
+
+def check_format(form: Format, files: int, seed: int, folder: Path) -> list[str]:
+    """Complaints about `files` bad files of a format: those of fields first, a sample if many."""
+    rng = np.random.default_rng(seed)
+    data = form.encode(form.content)
+    path = folder / form.name
+    complaints = []
+    good = complaint(form, Change("good", lambda: data, None), path)
+    form.read(path)
+    changes = list(field_changes(form, rng))
+    sample = rng.permutation(len(changes))[: max(files // 2, files - 200)]
+    chosen = [changes[i] for i in sample]
+    chosen += [byte_change(data, rng) for _ in range(files - len(chosen))]
+    complaints += [good] if good else []
+    for change in chosen:
+        found = complaint(form, change, path)
+        if found:
+            complaints.append(f"{form.name}: {change.label}: {found[:400]}")
+    print(f"{form.name}: {len(chosen)} files, {len(complaints)} complaints", flush=True)
+    print(*complaints, sep="\n", end="\n" * bool(complaints), flush=True)
+    return complaints
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--files", type=int, default=500, help="of each format")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--format", default="", help="names that contain this text only")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    signal.signal(signal.SIGALRM, out_of_time)
+    complaints = []
+    with tempfile.TemporaryDirectory() as name:
+        for form in all_formats(Path(name)):
+            if options.format in form.name:
+                pages = int(Path("/proc/self/statm").read_text().split()[0])
+                limit = pages * resource.getpagesize() + MEMORY
+                resource.setrlimit(resource.RLIMIT_AS, (limit, resource.RLIM_INFINITY))
+                complaints += check_format(form, options.files, options.seed, Path(name))
+    return bool(complaints)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
