@@ -31,11 +31,11 @@ from brokk_min import hw
 from brokk_min.can.canopen import valve_frame
 from brokk_min.can.operator_input import Script
 from brokk_min.can.safety_gate import fault_name
-from brokk_min.env import TaskConfig, reward
+from brokk_min.env import TaskConfig, observation_scale, reward
 from brokk_min.evaluation.rollout import rollout
 from brokk_min.evaluation.sequences import axis_sequences
 from brokk_min.kinematics import forward_kinematics, tool_velocity
-from brokk_min.learning.policy import PolicyController, load_policy
+from brokk_min.learning.policy import Policy, PolicyController, contract, load_policy
 from brokk_min.machine import BROKK_170
 
 SHIPPED = Path(hw.__file__).with_name("shipped") / BROKK_170.name / "policy.npz"
@@ -44,6 +44,19 @@ STEP = BROKK_170.encoder_step
 
 def policy():
     return PolicyController(BROKK_170, load_policy(SHIPPED, BROKK_170))
+
+
+def paper_policy():
+    """The paper's agent with random weights, which moves all driven joints."""
+    rng = np.random.default_rng(0)
+    sizes = [163, 256, 128, 64, 4]
+    weights = []
+    for inputs, outputs in pairwise(sizes):
+        weights += [rng.normal(0, 0.6 * inputs**-0.5, (inputs, outputs)), np.zeros(outputs)]
+    weights = tuple(array.astype(np.float32) for array in weights)
+    numbers = contract(BROKK_170, paper=True), {}, *observation_scale(BROKK_170, paper=True)
+    net = load_policy(SHIPPED, BROKK_170).net
+    return PolicyController(BROKK_170, Policy(*numbers, weights, net, "open"))
 
 
 @pytest.fixture
@@ -84,11 +97,11 @@ def test_import__loads_no_library_that_is_not_needed(modules, heavy):
 # --- driving -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("axis", "name"), [(1, "rl"), (2, "jacobian")])
+@pytest.mark.parametrize(("axis", "name"), [(1, "rl"), (2, "jacobian"), (0, "rl_paper")])
 def test_run__earns_over_the_bus_the_reward_of_evaluate(axis, name):
     """Within 0.2 %, with 2 ms of bus and machine between SYNC and valve frame."""
     sequence = axis_sequences(BROKK_170)[axis]
-    controller = policy() if name == "rl" else BASELINE
+    controller = {"rl": policy, "rl_paper": paper_policy}.get(name, lambda: BASELINE)()
     script = Script(BROKK_170, sequence.goals)
     world = World(controller, script)
 
