@@ -38,7 +38,7 @@ from brokk_min.identification.files import brief, located, write_json
 from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
 from brokk_min.identification.logs import Log, read_log, write_log
 from brokk_min.identification.net_file import load_net, save_net
-from brokk_min.learning.policy import Policy, PolicyController, load_policy
+from brokk_min.learning.policy import POLICIES, Policy, PolicyController, load_policy
 from brokk_min.machine import Machine
 
 
@@ -232,22 +232,26 @@ class Starts(Command):
 
 @dataclass(kw_only=True)
 class Evaluate(Command):
-    """Policy and tuned baselines on the same sequences and starts."""
+    """Policies and tuned baselines on the same sequences and starts."""
 
-    policy: Path | None = None  # Policy that `train` wrote; by default the package's.
+    policy: Path | None = None  # Policy that `train` wrote; by default those of the package.
     commands: Path | None = None  # Velocity sequences, CSV: sequence,time,vx,vy,vz [s, m/s].
     starts: Path | None = None  # Start poses, CSV: one column per joint [rad].
     plant: Literal["analytic", "net"] = "analytic"  # What moves: the analytic plant or the nets.
     json: Path | None = None  # Also write all runs here.
     gains: Path | None = None  # Tuned gains; by default gains.json in the folder of POLICY.
     num_starts: Count = 16  # Without --starts: how many of the machine's start poses.
+    noise: Annotated[float, Range(0, 1)] = 0.05  # Sensor noise [deviations]; 0: encoders only.
     perfect_model: bool = False  # Also a bound: a controller with the plant as its model (minutes).
+    all: bool = False  # Print all figures by kind of start, not the table alone.
 
     def __call__(self) -> None:
         machine = self.check(json="runs")
         if self.perfect_model and self.plant == "net":
             raise WrongUse("--perfect-model: expected --plant analytic, its model, got net")
         path, gains = default_policy(machine, self.policy, self.gains)
+        if self.noise != TaskConfig.noise:
+            gains = self.gains  # others were tuned with more noise
         policy = load_policy(path, machine)
         inputs = (self.commands, self.starts, self.num_starts, self.seed)
         driven, starts = sequences.goals_and_starts(machine, *inputs)
@@ -256,24 +260,61 @@ class Evaluate(Command):
         if self.perfect_model:
             controllers |= perfect_model.perfect_models(machine, starts)
         net = policy.net if self.plant == "net" else None
-        runs, _ = metrics.evaluate(machine, controllers, driven, starts, self.seed, net)
+        config = TaskConfig(noise=self.noise)
+        runs, _ = metrics.evaluate(
+            machine, controllers, driven, starts, self.seed, net, config=config
+        )
         if self.json:
             meta = metrics.metadata(machine, self.seed)
             meta |= {"policy": str(path), "gains": str(gains or "tuned now"), "plant": self.plant}
             meta["commands"] = str(self.commands or ", ".join(one.name for one in driven))
-            meta["starts"] = str(self.starts or self.num_starts)
+            meta |= {"starts": str(self.starts or self.num_starts), "noise": self.noise}
             write_json(self.json, {"meta": meta, "runs": runs})
-        print_means(runs, len(driven))
+        print_table(runs, len(driven))
+        if self.all:
+            print_means(runs, len(driven))
 
     def _controllers(
         self, machine: Machine, policy: Policy, gains: Path | None
     ) -> dict[str, Controller]:
-        rl = PolicyController(machine, policy)
+        controllers: dict[str, Controller] = {"rl": PolicyController(machine, policy)}
+        for name, file in POLICIES.items():
+            path = SHIPPED / machine.name / file
+            if not self.policy and name != "rl" and path.exists():
+                controllers[name] = PolicyController(machine, load_policy(path, machine))
         if gains:
-            return {"rl": rl, **baselines.read_gains(gains, machine, policy.net)}
-        budget = (baselines.TUNING_RUNS, baselines.GENERATIONS)
-        tuned, _ = baselines.tune_baselines(machine, policy.net, *budget, self.seed)
-        return {"rl": rl, **tuned}
+            return controllers | baselines.read_gains(gains, machine, policy.net)
+        budget = (baselines.TUNING_RUNS, baselines.GENERATIONS, self.seed)
+        config = TaskConfig(noise=self.noise)
+        tuned, _ = baselines.tune_baselines(machine, policy.net, *budget, config)
+        return controllers | tuned
+
+
+COLUMNS = {  # of the table: head, format
+    "velocity_error_mean": ("error [m/s]", "{:.4f}"),
+    "velocity_error_moves": ("in motion", "{:.4f}"),
+    "velocity_error_rests": ("at rest", "{:.4f}"),
+    "off_axis_drift_max": ("drift [m]", "{:.4f}"),
+    "jerk_rms": ("jerk [m/s^3]", "{:.1f}"),
+    "valve_travel": ("valve travel", "{:.0f}"),
+    "joint_motion_at_rest": ("joints at rest [rad]", "{:.4f}"),
+}
+
+
+def print_table(runs: list[dict[str, Any]], sequences: int) -> None:
+    """Means of `COLUMNS` by controller, over the workspace starts, or all if none is such."""
+    scored = [run for run in runs if run["kind"] == "workspace"] or runs
+    num = len({run["start"] for run in scored})
+    print(f"means over {sequences} sequences from {num} {scored[0]['kind']} starts")
+    heads = [head for head, _ in COLUMNS.values()]
+    print(f"{'controller':30} " + " ".join(f"{head:>12}" for head in heads))
+    for name, rows in metrics.summary(scored).items():
+        cells = []
+        for key, (head, form) in COLUMNS.items():
+            mean = rows["all"][key]
+            text = "none" if mean is None else form.format(mean)
+            cells.append(text.rjust(max(12, len(head))))
+        print(f"{name:30} " + " ".join(cells))
 
 
 def print_means(runs: list[dict[str, Any]], sequences: int) -> None:
@@ -293,8 +334,10 @@ CHAIN = {  # files of `reproduce`
     "log.npz": "log",
     "log_test.npz": "log",
     "net.npz": "nets",
-    "policy.npz": "policy",
-    "policy.npz.csv": "curve",
+    "log_paper.npz": "log",
+    "net_paper.npz": "nets",
+    **dict.fromkeys(POLICIES.values(), "policy"),
+    **{f"{name}.csv": "curve" for name in POLICIES.values()},
     "gains.json": "gains",
     "results.json": "results",
 }
@@ -318,7 +361,8 @@ class Reproduce(Command):
             errors = ", ".join(f"{s} {row['velocity_error_mean']:.4f}" for s, row in rows.items())
             print(f"{name:22} mean velocity error [m/s]: {errors}")
         for claim in results["claims"]:
-            print(f"{VERDICTS[claim['holds']]}: {claim['paper']}")
+            ours = VERDICTS[claim["ours"]["holds"]]
+            print(f"{VERDICTS[claim['holds']]} (of our policy: {ours}): {claim['paper']}")
         print(self.out / "report.html")
         print(self.out / "results.json")
 

@@ -35,13 +35,11 @@ from brokk_min.jacobian import JacobianController, manipulability, manipulabilit
 from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.learning.checkpoint import train_policy
 from brokk_min.learning.episodes import PAPER_LEARNER, PAPER_TASK
-from brokk_min.learning.policy import Policy, PolicyController, save_policy
+from brokk_min.learning.policy import POLICIES, Policy, PolicyController, save_policy
 from brokk_min.machine import Array, Machine
 from brokk_min.ppo import PPOConfig
 
 Pids = Mapping[str, JacobianController]  # baselines by name
-# Files of the policies: ours with valves closed or open while the tool rests, and the paper's.
-POLICIES = {"rl": "policy.npz", "rl_open": "policy_open.npz", "rl_paper": "policy_paper.npz"}
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,8 @@ from brokk_min.identification.net_file import LARGEST_NET, net_arrays, net_from_
 from brokk_min.machine import Array, Machine
 
 FORMAT = 3  # of policy files
+# Files of `reproduce`: our policy with valves closed or open while the tool rests, and the paper's.
+POLICIES = {"rl": "policy.npz", "rl_open": "policy_open.npz", "rl_paper": "policy_paper.npz"}
 
 
 @dataclass(frozen=True)
