@@ -34,7 +34,7 @@ from brokk_min.evaluation import baselines, figures, metrics, perfect_model, seq
 from brokk_min.evaluation.claims import VERDICTS
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.identification import excitation, validation
-from brokk_min.identification.files import brief, located, write_json
+from brokk_min.identification.files import SHIPPED, brief, located, write_json
 from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
 from brokk_min.identification.logs import Log, read_log, write_log
 from brokk_min.identification.net_file import load_net, save_net

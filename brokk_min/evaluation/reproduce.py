@@ -118,7 +118,9 @@ def side_by_side(calls: Mapping[str, Callable[[], Any]], clock: dict[str, float]
 
     `clock` gets the seconds of each. The first exception is raised.
     """
-    cores = len(os.sched_getaffinity(0))
+    cores = os.cpu_count() or 1
+    if hasattr(os, "sched_getaffinity"):
+        cores = len(os.sched_getaffinity(0))
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(cores, len(calls)), context, _one_thread) as pool:
         done = list(pool.map(_timed, calls.values()))
