@@ -1,6 +1,6 @@
 """Two processes on one CAN bus over UDP multicast: lateness, latency, lost frames, drift at 20 Hz.
 
-    python -m benchmarks.bus [--seconds 600] [--busy] [--realtime] [--json F]
+    python -m benchmarks.bus [--seconds 600] [--busy] [--realtime] [--foreign 1000] [--json F]
 
 `brokk-min machine` and `brokk-min drive` run as a user runs them; all figures come from the log of
 the drive. The policy has random weights, which cost the same time as trained ones.
@@ -30,6 +30,19 @@ from brokk_min.learning.policy import Policy, contract, save_policy
 from brokk_min.machine import BROKK_170
 
 BUS = ["--interface", "udp_multicast", "--channel", "239.74.163.2"]
+SENDER = """
+import can, sys, time
+bus = can.Bus(interface=sys.argv[2], channel=sys.argv[4])
+rate, start, sent = float(sys.argv[5]), time.monotonic(), 0
+while True:
+    while sent < rate * (time.monotonic() - start):
+        can_id = 0x300 + sent % 256
+        bus.send(can.Message(arbitration_id=can_id, data=bytes(8), is_extended_id=False))
+        sent += 1
+        if sent % 500 == 0:
+            print(sent / (time.monotonic() - start), flush=True)
+    time.sleep(0.001)
+"""
 PERCENTILES = {"median": 50, "p99": 99, "p99.9": 99.9, "max": 100}
 
 
@@ -38,6 +51,7 @@ class Options:
     seconds: float = 600.0  # How long to drive [s].
     busy: bool = False  # Also keep every core busy.
     realtime: bool = False  # Both processes with real-time priority (chrt -f 10), as on a machine.
+    foreign: int = 0  # Frames that another process sends each second, of foreign identifiers.
     json: Path | None = None  # Also write the figures here.
 
 
@@ -99,16 +113,23 @@ def main(options: Options) -> None:
         if options.busy:
             for _ in range(os.cpu_count() or 1):
                 processes.append(subprocess.Popen([sys.executable, "-c", "while True: pass"]))
+        if options.foreign:
+            sender = [sys.executable, "-c", SENDER, *BUS, str(options.foreign)]
+            processes.append(subprocess.Popen(sender, stdout=(Path(folder) / "rate").open("w")))
         try:
             time.sleep(10)
-            code = subprocess.run(drive, stdout=subprocess.DEVNULL).returncode
+            ended = subprocess.run(
+                drive, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+            )
             frames = list(read_frames(log))
         finally:
             for process in processes:
                 process.kill()
                 process.wait()
+        rates = (Path(folder) / "rate").read_text().split() if options.foreign else ["0"]
     result: dict[str, Any] = {"seconds": options.seconds, "busy": options.busy}
-    result |= {"realtime": options.realtime, "exit": code, **figures(frames)}
+    result |= {"realtime": options.realtime, "foreign": float(rates[-1]), "exit": ended.returncode}
+    result |= {"said": ended.stderr.strip()[-300:], **figures(frames)}
     write(result, options.json)
 
 

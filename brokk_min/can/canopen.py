@@ -120,8 +120,8 @@ def check_bus(machine: Machine) -> None:
             f"{machine.name}: expected at most {MAX_JOINTS} joints in a valve frame, "
             f"got {machine.n}"
         )
-    if 1.5 * machine.dt > WATCHDOG:  # a tick may be late by half
-        slowest = 1.5 / WATCHDOG
+    slowest = 1.5 / WATCHDOG  # Hz: a tick may be late by half
+    if machine.rate < slowest:
         raise ValueError(
             f"{machine.name}: expected a rate of {slowest:g} Hz or more, for the valve "
             f"controller's watchdog of {WATCHDOG} s, got {machine.rate:g} Hz"

@@ -50,7 +50,7 @@ class InputHandler:
         self.pad: Any = pygame.joystick.Joystick(0) if pygame.joystick.get_count() else None
 
     @property
-    def levers(self) -> bool:
+    def by_joint(self) -> bool:
         """Does the operator move the joints one by one?"""
         return self.modes[self.mode] == "levers"
 
@@ -109,7 +109,7 @@ class InputHandler:
         self._update_switch(bool(target.any()))
         v_goal: Array = np.zeros(3)
         levers: Array = np.zeros(len(self.machine.driven))
-        if self.levers:
+        if self.by_joint:
             levers = self.deflection
         else:
             length = float(np.linalg.norm(self.deflection))
@@ -118,7 +118,7 @@ class InputHandler:
 
     def _target(self) -> Array:
         """Deflections of stick or levers in [-1, 1]; keys give a third of it with shift."""
-        pairs = LEVER_KEYS[: len(self.machine.driven)] if self.levers else VELOCITY_KEYS
+        pairs = LEVER_KEYS[: len(self.machine.driven)] if self.by_joint else VELOCITY_KEYS
         target = np.array([float(p in self.held) - float(m in self.held) for p, m in pairs])
         if not self.focus:
             return np.zeros_like(target)

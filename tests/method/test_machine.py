@@ -27,6 +27,7 @@ from brokk_min.machine import (
     estimate_velocity,
     limit_command,
     read_encoder,
+    valve_opening,
 )
 
 # --- validation -----------------------------------------------------------------------------------
@@ -260,7 +261,7 @@ def test_the_code_is_off_by_half_a_count_at_most(u):
 @pytest.mark.parametrize("u", [1.01, -1.01, NAN, INF, -INF, 80.0])
 def test_commands_that_no_byte_can_carry_are_refused(u):
     with pytest.raises(ValueError, match=r"u: expected within \[-1, 1\], got ") as caught:
-        encode_pwm([0.0, u])
+        encode_pwm([-1.0, 1.0, u])
     assert str(caught.value).endswith(str(u))
 
 
@@ -310,6 +311,13 @@ def test_whole_numbers_are_commands_and_angles_too():
     )
     slope = estimate_velocity([0, 3, 6, 9], samples=4, dt=0.07)
     assert slope == pytest.approx(3 / 0.07)
+
+
+def test_valve_opening__by_hand():
+    opening = valve_opening([-1.0, -0.07, 0.0, 0.05, 0.07, 0.535, 1.0], 0.07)
+    np.testing.assert_allclose(opening, [-1, 0, 0, 0, 0, 0.5, 1], atol=1e-12)
+    assert valve_opening(np.float32([0.5]), 0.0).dtype == np.float32
+    assert valve_opening([1, -1, 0], 0.5).tolist() == [1, -1, 0]
 
 
 # --- encoders and velocity ------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from brokk_min.actuator import plant_reset, plant_step
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation import baselines, reproduce
 from brokk_min.identification import excitation, fitting, validation
-from brokk_min.machine import BROKK_170, Machine, valve_opening
+from brokk_min.machine import BROKK_170, Machine
 from brokk_min.ppo import PPOConfig, mlp
 
 
@@ -31,11 +31,6 @@ def test_constants__are_the_papers() -> None:
     assert layers == [256, 128, 64, 1]
     assert excitation.EXCITATIONS["sine"] is excitation.sine_command
     assert baselines.RANGES["feedback"] == (0.01, 1.0)
-
-
-def test_valve_opening__by_hand() -> None:
-    opening = valve_opening([-1.0, -0.07, 0.0, 0.05, 0.07, 0.535, 1.0], 0.07)
-    np.testing.assert_allclose(opening, [-1, 0, 0, 0, 0, 0.5, 1], atol=1e-12)
 
 
 def step_times(machine: Machine, before: int) -> float:

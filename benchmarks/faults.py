@@ -1,0 +1,178 @@
+"""Faults on the bus: time until the valves are closed, in simulated time, as a Markdown table.
+
+    python -m benchmarks.faults [--repeats 20] [--json F]
+    python -m benchmarks.faults --frozen
+    python -m benchmarks.faults --hours 1
+
+Machine, bus and `hw.Drive` run in one process on one clock. A fault of an encoder is repeated over
+the joints. `--frozen` prints instead how long a frozen encoder takes at each command. `--hours`
+drives instead for that long of simulated time, and prints the memory.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import re
+import sys
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import can
+import numpy as np
+import tyro
+
+from benchmarks.rollout import write
+from brokk_min.actuator import plant_reset, plant_step
+from brokk_min.can.safety_gate import FROZEN_ANGLE, SLEW, expected_motion, gate_start
+from brokk_min.machine import BROKK_170, PWM_MAX
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from helpers_bus import ConstantCommand, HoldingOperator, World
+from helpers_faults import FAULTS, NOT_FOUND, measure
+
+
+@dataclass
+class Options:
+    repeats: int = 20  # Of each fault, at other moments between two SYNCs.
+    only: str = ""  # Kinds of faults whose names match this regular expression.
+    frozen: bool = False  # Times of frozen encoders by command instead.
+    hours: float = 0.0  # Drive for this long of simulated time, and print the memory.
+    json: Path | None = None  # Also write the figures here.
+
+
+def groups(faults: dict[str, Any]) -> dict[str, list[Any]]:
+    """Faults of one kind at several joints under one name."""
+    kinds = defaultdict(list)
+    for name, kind in faults.items():
+        joint = re.fullmatch(r"q[1-5] (.*)", name) if faults is FAULTS else None
+        kinds[f"position {joint[1]}" if joint else name].append(kind)
+    return kinds
+
+
+def table(repeats: int, only: str) -> list[dict[str, Any]]:
+    """One row a kind of fault; `words` without the joint's name."""
+    rows = []
+    print("| fault | median, worst [ms] | latched | words, or why it is not found |")
+    print("|---|---|---|---|")
+    for faults in (FAULTS, NOT_FOUND):
+        for name, kinds in groups(faults).items():
+            if not re.search(only, name):
+                continue
+            phases = (np.arange(repeats) + 0.5) / repeats * 0.05
+            outcomes = [measure(kinds[k % len(kinds)].cause, phases[k]) for k in range(repeats)]
+            latched = sum(bool(outcome.latched) for outcome in outcomes)
+            times = [1e3 * outcome.seconds for outcome in outcomes]
+            said = {re.sub(r"^(fault: )?(q\d: )?| \(.*", "", outcome.words) for outcome in outcomes}
+            words = "; ".join(sorted(said - {""})) if faults is FAULTS else kinds[0].words
+            row = {"fault": name, "median": float(np.median(times)), "worst": max(times)}
+            rows.append(row | {"latched": latched, "repeats": repeats, "words": words})
+            span = f"{row['median']:.0f}, {row['worst']:.0f}" if latched else "not found"
+            print(f"| {name} | {span} | {latched} of {repeats} | {words} |", flush=True)
+    return rows
+
+
+def frozen_times(counts: int, moving: bool, rng: np.random.Generator) -> np.ndarray:
+    """Time [s] from the freezing of an encoder to the gate's fault, many runs: inf, not found.
+
+    One joint of 200 machines moves alone under `counts` [of 127], up or down; its encoder freezes
+    at a random moment of a tick, in motion or before the command.
+    """
+    m, num, first = BROKK_170, 200, 40 if moving else 0
+    joint, up = rng.choice(m.driven, num), rng.choice([-1, 1], num)
+    low, high = m.column("q_min"), m.column("q_max")
+    fraction = np.where(up > 0, rng.uniform(0.1, 0.4, num), rng.uniform(0.6, 0.9, num))
+    plant = plant_reset(m, low + (high - low) * fraction[:, None])
+    moment = rng.uniform(0, 1, num)  # of tick `first`
+    gate = gate_start(m, (num,))._replace(counts=np.rint(plant.q / m.encoder_step).astype(int))
+    frozen, found = gate.counts, np.full(num, np.inf)
+    for tick in range(first + 40):
+        q = plant.q
+        expected = expected_motion(m, gate, frozen)
+        fault = (expected > max(FROZEN_ANGLE, m.encoder_step)).any(axis=-1)
+        found = np.where(fault & np.isinf(found), tick, found)
+        sent = np.zeros((num, m.n), int)
+        before = np.abs(gate.sent[range(num), joint, -1])
+        sent[range(num), joint] = up * np.minimum(before + SLEW, counts)
+        history = np.concatenate([gate.sent[..., 1:], sent[..., None]], axis=-1)
+        gate = gate._replace(counts=frozen, sent=history, expected_motion=expected)
+        plant = plant_step(m, plant, sent / PWM_MAX)
+        if tick < first:
+            frozen = np.rint(plant.q / m.encoder_step).astype(int)
+        elif tick == first:
+            q = q + moment[:, None] * (plant.q - q)
+            frozen = np.rint(q / m.encoder_step).astype(int)
+    return (found - first - moment) * m.dt
+
+
+def frozen_table() -> list[dict[str, float]]:
+    """Median and worst times of frozen encoders by command."""
+    rng = np.random.default_rng(0)
+    rows = []
+    print("| command, counts of 127 | joint was moving [s] | joint was at rest [s] |")
+    print("|---|---|---|")
+    for counts in (80, 60, 40, 30, 20, 16, 14):
+        times = [frozen_times(counts, moving, rng) for moving in (True, False)]
+        cells = [f"{np.median(t):.2f}, at most {t.max():.2f}" for t in times]
+        print(f"| {counts} | {cells[0]} | {cells[1]} |".replace("inf", "never"))
+        rows.append({"counts": counts, "moving": times[0].max(), "rest": times[1].max()})
+    return rows
+
+
+def memory() -> float:
+    """Resident memory of this process [MB] (Linux)."""
+    return float(re.findall(r"VmRSS:\s+(\d+)", Path("/proc/self/status").read_text())[0]) / 1e3
+
+
+def hours(number: float) -> dict[str, Any]:
+    """Memory while a drive runs, at its start and each twelfth of it."""
+
+    class Shuttle(HoldingOperator):
+        """Forward and back every two seconds, so that no joint gets to its limit."""
+
+        def __call__(self, driving: bool, ready: bool) -> Any:
+            self.v = (0.1 * (-1) ** (world.drive.ticks // 40), 0.0, 0.0)
+            return super().__call__(driving, ready)
+
+    class Shaking(ConstantCommand):
+        """Commands that change sign every two seconds."""
+
+        def __call__(self, measured: Any, state: None) -> Any:
+            u, state = super().__call__(measured, state)
+            return u * np.sign(measured.v_goal[..., :1]), state
+
+    gc.disable()  # as `Drive.run` does
+    log = can.CanutilsLogWriter(os.devnull)
+    world = World(Shaking(30, 0, 30, 30, 30), Shuttle(), log=log)
+    world.step = world.drive.machine.plant_dt
+    world.drive.begin()
+    world.simulated.record = lambda *row: None
+    ticks = round(3600 * number * world.drive.machine.rate)
+    used = []
+    for k in range(ticks):
+        world.drive.tick()
+        world.syncs.clear()
+        if k % max(1, ticks // 12) == max(1, ticks // 12) // 2:
+            used.append(memory())
+            print(f"{k} ticks: {used[-1]:.1f} MB, {world.drive.status()}", flush=True)
+    world.close()
+    return {"ticks": ticks, "memory_mb": used, "driving": bool(world.drive.gate.driving)}
+
+
+def main(options: Options) -> dict[str, Any]:
+    result: dict[str, Any] = {}
+    if options.hours:
+        result = hours(options.hours)
+    elif options.frozen:
+        result["frozen"] = frozen_table()
+    else:
+        result["faults"] = table(options.repeats, options.only)
+    if options.json:
+        write(result, options.json)
+    return result
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options, description=__doc__))

@@ -1,0 +1,149 @@
+"""The bus through python-can: waiting, echoes, filters, the log, and what a process may ask for."""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+
+import can
+import pytest
+from helpers_bus import MULTICAST, own_multicast_port
+
+from brokk_min.can.canopen import Frame
+from brokk_min.can.connection import Bus, has_real_time_priority, lock_memory, open_bus
+
+
+@pytest.fixture
+def buses():
+    here, there = (can.Bus("canopen", interface="virtual") for _ in range(2))
+    yield here, there
+    here.shutdown()
+    there.shutdown()
+
+
+def test_bus__marks_foreign_frames_and_echoes_and_logs_all_but_echoes(buses):
+    text = io.StringIO()
+    bus = Bus(buses[0], can.CanutilsLogWriter(text), "can0", echo=True, clock=lambda: 1.0)
+    bus.send(0x123, b"\x01\x02")
+    for fields in (
+        {"arbitration_id": 0x123, "data": b"\x01\x02"},  # the echo
+        {"arbitration_id": 0x123, "data": b"\x01\x02"},  # somebody else
+        {"arbitration_id": 0x123, "data": b"\x01", "is_extended_id": True},
+        {"arbitration_id": 0x124, "is_remote_frame": True},
+        {"arbitration_id": 0x125, "is_error_frame": True},
+        {"arbitration_id": 0x126, "is_fd": True, "data": bytes(12)},
+    ):
+        buses[1].send(can.Message(**({"is_extended_id": False} | fields)))
+    frames = [bus.recv(0.5) for _ in range(6)]
+    assert [frame and frame.id for frame in frames] == [-1, 0x123, -1, -1, -1, -1]
+    assert frames[0] == Frame(bus.now(), -1, b"\x01\x02")
+    assert bus.recv(0.0) is None
+    bus.log_input(b"\x09")
+    assert not text.getvalue()  # writing waits until there is time
+    bus.flush()
+    lines = text.getvalue().splitlines()
+    assert len(lines) == 7
+    assert re.fullmatch(r"\(\d+\.\d{6}\) can0 123#0102 T", lines[0])
+    assert re.fullmatch(r"\(\d+\.\d{6}\) can0 123#0102 R", lines[1])
+    assert re.fullmatch(r"\(\d+\.\d{6}\) operator 7FF#09 T", lines[-1])
+
+
+class SelectBus:
+    """A silent bus; a wait on it takes as long as the wait says, or a millisecond."""
+
+    def __init__(self):
+        self.t = 7.0
+        self.waits = []
+        self.ready = []
+        self.messages = []
+
+    def fileno(self):
+        return 7
+
+    def recv(self, timeout):
+        assert timeout == 0.0  # python-can's own timeout follows the time of day
+        return self.messages.pop() if self.messages else None  # None: the filter took it
+
+    def send(self, message, timeout):
+        assert 0 < timeout <= 0.02  # a full buffer must not hold up the tick
+
+    def shutdown(self):
+        self.t = -1.0
+
+    def select(self, read, *rest):
+        assert read == [7]
+        self.waits.append(rest[-1])
+        self.t += rest[-1] + 1e-6 if rest[-1] and not self.ready else 0.001
+        return self.ready, [], []
+
+
+@pytest.mark.parametrize(("busy", "slept"), [(0.0, [0.019]), (0.004, [0.016]), (0.020, [])])
+def test_recv__sleeps_only_after_its_busy_wait(busy, slept, monkeypatch):
+    silent = SelectBus()
+    bus = Bus(silent, clock=lambda: silent.t)
+    monkeypatch.setattr("select.select", silent.select)
+    assert bus.recv(0.020, busy) is None
+    assert [wait for wait in silent.waits if wait] == pytest.approx(slept, abs=1.1e-3)
+    assert 0.020 <= silent.t - 7.0 < 0.0225
+    silent.t = 7.0
+    silent.ready = [7]
+    silent.messages = [can.Message(arbitration_id=0x181, is_extended_id=False), None, None]
+    assert bus.recv(0.020, busy).id == 0x181
+    assert silent.t < 7.004  # what is there is read at once, and frames that a filter took
+
+
+def test_open_bus__refuses_a_bus_that_is_not_there_or_fails():
+    refusal = r"socketcan nosuch0: expected a CAN bus, got"
+    with pytest.raises(ValueError, match=refusal), open_bus("socketcan", "nosuch0"):
+        pass
+    refusal = r"virtual v: expected a CAN bus that works, got CanOperationError\('full'\)"
+    with pytest.raises(ValueError, match=refusal), open_bus("virtual", "v"):
+        raise can.CanOperationError("full")
+
+
+def test_open_bus__gives_back_no_echo_over_udp(tmp_path, monkeypatch):
+    own_multicast_port(monkeypatch)
+    with (
+        open_bus("udp_multicast", MULTICAST, tmp_path / "a.log") as a,
+        open_bus("udp_multicast", MULTICAST) as b,
+    ):
+        a.send(0x5A5, b"\x01")
+        first = [a.recv(1.0), b.recv(1.0)]
+        assert [f and (f.id, f.data) for f in first] == [(-1, b"\x01"), (0x5A5, b"\x01")]
+        b.send(0x5A5, b"\x01")
+        answer = a.recv(1.0)
+        assert answer and answer.id == 0x5A5
+    lines = (tmp_path / "a.log").read_text().splitlines()
+    assert [line.partition(") ")[2] for line in lines] == [
+        "udp_multicast 5A5#01 T",
+        "udp_multicast 5A5#01 R",
+    ]
+
+
+def test_open_bus__keeps_frames_of_other_identifiers_away():
+    with (
+        open_bus("virtual", "filtered", ids=(0x181, 0x710)) as bus,
+        open_bus("virtual", "filtered") as other,
+    ):
+        for can_id in (0x123, 0x181, 0x300, 0x710):
+            other.send(can_id, b"")
+        frames = [bus.recv(0.1) for _ in range(3)]
+    assert [frame.id for frame in frames if frame] == [0x181, 0x710]
+
+
+def test_has_real_time_priority__is_what_the_kernel_says():
+    """Field 41 of /proc/self/stat is the policy: 1 and 2 are FIFO and round robin."""
+    with open("/proc/self/stat") as stat:
+        policy = int(stat.read().rpartition(")")[2].split()[38])
+    assert has_real_time_priority() == (policy in (1, 2))
+
+
+def test_lock_memory__locks_what_is_used_or_says_that_it_must_not():
+    child = os.fork()
+    if not child:  # a child, so that the tests' own memory stays as it is
+        locked = lock_memory()
+        with open("/proc/self/status") as status:
+            kilobytes = int(re.findall(r"VmLck:\s+(\d+)", status.read())[0])
+        os._exit(0 if locked == (kilobytes > 0) else 1)
+    assert os.waitpid(child, 0)[1] == 0

@@ -1,0 +1,352 @@
+"""What can go wrong on a bus: causes in a `World`, words that name each, and what came of it."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from functools import partial
+from operator import attrgetter
+from typing import Any, NamedTuple
+
+import can
+import numpy as np
+from helpers_bus import ConstantCommand, HoldingOperator, World, once, only, raises
+
+from brokk_min.can.canopen import Frame, encoder_raw, valve_frame
+from brokk_min.machine import BROKK_170
+
+COMMAND = (60, 0, 60, 60, 60)
+SLOW = (15, 0, 15, 15, 15)
+STEP = BROKK_170.encoder_step
+
+
+class Fault:
+    """What goes wrong in a world, from now on."""
+
+    def __init__(self, world, operator, controller):
+        self.world, self.operator, self.controller = world, operator, controller
+
+
+def put(name, value):
+    """Set an attribute of something in the world."""
+    owner, _, attribute = name.rpartition(".")
+    return lambda f: setattr(attrgetter(owner)(f), attribute, value)
+
+
+def up(can_id, act):
+    """Change frames of one identifier from the machine."""
+    return put("world.upward", only(can_id, act))
+
+
+def up_once(can_id, act):
+    """Change the first of them."""
+    return lambda f: up(can_id, once(act))(f)
+
+
+def down_once(act):
+    """Change the first valve frame."""
+    return lambda f: put("world.downward", only(0x210, once(act)))(f)
+
+
+def moved(add):
+    return lambda data: [struct.pack("<I", (struct.unpack("<I", data)[0] + add) % 2**26)]
+
+
+def freeze(f, node, slow=False):
+    f.controller.m[:] = SLOW if slow else f.controller.m
+    counts = np.rint(f.world.simulated.plant.q / STEP).astype(int)
+    data = struct.pack("<I", encoder_raw(BROKK_170, counts)[node - 1])
+    up(0x180 + node, lambda _: [data])(f)
+
+
+def delay(f, node, draw):
+    """Positions come `draw()` seconds late."""
+    held = []
+
+    def hold(data):
+        held.append((f.world.t + draw(), data))
+        return []
+
+    def noise():
+        due = [data for then, data in held if then <= f.world.t]
+        held[:] = [item for item in held if item[0] > f.world.t]
+        return [(0x180 + node, data) for data in due]
+
+    up(0x180 + node, hold)(f)
+    f.world.noise = noise
+
+
+def late(f, node):
+    """Constantly late positions, and an operator who presses again and again."""
+    delay(f, node, lambda: 0.030)
+    f.operator.act = lambda: setattr(
+        f.operator, "enable", bool(f.world.drive.gate.driving or not f.operator.enable)
+    )
+
+
+def reorder(f, node):
+    """Every second position comes after the next one."""
+    held = []
+
+    def act(data):
+        if held:
+            return [data, held.pop()]
+        held.append(data)
+        return []
+
+    up(0x180 + node, act)(f)
+
+
+def flood(f, foreign=False, rate=2000):
+    """Frames of any identifier; pairs of identifier and length that came, and how many exist."""
+    rng = np.random.default_rng(0)
+    nodes = (1, 2, 3, 4, 5, 16)
+    ours = {0, 0x80, 0x210, *(base + n for base in (0x180, 0x580, 0x600, 0x700) for n in nodes)}
+    ids = rng.permutation([i for i in range(2048) if not foreign or i not in ours])
+    assert len(ids) % 3  # no factor in common with the nine lengths: each pair has its turn
+    seen = set()
+    begun, count = f.world.t, 0
+
+    def noise():
+        nonlocal count
+        out = []
+        while begun + count / rate < f.world.t:
+            count += 1
+            out.append((int(ids[count % len(ids)]), rng.bytes(count % 9)))
+            seen.add((out[-1][0], len(out[-1][1])))
+        return out
+
+    f.world.noise = noise
+    return seen, 9 * len(ids)
+
+
+def second_master(f):
+    """Somebody else sends valid valve frames of his own."""
+    begun, count = f.world.t, 0
+
+    def noise():
+        nonlocal count
+        if f.world.t < begun + 0.05 * (count + 1):
+            return []
+        count += 1
+        return [(0x210, valve_frame([20, 0, 0, 0, 0], count % 256, 1).tobytes())]
+
+    f.world.noise = noise
+
+
+def intruder(f, after):
+    """Somebody else sends a well-formed frame of 77 counts after each of our frames of an id."""
+    counter = 0
+
+    def follow(can_id, data):
+        nonlocal counter
+        out = [(can_id, data)]
+        if can_id == 0x210:
+            counter = data[5]
+        if can_id == after:
+            counter += 1
+            out.append((0x210, valve_frame([77, 0, 0, 0, 0], counter % 256, 1).tobytes()))
+            message = can.Message(arbitration_id=0x210, data=out[-1][1], is_extended_id=False)
+            f.world.far.send(message)
+        return out
+
+    f.world.downward = follow
+
+
+def foreign(can_id, data):
+    """One frame of somebody else."""
+
+    def cause(f):
+        frames = [(can_id, data)]
+        f.world.noise = lambda: [frames.pop()] if frames else []
+
+    return cause
+
+
+def delay_valve_frames(f, seconds):
+    held = []
+
+    def deliver():
+        while held and held[0][0] <= f.world.t:
+            f.world.simulated.receive(Frame(f.world.t, 0x210, held.pop(0)[1]))
+        return []
+
+    f.world.downward = only(0x210, lambda d: held.append((f.world.t + seconds, d)) or [])
+    f.world.noise = deliver
+
+
+def repeat_once(f, node, slow=False):
+    """The position of the tick before, from now on, without a gap."""
+    f.controller.m[:] = SLOW if slow else COMMAND
+    held = []
+
+    def act(data):
+        held.append(data)
+        return held[-2:][:1]
+
+    up(0x180 + node, act)(f)
+
+
+def drift(f, node, speed):
+    """An encoder that gains `speed` counts a second."""
+    begun = f.world.t
+    up(0x180 + node, lambda data: moved(round(speed * (f.world.t - begun)))(data))(f)
+
+
+def close_bus(f):
+    f.world.near.shutdown()
+    f.world.recv = raises(can.CanOperationError("closed"))
+    f.world.send = raises(can.CanOperationError("closed"))
+
+
+def send_error(f, valves_only):
+    fail = raises(can.CanOperationError("no buffer space"))
+    f.world.downward = only(0x210, fail) if valves_only else fail
+
+
+def stall(seconds):
+    def cause(f):
+        stalls = [seconds]
+        f.controller.act = lambda: f.world.sleep(stalls.pop()) if stalls else None
+
+    return cause
+
+
+def command(joint, value):
+    return lambda f: f.controller.m.__setitem__(joint, value)
+
+
+class Kind(NamedTuple):
+    """A fault, and words of the reason that the program gives, or why it cannot find it."""
+
+    cause: Callable[[Fault], Any]
+    words: str
+
+
+OTHER_SENDER = "SYNC, NMT or valve frame of another sender"
+NOT_OPERATIONAL = "valve controller: not operational"
+FAULTS = {
+    "valve controller silent": Kind(up(0x710, lambda d: []), "valve controller: heartbeat lost"),
+    "valve controller stopped": Kind(up(0x710, lambda d: [b"\x04"]), NOT_OPERATIONAL),
+    "valve controller's heartbeat malformed": Kind(up(0x710, lambda d: [d * 2]), "heartbeat lost"),
+    "flood on all identifiers": Kind(flood, ""),
+    "flood of 6,000 foreign frames a second": Kind(
+        partial(flood, foreign=True, rate=6000), "bus flooded"
+    ),
+    "flood of 20,000 foreign frames a second": Kind(
+        partial(flood, foreign=True, rate=20_000), "bus flooded"
+    ),
+    "second master": Kind(second_master, OTHER_SENDER),
+    "second sender after each of our valve frames": Kind(partial(intruder, after=0x210), ""),
+    "second sender after each SYNC": Kind(partial(intruder, after=0x080), OTHER_SENDER),
+    "foreign SYNC": Kind(foreign(0x080, b""), OTHER_SENDER),
+    "foreign NMT stop of all": Kind(foreign(0x000, b"\x02\x00"), OTHER_SENDER),
+    "foreign NMT reset of q4": Kind(foreign(0x000, b"\x81\x04"), OTHER_SENDER),
+    "foreign NMT stop of the valve controller": Kind(foreign(0x000, b"\x02\x10"), OTHER_SENDER),
+    "bus closed": Kind(close_bus, "error (CanOperationError: closed)"),
+    "send error of all frames": Kind(partial(send_error, valves_only=False), "(CanOperationError"),
+    "send error of valve frames": Kind(partial(send_error, valves_only=True), ""),
+    "valve frame lost": Kind(down_once(lambda d: []), NOT_OPERATIONAL),
+    "valve frame doubled": Kind(down_once(lambda d: [d, d]), NOT_OPERATIONAL),
+    "valve frame's bit flipped": Kind(
+        down_once(lambda d: [bytes([d[0] ^ 4, *d[1:]])]), "valve controller"
+    ),
+    "valve frame cut": Kind(down_once(lambda d: [d[:7]]), NOT_OPERATIONAL),
+    "all valve frames lost": Kind(
+        put("world.downward", only(0x210, lambda d: [])), NOT_OPERATIONAL
+    ),
+    "valve frames 60 ms late": Kind(partial(delay_valve_frames, seconds=0.06), NOT_OPERATIONAL),
+    "valve frames 100 ms late": Kind(partial(delay_valve_frames, seconds=0.1), NOT_OPERATIONAL),
+    "joystick unplugged": Kind(put("operator.alive", False), "operator's device lost"),
+    "joystick raises": Kind(put("operator.act", raises(OSError("gone"))), "error (OSError: gone)"),
+    "enable released": Kind(put("operator.enable", False), ""),
+    "SIGTERM": Kind(lambda f: f.world.drive.signals.append(15), "stop asked for"),
+    "operator stops": Kind(put("operator.stop", True), "stop asked for"),
+    "clock stepped forward": Kind(put("world.offset", 3600.0), "tick late, or the"),
+    "clock stepped back": Kind(put("world.offset", -3600.0), "tick late, or the"),
+    "log cannot be written": Kind(
+        put("world.bus.flush", raises(OSError("no space"))), "error (OSError: no space)"
+    ),
+    "late tick": Kind(stall(0.08), "tick late"),
+    "hang": Kind(stall(0.8), "tick late"),
+    "policy returns NaN": Kind(command(2, np.nan), "q3: no valid command"),
+    "policy returns infinity": Kind(command(0, np.inf), "q1: no valid command"),
+    "policy beyond the limit": Kind(command(4, 81), "q5: no valid command"),
+    "policy moves the locked joint": Kind(command(1, 20), "q2: no valid command"),
+    "policy raises": Kind(
+        put("controller.act", raises(RuntimeError("boom"))), "error (RuntimeError: boom)"
+    ),
+    "encoders all silent": Kind(
+        put("world.upward", lambda i, d: [] if 0x180 < i < 0x190 else [(i, d)]), "q1: silent"
+    ),
+}
+for node in range(1, 6):
+    name, tpdo, heartbeat = f"q{node}", 0x180 + node, 0x700 + node
+    doubled = f"{name}: doubled or malformed"
+    FAULTS |= {
+        f"{name} dropped": Kind(up(tpdo, lambda d: []), f"{name}: silent"),
+        f"{name} dropped once": Kind(up_once(tpdo, lambda d: []), f"{name}: silent"),
+        f"{name} jumps": Kind(up(tpdo, moved(90)), f"{name}: jumped"),
+        f"{name} jumps by half a turn": Kind(up(tpdo, moved(2048)), f"{name}: out of range"),
+        f"{name} jumps by a turn": Kind(up(tpdo, moved(4096)), doubled),
+        f"{name} says FFFFFFFF": Kind(up(tpdo, lambda d: [b"\xff" * 4]), doubled),
+        f"{name} doubled": Kind(up(tpdo, lambda d: [d, d]), doubled),
+        f"{name} reordered": Kind(partial(reorder, node=node), f"{name}: silent"),
+        f"{name} malformed": Kind(up(tpdo, lambda d: [d[:3]]), doubled),
+        f"{name} heartbeat lost": Kind(up(heartbeat, lambda d: []), f"{name}: heartbeat lost"),
+        f"{name} rebooted": Kind(up(heartbeat, lambda d: [b"\x00"]), f"{name}: not operational"),
+    }
+    if node != 2:  # the operator moves q2, no command of ours
+        FAULTS |= {
+            f"{name} late by 30 ms, after re-arm too": Kind(
+                partial(late, node=node), f"{name}: silent"
+            ),
+            f"{name} frozen": Kind(partial(freeze, node=node), f"{name}: frozen"),
+            f"{name} a tick late, without a gap": Kind(
+                partial(repeat_once, node=node), f"{name}: frozen"
+            ),
+        }
+MOTION = "it looks like motion, which no other sensor confirms"
+NOT_FOUND = {
+    "q2 frozen, the locked joint": Kind(partial(freeze, node=2), "it may stand still"),
+    "slow q3 a tick late, without a gap": Kind(
+        partial(repeat_once, node=3, slow=True), "a position has neither time nor number"
+    ),
+    "slow q3 frozen": Kind(partial(freeze, node=3, slow=True), "it takes longer, see below"),
+    "q3 drifts by 60 counts/s": Kind(partial(drift, node=3, speed=60), MOTION),
+    "q5 drifts by 400 counts/s": Kind(partial(drift, node=5, speed=-400), MOTION),
+    "valve frames 30 ms late": Kind(
+        partial(delay_valve_frames, seconds=0.03), "within the tick; the machine follows later"
+    ),
+    "2,000 foreign frames a second": Kind(partial(flood, foreign=True), "harmless"),
+}
+
+
+class Outcome(NamedTuple):
+    """What came of a fault, by the plant's own record."""
+
+    seconds: float  # from the fault until the valves were closed for good
+    latched: bool  # closed long before the end, though the operator held on
+    words: str  # reason that the program gave
+    commands: tuple[np.ndarray, np.ndarray]  # `World.commands` since the fault
+
+
+def measure(cause: Callable[[Fault], Any], phase: float, seconds: float = 0.6) -> Outcome:
+    """Drive for a second, let it go wrong `phase` [s] after a SYNC, and go on for `seconds`."""
+    operator, controller = HoldingOperator(), ConstantCommand(*COMMAND)
+    world = World(controller, operator)
+    world.drive.begin()
+    world.run(1.0)
+    world.sleep(max(0.0, world.syncs[-1] + phase - world.t))
+    assert world.commands[1][-1].tolist() == list(COMMAND), "it drove"
+    begun = world.t
+    cause(Fault(world, operator, controller))
+    world.run(seconds)
+    words = world.drive.reason
+    world.sleep(max(0.0, begun + seconds + 0.3 - world.t))
+    world.close()
+    times, m = world.commands
+    times, m = times[times > begun], m[times > begun]
+    is_open = m.any(axis=1)
+    last = float(times[is_open][-1]) if is_open.any() else begun
+    return Outcome(last - begun, last < begun + seconds - 0.2, words, (times, m))
