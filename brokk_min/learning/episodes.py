@@ -27,7 +27,7 @@ PAPER_LEARNER: dict[str, Any] = {
     "epochs": 2,
     "learning_rate": 1.2e-3,
     "target_kl": 0.03,
-    "gamma": 0.9,
+    "gamma": 0.8,
     "log_std": -1.2,
     "log_std_end": None,
 }
