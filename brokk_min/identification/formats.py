@@ -199,7 +199,9 @@ def check_fields(
     """`check` of all fields of an object, also of objects within; others are not looked at."""
     if not isinstance(content, Mapping):
         place = within.removesuffix(".") or "content"
-        raise ValueError(f"{path}: {place}: expected names {list(fields)}, got {brief(content)}")
+        wanted = [name for name in fields if name != "*"]
+        what = f"names {wanted}" if wanted else "an object"
+        raise ValueError(f"{path}: {place}: expected {what}, got {brief(content)}")
     others = [name for name in content if name not in fields] if "*" in fields else []
     named = {name: field for name, field in fields.items() if name != "*"}
     for name, field in (named | dict.fromkeys(others, fields.get("*"))).items():

@@ -235,7 +235,7 @@ def test_evaluate__writes_what_it_used(folder, capsys):
     assert [run["controller"] for run in best] == ["perfect_model", "perfect_model_closed"]
     capsys.readouterr()
     assert run(f"evaluate {line} --gains", SHIPPED_GAINS) == 1  # gains for other nets
-    assert "gains for" in capsys.readouterr().err
+    assert "gains.json: actuator: expected" in capsys.readouterr().err
     (folder / "low.csv").write_text("q1,q2,q3,q4,q5\n0,0,-0.3,2.5,1.2\n")
     assert run(f"evaluate --starts '{folder}/low.csv'") == 1
     assert "low.csv: row 2: expected the whole arm above" in capsys.readouterr().err
