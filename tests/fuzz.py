@@ -117,8 +117,12 @@ def places(table: Any, content: Any, within: Place = ()) -> dict[Place, Field]:
         return {within: table}
     found = {}
     for name in content:
-        if name in table or "*" in table:
-            found |= places(table.get(name, table.get("*")), content[name], (*within, name))
+        if name in table:
+            found |= places(table[name], content[name], (*within, name))
+        elif isinstance(table.get("*"), Field):
+            found[(*within, name)] = replace(table["*"], required=False)
+        elif "*" in table:
+            found |= places(table["*"], content[name], (*within, name))
     return found
 
 
@@ -265,7 +269,11 @@ def bad_values(value: Any, field: Field, rng: np.random.Generator) -> Iterator[t
         yield "reshaped", array[None]
         yield "cut", array[:-1]
     else:
-        other = 3 if field.kind in ("text", "object", "truth value") else "a"
+        other = (
+            "a"
+            if field.kind in ("float", "number", "whole number") or type(value) in (int, float)
+            else 3
+        )
         yield "retyped", [other] * len(array) if field.shape == ("rows",) else other
         if field.shape != ("rows",):
             yield "nested", NESTED

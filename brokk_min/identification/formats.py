@@ -185,7 +185,7 @@ def check(
         return
     at = tuple(int(i) for i in np.argwhere(~good)[0])
     got = brief(array[at]) if field.kind == "text" else f"{numbers[at]:g}"
-    got = repr(cell[:60]) if cell is not None and not np.isfinite(numbers[at]) else got
+    got = brief(cell) if cell is not None and not np.isfinite(numbers[at]) else got
     place = f"{name}{list(at) or ''}"
     if field.shape == ("rows",):
         place = f"row {at[0] + 2}, column {name}"

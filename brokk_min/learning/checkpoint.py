@@ -261,13 +261,16 @@ class TrainingLog:
 def check_like(path: Path, place: str, value: Any, like: Any) -> None:
     """ValueError: `value` has other keys, types or shapes than `like`, or is not finite."""
     wanted, got = type(like).__name__, type(value).__name__
+    if isinstance(like, dict) and isinstance(value, dict):
+        wanted = got = "dict"  # ordered or not
     if isinstance(like, torch.Tensor) and isinstance(value, torch.Tensor):
         wanted, got = (f"{list(x.shape)} of {x.dtype}" for x in (like, value))
         if value.shape == like.shape and value.is_floating_point() == like.is_floating_point():
             got = wanted if torch.isfinite(value).all() else "nan or inf"
     elif isinstance(like, dict) and isinstance(value, dict):
-        wanted, got = brief(sorted(map(str, like))), brief(sorted(map(str, value)))
-        for key in like if value.keys() == like.keys() else ():
+        differing = sorted(map(str, like.keys() ^ value.keys()))
+        got = f"one of other names: {brief(differing)}" if differing else wanted
+        for key in like.keys() & value.keys():
             check_like(path, f"{place}.{key}", value[key], like[key])
     elif isinstance(like, list | tuple) and type(value) is type(like) and len(value) == len(like):
         for i, pair in enumerate(zip(value, like, strict=True)):

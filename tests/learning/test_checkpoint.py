@@ -233,7 +233,7 @@ def test_train_policy__refuses_a_truncated_checkpoint(broken, fraction):
     [
         ("header", '{"format": 0, "identity": {}}', "format: expected 5, got 0"),
         ("generator", None, "content.generator: expected Tensor, got NoneType"),
-        ("random", {}, "content.random: expected "),
+        ("random", {}, "content.random: expected dict, got one of other names"),
     ],
 )
 def test_train_policy__refuses_a_checkpoint_with_other_content(broken, name, value, message):
