@@ -31,6 +31,8 @@ FREE_RUN_S = 30.0  # s, as in the paper
 STYLES: dict[str, dict[str, Any]] = {
     "goal": {"color": "black", "linestyle": ":"},
     "rl": {"color": "#08306b"},
+    "rl_open": {"color": "#5b8fd0"},
+    "rl_paper": {"color": "#b2182b"},
     "jacobian_pid_k0.1": {"color": "#d9661a"},
     "jacobian_pid_k0.05": {"color": "#f0b84a", "linestyle": "--"},
     "jacobian_pid_ff": {"color": "#00886a", "linestyle": "-."},

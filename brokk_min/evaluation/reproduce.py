@@ -257,8 +257,8 @@ def compare(
     along_x = {c: Trace(*(array[:, workspace] for array in traces[c, "x"])) for c in pids}
     goals = commands[0].for_starts(machine, reachable)
     claim = partial(claims.task_claims, machine)
-    theirs = claim("rl_paper", pids, scored, along_x, goals, near["rl_paper"])
-    ours = claim("rl", pids, scored, along_x, goals, near["rl"])
+    theirs = claim("rl_paper", pids, scored, along_x, goals, near.get("rl_paper", []))
+    ours = claim("rl", pids, scored, along_x, goals, near.get("rl", []))
     short = shorten(machine, sequences.axis_sequences(machine), budget.short_s)
     results = {
         "task_space": tables(runs, scored),
@@ -317,7 +317,7 @@ def near_singularities(
     empty without starts. Paper: Fig. 6a, 6e, 6f
     """
     if not len(starts):
-        return {"summary": {}, "claims": {}}, {"rl": [], "rl_paper": []}, {}
+        return {"summary": {}, "claims": {}}, {}, {}
     commands = shorten(machine, sequences.singular_sequences(machine, starts), seconds)
     runs, traces = evaluate(machine, controllers, commands, starts, seed)
     w0 = manipulability_threshold(machine)
@@ -329,7 +329,7 @@ def near_singularities(
             for s in commands
         ]
         speed[name] = metrics.row_mean(np.stack(fractions, axis=1))
-    singular = {name: claims.singular_claims(name, runs, speed) for name in ("rl", "rl_paper")}
+    singular = {name: claims.singular_claims(name, runs, speed) for name in POLICIES if name in speed}
     results = {
         "summary": summary(runs),
         "claims": {name: [c.to_json() for c in every] for name, every in singular.items()},

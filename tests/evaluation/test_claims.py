@@ -111,7 +111,7 @@ def test_training_claim__allows_a_factor_of_two(hours, holds):
 )
 def test_drift_claim__is_of_all_baselines(rl, high, low, holds):
     runs = runs_with("off_axis_drift_max", rl=rl, high=high, low=low)
-    result = [claims.still_claim(runs), claims.drift_claim(runs, (HIGH, LOW))]
+    result = [claims.still_claim(runs, "rl"), claims.drift_claim(runs, "rl", (HIGH, LOW))]
     assert verdicts(result) == holds
     assert result[0].numbers["rl"]["mean"] == pytest.approx(rl + 0.001)
     assert result[1].numbers[f"{HIGH} less rl"]["mean"] == pytest.approx(high - rl)
@@ -120,7 +120,7 @@ def test_drift_claim__is_of_all_baselines(rl, high, low, holds):
 def test_drift_claim__of_one_start_has_no_verdict():
     runs = runs_with("off_axis_drift_max", rl=0.1, high=0.2, low=0.2)
     one = [run for run in runs if run["start"] == 0]
-    assert verdicts([claims.still_claim(one), claims.drift_claim(one, (HIGH, LOW))]) == [None, None]
+    assert verdicts([claims.still_claim(one, "rl"), claims.drift_claim(one, "rl", (HIGH, LOW))]) == [None, None]
 
 
 @pytest.mark.parametrize(
@@ -143,9 +143,9 @@ def test_less_claim__is_of_each_sequence_and_figure(x, z, drift, holds):
     names = (HIGH, LOW)
     both = ("velocity_error_mean", "off_axis_drift_max")
     result = [
-        claims.less_claim("tracking", runs, names, "xyz"),
-        claims.less_claim("along z", runs, names, "z", both),
-        claims.less_claim("outperforms", runs, names, ["all"]),
+        claims.less_claim("tracking", runs, "rl", names, "xyz"),
+        claims.less_claim("along z", runs, "rl", names, "z", both),
+        claims.less_claim("outperforms", runs, "rl", names, ["all"]),
     ]
     assert verdicts(result) == holds
     less = result[1].numbers["drift z, less jacobian_pid_k0.1"]["mean"]
@@ -188,7 +188,7 @@ def test_task_claims__are_in_the_papers_order_and_of_a_stronger_baseline_too():
     trace = trace_of(np.tile(POSE, (2, 1)), np.zeros(3), np.zeros(5), 20)
     singular = [Claim("slowed", {}, None), Claim("jerky", {}, True)]
     along_x = dict.fromkeys(pids, trace)
-    result = claims.task_claims(BROKK_170, pids, runs, along_x, np.zeros((20, 2, 3)), singular)
+    result = claims.task_claims(BROKK_170, "rl", pids, runs, along_x, np.zeros((20, 2, 3)), singular)
     expected = ["still", "drift", "direction", "slowed", "jerky", "tracking", "along z"]
     assert [claim.name for claim in result] == [*expected, "outperforms"]
     assert set(expected) < set(claims.TEXTS)
@@ -228,4 +228,4 @@ def test_singular_claims__compare_speed_and_jerk(speed, jerk, holds):
     speeds = {c: s + spread for c, s in zip(("rl", HIGH, LOW), speed, strict=True)}
     rl, high, low = jerk
     runs = runs_with("jerk_rms", rl=rl, high=high, low=low)
-    assert verdicts(claims.singular_claims(runs, speeds)) == holds
+    assert verdicts(claims.singular_claims("rl", runs, speeds)) == holds

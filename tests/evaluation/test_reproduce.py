@@ -21,13 +21,14 @@ from brokk_min.evaluation.sequences import axis_sequences, task_sequences, tunin
 from brokk_min.identification.fitting import FitConfig
 from brokk_min.identification.logs import read_log
 from brokk_min.identification.net_file import load_net
-from brokk_min.learning.policy import load_policy
+from brokk_min.learning.policy import POLICIES, load_policy
 from brokk_min.machine import BROKK_170
 
 TINY = Budget(0.004, 20, 4096, 1, 1, 4, 2, 0.5)
 ERROR = "velocity_error_mean"
 PIDS = ["jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff", "jacobian_pid_ff_awake"]
 PIDS += ["jacobian_pid_ff_integral", "jacobian_pid_ff_integral_awake"]
+CONTROLLERS = [*POLICIES, *PIDS]
 
 
 class Idle:
@@ -64,7 +65,8 @@ def test_reproduce__gives_the_same_bits_twice(folder, tmp_path, monkeypatch, cap
     for name in ("log.npz", "net.npz", "policy.npz", "gains.json", "results.json"):
         assert (folder / name).read_bytes() == (tmp_path / name).read_bytes(), name
     clock = json.loads((folder / "timing.json").read_text())
-    assert list(clock) == ["record", "fit", "train", "tune", "evaluate", "draw"]
+    stages = ["record", "fit net", "fit net_paper", "fit", *(f"train {name}" for name in POLICIES)]
+    assert list(clock) == [*stages, "tune", "train and tune", "evaluate", "draw"]
     printed = capsys.readouterr().out
     assert printed.startswith("rl ") and printed.endswith(f"{tmp_path / 'results.json'}\n")
 
@@ -87,7 +89,7 @@ def test_reproduce__results_hold_every_run_with_its_figures(results):
     runs = results["task_space"]["runs"]
     sequences = [sequence.name for sequence in task_sequences(BROKK_170)]
     keys = {(run["controller"], run["sequence"], run["start"]) for run in runs}
-    assert keys == {(c, s, i) for c in ("rl", *PIDS) for s in sequences for i in range(4)}
+    assert keys == {(c, s, i) for c in CONTROLLERS for s in sequences for i in range(4)}
     assert all(
         run["velocity_rmse"] >= run[ERROR] > 0 and 0 < run["reward_mean"] < 1 for run in runs
     )
@@ -105,7 +107,9 @@ def test_reproduce__results_answer_the_papers_sentences(results):
     assert [claim["figure"] for claim in results["claims"]] == [
         *["Fig. 6b-d"] * 3, *["Fig. 6a, e, f"] * 3, "Fig. 6e, f", "Fig. 6g, h", "Sec. 5"
     ]  # fmt: skip
-    assert results["claims"][3:6] == results["singular"]["claims"]
+    of_papers_learner = [dict(claim) for claim in results["claims"][3:6]]
+    ours = [claim.pop("ours") for claim in of_papers_learner]
+    assert results["singular"]["claims"] == {"rl": ours, "rl_paper": of_papers_learner}
     both = ["stronger" in claim for claim in results["claims"]]
     assert both == [False, True, True, False, False, False, True, True, True]
     less = results["task_space"]["rl_less"][ERROR]["jacobian_pid_ff"]
@@ -118,13 +122,13 @@ def test_reproduce__results_answer_the_papers_sentences(results):
 
 def test_reproduce__results_compare_with_the_bound_and_on_other_machines(results):
     less = results["regret"]["less_perfect_model"]
-    assert set(less) == {"rl", *PIDS} and set(less["rl"]) == {*"xyz", "all"}
+    assert set(less) == set(CONTROLLERS) and set(less["rl"]) == {*"xyz", "all"}
     means = results["regret"]["summary"]
     difference = means["rl"]["all"][ERROR] - means["perfect_model"]["all"][ERROR]
     assert less["rl"]["all"]["mean"] == pytest.approx(difference)
     assert "perfect_model_closed" in means
     assert set(results["robustness"]) == set(variations(BROKK_170))
-    assert set(results["robustness"]["nominal"]) == {"rl", *PIDS}
+    assert set(results["robustness"]["nominal"]) == set(CONTROLLERS)
 
 
 def test_reproduce__results_record_the_tuning(results):
@@ -230,6 +234,7 @@ def test_near_singularities__drives_along_what_an_upright_arm_can_do_least():
     np.testing.assert_allclose(result["least"], np.sqrt(np.linalg.eigvalsh(JJt)[:, 0]), rtol=1e-6)
     assert list(result["summary"]) == list(controllers)
     assert result["summary"]["rl"]["all"][ERROR] == pytest.approx(0.075 * 10 / 30)
-    assert result["claims"] == [claim.to_json() for claim in claims] and len(claims) == 3
+    assert result["claims"] == {"rl": [claim.to_json() for claim in claims["rl"]]}
+    assert len(claims["rl"]) == 3
     none = reproduce.near_singularities(machine, controllers, starts[:0], 1.5, 3)
-    assert none == ({"summary": {}, "claims": []}, [], {})
+    assert none == ({"summary": {}, "claims": {}}, {}, {})
