@@ -329,7 +329,9 @@ def near_singularities(
             for s in commands
         ]
         speed[name] = metrics.row_mean(np.stack(fractions, axis=1))
-    singular = {name: claims.singular_claims(name, runs, speed) for name in POLICIES if name in speed}
+    singular = {
+        name: claims.singular_claims(name, runs, speed) for name in POLICIES if name in speed
+    }
     results = {
         "summary": summary(runs),
         "claims": {name: [c.to_json() for c in every] for name, every in singular.items()},

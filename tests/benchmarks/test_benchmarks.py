@@ -7,12 +7,15 @@ import json
 import numpy as np
 import pytest
 
-from benchmarks import deviations, limits, peers
+from benchmarks import deviations, ladder, limits, peers
 from benchmarks.rollout import random_net
 from brokk_min import kinematics
 from brokk_min.env import action_to_pwm
 from brokk_min.evaluation import metrics
+from brokk_min.identification.files import SHIPPED
+from brokk_min.identification.net_file import save_net
 from brokk_min.learning.gym_env import TaskVectorEnv
+from brokk_min.learning.policy import load_policy
 from brokk_min.machine import BROKK_170
 
 
@@ -84,3 +87,11 @@ def test_deviations__train_and_compare(entry, monkeypatch):
     assert len(table) in (6, 12)
     assert set(table.values()) == {0.1, 0.02, 20.0}
     assert kinematics.to_heading is to_heading
+
+
+@pytest.mark.parametrize("name", ["our nets", "valves open at rest"])
+def test_climb__trains_and_scores_a_policy(tmp_path, name):
+    net = load_policy(SHIPPED / BROKK_170.name / "policy.npz", BROKK_170).net
+    save_net(tmp_path / "net.npz", net)
+    error, drift, travel, jerk = ladder.climb(tmp_path, name, 1, 0)
+    assert 0.05 < error < 0.3 and 0 < drift < 2 and travel > 0 and jerk > 0

@@ -120,7 +120,9 @@ def test_drift_claim__is_of_all_baselines(rl, high, low, holds):
 def test_drift_claim__of_one_start_has_no_verdict():
     runs = runs_with("off_axis_drift_max", rl=0.1, high=0.2, low=0.2)
     one = [run for run in runs if run["start"] == 0]
-    assert verdicts([claims.still_claim(one, "rl"), claims.drift_claim(one, "rl", (HIGH, LOW))]) == [None, None]
+    assert verdicts(
+        [claims.still_claim(one, "rl"), claims.drift_claim(one, "rl", (HIGH, LOW))]
+    ) == [None, None]
 
 
 @pytest.mark.parametrize(
@@ -188,7 +190,9 @@ def test_task_claims__are_in_the_papers_order_and_of_a_stronger_baseline_too():
     trace = trace_of(np.tile(POSE, (2, 1)), np.zeros(3), np.zeros(5), 20)
     singular = [Claim("slowed", {}, None), Claim("jerky", {}, True)]
     along_x = dict.fromkeys(pids, trace)
-    result = claims.task_claims(BROKK_170, "rl", pids, runs, along_x, np.zeros((20, 2, 3)), singular)
+    result = claims.task_claims(
+        BROKK_170, "rl", pids, runs, along_x, np.zeros((20, 2, 3)), singular
+    )
     expected = ["still", "drift", "direction", "slowed", "jerky", "tracking", "along z"]
     assert [claim.name for claim in result] == [*expected, "outperforms"]
     assert set(expected) < set(claims.TEXTS)

@@ -163,7 +163,7 @@ def test_render__answers_the_papers_sentences_first(folder, results):
     answers = [re.findall(r"<td[^>]*>(.*?)</td>", row, re.S) for row in rows[1:]]
     claims = [c for c in (*results["net_claims"], *results["claims"]) if c["figure"] != "Sec. 3.4"]
     assert len(answers) == len(claims)
-    for claim, (sentence, verdict, _) in zip(claims, answers, strict=True):
+    for claim, (sentence, verdict, *_) in zip(claims, answers, strict=True):
         assert html.unescape(sentence) == claim["paper"]
         assert verdict == VERDICTS[claim["holds"]]
     for title, text in sections.items():
