@@ -184,12 +184,12 @@ def test_render__escapes_names_and_shows_training_seeds(results):
 # --- stages ---------------------------------------------------------------------------------------
 
 
-def test_paper_recipe__is_scored_on_the_test_log(folder):
-    test = read_log([folder / "log_test.npz"], 4, rate=20.0)
-    config = FitConfig(steps=3, batch_size=8)
-    result = reproduce.paper_recipe(BROKK_170, test, 0.004, config, 3)
-    assert set(result["test"]) == set(BROKK_170.names) and "10" in result["test"]["q5"]["free_run"]
-    assert result["sim_to_real"]["tool_position_error_mean_of_runs"]["runs"] == 20
+def test_net_errors__of_the_papers_nets_are_in_the_results(folder, results):
+    """They were fitted to the paper's sines, plain commands and errors of one step."""
+    net = load_net(folder / "net_paper.npz")
+    assert (net.dead_zone, net.settings["rollout"], net.settings["noise"]) == (0.0, 1, 0.0)
+    test = read_log([folder / "log_test.npz"], BROKK_170.velocity_samples, rate=20.0)
+    assert reproduce.net_errors(BROKK_170, net, test, 3) == results["paper_recipe"]
 
 
 def test_tables__keep_kinds_of_starts_apart():
