@@ -18,7 +18,6 @@ from brokk_min.evaluation.claims import VERDICTS
 from brokk_min.evaluation.reproduce import Budget
 from brokk_min.evaluation.robustness import variations
 from brokk_min.evaluation.sequences import axis_sequences, task_sequences, tuning_set
-from brokk_min.identification.fitting import FitConfig
 from brokk_min.identification.logs import read_log
 from brokk_min.identification.net_file import load_net
 from brokk_min.learning.policy import POLICIES, load_policy
