@@ -160,7 +160,7 @@ def measure(
 
 
 def features(machine: Machine, measured: Measured, paper: bool = False) -> Array:
-    """The observation of the table above, ours or the paper's, float32 (..., obs). Paper: Sec. 3.4
+    """The observation of the table above, ours or the paper's. Paper: Sec. 3.4, Fig. 3
 
     Resolved velocities (ours): `dls` with W = 1, lambda = 6 % of the links' lengths (assumed).
     """

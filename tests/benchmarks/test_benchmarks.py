@@ -94,4 +94,4 @@ def test_climb__trains_and_scores_a_policy(tmp_path, name):
     net = load_policy(SHIPPED / BROKK_170.name / "policy.npz", BROKK_170).net
     save_net(tmp_path / "net.npz", net)
     error, drift, travel, jerk = ladder.climb(tmp_path, name, 1, 0)
-    assert 0.05 < error < 0.3 and 0 < drift < 2 and travel > 0 and jerk > 0
+    assert 0.05 < error < 0.3 and 0 <= drift < 2 and travel >= 0 and jerk >= 0

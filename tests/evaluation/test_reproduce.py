@@ -113,10 +113,11 @@ def test_reproduce__results_answer_the_papers_sentences(results):
     assert both == [False, True, True, False, False, False, True, True, True]
     less = results["task_space"]["rl_less"][ERROR]["jacobian_pid_ff"]
     for claim, sequences in zip(results["claims"][-3:], ("xyz", "z", ["all"]), strict=True):
-        numbers = claim["stronger"]["numbers"]
+        stronger = claim["ours"]["stronger"]
+        numbers = stronger["numbers"]
         for s in sequences:
             assert numbers[f"error {s}, less jacobian_pid_ff"] == less[s]
-        assert claim["stronger"]["holds"] is all(n["high"] < 0 for n in numbers.values())
+        assert stronger["holds"] is all(n["high"] < 0 for n in numbers.values())
 
 
 def test_reproduce__results_compare_with_the_bound_and_on_other_machines(results):
@@ -175,7 +176,7 @@ def test_render__escapes_names_and_shows_training_seeds(results):
     meta = results["meta"] | {"machine": "digger <1>"}
     changed = results | {"meta": meta, "training_seeds": {"rl": row}}
     images = collections.defaultdict(lambda: "QUJD")
-    page = report.render(BROKK_170, changed, images, {"train": 3600.0})
+    page = report.render(BROKK_170, changed, images, {"train rl_paper": 3600.0})
     assert "digger &lt;1&gt;) is an analytic plant, not a real machine" in page
     assert "0.5000 (0.2500 to 0.7500)" in page_sections(page)["Training seeds"]
 
