@@ -183,7 +183,7 @@ def train(
     """One of `POLICIES`: ours, ours with open valves, or the paper's, by its own settings."""
     task, learner = TaskConfig(), PPOConfig(total_steps=budget.train_steps, threads=1)
     if name == "rl_open":
-        task = TaskConfig(valves="open")
+        task = TaskConfig(valves="open", zero_goals=0.25, hold_max_s=5.0)  # it learns to rest, too
     if name == "rl_paper":
         task = TaskConfig(paper=True, **PAPER_TASK)
         learner = replace(learner, **PAPER_LEARNER)

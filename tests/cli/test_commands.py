@@ -18,7 +18,7 @@ from brokk_min.identification.files import SHIPPED
 from brokk_min.identification.logs import Log, Recording, read_log, write_log
 from brokk_min.identification.net_file import load_net, save_net
 from brokk_min.learning.episodes import PAPER_LEARNER, PAPER_TASK
-from brokk_min.learning.policy import load_policy
+from brokk_min.learning.policy import POLICIES, load_policy
 from brokk_min.machine import BROKK_170
 from brokk_min.ppo import PPOConfig
 
@@ -261,11 +261,12 @@ def test_shipped_policy__beats_the_papers_controllers(tmp_path):
     before = training["velocity_error_mean"]
     assert (training["command"], training["seed"]) == ("brokk-min reproduce --seed 0", 0)
     gains = json.loads(SHIPPED_GAINS.read_text())
-    assert set(gains["gains"]) | {"rl"} == set(before)
+    assert {*gains["gains"], *POLICIES} == set(before)
     assert gains["meta"]["seed"] == 0
     assert run("evaluate --num-starts 4 --json", tmp_path / "e.json") == 0
     rows = summary(json.loads((tmp_path / "e.json").read_text())["runs"])
     now = {name: row["all"]["velocity_error_mean"] for name, row in rows.items()}
+    assert set(before) == set(now)
     for errors in (before, now):
         assert 0 < errors["rl"] < min(errors["jacobian_pid_k0.1"], errors["jacobian_pid_k0.05"])
 
