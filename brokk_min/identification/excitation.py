@@ -25,9 +25,13 @@ MAX_RETURN = 300.0  # s, assumed: a longer return to the start is stopped
 
 
 def sine_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Array:
-    """One sine of random amplitude (dead zone to limit) and frequency, (ticks,). Paper: Sec. 3.3"""
+    """One sine of random amplitude (dead zone to limit) and frequency, (ticks,). Paper: Sec. 3.3
+
+    The paper prints no frequencies. These, 0.05 to 5 Hz, are as fast as a policy's commands: on
+    nets from slower sines policies learn to shake the valves.
+    """
     amplitude = rng.uniform(machine.dead_zone, machine.pwm_limit / PWM_MAX)
-    frequency = rng.uniform(0.02, 0.5)
+    frequency = np.exp(rng.uniform(np.log(0.05), np.log(5.0)))
     phase = rng.uniform(0, 2 * np.pi)
     time = machine.dt * np.arange(ticks)
     return np.asarray(amplitude * np.sin(2 * np.pi * frequency * time + phase))

@@ -42,7 +42,8 @@ def test_sine_command__has_amplitudes_from_dead_zone_to_limit_and_random_frequen
         amplitudes.append(np.abs(u).max())
         frequencies.append(np.arccos(doubled / 2) / (2 * np.pi * 0.05))
     assert 0.069 < min(amplitudes) < 0.15 and 0.55 < max(amplitudes) <= LIMIT
-    assert 0.02 <= min(frequencies) < 0.03 and 0.47 < max(frequencies) <= 0.5
+    assert 0.05 <= min(frequencies) < 0.06 and 4.5 < max(frequencies) <= 5.0
+    assert 0.35 < np.median(frequencies) < 0.75  # uniform in their logarithm: 0.5
 
 
 def test_rich_command__has_pauses_jumps_and_holds_and_the_requested_length():
