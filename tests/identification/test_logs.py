@@ -356,7 +356,7 @@ def test_read_log__names_file_and_place_of_a_bad_csv(tmp_path, case):
     [
         GOOD.encode("utf-16"),
         GOOD.replace("x", "\xfc").encode("latin-1"),
-        gzip.compress(b"run,time"),
+        gzip.compress(b"run,time", mtime=0),
     ],
 )
 def test_read_log__refuses_what_is_no_utf_8_text(tmp_path, content):
