@@ -91,7 +91,7 @@ def plot_panels(
 
 def _add_legend(figure: Figure) -> None:
     handles = figure.axes[0].get_legend_handles_labels()
-    figure.legend(*handles, loc="outside upper center", ncol=5)
+    figure.legend(*handles, loc="outside upper center", ncol=4)
 
 
 def _time_panels(dt: float, labels: Sequence[str], curves: Mapping[str, Array]) -> list[Panel]:
