@@ -330,7 +330,9 @@ def near_singularities(
         ]
         speed[name] = metrics.row_mean(np.stack(fractions, axis=1))
     singular = {
-        name: claims.singular_claims(name, runs, speed) for name in POLICIES if name in speed
+        name: claims.singular_claims(name, runs, speed)
+        for name in ("rl", "rl_paper")
+        if name in speed
     }
     results = {
         "summary": summary(runs),
