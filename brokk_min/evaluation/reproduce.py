@@ -329,11 +329,10 @@ def near_singularities(
             for s in commands
         ]
         speed[name] = metrics.row_mean(np.stack(fractions, axis=1))
-    singular = {
-        name: claims.singular_claims(name, runs, speed)
-        for name in ("rl", "rl_paper")
-        if name in speed
-    }
+    singular: dict[str, list[claims.Claim]] = {}
+    for name in ("rl", "rl_paper"):
+        if name in speed:
+            singular[name] = claims.singular_claims(name, runs, speed)
     results = {
         "summary": summary(runs),
         "claims": {name: [c.to_json() for c in every] for name, every in singular.items()},
