@@ -3,7 +3,7 @@
     python -m benchmarks.ladder [FOLDER] [STEPS] [SEEDS]
 
 Each row has all the changes of the rows above it. FOLDER is one of `brokk-min reproduce`, with both
-nets; by default results. By default three seeds of two million steps each, some 40 minutes.
+nets; by default results. By default three seeds of two million steps each.
 """
 
 import sys
