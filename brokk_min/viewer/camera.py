@@ -86,6 +86,16 @@ def cameras(
     return [_fit("side", side_box, side, axes), _fit("top", top_box, top, ABOVE)]
 
 
+def close_up(points: Array, box: Box) -> Camera:
+    """From the side or from above, whichever shows more of the points [m] (K, 3), and only them."""
+    side = _side_axes(points.mean(axis=0))
+    spans = [np.prod(np.ptp(points @ axes.T, axis=0)) for axes in (side, ABOVE)]
+    label, axes = ("side", side) if spans[0] >= spans[1] else ("top", ABOVE)
+    low, high = _bounds(points @ axes.T, 0.0)
+    border = max(0.15 * float((high - low).max()), 0.1)
+    return _fit(label, box, np.stack([low - border, high + border]), axes)
+
+
 def _fit(label: str, box: Box, bounds: Array, axes: Array) -> Camera:
     """The camera that shows the bounds [m] (2, 2) in a box, above a strip of soil."""
     left, upper, width, height = box

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from brokk_min.kinematics import forward_kinematics, jacobian, tool_position, tool_velocity
 from brokk_min.machine import PWM_MAX, Array, Machine
-from brokk_min.viewer.camera import ABOVE, Camera, cameras, extent, skeleton
+from brokk_min.viewer.camera import ABOVE, Camera, cameras, close_up, extent, skeleton
 from brokk_min.viewer.window import BACKGROUND, INK, Box, Canvas, Colour
 
 # all assumed
@@ -21,6 +21,7 @@ NEAR_LIMIT = 0.05  # of a joint's range: nearer to its end is a warning
 NEAR_SINGULAR = 0.1  # of the arm's length [1/rad]: a smaller singular value is a warning
 ARROW = 0.2  # of a view's smaller side: an arrow of the machine's tool speed
 HEAD = 40.0  # px above the views
+FOOT = 44.0  # px below a close-up
 
 NO_POINTS = np.zeros((0, 3))
 MUTED = (120, 128, 138)
@@ -37,12 +38,12 @@ PATH = (230, 159, 0)
 COLOURS = {"rl": (0, 114, 178), "jacobian": (213, 94, 0), "levers": (124, 87, 148)}
 TITLES = {
     "rl": "RL policy",
-    "jacobian": "Jacobian + PID",
+    "jacobian": "PID with DLS (the paper's)",
     "levers": "levers, joint by joint",
-    "jacobian_pid_k0.1": "Jacobian + PID",
-    "jacobian_pid_ff": "Jacobian + PID with feed-forward",
+    "jacobian_pid_k0.1": "PID with DLS (the paper's)",
+    "jacobian_pid_ff": "PID with DLS and feed-forward",
     "jacobian_pid_ff_awake": "the same, valves kept open",
-    "jacobian_pid_ff_integral": "Jacobian + PID with feed-forward and integral",
+    "jacobian_pid_ff_integral": "PID with DLS, feed-forward and integral",
     "jacobian_pid_ff_integral_awake": "the same, valves kept open",
 }
 
@@ -63,6 +64,8 @@ class Scene(NamedTuple):
     colour: Colour = COLOURS["rl"]
     notes: Sequence[str] = ()
     in_view: Array = NO_POINTS  # points that the views show [m] (K, 3); none: the whole reach
+    close_up: Array = NO_POINTS  # these points [m] (K, 3) fill a view, instead of top view and rows
+    headline: str = ""  # the one figure that decides
 
 
 def draw(canvas: Canvas, machine: Machine, scenes: Sequence[Scene]) -> None:
@@ -125,8 +128,13 @@ def near_singular(machine: Machine, q: Array) -> bool:
 
 def _panel(canvas: Canvas, machine: Machine, scene: Scene, box: Box) -> None:
     """One arm: title and status, both views, a row for each joint, notes."""
-    left, _, width, _ = box
+    left, upper, width, height = box
     side, top, rows, (x_notes, y_notes) = _layout(box, machine.n, len(scene.notes))
+    if len(scene.close_up):
+        half = (height - HEAD) / 2
+        side = (left, HEAD, width, half)
+        top = (left, HEAD + half, width, half - FOOT)
+        x_notes, y_notes = left + 16, HEAD + 34
     room = width - 60 - 9 * len(scene.status)  # px that the status leaves for the title
     title_size = int(np.clip(room / (0.7 * max(1, len(scene.title))), 8, 18))
     canvas.circle(np.array([left + 22.0, 21.0]), 7, scene.colour)
@@ -137,7 +145,10 @@ def _panel(canvas: Canvas, machine: Machine, scene: Scene, box: Box) -> None:
     else:
         middle = side[1] + side[3] / 2
         canvas.text(left + width / 2, middle, "no positions", 20, WARNING, 0.5)
-    _joint_rows(canvas, machine, scene, rows)
+    if len(scene.close_up):
+        canvas.text(left + width / 2, upper + height - FOOT / 2, scene.headline, 17, INK, 0.5)
+    else:
+        _joint_rows(canvas, machine, scene, rows)
     for i, note in enumerate(scene.notes):
         canvas.text(x_notes, y_notes + 18 * i, note, 12)
 
@@ -146,7 +157,10 @@ def _views(canvas: Canvas, machine: Machine, scene: Scene, side: Box, top: Box) 
     """The arm from both sides; goal and measured speed, warnings."""
     frames = forward_kinematics(machine, scene.q)
     p_tool = tool_position(frames)
-    for camera in cameras(machine, p_tool, side, top, scene.in_view):
+    views = cameras(machine, p_tool, side, top, scene.in_view)
+    if len(scene.close_up):
+        views = [views[0], close_up(scene.close_up, top)]
+    for camera in views:
         canvas.clip(camera.box)
         _backdrop(canvas, machine, camera)
         _arm(canvas, machine, camera, scene)

@@ -1,7 +1,7 @@
 """Recorded runs side by side, of logs or of results simulated again: in a window or as a film."""
 
 import subprocess
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,14 +23,26 @@ from brokk_min.identification.files import expected, read_json, whole_file
 from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocity
 from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import Array, Machine
-from brokk_min.viewer import camera, drawing
+from brokk_min.viewer import camera, drawing, tracing
 from brokk_min.viewer.window import Canvas, Colour, Window
 
 FFMPEG = (  # raw pictures in, MP4 of even width and height out
     "ffmpeg -loglevel error -f rawvideo -pix_fmt rgb24 -s {0}x{1} -r {2} -i - -pix_fmt yuv420p "
     "-vf crop=trunc(iw/2)*2:trunc(ih/2)*2 -f mp4 -movflags frag_keyframe+empty_moov pipe:1"
 )
-Images = Iterable[NDArray[np.uint8]]
+LAST_FRAME = 3000  # ms for which a GIF holds it, then it begins again
+
+
+@dataclass(frozen=True)
+class Images:
+    """The pictures (height, width, 3) of a film."""
+
+    ticks: list[int]
+    draw: Callable[[int], NDArray[np.uint8]]  # the picture of a tick
+
+    def __iter__(self) -> Iterator[NDArray[np.uint8]]:
+        """One after another, with a progress bar."""
+        return map(self.draw, tqdm(self.ticks, desc="draw", unit="frame", disable=None))
 
 
 @dataclass
@@ -56,6 +68,11 @@ class Run:
         """Velocity error |v_goal - v_tool| [m/s], (T,)."""
         v_tool = tool_velocity(forward_kinematics(self.machine, self.q), self.q_dot)
         return np.asarray(np.linalg.norm(self.v_goal - v_tool, axis=-1))
+
+    @cached_property
+    def distance(self) -> Array:
+        """Distance of the tool from the path [m], (T,)."""
+        return tracing.distance(self.path, self.p_tool)
 
     @cached_property
     def in_view(self) -> Array:
@@ -161,29 +178,37 @@ def _check_row(results: Results, row: dict[str, Any]) -> None:
 def film(runs: Sequence[Run], tick: int, size: tuple[int, int]) -> Canvas:
     """The picture of one tick of all runs; a run that is over stands still."""
     in_view = np.vstack([run.in_view for run in runs])
-    scenes = []
-    for run in runs:
-        at = min(tick, len(run.q) - 1)
-        scene = drawing.Scene(
-            run.q[at],
-            run.q_dot[at],
-            run.u[at],
-            run.v_goal[at],
-            trail=run.p_tool[: at + 1],
-            path=run.path,
-            title=drawing.TITLES.get(run.title, run.title),
-            status=f"{at * run.machine.dt:.1f} s",
-            colour=run.colour,
-            notes=[
-                f"velocity error {run.error[at]:.3f} m/s",
-                f"mean so far {run.error[: at + 1].mean():.3f} m/s",
-            ],
-            in_view=in_view,
-        )
-        scenes.append(scene)
+    traced = [p for run in runs if len(run.path) for p in (run.path, run.p_tool)]
+    close_up = np.vstack(traced) if len(traced) == 2 * len(runs) else drawing.NO_POINTS
     canvas = Canvas(size)
+    scenes = [_scene(run, tick, in_view, close_up) for run in runs]
     drawing.draw(canvas, runs[0].machine, scenes)
     return canvas
+
+
+def _scene(run: Run, tick: int, in_view: Array, close_up: Array) -> drawing.Scene:
+    at = min(tick, len(run.q) - 1)
+    headline = ""
+    if len(close_up):
+        headline = f"largest distance from the line: {1e3 * run.distance[: at + 1].max():.0f} mm"
+    return drawing.Scene(
+        run.q[at],
+        run.q_dot[at],
+        run.u[at],
+        run.v_goal[at],
+        trail=run.p_tool[: at + 1],
+        path=run.path,
+        title=drawing.TITLES.get(run.title, run.title),
+        status=f"{at * run.machine.dt:.1f} s",
+        colour=run.colour,
+        notes=[
+            f"velocity error {run.error[at]:.3f} m/s",
+            f"mean so far {run.error[: at + 1].mean():.3f} m/s",
+        ],
+        in_view=in_view,
+        close_up=close_up,
+        headline=headline,
+    )
 
 
 def write_film(
@@ -197,20 +222,21 @@ def write_film(
     if path.suffix not in writers:
         raise ValueError(f"{path}: expected a name ending in .gif or .mp4, got {path.suffix!r}")
     step = max(1, round(machine.rate / fps))
-    ticks = range(0, max(len(run.q) for run in runs), step)
-    bar = tqdm(ticks, desc="draw", unit="frame", disable=None)
-    images = (film(runs, tick, size).image() for tick in bar)
+    last = max(len(run.q) for run in runs) - 1
+    images = Images([*range(0, last, step), last], lambda tick: film(runs, tick, size).image())
     with whole_file(path) as file:
         writers[path.suffix](file, images, size, machine.rate / step)
 
 
 def _write_gif(file: IO[bytes], images: Images, size: tuple[int, int], fps: float) -> None:
-    octree = Image.Quantize.FASTOCTREE  # keeps the red of a short warning
-    frames = [Image.fromarray(image).quantize(256, octree) for image in images]
-    more = frames[1:]
-    frames[0].save(
-        file, "GIF", save_all=True, append_images=more, duration=round(1000 / fps), loop=0
-    )
+    ticks = images.ticks
+    samples = [images.draw(tick) for tick in (ticks[0], ticks[len(ticks) // 2], ticks[-1])]
+    warning = np.full_like(samples[0][:40], drawing.WARNING)  # a warning may be short
+    palette = Image.fromarray(np.vstack([*samples, warning])).quantize(64)
+    frames = [Image.fromarray(image).quantize(palette=palette, dither=0) for image in images]
+    times = [round(1000 / fps)] * (len(frames) - 1) + [LAST_FRAME]
+    more = {"append_images": frames[1:], "duration": times, "loop": 0}
+    frames[0].save(file, "GIF", save_all=True, **more)
 
 
 def _write_mp4(file: IO[bytes], images: Images, size: tuple[int, int], fps: float) -> None:

@@ -10,8 +10,9 @@ import numpy as np
 import pygame
 import pytest
 from helpers_bus import BASELINE, START
+from helpers_canvas import Recorder
 from helpers_viewer import PipedLoop, post_key
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from benchmarks.bus import random_policy
 from brokk_min.__main__ import main
@@ -143,15 +144,30 @@ def test_read_results__takes_files_of_reproduce_with_policy_and_gains_beside_the
 # --- films ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("fps", "frames"), [(10.0, 3), (7.0, 2), (100.0, 5)])
-def test_write_film__has_as_many_frames_a_second_as_ticks_allow(fps, frames, tmp_path):
+@pytest.mark.parametrize(("fps", "times"), [(10.0, [100, 100]), (7.0, [150, 150]), (100.0, [50] * 4)])
+def test_write_film__has_as_many_frames_a_second_as_ticks_allow(fps, times, tmp_path):
+    """The last tick is always there, and is held for three seconds."""
     replay.write_film(tmp_path / "f.gif", BROKK_170, [run_of(5), run_of(2)], (640, 360), fps)
     film = Image.open(tmp_path / "f.gif")
-    assert film.n_frames == frames
-    assert film.info["duration"] == 50 * {3: 2, 2: 3, 5: 1}[frames]
+    assert [frame.info["duration"] for frame in ImageSequence.Iterator(film)] == [*times, 3000]
     assert film.info["loop"] == 0
     with pytest.raises(ValueError, match=r"expected a name ending in .gif or .mp4, got '.avi'"):
         replay.write_film(tmp_path / "f.avi", BROKK_170, [run_of(5)], (640, 360), fps)
+
+
+def test_film__prints_the_largest_distance_from_the_line_so_far():
+    """The tool leaves a level line upward, by 5 mrad a tick at 3.05 m from the slew axis."""
+    run = run_of(5)
+    line = np.vstack([run.p_tool[0] - [1.0, 0, 0], run.p_tool[0] + [1.0, 0, 0]])
+    run = run_of(5, path=line)
+    distance = np.abs(run.p_tool[:, 1] - run.p_tool[0, 1])
+    for tick in (0, 2, 4):
+        scene = replay._scene(run, tick, run.in_view, run.path)
+        text = f"largest distance from the line: {1e3 * distance[: tick + 1].max():.0f} mm"
+        assert scene.headline == text
+        canvas = Recorder((480, 480))
+        drawing.draw(canvas, BROKK_170, [scene])
+        assert text in canvas.texts_drawn
 
 
 @pytest.mark.parametrize(
