@@ -34,7 +34,9 @@ class PlantState(NamedTuple):
 
 
 def plant_reset(machine: Machine, q: ArrayLike) -> PlantState:
-    """The plant at rest at angles `q` [rad] (..., n)."""
+    """The plant at rest at angles `q` [rad] (..., n): the analytic one, or `machine.plant`."""
+    if machine.plant:  # any object with `reset` and `step`, whose states have angles `q`
+        return machine.plant.reset(machine, q)  # type: ignore[no-any-return]
     q = np.array(q, float)
     zero = np.zeros_like(q)
     delayed = np.zeros((*q.shape, round(machine.delay / machine.plant_dt)))
@@ -62,6 +64,8 @@ def plant_step(machine: Machine, state: PlantState, u: ArrayLike) -> PlantState:
 
     Paper: eq1 and Sec. 3.2 (dead zone, delay, direction, coupling by the pump, past movement)
     """
+    if machine.plant:
+        return machine.plant.step(machine, state, u)  # type: ignore[no-any-return]
     steps = round(machine.dt / machine.plant_dt)
     held = np.repeat(np.asarray(u, float)[..., None], steps, axis=-1)
     commands = np.concatenate([state.delayed, held], axis=-1)  # what the valve gets, step by step
@@ -269,21 +273,6 @@ def folded_weights(net: ActuatorNet) -> tuple[Array, ...]:
     scaled = w1 / net.input_scale[..., None]
     shift = b1 - np.einsum("ni,nih->nh", net.input_mean, scaled)
     return scaled, shift[:, None], w2, b2[:, None], w3, b3[:, None]
-
-
-def select_nets(machine: Machine, net: ActuatorNet) -> ActuatorNet:
-    """The nets of the machine's driven joints; ValueError: nets of another machine or estimator."""
-    wanted = {
-        "machine": machine.name,
-        "rate": machine.rate,
-        "history": machine.history,
-        "velocity_samples": machine.velocity_samples,
-        "velocity_logged": False,  # a bus carries angles only
-    }
-    found = {name: getattr(net, name) for name in wanted}
-    if found != wanted:
-        raise ValueError(f"actuator: expected nets for {machine.name} with {wanted}, got {found}")
-    return net.select([machine.names[i] for i in machine.driven])
 
 
 def net_step(

@@ -276,7 +276,7 @@ def transition(
     q = plant.q if plant else actuator.net_step(machine, net, state.true_history, state.q, u)
     driven = machine.driven
     window = machine.velocity_samples, machine.dt
-    history = append_sample(state.history, u, read(machine, q), *window)
+    history = append_sample(state.history, u, read(machine, getattr(plant, "encoder", q)), *window)
     q_dot = (q - state.q) / machine.dt
     poses = np.stack([q, history[..., 0, -1]], dtype=np.float32)  # true and measured
     velocities = np.stack([q_dot, history[..., 1, -1]], dtype=np.float32)

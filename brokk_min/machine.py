@@ -115,6 +115,7 @@ class Machine:
     controller_node: int = number("CANopen node id", 1, 127)  # of the valve controller
     largest_dead_zone: float = number("of full command", 0, 0.99, default=0.0)  # 0: 1.5 dead zones
     q_start: tuple[float, ...] = ()  # rad, where experiments start; empty: the middle of the ranges
+    plant: Any = None  # reset(machine, q) and step(machine, state, u); None: that of `actuator`
 
     def __post_init__(self) -> None:
         """ValueError: what cannot be a machine, with field, wanted and got."""

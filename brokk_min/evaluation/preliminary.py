@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from brokk_min.actuator import ActuatorNet, select_nets
+from brokk_min.actuator import ActuatorNet
 from brokk_min.identification.excitation import task_log
+from brokk_min.identification.net_file import select_nets
 from brokk_min.identification.validation import (
     Simulator,
     named_times,

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from brokk_min.actuator import ActuatorNet, select_nets
+from brokk_min.actuator import ActuatorNet
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation import baselines, claims, metrics, preliminary, report, sequences
 from brokk_min.evaluation.metrics import Controllers, Run, Traces, evaluate, summary
@@ -30,7 +30,7 @@ from brokk_min.identification.excitation import collect, task_log
 from brokk_min.identification.files import write_json
 from brokk_min.identification.fitting import FitConfig
 from brokk_min.identification.logs import Log
-from brokk_min.identification.net_file import save_net
+from brokk_min.identification.net_file import save_net, select_nets
 from brokk_min.jacobian import JacobianController, manipulability, manipulability_threshold
 from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.learning.checkpoint import train_policy

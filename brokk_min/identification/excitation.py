@@ -123,7 +123,8 @@ class _Recorder:
         u = limit_command(self.machine, u)
         self.state = plant_step(self.machine, self.state, u)
         self.u.append(u)
-        self.q.append(read_encoder(self.machine, self.state.q))
+        angle = getattr(self.state, "encoder", self.state.q)
+        self.q.append(read_encoder(self.machine, angle))
 
 
 class _Phase(IntEnum):

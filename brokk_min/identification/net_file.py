@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min.actuator import ActuatorNet, select_nets
+from brokk_min.actuator import ActuatorNet
 from brokk_min.identification.files import expected, load_arrays, load_header, located, whole_file
 from brokk_min.identification.formats import NET_ARRAYS, NET_HEADER, check_fields
 from brokk_min.machine import Machine
@@ -56,6 +56,21 @@ def net_from_arrays(path: Path, arrays: dict[str, NDArray[Any]], prefix: str = "
         header["joints"] = tuple(header["joints"])
         header |= {name: arrays[name] for name in STATISTICS}
         return ActuatorNet(**header, weights=tuple(arrays[f"weight_{i}"] for i in range(6)))
+
+
+def select_nets(machine: Machine, net: ActuatorNet) -> ActuatorNet:
+    """The nets of the machine's driven joints; ValueError: nets of another machine or estimator."""
+    wanted = {
+        "machine": machine.name,
+        "rate": machine.rate,
+        "history": machine.history,
+        "velocity_samples": machine.velocity_samples,
+        "velocity_logged": False,  # a bus carries angles only
+    }
+    found = {name: getattr(net, name) for name in wanted}
+    if found != wanted:
+        raise ValueError(f"actuator: expected nets for {machine.name} with {wanted}, got {found}")
+    return net.select([machine.names[i] for i in machine.driven])
 
 
 def save_net(path: Path, net: ActuatorNet) -> None:

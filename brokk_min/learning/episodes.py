@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min.actuator import PlantState
 from brokk_min.env import (
     State,
     TaskConfig,
@@ -116,8 +115,8 @@ def replace_rows(state: State, rows: NDArray[np.intp], fresh: State) -> State:
     def put(old: Any, new: Any) -> Any:
         if old is None:
             return None
-        if isinstance(old, PlantState):
-            return PlantState(*map(put, old, new))
+        if isinstance(old, tuple):  # the state of a plant
+            return type(old)(*map(put, old, new))
         result = old.copy()
         result[rows] = new
         return result

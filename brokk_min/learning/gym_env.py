@@ -18,9 +18,9 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from brokk_min import env
-from brokk_min.actuator import ActuatorNet, select_nets
+from brokk_min.actuator import ActuatorNet
 from brokk_min.env import Bools, State, TaskConfig, observation_scale
-from brokk_min.identification.net_file import load_net
+from brokk_min.identification.net_file import load_net, select_nets
 from brokk_min.learning.episodes import get_obs, new_goals, replace_rows, reset
 from brokk_min.machine import BROKK_170, Array, Machine
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min.actuator import ActuatorNet, close_valves, select_nets
+from brokk_min.actuator import ActuatorNet, close_valves
 from brokk_min.env import Measured, action_to_pwm, features, observation_scale
 from brokk_min.identification.files import (
     expect_same,
@@ -19,7 +19,7 @@ from brokk_min.identification.files import (
     whole_file,
 )
 from brokk_min.identification.formats import POLICY_ARRAYS, POLICY_HEADER, check_fields
-from brokk_min.identification.net_file import LARGEST_NET, net_arrays, net_from_arrays
+from brokk_min.identification.net_file import LARGEST_NET, net_arrays, net_from_arrays, select_nets
 from brokk_min.machine import Array, Machine
 
 FORMAT = 3  # of policy files

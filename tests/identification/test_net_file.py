@@ -7,10 +7,10 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from helpers_machines import random_net
+from helpers_machines import random_net, small_net
 
 from brokk_min.actuator import ActuatorNet
-from brokk_min.identification.net_file import fingerprint, load_net, save_net
+from brokk_min.identification.net_file import fingerprint, load_net, save_net, select_nets
 from brokk_min.machine import BROKK_170
 
 
@@ -85,3 +85,14 @@ def test_fingerprint__differs_between_nets_and_survives_a_file(tmp_path):
     weights = (net.weights[0] + 1e-6, *net.weights[1:])
     others = [net.select(["j1"]), replace(net, rate=25.0), replace(net, weights=weights)]
     assert len({fingerprint(other) for other in (net, *others)}) == 4
+
+
+def test_select_nets__refuses_nets_of_another_machine_rate_or_estimator():
+    net = small_net(BROKK_170, np.random.default_rng(0), BROKK_170.names)
+    assert select_nets(BROKK_170, net).joints == ("q1", "q3", "q4", "q5")
+    changes = {"machine": "other", "rate": 25.0, "history": 12, "velocity_samples": 3}
+    for name, value in (changes | {"velocity_logged": True}).items():
+        with pytest.raises(ValueError, match=f"actuator: expected nets for brokk170.*{value!r}"):
+            select_nets(BROKK_170, replace(net, **{name: value}))
+    with pytest.raises(ValueError, match=r"joints: expected nets for \['q1', 'q3', 'q4', 'q5'\]"):
+        select_nets(BROKK_170, net.select(["q1", "q3"]))

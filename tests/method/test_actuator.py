@@ -8,14 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers_machines import (
-    POSE,
-    constant_net,
-    obedient_net,
-    obedient_velocity,
-    random_net,
-    small_net,
-)
+from helpers_machines import POSE, constant_net, obedient_net, obedient_velocity, random_net
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
@@ -31,7 +24,6 @@ from brokk_min.actuator import (
     net_step,
     plant_reset,
     plant_step,
-    select_nets,
     smooth_angles,
 )
 from brokk_min.machine import BROKK_170, Machine
@@ -454,14 +446,3 @@ def test_select__gives_the_same_nets_in_another_order():
     assert part.output_low.tolist() == net.output_low[[2, 0]].tolist()
     with pytest.raises(ValueError, match=r"joints: expected nets for \['j0', 'q9'\], got"):
         net.select(["j0", "q9"])
-
-
-def test_select_nets__refuses_nets_of_another_machine_rate_or_estimator():
-    net = small_net(BROKK_170, np.random.default_rng(0), BROKK_170.names)
-    assert select_nets(BROKK_170, net).joints == ("q1", "q3", "q4", "q5")
-    changes = {"machine": "other", "rate": 25.0, "history": 12, "velocity_samples": 3}
-    for name, value in (changes | {"velocity_logged": True}).items():
-        with pytest.raises(ValueError, match=f"actuator: expected nets for brokk170.*{value!r}"):
-            select_nets(BROKK_170, replace(net, **{name: value}))
-    with pytest.raises(ValueError, match=r"joints: expected nets for \['q1', 'q3', 'q4', 'q5'\]"):
-        select_nets(BROKK_170, net.select(["q1", "q3"]))
