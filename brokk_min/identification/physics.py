@@ -192,7 +192,7 @@ def arm_mode(
 
 def warm(warmth: Array, work: Array, dt: float, tau: float) -> Array:
     """Warmth (..., 1) after `dt` of mean opening `work` (..., n): w' = (1 - w) mean(work) / tau."""
-    return warmth + dt * (1 - warmth) * work.mean(axis=-1, keepdims=True) / tau
+    return np.asarray(warmth + dt * (1 - warmth) * work.mean(axis=-1, keepdims=True) / tau)
 
 
 def pseudo_random(tick: Array) -> Array:
@@ -259,6 +259,10 @@ def draw_machine(base: Machine, seed: int) -> Machine:
 
 def _scale_joint(joint: Joint, gains: list[float]) -> Joint:
     up, down = gains
-    speeds = {"speed_positive": up * joint.speed_positive, "q_dot_up": up * joint.q_dot_up}
-    speeds |= {"speed_negative": down * joint.speed_negative, "q_dot_down": down * joint.q_dot_down}
-    return replace(joint, **speeds)
+    return replace(
+        joint,
+        speed_positive=up * joint.speed_positive,
+        speed_negative=down * joint.speed_negative,
+        q_dot_up=up * joint.q_dot_up,
+        q_dot_down=down * joint.q_dot_down,
+    )
