@@ -1,34 +1,55 @@
-"""The walkthrough is true: its blocks run in order, are short, and print what stands below them.
+"""The walkthrough is true: its blocks run in order, are short, print and draw what stands below.
 
-`python tests/paper/test_walkthrough.py` writes what the blocks print.
+`python tests/paper/test_walkthrough.py` writes what the blocks print, and their figures.
 """
 
 from __future__ import annotations
 
 import io
+import os
 import re
 import tempfile
 from contextlib import chdir, redirect_stdout
 from pathlib import Path
+from unittest import mock
 
 import matplotlib
+import numpy as np
+import pytest
 
 matplotlib.use("Agg")
 PAGE = Path(__file__).parents[2] / "docs" / "walkthrough.md"
+FIGURES = PAGE.parent / "figures"
 BLOCK = re.compile(r"^```python\n(.*?)^```\n(?:^```\n(.*?)^```\n)?", re.M | re.S)
+SVG = {"svg.hashsalt": "walkthrough", "svg.fonttype": "none"}  # the same bytes, letters as text
+CURVE = re.compile(r'<path d="([^"]+)" clip-path="[^"]+" style="fill: none')
 
 
-def printed(codes: list[str]) -> list[str]:
-    """What the blocks print, one after the other in one interpreter; figures go nowhere."""
+def run(codes: list[str]) -> tuple[list[str], dict[str, str]]:
+    """What the blocks print, one after the other in one interpreter, and the files they write."""
     namespace: dict[str, object] = {}
+    printed = []
+    no_date = mock.patch.dict(os.environ, SOURCE_DATE_EPOCH="0")
+    with tempfile.TemporaryDirectory() as folder, chdir(folder), no_date:
+        with matplotlib.rc_context(SVG):
+            for code in codes:
+                with redirect_stdout(io.StringIO()) as output:
+                    exec(compile(code, str(PAGE), "exec"), namespace)
+                printed.append(output.getvalue())
+        return printed, {path.name: path.read_text() for path in Path(folder).iterdir()}
+
+
+@pytest.fixture(scope="module")
+def ran() -> tuple[list[str], dict[str, str]]:
+    return run([code for code, _ in BLOCK.findall(PAGE.read_text())])
+
+
+def corners(figure: str) -> list[list[float]]:
+    """Extent and end of each curve of an SVG, in points."""
     result = []
-    with tempfile.TemporaryDirectory() as folder, chdir(folder):
-        for code in codes:
-            with redirect_stdout(io.StringIO()) as output:
-                exec(compile(code, str(PAGE), "exec"), namespace)
-            result.append(output.getvalue())
-        figures = {path.name for path in Path(folder).iterdir()}
-    assert figures == set(re.findall(r'savefig\("(.*?)"\)', PAGE.read_text()))
+    for path in CURVE.findall(figure):
+        points = np.array(re.findall(r"-?[\d.]+", path), float).reshape(-1, 2)
+        result.append([*points.min(axis=0), *points.max(axis=0), *points[-1]])
     return result
 
 
@@ -40,20 +61,44 @@ def test_blocks__are_short_and_the_page_takes_half_an_hour() -> None:
     assert len(BLOCK.sub("", text).split()) < 30 * 180 / 2  # words, at half the speed of prose
 
 
-def test_blocks__print_what_stands_below() -> None:
-    blocks = BLOCK.findall(PAGE.read_text())
-    assert printed([code for code, _ in blocks]) == [below for _, below in blocks]
+def test_blocks__print_what_stands_below(ran: tuple[list[str], dict[str, str]]) -> None:
+    below = [output for _, output in BLOCK.findall(PAGE.read_text())]
+    assert ran[0] == below, "run `make docs`"
+
+
+def test_sections__have_the_figure_that_they_draw(ran: tuple[list[str], dict[str, str]]) -> None:
+    sections = PAGE.read_text().split("\n## ")[1:]
+    drawn = [re.findall(r'^save\("(.*?)"', section, re.M) for section in sections]
+    shown = [re.findall(r"^!\[.{30,}\]\(figures/(.*?)\)$", section, re.M) for section in sections]
+    assert shown == drawn
+    assert [len(files) for files in drawn] == [1] * 9 + [0] * (len(sections) - 9)
+    assert sorted(ran[1]) == sorted(file for files in drawn for file in files)
+
+
+def test_figures__are_those_of_the_blocks(ran: tuple[list[str], dict[str, str]]) -> None:
+    for name, figure in ran[1].items():
+        wanted, got = corners(figure), corners((FIGURES / name).read_text())
+        assert len(wanted) >= 2
+        np.testing.assert_allclose(got, wanted, atol=2, err_msg=f"{name}: run `make docs`")
+
+
+def test_figures__are_small() -> None:
+    assert sum(path.stat().st_size for path in FIGURES.iterdir()) < 500_000
 
 
 def write() -> None:
-    """Put what the blocks print below them."""
-    outputs = iter(printed([code for code, _ in BLOCK.findall(PAGE.read_text())]))
+    """Put what the blocks print below them, and what they draw into figures/."""
+    printed, figures = run([code for code, _ in BLOCK.findall(PAGE.read_text())])
+    outputs = iter(printed)
 
     def with_output(match: re.Match[str]) -> str:
         output = next(outputs)
         return f"```python\n{match[1]}```\n" + (f"```\n{output}```\n" if output else "")
 
     PAGE.write_text(BLOCK.sub(with_output, PAGE.read_text()))
+    FIGURES.mkdir(exist_ok=True)
+    for name, figure in figures.items():
+        (FIGURES / name).write_text(figure)
 
 
 if __name__ == "__main__":
