@@ -1,5 +1,11 @@
-"""The command line: `brokk-min COMMAND --help`. Exits 0 done, 1 failed, 2 wrong use."""
+"""The command line: `brokk-min COMMAND --help`. Exits 0 done, 1 failed, 2 wrong use.
 
+`brokk-min --tyro-print-completion bash` (or zsh, tcsh) prints a completion for the shell.
+"""
+
+import contextlib
+import io
+import re
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -9,6 +15,7 @@ import tyro
 from brokk_min import __version__
 from brokk_min.cli import commands, operating
 from brokk_min.cli.options import WrongUse
+from brokk_min.identification.files import reason
 
 LONGEST = 300  # characters of an error
 COMMANDS: dict[str, Callable[..., Any]] = {
@@ -35,6 +42,57 @@ def one_line(text: str) -> str:
     return text if len(text) <= LONGEST else f"{text[: LONGEST - 105]} ... {text[-100:]}"
 
 
+# What tyro says of a wrong command line, and what we say of it: option, wanted, got.
+REFUSALS = {
+    r"Expected one of \{(.*?)\}": r"COMMAND: expected one of \1, got none",
+    r"Unrecognized options: (.*?); Available subcommands: (.*?);": (
+        r"COMMAND: expected one of \2, got \1"
+    ),
+    r"Unrecognized options: (.*?);.*?you meant: (\S+)": r"expected options such as \2, got \1",
+    r"Unrecognized options: (.*?);": r"expected no further words, got \1",
+    r"Missing from .*?: (\S+)": r"\1: expected a value, got none",
+    r"Missing value for argument '(.*?)'. Expected 1 ": r"\1: expected a value, got none",
+    r"Missing value for argument '(.*?)'. Expected (\d+)": r"\1: expected \2 values, got fewer",
+    r"invalid choice '(.*?)' for argument '(.*?)'. Expected one of \((.*?),?\)": (
+        r"\2: expected one of \3, got \1"
+    ),
+    r"Error parsing (.*?): .*?(\[.*?\]|'.*?').*?; Argument helptext: \S+ (.*?) [A-Z][a-z]": (
+        r"\1: expected \3, got \2"
+    ),
+}
+
+
+def usage_error(box: str) -> str:
+    """The box of many lines in which tyro refuses a command line, as one line."""
+    rows = re.sub(r"\x1b\[[\d;]*m", "", box).splitlines()
+    text = " ".join(row.strip("│ ") for row in rows[1:])
+    text = re.sub(" *[─╰╯-]{5,} *", "; ", text).strip("; ")
+    for pattern, message in REFUSALS.items():
+        if match := re.match(pattern, text):
+            return match.expand(message)
+    return text
+
+
+def parse(arguments: list[str], commands: dict[str, Callable[..., Any]]) -> Callable[[], None]:
+    """The command with its options; WrongUse: others than it has."""
+    try:
+        with contextlib.redirect_stderr(io.StringIO()) as box:
+            command: Callable[[], None] = tyro.extras.subcommand_cli_from_dict(
+                commands,
+                prog="brokk-min",
+                description=__doc__,
+                args=arguments,
+                config=(tyro.conf.FlagCreatePairsOff,),
+            )
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        name = f"{arguments[0]} " if arguments and arguments[0] in commands else ""
+        text = f"{usage_error(box.getvalue())}; see brokk-min {name}--help"
+        raise WrongUse(text) from stop
+    return command
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; errors are one line on stderr."""
     arguments = sys.argv[1:] if arguments is None else arguments
@@ -42,23 +100,20 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"brokk_min {__version__}")
         return 0
     paper = {"train": commands.PaperTrain, "sweep": commands.PaperSweep}
-    command = tyro.extras.subcommand_cli_from_dict(
-        COMMANDS | paper if "--paper" in arguments else COMMANDS,
-        prog="brokk-min",
-        description=__doc__,
-        args=arguments,
-        config=(tyro.conf.FlagCreatePairsOff,),
-    )
     try:
-        command()
+        parse(arguments, COMMANDS | paper if "--paper" in arguments else COMMANDS)()
     except WrongUse as error:
         print(one_line(f"brokk-min: {error}"), file=sys.stderr)
         return 2
-    except (ValueError, OSError, MemoryError) as error:
+    except OSError as error:
+        place = f"{error.filename}: " if error.filename else ""
+        print(one_line(f"brokk-min: {place}{reason(error)}"), file=sys.stderr)
+        return 1
+    except (ValueError, MemoryError) as error:
         print(one_line(f"brokk-min: {error or 'out of memory'}"), file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
-        print("brokk-min: stopped", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        print(f"brokk-min: stopped{stop}", file=sys.stderr)
         return 1
     return 0
 

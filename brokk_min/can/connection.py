@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from brokk_min.can.canopen import OPERATOR_CHANNEL, OPERATOR_INPUT, Frame
-from brokk_min.identification.files import require
+from brokk_min.identification.files import reason, require
 
 
 @dataclass
@@ -124,14 +124,14 @@ def open_bus(
     try:
         raw = can.Bus(interface=interface, channel=channel, can_filters=filters or None)
     except Exception as error:  # each interface has its own
-        raise ValueError(f"{where}, got {error!r}") from error
+        raise ValueError(f"{where}, got {reason(error)}") from error
     name = channel if interface == "socketcan" else interface
     writer = can.CanutilsLogWriter(log) if log else None
     bus = Bus(raw, writer, name, echo=interface == "udp_multicast")
     try:
         yield bus
     except can.CanError as error:
-        raise ValueError(f"{where} that works, got {error!r}") from error
+        raise ValueError(f"{where} that works, got {reason(error)}") from error
     finally:
         bus.close()
 

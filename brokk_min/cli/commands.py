@@ -137,8 +137,8 @@ def split(log: Log) -> tuple[Log, Log]:
 def print_scores(scores: dict[str, Any]) -> None:
     """Scores of each net, of the linear model of its joint, and warnings."""
     row = "{:12} {:>9} {:>13}  {:30} {}"
-    free_runs = "free run of 1, 5, 10, 30 s"
-    print(row.format("joint", "one step", "same as last", free_runs, "creep [rad/s]"))
+    print("Errors [rad/s] of one step, of the last velocity again, of free runs of 1, 5, 10, 30 s:")
+    print(row.format("joint", "one step", "same as last", "free runs", "creep [rad/s]"))
     for name, net in scores["joints"].items():
         for label, model in ((name, net), ("  linear", net["linear"])):
             one_step = f"{model.get('one_step_rmse', np.nan):.4f}"
@@ -146,8 +146,10 @@ def print_scores(scores: dict[str, Any]) -> None:
             free = ", ".join(f"{run['velocity_rmse']:.4f}" for run in model["free_run"].values())
             creep = f"{net['creep']:.5f}" if label == name else ""
             print(row.format(label, one_step, persistence, free, creep))
-    for warning in scores["warnings"]:
-        print(f"warning: {warning}")
+    for name in scores["joints"]:
+        own = [w.removeprefix(f"{name}: ") for w in scores["warnings"] if w.startswith(f"{name}: ")]
+        if own:
+            print("\n  ".join([f"warnings for {name}:", *own]))
 
 
 @dataclass(kw_only=True)
@@ -292,12 +294,9 @@ class Evaluate(Command):
 
 COLUMNS = {  # of the table: head, format
     "velocity_error_mean": ("error [m/s]", "{:.4f}"),
-    "velocity_error_moves": ("in motion", "{:.4f}"),
-    "velocity_error_rests": ("at rest", "{:.4f}"),
     "off_axis_drift_max": ("drift [m]", "{:.4f}"),
     "jerk_rms": ("jerk [m/s^3]", "{:.1f}"),
-    "valve_travel": ("valve travel", "{:.0f}"),
-    "joint_motion_at_rest": ("joints at rest [rad]", "{:.4f}"),
+    "valve_travel": ("travel [1]", "{:.0f}"),
 }
 
 
@@ -307,13 +306,13 @@ def print_table(runs: list[dict[str, Any]], sequences: int) -> None:
     num = len({run["start"] for run in scored})
     print(f"means over {sequences} sequences from {num} {scored[0]['kind']} starts")
     heads = [head for head, _ in COLUMNS.values()]
-    print(f"{'controller':30} " + " ".join(f"{head:>12}" for head in heads))
+    print(f"{'controller':30} " + " ".join(heads))
     for name, rows in metrics.summary(scored).items():
         cells = []
         for key, (head, form) in COLUMNS.items():
             mean = rows["all"][key]
             text = "none" if mean is None else form.format(mean)
-            cells.append(text.rjust(max(12, len(head))))
+            cells.append(text.rjust(len(head)))
         print(f"{name:30} " + " ".join(cells))
 
 

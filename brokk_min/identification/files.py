@@ -95,9 +95,21 @@ def brief(value: Any) -> str:
     short = reprlib.Repr()
     short.maxlist = short.maxdict = short.maxtuple = 6
     short.maxstring = short.maxother = 60
-    text = f"{type(value).__name__}: {value}" if isinstance(value, Exception) else None
-    text = " ".join(short.repr(value).split()) if text is None else " ".join(text.split())
+    text = reason(value) if isinstance(value, Exception) else short.repr(value)
+    text = " ".join(text.split())
     return text if len(text) <= 110 else f"{text[:70]} ... {text[-30:]}"
+
+
+def reason(error: BaseException) -> str:
+    """What went wrong, in words, without the names that Python gives to errors.
+
+    Example:
+        >>> reason(FileNotFoundError(2, "No such file or directory", "log.csv"))
+        'no such file or directory'
+    """
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror[:1].lower() + error.strerror[1:]
+    return f"no entry {error}" if isinstance(error, KeyError) else str(error) or "no reason given"
 
 
 @contextmanager

@@ -2,7 +2,9 @@
 
 import io
 import json
+import signal
 import sys
+import threading
 import time
 import zipfile
 from contextlib import closing
@@ -140,6 +142,8 @@ class TrainingLog:
         self.returns = np.zeros(env.num_envs)  # of running episodes
         self.lengths = np.zeros(env.num_envs)
         self.episodes = {"charts/episodic_return": 0.0, "charts/episodic_length": 0.0}  # last ended
+        self.interrupted = False
+        self.before = signal.getsignal(signal.SIGINT)
         self.writer = None
         if tensorboard is not None:
             module = require("torch.utils.tensorboard", "tensorboard")
@@ -159,6 +163,8 @@ class TrainingLog:
             tqdm.write(f"{self.checkpoint}: {text}", file=sys.stderr)
         self.first_step = learner.global_step
         self.start = time.perf_counter()
+        if threading.current_thread() is threading.main_thread():  # others get no signals
+            signal.signal(signal.SIGINT, self.interrupt)
         total = self.config.total_steps
         self.bar = tqdm(
             total=total, initial=self.first_step, desc="train", unit="step", disable=None
@@ -177,9 +183,16 @@ class TrainingLog:
                 self.writer.add_scalar(name, value, learner.global_step)
         self.bar.update(learner.global_step - self.bar.n)
         self.bar.set_postfix_str(f"reward {metrics['charts/reward']:.3f}, error {error:.3f} m/s")
-        if learner.updates % self.config.checkpoint_every == 0:
+        if self.interrupted or learner.updates % self.config.checkpoint_every == 0:
             write_csv(self.curve, self.rows[0], [row.values() for row in self.rows])
             self.save(learner)
+        if self.interrupted:
+            raise KeyboardInterrupt(f"; {self.checkpoint} is saved, go on with --resume")
+
+    def interrupt(self, *_: object) -> None:
+        """Ctrl-C: stop after this update; a second one stops at once."""
+        self.interrupted = True
+        signal.signal(signal.SIGINT, self.before)
 
     def count_episodes(self, rewards: np.ndarray, dones: np.ndarray) -> None:
         """Mean return and length of the episodes that ended in these ticks (T, N), if any did."""
@@ -195,7 +208,9 @@ class TrainingLog:
             self.episodes = dict(zip(self.episodes, means.mean(axis=1).tolist(), strict=True))
 
     def close(self) -> None:
-        """Close the files of TensorBoard."""
+        """Close the files of TensorBoard; let Ctrl-C stop at once again."""
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, self.before)
         if self.writer is not None:
             self.writer.close()
 

@@ -12,7 +12,7 @@ import pytest
 from helpers_cli import MINI, run
 
 import brokk_min
-from brokk_min.__main__ import COMMANDS
+from brokk_min.__main__ import COMMANDS, usage_error
 
 ROOT = Path(__file__).parents[2]
 OPTIONS = {
@@ -82,14 +82,24 @@ TRAIN = "train --actuator missing.npz --out p.npz"
 @pytest.mark.parametrize(
     ("line", "status", "message"),
     [
-        ("", 2, "collect"),
-        ("nonsense", 2, "nonsense"),
-        ("collect", 2, "--out"),
+        ("", 2, "COMMAND: expected one of collect, fit, preliminary, train, sweep, starts, eval"),
+        ("nonsense", 2, "play, replay, got nonsense; see brokk-min --help"),
+        ("collect", 2, "--out: expected a value, got none; see brokk-min collect --help"),
+        ("collect --out", 2, "--out: expected a value, got none"),
+        ("collect --out x.csv --hours a", 2, "--hours: expected FLOAT, got 'a'"),
+        ("collect --out x.csv --seed 1.5", 2, "--seed: expected INT, got '1.5'"),
+        ("collect --out x.csv --hurs 3", 2, "expected options such as --hours, got --hurs, 3"),
+        ("collect --out x.csv more", 2, "expected no further words, got more"),
+        ("collect --out x.csv --excitation ramp", 2, "expected one of 'sine', 'rich', got ramp"),
+        (f"collect --out x.csv --o {'a' * 999}", 2, "got --o, aaa"),
+        ("replay a.log --size 3", 2, "--size: expected 2 values, got fewer"),
+        ("replay a.log --size 3 x", 2, "--size: expected INT INT, got ['3', 'x']"),
+        (f"{TRAIN} --log-std-end a", 2, "--log-std-end: expected {None}|FLOAT, got ['a']"),
         ("collect --out x.csv --hours 0", 2, "--hours: expected 0.0001 to 100, got 0.0"),
         ("collect --out x.txt", 2, "--out: expected a name ending in .csv or .npz, got x.txt"),
         ("collect --out x.csv --machine digger", 2, "brokk170"),
         ("fit --out n.npz", 2, "LOGS: expected at least one log, got none"),
-        ("fit missing.csv --out n.npz", 1, "missing.csv"),
+        ("fit missing.csv --out n.npz", 1, "missing.csv: expected a readable CSV table, got no su"),
         ("fit missing.csv --out n.npz --dead-zone 1.5", 2, "--dead-zone: expected 0 to 0.99"),
         ("fit a.csv --out n.npz --velocity-samples 20", 2, "expected at most --history, got 20"),
         (TRAIN, 1, "missing.npz"),
@@ -130,9 +140,10 @@ def test_wrong_use__is_refused_in_one_line(line, status, message, capsys, tmp_pa
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     assert run(line) == status
     printed = capsys.readouterr()
-    assert message in printed.err + printed.out
-    assert "Traceback" not in printed.err
-    assert printed.err.count("\n") == 1 or not printed.err.startswith("brokk-min: ")
+    refusal = printed.err.splitlines()[-1]
+    assert refusal.startswith("brokk-min: ") and message in refusal and len(refusal) <= 300
+    assert not re.search("Traceback|Error|Errno", printed.err)
+    assert status == 1 or (printed.out, printed.err) == ("", f"{refusal}\n")
     assert not list(tmp_path.iterdir())
 
 
@@ -160,6 +171,17 @@ def test_outputs__that_cannot_be_written_are_refused_before_any_work(line, tmp_p
     assert run(line, path) == 2
     expected = f"brokk-min: {path}: expected a file in an existing, writable directory\n"
     assert capsys.readouterr().err == expected
+
+
+@pytest.mark.parametrize(
+    "box",
+    [
+        "╭─ Title ──╮\n│ One \x1b[1mthing\x1b[0m │\n│ ──────── │\n│ or two   │\n╰──────────╯",
+        " Title\n-----------\n One thing\n --------- \n or two\n",
+    ],
+)
+def test_usage_error__is_the_text_of_a_box_that_is_not_known(box):
+    assert usage_error(box) == "One thing; or two"
 
 
 def test_interrupt__is_one_line(monkeypatch, capsys):

@@ -14,6 +14,7 @@ from brokk_min.identification.files import (
     located,
     names_in,
     parse_json,
+    reason,
     require,
     whole_file,
     write_csv,
@@ -54,6 +55,20 @@ def test_write_csv__reads_back(tmp_path):
     assert (tmp_path / "a.csv").read_text() == f'name,x,y\na,0.1,1e-17\n"b, c",-2.0,{1 / 3}\n'
     back = read_table(tmp_path / "a.csv", ["name", "x", "y"], text=["name"])
     assert [list(row) for row in zip(*back.values(), strict=True)] == rows
+
+
+@pytest.mark.parametrize(
+    ("error", "text"),
+    [
+        (PermissionError(13, "Permission denied", "a.csv"), "permission denied"),
+        (zipfile.BadZipFile("File is not a zip file"), "File is not a zip file"),
+        (KeyError("gains"), "no entry 'gains'"),
+        (OSError("gone"), "gone"),
+        (RuntimeError(), "no reason given"),
+    ],
+)
+def test_reason__has_words_and_no_names_of_python(error, text):
+    assert reason(error) == text
 
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit])

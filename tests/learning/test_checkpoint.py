@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+import signal
 from dataclasses import replace
 
 import numpy as np
@@ -194,6 +195,24 @@ def test_train_policy__resumes_to_the_same_bytes(tmp_path, monkeypatch, straight
     assert path.read_bytes() == straight.read_bytes()
     assert read_curve(path) == read_curve(straight)
     assert not (tmp_path / "p.npz.checkpoint").exists()
+
+
+def test_train_policy__saves_all_updates_when_it_is_interrupted(tmp_path, monkeypatch, straight):
+    """Ctrl-C is answered after the update, also where no checkpoint is due."""
+
+    def press(*result):
+        signal.raise_signal(signal.SIGINT)
+        return result
+
+    before = signal.getsignal(signal.SIGINT)
+    with monkeypatch.context() as patch:
+        fail_at_tick(patch, 20, press)
+        with pytest.raises(KeyboardInterrupt, match=r"p\.npz\.checkpoint is saved, .* --resume$"):
+            run(tmp_path / "p.npz")
+    assert signal.getsignal(signal.SIGINT) == before
+    assert len(read_curve(tmp_path / "p.npz")) == 3
+    run(tmp_path / "p.npz", resume=True)
+    assert (tmp_path / "p.npz").read_bytes() == straight.read_bytes()
 
 
 @pytest.mark.parametrize(
