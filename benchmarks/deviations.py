@@ -31,7 +31,7 @@ from brokk_min.identification.files import SHIPPED
 from brokk_min.kinematics import forward_kinematics
 from brokk_min.learning import policy, simulation_gradient
 from brokk_min.learning.checkpoint import train_policy
-from brokk_min.learning.episodes import PAPER_LEARNER, PAPER_TASK, draw_pose
+from brokk_min.learning.episodes import GRADIENT_LEARNER, PAPER_TASK, draw_pose
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.machine import BROKK_170, PWM_MAX, Array
 from brokk_min.ppo import PPOConfig
@@ -200,13 +200,12 @@ def fit_scores(kind: str, seed: int, **settings: Any) -> Figures:
     }
 
 
-def train(
-    task: TaskConfig, critic: bool = False, net: Any = None, settings: dict[str, Any] | None = None
-) -> Figures:
+def train(task: TaskConfig, critic: bool = False, net: Any = None) -> Figures:
     """Error [m/s], drift [m], travel of a new policy along x, y, z, on nets and plant."""
     net = net or policy.load_policy(SHIPPED / M.name / "policy.npz", M).net
     with tempfile.TemporaryDirectory() as folder:
-        config = replace(PPOConfig(total_steps=STEPS, threads=1), **(settings or {}))
+        settings = {} if critic else GRADIENT_LEARNER
+        config = PPOConfig(**{**settings, "total_steps": STEPS, "threads": 1})
         trained = train_policy(M, net, task, config, 0, Path(folder) / "policy.npz", critic)
     controllers = {"rl": policy.PolicyController(M, trained)}
     starts = sequences.evaluation_starts(M, 32, sequences.task_sequences(M), 2)
@@ -254,7 +253,7 @@ def d5() -> Figures:
 
 def d7() -> Figures:
     """The paper's agent by its own settings, on our nets; and a policy with newest angles."""
-    paper = train(TaskConfig(paper=True, **PAPER_TASK), settings=PAPER_LEARNER)
+    paper = train(TaskConfig(paper=True, **PAPER_TASK), critic=True)
     with mock.patch.object(actuator, "smooth_angles", lambda _, history: history[..., 0, -1]):
         newest_angles = train(TaskConfig())
     return compare(paper=paper, newest_angles=newest_angles, ours=default_training())

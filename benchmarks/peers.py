@@ -33,9 +33,9 @@ from brokk_min.env import COMPENSATION, measure
 from brokk_min.evaluation import baselines
 from brokk_min.identification.net_file import load_net
 from brokk_min.learning.checkpoint import stagger_episodes
-from brokk_min.learning.episodes import draw_noise
+from brokk_min.learning.episodes import GRADIENT_LEARNER, draw_noise
 from brokk_min.learning.gym_env import TaskVectorEnv
-from brokk_min.learning.simulation_gradient import gradient_advantages
+from brokk_min.learning.simulation_gradient import improved_actions, regression_loss
 from brokk_min.machine import BROKK_170 as M
 from brokk_min.machine import PWM_MAX
 
@@ -103,18 +103,19 @@ def mean_reward(net: ActuatorNet, act: Act) -> float:
 def ours(
     env: TaskVectorEnv, rate: float, planned: int, seed: int, report: Report, critic: bool = False
 ) -> None:
-    std_end = None if critic else ppo.PPOConfig.log_std_end
-    options = {"learning_rate": rate, "log_std_end": std_end, "threads": torch.get_num_threads()}
-    config = ppo.PPOConfig(planned, env.num_envs, **options)
+    settings = {} if critic else GRADIENT_LEARNER
+    options = {"learning_rate": rate, "total_steps": planned, "num_envs": env.num_envs}
+    config = ppo.PPOConfig(**{**settings, **options, "threads": torch.get_num_threads()})
     assert env.net is not None
     learner = ppo.make_learner(env, config, seed, critic)
     stagger_episodes(env)
-    estimate = None if critic else gradient_advantages(M, env.net, env.config)
+    estimate = None if critic else improved_actions(M, env.net, env.config)
+    loss = ppo.ppo_loss if critic else regression_loss
 
     def on_update(learner: ppo.Learner, *_: object) -> None:
         report(lambda _, obs: learner.agent.actor(torch.from_numpy(obs)).numpy())
 
-    ppo.train(env, config, seed, on_update, estimate, learner)
+    ppo.train(env, config, seed, on_update, estimate, loss, learner)
 
 
 def sb3(env: TaskVectorEnv, rate: float, planned: int, seed: int, report: Report) -> None:

@@ -22,8 +22,8 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "collect": commands.Collect,
     "fit": commands.Fit,
     "preliminary": commands.Preliminary,
-    "train": commands.Train,
-    "sweep": commands.Sweep,
+    "train": commands.GradientTrain,
+    "sweep": commands.GradientSweep,
     "starts": commands.Starts,
     "evaluate": commands.Evaluate,
     "reproduce": commands.Reproduce,
@@ -99,9 +99,13 @@ def main(arguments: list[str] | None = None) -> int:
     if arguments == ["--version"]:
         print(f"brokk_min {__version__}")
         return 0
-    paper = {"train": commands.PaperTrain, "sweep": commands.PaperSweep}
+    available = dict(COMMANDS)
+    if "--critic" in arguments:  # learners have defaults of their own
+        available |= {"train": commands.Train, "sweep": commands.Sweep}
+    if "--paper" in arguments:
+        available |= {"train": commands.PaperTrain, "sweep": commands.PaperSweep}
     try:
-        parse(arguments, COMMANDS | paper if "--paper" in arguments else COMMANDS)()
+        parse(arguments, available)()
     except WrongUse as error:
         print(one_line(f"brokk-min: {error}"), file=sys.stderr)
         return 2

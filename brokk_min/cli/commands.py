@@ -24,6 +24,7 @@ from brokk_min.cli.options import (
 )
 from brokk_min.cli.settings import (
     FitSettings,
+    GradientDefaults,
     LearnerSettings,
     PaperDefaults,
     TaskSettings,
@@ -164,7 +165,7 @@ class Training(Command):
 
 @dataclass(kw_only=True)
 class Train(Training):
-    """Train a policy with PPO on the nets."""
+    """Train a policy on the nets, with PPO and a critic."""
 
     out: Path  # Policy to write, .npz.
     resume: bool = False  # Go on from OUT.checkpoint; the end is the same as without the break.
@@ -204,6 +205,16 @@ class Sweep(Training):
         seeds = range(self.seed, self.seed + self.seeds)
         options = (self.poses, self.scheduler, self.gains, self.critic)
         print(show(sweep(machine, net, task, config, seeds, self.out, *options)))
+
+
+@dataclass(kw_only=True)
+class GradientTrain(GradientDefaults, Train):
+    """Train a policy on the nets, by gradients of the simulation."""
+
+
+@dataclass(kw_only=True)
+class GradientSweep(GradientDefaults, Sweep):
+    """Train and evaluate many seeds, one thread each; finished seeds are not run again."""
 
 
 @dataclass(kw_only=True)

@@ -13,7 +13,7 @@ import tyro
 from brokk_min.cli.options import WrongUse
 from brokk_min.env import TaskConfig
 from brokk_min.identification.fit_config import FitConfig
-from brokk_min.learning.episodes import PAPER_LEARNER, PAPER_TASK
+from brokk_min.learning.episodes import GRADIENT_LEARNER, PAPER_TASK
 
 T = TypeVar("T")
 
@@ -54,28 +54,34 @@ class LearnerSettings:
     total_steps: int = 6_000_000  # Environment steps in all.
     num_envs: int = 256  # Environments side by side (paper: 256).
     horizon: int = 32  # Ticks of each environment between two updates.
-    epochs: int = 4  # Passes over the collected steps in each update.
+    epochs: int = 2  # Passes over the collected steps in each update.
     minibatch_size: int = 2048  # Steps in one gradient.
-    learning_rate: float = 4e-3  # Of Adam, at most; falls to zero.
-    target_kl: float = 0.3  # KL divergence that keeps the learning rate.
-    gamma: float = 0.95  # Discount a tick: 0.95 looks 20 ticks ahead.
+    learning_rate: float = 1.2e-3  # Of Adam, at most; falls to zero.
+    target_kl: float = 0.03  # KL divergence that keeps the learning rate.
+    gamma: float = 0.8  # Discount a tick: 0.8 looks 5 ticks ahead.
     gae_lambda: float = 0.95  # Weight of longer returns in the advantage.
     clip: float = 0.2  # Largest rewarded change of a probability ratio.
     entropy: float = 0.0  # Coefficient of the entropy bonus.
     max_grad_norm: float = 1.0  # Gradients are scaled down to this norm.
-    log_std: float = -1.8  # Log of the actions' deviation at the start.
-    log_std_end: float | None = -4.5  # At the end, linear; None: learned.
+    log_std: float = -1.2  # Log of the actions' deviation at the start.
+    log_std_end: float | None = None  # At the end, linear; None: learned.
     checkpoint_every: int = 50  # Updates between two checkpoints.
     threads: int = 2  # Threads of torch; the last bits depend on it.
+
+
+@dataclass(kw_only=True)
+class GradientDefaults:
+    """Options of trainings by gradients of the simulation: their own defaults."""
+
+    settings: tyro.conf.OmitArgPrefixes[LearnerSettings] = field(
+        default_factory=lambda: LearnerSettings(**GRADIENT_LEARNER)
+    )
 
 
 @dataclass(kw_only=True)
 class PaperDefaults:
     """Options of trainings with --paper: its own defaults."""
 
-    settings: tyro.conf.OmitArgPrefixes[LearnerSettings] = field(
-        default_factory=lambda: LearnerSettings(**PAPER_LEARNER)
-    )
     task: tyro.conf.OmitArgPrefixes[TaskSettings] = field(
         default_factory=lambda: TaskSettings(**PAPER_TASK)
     )

@@ -34,7 +34,7 @@ from brokk_min.identification.net_file import save_net, select_nets
 from brokk_min.jacobian import JacobianController, manipulability, manipulability_threshold
 from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.learning.checkpoint import train_policy
-from brokk_min.learning.episodes import PAPER_LEARNER, PAPER_TASK
+from brokk_min.learning.episodes import GRADIENT_LEARNER, PAPER_TASK
 from brokk_min.learning.policy import POLICIES, Policy, PolicyController, save_policy
 from brokk_min.machine import Array, Machine
 from brokk_min.ppo import PPOConfig
@@ -48,7 +48,8 @@ class Budget:
 
     hours: float = 1.0  # driving time of each actuator that is recorded
     fit_steps: int = FitConfig.steps
-    train_steps: int = PPOConfig.total_steps
+    train_steps: int = GRADIENT_LEARNER["total_steps"]
+    paper_steps: int = PPOConfig.total_steps  # of the paper's learner
     generations: int = baselines.GENERATIONS  # of the tuning
     tuning_runs: int = baselines.TUNING_RUNS
     starts: int = 64
@@ -56,7 +57,7 @@ class Budget:
     short_s: float = 26.0  # s of each sequence for regret, robustness and singularities
 
 
-QUICK = Budget(0.1, 700, 200_000, 4, 4, 8, 2, 3.0)
+QUICK = Budget(0.1, 700, 100_000, 200_000, 4, 4, 8, 2, 3.0)
 
 
 def reproduce(
@@ -181,12 +182,13 @@ def train(
     machine: Machine, out: Path, name: str, net: ActuatorNet, budget: Budget, seed: int
 ) -> Policy:
     """One of `POLICIES`: ours, ours with open valves, or the paper's, by its own settings."""
-    task, learner = TaskConfig(), PPOConfig(total_steps=budget.train_steps, threads=1)
+    task, steps = TaskConfig(), budget.train_steps
+    learner = PPOConfig(**{**GRADIENT_LEARNER, "total_steps": steps, "threads": 1})
     if name == "rl_open":
         task = TaskConfig(valves="open", zero_goals=0.25, hold_max_s=5.0)  # it learns to rest, too
     if name == "rl_paper":
         task = TaskConfig(paper=True, **PAPER_TASK)
-        learner = replace(learner, **PAPER_LEARNER)
+        learner = PPOConfig(total_steps=budget.paper_steps, threads=1)
     return train_policy(machine, net, task, learner, seed, out / POLICIES[name], resume=True)
 
 

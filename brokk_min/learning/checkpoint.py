@@ -36,7 +36,7 @@ from brokk_min.identification.files import (
 from brokk_min.identification.net_file import fingerprint
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import Policy, contract, save_policy
-from brokk_min.learning.simulation_gradient import gradient_advantages
+from brokk_min.learning.simulation_gradient import improved_actions, regression_loss
 from brokk_min.machine import Machine
 from brokk_min.ppo import Agent, Learner, PPOConfig, Rollout
 
@@ -76,7 +76,7 @@ def train_policy(
 
     `net` has the nets of the driven joints. The same `seed` gives the same bits on the same
     computer. Its checkpoint `<out>.checkpoint` and its curve `<out>.csv` lie next to the policy.
-    `critic`: advantages by a critic (always with `task.paper`), not by the nets' derivatives.
+    `critic`: PPO with a critic (always with `task.paper`), not gradients of the simulation.
     `resume`: continue from the checkpoint; the result is the same as without interruption.
     `tensorboard`: folder for the scalars of the curve (needs the extra `tensorboard`).
     ValueError: settings that do not fit, a checkpoint of another training, or a number that is not
@@ -91,9 +91,10 @@ def train_policy(
     stagger_episodes(env)
     log = TrainingLog(env, config, out, about, tensorboard)
     log.begin(learner, resume)
-    estimate = None if critic else gradient_advantages(machine, net, task)
+    estimate = None if critic else improved_actions(machine, net, task)
+    loss = ppo.ppo_loss if critic else regression_loss
     with log.bar, closing(log):
-        agent = ppo.train(env, config, seed, log.on_update, estimate, learner)
+        agent = ppo.train(env, config, seed, log.on_update, estimate, loss, learner)
     write_csv(log.curve, log.rows[0], [row.values() for row in log.rows])
     policy = export_policy(machine, net, agent, task, about)
     save_policy(out, policy)

@@ -1,4 +1,4 @@
-"""Advantages from the simulation's derivatives: backpropagation through time instead of a critic.
+"""Learning from the simulation's derivatives: backpropagation through time instead of a critic.
 
 The simulation consists of nets and kinematics, so its rewards can be differentiated by the actions.
 With the state x_t (history, angles, error integral) and x_{t+1} = f(x_t, a_t), the costate
@@ -9,16 +9,19 @@ runs backwards through a rollout; it gives the derivative of the discounted rewa
 
     dR_t/da_t = dr_t/da_t + gamma (df/da_t)^T lambda_{t+1}.
 
-The advantage of an action is, to first order, this gradient times its deviation from the mean,
+The policy's mean action moves along it, by STEP deviations at most, and the policy is fitted to the
+actions so improved,
 
-    A_t = (dR_t/da_t)^T (a_t - mean_t),
+    target_t = mean_t + STEP std g_t / max(|g_t|, median |g|),   g_t = dR_t/da_t,
+    loss = KL(N(target, std) || N(mean, std)) = |target - mean|^2 / (2 std^2).
 
-and PPO's clipped loss takes it: PPO around a first-order (pathwise) policy gradient. It is open
-loop: later actions count as given. No value stands at the end of the window, so the last actions of
-a window, which move the tool after it, get little credit. None of this is new. Nearest are:
+There is no likelihood ratio, no clip and no critic. Where the simulation has derivatives, this
+takes a sixth of the time of PPO's clip around the same gradient (docs/deviations.md, D10). It is
+open loop: later actions count as given. No value stands at the end of the window, so the last
+actions of a window, which move the tool after it, get little credit. None of this is new:
 
-- PODS (Mora et al., 2021): this gradient of the return by the actions, in a differentiable
-  simulator and without a value function, for deterministic policies.
+- PODS (Mora et al., 2021) is this method: actions improved along the gradient of the return in a
+  differentiable simulator, a policy regressed to them. There the policy is deterministic.
 - SVG (Heess et al., 2015, arXiv 1510.09142): backpropagation through learned dynamics, policy too.
 - Q-Prop (Gu et al., 2017, arXiv 1611.02247): the same Taylor expansion of the advantage, but of a
   learned critic, as a control variate of sampled returns.
@@ -53,6 +56,8 @@ from brokk_min.env import (
 from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.machine import PWM_MAX, Array, Machine, estimate_velocity, valve_opening
 
+STEP = 4.0  # deviations of the actions by which targets differ from means, at most
+
 
 class Ticks(NamedTuple):
     """What each tick of `env.step` began with, and its command: arrays (T, num, ...)."""
@@ -66,9 +71,10 @@ class Ticks(NamedTuple):
     done: NDArray[np.bool_]  # did the episode end with the tick?
 
 
-def gradient_advantages(machine: Machine, net: ActuatorNet, task: TaskConfig) -> ppo.Estimate:
+def improved_actions(machine: Machine, net: ActuatorNet, task: TaskConfig) -> ppo.Estimate:
     """The estimate that `ppo.train` takes, for rollouts of `gym_env.TaskVectorEnv` on `net`."""
 
+    @torch.no_grad()
     def estimate(
         agent: ppo.Agent, rollout: ppo.Rollout, config: ppo.PPOConfig
     ) -> dict[str, Tensor]:
@@ -87,10 +93,35 @@ def gradient_advantages(machine: Machine, net: ActuatorNet, task: TaskConfig) ->
             done=rollout.dones.numpy(),
         )
         gradient = torch.from_numpy(action_gradients(machine, net, ticks, config.gamma, task))
-        deviation = rollout.actions.clamp(-1, 1) - rollout.means.clamp(-1, 1)
-        return {"advantages": (gradient * deviation).sum(-1)}
+        step = STEP * agent.log_std.exp() * saturate(gradient)
+        targets = (rollout.means.clamp(-1, 1) + step).clamp(-1, 1)
+        return {"means": rollout.means, "targets": targets}
 
     return estimate
+
+
+def saturate(gradient: Tensor) -> Tensor:
+    """Vectors (..., n) divided by their norms, or by the median norm where that is larger."""
+    norm = torch.linalg.vector_norm(gradient, dim=-1, keepdim=True)
+    return gradient / torch.maximum(norm, norm.median()).clamp(min=1e-12)
+
+
+def regression_loss(
+    agent: ppo.Agent, mb: dict[str, Tensor], config: ppo.PPOConfig
+) -> tuple[Tensor, Tensor]:
+    """KL divergence of the policy from its targets; the log gets what `ppo.ppo_loss` gives."""
+    mean = agent.actor(mb["obs"])
+    loss = normal_kl(mean, mb["targets"], agent.log_std)
+    with torch.no_grad():
+        change = normal_kl(mean, mb["means"], agent.log_std)
+    zero = torch.zeros(())
+    return loss, torch.stack([loss.detach(), zero, zero, change, zero])
+
+
+def normal_kl(mean: Tensor, other: Tensor, log_std: Tensor) -> Tensor:
+    """Mean KL divergence of normal distributions with means (B, n) and the same deviation."""
+    z = (mean - other) * torch.exp(-log_std.detach())
+    return 0.5 * (z * z).sum(-1).mean()
 
 
 def action_gradients(

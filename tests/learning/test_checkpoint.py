@@ -14,16 +14,16 @@ from helpers_machines import obedient_net, small_net
 
 from brokk_min.env import TaskConfig
 from brokk_min.learning.checkpoint import TrainingLog, export_policy, stagger_episodes, train_policy
-from brokk_min.learning.episodes import PAPER_LEARNER, PAPER_TASK, get_obs
+from brokk_min.learning.episodes import GRADIENT_LEARNER, PAPER_TASK, get_obs
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import load_policy, save_policy
 from brokk_min.machine import BROKK_170
 from brokk_min.ppo import PPOConfig, make_learner
 
-TINY = PPOConfig(
+TINY = replace(
+    PPOConfig(**GRADIENT_LEARNER),
     num_envs=8,
     horizon=8,
-    epochs=2,
     minibatch_size=32,
     total_steps=4 * 64,
     checkpoint_every=2,
@@ -118,9 +118,7 @@ def test_export_policy__is_the_actor_of_the_papers_agent_through_a_file(tmp_path
 
 def test_train_policy__of_the_paper_learns_values_with_its_own_settings(tmp_path):
     """41,000 steps: the critic explains more than 0.3 of the variance of the returns."""
-    config = PPOConfig(
-        **PAPER_LEARNER, num_envs=64, minibatch_size=512, total_steps=20 * 2048, threads=1
-    )
+    config = PPOConfig(num_envs=64, minibatch_size=512, total_steps=20 * 2048, threads=1)
     task = TaskConfig(paper=True, **PAPER_TASK)
     run(tmp_path / "p.npz", net=obedient_net(BROKK_170), task=task, config=config)
     explained = [float(row["losses/explained_variance"]) for row in read_curve(tmp_path / "p.npz")]

@@ -18,13 +18,16 @@ from brokk_min.env import TaskConfig, integrate_error
 from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.simulation_gradient import (
+    STEP,
     Ticks,
     action_gradients,
-    gradient_advantages,
+    improved_actions,
     input_gradient,
+    regression_loss,
+    saturate,
 )
 from brokk_min.machine import BROKK_170, PWM_MAX
-from brokk_min.ppo import PPOConfig, collect, make_learner
+from brokk_min.ppo import Agent, PPOConfig, collect, make_learner
 
 NUM, TICKS = 3, 9
 
@@ -249,27 +252,52 @@ def test_input_gradient__equals_finite_differences(machine, seed):
     np.testing.assert_allclose((gradient * direction).sum((-1, -2)), difference, atol=1e-5)
 
 
-def test_gradient_advantages__are_gradient_times_deviation():
-    """Deviations count within [-1, 1]; ticks are those of the rollout, episodes end within it."""
+def test_improved_actions__are_means_and_a_saturated_step_along_the_gradient():
+    """Means count within [-1, 1], as do targets; episodes end within the rollout."""
     net = small_net(BROKK_170, np.random.default_rng(0))
     task = TaskConfig(episode_s=0.6, valve_cost=0.02)
-    config = PPOConfig(num_envs=8, horizon=13, log_std=-0.5, threads=1)
+    config = PPOConfig(num_envs=8, horizon=13, log_std=-2.5, threads=1)
     vector = TaskVectorEnv(8, net, BROKK_170, task)
     learner = make_learner(vector, config, 1, critic=False)
     learner.agent.actor[-1].bias.data += torch.tensor([1.1, -0.9, 0.3, 0.0])  # beyond the limit
     rollout = collect(vector, learner, config)
-    batch = gradient_advantages(BROKK_170, net, task)(learner.agent, rollout, config)
-    assert list(batch) == ["advantages"]
-    expected = expected_advantages(net, task, rollout, config.gamma)
-    np.testing.assert_allclose(batch["advantages"], expected, rtol=1e-4, atol=1e-6)
+    batch = improved_actions(BROKK_170, net, task)(learner.agent, rollout, config)
+    means = rollout.means.numpy().clip(-1, 1)
+    gradient = expected_gradient(net, task, rollout, config.gamma)
+    norm = np.linalg.norm(gradient, axis=-1, keepdims=True)
+    largest = np.maximum(norm, np.sort(norm, axis=None)[(norm.size - 1) // 2])
+    targets = (means + STEP * np.exp(-2.5) * gradient / largest).clip(-1, 1)
+    np.testing.assert_allclose(batch["targets"], targets, rtol=1e-4, atol=1e-6)
     assert rollout.dones.any()
     assert rollout.means.abs().max() > 1
+    assert (norm > largest.min()).any() and (norm < largest.min()).any()
 
 
-def expected_advantages(net, task, rollout, gamma):
+def test_saturate__divides_by_the_norm_or_the_median_and_stands_still_without_a_gradient():
+    gradient = torch.tensor([[3.0, 4.0], [0.0, 1.0], [0.0, 0.5]])
+    expected = torch.tensor([[0.6, 0.8], [0.0, 1.0], [0.0, 0.5]])
+    torch.testing.assert_close(saturate(gradient), expected)
+    assert not saturate(torch.zeros(3, 2)).any()
+
+
+def test_regression_loss__is_the_divergence_of_normal_distributions():
+    """PyTorch's own distributions are the oracle."""
+    agent = Agent(5, 2, -0.7, critic=False)
+    obs, targets, means = torch.randn(6, 5), torch.randn(6, 2), torch.randn(6, 2)
+    batch = {"obs": obs, "targets": targets, "means": means}
+    loss, parts = regression_loss(agent, batch, PPOConfig())
+
+    def divergence(other):
+        std = agent.log_std.exp()
+        normals = [torch.distributions.Normal(m, std) for m in (other, agent.actor(obs))]
+        return torch.distributions.kl_divergence(*normals).sum(-1).mean()
+
+    torch.testing.assert_close(loss, divergence(targets))
+    assert parts.tolist() == pytest.approx([loss.item(), 0, 0, divergence(means).item(), 0])
+
+
+def expected_gradient(net, task, rollout, gamma):
     states = [info["state"] for info in rollout.infos]
     commands = env.action_to_pwm(BROKK_170, rollout.actions.numpy())
     ticks = ticks_of([*states, states[-1]], commands, rollout.dones.numpy())
-    gradient = action_gradients(BROKK_170, net, ticks, gamma, task)
-    deviation = rollout.actions.numpy().clip(-1, 1) - rollout.means.numpy().clip(-1, 1)
-    return (gradient * deviation).sum(-1)
+    return action_gradients(BROKK_170, net, ticks, gamma, task)

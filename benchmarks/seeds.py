@@ -1,0 +1,109 @@
+"""Ten chains, each with its own logs, nets and policies: means over seeds and their spread.
+
+    python -m benchmarks.seeds [--folder results-seeds] [--seeds 10] [--policies rl rl_paper]
+
+Each seed records, fits and trains as `brokk-min reproduce` does, on one thread; as many seeds run
+at once as there are cores. What the folder holds already is not made again. Policies and the
+package's tuned baselines are then scored on the sequences and starts of `evaluate`. All
+figures go to `seeds.json` in the folder.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+
+from brokk_min.actuator import select_nets
+from brokk_min.evaluation import metrics, reproduce, sequences
+from brokk_min.evaluation.baselines import read_gains
+from brokk_min.identification import excitation, fitting, logs
+from brokk_min.identification.files import SHIPPED, write_json
+from brokk_min.identification.net_file import load_net
+from brokk_min.learning.policy import POLICIES, PolicyController, load_policy
+from brokk_min.machine import BROKK_170 as M
+
+FIGURES = {  # name in the file -> figure of `metrics`
+    "error": "velocity_error_mean",
+    "drift": "off_axis_drift_max",
+    "jerk": "jerk_rms",
+    "valve_travel": "valve_travel",
+    "joint_motion_at_rest": "joint_motion_at_rest",
+}
+RECIPES: dict[str, tuple[str, str, dict[str, Any]]] = {  # policy -> nets, excitation, recipe
+    "rl": ("net", "rich", {}),
+    "rl_open": ("net", "rich", {}),
+    "rl_paper": ("net_paper", "sine", fitting.PAPER_RECIPE),
+}
+
+
+@dataclass
+class Options:
+    folder: Path = Path("results-seeds")  # A folder for each seed, and seeds.json.
+    seeds: int = 10  # How many, from 0 on.
+    policies: tuple[str, ...] = tuple(POLICIES)  # Which are trained.
+    quick: bool = False  # Tiny fits and trainings, only to show that it runs.
+
+
+def make(options: Options, name: str, seed: int) -> None:
+    """The policy `name` of one seed, and before it the nets, unless the folder has them."""
+    budget = reproduce.QUICK if options.quick else reproduce.Budget()
+    out = options.folder / f"seed_{seed}"
+    out.mkdir(parents=True, exist_ok=True)
+    nets, kind, recipe = RECIPES[name]
+    if not (out / f"{nets}.npz").exists():
+        log_file = out / f"log_{nets}.npz"
+        log = excitation.collect(M, budget.hours, kind, np.random.default_rng(seed))
+        logs.write_log(log_file, log)
+        log = logs.read_log([log_file], M.velocity_samples, rate=M.rate)
+        reproduce.fit_net(M, out / f"{nets}.npz", log, budget, recipe, seed)
+    if not (out / POLICIES[name]).exists():
+        net = select_nets(M, load_net(out / f"{nets}.npz", M))
+        reproduce.train(M, out, name, net, budget, seed)
+
+
+def score(options: Options) -> list[dict[str, Any]]:
+    """A row for each policy that the folder has, and for each baseline: means over starts."""
+    commands = sequences.task_sequences(M)
+    starts = sequences.evaluation_starts(M, 8 if options.quick else 64, commands, 2)
+    workspace = np.array(sequences.start_kinds(M, starts)) == "workspace"
+    policies = {
+        (name, seed): load_policy(file, M)
+        for seed in range(options.seeds)
+        for name in options.policies
+        if (file := options.folder / f"seed_{seed}" / POLICIES[name]).exists()
+    }
+    controllers: dict[Any, Any] = {k: PolicyController(M, p) for k, p in policies.items()}
+    shipped = SHIPPED / M.name
+    gains = read_gains(shipped / "gains.json", M, load_policy(shipped / "policy.npz", M).net)
+    controllers |= {(name, None): pid for name, pid in gains.items()}
+    rows = []
+    for (name, seed), controller in controllers.items():
+        runs, _ = metrics.evaluate(M, {name: controller}, commands, starts[workspace], 0)
+        axes = [run for run in runs if run["sequence"] in sequences.AXES]
+        row = {key: float(np.mean([run[of] for run in runs])) for key, of in FIGURES.items()}
+        row["error_xyz"] = float(np.mean([run["velocity_error_mean"] for run in axes]))
+        rows.append({"controller": name, "seed": seed} | row)
+    return rows
+
+
+def main(options: Options) -> None:
+    """Make what is missing, score all and print means, and the largest less the smallest."""
+    for name in options.policies:
+        jobs = {str(seed): partial(make, options, name, seed) for seed in range(options.seeds)}
+        reproduce.side_by_side(jobs, {})
+    rows = score(options)
+    write_json(options.folder / "seeds.json", rows)
+    columns = [key for key in rows[0] if key not in ("controller", "seed")]
+    print(f"{'mean (largest less smallest)':34}", *(f"{column:>22}" for column in columns))
+    for name in dict.fromkeys(row["controller"] for row in rows):
+        values = np.array([[r[c] for c in columns] for r in rows if r["controller"] == name])
+        spread = np.ptp(values, axis=0)
+        cells = [f"{m:.4f} ({s:.4f})" for m, s in zip(values.mean(axis=0), spread, strict=True)]
+        print(f"{name:30} {len(values):3}", *(f"{cell:>22}" for cell in cells))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
