@@ -83,10 +83,15 @@ def score(options: Options) -> list[dict[str, Any]]:
     for (name, seed), controller in controllers.items():
         runs, _ = metrics.evaluate(M, {name: controller}, commands, starts[workspace], 0)
         axes = [run for run in runs if run["sequence"] in sequences.AXES]
-        row = {key: float(np.mean([run[of] for run in runs])) for key, of in FIGURES.items()}
-        row["error_xyz"] = float(np.mean([run["velocity_error_mean"] for run in axes]))
+        row = {key: mean(runs, figure) for key, figure in FIGURES.items()}
+        row["error_xyz"] = mean(axes, "velocity_error_mean")
         rows.append({"controller": name, "seed": seed} | row)
     return rows
+
+
+def mean(runs: list[dict[str, Any]], figure: str) -> float:
+    """Mean of a figure over the runs that have it: some never rest."""
+    return float(np.mean([run[figure] for run in runs if run[figure] is not None]))
 
 
 def main(options: Options) -> None:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+from shutil import copyfile
 
 import numpy as np
 import pytest
 
-from benchmarks import deviations, ladder, limits, peers
+from benchmarks import deviations, ladder, limits, peers, seeds
 from benchmarks.rollout import random_net
 from brokk_min import kinematics
 from brokk_min.env import action_to_pwm
@@ -57,6 +58,18 @@ def test_limits__are_measured(tmp_path):
     assert result["gradient"]["fraction_of_best"] > 0
     assert result["kinematics"]["us_per_configuration"] > 0
     assert json.loads(out.read_text())["gradient"] == result["gradient"]
+
+
+def test_seeds__score_what_the_folder_has(tmp_path, capsys):
+    """The shipped policy as one seed, not trained again, and the baselines."""
+    (tmp_path / "seed_0").mkdir()
+    for name in ("net.npz", "policy.npz"):
+        copyfile(SHIPPED / "brokk170/policy.npz", tmp_path / "seed_0" / name)
+    seeds.main(seeds.Options(tmp_path, 1, ("rl",), quick=True))
+    rows = json.loads((tmp_path / "seeds.json").read_text())
+    assert [row["seed"] for row in rows] == [0, *[None] * 6]
+    assert all(0.005 < row["error"] < 0.03 and row["jerk"] > 1 for row in rows)
+    assert "jacobian_pid_ff_integral" in capsys.readouterr().out
 
 
 def test_shapes__are_the_products_of_a_gradient():
