@@ -16,12 +16,11 @@ from typing import Any
 import numpy as np
 import tyro
 
-from brokk_min.actuator import select_nets
 from brokk_min.evaluation import metrics, reproduce, sequences
 from brokk_min.evaluation.baselines import read_gains
 from brokk_min.identification import excitation, fitting, logs
 from brokk_min.identification.files import SHIPPED, write_json
-from brokk_min.identification.net_file import load_net
+from brokk_min.identification.net_file import load_net, select_nets
 from brokk_min.learning.policy import POLICIES, PolicyController, load_policy
 from brokk_min.machine import BROKK_170 as M
 

@@ -144,7 +144,9 @@ def test_read_results__takes_files_of_reproduce_with_policy_and_gains_beside_the
 # --- films ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("fps", "times"), [(10.0, [100, 100]), (7.0, [150, 150]), (100.0, [50] * 4)])
+@pytest.mark.parametrize(
+    ("fps", "times"), [(10.0, [100, 100]), (7.0, [150, 150]), (100.0, [50] * 4)]
+)
 def test_write_film__has_as_many_frames_a_second_as_ticks_allow(fps, times, tmp_path):
     """The last tick is always there, and is held for three seconds."""
     replay.write_film(tmp_path / "f.gif", BROKK_170, [run_of(5), run_of(2)], (640, 360), fps)
