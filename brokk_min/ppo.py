@@ -42,7 +42,7 @@ class PPOConfig:
     log_std: float = number("1", -10, 3, -1.2)  # Log of the actions' deviation at the start.
     log_std_end: float | None = number("1", -10, 3, None)  # At the end, linear; None: learned.
     checkpoint_every: int = number("updates", 1, 10**12, 50)  # Updates between two checkpoints.
-    threads: int = number("1", 1, 10**6, 2)  # Threads of torch; the last bits depend on it.
+    threads: int = number("1", 1, 10**6, 1)  # Of torch; several wait in vain on busy cores.
     __post_init__ = check_numbers  # type: ignore[misc]
 
 

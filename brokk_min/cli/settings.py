@@ -66,7 +66,7 @@ class LearnerSettings:
     log_std: float = -1.2  # Log of the actions' deviation at the start.
     log_std_end: float | None = None  # At the end, linear; None: learned.
     checkpoint_every: int = 50  # Updates between two checkpoints.
-    threads: int = 2  # Threads of torch; the last bits depend on it.
+    threads: int = 1  # Of torch; several wait in vain on busy cores.
 
 
 @dataclass(kw_only=True)

@@ -120,7 +120,7 @@ def render(
     page = Environment(loader=FileSystemLoader(folder), autoescape=True, undefined=StrictUndefined)
     page.filters["interval"] = interval_text
     page.filters.update(label=label, transpose=transpose, with_intervals=with_intervals)
-    training = training_claim(clock["train rl_paper"], results["meta"]["effort"]["train_steps"])
+    training = training_claim(clock["train rl_paper"], results["meta"]["effort"]["paper_steps"])
     sequences = {}
     for sequence in task_sequences(machine):
         sequences[sequence.name] = path_row(hold_table(machine, sequence.goals))

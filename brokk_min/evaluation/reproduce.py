@@ -94,7 +94,7 @@ def reproduce(
             *trained, (pids, tuning) = side_by_side(jobs, clock)
             policies = dict(zip(POLICIES, trained, strict=True))
         with stage("evaluate"):
-            results, shown = measure(machine, net, test, policies, pids, budget, seed)
+            results, shown = measure(machine, net, test, policies, pids, budget, seed, clock)
             results["paper_recipe"] = net_errors(machine, paper_net, test, seed)
         with stage("draw"):
             results |= {"tuning": tuning, "training_seeds": training_seeds}
@@ -210,10 +210,11 @@ def measure(
     pids: Pids,
     budget: Budget,
     seed: int,
+    clock: dict[str, float],
 ) -> tuple[dict[str, Any], report.Shown]:
     """All measurements of nets, policies and baselines, for JSON and for the figures."""
     controllers = {name: PolicyController(machine, policy) for name, policy in policies.items()}
-    compared, task, singular = compare(machine, controllers, pids, budget, seed)
+    compared, task, singular = compare(machine, controllers, pids, budget, seed, clock)
     starts = np.array(compared["starts"])[np.array(compared["start_kinds"]) == "workspace"]
     axes = sequences.axis_sequences(machine)
     rl = {"rl": controllers["rl"]}
@@ -237,7 +238,12 @@ def measure(
 
 
 def compare(
-    machine: Machine, policies: Mapping[str, Controller], pids: Pids, budget: Budget, seed: int
+    machine: Machine,
+    policies: Mapping[str, Controller],
+    pids: Pids,
+    budget: Budget,
+    seed: int,
+    clock: dict[str, float],
 ) -> tuple[dict[str, Any], Traces, Traces]:
     """The paper's experiment, regret and robustness: JSON, all traces, those near singularities.
 
@@ -250,22 +256,31 @@ def compare(
     kinds = np.array(sequences.start_kinds(machine, starts))
     workspace = kinds == "workspace"
     reachable = starts[workspace]
-    runs, traces = evaluate(machine, controllers, commands, starts, seed)
+    short = shorten(machine, sequences.axis_sequences(machine), budget.short_s)
+    bound_starts, extended = reachable[: budget.bound_starts], starts[kinds == "extended"]
+    few = claims.singular_controllers(policies, pids)
+    jobs: dict[str, Callable[[], Any]] = {
+        "score": partial(evaluate, machine, controllers, commands, starts, seed),
+        "score near singularities": partial(
+            near_singularities, machine, few, extended, budget.short_s, seed
+        ),
+        "score perfect model": partial(regret, machine, controllers, short, bound_starts, seed),
+        "score changed machines": partial(
+            robustness, machine, controllers, short, reachable[:16], seed
+        ),
+    }
+    task, (singular, near, near_traces), less, changed = side_by_side(jobs, clock)
+    runs, traces = task
     scored = [run for run in runs if run["kind"] == "workspace"]
-    extended = starts[kinds == "extended"]
-    singular, near, near_traces = near_singularities(
-        machine, claims.singular_controllers(policies, pids), extended, budget.short_s, seed
-    )
     along_x = {c: Trace(*(array[:, workspace] for array in traces[c, "x"])) for c in pids}
     goals = commands[0].for_starts(machine, reachable)
     claim = partial(claims.task_claims, machine)
     theirs = claim("rl_paper", pids, scored, along_x, goals, near.get("rl_paper", []))
     ours = claim("rl", pids, scored, along_x, goals, near.get("rl", []))
-    short = shorten(machine, sequences.axis_sequences(machine), budget.short_s)
     results = {
         "task_space": tables(runs, scored),
-        "regret": regret(machine, controllers, short, reachable[: budget.bound_starts], seed),
-        "robustness": robustness(machine, controllers, short, reachable[:16], seed),
+        "regret": less,
+        "robustness": changed,
         "singular": singular,
         "claims": [a.to_json() | {"ours": b.to_json()} for a, b in zip(theirs, ours, strict=True)],
         "starts": starts.tolist(),

@@ -106,6 +106,7 @@ def _check_targets(log: Log, targets: list[Array], history: int) -> None:
 def train(data: TrainingSet, config: FitConfig, seed: int, estimator: int | None) -> list[Tensor]:
     """Weights of all nets, as in `ActuatorNet.weights`; `estimator` as in `multi_step_loss`."""
     torch.set_float32_matmul_precision("highest")  # a training of policies may have lowered it
+    torch.set_num_threads(1)  # several wait in vain on busy cores
     generator = Generator().manual_seed(seed)
     weights = initial_weights(len(data.windows), 3 * config.history, config.hidden, generator)
     optimizer = torch.optim.Adam(weights, lr=config.learning_rate)

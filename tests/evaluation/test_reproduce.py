@@ -23,7 +23,7 @@ from brokk_min.identification.net_file import load_net
 from brokk_min.learning.policy import POLICIES, load_policy
 from brokk_min.machine import BROKK_170
 
-TINY = Budget(0.004, 20, 4096, 1, 1, 4, 2, 0.5)
+TINY = Budget(0.004, 20, 4096, 4096, 1, 1, 4, 2, 0.5)
 ERROR = "velocity_error_mean"
 PIDS = ["jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff", "jacobian_pid_ff_awake"]
 PIDS += ["jacobian_pid_ff_integral", "jacobian_pid_ff_integral_awake"]
@@ -65,7 +65,8 @@ def test_reproduce__gives_the_same_bits_twice(folder, tmp_path, monkeypatch, cap
         assert (folder / name).read_bytes() == (tmp_path / name).read_bytes(), name
     clock = json.loads((folder / "timing.json").read_text())
     stages = ["record", "fit net", "fit net_paper", "fit", *(f"train {name}" for name in POLICIES)]
-    assert list(clock) == [*stages, "tune", "train and tune", "evaluate", "draw"]
+    scores = ["score", "score near singularities", "score perfect model", "score changed machines"]
+    assert list(clock) == [*stages, "tune", "train and tune", *scores, "evaluate", "draw"]
     printed = capsys.readouterr().out
     assert printed.startswith("rl ") and printed.endswith(f"{tmp_path / 'results.json'}\n")
 
