@@ -1,14 +1,13 @@
 """A machine as one frozen value: geometry, limits, valves, cylinders, encoders, CAN ids.
 
-Porting to another machine means writing another `Machine`. Nothing else in the package knows a
-Brokk. The fields below state each unit; `BROKK_170` states the source of each number:
-paper, assumed (plausible, not the maker's data) or tuned (by runs of this project).
+To port means to write another `Machine`: nothing else knows a Brokk. Fields state their units,
+`BROKK_170` its sources: paper, assumed (not the maker's data) or tuned (by runs of this project).
 """
 
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -50,42 +49,47 @@ def check_numbers(owner: Any, label: str = "") -> None:
 class Joint:
     """One revolute joint: its standard DH row Rz(q + theta) Tz(d) Tx(a) Rx(alpha), range and drive.
 
-    A cylinder spans a triangle: sides `cylinder_base` and `cylinder_rod` meet at the pivot under
-    the angle `cylinder_angle + q`. A base of 0 means a slew drive with constant lever arm `rod`.
+    A cylinder (of the plant alone) spans a triangle: sides `cylinder_base` and `cylinder_rod` meet
+    under the angle `cylinder_angle + q`. A base of 0 means a slew drive with constant lever arm.
     """
 
     name: str
-    driven: bool  # does the controller move it? (a locked joint is set by the operator)
+    driven: bool  # by the controller? (a locked joint is set by the operator)
     a: float = number("m")
     alpha: float = number("rad")
     d: float = number("m")
     theta: float = number("rad")
     q_min: float = number("rad")
     q_max: float = number("rad")
-    cylinder_base: float = number("m", 0)
-    cylinder_rod: float = number("m", 1e-6)
-    cylinder_angle: float = number("rad")
-    cylinder_area: float = number("m^2", 1e-9)
-    speed_positive: float = number("m/s", 1e-9)  # of the cylinder at full command
-    speed_negative: float = number("m/s", 1e-9)
     q_dot_up: float = number("rad/s", 1e-9)  # fastest positive motion at the command limit
     q_dot_down: float = number("rad/s", 1e-9)  # fastest negative motion, a positive number
     encoder_node: int = number("CANopen node id", 1, 127)
+    cylinder_base: float = number("m", 0, default=0.0)
+    cylinder_rod: float = number("m", 1e-6, default=1.0)
+    cylinder_angle: float = number("rad", default=0.0)
+    cylinder_area: float = number("m^2", 1e-9, default=0.005)
+    speed_positive: float = number("m/s", 0, default=0.0)  # of the cylinder at full command; 0:
+    speed_negative: float = number("m/s", 0, default=0.0)  # what gives q_dot_up and q_dot_down
     encoder_zero: int = number("counts", default=0)  # the reading at q = 0
-    encoder_sign: int = number("1", -1, 1, default=1)  # -1: it counts down while q rises
+    encoder_sign: Literal[-1, 1] = 1  # -1: it counts down while q rises
+    kind: Literal["revolute"] = "revolute"  # prismatic ones are not supported
 
     def __post_init__(self) -> None:
         """ValueError: a bad number, an empty range, a triangle that closes over the range."""
         check_numbers(self, f"{self.name}.")
-        if self.encoder_sign == 0:
-            raise ValueError(f"{self.name}.encoder_sign: expected -1 or 1, got 0")
         if not self.q_min < self.q_max:
             raise ValueError(f"{self.name}.q_max: expected above {self.q_min}, got {self.q_max!r}")
-        low = self.cylinder_angle + self.q_min
-        high = self.cylinder_angle + self.q_max
+        low, high = self.cylinder_angle + self.q_min, self.cylinder_angle + self.q_max
         if self.cylinder_base > 0 and not 0 < low < high < np.pi:
             expected = "expected the triangle's angle within (0, pi) over the joint's range"
             raise ValueError(f"{self.name}.cylinder_angle: {expected}, got {low:.3f} to {high:.3f}")
+
+    def with_speeds(self, opening: float) -> Joint:
+        """Cylinder speeds, if none are given, that give q_dot_up, q_dot_down at a valve opening."""
+        r = self.cylinder_rod / opening
+        up = self.speed_positive or self.q_dot_up * r
+        down = self.speed_negative or self.q_dot_down * r
+        return replace(self, speed_positive=up, speed_negative=down)
 
 
 @dataclass(frozen=True)
@@ -97,15 +101,6 @@ class Machine:
     rate: float = number("Hz", 1e-3)  # of control and logging
     pwm_limit: int = number("counts of 127", 1, PWM_MAX)  # largest command that leaves the program
     dead_zone: float = number("of full command", 0, 0.99)
-    delay: float = number("s", 0)  # until a command reaches the valve
-    tau_spool: float = number("s", 1e-6)  # time constants of spool, cylinder speed, activation
-    tau_cylinder: float = number("s", 1e-6)
-    tau_valve_up: float = number("s", 1e-6)
-    tau_valve_down: float = number("s", 1e-6)
-    valve_threshold: float = number("1", 0, 0.999)  # activation below which a valve is closed
-    spool_threshold: float = number("of full stroke", 0, 1)  # above it a valve activates
-    pump_flow: float = number("m^3/s", 1e-9)
-    plant_dt: float = number("s", 1e-6, 1)  # explicit Euler step of the analytic plant
     encoder_bits: int = number("bits a turn", 1, 32)
     velocity_samples: int = number("samples", 2, 100)  # window of the velocity estimator
     history: int = number("samples", 2, 1000)  # of q, q_dot and u that nets and policy get
@@ -114,6 +109,16 @@ class Machine:
     valve_frame_id: int = number("CAN id", 0, 0x7FF)
     controller_node: int = number("CANopen node id", 1, 127)  # of the valve controller
     largest_dead_zone: float = number("of full command", 0, 0.99, default=0.0)  # 0: 1.5 dead zones
+    # Of the analytic plant alone; by default what is assumed of the Brokk, with any pump flow.
+    delay: float = number("s", 0, default=0.040)  # until a command reaches the valve
+    tau_spool: float = number("s", 1e-6, default=0.030)  # time constants: spool, cylinder speed,
+    tau_cylinder: float = number("s", 1e-6, default=0.030)
+    tau_valve_up: float = number("s", 1e-6, default=0.15)  # activation (paper: 400 ms from idle)
+    tau_valve_down: float = number("s", 1e-6, default=0.40)
+    valve_threshold: float = number("1", 0, 0.999, 0.80)  # a valve of less activation is closed
+    spool_threshold: float = number("of full stroke", 0, 1, 0.01)  # above it a valve activates
+    pump_flow: float = number("m^3/s", 1e-9, default=1.0)
+    plant_dt: float = number("s", 1e-6, 1, 0.005)  # step of explicit Euler
     q_start: tuple[float, ...] = ()  # rad, where experiments start; empty: the middle of the ranges
     plant: Any = None  # reset(machine, q) and step(machine, state, u); None: that of `actuator`
 
@@ -132,6 +137,9 @@ class Machine:
         zone = max(self.dead_zone, self.largest_dead_zone)
         if not zone * PWM_MAX < self.pwm_limit:  # no valve would ever open
             raise ValueError(f"dead_zone: expected below {self.pwm_limit}/{PWM_MAX}, got {zone!r}")
+        opening = float(valve_opening(self.pwm_limit / PWM_MAX, self.dead_zone))
+        joints = tuple(joint.with_speeds(opening) for joint in self.joints)
+        object.__setattr__(self, "joints", joints)
         if self.q_start and len(self.q_start) != self.n:
             raise ValueError(f"q_start: expected {self.n} angles or none, got {self.q_start}")
         steps = self.dt / self.plant_dt
@@ -295,12 +303,12 @@ _DH = [
     ("q5", True,   1.20,  0.0,         0.0,   -3 * np.pi / 4, 0.0,  2.0),
 ]
 _DRIVES = [
-    # base, rod [m]  angle [rad]  area [m^2]  speed +, - [m/s]  up, down [rad/s]  node
-    (0.00, 0.15,     0.00,        0.0040,     0.0498, 0.0498,   0.20, 0.20,       1),
-    (1.00, 0.35,     0.45,        0.0100,     0.0588, 0.0802,   0.15, 0.22,       2),
-    (0.90, 0.30,     0.80,        0.0090,     0.0453, 0.0825,   0.17, 0.28,       3),
-    (0.80, 0.25,    -0.30,        0.0060,     0.0370, 0.0662,   0.22, 0.38,       4),
-    (0.60, 0.20,     0.40,        0.0040,     0.0425, 0.0833,   0.24, 0.47,       5),
+    # up, down [rad/s]  node  base, rod [m]  angle [rad]  area [m^2]  speed +, - [m/s]
+    (0.20, 0.20,        1,    0.00, 0.15,     0.00,       0.0040,     0.0498, 0.0498),
+    (0.15, 0.22,        2,    1.00, 0.35,     0.45,       0.0100,     0.0588, 0.0802),
+    (0.17, 0.28,        3,    0.90, 0.30,     0.80,       0.0090,     0.0453, 0.0825),
+    (0.22, 0.38,        4,    0.80, 0.25,    -0.30,       0.0060,     0.0370, 0.0662),
+    (0.24, 0.47,        5,    0.60, 0.20,     0.40,       0.0040,     0.0425, 0.0833),
 ]
 # fmt: on
 
@@ -310,15 +318,7 @@ BROKK_170 = Machine(
     rate=20.0,  # Hz; paper: Sec. 3.3
     pwm_limit=80,  # counts of 127; paper: Sec. 3.2
     dead_zone=0.07,  # of full command; paper: Sec. 3.3
-    delay=0.040,  # s; assumed
-    tau_spool=0.030,  # s; assumed
-    tau_cylinder=0.030,  # s; assumed
-    tau_valve_up=0.15,  # s; assumed, for the paper's 400 ms from idle
-    tau_valve_down=0.40,  # s; assumed
-    valve_threshold=0.80,  # of activation; assumed
-    spool_threshold=0.01,  # of full stroke; assumed
     pump_flow=0.00105,  # m^3/s; assumed
-    plant_dt=0.005,  # s; assumed
     encoder_bits=12,  # bits a turn; assumed
     velocity_samples=4,  # samples; tuned
     history=13,  # samples; paper: Table 1 (0.6 s)

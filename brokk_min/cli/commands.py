@@ -16,11 +16,13 @@ from brokk_min.cli.options import (
     Command,
     Count,
     MachineName,
+    PlantName,
     Range,
     Samples,
     Seed,
     WrongUse,
     default_policy,
+    with_plant,
 )
 from brokk_min.cli.settings import (
     FitSettings,
@@ -37,7 +39,7 @@ from brokk_min.evaluation.rollout import Controller
 from brokk_min.identification import excitation, validation
 from brokk_min.identification.files import SHIPPED, brief, located, write_json
 from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
-from brokk_min.identification.logs import Log, read_log, write_log
+from brokk_min.identification.logs import Log, Recording, driven, read_log, write_log
 from brokk_min.identification.net_file import load_net, save_net
 from brokk_min.learning.policy import POLICIES, Policy, PolicyController, load_policy
 from brokk_min.machine import Machine
@@ -45,17 +47,19 @@ from brokk_min.machine import Machine
 
 @dataclass(kw_only=True)
 class Collect(Command):
-    """Record the machine (the analytic plant) under excitation."""
+    """Record the machine (the analytic plant, or your own) under excitation."""
 
     out: Path  # Log to write, .csv or .npz.
     hours: Annotated[float, Range(1e-4, 100)] = 1.0  # Driving time for each actuator [h].
     excitation: Literal["sine", "rich"] = "rich"  # The paper's sines, or steps and holds too.
+    plant: PlantName = "analytic"  # What moves: the analytic plant, or an object of your file.
 
     def __call__(self) -> None:
         machine = self.check(out="log")
         if self.out.suffix not in (".csv", ".npz"):
             raise WrongUse(f"--out: expected a name ending in .csv or .npz, got {self.out}")
         rng = np.random.default_rng(self.seed)
+        machine = with_plant(machine, self.plant, ["analytic"])
         log = excitation.collect(machine, self.hours, self.excitation, rng)
         write_log(self.out, log)
         print(f"{self.out}: {len(log.recordings)} recordings of {', '.join(log.joints)}")
@@ -81,14 +85,14 @@ class Fit(Command):
         if not self.logs:
             raise WrongUse("LOGS: expected at least one log, got none")
         machine = self.check(out="nets", json="scores", figure="picture")
-        make_config(FitConfig, vars(self.settings))  # before the logs are read
+        make_config(FitConfig, self._settings(None, machine.history))  # before the logs are read
         samples = self.velocity_samples or machine.velocity_samples
         log, test = self._read(machine, samples)
         known = machine if machine.names == log.joints else None
         if self.machine and not known:
             expected = f"expected those of --machine {self.machine}"
             raise ValueError(f"{self.logs[0]}: joints: {expected}, got {brief(log.joints)}")
-        config = make_config(FitConfig, self._settings(known))
+        config = make_config(FitConfig, self._settings(known, machine.history))
         with located(*self.logs):
             net = fit(log, config, self.seed, samples, known.name if known else "")
         with located(*self.test, *self.logs):
@@ -104,7 +108,7 @@ class Fit(Command):
 
     def _read(self, machine: Machine, samples: int) -> tuple[Log, Log]:
         """Recordings to fit to and to score on."""
-        if samples > self.settings.history:
+        if samples > (self.settings.history or machine.history):
             raise WrongUse(f"--velocity-samples: expected at most --history, got {samples}")
         log = read_log(self.logs, samples, rate=machine.rate)
         if self.test:
@@ -117,9 +121,9 @@ class Fit(Command):
         files = {"logs": list(map(str, self.logs)), "test": list(map(str, self.test))}
         return {**meta, "machine": net.machine, "dead_zone": net.dead_zone, **files}
 
-    def _settings(self, known: Machine | None) -> dict[str, Any]:
-        """The settings, by default with the known machine's dead zone; or the paper's."""
-        settings = dict(vars(self.settings))
+    def _settings(self, known: Machine | None, history: int) -> dict[str, Any]:
+        """The settings, by default with the machine's history and dead zone; or the paper's."""
+        settings = vars(self.settings) | {"history": self.settings.history or history}
         if self.paper:
             settings |= PAPER_RECIPE
         elif known and settings["dead_zone"] is None:
@@ -128,11 +132,22 @@ class Fit(Command):
 
 
 def split(log: Log) -> tuple[Log, Log]:
-    """Recordings to fit to, and every tenth, to score on; ValueError: a single one."""
-    if len(log.recordings) < 2:
-        raise ValueError("recordings: expected two or more, or --test, to score on, got one")
-    kept = tuple(recording for i, recording in enumerate(log.recordings) if i % 10)
-    return log._replace(recordings=kept), log._replace(recordings=log.recordings[::10])
+    """Recordings to fit to, and to score on: every tenth of those that drive the same joints.
+
+    ValueError: no two recordings drive the same joints.
+    """
+    groups: dict[tuple[bool, ...], list[int]] = {}
+    for i, recording in enumerate(log.recordings):
+        groups.setdefault(tuple(driven(recording).tolist()), []).append(i)
+    held_out = {i for group in groups.values() if len(group) > 1 for i in group[::10]}
+    if not held_out:
+        expected = "expected two or more that drive the same joints, or --test, to score on"
+        raise ValueError(f"recordings: {expected}, got {len(log.recordings)}")
+    parts: tuple[list[Recording], list[Recording]] = ([], [])
+    for i, recording in enumerate(log.recordings):
+        parts[i in held_out].append(recording)
+    kept, test = (log._replace(recordings=tuple(part)) for part in parts)
+    return kept, test
 
 
 def print_scores(scores: dict[str, Any]) -> None:
@@ -250,7 +265,7 @@ class Evaluate(Command):
     policy: Path | None = None  # Policy that `train` wrote; by default those of the package.
     commands: Path | None = None  # Velocity sequences, CSV: sequence,time,vx,vy,vz [s, m/s].
     starts: Path | None = None  # Start poses, CSV: one column per joint [rad].
-    plant: Literal["analytic", "net"] = "analytic"  # What moves: the analytic plant or the nets.
+    plant: PlantName = "analytic"  # What moves: analytic, net, or an object of your file.
     json: Path | None = None  # Also write all runs here.
     gains: Path | None = None  # Tuned gains; by default gains.json in the folder of POLICY.
     num_starts: Count = 16  # Without --starts: how many of the machine's start poses.
@@ -260,35 +275,38 @@ class Evaluate(Command):
 
     def __call__(self) -> None:
         machine = self.check(json="runs")
-        if self.perfect_model and self.plant == "net":
-            raise WrongUse("--perfect-model: expected --plant analytic, its model, got net")
+        if self.perfect_model and self.plant != "analytic":
+            raise WrongUse(
+                f"--perfect-model: expected --plant analytic, its model, got {self.plant}"
+            )
         path, gains = default_policy(machine, self.policy, self.gains)
         if self.noise != TaskConfig.noise:
             gains = self.gains  # others were tuned with more noise
         policy = load_policy(path, machine)
+        machine = with_plant(machine, self.plant, ["analytic", "net"])
+        net = policy.net if self.plant == "net" else None
         inputs = (self.commands, self.starts, self.num_starts, self.seed)
-        driven, starts = sequences.goals_and_starts(machine, *inputs)
+        commands, starts = sequences.goals_and_starts(machine, *inputs)
         print(f"gains of the baselines: {gains or 'tuned now'}", file=sys.stderr)
-        controllers = self._controllers(machine, policy, gains)
+        controllers = self._controllers(machine, policy, gains, net)
         if self.perfect_model:
             controllers |= perfect_model.perfect_models(machine, starts)
-        net = policy.net if self.plant == "net" else None
         config = TaskConfig(noise=self.noise)
         runs, _ = metrics.evaluate(
-            machine, controllers, driven, starts, self.seed, net, config=config
+            machine, controllers, commands, starts, self.seed, net, config=config
         )
         if self.json:
             meta = metrics.metadata(machine, self.seed)
             meta |= {"policy": str(path), "gains": str(gains or "tuned now"), "plant": self.plant}
-            meta["commands"] = str(self.commands or ", ".join(one.name for one in driven))
+            meta["commands"] = str(self.commands or ", ".join(one.name for one in commands))
             meta |= {"starts": str(self.starts or self.num_starts), "noise": self.noise}
             write_json(self.json, {"meta": meta, "runs": runs})
-        print_table(runs, len(driven))
+        print_table(runs, len(commands))
         if self.all:
-            print_means(runs, len(driven))
+            print_means(runs, len(commands))
 
     def _controllers(
-        self, machine: Machine, policy: Policy, gains: Path | None
+        self, machine: Machine, policy: Policy, gains: Path | None, net: ActuatorNet | None
     ) -> dict[str, Controller]:
         controllers: dict[str, Controller] = {"rl": PolicyController(machine, policy)}
         for name, file in POLICIES.items():
@@ -299,7 +317,7 @@ class Evaluate(Command):
             return controllers | baselines.read_gains(gains, machine, policy.net)
         budget = (baselines.TUNING_RUNS, baselines.GENERATIONS, self.seed)
         config = TaskConfig(noise=self.noise)
-        tuned, _ = baselines.tune_baselines(machine, policy.net, *budget, config)
+        tuned, _ = baselines.tune_baselines(machine, policy.net, *budget, config, net)
         return controllers | tuned
 
 

@@ -2,18 +2,20 @@
 
 import os
 import runpy
-from collections.abc import Mapping
-from dataclasses import dataclass, is_dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
 import tyro
 
 from brokk_min.identification.files import SHIPPED, brief, names_in, open_regular
+from brokk_min.identification.plants import CheckedPlant, Plant
 from brokk_min.machine import BROKK_170, Machine
 
 MACHINES = {BROKK_170.name: BROKK_170}
 MachineName = Annotated[str, tyro.conf.arg(metavar="{" + ",".join(MACHINES) + "}|FILE.py:NAME")]
+PlantName = Annotated[str, tyro.conf.arg(metavar="{analytic,net}|FILE.py:NAME")]
 
 
 class WrongUse(ValueError):
@@ -114,21 +116,38 @@ def check_output(path: Path, names: set[str], kind: str, force: bool) -> None:
         raise WrongUse(f"{path}: {expected}, got another: {got}")
 
 
-def find_machine(name: str) -> Machine:
-    """A machine by its name, or `FILE.py:NAME`: that file is run, as `python FILE.py` would."""
-    if name in MACHINES:
-        return MACHINES[name]
+def find_object(option: str, name: str, known: Mapping[str, Any], kind: type, what: str) -> Any:
+    """A known object by its name, or `FILE.py:NAME`: that file is run, as `python FILE.py` would.
+
+    WrongUse: `option` names no file, or one without a NAME that is `what`, an object of a `kind`.
+    """
+    if name in known:
+        return known[name]
     path, _, symbol = name.rpartition(":")
     if not path.endswith(".py"):
-        raise WrongUse(f"--machine: expected one of {list(MACHINES)} or FILE.py:NAME, got {name}")
+        raise WrongUse(f"{option}: expected one of {list(known)} or FILE.py:NAME, got {name}")
     try:
         with open_regular(Path(path), 2**20):
-            machine = runpy.run_path(path).get(symbol)
+            found = runpy.run_path(path).get(symbol)
     except (Exception, SystemExit) as error:  # whatever the file does
-        raise ValueError(f"--machine: expected {path} to run, got {brief(error)}") from error
-    if not isinstance(machine, Machine):
-        raise WrongUse(f"--machine: expected a Machine {symbol} in {path}, got {brief(machine)}")
+        raise ValueError(f"{option}: expected {path} to run, got {brief(error)}") from error
+    if not isinstance(found, kind) or isinstance(found, type):
+        raise WrongUse(f"{option}: expected {what} {symbol} in {path}, got {brief(found)}")
+    return found
+
+
+def find_machine(name: str) -> Machine:
+    """A machine by its name, or of a file, see `find_object`."""
+    machine: Machine = find_object("--machine", name, MACHINES, Machine, "a Machine")
     return machine
+
+
+def with_plant(machine: Machine, name: str, known: Sequence[str]) -> Machine:
+    """The machine with the plant of a file, see `find_object`, or as it is for a `known` name."""
+    if name in known:
+        return machine
+    own = find_object("--plant", name, dict.fromkeys(known), Plant, "an object with reset and step")
+    return replace(machine, plant=CheckedPlant(name.rpartition(":")[2], own))
 
 
 def default_policy(

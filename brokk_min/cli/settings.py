@@ -27,8 +27,12 @@ def make_config(kind: Callable[..., T], options: dict[str, Any]) -> T:
         raise WrongUse(f"--{name.replace('_', '-')}: {text}") from error
 
 
+@dataclass(frozen=True)
 class FitSettings(FitConfig):
     """How the nets are fitted."""
+
+    history: int | None = None  # type: ignore[assignment]
+    """Samples of angle, velocity and command (paper: 13); by default the machine's."""
 
     def __post_init__(self) -> None:
         """Leave the check to `make_config`."""

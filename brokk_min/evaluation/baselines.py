@@ -128,17 +128,18 @@ def tune_baselines(
     generations: int,
     seed: int,
     config: TaskConfig | None = None,
+    plant: ActuatorNet | None = None,
 ) -> tuple[dict[str, JacobianController], dict[str, dict[str, Any]]]:
     """The baselines, each tuned on the machine itself with `tuning_cost`; and a record for JSON.
 
-    Tuning on the machine favours the baselines: the policy is trained on nets alone. Each is tuned
-    twice, with `seed` and the next: "cost" and "second_cost" agree if the search has converged;
-    the better gains are kept. The least of many noisy costs is too good, so "cost_anew" is the mean
-    of 16 more of these. `config` has the noise.
+    Tuning on the machine (or the nets `plant`) favours the baselines: the policy is
+    trained on nets alone. Each is tuned twice, with `seed` and the next: "cost" and "second_cost"
+    agree if the search has converged; the better gains are kept. The least of many noisy costs is
+    too good, so "cost_anew" is the mean of 16 more of these. `config` has the noise.
     """
     start, goals = tuning_set(machine, runs, seed)
     config = config or TaskConfig()
-    cost = partial(tuning_cost, start=start, goals=goals, seed=seed, config=config)
+    cost = partial(tuning_cost, start=start, goals=goals, seed=seed, config=config, plant=plant)
     tuned = {}
     record = {}
     for name, controller in baselines(machine, net).items():
@@ -157,11 +158,17 @@ def tune_baselines(
 
 
 def tuning_cost(
-    controller: JacobianController, start: Array, goals: Array, seed: int, config: TaskConfig
+    controller: JacobianController,
+    start: Array,
+    goals: Array,
+    seed: int,
+    config: TaskConfig,
+    plant: ActuatorNet | None = None,
 ) -> Array:
     """Mean |v_goal - v_tool| [m/s] of each candidate, one row of the controller's gains: (rows,).
 
-    `start` [rad] (runs, n) and `goals` [m/s] (T, runs, 3) are of `tuning_set`.
+    `start` [rad] (runs, n) and `goals` [m/s] (T, runs, 3) are of `tuning_set`. The nets `plant`
+    move the machine, or the plant (None).
     """
     vectors = gains_vector(controller.gains)
     runs = len(start)
@@ -170,7 +177,7 @@ def tuning_cost(
     start = np.tile(start, (candidates, 1))
     goals = np.tile(goals, (1, candidates, 1))
     rng = np.random.default_rng(seed)
-    trace = rollout(controller.machine, batch, start, goals, config, rng)
+    trace = rollout(controller.machine, batch, start, goals, config, rng, plant)
     error = np.linalg.norm(goals - trace.v_tool, axis=-1)  # (T, candidates * runs)
     return np.asarray(error.mean(axis=0).reshape(candidates, runs).mean(axis=1))
 

@@ -28,6 +28,13 @@ REST_SEED = 2026  # of the scored rests; nothing else draws from it
 SECONDS = 26.0  # of a scored sequence, assumed
 SHORTEST_REST, LONGEST_REST = 0.5, 10.0  # s, assumed
 RESTS = (0.5, 1.0, 2.0, 2.5, 4.0, 5.0, 10.0)  # s, of `rest_sequences`, assumed
+TRIES = 8  # draws after which a kind of starts without any pose is given up, assumed
+CRITERIA = (  # of `first_failure`, all margins assumed
+    "the tool must stay within 20 mm of its path",
+    "the arm must stay 0.1 m above Machine.ground",
+    "a driven joint must stay 0.05 from its q_min and q_max",
+    "a driven joint must stay below 0.9 of its q_dot_up and q_dot_down",
+)
 # Rows of seconds and velocity in fractions of tool_speed (assumed).
 # On one axis, as in the paper, with changes of direction:
 AXIS = ((1, 0), (4, 2 / 3), (1, 0), (4, -2 / 3), (1, 0), (3, 1 / 3), (3, -1 / 3), (1, 0))
@@ -250,53 +257,75 @@ def draw_starts(
     """Random poses [rad] (num, n): of four, two "workspace", one "limits", one "extended".
 
     All sequences are `feasible` from the first kind, at least half of them from the second.
-    Where a machine has no poses of a kind, "workspace" ones replace them. Paper: Fig. 6a
-    ValueError: too few poses in 200 draws.
+    Where a machine has no poses of a kind in 8 draws, "workspace" ones replace them. Paper: Fig. 6a
+    ValueError: too few poses in 200 draws, or none in 8, with the criterion that most of them fail.
     """
     order = [("workspace", "limits", "workspace", "extended")[i % 4] for i in range(num)]
     kept: dict[str, list[Array]] = {kind: [] for kind in KINDS}
+    failures = np.zeros(len(CRITERIA), int)
     with tqdm(total=num, desc="draw starts", unit="start", disable=None) as bar:
-        for _ in range(200):
+        for draw in range(200):
             poses = draw_pose(machine, TaskConfig(), rng, 4000).round(4)
-            for kind, poses_of_kind in _select(machine, poses, sequences).items():
+            for kind, poses_of_kind in _select(machine, poses, sequences, failures).items():
                 kept[kind] += list(poses_of_kind)
-            complete = sum(min(len(kept[kind]), order.count(kind)) for kind in KINDS)
-            bar.update(complete - bar.n)
-            if complete == num:
+            if draw == TRIES - 1:  # a kind without poses until now has none
+                order = [kind if kept[kind] else "workspace" for kind in order]
+            missing = [kind for kind in KINDS if len(kept[kind]) < order.count(kind)]
+            bar.update(sum(min(len(kept[kind]), order.count(kind)) for kind in KINDS) - bar.n)
+            if not missing or (draw == TRIES - 1 and not kept["workspace"]):
                 break
-    starts = []
-    for kind in order:
-        available = kept[kind] or kept["workspace"]
-        if not available:
-            expected = f"expected {num} poses from which all sequences are feasible"
-            raise ValueError(f"{machine.name}: {expected}, got fewer in 200 draws")
-        starts.append(available.pop(0))
-    return np.array(starts)
+    if missing:
+        got = f"got {len(kept[missing[0]])} {missing[0]} ones in {draw + 1} draws"
+        expected = f"expected {num} poses from which all sequences are feasible"
+        raise ValueError(f"{machine.name}: {expected}, {got}; {most_frequent(failures)}")
+    return np.array([kept[kind].pop(0) for kind in order])
 
 
-def _select(machine: Machine, poses: Array, sequences: Sequence[Commands]) -> dict[str, Array]:
-    """Poses (num, n) that may be starts, by kind."""
+def count_failures(failure: NDArray[np.int64]) -> NDArray[np.int64]:
+    """How often each of `CRITERIA` is the first that failed; `failure` is of `first_failure`."""
+    return np.asarray(np.bincount(failure, minlength=len(CRITERIA) + 1)[1:])
+
+
+def most_frequent(failures: NDArray[np.int64]) -> str:
+    """The criterion that failed most often, by the counts of `count_failures`."""
+    first = failures.argmax()
+    return f"{failures[first]} of {failures.sum()} others fail: {CRITERIA[first]}"
+
+
+def _select(
+    machine: Machine, poses: Array, sequences: Sequence[Commands], failures: NDArray[np.int64]
+) -> dict[str, Array]:
+    """Poses (num, n) that may be starts, by kind; adds to the counts of `first_failure`."""
     kinds = np.array(start_kinds(machine, poses))
     workspace = poses[kinds == "workspace"][:1500]
     limits = poses[kinds == "limits"][:30]
     feasible_sequences = np.zeros(len(limits))
     for sequence in sequences:
-        workspace = workspace[feasible(machine, workspace, sequence.for_starts(machine, workspace))]
+        failure = first_failure(machine, workspace, sequence.for_starts(machine, workspace))
+        failures += count_failures(failure)
+        workspace = workspace[failure == 0]
         feasible_sequences += feasible(machine, limits, sequence.for_starts(machine, limits))
     limits = limits[feasible_sequences >= 0.5 * len(sequences)]
     return {"workspace": workspace, "limits": limits, "extended": poses[kinds == "extended"]}
 
 
 def feasible(machine: Machine, start: Array, goals: Array) -> NDArray[np.bool_]:
-    """Can ideal actuators follow `goals` (T, num, 3) from `start` (num, n)? Shape (num,).
+    """Can ideal actuators follow `goals` (T, num, 3) from `start` (num, n)? Shape (num,)."""
+    return np.asarray(first_failure(machine, start, goals) == 0)
 
-    Integrates resolved velocities with little damping. The tool must stay within 20 mm of its
-    path (no singularity is crossed) and the arm 0.1 m above the ground (margins assumed).
+
+def first_failure(machine: Machine, start: Array, goals: Array) -> NDArray[np.int64]:
+    """1 + the index in `CRITERIA` of what fails first on the path of `goals`, 0: nothing, (num,).
+
+    Integrates resolved velocities with little damping from `start` (num, n) under `goals`
+    (T, num, 3). The first criterion holds where no singularity is crossed.
     """
     q = np.array(start, float)
     q_dot = np.zeros_like(q)
     p_goal = tool_position(forward_kinematics(machine, q))
-    result = np.ones(len(q), bool)
+    result = np.zeros(len(q), np.int64)
+    low, high = machine.column("q_min") + 0.05, machine.column("q_max") - 0.05
+    up, down = machine.column("q_dot_up"), machine.column("q_dot_down")
     for v_goal in goals:
         frames = forward_kinematics(machine, q)
         p = tool_position(frames)
@@ -304,22 +333,19 @@ def feasible(machine: Machine, start: Array, goals: Array) -> NDArray[np.bool_]:
         W = classic.limit_weights(machine, q, q_dot)[:, machine.driven]
         J_inv = classic.dls(J, W, np.full(len(q), 1e-4))
         v = v_goal + (p_goal - p)  # the second term brings the tool back to its path in 1 s
+        on_path = np.linalg.norm(p_goal - p, axis=-1) < 0.02
+        above_ground = lowest_point(frames) > machine.ground + 0.1
         q_dot = np.zeros_like(q)
         q_dot[:, machine.driven] = (J_inv @ v[..., None])[..., 0]
         q = q + q_dot * machine.dt
         p_goal = p_goal + v_goal * machine.dt
-        on_path = np.linalg.norm(p_goal - p, axis=-1) < 0.02
-        above_ground = lowest_point(frames) > machine.ground + 0.1
-        result &= on_path & above_ground & _within_limits(machine, q, q_dot)
+        within = ((q > low) & (q < high))[:, machine.driven].all(axis=-1)
+        slow = ((q_dot > -0.9 * down) & (q_dot < 0.9 * up)).all(axis=-1)
+        holds = np.stack([on_path, above_ground, within, slow])
+        result = np.where((result == 0) & ~holds.all(axis=0), 1 + holds.argmin(axis=0), result)
+        if result.all():
+            break
     return result
-
-
-def _within_limits(machine: Machine, q: Array, q_dot: Array) -> NDArray[np.bool_]:
-    """Are driven joints 0.05 rad off their limits, below 0.9 of `speed_limits` (assumed)? (num,)"""
-    low, high = machine.column("q_min") + 0.05, machine.column("q_max") - 0.05
-    down, up = speed_limits(machine, q)
-    within = (q > low) & (q < high) & (q_dot > 0.9 * down) & (q_dot < 0.9 * up)
-    return np.asarray(within[:, machine.driven].all(axis=-1))
 
 
 def speed_limits(machine: Machine, q: ArrayLike) -> tuple[Array, Array]:
@@ -338,7 +364,7 @@ def tuning_set(machine: Machine, num: int, seed: int, seconds: float = 20.0) -> 
     """`feasible` starts [rad] (num, n) and goals [m/s] (T, num, 3) for tuning the baselines.
 
     `learning.episodes.reset` draws them, as for the policy; but half of the time the tool rests,
-    and rests are as long as scored ones. ValueError: too few in 60 draws.
+    and rests are as long as scored ones. ValueError: too few in 60 draws, or none in 8.
     """
     rng = np.random.default_rng(seed + 1000)
     config = TaskConfig(zero_goals=0.3)
@@ -346,16 +372,21 @@ def tuning_set(machine: Machine, num: int, seed: int, seconds: float = 20.0) -> 
     tick = np.arange(round(seconds * machine.rate))[:, None]
     starts = np.empty((0, machine.n))
     goals = np.empty((len(tick), 0, 3), np.float32)
-    for _ in range(60):
+    failures = np.zeros(len(CRITERIA), int)
+    for draw in range(60):
         drawn = reset(machine, config, rng, 200 * holds, plant=False)
         rests = np.rint(_log_uniform(rng, 200 * holds) * machine.rate).astype(int)
         ticks = np.where(drawn.v_goal.any(axis=-1), drawn.goal_ticks, rests)
         first = np.concatenate([[0], np.cumsum(ticks)])[:-1:holds]  # tick of each run
         v_goal = np.repeat(drawn.v_goal, ticks, axis=0)[first + tick]  # (T, 200, 3)
         q = drawn.q[::holds]
-        good = feasible(machine, q, v_goal)
-        starts = np.concatenate([starts, q[good]])
-        goals = np.concatenate([goals, v_goal[:, good]], axis=1)
+        failure = first_failure(machine, q, v_goal)
+        failures += count_failures(failure)
+        starts = np.concatenate([starts, q[failure == 0]])
+        goals = np.concatenate([goals, v_goal[:, failure == 0]], axis=1)
         if len(starts) >= num:
             return starts[:num], goals[:, :num]
-    raise ValueError(f"{machine.name}: expected {num} feasible runs to tune on, got {len(starts)}")
+        if draw == TRIES - 1 and not len(starts):
+            break
+    expected = f"expected {num} feasible runs to tune on, got {len(starts)}"
+    raise ValueError(f"{machine.name}: {expected}; {most_frequent(failures)}")

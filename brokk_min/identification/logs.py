@@ -25,7 +25,9 @@ from brokk_min.identification.formats import LOG, check_columns
 from brokk_min.machine import Array, Machine, estimate_velocity
 
 RATE = 20.0  # Hz, paper: everything runs at 20 Hz; other machines have others
-MAX_GAP = 0.25  # s, assumed: a longer gap between time stamps starts a new recording
+MAX_GAP = 0.25  # s, or 2.5 samples, assumed: a longer gap starts a new recording
+COMMANDED = 0.02  # of full command, assumed: more than a stick at rest gives
+MOVED = 0.01  # rad, assumed: more than a parked joint creeps
 RETURN = "_return"
 Columns = Mapping[str, Any]
 
@@ -74,13 +76,8 @@ class Samples(NamedTuple):
 
     joined: Recording
     target: Array  # (N, n) rad/s, output of the nets, see `join_recordings`
-    moves: NDArray[np.bool_]  # (N, n): the joint moves or has a command in this recording
+    moves: NDArray[np.bool_]  # (N, n): the joint is `driven` in this recording
     lengths: list[int]  # of the recordings
-
-    @property
-    def scored(self) -> NDArray[np.bool_]:
-        """Where a joint is scored (N, n): where it moves; if it never moves, everywhere."""
-        return self.moves | ~self.moves.any(axis=0)
 
     def starts(self, before: int, after: int, step: int) -> NDArray[np.intp]:
         """Every `step`-th sample with `before` and `after` samples around it in its recording."""
@@ -97,6 +94,12 @@ class Samples(NamedTuple):
         return [ends[moves] for moves in self.moves[ends].T]
 
 
+def driven(recording: Recording) -> NDArray[np.bool_]:
+    """Which joints have a command or move in a recording (n,); a parked one may creep a little."""
+    commanded = np.ptp(recording.u, axis=0) > COMMANDED
+    return np.asarray(commanded | (np.ptp(recording.q, axis=0) > MOVED))
+
+
 def join_recordings(log: Log) -> Samples:
     """Join the recordings of a log and add the target velocity of each sample.
 
@@ -110,7 +113,7 @@ def join_recordings(log: Log) -> Samples:
     if log.velocity_logged:
         target = np.roll(q_dot, -1, axis=0)
     lengths = [len(recording.q) for recording in log.recordings]
-    moves = [np.ptp(r.u, axis=0) + np.ptp(r.q, axis=0) > 0 for r in log.recordings]
+    moves = [driven(recording) for recording in log.recordings]
     return Samples(Recording("", u, q, q_dot), target, np.repeat(moves, lengths, axis=0), lengths)
 
 
@@ -144,7 +147,8 @@ def read_log(
 ) -> Log:
     """Read and check tables of one machine and resample them at `rate` [Hz].
 
-    The command is held, the angle interpolated. A gap longer than `MAX_GAP` cuts a recording.
+    The command is held, the angle interpolated. A gap longer than `MAX_GAP` and 2.5 samples cuts a
+    recording.
     Without q_dot columns velocities are estimated: a recording starts at rest; after a gap, the
     rows that would need samples of the gap are left out.
 
@@ -212,6 +216,7 @@ def _recordings(
             for kind in kinds:
                 numbers = [np.asarray(table[kind + joint])[piece] for joint in joints]
                 columns[kind] = np.stack(numbers, axis=1, dtype=float)
+            _check_turns(path, joints, piece, columns["q_"])
             u, q, q_dot = _resample(time[piece], columns, samples, rate)
             first = samples - 1 if part and not logged else 0  # rows before it need the gap
             if len(u) > first:
@@ -241,10 +246,19 @@ def _gaps(
     """Where to cut a recording; ValueError: time stamps that rise too slowly."""
     step = np.diff(time)
     if len(step) and np.median(step) > 1.05 / rate:
-        expected = f"expected {rate:g} Hz or more in run {brief(run)}"
+        expected = f"expected {rate:g} Hz, the machine's rate (--machine), or more in {brief(run)}"
         got = f"got {1 / np.median(step):.3g} Hz"
         raise ValueError(f"{path}: row {rows[0] + 2}, column time: {expected}, {got}")
-    return np.flatnonzero(step > MAX_GAP) + 1
+    return np.flatnonzero(step > max(MAX_GAP, 2.5 / rate)) + 1
+
+
+def _check_turns(path: Path, joints: Sequence[str], rows: NDArray[np.intp], q: Floats) -> None:
+    """ValueError: an angle that starts again after a turn, as from pi to -pi."""
+    jumps = np.argwhere(np.abs(np.diff(q, axis=0)) > 1.5 * np.pi)
+    for at, joint in jumps[:1]:
+        place = f"{path}: row {rows[at + 1] + 2}, column q_{joints[joint]}"
+        expected = "expected an angle that does not start again after a turn (numpy.unwrap)"
+        raise ValueError(f"{place}: {expected}, got {q[at + 1, joint]:g} after {q[at, joint]:g}")
 
 
 def _resample(

@@ -22,7 +22,7 @@ from brokk_min.actuator import (
     plant_reset,
     plant_step,
 )
-from brokk_min.identification.logs import Log, Recording, Samples, join_recordings
+from brokk_min.identification.logs import Log, Recording, Samples, driven, join_recordings
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
 
@@ -138,7 +138,7 @@ def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
             break
         q_error, v_error = run_errors(net, samples, starts, ticks)
         for j, name in enumerate(log.joints):
-            scored = samples.scored[starts, j]
+            scored = samples.moves[starts, j]
             if scored.any():
                 result[name]["free_run"][str(horizon)] = {
                     "velocity_rmse": _rms(v_error[:, scored, j]),
@@ -158,7 +158,7 @@ def _one_step_scores(net: ActuatorNet, samples: Samples) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for j, name in enumerate(net.joints):
         result[name] = {"free_run": {}}
-        scored = samples.scored[starts, j]
+        scored = samples.moves[starts, j]
         if scored.any():
             result[name]["one_step_rmse"] = _rms(error[scored, j])
             result[name]["persistence_rmse"] = _rms(persistence[scored, j])
@@ -174,7 +174,7 @@ def recording_errors(net: ActuatorNet, log: Log, seconds: float) -> Array:
 
     nan: a joint that rests in this recording but not in all, or `history` + 1 samples or fewer.
     """
-    moves = np.array([np.ptp(r.u, axis=0) + np.ptp(r.q, axis=0) > 0 for r in log.recordings])
+    moves = np.array([driven(recording) for recording in log.recordings])
     scored = moves | ~moves.any(axis=0)
     result = np.full(moves.shape, np.nan)
     for i, recording in enumerate(log.recordings):

@@ -241,7 +241,10 @@ def test_draw_starts__replaces_a_kind_without_poses_by_workspace(monkeypatch):
 def test_draw_starts__refuses_a_machine_that_can_follow_nothing(monkeypatch):
     monkeypatch.setattr(s, "draw_pose", lambda *_: np.tile(START, (3, 1)))  # faster
     sequences = [s.Commands("fast", np.full((2, 3), 9.0))]
-    message = "^brokk170: expected 2 poses from which all .* feasible, got fewer in 200 draws$"
+    message = (
+        "^brokk170: expected 2 poses .* are feasible, got 0 workspace ones in 8 draws; "
+        "24 of 24 others fail: a driven joint must stay below 0.9 of its q_dot_up and q_dot_down$"
+    )
     with pytest.raises(ValueError, match=message):
         s.draw_starts(BROKK_170, sequences, 2, np.random.default_rng(0))
 
@@ -300,12 +303,34 @@ def test_feasible__keeps_a_margin_to_the_ground():
 @pytest.mark.parametrize("direction", [-1, 1])
 def test_feasible__keeps_a_margin_to_the_speed_limits(direction):
     start = np.array([0.0, *START[1:]])
-    limit = s.speed_limits(BROKK_170, start)[0 if direction < 0 else 1][0]
+    limit = -0.20 if direction < 0 else 0.20  # of q1 [rad/s]
     radius = np.hypot(*tool_position(forward_kinematics(BROKK_170, start))[:2])
     machine = replace(BROKK_170, rate=100.0)
     for fraction, expected in ((0.89, True), (0.91, False)):
         slewing = np.tile([0.0, fraction * limit * radius, 0.0], (2, 1, 1))
         assert feasible(start, slewing, machine) == expected
+
+
+@pytest.mark.parametrize("rate", [5.0, 10.0, 20.0])
+def test_feasible__compares_tool_and_path_at_the_same_tick(rate):
+    """At 10 Hz and 0.3 m/s the path of the next tick is 30 mm ahead."""
+    machine = replace(BROKK_170, rate=rate)
+    sideways = np.tile([0.0, 0.3, 0.0], (3, 1, 1))
+    assert feasible(np.array([0.0, *START[1:]]), sideways, machine)
+
+
+def test_first_failure__names_the_criterion():
+    start = np.array([[0.0, *START[1:]]])
+    lowest = float(lowest_point(forward_kinematics(BROKK_170, start))[0])
+    fast = np.tile([0.0, 2.0, 0.0], (2, 1, 1))
+    at_end = np.array([[0.0, *START[1:3], 2.88, START[4]]])
+    found = [
+        s.first_failure(BROKK_170, start, STILL),
+        s.first_failure(replace(BROKK_170, ground=lowest), start, STILL),
+        s.first_failure(BROKK_170, at_end, STILL),
+        s.first_failure(BROKK_170, start, fast),
+    ]
+    assert np.concatenate(found).tolist() == [0, 2, 3, 4]
 
 
 @given(machines(), st.data())
@@ -361,5 +386,6 @@ def test_tuning_set__is_apart_from_the_evaluation():
 
 def test_tuning_set__refuses_a_machine_that_can_follow_nothing():
     machine = replace(BROKK_170, ground=0.9)  # most arms are too low
-    with pytest.raises(ValueError, match=r"brokk170: expected 99999 feasible runs to tune on, got"):
+    message = r"brokk170: expected 99999 feasible runs to tune on, got \d+; .* above Machine.ground"
+    with pytest.raises(ValueError, match=message):
         s.tuning_set(machine, 99999, 0, 0.1)

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from brokk_min.identification.logs import (
     Log,
     Recording,
+    driven,
     join_recordings,
     read_log,
     velocity_of,
@@ -62,7 +63,7 @@ def some_log(velocity_logged, lengths=(30, 1, 7)):
     rng = np.random.default_rng(5)
     recordings = []
     for i, length in enumerate(lengths):
-        u, q, q_dot = rng.integers(-80, 81, (length, 3)) / 127, *rng.uniform(-3, 3, (2, length, 3))
+        u, q, q_dot = rng.integers(-80, 81, (length, 3)) / 127, *rng.uniform(-2, 2, (2, length, 3))
         recordings.append(Recording(f"run {i}", u, q, q_dot))
     return Log(("boom", "stick", "q_dot_like"), tuple(recordings), velocity_logged)
 
@@ -147,7 +148,7 @@ def test_read_log__has_the_requested_rate_and_refuses_slower_logs(tmp_path, rate
     again = read_log([tmp_path / "again.csv"], 4, rate=rate)
     assert again.rate == log.rate == rate
     np.testing.assert_allclose(again.recordings[0].q, log.recordings[0].q, atol=1e-6)
-    with pytest.raises(ValueError, match="expected 200 Hz or more in run 'a', got 100 Hz"):
+    with pytest.raises(ValueError, match=r"expected 200 Hz, .*--machine.*more in 'a', got 100 Hz"):
         read_log([tmp_path / "log.csv"], 4, rate=200.0)
 
 
@@ -286,13 +287,12 @@ def test_read_log__refuses_an_angle_without_a_command_unless_joints_are_given(tm
 # --- joined recordings ----------------------------------------------------------------------------
 
 
-def test_join_recordings__marks_recordings_in_which_a_joint_moves_or_has_a_command():
+def test_join_recordings__marks_recordings_in_which_a_joint_is_driven():
     still, ramp = np.zeros(6), np.arange(6) / 10
     u, q = np.stack([still, still, ramp], 1), np.stack([ramp, still, still], 1)
     recordings = (Recording("angle too", u, q, q), Recording("command alone", u, 0 * q, q))
     samples = join_recordings(Log(("a", "b", "c"), recordings))
     assert samples.moves.tolist() == [[True, False, True]] * 6 + [[False, False, True]] * 6
-    assert samples.scored.tolist() == [[True, True, True]] * 6 + [[False, True, True]] * 6
     assert [w.tolist() for w in samples.windows(3, 2)] == [[2, 3], [], [2, 3, 8, 9]]
     np.testing.assert_allclose(samples.target[:5, 0], 2.0)  # 0.1 rad in 0.05 s
 
@@ -329,7 +329,7 @@ BAD_CSV = {
     "wrong delimiter": (GOOD.replace(",", ";"), "row 1: expected columns u_<joint>"),
     "column twice": (GOOD.replace("q_a", "u_a", 1), "expected each column once, got ['u_a']"),
     "too slow": ("run,time,u_a,q_a\nslow,0,0,0\nslow,0.1,0,0\nslow,0.2,0,0\n",
-        "row 2, column time: expected 20 Hz or more in run 'slow', got 10 Hz"),
+        "expected 20 Hz, the machine's rate (--machine), or more in 'slow', got 10 Hz"),
     "half the velocities": ("run,time,u_a,u_b,q_a,q_b,q_dot_a\nx,0,0,0,0,0,0\n",
         "row 1: expected a column q_dot_b"),
     "no name": (GOOD.replace("x,0.10", " ,0.10"), "row 4, column run: expected text of 1 to 200"),
@@ -405,3 +405,27 @@ def test_read_log__refuses_a_missing_file_and_a_folder(tmp_path, suffix):
         with pytest.raises(ValueError, match="expected a readable") as caught:
             read_log([tmp_path / f"{name}{suffix}"], 4)
         assert str(tmp_path / f"{name}{suffix}") in str(caught.value)
+
+
+def test_driven__is_no_joint_that_creeps_a_count_under_a_stick_at_rest():
+    u, q = np.zeros((40, 3)), np.zeros((40, 3))
+    u[9:, 0], u[5, 1] = 0.5, 0.015  # held at a stop; the noise of a stick
+    q[20:, 1] = 2 * np.pi / 4096  # one count
+    q[20:, 2] = 0.02  # sags without a command
+    assert driven(Recording("x", u, q, q)).tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize("rate", [4.0, 8.0])
+def test_read_log__cuts_slow_logs_at_gaps_of_more_than_two_samples(tmp_path, rate):
+    time = np.delete(np.arange(40), [10, 20, 21, 22]) / rate
+    columns = table("x", time) | {"u_a": np.zeros(36), "q_a": np.zeros(36)}
+    log = read_log([write(tmp_path / "log.npz", columns)], 4, rate=rate)
+    assert [recording.name for recording in log.recordings] == ["x", "x#2"]
+
+
+def test_read_log__refuses_an_angle_that_wraps(tmp_path):
+    q = (np.arange(60) / 10 + np.pi) % (2 * np.pi) - np.pi
+    columns = table("x", np.arange(60) / 20) | {"q_a": q}
+    message = r"log.npz: row 34, column q_a: .* after a turn .*, got -3.08319 after 3.1$"
+    with pytest.raises(ValueError, match=message):
+        read_log([write(tmp_path / "log.npz", columns)], 4)

@@ -18,6 +18,7 @@ from hypothesis.extra import numpy as npst
 from strategies import machines, posed, reals
 
 from brokk_min import machine as machine_module
+from brokk_min.actuator import plant_reset, plant_step
 from brokk_min.machine import (
     BROKK_170,
     Joint,
@@ -70,15 +71,15 @@ BAD = [
     (with_joint(1, encoder_node=1), ["joints", "different encoder nodes", "[1, 1, 3, 4, 5]"]),
     (with_joint(4, cylinder_angle=1.2), ["q5.cylinder_angle", "(0, pi)", "1.200 to 3.200"]),
     (with_joint(4, cylinder_area=0.0), ["q5.cylinder_area", "got 0.0"]),
-    (with_joint(4, speed_positive=0.0), ["q5.speed_positive", "got 0.0"]),
+    (with_joint(4, speed_positive=-0.1), ["q5.speed_positive", "got -0.1"]),
     (with_joint(4, speed_negative=-0.08), ["q5.speed_negative", "got -0.08"]),
     (with_joint(4, q_dot_up=0.0), ["q5.q_dot_up", "got 0.0"]),
     (with_joint(4, q_dot_down=-1.0), ["q5.q_dot_down", "got -1.0"]),
     (with_joint(4, encoder_node=0), ["q5.encoder_node", "1 to 127", "got 0"]),
     (with_joint(4, encoder_node=128), ["q5.encoder_node", "1 to 127", "got 128"]),
     (with_joint(4, encoder_zero=0.5), ["q5.encoder_zero", "whole number", "got 0.5"]),
-    (with_joint(4, encoder_sign=0), ["q5.encoder_sign", "-1 or 1", "got 0"]),
-    (with_joint(4, encoder_sign=2), ["q5.encoder_sign", "-1 to 1", "got 2"]),
+    (with_joint(4, encoder_sign=0), ["q5.encoder_sign", "(-1, 1)", "got 0"]),
+    (with_joint(4, encoder_sign=2), ["q5.encoder_sign", "(-1, 1)", "got 2"]),
     ({"rate": 0.0}, ["rate", "got 0.0"]),
     ({"rate": -20.0}, ["rate", "got -20.0"]),
     ({"pwm_limit": 0}, ["pwm_limit", "1 to 127", "got 0"]),
@@ -152,8 +153,10 @@ def test_every_number__has_its_unit_in_the_class_and_its_source_beside_it():
     tables, numbers = source.split("# Joints of the Brokk 170.")[1].split("BROKK_170 = Machine(")
     assert {"[m]", "[rad]", "[m^2]", "[m/s]", "[rad/s]"} <= set(re.findall(r"\[\S+\]", tables))
     stated = re.findall(r"^    (\w+)=[^#\n]+# .+; (?:paper|assumed|tuned)", numbers, re.M)
-    without = {"name", "joints", "largest_dead_zone", "plant"}  # the last two have a default
-    assert set(stated) == {f.name for f in dataclasses.fields(Machine)} - without
+    fields = dataclasses.fields(Machine)
+    needed = {f.name for f in fields if f.default is dataclasses.MISSING}
+    assert set(stated) == needed - {"name", "joints"} | {"pump_flow", "q_start"}
+    assert "by default what is assumed of the Brokk" in source
 
 
 @pytest.mark.parametrize(
@@ -165,6 +168,25 @@ def test_every_number__has_its_unit_in_the_class_and_its_source_beside_it():
 )
 def test_units__of_well_known_numbers(field, unit):
     assert dict(numeric_fields())[field].metadata["unit"] == unit
+
+
+def test_a_machine_without_hydraulics__moves_as_fast_as_its_joints_say():
+    """All 17 numbers of the plant are optional; speeds come from q_dot_up and q_dot_down."""
+    fields = {f.name for f in dataclasses.fields(Joint) if f.default is dataclasses.MISSING}
+    joints = [Joint(**{name: getattr(j, name) for name in fields}) for j in BROKK_170.joints]
+    given = {f.name for f in dataclasses.fields(Machine) if f.default is dataclasses.MISSING}
+    machine = Machine(**{n: getattr(BROKK_170, n) for n in given} | {"joints": tuple(joints)})
+    for sign, q_dot in ((1, machine.column("q_dot_up")), (-1, -machine.column("q_dot_down"))):
+        start = machine.column("q_min" if sign > 0 else "q_max")
+        state, u = plant_reset(machine, start), np.full(5, sign * 80 / 127)
+        for _ in range(30):
+            last, state = state, plant_step(machine, state, u)
+        np.testing.assert_allclose((state.q - last.q) * machine.rate, q_dot, rtol=1e-3)
+
+
+def test_prismatic_joints__are_refused():
+    with pytest.raises(ValueError, match=r"q4.kind: expected one of .*, got 'prismatic'"):
+        dataclasses.replace(BROKK_170.joints[3], kind="prismatic")
 
 
 def test_the_brokk_has_the_numbers_of_the_paper_and_the_design():

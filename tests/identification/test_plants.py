@@ -1,0 +1,79 @@
+"""Plants of one's own: two functions, in the place of the analytic plant."""
+
+from __future__ import annotations
+
+import runpy
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers_cli import MINI, run
+
+from brokk_min import BROKK_170
+from brokk_min.actuator import plant_reset, plant_step
+from brokk_min.identification.plants import CheckedPlant, Plant
+
+OWN = str(Path(__file__).parents[2] / "examples" / "own_plant.py") + ":PLANT"
+
+
+class Obedient:
+    """A stateful one, as a machine on a bus is: joints turn at 0.2 u rad/s."""
+
+    def reset(self, machine, q):
+        self.q = q
+        return self
+
+    def step(self, machine, state, u):
+        self.q = self.q + 0.2 * machine.dt * u
+        return self
+
+
+def test_checked_plant__is_a_plant_as_any_object_of_two_functions():
+    plant = CheckedPlant("own", Obedient())
+    assert isinstance(plant, Plant) and not isinstance(BROKK_170, Plant)
+    machine = replace(BROKK_170, plant=plant)
+    state = plant_step(machine, plant_reset(machine, np.ones((2, 5))), np.full((2, 5), 0.5))
+    np.testing.assert_allclose(state.q, 1.005)
+
+
+@pytest.mark.parametrize(
+    ("answer", "got"),
+    [(lambda u: u[:, :2], r"array\("), (lambda u: u + np.nan, "nan"), (lambda u: 1 / 0, "zero")],
+)
+def test_checked_plant__refuses_what_is_no_state(answer, got):
+    own = SimpleNamespace(
+        reset=lambda machine, q: q, step=lambda machine, state, u: SimpleNamespace(q=answer(u))
+    )
+    plant = CheckedPlant("OWN", own)
+    with pytest.raises(ValueError, match=r"^OWN.reset: expected a state .* attribute 'q'"):
+        plant.reset(BROKK_170, np.zeros((4, 5)))
+    with pytest.raises(
+        ValueError, match=rf"^OWN.step: expected .*angles q .*\(4, 5\), got .*{got}"
+    ):
+        plant.step(BROKK_170, None, np.zeros((4, 5)))
+
+
+def test_commands__take_an_own_plant(tmp_path, capsys):
+    line = f"collect --machine '{MINI}' --hours 0.002 --out '{tmp_path}/log.csv' --plant"
+    assert run(line, OWN) == 0
+    assert len((tmp_path / "log.csv").read_text().splitlines()) > 4 * 0.002 * 3600 * 25
+    for plant, got in (
+        ("net", "--plant: expected one of ['analytic'] or FILE.py:NAME, got net"),
+        (OWN.replace("PLANT", "OwnPlant"), "expected an object with reset and step OwnPlant in"),
+        (OWN.replace("PLANT", "TAU"), "expected an object with reset and step TAU in"),
+    ):
+        assert run(line, plant) == 2
+        assert got in capsys.readouterr().err
+
+
+def test_example__differs_from_the_analytic_plant_by_joint_and_direction():
+    plant = runpy.run_path(OWN.split(":")[0])["PLANT"]
+    machine = SimpleNamespace(dt=0.04)
+    q = np.array([[0.0, -0.3, 1.5, 1.0]])
+    for u, moves in ((0.135, [1, 1, 0, 0]), (-0.135, [0, 0, 1, 1])):
+        state = plant.reset(machine, q)
+        for _ in range(25):
+            state = plant.step(machine, state, np.full((1, 4), u))
+        assert (np.abs(state.q - q)[0] > 1e-4).tolist() == [bool(move) for move in moves], u
