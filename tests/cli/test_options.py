@@ -112,7 +112,7 @@ def test_find_machine__runs_a_file(tmp_path):
     with pytest.raises(WrongUse, match=r"one of \['brokk170'\] or FILE.py:NAME, got digger$"):
         find_machine("digger")
     file.write_text("raise KeyError('no')")
-    with pytest.raises(ValueError, match=r"expected .*a:b.py to run, got KeyError: 'no'$"):
+    with pytest.raises(ValueError, match=r"expected .*a:b.py to run, got no entry 'no'$"):
         find_machine(f"{file}:MINE")
 
 

@@ -106,7 +106,7 @@ def test_run_seed__refuses_results_of_something_else(tmp_path):
     with pytest.raises(ValueError, match=r"seed_4\.json: settings.horizon: expected 8, got 4"):
         seed_job(tmp_path, config=other)(4)
     (tmp_path / "seed_4.json").write_text("{")
-    with pytest.raises(ValueError, match=r"seed_4\.json: expected the result of a seed, got JSOND"):
+    with pytest.raises(ValueError, match=r"seed_4\.json: expected the result of a seed, got Expect"):
         seed_job(tmp_path)(4)
 
 
@@ -182,7 +182,7 @@ def test_read_seeds__reads_what_a_sweep_wrote(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{", r"expected the sweep\.json of a sweep, got JSONDecodeError"),
+        ("{", r"expected the sweep\.json of a sweep, got Expecting"),
         ("[]", r"content: expected names \['meta', 'table'\], got \[\]"),
         ('{"meta": {"machine": "m"}}', "meta.actuator: expected text of 1 to 200 char.*, got none"),
     ],
