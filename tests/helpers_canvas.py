@@ -43,6 +43,11 @@ class Recorder(Canvas):
         super().circle(centre, radius, colour, width)
         self.circles.append(Shape(centre, colour, width, radius))
 
+    def bar(self, x0, x1, y, half, colour):
+        super().bar(x0, x1, y, half, colour)
+        corners = [[x0, y - half], [x1, y - half], [x1, y + half], [x0, y + half]]
+        self.polygons.append(Shape(np.array(corners), colour))
+
     def text(self, x, y, text, size, *more):
         super().text(x, y, text, size, *more)
         word, (left, upper) = self.texts[-1]

@@ -7,11 +7,10 @@ its gate; a window that is silent counts as a lost input device.
 import multiprocessing
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
-from threading import Event, Thread
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,19 +18,17 @@ import numpy as np
 from brokk_min.can.canopen import OperatorInput, used_ids
 from brokk_min.can.connection import lock_memory, open_bus
 from brokk_min.can.drive_log import Telemetry
-from brokk_min.can.simulated_machine import SimulatedMachine, serve, start_pose
 from brokk_min.env import Measured, action_to_pwm
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.hw import Drive
 from brokk_min.machine import PWM_MAX, Array, Machine
 
 SILENCE = 0.2  # s without a request, then the input device is lost (assumed)
-CHANNEL = "brokk_min play"  # of the virtual bus
 
 
 @dataclass(frozen=True)
 class BusOptions:
-    """The bus to drive on; without an interface, a simulated machine on a virtual bus."""
+    """The bus to drive on; without an interface, a simulated machine, see `lockstep`."""
 
     interface: str = ""
     channel: str = ""
@@ -51,15 +48,27 @@ class Request(NamedTuple):
 
 
 class WindowOperator:
-    """The operator of the loop: the newest request; a closed pipe stops the loop."""
+    """The operator of a loop in the window's process: the newest request."""
+
+    def __init__(self, machine: Machine) -> None:
+        none = np.zeros(len(machine.driven))
+        self.request = Request(-np.inf, 0, False, False, np.zeros(3), none)
+
+    def __call__(self, driving: bool, ready: bool) -> OperatorInput:
+        """The operator's input in this tick."""
+        x, y, z = self.request.v_goal.tolist()
+        return OperatorInput((x, y, z), self.request.enable, self.request.alive)
+
+
+class PipedOperator(WindowOperator):
+    """The operator at the other end of a pipe; a closed pipe stops the loop."""
 
     def __init__(
         self, machine: Machine, connection: Any, clock: Callable[[], float] = time.monotonic
     ) -> None:
+        super().__init__(machine)
         self.connection = connection
         self.clock = clock
-        none = np.zeros(len(machine.driven))
-        self.request = Request(-np.inf, 0, False, False, np.zeros(3), none)
 
     @property
     def silent(self) -> bool:
@@ -75,8 +84,7 @@ class WindowOperator:
             return OperatorInput(stop=True)
         if self.silent:
             return OperatorInput(alive=False)
-        x, y, z = self.request.v_goal.tolist()
-        return OperatorInput((x, y, z), self.request.enable, self.request.alive)
+        return super().__call__(driving, ready)
 
 
 class SelectedController:
@@ -108,17 +116,9 @@ class SelectedController:
 
 
 class WindowDrive(Drive):
-    """The 20 Hz loop, which sends telemetry to the window after each tick."""
+    """The 20 Hz loop, with telemetry for a window."""
 
     operator: WindowOperator
-
-    def tick(self) -> bool:
-        """One tick; a window that is silent gets nothing, because a full pipe would block."""
-        more = super().tick()
-        with self.catch_errors():
-            if more and not self.operator.silent:
-                self.operator.connection.send(self.telemetry())
-        return more
 
     def telemetry(self) -> Telemetry:
         """State after a tick."""
@@ -131,19 +131,31 @@ class WindowDrive(Drive):
         return Telemetry(self.ticks, q, q_dot, u, v_goal, *flags, mode, self.lateness)
 
 
+class PipedDrive(WindowDrive):
+    """The loop that sends its telemetry through a pipe after each tick."""
+
+    operator: PipedOperator
+
+    def tick(self) -> bool:
+        """One tick; a window that is silent gets nothing, because a full pipe would block."""
+        more = super().tick()
+        with self.catch_errors():
+            if more and not self.operator.silent:
+                self.operator.connection.send(self.telemetry())
+        return more
+
+
 def control(
     machine: Machine, controllers: Sequence[Controller], options: BusOptions, connection: Any
 ) -> None:
     """Drive until the window closes the pipe; errors go through it as text."""
-    simulated = nullcontext() if options.interface else simulated_machine(machine, options.start)
-    interface = options.interface or "virtual"
-    channel = options.channel or CHANNEL
     lock_memory()
+    where = (options.interface, options.channel, options.log, used_ids(machine))
     try:
-        with simulated, open_bus(interface, channel, options.log, used_ids(machine)) as bus:
-            operator = WindowOperator(machine, connection)
+        with open_bus(*where) as bus:
+            operator = PipedOperator(machine, connection)
             selected = SelectedController(machine, controllers, operator)
-            drive = WindowDrive(machine, selected, bus, operator)
+            drive = PipedDrive(machine, selected, bus, operator)
             drive.begin()
             connection.send(drive.telemetry())  # from now on the window sends requests
             drive.run()
@@ -151,22 +163,6 @@ def control(
         text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
         with suppress(OSError):
             connection.send(text)
-
-
-@contextmanager
-def simulated_machine(machine: Machine, start: tuple[float, ...]) -> Iterator[None]:
-    """A simulated machine on the virtual bus, in a thread."""
-    pose = start_pose(machine, start)
-    end = Event()
-    with open_bus("virtual", CHANNEL) as bus:
-        simulated = SimulatedMachine(machine, pose, bus.now())
-        thread = Thread(target=serve, args=(simulated, bus, lambda: not end.is_set()))
-        thread.start()
-        try:
-            yield
-        finally:
-            end.set()
-            thread.join()
 
 
 @contextmanager

@@ -13,14 +13,24 @@ from numpy.typing import NDArray
 
 from brokk_min.kinematics import forward_kinematics, jacobian, tool_position, tool_velocity
 from brokk_min.machine import PWM_MAX, Array, Machine
-from brokk_min.viewer.camera import ABOVE, Camera, cameras, close_up, extent, skeleton
+from brokk_min.viewer.camera import Camera, cameras, close_up, skeleton
+from brokk_min.viewer.shapes import (
+    BOOM,
+    BREAKER,
+    CHISEL,
+    contacts,
+    half_widths,
+    turret,
+    undercarriage,
+    unit,
+)
 from brokk_min.viewer.window import BACKGROUND, INK, Box, Canvas, Colour
 
 # all assumed
 NEAR_LIMIT = 0.05  # of a joint's range: nearer to its end is a warning
 NEAR_SINGULAR = 0.1  # of the arm's length [1/rad]: a smaller singular value is a warning
 ARROW = 0.2  # of a view's smaller side: an arrow of the machine's tool speed
-HEAD = 40.0  # px above the views
+HEAD = 48.0  # px above the views
 FOOT = 44.0  # px below a close-up
 
 NO_POINTS = np.zeros((0, 3))
@@ -48,6 +58,15 @@ TITLES = {
 }
 
 
+class Trace(NamedTuple):
+    """The run of another controller, laid over a scene."""
+
+    q: Array  # angles [rad] (n,)
+    trail: Array  # past tool positions [m] (T, 3)
+    colour: Colour
+    text: str
+
+
 class Scene(NamedTuple):
     """What a picture shows of one arm, base frame."""
 
@@ -64,6 +83,8 @@ class Scene(NamedTuple):
     colour: Colour = COLOURS["rl"]
     notes: Sequence[str] = ()
     in_view: Array = NO_POINTS  # points that the views show [m] (K, 3); none: the whole reach
+    banner: str = ""  # what keeps the machine from moving, in words
+    traces: Sequence[Trace] = ()  # other runs over this one
     close_up: Array = NO_POINTS  # these points [m] (K, 3) fill a view, instead of top view and rows
     headline: str = ""  # the one figure that decides
 
@@ -142,12 +163,14 @@ def _panel(canvas: Canvas, machine: Machine, scene: Scene, box: Box) -> None:
     canvas.text(left + width - 16, 21, scene.status, 14, scene.status_colour, 1.0)
     if np.isfinite(scene.q).all():
         _views(canvas, machine, scene, side, top)
-    else:
-        middle = side[1] + side[3] / 2
-        canvas.text(left + width / 2, middle, "no positions", 20, WARNING, 0.5)
+    if scene.banner:
+        size = int(np.clip(width / (0.62 * len(scene.banner)), 8, 14))
+        canvas.text(left + width / 2, HEAD - 6, scene.banner, size, WARNING, 0.5)
     if len(scene.close_up):
         canvas.text(left + width / 2, upper + height - FOOT / 2, scene.headline, 17, INK, 0.5)
     else:
+        x, y = side[0] + side[2] / 2, side[1] + side[3] - 34
+        canvas.text(x, y, scene.headline, 15, INK, 0.5)
         _joint_rows(canvas, machine, scene, rows)
     for i, note in enumerate(scene.notes):
         canvas.text(x_notes, y_notes + 18 * i, note, 12)
@@ -157,13 +180,18 @@ def _views(canvas: Canvas, machine: Machine, scene: Scene, side: Box, top: Box) 
     """The arm from both sides; goal and measured speed, warnings."""
     frames = forward_kinematics(machine, scene.q)
     p_tool = tool_position(frames)
+    touching = contacts(machine, scene.q)
     views = cameras(machine, p_tool, side, top, scene.in_view)
     if len(scene.close_up):
         views = [views[0], close_up(scene.close_up, top)]
     for camera in views:
         canvas.clip(camera.box)
         _backdrop(canvas, machine, camera)
-        _arm(canvas, machine, camera, scene)
+        _base(canvas, machine, camera, scene)
+        for trace in scene.traces[1:]:
+            other = scene._replace(q=trace.q, colour=trace.colour)
+            _arm(canvas, machine, camera, other, set(), fade=0.4)
+        _arm(canvas, machine, camera, scene, set().union(*touching.values()))
         _tool(canvas, machine, camera, scene)
     canvas.clip(None)
     legend = [
@@ -174,55 +202,86 @@ def _views(canvas: Canvas, machine: Machine, scene: Scene, side: Box, top: Box) 
     legend += [(f"{machine.names[i]} near its limit", WARNING) for i in warned]
     if near_singular(machine, scene.q):
         legend.append(("near a singularity", WARNING))
+    legend += [(text, WARNING) for text in touching]
+    legend += [(trace.text, trace.colour) for trace in scene.traces]
     for i, (text, ink) in enumerate(legend):
         canvas.text(side[0] + side[2] - 14, HEAD + 14 + 18 * i, text, 12, ink, 1.0)
 
 
 def _backdrop(canvas: Canvas, machine: Machine, camera: Camera) -> None:
-    """Grid of 1 m (or a power of ten that fits), the ground, and the name of the view."""
+    """The ground, a grid of 1 m (or a power of ten that fits) with its numbers, the axes' names."""
     left, upper, width, height = camera.box
     right = left + width
     lower = upper + height
     x0, y0 = camera.origin
     metres = next(m for m in 10.0 ** np.arange(-1, 20) if m * camera.scale > 12)
     step = camera.scale * metres
-    for x in x0 + step * np.arange(np.ceil((left - x0) / step), (right - x0) // step + 1):
-        canvas.line(np.array([[x, upper + 1], [x, lower]]), GRID)
-    for y in y0 + step * np.arange(np.ceil((upper - y0) / step), (lower - y0) // step + 1):
-        canvas.line(np.array([[left, y], [right, y]]), GRID)
-    ground = y0 - camera.scale * machine.ground
-    if camera.label == "side" and ground < lower:
-        soil = np.array([[left, ground], [right, ground], [right, lower], [left, lower]])
-        canvas.polygon(soil, SOIL)
-        canvas.line(soil[:2], STEEL, 2)
-    label = f"{camera.label} view, grid {metres:g} m"
-    canvas.text(left + 14, upper + 14, label, 11, MUTED)
+    ground = lower
+    if camera.label == "side" and y0 - camera.scale * machine.ground < lower:
+        ground = y0 - camera.scale * machine.ground
+        canvas.bar(left, right, (ground + lower) / 2, (lower - ground) / 2, SOIL)
+        foot = 0.25 * unit(machine) * camera.scale  # the machine stands at the height 0
+        canvas.bar(x0 - foot, x0 + foot, (y0 + ground) / 2, (ground - y0) / 2, SOIL)
+    columns = np.arange(np.ceil((left - x0) / step), (right - x0) // step + 1)
+    rows = np.arange(np.ceil((y0 - lower) / step), (y0 - upper) // step + 1)
+    every = np.ceil(34 / step)  # grid lines from one number to the next
+    sign = -1 if camera.label == "top" else 1
+    for k in columns:
+        x = x0 + step * k
+        canvas.bar(x, x + 1, (upper + ground) / 2, (ground - upper) / 2, GRID)
+        if k % every == 0 and left + 40 < x < right - 60:
+            canvas.text(x, lower - 9, f"{sign * k * metres + 0.0:g}", 10, MUTED, 0.5)
+    for k in rows:
+        y = y0 - step * k
+        if y < ground:
+            canvas.bar(left, right, y, 0.5, GRID)
+        if k % every == 0 and upper + 0.3 * height < y < lower - 40:
+            canvas.text(left + 6, y, f"{k * metres + 0.0:g}", 10, MUTED)
+    across, up = ("out", "z") if camera.label == "side" else ("y", "x")
+    canvas.text(right - 8, lower - 9, f"{across} [m]", 10, MUTED, 1.0)
+    canvas.text(left + 6, lower - 26, f"{up} [m]", 10, MUTED)
+    canvas.text(left + 14, upper + 14, f"{camera.label} view", 11, MUTED)
 
 
-def _arm(canvas: Canvas, machine: Machine, camera: Camera, scene: Scene) -> None:
-    """Links that taper towards the tool, joints at their frames; near a limit red and larger."""
+def _base(canvas: Canvas, machine: Machine, camera: Camera, scene: Scene) -> None:
+    """Tracks, outriggers, and the turret over them."""
+    parts = [(part, STEEL) for part in undercarriage(machine)]
+    for part, colour in [*parts, (turret(machine, scene.q), _pale(scene.colour, -0.3))]:
+        near, far = camera.project(part.near), camera.project(part.far)
+        for k in range(len(near)):
+            canvas.polygon(np.array([near[k - 1], near[k], far[k], far[k - 1]]), colour)
+        canvas.polygon(near, colour)
+        canvas.polygon(far, colour)
+
+
+def _arm(
+    canvas: Canvas,
+    machine: Machine,
+    camera: Camera,
+    scene: Scene,
+    touching: set[int],
+    fade: float = 0.0,
+) -> None:
+    """Links, the last one a breaker, and joints; red near a limit and where the arm touches."""
     corners = camera.project(skeleton(machine, scene.q))
     warned = near_limit(machine, scene.q)
-    _, _, reach = extent(machine)
-    thick = float(np.clip(0.032 * reach * camera.scale, 3.0, 30.0))
-    sizes = np.linspace(thick, 0.45 * thick, 2 * machine.n + 1)
-    sizes[-1] = 0.12 * thick
-    base = [[-2.0, -0.9], [2.0, -0.9], [2.3, 0.0], [-2.3, 0.0]]
-    if camera.axes is ABOVE:
-        base = [[-1.8, -2.4], [1.8, -2.4], [1.8, 2.4], [-1.8, 2.4]]
-    canvas.polygon(camera.origin + thick * np.array(base), STEEL)
-    for i in range(2 * machine.n):
-        start, end = corners[i : i + 2]
-        length = np.hypot(*(end - start))
-        if length > 0.5:
-            across = np.array([start[1] - end[1], end[0] - start[0]]) / length
-            first = across * sizes[i]
-            last = across * sizes[i + 1]
-            link = np.array([start + first, end + last, end - last, start - first])
-            canvas.polygon(link, scene.colour if i > 0 else STEEL)
-    for i in range(machine.n):
-        size = max(4.0, float(sizes[2 * i]))
-        radius, colour = (1.5, WARNING) if warned[i] else (1.1, _pale(scene.colour, 0.15))
+    sizes = np.maximum(half_widths(machine) * camera.scale, 1.5)
+    lengths = np.linalg.norm(np.diff(corners, axis=0), axis=-1)
+    links = [i for i in range(2, 2 * machine.n) if lengths[i] > 0.5]
+    for i in links:
+        colour = WARNING if i in touching else _pale(scene.colour, 0.2 * (i // 2 % 2) + fade)
+        along = (corners[i + 1] - corners[i]) / lengths[i]
+        across = along[::-1] * (-1, 1)
+        parts = [BREAKER, CHISEL] if i == 2 * machine.n - 1 else [BOOM]
+        for part, ink in zip(parts, (colour, STEEL)):
+            middle = corners[i] + lengths[i] * part[:, :1] * along
+            wide = sizes[i] * part[:, 1:] * across
+            outline = np.vstack([middle + wide, (middle - wide)[::-1]])
+            canvas.polygon(outline, ink)
+            canvas.line(np.vstack([outline, outline[:1]]), _pale(ink, -0.3))
+    for i in range(1, machine.n):
+        size = max(3.0, 0.6 * float(sizes[2 * i]))
+        radius, colour = (1.8, WARNING) if warned[i] else (1.0, _pale(scene.colour, -0.3))
         canvas.circle(corners[2 * i], radius * size, colour)
         canvas.circle(corners[2 * i], 0.5 * size, BACKGROUND)
 
@@ -233,6 +292,9 @@ def _tool(canvas: Canvas, machine: Machine, camera: Camera, scene: Scene) -> Non
         canvas.line(camera.project(scene.path), PATH, 3)
     if len(scene.trail) > 1:
         canvas.line(camera.project(scene.trail), _pale(scene.colour, 0.45), 2)
+    for trace in scene.traces:
+        if len(trace.trail) > 1:
+            canvas.line(camera.project(trace.trail), trace.colour, 2)
     for p in scene.target:
         canvas.circle(camera.project(p), 10.5, PATH, 3)
     frames = forward_kinematics(machine, scene.q)
@@ -258,8 +320,9 @@ def _arrow(canvas: Canvas, start: Array, along: Array, colour: Colour) -> None:
 
 
 def _pale(colour: Colour, fraction: float) -> Colour:
-    """A colour mixed with a fraction of the background."""
-    r, g, b = (round(c + fraction * (w - c)) for c, w in zip(colour, BACKGROUND, strict=True))
+    """A colour mixed with a fraction of the background, or of ink if it is negative."""
+    other = BACKGROUND if fraction > 0 else INK
+    r, g, b = (round(c + abs(fraction) * (w - c)) for c, w in zip(colour, other, strict=True))
     return r, g, b
 
 

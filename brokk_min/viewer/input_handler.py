@@ -17,7 +17,7 @@ LEVER_KEYS = (("q", "a"), ("w", "s"), ("e", "d"), ("r", "f"), ("t", "g"), ("y", 
 PAD_AXES = (1, 0, 4, 3)  # 2 and 5 are triggers, which do not rest in the middle
 PAD_SWITCH = 5
 PAD_BUTTONS = {3: "mode", 0: "next", 1: "again"}
-KEYS = {"escape": "close", "tab": "mode", "return": "next", "backspace": "again"}
+KEYS = {"escape": "close", "tab": "mode", "return": "next", "backspace": "again", "c": "compare"}
 
 
 class InputHandler:
@@ -44,7 +44,7 @@ class InputHandler:
         self.enable = False
         self.lost = False  # gamepad unplugged?
         self.closed = False
-        self.task = ""  # "next" or "again"
+        self.task = ""  # "next", "again" or "compare"
         self.deflection: Array = np.zeros(3)
         pygame.joystick.init()
         self.pad: Any = pygame.joystick.Joystick(0) if pygame.joystick.get_count() else None

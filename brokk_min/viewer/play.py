@@ -4,8 +4,10 @@ The window sends requests to the loop (`control_process`) and shows the telemetr
 """
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import closing
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import closing, contextmanager
+from functools import partial
 from itertools import cycle
 from pathlib import Path
 
@@ -13,81 +15,123 @@ import numpy as np
 
 from brokk_min.can.connection import open_bus
 from brokk_min.can.drive_log import Telemetry, TelemetryReader
-from brokk_min.can.safety_gate import fault_name
+from brokk_min.can.simulated_machine import start_pose
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
 from brokk_min.viewer import control_process, drawing, tracing
 from brokk_min.viewer.control_process import BusOptions, Request
+from brokk_min.viewer.faults import fault_in_words
 from brokk_min.viewer.input_handler import LEVER_KEYS, PAD_SWITCH, InputHandler
+from brokk_min.viewer.lockstep import Comparison, Lockstep
 from brokk_min.viewer.window import Canvas, Colour, Window
 
-SIZE = (1120, 680)  # of the window [px]
-STALE = 0.5  # s without telemetry, then angles count as unknown (assumed)
+SIZE = (1120, 680)  # of the window at first [px]
+STALE = 0.5  # s without telemetry, then the pose is an old one (assumed)
+SLOW = 0.95  # of real time: a slower motion is shown (assumed)
 TRAIL = 600  # tool positions
 
 
 class Session:
-    """What the window shows: telemetry, trail of the tool, the line being traced, attempts."""
+    """What the window shows: telemetry, trail of the tool, the line being traced, attempts.
 
-    def __init__(self, machine: Machine, modes: Sequence[str], file: Path | None) -> None:
+    Args:
+        machine: what is shown.
+        controllers: by mode; the levers are the last mode. None: the window only watches.
+        file: of the attempts, or None.
+        simulated: may the controllers be compared on simulated machines?
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        controllers: Mapping[str, Controller] | None,
+        file: Path | None,
+        simulated: bool = False,
+    ) -> None:
         self.machine = machine
-        self.modes = modes
-        self.file = file  # of the attempts
+        self.modes = [] if controllers is None else [*controllers, "levers"]
+        self.compared = dict(controllers or {}) if simulated else {}
+        self.file = file
         self.attempts = tracing.read_attempts(file) if file else []
         self.lines = tracing.task_lines(machine)
         self.names = cycle(self.lines)
         self.task = ""
         self.path: Array = drawing.NO_POINTS  # of the last line [m]
+        self.in_view: Array = drawing.NO_POINTS  # while and after a line is traced
         self.tracing: tracing.Tracing | None = None
         self.finished: tracing.Attempt | None = None
+        self.comparison: Comparison | None = None
         self.previous: Telemetry | None = None
         self.telemetry: Telemetry | None = None
-        self.arrived = 0.0  # s
+        self.pose: Array = np.full(machine.n, np.nan)  # the last known one [rad]
+        self.arrivals = deque[float](maxlen=round(machine.rate) + 1)  # s, of a second's ticks
         self.trail = list[Array]()
 
     def update(self, telemetry: Telemetry, now: float) -> None:
         """A new tick."""
         self.previous = self.telemetry
         self.telemetry = telemetry
-        self.arrived = now
+        self.arrivals.append(now)
         if not np.isfinite(telemetry.q).all():
             return
+        self.pose = telemetry.q
         p_tool = tool_position(forward_kinematics(self.machine, telemetry.q))
         self.trail = [*self.trail, p_tool][-TRAIL:]
         mode_changed = self.previous is not None and self.previous.mode != telemetry.mode
         if mode_changed and self.tracing and self.tracing.p:
-            self.next_task(again=True)
+            self.next_task("again")
         if self.tracing and self.tracing.update(telemetry):
             self.finished = self.tracing.attempt(self.modes[telemetry.mode])
             self.tracing = None
             self.attempts.append(self.finished)
             if self.file:
                 tracing.write_attempts(self.file, self.attempts)
+        if self.comparison and telemetry.driving:
+            self.comparison = None
+        if self.comparison:
+            self.comparison.update()
 
-    def next_task(self, again: bool = False) -> None:
-        """The next line, or the same one again, from where the tool is."""
+    def next_task(self, which: str = "next") -> None:
+        """The next line, the same one "again" from where the tool is, or by all: "compare"."""
         if not self.trail:
             return
-        if not (again and self.task):
+        if which == "next" or not self.task:
             self.task = next(self.names)
-        self.path = self.trail[-1] + self.lines[self.task]
-        self.tracing = tracing.Tracing(self.machine, self.task, self.path)
-        self.trail = []
-        self.finished = None
+        self.path = self.in_view = self.trail[-1] + self.lines[self.task]
+        self.trail = self.trail[-1:]
+        self.finished = self.comparison = self.tracing = None
+        if which == "compare" and self.compared:
+            self.comparison = Comparison(self.machine, self.compared, self.pose, self.path)
+        else:
+            self.tracing = tracing.Tracing(self.machine, self.task, self.path)
+
+    def speed(self) -> float:
+        """Speed of the ticks of the last second, as a fraction of real time."""
+        if len(self.arrivals) < 2:
+            return 1.0
+        seconds = max(1e-9, self.arrivals[-1] - self.arrivals[0])
+        return (len(self.arrivals) - 1) * self.machine.dt / seconds
 
     def scene(self, now: float, mode: str, hint: str) -> drawing.Scene:
         """What the window shows now; angles between the last two ticks, for smooth motion."""
-        unknown = np.full(self.machine.n, np.nan)
-        telemetry = Telemetry(0, unknown, unknown, np.zeros(self.machine.n), np.zeros(3), False)
-        status = hint or "no telemetry"
-        colour = drawing.WARNING
-        if self.telemetry is not None and now - self.arrived <= STALE:
-            telemetry = self.telemetry
-            status, colour = gate_status(self.machine, telemetry, hint)
+        zero = np.zeros(self.machine.n)
+        telemetry = self.telemetry
+        if telemetry is None or now - self.arrivals[-1] > STALE:
+            banner = hint if telemetry is None else "No telemetry: the pose is the last known one."
+            telemetry = Telemetry(0, zero + np.nan, zero, zero, np.zeros(3), False)
+            status, colour = "no telemetry", drawing.WARNING
+        else:
+            status, colour = gate_status(telemetry, hint)
+            banner = fault_in_words(self.machine, telemetry)
+            if self.speed() < SLOW:
+                status += (
+                    f", {100 * self.speed():.0f} % of real time, {telemetry.lateness:.1f} s late"
+                )
+        known = bool(np.isfinite(telemetry.q).all())
         scene = drawing.Scene(
-            self._interpolate(telemetry.q, now),
-            telemetry.q_dot,
+            self._interpolate(telemetry.q, now) if known else self.pose,
+            telemetry.q_dot if known else zero,
             telemetry.u,
             telemetry.v_goal,
             trail=np.array(self.trail).reshape(-1, 3),
@@ -95,19 +139,36 @@ class Session:
             title=drawing.TITLES.get(mode, self.machine.name),
             status=status,
             status_colour=colour,
-            colour=drawing.COLOURS.get(mode, drawing.STEEL),
+            colour=drawing.COLOURS.get(mode, drawing.STEEL) if known else drawing.TRACK,
             notes=self.notes(mode),
+            banner=banner,
         )
-        if self.tracing is None:
-            return scene
-        p_tool = tool_position(forward_kinematics(self.machine, scene.q))
-        target = self.path[self.tracing.passed : self.tracing.passed + 1]
-        return scene._replace(target=target, in_view=np.vstack([self.path, p_tool]))
+        return self._with_line(scene) if len(self.path) and known else scene
+
+    def _with_line(self, scene: drawing.Scene) -> drawing.Scene:
+        """The scene near the line, which stays so until the next line."""
+        runs = []
+        if self.comparison:
+            for name, q in self.comparison.q.items():
+                trace = np.array(self.comparison.traces[name]).reshape(-1, 3)
+                text = f"{drawing.TITLES.get(name, name)}: {distances(self.path, trace)}"
+                runs.append(drawing.Trace(q, trace, drawing.COLOURS[name], text))
+            scene = scene._replace(
+                q=runs[0].q, q_dot=0 * scene.q, traces=runs, trail=scene.path[:0]
+            )
+        p_tool = [tool_position(forward_kinematics(self.machine, run.q)) for run in [scene, *runs]]
+        points = np.vstack([self.in_view, *p_tool])
+        self.in_view = np.vstack([self.path, points.min(axis=0), points.max(axis=0)])
+        headline = distances(self.path, scene.trail)
+        target = self.path[:0]
+        if self.tracing:
+            target = self.path[self.tracing.passed : self.tracing.passed + 1]
+        return scene._replace(target=target, in_view=self.in_view, headline=headline)
 
     def _interpolate(self, q: Array, now: float) -> Array:
         if self.previous is None or not np.isfinite(self.previous.q).all():
             return q
-        fraction = min(1.0, (now - self.arrived) / self.machine.dt)
+        fraction = min(1.0, (now - self.arrivals[-1]) / self.machine.dt)
         return np.asarray(self.previous.q + fraction * (q - self.previous.q))
 
     def notes(self, mode: str) -> list[str]:
@@ -123,6 +184,8 @@ class Session:
             f"hold SPACE to drive    {keys}",
             "SHIFT: slow  TAB: next controller  ENTER: next line  BACKSPACE: again  ESC: end",
         ]
+        if self.compared:
+            notes.append("C: the same line by all controllers, simulated, nobody steers")
         done = self.finished
         if self.tracing:
             work = self.tracing
@@ -133,14 +196,20 @@ class Session:
         return notes + tracing.attempts_table(self.attempts, self.task)
 
 
-def gate_status(machine: Machine, telemetry: Telemetry, hint: str) -> tuple[str, Colour]:
+def distances(line: Array, trail: Array) -> str:
+    """Distance of the tool from a line now, and the largest one, as text."""
+    if not len(trail):
+        return ""
+    millimetres = 1e3 * tracing.distance(line, trail)
+    return f"{millimetres[-1]:.0f} mm from the line, at most {millimetres.max():.0f} mm"
+
+
+def gate_status(telemetry: Telemetry, hint: str) -> tuple[str, Colour]:
     """Status of the gate as text, and its colour."""
     if telemetry.driving:
         return "driving", drawing.DRIVING
-    if telemetry.active_fault:
-        return f"waiting: {fault_name(machine, telemetry.active_fault)}", drawing.WARNING
-    if telemetry.latched_fault:
-        return f"stopped: {fault_name(machine, telemetry.latched_fault)}", drawing.WARNING
+    if telemetry.active_fault or telemetry.latched_fault:
+        return "waiting" if telemetry.active_fault else "stopped", drawing.WARNING
     return hint or "ready", drawing.READY
 
 
@@ -184,9 +253,9 @@ def show(
         if session.telemetry is not None:
             send(request)
         if handler.task and session.modes:
-            session.next_task(again=handler.task == "again")
+            session.next_task(handler.task)
         handler.task = ""
-        canvas = Canvas(SIZE)
+        canvas = Canvas(window.size)
         scene = session.scene(now, modes[handler.mode], next_step(session, handler))
         drawing.draw(canvas, session.machine, [scene])
         window.show(canvas, fps)
@@ -205,25 +274,37 @@ def play(
 
     ValueError: no window, no bus, or a loop that ended by itself.
     """
-    session = Session(machine, [*controllers, "levers"], attempts)
+    session = Session(machine, controllers, attempts, not options.interface)
     with (
         closing(Window(SIZE, f"brokk_min: {machine.name}")) as window,
-        control_process.start(machine, list(controllers.values()), options) as connection,
+        connect(machine, controllers, options) as (receive, send),
     ):
-        show(
-            window,
-            session,
-            lambda: control_process.receive_telemetry(connection),
-            lambda request: control_process.send_request(connection, request),
-            each_frame,
-        )
+        show(window, session, receive, send, each_frame)
+
+
+@contextmanager
+def connect(
+    machine: Machine, controllers: Mapping[str, Controller], options: BusOptions
+) -> Iterator[tuple[Callable[[], Iterable[Telemetry]], Callable[[Request], object]]]:
+    """How to receive telemetry and to send requests: in lockstep, or to a process with a bus."""
+    loops = list(controllers.values())
+    if options.interface:
+        with control_process.start(machine, loops, options) as connection:
+            yield (
+                partial(control_process.receive_telemetry, connection),
+                partial(control_process.send_request, connection),
+            )
+    else:
+        start = start_pose(machine, options.start)
+        with closing(Lockstep(machine, loops, start, options.log)) as loop:
+            yield loop.advance, loop.send
 
 
 def watch(
     machine: Machine, options: BusOptions, each_frame: FrameHook = lambda session, handler: True
 ) -> None:
     """Show a machine on a bus; nothing is sent."""
-    session = Session(machine, [], None)
+    session = Session(machine, None, None)
     reader = TelemetryReader(machine)
     with (
         closing(Window(SIZE, f"brokk_min: {machine.name}")) as window,

@@ -7,7 +7,7 @@ import threading
 
 import numpy as np
 import pytest
-from helpers_bus import START, ConstantCommand
+from helpers_bus import ConstantCommand, served
 from helpers_viewer import PipedLoop
 
 from brokk_min.can.canopen import OperatorInput
@@ -15,13 +15,13 @@ from brokk_min.machine import BROKK_170
 from brokk_min.viewer import control_process
 from brokk_min.viewer.control_process import (
     BusOptions,
+    PipedOperator,
     Request,
-    WindowOperator,
     control,
     receive_telemetry,
     send_request,
 )
-from brokk_min.viewer.play import gate_status
+from brokk_min.viewer.faults import fault_in_words
 
 REQUEST = Request(10.0, 0, True, True, np.array([0.1, 0.0, 0.0]), np.zeros(4))
 
@@ -29,7 +29,7 @@ REQUEST = Request(10.0, 0, True, True, np.array([0.1, 0.0, 0.0]), np.zeros(4))
 def test_operator__gives_the_newest_request_until_it_is_too_old():
     here, there = multiprocessing.Pipe()
     now = 10.0
-    operator = WindowOperator(BROKK_170, there, lambda: now)
+    operator = PipedOperator(BROKK_170, there, lambda: now)
     assert operator(False, True) == OperatorInput(alive=False)  # no request yet
     here.send(REQUEST._replace(v_goal=np.ones(3)))
     here.send(REQUEST)
@@ -77,7 +77,7 @@ def test_loop__closes_the_valves_and_sends_nothing_while_the_window_is_silent():
     late = times[(commands != 0).any(axis=1)].max() - last
     assert 0.1 < late <= control_process.SILENCE + 0.06
     loop.go(0.06, True)
-    assert "device lost" in gate_status(BROKK_170, loop.ticks[-1], "")[0]
+    assert "device lost" in fault_in_words(BROKK_170, loop.ticks[-1])
     loop.go(0.5, True)
     assert not loop.ticks[-1].driving  # the switch was never released
     loop.go(0.1, False)
@@ -86,9 +86,9 @@ def test_loop__closes_the_valves_and_sends_nothing_while_the_window_is_silent():
     loop.close()
 
 
-def test_control__drives_a_machine_of_its_own_until_the_window_closes_the_pipe(tmp_path):
+def test_control__drives_a_machine_on_a_bus_until_the_window_closes_the_pipe(tmp_path):
     here, there = multiprocessing.Pipe()
-    options = BusOptions(log=tmp_path / "run.log", start=START)
+    options = BusOptions("virtual", "control", log=tmp_path / "run.log")
     thread = threading.Thread(target=here.close)  # as soon as the loop runs
     poll = there.poll
 
@@ -98,17 +98,16 @@ def test_control__drives_a_machine_of_its_own_until_the_window_closes_the_pipe(t
         return poll()
 
     there.poll = poll_once
-    control(BROKK_170, [], options, there)
+    with served("control"):
+        control(BROKK_170, [], options, there)
     assert (tmp_path / "run.log").stat().st_size > 0
-    assert not [thread for thread in threading.enumerate() if "serve" in thread.name]
 
 
 @pytest.mark.parametrize(
     ("machine", "options", "message"),
     [
         (BROKK_170, BusOptions("nonsense", "bus"), "got nonsense bus: expected a CAN bus"),
-        (BROKK_170, BusOptions(start=(0.0, 9.0)), "got start: expected 5 angles"),
-        (None, BusOptions(start=START), "got AttributeError: "),
+        (BROKK_170, BusOptions("virtual", "empty"), "got node 1: object 0x6501"),
     ],
 )
 def test_receive_telemetry__says_why_the_loop_ended(machine, options, message):

@@ -8,16 +8,19 @@ import can
 import numpy as np
 import pygame
 import pytest
-from helpers_bus import START, ConstantCommand, World, recording
-from helpers_viewer import MODES, post, post_key, telemetry
+from helpers_bus import BASELINE, START, ConstantCommand, World, recording
+from helpers_viewer import post, post_key, telemetry
 
 from brokk_min.can.canopen import OperatorInput
+from brokk_min.can.safety_gate import Fault
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer import drawing, play, replay
 from brokk_min.viewer.control_process import BusOptions
 from brokk_min.viewer.play import Session
 from brokk_min.viewer.window import Window
+
+CONTROLLERS = {"rl": ConstantCommand(), "jacobian": ConstantCommand()}
 
 
 def tool(q):
@@ -27,16 +30,15 @@ def tool(q):
 # --- what is shown --------------------------------------------------------------------------------
 
 
-def test_scene__interpolates_between_two_ticks_and_forgets_them_after_half_a_second():
-    session = Session(BROKK_170, MODES, None)
+def test_scene__interpolates_between_two_ticks_and_keeps_the_last_pose():
+    session = Session(BROKK_170, CONTROLLERS, None)
     q = np.array(START)
-    for hint, status in (("starting", "starting"), ("", "no telemetry")):
-        scene = session.scene(0.0, "rl", hint)
-        assert np.isnan(scene.q).all()
-        assert np.isnan(scene.q_dot).all()
-        assert not scene.u.any()
-        assert (scene.status, scene.status_colour) == (status, drawing.WARNING)
-        assert scene.path.shape == scene.trail.shape == (0, 3)
+    scene = session.scene(0.0, "rl", "starting")
+    assert np.isnan(scene.q).all()
+    assert not scene.q_dot.any()
+    assert not scene.u.any()
+    assert (scene.banner, scene.status_colour) == ("starting", drawing.WARNING)
+    assert scene.path.shape == scene.trail.shape == (0, 3)
     session.update(telemetry(0, q), 1.0)
     np.testing.assert_array_equal(session.scene(1.02, "rl", "").q, q)
     u = np.full(5, 0.1)
@@ -49,16 +51,89 @@ def test_scene__interpolates_between_two_ticks_and_forgets_them_after_half_a_sec
         assert scene.u is u
         assert scene.v_goal is v
         assert (scene.status, scene.status_colour) == ("driving", drawing.DRIVING)
+        assert scene.colour == drawing.COLOURS["rl"]
     np.testing.assert_allclose(scene.trail, [tool(q), tool(q + 0.02)])
     late = session.scene(1.56, "rl", "")
-    assert np.isnan(late.q).all()
-    assert late.status == "no telemetry"
+    np.testing.assert_array_equal(late.q, q + 0.02)
+    assert not late.q_dot.any()
+    assert (late.colour, late.status) == (drawing.TRACK, "no telemetry")
+    assert late.banner == "No telemetry: the pose is the last known one."
+
+
+def test_scene__greys_the_last_pose_and_says_why_a_position_is_missing():
+    session = Session(BROKK_170, CONTROLLERS, None)
+    session.update(telemetry(0), 1.0)
+    malformed = 1 + Fault.MALFORMED * 6  # of q1, among five joints and the valve controller
+    lost = telemetry(1, np.full(5, np.nan), active_fault=malformed, driving=False)
+    session.update(lost, 1.05)
+    scene = session.scene(1.06, "rl", "ready")
+    np.testing.assert_array_equal(scene.q, START)
+    assert (scene.colour, scene.status) == (drawing.TRACK, "waiting")
+    assert scene.banner.startswith("q1: doubled or malformed position. It sent two positions")
+    session.update(telemetry(2, latched_fault=malformed, driving=False), 1.1)
+    scene = session.scene(1.11, "rl", "ready")
+    assert (scene.colour, scene.status) == (drawing.COLOURS["rl"], "stopped")
+    assert scene.banner.endswith("Over now: release SPACE, then press it again.")
+
+
+def test_scene__says_how_slow_and_how_late_the_machine_is():
+    session = Session(BROKK_170, CONTROLLERS, None)
+    for tick in range(30):
+        session.update(telemetry(tick, lateness=0.1 * tick), 0.1 * tick)
+    scene = session.scene(2.9, "rl", "")
+    assert scene.status == "driving, 50 % of real time, 2.9 s late"
+    for tick in range(30, 60):
+        session.update(telemetry(tick), 1.5 + 0.05 * tick)
+    assert session.scene(4.45, "rl", "").status == "driving"
+
+
+def test_scene__keeps_its_zoom_and_the_distance_from_the_line_until_the_next_line():
+    session = Session(BROKK_170, CONTROLLERS, None)
+    session.update(telemetry(), 0.0)
+    assert not len(session.scene(0.0, "rl", "").in_view)
+    session.lines["rectangle"] = np.array([[0.0, 0, 0], [0, 0.05, 0]])
+    session.next_task()
+    radius = np.hypot(*tool(START)[:2])
+    for tick, y in enumerate((0.0, 0.05)):
+        q = (np.arcsin(y / radius), *START[1:])
+        session.update(telemetry(tick, q, u=np.full(5, 0.5)), 0.05 * tick)
+    assert session.finished
+    scene = session.scene(0.06, "rl", "")
+    np.testing.assert_allclose(scene.in_view.min(axis=0)[1], 0.0, atol=1e-9)
+    np.testing.assert_allclose(scene.in_view.max(axis=0)[1], 0.05)
+    off = radius - np.sqrt(radius**2 - 0.05**2)  # the tool moves on a circle
+    assert scene.headline == f"{1e3 * off:.0f} mm from the line, at most {1e3 * off:.0f} mm"
+    session.update(telemetry(2, (0.5, *START[1:])), 0.1)
+    wider = session.scene(0.16, "rl", "").in_view
+    assert wider[:, 1].max() == pytest.approx(tool((0.5, *START[1:]))[1])
+    session.update(telemetry(3), 0.15)
+    np.testing.assert_allclose(session.scene(0.21, "rl", "").in_view, wider)  # it does not shrink
+
+
+def test_compare__lays_the_traces_of_all_controllers_over_each_other():
+    session = Session(BROKK_170, {"jacobian": BASELINE, "rl": ConstantCommand(0, 0, 0, 0, 0)}, None)
+    session.update(telemetry(driving=False), 0.0)
+    session.next_task("compare")
+    assert session.comparison is None  # on a bus the window shows the machine alone
+    session.compared = {"jacobian": BASELINE, "rl": ConstantCommand(0, 0, 0, 0, 0)}
+    session.lines["rectangle"] = np.array([[0.0, 0, 0], [0, 0.3, 0]])
+    session.next_task("compare")
+    for tick in range(80):
+        session.update(telemetry(tick, driving=False), 0.05 * tick)
+    scene = session.scene(3.96, "rl", "ready")
+    moved, stood = scene.traces
+    assert moved.trail[-1][1] == pytest.approx(0.3, abs=0.05)
+    np.testing.assert_allclose(stood.trail, np.tile(tool(START), (len(stood.trail), 1)), atol=1e-9)
+    assert moved.text.startswith("PID with DLS (the paper's): ")
+    assert stood.text == "RL policy: 0 mm from the line, at most 0 mm"
+    session.update(telemetry(81), 4.0)
+    assert session.comparison is None  # who drives sees the machine
 
 
 def test_session__begins_a_line_again_when_the_mode_changes_on_the_way():
-    session = Session(BROKK_170, MODES, None)
+    session = Session(BROKK_170, CONTROLLERS, None)
     session.update(telemetry(), 0.0)
-    session.next_task(again=True)
+    session.next_task("again")
     first = session.tracing
     assert session.task == "rectangle"  # there was nothing to repeat
     session.update(telemetry(mode=1), 0.0)
@@ -79,7 +154,7 @@ def test_session__begins_a_line_again_when_the_mode_changes_on_the_way():
 
 
 def test_show__sends_requests_once_there_is_telemetry_and_takes_keys_frame_by_frame():
-    session = Session(BROKK_170, MODES, None)
+    session = Session(BROKK_170, CONTROLLERS, None)
     frames = [[], [telemetry(0)], [telemetry(1)], [telemetry(2), telemetry(3)], [telemetry(4)]]
     presses = [[], [], ["return"], ["return"], ["backspace", "tab"], ["escape"]]
     sent = []
@@ -101,11 +176,8 @@ def test_show__sends_requests_once_there_is_telemetry_and_takes_keys_frame_by_fr
     assert session.previous.tick == 3
 
 
-def test_play__drives_a_machine_in_another_process(tmp_path):
-    """In real time: keys, the loop's process, the plant behind the bus; then focus and closing.
-
-    On a busy computer the gate may stop for a late tick: then the switch is pressed anew.
-    """
+def test_play__drives_a_simulated_machine_in_lockstep(tmp_path):
+    """Keys, the loop, the plant behind its bus; then loss of focus, and closing."""
     seen = []
     steps = [
         (lambda t: t.active_fault == 0, pygame.KEYDOWN, {"key": pygame.K_SPACE}),
@@ -114,28 +186,19 @@ def test_play__drives_a_machine_in_another_process(tmp_path):
         (lambda t: not t.driving and not t.u.any(), pygame.WINDOWFOCUSGAINED, {}),
         (lambda t: True, pygame.QUIT, {}),
     ]
-    at = frames = 0
 
     def each_frame(session, handler):
-        nonlocal at, frames
-        frames += 1
-        assert frames < 3600, (session.telemetry, at)
-        if session.telemetry is None or at == len(steps):
-            return True
-        seen.append(session.telemetry)
-        condition, kind, event = steps[at]
-        if condition(session.telemetry):
-            post(kind, **event)
-            at += 1
-        elif at in (1, 2) and not session.telemetry.driving and frames % 60 == 0:
-            post_key("q", False)
-            post_key("space", False)
-            at = 0
-        return True
+        if session.telemetry is not None and steps:
+            seen.append(session.telemetry)
+            condition, kind, event = steps[0]
+            if condition(session.telemetry):
+                post(kind, **event)
+                steps.pop(0)
+        return len(seen) < 3600
 
     options = BusOptions(log=tmp_path / "run.log")
     play.play(BROKK_170, {}, options, tmp_path / "attempts.csv", each_frame)
-    assert at == len(steps)
+    assert not steps
     assert seen[-1].q[0] > 0.01
     assert not pygame.display.get_init()
     run = replay.run_of_log(BROKK_170, tmp_path / "run.log", (1, 2, 3))

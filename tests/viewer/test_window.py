@@ -18,6 +18,13 @@ def columns(image, row, colour):
     return np.flatnonzero((image[row] == colour).all(axis=-1)).tolist()
 
 
+def is_span(found, first, end):
+    """All pixels from the first to the end, but those at the smooth edges."""
+    return found == list(range(found[0], found[-1] + 1)) and (
+        abs(found[0] - first) <= 1 and abs(found[-1] + 1 - end) <= 1
+    )
+
+
 def test_canvas__paints_shapes_where_they_are_and_as_large():
     canvas = Canvas((60, 40))
     canvas.line(np.array([[5.0, 5], [5, 35], [35, 35]]), RED, 4)
@@ -26,19 +33,20 @@ def test_canvas__paints_shapes_where_they_are_and_as_large():
     image = canvas.image()
     assert image.shape == (40, 60, 3)
     assert image.dtype == np.uint8
-    assert columns(image, 20, RED) == [4, 5, 6]
-    assert columns(image, 35, RED) == list(range(5, 35))  # open: no line back to the start
-    assert columns(image, 15, BLUE) == list(range(20, 30))
+    assert is_span(columns(image, 20, RED), 3, 7)
+    assert is_span(columns(image, 35, RED), 5, 35)  # open: no line back to the start
+    assert is_span(columns(image, 15, BLUE), 20, 30)
     assert columns(image, 24, GREEN) == list(range(44, 52))
-    assert (image[20, 8:44] == BACKGROUND).all()
+    assert (image[24, 8:43] == BACKGROUND).all()
     canvas.circle(np.array([25.0, 15]), 5, RED, 2)
-    assert columns(canvas.image(), 15, BLUE) == list(range(22, 28))  # a ring around it
+    assert is_span(columns(canvas.image(), 15, BLUE), 22, 28)  # a ring around it
 
 
 def test_canvas__cuts_shapes_but_not_text_at_the_clip():
     canvas = Canvas((60, 40))
     canvas.clip((0.0, 0.0, 30.0, 40.0))
     canvas.bar(10.0, 50.0, 20.0, 5.0, RED)
+    assert columns(canvas.image(), 20, RED) == list(range(10, 30))
     canvas.text(35, 20, "HHH", 12, BLUE)
     image = canvas.image()
     assert columns(image, 20, RED) == list(range(10, 30))
@@ -57,6 +65,19 @@ def test_window__shows_a_canvas():
         np.testing.assert_array_equal(pixels.swapaxes(0, 1), canvas.image())
         assert window.pygame.display.get_caption()[0] == "a title"
     assert not window.pygame.display.get_init()
+
+
+def test_window__gives_the_size_of_pictures_after_it_was_resized():
+    with closing(Window((700, 500), "a title")) as window:
+        assert window.size == (700, 500)
+        for size, picture in (((900, 600), (900, 600)), ((300, 600), (640, 600))):
+            window.pygame.display.set_mode(size, window.pygame.RESIZABLE)
+            assert window.size == picture
+            canvas = Canvas(picture)
+            canvas.bar(10.0, 50.0, 20.0, 5.0, RED)
+            window.show(canvas, 1000.0)
+            shown = window.pygame.surfarray.array3d(window.surface).swapaxes(0, 1)
+            np.testing.assert_array_equal(shown, canvas.image()[:, : size[0]])
 
 
 def test_window__draws_unseen_only_if_asked_to(monkeypatch):

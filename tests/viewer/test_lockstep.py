@@ -1,0 +1,101 @@
+"""Loop and simulated machine on a clock that stands still while anything computes."""
+
+from __future__ import annotations
+
+from contextlib import closing
+
+import numpy as np
+import pytest
+from helpers_bus import BASELINE, START, ConstantCommand
+
+from brokk_min.actuator import plant_reset, plant_step
+from brokk_min.kinematics import forward_kinematics, tool_position
+from brokk_min.machine import BROKK_170
+from brokk_min.viewer.control_process import Request
+from brokk_min.viewer.lockstep import Comparison, Lockstep, follow, line_goals
+
+NEUTRAL = Request(0.0, 0, False, True, np.zeros(3), np.zeros(4))
+
+
+class Clock:
+    """A clock that is set by hand."""
+
+    def __init__(self):
+        self.now = 100.0
+
+    def __call__(self):
+        return self.now
+
+
+def driven(seconds_a_picture, pictures):
+    """Telemetry of a window that draws slowly, while the operator holds the switch."""
+    clock = Clock()
+    with closing(
+        Lockstep(BROKK_170, [ConstantCommand(60, 0, 0, 0, 0)], START, None, clock)
+    ) as loop:
+        ticks = []
+        for _ in range(pictures):
+            ready = bool(ticks) and not ticks[-1].active_fault
+            loop.send(NEUTRAL._replace(enable=ready))
+            ticks += loop.advance()
+            clock.now += seconds_a_picture
+    return ticks
+
+
+@pytest.mark.parametrize(("period", "late"), [(1 / 60, 0.0), (0.1, 0.0), (0.5, 0.4)])
+def test_advance__makes_due_ticks_and_loses_the_time_of_more_than_two_a_picture(period, late):
+    ticks = driven(period, 30)
+    assert [t.tick for t in ticks] == list(range(1, len(ticks) + 1))
+    expected = min(2, period / 0.05) * 29
+    assert abs(len(ticks) - expected) <= 2
+    assert ticks[-1].lateness == pytest.approx(28 * late, abs=0.11)
+    assert not [t for t in ticks if t.driving and t.active_fault]
+
+
+def test_advance__gives_the_same_motion_however_slow_the_window_is():
+    quick = [t for t in driven(0.05, 60) if t.driving]
+    slow = [t for t in driven(1.0, 30) if t.driving]
+    assert len(slow) > 40
+    for a, b in zip(quick, slow, strict=False):
+        np.testing.assert_array_equal(a.u, b.u)
+        np.testing.assert_array_equal(a.q, b.q)
+    assert quick[-1].q[0] > START[0] + 0.2
+
+
+def test_follow__moves_the_plant_as_the_commands_of_the_loop_do():
+    """A constant command, through bus and gate: the plant's own steps give the same angles."""
+    goals = np.tile([0.1, 0.0, 0.0], (40, 1))
+    q = np.array(list(follow(BROKK_170, ConstantCommand(30, 0, 0, 0, 0), START, goals)))
+    moving = np.flatnonzero(q[:, 0] > START[0])
+    plant = plant_reset(BROKK_170, np.array(START))
+    alone = []
+    for _ in range(30):
+        plant = plant_step(BROKK_170, plant, np.array([30, 0, 0, 0, 0]) / 127)
+        alone.append(plant.q[0])
+    first = np.flatnonzero(np.array(alone) > START[0])[0]
+    np.testing.assert_allclose(
+        q[moving[0] + 2 : moving[0] + 20, 0], alone[first + 2 : first + 20], atol=0.01
+    )
+
+
+def test_line_goals__lead_along_the_line_at_half_the_tool_speed():
+    line = np.array([[1.0, 2, 3], [1, 2.6, 3], [1, 2.6, 3.3]])
+    goals = line_goals(BROKK_170, line)
+    assert goals.shape == (20 + 80 + 40 + 20, 3)
+    np.testing.assert_allclose(goals[20], [0, 0.15, 0])
+    np.testing.assert_allclose(goals[100], [0, 0, 0.15])
+    np.testing.assert_allclose(goals.sum(axis=0) * 0.05, line[-1] - line[0], atol=1e-12)
+    assert not goals[:20].any()
+    assert not goals[-20:].any()
+
+
+def test_comparison__stands_still_at_the_end_of_the_line():
+    p = tool_position(forward_kinematics(BROKK_170, np.array(START)))
+    line = p + np.array([[0.0, 0, 0], [0, 0.15, 0]])
+    comparison = Comparison(BROKK_170, {"jacobian": BASELINE}, np.array(START), line)
+    for _ in range(90):
+        comparison.update()
+    trace = np.array(comparison.traces["jacobian"])
+    assert len(trace) == 90
+    np.testing.assert_allclose(trace[-1], line[-1], atol=0.05)
+    np.testing.assert_array_equal(trace[-1], trace[-10])

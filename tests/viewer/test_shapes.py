@@ -1,0 +1,57 @@
+"""Shapes from a machine's geometry: where they stand, and what touches what."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers_bus import START
+from hypothesis import given
+from strategies import moving
+
+from brokk_min.evaluation.sequences import evaluation_starts, task_sequences
+from brokk_min.machine import BROKK_170
+from brokk_min.viewer import shapes
+
+
+def test_undercarriage__stands_at_height_zero_below_the_second_joint():
+    corners = np.vstack([np.vstack(part) for part in shapes.undercarriage(BROKK_170)])
+    assert corners[:, 2].min() == pytest.approx(0.0)
+    assert corners[:, 2].max() < 0.95
+    np.testing.assert_allclose(corners.min(axis=0)[:2], -corners.max(axis=0)[:2])
+
+
+def test_turret__turns_with_the_first_joint():
+    ahead = np.vstack(shapes.turret(BROKK_170, np.array(START)))
+    left = np.vstack(shapes.turret(BROKK_170, np.array([np.pi / 2, *START[1:]])))
+    quarter = np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    np.testing.assert_allclose(left, ahead @ quarter, atol=1e-9)
+    assert ahead[:, 2].max() == pytest.approx(0.95)
+
+
+@pytest.mark.parametrize(
+    ("q", "text", "links"),
+    [
+        (START, None, set()),
+        ((0.4, 1.4, 1.6, 0.6, 0.0), "the arm touches itself", {5, 9}),
+        ((0.0, 0.0, -0.3, 1.6, 0.0), "the arm touches the ground", None),
+    ],
+)
+def test_contacts__of_poses_seen_by_eye(q, text, links):
+    found = shapes.contacts(BROKK_170, np.array(q))
+    assert (text in found) == (text is not None)
+    if links:
+        assert links <= found[text]
+
+
+def test_contacts__are_rare_among_the_starts_of_the_evaluation():
+    starts = evaluation_starts(BROKK_170, 32, task_sequences(BROKK_170), 2)
+    assert sum(bool(shapes.contacts(BROKK_170, q)) for q in starts) <= 1
+
+
+@given(moving([()]))
+def test_shapes__of_any_machine_are_finite(machine_moving):
+    machine, q, _ = machine_moving
+    for part in [*shapes.undercarriage(machine), shapes.turret(machine, q)]:
+        assert np.isfinite(np.vstack(part)).all()
+    for links in shapes.contacts(machine, q).values():
+        assert all(0 <= i < 2 * machine.n for i in links)
