@@ -25,7 +25,7 @@ from brokk_min.identification.logs import write_log
 from brokk_min.learning.onnx import export_onnx
 from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import Machine
-from brokk_min.viewer import control_process, drawing, play, replay
+from brokk_min.viewer import control_process, drawing, play, replay, rerun_log
 
 
 @dataclass(kw_only=True)
@@ -194,6 +194,7 @@ class Replay(Command):
 
     logs: Positional[tuple[Path, ...]]  # One or two: candump logs, or JSON of results.
     out: Path | None = None  # Write a film, .gif or .mp4, instead of opening a window.
+    rerun: Path | None = None  # Write all on the timeline of rerun instead, .rrd.
     fps: Annotated[float, Range(0.1, 100)] = 10.0  # Pictures per second of the film.
     size: tuple[int, int] = (960, 540)  # Width and height [px], 320 to 4000 for each arm.
     controllers: tuple[str, ...] = ("rl", "jacobian_pid_k0.1")  # Whose runs of the results.
@@ -201,7 +202,7 @@ class Replay(Command):
     start: int = 0  # Which start of the results.
 
     def __call__(self) -> None:
-        machine = self.check(out="film")
+        machine = self.check(out="film", rerun="rerun")
         if not 1 <= len(self.logs) <= 2:
             raise WrongUse(f"LOGS: expected one or two, got {len(self.logs)}")
         self._check_size()
@@ -211,9 +212,11 @@ class Replay(Command):
                 runs += self._simulate_again(machine, log)
             else:
                 runs.append(replay.run_of_log(machine, log, colour))
+        if self.rerun:
+            rerun_log.write_rerun(self.rerun, runs)
         if self.out:
             replay.write_film(self.out, machine, runs, self.size, self.fps)
-        else:
+        elif not self.rerun:
             replay.show_film(machine, runs, self.size)
 
     def _check_size(self) -> None:

@@ -66,6 +66,7 @@ CONTENTS = {
     "drive log": {"candump"},
     "picture": {"PNG"},
     "film": {"film"},
+    "rerun": {"rerun"},
     "ONNX": {"ONNX"},
 }
 

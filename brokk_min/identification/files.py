@@ -280,7 +280,13 @@ def names_in(path: Path) -> set[str]:
                 return {name.removesuffix(".npy") for name in archive.namelist()}
         if begin.startswith(b"{"):
             return set(read_json(path, "JSON"))
-        kinds = {b"\x89PNG": "PNG", b"GIF8": "film", b"(": "candump", b"\x08": "ONNX"}
+        kinds = {
+            b"\x89PNG": "PNG",
+            b"GIF8": "film",
+            b"(": "candump",
+            b"\x08": "ONNX",
+            b"RRF": "rerun",
+        }
         found = {kind for start, kind in kinds.items() if begin.startswith(start)}
         found |= {"film"} if begin[4:8] == b"ftyp" else set()
         return found or {

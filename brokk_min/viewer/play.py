@@ -156,8 +156,9 @@ class Session:
             scene = scene._replace(
                 q=runs[0].q, q_dot=0 * scene.q, traces=runs, trail=scene.path[:0]
             )
-        p_tool = [tool_position(forward_kinematics(self.machine, run.q)) for run in [scene, *runs]]
-        points = np.vstack([self.in_view, *p_tool])
+        poses = np.array([scene.q, *(run.q for run in runs)])
+        p_tool = tool_position(forward_kinematics(self.machine, poses))
+        points = np.vstack([self.in_view, p_tool])
         self.in_view = np.vstack([self.path, points.min(axis=0), points.max(axis=0)])
         headline = distances(self.path, scene.trail)
         target = self.path[:0]

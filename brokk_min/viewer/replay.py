@@ -233,7 +233,10 @@ def _write_gif(file: IO[bytes], images: Images, size: tuple[int, int], fps: floa
     samples = [images.draw(tick) for tick in (ticks[0], ticks[len(ticks) // 2], ticks[-1])]
     warning = np.full_like(samples[0][:40], drawing.WARNING)  # a warning may be short
     palette = Image.fromarray(np.vstack([*samples, warning])).quantize(64)
-    frames = [Image.fromarray(image).quantize(palette=palette, dither=0) for image in images]
+    frames = [
+        Image.fromarray(image).quantize(palette=palette, dither=Image.Dither.NONE)
+        for image in images
+    ]
     times = [round(1000 / fps)] * (len(frames) - 1) + [LAST_FRAME]
     more = {"append_images": frames[1:], "duration": times, "loop": 0}
     frames[0].save(file, "GIF", save_all=True, **more)

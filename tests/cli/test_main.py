@@ -29,7 +29,7 @@ OPTIONS = {
     "convert": "--out",
     "export": "--policy --out",
     "play": "--policy --gains --interface --channel --drive --attempts --log --start",
-    "replay": "--out --fps --size --controllers --sequence --start",
+    "replay": "--out --rerun --fps --size --controllers --sequence --start",
 }
 
 
