@@ -1,0 +1,217 @@
+"""Each exercise passes with its solution, and says what is missing as handed out."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+import exercises
+from brokk_min import actuator, env, jacobian, kinematics
+from brokk_min.machine import decode_pwm, encode_pwm, estimate_velocity
+from exercises.__main__ import FILES, main
+from exercises.verdict import judge
+
+ROOT = Path(exercises.__file__).parents[1]
+MODULES = {number: importlib.import_module(f"exercises.{FILES[number].stem}") for number in FILES}
+
+
+# --- the solutions, from the package -------------------------------------------------------------
+
+
+def fit_net(inputs, targets):
+    """A small net of the package's shape, trained for a second."""
+    torch.manual_seed(0)
+    mean, std = inputs.mean(axis=0), inputs.std(axis=0) + 1e-6
+    nn = torch.nn
+    layers = nn.Linear(39, 32), nn.ReLU(), nn.Linear(32, 32), nn.ReLU(), nn.Linear(32, 1)
+    net = nn.Sequential(*layers)
+    x = torch.tensor((inputs - mean) / std).float()
+    y = torch.tensor(targets).float()
+    optimizer = torch.optim.Adam(net.parameters(), lr=3e-3)
+    for _ in range(400):
+        rows = torch.randint(len(x), (512,))
+        loss = ((net(x[rows])[:, 0] - y[rows]) ** 2).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+
+    def predict(inputs):
+        with torch.no_grad():
+            return net(torch.tensor((inputs - mean) / std).float())[:, 0].numpy()
+
+    return predict
+
+
+def free_run(predict, history, q, commands):
+    angles = []
+    for u in commands:
+        inputs = actuator.append_command(history, u)
+        q = q + predict(inputs.reshape(len(q), -1)) / 20
+        history = actuator.append_sample(history, u, q, 4, 1 / 20)
+        angles.append(q)
+    return np.array(angles)
+
+
+def reward_gradient(v_goal, v_tool):
+    error = v_goal - v_tool
+    size = np.linalg.norm(error)
+    return error / (max(size, 1e-6) * (1 + size) ** 2)
+
+
+def damping(J, w0, k):
+    return jacobian.nakamura_damping(jacobian.manipulability(J), w0, k)
+
+
+def tool_position(rows, q):
+    return kinematics.tool_position(MODULES[2].our_frames(rows, q))
+
+
+def lever_arm(a, b, gamma):
+    """By the package, of joints with this triangle."""
+    triangle = {"cylinder_base": a, "cylinder_rod": b, "cylinder_angle": 0.0}
+    machine = SimpleNamespace(column=triangle.__getitem__)
+    return float(actuator.lever_arm(machine, gamma))
+
+
+def shifted_jacobian(frames):
+    """With the axes of the frames behind the joints."""
+    return kinematics.jacobian(frames._replace(z=np.roll(frames.z, -1, axis=0)))
+
+
+def pid(machine):
+    return MODULES[12].opponents()["PID, k = 0.1"]
+
+
+SOLUTIONS = {
+    1: {
+        "encode": lambda counts: int(encode_pwm(counts / 127)),
+        "decode": lambda byte: round(decode_pwm(byte) * 127),
+    },
+    2: {
+        "tool_position": tool_position,
+        "jacobian": lambda rows, q: kinematics.jacobian(MODULES[2].our_frames(rows, q)),
+    },
+    3: {
+        "lever_arm": lever_arm,
+        "joint_velocity": lambda v, a, b, gamma: v / lever_arm(a, b, gamma),
+    },
+    4: {
+        "half_gradient": lambda J, W, d, v, q_dot: J.T @ (J @ q_dot - v) + d * W * q_dot,
+        "minimiser": lambda J, W, d, v: jacobian.dls(J, W, d) @ v,
+    },
+    5: {
+        "damping": damping,
+        "damped_velocities": lambda J, v, w0, k: (
+            jacobian.dls(J, np.ones(J.shape[1]), damping(J, w0, k) + 1e-12) @ v
+        ),
+    },
+    6: {
+        "velocity": estimate_velocity,
+        "append": lambda history, u, q, samples, dt: actuator.append_sample(
+            history[None], [u], np.array([q]), samples, dt
+        )[0],
+    },
+    7: {"fit": fit_net, "free_run": free_run},
+    8: {"reward": env.reward, "gradient": reward_gradient},
+    9: {"gae": MODULES[9].ours},
+    10: {"loss": MODULES[10].our_loss, "counts": MODULES[10].our_counts},
+    11: {"command_gradients": MODULES[11].our_gradients},
+    12: {"Mine": pid},
+    13: {"drives": MODULES[13].our_drives, "limit": MODULES[13].our_limit},
+}
+
+
+# --- typical wrong answers, and a word of what the verdict says about them -----------------------
+
+WRONG = {
+    1: ({"encode": lambda counts: counts % 256}, "two's complement"),
+    2: (
+        {"jacobian": lambda rows, q: shifted_jacobian(MODULES[2].our_frames(rows, q))},
+        "z_0 x (p_4 - p_0)",
+    ),
+    3: ({"joint_velocity": lambda v, a, b, gamma: v * lever_arm(a, b, gamma)}, "v / r"),
+    4: ({"minimiser": lambda J, W, d, v: jacobian.dls(J, W, d, as_printed=True) @ v}, "1/24"),
+    5: ({"damping": lambda J, w0, k: k}, "w is 0.5"),
+    6: ({"velocity": lambda q, samples, dt: (q[-1] - q[-2]) / dt}, "By hand"),
+    7: ({"fit": lambda x, y: lambda x: np.full(len(x), y.mean())}, "one step"),
+    8: ({"gradient": lambda v_goal, v_tool: v_tool - v_goal}, "towards the goal"),
+    9: (
+        {"gae": lambda r, v, v1, end, cut, *c: MODULES[9].ours(r, v, v1, end + cut, cut, *c)},
+        "time limit",
+    ),
+    10: (
+        {"loss": lambda ratio, a, eps: -np.mean(np.clip(ratio, 1 - eps, 1 + eps) * a)},
+        "The smaller of the two",
+    ),
+    11: (
+        {
+            "command_gradients": lambda m, net, ticks, g: (
+                1.5 * MODULES[11].our_gradients(m, net, ticks, g)
+            )
+        },
+        "1 ticks",
+    ),
+    13: ({"drives": lambda driving, enable, *others: enable}, "no edge"),
+}
+
+
+def test_exercises__are_thirteen_with_a_page_each() -> None:
+    assert sorted(FILES) == list(range(1, 14)) == sorted(SOLUTIONS)
+    for number, module in MODULES.items():
+        assert 8 <= len((module.__doc__ or "").splitlines()) <= 40, number
+
+
+@pytest.mark.parametrize("number", sorted(FILES))
+def test_exercise__passes_with_its_solution(number: int) -> None:
+    assert judge(MODULES[number], SOLUTIONS[number]) == ""
+
+
+@pytest.mark.parametrize("number", sorted(FILES))
+def test_exercise__as_handed_out_says_what_to_fill_in(
+    number: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([str(number)]) == 1
+    name = next(iter(SOLUTIONS[number]))
+    printed = capsys.readouterr().out
+    assert "nothing there yet: fill in `" in printed
+    assert f"exercises/{FILES[number].name}, line " in printed
+    assert name in printed or number in (7, 12)
+
+
+@pytest.mark.parametrize("number", sorted(WRONG))
+def test_exercise__says_why_a_typical_answer_is_wrong(number: int) -> None:
+    wrong, word = WRONG[number]
+    assert word in judge(MODULES[number], SOLUTIONS[number] | wrong)
+
+
+def test_judge__says_where_an_answer_raised() -> None:
+    def encode(counts):
+        return [][counts]
+
+    message = judge(MODULES[1], SOLUTIONS[1] | {"encode": encode})
+    assert "IndexError" in message
+
+
+@pytest.mark.parametrize("number", sorted(FILES))
+def test_solutions__stand_where_the_exercise_says(number: int) -> None:
+    text = ""
+    for part in MODULES[number].SOLUTION.split(";"):
+        path, _, names = part.strip().partition(": ")
+        folder = ROOT if "/" in path else ROOT / "brokk_min" / "identification"
+        text = (folder / path).read_text()
+        for name in re.findall(r"\w+", names):
+            assert re.search(rf"(def|class) {name}\b|\b{name} = ", text), name
+
+
+def test_main__lists_the_exercises_and_refuses_others(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 0
+    assert capsys.readouterr().out.count(" minutes)") == 13
+    assert main(["14"]) == 2
+    assert main(["one"]) == 2
+    assert "expected a number from 1 to 13" in capsys.readouterr().out
