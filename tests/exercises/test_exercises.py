@@ -15,6 +15,7 @@ import exercises
 from brokk_min import actuator, env, jacobian, kinematics
 from brokk_min.machine import decode_pwm, encode_pwm, estimate_velocity
 from exercises.__main__ import FILES, main
+from exercises.hunt import bugs
 from exercises.verdict import judge
 
 ROOT = Path(exercises.__file__).parents[1]
@@ -215,3 +216,16 @@ def test_main__lists_the_exercises_and_refuses_others(capsys: pytest.CaptureFixt
     assert main(["14"]) == 2
     assert main(["one"]) == 2
     assert "expected a number from 1 to 13" in capsys.readouterr().out
+
+
+def test_page__has_every_exercise_with_its_minutes_and_every_bug() -> None:
+    page = (ROOT / "exercises" / "README.md").read_text()
+    rows = re.findall(r"^\| (\d+) \| .* \| \[(\w+\.py)\]\(\2\) \| (\d+) \|$", page, re.M)
+    assert [(int(number), file) for number, file, _ in rows] == [
+        (number, FILES[number].name) for number in sorted(FILES)
+    ]
+    for number, _, minutes in rows:
+        assert f"({minutes} minutes)" in (MODULES[int(number)].__doc__ or "")
+    assert "Sixty errors" in page
+    assert len(bugs()) == 60
+    assert max(len(line) for line in page.splitlines() if line[:1] != "|") <= 100
