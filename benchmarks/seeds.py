@@ -5,7 +5,7 @@
 Each seed records, fits and trains as `brokk-min reproduce` does, on one thread; as many seeds run
 at once as there are cores. What the folder holds already is not made again. Policies and the
 package's tuned baselines are then scored on the sequences and starts of `evaluate`. All
-figures go to `seeds.json` in the folder.
+figures go to `seeds.json` in the folder, the learning curves of ours to `seeds.svg`.
 """
 
 from dataclasses import dataclass
@@ -15,11 +15,13 @@ from typing import Any
 
 import numpy as np
 import tyro
+from matplotlib.figure import Figure
 
 from brokk_min.evaluation import metrics, reproduce, sequences
 from brokk_min.evaluation.baselines import read_gains
 from brokk_min.identification import excitation, fitting, logs
 from brokk_min.identification.files import SHIPPED, write_json
+from brokk_min.identification.formats import read_table
 from brokk_min.identification.net_file import load_net, select_nets
 from brokk_min.learning.policy import POLICIES, PolicyController, load_policy
 from brokk_min.machine import BROKK_170 as M
@@ -31,6 +33,7 @@ FIGURES = {  # name in the file -> figure of `metrics`
     "valve_travel": "valve_travel",
     "joint_motion_at_rest": "joint_motion_at_rest",
 }
+NAMES = {"rl": "ours closed", "rl_open": "ours open", "rl_paper": "paper"}
 RECIPES: dict[str, tuple[str, str, dict[str, Any]]] = {  # policy -> nets, excitation, recipe
     "rl": ("net", "rich", {}),
     "rl_open": ("net", "rich", {}),
@@ -84,13 +87,31 @@ def score(options: Options) -> list[dict[str, Any]]:
         axes = [run for run in runs if run["sequence"] in sequences.AXES]
         row = {key: mean(runs, figure) for key, figure in FIGURES.items()}
         row["error_xyz"] = mean(axes, "velocity_error_mean")
-        rows.append({"controller": name, "seed": seed} | row)
+        rows.append({"controller": NAMES.get(name, name), "seed": seed} | row)
     return rows
 
 
 def mean(runs: list[dict[str, Any]], figure: str) -> float:
     """Mean of a figure over the runs that have it: some never rest."""
     return float(np.mean([run[figure] for run in runs if run[figure] is not None]))
+
+
+def draw(options: Options) -> None:
+    """Velocity error on the nets while ours learn: mean of the seeds, least and largest."""
+    figure = Figure(figsize=(7.0, 2.4), layout="compressed")
+    axes = figure.subplots()
+    for name, style in (("rl", "-"), ("rl_open", "--")):
+        files = sorted(options.folder.glob(f"seed_*/{POLICIES[name]}.csv"))
+        if files:
+            tables = [read_table(f, ["global_step", "charts/velocity_error"]) for f in files]
+            million_steps = tables[0]["global_step"] / 1e6
+            errors = np.array([table["charts/velocity_error"] for table in tables])
+            label = f"{NAMES[name]}, {len(files)} seeds"
+            axes.plot(million_steps, errors.mean(axis=0), style, color="black", label=label)
+            axes.fill_between(million_steps, errors.min(axis=0), errors.max(axis=0), alpha=0.3)
+    axes.set(xlabel="environment steps [million]", ylabel="velocity error [m/s]", yscale="log")
+    axes.legend()
+    figure.savefig(options.folder / "seeds.svg", metadata={"Date": None})
 
 
 def main(options: Options) -> None:
@@ -100,6 +121,7 @@ def main(options: Options) -> None:
         reproduce.side_by_side(jobs, {})
     rows = score(options)
     write_json(options.folder / "seeds.json", rows)
+    draw(options)
     columns = [key for key in rows[0] if key not in ("controller", "seed")]
     print(f"{'mean (largest less smallest)':34}", *(f"{column:>22}" for column in columns))
     for name in dict.fromkeys(row["controller"] for row in rows):

@@ -1,6 +1,6 @@
 """The commands of the method: from logs to nets, policies, comparisons and the report.
 
-What trains is imported by the command that runs it: help must not wait for torch.
+What trains or draws is imported by the command that runs it: help must not wait for it.
 """
 
 import sys
@@ -33,7 +33,7 @@ from brokk_min.cli.settings import (
     make_config,
 )
 from brokk_min.env import TaskConfig
-from brokk_min.evaluation import baselines, figures, metrics, perfect_model, sequences
+from brokk_min.evaluation import baselines, metrics, perfect_model, sequences
 from brokk_min.evaluation.claims import VERDICTS
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.identification import excitation, validation
@@ -80,6 +80,7 @@ class Fit(Command):
     settings: OmitArgPrefixes[FitSettings] = field(default_factory=FitSettings)
 
     def __call__(self) -> None:
+        from brokk_min.evaluation import figures
         from brokk_min.identification.fitting import fit
 
         if not self.logs:
@@ -403,7 +404,7 @@ class Preliminary(Command):
     out: Path = Path("preliminary")  # Folder for figures and preliminary.json.
 
     def __call__(self) -> None:
-        from brokk_min.evaluation import preliminary
+        from brokk_min.evaluation import figures, preliminary
 
         machine = self.check({self.out / "preliminary.json": "preliminary"})
         with located(self.actuator):

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import Bounds, OptimizeResult, differential_evolution
 from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet
@@ -195,6 +194,8 @@ def tune(
     gains; gains that are 0 stay so. `cost` is that (candidates,) of a controller with one row of
     gains per candidate.
     """
+    from scipy.optimize import differential_evolution  # slow to import, and only needed here
+
     machine = controller.machine
     start = fractions_of(machine, controller.gains)
     searched = gains_vector(controller.gains) > 0
@@ -213,13 +214,13 @@ def tune(
 
     with tqdm(total=generations, desc=f"tune {label}", unit="generation", disable=None) as bar:
 
-        def record(intermediate_result: OptimizeResult) -> None:
+        def record(intermediate_result: Any) -> None:
             costs.append(float(intermediate_result.fun))
             bar.update()
 
         first = np.clip(first, 0, 1)[:, searched]
         options = SEARCH | {"init": first, "maxiter": generations, "rng": seed}
-        bounds = Bounds(np.zeros(first.shape[1]), np.ones(first.shape[1]))
+        bounds = [(0.0, 1.0)] * first.shape[1]
         result = differential_evolution(objective, bounds, callback=record, **options)
     x = np.zeros(len(start))
     x[searched] = result.x

@@ -8,7 +8,6 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.linalg import norm
 from numpy.typing import NDArray
-from scipy import stats
 from tqdm import tqdm
 
 from brokk_min import __version__
@@ -240,10 +239,12 @@ def interval(values: Array) -> list[float | None]:
         >>> [round(end, 3) for end in interval(np.array([1.0, 2.0, 3.0]))]
         [-0.484, 4.484]
     """
+    from scipy.special import stdtrit  # Student's t quantile; slow to import
+
     values = values[np.isfinite(values)]
     if len(values) < 2:
         return [None, None]
-    half = stats.t.ppf(0.975, len(values) - 1) * values.std(ddof=1) / math.sqrt(len(values))
+    half = stdtrit(len(values) - 1, 0.975) * values.std(ddof=1) / math.sqrt(len(values))
     return [float(values.mean() - half), float(values.mean() + half)]
 
 
