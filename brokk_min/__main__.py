@@ -13,7 +13,7 @@ from typing import Any
 import tyro
 
 from brokk_min import __version__
-from brokk_min.cli import commands, operating
+from brokk_min.cli import commands, operating, porting
 from brokk_min.cli.options import WrongUse
 from brokk_min.identification.files import reason
 
@@ -21,6 +21,8 @@ LONGEST = 300  # characters of an error
 COMMANDS: dict[str, Callable[..., Any]] = {
     "collect": commands.Collect,
     "fit": commands.Fit,
+    "score": porting.Score,
+    "inspect": porting.Inspect,
     "preliminary": commands.Preliminary,
     "train": commands.GradientTrain,
     "sweep": commands.GradientSweep,

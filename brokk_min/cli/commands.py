@@ -3,6 +3,7 @@
 What trains or draws is imported by the command that runs it: help must not wait for it.
 """
 
+import math
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -36,7 +37,7 @@ from brokk_min.env import TaskConfig
 from brokk_min.evaluation import baselines, metrics, perfect_model, sequences
 from brokk_min.evaluation.claims import VERDICTS
 from brokk_min.evaluation.rollout import Controller
-from brokk_min.identification import excitation, validation
+from brokk_min.identification import excitation, inspection, validation
 from brokk_min.identification.files import SHIPPED, brief, located, write_json
 from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
 from brokk_min.identification.logs import Log, Recording, driven, read_log, write_log
@@ -77,6 +78,7 @@ class Fit(Command):
     machine: MachineName = ""  # Of LOGS; by default the usual one, if LOGS has its joints.
     velocity_samples: Samples | None = None  # Window of velocities; by default the machine's.
     paper: bool = False  # The paper's recipe: errors of one step, no noise, plain commands.
+    curve: bool = False  # Also score nets fitted to an eighth, a quarter, a half of the recordings.
     settings: OmitArgPrefixes[FitSettings] = field(default_factory=FitSettings)
 
     def __call__(self) -> None:
@@ -94,11 +96,22 @@ class Fit(Command):
             expected = f"expected those of --machine {self.machine}"
             raise ValueError(f"{self.logs[0]}: joints: {expected}, got {brief(log.joints)}")
         config = make_config(FitConfig, self._settings(known, machine.history))
+        reports = inspection.inspect(log)
         with located(*self.logs):
+            inspection.check_signs(reports)
             net = fit(log, config, self.seed, samples, known.name if known else "")
         with located(*self.test, *self.logs):
             scores = validation.validate(net, log, test, known)
+        for name, scored in scores["joints"].items():
+            if "one_step_rmse" not in scored:
+                scores["warnings"].append(f"{name}: not driven in the test: no score")
+        scores["warnings"] += inspection.warnings(log, reports, known)
         save_net(self.out, net)
+        if self.curve:
+            parts = [part_of(log, part) for part in (1 / 8, 1 / 4, 1 / 2)]
+            nets = [fit(part, config, self.seed, samples) for part in parts]
+            curve = [validation.score(one, test) for one in [*nets, net]]
+            scores["curve"] = learning_curve([*parts, log], curve)
         if self.json:
             write_json(self.json, {"meta": self._meta(net), **scores})
         if self.figure:
@@ -106,6 +119,11 @@ class Fit(Command):
         name = net.machine or "no known machine"
         print(f"nets of {name}, dead zone {net.dead_zone} of full command")
         print_scores(scores)
+        for point in scores.get("curve", []):
+            errors_5_s = ", ".join(f"{k} {v:.4f}" for k, v in point["free_run_rmse"].items())
+            print(
+                f"fitted to {point['minutes']:.1f} minutes: free runs of 5 s [rad/s]: {errors_5_s}"
+            )
 
     def _read(self, machine: Machine, samples: int) -> tuple[Log, Log]:
         """Recordings to fit to and to score on."""
@@ -137,10 +155,7 @@ def split(log: Log) -> tuple[Log, Log]:
 
     ValueError: no two recordings drive the same joints.
     """
-    groups: dict[tuple[bool, ...], list[int]] = {}
-    for i, recording in enumerate(log.recordings):
-        groups.setdefault(tuple(driven(recording).tolist()), []).append(i)
-    held_out = {i for group in groups.values() if len(group) > 1 for i in group[::10]}
+    held_out = {i for group in same_joints(log) if len(group) > 1 for i in group[::10]}
     if not held_out:
         expected = "expected two or more that drive the same joints, or --test, to score on"
         raise ValueError(f"recordings: {expected}, got {len(log.recordings)}")
@@ -149,6 +164,31 @@ def split(log: Log) -> tuple[Log, Log]:
         parts[i in held_out].append(recording)
     kept, test = (log._replace(recordings=tuple(part)) for part in parts)
     return kept, test
+
+
+def same_joints(log: Log) -> list[list[int]]:
+    """Indices of recordings that drive the same joints, group by group."""
+    groups: dict[tuple[bool, ...], list[int]] = {}
+    for i, recording in enumerate(log.recordings):
+        groups.setdefault(tuple(driven(recording).tolist()), []).append(i)
+    return list(groups.values())
+
+
+def part_of(log: Log, part: float) -> Log:
+    """The first recordings of each joint, a `part` of them and at least one."""
+    kept = [i for group in same_joints(log) for i in group[: math.ceil(part * len(group))]]
+    return log._replace(recordings=tuple(log.recordings[i] for i in sorted(kept)))
+
+
+def learning_curve(logs: list[Log], scores: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Minutes of each log, and the errors of 5 s free runs [rad/s] of the nets fitted to it."""
+    curve = []
+    for log, joints in zip(logs, scores, strict=True):
+        minutes = sum(len(recording.q) for recording in log.recordings) / log.rate / 60
+        runs = {name: joint["free_run"].get("5") for name, joint in joints.items()}
+        errors = {name: run["velocity_rmse"] for name, run in runs.items() if run}
+        curve.append({"minutes": minutes, "free_run_rmse": errors})
+    return curve
 
 
 def print_scores(scores: dict[str, Any]) -> None:

@@ -56,6 +56,7 @@ CONTENTS = {
     "policy": {"header", "net_header"},
     "curve": {"global_step"},
     "scores": {"meta", "joints"},
+    "inspection": {"meta", "recordings"},
     "runs": {"meta", "runs"},
     "gains": {"meta", "gains"},
     "sweep": {"meta", "table"},

@@ -1,0 +1,191 @@
+"""What a log tells of its machine, and what it cannot tell: joint by joint, before any fit.
+
+A small model of each joint is fitted by a search over a grid: its command, later by a delay, less a
+dead zone of each direction, times a gain of each direction, through a first-order lag.
+
+    q_dot' = (g_up max(u(t - d) - z_up, 0) - g_down max(-u(t - d) - z_down, 0) - q_dot) / tau
+"""
+
+from dataclasses import asdict, dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+from scipy.signal import lfilter
+
+from brokk_min.identification.logs import COMMANDED, Log, Recording, driven
+from brokk_min.machine import Array, Machine
+
+LARGEST_ZONE = 0.4  # of full command, assumed
+ZONES = np.arange(0, LARGEST_ZONE, 0.005)
+TAUS = (0.05, 0.1, 0.2, 0.4)  # s, assumed
+LATEST = 0.4  # s, assumed: longest delay
+SAMPLES = 20_000  # of a joint that are used
+LEVELS = 8  # of commands from 0 to the largest, by direction
+# What a log must have for its score to hold in other driving, all assumed.
+LEAST_MINUTES = 10.0
+LEAST_RANGE = 0.7  # of a joint's range
+LEAST_LEVELS = 6  # with 1 % of the commands or more
+LEAST_CHANGES = 0.05  # of the ticks: commands that change by more than a tenth of the largest
+CLOSED_LOOP = -0.42  # `feedback`: excitations give -0.4 to 0, a driver of positions -0.6 to -0.5
+LEAST_FIT = 0.2  # of the velocities' variance that the model explains, or it tells nothing
+
+
+@dataclass(frozen=True)
+class JointReport:
+    """One joint of a log; velocities in rad/s, commands of full command."""
+
+    minutes: float  # in recordings in which it is driven
+    alone: float  # part of its commanded time without commands of other joints
+    together: dict[str, float]  # part with commands of each other joint
+    low: float  # rad, smallest angle
+    high: float  # rad
+    levels: tuple[int, int]  # of `LEVELS` commands up and down that the log has
+    changes: float  # part of the ticks at which the command changes fast
+    feedback: float  # correlation of commands with the angle a second before
+    explained: float  # part of the velocities' variance that the model explains
+    sign: int  # of velocity under a positive command; 0: the model tells nothing
+    delay: float  # s
+    tau: float  # s
+    dead_zone_up: float
+    dead_zone_down: float
+    gain_up: float  # rad/s per full opening
+    gain_down: float
+
+
+def inspect(log: Log) -> dict[str, JointReport]:
+    """A report of each joint that is driven in a log, at the log's rate."""
+    reports = {}
+    for j, name in enumerate(log.joints):
+        recordings = [one for one in log.recordings if driven(one)[j]]
+        if recordings:
+            reports[name] = inspect_joint(log, recordings, j)
+    return reports
+
+
+def inspect_joint(log: Log, recordings: list[Recording], j: int) -> JointReport:
+    """The report of joint `j` from the recordings that drive it."""
+    u = np.concatenate([recording.u for recording in recordings])
+    q = np.concatenate([recording.q[:, j] for recording in recordings])
+    moving = np.abs(u) > COMMANDED
+    own = moving[moving[:, j]]
+    others = [i for i in range(len(log.joints)) if i != j]
+    largest = max(np.abs(u[:, j]).max(), 1e-9)
+    level = np.floor(LEVELS * np.abs(u[:, j]) / largest).clip(0, LEVELS - 1)
+    sides = [level[side * u[:, j] > COMMANDED] for side in (1, -1)]
+    counts = [np.bincount(side.astype(int), minlength=LEVELS) for side in sides]
+    levels = [int((count > 0.01 * max(count.sum(), 1)).sum()) for count in counts]
+    changes = [np.abs(np.diff(one.u[:, j])) > 0.1 * largest for one in recordings]
+    return JointReport(
+        minutes=len(u) / log.rate / 60,
+        alone=float(1 - own[:, others].any(axis=1).mean()) if len(own) else 1.0,
+        together={log.joints[i]: float(own[:, i].mean()) if len(own) else 0.0 for i in others},
+        low=float(q.min()),
+        high=float(q.max()),
+        levels=(levels[0], levels[1]),
+        changes=float(np.concatenate(changes).mean()),
+        feedback=feedback(recordings, j, log.rate),
+        **joint_model(recordings, j, log.rate),
+    )
+
+
+def joint_model(recordings: list[Recording], j: int, rate: float) -> dict[str, Any]:
+    """Fields of `JointReport` by the model above: the best of a grid, then of the dead zones."""
+    u = np.concatenate([one.u[:, j] for one in recordings])[:SAMPLES]
+    q = np.concatenate([one.q[:, j] for one in recordings])[:SAMPLES]
+    velocity = np.diff(q, append=q[-1]) * rate
+    seams = np.cumsum([len(one.q) for one in recordings])
+    velocity[seams[seams <= len(q)] - 1] = 0.0  # no velocity from one recording to the next
+    zones = [0.05, 0.05]
+    for _ in range(2):
+        grid = product(range(round(LATEST * rate) + 1), TAUS)
+        delay, tau = min(grid, key=lambda one: residual(u, velocity, rate, *one, *zones)[0])
+        for side in (0, 1, 0, 1):
+            trials = [[*zones[:side], zone, *zones[side + 1 :]] for zone in ZONES]
+            zones = min(trials, key=lambda one: residual(u, velocity, rate, delay, tau, *one)[0])
+    error, gains = residual(u, velocity, rate, delay, tau, *zones)
+    explained = 1 - error / max(float(velocity @ velocity), 1e-12)
+    sign = int(np.sign(gains.sum())) if explained > LEAST_FIT else 0
+    return {
+        **{"explained": explained, "sign": sign, "delay": delay / rate, "tau": tau},
+        **{"dead_zone_up": float(zones[0]), "dead_zone_down": float(zones[1])},
+        **{"gain_up": float(gains[0]), "gain_down": float(gains[1])},
+    }
+
+
+def residual(
+    u: Array, velocity: Array, rate: float, delay: int, tau: float, up: float, down: float
+) -> tuple[float, Array]:
+    """Sum of the squared errors of the model with the best gains; and these, up and down."""
+    late = np.concatenate([np.zeros(delay), u[: len(u) - delay]])
+    openings = np.stack([np.maximum(late - up, 0), -np.maximum(-late - down, 0)])
+    a = np.exp(-1 / (rate * tau))
+    x = lfilter([1 - a], [1, -a], openings)
+    gains = np.linalg.lstsq(x @ x.T + 1e-9 * np.eye(2), x @ velocity, rcond=None)[0]
+    error = velocity - gains @ x
+    return float(error @ error), gains
+
+
+def feedback(recordings: list[Recording], j: int, rate: float) -> float:
+    """Correlation of the command with the angle a second before it; 0: no command changes.
+
+    A controller or an operator brings a joint back to where it is to be: below `CLOSED_LOOP`. An
+    excitation does not look at the angle.
+    """
+    late = round(rate)
+    u = np.concatenate([one.u[late:, j] for one in recordings])
+    q = np.concatenate([one.q[: max(0, len(one.q) - late), j] for one in recordings])
+    if len(u) < 2 or not np.ptp(u) or not np.ptp(q):
+        return 0.0
+    return float(np.corrcoef(q, u)[0, 1])
+
+
+def check_signs(reports: dict[str, JointReport]) -> None:
+    """ValueError: a joint whose angle falls under positive commands."""
+    for name, report in reports.items():
+        if report.sign < 0:
+            expected = f"expected positive commands to raise q_{name}"
+            got = f"got {report.gain_up:.2f} rad/s per full opening: change the sign of one column"
+            raise ValueError(f"u_{name}: {expected}, {got}")
+
+
+def warnings(
+    log: Log, reports: dict[str, JointReport], machine: Machine | None = None
+) -> list[str]:
+    """Where the log is an operator's work rather than an excitation: its score is of such work."""
+    result = []
+    for name in log.joints:
+        if name not in reports:
+            result.append(f"{name}: never driven in the log")
+            continue
+        r = reports[name]
+        checks = {
+            f"{r.minutes:.1f} minutes": r.minutes < LEAST_MINUTES,
+            f"commands of {r.levels[0]} of {LEVELS} levels up, {r.levels[1]} down": (
+                min(r.levels) < LEAST_LEVELS
+            ),
+            f"fast changes of command in {r.changes:.1%} of the ticks": r.changes < LEAST_CHANGES,
+            f"commands that follow the angle ({r.feedback:.2f})": r.feedback < CLOSED_LOOP,
+        }
+        if machine:
+            joint = machine.joints[machine.names.index(name)]
+            part = (r.high - r.low) / (joint.q_max - joint.q_min)
+            checks[f"{part:.0%} of the range"] = part < LEAST_RANGE
+        found = [text for text, bad in checks.items() if bad]
+        if found:
+            result.append(f"{name}: {', '.join(found)}: scores hold for such driving alone")
+    return result
+
+
+def report_json(log: Log, machine: Machine | None = None) -> dict[str, Any]:
+    """All reports of a log, its warnings and its gaps, for JSON."""
+    reports = inspect(log)
+    gaps = sum("#" in recording.name for recording in log.recordings)
+    return {
+        "rate": log.rate,
+        "recordings": len(log.recordings),
+        "gaps": gaps,
+        "velocity_logged": log.velocity_logged,
+        "joints": {name: asdict(report) for name, report in reports.items()},
+        "warnings": warnings(log, reports, machine),
+    }

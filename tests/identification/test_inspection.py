@@ -1,0 +1,168 @@
+"""What a log tells: known joints are found again, and an operator's work is no excitation."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from itertools import count
+
+import numpy as np
+import pytest
+from helpers_cli import run
+
+from brokk_min.identification.inspection import (
+    CLOSED_LOOP,
+    check_signs,
+    feedback,
+    inspect,
+    warnings,
+)
+from brokk_min.identification.logs import Log, Recording, velocity_of, write_log
+from brokk_min.machine import BROKK_170
+
+TRUE = {  # dead zones, gains [rad/s per full opening], delay [ticks of 0.05 s], tau [s]
+    "boom": (0.12, 0.20, 0.5, 0.3, 2, 0.1),
+    "arm": (0.05, 0.09, -0.4, -0.8, 5, 0.2),
+}
+NUMBERS = count()
+
+
+def respond(name, u):
+    """Angles [rad] of a joint of `TRUE` under the commands u (T,), in counts of 14 bits."""
+    up, down, gain_up, gain_down, delay, tau = TRUE[name]
+    late = np.concatenate([np.zeros(delay), u])[: len(u)]
+    wanted = gain_up * np.maximum(late - up, 0) - gain_down * np.maximum(-late - down, 0)
+    q = q_dot = 0.0
+    angles = []
+    for v in wanted:
+        angles.append(q)
+        q_dot += (1 - np.exp(-0.05 / tau)) * (v - q_dot)
+        q += 0.05 * q_dot
+    step = 2 * np.pi / 2**14
+    return np.rint(np.array(angles) / step) * step
+
+
+def record(name, commands):
+    """A recording in which one joint of `TRUE` is driven."""
+    j = list(TRUE).index(name)
+    u, q = np.zeros((2, len(commands), len(TRUE)))
+    u[:, j], q[:, j] = commands, respond(name, commands)
+    return Recording(f"{name} {next(NUMBERS)}", u, q, velocity_of(q, 4))
+
+
+def holds(rng, ticks=4000):
+    return np.repeat(rng.uniform(-0.6, 0.6, ticks // 8), 8)
+
+
+def excited(names=TRUE):
+    rng = np.random.default_rng(0)
+    return Log(tuple(TRUE), tuple(record(name, holds(rng)) for name in names for _ in range(4)))
+
+
+def operator(rng, ticks=4000):
+    """Commands of somebody who moves a joint slowly between two places that he looks at."""
+    u, command, angle = [], 0.0, 0.0
+    for tick in range(ticks):
+        far = 0.3 * (-1) ** (tick // 160) - angle
+        command += 0.1 * (np.clip(2.0 * far, -0.4, 0.4) - command)
+        angle += 0.05 * (0.5 * max(command - 0.12, 0) - 0.3 * max(-command - 0.2, 0))
+        u.append(command)
+    return np.array(u) + 0.001 * rng.standard_normal(ticks)
+
+
+def test_inspect__finds_what_is_true():
+    reports = inspect(excited())
+    for name, (up, down, gain_up, gain_down, delay, tau) in TRUE.items():
+        report = reports[name]
+        assert report.sign == np.sign(gain_up) and report.explained > 0.9
+        assert report.delay == pytest.approx(0.05 * delay, abs=0.051)
+        assert (report.dead_zone_up, report.dead_zone_down) == pytest.approx((up, down), abs=0.02)
+        assert (report.gain_up, report.gain_down) == pytest.approx((gain_up, gain_down), rel=0.1)
+        assert report.tau == pytest.approx(tau, abs=0.1)
+        assert report.minutes == pytest.approx(4 * 4000 / 20 / 60)
+        assert report.alone == 1 and report.levels == (8, 8)
+
+
+def test_inspect__leaves_out_joints_that_are_never_driven():
+    log = excited(["boom"])
+    reports = inspect(log)
+    assert list(reports) == ["boom"]
+    assert warnings(log, reports) == ["arm: never driven in the log"]
+
+
+def test_inspect__tells_which_joints_are_driven_together():
+    rng = np.random.default_rng(1)
+    boom, arm = (record(name, holds(rng, 400)) for name in TRUE)
+    both = Recording("both", boom.u + arm.u, boom.q + arm.q, boom.q_dot + arm.q_dot)
+    report = inspect(Log(tuple(TRUE), (both, boom)))["boom"]
+    assert report.alone == pytest.approx(0.5, abs=0.05)
+    assert report.together["arm"] == pytest.approx(0.5, abs=0.05)
+
+
+def test_check_signs__refuses_a_reversed_command():
+    reports = inspect(excited())
+    check_signs({"boom": reports["boom"]})
+    with pytest.raises(ValueError, match=r"^u_arm: expected positive commands to raise q_arm, got"):
+        check_signs(reports)
+
+
+def test_warnings__know_an_operators_work_from_an_excitation():
+    rng = np.random.default_rng(2)
+    work = Log(tuple(TRUE), tuple(record("boom", operator(rng)) for _ in range(4)))
+    (about, _) = warnings(work, inspect(work))
+    assert about.startswith("boom: ") and "fast changes of command in " in about
+    assert about.endswith("scores hold for such driving alone")
+    log = excited(["boom"])
+    assert len(warnings(log, inspect(log))) == 1  # the arm alone
+
+
+def test_feedback__tells_closed_loop_from_open_loop():
+    rng = np.random.default_rng(2)
+    goals, q, u = np.repeat(rng.uniform(-1, 1, 100), 80), [0.0], []
+    for goal in goals:
+        u.append(2.0 * (goal - q[-1]))
+        q.append(q[-1] + 0.05 * 0.5 * u[-1])
+    closed = Recording("", np.array(u)[:, None], np.array(q[:-1])[:, None], np.zeros((8000, 1)))
+    assert feedback([closed], 0, 20.0) < CLOSED_LOOP
+    assert feedback([record("boom", holds(rng))], 0, 20.0) > CLOSED_LOOP
+
+
+def test_warnings__know_the_range_of_a_machine():
+    log = excited(["boom"])._replace(joints=("q1", "q3"))  # q1: 4.3 rad
+    reports = inspect(log)
+    reports["q1"] = replace(reports["q1"], low=-1.0, high=1.0)
+    about, _ = warnings(log, reports, BROKK_170)
+    assert about == "q1: 47% of the range: scores hold for such driving alone"
+
+
+def test_commands__print_what_a_log_tells_and_refuse_reversed_commands(tmp_path, capsys):
+    write_log(tmp_path / "log.npz", excited())
+    assert run(f"inspect '{tmp_path}/log.npz' --json '{tmp_path}/i.json'") == 0
+    printed = capsys.readouterr().out
+    assert "8 recordings, 0 begin after a gap; q_dot estimated" in printed
+    report = json.loads((tmp_path / "i.json").read_text())
+    assert report["joints"]["arm"]["sign"] == -1
+    assert run(f"fit '{tmp_path}/log.npz' --steps 1 --out '{tmp_path}/n.npz'") == 1
+    assert "log.npz: u_arm: expected positive commands to raise q_arm" in capsys.readouterr().err
+    assert run("inspect") == 2
+
+
+def test_score__scores_nets_on_other_logs_and_fit_has_a_learning_curve(tmp_path, capsys):
+    log = excited(["boom"] * 3)
+    log = Log(
+        ("boom",), tuple(Recording(r.name, *(x[:400, :1] for x in r[1:])) for r in log.recordings)
+    )
+    write_log(tmp_path / "log.npz", log._replace(recordings=log.recordings[:8]))
+    write_log(tmp_path / "test.npz", log._replace(recordings=log.recordings[8:]))
+    fit = f"fit '{tmp_path}/log.npz' --test '{tmp_path}/test.npz' --steps 60 --curve"
+    assert run(f"{fit} --out '{tmp_path}/n.npz' --json '{tmp_path}/f.json'") == 0
+    scores = json.loads((tmp_path / "f.json").read_text())
+    minutes = [point["minutes"] for point in scores["curve"]]
+    np.testing.assert_allclose(np.array(minutes) / minutes[-1], [1 / 8, 1 / 4, 1 / 2, 1], rtol=0.03)
+    assert all("boom" in point["free_run_rmse"] for point in scores["curve"])
+    printed = capsys.readouterr().out
+    assert printed.count("fitted to ") == 4 and "minutes" in printed
+    assert run(f"score '{tmp_path}/n.npz' '{tmp_path}/test.npz' --json '{tmp_path}/s.json'") == 0
+    again = json.loads((tmp_path / "s.json").read_text())
+    for key in ("one_step_rmse", "persistence_rmse", "free_run"):
+        assert again["joints"]["boom"][key] == scores["joints"]["boom"][key]
