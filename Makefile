@@ -1,5 +1,6 @@
 # Two commands: `make reproduce` runs the whole chain, `make test` passes the tests.
-# Both set up a virtual environment in .venv on first use and need no network after that.
+# `make docs` writes what pages draw from code and measurements.
+# They set up a virtual environment in .venv on first use and need no network after that.
 # PYTHON: the first Python from 3.11 on that can make one; `make PYTHON=...` names another.
 SUITABLE := import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))
 NAMES := python3.11 python3.12 python3.13 python3.14 python3 python
@@ -9,7 +10,7 @@ OUT ?= $(if $(QUICK),results-quick,results)
 RUN := .venv/bin/python -m
 QUICK ?=
 
-.PHONY: reproduce test check lint bench clean
+.PHONY: reproduce test check lint bench docs clean
 .DELETE_ON_ERROR:
 
 reproduce: .venv/installed
@@ -30,6 +31,12 @@ lint: .venv/installed-dev
 
 bench: .venv/installed-dev
 	$(RUN) benchmarks.rollout
+
+docs: .venv/installed-dev
+	.venv/bin/python tests/paper/test_docs.py
+	.venv/bin/python tests/paper/test_paper.py
+	.venv/bin/python tests/paper/test_walkthrough.py
+	.venv/bin/python docs/annotated.py
 
 .venv/bin/python:
 	$(if $(PYTHON),,$(error PYTHON: expected Python 3.11 or newer with venv, found none of $(NAMES)))

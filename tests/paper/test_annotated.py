@@ -1,0 +1,116 @@
+"""docs/annotated.md is what its template, the code, PAPER.md and the shipped files give today."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import re
+import runpy
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from brokk_min import env
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+PAGE = (DOCS / "annotated.md").read_text()
+PAPER = (ROOT / "PAPER.md").read_text()
+CODE = re.compile(
+    r"^\[`[\w.]+`\]\(\.\./(\S*)#L(\d+)(?:-L(\d+))?\):\n\n^```python\n(.*?)^```$", re.M | re.S
+)
+FORMULA = re.compile(r"^\$\$(.*)\$\$$", re.M)
+MAKER = runpy.run_path(str(DOCS / "annotated.py"))
+
+
+@pytest.fixture(scope="module")
+def numbers() -> dict[str, Any]:
+    return runpy.run_path(str(DOCS / "annotated_numbers.py"))
+
+
+def test_page__is_what_the_sources_give() -> None:
+    assert MAKER["render"]() == PAGE, "run `make docs`"
+
+
+def test_numbers__are_of_the_shipped_files(numbers: dict[str, Any]) -> None:
+    measured = json.loads((DOCS / "annotated.json").read_text())
+    message = "run `python docs/annotated_numbers.py`, then `make docs`"
+    assert measured["files"] == numbers["fingerprints"](), message
+    again = numbers["sample"](numbers["controllers"]()[0])
+    assert measured["sample"] == pytest.approx(again, rel=0.02), message
+
+
+def test_code__is_lines_of_its_file() -> None:
+    found = CODE.findall(PAGE)
+    assert len(found) == PAGE.count("```python") >= 25
+    for path, first, last, block in found:
+        lines = [line.strip() for line in (ROOT / path).read_text().splitlines()]
+        shown = [line.strip() for line in block.splitlines() if line != "..."]
+        assert shown[0] == lines[int(first) - 1]
+        assert shown[-1] == lines[int(last or first) - 1]
+        assert set(shown) <= set(lines[int(first) - 1 : int(last or first)]) | {""}
+
+
+def test_code__without_parts_is_the_definition_without_its_docstring() -> None:
+    source = textwrap.dedent(inspect.getsource(env.reward))
+    wanted = source.replace(f'    """{env.reward.__doc__}"""\n', "")
+    assert wanted in MAKER["code"]("env.reward")
+    assert '"""' not in wanted
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("nowhere.f",), "nowhere.f: expected one module nowhere, got []"),
+        (("env.nothing",), "env.nothing: expected one nothing in env.py, got 0"),
+        (("env.reward", ["gone"]), "env.reward: expected one line with 'gone', got 0"),
+        (("env.step", ["error"]), "env.step: expected one line with 'error', got "),
+    ],
+)
+def test_code__refuses_what_is_not_there_once(arguments: tuple[Any, ...], message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        MAKER["code"](*arguments)
+
+
+def test_page__has_all_that_the_paper_numbers_and_each_deviation() -> None:
+    rows = re.findall(r"^\| (eq\d|Table \d|Fig\. \d[a-h]?|Sec\. [\d.]+\d?) \|", PAPER, re.M)
+    assert len(set(rows)) > 30
+    named = set(re.findall(r"eq\d|Table \d|Fig\. \d|Sec\. \d(?:\.\d)?", PAGE))
+    for figure, first, last in re.findall(r"\b(\d)([a-h])\b(?: to \d([a-h])\b)?", PAGE):
+        panels = "abcdefgh"
+        end = panels.index(last or first) + 1
+        named |= {f"Fig. {figure}{panel}" for panel in panels[panels.index(first) : end]}
+    assert set(rows) <= named, set(rows) - named
+    deviations = re.findall(r"^\| (D\d+) \|", PAPER, re.M)
+    assert re.findall(r"\*\*Deviation \[(D\d+)\]", PAGE)
+    assert sorted(re.findall(r"\*\*Deviation \[(D\d+)\]", PAGE)) == sorted(deviations)
+
+
+def test_formulas__survive_markdown() -> None:
+    """Markdown takes a backslash before punctuation as an escape, and * as emphasis."""
+    formulas = FORMULA.findall(PAGE)
+    assert len(formulas) == PAGE.count("$$") / 2 >= 15
+    for formula in formulas:
+        assert not re.search(r"\\[^A-Za-z ]|\*", formula), formula
+        assert formula.count("{") == formula.count("}"), formula
+    assert not re.search(r"[^\n]\n\$\$|\$\$\n[^\n]", PAGE)  # a paragraph of its own
+
+
+def test_page__takes_a_quarter_of_an_hour() -> None:
+    lines = [line for *_, block in CODE.findall(PAGE) for line in block.splitlines()]
+    words = CODE.sub("", FORMULA.sub("", PAGE)).split()
+    assert len(words) / 200 + len(lines) / 30 + len(FORMULA.findall(PAGE)) / 6 < 15
+
+
+@pytest.mark.parametrize(
+    "page", [*sorted(DOCS.glob("*.md")), ROOT / "README.md"], ids=lambda p: p.name
+)
+def test_anchors__are_headings_of_their_page(page: Path) -> None:
+    """As GitHub makes them: lower case, without punctuation, hyphens for spaces."""
+    for target, anchor in re.findall(r"\]\(([\w./]*\.md)?#([^)]+)\)", page.read_text()):
+        text = (page.parent / target).read_text() if target else page.read_text()
+        headings = re.findall(r"^#+ (.*)$", text, re.M)
+        slugs = [re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings]
+        assert slugs.count(anchor) == 1, (target, anchor)
