@@ -1,7 +1,8 @@
 """Measure the numbers of docs/annotated.md: `python docs/annotated_numbers.py`, two minutes.
 
 They are of the shipped policies, nets and gains on the analytic plant. Numbers go to
-annotated.json, figures to figures/.
+annotated.json, figures to figures/. `--if-changed`: only if the shipped files are others than
+those of annotated.json.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -152,4 +154,7 @@ def measure() -> dict[str, Any]:
 
 
 if __name__ == "__main__":
+    same = NUMBERS.exists() and json.loads(NUMBERS.read_text())["files"] == fingerprints()
+    if same and "--if-changed" in sys.argv:
+        sys.exit()
     NUMBERS.write_text(json.dumps(rounded(measure()), indent=1) + "\n")
