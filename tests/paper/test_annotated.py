@@ -99,9 +99,10 @@ def test_formulas__survive_markdown() -> None:
 
 
 def test_page__takes_a_quarter_of_an_hour() -> None:
+    """At 220 words, 30 lines of code or 8 formulas a minute."""
     lines = [line for *_, block in CODE.findall(PAGE) for line in block.splitlines()]
-    words = CODE.sub("", FORMULA.sub("", PAGE)).split()
-    assert len(words) / 200 + len(lines) / 30 + len(FORMULA.findall(PAGE)) / 6 < 15
+    words = re.findall(r"\S*[A-Za-z]\S*", CODE.sub("", FORMULA.sub("", PAGE)))
+    assert len(words) / 220 + len(lines) / 30 + len(FORMULA.findall(PAGE)) / 8 < 15
 
 
 @pytest.mark.parametrize(
