@@ -11,10 +11,10 @@ from helpers_bus import START, ConstantCommand, World
 from brokk_min.can.drive_log import Telemetry
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer.control_process import (
-    PipedDrive,
-    PipedOperator,
     Request,
     SelectedController,
+    WindowDrive,
+    WindowOperator,
     receive_telemetry,
 )
 from brokk_min.viewer.input_handler import InputHandler
@@ -67,9 +67,9 @@ class PipedLoop:
     def __init__(self, *controllers, log=None):
         self.connection, there = multiprocessing.Pipe()
         self.world = World(ConstantCommand(), lambda driving, ready: None, log=log)
-        operator = PipedOperator(BROKK_170, there, lambda: self.world.t)
+        operator = WindowOperator(BROKK_170, there, lambda: self.world.t)
         selected = SelectedController(BROKK_170, controllers, operator)
-        self.world.drive = PipedDrive(BROKK_170, selected, self.world.bus, operator)
+        self.world.drive = WindowDrive(BROKK_170, selected, self.world.bus, operator)
         self.ticks = []
         self.request(False)
         self.world.drive.begin()

@@ -48,27 +48,15 @@ class Request(NamedTuple):
 
 
 class WindowOperator:
-    """The operator of a loop in the window's process: the newest request."""
-
-    def __init__(self, machine: Machine) -> None:
-        none = np.zeros(len(machine.driven))
-        self.request = Request(-np.inf, 0, False, False, np.zeros(3), none)
-
-    def __call__(self, driving: bool, ready: bool) -> OperatorInput:
-        """The operator's input in this tick."""
-        x, y, z = self.request.v_goal.tolist()
-        return OperatorInput((x, y, z), self.request.enable, self.request.alive)
-
-
-class PipedOperator(WindowOperator):
-    """The operator at the other end of a pipe; a closed pipe stops the loop."""
+    """The operator of the loop: the newest request; a closed pipe stops the loop."""
 
     def __init__(
         self, machine: Machine, connection: Any, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        super().__init__(machine)
         self.connection = connection
         self.clock = clock
+        none = np.zeros(len(machine.driven))
+        self.request = Request(-np.inf, 0, False, False, np.zeros(3), none)
 
     @property
     def silent(self) -> bool:
@@ -84,7 +72,8 @@ class PipedOperator(WindowOperator):
             return OperatorInput(stop=True)
         if self.silent:
             return OperatorInput(alive=False)
-        return super().__call__(driving, ready)
+        x, y, z = self.request.v_goal.tolist()
+        return OperatorInput((x, y, z), self.request.enable, self.request.alive)
 
 
 class SelectedController:
@@ -116,9 +105,17 @@ class SelectedController:
 
 
 class WindowDrive(Drive):
-    """The 20 Hz loop, with telemetry for a window."""
+    """The 20 Hz loop, which sends telemetry to the window after each tick."""
 
     operator: WindowOperator
+
+    def tick(self) -> bool:
+        """One tick; a window that is silent gets nothing, because a full pipe would block."""
+        more = super().tick()
+        with self.catch_errors():
+            if more and not self.operator.silent:
+                self.operator.connection.send(self.telemetry())
+        return more
 
     def telemetry(self) -> Telemetry:
         """State after a tick."""
@@ -131,20 +128,6 @@ class WindowDrive(Drive):
         return Telemetry(self.ticks, q, q_dot, u, v_goal, *flags, mode, self.lateness)
 
 
-class PipedDrive(WindowDrive):
-    """The loop that sends its telemetry through a pipe after each tick."""
-
-    operator: PipedOperator
-
-    def tick(self) -> bool:
-        """One tick; a window that is silent gets nothing, because a full pipe would block."""
-        more = super().tick()
-        with self.catch_errors():
-            if more and not self.operator.silent:
-                self.operator.connection.send(self.telemetry())
-        return more
-
-
 def control(
     machine: Machine, controllers: Sequence[Controller], options: BusOptions, connection: Any
 ) -> None:
@@ -153,9 +136,9 @@ def control(
     where = (options.interface, options.channel, options.log, used_ids(machine))
     try:
         with open_bus(*where) as bus:
-            operator = PipedOperator(machine, connection)
+            operator = WindowOperator(machine, connection)
             selected = SelectedController(machine, controllers, operator)
-            drive = PipedDrive(machine, selected, bus, operator)
+            drive = WindowDrive(machine, selected, bus, operator)
             drive.begin()
             connection.send(drive.telemetry())  # from now on the window sends requests
             drive.run()

@@ -9,9 +9,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from brokk_min.kinematics import forward_kinematics, jacobian, tool_position, tool_velocity
+from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocity
 from brokk_min.machine import PWM_MAX, Array, Machine
 from brokk_min.viewer.camera import Camera, cameras, close_up, skeleton
 from brokk_min.viewer.shapes import (
@@ -20,6 +19,8 @@ from brokk_min.viewer.shapes import (
     CHISEL,
     contacts,
     half_widths,
+    near_limit,
+    near_singular,
     turret,
     undercarriage,
     unit,
@@ -27,8 +28,6 @@ from brokk_min.viewer.shapes import (
 from brokk_min.viewer.window import BACKGROUND, INK, Box, Canvas, Colour
 
 # all assumed
-NEAR_LIMIT = 0.05  # of a joint's range: nearer to its end is a warning
-NEAR_SINGULAR = 0.1  # of the arm's length [1/rad]: a smaller singular value is a warning
 ARROW = 0.2  # of a view's smaller side: an arrow of the machine's tool speed
 HEAD = 48.0  # px above the views
 FOOT = 44.0  # px below a close-up
@@ -99,7 +98,7 @@ def draw(canvas: Canvas, machine: Machine, scenes: Sequence[Scene]) -> None:
             canvas.line(np.array([[i * width, 12], [i * width, height - 12]]), TRACK, 2)
 
 
-# --- layout and warnings --------------------------------------------------------------------------
+# --- layout ---------------------------------------------------------------------------------------
 
 
 def _layout(box: Box, joints: int, notes: int) -> tuple[Box, Box, Box, tuple[float, float]]:
@@ -122,26 +121,6 @@ def _layout(box: Box, joints: int, notes: int) -> tuple[Box, Box, Box, tuple[flo
     top = (left, upper, 0.38 * width, foot)
     rows = (left + 0.38 * width + 8, upper + 6, 0.62 * width - 16, foot)
     return side, top, rows, (left + 16, HEAD + 34)
-
-
-def near_limit(machine: Machine, q: Array) -> NDArray[np.bool_]:
-    """Is each driven joint within `NEAR_LIMIT` of an end of its range? (..., n)"""
-    low = machine.column("q_min")
-    high = machine.column("q_max")
-    margin = NEAR_LIMIT * (high - low)
-    driven = [joint.driven for joint in machine.joints]
-    return np.asarray(((q < low + margin) | (q > high - margin)) & driven)
-
-
-def near_singular(machine: Machine, q: Array) -> bool:
-    """Is the least singular value of the Jacobian small: is there a direction of hardly any motion?
-
-    Manipulability, the product of all singular values, grows with the radius of a slewing arm.
-    """
-    J = jacobian(forward_kinematics(machine, q))[..., machine.driven]
-    least_singular_value = np.linalg.svd(J, compute_uv=False)[-1]
-    length = np.hypot(machine.column("a"), machine.column("d")).sum()
-    return bool(least_singular_value < NEAR_SINGULAR * length)
 
 
 # --- a panel for each arm -------------------------------------------------------------------------
@@ -189,8 +168,8 @@ def _views(canvas: Canvas, machine: Machine, scene: Scene, side: Box, top: Box) 
         _backdrop(canvas, machine, camera)
         _base(canvas, machine, camera, scene)
         for trace in scene.traces[1:]:
-            other = scene._replace(q=trace.q, colour=trace.colour)
-            _arm(canvas, machine, camera, other, set(), fade=0.4)
+            other = scene._replace(q=trace.q, colour=_pale(trace.colour, 0.4))
+            _arm(canvas, machine, camera, other, set())
         _arm(canvas, machine, camera, scene, set().union(*touching.values()))
         _tool(canvas, machine, camera, scene)
     canvas.clip(None)
@@ -220,8 +199,6 @@ def _backdrop(canvas: Canvas, machine: Machine, camera: Camera) -> None:
     if camera.label == "side" and y0 - camera.scale * machine.ground < lower:
         ground = y0 - camera.scale * machine.ground
         canvas.bar(left, right, (ground + lower) / 2, (lower - ground) / 2, SOIL)
-        foot = 0.25 * unit(machine) * camera.scale  # the machine stands at the height 0
-        canvas.bar(x0 - foot, x0 + foot, (y0 + ground) / 2, (ground - y0) / 2, SOIL)
     columns = np.arange(np.ceil((left - x0) / step), (right - x0) // step + 1)
     rows = np.arange(np.ceil((y0 - lower) / step), (y0 - upper) // step + 1)
     every = np.ceil(34 / step)  # grid lines from one number to the next
@@ -237,6 +214,9 @@ def _backdrop(canvas: Canvas, machine: Machine, camera: Camera) -> None:
             canvas.bar(left, right, y, 0.5, GRID)
         if k % every == 0 and upper + 0.3 * height < y < lower - 40:
             canvas.text(left + 6, y, f"{k * metres + 0.0:g}", 10, MUTED)
+    if y0 < ground < lower:  # the machine stands at the height 0
+        foot = 0.25 * unit(machine) * camera.scale
+        canvas.bar(x0 - foot, x0 + foot, (y0 + ground) / 2, (ground - y0) / 2, SOIL)
     across, up = ("out", "z") if camera.label == "side" else ("y", "x")
     canvas.text(right - 8, lower - 9, f"{across} [m]", 10, MUTED, 1.0)
     canvas.text(left + 6, lower - 26, f"{up} [m]", 10, MUTED)
@@ -254,14 +234,7 @@ def _base(canvas: Canvas, machine: Machine, camera: Camera, scene: Scene) -> Non
         canvas.polygon(far, colour)
 
 
-def _arm(
-    canvas: Canvas,
-    machine: Machine,
-    camera: Camera,
-    scene: Scene,
-    touching: set[int],
-    fade: float = 0.0,
-) -> None:
+def _arm(canvas: Canvas, machine: Machine, camera: Camera, scene: Scene, red: set[int]) -> None:
     """Links, the last one a breaker, and joints; red near a limit and where the arm touches."""
     corners = camera.project(skeleton(machine, scene.q))
     warned = near_limit(machine, scene.q)
@@ -269,7 +242,7 @@ def _arm(
     lengths = np.linalg.norm(np.diff(corners, axis=0), axis=-1)
     links = [i for i in range(2, 2 * machine.n) if lengths[i] > 0.5]
     for i in links:
-        colour = WARNING if i in touching else _pale(scene.colour, 0.2 * (i // 2 % 2) + fade)
+        colour = WARNING if i in red else _pale(scene.colour, 0.2 * (i // 2 % 2))
         along = (corners[i + 1] - corners[i]) / lengths[i]
         across = along[::-1] * (-1, 1)
         parts = [BREAKER, CHISEL] if i == 2 * machine.n - 1 else [BOOM]
@@ -291,7 +264,7 @@ def _tool(canvas: Canvas, machine: Machine, camera: Camera, scene: Scene) -> Non
     if len(scene.path) > 1:
         canvas.line(camera.project(scene.path), PATH, 3)
     if len(scene.trail) > 1:
-        canvas.line(camera.project(scene.trail), _pale(scene.colour, 0.45), 2)
+        canvas.line(camera.project(scene.trail), scene.colour, 2)
     for trace in scene.traces:
         if len(trace.trail) > 1:
             canvas.line(camera.project(trace.trail), trace.colour, 2)
@@ -311,10 +284,10 @@ def _arrow(canvas: Canvas, start: Array, along: Array, colour: Colour) -> None:
     """An arrow; none if it is shorter than its head is wide."""
     length = float(np.hypot(*along))
     if length > 4:
-        unit = along / length
+        direction = along / length
         head = min(11.0, 0.7 * length)
-        neck = start + (length - head) * unit
-        barb = 0.45 * head * np.array([-unit[1], unit[0]])
+        neck = start + (length - head) * direction
+        barb = 0.45 * head * direction[::-1] * (-1, 1)
         canvas.line(np.array([start, neck]), colour, 3)
         canvas.polygon(np.array([start + along, neck + barb, neck - barb]), colour)
 
@@ -347,17 +320,11 @@ def _joint_rows(canvas: Canvas, machine: Machine, scene: Scene, box: Box) -> Non
             canvas.text(angle + length + 8, y, f"{scene.q[i]:+z.2f}", 12, colour)
         if joint.driven:
             counts = float(scene.u[i]) * PWM_MAX
-            _valve_bar(canvas, valve, length, y, counts / machine.pwm_limit, scene.colour)
+            zero = valve + length / 2
+            end = zero + counts / machine.pwm_limit * length / 2
+            canvas.bar(valve, valve + length, y, 6, TRACK)
+            canvas.bar(zero, end, y, 6, scene.colour)
+            canvas.bar(zero - 1, zero + 1, y, 8, INK)
             canvas.text(left + width, y, f"{round(counts):+d}", 12, INK, 1.0)
         else:
             canvas.text(valve, y, "locked", 12, MUTED)
-
-
-def _valve_bar(
-    canvas: Canvas, left: float, length: float, y: float, fraction: float, colour: Colour
-) -> None:
-    """A command, as a fraction of the limit, from the middle of its track."""
-    zero = left + length / 2
-    canvas.bar(left, left + length, y, 6, TRACK)
-    canvas.bar(zero, zero + fraction * length / 2, y, 6, colour)
-    canvas.bar(zero - 1, zero + 1, y, 8, INK)

@@ -14,7 +14,6 @@ import numpy as np
 
 from brokk_min.can.canopen import Frame
 from brokk_min.can.connection import Bus
-from brokk_min.can.drive_log import Telemetry
 from brokk_min.can.operator_input import Script
 from brokk_min.can.simulated_machine import SimulatedMachine
 from brokk_min.evaluation.rollout import Controller
@@ -22,12 +21,7 @@ from brokk_min.hw import Drive
 from brokk_min.identification.files import require
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
-from brokk_min.viewer.control_process import (
-    Request,
-    SelectedController,
-    WindowDrive,
-    WindowOperator,
-)
+from brokk_min.viewer.control_process import SelectedController, WindowDrive, WindowOperator
 
 MOST_TICKS = 2  # for one picture; a window with fewer pictures a second than 10 is in slow motion
 REST = 1.0  # s before and after a line that controllers trace (assumed)
@@ -84,6 +78,7 @@ class Lockstep:
         machine: what moves.
         controllers: see `SelectedController`.
         start: first angles [rad] (n,).
+        connection: to the window, as of `control_process.control`.
         log: of all frames, or None.
         clock: of the window [s].
     """
@@ -93,36 +88,32 @@ class Lockstep:
         machine: Machine,
         controllers: Sequence[Controller],
         start: Array,
+        connection: Any,
         log: Path | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.clock = clock
         self.bus = SimulatedBus(machine, start).open(log)
-        self.operator = WindowOperator(machine)
-        selected = SelectedController(machine, controllers, self.operator)
-        self.drive = WindowDrive(machine, selected, self.bus, self.operator)
+        operator = WindowOperator(machine, connection, clock=lambda: -np.inf)  # never silent
+        selected = SelectedController(machine, controllers, operator)
+        self.drive = WindowDrive(machine, selected, self.bus, operator)
         self.drive.begin()
         self.due = clock()  # s, of the next tick
         self.late = 0.0  # s behind the window's clock
 
-    def send(self, request: Request) -> None:
-        """The operator's input from now on."""
-        self.operator.request = request
-
-    def advance(self) -> Iterator[Telemetry]:
-        """Ticks that are due, `MOST_TICKS` at most; the time of the others is lost."""
+    def advance(self) -> float:
+        """Ticks that are due, `MOST_TICKS` at most; how late the machine is in all [s]."""
         for _ in range(MOST_TICKS):
             if self.clock() >= self.due:
                 self.due += self.drive.machine.dt
                 self.drive.tick()
-                yield self.drive.telemetry()._replace(lateness=self.late)
         lost = max(0.0, self.clock() - self.due)
         self.late += lost
         self.due += lost
+        return self.late
 
     def close(self) -> None:
-        """A last tick, with closed valves."""
-        self.operator.request = WindowOperator(self.drive.machine).request
+        """A last tick, with closed valves: the window has closed its end of the connection."""
         self.drive.tick()
         self.bus.close()
 

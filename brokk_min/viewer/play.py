@@ -5,10 +5,12 @@ The window sends requests to the loop (`control_process`) and shows the telemetr
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from functools import partial
 from itertools import cycle
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
@@ -278,27 +280,31 @@ def play(
     session = Session(machine, controllers, attempts, not options.interface)
     with (
         closing(Window(SIZE, f"brokk_min: {machine.name}")) as window,
-        connect(machine, controllers, options) as (receive, send),
+        connect(machine, list(controllers.values()), options) as (connection, advance),
     ):
+
+        def receive() -> Iterator[Telemetry]:
+            late = advance()
+            for telemetry in control_process.receive_telemetry(connection):
+                yield telemetry if late is None else telemetry._replace(lateness=late)
+
+        send = partial(control_process.send_request, connection)
         show(window, session, receive, send, each_frame)
 
 
 @contextmanager
 def connect(
-    machine: Machine, controllers: Mapping[str, Controller], options: BusOptions
-) -> Iterator[tuple[Callable[[], Iterable[Telemetry]], Callable[[Request], object]]]:
-    """How to receive telemetry and to send requests: in lockstep, or to a process with a bus."""
-    loops = list(controllers.values())
+    machine: Machine, controllers: Sequence[Controller], options: BusOptions
+) -> Iterator[tuple[Connection, Callable[[], float | None]]]:
+    """The pipe to a loop, and what lets its time pass: a process with a bus has its own time."""
     if options.interface:
-        with control_process.start(machine, loops, options) as connection:
-            yield (
-                partial(control_process.receive_telemetry, connection),
-                partial(control_process.send_request, connection),
-            )
-    else:
-        start = start_pose(machine, options.start)
-        with closing(Lockstep(machine, loops, start, options.log)) as loop:
-            yield loop.advance, loop.send
+        with control_process.start(machine, controllers, options) as connection:
+            yield connection, lambda: None
+        return
+    start = start_pose(machine, options.start)
+    window_end, loop_end = Pipe()
+    with closing(Lockstep(machine, controllers, start, loop_end, options.log)) as loop, window_end:
+        yield window_end, loop.advance
 
 
 def watch(

@@ -231,8 +231,8 @@ def write_film(
 def _write_gif(file: IO[bytes], images: Images, size: tuple[int, int], fps: float) -> None:
     ticks = images.ticks
     samples = [images.draw(tick) for tick in (ticks[0], ticks[len(ticks) // 2], ticks[-1])]
-    warning = np.full_like(samples[0][:40], drawing.WARNING)  # a warning may be short
-    palette = Image.fromarray(np.vstack([*samples, warning])).quantize(64)
+    rare = [np.full_like(samples[0][:40], c) for c in (drawing.WARNING, drawing.MEASURED)]
+    palette = Image.fromarray(np.vstack([*samples, *rare])).quantize(48)
     frames = [
         Image.fromarray(image).quantize(palette=palette, dither=Image.Dither.NONE)
         for image in images

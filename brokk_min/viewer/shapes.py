@@ -1,17 +1,21 @@
-"""Shapes of a machine, from its geometry alone: any `Machine` gets tracks, outriggers and a turret.
+"""Shapes of a machine from its geometry alone, and what is wrong with a pose.
 
-Only joints and links are where the machine has them; all sizes here are assumed.
+Any `Machine` gets tracks, outriggers and a turret. Only joints and links are where the machine has
+them; all sizes here are assumed.
 """
 
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from brokk_min.kinematics import forward_kinematics, lowest_point
+from brokk_min.kinematics import forward_kinematics, jacobian, lowest_point
 from brokk_min.machine import Array, Machine
 from brokk_min.viewer.camera import extent, skeleton
 
+NEAR_LIMIT = 0.05  # of a joint's range: nearer to its end is a warning
+NEAR_SINGULAR = 0.1  # of the arm's length [1/rad]: a smaller singular value is a warning
 THICK = 0.032  # of the reach: half the width of the first link
 BOOM = np.array([[0, 1.0], [0.3, 1.2], [1, 0.7]])  # along a link, half widths across
 BREAKER = np.array([[0, 0.6], [0.1, 1.3], [0.6, 1.3], [0.66, 0.5]])  # of the last link
@@ -106,3 +110,23 @@ def contacts(machine: Machine, q: Array) -> dict[str, set[int]]:
         low = {i for i in links if points[i][-1, 2] < machine.ground}
         found["the arm touches the ground"] = low
     return found
+
+
+def near_limit(machine: Machine, q: Array) -> NDArray[np.bool_]:
+    """Is each driven joint within `NEAR_LIMIT` of an end of its range? (..., n)"""
+    low = machine.column("q_min")
+    high = machine.column("q_max")
+    margin = NEAR_LIMIT * (high - low)
+    driven = [joint.driven for joint in machine.joints]
+    return np.asarray(((q < low + margin) | (q > high - margin)) & driven)
+
+
+def near_singular(machine: Machine, q: Array) -> bool:
+    """Is the least singular value of the Jacobian small: is there a direction of hardly any motion?
+
+    Manipulability, the product of all singular values, grows with the radius of a slewing arm.
+    """
+    J = jacobian(forward_kinematics(machine, q))[..., machine.driven]
+    least_singular_value = np.linalg.svd(J, compute_uv=False)[-1]
+    length = np.hypot(machine.column("a"), machine.column("d")).sum()
+    return bool(least_singular_value < NEAR_SINGULAR * length)

@@ -148,16 +148,6 @@ def test_draw__rings_the_tool_in_red_near_a_singularity():
     assert not [c for c in drawn(scene()).circles if c.colour == drawing.WARNING]
 
 
-def test_near_singular__compares_the_least_singular_value_with_the_arms_length():
-    length = 0.95 + 0.25 + 1.15 + 1.25 + 1.15 + 1.2
-    length += np.hypot(0.25, 0.95) - 0.25 - 0.95
-    for q3 in np.linspace(-0.3, 1.6, 20):
-        q = np.array([0.0, 0.5, q3, 2.9, 1.9])
-        J = jacobian(forward_kinematics(BROKK_170, q))[:, [0, 2, 3, 4]]
-        least = np.sqrt(np.linalg.eigvalsh(J @ J.T)[0])
-        assert drawing.near_singular(BROKK_170, q) == (least < 0.1 * length)
-
-
 @pytest.mark.parametrize(("counts", "fraction"), [(80, 1.0), (-40, -0.5), (0, 0.0)])
 def test_joint_rows__have_valve_bars_as_long_as_the_command(counts, fraction):
     u = np.zeros(5)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing
+from multiprocessing import Pipe
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from helpers_bus import BASELINE, START, ConstantCommand
 from brokk_min.actuator import plant_reset, plant_step
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
-from brokk_min.viewer.control_process import Request
+from brokk_min.viewer.control_process import Request, receive_telemetry, send_request
 from brokk_min.viewer.lockstep import Comparison, Lockstep, follow, line_goals
 
 NEUTRAL = Request(0.0, 0, False, True, np.zeros(3), np.zeros(4))
@@ -28,33 +29,35 @@ class Clock:
 
 
 def driven(seconds_a_picture, pictures):
-    """Telemetry of a window that draws slowly, while the operator holds the switch."""
+    """Telemetry of a window that draws slowly, while the operator holds the switch; lateness."""
     clock = Clock()
-    with closing(
-        Lockstep(BROKK_170, [ConstantCommand(60, 0, 0, 0, 0)], START, None, clock)
-    ) as loop:
-        ticks = []
+    here, there = Pipe()
+    slew = ConstantCommand(60, 0, 0, 0, 0)
+    ticks = []
+    with closing(Lockstep(BROKK_170, [slew], START, there, None, clock)) as loop, here:
         for _ in range(pictures):
             ready = bool(ticks) and not ticks[-1].active_fault
-            loop.send(NEUTRAL._replace(enable=ready))
-            ticks += loop.advance()
+            send_request(here, NEUTRAL._replace(enable=ready))
+            late = loop.advance()
+            ticks += receive_telemetry(here)
             clock.now += seconds_a_picture
-    return ticks
+    assert not loop.drive.gate.sent[..., -1].any()  # the last tick, after the window was closed
+    return ticks, late
 
 
 @pytest.mark.parametrize(("period", "late"), [(1 / 60, 0.0), (0.1, 0.0), (0.5, 0.4)])
 def test_advance__makes_due_ticks_and_loses_the_time_of_more_than_two_a_picture(period, late):
-    ticks = driven(period, 30)
+    ticks, lateness = driven(period, 30)
     assert [t.tick for t in ticks] == list(range(1, len(ticks) + 1))
     expected = min(2, period / 0.05) * 29
     assert abs(len(ticks) - expected) <= 2
-    assert ticks[-1].lateness == pytest.approx(28 * late, abs=0.11)
+    assert lateness == pytest.approx(29 * late, abs=0.11)
     assert not [t for t in ticks if t.driving and t.active_fault]
 
 
 def test_advance__gives_the_same_motion_however_slow_the_window_is():
-    quick = [t for t in driven(0.05, 60) if t.driving]
-    slow = [t for t in driven(1.0, 30) if t.driving]
+    quick = [t for t in driven(0.05, 60)[0] if t.driving]
+    slow = [t for t in driven(1.0, 30)[0] if t.driving]
     assert len(slow) > 40
     for a, b in zip(quick, slow, strict=False):
         np.testing.assert_array_equal(a.u, b.u)
