@@ -19,8 +19,11 @@ Go backwards from the last tick with costates of zero. In each tick:
 2. What the newest velocity of h_{t+1} brings goes to the angles that it was made of (`slope`).
 3. The newest angle of h_{t+1} is q_{t+1}: add its costate to that of q.
 4. v moves q by dt v, and makes this tick's reward: its derivative.
-5. v comes from the net: the derivative by all its inputs, the command of the tick among them.
-6. Shift: sample j + 1 of h_t was sample j of h_{t+1}. Commands are already shifted in dv/dh.
+5. v comes from the net: its derivative times dv/dh is the costate of what the net read. To its
+   command row add that of h_{t+1}: both are the same row, with u_t last. The last is dR_t/du_t.
+6. Shift back to h_t. Sample j of the angles and velocities of h_{t+1}, and of the command row of
+   step 5, was sample j + 1 of h_t. The newest of h_{t+1} have gone in the steps 2, 3 and 5. The
+   oldest command of h_t reaches nothing: zero.
 """
 
 from collections.abc import Callable

@@ -5,7 +5,9 @@ velocities, histories, Jacobian, error integral. It returns a command for each j
 the PIDs and yours all have this one interface, `evaluation.rollout.Controller`.
 
 Begin with the Jacobian: joint velocities for the goal by damped least squares, then a command in
-proportion, beyond the dead zone. (`machine.q_dot_max` belongs to 80 counts.) That is ten lines.
+proportion, beyond the dead zone. That is ten lines. `brokk_min/env.py` lists the fields of
+`Measured`. J has a column for each joint: take `J[..., machine.driven]` and `jacobian.dls`. The
+velocity `machine.q_dot_max` belongs to the limit of 80/127; joint q2 is locked, its command is 0.
 Then think about what the plant does: valves that have closed answer 0.3 s later; the lever arm
 changes with the angle; the error of the tool is measured.
 

@@ -97,9 +97,11 @@ def symptoms_of_copy(name: str, folder: Path) -> dict[str, Any]:
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(folder.resolve()), str(ROOT)])}
     command = [sys.executable, "-m", "exercises.symptoms", name]
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+    printed, _, last = done.stdout.rstrip().rpartition("\n")
+    print(printed, end="\n" * bool(printed))  # what the hunter prints from the copy
     if done.returncode:
         return {"rows": {"raised": done.stderr.strip().rpartition("\n")[2]}, "curves": {}}
-    result: dict[str, Any] = json.loads(done.stdout)
+    result: dict[str, Any] = json.loads(last)
     return result
 
 
@@ -135,8 +137,9 @@ def show(bug: Bug, folder: Path) -> int:
     if not folder.exists():
         plant(bug, folder)
     expected, got = measure(bug.symptom), symptoms_of_copy(bug.symptom, folder)
-    print(f"Bug {bug.number}, grade {bug.grade}, somewhere in {folder}/brokk_min.")
-    print((SYMPTOMS[bug.symptom].__doc__ or "").strip(), end="\n\n")
+    print(f"Bug {bug.number}, grade {bug.grade}, somewhere in {folder}/brokk_min. The symptom:")
+    print((SYMPTOMS[bug.symptom].__doc__ or "").strip(), end=" ")
+    print(f"(`{bug.symptom}` in exercises/symptoms.py measures it.)", end="\n\n")
     print("\n".join(comparison(expected["rows"], got["rows"])))
     if got["curves"]:
         draw(expected, got, folder / "symptom.png")

@@ -169,9 +169,10 @@ def nets() -> Symptom:
         "joint velocities in the state [rad/s]": states[10].q_dot[0],
         "command of 12 counts as nets read it": actuator.mu_law(12 / 127, 0.07),
     }
-    time = BROKK.dt * np.arange(1, 81)
-    curves = {"q5 on the nets": (time, sides[1][:, 3]), "q4 on the nets": (time, sides[1][:, 2])}
-    return Symptom(rows, curves, ("time [s]", "angle [rad]"))
+    time = BROKK.dt * np.arange(1, 80)
+    q_dot = np.diff(sides[1], axis=0) / BROKK.dt
+    curves = {"q5 on the nets": (time, q_dot[:, 3]), "q4 on the nets": (time, q_dot[:, 2])}
+    return Symptom(rows, curves, ("time [s]", "joint velocity [rad/s]"))
 
 
 def drive(controller: Controller) -> Symptom:

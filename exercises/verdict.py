@@ -13,7 +13,7 @@ from hypothesis.errors import NoSuchExample
 from hypothesis.strategies import SearchStrategy
 
 SETTINGS = settings(
-    max_examples=100, database=None, derandomize=True, suppress_health_check=list(HealthCheck)
+    max_examples=60, database=None, derandomize=True, suppress_health_check=list(HealthCheck)
 )
 
 

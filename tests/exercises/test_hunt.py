@@ -81,9 +81,12 @@ def test_hunt__shows_symptoms_alone_until_the_copy_is_mended(
     assert bug.hint not in shown
     assert (folder / "symptom.png").stat().st_size > 5000
     path = folder / "brokk_min" / bug.file
-    path.write_text(path.read_text().replace(bug.wrong, bug.right))
+    mended = path.read_text().replace(bug.wrong, bug.right)
+    path.write_text(mended + "\nprint('from the copy')\n")
     assert main([str(bug.number)]) == 0
-    assert "No symptom is left" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "from the copy\n" in shown
+    assert "No symptom is left" in shown
 
 
 def test_main__lists_hints_and_refuses(capsys: pytest.CaptureFixture[str]) -> None:
