@@ -27,7 +27,7 @@ LEAST_MINUTES = 10.0
 LEAST_RANGE = 0.7  # of a joint's range
 LEAST_LEVELS = 6  # with 1 % of the commands or more
 LEAST_CHANGES = 0.05  # of the ticks: commands that change by more than a tenth of the largest
-CLOSED_LOOP = -0.42  # `feedback`: excitations give -0.4 to 0, a driver of positions -0.6 to -0.5
+CLOSED_LOOP = -0.42  # `feedback`: excitations give -0.4 to 0, going between places -0.6 to -0.5
 LEAST_FIT = 0.2  # of the velocities' variance that the model explains, or it tells nothing
 
 
