@@ -32,6 +32,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "machine": operating.Simulate,
     "drive": operating.Drive,
     "convert": operating.Convert,
+    "diagnose": porting.Diagnose,
     "export": operating.Export,
     "play": operating.Play,
     "replay": operating.Replay,

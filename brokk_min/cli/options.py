@@ -57,6 +57,7 @@ CONTENTS = {
     "curve": {"global_step"},
     "scores": {"meta", "joints"},
     "inspection": {"meta", "recordings"},
+    "diagnosis": {"meta", "terms"},
     "runs": {"meta", "runs"},
     "gains": {"meta", "gains"},
     "sweep": {"meta", "table"},

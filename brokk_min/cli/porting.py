@@ -4,14 +4,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
 from tyro.conf import Positional
 
+from brokk_min.can import diagnosis
+from brokk_min.can.drive_log import read_frames
 from brokk_min.cli.options import Command, MachineName, WrongUse
 from brokk_min.evaluation import figures
 from brokk_min.identification import inspection, validation
 from brokk_min.identification.files import brief, located, write_json
 from brokk_min.identification.logs import Log, read_log
 from brokk_min.identification.net_file import load_net
+from brokk_min.learning.policy import Policy, load_policy
 from brokk_min.machine import Machine
 
 COLUMNS = {  # of the table of `inspect`: head, format, field of `JointReport`
@@ -89,6 +93,52 @@ class Inspect(Command):
         if self.json:
             write_json(self.json, {"meta": {"logs": list(map(str, self.logs))}, **report})
         print_report(log, report, known)
+
+
+@dataclass(kw_only=True)
+class Diagnose(Command):
+    """Why does it shake? A log of `drive` against its policy and nets; names what differs."""
+
+    log: Positional[Path]  # Log that `drive --log` wrote.
+    policy: Path  # Policy that drove.
+    json: Path | None = None  # Also write all terms here.
+    figure: Path | None = None  # Also draw commands and velocities with the expected ones, .png.
+
+    def __call__(self) -> None:
+        machine = self.check(json="diagnosis", figure="picture")
+        policy = load_policy(self.policy, machine)
+        with located(self.log):
+            ticks = diagnosis.read_ticks(machine, read_frames(self.log))
+        terms = diagnosis.diagnose(machine, policy, ticks)
+        print(f"{self.log}: {len(ticks.time)} ticks; error that is left if a term was so:")
+        for term in terms[:5]:
+            print(f"  {term.side}: {term.name} ({term.error / term.before:.0%})")
+        if not terms:
+            print("  commands and motion are as the policy and its nets have them")
+        if self.json:
+            meta = {"log": str(self.log), "policy": str(self.policy)}
+            write_json(self.json, {"meta": meta, "terms": [term._asdict() for term in terms]})
+        if self.figure:
+            figures.save(self.figure, plot_drive(machine, policy, ticks))
+
+
+def plot_drive(machine: Machine, policy: Policy, ticks: diagnosis.Ticks) -> Figure:
+    """Of each driven joint: sent and expected command, measured and simulated velocity."""
+    history = diagnosis.measured_history(machine, ticks)
+    expected = diagnosis.expected_commands(machine, policy, ticks, history)
+    simulated, measured = diagnosis.net_velocities(machine, policy, ticks.u, ticks.q)
+    time = ticks.time - ticks.time[0]
+    ahead, runs, _ = simulated.shape
+    later = time[machine.history + 1 : machine.history + 1 + ahead * runs]
+    rows = []
+    for k, j in enumerate(machine.driven):
+        name = machine.names[j]
+        u = {"measured": (time, ticks.u[:, j]), "expected": (time, expected[:, j])}
+        values = {"measured": measured, "expected": simulated}
+        q_dot = {label: (later, x[..., k].T.ravel()) for label, x in values.items()}
+        left = figures.Panel("", "time [s]", f"command of {name} [1]", u)
+        rows.append([left, figures.Panel("", "time [s]", f"{name} [rad/s]", q_dot)])
+    return figures.plot_panels(rows)
 
 
 def print_report(log: Log, report: dict[str, Any], machine: Machine | None) -> None:

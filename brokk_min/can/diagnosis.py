@@ -1,0 +1,224 @@
+"""Why does it shake? The log of a drive, compared with its policy and its simulation, term by term.
+
+Two questions: are the commands those of the policy for what was measured, and do the joints move as
+the nets say? Each is asked again with one term changed, as a wrong program or machine would change
+it: the term after whose change the log fits best is the one to look at first.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from brokk_min.actuator import close_valves, initial_history
+from brokk_min.can import canopen
+from brokk_min.can.canopen import Frame
+from brokk_min.can.drive_log import TelemetryReader
+from brokk_min.env import action_to_pwm, features, integrate_error, measure
+from brokk_min.identification.logs import Recording, velocity_of
+from brokk_min.identification.validation import free_run
+from brokk_min.kinematics import forward_kinematics, tool_velocity
+from brokk_min.learning.policy import Policy
+from brokk_min.machine import PWM_MAX, Array, Machine
+
+CLEARLY = 0.8  # of the error that is left, assumed: then a changed term explains something
+COMMAND_ERROR = 0.01  # of full command, assumed: smaller ones are the gate's and of rounding
+RATE_ERROR = 0.05  # of a tick, assumed
+AHEAD = 20  # ticks of a free run, assumed
+ZEROS = (0.05, -0.05, 0.1, -0.1, 0.2, -0.2, 0.4, -0.4)  # rad
+SCALES = (0.5, 0.7, 1.4, 2.0)
+DEGREES = 180 / np.pi
+Change = Callable[[Array], Array]
+
+
+class Ticks(NamedTuple):
+    """A stretch of a drive, tick by tick."""
+
+    time: Array  # of SYNC [s], (T,)
+    q: Array  # measured angles [rad], (T, n)
+    u: Array  # sent commands [-1, 1], (T, n)
+    v_goal: Array  # m/s, (T, 3)
+    driving: Array  # bool, (T,)
+
+
+class Term(NamedTuple):
+    """A term as it might be wrong, and the error that is left once it is taken so."""
+
+    side: str  # "commands" or "motion"
+    name: str
+    error: float
+    before: float  # error without the change
+
+
+def read_ticks(machine: Machine, frames: Iterable[Frame]) -> Ticks:
+    """The longest stretch of ticks with all positions; ValueError: it is too short."""
+    reader = TelemetryReader(machine)
+    stretches: list[list[tuple[float, Array, Array, Array, bool]]] = [[]]
+    start = 0.0
+    for frame in frames:
+        tick = reader.update(frame)
+        if tick is not None and np.isfinite(tick.q).all():
+            stretches[-1].append((start, tick.q, tick.u, tick.v_goal, tick.driving))
+        elif tick is not None:
+            stretches.append([])
+        start = frame.time if frame.id == canopen.SYNC else start
+    longest = max(stretches, key=len)
+    driven = sum(row[-1] for row in longest)
+    if driven < machine.history + 3 * AHEAD:
+        expected = f"expected {machine.history + 3 * AHEAD} ticks of driving in a row or more"
+        raise ValueError(f"log: {expected}, got {driven}")
+    return Ticks(*(np.array(column) for column in zip(*longest, strict=True)))
+
+
+def diagnose(machine: Machine, policy: Policy, ticks: Ticks) -> list[Term]:
+    """All terms that explain something, those first that explain most."""
+    terms = []
+    step = float(np.median(np.diff(ticks.time)))
+    if abs(step / machine.dt - 1) > RATE_ERROR:
+        name = f"rate: {1 / step:.3g} Hz instead of {machine.rate:g} Hz"
+        terms.append(Term("commands", name, 0.0, abs(step / machine.dt - 1)))
+    history = measured_history(machine, ticks)
+    base = command_error(machine, policy, ticks, history)
+    if base > COMMAND_ERROR:
+        for name, change in observation_changes(machine):
+            error = command_error(machine, policy, ticks, change(history))
+            terms.append(Term("commands", name, error, base))
+        for name, change in command_changes(machine):
+            error = command_error(machine, policy, ticks, history, change)
+            terms.append(Term("commands", name, error, base))
+    base = motion_error(machine, policy, ticks.u, ticks.q)
+    for name, change in command_changes(machine):
+        error = motion_error(machine, policy, change(ticks.u), ticks.q)
+        terms.append(Term("motion", name, error, base))
+    for name, change in angle_changes(machine):
+        error = motion_error(machine, policy, ticks.u, change(ticks.q))
+        terms.append(Term("motion", name, error, base))
+    found = [term for term in terms if term.error < CLEARLY * term.before]
+    return sorted(found, key=lambda term: term.error / term.before)
+
+
+def measured_history(machine: Machine, ticks: Ticks) -> Array:
+    """History (T, n, 3, H) at each tick, as `hw.Drive` has it; at rest before the first."""
+    H = machine.history
+    first = initial_history(ticks.q[0], H)
+    q_dot = velocity_of(ticks.q, machine.velocity_samples, machine.rate)
+    rows = np.stack([ticks.q, q_dot, np.roll(ticks.u, 1, axis=0)], axis=-1)  # (T, n, 3)
+    rows[0, :, 2] = 0.0
+    padded = np.concatenate([np.moveaxis(first, -1, 0)[1:], rows])
+    windows = np.lib.stride_tricks.sliding_window_view(padded, H, axis=0)
+    return np.array(windows, np.float32)
+
+
+def expected_commands(machine: Machine, policy: Policy, ticks: Ticks, history: Array) -> Array:
+    """Commands (T, n) of the policy at each tick for a history (T, n, 3, H)."""
+    frames = forward_kinematics(machine, history[..., 0, -1])
+    v_tool = tool_velocity(frames, history[..., 1, -1])
+    v_goal = ticks.v_goal.astype(np.float32)
+    integral = np.zeros((len(v_goal), 3), np.float32)
+    for t in range(1, len(v_goal)):
+        if ticks.driving[t - 1]:
+            integral[t] = integrate_error(machine, v_goal[t - 1], v_tool[t], integral[t - 1])
+    measured = measure(machine, history, v_goal, integral)
+    action = policy.act(np.clip(features(machine, measured, policy.paper), -1e4, 1e4))
+    u = action_to_pwm(machine, np.clip(action, -2, 2), policy.paper)
+    rest = np.zeros((), np.int64)
+    for t in range(len(u)):
+        rest = rest * ticks.driving[t]
+        u[t], rest = close_valves(machine, policy.valves, u[t], v_goal[t], rest)
+    return np.asarray(u)
+
+
+def command_error(
+    machine: Machine, policy: Policy, ticks: Ticks, history: Array, change: Change = np.array
+) -> float:
+    """Mean difference of the sent commands from the expected ones, while driving."""
+    u = change(expected_commands(machine, policy, ticks, history))
+    limit = machine.pwm_limit / PWM_MAX
+    driving = ticks.driving & np.roll(ticks.driving, 1)
+    error = np.abs(ticks.u - np.clip(u, -limit, limit))
+    return float(error[driving][:, machine.driven].mean())
+
+
+def motion_error(machine: Machine, policy: Policy, u: Array, q: Array) -> float:
+    """Mean difference of the velocities of free runs of the nets, in deviations of the measured."""
+    velocities, measured = net_velocities(machine, policy, u, q)
+    scale = np.maximum(measured.std(axis=(0, 1)), 0.02)
+    return float(np.sqrt(np.mean(np.square((velocities - measured) / scale))))
+
+
+def net_velocities(machine: Machine, policy: Policy, u: Array, q: Array) -> tuple[Array, Array]:
+    """Velocities [rad/s] (AHEAD, runs, n_driven) of free runs of the nets, and the measured ones.
+
+    A run begins every `AHEAD` ticks with what was measured.
+    """
+    driven = machine.driven
+    q_dot = velocity_of(q, machine.velocity_samples, machine.rate)
+    recording = Recording("", u[:, driven], q[:, driven], q_dot[:, driven])
+    starts = np.arange(machine.history, len(q) - AHEAD, AHEAD)
+    _, velocities = free_run(policy.net, recording, starts, AHEAD)
+    return velocities, recording.q_dot[starts + np.arange(1, AHEAD + 1)[:, None]]
+
+
+def joint_changes(machine: Machine) -> Iterator[tuple[str, Callable[[Array], Array]]]:
+    """Signs and orders of the driven joints: changes of arrays (T, n, ...)."""
+    for i in machine.driven:
+        sign = np.ones(machine.n)
+        sign[i] = -1
+
+        def turn(x: Array, sign: Array = sign) -> Array:
+            return np.asarray(x * sign.reshape(-1, *[1] * (x.ndim - 2)))
+
+        yield f"sign of {machine.names[i]}", turn
+    for i, j in combinations(machine.driven, 2):
+        order = np.arange(machine.n)
+        order[[i, j]] = j, i
+        yield f"order of {machine.names[i]}, {machine.names[j]}", lambda x, o=order: x[:, o]
+
+
+def command_changes(machine: Machine) -> Iterator[tuple[str, Change]]:
+    """Changes of commands (T, n): on their way, or within a machine."""
+    for name, change in joint_changes(machine):
+        yield f"{name} (command)", change
+    for scale in SCALES:
+        yield f"scale of commands: {scale:g}", lambda u, c=scale: c * u
+    for ticks in (1, 2):
+        late = f"delay: {1e3 * ticks * machine.dt:.0f} ms more"
+        yield late, lambda u, k=ticks: np.concatenate([u[:1].repeat(k, axis=0), u[:-k]])
+    for more in (0.03, 0.06, -0.03, -machine.dead_zone):
+        zone = f"dead zone: {more:+.2f}"
+        yield zone, lambda u, z=more: np.sign(u) * np.maximum(np.abs(u) - z * (u != 0), 0)
+
+
+def angle_changes(machine: Machine) -> Iterator[tuple[str, Change]]:
+    """Changes of measured angles (T, n) back to what the nets know."""
+    middle = (machine.column("q_min") + machine.column("q_max")) / 2
+    for name, change in joint_changes(machine):
+        yield f"{name} (angle)", lambda q, f=change: middle + f(q - middle)
+    for scale in (*SCALES, DEGREES):
+        yield f"scale of angles: {scale:.3g}", lambda q, c=scale: q / c
+    for i in machine.driven:
+        for zero in ZEROS:
+            offset = zero * (np.arange(machine.n) == i)
+            yield f"encoder zero of {machine.names[i]}: {zero:+.1f} rad", lambda q, o=offset: q - o
+
+
+def observation_changes(machine: Machine) -> Iterator[tuple[str, Change]]:
+    """Changes of the history (T, n, 3, H) that a program gives its policy."""
+
+    def scaled(*factors: float) -> Change:
+        return lambda h: h * np.array(factors, np.float32)[:, None]
+
+    yield "one sample late", lambda h: np.concatenate([h[:1], h[:-1]])
+    yield "order of the history", lambda h: h[..., ::-1].copy()
+    yield "degrees instead of radians", scaled(DEGREES, DEGREES, 1.0)
+    for scale in SCALES:
+        yield f"scale of angles and velocities: {scale:g}", scaled(scale, scale, 1.0)
+        yield f"scale of velocities (rate): {scale:g}", scaled(1.0, scale, 1.0)
+    for name, change in joint_changes(machine):
+        yield f"{name} (observation)", lambda h, f=change: np.float32(f(h))
+    for i in machine.driven:
+        for zero in ZEROS:
+            offset = np.zeros((machine.n, 3, 1), np.float32)
+            offset[i, 0] = zero
+            yield f"zero of {machine.names[i]}: {zero:+.1f} rad", lambda h, o=offset: h + o
