@@ -37,9 +37,9 @@ STARTS, SEED = 64, 0  # as `brokk-min evaluate --num-starts 64`
 
 
 def fingerprints() -> dict[str, str]:
-    """The first 16 digits of SHA-256 of the shipped files, by name."""
-    files = sorted(FILES.iterdir())
-    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for path in files}
+    """The first 16 digits of SHA-256 of the shipped files that are read here, by name."""
+    names = sorted([*POLICIES.values(), "gains.json", "starts.csv"])
+    return {name: hashlib.sha256((FILES / name).read_bytes()).hexdigest()[:16] for name in names}
 
 
 def controllers() -> tuple[dict[str, Any], dict[str, Any]]:
