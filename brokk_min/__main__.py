@@ -33,6 +33,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "drive": operating.Drive,
     "convert": operating.Convert,
     "diagnose": porting.Diagnose,
+    "dbc": porting.Dbc,
     "export": operating.Export,
     "play": operating.Play,
     "replay": operating.Replay,

@@ -6,10 +6,12 @@ it: the term after whose change the log fits best is the one to look at first.
 """
 
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brokk_min.actuator import close_valves, initial_history
 from brokk_min.can import canopen
@@ -39,7 +41,7 @@ class Ticks(NamedTuple):
     q: Array  # measured angles [rad], (T, n)
     u: Array  # sent commands [-1, 1], (T, n)
     v_goal: Array  # m/s, (T, 3)
-    driving: Array  # bool, (T,)
+    driving: NDArray[np.bool_]  # (T,)
 
 
 class Term(NamedTuple):
@@ -160,65 +162,93 @@ def net_velocities(machine: Machine, policy: Policy, u: Array, q: Array) -> tupl
     return velocities, recording.q_dot[starts + np.arange(1, AHEAD + 1)[:, None]]
 
 
-def joint_changes(machine: Machine) -> Iterator[tuple[str, Callable[[Array], Array]]]:
-    """Signs and orders of the driven joints: changes of arrays (T, n, ...)."""
+def scale(x: Array, factors: Array) -> Array:
+    """Factors that broadcast."""
+    return np.asarray(x * factors, x.dtype)
+
+
+def shift(x: Array, offset: Array) -> Array:
+    """An offset that broadcasts."""
+    return np.asarray(x + offset, x.dtype)
+
+
+def reorder(x: Array, order: NDArray[np.intp]) -> Array:
+    """Joints (axis 1) in another order."""
+    return x[:, order]
+
+
+def delay(x: Array, ticks: int) -> Array:
+    """The same some ticks later."""
+    return np.concatenate([x[:1].repeat(ticks, axis=0), x[:-ticks]])
+
+
+def reverse(history: Array) -> Array:
+    """The newest sample first."""
+    return history[..., ::-1].copy()
+
+
+def widen_zone(u: Array, more: float) -> Array:
+    """Commands as valves get them whose dead zone is wider by `more`."""
+    return np.asarray(np.sign(u) * np.maximum(np.abs(u) - more * (u != 0), 0))
+
+
+def about(q: Array, change: Change, middle: Array) -> Array:
+    """A change of angles from the middle of their ranges."""
+    return middle + change(q - middle)
+
+
+def joint_changes(machine: Machine, axes: int = 2) -> Iterator[tuple[str, Change]]:
+    """Signs and orders of the driven joints: changes of arrays (T, n, ...) of some axes."""
     for i in machine.driven:
-        sign = np.ones(machine.n)
-        sign[i] = -1
-
-        def turn(x: Array, sign: Array = sign) -> Array:
-            return np.asarray(x * sign.reshape(-1, *[1] * (x.ndim - 2)))
-
-        yield f"sign of {machine.names[i]}", turn
+        sign = 1.0 - 2.0 * (np.arange(machine.n) == i)
+        sign = sign.reshape(-1, *[1] * (axes - 2))
+        yield f"sign of {machine.names[i]}", partial(scale, factors=sign)
     for i, j in combinations(machine.driven, 2):
-        order = np.arange(machine.n)
+        order = np.arange(machine.n, dtype=np.intp)
         order[[i, j]] = j, i
-        yield f"order of {machine.names[i]}, {machine.names[j]}", lambda x, o=order: x[:, o]
+        names = f"{machine.names[i]}, {machine.names[j]}"
+        yield f"order of {names}", partial(reorder, order=order)
 
 
 def command_changes(machine: Machine) -> Iterator[tuple[str, Change]]:
     """Changes of commands (T, n): on their way, or within a machine."""
     for name, change in joint_changes(machine):
         yield f"{name} (command)", change
-    for scale in SCALES:
-        yield f"scale of commands: {scale:g}", lambda u, c=scale: c * u
+    for factor in SCALES:
+        yield f"scale of commands: {factor:g}", partial(scale, factors=np.array(factor))
     for ticks in (1, 2):
-        late = f"delay: {1e3 * ticks * machine.dt:.0f} ms more"
-        yield late, lambda u, k=ticks: np.concatenate([u[:1].repeat(k, axis=0), u[:-k]])
+        yield f"delay: {1e3 * ticks * machine.dt:.0f} ms more", partial(delay, ticks=ticks)
     for more in (0.03, 0.06, -0.03, -machine.dead_zone):
-        zone = f"dead zone: {more:+.2f}"
-        yield zone, lambda u, z=more: np.sign(u) * np.maximum(np.abs(u) - z * (u != 0), 0)
+        yield f"dead zone: {more:+.2f}", partial(widen_zone, more=more)
 
 
 def angle_changes(machine: Machine) -> Iterator[tuple[str, Change]]:
     """Changes of measured angles (T, n) back to what the nets know."""
     middle = (machine.column("q_min") + machine.column("q_max")) / 2
     for name, change in joint_changes(machine):
-        yield f"{name} (angle)", lambda q, f=change: middle + f(q - middle)
-    for scale in (*SCALES, DEGREES):
-        yield f"scale of angles: {scale:.3g}", lambda q, c=scale: q / c
+        yield f"{name} (angle)", partial(about, change=change, middle=middle)
+    for factor in (*SCALES, DEGREES):
+        yield f"scale of angles: {factor:.3g}", partial(scale, factors=np.array(1 / factor))
     for i in machine.driven:
         for zero in ZEROS:
-            offset = zero * (np.arange(machine.n) == i)
-            yield f"encoder zero of {machine.names[i]}: {zero:+.1f} rad", lambda q, o=offset: q - o
+            offset = -zero * (np.arange(machine.n) == i)
+            name = f"encoder zero of {machine.names[i]}: {zero:+.2f} rad"
+            yield name, partial(shift, offset=offset)
 
 
 def observation_changes(machine: Machine) -> Iterator[tuple[str, Change]]:
     """Changes of the history (T, n, 3, H) that a program gives its policy."""
-
-    def scaled(*factors: float) -> Change:
-        return lambda h: h * np.array(factors, np.float32)[:, None]
-
-    yield "one sample late", lambda h: np.concatenate([h[:1], h[:-1]])
-    yield "order of the history", lambda h: h[..., ::-1].copy()
-    yield "degrees instead of radians", scaled(DEGREES, DEGREES, 1.0)
-    for scale in SCALES:
-        yield f"scale of angles and velocities: {scale:g}", scaled(scale, scale, 1.0)
-        yield f"scale of velocities (rate): {scale:g}", scaled(1.0, scale, 1.0)
-    for name, change in joint_changes(machine):
-        yield f"{name} (observation)", lambda h, f=change: np.float32(f(h))
+    both, velocity = np.array([[1.0], [1.0], [0.0]]), np.array([[0.0], [1.0], [0.0]])
+    yield "one sample late", partial(delay, ticks=1)
+    yield "order of the history", reverse
+    yield "degrees instead of radians", partial(scale, factors=DEGREES**both)
+    for factor in SCALES:
+        yield f"scale of angles and velocities: {factor:g}", partial(scale, factors=factor**both)
+        yield f"scale of velocities (rate): {factor:g}", partial(scale, factors=factor**velocity)
+    for name, change in joint_changes(machine, axes=4):
+        yield f"{name} (observation)", change
     for i in machine.driven:
         for zero in ZEROS:
-            offset = np.zeros((machine.n, 3, 1), np.float32)
+            offset = np.zeros((machine.n, 3, 1))
             offset[i, 0] = zero
-            yield f"zero of {machine.names[i]}: {zero:+.1f} rad", lambda h, o=offset: h + o
+            yield f"zero of {machine.names[i]}: {zero:+.2f} rad", partial(shift, offset=offset)

@@ -58,6 +58,7 @@ CONTENTS = {
     "scores": {"meta", "joints"},
     "inspection": {"meta", "recordings"},
     "diagnosis": {"meta", "terms"},
+    "DBC": {'VERSION ""'},
     "runs": {"meta", "runs"},
     "gains": {"meta", "gains"},
     "sweep": {"meta", "table"},

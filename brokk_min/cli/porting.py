@@ -1,22 +1,27 @@
-"""The commands for logs and nets of another machine: what they tell, and how good they are."""
+"""The commands for logs and nets of another machine: what they tell, and how good they are.
+
+What draws is imported by the function that draws: help must not wait for it.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from matplotlib.figure import Figure
 from tyro.conf import Positional
 
 from brokk_min.can import diagnosis
+from brokk_min.can.dbc import dbc
 from brokk_min.can.drive_log import read_frames
 from brokk_min.cli.options import Command, MachineName, WrongUse
-from brokk_min.evaluation import figures
 from brokk_min.identification import inspection, validation
-from brokk_min.identification.files import brief, located, write_json
+from brokk_min.identification.files import brief, located, whole_file, write_json
 from brokk_min.identification.logs import Log, read_log
 from brokk_min.identification.net_file import load_net
 from brokk_min.learning.policy import Policy, load_policy
 from brokk_min.machine import Machine
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 COLUMNS = {  # of the table of `inspect`: head, format, field of `JointReport`
     "minutes": ("{:.1f}", "minutes"),
@@ -56,6 +61,8 @@ class Score(Command):
             meta = {"net": str(self.net), "logs": list(map(str, self.logs))}
             write_json(self.json, {"meta": meta, **scores})
         if self.figure:
+            from brokk_min.evaluation import figures
+
             figures.save(self.figure, figures.plot_worst_and_median(net, log))
         print("Errors [rad/s] of one step, of the last velocity again, of free runs of 1 to 30 s:")
         for name, joint in scores["joints"].items():
@@ -119,11 +126,15 @@ class Diagnose(Command):
             meta = {"log": str(self.log), "policy": str(self.policy)}
             write_json(self.json, {"meta": meta, "terms": [term._asdict() for term in terms]})
         if self.figure:
+            from brokk_min.evaluation import figures
+
             figures.save(self.figure, plot_drive(machine, policy, ticks))
 
 
-def plot_drive(machine: Machine, policy: Policy, ticks: diagnosis.Ticks) -> Figure:
+def plot_drive(machine: Machine, policy: Policy, ticks: diagnosis.Ticks) -> "Figure":
     """Of each driven joint: sent and expected command, measured and simulated velocity."""
+    from brokk_min.evaluation import figures
+
     history = diagnosis.measured_history(machine, ticks)
     expected = diagnosis.expected_commands(machine, policy, ticks, history)
     simulated, measured = diagnosis.net_velocities(machine, policy, ticks.u, ticks.q)
@@ -139,6 +150,19 @@ def plot_drive(machine: Machine, policy: Policy, ticks: diagnosis.Ticks) -> Figu
         left = figures.Panel("", "time [s]", f"command of {name} [1]", u)
         rows.append([left, figures.Panel("", "time [s]", f"{name} [rad/s]", q_dot)])
     return figures.plot_panels(rows)
+
+
+@dataclass(kw_only=True)
+class Dbc(Command):
+    """Write the frames of a machine's bus as a DBC file, for other tools."""
+
+    out: Path  # File to write, .dbc.
+
+    def __call__(self) -> None:
+        text = dbc(self.check(out="DBC"))
+        with whole_file(self.out, "w") as file:
+            file.write(text)
+        print(f"{self.out}: {text.count('BO_ ')} messages")
 
 
 def print_report(log: Log, report: dict[str, Any], machine: Machine | None) -> None:

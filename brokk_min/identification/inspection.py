@@ -11,7 +11,6 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from scipy.signal import lfilter
 
 from brokk_min.identification.logs import COMMANDED, Log, Recording, driven
 from brokk_min.machine import Array, Machine
@@ -117,6 +116,8 @@ def residual(
     u: Array, velocity: Array, rate: float, delay: int, tau: float, up: float, down: float
 ) -> tuple[float, Array]:
     """Sum of the squared errors of the model with the best gains; and these, up and down."""
+    from scipy.signal import lfilter  # slow to import
+
     late = np.concatenate([np.zeros(delay), u[: len(u) - delay]])
     openings = np.stack([np.maximum(late - up, 0), -np.maximum(-late - down, 0)])
     a = np.exp(-1 / (rate * tau))

@@ -16,8 +16,10 @@ from brokk_min.__main__ import COMMANDS, usage_error
 
 ROOT = Path(__file__).parents[2]
 OPTIONS = {
-    "collect": "--out --hours --excitation --machine",
-    "fit": "--out --test --json --figure --velocity-samples --history --dead-zone --paper",
+    "collect": "--out --hours --excitation --machine --plant",
+    "fit": "--out --test --json --figure --velocity-samples --history --dead-zone --paper --curve",
+    "score": "--machine --json --figure",
+    "inspect": "--machine --json",
     "preliminary": "--actuator --out",
     "train": "--actuator --out --total-steps --num-envs --resume --paper --critic --lag-cost",
     "sweep": "--critic --actuator --out --seeds --poses --scheduler --gains --total-steps --paper",
@@ -27,6 +29,8 @@ OPTIONS = {
     "machine": "--interface --channel --start --record",
     "drive": "--policy --interface --channel --command --controller --counts --log --replay",
     "convert": "--out",
+    "diagnose": "--policy --json --figure",
+    "dbc": "--out --machine",
     "export": "--policy --out",
     "play": "--policy --gains --interface --channel --drive --attempts --log --start",
     "replay": "--out --rerun --fps --size --controllers --sequence --start",

@@ -1,0 +1,53 @@
+"""The frames of a machine's bus as a DBC file, which other tools of a CAN bus read."""
+
+import re
+from collections.abc import Iterator
+
+from brokk_min.can import canopen
+from brokk_min.machine import PWM_MAX, Machine
+
+SENDER = "brokk_min"
+HEAD = 'VERSION ""\n\nNS_ :\n\nBS_:\n\n'
+PWM = f'CM_ "PWM bytes u: m for m = 0..{PWM_MAX}, 255 - |m| for m < 0";'
+
+
+def dbc(machine: Machine) -> str:
+    """The text of a DBC file: valve frame, SYNC, NMT, positions and heartbeats.
+
+    A position is the raw count of an encoder; q = sign (count - zero) 2 pi / 2^bits, unwrapped.
+    ValueError: a machine that does not fit the bus.
+    """
+    canopen.check_bus(machine)
+    nodes = [SENDER, *(f"encoder_{name}" for name in _names(machine)), "valve_controller"]
+    parts = [f"{HEAD}BU_: {' '.join(nodes)}", *_messages(machine), PWM]
+    return "\n\n".join(parts) + "\n"
+
+
+def _names(machine: Machine) -> list[str]:
+    """Names of the joints as a DBC file may have them."""
+    return [re.sub(r"\W", "_", name) for name in machine.names]
+
+
+def _messages(machine: Machine) -> Iterator[str]:
+    yield _message(canopen.NMT, "NMT", 2, SENDER, [_signal("command", 0), _signal("node", 8)])
+    yield _message(canopen.SYNC, "SYNC", 0, SENDER, [])
+    bytes_ = [_signal(f"u_{name}", 8 * i) for i, name in enumerate(_names(machine))]
+    bytes_ += [_signal("counter", 40), _signal("checksum", 48), _signal("enable", 56, high=1)]
+    yield _message(machine.valve_frame_id, "valves", 8, SENDER, bytes_)
+    nodes = [joint.encoder_node for joint in machine.joints]
+    sources = [(f"encoder_{name}", node) for name, node in zip(_names(machine), nodes)]
+    for name, node in sources:
+        position = _signal("position", 0, 32, 2**canopen.POSITION_BITS - 1, "counts")
+        yield _message(canopen.TPDO1 + node, name, 4, name, [position])
+    for name, node in (*sources, ("valve_controller", machine.controller_node)):
+        state = _signal("state", 0, high=127)
+        yield _message(canopen.HEARTBEAT + node, f"heartbeat_{name}", 1, name, [state])
+
+
+def _message(can_id: int, name: str, size: int, sender: str, signals: list[str]) -> str:
+    return "\n".join([f"BO_ {can_id} {name}: {size} {sender}", *signals])
+
+
+def _signal(name: str, start: int, bits: int = 8, high: int = 255, unit: str = "") -> str:
+    """An unsigned, little-endian signal; a PWM byte is m, or 255 - |m| for negative m."""
+    return f' SG_ {name} : {start}|{bits}@1+ (1,0) [0|{high}] "{unit}" Vector__XXX'

@@ -1,0 +1,49 @@
+"""The DBC file, read by cantools: what it decodes is what the program means."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cantools
+import numpy as np
+import pytest
+from helpers_cli import MINI, run
+
+from brokk_min import BROKK_170
+from brokk_min.can import canopen
+from brokk_min.can.canopen import encoder_raw, used_ids, valve_frame
+from brokk_min.can.dbc import dbc
+from brokk_min.cli.options import find_machine
+
+
+@pytest.mark.parametrize("machine", [BROKK_170, find_machine(MINI)], ids=lambda m: m.name)
+def test_dbc__describes_the_frames_that_the_program_uses(machine):
+    database = cantools.database.load_string(dbc(machine), "dbc", strict=True)
+    unused = {canopen.SDO_ANSWER + node for node in range(128)}
+    unused.add(canopen.TPDO1 + machine.controller_node)
+    assert {message.frame_id for message in database.messages} == set(used_ids(machine)) - unused
+    command = np.arange(machine.n) * 30 - 60
+    frame = valve_frame(command, 7, 1).tobytes()
+    decoded = database.decode_message(machine.valve_frame_id, frame)
+    expected = {f"u_{n}": m if m >= 0 else 255 + m for n, m in zip(machine.names, command)}
+    assert decoded == expected | {"counter": 7, "checksum": frame[6], "enable": 1}
+    raw = int(encoder_raw(machine, np.full(machine.n, -5))[1])
+    node = machine.joints[1].encoder_node
+    position = database.decode_message(canopen.TPDO1 + node, raw.to_bytes(4, "little"))
+    assert position == {"position": raw}
+    heartbeat = canopen.HEARTBEAT + machine.controller_node
+    assert database.decode_message(heartbeat, b"\x05") == {"state": 5}
+
+
+def test_dbc__takes_any_name_of_a_joint():
+    joints = [replace(joint, name=f"{joint.name} (left)") for joint in BROKK_170.joints]
+    text = dbc(replace(BROKK_170, joints=tuple(joints)))
+    database = cantools.database.load_string(text, "dbc")
+    assert "u_q1__left_" in database.get_message_by_name("valves").signal_tree
+
+
+def test_command__writes_a_file_that_cantools_reads(tmp_path, capsys):
+    path = tmp_path / "bus.dbc"
+    assert run(f"dbc --machine '{MINI}' --out '{path}'") == 0 == run(f"dbc --out '{path}'")
+    assert "bus.dbc: 14 messages" in capsys.readouterr().out
+    assert len(cantools.database.load_file(path).messages) == 14
