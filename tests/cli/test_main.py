@@ -86,7 +86,7 @@ TRAIN = "train --actuator missing.npz --out p.npz"
 @pytest.mark.parametrize(
     ("line", "status", "message"),
     [
-        ("", 2, "COMMAND: expected one of collect, fit, preliminary, train, sweep, starts, eval"),
+        ("", 2, "COMMAND: expected one of collect, fit, score, inspect, preliminary, train, sweep"),
         ("nonsense", 2, "play, replay, got nonsense; see brokk-min --help"),
         ("collect", 2, "--out: expected a value, got none; see brokk-min collect --help"),
         ("collect --out", 2, "--out: expected a value, got none"),
