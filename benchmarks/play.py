@@ -1,4 +1,4 @@
-"""The window and the 20 Hz loop at once: pictures per second, lateness, lost ticks.
+"""The window and the 20 Hz loop in lockstep: pictures per second, lateness, processor time.
 
     python -m benchmarks.play [--seconds 20] [--json F]
 
@@ -39,6 +39,7 @@ class Player:
     def __init__(self, seconds: float) -> None:
         self.seconds = seconds
         self.start = 0.0  # s, when it first drove
+        self.processor = 0.0  # s of processor time until then
         self.keys = set[str]()
         self.times: list[float] = []  # s, of pictures
         self.telemetry: dict[float, Telemetry] = {}  # by tick
@@ -54,6 +55,7 @@ class Player:
             keys.add("space")
         if telemetry.driving and not self.start:
             self.start = now
+            self.processor = time.process_time()
         if self.start:
             self.times.append(now)
             self.telemetry[telemetry.tick] = telemetry
@@ -68,12 +70,14 @@ class Player:
     def figures(self) -> dict[str, Any]:
         """Pictures per second and times in ms."""
         periods = 1e3 * np.diff(self.times)
+        processor = 1e3 * (time.process_time() - self.processor) / len(periods)
         ticks = sorted(self.telemetry)
         late = [1e3 * self.telemetry[tick].lateness for tick in ticks]
         driving = [telemetry.driving for telemetry in self.telemetry.values()]
         return {
             "pictures_per_second": round(1e3 / float(np.mean(periods)), 1),
             "picture_period": percentiles(periods),
+            "processor_time_per_picture": round(processor, 1),
             "ticks": len(ticks),
             "ticks_not_seen": round(ticks[-1] - ticks[0]) + 1 - len(ticks),
             "driving": round(float(np.mean(driving)), 3),

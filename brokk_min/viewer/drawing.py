@@ -6,25 +6,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from textwrap import wrap
 from typing import NamedTuple
 
 import numpy as np
 
 from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocity
 from brokk_min.machine import PWM_MAX, Array, Machine
+from brokk_min.viewer import shapes
 from brokk_min.viewer.camera import Camera, cameras, close_up, skeleton
-from brokk_min.viewer.shapes import (
-    BOOM,
-    BREAKER,
-    CHISEL,
-    contacts,
-    half_widths,
-    near_limit,
-    near_singular,
-    turret,
-    undercarriage,
-    unit,
-)
 from brokk_min.viewer.window import BACKGROUND, INK, Box, Canvas, Colour
 
 # all assumed
@@ -129,7 +119,9 @@ def _layout(box: Box, joints: int, notes: int) -> tuple[Box, Box, Box, tuple[flo
 def _panel(canvas: Canvas, machine: Machine, scene: Scene, box: Box) -> None:
     """One arm: title and status, both views, a row for each joint, notes."""
     left, upper, width, height = box
-    side, top, rows, (x_notes, y_notes) = _layout(box, machine.n, len(scene.notes))
+    room = 0.48 * width - 44 if width > 1.3 * height else width - 32
+    notes = [line for note in scene.notes for line in wrap(note, int(room / 7))]
+    side, top, rows, (x_notes, y_notes) = _layout(box, machine.n, len(notes))
     if len(scene.close_up):
         half = (height - HEAD) / 2
         side = (left, HEAD, width, half)
@@ -151,7 +143,7 @@ def _panel(canvas: Canvas, machine: Machine, scene: Scene, box: Box) -> None:
         x, y = side[0] + side[2] / 2, side[1] + side[3] - 34
         canvas.text(x, y, scene.headline, 15, INK, 0.5)
         _joint_rows(canvas, machine, scene, rows)
-    for i, note in enumerate(scene.notes):
+    for i, note in enumerate(notes):
         canvas.text(x_notes, y_notes + 18 * i, note, 12)
 
 
@@ -159,7 +151,7 @@ def _views(canvas: Canvas, machine: Machine, scene: Scene, side: Box, top: Box) 
     """The arm from both sides; goal and measured speed, warnings."""
     frames = forward_kinematics(machine, scene.q)
     p_tool = tool_position(frames)
-    touching = contacts(machine, scene.q)
+    touching = shapes.contacts(machine, scene.q)
     views = cameras(machine, p_tool, side, top, scene.in_view)
     if len(scene.close_up):
         views = [views[0], close_up(scene.close_up, top)]
@@ -177,9 +169,9 @@ def _views(canvas: Canvas, machine: Machine, scene: Scene, side: Box, top: Box) 
         (f"goal {np.linalg.norm(scene.v_goal):.2f} m/s", GOAL),
         (f"measured {np.linalg.norm(tool_velocity(frames, scene.q_dot)):.2f} m/s", MEASURED),
     ]
-    warned = np.flatnonzero(near_limit(machine, scene.q))
+    warned = np.flatnonzero(shapes.near_limit(machine, scene.q))
     legend += [(f"{machine.names[i]} near its limit", WARNING) for i in warned]
-    if near_singular(machine, scene.q):
+    if shapes.near_singular(machine, scene.q):
         legend.append(("near a singularity", WARNING))
     legend += [(text, WARNING) for text in touching]
     legend += [(trace.text, trace.colour) for trace in scene.traces]
@@ -215,7 +207,7 @@ def _backdrop(canvas: Canvas, machine: Machine, camera: Camera) -> None:
         if k % every == 0 and upper + 0.3 * height < y < lower - 40:
             canvas.text(left + 6, y, f"{k * metres + 0.0:g}", 10, MUTED)
     if y0 < ground < lower:  # the machine stands at the height 0
-        foot = 0.25 * unit(machine) * camera.scale
+        foot = 0.25 * shapes.unit(machine) * camera.scale
         canvas.bar(x0 - foot, x0 + foot, (y0 + ground) / 2, (ground - y0) / 2, SOIL)
     across, up = ("out", "z") if camera.label == "side" else ("y", "x")
     canvas.text(right - 8, lower - 9, f"{across} [m]", 10, MUTED, 1.0)
@@ -225,8 +217,8 @@ def _backdrop(canvas: Canvas, machine: Machine, camera: Camera) -> None:
 
 def _base(canvas: Canvas, machine: Machine, camera: Camera, scene: Scene) -> None:
     """Tracks, outriggers, and the turret over them."""
-    parts = [(part, STEEL) for part in undercarriage(machine)]
-    for part, colour in [*parts, (turret(machine, scene.q), _pale(scene.colour, -0.3))]:
+    parts = [(part, STEEL) for part in shapes.undercarriage(machine)]
+    for part, colour in [*parts, (shapes.turret(machine, scene.q), _pale(scene.colour, -0.3))]:
         near, far = camera.project(part.near), camera.project(part.far)
         for k in range(len(near)):
             canvas.polygon(np.array([near[k - 1], near[k], far[k], far[k - 1]]), colour)
@@ -237,15 +229,15 @@ def _base(canvas: Canvas, machine: Machine, camera: Camera, scene: Scene) -> Non
 def _arm(canvas: Canvas, machine: Machine, camera: Camera, scene: Scene, red: set[int]) -> None:
     """Links, the last one a breaker, and joints; red near a limit and where the arm touches."""
     corners = camera.project(skeleton(machine, scene.q))
-    warned = near_limit(machine, scene.q)
-    sizes = np.maximum(half_widths(machine) * camera.scale, 1.5)
+    warned = shapes.near_limit(machine, scene.q)
+    sizes = np.maximum(shapes.half_widths(machine) * camera.scale, 1.5)
     lengths = np.linalg.norm(np.diff(corners, axis=0), axis=-1)
     links = [i for i in range(2, 2 * machine.n) if lengths[i] > 0.5]
     for i in links:
         colour = WARNING if i in red else _pale(scene.colour, 0.2 * (i // 2 % 2))
         along = (corners[i + 1] - corners[i]) / lengths[i]
         across = along[::-1] * (-1, 1)
-        parts = [BREAKER, CHISEL] if i == 2 * machine.n - 1 else [BOOM]
+        parts = [shapes.BREAKER, shapes.CHISEL] if i == 2 * machine.n - 1 else [shapes.BOOM]
         for part, ink in zip(parts, (colour, STEEL)):
             middle = corners[i] + lengths[i] * part[:, :1] * along
             wide = sizes[i] * part[:, 1:] * across
@@ -273,7 +265,7 @@ def _tool(canvas: Canvas, machine: Machine, camera: Camera, scene: Scene) -> Non
     frames = forward_kinematics(machine, scene.q)
     tip = camera.project(tool_position(frames))
     canvas.circle(tip, 4.0, INK)
-    if near_singular(machine, scene.q):
+    if shapes.near_singular(machine, scene.q):
         canvas.circle(tip, 16.0, WARNING, 2)
     scale = ARROW * min(camera.box[2:]) / machine.tool_speed
     for v, colour in ((tool_velocity(frames, scene.q_dot), MEASURED), (scene.v_goal, GOAL)):
@@ -308,7 +300,7 @@ def _joint_rows(canvas: Canvas, machine: Machine, scene: Scene, box: Box) -> Non
     canvas.text(angle, upper + 6, "angle [rad]", 11, MUTED)
     header = f"valve of {machine.pwm_limit}"
     canvas.text(min(valve, left + width - 66), upper + 6, header, 11, MUTED)
-    warned = near_limit(machine, scene.q)
+    warned = shapes.near_limit(machine, scene.q)
     for i, joint in enumerate(machine.joints):
         y = upper + 26 + 22 * i
         colour = WARNING if warned[i] else INK if joint.driven else MUTED

@@ -24,6 +24,7 @@ from brokk_min.machine import Array, Machine
 from brokk_min.viewer.control_process import SelectedController, WindowDrive, WindowOperator
 
 MOST_TICKS = 2  # for one picture; a window with fewer pictures a second than 10 is in slow motion
+START = 0.2  # s that the machine was on before: its nodes have been heard (assumed)
 REST = 1.0  # s before and after a line that controllers trace (assumed)
 
 
@@ -98,6 +99,9 @@ class Lockstep:
         selected = SelectedController(machine, controllers, operator)
         self.drive = WindowDrive(machine, selected, self.bus, operator)
         self.drive.begin()
+        operator.request = operator.request._replace(alive=True)
+        for _ in range(round(START * machine.rate)):
+            self.drive.tick()
         self.due = clock()  # s, of the next tick
         self.late = 0.0  # s behind the window's clock
 

@@ -153,7 +153,8 @@ class Session:
         if self.comparison:
             for name, q in self.comparison.q.items():
                 trace = np.array(self.comparison.traces[name]).reshape(-1, 3)
-                text = f"{drawing.TITLES.get(name, name)}: {distances(self.path, trace)}"
+                text = distances(self.path, trace).replace(" from the line", "")
+                text = f"{drawing.TITLES.get(name, name)}: {text}"
                 runs.append(drawing.Trace(q, trace, drawing.COLOURS[name], text))
             scene = scene._replace(
                 q=runs[0].q, q_dot=0 * scene.q, traces=runs, trail=scene.path[:0]

@@ -177,7 +177,7 @@ def test_draw__cuts_off_no_text_and_puts_none_on_another(n, arms, size):
         machine.column("q_max"),
         title="drive_of_the_long_name_2026-11-21.log",
         status="12.3 s",
-        notes=[f"note {i}" for i in range(6 if arms == 1 else 2)],
+        notes=[f"note {i} " + 9 * "of some length " * (arms == 1) for i in range(3)],
         banner="q1: silent. It sent no position.",
         headline="3 mm",
     )
@@ -188,6 +188,7 @@ def test_draw__cuts_off_no_text_and_puts_none_on_another(n, arms, size):
     for box in boxes:
         assert (box >= 0).all()
         assert (box[2:] <= size).all()
+    assert sum("length" in text for text in canvas.texts_drawn) >= 3 * (arms == 1)
     for one, other in itertools.combinations(boxes, 2):
         assert (one[:2] >= other[2:]).any() or (other[:2] >= one[2:]).any()
     tracks = [p.points for p in canvas.polygons if p.colour == drawing.TRACK]

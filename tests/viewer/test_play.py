@@ -125,7 +125,7 @@ def test_compare__lays_the_traces_of_all_controllers_over_each_other():
     assert moved.trail[-1][1] == pytest.approx(0.3, abs=0.05)
     np.testing.assert_allclose(stood.trail, np.tile(tool(START), (len(stood.trail), 1)), atol=1e-9)
     assert moved.text.startswith("PID with DLS (the paper's): ")
-    assert stood.text == "RL policy: 0 mm from the line, at most 0 mm"
+    assert stood.text == "RL policy: 0 mm, at most 0 mm"
     session.update(telemetry(81), 4.0)
     assert session.comparison is None  # who drives sees the machine
 
