@@ -5,6 +5,7 @@ What trains or draws is imported by the command that runs it: help must not wait
 
 import math
 import sys
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -342,9 +343,12 @@ class Evaluate(Command):
             meta["commands"] = str(self.commands or ", ".join(one.name for one in commands))
             meta |= {"starts": str(self.starts or self.num_starts), "noise": self.noise}
             write_json(self.json, {"meta": meta, "runs": runs})
-        print_table(runs, len(commands))
-        if self.all:
-            print_means(runs, len(commands))
+        runs.sort(key=lambda run: sequences.KINDS.index(run["kind"]))  # those that count first
+        print_table(runs, len(commands), COLUMNS)
+        for kind in sequences.KINDS if self.all else ():
+            of_kind = [run for run in runs if run["kind"] == kind]
+            if of_kind:
+                print_table(of_kind, len(commands), [k for k in runs[0] if k not in metrics.LABELS])
 
     def _controllers(
         self, machine: Machine, policy: Policy, gains: Path | None, net: ActuatorNet | None
@@ -370,33 +374,20 @@ COLUMNS = {  # of the table: head, format
 }
 
 
-def print_table(runs: list[dict[str, Any]], sequences: int) -> None:
-    """Means of `COLUMNS` by controller, over the workspace starts, or all if none is such."""
-    scored = [run for run in runs if run["kind"] == "workspace"] or runs
-    num = len({run["start"] for run in scored})
-    print(f"means over {sequences} sequences from {num} {scored[0]['kind']} starts")
-    heads = [head for head, _ in COLUMNS.values()]
-    print(f"{'controller':30} " + " ".join(heads))
-    for name, rows in metrics.summary(scored).items():
+def print_table(runs: list[dict[str, Any]], sequences: int, keys: Iterable[str]) -> None:
+    """Means of some metrics by controller, over the starts of the first run's kind."""
+    runs = [run for run in runs if run["kind"] == runs[0]["kind"]]
+    num = len({run["start"] for run in runs})
+    print(f"means over {sequences} sequences from {num} {runs[0]['kind']} starts")
+    columns = {key: COLUMNS.get(key, (key, "{:.4f}")) for key in keys}
+    print(f"{'controller':30} " + " ".join(head for head, _ in columns.values()))
+    for name, rows in metrics.summary(runs).items():
         cells = []
-        for key, (head, form) in COLUMNS.items():
+        for key, (head, form) in columns.items():
             mean = rows["all"][key]
             text = "none" if mean is None else form.format(mean)
             cells.append(text.rjust(len(head)))
         print(f"{name:30} " + " ".join(cells))
-
-
-def print_means(runs: list[dict[str, Any]], sequences: int) -> None:
-    """Means of all metrics by kind of start and controller."""
-    for kind in dict.fromkeys(run["kind"] for run in runs):
-        of_kind = [run for run in runs if run["kind"] == kind]
-        num = len({run["start"] for run in of_kind})
-        print(f"{kind} starts ({num}), means over {sequences} sequences")
-        for name, rows in metrics.summary(of_kind).items():
-            cells = []
-            for metric, mean in rows["all"].items():
-                cells.append(f"{metric} none" if mean is None else f"{metric} {mean:.4f}")
-            print(f"  {name:22} " + ", ".join(cells))
 
 
 CHAIN = {  # files of `reproduce`

@@ -1,6 +1,6 @@
 """Figures: one style, units on every axis.
 
-Colours that stand in one plot differ in brightness: for print and for the colour-blind.
+Controllers differ in brightness, dashes and markers: for grey prints and for the colour-blind.
 """
 
 import io
@@ -11,11 +11,12 @@ from typing import Any, Literal, NamedTuple
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
+from numpy.linalg import norm
 
 from brokk_min.actuator import ActuatorNet
-from brokk_min.evaluation.metrics import Mean, Traces
+from brokk_min.evaluation.metrics import AFTER_STOP, Mean, Traces
 from brokk_min.evaluation.preliminary import Motion, SimulatorTests
-from brokk_min.evaluation.sequences import AXES, Commands
+from brokk_min.evaluation.sequences import AXES, Commands, hold_table
 from brokk_min.identification import validation
 from brokk_min.identification.files import whole_file
 from brokk_min.identification.formats import read_table
@@ -31,19 +32,20 @@ FREE_RUN_S = 30.0  # s, as in the paper
 STYLES: dict[str, dict[str, Any]] = {
     "goal": {"color": "black", "linestyle": ":"},
     "rl": {"color": "#08306b"},
-    "rl_open": {"color": "#5b8fd0"},
-    "rl_paper": {"color": "#b2182b"},
-    "jacobian_pid_k0.1": {"color": "#d9661a"},
+    "rl_open": {"color": "#5b8fd0", "linestyle": (0, (6, 1))},
+    "rl_paper": {"color": "#b2182b", "linestyle": (0, (1, 1))},
+    "jacobian_pid_k0.1": {"color": "#d9661a", "linestyle": (0, (6, 1, 1, 1, 1, 1))},
     "jacobian_pid_k0.05": {"color": "#f0b84a", "linestyle": "--"},
     "jacobian_pid_ff": {"color": "#00886a", "linestyle": "-."},
     "jacobian_pid_ff_awake": {"color": "#6fbf9b", "linestyle": (0, (4, 1, 1, 1))},
-    "jacobian_pid_ff_integral": {"color": "#7a4fa3", "linestyle": "-."},
-    "jacobian_pid_ff_integral_awake": {"color": "#b39ad0", "linestyle": (0, (4, 1, 1, 1))},
+    "jacobian_pid_ff_integral": {"color": "#7a4fa3", "linestyle": (0, (2, 1))},
+    "jacobian_pid_ff_integral_awake": {"color": "#b39ad0", "linestyle": (0, (2, 2, 6, 2))},
     "perfect_model": {"color": "#c987b7"},
     "workspace": {"color": "#08306b"},
     "limits": {"color": "#d9661a"},
     "extended": {"color": "#f0b84a"},
 }
+MARKERS = dict(zip(STYLES, ".osD^v<>PX*", strict=False))
 OTHER_STYLES: list[dict[str, Any]] = [
     {"color": "#08306b"},
     {"color": "#d9661a", "linestyle": "--"},
@@ -51,11 +53,14 @@ OTHER_STYLES: list[dict[str, Any]] = [
     {"color": "#f0b84a", "linestyle": (0, (4, 1, 1, 1, 1, 1))},
 ]
 
-Bars = Mapping[str, Mapping[str, Mean]]  # by controller and sequence
+Rows = Mapping[str, Mapping[str, Mean]]  # by name of the row and controller
 
 
 class Panel(NamedTuple):
-    """One plot: title, labels of the axes with units, and curves (x, y) by label."""
+    """One plot: title, labels of the axes with units, and curves (x, y) by label.
+
+    Of y (T, runs) the median and a band from 10 to 90 % of the runs are drawn.
+    """
 
     title: str
     xlabel: str
@@ -74,6 +79,9 @@ def plot_panels(
         for ax, panel in zip(axes, row, strict=False):
             for i, (label, (x, y)) in enumerate(panel.curves.items()):
                 style = STYLES.get(label, OTHER_STYLES[i % len(OTHER_STYLES)])
+                if y.ndim == 2:
+                    low, y, high = np.percentile(y, [10, 50, 90], axis=1)
+                    ax.fill_between(x, low, high, color=style["color"], alpha=0.2, linewidth=0)
                 ax.plot(x, y, label=label, linewidth=1.1, **style)
             ax.set(xlabel=panel.xlabel, ylabel=panel.ylabel)
             if one_legend:
@@ -90,8 +98,9 @@ def plot_panels(
 
 
 def _add_legend(figure: Figure) -> None:
-    handles = figure.axes[0].get_legend_handles_labels()
-    figure.legend(*handles, loc="outside upper center", ncol=4)
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    by_label = dict(zip(labels, handles, strict=True))
+    figure.legend(by_label.values(), by_label.keys(), loc="outside upper center", ncol=4)
 
 
 def _time_panels(dt: float, labels: Sequence[str], curves: Mapping[str, Array]) -> list[Panel]:
@@ -121,20 +130,19 @@ def plot_tests(machine: Machine, tests: Mapping[str, SimulatorTests]) -> Figure:
 
 
 def plot_gap(machine: Machine, gap: Motion) -> Figure:
-    """Nets less machine under the same commands, of the first run. Paper: Fig. 5"""
-    names = [machine.names[i] for i in machine.driven]
-    quantities = {
-        "tool velocity [m/s]": (AXES, gap.v_tool),
-        "tool position [m]": (AXES, gap.p_tool),
-        "joint velocity [rad/s]": (names, gap.q_dot[..., machine.driven]),
-        "joint angle [rad]": (names, gap.q[..., machine.driven]),
-    }
+    """Nets less machine under the same commands: tool, and a row for each joint. Paper: Fig. 5"""
+    rows = {"tool": ("m", norm(gap.v_tool, axis=-1), norm(gap.p_tool, axis=-1))}
+    rows |= {machine.names[i]: ("rad", gap.q_dot[..., i], gap.q[..., i]) for i in machine.driven}
     time = machine.dt * np.arange(1, len(gap.q) + 1)
     panels = []
-    for label, (columns, values) in quantities.items():
-        curves = {name: (time, values[:, 0, i]) for i, name in enumerate(columns)}
-        panels.append(Panel("nets - machine", "time [s]", label, curves))
-    return plot_panels([panels[:2], panels[2:]])
+    for name, (unit, velocity, position) in rows.items():
+        labels = {f"{name} [{unit}/s]": velocity, f"{name} [m{unit}]": 1000 * position}
+        row = []
+        for label, values in labels.items():
+            curves = {"all runs": (time, values), "first run": (time, values[:, 0])}
+            row.append(Panel("", "time [s]", label, curves))
+        panels.append(row)
+    return plot_panels(panels)
 
 
 def plot_free_run(net: ActuatorNet, log: Log) -> Figure:
@@ -228,23 +236,74 @@ def plot_joint_velocities(machine: Machine, traces: Traces, sequence: str, run: 
     return plot_panels([panels[i : i + 2] for i in range(0, len(panels), 2)])
 
 
-def plot_bars(panels: Mapping[str, Bars]) -> Figure:
-    """Means with their 95 % intervals by controller and sequence; panels by their y label."""
-    figure = Figure(figsize=(WIDTH, 2.8 * len(panels)), layout="constrained")
-    grid = figure.subplots(len(panels), 1, squeeze=False)[:, 0]
-    for ax, (ylabel, bars) in zip(grid, panels.items(), strict=True):
-        sequences = list(next(iter(bars.values())))
-        width = 0.8 / len(bars)
-        for i, (controller, means) in enumerate(bars.items()):
-            x = np.arange(len(sequences)) + (i - (len(bars) - 1) / 2) * width
-            numbers = [[means[s][key] for key in ("mean", "low", "high")] for s in sequences]
-            mean, low, high = np.array(numbers, float).T
-            style = {"color": STYLES[controller]["color"], "error_kw": {"linewidth": 0.8}}
-            ax.bar(x, mean, width, yerr=[mean - low, high - mean], label=controller, **style)
-        ax.set_xticks(np.arange(len(sequences)), [s.replace("_", "\n") for s in sequences])
-        ax.set_ylabel(ylabel)
-        ax.grid(False, axis="x")
-    _add_legend(figure)
+def plot_position_error(
+    machine: Machine, traces: Traces, sequence: Commands, starts: Array, controllers: Sequence[str]
+) -> Figure:
+    """Motion along an axis, and the tool's distance from where the goals lead; from all starts."""
+    axis = AXES.index(sequence.name)
+    moved = machine.dt * np.cumsum(sequence.for_starts(machine, starts), axis=0)
+    sign = np.sign(moved.sum(axis=0)[:, axis])  # inward goals are negative from some starts
+    time = machine.dt * np.arange(1, len(moved) + 1)
+    motion, error = {"goal": (time, sign * moved[..., axis])}, {}
+    for name in controllers:
+        p = traces[name, sequence.name].p_tool - tool_position(forward_kinematics(machine, starts))
+        motion[name] = time, sign * p[..., axis]
+        error[name] = time, 1000 * norm(moved - p, axis=-1)
+    along = Panel("", "time [s]", f"motion along {sequence.name} [m]", motion)
+    return plot_panels([[along, Panel("", "time [s]", "position error [mm]", error)]])
+
+
+def plot_rest(
+    machine: Machine, traces: Traces, sequence: Commands, controllers: Sequence[str]
+) -> Figure:
+    """How far each driven joint goes in the longest rest from where it was 1 s after the stop."""
+    rows = hold_table(machine, sequence.goals)  # of seconds and goal
+    ends = np.rint(machine.rate * rows[:, 0].cumsum()).astype(int)
+    longest = 1 + np.argmax(rows[1:, 0] * ~rows[1:, 1:].any(axis=1))  # the first follows no motion
+    rest = slice(ends[longest - 1] + round(AFTER_STOP * machine.rate) - 1, ends[longest])
+    panels = []
+    for joint in machine.driven:
+        curves = {}
+        for name in controllers:
+            q = traces[name, sequence.name].q[rest, :, joint]
+            curves[name] = machine.dt * np.arange(len(q)), 1000 * np.abs(q - q[0])
+        panels.append(Panel(machine.names[joint], "time at rest [s]", "motion [mrad]", curves))
+    return plot_panels([panels], sharey="row")
+
+
+def plot_intervals(panels: Mapping[str, Rows]) -> Figure:
+    """Means and 95 % intervals of controllers in rows; panels by their x label.
+
+    As rliable draws them: Agarwal et al. 2021, "Deep RL at the edge of the statistical precipice".
+    """
+    rows = next(iter(panels.values()))
+    most = max(map(len, rows.values()))
+    figure = Figure(figsize=(WIDTH, len(rows) * (0.15 + 0.09 * most) + 1.0), layout="constrained")
+    grid = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
+    for ax, (xlabel, of_rows) in zip(grid, panels.items(), strict=True):
+        for i, row in enumerate(of_rows.values()):
+            for k, (name, number) in enumerate(row.items()):
+                y = i + 0.8 * ((k + 0.5) / len(row) - 0.5)
+                mean, low, high = (np.array(number[key], float) for key in ("mean", "low", "high"))
+                style = {"color": STYLES[name]["color"], "marker": MARKERS[name]}
+                style |= {
+                    "markeredgecolor": "black",
+                    "linestyle": "",
+                    "elinewidth": 5,
+                    "markersize": 4,
+                }
+                error = np.array([[mean - low], [high - mean]])
+                ax.errorbar(mean, y, xerr=error, label=name, **style)
+        ax.set_yticks(range(len(rows)), rows)
+        ax.set(xlabel=xlabel, ylim=(len(rows) - 0.5, -0.5))
+        means = [number["mean"] or np.nan for row in of_rows.values() for number in row.values()]
+        if np.nanmax(means) > 8 * np.nanmin(means) > 0:
+            ax.set_xscale("log")
+            ax.xaxis.set_major_formatter("{x:g}")
+        else:
+            ax.set_xlim(left=min(0.0, ax.get_xlim()[0]))
+    if most > 1:
+        _add_legend(figure)
     return figure
 
 

@@ -1,7 +1,10 @@
 """The report: one HTML page with all figures and tables. The page is in `report.html.j2`."""
 
 import base64
+import os
+import platform
 from collections.abc import Mapping
+from datetime import date
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,19 +16,24 @@ from tqdm import tqdm
 from brokk_min.actuator import ActuatorNet
 from brokk_min.evaluation import figures
 from brokk_min.evaluation.claims import VERDICTS, training_claim
-from brokk_min.evaluation.figures import Bars
-from brokk_min.evaluation.metrics import Mean, Traces
+from brokk_min.evaluation.figures import Rows
+from brokk_min.evaluation.metrics import Mean, Traces, mean_interval
 from brokk_min.evaluation.preliminary import Preliminary
+from brokk_min.evaluation.rollout import Trace
 from brokk_min.evaluation.sequences import (
     axis_sequences,
     hold_table,
     singular_sequences,
     task_sequences,
 )
-from brokk_min.identification.files import whole_file
+from brokk_min.identification.files import SHIPPED, expected, read_json, whole_file
 from brokk_min.identification.logs import Log
 from brokk_min.machine import Array, Machine
 
+POSITION = ("rl", "rl_paper", "jacobian_pid_k0.1")  # in the figures of position errors
+AT_REST = ("rl", "rl_open", "jacobian_pid_ff_integral_awake")
+ROBUST = ("rl", "rl_open", "rl_paper", "jacobian_pid_k0.1", "jacobian_pid_ff_integral")
+STAGES = ("record", "fit", "train and tune", "evaluate")  # of the clock; the others are within
 Results = Mapping[str, Any]  # of `results.json`
 UNITS = {
     "velocity": "m/s",
@@ -39,6 +47,14 @@ UNITS = {
     "valve": "full strokes",
     "reward": "1",
 }  # of the figures of merit, by their first word
+FIRST = {  # figures of the first screen: names in seeds.json, in results, in a sweep
+    "error [m/s]": ("error", "velocity_error_mean", "velocity_error_all"),
+    "largest drift [m]": ("drift", "off_axis_drift_max", "off_axis_drift_max"),
+    "jerk [m/s^3]": ("jerk", "jerk_rms", "jerk_rms"),
+    "valve travel [strokes]": ("valve_travel", "valve_travel", "valve_travel"),
+}
+NONE: Mean = {"mean": None, "low": None, "high": None}
+SEEDS = {"ours closed": "rl", "ours open": "rl_open", "paper": "rl_paper"}  # other names there
 
 
 class Shown(NamedTuple):
@@ -67,29 +83,67 @@ def draw(machine: Machine, results: Results, shown: Shown, curve: Path) -> dict[
     """All figures of the page by name; `curve` is the file of the learning curve."""
     starts, kinds = np.array(results["starts"]), results["start_kinds"]
     run = kinds.index("workspace")
-    bars = {
-        "mean velocity error [m/s]": with_intervals(results, "velocity_error_mean"),
-        "largest drift [m]": with_intervals(results, "off_axis_drift_max"),
+    scored = np.array(kinds) == "workspace"
+    task = {k: Trace(*(array[:, scored] for array in trace)) for k, trace in shown.task.items()}
+    error, drift = (
+        transpose(with_intervals(results, key))
+        for key in ("velocity_error_mean", "off_axis_drift_max")
+    )
+    robustness = {
+        variation: {name: row[name] for name in row if name in ROBUST}
+        for variation, row in results["robustness"].items()
     }
+    regret = transpose(results["regret"]["less_perfect_model"])
+    axes = axis_sequences(machine)
     drawn = {
+        "first": figures.plot_intervals(first_panels(machine, results)),
         "tests": figures.plot_tests(machine, shown.preliminary.tests),
         "free_run": figures.plot_free_run(shown.net, shown.test),
         "learning": figures.plot_learning(curve),
         "gap": figures.plot_gap(machine, shown.preliminary.gap),
         "starts": figures.plot_starts(machine, starts, kinds),
         "joint_velocities": figures.plot_joint_velocities(machine, shown.task, "x", run),
-        "by_sequence": figures.plot_bars(bars),
-        "regret": figures.plot_bars({"regret [m/s]": results["regret"]["less_perfect_model"]}),
+        "rest": figures.plot_rest(machine, task, axes[0], AT_REST),
+        "by_sequence": figures.plot_intervals({"error [m/s]": error, "largest drift [m]": drift}),
+        "regret": figures.plot_intervals({"regret [m/s]": regret}),
+        "robustness": figures.plot_intervals({"mean velocity error [m/s]": robustness}),
     }
-    for sequence in axis_sequences(machine):
-        plot = figures.plot_sequence(machine, shown.task, sequence, starts[run], run)
-        drawn[sequence.name] = plot
+    for s in axes:
+        drawn[s.name] = figures.plot_sequence(machine, shown.task, s, starts[run], run)
+        errors = figures.plot_position_error(machine, task, s, starts[scored], POSITION)
+        drawn[f"{s.name}_error"] = errors
     if shown.singular:
         drawn["singular"] = _draw_singular(machine, results, shown.singular)
-    if results["training_seeds"]:
-        seeds = {"mean velocity error [m/s]": seed_bars(results["training_seeds"])}
-        drawn["seeds"] = figures.plot_bars(seeds)
     return drawn
+
+
+def first_panels(machine: Machine, results: Results) -> dict[str, Rows]:
+    """Rows of the first figure: seeds that the package has or that were swept, then this run."""
+    seeds = shipped_seeds(SHIPPED / machine.name / "seeds.json")
+    panels: dict[str, Rows] = {}
+    for label, (name, key, key_swept) in FIRST.items():
+        rows: dict[str, dict[str, Mean]] = {}
+        for of in dict.fromkeys(row["controller"] for row in seeds):
+            values = np.array([row[name] for row in seeds if row["controller"] == of], float)
+            rows[f"{of}, {len(values)} seeds"] = {SEEDS.get(of, of): mean_interval(values)}
+        if results["training_seeds"]:
+            rows["rl, swept seeds"] = {"rl": results["training_seeds"]["rl"].get(key_swept, NONE)}
+        for controller, of_sequence in with_intervals(results, key).items():
+            rows[controller] = {controller: of_sequence["all"]}
+        panels[label] = rows
+    return panels
+
+
+def shipped_seeds(path: Path) -> list[dict[str, Any]]:
+    """Rows of `benchmarks.seeds` that have a seed, see `FIRST`; none without the file."""
+    if not path.exists():
+        return []
+    names = ["controller", "seed", *(name for name, *_ in FIRST.values())]
+    with expected(path, f"rows with {', '.join(names)}"):
+        content = read_json(path, "JSON")
+        rows = content["rows"] if isinstance(content, dict) else content
+        every = [{name: row[name] for name in names} for row in rows]
+        return [row for row in every if row["seed"] is not None]
 
 
 def _draw_singular(machine: Machine, results: Results, traces: Traces) -> Figure:
@@ -102,16 +156,6 @@ def _draw_singular(machine: Machine, results: Results, traces: Traces) -> Figure
     return figures.plot_sequence(machine, traces, half, starts[run], run)
 
 
-def seed_bars(table: Mapping[str, Mapping[str, Mean]]) -> Bars:
-    """Velocity error over training seeds by controller and sequence."""
-    bars = {}
-    for controller, row in table.items():
-        if "less" not in controller:
-            errors = {k: v for k, v in row.items() if k.startswith("velocity_error_")}
-            bars[controller] = {k.removeprefix("velocity_error_"): v for k, v in errors.items()}
-    return bars
-
-
 def render(
     machine: Machine, results: Results, images: Mapping[str, str], clock: Mapping[str, float]
 ) -> str:
@@ -121,20 +165,36 @@ def render(
     page.filters["interval"] = interval_text
     page.filters.update(label=label, transpose=transpose, with_intervals=with_intervals)
     training = training_claim(clock["train rl_paper"], results["meta"]["effort"]["paper_steps"])
+    rows = next(iter(first_panels(machine, results).values()))
     sequences = {}
     for sequence in task_sequences(machine):
         sequences[sequence.name] = path_row(hold_table(machine, sequence.goals))
     return page.get_template("report.html.j2").render(
         results=results,
+        compared=compare(results),
+        seeds=[row for row in rows if "seeds" in row],
+        minutes=sum(clock.get(stage, 0) for stage in STAGES) / 60,
+        date=date.today().isoformat(),
+        computer=f"{platform.machine()}, {os.cpu_count()} cores",
         claims=[*results["net_claims"], *results["claims"], training.to_json()],
         images=images,
         clock=clock,
         verdicts=VERDICTS,
         intervals="95 % intervals over starts in brackets",
-        joints=machine.names,
+        joints=list(machine.names),
         sequences=sequences,
         tuning_paths=[path_row(np.array(run["goals"])) for run in results["tuning_runs"]],
     )
+
+
+def compare(results: Results) -> dict[str, list[str]]:
+    """Controllers by the interval of our policy's velocity error less theirs: below 0, above 0."""
+    sides: dict[str, list[str]] = {"lower than": [], "higher than": [], "not told apart from": []}
+    for name, less in results["task_space"]["rl_less"]["velocity_error_mean"].items():
+        low, high = less["all"]["low"], less["all"]["high"]
+        side = "lower than" if high is not None and high < 0 else "not told apart from"
+        sides["higher than" if low is not None and low > 0 else side].append(name)
+    return sides
 
 
 def interval_text(number: Mean) -> str:
@@ -165,7 +225,7 @@ def transpose(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]
     return {column: {name: row[column] for name, row in rows.items()} for column in columns}
 
 
-def with_intervals(results: Results, key: str) -> Bars:
+def with_intervals(results: Results, key: str) -> Rows:
     """A figure of merit with its interval, by controller and sequence."""
     task = results["task_space"]
     table: dict[str, dict[str, Mean]] = {}

@@ -180,7 +180,7 @@ def table(seeds: Sequence[Rows], baselines: Rows) -> Table:
     runs = [*baselines, *(row for rows in seeds for row in rows)]
     sequences = list(dict.fromkeys(run["sequence"] for run in runs))
     columns = {f"velocity_error_{s}": (s, "velocity_error_mean") for s in (*sequences, "all")}
-    columns |= {name: ("all", name) for name in ("off_axis_drift_max", "valve_travel")}
+    columns |= {name: ("all", name) for name in ("off_axis_drift_max", "jerk_rms", "valve_travel")}
 
     def means(runs: Rows, controller: str) -> Array:
         scored = [run for run in runs if run["kind"] == "workspace"]

@@ -101,12 +101,7 @@ def brief(value: Any) -> str:
 
 
 def reason(error: BaseException) -> str:
-    """What went wrong, in words, without the names that Python gives to errors.
-
-    Example:
-        >>> reason(FileNotFoundError(2, "No such file or directory", "log.csv"))
-        'no such file or directory'
-    """
+    """What went wrong, in words, without the names that Python gives to errors."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror[:1].lower() + error.strerror[1:]
     return f"no entry {error}" if isinstance(error, KeyError) else str(error) or "no reason given"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers_cli import run
 
-from brokk_min.cli.commands import print_scores, print_table, split
+from brokk_min.cli.commands import COLUMNS, print_scores, print_table, split
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation import baselines
 from brokk_min.evaluation.metrics import summary
@@ -169,7 +169,7 @@ def test_print_table__has_units_and_counts_workspace_starts(capsys):
     for start, (kind, travel) in enumerate({"workspace": 20.0, "limits": 90.0}.items()):
         row = {"controller": "rl", "sequence": "x", "start": start, "kind": kind}
         runs.append(row | figures | {"valve_travel": travel})
-    print_table(runs, 1)
+    print_table(runs, 1, COLUMNS)
     title, heads, rl = capsys.readouterr().out.splitlines()
     assert title == "means over 1 sequences from 1 workspace starts"
     assert heads.endswith(" travel [1]") and len(heads) <= 80

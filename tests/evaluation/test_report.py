@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
 from brokk_min.evaluation import report
+from brokk_min.machine import BROKK_170
 
 
 def number(mean, low=None, high=None):
@@ -33,8 +36,46 @@ def test_path_row__lists_the_goals_that_hold():
     assert report.path_row(np.ones((60, 4)))["held for, vx, vy, vz [m/s]"] == "new at every tick"
 
 
-def test_seed_bars__are_velocity_errors_of_controllers_by_sequence():
-    row = {"velocity_error_to_go": number(0.5, 0.25, 0.75), "valve_travel": number(9.0)}
-    bars = report.seed_bars({"rl": row, "pid": row, "rl less pid": row})
-    errors = {"to_go": row["velocity_error_to_go"]}
-    assert bars == {"rl": errors, "pid": errors}
+def test_compare__has_the_sides_of_the_intervals():
+    less = {"a": number(-1.0, -2.0, -0.1), "b": number(1.0, 0.1, 2.0), "c": number(0.0, -1.0, 1.0)}
+    less["d"] = number(-1.0)
+    rows = {"velocity_error_mean": {name: {"all": value} for name, value in less.items()}}
+    sides = {"lower than": ["a"], "higher than": ["b"], "not told apart from": ["c", "d"]}
+    assert report.compare({"task_space": {"rl_less": rows}}) == sides
+
+
+def test_shipped_seeds__are_rows_of_a_file_that_need_not_be_there(tmp_path):
+    path = tmp_path / "seeds.json"
+    assert report.shipped_seeds(path) == []
+    row = {"controller": "rl", "seed": 0, "error": 0.1, "drift": 0.2, "jerk": 3.0}
+    row["valve_travel"] = 4.0
+    rows = [row | {"more": 1}, row | {"controller": "pid", "seed": None}]
+    for content in (rows, {"meta": {}, "rows": rows}):
+        path.write_text(json.dumps(content))
+        assert report.shipped_seeds(path) == [row]
+    path.write_text(json.dumps([{"seed": 0}]))
+    with pytest.raises(ValueError, match=r"seeds.json: expected rows with controller, seed, .* no"):
+        report.shipped_seeds(path)
+
+
+def test_first_panels__are_seeds_before_this_run(tmp_path, monkeypatch):
+    folder = tmp_path / BROKK_170.name
+    folder.mkdir()
+    row = {"controller": "ours open", "seed": 0, "error": 1, "drift": 0, "jerk": 1}
+    row["valve_travel"] = 2
+    rows = [row, row | {"seed": 1, "error": 3}]
+    (folder / "seeds.json").write_text(json.dumps(rows))
+    monkeypatch.setattr(report, "SHIPPED", tmp_path)
+    keys = ("velocity_error_mean", "off_axis_drift_max", "jerk_rms", "valve_travel")
+    summary = {"rl": {"all": dict.fromkeys(keys, 5.0)}}
+    intervals = {"rl": {"all": {key: [4.0, 6.0] for key in keys}}}
+    swept = {"rl": {"velocity_error_all": number(7.0, 6.0, 8.0)}}
+    task = {"summary": summary, "intervals": intervals}
+    panels = report.first_panels(BROKK_170, {"training_seeds": swept, "task_space": task})
+    assert list(panels) == list(report.FIRST)
+    error = panels["error [m/s]"]
+    assert list(error) == ["ours open, 2 seeds", "rl, swept seeds", "rl"]
+    assert error["ours open, 2 seeds"]["rl_open"]["mean"] == 2.0
+    assert error["rl, swept seeds"]["rl"] == number(7.0, 6.0, 8.0)
+    assert error["rl"]["rl"] == number(5.0, 4.0, 6.0)
+    assert panels["jerk [m/s^3]"]["rl, swept seeds"]["rl"] == number(None)  # of older sweeps

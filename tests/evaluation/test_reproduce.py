@@ -144,32 +144,48 @@ def test_reproduce__results_record_the_tuning(results):
 
 def test_reproduce__report_is_one_file_with_its_figures(folder, results):
     page = (folder / "report.html").read_text()
-    assert len(re.findall(r'src="data:image/png;base64,iVBOR', page)) == 12
+    assert len(re.findall(r'src="data:image/png;base64,iVBOR', page)) == 18
     text = re.sub(r'base64,[^"]*', "", page)  # letters of an image may spell anything
-    assert not re.findall(r'(?:src|href)="(?!data:)', text) and "http" not in text
+    assert not re.findall(r'(?:src|href)="(?!data:|#)', text) and "http" not in text
+    places = re.findall(r'<h2 id="(.*?)"', text)
+    assert set(re.findall(r'href="#(.*?)"', text)) == set(places) and len(set(places)) == len(
+        places
+    )
     for claim in (*results["net_claims"], *results["claims"]):
         assert html.escape(claim["measured"], quote=False) in text.replace("&#39;", "'")
+    assert text.count("<table") == text.count("<thead>") and text.count("<details>") == 3
     assert text.count("<td>start ") == 4 and text.count("<td>tuning run ") == TINY.tuning_runs
 
 
 def page_sections(page):
-    """Sections of a page by their titles."""
-    return dict(re.findall(r"<h2>(.*?)</h2>(.*?)(?=<h2>|</body>)", page, re.S))
+    """What stands before the first section, and sections of a page by their titles."""
+    page = page.replace("<body>", "<h2>First</h2>", 1)
+    return dict(re.findall(r"<h2[^>]*>(.*?)</h2>(.*?)(?=<h2|</body>)", page, re.S))
 
 
 def test_render__answers_the_papers_sentences_first(folder, results):
     sections = page_sections((folder / "report.html").read_text())
-    assert next(iter(sections)) == "Results"
-    rows = re.findall(r"<tr>(.*?)</tr>", sections["Results"], re.S)
-    answers = [re.findall(r"<td[^>]*>(.*?)</td>", row, re.S) for row in rows[1:]]
-    claims = [c for c in (*results["net_claims"], *results["claims"]) if c["figure"] != "Sec. 3.4"]
-    assert len(answers) == len(claims)
-    for claim, (sentence, verdict, *_) in zip(claims, answers, strict=True):
-        assert html.unescape(sentence) == claim["paper"]
-        assert verdict == VERDICTS[claim["holds"]]
+    first = sections.pop("First")
     for title, text in sections.items():
         if "(Fig." in title:  # each figure of the paper stands with its sentences
             assert "<img" in text and ("<blockquote>" in text or "6a)" in title), title
+    for key in ("rl", "rl_paper", "jacobian_pid_k0.1"):
+        error = results["task_space"]["summary"][key]["all"][ERROR]
+        assert f"{error:.4f}" in first.partition("</b>")[0]
+    rows = re.findall(r"<tr>(.*?)</tr>", first, re.S)
+    heads, *answers = [re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", row, re.S) for row in rows]
+    claims = [*results["net_claims"], *results["claims"]]
+    assert len(answers) == len(claims) + 1  # and the time of the training
+    for claim, (figure, sentence, _, verdict, ours) in zip(claims, answers[:-1], strict=True):
+        assert re.sub("<.*?>", "", figure) == claim["figure"]
+        assert html.unescape(sentence) == claim["paper"]
+        assert verdict.partition("<br>")[0] == VERDICTS[claim["holds"]]
+        expected = VERDICTS[claim["ours"]["holds"]] if "ours" in claim else ""
+        assert ours.partition("<br>")[0] == expected
+    held = sum(claim["holds"] is True for claim in claims)
+    assert re.search(rf"\(({held}|{held + 1}) of {len(answers)} hold\)", heads[3])
+    held = sum(claim["ours"]["holds"] is True for claim in results["claims"])
+    assert f"({held} of {len(results['claims'])} hold)" in heads[4]
 
 
 def test_render__escapes_names_and_shows_training_seeds(results):
