@@ -11,6 +11,7 @@ from typing import Any, Literal, NamedTuple
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 from numpy.linalg import norm
 
 from brokk_min.actuator import ActuatorNet
@@ -299,7 +300,9 @@ def plot_intervals(panels: Mapping[str, Rows]) -> Figure:
         means = [number["mean"] or np.nan for row in of_rows.values() for number in row.values()]
         if np.nanmax(means) > 8 * np.nanmin(means) > 0:
             ax.set_xscale("log")
+            ax.xaxis.set_major_locator(LogLocator(subs=(1, 3)))
             ax.xaxis.set_major_formatter("{x:g}")
+            ax.xaxis.set_minor_formatter("")
         else:
             ax.set_xlim(left=min(0.0, ax.get_xlim()[0]))
     if most > 1:
