@@ -36,8 +36,8 @@ QUICK = {
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("port")
-    source = (ROOT / "examples" / "mini_excavator.py").read_text()
-    (path / "mini_excavator.py").write_text(source)
+    for name in ("mini_excavator.py", "own_plant.py"):
+        (path / name).write_text((ROOT / "examples" / name).read_text())
     return path
 
 
@@ -95,14 +95,21 @@ def test_page__has_commands_that_run_one_after_the_other(here, mini):
     Path("starts.csv").write_text(",".join(mini.names) + "\n" + ",".join(map(str, start)) + "\n")
     Path("commands.csv").write_text("sequence,time,vx,vy,vz\nout,0,0.2,0,0\nout,1,0,0,0\n")
     names = [words[0] for words in COMMANDS]
-    assert names == ["collect", "fit", "train", "evaluate", "machine", "drive"]
-    for words in COMMANDS[:4]:
+    assert names[:7] == ["collect", "inspect", "fit", "score", "train", "evaluate", "dbc"]
+    assert names[7:] == ["machine", "drive", "diagnose"]
+    for words in COMMANDS[:7]:
         if words[0] == "evaluate":  # gains, so that nothing is tuned
             net = select_nets(mini, load_net(Path("net.npz")))
             meta = baselines.gains_metadata(mini, net)
             baselines.write_gains(Path("gains.json"), baselines.baselines(mini, net), meta)
         short = [word for word in words if word not in ("--hours", "1")]
-        assert main([*short, *QUICK[words[0]].split()]) == 0, words
+        assert main([*short, *QUICK.get(words[0], "").split()]) == 0, words
+        if words[0] == "evaluate":  # on the plant that was recorded, too
+            own = ["own_plant.py:PLANT" if word == "net" else word for word in short[:-2]]
+            assert main([*own, *QUICK["evaluate"].split(), "--json", "own.json"]) == 0
+    assert json.loads(Path("own.json").read_text())["meta"]["plant"] == "own_plant.py:PLANT"
+    assert len(json.loads(Path("fit.json").read_text())["curve"]) == 4
+    assert Path("fit.png").stat().st_size > 1000 < Path("score.png").stat().st_size
     results = json.loads(Path("nets.json").read_text())
     net = load_net(Path("net.npz"))
     assert (net.rate, net.history, net.velocity_samples) == (25.0, 14, mini.velocity_samples)
@@ -112,10 +119,10 @@ def test_page__has_commands_that_run_one_after_the_other(here, mini):
 
 def test_page__has_commands_of_the_bus(here, capsys):
     """They need two programs; here the options are read, and what they name is not there."""
-    for words in COMMANDS[4:]:
+    for words in COMMANDS[7:]:
         assert main(["nonsense" if word == "udp_multicast" else word for word in words]) == 1
         message = capsys.readouterr().err
-        assert any(name in message for name in ("nonsense", "policy.npz", "joystick"))
+        assert any(name in message for name in ("nonsense", "policy.npz", "joystick", "run.log"))
 
 
 @pytest.mark.parametrize("axis", range(3))
