@@ -1,7 +1,7 @@
 """Recorded runs side by side, of logs or of results simulated again: in a window or as a film."""
 
 import subprocess
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
@@ -31,18 +31,7 @@ FFMPEG = (  # raw pictures in, MP4 of even width and height out
     "-vf crop=trunc(iw/2)*2:trunc(ih/2)*2 -f mp4 -movflags frag_keyframe+empty_moov pipe:1"
 )
 LAST_FRAME = 3000  # ms for which a GIF holds it, then it begins again
-
-
-@dataclass(frozen=True)
-class Images:
-    """The pictures (height, width, 3) of a film."""
-
-    ticks: list[int]
-    draw: Callable[[int], NDArray[np.uint8]]  # the picture of a tick
-
-    def __iter__(self) -> Iterator[NDArray[np.uint8]]:
-        """One after another, with a progress bar."""
-        return map(self.draw, tqdm(self.ticks, desc="draw", unit="frame", disable=None))
+Images = Iterable[NDArray[np.uint8]]  # (height, width, 3)
 
 
 @dataclass
@@ -218,25 +207,26 @@ def write_film(
 
     ValueError: another kind of file, or no ffmpeg that writes it.
     """
-    writers = {".gif": _write_gif, ".mp4": _write_mp4}
-    if path.suffix not in writers:
+    if path.suffix not in (".gif", ".mp4"):
         raise ValueError(f"{path}: expected a name ending in .gif or .mp4, got {path.suffix!r}")
     step = max(1, round(machine.rate / fps))
     last = max(len(run.q) for run in runs) - 1
-    images = Images([*range(0, last, step), last], lambda tick: film(runs, tick, size).image())
+    bar = tqdm([*range(0, last, step), last], desc="draw", unit="frame", disable=None)
+    images = (film(runs, tick, size).image() for tick in bar)
     with whole_file(path) as file:
-        writers[path.suffix](file, images, size, machine.rate / step)
+        if path.suffix == ".mp4":
+            _write_mp4(file, images, size, machine.rate / step)
+        else:
+            samples = [film(runs, tick, size).image() for tick in (0, last // 2, last)]
+            _write_gif(file, images, samples, machine.rate / step)
 
 
-def _write_gif(file: IO[bytes], images: Images, size: tuple[int, int], fps: float) -> None:
-    ticks = images.ticks
-    samples = [images.draw(tick) for tick in (ticks[0], ticks[len(ticks) // 2], ticks[-1])]
+def _write_gif(file: IO[bytes], images: Images, samples: Sequence[Any], fps: float) -> None:
+    """A GIF with the colours of some samples of the pictures, and of what may be short."""
     rare = [np.full_like(samples[0][:40], c) for c in (drawing.WARNING, drawing.MEASURED)]
     palette = Image.fromarray(np.vstack([*samples, *rare])).quantize(48)
-    frames = [
-        Image.fromarray(image).quantize(palette=palette, dither=Image.Dither.NONE)
-        for image in images
-    ]
+    none = Image.Dither.NONE
+    frames = [Image.fromarray(image).quantize(palette=palette, dither=none) for image in images]
     times = [round(1000 / fps)] * (len(frames) - 1) + [LAST_FRAME]
     more = {"append_images": frames[1:], "duration": times, "loop": 0}
     frames[0].save(file, "GIF", save_all=True, **more)

@@ -105,11 +105,11 @@ def test_switch__needs_a_fresh_press_after_loss_of_focus_and_change_of_mode(loss
 
 def test_handle__keeps_the_requested_task_and_closes():
     operator = Operator()
-    for key, task in (("return", "next"), ("up", "next"), ("backspace", "again"), ("up", "again")):
+    for key, task in (("return", "next"), ("up", "next"), ("backspace", "again"), ("c", "compare")):
         operator.key(key)
         assert operator.handler.task == task
     operator.event(pygame.JOYBUTTONDOWN, button=9)
-    assert operator.handler.task == "again"
+    assert operator.handler.task == "compare"
     operator.key("escape")
     assert operator.handler.closed
     other = Operator()
