@@ -19,7 +19,7 @@ ADVICE = {
     Fault.JUMPED: "Its angle jumped. Check that encoder and plug sit tight.",
     Fault.FROZEN: "The valve is open, but the angle stands still. Check pump, valve and encoder.",
     Fault.NO_COMMAND: "The controller gave no command that a valve can take.",
-    Fault.STOP: "The program ends.",
+    Fault.STOP: "The program ends, and the valves are closed.",
 }
 
 
