@@ -3,7 +3,6 @@
 What trains or draws is imported by the command that runs it: help must not wait for it.
 """
 
-import math
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -41,7 +40,7 @@ from brokk_min.evaluation.rollout import Controller
 from brokk_min.identification import excitation, inspection, validation
 from brokk_min.identification.files import SHIPPED, brief, located, write_json
 from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
-from brokk_min.identification.logs import Log, Recording, driven, read_log, write_log
+from brokk_min.identification.logs import Log, part_of, read_log, split, write_log
 from brokk_min.identification.net_file import load_net, save_net
 from brokk_min.learning.policy import POLICIES, Policy, PolicyController, load_policy
 from brokk_min.machine import Machine
@@ -149,36 +148,6 @@ class Fit(Command):
         elif known and settings["dead_zone"] is None:
             settings["dead_zone"] = known.dead_zone
         return settings
-
-
-def split(log: Log) -> tuple[Log, Log]:
-    """Recordings to fit to, and to score on: every tenth of those that drive the same joints.
-
-    ValueError: no two recordings drive the same joints.
-    """
-    held_out = {i for group in same_joints(log) if len(group) > 1 for i in group[::10]}
-    if not held_out:
-        expected = "expected two or more that drive the same joints, or --test, to score on"
-        raise ValueError(f"recordings: {expected}, got {len(log.recordings)}")
-    parts: tuple[list[Recording], list[Recording]] = ([], [])
-    for i, recording in enumerate(log.recordings):
-        parts[i in held_out].append(recording)
-    kept, test = (log._replace(recordings=tuple(part)) for part in parts)
-    return kept, test
-
-
-def same_joints(log: Log) -> list[list[int]]:
-    """Indices of recordings that drive the same joints, group by group."""
-    groups: dict[tuple[bool, ...], list[int]] = {}
-    for i, recording in enumerate(log.recordings):
-        groups.setdefault(tuple(driven(recording).tolist()), []).append(i)
-    return list(groups.values())
-
-
-def part_of(log: Log, part: float) -> Log:
-    """The first recordings of each joint, a `part` of them and at least one."""
-    kept = [i for group in same_joints(log) for i in group[: math.ceil(part * len(group))]]
-    return log._replace(recordings=tuple(log.recordings[i] for i in sorted(kept)))
 
 
 def learning_curve(logs: list[Log], scores: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -6,6 +6,7 @@ Columns `run,time,u_<joint>...,q_<joint>...[,q_dot_<joint>...]`, one row per sam
 not below the machine's, jitter allowed. Recordings whose name ends in `_return` are dropped.
 """
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -115,6 +116,36 @@ def join_recordings(log: Log) -> Samples:
     lengths = [len(recording.q) for recording in log.recordings]
     moves = [driven(recording) for recording in log.recordings]
     return Samples(Recording("", u, q, q_dot), target, np.repeat(moves, lengths, axis=0), lengths)
+
+
+def split(log: Log) -> tuple[Log, Log]:
+    """Recordings to fit to, and to score on: every tenth of those that drive the same joints.
+
+    ValueError: no two recordings drive the same joints.
+    """
+    held_out = {i for group in same_joints(log) if len(group) > 1 for i in group[::10]}
+    if not held_out:
+        expected = "expected two or more that drive the same joints, or --test, to score on"
+        raise ValueError(f"recordings: {expected}, got {len(log.recordings)}")
+    parts: tuple[list[Recording], list[Recording]] = ([], [])
+    for i, recording in enumerate(log.recordings):
+        parts[i in held_out].append(recording)
+    kept, test = (log._replace(recordings=tuple(part)) for part in parts)
+    return kept, test
+
+
+def same_joints(log: Log) -> list[list[int]]:
+    """Indices of recordings that drive the same joints, group by group."""
+    groups: dict[tuple[bool, ...], list[int]] = {}
+    for i, recording in enumerate(log.recordings):
+        groups.setdefault(tuple(driven(recording).tolist()), []).append(i)
+    return list(groups.values())
+
+
+def part_of(log: Log, part: float) -> Log:
+    """The first recordings of each joint, a `part` of them and at least one."""
+    kept = [i for group in same_joints(log) for i in group[: math.ceil(part * len(group))]]
+    return log._replace(recordings=tuple(log.recordings[i] for i in sorted(kept)))
 
 
 def write_log(path: Path, log: Log) -> None:

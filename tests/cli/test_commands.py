@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from helpers_cli import run
 
-from brokk_min.cli.commands import COLUMNS, print_scores, print_table, split
+from brokk_min.cli.commands import COLUMNS, print_scores, print_table
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation import baselines
 from brokk_min.evaluation.metrics import summary
 from brokk_min.evaluation.sequences import read_starts, start_kinds
 from brokk_min.identification.files import SHIPPED
-from brokk_min.identification.logs import Log, Recording, join_recordings, read_log, write_log
+from brokk_min.identification.logs import Log, Recording, read_log, write_log
 from brokk_min.identification.net_file import load_net, save_net
 from brokk_min.learning.episodes import PAPER_TASK
 from brokk_min.learning.policy import POLICIES, load_policy
@@ -187,24 +187,6 @@ def test_fit__takes_the_history_of_the_machine(tmp_path):
     for more, history in (("", 9), ("--history 5", 5)):
         assert run(f"{line} {more} --out '{tmp_path}/n.npz'") == 0
         assert load_net(tmp_path / "n.npz").history == history
-
-
-def test_split__holds_out_drives_of_each_joint():
-    time = np.arange(40)[:, None]
-    drives = {"a": np.sin(time * [1, 0]), "b": np.sin(time * [0, 1])}
-    names = ["a"] * 11 + ["b"] * 2
-    recordings = [Recording(f"{i}", drives[x], drives[x], 0 * time) for i, x in enumerate(names)]
-    kept, held_out = split(Log(("a", "b"), tuple(recordings)))
-    assert [recording.name for recording in held_out.recordings] == ["0", "10", "11"]
-    assert join_recordings(kept).moves.any(axis=0).all()
-
-
-def test_split__holds_out_every_tenth_recording():
-    kept, held_out = split(steady_log(("a",), 21))
-    assert [recording.name for recording in held_out.recordings] == ["0", "10", "20"]
-    assert len(kept.recordings) == 18
-    with pytest.raises(ValueError, match=r"^recordings: expected two or more that .*, or --test"):
-        split(steady_log(("a",), 1))
 
 
 # --- collect, train, starts, evaluate -------------------------------------------------------------

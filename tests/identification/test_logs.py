@@ -14,7 +14,9 @@ from brokk_min.identification.logs import (
     Recording,
     driven,
     join_recordings,
+    part_of,
     read_log,
+    split,
     velocity_of,
     write_log,
 )
@@ -429,3 +431,24 @@ def test_read_log__refuses_an_angle_that_wraps(tmp_path):
     message = r"log.npz: row 34, column q_a: .* after a turn .*, got -3.08319 after 3.1$"
     with pytest.raises(ValueError, match=message):
         read_log([write(tmp_path / "log.npz", columns)], 4)
+
+
+def test_split__holds_out_drives_of_each_joint():
+    time = np.arange(40)[:, None]
+    drives = {"a": np.sin(time * [1, 0]), "b": np.sin(time * [0, 1])}
+    names = ["a"] * 11 + ["b"] * 2
+    recordings = [Recording(f"{i}", drives[x], drives[x], 0 * time) for i, x in enumerate(names)]
+    kept, held_out = split(Log(("a", "b"), tuple(recordings)))
+    assert [recording.name for recording in held_out.recordings] == ["0", "10", "11"]
+    assert join_recordings(kept).moves.any(axis=0).all()
+
+
+def test_split__holds_out_every_tenth_recording():
+    q = np.cumsum(np.full((40, 1), 0.01), axis=0)
+    log = Log(("a",), tuple(Recording(str(i), 0 * q, q, 0 * q) for i in range(21)))
+    kept, held_out = split(log)
+    assert [recording.name for recording in held_out.recordings] == ["0", "10", "20"]
+    assert len(kept.recordings) == 18
+    with pytest.raises(ValueError, match=r"^recordings: expected two or more that .*, or --test"):
+        split(log._replace(recordings=log.recordings[:1]))
+    assert [recording.name for recording in part_of(log, 0.25).recordings] == [*"012345"]
