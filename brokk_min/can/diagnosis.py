@@ -24,10 +24,10 @@ from brokk_min.kinematics import forward_kinematics, tool_velocity
 from brokk_min.learning.policy import Policy
 from brokk_min.machine import PWM_MAX, Array, Machine
 
-CLEARLY = 0.8  # of the error that is left, assumed: then a changed term explains something
+CLEARLY = 0.75  # of the error that is left, assumed: then a changed term explains something
 COMMAND_ERROR = 0.01  # of full command, assumed: smaller ones are the gate's and of rounding
 RATE_ERROR = 0.05  # of a tick, assumed
-AHEAD = 20  # ticks of a free run, assumed
+AHEAD = 1.0  # s of a free run, assumed
 ZEROS = (0.05, -0.05, 0.1, -0.1, 0.2, -0.2, 0.4, -0.4)  # rad
 SCALES = (0.5, 0.7, 1.4, 2.0)
 DEGREES = 180 / np.pi
@@ -67,8 +67,9 @@ def read_ticks(machine: Machine, frames: Iterable[Frame]) -> Ticks:
         start = frame.time if frame.id == canopen.SYNC else start
     longest = max(stretches, key=len)
     driven = sum(row[-1] for row in longest)
-    if driven < machine.history + 3 * AHEAD:
-        expected = f"expected {machine.history + 3 * AHEAD} ticks of driving in a row or more"
+    least = machine.history + 3 * round(AHEAD * machine.rate)
+    if driven < least:
+        expected = f"expected {least} ticks of driving in a row or more"
         raise ValueError(f"log: {expected}, got {driven}")
     return Ticks(*(np.array(column) for column in zip(*longest, strict=True)))
 
@@ -150,16 +151,16 @@ def motion_error(machine: Machine, policy: Policy, u: Array, q: Array) -> float:
 
 
 def net_velocities(machine: Machine, policy: Policy, u: Array, q: Array) -> tuple[Array, Array]:
-    """Velocities [rad/s] (AHEAD, runs, n_driven) of free runs of the nets, and the measured ones.
+    """Velocities [rad/s] (ticks, runs, n_driven) of free runs of the nets, and the measured ones.
 
-    A run begins every `AHEAD` ticks with what was measured.
+    A run begins every `AHEAD` seconds with what was measured.
     """
-    driven = machine.driven
+    driven, ticks = machine.driven, round(AHEAD * machine.rate)
     q_dot = velocity_of(q, machine.velocity_samples, machine.rate)
     recording = Recording("", u[:, driven], q[:, driven], q_dot[:, driven])
-    starts = np.arange(machine.history, len(q) - AHEAD, AHEAD)
-    _, velocities = free_run(policy.net, recording, starts, AHEAD)
-    return velocities, recording.q_dot[starts + np.arange(1, AHEAD + 1)[:, None]]
+    starts = np.arange(machine.history, len(q) - ticks, ticks)
+    _, velocities = free_run(policy.net, recording, starts, ticks)
+    return velocities, recording.q_dot[starts + np.arange(1, ticks + 1)[:, None]]
 
 
 def scale(x: Array, factors: Array) -> Array:
