@@ -45,9 +45,10 @@ class Score(Command):
     logs: Positional[tuple[Path, ...]]  # Logs of the same machine, .csv or .npz.
     machine: MachineName = ""  # Of NET; also scores the tool.
     json: Path | None = None  # Also write the scores here.
-    figure: Path | None = None  # Also draw free runs of the worst and median recording, .png.
+    figure: Path | None = None  # Free runs of the worst and median recording; by default NET.png.
 
     def __call__(self) -> None:
+        self.figure = self.figure or self.net.with_suffix(".png")
         machine = self.check(json="scores", figure="picture")
         if not self.logs:
             raise WrongUse("LOGS: expected at least one log, got none")
@@ -60,7 +61,7 @@ class Score(Command):
         if self.json:
             meta = {"net": str(self.net), "logs": list(map(str, self.logs))}
             write_json(self.json, {"meta": meta, **scores})
-        if self.figure:
+        if any("one_step_rmse" in joint for joint in scores["joints"].values()):
             from brokk_min.evaluation import figures
 
             figures.save(self.figure, figures.plot_worst_and_median(net, log))

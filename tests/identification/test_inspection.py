@@ -163,6 +163,7 @@ def test_score__scores_nets_on_other_logs_and_fit_has_a_learning_curve(tmp_path,
     printed = capsys.readouterr().out
     assert printed.count("fitted to ") == 4 and "minutes" in printed
     assert run(f"score '{tmp_path}/n.npz' '{tmp_path}/test.npz' --json '{tmp_path}/s.json'") == 0
+    assert (tmp_path / "n.png").read_bytes().startswith(b"\x89PNG")
     again = json.loads((tmp_path / "s.json").read_text())
     for key in ("one_step_rmse", "persistence_rmse", "free_run"):
         assert again["joints"]["boom"][key] == scores["joints"]["boom"][key]

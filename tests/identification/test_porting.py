@@ -109,7 +109,7 @@ def test_page__has_commands_that_run_one_after_the_other(here, mini):
             assert main([*own, *QUICK["evaluate"].split(), "--json", "own.json"]) == 0
     assert json.loads(Path("own.json").read_text())["meta"]["plant"] == "own_plant.py:PLANT"
     assert len(json.loads(Path("fit.json").read_text())["curve"]) == 4
-    assert Path("fit.png").stat().st_size > 1000 < Path("score.png").stat().st_size
+    assert Path("fit.png").stat().st_size > 1000 < Path("net.png").stat().st_size
     results = json.loads(Path("nets.json").read_text())
     net = load_net(Path("net.npz"))
     assert (net.rate, net.history, net.velocity_samples) == (25.0, 14, mini.velocity_samples)
