@@ -162,6 +162,20 @@ def test_tune_baselines__lowers_each_cost_and_records_it():
         assert of["at_bound"] == baselines.gains_at_bound(tuned[name])
 
 
+def test_tuning_cost__is_that_of_the_plant_that_is_named():
+    """Nets that obey at once follow a goal that the plant's valves cannot."""
+    net = obedient_net(BROKK_170)
+    controller = baselines.baselines(BROKK_170, net)["jacobian_pid_k0.1"]
+    batch = replace(controller, gains=baselines.split_vector(vector(controller)[None]))
+    start = np.array([[0.0, 0.5, 0.58, 1.71, 1.24]])
+    goals = np.tile([0.0, 0.1, 0.0], (8, 1, 1))  # 0.4 s
+    noiseless = TaskConfig(noise=0.0)
+    of_plant, of_nets = (
+        baselines.tuning_cost(batch, start, goals, 0, noiseless, plant)[0] for plant in (None, net)
+    )
+    assert 0.08 < of_plant <= 0.1 and of_nets != pytest.approx(of_plant, abs=0.01)
+
+
 # --- files ----------------------------------------------------------------------------------------
 
 
