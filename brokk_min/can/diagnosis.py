@@ -163,29 +163,9 @@ def net_velocities(machine: Machine, policy: Policy, u: Array, q: Array) -> tupl
     return velocities, recording.q_dot[starts + np.arange(1, ticks + 1)[:, None]]
 
 
-def scale(x: Array, factors: Array) -> Array:
-    """Factors that broadcast."""
-    return np.asarray(x * factors, x.dtype)
-
-
-def shift(x: Array, offset: Array) -> Array:
-    """An offset that broadcasts."""
-    return np.asarray(x + offset, x.dtype)
-
-
-def reorder(x: Array, order: NDArray[np.intp]) -> Array:
-    """Joints (axis 1) in another order."""
-    return x[:, order]
-
-
 def delay(x: Array, ticks: int) -> Array:
     """The same some ticks later."""
     return np.concatenate([x[:1].repeat(ticks, axis=0), x[:-ticks]])
-
-
-def reverse(history: Array) -> Array:
-    """The newest sample first."""
-    return history[..., ::-1].copy()
 
 
 def widen_zone(u: Array, more: float) -> Array:
@@ -203,12 +183,12 @@ def joint_changes(machine: Machine, axes: int = 2) -> Iterator[tuple[str, Change
     for i in machine.driven:
         sign = 1.0 - 2.0 * (np.arange(machine.n) == i)
         sign = sign.reshape(-1, *[1] * (axes - 2))
-        yield f"sign of {machine.names[i]}", partial(scale, factors=sign)
+        yield f"sign of {machine.names[i]}", partial(np.multiply, sign)
     for i, j in combinations(machine.driven, 2):
         order = np.arange(machine.n, dtype=np.intp)
         order[[i, j]] = j, i
         names = f"{machine.names[i]}, {machine.names[j]}"
-        yield f"order of {names}", partial(reorder, order=order)
+        yield f"order of {names}", partial(np.take, indices=order, axis=1)
 
 
 def command_changes(machine: Machine) -> Iterator[tuple[str, Change]]:
@@ -216,7 +196,7 @@ def command_changes(machine: Machine) -> Iterator[tuple[str, Change]]:
     for name, change in joint_changes(machine):
         yield f"{name} (command)", change
     for factor in SCALES:
-        yield f"scale of commands: {factor:g}", partial(scale, factors=np.array(factor))
+        yield f"scale of commands: {factor:g}", partial(np.multiply, factor)
     for ticks in (1, 2):
         yield f"delay: {1e3 * ticks * machine.dt:.0f} ms more", partial(delay, ticks=ticks)
     for more in (0.03, 0.06, -0.03, -machine.dead_zone):
@@ -229,27 +209,27 @@ def angle_changes(machine: Machine) -> Iterator[tuple[str, Change]]:
     for name, change in joint_changes(machine):
         yield f"{name} (angle)", partial(about, change=change, middle=middle)
     for factor in (*SCALES, DEGREES):
-        yield f"scale of angles: {factor:.3g}", partial(scale, factors=np.array(1 / factor))
+        yield f"scale of angles: {factor:.3g}", partial(np.multiply, 1 / factor)
     for i in machine.driven:
         for zero in ZEROS:
             offset = -zero * (np.arange(machine.n) == i)
             name = f"encoder zero of {machine.names[i]}: {zero:+.2f} rad"
-            yield name, partial(shift, offset=offset)
+            yield name, partial(np.add, offset)
 
 
 def observation_changes(machine: Machine) -> Iterator[tuple[str, Change]]:
     """Changes of the history (T, n, 3, H) that a program gives its policy."""
     both, velocity = np.array([[1.0], [1.0], [0.0]]), np.array([[0.0], [1.0], [0.0]])
     yield "one sample late", partial(delay, ticks=1)
-    yield "order of the history", reverse
-    yield "degrees instead of radians", partial(scale, factors=DEGREES**both)
+    yield "order of the history", partial(np.flip, axis=-1)
+    yield "degrees instead of radians", partial(np.multiply, DEGREES**both)
     for factor in SCALES:
-        yield f"scale of angles and velocities: {factor:g}", partial(scale, factors=factor**both)
-        yield f"scale of velocities (rate): {factor:g}", partial(scale, factors=factor**velocity)
+        yield f"scale of angles and velocities: {factor:g}", partial(np.multiply, factor**both)
+        yield f"scale of velocities (rate): {factor:g}", partial(np.multiply, factor**velocity)
     for name, change in joint_changes(machine, axes=4):
         yield f"{name} (observation)", change
     for i in machine.driven:
         for zero in ZEROS:
             offset = np.zeros((machine.n, 3, 1))
             offset[i, 0] = zero
-            yield f"zero of {machine.names[i]}: {zero:+.2f} rad", partial(shift, offset=offset)
+            yield f"zero of {machine.names[i]}: {zero:+.2f} rad", partial(np.add, offset)
