@@ -194,7 +194,7 @@ def tune(
     gains; gains that are 0 stay so. `cost` is that (candidates,) of a controller with one row of
     gains per candidate.
     """
-    from scipy.optimize import differential_evolution  # slow to import, and only needed here
+    from scipy.optimize import Bounds, differential_evolution  # slow to import
 
     machine = controller.machine
     start = fractions_of(machine, controller.gains)
@@ -220,7 +220,7 @@ def tune(
 
         first = np.clip(first, 0, 1)[:, searched]
         options = SEARCH | {"init": first, "maxiter": generations, "rng": seed}
-        bounds = [(0.0, 1.0)] * first.shape[1]
+        bounds = Bounds(np.zeros(first.shape[1]), np.ones(first.shape[1]))
         result = differential_evolution(objective, bounds, callback=record, **options)
     x = np.zeros(len(start))
     x[searched] = result.x
