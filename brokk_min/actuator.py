@@ -200,6 +200,7 @@ class ActuatorNet:
 
     Weights, joint by joint: (n, 3 H, 32), (n, 32), (n, 32, 32), (n, 32), (n, 32, 1) and (n, 1).
     Paper: Table 1 and Sec. 3.3 (39 inputs, two hidden layers of 32, ReLU, sigmoid output)
+    Not in the paper: two more, (n, 6 H, L) and (n, L, 32), where joints are not alone, `latents`.
     """
 
     joints: tuple[str, ...]
@@ -253,12 +254,23 @@ class ActuatorNet:
         x[..., 2, :] = mu_law(x[..., 2, :].copy(), self.dead_zone)  # contiguous: half the time
         return x.reshape(*x.shape[:-2], 3 * self.history)
 
+    def latents(self, x: Array) -> Array:
+        """What all nets share of all joints' inputs (batch, n, 3 H): pump, load; (batch, L).
+
+        z = tanh(sum_j S_j^T [x_j, |x_j|]) of standardised inputs x.
+        """
+        x = (x - self.input_mean) / self.input_scale
+        x = np.concatenate([x, np.abs(x)], axis=-1)
+        return np.tanh(x.reshape(len(x), -1) @ np.concatenate(self.weights[6]))
+
     def forward(self, history: Array) -> tuple[Array, Array, Array, Array]:
         """Velocities [rad/s] (..., n); sigmoid output, hidden layers 2 and 1 (n, batch, units)."""
         x = self.inputs(history)
-        x = x.reshape(-1, *x.shape[-2:]).swapaxes(0, 1)  # (n, batch, 3 H)
+        x = x.reshape(-1, *x.shape[-2:])
         w1, b1, w2, b2, w3, b3 = folded_weights(self)
-        hidden1 = np.maximum(x @ w1 + b1, 0)
+        if len(self.weights) > 6:
+            b1 = b1 + self.latents(x) @ self.weights[7]  # (n, batch, units)
+        hidden1 = np.maximum(x.swapaxes(0, 1) @ w1 + b1, 0)
         hidden2 = np.maximum(hidden1 @ w2 + b2, 0)
         y = 1 / (1 + np.exp(-(hidden2 @ w3 + b3)))
         low, high = self.output_low[:, None], self.output_high[:, None]
@@ -269,7 +281,7 @@ class ActuatorNet:
 @lru_cache(maxsize=8)
 def folded_weights(net: ActuatorNet) -> tuple[Array, ...]:
     """Weights with the normalisation of the inputs folded into the first layer."""
-    w1, b1, w2, b2, w3, b3 = net.weights
+    w1, b1, w2, b2, w3, b3 = net.weights[:6]
     scaled = w1 / net.input_scale[..., None]
     shift = b1 - np.einsum("ni,nih->nh", net.input_mean, scaled)
     return scaled, shift[:, None], w2, b2[:, None], w3, b3[:, None]

@@ -19,14 +19,14 @@ import signal
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from helpers_machines import obedient_net, random_net
+from helpers_machines import obedient_net, random_net, shared_net
 
 from brokk_min.__main__ import LONGEST
 from brokk_min.can.drive_log import read_frames
@@ -195,9 +195,14 @@ def all_formats(folder: Path) -> Iterator[Format]:
     arrays["header"] = json.loads(str(arrays["header"]))
     found = places({"header": formats.NET_HEADER, **formats.NET_ARRAYS}, arrays)
     yield Format("net.npz", arrays, encode_npz, load_net, found)
+    shared = net_arrays(shared_net())
+    shared["header"] = json.loads(str(shared["header"]))
+    found = places({"header": formats.NET_HEADER, **formats.NET_ARRAYS}, shared)
+    yield Format("shared.npz", shared, encode_npz, load_net, found)
     policy = decode_npz(SHIPPED_POLICY)
     found = places({"header": formats.POLICY_HEADER, **formats.POLICY_ARRAYS}, policy)
-    found |= {(f"net_{name}",): field for name, field in formats.NET_ARRAYS.items()}
+    fields = {name: field for name, field in formats.NET_ARRAYS.items() if field.required}
+    found |= {(f"net_{name}",): field for name, field in fields.items()}
     yield Format("policy.npz", policy, encode_npz, partial(load_policy, machine=BROKK_170), found)
     read = lambda path: read_log([path], 4, ["a"] if "q_dot" in path.name else None)  # noqa: E731
     log = columns(30)

@@ -98,6 +98,14 @@ def random_net(seed=0, n=3, history=13, hidden=32):
     )  # fmt: skip
 
 
+def shared_net(latents=2):
+    """`random_net` whose joints share latents."""
+    net, rng = random_net(), np.random.default_rng(1)
+    shapes = (len(net.joints), 6 * net.history, latents), (len(net.joints), latents, 32)
+    more = tuple(0.1 * rng.standard_normal(shape).astype(np.float32) for shape in shapes)
+    return replace(net, weights=net.weights + more)
+
+
 def constant_net(velocity, logged, joints):
     """Nets that say `velocity` whatever they see: no weights, sigmoid(0) = 1/2, the middle."""
     middle = np.array(velocity, np.float32)

@@ -38,6 +38,7 @@ from brokk_min.evaluation import baselines, metrics, perfect_model, sequences
 from brokk_min.evaluation.claims import VERDICTS
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.identification import excitation, inspection, validation
+from brokk_min.identification.coupling import history_of
 from brokk_min.identification.files import SHIPPED, brief, located, write_json
 from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
 from brokk_min.identification.logs import Log, part_of, read_log, split, write_log
@@ -52,7 +53,8 @@ class Collect(Command):
 
     out: Path  # Log to write, .csv or .npz.
     hours: Annotated[float, Range(1e-4, 100)] = 1.0  # Driving time for each actuator [h].
-    excitation: Literal["sine", "rich"] = "rich"  # The paper's sines, or steps and holds too.
+    excitation: Literal["sine", "rich", "joint"] = "rich"
+    """The paper's sines; steps and holds too; or the same on all joints at once: HOURS in all."""
     plant: PlantName = "analytic"  # What moves: the analytic plant, or an object of your file.
 
     def __call__(self) -> None:
@@ -95,7 +97,8 @@ class Fit(Command):
         if self.machine and not known:
             expected = f"expected those of --machine {self.machine}"
             raise ValueError(f"{self.logs[0]}: joints: {expected}, got {brief(log.joints)}")
-        config = make_config(FitConfig, self._settings(known, machine.history))
+        history = machine.history if known else history_of(log, machine.history)
+        config = make_config(FitConfig, self._settings(known, history))
         reports = inspection.inspect(log)
         with located(*self.logs):
             inspection.check_signs(reports)
@@ -118,6 +121,8 @@ class Fit(Command):
             figures.save(self.figure, figures.plot_worst_and_median(net, test))
         name = net.machine or "no known machine"
         print(f"nets of {name}, dead zone {net.dead_zone} of full command")
+        seconds = net.history / net.rate
+        print(f"history: {net.history} samples at {net.rate:g} Hz, {seconds:.2f} s")
         print_scores(scores)
         for point in scores.get("curve", []):
             errors_5_s = ", ".join(f"{k} {v:.4f}" for k, v in point["free_run_rmse"].items())
@@ -173,6 +178,12 @@ def print_scores(scores: dict[str, Any]) -> None:
             free = ", ".join(f"{run['velocity_rmse']:.4f}" for run in model["free_run"].values())
             creep = f"{net['creep']:.5f}" if label == name else ""
             print(row.format(label, one_step, persistence, free, creep))
+        relative = [run.get("relative_error") for run in net["free_run"].values()]
+        parts = ", ".join("none" if part is None else f"{part:6.0%}" for part in relative)
+        print(row.format("  of rms speed", "", "", parts, ""))
+    if scores.get("tool"):
+        metres = ", ".join(f"{error:.3f}" for error in scores["tool"].values())
+        print(f"tool: off by {metres} m after {', '.join(scores['tool'])} s (median)")
     for name in scores["joints"]:
         own = [w.removeprefix(f"{name}: ") for w in scores["warnings"] if w.startswith(f"{name}: ")]
         if own:

@@ -1,7 +1,8 @@
 """Excitation of the machine: commands, and the recordings of encoder angles under them.
 
-Nets are fitted to recordings of `collect`, one actuator at a time over its whole range. They are
-validated on `task_log`, where the joints move together, as under a policy.
+Nets are fitted to recordings of `collect`: one actuator at a time over its whole range, or all at
+once where joints are not alone (one pump, weight). They are validated on `task_log`, where the
+joints move together, as under a policy.
 """
 
 from collections.abc import Callable
@@ -22,6 +23,7 @@ MIX = {"sine": 0.17, "step": 0.1, "holds": 0.17, "start": 0.21, "dither": 0.35}
 BARELY_OPEN = 0.049  # of full command beyond the dead zone, assumed: largest dither
 MAX_SEGMENT = 30.0  # s, assumed: longest motion that is recorded in one piece
 MAX_RETURN = 300.0  # s, assumed: a longer return to the start is stopped
+TURN_AFTER = 0.5  # s at a limit, assumed: then a joint that moves with others turns back
 
 
 def sine_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Array:
@@ -139,13 +141,16 @@ def collect(machine: Machine, hours: float, excitation: str, rng: np.random.Gene
 
     A segment begins with `history` samples of an idle valve. The return to its start is recorded as
     `..._return`; `read_log` drops it. Sines start at mid range, as in the paper, rich excitation at
-    random angles. ValueError: another excitation, or hours that are not positive. Paper: Sec. 3.3
+    random angles. Under "joint" excitation all joints move at once, `hours` in all. Paper: Sec. 3.3
+    ValueError: another excitation, or hours that are not positive.
     """
-    if excitation not in EXCITATIONS:
-        raise ValueError(f"excitation: expected one of {list(EXCITATIONS)}, got {excitation!r}")
+    if excitation not in (kinds := [*EXCITATIONS, "joint"]):
+        raise ValueError(f"excitation: expected one of {kinds}, got {excitation!r}")
     if not 0 < hours < np.inf:
         raise ValueError(f"hours: expected above 0, got {hours}")
     goal = max(machine.history + 2, round(hours * 3600 * machine.rate))  # samples per joint
+    if excitation == "joint":
+        return _drive_together(machine, goal, rng)
     rows = int(np.clip(goal // 300, 1, 100))  # segments of a joint that are simulated at once
     count = np.zeros(machine.n, int)
     recordings: list[list[tuple[str, Array, Array]]] = [[] for _ in machine.joints]
@@ -194,6 +199,33 @@ def _drive_segments(
         recorder.step(u)
         phases.append(phase)
     return np.array(phases), np.array(recorder.u), np.array(recorder.q[: len(phases)])
+
+
+def _drive_together(machine: Machine, goal: int, rng: np.random.Generator) -> Log:
+    """`goal` samples or more in segments in which all driven joints move, from random poses.
+
+    Each joint has rich commands of its own and rests in three of ten segments, but not in the
+    first. In every fifth the locked joints move, too. A joint that was at a limit for `TURN_AFTER`
+    gets its commands reversed.
+    """
+    ticks = min(goal, round(MAX_SEGMENT * machine.rate))
+    shape = (rows := -(-goal // ticks), machine.n)
+    low, high = machine.column("q_min"), machine.column("q_max")
+    recorder = _Recorder(machine, rng.uniform(low, high, shape))
+    commands = np.array([rich_command(rng, machine, ticks) for _ in range(rows * machine.n)])
+    moves = np.isin(np.arange(machine.n), machine.driven) | (np.arange(rows) % 5 == 0)[:, None]
+    moves &= (rng.random(shape) < 0.7) | (np.arange(rows) == 0)[:, None]
+    commands = commands.reshape(*shape, ticks) * moves[..., None]
+    commands[..., : machine.history] = 0.0
+    sign, at_limit, near = np.ones(shape), np.zeros(shape), 2 * machine.encoder_step
+    for tick in tqdm(range(ticks), desc="record (joint)", unit="tick", disable=None):
+        stopped = (recorder.q[-1] < low + near) | (recorder.q[-1] > high - near)
+        at_limit = (at_limit + 1) * stopped
+        sign = np.where(at_limit >= TURN_AFTER * machine.rate, -sign, sign)
+        at_limit = at_limit * (at_limit < TURN_AFTER * machine.rate)
+        recorder.step(sign * commands[..., tick])
+    u, q = np.stack(recorder.u, axis=1), np.stack(recorder.q[:-1], axis=1)
+    return machine_log(machine, [(f"joint_{i:03d}", u[i], q[i]) for i in range(rows)])
 
 
 class _SegmentPhases:

@@ -19,6 +19,7 @@ class FitConfig:
     hidden: int = number("1", 1, 10**4, 32)  # Units in each of the two hidden layers (paper: 32).
     history: int = number("samples", 2, 1000, 13)  # Of angle, velocity and command (paper: 13).
     rollout: int = number("ticks", 1, 10**6, 8)  # Of the errors in the last third (paper: 1).
+    shared: int = number("1", 0, 1000, 0)  # Latents of all joints' inputs: 4 for a pump and weight.
     dead_zone: float | None = number("1", 0, 0.99, None)
     """Command within which no valve opens; by default the known machine's, else 0."""
     __post_init__ = check_numbers  # type: ignore[misc]

@@ -81,11 +81,14 @@ def training_set(log: Log, config: FitConfig) -> TrainingSet:
     low = np.array([target.min() for target in targets])
     high = np.array([target.max() for target in targets])
     margin = 0.05 * (high - low) + 1e-6  # rad/s
+    multi_step_windows = samples.windows(config.history, config.rollout)
+    if config.shared:  # the same windows for all joints
+        windows, multi_step_windows = map(same_windows, (windows, multi_step_windows))
     return TrainingSet(
         signals=torch.tensor(signals).float(),
         target=torch.tensor(samples.target).float(),
         windows=windows,
-        multi_step_windows=samples.windows(config.history, config.rollout),
+        multi_step_windows=multi_step_windows,
         input_mean=torch.tensor(np.repeat(mean, config.history, axis=1)).float(),
         input_scale=torch.tensor(np.repeat(std, config.history, axis=1)).float(),
         output_low=torch.tensor(low - margin).float(),
@@ -94,6 +97,11 @@ def training_set(log: Log, config: FitConfig) -> TrainingSet:
         q_high=torch.tensor(q.max(axis=0)).float(),
         rate=log.rate,
     )
+
+
+def same_windows(windows: list[NDArray[np.intp]]) -> list[NDArray[np.intp]]:
+    """For each joint the windows in which any joint moves."""
+    return [np.unique(np.concatenate(windows))] * len(windows)
 
 
 def _check_targets(log: Log, targets: list[Array], history: int) -> None:
@@ -108,7 +116,7 @@ def train(data: TrainingSet, config: FitConfig, seed: int, estimator: int | None
     torch.set_float32_matmul_precision("highest")  # a training of policies may have lowered it
     torch.set_num_threads(1)  # several wait in vain on busy cores
     generator = Generator().manual_seed(seed)
-    weights = initial_weights(len(data.windows), 3 * config.history, config.hidden, generator)
+    weights = initial_weights(len(data.windows), config, generator)
     optimizer = torch.optim.Adam(weights, lr=config.learning_rate)
     multi_step = config.rollout > 1 and all(map(len, data.multi_step_windows))
     switch_step = round(0.65 * config.steps) if multi_step else config.steps
@@ -118,10 +126,11 @@ def train(data: TrainingSet, config: FitConfig, seed: int, estimator: int | None
     for step in tqdm(range(config.steps), desc="fit nets", unit="step", disable=None):
         if step < switch_step:
             settings = replace(config, rollout=1)
-            at = draw_windows(data.windows, config.batch_size, generator)
+            windows, batch = data.windows, config.batch_size
         else:
             settings = config
-            at = draw_windows(data.multi_step_windows, math.ceil(config.batch_size / 4), generator)
+            windows, batch = data.multi_step_windows, math.ceil(config.batch_size / 4)
+        at = draw_windows(windows, batch, generator, together=config.shared > 0)
         loss = multi_step_loss(data, settings, weights, at, estimator, generator)
         optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
@@ -132,13 +141,22 @@ def train(data: TrainingSet, config: FitConfig, seed: int, estimator: int | None
     return weights
 
 
-def initial_weights(n: int, inputs: int, hidden: int, generator: Generator) -> list[Tensor]:
-    """Weights, by He's uniform initialisation for ReLU, and zero biases of `n` nets."""
+def initial_weights(n: int, config: FitConfig, generator: Generator) -> list[Tensor]:
+    """Weights, by He's uniform initialisation for ReLU, and zero biases of `n` nets.
+
+    Those of latents, if any, begin small: the nets begin nearly alone.
+    """
+
+    def uniform(rows: int, columns: int, bound: float) -> Tensor:
+        return (torch.rand(n, rows, columns, generator=generator) * 2 - 1) * bound
+
+    inputs, hidden, latents = 3 * config.history, config.hidden, config.shared
     weights = []
     for rows, columns in [(inputs, hidden), (hidden, hidden), (hidden, 1)]:
-        bound = math.sqrt(6 / rows)
-        weights.append((torch.rand(n, rows, columns, generator=generator) * 2 - 1) * bound)
-        weights.append(torch.zeros(n, columns))
+        weights += [uniform(rows, columns, math.sqrt(6 / rows)), torch.zeros(n, columns)]
+    if latents:
+        weights.append(uniform(2 * inputs, latents, math.sqrt(1 / (2 * n * inputs))))
+        weights.append(uniform(latents, hidden, math.sqrt(6 / inputs)))
     return [weight.requires_grad_() for weight in weights]
 
 
@@ -150,8 +168,13 @@ def cosine_decay(step: int, switch_step: int, steps: int) -> float:
     return 0.125 * (1 + math.cos(math.pi * fraction))
 
 
-def draw_windows(windows: list[NDArray[np.intp]], batch: int, generator: Generator) -> Tensor:
-    """Newest samples (n, batch) of random windows of each joint."""
+def draw_windows(
+    windows: list[NDArray[np.intp]], batch: int, generator: Generator, together: bool = False
+) -> Tensor:
+    """Newest samples (n, batch) of random windows of each joint, or of all joints `together`."""
+    if together:
+        pick = torch.randint(len(windows[0]), (batch,), generator=generator)
+        return torch.tensor(windows[0][pick]).expand(len(windows), batch)
     picks = [torch.randint(len(window), (batch,), generator=generator) for window in windows]
     drawn = [window[pick] for window, pick in zip(windows, picks, strict=True)]
     return torch.tensor(np.stack(drawn))
@@ -217,10 +240,14 @@ def predict(
     data: TrainingSet, weights: list[Tensor], q: Tensor, q_dot: Tensor, u: Tensor
 ) -> Tensor:
     """Velocities [rad/s] (n, batch) for windows (n, batch, H); none passes a stop in one tick."""
-    w1, b1, w2, b2, w3, b3 = weights
+    w1, b1, w2, b2, w3, b3 = weights[:6]
     x = torch.cat([q, q_dot, u], dim=-1)
     x = (x - data.input_mean[:, None]) / data.input_scale[:, None]
-    x = torch.relu(torch.baddbmm(b1[:, None], x, w1))
+    bias = b1[:, None]
+    if len(weights) > 6:  # as `ActuatorNet.latents`
+        both = torch.cat([x, x.abs()], dim=-1)
+        bias = bias + torch.tanh((both @ weights[6]).sum(dim=0)) @ weights[7]
+    x = torch.relu(torch.baddbmm(bias, x, w1))
     x = torch.relu(torch.baddbmm(b2[:, None], x, w2))
     y = torch.sigmoid(torch.baddbmm(b3[:, None], x, w3))[..., 0]
     low, high = data.output_low[:, None], data.output_high[:, None]

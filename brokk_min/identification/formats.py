@@ -82,6 +82,8 @@ NET_ARRAYS: dict[str, Field] = {
     "weight_3": Field("float", -LARGE, LARGE, ("n", "hidden")),
     "weight_4": Field("float", -LARGE, LARGE, ("n", "hidden", 1)),
     "weight_5": Field("float", -LARGE, LARGE, ("n", 1)),
+    "weight_6": Field("float", -LARGE, LARGE, ("n", "6 history", "latents"), required=False),
+    "weight_7": Field("float", -LARGE, LARGE, ("n", "latents", "hidden"), required=False),
 }
 POLICY_HEADER: Fields = {
     "contract": {"paper": Field("truth value", required=False)},  # see `policy.contract`
@@ -132,6 +134,17 @@ MEAN: Fields = {
 }
 FIGURES: Fields = {"velocity_error_all": MEAN, "off_axis_drift_max": MEAN, "valve_travel": MEAN}
 SWEEP: Fields = {"meta": META, "table": {"rl": {**FIGURES, "*": MEAN}, "*": {**FIGURES, "*": MEAN}}}
+
+
+FAMILY_MEMBER: Fields = {
+    "seed": Field("whole number", 0, 2**63),
+    "budget": {"*": Field("number")},
+    "free_run": {"*": Field("float", none=True)},
+    "error": {"rl": Field("float", 0), "*": Field("float", 0)},
+    "on_nets": Field("float", 0),
+    "loaded": Field("float", 0),
+    "best": Field("text", 1, 100),
+}
 
 
 def starts_of(machine: Machine) -> dict[str, Field]:

@@ -15,13 +15,15 @@ from brokk_min.identification.formats import NET_ARRAYS, NET_HEADER, check_field
 from brokk_min.machine import Machine
 
 FORMAT = 1
+SHARED_FORMAT = 2  # of nets with `ActuatorNet.latents`
 LARGEST_NET = 2**26  # bytes of a file
 STATISTICS = [name for name in NET_ARRAYS if not name.startswith("weight_")]
 
 
 def net_arrays(net: ActuatorNet) -> dict[str, Any]:
     """Nets as named arrays, as in the file; one of them is the JSON header."""
-    header: dict[str, Any] = {"format": FORMAT, "kind": "actuator net"}
+    version = SHARED_FORMAT if len(net.weights) > 6 else FORMAT
+    header: dict[str, Any] = {"format": version, "kind": "actuator net"}
     for field in fields(net):
         if field.name not in (*STATISTICS, "weights"):
             header[field.name] = getattr(net, field.name)
@@ -43,10 +45,12 @@ def net_from_arrays(path: Path, arrays: dict[str, NDArray[Any]], prefix: str = "
 
     `prefix` is that of the names of the arrays in the file.
     """
-    header = load_header(path, arrays, "actuator net", FORMAT)
+    number = 8 if "weight_6" in arrays else 6
+    version = SHARED_FORMAT if number > 6 else FORMAT
+    header = load_header(path, arrays, "actuator net", version)
     sizes: dict[str, int] = {}
     check_fields(path, header, NET_HEADER, sizes, prefix)
-    sizes["3 history"] = 3 * header["history"]
+    sizes |= {"3 history": 3 * header["history"], "6 history": 6 * header["history"]}
     check_fields(path, arrays, NET_ARRAYS, sizes, prefix)
     for name in ("output", "q"):
         if not (arrays[f"{name}_low"] < arrays[f"{name}_high"]).all():
@@ -55,7 +59,7 @@ def net_from_arrays(path: Path, arrays: dict[str, NDArray[Any]], prefix: str = "
     with expected(path, "a complete actuator net"):
         header["joints"] = tuple(header["joints"])
         header |= {name: arrays[name] for name in STATISTICS}
-        return ActuatorNet(**header, weights=tuple(arrays[f"weight_{i}"] for i in range(6)))
+        return ActuatorNet(**header, weights=tuple(arrays[f"weight_{i}"] for i in range(number)))
 
 
 def select_nets(machine: Machine, net: ActuatorNet) -> ActuatorNet:

@@ -207,8 +207,8 @@ def pseudo_random(tick: Array) -> Array:
 # Largest effects of a drawn machine, all assumed; each is there with probability `PRESENT`.
 PRESENT = 0.6
 LARGEST = {
-    "load": 0.5,  # of the supply pressure, in the worst pose
-    "pump": 0.6,  # part of the pump's flow that is missing
+    "load": 0.8,  # of the supply pressure, in the worst pose
+    "pump": 0.8,  # part of the pump's flow that is missing
     "zone": 0.8,  # a dead zone's excess over the machine's
     "gain": 0.3,  # change of a speed, up or down
     "hysteresis": 0.02,
@@ -229,7 +229,7 @@ def draw_machine(base: Machine, seed: int) -> Machine:
     """
     rng = np.random.default_rng([2026, seed])
     size = {name: (rng.random() < PRESENT) * largest for name, largest in LARGEST.items()}
-    drawn = {name: value * rng.uniform(0.4, 1.0) for name, value in size.items()}
+    drawn = {name: value * rng.uniform(0.5, 1.0) for name, value in size.items()}
     gains = 1 + size["gain"] * rng.uniform(-1, 1, (base.n, 2))
     zones = base.dead_zone * (1 + size["zone"] * rng.random((base.n, 2)))
     poses = rng.uniform(base.column("q_min"), base.column("q_max"), (1000, base.n))

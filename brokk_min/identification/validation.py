@@ -22,10 +22,13 @@ from brokk_min.actuator import (
     plant_reset,
     plant_step,
 )
+from brokk_min.identification.coupling import coupling, response_delays
 from brokk_min.identification.logs import Log, Recording, Samples, driven, join_recordings
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
 
+ALLOWED_ERROR = 0.2  # of a joint's rms speed in free runs, assumed
+COUPLED = 0.1  # of a joint's error, assumed: more that another joint explains is a warning
 ALLOWED_OUTSIDE = 0.02  # of the samples, assumed: 0.2 % of the training are outside by definition
 RISE = 0.63  # paper's response times: 0.4 s and 0.1 s, read as the time to 63 % of the change
 HORIZONS = (1, 5, 10, 30)  # s, of the free runs
@@ -40,26 +43,55 @@ def validate(
 
     Each joint: `score` of the nets and, as `linear`, of a linear model; `creep` [rad/s];
     `response_time` of the nets and `machine_response_time` of a known machine [s]; `outside` as in
-    `outside_training`. `tool`: `tool_errors` of a known machine [m].
+    `outside_training`; `coupling`: part of the error that each other joint explains, where known;
+    `delay` [s] by `response_delays`. `tool`: `tool_errors` of a known machine [m].
     """
     joints = score(net, test)
     linear = score(fit_linear(net, log), test)
     speed = creep(net)
     outside = outside_training(log, test, net.history)
     times = log_response_times(net, log, machine)
+    explained, delays = coupled_errors(net, test), response_delays(log)
     for j, name in enumerate(net.joints):
         joints[name]["linear"] = linear[name]
+        pairs = zip(net.joints, explained[j], strict=True)
+        joints[name]["coupling"] = {other: float(x) for other, x in pairs if np.isfinite(x)}
+        joints[name]["delay"] = float(delays[j]) if np.isfinite(delays[j]) else None
         joints[name]["creep"] = float(speed[j])
         joints[name]["outside"] = {kind: float(fraction[j]) for kind, fraction in outside.items()}
         joints[name] |= {kind: of_joint[name] for kind, of_joint in times.items()}
     tool = tool_errors(machine, net, test) if machine else {}
-    return {"joints": joints, "tool": tool, "warnings": _warnings(joints)}
+    return {"joints": joints, "tool": tool, "warnings": _warnings(net, joints)}
 
 
-def _warnings(joints: dict[str, Any]) -> list[str]:
-    """Joints whose nets are no better than the linear model, or tested outside their training."""
+def coupled_errors(net: ActuatorNet, test: Log) -> Array:
+    """`coupling` of the nets' free runs of 1 s."""
+    samples, ticks = join_recordings(test), round(net.rate)
+    starts = samples.starts(net.history, ticks, ticks)
+    return coupling(samples, starts, run_errors(net, samples, starts, ticks)[1])
+
+
+def _warnings(net: ActuatorNet, joints: dict[str, Any]) -> list[str]:
+    """Joints whose nets err much, are no better than the linear model, or lack inputs.
+
+    Also joints that are tested outside their training.
+    """
     warnings = []
+    shared = len(net.weights) > 6
     for name, scores in joints.items():
+        runs = {int(h): run for h, run in scores["free_run"].items() if int(h) <= 10}
+        if runs and (part := runs[max(runs)]["relative_error"]) and part > ALLOWED_ERROR:
+            of_speed = f"free runs of {max(runs)} s are off by {part:.0%} of its rms speed"
+            warnings.append(f"{name}: {of_speed}: expected at most {ALLOWED_ERROR:.0%}")
+        others = [k for k, x in scores["coupling"].items() if x > COUPLED]
+        if others:
+            parts = ", ".join(f"{scores['coupling'][k]:.0%} by {k}" for k in others)
+            remedy = "" if shared else ": record with --excitation joint, fit with --shared 4"
+            warnings.append(f"{name}: its error is explained by other joints, {parts}{remedy}")
+        if scores["delay"] and net.history / net.rate < scores["delay"]:
+            span = f"{net.history} samples are {net.history / net.rate:.2f} s"
+            late = f"it answers after {scores['delay']:.2f} s"
+            warnings.append(f"{name}: {late}, {span}: fit with more --history or at a lower rate")
         for horizon, run in scores["free_run"].items():
             error = run["velocity_rmse"]
             reference = scores["linear"]["free_run"][horizon]["velocity_rmse"]
@@ -121,8 +153,8 @@ def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
 
     Each joint is scored where it moves. `one_step_rmse` is the error of the predicted target (see
     `join_recordings`), `persistence_rmse` that of the newest velocity in the history. Free runs
-    start every `horizon` seconds: `velocity_rmse` is over all samples, `position_error_median` over
-    their ends.
+    start every `horizon` seconds: `velocity_rmse` is over all samples, `relative_error` this by the
+    joint's rms speed, `position_error_median` over their ends.
     ValueError: other joints, rate or kind of velocity than the nets', or no recording long enough.
     """
     for name in ("joints", "rate", "velocity_logged"):
@@ -136,11 +168,14 @@ def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
         if not len(starts):
             break
         q_error, v_error = run_errors(net, samples, starts, ticks)
+        after = starts + np.arange(1, ticks + 1)[:, None]
         for j, name in enumerate(log.joints):
             scored = samples.moves[starts, j]
             if scored.any():
+                speed = _rms(samples.joined.q_dot[after][:, scored, j])
                 result[name]["free_run"][str(horizon)] = {
                     "velocity_rmse": _rms(v_error[:, scored, j]),
+                    "relative_error": _rms(v_error[:, scored, j]) / speed if speed else None,
                     "position_error_median": float(np.median(np.abs(q_error[-1, scored, j]))),
                 }
     return result

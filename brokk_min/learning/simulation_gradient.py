@@ -32,8 +32,9 @@ actions of a window, which move the tool after it, get little credit. None of th
 
 Simplifications: angles and commands count as exact, not rounded; the error integral takes the true
 velocity of the tick; Jacobians count as constant, for in one second a joint turns little; joints at
-rest count without the standstill rule; a tick into the ground counts as any other; nothing counts
-after the end of an episode, not even where it only ran out of time.
+rest count without the standstill rule; latents that the nets share count as given; a tick into the
+ground counts as any other; nothing counts after the end of an episode, not even where it only ran
+out of time.
 """
 
 from typing import NamedTuple

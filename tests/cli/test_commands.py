@@ -91,6 +91,7 @@ def test_fit__has_the_papers_recipe_as_one_option(tmp_path):
     scores = json.loads((tmp_path / "f.json").read_text())
     assert set(scores) == {"meta", "joints", "tool", "warnings"}
     keys = "one_step_rmse persistence_rmse free_run linear creep response_time outside"
+    keys += " coupling delay"
     assert all(set(joint) == set(keys.split()) for joint in scores["joints"].values())
 
 
@@ -160,7 +161,7 @@ def test_print_scores__has_units_and_groups_warnings_by_joint(capsys):
     head, _, *rows = capsys.readouterr().out.splitlines()
     assert head.startswith("Errors [rad/s] of one step, of the last velocity again, of free runs")
     assert rows[0].split() == ["boom", "0.0100", "0.0400", "0.0200,", "0.0300", "0.00000"]
-    assert rows[4:] == ["warnings for boom:", "  slow", "warnings for arm:", "  far", "  late"]
+    assert rows[6:] == ["warnings for boom:", "  slow", "warnings for arm:", "  far", "  late"]
 
 
 def test_print_table__has_units_and_counts_workspace_starts(capsys):

@@ -223,9 +223,38 @@ def test_task_log__starts_at_given_angles():
     [
         (0.0, "sine", "hours: expected above 0, got 0.0"),
         (np.inf, "rich", "hours: expected above 0, got inf"),
-        (1.0, "noise", r"excitation: expected one of \['sine', 'rich'\], got 'noise'"),
+        (1.0, "noise", r"excitation: expected one of \['sine', 'rich', 'joint'\], got 'noise'"),
     ],
 )
 def test_collect__refuses_hours_and_excitations_that_are_none(hours, excitation, message):
     with pytest.raises(ValueError, match=message):
         collect(BROKK_170, hours, excitation, np.random.default_rng(0))
+
+
+# --- all joints at once ---------------------------------------------------------------------------
+
+
+def test_collect__drives_the_joints_together_for_the_requested_time():
+    log = collect(BROKK_170, 0.05, "joint", np.random.default_rng(0))
+    assert [recording.name for recording in log.recordings] == [f"joint_{i:03d}" for i in range(6)]
+    assert sum(len(recording.u) for recording in log.recordings) == 0.05 * 3600 * 20
+    moved = np.array([np.ptp(recording.u, axis=0) > 0 for recording in log.recordings])
+    assert moved[0].all()
+    assert not moved[1:5, BROKK_170.locked].any()  # moves in every fifth
+    assert 0.4 < moved[:, BROKK_170.driven].mean() < 0.95
+    together = [
+        (np.abs(recording.u) > BROKK_170.dead_zone).sum(axis=1) for recording in log.recordings
+    ]
+    assert np.mean(np.concatenate(together) >= 2) > 0.3
+    for recording in log.recordings:
+        assert not recording.u[: BROKK_170.history].any()
+        assert (np.abs(recording.u) <= LIMIT + 1e-9).all()
+
+
+def test_collect__turns_joints_back_from_their_limits():
+    log = collect(BROKK_170, 0.1, "joint", np.random.default_rng(1))
+    near = 2 * BROKK_170.encoder_step
+    q = np.stack([recording.q for recording in log.recordings])[..., BROKK_170.driven]
+    low, high = LOW[BROKK_170.driven] + near, HIGH[BROKK_170.driven] - near
+    assert np.mean((q < low) | (q > high)) < 0.15
+    assert (np.ptp(q, axis=(0, 1)) > 0.8 * (high - low)).all()

@@ -187,3 +187,47 @@ def test_input_windows__have_noise_per_sample_and_per_window_in_units_of_the_vel
     noise = ((noisy - exact) / data.input_scale[:, None, 13:14]).numpy()
     assert noise.std() == pytest.approx(0.1 * 2**0.5, rel=0.02)
     assert noise.mean(axis=-1).std() == pytest.approx(0.1 * (1 + 1 / 13) ** 0.5, rel=0.02)
+
+
+# --- joints that are not alone --------------------------------------------------------------------
+
+
+def one_pump(seed, recordings, ticks=300):
+    """Two joints; each is slowed by the command of the other."""
+    rng = np.random.default_rng(seed)
+    result = []
+    for i in range(recordings):
+        u = np.repeat(
+            rng.uniform(-1, 1, (ticks // 20, 2)) * (rng.random((ticks // 20, 2)) < 0.6), 20, 0
+        )
+        speed = 0.4 * u * (1 - 0.8 * np.abs(u[:, ::-1]))
+        q = np.cumsum(np.concatenate([np.zeros((1, 2)), speed[:-1]]), axis=0) / 20
+        result.append(Recording(f"r{i}", u, q, velocity_of(q, 4)))
+    return Log(("boom", "stick"), tuple(result))
+
+
+def test_fit__with_latents_learns_what_joints_share():
+    log, unseen = one_pump(0, 20), one_pump(1, 5)
+    error = {}
+    for latents in (0, 2):
+        config = FitConfig(steps=600, batch_size=128, rollout=1, noise=0.0, shared=latents)
+        net = fit(log, config, seed=0, velocity_samples=4)
+        assert len(net.weights) == (8 if latents else 6)
+        scores = score(net, unseen)
+        error[latents] = np.mean([scores[j]["free_run"]["1"]["velocity_rmse"] for j in log.joints])
+    assert error[2] < 0.9 * error[0]
+
+
+def test_predict__of_the_fit_is_that_of_the_nets_with_latents():
+    log = simple_system(0, 4)
+    config = FitConfig(steps=1, shared=3)
+    net = fit(log, config, seed=0, velocity_samples=4)
+    data, joined = training_set(log, config), join_recordings(log).joined
+    at = torch.tensor([[50, 400], [50, 400]])
+    q, q_dot, u = fitting.input_windows(data, replace(config, noise=0.0), at, 1, torch.Generator())
+    weights = [torch.tensor(weight) for weight in net.weights]
+    rows = np.array([50, 400])[:, None] + np.arange(-12, 1)
+    history = np.stack([joined.q[rows], joined.q_dot[rows], joined.u[rows]], axis=1)
+    history = history.transpose(0, 3, 1, 2).astype(np.float32)
+    expected = net.forward(history)[0].T
+    np.testing.assert_allclose(fitting.predict(data, weights, q, q_dot, u), expected, atol=1e-5)

@@ -7,7 +7,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from helpers_machines import random_net, small_net
+from helpers_machines import random_net, shared_net, small_net
 
 from brokk_min.actuator import ActuatorNet
 from brokk_min.identification.net_file import fingerprint, load_net, save_net, select_nets
@@ -96,3 +96,19 @@ def test_select_nets__refuses_nets_of_another_machine_rate_or_estimator():
             select_nets(BROKK_170, replace(net, **{name: value}))
     with pytest.raises(ValueError, match=r"joints: expected nets for \['q1', 'q3', 'q4', 'q5'\]"):
         select_nets(BROKK_170, net.select(["q1", "q3"]))
+
+
+def test_load_net__gives_nets_that_share_latents(tmp_path):
+    net = shared_net()
+    save_net(tmp_path / "net.npz", net)
+    loaded = load_net(tmp_path / "net.npz")
+    history = np.random.default_rng(2).uniform(-1, 1, (6, 3, 3, 13)).astype(np.float32)
+    np.testing.assert_array_equal(loaded.predict(history), net.predict(history))
+    assert len(loaded.select(["j0", "j2"]).weights) == 8
+    with np.load(tmp_path / "net.npz") as file:
+        arrays = dict(file)
+    assert json.loads(str(arrays["header"]))["format"] == 2  # older programs refuse it
+    for name in ("weight_6", "weight_7"):
+        np.savez(tmp_path / "part.npz", **{key: arrays[key] for key in arrays if key != name})
+        with pytest.raises(ValueError, match=r"expected .*actuator net"):
+            load_net(tmp_path / "part.npz")

@@ -238,7 +238,7 @@ def test_validate__warns_of_nets_no_better_than_linear_and_of_tests_outside_the_
     assert result["tool"] == {} and set(result["joints"]) == {"a"}
     assert set(result["joints"]["a"]) == {
         "one_step_rmse", "persistence_rmse", "free_run", "linear", "creep", "outside",
-        "response_time",
+        "response_time", "coupling", "delay",
     }  # fmt: skip
     expected = "a: the error of a free run of 1 s is .* rad/s, that of a linear model"
     assert any(np.char.startswith(result["warnings"], "a: the error of a free run of 1 s")), (

@@ -8,7 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers_machines import POSE, constant_net, obedient_net, obedient_velocity, random_net
+from helpers_machines import (
+    POSE,
+    constant_net,
+    obedient_net,
+    obedient_velocity,
+    random_net,
+    shared_net,
+)
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
@@ -446,3 +453,23 @@ def test_select__gives_the_same_nets_in_another_order():
     assert part.output_low.tolist() == net.output_low[[2, 0]].tolist()
     with pytest.raises(ValueError, match=r"joints: expected nets for \['j0', 'q9'\], got"):
         net.select(["j0", "q9"])
+
+
+def test_latents__are_of_all_joints_by_hand():
+    net = shared_net()
+    history = np.random.default_rng(0).uniform(-1, 1, (5, 3, 3, 13)).astype(np.float32)
+    x = (history.reshape(5, 3, 39) - net.input_mean) / net.input_scale
+    z = np.zeros((5, 2))
+    for j in range(3):
+        z += np.concatenate([x[:, j], np.abs(x[:, j])], axis=1) @ net.weights[6][j]
+    np.testing.assert_allclose(net.latents(history.reshape(5, 3, 39)), np.tanh(z), atol=1e-5)
+    alone = replace(net, weights=net.weights[:6])
+    moved = history.copy()
+    moved[:, 2] *= 2
+    others = [0, 1]
+    np.testing.assert_array_equal(
+        alone.forward(history)[0][:, others], alone.forward(moved)[0][:, others]
+    )
+    assert (net.forward(history)[0][:, others] != net.forward(moved)[0][:, others]).all()
+    without = replace(net, weights=(*net.weights[:7], 0 * net.weights[7]))
+    np.testing.assert_allclose(without.forward(history)[0], alone.forward(history)[0], atol=1e-6)
