@@ -14,6 +14,7 @@ import tyro
 
 from brokk_min import __version__
 from brokk_min.cli import commands, operating, porting
+from brokk_min.cli.family import Family
 from brokk_min.cli.options import WrongUse
 from brokk_min.identification.files import reason
 
@@ -29,6 +30,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "starts": commands.Starts,
     "evaluate": commands.Evaluate,
     "reproduce": commands.Reproduce,
+    "family": Family,
     "machine": operating.Simulate,
     "drive": operating.Drive,
     "convert": operating.Convert,

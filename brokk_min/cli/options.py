@@ -62,6 +62,7 @@ CONTENTS = {
     "runs": {"meta", "runs"},
     "gains": {"meta", "gains"},
     "sweep": {"meta", "table"},
+    "family": {"meta", "members"},
     "results": {"meta", "task_space"},
     "preliminary": {"meta", "sim_to_real"},
     "attempts": {"when", "task", "mode"},

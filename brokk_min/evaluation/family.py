@@ -1,0 +1,168 @@
+"""The whole method on machines with physics of their own, drawn by seeds, and transfers among them.
+
+A member's controllers are made from its own logs, as a user's would be: an hour of all joints at
+once, nets that share latents, a policy, baselines tuned on the member itself. `family.json` has:
+
+    members[]: seed, effects, free_run {joint: error over rms speed in 10 s}, error {controller: m/s
+    on the machine}, on_nets: the policy's error on its nets, to_nets: its error on the machine over
+    that, best: the best baseline, to_best: the policy's error over this baseline's, payload: its
+    error with an unknown load at the tool over that without
+    transfers[i][j]: error [m/s] of the policy of member i on member j
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from brokk_min.evaluation import baselines, metrics, reproduce, sequences
+from brokk_min.evaluation.metrics import Controllers
+from brokk_min.evaluation.reproduce import Budget
+from brokk_min.identification import logs, validation
+from brokk_min.identification.excitation import collect, task_log
+from brokk_min.identification.files import read_json, write_json
+from brokk_min.identification.formats import FAMILY_MEMBER, check_fields
+from brokk_min.identification.net_file import select_nets
+from brokk_min.identification.physics import draw_machine
+from brokk_min.learning.policy import POLICIES, PolicyController, load_policy
+from brokk_min.machine import Machine
+
+LATENTS = 4  # that the nets share
+PAYLOAD = 50.0  # kg at the tool that no log has, assumed: half of a link
+# Small enough for 15 minutes a member on two cores.
+FAMILY = Budget(fit_steps=10_000, generations=5, tuning_runs=6, starts=16)
+QUICK = replace(reproduce.QUICK, train_steps=20_000, generations=2, tuning_runs=3, fit_steps=400)
+
+
+def run_family(base: Machine, seeds: Sequence[int], out: Path, budget: Budget) -> dict[str, Any]:
+    """Run the chain on each member, then transfers; results, also in `out`/family.json.
+
+    A member whose results lie in `out` is not run again. ValueError: results of another budget.
+    """
+    rows = [run_member(base, seed, out / f"member_{seed}", budget) for seed in seeds]
+    results = {
+        "meta": {"machine": base.name, "budget": asdict(budget)},
+        "members": rows,
+        "transfers": transfers(base, seeds, out, budget),
+        "summary": summary(rows),
+    }
+    write_json(out / "family.json", results)
+    return results
+
+
+def run_member(base: Machine, seed: int, out: Path, budget: Budget) -> dict[str, Any]:
+    """Collect, fit, train, tune and evaluate on one member; files and `member.json` in `out`."""
+    file, made_by = out / "member.json", asdict(budget)
+    if file.exists():
+        row: dict[str, Any] = read_json(file, "results of `family`")
+        check_fields(file, row, FAMILY_MEMBER, {})
+        if row["budget"] != made_by:
+            raise ValueError(f"{file}: budget: expected {made_by}, got {row['budget']}")
+        return row
+    out.mkdir(parents=True, exist_ok=True)
+    machine = draw_machine(base, seed)
+    log = collect(machine, budget.hours, "joint", np.random.default_rng(seed))
+    test = task_log(machine, 20, 40.0, np.random.default_rng(seed + 1))
+    logs.write_log(out / "log.npz", log)
+    every = reproduce.fit_net(machine, out / "net.npz", log, budget, {"shared": LATENTS}, seed)
+    net = select_nets(machine, every)
+    settings = budget.tuning_runs, budget.generations, seed
+    jobs = {
+        "train": partial(reproduce.train, machine, out, "rl", net, budget, seed),
+        "tune": partial(baselines.tune_baselines, machine, net, *settings),
+    }
+    clock: dict[str, float] = {}
+    policy, (pids, _) = reproduce.side_by_side(jobs, clock)
+    baselines.write_gains(out / "gains.json", pids, baselines.gains_metadata(machine, net))
+    controllers: Controllers = {"rl": PolicyController(machine, policy), **pids}
+    errors = mean_errors(base, machine, controllers, budget)
+    scores = validation.score(every, test)
+    driven = [base.names[i] for i in base.driven]
+    row = {
+        "seed": seed,
+        "budget": made_by,
+        "effects": {**asdict(machine.plant), "pump": machine.pump_flow / base.pump_flow},
+        "free_run": {name: scores[name]["free_run"]["10"]["relative_error"] for name in driven},
+        "tool": validation.tool_errors(machine, every, test),
+        "error": errors,
+        "on_nets": mean_errors(base, machine, {"rl": controllers["rl"]}, budget, net)["rl"],
+        "loaded": mean_errors(base, with_payload(machine), {"rl": controllers["rl"]}, budget)["rl"],
+        "best": min(pids, key=errors.__getitem__),
+    }
+    write_json(file, row)
+    return row
+
+
+def with_payload(machine: Machine) -> Machine:
+    """The member with a load at its tool."""
+    return replace(machine, plant=replace(machine.plant, payload=PAYLOAD))
+
+
+def mean_errors(
+    base: Machine, machine: Machine, controllers: Controllers, budget: Budget, net: Any = None
+) -> dict[str, float]:
+    """Mean |v_goal - v_tool| [m/s] of controllers on a member (or nets) over the base's starts."""
+    commands = sequences.task_sequences(base)
+    starts = sequences.evaluation_starts(base, budget.starts, commands, 2)
+    starts = starts[np.array(sequences.start_kinds(base, starts)) == "workspace"]
+    short = reproduce.shorten(machine, commands, budget.short_s)
+    runs, _ = metrics.evaluate(machine, controllers, short, starts, 0, net)
+    means = metrics.summary(runs)
+    return {name: float(rows["all"]["velocity_error_mean"] or 0.0) for name, rows in means.items()}
+
+
+def transfers(base: Machine, seeds: Sequence[int], out: Path, budget: Budget) -> list[list[float]]:
+    """Errors [m/s] of the policy of each member (rows) on each member (columns)."""
+    controllers: Controllers = {}
+    for seed in seeds:
+        own = draw_machine(base, seed)
+        policy = load_policy(out / f"member_{seed}" / POLICIES["rl"], own)
+        controllers[str(seed)] = PolicyController(own, policy)
+    columns = [mean_errors(base, draw_machine(base, s), controllers, budget) for s in seeds]
+    return [[column[str(seed)] for column in columns] for seed in seeds]
+
+
+def ratios(row: dict[str, Any]) -> dict[str, float]:
+    """What a member is judged by: the policy's error over others, and the nets' largest error."""
+    rl = row["error"]["rl"]
+    return {
+        "to_nets": rl / row["on_nets"],
+        "to_best": rl / row["error"][row["best"]],
+        "payload": row["loaded"] / rl,
+        "free_run": max(row["free_run"].values()),
+    }
+
+
+def summary(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
+    """Median and largest of the `ratios` over the members."""
+    table = {key: [ratios(row)[key] for row in rows] for key in ratios(rows[0])}
+    return {key: {"median": float(np.median(x)), "worst": max(x)} for key, x in table.items()}
+
+
+def show(results: dict[str, Any]) -> str:
+    """The table of the members, and the transfers."""
+    row = "{:>6} {:>9} {:>9} {:>8} {:>9} {:>8} {:>8} {:>9}  {}"
+    heads = [
+        "member",
+        "rl [m/s]",
+        "on nets",
+        "to nets",
+        "best PID",
+        "to best",
+        "payload",
+        "free run",
+    ]
+    lines = [row.format(*heads, "best baseline")]
+    for one in results["members"]:
+        found, errors = ratios(one), one["error"]
+        numbers = [errors["rl"], one["on_nets"], found["to_nets"], errors[one["best"]]]
+        numbers += [found["to_best"], found["payload"], found["free_run"]]
+        lines.append(row.format(one["seed"], *(f"{x:.3f}" for x in numbers), one["best"]))
+    for name, value in results["summary"].items():
+        lines.append(f"{name}: median {value['median']:.2f}, worst {value['worst']:.2f}")
+    lines.append("error [m/s] of the policy of a member (row) on a member (column):")
+    lines += ["  ".join(f"{x:.3f}" for x in errors) for errors in results["transfers"]]
+    return "\n".join(lines)

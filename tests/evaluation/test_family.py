@@ -1,0 +1,64 @@
+"""The family: the chain on a member, once; what it is judged by, by hand."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from brokk_min.evaluation import family
+from brokk_min.evaluation.family import run_family, show, summary
+from brokk_min.evaluation.reproduce import Budget
+from brokk_min.machine import BROKK_170
+
+TINY = Budget(0.01, 20, 2048, 2048, 1, 1, 2, 2, 0.5)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("family")
+    return folder, run_family(BROKK_170, [2], folder, TINY)
+
+
+def test_run_family__has_each_member_and_each_policy_on_each(made):
+    folder, results = made
+    assert json.loads((folder / "family.json").read_text()) == json.loads(json.dumps(results))
+    assert [row["seed"] for row in results["members"]] == [2]
+    for i, row in enumerate(results["members"]):
+        assert {"rl", row["best"]} <= set(row["error"])
+        assert row["best"] == min(set(row["error"]) - {"rl"}, key=row["error"].get)
+        assert set(row["free_run"]) == {"q1", "q3", "q4", "q5"}
+        assert results["transfers"][i][i] == pytest.approx(row["error"]["rl"])
+        files = {path.name for path in (folder / f"member_{row['seed']}").iterdir()}
+        assert {"log.npz", "net.npz", "policy.npz", "gains.json", "member.json"} <= files
+    text = show(results)
+    assert "to_best: median" in text
+    assert text.count("\n") == 1 + 1 + 4 + 1
+
+
+def test_run_member__is_not_run_again_and_refuses_another_budget(made):
+    folder, results = made
+    file = folder / "member_2" / "member.json"
+    before = file.stat().st_mtime_ns
+    row = family.run_member(BROKK_170, 2, folder / "member_2", TINY)
+    assert row == results["members"][0]
+    assert file.stat().st_mtime_ns == before
+    with pytest.raises(ValueError, match=r"member.json: budget: expected"):
+        family.run_member(BROKK_170, 2, folder / "member_2", replace(TINY, starts=3))
+
+
+def test_summary__by_hand():
+    row = {
+        "error": {"rl": 0.03, "pid": 0.05},
+        "best": "pid",
+        "on_nets": 0.02,
+        "loaded": 0.036,
+        "free_run": {"a": 0.1, "b": 0.3},
+    }
+    other = row | {"on_nets": 0.03}
+    found = summary([row, other])
+    assert found["to_nets"] == {"median": 1.25, "worst": 1.5}
+    assert found["to_best"]["worst"] == pytest.approx(0.6)
+    assert found["payload"]["median"] == pytest.approx(1.2)
+    assert found["free_run"]["worst"] == 0.3
