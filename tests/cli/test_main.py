@@ -26,6 +26,7 @@ OPTIONS = {
     "starts": "--out --num",
     "evaluate": "--policy --commands --starts --num-starts --perfect-model --plant --json --gains",
     "reproduce": "--out --quick --sweep",
+    "family": "--out --members --quick",
     "machine": "--interface --channel --start --record",
     "drive": "--policy --interface --channel --command --controller --counts --log --replay",
     "convert": "--out",

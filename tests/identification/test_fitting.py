@@ -197,9 +197,7 @@ def one_pump(seed, recordings, ticks=300):
     rng = np.random.default_rng(seed)
     result = []
     for i in range(recordings):
-        u = np.repeat(
-            rng.uniform(-1, 1, (ticks // 20, 2)) * (rng.random((ticks // 20, 2)) < 0.6), 20, 0
-        )
+        u = np.repeat(rng.uniform(-1, 1, (ticks // 4, 2)), 4, axis=0)
         speed = 0.4 * u * (1 - 0.8 * np.abs(u[:, ::-1]))
         q = np.cumsum(np.concatenate([np.zeros((1, 2)), speed[:-1]]), axis=0) / 20
         result.append(Recording(f"r{i}", u, q, velocity_of(q, 4)))
@@ -209,13 +207,13 @@ def one_pump(seed, recordings, ticks=300):
 def test_fit__with_latents_learns_what_joints_share():
     log, unseen = one_pump(0, 20), one_pump(1, 5)
     error = {}
-    for latents in (0, 2):
-        config = FitConfig(steps=600, batch_size=128, rollout=1, noise=0.0, shared=latents)
+    for latents, steps in ((0, 300), (4, 1500)):  # more steps do not help nets that are alone
+        config = FitConfig(steps, batch_size=256, rollout=1, noise=0.0, shared=latents)
         net = fit(log, config, seed=0, velocity_samples=4)
         assert len(net.weights) == (8 if latents else 6)
         scores = score(net, unseen)
         error[latents] = np.mean([scores[j]["free_run"]["1"]["velocity_rmse"] for j in log.joints])
-    assert error[2] < 0.9 * error[0]
+    assert error[4] < 0.6 * error[0]
 
 
 def test_predict__of_the_fit_is_that_of_the_nets_with_latents():
