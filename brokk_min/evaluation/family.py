@@ -21,6 +21,7 @@ import numpy as np
 from brokk_min.evaluation import baselines, metrics, reproduce, sequences
 from brokk_min.evaluation.metrics import Controllers
 from brokk_min.evaluation.reproduce import Budget
+from brokk_min.evaluation.rollout import Controller
 from brokk_min.identification import logs, validation
 from brokk_min.identification.excitation import collect, task_log
 from brokk_min.identification.files import read_json, write_json
@@ -70,7 +71,7 @@ def run_member(base: Machine, seed: int, out: Path, budget: Budget) -> dict[str,
     every = reproduce.fit_net(machine, out / "net.npz", log, budget, {"shared": LATENTS}, seed)
     net = select_nets(machine, every)
     settings = budget.tuning_runs, budget.generations, seed
-    jobs = {
+    jobs: dict[str, Any] = {
         "train": partial(reproduce.train, machine, out, "rl", net, budget, seed),
         "tune": partial(baselines.tune_baselines, machine, net, *settings),
     }
@@ -116,7 +117,7 @@ def mean_errors(
 
 def transfers(base: Machine, seeds: Sequence[int], out: Path, budget: Budget) -> list[list[float]]:
     """Errors [m/s] of the policy of each member (rows) on each member (columns)."""
-    controllers: Controllers = {}
+    controllers: dict[str, Controller] = {}
     for seed in seeds:
         own = draw_machine(base, seed)
         policy = load_policy(out / f"member_{seed}" / POLICIES["rl"], own)
