@@ -27,7 +27,7 @@ LEAST_RANGE = 0.7  # of a joint's range
 LEAST_LEVELS = 6  # with 1 % of the commands or more
 LEAST_CHANGES = 0.05  # of the ticks: commands that change by more than a tenth of the largest
 CLOSED_LOOP = -0.42  # `feedback`: excitations give -0.4 to 0, going between places -0.6 to -0.5
-LEAST_FIT = 0.2  # of the velocities' variance that the model explains, or it tells nothing
+CLEAR_SIGN = 0.2  # of the velocities' variance: fast sines fit as well reversed and later
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class JointReport:
     changes: float  # part of the ticks at which the command changes fast
     feedback: float  # correlation of commands with the angle a second before
     explained: float  # part of the velocities' variance that the model explains
-    sign: int  # of velocity under a positive command; 0: the model tells nothing
+    sign: int  # of velocity under a positive command; 0: not clear
     delay: float  # s
     tau: float  # s
     dead_zone_up: float
@@ -95,27 +95,46 @@ def joint_model(recordings: list[Recording], j: int, rate: float) -> dict[str, A
     velocity = np.diff(q, append=q[-1]) * rate
     seams = np.cumsum([len(one.q) for one in recordings])
     velocity[seams[seams <= len(q)] - 1] = 0.0  # no velocity from one recording to the next
+    power = max(float(velocity @ velocity), 1e-12)
+    models = {sign: best_model(u, velocity, rate, sign) for sign in (1, -1)}
+    explained = {sign: 1 - model["error"] / power for sign, model in models.items()}
+    better = explained[1] - explained[-1]
+    model = models[1 if better > -CLEAR_SIGN else -1]
+    return {
+        "explained": 1 - model.pop("error") / power,
+        "sign": int(np.sign(better)) * int(abs(better) > CLEAR_SIGN),
+        **model,
+    }
+
+
+def best_model(u: Array, velocity: Array, rate: float, sign: int) -> dict[str, float]:
+    """The model with gains of one sign, by turns of a grid of delays and lags, and dead zones."""
     zones = [0.05, 0.05]
     for _ in range(2):
         grid = product(range(round(LATEST * rate) + 1), TAUS)
-        delay, tau = min(grid, key=lambda one: residual(u, velocity, rate, *one, *zones)[0])
+        delay, tau = min(grid, key=lambda one: residual(u, velocity, rate, sign, *one, *zones)[0])
         for side in (0, 1, 0, 1):
             trials = [[*zones[:side], zone, *zones[side + 1 :]] for zone in ZONES]
-            zones = min(trials, key=lambda one: residual(u, velocity, rate, delay, tau, *one)[0])
-    error, gains = residual(u, velocity, rate, delay, tau, *zones)
-    explained = 1 - error / max(float(velocity @ velocity), 1e-12)
-    sign = int(np.sign(gains.sum())) if explained > LEAST_FIT else 0
+            zones = min(trials, key=lambda z: residual(u, velocity, rate, sign, delay, tau, *z)[0])
+    error, gains = residual(u, velocity, rate, sign, delay, tau, *zones)
     return {
-        **{"explained": explained, "sign": sign, "delay": delay / rate, "tau": tau},
+        **{"error": error, "delay": delay / rate, "tau": tau},
         **{"dead_zone_up": float(zones[0]), "dead_zone_down": float(zones[1])},
         **{"gain_up": float(gains[0]), "gain_down": float(gains[1])},
     }
 
 
 def residual(
-    u: Array, velocity: Array, rate: float, delay: int, tau: float, up: float, down: float
+    u: Array,
+    velocity: Array,
+    rate: float,
+    sign: int,
+    delay: int,
+    tau: float,
+    up: float,
+    down: float,
 ) -> tuple[float, Array]:
-    """Sum of the squared errors of the model with the best gains; and these, up and down."""
+    """Sum of the squared errors of the model with the best gains of a sign; and these gains."""
     from scipy.signal import lfilter  # slow to import
 
     late = np.concatenate([np.zeros(delay), u[: len(u) - delay]])
@@ -123,6 +142,7 @@ def residual(
     a = np.exp(-1 / (rate * tau))
     x = lfilter([1 - a], [1, -a], openings)
     gains = np.linalg.lstsq(x @ x.T + 1e-9 * np.eye(2), x @ velocity, rcond=None)[0]
+    gains = sign * np.maximum(sign * gains, 0)
     error = velocity - gains @ x
     return float(error @ error), gains
 
