@@ -8,7 +8,7 @@ from shutil import copyfile
 import numpy as np
 import pytest
 
-from benchmarks import deviations, ladder, limits, peers, seeds
+from benchmarks import deviations, ladder, limits, neighbours, peers, seeds
 from benchmarks.rollout import random_net
 from brokk_min import kinematics
 from brokk_min.env import action_to_pwm
@@ -70,6 +70,12 @@ def test_seeds__score_what_the_folder_has(tmp_path, capsys):
     assert [row["seed"] for row in rows] == [0, *[None] * 6]
     assert all(0.005 < row["error"] < 0.03 and row["jerk"] > 1 for row in rows)
     assert "jacobian_pid_ff_integral" in capsys.readouterr().out
+
+
+def test_neighbours__are_slowed_by_numbers():
+    ratios = neighbours.main(neighbours.Options(1, 1, 2048, 2))
+    assert ratios.keys() == {"training", "fit"}
+    assert min(ratios.values()) > 0
 
 
 def test_shapes__are_the_products_of_a_gradient():

@@ -1,0 +1,91 @@
+"""How much longer a fit and a training take beside busy processes: what a student's laptop does.
+
+    python -m benchmarks.neighbours [--busy 1] [--repeats 3]
+
+Quiet and busy runs take turns; the ratio is of their medians. All use one thread.
+"""
+
+import multiprocessing
+import platform
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import tyro
+
+from brokk_min.env import TaskConfig
+from brokk_min.identification import excitation, fitting
+from brokk_min.identification.files import SHIPPED
+from brokk_min.learning.checkpoint import train_policy
+from brokk_min.learning.episodes import GRADIENT_LEARNER
+from brokk_min.learning.policy import load_policy
+from brokk_min.machine import BROKK_170 as M
+from brokk_min.ppo import PPOConfig
+
+
+@dataclass
+class Options:
+    busy: int = 1  # Processes that only count.
+    repeats: int = 3  # Runs of each kind.
+    train_steps: int = 200_000  # Of a training.
+    fit_steps: int = 300  # Of a fit.
+
+
+def spin() -> None:
+    """Keep a core busy."""
+    while True:
+        pass
+
+
+@contextmanager
+def neighbours(num: int) -> Iterator[None]:
+    """`num` busy processes for as long as the block runs."""
+    processes = [multiprocessing.Process(target=spin, daemon=True) for _ in range(num)]
+    for process in processes:
+        process.start()
+    yield
+    for process in processes:
+        process.kill()
+        process.join()
+
+
+def seconds(work: Callable[[], object]) -> float:
+    """Wall time of a call [s]."""
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+def main(options: Options) -> dict[str, float]:
+    """Ratio of busy to quiet wall time of a training and of a fit."""
+    net = load_policy(SHIPPED / M.name / "policy.npz", M).net
+    config = PPOConfig(**GRADIENT_LEARNER | {"total_steps": options.train_steps})
+    log = excitation.collect(M, 0.05, "rich", np.random.default_rng(0))
+    fit_config = fitting.FitConfig(options.fit_steps)
+
+    def train() -> None:
+        with TemporaryDirectory() as folder:
+            train_policy(M, net, TaskConfig(), config, 0, Path(folder) / "policy.npz")
+
+    def fit() -> None:
+        fitting.fit(log, fit_config, 0, M.velocity_samples)
+
+    result = {}
+    for name, work in (("training", train), ("fit", fit)):
+        quiet, busy = [], []
+        for _ in range(options.repeats):
+            quiet.append(seconds(work))
+            with neighbours(options.busy):
+                busy.append(seconds(work))
+        result[name] = float(np.median(busy) / np.median(quiet))
+        print(f"{name}: quiet {np.median(quiet):.1f} s, busy {result[name]:.2f} times as long")
+    print(platform.processor(), multiprocessing.cpu_count(), "cores")
+    return result
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
