@@ -178,17 +178,21 @@ def net_errors(machine: Machine, net: ActuatorNet, test: Log, seed: int) -> dict
     return {"test": validation.score(net, test), "sim_to_real": gap}
 
 
+def settings(name: str, budget: Budget) -> tuple[TaskConfig, PPOConfig]:
+    """Task and learner of one of `POLICIES`: ours, ours with open valves, or the paper's."""
+    if name == "rl_paper":
+        return TaskConfig(paper=True, **PAPER_TASK), PPOConfig(budget.paper_steps)
+    task = TaskConfig()
+    if name == "rl_open":
+        task = TaskConfig(valves="open", zero_goals=0.25, hold_max_s=5.0)  # it learns to rest, too
+    return task, PPOConfig(**GRADIENT_LEARNER | {"total_steps": budget.train_steps})
+
+
 def train(
     machine: Machine, out: Path, name: str, net: ActuatorNet, budget: Budget, seed: int
 ) -> Policy:
-    """One of `POLICIES`: ours, ours with open valves, or the paper's, by its own settings."""
-    task, steps = TaskConfig(), budget.train_steps
-    learner = PPOConfig(**{**GRADIENT_LEARNER, "total_steps": steps, "threads": 1})
-    if name == "rl_open":
-        task = TaskConfig(valves="open", zero_goals=0.25, hold_max_s=5.0)  # it learns to rest, too
-    if name == "rl_paper":
-        task = TaskConfig(paper=True, **PAPER_TASK)
-        learner = PPOConfig(total_steps=budget.paper_steps, threads=1)
+    """One of `POLICIES`, by its own settings."""
+    task, learner = settings(name, budget)
     return train_policy(machine, net, task, learner, seed, out / POLICIES[name], resume=True)
 
 

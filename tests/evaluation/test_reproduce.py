@@ -6,6 +6,7 @@ import collections
 import html
 import json
 import re
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from brokk_min.evaluation.claims import VERDICTS
 from brokk_min.evaluation.reproduce import Budget
 from brokk_min.evaluation.robustness import variations
 from brokk_min.evaluation.sequences import axis_sequences, task_sequences, tuning_set
+from brokk_min.identification.files import SHIPPED
 from brokk_min.identification.logs import read_log
 from brokk_min.identification.net_file import load_net
 from brokk_min.learning.policy import POLICIES, load_policy
@@ -52,6 +54,14 @@ def folder(tmp_path_factory):
 def results(folder):
     loaded = json.loads((folder / "results.json").read_text())
     return loaded
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_settings__made_the_shipped_policies(name):
+    recorded = load_policy(SHIPPED / "brokk170" / POLICIES[name], BROKK_170).training
+    task, learner = reproduce.settings(name, Budget())
+    assert recorded["task"] == asdict(task)
+    assert recorded["settings"] == asdict(learner) | {"critic": name == "rl_paper"}
 
 
 # --- the chain ------------------------------------------------------------------------------------
