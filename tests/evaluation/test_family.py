@@ -12,13 +12,15 @@ from brokk_min.evaluation.family import run_family, show, summary
 from brokk_min.evaluation.reproduce import Budget
 from brokk_min.machine import BROKK_170
 
+COARSE = replace(BROKK_170, plant_dt=0.05)  # one Euler step a tick: fast
+
 TINY = Budget(0.01, 20, 2048, 2048, 1, 1, 2, 2, 0.5)
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("family")
-    return folder, run_family(BROKK_170, [2], folder, TINY)
+    return folder, run_family(COARSE, [2], folder, TINY)
 
 
 def test_run_family__has_each_member_and_each_policy_on_each(made):
@@ -41,11 +43,11 @@ def test_run_member__is_not_run_again_and_refuses_another_budget(made):
     folder, results = made
     file = folder / "member_2" / "member.json"
     before = file.stat().st_mtime_ns
-    row = family.run_member(BROKK_170, 2, folder / "member_2", TINY)
+    row = family.run_member(COARSE, 2, folder / "member_2", TINY)
     assert row == results["members"][0]
     assert file.stat().st_mtime_ns == before
     with pytest.raises(ValueError, match=r"member.json: budget: expected"):
-        family.run_member(BROKK_170, 2, folder / "member_2", replace(TINY, starts=3))
+        family.run_member(COARSE, 2, folder / "member_2", replace(TINY, starts=3))
 
 
 def test_summary__by_hand():
