@@ -112,7 +112,7 @@ def mean_errors(
     short = reproduce.shorten(machine, commands, budget.short_s)
     runs, _ = metrics.evaluate(machine, controllers, short, starts, 0, net)
     means = metrics.summary(runs)
-    return {name: float(rows["all"]["velocity_error_mean"] or 0.0) for name, rows in means.items()}
+    return {name: float(rows["all"]["velocity_error_mean"]) for name, rows in means.items()}
 
 
 def transfers(base: Machine, seeds: Sequence[int], out: Path, budget: Budget) -> list[list[float]]:
