@@ -201,8 +201,8 @@ def all_formats(folder: Path) -> Iterator[Format]:
     yield Format("shared.npz", shared, encode_npz, load_net, found)
     policy = decode_npz(SHIPPED_POLICY)
     found = places({"header": formats.POLICY_HEADER, **formats.POLICY_ARRAYS}, policy)
-    fields = {name: field for name, field in formats.NET_ARRAYS.items() if field.required}
-    found |= {(f"net_{name}",): field for name, field in fields.items()}
+    required = {name: field for name, field in formats.NET_ARRAYS.items() if field.required}
+    found |= {(f"net_{name}",): field for name, field in required.items()}
     yield Format("policy.npz", policy, encode_npz, partial(load_policy, machine=BROKK_170), found)
     read = lambda path: read_log([path], 4, ["a"] if "q_dot" in path.name else None)  # noqa: E731
     log = columns(30)

@@ -363,7 +363,9 @@ def test_read_log__names_file_and_place_of_a_bad_csv(tmp_path, case):
 )
 def test_read_log__refuses_what_is_no_utf_8_text(tmp_path, content):
     (tmp_path / "bad.csv").write_bytes(content)
-    with pytest.raises(ValueError, match=r"bad\.csv: expected a readable CSV table, got Unicode"):
+    with pytest.raises(
+        ValueError, match=r"bad\.csv: expected a readable CSV table, got 'utf-8' codec"
+    ):
         read_log([tmp_path / "bad.csv"], 4)
 
 
