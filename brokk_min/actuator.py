@@ -35,7 +35,9 @@ class PlantState(NamedTuple):
 
 def plant_reset(machine: Machine, q: ArrayLike) -> PlantState:
     """The plant at rest at angles `q` [rad] (..., n): the analytic one, or `machine.plant`."""
-    if machine.plant:  # any object with `reset` and `step`, whose states have angles `q`
+    # any object with `reset` and `step`, whose states have angles `q` [rad]; and `encoder` [rad],
+    # where encoders see other angles (backlash: `identification.physics`)
+    if machine.plant:
         return machine.plant.reset(machine, q)  # type: ignore[no-any-return]
     q = np.array(q, float)
     zero = np.zeros_like(q)
@@ -157,8 +159,9 @@ def smooth_angles(machine: Machine, history: Array) -> Array:
     """Present angles [rad] (..., n), from all samples of a history (..., n, 3, H).
 
     Mean over j of q_j + dt (q_dot_{j+1} + ... + q_dot_H) + dt l (q_dot_H - q_dot_j): each sample,
-    moved on by the velocities since, which come l = window / 2 - 1 ticks late. It has 0.28 of the
-    training noise of the newest angle.
+    moved on by the velocities since. Each is a slope: that at the middle of its window, which lies
+    l = window / 2 - 1 ticks before the middle of the tick that the velocity stands for. The mean
+    has 0.28 of the training noise of the newest angle.
     """
     weights = smoothing_weights(machine).astype(history.dtype)
     return np.asarray(np.einsum("...kh,kh->...", history[..., :2, :], weights))

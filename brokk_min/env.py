@@ -270,7 +270,7 @@ def transition(
 ) -> State:
     """One tick under the command `u` (..., n), by the plant if the state has one, else by the nets.
 
-    `read(machine, q)` gives the encoders' angles; the nets go on from true ones. Paper: Sec. 3.4
+    `read` gives encoder angles, of q or a state's own `encoder`; nets get true q. Paper: Sec. 3.4
     """
     plant = state.plant and actuator.plant_step(machine, state.plant, u)
     q = plant.q if plant else actuator.net_step(machine, net, state.true_history, state.q, u)

@@ -69,7 +69,7 @@ class Joint:
     cylinder_angle: float = number("rad", default=0.0)
     cylinder_area: float = number("m^2", 1e-9, default=0.005)
     speed_positive: float = number("m/s", 0, default=0.0)  # of the cylinder at full command; 0:
-    speed_negative: float = number("m/s", 0, default=0.0)  # what gives q_dot_up and q_dot_down
+    speed_negative: float = number("m/s", 0, default=0.0)  # by lever arm cylinder_rod
     encoder_zero: int = number("counts", default=0)  # the reading at q = 0
     encoder_sign: Literal[-1, 1] = 1  # -1: it counts down while q rises
     kind: Literal["revolute"] = "revolute"  # prismatic ones are not supported
@@ -85,7 +85,7 @@ class Joint:
             raise ValueError(f"{self.name}.cylinder_angle: {expected}, got {low:.3f} to {high:.3f}")
 
     def with_speeds(self, opening: float) -> Joint:
-        """Cylinder speeds, if none are given, that give q_dot_up, q_dot_down at a valve opening."""
+        """Cylinder speeds, if none: for q_dot_up, q_dot_down at the largest lever arm; else faster."""
         r = self.cylinder_rod / opening
         up = self.speed_positive or self.q_dot_up * r
         down = self.speed_negative or self.q_dot_down * r

@@ -4,13 +4,13 @@ The simulation is made of nets and kinematics, so the rewards have derivatives b
 come from one walk backwards, backpropagation through time. Its costate is the derivative of all
 rewards to come by the state. The state is a history h (3, H) and an angle q for each joint:
 
-    v = net(h with the command u_t in it)
-    q_{t+1} = q_t + dt v
+    q_dot = net(h with the command u_t in it)
+    q_{t+1} = q_t + dt q_dot
     h_{t+1}: each row moves on by one sample; newest are q_{t+1}, the slope of the last angles, u_t
 
-The rows of h are angles, velocities and commands, as in exercise 6. Given are, for each tick, dr/dv
-(by v_tool = J v) and dv/dh, the derivative of the net by all 3 H inputs, the command of the tick
-among them (row 2, last). What is left is the bookkeeping of the shift. There the errors are: the
+The rows of h are angles, velocities and commands, as in exercise 6. Given are, for each tick,
+dr/dq_dot (by v_tool = J q_dot) and dq_dot/dh, the derivative of the net by all 3 H inputs, the
+command of the tick among them (row 2, last). What is left is the bookkeeping of the shift. There the errors are: the
 net reads a command in this tick, and again in twelve ticks to come.
 
 Go backwards from the last tick with costates of zero. In each tick:
@@ -18,9 +18,9 @@ Go backwards from the last tick with costates of zero. In each tick:
 1. Discount the costates of h and q by gamma.
 2. What the newest velocity of h_{t+1} brings goes to the angles that it was made of (`slope`).
 3. The newest angle of h_{t+1} is q_{t+1}: add its costate to that of q.
-4. v moves q by dt v, and makes this tick's reward: its derivative.
-5. v comes from the net: its derivative times dv/dh is the costate of what the net read. To its
-   command row add that of h_{t+1}: both are the same row, with u_t last. The last is dR_t/du_t.
+4. q_dot moves q by dt q_dot, and makes this tick's reward: its derivative.
+5. q_dot comes from the net: its derivative times dq_dot/dh is the costate of what the net read. To
+   its command row add that of h_{t+1}: both are the same row, u_t last. The last is dR_t/du_t.
 6. Shift back to h_t. Sample j of the angles and velocities of h_{t+1}, and of the command row of
    step 5, was sample j + 1 of h_t. The newest of h_{t+1} have gone in the steps 2, 3 and 5. The
    oldest command of h_t reaches nothing: zero.
@@ -47,12 +47,12 @@ SOLUTION = "brokk_min/learning/simulation_gradient.py: action_gradients"
 def command_gradients(machine: Machine, net: ActuatorNet, ticks: Ticks, gamma: float) -> Array:
     """dR_t/du_t (T, num, n_driven): discounted rewards to come by each command. No costs, no stops.
 
-    `dr_dv` is (T, num, n_driven), `dv_dh` (T, num, n_driven, 3, H).
+    `dr_dq_dot` is (T, num, n_driven), `dq_dot_dh` (T, num, n_driven, 3, H).
     """
-    dr_dv, dv_dh, _ = local_derivatives(machine, net, ticks, gamma, integral_cost=0.0)
+    dr_dq_dot, dq_dot_dh, _ = local_derivatives(machine, net, ticks, gamma, integral_cost=0.0)
     window = machine.velocity_samples
-    slope = estimate_velocity(np.eye(window), window, machine.dt)  # of the newest q_dot by q
-    raise NotImplementedError(dr_dv.shape, dv_dh.shape, slope.shape)
+    slope = estimate_velocity(np.eye(window), window, machine.dt)  # of h's newest velocity by q
+    raise NotImplementedError(dr_dq_dot.shape, dq_dot_dh.shape, slope.shape)
 
 
 def simulate(machine: Machine, net: ActuatorNet, ticks: int) -> Ticks:
@@ -85,7 +85,7 @@ def check(command_gradients: Callable[..., Array]) -> None:
     net = load_policy(SHIPPED / BROKK_170.name / "policy.npz", BROKK_170).net
     net = replace(net, weights=tuple(weight.astype(float) for weight in net.weights))
     hints = {
-        1: "One tick: dr/dv times dv/du, the newest command, and nothing else.",
+        1: "One tick: dr/dq_dot times dq_dot/du, the newest command, and nothing else.",
         2: "Two ticks: the command acts again as the second newest one, and through the angle.",
         6: "Six ticks: the slope of the newest angles and the shift of all three rows.",
         20: "Twenty ticks: what is older than 13 samples is forgotten.",

@@ -106,14 +106,14 @@ def symptoms_of_copy(name: str, folder: Path) -> dict[str, Any]:
 
 
 def comparison(expected: dict[str, str], got: dict[str, str]) -> list[str]:
-    """Rows of two symptoms; those that differ twice, with a star."""
+    """Rows of two symptoms; those that differ twice, with an arrow."""
     lines = []
     for what in expected | got:
         values = expected.get(what, "nothing"), got.get(what, "nothing")
         if values[0] == values[1]:
             lines.append(f"  {what}: {values[0]}")
         else:
-            lines += [f"* {what}", f"      expected {values[0]}", f"      got      {values[1]}"]
+            lines += [f"  {what}  <-", f"      expected {values[0]}", f"      got      {values[1]}"]
     return lines
 
 

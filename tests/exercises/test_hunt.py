@@ -42,7 +42,7 @@ def test_bug__shows_in_its_symptom(bug: Bug) -> None:
     expected = healthy(bug.symptom)
     with mutants().planted(bug.module, bug.right, bug.wrong):
         got = measure(bug.symptom)["rows"]
-    assert any(line.startswith("* ") for line in comparison(expected, got))
+    assert any(line.endswith(" <-") for line in comparison(expected, got))
 
 
 @pytest.mark.parametrize("bug", BUGS, ids=NAMES)
@@ -76,7 +76,7 @@ def test_hunt__shows_symptoms_alone_until_the_copy_is_mended(
     folder = tmp_path / "hunts" / f"{bug.number:02}"
     assert main([str(bug.number)]) == 0
     shown = capsys.readouterr().out
-    assert "* the paper's start: tool x, y, z [m]" in shown
+    assert "the paper's start: tool x, y, z [m]  <-\n" in shown
     assert bug.wrong not in shown
     assert bug.hint not in shown
     assert (folder / "symptom.png").stat().st_size > 5000
