@@ -85,7 +85,7 @@ class Joint:
             raise ValueError(f"{self.name}.cylinder_angle: {expected}, got {low:.3f} to {high:.3f}")
 
     def with_speeds(self, opening: float) -> Joint:
-        """Cylinder speeds, if none: for q_dot_up, q_dot_down at the largest lever arm; else faster."""
+        """Cylinder speeds, if none: q_dot_up, q_dot_down at the largest lever arm, else faster."""
         r = self.cylinder_rod / opening
         up = self.speed_positive or self.q_dot_up * r
         down = self.speed_negative or self.q_dot_down * r

@@ -10,8 +10,8 @@ rewards to come by the state. The state is a history h (3, H) and an angle q for
 
 The rows of h are angles, velocities and commands, as in exercise 6. Given are, for each tick,
 dr/dq_dot (by v_tool = J q_dot) and dq_dot/dh, the derivative of the net by all 3 H inputs, the
-command of the tick among them (row 2, last). What is left is the bookkeeping of the shift. There the errors are: the
-net reads a command in this tick, and again in twelve ticks to come.
+command of the tick among them (row 2, last). What is left is the bookkeeping of the shift. There
+the errors are: the net reads a command in this tick, and again in twelve ticks to come.
 
 Go backwards from the last tick with costates of zero. In each tick:
 
