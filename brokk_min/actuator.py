@@ -35,9 +35,7 @@ class PlantState(NamedTuple):
 
 def plant_reset(machine: Machine, q: ArrayLike) -> PlantState:
     """The plant at rest at angles `q` [rad] (..., n): the analytic one, or `machine.plant`."""
-    # any object with `reset` and `step`, whose states have angles `q` [rad]; and `encoder` [rad],
-    # where encoders see other angles (backlash: `identification.physics`)
-    if machine.plant:
+    if machine.plant:  # has `reset`, `step`; states have `q`, and `encoder` if encoders see others
         return machine.plant.reset(machine, q)  # type: ignore[no-any-return]
     q = np.array(q, float)
     zero = np.zeros_like(q)
@@ -159,9 +157,8 @@ def smooth_angles(machine: Machine, history: Array) -> Array:
     """Present angles [rad] (..., n), from all samples of a history (..., n, 3, H).
 
     Mean over j of q_j + dt (q_dot_{j+1} + ... + q_dot_H) + dt l (q_dot_H - q_dot_j): each sample,
-    moved on by the velocities since. Each is a slope: that at the middle of its window, which lies
-    l = window / 2 - 1 ticks before the middle of the tick that the velocity stands for. The mean
-    has 0.28 of the training noise of the newest angle.
+    moved on by the velocities since. As slopes, they come l = window / 2 - 1 ticks later than the
+    mean velocity of their tick. The mean has 0.28 of the training noise of the newest angle.
     """
     weights = smoothing_weights(machine).astype(history.dtype)
     return np.asarray(np.einsum("...kh,kh->...", history[..., :2, :], weights))
