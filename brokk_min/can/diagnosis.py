@@ -24,8 +24,10 @@ from brokk_min.kinematics import forward_kinematics, tool_velocity
 from brokk_min.learning.policy import Policy
 from brokk_min.machine import PWM_MAX, Array, Machine
 
-CLEARLY = 0.75  # of the error that is left, assumed: then a changed term explains something
-COMMAND_ERROR = 0.01  # of full command, assumed: smaller ones are the gate's and of rounding
+# Thresholds between sound drives of the shipped policies and ten planted faults.
+CLEARLY = 0.89  # of the error that is left: then a changed term explains something
+CLEARLY_ANGLES = 0.7  # the same for changed angles, which also hide errors of inexact nets
+COMMAND_ERROR = 0.003  # of full command: smaller ones are the gate's and of rounding
 RATE_ERROR = 0.05  # of a tick, assumed
 AHEAD = 1.0  # s of a free run, assumed
 ZEROS = (0.05, -0.05, 0.1, -0.1, 0.2, -0.2, 0.4, -0.4)  # rad
@@ -96,7 +98,8 @@ def diagnose(machine: Machine, policy: Policy, ticks: Ticks) -> list[Term]:
         terms.append(Term("motion", name, error, base))
     for name, change in angle_changes(machine):
         error = motion_error(machine, policy, ticks.u, change(ticks.q))
-        terms.append(Term("motion", name, error, base))
+        if error < CLEARLY_ANGLES * base:
+            terms.append(Term("motion", name, error, base))
     found = [term for term in terms if term.error < CLEARLY * term.before]
     return sorted(found, key=lambda term: term.error / term.before)
 

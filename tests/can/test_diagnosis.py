@@ -20,13 +20,15 @@ from brokk_min.machine import BROKK_170 as M
 from brokk_min.machine import read_encoder
 
 POLICY = load_policy(SHIPPED / "brokk170" / "policy.npz", M)
+OPEN = load_policy(SHIPPED / "brokk170" / "policy_open.npz", M)
+PAPER = load_policy(SHIPPED / "brokk170" / "policy_paper.npz", M)
 START = np.array([[0.0, 0.5, 0.58, 1.71, 1.24]])
 SECONDS = 14
 
 
-def drive(observe=lambda h: h, send=lambda u: u, read=lambda q: q, ticks_of_plant=1):
+def drive(observe=lambda h: h, send=lambda u: u, read=lambda q: q, ticks_of_plant=1, policy=POLICY):
     """A drive with a fault: in what the policy gets, the valves get, or the encoders give."""
-    controller = PolicyController(M, POLICY)
+    controller = PolicyController(M, policy)
     goals = np.concatenate([0.7 * sequence.goals[20:120] for sequence in axis_sequences(M)])
     plant, state = plant_reset(M, START), controller.start(1)
     history, integral, goal = None, np.zeros((1, 3), np.float32), np.zeros((1, 3), np.float32)
@@ -88,8 +90,9 @@ FAULTS = {
 }
 
 
-def test_diagnose__finds_nothing_in_a_sound_drive():
-    assert diagnose(M, POLICY, drive()) == []
+@pytest.mark.parametrize("policy", [POLICY, OPEN, PAPER], ids=["policy", "open", "paper"])
+def test_diagnose__finds_nothing_in_a_sound_drive(policy):
+    assert diagnose(M, policy, drive(policy=policy)) == []
 
 
 def test_diagnose__cannot_see_an_encoder_zero_that_the_log_has_too():
