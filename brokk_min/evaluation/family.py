@@ -111,8 +111,8 @@ def mean_errors(
     starts = starts[np.array(sequences.start_kinds(base, starts)) == "workspace"]
     short = reproduce.shorten(machine, commands, budget.short_s)
     runs, _ = metrics.evaluate(machine, controllers, short, starts, 0, net)
-    means = metrics.summary(runs)
-    return {name: float(rows["all"]["velocity_error_mean"]) for name, rows in means.items()}
+    rows = {c: [run for run in runs if run["controller"] == c] for c in controllers}
+    return {c: float(np.mean([row["velocity_error_mean"] for row in rows[c]])) for c in rows}
 
 
 def transfers(base: Machine, seeds: Sequence[int], out: Path, budget: Budget) -> list[list[float]]:
