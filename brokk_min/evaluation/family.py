@@ -3,11 +3,11 @@
 A member's controllers are made from its own logs, as a user's would be: an hour of all joints at
 once, nets that share latents, a policy, baselines tuned on the member itself. `family.json` has:
 
-    members[]: seed, effects, free_run {joint: error over rms speed in 10 s}, error {controller: m/s
-    on the machine}, on_nets: the policy's error on its nets, to_nets: its error on the machine over
-    that, best: the best baseline, to_best: the policy's error over this baseline's, payload: its
-    error with an unknown load at the tool over that without
+    members[]: seed, budget, effects, free_run {joint: error over rms speed in 10 s}, tool: errors
+    of the tool in free runs, error {controller: m/s on the machine}, on_nets: the policy's error on
+    its nets [m/s], loaded: its error with an unknown load at the tool [m/s], best: best baseline
     transfers[i][j]: error [m/s] of the policy of member i on member j
+    summary: median and largest of the `ratios` over the members
 """
 
 from collections.abc import Sequence
