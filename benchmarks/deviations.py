@@ -25,6 +25,7 @@ from brokk_min import actuator, env, jacobian, kinematics, machine
 from brokk_min.env import TaskConfig, terminated
 from brokk_min.evaluation import metrics, sequences
 from brokk_min.evaluation.baselines import make_gains
+from brokk_min.evaluation.feasibility import feasible
 from brokk_min.evaluation.rollout import rollout
 from brokk_min.identification import excitation, fitting, logs, validation
 from brokk_min.identification.files import SHIPPED
@@ -105,12 +106,12 @@ def a7() -> Figures:
 def a9() -> Figures:
     """Fraction of poses above the ground from which each sequence, and all three, are feasible."""
     q = draw_pose(M, TaskConfig(), np.random.default_rng(0), 3000)
-    feasible = {}
+    followed = {}
     for sequence in sequences.axis_sequences(M):
         goals = np.repeat(sequence.goals[:, None], len(q), axis=1)
-        feasible[sequence.name] = sequences.feasible(M, q, goals)
-    feasible["all"] = np.all(list(feasible.values()), axis=0)
-    return {name: rows.mean() for name, rows in feasible.items()}
+        followed[sequence.name] = feasible(M, q, goals)
+    followed["all"] = np.all(list(followed.values()), axis=0)
+    return {name: rows.mean() for name, rows in followed.items()}
 
 
 def baseline_error(min_opening: float, noise: float) -> float:

@@ -13,29 +13,28 @@ from typing import Any
 import tyro
 
 from brokk_min import __version__
-from brokk_min.cli import commands, operating, porting
-from brokk_min.cli.family import Family
+from brokk_min.cli import evaluation, identification, operating, training
 from brokk_min.cli.options import WrongUse
 from brokk_min.identification.files import reason
 
 LONGEST = 300  # characters of an error
 COMMANDS: dict[str, Callable[..., Any]] = {
-    "collect": commands.Collect,
-    "fit": commands.Fit,
-    "score": porting.Score,
-    "inspect": porting.Inspect,
-    "preliminary": commands.Preliminary,
-    "train": commands.GradientTrain,
-    "sweep": commands.GradientSweep,
-    "starts": commands.Starts,
-    "evaluate": commands.Evaluate,
-    "reproduce": commands.Reproduce,
-    "family": Family,
+    "collect": identification.Collect,
+    "fit": identification.Fit,
+    "score": identification.Score,
+    "inspect": identification.Inspect,
+    "preliminary": evaluation.Preliminary,
+    "train": training.Train,
+    "sweep": training.Sweep,
+    "starts": evaluation.Starts,
+    "evaluate": evaluation.Evaluate,
+    "reproduce": evaluation.Reproduce,
+    "family": evaluation.Family,
     "machine": operating.Simulate,
     "drive": operating.Drive,
     "convert": operating.Convert,
-    "diagnose": porting.Diagnose,
-    "dbc": porting.Dbc,
+    "diagnose": operating.Diagnose,
+    "dbc": operating.Dbc,
     "export": operating.Export,
     "play": operating.Play,
     "replay": operating.Replay,
@@ -105,13 +104,10 @@ def main(arguments: list[str] | None = None) -> int:
     if arguments == ["--version"]:
         print(f"brokk_min {__version__}")
         return 0
-    available = dict(COMMANDS)
-    if "--critic" in arguments:  # learners have defaults of their own
-        available |= {"train": commands.Train, "sweep": commands.Sweep}
-    if "--paper" in arguments:
-        available |= {"train": commands.PaperTrain, "sweep": commands.PaperSweep}
+    learners = {"train": training.Train, "sweep": training.Sweep}
+    named = {name: training.with_defaults(one, arguments) for name, one in learners.items()}
     try:
-        parse(arguments, available)()
+        parse(arguments, COMMANDS | named)()
     except WrongUse as error:
         print(one_line(f"brokk-min: {error}"), file=sys.stderr)
         return 2

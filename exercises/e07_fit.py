@@ -25,11 +25,11 @@ from brokk_min.actuator import (
     plant_reset,
     plant_step,
 )
-from brokk_min.identification.validation import free_run_step
+from brokk_min.identification.simulation import free_run_step
 from brokk_min.machine import BROKK_170, Array, read_encoder
 from exercises.verdict import WrongAnswer, expect
 
-SOLUTION = "brokk_min/identification/fitting.py: train; validation.py: free_run_step"
+SOLUTION = "brokk_min/identification/fitting.py: train; simulation.py: free_run_step"
 H, DT, WINDOW = BROKK_170.history, BROKK_170.dt, BROKK_170.velocity_samples
 Predict = Callable[[Array], Array]  # inputs (N, 39) -> velocities [rad/s] (N,)
 

@@ -19,7 +19,7 @@ from brokk_min.can.canopen import Frame
 from brokk_min.can.drive_log import TelemetryReader
 from brokk_min.env import action_to_pwm, features, integrate_error, measure
 from brokk_min.identification.logs import Recording, velocity_of
-from brokk_min.identification.validation import free_run
+from brokk_min.identification.simulation import free_run
 from brokk_min.kinematics import forward_kinematics, tool_velocity
 from brokk_min.learning.policy import Policy
 from brokk_min.machine import PWM_MAX, Array, Machine

@@ -4,28 +4,32 @@ import shutil
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from tyro.conf import Positional
 
 from brokk_min import hw
-from brokk_min.can import drive_log
+from brokk_min.can import diagnosis, drive_log
 from brokk_min.can.canopen import used_ids
 from brokk_min.can.connection import has_real_time_priority, lock_memory, open_bus
+from brokk_min.can.dbc import dbc
 from brokk_min.can.drive_log import read_frames
 from brokk_min.can.operator_input import JointJog, Joystick, Script
 from brokk_min.can.simulated_machine import simulate
-from brokk_min.cli.options import Command, Range, WrongUse, default_policy
+from brokk_min.cli.options import Command, WrongUse, default_policy
 from brokk_min.evaluation import baselines
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.evaluation.sequences import read_commands
-from brokk_min.identification.files import located
+from brokk_min.identification.files import located, whole_file, write_json
 from brokk_min.identification.logs import write_log
 from brokk_min.learning.onnx import export_onnx
-from brokk_min.learning.policy import PolicyController, load_policy
-from brokk_min.machine import Machine
+from brokk_min.learning.policy import Policy, PolicyController, load_policy
+from brokk_min.machine import Machine, number
 from brokk_min.viewer import control_process, drawing, play, replay, rerun_log
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(kw_only=True)
@@ -53,7 +57,7 @@ class Drive(Command):
     command: str = "joystick"  # Or velocity sequences, CSV: sequence,time,vx,vy,vz [s, m/s].
     controller: Literal["rl", "jacobian", "jog"] = "rl"  # Policy, baseline (k = 0.1), one joint.
     joint: str = "q1"  # Joint that jogs, forward and backward with x.
-    counts: Annotated[int, Range(1, 127)] = 12  # Its command, of 127.
+    counts: int = number("counts", 1, 127, 12)  # Its command, of 127.
     gains: Path | None = None  # Tuned gains; by default gains.json in the folder of POLICY.
     axes: tuple[int, int, int] = (1, 0, 4)  # Axes of the joystick for x, y and z.
     button: int = 5  # Button of the joystick that must be held.
@@ -140,6 +144,69 @@ class Convert(Command):
 
 
 @dataclass(kw_only=True)
+class Diagnose(Command):
+    """Why does it shake? A log of `drive` against its policy and nets; names what differs."""
+
+    log: Positional[Path]  # Log that `drive --log` wrote.
+    policy: Path  # Policy that drove.
+    json: Path | None = None  # Also write all terms here.
+    figure: Path | None = None  # Also draw commands and velocities with the expected ones, .png.
+
+    def __call__(self) -> None:
+        machine = self.check(json="diagnosis", figure="picture")
+        policy = load_policy(self.policy, machine)
+        with located(self.log):
+            ticks = diagnosis.read_ticks(machine, read_frames(self.log))
+        terms = diagnosis.diagnose(machine, policy, ticks)
+        print(f"{self.log}: {len(ticks.time)} ticks; error that is left if a term was so:")
+        for term in terms[:5]:
+            print(f"  {term.side}: {term.name} ({term.error / term.before:.0%})")
+        if not terms:
+            print("  commands and motion are as the policy and its nets have them")
+        if self.json:
+            meta = {"log": str(self.log), "policy": str(self.policy)}
+            write_json(self.json, {"meta": meta, "terms": [term._asdict() for term in terms]})
+        if self.figure:
+            from brokk_min.evaluation import figures
+
+            figures.save(self.figure, plot_drive(machine, policy, ticks))
+
+
+def plot_drive(machine: Machine, policy: Policy, ticks: diagnosis.Ticks) -> "Figure":
+    """Of each driven joint: sent and expected command, measured and simulated velocity."""
+    from brokk_min.evaluation import figures
+
+    history = diagnosis.measured_history(machine, ticks)
+    expected = diagnosis.expected_commands(machine, policy, ticks, history)
+    simulated, measured = diagnosis.net_velocities(machine, policy, ticks.u, ticks.q)
+    time = ticks.time - ticks.time[0]
+    ahead, runs, _ = simulated.shape
+    later = time[machine.history + 1 : machine.history + 1 + ahead * runs]
+    rows = []
+    for k, j in enumerate(machine.driven):
+        name = machine.names[j]
+        u = {"measured": (time, ticks.u[:, j]), "expected": (time, expected[:, j])}
+        values = {"measured": measured, "expected": simulated}
+        q_dot = {label: (later, x[..., k].T.ravel()) for label, x in values.items()}
+        left = figures.Panel("", "time [s]", f"command of {name} [1]", u)
+        rows.append([left, figures.Panel("", "time [s]", f"{name} [rad/s]", q_dot)])
+    return figures.plot_panels(rows)
+
+
+@dataclass(kw_only=True)
+class Dbc(Command):
+    """Write the frames of a machine's bus as a DBC file, for other tools."""
+
+    out: Path  # File to write, .dbc.
+
+    def __call__(self) -> None:
+        text = dbc(self.check(out="DBC"))
+        with whole_file(self.out, "w") as file:
+            file.write(text)
+        print(f"{self.out}: {text.count('BO_ ')} messages")
+
+
+@dataclass(kw_only=True)
 class Export(Command):
     """Write a policy as one ONNX file, to be run elsewhere."""
 
@@ -195,7 +262,7 @@ class Replay(Command):
     logs: Positional[tuple[Path, ...]]  # One or two: candump logs, or JSON of results.
     out: Path | None = None  # Write a film, .gif or .mp4, instead of opening a window.
     rerun: Path | None = None  # Write all on the timeline of rerun instead, .rrd.
-    fps: Annotated[float, Range(0.1, 100)] = 10.0  # Pictures per second of the film.
+    fps: float = number("1/s", 0.1, 100, 10.0)  # Pictures per second of the film.
     size: tuple[int, int] = (960, 540)  # Width and height [px], 320 to 4000 for each arm.
     controllers: tuple[str, ...] = ("rl", "jacobian_pid_k0.1")  # Whose runs of the results.
     sequence: str = ""  # Which sequence of the results; by default the first.

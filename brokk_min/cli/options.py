@@ -1,18 +1,19 @@
-"""Common to the commands: ranges of options, the machine, default policy and gains."""
+"""Common to the commands: checks of options, the machine, default policy and gains."""
 
 import os
 import runpy
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, is_dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, TypeVar
 
 import tyro
 
 from brokk_min.identification.files import SHIPPED, brief, names_in, open_regular
 from brokk_min.identification.plants import CheckedPlant, Plant
-from brokk_min.machine import BROKK_170, Machine
+from brokk_min.machine import BROKK_170, Machine, check_numbers, number
 
+T = TypeVar("T")
 MACHINES = {BROKK_170.name: BROKK_170}
 MachineName = Annotated[str, tyro.conf.arg(metavar="{" + ",".join(MACHINES) + "}|FILE.py:NAME")]
 PlantName = Annotated[str, tyro.conf.arg(metavar="{analytic,net}|FILE.py:NAME")]
@@ -22,31 +23,13 @@ class WrongUse(ValueError):
     """Options that make no sense; exit status 2."""
 
 
-@dataclass(frozen=True)
-class Range:
-    """Least and largest value of an option, both allowed."""
-
-    low: float
-    high: float
-
-
-Seed = Annotated[int, Range(0, 2**31 - 1)]
-Count = Annotated[int, Range(1, 10**6)]
-Samples = Annotated[int, Range(2, 100)]
-
-
-def check_ranges(options: Any) -> None:
-    """WrongUse: a field, or one of a dataclass within, is outside the `Range` of its annotation."""
-    for name, hint in get_type_hints(type(options), include_extras=True).items():
-        value = getattr(options, name)
-        if is_dataclass(value):
-            check_ranges(value)
-        for limits in getattr(hint, "__metadata__", ()):
-            if not isinstance(limits, Range) or value is None:
-                continue
-            if not limits.low <= value <= limits.high:
-                expected = f"{limits.low:.10g} to {limits.high:.10g}"
-                raise WrongUse(f"--{name.replace('_', '-')}: expected {expected}, got {value}")
+def checked(make: Callable[..., T], **options: Any) -> T:
+    """What `make` gives for values of options; WrongUse: one that it refuses."""
+    try:
+        return make(**options)
+    except ValueError as error:
+        name, _, text = str(error).partition(": ")
+        raise WrongUse(f"--{name.replace('_', '-')}: {text}") from error
 
 
 # What a file of each kind that commands write holds: columns, arrays, keys, or see `names_in`.
@@ -80,7 +63,7 @@ class Command:
     """Options of every command."""
 
     machine: MachineName = BROKK_170.name  # Which one; FILE.py:NAME runs a file that you trust.
-    seed: Seed = 0  # Of everything random.
+    seed: int = number("1", 0, 2**31 - 1, 0)  # Of everything random.
     force: bool = False  # Write over files of another kind, too; never over an input.
 
     def check(self, others: Mapping[Path, str] | None = None, /, **outputs: str) -> Machine:
@@ -89,13 +72,15 @@ class Command:
         `outputs` are the kinds, as in `CONTENTS`, of options that name files to write; `others`
         those of files that are written without an option of their own.
         """
-        check_ranges(self)
+        checked(check_numbers, owner=self)
+        if not getattr(self, "logs", True):
+            raise WrongUse("LOGS: expected at least one log, got none")
         machine = find_machine(self.machine or BROKK_170.name)
         inputs = []
-        for name, value in vars(self).items():
+        for name in vars(self).keys() - outputs.keys():
+            value = getattr(self, name)
             values = value if isinstance(value, tuple) else (value,)
-            words = [str(word) for word in values if isinstance(word, Path | str)]
-            inputs += [Path(word) for word in words if word and name not in outputs]
+            inputs += [Path(word) for word in values if word and isinstance(word, Path | str)]
         files = {getattr(self, name): kind for name, kind in outputs.items()}
         if len(files) < len(outputs) and None not in files:
             raise WrongUse(f"--{', --'.join(outputs)}: expected different files, got the same")

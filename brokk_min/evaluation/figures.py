@@ -18,10 +18,11 @@ from brokk_min.actuator import ActuatorNet
 from brokk_min.evaluation.metrics import AFTER_STOP, Mean, Traces
 from brokk_min.evaluation.preliminary import Motion, SimulatorTests
 from brokk_min.evaluation.sequences import AXES, Commands, hold_table
-from brokk_min.identification import validation
 from brokk_min.identification.files import whole_file
 from brokk_min.identification.formats import read_table
 from brokk_min.identification.logs import Log, Recording
+from brokk_min.identification.simulation import free_run
+from brokk_min.identification.validation import recording_errors
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
 
@@ -155,7 +156,7 @@ def plot_free_run(net: ActuatorNet, log: Log) -> Figure:
 
 def plot_worst_and_median(net: ActuatorNet, log: Log) -> Figure:
     """The free runs with the worst and the median velocity error; of each its worst joint."""
-    errors = np.nan_to_num(validation.recording_errors(net, log, FREE_RUN_S), nan=-1.0)
+    errors = np.nan_to_num(recording_errors(net, log, FREE_RUN_S), nan=-1.0)
     largest = errors.max(axis=1)
     order = [i for i in np.argsort(largest) if largest[i] >= 0]
     rows = []
@@ -169,7 +170,7 @@ def plot_worst_and_median(net: ActuatorNet, log: Log) -> Figure:
 def _free_run(net: ActuatorNet, recording: Recording) -> list[list[Panel]]:
     """Angle and velocity of each joint, measured and in a free run."""
     ticks = min(round(FREE_RUN_S * net.rate), len(recording.q) - net.history - 1)
-    q, q_dot = validation.free_run(net, recording, np.array([net.history]), ticks)
+    q, q_dot = free_run(net, recording, np.array([net.history]), ticks)
     run = slice(net.history + 1, net.history + 1 + ticks)
     angles = {"measured": recording.q[run], "free run": q[:, 0]}
     velocities = {"measured": recording.q_dot[run], "free run": q_dot[:, 0]}

@@ -4,15 +4,18 @@ Model-predictive control on the analytic plant. Like every other controller it g
 of time: it plans as if the present goal lasted. Its error is the price of delay and dead time.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brokk_min.actuator import PlantState, close_valves, lever_arm, plant_reset, plant_step
 from brokk_min.env import Measured
+from brokk_min.evaluation.metrics import Controllers, evaluate, paired_difference, summary
+from brokk_min.evaluation.sequences import Commands
 from brokk_min.jacobian import dls
 from brokk_min.kinematics import forward_kinematics, jacobian, tool_velocity
 from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, valve_opening
@@ -158,3 +161,18 @@ def perfect_models(machine: Machine, starts: Array) -> dict[str, PerfectModel]:
         "perfect_model": PerfectModel(machine, starts, "open"),
         "perfect_model_closed": PerfectModel(machine, starts, "closed"),
     }
+
+
+def regret(
+    machine: Machine,
+    controllers: Controllers,
+    commands: Sequence[Commands],
+    starts: Array,
+    seed: int,
+) -> dict[str, Any]:
+    """Mean errors, and velocity errors less that of a controller that knows the plant."""
+    every = {**controllers, **perfect_models(machine, starts)}
+    runs, _ = evaluate(machine, every, commands, starts, seed)
+    error = "velocity_error_mean"
+    less = {c: paired_difference(runs, c, "perfect_model", error) for c in controllers}
+    return {"summary": summary(runs), "less_perfect_model": less}

@@ -11,7 +11,7 @@ import numpy as np
 from brokk_min.actuator import ActuatorNet
 from brokk_min.identification.excitation import task_log
 from brokk_min.identification.net_file import select_nets
-from brokk_min.identification.validation import (
+from brokk_min.identification.simulation import (
     Simulator,
     named_times,
     net_simulator,

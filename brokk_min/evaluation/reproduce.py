@@ -20,23 +20,21 @@ from brokk_min.actuator import ActuatorNet
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation import baselines, claims, metrics, preliminary, report, sequences
 from brokk_min.evaluation.metrics import Controllers, Run, Traces, evaluate, summary
-from brokk_min.evaluation.perfect_model import perfect_models
-from brokk_min.evaluation.robustness import robustness
+from brokk_min.evaluation.perfect_model import regret
+from brokk_min.evaluation.robustness import near_singularities, robustness
 from brokk_min.evaluation.rollout import Controller, Trace
 from brokk_min.evaluation.seeds import read_seeds, seeds_of
-from brokk_min.evaluation.sequences import Commands
 from brokk_min.identification import fitting, logs, validation
 from brokk_min.identification.excitation import collect, task_log
 from brokk_min.identification.files import write_json
 from brokk_min.identification.fitting import FitConfig
 from brokk_min.identification.logs import Log
 from brokk_min.identification.net_file import save_net, select_nets
-from brokk_min.jacobian import JacobianController, manipulability, manipulability_threshold
-from brokk_min.kinematics import forward_kinematics, jacobian
+from brokk_min.jacobian import JacobianController
 from brokk_min.learning.checkpoint import train_policy
 from brokk_min.learning.episodes import GRADIENT_LEARNER, PAPER_TASK
 from brokk_min.learning.policy import POLICIES, Policy, PolicyController, save_policy
-from brokk_min.machine import Array, Machine
+from brokk_min.machine import Machine
 from brokk_min.ppo import PPOConfig
 
 Pids = Mapping[str, JacobianController]  # baselines by name
@@ -226,6 +224,7 @@ def measure(
     compared["task_space"]["rl_on_nets"] = summary(on_nets)["rl"]
     measured = preliminary.run(machine, net, seed)
     numbers = preliminary.numbers(machine, measured)
+    tuned_on = sequences.tuning_set(machine, budget.tuning_runs, seed)
     meta = metrics.metadata(machine, seed) | baselines.gains_metadata(machine, policies["rl"].net)
     results = {
         "meta": meta | {"effort": asdict(budget)},
@@ -236,7 +235,10 @@ def measure(
         "preliminary": numbers,
         "net_claims": [claim.to_json() for claim in claims.net_claims(numbers)],
         "gains": baselines.gains_table(pids),
-        "tuning_runs": tuning_runs(machine, budget.tuning_runs, seed),
+        "tuning_runs": [
+            {"start": q.tolist(), "goals": sequences.hold_table(machine, v_goal).tolist()}
+            for q, v_goal in zip(tuned_on[0], tuned_on[1].swapaxes(0, 1), strict=True)
+        ],
     }
     return results | compared, report.Shown(net, test, measured, task, singular)
 
@@ -260,21 +262,19 @@ def compare(
     kinds = np.array(sequences.start_kinds(machine, starts))
     workspace = kinds == "workspace"
     reachable = starts[workspace]
-    short = shorten(machine, sequences.axis_sequences(machine), budget.short_s)
+    short = sequences.shorten(machine, sequences.axis_sequences(machine), budget.short_s)
     bound_starts, extended = reachable[: budget.bound_starts], starts[kinds == "extended"]
     few = claims.singular_controllers(policies, pids)
+    every = machine, controllers
     jobs: dict[str, Callable[[], Any]] = {
-        "score": partial(evaluate, machine, controllers, commands, starts, seed),
+        "score": partial(evaluate, *every, commands, starts, seed),
         "score near singularities": partial(
             near_singularities, machine, few, extended, budget.short_s, seed
         ),
-        "score perfect model": partial(regret, machine, controllers, short, bound_starts, seed),
-        "score changed machines": partial(
-            robustness, machine, controllers, short, reachable[:16], seed
-        ),
+        "score perfect model": partial(regret, *every, short, bound_starts, seed),
+        "score changed machines": partial(robustness, *every, short, reachable[:16], seed),
     }
-    task, (singular, near, near_traces), less, changed = side_by_side(jobs, clock)
-    runs, traces = task
+    (runs, traces), (singular, near, near_traces), less, changed = side_by_side(jobs, clock)
     scored = [run for run in runs if run["kind"] == "workspace"]
     along_x = {c: Trace(*(array[:, workspace] for array in traces[c, "x"])) for c in pids}
     goals = commands[0].for_starts(machine, reachable)
@@ -293,12 +293,6 @@ def compare(
     return results, traces, near_traces
 
 
-def shorten(machine: Machine, commands: Sequence[Commands], seconds: float) -> list[Commands]:
-    """The first seconds of each sequence."""
-    ticks = round(seconds * machine.rate)
-    return [sequence._replace(goals=sequence.goals[:ticks]) for sequence in commands]
-
-
 def tables(runs: Sequence[Run], scored: Sequence[Run]) -> dict[str, Any]:
     """All runs, and means and intervals of those that count, RL less each baseline."""
     by_kind = {}
@@ -312,66 +306,6 @@ def tables(runs: Sequence[Run], scored: Sequence[Run]) -> dict[str, Any]:
         "by_kind": by_kind,
         "rl_less": metrics.paired_differences(scored, "rl"),
     }
-
-
-def regret(
-    machine: Machine,
-    controllers: Controllers,
-    commands: Sequence[Commands],
-    starts: Array,
-    seed: int,
-) -> dict[str, Any]:
-    """Mean errors, and velocity errors less that of a controller that knows the plant."""
-    every = {**controllers, **perfect_models(machine, starts)}
-    runs, _ = evaluate(machine, every, commands, starts, seed)
-    error = "velocity_error_mean"
-    less = {c: metrics.paired_difference(runs, c, "perfect_model", error) for c in controllers}
-    return {"summary": summary(runs), "less_perfect_model": less}
-
-
-def near_singularities(
-    machine: Machine, controllers: Controllers, starts: Array, seconds: float, seed: int
-) -> tuple[dict[str, Any], dict[str, list[claims.Claim]], Traces]:
-    """Runs of `claims.singular_controllers` from extended starts: JSON, claims and traces.
-
-    The JSON has the "manipulability" and the "least" singular value [m/rad] at each start. All are
-    empty without starts. Paper: Fig. 6a, 6e, 6f
-    """
-    if not len(starts):
-        return {"summary": {}, "claims": {}}, {}, {}
-    commands = shorten(machine, sequences.singular_sequences(machine, starts), seconds)
-    runs, traces = evaluate(machine, controllers, commands, starts, seed)
-    w0 = manipulability_threshold(machine)
-    J = jacobian(forward_kinematics(machine, starts))[..., machine.driven]
-    speed = {}
-    for name in controllers:
-        fractions = [
-            claims.speed_fraction(machine, w0, traces[name, s.name], s.for_starts(machine, starts))
-            for s in commands
-        ]
-        speed[name] = metrics.row_mean(np.stack(fractions, axis=1))
-    singular: dict[str, list[claims.Claim]] = {}
-    for name in ("rl", "rl_paper"):
-        if name in speed:
-            singular[name] = claims.singular_claims(name, runs, speed)
-    results = {
-        "summary": summary(runs),
-        "claims": {name: [c.to_json() for c in every] for name, every in singular.items()},
-        "w0": w0,
-        "manipulability": manipulability(J).tolist(),
-        "least": np.linalg.svd(J, compute_uv=False)[:, -1].tolist(),
-    }
-    return results, singular, traces
-
-
-def tuning_runs(machine: Machine, num: int, seed: int) -> list[dict[str, Any]]:
-    """Each run on which the baselines were tuned: "start" [rad] and "goals", see `hold_table`."""
-    starts, goals = sequences.tuning_set(machine, num, seed)
-    runs = []
-    for i, start in enumerate(starts):
-        table = sequences.hold_table(machine, goals[:, i])
-        runs.append({"start": start.tolist(), "goals": table.tolist()})
-    return runs
 
 
 def write(

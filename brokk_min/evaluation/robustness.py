@@ -1,4 +1,4 @@
-"""Robustness: controllers on other machines and encoders, and after rests of other lengths."""
+"""Robustness: other machines and encoders, rests of other lengths, motion near singularities."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -7,15 +7,26 @@ from typing import Any
 import numpy as np
 
 from brokk_min.env import Encoder, TaskConfig
+from brokk_min.evaluation import claims
 from brokk_min.evaluation.metrics import (
     Controllers,
+    Traces,
     by_start,
     evaluate,
     mean_interval,
     paired_difference,
+    row_mean,
     summary,
 )
-from brokk_min.evaluation.sequences import RESTS, Commands, rest_sequences
+from brokk_min.evaluation.sequences import (
+    RESTS,
+    Commands,
+    rest_sequences,
+    shorten,
+    singular_sequences,
+)
+from brokk_min.jacobian import manipulability, manipulability_threshold
+from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.machine import Array, Machine, read_encoder, valve_opening
 
 Sensor = Callable[[np.random.Generator], Encoder]  # makes the encoders of one rollout
@@ -128,3 +139,38 @@ def by_length_of_rest(
         runs, _ = evaluate(machine, controllers, commands, starts, seed, config=config)
         result[f"{seconds:g}"] = {name: rows["all"] for name, rows in summary(runs).items()}
     return result
+
+
+def near_singularities(
+    machine: Machine, controllers: Controllers, starts: Array, seconds: float, seed: int
+) -> tuple[dict[str, Any], dict[str, list[claims.Claim]], Traces]:
+    """Runs of `claims.singular_controllers` from extended starts: JSON, claims and traces.
+
+    The JSON has the "manipulability" and the "least" singular value [m/rad] at each start. All are
+    empty without starts. Paper: Fig. 6a, 6e, 6f
+    """
+    if not len(starts):
+        return {"summary": {}, "claims": {}}, {}, {}
+    commands = shorten(machine, singular_sequences(machine, starts), seconds)
+    runs, traces = evaluate(machine, controllers, commands, starts, seed)
+    w0 = manipulability_threshold(machine)
+    J = jacobian(forward_kinematics(machine, starts))[..., machine.driven]
+    speed = {}
+    for name in controllers:
+        fractions = [
+            claims.speed_fraction(machine, w0, traces[name, s.name], s.for_starts(machine, starts))
+            for s in commands
+        ]
+        speed[name] = row_mean(np.stack(fractions, axis=1))
+    singular: dict[str, list[claims.Claim]] = {}
+    for name in ("rl", "rl_paper"):
+        if name in speed:
+            singular[name] = claims.singular_claims(name, runs, speed)
+    results = {
+        "summary": summary(runs),
+        "claims": {name: [c.to_json() for c in every] for name, every in singular.items()},
+        "w0": w0,
+        "manipulability": manipulability(J).tolist(),
+        "least": np.linalg.svd(J, compute_uv=False)[:, -1].tolist(),
+    }
+    return results, singular, traces

@@ -21,17 +21,10 @@ from brokk_min.evaluation import metrics
 from brokk_min.evaluation.baselines import gains_metadata, read_gains
 from brokk_min.evaluation.metrics import Controllers, Rows, by_start, mean_interval
 from brokk_min.evaluation.sequences import AXES, evaluation_starts, task_sequences
-from brokk_min.identification.files import (
-    brief,
-    expect_same,
-    expected,
-    read_json,
-    require,
-    write_json,
-)
+from brokk_min.identification.files import brief, expect_same, expected, read_json, write_json
 from brokk_min.identification.formats import SWEEP, check_fields
 from brokk_min.learning.checkpoint import describe_training, train_policy
-from brokk_min.learning.policy import Policy, PolicyController, load_policy
+from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import Array, Machine
 from brokk_min.ppo import PPOConfig
 
@@ -59,18 +52,13 @@ def sweep(
     ValueError: with the seeds that failed and why, after all others are written.
     """
     out.mkdir(parents=True, exist_ok=True)
-    about = {"starts": starts, "sequences": [s.name for s in task_sequences(machine)]}
     config = replace(config, threads=1)
-    evaluate = partial(evaluate_policy, machine, starts)
-    job = partial(
-        run_seed, machine, net, task, config, out.resolve(), evaluate, about, critic=critic
-    )
+    job = partial(run_seed, machine, net, task, config, critic, out.resolve(), starts)
     results, failed = run_seeds(job, seeds, scheduler)
     baselines = read_gains(gains, machine, net) if gains else {}
     baseline_rows = run_scored(machine, baselines, starts)
-    finished = sorted(results)
-    figures = table([results[seed] for seed in finished], baseline_rows)
-    rows = [{"seed": seed} | row for seed in finished for row in results[seed]]
+    figures = table([results[seed] for seed in sorted(results)], baseline_rows)
+    rows = [{"seed": seed} | row for seed in sorted(results) for row in results[seed]]
     meta = metrics.metadata(machine, min(seeds)) | gains_metadata(machine, net)
     meta |= {"seeds": len(seeds), "failed": failed}
     write_json(out / "sweep.json", {"meta": meta, "table": figures, "runs": rows + baseline_rows})
@@ -84,34 +72,32 @@ def run_seed(
     net: ActuatorNet,
     task: TaskConfig,
     config: PPOConfig,
+    critic: bool,
     out: Path,
-    evaluate: Callable[[Policy], Rows],
-    about: Mapping[str, Any],
+    starts: int,
     seed: int,
-    critic: bool = False,
 ) -> Rows:
-    """Train one seed and evaluate its policy, or continue from what the folder `out` holds of it.
+    """Train and score one seed, or go on from what the folder `out` holds of it; see `sweep`.
 
-    `evaluate` gives the figures of a policy; `about` is what decides them, for the header of the
-    result. The other arguments are those of `train_policy`.
     ValueError: a result of another training or evaluation.
     """
     policy_file = out / f"seed_{seed}.npz"
     result_file = out / f"seed_{seed}.json"
-    identity = describe_training(machine, net, task, config, critic, seed)
+    training = describe_training(machine, net, task, config, critic, seed)
+    names = [sequence.name for sequence in task_sequences(machine)]
+    identity = {**training, "starts": starts, "sequences": names}
     if result_file.exists():
         with expected(result_file, "the result of a seed"):
             result: dict[str, Any] = read_json(result_file, "the result of a seed")
             rows: Rows = result["runs"]
-            recorded = result["identity"]
-        expect_same(result_file, recorded, {**identity, **about})
+            expect_same(result_file, result["identity"], identity)
         return rows
     policy = load_policy(policy_file, machine) if policy_file.exists() else None
-    if policy is None or dict(policy.training) != identity:
+    if policy is None or dict(policy.training) != training:
         resume = Path(f"{policy_file}.checkpoint").exists()
         policy = train_policy(machine, net, task, config, seed, policy_file, critic, resume)
-    rows = evaluate(policy)
-    write_json(result_file, {"identity": {**identity, **about}, "runs": rows})
+    rows = run_scored(machine, {"rl": PolicyController(machine, policy)}, starts)
+    write_json(result_file, {"identity": identity, "runs": rows})
     return rows
 
 
@@ -124,6 +110,8 @@ def run_seeds(
     `scheduler`; dask repeats it if the worker dies. ValueError: workers of several threads, which
     would share torch's settings.
     """
+    from distributed import as_completed  # slow to import
+
     results: dict[int, Rows] = {}
     failed: dict[int, str] = {}
     with connect(scheduler) as client:
@@ -133,7 +121,7 @@ def run_seeds(
             got = sorted(threads)
             raise ValueError(f"{scheduler}: expected workers with --nthreads 1, got {got}")
         futures = {client.submit(job, seed, pure=False): seed for seed in seeds}
-        done = require("distributed", "sweep").as_completed(futures)
+        done = as_completed(futures)
         for future in tqdm(done, total=len(futures), desc="sweep", unit="seed", disable=None):
             seed = futures[future]
             if future.status == "finished":
@@ -145,6 +133,9 @@ def run_seeds(
 
 def connect(scheduler: str | None) -> Any:
     """A dask client of the scheduler at an address, or of one process per core of this machine."""
+    import dask
+    from distributed import Client
+
     options: dict[str, Any] = {"address": scheduler, "timeout": 10}
     if scheduler is None:
         options = {"threads_per_worker": 1, "memory_limit": None, "dashboard_address": ":0"}
@@ -154,14 +145,8 @@ def connect(scheduler: str | None) -> Any:
         f"{environ}.TQDM_DISABLE": 1,
         f"{environ}.MALLOC_TRIM_THRESHOLD_": 2**30,  # with dask's 64 kB a training takes 1.4 times
     }
-    client = require("distributed", "sweep").Client
-    with require("dask", "sweep").config.set(settings):
-        return client(**options)
-
-
-def evaluate_policy(machine: Machine, starts: int, policy: Policy) -> Rows:
-    """Figures of a policy on the machine."""
-    return run_scored(machine, {"rl": PolicyController(machine, policy)}, starts)
+    with dask.config.set(settings):
+        return Client(**options)
 
 
 def run_scored(machine: Machine, controllers: Controllers, starts: int) -> Rows:

@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
-from brokk_min import jacobian as classic
-from brokk_min.actuator import lever_arm
 from brokk_min.env import TaskConfig, terminated
+from brokk_min.evaluation.feasibility import feasible, first_failure, most_frequent
 from brokk_min.identification import files
 from brokk_min.identification.formats import COMMANDS, read_table, starts_of
+from brokk_min.jacobian import manipulability, manipulability_threshold
 from brokk_min.kinematics import forward_kinematics, jacobian, lowest_point, tool_position
 from brokk_min.learning.episodes import draw_pose, reset
-from brokk_min.machine import PWM_MAX, Array, Machine, valve_opening
+from brokk_min.machine import Array, Machine
 
 AXES = "xyz"
 LONGEST = 3600.0  # s of a sequence of a file, assumed
@@ -29,12 +29,6 @@ SECONDS = 26.0  # of a scored sequence, assumed
 SHORTEST_REST, LONGEST_REST = 0.5, 10.0  # s, assumed
 RESTS = (0.5, 1.0, 2.0, 2.5, 4.0, 5.0, 10.0)  # s, of `rest_sequences`, assumed
 TRIES = 8  # draws after which a kind of starts without any pose is given up, assumed
-CRITERIA = (  # of `first_failure`, all margins assumed
-    "the tool must stay within 20 mm of its path",
-    "the arm must stay 0.1 m above Machine.ground",
-    "a driven joint must stay 0.05 from its q_min and q_max",
-    "a driven joint must stay below 0.9 of its q_dot_up and q_dot_down",
-)
 # Rows of seconds and velocity in fractions of tool_speed (assumed).
 # On one axis, as in the paper, with changes of direction:
 AXIS = ((1, 0), (4, 2 / 3), (1, 0), (4, -2 / 3), (1, 0), (3, 1 / 3), (3, -1 / 3), (1, 0))
@@ -154,6 +148,12 @@ def _goals(machine: Machine, rows: Array) -> Array:
     return np.repeat(machine.tool_speed * rows[:, 1:], ticks, axis=0)
 
 
+def shorten(machine: Machine, commands: Sequence[Commands], seconds: float) -> list[Commands]:
+    """The first seconds of each sequence."""
+    ticks = round(seconds * machine.rate)
+    return [sequence._replace(goals=sequence.goals[:ticks]) for sequence in commands]
+
+
 def hold_table(machine: Machine, goals: Array) -> Array:
     """Rows of seconds and the velocity [m/s] that goals (T, 3) hold for them."""
     changes = np.flatnonzero(np.any(np.diff(goals, axis=0) != 0, axis=-1)) + 1
@@ -243,8 +243,8 @@ def start_kinds(machine: Machine, starts: Array) -> list[str]:
     frames = forward_kinematics(machine, starts)
     reach = np.linalg.norm(frames.p[:, -1] - frames.p[:, 1], axis=-1)
     length = np.hypot(machine.column("a"), machine.column("d"))[1:].sum()
-    w = classic.manipulability(jacobian(frames)[..., machine.driven])
-    extended = (reach > 0.9 * length) & (w < classic.manipulability_threshold(machine))
+    w = manipulability(jacobian(frames)[..., machine.driven])
+    extended = (reach > 0.9 * length) & (w < manipulability_threshold(machine))
     margin = np.minimum(starts - machine.column("q_min"), machine.column("q_max") - starts)
     at_limit = margin[:, machine.driven].min(axis=-1) < 0.15
     kinds: list[str] = np.select([extended, at_limit], ["extended", "limits"], "workspace").tolist()
@@ -262,7 +262,7 @@ def draw_starts(
     """
     order = [("workspace", "limits", "workspace", "extended")[i % 4] for i in range(num)]
     kept: dict[str, list[Array]] = {kind: [] for kind in KINDS}
-    failures = np.zeros(len(CRITERIA), int)
+    failures: list[NDArray[np.int64]] = []
     with tqdm(total=num, desc="draw starts", unit="start", disable=None) as bar:
         for draw in range(200):
             poses = draw_pose(machine, TaskConfig(), rng, 4000).round(4)
@@ -281,83 +281,21 @@ def draw_starts(
     return np.array([kept[kind].pop(0) for kind in order])
 
 
-def count_failures(failure: NDArray[np.int64]) -> NDArray[np.int64]:
-    """How often each of `CRITERIA` is the first that failed; `failure` is of `first_failure`."""
-    return np.asarray(np.bincount(failure, minlength=len(CRITERIA) + 1)[1:])
-
-
-def most_frequent(failures: NDArray[np.int64]) -> str:
-    """The criterion that failed most often, by the counts of `count_failures`."""
-    first = failures.argmax()
-    return f"{failures[first]} of {failures.sum()} others fail: {CRITERIA[first]}"
-
-
 def _select(
-    machine: Machine, poses: Array, sequences: Sequence[Commands], failures: NDArray[np.int64]
+    machine: Machine, poses: Array, sequences: Sequence[Commands], failures: list[NDArray[np.int64]]
 ) -> dict[str, Array]:
-    """Poses (num, n) that may be starts, by kind; adds to the counts of `first_failure`."""
+    """Poses (num, n) that may be starts, by kind; `failures` gets those of `first_failure`."""
     kinds = np.array(start_kinds(machine, poses))
     workspace = poses[kinds == "workspace"][:1500]
     limits = poses[kinds == "limits"][:30]
     feasible_sequences = np.zeros(len(limits))
     for sequence in sequences:
         failure = first_failure(machine, workspace, sequence.for_starts(machine, workspace))
-        failures += count_failures(failure)
+        failures.append(failure)
         workspace = workspace[failure == 0]
         feasible_sequences += feasible(machine, limits, sequence.for_starts(machine, limits))
     limits = limits[feasible_sequences >= 0.5 * len(sequences)]
     return {"workspace": workspace, "limits": limits, "extended": poses[kinds == "extended"]}
-
-
-def feasible(machine: Machine, start: Array, goals: Array) -> NDArray[np.bool_]:
-    """Can ideal actuators follow `goals` (T, num, 3) from `start` (num, n)? Shape (num,)."""
-    return np.asarray(first_failure(machine, start, goals) == 0)
-
-
-def first_failure(machine: Machine, start: Array, goals: Array) -> NDArray[np.int64]:
-    """1 + the index in `CRITERIA` of what fails first on the path of `goals`, 0: nothing, (num,).
-
-    Integrates resolved velocities with little damping from `start` (num, n) under `goals`
-    (T, num, 3). The first criterion holds where no singularity is crossed.
-    """
-    q = np.array(start, float)
-    q_dot = np.zeros_like(q)
-    p_goal = tool_position(forward_kinematics(machine, q))
-    result = np.zeros(len(q), np.int64)
-    low, high = machine.column("q_min") + 0.05, machine.column("q_max") - 0.05
-    up, down = machine.column("q_dot_up"), machine.column("q_dot_down")
-    for v_goal in goals:
-        frames = forward_kinematics(machine, q)
-        p = tool_position(frames)
-        J = jacobian(frames)[..., machine.driven]
-        W = classic.limit_weights(machine, q, q_dot)[:, machine.driven]
-        J_inv = classic.dls(J, W, np.full(len(q), 1e-4))
-        v = v_goal + (p_goal - p)  # the second term brings the tool back to its path in 1 s
-        on_path = np.linalg.norm(p_goal - p, axis=-1) < 0.02
-        above_ground = lowest_point(frames) > machine.ground + 0.1
-        q_dot = np.zeros_like(q)
-        q_dot[:, machine.driven] = (J_inv @ v[..., None])[..., 0]
-        q = q + q_dot * machine.dt
-        p_goal = p_goal + v_goal * machine.dt
-        within = ((q > low) & (q < high))[:, machine.driven].all(axis=-1)
-        slow = ((q_dot > -0.9 * down) & (q_dot < 0.9 * up)).all(axis=-1)
-        holds = np.stack([on_path, above_ground, within, slow])
-        result = np.where((result == 0) & ~holds.all(axis=0), 1 + holds.argmin(axis=0), result)
-        if result.all():
-            break
-    return result
-
-
-def speed_limits(machine: Machine, q: ArrayLike) -> tuple[Array, Array]:
-    """Fastest negative and positive velocity [rad/s] (..., n) of each joint at angles `q` [rad].
-
-    They hold at the command limit, if no other joint needs the pump. Paper: eq1
-    """
-    opening = valve_opening(machine.pwm_limit / PWM_MAX, machine.dead_zone)
-    r = lever_arm(machine, q)
-    down = -opening * machine.column("speed_negative") / r
-    up = opening * machine.column("speed_positive") / r
-    return down, up
 
 
 def tuning_set(machine: Machine, num: int, seed: int, seconds: float = 20.0) -> tuple[Array, Array]:
@@ -372,7 +310,7 @@ def tuning_set(machine: Machine, num: int, seed: int, seconds: float = 20.0) -> 
     tick = np.arange(round(seconds * machine.rate))[:, None]
     starts = np.empty((0, machine.n))
     goals = np.empty((len(tick), 0, 3), np.float32)
-    failures = np.zeros(len(CRITERIA), int)
+    failures: list[NDArray[np.int64]] = []
     for draw in range(60):
         drawn = reset(machine, config, rng, 200 * holds, plant=False)
         rests = np.rint(_log_uniform(rng, 200 * holds) * machine.rate).astype(int)
@@ -381,7 +319,7 @@ def tuning_set(machine: Machine, num: int, seed: int, seconds: float = 20.0) -> 
         v_goal = np.repeat(drawn.v_goal, ticks, axis=0)[first + tick]  # (T, 200, 3)
         q = drawn.q[::holds]
         failure = first_failure(machine, q, v_goal)
-        failures += count_failures(failure)
+        failures.append(failure)
         starts = np.concatenate([starts, q[failure == 0]])
         goals = np.concatenate([goals, v_goal[:, failure == 0]], axis=1)
         if len(starts) >= num:

@@ -11,8 +11,8 @@ from helpers_machines import small_net
 from brokk_min.evaluation import figures
 from brokk_min.evaluation.preliminary import Motion, SimulatorTests, Sweep
 from brokk_min.evaluation.sequences import Commands, axis_sequences
-from brokk_min.identification import validation
 from brokk_min.identification.logs import Log, Recording
+from brokk_min.identification.simulation import free_run
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
 
@@ -85,7 +85,7 @@ def test_plot_free_run__begins_after_a_history_and_lasts_30_s_or_to_the_end(samp
     angle, velocity = (curves(ax) for ax in figure.axes)
     np.testing.assert_allclose(angle["measured"], [time, q[14 : 14 + ticks, 1]])
     np.testing.assert_allclose(velocity["measured"], [time, -q[14 : 14 + ticks, 1]])
-    own_q, own_q_dot = validation.free_run(net, recording, np.array([13]), ticks)
+    own_q, own_q_dot = free_run(net, recording, np.array([13]), ticks)
     np.testing.assert_allclose(angle["free run"][1], own_q[:, 0, 1])
     np.testing.assert_allclose(velocity["free run"][1], own_q_dot[:, 0, 1])
 

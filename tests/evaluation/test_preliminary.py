@@ -11,7 +11,7 @@ from helpers_machines import small_net
 
 from brokk_min.evaluation import preliminary
 from brokk_min.evaluation.preliminary import Motion, Sweep
-from brokk_min.identification.validation import net_simulator, plant_simulator
+from brokk_min.identification.simulation import net_simulator, plant_simulator
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
 from examples.mini_excavator import MINI_EXCAVATOR

@@ -11,14 +11,12 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 from helpers_cli import run
-from helpers_machines import small_net
 
-from brokk_min import kinematics
 from brokk_min.evaluation import baselines, report, reproduce
 from brokk_min.evaluation.claims import VERDICTS
 from brokk_min.evaluation.reproduce import Budget
 from brokk_min.evaluation.robustness import variations
-from brokk_min.evaluation.sequences import axis_sequences, task_sequences, tuning_set
+from brokk_min.evaluation.sequences import task_sequences, tuning_set
 from brokk_min.identification.files import SHIPPED
 from brokk_min.identification.logs import read_log
 from brokk_min.identification.net_file import load_net
@@ -30,16 +28,6 @@ ERROR = "velocity_error_mean"
 PIDS = ["jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff", "jacobian_pid_ff_awake"]
 PIDS += ["jacobian_pid_ff_integral", "jacobian_pid_ff_integral_awake"]
 CONTROLLERS = [*POLICIES, *PIDS]
-
-
-class Idle:
-    """A controller that sends no commands."""
-
-    def start(self, num):
-        return None
-
-    def __call__(self, measured, state):
-        return np.zeros((len(measured.q), BROKK_170.n)), None
 
 
 @pytest.fixture(scope="module")
@@ -236,32 +224,3 @@ def test_tables__keep_kinds_of_starts_apart():
     assert less == {"mean": -3.0, "low": -3.0, "high": -3.0}
     low, high = result["intervals"]["rl"]["x"]["error"]
     assert (low, high) == pytest.approx((2 - 12.7062, 2 + 12.7062), abs=1e-3)
-
-
-def test_shorten__keeps_the_first_seconds():
-    short = reproduce.shorten(BROKK_170, axis_sequences(BROKK_170), 3.0)
-    assert [(s.name, len(s.goals)) for s in short] == [("x", 60), ("y", 60), ("z", 60)]
-
-
-def test_near_singularities__drives_along_what_an_upright_arm_can_do_least():
-    machine = BROKK_170
-    starts = np.array([[0.0, 1.139, 0.97, 2.804, 1.948], [1.0, 1.2, 0.9, 2.8, 1.9]])
-    net = small_net(machine, np.random.default_rng(0))
-    pids = baselines.baselines(machine, net)
-    controllers = {"rl": Idle(), **{name: pids[name] for name in baselines.PAPER_BASELINES}}
-    result, claims, traces = reproduce.near_singularities(machine, controllers, starts, 1.5, 3)
-    halves = ("least_half", "least_quarter")
-    assert list(traces) == [(c, s) for c in controllers for s in halves]
-    assert all(trace.q.shape == (30, 2, 5) for trace in traces.values())
-    np.testing.assert_array_equal(traces["rl", "least_half"].q[-1], starts)
-    frames = kinematics.forward_kinematics(machine, starts)
-    J = kinematics.jacobian(frames)[..., machine.driven]
-    JJt = J @ J.swapaxes(-1, -2)
-    np.testing.assert_allclose(result["manipulability"], np.sqrt(np.linalg.det(JJt)))
-    np.testing.assert_allclose(result["least"], np.sqrt(np.linalg.eigvalsh(JJt)[:, 0]), rtol=1e-6)
-    assert list(result["summary"]) == list(controllers)
-    assert result["summary"]["rl"]["all"][ERROR] == pytest.approx(0.075 * 10 / 30)
-    assert result["claims"] == {"rl": [claim.to_json() for claim in claims["rl"]]}
-    assert len(claims["rl"]) == 3
-    none = reproduce.near_singularities(machine, controllers, starts[:0], 1.5, 3)
-    assert none == ({"summary": {}, "claims": {}}, {}, {})

@@ -6,14 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers_machines import obedient_net
+from helpers_machines import obedient_net, small_net
 
+from brokk_min import kinematics
 from brokk_min.actuator import plant_reset, plant_step
 from brokk_min.evaluation import robustness as module
-from brokk_min.evaluation.baselines import baselines
+from brokk_min.evaluation.baselines import PAPER_BASELINES, baselines
 from brokk_min.evaluation.metrics import by_start, evaluate, mean_interval
 from brokk_min.evaluation.robustness import (
     by_length_of_rest,
+    near_singularities,
     pump_flow_ratio,
     robustness,
     variations,
@@ -126,3 +128,37 @@ def test_by_length_of_rest__is_of_the_axes_with_equal_rests(monkeypatch):
     runs, _ = evaluate(BROKK_170, {"pid": PIDS["jacobian_pid_ff"]}, commands, STARTS[:1], 0)
     for key in ("velocity_error_moves", "velocity_error_rests"):
         assert row["pid"][key] == pytest.approx(np.mean([run[key] for run in runs]))
+
+
+class Idle:
+    """A controller that sends no commands."""
+
+    def start(self, num):
+        return None
+
+    def __call__(self, measured, state):
+        return np.zeros((len(measured.q), BROKK_170.n)), None
+
+
+def test_near_singularities__drives_along_what_an_upright_arm_can_do_least():
+    machine = BROKK_170
+    starts = np.array([[0.0, 1.139, 0.97, 2.804, 1.948], [1.0, 1.2, 0.9, 2.8, 1.9]])
+    net = small_net(machine, np.random.default_rng(0))
+    pids = baselines(machine, net)
+    controllers = {"rl": Idle(), **{name: pids[name] for name in PAPER_BASELINES}}
+    result, claims, traces = near_singularities(machine, controllers, starts, 1.5, 3)
+    halves = ("least_half", "least_quarter")
+    assert list(traces) == [(c, s) for c in controllers for s in halves]
+    assert all(trace.q.shape == (30, 2, 5) for trace in traces.values())
+    np.testing.assert_array_equal(traces["rl", "least_half"].q[-1], starts)
+    frames = kinematics.forward_kinematics(machine, starts)
+    J = kinematics.jacobian(frames)[..., machine.driven]
+    JJt = J @ J.swapaxes(-1, -2)
+    np.testing.assert_allclose(result["manipulability"], np.sqrt(np.linalg.det(JJt)))
+    np.testing.assert_allclose(result["least"], np.sqrt(np.linalg.eigvalsh(JJt)[:, 0]), rtol=1e-6)
+    assert list(result["summary"]) == list(controllers)
+    assert result["summary"]["rl"]["all"]["velocity_error_mean"] == pytest.approx(0.075 * 10 / 30)
+    assert result["claims"] == {"rl": [claim.to_json() for claim in claims["rl"]]}
+    assert len(claims["rl"]) == 3
+    none = near_singularities(machine, controllers, starts[:0], 1.5, 3)
+    assert none == ({"summary": {}, "claims": {}}, {}, {})

@@ -30,12 +30,14 @@ TASK = TaskConfig(episode_s=0.6)
 NET = small_net(BROKK_170, np.random.default_rng(0))
 
 
-def first_bias(policy):
-    return [{"bias": float(policy.weights[-1][0])}]
+def first_bias(machine, controllers, starts):
+    return [{"bias": float(controllers["rl"].policy.weights[-1][0])}]
 
 
-def seed_job(out, evaluate=first_bias, config=TINY):
-    return partial(run_seed, BROKK_170, NET, TASK, config, out, evaluate, {"starts": 2})
+@pytest.fixture
+def seed_job(monkeypatch):
+    monkeypatch.setattr(seeds, "run_scored", first_bias)
+    return lambda out, config=TINY: partial(run_seed, BROKK_170, NET, TASK, config, False, out, 2)
 
 
 def square(seed):
@@ -63,31 +65,31 @@ def cluster():
 # --- one seed -------------------------------------------------------------------------------------
 
 
-def test_run_seed__trains_as_train_policy_and_writes_its_rows(tmp_path):
+def test_run_seed__trains_as_train_policy_and_writes_its_rows(tmp_path, seed_job):
     rows = seed_job(tmp_path)(4)
     train_policy(BROKK_170, NET, TASK, TINY, 4, tmp_path / "alone.npz")
     assert (tmp_path / "seed_4.npz").read_bytes() == (tmp_path / "alone.npz").read_bytes()
-    assert rows == first_bias(load_policy(tmp_path / "alone.npz", BROKK_170))
+    policy = load_policy(tmp_path / "alone.npz", BROKK_170)
+    assert rows == [{"bias": float(policy.weights[-1][0])}]
     written = json.loads((tmp_path / "seed_4.json").read_text())
     assert written["runs"] == rows
     assert written["identity"]["seed"] == 4
     assert written["identity"]["starts"] == 2
 
 
-def test_run_seed__does_nothing_twice(tmp_path):
+def test_run_seed__does_nothing_twice(tmp_path, seed_job, monkeypatch):
     rows = seed_job(tmp_path)(4)
 
-    def fail(policy):
-        raise AssertionError("evaluated again")
-
-    assert seed_job(tmp_path, fail)(4) == rows
+    monkeypatch.setattr(seeds, "run_scored", None)  # it would fail
+    assert seed_job(tmp_path)(4) == rows
+    monkeypatch.setattr(seeds, "run_scored", first_bias)
     (tmp_path / "seed_4.json").unlink()
     changed = os.stat(tmp_path / "seed_4.npz").st_mtime_ns
     assert seed_job(tmp_path)(4) == rows
     assert os.stat(tmp_path / "seed_4.npz").st_mtime_ns == changed  # not trained again
 
 
-def test_run_seed__trains_again_over_another_training_and_resumes_its_own(tmp_path):
+def test_run_seed__trains_again_over_another_training_and_resumes_its_own(tmp_path, seed_job):
     train_policy(BROKK_170, NET, TASK, TINY, 5, tmp_path / "seed_4.npz")
     rows = seed_job(tmp_path)(4)
     assert load_policy(tmp_path / "seed_4.npz", BROKK_170).training["seed"] == 4
@@ -100,7 +102,7 @@ def test_run_seed__trains_again_over_another_training_and_resumes_its_own(tmp_pa
     assert seed_job(tmp_path)(4) == rows
 
 
-def test_run_seed__refuses_results_of_something_else(tmp_path):
+def test_run_seed__refuses_results_of_something_else(tmp_path, seed_job):
     seed_job(tmp_path)(4)
     other = PPOConfig(num_envs=4, horizon=8, total_steps=32)
     with pytest.raises(ValueError, match=r"seed_4\.json: settings.horizon: expected 8, got 4"):

@@ -13,7 +13,8 @@ from brokk_min.actuator import initial_history, mu_law
 from brokk_min.identification import fitting
 from brokk_min.identification.fitting import FitConfig, fit, training_set
 from brokk_min.identification.logs import Log, Recording, join_recordings, velocity_of
-from brokk_min.identification.validation import free_run_step, score
+from brokk_min.identification.simulation import free_run_step
+from brokk_min.identification.validation import score
 
 
 def simple_system(seed, recordings, ticks=300, logged=False):

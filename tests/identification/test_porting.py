@@ -15,7 +15,8 @@ from helpers_bus import World
 from brokk_min.__main__ import main
 from brokk_min.can.operator_input import Script
 from brokk_min.evaluation import baselines
-from brokk_min.evaluation.sequences import axis_sequences, draw_starts, speed_limits
+from brokk_min.evaluation.feasibility import speed_limits
+from brokk_min.evaluation.sequences import axis_sequences, draw_starts
 from brokk_min.identification.logs import read_log
 from brokk_min.identification.net_file import load_net, select_nets
 from brokk_min.jacobian import Gains, JacobianController, manipulability_threshold

@@ -10,7 +10,7 @@ import pytest
 from helpers_bus import BASELINE, START
 from helpers_viewer import PipedLoop, telemetry
 
-from brokk_min.evaluation.sequences import feasible
+from brokk_min.evaluation.feasibility import feasible
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer import tracing

@@ -8,8 +8,9 @@ from typing import get_type_hints
 import pytest
 import tyro
 
-from brokk_min.cli.options import WrongUse
-from brokk_min.cli.settings import FitSettings, LearnerSettings, TaskSettings, make_config
+from brokk_min.cli.identification import FitSettings
+from brokk_min.cli.options import WrongUse, checked
+from brokk_min.cli.training import LearnerSettings, TaskSettings
 from brokk_min.env import TaskConfig
 from brokk_min.identification.fitting import FitConfig
 from brokk_min.ppo import PPOConfig
@@ -25,7 +26,7 @@ def test_settings__have_the_fields_types_and_defaults_of_the_config(settings, co
     for name, hint in get_type_hints(config).items():
         assert get_type_hints(settings)[name] in (hint, hint | None if name in same else hint)
     assert vars(settings()) | same == vars(config())
-    assert make_config(config, vars(settings()) | same) == config()
+    assert checked(config, **vars(settings()) | same) == config()
 
 
 @pytest.mark.parametrize(("config", "field"), FIELDS, ids=lambda x: getattr(x, "name", ""))
@@ -45,14 +46,14 @@ def test_configs__refuse_what_no_setting_can_be(config, field):
             config(**{field.name: value})
 
 
-def test_make_config__names_the_option():
+def test_checked__names_the_option():
     with pytest.raises(WrongUse, match=r"^--valve-cost: expected 0 to 1000, got -1\.0$"):
-        make_config(TaskConfig, vars(TaskSettings(valve_cost=-1.0)))
+        checked(TaskConfig, **vars(TaskSettings(valve_cost=-1.0)))
     with pytest.raises(WrongUse, match=r"^--hold-max-s: expected 0\.75 to 1000000\.0, got 0\.5$"):
-        make_config(TaskConfig, vars(TaskSettings(hold_min_s=0.75, hold_max_s=0.5)))
+        checked(TaskConfig, **vars(TaskSettings(hold_min_s=0.75, hold_max_s=0.5)))
 
 
 @pytest.mark.parametrize("option", ["--integral-cost", "--lag-cost"])
 def test_task_settings__keep_the_old_name_of_an_option(option):
     settings = tyro.cli(TaskSettings, args=[option, "2.5"])
-    assert make_config(TaskConfig, vars(settings)) == TaskConfig(integral_cost=2.5)
+    assert checked(TaskConfig, **vars(settings)) == TaskConfig(integral_cost=2.5)

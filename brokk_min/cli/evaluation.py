@@ -1,0 +1,211 @@
+"""The commands that compare: policies, baselines, the paper's tests, the whole chain.
+
+What trains or draws is imported by the command that runs it: help must not wait for it.
+"""
+
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from brokk_min.actuator import ActuatorNet
+from brokk_min.cli.options import Command, PlantName, WrongUse, default_policy, with_plant
+from brokk_min.env import TaskConfig
+from brokk_min.evaluation import baselines, metrics, perfect_model, sequences
+from brokk_min.evaluation.claims import VERDICTS
+from brokk_min.evaluation.rollout import Controller
+from brokk_min.identification.files import SHIPPED, located, write_json
+from brokk_min.identification.net_file import load_net
+from brokk_min.learning.policy import POLICIES, Policy, PolicyController, load_policy
+from brokk_min.machine import Machine, number
+
+
+@dataclass(kw_only=True)
+class Starts(Command):
+    """Draw start poses: across the workspace, near joint limits, near full extension."""
+
+    out: Path  # Poses to write, .csv.
+    num: int = number("1", 1, 10**6, 64)  # How many.
+    seed: int = number("1", 0, 2**31 - 1, 2)  # Of the poses.
+
+    def __call__(self) -> None:
+        machine = self.check(out="starts")
+        rng = np.random.default_rng(self.seed)
+        poses = sequences.draw_starts(machine, sequences.task_sequences(machine), self.num, rng)
+        sequences.write_starts(self.out, machine, poses)
+        print(f"{self.out}: {self.num} start poses")
+
+
+@dataclass(kw_only=True)
+class Evaluate(Command):
+    """Policies and tuned baselines on the same sequences and starts."""
+
+    policy: Path | None = None  # Policy that `train` wrote; by default those of the package.
+    commands: Path | None = None  # Velocity sequences, CSV: sequence,time,vx,vy,vz [s, m/s].
+    starts: Path | None = None  # Start poses, CSV: one column per joint [rad].
+    plant: PlantName = "analytic"  # What moves: analytic, net, or an object of your file.
+    json: Path | None = None  # Also write all runs here.
+    gains: Path | None = None  # Tuned gains; by default gains.json in the folder of POLICY.
+    num_starts: int = number("1", 1, 10**6, 16)  # Without --starts: how many of the machine's.
+    noise: float = number("1", 0, 1, 0.05)  # Sensor noise [deviations]; 0: encoders only.
+    perfect_model: bool = False  # Also a bound: a controller with the plant as its model (minutes).
+    all: bool = False  # Print all figures by kind of start, not the table alone.
+
+    def __call__(self) -> None:
+        machine = self.check(json="runs")
+        if self.perfect_model and self.plant != "analytic":
+            raise WrongUse(
+                f"--perfect-model: expected --plant analytic, its model, got {self.plant}"
+            )
+        path, gains = default_policy(machine, self.policy, self.gains)
+        if self.noise != TaskConfig.noise:
+            gains = self.gains  # others were tuned with more noise
+        policy = load_policy(path, machine)
+        machine = with_plant(machine, self.plant, ["analytic", "net"])
+        net = policy.net if self.plant == "net" else None
+        inputs = (self.commands, self.starts, self.num_starts, self.seed)
+        commands, starts = sequences.goals_and_starts(machine, *inputs)
+        print(f"gains of the baselines: {gains or 'tuned now'}", file=sys.stderr)
+        controllers = self._controllers(machine, policy, gains, net)
+        if self.perfect_model:
+            controllers |= perfect_model.perfect_models(machine, starts)
+        config = TaskConfig(noise=self.noise)
+        runs, _ = metrics.evaluate(
+            machine, controllers, commands, starts, self.seed, net, config=config
+        )
+        if self.json:
+            meta = metrics.metadata(machine, self.seed)
+            meta |= {"policy": str(path), "gains": str(gains or "tuned now"), "plant": self.plant}
+            meta["commands"] = str(self.commands or ", ".join(one.name for one in commands))
+            meta |= {"starts": str(self.starts or self.num_starts), "noise": self.noise}
+            write_json(self.json, {"meta": meta, "runs": runs})
+        runs.sort(key=lambda run: sequences.KINDS.index(run["kind"]))  # those that count first
+        print_table(runs, len(commands), COLUMNS)
+        for kind in sequences.KINDS if self.all else ():
+            of_kind = [run for run in runs if run["kind"] == kind]
+            if of_kind:
+                print_table(of_kind, len(commands), [k for k in runs[0] if k not in metrics.LABELS])
+
+    def _controllers(
+        self, machine: Machine, policy: Policy, gains: Path | None, net: ActuatorNet | None
+    ) -> dict[str, Controller]:
+        controllers: dict[str, Controller] = {"rl": PolicyController(machine, policy)}
+        for name, file in POLICIES.items():
+            path = SHIPPED / machine.name / file
+            if not self.policy and name != "rl" and path.exists():
+                controllers[name] = PolicyController(machine, load_policy(path, machine))
+        if gains:
+            return controllers | baselines.read_gains(gains, machine, policy.net)
+        budget = (baselines.TUNING_RUNS, baselines.GENERATIONS, self.seed)
+        config = TaskConfig(noise=self.noise)
+        tuned, _ = baselines.tune_baselines(machine, policy.net, *budget, config, net)
+        return controllers | tuned
+
+
+COLUMNS = {  # of the table: head, format
+    "velocity_error_mean": ("error [m/s]", "{:.4f}"),
+    "off_axis_drift_max": ("drift [m]", "{:.4f}"),
+    "jerk_rms": ("jerk [m/s^3]", "{:.1f}"),
+    "valve_travel": ("travel [1]", "{:.0f}"),
+}
+
+
+def print_table(runs: list[dict[str, Any]], sequences: int, keys: Iterable[str]) -> None:
+    """Means of some metrics by controller, over the starts of the first run's kind."""
+    runs = [run for run in runs if run["kind"] == runs[0]["kind"]]
+    num = len({run["start"] for run in runs})
+    print(f"means over {sequences} sequences from {num} {runs[0]['kind']} starts")
+    columns = {key: COLUMNS.get(key, (key, "{:.4f}")) for key in keys}
+    print(f"{'controller':30} " + " ".join(head for head, _ in columns.values()))
+    for name, rows in metrics.summary(runs).items():
+        cells = []
+        for key, (head, form) in columns.items():
+            mean = rows["all"][key]
+            text = "none" if mean is None else form.format(mean)
+            cells.append(text.rjust(len(head)))
+        print(f"{name:30} " + " ".join(cells))
+
+
+CHAIN = {  # files of `reproduce`
+    "log.npz": "log",
+    "log_test.npz": "log",
+    "net.npz": "nets",
+    "log_paper.npz": "log",
+    "net_paper.npz": "nets",
+    **dict.fromkeys(POLICIES.values(), "policy"),
+    **{f"{name}.csv": "curve" for name in POLICIES.values()},
+    "gains.json": "gains",
+    "results.json": "results",
+}
+
+
+@dataclass(kw_only=True)
+class Reproduce(Command):
+    """The whole chain: logs, nets, policy, baselines, comparison, report.html and results.json."""
+
+    out: Path = Path("results")  # Folder for everything.
+    quick: bool = False  # The same, smaller: to see that it runs, not to assess the policy.
+    sweep: Path | None = None  # sweep.json on these nets: intervals over its seeds in the report.
+
+    def __call__(self) -> None:
+        from brokk_min.evaluation.reproduce import QUICK, Budget, reproduce
+
+        budget = QUICK if self.quick else Budget()
+        machine = self.check({self.out / name: kind for name, kind in CHAIN.items()})
+        results = reproduce(machine, self.out, budget, self.seed, self.sweep)
+        for name, rows in results["task_space"]["summary"].items():
+            errors = ", ".join(f"{s} {row['velocity_error_mean']:.4f}" for s, row in rows.items())
+            print(f"{name:22} mean velocity error [m/s]: {errors}")
+        for claim in results["claims"]:
+            ours = VERDICTS[claim["ours"]["holds"]]
+            print(f"{VERDICTS[claim['holds']]} (of our policy: {ours}): {claim['paper']}")
+        print(self.out / "report.html")
+        print(self.out / "results.json")
+
+
+@dataclass(kw_only=True)
+class Preliminary(Command):
+    """The paper's preliminary tests and its sim-to-real experiment, on the machine and the nets."""
+
+    actuator: Path  # Nets that `fit` wrote.
+    out: Path = Path("preliminary")  # Folder for figures and preliminary.json.
+
+    def __call__(self) -> None:
+        from brokk_min.evaluation import figures, preliminary
+
+        machine = self.check({self.out / "preliminary.json": "preliminary"})
+        with located(self.actuator):
+            measured = preliminary.run(machine, load_net(self.actuator), self.seed)
+        numbers = preliminary.numbers(machine, measured)
+        self.out.mkdir(parents=True, exist_ok=True)
+        plots = {"preliminary": figures.plot_tests(machine, measured.tests)}
+        plots["sim_to_real"] = figures.plot_gap(machine, measured.gap)
+        for name, figure in plots.items():
+            figures.save(self.out / f"{name}.png", figure)
+            print(self.out / f"{name}.png")
+        meta = metrics.metadata(machine, self.seed) | {"actuator": str(self.actuator)}
+        write_json(self.out / "preliminary.json", {"meta": meta, **numbers})
+        print(self.out / "preliminary.json")
+        distance = numbers["sim_to_real"]["tool"]["position_error_mean"]
+        print(f"mean distance of the tools of nets and machine over 30 s: {distance:.4f} m")
+
+
+@dataclass(kw_only=True)
+class Family(Command):
+    """Draw machines with physics of their own; run the chain on each, and each policy on all."""
+
+    out: Path = Path("family")  # Folder for a folder of each member, and family.json.
+    members: int = number("1", 1, 1000, 8)  # How many, from --seed on; finished ones stay.
+    quick: bool = False  # The same, smaller: to see that it runs, not to assess the policies.
+
+    def __call__(self) -> None:
+        from brokk_min.evaluation.family import FAMILY, QUICK, run_family, show
+
+        machine = self.check({self.out / "family.json": "family"})
+        seeds = range(self.seed, self.seed + self.members)
+        results = run_family(machine, seeds, self.out, QUICK if self.quick else FAMILY)
+        print(show(results))
+        print(self.out / "family.json")

@@ -1,0 +1,258 @@
+"""The commands for logs and nets: to record, to look at logs, to fit and to score.
+
+What fits or draws is imported by the command that runs it: help must not wait for it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from tyro.conf import OmitArgPrefixes, Positional
+
+from brokk_min.cli.options import Command, MachineName, PlantName, WrongUse, checked, with_plant
+from brokk_min.identification import excitation, inspection, validation
+from brokk_min.identification.coupling import history_of
+from brokk_min.identification.files import brief, located, write_json
+from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
+from brokk_min.identification.logs import Log, part_of, read_log, split, write_log
+from brokk_min.identification.net_file import load_net, save_net
+from brokk_min.machine import Machine, number
+
+COLUMNS = {  # of the table of `inspect`: head, format, field of `JointReport`
+    "minutes": ("{:.1f}", "minutes"),
+    "alone": ("{:.0%}", "alone"),
+    "sign": ("{:+d}", "sign"),
+    "delay [s]": ("{:.2f}", "delay"),
+    "zone up": ("{:.3f}", "dead_zone_up"),
+    "zone down": ("{:.3f}", "dead_zone_down"),
+    "gain up": ("{:.2f}", "gain_up"),
+    "gain down": ("{:.2f}", "gain_down"),
+    "explained": ("{:.0%}", "explained"),
+    "feedback": ("{:+.2f}", "feedback"),
+}
+
+
+@dataclass(kw_only=True)
+class Collect(Command):
+    """Record the machine (the analytic plant, or your own) under excitation."""
+
+    out: Path  # Log to write, .csv or .npz.
+    hours: float = number("h", 1e-4, 100, 1.0)  # Driving time for each actuator [h].
+    excitation: Literal["sine", "rich", "joint"] = "rich"
+    """The paper's sines; steps and holds too; or the same on all joints at once: HOURS in all."""
+    plant: PlantName = "analytic"  # What moves: the analytic plant, or an object of your file.
+
+    def __call__(self) -> None:
+        machine = self.check(out="log")
+        if self.out.suffix not in (".csv", ".npz"):
+            raise WrongUse(f"--out: expected a name ending in .csv or .npz, got {self.out}")
+        rng = np.random.default_rng(self.seed)
+        machine = with_plant(machine, self.plant, ["analytic"])
+        log = excitation.collect(machine, self.hours, self.excitation, rng)
+        write_log(self.out, log)
+        print(f"{self.out}: {len(log.recordings)} recordings of {', '.join(log.joints)}")
+
+
+@dataclass(frozen=True)
+class FitSettings(FitConfig):
+    """How the nets are fitted."""
+
+    history: int | None = None  # type: ignore[assignment]
+    """Samples of angle, velocity and command (paper: 13); by default the machine's."""
+
+    def __post_init__(self) -> None:
+        """Leave the check to `Fit`."""
+
+
+@dataclass(kw_only=True)
+class Fit(Command):
+    """Fit one net per joint to logs of any machine; score it on other recordings."""
+
+    logs: Positional[tuple[Path, ...]]  # Logs of one machine, .csv or .npz.
+    out: Path  # Nets to write, .npz.
+    test: tuple[Path, ...] = ()  # Logs to score on; by default every tenth recording of LOGS.
+    json: Path | None = None  # Also write the scores here.
+    figure: Path | None = None  # Also draw free runs of the worst and median recording, .png.
+    machine: MachineName = ""  # Of LOGS; by default the usual one, if LOGS has its joints.
+    velocity_samples: int | None = number("samples", 2, 100, None)
+    """Window of velocities; by default the machine's."""
+    paper: bool = False  # The paper's recipe: errors of one step, no noise, plain commands.
+    curve: bool = False  # Also score nets fitted to an eighth, a quarter, a half of the recordings.
+    settings: OmitArgPrefixes[FitSettings] = field(default_factory=FitSettings)
+
+    def __call__(self) -> None:
+        from brokk_min.evaluation import figures
+        from brokk_min.identification.fitting import fit
+
+        machine = self.check(out="nets", json="scores", figure="picture")
+        self.config(None, machine.history)  # before the logs are read
+        samples = self.velocity_samples or machine.velocity_samples
+        if samples > (self.settings.history or machine.history):
+            raise WrongUse(f"--velocity-samples: expected at most --history, got {samples}")
+        log, known = read_known(self.logs, machine, samples, self.machine)
+        log, test = self.parts(log, samples)
+        history = machine.history if known else history_of(log, machine.history)
+        config = self.config(known, history)
+        reports = inspection.inspect(log)
+        with located(*self.logs):
+            inspection.check_signs(reports)
+            net = fit(log, config, self.seed, samples, known.name if known else "")
+        with located(*self.test, *self.logs):
+            scores = validation.validate(net, log, test, known)
+        for name, scored in scores["joints"].items():
+            if "one_step_rmse" not in scored:
+                scores["warnings"].append(f"{name}: not driven in the test: no score")
+        scores["warnings"] += inspection.warnings(log, reports, known)
+        save_net(self.out, net)
+        if self.curve:
+            logs = [part_of(log, part) for part in (1 / 8, 1 / 4, 1 / 2)]
+            nets = [fit(part, config, self.seed, samples) for part in logs]
+            pairs = zip([*logs, log], [*nets, net], strict=True)
+            scores["curve"] = [curve_point(part, validation.score(n, test)) for part, n in pairs]
+        if self.json:
+            names = ("seed", "rate", "history", "machine", "dead_zone")
+            meta: dict[str, Any] = {name: getattr(net, name) for name in names}
+            meta |= {"logs": list(map(str, self.logs)), "test": list(map(str, self.test))}
+            write_json(self.json, {"meta": meta, **scores})
+        if self.figure:
+            figures.save(self.figure, figures.plot_worst_and_median(net, test))
+        name = net.machine or "no known machine"
+        print(f"nets of {name}, dead zone {net.dead_zone} of full command")
+        seconds = net.history / net.rate
+        print(f"history: {net.history} samples at {net.rate:g} Hz, {seconds:.2f} s")
+        print_scores(scores)
+
+    def config(self, known: Machine | None, history: int) -> FitConfig:
+        """The settings, by default with the machine's history and dead zone; or the paper's."""
+        settings = vars(self.settings) | {"history": self.settings.history or history}
+        if self.paper:
+            settings |= PAPER_RECIPE
+        elif known and settings["dead_zone"] is None:
+            settings["dead_zone"] = known.dead_zone
+        return checked(FitConfig, **settings)
+
+    def parts(self, log: Log, samples: int) -> tuple[Log, Log]:
+        """Recordings to fit to and to score on."""
+        if self.test:
+            return log, read_log(self.test, samples, log.joints, log.rate)
+        with located(*self.logs):
+            return split(log)
+
+
+def read_known(
+    logs: Sequence[Path], machine: Machine, samples: int, name: str
+) -> tuple[Log, Machine | None]:
+    """Logs at the machine's rate, and the machine if it has their joints.
+
+    ValueError: it was given by its `name` and has others.
+    """
+    log = read_log(logs, samples, rate=machine.rate)
+    known = machine if machine.names == log.joints else None
+    if name and not known:
+        expected = f"expected those of --machine {name}"
+        raise ValueError(f"{logs[0]}: joints: {expected}, got {brief(log.joints)}")
+    return log, known
+
+
+def curve_point(log: Log, joints: dict[str, Any]) -> dict[str, Any]:
+    """Minutes of a log, and the errors of 5 s free runs [rad/s] of the nets fitted to it."""
+    minutes = sum(len(recording.q) for recording in log.recordings) / log.rate / 60
+    runs = {name: joint["free_run"].get("5") for name, joint in joints.items()}
+    errors = {name: run["velocity_rmse"] for name, run in runs.items() if run}
+    return {"minutes": minutes, "free_run_rmse": errors}
+
+
+def print_scores(scores: dict[str, Any]) -> None:
+    """Scores of each net, of the linear model of its joint if it has one, and warnings."""
+    row = "{:12} {:>9} {:>13}  {:30} {}"
+    print("Errors [rad/s] of one step, of the last velocity again, of free runs of 1, 5, 10, 30 s:")
+    print(row.format("joint", "one step", "same as last", "free runs", "creep [rad/s]"))
+    for name, net in scores["joints"].items():
+        models = {name: net, "  linear": net["linear"]} if "linear" in net else {name: net}
+        for label, model in models.items():
+            one_step = f"{model.get('one_step_rmse', np.nan):.4f}"
+            persistence = f"{model.get('persistence_rmse', np.nan):.4f}"
+            free = ", ".join(f"{run['velocity_rmse']:.4f}" for run in model["free_run"].values())
+            creep = f"{model['creep']:.5f}" if "creep" in model else ""
+            print(row.format(label, one_step, persistence, free, creep))
+        relative = [run.get("relative_error") for run in net["free_run"].values()]
+        parts = ", ".join("none" if part is None else f"{part:6.0%}" for part in relative)
+        print(row.format("  of rms speed", "", "", parts, ""))
+    if scores.get("tool"):
+        metres = ", ".join(f"{error:.3f}" for error in scores["tool"].values())
+        print(f"tool: off by {metres} m after {', '.join(scores['tool'])} s (median)")
+    warnings = [warning.partition(": ") for warning in scores.get("warnings", [])]
+    for name in scores["joints"]:
+        own = [text for joint, _, text in warnings if joint == name]
+        if own:
+            print("\n  ".join([f"warnings for {name}:", *own]))
+    for point in scores.get("curve", []):
+        errors = ", ".join(f"{k} {v:.4f}" for k, v in point["free_run_rmse"].items())
+        print(f"fitted to {point['minutes']:.1f} minutes: free runs of 5 s [rad/s]: {errors}")
+
+
+@dataclass(kw_only=True)
+class Score(Command):
+    """Score existing nets on logs, as `fit` does on recordings that it held out."""
+
+    net: Positional[Path]  # Nets that `fit` wrote.
+    logs: Positional[tuple[Path, ...]]  # Logs of the same machine, .csv or .npz.
+    machine: MachineName = ""  # Of NET; also scores the tool.
+    json: Path | None = None  # Also write the scores here.
+    figure: Path | None = None  # Free runs of the worst and median recording; by default NET.png.
+
+    def __call__(self) -> None:
+        self.figure = self.figure or self.net.with_suffix(".png")
+        machine = self.check(json="scores", figure="picture")
+        net = load_net(self.net)
+        log = read_log(self.logs, net.velocity_samples, net.joints, net.rate)
+        with located(*self.logs):
+            scores: dict[str, Any] = {"joints": validation.score(net, log)}
+        if self.machine and machine.names == net.joints:
+            scores["tool"] = validation.tool_errors(machine, net, log)
+        if self.json:
+            meta = {"net": str(self.net), "logs": list(map(str, self.logs))}
+            write_json(self.json, {"meta": meta, **scores})
+        if any("one_step_rmse" in joint for joint in scores["joints"].values()):
+            from brokk_min.evaluation import figures
+
+            figures.save(self.figure, figures.plot_worst_and_median(net, log))
+        print_scores(scores)
+
+
+@dataclass(kw_only=True)
+class Inspect(Command):
+    """What a log tells of its machine before any fit, and what it cannot tell."""
+
+    logs: Positional[tuple[Path, ...]]  # Logs of one machine, .csv or .npz.
+    machine: MachineName = ""  # Of LOGS; by default the usual one, if LOGS has its joints.
+    json: Path | None = None  # Also write the report here.
+
+    def __call__(self) -> None:
+        machine = self.check(json="inspection")
+        log, known = read_known(self.logs, machine, machine.velocity_samples, self.machine)
+        report = inspection.report_json(log, known)
+        if self.json:
+            write_json(self.json, {"meta": {"logs": list(map(str, self.logs))}, **report})
+        print_report(log, report, known)
+
+
+def print_report(log: Log, report: dict[str, Any], machine: Machine | None) -> None:
+    """A table of `inspection.report_json`, what a known machine says instead, and warnings."""
+    velocity = "logged" if log.velocity_logged else "estimated"
+    print(f"{len(log.recordings)} recordings, {report['gaps']} begin after a gap; q_dot {velocity}")
+    row = " ".join(["{:14}", *["{:>9}"] * len(COLUMNS)])
+    print(row.format("joint", *COLUMNS))
+    for name, joint in report["joints"].items():
+        print(row.format(name, *(form.format(joint[key]) for form, key in COLUMNS.values())))
+        together = {other: part for other, part in joint["together"].items() if part > 0.05}
+        if together:
+            parts = ", ".join(f"{other} {part:.0%}" for other, part in together.items())
+            print(f"  with commands of {parts}")
+    if machine:
+        zones = machine.dead_zone, machine.largest_dead_zone or machine.dead_zone
+        print(f"{machine.name}: dead zones {zones[0]:g} to {zones[1]:g}, delay {machine.delay:g} s")
+    for warning in report["warnings"]:
+        print(f"warning: {warning}")

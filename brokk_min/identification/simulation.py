@@ -1,0 +1,172 @@
+"""Nets on their own outputs, and the plant, under given commands: free runs, step responses."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brokk_min.actuator import (
+    ActuatorNet,
+    append_command,
+    append_sample,
+    initial_history,
+    plant_reset,
+    plant_step,
+)
+from brokk_min.identification.logs import Log, Recording
+from brokk_min.machine import Array, Machine
+
+RISE = 0.63  # paper's response times: 0.4 s and 0.1 s, read as the time to 63 % of the change
+# angles (..., n) and commands (T, ..., n) -> angles (T+1, ..., n)
+Simulator = Callable[[Array, Array], Array]
+
+
+def free_run_step(net: ActuatorNet, history: Array, q: Array, u: Array) -> tuple[Array, Array]:
+    """History and angles [rad] after a tick under `u`; no joint leaves the training's range."""
+    velocity = net.predict(append_command(history, u))
+    low, high = np.minimum(q, net.q_low), np.maximum(q, net.q_high)
+    q_next = np.clip(q + velocity / net.rate, low, high)
+    history = append_sample(history, u, q_next, net.velocity_samples, 1 / net.rate)
+    if net.velocity_logged:
+        history[..., 1, -1] = (q_next - q) * net.rate
+    return history, q_next
+
+
+def free_run(
+    net: ActuatorNet, recording: Recording, starts: NDArray[np.intp], ticks: int
+) -> tuple[Array, Array]:
+    """Angles [rad] and velocities [rad/s] (ticks, s, n) of nets on their own outputs.
+
+    Each run has the recorded commands and begins at one of the samples `starts` (s,).
+    """
+    rows = starts[:, None] + np.arange(1 - net.history, 1)
+    history = np.stack([recording.q[rows], recording.q_dot[rows], recording.u[rows - 1]])
+    history = history.transpose(1, 3, 0, 2).astype(np.float32)  # (s, n, 3, H)
+    q: Array = recording.q[starts]
+    angles, velocities = [], []
+    for k in range(ticks):
+        history, q = free_run_step(net, history, q, recording.u[starts + k])
+        angles.append(q)
+        velocities.append(history[..., 1, -1])
+    return np.array(angles), np.array(velocities)
+
+
+def plant_simulator(machine: Machine) -> Simulator:
+    """The analytic plant, from rest."""
+
+    def simulate(q: Array, u: Array) -> Array:
+        state = plant_reset(machine, q)
+        angles = [state.q]
+        for command in u:
+            state = plant_step(machine, state, command)
+            angles.append(state.q)
+        return np.array(angles)
+
+    return simulate
+
+
+def net_simulator(net: ActuatorNet) -> Simulator:
+    """The nets, from rest."""
+
+    def simulate(q: Array, u: Array) -> Array:
+        history = initial_history(q, net.history).astype(np.float32)
+        angles = [q]
+        for command in u:
+            history, q = free_run_step(net, history, q, command)
+            angles.append(q)
+        return np.array(angles)
+
+    return simulate
+
+
+def creep(net: ActuatorNet) -> Array:
+    """Largest speed [rad/s] (n,) of joints without a command for 10 s, from 21 angles."""
+    seconds = 10.0
+    q = np.linspace(net.q_low, net.q_high, 21)
+    angles = net_simulator(net)(q, np.zeros((round(seconds * net.rate), *q.shape)))
+    return np.asarray(np.abs(angles[-1] - q).max(axis=0) / seconds)
+
+
+def steps(
+    simulate: Simulator, q_low: Array, q_high: Array, level: Array, before: Array, wait: int
+) -> Array:
+    """Angles (2 wait + 1, 2, 2, n, n) around a step of each joint alone to the command `level`.
+
+    Axes: tick; from idle, or out of a motion under `before` (n,); up, down; stepping joint; joint.
+    The step comes after `wait` ticks. The joint begins a tenth of its range from the end behind it.
+    Paper: Sec. 3.2 (past movement)
+    """
+    n = len(level)
+    sign = np.array([1, -1])[:, None, None]
+    own = np.eye(n, dtype=bool)
+    behind = np.where(sign > 0, 0.9 * q_low + 0.1 * q_high, 0.1 * q_low + 0.9 * q_high)
+    q = np.broadcast_to(np.where(own, behind, (q_low + q_high) / 2), (2, 2, n, n))
+    u = np.zeros((2 * wait, 2, 2, n, n))
+    u[:wait, 1] = sign * own * before
+    u[wait:] = sign * own * level
+    return simulate(q, u)
+
+
+def step_velocity(angles: Array, rate: float) -> Array:
+    """Velocity of each stepping joint in its direction [rad/s] (2 wait, 2, 2, n)."""
+    own = np.diagonal(angles, axis1=3, axis2=4)
+    return np.asarray(np.diff(own, axis=0) * rate * np.array([[1], [-1]]))
+
+
+def response_times(angles: Array, rate: float) -> Array:
+    """Time [s] (2, 2, n) from the step to 63 % of the change of velocity; nan: no change.
+
+    Velocities are means over a tick, taken at its middle, with lines between them.
+    """
+    wait = (len(angles) - 1) // 2
+    after = step_velocity(angles, rate)[wait - 1 :]
+    change = after.max(axis=0) - after[0]
+    rise = (after - after[0]) / np.where(change > 1e-3, change, np.nan)
+    at = np.maximum(np.argmax(rise >= RISE, axis=0), 1)  # row k: the tick k - 1 after the step
+    high = np.take_along_axis(rise, at[None], axis=0)[0]
+    low = np.take_along_axis(rise, at[None] - 1, axis=0)[0]
+    return np.asarray((at - 0.5 - (high - RISE) / (high - low)) / rate)
+
+
+def step_commands(
+    simulate: Simulator, q_low: Array, q_high: Array, level: Array, wait: int
+) -> Array:
+    """Commands (n,) half way to `level` from the least tenth of it that moves a joint."""
+    fractions = np.arange(1, 11) / 10
+    speeds = []
+    for fraction in fractions:
+        command = fraction * level
+        velocity = step_velocity(steps(simulate, q_low, q_high, command, command, wait), 1.0)
+        speeds.append(velocity[wait:, 0].max(axis=0).min(axis=0))  # (n,)
+    moves = np.array(speeds) > 0.05 * speeds[-1]
+    return np.asarray((fractions[np.argmax(moves, axis=0)] + 1) / 2 * level)
+
+
+def named_times(times: Array, joints: Sequence[str]) -> dict[str, Any]:
+    """Response times for JSON: {joint: {"idle": {"up", "down"}, "moving": {...}}} [s or None]."""
+    result: dict[str, Any] = {}
+    for j, name in enumerate(joints):
+        result[name] = {}
+        for kind, row in zip(("idle", "moving"), times[..., j], strict=True):
+            up, down = (None if np.isnan(time) else float(time) for time in row)
+            result[name][kind] = {"up": up, "down": down}
+    return result
+
+
+def log_response_times(
+    net: ActuatorNet, log: Log, machine: Machine | None
+) -> dict[str, dict[str, Any]]:
+    """`named_times` to the largest command of a log, of the nets and of a known machine."""
+    level = np.abs(np.concatenate([recording.u for recording in log.recordings])).max(axis=0)
+    wait = max(round(1.5 * net.rate), 2 * net.history)
+    simulators = {"response_time": net_simulator(net)}
+    if machine:
+        simulators["machine_response_time"] = plant_simulator(machine)
+    low, high = net.q_low, net.q_high
+    before = step_commands(simulators["response_time"], low, high, level, wait)
+    result = {}
+    for name, simulate in simulators.items():
+        angles = steps(simulate, low, high, level, before, wait)
+        result[name] = named_times(response_times(angles, net.rate), net.joints)
+    return result

@@ -1,0 +1,161 @@
+"""The commands for logs and nets on small files: what they write and what they print."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from helpers_cli import run
+
+from brokk_min.cli.identification import print_scores
+from brokk_min.identification.logs import Log, Recording, write_log
+from brokk_min.identification.net_file import load_net
+from brokk_min.machine import BROKK_170
+
+
+def foreign_log(path, seed, runs):
+    """Another machine at 100 Hz with jitter: first-order joints, a dead zone, angles only."""
+    rng = np.random.default_rng(seed)
+    lines = ["run,time,u_boom,u_arm,q_boom,q_arm"]
+    for r in range(runs):
+        t = 10.0 * r
+        q = np.array([0.3, -0.2])
+        v = np.zeros(2)
+        for k in range(2500):
+            if k % 60 == 0:
+                u = rng.uniform(-1, 1, 2)
+                opening = np.sign(u) * np.maximum(0, np.abs(u) - 0.3)
+            step = 0.01 + rng.uniform(-0.003, 0.003)
+            v += step * (np.array([0.6, 1.0]) * opening - v) / 0.15
+            q = q + step * v
+            lines.append(f"take {r},{t:.4f},{u[0]:.3f},{u[1]:.3f},{q[0]:.5f},{q[1]:.5f}")
+            t += step
+    path.write_text("\n".join(lines) + "\n")
+
+
+def steady_log(joints, recordings):
+    """Angles that go up by 0.01 rad a tick."""
+    q = np.cumsum(np.full((40, len(joints)), 0.01), axis=0)
+    return Log(joints, tuple(Recording(str(i), 0 * q, q, 0 * q) for i in range(recordings)))
+
+
+def test_fit__takes_a_foreign_log_and_beats_persistence_and_a_linear_model(tmp_path):
+    foreign_log(tmp_path / "log.csv", 0, 16)
+    foreign_log(tmp_path / "test.csv", 1, 2)
+    files = ["--test", tmp_path / "test.csv", "--json", tmp_path / "f.json"]
+    files += ["--figure", tmp_path / "f.png"]
+    assert run(f"fit '{tmp_path}/log.csv' --steps 400 --out", tmp_path / "n.npz", *files) == 0
+    written = json.loads((tmp_path / "f.json").read_text())
+    assert written["meta"] == {
+        "seed": 0,
+        "rate": 20.0,
+        "history": 13,
+        "machine": "",
+        "dead_zone": 0.0,
+        "logs": [str(tmp_path / "log.csv")],
+        "test": [str(tmp_path / "test.csv")],
+    }
+    assert list(written["joints"]) == ["boom", "arm"]
+    for joint in written["joints"].values():
+        assert joint["one_step_rmse"] < joint["persistence_rmse"]
+        assert set(joint["free_run"]) == {"1", "5", "10"}  # 25 s recordings hold no 30 s run
+        linear = joint["linear"]["free_run"]["5"]["velocity_rmse"]
+        assert joint["free_run"]["5"]["velocity_rmse"] < 0.9 * linear
+        assert joint["creep"] < 5e-4
+    assert not [warning for warning in written["warnings"] if "linear" in warning]
+    assert (tmp_path / "f.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_fit__has_the_papers_recipe_as_one_option(tmp_path):
+    foreign_log(tmp_path / "log.csv", 0, 2)
+    files = [tmp_path / "log.csv", "--out", tmp_path / "n.npz", "--json", tmp_path / "f.json"]
+    assert run("fit --steps 3 --paper", *files) == 0
+    settings = load_net(tmp_path / "n.npz").settings
+    assert (settings["noise"], settings["rollout"], settings["steps"]) == (0, 1, 3)
+    scores = json.loads((tmp_path / "f.json").read_text())
+    assert set(scores) == {"meta", "joints", "tool", "warnings"}
+    keys = "one_step_rmse persistence_rmse free_run linear creep response_time outside"
+    keys += " coupling delay"
+    assert all(set(joint) == set(keys.split()) for joint in scores["joints"].values())
+
+
+def test_fit__writes_nothing_for_a_bad_log(tmp_path, capsys):
+    path = tmp_path / "log.csv"
+    foreign_log(path, 0, 1)
+    lines = path.read_text().splitlines()
+    lines[16] = lines[16].replace("take 0,", "take 0,x", 1)
+    path.write_text("\n".join([*lines, ""]))
+    files = ["--out", tmp_path / "n.npz", "--json", tmp_path / "f.json"]
+    assert run("fit", path, *files) == 1
+    assert "row 17, column time: expected finite number" in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == ["log.csv"]
+
+
+@pytest.mark.parametrize(
+    ("joints", "options", "machine", "dead_zone"),
+    [
+        (BROKK_170.names, "", "brokk170", 0.07),
+        (BROKK_170.names, "--machine brokk170", "brokk170", 0.07),
+        (BROKK_170.names, "--dead-zone 0", "brokk170", 0.0),
+        (BROKK_170.names, "--paper", "brokk170", 0.0),
+        (("boom", "stick"), "", "", 0.0),
+        (("boom", "stick"), "--dead-zone 0.1", "", 0.1),
+    ],
+)
+def test_fit__uses_the_dead_zone_of_a_known_machine_or_the_one_given(
+    joints, options, machine, dead_zone, tmp_path, capsys
+):
+    write_log(tmp_path / "log.csv", steady_log(joints, 3))
+    out = tmp_path / "n.npz"
+    assert run(f"fit {options} --steps 1 --batch-size 8", tmp_path / "log.csv", "--out", out) == 0
+    net = load_net(out)
+    assert (net.machine, net.dead_zone) == (machine, dead_zone)
+    expected = f"nets of {machine or 'no known machine'}, dead zone {dead_zone} of full command\n"
+    assert capsys.readouterr().out.startswith(expected)
+
+
+def test_fit__takes_rate_and_velocity_window_of_the_machine(tmp_path):
+    write_log(tmp_path / "log.csv", steady_log(BROKK_170.names, 4))
+    (tmp_path / "slow.py").write_text(
+        "from dataclasses import replace\nfrom brokk_min.machine import BROKK_170\n"
+        "SLOW = replace(BROKK_170, name='slow', rate=10.0, velocity_samples=3)\n"
+    )
+    line = f"fit '{tmp_path}/log.csv' --steps 1 --history 5 --rollout 1 --out '{tmp_path}/n.npz'"
+    assert run(f"{line} --machine '{tmp_path}/slow.py:SLOW'") == 0
+    net = load_net(tmp_path / "n.npz")
+    assert (net.machine, net.rate, net.velocity_samples) == ("slow", 10.0, 3)
+    assert run(f"{line} --velocity-samples 5") == 0
+    assert load_net(tmp_path / "n.npz").velocity_samples == 5
+
+
+def test_fit__refuses_the_log_of_another_machine(tmp_path, capsys):
+    write_log(tmp_path / "log.csv", steady_log(("a", "b"), 2))
+    assert run(f"fit '{tmp_path}/log.csv' --machine brokk170 --out '{tmp_path}/n.npz'") == 1
+    assert (
+        "log.csv: joints: expected those of --machine brokk170, got ('a', 'b')"
+        in capsys.readouterr().err
+    )
+
+
+def test_print_scores__has_units_and_groups_warnings_by_joint(capsys):
+    free_run = {"1": {"velocity_rmse": 0.02}, "5": {"velocity_rmse": 0.03}}
+    net = {"one_step_rmse": 0.01, "persistence_rmse": 0.04, "free_run": free_run, "creep": 0.0}
+    joints = {"boom": net | {"linear": net}, "arm": net | {"linear": net}}
+    print_scores({"joints": joints, "warnings": ["arm: far", "boom: slow", "arm: late"]})
+    head, _, *rows = capsys.readouterr().out.splitlines()
+    assert head.startswith("Errors [rad/s] of one step, of the last velocity again, of free runs")
+    assert rows[0].split() == ["boom", "0.0100", "0.0400", "0.0200,", "0.0300", "0.00000"]
+    assert rows[6:] == ["warnings for boom:", "  slow", "warnings for arm:", "  far", "  late"]
+
+
+def test_fit__takes_the_history_of_the_machine(tmp_path):
+    write_log(tmp_path / "log.csv", steady_log(BROKK_170.names, 4))
+    (tmp_path / "long.py").write_text(
+        "from dataclasses import replace\nfrom brokk_min.machine import BROKK_170\n"
+        "LONG = replace(BROKK_170, name='long', history=9)\n"
+    )
+    line = f"fit '{tmp_path}/log.csv' --steps 1 --rollout 1 --machine '{tmp_path}/long.py:LONG'"
+    for more, history in (("", 9), ("--history 5", 5)):
+        assert run(f"{line} {more} --out '{tmp_path}/n.npz'") == 0
+        assert load_net(tmp_path / "n.npz").history == history

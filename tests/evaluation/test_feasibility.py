@@ -1,0 +1,105 @@
+"""Which paths ideal actuators can follow, by hand; speeds of the joints by the plant."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import machines
+
+from brokk_min.actuator import plant_reset, plant_step
+from brokk_min.evaluation import feasibility
+from brokk_min.kinematics import forward_kinematics, lowest_point, tool_position
+from brokk_min.machine import BROKK_170, valve_opening
+
+START = np.array(BROKK_170.q_start)
+STILL = np.zeros((2, 1, 3))
+
+
+def feasible(start, goals=STILL, machine=BROKK_170):
+    return bool(feasibility.feasible(machine, start[None], goals)[0])
+
+
+def test_feasible__refuses_a_path_through_a_singularity():
+    """Stretched out straight no joint can move the tool outward: it leaves its path."""
+    wide = [replace(j, cylinder_base=0.0, q_min=-3.0, q_max=4.0) for j in BROKK_170.joints]
+    machine = replace(BROKK_170, joints=tuple(wide))
+    start = np.array([0.0, 0.5, 0.1, np.pi, 3 * np.pi / 4])
+    outward = np.array([np.cos(0.6), 0.0, np.sin(0.6)]) / 5  # along the links after q2
+    assert feasible(start, np.zeros((5, 1, 3)), machine)
+    assert not feasible(start, np.tile(outward, (5, 1, 1)), machine)
+
+
+@pytest.mark.parametrize("joint", BROKK_170.driven)
+@pytest.mark.parametrize("end", ["q_min", "q_max"])
+def test_feasible__keeps_a_margin_to_joint_limits(joint, end):
+    inward = 1 if end == "q_min" else -1
+    near = np.array([0.0, *START[1:]])
+    far = near.copy()
+    near[joint] = BROKK_170.column(end)[joint] + inward * 0.049
+    far[joint] = BROKK_170.column(end)[joint] + inward * 0.051
+    high_enough = lowest_point(forward_kinematics(BROKK_170, far)) > 0.1
+    assert not feasible(near) and feasible(far) == high_enough
+
+
+def test_feasible__keeps_a_margin_to_the_ground():
+    lowest = float(lowest_point(forward_kinematics(BROKK_170, START)))
+    assert feasible(START, machine=replace(BROKK_170, ground=lowest - 0.101))
+    assert not feasible(START, machine=replace(BROKK_170, ground=lowest - 0.099))
+
+
+@pytest.mark.parametrize("direction", [-1, 1])
+def test_feasible__keeps_a_margin_to_the_speed_limits(direction):
+    start = np.array([0.0, *START[1:]])
+    limit = -0.20 if direction < 0 else 0.20  # of q1 [rad/s]
+    radius = np.hypot(*tool_position(forward_kinematics(BROKK_170, start))[:2])
+    machine = replace(BROKK_170, rate=100.0)
+    for fraction, expected in ((0.89, True), (0.91, False)):
+        slewing = np.tile([0.0, fraction * limit * radius, 0.0], (2, 1, 1))
+        assert feasible(start, slewing, machine) == expected
+
+
+@pytest.mark.parametrize("rate", [5.0, 10.0, 20.0])
+def test_feasible__compares_tool_and_path_at_the_same_tick(rate):
+    """At 10 Hz and 0.3 m/s the path of the next tick is 30 mm ahead."""
+    machine = replace(BROKK_170, rate=rate)
+    sideways = np.tile([0.0, 0.3, 0.0], (3, 1, 1))
+    assert feasible(np.array([0.0, *START[1:]]), sideways, machine)
+
+
+def test_first_failure__names_the_criterion():
+    start = np.array([[0.0, *START[1:]]])
+    lowest = float(lowest_point(forward_kinematics(BROKK_170, start))[0])
+    fast = np.tile([0.0, 2.0, 0.0], (2, 1, 1))
+    at_end = np.array([[0.0, *START[1:3], 2.88, START[4]]])
+    found = [
+        feasibility.first_failure(BROKK_170, start, STILL),
+        feasibility.first_failure(replace(BROKK_170, ground=lowest), start, STILL),
+        feasibility.first_failure(BROKK_170, at_end, STILL),
+        feasibility.first_failure(BROKK_170, start, fast),
+    ]
+    assert np.concatenate(found).tolist() == [0, 2, 3, 4]
+
+
+@given(machines(), st.data())
+def test_speed_limits__are_where_the_plant_settles(machine, data):
+    """One joint alone at the command limit, with a pump that suffices."""
+    machine = replace(machine, pump_flow=1.0)
+    low, high = machine.column("q_min"), machine.column("q_max")
+    joint = data.draw(st.sampled_from(range(machine.n)))
+    side = data.draw(st.sampled_from([0, 1]))
+    u = np.zeros(machine.n)
+    u[joint] = (2 * side - 1) * machine.pwm_limit / 127
+    opening = valve_opening(u, machine.dead_zone)
+    state = plant_reset(machine, low + (0.05 if side else 0.95) * (high - low))
+    speed = np.where(side, machine.column("speed_positive"), -machine.column("speed_negative"))
+    state = state._replace(z=np.ones(machine.n), s=opening, v=speed * np.abs(opening))
+    state = state._replace(delayed=np.repeat(u[:, None], state.delayed.shape[-1], axis=1))
+    after = plant_step(machine, state, u)
+    result = feasibility.speed_limits(machine, np.stack([state.q, after.q]))[side][:, joint]
+    q_dot = (after.q - state.q)[joint] * machine.rate
+    if low[joint] < after.q[joint] < high[joint]:
+        assert min(result) - 1e-3 * abs(q_dot) <= q_dot <= max(result) + 1e-3 * abs(q_dot)

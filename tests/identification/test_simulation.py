@@ -1,0 +1,130 @@
+"""Free runs by hand; step responses of simulators whose answer is known, and of the plant."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers_machines import constant_net, random_net
+
+from brokk_min.identification import simulation
+from brokk_min.identification.logs import Log, Recording, velocity_of
+from brokk_min.identification.simulation import (
+    creep,
+    free_run,
+    response_times,
+    step_commands,
+    step_velocity,
+    steps,
+)
+from brokk_min.machine import BROKK_170, estimate_velocity
+
+LOW, HIGH = BROKK_170.column("q_min"), BROKK_170.column("q_max")
+
+
+def constant_simulator(speed_up, speed_down, late):
+    """Joints that move at one speed `late` ticks after a command, whatever its size."""
+
+    def simulate(q, u):
+        sent = np.concatenate([np.zeros((late, *u.shape[1:])), u])[: len(u)]
+        speed = np.where(sent > 0, speed_up, np.where(sent < 0, -speed_down, 0.0))
+        return np.concatenate([q[None], q + np.cumsum(speed, axis=0) / 20])
+
+    return simulate
+
+
+def test_free_run__has_the_history_of_the_log_and_then_its_own():
+    net = replace(random_net(n=2, history=5), velocity_samples=3)
+    rng = np.random.default_rng(0)
+    u, q = rng.uniform(-0.6, 0.6, (40, 2)), np.cumsum(rng.uniform(-0.02, 0.02, (40, 2)), axis=0)
+    recording = Recording("x", u, q, velocity_of(q, 3))
+    angles, velocities = free_run(net, recording, np.array([7, 20]), 6)
+    assert angles.shape == velocities.shape == (6, 2, 2)
+    for s, start in enumerate((7, 20)):
+        past, speeds = list(q[start - 4 : start + 1]), list(recording.q_dot[start - 4 : start + 1])
+        for k in range(6):
+            window = np.stack([past[-5:], speeds[-5:], u[start + k - 4 : start + k + 1]])
+            velocity = net.predict(window.transpose(2, 0, 1).astype(np.float32))
+            past.append(past[-1] + velocity / 20)
+            speeds.append(estimate_velocity(np.array(past[-3:]).T, 3, 0.05))
+            np.testing.assert_allclose(angles[k, s], past[-1], atol=1e-4)
+            np.testing.assert_allclose(velocities[k, s], speeds[-1], atol=1e-4)
+
+
+def test_creep__is_the_largest_drift_without_a_command():
+    net = constant_net([0.003, -0.002], False, ("a", "b"))
+    one = np.ones(2)
+    net = replace(net, q_low=-one, q_high=one, dead_zone=-1.0)  # no standstill
+    np.testing.assert_allclose(creep(net), [0.003, 0.002], rtol=1e-2)
+    assert not creep(replace(net, dead_zone=0.07)).any()
+
+
+@pytest.mark.parametrize("late", [0, 3, 9])
+def test_response_times__of_a_pure_delay_by_hand(late):
+    """All speed from tick `late` on: between two ticks' middles the line passes 63 % at 0.63."""
+    level, simulate = np.full(2, 0.6), constant_simulator(0.2, 0.4, late)
+    angles = steps(simulate, -np.ones(2), np.ones(2), level, 0 * level, 30)
+    assert angles.shape == (61, 2, 2, 2, 2)
+    np.testing.assert_allclose(response_times(angles, 20.0), (late + 0.63 - 0.5) / 20, atol=1e-9)
+    speeds = step_velocity(angles, 20.0)
+    np.testing.assert_allclose(speeds[-1], [[[0.2, 0.2], [0.4, 0.4]]] * 2)  # positive up and down
+
+
+def test_response_times__of_a_joint_that_does_not_answer_are_none():
+    level, simulate = np.full(2, 0.5), constant_simulator(0.2, 0.0, 0)
+    times = response_times(steps(simulate, -np.ones(2), np.ones(2), level, level, 20), 20.0)
+    assert np.isnan(times[0, 1]).all() and np.isfinite(times[0, 0]).all()
+    assert np.isnan(times[1]).all()  # it moves before the step as after it
+    named = simulation.named_times(times, ("a", "b"))
+    none = {"up": None, "down": None}
+    assert named["b"] == {"idle": {"up": pytest.approx(0.0065), "down": None}, "moving": none}
+
+
+def test_response_times__of_the_plant_are_the_papers():
+    level, simulate = np.full(5, 80 / 127), simulation.plant_simulator(BROKK_170)
+    idle, moving = response_times(steps(simulate, LOW, HIGH, level, level / 2, 30), 20.0)
+    np.testing.assert_allclose(idle, 0.40, atol=0.01)
+    np.testing.assert_allclose(moving, 0.105, atol=0.01)
+
+
+def test_steps__move_only_the_stepping_joint_away_from_the_end_behind_it():
+    level, simulate = np.full(3, 0.5), constant_simulator(0.1, 0.1, 0)
+    low, high = np.array([0.0, -1.0, 2.0]), np.array([1.0, 1.0, 4.0])
+    angles = steps(simulate, low, high, level, level / 2, 30)
+    starts = angles[0, 0]  # (up and down, stepping, joint)
+    np.testing.assert_allclose(starts[0, 1], [0.5, -0.8, 3.0])
+    np.testing.assert_allclose(starts[1, 2], [0.5, 0.0, 3.8])
+    moved, own = np.abs(angles[-1] - angles[0]), np.eye(3, dtype=bool)
+    assert not moved[..., ~own].any()
+    np.testing.assert_allclose(moved[0][:, own], 0.1 * 1.5)  # after the step alone
+    np.testing.assert_allclose(moved[1][:, own], 0.1 * 3.0)  # before it too
+
+
+def test_step_commands__move_a_joint_beyond_its_dead_zone():
+    """Three ticks late; two dead zones, and a valve that opens with the fourth power."""
+
+    def simulate(q, u):
+        u = np.concatenate([np.zeros((3, *u.shape[1:])), u])[: len(u)]
+        beyond = np.maximum(0, np.abs(u) - np.array([0.07, 0.45, 0.0]))
+        speed = np.sign(u) * beyond ** np.array([1, 1, 4])
+        return np.concatenate([q[None], q + np.cumsum(speed, axis=0) / 20])
+
+    level = np.array([0.6, 1.0, 1.0])
+    before = step_commands(simulate, -np.ones(3), np.ones(3), level, 20)
+    # tenths of the level that move by a twentieth of the full speed: 0.12, 0.5 and 0.5
+    np.testing.assert_allclose(before, [(0.12 + 0.6) / 2, (0.5 + 1.0) / 2, (0.5 + 1.0) / 2])
+
+
+def test_log_response_times__are_at_the_largest_command_of_the_log():
+    """Nets of the plant's joints; the plant answers in 0.40 s to the largest command."""
+    u = np.zeros((40, 5))
+    u[7], u[9] = 80 / 127, -0.1
+    log = Log(BROKK_170.names, (Recording("x", u, u, u),))
+    net = replace(constant_net([0.0] * 5, False, BROKK_170.names), q_low=LOW, q_high=HIGH)
+    times = simulation.log_response_times(net, log, BROKK_170)
+    assert list(times) == ["response_time", "machine_response_time"]
+    assert times["response_time"]["q1"]["idle"] == {"up": None, "down": None}
+    machine = times["machine_response_time"]
+    assert all(machine[name]["idle"]["up"] == pytest.approx(0.4, abs=0.01) for name in machine)
+    assert list(simulation.log_response_times(net, log, None)) == ["response_time"]
