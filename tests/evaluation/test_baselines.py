@@ -128,17 +128,6 @@ def test_tune__finds_the_minimum_of_a_bowl_and_repeats_itself():
     assert len(costs) == 60 and (np.diff(costs) <= 0).all()
 
 
-def test_tune__is_never_worse_than_the_gains_it_starts_with():
-    start = controller(machine_with_one_valve(), **GAINS)
-
-    def distance(candidates):
-        return np.abs(vector(candidates) - vector(start)).sum(axis=-1)
-
-    result, costs = baselines.tune(start, distance, seed=0, generations=1, label="start")
-    assert costs == pytest.approx([0.0], abs=1e-9)
-    np.testing.assert_allclose(vector(result), vector(start), atol=1e-9)
-
-
 def test_tune_baselines__lowers_each_cost_and_records_it():
     machine = replace(BROKK_170, rate=5.0, plant_dt=0.02)  # faster to simulate
     net = obedient_net(machine)

@@ -6,13 +6,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers_machines import small_net
 
 from brokk_min.evaluation import figures
 from brokk_min.evaluation.preliminary import Motion, SimulatorTests, Sweep
 from brokk_min.evaluation.sequences import Commands, axis_sequences
-from brokk_min.identification import validation
-from brokk_min.identification.logs import Log, Recording
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
 
@@ -69,25 +66,6 @@ def test_plot_gap__has_a_row_for_the_tool_and_for_each_driven_joint():
     np.testing.assert_allclose(curves(figure.axes[1])["all runs"], [time, distance.mean(axis=1)])
     np.testing.assert_allclose(curves(figure.axes[4])["first run"], [time, gap.q_dot[:, 0, 2]])
     np.testing.assert_allclose(curves(figure.axes[9])["first run"], [time, 1000 * gap.q[:, 0, 4]])
-
-
-# --- nets and training ----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("samples", "ticks"), [(40, 26), (700, 600)])
-def test_plot_free_run__begins_after_a_history_and_lasts_30_s_or_to_the_end(samples, ticks):
-    net = small_net(BROKK_170, np.random.default_rng(1), ("q4", "q5"))
-    q = RNG.normal(size=(samples, 2))
-    recording = Recording("r", np.tile([0.0, 0.2], (samples, 1)), q, -q)
-    figure = figures.plot_free_run(net, Log(("q4", "q5"), (recording,)))
-    assert ylabels(figure) == ["q5 [rad]", "q5 [rad/s]"]  # q4 has no command
-    time = 0.05 * np.arange(1, ticks + 1)
-    angle, velocity = (curves(ax) for ax in figure.axes)
-    np.testing.assert_allclose(angle["measured"], [time, q[14 : 14 + ticks, 1]])
-    np.testing.assert_allclose(velocity["measured"], [time, -q[14 : 14 + ticks, 1]])
-    own_q, own_q_dot = validation.free_run(net, recording, np.array([13]), ticks)
-    np.testing.assert_allclose(angle["free run"][1], own_q[:, 0, 1])
-    np.testing.assert_allclose(velocity["free run"][1], own_q_dot[:, 0, 1])
 
 
 # --- task-space control ---------------------------------------------------------------------------

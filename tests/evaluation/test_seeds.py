@@ -128,12 +128,6 @@ def test_run_seeds__refuse_workers_of_several_threads():
 
 
 @pytest.mark.slow
-def test_run_seeds__name_a_scheduler_that_is_not_there():
-    with pytest.raises(OSError, match=r"127\.0\.0\.1:9"):
-        run_seeds(square, [1], "tcp://127.0.0.1:9")
-
-
-@pytest.mark.slow
 def test_run_seeds__run_a_seed_again_whose_worker_died(tmp_path):
     """In processes of this machine."""
     results, failed = run_seeds(partial(die_once, tmp_path), [0, 1])

@@ -177,6 +177,8 @@ def test_exercise__passes_with_its_solution(number: int) -> None:
 def test_exercise__as_handed_out_says_what_to_fill_in(
     number: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    if FILES[number].read_text().count("raise NotImplementedError") < len(SOLUTIONS[number]):
+        pytest.skip("somebody works on it")
     assert main([str(number)]) == 1
     name = next(iter(SOLUTIONS[number]))
     printed = capsys.readouterr().out

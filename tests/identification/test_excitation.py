@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import pairwise
-from unittest import mock
 
 import numpy as np
 import pytest
@@ -23,7 +21,6 @@ from brokk_min.identification.logs import read_log, velocity_of, write_log
 from brokk_min.machine import BROKK_170, read_encoder
 
 LIMIT = 80 / 127
-TOP = 4 / 3 * LIMIT  # largest level of rich excitation
 Q5 = 4
 LOW, HIGH = BROKK_170.column("q_min"), BROKK_170.column("q_max")
 
@@ -55,41 +52,6 @@ def test_rich_command__has_pauses_jumps_and_holds_and_the_requested_length():
     assert np.sum(np.abs(np.diff(u)) > 0.5) > 50  # jumps
     assert np.mean((np.diff(u) == 0) & (u[1:] != 0)) > 0.1  # holds
     assert sum(MIX.values()) == pytest.approx(1)
-
-
-def held_levels(u):
-    """Levels that follow one another, and the ticks for which each is held."""
-    at = np.flatnonzero(np.abs(np.diff(u, prepend=np.nan)) > 1e-9)
-    return u[at[:-1]], np.diff(at)
-
-
-@pytest.mark.parametrize(("dead_zone", "least", "most"), [(0.0, 0, 0.049), (0.2, 0.18, 0.249)])
-def test_rich_command__dithers_about_the_dead_zone_of_any_machine(dead_zone, least, most):
-    machine = replace(BROKK_170, dead_zone=dead_zone)
-    rng = np.random.default_rng(1)
-    with mock.patch.dict(excitation.MIX, dict.fromkeys(MIX, 0.0) | {"dither": 1.0}):
-        u = np.concatenate([rich_command(rng, machine, 600) for _ in range(60)])
-    level, held = held_levels(u)
-    alternating = np.isclose(level[1:], -level[:-1])
-    dither = np.abs(level[1:][alternating])
-    assert least <= dither.min() < least + 0.003 and most - 0.003 < dither.max() <= most
-    assert {1, 2, 3, 4, 6} <= set(held[1:][alternating].tolist())
-    start = np.abs(level) > most + 1e-9
-    assert start.sum() > 300 and np.abs(level).max() > LIMIT
-    assert held[start].max() <= 20 and held[start].min() >= 1  # 0.1 to 1 s
-
-
-def test_rich_command__starts_after_pauses_up_to_idle():
-    """Pauses of 0.05 to 3 s, or until the valve is idle, 2 s; then at most a second of motion."""
-    rng = np.random.default_rng(0)
-    with mock.patch.dict(excitation.MIX, dict.fromkeys(MIX, 0.0) | {"start": 1.0}):
-        u = rich_command(rng, BROKK_170, 100_000)
-    edges = np.flatnonzero(np.diff(np.r_[0, np.abs(u) > 0.07, 0]))
-    moves, pauses = edges[1::2] - edges[::2], edges[2::2] - edges[1:-1:2]
-    assert moves.max() < 20 and np.mean(pauses == 40) > 0.25 and pauses.min() == 1
-    noise = u[(np.abs(u) < 0.07) & (u != 0)]
-    assert min(noise.max(), -noise.min()) > 0.06  # of a hand at rest, within the dead zone
-    assert min(u.max(), -u.min()) > 0.99 * TOP and np.abs(u).max() <= TOP
 
 
 # --- segments and returns -------------------------------------------------------------------------

@@ -23,32 +23,6 @@ from brokk_min.identification.files import (
 from brokk_min.identification.formats import read_table
 
 
-def test_read_table__reads_numbers_and_text(tmp_path):
-    path = tmp_path / "commands.csv"
-    path.write_text("sequence,time,vx\nup,0,0.1\nup,2.5,-1e-1\n")
-    columns = read_table(path, ["sequence", "time", "vx"], text=["sequence"])
-    assert columns["sequence"].tolist() == ["up", "up"]
-    assert columns["time"].tolist() == [0, 2.5] and columns["vx"].tolist() == [0.1, -0.1]
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("sequence,time\nup,0\n", ["row 1", "a column vx", "['sequence', 'time']"]),
-        ("sequence,time,vx\nup,0,fast\n", ["row 2", "column vx", "number", "'fast'"]),
-        ("sequence,time,vx\nup,0,1\nup,nan,1\n", ["row 3", "column time", "finite", "nan"]),
-        ("sequence,time,vx\nup,0\n", ["row 2", "3 cells", "got 2"]),
-    ],
-)
-def test_read_table__names_file_row_and_column_of_an_error(tmp_path, text, words):
-    path = tmp_path / "commands.csv"
-    path.write_text(text)
-    with pytest.raises(ValueError) as caught:
-        read_table(path, ["sequence", "time", "vx"], text=["sequence"])
-    message = str(caught.value)
-    assert message.startswith(f"{path}: ") and all(word in message for word in words), message
-
-
 def test_write_csv__reads_back(tmp_path):
     rows = [["a", 0.1, 1e-17], ["b, c", -2.0, 1 / 3]]
     write_csv(tmp_path / "a.csv", ["name", "x", "y"], rows)

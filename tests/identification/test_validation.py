@@ -10,7 +10,7 @@ from helpers_machines import constant_net, line, random_net
 
 from brokk_min.identification import validation
 from brokk_min.identification.fitting import FitConfig, fit
-from brokk_min.identification.logs import Log, Recording, join_recordings, velocity_of
+from brokk_min.identification.logs import Log, Recording, velocity_of
 from brokk_min.identification.validation import (
     creep,
     fit_linear,
@@ -18,7 +18,6 @@ from brokk_min.identification.validation import (
     outside_training,
     recording_errors,
     response_times,
-    run_errors,
     score,
     step_commands,
     step_velocity,
@@ -36,22 +35,6 @@ def one_joint(u, q=None):
 
 
 # --- one step and free runs -----------------------------------------------------------------------
-
-
-def test_score__of_a_net_with_one_velocity_by_hand():
-    """The joints go at 0.1 and -0.3 rad/s, the nets at 0.2 and -0.3."""
-    q = np.array([0.1, -0.3]) * np.arange(120)[:, None] / 20
-    recording = Recording("x", np.zeros((120, 2)), q, np.full((120, 2), [0.1, -0.3]))
-    net = constant_net([0.2, -0.3], True, ("a", "b"))
-    result = score(net, Log(("a", "b"), (recording,), True))
-    assert set(result) == {"a", "b"} and set(result["a"]["free_run"]) == {"1", "5"}  # 6 s of log
-    assert result["a"]["one_step_rmse"] == pytest.approx(0.1, abs=1e-6)
-    assert result["a"]["persistence_rmse"] == pytest.approx(0.0, abs=1e-9)
-    for name, error in (("a", 0.1), ("b", 0.0)):
-        for horizon in (1, 5):
-            run = result[name]["free_run"][str(horizon)]
-            assert run["velocity_rmse"] == pytest.approx(error, abs=1e-6)
-            assert run["position_error_median"] == pytest.approx(error * horizon, abs=1e-5)
 
 
 def test_score__compares_one_step_with_the_target_of_the_fit_by_hand():
@@ -132,16 +115,6 @@ def test_free_run__has_the_history_of_the_log_and_then_its_own():
             speeds.append(estimate_velocity(np.array(past[-3:]).T, 3, 0.05))
             np.testing.assert_allclose(angles[k, s], past[-1], atol=1e-4)
             np.testing.assert_allclose(velocities[k, s], speeds[-1], atol=1e-4)
-
-
-def test_run_errors__of_many_runs_are_those_of_few():
-    q = np.cumsum(np.random.default_rng(0).uniform(-0.02, 0.02, (9000, 2)), axis=0)
-    log = Log(("a", "b"), (Recording("", 0.1 + 0 * q, q, velocity_of(q, 4)),))
-    net, samples, starts = random_net(n=2, history=5), join_recordings(log), np.arange(5, 8990)
-    many, few = (run_errors(net, samples, at, 2) for at in (starts, starts[8000:]))
-    for all_errors, errors in zip(many, few, strict=True):
-        assert all_errors.shape == (2, 8985, 2)
-        np.testing.assert_allclose(all_errors[:, 8000:], errors, atol=1e-6)
 
 
 def test_recording_errors__by_hand():

@@ -84,18 +84,13 @@ def test_export_policy__keeps_a_copy_of_the_weights(agent, policy):
     assert np.array_equal(before, after)
 
 
-@pytest.mark.parametrize("shape", [(), (170,), (171, 1), (3, 172)])
-def test_act__refuses_wrong_shapes(policy, shape):
-    with pytest.raises(ValueError, match=r"observation: expected \(\.\.\., 171\), got \("):
-        policy.act(np.zeros(shape))
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_act__refuses_what_is_not_finite(policy, bad):
-    obs = np.zeros((2, 171))
-    obs[1, 40] = bad
-    with pytest.raises(ValueError, match="observation: expected finite numbers, got"):
-        policy.act(obs)
+def test_act__refuses_wrong_shapes_and_what_is_not_finite(policy):
+    for shape in ((), (170,), (171, 1), (3, 172)):
+        with pytest.raises(ValueError, match=r"observation: expected \(\.\.\., 171\), got \("):
+            policy.act(np.zeros(shape))
+    for bad in (np.nan, np.inf, -np.inf):
+        with pytest.raises(ValueError, match="observation: expected finite numbers, got"):
+            policy.act(np.where(np.arange(171) == 40, bad, np.zeros((2, 171))))
 
 
 # --- the controller -------------------------------------------------------------------------------
@@ -180,11 +175,7 @@ def reordered():
         (replace(BROKK_170, name="brokk500"), r"machine: expected 'brokk500', got 'brokk170'"),
         (reordered(), r"joints: expected \['q2', 'q3', 'q4', 'q5', 'q1'\], got \['q1', 'q2'"),
         (change_joint(1, driven=True), r"driven: expected \['q1', 'q2'.*got \['q1', 'q3'"),
-        (replace(BROKK_170, history=12), r"history: expected 12, got 13"),
-        (replace(BROKK_170, rate=40.0), r"rate: expected 40.0, got 20.0"),
-        (replace(BROKK_170, velocity_samples=3), r"velocity_samples: expected 3, got 4"),
         (replace(BROKK_170, pwm_limit=60), r"pwm_limit: expected 60, got 80"),
-        (change_joint(2, q_max=1.5), r"geometry\[2\]\[5\]: expected 1\.5, got 1\.6"),
         (change_joint(2, a=1.5), r"geometry\[2\]\[0\]: expected 1\.5, got 1\.25"),
         (change_joint(2, q_dot_down=0.5), r"scale: expected the machine's normalisation, got"),
         (replace(BROKK_170, tool_speed=0.4), r"scale: expected the machine's normalisation, got"),
@@ -200,26 +191,16 @@ def test_load_policy__refuses_one_for_something_else(saved, machine, message):
     ("changes", "message"),
     [
         ({"mean": np.zeros(171)}, "mean: expected the machine's normalisation, got another"),
-        ({"weight_7": np.zeros(3)}, r"weight_7: expected .*\(4,\), got float64, shape \(3,\)"),
-        ({"weight_7": np.ones(4) * 1j}, "weight_7: expected finite float .*, got complex128"),
         ({"header": {"format": 99}}, r"expected \(policy, format 3\), got .*99"),
-        (
-            {"header": {"kind": "actuator net"}},
-            r"expected \(policy, format 3\), got .*actuator net",
-        ),
         ({"header": {"contract": {}}}, "machine: expected 'brokk170', got None"),
-        ({"header": {"training": None}}, "training: expected object, got none"),
         (
             {"header": {"contract": {**contract(BROKK_170), "paper": True}}},
             "mean: expected finite float in .*, got float32, shape",
         ),
-        (
-            {"header": {"contract": {**contract(BROKK_170), "paper": 1}}},
-            "contract.paper: expected truth value, got 1",
-        ),
     ],
 )
 def test_load_policy__refuses_a_changed_file(saved, changes, message):
+    """`tests/fuzz.py` makes the others, from the description of the fields."""
     rewrite(saved, **changes)
     with pytest.raises(ValueError, match=rf"policy\.npz: {message}"):
         load_policy(saved, BROKK_170)

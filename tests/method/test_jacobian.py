@@ -298,14 +298,6 @@ def test_controller__closes_its_valves_half_a_second_after_the_stop():
     np.testing.assert_allclose(grown[0], 4 * 5.0 * 0.05 * 0.05, rtol=1e-2)
 
 
-def test_controller__at_rest_without_a_goal_keeps_valves_closed():
-    c = controller(kp=2.0, ki=5.0, kd=0.1, feedback=0.5)
-    state = c.start(3)
-    for _ in range(5):
-        u, state = c(measured(np.tile(POSE, (3, 1)), np.zeros(3)), state)
-        assert not u.any()
-
-
 def test_controller__adds_the_opening_of_the_feedforward():
     """Commands of 20 counts: their opening beyond the dead zone, and the PID's on top of it."""
     calls = []
