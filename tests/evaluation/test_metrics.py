@@ -114,17 +114,6 @@ def test_metrics__time_at_limits_is_of_driven_joints():
     assert figures(still, still, q=q)["time_at_limits"] == pytest.approx(4 * 0.05)
 
 
-def test_metrics__errors_in_moves_and_in_rests():
-    goals = np.zeros((40, 3))
-    goals[10:30, 2] = 0.2
-    v = goals.copy()
-    v[[5, 35], 0] = 0.1
-    v[20, 2] = 0.0
-    row = figures(v, goals)
-    assert row["velocity_error_moves"] == pytest.approx(0.2 / 20)
-    assert row["velocity_error_rests"] == pytest.approx(0.2 / 20)
-
-
 def test_motion_at_rest__by_hand():
     """Rests of 2, 1.5 and 1 s: what moves in the first second of each does not count."""
     moving = np.repeat([0, 1, 0, 1, 0, 1, 0], [50, 10, 40, 10, 30, 10, 20])

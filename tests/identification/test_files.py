@@ -76,13 +76,6 @@ def test_whole_file__names_a_missing_folder(tmp_path):
     assert str(caught.value) == f"{path}: expected an existing directory, got {path.parent}"
 
 
-def test_write_json__keeps_all_digits_and_refuses_nan(tmp_path):
-    write_json(tmp_path / "a.json", {"b": [0.1]})
-    assert (tmp_path / "a.json").read_text() == '{\n "b": [\n  0.1\n ]\n}\n'
-    with pytest.raises(ValueError, match="not JSON compliant"):
-        write_json(tmp_path / "a.json", {"b": float("nan")})
-
-
 class Bomb:
     def __reduce__(self):
         return os.mkdir, (os.environ["BOMB"],)
