@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import re
 
 import numpy as np
 import pytest
 from helpers_cli import run
 
-from brokk_min.cli.commands import COLUMNS, print_scores, print_table
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation import baselines
 from brokk_min.evaluation.metrics import summary
@@ -155,31 +153,6 @@ def test_fit__refuses_the_log_of_another_machine(tmp_path, capsys):
         "log.csv: joints: expected those of --machine brokk170, got ('a', 'b')"
         in capsys.readouterr().err
     )
-
-
-def test_print_scores__has_units_and_groups_warnings_by_joint(capsys):
-    free_run = {"1": {"velocity_rmse": 0.02}, "5": {"velocity_rmse": 0.03}}
-    net = {"one_step_rmse": 0.01, "persistence_rmse": 0.04, "free_run": free_run, "creep": 0.0}
-    joints = {"boom": net | {"linear": net}, "arm": net | {"linear": net}}
-    print_scores({"joints": joints, "warnings": ["arm: far", "boom: slow", "arm: late"]})
-    head, _, *rows = capsys.readouterr().out.splitlines()
-    assert head.startswith("Errors [rad/s] of one step, of the last velocity again, of free runs")
-    assert rows[0].split() == ["boom", "0.0100", "0.0400", "0.0200,", "0.0300", "0.00000"]
-    assert rows[6:] == ["warnings for boom:", "  slow", "warnings for arm:", "  far", "  late"]
-
-
-def test_print_table__has_units_and_counts_workspace_starts(capsys):
-    figures = {"velocity_error_mean": 0.01234, "off_axis_drift_max": 0.05, "jerk_rms": None}
-    runs = []
-    for start, (kind, travel) in enumerate({"workspace": 20.0, "limits": 90.0}.items()):
-        row = {"controller": "rl", "sequence": "x", "start": start, "kind": kind}
-        runs.append(row | figures | {"valve_travel": travel})
-    print_table(runs, 1, COLUMNS)
-    title, heads, rl = capsys.readouterr().out.splitlines()
-    assert title == "means over 1 sequences from 1 workspace starts"
-    assert heads.endswith(" travel [1]") and len(heads) <= 80
-    assert re.findall(r"\[(.*?)\]", heads) == ["m/s", "m", "m/s^3", "1"]
-    assert rl.split() == ["rl", "0.0123", "0.0500", "none", "20"]
 
 
 # --- collect, train, starts, evaluate -------------------------------------------------------------

@@ -12,7 +12,7 @@ import pytest
 from helpers_cli import MINI, run
 
 import brokk_min
-from brokk_min.__main__ import COMMANDS, usage_error
+from brokk_min.__main__ import COMMANDS
 
 ROOT = Path(__file__).parents[2]
 OPTIONS = {
@@ -168,17 +168,6 @@ def test_outputs__that_cannot_be_written_are_refused_before_any_work(line, tmp_p
     assert run(line, path) == 2
     expected = f"brokk-min: {path}: expected a file in an existing, writable directory\n"
     assert capsys.readouterr().err == expected
-
-
-@pytest.mark.parametrize(
-    "box",
-    [
-        "╭─ Title ──╮\n│ One \x1b[1mthing\x1b[0m │\n│ ──────── │\n│ or two   │\n╰──────────╯",
-        " Title\n-----------\n One thing\n --------- \n or two\n",
-    ],
-)
-def test_usage_error__is_the_text_of_a_box_that_is_not_known(box):
-    assert usage_error(box) == "One thing; or two"
 
 
 def test_interrupt__is_one_line(monkeypatch, capsys):

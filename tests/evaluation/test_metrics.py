@@ -154,14 +154,6 @@ def test_settling_time__by_hand(goals, v, expected):
     assert figures(v, goals)["settling_time"] == pytest.approx(expected)
 
 
-def test_ticks_since_change__ignores_a_goal_that_turns_slowly():
-    angle = np.linspace(0, 2 * np.pi, 320)
-    goals = 0.15 * np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1)
-    ticks = m.ticks_since_change(BROKK_170, goals[:, None])
-    np.testing.assert_array_equal(ticks[:, 0], np.arange(320))  # the start is the only change
-    assert (m.ticks_since_change(BROKK_170, np.zeros((4, 1, 3))) == -1).all()
-
-
 # --- runs of all controllers ----------------------------------------------------------------------
 
 

@@ -11,14 +11,13 @@ from helpers_machines import small_net
 
 from brokk_min.evaluation import preliminary
 from brokk_min.evaluation.preliminary import Motion, Sweep
-from brokk_min.identification.validation import net_simulator, plant_simulator
+from brokk_min.identification.validation import plant_simulator
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
 from examples.mini_excavator import MINI_EXCAVATOR
 
 LOW, HIGH = BROKK_170.column("q_min"), BROKK_170.column("q_max")
 PLANT = plant_simulator(BROKK_170)
-DRIVEN = [0, 2, 3, 4]
 
 
 def two_speeds(up, down):
@@ -87,17 +86,6 @@ def test_preliminary_tests__of_the_plant_have_the_papers_response_times():
         assert joint["moving"]["up"] == pytest.approx(0.105, abs=0.01)
     together = preliminary.sweep_rms(*tests.coupling.values())
     assert together < 0.002  # "marginal and neglectable"
-
-
-def test_simulators__leave_locked_joints_where_they_are():
-    net = small_net(BROKK_170, np.random.default_rng(0), BROKK_170.names)
-    both = preliminary.simulators(BROKK_170, net)
-    q, u = np.tile((LOW + HIGH) / 2, (2, 1)), np.full((3, 2, 5), 0.5)
-    angles = both["nets"](q, u)
-    assert angles.shape == (4, 2, 5) and (angles[..., 1] == q[0, 1]).all()
-    driven = net_simulator(net.select(["q1", "q3", "q4", "q5"]))
-    np.testing.assert_array_equal(angles[..., DRIVEN], driven(q[:, DRIVEN], u[..., DRIVEN]))
-    np.testing.assert_array_equal(both["machine"](q, u), PLANT(q, u))
 
 
 # --- the gap --------------------------------------------------------------------------------------

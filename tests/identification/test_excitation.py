@@ -211,12 +211,3 @@ def test_collect__drives_the_joints_together_for_the_requested_time():
     for recording in log.recordings:
         assert not recording.u[: BROKK_170.history].any()
         assert (np.abs(recording.u) <= LIMIT + 1e-9).all()
-
-
-def test_collect__turns_joints_back_from_their_limits():
-    log = collect(BROKK_170, 0.1, "joint", np.random.default_rng(1))
-    near = 2 * BROKK_170.encoder_step
-    q = np.stack([recording.q for recording in log.recordings])[..., BROKK_170.driven]
-    low, high = LOW[BROKK_170.driven] + near, HIGH[BROKK_170.driven] - near
-    assert np.mean((q < low) | (q > high)) < 0.15
-    assert (np.ptp(q, axis=(0, 1)) > 0.8 * (high - low)).all()

@@ -9,12 +9,9 @@ import numpy as np
 import pytest
 
 from brokk_min.identification.files import (
-    expect_same,
     load_arrays,
-    located,
     names_in,
     parse_json,
-    reason,
     require,
     whole_file,
     write_csv,
@@ -29,20 +26,6 @@ def test_write_csv__reads_back(tmp_path):
     assert (tmp_path / "a.csv").read_text() == f'name,x,y\na,0.1,1e-17\n"b, c",-2.0,{1 / 3}\n'
     back = read_table(tmp_path / "a.csv", ["name", "x", "y"], text=["name"])
     assert [list(row) for row in zip(*back.values(), strict=True)] == rows
-
-
-@pytest.mark.parametrize(
-    ("error", "text"),
-    [
-        (PermissionError(13, "Permission denied", "a.csv"), "permission denied"),
-        (zipfile.BadZipFile("File is not a zip file"), "File is not a zip file"),
-        (KeyError("gains"), "no entry 'gains'"),
-        (OSError("gone"), "gone"),
-        (RuntimeError(), "no reason given"),
-    ],
-)
-def test_reason__has_words_and_no_names_of_python(error, text):
-    assert reason(error) == text
 
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit])
@@ -140,25 +123,6 @@ def test_names_in__tells_kinds_of_files_apart(tmp_path):
     for content, names in contents.items():
         (tmp_path / "file").write_bytes(content)
         assert names_in(tmp_path / "file") == names
-
-
-def test_located__puts_the_file_in_front_once(tmp_path):
-    for text in ("joint a: expected", "a.csv: joint a: expected"):
-        match = r"^a\.csv( and 1 more)?: joint a: expected$"
-        with pytest.raises(ValueError, match=match), located("a.csv", "b.csv"):
-            raise ValueError(text)
-
-
-def test_expect_same__names_the_first_entry_that_differs(tmp_path):
-    header = {"machine": "brokk170", "rate": 20.0, "task": {"noise": 0.1}, "table": [[1], [2]]}
-    expect_same(tmp_path, header, header)
-    for name, value, message in (
-        ("rate", 25.0, r"rate: expected 25\.0, got 20\.0"),
-        ("task", {"noise": 0.2}, r"task\.noise: expected 0\.2, got 0\.1"),
-        ("table", [[1], [3]], r"table\[1\]: expected \[3\], got \[2\]"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            expect_same(tmp_path, header, header | {name: value})
 
 
 def test_require__names_the_extra_that_brings_a_missing_package():

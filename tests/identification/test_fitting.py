@@ -211,18 +211,3 @@ def test_fit__with_latents_learns_what_joints_share():
         scores = score(net, unseen)
         error[latents] = np.mean([scores[j]["free_run"]["1"]["velocity_rmse"] for j in log.joints])
     assert error[4] < 0.6 * error[0]
-
-
-def test_predict__of_the_fit_is_that_of_the_nets_with_latents():
-    log = simple_system(0, 4)
-    config = FitConfig(steps=1, shared=3)
-    net = fit(log, config, seed=0, velocity_samples=4)
-    data, joined = training_set(log, config), join_recordings(log).joined
-    at = torch.tensor([[50, 400], [50, 400]])
-    q, q_dot, u = fitting.input_windows(data, replace(config, noise=0.0), at, 1, torch.Generator())
-    weights = [torch.tensor(weight) for weight in net.weights]
-    rows = np.array([50, 400])[:, None] + np.arange(-12, 1)
-    history = np.stack([joined.q[rows], joined.q_dot[rows], joined.u[rows]], axis=1)
-    history = history.transpose(0, 3, 1, 2).astype(np.float32)
-    expected = net.forward(history)[0].T
-    np.testing.assert_allclose(fitting.predict(data, weights, q, q_dot, u), expected, atol=1e-5)

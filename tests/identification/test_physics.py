@@ -78,14 +78,6 @@ def test_load__slows_the_lift_and_speeds_the_fall():
     assert steady_speed(heavier, 0.4, 2) < steady_speed(loaded, 0.4, 2)
 
 
-def test_tilt__loads_the_slew():
-    machine = replace(BROKK_170, plant=Physics(link_mass=100.0, pressure=2e6, tilt=0.14))
-    up, down = steady_speed(machine, 0.4, 0), steady_speed(machine, -0.4, 0)
-    assert abs(up + down) > 0.02 * up
-    level = replace(machine, plant=replace(machine.plant, tilt=0.0))
-    assert steady_speed(level, 0.4, 0) == pytest.approx(-steady_speed(level, -0.4, 0), rel=1e-6)
-
-
 def test_asymmetric_opening__has_a_dead_zone_for_each_direction():
     u = np.array([[0.15, 0.55, -0.15, -0.6], [0.15, 0.55, -0.15, -0.6]])
     opening = physics.asymmetric_opening(u, np.array([[0.1, 0.2], [0.0, 0.0]]))

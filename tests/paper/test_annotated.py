@@ -50,20 +50,6 @@ def test_code__is_lines_of_its_file() -> None:
         assert set(shown) <= set(lines[int(first) - 1 : int(last or first)]) | {""}
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("nowhere.f",), "nowhere.f: expected one module nowhere, got []"),
-        (("env.nothing",), "env.nothing: expected one nothing in env.py, got 0"),
-        (("env.reward", ["gone"]), "env.reward: expected one line with 'gone', got 0"),
-        (("env.step", ["error"]), "env.step: expected one line with 'error', got "),
-    ],
-)
-def test_code__refuses_what_is_not_there_once(arguments: tuple[Any, ...], message: str) -> None:
-    with pytest.raises(ValueError, match=re.escape(message)):
-        MAKER["code"](*arguments)
-
-
 def test_page__has_all_that_the_paper_numbers_and_each_deviation() -> None:
     rows = re.findall(r"^\| (eq\d|Table \d|Fig\. \d[a-h]?|Sec\. [\d.]+\d?) \|", PAPER, re.M)
     assert len(set(rows)) > 30
