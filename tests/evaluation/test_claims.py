@@ -117,14 +117,6 @@ def test_drift_claim__is_of_all_baselines(rl, high, low, holds):
     assert result[1].numbers[f"{HIGH} less rl"]["mean"] == pytest.approx(high - rl)
 
 
-def test_drift_claim__of_one_start_has_no_verdict():
-    runs = runs_with("off_axis_drift_max", rl=0.1, high=0.2, low=0.2)
-    one = [run for run in runs if run["start"] == 0]
-    assert verdicts(
-        [claims.still_claim(one, "rl"), claims.drift_claim(one, "rl", (HIGH, LOW))]
-    ) == [None, None]
-
-
 @pytest.mark.parametrize(
     ("x", "z", "drift", "holds"),
     [

@@ -15,7 +15,6 @@ from brokk_min.identification.validation import (
     creep,
     fit_linear,
     free_run,
-    outside_training,
     recording_errors,
     response_times,
     score,
@@ -26,11 +25,6 @@ from brokk_min.identification.validation import (
 from brokk_min.machine import BROKK_170, estimate_velocity
 
 LOW, HIGH = BROKK_170.column("q_min"), BROKK_170.column("q_max")
-
-
-def one_joint(u, q=None):
-    q = np.zeros((len(u), 1)) if q is None else q[:, None]
-    return Log(("a",), (Recording("x", u[:, None], q, velocity_of(q, 2)),))
 
 
 # --- one step and free runs -----------------------------------------------------------------------
@@ -180,28 +174,6 @@ def test_fit_linear__solves_the_normal_equations_of_ridge_regression():
     expected = np.clip(x @ w, net.output_low, net.output_high)
     np.testing.assert_allclose(predict(inputs)[:, 0], expected, atol=1e-5)
     assert predict(inputs[:1] * 1e4) in (net.output_low, net.output_high)  # the nets' range
-
-
-def test_outside_training__by_hand():
-    time = np.arange(1000) / 20
-    known = one_joint(np.sin(2 * np.pi * 0.2 * time), 0.5 * np.cos(time))
-
-    def fractions(u, q=0.0):
-        outside = outside_training(known, one_joint(u, q + 0 * u), 13)
-        return {kind: float(fraction[0]) for kind, fraction in outside.items()}
-
-    assert not any(fractions(0.9 * np.sin(2 * np.pi * 0.2 * time + 1)).values())
-    large = fractions(np.where(np.arange(1000) < 500, 0.5, 1.2))
-    assert large["command"] == pytest.approx(500 / 987)
-    fast = fractions(np.tile([0.5, 0.5, -0.5, -0.5], 250))
-    assert fast["change of command"] == pytest.approx(0.5, abs=0.01)
-    assert fast["command"] == fast["mean command"] == 0
-    assert fractions(0 * time + np.sin(time), 0.6)["angle"] == 1
-    alternating = one_joint(np.tile([0.9, -0.9], 500))
-    rest = outside_training(alternating, one_joint(0.5 + 0 * time), 13)
-    assert rest["mean command"][0] == 0  # this joint rests in the test
-    moving = outside_training(alternating, one_joint(0.5 + 0 * time, 0.1 * time), 13)
-    assert moving["mean command"][0] == 1 and moving["command"][0] == 0
 
 
 def test_validate__warns_of_nets_no_better_than_linear_and_of_tests_outside_the_training():

@@ -430,25 +430,6 @@ def test_step__writes_into_nothing_that_it_is_given(plant):
         state = after
 
 
-def test_step__of_a_batch_is_that_of_its_rows():
-    rng = np.random.default_rng(8)
-    machine = replace(BROKK_170, ground=-100.0)
-    net = small_net(machine, rng)
-    pose = rng.uniform(machine.column("q_min"), machine.column("q_max"), (3, 5))
-    goals = rng.normal(0, 0.2, (3, 3))
-    batch = initial_state(machine, pose, goals, plant=False)
-    rows = [initial_state(machine, pose[i : i + 1], goals[i], plant=False) for i in range(3)]
-    for _ in range(20):
-        action = rng.uniform(-1, 1, (3, 4)).astype(np.float32)
-        batch, r, _, _, error = step(machine, TaskConfig(), net, batch, action)
-        for i in range(3):
-            rows[i], r_row, _, _, error_row = step(
-                machine, TaskConfig(), net, rows[i], action[i : i + 1]
-            )
-            np.testing.assert_allclose(batch.q[i], rows[i].q[0], atol=1e-6)
-            np.testing.assert_allclose([r[i], error[i]], [r_row[0], error_row[0]], atol=1e-5)
-
-
 def test_step__charges_the_way_of_the_valves_from_the_command_before():
     """Idle to full on every valve costs valve_cost; full to full nothing; full to -full twice."""
     config = TaskConfig(valve_cost=0.05, integral_cost=0.0)
