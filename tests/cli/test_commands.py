@@ -24,9 +24,6 @@ SHIPPED_POLICY = SHIPPED / "brokk170" / "policy.npz"
 SHIPPED_GAINS = SHIPPED / "brokk170" / "gains.json"
 
 
-# --- fit ------------------------------------------------------------------------------------------
-
-
 def foreign_log(path, seed, runs):
     """Another machine at 100 Hz with jitter: first-order joints, a dead zone, angles only."""
     rng = np.random.default_rng(seed)
@@ -154,8 +151,6 @@ def test_fit__refuses_the_log_of_another_machine(tmp_path, capsys):
         in capsys.readouterr().err
     )
 
-
-# --- collect, train, starts, evaluate -------------------------------------------------------------
 
 SMALL = "--total-steps 512 --num-envs 16 --horizon 16 --minibatch-size 128"
 

@@ -24,9 +24,6 @@ POLICY = SHIPPED / "brokk170" / "policy.npz"
 GAINS = SHIPPED / "brokk170" / "gains.json"
 
 
-# --- logs of `drive` ------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
     """Joint q4 jogs for two seconds, on a simulated machine and an injected clock."""
@@ -73,9 +70,6 @@ def test_export__writes_an_onnx_file(tmp_path, capsys):
     assert run(f"export --policy '{POLICY}' --out", out) == 0
     assert b"observation" in out.read_bytes()
     assert capsys.readouterr().out.startswith(f"{out}: observation (batch, obs) in")
-
-
-# --- windows and films ----------------------------------------------------------------------------
 
 
 def test_play__has_policy_and_tuned_baseline(tmp_path, capsys):

@@ -58,9 +58,6 @@ def test_baselines__are_the_papers_two_and_four_with_feedforward():
     assert [table["jacobian_pid_ff"][name][0] for name in ("kp", "ki", "kd")] == [0.2, 0.5, 0.02]
 
 
-# --- gains ----------------------------------------------------------------------------------------
-
-
 def test_split_vector__orders_gains_by_name_and_joint():
     gains = baselines.split_vector(np.arange(30).reshape(2, 15))
     assert gains.kp.tolist() == [[0, 1, 2, 3], [15, 16, 17, 18]]
@@ -100,9 +97,6 @@ def test_gains_at_bound__names_gains_by_the_ends_of_their_range():
     changed[[1, 4, 7, 13]] = [3.97, 0.0011, 11.6, 1e-7]  # of 4, 12, 12 and 0.06
     result = baselines.gains_at_bound(replace(start, gains=baselines.split_vector(changed)))
     assert result == ["kp q3", "ki q1", "min_opening"]
-
-
-# --- tuning ---------------------------------------------------------------------------------------
 
 
 SMALL = dict.fromkeys(baselines.RANGES, 0.01)
@@ -163,9 +157,6 @@ def test_tuning_cost__is_that_of_the_plant_that_is_named():
         baselines.tuning_cost(batch, start, goals, 0, noiseless, plant)[0] for plant in (None, net)
     )
     assert 0.08 < of_plant <= 0.1 and of_nets != pytest.approx(of_plant, abs=0.01)
-
-
-# --- files ----------------------------------------------------------------------------------------
 
 
 def test_read_gains__reads_what_write_gains_wrote(tmp_path):

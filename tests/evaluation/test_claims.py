@@ -39,9 +39,6 @@ def trace_of(q, v, q_dot, ticks):
     return Trace(zero + q, zero + q_dot, zero, zero, zero[..., :3], v_tool, zero[..., 0])
 
 
-# --- machine, nets, training ----------------------------------------------------------------------
-
-
 def preliminary_numbers(**change):
     """Numbers of a machine that behaves as the paper's and of nets that behave as the machine."""
     times = {"q5": {"idle": {"up": 0.4, "down": 0.4}, "moving": {"up": 0.1, "down": 0.1}}}
@@ -95,9 +92,6 @@ def test_training_claim__allows_a_factor_of_two(hours, holds):
     claim = claims.training_claim(hours * 3600, 8_000_000)
     assert claim.holds is holds
     assert f"8,000,000 steps here {hours:g} [h]" in claim.to_json()["measured"]
-
-
-# --- task-space control ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -192,9 +186,6 @@ def test_task_claims__are_in_the_papers_order_and_of_a_stronger_baseline_too():
     stronger = [claim.stronger for claim in result if claim.stronger]
     assert verdicts(stronger) == [False, None, False, False, False]
     assert list(stronger[-1].numbers) == [f"error all, less {name}" for name in STRONGER]
-
-
-# --- near singularities ---------------------------------------------------------------------------
 
 
 def test_speed_fraction__is_of_goals_that_last_near_singularities():

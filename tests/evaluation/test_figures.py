@@ -24,9 +24,6 @@ def ylabels(figure):
     return [ax.get_ylabel() for ax in figure.axes]
 
 
-# --- preliminary tests ----------------------------------------------------------------------------
-
-
 def test_plot_tests__shows_machine_above_nets():
     x = np.arange(3.0)
     rows = {}
@@ -56,9 +53,6 @@ def test_plot_gap__has_a_row_for_the_tool_and_for_each_driven_joint():
     np.testing.assert_allclose(curves(figure.axes[1])["all runs"], [time, distance.mean(axis=1)])
     np.testing.assert_allclose(curves(figure.axes[4])["first run"], [time, gap.q_dot[:, 0, 2]])
     np.testing.assert_allclose(curves(figure.axes[9])["first run"], [time, 1000 * gap.q[:, 0, 4]])
-
-
-# --- task-space control ---------------------------------------------------------------------------
 
 
 def test_plot_sequence__is_relative_to_where_the_tool_began():

@@ -31,9 +31,6 @@ def figures(v, goals, **more):
     return {name: float(value[0]) for name, value in result.items()}
 
 
-# --- one run --------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("goals", "p_tool", "expected"),
     [
@@ -154,9 +151,6 @@ def test_settling_time__by_hand(goals, v, expected):
     assert figures(v, goals)["settling_time"] == pytest.approx(expected)
 
 
-# --- runs of all controllers ----------------------------------------------------------------------
-
-
 class Idle:
     """A controller that sends nothing."""
 
@@ -214,9 +208,6 @@ def test_evaluate__has_none_for_figures_without_a_value():
     rows, _ = m.evaluate(BROKK_170, {"idle": Idle()}, rest, STARTS, 0, obedient_net(BROKK_170))
     assert [row["settling_time"] for row in rows] == [None, None]
     assert [row["velocity_error_mean"] for row in rows] == [0.0, 0.0]
-
-
-# --- over many runs -------------------------------------------------------------------------------
 
 
 def run(controller, sequence, start, error):

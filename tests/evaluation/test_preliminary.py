@@ -34,9 +34,6 @@ def standing(q, u):
     return np.repeat(q[None], len(u) + 1, axis=0)
 
 
-# --- tests of one simulator -----------------------------------------------------------------------
-
-
 def test_sweeps__go_from_stop_to_stop_at_the_papers_speeds():
     u = np.zeros((2, 5))
     u[:, 4] = [80 / 127, -80 / 127]
@@ -88,9 +85,6 @@ def test_preliminary_tests__of_the_plant_have_the_papers_response_times():
     assert together < 0.002  # "marginal and neglectable"
 
 
-# --- the gap --------------------------------------------------------------------------------------
-
-
 def test_sim_to_real__of_a_machine_to_itself_is_zero():
     gap = preliminary.sim_to_real(BROKK_170, {"machine": PLANT, "nets": PLANT}, 0)
     assert not any(array.any() for array in gap)
@@ -117,9 +111,6 @@ def test_sim_to_real__is_between_tools_where_the_arms_end(machine):
     np.testing.assert_allclose(gap.q_dot, -20 * np.diff(q, axis=0), atol=1e-12)
     np.testing.assert_allclose(gap.p_tool, p[0] - p[1:], atol=1e-12)
     np.testing.assert_allclose(gap.v_tool, -20 * np.diff(p, axis=0), atol=1e-12)
-
-
-# --- numbers --------------------------------------------------------------------------------------
 
 
 def test_numbers__of_another_machine_are_json():

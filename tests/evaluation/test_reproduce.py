@@ -64,9 +64,6 @@ def test_settings__made_the_shipped_policies(name):
     assert recorded["settings"] == asdict(learner) | {"critic": name == "rl_paper"}
 
 
-# --- the chain ------------------------------------------------------------------------------------
-
-
 def test_reproduce__gives_the_same_bits_twice(folder, tmp_path, monkeypatch, capsys):
     """The second time by its command, as `--quick`."""
     monkeypatch.setattr(reproduce, "QUICK", TINY)
@@ -196,9 +193,6 @@ def test_render__escapes_names_and_shows_training_seeds(results):
     page = report.render(BROKK_170, changed, images, {"train rl_paper": 3600.0})
     assert "digger &lt;1&gt;) is an analytic plant, not a real machine" in page
     assert "0.5000 (0.2500 to 0.7500)" in page_sections(page)["Training seeds"]
-
-
-# --- stages ---------------------------------------------------------------------------------------
 
 
 def test_net_errors__of_the_papers_nets_are_in_the_results(folder, results):

@@ -50,9 +50,6 @@ def cluster():
         yield cluster.scheduler_address
 
 
-# --- one seed -------------------------------------------------------------------------------------
-
-
 def test_run_seed__trains_as_train_policy_and_writes_its_rows(tmp_path):
     rows = seed_job(tmp_path)(4)
     train_policy(BROKK_170, NET, TASK, TINY, 4, tmp_path / "alone.npz")
@@ -77,9 +74,6 @@ def test_run_seed__does_nothing_twice(tmp_path):
     assert os.stat(tmp_path / "seed_4.npz").st_mtime_ns == changed  # not trained again
 
 
-# --- many seeds -----------------------------------------------------------------------------------
-
-
 def test_run_seeds__a_failed_seed_leaves_the_others_alone(cluster):
     results, failed = run_seeds(square, range(2, 5), cluster)
     assert results == {2: [{"square": 4}], 4: [{"square": 16}]}
@@ -92,9 +86,6 @@ def test_run_seeds__refuse_workers_of_several_threads():
         message = r"tcp.*: expected workers with --nthreads 1, got \[2\]"
         with pytest.raises(ValueError, match=message):
             run_seeds(square, [1], cluster.scheduler_address)
-
-
-# --- the table and `sweep.json` -------------------------------------------------------------------
 
 
 def rows(error, controller="rl"):

@@ -22,9 +22,6 @@ ROOT = Path(exercises.__file__).parents[1]
 MODULES = {number: importlib.import_module(f"exercises.{FILES[number].stem}") for number in FILES}
 
 
-# --- the solutions, from the package -------------------------------------------------------------
-
-
 def fit_net(inputs, targets):
     """A small net of the package's shape, trained for a second."""
     torch.manual_seed(0)
@@ -127,8 +124,6 @@ SOLUTIONS = {
     13: {"drives": MODULES[13].our_drives, "limit": MODULES[13].our_limit},
 }
 
-
-# --- typical wrong answers, and a word of what the verdict says about them -----------------------
 
 WRONG = {
     1: ({"encode": lambda counts: counts % 256}, "two's complement"),

@@ -25,9 +25,6 @@ Q5 = 4
 LOW, HIGH = BROKK_170.column("q_min"), BROKK_170.column("q_max")
 
 
-# --- commands -------------------------------------------------------------------------------------
-
-
 def test_sine_command__has_amplitudes_from_dead_zone_to_limit_and_random_frequencies():
     rng = np.random.default_rng(0)
     amplitudes, frequencies = [], []
@@ -52,9 +49,6 @@ def test_rich_command__has_pauses_jumps_and_holds_and_the_requested_length():
     assert np.sum(np.abs(np.diff(u)) > 0.5) > 50  # jumps
     assert np.mean((np.diff(u) == 0) & (u[1:] != 0)) > 0.1  # holds
     assert sum(MIX.values()) == pytest.approx(1)
-
-
-# --- segments and returns -------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -154,9 +148,6 @@ def test_collect__reads_back_from_a_file_without_the_returns(collected, tmp_path
         np.testing.assert_allclose(got.q, segment.q, atol=1e-12)
 
 
-# --- recordings for validation --------------------------------------------------------------------
-
-
 def test_task_log__moves_driven_or_locked_joints_within_the_limits():
     log = task_log(BROKK_170, 5, 20.0, np.random.default_rng(0))
     for i, recording in enumerate(log.recordings):
@@ -191,9 +182,6 @@ def test_task_log__starts_at_given_angles():
 def test_collect__refuses_hours_and_excitations_that_are_none(hours, excitation, message):
     with pytest.raises(ValueError, match=message):
         collect(BROKK_170, hours, excitation, np.random.default_rng(0))
-
-
-# --- all joints at once ---------------------------------------------------------------------------
 
 
 def test_collect__drives_the_joints_together_for_the_requested_time():

@@ -38,9 +38,6 @@ def same_weights(one, two):
     return all(np.array_equal(a, b) for a, b in zip(one.weights, two.weights, strict=True))
 
 
-# --- fit ------------------------------------------------------------------------------------------
-
-
 def test_fit__learns_a_simple_system():
     log = simple_system(0, 25, logged=True)
     net = fit(log, FitConfig(steps=500, batch_size=256), seed=0, velocity_samples=4)
@@ -124,9 +121,6 @@ def test_fit__refuses_what_cannot_be_learned():
         fit(Log(("boom", "stick"), (big,)), FitConfig(steps=4, rollout=1), 0, 4)
 
 
-# --- windows and losses ---------------------------------------------------------------------------
-
-
 def test_training_set__has_windows_that_end_before_the_seams():
     """Between these recordings lies a jump of 5 rad: a window across it would have 100 rad/s."""
     log = Log(("a",), (line("x", 0, 0.1, 30), line("y", 5, 0.2, 40)))
@@ -184,9 +178,6 @@ def test_input_windows__have_noise_per_sample_and_per_window_in_units_of_the_vel
     noise = ((noisy - exact) / data.input_scale[:, None, 13:14]).numpy()
     assert noise.std() == pytest.approx(0.1 * 2**0.5, rel=0.02)
     assert noise.mean(axis=-1).std() == pytest.approx(0.1 * (1 + 1 / 13) ** 0.5, rel=0.02)
-
-
-# --- joints that are not alone --------------------------------------------------------------------
 
 
 def one_pump(seed, recordings, ticks=300):

@@ -27,9 +27,6 @@ from brokk_min.machine import BROKK_170, estimate_velocity
 LOW, HIGH = BROKK_170.column("q_min"), BROKK_170.column("q_max")
 
 
-# --- one step and free runs -----------------------------------------------------------------------
-
-
 def test_score__compares_one_step_with_the_target_of_the_fit_by_hand():
     """q = 0.1 t^2: in the tick from t it moves at 0.2 t + 0.005 rad/s."""
     time = np.arange(60)[:, None] / 20
@@ -136,9 +133,6 @@ def test_tool_errors__by_hand():
     assert errors == {"1": pytest.approx(0.0305, abs=2e-4), "5": pytest.approx(0.1525, abs=1e-3)}
 
 
-# --- the linear reference and the range of the training -------------------------------------------
-
-
 def linear_log(seed, runs=12, scale=1.0):
     """A joint whose next velocity is 0.8 times the newest difference plus 0.1 u, exactly."""
     rng, recordings = np.random.default_rng(seed), []
@@ -193,9 +187,6 @@ def test_validate__warns_of_nets_no_better_than_linear_and_of_tests_outside_the_
     jumps = tuple(r._replace(u=-np.abs(r.u) - 0.2) for r in test.recordings)
     warnings = validate(blank_net(log), log, Log(("a",), jumps))["warnings"]
     assert any(warning.startswith("a: command outside") for warning in warnings)
-
-
-# --- step responses -------------------------------------------------------------------------------
 
 
 def constant_simulator(speed_up, speed_down, late):

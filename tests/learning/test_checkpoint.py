@@ -79,9 +79,6 @@ def broken(tmp_path, monkeypatch):
     return tmp_path / "p.npz"
 
 
-# --- what a training writes -----------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("critic", [False, True])
 def test_train_policy__writes_a_policy_and_its_curve(tmp_path, critic):
     policy = run(tmp_path / "p.npz", critic=critic)
@@ -163,9 +160,6 @@ def test_train_policy__writes_for_tensorboard_or_says_what_is_missing(tmp_path, 
     monkeypatch.setitem(os.sys.modules, "torch.utils.tensorboard", None)
     with pytest.raises(ValueError, match=r"brokk_min\[tensorboard\]"):
         run(tmp_path / "p.npz", tensorboard=tmp_path / "board")
-
-
-# --- interruptions --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("tick", "critic"), [(4, False), (17, False), (30, False), (30, True)])

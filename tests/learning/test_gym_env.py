@@ -146,9 +146,6 @@ def test_step__refuses_to_begin_without_a_reset(make):
         make().render()
 
 
-# --- nets -----------------------------------------------------------------------------------------
-
-
 def test_task_vector_env__takes_a_file_and_selects_driven_joints(tmp_path):
     names = BROKK_170.names
     net = small_net(BROKK_170, np.random.default_rng(0), joints=names)
@@ -157,9 +154,6 @@ def test_task_vector_env__takes_a_file_and_selects_driven_joints(tmp_path):
     assert env.net.joints == ("q1", "q3", "q4", "q5")
     assert TaskVectorEnv(1, str(tmp_path / "net.npz")).net.joints == env.net.joints
     assert TaskVectorEnv(1).net is None
-
-
-# --- Gymnasium ------------------------------------------------------------------------------------
 
 
 def test_make__gives_an_environment_that_gymnasium_and_stable_baselines_accept():

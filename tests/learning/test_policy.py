@@ -50,9 +50,6 @@ def rewrite(path, header=None, drop=(), **arrays):
     np.savez(path, **(content | arrays | {"header": np.array(json.dumps(text))}))
 
 
-# --- the function ---------------------------------------------------------------------------------
-
-
 def test_act__by_hand():
     """Two inputs, two ELU units, one output: x = (1, -1) at the units."""
     weights = (
@@ -82,9 +79,6 @@ def test_act__refuses_wrong_shapes_and_what_is_not_finite(policy):
     for bad in (np.nan, np.inf, -np.inf):
         with pytest.raises(ValueError, match="observation: expected finite numbers, got"):
             policy.act(np.where(np.arange(171) == 40, bad, np.zeros((2, 171))))
-
-
-# --- the controller -------------------------------------------------------------------------------
 
 
 def measured(v_goal):
@@ -131,9 +125,6 @@ def test_controller__of_the_papers_agent_takes_its_observation_and_sends_plain_a
     action = paper.act(features(BROKK_170, measured(v_goal), paper=True))
     assert np.array_equal(u, action_to_pwm(BROKK_170, action, paper=True))
     assert np.abs(u[0]).max() > 0.1  # valves stay as the policy has them
-
-
-# --- the file -------------------------------------------------------------------------------------
 
 
 def test_load_policy__keeps_every_bit(policy, saved, tmp_path):
