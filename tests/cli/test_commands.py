@@ -1,7 +1,5 @@
 """The commands of the method on small files: what they write and what they print."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

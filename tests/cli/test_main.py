@@ -1,7 +1,5 @@
 """The command line as a user meets it: help, version, refusals in one line, exit statuses."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

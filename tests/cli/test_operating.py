@@ -1,7 +1,5 @@
 """The commands at a machine: logs that are compared and converted, the window, films."""
 
-from __future__ import annotations
-
 import json
 
 import can

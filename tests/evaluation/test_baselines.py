@@ -1,7 +1,5 @@
 """The classical controllers: their gains as vectors and files, and their tuning."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

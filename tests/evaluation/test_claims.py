@@ -1,7 +1,5 @@
 """Verdicts follow from the numbers: made-up runs for which they are known."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Feed-forward: the static map is what the nets say of steady motion, and its inverse undoes it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Figures of the paper show the curves that they are given, with units."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Figures of merit worked by hand; intervals against SciPy; controllers on the same starts."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers_machines import obedient_net

@@ -1,7 +1,5 @@
 """Preliminary tests and the sim-to-real gap, by hand, on the plant, and on any machine."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

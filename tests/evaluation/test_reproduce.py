@@ -1,7 +1,5 @@
 """The chain, small but whole: the same bits twice, every run with its numbers, one page."""
 
-from __future__ import annotations
-
 import collections
 import html
 import json

@@ -1,7 +1,5 @@
 """Robustness: other encoders and machines, the pump's flow, and the table over them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rollouts: what a controller gets, what moves the machine, and what is recorded when."""
 
-from __future__ import annotations
-
 import numpy as np
 from helpers_machines import closed_form, small_net
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """Many seeds: nothing is done twice, a failure costs one seed; their table."""
 
-from __future__ import annotations
-
 import json
 import os
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Sequences and starts: by hand, from files, feasible, and apart from those for tuning."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """Excitation: the commands, the segments, and the recordings for validation."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Files: errors have a place, nothing is half written, and nothing is executed."""
 
-from __future__ import annotations
-
 import os
 import zipfile
 

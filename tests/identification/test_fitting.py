@@ -1,7 +1,5 @@
 """Fitting: nets learn from logs, and from nothing that a log does not hold."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Logs: what is written reads back, any rate becomes the machine's, and errors have a place."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

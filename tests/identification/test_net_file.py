@@ -1,7 +1,5 @@
 """Files of nets: what is saved is loaded, and nothing else is."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import fields, replace
 

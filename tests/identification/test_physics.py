@@ -1,7 +1,5 @@
 """Physics beyond the paper's plant: each effect by hand, and none where it is switched off."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

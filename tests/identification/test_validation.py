@@ -1,7 +1,5 @@
 """Validation by hand: one step, free runs, the linear reference, step responses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

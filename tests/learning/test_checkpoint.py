@@ -1,7 +1,5 @@
 """Training with files: the same bits after an interruption, curves, refusals, a full disk."""
 
-from __future__ import annotations
-
 import csv
 import os
 import signal

@@ -1,7 +1,5 @@
 """The Gymnasium environments: resets in the same step, final observations, registration."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import fields, replace
 

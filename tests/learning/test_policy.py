@@ -1,7 +1,5 @@
 """The policy's file and function: by hand, against torch, bit for bit through a file, refusals."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Derivatives of the rewards by the actions: against finite differences, and by hand."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The 20 Hz loop against the plant, on a virtual bus with an injected clock."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

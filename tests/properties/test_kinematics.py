@@ -1,7 +1,5 @@
 """Kinematics of any machine: derivatives, rotations, symmetries, batches."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
