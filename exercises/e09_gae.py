@@ -15,6 +15,7 @@ learners had this error, and its reverse, the leak; skrl has had both (its issue
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -44,16 +45,9 @@ def gae(
     raise NotImplementedError
 
 
-def ours(
-    rewards: Array,
-    values: Array,
-    next_values: Array,
-    terminated: Array,
-    truncated: Array,
-    gamma: float,
-    lam: float,
-) -> Array:
-    """The package's answer."""
+def ours(*case: Any) -> Array:
+    """The package's answer to the arguments of `gae`."""
+    rewards, values, next_values, terminated, truncated, gamma, lam = case
     next_values = next_values * (1 - terminated)
     dones = np.maximum(terminated, truncated)
     arrays = (torch.tensor(x)[:, None] for x in (rewards, values, next_values, dones))

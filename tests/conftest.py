@@ -1,7 +1,5 @@
 """Hypothesis profiles: `ci` repeats itself bit for bit, `dev` explores, `deep` for long."""
 
-from __future__ import annotations
-
 import os
 
 import pytest

@@ -1,7 +1,5 @@
 """A machine, a bus and a program in one process on one injected clock: nothing waits for real."""
 
-from __future__ import annotations
-
 import ctypes
 import itertools
 import json

@@ -1,7 +1,5 @@
 """Cheap actuator nets, a recording and oracles for the tests."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

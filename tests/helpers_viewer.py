@@ -1,7 +1,5 @@
 """What several tests of the window need: keys, and the loop behind a pipe on an injected clock."""
 
-from __future__ import annotations
-
 import multiprocessing
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Bad files of every format, a sample; `python tests/fuzz.py` makes more."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -102,9 +102,10 @@ class Sweep(Training):
         from brokk_min.evaluation.seeds import show, sweep
 
         machine = self.check({self.out / "sweep.json": "sweep"})
+        net, task, config = self.prepare(machine)
         seeds = range(self.seed, self.seed + self.seeds)
         options = (self.poses, self.scheduler, self.gains, self.critic)
-        print(show(sweep(machine, *self.prepare(machine), seeds, self.out, *options)))
+        print(show(sweep(machine, net, task, config, seeds, self.out, *options)))
 
 
 def with_defaults(command: type[Training], arguments: Sequence[str]) -> Callable[..., Training]:

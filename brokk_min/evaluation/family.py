@@ -109,7 +109,7 @@ def mean_errors(
     commands = sequences.task_sequences(base)
     starts = sequences.evaluation_starts(base, budget.starts, commands, 2)
     starts = starts[np.array(sequences.start_kinds(base, starts)) == "workspace"]
-    short = reproduce.shorten(machine, commands, budget.short_s)
+    short = sequences.shorten(machine, commands, budget.short_s)
     runs, _ = metrics.evaluate(machine, controllers, short, starts, 0, net)
     rows = {c: [run for run in runs if run["controller"] == c] for c in controllers}
     return {c: float(np.mean([row["velocity_error_mean"] for row in rows[c]])) for c in rows}

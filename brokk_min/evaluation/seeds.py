@@ -121,7 +121,7 @@ def run_seeds(
             got = sorted(threads)
             raise ValueError(f"{scheduler}: expected workers with --nthreads 1, got {got}")
         futures = {client.submit(job, seed, pure=False): seed for seed in seeds}
-        done = as_completed(futures)
+        done = as_completed(futures)  # type: ignore[no-untyped-call]
         for future in tqdm(done, total=len(futures), desc="sweep", unit="seed", disable=None):
             seed = futures[future]
             if future.status == "finished":
@@ -146,7 +146,7 @@ def connect(scheduler: str | None) -> Any:
         f"{environ}.MALLOC_TRIM_THRESHOLD_": 2**30,  # with dask's 64 kB a training takes 1.4 times
     }
     with dask.config.set(settings):
-        return Client(**options)
+        return Client(**options)  # type: ignore[no-untyped-call]
 
 
 def run_scored(machine: Machine, controllers: Controllers, starts: int) -> Rows:

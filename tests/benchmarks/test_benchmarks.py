@@ -1,7 +1,5 @@
 """The benchmarks run: learners train, figures are numbers. What they measure is not tested."""
 
-from __future__ import annotations
-
 import json
 from shutil import copyfile
 

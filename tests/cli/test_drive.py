@@ -1,7 +1,5 @@
 """The command `drive`: as a process on a real bus, and where it cannot go on."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

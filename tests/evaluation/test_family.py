@@ -1,7 +1,5 @@
 """The family: the chain on a member, once; what it is judged by, by hand."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

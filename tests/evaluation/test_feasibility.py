@@ -1,7 +1,5 @@
 """Which paths ideal actuators can follow, by hand; speeds of the joints by the plant."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -43,12 +41,6 @@ def test_feasible__keeps_a_margin_to_joint_limits(joint, end):
     far[joint] = BROKK_170.column(end)[joint] + inward * 0.051
     high_enough = lowest_point(forward_kinematics(BROKK_170, far)) > 0.1
     assert not feasible(near) and feasible(far) == high_enough
-
-
-def test_feasible__keeps_a_margin_to_the_ground():
-    lowest = float(lowest_point(forward_kinematics(BROKK_170, START)))
-    assert feasible(START, machine=replace(BROKK_170, ground=lowest - 0.101))
-    assert not feasible(START, machine=replace(BROKK_170, ground=lowest - 0.099))
 
 
 @pytest.mark.parametrize("direction", [-1, 1])

@@ -1,17 +1,14 @@
 """Feed-forward: the static map is what the nets say of steady motion, and its inverse undoes it."""
 
-from __future__ import annotations
-
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers_machines import obedient_net, obedient_velocity, small_net
+from helpers_machines import obedient_net, obedient_velocity
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import machines
 
-from brokk_min.actuator import ActuatorNet
 from brokk_min.evaluation.feedforward import StaticMap, static_map
 from brokk_min.machine import BROKK_170
 
@@ -67,19 +64,3 @@ def test_static_map__is_the_fixed_point_of_steady_motion():
         rising = np.maximum.accumulate(speeds, axis=0).T
         np.testing.assert_allclose(steady.velocity[:, angle], rising, atol=1e-5)
         assert (rising[:, -1] - rising[:, 0] > 0.1).all()
-
-
-def test_static_map__is_of_motion_even_if_the_nets_know_stops():
-    """A net that was trained on joints at their stop predicts standstill for joints that stand."""
-
-    class Stalling(ActuatorNet):
-        def predict(self, history):
-            speed = 0.3 * history[..., 2, -1]
-            return np.where(np.abs(history[..., 1, -1]) < 0.01, 0.0, speed)
-
-    net = small_net(BROKK_170, np.random.default_rng(0))
-    result = static_map(BROKK_170, Stalling(**{f.name: getattr(net, f.name) for f in fields(net)}))
-    moving = np.abs(result.u) > 0.1
-    expected = np.broadcast_to(0.3 * result.u[moving], (4, 9, moving.sum()))
-    np.testing.assert_allclose(result.velocity[..., moving], expected, atol=1e-4)
-    assert (result.q[:, 0] > BROKK_170.column("q_min")[BROKK_170.driven]).all()

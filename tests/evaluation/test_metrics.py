@@ -1,7 +1,5 @@
 """Figures of merit worked by hand; intervals against SciPy; controllers on the same starts."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers_machines import obedient_net
@@ -29,9 +27,6 @@ def trace_of(v, q=None, u=None):
 def figures(v, goals, **more):
     result = m.metrics(BROKK_170, trace_of(v, **more), goals[:, None], np.zeros((1, 3)))
     return {name: float(value[0]) for name, value in result.items()}
-
-
-# --- one run --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -114,17 +109,6 @@ def test_metrics__time_at_limits_is_of_driven_joints():
     assert figures(still, still, q=q)["time_at_limits"] == pytest.approx(4 * 0.05)
 
 
-def test_metrics__errors_in_moves_and_in_rests():
-    goals = np.zeros((40, 3))
-    goals[10:30, 2] = 0.2
-    v = goals.copy()
-    v[[5, 35], 0] = 0.1
-    v[20, 2] = 0.0
-    row = figures(v, goals)
-    assert row["velocity_error_moves"] == pytest.approx(0.2 / 20)
-    assert row["velocity_error_rests"] == pytest.approx(0.2 / 20)
-
-
 def test_motion_at_rest__by_hand():
     """Rests of 2, 1.5 and 1 s: what moves in the first second of each does not count."""
     moving = np.repeat([0, 1, 0, 1, 0, 1, 0], [50, 10, 40, 10, 30, 10, 20])
@@ -163,17 +147,6 @@ def held(*parts):
 )
 def test_settling_time__by_hand(goals, v, expected):
     assert figures(v, goals)["settling_time"] == pytest.approx(expected)
-
-
-def test_ticks_since_change__ignores_a_goal_that_turns_slowly():
-    angle = np.linspace(0, 2 * np.pi, 320)
-    goals = 0.15 * np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1)
-    ticks = m.ticks_since_change(BROKK_170, goals[:, None])
-    np.testing.assert_array_equal(ticks[:, 0], np.arange(320))  # the start is the only change
-    assert (m.ticks_since_change(BROKK_170, np.zeros((4, 1, 3))) == -1).all()
-
-
-# --- runs of all controllers ----------------------------------------------------------------------
 
 
 class Idle:
@@ -233,9 +206,6 @@ def test_evaluate__has_none_for_figures_without_a_value():
     rows, _ = m.evaluate(BROKK_170, {"idle": Idle()}, rest, STARTS, 0, obedient_net(BROKK_170))
     assert [row["settling_time"] for row in rows] == [None, None]
     assert [row["velocity_error_mean"] for row in rows] == [0.0, 0.0]
-
-
-# --- over many runs -------------------------------------------------------------------------------
 
 
 def run(controller, sequence, start, error):

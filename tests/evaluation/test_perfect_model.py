@@ -1,7 +1,5 @@
 """The bound: it simulates the plant exactly, plans with it, and leaves less error than the PIDs."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Preliminary tests and the sim-to-real gap, by hand, on the plant, and on any machine."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
@@ -11,14 +9,13 @@ from helpers_machines import small_net
 
 from brokk_min.evaluation import preliminary
 from brokk_min.evaluation.preliminary import Motion, Sweep
-from brokk_min.identification.simulation import net_simulator, plant_simulator
+from brokk_min.identification.simulation import plant_simulator
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
 from examples.mini_excavator import MINI_EXCAVATOR
 
 LOW, HIGH = BROKK_170.column("q_min"), BROKK_170.column("q_max")
 PLANT = plant_simulator(BROKK_170)
-DRIVEN = [0, 2, 3, 4]
 
 
 def two_speeds(up, down):
@@ -33,9 +30,6 @@ def two_speeds(up, down):
 
 def standing(q, u):
     return np.repeat(q[None], len(u) + 1, axis=0)
-
-
-# --- tests of one simulator -----------------------------------------------------------------------
 
 
 def test_sweeps__go_from_stop_to_stop_at_the_papers_speeds():
@@ -89,20 +83,6 @@ def test_preliminary_tests__of_the_plant_have_the_papers_response_times():
     assert together < 0.002  # "marginal and neglectable"
 
 
-def test_simulators__leave_locked_joints_where_they_are():
-    net = small_net(BROKK_170, np.random.default_rng(0), BROKK_170.names)
-    both = preliminary.simulators(BROKK_170, net)
-    q, u = np.tile((LOW + HIGH) / 2, (2, 1)), np.full((3, 2, 5), 0.5)
-    angles = both["nets"](q, u)
-    assert angles.shape == (4, 2, 5) and (angles[..., 1] == q[0, 1]).all()
-    driven = net_simulator(net.select(["q1", "q3", "q4", "q5"]))
-    np.testing.assert_array_equal(angles[..., DRIVEN], driven(q[:, DRIVEN], u[..., DRIVEN]))
-    np.testing.assert_array_equal(both["machine"](q, u), PLANT(q, u))
-
-
-# --- the gap --------------------------------------------------------------------------------------
-
-
 def test_sim_to_real__of_a_machine_to_itself_is_zero():
     gap = preliminary.sim_to_real(BROKK_170, {"machine": PLANT, "nets": PLANT}, 0)
     assert not any(array.any() for array in gap)
@@ -129,9 +109,6 @@ def test_sim_to_real__is_between_tools_where_the_arms_end(machine):
     np.testing.assert_allclose(gap.q_dot, -20 * np.diff(q, axis=0), atol=1e-12)
     np.testing.assert_allclose(gap.p_tool, p[0] - p[1:], atol=1e-12)
     np.testing.assert_allclose(gap.v_tool, -20 * np.diff(p, axis=0), atol=1e-12)
-
-
-# --- numbers --------------------------------------------------------------------------------------
 
 
 def test_numbers__of_another_machine_are_json():

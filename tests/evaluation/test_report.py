@@ -1,7 +1,5 @@
 """Texts and tables of the report; the page itself is drawn in test_reproduce.py."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

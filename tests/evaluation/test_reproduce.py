@@ -1,7 +1,5 @@
 """The chain, small but whole: the same bits twice, every run with its numbers, one page."""
 
-from __future__ import annotations
-
 import collections
 import html
 import json
@@ -16,7 +14,7 @@ from brokk_min.evaluation import baselines, report, reproduce
 from brokk_min.evaluation.claims import VERDICTS
 from brokk_min.evaluation.reproduce import Budget
 from brokk_min.evaluation.robustness import variations
-from brokk_min.evaluation.sequences import task_sequences, tuning_set
+from brokk_min.evaluation.sequences import task_sequences
 from brokk_min.identification.files import SHIPPED
 from brokk_min.identification.logs import read_log
 from brokk_min.identification.net_file import load_net
@@ -50,9 +48,6 @@ def test_settings__made_the_shipped_policies(name):
     task, learner = reproduce.settings(name, Budget())
     assert recorded["task"] == asdict(task)
     assert recorded["settings"] == asdict(learner) | {"critic": name == "rl_paper"}
-
-
-# --- the chain ------------------------------------------------------------------------------------
 
 
 def test_reproduce__gives_the_same_bits_twice(folder, tmp_path, monkeypatch, capsys):
@@ -130,16 +125,6 @@ def test_reproduce__results_compare_with_the_bound_and_on_other_machines(results
     assert set(results["robustness"]["nominal"]) == set(CONTROLLERS)
 
 
-def test_reproduce__results_record_the_tuning(results):
-    assert set(results["tuning"]) == set(results["gains"]) == set(PIDS)
-    starts, goals = tuning_set(BROKK_170, TINY.tuning_runs, 3)
-    np.testing.assert_allclose([run["start"] for run in results["tuning_runs"]], starts)
-    for i, tuning_run in enumerate(results["tuning_runs"]):
-        table = np.array(tuning_run["goals"])
-        ticks = np.rint(table[:, 0] * 20).astype(int)
-        np.testing.assert_allclose(np.repeat(table[:, 1:], ticks, axis=0), goals[:, i])
-
-
 def test_reproduce__report_is_one_file_with_its_figures(folder, results):
     page = (folder / "report.html").read_text()
     assert len(re.findall(r'src="data:image/png;base64,iVBOR', page)) == 18
@@ -196,31 +181,9 @@ def test_render__escapes_names_and_shows_training_seeds(results):
     assert "0.5000 (0.2500 to 0.7500)" in page_sections(page)["Training seeds"]
 
 
-# --- stages ---------------------------------------------------------------------------------------
-
-
 def test_net_errors__of_the_papers_nets_are_in_the_results(folder, results):
     """They were fitted to the paper's sines, plain commands and errors of one step."""
     net = load_net(folder / "net_paper.npz")
     assert (net.dead_zone, net.settings["rollout"], net.settings["noise"]) == (0.0, 1, 0.0)
     test = read_log([folder / "log_test.npz"], BROKK_170.velocity_samples, rate=20.0)
     assert reproduce.net_errors(BROKK_170, net, test, 3) == results["paper_recipe"]
-
-
-def test_tables__keep_kinds_of_starts_apart():
-    rows = []
-    for controller, base in (("rl", 1.0), ("pid", 4.0)):
-        for sequence in "xy":
-            for i, kind in enumerate(("workspace", "limits", "workspace")):
-                row = {"controller": controller, "sequence": sequence, "start": i, "kind": kind}
-                rows.append(row | {"error": base + i + (kind == "limits") / 2})
-    result = reproduce.tables(rows, [row for row in rows if row["kind"] == "workspace"])
-    assert result["runs"] is rows
-    assert result["summary"]["pid"] == {s: {"error": 5.0} for s in ("x", "y", "all")}
-    limits = {"rl": {"error": 2.5}, "pid": {"error": 5.5}}
-    workspace = {"rl": {"error": 2.0}, "pid": {"error": 5.0}}
-    assert result["by_kind"] == {"workspace": workspace, "limits": limits}
-    less = result["rl_less"]["error"]["pid"]["all"]
-    assert less == {"mean": -3.0, "low": -3.0, "high": -3.0}
-    low, high = result["intervals"]["rl"]["x"]["error"]
-    assert (low, high) == pytest.approx((2 - 12.7062, 2 + 12.7062), abs=1e-3)

@@ -1,7 +1,5 @@
 """Robustness: other encoders and machines, the pump's flow, and the table over them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -14,13 +12,12 @@ from brokk_min.evaluation import robustness as module
 from brokk_min.evaluation.baselines import PAPER_BASELINES, baselines
 from brokk_min.evaluation.metrics import by_start, evaluate, mean_interval
 from brokk_min.evaluation.robustness import (
-    by_length_of_rest,
     near_singularities,
     pump_flow_ratio,
     robustness,
     variations,
 )
-from brokk_min.evaluation.sequences import rest_sequences, task_sequences
+from brokk_min.evaluation.sequences import task_sequences
 from brokk_min.machine import BROKK_170, read_encoder
 
 Q = np.cumsum(np.full((4000, 2, 5), 0.01), axis=0)  # ticks of two machines
@@ -111,23 +108,6 @@ def test_robustness__has_a_row_for_each_variation_and_controller():
     assert error["supply flow -20 %"] == error["nominal"]  # the pump has more than they need
     demand = {name: row["pid"]["supply_demand"] for name, row in table.items()}
     assert demand["supply flow -20 %"] == pytest.approx(demand["nominal"] / 0.8)
-
-
-def test_robustness__shows_how_often_the_pump_is_the_limit():
-    weak = replace(BROKK_170, pump_flow=0.1 * BROKK_170.pump_flow)
-    short = [ALONG_Z._replace(goals=ALONG_Z.goals[MOVES - 5 : MOVES + 25])]
-    row = robustness(weak, {"pid": PIDS["jacobian_pid_ff"]}, short, STARTS[:1], 0)["nominal"]["pid"]
-    assert row["supply_demand"] > 1 and 0 < row["supply_limits"] < 1
-    assert "rl_less" not in row
-
-
-def test_by_length_of_rest__is_of_the_axes_with_equal_rests(monkeypatch):
-    monkeypatch.setattr(module, "RESTS", (0.5,))
-    row = by_length_of_rest(BROKK_170, {"pid": PIDS["jacobian_pid_ff"]}, STARTS[:1], 0)["0.5"]
-    commands = rest_sequences(BROKK_170, 0.5)
-    runs, _ = evaluate(BROKK_170, {"pid": PIDS["jacobian_pid_ff"]}, commands, STARTS[:1], 0)
-    for key in ("velocity_error_moves", "velocity_error_rests"):
-        assert row["pid"][key] == pytest.approx(np.mean([run[key] for run in runs]))
 
 
 class Idle:

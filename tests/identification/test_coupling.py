@@ -1,7 +1,5 @@
 """Joints that are not alone, by hand: who explains whose error; how late a joint answers."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,10 +1,6 @@
 """Excitation: the commands, the segments, and the recordings for validation."""
 
-from __future__ import annotations
-
-from dataclasses import replace
 from itertools import pairwise
-from unittest import mock
 
 import numpy as np
 import pytest
@@ -23,12 +19,8 @@ from brokk_min.identification.logs import read_log, velocity_of, write_log
 from brokk_min.machine import BROKK_170, read_encoder
 
 LIMIT = 80 / 127
-TOP = 4 / 3 * LIMIT  # largest level of rich excitation
 Q5 = 4
 LOW, HIGH = BROKK_170.column("q_min"), BROKK_170.column("q_max")
-
-
-# --- commands -------------------------------------------------------------------------------------
 
 
 def test_sine_command__has_amplitudes_from_dead_zone_to_limit_and_random_frequencies():
@@ -55,44 +47,6 @@ def test_rich_command__has_pauses_jumps_and_holds_and_the_requested_length():
     assert np.sum(np.abs(np.diff(u)) > 0.5) > 50  # jumps
     assert np.mean((np.diff(u) == 0) & (u[1:] != 0)) > 0.1  # holds
     assert sum(MIX.values()) == pytest.approx(1)
-
-
-def held_levels(u):
-    """Levels that follow one another, and the ticks for which each is held."""
-    at = np.flatnonzero(np.abs(np.diff(u, prepend=np.nan)) > 1e-9)
-    return u[at[:-1]], np.diff(at)
-
-
-@pytest.mark.parametrize(("dead_zone", "least", "most"), [(0.0, 0, 0.049), (0.2, 0.18, 0.249)])
-def test_rich_command__dithers_about_the_dead_zone_of_any_machine(dead_zone, least, most):
-    machine = replace(BROKK_170, dead_zone=dead_zone)
-    rng = np.random.default_rng(1)
-    with mock.patch.dict(excitation.MIX, dict.fromkeys(MIX, 0.0) | {"dither": 1.0}):
-        u = np.concatenate([rich_command(rng, machine, 600) for _ in range(60)])
-    level, held = held_levels(u)
-    alternating = np.isclose(level[1:], -level[:-1])
-    dither = np.abs(level[1:][alternating])
-    assert least <= dither.min() < least + 0.003 and most - 0.003 < dither.max() <= most
-    assert {1, 2, 3, 4, 6} <= set(held[1:][alternating].tolist())
-    start = np.abs(level) > most + 1e-9
-    assert start.sum() > 300 and np.abs(level).max() > LIMIT
-    assert held[start].max() <= 20 and held[start].min() >= 1  # 0.1 to 1 s
-
-
-def test_rich_command__starts_after_pauses_up_to_idle():
-    """Pauses of 0.05 to 3 s, or until the valve is idle, 2 s; then at most a second of motion."""
-    rng = np.random.default_rng(0)
-    with mock.patch.dict(excitation.MIX, dict.fromkeys(MIX, 0.0) | {"start": 1.0}):
-        u = rich_command(rng, BROKK_170, 100_000)
-    edges = np.flatnonzero(np.diff(np.r_[0, np.abs(u) > 0.07, 0]))
-    moves, pauses = edges[1::2] - edges[::2], edges[2::2] - edges[1:-1:2]
-    assert moves.max() < 20 and np.mean(pauses == 40) > 0.25 and pauses.min() == 1
-    noise = u[(np.abs(u) < 0.07) & (u != 0)]
-    assert min(noise.max(), -noise.min()) > 0.06  # of a hand at rest, within the dead zone
-    assert min(u.max(), -u.min()) > 0.99 * TOP and np.abs(u).max() <= TOP
-
-
-# --- segments and returns -------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -192,9 +146,6 @@ def test_collect__reads_back_from_a_file_without_the_returns(collected, tmp_path
         np.testing.assert_allclose(got.q, segment.q, atol=1e-12)
 
 
-# --- recordings for validation --------------------------------------------------------------------
-
-
 def test_task_log__moves_driven_or_locked_joints_within_the_limits():
     log = task_log(BROKK_170, 5, 20.0, np.random.default_rng(0))
     for i, recording in enumerate(log.recordings):
@@ -231,9 +182,6 @@ def test_collect__refuses_hours_and_excitations_that_are_none(hours, excitation,
         collect(BROKK_170, hours, excitation, np.random.default_rng(0))
 
 
-# --- all joints at once ---------------------------------------------------------------------------
-
-
 def test_collect__drives_the_joints_together_for_the_requested_time():
     log = collect(BROKK_170, 0.05, "joint", np.random.default_rng(0))
     assert [recording.name for recording in log.recordings] == [f"joint_{i:03d}" for i in range(6)]
@@ -249,12 +197,3 @@ def test_collect__drives_the_joints_together_for_the_requested_time():
     for recording in log.recordings:
         assert not recording.u[: BROKK_170.history].any()
         assert (np.abs(recording.u) <= LIMIT + 1e-9).all()
-
-
-def test_collect__turns_joints_back_from_their_limits():
-    log = collect(BROKK_170, 0.1, "joint", np.random.default_rng(1))
-    near = 2 * BROKK_170.encoder_step
-    q = np.stack([recording.q for recording in log.recordings])[..., BROKK_170.driven]
-    low, high = LOW[BROKK_170.driven] + near, HIGH[BROKK_170.driven] - near
-    assert np.mean((q < low) | (q > high)) < 0.15
-    assert (np.ptp(q, axis=(0, 1)) > 0.8 * (high - low)).all()

@@ -1,7 +1,5 @@
 """Files: errors have a place, nothing is half written, and nothing is executed."""
 
-from __future__ import annotations
-
 import os
 import zipfile
 
@@ -9,12 +7,9 @@ import numpy as np
 import pytest
 
 from brokk_min.identification.files import (
-    expect_same,
     load_arrays,
-    located,
     names_in,
     parse_json,
-    reason,
     require,
     whole_file,
     write_csv,
@@ -23,52 +18,12 @@ from brokk_min.identification.files import (
 from brokk_min.identification.formats import read_table
 
 
-def test_read_table__reads_numbers_and_text(tmp_path):
-    path = tmp_path / "commands.csv"
-    path.write_text("sequence,time,vx\nup,0,0.1\nup,2.5,-1e-1\n")
-    columns = read_table(path, ["sequence", "time", "vx"], text=["sequence"])
-    assert columns["sequence"].tolist() == ["up", "up"]
-    assert columns["time"].tolist() == [0, 2.5] and columns["vx"].tolist() == [0.1, -0.1]
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("sequence,time\nup,0\n", ["row 1", "a column vx", "['sequence', 'time']"]),
-        ("sequence,time,vx\nup,0,fast\n", ["row 2", "column vx", "number", "'fast'"]),
-        ("sequence,time,vx\nup,0,1\nup,nan,1\n", ["row 3", "column time", "finite", "nan"]),
-        ("sequence,time,vx\nup,0\n", ["row 2", "3 cells", "got 2"]),
-    ],
-)
-def test_read_table__names_file_row_and_column_of_an_error(tmp_path, text, words):
-    path = tmp_path / "commands.csv"
-    path.write_text(text)
-    with pytest.raises(ValueError) as caught:
-        read_table(path, ["sequence", "time", "vx"], text=["sequence"])
-    message = str(caught.value)
-    assert message.startswith(f"{path}: ") and all(word in message for word in words), message
-
-
 def test_write_csv__reads_back(tmp_path):
     rows = [["a", 0.1, 1e-17], ["b, c", -2.0, 1 / 3]]
     write_csv(tmp_path / "a.csv", ["name", "x", "y"], rows)
     assert (tmp_path / "a.csv").read_text() == f'name,x,y\na,0.1,1e-17\n"b, c",-2.0,{1 / 3}\n'
     back = read_table(tmp_path / "a.csv", ["name", "x", "y"], text=["name"])
     assert [list(row) for row in zip(*back.values(), strict=True)] == rows
-
-
-@pytest.mark.parametrize(
-    ("error", "text"),
-    [
-        (PermissionError(13, "Permission denied", "a.csv"), "permission denied"),
-        (zipfile.BadZipFile("File is not a zip file"), "File is not a zip file"),
-        (KeyError("gains"), "no entry 'gains'"),
-        (OSError("gone"), "gone"),
-        (RuntimeError(), "no reason given"),
-    ],
-)
-def test_reason__has_words_and_no_names_of_python(error, text):
-    assert reason(error) == text
 
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit])
@@ -100,13 +55,6 @@ def test_whole_file__names_a_missing_folder(tmp_path):
     with pytest.raises(ValueError) as caught, whole_file(path):
         pass
     assert str(caught.value) == f"{path}: expected an existing directory, got {path.parent}"
-
-
-def test_write_json__keeps_all_digits_and_refuses_nan(tmp_path):
-    write_json(tmp_path / "a.json", {"b": [0.1]})
-    assert (tmp_path / "a.json").read_text() == '{\n "b": [\n  0.1\n ]\n}\n'
-    with pytest.raises(ValueError, match="not JSON compliant"):
-        write_json(tmp_path / "a.json", {"b": float("nan")})
 
 
 class Bomb:
@@ -173,25 +121,6 @@ def test_names_in__tells_kinds_of_files_apart(tmp_path):
     for content, names in contents.items():
         (tmp_path / "file").write_bytes(content)
         assert names_in(tmp_path / "file") == names
-
-
-def test_located__puts_the_file_in_front_once(tmp_path):
-    for text in ("joint a: expected", "a.csv: joint a: expected"):
-        match = r"^a\.csv( and 1 more)?: joint a: expected$"
-        with pytest.raises(ValueError, match=match), located("a.csv", "b.csv"):
-            raise ValueError(text)
-
-
-def test_expect_same__names_the_first_entry_that_differs(tmp_path):
-    header = {"machine": "brokk170", "rate": 20.0, "task": {"noise": 0.1}, "table": [[1], [2]]}
-    expect_same(tmp_path, header, header)
-    for name, value, message in (
-        ("rate", 25.0, r"rate: expected 25\.0, got 20\.0"),
-        ("task", {"noise": 0.2}, r"task\.noise: expected 0\.2, got 0\.1"),
-        ("table", [[1], [3]], r"table\[1\]: expected \[3\], got \[2\]"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            expect_same(tmp_path, header, header | {name: value})
 
 
 def test_require__names_the_extra_that_brings_a_missing_package():

@@ -1,7 +1,5 @@
 """Fitting: nets learn from logs, and from nothing that a log does not hold."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -39,14 +37,10 @@ def same_weights(one, two):
     return all(np.array_equal(a, b) for a, b in zip(one.weights, two.weights, strict=True))
 
 
-# --- fit ------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("logged", [False, True])
-def test_fit__learns_a_simple_system(logged):
-    log = simple_system(0, 25, logged=logged)
+def test_fit__learns_a_simple_system():
+    log = simple_system(0, 25, logged=True)
     net = fit(log, FitConfig(steps=500, batch_size=256), seed=0, velocity_samples=4)
-    unseen = simple_system(1, 6, logged=logged)
+    unseen = simple_system(1, 6, logged=True)
     result = score(net, unseen)
     for j, name in enumerate(net.joints):
         assert result[name]["one_step_rmse"] < 0.5 * result[name]["persistence_rmse"], result
@@ -84,8 +78,7 @@ def test_fit__states_how_the_nets_were_fitted():
     assert fit(log._replace(rate=50.0), FitConfig(steps=0), 7, 3).rate == 50.0
 
 
-@pytest.mark.parametrize("logged", [False, True])
-def test_fit__does_not_learn_to_brake_before_a_stop(logged):
+def test_fit__does_not_learn_to_brake_before_a_stop():
     """A joint that goes at 0.3 u until it hits a hard stop: the nets keep its speed up to there."""
     rng, recordings = np.random.default_rng(0), []
     for run in range(60):
@@ -93,9 +86,8 @@ def test_fit__does_not_learn_to_brake_before_a_stop(logged):
         q = np.zeros((161, 1))
         for k in range(160):
             q[k + 1] = np.clip(q[k] + 0.3 * u[k] / 20, -0.2, 0.2)
-        q_dot = np.diff(q, axis=0, prepend=0) * 20 if logged else velocity_of(q, 4)
-        recordings.append(Recording(f"r{run}", u, q[:160], q_dot[:160]))
-    log = Log(("a",), tuple(recordings), logged)
+        recordings.append(Recording(f"r{run}", u, q[:160], velocity_of(q, 4)[:160]))
+    log = Log(("a",), tuple(recordings))
     net = fit(log, FitConfig(steps=800, batch_size=256), seed=0, velocity_samples=4)
     history, q, angles = initial_history(np.float32([-0.2]), 13), np.array([-0.2]), []
     for _ in range(60):
@@ -126,9 +118,6 @@ def test_fit__refuses_what_cannot_be_learned():
     with pytest.raises(ValueError, match="weights: expected finite numbers"):
         big = still._replace(q=1e39 * moving.q, u=moving.u)  # infinite as float32
         fit(Log(("boom", "stick"), (big,)), FitConfig(steps=4, rollout=1), 0, 4)
-
-
-# --- windows and losses ---------------------------------------------------------------------------
 
 
 def test_training_set__has_windows_that_end_before_the_seams():
@@ -190,9 +179,6 @@ def test_input_windows__have_noise_per_sample_and_per_window_in_units_of_the_vel
     assert noise.mean(axis=-1).std() == pytest.approx(0.1 * (1 + 1 / 13) ** 0.5, rel=0.02)
 
 
-# --- joints that are not alone --------------------------------------------------------------------
-
-
 def one_pump(seed, recordings, ticks=300):
     """Two joints; each is slowed by the command of the other."""
     rng = np.random.default_rng(seed)
@@ -215,18 +201,3 @@ def test_fit__with_latents_learns_what_joints_share():
         scores = score(net, unseen)
         error[latents] = np.mean([scores[j]["free_run"]["1"]["velocity_rmse"] for j in log.joints])
     assert error[4] < 0.6 * error[0]
-
-
-def test_predict__of_the_fit_is_that_of_the_nets_with_latents():
-    log = simple_system(0, 4)
-    config = FitConfig(steps=1, shared=3)
-    net = fit(log, config, seed=0, velocity_samples=4)
-    data, joined = training_set(log, config), join_recordings(log).joined
-    at = torch.tensor([[50, 400], [50, 400]])
-    q, q_dot, u = fitting.input_windows(data, replace(config, noise=0.0), at, 1, torch.Generator())
-    weights = [torch.tensor(weight) for weight in net.weights]
-    rows = np.array([50, 400])[:, None] + np.arange(-12, 1)
-    history = np.stack([joined.q[rows], joined.q_dot[rows], joined.u[rows]], axis=1)
-    history = history.transpose(0, 3, 1, 2).astype(np.float32)
-    expected = net.forward(history)[0].T
-    np.testing.assert_allclose(fitting.predict(data, weights, q, q_dot, u), expected, atol=1e-5)

@@ -1,7 +1,5 @@
 """What a log tells: known joints are found again, and an operator's work is no excitation."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from itertools import count

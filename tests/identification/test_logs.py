@@ -1,9 +1,5 @@
 """Logs: what is written reads back, any rate becomes the machine's, and errors have a place."""
 
-from __future__ import annotations
-
-import gzip
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -66,7 +62,7 @@ def some_log(velocity_logged, lengths=(30, 1, 7)):
     recordings = []
     for i, length in enumerate(lengths):
         u, q, q_dot = rng.integers(-80, 81, (length, 3)) / 127, *rng.uniform(-2, 2, (2, length, 3))
-        recordings.append(Recording(f"run {i}", u, q, q_dot))
+        recordings.append(Recording(f'run {i}, "wet"', u, q, q_dot))
     return Log(("boom", "stick", "q_dot_like"), tuple(recordings), velocity_logged)
 
 
@@ -78,23 +74,13 @@ def test_write_log__reads_back(tmp_path, suffix, velocity_logged):
     again = read_log([tmp_path / f"log{suffix}"], velocity_samples=4)
     assert again.joints == log.joints and again.velocity_logged == velocity_logged
     assert [r.name for r in again.recordings] == [r.name for r in log.recordings]
+    assert suffix == ".npz" or b"\r" not in (tmp_path / "log.csv").read_bytes()  # on all systems
     tolerance = 1e-12 if suffix == ".npz" else 2e-6
     for got, written in zip(again.recordings, log.recordings, strict=True):
         np.testing.assert_allclose(got.u, written.u, atol=tolerance)
         np.testing.assert_allclose(got.q, written.q, atol=tolerance)
         q_dot = written.q_dot if velocity_logged else velocity_of(written.q, 4)
         np.testing.assert_allclose(got.q_dot, q_dot, atol=max(tolerance, 1e-12) * 30)
-
-
-def test_write_log__keeps_the_time_stamps_of_an_hour_and_any_name(tmp_path):
-    rng = np.random.default_rng(0)
-    u, q = rng.uniform(-0.6, 0.6, (72_000, 1)), rng.uniform(-1, 1, (72_000, 1))
-    write_log(tmp_path / "hour.csv", Log(("a",), (Recording('Tuesday, "wet"', u, q, q),)))
-    (again,) = read_log([tmp_path / "hour.csv"], 4).recordings
-    assert again.name == 'Tuesday, "wet"'
-    np.testing.assert_allclose(again.u, u, atol=2e-6)
-    np.testing.assert_allclose(again.q, q, atol=2e-6)
-    assert b"\r" not in (tmp_path / "hour.csv").read_bytes()  # one line end on all systems
 
 
 @pytest.mark.parametrize("name", ["log.txt", "log", "log.npz.gz"])
@@ -110,30 +96,23 @@ def test_write_log__refuses_another_suffix_and_an_empty_log(tmp_path, name):
 # --- resampling -----------------------------------------------------------------------------------
 
 
-def test_read_log__resamples_a_jittering_log_by_hand(tmp_path):
-    path = tmp_path / "log.csv"
-    path.write_text(
-        "run,time,u_arm,q_arm\nx,10.00,0.1,1.0\nx,10.03,0.2,1.3\nx,10.06,0.3,1.6\nx,10.11,0.4,2.6\n"
-    )
-    (recording,) = read_log([path], velocity_samples=2).recordings
-    # at 10.00, 10.05 and 10.10 s; the next tick would be after the last sample
-    np.testing.assert_allclose(recording.u[:, 0], [0.1, 0.2, 0.3])
-    np.testing.assert_allclose(recording.q[:, 0], [1.0, 1.5, 2.4])
-    np.testing.assert_allclose(recording.q_dot[:, 0], [0.0, 10.0, 18.0])
-
-
-@given(st.lists(st.floats(0.004, 0.05), min_size=2, max_size=60), st.integers(0, 2**16))
-def test_read_log__resamples_as_a_loop_does(tmp_path_factory, steps, seed):
-    time = np.concatenate([[7.0], 7.0 + np.cumsum(steps)])
-    ticks = (time - 7.0) * 20  # stamps within a microsecond of a tick may go either way: shift them
+@given(
+    st.lists(st.floats(0.004, 0.05), min_size=2, max_size=60),
+    st.integers(0, 2**16),
+    st.sampled_from([0.0, 7.0, 1.7e9]),
+)
+def test_read_log__resamples_as_a_loop_does(tmp_path_factory, steps, seed, start):
+    """From any start of the clock. Stamps close to a tick may go either way: they are moved."""
+    time = np.concatenate([[start], start + np.cumsum(steps)])
+    ticks = (time - start) * 20
     time = np.where(np.abs(ticks - np.rint(ticks)) < 1e-3, time + 1e-3, time)
-    time[0] = 7.0
+    time[0] = start
     columns = table("x", time, seed, ("a",))
     path = write(tmp_path_factory.getbasetemp() / "looped.npz", columns)
     (recording,) = read_log([path], 4).recordings
     u, q = resampled(columns, "a")
     np.testing.assert_array_equal(recording.u[:, 0], u)
-    np.testing.assert_allclose(recording.q[:, 0], q, atol=1e-9)
+    np.testing.assert_allclose(recording.q[:, 0], q, atol=1e-5 if start > 1e9 else 1e-9)
 
 
 @pytest.mark.parametrize("rate", [10.0, 25.0, 50.0])
@@ -152,14 +131,6 @@ def test_read_log__has_the_requested_rate_and_refuses_slower_logs(tmp_path, rate
     np.testing.assert_allclose(again.recordings[0].q, log.recordings[0].q, atol=1e-6)
     with pytest.raises(ValueError, match=r"expected 200 Hz, .*--machine.*more in 'a', got 100 Hz"):
         read_log([tmp_path / "log.csv"], 4, rate=200.0)
-
-
-@pytest.mark.parametrize("start", [0.0, 1e5, 1.7e9])
-def test_read_log__takes_clock_time_as_well_as_time_from_zero(tmp_path, start):
-    columns = table("x", start + np.arange(101) / 20)
-    (recording,) = read_log([write(tmp_path / "log.npz", columns)], 4).recordings
-    np.testing.assert_allclose(recording.u[:, 0], columns["u_a"])
-    np.testing.assert_allclose(recording.q[:, 0], columns["q_a"], atol=1e-5)
 
 
 def test_read_log__interpolates_logged_velocities(tmp_path):
@@ -320,18 +291,11 @@ x,0.15,0.4,1.3
 """
 BAD_CSV = {
     "empty file": ("", "header and at least one row, got 0 rows"),
-    "no run": (GOOD.replace("run", "r"), "row 1: expected a column run, got ['r', 'time'"),
-    "no angle": (GOOD.replace("q_a", "angle"), "row 1: expected a column q_a, got"),
-    "text in a cell": (GOOD.replace("0.3", "off"), "row 4, column u_a: expected finite number"),
     "decimal comma": (GOOD.replace("1.2", "1,2"), "row 4: expected 4 cells, got 5"),
     "blank line": (GOOD.replace("x,0.10", "\nx,0.10"), "row 4: expected 4 cells, got 0"),
     "repeated time": (GOOD.replace("0.10", "0.05"), "row 4, column time: expected later than 0.05"),
-    "percent": (GOOD.replace("0.2", "63"), "not percent or bytes), got 63"),
-    "degrees": (GOOD.replace("1.2", "68.8"), "(rad, not degrees), got 68.8"),
     "wrong delimiter": (GOOD.replace(",", ";"), "row 1: expected columns u_<joint>"),
     "column twice": (GOOD.replace("q_a", "u_a", 1), "expected each column once, got ['u_a']"),
-    "too slow": ("run,time,u_a,q_a\nslow,0,0,0\nslow,0.1,0,0\nslow,0.2,0,0\n",
-        "expected 20 Hz, the machine's rate (--machine), or more in 'slow', got 10 Hz"),
     "half the velocities": ("run,time,u_a,u_b,q_a,q_b,q_dot_a\nx,0,0,0,0,0,0\n",
         "row 1: expected a column q_dot_b"),
     "no name": (GOOD.replace("x,0.10", " ,0.10"), "row 4, column run: expected text of 1 to 200"),
@@ -353,19 +317,10 @@ def test_read_log__names_file_and_place_of_a_bad_csv(tmp_path, case):
     assert message in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        GOOD.encode("utf-16"),
-        GOOD.replace("x", "\xfc").encode("latin-1"),
-        gzip.compress(b"run,time", mtime=0),
-    ],
-)
-def test_read_log__refuses_what_is_no_utf_8_text(tmp_path, content):
-    (tmp_path / "bad.csv").write_bytes(content)
-    with pytest.raises(
-        ValueError, match=r"bad\.csv: expected a readable CSV table, got 'utf-8' codec"
-    ):
+def test_read_log__refuses_what_is_no_utf_8_text(tmp_path):
+    (tmp_path / "bad.csv").write_text(GOOD.replace("x", "\xfc"), "latin-1")
+    message = r"bad\.csv: expected a readable CSV table, got 'utf-8' codec"
+    with pytest.raises(ValueError, match=message):
         read_log([tmp_path / "bad.csv"], 4)
 
 
@@ -389,8 +344,6 @@ FINE = {"run": np.array(["x"] * 6), "time": TIMES, "u_a": TIMES, "q_a": TIMES}
     ("columns", "message"),
     [
         ({}, "row 1: expected a column run, got []"),
-        (FINE | {"q_a": TIMES[:-1]}, "q_a: expected"),
-        (FINE | {"u_a": FINE["run"]}, "u_a: expected"),
         (FINE | {"q_a": TIMES + np.nan}, "row 2, column q_a: expected finite"),
         ({k: v[:0] for k, v in FINE.items()}, "expected at least one row, got none"),
     ],

@@ -1,7 +1,5 @@
 """Files of nets: what is saved is loaded, and nothing else is."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import fields, replace
 
@@ -54,9 +52,6 @@ def test_load_net__reads_a_file_without_a_dead_zone(tmp_path):
         ({"format": 99}, r"expected \(actuator net, format 1\), got \('actuator net', 99\)"),
         ({"kind": "policy"}, r"expected \(actuator net, format 1\), got \('policy', 1\)"),
         ({"colour": "red"}, "expected a complete actuator net, got .*'colour'"),
-        ({"history": 13.0}, r"history: expected whole number in \[2, 1000\], got 13\.0"),
-        ({"dead_zone": "a"}, r"dead_zone: expected finite float in \[0, 0\.99\], got 'a'"),
-        ({"joints": ["a", "b", "a"]}, r"joints: expected different text .*got \['a', 'b', 'a'\]"),
         ("[" * 2000, "expected a file with a JSON header, got maximum recursion depth"),
         ("3", "expected a file with a JSON header, got 'int' object"),
     ],

@@ -1,7 +1,5 @@
 """Plants of one's own: two functions, in the place of the analytic plant."""
 
-from __future__ import annotations
-
 import runpy
 from dataclasses import replace
 from pathlib import Path

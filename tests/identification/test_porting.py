@@ -1,7 +1,5 @@
 """The page on porting is true: all of its blocks run, on a machine that is no Brokk."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

@@ -1,7 +1,5 @@
 """Free runs by hand; step responses of simulators whose answer is known, and of the plant."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -9,12 +7,11 @@ import pytest
 from helpers_machines import constant_net, random_net
 
 from brokk_min.identification import simulation
-from brokk_min.identification.logs import Log, Recording, velocity_of
+from brokk_min.identification.logs import Recording, velocity_of
 from brokk_min.identification.simulation import (
     creep,
     free_run,
     response_times,
-    step_commands,
     step_velocity,
     steps,
 )
@@ -99,32 +96,3 @@ def test_steps__move_only_the_stepping_joint_away_from_the_end_behind_it():
     assert not moved[..., ~own].any()
     np.testing.assert_allclose(moved[0][:, own], 0.1 * 1.5)  # after the step alone
     np.testing.assert_allclose(moved[1][:, own], 0.1 * 3.0)  # before it too
-
-
-def test_step_commands__move_a_joint_beyond_its_dead_zone():
-    """Three ticks late; two dead zones, and a valve that opens with the fourth power."""
-
-    def simulate(q, u):
-        u = np.concatenate([np.zeros((3, *u.shape[1:])), u])[: len(u)]
-        beyond = np.maximum(0, np.abs(u) - np.array([0.07, 0.45, 0.0]))
-        speed = np.sign(u) * beyond ** np.array([1, 1, 4])
-        return np.concatenate([q[None], q + np.cumsum(speed, axis=0) / 20])
-
-    level = np.array([0.6, 1.0, 1.0])
-    before = step_commands(simulate, -np.ones(3), np.ones(3), level, 20)
-    # tenths of the level that move by a twentieth of the full speed: 0.12, 0.5 and 0.5
-    np.testing.assert_allclose(before, [(0.12 + 0.6) / 2, (0.5 + 1.0) / 2, (0.5 + 1.0) / 2])
-
-
-def test_log_response_times__are_at_the_largest_command_of_the_log():
-    """Nets of the plant's joints; the plant answers in 0.40 s to the largest command."""
-    u = np.zeros((40, 5))
-    u[7], u[9] = 80 / 127, -0.1
-    log = Log(BROKK_170.names, (Recording("x", u, u, u),))
-    net = replace(constant_net([0.0] * 5, False, BROKK_170.names), q_low=LOW, q_high=HIGH)
-    times = simulation.log_response_times(net, log, BROKK_170)
-    assert list(times) == ["response_time", "machine_response_time"]
-    assert times["response_time"]["q1"]["idle"] == {"up": None, "down": None}
-    machine = times["machine_response_time"]
-    assert all(machine[name]["idle"]["up"] == pytest.approx(0.4, abs=0.01) for name in machine)
-    assert list(simulation.log_response_times(net, log, None)) == ["response_time"]

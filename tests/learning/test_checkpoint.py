@@ -1,7 +1,5 @@
 """Training with files: the same bits after an interruption, curves, refusals, a full disk."""
 
-from __future__ import annotations
-
 import csv
 import os
 import signal
@@ -14,7 +12,7 @@ from helpers_machines import obedient_net, small_net
 
 from brokk_min.env import TaskConfig
 from brokk_min.learning.checkpoint import TrainingLog, export_policy, stagger_episodes, train_policy
-from brokk_min.learning.episodes import GRADIENT_LEARNER, PAPER_TASK, get_obs
+from brokk_min.learning.episodes import GRADIENT_LEARNER, get_obs
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import load_policy, save_policy
 from brokk_min.machine import BROKK_170
@@ -79,9 +77,6 @@ def broken(tmp_path, monkeypatch):
     return tmp_path / "p.npz"
 
 
-# --- what a training writes -----------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("critic", [False, True])
 def test_train_policy__writes_a_policy_and_its_curve(tmp_path, critic):
     policy = run(tmp_path / "p.npz", critic=critic)
@@ -114,15 +109,6 @@ def test_export_policy__is_the_actor_of_the_papers_agent_through_a_file(tmp_path
     expected = agent.actor(torch.from_numpy(obs)).detach().numpy()
     np.testing.assert_allclose(policy.act(obs), expected, atol=1e-5)
     assert np.abs(expected).max() > 0.1 and policy.paper
-
-
-def test_train_policy__of_the_paper_learns_values_with_its_own_settings(tmp_path):
-    """41,000 steps: the critic explains more than 0.3 of the variance of the returns."""
-    config = PPOConfig(num_envs=64, minibatch_size=512, total_steps=20 * 2048, threads=1)
-    task = TaskConfig(paper=True, **PAPER_TASK)
-    run(tmp_path / "p.npz", net=obedient_net(BROKK_170), task=task, config=config)
-    explained = [float(row["losses/explained_variance"]) for row in read_curve(tmp_path / "p.npz")]
-    assert np.mean(explained[-5:]) > 0.3 > explained[0], explained
 
 
 def test_train_policy__learns_a_little(tmp_path):
@@ -172,9 +158,6 @@ def test_train_policy__writes_for_tensorboard_or_says_what_is_missing(tmp_path, 
     monkeypatch.setitem(os.sys.modules, "torch.utils.tensorboard", None)
     with pytest.raises(ValueError, match=r"brokk_min\[tensorboard\]"):
         run(tmp_path / "p.npz", tensorboard=tmp_path / "board")
-
-
-# --- interruptions --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("tick", "critic"), [(4, False), (17, False), (30, False), (30, True)])
@@ -236,32 +219,15 @@ def test_train_policy__refuses_the_checkpoint_of_another_training(broken, change
     assert checkpoint.read_bytes() == data
 
 
-@pytest.mark.parametrize("fraction", [0.0, 0.5, 0.999])
-def test_train_policy__refuses_a_truncated_checkpoint(broken, fraction):
+def test_train_policy__wants_checkpoint_and_curve_of_this_version(broken):
+    """`tests/fuzz.py` makes the other bad checkpoints."""
     checkpoint = broken.with_name("p.npz.checkpoint")
-    data = checkpoint.read_bytes()
-    checkpoint.write_bytes(data[: int(fraction * len(data))])
-    with pytest.raises(ValueError, match=r"checkpoint: expected a readable checkpoint, got"):
-        run(broken, resume=True)
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "message"),
-    [
-        ("header", '{"format": 0, "identity": {}}', "format: expected 5, got 0"),
-        ("generator", None, "content.generator: expected Tensor, got NoneType"),
-        ("random", {}, "content.random: expected dict, got one of other names"),
-    ],
-)
-def test_train_policy__refuses_a_checkpoint_with_other_content(broken, name, value, message):
-    checkpoint = broken.with_name("p.npz.checkpoint")
+    good = checkpoint.read_bytes()
     content = torch.load(checkpoint, weights_only=True)
-    torch.save(content | {name: value}, checkpoint)
-    with pytest.raises(ValueError, match=rf"p\.npz\.checkpoint: {message}"):
+    torch.save(content | {"header": '{"format": 0, "identity": {}}'}, checkpoint)
+    with pytest.raises(ValueError, match=r"p\.npz\.checkpoint: format: expected 5, got 0"):
         run(broken, resume=True)
-
-
-def test_train_policy__wants_the_curve_of_the_checkpoint(broken):
+    checkpoint.write_bytes(good)
     broken.with_name("p.npz.csv").unlink()
     with pytest.raises(ValueError, match=r"p\.npz\.csv: expected the curve of the checkpoint, got"):
         run(broken, resume=True)
@@ -276,18 +242,3 @@ def test_train_policy__does_not_overwrite_a_checkpoint(broken):
 def test_train_policy__says_that_there_is_nothing_to_resume(tmp_path, capsys):
     run(tmp_path / "p.npz", resume=True)
     assert "p.npz.checkpoint: no checkpoint, training starts from" in capsys.readouterr().err
-
-
-def test_train_policy__stops_at_nan_and_keeps_the_checkpoint(tmp_path, monkeypatch, straight):
-    def poison(obs, reward, *rest):
-        reward[5] = np.nan
-        return obs, reward, *rest
-
-    path = tmp_path / "p.npz"
-    with monkeypatch.context() as patch:
-        fail_at_tick(patch, 19, poison)
-        with pytest.raises(ValueError, match=r"reward\[5\]: expected .* step 144, got nan"):
-            run(path)
-    assert not path.exists()
-    run(path, resume=True)
-    assert path.read_bytes() == straight.read_bytes()

@@ -1,7 +1,5 @@
 """Episodes: distributions of poses and goals, goals that change, rows that are replaced."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The Gymnasium environments: resets in the same step, final observations, registration."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import fields, replace
 
@@ -146,32 +144,6 @@ def test_step__refuses_to_begin_without_a_reset(make):
         make().render()
 
 
-@pytest.mark.parametrize("shape", [(2, 5), (2,), (2, 3)])
-def test_step__refuses_wrong_actions(shape):
-    env = TaskVectorEnv(2)
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match=r"action: expected \(\.\.\., 4\), got \(2"):
-        env.step(np.zeros(shape, np.float32))
-
-
-# --- nets -----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("net", "message"),
-    [
-        (replace(NET, rate=10.0), "actuator: expected nets for brokk170 .*got .*'rate': 10.0"),
-        (replace(NET, velocity_samples=3), "actuator: expected .*got .*'velocity_samples': 3"),
-        (replace(NET, velocity_logged=True), "actuator: expected .*got .*'velocity_logged': True"),
-        (replace(NET, machine="other"), "actuator: expected .*got .*'machine': 'other'"),
-        (NET.select(["q1", "q3"]), r"joints: expected nets for \['q1', .*'q5'\], got \['q1'"),
-    ],
-)
-def test_task_vector_env__refuses_nets_that_do_not_fit(net, message):
-    with pytest.raises(ValueError, match=message):
-        TaskVectorEnv(1, net)
-
-
 def test_task_vector_env__takes_a_file_and_selects_driven_joints(tmp_path):
     names = BROKK_170.names
     net = small_net(BROKK_170, np.random.default_rng(0), joints=names)
@@ -180,9 +152,6 @@ def test_task_vector_env__takes_a_file_and_selects_driven_joints(tmp_path):
     assert env.net.joints == ("q1", "q3", "q4", "q5")
     assert TaskVectorEnv(1, str(tmp_path / "net.npz")).net.joints == env.net.joints
     assert TaskVectorEnv(1).net is None
-
-
-# --- Gymnasium ------------------------------------------------------------------------------------
 
 
 def test_make__gives_an_environment_that_gymnasium_and_stable_baselines_accept():

@@ -1,7 +1,5 @@
 """An exported policy before onnxruntime, which nobody here wrote."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

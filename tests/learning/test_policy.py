@@ -1,7 +1,5 @@
 """The policy's file and function: by hand, against torch, bit for bit through a file, refusals."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
@@ -50,9 +48,6 @@ def rewrite(path, header=None, drop=(), **arrays):
     np.savez(path, **(content | arrays | {"header": np.array(json.dumps(text))}))
 
 
-# --- the function ---------------------------------------------------------------------------------
-
-
 def test_act__by_hand():
     """Two inputs, two ELU units, one output: x = (1, -1) at the units."""
     weights = (
@@ -75,30 +70,13 @@ def test_act__equals_the_actor_of_torch(agent, policy):
     assert np.isfinite(policy.act(np.array([[1e4], [-1e4]]) * np.ones(171))).all()
 
 
-def test_export_policy__keeps_a_copy_of_the_weights(agent, policy):
-    before = policy.act(np.ones(171))
-    with torch.no_grad():
-        agent.actor[0].weight *= 2
-        after = policy.act(np.ones(171))
-        agent.actor[0].weight /= 2
-    assert np.array_equal(before, after)
-
-
-@pytest.mark.parametrize("shape", [(), (170,), (171, 1), (3, 172)])
-def test_act__refuses_wrong_shapes(policy, shape):
-    with pytest.raises(ValueError, match=r"observation: expected \(\.\.\., 171\), got \("):
-        policy.act(np.zeros(shape))
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_act__refuses_what_is_not_finite(policy, bad):
-    obs = np.zeros((2, 171))
-    obs[1, 40] = bad
-    with pytest.raises(ValueError, match="observation: expected finite numbers, got"):
-        policy.act(obs)
-
-
-# --- the controller -------------------------------------------------------------------------------
+def test_act__refuses_wrong_shapes_and_what_is_not_finite(policy):
+    for shape in ((), (170,), (171, 1), (3, 172)):
+        with pytest.raises(ValueError, match=r"observation: expected \(\.\.\., 171\), got \("):
+            policy.act(np.zeros(shape))
+    for bad in (np.nan, np.inf, -np.inf):
+        with pytest.raises(ValueError, match="observation: expected finite numbers, got"):
+            policy.act(np.where(np.arange(171) == 40, bad, np.zeros((2, 171))))
 
 
 def measured(v_goal):
@@ -147,9 +125,6 @@ def test_controller__of_the_papers_agent_takes_its_observation_and_sends_plain_a
     assert np.abs(u[0]).max() > 0.1  # valves stay as the policy has them
 
 
-# --- the file -------------------------------------------------------------------------------------
-
-
 def test_load_policy__keeps_every_bit(policy, saved, tmp_path):
     again = load_policy(saved, BROKK_170)
     assert dict(again.contract) == dict(policy.contract)
@@ -180,11 +155,7 @@ def reordered():
         (replace(BROKK_170, name="brokk500"), r"machine: expected 'brokk500', got 'brokk170'"),
         (reordered(), r"joints: expected \['q2', 'q3', 'q4', 'q5', 'q1'\], got \['q1', 'q2'"),
         (change_joint(1, driven=True), r"driven: expected \['q1', 'q2'.*got \['q1', 'q3'"),
-        (replace(BROKK_170, history=12), r"history: expected 12, got 13"),
-        (replace(BROKK_170, rate=40.0), r"rate: expected 40.0, got 20.0"),
-        (replace(BROKK_170, velocity_samples=3), r"velocity_samples: expected 3, got 4"),
         (replace(BROKK_170, pwm_limit=60), r"pwm_limit: expected 60, got 80"),
-        (change_joint(2, q_max=1.5), r"geometry\[2\]\[5\]: expected 1\.5, got 1\.6"),
         (change_joint(2, a=1.5), r"geometry\[2\]\[0\]: expected 1\.5, got 1\.25"),
         (change_joint(2, q_dot_down=0.5), r"scale: expected the machine's normalisation, got"),
         (replace(BROKK_170, tool_speed=0.4), r"scale: expected the machine's normalisation, got"),
@@ -200,26 +171,16 @@ def test_load_policy__refuses_one_for_something_else(saved, machine, message):
     ("changes", "message"),
     [
         ({"mean": np.zeros(171)}, "mean: expected the machine's normalisation, got another"),
-        ({"weight_7": np.zeros(3)}, r"weight_7: expected .*\(4,\), got float64, shape \(3,\)"),
-        ({"weight_7": np.ones(4) * 1j}, "weight_7: expected finite float .*, got complex128"),
         ({"header": {"format": 99}}, r"expected \(policy, format 3\), got .*99"),
-        (
-            {"header": {"kind": "actuator net"}},
-            r"expected \(policy, format 3\), got .*actuator net",
-        ),
         ({"header": {"contract": {}}}, "machine: expected 'brokk170', got None"),
-        ({"header": {"training": None}}, "training: expected object, got none"),
         (
             {"header": {"contract": {**contract(BROKK_170), "paper": True}}},
             "mean: expected finite float in .*, got float32, shape",
         ),
-        (
-            {"header": {"contract": {**contract(BROKK_170), "paper": 1}}},
-            "contract.paper: expected truth value, got 1",
-        ),
     ],
 )
 def test_load_policy__refuses_a_changed_file(saved, changes, message):
+    """`tests/fuzz.py` makes the others, from the description of the fields."""
     rewrite(saved, **changes)
     with pytest.raises(ValueError, match=rf"policy\.npz: {message}"):
         load_policy(saved, BROKK_170)

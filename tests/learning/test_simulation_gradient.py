@@ -1,7 +1,5 @@
 """Derivatives of the rewards by the actions: against finite differences, and by hand."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brokk_min import env
-from brokk_min.actuator import append_command
 from brokk_min.env import TaskConfig, integrate_error
 from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.learning.gym_env import TaskVectorEnv
@@ -22,7 +19,6 @@ from brokk_min.learning.simulation_gradient import (
     Ticks,
     action_gradients,
     improved_actions,
-    input_gradient,
     regression_loss,
     saturate,
 )
@@ -236,20 +232,6 @@ def test_action_gradients__are_zero_for_a_joint_pushed_into_its_limit(limit, u_q
     gradient = action_gradients(BROKK_170, net, ticks, 0.9, costs())[:, 0]
     assert not gradient[:, 3].any()
     assert gradient[:, 2].all()
-
-
-@cases
-def test_input_gradient__equals_finite_differences(machine, seed):
-    net, state, commands = moving_case(machine, seed)
-    driven = machine.driven
-    history = append_command(state.true_history, commands[0][:, driven])
-    velocity, gradient = input_gradient(net, history)
-    np.testing.assert_allclose(velocity, net.forward(history)[0])
-    direction = np.random.default_rng(seed).standard_normal(history.shape)
-    direction[..., 2, :] *= np.abs(np.abs(history[..., 2, :]) - net.dead_zone) > 1e-3
-    step = 1e-6 * direction
-    difference = (net.forward(history + step)[0] - net.forward(history - step)[0]) / 2e-6
-    np.testing.assert_allclose((gradient * direction).sum((-1, -2)), difference, atol=1e-5)
 
 
 def test_improved_actions__are_means_and_a_saturated_step_along_the_gradient():

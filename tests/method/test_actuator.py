@@ -101,15 +101,6 @@ def test_lever_arm__varies_by_one_and_a_half_to_two_and_a_half():
     assert np.all((ratio[1:] > 1.5) & (ratio[1:] < 2.5)), ratio
 
 
-def test_plant_step__moves_nothing_in_the_dead_zone():
-    for sign in (1, -1):
-        state, velocities, _ = record(BROKK_170, MIDDLE, np.full((200, 5), sign * 8 / 127))
-        np.testing.assert_array_equal(state.q, MIDDLE)
-        assert not velocities.any()
-        state, velocities, _ = record(BROKK_170, MIDDLE, np.full((100, 5), sign * 20 / 127))
-        assert np.all(sign * velocities[-1] > 1e-3)
-
-
 def test_plant_step__has_pump_enough_at_the_limit_and_too_little_at_full_command():
     q = np.array([0.0, 0.5, 1.4, 2.6, 1.8])
     falling = -(np.arange(5) != 1).astype(float)  # the driven joints where they need most oil
@@ -121,14 +112,6 @@ def test_plant_step__has_pump_enough_at_the_limit_and_too_little_at_full_command
 
     assert abs(loss(LIMIT)) < 0.02
     assert loss(1.0) > 0.05
-
-
-def test_plant_step__gives_each_machine_a_pump():
-    starts = MIDDLE + 0.1 * np.arange(3)[:, None]
-    batch, one = plant_reset(BROKK_170, starts), plant_reset(BROKK_170, starts[1])
-    for _ in range(12):
-        batch, one = (plant_step(BROKK_170, s, np.ones_like(s.q)) for s in (batch, one))
-    np.testing.assert_allclose(batch.q[1], one.q, atol=1e-12)
 
 
 def test_plant_step__delays_commands_by_the_delay():
@@ -238,43 +221,6 @@ def test_lever_arm__is_the_derivative_of_the_cylinder_length(case):
     slope = (length(angle + q + 1e-6) - length(angle + q - 1e-6)) / 2e-6
     np.testing.assert_allclose(arm, np.where(base > 0, slope, rod), atol=1e-8)
     assert np.all(arm > 0)
-
-
-def test_lever_arm__of_q5_at_a_right_angle():
-    # a right angle: legs 0.6 and 0.2, hypotenuse 0.6325, height 0.12 / 0.6325
-    q = MIDDLE.copy()
-    q[Q5] = np.pi / 2 - 0.4
-    assert lever_arm(BROKK_170, q)[Q5] == pytest.approx(0.18974, abs=1e-5)
-    assert lever_arm(BROKK_170, q)[0] == 0.15
-
-
-def frozen(state: PlantState) -> PlantState:
-    for array in state:
-        array.setflags(write=False)
-    return state
-
-
-def test_plant_step__changes_nothing_that_it_was_given():
-    rng = np.random.default_rng(0)
-    state = plant_reset(BROKK_170, np.tile(MIDDLE, (3, 1)))
-    u = rng.uniform(-1, 1, (3, 5))
-    for _ in range(20):
-        before = [array.copy() for array in state]
-        following = plant_step(BROKK_170, frozen(state), u)
-        for array, copy in zip(state, before, strict=True):
-            np.testing.assert_array_equal(array, copy)
-        again = plant_step(BROKK_170, state, u)
-        np.testing.assert_array_equal(again.q, following.q)
-        state = following
-    # a caller that reuses its arrays does not reach into the plant
-    q, late = MIDDLE.copy(), np.ones(5)
-    state = plant_reset(BROKK_170, q)
-    q[:] = 0.0
-    np.testing.assert_array_equal(state.q, MIDDLE)
-    state = plant_step(BROKK_170, state, late)
-    kept = plant_step(BROKK_170, state, np.zeros(5))
-    late[:] = -1.0
-    np.testing.assert_array_equal(plant_step(BROKK_170, state, np.zeros(5)).s, kept.s)
 
 
 def test_plant_step__of_a_batch_is_that_of_its_rows():
@@ -394,17 +340,6 @@ def test_predict__holds_a_joint_without_a_command_that_stood_still():
     np.testing.assert_allclose(net.predict(history), [0, 0.2, 0.2, 0.2], atol=1e-6)
     history[2, 0, -1] = 0.501  # less than the threshold of 2 mrad
     assert net.predict(history)[2] == 0
-
-
-def test_smooth_angles__is_exact_on_steady_motion():
-    """q = q_H + v t: every sample, moved on, gives the same angle."""
-    for samples in (2, 4, 5):
-        machine = replace(BROKK_170, velocity_samples=samples)
-        t = 0.05 * np.arange(-12, 1)
-        history = np.zeros((2, 3, 13))
-        history[:, 0] = np.array([[0.5], [1.0]]) + np.outer([0.2, -0.1], t)
-        history[:, 1] = [[0.2], [-0.1]]
-        np.testing.assert_allclose(smooth_angles(machine, history), [0.5, 1.0], atol=1e-12)
 
 
 def test_smooth_angles__by_hand():

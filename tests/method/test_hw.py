@@ -1,7 +1,5 @@
 """The 20 Hz loop against the plant, on a virtual bus with an injected clock."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -39,7 +37,6 @@ from brokk_min.learning.policy import Policy, PolicyController, contract, load_p
 from brokk_min.machine import BROKK_170
 
 SHIPPED = Path(hw.__file__).with_name("shipped") / BROKK_170.name / "policy.npz"
-STEP = BROKK_170.encoder_step
 
 
 def policy():
@@ -276,13 +273,6 @@ def test_tick__opens_no_valve_again_on_frames_of_any_identifier_and_length(
     world.run(9.3)
     assert len(seen) == pairs == 2048 * 9
     assert closes_within(world, begun, 0.175)
-
-
-def test_tick__drives_on_among_2000_foreign_frames_a_second(world, controller, operator):
-    seen, pairs = flood(Fault(world, operator, controller), foreign=True)
-    world.run(9.3)
-    assert world.drive.gate.driving and world.drive.reason == "" and world.drive.skipped == 0
-    assert len(seen) == pairs > 18_000
 
 
 def test_tick__leaves_a_fault_by_a_new_edge_only(world, operator):

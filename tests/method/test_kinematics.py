@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers_machines import POSE
+from helpers_machines import POSE, closed_form
 from hypothesis import given
 from scipy.linalg import expm
 from strategies import posed, poses
@@ -85,19 +85,10 @@ def test_cross__is_numpys():
 
 @given(poses(BROKK_170, (20,)))
 def test_forward_kinematics__is_the_closed_form_of_the_brokk(q):
-    """Elevations e2 = q2, e3 = e2 + q3, e4 = e3 + q4 - pi, e5 = e4 + q5 - 3 pi/4."""
-    e2 = q[:, 1]
-    e3 = e2 + q[:, 2]
-    e4 = e3 + q[:, 3] - np.pi
-    e5 = e4 + q[:, 4] - 3 * np.pi / 4
-    r = np.full(20, 0.25)
-    z = np.full(20, 0.95)
-    points = [np.zeros((20, 3)), np.stack([r * np.cos(q[:, 0]), r * np.sin(q[:, 0]), z], -1)]
-    for length, e in zip((1.15, 1.25, 1.15, 1.20), (e2, e3, e4, e5), strict=True):
-        r = r + length * np.cos(e)
-        z = z + length * np.sin(e)
-        points.append(np.stack([r * np.cos(q[:, 0]), r * np.sin(q[:, 0]), z], -1))
-    np.testing.assert_allclose(forward_kinematics(BROKK_170, q).p, np.stack(points, 1), atol=1e-12)
+    frames = forward_kinematics(BROKK_170, q)
+    tool, lowest = closed_form(q)
+    np.testing.assert_allclose(tool_position(frames), tool, atol=1e-12)
+    np.testing.assert_allclose(lowest_point(frames), lowest, atol=1e-12)
 
 
 def twist(angular: np.ndarray, linear: np.ndarray) -> np.ndarray:

@@ -1,7 +1,5 @@
 """PPO: formulas by hand and against torch, a training written once more, refusals, Pendulum."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -85,8 +85,6 @@ def test_readme__has_the_sizes_of_observation_and_action() -> None:
     assert [size for name, size in sizes if name == "action"] == [action.shape[0]]
 
 
-# --- commands -------------------------------------------------------------------------------------
-
 LINE = re.compile(r"^ *brokk-min (.*?)(?: {2,}#.*)?$", re.M)
 LINES = sorted({line for page in PAGES for line in LINE.findall(page.read_text())})
 

@@ -22,16 +22,6 @@ def functions(path: Path) -> set[str]:
     return {node.name for node in body if isinstance(node, ast.FunctionDef)}
 
 
-def test_hours__add_up_to_two() -> None:
-    parts = re.findall(r"^## (\d):(\d\d) .* \((\d+) minutes\)$", PAGE, re.M)
-    assert len(parts) == PAGE.count("\n## ")
-    time = 0
-    for hours, minutes, length in parts:
-        assert 60 * int(hours) + int(minutes) == time
-        time += int(length)
-    assert time == 120
-
-
 def commands(program: str) -> list[list[str]]:
     """Arguments of each call of a program."""
     split = [shlex.split(command) for command in COMMANDS]

@@ -82,10 +82,6 @@ def test_figures__are_those_of_the_blocks(ran: tuple[list[str], dict[str, str]])
         np.testing.assert_allclose(got, wanted, atol=2, err_msg=f"{name}: run `make docs`")
 
 
-def test_figures__are_small() -> None:
-    assert sum(path.stat().st_size for path in FIGURES.iterdir()) < 500_000
-
-
 def write() -> None:
     """Put what the blocks print below them, and what they draw into figures/."""
     printed, figures = run([code for code, _ in BLOCK.findall(PAGE.read_text())])

@@ -42,20 +42,6 @@ def test_dls__is_the_least_squares_of_scipy(problem):
     np.testing.assert_allclose(dls(J, W, damping) @ v, expected, atol=1e-8)
 
 
-@given(problems(), npst.arrays(np.float64, 6, elements=reals(-1, 1)))
-def test_dls__has_the_least_cost(problem, change):
-    """The cost grows by exactly its quadratic part, whatever the change of the joint velocities."""
-    J, W, damping, v = problem
-    d = change[: len(W)]
-
-    def cost(x: np.ndarray) -> float:
-        return float(np.sum((J @ x - v) ** 2) + damping * x @ (W * x))
-
-    q_dot = dls(J, W, damping) @ v
-    growth = np.sum((J @ d) ** 2) + damping * d @ (W * d)
-    np.testing.assert_allclose(cost(q_dot + d) - cost(q_dot), growth, atol=1e-7, rtol=1e-7)
-
-
 @given(problems())
 def test_dls__bounds_the_joint_velocities_for_unit_weights(problem):
     """|q_dot| <= |v| / (2 lambda), however near a singularity."""

@@ -1,9 +1,5 @@
 """Kinematics of any machine: derivatives, rotations, symmetries, batches."""
 
-from __future__ import annotations
-
-from dataclasses import replace
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -73,14 +69,6 @@ def test_forward_kinematics__turns_with_the_first_joint(case, angle):
     np.testing.assert_allclose(lowest_point(turned), lowest_point(still), atol=1e-12)
 
 
-@given(posed())
-def test_lowest_point__is_the_least_height_of_a_link_end(case):
-    machine, q = case
-    frames = forward_kinematics(machine, q)
-    heights = [frames.p[..., i, 2] for i in range(1, machine.n + 1)]
-    np.testing.assert_array_equal(lowest_point(frames), np.min(heights, axis=0))
-
-
 @given(moving(shapes=[(1,), (4,), (2, 3)]))
 def test_a_batch__is_its_poses_one_by_one(case):
     machine, q, q_dot = case
@@ -120,10 +108,3 @@ def test_to_heading__turns_about_z_so_that_the_tool_lies_ahead(case, v):
     vector = np.broadcast_to(v, p.shape)
     turned = to_heading(p, vector)
     np.testing.assert_array_equal(turned[..., 2], vector[..., 2])
-
-
-@given(posed())
-def test_driven_joints__do_not_change_the_kinematics(case):
-    machine, q = case
-    free = replace(machine, joints=tuple(replace(joint, driven=True) for joint in machine.joints))
-    np.testing.assert_array_equal(forward_kinematics(free, q).p, forward_kinematics(machine, q).p)
