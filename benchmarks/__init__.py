@@ -1,3 +1,18 @@
 """Speed, each script one JSON; run as `python -m benchmarks.<name>` from the project's root."""
 
+import json
+from pathlib import Path
+
 import brokk_min  # noqa: F401, before NumPy: it settles how many threads that takes
+from brokk_min.identification.files import SHIPPED
+from brokk_min.machine import BROKK_170
+
+POLICY = SHIPPED / BROKK_170.name / "policy.npz"  # of ours; it holds the nets of the driven joints
+
+
+def write(result: object, path: Path | None) -> None:
+    """Print a result, and write it to a file."""
+    text = json.dumps(result, indent=1)
+    print(text)
+    if path:
+        path.write_text(text + "\n")

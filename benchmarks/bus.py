@@ -3,7 +3,7 @@
     python -m benchmarks.bus [--seconds 600] [--busy] [--realtime] [--foreign 1000] [--json F]
 
 `brokk-min machine` and `brokk-min drive` run as a user runs them; all figures come from the log of
-the drive. The policy has random weights, which cost the same time as trained ones.
+the drive.
 """
 
 from __future__ import annotations
@@ -15,19 +15,15 @@ import sys
 import tempfile
 import time
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import tyro
 
-from benchmarks.rollout import random_net, write
+from benchmarks import POLICY, write
 from brokk_min.can.canopen import Frame
 from brokk_min.can.drive_log import read_frames
-from brokk_min.env import observation_scale
-from brokk_min.learning.policy import Policy, contract, save_policy
-from brokk_min.machine import BROKK_170
 
 BUS = ["--interface", "udp_multicast", "--channel", "239.74.163.2"]
 SENDER = """
@@ -53,16 +49,6 @@ class Options:
     realtime: bool = False  # Both processes with real-time priority (chrt -f 10), as on a machine.
     foreign: int = 0  # Frames that another process sends each second, of foreign identifiers.
     json: Path | None = None  # Also write the figures here.
-
-
-def random_policy(rng: np.random.Generator) -> Policy:
-    mean, scale = observation_scale(BROKK_170)
-    weights = []
-    for rows, columns in pairwise([len(mean), 256, 128, 64, len(BROKK_170.driven)]):
-        weights.append(rng.normal(0, rows**-0.5, (rows, columns)).astype(np.float32))
-        weights.append(np.zeros(columns, np.float32))
-    net = random_net(rng).select([BROKK_170.names[i] for i in BROKK_170.driven])
-    return Policy(contract(BROKK_170), {}, mean, scale, tuple(weights), net)
 
 
 def figures(frames: list[Frame]) -> dict[str, Any]:
@@ -102,13 +88,11 @@ def main(options: Options) -> None:
         run = ["chrt", "-f", "10", *run]
     os.environ["CAN_CONFIG"] = json.dumps({"port": 43114})  # python-can's own is for users, tests
     with tempfile.TemporaryDirectory() as folder:
-        policy = Path(folder) / "policy.npz"
         commands = Path(folder) / "c.csv"
         log = Path(folder) / "run.log"
-        save_policy(policy, random_policy(np.random.default_rng(0)))
         goals = [f"g,{t},{0.1 * (-1) ** t},0,0" for t in range(round(options.seconds) + 1)]
         commands.write_text("\n".join(["sequence,time,vx,vy,vz", *goals]) + "\n")
-        drive = [*run, "drive", "--policy", policy, *BUS, "--command", commands, "--log", log]
+        drive = [*run, "drive", "--policy", POLICY, *BUS, "--command", commands, "--log", log]
         processes = [subprocess.Popen([*run, "machine", *BUS], stdout=subprocess.DEVNULL)]
         if options.busy:
             for _ in range(os.cpu_count() or 1):

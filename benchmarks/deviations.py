@@ -21,6 +21,7 @@ from unittest import mock
 import numpy as np
 from numpy.linalg import norm
 
+from benchmarks import POLICY
 from brokk_min import actuator, env, jacobian, kinematics, machine
 from brokk_min.env import TaskConfig, terminated
 from brokk_min.evaluation import metrics, sequences
@@ -28,7 +29,6 @@ from brokk_min.evaluation.baselines import make_gains
 from brokk_min.evaluation.feasibility import feasible
 from brokk_min.evaluation.rollout import rollout
 from brokk_min.identification import excitation, fitting, logs, validation
-from brokk_min.identification.files import SHIPPED
 from brokk_min.kinematics import forward_kinematics
 from brokk_min.learning import policy, simulation_gradient
 from brokk_min.learning.checkpoint import train_policy
@@ -157,7 +157,7 @@ def stand() -> Figures:
     """Path [m] from 0.5 to 2 s after a stop with open valves; dead zone as known, and smaller."""
     starts = sequences.evaluation_starts(M, 64, sequences.task_sequences(M), 2)
     starts = starts[np.array(sequences.start_kinds(M, starts)) == "workspace"]
-    shipped = policy.load_policy(SHIPPED / M.name / "policy.npz", M)
+    shipped = policy.load_policy(POLICY, M)
     shipped = replace(shipped, valves="open")
     controller = policy.PolicyController(M, shipped)
     result = {}
@@ -203,7 +203,7 @@ def fit_scores(kind: str, seed: int, **settings: Any) -> Figures:
 
 def train(task: TaskConfig, critic: bool = False, net: Any = None) -> Figures:
     """Error [m/s], drift [m], travel of a new policy along x, y, z, on nets and plant."""
-    net = net or policy.load_policy(SHIPPED / M.name / "policy.npz", M).net
+    net = net or policy.load_policy(POLICY, M).net
     with tempfile.TemporaryDirectory() as folder:
         settings = {} if critic else GRADIENT_LEARNER
         config = PPOConfig(**{**settings, "total_steps": STEPS, "threads": 1})

@@ -24,7 +24,7 @@ import can
 import numpy as np
 import tyro
 
-from benchmarks.rollout import write
+from benchmarks import write
 from brokk_min.actuator import plant_reset, plant_step
 from brokk_min.can.safety_gate import FROZEN_ANGLE, SLEW, expected_motion, gate_start
 from brokk_min.machine import BROKK_170, PWM_MAX

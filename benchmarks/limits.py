@@ -22,7 +22,7 @@ import pinocchio
 import torch
 import tyro
 
-from benchmarks.rollout import write
+from benchmarks import write
 from brokk_min import ppo
 from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.machine import BROKK_170

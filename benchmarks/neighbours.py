@@ -7,7 +7,7 @@ Quiet and busy runs take turns; the ratio is of their medians. All use one threa
 
 import multiprocessing
 import platform
-import time
+import timeit
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,9 +17,9 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import tyro
 
+from benchmarks import POLICY
 from brokk_min.env import TaskConfig
 from brokk_min.identification import excitation, fitting
-from brokk_min.identification.files import SHIPPED
 from brokk_min.learning.checkpoint import train_policy
 from brokk_min.learning.episodes import GRADIENT_LEARNER
 from brokk_min.learning.policy import load_policy
@@ -53,36 +53,28 @@ def neighbours(num: int) -> Iterator[None]:
         process.join()
 
 
-def seconds(work: Callable[[], object]) -> float:
-    """Wall time of a call [s]."""
-    start = time.perf_counter()
-    work()
-    return time.perf_counter() - start
-
-
 def main(options: Options) -> dict[str, float]:
     """Ratio of busy to quiet wall time of a training and of a fit."""
-    net = load_policy(SHIPPED / M.name / "policy.npz", M).net
+    net = load_policy(POLICY, M).net
     config = PPOConfig(**GRADIENT_LEARNER | {"total_steps": options.train_steps})
     log = excitation.collect(M, 0.05, "rich", np.random.default_rng(0))
     fit_config = fitting.FitConfig(options.fit_steps)
 
-    def train() -> None:
-        with TemporaryDirectory() as folder:
-            train_policy(M, net, TaskConfig(), config, 0, Path(folder) / "policy.npz")
-
-    def fit() -> None:
-        fitting.fit(log, fit_config, 0, M.velocity_samples)
-
     result = {}
-    for name, work in (("training", train), ("fit", fit)):
-        quiet, busy = [], []
-        for _ in range(options.repeats):
-            quiet.append(seconds(work))
-            with neighbours(options.busy):
-                busy.append(seconds(work))
-        result[name] = float(np.median(busy) / np.median(quiet))
-        print(f"{name}: quiet {np.median(quiet):.1f} s, busy {result[name]:.2f} times as long")
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "policy.npz"
+        works: dict[str, Callable[[], object]] = {
+            "training": lambda: train_policy(M, net, TaskConfig(), config, 0, file),
+            "fit": lambda: fitting.fit(log, fit_config, 0, M.velocity_samples),
+        }
+        for name, work in works.items():
+            quiet, busy = [], []
+            for _ in range(options.repeats):
+                quiet.append(timeit.timeit(work, number=1))
+                with neighbours(options.busy):
+                    busy.append(timeit.timeit(work, number=1))
+            result[name] = float(np.median(busy) / np.median(quiet))
+            print(f"{name}: quiet {np.median(quiet):.1f} s, busy {result[name]:.2f} times as long")
     print(platform.processor(), multiprocessing.cpu_count(), "cores")
     return result
 

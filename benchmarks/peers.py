@@ -26,7 +26,7 @@ import numpy as np
 import torch
 import tyro
 
-from benchmarks.rollout import random_net, write
+from benchmarks import POLICY, write
 from brokk_min import ppo
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import COMPENSATION, measure
@@ -35,6 +35,7 @@ from brokk_min.identification.net_file import load_net
 from brokk_min.learning.checkpoint import stagger_episodes
 from brokk_min.learning.episodes import GRADIENT_LEARNER, draw_noise
 from brokk_min.learning.gym_env import TaskVectorEnv
+from brokk_min.learning.policy import load_policy
 from brokk_min.learning.simulation_gradient import improved_actions, regression_loss
 from brokk_min.machine import BROKK_170 as M
 from brokk_min.machine import PWM_MAX
@@ -50,7 +51,7 @@ class Finished(Exception):
 
 @dataclass
 class Options:
-    actuator: Path | None = None  # Nets that `brokk-min fit` wrote; by default random ones.
+    actuator: Path | None = None  # Nets that `brokk-min fit` wrote; by default the shipped.
     gains: Path | None = None  # Tuned gains that `reproduce` wrote; by default those set by hand.
     learners: tuple[str, ...] = ("ours", "critic", "sb3")  # Who takes part.
     seeds: tuple[int, ...] = (0, 1, 2)  # One run each.
@@ -212,8 +213,7 @@ def best_setting(rows: list[dict[str, Any]]) -> Setting:
 
 
 def main(options: Options) -> dict[str, Any]:
-    net = load_net(options.actuator) if options.actuator else random_net(np.random.default_rng(0))
-    net = net.select([M.names[i] for i in M.driven])
+    net = load_net(options.actuator, M) if options.actuator else load_policy(POLICY, M).net
     target = options.target
     if target is None:
         target = mean_reward(net, pid(net, options.gains))

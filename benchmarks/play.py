@@ -2,8 +2,8 @@
 
     python -m benchmarks.play [--seconds 20] [--json F]
 
-The window is SDL's dummy one, keys come through its queue. A policy drives the simulated machine;
-its weights are random, which costs the same time as trained ones.
+The window is SDL's dummy one, keys come through its queue. The shipped policy drives the simulated
+machine.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 import tyro
 
-from benchmarks.bus import percentiles, random_policy
-from benchmarks.rollout import write
+from benchmarks import POLICY, write
+from benchmarks.bus import percentiles
 from brokk_min.can.drive_log import Telemetry
-from brokk_min.learning.policy import PolicyController
+from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer import play
 from brokk_min.viewer.control_process import BusOptions
@@ -88,7 +88,7 @@ class Player:
 def main(options: Options) -> None:
     os.environ["SDL_VIDEODRIVER"] = "dummy"
     player = Player(options.seconds)
-    controllers = {"rl": PolicyController(BROKK_170, random_policy(np.random.default_rng(0)))}
+    controllers = {"rl": PolicyController(BROKK_170, load_policy(POLICY, BROKK_170))}
     no_attempts = Path(os.devnull).with_name("no attempts")
     play.play(BROKK_170, controllers, BusOptions(), no_attempts, player)
     write({"seconds": options.seconds, **player.figures()}, options.json)

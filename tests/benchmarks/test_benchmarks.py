@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from benchmarks import deviations, ladder, limits, neighbours, peers, seeds
-from benchmarks.rollout import random_net
 from brokk_min import kinematics
 from brokk_min.env import action_to_pwm
 from brokk_min.evaluation import metrics
@@ -31,7 +30,7 @@ def test_peers__train_on_the_environment(learner, tmp_path):
 
 
 def test_pid__gives_actions_for_its_commands():
-    env = TaskVectorEnv(3, random_net(np.random.default_rng(0)))
+    env = TaskVectorEnv(3, load_policy(SHIPPED / "brokk170" / "policy.npz", BROKK_170).net)
     obs, _ = env.reset(seed=0)
     assert env.state is not None
     actions = peers.pid(env.net, None)(env, obs)
