@@ -2,6 +2,7 @@
 
 import os
 import runpy
+import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Annotated, Any, TypeVar
 
 import tyro
 
-from brokk_min.identification.files import SHIPPED, brief, names_in, open_regular
+from brokk_min.identification.files import SHIPPED, brief, open_regular, read_json
 from brokk_min.identification.plants import CheckedPlant, Plant
 from brokk_min.machine import BROKK_170, Machine, check_numbers, number
 
@@ -56,6 +57,8 @@ CONTENTS = {
     "rerun": {"rerun"},
     "ONNX": {"ONNX"},
 }
+# What files of some kinds begin with, and what `names_in` calls them.
+SIGNS = {b"\x89PNG": "PNG", b"GIF8": "film", b"(": "candump", b"\x08": "ONNX", b"RRF": "rerun"}
 
 
 @dataclass(kw_only=True)
@@ -104,6 +107,24 @@ def check_output(path: Path, names: set[str], kind: str, force: bool) -> None:
         got = "it has " + brief(sorted(names_in(path))) if path.is_file() else "no regular file"
         expected = f"expected no file, or one of kind {kind} (--force writes over others)"
         raise WrongUse(f"{path}: {expected}, got another: {got}")
+
+
+def names_in(path: Path) -> set[str]:
+    """Columns of a CSV, keys of JSON, arrays of an archive; PNG, ONNX, film or candump; or none."""
+    try:
+        with open_regular(path) as file:
+            begin = file.read(2**16)
+        if begin.startswith(b"PK"):
+            with zipfile.ZipFile(path) as archive:
+                return {name.removesuffix(".npy") for name in archive.namelist()}
+        if begin.startswith(b"{"):
+            return set(read_json(path, "JSON"))
+        found = {kind for sign, kind in SIGNS.items() if begin.startswith(sign)}
+        found |= {"film"} if begin[4:8] == b"ftyp" else set()
+        header = begin.decode("utf-8-sig").split("\n")[0] if not found else ""
+        return found or {name.strip() for name in header.split(",")}
+    except Exception:  # whatever it is
+        return set()
 
 
 def find_object(option: str, name: str, known: Mapping[str, Any], kind: type, what: str) -> Any:

@@ -149,13 +149,12 @@ def settling_time(machine: Machine, error: Array, goals: Array) -> Array:
 
 def _mean(values: Array, where: NDArray[np.bool_]) -> Array:
     """Mean over the ticks of (T, num) at which `where` holds, (num,); NaN: nowhere."""
-    count = where.sum(axis=0)
-    return np.where(count > 0, (values * where).sum(axis=0) / np.maximum(count, 1), np.nan)
+    return np.asarray(np.ma.array(values, mask=~where).mean(axis=0).filled(np.nan))
 
 
 def row_mean(values: Array) -> Array:
     """Mean of each row of (rows, n) without its NaN, (rows,); NaN: no other value."""
-    return _mean(np.nan_to_num(values).T, np.isfinite(values).T)
+    return _mean(values.T, np.isfinite(values).T)
 
 
 def evaluate(

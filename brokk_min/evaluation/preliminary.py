@@ -9,17 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from brokk_min.actuator import ActuatorNet
+from brokk_min.identification import simulation
 from brokk_min.identification.excitation import task_log
 from brokk_min.identification.net_file import select_nets
-from brokk_min.identification.simulation import (
-    Simulator,
-    named_times,
-    net_simulator,
-    plant_simulator,
-    response_times,
-    step_velocity,
-    steps,
-)
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import PWM_MAX, Array, Machine, encode_pwm
 
@@ -68,20 +60,20 @@ def run(machine: Machine, net: ActuatorNet, seed: int) -> Preliminary:
     return Preliminary(tests, sim_to_real(machine, both, seed))
 
 
-def simulators(machine: Machine, net: ActuatorNet) -> dict[str, Simulator]:
+def simulators(machine: Machine, net: ActuatorNet) -> dict[str, simulation.Simulator]:
     """The "machine", and the "nets" of its driven joints, under which locked joints stand."""
     driven = machine.driven
-    simulate = net_simulator(select_nets(machine, net))
+    simulate = simulation.net_simulator(select_nets(machine, net))
 
     def nets(q: Array, u: Array) -> Array:
         angles = np.repeat(q[None], len(u) + 1, axis=0)
         angles[..., driven] = simulate(q[..., driven], u[..., driven])
         return angles
 
-    return {"machine": plant_simulator(machine), "nets": nets}
+    return {"machine": simulation.plant_simulator(machine), "nets": nets}
 
 
-def preliminary_tests(machine: Machine, simulate: Simulator) -> SimulatorTests:
+def preliminary_tests(machine: Machine, simulate: simulation.Simulator) -> SimulatorTests:
     """Range and direction, coupling, past movement. Paper: Sec. 3.2, Fig. 2"""
     joint = int(machine.driven[-1])
     limit = machine.pwm_limit / PWM_MAX
@@ -95,15 +87,15 @@ def preliminary_tests(machine: Machine, simulate: Simulator) -> SimulatorTests:
     level = np.full(machine.n, limit)
     before = (level + machine.dead_zone) / 2
     wait = max(round(1.5 * machine.rate), 2 * machine.history)  # ticks before the step
-    angles = steps(simulate, low, high, level, before, wait)
-    from_idle, moving = step_velocity(angles, machine.rate)[:, :, 0, joint].T
+    angles = simulation.steps(simulate, low, high, level, before, wait)
+    from_idle, moving = simulation.step_velocity(angles, machine.rate)[:, :, 0, joint].T
     time = (np.arange(2 * wait) + 0.5 - wait) * machine.dt
-    times = response_times(angles, machine.rate)[..., machine.driven]
+    times = simulation.response_times(angles, machine.rate)[..., machine.driven]
     return SimulatorTests(
         dict(zip(names, alone, strict=True)),
         {"alone": alone[1], "with the others": together},
         {"from idle": (time, from_idle), "while moving": (time, moving)},
-        named_times(times, [machine.names[i] for i in machine.driven]),
+        simulation.named_times(times, [machine.names[i] for i in machine.driven]),
     )
 
 
@@ -116,7 +108,7 @@ def other_commands(machine: Machine, joint: int) -> Array:
     return u
 
 
-def sweeps(machine: Machine, simulate: Simulator, joint: int, u: Array) -> list[Sweep]:
+def sweeps(machine: Machine, simulate: simulation.Simulator, joint: int, u: Array) -> list[Sweep]:
     """A joint from stop to stop under each row of constant commands `u` (k, n).
 
     The others begin amid their ranges. A sweep ends when the joint stands. Paper: Sec. 3.2
@@ -134,7 +126,7 @@ def sweeps(machine: Machine, simulate: Simulator, joint: int, u: Array) -> list[
     return result
 
 
-def sim_to_real(machine: Machine, both: Mapping[str, Simulator], seed: int) -> Motion:
+def sim_to_real(machine: Machine, both: Mapping[str, simulation.Simulator], seed: int) -> Motion:
     """Nets less machine under commands that move several joints. Paper: Sec. 4.1, Fig. 5"""
     middle = (machine.column("q_min") + machine.column("q_max")) / 2
     start = np.array(machine.q_start or middle)

@@ -7,17 +7,7 @@ from typing import Any
 import numpy as np
 
 from brokk_min.env import Encoder, TaskConfig
-from brokk_min.evaluation import claims
-from brokk_min.evaluation.metrics import (
-    Controllers,
-    Traces,
-    by_start,
-    evaluate,
-    mean_interval,
-    paired_difference,
-    row_mean,
-    summary,
-)
+from brokk_min.evaluation import claims, metrics
 from brokk_min.evaluation.sequences import (
     RESTS,
     Commands,
@@ -98,7 +88,7 @@ def pump_flow_ratio(machine: Machine, u: Array) -> Array:
 
 def robustness(
     machine: Machine,
-    controllers: Controllers,
+    controllers: metrics.Controllers,
     sequences: Sequence[Commands],
     starts: Array,
     seed: int,
@@ -111,23 +101,25 @@ def robustness(
     error = "velocity_error_mean"
     result: dict[str, dict[str, dict[str, Any]]] = {}
     for name, (plant, sensor) in variations(machine).items():
-        runs, traces = evaluate(plant, controllers, sequences, starts, seed, sensor=sensor)
+        runs, traces = metrics.evaluate(plant, controllers, sequences, starts, seed, sensor=sensor)
         result[name] = {}
         for controller in controllers:
             u = np.array([traces[controller, sequence.name].u for sequence in sequences])
             ratio = pump_flow_ratio(plant, u)
-            row: dict[str, Any] = dict(mean_interval(by_start(runs, controller, "all", error)))
+            row: dict[str, Any] = dict(
+                metrics.mean_interval(metrics.by_start(runs, controller, "all", error))
+            )
             row["supply_demand"] = float(ratio.max())
             row["supply_limits"] = float((ratio > 1).mean())
             if "rl" in controllers and controller != "rl":
-                row["rl_less"] = paired_difference(runs, "rl", controller, error)["all"]
+                row["rl_less"] = metrics.paired_difference(runs, "rl", controller, error)["all"]
             result[name][controller] = row
     return result
 
 
 def by_length_of_rest(
     machine: Machine,
-    controllers: Controllers,
+    controllers: metrics.Controllers,
     starts: Array,
     seed: int,
     config: TaskConfig | None = None,
@@ -136,14 +128,14 @@ def by_length_of_rest(
     result = {}
     for seconds in RESTS:
         commands = rest_sequences(machine, seconds)
-        runs, _ = evaluate(machine, controllers, commands, starts, seed, config=config)
-        result[f"{seconds:g}"] = {name: rows["all"] for name, rows in summary(runs).items()}
+        runs, _ = metrics.evaluate(machine, controllers, commands, starts, seed, config=config)
+        result[f"{seconds:g}"] = {name: rows["all"] for name, rows in metrics.summary(runs).items()}
     return result
 
 
 def near_singularities(
-    machine: Machine, controllers: Controllers, starts: Array, seconds: float, seed: int
-) -> tuple[dict[str, Any], dict[str, list[claims.Claim]], Traces]:
+    machine: Machine, controllers: metrics.Controllers, starts: Array, seconds: float, seed: int
+) -> tuple[dict[str, Any], dict[str, list[claims.Claim]], metrics.Traces]:
     """Runs of `claims.singular_controllers` from extended starts: JSON, claims and traces.
 
     The JSON has the "manipulability" and the "least" singular value [m/rad] at each start. All are
@@ -152,7 +144,7 @@ def near_singularities(
     if not len(starts):
         return {"summary": {}, "claims": {}}, {}, {}
     commands = shorten(machine, singular_sequences(machine, starts), seconds)
-    runs, traces = evaluate(machine, controllers, commands, starts, seed)
+    runs, traces = metrics.evaluate(machine, controllers, commands, starts, seed)
     w0 = manipulability_threshold(machine)
     J = jacobian(forward_kinematics(machine, starts))[..., machine.driven]
     speed = {}
@@ -161,13 +153,13 @@ def near_singularities(
             claims.speed_fraction(machine, w0, traces[name, s.name], s.for_starts(machine, starts))
             for s in commands
         ]
-        speed[name] = row_mean(np.stack(fractions, axis=1))
+        speed[name] = metrics.row_mean(np.stack(fractions, axis=1))
     singular: dict[str, list[claims.Claim]] = {}
     for name in ("rl", "rl_paper"):
         if name in speed:
             singular[name] = claims.singular_claims(name, runs, speed)
     results = {
-        "summary": summary(runs),
+        "summary": metrics.summary(runs),
         "claims": {name: [c.to_json() for c in every] for name, every in singular.items()},
         "w0": w0,
         "manipulability": manipulability(J).tolist(),

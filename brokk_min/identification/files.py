@@ -2,12 +2,12 @@
 
 A new file replaces the old one only once it is complete. A file with other content than expected is
 refused with its path, the place, what was expected and what was found. Sizes are checked before
-anything is read: what a file may take of the memory is bounded by its own size. `formats` says
-what the fields of a file must be.
+anything is read. `formats` says what the fields of a file must be.
 """
 
 import csv
 import json
+import math
 import os
 import reprlib
 import stat
@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
@@ -34,6 +35,7 @@ LONGEST_LINE = 2**20  # bytes of a CSV
 DEEPEST = 32  # levels of JSON
 MEMBERS = 4096  # of an archive
 HEADER_SIZE = 10_000  # characters of the header of an array
+READ_HEADER = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 
 
 def require(package: str, extra: str) -> Any:
@@ -178,9 +180,11 @@ def parse_json(text: str | bytes) -> Any:
     """JSON with each key once, at most 32 levels deep; ValueError: another text."""
 
     def whole(number: str) -> float:
+        """A whole number, as a float if it has too many digits for 64 bits."""
         return int(number) if len(number) < 19 else float(number)
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        """An object; ValueError: a key twice."""
         keys = [key for key, _ in pairs]
         if len(set(keys)) < len(keys):
             raise ValueError(f"expected each key once, got {brief(keys)}")
@@ -228,7 +232,7 @@ def load_arrays(
         for name, member in zip(arrays, members, strict=True):
             if names is None or name in names:
                 with archive.open(member) as content:
-                    result[name] = np.lib.format.read_array(content, allow_pickle=False)
+                    result[name] = npy.read_array(content, allow_pickle=False)
         return result
 
 
@@ -238,17 +242,13 @@ def _checked_size(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> int:
     if not member.filename.endswith(".npy") or not packed:
         raise ValueError(f"member {brief(member.filename)} that is no array")
     with archive.open(member) as content:
-        version = np.lib.format.read_magic(content)
-        read = {(1, 0): np.lib.format.read_array_header_1_0}
-        read[2, 0] = np.lib.format.read_array_header_2_0
-        shape, _, dtype = read[version](content, max_header_size=HEADER_SIZE)
-        size = dtype.itemsize
-        for length in shape:
-            size *= int(length)
+        read = READ_HEADER[npy.read_magic(content)]
+        shape, _, dtype = read(content, max_header_size=HEADER_SIZE)
+        size = dtype.itemsize * math.prod(shape)
+        got = member.file_size - content.tell()
         if dtype.kind not in "biufcU" or min(shape, default=0) < 0:
             raise ValueError(f"member {brief(member.filename)} of {dtype}, e.g. pickled objects")
-        if size != member.file_size - content.tell():
-            got = member.file_size - content.tell()
+        if size != got:
             raise ValueError(f"member {brief(member.filename)} of {got} bytes instead of {size}")
     return int(member.file_size)
 
@@ -263,32 +263,6 @@ def load_header(path: Path, arrays: dict[str, Any], kind: str, version: int) -> 
     if got != (kind, version):
         raise ValueError(f"{path}: expected ({kind}, format {version}), got {brief(got)}")
     return header
-
-
-def names_in(path: Path) -> set[str]:
-    """Columns of a CSV, keys of JSON, arrays of an archive; PNG, ONNX, film or candump; or none."""
-    try:
-        with open_regular(path) as file:
-            begin = file.read(2**16)
-        if begin.startswith(b"PK"):
-            with zipfile.ZipFile(path) as archive:
-                return {name.removesuffix(".npy") for name in archive.namelist()}
-        if begin.startswith(b"{"):
-            return set(read_json(path, "JSON"))
-        kinds = {
-            b"\x89PNG": "PNG",
-            b"GIF8": "film",
-            b"(": "candump",
-            b"\x08": "ONNX",
-            b"RRF": "rerun",
-        }
-        found = {kind for start, kind in kinds.items() if begin.startswith(start)}
-        found |= {"film"} if begin[4:8] == b"ftyp" else set()
-        return found or {
-            name.strip() for name in begin.decode("utf-8-sig").split("\n")[0].split(",")
-        }
-    except Exception:  # whatever it is
-        return set()
 
 
 class Table(dict[str, Any]):

@@ -14,14 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min.identification.files import (
-    Floats,
-    brief,
-    load_arrays,
-    read_csv,
-    whole_file,
-    write_csv,
-)
+from brokk_min.identification import files
+from brokk_min.identification.files import Floats, brief
 from brokk_min.identification.formats import LOG, check_columns
 from brokk_min.machine import Array, Machine, estimate_velocity
 
@@ -161,11 +155,11 @@ def write_log(path: Path, log: Log) -> None:
         values = np.concatenate([getattr(recording, kind) for recording in log.recordings])
         columns |= {f"{kind}_{name}": values[:, i] for i, name in enumerate(log.joints)}
     if path.suffix == ".npz":
-        with whole_file(path) as file:
+        with files.whole_file(path) as file:
             np.savez_compressed(file, **columns)
     elif path.suffix == ".csv":
         numbers = [np.char.mod("%.7g", column) for column in list(columns.values())[1:]]
-        write_csv(path, columns, zip(columns["run"], *numbers, strict=True))
+        files.write_csv(path, columns, zip(columns["run"], *numbers, strict=True))
     else:
         raise ValueError(f"{path}: expected a name ending in .csv or .npz, got {path.suffix!r}")
 
@@ -191,7 +185,7 @@ def read_log(
     recordings: list[Recording] = []
     logged: set[bool] = set()
     for path in map(Path, paths):
-        table: Columns = read_csv(path, ["run"]) if path.suffix.lower() == ".csv" else {}
+        table: Columns = files.read_csv(path, ["run"]) if path.suffix.lower() == ".csv" else {}
         table = table or _read_npz(path)
         got = names if joints else _joints(path, table)
         names = names or got
@@ -209,10 +203,10 @@ def read_log(
 
 def _read_npz(path: Path) -> Columns:
     """Columns of an `.npz`, once run and time are those of a log: they justify the others."""
-    narrow = load_arrays(path, ["run", "time"])
+    narrow = files.load_arrays(path, ["run", "time"])
     check_columns(path, narrow, {name: LOG[name] for name in ("run", "time")})
     _runs(path, narrow["run"].tolist(), narrow["time"])
-    table: dict[str, Any] = load_arrays(path)
+    table: dict[str, Any] = files.load_arrays(path)
     return table | {"run": table["run"].tolist()}
 
 

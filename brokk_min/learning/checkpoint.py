@@ -20,19 +20,7 @@ from tqdm import tqdm
 from brokk_min import ppo
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import State, TaskConfig, observation_scale
-from brokk_min.identification.files import (
-    LARGEST,
-    LONGEST_LINE,
-    brief,
-    expect_same,
-    expected,
-    open_regular,
-    parse_json,
-    read_csv,
-    require,
-    whole_file,
-    write_csv,
-)
+from brokk_min.identification import files
 from brokk_min.identification.net_file import fingerprint
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import Policy, contract, save_policy
@@ -95,7 +83,7 @@ def train_policy(
     loss = ppo.ppo_loss if critic else regression_loss
     with log.bar, closing(log):
         agent = ppo.train(env, config, seed, log.on_update, estimate, loss, learner)
-    write_csv(log.curve, log.rows[0], [row.values() for row in log.rows])
+    files.write_csv(log.curve, log.rows[0], [row.values() for row in log.rows])
     policy = export_policy(machine, net, agent, task, about)
     save_policy(out, policy)
     log.checkpoint.unlink(missing_ok=True)
@@ -147,7 +135,7 @@ class TrainingLog:
         self.before = signal.getsignal(signal.SIGINT)
         self.writer = None
         if tensorboard is not None:
-            module = require("torch.utils.tensorboard", "tensorboard")
+            module = files.require("torch.utils.tensorboard", "tensorboard")
             self.writer = module.SummaryWriter(str(tensorboard))
 
     def begin(self, learner: Learner, resume: bool) -> None:
@@ -185,7 +173,7 @@ class TrainingLog:
         self.bar.update(learner.global_step - self.bar.n)
         self.bar.set_postfix_str(f"reward {metrics['charts/reward']:.3f}, error {error:.3f} m/s")
         if self.interrupted or learner.updates % self.config.checkpoint_every == 0:
-            write_csv(self.curve, self.rows[0], [row.values() for row in self.rows])
+            files.write_csv(self.curve, self.rows[0], [row.values() for row in self.rows])
             self.save(learner)
         if self.interrupted:
             raise KeyboardInterrupt(f"; {self.checkpoint} is saved, go on with --resume")
@@ -234,7 +222,7 @@ class TrainingLog:
         """Write a checkpoint from which a training continues to the same bits."""
         buffer = io.BytesIO()
         torch.save(self.content(learner), buffer)
-        with whole_file(self.checkpoint) as file:
+        with files.whole_file(self.checkpoint) as file:
             file.write(buffer.getvalue())
 
     def load(self, learner: Learner) -> None:
@@ -242,18 +230,18 @@ class TrainingLog:
 
         ValueError: not a checkpoint, or one of another training, with the difference.
         """
-        with expected(self.checkpoint, "a readable checkpoint"):
-            with open_regular(self.checkpoint, LARGEST) as file, zipfile.ZipFile(file) as archive:
+        with files.expected(self.checkpoint, "a readable checkpoint"):
+            with files.open_regular(self.checkpoint) as file, zipfile.ZipFile(file) as archive:
                 if any(member.compress_size != member.file_size for member in archive.infolist()):
                     raise ValueError("compressed members")
                 file.seek(0)
                 content = torch.load(file, weights_only=True)  # executes nothing
-            header = parse_json(content["header"])
+            header = files.parse_json(content["header"])
             identity = dict(header["identity"])
-        expect_same(self.checkpoint, header, {"format": FORMAT})
-        expect_same(self.checkpoint, identity, self.about)
+        files.expect_same(self.checkpoint, header, {"format": FORMAT})
+        files.expect_same(self.checkpoint, identity, self.about)
         like = self.content(learner)
-        with expected(self.checkpoint, "a complete checkpoint"):
+        with files.expected(self.checkpoint, "a complete checkpoint"):
             moments = {}
             parameters = learner.optimizer.param_groups[0]["params"]
             for i in content["optimizer"]["state"]:
@@ -285,7 +273,7 @@ def check_like(path: Path, place: str, value: Any, like: Any) -> None:
             got = wanted if torch.isfinite(value).all() else "nan or inf"
     elif isinstance(like, dict) and isinstance(value, dict):
         differing = sorted(map(str, like.keys() ^ value.keys()))
-        got = f"one of other names: {brief(differing)}" if differing else wanted
+        got = f"one of other names: {files.brief(differing)}" if differing else wanted
         for key in like.keys() & value.keys():
             check_like(path, f"{place}.{key}", value[key], like[key])
     elif isinstance(like, list | tuple) and type(value) is type(like) and len(value) == len(like):
@@ -299,9 +287,9 @@ def check_like(path: Path, place: str, value: Any, like: Any) -> None:
 
 def read_curve(path: Path, last_step: int) -> list[dict[str, Any]]:
     """Rows of a curve up to a step; ValueError: no such file, or another one."""
-    with expected(path, "the curve of the checkpoint"):
-        with open_regular(path) as file:
-            columns = file.readline(LONGEST_LINE).decode().strip().split(",")
-        table = read_csv(path, columns)
+    with files.expected(path, "the curve of the checkpoint"):
+        with files.open_regular(path) as file:
+            columns = file.readline(files.LONGEST_LINE).decode().strip().split(",")
+        table = files.read_csv(path, columns)
         rows = [dict(zip(columns, row, strict=True)) for row in zip(*table.values(), strict=True)]
         return [row for row in rows if int(row["global_step"]) <= last_step]

@@ -11,13 +11,7 @@ from numpy.typing import NDArray
 
 from brokk_min.actuator import ActuatorNet, close_valves
 from brokk_min.env import Measured, action_to_pwm, features, observation_scale
-from brokk_min.identification.files import (
-    expect_same,
-    load_arrays,
-    load_header,
-    located,
-    whole_file,
-)
+from brokk_min.identification import files
 from brokk_min.identification.formats import POLICY_ARRAYS, POLICY_HEADER, check_fields
 from brokk_min.identification.net_file import LARGEST_NET, net_arrays, net_from_arrays, select_nets
 from brokk_min.machine import Array, Machine
@@ -114,7 +108,7 @@ def save_policy(path: Path, policy: Policy) -> None:
     arrays = {"header": np.array(json.dumps(header)), "mean": policy.mean, "scale": policy.scale}
     arrays |= {f"weight_{i}": weight for i, weight in enumerate(policy.weights)}
     arrays |= {f"net_{name}": array for name, array in net_arrays(policy.net).items()}
-    with whole_file(path) as file:
+    with files.whole_file(path) as file:
         np.savez(file, **dict[str, Any](arrays))
 
 
@@ -124,12 +118,12 @@ def load_policy(path: Path, machine: Machine) -> Policy:
     ValueError: not a policy file, or one for another machine, joint order, history, rate or scale,
     with what was expected and what was found.
     """
-    arrays = load_arrays(path, largest=LARGEST_NET)
-    header = load_header(path, arrays, "policy", FORMAT)
+    arrays = files.load_arrays(path, largest=LARGEST_NET)
+    header = files.load_header(path, arrays, "policy", FORMAT)
     check_fields(path, header, POLICY_HEADER, {})
     recorded = {"paper": False, **header["contract"]}
     paper = recorded["paper"]
-    expect_same(path, recorded, contract(machine, paper))
+    files.expect_same(path, recorded, contract(machine, paper))
     scales = dict(zip(("mean", "scale"), observation_scale(machine, paper), strict=True))
     sizes = {"obs": len(scales["mean"]), "driven": len(machine.driven)}
     check_fields(path, arrays, POLICY_ARRAYS, sizes)
@@ -137,7 +131,7 @@ def load_policy(path: Path, machine: Machine) -> Policy:
         if not np.array_equal(arrays[name], value):
             raise ValueError(f"{path}: {name}: expected the machine's normalisation, got another")
     net = {name[4:]: array for name, array in arrays.items() if name.startswith("net_")}
-    with located(path):
+    with files.located(path):
         return Policy(
             contract=recorded,
             training=header["training"],

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from helpers_cli import MINI
 
-from brokk_min.cli.options import Command, WrongUse, default_policy, find_machine
+from brokk_min.cli.options import Command, WrongUse, default_policy, find_machine, names_in
 from brokk_min.identification.files import SHIPPED
 from brokk_min.machine import BROKK_170, number
 
@@ -107,3 +107,17 @@ def test_default_policy__takes_gains_from_the_folder_of_the_policy(tmp_path):
     gains.touch()
     assert default_policy(BROKK_170, policy, None) == (policy, gains)
     assert default_policy(BROKK_170, policy, other) == (policy, other)
+
+
+def test_names_in__tells_kinds_of_files_apart(tmp_path):
+    contents = {
+        b"run,time\n": {"run", "time"},
+        b'{"meta": 1, "runs": []}': {"meta", "runs"},
+        b"\x89PNG\r\n": {"PNG"},
+        b"(1.0) can0 080#\n": {"candump"},
+        b"PK\x03\x04": set(),
+        b"{": set(),
+    }
+    for content, names in contents.items():
+        (tmp_path / "file").write_bytes(content)
+        assert names_in(tmp_path / "file") == names

@@ -8,7 +8,6 @@ import pytest
 
 from brokk_min.identification.files import (
     load_arrays,
-    names_in,
     parse_json,
     require,
     whole_file,
@@ -107,20 +106,6 @@ def test_parse_json__refuses_deep_and_repeated_content():
     ):
         with pytest.raises(ValueError, match=message):
             parse_json(text)
-
-
-def test_names_in__tells_kinds_of_files_apart(tmp_path):
-    contents = {
-        b"run,time\n": {"run", "time"},
-        b'{"meta": 1, "runs": []}': {"meta", "runs"},
-        b"\x89PNG\r\n": {"PNG"},
-        b"(1.0) can0 080#\n": {"candump"},
-        b"PK\x03\x04": set(),
-        b"{": set(),
-    }
-    for content, names in contents.items():
-        (tmp_path / "file").write_bytes(content)
-        assert names_in(tmp_path / "file") == names
 
 
 def test_require__names_the_extra_that_brings_a_missing_package():
