@@ -9,7 +9,7 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 from helpers_cli import run
-from helpers_machines import small_net
+from helpers_machines import Idle, small_net
 
 from brokk_min import kinematics
 from brokk_min.evaluation import baselines, report, reproduce
@@ -28,16 +28,6 @@ ERROR = "velocity_error_mean"
 PIDS = ["jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff", "jacobian_pid_ff_awake"]
 PIDS += ["jacobian_pid_ff_integral", "jacobian_pid_ff_integral_awake"]
 CONTROLLERS = [*POLICIES, *PIDS]
-
-
-class Idle:
-    """A controller that sends no commands."""
-
-    def start(self, num):
-        return None
-
-    def __call__(self, measured, state):
-        return np.zeros((len(measured.q), BROKK_170.n)), None
 
 
 @pytest.fixture(scope="module")
