@@ -36,7 +36,7 @@ from brokk_min.cli.settings import (
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation import baselines, metrics, perfect_model, sequences
 from brokk_min.evaluation.claims import VERDICTS
-from brokk_min.evaluation.rollout import Controller
+from brokk_min.evaluation.rollout import Controller, own_drives
 from brokk_min.identification import excitation, inspection, validation
 from brokk_min.identification.coupling import history_of
 from brokk_min.identification.files import SHIPPED, brief, located, write_json
@@ -49,12 +49,13 @@ from brokk_min.machine import Machine
 
 @dataclass(kw_only=True)
 class Collect(Command):
-    """Record the machine (the analytic plant, or your own) under excitation."""
+    """Record the machine (the analytic plant, or your own) under excitation, or under a policy."""
 
     out: Path  # Log to write, .csv or .npz.
     hours: Annotated[float, Range(1e-4, 100)] = 1.0  # Driving time for each actuator [h].
     excitation: Literal["sine", "rich", "joint"] = "rich"
     """The paper's sines; steps and holds too; or the same on all joints at once: HOURS in all."""
+    policy: Path | None = None  # It drives instead: fit to its log, too, and train again.
     plant: PlantName = "analytic"  # What moves: the analytic plant, or an object of your file.
 
     def __call__(self) -> None:
@@ -63,7 +64,11 @@ class Collect(Command):
             raise WrongUse(f"--out: expected a name ending in .csv or .npz, got {self.out}")
         rng = np.random.default_rng(self.seed)
         machine = with_plant(machine, self.plant, ["analytic"])
-        log = excitation.collect(machine, self.hours, self.excitation, rng)
+        if self.policy:
+            driver = PolicyController(machine, load_policy(self.policy, machine))
+            log = own_drives(machine, [driver], self.hours, self.seed)
+        else:
+            log = excitation.collect(machine, self.hours, self.excitation, rng)
         write_log(self.out, log)
         print(f"{self.out}: {len(log.recordings)} recordings of {', '.join(log.joints)}")
 
@@ -206,6 +211,7 @@ class Train(Training):
 
     out: Path  # Policy to write, .npz.
     resume: bool = False  # Go on from OUT.checkpoint; the end is the same as without the break.
+    start: Path | None = None  # Policy to begin with, for nets that were fitted to its drives, too.
     tensorboard: Path | None = None  # Folder for TensorBoard (extra `tensorboard`).
 
     def __call__(self) -> None:
@@ -216,7 +222,8 @@ class Train(Training):
         task = make_config(TaskConfig, vars(self.task))
         config = make_config(PPOConfig, vars(self.settings))
         net = load_net(self.actuator, machine)
-        files = (self.out, self.critic, self.resume, self.tensorboard)
+        start = load_policy(self.start, machine) if self.start else None
+        files = (self.out, self.critic, self.resume, self.tensorboard, start)
         train_policy(machine, net, task, config, self.seed, *files)
         print(f"{self.out}: trained for {config.total_steps} steps; curve in {self.out}.csv")
 

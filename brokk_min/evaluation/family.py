@@ -1,7 +1,8 @@
 """The whole method on machines with physics of their own, drawn by seeds, and transfers among them.
 
 A member's controllers are made from its own logs, as a user's would be: an hour of all joints at
-once, nets that share latents, a policy, baselines tuned on the member itself. `family.json` has:
+once, nets that share latents, policies; an hour of the policies' own drives, nets fitted to both
+logs, the policies trained on; baselines tuned on the member itself. `family.json` has:
 
     members[]: seed, budget, effects, free_run {joint: error over rms speed in 10 s}, tool: errors
     of the tool in free runs, error {controller: m/s on the machine}; for each of our policies
@@ -19,24 +20,27 @@ from typing import Any
 
 import numpy as np
 
+from brokk_min.actuator import ActuatorNet
 from brokk_min.evaluation import baselines, metrics, reproduce, sequences
 from brokk_min.evaluation.metrics import Controllers
 from brokk_min.evaluation.reproduce import Budget
-from brokk_min.evaluation.rollout import Controller
+from brokk_min.evaluation.rollout import Controller, own_drives
 from brokk_min.identification import logs, validation
 from brokk_min.identification.excitation import collect, task_log
 from brokk_min.identification.files import read_json, write_json
 from brokk_min.identification.formats import FAMILY_MEMBER, check_fields
+from brokk_min.identification.logs import Log
 from brokk_min.identification.net_file import select_nets
 from brokk_min.identification.physics import draw_machine
-from brokk_min.learning.policy import POLICIES, PolicyController, load_policy
+from brokk_min.learning.policy import POLICIES, Policy, PolicyController, load_policy
 from brokk_min.machine import Machine
 
+Policies = dict[str, Policy]
 LATENTS = 4  # that the nets share
 VALVES = {"rl": "closed", "rl_open": "open"}  # our policies, and their classes at rest
 PAYLOAD = 50.0  # kg at the tool that no log has, assumed: half of a link
 # Small enough for 15 minutes a member on two cores.
-FAMILY = Budget(fit_steps=10_000, generations=5, tuning_runs=6, starts=16)
+FAMILY = Budget(fit_steps=12_000, train_steps=2_000_000, generations=5, tuning_runs=6, starts=16)
 QUICK = replace(reproduce.QUICK, train_steps=20_000, generations=2, tuning_runs=3, fit_steps=400)
 
 
@@ -65,17 +69,18 @@ def run_member(base: Machine, seed: int, out: Path, budget: Budget) -> dict[str,
         if row["budget"] != made_by:
             raise ValueError(f"{file}: budget: expected {made_by}, got {row['budget']}")
         return row
-    out.mkdir(parents=True, exist_ok=True)
     machine = draw_machine(base, seed)
     log = collect(machine, budget.hours, "joint", np.random.default_rng(seed))
     test = task_log(machine, 20, 40.0, np.random.default_rng(seed + 1))
-    logs.write_log(out / "log.npz", log)
-    every = reproduce.fit_net(machine, out / "net.npz", log, budget, {"shared": LATENTS}, seed)
+    first = replace(budget, fit_steps=budget.fit_steps // 2, train_steps=budget.train_steps // 2)
+    _, jobs = trainings(machine, out / "first", log, first, seed)
+    begun = dict(zip(VALVES, reproduce.side_by_side(jobs, {}), strict=True))
+    drivers = [PolicyController(machine, policy) for policy in begun.values()]
+    own = own_drives(machine, drivers, budget.hours, seed)
+    log = log._replace(recordings=log.recordings + own.recordings)
+    every, jobs = trainings(machine, out, log, budget, seed, begun)
     net = select_nets(machine, every)
     settings = budget.tuning_runs, budget.generations, seed
-    jobs: dict[str, Any] = {
-        name: partial(reproduce.train, machine, out, name, net, budget, seed) for name in VALVES
-    }
     jobs["tune"] = partial(baselines.tune_baselines, machine, net, *settings)
     *trained, (pids, _) = reproduce.side_by_side(jobs, {})
     baselines.write_gains(out / "gains.json", pids, baselines.gains_metadata(machine, net))
@@ -102,6 +107,22 @@ def run_member(base: Machine, seed: int, out: Path, budget: Budget) -> dict[str,
     }
     write_json(file, row)
     return row
+
+
+def trainings(
+    machine: Machine, out: Path, log: Log, budget: Budget, seed: int, start: Policies | None = None
+) -> tuple[ActuatorNet, dict[str, Any]]:
+    """Nets of all joints, fitted to a log, and calls that train our policies on them."""
+    out.mkdir(parents=True, exist_ok=True)
+    logs.write_log(out / "log.npz", log)
+    every = reproduce.fit_net(machine, out / "net.npz", log, budget, {"shared": LATENTS}, seed)
+    net = select_nets(machine, every)
+    begin = start or dict.fromkeys(VALVES)
+    calls: dict[str, Any] = {
+        name: partial(reproduce.train, machine, out, name, net, budget, seed, begin[name])
+        for name in VALVES
+    }
+    return every, calls
 
 
 def with_payload(machine: Machine) -> Machine:

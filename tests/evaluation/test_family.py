@@ -1,6 +1,7 @@
 """The family: the chain on a member, once; what it is judged by, by hand."""
 
 import json
+import os
 from dataclasses import replace
 
 import pytest
@@ -18,7 +19,9 @@ TINY = Budget(0.01, 20, 2048, 2048, 1, 1, 4, 2, 3.0)
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("family")
-    return folder, run_family(COARSE, [2], folder, TINY)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "sched_getaffinity", lambda _: {0}, raising=False)  # one process: fast
+        return folder, run_family(COARSE, [2], folder, TINY)
 
 
 def test_run_family__has_each_member_and_each_policy_on_each(made):
