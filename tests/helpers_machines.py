@@ -11,6 +11,16 @@ GAIN = 3.0  # of `obedient_net`
 POSE = np.array([1.5, 0.5, 0.58, 1.71, 1.24])  # the paper's q_s
 
 
+class Idle:
+    """A controller that sends nothing."""
+
+    def start(self, num):
+        return None
+
+    def __call__(self, measured, state):
+        return np.zeros(measured.q.shape), None
+
+
 def small_net(machine, rng, joints=()):
     """Nets with random weights for `joints` (none: the driven ones): all inputs matter."""
     joints = joints or tuple(machine.names[i] for i in machine.driven)

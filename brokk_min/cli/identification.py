@@ -12,12 +12,14 @@ import numpy as np
 from tyro.conf import OmitArgPrefixes, Positional
 
 from brokk_min.cli.options import Command, MachineName, PlantName, WrongUse, checked, with_plant
+from brokk_min.evaluation.rollout import own_drives
 from brokk_min.identification import excitation, inspection, validation
 from brokk_min.identification.coupling import history_of
 from brokk_min.identification.files import brief, located, write_json
 from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
 from brokk_min.identification.logs import Log, part_of, read_log, split, write_log
 from brokk_min.identification.net_file import load_net, save_net
+from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import Machine, number
 
 COLUMNS = {  # of the table of `inspect`: head, format, field of `JointReport`
@@ -36,12 +38,13 @@ COLUMNS = {  # of the table of `inspect`: head, format, field of `JointReport`
 
 @dataclass(kw_only=True)
 class Collect(Command):
-    """Record the machine (the analytic plant, or your own) under excitation."""
+    """Record the machine (the analytic plant, or your own) under excitation, or under a policy."""
 
     out: Path  # Log to write, .csv or .npz.
     hours: float = number("h", 1e-4, 100, 1.0)  # Driving time for each actuator [h].
     excitation: Literal["sine", "rich", "joint"] = "rich"
     """The paper's sines; steps and holds too; or the same on all joints at once: HOURS in all."""
+    policy: Path | None = None  # It drives instead: fit to its log, too, and train again.
     plant: PlantName = "analytic"  # What moves: the analytic plant, or an object of your file.
 
     def __call__(self) -> None:
@@ -50,7 +53,11 @@ class Collect(Command):
             raise WrongUse(f"--out: expected a name ending in .csv or .npz, got {self.out}")
         rng = np.random.default_rng(self.seed)
         machine = with_plant(machine, self.plant, ["analytic"])
-        log = excitation.collect(machine, self.hours, self.excitation, rng)
+        if self.policy:
+            driver = PolicyController(machine, load_policy(self.policy, machine))
+            log = own_drives(machine, [driver], self.hours, self.seed)
+        else:
+            log = excitation.collect(machine, self.hours, self.excitation, rng)
         write_log(self.out, log)
         print(f"{self.out}: {len(log.recordings)} recordings of {', '.join(log.joints)}")
 

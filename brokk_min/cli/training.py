@@ -16,6 +16,7 @@ from brokk_min.cli.options import Command, checked
 from brokk_min.env import TaskConfig
 from brokk_min.identification.net_file import load_net
 from brokk_min.learning.episodes import GRADIENT_LEARNER, PAPER_TASK
+from brokk_min.learning.policy import load_policy
 from brokk_min.machine import Machine, number
 
 
@@ -76,6 +77,7 @@ class Train(Training):
 
     out: Path  # Policy to write, .npz.
     resume: bool = False  # Go on from OUT.checkpoint; the end is the same as without the break.
+    start: Path | None = None  # Policy to begin with, for nets that were fitted to its drives, too.
     tensorboard: Path | None = None  # Folder for TensorBoard (extra `tensorboard`).
 
     def __call__(self) -> None:
@@ -83,7 +85,8 @@ class Train(Training):
 
         machine = self.check({Path(f"{self.out}.csv"): "curve"}, out="policy")
         net, task, config = self.prepare(machine)
-        files = (self.out, self.critic, self.resume, self.tensorboard)
+        start = load_policy(self.start, machine) if self.start else None
+        files = (self.out, self.critic, self.resume, self.tensorboard, start)
         train_policy(machine, net, task, config, self.seed, *files)
         print(f"{self.out}: trained for {config.total_steps} steps; curve in {self.out}.csv")
 

@@ -1,13 +1,15 @@
 """The whole method on machines with physics of their own, drawn by seeds, and transfers among them.
 
 A member's controllers are made from its own logs, as a user's would be: an hour of all joints at
-once, nets that share latents, a policy, baselines tuned on the member itself. `family.json` has:
+once, nets that share latents, policies; an hour of the policies' own drives, nets fitted to both
+logs, the policies trained on; baselines tuned on the member itself. `family.json` has:
 
     members[]: seed, budget, effects, free_run {joint: error over rms speed in 10 s}, tool: errors
-    of the tool in free runs, error {controller: m/s on the machine}, on_nets: the policy's error on
-    its nets [m/s], loaded: its error with an unknown load at the tool [m/s], best: best baseline
-    transfers[i][j]: error [m/s] of the policy of member i on member j
-    summary: median and largest of the `ratios` over the members
+    of the tool in free runs, error {controller: m/s on the machine}; for each of our policies
+    on_nets: its error on its nets [m/s], loaded: with an unknown load at the tool [m/s], best: the
+    best baseline of its class of valves at rest
+    transfers[i][j]: error [m/s] of the policy "rl" of member i on member j
+    summary: {policy: median and largest of its `ratios` over the members}
 """
 
 from collections.abc import Sequence
@@ -18,23 +20,27 @@ from typing import Any
 
 import numpy as np
 
+from brokk_min.actuator import ActuatorNet
 from brokk_min.evaluation import baselines, metrics, reproduce, sequences
 from brokk_min.evaluation.metrics import Controllers
 from brokk_min.evaluation.reproduce import Budget
-from brokk_min.evaluation.rollout import Controller
+from brokk_min.evaluation.rollout import Controller, own_drives
 from brokk_min.identification import logs, validation
 from brokk_min.identification.excitation import collect, task_log
 from brokk_min.identification.files import read_json, write_json
 from brokk_min.identification.formats import FAMILY_MEMBER, check_fields
+from brokk_min.identification.logs import Log
 from brokk_min.identification.net_file import select_nets
 from brokk_min.identification.physics import draw_machine
-from brokk_min.learning.policy import POLICIES, PolicyController, load_policy
+from brokk_min.learning.policy import POLICIES, Policy, PolicyController, load_policy
 from brokk_min.machine import Machine
 
+Policies = dict[str, Policy]
 LATENTS = 4  # that the nets share
+VALVES = {"rl": "closed", "rl_open": "open"}  # our policies, and their classes at rest
 PAYLOAD = 50.0  # kg at the tool that no log has, assumed: half of a link
 # Small enough for 15 minutes a member on two cores.
-FAMILY = Budget(fit_steps=10_000, generations=5, tuning_runs=6, starts=16)
+FAMILY = Budget(fit_steps=12_000, train_steps=2_000_000, generations=5, tuning_runs=6, starts=16)
 QUICK = replace(reproduce.QUICK, train_steps=20_000, generations=2, tuning_runs=3, fit_steps=400)
 
 
@@ -63,23 +69,26 @@ def run_member(base: Machine, seed: int, out: Path, budget: Budget) -> dict[str,
         if row["budget"] != made_by:
             raise ValueError(f"{file}: budget: expected {made_by}, got {row['budget']}")
         return row
-    out.mkdir(parents=True, exist_ok=True)
     machine = draw_machine(base, seed)
     log = collect(machine, budget.hours, "joint", np.random.default_rng(seed))
     test = task_log(machine, 20, 40.0, np.random.default_rng(seed + 1))
-    logs.write_log(out / "log.npz", log)
-    every = reproduce.fit_net(machine, out / "net.npz", log, budget, {"shared": LATENTS}, seed)
+    first = replace(budget, fit_steps=budget.fit_steps // 2, train_steps=budget.train_steps // 2)
+    _, jobs = trainings(machine, out / "first", log, first, seed)
+    begun = dict(zip(VALVES, reproduce.side_by_side(jobs, {}), strict=True))
+    drivers = [PolicyController(machine, policy) for policy in begun.values()]
+    own = own_drives(machine, drivers, budget.hours, seed)
+    log = log._replace(recordings=log.recordings + own.recordings)
+    every, jobs = trainings(machine, out, log, budget, seed, begun)
     net = select_nets(machine, every)
     settings = budget.tuning_runs, budget.generations, seed
-    jobs: dict[str, Any] = {
-        "train": partial(reproduce.train, machine, out, "rl", net, budget, seed),
-        "tune": partial(baselines.tune_baselines, machine, net, *settings),
-    }
-    clock: dict[str, float] = {}
-    policy, (pids, _) = reproduce.side_by_side(jobs, clock)
+    jobs["tune"] = partial(baselines.tune_baselines, machine, net, *settings)
+    *trained, (pids, _) = reproduce.side_by_side(jobs, {})
     baselines.write_gains(out / "gains.json", pids, baselines.gains_metadata(machine, net))
-    controllers: Controllers = {"rl": PolicyController(machine, policy), **pids}
-    errors = mean_errors(base, machine, controllers, budget)
+    policies = {
+        name: PolicyController(machine, policy)
+        for name, policy in zip(VALVES, trained, strict=True)
+    }
+    errors = mean_errors(base, machine, {**policies, **pids}, budget)
     scores = validation.score(every, test)
     driven = [base.names[i] for i in base.driven]
     row = {
@@ -89,12 +98,31 @@ def run_member(base: Machine, seed: int, out: Path, budget: Budget) -> dict[str,
         "free_run": {name: scores[name]["free_run"]["10"]["relative_error"] for name in driven},
         "tool": validation.tool_errors(machine, every, test),
         "error": errors,
-        "on_nets": mean_errors(base, machine, {"rl": controllers["rl"]}, budget, net)["rl"],
-        "loaded": mean_errors(base, with_payload(machine), {"rl": controllers["rl"]}, budget)["rl"],
-        "best": min(pids, key=errors.__getitem__),
+        "on_nets": mean_errors(base, machine, {**policies}, budget, net),
+        "loaded": mean_errors(base, with_payload(machine), {**policies}, budget),
+        "best": {
+            name: min((p for p in pids if pids[p].valves == valves), key=errors.__getitem__)
+            for name, valves in VALVES.items()
+        },
     }
     write_json(file, row)
     return row
+
+
+def trainings(
+    machine: Machine, out: Path, log: Log, budget: Budget, seed: int, start: Policies | None = None
+) -> tuple[ActuatorNet, dict[str, Any]]:
+    """Nets of all joints, fitted to a log, and calls that train our policies on them."""
+    out.mkdir(parents=True, exist_ok=True)
+    logs.write_log(out / "log.npz", log)
+    every = reproduce.fit_net(machine, out / "net.npz", log, budget, {"shared": LATENTS}, seed)
+    net = select_nets(machine, every)
+    begin = start or dict.fromkeys(VALVES)
+    calls: dict[str, Any] = {
+        name: partial(reproduce.train, machine, out, name, net, budget, seed, begin[name])
+        for name in VALVES
+    }
+    return every, calls
 
 
 def with_payload(machine: Machine) -> Machine:
@@ -126,44 +154,48 @@ def transfers(base: Machine, seeds: Sequence[int], out: Path, budget: Budget) ->
     return [[column[str(seed)] for column in columns] for seed in seeds]
 
 
-def ratios(row: dict[str, Any]) -> dict[str, float]:
-    """What a member is judged by: the policy's error over others, and the nets' largest error."""
-    rl = row["error"]["rl"]
+def ratios(row: dict[str, Any], policy: str) -> dict[str, float]:
+    """What a member is judged by: a policy's error over others, and the nets' largest error."""
+    error = row["error"][policy]
     return {
-        "to_nets": rl / row["on_nets"],
-        "to_best": rl / row["error"][row["best"]],
-        "payload": row["loaded"] / rl,
+        "to_nets": error / row["on_nets"][policy],
+        "to_best": error / row["error"][row["best"][policy]],
+        "payload": row["loaded"][policy] / error,
         "free_run": max(row["free_run"].values()),
     }
 
 
-def summary(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """Median and largest of the `ratios` over the members."""
-    table = {key: [ratios(row)[key] for row in rows] for key in ratios(rows[0])}
-    return {key: {"median": float(np.median(x)), "worst": max(x)} for key, x in table.items()}
+def summary(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
+    """Median and largest of the `ratios` over the members, of each policy."""
+    result = {}
+    for policy in VALVES:
+        found = [ratios(row, policy) for row in rows]
+        table = {key: [one[key] for one in found] for key in found[0]}
+        medians = {
+            key: {"median": float(np.median(x)), "worst": max(x)} for key, x in table.items()
+        }
+        result[policy] = medians
+    return result
+
+
+HEADS = ("member", "policy", "[m/s]", "on nets", "to nets", "PID", "to PID", "payload", "free run")
 
 
 def show(results: dict[str, Any]) -> str:
     """The table of the members, and the transfers."""
-    row = "{:>6} {:>9} {:>9} {:>8} {:>9} {:>8} {:>8} {:>9}  {}"
-    heads = [
-        "member",
-        "rl [m/s]",
-        "on nets",
-        "to nets",
-        "best PID",
-        "to best",
-        "payload",
-        "free run",
-    ]
-    lines = [row.format(*heads, "best baseline")]
-    for one in results["members"]:
-        found, errors = ratios(one), one["error"]
-        numbers = [errors["rl"], one["on_nets"], found["to_nets"], errors[one["best"]]]
-        numbers += [found["to_best"], found["payload"], found["free_run"]]
-        lines.append(row.format(one["seed"], *(f"{x:.3f}" for x in numbers), one["best"]))
-    for name, value in results["summary"].items():
-        lines.append(f"{name}: median {value['median']:.2f}, worst {value['worst']:.2f}")
-    lines.append("error [m/s] of the policy of a member (row) on a member (column):")
-    lines += ["  ".join(f"{x:.3f}" for x in errors) for errors in results["transfers"]]
+    line = "{:>6} {:>8} {:>7} {:>8} {:>8} {:>7} {:>7} {:>8} {:>9}  {}"
+    lines = [line.format(*HEADS, "best PID of its class")]
+    for row in results["members"]:
+        for policy, best in row["best"].items():
+            found, errors = ratios(row, policy), row["error"]
+            numbers = [errors[policy], row["on_nets"][policy], found["to_nets"], errors[best]]
+            numbers += [found["to_best"], found["payload"], found["free_run"]]
+            shown = [f"{number:.4f}"[:6] for number in numbers]
+            lines.append(line.format(row["seed"], policy, *shown, best))
+    for policy, table in results["summary"].items():
+        for name, value in table.items():
+            numbers_of = f"median {value['median']:.2f}, worst {value['worst']:.2f}"
+            lines.append(f"{policy} {name}: {numbers_of}")
+    lines.append("error [m/s] of the policy rl of a member (row) on a member (column):")
+    lines += ["  ".join(f"{x:.4f}" for x in errors) for errors in results["transfers"]]
     return "\n".join(lines)

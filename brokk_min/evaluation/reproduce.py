@@ -115,14 +115,18 @@ def _stage(clock: dict[str, float], bar: Any, name: str) -> Iterator[None]:
 def side_by_side(calls: Mapping[str, Callable[[], Any]], clock: dict[str, float]) -> list[Any]:
     """Results of independent calls, each in a process of one thread, as many at once as cores.
 
-    `clock` gets the seconds of each. The first exception is raised.
+    One core runs them one after the other, here. `clock` gets the seconds of each. The first
+    exception is raised.
     """
     cores = os.cpu_count() or 1
     if hasattr(os, "sched_getaffinity"):
         cores = len(os.sched_getaffinity(0))
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(cores, len(calls)), context, _one_thread) as pool:
-        done = list(pool.map(_timed, calls.values()))
+    if cores == 1:
+        done = [_timed(call) for call in calls.values()]
+    else:
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(min(cores, len(calls)), context, _one_thread) as pool:
+            done = list(pool.map(_timed, calls.values()))
     clock |= {name: seconds for name, (seconds, _) in zip(calls, done, strict=True)}
     return [result for _, result in done]
 
@@ -187,11 +191,18 @@ def settings(name: str, budget: Budget) -> tuple[TaskConfig, PPOConfig]:
 
 
 def train(
-    machine: Machine, out: Path, name: str, net: ActuatorNet, budget: Budget, seed: int
+    machine: Machine,
+    out: Path,
+    name: str,
+    net: ActuatorNet,
+    budget: Budget,
+    seed: int,
+    start: Policy | None = None,
 ) -> Policy:
-    """One of `POLICIES`, by its own settings."""
+    """One of `POLICIES`, by its own settings; `start` as in `train_policy`."""
     task, learner = settings(name, budget)
-    return train_policy(machine, net, task, learner, seed, out / POLICIES[name], resume=True)
+    file = out / POLICIES[name]
+    return train_policy(machine, net, task, learner, seed, file, resume=True, start=start)
 
 
 def driven_log(machine: Machine, traces: Traces, controller: str) -> Log:

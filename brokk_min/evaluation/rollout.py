@@ -1,5 +1,6 @@
 """A controller follows given tool velocities, on the analytic plant or on the nets."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
 
@@ -8,6 +9,8 @@ from numpy.typing import ArrayLike
 
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import Encoder, Measured, TaskConfig, initial_state, measure, reward, transition
+from brokk_min.evaluation.sequences import tuning_set
+from brokk_min.identification.logs import Log, machine_log
 from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocity
 from brokk_min.learning.episodes import draw_noise
 from brokk_min.machine import Array, Machine, read_encoder
@@ -67,3 +70,22 @@ def rollout(
         rewards = reward(goal, v_tool)
         ticks.append(Trace(state.q, state.q_dot, q_measured, u, p_tool, v_tool, rewards))
     return Trace(*(np.array(arrays) for arrays in zip(*ticks, strict=True)))
+
+
+def own_drives(machine: Machine, controllers: Sequence[Controller], hours: float, seed: int) -> Log:
+    """Recordings of controllers on the plant, `hours` in all: what their nets should know best.
+
+    Nets that are fitted to these, too, err less where the policy drives: DAgger for models (Ross
+    and Bagnell, ICML 2012; Nagabandi et al., ICRA 2018). Runs of 20 s with goals as in training, of
+    seeds of their own. ValueError: too few feasible starts.
+    """
+    num = max(1, round(hours * 180 / len(controllers)))
+    recordings = []
+    for k, controller in enumerate(controllers):
+        start, goals = tuning_set(machine, num, seed + 1000 * (k + 1))
+        rng = np.random.default_rng(seed)
+        trace = rollout(machine, controller, start, goals, TaskConfig(), rng)
+        for i in range(num):
+            run = (trace.u[:, i].astype(float), trace.q_measured[:, i].astype(float))
+            recordings.append((f"own_{k}_{i:03d}", *run))
+    return machine_log(machine, recordings)

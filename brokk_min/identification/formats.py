@@ -141,9 +141,9 @@ FAMILY_MEMBER: Fields = {
     "budget": {"*": Field("number")},
     "free_run": {"*": Field("float", none=True)},
     "error": {"rl": Field("float", 0), "*": Field("float", 0)},
-    "on_nets": Field("float", 0),
-    "loaded": Field("float", 0),
-    "best": Field("text", 1, 100),
+    "on_nets": {"*": Field("float", 0)},
+    "loaded": {"*": Field("float", 0)},
+    "best": {"*": Field("text", 1, 100)},
 }
 
 

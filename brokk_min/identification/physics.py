@@ -37,7 +37,7 @@ class PhysicsState(NamedTuple):
     z: Array  # valve activation, 0..1
     delayed: Array  # commands not yet at the valve, next first, (..., n, steps)
     v_dot: Array  # cylinder acceleration [m/s^2], of joints with an arm mode
-    play: Array  # opening behind the spool's hysteresis, -1..1
+    play: Array  # command behind the spool's hysteresis, -1..1
     encoder: Array  # angle of the encoder's shaft behind its backlash [rad]
     warmth: Array  # of the oil, 0 cold to 1 hot, (..., 1)
     tick: Array  # ticks since the reset, (..., 1)
@@ -80,13 +80,11 @@ class Physics:
         longest = round(self.jitter / machine.plant_dt)
         later = np.rint(longest * pseudo_random(state.tick))[..., None].astype(int)
         at = np.broadcast_to(longest - later + np.arange(steps), held.shape)
-        openings = asymmetric_opening(
-            np.take_along_axis(commands, at, -1), dead_zones(self, machine)
-        )
+        commanded = np.take_along_axis(commands, at, -1)
         torque = gravity_torque(machine, state.q, self.link_mass, self.payload, self.tilt)
         p_load = torque / (lever_arm(machine, state.q) * machine.column("cylinder_area"))
         for i in range(steps):
-            state = euler_step(self, machine, state, openings[..., i], p_load / self.pressure)
+            state = euler_step(self, machine, state, commanded[..., i], p_load / self.pressure)
         warmth = warm(state.warmth, np.abs(state.s), machine.dt, self.warm_up)
         encoder = play(state.encoder, state.q, self.backlash / 2)
         later_on = {"delayed": commands[..., steps:], "tick": state.tick + 1}
@@ -94,13 +92,17 @@ class Physics:
 
 
 def euler_step(
-    physics: Physics, machine: Machine, state: PhysicsState, opening: Array, load: Array
+    physics: Physics, machine: Machine, state: PhysicsState, u: Array, load: Array
 ) -> PhysicsState:
-    """All states `plant_dt` later; `load` p_L / p_s (..., n) holds for the tick."""
+    """All states `plant_dt` later; `load` p_L / p_s (..., n) holds for the tick.
+
+    The play acts on the command: within the dead zone a spool that sticks leaks nothing.
+    """
     m, dt, s, v = machine, machine.plant_dt, state.s, state.v
     viscous = 1 + physics.cold * (1 - state.warmth)
-    play_next = play(state.play, opening, physics.hysteresis)
-    s_next = s + dt * (play_next - s) / (m.tau_spool * viscous)  # ds/dt = (x - s) / tau_s
+    play_next = play(state.play, u, physics.hysteresis)
+    opening = asymmetric_opening(play_next, dead_zones(physics, m))
+    s_next = s + dt * (opening - s) / (m.tau_spool * viscous)  # ds/dt = (x - s) / tau_s
     open_valve = np.abs(s) > m.spool_threshold
     tau = np.where(open_valve > state.z, m.tau_valve_up, m.tau_valve_down)
     z_next = state.z + dt * (open_valve - state.z) / tau
@@ -157,8 +159,8 @@ def load_factor(load: Array, s: Array) -> Array:
 
 
 def asymmetric_opening(u: Array, zones: Array) -> Array:
-    """`valve_opening` with dead zones up and down by joint: u (..., n, T), zones (n, 2)."""
-    up, down = zones[:, :1], zones[:, 1:]
+    """`valve_opening` with dead zones up and down by joint: u (..., n), zones (n, 2)."""
+    up, down = zones.T
     return np.maximum(u - up, 0) / (1 - up) - np.maximum(-u - down, 0) / (1 - down)
 
 

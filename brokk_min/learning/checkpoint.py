@@ -1,5 +1,6 @@
 """Training of a policy with files: checkpoint, learning curve, TensorBoard, policy."""
 
+import hashlib
 import io
 import json
 import signal
@@ -59,6 +60,7 @@ def train_policy(
     critic: bool = False,
     resume: bool = False,
     tensorboard: Path | None = None,
+    start: Policy | None = None,
 ) -> Policy:
     """Train a policy on the nets and write it to `out`.
 
@@ -67,6 +69,7 @@ def train_policy(
     `critic`: PPO with a critic (always with `task.paper`), not gradients of the simulation.
     `resume`: continue from the checkpoint; the result is the same as without interruption.
     `tensorboard`: folder for the scalars of the curve (needs the extra `tensorboard`).
+    `start`: a policy that the training starts from, for nets that it was not trained on.
     ValueError: settings that do not fit, a checkpoint of another training, or a number that is not
     finite. OSError: a file that cannot be written. The last checkpoint stays.
     """
@@ -76,6 +79,8 @@ def train_policy(
     about = describe_training(machine, net, task, config, critic, seed)
     env = TaskVectorEnv(config.num_envs, net, machine, task)
     learner = ppo.make_learner(env, config, seed, critic)
+    if start:
+        about["start"] = load_actor(learner.agent, start)
     stagger_episodes(env)
     log = TrainingLog(env, config, out, about, tensorboard)
     log.begin(learner, resume)
@@ -95,6 +100,18 @@ def stagger_episodes(env: TaskVectorEnv) -> None:
     assert env.state is not None
     episode_ticks = round(env.config.episode_s * env.machine.rate)
     env.state = replace(env.state, ticks=np.arange(env.num_envs) * episode_ticks // env.num_envs)
+
+
+def load_actor(agent: Agent, policy: Policy) -> str:
+    """Give the actor the weights of a policy; their hash. ValueError: the other kind of agent."""
+    layers = [layer for layer in agent.actor if isinstance(layer, nn.Linear)]
+    if policy.weights[0].shape[0] != layers[0].in_features:
+        raise ValueError("start: expected a policy of the same kind of agent (--paper or not)")
+    with torch.no_grad():
+        for layer, w, b in zip(layers, policy.weights[::2], policy.weights[1::2], strict=True):
+            layer.weight.copy_(torch.tensor(w.T))
+            layer.bias.copy_(torch.tensor(b))
+    return hashlib.sha256(b"".join(w.tobytes() for w in policy.weights)).hexdigest()[:16]
 
 
 def export_policy(

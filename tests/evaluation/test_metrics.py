@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers_machines import obedient_net
+from helpers_machines import Idle, obedient_net
 from scipy import stats
 
 from brokk_min.evaluation import metrics as m
@@ -147,16 +147,6 @@ def held(*parts):
 )
 def test_settling_time__by_hand(goals, v, expected):
     assert figures(v, goals)["settling_time"] == pytest.approx(expected)
-
-
-class Idle:
-    """A controller that sends nothing."""
-
-    def start(self, num):
-        return None
-
-    def __call__(self, measured, state):
-        return np.zeros((len(measured.q), BROKK_170.n)), None
 
 
 STARTS = np.array([BROKK_170.q_start, [1.0, 0.5, 0.9, 1.5, 1.0]])

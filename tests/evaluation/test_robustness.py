@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers_machines import obedient_net, small_net
+from helpers_machines import Idle, obedient_net, small_net
 
 from brokk_min import kinematics
 from brokk_min.actuator import plant_reset, plant_step
@@ -108,16 +108,6 @@ def test_robustness__has_a_row_for_each_variation_and_controller():
     assert error["supply flow -20 %"] == error["nominal"]  # the pump has more than they need
     demand = {name: row["pid"]["supply_demand"] for name, row in table.items()}
     assert demand["supply flow -20 %"] == pytest.approx(demand["nominal"] / 0.8)
-
-
-class Idle:
-    """A controller that sends no commands."""
-
-    def start(self, num):
-        return None
-
-    def __call__(self, measured, state):
-        return np.zeros((len(measured.q), BROKK_170.n)), None
 
 
 def test_near_singularities__drives_along_what_an_upright_arm_can_do_least():

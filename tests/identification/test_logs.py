@@ -97,7 +97,7 @@ def test_write_log__refuses_another_suffix_and_an_empty_log(tmp_path, name):
 
 
 @given(
-    st.lists(st.floats(0.004, 0.05), min_size=2, max_size=60),
+    st.lists(st.floats(0.0255, 0.05), min_size=2, max_size=60),
     st.integers(0, 2**16),
     st.sampled_from([0.0, 7.0, 1.7e9]),
 )
@@ -113,6 +113,19 @@ def test_read_log__resamples_as_a_loop_does(tmp_path_factory, steps, seed, start
     u, q = resampled(columns, "a")
     np.testing.assert_array_equal(recording.u[:, 0], u)
     np.testing.assert_allclose(recording.q[:, 0], q, atol=1e-5 if start > 1e9 else 1e-9)
+
+
+def test_read_log__takes_means_of_fast_logs_by_hand(tmp_path):
+    """100 Hz: a step between two ticks has its moment; angles and velocities lose their noise."""
+    time = np.arange(41) / 100
+    noise = 0.1 * (-1.0) ** np.arange(41)
+    columns = {"run": np.repeat("x", 41), "time": time, "u_a": (time > 0.175).astype(float)}
+    columns |= {"q_a": time + noise, "q_dot_a": 1 + noise}
+    (recording,) = read_log([write(tmp_path / "fast.npz", columns)], 4).recordings
+    np.testing.assert_allclose(recording.u[:, 0], [0, 0, 0, 0.4, 1, 1, 1, 1, 1])
+    np.testing.assert_allclose(recording.q[1:-1, 0], 0.05 * np.arange(1, 8), atol=0.021)
+    np.testing.assert_allclose(recording.q_dot[1:-1, 0], 1, atol=0.021)
+    np.testing.assert_allclose(recording.q[[0, -1], 0], [0.1, 0.5])  # nothing beyond the ends
 
 
 @pytest.mark.parametrize("rate", [10.0, 25.0, 50.0])

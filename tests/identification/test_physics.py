@@ -78,16 +78,18 @@ def test_load__slows_the_lift_and_speeds_the_fall():
 
 def test_asymmetric_opening__has_a_dead_zone_for_each_direction():
     u = np.array([[0.15, 0.55, -0.15, -0.6], [0.15, 0.55, -0.15, -0.6]])
-    opening = physics.asymmetric_opening(u, np.array([[0.1, 0.2], [0.0, 0.0]]))
-    np.testing.assert_allclose(opening, [[0.05 / 0.9, 0.5, 0, -0.5], u[1]])
+    opening = physics.asymmetric_opening(u.T, np.array([[0.1, 0.2], [0.0, 0.0]]))
+    np.testing.assert_allclose(opening.T, [[0.05 / 0.9, 0.5, 0, -0.5], u[1]])
 
 
 def test_hysteresis__leaves_the_spool_open_behind_a_falling_command():
     machine = replace(BROKK_170, plant=Physics(hysteresis=0.02))
     rising, falling = constant(0.2, 2, 40), constant(0.4, 2, 80)
     falling[40:] = constant(0.2, 2, 40)
-    assert drive(machine, rising)[-1].s[2] == pytest.approx(0.13 / 0.93 - 0.02, abs=1e-4)
-    assert drive(machine, falling)[-1].s[2] == pytest.approx(0.13 / 0.93 + 0.02, abs=1e-4)
+    assert drive(machine, rising)[-1].s[2] == pytest.approx(0.11 / 0.93, abs=1e-4)
+    assert drive(machine, falling)[-1].s[2] == pytest.approx(0.15 / 0.93, abs=1e-4)
+    at_rest = np.concatenate([falling, constant(0.0, 2, 40)])
+    assert drive(machine, at_rest)[-1].s[2] == pytest.approx(0, abs=1e-6)
 
 
 def test_stick_slip__holds_a_slow_cylinder_and_lets_a_moving_one_go_on():

@@ -98,6 +98,17 @@ def test_train_policy__writes_a_policy_and_its_curve(tmp_path, critic):
     assert sorted(os.listdir(tmp_path)) == ["p.npz", "p.npz.csv"]
 
 
+def test_train_policy__starts_from_a_policy(tmp_path, straight):
+    begun = load_policy(straight, BROKK_170)
+    still = replace(TINY, learning_rate=1e-9)
+    policy = run(tmp_path / "p.npz", config=still, start=begun)
+    for ours, theirs in zip(policy.weights, begun.weights, strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-6)
+    assert len(policy.training["start"]) == 16
+    with pytest.raises(ValueError, match="start: expected a policy of the same kind"):
+        run(tmp_path / "q.npz", task=replace(TASK, paper=True), start=begun)
+
+
 def test_export_policy__is_the_actor_of_the_papers_agent_through_a_file(tmp_path):
     task = replace(TASK, paper=True)
     env = TaskVectorEnv(8, NET, BROKK_170, task)

@@ -8,6 +8,7 @@ import inspect
 import pickle
 import re
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -103,11 +104,15 @@ OUTSIDE = {  # numbers beyond the ends of the range of each field
 def test_each_number__is_refused_outside_its_range_and_where_it_is_none(name):
     of_joint = name in {field.name for field in dataclasses.fields(Joint)}
     whole = dict(numeric_fields())[name].type == "int"
-    for value in (*OUTSIDE[name], NAN, INF, -INF, "1", None, True, np.zeros(2), *[0.5] * whole):
+    kind = f"expected a {'whole' if whole else 'finite'} number"
+    no_number = (NAN, INF, -INF, "1", None, True, np.zeros(2), *[0.5] * whole)
+    for value, words in (*product(OUTSIDE[name], [" to "]), *product(no_number, [kind])):
         with pytest.raises(ValueError) as caught:
             changed(**with_joint(4, **{name: value}) if of_joint else {name: value})
-        assert str(caught.value).startswith(f"{'q5.' * of_joint}{name}: expected ")
-        assert str(caught.value).endswith(f"got {value!r}")
+        message = str(caught.value)
+        assert message.startswith(f"{'q5.' * of_joint}{name}: expected ")
+        assert message.endswith(f"got {value!r}")
+        assert words in message
 
 
 def test_every_numeric_field_is_in_the_table_of_numbers():

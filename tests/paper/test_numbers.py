@@ -1,4 +1,4 @@
-"""The paper's numbers: its constants, and what its preliminary tests found of the machine."""
+"""The paper's constants; what it found of the machine, the tests of the plant hold."""
 
 from __future__ import annotations
 
