@@ -21,15 +21,8 @@ from brokk_min.evaluation import metrics
 from brokk_min.evaluation.baselines import gains_metadata, read_gains
 from brokk_min.evaluation.metrics import Controllers, Rows, by_start, mean_interval
 from brokk_min.evaluation.sequences import AXES, evaluation_starts, task_sequences
-from brokk_min.identification.files import (
-    brief,
-    expect_same,
-    expected,
-    read_json,
-    require,
-    write_json,
-)
-from brokk_min.identification.formats import SWEEP, check_fields
+from brokk_min.identification.files import brief, expect_same, read_json, require, write_json
+from brokk_min.identification.formats import RUNS, SWEEP, Field, check_fields
 from brokk_min.learning.checkpoint import describe_training, train_policy
 from brokk_min.learning.policy import Policy, PolicyController, load_policy
 from brokk_min.machine import Array, Machine
@@ -100,12 +93,11 @@ def run_seed(
     result_file = out / f"seed_{seed}.json"
     identity = describe_training(machine, net, task, config, critic, seed)
     if result_file.exists():
-        with expected(result_file, "the result of a seed"):
-            result: dict[str, Any] = read_json(result_file, "the result of a seed")
-            rows: Rows = result["runs"]
-            recorded = result["identity"]
-        expect_same(result_file, recorded, {**identity, **about})
-        return rows
+        result: dict[str, Any] = read_json(result_file, "the result of a seed")
+        check_fields(result_file, result, {"identity": Field("object"), **RUNS}, {})
+        expect_same(result_file, result["identity"], {**identity, **about})
+        recorded: Rows = result["runs"]
+        return recorded
     policy = load_policy(policy_file, machine) if policy_file.exists() else None
     if policy is None or dict(policy.training) != identity:
         resume = Path(f"{policy_file}.checkpoint").exists()

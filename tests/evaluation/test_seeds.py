@@ -15,6 +15,7 @@ from brokk_min.evaluation import seeds
 from brokk_min.evaluation.baselines import gains_metadata
 from brokk_min.evaluation.seeds import run_seed, run_seeds
 from brokk_min.evaluation.sequences import axis_sequences
+from brokk_min.identification import formats
 from brokk_min.identification.net_file import save_net
 from brokk_min.learning.checkpoint import train_policy
 from brokk_min.learning.policy import load_policy
@@ -28,7 +29,9 @@ NET = small_net(BROKK_170, np.random.default_rng(0))
 
 
 def first_bias(policy):
-    return [{"bias": float(policy.weights[-1][0])}]
+    """Rows of an evaluation whose figures are all the policy's first bias."""
+    figures = dict.fromkeys(formats.RUN, abs(float(policy.weights[-1][0])))
+    return [figures | {"controller": "rl", "sequence": "x", "start": 0, "kind": "workspace"}]
 
 
 def seed_job(out, evaluate=first_bias, config=TINY):
