@@ -19,7 +19,7 @@ import signal
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -33,7 +33,9 @@ from brokk_min.can.drive_log import read_frames
 from brokk_min.cli.options import find_machine
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation.baselines import baselines, gains_metadata, gains_table, read_gains
-from brokk_min.evaluation.seeds import read_seeds
+from brokk_min.evaluation.family import run_member
+from brokk_min.evaluation.reproduce import QUICK
+from brokk_min.evaluation.seeds import read_seeds, run_seed
 from brokk_min.evaluation.sequences import read_commands, read_starts
 from brokk_min.identification import formats
 from brokk_min.identification.files import SHIPPED
@@ -45,6 +47,8 @@ from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import load_policy
 from brokk_min.machine import BROKK_170, Machine
 from brokk_min.ppo import PPOConfig, make_learner
+from brokk_min.viewer.replay import read_results
+from brokk_min.viewer.tracing import Attempt, read_attempts
 
 MEMORY = 2**30  # bytes
 SECONDS = 10
@@ -52,7 +56,7 @@ REMOVED = object()
 NESTED = "nested a thousand deep"
 SHIPPED_POLICY = SHIPPED / "brokk170" / "policy.npz"
 Content = dict[str, Any]
-Place = tuple[str, ...]
+Place = tuple[Any, ...]
 
 
 class Format(NamedTuple):
@@ -115,6 +119,8 @@ def places(table: Any, content: Any, within: Place = ()) -> dict[Place, Field]:
     """Fields by their place in a content."""
     if isinstance(table, Field):
         return {within: table}
+    if isinstance(table, list):
+        return places(table[0], content[0], (*within, 0))
     found = {}
     for name in content:
         if name in table:
@@ -147,6 +153,20 @@ def sweep() -> Content:
     mean = {"mean": 0.1, "low": 0.05, "high": 0.15}
     row = {"velocity_error_all": mean, "off_axis_drift_max": mean, "valve_travel": mean}
     return {"meta": {"machine": "m", "actuator": "a"}, "table": {"rl": row, "pid": row}}
+
+
+def runs(policy: Path) -> Content:
+    numbers = dict.fromkeys(("velocity_rmse", "velocity_error_mean", "jerk_rms"), 0.1)
+    numbers |= dict.fromkeys(("off_axis_drift_max", "valve_travel"), 0.2)
+    row = {"controller": "rl", "sequence": "x", "start": 0, "kind": "workspace", **numbers}
+    meta = {"machine": "brokk170", "seed": 0, "plant": "analytic", "starts": "2"}
+    return {"meta": meta | {"policy": str(policy)}, "starts": [BROKK_170.q_start], "runs": [row]}
+
+
+def member() -> Content:
+    errors = {"error": {"rl": 0.1, "pid": 0.2}, "free_run": {"q1": 0.1}}
+    numbers = {"on_nets": 0.1, "loaded": 0.2, "best": "pid"}
+    return {"seed": 0, "budget": asdict(QUICK), **errors, **numbers}
 
 
 def checkpoint(folder: Path) -> tuple[Content, Callable[[Path], object]]:
@@ -225,6 +245,21 @@ def all_formats(folder: Path) -> Iterator[Format]:
     starts = formats.starts_of(BROKK_170)
     read = partial(read_starts, machine=BROKK_170)
     yield Format("s.csv", poses, encode_csv, read, places(starts, poses))
+    tried = {"when": ["now"] * 3, "task": ["box"] * 3, "mode": ["rl"] * 3}
+    tried |= {name: [1.0, 2.0, 3.0] for name in Attempt._fields[3:]}
+    text, number = (Field(kind, shape=("rows",)) for kind in ("text", "number"))
+    found = {(name,): text if name in ("when", "task", "mode") else number for name in tried}
+    yield Format("attempts.csv", tried, encode_csv, read_attempts, found)
+    results = runs(SHIPPED_POLICY)
+    read = partial(read_results, BROKK_170, controllers=["rl"])
+    yield Format("runs.json", results, encode_json, read, places(formats.RESULTS, results))
+    known = (BROKK_170, net, TaskConfig(), PPOConfig())
+    seed = {"identity": describe_training(*known, False, 0), "runs": results["runs"]}
+    read = lambda path: run_seed(*known, path.parent, None, {}, 0)  # noqa: E731
+    yield Format("seed_0.json", seed, encode_json, read, places(formats.RUNS, seed))
+    made = member()
+    read = lambda path: run_member(BROKK_170, 0, path.parent, QUICK)  # noqa: E731
+    yield Format("member.json", made, encode_json, read, places(formats.FAMILY_MEMBER, made))
     content, load = checkpoint(folder)
     yield Format("policy.npz.checkpoint", content, encode_torch, load, leaves(content))
     frames = {str(i): f"({i}.5) can0 18{i}#0001020304" for i in range(1, 9)}
@@ -244,7 +279,7 @@ def all_formats(folder: Path) -> Iterator[Format]:
 def with_value(content: Content, place: Place, value: Any) -> Content:
     """A copy of a content with another value at one place."""
     name, *rest = place
-    result = dict(content)
+    result = content.copy()
     if rest:
         result[name] = with_value(content[name], tuple(rest), value)
     elif value is REMOVED:
@@ -310,6 +345,8 @@ def field_changes(form: Format, rng: np.random.Generator) -> Iterator[Change]:
                 continue
             if form.encode is encode_csv and field.kind == "text" and "retyped" in label:
                 continue  # all cells of a CSV are text
+            if (field.kind, label) == ("text", "cut") and field.low <= 0:
+                continue  # it may be empty
             if form.encode is encode_csv and label == "retyped to text":
                 bad = np.array([*value[:-1].tolist(), "a"], object)
             if form.encode is encode_machine and label in ("removed", "reshaped"):

@@ -91,9 +91,6 @@ class World:
         self.drive = Drive(machine, controller, self.bus, operator)
         self.say(self.simulated.boot())
 
-    def fileno(self):
-        raise NotImplementedError
-
     def send(self, message, timeout=None):
         for can_id, data in self.downward(message.arbitration_id, bytes(message.data)):
             self.near.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))

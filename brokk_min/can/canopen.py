@@ -114,11 +114,17 @@ class Nodes:
 
 
 def check_bus(machine: Machine) -> None:
-    """ValueError: more joints than a valve frame has, or ticks that the watchdog does not allow."""
+    """ValueError: more joints than a valve frame has, its identifier twice, or too long ticks."""
     if machine.n > MAX_JOINTS:
         raise ValueError(
             f"{machine.name}: expected at most {MAX_JOINTS} joints in a valve frame, "
             f"got {machine.n}"
+        )
+    others = [*used_ids(machine), *(SDO_REQUEST + joint.encoder_node for joint in machine.joints)]
+    if others.count(machine.valve_frame_id) > 1:
+        raise ValueError(
+            f"{machine.name}: valve_frame_id: expected an identifier of no other frame, "
+            f"got 0x{machine.valve_frame_id:03X}"
         )
     slowest = 1.5 / WATCHDOG  # Hz: a tick may be late by half
     if machine.rate < slowest:

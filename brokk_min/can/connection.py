@@ -21,22 +21,20 @@ from brokk_min.identification.files import reason, require
 class Bus:
     """A CAN bus with a monotonic clock and a log of what is sent and read."""
 
-    bus: Any  # of python-can, without filters
+    bus: Any  # of python-can
     writer: Any = None  # python-can's candump writer
     name: str = "can"  # of the bus in the log
     echo: bool = False  # does the bus give back what we send?
+    file: int = -1  # descriptor to wait on; -1: `bus` waits itself
     clock: Callable[[], float] = time.monotonic  # s
     sleep: Callable[[float], object] = time.sleep
 
     def __post_init__(self) -> None:
-        """Find the descriptor to wait on, if the bus has one."""
+        """Begin with nothing sent and nothing to log."""
         self.start = time.time() - self.clock()  # the log has the time of day, but it may be set
         self.echoes: deque[tuple[int, bytes]] = deque(maxlen=64 if self.echo else 0)
         self.unwritten: deque[Any] = deque()  # messages for the log
         self.message = require("can", "hw").Message
-        self.file = -1
-        with suppress(NotImplementedError):
-            self.file = self.bus.fileno()
 
     def now(self) -> float:
         """Time of day at the start plus monotonic time since [s], in whole microseconds."""
@@ -119,6 +117,7 @@ def open_bus(
     ValueError: python-can is not installed, finds no such bus, or fails in the block.
     """
     can = require("can", "hw")
+    can.log.setLevel("ERROR")  # it also warns of a bus that it could not open
     where = f"{interface} {channel}: expected a CAN bus"
     filters = [{"can_id": i, "can_mask": 0x7FF, "extended": False} for i in ids]
     try:
@@ -128,6 +127,8 @@ def open_bus(
     name = channel if interface == "socketcan" else interface
     writer = can.CanutilsLogWriter(log) if log else None
     bus = Bus(raw, writer, name, echo=interface == "udp_multicast")
+    with suppress(NotImplementedError):  # by this python-can says that a bus has no descriptor
+        bus.file = raw.fileno()
     try:
         yield bus
     except can.CanError as error:

@@ -68,8 +68,8 @@ class Evaluate(Command):
         net = policy.net if self.plant == "net" else None
         inputs = (self.commands, self.starts, self.num_starts, self.seed)
         commands, starts = sequences.goals_and_starts(machine, *inputs)
-        print(f"gains of the baselines: {gains or 'tuned now'}", file=sys.stderr)
         controllers = self._controllers(machine, policy, gains, net)
+        print(f"gains of the baselines: {gains or 'tuned now'}", file=sys.stderr)
         if self.perfect_model:
             controllers |= perfect_model.perfect_models(machine, starts)
         config = TaskConfig(noise=self.noise)

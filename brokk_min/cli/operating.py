@@ -246,11 +246,11 @@ class Play(Command):
         if not self.policy and not path.exists():
             return {}
         policy = load_policy(path, machine)
-        print(f"gains of the Jacobian controller: {gains or 'set by hand'}", file=sys.stderr)
         if gains:
             known = baselines.read_gains(gains, machine, policy.net)
         else:
             known = baselines.baselines(machine, policy.net)
+        print(f"gains of the Jacobian controller: {gains or 'set by hand'}", file=sys.stderr)
         rl = PolicyController(machine, policy)
         return {"rl": rl, "jacobian": known["jacobian_pid_k0.1"]}
 

@@ -27,7 +27,7 @@ from brokk_min.evaluation.reproduce import Budget
 from brokk_min.evaluation.rollout import Controller, own_drives
 from brokk_min.identification import logs, validation
 from brokk_min.identification.excitation import collect, task_log
-from brokk_min.identification.files import read_json, write_json
+from brokk_min.identification.files import expect_same, read_json, write_json
 from brokk_min.identification.formats import FAMILY_MEMBER, check_fields
 from brokk_min.identification.logs import Log
 from brokk_min.identification.net_file import select_nets
@@ -66,8 +66,7 @@ def run_member(base: Machine, seed: int, out: Path, budget: Budget) -> dict[str,
     if file.exists():
         row: dict[str, Any] = read_json(file, "results of `family`")
         check_fields(file, row, FAMILY_MEMBER, {})
-        if row["budget"] != made_by:
-            raise ValueError(f"{file}: budget: expected {made_by}, got {row['budget']}")
+        expect_same(file, row, {"budget": made_by})
         return row
     machine = draw_machine(base, seed)
     log = collect(machine, budget.hours, "joint", np.random.default_rng(seed))

@@ -21,8 +21,8 @@ from brokk_min.evaluation import metrics
 from brokk_min.evaluation.baselines import gains_metadata, read_gains
 from brokk_min.evaluation.metrics import Controllers, Rows, by_start, mean_interval
 from brokk_min.evaluation.sequences import AXES, evaluation_starts, task_sequences
-from brokk_min.identification.files import brief, expect_same, expected, read_json, write_json
-from brokk_min.identification.formats import SWEEP, check_fields
+from brokk_min.identification.files import brief, expect_same, read_json, write_json
+from brokk_min.identification.formats import RUNS, SWEEP, Field, check_fields
 from brokk_min.learning.checkpoint import describe_training, train_policy
 from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import Array, Machine
@@ -87,11 +87,11 @@ def run_seed(
     names = [sequence.name for sequence in task_sequences(machine)]
     identity = {**training, "starts": starts, "sequences": names}
     if result_file.exists():
-        with expected(result_file, "the result of a seed"):
-            result: dict[str, Any] = read_json(result_file, "the result of a seed")
-            rows: Rows = result["runs"]
-            expect_same(result_file, result["identity"], identity)
-        return rows
+        result: dict[str, Any] = read_json(result_file, "the result of a seed")
+        check_fields(result_file, result, {"identity": Field("object"), **RUNS}, {})
+        expect_same(result_file, result["identity"], identity)
+        recorded: Rows = result["runs"]
+        return recorded
     policy = load_policy(policy_file, machine) if policy_file.exists() else None
     if policy is None or dict(policy.training) != training:
         resume = Path(f"{policy_file}.checkpoint").exists()

@@ -23,6 +23,7 @@ from brokk_min.machine import Array, Machine
 
 AXES = "xyz"
 LONGEST = 3600.0  # s of a sequence of a file, assumed
+MOST_STARTS = 1000  # of a file
 KINDS = ("workspace", "limits", "extended")  # of starts, see `start_kinds`
 REST_SEED = 2026  # of the scored rests; nothing else draws from it
 SECONDS = 26.0  # of a scored sequence, assumed
@@ -190,10 +191,13 @@ def read_commands(path: Path, machine: Machine) -> list[Commands]:
 def read_starts(path: Path, machine: Machine) -> Array:
     """Start poses [rad] (starts, n) of a CSV with one column per joint.
 
-    ValueError: an angle outside its joint's range or a pose in the ground, with file and row.
+    ValueError: an angle outside its joint's range or a pose in the ground, with file and row, or
+    too many poses: all are simulated at once.
     """
     table = read_table(path, starts_of(machine))
     starts = np.stack([table[name] for name in machine.names], axis=1)
+    if len(starts) > MOST_STARTS:
+        raise ValueError(f"{path}: expected at most {MOST_STARTS} poses, got {len(starts)}")
     lowest = lowest_point(forward_kinematics(machine, starts))
     for row in np.flatnonzero(terminated(machine, lowest)):
         expected = f"expected the whole arm above {machine.ground} m"

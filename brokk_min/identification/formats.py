@@ -52,7 +52,8 @@ class Field:
         return words + f", shape {tuple(shape)}" * (len(shape) > 0) + " or null" * self.none
 
 
-Fields = Mapping[str, Any]  # `Field`, or the fields of an object within; "*": of all other names
+# `Field`, the fields of an object within, or those of a list of objects; "*": of all other names
+Fields = Mapping[str, Any]
 JOINTS = Field("text", 1, 100, ("n",), unique=True)
 SAMPLES = Field("whole number", 2, 1000)
 DEAD_ZONE = Field("float", 0, 0.99, required=False)  # of full command
@@ -135,6 +136,25 @@ MEAN: Fields = {
 FIGURES: Fields = {"velocity_error_all": MEAN, "off_axis_drift_max": MEAN, "valve_travel": MEAN}
 SWEEP: Fields = {"meta": META, "table": {"rl": {**FIGURES, "*": MEAN}, "*": {**FIGURES, "*": MEAN}}}
 
+NAMED = Field("text", 0, 4096, required=False)
+RESULTS: Fields = {  # of `evaluate` and `reproduce`
+    "meta": {
+        "machine": Field("text", 1, 200),
+        "seed": Field("whole number", 0, 2**63),
+        **dict.fromkeys(("plant", "commands", "starts", "policy", "gains"), NAMED),
+    },
+    "starts": Field("number", -62.8, 62.8, ("starts", "n"), "rad", required=False),
+}
+RUN: Fields = {
+    "controller": Field("text", 1, 200),
+    "sequence": Field("text", 1, 200),
+    "start": Field("whole number", 0, 1e6),
+    "kind": Field("text", 1, 200),
+    "velocity_rmse": Field("float", 0),
+    "velocity_error_mean": Field("float", 0),
+    **dict.fromkeys(("off_axis_drift_max", "jerk_rms", "valve_travel"), Field("float", none=True)),
+}
+RUNS: Fields = {"runs": [RUN]}
 
 FAMILY_MEMBER: Fields = {
     "seed": Field("whole number", 0, 2**63),
@@ -224,6 +244,10 @@ def check_fields(
                 check(path, place, content[name], field, sizes)
             elif field.required:
                 raise ValueError(f"{path}: {place}: expected {field.wanted(sizes)}, got none")
+        elif isinstance(field, list):
+            check(path, place, content.get(name, "none"), Field("object", shape=("rows",)), {})
+            for i, row in enumerate(content[name]):
+                check_fields(path, row, field[0], sizes, f"{place}[{i}].")
         else:
             check_fields(path, content.get(name), field or {}, sizes, f"{place}.")
 

@@ -44,10 +44,6 @@ class SimulatedBus:
         writer = require("can", "play").CanutilsLogWriter(log) if log else None
         return Bus(self, writer, "virtual", clock=lambda: self.time, sleep=self.sleep)
 
-    def fileno(self) -> int:
-        """There is no descriptor to wait on."""
-        raise NotImplementedError
-
     def send(self, message: Any, timeout: float) -> None:
         """The machine takes in a frame at once."""
         frame = Frame(self.time, message.arbitration_id, bytes(message.data))

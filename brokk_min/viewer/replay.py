@@ -19,7 +19,8 @@ from brokk_min.can.drive_log import TelemetryReader, read_frames
 from brokk_min.evaluation import baselines, metrics
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.evaluation.sequences import Commands, goals_and_starts, task_sequences
-from brokk_min.identification.files import expected, read_json, whole_file
+from brokk_min.identification.files import located, read_json, whole_file
+from brokk_min.identification.formats import RESULTS, RUNS, check_fields
 from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocity
 from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import Array, Machine
@@ -106,27 +107,29 @@ def read_results(machine: Machine, path: Path, controllers: Sequence[str]) -> Re
 
     ValueError: no results, or of another machine, or the files named in it are wrong.
     """
-    with expected(path, "results of `evaluate`"):
-        file = read_json(path, "results of `evaluate`")
-        meta = {"plant": "analytic", "commands": "", "starts": "", **file["meta"]}
-        rows = file.get("task_space", file)["runs"]
-        seed = int(meta["seed"])
-        num = int(meta["starts"]) if meta["starts"].isdigit() else 0
-        starts = np.array(file["starts"], float) if "starts" in file else None
-    if meta.get("machine") != machine.name:
-        raise ValueError(f"{path}: expected --machine {meta.get('machine')}, got {machine.name}")
+    file = read_json(path, "results of `evaluate`")
+    check_fields(path, file, {"meta": RESULTS["meta"]}, {})
+    meta = {"plant": "analytic", "commands": "", "starts": "", **file["meta"]}
+    if meta["machine"] != machine.name:
+        raise ValueError(f"{path}: expected --machine {meta['machine']}, got {machine.name}")
+    check_fields(path, file, RESULTS, {"n": machine.n})
+    content = file.get("task_space", file)
+    check_fields(path, content, RUNS, {})
+    num = int(meta["starts"]) if meta["starts"].isdecimal() else 0
     own = ", ".join(sequence.name for sequence in task_sequences(machine))
     commands = None if meta["commands"] in ("", own) else Path(meta["commands"])
     poses = None if num or not meta["starts"] else Path(meta["starts"])
-    sequences, drawn = goals_and_starts(machine, commands, poses, num, seed)
-    policy = load_policy(Path(meta.get("policy", path.with_name("policy.npz"))), machine)
-    named: dict[str, Controller] = {"rl": PolicyController(machine, policy)}
-    if set(controllers) - {"rl"}:
-        gains = Path(meta.get("gains", path.with_name("gains.json")))
-        named |= baselines.read_gains(gains, machine, policy.net)
-    starts = drawn if starts is None else starts
+    with located(path):
+        sequences, drawn = goals_and_starts(machine, commands, poses, num, meta["seed"])
+        policy = load_policy(Path(meta.get("policy", path.with_name("policy.npz"))), machine)
+        named: dict[str, Controller] = {"rl": PolicyController(machine, policy)}
+        if set(controllers) - {"rl"}:
+            gains = Path(meta.get("gains", path.with_name("gains.json")))
+            named |= baselines.read_gains(gains, machine, policy.net)
+    starts = np.array(file.get("starts", drawn), float)
     net = policy.net if meta["plant"] == "net" else None
-    return Results(path, rows, {s.name: s for s in sequences}, starts, named, net, seed)
+    by_name = {s.name: s for s in sequences}
+    return Results(path, content["runs"], by_name, starts, named, net, meta["seed"])
 
 
 def simulate_again(

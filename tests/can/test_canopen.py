@@ -153,6 +153,9 @@ def test_set_up_nodes__refuses_what_does_not_fit(world):
     with pytest.raises(ValueError, match=r"slow: expected a rate of 10 Hz or more, .* got 5 Hz"):
         hw.Drive(slow, ConstantCommand(*np.zeros(5)), world.bus, HoldingOperator()).begin()
     SimulatedMachine(replace(slow, rate=10.0), START, 0.0)
+    clashing = replace(BROKK_170, valve_frame_id=0x583)  # of an SDO answer
+    with pytest.raises(ValueError, match=r"valve_frame_id: .* no other frame, got 0x583"):
+        SimulatedMachine(clashing, START, 0.0)
     for unfit in (machine, slow):
         with pytest.raises(ValueError, match="expected"):
             SimulatedMachine(unfit, np.zeros(unfit.n), 0.0)

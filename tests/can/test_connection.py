@@ -58,9 +58,6 @@ class SelectBus:
         self.ready = []
         self.messages = []
 
-    def fileno(self):
-        return 7
-
     def recv(self, timeout):
         assert timeout == 0.0  # python-can's own timeout follows the time of day
         return self.messages.pop() if self.messages else None  # None: the filter took it
@@ -81,7 +78,7 @@ class SelectBus:
 @pytest.mark.parametrize(("busy", "slept"), [(0.0, [0.019]), (0.004, [0.016]), (0.020, [])])
 def test_recv__sleeps_only_after_its_busy_wait(busy, slept, monkeypatch):
     silent = SelectBus()
-    bus = Bus(silent, clock=lambda: silent.t)
+    bus = Bus(silent, file=7, clock=lambda: silent.t)
     monkeypatch.setattr("select.select", silent.select)
     assert bus.recv(0.020, busy) is None
     assert [wait for wait in silent.waits if wait] == pytest.approx(slept, abs=1.1e-3)

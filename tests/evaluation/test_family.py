@@ -50,7 +50,7 @@ def test_run_member__is_not_run_again_and_refuses_another_budget(made):
     row = family.run_member(COARSE, 2, folder / "member_2", TINY)
     assert row == json.loads(json.dumps(results["members"][0]))
     assert file.stat().st_mtime_ns == before
-    with pytest.raises(ValueError, match=r"member.json: budget: expected"):
+    with pytest.raises(ValueError, match=r"member.json: budget.starts: expected 3, got 4"):
         family.run_member(COARSE, 2, folder / "member_2", replace(TINY, starts=3))
 
 

@@ -15,6 +15,7 @@ from brokk_min.evaluation import seeds
 from brokk_min.evaluation.baselines import gains_metadata
 from brokk_min.evaluation.seeds import run_seed, run_seeds
 from brokk_min.evaluation.sequences import axis_sequences
+from brokk_min.identification import formats
 from brokk_min.identification.net_file import save_net
 from brokk_min.learning.checkpoint import train_policy
 from brokk_min.learning.policy import load_policy
@@ -27,8 +28,14 @@ TASK = TaskConfig(episode_s=0.6)
 NET = small_net(BROKK_170, np.random.default_rng(0))
 
 
+def bias_rows(policy):
+    """Rows of an evaluation whose figures are all the policy's first bias."""
+    figures = dict.fromkeys(formats.RUN, abs(float(policy.weights[-1][0])))
+    return [figures | {"controller": "rl", "sequence": "x", "start": 0, "kind": "workspace"}]
+
+
 def first_bias(machine, controllers, starts):
-    return [{"bias": float(controllers["rl"].policy.weights[-1][0])}]
+    return bias_rows(controllers["rl"].policy)
 
 
 @pytest.fixture
@@ -54,8 +61,7 @@ def test_run_seed__trains_as_train_policy_and_writes_its_rows(tmp_path, seed_job
     rows = seed_job(tmp_path)(4)
     train_policy(BROKK_170, NET, TASK, TINY, 4, tmp_path / "alone.npz")
     assert (tmp_path / "seed_4.npz").read_bytes() == (tmp_path / "alone.npz").read_bytes()
-    policy = load_policy(tmp_path / "alone.npz", BROKK_170)
-    assert rows == [{"bias": float(policy.weights[-1][0])}]
+    assert rows == bias_rows(load_policy(tmp_path / "alone.npz", BROKK_170))
     written = json.loads((tmp_path / "seed_4.json").read_text())
     assert written["runs"] == rows
     assert written["identity"]["seed"] == 4

@@ -180,12 +180,13 @@ def test_read_starts__reads_what_write_starts_wrote(tmp_path):
     ("row", "message"),
     [
         ("0,0.5,0.5,1.7,2.2", r"s.csv: row 3, column q5: .* in \[0, 2\] \(rad\), got 2.2"),
+        ("0,0.5,0.5,1.7,1.2\n" * 1000, r"s.csv: expected at most 1000 poses, got 1001"),
         ("0,0,-0.3,2.5,1.2", r"s.csv: row 3: expected the whole arm above 0.0 m, got -"),
     ],
 )
 def test_read_starts__refuses_poses_out_of_range_or_in_the_ground(tmp_path, row, message):
     path = tmp_path / "s.csv"
-    path.write_text(f"q1,q2,q3,q4,q5\n0,0.5,0.5,1.7,1.2\n{row}\n")
+    path.write_text(f"q1,q2,q3,q4,q5\n0,0.5,0.5,1.7,1.2\n{row.strip()}\n")
     with pytest.raises(ValueError, match=message):
         s.read_starts(path, BROKK_170)
 
