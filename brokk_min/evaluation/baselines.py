@@ -87,11 +87,10 @@ def split_vector(vector: Array) -> Gains:
     return Gains(*np.split(vector, [n, 2 * n, 3 * n, 3 * n + 1, 3 * n + 2], axis=-1))
 
 
-def gain_bounds(machine: Machine) -> tuple[Array, Array]:
-    """Smallest and largest gains of `RANGES` as vectors (3 n_driven + 3,)."""
-    low = make_gains(machine, **{name: low for name, (low, _) in RANGES.items()})
-    high = make_gains(machine, **{name: high for name, (_, high) in RANGES.items()})
-    return gains_vector(low), gains_vector(high)
+def gain_bounds(machine: Machine) -> Array:
+    """Smallest and largest gains of `RANGES` as vectors, (2, 3 n_driven + 3)."""
+    ranges = np.array(list(RANGES.values()))
+    return np.repeat(ranges, [len(machine.driven)] * 3 + [1] * 3, axis=0).T
 
 
 def gains_of(machine: Machine, x: Array) -> Gains:

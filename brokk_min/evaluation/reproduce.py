@@ -22,7 +22,7 @@ from brokk_min.evaluation import baselines, claims, metrics, preliminary, report
 from brokk_min.evaluation.metrics import Controllers, Run, Traces, evaluate, summary
 from brokk_min.evaluation.perfect_model import regret
 from brokk_min.evaluation.robustness import near_singularities, robustness
-from brokk_min.evaluation.rollout import Controller, Trace
+from brokk_min.evaluation.rollout import Controller, Trace, log_of
 from brokk_min.evaluation.seeds import read_seeds, seeds_of
 from brokk_min.identification import fitting, logs, validation
 from brokk_min.identification.excitation import collect, task_log
@@ -73,11 +73,9 @@ def reproduce(
         with stage("record"):
             log, paper_log, test = record(machine, out, budget, seed)
         with stage("fit"):
-            ours = partial(fit_net, machine, out / "net.npz", log, budget, {}, seed)
-            recipe = fitting.PAPER_RECIPE
-            theirs = partial(
-                fit_net, machine, out / "net_paper.npz", paper_log, budget, recipe, seed
-            )
+            fit = partial(fit_net, machine, budget=budget, seed=seed)
+            ours = partial(fit, out / "net.npz", log, recipe={})
+            theirs = partial(fit, out / "net_paper.npz", paper_log, recipe=fitting.PAPER_RECIPE)
             net, paper_net = side_by_side({"fit net": ours, "fit net_paper": theirs}, clock)
             driven = select_nets(machine, net)
             training_seeds = seeds_of(machine, driven, seeds) if seeds else {}
@@ -205,16 +203,6 @@ def train(
     return train_policy(machine, net, task, learner, seed, file, resume=True, start=start)
 
 
-def driven_log(machine: Machine, traces: Traces, controller: str) -> Log:
-    """Commands and encoder angles of a controller's first 16 runs of each sequence."""
-    recordings = []
-    for (name, sequence), trace in traces.items():
-        for i in range(min(16, trace.q.shape[1]) if name == controller else 0):
-            run = (trace.u[:, i].astype(float), trace.q_measured[:, i].astype(float))
-            recordings.append((f"{controller}_{sequence}_{i:02d}", *run))
-    return logs.machine_log(machine, recordings)
-
-
 def measure(
     machine: Machine,
     net: ActuatorNet,
@@ -233,6 +221,7 @@ def measure(
     rl = {"rl": controllers["rl"]}
     on_nets, _ = evaluate(machine, rl, axes, starts, seed, policies["rl"].net)
     compared["task_space"]["rl_on_nets"] = summary(on_nets)["rl"]
+    own = log_of(machine, {s: trace for (c, s), trace in task.items() if c == "rl"}, 16)
     measured = preliminary.run(machine, net, seed)
     numbers = preliminary.numbers(machine, measured)
     tuned_on = sequences.tuning_set(machine, budget.tuning_runs, seed)
@@ -241,7 +230,7 @@ def measure(
         "meta": meta | {"effort": asdict(budget)},
         "actuator": {
             "test": validation.score(net, test),
-            "driven_by_policy": validation.score(net, driven_log(machine, task, "rl")),
+            "driven_by_policy": validation.score(net, own),
         },
         "preliminary": numbers,
         "net_claims": [claim.to_json() for claim in claims.net_claims(numbers)],

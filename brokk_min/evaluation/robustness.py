@@ -1,4 +1,4 @@
-"""Robustness: other machines and encoders, rests of other lengths, motion near singularities."""
+"""Robustness: other machines and encoders, and motion near singularities."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -6,15 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from brokk_min.env import Encoder, TaskConfig
+from brokk_min.env import Encoder
 from brokk_min.evaluation import claims, metrics
-from brokk_min.evaluation.sequences import (
-    RESTS,
-    Commands,
-    rest_sequences,
-    shorten,
-    singular_sequences,
-)
+from brokk_min.evaluation.sequences import Commands, shorten, singular_sequences
 from brokk_min.jacobian import manipulability, manipulability_threshold
 from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.machine import Array, Machine, read_encoder, valve_opening
@@ -114,22 +108,6 @@ def robustness(
             if "rl" in controllers and controller != "rl":
                 row["rl_less"] = metrics.paired_difference(runs, "rl", controller, error)["all"]
             result[name][controller] = row
-    return result
-
-
-def by_length_of_rest(
-    machine: Machine,
-    controllers: metrics.Controllers,
-    starts: Array,
-    seed: int,
-    config: TaskConfig | None = None,
-) -> dict[str, dict[str, dict[str, float | None]]]:
-    """Means of all figures of `metrics` on the axes, by seconds of each rest and controller."""
-    result = {}
-    for seconds in RESTS:
-        commands = rest_sequences(machine, seconds)
-        runs, _ = metrics.evaluate(machine, controllers, commands, starts, seed, config=config)
-        result[f"{seconds:g}"] = {name: rows["all"] for name, rows in metrics.summary(runs).items()}
     return result
 
 

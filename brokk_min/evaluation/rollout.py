@@ -1,6 +1,6 @@
 """A controller follows given tool velocities, on the analytic plant or on the nets."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
 
@@ -80,12 +80,19 @@ def own_drives(machine: Machine, controllers: Sequence[Controller], hours: float
     seeds of their own. ValueError: too few feasible starts.
     """
     num = max(1, round(hours * 180 / len(controllers)))
-    recordings = []
+    traces = {}
     for k, controller in enumerate(controllers):
         start, goals = tuning_set(machine, num, seed + 1000 * (k + 1))
         rng = np.random.default_rng(seed)
-        trace = rollout(machine, controller, start, goals, TaskConfig(), rng)
-        for i in range(num):
-            run = (trace.u[:, i].astype(float), trace.q_measured[:, i].astype(float))
-            recordings.append((f"own_{k}_{i:03d}", *run))
+        traces[f"own_{k}"] = rollout(machine, controller, start, goals, TaskConfig(), rng)
+    return log_of(machine, traces, num)
+
+
+def log_of(machine: Machine, traces: Mapping[str, Trace], num: int) -> Log:
+    """Commands and encoder angles of the first `num` runs of each trace, under its name."""
+    recordings = []
+    for name, trace in traces.items():
+        for i in range(min(num, trace.q.shape[1])):
+            u, q = trace.u[:, i].astype(float), trace.q_measured[:, i].astype(float)
+            recordings.append((f"{name}_{i:03d}", u, q))
     return machine_log(machine, recordings)

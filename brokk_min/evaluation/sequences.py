@@ -28,7 +28,6 @@ KINDS = ("workspace", "limits", "extended")  # of starts, see `start_kinds`
 REST_SEED = 2026  # of the scored rests; nothing else draws from it
 SECONDS = 26.0  # of a scored sequence, assumed
 SHORTEST_REST, LONGEST_REST = 0.5, 10.0  # s, assumed
-RESTS = (0.5, 1.0, 2.0, 2.5, 4.0, 5.0, 10.0)  # s, of `rest_sequences`, assumed
 TRIES = 8  # draws after which a kind of starts without any pose is given up, assumed
 # Rows of seconds and velocity in fractions of tool_speed (assumed).
 # On one axis, as in the paper, with changes of direction:
@@ -102,28 +101,9 @@ def task_sequences(machine: Machine) -> list[Commands]:
     }
     rng = np.random.default_rng(REST_SEED)
     return [
-        Commands(name, _goals(machine, _with_rests(rows, _draw_rests(rows, rng))), inward=True)
+        Commands(name, _goals(machine, _with_rests(rows, rng)), inward=True)
         for name, rows in moves.items()
     ]
-
-
-def rest_sequences(machine: Machine, seconds: float) -> list[Commands]:
-    """The moves of `axis_sequences` with every rest equally long [s]."""
-    return [
-        Commands(name, _goals(machine, _with_rests(_along(np.eye(3)[i]), seconds)), inward=True)
-        for i, name in enumerate(AXES)
-    ]
-
-
-def _draw_rests(rows: Array, rng: np.random.Generator) -> Array:
-    """Random seconds of each rest of rows, such that all rows last `SECONDS`."""
-    at_rest = ~rows[:, 1:].any(axis=1)
-    total = SECONDS - rows[~at_rest, 0].sum()
-    while True:
-        seconds = _log_uniform(rng, at_rest.sum()).round(1)
-        seconds[-1] = total - seconds[:-1].sum()
-        if SHORTEST_REST <= seconds[-1] <= LONGEST_REST:
-            return rng.permutation(seconds)
 
 
 def _log_uniform(rng: np.random.Generator, num: int) -> Array:
@@ -131,11 +111,17 @@ def _log_uniform(rng: np.random.Generator, num: int) -> Array:
     return np.exp(rng.uniform(np.log(SHORTEST_REST), np.log(LONGEST_REST), num))
 
 
-def _with_rests(rows: Array, seconds: ArrayLike) -> Array:
-    """Rows with other seconds of the rests."""
+def _with_rests(rows: Array, rng: np.random.Generator) -> Array:
+    """Rows with random seconds of each rest, such that all rows last `SECONDS`."""
     rows = rows.astype(float)
-    rows[~rows[:, 1:].any(axis=1), 0] = seconds
-    return rows
+    at_rest = ~rows[:, 1:].any(axis=1)
+    total = SECONDS - rows[~at_rest, 0].sum()
+    while True:
+        seconds = _log_uniform(rng, at_rest.sum()).round(1)
+        seconds[-1] = total - seconds[:-1].sum()
+        if SHORTEST_REST <= seconds[-1] <= LONGEST_REST:
+            rows[at_rest, 0] = rng.permutation(seconds)
+            return rows
 
 
 def _along(direction: ArrayLike) -> Array:

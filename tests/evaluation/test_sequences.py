@@ -57,16 +57,6 @@ def test_task_sequences__rests_are_of_all_lengths():
     assert below[-1] == 35 and np.diff([0, *below]).min() >= 5
 
 
-@pytest.mark.parametrize("seconds", s.RESTS)
-def test_rest_sequences__have_equal_rests_and_the_moves_of_the_axes(seconds):
-    axes = s.axis_sequences(BROKK_170)
-    for sequence, scored in zip(s.rest_sequences(BROKK_170, seconds), axes, strict=True):
-        assert sequence.name == scored.name
-        assert rests_of(sequence.goals).tolist() == pytest.approx([seconds] * 4)
-        moves = [commands.goals[commands.goals.any(axis=1)] for commands in (sequence, scored)]
-        np.testing.assert_array_equal(*moves)
-
-
 def test_for_starts__reverses_inward_goals_by_the_quadrant_of_the_tool():
     goals = np.array([[0.1, 0.2, 0.3]])
     q1 = np.array([0.5, 2.0, -0.5, -2.0])  # of the four quadrants
