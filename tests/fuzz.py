@@ -36,7 +36,7 @@ from brokk_min.evaluation.baselines import baselines, gains_metadata, gains_tabl
 from brokk_min.evaluation.family import run_member
 from brokk_min.evaluation.reproduce import QUICK
 from brokk_min.evaluation.seeds import read_seeds, run_seed
-from brokk_min.evaluation.sequences import read_commands, read_starts
+from brokk_min.evaluation.sequences import read_commands, read_starts, task_sequences
 from brokk_min.identification import formats
 from brokk_min.identification.files import SHIPPED
 from brokk_min.identification.formats import Field
@@ -254,8 +254,10 @@ def all_formats(folder: Path) -> Iterator[Format]:
     read = partial(read_results, BROKK_170, controllers=["rl"])
     yield Format("runs.json", results, encode_json, read, places(formats.RESULTS, results))
     known = (BROKK_170, net, TaskConfig(), PPOConfig())
-    seed = {"identity": describe_training(*known, False, 0), "runs": results["runs"]}
-    read = lambda path: run_seed(*known, path.parent, None, {}, 0)  # noqa: E731
+    scored = {"starts": 2, "sequences": [one.name for one in task_sequences(BROKK_170)]}
+    identity = describe_training(*known, False, 0) | scored
+    seed = {"identity": identity, "runs": results["runs"]}
+    read = lambda path: run_seed(*known, False, path.parent, 2, 0)  # noqa: E731
     yield Format("seed_0.json", seed, encode_json, read, places(formats.RUNS, seed))
     made = member()
     read = lambda path: run_member(BROKK_170, 0, path.parent, QUICK)  # noqa: E731

@@ -266,7 +266,8 @@ class TrainingLog:
                 moments[i] = {"step": torch.zeros(()), "exp_avg": parameter}
                 moments[i]["exp_avg_sq"] = parameter
             like["optimizer"]["state"] = moments
-            check_like(self.checkpoint, "content", content, like)
+            wanted = {"content": kinds(like)}
+            files.expect_same(self.checkpoint, {"content": kinds(content)}, wanted)
             learner.agent.load_state_dict(content["agent"])
             learner.optimizer.load_state_dict(content["optimizer"])
             learner.generator.set_state(content["generator"])
@@ -279,27 +280,19 @@ class TrainingLog:
             self.episodes = content["episodes"]
 
 
-def check_like(path: Path, place: str, value: Any, like: Any) -> None:
-    """ValueError: `value` has other keys, types or shapes than `like`, or is not finite."""
-    wanted, got = type(like).__name__, type(value).__name__
-    if isinstance(like, dict) and isinstance(value, dict):
-        wanted = got = "dict"  # ordered or not
-    if isinstance(like, torch.Tensor) and isinstance(value, torch.Tensor):
-        wanted, got = (f"{list(x.shape)} of {x.dtype}" for x in (like, value))
-        if value.shape == like.shape and value.is_floating_point() == like.is_floating_point():
-            got = wanted if torch.isfinite(value).all() else "nan or inf"
-    elif isinstance(like, dict) and isinstance(value, dict):
-        differing = sorted(map(str, like.keys() ^ value.keys()))
-        got = f"one of other names: {files.brief(differing)}" if differing else wanted
-        for key in like.keys() & value.keys():
-            check_like(path, f"{place}.{key}", value[key], like[key])
-    elif isinstance(like, list | tuple) and type(value) is type(like) and len(value) == len(like):
-        for i, pair in enumerate(zip(value, like, strict=True)):
-            check_like(path, f"{place}[{i}]", *pair)
-    elif isinstance(value, float) and not np.isfinite(value):
-        got = str(value)
-    if got != wanted:
-        raise ValueError(f"{path}: {place}: expected {wanted}, got {got}")
+def kinds(value: Any, place: str = "") -> dict[str, str]:
+    """Types of the leaves of nested dictionaries and lists, by place; of tensors shapes, too."""
+    if isinstance(value, dict | list | tuple):
+        found = {}
+        for name, inner in value.items() if isinstance(value, dict) else enumerate(value):
+            found |= kinds(inner, f"{place}.{name}" if place else str(name))
+        return found
+    kind = type(value).__name__
+    if isinstance(value, torch.Tensor):
+        numbers = "floats" if value.is_floating_point() else "whole numbers"
+        kind = f"{numbers} of shape {list(value.shape)}"
+    finite = not isinstance(value, float | torch.Tensor) or np.isfinite(np.asarray(value)).all()
+    return {place: kind if finite else f"{kind} with nan or inf"}
 
 
 def read_curve(path: Path, last_step: int) -> list[dict[str, Any]]:
