@@ -179,8 +179,8 @@ def read_log(
 ) -> Log:
     """Read and check tables of one machine and resample them at `rate` [Hz].
 
-    The command is held, the angle interpolated; of faster logs they are means. A gap longer than `MAX_GAP` and 2.5 samples cuts a
-    recording.
+    The command is held, the angle interpolated; of faster logs they are means. A gap longer than
+    `MAX_GAP` and 2.5 samples cuts a recording.
     Without q_dot columns velocities are estimated: a recording starts at rest; after a gap, the
     rows that would need samples of the gap are left out.
 
