@@ -1,7 +1,5 @@
 """Bytes by hand and on all values, nodes, and the canopen library as peer."""
 
-from __future__ import annotations
-
 import struct
 import time
 from contextlib import contextmanager
@@ -31,8 +29,6 @@ from brokk_min.can.simulated_machine import SimulatedMachine
 from brokk_min.machine import BROKK_170
 
 STEP = BROKK_170.encoder_step
-
-# --- bytes ---------------------------------------------------------------------------------------
 
 
 def bitwise_crc(data):
@@ -64,16 +60,6 @@ def test_valve_frame__by_hand():
     assert two[:, 7].tolist() == [0, 1]
 
 
-@pytest.mark.parametrize(
-    ("raw", "counts"),
-    [(1, 1), (0, 0), (2**26 - 1, -1), (2**26 - 2, -2), (4095, -1), (5 | 1 << 29, 5)],
-)
-def test_encoder_counts__unwraps_about_zero(raw, counts):
-    found = encoder_counts(BROKK_170, [raw, 0, 0, 1000, 0])
-    assert found.dtype == int
-    assert found.tolist() == [counts, 0, 0, 1000, 0]
-
-
 def test_encoder_counts__unwraps_half_a_turn_from_mid_range():
     q4 = encoder_counts(BROKK_170, np.full((3, 5), [[100], [3188], [3189]]))[:, 3]
     assert q4.tolist() == [100, 3188, 3189 - 4096]  # the middle is 1141
@@ -100,9 +86,6 @@ def test_operator_input__survives_the_log_to_a_tenth_of_a_millimetre(flags):
     assert unpack_operator_input(data) == given._replace(v_goal=(0.3, -0.1234, 3.2))
     rounded = unpack_operator_input(OperatorInput((0.00019, -0.00019, 0.00011)).pack())
     assert rounded.v_goal == (0.0002, -0.0002, 0.0001)  # not cut
-
-
-# --- encoders ------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -225,9 +208,6 @@ def test_sdo__reads_small_objects_and_skips_foreign_answers(world):
     assert sdo(world.bus, 1, (0x1000, 0)) == 406
     with pytest.raises(ValueError, match="0x06010000"):
         sdo(world.bus, 1, (0x1000, 0), 5)
-
-
-# --- a peer: the canopen library -----------------------------------------------------------------
 
 
 @contextmanager

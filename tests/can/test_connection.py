@@ -1,7 +1,5 @@
 """The bus through python-can: waiting, echoes, filters, the log, and what a process may ask for."""
 
-from __future__ import annotations
-
 import io
 import os
 import re

@@ -1,7 +1,5 @@
 """The DBC file, read by cantools: what it decodes is what the program means."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cantools

@@ -1,7 +1,5 @@
 """Ten faults planted in a drive on the plant: the log names them."""
 
-from __future__ import annotations
-
 import json
 
 import can

@@ -1,7 +1,5 @@
 """Logs of drives: run again to the same bytes, read as recordings, and read as telemetry."""
 
-from __future__ import annotations
-
 import struct
 from collections import deque
 from dataclasses import replace
@@ -27,7 +25,6 @@ from brokk_min.can.drive_log import (
     read_frames,
     replay,
 )
-from brokk_min.identification.logs import read_log, write_log
 from brokk_min.machine import BROKK_170, estimate_velocity
 
 STEP = BROKK_170.encoder_step
@@ -108,30 +105,6 @@ def test_replayed_bus__ends_where_another_frame_or_none_was_sent(changed):
     bus.send(0x080, b"")
     assert bus.mismatch == f"080 sent at 1.000000, got {found.id:03X}"
     assert not bus.frames
-
-
-def test_log_for_fit__holds_what_the_machine_did(tmp_path):
-    world = drive_logged(tmp_path / "run.log")
-    log = log_for_fit(BROKK_170, read_frames(tmp_path / "run.log"))
-    assert log.joints == BROKK_170.names
-    assert [recording.name for recording in log.recordings] == ["drive_000", "drive_001"]
-    write_log(tmp_path / "log.csv", log)
-    copies = read_log([tmp_path / "log.csv"], BROKK_170.velocity_samples).recordings
-    times, m = world.commands
-    q = np.array([row[2] for row in world.record])
-    begins = np.array(world.syncs)
-    for recording, copy in zip(log.recordings, copies, strict=True):
-        np.testing.assert_allclose(copy.q, recording.q, atol=1e-6)
-        np.testing.assert_allclose(copy.u, recording.u, atol=1e-6)
-        # it begins at some SYNC, which may fall on the border of two of the plant's steps
-        length = len(recording.q)
-        steps = [
-            np.searchsorted(times, begins[k : k + length]) for k in range(len(begins) - length)
-        ]
-        errors = [min(np.abs(q[step - k] - recording.q).max() for k in (1, 2)) for step in steps]
-        assert min(errors) < 0.51 * STEP
-        inside = np.searchsorted(times, begins[np.argmin(errors) :][:length] + 0.03)
-        np.testing.assert_allclose(m[inside], recording.u * 127, atol=1e-6)  # the next command
 
 
 def test_log_for_fit__by_hand():

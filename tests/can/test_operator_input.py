@@ -1,7 +1,5 @@
 """Script, joystick and joint jog; the joystick is SDL's virtual one."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers_bus import START, HoldingOperator, Virtual, World

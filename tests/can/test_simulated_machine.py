@@ -1,7 +1,5 @@
 """The simulated machine frame by frame on a clock of its own, and before a master of canopen."""
 
-from __future__ import annotations
-
 import os
 import signal
 import struct
@@ -147,15 +145,6 @@ def test_receive__changes_states_of_nodes_alone_or_together(command, state, boot
     assert machine.nmt_(command) == [(0x700 + node, b"\x00") for node in boots * NODES]
 
 
-def test_receive__answers_a_sync_with_the_counts_of_running_encoders():
-    machine = Machine()
-    assert machine.receive(Frame(100.0, 0x080, b"")) == []
-    machine.nmt_(1, 1)
-    machine.nmt_(1, 4)
-    answers = [(0x180 + node, struct.pack("<I", RAW[node - 1])) for node in (1, 4)]
-    assert machine.receive(Frame(100.0, 0x080, b"")) == answers
-
-
 @pytest.mark.parametrize(
     ("command", "address", "value", "answer"),
     [
@@ -198,9 +187,6 @@ def test_start_pose__refuses_what_the_machine_cannot_take(pose):
     with pytest.raises(ValueError, match=r"start: expected 5 angles within .*, got") as e:
         start_pose(BROKK_170, pose)
     assert str(pose) in str(e.value)
-
-
-# --- as others see it ----------------------------------------------------------------------------
 
 
 def test_simulate__serves_until_a_signal_and_records_every_step(tmp_path):

@@ -1,7 +1,5 @@
 """No display: SDL draws unseen."""
 
-from __future__ import annotations
-
 import pygame
 import pytest
 

@@ -1,14 +1,10 @@
 """Views from the side and from above, worked out by hand."""
 
-from __future__ import annotations
-
-from dataclasses import replace
-
 import numpy as np
 
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
-from brokk_min.viewer.camera import cameras, skeleton
+from brokk_min.viewer.camera import cameras
 from brokk_min.viewer.drawing import NO_POINTS
 
 STRETCHED = np.array([0.0, 0.0, 0.0, np.pi, 3 * np.pi / 4])  # all links horizontal
@@ -32,11 +28,3 @@ def test_cameras__see_the_brokk_as_worked_out_by_hand():
     np.testing.assert_allclose(
         side.project(tool(along_y)), side.origin + side.scale * np.array([5.0, -0.95])
     )
-
-
-def test_skeleton__has_the_ends_of_d_and_a_of_two_links_by_hand():
-    """Two links that turn about z, each 0.2 m above the one before and 1 m long."""
-    joints = [replace(j, a=1.0, d=0.2, alpha=0.0, theta=0.0) for j in BROKK_170.joints[:2]]
-    arm = replace(BROKK_170, joints=tuple(joints), q_start=())
-    expected = [[0, 0, 0], [0, 0, 0.2], [1, 0, 0.2], [1, 0, 0.4], [1, 1, 0.4]]
-    np.testing.assert_allclose(skeleton(arm, np.array([0.0, np.pi / 2])), expected, atol=1e-12)

@@ -1,7 +1,5 @@
 """The loop behind a pipe: requests reach the gate, telemetry comes back, silence stops it."""
 
-from __future__ import annotations
-
 import multiprocessing
 import threading
 

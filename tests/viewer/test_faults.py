@@ -1,7 +1,5 @@
 """Each fault of the gate has words for an operator."""
 
-from __future__ import annotations
-
 import pytest
 from helpers_viewer import telemetry
 

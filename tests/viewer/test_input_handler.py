@@ -1,7 +1,5 @@
 """Keys and gamepad become requests; the dead-man switch counts only when pressed afresh."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

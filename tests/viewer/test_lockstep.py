@@ -1,7 +1,5 @@
 """Loop and simulated machine on a clock that stands still while anything computes."""
 
-from __future__ import annotations
-
 from contextlib import closing
 from multiprocessing import Pipe
 
@@ -13,7 +11,7 @@ from brokk_min.actuator import plant_reset, plant_step
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer.control_process import Request, receive_telemetry, send_request
-from brokk_min.viewer.lockstep import Comparison, Lockstep, follow, line_goals
+from brokk_min.viewer.lockstep import Comparison, Lockstep, follow
 
 NEUTRAL = Request(0.0, 0, False, True, np.zeros(3), np.zeros(4))
 
@@ -80,17 +78,6 @@ def test_follow__moves_the_plant_as_the_commands_of_the_loop_do():
     np.testing.assert_allclose(
         q[moving[0] + 2 : moving[0] + 20, 0], alone[first + 2 : first + 20], atol=0.01
     )
-
-
-def test_line_goals__lead_along_the_line_at_half_the_tool_speed():
-    line = np.array([[1.0, 2, 3], [1, 2.6, 3], [1, 2.6, 3.3]])
-    goals = line_goals(BROKK_170, line)
-    assert goals.shape == (20 + 80 + 40 + 20, 3)
-    np.testing.assert_allclose(goals[20], [0, 0.15, 0])
-    np.testing.assert_allclose(goals[100], [0, 0, 0.15])
-    np.testing.assert_allclose(goals.sum(axis=0) * 0.05, line[-1] - line[0], atol=1e-12)
-    assert not goals[:20].any()
-    assert not goals[-20:].any()
 
 
 def test_comparison__stands_still_at_the_end_of_the_line():

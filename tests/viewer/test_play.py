@@ -1,7 +1,5 @@
 """The window without a display: what it shows, whom it hears, and the whole of it in real time."""
 
-from __future__ import annotations
-
 from contextlib import closing
 
 import can
@@ -25,9 +23,6 @@ CONTROLLERS = {"rl": ConstantCommand(), "jacobian": ConstantCommand()}
 
 def tool(q):
     return tool_position(forward_kinematics(BROKK_170, np.array(q)))
-
-
-# --- what is shown --------------------------------------------------------------------------------
 
 
 def test_scene__interpolates_between_two_ticks_and_keeps_the_last_pose():
@@ -74,17 +69,6 @@ def test_scene__greys_the_last_pose_and_says_why_a_position_is_missing():
     scene = session.scene(1.11, "rl", "ready")
     assert (scene.colour, scene.status) == (drawing.COLOURS["rl"], "stopped")
     assert scene.banner.endswith("Over now: release SPACE, then press it again.")
-
-
-def test_scene__says_how_slow_and_how_late_the_machine_is():
-    session = Session(BROKK_170, CONTROLLERS, None)
-    for tick in range(30):
-        session.update(telemetry(tick, lateness=0.1 * tick), 0.1 * tick)
-    scene = session.scene(2.9, "rl", "")
-    assert scene.status == "driving, 50 % of real time, 2.9 s late"
-    for tick in range(30, 60):
-        session.update(telemetry(tick), 1.5 + 0.05 * tick)
-    assert session.scene(4.45, "rl", "").status == "driving"
 
 
 def test_scene__keeps_its_zoom_and_the_distance_from_the_line_until_the_next_line():
@@ -148,9 +132,6 @@ def test_session__begins_a_line_again_when_the_mode_changes_on_the_way():
     session.update(telemetry(mode=2), 0.0)
     session.next_task()
     assert session.task == "circle"
-
-
-# --- the window -----------------------------------------------------------------------------------
 
 
 def test_show__sends_requests_once_there_is_telemetry_and_takes_keys_frame_by_frame():

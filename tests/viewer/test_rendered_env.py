@@ -1,7 +1,5 @@
 """Gymnasium's environments draw what happens: frames, videos, a window."""
 
-from __future__ import annotations
-
 import sys
 
 import gymnasium

@@ -1,7 +1,5 @@
 """Recorded runs: of logs, of results simulated again, and films of them."""
 
-from __future__ import annotations
-
 import json
 import os
 
@@ -10,7 +8,6 @@ import numpy as np
 import pygame
 import pytest
 from helpers_bus import BASELINE, START
-from helpers_canvas import Recorder
 from helpers_viewer import PipedLoop, post_key
 from PIL import Image, ImageSequence
 
@@ -45,9 +42,6 @@ def recorded_log(path, controller, seconds, v):
     return loop
 
 
-# --- runs -----------------------------------------------------------------------------------------
-
-
 def test_run_of_log__has_the_telemetry_of_the_loop_from_the_first_driven_tick(tmp_path):
     path = tmp_path / "run.log"
     loop = recorded_log(path, BASELINE, 2.0, (0.0, 0.2, 0.1))
@@ -67,9 +61,6 @@ def test_run_of_log__refuses_a_log_in_which_nothing_drives(tmp_path):
     idle.write_text("(1.0) can0 080# R\n(1.05) can0 080# R\n")
     with pytest.raises(ValueError, match="expected a log in which the valves are driven, got none"):
         replay.run_of_log(BROKK_170, idle, COLOUR)
-
-
-# --- results --------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -144,9 +135,6 @@ def test_read_results__takes_files_of_reproduce_with_policy_and_gains_beside_the
     assert set(replay.read_results(BROKK_170, whole, ["rl"]).controllers) == {"rl"}
 
 
-# --- films ----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("fps", "times"), [(10.0, [100, 100]), (7.0, [150, 150]), (100.0, [50] * 4)]
 )
@@ -158,21 +146,6 @@ def test_write_film__has_as_many_frames_a_second_as_ticks_allow(fps, times, tmp_
     assert film.info["loop"] == 0
     with pytest.raises(ValueError, match=r"expected a name ending in .gif or .mp4, got '.avi'"):
         replay.write_film(tmp_path / "f.avi", BROKK_170, [run_of(5)], (640, 360), fps)
-
-
-def test_film__prints_the_largest_distance_from_the_line_so_far():
-    """The tool leaves a level line upward, by 5 mrad a tick at 3.05 m from the slew axis."""
-    run = run_of(5)
-    line = np.vstack([run.p_tool[0] - [1.0, 0, 0], run.p_tool[0] + [1.0, 0, 0]])
-    run = run_of(5, path=line)
-    distance = np.abs(run.p_tool[:, 1] - run.p_tool[0, 1])
-    for tick in (0, 2, 4):
-        scene = replay._scene(run, tick, run.in_view, run.path)
-        text = f"largest distance from the line: {1e3 * distance[: tick + 1].max():.0f} mm"
-        assert scene.headline == text
-        canvas = Recorder((480, 480))
-        drawing.draw(canvas, BROKK_170, [scene])
-        assert text in canvas.texts_drawn
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """Runs on rerun's timeline, read back with rerun's own reader."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers_bus import START

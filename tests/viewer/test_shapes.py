@@ -1,7 +1,5 @@
 """Shapes from a machine's geometry: where they stand, and what touches what."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers_bus import START
@@ -12,21 +10,6 @@ from brokk_min.evaluation.sequences import evaluation_starts, task_sequences
 from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer import shapes
-
-
-def test_undercarriage__stands_at_height_zero_below_the_second_joint():
-    corners = np.vstack([np.vstack(part) for part in shapes.undercarriage(BROKK_170)])
-    assert corners[:, 2].min() == pytest.approx(0.0)
-    assert corners[:, 2].max() < 0.95
-    np.testing.assert_allclose(corners.min(axis=0)[:2], -corners.max(axis=0)[:2])
-
-
-def test_turret__turns_with_the_first_joint():
-    ahead = np.vstack(shapes.turret(BROKK_170, np.array(START)))
-    left = np.vstack(shapes.turret(BROKK_170, np.array([np.pi / 2, *START[1:]])))
-    quarter = np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
-    np.testing.assert_allclose(left, ahead @ quarter, atol=1e-9)
-    assert ahead[:, 2].max() == pytest.approx(0.95)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """Lines to trace: their shapes by hand, what counts as passed, the figures, the table."""
 
-from __future__ import annotations
-
 import time
 from itertools import pairwise
 

@@ -1,11 +1,8 @@
 """The canvas paints what it is asked to; the window needs a display."""
 
-from __future__ import annotations
-
 from contextlib import closing
 
 import numpy as np
-import pytest
 
 from brokk_min.viewer.window import BACKGROUND, Canvas, Window
 
@@ -78,13 +75,3 @@ def test_window__gives_the_size_of_pictures_after_it_was_resized():
             window.show(canvas, 1000.0)
             shown = window.pygame.surfarray.array3d(window.surface).swapaxes(0, 1)
             np.testing.assert_array_equal(shown, canvas.image()[:, : size[0]])
-
-
-def test_window__draws_unseen_only_if_asked_to(monkeypatch):
-    for name in ("DISPLAY", "WAYLAND_DISPLAY", "XDG_RUNTIME_DIR", "SDL_VIDEODRIVER"):
-        monkeypatch.delenv(name, raising=False)
-    with pytest.raises(ValueError, match="window: expected a display"):
-        Window((9, 9), "none")
-    monkeypatch.setenv("SDL_VIDEODRIVER", "offscreen")
-    with closing(Window((9, 9), "unseen")) as window:
-        assert window.pygame.display.get_init()
