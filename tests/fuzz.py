@@ -165,7 +165,7 @@ def runs(policy: Path) -> Content:
 
 def member() -> Content:
     errors = {"error": {"rl": 0.1, "pid": 0.2}, "free_run": {"q1": 0.1}}
-    numbers = {"on_nets": 0.1, "loaded": 0.2, "best": "pid"}
+    numbers = {"on_nets": {"rl": 0.1}, "loaded": {"rl": 0.2}, "best": {"rl": "pid"}}
     return {"seed": 0, "budget": asdict(QUICK), **errors, **numbers}
 
 
