@@ -316,6 +316,14 @@ def test_initial_state__is_at_rest_at_the_measured_pose():
     assert state.ticks.tolist() == [0, 0] and (state.goal_ticks > 1e9).all()
 
 
+@pytest.mark.parametrize("shape", [(), (2, 3)])
+def test_initial_state__takes_whole_numbers_and_any_leading_axes(shape):
+    state = initial_state(BROKK_170, np.full((*shape, 5), 1), ZERO, plant=True)
+    assert state.q.dtype == state.plant.q.dtype == float
+    assert state.v_goal.shape == state.error_integral.shape == (*shape, 3)
+    assert state.ticks.shape == state.goal_ticks.shape == state.lowest.shape == shape
+
+
 def test_transition__on_nets_by_hand():
     """With nets that obey the command, one tick moves each driven joint by velocity x 50 ms."""
     u = np.array([40, 0, -80, 13, 0]) / 127
