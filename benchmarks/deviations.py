@@ -21,7 +21,7 @@ from unittest import mock
 import numpy as np
 from numpy.linalg import norm
 
-from benchmarks import POLICY
+from benchmarks import POLICY, new_policy
 from brokk_min import actuator, env, jacobian, kinematics, machine
 from brokk_min.env import TaskConfig, terminated
 from brokk_min.evaluation import metrics, sequences
@@ -31,11 +31,9 @@ from brokk_min.evaluation.rollout import rollout
 from brokk_min.identification import excitation, fitting, logs, validation
 from brokk_min.kinematics import forward_kinematics
 from brokk_min.learning import policy, simulation_gradient
-from brokk_min.learning.checkpoint import train_policy
-from brokk_min.learning.episodes import GRADIENT_LEARNER, PAPER_TASK, draw_pose
+from brokk_min.learning.episodes import PAPER_TASK, draw_pose
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.machine import BROKK_170, PWM_MAX, Array
-from brokk_min.ppo import PPOConfig
 
 M = BROKK_170
 LOW = M.column("q_min")
@@ -157,8 +155,7 @@ def stand() -> Figures:
     """Path [m] from 0.5 to 2 s after a stop with open valves; dead zone as known, and smaller."""
     starts = sequences.evaluation_starts(M, 64, sequences.task_sequences(M), 2)
     starts = starts[np.array(sequences.start_kinds(M, starts)) == "workspace"]
-    shipped = policy.load_policy(POLICY, M)
-    shipped = replace(shipped, valves="open")
+    shipped = replace(policy.load_policy(POLICY, M), valves="open")
     controller = policy.PolicyController(M, shipped)
     result = {}
     for dead_zone in (M.dead_zone, M.dead_zone - 0.02):
@@ -204,11 +201,7 @@ def fit_scores(kind: str, seed: int, **settings: Any) -> Figures:
 def train(task: TaskConfig, critic: bool = False, net: Any = None) -> Figures:
     """Error [m/s], drift [m], travel of a new policy along x, y, z, on nets and plant."""
     net = net or policy.load_policy(POLICY, M).net
-    with tempfile.TemporaryDirectory() as folder:
-        settings = {} if critic else GRADIENT_LEARNER
-        config = PPOConfig(**{**settings, "total_steps": STEPS, "threads": 1})
-        trained = train_policy(M, net, task, config, 0, Path(folder) / "policy.npz", critic)
-    controllers = {"rl": policy.PolicyController(M, trained)}
+    controllers = {"rl": policy.PolicyController(M, new_policy(net, task, critic, STEPS))}
     starts = sequences.evaluation_starts(M, 32, sequences.task_sequences(M), 2)
     result = {}
     for name, moves in (("nets", net), ("plant", None)):

@@ -7,45 +7,38 @@ nets; by default results. By default three seeds of two million steps each.
 """
 
 import sys
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 
+from benchmarks import new_policy
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation import metrics, sequences
 from brokk_min.evaluation.reproduce import side_by_side
 from brokk_min.identification.net_file import load_net
-from brokk_min.learning.checkpoint import train_policy
-from brokk_min.learning.episodes import GRADIENT_LEARNER, PAPER_TASK
+from brokk_min.learning.episodes import PAPER_TASK
 from brokk_min.learning.policy import PolicyController
 from brokk_min.machine import BROKK_170
-from brokk_min.ppo import PPOConfig
 
 FIGURES = ("velocity_error_mean", "off_axis_drift_max", "valve_travel", "jerk_rms")
 PAPER = TaskConfig(paper=True, **PAPER_TASK)
 NO_COST = TaskConfig(valve_cost=0.0, integral_cost=0.0)
-RUNGS: dict[str, tuple[str, TaskConfig, bool, dict[str, Any]]] = {  # nets, task, critic, settings
-    "the paper's learner and nets": ("net_paper", PAPER, True, {}),
-    "our nets": ("net", PAPER, True, {}),
-    "our observation, actions, starts": ("net", NO_COST, True, {}),
-    "costs of valves and error integral": ("net", TaskConfig(), True, {}),
-    "gradients of the simulation, our settings": ("net", TaskConfig(), False, GRADIENT_LEARNER),
-    "valves open at rest": ("net", TaskConfig(valves="open"), False, GRADIENT_LEARNER),
+RUNGS = {  # nets, task, critic
+    "the paper's learner and nets": ("net_paper", PAPER, True),
+    "our nets": ("net", PAPER, True),
+    "our observation, actions, starts": ("net", NO_COST, True),
+    "costs of valves and error integral": ("net", TaskConfig(), True),
+    "gradients of the simulation, our settings": ("net", TaskConfig(), False),
+    "valves open at rest": ("net", TaskConfig(valves="open"), False),
 }
 
 
 def climb(folder: Path, name: str, steps: int, seed: int) -> list[float]:
     """`FIGURES` of one new policy on the machine, means over x, y, z and 32 workspace starts."""
-    nets, task, critic, settings = RUNGS[name]
+    nets, task, critic = RUNGS[name]
     net = load_net(folder / f"{nets}.npz", BROKK_170)
-    config = replace(PPOConfig(threads=1), **{**settings, "total_steps": steps})
-    with TemporaryDirectory() as out:
-        file = Path(out) / "policy.npz"
-        policy = train_policy(BROKK_170, net, task, config, seed, file, critic)
+    policy = new_policy(net, task, critic, steps, seed)
     axes = sequences.axis_sequences(BROKK_170)
     starts = sequences.evaluation_starts(BROKK_170, 64, sequences.task_sequences(BROKK_170), 2)
     starts = starts[np.array(sequences.start_kinds(BROKK_170, starts)) == "workspace"]
