@@ -6,11 +6,12 @@ from shutil import copyfile
 import numpy as np
 import pytest
 
-from benchmarks import deviations, ladder, limits, neighbours, peers, seeds
+from benchmarks import deviations, ladder, limits, neighbours, peers, seeds, step_logs
 from brokk_min import kinematics
 from brokk_min.env import action_to_pwm
 from brokk_min.evaluation import metrics
 from brokk_min.identification.files import SHIPPED
+from brokk_min.identification.logs import read_log
 from brokk_min.identification.net_file import save_net
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import load_policy
@@ -111,3 +112,15 @@ def test_climb__trains_and_scores_a_policy(tmp_path, name):
     save_net(tmp_path / "net.npz", net)
     error, drift, travel, jerk = ladder.climb(tmp_path, name, 1, 0)
     assert 0.05 < error < 0.3 and 0 <= drift < 2 and travel >= 0 and jerk >= 0
+
+
+def test_step_logs__have_steps_of_one_joint_and_late_answers(tmp_path):
+    logs = [read_log([path], 4, rate=100.0) for path in step_logs.make_logs(tmp_path, 3)]
+    duties = [{float(abs(one.u).max()) for one in log.recordings} for log in logs]
+    assert [len(duty) for duty in duties] == [5, 2]
+    assert set.union(*duties) == set(step_logs.DUTIES)
+    for one in logs[1].recordings:
+        (j,) = np.flatnonzero(one.u.any(axis=0))
+        first = np.flatnonzero(one.u[:, j])[0]
+        assert np.ptp(one.q[: first + 20, j]) < 0.03  # rad of noise, 0.2 s after the command
+        assert np.ptp(one.q[:, j]) > 0.1
