@@ -1,67 +1,193 @@
-"""From the paper's learner to ours, step by step: what buys how much on the machine.
+"""From the paper's learner to ours: what each step buys on the machine, alone and in order.
 
-    python -m benchmarks.ladder [FOLDER] [STEPS] [SEEDS]
+    python -m benchmarks.ladder [FOLDER] [STEPS] [SEEDS] [NAME...]
 
-Each row has all the changes of the rows above it. FOLDER is one of `brokk-min reproduce`, with both
-nets; by default results. By default three seeds of two million steps each.
+"Alone" is the paper's learner with one of `STEPS`; "in order" has the steps of all rows above it,
+too. FOLDER is one of `brokk-min reproduce`, by default results; nets that are missing are fitted to
+its logs. By default three seeds of one million environment steps each. NAME: only rows that begin
+with it. Figures are means over x, y, z and the workspace starts; "closed" is the error with valves
+that close while the tool rests.
 """
 
 import sys
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from benchmarks import new_policy
-from brokk_min.env import TaskConfig
+from brokk_min import actuator, env, ppo
+from brokk_min.actuator import ActuatorNet
+from brokk_min.env import Bools, Measured, TaskConfig, action_to_pwm, features
 from brokk_min.evaluation import metrics, sequences
-from brokk_min.evaluation.reproduce import side_by_side
-from brokk_min.identification.net_file import load_net
-from brokk_min.learning.episodes import PAPER_TASK
-from brokk_min.learning.policy import PolicyController
-from brokk_min.machine import BROKK_170
+from brokk_min.evaluation.reproduce import Budget, fit_net, side_by_side
+from brokk_min.identification import logs
+from brokk_min.identification.fitting import PAPER_RECIPE
+from brokk_min.identification.net_file import load_net, select_nets
+from brokk_min.learning.checkpoint import export_policy, stagger_episodes
+from brokk_min.learning.episodes import GRADIENT_LEARNER, PAPER_TASK, get_obs, new_goals, reset
+from brokk_min.learning.gym_env import TaskVectorEnv
+from brokk_min.learning.policy import Policy
+from brokk_min.learning.simulation_gradient import improved_actions, regression_loss
+from brokk_min.machine import BROKK_170 as M
+from brokk_min.machine import PWM_MAX, Array
 
 FIGURES = ("velocity_error_mean", "off_axis_drift_max", "valve_travel", "jerk_rms")
-PAPER = TaskConfig(paper=True, **PAPER_TASK)
-NO_COST = TaskConfig(valve_cost=0.0, integral_cost=0.0)
-RUNGS = {  # nets, task, critic
-    "the paper's learner and nets": ("net_paper", PAPER, True),
-    "our nets": ("net", PAPER, True),
-    "our observation, actions, starts": ("net", NO_COST, True),
-    "costs of valves and error integral": ("net", TaskConfig(), True),
-    "gradients of the simulation, our settings": ("net", TaskConfig(), False),
-    "valves open at rest": ("net", TaskConfig(valves="open"), False),
+STEPS = {
+    "fit": "rich excitation, multi-step fit",
+    "mu_law": "nets read commands by the mu law",
+    "observation": "error integral, resolved rates, heading frame",
+    "actions": "actions from the dead zone on",
+    "costs": "costs of valve travel and error integral",
+    "episodes": "starts, ends, goals; valves closed at rest",
+    "gradients": "gradients of the simulation, not a critic",
 }
+RUNGS = {"the paper's learner": frozenset[str]()}
+RUNGS |= {f"alone: {text}": frozenset([name]) for name, text in STEPS.items()}
+RUNGS |= {
+    f"in order: {text}": frozenset(list(STEPS)[: i + 1])
+    for i, text in enumerate(STEPS.values())
+    if i
+}
+NETS: dict[frozenset[str], tuple[str, str, dict[str, Any]]] = {  # steps -> file, log, recipe
+    frozenset(): ("net_paper", "log_paper", PAPER_RECIPE),
+    frozenset(["fit"]): ("net_plain", "log", {"dead_zone": 0.0}),
+    frozenset(["mu_law"]): ("net_mu_law", "log_paper", PAPER_RECIPE | {"dead_zone": M.dead_zone}),
+    frozenset(["fit", "mu_law"]): ("net", "log", {}),
+}
+PAPER = TaskConfig(paper=True, **PAPER_TASK)
+GROUNDLESS = replace(M, ground=-1e9)
 
 
-def climb(folder: Path, name: str, steps: int, seed: int) -> list[float]:
-    """`FIGURES` of one new policy on the machine, means over x, y, z and 32 workspace starts."""
-    nets, task, critic = RUNGS[name]
-    net = load_net(folder / f"{nets}.npz", BROKK_170)
-    policy = new_policy(net, task, critic, steps, seed)
-    axes = sequences.axis_sequences(BROKK_170)
-    starts = sequences.evaluation_starts(BROKK_170, 64, sequences.task_sequences(BROKK_170), 2)
-    starts = starts[np.array(sequences.start_kinds(BROKK_170, starts)) == "workspace"]
-    rl = {"rl": PolicyController(BROKK_170, policy)}
-    runs, _ = metrics.evaluate(BROKK_170, rl, axes, starts, 0)
-    return [float(np.mean([run[key] for run in runs])) for key in FIGURES]
+def task_of(steps: frozenset[str]) -> TaskConfig:
+    """Costs and valves of our task, each only if the step is taken."""
+    task = TaskConfig(valves="closed" if "episodes" in steps else "open")
+    return task if "costs" in steps else replace(task, valve_cost=0.0, integral_cost=0.0)
 
 
-def main(folder: str = "results", steps: str = "2000000", seeds: str = "3") -> None:
+def our_action(action: Array) -> Array:
+    """Actions (..., n_driven) that give, from the dead zone on, what linear ones give."""
+    beyond = M.pwm_limit / PWM_MAX - M.dead_zone
+    u = np.abs(action) * M.pwm_limit / PWM_MAX
+    crossing = u / (M.dead_zone / env.COMPENSATION + beyond)
+    size = np.where(crossing < env.COMPENSATION, crossing, (u - M.dead_zone) / beyond)
+    return np.asarray(np.copysign(size, action), action.dtype)
+
+
+class MixedEnv(TaskVectorEnv):
+    """The task with some steps from the paper's to ours."""
+
+    def __init__(self, net: ActuatorNet, steps: frozenset[str], num_envs: int = 256) -> None:
+        super().__init__(num_envs, net, M, TaskConfig(paper="observation" not in steps))
+        self.steps = steps
+        self.episodes = TaskConfig() if "episodes" in steps else PAPER
+
+    def step_without_reset(
+        self, actions: Array
+    ) -> tuple[Array, Array, Bools, Bools, dict[str, Any]]:
+        """One tick; the paper's episodes end in the ground in their first tick only."""
+        before = self.state
+        assert before is not None
+        ours = "episodes" in self.steps
+        actions = actions if "actions" in self.steps else our_action(actions)
+        state, reward, end, truncated, error = env.step(
+            M if ours else GROUNDLESS, task_of(self.steps), self.net, before, actions
+        )
+        if not ours:
+            end = env.terminated(M, state.lowest) & (state.ticks == 1)
+        self.state = new_goals(M, self.episodes, state, self.np_random)
+        obs = get_obs(M, self.config, self.state, self.np_random)
+        info = {"state": before, "velocity_error": error}
+        return obs, np.where(end, 0.0, reward), end, truncated & ~end, info
+
+    def _new_episodes(self, num: int) -> env.State:
+        return reset(M, self.episodes, self.np_random, num, plant=False)
+
+
+@dataclass(frozen=True)
+class MixedController:
+    """A policy of `MixedEnv` on the machine."""
+
+    policy: Policy
+    steps: frozenset[str]
+    valves: str
+
+    def start(self, num: int) -> NDArray[np.int64]:
+        """Ticks for which the goal has been zero, (num,)."""
+        return np.zeros(num, np.int64)
+
+    def __call__(
+        self, measured: Measured, ticks: NDArray[np.int64]
+    ) -> tuple[Array, NDArray[np.int64]]:
+        """As `PolicyController`."""
+        action = self.policy.act(features(M, measured, "observation" not in self.steps))
+        u = action_to_pwm(M, action, "actions" not in self.steps)
+        return actuator.close_valves(M, self.valves, u, measured.v_goal, ticks)
+
+
+def nets_of(folder: Path, steps: frozenset[str]) -> ActuatorNet:
+    """Nets of the driven joints, from the folder or fitted to its log."""
+    name, log, recipe = NETS[steps & {"fit", "mu_law"}]
+    file = folder / f"{name}.npz"
+    if not file.exists():
+        recorded = logs.read_log([folder / f"{log}.npz"], M.velocity_samples, rate=M.rate)
+        fit_net(M, file, recorded, Budget(), recipe, 0)
+    return select_nets(M, load_net(file, M))
+
+
+def train(net: ActuatorNet, steps: frozenset[str], total_steps: int, seed: int) -> Policy:
+    """A new policy."""
+    gradients = "gradients" in steps
+    settings = {**(GRADIENT_LEARNER if gradients else {}), "total_steps": total_steps}
+    config = ppo.PPOConfig(**settings)
+    task_env = MixedEnv(net, steps)
+    learner = ppo.make_learner(task_env, config, seed, critic=not gradients)
+    stagger_episodes(task_env)
+    estimate, loss = None, ppo.ppo_loss
+    if gradients:
+        task = replace(task_of(steps), paper="actions" not in steps)
+        estimate, loss = improved_actions(M, net, task), regression_loss
+    agent = ppo.train(
+        task_env, config, seed, estimate=estimate, loss_function=loss, learner=learner
+    )
+    return export_policy(M, net, agent, task_env.config, {})
+
+
+def climb(folder: Path, name: str, total_steps: int, seed: int) -> list[float]:
+    """`FIGURES` of one new policy on the machine, and its error with closed valves."""
+    steps = RUNGS[name]
+    policy = train(nets_of(folder, steps), steps, total_steps, seed)
+    axes = sequences.axis_sequences(M)
+    starts = sequences.evaluation_starts(M, 64, sequences.task_sequences(M), 2)
+    starts = starts[np.array(sequences.start_kinds(M, starts)) == "workspace"]
+    both = {v: MixedController(policy, steps, v) for v in (task_of(steps).valves, "closed")}
+    runs, _ = metrics.evaluate(M, both, axes, starts, 0)
+    table = metrics.summary(runs)
+    figures = [table[task_of(steps).valves]["all"][key] for key in FIGURES]
+    return [float(x or 0.0) for x in [*figures, table["closed"]["all"][FIGURES[0]]]]
+
+
+def main(folder: str = "results", steps: str = "1000000", seeds: str = "3", *names: str) -> None:
+    rungs = [rung for rung in RUNGS if rung.startswith(names or "")]
+    for rung in rungs:  # before the jobs, which would fit them at once
+        nets_of(Path(folder), RUNGS[rung])
     jobs = {
-        (name, seed): partial(climb, Path(folder), name, int(steps), seed)
-        for name in RUNGS
+        (rung, seed): partial(climb, Path(folder), rung, int(steps), seed)
+        for rung in rungs
         for seed in range(int(seeds))
     }
     results = dict(
         zip(jobs, side_by_side({str(k): job for k, job in jobs.items()}, {}), strict=True)
     )
-    print(f"{'means of seeds, largest less smallest':44}", *(f"{key:>26}" for key in FIGURES))
-    for name in RUNGS:
-        figures = np.array([results[name, seed] for seed in range(int(seeds))])
+    columns = [*FIGURES, "closed"]
+    print(f"{'means of seeds (largest less smallest)':56}", *(f"{key:>22}" for key in columns))
+    for rung in rungs:
+        figures = np.array([results[rung, seed] for seed in range(int(seeds))])
         spread = np.ptp(figures, axis=0)
         cells = [f"{m:.4f} ({s:.4f})" for m, s in zip(figures.mean(axis=0), spread, strict=True)]
-        print(f"{name:44}", *(f"{cell:>26}" for cell in cells))
+        print(f"{rung:56}", *(f"{cell:>22}" for cell in cells))
 
 
 if __name__ == "__main__":

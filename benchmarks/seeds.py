@@ -4,11 +4,12 @@
 
 Each seed records, fits and trains as `brokk-min reproduce` does, on one thread; as many seeds run
 at once as there are cores. What the folder holds already is not made again. Policies and the
-package's tuned baselines are then scored on the sequences and starts of `evaluate`. All
+package's tuned baselines are then scored on the sequences and starts of `evaluate`; the paper's
+policies also with valves that close while the tool rests, as an operator's and the PIDs' do. All
 figures go to `seeds.json` in the folder, the learning curves of ours to `seeds.svg`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,7 @@ FIGURES = {  # name in the file -> figure of `metrics`
     "joint_motion_at_rest": "joint_motion_at_rest",
 }
 NAMES = {"rl": "ours closed", "rl_open": "ours open", "rl_paper": "paper"}
+NAMES |= {"rl_paper_closed": "paper closed"}
 RECIPES: dict[str, tuple[str, str, dict[str, Any]]] = {  # policy -> nets, excitation, recipe
     "rl": ("net", "rich", {}),
     "rl_open": ("net", "rich", {}),
@@ -76,6 +78,11 @@ def score(options: Options) -> list[dict[str, Any]]:
         for seed in range(options.seeds)
         for name in options.policies
         if (file := options.folder / f"seed_{seed}" / POLICIES[name]).exists()
+    }
+    policies |= {  # the paper's learner once more, with valves that close at rest
+        (f"{name}_closed", seed): replace(policy, valves="closed")
+        for (name, seed), policy in policies.items()
+        if policy.paper
     }
     controllers: dict[Any, Any] = {k: PolicyController(M, p) for k, p in policies.items()}
     shipped = SHIPPED / M.name

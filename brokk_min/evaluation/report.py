@@ -54,7 +54,8 @@ FIRST = {  # figures of the first screen: names in seeds.json, in results, in a 
     "valve travel [strokes]": ("valve_travel", "valve_travel", "valve_travel"),
 }
 NONE: Mean = {"mean": None, "low": None, "high": None}
-SEEDS = {"ours closed": "rl", "ours open": "rl_open", "paper": "rl_paper"}  # other names there
+SEEDS = {"ours closed": "rl", "ours open": "rl_open", "paper": "rl_paper"}  # names there
+SEEDS |= {"paper closed": "rl_paper"}
 
 
 class Shown(NamedTuple):

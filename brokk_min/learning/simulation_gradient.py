@@ -17,8 +17,8 @@ actions so improved,
 
 There is no likelihood ratio, no clip and no critic. To the same error it takes 45 s of CPU where
 PPO's clip around the same gradient takes 312 s (docs/deviations.md, D10). It is open loop: later
-actions count as given. No value stands at the end of the window, so the last
-actions of a window, which move the tool after it, get little credit. None of this is new:
+actions count as given. No value stands at the end of the window, so its last actions, which move
+the tool after it, get little credit. None of this is new:
 
 - PODS (Mora et al., 2021) is this method: actions improved along the gradient of the return in a
   differentiable simulator, a policy regressed to them. There the policy is deterministic.
@@ -82,7 +82,7 @@ def improved_actions(machine: Machine, net: ActuatorNet, task: TaskConfig) -> pp
         states = [info["state"] for info in rollout.infos]
         v_goal = np.stack([state.v_goal for state in states])
         rest_ticks = np.stack([state.rest_ticks for state in states])
-        u = action_to_pwm(machine, rollout.actions.numpy())
+        u = action_to_pwm(machine, rollout.actions.numpy(), task.paper)
         follows, _ = close_valves(machine, task.valves, np.ones_like(u), v_goal, rest_ticks)
         ticks = Ticks(
             q=np.stack([state.q for state in states]),
@@ -160,7 +160,7 @@ def action_gradients(
         dR_dh = before
         dR_dlast = dc_du[t]
     follows = ticks.follows[..., machine.driven].astype(np.float32)
-    return dR_du * follows * compensation_derivative(machine, ticks.u)
+    return dR_du * follows * compensation_derivative(machine, ticks.u, task.paper)
 
 
 def valve_cost_gradient(machine: Machine, ticks: Ticks, valve_cost: float) -> Array:
@@ -240,11 +240,12 @@ def mu_law_derivative(u: Array, dead_zone: float) -> Array:
     return np.asarray((x > 0) * slope, u.dtype)
 
 
-def compensation_derivative(machine: Machine, u: Array) -> Array:
+def compensation_derivative(machine: Machine, u: Array, paper: bool = False) -> Array:
     """Derivative of `env.action_to_pwm` by the action at commands `u` (..., n): (..., n_driven).
 
     Of an action beyond [-1, 1], which is clipped, it should be 0; here the targets are clipped.
     """
-    beyond = machine.pwm_limit / PWM_MAX - machine.dead_zone
-    crossing = np.abs(u[..., machine.driven]) < machine.dead_zone + COMPENSATION * beyond
-    return np.asarray((beyond + crossing * (machine.dead_zone / COMPENSATION)), np.float32)
+    dead_zone = 0.0 if paper else machine.dead_zone
+    beyond = machine.pwm_limit / PWM_MAX - dead_zone
+    crossing = np.abs(u[..., machine.driven]) < dead_zone + COMPENSATION * beyond
+    return np.asarray((beyond + crossing * (dead_zone / COMPENSATION)), np.float32)

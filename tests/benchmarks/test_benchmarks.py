@@ -5,6 +5,9 @@ from shutil import copyfile
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 from benchmarks import deviations, ladder, limits, neighbours, peers, seeds, step_logs
 from brokk_min import kinematics
@@ -106,12 +109,37 @@ def test_deviations__train_and_compare(entry, monkeypatch):
     assert kinematics.to_heading is to_heading
 
 
-@pytest.mark.parametrize("name", ["our nets", "valves open at rest"])
+FIRST, *_, LAST = ladder.RUNGS
+
+
+@pytest.mark.parametrize("name", ["alone: gradients of the simulation, not a critic", LAST])
 def test_climb__trains_and_scores_a_policy(tmp_path, name):
     net = load_policy(SHIPPED / BROKK_170.name / "policy.npz", BROKK_170).net
-    save_net(tmp_path / "net.npz", net)
-    error, drift, travel, jerk = ladder.climb(tmp_path, name, 1, 0)
+    for file in ("net.npz", "net_paper.npz"):
+        save_net(tmp_path / file, net)
+    error, drift, travel, jerk, closed = ladder.climb(tmp_path, name, 1, 0)
     assert 0.05 < error < 0.3 and 0 <= drift < 2 and travel >= 0 and jerk >= 0
+    assert 0.05 < closed < 0.3
+
+
+@given(arrays(float, 4, elements=st.floats(-1, 1)))
+def test_our_action__gives_the_command_of_a_linear_one(action):
+    u = action_to_pwm(BROKK_170, ladder.our_action(action))
+    assert u == pytest.approx(action_to_pwm(BROKK_170, action, paper=True), abs=1e-12)
+
+
+@pytest.mark.parametrize(("name", "paper"), [(LAST, False), (FIRST, True)])
+def test_mixed_env__is_the_task_of_the_package_at_both_ends(name, paper):
+    """Same seed, same actions: observations, rewards and ends agree."""
+    net = load_policy(SHIPPED / BROKK_170.name / "policy.npz", BROKK_170).net
+    mixed = ladder.MixedEnv(net, ladder.RUNGS[name], 8)
+    whole = TaskVectorEnv(8, net, BROKK_170, ladder.PAPER if paper else None)
+    rng = np.random.default_rng(0)
+    assert mixed.reset(seed=1)[0] == pytest.approx(whole.reset(seed=1)[0])
+    for _ in range(100):
+        actions = rng.uniform(-1, 1, (8, 4)).astype(np.float32)
+        for one, other in zip(mixed.step(actions)[:4], whole.step(actions)[:4], strict=True):
+            assert one == pytest.approx(other, abs=2e-3)
 
 
 def test_step_logs__have_steps_of_one_joint_and_late_answers(tmp_path):
