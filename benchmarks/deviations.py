@@ -21,7 +21,7 @@ from unittest import mock
 import numpy as np
 from numpy.linalg import norm
 
-from benchmarks import POLICY, new_policy
+from benchmarks import POLICY
 from brokk_min import actuator, env, jacobian, kinematics, machine
 from brokk_min.env import TaskConfig, terminated
 from brokk_min.evaluation import baselines, metrics, sequences
@@ -31,9 +31,11 @@ from brokk_min.evaluation.rollout import rollout
 from brokk_min.identification import excitation, fitting, logs, validation
 from brokk_min.kinematics import forward_kinematics
 from brokk_min.learning import policy, simulation_gradient
-from brokk_min.learning.episodes import PAPER_TASK, draw_pose
+from brokk_min.learning.checkpoint import train_policy
+from brokk_min.learning.episodes import GRADIENT_LEARNER, PAPER_TASK, draw_pose
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.machine import BROKK_170, PWM_MAX, Array
+from brokk_min.ppo import PPOConfig
 
 M = BROKK_170
 LOW = M.column("q_min")
@@ -201,7 +203,11 @@ def fit_scores(kind: str, seed: int, **settings: Any) -> Figures:
 def train(task: TaskConfig, critic: bool = False, net: Any = None) -> Figures:
     """Error [m/s], drift [m], travel of a new policy along x, y, z, on nets and plant."""
     net = net or policy.load_policy(POLICY, M).net
-    controllers = {"rl": policy.PolicyController(M, new_policy(net, task, critic, STEPS))}
+    settings = {} if critic else GRADIENT_LEARNER
+    config = PPOConfig(**{**settings, "total_steps": STEPS, "threads": 1})
+    with tempfile.TemporaryDirectory() as folder:
+        trained = train_policy(M, net, task, config, 0, Path(folder) / "policy.npz", critic)
+    controllers = {"rl": policy.PolicyController(M, trained)}
     starts = sequences.evaluation_starts(M, 32, sequences.task_sequences(M), 2)
     result = {}
     for name, moves in (("nets", net), ("plant", None)):
@@ -319,7 +325,7 @@ def a5() -> Figures:
 def quiet() -> Figures:
     """Velocity errors [m/s] without noise: policies, shipped gains, gains tuned without noise."""
     config = TaskConfig(noise=0.0)
-    shipped = SHIPPED / M.name
+    shipped = POLICY.parent
     files = {name: policy.load_policy(shipped / file, M) for name, file in policy.POLICIES.items()}
     controllers: dict[str, Any] = {k: policy.PolicyController(M, p) for k, p in files.items()}
     net = files["rl"].net
