@@ -26,6 +26,7 @@ from benchmarks.rollout import random_net, write
 from brokk_min.can.canopen import Frame
 from brokk_min.can.drive_log import read_frames
 from brokk_min.env import observation_scale
+from brokk_min.identification.net_file import joint_nets
 from brokk_min.learning.policy import Policy, contract, save_policy
 from brokk_min.machine import BROKK_170
 
@@ -61,7 +62,7 @@ def random_policy(rng: np.random.Generator) -> Policy:
     for rows, columns in pairwise([len(mean), 256, 128, 64, len(BROKK_170.driven)]):
         weights.append(rng.normal(0, rows**-0.5, (rows, columns)).astype(np.float32))
         weights.append(np.zeros(columns, np.float32))
-    net = random_net(rng).select([BROKK_170.names[i] for i in BROKK_170.driven])
+    net = joint_nets(random_net(rng), [BROKK_170.names[i] for i in BROKK_170.driven])
     return Policy(contract(BROKK_170), {}, mean, scale, tuple(weights), net)
 
 

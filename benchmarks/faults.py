@@ -91,7 +91,7 @@ def frozen_times(counts: int, moving: bool, rng: np.random.Generator) -> np.ndar
     for tick in range(first + 40):
         q = plant.q
         expected = expected_motion(m, gate, frozen)
-        fault = (expected > max(FROZEN_ANGLE, m.encoder_step)).any(axis=-1)
+        fault = (expected > np.maximum(FROZEN_ANGLE, m.encoder_step)).any(axis=-1)
         found = np.where(fault & np.isinf(found), tick, found)
         sent = np.zeros((num, m.n), int)
         before = np.abs(gate.sent[range(num), joint, -1])

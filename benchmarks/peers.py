@@ -31,7 +31,7 @@ from brokk_min import ppo
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import COMPENSATION, measure
 from brokk_min.evaluation import baselines
-from brokk_min.identification.net_file import load_net
+from brokk_min.identification.net_file import joint_nets, load_net
 from brokk_min.learning.checkpoint import stagger_episodes
 from brokk_min.learning.episodes import GRADIENT_LEARNER, draw_noise
 from brokk_min.learning.gym_env import TaskVectorEnv
@@ -213,7 +213,7 @@ def best_setting(rows: list[dict[str, Any]]) -> Setting:
 
 def main(options: Options) -> dict[str, Any]:
     net = load_net(options.actuator) if options.actuator else random_net(np.random.default_rng(0))
-    net = net.select([M.names[i] for i in M.driven])
+    net = joint_nets(net, [M.names[i] for i in M.driven])
     target = options.target
     if target is None:
         target = mean_reward(net, pid(net, options.gains))

@@ -17,7 +17,7 @@ from brokk_min.machine import BROKK_170
 
 COMMAND = (60, 0, 60, 60, 60)
 SLOW = (15, 0, 15, 15, 15)
-STEP = BROKK_170.encoder_step
+STEP = BROKK_170.encoder_step[0]
 
 
 class Fault:
