@@ -43,6 +43,7 @@ from brokk_min.identification.files import SHIPPED, brief, located, write_json
 from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
 from brokk_min.identification.logs import Log, part_of, read_log, split, write_log
 from brokk_min.identification.net_file import load_net, save_net
+from brokk_min.identification.recovery import recovery
 from brokk_min.learning.policy import POLICIES, Policy, PolicyController, load_policy
 from brokk_min.machine import Machine
 
@@ -81,8 +82,9 @@ class Fit(Command):
     out: Path  # Nets to write, .npz.
     test: tuple[Path, ...] = ()  # Logs to score on; by default every tenth recording of LOGS.
     json: Path | None = None  # Also write the scores here.
-    figure: Path | None = None  # Also draw free runs of the worst and median recording, .png.
+    figure: Path | None = None  # Free runs of the worst and median recording; by default OUT.png.
     machine: MachineName = ""  # Of LOGS; by default the usual one, if LOGS has its joints.
+    plant: PlantName = ""  # What LOGS recorded, if known: also print what the nets recovered of it.
     velocity_samples: Samples | None = None  # Window of velocities; by default the machine's.
     paper: bool = False  # The paper's recipe: errors of one step, no noise, plain commands.
     curve: bool = False  # Also score nets fitted to an eighth, a quarter, a half of the recordings.
@@ -94,6 +96,7 @@ class Fit(Command):
 
         if not self.logs:
             raise WrongUse("LOGS: expected at least one log, got none")
+        self.figure = self.figure or self.out.with_suffix(".png")
         machine = self.check(out="nets", json="scores", figure="picture")
         make_config(FitConfig, self._settings(None, machine.history))  # before the logs are read
         samples = self.velocity_samples or machine.velocity_samples
@@ -102,6 +105,9 @@ class Fit(Command):
         if self.machine and not known:
             expected = f"expected those of --machine {self.machine}"
             raise ValueError(f"{self.logs[0]}: joints: {expected}, got {brief(log.joints)}")
+        if self.plant and not known:
+            raise WrongUse("--plant: expected LOGS with the joints of --machine")
+        recorded = with_plant(machine, self.plant, ["analytic", ""])
         history = machine.history if known else history_of(log, machine.history)
         config = make_config(FitConfig, self._settings(known, history))
         reports = inspection.inspect(log)
@@ -114,6 +120,8 @@ class Fit(Command):
             if "one_step_rmse" not in scored:
                 scores["warnings"].append(f"{name}: not driven in the test: no score")
         scores["warnings"] += inspection.warnings(log, reports, known)
+        if self.plant:
+            scores["recovery"] = recovery(net, recorded)
         save_net(self.out, net)
         if self.curve:
             parts = [part_of(log, part) for part in (1 / 8, 1 / 4, 1 / 2)]
@@ -122,13 +130,14 @@ class Fit(Command):
             scores["curve"] = learning_curve([*parts, log], curve)
         if self.json:
             write_json(self.json, {"meta": self._meta(net), **scores})
-        if self.figure:
-            figures.save(self.figure, figures.plot_worst_and_median(net, test))
+        if any("one_step_rmse" in joint for joint in scores["joints"].values()):
+            figures.save(self.figure, figures.plot_worst_and_median(net, test, known))
         name = net.machine or "no known machine"
         print(f"nets of {name}, dead zone {net.dead_zone} of full command")
         seconds = net.history / net.rate
         print(f"history: {net.history} samples at {net.rate:g} Hz, {seconds:.2f} s")
         print_scores(scores)
+        print_recovery(scores.get("recovery", {}))
         for point in scores.get("curve", []):
             errors_5_s = ", ".join(f"{k} {v:.4f}" for k, v in point["free_run_rmse"].items())
             print(
@@ -169,6 +178,18 @@ def learning_curve(logs: list[Log], scores: list[dict[str, Any]]) -> list[dict[s
         errors = {name: run["velocity_rmse"] for name, run in runs.items() if run}
         curve.append({"minutes": minutes, "free_run_rmse": errors})
     return curve
+
+
+def print_recovery(joints: dict[str, dict[str, Any]]) -> None:
+    """A table of `recovery`: of each number up and down."""
+    if joints:
+        print("What the nets recovered of the plant, up and down:")
+        row = "{:12} {:6} {:>15} {:>15} {:>15} {:>15}"
+        print(row.format("joint", "", "dead zone", "delay [s]", "from idle [s]", "speed"))
+    for name, sides in joints.items():
+        for side, numbers in sides.items():
+            pairs = (", ".join(f"{x or np.nan:.3f}" for x in pair) for pair in numbers.values())
+            print(row.format(name, side, *pairs))
 
 
 def print_scores(scores: dict[str, Any]) -> None:

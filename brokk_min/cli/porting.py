@@ -17,6 +17,7 @@ from brokk_min.identification import inspection, validation
 from brokk_min.identification.files import brief, located, whole_file, write_json
 from brokk_min.identification.logs import Log, read_log
 from brokk_min.identification.net_file import load_net
+from brokk_min.kinematics import UNITS
 from brokk_min.learning.policy import Policy, load_policy
 from brokk_min.machine import Machine
 
@@ -34,6 +35,7 @@ COLUMNS = {  # of the table of `inspect`: head, format, field of `JointReport`
     "gain down": ("{:.2f}", "gain_down"),
     "explained": ("{:.0%}", "explained"),
     "feedback": ("{:+.2f}", "feedback"),
+    "reaction": ("{:+.2f}", "reaction"),
 }
 
 
@@ -64,7 +66,8 @@ class Score(Command):
         if any("one_step_rmse" in joint for joint in scores["joints"].values()):
             from brokk_min.evaluation import figures
 
-            figures.save(self.figure, figures.plot_worst_and_median(net, log))
+            drawn = machine if machine.names == net.joints else None
+            figures.save(self.figure, figures.plot_worst_and_median(net, log, drawn))
         print("Errors [rad/s] of one step, of the last velocity again, of free runs of 1 to 30 s:")
         for name, joint in scores["joints"].items():
             print_score(name, joint)
@@ -149,7 +152,8 @@ def plot_drive(machine: Machine, policy: Policy, ticks: diagnosis.Ticks) -> "Fig
         values = {"measured": measured, "expected": simulated}
         q_dot = {label: (later, x[..., k].T.ravel()) for label, x in values.items()}
         left = figures.Panel("", "time [s]", f"command of {name} [1]", u)
-        rows.append([left, figures.Panel("", "time [s]", f"{name} [rad/s]", q_dot)])
+        label = f"{name} [{UNITS[machine.joints[j].kind]}/s]"
+        rows.append([left, figures.Panel("", "time [s]", label, q_dot)])
     return figures.plot_panels(rows)
 
 
