@@ -9,6 +9,7 @@ machine's dead zone.
 from __future__ import annotations
 
 import json
+import re
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -85,6 +86,12 @@ def main(options: Options) -> None:
         "step_over_products": float(np.median(products) / np.median(steps)),
     }
     write(result, options.json)
+
+
+def memory(process: int | str = "self") -> float:
+    """Resident memory of a process [MB] (Linux)."""
+    status = Path(f"/proc/{process}/status").read_text()
+    return int(re.findall(r"VmRSS:\s+(\d+)", status)[0]) / 1e3
 
 
 def write(result: object, path: Path | None) -> None:
