@@ -80,8 +80,10 @@ def random_policy(rng: np.random.Generator) -> Policy:
 
 def figures(frames: list[Frame]) -> dict[str, Any]:
     """Times in ms. Lateness is that of SYNC on the grid of the first one, drift included."""
-    begin = next(k for k, frame in enumerate(frames) if frame.id == 0x210)
+    begin = next((k for k, frame in enumerate(frames) if frame.id == 0x210), len(frames))
     frames = frames[begin:]
+    if not frames:
+        return {"ticks": 0}  # it never drove
     times = np.array([frame.time for frame in frames])
     ids = np.array([frame.id for frame in frames])
     syncs = times[ids == 0x080]
