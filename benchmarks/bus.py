@@ -119,7 +119,7 @@ def memory_of(process: Any) -> dict[str, float]:
             times.append((time.monotonic() - begin) / 3600)
             used.append(memory(process.pid))
         time.sleep(1)
-    if len(used) < 10:
+    if len(used) < 240:  # s; of less the growth is noise
         return {}
     growth = float(np.polyfit(times, used, 1)[0])
     return {"begin": used[0], "end": used[-1], "growth_per_hour": round(growth, 2)}
