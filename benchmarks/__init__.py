@@ -1,6 +1,7 @@
 """Speed, each script one JSON; run as `python -m benchmarks.<name>` from the project's root."""
 
 import json
+import re
 from pathlib import Path
 
 import brokk_min  # noqa: F401, before NumPy: it settles how many threads that takes
@@ -16,3 +17,9 @@ def write(result: object, path: Path | None) -> None:
     print(text)
     if path:
         path.write_text(text + "\n")
+
+
+def memory(process: int | str = "self") -> float:
+    """Resident memory of a process [MB] (Linux)."""
+    status = Path(f"/proc/{process}/status").read_text()
+    return int(re.findall(r"VmRSS:\s+(\d+)", status)[0]) / 1e3

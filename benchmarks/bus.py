@@ -3,7 +3,8 @@
     python -m benchmarks.bus [--seconds 600] [--busy] [--realtime] [--foreign 1000] [--json F]
 
 `brokk-min machine` and `brokk-min drive` run as a user runs them; all figures come from the log of
-the drive.
+the drive. Beside them a process of the same priority only sleeps, a millisecond each time: what
+makes it late is not the loop. Memory is that of the drive.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from typing import Any
 import numpy as np
 import tyro
 
-from benchmarks import POLICY, write
+from benchmarks import POLICY, memory, write
 from brokk_min.can.canopen import Frame
 from brokk_min.can.drive_log import read_frames
 
@@ -39,6 +40,16 @@ while True:
             print(sent / (time.monotonic() - start), flush=True)
     time.sleep(0.001)
 """
+SLEEPER = """
+import time
+while True:
+    begin = time.monotonic()
+    time.sleep(0.001)
+    late = time.monotonic() - begin - 0.001
+    if late > 0.002:
+        print(time.time(), 1e3 * late, flush=True)
+"""
+WARM_UP = 30.0  # s of a drive, before its memory counts
 PERCENTILES = {"median": 50, "p99": 99, "p99.9": 99.9, "max": 100}
 
 
@@ -53,8 +64,10 @@ class Options:
 
 def figures(frames: list[Frame]) -> dict[str, Any]:
     """Times in ms. Lateness is that of SYNC on the grid of the first one, drift included."""
-    begin = next(k for k, frame in enumerate(frames) if frame.id == 0x210)
+    begin = next((k for k, frame in enumerate(frames) if frame.id == 0x210), len(frames))
     frames = frames[begin:]
+    if not frames:
+        return {"ticks": 0}  # it never drove
     times = np.array([frame.time for frame in frames])
     ids = np.array([frame.id for frame in frames])
     syncs = times[ids == 0x080]
@@ -82,10 +95,31 @@ def percentiles(values: Any) -> dict[str, float]:
     return {name: round(float(np.percentile(values, p)), 3) for name, p in PERCENTILES.items()}
 
 
+def memory_of(process: Any) -> dict[str, float]:
+    """Memory [MB] of a process until its end, and by how much it grows in an hour."""
+    begin, times, used = time.monotonic(), [], []
+    while process.poll() is None:
+        if time.monotonic() - begin > WARM_UP:
+            times.append((time.monotonic() - begin) / 3600)
+            used.append(memory(process.pid))
+        time.sleep(1)
+    if len(used) < 240:  # s; of less the growth is noise
+        return {}
+    growth = float(np.polyfit(times, used, 1)[0])
+    return {"begin": used[0], "end": used[-1], "growth_per_hour": round(growth, 2)}
+
+
+def sleeper_figures(lines: str, frames: list[Frame]) -> dict[str, float]:
+    """How often the sleeping process was late during the drive, and by how much [ms]."""
+    rows = [line.split() for line in lines.splitlines()]
+    during = [float(ms) for t, ms in rows if frames[0].time < float(t) < frames[-1].time + 0.1]
+    counts = {f"over_{ms}_ms": sum(late > ms for late in during) for ms in (5, 10, 25)}
+    return counts | {"max": round(max(during, default=0.0), 2)}
+
+
 def main(options: Options) -> None:
-    run = [sys.executable, "-m", "brokk_min"]
-    if options.realtime:
-        run = ["chrt", "-f", "10", *run]
+    priority = ["chrt", "-f", "10"] if options.realtime else []
+    run = [*priority, sys.executable, "-m", "brokk_min"]
     os.environ["CAN_CONFIG"] = json.dumps({"port": 43114})  # python-can's own is for users, tests
     with tempfile.TemporaryDirectory() as folder:
         commands = Path(folder) / "c.csv"
@@ -100,20 +134,26 @@ def main(options: Options) -> None:
         if options.foreign:
             sender = [sys.executable, "-c", SENDER, *BUS, str(options.foreign)]
             processes.append(subprocess.Popen(sender, stdout=(Path(folder) / "rate").open("w")))
+        late = Path(folder) / "late"
+        sleeper = [*priority, sys.executable, "-c", SLEEPER]
+        processes.append(subprocess.Popen(sleeper, stdout=late.open("w")))
         try:
             time.sleep(10)
-            ended = subprocess.run(
+            ended = subprocess.Popen(
                 drive, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
             )
+            used = memory_of(ended)
+            said = ended.stderr.read() if ended.stderr else ""
             frames = list(read_frames(log))
         finally:
             for process in processes:
                 process.kill()
                 process.wait()
+        asleep = sleeper_figures(late.read_text(), frames)
         rates = (Path(folder) / "rate").read_text().split() if options.foreign else ["0"]
     result: dict[str, Any] = {"seconds": options.seconds, "busy": options.busy}
     result |= {"realtime": options.realtime, "foreign": float(rates[-1]), "exit": ended.returncode}
-    result |= {"said": ended.stderr.strip()[-300:], **figures(frames)}
+    result |= {"said": said.strip()[-300:], **figures(frames), "memory_mb": used, "sleeper": asleep}
     write(result, options.json)
 
 

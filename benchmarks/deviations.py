@@ -29,6 +29,7 @@ from brokk_min.evaluation.baselines import make_gains
 from brokk_min.evaluation.feasibility import feasible
 from brokk_min.evaluation.rollout import rollout
 from brokk_min.identification import excitation, fitting, logs, validation
+from brokk_min.identification.net_file import joint_nets
 from brokk_min.kinematics import forward_kinematics
 from brokk_min.learning import policy, simulation_gradient
 from brokk_min.learning.checkpoint import train_policy
@@ -75,7 +76,8 @@ def d1() -> Figures:
 
 def d3() -> Figures:
     """Deviation [rad/s] of two velocity estimates at a steady 0.1 rad/s and a 12-bit encoder."""
-    q = machine.read_encoder(M, 0.1 * M.dt * np.arange(4000) + 1e-4)
+    ramp = 0.1 * M.dt * np.arange(4000) + 1e-4
+    q = machine.read_encoder(M, np.tile(ramp, (M.n, 1)).T)[:, 0]
     ends = range(4, len(q) + 1)
     slopes = [machine.estimate_velocity(q[:end], M.velocity_samples, M.dt) for end in ends]
     return {"one tick": np.std(np.diff(q) * M.rate), "4 samples": np.std(slopes)}
@@ -267,10 +269,10 @@ def d10() -> Figures:
 def d11() -> Figures:
     """Policies on nets whose inputs are plain commands; and on such from a log without dither."""
     driven = [M.names[i] for i in M.driven]
-    plain = fit_nets("rich", 0, dead_zone=0.0)[0].select(driven)
+    plain = joint_nets(fit_nets("rich", 0, dead_zone=0.0)[0], driven)
     mix = {"sine": 0.25, "step": 0.15, "holds": 0.25, "start": 0.35}
     with mock.patch.object(excitation, "MIX", mix):
-        no_dither = fit_nets("rich", 0, dead_zone=0.0)[0].select(driven)
+        no_dither = joint_nets(fit_nets("rich", 0, dead_zone=0.0)[0], driven)
     return compare(
         plain=train(TaskConfig(), net=plain),
         no_dither=train(TaskConfig(), net=no_dither),
@@ -308,7 +310,8 @@ def d14() -> Figures:
     """A policy trained on nets that go on from encoder angles."""
 
     def append(history: Array, u: Array, q: Array, samples: int, dt: float) -> Array:
-        return actuator.append_sample(history, u, machine.read_encoder(M, q), samples, dt)
+        counts = np.rint(q / M.encoder_step[0])  # those of all joints are alike
+        return actuator.append_sample(history, u, counts * M.encoder_step[0], samples, dt)
 
     with mock.patch.object(env, "append_sample", append):
         encoder_angles = train(TaskConfig())

@@ -2,11 +2,13 @@
 
     python -m benchmarks.faults [--repeats 20] [--json F]
     python -m benchmarks.faults --frozen
+    python -m benchmarks.faults --recorded
     python -m benchmarks.faults --hours 1
 
 Machine, bus and `hw.Drive` run in one process on one clock. A fault of an encoder is repeated over
-the joints. `--frozen` prints instead how long a frozen encoder takes at each command. `--hours`
-drives instead for that long of simulated time, and prints the memory.
+the joints. `--frozen` prints instead how long a frozen encoder takes at each command, `--recorded`
+how long in logs of drives of the shipped policy, frozen there at each tick. `--hours` drives
+instead for that long of simulated time, and prints the memory.
 """
 
 from __future__ import annotations
@@ -15,7 +17,9 @@ import gc
 import os
 import re
 import sys
+import tempfile
 from collections import defaultdict
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,10 +28,17 @@ import can
 import numpy as np
 import tyro
 
-from benchmarks import write
+from benchmarks import memory, write
 from brokk_min.actuator import plant_reset, plant_step
+from brokk_min.can.drive_log import TelemetryReader, read_frames
+from brokk_min.can.operator_input import Script
 from brokk_min.can.safety_gate import FROZEN_ANGLE, SLEW, expected_motion, gate_start
+from brokk_min.evaluation.sequences import task_sequences
+from brokk_min.hw import Drive
+from brokk_min.identification.files import SHIPPED
+from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import BROKK_170, PWM_MAX
+from brokk_min.viewer.lockstep import SimulatedBus
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from helpers_bus import ConstantCommand, HoldingOperator, World
@@ -39,6 +50,7 @@ class Options:
     repeats: int = 20  # Of each fault, at other moments between two SYNCs.
     only: str = ""  # Kinds of faults whose names match this regular expression.
     frozen: bool = False  # Times of frozen encoders by command instead.
+    recorded: bool = False  # Times of frozen encoders in logs of drives instead.
     hours: float = 0.0  # Drive for this long of simulated time, and print the memory.
     json: Path | None = None  # Also write the figures here.
 
@@ -91,7 +103,7 @@ def frozen_times(counts: int, moving: bool, rng: np.random.Generator) -> np.ndar
     for tick in range(first + 40):
         q = plant.q
         expected = expected_motion(m, gate, frozen)
-        fault = (expected > max(FROZEN_ANGLE, m.encoder_step)).any(axis=-1)
+        fault = (expected > np.maximum(FROZEN_ANGLE, m.encoder_step)).any(axis=-1)
         found = np.where(fault & np.isinf(found), tick, found)
         sent = np.zeros((num, m.n), int)
         before = np.abs(gate.sent[range(num), joint, -1])
@@ -121,9 +133,71 @@ def frozen_table() -> list[dict[str, float]]:
     return rows
 
 
-def memory() -> float:
-    """Resident memory of this process [MB] (Linux)."""
-    return float(re.findall(r"VmRSS:\s+(\d+)", Path("/proc/self/status").read_text())[0]) / 1e3
+def recorded_drives() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Angles [encoder counts] and commands [counts of 127] (T, n) of logs of the shipped policy."""
+    m = BROKK_170
+    policy = PolicyController(m, load_policy(SHIPPED / m.name / "policy.npz", m))
+    start = np.array(m.q_start)
+    with tempfile.TemporaryDirectory() as folder:
+        for sequence in task_sequences(m):
+            log = Path(folder) / f"{sequence.name}.log"
+            bus = SimulatedBus(m, start).open(log)
+            drive = Drive(m, policy, bus, Script(m, sequence.for_starts(m, start[None])[:, 0]))
+            drive.begin()
+            drive.run()
+            bus.close()
+            reader = TelemetryReader(m)
+            ticks = [tick for frame in read_frames(log) if (tick := reader.update(frame))]
+            q, u = (np.array([getattr(t, k) for t in ticks if t.driving]) for k in ("q", "u"))
+            yield np.rint(q / m.encoder_step).astype(int), np.rint(u * PWM_MAX).astype(int)
+
+
+def frozen_on_drive(counts: np.ndarray, sent: np.ndarray, most: int = 60) -> np.ndarray:
+    """Speed [rad/s], time to the fault [s] and angle turned until then [rad] (num, 3).
+
+    One row for each driven joint and each tick at which its encoder freezes. The commands stay as
+    they were recorded. A false alarm without any fault is an AssertionError.
+    """
+    m, start = BROKK_170, gate_start(BROKK_170)
+    before = np.concatenate([np.zeros_like(start.sent.T), sent])
+    windows = np.lib.stride_tricks.sliding_window_view(before, start.sent.shape[-1], axis=0)
+    sound = np.zeros(counts.shape)
+    for t in range(1, len(counts)):
+        state = start._replace(counts=counts[t - 1], sent=windows[t], expected_motion=sound[t - 1])
+        sound[t] = expected_motion(m, state, counts[t])
+    limit = max(FROZEN_ANGLE, m.encoder_step)
+    assert (sound <= limit).all(), "false alarm"
+    at = np.arange(4, len(counts) - most)
+    frozen, expected = counts[at], sound[at]
+    ticks = np.full(frozen.shape, most)
+    for k in range(1, most):
+        state = start._replace(counts=frozen, sent=windows[at + k], expected_motion=expected)
+        expected = expected_motion(m, state, frozen)
+        ticks = np.where(expected > limit, np.minimum(ticks, k), ticks)
+    later = np.take_along_axis(counts, at[:, None] + ticks, axis=0)
+    speed = np.abs(frozen - counts[at - 4]) * m.encoder_step / (4 * m.dt)
+    seconds = np.where(ticks < most, ticks * m.dt, np.inf)
+    rows = np.stack([speed, seconds, np.abs(later - frozen) * m.encoder_step], axis=-1)
+    return rows[:, m.driven].reshape(-1, 3)
+
+
+def recorded_table() -> list[dict[str, float]]:
+    """Times to the fault by how fast the joint turns when its encoder freezes."""
+    rows = np.concatenate([frozen_on_drive(*drive) for drive in recorded_drives()])
+    print("| speed [rad/s] | cases | within 175 ms | found | median, 95 % [s] | turned [rad] |")
+    print("|---|---|---|---|---|---|")
+    table = []
+    for low, high in ((0.1, np.inf), (0.05, 0.1), (0.02, 0.05)):
+        _, seconds, turned = rows[(rows[:, 0] >= low) & (rows[:, 0] < high)].T
+        found = np.isfinite(seconds)
+        row = {"from": low, "cases": len(found), "within_175_ms": (seconds <= 0.175).mean()}
+        row |= {"found": found.mean(), "median": np.median(seconds[found])}
+        row |= {"p95": np.percentile(seconds[found], 95), "turned": np.median(turned[found])}
+        table.append({name: float(value) for name, value in row.items()})
+        shares = f"{row['within_175_ms']:.0%} | {row['found']:.0%}"
+        times = f"{row['median']:.2f}, {row['p95']:.2f} | {row['turned']:.3f}"
+        print(f"| {low:g} to {high:g} | {len(found)} | {shares} | {times} |")
+    return table
 
 
 def hours(number: float) -> dict[str, Any]:
@@ -165,6 +239,8 @@ def main(options: Options) -> dict[str, Any]:
     result: dict[str, Any] = {}
     if options.hours:
         result = hours(options.hours)
+    elif options.recorded:
+        result["recorded"] = recorded_table()
     elif options.frozen:
         result["frozen"] = frozen_table()
     else:

@@ -11,7 +11,7 @@ the last axis of an array runs over joints or x, y, z, leading axes are batches 
 
 Glossary:
     tick          one control period, 1/20 s
-    q, q_dot      joint angle [rad], joint velocity [rad/s]
+    q, q_dot      joint angle [rad], joint velocity [rad/s]; of a prismatic joint [m], [m/s]
     u             command in [-1, 1] of full valve opening; `encode_pwm` makes its byte on the bus
     p, v          position [m] and velocity [m/s] of the tool tip
     v_goal        velocity that the tool should have [m/s]

@@ -6,10 +6,9 @@ plant's equations. `identification.fitting` makes nets from logs.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from brokk_min.machine import Array, Machine, estimate_velocity, valve_opening
 
 CLOSE_AFTER = 0.5  # s of a zero goal, assumed: then the valves close
-STANDSTILL = 0.002  # rad, assumed: little more than one step of a 12-bit encoder
+STANDSTILL = 0.002  # rad or m, assumed: little more than one step of a 12-bit encoder
 MU = 50.0  # assumed: the mu law is about linear below 1/50 of full opening
 
 # --- the analytic plant ---------------------------------------------------------------------------
@@ -26,7 +25,7 @@ MU = 50.0  # assumed: the mu law is about linear below 1/50 of full opening
 class PlantState(NamedTuple):
     """State of the analytic plant, arrays (..., n) unless noted."""
 
-    q: Array  # joint angle [rad]
+    q: Array  # joint angle [rad or m]
     v: Array  # cylinder speed [m/s]
     s: Array  # spool position, -1..1
     z: Array  # valve activation, 0..1: below the threshold the valve is closed
@@ -219,16 +218,6 @@ class ActuatorNet:
     q_high: Array  # (n,) rad
     weights: tuple[Array, ...]
     dead_zone: float = 0.0  # of full command: commands pass `mu_law`
-
-    def select(self, joints: Sequence[str]) -> Self:
-        """The nets of some joints, in the order given; ValueError: a joint without a net."""
-        if not set(joints) <= set(self.joints):
-            raise ValueError(f"joints: expected nets for {list(joints)}, got {list(self.joints)}")
-        index = [self.joints.index(name) for name in joints]
-        names = ("input_mean", "input_scale", "output_low", "output_high", "q_low", "q_high")
-        arrays = {name: getattr(self, name)[index] for name in names}
-        weights = tuple(weight[index] for weight in self.weights)
-        return replace(self, joints=tuple(joints), weights=weights, **arrays)
 
     def predict(self, history: Array) -> Array:
         """Velocity over the coming tick [rad/s] (..., n): q(t + dt) = q(t) + dt * velocity.

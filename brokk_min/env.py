@@ -162,7 +162,7 @@ def measure(
 def features(machine: Machine, measured: Measured, paper: bool = False) -> Array:
     """The observation of the table above, ours or the paper's. Paper: Sec. 3.4, Fig. 3
 
-    Resolved velocities (ours): `dls` with W = 1, lambda = 6 % of the links' lengths (assumed).
+    Resolved velocities (ours): `dls` with lambda = 6 % of the links' lengths (assumed).
     """
     signals = measured.history[..., :2, :].reshape(*measured.q.shape[:-1], -1)
     commands = measured.history[..., 2, :].reshape(*measured.q.shape[:-1], -1)
@@ -171,7 +171,7 @@ def features(machine: Machine, measured: Measured, paper: bool = False) -> Array
         numbers[:2] = [kinematics.to_heading(measured.p_tool, v) for v in numbers[:2]]
         J, integral = measured.J[..., machine.driven], measured.error_integral
         arm = np.hypot(machine.column("a"), machine.column("d")).sum()
-        J_inv = dls(J, np.ones(len(machine.driven)), (0.06 * arm) ** 2 + 1e-6)
+        J_inv = dls(J, machine.column("weight")[machine.driven], (0.06 * arm) ** 2 + 1e-6)
         numbers += [(J_inv @ v[..., None])[..., 0] for v in (measured.v_goal, integral)]
     mean, scale = observation_scale(machine, paper)
     return (np.concatenate(numbers, axis=-1, dtype=np.float32) - mean) / scale

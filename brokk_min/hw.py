@@ -114,7 +114,7 @@ class Drive:
         if (self.nodes.frames != 1).any():
             self.history = None  # samples before a gap do not join those after it
             return np.zeros(m.n)
-        q = counts[None].astype(np.float32) * m.encoder_step  # as `machine.read_encoder`
+        q = (counts[None] * m.encoder_step).astype(np.float32)  # as `machine.read_encoder`
         if self.history is None:
             self.history = initial_history(q, m.history)
         else:
@@ -147,12 +147,13 @@ class Drive:
             flooded=np.array(self.nodes.received >= canopen.MAX_FRAMES),
             other_sender=np.array(self.nodes.others > 0),
         )
-        self.gate, frame = gate(self.machine, self.gate, inputs, now)
+        self.gate, frames = gate(self.machine, self.gate, inputs, now)
         self.explain()
         self.exception = ""  # one while sending is a fault of the next tick
         with self.catch_errors():
             if self.gate.armed_once:
-                self.bus.send(self.machine.valve_frame_id, frame.tobytes())
+                for can_id, frame in zip(canopen.valve_frame_ids(self.machine), frames):
+                    self.bus.send(can_id, frame.tobytes())
 
     def explain(self) -> None:
         """Set `reason` from the gate's faults and from exceptions."""

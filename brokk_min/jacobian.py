@@ -71,10 +71,12 @@ def limit_gradient(machine: Machine, q: ArrayLike) -> Array:
 def limit_weights(machine: Machine, q: ArrayLike, q_dot: ArrayLike) -> Array:
     """Diagonal of W for all joints, (..., n): 1 + |dH/dq| towards a limit, otherwise 1.
 
-    `q` are angles [rad], `q_dot` velocities whose sign gives the direction. Paper: Sec. 4.2 (W)
+    All times `Joint.weight`: metres and radians are not alike. `q` are angles [rad], `q_dot`
+    velocities whose sign gives the direction. Paper: Sec. 4.2 (W)
     """
     gradient = limit_gradient(machine, q)
-    return np.where(gradient * np.asarray(q_dot) > 0, 1 + np.abs(gradient), 1.0)
+    W = np.where(gradient * np.asarray(q_dot) > 0, 1 + np.abs(gradient), 1.0)
+    return np.asarray(W * machine.column("weight"))
 
 
 def manipulability(J: ArrayLike) -> Array:

@@ -19,18 +19,22 @@ from numpy.typing import ArrayLike
 
 from brokk_min.machine import Array, Machine, as_floats
 
+UNITS = {"revolute": "rad", "prismatic": "m"}  # of q, by the kind of the joint
+
 
 class Frames(NamedTuple):
     """Frame 0 is the base, frame i moves with joint i, frame n is at the tool tip."""
 
     p: Array  # origins p_0 .. p_n [m], (..., n + 1, 3)
     z: Array  # unit vectors z_0 .. z_n, (..., n + 1, 3); z_{i-1} is the axis of joint i
+    prismatic: list[int]  # joints that slide along their axis, from 0
 
 
 def forward_kinematics(machine: Machine, q: ArrayLike) -> Frames:
-    """Frames at joint angles `q` [rad] (..., n), which keep their float type.
+    """Frames at joint variables `q` [rad, m if prismatic] (..., n), which keep their float type.
 
-    T_i = T_{i-1} Rz(q_i + theta_i) Tz(d_i) Tx(a_i) Rx(alpha_i) (standard Denavit-Hartenberg).
+    T_i = T_{i-1} Rz(theta_i) Tz(d_i) Tx(a_i) Rx(alpha_i) (standard Denavit-Hartenberg), with
+    theta_i + q_i for theta_i of a revolute joint and d_i + q_i for d_i of a prismatic one.
 
     ValueError: `q` has another number of joints.
     """
@@ -38,22 +42,22 @@ def forward_kinematics(machine: Machine, q: ArrayLike) -> Frames:
     if q.ndim < 1 or q.shape[-1] != machine.n:
         raise ValueError(f"q: expected (..., {machine.n}), got {q.shape}")
     # in here all axes are reversed, vectors are (3, ...): c * x scales x at each pose of a batch
-    angles = np.ascontiguousarray((q + machine.column("theta").astype(q.dtype)).T)
-    c = np.cos(angles)
-    s = np.sin(angles)
-    p = np.zeros((3, machine.n + 1, *c.shape[1:]), q.dtype)
+    q = np.ascontiguousarray(q.T)
+    p = np.zeros((3, machine.n + 1, *q.shape[1:]), q.dtype)
     axes = np.zeros_like(p)
     x, y, z = np.eye(3, dtype=q.dtype).reshape(3, 3, *[1] * (q.ndim - 1))
     axes[:, 0] = z
+    slides = [joint.kind == "prismatic" for joint in machine.joints]
     for i, joint in enumerate(machine.joints):
-        x, y = rotate(x, y, c[i], s[i])  # Rz(q + theta)
+        theta, d = (joint.theta, joint.d + q[i]) if slides[i] else (joint.theta + q[i], joint.d)
+        x, y = rotate(x, y, np.cos(theta), np.sin(theta))  # Rz(theta)
         p[:, i + 1] = p[:, i] + joint.a * x  # Tx(a)
-        if joint.d:
-            p[:, i + 1] += joint.d * z  # Tz(d)
+        if joint.d or slides[i]:
+            p[:, i + 1] += d * z  # Tz(d)
         if joint.alpha:
             y, z = rotate(y, z, math.cos(joint.alpha), math.sin(joint.alpha))  # Rx(alpha)
         axes[:, i + 1] = z
-    return Frames(p.T, axes.T)
+    return Frames(p.T, axes.T, [i for i in range(machine.n) if slides[i]])
 
 
 def rotate(a: Array, b: Array, c: Array | float, s: Array | float) -> tuple[Array, Array]:
@@ -67,11 +71,13 @@ def tool_position(frames: Frames) -> Array:
 
 
 def jacobian(frames: Frames) -> Array:
-    """Derivative of the tool position by all joint angles [m/rad], (..., 3, n). Paper: eq3 (J)
+    """Derivative of the tool position by all joints [m/rad or 1], (..., 3, n). Paper: eq3 (J)
 
-    J_i = z_{i-1} x (p_n - p_{i-1}), i = 1 .. n.
+    J_i = z_{i-1} x (p_n - p_{i-1}), i = 1 .. n; J_i = z_{i-1} of a prismatic joint.
     """
     J = cross(frames.z[..., :-1, :], frames.p[..., -1:, :] - frames.p[..., :-1, :])
+    for i in frames.prismatic:
+        J[..., i, :] = frames.z[..., i, :]
     return np.swapaxes(J, -1, -2)
 
 
@@ -90,7 +96,7 @@ def cross(a: Array, b: Array) -> Array:
 def tool_velocity(frames: Frames, q_dot: ArrayLike) -> Array:
     """Velocity J q_dot of the tool tip in the base frame [m/s], (..., 3).
 
-    `q_dot` [rad/s] (..., n) is of all joints, locked ones included. Paper: Sec. 3.4
+    `q_dot` [rad/s or m/s] (..., n) is of all joints, locked ones included. Paper: Sec. 3.4
 
     Example:
         >>> from brokk_min.machine import BROKK_170

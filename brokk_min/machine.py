@@ -47,10 +47,11 @@ def check_numbers(owner: Any, label: str = "") -> None:
 
 @dataclass(frozen=True)
 class Joint:
-    """One revolute joint: its standard DH row Rz(q + theta) Tz(d) Tx(a) Rx(alpha), range and drive.
+    """One joint: its standard DH row Rz(theta) Tz(d) Tx(a) Rx(alpha), range and drive.
 
-    A cylinder (of the plant alone) spans a triangle: sides `cylinder_base` and `cylinder_rod` meet
-    under the angle `cylinder_angle + q`. A base of 0 means a slew drive with constant lever arm.
+    Its variable q is added to theta [rad], or to d [m] of a prismatic joint. A cylinder (of the
+    plant) spans a triangle: sides `cylinder_base` and `cylinder_rod` meet under `cylinder_angle`
+    + q. A base of 0 means a constant lever arm `cylinder_rod`; 1: q is the cylinder's own travel.
     """
 
     name: str
@@ -59,10 +60,10 @@ class Joint:
     alpha: float = number("rad")
     d: float = number("m")
     theta: float = number("rad")
-    q_min: float = number("rad")
-    q_max: float = number("rad")
-    q_dot_up: float = number("rad/s", 1e-9)  # fastest positive motion at the command limit
-    q_dot_down: float = number("rad/s", 1e-9)  # fastest negative motion, a positive number
+    q_min: float = number("rad or m")
+    q_max: float = number("rad or m")
+    q_dot_up: float = number("rad/s or m/s", 1e-9)  # fastest positive motion at the command limit
+    q_dot_down: float = number("rad/s or m/s", 1e-9)  # fastest negative motion, a positive number
     encoder_node: int = number("CANopen node id", 1, 127)
     cylinder_base: float = number("m", 0, default=0.0)
     cylinder_rod: float = number("m", 1e-6, default=1.0)
@@ -72,7 +73,9 @@ class Joint:
     speed_negative: float = number("m/s", 0, default=0.0)  # by lever arm cylinder_rod
     encoder_zero: int = number("counts", default=0)  # the reading at q = 0
     encoder_sign: Literal[-1, 1] = 1  # -1: it counts down while q rises
-    kind: Literal["revolute"] = "revolute"  # prismatic ones are not supported
+    kind: Literal["revolute", "prismatic"] = "revolute"
+    encoder_step: float = number("m a count", 1e-9, 1, 1e-4)  # if prismatic, else `encoder_bits`
+    weight: float = number("1", 1e-9, 1e9, 1.0)  # in W; if prismatic 1/L^2, L the arm's length [m]
 
     def __post_init__(self) -> None:
         """ValueError: a bad number, an empty range, a triangle that closes over the range."""
@@ -80,16 +83,18 @@ class Joint:
         if not self.q_min < self.q_max:
             raise ValueError(f"{self.name}.q_max: expected above {self.q_min}, got {self.q_max!r}")
         low, high = self.cylinder_angle + self.q_min, self.cylinder_angle + self.q_max
-        if self.cylinder_base > 0 and not 0 < low < high < np.pi:
-            expected = "expected the triangle's angle within (0, pi) over the joint's range"
+        closes = self.kind == "revolute" and 0 < low < high < np.pi
+        if self.cylinder_base > 0 and not closes:
+            expected = "expected the triangle of a revolute joint within (0, pi) over its range"
             raise ValueError(f"{self.name}.cylinder_angle: {expected}, got {low:.3f} to {high:.3f}")
 
-    def with_speeds(self, opening: float) -> Joint:
-        """Cylinder speeds, if none: q_dot_up, q_dot_down at the largest lever arm, else faster."""
+    def complete(self, opening: float, turn: float) -> Joint:
+        """Encoder step; speeds, if none: q_dot_up and q_dot_down at the largest lever arm."""
         r = self.cylinder_rod / opening
         up = self.speed_positive or self.q_dot_up * r
         down = self.speed_negative or self.q_dot_down * r
-        return replace(self, speed_positive=up, speed_negative=down)
+        step = self.encoder_step if self.kind == "prismatic" else 2 * np.pi / turn
+        return replace(self, speed_positive=up, speed_negative=down, encoder_step=step)
 
 
 @dataclass(frozen=True)
@@ -101,7 +106,7 @@ class Machine:
     rate: float = number("Hz", 1e-3)  # of control and logging
     pwm_limit: int = number("counts of 127", 1, PWM_MAX)  # largest command that leaves the program
     dead_zone: float = number("of full command", 0, 0.99)
-    encoder_bits: int = number("bits a turn", 1, 32)
+    encoder_bits: int = number("bits a turn", 1, 32)  # of revolute joints
     velocity_samples: int = number("samples", 2, 100)  # window of the velocity estimator
     history: int = number("samples", 2, 1000)  # of q, q_dot and u that nets and policy get
     tool_speed: float = number("m/s", 1e-9)  # largest goal velocity of the tool
@@ -119,7 +124,7 @@ class Machine:
     spool_threshold: float = number("of full stroke", 0, 1, 0.01)  # above it a valve activates
     pump_flow: float = number("m^3/s", 1e-9, default=1.0)
     plant_dt: float = number("s", 1e-6, 1, 0.005)  # step of explicit Euler
-    q_start: tuple[float, ...] = ()  # rad, where experiments start; empty: the middle of the ranges
+    q_start: tuple[float, ...] = ()  # where experiments start; empty: the middle of the ranges
     plant: Any = None  # reset(machine, q) and step(machine, state, u); None: that of `actuator`
 
     def __post_init__(self) -> None:
@@ -127,18 +132,15 @@ class Machine:
         check_numbers(self, "")
         if not any(joint.driven for joint in self.joints):
             raise ValueError("joints: expected at least one driven joint, got none")
-        nodes = [joint.encoder_node for joint in self.joints]
-        for what, values in (("names", [*self.names]), ("encoder nodes", nodes)):
+        nodes = [*(joint.encoder_node for joint in self.joints), self.controller_node]
+        for what, values in (("names", [*self.names]), ("CANopen nodes", nodes)):
             if len(set(values)) != len(values):
                 raise ValueError(f"joints: expected different {what}, got {values}")
-        node = self.controller_node
-        if node in nodes:
-            raise ValueError(f"controller_node: expected none of {nodes}, got {node}")
         zone = max(self.dead_zone, self.largest_dead_zone)
         if not zone * PWM_MAX < self.pwm_limit:  # no valve would ever open
             raise ValueError(f"dead_zone: expected below {self.pwm_limit}/{PWM_MAX}, got {zone!r}")
         opening = float(valve_opening(self.pwm_limit / PWM_MAX, self.dead_zone))
-        joints = tuple(joint.with_speeds(opening) for joint in self.joints)
+        joints = tuple(joint.complete(opening, 2**self.encoder_bits) for joint in self.joints)
         object.__setattr__(self, "joints", joints)
         if self.q_start and len(self.q_start) != self.n:
             raise ValueError(f"q_start: expected {self.n} angles or none, got {self.q_start}")
@@ -161,9 +163,9 @@ class Machine:
         return 1.0 / self.rate
 
     @property
-    def encoder_step(self) -> float:
-        """Angle of one encoder count [rad]."""
-        return float(2 * np.pi / 2**self.encoder_bits)
+    def encoder_step(self) -> NDArray[np.float64]:
+        """Motion of each joint by one encoder count [rad or m], (n,)."""
+        return self.column("encoder_step")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -184,7 +186,7 @@ class Machine:
 
     @property
     def q_dot_max(self) -> NDArray[np.float64]:
-        """Fastest motion of each joint at the command limit, either direction [rad/s], (n,)."""
+        """Fastest motion of each joint at the command limit, either way [rad/s or m/s], (n,)."""
         return np.maximum(self.column("q_dot_up"), self.column("q_dot_down"))
 
     @lru_cache(maxsize=1024)  # noqa: B019
@@ -258,20 +260,18 @@ def decode_pwm(u_byte: ArrayLike) -> NDArray[np.float64]:
     wrong = (u_byte < 0) | (u_byte > 255)
     if wrong.any():
         raise ValueError(f"u_byte: expected 0 to 255, got {u_byte[wrong].flat[0]}")
-    counts = np.where(u_byte > PWM_MAX, u_byte - 255, u_byte)
-    return np.asarray(counts / PWM_MAX, float)
+    return np.asarray(np.where(u_byte > PWM_MAX, u_byte - 255, u_byte) / PWM_MAX)
 
 
 def read_encoder(machine: Machine, q: ArrayLike) -> NDArray[np.floating]:
-    """What the encoders report for true angles `q` [rad]: whole counts, same shape and float type.
+    """What the encoders report for true angles `q` (..., n): whole counts, in the same float type.
 
     Example:
-        >>> read_encoder(BROKK_170, [0.0, 0.001, 1.0]) / BROKK_170.encoder_step
-        array([  0.,   1., 652.])
+        >>> read_encoder(BROKK_170, [0.0, 0.001, 1.0, 0.0, 0.0]) / BROKK_170.encoder_step
+        array([  0.,   1., 652.,   0.,   0.])
     """
     q = as_floats(q)
-    counts = np.rint(q / machine.encoder_step)
-    return np.asarray(counts * machine.encoder_step, q.dtype)
+    return np.asarray(np.rint(q / machine.encoder_step) * machine.encoder_step, q.dtype)
 
 
 def estimate_velocity(q: ArrayLike, samples: int, dt: float) -> NDArray[np.floating]:

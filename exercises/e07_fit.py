@@ -57,7 +57,7 @@ def record(seed: int, ticks: int = 300, runs: int = 16) -> tuple[Array, Array, A
     poses = np.tile([0.0, 0.5, 0.5, 1.7, 1.0], (runs, 1))
     poses[:, 4] = rng.uniform(0.3, 1.7, runs)
     state = plant_reset(BROKK_170, poses)
-    angles = [read_encoder(BROKK_170, state.q[:, 4])]
+    angles = [read_encoder(BROKK_170, state.q)[:, 4]]
     history = initial_history(angles[0], H)
     commands, inputs = [], []
     for t in range(ticks):
@@ -65,7 +65,7 @@ def record(seed: int, ticks: int = 300, runs: int = 16) -> tuple[Array, Array, A
             u = rng.uniform(0.1, 0.63, runs) * np.sign(1 - angles[-1]) * (rng.random(runs) > 0.4)
         inputs.append(append_command(history, u).reshape(runs, -1))
         state = plant_step(BROKK_170, state, u[:, None] * np.eye(5)[4])
-        angles.append(read_encoder(BROKK_170, state.q[:, 4]))
+        angles.append(read_encoder(BROKK_170, state.q)[:, 4])
         history = append_sample(history, u, angles[-1], WINDOW, DT)
         commands.append(u)
     return np.array(inputs), np.array(angles), np.array(commands)

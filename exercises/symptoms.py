@@ -21,6 +21,7 @@ from brokk_min.env import TaskConfig
 from brokk_min.evaluation.baselines import make_gains
 from brokk_min.evaluation.rollout import Controller, rollout
 from brokk_min.identification.files import SHIPPED
+from brokk_min.identification.net_file import joint_nets
 from brokk_min.learning import simulation_gradient
 from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import BROKK_170 as BROKK
@@ -96,7 +97,7 @@ def estimator() -> Symptom:
     history = actuator.initial_history(np.zeros(1), 13)
     velocities = []
     for i, q in enumerate(angles):
-        measured = machine.read_encoder(BROKK, np.array([q]))
+        measured = machine.read_encoder(BROKK, np.full(5, q))[:1]
         history = actuator.append_sample(history, [i / 100], measured, 4, 0.05)
         velocities.append(history[0, 1, -1])
     names = "angles [rad]", "velocities [rad/s]", "commands"
@@ -155,7 +156,7 @@ def nets() -> Symptom:
     still = env.initial_state(BROKK, START[None], np.zeros(3), plant=False)
     for _ in range(40):
         still = env.transition(BROKK, net, still, np.full((1, 5), 5 / 127))
-    swapped = net.select(["q5", "q1"])
+    swapped = joint_nets(net, ["q5", "q1"])
     last = np.array([side[-1] for side in sides]).T
     rows = {f"{name}: end on plant, nets [rad]": ends for name, ends in zip(DRIVEN, last)}
     rows |= {
@@ -472,11 +473,11 @@ def gate() -> Symptom:
             alive=np.array(change.get("alive", True)),
             error=np.array(change.get("error", False)),
         )
-        state, frame = safety_gate.gate(BROKK, state, inputs, now)
+        state, frames = safety_gate.gate(BROKK, state, inputs, now)
         fault = safety_gate.fault_name(BROKK, int(state.active_fault)) or "no fault"
         latched = safety_gate.fault_name(BROKK, int(state.latched_fault)) or "none"
         text = f"{'drives' if state.driving else 'closed'}, {fault}; latched {latched}; bytes "
-        rows[f"{i:2} {what}"] = text + f"{frame[0]} {frame[4]}, {frame[5]}"
+        rows[f"{i:2} {what}"] = text + f"{frames[0, 0]} {frames[0, 4]}, {frames[0, 5]}"
     return Symptom(rows)
 
 

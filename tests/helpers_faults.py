@@ -17,7 +17,7 @@ from brokk_min.machine import BROKK_170
 
 COMMAND = (60, 0, 60, 60, 60)
 SLOW = (15, 0, 15, 15, 15)
-STEP = BROKK_170.encoder_step
+STEP = BROKK_170.encoder_step[0]
 
 
 class Fault:
@@ -97,6 +97,21 @@ def reorder(f, node):
     up(0x180 + node, act)(f)
 
 
+def repeat(f, period, frame):
+    """Somebody else sends `frame(1)`, `frame(2)`, ..., one each `period` [s]."""
+    begun, count = f.world.t, 0
+
+    def noise():
+        nonlocal count
+        out = []
+        while begun + period * (count + 1) <= f.world.t:
+            count += 1
+            out.append(frame(count))
+        return out
+
+    f.world.noise = noise
+
+
 def flood(f, foreign=False, rate=2000):
     """Frames of any identifier; pairs of identifier and length that came, and how many exist."""
     rng = np.random.default_rng(0)
@@ -105,33 +120,26 @@ def flood(f, foreign=False, rate=2000):
     ids = rng.permutation([i for i in range(2048) if not foreign or i not in ours])
     assert len(ids) % 3  # no factor in common with the nine lengths: each pair has its turn
     seen = set()
-    begun, count = f.world.t, 0
 
-    def noise():
-        nonlocal count
-        out = []
-        while begun + count / rate < f.world.t:
-            count += 1
-            out.append((int(ids[count % len(ids)]), rng.bytes(count % 9)))
-            seen.add((out[-1][0], len(out[-1][1])))
-        return out
+    def frame(count):
+        can_id, data = int(ids[count % len(ids)]), rng.bytes(count % 9)
+        seen.add((can_id, len(data)))
+        return can_id, data
 
-    f.world.noise = noise
+    repeat(f, 1 / rate, frame)
     return seen, 9 * len(ids)
+
+
+def request(f, rate):
+    """Somebody else reads the encoders' resolution, by SDO."""
+    data = struct.pack("<BHBI", 0x40, 0x6501, 0, 0)
+    repeat(f, 1 / rate, lambda count: (0x601 + count % 5, data))
 
 
 def second_master(f):
     """Somebody else sends valid valve frames of his own."""
-    begun, count = f.world.t, 0
-
-    def noise():
-        nonlocal count
-        if f.world.t < begun + 0.05 * (count + 1):
-            return []
-        count += 1
-        return [(0x210, valve_frame([20, 0, 0, 0, 0], count % 256, 1).tobytes())]
-
-    f.world.noise = noise
+    act = lambda k: (0x210, valve_frame([20, 0, 0, 0, 0], k % 256, 1).tobytes())  # noqa: E731
+    repeat(f, 0.05, act)
 
 
 def intruder(f, after):
@@ -318,7 +326,8 @@ NOT_FOUND = {
     "valve frames 30 ms late": Kind(
         partial(delay_valve_frames, seconds=0.03), "within the tick; the machine follows later"
     ),
-    "2,000 foreign frames a second": Kind(partial(flood, foreign=True), "harmless"),
+    "4,500 foreign frames a second": Kind(partial(flood, foreign=True, rate=4500), "harmless"),
+    "2,000 SDO requests a second": Kind(partial(request, rate=2000), "harmless"),
 }
 
 

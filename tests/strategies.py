@@ -20,10 +20,11 @@ def reals(low: float, high: float) -> st.SearchStrategy[float]:
 
 @st.composite
 def joints(draw: st.DrawFn, index: int, driven: bool) -> Joint:
-    """Any DH row, any range, a slew drive or a cylinder whose triangle closes over the range."""
+    """Any DH row and range; prismatic, a slew drive, or a triangle that closes over the range."""
     q_min = draw(reals(-2.5, 1.5))
     width = draw(reals(0.3, 2.2))
-    slew = draw(st.booleans())
+    kind = draw(st.sampled_from(["revolute", "revolute", "prismatic"]))
+    slew = draw(st.booleans()) or kind == "prismatic"
     start = draw(reals(0.25, np.pi - 0.25 - width))  # the triangle's angle at q_min
     return Joint(
         name=f"joint {index}",
@@ -43,6 +44,9 @@ def joints(draw: st.DrawFn, index: int, driven: bool) -> Joint:
         q_dot_up=draw(reals(0.1, 1.0)),
         q_dot_down=draw(reals(0.1, 1.0)),
         encoder_node=index + 1,
+        kind=kind,
+        encoder_step=draw(reals(1e-5, 2e-3)),
+        weight=draw(reals(0.02, 1.0)) if kind == "prismatic" else 1.0,
     )
 
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brokk_min.machine import PWM_MAX, Machine, encode_pwm
+from brokk_min.machine import PWM_MAX, Joint, Machine, decode_pwm, encode_pwm
 
 Array = NDArray[Any]  # counts and flags, too
 
@@ -21,7 +21,7 @@ HEARTBEAT = 0x700
 # objects of an encoder: index, subindex
 HEARTBEAT_OBJECT = (0x1017, 0)  # period [ms]
 SYNC_OBJECT = (0x1800, 2)  # after how many SYNCs a position is sent
-RESOLUTION_OBJECT = (0x6501, 0)  # counts per turn
+RESOLUTION_OBJECT = (0x6501, 0)  # counts per turn; measuring step [nm] of a linear encoder
 OPERATIONAL = 5  # NMT state
 START_ALL = bytes([1, 0])  # NMT command
 POSITION_BITS = 26  # of the encoders that we simulate
@@ -30,7 +30,7 @@ HEARTBEAT_PERIOD = 0.050  # s, set in the encoders (assumed)
 SDO_TIMEOUT = 0.5  # s (assumed)
 MAX_FRAMES = 256  # read in a tick; with more the bus is flooded
 WATCHDOG = 0.150  # s without valid valve frame, then the controller closes the valves (assumed)
-MAX_JOINTS = 5  # in a valve frame
+JOINTS_A_FRAME = 5  # in a valve frame; joints 6 to 10 are in the frame of the next identifier
 # the operator's input is logged as frames that are never on the bus
 OPERATOR_CHANNEL = "operator"
 OPERATOR_INPUT = 0x7FF
@@ -55,7 +55,7 @@ class Nodes:
     def __init__(self, machine: Machine) -> None:
         nodes = [*(joint.encoder_node for joint in machine.joints), machine.controller_node]
         self.machine = machine
-        self.ours = (NMT, SYNC, machine.valve_frame_id)  # only this program sends them
+        self.ours = (NMT, SYNC, *valve_frame_ids(machine))  # only this program sends them
         self.received = 0  # frames of this tick
         self.others = 0  # of them, frames that only this program may send
         self.position_index = {TPDO1 + node: i for i, node in enumerate(nodes[:-1])}
@@ -104,7 +104,7 @@ class Nodes:
         Of 12 bits: 5 -> 4101 skips one; 4095 -> 0 of a single turn and 2**26 - 1 -> 0 do not.
         """
         last = int(self.raw[i])
-        turn = 2**self.machine.encoder_bits
+        turn = int(encoder_turns(self.machine)[i])
         step = (raw - last + turn // 2) % turn - turn // 2
         return last >= 0 and 0 < abs(raw - last - step) <= max(raw, last)
 
@@ -114,18 +114,14 @@ class Nodes:
 
 
 def check_bus(machine: Machine) -> None:
-    """ValueError: more joints than a valve frame has, its identifier twice, or too long ticks."""
-    if machine.n > MAX_JOINTS:
-        raise ValueError(
-            f"{machine.name}: expected at most {MAX_JOINTS} joints in a valve frame, "
-            f"got {machine.n}"
-        )
-    others = [*used_ids(machine), *(SDO_REQUEST + joint.encoder_node for joint in machine.joints)]
-    if others.count(machine.valve_frame_id) > 1:
-        raise ValueError(
-            f"{machine.name}: valve_frame_id: expected an identifier of no other frame, "
-            f"got 0x{machine.valve_frame_id:03X}"
-        )
+    """ValueError: valve frames without free identifiers, or ticks too long for the watchdog."""
+    ids = valve_frame_ids(machine)
+    used = [*used_ids(machine), *(SDO_REQUEST + joint.encoder_node for joint in machine.joints)]
+    taken = [i for i in ids if i > 0x7FF or used.count(i) > 1]
+    if taken:
+        got = ", ".join(f"0x{i:03X}" for i in taken)
+        expected = "expected an identifier of no other frame"
+        raise ValueError(f"{machine.name}: valve_frame_id: {expected}, got {got}")
     slowest = 1.5 / WATCHDOG  # Hz: a tick may be late by half
     if machine.rate < slowest:
         raise ValueError(
@@ -134,27 +130,31 @@ def check_bus(machine: Machine) -> None:
         )
 
 
+def valve_frame_ids(machine: Machine) -> list[int]:
+    """CAN identifiers of the valve frames, one after another, each with up to five joints."""
+    return [machine.valve_frame_id + k for k in range(-(-machine.n // JOINTS_A_FRAME))]
+
+
 def used_ids(machine: Machine) -> list[int]:
     """CAN identifiers of all frames that concern the program that drives."""
     nodes = [*(joint.encoder_node for joint in machine.joints), machine.controller_node]
     bases = (TPDO1, SDO_ANSWER, HEARTBEAT)
-    return [NMT, SYNC, machine.valve_frame_id, *(base + n for n in nodes for base in bases)]
+    return [NMT, SYNC, *valve_frame_ids(machine), *(base + n for n in nodes for base in bases)]
 
 
 def set_up_nodes(bus: Any, machine: Machine) -> None:
     """Check the encoders, set their heartbeats, let them answer each SYNC, and start all nodes.
 
-    ValueError: an encoder that does not answer or has another resolution, or too many joints.
+    ValueError: an encoder that does not answer or has another resolution, see `check_bus`, too.
     """
     check_bus(machine)
     for joint in machine.joints:
         node = joint.encoder_node
-        resolution = sdo(bus, node, RESOLUTION_OBJECT)
-        if resolution != 2**machine.encoder_bits:
-            raise ValueError(
-                f"{joint.name}: expected {2**machine.encoder_bits} counts a turn of encoder node "
-                f"{node} (object 0x6501), got {resolution}"
-            )
+        resolution, found = encoder_resolution(joint), sdo(bus, node, RESOLUTION_OBJECT)
+        if found != resolution:
+            unit = "counts a turn" if joint.kind == "revolute" else "nm a count"
+            expected = f"expected {resolution} {unit} of encoder node {node} (object 0x6501)"
+            raise ValueError(f"{joint.name}: {expected}, got {found}")
         sdo(bus, node, HEARTBEAT_OBJECT, round(1e3 * HEARTBEAT_PERIOD), size=2)
         sdo(bus, node, SYNC_OBJECT, 1, size=1)
     bus.send(NMT, START_ALL)
@@ -184,9 +184,21 @@ def sdo(
     raise ValueError(f"{where} within {SDO_TIMEOUT} s, got none")
 
 
+def encoder_resolution(joint: Joint) -> int:
+    """Object 0x6501 of a joint's encoder: counts a turn; of a prismatic joint nm a count."""
+    step = joint.encoder_step
+    return round(2 * np.pi / step if joint.kind == "revolute" else 1e9 * step)
+
+
+def encoder_turns(machine: Machine) -> Array:
+    """Counts (n,) after which positions repeat: a turn, all bits of prismatic joints' encoders."""
+    slides = [joint.kind == "prismatic" for joint in machine.joints]
+    return np.asarray(np.where(slides, 2**POSITION_BITS, 2**machine.encoder_bits))
+
+
 def encoder_counts(machine: Machine, raw: ArrayLike) -> Array:
     """Joint angles [counts] of raw positions (..., n): zeroed, unwrapped at mid range."""
-    turn = 2**machine.encoder_bits
+    turn = encoder_turns(machine)
     zero, sign = (machine.column(name).astype(int) for name in ("encoder_zero", "encoder_sign"))
     middle = (machine.column("q_min") + machine.column("q_max")) / 2
     lowest = np.rint(middle / machine.encoder_step).astype(int) - turn // 2
@@ -221,14 +233,41 @@ def valve_frame(command: ArrayLike, counter: ArrayLike, enable: ArrayLike) -> Ar
     `command` [counts of 127] is (..., n). ValueError: n > 5. Paper: Sec. 3.2 (PWM bytes)
     """
     command = np.asarray(command)
-    if command.shape[-1] > MAX_JOINTS:  # the sixth would overwrite the counter
-        raise ValueError(f"command: expected at most {MAX_JOINTS} joints, got {command.shape[-1]}")
+    n = command.shape[-1]
+    if n > JOINTS_A_FRAME:  # the sixth would overwrite the counter
+        raise ValueError(f"command: expected at most {JOINTS_A_FRAME} joints, got {n}")
     frame = np.zeros((*command.shape[:-1], 8), np.uint8)
     frame[..., : command.shape[-1]] = encode_pwm(command / PWM_MAX)
     frame[..., 5] = counter
     frame[..., 7] = enable
     frame[..., 6] = checksum(frame[..., [0, 1, 2, 3, 4, 5, 7]])
     return frame
+
+
+def valve_frames(command: ArrayLike, counter: ArrayLike, enable: ArrayLike) -> Array:
+    """The valve frames (..., frames, 8) of a tick, each with five of the commands (..., n)."""
+    command = np.asarray(command)
+    parts = np.split(command, range(JOINTS_A_FRAME, command.shape[-1], JOINTS_A_FRAME), axis=-1)
+    return np.stack([valve_frame(part, counter, enable) for part in parts], axis=-2)
+
+
+class ValveFrames:
+    """What the newest valve frames say: commands u (n,), and the enable byte of each frame."""
+
+    def __init__(self, machine: Machine) -> None:
+        self.ids = valve_frame_ids(machine)
+        self.u = np.zeros(machine.n)
+        self.enable = np.zeros(len(self.ids), bool)
+
+    def update(self, frame: Frame) -> bool:
+        """Take in one frame; was it the last valve frame of a tick?"""
+        if frame.id not in self.ids or len(frame.data) != 8:
+            return False
+        k = self.ids.index(frame.id)
+        part = self.u[k * JOINTS_A_FRAME : (k + 1) * JOINTS_A_FRAME]
+        part[:] = decode_pwm(list(frame.data[: len(part)]))
+        self.enable[k] = frame.data[7] == 1
+        return frame.id == self.ids[-1]
 
 
 class OperatorInput(NamedTuple):

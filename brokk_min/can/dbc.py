@@ -12,9 +12,9 @@ PWM = f'CM_ "PWM bytes u: m for m = 0..{PWM_MAX}, 255 - |m| for m < 0";'
 
 
 def dbc(machine: Machine) -> str:
-    """The text of a DBC file: valve frame, SYNC, NMT, positions and heartbeats.
+    """The text of a DBC file: valve frames, SYNC, NMT, positions and heartbeats.
 
-    A position is the raw count of an encoder; q = sign (count - zero) 2 pi / 2^bits, unwrapped.
+    A position is the raw count of an encoder; q = sign (count - zero) `encoder_step`, unwrapped.
     ValueError: a machine that does not fit the bus.
     """
     canopen.check_bus(machine)
@@ -31,9 +31,12 @@ def _names(machine: Machine) -> list[str]:
 def _messages(machine: Machine) -> Iterator[str]:
     yield _message(canopen.NMT, "NMT", 2, SENDER, [_signal("command", 0), _signal("node", 8)])
     yield _message(canopen.SYNC, "SYNC", 0, SENDER, [])
-    bytes_ = [_signal(f"u_{name}", 8 * i) for i, name in enumerate(_names(machine))]
-    bytes_ += [_signal("counter", 40), _signal("checksum", 48), _signal("enable", 56, high=1)]
-    yield _message(machine.valve_frame_id, "valves", 8, SENDER, bytes_)
+    for k, can_id in enumerate(canopen.valve_frame_ids(machine)):
+        first = k * canopen.JOINTS_A_FRAME
+        names = _names(machine)[first : first + canopen.JOINTS_A_FRAME]
+        bytes_ = [_signal(f"u_{name}", 8 * i) for i, name in enumerate(names)]
+        bytes_ += [_signal("counter", 40), _signal("checksum", 48), _signal("enable", 56, high=1)]
+        yield _message(can_id, f"valves_{k + 1}" if k else "valves", 8, SENDER, bytes_)
     nodes = [joint.encoder_node for joint in machine.joints]
     sources = [(f"encoder_{name}", node) for name, node in zip(_names(machine), nodes)]
     for name, node in sources:

@@ -20,7 +20,7 @@ from brokk_min.can.drive_log import TelemetryReader
 from brokk_min.env import action_to_pwm, features, integrate_error, measure
 from brokk_min.identification.logs import Recording, velocity_of
 from brokk_min.identification.simulation import free_run
-from brokk_min.kinematics import forward_kinematics, tool_velocity
+from brokk_min.kinematics import UNITS, forward_kinematics, tool_velocity
 from brokk_min.learning.policy import Policy
 from brokk_min.machine import PWM_MAX, Array, Machine
 
@@ -30,9 +30,8 @@ CLEARLY_ANGLES = 0.7  # the same for changed angles, which also hide errors of i
 COMMAND_ERROR = 0.003  # of full command: smaller ones are the gate's and of rounding
 RATE_ERROR = 0.05  # of a tick, assumed
 AHEAD = 1.0  # s of a free run, assumed
-ZEROS = (0.05, -0.05, 0.1, -0.1, 0.2, -0.2, 0.4, -0.4)  # rad
+ZEROS = (0.05, -0.05, 0.1, -0.1, 0.2, -0.2, 0.4, -0.4)  # rad or m
 SCALES = (0.5, 0.7, 1.4, 2.0)
-DEGREES = 180 / np.pi
 Change = Callable[[Array], Array]
 
 
@@ -211,13 +210,19 @@ def angle_changes(machine: Machine) -> Iterator[tuple[str, Change]]:
     middle = (machine.column("q_min") + machine.column("q_max")) / 2
     for name, change in joint_changes(machine):
         yield f"{name} (angle)", partial(about, change=change, middle=middle)
-    for factor in (*SCALES, DEGREES):
+    yield "scale of angles: 57.3", partial(np.multiply, 1 / degrees(machine))
+    for factor in SCALES:
         yield f"scale of angles: {factor:.3g}", partial(np.multiply, 1 / factor)
     for i in machine.driven:
         for zero in ZEROS:
             offset = -zero * (np.arange(machine.n) == i)
-            name = f"encoder zero of {machine.names[i]}: {zero:+.2f} rad"
-            yield name, partial(np.add, offset)
+            name = f"encoder zero of {machine.names[i]}: {zero:+.2f}"
+            yield f"{name} {UNITS[machine.joints[i].kind]}", partial(np.add, offset)
+
+
+def degrees(machine: Machine) -> Array:
+    """Degrees in a radian for revolute joints, 1 for prismatic ones, (n,)."""
+    return np.array([180 / np.pi if j.kind == "revolute" else 1.0 for j in machine.joints])
 
 
 def observation_changes(machine: Machine) -> Iterator[tuple[str, Change]]:
@@ -225,7 +230,10 @@ def observation_changes(machine: Machine) -> Iterator[tuple[str, Change]]:
     both, velocity = np.array([[1.0], [1.0], [0.0]]), np.array([[0.0], [1.0], [0.0]])
     yield "one sample late", partial(delay, ticks=1)
     yield "order of the history", partial(np.flip, axis=-1)
-    yield "degrees instead of radians", partial(np.multiply, DEGREES**both)
+    yield (
+        "degrees instead of radians",
+        partial(np.multiply, degrees(machine)[:, None, None] ** both),
+    )
     for factor in SCALES:
         yield f"scale of angles and velocities: {factor:g}", partial(np.multiply, factor**both)
         yield f"scale of velocities (rate): {factor:g}", partial(np.multiply, factor**velocity)
@@ -235,4 +243,5 @@ def observation_changes(machine: Machine) -> Iterator[tuple[str, Change]]:
         for zero in ZEROS:
             offset = np.zeros((machine.n, 3, 1))
             offset[i, 0] = zero
-            yield f"zero of {machine.names[i]}: {zero:+.2f} rad", partial(np.add, offset)
+            name = f"zero of {machine.names[i]}: {zero:+.2f} {UNITS[machine.joints[i].kind]}"
+            yield name, partial(np.add, offset)

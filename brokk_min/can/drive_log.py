@@ -19,7 +19,7 @@ from brokk_min.evaluation.rollout import Controller
 from brokk_min.hw import Drive
 from brokk_min.identification.files import expected, open_regular, require
 from brokk_min.identification.logs import Log, machine_log
-from brokk_min.machine import Array, Machine, decode_pwm, estimate_velocity
+from brokk_min.machine import Array, Machine, estimate_velocity
 
 LONGEST_LINE = 1000  # bytes
 LARGEST_LOG = 2**40  # bytes: frames are read one by one
@@ -122,9 +122,9 @@ def replay(machine: Machine, controller: Controller, frames: Sequence[Frame]) ->
 
 def compare(machine: Machine, frames: Sequence[Frame], sent: Sequence[Frame]) -> tuple[int, int]:
     """How many valve frames of `sent` are those of the log, byte by byte, and how many it has."""
-    valves = machine.valve_frame_id
-    old = [frame.data for frame in frames if frame.sent and frame.id == valves]
-    new = [frame.data for frame in sent if frame.id == valves]
+    valves = canopen.valve_frame_ids(machine)
+    old = [(frame.id, frame.data) for frame in frames if frame.sent and frame.id in valves]
+    new = [(frame.id, frame.data) for frame in sent if frame.id in valves]
     return sum(a == b for a, b in zip(old, new)), max(len(old), len(new))
 
 
@@ -156,22 +156,15 @@ def _driven_ticks(
     machine: Machine, frames: Iterable[Frame]
 ) -> Iterator[tuple[float, Array, Array]]:
     """Start [s], commands u (n,) and angles [rad] (n,) of ticks with all positions."""
-    nodes = Nodes(machine)
+    nodes, valves = Nodes(machine), canopen.ValveFrames(machine)
     start = 0.0
     for frame in frames:
         nodes.update(frame)
         if frame.id == canopen.SYNC:
             nodes.start_tick()
             start = frame.time
-        elif frame.id == machine.valve_frame_id and len(frame.data) == 8:
-            u, driving = _read_valve_frame(machine, frame.data)
-            if driving and (nodes.frames == 1).all():
-                yield start, u, nodes.counts() * machine.encoder_step
-
-
-def _read_valve_frame(machine: Machine, data: bytes) -> tuple[Array, bool]:
-    """Commands u (n,), and whether the valves may move."""
-    return decode_pwm(list(data[: machine.n])), data[7] == 1
+        elif valves.update(frame) and valves.enable.all() and (nodes.frames == 1).all():
+            yield start, valves.u.copy(), nodes.counts() * machine.encoder_step
 
 
 class Telemetry(NamedTuple):
@@ -196,8 +189,7 @@ class TelemetryReader:
         self.machine = machine
         self.nodes = Nodes(machine)
         self.operator_input = OperatorInput()
-        self.u: Array = np.zeros(machine.n)
-        self.driving = False
+        self.valves = canopen.ValveFrames(machine)
         self.tick = 0
         self.angles: list[Array] = []  # rad (n,), as many as the velocity needs
 
@@ -211,8 +203,7 @@ class TelemetryReader:
             return telemetry
         if frame.id == canopen.OPERATOR_INPUT and frame.channel == OPERATOR_CHANNEL:
             self.operator_input = canopen.unpack_operator_input(frame.data)
-        elif frame.id == self.machine.valve_frame_id and len(frame.data) == 8:
-            self.u, self.driving = _read_valve_frame(self.machine, frame.data)
+        self.valves.update(frame)
         return None
 
     def _telemetry(self) -> Telemetry:
@@ -226,5 +217,6 @@ class TelemetryReader:
             q_dot = estimate_velocity(np.stack(self.angles, axis=-1), m.velocity_samples, m.dt)
         else:
             self.angles = []
-        v_goal = np.array(self.operator_input.v_goal) * self.driving
-        return Telemetry(self.tick, q, q_dot, self.u, v_goal, self.driving)
+        driving = bool(self.valves.enable.all())
+        v_goal = np.array(self.operator_input.v_goal) * driving
+        return Telemetry(self.tick, q, q_dot, self.valves.u.copy(), v_goal, driving)

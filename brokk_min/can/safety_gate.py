@@ -10,18 +10,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brokk_min.can.canopen import OPERATIONAL, Array, valve_frame
+from brokk_min.can.canopen import OPERATIONAL, Array, valve_frames
 from brokk_min.machine import PWM_MAX, Machine
 
 # all assumed
 HEARTBEAT_TIMEOUT = 0.110  # s
 SLEW = 40  # counts of 127 per tick by which a command may grow
-END_STOP_MARGIN = 0.02  # rad before a joint's limit, from where no command goes outward
-RANGE_MARGIN = 0.05  # rad beyond a joint's limit, then the encoder is wrong
+END_STOP_MARGIN = 0.02  # rad or m before a joint's limit, from where no command goes outward
+RANGE_MARGIN = 0.05  # rad or m beyond a joint's limit, then the encoder is wrong
 JUMP_FACTOR = 2.0  # times the fastest motion,
-JUMP_ANGLE = 0.0045  # rad, plus this and one count: a larger step is a jump
+JUMP_ANGLE = 0.0045  # rad or m, plus this and one count: a larger step is a jump
 # an encoder is frozen if it stands still while the joint must have turned by this, or by one count
-FROZEN_ANGLE = 0.0015  # rad
+FROZEN_ANGLE = 0.0015  # rad or m
 OPENING_TIME = 0.45  # s of commands to one side, after which a joint moves even from rest
 IDLE_ZONES = 1.5  # dead zones: the default of `Machine.largest_dead_zone`
 SLOWEST = 0.4  # of the fastest motion: long lever arm, weak pump
@@ -109,7 +109,7 @@ def gate_start(machine: Machine, shape: tuple[int, ...] = ()) -> GateState:
 def gate(
     machine: Machine, state: GateState, inputs: GateInputs, now: ArrayLike
 ) -> tuple[GateState, Array]:
-    """Next state, and the valve frame (..., 8) to send if it was `armed_once`. Paper: Sec. 2
+    """Next state, and valve frames (..., k, 8) to send if it was `armed_once`. Paper: Sec. 2
 
     A rising edge of the dead-man switch at zero goal, without any fault, arms the gate. Any fault,
     or the switch released, closes the valves until the next such edge. `now` [s] (...) is on the
@@ -137,7 +137,7 @@ def gate(
         sent=np.concatenate([state.sent[..., 1:], command[..., None]], axis=-1),
         expected_motion=expected,
     )
-    return state, valve_frame(command, counter, driving)
+    return state, valve_frames(command, counter, driving)
 
 
 def limit_slew(machine: Machine, state: GateState, inputs: GateInputs) -> Array:
@@ -201,7 +201,7 @@ def active_fault(
     faults[..., Fault.MALFORMED, :n] = inputs.frames > 1
     faults[..., Fault.OUT_OF_RANGE, :n] = (q < low) | (q > high)
     faults[..., Fault.JUMPED, :n] = np.abs(q - state.counts * machine.encoder_step) > jump
-    faults[..., Fault.FROZEN, :n] = expected > max(FROZEN_ANGLE, machine.encoder_step)
+    faults[..., Fault.FROZEN, :n] = expected > np.maximum(FROZEN_ANGLE, machine.encoder_step)
     faults[..., Fault.NO_COMMAND, :n] = ~(np.abs(inputs.command) <= limit)  # nan, too
     faults[..., Fault.STOP, 0] = inputs.stop
     faults = faults.reshape(*now.shape, -1)

@@ -19,7 +19,7 @@ from brokk_min.actuator import plant_reset, plant_step
 from brokk_min.can import canopen
 from brokk_min.can.canopen import OPERATIONAL, WATCHDOG, Array, Frame, checksum, encoder_raw
 from brokk_min.can.connection import open_bus, stop_signals
-from brokk_min.machine import Machine, decode_pwm
+from brokk_min.machine import Machine
 
 # NMT states besides OPERATIONAL
 BOOT = 0
@@ -32,9 +32,10 @@ class SimulatedMachine:
     """CiA 406 encoders and a valve controller on one bus, the analytic plant behind them.
 
     The plant moves by its own clock. A valve frame is refused if its counter, checksum or length is
-    wrong, or if it is not the first since a SYNC. The valves close on a refused frame, on two SYNCs
-    without a frame between, and after `WATCHDOG` without a valid frame. They stay closed until an
-    NMT start and a neutral frame.
+    wrong, or if it is not the first since a SYNC. With more than five joints the valves follow once
+    all frames of the tick are there. They close on a refused frame, on two SYNCs without all frames
+    between, and after `WATCHDOG` without them. They stay closed until an NMT start and neutral
+    frames.
 
     Args:
         machine: what moves.
@@ -67,20 +68,21 @@ class SimulatedMachine:
         self.encoders = [joint.encoder_node for joint in machine.joints]
         self.nmt = dict.fromkeys([*self.encoders, machine.controller_node], PRE_OPERATIONAL)
         self.objects = {
-            (node, *address): value
-            for node in self.encoders
+            (joint.encoder_node, *address): value
+            for joint in machine.joints
             for address, value in (
                 ((0x1000, 0), 406),  # device type
                 (canopen.HEARTBEAT_OBJECT, round(1e3 * canopen.HEARTBEAT_PERIOD)),
                 (canopen.SYNC_OBJECT, 1),
-                (canopen.RESOLUTION_OBJECT, 2**machine.encoder_bits),
+                (canopen.RESOLUTION_OBJECT, canopen.encoder_resolution(joint)),
             )
         }
-        self.valid = now  # time of the last valid valve frame
+        self.received = canopen.ValveFrames(machine)
+        self.valid = now  # time at which the last valid valve frames of a tick were there
         self.u: Array = np.zeros(machine.n)
         self.enabled = False  # by a neutral frame with the enable byte, until the byte is cleared
-        self.counter = -1  # of the last valve frame; -1: the next may have any
-        self.expects_frame = False  # was there a SYNC since the last valve frame?
+        self.counters: dict[int, int] = {}  # of the last valve frames; without one any may come
+        self.missing: set[int] = set()  # valve frames that did not yet come since the last SYNC
 
     def boot(self) -> Frames:
         """The boot-up messages of all nodes."""
@@ -114,11 +116,11 @@ class SimulatedMachine:
         if frame.id == canopen.NMT and len(frame.data) == 2:
             return self._on_nmt(*frame.data)
         if frame.id == canopen.SYNC:
-            if self.enabled and self.expects_frame:
+            if self.enabled and self.missing:
                 self._trip("no valve frame between two SYNCs")
-            self.expects_frame = True
+            self.missing = set(self.received.ids)
             return self._positions()
-        if frame.id == self.machine.valve_frame_id:
+        if frame.id in self.received.ids:
             self._on_valve_frame(frame)
         elif node in self.encoders and len(frame.data) == 8:
             return [(canopen.SDO_ANSWER + node, self._on_sdo(node, frame.data))]
@@ -145,22 +147,25 @@ class SimulatedMachine:
             self._trip("valve frame with a wrong length or checksum")
             return
         counter = int(data[5])
-        before, self.counter = self.counter, counter
-        first, self.expects_frame = self.expects_frame, False
-        self.valid = frame.time
-        if before not in (-1, (counter - 1) % 256):
+        before, self.counters[frame.id] = self.counters.get(frame.id), counter
+        first = frame.id in self.missing
+        self.missing.discard(frame.id)
+        self.received.update(frame)
+        if not self.missing:
+            self.valid = frame.time
+        if before not in (None, (counter - 1) % 256):
             self._trip(f"valve frame with counter {counter} after {before}")
         elif not first:
             self._trip(f"second valve frame after a SYNC, counter {counter}")
-        elif self.nmt[self.machine.controller_node] == OPERATIONAL:
-            u = decode_pwm(data[: self.machine.n])
-            self.enabled = data[7] == 1 and (self.enabled or not u.any())
-            self.u = u * self.enabled
+        elif not self.missing and self.nmt[self.machine.controller_node] == OPERATIONAL:
+            neutral = not self.received.u.any()
+            self.enabled = bool(self.received.enable.all()) and (self.enabled or neutral)
+            self.u = self.received.u * self.enabled
 
     def _close_valves(self) -> None:
         self.u = np.zeros(self.machine.n)
         self.enabled = False
-        self.counter = -1
+        self.counters = {}
 
     def _trip(self, reason: str) -> None:
         if self.nmt[self.machine.controller_node] == OPERATIONAL:
@@ -222,7 +227,7 @@ def simulate(
     """
     pose = start_pose(machine, q)
     nodes = [joint.encoder_node for joint in machine.joints]
-    ids = [canopen.NMT, canopen.SYNC, machine.valve_frame_id]
+    ids = [canopen.NMT, canopen.SYNC, *canopen.valve_frame_ids(machine)]
     ids += [canopen.SDO_REQUEST + node for node in nodes]
     gc.freeze()  # no long garbage collection while the encoders should answer
     with ExitStack() as stack:

@@ -19,6 +19,7 @@ from brokk_min.identification.files import brief, located, write_json
 from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
 from brokk_min.identification.logs import Log, part_of, read_log, split, write_log
 from brokk_min.identification.net_file import load_net, save_net
+from brokk_min.identification.recovery import recovery
 from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import Machine, number
 
@@ -33,6 +34,7 @@ COLUMNS = {  # of the table of `inspect`: head, format, field of `JointReport`
     "gain down": ("{:.2f}", "gain_down"),
     "explained": ("{:.0%}", "explained"),
     "feedback": ("{:+.2f}", "feedback"),
+    "reaction": ("{:+.2f}", "reaction"),
 }
 
 
@@ -81,8 +83,9 @@ class Fit(Command):
     out: Path  # Nets to write, .npz.
     test: tuple[Path, ...] = ()  # Logs to score on; by default every tenth recording of LOGS.
     json: Path | None = None  # Also write the scores here.
-    figure: Path | None = None  # Also draw free runs of the worst and median recording, .png.
+    figure: Path | None = None  # Free runs of the worst and median recording; by default OUT.png.
     machine: MachineName = ""  # Of LOGS; by default the usual one, if LOGS has its joints.
+    plant: PlantName = ""  # What LOGS recorded, if known: also print what the nets recovered of it.
     velocity_samples: int | None = number("samples", 2, 100, None)
     """Window of velocities; by default the machine's."""
     paper: bool = False  # The paper's recipe: errors of one step, no noise, plain commands.
@@ -93,12 +96,16 @@ class Fit(Command):
         from brokk_min.evaluation import figures
         from brokk_min.identification.fitting import fit
 
+        self.figure = self.figure or self.out.with_suffix(".png")
         machine = self.check(out="nets", json="scores", figure="picture")
         self.config(None, machine.history)  # before the logs are read
         samples = self.velocity_samples or machine.velocity_samples
         if samples > (self.settings.history or machine.history):
             raise WrongUse(f"--velocity-samples: expected at most --history, got {samples}")
         log, known = read_known(self.logs, machine, samples, self.machine)
+        if self.plant and not known:
+            raise WrongUse("--plant: expected LOGS with the joints of --machine")
+        recorded = with_plant(machine, self.plant, ["analytic", ""])
         log, test = self.parts(log, samples)
         history = machine.history if known else history_of(log, machine.history)
         config = self.config(known, history)
@@ -112,6 +119,8 @@ class Fit(Command):
             if "one_step_rmse" not in scored:
                 scores["warnings"].append(f"{name}: not driven in the test: no score")
         scores["warnings"] += inspection.warnings(log, reports, known)
+        if self.plant:
+            scores["recovery"] = recovery(net, recorded)
         save_net(self.out, net)
         if self.curve:
             logs = [part_of(log, part) for part in (1 / 8, 1 / 4, 1 / 2)]
@@ -123,8 +132,8 @@ class Fit(Command):
             meta: dict[str, Any] = {name: getattr(net, name) for name in names}
             meta |= {"logs": list(map(str, self.logs)), "test": list(map(str, self.test))}
             write_json(self.json, {"meta": meta, **scores})
-        if self.figure:
-            figures.save(self.figure, figures.plot_worst_and_median(net, test))
+        if any("one_step_rmse" in joint for joint in scores["joints"].values()):
+            figures.save(self.figure, figures.plot_worst_and_median(net, test, known))
         name = net.machine or "no known machine"
         print(f"nets of {name}, dead zone {net.dead_zone} of full command")
         seconds = net.history / net.rate
@@ -171,6 +180,18 @@ def curve_point(log: Log, joints: dict[str, Any]) -> dict[str, Any]:
     return {"minutes": minutes, "free_run_rmse": errors}
 
 
+def print_recovery(joints: dict[str, dict[str, Any]]) -> None:
+    """A table of `recovery`: of each number up and down."""
+    if joints:
+        print("What the nets recovered of the plant, up and down:")
+        row = "{:12} {:6} {:>15} {:>15} {:>15} {:>15}"
+        print(row.format("joint", "", "dead zone", "delay [s]", "from idle [s]", "speed"))
+    for name, sides in joints.items():
+        for side, numbers in sides.items():
+            pairs = (", ".join(f"{x or np.nan:.3f}" for x in pair) for pair in numbers.values())
+            print(row.format(name, side, *pairs))
+
+
 def print_scores(scores: dict[str, Any]) -> None:
     """Scores of each net, of the linear model of its joint if it has one, and warnings."""
     row = "{:12} {:>9} {:>13}  {:30} {}"
@@ -195,6 +216,7 @@ def print_scores(scores: dict[str, Any]) -> None:
         own = [text for joint, _, text in warnings if joint == name]
         if own:
             print("\n  ".join([f"warnings for {name}:", *own]))
+    print_recovery(scores.get("recovery", {}))
     for point in scores.get("curve", []):
         errors = ", ".join(f"{k} {v:.4f}" for k, v in point["free_run_rmse"].items())
         print(f"fitted to {point['minutes']:.1f} minutes: free runs of 5 s [rad/s]: {errors}")
@@ -225,7 +247,8 @@ class Score(Command):
         if any("one_step_rmse" in joint for joint in scores["joints"].values()):
             from brokk_min.evaluation import figures
 
-            figures.save(self.figure, figures.plot_worst_and_median(net, log))
+            drawn = machine if machine.names == net.joints else None
+            figures.save(self.figure, figures.plot_worst_and_median(net, log, drawn))
         print_scores(scores)
 
 

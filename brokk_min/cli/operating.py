@@ -23,6 +23,7 @@ from brokk_min.evaluation.rollout import Controller
 from brokk_min.evaluation.sequences import read_commands
 from brokk_min.identification.files import located, whole_file, write_json
 from brokk_min.identification.logs import write_log
+from brokk_min.kinematics import UNITS
 from brokk_min.learning.onnx import export_onnx
 from brokk_min.learning.policy import Policy, PolicyController, load_policy
 from brokk_min.machine import Machine, number
@@ -189,7 +190,8 @@ def plot_drive(machine: Machine, policy: Policy, ticks: diagnosis.Ticks) -> "Fig
         values = {"measured": measured, "expected": simulated}
         q_dot = {label: (later, x[..., k].T.ravel()) for label, x in values.items()}
         left = figures.Panel("", "time [s]", f"command of {name} [1]", u)
-        rows.append([left, figures.Panel("", "time [s]", f"{name} [rad/s]", q_dot)])
+        label = f"{name} [{UNITS[machine.joints[j].kind]}/s]"
+        rows.append([left, figures.Panel("", "time [s]", label, q_dot)])
     return figures.plot_panels(rows)
 
 

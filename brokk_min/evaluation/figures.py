@@ -23,7 +23,7 @@ from brokk_min.identification.formats import read_table
 from brokk_min.identification.logs import Log, Recording
 from brokk_min.identification.simulation import free_run
 from brokk_min.identification.validation import recording_errors
-from brokk_min.kinematics import forward_kinematics, tool_position
+from brokk_min.kinematics import UNITS, forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
 
 matplotlib.rcParams.update({"axes.grid": True, "grid.alpha": 0.3, "axes.axisbelow": True})
@@ -154,28 +154,35 @@ def plot_free_run(net: ActuatorNet, log: Log) -> Figure:
     return plot_panels([rows[j] for j in np.flatnonzero(recording.u.any(axis=0))])
 
 
-def plot_worst_and_median(net: ActuatorNet, log: Log) -> Figure:
-    """The free runs with the worst and the median velocity error; of each its worst joint."""
+def plot_worst_and_median(net: ActuatorNet, log: Log, machine: Machine | None = None) -> Figure:
+    """The free runs with the worst and the median velocity error; of each its worst joint.
+
+    A `machine` with prismatic joints tells which angles are in m.
+    """
     errors = np.nan_to_num(recording_errors(net, log, FREE_RUN_S), nan=-1.0)
     largest = errors.max(axis=1)
     order = [i for i in np.argsort(largest) if largest[i] >= 0]
     rows = []
     for title, index in {"worst": order[-1], "median": order[(len(order) - 1) // 2]}.items():
         recording = log.recordings[index]
-        row = _free_run(net, recording)[errors[index].argmax()]
+        row = _free_run(net, recording, machine)[errors[index].argmax()]
         rows.append([panel._replace(title=f"{title}: {recording.name}") for panel in row])
     return plot_panels(rows)
 
 
-def _free_run(net: ActuatorNet, recording: Recording) -> list[list[Panel]]:
+def _free_run(
+    net: ActuatorNet, recording: Recording, machine: Machine | None = None
+) -> list[list[Panel]]:
     """Angle and velocity of each joint, measured and in a free run."""
     ticks = min(round(FREE_RUN_S * net.rate), len(recording.q) - net.history - 1)
     q, q_dot = free_run(net, recording, np.array([net.history]), ticks)
     run = slice(net.history + 1, net.history + 1 + ticks)
     angles = {"measured": recording.q[run], "free run": q[:, 0]}
     velocities = {"measured": recording.q_dot[run], "free run": q_dot[:, 0]}
-    left = _time_panels(1 / net.rate, [f"{name} [rad]" for name in net.joints], angles)
-    right = _time_panels(1 / net.rate, [f"{name} [rad/s]" for name in net.joints], velocities)
+    units = {joint.name: UNITS[joint.kind] for joint in (machine.joints if machine else ())}
+    labels = [(name, units.get(name, "rad")) for name in net.joints]
+    left = _time_panels(1 / net.rate, [f"{name} [{unit}]" for name, unit in labels], angles)
+    right = _time_panels(1 / net.rate, [f"{name} [{unit}/s]" for name, unit in labels], velocities)
     return [list(row) for row in zip(left, right, strict=True)]
 
 

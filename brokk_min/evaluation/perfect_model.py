@@ -147,7 +147,7 @@ def steady_opening(machine: Machine, q: Array, goal: Array) -> Array:
     """Openings (num, n_driven) that hold the tool velocity `goal` [m/s] at angles `q` [rad]."""
     driven = machine.driven
     J = jacobian(forward_kinematics(machine, q))[..., driven]
-    J_inv = dls(J, np.ones(len(driven)), np.full(len(q), 1e-3))
+    J_inv = dls(J, machine.column("weight")[driven], np.full(len(q), 1e-3))
     q_dot = np.zeros_like(q)
     q_dot[:, driven] = (J_inv @ goal[..., None])[..., 0]
     v = q_dot * lever_arm(machine, q)  # of the cylinders [m/s]

@@ -238,11 +238,11 @@ class _SegmentPhases:
     def __init__(
         self, machine: Machine, joint: Indices, start: Array, length: int, push: float
     ) -> None:
-        near = 2 * machine.encoder_step
+        near = 2 * machine.encoder_step[joint]
         self.low = machine.column("q_min")[joint] + near
         self.high = machine.column("q_max")[joint] - near
         self.start = start
-        self.arrival = max(0.06, near)  # rad
+        self.arrival = np.maximum(0.06, near)  # rad or m
         self.length = length
         self.push = push
         self.earliest = machine.history + machine.rate

@@ -107,8 +107,8 @@ LOG: dict[str, Field] = {  # columns, or what their names begin with; q: ten tur
     "run": Field("text", 1, 200, ("rows",)),
     "time": Field("number", -1e12, 1e12, ("rows",), "s"),
     "u_": Field("number", -1, 1, ("rows",), "of full command, not percent or bytes"),
-    "q_": Field("number", -62.8, 62.8, ("rows",), "rad, not degrees"),
-    "q_dot_": Field("number", -62.8, 62.8, ("rows",), "rad/s, not degrees/s"),
+    "q_": Field("number", -62.8, 62.8, ("rows",), "rad or m, not degrees"),
+    "q_dot_": Field("number", -62.8, 62.8, ("rows",), "rad/s or m/s, not degrees/s"),
 }
 VELOCITY = Field("number", -100, 100, ("rows",), "m/s")
 COMMANDS: dict[str, Field] = {

@@ -27,6 +27,9 @@ LEAST_RANGE = 0.7  # of a joint's range
 LEAST_LEVELS = 6  # with 1 % of the commands or more
 LEAST_CHANGES = 0.05  # of the ticks: commands that change by more than a tenth of the largest
 CLOSED_LOOP = -0.42  # `feedback`: excitations give -0.4 to 0, going between places -0.6 to -0.5
+SMALL = 0.02  # of full command: larger changes are of goals, or of an excitation
+LEAST_SMALL = 400  # small changes of a command, else nothing is said of its `reaction`
+REACTS = 0.01  # least `reaction` of all joints: excitations have 0 or less, a policy has 0.03
 CLEAR_SIGN = 0.2  # of the velocities' variance: fast sines fit as well reversed and later
 
 
@@ -42,6 +45,7 @@ class JointReport:
     levels: tuple[int, int]  # of `LEVELS` commands up and down that the log has
     changes: float  # part of the ticks at which the command changes fast
     feedback: float  # correlation of commands with the angle a second before
+    reaction: float  # part of the small changes of the command that measured motion explains
     explained: float  # part of the velocities' variance that the model explains
     sign: int  # of velocity under a positive command; 0: not clear
     delay: float  # s
@@ -84,6 +88,7 @@ def inspect_joint(log: Log, recordings: list[Recording], j: int) -> JointReport:
         levels=(levels[0], levels[1]),
         changes=float(np.concatenate(changes).mean()),
         feedback=feedback(recordings, j, log.rate),
+        reaction=reaction(recordings, j),
         **joint_model(recordings, j, log.rate),
     )
 
@@ -161,6 +166,38 @@ def feedback(recordings: list[Recording], j: int, rate: float) -> float:
     return float(np.corrcoef(q, u)[0, 1])
 
 
+def reaction(recordings: list[Recording], j: int) -> float:
+    """Part of the small changes of a command that the joint's motion explains; 0: too few of them.
+
+    As Granger (1969) has it: beyond what the command's own past explains, by linear models that are
+    fitted to one half of the changes and scored on the other. Commands of an excitation change
+    whatever the joint does; those of a controller follow its velocity.
+    """
+    own, motion, changes = map(
+        np.concatenate, zip(*(_small_changes(one, j) for one in recordings), strict=True)
+    )
+    if len(changes) < LEAST_SMALL:
+        return 0.0
+    halves = np.array_split(np.arange(len(changes)), 2)
+    error = np.zeros(2)
+    for fitted, scored in (halves, halves[::-1]):
+        for k, x in enumerate((own, np.hstack([own, motion]))):
+            w = np.linalg.lstsq(x[fitted], changes[fitted], rcond=None)[0]
+            error[k] += np.square(changes[scored] - x[scored] @ w).sum()
+    return float(1 - error[1] / max(error[0], 1e-12))
+
+
+def _small_changes(recording: Recording, j: int) -> tuple[Array, Array, Array]:
+    """Of each small change of a command: its past, the joint's motion until then, the change."""
+    u, q, q_dot = recording.u[:, j], recording.q[:, j], recording.q_dot[:, j]
+    t = np.arange(6, len(u))
+    change = np.stack([u[t - k] - u[t - k - 1] for k in range(5)], axis=-1)  # newest first
+    small = (np.abs(change[:, :3]) < SMALL).all(axis=-1) & (u[t] != 0) & (u[t - 1] != 0)
+    own = np.column_stack([np.ones(len(t)), change[:, 1:], u[t - 1]])
+    motion = np.column_stack([*(q_dot[t - k] for k in (0, 1, 2, 4)), q[t]])
+    return own[small], motion[small], change[small, 0]
+
+
 def check_signs(reports: dict[str, JointReport]) -> None:
     """ValueError: a joint whose angle falls under positive commands."""
     for name, report in reports.items():
@@ -195,6 +232,11 @@ def warnings(
         found = [text for text, bad in checks.items() if bad]
         if found:
             result.append(f"{name}: {', '.join(found)}: scores hold for such driving alone")
+    reactions = [r.reaction for r in reports.values() if r.reaction]
+    if len(reactions) > 1 and min(reactions) > REACTS:
+        parts = ", ".join(f"{reaction:.0%}" for reaction in reactions)
+        of_changes = f"commands follow the measured motion ({parts} of their small changes)"
+        result.append(f"{of_changes}: a controller drove; scores hold for such driving alone")
     return result
 
 

@@ -2,8 +2,9 @@
 
 Columns `run,time,u_<joint>...,q_<joint>...[,q_dot_<joint>...]`, one row per sample; `.csv`, or
 `.npz` with the same columns as arrays. `run` is the name of the recording, time is in s, u in
-[-1, 1] of full command (held until the next row), q in rad, q_dot in rad/s. Any joints, any rate
-not below the machine's, jitter allowed. Recordings whose name ends in `_return` are dropped.
+[-1, 1] of full command (held until the next row), q in rad (m of prismatic joints), q_dot in q/s.
+Any joints, any rate not below the machine's, jitter allowed. Recordings whose name ends in
+`_return` are dropped.
 """
 
 import math
@@ -22,7 +23,7 @@ from brokk_min.machine import Array, Machine, estimate_velocity
 RATE = 20.0  # Hz, paper: everything runs at 20 Hz; other machines have others
 MAX_GAP = 0.25  # s, or 2.5 samples, assumed: a longer gap starts a new recording
 COMMANDED = 0.02  # of full command, assumed: more than a stick at rest gives
-MOVED = 0.01  # rad, assumed: more than a parked joint creeps
+MOVED = 0.01  # rad or m, assumed: more than a parked joint creeps
 MEAN_OF = 10  # values in a tick, of logs that are faster
 RETURN = "_return"
 Columns = Mapping[str, Any]

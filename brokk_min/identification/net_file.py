@@ -2,7 +2,8 @@
 
 import hashlib
 import json
-from dataclasses import fields
+from collections.abc import Sequence
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +75,17 @@ def select_nets(machine: Machine, net: ActuatorNet) -> ActuatorNet:
     found = {name: getattr(net, name) for name in wanted}
     if found != wanted:
         raise ValueError(f"actuator: expected nets for {machine.name} with {wanted}, got {found}")
-    return net.select([machine.names[i] for i in machine.driven])
+    return joint_nets(net, [machine.names[i] for i in machine.driven])
+
+
+def joint_nets(net: ActuatorNet, joints: Sequence[str]) -> ActuatorNet:
+    """The nets of some joints, in the order given; ValueError: a joint without a net."""
+    if not set(joints) <= set(net.joints):
+        raise ValueError(f"joints: expected nets for {list(joints)}, got {list(net.joints)}")
+    index = [net.joints.index(name) for name in joints]
+    arrays = {name: getattr(net, name)[index] for name in STATISTICS}
+    weights = tuple(weight[index] for weight in net.weights)
+    return replace(net, joints=tuple(joints), weights=weights, **arrays)
 
 
 def save_net(path: Path, net: ActuatorNet) -> None:

@@ -130,7 +130,7 @@ def euler_step(
 def gravity_torque(
     machine: Machine, q: Array, link_mass: float, payload: float, tilt: float
 ) -> Array:
-    """Torque [N m] (..., n) that holds the arm at `q`: positive where +q lifts it.
+    """Torque [N m], force [N] of prismatic joints (..., n), that holds the arm: > 0 where +q lifts.
 
     tau_i = g sum_k m_k e . (z_{i-1} x (c_k - p_{i-1})), links k = i .. n with their middles c_k and
     the payload at the tool; e is up, seen from the tilted base. 0 without masses.
@@ -145,7 +145,10 @@ def gravity_torque(
     moment = link_mass * (np.cumsum(middle[..., ::-1, :], -2)[..., ::-1, :])
     moment = moment - link_mass * links * frames.p[..., :-1, :]
     moment = moment + payload * (frames.p[..., -1:, :] - frames.p[..., :-1, :])
-    return G * np.asarray(cross(frames.z[..., :-1, :], moment) @ up)
+    torque = cross(frames.z[..., :-1, :], moment) @ up
+    for i in frames.prismatic:  # the force along its axis
+        torque[..., i] = (link_mass * (machine.n - i - 0.5) + payload) * (frames.z[..., i, :] @ up)
+    return G * np.asarray(torque)
 
 
 def load_factor(load: Array, s: Array) -> Array:

@@ -114,19 +114,19 @@ def step_velocity(angles: Array, rate: float) -> Array:
     return np.asarray(np.diff(own, axis=0) * rate * np.array([[1], [-1]]))
 
 
-def response_times(angles: Array, rate: float) -> Array:
-    """Time [s] (2, 2, n) from the step to 63 % of the change of velocity; nan: no change.
+def response_times(angles: Array, rate: float, rise: float = RISE) -> Array:
+    """Time [s] (2, 2, n) from the step to `rise` of the change of velocity; nan: no change.
 
     Velocities are means over a tick, taken at its middle, with lines between them.
     """
     wait = (len(angles) - 1) // 2
     after = step_velocity(angles, rate)[wait - 1 :]
     change = after.max(axis=0) - after[0]
-    rise = (after - after[0]) / np.where(change > 1e-3, change, np.nan)
-    at = np.maximum(np.argmax(rise >= RISE, axis=0), 1)  # row k: the tick k - 1 after the step
-    high = np.take_along_axis(rise, at[None], axis=0)[0]
-    low = np.take_along_axis(rise, at[None] - 1, axis=0)[0]
-    return np.asarray((at - 0.5 - (high - RISE) / (high - low)) / rate)
+    part = (after - after[0]) / np.where(change > 1e-3, change, np.nan)
+    at = np.maximum(np.argmax(part >= rise, axis=0), 1)  # row k: the tick k - 1 after the step
+    high = np.take_along_axis(part, at[None], axis=0)[0]
+    low = np.take_along_axis(part, at[None] - 1, axis=0)[0]
+    return np.asarray((at - 0.5 - (high - rise) / (high - low)) / rate)
 
 
 def step_commands(

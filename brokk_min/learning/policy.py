@@ -92,7 +92,10 @@ def contract(machine: Machine, paper: bool = False) -> dict[str, Any]:
         "velocity_samples": machine.velocity_samples,
         "pwm_limit": machine.pwm_limit,
         "dead_zone": machine.dead_zone,
-        "geometry": [[j.a, j.alpha, j.d, j.theta, j.q_min, j.q_max] for j in machine.joints],
+        "geometry": [
+            [j.a, j.alpha, j.d, j.theta, j.q_min, j.q_max] + [j.kind] * (j.kind == "prismatic")
+            for j in machine.joints
+        ],
     }
 
 

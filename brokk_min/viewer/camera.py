@@ -30,10 +30,11 @@ class Camera(NamedTuple):
 
 def skeleton(machine: Machine, q: ArrayLike) -> Array:
     """Corners of the arm [m], (..., 2 n + 1, 3): base, then the ends of each joint's d and a."""
-    p, z = forward_kinematics(machine, q)
+    p, z, _ = forward_kinematics(machine, q)
     corners = np.empty((*p.shape[:-2], 2 * machine.n + 1, 3))
     corners[..., ::2, :] = p
-    corners[..., 1::2, :] = p[..., :-1, :] + machine.column("d")[:, None] * z[..., :-1, :]
+    along = np.sum((p[..., 1:, :] - p[..., :-1, :]) * z[..., :-1, :], axis=-1, keepdims=True)
+    corners[..., 1::2, :] = p[..., :-1, :] + along * z[..., :-1, :]
     return corners
 
 

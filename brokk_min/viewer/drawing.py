@@ -309,7 +309,8 @@ def _joint_rows(canvas: Canvas, machine: Machine, scene: Scene, box: Box) -> Non
         if np.isfinite(scene.q[i]):
             x = angle + length * (scene.q[i] - joint.q_min) / (joint.q_max - joint.q_min)
             canvas.bar(x - 3, x + 3, y, 8, colour)
-            canvas.text(angle + length + 8, y, f"{scene.q[i]:+z.2f}", 12, colour)
+            unit = " m" if joint.kind == "prismatic" else ""
+            canvas.text(angle + length + 8, y, f"{scene.q[i]:+z.2f}{unit}", 12, colour)
         if joint.driven:
             counts = float(scene.u[i]) * PWM_MAX
             zero = valve + length / 2

@@ -15,20 +15,26 @@ from brokk_min.can.canopen import (
     Frame,
     Nodes,
     OperatorInput,
+    ValveFrames,
     checksum,
     encoder_counts,
     encoder_raw,
+    encoder_resolution,
     sdo,
     unpack_operator_input,
     used_ids,
     valve_frame,
+    valve_frame_ids,
+    valve_frames,
 )
 from brokk_min.can.connection import open_bus
 from brokk_min.can.safety_gate import fault_name
 from brokk_min.can.simulated_machine import SimulatedMachine
 from brokk_min.machine import BROKK_170
 
-STEP = BROKK_170.encoder_step
+STEP = BROKK_170.encoder_step[0]
+SIXTH = replace(BROKK_170.joints[4], name="q6", encoder_node=6)
+SIX = replace(BROKK_170, name="six joints", joints=(*BROKK_170.joints, SIXTH), q_start=())
 
 
 def bitwise_crc(data):
@@ -126,9 +132,8 @@ def test_set_up_nodes__refuses_what_does_not_fit(world):
     with pytest.raises(ValueError, match=refusal):
         world.drive.begin()
     assert world.t - begun == pytest.approx(0.5, abs=0.002)
-    six = (*BROKK_170.joints, replace(BROKK_170.joints[4], name="q6", encoder_node=6))
-    machine = replace(BROKK_170, name="6_joints", joints=six, q_start=())
-    with pytest.raises(ValueError, match=r"6_joints: expected at most 5 joints"):
+    machine = replace(SIX, valve_frame_id=0x185)
+    with pytest.raises(ValueError, match=r"valve_frame_id: expected .*, got 0x185, 0x186"):
         hw.Drive(machine, ConstantCommand(*np.zeros(6)), world.bus, HoldingOperator()).begin()
     with pytest.raises(ValueError, match="command: expected at most 5 joints, got 6"):
         valve_frame([0, 0, 0, 0, 0, 77], 9, 1)  # would be the counter
@@ -168,6 +173,37 @@ def test_update__counts_a_position_twice_that_skips_turns_or_is_none(first, seco
     assert nodes.frames[2] == (1 if sound else 2)
 
 
+@pytest.mark.parametrize("n", [1, 5, 6, 10, 11])
+def test_valve_frames__have_five_joints_each_and_are_read_back(n):
+    joints = [replace(SIX.joints[0], name=f"j{i}", encoder_node=i + 1) for i in range(n)]
+    machine = replace(SIX, joints=tuple(joints))
+    command = np.arange(n) * 12 - 60
+    frames = valve_frames(command, 7, 1)
+    assert frames.shape == (len(valve_frame_ids(machine)), 8) == (-(-n // 5), 8)
+    reader = ValveFrames(machine)
+    ids = zip(valve_frame_ids(machine), frames, strict=True)
+    last = [reader.update(Frame(0.0, can_id, frame.tobytes())) for can_id, frame in ids]
+    assert last == [False] * (len(last) - 1) + [True]
+    np.testing.assert_allclose(reader.u * 127, command, atol=1e-9)
+    assert reader.enable.all() and not reader.update(Frame(0.0, 0x211, bytes(7)))
+
+
+def test_linear_encoders__have_steps_in_nanometres_and_no_turns():
+    """CiA 406: object 0x6501 of a linear encoder is its measuring step in multiples of 1 nm."""
+    slide = replace(BROKK_170.joints[3], kind="prismatic", cylinder_base=0.0, encoder_step=2e-4)
+    slide = replace(slide, q_min=0.0, q_max=2.9, encoder_zero=100, encoder_sign=-1)
+    machine = replace(BROKK_170, joints=(*BROKK_170.joints[:3], slide, BROKK_170.joints[4]))
+    assert [encoder_resolution(joint) for joint in machine.joints[2:4]] == [4096, 200_000]
+    raw = encoder_raw(machine, [0, 0, 0, 12_345, 0])
+    assert raw[3] == 2**26 + 100 - 12_345
+    assert encoder_counts(machine, raw)[3] == 12_345  # three times 4096: a turn means nothing
+    nodes = Nodes(machine)
+    for position, frames in ((5, 1), (5 + 4096, 1), (2**26 - 1, 1), (3, 1)):
+        nodes.start_tick()
+        nodes.update(Frame(0.0, 0x184, position.to_bytes(4, "little")))
+        assert nodes.frames[3] == frames
+
+
 def test_update__counts_frames_and_those_that_only_the_program_may_send():
     nodes = Nodes(BROKK_170)
     for can_id, sent in (
@@ -187,6 +223,7 @@ def test_used_ids__are_those_that_the_loop_reads_or_sends():
     ids = used_ids(BROKK_170)
     assert {0x000, 0x080, 0x210, 0x181, 0x185, 0x581, 0x701, 0x710} <= set(ids)
     assert len(set(ids)) == len(ids) == 3 + 3 * 6
+    assert set(used_ids(SIX)) - set(ids) == {0x211, 0x186, 0x586, 0x706}
 
 
 def test_sdo__reads_small_objects_and_skips_foreign_answers(world):

@@ -3,13 +3,17 @@
 import io
 import os
 import re
+import struct
 
 import can
 import pytest
+from can.interfaces.socketcan.constants import CAN_EFF_FLAG
+from can.interfaces.socketcan.socketcan import pack_filters
 from helpers_bus import MULTICAST, own_multicast_port
 
-from brokk_min.can.canopen import Frame
+from brokk_min.can.canopen import Frame, used_ids
 from brokk_min.can.connection import Bus, has_real_time_priority, lock_memory, open_bus
+from brokk_min.machine import BROKK_170
 
 
 @pytest.fixture
@@ -125,6 +129,19 @@ def test_open_bus__keeps_frames_of_other_identifiers_away():
             other.send(can_id, b"")
         frames = [bus.recv(0.1) for _ in range(3)]
     assert [frame.id for frame in frames if frame] == [0x181, 0x710]
+
+
+def test_open_bus__gives_socketcan_filters_that_take_its_identifiers_alone():
+    """A frame passes if id & mask are those of one filter (CAN_RAW_FILTER of Linux)."""
+    ids = used_ids(BROKK_170)
+    with open_bus("virtual", "filtered", ids=ids) as bus:
+        filters = list(struct.iter_unpack("=II", pack_filters(bus.bus.filters)))
+
+    def passes(can_id):
+        return any(can_id & mask == wanted & mask for wanted, mask in filters)
+
+    assert [can_id for can_id in range(2048) if passes(can_id)] == sorted(ids)
+    assert not any(passes(can_id | CAN_EFF_FLAG) for can_id in ids)  # 29 bits
 
 
 def test_has_real_time_priority__is_what_the_kernel_says():

@@ -27,7 +27,7 @@ from brokk_min.can.drive_log import (
 )
 from brokk_min.machine import BROKK_170, estimate_velocity
 
-STEP = BROKK_170.encoder_step
+STEP = BROKK_170.encoder_step[0]
 
 
 def drive_logged(path, seconds=4.0):

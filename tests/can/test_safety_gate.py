@@ -18,7 +18,7 @@ from brokk_min.can.safety_gate import (
 )
 from brokk_min.machine import BROKK_170, decode_pwm
 
-STEP = BROKK_170.encoder_step
+STEP = BROKK_170.encoder_step[0]
 DT = 0.05
 DRIVEN = np.array([joint.driven for joint in BROKK_170.joints])
 
@@ -295,7 +295,8 @@ def test_gate__is_what_its_promises_say_in_any_leading_shape(machine, seed):
             type(part)(*(np.reshape(field, (*shape, *np.shape(field)[1:])) for field in part))
             for part in (cases.state, cases.inputs)
         ]
-        state, frame = gate(machine, *given, cases.now.reshape(shape))
+        state, frames = gate(machine, *given, cases.now.reshape(shape))
+        frame = frames[..., 0, :]
         assert frame.dtype == np.uint8 and frame.shape == (*shape, 8)
         frame = frame.reshape(3000, 8)
         np.testing.assert_array_equal(np.delete(frame, 6, axis=1), [f for _, f in cases.expected])
@@ -328,7 +329,7 @@ def test_gate__never_raises_and_closes_the_valves_on_nonsense():
         state = GateState(*map(spoil, cases.state))
         state = state._replace(counter=rng.integers(0, 256, 2000), sent=cases.state.sent)
         with np.errstate(all="ignore"):
-            _, frame = gate(BROKK_170, state, inputs, spoil(cases.now))
+            frame = gate(BROKK_170, state, inputs, spoil(cases.now))[1][:, 0]
         assert frame.dtype == np.uint8 and frame.shape == (2000, 8)
         m = np.rint(decode_pwm(frame[:, :5]) * 127)
         assert (np.abs(m) <= 80 * DRIVEN).all()

@@ -12,7 +12,14 @@ import numpy as np
 import pytest
 from helpers_bus import START, dictionary, eventually, recorded_rows, served
 
-from brokk_min.can.canopen import HEARTBEAT_PERIOD, WATCHDOG, Frame, encoder_raw, valve_frame
+from brokk_min.can.canopen import (
+    HEARTBEAT_PERIOD,
+    WATCHDOG,
+    Frame,
+    encoder_raw,
+    valve_frame,
+    valve_frames,
+)
 from brokk_min.can.simulated_machine import SimulatedMachine, simulate, start_pose
 from brokk_min.identification.logs import read_log
 from brokk_min.machine import BROKK_170
@@ -79,6 +86,29 @@ def test_receive__opens_valves_after_a_start_and_a_neutral_frame():
     assert machine.valves(4) == neutral and any(machine.valves(5, 50))
     machine.nmt_(1)  # to start what runs changes nothing
     assert machine.u.any() and machine.valves(6, 30)[0] == 30
+
+
+def test_receive__opens_valves_when_all_frames_of_a_tick_are_there():
+    """Six joints have two frames: one alone moves nothing, and a SYNC without it closes all."""
+    sixth = replace(BROKK_170.joints[4], name="q6", encoder_node=6)
+    six = replace(BROKK_170, joints=(*BROKK_170.joints, sixth), q_start=())
+    reasons = []
+    machine = SimulatedMachine(six, [*START, 1.0], 0.0, report=reasons.append)
+    machine.receive(Frame(0.0, 0x000, bytes([1, 0])))
+
+    def tick(counter, *counts, lost=None):
+        machine.receive(Frame(0.0, 0x080, b""))
+        for k, frame in enumerate(valve_frames(counts, counter, 1)):
+            if k != lost:
+                machine.receive(Frame(0.0, 0x210 + k, frame.tobytes()))
+        return np.rint(127 * machine.u).astype(int).tolist()
+
+    rest = [0] * 6
+    assert tick(7, *rest) == rest and machine.enabled
+    assert tick(8, 50, 0, 0, 0, -60, 70) == [50, 0, 0, 0, -60, 70]
+    assert tick(9, 20, 0, 0, 0, 0, 0, lost=1) == [50, 0, 0, 0, -60, 70]
+    assert tick(10, 20, 0, 0, 0, 0, 0) == rest
+    assert reasons == ["no valve frame between two SYNCs"]
 
 
 def watchdog(machine):

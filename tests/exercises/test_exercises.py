@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 import re
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -174,6 +176,8 @@ def test_exercise__as_handed_out_says_what_to_fill_in(
 ) -> None:
     if FILES[number].read_text().count("raise NotImplementedError") < len(SOLUTIONS[number]):
         pytest.skip("somebody works on it")
+    for words in (["check"], ["format", "--check"]):
+        assert not subprocess.run([sys.executable, "-m", "ruff", *words, FILES[number]]).returncode
     assert main([str(number)]) == 1
     name = next(iter(SOLUTIONS[number]))
     printed = capsys.readouterr().out

@@ -10,9 +10,11 @@ from helpers_cli import run
 
 from brokk_min.identification.inspection import (
     CLOSED_LOOP,
+    REACTS,
     check_signs,
     feedback,
     inspect,
+    reaction,
     warnings,
 )
 from brokk_min.identification.logs import Log, Recording, velocity_of, write_log
@@ -130,6 +132,26 @@ def test_feedback__tells_who_goes_between_places_from_an_excitation():
     closed = Recording("", np.array(u)[:, None], np.array(q[:-1])[:, None], np.zeros((6000, 1)))
     assert feedback([closed], 0, 20.0) < CLOSED_LOOP
     assert feedback([record("boom", holds(rng))], 0, 20.0) > CLOSED_LOOP
+
+
+def test_reaction__tells_a_controller_with_random_goals_from_an_excitation():
+    """A PI controller of the measured velocity of a joint; its goal changes every 3 s."""
+    rng = np.random.default_rng(3)
+    q, u, integral, q_dot = [0.0] * 4, [], 0.0, 0.0
+    for goal in np.repeat(rng.uniform(-0.2, 0.2, 60), 60):
+        error = goal - (q[-1] - q[-4]) / 0.15
+        integral += 0.05 * error
+        u.append(0.2 * np.sign(goal) + 0.5 * error + 2.0 * integral)
+        q_dot += 0.3 * (0.5 * u[-1] - q_dot) + 0.002 * rng.standard_normal()
+        q.append(q[-1] + 0.05 * q_dot)
+    angles = np.array(q[3:-1])[:, None]
+    closed = Recording("", np.array(u)[:, None], angles, velocity_of(angles, 4))
+    assert reaction([closed], 0) > 0.1 > REACTS
+    noisy = holds(rng) + 0.005 * rng.standard_normal(4000)
+    assert reaction([record("boom", noisy)], 0) < REACTS
+    two = Recording("", *(np.tile(x, 2) for x in closed[1:]))
+    log = Log(tuple(TRUE), (two,))
+    assert "commands follow the measured motion (7" in warnings(log, inspect(log))[-1]
 
 
 def test_warnings__know_the_range_of_a_machine():

@@ -8,7 +8,13 @@ import pytest
 from helpers_machines import random_net, shared_net, small_net
 
 from brokk_min.actuator import ActuatorNet
-from brokk_min.identification.net_file import fingerprint, load_net, save_net, select_nets
+from brokk_min.identification.net_file import (
+    fingerprint,
+    joint_nets,
+    load_net,
+    save_net,
+    select_nets,
+)
 from brokk_min.machine import BROKK_170
 
 
@@ -78,7 +84,7 @@ def test_fingerprint__differs_between_nets_and_survives_a_file(tmp_path):
     save_net(tmp_path / "net.npz", net)
     assert fingerprint(load_net(tmp_path / "net.npz")) == fingerprint(net)
     weights = (net.weights[0] + 1e-6, *net.weights[1:])
-    others = [net.select(["j1"]), replace(net, rate=25.0), replace(net, weights=weights)]
+    others = [joint_nets(net, ["j1"]), replace(net, rate=25.0), replace(net, weights=weights)]
     assert len({fingerprint(other) for other in (net, *others)}) == 4
 
 
@@ -90,7 +96,7 @@ def test_select_nets__refuses_nets_of_another_machine_rate_or_estimator():
         with pytest.raises(ValueError, match=f"actuator: expected nets for brokk170.*{value!r}"):
             select_nets(BROKK_170, replace(net, **{name: value}))
     with pytest.raises(ValueError, match=r"joints: expected nets for \['q1', 'q3', 'q4', 'q5'\]"):
-        select_nets(BROKK_170, net.select(["q1", "q3"]))
+        select_nets(BROKK_170, joint_nets(net, ["q1", "q3"]))
 
 
 def test_load_net__gives_nets_that_share_latents(tmp_path):
@@ -99,7 +105,7 @@ def test_load_net__gives_nets_that_share_latents(tmp_path):
     loaded = load_net(tmp_path / "net.npz")
     history = np.random.default_rng(2).uniform(-1, 1, (6, 3, 3, 13)).astype(np.float32)
     np.testing.assert_array_equal(loaded.predict(history), net.predict(history))
-    assert len(loaded.select(["j0", "j2"]).weights) == 8
+    assert len(joint_nets(loaded, ["j0", "j2"]).weights) == 8
     with np.load(tmp_path / "net.npz") as file:
         arrays = dict(file)
     assert json.loads(str(arrays["header"]))["format"] == 2  # older programs refuse it

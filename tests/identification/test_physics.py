@@ -129,7 +129,7 @@ def test_backlash__is_what_the_encoder_lags_behind():
     for u in constant(0.4, 2):
         state = transition(machine, None, state, u)
     late = state.q[2] - state.history[2, 0, -1]
-    assert late == pytest.approx(0.005, abs=machine.encoder_step)
+    assert late == pytest.approx(0.005, abs=machine.encoder_step[0])
 
 
 def test_oil__is_slow_when_cold_and_warms_with_work():

@@ -33,6 +33,7 @@ from brokk_min.actuator import (
     plant_step,
     smooth_angles,
 )
+from brokk_min.identification.net_file import joint_nets
 from brokk_min.machine import BROKK_170, Machine
 
 FAST = replace(BROKK_170, rate=200.0)  # a tick is one step of 5 ms
@@ -378,16 +379,16 @@ def test_predict__holds_joints_under_commands_within_the_dead_zone():
     np.testing.assert_allclose(net.predict(history), 0.2, atol=1e-6)  # these know none
 
 
-def test_select__gives_the_same_nets_in_another_order():
+def test_joint_nets__are_the_same_nets_in_another_order():
     net = random_net()
     history = np.random.default_rng(2).uniform(-1, 1, (6, 3, 3, 13)).astype(np.float32)
     every = net.predict(history)  # before: a cache of the whole must not leak into the part
-    part = net.select(["j2", "j0"])
+    part = joint_nets(net, ["j2", "j0"])
     assert part.joints == ("j2", "j0")
     np.testing.assert_allclose(part.predict(history[:, [2, 0]]), every[:, [2, 0]], atol=1e-6)
     assert part.output_low.tolist() == net.output_low[[2, 0]].tolist()
     with pytest.raises(ValueError, match=r"joints: expected nets for \['j0', 'q9'\], got"):
-        net.select(["j0", "q9"])
+        joint_nets(net, ["j0", "q9"])
 
 
 def test_latents__are_of_all_joints_by_hand():

@@ -306,7 +306,7 @@ def test_update_history__measures_the_tool_by_the_newest_samples():
 def test_initial_state__is_at_rest_at_the_measured_pose():
     state = initial_state(BROKK_170, np.stack([POSE, POSE]), [0.1, 0.0, 0.2], plant=True)
     assert state.q.dtype == np.float64 and state.history.dtype == np.float32
-    counts = state.history[:, :, 0] / BROKK_170.encoder_step
+    counts = state.history[:, :, 0] / BROKK_170.encoder_step[:, None]
     np.testing.assert_allclose(counts, np.rint(counts), atol=1e-3)
     np.testing.assert_allclose(state.true_history[0, :, 0, -1], POSE[DRIVEN], rtol=1e-6)
     assert not state.history[:, :, 1:].any() and not state.true_history[:, :, 1:].any()

@@ -107,7 +107,9 @@ def product_of_exponentials(machine: Machine, q: np.ndarray) -> np.ndarray:
     result = [np.eye(4)]
     for joint, angle in zip(machine.joints, q, strict=True):
         axis = home[:3, :3] @ z
-        moved = moved @ expm(angle * twist(axis, np.cross(home[:3, 3], axis)))
+        screw = twist(axis, np.cross(home[:3, 3], axis))
+        slide = twist(np.zeros(3), axis)
+        moved = moved @ expm(angle * (screw if joint.kind == "revolute" else slide))
         home = home @ expm(twist(z * joint.theta, z * joint.d))
         home = home @ expm(twist(x * joint.alpha, x * joint.a))
         result.append(moved @ home)

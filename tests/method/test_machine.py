@@ -56,19 +56,20 @@ BAD = [
     ({"joints": ()}, ["joints", "at least one", "none"]),
     ({"joints": LOCKED}, ["joints", "driven", "none"]),
     (with_joint(1, name="q1"), ["joints", "different names", "['q1', 'q1', 'q3', 'q4', 'q5']"]),
-    (with_joint(1, encoder_node=1), ["joints", "different encoder nodes", "[1, 1, 3, 4, 5]"]),
+    (with_joint(1, encoder_node=1), ["joints", "different CANopen nodes", "[1, 1, 3, 4, 5, 16]"]),
     (with_joint(3, q_max=0.6), ["q4.q_max", "above 0.6", "got 0.6"]),
     (with_joint(4, cylinder_angle=0.0), ["q5.cylinder_angle", "(0, pi)", "0.000 to 2.000"]),
     (with_joint(4, q_max=np.pi - 0.4), ["q5.cylinder_angle", "(0, pi)", "0.400 to 3.142"]),
+    (with_joint(0, kind="prismatic", cylinder_base=0.1), ["q1.cylinder_angle", "revolute", "got"]),
+    (with_joint(0, kind="linear"), ["q1.kind", "('revolute', 'prismatic')", "'linear'"]),
     (with_joint(4, encoder_sign=0), ["q5.encoder_sign", "(-1, 1)", "got 0"]),
-    (with_joint(3, kind="prismatic"), ["q4.kind", "expected one of", "got 'prismatic'"]),
     ({"dead_zone": 80 / 127}, ["dead_zone", "below 80/127", "got 0.629"]),
     ({"dead_zone": 0.125, "pwm_limit": 10}, ["dead_zone", "below 10/127", "got 0.125"]),
     ({"largest_dead_zone": 0.63}, ["dead_zone", "below 80/127", "got 0.63"]),
     ({"plant_dt": 0.03}, ["plant_dt", "a part of 0.05 s", "got 0.03"]),
     ({"plant_dt": 1.0, "rate": 1e7}, ["plant_dt", "a part of 1e-07 s", "got 1.0"]),
     ({"q_start": (0.0, 1.0)}, ["q_start", "5 angles or none", "(0.0, 1.0)"]),
-    ({"controller_node": 3}, ["controller_node", "none of [1, 2, 3, 4, 5]", "got 3"]),
+    ({"controller_node": 3}, ["joints", "different CANopen nodes", "[1, 2, 3, 4, 5, 3]"]),
 ]
 
 
@@ -93,6 +94,8 @@ OUTSIDE = {  # numbers beyond the ends of the range of each field
     **dict.fromkeys(("dead_zone", "largest_dead_zone", "valve_threshold"), (-0.01, 1.0)),
     "spool_threshold": (-0.1, 1.1),
     "plant_dt": (0.0, 1.1),
+    "encoder_step": (0.0, 1.1),
+    "weight": (0.0, 1.1e9),
     "encoder_bits": (0, 33),
     "velocity_samples": (1, 101),
     "history": (1, 1001),
@@ -171,6 +174,17 @@ def test_a_machine_without_hydraulics__moves_as_fast_as_its_joints_say():
         np.testing.assert_allclose((state.q - last.q) * machine.rate, q_dot, rtol=1e-3)
 
 
+def test_prismatic_joints__have_encoders_of_their_own_in_metres():
+    slides = {"kind": "prismatic", "cylinder_base": 0.0, "encoder_step": 2e-4}
+    machine = changed(joint=(3, slides))
+    turning = 2 * np.pi / 4096
+    np.testing.assert_allclose(machine.encoder_step, [turning] * 3 + [2e-4, turning], rtol=1e-15)
+    finer = replace(machine, encoder_bits=13)
+    np.testing.assert_allclose(finer.encoder_step[[0, 3]], [turning / 2, 2e-4], rtol=1e-15)
+    measured = read_encoder(machine, np.full(5, 0.12345))
+    assert measured[3] == pytest.approx(0.1234, abs=1e-9) and measured[3] != measured[0]
+
+
 def test_the_brokk_has_the_numbers_of_the_paper_and_the_design():
     m = BROKK_170
     assert (m.rate, m.dt, m.pwm_limit, m.dead_zone, m.history) == (20.0, 0.05, 80, 0.07, 13)
@@ -178,8 +192,8 @@ def test_the_brokk_has_the_numbers_of_the_paper_and_the_design():
     assert m.driven.tolist() == [0, 2, 3, 4] and m.locked.tolist() == [1]
     assert m.column("q_min").tolist() == [-2.14, 0.0, -0.3, 0.6, 0.0]
     assert m.column("q_max").tolist() == [2.14, 1.4, 1.6, 2.9, 2.0]
-    assert m.encoder_step == pytest.approx(1.534e-3, abs=5e-7)  # 12 bits
-    assert m.encoder_step * m.rate == pytest.approx(0.031, abs=5e-4)  # one count over one tick
+    assert m.encoder_step == pytest.approx(np.full(5, 1.534e-3), abs=5e-7)  # 12 bits
+    assert m.encoder_step[0] * m.rate == pytest.approx(0.031, abs=5e-4)  # one count over one tick
 
 
 @given(machines())
@@ -305,7 +319,7 @@ def test_whole_numbers_are_commands_and_angles_too():
     """[1, -1] is full command both ways; that it came as integers must not make it zero."""
     np.testing.assert_allclose(limit_command(BROKK_170, [1, -1, 0]) * 127, [80, -80, 0])
     np.testing.assert_array_equal(
-        read_encoder(BROKK_170, [1, 2]), read_encoder(BROKK_170, [1.0, 2.0])
+        read_encoder(BROKK_170, [1, 2, 0, 1, 1]), read_encoder(BROKK_170, [1.0, 2.0, 0, 1, 1])
     )
     slope = estimate_velocity([0, 3, 6, 9], samples=4, dt=0.07)
     assert slope == pytest.approx(3 / 0.07)
@@ -324,7 +338,9 @@ def test_valve_opening__by_hand():
 @given(posed())
 def test_encoders_report_the_nearest_count(machine_and_pose):
     machine, q = machine_and_pose
-    step = 2 * np.pi / 2**machine.encoder_bits
+    turning = 2 * np.pi / 2**machine.encoder_bits
+    steps = [turning if j.kind == "revolute" else j.encoder_step for j in machine.joints]
+    step = np.array(steps)
     measured = read_encoder(machine, q)
     counts = measured / step
     np.testing.assert_allclose(counts, np.rint(counts), atol=1e-7)
@@ -335,9 +351,8 @@ def test_encoders_report_the_nearest_count(machine_and_pose):
 
 def test_encoder_by_hand():
     # 1 rad = 651.9 counts of 1.53398 mrad
-    assert read_encoder(BROKK_170, np.array(1.0)) == pytest.approx(652 * 2 * np.pi / 4096)
-    assert read_encoder(BROKK_170, np.array(-0.0007)) == 0.0
-    assert read_encoder(BROKK_170, np.array(-0.0008)) == pytest.approx(-0.00153398, rel=1e-5)
+    q = read_encoder(BROKK_170, [1.0, -0.0007, -0.0008, 0.0, 0.0])
+    np.testing.assert_allclose(q, [652 * 2 * np.pi / 4096, 0, -0.00153398, 0, 0], rtol=1e-5)
 
 
 @given(
@@ -361,7 +376,7 @@ def test_velocity_is_the_least_squares_slope_and_forgets_what_is_older(case):
 
 def test_velocity_by_hand():
     # newest of four samples moved one count: 1.5 / 5 counts a tick; two samples: one count a tick
-    step = BROKK_170.encoder_step
+    step = BROKK_170.encoder_step[0]
     q = np.array([0.0, 0.0, 0.0, step])
     assert estimate_velocity(q, 4, 0.05) == pytest.approx(0.3 * step / 0.05)
     assert estimate_velocity(q, 2, 0.05) == pytest.approx(0.0307, abs=1e-4)

@@ -1,5 +1,7 @@
 """Kinematics of any machine: derivatives, rotations, symmetries, batches."""
 
+from dataclasses import replace
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -39,17 +41,18 @@ def test_tool_velocity__is_the_derivative_along_the_motion(case):
 
 @given(posed())
 def test_forward_kinematics__neighbouring_frames_are_one_dh_row_apart(case):
-    """|p_i - p_{i-1}|^2 = a^2 + d^2; the axes enclose alpha; the offset along the old axis is d."""
+    """|p_i - p_{i-1}|^2 = a^2 + d^2; the axes enclose alpha; the offset along the old axis is d.
+
+    q is added to d where a joint is prismatic.
+    """
     machine, q = case
-    p, z = forward_kinematics(machine, q)
+    p, z, prismatic = forward_kinematics(machine, q)
     link = p[..., 1:, :] - p[..., :-1, :]
-    a, d = machine.column("a"), machine.column("d")
-    np.testing.assert_allclose(
-        np.sum(link**2, -1), np.broadcast_to(a**2 + d**2, q.shape), atol=1e-12
-    )
-    np.testing.assert_allclose(
-        np.sum(link * z[..., :-1, :], -1), np.broadcast_to(d, q.shape), atol=1e-12
-    )
+    slides = np.array([joint.kind == "prismatic" for joint in machine.joints])
+    assert prismatic == np.flatnonzero(slides).tolist()
+    a, d = machine.column("a"), machine.column("d") + slides * q
+    np.testing.assert_allclose(np.sum(link**2, -1), a**2 + d**2, atol=1e-11)
+    np.testing.assert_allclose(np.sum(link * z[..., :-1, :], -1), d, atol=1e-12)
     cosine = np.sum(z[..., 1:, :] * z[..., :-1, :], -1)
     alpha = np.broadcast_to(machine.column("alpha"), q.shape)
     np.testing.assert_allclose(cosine, np.cos(alpha), atol=1e-12)
@@ -58,9 +61,11 @@ def test_forward_kinematics__neighbouring_frames_are_one_dh_row_apart(case):
 
 @given(posed(), reals(-3, 3))
 def test_forward_kinematics__turns_with_the_first_joint(case, angle):
-    """Turning the first joint turns the tool about z and leaves heights and headings alone."""
+    """Turning the base turns the tool about z and leaves heights and headings alone."""
     machine, q = case
-    turned = forward_kinematics(machine, q + angle * np.eye(machine.n)[0])
+    first, *others = machine.joints
+    base = replace(machine, joints=(replace(first, theta=first.theta + angle), *others))
+    turned = forward_kinematics(base, q)
     still = forward_kinematics(machine, q)
     c, s = np.cos(angle), np.sin(angle)
     Rz = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
