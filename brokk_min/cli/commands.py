@@ -3,6 +3,7 @@
 What trains or draws is imported by the command that runs it: help must not wait for it.
 """
 
+import math
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -36,7 +37,7 @@ from brokk_min.cli.settings import (
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation import baselines, metrics, perfect_model, sequences
 from brokk_min.evaluation.claims import VERDICTS
-from brokk_min.evaluation.rollout import Controller, own_drives
+from brokk_min.evaluation.rollout import TITLES, Controller, own_drives
 from brokk_min.identification import excitation, inspection, validation
 from brokk_min.identification.coupling import history_of
 from brokk_min.identification.files import SHIPPED, brief, located, write_json
@@ -353,6 +354,7 @@ class Evaluate(Command):
             write_json(self.json, {"meta": meta, "runs": runs})
         runs.sort(key=lambda run: sequences.KINDS.index(run["kind"]))  # those that count first
         print_table(runs, len(commands), COLUMNS)
+        print_answer(runs)
         for kind in sequences.KINDS if self.all else ():
             of_kind = [run for run in runs if run["kind"] == kind]
             if of_kind:
@@ -396,6 +398,18 @@ def print_table(runs: list[dict[str, Any]], sequences: int, keys: Iterable[str])
             text = "none" if mean is None else form.format(mean)
             cells.append(text.rjust(len(head)))
         print(f"{name:30} " + " ".join(cells))
+
+
+def print_answer(runs: list[dict[str, Any]]) -> None:
+    """By how much our policy is better than the PIDs that close the valves at rest, as it does."""
+    summary = metrics.summary([run for run in runs if run["kind"] == runs[0]["kind"]])
+    error = {name: rows["all"]["velocity_error_mean"] or math.nan for name, rows in summary.items()}
+    closed = {name: x for name, x in error.items() if "jacobian" in name and "awake" not in name}
+    for name in dict.fromkeys(["jacobian_pid_k0.1", min(closed, key=closed.__getitem__)]):
+        less = 1 - error["rl"] / closed[name]
+        side = "less" if less > 0 else "more"
+        print(f"rl has {abs(less):.0%} {side} error than {name}: {TITLES[name]}")
+    print("rl_paper: the paper's learner; _open, _awake: the valves stay open while the tool rests")
 
 
 CHAIN = {  # files of `reproduce`
