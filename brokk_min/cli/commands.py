@@ -401,12 +401,12 @@ def print_table(runs: list[dict[str, Any]], sequences: int, keys: Iterable[str])
 
 
 def print_answer(runs: list[dict[str, Any]]) -> None:
-    """By how much our policy is better than the PIDs that close the valves at rest, as it does."""
+    """By how much the policy is better than the paper's PID and than the best one."""
     summary = metrics.summary([run for run in runs if run["kind"] == runs[0]["kind"]])
     error = {name: rows["all"]["velocity_error_mean"] or math.nan for name, rows in summary.items()}
-    closed = {name: x for name, x in error.items() if "jacobian" in name and "awake" not in name}
-    for name in dict.fromkeys(["jacobian_pid_k0.1", min(closed, key=closed.__getitem__)]):
-        less = 1 - error["rl"] / closed[name]
+    best = min((name for name in error if "jacobian" in name), key=error.__getitem__)
+    for name in dict.fromkeys(["jacobian_pid_k0.1", best]):
+        less = 1 - error["rl"] / error[name]
         side = "less" if less > 0 else "more"
         print(f"rl has {abs(less):.0%} {side} error than {name}: {TITLES[name]}")
     print("rl_paper: the paper's learner; _open, _awake: the valves stay open while the tool rests")
