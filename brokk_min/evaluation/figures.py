@@ -94,8 +94,7 @@ def plot_panels(
                 ax.set_title(panel.title, fontsize="medium")
             else:
                 place: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0)}
-                place["ncol"] = 2 if len(row) > 2 else 4
-                ax.legend(title=panel.title, frameon=False, **place)
+                ax.legend(title=panel.title, frameon=False, ncol=2, **place)
         for ax in axes[len(row) :]:
             ax.remove()
     if one_legend:
