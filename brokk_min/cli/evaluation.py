@@ -3,6 +3,7 @@
 What trains or draws is imported by the command that runs it: help must not wait for it.
 """
 
+import math
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from brokk_min.cli.options import Command, PlantName, WrongUse, default_policy, 
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation import baselines, metrics, perfect_model, sequences
 from brokk_min.evaluation.claims import VERDICTS
-from brokk_min.evaluation.rollout import Controller
+from brokk_min.evaluation.rollout import TITLES, Controller
 from brokk_min.identification.files import SHIPPED, located, write_json
 from brokk_min.identification.net_file import load_net
 from brokk_min.learning.policy import POLICIES, Policy, PolicyController, load_policy
@@ -84,6 +85,7 @@ class Evaluate(Command):
             write_json(self.json, {"meta": meta, "runs": runs})
         runs.sort(key=lambda run: sequences.KINDS.index(run["kind"]))  # those that count first
         print_table(runs, len(commands), COLUMNS)
+        print_answer(runs)
         for kind in sequences.KINDS if self.all else ():
             of_kind = [run for run in runs if run["kind"] == kind]
             if of_kind:
@@ -127,6 +129,18 @@ def print_table(runs: list[dict[str, Any]], sequences: int, keys: Iterable[str])
             text = "none" if mean is None else form.format(mean)
             cells.append(text.rjust(len(head)))
         print(f"{name:30} " + " ".join(cells))
+
+
+def print_answer(runs: list[dict[str, Any]]) -> None:
+    """By how much the policy is better than the paper's PID and than the best one."""
+    summary = metrics.summary([run for run in runs if run["kind"] == runs[0]["kind"]])
+    error = {name: rows["all"]["velocity_error_mean"] or math.nan for name, rows in summary.items()}
+    best = min((name for name in error if "jacobian" in name), key=error.__getitem__)
+    for name in dict.fromkeys(["jacobian_pid_k0.1", best]):
+        less = 1 - error["rl"] / error[name]
+        side = "less" if less > 0 else "more"
+        print(f"rl has {abs(less):.0%} {side} error than {name}: {TITLES[name]}")
+    print("rl_paper: the paper's learner; _open, _awake: the valves stay open while the tool rests")
 
 
 CHAIN = {  # files of `reproduce`

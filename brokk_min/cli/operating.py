@@ -26,7 +26,7 @@ from brokk_min.identification.logs import write_log
 from brokk_min.kinematics import UNITS
 from brokk_min.learning.onnx import export_onnx
 from brokk_min.learning.policy import Policy, PolicyController, load_policy
-from brokk_min.machine import Machine, number
+from brokk_min.machine import PWM_MAX, Machine, number
 from brokk_min.viewer import control_process, drawing, play, replay, rerun_log
 
 if TYPE_CHECKING:
@@ -57,8 +57,8 @@ class Drive(Command):
     channel: str = ""  # Channel of the interface: can0, 239.74.163.2, ...
     command: str = "joystick"  # Or velocity sequences, CSV: sequence,time,vx,vy,vz [s, m/s].
     controller: Literal["rl", "jacobian", "jog"] = "rl"  # Policy, baseline (k = 0.1), one joint.
-    joint: str = "q1"  # Joint that jogs, forward and backward with x.
-    counts: int = number("counts", 1, 127, 12)  # Its command, of 127.
+    joint: str = ""  # Joint that jogs, forward and backward with x; by default the first driven.
+    counts: int = number("counts", 0, 127, 0)  # Its command, of 127; 0: 3 beyond the dead zone.
     gains: Path | None = None  # Tuned gains; by default gains.json in the folder of POLICY.
     axes: tuple[int, int, int] = (1, 0, 4)  # Axes of the joystick for x, y and z.
     button: int = 5  # Button of the joystick that must be held.
@@ -91,9 +91,11 @@ class Drive(Command):
     def _controller(self, machine: Machine) -> Controller:
         if self.controller == "jog":
             driven = [machine.names[i] for i in machine.driven]
-            if self.joint not in driven:
-                raise WrongUse(f"--joint: expected a driven one of {driven}, got {self.joint}")
-            return JointJog(machine, self.joint, self.counts)
+            joint = self.joint or driven[0]
+            if joint not in driven:
+                raise WrongUse(f"--joint: expected a driven one of {driven}, got {joint}")
+            counts = self.counts or int(np.ceil(machine.dead_zone * PWM_MAX)) + 3
+            return JointJog(machine, joint, counts)
         if not self.policy:
             raise WrongUse("--policy: expected a policy that `train` wrote, got none")
         policy = load_policy(self.policy, machine)

@@ -1,6 +1,6 @@
 """Figures: one style, units on every axis.
 
-Controllers differ in brightness, dashes and markers: for grey prints and for the colour-blind.
+Controllers differ in brightness, dashes, markers and hatches: for grey prints and the colour-blind.
 """
 
 import io
@@ -17,6 +17,7 @@ from numpy.linalg import norm
 from brokk_min.actuator import ActuatorNet
 from brokk_min.evaluation.metrics import AFTER_STOP, Mean, Traces
 from brokk_min.evaluation.preliminary import Motion, SimulatorTests
+from brokk_min.evaluation.rollout import TITLES
 from brokk_min.evaluation.sequences import AXES, Commands, hold_table
 from brokk_min.identification.files import whole_file
 from brokk_min.identification.formats import read_table
@@ -27,6 +28,7 @@ from brokk_min.kinematics import UNITS, forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
 
 matplotlib.rcParams.update({"axes.grid": True, "grid.alpha": 0.3, "axes.axisbelow": True})
+matplotlib.rcParams["hatch.linewidth"] = 0.4
 WIDTH = 10.0  # inch, of every figure: letters have one size in the report
 DPI = 150
 FREE_RUN_S = 30.0  # s, as in the paper
@@ -48,6 +50,9 @@ STYLES: dict[str, dict[str, Any]] = {
     "extended": {"color": "#f0b84a"},
 }
 MARKERS = dict(zip(STYLES, ".osD^v<>PX*", strict=False))
+PATTERNS = ("", "", "///", "xxx", "\\\\\\", "---", "...", "|||", "+++", "ooo", "OO")
+HATCHES = dict(zip(STYLES, PATTERNS, strict=False))
+SAMPLE = ("rl", "rl_paper", "jacobian_pid_k0.1", "jacobian_pid_k0.05")  # of single paths
 OTHER_STYLES: list[dict[str, Any]] = [
     {"color": "#08306b"},
     {"color": "#d9661a", "linestyle": "--"},
@@ -84,14 +89,13 @@ def plot_panels(
                 if y.ndim == 2:
                     low, y, high = np.percentile(y, [10, 50, 90], axis=1)
                     ax.fill_between(x, low, high, color=style["color"], alpha=0.2, linewidth=0)
-                ax.plot(x, y, label=label, linewidth=1.1, **style)
+                ax.plot(x, y, label=TITLES.get(label, label), linewidth=1.1, **style)
             ax.set(xlabel=panel.xlabel, ylabel=panel.ylabel)
             if one_legend:
                 ax.set_title(panel.title, fontsize="medium")
             else:
                 place: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0)}
-                place["ncol"] = 2 if len(row) > 2 else 4
-                ax.legend(title=panel.title, frameon=False, **place)
+                ax.legend(title=panel.title, frameon=False, ncol=2, **place)
         for ax in axes[len(row) :]:
             ax.remove()
     if one_legend:
@@ -102,7 +106,8 @@ def plot_panels(
 def _add_legend(figure: Figure) -> None:
     handles, labels = figure.axes[0].get_legend_handles_labels()
     by_label = dict(zip(labels, handles, strict=True))
-    figure.legend(by_label.values(), by_label.keys(), loc="outside upper center", ncol=4)
+    columns = 3 if len(by_label) > 4 else 4
+    figure.legend(by_label.values(), by_label.keys(), loc="outside upper center", ncol=columns)
 
 
 def _time_panels(dt: float, labels: Sequence[str], curves: Mapping[str, Array]) -> list[Panel]:
@@ -141,7 +146,7 @@ def plot_gap(machine: Machine, gap: Motion) -> Figure:
         labels = {f"{name} [{unit}/s]": velocity, f"{name} [m{unit}]": 1000 * position}
         row = []
         for label, values in labels.items():
-            curves = {"all runs": (time, values), "first run": (time, values[:, 0])}
+            curves = {"median of all runs": (time, values), "first run": (time, values[:, 0])}
             row.append(Panel("", "time [s]", label, curves))
         panels.append(row)
     return plot_panels(panels)
@@ -219,14 +224,14 @@ def plot_starts(machine: Machine, starts: Array, kinds: Sequence[str]) -> Figure
 def plot_sequence(
     machine: Machine, traces: Traces, sequence: Commands, start: Array, run: int
 ) -> Figure:
-    """Tool position and velocity along x, y, z of all controllers in one run. Paper: Fig. 6"""
+    """Tool position and velocity along x, y, z of `SAMPLE` in one run. Paper: Fig. 6"""
     starts = np.tile(start, (run + 1, 1))
     goals = sequence.for_starts(machine, starts)[:, run]
     p_start = tool_position(forward_kinematics(machine, start))
     positions = {"goal": machine.dt * np.cumsum(goals, axis=0)}
     velocities = {"goal": goals}
     for (controller, name), trace in traces.items():
-        if name == sequence.name:
+        if name == sequence.name and controller in SAMPLE:
             positions[controller] = trace.p_tool[:, run] - p_start
             velocities[controller] = trace.v_tool[:, run]
     above = _time_panels(machine.dt, [f"{axis} - {axis}(0) [m]" for axis in AXES], positions)
@@ -235,11 +240,11 @@ def plot_sequence(
 
 
 def plot_joint_velocities(machine: Machine, traces: Traces, sequence: str, run: int) -> Figure:
-    """Velocity of the driven joints of all controllers in one run. Paper: Fig. 6d"""
+    """Velocity of the driven joints of `SAMPLE` in one run. Paper: Fig. 6d"""
     labels = [f"velocity {machine.names[i]} [rad/s]" for i in machine.driven]
     curves = {}
     for (controller, name), trace in traces.items():
-        if name == sequence:
+        if name == sequence and controller in SAMPLE:
             curves[controller] = trace.q_dot[:, run, machine.driven]
     panels = _time_panels(machine.dt, labels, curves)
     return plot_panels([panels[i : i + 2] for i in range(0, len(panels), 2)])
@@ -290,20 +295,18 @@ def plot_intervals(panels: Mapping[str, Rows]) -> Figure:
     figure = Figure(figsize=(WIDTH, len(rows) * (0.15 + 0.09 * most) + 1.0), layout="constrained")
     grid = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
     for ax, (xlabel, of_rows) in zip(grid, panels.items(), strict=True):
+        ax.use_sticky_edges = False  # a margin left of the bars
         for i, row in enumerate(of_rows.values()):
             for k, (name, number) in enumerate(row.items()):
                 y = i + 0.8 * ((k + 0.5) / len(row) - 0.5)
                 mean, low, high = (np.array(number[key], float) for key in ("mean", "low", "high"))
-                style = {"color": STYLES[name]["color"], "marker": MARKERS[name]}
-                style |= {
-                    "markeredgecolor": "black",
-                    "linestyle": "",
-                    "elinewidth": 5,
-                    "markersize": 4,
-                }
-                error = np.array([[mean - low], [high - mean]])
-                ax.errorbar(mean, y, xerr=error, label=name, **style)
-        ax.set_yticks(range(len(rows)), rows)
+                color, height = STYLES[name]["color"], 0.6 / len(row)
+                bar = {"color": color, "hatch": 2 * HATCHES[name], "edgecolor": "white"}
+                ax.barh(y, high - low, height, low, linewidth=0, **bar)
+                mark = {"color": color, "marker": MARKERS[name], "markeredgecolor": "black"}
+                title = TITLES.get(name, name)
+                ax.plot(mean, y, label=title, linestyle="", markersize=5, **mark)
+        ax.set_yticks(range(len(rows)), [TITLES.get(row, row) for row in rows])
         ax.set(xlabel=xlabel, ylim=(len(rows) - 0.5, -0.5))
         means = [number["mean"] or np.nan for row in of_rows.values() for number in row.values()]
         if np.nanmax(means) > 8 * np.nanmin(means) > 0:

@@ -19,7 +19,7 @@ from brokk_min.evaluation.claims import VERDICTS, training_claim
 from brokk_min.evaluation.figures import Rows
 from brokk_min.evaluation.metrics import Mean, Traces, mean_interval
 from brokk_min.evaluation.preliminary import Preliminary
-from brokk_min.evaluation.rollout import Trace
+from brokk_min.evaluation.rollout import TITLES, Trace
 from brokk_min.evaluation.sequences import (
     axis_sequences,
     hold_table,
@@ -56,6 +56,7 @@ FIRST = {  # figures of the first screen: names in seeds.json, in results, in a 
 NONE: Mean = {"mean": None, "low": None, "high": None}
 SEEDS = {"ours closed": "rl", "ours open": "rl_open", "paper": "rl_paper"}  # names there
 SEEDS |= {"paper closed": "rl_paper"}
+PID = "jacobian_pid_k0.1"  # what the first sentences compare with
 
 
 class Shown(NamedTuple):
@@ -126,7 +127,9 @@ def first_panels(machine: Machine, results: Results) -> dict[str, Rows]:
         rows: dict[str, dict[str, Mean]] = {}
         for of in dict.fromkeys(row["controller"] for row in seeds):
             values = np.array([row[name] for row in seeds if row["controller"] == of], float)
-            rows[f"{of}, {len(values)} seeds"] = {SEEDS.get(of, of): mean_interval(values)}
+            code = SEEDS.get(of, of)
+            title = TITLES.get(code, code) + " (closed)" * (of == "paper closed")
+            rows[f"{title}, {len(values)} seeds"] = {code: mean_interval(values)}
         if results["training_seeds"]:
             rows["rl, swept seeds"] = {"rl": results["training_seeds"]["rl"].get(key_swept, NONE)}
         for controller, of_sequence in with_intervals(results, key).items():
@@ -173,6 +176,8 @@ def render(
     return page.get_template("report.html.j2").render(
         results=results,
         compared=compare(results),
+        titles=TITLES,
+        less=less_than(results["task_space"]["summary"], PID),
         seeds=[row for row in rows if "seeds" in row],
         minutes=sum(clock.get(stage, 0) for stage in STAGES) / 60,
         date=date.today().isoformat(),
@@ -186,6 +191,12 @@ def render(
         sequences=sequences,
         tuning_paths=[path_row(np.array(run["goals"])) for run in results["tuning_runs"]],
     )
+
+
+def less_than(summary: Mapping[str, Any], other: str) -> dict[str, float]:
+    """How much less our policy's figures of the first screen are than another's, as fractions."""
+    ours, theirs = summary["rl"]["all"], summary[other]["all"]
+    return {name: 1 - ours[key] / theirs[key] for name, (_, key, _) in FIRST.items()}
 
 
 def compare(results: Results) -> dict[str, list[str]]:

@@ -15,6 +15,22 @@ from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocit
 from brokk_min.learning.episodes import draw_noise
 from brokk_min.machine import Array, Machine, read_encoder
 
+TITLES = {  # of controllers in tables, figures and windows, by their names in files
+    "rl": "RL policy",
+    "rl_open": "RL policy (open)",
+    "rl_paper": "the paper's learner",
+    "jacobian": "PID with DLS (the paper's)",
+    "jacobian_pid_k0.1": "PID with DLS (the paper's)",
+    "jacobian_pid_k0.05": "the paper's PID, k = 0.05",
+    "jacobian_pid_ff": "PID + feed-forward",
+    "jacobian_pid_ff_awake": "PID + feed-forward (open)",
+    "jacobian_pid_ff_integral": "PID + feed-forward + integral",
+    "jacobian_pid_ff_integral_awake": "PID + feed-forward + integral (open)",
+    "perfect_model": "perfect model (open)",
+    "perfect_model_closed": "perfect model",
+    "levers": "levers, joint by joint",
+}
+
 
 class Controller(Protocol):
     """What can drive a machine: a policy, the PIDs, an operator."""

@@ -164,7 +164,7 @@ def load_factor(load: Array, s: Array) -> Array:
 def asymmetric_opening(u: Array, zones: Array) -> Array:
     """`valve_opening` with dead zones up and down by joint: u (..., n), zones (n, 2)."""
     up, down = zones.T
-    return np.maximum(u - up, 0) / (1 - up) - np.maximum(-u - down, 0) / (1 - down)
+    return np.asarray(np.maximum(u - up, 0) / (1 - up) - np.maximum(-u - down, 0) / (1 - down))
 
 
 def dead_zones(physics: Physics, machine: Machine) -> Array:

@@ -35,16 +35,6 @@ GOAL = INK
 MEASURED = (0, 158, 115)
 PATH = (230, 159, 0)
 COLOURS = {"rl": (0, 114, 178), "jacobian": (213, 94, 0), "levers": (124, 87, 148)}
-TITLES = {
-    "rl": "RL policy",
-    "jacobian": "PID with DLS (the paper's)",
-    "levers": "levers, joint by joint",
-    "jacobian_pid_k0.1": "PID with DLS (the paper's)",
-    "jacobian_pid_ff": "PID with DLS and feed-forward",
-    "jacobian_pid_ff_awake": "the same, valves kept open",
-    "jacobian_pid_ff_integral": "PID with DLS, feed-forward and integral",
-    "jacobian_pid_ff_integral_awake": "the same, valves kept open",
-}
 
 
 class Trace(NamedTuple):

@@ -18,7 +18,7 @@ import numpy as np
 from brokk_min.can.connection import open_bus
 from brokk_min.can.drive_log import Telemetry, TelemetryReader
 from brokk_min.can.simulated_machine import start_pose
-from brokk_min.evaluation.rollout import Controller
+from brokk_min.evaluation.rollout import TITLES, Controller
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
 from brokk_min.viewer import control_process, drawing, tracing
@@ -138,7 +138,7 @@ class Session:
             telemetry.v_goal,
             trail=np.array(self.trail).reshape(-1, 3),
             path=self.path,
-            title=drawing.TITLES.get(mode, self.machine.name),
+            title=TITLES.get(mode, self.machine.name),
             status=status,
             status_colour=colour,
             colour=drawing.COLOURS.get(mode, drawing.STEEL) if known else drawing.TRACK,
@@ -154,7 +154,7 @@ class Session:
             for name, q in self.comparison.q.items():
                 trace = np.array(self.comparison.traces[name]).reshape(-1, 3)
                 text = distances(self.path, trace).replace(" from the line", "")
-                text = f"{drawing.TITLES.get(name, name)}: {text}"
+                text = f"{TITLES.get(name, name)}: {text}"
                 runs.append(drawing.Trace(q, trace, drawing.COLOURS[name], text))
             scene = scene._replace(
                 q=runs[0].q, q_dot=0 * scene.q, traces=runs, trail=scene.path[:0]

@@ -17,7 +17,7 @@ from tqdm import tqdm
 from brokk_min.actuator import ActuatorNet
 from brokk_min.can.drive_log import TelemetryReader, read_frames
 from brokk_min.evaluation import baselines, metrics
-from brokk_min.evaluation.rollout import Controller
+from brokk_min.evaluation.rollout import TITLES, Controller
 from brokk_min.evaluation.sequences import Commands, goals_and_starts, task_sequences
 from brokk_min.identification.files import located, read_json, whole_file
 from brokk_min.identification.formats import RESULTS, RUNS, check_fields
@@ -190,7 +190,7 @@ def _scene(run: Run, tick: int, in_view: Array, close_up: Array) -> drawing.Scen
         run.v_goal[at],
         trail=run.p_tool[: at + 1],
         path=run.path,
-        title=drawing.TITLES.get(run.title, run.title),
+        title=TITLES.get(run.title, run.title),
         status=f"{at * run.machine.dt:.1f} s",
         colour=run.colour,
         notes=[

@@ -48,7 +48,8 @@ def test_plot_gap__has_a_row_for_the_tool_and_for_each_driven_joint():
     time = [0.05, 0.1, 0.15, 0.2]
     distance = 1000 * np.linalg.norm(gap.p_tool, axis=-1)
     np.testing.assert_allclose(curves(figure.axes[1])["first run"], [time, distance[:, 0]])
-    np.testing.assert_allclose(curves(figure.axes[1])["all runs"], [time, distance.mean(axis=1)])
+    median = curves(figure.axes[1])["median of all runs"]
+    np.testing.assert_allclose(median, [time, distance.mean(axis=1)])
     np.testing.assert_allclose(curves(figure.axes[4])["first run"], [time, gap.q_dot[:, 0, 2]])
     np.testing.assert_allclose(curves(figure.axes[9])["first run"], [time, 1000 * gap.q[:, 0, 4]])
 
@@ -63,22 +64,23 @@ def test_plot_sequence__is_relative_to_where_the_tool_began():
     time = 0.05 * np.arange(1, 521)
     positions = [f"{axis} - {axis}(0) [m]" for axis in "xyz"]
     assert ylabels(figure) == positions + [f"velocity {axis} [m/s]" for axis in "xyz"]
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["goal", "rl"]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["goal", "RL policy"]
     p_start = tool_position(forward_kinematics(BROKK_170, POSE))
     for i in range(3):
         above, below = curves(figure.axes[i]), curves(figure.axes[3 + i])
-        np.testing.assert_allclose(above["rl"], [time, trace.p_tool[:, 1, i] - p_start[i]])
+        np.testing.assert_allclose(above["RL policy"], [time, trace.p_tool[:, 1, i] - p_start[i]])
         np.testing.assert_allclose(above["goal"], [time, 0.05 * np.cumsum(goals[:, i])])
-        np.testing.assert_allclose(below["rl"], [time, trace.v_tool[:, 1, i]])
+        np.testing.assert_allclose(below["RL policy"], [time, trace.v_tool[:, 1, i]])
         np.testing.assert_allclose(below["goal"], [time, goals[:, i]])
     joints = figures.plot_joint_velocities(BROKK_170, traces, "x", 1)
     assert ylabels(joints) == [f"velocity q{i} [rad/s]" for i in (1, 3, 4, 5)]
-    np.testing.assert_array_equal(curves(joints.axes[2])["rl"], [time, trace.q_dot[:, 1, 3]])
+    np.testing.assert_array_equal(curves(joints.axes[2])["RL policy"], [time, trace.q_dot[:, 1, 3]])
 
 
 def test_styles__tell_controllers_apart_without_colour():
     controllers = [name for name in figures.STYLES if name.startswith(("rl", "jacobian"))]
-    assert len({figures.MARKERS[name] for name in controllers}) == len(controllers) == 9
+    for marks in (figures.MARKERS, figures.HATCHES):
+        assert len({marks[name] for name in controllers}) == len(controllers) == 9
     dashes = {str(figures.STYLES[name].get("linestyle")) for name in ("goal", *controllers)}
     assert len(dashes) == 10
 

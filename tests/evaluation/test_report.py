@@ -42,6 +42,12 @@ def test_compare__has_the_sides_of_the_intervals():
     assert report.compare({"task_space": {"rl_less": rows}}) == sides
 
 
+def test_less_than__has_fractions_of_the_others_figures():
+    keys = [key for _, key, _ in report.FIRST.values()]
+    summary = {"rl": {"all": dict.fromkeys(keys, 3.0)}, "pid": {"all": dict.fromkeys(keys, 4.0)}}
+    assert report.less_than(summary, "pid") == dict.fromkeys(report.FIRST, 0.25)
+
+
 def test_shipped_seeds__are_rows_of_a_file_that_need_not_be_there(tmp_path):
     path = tmp_path / "seeds.json"
     assert report.shipped_seeds(path) == []
@@ -72,8 +78,8 @@ def test_first_panels__are_seeds_before_this_run(tmp_path, monkeypatch):
     panels = report.first_panels(BROKK_170, {"training_seeds": swept, "task_space": task})
     assert list(panels) == list(report.FIRST)
     error = panels["error [m/s]"]
-    assert list(error) == ["ours open, 2 seeds", "rl, swept seeds", "rl"]
-    assert error["ours open, 2 seeds"]["rl_open"]["mean"] == 2.0
+    assert list(error) == ["RL policy (open), 2 seeds", "rl, swept seeds", "rl"]
+    assert error["RL policy (open), 2 seeds"]["rl_open"]["mean"] == 2.0
     assert error["rl, swept seeds"]["rl"] == number(7.0, 6.0, 8.0)
     assert error["rl"]["rl"] == number(5.0, 4.0, 6.0)
     assert panels["jerk [m/s^3]"]["rl, swept seeds"]["rl"] == number(None)  # of older sweeps

@@ -136,7 +136,7 @@ def test_reproduce__report_is_one_file_with_its_figures(folder, results):
     )
     for claim in (*results["net_claims"], *results["claims"]):
         assert html.escape(claim["measured"], quote=False) in text.replace("&#39;", "'")
-    assert text.count("<table") == text.count("<thead>") and text.count("<details>") == 3
+    assert text.count("<table") == text.count("<thead>") and text.count("<details>") == 4
     assert text.count("<td>start ") == 4 and text.count("<td>tuning run ") == TINY.tuning_runs
 
 

@@ -11,12 +11,12 @@ from helpers_bus import BASELINE, START
 from helpers_viewer import PipedLoop, post_key
 from PIL import Image, ImageSequence
 
-from benchmarks.bus import random_policy
+from benchmarks import POLICY
 from brokk_min.__main__ import main
 from brokk_min.evaluation import baselines
 from brokk_min.evaluation.sequences import task_sequences
 from brokk_min.kinematics import forward_kinematics, tool_position
-from brokk_min.learning.policy import save_policy
+from brokk_min.learning.policy import load_policy, save_policy
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer import drawing, replay
 from brokk_min.viewer.replay import Run
@@ -67,7 +67,7 @@ def test_run_of_log__refuses_a_log_in_which_nothing_drives(tmp_path):
 def results(tmp_path_factory):
     """What `evaluate` writes, of a policy and gains that nobody tuned."""
     folder = tmp_path_factory.mktemp("results")
-    policy = random_policy(np.random.default_rng(0))
+    policy = load_policy(POLICY, BROKK_170)
     save_policy(folder / "policy.npz", policy)
     about = baselines.gains_metadata(BROKK_170, policy.net)
     baselines.write_gains(folder / "gains.json", baselines.baselines(BROKK_170, policy.net), about)
