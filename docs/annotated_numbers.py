@@ -18,7 +18,7 @@ import numpy as np
 from PIL import Image
 
 from brokk_min import BROKK_170
-from brokk_min.evaluation import baselines, claims, figures, metrics, preliminary, reproduce
+from brokk_min.evaluation import baselines, claims, figures, metrics, preliminary, robustness
 from brokk_min.evaluation.rollout import Trace
 from brokk_min.evaluation.sequences import evaluation_starts, task_sequences
 from brokk_min.identification import excitation, validation
@@ -92,7 +92,7 @@ def verdicts(every: dict[str, Any], rows: metrics.Rows, traces: metrics.Traces) 
     reachable = kinds == "workspace"
     pids = {name: every[name] for name in PIDS}
     near = claims.singular_controllers({n: every[n] for n in ("rl", "rl_paper")}, pids)
-    _, singular, _ = reproduce.near_singularities(m, near, starts[kinds == "extended"], 26.0, SEED)
+    _, singular, _ = robustness.near_singularities(m, near, starts[kinds == "extended"], 26.0, SEED)
     along_x = {c: Trace(*(array[:, reachable] for array in traces[c, "x"])) for c in pids}
     goals = commands[0].for_starts(m, starts[reachable])
     result: dict[str, Any] = {}

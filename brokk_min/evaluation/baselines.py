@@ -105,7 +105,7 @@ def gains_of(machine: Machine, x: Array) -> Gains:
 def fractions_of(machine: Machine, gains: Gains) -> Array:
     """The inverse of `gains_of`; gains outside their range are at its end."""
     low, high = gain_bounds(machine)
-    return np.sqrt(np.clip((gains_vector(gains) - low) / (high - low), 0, 1))
+    return np.asarray(np.sqrt(np.clip((gains_vector(gains) - low) / (high - low), 0, 1)))
 
 
 def gains_at_bound(controller: JacobianController) -> list[str]:

@@ -283,7 +283,7 @@ class TrainingLog:
 def kinds(value: Any, place: str = "") -> dict[str, str]:
     """Types of the leaves of nested dictionaries and lists, by place; of tensors shapes, too."""
     if isinstance(value, dict | list | tuple):
-        found = {}
+        found: dict[str, str] = {}
         for name, inner in value.items() if isinstance(value, dict) else enumerate(value):
             found |= kinds(inner, f"{place}.{name}" if place else str(name))
         return found
