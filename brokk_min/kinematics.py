@@ -77,7 +77,7 @@ def jacobian(frames: Frames) -> Array:
     """
     J = cross(frames.z[..., :-1, :], frames.p[..., -1:, :] - frames.p[..., :-1, :])
     for i in frames.prismatic:
-        J[..., i, :] = frames.z[..., i, :]
+        J[..., i, :] = frames.z[..., i, :]  # J_i = z_{i-1}
     return np.swapaxes(J, -1, -2)
 
 

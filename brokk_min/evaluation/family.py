@@ -8,6 +8,7 @@ logs, the policies trained on; baselines tuned on the member itself. `family.jso
     of the tool in free runs, error {controller: m/s on the machine}; for each of our policies
     on_nets: its error on its nets [m/s], loaded: with an unknown load at the tool [m/s], best: the
     best baseline of its class of valves at rest
+    table: what `show` prints, {"member, policy": {column: number}}
     transfers[i][j]: error [m/s] of the policy "rl" of member i on member j
     summary: {policy: median and largest of its `ratios` over the members}
 """
@@ -53,6 +54,7 @@ def run_family(base: Machine, seeds: Sequence[int], out: Path, budget: Budget) -
     results = {
         "meta": {"machine": base.name, "budget": asdict(budget)},
         "members": rows,
+        "table": table(rows),
         "transfers": transfers(base, seeds, out, budget),
         "summary": summary(rows),
     }
@@ -177,24 +179,31 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, dict[str, flo
     return result
 
 
-HEADS = ("member", "policy", "[m/s]", "on nets", "to nets", "PID", "to PID", "payload", "free run")
+def table(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
+    """Errors and `ratios` of each member and policy."""
+    result = {}
+    for row in rows:
+        for policy, best in row["best"].items():
+            result[f"{row['seed']}, {policy}"] = {
+                "error [m/s]": row["error"][policy],
+                "on its nets": row["on_nets"][policy],
+                "best PID": row["error"][best],
+                **ratios(row, policy),
+            }
+    return result
 
 
 def show(results: dict[str, Any]) -> str:
     """The table of the members, and the transfers."""
-    line = "{:>6} {:>8} {:>7} {:>8} {:>8} {:>7} {:>7} {:>8} {:>9}  {}"
-    lines = [line.format(*HEADS, "best PID of its class")]
-    for row in results["members"]:
-        for policy, best in row["best"].items():
-            found, errors = ratios(row, policy), row["error"]
-            numbers = [errors[policy], row["on_nets"][policy], found["to_nets"], errors[best]]
-            numbers += [found["to_best"], found["payload"], found["free_run"]]
-            shown = [f"{number:.4f}"[:6] for number in numbers]
-            lines.append(line.format(row["seed"], policy, *shown, best))
-    for policy, table in results["summary"].items():
-        for name, value in table.items():
-            numbers_of = f"median {value['median']:.2f}, worst {value['worst']:.2f}"
-            lines.append(f"{policy} {name}: {numbers_of}")
+    line = "{:12}" + 7 * "{:>13}"
+    rows = results["table"]
+    lines = [line.format("member", *next(iter(rows.values())))]
+    for name, row in rows.items():
+        lines.append(line.format(name, *(f"{x:.4f}" for x in row.values())))
+    for policy, of in results["summary"].items():
+        for name, value in of.items():
+            numbers = f"median {value['median']:.2f}, worst {value['worst']:.2f}"
+            lines.append(f"{policy} {name}: {numbers}")
     lines.append("error [m/s] of the policy rl of a member (row) on a member (column):")
     lines += ["  ".join(f"{x:.4f}" for x in errors) for errors in results["transfers"]]
     return "\n".join(lines)

@@ -150,6 +150,15 @@ def shipped_seeds(path: Path) -> list[dict[str, Any]]:
         return [row for row in every if row["seed"] is not None]
 
 
+def shipped_family(path: Path) -> dict[str, dict[str, float]]:
+    """Table of the members by `brokk-min family`; empty without the file."""
+    if not path.exists():
+        return {}
+    with expected(path, "a table of `brokk-min family`"):
+        rows = dict(read_json(path, "JSON")["table"])
+        return {name: {key: float(x) for key, x in row.items()} for name, row in rows.items()}
+
+
 def _draw_singular(machine: Machine, results: Results, traces: Traces) -> Figure:
     """Half the speed, from the start nearest to a singularity."""
     starts = np.array(results["starts"])[np.array(results["start_kinds"]) == "extended"]
@@ -179,6 +188,7 @@ def render(
         titles=TITLES,
         less=less_than(results["task_space"]["summary"], PID),
         seeds=[row for row in rows if "seeds" in row],
+        family=shipped_family(SHIPPED / machine.name / "family.json"),
         minutes=sum(clock.get(stage, 0) for stage in STAGES) / 60,
         date=date.today().isoformat(),
         computer=f"{platform.machine()}, {os.cpu_count()} cores",

@@ -62,6 +62,17 @@ def test_shipped_seeds__are_rows_of_a_file_that_need_not_be_there(tmp_path):
         report.shipped_seeds(path)
 
 
+def test_shipped_family__is_a_table_that_need_not_be_there(tmp_path):
+    path = tmp_path / "family.json"
+    assert report.shipped_family(path) == {}
+    path.write_text(json.dumps({"table": {"0, rl": {"to_nets": 1}}, "members": []}))
+    assert report.shipped_family(path) == {"0, rl": {"to_nets": 1.0}}
+    for content in ({"members": []}, {"table": {"0, rl": {"to_nets": "a"}}}):
+        path.write_text(json.dumps(content))
+        with pytest.raises(ValueError, match=r"family.json: expected a table of"):
+            report.shipped_family(path)
+
+
 def test_first_panels__are_seeds_before_this_run(tmp_path, monkeypatch):
     folder = tmp_path / BROKK_170.name
     folder.mkdir()
