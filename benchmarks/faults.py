@@ -30,7 +30,7 @@ import tyro
 
 from benchmarks import memory, write
 from brokk_min.actuator import plant_reset, plant_step
-from brokk_min.can.drive_log import TelemetryReader, read_frames
+from brokk_min.can.drive_log import TelemetryReader, read_frames, status
 from brokk_min.can.operator_input import Script
 from brokk_min.can.safety_gate import FROZEN_ANGLE, SLEW, expected_motion, gate_start
 from brokk_min.evaluation.sequences import task_sequences
@@ -230,7 +230,7 @@ def hours(number: float) -> dict[str, Any]:
         world.syncs.clear()
         if k % max(1, ticks // 12) == max(1, ticks // 12) // 2:
             used.append(memory())
-            print(f"{k} ticks: {used[-1]:.1f} MB, {world.drive.status()}", flush=True)
+            print(f"{k} ticks: {used[-1]:.1f} MB, {status(world.drive)}", flush=True)
     world.close()
     return {"ticks": ticks, "memory_mb": used, "driving": bool(world.drive.gate.driving)}
 

@@ -20,7 +20,6 @@ from brokk_min.can.canopen import Array, Operator, OperatorInput
 from brokk_min.can.connection import stop_signals
 from brokk_min.can.safety_gate import GateInputs, fault_name, gate, gate_start
 from brokk_min.env import measure, update_history
-from brokk_min.kinematics import forward_kinematics, tool_velocity
 from brokk_min.machine import PWM_MAX, Machine
 
 BUSY_WAIT = 0.002  # s before and after SYNC in which the loop does not sleep (tuned)
@@ -64,14 +63,14 @@ class Drive:
         canopen.set_up_nodes(self.bus, self.machine)
         self.start_time = self.bus.now()
 
-    def run(self, show: Callable[[str], object] = lambda text: None) -> None:
+    def run(self, show: Callable[["Drive"], object] = lambda drive: None) -> None:
         """Tick until the operator, SIGINT or SIGTERM stops it; the last frame is always neutral."""
         gc.disable()  # no garbage collection in the middle of a tick
         try:
             with stop_signals() as self.signals:
                 while self.tick():
                     if self.ticks % 5 == 0:
-                        show(self.status())
+                        show(self)
         except BaseException:
             self.exception = "the loop ended"
             self.send_command(np.zeros(self.machine.n), self.nodes.counts(), self.bus.now())
@@ -206,15 +205,3 @@ class Drive:
         if self.history is None:
             return np.full((2, self.machine.n), np.nan)
         return self.history[0, :, :2, -1].T
-
-    def status(self) -> str:
-        """One line: state, faults, goal and measured tool velocity [m/s], angles [rad]."""
-        state = "waiting" if self.gate.active_fault else "ready  "
-        state = "driving" if self.gate.driving else state
-        reason = f" {self.reason}" if self.reason else ""
-        q, q_dot = self.measured
-        v = tool_velocity(forward_kinematics(self.machine, q), q_dot)
-        vectors = (self.operator_input.v_goal, v, q)
-        goal, measured, pose = (" ".join(f"{x:+.2f}" for x in vector) for vector in vectors)
-        late = f"late {1e3 * self.lateness:.1f} ms, skipped {self.skipped}"
-        return f"{state}{reason} v goal {goal} measured {measured} q {pose} {late}"

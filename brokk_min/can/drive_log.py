@@ -19,6 +19,7 @@ from brokk_min.evaluation.rollout import Controller
 from brokk_min.hw import Drive
 from brokk_min.identification.files import expected, open_regular, require
 from brokk_min.identification.logs import Log, machine_log
+from brokk_min.kinematics import forward_kinematics, tool_velocity
 from brokk_min.machine import Array, Machine, estimate_velocity
 
 LONGEST_LINE = 1000  # bytes
@@ -220,3 +221,16 @@ class TelemetryReader:
         driving = bool(self.valves.enable.all())
         v_goal = np.array(self.operator_input.v_goal) * driving
         return Telemetry(self.tick, q, q_dot, self.valves.u.copy(), v_goal, driving)
+
+
+def status(drive: Drive) -> str:
+    """One line: state, faults, goal and measured tool velocity [m/s], angles [rad], lateness."""
+    state = "waiting" if drive.gate.active_fault else "ready  "
+    state = "driving" if drive.gate.driving else state
+    reason = f" {drive.reason}" if drive.reason else ""
+    q, q_dot = drive.measured
+    v = tool_velocity(forward_kinematics(drive.machine, q), q_dot)
+    vectors = (drive.operator_input.v_goal, v, q)
+    goal, measured, pose = (" ".join(f"{x:+.2f}" for x in vector) for vector in vectors)
+    late = f"late {1e3 * drive.lateness:.1f} ms, skipped {drive.skipped}"
+    return f"{state}{reason} v goal {goal} measured {measured} q {pose} {late}"

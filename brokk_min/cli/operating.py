@@ -81,7 +81,7 @@ class Drive(Command):
                 warning = "other work may make ticks late and end the drive (docs/hardware.md)"
                 print(f"drive: no real-time priority: {warning}", file=sys.stderr)
             try:
-                drive.run(show_line)
+                drive.run(show_status)
             finally:
                 print(end="\n" if sys.stdout.isatty() else "")
         if isinstance(operator, Script) and not operator.done:
@@ -122,8 +122,9 @@ def compare(machine: Machine, controller: Controller, log: Path) -> None:
         raise ValueError(f"{log}: expected the frames of the log, got {sent - same} others")
 
 
-def show_line(text: str) -> None:
+def show_status(drive: hw.Drive) -> None:
     """Rewrite one line of a terminal, cut to its width; elsewhere print a line each time."""
+    text = drive_log.status(drive)
     if sys.stdout.isatty():
         columns = shutil.get_terminal_size().columns
         print(f"\r{text[: columns - 1]}\033[K", end="", flush=True)

@@ -27,6 +27,7 @@ from helpers_faults import COMMAND, FAULTS, NOT_FOUND, Fault, delay, flood, free
 
 from brokk_min import hw
 from brokk_min.can.canopen import valve_frame
+from brokk_min.can.drive_log import status
 from brokk_min.can.operator_input import Script
 from brokk_min.can.safety_gate import fault_name
 from brokk_min.env import TaskConfig, observation_scale, reward
@@ -281,14 +282,14 @@ def test_tick__leaves_a_fault_by_a_new_edge_only(world, operator):
     world.upward = only(0x183, once(lambda d: []))
     world.run(0.5)
     assert drive.reason == "fault: q3: silent" and not drive.gate.driving
-    assert drive.status().startswith("ready   fault: q3: silent v goal ")
+    assert status(drive).startswith("ready   fault: q3: silent v goal ")
     operator.enable = False
     world.run(0.2)
     assert drive.reason == "fault: q3: silent"
     operator.enable = True
     world.run(0.4)
     assert drive.gate.driving and drive.reason == ""
-    assert drive.status().startswith("driving v goal +0.10 +0.00 +0.00 measured ")
+    assert status(drive).startswith("driving v goal +0.10 +0.00 +0.00 measured ")
     assert world.commands[1][-1].tolist() == list(COMMAND)
 
 
@@ -341,7 +342,7 @@ def test_tick__starts_nodes_that_fell_back_once_the_switch_is_released(world, op
     assert not world.drive.gate.active_fault
     out.clear()
     world.run(0.2)
-    assert 0x000 not in dict(out) and world.drive.status().startswith("ready")
+    assert 0x000 not in dict(out) and status(world.drive).startswith("ready")
 
 
 # --- the clock -----------------------------------------------------------------------------------
