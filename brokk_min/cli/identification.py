@@ -188,8 +188,8 @@ def print_recovery(joints: dict[str, dict[str, Any]]) -> None:
         print(row.format("joint", "", "dead zone", "delay [s]", "from idle [s]", "speed"))
     for name, sides in joints.items():
         for side, numbers in sides.items():
-            pairs = (", ".join(f"{x or np.nan:.3f}" for x in pair) for pair in numbers.values())
-            print(row.format(name, side, *pairs))
+            pairs = [[np.nan if x is None else x for x in pair] for pair in numbers.values()]
+            print(row.format(name, side, *(f"{up:.3f}, {down:.3f}" for up, down in pairs)))
 
 
 def print_scores(scores: dict[str, Any]) -> None:

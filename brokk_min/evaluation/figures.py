@@ -264,7 +264,10 @@ def plot_position_error(
         motion[name] = time, sign * p[..., axis]
         error[name] = time, 1000 * norm(moved - p, axis=-1)
     along = Panel("", "time [s]", f"motion along {sequence.name} [m]", motion)
-    return plot_panels([[along, Panel("", "time [s]", "position error [mm]", error)]])
+    figure = plot_panels([[along, Panel("", "time [s]", "position error [mm]", error)]])
+    figure.axes[1].set(yscale="log", ylim=(1, None))
+    figure.axes[1].yaxis.set_major_formatter("{x:g}")
+    return figure
 
 
 def plot_rest(

@@ -18,6 +18,7 @@ from brokk_min.learning.simulation_gradient import (
     STEP,
     Ticks,
     action_gradients,
+    compensation_derivative,
     improved_actions,
     regression_loss,
     saturate,
@@ -253,6 +254,16 @@ def test_improved_actions__are_means_and_a_saturated_step_along_the_gradient():
     assert rollout.dones.any()
     assert rollout.means.abs().max() > 1
     assert (norm > largest.min()).any() and (norm < largest.min()).any()
+
+
+@pytest.mark.parametrize("paper", [False, True])
+def test_compensation_derivative__by_hand(paper):
+    """Limit 80 / 127, dead zone 0.07, compensated over 0.01 of an action; the paper's is linear."""
+    u = np.array([0.04, 0.5, -0.2, -0.3, -0.03])  # the second joint is locked
+    beyond, crossing = 80 / 127 - 0.07, 0.07 / 0.01
+    expected = [beyond + crossing, beyond, beyond, beyond + crossing]
+    found = compensation_derivative(BROKK_170, u, paper)
+    np.testing.assert_allclose(found, [80 / 127] * 4 if paper else expected, rtol=1e-6)
 
 
 def test_saturate__divides_by_the_norm_or_the_median_and_stands_still_without_a_gradient():
