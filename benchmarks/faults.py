@@ -165,7 +165,7 @@ def frozen_on_drive(counts: np.ndarray, sent: np.ndarray, most: int = 60) -> np.
     for t in range(1, len(counts)):
         state = start._replace(counts=counts[t - 1], sent=windows[t], expected_motion=sound[t - 1])
         sound[t] = expected_motion(m, state, counts[t])
-    limit = max(FROZEN_ANGLE, m.encoder_step)
+    limit = np.maximum(FROZEN_ANGLE, m.encoder_step)
     assert (sound <= limit).all(), "false alarm"
     at = np.arange(4, len(counts) - most)
     frozen, expected = counts[at], sound[at]
