@@ -255,7 +255,7 @@ class Play(Command):
             known = baselines.read_gains(gains, machine, policy.net)
         else:
             known = baselines.baselines(machine, policy.net)
-        print(f"gains of the Jacobian controller: {gains or 'set by hand'}", file=sys.stderr)
+        print(f"gains of the Jacobian controller: {gains or 'set by hand'}")
         rl = PolicyController(machine, policy)
         return {"rl": rl, "jacobian": known["jacobian_pid_k0.1"]}
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from benchmarks import deviations, ladder, limits, neighbours, peers, seeds, step_logs
+from benchmarks import deviations, faults, ladder, limits, neighbours, peers, seeds, step_logs
 from brokk_min import kinematics
 from brokk_min.env import action_to_pwm
 from brokk_min.evaluation import metrics
@@ -152,3 +152,10 @@ def test_step_logs__have_steps_of_one_joint_and_late_answers(tmp_path):
         first = np.flatnonzero(one.u[:, j])[0]
         assert np.ptp(one.q[: first + 20, j]) < 0.03  # rad of noise, 0.2 s after the command
         assert np.ptp(one.q[:, j]) > 0.1
+
+
+def test_faults__find_a_frozen_encoder_of_a_moving_joint_in_the_log_of_a_drive():
+    rows = faults.frozen_on_drive(*next(faults.recorded_drives()))
+    seconds = rows[rows[:, 0] > 0.05, 1]
+    assert len(seconds) > 50
+    assert (seconds <= 0.175).mean() > 0.9

@@ -88,7 +88,7 @@ def test_play__has_policy_and_tuned_baseline(tmp_path, capsys):
         assert jacobian.k == 0.1
         assert np.array_equal(jacobian.gains.kp, tuned.gains.kp) == (gains is not None)
         expected = f"gains of the Jacobian controller: {gains or 'set by hand'}\n"
-        assert capsys.readouterr().err == expected
+        assert capsys.readouterr().out == expected
 
 
 @pytest.fixture(scope="module")
