@@ -289,7 +289,7 @@ def d12() -> Figures:
         u[..., m.driven] = limit * np.clip(action, -1, 1)
         return machine.limit_command(m, u)
 
-    def derivative(m: machine.Machine, u: Array) -> Array:
+    def derivative(m: machine.Machine, u: Array, paper: bool = False) -> Array:
         return np.full_like(u[..., m.driven], limit)
 
     with ExitStack() as patches:
