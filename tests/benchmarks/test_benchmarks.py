@@ -9,7 +9,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from benchmarks import deviations, faults, ladder, limits, neighbours, peers, seeds, step_logs
+from benchmarks import (
+    POLICY,
+    deviations,
+    faults,
+    ladder,
+    limits,
+    neighbours,
+    peers,
+    seeds,
+    step_logs,
+)
 from brokk_min import kinematics
 from brokk_min.env import action_to_pwm
 from brokk_min.evaluation import metrics
@@ -22,35 +32,46 @@ from brokk_min.machine import BROKK_170
 
 
 @pytest.mark.parametrize("learner", list(peers.LEARNERS))
-def test_peers__train_on_the_environment(learner, tmp_path):
-    out = tmp_path / "p.json"
-    once = {"seeds": (0,), "learning_rates": (1e-3,), "planned": (1024,), "num_envs": 16}
-    options = peers.Options(learners=(learner,), target=9.0, threads=1, json=out, **once)
-    (row,) = peers.main(options)["runs"]
-    assert (row["learner"], row["updates"], row["seconds"]) == (learner, 2, None)
-    assert 0.3 < row["best"] < 1
-    assert row["trained_s"] > 0
-    assert json.loads(out.read_text())["runs"] == [row]
+def test_race__trains_each_learner_and_notes_the_levels_it_reached(learner):
+    if learner == "rl_games":
+        pytest.importorskip("rl_games")
+    options = peers.Options(runs=1, num_envs=16)
+    targets = {"any": 9.0, "none": 0.0}
+    net = load_policy(POLICY, BROKK_170).net
+    row = peers.race(learner, net, (1e-3, 1024), 0, targets, options)
+    assert (row["learner"], row["updates"], row["seed"]) == (learner, 2, 0)
+    epochs = 2 if learner in ("ours", "critic") else peers.EPOCHS
+    assert 0 < row["best"] < 1 and row["gradient_steps"] == 2 * epochs
+    cpu, wall, steps, gradients = row["reached"].pop("any")
+    assert row["reached"] == {}
+    assert (steps, gradients) == (1024, row["gradient_steps"])
+    assert (cpu, wall) == (row["cpu_s"], row["wall_s"]) and cpu > 0
 
 
-def test_pid__gives_actions_for_its_commands():
-    env = TaskVectorEnv(3, load_policy(SHIPPED / "brokk170" / "policy.npz", BROKK_170).net)
-    obs, _ = env.reset(seed=0)
-    assert env.state is not None
-    actions = peers.pid(env.net, None)(env, obs)
-    u = action_to_pwm(BROKK_170, actions)[:, BROKK_170.driven]
-    assert (abs(u) >= BROKK_170.dead_zone - 1e-9).any()
-    assert (np.sign(u) == np.sign(actions)).all()
+def test_best_run__is_the_first_at_a_level_or_the_closest():
+    rows = [
+        {"setting": (1e-3, 100), "reached": {}, "best": 0.7},
+        {"setting": (2e-3, 100), "reached": {}, "best": 0.6},
+    ]
+    assert peers.best_run(rows, "PID")["setting"] == (2e-3, 100)
+    rows += [
+        {"setting": (3e-3, 9), "reached": {"PID": [cpu, 1, 1, 1]}, "best": 1} for cpu in (8, 9)
+    ]
+    assert peers.best_run(rows, "PID")["setting"] == (3e-3, 9)
 
 
-def test_best_setting__is_the_fastest_or_the_closest():
-    def row(rate, seconds, best):
-        return {"learning_rate": rate, "planned": 100, "seconds": seconds, "best": best}
-
-    rows = [row(1e-3, None, 0.7), row(2e-3, None, 0.8)]
-    assert peers.best_setting(rows) == (2e-3, 100)
-    rows += [row(3e-3, 9.0, 0.9), row(4e-3, 8.0, 0.9)]
-    assert peers.best_setting(rows) == (4e-3, 100)
+def test_median__needs_most_of_the_seeds():
+    reached = [{"PID": [3.0, 6.0, 100, 10]}, {}, {"PID": [5.0, 7.0, 200, 20]}]
+    rows = [{"reached": row, "best": best} for row, best in zip(reached, (0.1, 0.4, 0.2))]
+    assert peers.median(rows, "PID") == {"reached": [5.0, 7.0, 200.0, 20.0], "best": 0.2}
+    assert peers.median(rows[:2], "PID") == {"reached": None, "best": 0.25}
+    table = {
+        "ours": {"PID": peers.median(rows, "PID")},
+        "sb3": {"PID": peers.median(rows[:2], "PID")},
+    }
+    lines = peers.markdown({"table": table, "targets": {"PID": 0.3}}).splitlines()
+    assert lines[2].endswith("| yes, by hand | PID: 0.3000 | 5.0 | 7 | 0 | 20 | 0.2000 |")
+    assert lines[3].endswith("| no | PID: 0.3000 | not reached |  |  |  | 0.2500 |")
 
 
 def test_limits__are_measured(tmp_path):
