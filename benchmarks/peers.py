@@ -49,6 +49,7 @@ from brokk_min.machine import BROKK_170 as M
 
 C = ppo.PPOConfig  # its gamma, GAE lambda, clip, window and first deviation are the peers', too
 EPOCHS = 4  # of peers
+GAINS = POLICY.with_name("gains.json")
 Setting = tuple[float, int]  # learning rate, environment steps
 Report = Callable[[Iterable[nn.Module], int], None]  # an actor's layers, gradient steps in all
 
@@ -61,7 +62,7 @@ class Finished(Exception):
 class Options:
     learners: tuple[str, ...] = ("ours", "critic", "sb3", "cleanrl", "rl_games")  # Who takes part.
     policy: Path = POLICY  # Whose nets all train on; its error is the third level.
-    gains: Path = POLICY.with_name("gains.json")  # Tuned gains of the PID.
+    gains: Path = GAINS  # Tuned gains of the PID.
     seeds: tuple[int, ...] = (0, 1, 2)  # One run each.
     longest: float = 1.0  # Fraction of the lengths of `SETTINGS`.
     runs: int = 16  # Runs of 20 s on the machine for each error.

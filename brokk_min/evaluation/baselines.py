@@ -25,6 +25,7 @@ PAPER_BASELINES = ("jacobian_pid_k0.1", "jacobian_pid_k0.05")
 # Stronger than the paper's: its claims are tested against these, too.
 STRONGER = ("jacobian_pid_ff", "jacobian_pid_ff_integral")
 TUNING_RUNS = 10  # of the whole chain and of `evaluate`, assumed
+TUNING_SECONDS = 20.0  # of each run
 GENERATIONS = 10
 CANDIDATES = 24
 SPREAD = 0.12  # of the first candidates, in the scale of `gains_of`, assumed
@@ -127,20 +128,24 @@ def tune_baselines(
     seed: int,
     config: TaskConfig | None = None,
     plant: ActuatorNet | None = None,
+    longest: float = np.inf,
+    only: str = "",
 ) -> tuple[dict[str, JacobianController], dict[str, dict[str, Any]]]:
     """The baselines, each tuned on the machine itself with `tuning_cost`; and a record for JSON.
 
     Tuning on the machine (or the nets `plant`) favours the baselines: the policy is
     trained on nets alone. Each is tuned twice, with `seed` and the next: "cost" and "second_cost"
     agree if the search has converged; the better gains are kept. The least of many noisy costs is
-    too good, so "cost_anew" is the mean of 16 more of these. `config` has the noise.
+    too good, so "cost_anew" is the mean of 16 more of these. `config` has the noise. No run is
+    longer than `longest` [s]; `only` one baseline, or "" for all.
     """
-    start, goals = tuning_set(machine, runs, seed)
+    start, goals = tuning_set(machine, runs, seed, min(TUNING_SECONDS, longest))
     config = config or TaskConfig()
     cost = partial(tuning_cost, start=start, goals=goals, seed=seed, config=config, plant=plant)
     tuned = {}
     record = {}
-    for name, controller in baselines(machine, net).items():
+    every = baselines(machine, net)
+    for name, controller in {only: every[only]}.items() if only else every.items():
         first, costs = tune(controller, cost, seed, generations, name)
         second, second_costs = tune(controller, cost, seed + 1, generations, name)
         tuned[name] = first if costs[-1] <= second_costs[-1] else second

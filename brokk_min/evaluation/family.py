@@ -82,7 +82,8 @@ def run_member(base: Machine, seed: int, out: Path, budget: Budget) -> dict[str,
     every, jobs = trainings(machine, out, log, budget, seed, begun)
     net = select_nets(machine, every)
     settings = budget.tuning_runs, budget.generations, seed
-    jobs["tune"] = partial(baselines.tune_baselines, machine, net, *settings)
+    tune = partial(baselines.tune_baselines, machine, net, *settings)
+    jobs["tune"] = partial(tune, longest=budget.short_s)
     *trained, (pids, _) = reproduce.side_by_side(jobs, {})
     baselines.write_gains(out / "gains.json", pids, baselines.gains_metadata(machine, net))
     policies = {

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from brokk_min.actuator import PlantState, close_valves, lever_arm, plant_reset, plant_step
 from brokk_min.env import Measured
-from brokk_min.evaluation.metrics import Controllers, evaluate, paired_difference, summary
-from brokk_min.evaluation.sequences import Commands
+from brokk_min.evaluation.metrics import Run, paired_difference, summary
 from brokk_min.jacobian import dls
 from brokk_min.kinematics import forward_kinematics, jacobian, tool_velocity
 from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, valve_opening
@@ -163,16 +162,9 @@ def perfect_models(machine: Machine, starts: Array) -> dict[str, PerfectModel]:
     }
 
 
-def regret(
-    machine: Machine,
-    controllers: Controllers,
-    commands: Sequence[Commands],
-    starts: Array,
-    seed: int,
-) -> dict[str, Any]:
+def regret(runs: Sequence[Run]) -> dict[str, Any]:
     """Mean errors, and velocity errors less that of a controller that knows the plant."""
-    every = {**controllers, **perfect_models(machine, starts)}
-    runs, _ = evaluate(machine, every, commands, starts, seed)
-    error = "velocity_error_mean"
-    less = {c: paired_difference(runs, c, "perfect_model", error) for c in controllers}
-    return {"summary": summary(runs), "less_perfect_model": less}
+    error, means = "velocity_error_mean", summary(runs)
+    others = [c for c in means if not c.startswith("perfect_model")]
+    less = {c: paired_difference(runs, c, "perfect_model", error) for c in others}
+    return {"summary": means, "less_perfect_model": less}

@@ -4,8 +4,9 @@ import multiprocessing
 import os
 import sys
 import time
+from collections import ChainMap
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -20,7 +21,7 @@ from brokk_min.actuator import ActuatorNet
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation import baselines, claims, metrics, preliminary, report, sequences
 from brokk_min.evaluation.metrics import Controllers, Run, Traces, evaluate, summary
-from brokk_min.evaluation.perfect_model import regret
+from brokk_min.evaluation.perfect_model import perfect_models, regret
 from brokk_min.evaluation.robustness import near_singularities, robustness
 from brokk_min.evaluation.rollout import Controller, Trace, log_of
 from brokk_min.evaluation.seeds import read_seeds, seeds_of
@@ -52,7 +53,7 @@ class Budget:
     tuning_runs: int = baselines.TUNING_RUNS
     starts: int = 64
     bound_starts: int = 16  # of them, for the regret
-    short_s: float = 26.0  # s of each sequence for regret, robustness and singularities
+    short_s: float = 26.0  # s of a run for regret, robustness, singularities, tuning, at most
 
 
 QUICK = Budget(0.1, 700, 100_000, 200_000, 4, 4, 8, 2, 3.0)
@@ -83,12 +84,15 @@ def reproduce(
             nets = {"rl": driven, "rl_open": driven, "rl_paper": select_nets(machine, paper_net)}
             jobs: dict[str, Any] = {
                 f"train {name}": partial(train, machine, out, name, nets[name], budget, seed)
-                for name in POLICIES
+                for name in ("rl_paper", "rl_open", "rl")
             }
-            settings = budget.tuning_runs, budget.generations, seed
-            jobs["tune"] = partial(baselines.tune_baselines, machine, driven, *settings)
-            *trained, (pids, tuning) = side_by_side(jobs, clock)
-            policies = dict(zip(POLICIES, trained, strict=True))
+            settings = budget.tuning_runs, budget.generations, seed, None, None, budget.short_s
+            for name in baselines.baselines(machine, driven):
+                tune = partial(baselines.tune_baselines, machine, driven, *settings)
+                jobs[f"tune {name}"] = partial(tune, name)
+            paper, opened, rl, *tuned = side_by_side(jobs, clock)
+            policies = {"rl": rl, "rl_open": opened, "rl_paper": paper}
+            pids, tuning = (dict(ChainMap(*both[::-1])) for both in zip(*tuned, strict=True))
         with stage("evaluate"):
             results, shown = measure(machine, net, test, policies, pids, budget, seed, clock)
             results["paper_recipe"] = net_errors(machine, paper_net, test, seed)
@@ -113,8 +117,8 @@ def _stage(clock: dict[str, float], bar: Any, name: str) -> Iterator[None]:
 def side_by_side(calls: Mapping[str, Callable[[], Any]], clock: dict[str, float]) -> list[Any]:
     """Results of independent calls, each in a process of one thread, as many at once as cores.
 
-    One core runs them one after the other, here. `clock` gets the seconds of each. The first
-    exception is raised.
+    They begin in their order: the longest should be the first. One core runs them one after the
+    other, here. `clock` gets the seconds of each. The first exception is raised.
     """
     cores = os.cpu_count() or 1
     if hasattr(os, "sched_getaffinity"):
@@ -123,8 +127,16 @@ def side_by_side(calls: Mapping[str, Callable[[], Any]], clock: dict[str, float]
         done = [_timed(call) for call in calls.values()]
     else:
         context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(min(cores, len(calls)), context, _one_thread) as pool:
-            done = list(pool.map(_timed, calls.values()))
+        bar = tqdm(total=len(calls), unit="job", disable=None)
+        with ProcessPoolExecutor(min(cores, len(calls)), context, _one_thread) as pool, bar:
+            futures = {pool.submit(_timed, call): name for name, call in calls.items()}
+            bar.set_postfix_str(", ".join([*calls][:cores]))
+            for future in as_completed(futures):
+                future.result()  # or its exception
+                running = [name for other, name in futures.items() if not other.done()]
+                bar.set_postfix_str(", ".join(running[:cores]))
+                bar.update()
+            done = [future.result() for future in futures]
     clock |= {name: seconds for name, (seconds, _) in zip(calls, done, strict=True)}
     return [result for _, result in done]
 
@@ -224,7 +236,8 @@ def measure(
     own = log_of(machine, {s: trace for (c, s), trace in task.items() if c == "rl"}, 16)
     measured = preliminary.run(machine, net, seed)
     numbers = preliminary.numbers(machine, measured)
-    tuned_on = sequences.tuning_set(machine, budget.tuning_runs, seed)
+    seconds = min(baselines.TUNING_SECONDS, budget.short_s)
+    tuned_on = sequences.tuning_set(machine, budget.tuning_runs, seed, seconds)
     meta = metrics.metadata(machine, seed) | baselines.gains_metadata(machine, policies["rl"].net)
     results = {
         "meta": meta | {"effort": asdict(budget)},
@@ -267,14 +280,19 @@ def compare(
     few = claims.singular_controllers(policies, pids)
     every = machine, controllers
     jobs: dict[str, Callable[[], Any]] = {
+        "score changed machines": partial(robustness, *every, short, reachable[:16], seed)
+    }
+    for name, bound in perfect_models(machine, bound_starts).items():
+        jobs[f"score {name}"] = partial(evaluate, machine, {name: bound}, short, bound_starts, seed)
+    jobs |= {
         "score": partial(evaluate, *every, commands, starts, seed),
+        "score for the regret": partial(evaluate, *every, short, bound_starts, seed),
         "score near singularities": partial(
             near_singularities, machine, few, extended, budget.short_s, seed
         ),
-        "score perfect model": partial(regret, *every, short, bound_starts, seed),
-        "score changed machines": partial(robustness, *every, short, reachable[:16], seed),
     }
-    (runs, traces), (singular, near, near_traces), less, changed = side_by_side(jobs, clock)
+    changed, *bounds, (runs, traces), (on_short, _), singularities = side_by_side(jobs, clock)
+    singular, near, near_traces = singularities
     scored = [run for run in runs if run["kind"] == "workspace"]
     along_x = {c: Trace(*(array[:, workspace] for array in traces[c, "x"])) for c in pids}
     goals = commands[0].for_starts(machine, reachable)
@@ -283,7 +301,7 @@ def compare(
     ours = claim("rl", pids, scored, along_x, goals, near.get("rl", []))
     results = {
         "task_space": tables(runs, scored),
-        "regret": less,
+        "regret": regret([*on_short, *(run for rows, _ in bounds for run in rows)]),
         "robustness": changed,
         "singular": singular,
         "claims": [a.to_json() | {"ours": b.to_json()} for a, b in zip(theirs, ours, strict=True)],

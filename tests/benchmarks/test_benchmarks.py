@@ -29,6 +29,7 @@ from brokk_min.identification.net_file import save_net
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import load_policy
 from brokk_min.machine import BROKK_170
+from examples import gradients
 
 
 @pytest.mark.parametrize("learner", list(peers.LEARNERS))
@@ -46,6 +47,12 @@ def test_race__trains_each_learner_and_notes_the_levels_it_reached(learner):
     assert row["reached"] == {}
     assert (steps, gradients) == (1024, row["gradient_steps"])
     assert (cpu, wall) == (row["cpu_s"], row["wall_s"]) and cpu > 0
+
+
+def test_gradients__are_compared_with_ppo(capsys):
+    errors = gradients.main(1024)
+    assert errors.keys() == {"gradients", "PPO"} and all(0 < e < 1 for e in errors.values())
+    assert capsys.readouterr().out.count(" m/s after ") == 2
 
 
 def test_best_run__is_the_first_at_a_level_or_the_closest():

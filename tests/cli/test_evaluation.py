@@ -103,6 +103,7 @@ def test_evaluate__writes_what_it_used(folder, capsys):
 
 def test_evaluate__tunes_baselines_without_gains(folder, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(baselines, "TUNING_RUNS", 1)
+    monkeypatch.setattr(baselines, "TUNING_SECONDS", 1.0)
     monkeypatch.setattr(baselines, "GENERATIONS", 1)
     (tmp_path / "p.npz").write_bytes(SHIPPED_POLICY.read_bytes())
     out = tmp_path / "e.json"

@@ -124,9 +124,9 @@ def test_tune_baselines__lowers_each_cost_and_records_it():
     machine = replace(BROKK_170, rate=5.0, plant_dt=0.02)  # faster to simulate
     net = obedient_net(machine)
     noiseless = TaskConfig(noise=0.0)
-    tuned, record = baselines.tune_baselines(machine, net, 2, 1, 3, noiseless)
+    tuned, record = baselines.tune_baselines(machine, net, 2, 1, 3, noiseless, longest=2)
     assert list(tuned) == list(record) == NAMES
-    start, goals = tuning_set(machine, 2, 3)
+    start, goals = tuning_set(machine, 2, 3, 2.0)
 
     def cost(controller):
         gains = baselines.split_vector(vector(controller)[None])

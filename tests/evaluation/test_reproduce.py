@@ -57,9 +57,13 @@ def test_reproduce__gives_the_same_bits_twice(folder, tmp_path, monkeypatch, cap
     for name in ("log.npz", "net.npz", "policy.npz", "gains.json", "results.json"):
         assert (folder / name).read_bytes() == (tmp_path / name).read_bytes(), name
     clock = json.loads((folder / "timing.json").read_text())
-    stages = ["record", "fit net", "fit net_paper", "fit", *(f"train {name}" for name in POLICIES)]
-    scores = ["score", "score near singularities", "score perfect model", "score changed machines"]
-    assert list(clock) == [*stages, "tune", "train and tune", *scores, "evaluate", "draw"]
+    trained = [f"train {name}" for name in ("rl_paper", "rl_open", "rl")]
+    stages = ["record", "fit net", "fit net_paper", "fit", *trained]
+    stages += [*(f"tune {name}" for name in PIDS), "train and tune"]
+    scores = ["changed machines", "perfect_model", "perfect_model_closed"]
+    stages += [f"score {name}" for name in scores]
+    stages += ["score", "score for the regret", "score near singularities", "evaluate", "draw"]
+    assert list(clock) == stages
     printed = capsys.readouterr().out
     assert printed.startswith("rl ") and printed.endswith(f"{tmp_path / 'results.json'}\n")
 
