@@ -1,15 +1,17 @@
-"""How far from what the computer can do: PPO gradient and kinematics.
+"""How far from what the computer can do: gradients of both learners, and kinematics.
 
-    python -m benchmarks.limits [--threads 2] [--json F]
+    python -m benchmarks.limits [--json F]
 
-PPO: operations per second of the matrix products in a gradient, compared with the better rate of
-torch and NumPy on the same shapes. Kinematics: compared with a loop over pinocchio. For the
-environment see `benchmarks.rollout`.
+Updates, PPO's and ours: operations per second of the matrix products in a gradient, compared with
+the better rate of torch and NumPy on the same shapes. Kinematics: compared with a loop over
+pinocchio. For the environment see `benchmarks.rollout`. Times are of CPU, of one thread, so that
+other work counts little.
 """
 
 from __future__ import annotations
 
 import os
+import time
 import timeit
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,12 +27,13 @@ import tyro
 from benchmarks import write
 from brokk_min import ppo
 from brokk_min.kinematics import forward_kinematics, jacobian
+from brokk_min.learning.episodes import GRADIENT_LEARNER
+from brokk_min.learning.simulation_gradient import regression_loss
 from brokk_min.machine import BROKK_170
 
 
 @dataclass
 class Options:
-    threads: int = 2  # Threads of torch and OpenBLAS.
     repeats: int = 15  # Timed blocks; what is compared is timed in turn, the least time counts.
     block_s: float = 0.1  # Length of a block [s].
     json: Path | None = None  # Also write the figures here.
@@ -38,7 +41,7 @@ class Options:
 
 def seconds(calls: dict[str, Callable[[], Any]], options: Options) -> dict[str, float]:
     """Least time of each call [s], all timed in turn: other work can only add to it."""
-    timers = {name: timeit.Timer(call) for name, call in calls.items()}
+    timers = {name: timeit.Timer(call, timer=time.process_time) for name, call in calls.items()}
     least = dict.fromkeys(calls, np.inf)
     for _ in range(options.repeats):
         for name, timer in timers.items():
@@ -57,16 +60,16 @@ def shapes(widths: tuple[int, ...], batch: int) -> list[tuple[int, int, int]]:
     return result
 
 
-def gradient(options: Options) -> dict[str, Any]:
+def gradient(loss_function: ppo.Loss, batch: int, options: Options) -> dict[str, Any]:
     """One minibatch of `ppo.train`: loss, gradient, step of Adam."""
-    batch = ppo.PPOConfig.minibatch_size
     agent = ppo.Agent(171, 4, -1.8, critic=False)
     optimizer = torch.optim.Adam(agent.parameters(), fused=True)
     mb = {"obs": torch.randn(batch, 171), "actions": torch.randn(batch, 4)}
     mb |= {"logprobs": torch.zeros(batch), "advantages": torch.randn(batch)}
+    mb |= {"means": torch.randn(batch, 4), "targets": torch.randn(batch, 4)}
 
     def step() -> None:
-        loss, _ = ppo.ppo_loss(agent, mb, ppo.PPOConfig())
+        loss, _ = loss_function(agent, mb, ppo.PPOConfig())
         optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(agent.parameters(), 1.0)
@@ -123,11 +126,13 @@ def kinematics(options: Options) -> dict[str, float]:
 
 
 def main(options: Options) -> dict[str, Any]:
-    torch.set_num_threads(options.threads)
+    torch.set_num_threads(1)
+    torch.set_float32_matmul_precision("medium")  # as `ppo.make_learner`
+    ours = GRADIENT_LEARNER["minibatch_size"]
     result = {
-        "threads": options.threads,
         "load": os.getloadavg(),
-        "gradient": gradient(options),
+        "gradient": gradient(ppo.ppo_loss, ppo.PPOConfig.minibatch_size, options),
+        "regression": gradient(regression_loss, ours, options),
         "kinematics": kinematics(options),
     }
     write(result, options.json)

@@ -2,12 +2,14 @@
 
     python -m benchmarks.neighbours [--busy 1] [--repeats 3]
 
-Quiet and busy runs take turns; the ratio is of their medians. All use one thread.
+Quiet and busy runs take turns; the ratios are of medians: of wall time, and of CPU time, which
+grows where threads spin while they wait. All use one thread. On a computer that is never quiet the
+wall time says little.
 """
 
 import multiprocessing
 import platform
-import timeit
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -53,8 +55,15 @@ def neighbours(num: int) -> Iterator[None]:
         process.join()
 
 
-def main(options: Options) -> dict[str, float]:
-    """Ratio of busy to quiet wall time of a training and of a fit."""
+def seconds(work: Callable[[], object]) -> list[float]:
+    """Wall and CPU time of a call [s]."""
+    start, cpu = time.perf_counter(), time.process_time()
+    work()
+    return [time.perf_counter() - start, time.process_time() - cpu]
+
+
+def main(options: Options) -> dict[str, list[float]]:
+    """Ratios of busy to quiet wall and CPU time of a training and of a fit."""
     net = load_policy(POLICY, M).net
     config = PPOConfig(**GRADIENT_LEARNER | {"total_steps": options.train_steps})
     log = excitation.collect(M, 0.05, "rich", np.random.default_rng(0))
@@ -70,11 +79,13 @@ def main(options: Options) -> dict[str, float]:
         for name, work in works.items():
             quiet, busy = [], []
             for _ in range(options.repeats):
-                quiet.append(timeit.timeit(work, number=1))
+                quiet.append(seconds(work))
                 with neighbours(options.busy):
-                    busy.append(timeit.timeit(work, number=1))
-            result[name] = float(np.median(busy) / np.median(quiet))
-            print(f"{name}: quiet {np.median(quiet):.1f} s, busy {result[name]:.2f} times as long")
+                    busy.append(seconds(work))
+            before, after = np.median(quiet, axis=0), np.median(busy, axis=0)
+            wall, cpu = result[name] = (after / before).tolist()
+            times = f"quiet {before[0]:.1f} s ({before[1]:.1f} s of CPU)"
+            print(f"{name}: {times}, busy {wall:.2f} times as long ({cpu:.2f} times the CPU)")
     print(platform.processor(), multiprocessing.cpu_count(), "cores")
     return result
 

@@ -1,4 +1,4 @@
-"""Environment steps per second on the nets, and their ratio to the bare products of the nets.
+"""Environment steps per second of CPU on the nets, and their ratio to the nets' bare products.
 
     python -m benchmarks.rollout [--actuator NET] [--num-envs 256] [--json F]
 
@@ -38,14 +38,14 @@ def main(options: Options) -> None:
     steps = []
     products = []
     for _ in range(5):
-        start = time.perf_counter()
+        start = time.process_time()
         for k in range(options.ticks):
             env.step(actions[k % 32])
-        steps.append(options.ticks * options.num_envs / (time.perf_counter() - start))
-        start = time.perf_counter()
+        steps.append(options.ticks * options.num_envs / (time.process_time() - start))
+        start = time.process_time()
         for _ in range(options.ticks):
             env.net.predict(history)
-        products.append(options.ticks * options.num_envs / (time.perf_counter() - start))
+        products.append(options.ticks * options.num_envs / (time.process_time() - start))
     result = {
         "num_envs": options.num_envs,
         "steps_per_second": {"median": float(np.median(steps)), "runs": steps},

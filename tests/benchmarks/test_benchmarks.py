@@ -83,8 +83,8 @@ def test_median__needs_most_of_the_seeds():
 
 def test_limits__are_measured(tmp_path):
     out = tmp_path / "l.json"
-    result = limits.main(limits.Options(repeats=1, threads=1, block_s=0.02, json=out))
-    assert result["gradient"]["fraction_of_best"] > 0
+    result = limits.main(limits.Options(repeats=1, block_s=0.02, json=out))
+    assert result["gradient"]["fraction_of_best"] > 0 < result["regression"]["fraction_of_best"]
     assert result["kinematics"]["us_per_configuration"] > 0
     assert json.loads(out.read_text())["gradient"] == result["gradient"]
 
@@ -104,7 +104,7 @@ def test_seeds__score_what_the_folder_has(tmp_path, capsys):
 def test_neighbours__are_slowed_by_numbers():
     ratios = neighbours.main(neighbours.Options(1, 1, 2048, 2))
     assert ratios.keys() == {"training", "fit"}
-    assert min(ratios.values()) > 0
+    assert min(min(wall_and_cpu) for wall_and_cpu in ratios.values()) > 0
 
 
 def test_shapes__are_the_products_of_a_gradient():
