@@ -81,9 +81,8 @@ def run_member(base: Machine, seed: int, out: Path, budget: Budget) -> dict[str,
     log = log._replace(recordings=log.recordings + own.recordings)
     every, jobs = trainings(machine, out, log, budget, seed, begun)
     net = select_nets(machine, every)
-    settings = budget.tuning_runs, budget.generations, seed
-    tune = partial(baselines.tune_baselines, machine, net, *settings)
-    jobs["tune"] = partial(tune, longest=budget.short_s)
+    settings = budget.tuning_runs, budget.generations, seed, None, None, budget.short_s
+    jobs["tune"] = partial(baselines.tune_baselines, machine, net, *settings)
     *trained, (pids, _) = reproduce.side_by_side(jobs, {})
     baselines.write_gains(out / "gains.json", pids, baselines.gains_metadata(machine, net))
     policies = {

@@ -131,9 +131,8 @@ def side_by_side(calls: Mapping[str, Callable[[], Any]], clock: dict[str, float]
         with ProcessPoolExecutor(min(cores, len(calls)), context, _one_thread) as pool, bar:
             futures = {pool.submit(_timed, call): name for name, call in calls.items()}
             bar.set_postfix_str(", ".join([*calls][:cores]))
-            for future in as_completed(futures):
-                future.result()  # or its exception
-                running = [name for other, name in futures.items() if not other.done()]
+            for _ in as_completed(futures):
+                running = [name for future, name in futures.items() if not future.done()]
                 bar.set_postfix_str(", ".join(running[:cores]))
                 bar.update()
             done = [future.result() for future in futures]
