@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -100,8 +101,9 @@ def memory_of(process: Any) -> dict[str, float]:
     begin, times, used = time.monotonic(), [], []
     while process.poll() is None:
         if time.monotonic() - begin > WARM_UP:
-            times.append((time.monotonic() - begin) / 3600)
-            used.append(memory(process.pid))
+            with suppress(IndexError):  # it has just ended
+                used.append(memory(process.pid))
+                times.append((time.monotonic() - begin) / 3600)
         time.sleep(1)
     if len(used) < 240:  # s; of less the growth is noise
         return {}

@@ -382,7 +382,7 @@ def test_run__ends_on_a_signal_with_a_neutral_frame(number, world, operator):
     world.downward = recording(out)
     operator.act = lambda: os.kill(os.getpid(), number) if world.drive.ticks == 20 else None
     handler = signal.getsignal(number)
-    world.drive.run(lambda text: shown.append((world.drive.ticks, text)))
+    world.drive.run(lambda drive: shown.append((drive.ticks, status(drive))))
     assert world.drive.ticks in (20, 21) and signal.getsignal(number) is handler
     assert [tick for tick, _ in shown[:3]] == [5, 10, 15] and shown[2][1].startswith("driving")
     before, last = [data for can_id, data in out if can_id == 0x210][-2:]
