@@ -15,6 +15,7 @@ class FitConfig:
     steps: int = number("steps", 0, 10**12, 16000)  # Adam steps.
     batch_size: int = number("1", 1, 10**6, 512)  # Windows per joint in each step.
     learning_rate: float = number("1", 1e-9, 1, 4e-3)  # Of Adam; falls to zero twice, by a cosine.
+    weight_decay: float = number("1", 0, 100, 0.0)  # Of AdamW; 0.3 for logs of a few minutes.
     noise: float = number("1", 0, 1000, 0.1)  # Of velocity inputs, in their deviations.
     hidden: int = number("1", 1, 10**4, 32)  # Units in each of the two hidden layers (paper: 32).
     history: int = number("samples", 2, 1000, 13)  # Of angle, velocity and command (paper: 13).

@@ -117,7 +117,8 @@ def train(data: TrainingSet, config: FitConfig, seed: int, estimator: int | None
     torch.set_num_threads(1)  # several wait in vain on busy cores
     generator = Generator().manual_seed(seed)
     weights = initial_weights(len(data.windows), config, generator)
-    optimizer = torch.optim.Adam(weights, lr=config.learning_rate)
+    decay = config.weight_decay  # 0: Adam
+    optimizer = torch.optim.AdamW(weights, lr=config.learning_rate, weight_decay=decay)
     multi_step = config.rollout > 1 and all(map(len, data.multi_step_windows))
     switch_step = round(0.65 * config.steps) if multi_step else config.steps
     schedule = torch.optim.lr_scheduler.LambdaLR(

@@ -63,6 +63,13 @@ def test_fit__repeats_itself_to_the_bit_in_full_precision():
     assert not same_weights(one, fit(log, config, seed=6, velocity_samples=4))
 
 
+def test_fit__has_smaller_weights_with_weight_decay():
+    log, config = simple_system(0, 3), FitConfig(steps=40, batch_size=64)
+    plain = fit(log, config, seed=5, velocity_samples=4)
+    decayed = fit(log, replace(config, weight_decay=5.0), seed=5, velocity_samples=4)
+    assert (decayed.weights[0] ** 2).mean() < 0.7 * (plain.weights[0] ** 2).mean()
+
+
 def test_fit__states_how_the_nets_were_fitted():
     log, config = simple_system(0, 2, 40), FitConfig(steps=0, history=5, dead_zone=0.25)
     net = fit(log, config, 7, 3, "toy")
