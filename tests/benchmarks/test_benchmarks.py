@@ -17,12 +17,14 @@ from benchmarks import (
     limits,
     neighbours,
     peers,
+    rests,
     seeds,
     step_logs,
 )
 from brokk_min import kinematics
 from brokk_min.env import action_to_pwm
-from brokk_min.evaluation import metrics
+from brokk_min.evaluation import metrics, sequences
+from brokk_min.evaluation.sequences import hold_table
 from brokk_min.identification.files import SHIPPED
 from brokk_min.identification.logs import read_log
 from brokk_min.identification.net_file import save_net
@@ -187,3 +189,12 @@ def test_faults__find_a_frozen_encoder_of_a_moving_joint_in_the_log_of_a_drive()
     seconds = rows[rows[:, 0] > 0.05, 1]
     assert len(seconds) > 50
     assert (seconds <= 0.175).mean() > 0.9
+
+
+def test_with_rests__keeps_the_moves():
+    (x, *_) = sequences.axis_sequences(BROKK_170)
+    rows = hold_table(BROKK_170, rests.with_rests(BROKK_170, x, 2.5).goals)
+    before = hold_table(BROKK_170, x.goals)
+    moves = before[:, 1:].any(axis=1)
+    np.testing.assert_allclose(rows[moves], before[moves])
+    np.testing.assert_allclose(rows[~moves], [[2.5, 0, 0, 0]] * (~moves).sum())
