@@ -40,6 +40,7 @@ class StaticMap:
 def static_map(machine: Machine, net: ActuatorNet) -> StaticMap:
     """Velocity at which each driven joint moves steadily, by its net, at each angle and command.
 
+    It moves alone, the others rest: nets that share latents know the pump that joints share.
     It is the fixed point v = net(history that moves at v). A history at rest would not do: nets
     may take its joint for one that stands at its stop.
     """
@@ -50,13 +51,14 @@ def static_map(machine: Machine, net: ActuatorNet) -> StaticMap:
     fraction = np.linspace(-1, 1, COMMANDS)[:, None]
     u = fraction * machine.pwm_limit / PWM_MAX  # (commands, 1)
     v = np.where(fraction > 0, net.output_high * fraction, -net.output_low * fraction)
-    v = np.tile(v, (ANGLES, 1, 1))  # (angles, commands, n_driven)
+    alone = np.eye(len(low))[:, None, None]  # the joint that moves, by joint
+    v = alone * np.tile(v, (ANGLES, 1, 1))  # (moving, angles, commands, n_driven)
     time = np.arange(1 - net.history, 1) / net.rate
     history = np.zeros((*v.shape, 3, net.history), np.float32)
-    history[..., 2, :] = u[..., None]
+    history[..., 2, :] = (alone * u)[..., None]
     for _ in range(60):
         history[..., 0, :] = q[..., None] + v[..., None] * time
         history[..., 1, :] = v[..., None]
-        v = 0.5 * v + 0.5 * net.predict(history)
-    rising = np.maximum.accumulate(v.transpose(2, 0, 1), axis=-1)
+        v = alone * (0.5 * v + 0.5 * net.predict(history))
+    rising = np.maximum.accumulate(v.sum(axis=-1), axis=-1)
     return StaticMap(q[:, 0].T, u[:, 0], rising)
