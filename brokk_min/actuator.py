@@ -34,7 +34,7 @@ class PlantState(NamedTuple):
 
 def plant_reset(machine: Machine, q: ArrayLike) -> PlantState:
     """The plant at rest at angles `q` [rad] (..., n): the analytic one, or `machine.plant`."""
-    if machine.plant:  # has `reset`, `step`; states have `q`, and `encoder` if encoders see others
+    if machine.plant:  # has `reset`, `step`; its state `q`, and `encoder` if not q is measured
         return machine.plant.reset(machine, q)  # type: ignore[no-any-return]
     q = np.array(q, float)
     zero = np.zeros_like(q)
@@ -244,7 +244,7 @@ class ActuatorNet:
         return x.reshape(*x.shape[:-2], 3 * self.history)
 
     def latents(self, x: Array) -> Array:
-        """What all nets share of all joints' inputs (batch, n, 3 H): pump, load; (batch, L).
+        """Latents (batch, L) of all joints' inputs (batch, n, 3 H), such as pump flow and load.
 
         z = tanh(sum_j S_j^T [x_j, |x_j|]) of standardised inputs x.
         """

@@ -33,7 +33,7 @@ class Drive:
         machine: its encoders and its valve controller are on the bus.
         controller: a policy or a baseline, `evaluation.rollout.Controller`.
         bus: `connection.Bus`, or a `drive_log.ReplayedBus`.
-        operator: takes whether the gate drives and whether it is ready; gives the tick's input.
+        operator: called with (gate drives, no fault is active); returns an `OperatorInput`.
     """
 
     def __init__(self, machine: Machine, controller: Any, bus: Any, operator: Operator) -> None:
@@ -84,7 +84,7 @@ class Drive:
         with self.catch_errors():
             entered = self.operator(bool(self.gate.driving), bool(self.gate.active_fault == 0))
             self.operator_input = canopen.unpack_operator_input(entered.pack())  # as in the log
-        self.nodes.frames *= 2  # a position from before its SYNC is as wrong as a doubled one
+        self.nodes.frames *= 2  # a position that came before SYNC is a fault, as two of a tick
         with self.catch_errors():
             self.bus.send(canopen.SYNC, b"")
             answer_by = self.bus.now() + ANSWER_TIME * self.machine.dt

@@ -118,7 +118,7 @@ class Gains:
     kd: Array  # valve opening per rad/s^2, (..., n_driven)
     feedback: Array  # K = feedback * I of eq3 [1], (..., 1)
     min_opening: Array  # least valve opening while the tool is to move [1], (..., 1)
-    # K_I of the error integral beside eq3 [1/s], (..., 1):
+    # K_I of the error integral, which eq3 does not have [1/s], (..., 1):
     integral_feedback: Array = field(default_factory=lambda: np.zeros(1))
 
 
@@ -200,7 +200,7 @@ class JacobianController:
         return u, PIDState(state.integral + step, error, derivative, q_dot_goal, rest_ticks)
 
     def _open_valves(self, opening: Array, v_goal: Array) -> Array:
-        """Commands u (..., n) that open the valves so far beyond the dead zone (..., n_driven)."""
+        """Commands u (..., n) of valve openings beyond the dead zone (..., n_driven)."""
         m = self.machine
         moving = np.linalg.norm(v_goal, axis=-1, keepdims=True) > 1e-6
         least = (moving | (self.valves == "open")) * self.gains.min_opening

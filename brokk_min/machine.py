@@ -88,12 +88,12 @@ class Joint:
             expected = "expected the triangle of a revolute joint within (0, pi) over its range"
             raise ValueError(f"{self.name}.cylinder_angle: {expected}, got {low:.3f} to {high:.3f}")
 
-    def complete(self, opening: float, turn: float) -> Joint:
-        """Encoder step; speeds, if none: q_dot_up and q_dot_down at the largest lever arm."""
+    def complete(self, opening: float, counts: int) -> Joint:
+        """With encoder step, and cylinder speeds (if 0) for q_dot_up, q_dot_down at `opening`."""
         r = self.cylinder_rod / opening
         up = self.speed_positive or self.q_dot_up * r
         down = self.speed_negative or self.q_dot_down * r
-        step = self.encoder_step if self.kind == "prismatic" else 2 * np.pi / turn
+        step = self.encoder_step if self.kind == "prismatic" else 2 * np.pi / counts
         return replace(self, speed_positive=up, speed_negative=down, encoder_step=step)
 
 

@@ -96,7 +96,7 @@ class Rollout(NamedTuple):
     terminated: Tensor
     dones: Tensor  # terminated or truncated
     next_obs: Tensor  # where an episode ended: its own last observation
-    infos: list[dict[str, Any]]  # what the environment said beside, tick by tick
+    infos: list[dict[str, Any]]  # of `env.step`, tick by tick
 
 
 Estimate = Callable[[Agent, Rollout, PPOConfig], dict[str, Tensor]]  # what a loss needs
