@@ -11,53 +11,30 @@ import numpy as np
 
 from brokk_min.machine import Joint, Machine
 
+# fmt: off
 SLEW = Joint(
-    name="slew",
-    driven=True,
-    a=0.0,
-    alpha=np.pi / 2,  # the lift's axis is level
-    d=1.2,  # m, height of its pivot
-    theta=0.0,
-    q_min=-2.5,  # rad
-    q_max=2.5,
-    q_dot_up=0.25,  # rad/s at the command limit
-    q_dot_down=0.25,
+    name="slew", driven=True,
+    a=0.0, alpha=np.pi / 2, d=1.2, theta=0.0,  # m, height of the lift's pivot; its axis is level
+    q_min=-2.5, q_max=2.5,  # rad
+    q_dot_up=0.25, q_dot_down=0.25,  # rad/s at the command limit
     encoder_node=0x31,
     cylinder_rod=0.20,
 )
 LIFT = Joint(
-    name="lift",
-    driven=True,
-    a=0.0,
-    alpha=np.pi / 2,  # z now points along the boom,
-    d=0.0,
-    theta=np.pi / 2,  # and x across it, upwards
-    q_min=-0.2,
-    q_max=1.2,
-    q_dot_up=0.15,
-    q_dot_down=0.22,
+    name="lift", driven=True,
+    a=0.0, alpha=np.pi / 2, d=0.0, theta=np.pi / 2,  # z now along the boom, x across it, upwards
+    q_min=-0.2, q_max=1.2,
+    q_dot_up=0.15, q_dot_down=0.22,
     encoder_node=0x32,
-    cylinder_base=1.0,
-    cylinder_rod=0.4,
-    cylinder_angle=0.6,
-    cylinder_area=0.008,
+    cylinder_base=1.0, cylinder_rod=0.4, cylinder_angle=0.6, cylinder_area=0.008,
 )
 TELESCOPE = Joint(
-    name="telescope",
-    kind="prismatic",
-    driven=True,
-    a=0.0,
-    alpha=0.0,
-    d=3.0,  # m, retracted
-    theta=0.0,
-    q_min=0.0,  # m
-    q_max=1.8,
-    q_dot_up=0.25,  # m/s
-    q_dot_down=0.30,
-    encoder_node=0x33,
+    name="telescope", driven=True, kind="prismatic",
+    a=0.0, alpha=0.0, d=3.0, theta=0.0,  # m, retracted
+    q_min=0.0, q_max=1.8,  # m
+    q_dot_up=0.25, q_dot_down=0.30,  # m/s
+    encoder_node=0x33, encoder_zero=5000, encoder_sign=-1,
     encoder_step=2e-4,  # m a count, of a linear encoder
-    encoder_zero=5000,
-    encoder_sign=-1,
     weight=1 / 4.0**2,
 )
 TELESCOPIC_CRANE = Machine(
@@ -71,7 +48,7 @@ TELESCOPIC_CRANE = Machine(
     history=7,  # samples: 0.6 s
     tool_speed=0.3,
     ground=0.0,
-    valve_frame_id=0x220,
-    controller_node=0x40,
+    valve_frame_id=0x220, controller_node=0x40,
     pump_flow=0.0020,
 )
+# fmt: on

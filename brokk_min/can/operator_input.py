@@ -72,7 +72,7 @@ class Joystick:
         self.pygame.display.init()
         self.pygame.joystick.init()
         if not self.pygame.joystick.get_count():
-            raise ValueError("joystick: expected one, got none")
+            raise ValueError("joystick: expected one, or --command FILE.csv, got none")
         self.speed = machine.tool_speed
         self.axes = axes
         self.button = button

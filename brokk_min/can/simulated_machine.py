@@ -1,4 +1,4 @@
-"""A machine to try the hardware path on: CANopen encoders and a valve controller, the plant behind.
+"""A machine to try the hardware path on: CANopen encoders and a valve controller, a plant behind.
 
 It plays the part of a real Brokk on the bus; the program that drives it cannot tell.
 """
@@ -29,7 +29,7 @@ Frames = list[tuple[int, bytes]]  # identifiers and data
 
 
 class SimulatedMachine:
-    """CiA 406 encoders and a valve controller on one bus, the analytic plant behind them.
+    """CiA 406 encoders and a valve controller on one bus, the machine's plant behind them.
 
     The plant moves by its own clock. A valve frame is refused if its counter, checksum or length is
     wrong, or if it is not the first since a SYNC. With more than five joints the valves follow once
@@ -239,10 +239,12 @@ def simulate(
         print("run", "time", *names, "valid", sep=",", file=file)
 
         def write(now: float, u: Array, q: Array, valid: float) -> None:
+            """One row of `record`."""
             numbers = [*(f"{x:.7g}" for x in (*u, *q)), f"{valid - start:.6f}"]
             print("plant", f"{now - start:.3f}", *numbers, sep=",", file=file)
 
         def report(reason: str) -> None:
+            """Print when and why the valve controller stops."""
             print(f"{bus.now() - start:.3f} s, valve controller stops: {reason}", flush=True)
 
         serve(SimulatedMachine(machine, pose, start, write, report), bus, lambda: not signals)

@@ -50,13 +50,14 @@ class Evaluate(Command):
     plant: PlantName = "analytic"  # What moves: analytic, net, or an object of your file.
     json: Path | None = None  # Also write all runs here.
     gains: Path | None = None  # Tuned gains; by default gains.json in the folder of POLICY.
+    save_gains: Path | None = None  # Write the gains that are tuned now, for --gains and `drive`.
     num_starts: int = number("1", 1, 10**6, 16)  # Without --starts: how many of the machine's.
     noise: float = number("1", 0, 1, 0.05)  # Sensor noise [deviations]; 0: encoders only.
     perfect_model: bool = False  # Also a bound: a controller with the plant as its model (minutes).
     all: bool = False  # Print all figures by kind of start, not the table alone.
 
     def __call__(self) -> None:
-        machine = self.check(json="runs")
+        machine = self.check(json="runs", save_gains="gains")
         if self.perfect_model and self.plant != "analytic":
             raise WrongUse(
                 f"--perfect-model: expected --plant analytic, its model, got {self.plant}"
@@ -64,6 +65,8 @@ class Evaluate(Command):
         path, gains = default_policy(machine, self.policy, self.gains)
         if self.noise != TaskConfig.noise:
             gains = self.gains  # others were tuned with more noise
+        if gains and self.save_gains:
+            raise WrongUse(f"--save-gains: expected gains to tune, got tuned ones in {gains}")
         policy = load_policy(path, machine)
         machine = with_plant(machine, self.plant, ["analytic", "net"])
         net = policy.net if self.plant == "net" else None
@@ -104,6 +107,9 @@ class Evaluate(Command):
         budget = (baselines.TUNING_RUNS, baselines.GENERATIONS, self.seed)
         config = TaskConfig(noise=self.noise)
         tuned, _ = baselines.tune_baselines(machine, policy.net, *budget, config, net)
+        if self.save_gains:
+            meta = baselines.gains_metadata(machine, policy.net)
+            baselines.write_gains(self.save_gains, tuned, meta)
         return controllers | tuned
 
 

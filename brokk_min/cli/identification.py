@@ -17,7 +17,7 @@ from brokk_min.identification import excitation, inspection, validation
 from brokk_min.identification.coupling import history_of
 from brokk_min.identification.files import brief, located, write_json
 from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
-from brokk_min.identification.logs import Log, part_of, read_log, split, write_log
+from brokk_min.identification.logs import RETURN, Log, part_of, read_log, split, write_log
 from brokk_min.identification.net_file import load_net, save_net
 from brokk_min.identification.recovery import recovery
 from brokk_min.learning.policy import PolicyController, load_policy
@@ -44,8 +44,8 @@ class Collect(Command):
 
     out: Path  # Log to write, .csv or .npz.
     hours: float = number("h", 1e-4, 100, 1.0)  # Driving time for each actuator [h].
-    excitation: Literal["sine", "rich", "joint"] = "rich"
-    """The paper's sines; steps and holds too; or the same on all joints at once: HOURS in all."""
+    excitation: Literal["sine", "rich", "joint"] | None = None
+    """The paper's sines; steps and holds too (the default); these on all joints, HOURS in all."""
     policy: Path | None = None  # It drives instead: fit to its log, too, and train again.
     plant: PlantName = "analytic"  # What moves: the analytic plant, or an object of your file.
 
@@ -53,15 +53,18 @@ class Collect(Command):
         machine = self.check(out="log")
         if self.out.suffix not in (".csv", ".npz"):
             raise WrongUse(f"--out: expected a name ending in .csv or .npz, got {self.out}")
+        if self.policy and self.excitation:
+            raise WrongUse(f"--excitation: expected none with --policy, got {self.excitation}")
         rng = np.random.default_rng(self.seed)
         machine = with_plant(machine, self.plant, ["analytic"])
         if self.policy:
             driver = PolicyController(machine, load_policy(self.policy, machine))
             log = own_drives(machine, [driver], self.hours, self.seed)
         else:
-            log = excitation.collect(machine, self.hours, self.excitation, rng)
+            log = excitation.collect(machine, self.hours, self.excitation or "rich", rng)
         write_log(self.out, log)
-        print(f"{self.out}: {len(log.recordings)} recordings of {', '.join(log.joints)}")
+        num = sum(not one.name.endswith(RETURN) for one in log.recordings)
+        print(f"{self.out}: {num} recordings of {', '.join(log.joints)}")
 
 
 @dataclass(frozen=True)
@@ -266,11 +269,11 @@ class Inspect(Command):
         report = inspection.report_json(log, known)
         if self.json:
             write_json(self.json, {"meta": {"logs": list(map(str, self.logs))}, **report})
-        print_report(log, report, known)
+        print_report(log, report, machine)
 
 
-def print_report(log: Log, report: dict[str, Any], machine: Machine | None) -> None:
-    """A table of `inspection.report_json`, what a known machine says instead, and warnings."""
+def print_report(log: Log, report: dict[str, Any], machine: Machine) -> None:
+    """A table of `inspection.report_json`, fields of a known machine, and warnings."""
     velocity = "logged" if log.velocity_logged else "estimated"
     print(f"{len(log.recordings)} recordings, {report['gaps']} begin after a gap; q_dot {velocity}")
     row = " ".join(["{:14}", *["{:>9}"] * len(COLUMNS)])
@@ -281,8 +284,21 @@ def print_report(log: Log, report: dict[str, Any], machine: Machine | None) -> N
         if together:
             parts = ", ".join(f"{other} {part:.0%}" for other, part in together.items())
             print(f"  with commands of {parts}")
-    if machine:
-        zones = machine.dead_zone, machine.largest_dead_zone or machine.dead_zone
-        print(f"{machine.name}: dead zones {zones[0]:g} to {zones[1]:g}, delay {machine.delay:g} s")
+    if "fields" in report:
+        print_fields(report["fields"], machine)
     for warning in report["warnings"]:
         print(f"warning: {warning}")
+
+
+def print_fields(fields: dict[str, Any], machine: Machine) -> None:
+    """`inspection.fields`, and in brackets what the machine has."""
+    print(f"fields of {machine.name} by this log (now):")
+    zones = machine.dead_zone, machine.largest_dead_zone
+    pairs = zip(("dead_zone", "largest_dead_zone"), zones, strict=True)
+    print(", ".join(f"{field} {fields[field]:.3f} ({now:g})" for field, now in pairs))
+    for i, name in enumerate(machine.names):
+        if name in fields["q_dot_up"]:
+            up, down = (fields[field][name] for field in ("q_dot_up", "q_dot_down"))
+            now = machine.joints[i]
+            up_now, down_now = f"({now.q_dot_up:g})", f"({now.q_dot_down:g})"
+            print(f"{name}: q_dot_up {up:.2f} {up_now}, q_dot_down {down:.2f} {down_now}")

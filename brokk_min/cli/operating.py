@@ -17,7 +17,7 @@ from brokk_min.can.dbc import dbc
 from brokk_min.can.drive_log import read_frames
 from brokk_min.can.operator_input import JointJog, Joystick, Script
 from brokk_min.can.simulated_machine import simulate
-from brokk_min.cli.options import Command, WrongUse, default_policy
+from brokk_min.cli.options import Command, PlantName, WrongUse, default_policy, with_plant
 from brokk_min.evaluation import baselines
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.evaluation.sequences import read_commands
@@ -35,15 +35,16 @@ if TYPE_CHECKING:
 
 @dataclass(kw_only=True)
 class Simulate(Command):
-    """Put a simulated machine on a CAN bus: encoders, valve controller, the analytic plant."""
+    """Put a simulated machine on a CAN bus: encoders, valve controller, a plant behind them."""
 
     interface: str  # python-can's name of the bus, udp_multicast for a try without hardware.
     channel: str  # Channel of the interface, for udp_multicast 239.74.163.2.
     start: tuple[float, ...] = ()  # First angles [rad]; by default the paper's, or mid-range.
     record: Path | None = None  # Also log commands and true angles of each plant step, .csv.
+    plant: PlantName = "analytic"  # What moves, every `plant_dt`: or an object of your file.
 
     def __call__(self) -> None:
-        machine = self.check(record="plant record")
+        machine = with_plant(self.check(record="plant record"), self.plant, ["analytic"])
         print(f"{self.machine} on {self.interface} {self.channel}; Ctrl-C ends it", flush=True)
         simulate(machine, self.start, self.interface, self.channel, self.record)
 

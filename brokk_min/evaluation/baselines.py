@@ -209,9 +209,11 @@ def tune(
     costs: list[float] = []
 
     def gains(x: Array) -> Gains:
+        """Gains at fractions (..., 3 n_driven + 3); those not searched stay 0."""
         return split_vector(np.where(searched, gains_vector(gains_of(machine, x)), 0.0))
 
-    def objective(x: Array) -> Any:  # (searched gains, candidates) -> (candidates,)
+    def objective(x: Array) -> Any:
+        """The cost (candidates,) of fractions (searched gains, candidates)."""
         every = np.zeros((x.shape[1], len(start)))
         every[:, searched] = x.T
         return cost(replace(controller, gains=gains(every)))
@@ -219,6 +221,7 @@ def tune(
     with tqdm(total=generations, desc=f"tune {label}", unit="generation", disable=None) as bar:
 
         def record(intermediate_result: Any) -> None:
+            """Keep the least cost of a generation."""
             costs.append(float(intermediate_result.fun))
             bar.update()
 
@@ -252,12 +255,12 @@ def write_gains(
 
 
 def read_gains(path: Path, machine: Machine, net: ActuatorNet) -> dict[str, JacobianController]:
-    """The baselines with gains that `reproduce` wrote.
+    """The baselines with gains that `write_gains` wrote.
 
     ValueError: no such file, or gains of other controllers, of another machine, or of other nets.
     """
     controllers = baselines(machine, net)
-    file = read_json(path, "gains of `reproduce`")
+    file = read_json(path, "gains of `reproduce` or `evaluate --save-gains`")
     check_fields(path, file, {"meta": META}, {})
     expect_same(path, file["meta"], gains_metadata(machine, net))
     check_fields(path, file, {"gains": Field("object")}, {})

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from brokk_min.identification.logs import COMMANDED, Log, Recording, driven
-from brokk_min.machine import Array, Machine
+from brokk_min.machine import PWM_MAX, Array, Machine
 
 LARGEST_ZONE = 0.4  # of full command, assumed
 ZONES = np.arange(0, LARGEST_ZONE, 0.005)
@@ -52,7 +52,7 @@ class JointReport:
     tau: float  # s
     dead_zone_up: float
     dead_zone_down: float
-    gain_up: float  # rad/s per full opening
+    gain_up: float  # rad/s per command beyond the dead zone
     gain_down: float
 
 
@@ -218,7 +218,7 @@ def warnings(
             continue
         r = reports[name]
         checks = {
-            f"{r.minutes:.1f} minutes": r.minutes < LEAST_MINUTES,
+            f"{r.minutes:.1f} of {LEAST_MINUTES:g} minutes": r.minutes < LEAST_MINUTES,
             f"commands of {r.levels[0]} of {LEVELS} levels up, {r.levels[1]} down": (
                 min(r.levels) < LEAST_LEVELS
             ),
@@ -240,10 +240,24 @@ def warnings(
     return result
 
 
+def fields(reports: dict[str, JointReport], machine: Machine) -> dict[str, Any]:
+    """Fields of a machine by a log of it: dead zones, and fastest motions at the command limit."""
+    known = {name: reports[name] for name in machine.names if name in reports}
+    limit = machine.pwm_limit / PWM_MAX
+    zones = [zone for r in known.values() for zone in (r.dead_zone_up, r.dead_zone_down)]
+    return {
+        "dead_zone": min(zones),
+        "largest_dead_zone": max(zones),
+        "q_dot_up": {k: r.gain_up * max(limit - r.dead_zone_up, 0) for k, r in known.items()},
+        "q_dot_down": {k: r.gain_down * max(limit - r.dead_zone_down, 0) for k, r in known.items()},
+    }
+
+
 def report_json(log: Log, machine: Machine | None = None) -> dict[str, Any]:
     """All reports of a log, its warnings and its gaps, for JSON."""
     reports = inspect(log)
     gaps = sum("#" in recording.name for recording in log.recordings)
+    known = {"fields": fields(reports, machine)} if machine and reports else {}
     return {
         "rate": log.rate,
         "recordings": len(log.recordings),
@@ -251,4 +265,5 @@ def report_json(log: Log, machine: Machine | None = None) -> dict[str, Any]:
         "velocity_logged": log.velocity_logged,
         "joints": {name: asdict(report) for name, report in reports.items()},
         "warnings": warnings(log, reports, machine),
+        **known,
     }

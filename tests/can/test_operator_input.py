@@ -87,7 +87,7 @@ def test_joystick__notices_that_its_device_goes_and_another_comes():
 
 
 def test_joystick__refuses_a_device_without_its_axes_or_button():
-    with pytest.raises(ValueError, match="joystick: expected one, got none"):
+    with pytest.raises(ValueError, match="joystick: expected one, or --command"):
         Joystick(BROKK_170)
     device = Virtual()
     refusal = r"joystick: expected axes \[1, 0, 6\] and button 5, got 6 and 8"

@@ -92,7 +92,7 @@ def test_drive__refuses_in_one_line_to_drive_without_machine_joystick_or_slow_go
     fast.write_text("sequence,time,vx,vy,vz\nf,0,1,0,0\nf,1,0,0,0\n")
     for source, refusal in (
         (commands, "node 1: object 0x6501:00: expected an answer"),
-        ("joystick", "joystick: expected one, got none"),
+        ("joystick", "joystick: expected one, or --command FILE.csv, got none"),
         (fast, "command: expected at most 0.3 m/s, got 1 m/s"),
     ):
         assert run(*drive, "--command", source) == 1

@@ -108,10 +108,17 @@ def test_evaluate__tunes_baselines_without_gains(folder, tmp_path, capsys, monke
     (tmp_path / "p.npz").write_bytes(SHIPPED_POLICY.read_bytes())
     out = tmp_path / "e.json"
     files = f"--policy '{tmp_path}/p.npz' --commands '{folder}/c.csv'"
-    assert run(f"evaluate {files} --num-starts 1 --json", out) == 0
+    tuned = tmp_path / "pid.json"
+    assert run(f"evaluate {files} --num-starts 1 --save-gains '{tuned}' --json", out) == 0
     assert "gains of the baselines: tuned now" in capsys.readouterr().err
-    meta = json.loads(out.read_text())["meta"]
-    assert (meta["gains"], meta["starts"]) == ("tuned now", "1")
+    first = json.loads(out.read_text())
+    assert (first["meta"]["gains"], first["meta"]["starts"]) == ("tuned now", "1")
+    files += f" --gains '{tuned}' --num-starts 1"
+    assert run(f"evaluate {files} --json", out) == 0
+    again = json.loads(out.read_text())
+    assert again["meta"]["gains"] == str(tuned) and again["runs"] == first["runs"]
+    assert run(f"evaluate {files} --save-gains", tmp_path / "other.json") == 2
+    assert "--save-gains: expected gains to tune, got tuned ones in" in capsys.readouterr().err
 
 
 def test_shipped_policy__beats_the_papers_controllers(tmp_path):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers_cli import run
 
-from brokk_min.identification.logs import Log, Recording, write_log
+from brokk_min.identification.logs import Log, Recording, read_log, write_log
 from brokk_min.identification.net_file import load_net
 from brokk_min.machine import BROKK_170
 
@@ -137,3 +137,12 @@ def test_fit__refuses_the_log_of_another_machine(tmp_path, capsys):
         "log.csv: joints: expected those of --machine brokk170, got ('a', 'b')"
         in capsys.readouterr().err
     )
+
+
+def test_collect__has_a_policy_or_an_excitation(tmp_path, capsys):
+    out = tmp_path / "log.npz"
+    assert run(f"collect --policy p.npz --excitation rich --out '{out}'") == 2
+    assert "--excitation: expected none with --policy, got rich" in capsys.readouterr().err
+    assert run(f"collect --hours 0.0002 --out '{out}'") == 0
+    recordings = len(read_log([out], 4).recordings)  # without returns to the start
+    assert f"log.npz: {recordings} recordings of q1, q2, " in capsys.readouterr().out

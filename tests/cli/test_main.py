@@ -25,7 +25,7 @@ OPTIONS = {
     "evaluate": "--policy --commands --starts --num-starts --perfect-model --plant --json --gains",
     "reproduce": "--out --quick --sweep",
     "family": "--out --members --quick",
-    "machine": "--interface --channel --start --record",
+    "machine": "--interface --channel --start --record --plant",
     "drive": "--policy --interface --channel --command --controller --counts --log --replay",
     "convert": "--out",
     "diagnose": "--policy --json --figure",

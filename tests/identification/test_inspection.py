@@ -13,6 +13,7 @@ from brokk_min.identification.inspection import (
     REACTS,
     check_signs,
     feedback,
+    fields,
     inspect,
     reaction,
     warnings,
@@ -160,6 +161,16 @@ def test_warnings__know_the_range_of_a_machine():
     reports["q1"] = replace(reports["q1"], low=-1.0, high=1.0)
     about, _ = warnings(log, reports, BROKK_170)
     assert about == "q1: 47% of the range: scores hold for such driving alone"
+
+
+def test_fields__are_those_of_the_machine():
+    """A gain of 0.5 from a dead zone of 0.12 on: 0.5 * (80 / 127 - 0.12) rad/s at the limit."""
+    report = replace(inspect(excited(["boom"]))["boom"], dead_zone_up=0.12, dead_zone_down=0.2)
+    report = replace(report, gain_up=0.5, gain_down=0.3)
+    found = fields({"q1": report, "q3": replace(report, dead_zone_up=0.05)}, BROKK_170)
+    assert (found["dead_zone"], found["largest_dead_zone"]) == (0.05, 0.2)
+    assert found["q_dot_up"]["q1"] == pytest.approx(0.255, abs=1e-3)
+    assert found["q_dot_down"]["q1"] == pytest.approx(0.129, abs=1e-3)
 
 
 def test_commands__print_what_a_log_tells_and_refuse_reversed_commands(tmp_path, capsys):

@@ -12,11 +12,11 @@ from helpers_bus import World
 
 from brokk_min.__main__ import main
 from brokk_min.can.operator_input import Script
+from brokk_min.cli.options import with_plant
 from brokk_min.evaluation import baselines
 from brokk_min.evaluation.feasibility import speed_limits
-from brokk_min.evaluation.sequences import axis_sequences, draw_starts
 from brokk_min.identification.logs import read_log
-from brokk_min.identification.net_file import load_net, select_nets
+from brokk_min.identification.net_file import load_net
 from brokk_min.jacobian import Gains, JacobianController, manipulability_threshold
 from brokk_min.kinematics import forward_kinematics, tool_position
 
@@ -24,7 +24,9 @@ ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "porting.md").read_text()
 COMMANDS = [shlex.split(line) for line in re.findall(r"^brokk-min (.*)$", PAGE, re.M)]
 PYTHON = re.findall(r"^```python\n(.*?)^```", PAGE, re.M | re.S)
+MOTIONS = re.search(r"^```csv\n(.*?)^```", PAGE, re.M | re.S)[1]
 QUICK = {
+    "starts": "--num 1",
     "collect": "--hours 0.01",
     "fit": "--steps 30",
     "train": "--total-steps 1024 --num-envs 16 --horizon 16 --minibatch-size 128 --threads 1",
@@ -90,23 +92,20 @@ def test_page__has_blocks_of_python_that_run(here, capsys):
     assert log.recordings[0].u[0, 3] == pytest.approx(np.average(u, weights=(3, 2, 3, 2)))
 
 
-def test_page__has_commands_that_run_one_after_the_other(here, mini):
-    start = draw_starts(mini, axis_sequences(mini), 1, np.random.default_rng(0))[0]
-    Path("starts.csv").write_text(",".join(mini.names) + "\n" + ",".join(map(str, start)) + "\n")
-    Path("commands.csv").write_text("sequence,time,vx,vy,vz\nout,0,0.2,0,0\nout,1,0,0,0\n")
+def test_page__has_commands_that_run_one_after_the_other(here, mini, monkeypatch):
+    for name, value in {"TUNING_RUNS": 1, "TUNING_SECONDS": 1.0, "GENERATIONS": 1}.items():
+        monkeypatch.setattr(baselines, name, value)
+    Path("commands.csv").write_text(MOTIONS)
     names = [words[0] for words in COMMANDS]
-    first = ["collect", "inspect", "fit", "score", "train", "evaluate"]
+    first = ["starts", "collect", "inspect", "fit", "score", "train", "evaluate"]
     assert names == [*first, "collect", "fit", "train", "dbc", "machine", "drive", "diagnose"]
-    for words in COMMANDS[:10]:
-        if words[0] == "evaluate":  # gains, so that nothing is tuned
-            net = select_nets(mini, load_net(Path("net.npz")))
-            meta = baselines.gains_metadata(mini, net)
-            baselines.write_gains(Path("gains.json"), baselines.baselines(mini, net), meta)
+    for words in COMMANDS[:11]:
         short = [word for word in words if word not in ("--hours", "1")]
         assert main([*short, *QUICK.get(words[0], "").split()]) == 0, words
         if words[0] == "evaluate":  # on the plant that was recorded, too
-            own = ["own_plant.py:PLANT" if word == "net" else word for word in short[:-2]]
-            assert main([*own, *QUICK["evaluate"].split(), "--json", "own.json"]) == 0
+            own = ["own_plant.py:PLANT" if word == "net" else word for word in words[:-4]]
+            own += ["--gains", "pid.json", "--json", "own.json"]
+            assert main([*own, *QUICK["evaluate"].split()]) == 0
     assert json.loads(Path("own.json").read_text())["meta"]["plant"] == "own_plant.py:PLANT"
     assert len(json.loads(Path("fit.json").read_text())["curve"]) == 4
     recovered = json.loads(Path("fit.json").read_text())["recovery"]["bucket"]
@@ -121,15 +120,17 @@ def test_page__has_commands_that_run_one_after_the_other(here, mini):
 
 def test_page__has_commands_of_the_bus(here, capsys):
     """They need two programs; here the options are read, and what they name is not there."""
-    for words in COMMANDS[10:]:
+    for words in COMMANDS[11:]:
         assert main(["nonsense" if word == "udp_multicast" else word for word in words]) == 1
         message = capsys.readouterr().err
         assert any(name in message for name in ("nonsense", "policy.npz", "joystick", "run.log"))
 
 
-@pytest.mark.parametrize("axis", range(3))
-def test_example__is_driven_over_the_bus(mini, axis):
+@pytest.mark.parametrize(("axis", "plant"), [(0, None), (1, None), (2, None), (0, "own")])
+def test_example__is_driven_over_the_bus(mini, axis, plant):
     """Its own identifiers, zeros and signs: the tool moves at 0.15 m/s outward, sideways or up."""
+    if plant:
+        mini = with_plant(mini, f"{ROOT / 'examples' / 'own_plant.py'}:PLANT", [])
     one, feedback, min_opening = np.ones(4), np.array([0.3]), np.zeros(1)
     gains = Gains(one, 3 * one, 0 * one, feedback, min_opening)
     controller = JacobianController(mini, gains, 0.1, manipulability_threshold(mini))
