@@ -117,7 +117,7 @@ def step_velocity(angles: Array, rate: float) -> Array:
 def response_times(angles: Array, rate: float, rise: float = RISE) -> Array:
     """Time [s] (2, 2, n) from the step to `rise` of the change of velocity; nan: no change.
 
-    Velocities are means over a tick, taken at its middle, with lines between them.
+    Velocities are means over a tick, taken at its middle, with lines between them; none is < 0.
     """
     wait = (len(angles) - 1) // 2
     after = step_velocity(angles, rate)[wait - 1 :]
@@ -126,7 +126,7 @@ def response_times(angles: Array, rate: float, rise: float = RISE) -> Array:
     at = np.maximum(np.argmax(part >= rise, axis=0), 1)  # row k: the tick k - 1 after the step
     high = np.take_along_axis(part, at[None], axis=0)[0]
     low = np.take_along_axis(part, at[None] - 1, axis=0)[0]
-    return np.asarray((at - 0.5 - (high - rise) / (high - low)) / rate)
+    return np.asarray(np.maximum(at - 0.5 - (high - rise) / (high - low), 0) / rate)
 
 
 def step_commands(

@@ -64,6 +64,8 @@ def test_response_times__of_a_pure_delay_by_hand(late):
     angles = steps(simulate, -np.ones(2), np.ones(2), level, 0 * level, 30)
     assert angles.shape == (61, 2, 2, 2, 2)
     np.testing.assert_allclose(response_times(angles, 20.0), (late + 0.63 - 0.5) / 20, atol=1e-9)
+    begins = response_times(angles, 20.0, 0.05)  # without a delay the line passes before the step
+    np.testing.assert_allclose(begins, max(late + 0.05 - 0.5, 0) / 20, atol=1e-9)
     speeds = step_velocity(angles, 20.0)
     np.testing.assert_allclose(speeds[-1], [[[0.2, 0.2], [0.4, 0.4]]] * 2)  # positive up and down
 
