@@ -97,8 +97,8 @@ def test_page__has_commands_that_run_one_after_the_other(here, mini, monkeypatch
         monkeypatch.setattr(baselines, name, value)
     Path("commands.csv").write_text(MOTIONS)
     names = [words[0] for words in COMMANDS]
-    first = ["starts", "collect", "inspect", "fit", "score", "train", "evaluate"]
-    assert names == [*first, "collect", "fit", "train", "dbc", "machine", "drive", "diagnose"]
+    first = ["starts", "collect", "inspect", "fit", "train", "evaluate", "collect", "score"]
+    assert names == [*first, "fit", "train", "dbc", "machine", "drive", "diagnose"]
     for words in COMMANDS[:11]:
         short = [word for word in words if word not in ("--hours", "1")]
         assert main([*short, *QUICK.get(words[0], "").split()]) == 0, words
