@@ -34,7 +34,7 @@ class PPOConfig:
     minibatch_size: int = number("steps", 2, 10**7, 2048)  # Steps in one gradient.
     learning_rate: float = number("1", 1e-9, 1, 1.2e-3)  # Of Adam, at most; falls to zero.
     target_kl: float = number("1", 1e-9, 1e9, 0.03)  # KL divergence that keeps the learning rate.
-    gamma: float = number("1", 0, 0.9999, 0.8)  # Discount a tick: 0.8 looks 5 ticks ahead.
+    gamma: float = number("1", 0, 0.9999, 0.9)  # Discount a tick: 0.9 looks 10 ticks ahead.
     gae_lambda: float = number("1", 0, 1, 0.95)  # Weight of longer returns in the advantage.
     clip: float = number("1", 1e-9, 1e9, 0.2)  # Largest rewarded change of a probability ratio.
     entropy: float = number("1", 0, 1000, 0.0)  # Coefficient of the entropy bonus.

@@ -42,7 +42,7 @@ class LearnerSettings:
     minibatch_size: int = 2048  # Steps in one gradient.
     learning_rate: float = 1.2e-3  # Of Adam, at most; falls to zero.
     target_kl: float = 0.03  # KL divergence that keeps the learning rate.
-    gamma: float = 0.8  # Discount a tick: 0.8 looks 5 ticks ahead.
+    gamma: float = 0.9  # Discount a tick: 0.9 looks 10 ticks ahead.
     gae_lambda: float = 0.95  # Weight of longer returns in the advantage.
     clip: float = 0.2  # Largest rewarded change of a probability ratio.
     entropy: float = 0.0  # Coefficient of the entropy bonus.
