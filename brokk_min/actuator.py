@@ -145,7 +145,7 @@ def append_sample(history: Array, u: ArrayLike, q: Array, window: int, dt: float
     The velocity is the slope of the newest `window` angles.
     """
     result = np.empty(history.shape, history.dtype)
-    result.reshape(-1)[:-1] = history.reshape(-1)[1:]  # all rows in one copy
+    result[..., :-1] = history[..., 1:]
     result[..., 0, -1] = q
     result[..., 1, -1] = estimate_velocity(result[..., 0, :], window, dt)
     result[..., 2, -1] = u

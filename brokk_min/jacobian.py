@@ -195,9 +195,9 @@ class JacobianController:
         may_open, rest_ticks = close_valves(
             m, self.valves, np.ones_like(opening), measured.v_goal, state.rest_ticks
         )
-        step = np.where(saturated, 0.0, may_open * gains.ki * error * m.dt)  # anti-windup
+        increase = np.where(saturated, 0.0, may_open * gains.ki * error * m.dt)  # anti-windup
         u = self._open_valves(may_open * opening, measured.v_goal)
-        return u, PIDState(state.integral + step, error, derivative, q_dot_goal, rest_ticks)
+        return u, PIDState(state.integral + increase, error, derivative, q_dot_goal, rest_ticks)
 
     def _open_valves(self, opening: Array, v_goal: Array) -> Array:
         """Commands u (..., n) of valve openings beyond the dead zone (..., n_driven)."""
