@@ -127,7 +127,9 @@ def open_bus(
     name = channel if interface == "socketcan" else interface
     writer = can.CanutilsLogWriter(log) if log else None
     bus = Bus(raw, writer, name, echo=interface == "udp_multicast")
-    with suppress(NotImplementedError):  # by this python-can says that a bus has no descriptor
+    # Buses without a file descriptor (virtual, udp_multicast, Windows) raise NotImplementedError by
+    # python-can's contract. `file` stays -1 then, and `Bus.recv` waits in python-can's own recv.
+    with suppress(NotImplementedError):
         bus.file = raw.fileno()
     try:
         yield bus

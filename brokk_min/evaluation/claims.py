@@ -152,9 +152,11 @@ def task_claims(
     """
 
     def direction(names: Sequence[str]) -> Claim:
+        """Of the first baseline."""
         return direction_claim(machine, pids[names[0]], along_x[names[0]], goals)
 
     def of_baselines(claim: Callable[[Sequence[str]], Claim]) -> Claim:
+        """A claim on the paper's baselines, with that on a stronger one."""
         return claim(PAPER_BASELINES)._replace(stronger=claim(STRONGER))
 
     along_z = ["velocity_error_mean", "off_axis_drift_max"]

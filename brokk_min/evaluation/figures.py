@@ -30,7 +30,6 @@ from brokk_min.machine import Array, Machine
 matplotlib.rcParams.update({"axes.grid": True, "grid.alpha": 0.3, "axes.axisbelow": True})
 matplotlib.rcParams["hatch.linewidth"] = 0.4
 WIDTH = 10.0  # inch, of every figure: letters have one size in the report
-DPI = 150
 FREE_RUN_S = 30.0  # s, as in the paper
 
 STYLES: dict[str, dict[str, Any]] = {
@@ -59,8 +58,6 @@ OTHER_STYLES: list[dict[str, Any]] = [
     {"color": "#00886a", "linestyle": "-."},
     {"color": "#f0b84a", "linestyle": (0, (4, 1, 1, 1, 1, 1))},
 ]
-
-Rows = Mapping[str, Mapping[str, Mean]]  # by name of the row and controller
 
 
 class Panel(NamedTuple):
@@ -111,7 +108,7 @@ def _add_legend(figure: Figure) -> None:
 
 
 def _time_panels(dt: float, labels: Sequence[str], curves: Mapping[str, Array]) -> list[Panel]:
-    """One panel for each label: columns of curves (T, labels) over time."""
+    """One panel for each label: columns of curves (T, labels) or (T, labels, runs) over time."""
     panels = []
     for i, label in enumerate(labels):
         columns = {name: (dt * np.arange(1, len(y) + 1), y[:, i]) for name, y in curves.items()}
@@ -140,15 +137,12 @@ def plot_gap(machine: Machine, gap: Motion) -> Figure:
     """Nets less machine under the same commands: tool, and a row for each joint. Paper: Fig. 5"""
     rows = {"tool": ("m", norm(gap.v_tool, axis=-1), norm(gap.p_tool, axis=-1))}
     rows |= {machine.names[i]: ("rad", gap.q_dot[..., i], gap.q[..., i]) for i in machine.driven}
-    time = machine.dt * np.arange(1, len(gap.q) + 1)
     panels = []
     for name, (unit, velocity, position) in rows.items():
-        labels = {f"{name} [{unit}/s]": velocity, f"{name} [m{unit}]": 1000 * position}
-        row = []
-        for label, values in labels.items():
-            curves = {"median of all runs": (time, values), "first run": (time, values[:, 0])}
-            row.append(Panel("", "time [s]", label, curves))
-        panels.append(row)
+        labels = [f"{name} [{unit}/s]", f"{name} [m{unit}]"]
+        values = np.stack([velocity, 1000 * position], axis=1)
+        curves = {"median of all runs": values, "first run": values[..., 0]}
+        panels.append(_time_panels(machine.dt, labels, curves))
     return plot_panels(panels)
 
 
@@ -288,8 +282,8 @@ def plot_rest(
     return plot_panels([panels], sharey="row")
 
 
-def plot_intervals(panels: Mapping[str, Rows]) -> Figure:
-    """Means and 95 % intervals of controllers in rows; panels by their x label.
+def plot_intervals(panels: Mapping[str, Mapping[str, Mapping[str, Mean]]]) -> Figure:
+    """Means and 95 % intervals by x label of the panel, row and controller.
 
     As rliable draws them: Agarwal et al. 2021, "Deep RL at the edge of the statistical precipice".
     """
@@ -307,8 +301,7 @@ def plot_intervals(panels: Mapping[str, Rows]) -> Figure:
                 bar = {"color": color, "hatch": 2 * HATCHES[name], "edgecolor": "white"}
                 ax.barh(y, high - low, height, low, linewidth=0, **bar)
                 mark = {"color": color, "marker": MARKERS[name], "markeredgecolor": "black"}
-                title = TITLES.get(name, name)
-                ax.plot(mean, y, label=title, linestyle="", markersize=5, **mark)
+                ax.plot(mean, y, label=TITLES.get(name, name), linestyle="", markersize=5, **mark)
         ax.set_yticks(range(len(rows)), [TITLES.get(row, row) for row in rows])
         ax.set(xlabel=xlabel, ylim=(len(rows) - 0.5, -0.5))
         means = [number["mean"] or np.nan for row in of_rows.values() for number in row.values()]
@@ -327,7 +320,7 @@ def plot_intervals(panels: Mapping[str, Rows]) -> Figure:
 def png(figure: Figure) -> bytes:
     """A figure as PNG, the same bytes for the same figure."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
+    figure.savefig(buffer, format="png", dpi=150, metadata={"Software": None})
     return buffer.getvalue()
 
 

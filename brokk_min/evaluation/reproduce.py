@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from dask.system import cpu_count
 from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet
@@ -28,8 +29,6 @@ from brokk_min.evaluation.seeds import read_seeds, seeds_of
 from brokk_min.identification import fitting, logs, validation
 from brokk_min.identification.excitation import collect, task_log
 from brokk_min.identification.files import write_json
-from brokk_min.identification.fitting import FitConfig
-from brokk_min.identification.logs import Log
 from brokk_min.identification.net_file import save_net, select_nets
 from brokk_min.jacobian import JacobianController
 from brokk_min.learning.checkpoint import train_policy
@@ -46,7 +45,7 @@ class Budget:
     """How much each stage may spend."""
 
     hours: float = 1.0  # driving time of each actuator that is recorded
-    fit_steps: int = FitConfig.steps
+    fit_steps: int = fitting.FitConfig.steps
     train_steps: int = GRADIENT_LEARNER["total_steps"]
     paper_steps: int = PPOConfig.total_steps  # of the paper's learner
     generations: int = baselines.GENERATIONS  # of the tuning
@@ -81,11 +80,10 @@ def reproduce(
             driven = select_nets(machine, net)
             training_seeds = seeds_of(machine, driven, seeds) if seeds else {}
         with stage("train and tune"):
-            nets = {"rl": driven, "rl_open": driven, "rl_paper": select_nets(machine, paper_net)}
-            jobs: dict[str, Any] = {
-                f"train {name}": partial(train, machine, out, name, nets[name], budget, seed)
-                for name in ("rl_paper", "rl_open", "rl")
-            }
+            nets = {"rl_paper": select_nets(machine, paper_net), "rl_open": driven, "rl": driven}
+            jobs: dict[str, Any] = {}
+            for name, own in nets.items():
+                jobs[f"train {name}"] = partial(train, machine, out, name, own, budget, seed)
             settings = budget.tuning_runs, budget.generations, seed, None, None, budget.short_s
             for name in baselines.baselines(machine, driven):
                 tune = partial(baselines.tune_baselines, machine, driven, *settings)
@@ -117,12 +115,10 @@ def _stage(clock: dict[str, float], bar: Any, name: str) -> Iterator[None]:
 def side_by_side(calls: Mapping[str, Callable[[], Any]], clock: dict[str, float]) -> list[Any]:
     """Results of independent calls, each in a process of one thread, as many at once as cores.
 
-    They begin in their order: the longest should be the first. One core runs them one after the
-    other, here. `clock` gets the seconds of each. The first exception is raised.
+    They begin in their order: the longest should be the first. One core runs them here, in turn.
+    `clock` gets the seconds of each. The first exception is raised.
     """
-    cores = os.cpu_count() or 1
-    if hasattr(os, "sched_getaffinity"):
-        cores = len(os.sched_getaffinity(0))
+    cores = cpu_count()  # by affinity and cgroup, too
     if cores == 1:
         done = [_timed(call) for call in calls.values()]
     else:
@@ -151,7 +147,7 @@ def _timed(call: Callable[[], Any]) -> tuple[float, Any]:
     return time.perf_counter() - start, result
 
 
-def record(machine: Machine, out: Path, budget: Budget, seed: int) -> list[Log]:
+def record(machine: Machine, out: Path, budget: Budget, seed: int) -> list[logs.Log]:
     """Logs to fit nets to, rich ones and the paper's sines, and to score them on.
 
     They are written and read back as a user's.
@@ -172,17 +168,17 @@ def record(machine: Machine, out: Path, budget: Budget, seed: int) -> list[Log]:
 
 
 def fit_net(
-    machine: Machine, file: Path, log: Log, budget: Budget, recipe: Mapping[str, Any], seed: int
+    machine: Machine, file: Path, log: logs.Log, budget: Budget, recipe: dict[str, Any], seed: int
 ) -> ActuatorNet:
     """Nets of all joints by our settings but for those of `recipe`, written to `file`."""
-    config = FitConfig(budget.fit_steps, history=machine.history, dead_zone=machine.dead_zone)
-    config = replace(config, **recipe)
+    ours = {"history": machine.history, "dead_zone": machine.dead_zone}
+    config = fitting.FitConfig(budget.fit_steps, **ours | recipe)
     net = fitting.fit(log, config, seed, machine.velocity_samples, machine.name)
     save_net(file, net)
     return net
 
 
-def net_errors(machine: Machine, net: ActuatorNet, test: Log, seed: int) -> dict[str, Any]:
+def net_errors(machine: Machine, net: ActuatorNet, test: logs.Log, seed: int) -> dict[str, Any]:
     """Scores of nets on a log, and their distance from the machine in the paper's experiment."""
     both = preliminary.simulators(machine, net)
     gap = preliminary.gap_numbers(machine, preliminary.sim_to_real(machine, both, seed))
@@ -217,7 +213,7 @@ def train(
 def measure(
     machine: Machine,
     net: ActuatorNet,
-    test: Log,
+    test: logs.Log,
     policies: Mapping[str, Policy],
     pids: Pids,
     budget: Budget,
@@ -265,8 +261,7 @@ def compare(
 ) -> tuple[dict[str, Any], Traces, Traces]:
     """The paper's experiment, regret and robustness: JSON, all traces, those near singularities.
 
-    Means, intervals and verdicts are over the "workspace" starts, from which all sequences can be
-    followed.
+    Means, intervals and verdicts are over "workspace" starts: they can follow all sequences.
     """
     controllers: Controllers = {**policies, **pids}
     commands = sequences.task_sequences(machine)
@@ -277,27 +272,23 @@ def compare(
     short = sequences.shorten(machine, sequences.axis_sequences(machine), budget.short_s)
     bound_starts, extended = reachable[: budget.bound_starts], starts[kinds == "extended"]
     few = claims.singular_controllers(policies, pids)
+    near = partial(near_singularities, machine)
     every = machine, controllers
-    jobs: dict[str, Callable[[], Any]] = {
-        "score changed machines": partial(robustness, *every, short, reachable[:16], seed)
-    }
+    jobs: dict[str, Callable[[], Any]] = {}
+    jobs["score changed machines"] = partial(robustness, *every, short, reachable[:16], seed)
     for name, bound in perfect_models(machine, bound_starts).items():
         jobs[f"score {name}"] = partial(evaluate, machine, {name: bound}, short, bound_starts, seed)
-    jobs |= {
-        "score": partial(evaluate, *every, commands, starts, seed),
-        "score for the regret": partial(evaluate, *every, short, bound_starts, seed),
-        "score near singularities": partial(
-            near_singularities, machine, few, extended, budget.short_s, seed
-        ),
-    }
+    jobs["score"] = partial(evaluate, *every, commands, starts, seed)
+    jobs["score for the regret"] = partial(evaluate, *every, short, bound_starts, seed)
+    jobs["score near singularities"] = partial(near, few, extended, budget.short_s, seed)
     changed, *bounds, (runs, traces), (on_short, _), singularities = side_by_side(jobs, clock)
-    singular, near, near_traces = singularities
+    singular, verdicts, near_traces = singularities
     scored = [run for run in runs if run["kind"] == "workspace"]
     along_x = {c: Trace(*(array[:, workspace] for array in traces[c, "x"])) for c in pids}
     goals = commands[0].for_starts(machine, reachable)
     claim = partial(claims.task_claims, machine)
-    theirs = claim("rl_paper", pids, scored, along_x, goals, near.get("rl_paper", []))
-    ours = claim("rl", pids, scored, along_x, goals, near.get("rl", []))
+    theirs = claim("rl_paper", pids, scored, along_x, goals, verdicts.get("rl_paper", []))
+    ours = claim("rl", pids, scored, along_x, goals, verdicts.get("rl", []))
     results = {
         "task_space": tables(runs, scored),
         "regret": regret([*on_short, *(run for rows, _ in bounds for run in rows)]),

@@ -20,6 +20,7 @@ def noisy_encoder(rng: np.random.Generator) -> Encoder:
     """Encoders with normal noise of one count."""
 
     def read(machine: Machine, q: Array) -> Array:
+        """Whole counts of noisy angles."""
         noise = machine.encoder_step * rng.standard_normal(q.shape)
         return read_encoder(machine, q + noise)
 
@@ -31,6 +32,7 @@ def lossy_encoder(rng: np.random.Generator) -> Encoder:
     last: Array | None = None
 
     def read(machine: Machine, q: Array) -> Array:
+        """New angles, or the last ones where the sample is lost."""
         nonlocal last
         lost = rng.random((*q.shape[:-1], 1)) < 0.05
         angles = read_encoder(machine, q)

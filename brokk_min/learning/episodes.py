@@ -114,6 +114,7 @@ def replace_rows(state: State, rows: NDArray[np.intp], fresh: State) -> State:
     """`state` with its rows `rows` replaced by the states `fresh`, one each."""
 
     def put(old: Any, new: Any) -> Any:
+        """A copy of an array, or a tuple of arrays, with new rows."""
         if old is None:
             return None
         if isinstance(old, tuple):  # the state of a plant

@@ -79,6 +79,7 @@ def improved_actions(machine: Machine, net: ActuatorNet, task: TaskConfig) -> pp
     def estimate(
         agent: ppo.Agent, rollout: ppo.Rollout, config: ppo.PPOConfig
     ) -> dict[str, Tensor]:
+        """Means of the actions, and means moved along the gradient."""
         states = [info["state"] for info in rollout.infos]
         v_goal = np.stack([state.v_goal for state in states])
         rest_ticks = np.stack([state.rest_ticks for state in states])

@@ -285,6 +285,7 @@ def play(
     ):
 
         def receive() -> Iterator[Telemetry]:
+            """What the loop sent since the last picture, with how late it is."""
             late = advance()
             for telemetry in control_process.receive_telemetry(connection):
                 yield telemetry if late is None else telemetry._replace(lateness=late)
@@ -320,6 +321,7 @@ def watch(
     ):
 
         def receive() -> Iterable[Telemetry]:
+            """Telemetry from the frames that wait on the bus."""
             return filter(None, map(reader.update, iter(lambda: bus.recv(0), None)))
 
         show(window, session, receive, lambda request: None, each_frame)
