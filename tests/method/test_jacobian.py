@@ -47,18 +47,6 @@ def test_dls__by_hand():
     np.testing.assert_allclose(printed, np.diag([1 / 1.5, 0.5 / 16.5, 0.0]), atol=1e-12)
 
 
-def test_dls__of_a_batch_is_that_of_its_members_and_keeps_the_float_type():
-    rng = np.random.default_rng(0)
-    Js, W, damping = rng.normal(size=(2, 5, 3, 4)), rng.uniform(1, 9, (2, 5, 4)), rng.random((2, 5))
-    together = dls(Js, W, damping)
-    assert together.shape == (2, 5, 4, 3)
-    for i in np.ndindex(2, 5):
-        np.testing.assert_allclose(together[i], dls(Js[i], W[i], damping[i]), atol=1e-12)
-    single = dls(Js.astype(np.float32), W, damping)
-    assert single.dtype == np.float32
-    np.testing.assert_allclose(single, together, rtol=1e-3, atol=1e-4)
-
-
 @given(posed(shapes=[(3,)]))
 def test_limit_gradient__is_the_derivative_of_chan_and_dubeys_function(case):
     machine, q = case

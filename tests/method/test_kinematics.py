@@ -1,11 +1,10 @@
-"""Kinematics by hand, against a closed form, matrix exponentials and Pinocchio."""
+"""Kinematics by hand, against a closed form and matrix exponentials."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from helpers_machines import POSE, closed_form
 from hypothesis import given
@@ -19,7 +18,6 @@ from brokk_min.kinematics import (
     lowest_point,
     to_heading,
     tool_position,
-    tool_velocity,
 )
 from brokk_min.machine import BROKK_170, Machine
 
@@ -33,25 +31,11 @@ def test_tool_position__of_the_papers_start_pose():
     assert np.arctan2(y, x) == pytest.approx(1.5)
 
 
-def test_tool_position__of_the_arm_stretched_out():
-    level = tool_position(forward_kinematics(BROKK_170, STRAIGHT))
-    np.testing.assert_allclose(level, [0.25 + 1.15 + 1.25 + 1.15 + 1.2, 0, 0.95], atol=1e-12)
-    upright = np.add(STRAIGHT, [np.pi / 2, np.pi / 2, 0, 0, 0])
-    tool = tool_position(forward_kinematics(BROKK_170, upright))
-    np.testing.assert_allclose(tool, [0, 0.25, 5.7], atol=1e-12)
-
-
 def test_jacobian__of_the_arm_stretched_out():
     """1 rad/s of slew moves the tool at 5 m/s sideways; q2 to q5 lift it by their lever arms."""
     J = jacobian(forward_kinematics(BROKK_170, STRAIGHT))
     expected = [[0, 0, 0, 0, 0], [5, 0, 0, 0, 0], [0, 4.75, 3.6, 2.35, 1.2]]
     np.testing.assert_allclose(J, expected, atol=1e-12)
-
-
-def test_tool_velocity__adds_all_joints_the_locked_one_too():
-    frames = forward_kinematics(BROKK_170, STRAIGHT)
-    velocity = tool_velocity(frames, [0.1, 1.0, 0.0, 0.0, 2.0])
-    np.testing.assert_allclose(velocity, [0, 0.5, 4.75 + 2.4], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -123,42 +107,6 @@ def test_forward_kinematics__is_the_product_of_exponentials(case):
     frames = forward_kinematics(machine, q)
     np.testing.assert_allclose(frames.p, expected[:, :3, 3], atol=1e-10)
     np.testing.assert_allclose(frames.z, expected[:, :3, 2], atol=1e-10)
-
-
-def pinocchio_brokk() -> pin.Model:
-    """The arm from its description, not from the DH rows: axes to the right lift the links."""
-    model = pin.Model()
-    up, right = np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-    rows = [
-        ("q1", up, (0.0, 0.0, 0.0), 0.0),
-        ("q2", right, (0.25, 0.0, 0.95), 0.0),
-        ("q3", right, (1.15, 0.0, 0.0), 0.0),
-        ("q4", right, (1.25, 0.0, 0.0), -np.pi),
-        ("q5", right, (1.15, 0.0, 0.0), -3 * np.pi / 4),
-    ]
-    parent = 0
-    for name, axis, place, offset in rows:
-        turn = pin.AngleAxis(offset, right).toRotationMatrix()
-        at = pin.SE3(turn, np.array(place))
-        parent = model.addJoint(parent, pin.JointModelRevoluteUnaligned(axis), at, name)
-    tip = pin.SE3(np.eye(3), np.array([1.2, 0.0, 0.0]))
-    model.addFrame(pin.Frame("tool", parent, tip, pin.FrameType.OP_FRAME))
-    return model
-
-
-@given(poses(BROKK_170), poses(BROKK_170))
-def test_kinematics__of_the_brokk_in_pinocchio(q, other):
-    model = pinocchio_brokk()
-    data, tool = model.createData(), model.getFrameId("tool")
-    q_dot = np.array(other - q)
-    frames = forward_kinematics(BROKK_170, q)
-    pin.framesForwardKinematics(model, data, q)
-    np.testing.assert_allclose(tool_position(frames), data.oMf[tool].translation, atol=1e-12)
-    J = pin.computeFrameJacobian(model, data, q, tool, pin.LOCAL_WORLD_ALIGNED)[:3]
-    np.testing.assert_allclose(jacobian(frames), J, atol=1e-12)
-    pin.forwardKinematics(model, data, q, q_dot)
-    velocity = pin.getFrameVelocity(model, data, tool, pin.LOCAL_WORLD_ALIGNED).linear
-    np.testing.assert_allclose(tool_velocity(frames, q_dot), velocity, atol=1e-12)
 
 
 def test_forward_kinematics__takes_lists_whole_numbers_and_empty_batches():
