@@ -211,14 +211,11 @@ def encode_machine(content: Content) -> bytes:
 def all_formats(folder: Path) -> Iterator[Format]:
     """Every format with a good content."""
     net = load_policy(SHIPPED_POLICY, BROKK_170).net
-    arrays = net_arrays(random_net())
-    arrays["header"] = json.loads(str(arrays["header"]))
-    found = places({"header": formats.NET_HEADER, **formats.NET_ARRAYS}, arrays)
-    yield Format("net.npz", arrays, encode_npz, load_net, found)
-    shared = net_arrays(shared_net())
-    shared["header"] = json.loads(str(shared["header"]))
-    found = places({"header": formats.NET_HEADER, **formats.NET_ARRAYS}, shared)
-    yield Format("shared.npz", shared, encode_npz, load_net, found)
+    for name, made in {"net.npz": random_net(), "shared.npz": shared_net()}.items():
+        arrays = net_arrays(made)
+        arrays["header"] = json.loads(str(arrays["header"]))
+        found = places({"header": formats.NET_HEADER, **formats.NET_ARRAYS}, arrays)
+        yield Format(name, arrays, encode_npz, load_net, found)
     policy = decode_npz(SHIPPED_POLICY)
     found = places({"header": formats.POLICY_HEADER, **formats.POLICY_ARRAYS}, policy)
     required = {name: field for name, field in formats.NET_ARRAYS.items() if field.required}

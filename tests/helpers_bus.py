@@ -18,20 +18,25 @@ from canopen.objectdictionary import ObjectDictionary, ODArray, ODRecord, ODVari
 
 from brokk_min.can.canopen import Frame, OperatorInput
 from brokk_min.can.connection import Bus, open_bus
+from brokk_min.can.operator_input import Script
 from brokk_min.can.simulated_machine import SimulatedMachine, serve
 from brokk_min.hw import Drive
 from brokk_min.jacobian import Gains, JacobianController, manipulability_threshold
+from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
 
 MULTICAST = "239.74.163.2"
 START = (0.0, 0.5, 0.58, 1.71, 1.24)
-FOUR = np.ones(4)
-BASELINE = JacobianController(
-    BROKK_170,
-    Gains(1.0 * FOUR, 3.0 * FOUR, 0.0 * FOUR, np.array([0.3]), np.array([0.0])),
-    0.1,
-    manipulability_threshold(BROKK_170),
-)
+
+
+def baseline(machine):
+    """A PI controller that nobody tuned."""
+    one = np.ones(len(machine.driven))
+    gains = Gains(one, 3 * one, 0 * one, np.array([0.3]), np.zeros(1))
+    return JacobianController(machine, gains, 0.1, manipulability_threshold(machine))
+
+
+BASELINE = baseline(BROKK_170)
 Out = list[tuple[int, bytes]]
 Change = Callable[[int, bytes], Out]
 _channels = itertools.count()
@@ -177,6 +182,20 @@ class HoldingOperator:
         enable = self.pressed if self.enable is None else self.enable
         v = self.v if driving else (0.0, 0.0, 0.0)
         return OperatorInput(v, enable and self.alive, self.alive, self.stop)
+
+
+def tool_moved(machine, start, goals, log=None):
+    """The tool's way [m] under goals (T, 3), by a `baseline` over the simulated bus."""
+    script = Script(machine, goals)
+    world = World(baseline(machine), script, machine, log, start)
+    world.drive.begin()
+    while world.drive.tick():
+        pass
+    world.drive.bus.close()
+    world.close()
+    assert script.done, world.drive.reason
+    q = np.array([start, world.simulated.plant.q])
+    return np.diff(tool_position(forward_kinematics(machine, q)), axis=0)[0]
 
 
 def eventually(condition, seconds=20.0):

@@ -7,6 +7,7 @@ import pygame
 from helpers_bus import START, ConstantCommand, World
 
 from brokk_min.can.drive_log import Telemetry
+from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer.control_process import (
     Request,
@@ -26,6 +27,10 @@ def post(kind, **more):
 
 def post_key(name, down=True):
     post(pygame.KEYDOWN if down else pygame.KEYUP, key=pygame.key.key_code(name))
+
+
+def tool(q):
+    return tool_position(forward_kinematics(BROKK_170, np.array(q)))
 
 
 def telemetry(tick=0, q=START, **more):

@@ -57,18 +57,6 @@ def test_gradients__are_compared_with_ppo(capsys):
     assert capsys.readouterr().out.count(" m/s after ") == 2
 
 
-def test_best_run__is_the_first_at_a_level_or_the_closest():
-    rows = [
-        {"setting": (1e-3, 100), "reached": {}, "best": 0.7},
-        {"setting": (2e-3, 100), "reached": {}, "best": 0.6},
-    ]
-    assert peers.best_run(rows, "PID")["setting"] == (2e-3, 100)
-    rows += [
-        {"setting": (3e-3, 9), "reached": {"PID": [cpu, 1, 1, 1]}, "best": 1} for cpu in (8, 9)
-    ]
-    assert peers.best_run(rows, "PID")["setting"] == (3e-3, 9)
-
-
 def test_median__needs_most_of_the_seeds():
     reached = [{"PID": [3.0, 6.0, 100, 10]}, {}, {"PID": [5.0, 7.0, 200, 20]}]
     rows = [{"reached": row, "best": best} for row, best in zip(reached, (0.1, 0.4, 0.2))]

@@ -30,8 +30,8 @@ def folder(tmp_path_factory):
     """A log, nets and a policy of the Brokk, made by the commands."""
     folder = tmp_path_factory.mktemp("chain")
     net = folder / "net.npz"
-    assert run(f"collect --hours 0.02 --excitation sine --out '{folder}/log.csv'") == 0
-    assert run(f"fit '{folder}/log.csv' --steps 50 --out", net) == 0
+    assert run(f"collect --hours 0.005 --excitation sine --out '{folder}/log.csv'") == 0
+    assert run(f"fit '{folder}/log.csv' --steps 20 --batch-size 256 --out", net) == 0
     options = f"--resume --valve-cost 0.01 {SMALL}"
     assert run(f"train --actuator '{net}' {options} --out", folder / "policy.npz") == 0
     (folder / "c.csv").write_text("sequence,time,vx,vy,vz\nup,0,0,0,0.1\nup,1,0,0,0\n")
@@ -42,9 +42,8 @@ def folder(tmp_path_factory):
 def write_gains(folder):
     """Gains for the nets of the policy in `folder`; the names of the controllers."""
     row = {key: [0.5] * 4 for key in ("kp", "ki", "kd")} | {"feedback": [0.1], "ready": [0.01]}
-    names = ["jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff", "jacobian_pid_ff_awake"]
-    names += ["jacobian_pid_ff_integral", "jacobian_pid_ff_integral_awake"]
     net = load_policy(folder / "policy.npz", BROKK_170).net
+    names = list(baselines.baselines(BROKK_170, net))
     meta = baselines.gains_metadata(BROKK_170, net)
     table = {"meta": meta, "gains": dict.fromkeys(names, row)}
     (folder / "gains.json").write_text(json.dumps(table))
@@ -143,7 +142,11 @@ def test_shipped_policy__beats_the_papers_controllers(tmp_path):
     gains = json.loads(SHIPPED_GAINS.read_text())
     assert {*gains["gains"], *POLICIES} == set(before)
     assert gains["meta"]["seed"] == 0
-    assert run("evaluate --num-starts 4 --json", tmp_path / "e.json") == 0
+    up = "z,0,0,0,0.1\nz,2,0,0,-0.1\nz,4,0,0,0\nz,6,0,0,0\n"
+    side = "y,0,0,0.1,0\ny,2,0,-0.1,0\ny,4,0,0,0\ny,6,0,0,0\n"
+    (tmp_path / "c.csv").write_text(f"sequence,time,vx,vy,vz\n{up}{side}")
+    files = f"--commands '{tmp_path}/c.csv' --json '{tmp_path}/e.json'"
+    assert run(f"evaluate --num-starts 4 {files}") == 0
     rows = summary(json.loads((tmp_path / "e.json").read_text())["runs"])
     now = {name: row["all"]["velocity_error_mean"] for name, row in rows.items()}
     assert set(before) == set(now)
@@ -152,7 +155,9 @@ def test_shipped_policy__beats_the_papers_controllers(tmp_path):
 
 
 def test_starts__are_drawn_into_a_file_that_reads_back(tmp_path):
-    assert run("starts --num 4 --out", tmp_path / "s.csv") == 0
+    imports = "from dataclasses import replace\nfrom brokk_min import BROKK_170\n"
+    (tmp_path / "m.py").write_text(f"{imports}SLOW = replace(BROKK_170, rate=5.0)\n")  # fewer ticks
+    assert run(f"starts --num 4 --machine '{tmp_path}/m.py:SLOW' --out", tmp_path / "s.csv") == 0
     starts = read_starts(tmp_path / "s.csv", BROKK_170)
     assert start_kinds(BROKK_170, starts) == ["workspace", "limits", "workspace", "extended"]
 

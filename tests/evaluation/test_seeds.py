@@ -130,22 +130,6 @@ def test_read_seeds__reads_what_a_sweep_wrote(tmp_path):
         seeds.seeds_of(BROKK_170, other, seeds.read_seeds(path))
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("{", r"expected the sweep\.json of a sweep, got Expecting"),
-        ("[]", r"content: expected names \['meta', 'table'\], got \[\]"),
-        ('{"meta": {"machine": "m"}}', "meta.actuator: expected text of 1 to 200 char.*, got none"),
-    ],
-)
-def test_read_seeds__refuses_other_files(tmp_path, text, message):
-    """`tests/fuzz.py` makes the others, from the description of the fields."""
-    path = tmp_path / "sweep.json"
-    path.write_text(text)
-    with pytest.raises(ValueError, match=rf"sweep\.json: {message}"):
-        seeds.read_seeds(path)
-
-
 @pytest.fixture
 def short(monkeypatch):
     """Sequences of half a second, from poses that need no search."""

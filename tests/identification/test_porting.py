@@ -8,16 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers_bus import World
+from helpers_bus import tool_moved
 
 from brokk_min.__main__ import main
-from brokk_min.can.operator_input import Script
 from brokk_min.cli.options import with_plant
 from brokk_min.evaluation import baselines
 from brokk_min.evaluation.feasibility import speed_limits
 from brokk_min.identification.logs import read_log
 from brokk_min.identification.net_file import load_net
-from brokk_min.jacobian import Gains, JacobianController, manipulability_threshold
 from brokk_min.kinematics import forward_kinematics, tool_position
 
 ROOT = Path(__file__).parents[2]
@@ -131,20 +129,5 @@ def test_example__is_driven_over_the_bus(mini, axis, plant):
     """Its own identifiers, zeros and signs: the tool moves at 0.15 m/s outward, sideways or up."""
     if plant:
         mini = with_plant(mini, f"{ROOT / 'examples' / 'own_plant.py'}:PLANT", [])
-    one, feedback, min_opening = np.ones(4), np.array([0.3]), np.zeros(1)
-    gains = Gains(one, 3 * one, 0 * one, feedback, min_opening)
-    controller = JacobianController(mini, gains, 0.1, manipulability_threshold(mini))
-    start = (0.1, -0.5, 1.4, 0.8)
-    script = Script(mini, np.tile(0.15 * np.eye(3)[axis], (50, 1)))  # 2 s
-    world = World(controller, script, mini, start=start)
-    world.drive.begin()
-    while world.drive.tick():
-        pass
-    world.close()
-    assert script.done, world.drive.reason
-    p, p_start = (
-        tool_position(forward_kinematics(mini, np.array(q)))
-        for q in (world.simulated.plant.q, start)
-    )
-    moved = p - p_start
+    moved = tool_moved(mini, (0.1, -0.5, 1.4, 0.8), np.tile(0.15 * np.eye(3)[axis], (50, 1)))  # 2 s
     assert moved[axis] > 0.15 and np.delete(np.abs(moved), axis).max() < 0.08, moved

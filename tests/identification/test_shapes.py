@@ -8,15 +8,13 @@ import can
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers_bus import World
+from helpers_bus import tool_moved
 from helpers_cli import run
 
-from brokk_min.can.operator_input import Script
 from brokk_min.cli.options import find_machine
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation import baselines
 from brokk_min.identification.net_file import load_net, select_nets
-from brokk_min.jacobian import Gains, JacobianController, manipulability_threshold
 from brokk_min.kinematics import forward_kinematics, jacobian, tool_position
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -33,26 +31,6 @@ QUICK = {
 
 def example(name):
     return find_machine(f"{EXAMPLES / name}.py:{name.upper()}")
-
-
-def controller(machine):
-    one = np.ones(len(machine.driven))
-    gains = Gains(one, 3 * one, 0 * one, np.array([0.3]), np.zeros(1))
-    return JacobianController(machine, gains, 0.1, manipulability_threshold(machine))
-
-
-def drive(machine, start, goals, log=None):
-    """The tool's way [m] under goals (T, 3), over the simulated bus."""
-    script = Script(machine, goals)
-    world = World(controller(machine), script, machine, log, start)
-    world.drive.begin()
-    while world.drive.tick():
-        pass
-    world.drive.bus.close()
-    world.close()
-    assert script.done, world.drive.reason
-    q = np.array([start, world.simulated.plant.q])
-    return np.diff(tool_position(forward_kinematics(machine, q)), axis=0)[0]
 
 
 def test_telescope__has_the_geometry_of_its_drawing():
@@ -110,7 +88,7 @@ def test_example__runs_through_the_whole_chain(name, tmp_path, monkeypatch):
     assert all(np.isfinite(run["velocity_rmse"]) for run in runs)
     seconds = 4.0 if name == "telescopic_crane" else 1.5
     goals = np.tile([[0.0, 0.0, 0.15]], (round(seconds * machine.rate), 1))
-    up = drive(machine, STARTS[name], goals, can.CanutilsLogWriter("run.log"))
+    up = tool_moved(machine, STARTS[name], goals, can.CanutilsLogWriter("run.log"))
     assert up[2] > 0.06 * seconds and np.abs(up[:2]).max() < 0.08, up
     assert run(f"convert run.log --out drive.csv {option}") == 0
     if name == "telescopic_crane":  # the other drive is too short
@@ -121,5 +99,5 @@ def test_example__runs_through_the_whole_chain(name, tmp_path, monkeypatch):
 def test_telescope__is_driven_over_the_bus(axis):
     """Its encoder counts down and begins at 5,000; 2 s at 0.15 m/s."""
     crane = example("telescopic_crane")
-    moved = drive(crane, STARTS[crane.name], np.tile(0.15 * np.eye(3)[axis], (20, 1)))
+    moved = tool_moved(crane, STARTS[crane.name], np.tile(0.15 * np.eye(3)[axis], (20, 1)))
     assert moved[axis] > 0.15 and np.delete(np.abs(moved), axis).max() < 0.08, moved

@@ -80,13 +80,6 @@ def test_response_times__of_a_joint_that_does_not_answer_are_none():
     assert named["b"] == {"idle": {"up": pytest.approx(0.0065), "down": None}, "moving": none}
 
 
-def test_response_times__of_the_plant_are_the_papers():
-    level, simulate = np.full(5, 80 / 127), simulation.plant_simulator(BROKK_170)
-    idle, moving = response_times(steps(simulate, LOW, HIGH, level, level / 2, 30), 20.0)
-    np.testing.assert_allclose(idle, 0.40, atol=0.01)
-    np.testing.assert_allclose(moving, 0.105, atol=0.01)
-
-
 def test_steps__move_only_the_stepping_joint_away_from_the_end_behind_it():
     level, simulate = np.full(3, 0.5), constant_simulator(0.1, 0.1, 0)
     low, high = np.array([0.0, -1.0, 2.0]), np.array([1.0, 1.0, 4.0])

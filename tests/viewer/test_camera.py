@@ -1,18 +1,15 @@
 """Views from the side and from above, worked out by hand."""
 
 import numpy as np
+from helpers_viewer import tool
 
-from brokk_min.kinematics import forward_kinematics, tool_position
+from brokk_min.kinematics import forward_kinematics
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer.camera import cameras
 from brokk_min.viewer.drawing import NO_POINTS
 
 STRETCHED = np.array([0.0, 0.0, 0.0, np.pi, 3 * np.pi / 4])  # all links horizontal
 BOXES = ((10.0, 20.0, 400.0, 200.0), (0.0, 0.0, 100.0, 100.0))  # side, top [px]
-
-
-def tool(q):
-    return tool_position(forward_kinematics(BROKK_170, q))
 
 
 def test_cameras__see_the_brokk_as_worked_out_by_hand():

@@ -7,11 +7,10 @@ import numpy as np
 import pygame
 import pytest
 from helpers_bus import BASELINE, START, ConstantCommand, World, recording
-from helpers_viewer import post, post_key, telemetry
+from helpers_viewer import post, post_key, telemetry, tool
 
 from brokk_min.can.canopen import OperatorInput
 from brokk_min.can.safety_gate import Fault
-from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer import drawing, play, replay
 from brokk_min.viewer.control_process import BusOptions
@@ -19,10 +18,6 @@ from brokk_min.viewer.play import Session
 from brokk_min.viewer.window import Window
 
 CONTROLLERS = {"rl": ConstantCommand(), "jacobian": ConstantCommand()}
-
-
-def tool(q):
-    return tool_position(forward_kinematics(BROKK_170, np.array(q)))
 
 
 def test_scene__interpolates_between_two_ticks_and_keeps_the_last_pose():

@@ -6,7 +6,6 @@ from helpers_bus import START
 from hypothesis import given
 from strategies import moving
 
-from brokk_min.evaluation.sequences import evaluation_starts, task_sequences
 from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer import shapes
@@ -25,11 +24,6 @@ def test_contacts__of_poses_seen_by_eye(q, text, links):
     assert (text in found) == (text is not None)
     if links:
         assert links <= found[text]
-
-
-def test_contacts__are_rare_among_the_starts_of_the_evaluation():
-    starts = evaluation_starts(BROKK_170, 32, task_sequences(BROKK_170), 2)
-    assert sum(bool(shapes.contacts(BROKK_170, q)) for q in starts) <= 1
 
 
 @given(moving([()]))

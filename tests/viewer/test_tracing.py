@@ -6,10 +6,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from helpers_bus import BASELINE, START
-from helpers_viewer import PipedLoop, telemetry
+from helpers_viewer import PipedLoop, telemetry, tool
 
 from brokk_min.evaluation.feasibility import feasible
-from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer import tracing
 from brokk_min.viewer.camera import extent
@@ -19,10 +18,6 @@ from brokk_min.viewer.tracing import Attempt, Tracing
 LINES = tracing.task_lines(BROKK_170)
 REACH = extent(BROKK_170)[2]
 RECTANGLE = [[0, 0, 0], [0, 0.16, 0], [0.1, 0.16, 0], [0.1, 0, 0], [0, 0, 0]]
-
-
-def tool(q):
-    return tool_position(forward_kinematics(BROKK_170, np.array(q)))
 
 
 @pytest.mark.parametrize("task", LINES)
