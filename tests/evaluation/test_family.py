@@ -1,12 +1,11 @@
 """The family: the chain on a member, once; what it is judged by, by hand."""
 
 import json
-import os
 from dataclasses import replace
 
 import pytest
 
-from brokk_min.evaluation import family
+from brokk_min.evaluation import family, reproduce
 from brokk_min.evaluation.family import run_family, show, summary
 from brokk_min.evaluation.reproduce import Budget
 from brokk_min.machine import BROKK_170
@@ -20,7 +19,7 @@ TINY = Budget(0.01, 20, 2048, 2048, 1, 1, 4, 2, 3.0)
 def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("family")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(os, "sched_getaffinity", lambda _: {0}, raising=False)  # one process: fast
+        patch.setattr(reproduce, "cpu_count", lambda: 1)  # one process: fast
         return folder, run_family(COARSE, [2], folder, TINY)
 
 

@@ -4,7 +4,7 @@ import collections
 import html
 import json
 import re
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -21,6 +21,7 @@ from brokk_min.identification.net_file import load_net
 from brokk_min.learning.policy import POLICIES, load_policy
 from brokk_min.machine import BROKK_170
 
+COARSE = replace(BROKK_170, plant_dt=0.05)  # one Euler step a tick: fast
 TINY = Budget(0.004, 20, 4096, 4096, 1, 1, 4, 2, 0.5)
 ERROR = "velocity_error_mean"
 PIDS = ["jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff", "jacobian_pid_ff_awake"]
@@ -30,9 +31,11 @@ CONTROLLERS = [*POLICIES, *PIDS]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """What one run of the chain wrote."""
+    """What one run of the chain wrote, in one process."""
     out = tmp_path_factory.mktemp("a b") / "new"  # a space in the path
-    reproduce.reproduce(BROKK_170, out, TINY, 3)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(reproduce, "cpu_count", lambda: 1)
+        reproduce.reproduce(COARSE, out, TINY, 3)
     return out
 
 
@@ -51,9 +54,15 @@ def test_settings__made_the_shipped_policies(name):
 
 
 def test_reproduce__gives_the_same_bits_twice(folder, tmp_path, monkeypatch, capsys):
-    """The second time by its command, as `--quick`."""
+    """The second time by its command, as `--quick`, in as many processes as cores."""
     monkeypatch.setattr(reproduce, "QUICK", TINY)
-    assert run("reproduce --quick --seed 3 --out", tmp_path) == 0
+    (tmp_path / "m.py").write_text(
+        "from dataclasses import replace\nfrom brokk_min import BROKK_170\n"
+        "COARSE = replace(BROKK_170, plant_dt=0.05)\n"
+    )
+    assert (
+        run(f"reproduce --quick --machine '{tmp_path}/m.py:COARSE' --seed 3 --out", tmp_path) == 0
+    )
     for name in ("log.npz", "net.npz", "policy.npz", "gains.json", "results.json"):
         assert (folder / name).read_bytes() == (tmp_path / name).read_bytes(), name
     clock = json.loads((folder / "timing.json").read_text())
@@ -190,4 +199,4 @@ def test_net_errors__of_the_papers_nets_are_in_the_results(folder, results):
     net = load_net(folder / "net_paper.npz")
     assert (net.dead_zone, net.settings["rollout"], net.settings["noise"]) == (0.0, 1, 0.0)
     test = read_log([folder / "log_test.npz"], BROKK_170.velocity_samples, rate=20.0)
-    assert reproduce.net_errors(BROKK_170, net, test, 3) == results["paper_recipe"]
+    assert reproduce.net_errors(COARSE, net, test, 3) == results["paper_recipe"]

@@ -100,14 +100,15 @@ def test_command_lines__are_understood(line: str, monkeypatch: pytest.MonkeyPatc
 
 
 OPTION = re.compile(rf"`(?:brokk-min )?({'|'.join(COMMANDS)}) (--[\w-]+)")
-OPTIONS = sorted({option for page in PAGES for option in OPTION.findall(page.read_text())})
+OPTIONS = {option for page in PAGES for option in OPTION.findall(page.read_text())}
 
 
-@pytest.mark.parametrize(("command", "option"), OPTIONS)
-def test_options_in_the_text__exist(command: str, option: str) -> None:
+@pytest.mark.parametrize("command", sorted({command for command, _ in OPTIONS}))
+def test_options_in_the_text__exist(command: str) -> None:
     with contextlib.redirect_stdout(io.StringIO()) as printed, pytest.raises(SystemExit):
         main([command, "--help"])
-    assert re.search(rf"{option}\b", printed.getvalue())
+    known = set(re.findall(r"--[\w-]+", printed.getvalue()))
+    assert {option for name, option in OPTIONS if name == command} <= known
 
 
 def test_make__has_the_targets_of_the_readme() -> None:

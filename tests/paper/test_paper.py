@@ -200,11 +200,12 @@ def documented() -> Iterator[tuple[str, str]]:
             nodes += [(f"{symbol}.{part.name}", part) for part in parts]
 
 
+DOCUMENTED = sorted(set(documented()))
 IN_ROWS = {(row[0], symbol) for row in NAMED for symbol in labels(row[-3])}
 IN_CONSTANTS = {(row[1], symbol) for row in CONSTANT for symbol in labels(row[-3])}
 
 
-@pytest.mark.parametrize(("symbol", "tag"), sorted(set(documented())))
+@pytest.mark.parametrize(("symbol", "tag"), DOCUMENTED)
 def test_tags_of_docstrings__have_a_row(symbol: str, tag: str) -> None:
     """The tag of a module stands for one of its functions."""
     named = {name for row, name in IN_ROWS | IN_CONSTANTS if row.startswith(tag)}
@@ -214,7 +215,7 @@ def test_tags_of_docstrings__have_a_row(symbol: str, tag: str) -> None:
 @pytest.mark.parametrize(("row", "symbol"), sorted(IN_ROWS))
 def test_rows__have_a_tag_in_the_docstring(row: str, symbol: str) -> None:
     """A tag `Fig. 6` stands for all its panels; constants need no tag."""
-    assert any(name == symbol and row.startswith(tag) for name, tag in documented())
+    assert any(name == symbol and row.startswith(tag) for name, tag in DOCUMENTED)
 
 
 # --- tests use the code of their row --------------------------------------------------------------
