@@ -48,7 +48,7 @@ class Options:
     folder: Path = Path("results-seeds")  # A folder for each seed, and seeds.json.
     seeds: int = 10  # How many, from 0 on.
     policies: tuple[str, ...] = tuple(POLICIES)  # Which are trained.
-    quick: bool = False  # Tiny fits and trainings, only to show that it runs.
+    quick: bool = False  # Tiny fits and trainings, x, y, z alone: only to show that it runs.
 
 
 def make(options: Options, name: str, seed: int) -> None:

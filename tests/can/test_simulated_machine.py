@@ -1,32 +1,22 @@
-"""The simulated machine frame by frame on a clock of its own, and before a master of canopen."""
+"""The simulated machine frame by frame on a clock of its own, and as a process that serves."""
 
 import os
 import signal
 import struct
 import threading
-import time
 from dataclasses import replace
 
-import canopen
 import numpy as np
 import pytest
-from helpers_bus import START, dictionary, eventually, recorded_rows, served
+from helpers_bus import START, eventually, recorded_rows
 
-from brokk_min.can.canopen import (
-    HEARTBEAT_PERIOD,
-    WATCHDOG,
-    Frame,
-    encoder_raw,
-    valve_frame,
-    valve_frames,
-)
+from brokk_min.can.canopen import HEARTBEAT_PERIOD, WATCHDOG, Frame, valve_frame, valve_frames
 from brokk_min.can.simulated_machine import SimulatedMachine, simulate, start_pose
 from brokk_min.identification.logs import read_log
 from brokk_min.machine import BROKK_170
 
 NODES = [1, 2, 3, 4, 5, 16]
 CONTROLLER = 16
-RAW = encoder_raw(BROKK_170, np.rint(np.array(START) / BROKK_170.encoder_step).astype(int)).tolist()
 
 
 class Machine(SimulatedMachine):
@@ -233,42 +223,3 @@ def test_simulate__serves_until_a_signal_and_records_every_step(tmp_path):
     np.testing.assert_allclose(recording.q, np.tile(START, (len(recording.q), 1)))
     times = recorded_rows(tmp_path / "plant.csv")[:, 0]
     np.testing.assert_allclose(times, 0.005 * np.arange(1, len(times) + 1), atol=0.0006)
-
-
-def test_serve__is_five_encoders_to_a_master_of_the_canopen_library():
-    with served("master") as machine:
-        network = canopen.Network()
-        network.connect(interface="virtual", channel="master")
-        nodes = [canopen.RemoteNode(n, dictionary()) for n in (1, 2, 3, 4, 5)]
-        positions = {}
-        for node in nodes:
-            network.add_node(node)
-            network.subscribe(
-                0x180 + node.id,
-                lambda i, data, t: positions.update({i: struct.unpack("<I", data)[0]}),
-            )
-        try:
-            assert [node.sdo["units per revolution"].raw for node in nodes] == [4096] * 5
-            assert nodes[0].sdo["device type"].raw == 406
-            nodes[1].sdo["heartbeat"].raw = 100
-            assert nodes[1].sdo["heartbeat"].raw == 100
-            with pytest.raises(canopen.SdoAbortedError) as refused:
-                nodes[0].sdo["position"].raw  # noqa: B018
-            assert refused.value.code == 0x06020000
-            assert nodes[3].nmt.wait_for_heartbeat(10) == "PRE-OPERATIONAL"
-            network.sync.transmit()
-            time.sleep(0.05)
-            assert not positions  # not yet operational
-            network.nmt.state = "OPERATIONAL"
-            eventually(lambda: machine.nmt[5] == 5)
-            # one of before may still be on its way to the master
-            eventually(lambda: nodes[4].nmt.wait_for_heartbeat(10) == "OPERATIONAL")
-            network.sync.transmit()
-            eventually(lambda: len(positions) == 5)
-            assert [positions[0x180 + n] for n in (1, 2, 3, 4, 5)] == RAW
-            nodes[0].nmt.state = "STOPPED"
-            eventually(lambda: machine.nmt[1] == 4 and machine.nmt[2] == 5)
-            nodes[0].nmt.state = "RESET"
-            eventually(lambda: machine.nmt[1] == 127)
-        finally:
-            network.disconnect()

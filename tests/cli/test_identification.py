@@ -78,18 +78,6 @@ def test_fit__has_the_papers_recipe_as_one_option(tmp_path):
     }
 
 
-def test_fit__writes_nothing_for_a_bad_log(tmp_path, capsys):
-    path = tmp_path / "log.csv"
-    foreign_log(path, 0, 1)
-    lines = path.read_text().splitlines()
-    lines[16] = lines[16].replace("take 0,", "take 0,x", 1)
-    path.write_text("\n".join([*lines, ""]))
-    files = ["--out", tmp_path / "n.npz", "--json", tmp_path / "f.json"]
-    assert run("fit", path, *files) == 1
-    assert "row 17, column time: expected finite number" in capsys.readouterr().err
-    assert [p.name for p in tmp_path.iterdir()] == ["log.csv"]
-
-
 @pytest.mark.parametrize(
     ("joints", "options", "machine", "dead_zone"),
     [

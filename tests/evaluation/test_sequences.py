@@ -135,24 +135,18 @@ def test_read_commands__holds_values_until_the_next_row(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("rows", "message"),
     [
-        ("sequence,time,vx,vy,vz\na,1,0,0,0\na,0,0,0,0\n", "sequence a: expected two or more rows"),
-        (
-            "sequence,time,vx,vy,vz\na,1,0,0,0\na,1,1,0,0\na,2,0,0,0\n",
-            "a: expected two or more row",
-        ),
-        ("sequence,time,vx,vy,vz\na,1,0,0,0\n", "sequence a: expected two or more rows"),
-        (
-            "sequence,time,vx,vy,vz\na,1,0,0,0\na,1.01,0,0,0\n",
-            "sequence a: expected a tick to 3600 s",
-        ),
-        ("sequence,time,vx,vy,vz\nall,1,0,0,0\nall,2,0,0,0\n", "another name than all"),
+        ("a,1,0,0,0\na,0,0,0,0\n", "sequence a: expected two or more rows"),
+        ("a,1,0,0,0\na,1,1,0,0\na,2,0,0,0\n", "a: expected two or more row"),
+        ("a,1,0,0,0\n", "sequence a: expected two or more rows"),
+        ("a,1,0,0,0\na,1.01,0,0,0\n", "sequence a: expected a tick to 3600 s"),
+        ("all,1,0,0,0\nall,2,0,0,0\n", "another name than all"),
     ],
 )
-def test_read_commands__refuses_what_is_no_sequence(tmp_path, text, message):
+def test_read_commands__refuses_what_is_no_sequence(tmp_path, rows, message):
     path = tmp_path / "c.csv"
-    path.write_text(text)
+    path.write_text(f"sequence,time,vx,vy,vz\n{rows}")
     with pytest.raises(ValueError, match=message) as error:
         s.read_commands(path, BROKK_170)
     assert str(path) in str(error.value)

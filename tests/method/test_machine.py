@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import inspect
-import pickle
 import re
 from dataclasses import replace
 from itertools import product
@@ -205,12 +203,6 @@ def test_a_replaced_machine__has_columns_and_joints_of_its_own():
     assert BROKK_170.driven.tolist() == [0, 2, 3, 4] and machine.driven.tolist() == [0, 1, 2, 3, 4]
     assert BROKK_170.locked.tolist() == [1] and machine.locked.tolist() == []
     assert machine.q_dot_max.tolist() == [0.20, 0.22, 0.28, 0.38, 0.47]
-
-
-def test_a_machine_survives_copies_and_other_processes():
-    """Gymnasium deep-copies what an environment is made with, and workers get it pickled."""
-    assert copy.deepcopy(BROKK_170) == BROKK_170
-    assert pickle.loads(pickle.dumps(BROKK_170)) == BROKK_170
 
 
 # --- the PWM byte ---------------------------------------------------------------------------------
