@@ -16,6 +16,7 @@ from examples.mini_excavator import MINI_EXCAVATOR
 
 LOW, HIGH = BROKK_170.column("q_min"), BROKK_170.column("q_max")
 PLANT = plant_simulator(BROKK_170)
+COARSE = replace(BROKK_170, plant_dt=0.05)  # one Euler step a tick: fast
 
 
 def two_speeds(up, down):
@@ -84,18 +85,20 @@ def test_preliminary_tests__of_the_plant_have_the_papers_response_times():
 
 
 def test_sim_to_real__of_a_machine_to_itself_is_zero():
-    gap = preliminary.sim_to_real(BROKK_170, {"machine": PLANT, "nets": PLANT}, 0)
+    gap = preliminary.sim_to_real(
+        COARSE, dict.fromkeys(("machine", "nets"), plant_simulator(COARSE)), 0
+    )
     assert not any(array.any() for array in gap)
 
 
-@pytest.mark.parametrize("machine", [BROKK_170, replace(BROKK_170, q_start=())])
+@pytest.mark.parametrize("machine", [COARSE, replace(COARSE, q_start=())])
 def test_sim_to_real__is_between_tools_where_the_arms_end(machine):
     """Nets that stand still: the gap is what the machine moved, from its own start pose."""
     calls = {}
 
     def plant(q, u):
         calls["u"] = u
-        calls["q"] = PLANT(q, u)
+        calls["q"] = plant_simulator(COARSE)(q, u)
         return calls["q"]
 
     gap = preliminary.sim_to_real(machine, {"machine": plant, "nets": standing}, 7)

@@ -24,7 +24,7 @@ STARTS = {  # from where 0.15 m/s for a second is feasible in all directions
 }
 QUICK = {
     "collect": "--hours 0.004",
-    "fit": "--steps 10",
+    "fit": "--steps 10 --batch-size 256",
     "train": "--total-steps 512 --num-envs 16 --horizon 8 --minibatch-size 64 --threads 1",
 }
 
