@@ -128,22 +128,20 @@ def test_load_policy__keeps_every_bit(policy, saved, tmp_path):
     assert saved.read_bytes() == (tmp_path / "other.npz").read_bytes()
 
 
+REORDERED = replace(BROKK_170, joints=(*BROKK_170.joints[1:], BROKK_170.joints[0]))
+
+
 def change_joint(index, **changes):
     joints = list(BROKK_170.joints)
     joints[index] = replace(joints[index], **changes)
     return replace(BROKK_170, joints=tuple(joints))
 
 
-def reordered():
-    first, *others = BROKK_170.joints
-    return replace(BROKK_170, joints=(*others, first))
-
-
 @pytest.mark.parametrize(
     ("machine", "message"),
     [
         (replace(BROKK_170, name="brokk500"), r"machine: expected 'brokk500', got 'brokk170'"),
-        (reordered(), r"joints: expected \['q2', 'q3', 'q4', 'q5', 'q1'\], got \['q1', 'q2'"),
+        (REORDERED, r"joints: expected \['q2', 'q3', 'q4', 'q5', 'q1'\], got \['q1', 'q2'"),
         (change_joint(1, driven=True), r"driven: expected \['q1', 'q2'.*got \['q1', 'q3'"),
         (replace(BROKK_170, pwm_limit=60), r"pwm_limit: expected 60, got 80"),
         (change_joint(2, a=1.5), r"geometry\[2\]\[0\]: expected 1\.5, got 1\.25"),

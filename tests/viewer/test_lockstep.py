@@ -16,29 +16,19 @@ from brokk_min.viewer.lockstep import Comparison, Lockstep, follow
 NEUTRAL = Request(0.0, 0, False, True, np.zeros(3), np.zeros(4))
 
 
-class Clock:
-    """A clock that is set by hand."""
-
-    def __init__(self):
-        self.now = 100.0
-
-    def __call__(self):
-        return self.now
-
-
 def driven(seconds_a_picture, pictures):
     """Telemetry of a window that draws slowly, while the operator holds the switch; lateness."""
-    clock = Clock()
+    now = 100.0
     here, there = Pipe()
     slew = ConstantCommand(60, 0, 0, 0, 0)
     ticks = []
-    with closing(Lockstep(BROKK_170, [slew], START, there, None, clock)) as loop, here:
+    with closing(Lockstep(BROKK_170, [slew], START, there, None, lambda: now)) as loop, here:
         for _ in range(pictures):
             ready = bool(ticks) and not ticks[-1].active_fault
             send_request(here, NEUTRAL._replace(enable=ready))
             late = loop.advance()
             ticks += receive_telemetry(here)
-            clock.now += seconds_a_picture
+            now += seconds_a_picture
     assert not loop.drive.gate.sent[..., -1].any()  # the last tick, after the window was closed
     return ticks, late
 
