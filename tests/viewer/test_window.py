@@ -53,19 +53,9 @@ def test_canvas__cuts_shapes_but_not_text_at_the_clip():
     assert columns(again.image(), 20, RED) == list(range(10, 50))
 
 
-def test_window__shows_a_canvas():
-    canvas = Canvas((60, 40))
-    canvas.bar(10.0, 50.0, 20.0, 5.0, RED)
-    with closing(Window((60, 40), "a title")) as window:
-        window.show(canvas, 1000.0)
-        pixels = window.pygame.surfarray.array3d(window.surface)
-        np.testing.assert_array_equal(pixels.swapaxes(0, 1), canvas.image())
-        assert window.pygame.display.get_caption()[0] == "a title"
-    assert not window.pygame.display.get_init()
-
-
-def test_window__gives_the_size_of_pictures_after_it_was_resized():
+def test_window__shows_a_canvas_and_gives_its_size_after_it_was_resized():
     with closing(Window((700, 500), "a title")) as window:
+        assert window.pygame.display.get_caption()[0] == "a title"
         assert window.size == (700, 500)
         for size, picture in (((900, 600), (900, 600)), ((300, 600), (640, 600))):
             window.pygame.display.set_mode(size, window.pygame.RESIZABLE)
@@ -75,3 +65,4 @@ def test_window__gives_the_size_of_pictures_after_it_was_resized():
             window.show(canvas, 1000.0)
             shown = window.pygame.surfarray.array3d(window.surface).swapaxes(0, 1)
             np.testing.assert_array_equal(shown, canvas.image()[:, : size[0]])
+    assert not window.pygame.display.get_init()
