@@ -16,7 +16,6 @@ from tqdm import tqdm
 from brokk_min.actuator import ActuatorNet
 from brokk_min.evaluation import figures
 from brokk_min.evaluation.claims import VERDICTS, training_claim
-from brokk_min.evaluation.figures import Rows
 from brokk_min.evaluation.metrics import Mean, Traces, mean_interval
 from brokk_min.evaluation.preliminary import Preliminary
 from brokk_min.evaluation.rollout import TITLES, Trace
@@ -35,6 +34,7 @@ AT_REST = ("rl", "rl_open", "jacobian_pid_ff_integral_awake")
 ROBUST = ("rl", "rl_open", "rl_paper", "jacobian_pid_k0.1", "jacobian_pid_ff_integral")
 STAGES = ("record", "fit", "train and tune", "evaluate")  # of the clock; the others are within
 Results = Mapping[str, Any]  # of `results.json`
+Rows = Mapping[str, Mapping[str, Mean]]  # by name of the row and controller
 UNITS = {
     "velocity": "m/s",
     "off": "m",
