@@ -30,7 +30,7 @@ def folder(tmp_path_factory):
     """A log, nets and a policy of the Brokk, made by the commands."""
     folder = tmp_path_factory.mktemp("chain")
     net = folder / "net.npz"
-    assert run(f"collect --hours 0.012 --excitation sine --out '{folder}/log.csv'") == 0
+    assert run(f"collect --hours 0.02 --excitation sine --out '{folder}/log.csv'") == 0
     assert run(f"fit '{folder}/log.csv' --steps 20 --batch-size 256 --out", net) == 0
     options = f"--resume --valve-cost 0.01 {SMALL}"
     assert run(f"train --actuator '{net}' {options} --out", folder / "policy.npz") == 0
