@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from helpers_cli import run
 
-from brokk_min.evaluation import baselines, report, reproduce
+from brokk_min.evaluation import baselines, figures, report, reproduce
 from brokk_min.evaluation.claims import VERDICTS
 from brokk_min.evaluation.reproduce import Budget
 from brokk_min.evaluation.robustness import variations
@@ -21,7 +21,7 @@ from brokk_min.identification.net_file import load_net
 from brokk_min.learning.policy import POLICIES, load_policy
 from brokk_min.machine import BROKK_170
 
-COARSE = replace(BROKK_170, plant_dt=0.05)  # one Euler step a tick: fast
+COARSE = replace(BROKK_170, rate=10.0, plant_dt=0.05)  # two Euler steps a tick: fast
 TINY = Budget(0.004, 20, 4096, 4096, 1, 1, 4, 2, 0.5)
 ERROR = "velocity_error_mean"
 PIDS = ["jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff", "jacobian_pid_ff_awake"]
@@ -56,9 +56,10 @@ def test_settings__made_the_shipped_policies(name):
 def test_reproduce__gives_the_same_bits_twice(folder, tmp_path, monkeypatch, capsys):
     """The second time by its command, as `--quick`, in as many processes as cores."""
     monkeypatch.setattr(reproduce, "QUICK", TINY)
+    monkeypatch.setattr(figures, "png", lambda figure: b"")  # drawn once is enough
     (tmp_path / "m.py").write_text(
         "from dataclasses import replace\nfrom brokk_min import BROKK_170\n"
-        "COARSE = replace(BROKK_170, plant_dt=0.05)\n"
+        "COARSE = replace(BROKK_170, rate=10.0, plant_dt=0.05)\n"
     )
     assert (
         run(f"reproduce --quick --machine '{tmp_path}/m.py:COARSE' --seed 3 --out", tmp_path) == 0
@@ -78,14 +79,14 @@ def test_reproduce__gives_the_same_bits_twice(folder, tmp_path, monkeypatch, cap
 
 
 def test_reproduce__writes_files_that_the_other_commands_read(folder, results):
-    log = read_log([folder / "log.npz"], BROKK_170.velocity_samples, rate=20.0)
+    log = read_log([folder / "log.npz"], BROKK_170.velocity_samples, rate=COARSE.rate)
     assert log.joints == load_net(folder / "net.npz").joints == BROKK_170.names
-    policy = load_policy(folder / "policy.npz", BROKK_170)
+    policy = load_policy(folder / "policy.npz", COARSE)
     assert policy.training["command"] == "brokk-min reproduce --seed 3"
     means = results["task_space"]["summary"]
     errors = {controller: rows["all"][ERROR] for controller, rows in means.items()}
     assert policy.training["velocity_error_mean"] == errors
-    pids = baselines.read_gains(folder / "gains.json", BROKK_170, policy.net)
+    pids = baselines.read_gains(folder / "gains.json", COARSE, policy.net)
     assert baselines.gains_table(pids) == results["gains"]
     assert results["meta"]["seed"] == 3 and results["meta"]["machine"] == "brokk170"
     assert results["meta"]["effort"]["train_steps"] == TINY.train_steps
@@ -189,7 +190,7 @@ def test_render__escapes_names_and_shows_training_seeds(results):
     meta = results["meta"] | {"machine": "digger <1>"}
     changed = results | {"meta": meta, "training_seeds": {"rl": row}}
     images = collections.defaultdict(lambda: "QUJD")
-    page = report.render(BROKK_170, changed, images, {"train rl_paper": 3600.0})
+    page = report.render(COARSE, changed, images, {"train rl_paper": 3600.0})
     assert "digger &lt;1&gt;) is an analytic plant, not a real machine" in page
     assert "0.5000 (0.2500 to 0.7500)" in page_sections(page)["Training seeds"]
 
@@ -198,5 +199,5 @@ def test_net_errors__of_the_papers_nets_are_in_the_results(folder, results):
     """They were fitted to the paper's sines, plain commands and errors of one step."""
     net = load_net(folder / "net_paper.npz")
     assert (net.dead_zone, net.settings["rollout"], net.settings["noise"]) == (0.0, 1, 0.0)
-    test = read_log([folder / "log_test.npz"], BROKK_170.velocity_samples, rate=20.0)
+    test = read_log([folder / "log_test.npz"], BROKK_170.velocity_samples, rate=COARSE.rate)
     assert reproduce.net_errors(COARSE, net, test, 3) == results["paper_recipe"]
