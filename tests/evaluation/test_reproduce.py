@@ -54,7 +54,9 @@ def test_settings__made_the_shipped_policies(name):
 
 
 def test_reproduce__gives_the_same_bits_twice(folder, tmp_path, monkeypatch, capsys):
-    """The second time by its command, as `--quick`, in as many processes as cores."""
+    """The second time by its command, as `--quick`, with trainings and tunings side by side."""
+    cores = iter([1, 2])  # of the fits, of the trainings
+    monkeypatch.setattr(reproduce, "cpu_count", lambda: next(cores, 1))
     monkeypatch.setattr(reproduce, "QUICK", TINY)
     monkeypatch.setattr(figures, "png", lambda figure: b"")  # drawn once is enough
     (tmp_path / "m.py").write_text(
