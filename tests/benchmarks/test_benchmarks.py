@@ -23,7 +23,7 @@ from benchmarks import (
 )
 from brokk_min import kinematics
 from brokk_min.env import action_to_pwm
-from brokk_min.evaluation import metrics, sequences
+from brokk_min.evaluation import metrics, reproduce, sequences
 from brokk_min.evaluation.sequences import hold_table
 from brokk_min.identification.files import SHIPPED
 from brokk_min.identification.logs import read_log
@@ -79,8 +79,9 @@ def test_limits__are_measured(tmp_path):
     assert json.loads(out.read_text())["gradient"] == result["gradient"]
 
 
-def test_seeds__score_what_the_folder_has(tmp_path, capsys):
-    """The shipped policy as one seed, not trained again, and the baselines."""
+def test_seeds__score_what_the_folder_has(tmp_path, capsys, monkeypatch):
+    """The shipped policy as one seed, not trained again, and the baselines; in one process."""
+    monkeypatch.setattr(reproduce, "cpu_count", lambda: 1)
     (tmp_path / "seed_0").mkdir()
     for name in ("net.npz", "policy.npz"):
         copyfile(SHIPPED / "brokk170/policy.npz", tmp_path / "seed_0" / name)
