@@ -41,7 +41,7 @@ LATENTS = 4  # that the nets share
 VALVES = {"rl": "closed", "rl_open": "open"}  # our policies, and their classes at rest
 PAYLOAD = 50.0  # kg at the tool that no log has, assumed: half of a link
 # Small enough for 15 minutes a member on two cores.
-FAMILY = Budget(fit_steps=12_000, train_steps=2_000_000, generations=5, tuning_runs=6, starts=16)
+FAMILY = Budget(fit_steps=12_000, train_steps=2_000_000, starts=16)
 QUICK = replace(reproduce.QUICK, train_steps=20_000, generations=2, tuning_runs=3, fit_steps=400)
 
 
