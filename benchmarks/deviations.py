@@ -12,7 +12,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -174,6 +174,42 @@ def stand() -> Figures:
         result[f"{dead_zone:.2f}, median"] = np.median(paths)
         result[f"{dead_zone:.2f}, most"] = np.max(paths)
     return result
+
+
+@dataclass(frozen=True)
+class Alternating:
+    """A controller whose valves alternate, barely open, after 0.3 s of rest: they stay open."""
+
+    controller: Any
+    opening: float = 0.03  # beyond the dead zone; 0.017 is too little, 0.04 too much
+
+    def start(self, num: int) -> Any:
+        return self.controller.start(num), np.zeros(num, int)
+
+    def __call__(self, measured: Any, state: Any) -> Any:
+        u, inner = self.controller(measured, state[0])
+        rest = np.where(measured.v_goal.any(axis=-1), 0, state[1] + 1)
+        size = np.zeros(M.n)
+        size[M.driven] = M.dead_zone + (1 - M.dead_zone) * self.opening
+        alternating = machine.limit_command(M, (-1.0) ** rest[:, None] * size)
+        return np.where(rest[:, None] > 0.3 * M.rate, alternating, u), (inner, rest)
+
+
+def dither() -> Figures:
+    """Open valves along x, y, z, as shipped and if commands alternate at rest: policy and PID."""
+    shipped = policy.load_policy(POLICY.with_name("policy_open.npz"), M)
+    net = policy.load_policy(POLICY, M).net
+    gains = baselines.read_gains(POLICY.with_name("gains.json"), M, net)
+    pid = gains["jacobian_pid_ff_integral_awake"]
+    controllers: dict[str, Any] = {"ours": policy.PolicyController(M, shipped), "PID": pid}
+    controllers |= {f"{name}, dither": Alternating(c) for name, c in controllers.items()}
+    starts = sequences.evaluation_starts(M, 64, sequences.task_sequences(M), 2)
+    starts = starts[np.array(sequences.start_kinds(M, starts)) == "workspace"]
+    runs, _ = metrics.evaluate(M, controllers, sequences.axis_sequences(M), starts, 0)
+    keys = ("velocity_error_mean", "velocity_rmse", "velocity_error_moves", "velocity_error_rests")
+    keys += ("off_axis_drift_max", "jerk_rms", "valve_travel", "joint_motion_at_rest")
+    means = {name: rows["all"] for name, rows in metrics.summary(runs).items()}
+    return {f"{name}, {key}": means[name][key] or 0.0 for name in means for key in keys}
 
 
 # --- by fitting and training ----------------------------------------------------------------------
@@ -350,7 +386,8 @@ def quiet() -> Figures:
     }
 
 
-MEASURED: tuple[Callable[[], Figures], ...] = (a1, d1, d3, d6, a6, a7, a9, a11, levels, stand)
+MEASURED: tuple[Callable[[], Figures], ...] = (a1, d1, d3, d6, a6, a7, a9, a11)
+MEASURED += (levels, stand, dither)
 TRAINED: tuple[Callable[[], Figures], ...] = (d4, a4, d5, d7, d10, d11, d12, d13, d14, a5, quiet)
 
 
