@@ -57,20 +57,6 @@ def test_gradients__are_compared_with_ppo(capsys):
     assert capsys.readouterr().out.count(" m/s after ") == 2
 
 
-def test_median__needs_most_of_the_seeds():
-    reached = [{"PID": [3.0, 6.0, 100, 10]}, {}, {"PID": [5.0, 7.0, 200, 20]}]
-    rows = [{"reached": row, "best": best} for row, best in zip(reached, (0.1, 0.4, 0.2))]
-    assert peers.median(rows, "PID") == {"reached": [5.0, 7.0, 200.0, 20.0], "best": 0.2}
-    assert peers.median(rows[:2], "PID") == {"reached": None, "best": 0.25}
-    table = {
-        "ours": {"PID": peers.median(rows, "PID")},
-        "sb3": {"PID": peers.median(rows[:2], "PID")},
-    }
-    lines = peers.markdown({"table": table, "targets": {"PID": 0.3}}).splitlines()
-    assert lines[2].endswith("| yes, by hand | PID: 0.3000 | 5.0 | 7 | 0 | 20 | 0.2000 |")
-    assert lines[3].endswith("| no | PID: 0.3000 | not reached |  |  |  | 0.2500 |")
-
-
 def test_limits__are_measured(tmp_path):
     out = tmp_path / "l.json"
     result = limits.main(limits.Options(repeats=1, block_s=0.02, json=out))

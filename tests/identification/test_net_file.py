@@ -74,11 +74,6 @@ def test_load_net__wants_lower_bounds_below_upper_ones(tmp_path):
         load_net(path)
 
 
-def test_load_net__names_file_and_entry_for_another_machine(tmp_path):
-    with pytest.raises(ValueError, match=r"net\.npz: actuator: expected nets for brokk170 with"):
-        load_net(saved(tmp_path / "net.npz"), BROKK_170)
-
-
 def test_fingerprint__differs_between_nets_and_survives_a_file(tmp_path):
     net = random_net()
     save_net(tmp_path / "net.npz", net)

@@ -1,6 +1,5 @@
 """Plants of one's own: two functions, in the place of the analytic plant."""
 
-import runpy
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -64,14 +63,3 @@ def test_commands__take_an_own_plant(tmp_path, capsys):
     ):
         assert run(line, plant) == 2
         assert got in capsys.readouterr().err
-
-
-def test_example__differs_from_the_analytic_plant_by_joint_and_direction():
-    plant = runpy.run_path(OWN.split(":")[0])["PLANT"]
-    machine = SimpleNamespace(dt=0.04)
-    q = np.array([[0.0, -0.3, 1.5, 1.0]])
-    for u, moves in ((0.135, [1, 1, 0, 0]), (-0.135, [0, 0, 1, 1])):
-        state = plant.reset(machine, q)
-        for _ in range(25):
-            state = plant.step(machine, state, np.full((1, 4), u))
-        assert (np.abs(state.q - q)[0] > 1e-4).tolist() == [bool(move) for move in moves], u
