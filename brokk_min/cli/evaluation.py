@@ -20,6 +20,7 @@ from brokk_min.evaluation.claims import VERDICTS
 from brokk_min.evaluation.rollout import TITLES, Controller
 from brokk_min.identification.files import SHIPPED, located, write_json
 from brokk_min.identification.net_file import load_net
+from brokk_min.jacobian import JacobianController
 from brokk_min.learning.policy import POLICIES, Policy, PolicyController, load_policy
 from brokk_min.machine import Machine, number
 
@@ -70,9 +71,10 @@ class Evaluate(Command):
         policy = load_policy(path, machine)
         machine = with_plant(machine, self.plant, ["analytic", "net"])
         net = policy.net if self.plant == "net" else None
+        tuned = baselines.read_gains(gains, machine, policy.net) if gains else {}
         inputs = (self.commands, self.starts, self.num_starts, self.seed)
         commands, starts = sequences.goals_and_starts(machine, *inputs)
-        controllers = self._controllers(machine, policy, gains, net)
+        controllers = self._controllers(machine, policy, tuned, net)
         print(f"gains of the baselines: {gains or 'tuned now'}", file=sys.stderr)
         if self.perfect_model:
             controllers |= perfect_model.perfect_models(machine, starts)
@@ -95,15 +97,19 @@ class Evaluate(Command):
                 print_table(of_kind, len(commands), [k for k in runs[0] if k not in metrics.LABELS])
 
     def _controllers(
-        self, machine: Machine, policy: Policy, gains: Path | None, net: ActuatorNet | None
+        self,
+        machine: Machine,
+        policy: Policy,
+        tuned: dict[str, JacobianController],
+        net: ActuatorNet | None,
     ) -> dict[str, Controller]:
         controllers: dict[str, Controller] = {"rl": PolicyController(machine, policy)}
         for name, file in POLICIES.items():
             path = SHIPPED / machine.name / file
             if not self.policy and name != "rl" and path.exists():
                 controllers[name] = PolicyController(machine, load_policy(path, machine))
-        if gains:
-            return controllers | baselines.read_gains(gains, machine, policy.net)
+        if tuned:
+            return controllers | tuned
         budget = (baselines.TUNING_RUNS, baselines.GENERATIONS, self.seed)
         config = TaskConfig(noise=self.noise)
         tuned, _ = baselines.tune_baselines(machine, policy.net, *budget, config, net)
