@@ -70,7 +70,9 @@ def make(options: Options, name: str, seed: int) -> None:
 
 def score(options: Options) -> list[dict[str, Any]]:
     """A row for each policy that the folder has, and for each baseline: means over starts."""
-    commands = sequences.task_sequences(M)[: 3 if options.quick else None]
+    commands = sequences.task_sequences(M)
+    if options.quick:
+        commands = sequences.shorten(M, commands[:3], 8.0)
     starts = sequences.evaluation_starts(M, 8 if options.quick else 64, commands, 2)
     workspace = np.array(sequences.start_kinds(M, starts)) == "workspace"
     policies = {
