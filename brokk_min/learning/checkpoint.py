@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from brokk_min import ppo
 from brokk_min.actuator import ActuatorNet
-from brokk_min.env import State, TaskConfig, observation_scale
+from brokk_min.env import State, TaskConfig, observation_scale, terminated
 from brokk_min.identification import files
 from brokk_min.identification.net_file import fingerprint
 from brokk_min.learning.gym_env import TaskVectorEnv
@@ -96,10 +96,15 @@ def train_policy(
 
 
 def stagger_episodes(env: TaskVectorEnv) -> None:
-    """Let the first episodes end one after the other: every batch then has some starts."""
+    """Let the first episodes end one after the other: every batch then has some starts.
+
+    An arm that starts in the ground ends in its first tick, as in all later episodes.
+    """
     assert env.state is not None
     episode_ticks = round(env.config.episode_s * env.machine.rate)
-    env.state = replace(env.state, ticks=np.arange(env.num_envs) * episode_ticks // env.num_envs)
+    ticks = np.arange(env.num_envs) * episode_ticks // env.num_envs
+    ticks[terminated(env.machine, env.state.lowest)] = 0
+    env.state = replace(env.state, ticks=ticks)
 
 
 def load_actor(agent: Agent, policy: Policy) -> str:

@@ -162,6 +162,16 @@ def test_stagger_episodes__ends_them_one_after_the_other():
     assert np.diff(np.flatnonzero(ended.any(axis=1))).tolist() == [5] * 15
 
 
+def test_stagger_episodes__of_the_papers_agent_ends_starts_in_the_ground():
+    env = TaskVectorEnv(256, NET, BROKK_170, TaskConfig(paper=True))
+    env.reset(seed=0)
+    ground = env.state.lowest < BROKK_170.ground
+    stagger_episodes(env)
+    ended = env.step(np.zeros((256, 4)))[2]
+    assert 5 < ground.sum() < 30
+    assert ended.sum() == ground.sum()
+
+
 def test_count_episodes__means_return_and_length_of_those_that_ended(tmp_path):
     log = TrainingLog(TaskVectorEnv(2, NET), TINY, tmp_path / "p.npz", {}, None)
     rewards = np.array([[1.0, 10.0], [2.0, 20.0], [4.0, 40.0]])
