@@ -44,8 +44,8 @@ class Collect(Command):
 
     out: Path  # Log to write, .csv or .npz.
     hours: float = number("h", 1e-4, 100, 1.0)  # Driving time for each actuator [h].
-    excitation: Literal["sine", "rich", "joint"] | None = None
-    """The paper's sines; steps and holds too (the default); these on all joints, HOURS in all."""
+    excitation: Literal["auto", "sine", "rich", "joint"] = "auto"
+    """The paper's sines; steps and holds too (auto); these on all joints, HOURS in all."""
     policy: Path | None = None  # It drives instead: fit to its log, too, and train again.
     plant: PlantName = "analytic"  # What moves: the analytic plant, or an object of your file.
 
@@ -53,7 +53,7 @@ class Collect(Command):
         machine = self.check(out="log")
         if self.out.suffix not in (".csv", ".npz"):
             raise WrongUse(f"--out: expected a name ending in .csv or .npz, got {self.out}")
-        if self.policy and self.excitation:
+        if self.policy and self.excitation != "auto":
             raise WrongUse(f"--excitation: expected none with --policy, got {self.excitation}")
         rng = np.random.default_rng(self.seed)
         machine = with_plant(machine, self.plant, ["analytic"])
@@ -61,7 +61,8 @@ class Collect(Command):
             driver = PolicyController(machine, load_policy(self.policy, machine))
             log = own_drives(machine, [driver], self.hours, self.seed)
         else:
-            log = excitation.collect(machine, self.hours, self.excitation or "rich", rng)
+            kind = "rich" if self.excitation == "auto" else self.excitation
+            log = excitation.collect(machine, self.hours, kind, rng)
         write_log(self.out, log)
         num = sum(not one.name.endswith(RETURN) for one in log.recordings)
         print(f"{self.out}: {num} recordings of {', '.join(log.joints)}")
