@@ -248,6 +248,7 @@ class Play(Command):
             play.play(machine, self.controllers(machine), bus, self.attempts)
 
     def controllers(self, machine: Machine) -> dict[str, Controller]:
+        """The policy and the paper's PID; none if no policy is given and none is shipped."""
         path, gains = default_policy(machine, self.policy, self.gains)
         if not self.policy and not path.exists():
             return {}
