@@ -25,26 +25,6 @@ def number(
     return dataclasses.field(default=default, metadata={"unit": unit, "low": low, "high": high})
 
 
-def check_numbers(owner: Any, label: str = "") -> None:
-    """ValueError: a number that is not finite, not whole where it must be, or out of its range."""
-    hints = get_type_hints(type(owner))
-    for field in dataclasses.fields(owner):
-        value, hint = getattr(owner, field.name), hints[field.name]
-        values = (True, False) if hint is bool else get_args(hint)
-        if get_origin(hint) in (None, Literal) and values and value not in values:
-            raise ValueError(f"{label}{field.name}: expected one of {values}, got {value!r}")
-        if "unit" not in field.metadata or (value is None and type(None) in values):
-            continue
-        types: Any = (int, np.integer) if hint is int else (int, float, np.integer, np.floating)
-        if isinstance(value, bool) or not isinstance(value, types) or not abs(value) < np.inf:
-            kind = "whole" if hint is int else "finite"
-            raise ValueError(f"{label}{field.name}: expected a {kind} number, got {value!r}")
-        low, high = field.metadata["low"], field.metadata["high"]
-        low = getattr(owner, low) if isinstance(low, str) else low
-        if not low <= value <= high:
-            raise ValueError(f"{label}{field.name}: expected {low} to {high}, got {value!r}")
-
-
 @dataclass(frozen=True)
 class Joint:
     """One joint: its standard DH row Rz(theta) Tz(d) Tx(a) Rx(alpha), range and drive.
@@ -202,22 +182,30 @@ class Machine:
         return column
 
 
+def check_numbers(owner: Any, label: str = "") -> None:
+    """ValueError: a number that is not finite, not whole where it must be, or out of its range."""
+    hints = get_type_hints(type(owner))
+    for field in dataclasses.fields(owner):
+        value, hint = getattr(owner, field.name), hints[field.name]
+        values = (True, False) if hint is bool else get_args(hint)
+        if get_origin(hint) in (None, Literal) and values and value not in values:
+            raise ValueError(f"{label}{field.name}: expected one of {values}, got {value!r}")
+        if "unit" not in field.metadata or (value is None and type(None) in values):
+            continue
+        types: Any = (int, np.integer) if hint is int else (int, float, np.integer, np.floating)
+        if isinstance(value, bool) or not isinstance(value, types) or not abs(value) < np.inf:
+            kind = "whole" if hint is int else "finite"
+            raise ValueError(f"{label}{field.name}: expected a {kind} number, got {value!r}")
+        low, high = field.metadata["low"], field.metadata["high"]
+        low = getattr(owner, low) if isinstance(low, str) else low
+        if not low <= value <= high:
+            raise ValueError(f"{label}{field.name}: expected {low} to {high}, got {value!r}")
+
+
 def as_floats(values: ArrayLike) -> NDArray[np.floating]:
     """An array of floats; its float type is kept, whole numbers become float64."""
     array = np.asarray(values)
     return array if array.dtype.kind == "f" else array.astype(float)
-
-
-def limit_command(machine: Machine, u: ArrayLike) -> NDArray[np.floating]:
-    """The command that reaches the valve: whole PWM counts, clipped to the limit. Paper: Sec. 3.2
-
-    Example:
-        >>> limit_command(BROKK_170, [-1.0, 0.1]) * 127
-        array([-80.,  13.])
-    """
-    u = as_floats(u)
-    counts = np.clip(np.rint(u * PWM_MAX), -machine.pwm_limit, machine.pwm_limit)
-    return np.asarray(counts / PWM_MAX, u.dtype)
 
 
 def valve_opening(u: ArrayLike, dead_zone: float) -> NDArray[np.floating]:
@@ -231,6 +219,56 @@ def valve_opening(u: ArrayLike, dead_zone: float) -> NDArray[np.floating]:
     """
     u = as_floats(u)
     return np.asarray((u - np.clip(u, -dead_zone, dead_zone)) / (1 - dead_zone))
+
+
+# Joints of the Brokk 170. Sources: all assumed, but the fastest motions of q5 (paper, Sec. 3.2).
+# fmt: off
+_DH = [
+    # name driven  a [m]  alpha [rad]  d [m]  theta [rad]    q_min, q_max [rad]
+    ("q1", True,   0.25,  np.pi / 2,   0.95,  0.0,           -2.14, 2.14),
+    ("q2", False,  1.15,  0.0,         0.0,   0.0,            0.0,  1.4),
+    ("q3", True,   1.25,  0.0,         0.0,   0.0,           -0.3,  1.6),
+    ("q4", True,   1.15,  0.0,         0.0,   -np.pi,         0.6,  2.9),
+    ("q5", True,   1.20,  0.0,         0.0,   -3 * np.pi / 4, 0.0,  2.0),
+]
+_DRIVES = [
+    # up, down [rad/s]  node  base, rod [m]  angle [rad]  area [m^2]  speed +, - [m/s]
+    (0.20, 0.20,        1,    0.00, 0.15,     0.00,       0.0040,     0.0498, 0.0498),
+    (0.15, 0.22,        2,    1.00, 0.35,     0.45,       0.0100,     0.0588, 0.0802),
+    (0.17, 0.28,        3,    0.90, 0.30,     0.80,       0.0090,     0.0453, 0.0825),
+    (0.22, 0.38,        4,    0.80, 0.25,    -0.30,       0.0060,     0.0370, 0.0662),
+    (0.24, 0.47,        5,    0.60, 0.20,     0.40,       0.0040,     0.0425, 0.0833),
+]
+# fmt: on
+
+BROKK_170 = Machine(
+    name="brokk170",
+    joints=tuple(Joint(*dh, *drive) for dh, drive in zip(_DH, _DRIVES, strict=True)),  # type: ignore[arg-type]
+    rate=20.0,  # Hz; paper: Sec. 3.3
+    pwm_limit=80,  # counts of 127; paper: Sec. 3.2
+    dead_zone=0.07,  # of full command; paper: Sec. 3.3
+    pump_flow=0.00105,  # m^3/s; assumed
+    encoder_bits=12,  # bits a turn; assumed
+    velocity_samples=4,  # samples; tuned
+    history=13,  # samples; paper: Table 1 (0.6 s)
+    tool_speed=0.3,  # m/s; assumed
+    ground=0.0,  # m; assumed
+    valve_frame_id=0x210,  # CAN id; assumed
+    controller_node=0x10,  # CANopen node id; assumed
+    q_start=(1.5, 0.5, 0.58, 1.71, 1.24),  # rad; paper: Sec. 4.1
+)
+
+
+def limit_command(machine: Machine, u: ArrayLike) -> NDArray[np.floating]:
+    """The command that reaches the valve: whole PWM counts, clipped to the limit. Paper: Sec. 3.2
+
+    Example:
+        >>> limit_command(BROKK_170, [-1.0, 0.1]) * 127
+        array([-80.,  13.])
+    """
+    u = as_floats(u)
+    counts = np.clip(np.rint(u * PWM_MAX), -machine.pwm_limit, machine.pwm_limit)
+    return np.asarray(counts / PWM_MAX, u.dtype)
 
 
 def encode_pwm(u: ArrayLike) -> NDArray[np.uint8]:
@@ -290,41 +328,3 @@ def estimate_velocity(q: ArrayLike, samples: int, dt: float) -> NDArray[np.float
     t = dt * (np.arange(samples) - (samples - 1) / 2)
     weights = (t / (t @ t)).astype(q.dtype)  # slope = sum t_i q_i / sum t_i^2
     return np.asarray(np.einsum("...t,t", q[..., -samples:], weights))
-
-
-# Joints of the Brokk 170. Sources: all assumed, but the fastest motions of q5 (paper, Sec. 3.2).
-# fmt: off
-_DH = [
-    # name driven  a [m]  alpha [rad]  d [m]  theta [rad]    q_min, q_max [rad]
-    ("q1", True,   0.25,  np.pi / 2,   0.95,  0.0,           -2.14, 2.14),
-    ("q2", False,  1.15,  0.0,         0.0,   0.0,            0.0,  1.4),
-    ("q3", True,   1.25,  0.0,         0.0,   0.0,           -0.3,  1.6),
-    ("q4", True,   1.15,  0.0,         0.0,   -np.pi,         0.6,  2.9),
-    ("q5", True,   1.20,  0.0,         0.0,   -3 * np.pi / 4, 0.0,  2.0),
-]
-_DRIVES = [
-    # up, down [rad/s]  node  base, rod [m]  angle [rad]  area [m^2]  speed +, - [m/s]
-    (0.20, 0.20,        1,    0.00, 0.15,     0.00,       0.0040,     0.0498, 0.0498),
-    (0.15, 0.22,        2,    1.00, 0.35,     0.45,       0.0100,     0.0588, 0.0802),
-    (0.17, 0.28,        3,    0.90, 0.30,     0.80,       0.0090,     0.0453, 0.0825),
-    (0.22, 0.38,        4,    0.80, 0.25,    -0.30,       0.0060,     0.0370, 0.0662),
-    (0.24, 0.47,        5,    0.60, 0.20,     0.40,       0.0040,     0.0425, 0.0833),
-]
-# fmt: on
-
-BROKK_170 = Machine(
-    name="brokk170",
-    joints=tuple(Joint(*dh, *drive) for dh, drive in zip(_DH, _DRIVES, strict=True)),  # type: ignore[arg-type]
-    rate=20.0,  # Hz; paper: Sec. 3.3
-    pwm_limit=80,  # counts of 127; paper: Sec. 3.2
-    dead_zone=0.07,  # of full command; paper: Sec. 3.3
-    pump_flow=0.00105,  # m^3/s; assumed
-    encoder_bits=12,  # bits a turn; assumed
-    velocity_samples=4,  # samples; tuned
-    history=13,  # samples; paper: Table 1 (0.6 s)
-    tool_speed=0.3,  # m/s; assumed
-    ground=0.0,  # m; assumed
-    valve_frame_id=0x210,  # CAN id; assumed
-    controller_node=0x10,  # CANopen node id; assumed
-    q_start=(1.5, 0.5, 0.58, 1.71, 1.24),  # rad; paper: Sec. 4.1
-)
