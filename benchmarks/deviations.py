@@ -12,7 +12,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -176,33 +176,20 @@ def stand() -> Figures:
     return result
 
 
-@dataclass(frozen=True)
-class Alternating:
-    """A controller whose valves alternate, barely open, after 0.3 s of rest: they stay open."""
-
-    controller: Any
-    opening: float = 0.03  # beyond the dead zone; 0.017 is too little, 0.04 too much
-
-    def start(self, num: int) -> Any:
-        return self.controller.start(num), np.zeros(num, int)
-
-    def __call__(self, measured: Any, state: Any) -> Any:
-        u, inner = self.controller(measured, state[0])
-        rest = np.where(measured.v_goal.any(axis=-1), 0, state[1] + 1)
-        size = np.zeros(M.n)
-        size[M.driven] = M.dead_zone + (1 - M.dead_zone) * self.opening
-        alternating = machine.limit_command(M, (-1.0) ** rest[:, None] * size)
-        return np.where(rest[:, None] > 0.3 * M.rate, alternating, u), (inner, rest)
-
-
 def dither() -> Figures:
-    """Open valves along x, y, z, as shipped and if commands alternate at rest: policy and PID."""
-    shipped = policy.load_policy(POLICY.with_name("policy_open.npz"), M)
-    net = policy.load_policy(POLICY, M).net
-    gains = baselines.read_gains(POLICY.with_name("gains.json"), M, net)
-    pid = gains["jacobian_pid_ff_integral_awake"]
-    controllers: dict[str, Any] = {"ours": policy.PolicyController(M, shipped), "PID": pid}
-    controllers |= {f"{name}, dither": Alternating(c) for name, c in controllers.items()}
+    """Policies and PIDs along x, y, z, each with all three kinds of valves at rest."""
+    policies = {
+        name: policy.load_policy(POLICY.with_name(file), M)
+        for name, file in policy.POLICIES.items()
+    }
+    gains = baselines.read_gains(POLICY.with_name("gains.json"), M, policies["rl"].net)
+    controllers: dict[str, Any] = {}
+    for valves in ("closed", "dither", "open"):
+        for name, shipped in policies.items():
+            driver = policy.PolicyController(M, replace(shipped, valves=valves))
+            controllers[f"{name}, {valves}"] = driver
+        for name in ("jacobian_pid_k0.1", "jacobian_pid_ff_integral_dither"):
+            controllers[f"{name}, {valves}"] = replace(gains[name], valves=valves)
     starts = sequences.evaluation_starts(M, 64, sequences.task_sequences(M), 2)
     starts = starts[np.array(sequences.start_kinds(M, starts)) == "workspace"]
     runs, _ = metrics.evaluate(M, controllers, sequences.axis_sequences(M), starts, 0)
@@ -372,7 +359,11 @@ def quiet() -> Figures:
     cost = partial(baselines.tuning_cost, start=start, goals=goals, seed=0, config=config)
     gains = baselines.read_gains(shipped / "gains.json", M, net)
     by_hand = baselines.baselines(M, net)
-    for name in ("jacobian_pid_k0.1", "jacobian_pid_ff_integral", "jacobian_pid_ff_integral_awake"):
+    for name in (
+        "jacobian_pid_k0.1",
+        "jacobian_pid_ff_integral",
+        "jacobian_pid_ff_integral_dither",
+    ):
         controllers[name] = gains[name]
         tuned, _ = baselines.tune(by_hand[name], cost, 0, baselines.GENERATIONS, name)
         controllers[f"{name}, tuned so"] = tuned

@@ -124,7 +124,8 @@ class MixedController:
         """As `PolicyController`."""
         action = self.policy.act(features(M, measured, "observation" not in self.steps))
         u = action_to_pwm(M, action, "actions" not in self.steps)
-        return actuator.close_valves(M, self.valves, u, measured.v_goal, ticks)
+        u, _, ticks = actuator.command_at_rest(M, self.valves, u, measured.v_goal, ticks)
+        return u, ticks
 
 
 def nets_of(folder: Path, steps: frozenset[str]) -> ActuatorNet:

@@ -35,7 +35,6 @@ from torch.distributions import Normal
 
 from benchmarks import POLICY, write
 from brokk_min import ppo
-from brokk_min.actuator import ActuatorNet
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation.baselines import read_gains
 from brokk_min.evaluation.rollout import Controller, rollout
@@ -43,13 +42,14 @@ from brokk_min.evaluation.sequences import tuning_set
 from brokk_min.learning.checkpoint import export_policy, stagger_episodes
 from brokk_min.learning.episodes import GRADIENT_LEARNER
 from brokk_min.learning.gym_env import TaskVectorEnv
-from brokk_min.learning.policy import PolicyController, load_policy
+from brokk_min.learning.policy import Policy, PolicyController, load_policy
 from brokk_min.learning.simulation_gradient import improved_actions, regression_loss
 from brokk_min.machine import BROKK_170 as M
 
 C = ppo.PPOConfig  # its gamma, GAE lambda, clip, window and first deviation are the peers', too
 EPOCHS = 4  # of peers
 GAINS = POLICY.with_name("gains.json")
+SHIPPED = POLICY.with_name("policy_dither.npz")
 Setting = tuple[float, int]  # learning rate, environment steps
 Report = Callable[[Iterable[nn.Module], int], None]  # an actor's layers, gradient steps in all
 
@@ -61,7 +61,7 @@ class Finished(Exception):
 @dataclass
 class Options:
     learners: tuple[str, ...] = ("ours", "critic", "sb3", "cleanrl", "rl_games")  # Who takes part.
-    policy: Path = POLICY  # Whose nets all train on; its error is the third level.
+    policy: Path = SHIPPED  # Whose nets and valves at rest all have; its error is a level.
     gains: Path = GAINS  # Tuned gains of the PID.
     seeds: tuple[int, ...] = (0, 1, 2)  # One run each.
     longest: float = 1.0  # Fraction of the lengths of `SETTINGS`.
@@ -257,7 +257,7 @@ LEARNERS = {"ours": ours, "critic": partial(ours, critic=True)}
 LEARNERS |= {"sb3": sb3, "cleanrl": cleanrl, "rl_games": rl_games}
 NAMES = {"ours": "ours: gradients of the simulation", "critic": "ours, `train --critic`: GAE"}
 NAMES |= {"sb3": "Stable-Baselines3 PPO", "cleanrl": "CleanRL's loop", "rl_games": "rl_games PPO"}
-LENGTHS = (65_536, 131_072, 1_048_576, 3_000_000)  # ours; a policy is regressed in few steps
+LENGTHS = (131_072, 524_288, 1_048_576, 3_000_000)  # ours; a policy is regressed in few steps
 SETTINGS: dict[str, list[Setting]] = {
     name: [(rate, steps) for rate in (6e-4, 1.5e-3) for steps in (300_000, 800_000)]
     for name in LEARNERS
@@ -280,17 +280,18 @@ def machine_error(controller: Controller, runs: int) -> float:
     return float(np.linalg.norm(goals - trace.v_tool, axis=-1).mean())
 
 
-def levels(net: ActuatorNet, options: Options) -> dict[str, float]:
+def levels(shipped: Policy, options: Options) -> dict[str, float]:
     """Errors to reach [m/s]."""
-    pid = machine_error(read_gains(options.gains, M, net)["jacobian_pid_k0.1"], options.runs)
-    shipped = PolicyController(M, load_policy(options.policy, M))
-    error = machine_error(shipped, options.runs)
+    pid = machine_error(
+        read_gains(options.gains, M, shipped.net)["jacobian_pid_k0.1"], options.runs
+    )
+    error = machine_error(PolicyController(M, shipped), options.runs)
     return {"PID": pid, "half of the PID": pid / 2, "shipped policy": error}
 
 
 def race(
     name: str,
-    net: ActuatorNet,
+    shipped: Policy,
     setting: Setting,
     seed: int,
     targets: dict[str, float],
@@ -298,7 +299,7 @@ def race(
 ) -> dict[str, Any]:
     """One run: `reached` has CPU and wall seconds, environment and gradient steps of each level."""
     torch.set_num_threads(1)
-    env = TaskVectorEnv(options.num_envs, net)
+    env = TaskVectorEnv(options.num_envs, shipped.net, M, TaskConfig(valves=shipped.valves))  # type: ignore[arg-type]
     rate, steps = setting[0], round(setting[1] * options.longest)
     row: dict[str, Any] = {"learner": name, "setting": setting, "seed": seed, "best": np.inf}
     row |= {"updates": 0, "gradient_steps": 0, "cpu_s": 0.0, "wall_s": 0.0, "reached": {}}
@@ -314,7 +315,7 @@ def race(
         done = row["updates"] * C.horizon * env.num_envs
         if row["updates"] >= check or done >= steps:
             check = 1 + int(1.2 * row["updates"])
-            policy = export_policy(M, net, SimpleNamespace(actor=actor), env.config, {})  # type: ignore[arg-type]
+            policy = export_policy(M, shipped.net, SimpleNamespace(actor=actor), env.config, {})  # type: ignore[arg-type]
             row["best"] = min(row["best"], machine_error(PolicyController(M, policy), options.runs))
             now = [row["cpu_s"], row["wall_s"], done, gradient_steps]
             for level, target in targets.items():
@@ -335,8 +336,8 @@ def best_run(rows: list[dict[str, Any]], level: str) -> dict[str, Any]:
 
 
 def main(options: Options) -> dict[str, Any]:
-    net = load_policy(options.policy, M).net
-    targets = levels(net, options)
+    shipped = load_policy(options.policy, M)
+    targets = levels(shipped, options)
     rows: list[dict[str, Any]] = []
     if options.json and options.json.exists():  # go on
         rows = json.loads(options.json.read_text())["runs"]
@@ -349,7 +350,7 @@ def main(options: Options) -> dict[str, Any]:
         if any(tuple(row["setting"]) == setting for row in runs(name, seed, level)):
             return
         wanted = {level: targets[level]} if level else targets
-        rows.append(race(name, net, setting, seed, wanted, options) | {"level": level})
+        rows.append(race(name, shipped, setting, seed, wanted, options) | {"level": level})
         print(json.dumps(rows[-1]), flush=True)
         if options.json:
             options.json.write_text(json.dumps({"runs": rows}, indent=1) + "\n")

@@ -34,11 +34,11 @@ FIGURES = {  # name in the file -> figure of `metrics`
     "valve_travel": "valve_travel",
     "joint_motion_at_rest": "joint_motion_at_rest",
 }
-NAMES = {"rl": "ours closed", "rl_open": "ours open", "rl_paper": "paper"}
+NAMES = {"rl": "ours closed", "rl_dither": "ours dither", "rl_paper": "paper"}
 NAMES |= {"rl_paper_closed": "paper closed"}
 RECIPES: dict[str, tuple[str, str, dict[str, Any]]] = {  # policy -> nets, excitation, recipe
     "rl": ("net", "rich", {}),
-    "rl_open": ("net", "rich", {}),
+    "rl_dither": ("net", "rich", {}),
     "rl_paper": ("net_paper", "sine", fitting.PAPER_RECIPE),
 }
 
@@ -109,7 +109,7 @@ def draw(options: Options) -> None:
     """Velocity error on the nets while ours learn: mean of the seeds, least and largest."""
     figure = Figure(figsize=(7.0, 2.4), layout="compressed")
     axes = figure.subplots()
-    for name, style in (("rl", "-"), ("rl_open", "--")):
+    for name, style in (("rl", "-"), ("rl_dither", "--")):
         files = sorted(options.folder.glob(f"seed_*/{POLICIES[name]}.csv"))
         if files:
             tables = [read_table(f, ["global_step", "charts/velocity_error"]) for f in files]

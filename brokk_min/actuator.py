@@ -13,9 +13,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brokk_min.machine import Array, Machine, estimate_velocity, valve_opening
+from brokk_min.machine import Array, Machine, estimate_velocity, limit_command, valve_opening
 
-CLOSE_AFTER = 0.5  # s of a zero goal, assumed: then the valves close
+REST_AFTER = {"closed": 0.5, "dither": 0.1, "open": math.inf}  # s of a zero goal, assumed, tuned
+DITHER = 0.03  # opening of valves that alternate at rest, tuned: 0.02 is too little
 STANDSTILL = 0.002  # rad or m, assumed: little more than one step of a 12-bit encoder
 MU = 50.0  # assumed: the mu law is about linear below 1/50 of full opening
 
@@ -126,17 +127,23 @@ def append_command(history: Array, u: ArrayLike) -> Array:
     return result
 
 
-def close_valves(
-    machine: Machine, valves: str, u: Array, v_goal: Array, rest_ticks: NDArray[np.int64]
-) -> tuple[Array, NDArray[np.int64]]:
-    """Commands u (..., n): 0 after `CLOSE_AFTER` of a zero goal if `valves` are to be "closed".
+def command_at_rest(
+    machine: Machine, valves: str, u: Array, v_goal: Array, ticks: NDArray[np.int64]
+) -> tuple[Array, NDArray[np.bool_], NDArray[np.int64]]:
+    """Commands u (..., n), but those of the rule for `valves` after `REST_AFTER` of a zero goal.
 
-    Then the joints stand, but the next motion begins 0.3 s later. `rest_ticks` (...) counts the
-    ticks of a zero goal (..., 3) before this one; it is returned with this one counted.
+    "closed": zero. The joints stand, but the next motion begins 0.3 s later. "dither": driven
+    valves open by `DITHER`, each tick the other way; the joints stand, the valves stay open
+    (Merritt 1967). "open": no rule (the paper). `ticks` (...) of a zero goal (..., 3) are those
+    before this one. Also: does the rule hold, (..., 1), and the ticks with this one.
     """
-    rest_ticks = np.where(v_goal.any(axis=-1), 0, rest_ticks + 1)
-    resting = (valves == "closed") & (rest_ticks > CLOSE_AFTER * machine.rate)
-    return np.where(resting[..., None], np.zeros_like(u), u), rest_ticks
+    ticks = np.where(v_goal.any(axis=-1), 0, ticks + 1)
+    resting = (ticks > REST_AFTER[valves] * machine.rate)[..., None]
+    rule = np.zeros_like(u)
+    if valves == "dither":
+        size = machine.dead_zone + (1 - machine.dead_zone) * DITHER
+        rule[..., machine.driven] = (-1.0) ** ticks[..., None] * size
+    return np.where(resting, limit_command(machine, rule), u), resting, ticks
 
 
 def append_sample(history: Array, u: ArrayLike, q: Array, window: int, dt: float) -> Array:

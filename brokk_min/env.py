@@ -36,7 +36,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brokk_min import actuator, kinematics, machine
-from brokk_min.actuator import ActuatorNet, PlantState, append_sample, close_valves, initial_history
+from brokk_min.actuator import ActuatorNet, PlantState, append_sample, initial_history
 from brokk_min.jacobian import dls
 from brokk_min.kinematics import forward_kinematics, jacobian, tool_velocity
 from brokk_min.machine import PWM_MAX, Array, Machine, as_floats, limit_command, read_encoder
@@ -60,7 +60,7 @@ class TaskConfig:
     noise: float = machine.number("1", 0, 1000, 0.05)  # Of sensors, in deviations (paper: 5 %).
     valve_cost: float = machine.number("1", 0, 1000, 0.05)  # Of a full change of all (paper: 0).
     integral_cost: float = machine.number("1/m", 0, 1000, 1.0)  # Of the error integral (paper: 0).
-    valves: Literal["closed", "open"] = "closed"  # While the tool rests, see `close_valves`.
+    valves: Literal["closed", "dither", "open"] = "closed"  # At rest: `actuator.command_at_rest`.
     redraw_ground: bool = True  # Redraw start poses in the ground; the paper ends the episode.
     paper: bool = False  # The paper's agent: observation, action, reward, start and end, see above.
     __post_init__ = machine.check_numbers  # type: ignore[misc]
@@ -316,7 +316,7 @@ def step(
     """
     u = action_to_pwm(machine, action, config.paper)
     valves = "open" if config.paper else config.valves
-    u, rest = close_valves(machine, valves, u, state.v_goal, state.rest_ticks)
+    u, _, rest = actuator.command_at_rest(machine, valves, u, state.v_goal, state.rest_ticks)
     state = replace(transition(machine, net, state, u), rest_ticks=rest)
     rewards = reward(state.v_goal, state.v_tool)
     error = np.linalg.norm(state.v_goal - state.v_tool, axis=-1)

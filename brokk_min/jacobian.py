@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brokk_min.actuator import close_valves
+from brokk_min.actuator import command_at_rest
 from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, valve_opening
 
@@ -129,7 +129,7 @@ class PIDState(NamedTuple):
     error: Array  # velocity error of the last tick [rad/s]
     derivative: Array  # filtered derivative of the error [rad/s^2]
     q_dot_goal: Array  # desired joint velocities of the last tick [rad/s]
-    rest_ticks: NDArray[np.int64]  # of `close_valves`, (...)
+    rest_ticks: NDArray[np.int64]  # of `command_at_rest`, (...)
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ class JacobianController:
 
     The PID gives the valve opening; the dead zone is added afterwards. While the tool
     is to move, no valve goes below the opening `min_opening`: one that has closed answers late
-    (paper Sec. 3.2). At rest `close_valves` closes all, unless they are to stay "open".
+    (paper Sec. 3.2). At rest `command_at_rest` has a rule, unless `valves` are "open".
     Paper: eq3, Sec. 4.2
     """
 
@@ -147,7 +147,7 @@ class JacobianController:
     k: float  # of Nakamura's damping
     w0: float  # manipulability below which damping sets in
     feedforward: Callable[[Array, Array], Array] | None = None  # q, q_dot (..., n_driven) -> u
-    valves: str = "closed"  # or "open": `min_opening` holds while the tool rests, too
+    valves: str = "closed"  # or, at rest, "dither", or "open": no rule, and `min_opening` holds
 
     def start(self, num: int) -> PIDState:
         """State of `num` controllers at rest."""
@@ -192,18 +192,17 @@ class JacobianController:
             opening = opening + valve_opening(u, m.dead_zone)
         limit = valve_opening(m.pwm_limit / PWM_MAX, m.dead_zone)
         saturated = (np.abs(opening) >= limit) & (np.sign(opening) == np.sign(error))
-        may_open, rest_ticks = close_valves(
-            m, self.valves, np.ones_like(opening), measured.v_goal, state.rest_ticks
-        )
-        increase = np.where(saturated, 0.0, may_open * gains.ki * error * m.dt)  # anti-windup
-        u = self._open_valves(may_open * opening, measured.v_goal)
-        return u, PIDState(state.integral + increase, error, derivative, q_dot_goal, rest_ticks)
+        u = self._open_valves(opening, measured.v_goal)
+        rest = measured.v_goal, state.rest_ticks
+        u, resting, ticks = command_at_rest(m, self.valves, u, *rest)
+        increase = np.where(saturated | resting, 0.0, gains.ki * error * m.dt)  # anti-windup
+        return u, PIDState(state.integral + increase, error, derivative, q_dot_goal, ticks)
 
     def _open_valves(self, opening: Array, v_goal: Array) -> Array:
         """Commands u (..., n) of valve openings beyond the dead zone (..., n_driven)."""
         m = self.machine
         moving = np.linalg.norm(v_goal, axis=-1, keepdims=True) > 1e-6
-        least = (moving | (self.valves == "open")) * self.gains.min_opening
+        least = (moving | (self.valves != "closed")) * self.gains.min_opening
         size = np.maximum(np.abs(opening), least)
         closed = size < 0.5 / PWM_MAX  # below half a count
         size = np.where(closed, 0.0, m.dead_zone + (1 - m.dead_zone) * size)

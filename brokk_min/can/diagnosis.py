@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min.actuator import close_valves, initial_history
+from brokk_min.actuator import command_at_rest, initial_history
 from brokk_min.can import canopen
 from brokk_min.can.canopen import Frame
 from brokk_min.can.drive_log import TelemetryReader
@@ -130,7 +130,7 @@ def expected_commands(machine: Machine, policy: Policy, ticks: Ticks, history: A
     rest = np.zeros((), np.int64)
     for t in range(len(u)):
         rest = rest * ticks.driving[t]
-        u[t], rest = close_valves(machine, policy.valves, u[t], v_goal[t], rest)
+        u[t], _, rest = command_at_rest(machine, policy.valves, u[t], v_goal[t], rest)
     return np.asarray(u)
 
 

@@ -148,12 +148,12 @@ def print_answer(runs: list[dict[str, Any]]) -> None:
     summary = metrics.summary([run for run in runs if run["kind"] == runs[0]["kind"]])
     error = {name: rows["all"]["velocity_error_mean"] or math.nan for name, rows in summary.items()}
     pids = sorted((name for name in error if "jacobian" in name), key=error.__getitem__)
-    best = {name.endswith("_awake"): name for name in reversed(pids)}  # valves open, or closed
+    best = {name.endswith("_dither"): name for name in reversed(pids)}  # dither, or closed
     for name in dict.fromkeys(["jacobian_pid_k0.1", *best.values()]):
         less = 1 - error["rl"] / error[name]
         side = "less" if less > 0 else "more"
         print(f"rl has {abs(less):.0%} {side} error than {name}: {TITLES[name]}")
-    print("rl_paper: the paper's learner; _open, _awake: the valves stay open while the tool rests")
+    print("rl_paper: the paper's learner; _dither: valves stay open while the tool rests")
 
 
 CHAIN = {  # files of `reproduce`

@@ -44,8 +44,8 @@ RANGES = {  # that `tune` searches (assumed); each driven joint has its own kp, 
 def baselines(machine: Machine, net: ActuatorNet) -> dict[str, JacobianController]:
     """The paper's two baselines and four with feed-forward, with gains by hand. Paper: Sec. 4.2
 
-    Two also have the policy's integral of the tool's velocity error. Those named "awake" keep their
-    valves open while the tool is to stand still.
+    Two also have the policy's integral of the tool's velocity error. Those named "dither" keep
+    their valves open while the tool rests.
     """
     w0 = manipulability_threshold(machine)
     pid = make_gains(machine, kp=1.0, ki=8.0, kd=0.05, feedback=0.4, min_opening=0.015)
@@ -57,9 +57,9 @@ def baselines(machine: Machine, net: ActuatorNet) -> dict[str, JacobianControlle
         "jacobian_pid_k0.1": JacobianController(machine, pid, 0.1, w0),
         "jacobian_pid_k0.05": JacobianController(machine, pid, 0.05, w0),
         "jacobian_pid_ff": with_feedforward,
-        "jacobian_pid_ff_awake": replace(with_feedforward, valves="open"),
+        "jacobian_pid_ff_dither": replace(with_feedforward, valves="dither"),
         "jacobian_pid_ff_integral": with_integral,
-        "jacobian_pid_ff_integral_awake": replace(with_integral, valves="open"),
+        "jacobian_pid_ff_integral_dither": replace(with_integral, valves="dither"),
     }
 
 

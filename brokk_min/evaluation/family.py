@@ -38,7 +38,7 @@ from brokk_min.machine import Machine
 
 Policies = dict[str, Policy]
 LATENTS = 4  # that the nets share
-VALVES = {"rl": "closed", "rl_open": "open"}  # our policies, and their classes at rest
+VALVES = {"rl": "closed", "rl_dither": "dither"}  # our policies, and their classes at rest
 PAYLOAD = 50.0  # kg at the tool that no log has, assumed: half of a link
 # Small enough for 15 minutes a member on two cores.
 FAMILY = Budget(fit_steps=12_000, train_steps=2_000_000, starts=16)

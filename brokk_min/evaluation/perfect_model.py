@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min.actuator import PlantState, close_valves, lever_arm, plant_reset, plant_step
+from brokk_min.actuator import PlantState, command_at_rest, lever_arm, plant_reset, plant_step
 from brokk_min.env import Measured
 from brokk_min.evaluation.metrics import Run, paired_difference, summary
 from brokk_min.jacobian import dls
@@ -32,7 +32,7 @@ class Plan(NamedTuple):
     plant: PlantState
     opening: Array  # valve openings beyond the dead zone, (num, horizon, n_driven)
     tick: int
-    rest_ticks: NDArray[np.int64]  # of `close_valves`, (num,)
+    rest_ticks: NDArray[np.int64]  # of `command_at_rest`, (num,)
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,8 @@ class PerfectModel:
 
     It simulates the plant under its own commands, so its state (spools, valve activation, delayed
     commands) is exact; of the measurements it reads the goal alone. Openings near zero alternate
-    by `dither`, which keeps the valves open. At rest `close_valves` closes them, unless they are to
-    stay "open". It drives the nominal machine only.
+    by `dither`, which keeps the valves open. At rest "closed" valves close, "open" ones do not. It
+    drives the nominal machine only.
     """
 
     machine: Machine
@@ -64,7 +64,7 @@ class PerfectModel:
         shifted = np.concatenate([plan.opening[:, 1:], plan.opening[:, -1:]], axis=1)
         opening = self.improve(plan.plant, shifted, goal, plan.tick)
         u = self.quantise(plan.plant, opening, goal, plan.tick)
-        u, rest = close_valves(self.machine, self.valves, u, measured.v_goal, plan.rest_ticks)
+        u, _, rest = command_at_rest(self.machine, self.valves, u, measured.v_goal, plan.rest_ticks)
         return u, Plan(plant_step(self.machine, plan.plant, u), opening, plan.tick + 1, rest)
 
     def commands(self, opening: Array, tick: int) -> Array:

@@ -30,8 +30,8 @@ from brokk_min.identification.logs import Log
 from brokk_min.machine import Array, Machine
 
 POSITION = ("rl", "rl_paper", "jacobian_pid_k0.1")  # in the figures of position errors
-AT_REST = ("rl", "rl_open", "jacobian_pid_ff_integral_awake")
-ROBUST = ("rl", "rl_open", "rl_paper", "jacobian_pid_k0.1", "jacobian_pid_ff_integral")
+AT_REST = ("rl", "rl_dither", "jacobian_pid_ff_integral_dither")
+ROBUST = ("rl", "rl_dither", "rl_paper", "jacobian_pid_k0.1", "jacobian_pid_ff_integral")
 STAGES = ("record", "fit", "train and tune", "evaluate")  # of the clock; the others are within
 Results = Mapping[str, Any]  # of `results.json`
 Rows = Mapping[str, Mapping[str, Mean]]  # by name of the row and controller
@@ -54,7 +54,7 @@ FIRST = {  # figures of the first screen: names in seeds.json, in results, in a 
     "valve travel [strokes]": ("valve_travel", "valve_travel", "valve_travel"),
 }
 NONE: Mean = {"mean": None, "low": None, "high": None}
-SEEDS = {"ours closed": "rl", "ours open": "rl_open", "paper": "rl_paper"}  # names there
+SEEDS = {"ours closed": "rl", "ours dither": "rl_dither", "paper": "rl_paper"}  # names there
 SEEDS |= {"paper closed": "rl_paper"}
 PID = "jacobian_pid_k0.1"  # what the first sentences compare with
 

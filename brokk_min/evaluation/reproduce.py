@@ -80,7 +80,7 @@ def reproduce(
             driven = select_nets(machine, net)
             training_seeds = seeds_of(machine, driven, seeds) if seeds else {}
         with stage("train and tune"):
-            nets = {"rl_paper": select_nets(machine, paper_net), "rl_open": driven, "rl": driven}
+            nets = {"rl_paper": select_nets(machine, paper_net), "rl_dither": driven, "rl": driven}
             jobs: dict[str, Any] = {}
             for name, own in nets.items():
                 jobs[f"train {name}"] = partial(train, machine, out, name, own, budget, seed)
@@ -89,7 +89,7 @@ def reproduce(
                 tune = partial(baselines.tune_baselines, machine, driven, *settings)
                 jobs[f"tune {name}"] = partial(tune, name)
             paper, opened, rl, *tuned = side_by_side(jobs, clock)
-            policies = {"rl": rl, "rl_open": opened, "rl_paper": paper}
+            policies = {"rl": rl, "rl_dither": opened, "rl_paper": paper}
             pids, tuning = (dict(ChainMap(*both[::-1])) for both in zip(*tuned, strict=True))
         with stage("evaluate"):
             results, shown = measure(machine, net, test, policies, pids, budget, seed, clock)
@@ -186,12 +186,10 @@ def net_errors(machine: Machine, net: ActuatorNet, test: logs.Log, seed: int) ->
 
 
 def settings(name: str, budget: Budget) -> tuple[TaskConfig, PPOConfig]:
-    """Task and learner of one of `POLICIES`: ours, ours with open valves, or the paper's."""
+    """Task and learner of one of `POLICIES`: ours, ours with dither at rest, or the paper's."""
     if name == "rl_paper":
         return TaskConfig(paper=True, **PAPER_TASK), PPOConfig(budget.paper_steps)
-    task = TaskConfig()
-    if name == "rl_open":
-        task = TaskConfig(valves="open", zero_goals=0.25, hold_max_s=5.0)  # it learns to rest, too
+    task = TaskConfig(valves="dither" if name == "rl_dither" else "closed")
     return task, PPOConfig(**GRADIENT_LEARNER | {"total_steps": budget.train_steps})
 
 

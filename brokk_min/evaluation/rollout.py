@@ -17,16 +17,16 @@ from brokk_min.machine import Array, Machine, read_encoder
 
 TITLES = {  # of controllers in tables, figures and windows, by their names in files
     "rl": "RL policy",
-    "rl_open": "RL policy (open)",
+    "rl_dither": "RL policy (dither)",
     "rl_paper": "the paper's learner",
     "jacobian": "PID with DLS (the paper's)",
     "jacobian_pid_k0.1": "PID with DLS (the paper's)",
     "jacobian_pid_k0.05": "the paper's PID, k = 0.05",
     "jacobian_pid_ff": "PID + feed-forward",
-    "jacobian_pid_ff_awake": "PID + feed-forward (open)",
+    "jacobian_pid_ff_dither": "PID + feed-forward (dither)",
     "jacobian_pid_ff_integral": "PID + feed-forward + integral",
-    "jacobian_pid_ff_integral_awake": "PID + feed-forward + integral (open)",
-    "perfect_model": "perfect model (open)",
+    "jacobian_pid_ff_integral_dither": "PID + feed-forward + integral (dither)",
+    "perfect_model": "perfect model (dither)",
     "perfect_model_closed": "perfect model",
     "levers": "levers, joint by joint",
 }

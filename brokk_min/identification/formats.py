@@ -89,7 +89,7 @@ NET_ARRAYS: dict[str, Field] = {
 POLICY_HEADER: Fields = {
     "contract": {"paper": Field("truth value", required=False)},  # see `policy.contract`
     "training": Field("object"),
-    "valves": Field("text", required=False, among=("closed", "open")),
+    "valves": Field("text", required=False, among=("closed", "dither", "open")),
 }
 POLICY_ARRAYS: dict[str, Field] = {
     "mean": Field("float", -LARGE, LARGE, ("obs",)),

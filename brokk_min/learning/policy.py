@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min.actuator import ActuatorNet, close_valves
+from brokk_min.actuator import ActuatorNet, command_at_rest
 from brokk_min.env import Measured, action_to_pwm, features, observation_scale
 from brokk_min.identification import files
 from brokk_min.identification.formats import POLICY_ARRAYS, POLICY_HEADER, check_fields
@@ -18,7 +18,7 @@ from brokk_min.machine import Array, Machine
 
 FORMAT = 3  # of policy files
 # Files of `reproduce`: our policy with valves closed or open while the tool rests, and the paper's.
-POLICIES = {"rl": "policy.npz", "rl_open": "policy_open.npz", "rl_paper": "policy_paper.npz"}
+POLICIES = {"rl": "policy.npz", "rl_dither": "policy_dither.npz", "rl_paper": "policy_paper.npz"}
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Policy:
     scale: Array  # (obs,)
     weights: tuple[Array, ...]  # w, b of each layer, w (inputs, outputs)
     net: ActuatorNet  # the simulation it was trained in, kept with it
-    valves: str = "closed"  # or "open", while the tool rests; see `actuator.close_valves`
+    valves: str = "closed"  # at rest, or "dither", "open": see `actuator.command_at_rest`
 
     @property
     def paper(self) -> bool:
@@ -60,7 +60,7 @@ class Policy:
 class PolicyController:
     """A policy as an `evaluation.rollout.Controller`.
 
-    Its valves close while the tool rests (`actuator.close_valves`), unless trained otherwise.
+    While the tool rests the rule of `actuator.command_at_rest` holds that it was trained with.
     """
 
     machine: Machine
@@ -77,7 +77,8 @@ class PolicyController:
         machine, paper = self.machine, self.policy.paper
         action = self.policy.act(features(machine, measured, paper))
         u = action_to_pwm(machine, action, paper)
-        return close_valves(machine, self.policy.valves, u, measured.v_goal, ticks)
+        u, _, ticks = command_at_rest(machine, self.policy.valves, u, measured.v_goal, ticks)
+        return u, ticks
 
 
 def contract(machine: Machine, paper: bool = False) -> dict[str, Any]:

@@ -45,7 +45,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from brokk_min import ppo
-from brokk_min.actuator import MU, ActuatorNet, append_command, close_valves, folded_weights
+from brokk_min.actuator import MU, ActuatorNet, append_command, command_at_rest, folded_weights
 from brokk_min.env import (
     COMPENSATION,
     INTEGRAL_LIMIT,
@@ -68,7 +68,7 @@ class Ticks(NamedTuple):
     v_goal: Array  # goal velocity [m/s], 3
     error_integral: Array  # of `env.integrate_error` [m], 3
     u: Array  # command, n
-    follows: Array  # 1, or 0 where the valves were closed whatever the action, n
+    follows: Array  # 1, or 0 at rest, where the command does not depend on the action, 1
     done: NDArray[np.bool_]  # did the episode end with the tick?
 
 
@@ -84,14 +84,14 @@ def improved_actions(machine: Machine, net: ActuatorNet, task: TaskConfig) -> pp
         v_goal = np.stack([state.v_goal for state in states])
         rest_ticks = np.stack([state.rest_ticks for state in states])
         u = action_to_pwm(machine, rollout.actions.numpy(), task.paper)
-        follows, _ = close_valves(machine, task.valves, np.ones_like(u), v_goal, rest_ticks)
+        u, resting, _ = command_at_rest(machine, task.valves, u, v_goal, rest_ticks)
         ticks = Ticks(
             q=np.stack([state.q for state in states]),
             true_history=np.stack([state.true_history for state in states]),
             v_goal=v_goal,
             error_integral=np.stack([state.error_integral for state in states]),
-            u=follows * u,
-            follows=follows,
+            u=u,
+            follows=(~resting).astype(np.float32),
             done=rollout.dones.numpy(),
         )
         gradient = torch.from_numpy(action_gradients(machine, net, ticks, config.gamma, task))
@@ -160,8 +160,7 @@ def action_gradients(
         before[..., 2, 0] = 0
         dR_dh = before
         dR_dlast = dc_du[t]
-    follows = ticks.follows[..., machine.driven].astype(np.float32)
-    return dR_du * follows * compensation_derivative(machine, ticks.u, task.paper)
+    return dR_du * ticks.follows * compensation_derivative(machine, ticks.u, task.paper)
 
 
 def valve_cost_gradient(machine: Machine, ticks: Ticks, valve_cost: float) -> Array:

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from benchmarks import (
-    POLICY,
     deviations,
     faults,
     ladder,
@@ -40,8 +39,8 @@ def test_race__trains_each_learner_and_notes_the_levels_it_reached(learner):
         pytest.importorskip("rl_games")
     options = peers.Options(runs=1, num_envs=16)
     targets = {"any": 9.0, "none": 0.0}
-    net = load_policy(POLICY, BROKK_170).net
-    row = peers.race(learner, net, (1e-3, 1024), 0, targets, options)
+    shipped = load_policy(peers.SHIPPED, BROKK_170)
+    row = peers.race(learner, shipped, (1e-3, 1024), 0, targets, options)
     assert (row["learner"], row["updates"], row["seed"]) == (learner, 2, 0)
     epochs = 2 if learner in ("ours", "critic") else peers.EPOCHS
     assert 0 < row["best"] < 1 and row["gradient_steps"] == 2 * epochs

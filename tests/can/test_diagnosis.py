@@ -18,7 +18,7 @@ from brokk_min.machine import BROKK_170 as M
 from brokk_min.machine import read_encoder
 
 POLICY = load_policy(SHIPPED / "brokk170" / "policy.npz", M)
-OPEN = load_policy(SHIPPED / "brokk170" / "policy_open.npz", M)
+OPEN = load_policy(SHIPPED / "brokk170" / "policy_dither.npz", M)
 PAPER = load_policy(SHIPPED / "brokk170" / "policy_paper.npz", M)
 START = np.array([[0.0, 0.5, 0.58, 1.71, 1.24]])
 SECONDS = 14

@@ -18,8 +18,8 @@ from brokk_min.machine import BROKK_170
 
 NET = obedient_net(BROKK_170)
 GAINS = {"kp": 1.0, "ki": 7.0, "kd": 0.12, "feedback": 0.4, "min_opening": 0.03}
-NAMES = ["jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff", "jacobian_pid_ff_awake"]
-NAMES += ["jacobian_pid_ff_integral", "jacobian_pid_ff_integral_awake"]
+NAMES = ["jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff", "jacobian_pid_ff_dither"]
+NAMES += ["jacobian_pid_ff_integral", "jacobian_pid_ff_integral_dither"]
 
 
 def controller(machine=BROKK_170, **gains):
@@ -40,7 +40,7 @@ def test_baselines__are_the_papers_two_and_four_with_feedforward():
     result = baselines.baselines(BROKK_170, NET)
     assert list(result) == NAMES == [*baselines.PAPER_BASELINES, *NAMES[2:]]
     assert [c.k for c in result.values()] == [0.1, 0.05, 0.1, 0.1, 0.1, 0.1]
-    assert [name for name, c in result.items() if c.valves == "open"] == NAMES[3::2]
+    assert [name for name, c in result.items() if c.valves == "dither"] == NAMES[3::2]
     assert [c.feedforward is not None for c in result.values()] == [False, False, *[True] * 4]
     table = baselines.gains_table(result)
     assert table["jacobian_pid_k0.1"] == table["jacobian_pid_k0.05"]
@@ -52,7 +52,7 @@ def test_baselines__are_the_papers_two_and_four_with_feedforward():
         "min_opening": [0.015],
         "integral_feedback": [0.0],
     }
-    assert table["jacobian_pid_ff"] == table["jacobian_pid_ff_awake"]
+    assert table["jacobian_pid_ff"] == table["jacobian_pid_ff_dither"]
     assert [table["jacobian_pid_ff"][name][0] for name in ("kp", "ki", "kd")] == [0.2, 0.5, 0.02]
 
 

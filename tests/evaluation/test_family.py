@@ -28,17 +28,17 @@ def test_run_family__has_each_member_and_each_policy_on_each(made):
     assert json.loads((folder / "family.json").read_text()) == json.loads(json.dumps(results))
     assert [row["seed"] for row in results["members"]] == [2]
     for i, row in enumerate(results["members"]):
-        for policy, ending in (("rl", ""), ("rl_open", "_awake")):
+        for policy, ending in (("rl", ""), ("rl_dither", "_dither")):
             best = row["best"][policy]
             pids = [name for name in row["error"] if name.startswith("jacobian")]
-            own = [name for name in pids if name.endswith("_awake") == bool(ending)]
+            own = [name for name in pids if name.endswith("_dither") == bool(ending)]
             assert row["error"][best] == min(row["error"][name] for name in own)
         assert set(row["free_run"]) == {"q1", "q3", "q4", "q5"}
         assert results["transfers"][i][i] == pytest.approx(row["error"]["rl"])
         files = {path.name for path in (folder / f"member_{row['seed']}").iterdir()}
         assert {"log.npz", "net.npz", "policy.npz", "gains.json", "member.json"} <= files
     text = show(results)
-    assert "rl_open to_best: median" in text
+    assert "rl_dither to_best: median" in text
     assert text.count("\n") == 1 + 2 + 8 + 1
 
 
@@ -55,16 +55,16 @@ def test_run_member__is_not_run_again_and_refuses_another_budget(made):
 
 def test_summary__by_hand():
     row = {
-        "error": {"rl": 0.03, "rl_open": 0.02, "pid": 0.05, "awake": 0.04},
-        "best": {"rl": "pid", "rl_open": "awake"},
-        "on_nets": {"rl": 0.02, "rl_open": 0.02},
-        "loaded": {"rl": 0.036, "rl_open": 0.02},
+        "error": {"rl": 0.03, "rl_dither": 0.02, "pid": 0.05, "awake": 0.04},
+        "best": {"rl": "pid", "rl_dither": "awake"},
+        "on_nets": {"rl": 0.02, "rl_dither": 0.02},
+        "loaded": {"rl": 0.036, "rl_dither": 0.02},
         "free_run": {"a": 0.1, "b": 0.3},
     }
-    other = row | {"on_nets": {"rl": 0.03, "rl_open": 0.02}}
+    other = row | {"on_nets": {"rl": 0.03, "rl_dither": 0.02}}
     found = summary([row, other])
     assert found["rl"]["to_nets"] == {"median": 1.25, "worst": 1.5}
     assert found["rl"]["to_best"]["worst"] == pytest.approx(0.6)
     assert found["rl"]["payload"]["median"] == pytest.approx(1.2)
-    assert found["rl_open"]["to_best"]["worst"] == pytest.approx(0.5)
+    assert found["rl_dither"]["to_best"]["worst"] == pytest.approx(0.5)
     assert found["rl"]["free_run"]["worst"] == 0.3

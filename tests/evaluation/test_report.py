@@ -76,7 +76,7 @@ def test_shipped_family__is_a_table_that_need_not_be_there(tmp_path):
 def test_first_panels__are_seeds_before_this_run(tmp_path, monkeypatch):
     folder = tmp_path / BROKK_170.name
     folder.mkdir()
-    row = {"controller": "ours open", "seed": 0, "error": 1, "drift": 0, "jerk": 1}
+    row = {"controller": "ours dither", "seed": 0, "error": 1, "drift": 0, "jerk": 1}
     row["valve_travel"] = 2
     rows = [row, row | {"seed": 1, "error": 3}]
     (folder / "seeds.json").write_text(json.dumps(rows))
@@ -89,8 +89,8 @@ def test_first_panels__are_seeds_before_this_run(tmp_path, monkeypatch):
     panels = report.first_panels(BROKK_170, {"training_seeds": swept, "task_space": task})
     assert list(panels) == list(report.FIRST)
     error = panels["error [m/s]"]
-    assert list(error) == ["RL policy (open), 2 seeds", "rl, swept seeds", "rl"]
-    assert error["RL policy (open), 2 seeds"]["rl_open"]["mean"] == 2.0
+    assert list(error) == ["RL policy (dither), 2 seeds", "rl, swept seeds", "rl"]
+    assert error["RL policy (dither), 2 seeds"]["rl_dither"]["mean"] == 2.0
     assert error["rl, swept seeds"]["rl"] == number(7.0, 6.0, 8.0)
     assert error["rl"]["rl"] == number(5.0, 4.0, 6.0)
     assert panels["jerk [m/s^3]"]["rl, swept seeds"]["rl"] == number(None)  # of older sweeps

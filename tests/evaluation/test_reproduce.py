@@ -24,8 +24,8 @@ from brokk_min.machine import BROKK_170
 COARSE = replace(BROKK_170, rate=10.0, plant_dt=0.05)  # two Euler steps a tick: fast
 TINY = Budget(0.004, 20, 4096, 4096, 1, 1, 4, 2, 0.5)
 ERROR = "velocity_error_mean"
-PIDS = ["jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff", "jacobian_pid_ff_awake"]
-PIDS += ["jacobian_pid_ff_integral", "jacobian_pid_ff_integral_awake"]
+PIDS = ["jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff", "jacobian_pid_ff_dither"]
+PIDS += ["jacobian_pid_ff_integral", "jacobian_pid_ff_integral_dither"]
 CONTROLLERS = [*POLICIES, *PIDS]
 
 
@@ -69,7 +69,7 @@ def test_reproduce__gives_the_same_bits_twice(folder, tmp_path, monkeypatch, cap
     for name in ("log.npz", "net.npz", "policy.npz", "gains.json", "results.json"):
         assert (folder / name).read_bytes() == (tmp_path / name).read_bytes(), name
     clock = json.loads((folder / "timing.json").read_text())
-    trained = [f"train {name}" for name in ("rl_paper", "rl_open", "rl")]
+    trained = [f"train {name}" for name in ("rl_paper", "rl_dither", "rl")]
     stages = ["record", "fit net", "fit net_paper", "fit", *trained]
     stages += [*(f"tune {name}" for name in PIDS), "train and tune"]
     scores = ["changed machines", "perfect_model", "perfect_model_closed"]

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from brokk_min.actuator import CLOSE_AFTER
+from brokk_min.actuator import REST_AFTER
 from brokk_min.env import COMPENSATION
 from brokk_min.identification.files import SHIPPED
 from brokk_min.learning.onnx import export_onnx
@@ -44,6 +44,7 @@ def test_export_onnx__is_one_file_with_what_the_other_program_needs(policy, tmp_
     metadata = {prop.key: json.loads(prop.value) for prop in model.metadata_props}
     for name in ("mean", "scale"):
         np.testing.assert_array_equal(np.float32(metadata.pop(name)), getattr(policy, name))
-    assert (metadata.pop("ramp"), metadata.pop("stand_s")) == (COMPENSATION, CLOSE_AFTER)
+    assert (metadata.pop("ramp"), metadata.pop("rest_s")) == (COMPENSATION, REST_AFTER["closed"])
+    assert metadata.pop("rest_opening") == 0
     assert metadata == dict(policy.contract)
     assert metadata["driven"] == ["q1", "q3", "q4", "q5"] and metadata["rate"] == 20.0

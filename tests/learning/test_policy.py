@@ -84,22 +84,25 @@ def test_controller__sends_the_actions_of_the_policy(policy):
     assert len(np.unique(u[:, 0])) > 1
 
 
-@pytest.mark.parametrize("valves", ["closed", "open"])
-def test_controller__closes_valves_half_a_second_after_the_goal_became_zero(policy, valves):
-    """Goals of both machines are zero but for one tick of the first: 10 ticks later, u = 0."""
+@pytest.mark.parametrize(("valves", "after"), [("closed", 10), ("dither", 2), ("open", 100)])
+def test_controller__has_a_rule_for_valves_after_some_ticks_of_rest(policy, valves, after):
+    """Goals of both machines are zero but for one tick of the first."""
     controller = PolicyController(BROKK_170, replace(policy, valves=valves))
     ticks = controller.start(2)
-    is_open = []
+    sent = []
     for tick in range(100):
         v_goal = np.zeros((2, 3))
         v_goal[0, 2] = 0.1 * (tick == 30)
         u, ticks = controller(measured(v_goal), ticks)
-        is_open.append(u.any(axis=1))
-    first, second = np.array(is_open).T
-    assert first[30:41].all()
-    assert first[41:].any() == (valves == "open")
-    assert second[:10].all()
-    assert second[10:].any() == (valves == "open")
+        sent.append(u[:, BROKK_170.driven])
+    action = policy.act(features(BROKK_170, measured(np.zeros((2, 3)))))
+    free = action_to_pwm(BROKK_170, action)[:, BROKK_170.driven]
+    first, second = np.array(sent).swapaxes(0, 1)
+    assert (second[:after] == free[1]).all()
+    assert (first[31 : 31 + after] == free[0]).all()
+    size = 12 / 127 if valves == "dither" else 0.0
+    for rest in (second[after:], first[31 + after :]):
+        np.testing.assert_allclose(np.abs(rest), size, atol=1e-7)
 
 
 def test_controller__of_the_papers_agent_takes_its_observation_and_sends_plain_actions():

@@ -50,7 +50,7 @@ def ticks_of(states, commands, done=None):
     names = ("q", "true_history", "v_goal", "error_integral")
     arrays = [np.stack([getattr(s, name) for s in states[:-1]]) for name in names]
     done = np.zeros(commands.shape[:2], bool) if done is None else done
-    return Ticks(*arrays, commands, np.ones_like(commands), done)
+    return Ticks(*arrays, commands, np.ones((*commands.shape[:-1], 1)), done)
 
 
 def moving_case(machine, seed):

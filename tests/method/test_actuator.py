@@ -25,6 +25,7 @@ from brokk_min.actuator import (
     PlantState,
     append_command,
     append_sample,
+    command_at_rest,
     initial_history,
     lever_arm,
     mu_law,
@@ -380,3 +381,25 @@ def test_latents__are_of_all_joints_by_hand():
     assert (net.forward(history)[0][:, others] != net.forward(moved)[0][:, others]).all()
     without = replace(net, weights=(*net.weights[:7], 0 * net.weights[7]))
     np.testing.assert_allclose(without.forward(history)[0], alone.forward(history)[0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("valves", "after", "rule"),
+    [("closed", 10, [0, 0, 0]), ("dither", 2, [-12, 12, -12]), ("open", 15, [])],
+)
+def test_command_at_rest__has_a_rule_for_driven_joints_until_the_next_goal(valves, after, rule):
+    """127 (0.07 + 0.93 x 0.03) are 12 counts. Only the first of two machines rests all the time."""
+    ticks = np.zeros(2, np.int64)
+    v_goal = np.zeros((2, 3))
+    sent = []
+    for tick in range(1, 16):
+        v_goal[1, 2] = 0.1 * (tick == 12)
+        u, resting, ticks = command_at_rest(BROKK_170, valves, np.full((2, 5), 0.2), v_goal, ticks)
+        assert resting[0] == (tick > after)
+        sent.append(u)
+    assert ticks.tolist() == [15, 3]
+    first, second = np.rint(127 * np.array(sent)).astype(int).swapaxes(0, 1)
+    assert (first[:after] == 25).all() and (second[11] == 25).all()
+    assert first[after : after + 3, 0].tolist() == rule
+    assert not first[after:, 1].any()  # q2 is locked
+    assert (first[:, 2:] == first[:, :1]).all()

@@ -269,7 +269,7 @@ def test_controller__closes_its_valves_half_a_second_after_the_stop():
     """The arm still moves: the PID brakes for ten ticks, then its integral stands."""
     c = controller(kp=2.0, ki=5.0)
     drift = [0.05, 0.0, -0.05, 0.05, 0.05]
-    state = {valves: c.start(1) for valves in ("closed", "open")}
+    state = {valves: c.start(1) for valves in ("closed", "dither", "open")}
     sent = {valves: [] for valves in state}
     for v_goal in [GOAL, *[0 * GOAL] * 14]:
         for valves, last in state.items():
@@ -278,6 +278,8 @@ def test_controller__closes_its_valves_half_a_second_after_the_stop():
             sent[valves].append(u[0])
     assert np.array(sent["closed"]).any(axis=1).tolist() == [True] * 11 + [False] * 4
     assert np.array(sent["open"]).any(axis=1).all()
+    turning = np.rint(127 * np.array(sent["dither"])[3:, DRIVEN])  # counts: from 0.1 s on
+    assert (turning == 12 * (-1.0) ** np.arange(3, 15)[:, None]).all()
     grown = np.abs(state["open"].integral - state["closed"].integral)
     np.testing.assert_allclose(grown[0], 4 * 5.0 * 0.05 * 0.05, rtol=1e-2)
 
