@@ -56,16 +56,6 @@ def test_baselines__are_the_papers_two_and_four_with_feedforward():
     assert [table["jacobian_pid_ff"][name][0] for name in ("kp", "ki", "kd")] == [0.2, 0.5, 0.02]
 
 
-def test_split_vector__orders_gains_by_name_and_joint():
-    gains = baselines.split_vector(np.arange(30).reshape(2, 15))
-    assert gains.kp.tolist() == [[0, 1, 2, 3], [15, 16, 17, 18]]
-    assert gains.ki[0].tolist() == [4, 5, 6, 7]
-    assert gains.kd[1].tolist() == [23, 24, 25, 26]
-    assert gains.feedback.tolist() == [[12], [27]]
-    assert gains.min_opening.tolist() == [[13], [28]]
-    assert gains.integral_feedback.tolist() == [[14], [29]]
-
-
 @given(st.integers(1, 6), st.integers(0, 3), st.integers(0, 2**31))
 def test_split_vector__is_the_inverse_of_gains_vector(n, rows, seed):
     vectors = np.random.default_rng(seed).normal(size=(rows, 3 * n + 3))

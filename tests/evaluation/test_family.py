@@ -5,13 +5,12 @@ from dataclasses import replace
 
 import pytest
 
-from brokk_min.evaluation import family, reproduce
+from brokk_min.evaluation import family, reproduce, sequences
 from brokk_min.evaluation.family import run_family, show, summary
 from brokk_min.evaluation.reproduce import Budget
 from brokk_min.machine import BROKK_170
 
-COARSE = replace(BROKK_170, plant_dt=0.05)  # one Euler step a tick: fast
-
+COARSE = replace(BROKK_170, rate=10.0, plant_dt=0.05)  # two Euler steps a tick: fast
 TINY = Budget(0.01, 20, 2048, 2048, 1, 1, 4, 2, 3.0)
 
 
@@ -20,6 +19,8 @@ def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("family")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(reproduce, "cpu_count", lambda: 1)  # one process: fast
+        short = sequences.shorten(COARSE, sequences.task_sequences(COARSE), 4.0)
+        patch.setattr(sequences, "task_sequences", lambda machine: short)
         return folder, run_family(COARSE, [2], folder, TINY)
 
 

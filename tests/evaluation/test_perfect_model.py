@@ -98,7 +98,7 @@ def test_commands__alternate_about_openings_near_zero():
 
 
 def test_perfect_model__leaves_less_error_than_a_pid():
-    goals = np.zeros((52, 2, 3))
+    goals = np.zeros((42, 2, 3))
     goals[12:32, :, 2] = 0.15
     goals[32:, :, 1] = -0.1
     pid = baselines(BROKK_170, obedient_net(BROKK_170))["jacobian_pid_k0.1"]

@@ -15,7 +15,6 @@ from brokk_min.machine import BROKK_170
 from examples.mini_excavator import MINI_EXCAVATOR
 
 LOW, HIGH = BROKK_170.column("q_min"), BROKK_170.column("q_max")
-PLANT = plant_simulator(BROKK_170)
 COARSE = replace(BROKK_170, plant_dt=0.05)  # one Euler step a tick: fast
 
 
@@ -33,20 +32,18 @@ def standing(q, u):
     return np.repeat(q[None], len(u) + 1, axis=0)
 
 
-def test_sweeps__go_from_stop_to_stop_at_the_papers_speeds():
-    u = np.zeros((2, 5))
-    u[:, 4] = [80 / 127, -80 / 127]
-    up, down = preliminary.sweeps(BROKK_170, PLANT, 4, u)
-    for sweep, end, peak in ((up, HIGH, 0.24), (down, LOW, -0.45)):
+@pytest.fixture(scope="module")
+def of_plant():
+    return preliminary.preliminary_tests(BROKK_170, plant_simulator(BROKK_170))
+
+
+def test_sweeps__go_from_stop_to_stop_at_the_papers_speeds(of_plant):
+    for command, end, peak in (("u = 80", HIGH, 0.24), ("u = 175", LOW, -0.45)):
+        sweep = of_plant.sweeps[command]
         assert sweep.q[-1] == end[4] and sweep.q_dot[-1] != 0
         assert np.all(sweep.q_dot * peak >= 0)
         assert np.abs(sweep.q_dot).max() == pytest.approx(abs(peak), rel=0.04)
         np.testing.assert_allclose(np.diff(sweep.q) * 20, sweep.q_dot[1:], atol=1e-9)
-
-
-def test_other_commands__are_those_of_the_paper():
-    u = preliminary.other_commands(BROKK_170, 4) * 127
-    np.testing.assert_allclose(u, [-80, 0, -80, 80, 0])  # u1 and u3 175, u4 80
 
 
 def test_preliminary_tests__move_the_last_driven_joint_at_two_levels():
@@ -75,20 +72,12 @@ def test_preliminary_tests__move_the_last_driven_joint_at_two_levels():
     assert list(tests.response_time) == ["q1", "q3", "q4", "q5"]
 
 
-def test_preliminary_tests__of_the_plant_have_the_papers_response_times():
-    tests = preliminary.preliminary_tests(BROKK_170, PLANT)
-    for joint in tests.response_time.values():
+def test_preliminary_tests__of_the_plant_have_the_papers_response_times(of_plant):
+    for joint in of_plant.response_time.values():
         assert joint["idle"]["up"] == pytest.approx(0.40, abs=0.01)
         assert joint["moving"]["up"] == pytest.approx(0.105, abs=0.01)
-    together = preliminary.sweep_rms(*tests.coupling.values())
+    together = preliminary.sweep_rms(*of_plant.coupling.values())
     assert together < 0.002  # "marginal and neglectable"
-
-
-def test_sim_to_real__of_a_machine_to_itself_is_zero():
-    gap = preliminary.sim_to_real(
-        COARSE, dict.fromkeys(("machine", "nets"), plant_simulator(COARSE)), 0
-    )
-    assert not any(array.any() for array in gap)
 
 
 @pytest.mark.parametrize("machine", [COARSE, replace(COARSE, q_start=())])
@@ -115,7 +104,7 @@ def test_sim_to_real__is_between_tools_where_the_arms_end(machine):
 
 
 def test_numbers__of_another_machine_are_json():
-    machine = MINI_EXCAVATOR
+    machine = replace(MINI_EXCAVATOR, plant_dt=0.04)  # one Euler step a tick: fast
     net = small_net(machine, np.random.default_rng(0), machine.names)
     measured = preliminary.run(machine, net, 0)
     result = preliminary.numbers(machine, measured)

@@ -1,9 +1,7 @@
 """Many seeds: nothing is done twice, a failure costs one seed; their table."""
 
 import json
-import os
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -13,12 +11,11 @@ from helpers_machines import POSE, small_net
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation import seeds
 from brokk_min.evaluation.baselines import gains_metadata
-from brokk_min.evaluation.seeds import run_seed, run_seeds
+from brokk_min.evaluation.seeds import run_seeds
 from brokk_min.evaluation.sequences import axis_sequences
-from brokk_min.identification import formats
 from brokk_min.identification.net_file import save_net
 from brokk_min.learning.checkpoint import train_policy
-from brokk_min.learning.policy import load_policy
+from brokk_min.learning.policy import PolicyController
 from brokk_min.machine import BROKK_170
 from brokk_min.ppo import PPOConfig
 
@@ -28,20 +25,27 @@ TASK = TaskConfig(episode_s=0.6)
 NET = small_net(BROKK_170, np.random.default_rng(0))
 
 
-def bias_rows(policy):
-    """Rows of an evaluation whose figures are all the policy's first bias."""
-    figures = dict.fromkeys(formats.RUN, abs(float(policy.weights[-1][0])))
-    return [figures | {"controller": "rl", "sequence": "x", "start": 0, "kind": "workspace"}]
-
-
-def first_bias(machine, controllers, starts):
-    return bias_rows(controllers["rl"].policy)
-
-
 @pytest.fixture
-def seed_job(monkeypatch):
-    monkeypatch.setattr(seeds, "run_scored", first_bias)
-    return lambda out, config=TINY: partial(run_seed, BROKK_170, NET, TASK, config, False, out, 2)
+def short(monkeypatch):
+    """Sequences of half a second, from poses that need no search."""
+    poses = POSE + 0.1 * np.random.default_rng(0).random((2, 5))
+    sequences = [
+        s._replace(goals=s.goals[s.goals.any(axis=1)][:10]) for s in axis_sequences(BROKK_170)
+    ]
+    monkeypatch.setattr(seeds, "evaluation_starts", lambda *_: poses)
+    monkeypatch.setattr(seeds, "task_sequences", lambda machine: sequences)
+
+
+def test_run_seed__trains_as_train_policy_and_writes_the_rows_of_its_policy(tmp_path, short):
+    rows = seeds.run_seed(BROKK_170, NET, TASK, TINY, False, tmp_path, 2, 4)
+    policy = train_policy(BROKK_170, NET, TASK, TINY, 4, tmp_path / "alone.npz")
+    assert (tmp_path / "seed_4.npz").read_bytes() == (tmp_path / "alone.npz").read_bytes()
+    controllers = {"rl": PolicyController(BROKK_170, policy)}
+    assert rows == seeds.run_scored(BROKK_170, controllers, 2)
+    written = json.loads((tmp_path / "seed_4.json").read_text())
+    assert written["runs"] == rows
+    assert written["identity"]["seed"] == 4
+    assert written["identity"]["starts"] == 2
 
 
 def square(seed):
@@ -55,29 +59,6 @@ def cluster():
     options = {"n_workers": 1, "processes": False, "dashboard_address": ":0", "protocol": "tcp"}
     with distributed.LocalCluster(threads_per_worker=1, **options) as cluster:
         yield cluster.scheduler_address
-
-
-def test_run_seed__trains_as_train_policy_and_writes_its_rows(tmp_path, seed_job):
-    rows = seed_job(tmp_path)(4)
-    train_policy(BROKK_170, NET, TASK, TINY, 4, tmp_path / "alone.npz")
-    assert (tmp_path / "seed_4.npz").read_bytes() == (tmp_path / "alone.npz").read_bytes()
-    assert rows == bias_rows(load_policy(tmp_path / "alone.npz", BROKK_170))
-    written = json.loads((tmp_path / "seed_4.json").read_text())
-    assert written["runs"] == rows
-    assert written["identity"]["seed"] == 4
-    assert written["identity"]["starts"] == 2
-
-
-def test_run_seed__does_nothing_twice(tmp_path, seed_job, monkeypatch):
-    rows = seed_job(tmp_path)(4)
-
-    monkeypatch.setattr(seeds, "run_scored", None)  # it would fail
-    assert seed_job(tmp_path)(4) == rows
-    monkeypatch.setattr(seeds, "run_scored", first_bias)
-    (tmp_path / "seed_4.json").unlink()
-    changed = os.stat(tmp_path / "seed_4.npz").st_mtime_ns
-    assert seed_job(tmp_path)(4) == rows
-    assert os.stat(tmp_path / "seed_4.npz").st_mtime_ns == changed  # not trained again
 
 
 def test_run_seeds__a_failed_seed_leaves_the_others_alone(cluster):
@@ -130,17 +111,6 @@ def test_read_seeds__reads_what_a_sweep_wrote(tmp_path):
         seeds.seeds_of(BROKK_170, other, seeds.read_seeds(path))
 
 
-@pytest.fixture
-def short(monkeypatch):
-    """Sequences of half a second, from poses that need no search."""
-    poses = POSE + 0.1 * np.random.default_rng(0).random((2, 5))
-    sequences = [
-        s._replace(goals=s.goals[s.goals.any(axis=1)][:10]) for s in axis_sequences(BROKK_170)
-    ]
-    monkeypatch.setattr(seeds, "evaluation_starts", lambda *_: poses)
-    monkeypatch.setattr(seeds, "task_sequences", lambda machine: sequences)
-
-
 def test_sweep__writes_all_runs_and_does_nothing_twice(tmp_path, short, cluster, capsys):
     save_net(tmp_path / "net.npz", NET)
     folder = tmp_path / "a" / "b"
@@ -151,9 +121,11 @@ def test_sweep__writes_all_runs_and_does_nothing_twice(tmp_path, short, cluster,
     assert run(*sweep) == 0
     assert capsys.readouterr().out.startswith("mean and 95 % interval")
     assert sorted(path.name for path in folder.iterdir()) == [*names, "sweep.json"]
-    times = [(folder / name).stat().st_mtime_ns for name in names]
+    (folder / "seed_4.json").unlink()  # its policy is not trained again
+    kept = [name for name in names if name != "seed_4.json"]
+    times = [(folder / name).stat().st_mtime_ns for name in kept]
     assert run(*sweep) == 0
-    assert [(folder / name).stat().st_mtime_ns for name in names] == times
+    assert [(folder / name).stat().st_mtime_ns for name in kept] == times
     (folder / "seed_3.json").write_text("{")
     assert run(*sweep) == 1
     assert "seed_3.json: expected the result of a seed, got " in capsys.readouterr().err

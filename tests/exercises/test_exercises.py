@@ -176,8 +176,6 @@ def test_exercise__as_handed_out_says_what_to_fill_in(
 ) -> None:
     if FILES[number].read_text().count("raise NotImplementedError") < len(SOLUTIONS[number]):
         pytest.skip("somebody works on it")
-    for words in (["check"], ["format", "--check"]):
-        assert not subprocess.run([sys.executable, "-m", "ruff", *words, FILES[number]]).returncode
     assert main([str(number)]) == 1
     name = next(iter(SOLUTIONS[number]))
     printed = capsys.readouterr().out
@@ -190,6 +188,13 @@ def test_exercise__as_handed_out_says_what_to_fill_in(
 def test_exercise__says_why_a_typical_answer_is_wrong(number: int) -> None:
     wrong, word = WRONG[number]
     assert word in judge(MODULES[number], SOLUTIONS[number] | wrong)
+
+
+@pytest.mark.parametrize("words", [["check"], ["format", "--check"]])
+def test_exercises__as_handed_out_pass_the_linter(words: list[str]) -> None:
+    """`make lint` leaves them out: readers fill them in."""
+    files = [file for file in FILES.values() if "raise NotImplementedError" in file.read_text()]
+    assert not subprocess.run([sys.executable, "-m", "ruff", *words, *files]).returncode
 
 
 def test_judge__says_where_an_answer_raised() -> None:

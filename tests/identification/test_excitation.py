@@ -15,7 +15,7 @@ from brokk_min.identification.excitation import (
     sine_command,
     task_log,
 )
-from brokk_min.identification.logs import read_log, velocity_of, write_log
+from brokk_min.identification.logs import velocity_of
 from brokk_min.machine import BROKK_170, read_encoder
 
 LIMIT = 80 / 127
@@ -136,19 +136,12 @@ def test_collect__repeats_itself_to_the_bit_for_one_seed(monkeypatch):
     assert not np.array_equal(one.recordings[0].u, other.recordings[0].u)
 
 
-def test_collect__reads_back_from_a_file_without_the_returns(collected, tmp_path):
-    log = collected["sine"]
-    write_log(tmp_path / "log.npz", log)
-    again = read_log([tmp_path / "log.npz"], 4)
-    for got, (_, segment, _) in zip(again.recordings, segments(log), strict=True):
-        assert got.name == segment.name
-        np.testing.assert_allclose(got.u, segment.u, atol=1e-12)
-        np.testing.assert_allclose(got.q, segment.q, atol=1e-12)
-
-
-def test_task_log__moves_driven_or_locked_joints_within_the_limits():
-    log = task_log(BROKK_170, 5, 20.0, np.random.default_rng(0))
+@pytest.mark.parametrize("start", [None, np.array([1.0, 0.5, 0.58, 1.71, 1.24])])
+def test_task_log__moves_driven_or_locked_joints_within_the_limits(start):
+    log = task_log(BROKK_170, 5, 20.0, np.random.default_rng(0), start)
     for i, recording in enumerate(log.recordings):
+        if start is not None:
+            np.testing.assert_array_equal(recording.q[0], read_encoder(BROKK_170, start))
         moved = np.flatnonzero(np.ptp(recording.q, axis=0) > 0.05).tolist()
         assert moved == ([1] if i == 4 else [0, 2, 3, 4])  # q2 moves only alone
         assert recording.u.shape == recording.q.shape == (400, 5)
@@ -156,17 +149,11 @@ def test_task_log__moves_driven_or_locked_joints_within_the_limits():
         np.testing.assert_allclose(counts, np.rint(counts), atol=1e-9)
         assert np.abs(counts).max() <= 80 + 1e-9
         assert np.mean(np.abs(counts[:, moved]) > 79) < 0.2
-        state = plant_reset(BROKK_170, recording.q[0])
-        for u in recording.u:
-            state = plant_step(BROKK_170, state, u)
-        assert np.abs(state.q - recording.q[-1]).max() < 0.02
-
-
-def test_task_log__starts_at_given_angles():
-    pose = np.array([1.0, 0.5, 0.58, 1.71, 1.24])
-    log = task_log(BROKK_170, 2, 0.1, np.random.default_rng(0), pose)
-    for recording in log.recordings:
-        np.testing.assert_array_equal(recording.q[0], read_encoder(BROKK_170, pose))
+    q = np.stack([recording.q for recording in log.recordings], axis=1)
+    state = plant_reset(BROKK_170, q[0])
+    for u in np.stack([recording.u for recording in log.recordings], axis=1):
+        state = plant_step(BROKK_170, state, u)
+    assert np.abs(state.q - q[-1]).max() < 0.02
 
 
 @pytest.mark.parametrize(

@@ -201,8 +201,8 @@ def one_pump(seed, recordings, ticks=300):
 def test_fit__with_latents_learns_what_joints_share():
     log, unseen = one_pump(0, 20), one_pump(1, 5)
     error = {}
-    for latents, steps in ((0, 300), (4, 1500)):  # more steps do not help nets that are alone
-        config = FitConfig(steps, batch_size=256, rollout=1, noise=0.0, shared=latents)
+    for latents, steps in ((0, 200), (4, 1000)):  # more steps do not help nets that are alone
+        config = FitConfig(steps, batch_size=128, rollout=1, noise=0.0, shared=latents)
         net = fit(log, config, seed=0, velocity_samples=4)
         assert len(net.weights) == (8 if latents else 6)
         scores = score(net, unseen)

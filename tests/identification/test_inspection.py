@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import cache
 from itertools import count
 
 import numpy as np
@@ -55,9 +56,16 @@ def holds(rng, ticks=4000):
     return np.repeat(rng.uniform(-0.6, 0.6, ticks // 8), 8)
 
 
-def excited(names=TRUE):
+@cache
+def excited(*names, recordings=4):
     rng = np.random.default_rng(0)
-    return Log(tuple(TRUE), tuple(record(name, holds(rng)) for name in names for _ in range(4)))
+    repeated = [name for name in names or TRUE for _ in range(recordings)]
+    return Log(tuple(TRUE), tuple(record(name, holds(rng)) for name in repeated))
+
+
+@cache
+def inspected(*names):
+    return inspect(excited(*names))
 
 
 def operator(rng, ticks=4000):
@@ -72,7 +80,7 @@ def operator(rng, ticks=4000):
 
 
 def test_inspect__finds_what_is_true():
-    reports = inspect(excited())
+    reports = inspected()
     for name, (up, down, gain_up, gain_down, delay, tau) in TRUE.items():
         report = reports[name]
         assert report.sign == np.sign(gain_up) and report.explained > 0.9
@@ -85,10 +93,9 @@ def test_inspect__finds_what_is_true():
 
 
 def test_inspect__leaves_out_joints_that_are_never_driven():
-    log = excited(["boom"])
-    reports = inspect(log)
+    reports = inspected("boom")
     assert list(reports) == ["boom"]
-    assert warnings(log, reports) == ["arm: never driven in the log"]
+    assert warnings(excited("boom"), reports) == ["arm: never driven in the log"]
 
 
 def test_inspect__tells_which_joints_are_driven_together():
@@ -101,7 +108,7 @@ def test_inspect__tells_which_joints_are_driven_together():
 
 
 def test_check_signs__refuses_a_reversed_command():
-    reports = inspect(excited())
+    reports = inspected()
     check_signs({"boom": reports["boom"]})
     with pytest.raises(ValueError, match=r"^u_arm: expected positive commands to raise q_arm, got"):
         check_signs(reports)
@@ -120,8 +127,7 @@ def test_warnings__know_an_operators_work_from_an_excitation():
     (about, _) = warnings(work, inspect(work))
     assert about.startswith("boom: ") and "fast changes of command in " in about
     assert about.endswith("scores hold for such driving alone")
-    log = excited(["boom"])
-    assert len(warnings(log, inspect(log))) == 1  # the arm alone
+    assert len(warnings(excited("boom"), inspected("boom"))) == 1  # the arm alone
 
 
 def test_feedback__tells_who_goes_between_places_from_an_excitation():
@@ -156,7 +162,7 @@ def test_reaction__tells_a_controller_with_random_goals_from_an_excitation():
 
 
 def test_warnings__know_the_range_of_a_machine():
-    log = excited(["boom"])._replace(joints=("q1", "q3"))  # q1: 4.3 rad
+    log = excited("boom")._replace(joints=("q1", "q3"))  # q1: 4.3 rad
     reports = inspect(log)
     reports["q1"] = replace(reports["q1"], low=-1.0, high=1.0)
     about, _ = warnings(log, reports, BROKK_170)
@@ -165,7 +171,7 @@ def test_warnings__know_the_range_of_a_machine():
 
 def test_fields__are_those_of_the_machine():
     """A gain of 0.5 from a dead zone of 0.12 on: 0.5 * (80 / 127 - 0.12) rad/s at the limit."""
-    report = replace(inspect(excited(["boom"]))["boom"], dead_zone_up=0.12, dead_zone_down=0.2)
+    report = replace(inspected("boom")["boom"], dead_zone_up=0.12, dead_zone_down=0.2)
     report = replace(report, gain_up=0.5, gain_down=0.3)
     found = fields({"q1": report, "q3": replace(report, dead_zone_up=0.05)}, BROKK_170)
     assert (found["dead_zone"], found["largest_dead_zone"]) == (0.05, 0.2)
@@ -174,10 +180,10 @@ def test_fields__are_those_of_the_machine():
 
 
 def test_commands__print_what_a_log_tells_and_refuse_reversed_commands(tmp_path, capsys):
-    write_log(tmp_path / "log.npz", excited())
+    write_log(tmp_path / "log.npz", excited(recordings=2))
     assert run(f"inspect '{tmp_path}/log.npz' --json '{tmp_path}/i.json'") == 0
     printed = capsys.readouterr().out
-    assert "8 recordings, 0 begin after a gap; q_dot estimated" in printed
+    assert "4 recordings, 0 begin after a gap; q_dot estimated" in printed
     report = json.loads((tmp_path / "i.json").read_text())
     assert report["joints"]["arm"]["sign"] == -1
     assert run(f"fit '{tmp_path}/log.npz' --steps 1 --out '{tmp_path}/n.npz'") == 1
@@ -186,13 +192,13 @@ def test_commands__print_what_a_log_tells_and_refuse_reversed_commands(tmp_path,
 
 
 def test_score__scores_nets_on_other_logs_and_fit_has_a_learning_curve(tmp_path, capsys):
-    log = excited(["boom"] * 3)
+    log = excited("boom", recordings=12)
     log = Log(
         ("boom",), tuple(Recording(r.name, *(x[:400, :1] for x in r[1:])) for r in log.recordings)
     )
     write_log(tmp_path / "log.npz", log._replace(recordings=log.recordings[:8]))
     write_log(tmp_path / "test.npz", log._replace(recordings=log.recordings[8:]))
-    fit = f"fit '{tmp_path}/log.npz' --test '{tmp_path}/test.npz' --steps 60 --curve"
+    fit = f"fit '{tmp_path}/log.npz' --test '{tmp_path}/test.npz' --steps 2 --curve"
     assert run(f"{fit} --out '{tmp_path}/n.npz' --json '{tmp_path}/f.json'") == 0
     scores = json.loads((tmp_path / "f.json").read_text())
     minutes = [point["minutes"] for point in scores["curve"]]

@@ -40,18 +40,19 @@ def both(first, second):
     return {name: np.concatenate([first[name], second[name]]) for name in first}
 
 
-def resampled(columns, joint):
-    """Command held and angle interpolated at 20 Hz, sample by sample."""
-    time, u, q = (columns[name].tolist() for name in ("time", f"u_{joint}", f"q_{joint}"))
-    commands, angles = [], []
-    while (now := time[0] + len(angles) * 0.05) <= time[-1] + 1e-9:
+def resampled(columns, joint, interpolated="q"):
+    """Command held and angle (or velocity) interpolated at 20 Hz, sample by sample."""
+    time, u = columns["time"].tolist(), columns[f"u_{joint}"].tolist()
+    values = columns[f"{interpolated}_{joint}"].tolist()
+    commands, result = [], []
+    while (now := time[0] + len(result) * 0.05) <= time[-1] + 1e-9:
         last = max(i for i in range(len(time)) if time[i] <= now + 1e-9)
         following = min(last + 1, len(time) - 1)
         gap = time[following] - time[last]
         fraction = (now - time[last]) / gap if gap else 0.0
         commands.append(u[last])
-        angles.append(q[last] + fraction * (q[following] - q[last]))
-    return commands, angles
+        result.append(values[last] + fraction * (values[following] - values[last]))
+    return commands, result
 
 
 # --- round trips ----------------------------------------------------------------------------------
@@ -108,11 +109,15 @@ def test_read_log__resamples_as_a_loop_does(tmp_path_factory, steps, seed, start
     time = np.where(np.abs(ticks - np.rint(ticks)) < 1e-3, time + 1e-3, time)
     time[0] = start
     columns = table("x", time, seed, ("a",))
+    columns["q_dot_a"] = columns["q_a"][::-1]
     path = write(tmp_path_factory.getbasetemp() / "looped.npz", columns)
     (recording,) = read_log([path], 4).recordings
     u, q = resampled(columns, "a")
     np.testing.assert_array_equal(recording.u[:, 0], u)
-    np.testing.assert_allclose(recording.q[:, 0], q, atol=1e-5 if start > 1e9 else 1e-9)
+    tolerance = 1e-5 if start > 1e9 else 1e-9
+    np.testing.assert_allclose(recording.q[:, 0], q, atol=tolerance)
+    _, q_dot = resampled(columns, "a", "q_dot")
+    np.testing.assert_allclose(recording.q_dot[:, 0], q_dot, atol=tolerance)
 
 
 def test_read_log__takes_means_of_fast_logs_by_hand(tmp_path):
@@ -144,22 +149,6 @@ def test_read_log__has_the_requested_rate_and_refuses_slower_logs(tmp_path, rate
     np.testing.assert_allclose(again.recordings[0].q, log.recordings[0].q, atol=1e-6)
     with pytest.raises(ValueError, match=r"expected 200 Hz, .*--machine.*more in 'a', got 100 Hz"):
         read_log([tmp_path / "log.csv"], 4, rate=200.0)
-
-
-def test_read_log__interpolates_logged_velocities(tmp_path):
-    time = np.array([0.0, 0.03, 0.06, 0.09, 0.12])
-    columns = table("x", time) | {"q_dot_a": 10 * time, "q_dot_b": -np.ones(5)}
-    log = read_log([write(tmp_path / "log.csv", columns)], 4)
-    assert log.velocity_logged
-    np.testing.assert_allclose(log.recordings[0].q_dot, [[0.0, -1], [0.5, -1], [1.0, -1]])
-
-
-def test_velocity_of__is_causal_and_right_by_hand():
-    q = np.array([[0.0, 1.0], [0.1, 1.0], [0.3, 0.0]])
-    # two samples: plain differences at 20 Hz, at rest before the first
-    np.testing.assert_allclose(velocity_of(q, 2), [[0, 0], [2, 0], [4, -20]], atol=1e-12)
-    # three samples: slope (newest - oldest) / 2 ticks
-    np.testing.assert_allclose(velocity_of(q, 3), [[0, 0], [1, 0], [3, -10]], atol=1e-12)
 
 
 # --- which recordings, which joints ---------------------------------------------------------------
@@ -366,22 +355,15 @@ def test_read_log__refuses_an_angle_that_wraps(tmp_path):
         read_log([write(tmp_path / "log.npz", columns)], 4)
 
 
-def test_split__holds_out_drives_of_each_joint():
+def test_split__holds_out_every_tenth_recording_that_drives_the_same_joints():
     time = np.arange(40)[:, None]
     drives = {"a": np.sin(time * [1, 0]), "b": np.sin(time * [0, 1])}
-    names = ["a"] * 11 + ["b"] * 2
+    names = ["a"] * 21 + ["b"] * 2
     recordings = [Recording(f"{i}", drives[x], drives[x], 0 * time) for i, x in enumerate(names)]
-    kept, held_out = split(Log(("a", "b"), tuple(recordings)))
-    assert [recording.name for recording in held_out.recordings] == ["0", "10", "11"]
-    assert join_recordings(kept).moves.any(axis=0).all()
-
-
-def test_split__holds_out_every_tenth_recording():
-    q = np.cumsum(np.full((40, 1), 0.01), axis=0)
-    log = Log(("a",), tuple(Recording(str(i), 0 * q, q, 0 * q) for i in range(21)))
+    log = Log(("a", "b"), tuple(recordings))
     kept, held_out = split(log)
-    assert [recording.name for recording in held_out.recordings] == ["0", "10", "20"]
-    assert len(kept.recordings) == 18
+    assert [recording.name for recording in held_out.recordings] == ["0", "10", "20", "21"]
+    assert len(kept.recordings) == 19
+    assert [recording.name for recording in part_of(log, 0.25).recordings] == [*"012345", "21"]
     with pytest.raises(ValueError, match=r"^recordings: expected two or more that .*, or --test"):
         split(log._replace(recordings=log.recordings[:1]))
-    assert [recording.name for recording in part_of(log, 0.25).recordings] == [*"012345"]

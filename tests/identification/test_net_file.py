@@ -33,10 +33,9 @@ def saved(path, entries=None, **changes):
     return path
 
 
-def test_load_net__gives_the_net_that_was_saved(tmp_path):
-    net = replace(random_net(), dead_zone=0.1)
+@pytest.mark.parametrize("net", [replace(random_net(), dead_zone=0.1), shared_net()])
+def test_load_net__gives_the_net_that_was_saved(tmp_path, net):
     history = np.random.default_rng(2).uniform(-1, 1, (6, 3, 3, 13)).astype(np.float32)
-    velocity = net.predict(history)
     save_net(tmp_path / "net.npz", net)
     loaded = load_net(tmp_path / "net.npz")
     for field in fields(ActuatorNet):
@@ -45,7 +44,7 @@ def test_load_net__gives_the_net_that_was_saved(tmp_path):
             assert np.array_equal(one, two), field.name
     for one, two in zip(net.weights, loaded.weights, strict=True):
         assert np.array_equal(one, two) and one.dtype == two.dtype
-    np.testing.assert_array_equal(loaded.predict(history), velocity)
+    np.testing.assert_array_equal(loaded.predict(history), net.predict(history))
 
 
 def test_load_net__reads_a_file_without_a_dead_zone(tmp_path):
@@ -94,13 +93,9 @@ def test_select_nets__refuses_nets_of_another_machine_rate_or_estimator():
         select_nets(BROKK_170, joint_nets(net, ["q1", "q3"]))
 
 
-def test_load_net__gives_nets_that_share_latents(tmp_path):
-    net = shared_net()
-    save_net(tmp_path / "net.npz", net)
-    loaded = load_net(tmp_path / "net.npz")
-    history = np.random.default_rng(2).uniform(-1, 1, (6, 3, 3, 13)).astype(np.float32)
-    np.testing.assert_array_equal(loaded.predict(history), net.predict(history))
-    assert len(joint_nets(loaded, ["j0", "j2"]).weights) == 8
+def test_load_net__wants_all_weights_of_nets_that_share_latents(tmp_path):
+    save_net(tmp_path / "net.npz", shared_net())
+    assert len(joint_nets(load_net(tmp_path / "net.npz"), ["j0", "j2"]).weights) == 8
     with np.load(tmp_path / "net.npz") as file:
         arrays = dict(file)
     assert json.loads(str(arrays["header"]))["format"] == 2  # older programs refuse it

@@ -12,7 +12,7 @@ from helpers_bus import tool_moved
 
 from brokk_min.__main__ import main
 from brokk_min.cli.options import with_plant
-from brokk_min.evaluation import baselines
+from brokk_min.evaluation import baselines, sequences
 from brokk_min.evaluation.feasibility import speed_limits
 from brokk_min.identification.logs import read_log
 from brokk_min.identification.net_file import load_net
@@ -93,6 +93,8 @@ def test_page__has_blocks_of_python_that_run(here, capsys):
 def test_page__has_commands_that_run_one_after_the_other(here, mini, monkeypatch):
     for name, value in {"TUNING_RUNS": 1, "TUNING_SECONDS": 1.0, "GENERATIONS": 1}.items():
         monkeypatch.setattr(baselines, name, value)
+    few = sequences.shorten(mini, sequences.task_sequences(mini), 3.0)
+    monkeypatch.setattr(sequences, "task_sequences", lambda machine: few)  # for `starts`
     Path("commands.csv").write_text(MOTIONS)
     names = [words[0] for words in COMMANDS]
     first = ["starts", "collect", "inspect", "fit", "train", "evaluate", "collect", "score"]

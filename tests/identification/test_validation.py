@@ -148,10 +148,7 @@ def test_validate__warns_of_nets_no_better_than_linear_and_of_tests_outside_the_
         "one_step_rmse", "persistence_rmse", "free_run", "linear", "creep", "outside",
         "response_time", "coupling", "delay",
     }  # fmt: skip
-    expected = "a: the error of a free run of 1 s is .* rad/s, that of a linear model"
-    assert any(np.char.startswith(result["warnings"], "a: the error of a free run of 1 s")), (
-        expected
-    )
+    assert any(w.startswith("a: the error of a free run of 1 s is") for w in result["warnings"])
     still = tuple(r._replace(u=0 * r.u, q=0 * r.q, q_dot=0 * r.q_dot) for r in test.recordings)
     assert validate(blank_net(log), log, Log(("a",), still))["warnings"] == []
     jumps = tuple(r._replace(u=-np.abs(r.u) - 0.2) for r in test.recordings)

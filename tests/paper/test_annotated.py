@@ -15,9 +15,6 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PAGE = (DOCS / "annotated.md").read_text()
 PAPER = (ROOT / "PAPER.md").read_text()
-CODE = re.compile(
-    r"^\[`[\w.]+`\]\(\.\./(\S*)#L(\d+)(?:-L(\d+))?\):\n\n^```python\n(.*?)^```$", re.M | re.S
-)
 FORMULA = re.compile(r"^\$\$(.*)\$\$$", re.M)
 MAKER = runpy.run_path(str(DOCS / "annotated.py"))
 
@@ -37,17 +34,6 @@ def test_numbers__are_of_the_shipped_files(numbers: dict[str, Any]) -> None:
     assert measured["files"] == numbers["fingerprints"](), message
     again = numbers["sample"](numbers["controllers"]()[0])
     assert measured["sample"] == pytest.approx(again, rel=0.02), message
-
-
-def test_code__is_lines_of_its_file() -> None:
-    found = CODE.findall(PAGE)
-    assert len(found) == PAGE.count("```python") >= 25
-    for path, first, last, block in found:
-        lines = [line.strip() for line in (ROOT / path).read_text().splitlines()]
-        shown = [line.strip() for line in block.splitlines() if line != "..."]
-        assert shown[0] == lines[int(first) - 1]
-        assert shown[-1] == lines[int(last or first) - 1]
-        assert set(shown) <= set(lines[int(first) - 1 : int(last or first)]) | {""}
 
 
 def test_page__has_all_that_the_paper_numbers_and_each_deviation() -> None:

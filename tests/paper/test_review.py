@@ -52,9 +52,3 @@ def test_benchmarks__have_what_is_asked_of_them(words: list[str]) -> None:
 def test_grep__finds_nothing(words: list[str]) -> None:
     done = subprocess.run(["grep", *words], cwd=ROOT, capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (1, "", "")
-
-
-def test_make__has_targets_of_the_readme() -> None:
-    """test_docs.py runs those."""
-    readme = (ROOT / "README.md").read_text()
-    assert all(f"`make {target}`" in readme for (target,) in commands("make"))
