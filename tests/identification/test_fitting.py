@@ -95,7 +95,7 @@ def test_fit__does_not_learn_to_brake_before_a_stop():
             q[k + 1] = np.clip(q[k] + 0.3 * u[k] / 20, -0.2, 0.2)
         recordings.append(Recording(f"r{run}", u, q[:160], velocity_of(q, 4)[:160]))
     log = Log(("a",), tuple(recordings))
-    net = fit(log, FitConfig(steps=800, batch_size=256), seed=0, velocity_samples=4)
+    net = fit(log, FitConfig(steps=500, batch_size=256), seed=0, velocity_samples=4)
     history, q, angles = initial_history(np.float32([-0.2]), 13), np.array([-0.2]), []
     for _ in range(60):
         history, q = free_run_step(net, history, q, np.array([0.9]))
