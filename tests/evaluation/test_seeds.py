@@ -32,7 +32,7 @@ def short(monkeypatch):
     sequences = [
         s._replace(goals=s.goals[s.goals.any(axis=1)][:10]) for s in axis_sequences(BROKK_170)
     ]
-    monkeypatch.setattr(seeds, "evaluation_starts", lambda *_: poses)
+    monkeypatch.setattr(seeds, "evaluation_starts", lambda machine, num, *_: poses[:num])
     monkeypatch.setattr(seeds, "task_sequences", lambda machine: sequences)
 
 

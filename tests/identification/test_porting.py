@@ -26,7 +26,7 @@ MOTIONS = re.search(r"^```csv\n(.*?)^```", PAGE, re.M | re.S)[1]
 QUICK = {
     "starts": "--num 1",
     "collect": "--hours 0.01",
-    "fit": "--steps 30 --batch-size 256",
+    "fit": "--steps 8 --batch-size 256",
     "train": "--total-steps 1024 --num-envs 16 --horizon 16 --minibatch-size 128 --threads 1",
     "evaluate": "--commands commands.csv --starts starts.csv",
 }
