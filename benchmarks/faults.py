@@ -231,7 +231,6 @@ def hours(number: float) -> dict[str, Any]:
         if k % max(1, ticks // 12) == max(1, ticks // 12) // 2:
             used.append(memory())
             print(f"{k} ticks: {used[-1]:.1f} MB, {status(world.drive)}", flush=True)
-    world.close()
     return {"ticks": ticks, "memory_mb": used, "driving": bool(world.drive.gate.driving)}
 
 

@@ -1,11 +1,11 @@
 """A machine, a bus and a program in one process on one injected clock: nothing waits for real."""
 
 import ctypes
-import itertools
 import json
 import os
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from contextlib import contextmanager
 from functools import partial
@@ -39,7 +39,6 @@ def baseline(machine):
 BASELINE = baseline(BROKK_170)
 Out = list[tuple[int, bytes]]
 Change = Callable[[int, bytes], Out]
-_channels = itertools.count()
 
 
 def unchanged(can_id, data):
@@ -72,16 +71,14 @@ def raises(error):
 
 
 class World:
-    """A simulated machine and a `Drive` on python-can's virtual bus; time passes while it waits.
+    """A simulated machine and a `Drive`; time passes while the program waits.
 
     The bus of the program is this object: it lets the machine live while `recv` waits, and `upward`
     and `downward` may tamper with what machine and program send.
     """
 
     def __init__(self, controller, operator, machine=BROKK_170, log=None, start=START):
-        channel = f"world {next(_channels)}"
-        self.near = can.Bus(channel, interface="virtual")
-        self.far = can.Bus(channel, interface="virtual")
+        self.inbox = deque()  # messages for the program
         self.t = 0.0  # s
         self.step = 0.001  # s
         self.offset = 0.0  # s, of the program's clock
@@ -97,16 +94,21 @@ class World:
         self.say(self.simulated.boot())
 
     def send(self, message, timeout=None):
-        for can_id, data in self.downward(message.arbitration_id, bytes(message.data)):
-            self.near.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+        frames = self.downward(message.arbitration_id, bytes(message.data))
         self.live()
+        for can_id, data in frames:
+            self.syncs += [self.t] * (can_id == 0x080)
+            self.say(self.simulated.receive(Frame(self.t, can_id, data)))
 
     def recv(self, timeout):
         end = self.t + timeout
-        while (message := self.near.recv(0)) is None and self.t < end:
+        while not self.inbox and self.t < end:
             self.t = min(end, self.t + self.step)
             self.live()
-        return message
+        return self.inbox.popleft() if self.inbox else None
+
+    def shutdown(self):
+        """Nothing is open."""
 
     def sleep(self, seconds):
         end = self.t + seconds
@@ -118,30 +120,22 @@ class World:
         """The machine's side up to now."""
         self.say(self.simulated.advance(self.t))
         for can_id, data in self.noise():
-            self.far.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+            self.put(can_id, data)
             self.say(self.simulated.receive(Frame(self.t, can_id, data)))
-        while (message := self.far.recv(0)) is not None:
-            if message.arbitration_id == 0x080:
-                self.syncs.append(self.t)
-            frame = Frame(self.t, message.arbitration_id, bytes(message.data))
-            self.say(self.simulated.receive(frame))
 
     def say(self, frames):
         for frame in frames:
             for can_id, data in self.upward(*frame):
-                self.far.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+                self.put(can_id, data)
+
+    def put(self, can_id, data):
+        """Bring a frame to the program."""
+        self.inbox.append(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
 
     def run(self, seconds):
         end = self.t + seconds
         while self.t < end and self.drive.tick():
             pass
-
-    def close(self):
-        self.near.shutdown()
-        self.far.shutdown()
-
-    def shutdown(self):
-        self.near.shutdown()
 
     @property
     def commands(self):
@@ -191,8 +185,7 @@ def tool_moved(machine, start, goals, log=None):
     world.drive.begin()
     while world.drive.tick():
         pass
-    world.drive.bus.close()
-    world.close()
+    world.bus.close()
     assert script.done, world.drive.reason
     q = np.array([start, world.simulated.plant.q])
     return np.diff(tool_position(forward_kinematics(machine, q)), axis=0)[0]

@@ -154,8 +154,7 @@ def intruder(f, after):
         if can_id == after:
             counter += 1
             out.append((0x210, valve_frame([77, 0, 0, 0, 0], counter % 256, 1).tobytes()))
-            message = can.Message(arbitration_id=0x210, data=out[-1][1], is_extended_id=False)
-            f.world.far.send(message)
+            f.world.put(0x210, out[-1][1])
         return out
 
     f.world.downward = follow
@@ -202,7 +201,6 @@ def drift(f, node, speed):
 
 
 def close_bus(f):
-    f.world.near.shutdown()
     f.world.recv = raises(can.CanOperationError("closed"))
     f.world.send = raises(can.CanOperationError("closed"))
 
@@ -353,7 +351,6 @@ def measure(cause: Callable[[Fault], Any], phase: float, seconds: float = 0.6) -
     world.run(seconds)
     words = world.drive.reason
     world.sleep(max(0.0, begun + seconds + 0.3 - world.t))
-    world.close()
     times, m = world.commands
     times, m = times[times > begun], m[times > begun]
     is_open = m.any(axis=1)

@@ -91,4 +91,3 @@ class PipedLoop:
 
     def close(self):
         self.world.bus.close()
-        self.world.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from hypothesis.extra import numpy as npst
 
 from brokk_min.machine import BROKK_170, Joint, Machine
 
+NUMBERS = itertools.count()
 SHAPES = [(), (1,), (4,), (2, 3)]  # leading axes
 
 
@@ -58,7 +60,7 @@ def machines(draw: st.DrawFn, min_joints: int = 2, max_joints: int = 6) -> Machi
     pwm_limit = draw(st.integers(20, 127))
     return replace(
         BROKK_170,
-        name="drawn",
+        name=f"machine {next(NUMBERS)}",  # caches of the package hash names
         joints=tuple(draw(joints(i, drives)) for i, drives in enumerate(driven)),
         q_start=(),
         rate=draw(st.sampled_from([10.0, 20.0, 25.0, 50.0])),

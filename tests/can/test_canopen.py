@@ -92,8 +92,7 @@ def test_operator_input__survives_the_log_to_a_tenth_of_a_millimetre(flags):
 @pytest.fixture
 def world():
     world = World(ConstantCommand(0, 0, 0, 0, 0), HoldingOperator())
-    yield world
-    world.close()
+    return world
 
 
 def test_set_up_nodes__sets_up_the_encoders_and_starts_the_nodes(world):
@@ -201,14 +200,9 @@ def test_linear_encoders__have_steps_in_nanometres_and_no_turns():
 
 def test_update__counts_frames_and_those_that_only_the_program_may_send():
     nodes = Nodes(BROKK_170)
-    for can_id, sent in (
-        (0x080, False),
-        (0x080, True),
-        (0x210, False),
-        (0x123, False),
-        (-1, False),
-    ):
-        nodes.update(Frame(0.0, can_id, b"", sent))
+    nodes.update(Frame(0.0, 0x080, b"", True))
+    for can_id in (0x080, 0x210, 0x123, -1):
+        nodes.update(Frame(0.0, can_id, b""))
     assert (nodes.received, nodes.others) == (5, 2)
     nodes.start_tick()
     assert (nodes.received, nodes.others) == (0, 0)

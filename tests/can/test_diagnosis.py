@@ -21,7 +21,7 @@ POLICY = load_policy(SHIPPED / "brokk170" / "policy.npz", M)
 OPEN = load_policy(SHIPPED / "brokk170" / "policy_dither.npz", M)
 PAPER = load_policy(SHIPPED / "brokk170" / "policy_paper.npz", M)
 START = np.array([[0.0, 0.5, 0.58, 1.71, 1.24]])
-SECONDS = 14
+SECONDS = 10
 
 
 def drive(observe=lambda h: h, send=lambda u: u, read=lambda q: q, ticks_of_plant=1, policy=POLICY):
@@ -124,7 +124,6 @@ def test_command__prints_terms_and_draws_them(tmp_path, capsys):
     operator.v = (0.0, -0.15, -0.1)
     world.run(2.5)
     world.bus.close()
-    world.far.shutdown()
     files = f"--figure '{tmp_path}/d.png' --json '{tmp_path}/d.json'"
     policy = SHIPPED / "brokk170" / "policy.npz"
     assert run(f"diagnose '{log}' --policy '{policy}' {files}") == 0

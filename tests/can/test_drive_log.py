@@ -46,7 +46,6 @@ def drive_logged(path, seconds=4.0):
     world.drive.signals.append(2)
     world.run(1.0)
     world.bus.close()
-    world.far.shutdown()
     return world
 
 

@@ -109,7 +109,6 @@ def test_joint_jog__moves_one_joint_with_the_sign_of_x():
         operator.v = v
         world.run(0.2)
         assert world.commands[1][-1].tolist() == [0, 0, 0, command, 0]
-    world.close()
 
 
 def test_shape_axis__is_odd_rising_and_flat_near_the_middle():

@@ -28,13 +28,16 @@ class Machine(SimulatedMachine):
         record = lambda *row: self.rows.append(row)  # noqa: E731
         super().__init__(BROKK_170, START, 100.0, record, self.reasons.append)
 
+    def take(self, can_id, data=b"", now=100.0):
+        return self.receive(Frame(now, can_id, data))
+
     def nmt_(self, command, node=0):
-        return self.receive(Frame(100.0, 0x000, bytes([command, node])))
+        return self.take(0x000, bytes([command, node]))
 
     def valves(self, counter, *counts, enable=1, now=100.0, sync=True):
         """Send SYNC and a valve frame; the commands in force [counts]."""
         if sync:
-            self.receive(Frame(now, 0x080, b""))
+            self.take(0x080, now=now)
         data = valve_frame([*counts, *[0] * (5 - len(counts))], counter, enable).tobytes()
         assert self.receive(Frame(now, BROKK_170.valve_frame_id, data)) == []
         return np.rint(127 * self.u).astype(int).tolist()
@@ -109,33 +112,18 @@ def watchdog(machine):
 
 
 FRAME = valve_frame([80, 0, 0, 0, 0], 9, 1).tobytes()
+MALFORMED = "valve frame with a wrong length or checksum"
 
 
 @pytest.mark.parametrize(
     ("act", "state", "reason"),
     [
-        (lambda machine: machine.valves(10, 80), 127, "valve frame with counter 10 after 8"),
-        (
-            lambda machine: machine.receive(Frame(100.0, 0x210, FRAME[:6] + b"\x00\x01")),
-            127,
-            "valve frame with a wrong length or checksum",
-        ),
-        (
-            lambda machine: machine.receive(Frame(100.0, 0x210, FRAME[:7])),
-            127,
-            "valve frame with a wrong length or checksum",
-        ),
-        (
-            lambda machine: machine.valves(9, 77, sync=False),
-            127,
-            "second valve frame after a SYNC, counter 9",
-        ),
-        (
-            lambda machine: [machine.receive(Frame(100.0, 0x080, b"")) for _ in range(2)],
-            127,
-            "no valve frame between two SYNCs",
-        ),
-        (lambda machine: machine.nmt_(2, CONTROLLER), 4, None),
+        (lambda m: m.valves(10, 80), 127, "valve frame with counter 10 after 8"),
+        (lambda m: m.take(0x210, FRAME[:6] + b"\x00\x01"), 127, MALFORMED),
+        (lambda m: m.take(0x210, FRAME[:7]), 127, MALFORMED),
+        (lambda m: m.valves(9, 77, sync=False), 127, "second valve frame after a SYNC, counter 9"),
+        (lambda m: m.take(0x080) + m.take(0x080), 127, "no valve frame between two SYNCs"),
+        (lambda m: m.nmt_(2, CONTROLLER), 4, None),
         (watchdog, 127, "no valve frame for 0.15 s"),
     ],
     ids=["counter", "checksum", "short", "second", "missing", "stopped", "watchdog"],

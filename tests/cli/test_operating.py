@@ -28,7 +28,6 @@ def log(tmp_path_factory):
     world = World(JointJog(BROKK_170, "q4", 30), HoldingOperator(), log=writer)
     world.drive.begin()
     world.run(2.0)
-    world.close()
     writer.stop()
     return path
 

@@ -97,15 +97,16 @@ def test_compare__lays_the_traces_of_all_controllers_over_each_other():
     session.compared = {"jacobian": BASELINE, "rl": ConstantCommand(0, 0, 0, 0, 0)}
     session.lines["rectangle"] = np.array([[0.0, 0, 0], [0, 0.3, 0]])
     session.next_task("compare")
-    for tick in range(80):
+    for tick in range(120):
         session.update(telemetry(tick, driving=False), 0.05 * tick)
-    scene = session.scene(3.96, "rl", "ready")
+    scene = session.scene(5.96, "rl", "ready")
     moved, stood = scene.traces
     assert moved.trail[-1][1] == pytest.approx(0.3, abs=0.05)
+    np.testing.assert_array_equal(moved.trail[-1], moved.trail[-10])  # it has arrived
     np.testing.assert_allclose(stood.trail, np.tile(tool(START), (len(stood.trail), 1)), atol=1e-9)
     assert moved.text.startswith("PID with DLS (the paper's): ")
     assert stood.text == "RL policy: 0 mm, at most 0 mm"
-    session.update(telemetry(81), 4.0)
+    session.update(telemetry(121), 6.0)
     assert session.comparison is None  # who drives sees the machine
 
 
@@ -209,7 +210,6 @@ def test_watch__shows_another_programs_drive_and_sends_nothing():
     world.upward = world.downward = recording(frames)
     world.drive.begin()
     world.run(1.5)
-    world.close()
     peer = can.Bus("watched", interface="virtual")
     seen = []
 

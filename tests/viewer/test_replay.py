@@ -175,16 +175,8 @@ def test_write_film__hands_raw_pictures_to_ffmpeg(script, message, monkeypatch, 
 
 
 def test_show_film__halts_and_moves_by_a_second(monkeypatch):
-    keys = {
-        3: "space",
-        5: "right",
-        6: "left",
-        7: "left",
-        8: "space",
-        9: "right",
-        10: "right",
-        12: "escape",
-    }
+    keys = {3: "space", 5: "right", 6: "left", 7: "left", 8: "space"}
+    keys |= {9: "right", 10: "right", 12: "escape"}
     ticks = []
     film = replay.film
 
