@@ -68,7 +68,6 @@ def test_fit__takes_a_foreign_log_and_beats_persistence_and_a_linear_model(tmp_p
     ("joints", "options", "machine", "dead_zone"),
     [
         (BROKK_170.names, "", "brokk170", 0.07),
-        (BROKK_170.names, "--machine brokk170", "brokk170", 0.07),
         (BROKK_170.names, "--dead-zone 0", "brokk170", 0.0),
         (BROKK_170.names, "--paper", "brokk170", 0.0),
         (("boom", "stick"), "", "", 0.0),

@@ -91,6 +91,8 @@ def test_forward_kinematics__is_the_product_of_exponentials(case):
     frames = forward_kinematics(machine, q)
     np.testing.assert_allclose(frames.p, expected[:, :3, 3], atol=1e-10)
     np.testing.assert_allclose(frames.z, expected[:, :3, 2], atol=1e-10)
+    slides = [joint.kind == "prismatic" for joint in machine.joints]
+    assert frames.prismatic == np.flatnonzero(slides).tolist()
 
 
 def test_forward_kinematics__takes_lists_whole_numbers_and_empty_batches():
