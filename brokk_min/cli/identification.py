@@ -44,8 +44,8 @@ class Collect(Command):
 
     out: Path  # Log to write, .csv or .npz.
     hours: float = number("h", 1e-4, 100, 1.0)  # Driving time for each actuator [h].
-    excitation: Literal["auto", "sine", "rich", "joint"] = "auto"
-    """The paper's sines; steps and holds too (auto); these on all joints, HOURS in all."""
+    excitation: Literal["auto", "sine", "rich", "ramp", "joint"] = "auto"
+    """Sines (the paper's); steps, holds, too (auto); slow ramps; all joints, HOURS in all."""
     policy: Path | None = None  # It drives instead: fit to its log, too, and train again.
     plant: PlantName = "analytic"  # What moves: the analytic plant, or an object of your file.
 

@@ -23,6 +23,7 @@ MIX = {"sine": 0.17, "step": 0.1, "holds": 0.17, "start": 0.21, "dither": 0.35}
 BARELY_OPEN = 0.049  # of full command beyond the dead zone, assumed: largest dither
 MAX_SEGMENT = 30.0  # s, assumed: longest motion that is recorded in one piece
 MAX_RETURN = 300.0  # s, assumed: a longer return to the start is stopped
+RAMP = 7.5  # s, assumed: from 0 to the peak of a slow ramp
 TURN_AFTER = 0.5  # s at a limit, assumed: then a joint that moves with others turns back
 
 
@@ -108,7 +109,18 @@ def _dither(rng: np.random.Generator, machine: Machine, _: float) -> Array:
     return np.asarray(sign * level * (-1.0) ** alternations)
 
 
-EXCITATIONS = {"sine": sine_command, "rich": rich_command}
+def ramp_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Array:
+    """Slow ramps from 0 to beyond the dead zone and back, up and down in turns, (ticks,)."""
+    half = round(RAMP * machine.rate)
+    shape = 1 - np.abs(np.arange(1 - half, half + 1)) / half
+    num = -(-ticks // len(shape))
+    beyond = rng.uniform(0.05, 0.25, num)  # of full command: the dead zone may be a guess
+    peaks = max(machine.dead_zone, machine.largest_dead_zone) + beyond
+    signs = rng.choice([-1, 1]) * (-1.0) ** np.arange(num)
+    return np.outer(signs * peaks, shape).ravel()[:ticks]
+
+
+EXCITATIONS = {"sine": sine_command, "rich": rich_command, "ramp": ramp_command}
 
 
 class _Recorder:

@@ -4,6 +4,9 @@ A small model of each joint is fitted by a search over a grid: its command, late
 dead zone of each direction, times a gain of each direction, through a first-order lag.
 
     q_dot' = (g_up max(u(t - d) - z_up, 0) - g_down max(-u(t - d) - z_down, 0) - q_dot) / tau
+
+Recordings of slow ramps (`collect --excitation ramp`), if a log has any, give the dead zones:
+there the delay hardly counts, and the curve beyond, such as a pump that starves, does not.
 """
 
 from dataclasses import asdict, dataclass
@@ -11,6 +14,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from brokk_min.identification.logs import COMMANDED, Log, Recording, driven
 from brokk_min.machine import PWM_MAX, Array, Machine
@@ -20,6 +24,7 @@ ZONES = np.arange(0, LARGEST_ZONE, 0.005)
 TAUS = (0.05, 0.1, 0.2, 0.4)  # s, assumed
 LATEST = 0.4  # s, assumed: longest delay
 SAMPLES = 20_000  # of a joint that are used
+SLOW = 0.12  # of full command in a second, assumed: ramps change by less
 LEVELS = 8  # of commands from 0 to the largest, by direction
 # What a log must have for its score to hold in other driving, all assumed.
 LEAST_MINUTES = 10.0
@@ -93,15 +98,37 @@ def inspect_joint(log: Log, recordings: list[Recording], j: int) -> JointReport:
     )
 
 
+def is_ramp(u: Array, rate: float) -> bool:
+    """Whether commands (T,) change slowly, from 0 on or to 0: no step, no constant command."""
+    second = round(rate)
+    if len(u) < second or np.abs(u).min() > COMMANDED:
+        return False
+    return bool(np.ptp(sliding_window_view(u, second), axis=-1).max() < SLOW)
+
+
 def joint_model(recordings: list[Recording], j: int, rate: float) -> dict[str, Any]:
-    """Fields of `JointReport` by the model above: the best of a grid, then of the dead zones."""
+    """Fields of `JointReport` by the model above; dead zones by slow ramps, if both moved it."""
+    ramps = [one for one in recordings if is_ramp(one.u[:, j], rate)]
+    if not 0 < len(ramps) < len(recordings):
+        return fit_model(recordings, j, rate)
+    by_ramps = fit_model(ramps, j, rate)
+    moved = by_ramps["gain_up"] * by_ramps["gain_down"] > 0
+    zones = [by_ramps["dead_zone_up"], by_ramps["dead_zone_down"]]
+    others = [one for one in recordings if not is_ramp(one.u[:, j], rate)]
+    return fit_model(others, j, rate, zones if moved else None)
+
+
+def fit_model(
+    recordings: list[Recording], j: int, rate: float, zones: list[float] | None = None
+) -> dict[str, Any]:
+    """Fields of the model: the best of a grid, then of the dead zones unless they are given."""
     u = np.concatenate([one.u[:, j] for one in recordings])[:SAMPLES]
     q = np.concatenate([one.q[:, j] for one in recordings])[:SAMPLES]
     velocity = np.diff(q, append=q[-1]) * rate
     seams = np.cumsum([len(one.q) for one in recordings])
     velocity[seams[seams <= len(q)] - 1] = 0.0  # no velocity from one recording to the next
     power = max(float(velocity @ velocity), 1e-12)
-    models = {sign: best_model(u, velocity, rate, sign) for sign in (1, -1)}
+    models = {sign: best_model(u, velocity, rate, sign, zones) for sign in (1, -1)}
     explained = {sign: 1 - model["error"] / power for sign, model in models.items()}
     better = explained[1] - explained[-1]
     model = models[1 if better > -CLEAR_SIGN else -1]
@@ -112,13 +139,15 @@ def joint_model(recordings: list[Recording], j: int, rate: float) -> dict[str, A
     }
 
 
-def best_model(u: Array, velocity: Array, rate: float, sign: int) -> dict[str, float]:
+def best_model(
+    u: Array, velocity: Array, rate: float, sign: int, given: list[float] | None = None
+) -> dict[str, float]:
     """The model with gains of one sign, by turns of a grid of delays and lags, and dead zones."""
-    zones = [0.05, 0.05]
+    zones = given or [0.05, 0.05]
     for _ in range(2):
         grid = product(range(round(LATEST * rate) + 1), TAUS)
         delay, tau = min(grid, key=lambda one: residual(u, velocity, rate, sign, *one, *zones)[0])
-        for side in (0, 1, 0, 1):
+        for side in () if given else (0, 1, 0, 1):
             trials = [[*zones[:side], zone, *zones[side + 1 :]] for zone in ZONES]
             zones = min(trials, key=lambda z: residual(u, velocity, rate, sign, delay, tau, *z)[0])
     error, gains = residual(u, velocity, rate, sign, delay, tau, *zones)

@@ -91,7 +91,7 @@ TRAIN = "train --actuator missing.npz --out p.npz"
         ("collect --out x.csv --hours a", 2, "--hours: expected FLOAT, got 'a'"),
         ("collect --out x.csv --hurs 3", 2, "expected options such as --hours, got --hurs, 3"),
         ("collect --out x.csv more", 2, "expected no further words, got more"),
-        ("collect --out x.csv --excitation ramp", 2, "'rich', 'joint', got ramp"),
+        ("collect --out x.csv --excitation noise", 2, "'ramp', 'joint', got noise"),
         (f"collect --out x.csv --o {'a' * 999}", 2, "got --o, aaa"),
         ("replay a.log --size 3", 2, "--size: expected 2 values, got fewer"),
         ("replay a.log --size 3 x", 2, "--size: expected INT INT, got ['3', 'x']"),

@@ -1,5 +1,6 @@
 """Excitation: the commands, the segments, and the recordings for validation."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -8,9 +9,9 @@ import pytest
 from brokk_min.actuator import plant_reset, plant_step
 from brokk_min.identification import excitation
 from brokk_min.identification.excitation import (
-    EXCITATIONS,
     MIX,
     collect,
+    ramp_command,
     rich_command,
     sine_command,
     task_log,
@@ -49,9 +50,26 @@ def test_rich_command__has_pauses_jumps_and_holds_and_the_requested_length():
     assert sum(MIX.values()) == pytest.approx(1)
 
 
+def test_ramp_command__goes_slowly_over_the_dead_zone_and_back_up_and_down_in_turns():
+    machine = replace(BROKK_170, largest_dead_zone=0.12)
+    u = ramp_command(np.random.default_rng(0), machine, 10 * 300 + 50)
+    assert u.shape == (3050,)
+    turns = u[:3000].reshape(10, 300)  # 15 s each
+    assert (np.sign(turns[:, 149]) == np.sign(turns[0, 149]) * (-1.0) ** np.arange(10)).all()
+    sizes = np.abs(turns)
+    assert (sizes.argmax(axis=1) == 149).all() and not turns[:, -1].any()
+    assert 0.17 < sizes[:, 149].min() < sizes[:, 149].max() < 0.37
+    for size in sizes:  # 7.5 s up, 7.5 s down
+        np.testing.assert_allclose(size[:150], size[149] * np.arange(1, 151) / 150)
+        np.testing.assert_allclose(size[150:], size[149] * np.arange(149, -1, -1) / 150, atol=1e-9)
+
+
+KINDS = ("sine", "rich")
+
+
 @pytest.fixture(scope="module")
 def collected():
-    return {kind: collect(BROKK_170, 0.05, kind, np.random.default_rng(7)) for kind in EXCITATIONS}
+    return {kind: collect(BROKK_170, 0.05, kind, np.random.default_rng(7)) for kind in KINDS}
 
 
 def segments(log):
@@ -66,7 +84,7 @@ def uncut(log):
     return [pair for pair, after in pairwise(pairs) if pair[0] == after[0]]
 
 
-@pytest.mark.parametrize("kind", EXCITATIONS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_collect__drives_each_joint_alone_for_the_requested_time(collected, kind):
     log = collected[kind]
     assert log.joints == BROKK_170.names and log.rate == 20.0
@@ -87,7 +105,7 @@ def test_collect__drives_each_joint_alone_for_the_requested_time(collected, kind
     assert ticks.tolist() == [3600] * 5  # 0.05 h at 20 Hz
 
 
-@pytest.mark.parametrize("kind", EXCITATIONS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_collect__begins_segments_at_idle_and_ends_them_at_a_limit_or_in_time(collected, kind):
     log, tick = collected[kind], 0.05 * BROKK_170.q_dot_max + 0.01
     for joint, segment, _ in segments(log):
@@ -102,7 +120,7 @@ def test_collect__begins_segments_at_idle_and_ends_them_at_a_limit_or_in_time(co
         assert len(segment.q) == 613 or (at_limit and len(segment.q) > 33)  # a second at least
 
 
-@pytest.mark.parametrize("kind", EXCITATIONS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_collect__returns_from_the_end_of_a_segment_to_its_start_until_idle(collected, kind):
     for joint, segment, back in uncut(collected[kind]):
         assert np.abs(back.q[0] - segment.q[-1]).max() < 0.03  # a tick at full speed
@@ -161,7 +179,7 @@ def test_task_log__moves_driven_or_locked_joints_within_the_limits(start):
     [
         (0.0, "sine", "hours: expected above 0, got 0.0"),
         (np.inf, "rich", "hours: expected above 0, got inf"),
-        (1.0, "noise", r"excitation: expected one of \['sine', 'rich', 'joint'\], got 'noise'"),
+        (1.0, "noise", r"expected one of \['sine', 'rich', 'ramp', 'joint'\], got 'noise'"),
     ],
 )
 def test_collect__refuses_hours_and_excitations_that_are_none(hours, excitation, message):

@@ -16,6 +16,7 @@ from brokk_min.identification.inspection import (
     feedback,
     fields,
     inspect,
+    is_ramp,
     reaction,
     warnings,
 )
@@ -90,6 +91,48 @@ def test_inspect__finds_what_is_true():
         assert report.tau == pytest.approx(tau, abs=0.1)
         assert report.minutes == pytest.approx(4 * 4000 / 20 / 60)
         assert report.alone == 1 and report.levels == (8, 8)
+
+
+def starved(name, commands):
+    """The same with a pump that gives no more flow beyond a command of 0.3."""
+    u = np.zeros((len(commands), len(TRUE)))
+    u[:, list(TRUE).index(name)] = commands
+    return record(name, np.clip(commands, -0.3, 0.3))._replace(u=u)
+
+
+def ramps(largest):
+    """Two ramps up and two down, 7.5 s each, in counts of 127."""
+    one = np.abs(np.abs(np.linspace(-1, 1, 300)) - 1) * largest
+    return np.rint(127 * np.concatenate([one, -one, one, -one])) / 127
+
+
+def test_inspect__takes_dead_zones_from_slow_ramps_where_the_pump_bends_the_curve():
+    usual = starved("boom", holds(np.random.default_rng(0), 1200))
+
+    def zones(*recordings):
+        report = inspect(Log(tuple(TRUE), recordings))["boom"]
+        return report.dead_zone_up, report.dead_zone_down
+
+    assert max(np.abs(np.subtract(zones(usual), TRUE["boom"][:2]))) > 0.04
+    slow = starved("boom", ramps(0.3))
+    assert zones(usual, slow) == zones(slow) == pytest.approx(TRUE["boom"][:2], abs=0.01)
+    within = starved("boom", ramps(0.1))  # nothing moved
+    assert zones(usual, within) == zones(usual)
+
+
+@pytest.mark.parametrize(
+    ("commands", "ramp"),
+    [
+        (ramps(0.4), True),
+        (ramps(0.4)[:200], True),  # in one direction
+        (ramps(0.4)[:10], False),
+        (np.full(200, 0.3), False),
+        (4 * ramps(0.4), False),
+        (0.4 * np.sin(2 * np.pi * np.arange(200) / 20), False),  # 1 Hz
+    ],
+)
+def test_is_ramp__knows_slow_commands_that_begin_or_end_at_zero(commands, ramp):
+    assert is_ramp(commands, 20.0) == ramp
 
 
 def test_inspect__leaves_out_joints_that_are_never_driven():
