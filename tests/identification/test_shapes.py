@@ -56,7 +56,6 @@ def test_example__runs_through_the_whole_chain(name, tmp_path, monkeypatch):
     Path("commands.csv").write_text("sequence,time,vx,vy,vz\nup,0,0,0,0.15\nup,0.5,0,0,0\n")
     for line in (
         f"collect --out log.npz {QUICK['collect']}",
-        "inspect log.npz",
         f"fit log.npz --out net.npz --json fit.json {QUICK['fit']}",
         f"train --actuator net.npz --out policy.npz {QUICK['train']}",
         "dbc --out bus.dbc",
