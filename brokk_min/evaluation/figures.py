@@ -40,7 +40,6 @@ STYLES: dict[str, dict[str, Any]] = {
     "jacobian_pid_k0.1": {"color": "#d9661a", "linestyle": (0, (6, 1, 1, 1, 1, 1))},
     "jacobian_pid_k0.05": {"color": "#f0b84a", "linestyle": "--"},
     "jacobian_pid_ff": {"color": "#00886a", "linestyle": "-."},
-    "jacobian_pid_ff_dither": {"color": "#6fbf9b", "linestyle": (0, (4, 1, 1, 1))},
     "jacobian_pid_ff_integral": {"color": "#7a4fa3", "linestyle": (0, (2, 1))},
     "jacobian_pid_ff_integral_dither": {"color": "#b39ad0", "linestyle": (0, (2, 2, 6, 2))},
     "perfect_model": {"color": "#c987b7"},

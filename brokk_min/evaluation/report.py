@@ -31,7 +31,6 @@ from brokk_min.machine import Array, Machine
 
 POSITION = ("rl", "rl_paper", "jacobian_pid_k0.1")  # in the figures of position errors
 AT_REST = ("rl", "rl_dither", "jacobian_pid_ff_integral_dither")
-ROBUST = ("rl", "rl_dither", "rl_paper", "jacobian_pid_k0.1", "jacobian_pid_ff_integral")
 STAGES = ("record", "fit", "train and tune", "evaluate")  # of the clock; the others are within
 Results = Mapping[str, Any]  # of `results.json`
 Rows = Mapping[str, Mapping[str, Mean]]  # by name of the row and controller
@@ -91,10 +90,6 @@ def draw(machine: Machine, results: Results, shown: Shown, curve: Path) -> dict[
         transpose(with_intervals(results, key))
         for key in ("velocity_error_mean", "off_axis_drift_max")
     )
-    robustness = {
-        variation: {name: row[name] for name in row if name in ROBUST}
-        for variation, row in results["robustness"].items()
-    }
     regret = transpose(results["regret"]["less_perfect_model"])
     axes = axis_sequences(machine)
     drawn = {
@@ -108,7 +103,7 @@ def draw(machine: Machine, results: Results, shown: Shown, curve: Path) -> dict[
         "rest": figures.plot_rest(machine, task, axes[0], AT_REST),
         "by_sequence": figures.plot_intervals({"error [m/s]": error, "largest drift [m]": drift}),
         "regret": figures.plot_intervals({"regret [m/s]": regret}),
-        "robustness": figures.plot_intervals({"mean velocity error [m/s]": robustness}),
+        "robustness": figures.plot_intervals({"mean velocity error [m/s]": results["robustness"]}),
     }
     for s in axes:
         drawn[s.name] = figures.plot_sequence(machine, shown.task, s, starts[run], run)

@@ -23,7 +23,7 @@ from brokk_min.env import TaskConfig
 from brokk_min.evaluation import baselines, claims, metrics, preliminary, report, sequences
 from brokk_min.evaluation.metrics import Controllers, Run, Traces, evaluate, summary
 from brokk_min.evaluation.perfect_model import perfect_models, regret
-from brokk_min.evaluation.robustness import near_singularities, robustness
+from brokk_min.evaluation.robustness import ROBUST, near_singularities, robustness
 from brokk_min.evaluation.rollout import Controller, Trace, log_of
 from brokk_min.evaluation.seeds import read_seeds, seeds_of
 from brokk_min.identification import fitting, logs, validation
@@ -85,7 +85,7 @@ def reproduce(
             for name, own in nets.items():
                 jobs[f"train {name}"] = partial(train, machine, out, name, own, budget, seed)
             settings = budget.tuning_runs, budget.generations, seed, None, None, budget.short_s
-            for name in baselines.baselines(machine, driven):
+            for name in baselines.TUNED:
                 tune = partial(baselines.tune_baselines, machine, driven, *settings)
                 jobs[f"tune {name}"] = partial(tune, name)
             paper, opened, rl, *tuned = side_by_side(jobs, clock)
@@ -272,8 +272,10 @@ def compare(
     few = claims.singular_controllers(policies, pids)
     near = partial(near_singularities, machine)
     every = machine, controllers
+    robust = {name: controllers[name] for name in ROBUST}
     jobs: dict[str, Callable[[], Any]] = {}
-    jobs["score changed machines"] = partial(robustness, *every, short, reachable[:16], seed)
+    changed_machines = machine, robust, short, reachable[:16], seed
+    jobs["score changed machines"] = partial(robustness, *changed_machines)
     for name, bound in perfect_models(machine, bound_starts).items():
         jobs[f"score {name}"] = partial(evaluate, machine, {name: bound}, short, bound_starts, seed)
     jobs["score"] = partial(evaluate, *every, commands, starts, seed)

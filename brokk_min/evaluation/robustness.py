@@ -7,12 +7,14 @@ from typing import Any
 import numpy as np
 
 from brokk_min.env import Encoder
-from brokk_min.evaluation import claims, metrics
+from brokk_min.evaluation import baselines, claims, metrics
 from brokk_min.evaluation.sequences import Commands, shorten, singular_sequences
 from brokk_min.jacobian import manipulability, manipulability_threshold
 from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.machine import Array, Machine, read_encoder, valve_opening
 
+# Who drives changed machines.
+ROBUST = ("rl", "rl_dither", "rl_paper", "jacobian_pid_k0.1", *baselines.STRONGEST)
 Sensor = Callable[[np.random.Generator], Encoder]  # makes the encoders of one rollout
 
 

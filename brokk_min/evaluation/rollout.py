@@ -23,7 +23,6 @@ TITLES = {  # of controllers in tables, figures and windows, by their names in f
     "jacobian_pid_k0.1": "PID with DLS (the paper's)",
     "jacobian_pid_k0.05": "the paper's PID, k = 0.05",
     "jacobian_pid_ff": "PID + feed-forward",
-    "jacobian_pid_ff_dither": "PID + feed-forward (dither)",
     "jacobian_pid_ff_integral": "PID + feed-forward + integral",
     "jacobian_pid_ff_integral_dither": "PID + feed-forward + integral (dither)",
     "perfect_model": "perfect model (dither)",

@@ -80,7 +80,7 @@ def test_plot_sequence__is_relative_to_where_the_tool_began():
 def test_styles__tell_controllers_apart_without_colour():
     controllers = [name for name in figures.STYLES if name.startswith(("rl", "jacobian"))]
     for marks in (figures.MARKERS, figures.HATCHES):
-        assert len({marks[name] for name in controllers}) == len(controllers) == 9
+        assert len({marks[name] for name in controllers}) == len(controllers) == 8
     dashes = {str(figures.STYLES[name].get("linestyle")) for name in ("goal", *controllers)}
     assert len(dashes) == 10
 

@@ -12,9 +12,10 @@ import pytest
 from helpers_cli import run
 
 from brokk_min.evaluation import baselines, figures, report, reproduce
+from brokk_min.evaluation.baselines import TUNED
 from brokk_min.evaluation.claims import VERDICTS
 from brokk_min.evaluation.reproduce import Budget
-from brokk_min.evaluation.robustness import variations
+from brokk_min.evaluation.robustness import ROBUST, variations
 from brokk_min.evaluation.sequences import task_sequences
 from brokk_min.identification.files import SHIPPED
 from brokk_min.identification.logs import read_log
@@ -25,7 +26,7 @@ from brokk_min.machine import BROKK_170
 COARSE = replace(BROKK_170, rate=10.0, plant_dt=0.05)  # two Euler steps a tick: fast
 TINY = Budget(0.004, 20, 4096, 4096, 1, 1, 4, 2, 0.5)
 ERROR = "velocity_error_mean"
-PIDS = ["jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff", "jacobian_pid_ff_dither"]
+PIDS = ["jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff"]
 PIDS += ["jacobian_pid_ff_integral", "jacobian_pid_ff_integral_dither"]
 CONTROLLERS = [*POLICIES, *PIDS]
 
@@ -80,7 +81,7 @@ def test_reproduce__gives_the_same_bits_twice(folder, tmp_path, monkeypatch, cap
     clock = json.loads((folder / "timing.json").read_text())
     trained = [f"train {name}" for name in ("rl_paper", "rl_dither", "rl")]
     stages = ["record", "fit net", "fit net_paper", "fit", *trained]
-    stages += [*(f"tune {name}" for name in PIDS), "train and tune"]
+    stages += [*(f"tune {name}" for name in TUNED), "train and tune"]
     scores = ["changed machines", "perfect_model", "perfect_model_closed"]
     stages += [f"score {name}" for name in scores]
     stages += ["score", "score for the regret", "score near singularities", "evaluate", "draw"]
@@ -147,7 +148,7 @@ def test_reproduce__results_compare_with_the_bound_and_on_other_machines(results
     assert less["rl"]["all"]["mean"] == pytest.approx(difference)
     assert "perfect_model_closed" in means
     assert set(results["robustness"]) == set(variations(BROKK_170))
-    assert set(results["robustness"]["nominal"]) == set(CONTROLLERS)
+    assert set(results["robustness"]["nominal"]) == set(ROBUST)
 
 
 def test_reproduce__report_is_one_file_with_its_figures(folder, results):

@@ -89,7 +89,7 @@ def test_pump_flow_ratio__is_what_the_plant_divides_among_the_valves():
 
 def test_robustness__has_a_row_for_each_variation_and_controller():
     short = [ALONG_Z._replace(goals=ALONG_Z.goals[MOVES - 2 : MOVES + 18])]
-    controllers = {"rl": PIDS["jacobian_pid_ff_dither"], "pid": PIDS["jacobian_pid_ff"]}
+    controllers = {"rl": PIDS["jacobian_pid_ff_integral_dither"], "pid": PIDS["jacobian_pid_ff"]}
     table = robustness(BROKK_170, controllers, short, STARTS, 0)
     assert list(table) == list(variations(BROKK_170))
     machine, sensor = variations(BROKK_170)["delay +50 ms"]
