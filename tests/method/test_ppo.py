@@ -52,7 +52,7 @@ class Tape(VectorEnv):
     def reset(self, *, seed=None, options=None):
         self.reset_seed = seed
         self.tick = 0
-        return self.obs[0], {}
+        return self.obs[0].astype(float), {}  # as many environments do
 
     def step(self, actions):
         t = self.tick
@@ -64,7 +64,8 @@ class Tape(VectorEnv):
             info["final_obs"] = np.array([None] * self.num_envs, dtype=object)
             for i in np.flatnonzero(done):
                 info["final_obs"][i] = self.last_obs[t, i]
-        return self.obs[t + 1], self.rewards[t], self.terminated[t], self.truncated[t], info
+        obs = self.obs[t + 1].astype(float)
+        return obs, self.rewards[t], self.terminated[t], self.truncated[t], info
 
 
 def rewards_as_advantages(agent, rollout, config):
@@ -395,7 +396,7 @@ def test_train__swings_up_the_pendulum():
         learning_rate=4e-3,
         target_kl=0.3,
         gamma=0.95,
-        total_steps=65_536,
+        total_steps=40_960,
         num_envs=32,
         horizon=32,
         minibatch_size=256,
