@@ -353,7 +353,7 @@ def quiet() -> Figures:
     config = TaskConfig(noise=0.0)
     shipped = POLICY.parent
     files = {name: policy.load_policy(shipped / file, M) for name, file in policy.POLICIES.items()}
-    controllers: dict[str, Any] = {k: policy.PolicyController(M, p) for k, p in files.items()}
+    controllers: dict[str, Any] = {**policy.policy_controllers(M, files)}
     net = files["rl"].net
     start, goals = sequences.tuning_set(M, baselines.TUNING_RUNS, 0)
     cost = partial(baselines.tuning_cost, start=start, goals=goals, seed=0, config=config)

@@ -19,7 +19,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from itertools import product
 from pathlib import Path
@@ -49,7 +49,6 @@ from brokk_min.machine import BROKK_170 as M
 C = ppo.PPOConfig  # its gamma, GAE lambda, clip, window and first deviation are the peers', too
 EPOCHS = 4  # of peers
 GAINS = POLICY.with_name("gains.json")
-SHIPPED = POLICY.with_name("policy_dither.npz")
 Setting = tuple[float, int]  # learning rate, environment steps
 Report = Callable[[Iterable[nn.Module], int], None]  # an actor's layers, gradient steps in all
 
@@ -61,7 +60,7 @@ class Finished(Exception):
 @dataclass
 class Options:
     learners: tuple[str, ...] = ("ours", "critic", "sb3", "cleanrl", "rl_games")  # Who takes part.
-    policy: Path = SHIPPED  # Whose nets and valves at rest all have; its error is a level.
+    policy: Path = POLICY  # Whose nets all train on; its error, with dither at rest, is a level.
     gains: Path = GAINS  # Tuned gains of the PID.
     seeds: tuple[int, ...] = (0, 1, 2)  # One run each.
     longest: float = 1.0  # Fraction of the lengths of `SETTINGS`.
@@ -299,7 +298,7 @@ def race(
 ) -> dict[str, Any]:
     """One run: `reached` has CPU and wall seconds, environment and gradient steps of each level."""
     torch.set_num_threads(1)
-    env = TaskVectorEnv(options.num_envs, shipped.net, M, TaskConfig(valves=shipped.valves))  # type: ignore[arg-type]
+    env = TaskVectorEnv(options.num_envs, shipped.net, M, TaskConfig(valves="dither"))
     rate, steps = setting[0], round(setting[1] * options.longest)
     row: dict[str, Any] = {"learner": name, "setting": setting, "seed": seed, "best": np.inf}
     row |= {"updates": 0, "gradient_steps": 0, "cpu_s": 0.0, "wall_s": 0.0, "reached": {}}
@@ -336,7 +335,7 @@ def best_run(rows: list[dict[str, Any]], level: str) -> dict[str, Any]:
 
 
 def main(options: Options) -> dict[str, Any]:
-    shipped = load_policy(options.policy, M)
+    shipped = replace(load_policy(options.policy, M), valves="dither")  # as all who train here
     targets = levels(shipped, options)
     rows: list[dict[str, Any]] = []
     if options.json and options.json.exists():  # go on

@@ -12,7 +12,7 @@ import numpy as np
 from brokk_min import BROKK_170
 from brokk_min.evaluation import baselines, metrics, sequences
 from brokk_min.identification.files import SHIPPED
-from brokk_min.learning.policy import POLICIES, PolicyController, load_policy
+from brokk_min.learning.policy import POLICIES, load_policy, policy_controllers
 from brokk_min.machine import Machine
 
 RESTS = (0.5, 1.0, 2.0, 2.5, 4.0, 5.0, 10.0)  # s
@@ -33,7 +33,7 @@ def main() -> None:
     m, folder = BROKK_170, SHIPPED / BROKK_170.name
     policies = {name: load_policy(folder / file, m) for name, file in POLICIES.items()}
     controllers: metrics.Controllers = {
-        **{name: PolicyController(m, policy) for name, policy in policies.items()},
+        **policy_controllers(m, policies),
         **baselines.read_gains(folder / "gains.json", m, policies["rl"].net),
     }
     axes = sequences.axis_sequences(m)

@@ -5,8 +5,8 @@
 Each seed records, fits and trains as `brokk-min reproduce` does, on one thread; as many seeds run
 at once as there are cores. What the folder holds already is not made again. Policies and the
 package's tuned baselines are then scored on the sequences and starts of `evaluate`; the paper's
-policies also with valves that close while the tool rests, as an operator's and the PIDs' do. All
-figures go to `seeds.json` in the folder, the learning curves of ours to `seeds.svg`.
+also with valves that close while the tool rests, as the PIDs' do, ours also with dither then. All
+figures go to `seeds.json` in the folder, the learning curve of ours to `seeds.svg`.
 """
 
 from dataclasses import dataclass, replace
@@ -36,9 +36,9 @@ FIGURES = {  # name in the file -> figure of `metrics`
 }
 NAMES = {"rl": "ours closed", "rl_dither": "ours dither", "rl_paper": "paper"}
 NAMES |= {"rl_paper_closed": "paper closed"}
+OTHER = {"rl": ("rl_dither", "dither"), "rl_paper": ("rl_paper_closed", "closed")}
 RECIPES: dict[str, tuple[str, str, dict[str, Any]]] = {  # policy -> nets, excitation, recipe
     "rl": ("net", "rich", {}),
-    "rl_dither": ("net", "rich", {}),
     "rl_paper": ("net_paper", "sine", fitting.PAPER_RECIPE),
 }
 
@@ -81,10 +81,9 @@ def score(options: Options) -> list[dict[str, Any]]:
         for name in options.policies
         if (file := options.folder / f"seed_{seed}" / POLICIES[name]).exists()
     }
-    policies |= {  # the paper's learner once more, with valves that close at rest
-        (f"{name}_closed", seed): replace(policy, valves="closed")
+    policies |= {  # once more, with the other rule for valves at rest
+        (OTHER[name][0], seed): replace(policy, valves=OTHER[name][1])
         for (name, seed), policy in policies.items()
-        if policy.paper
     }
     controllers: dict[Any, Any] = {k: PolicyController(M, p) for k, p in policies.items()}
     shipped = SHIPPED / M.name
@@ -107,17 +106,16 @@ def mean(runs: list[dict[str, Any]], figure: str) -> float:
 
 def draw(options: Options) -> None:
     """Velocity error on the nets while ours learn: mean of the seeds, least and largest."""
+    files = sorted(options.folder.glob(f"seed_*/{POLICIES['rl']}.csv"))
+    if not files:
+        return
+    tables = [read_table(f, ["global_step", "charts/velocity_error"]) for f in files]
+    million_steps = tables[0]["global_step"] / 1e6
+    errors = np.array([table["charts/velocity_error"] for table in tables])
     figure = Figure(figsize=(7.0, 2.4), layout="compressed")
     axes = figure.subplots()
-    for name, style in (("rl", "-"), ("rl_dither", "--")):
-        files = sorted(options.folder.glob(f"seed_*/{POLICIES[name]}.csv"))
-        if files:
-            tables = [read_table(f, ["global_step", "charts/velocity_error"]) for f in files]
-            million_steps = tables[0]["global_step"] / 1e6
-            errors = np.array([table["charts/velocity_error"] for table in tables])
-            label = f"{NAMES[name]}, {len(files)} seeds"
-            axes.plot(million_steps, errors.mean(axis=0), style, color="black", label=label)
-            axes.fill_between(million_steps, errors.min(axis=0), errors.max(axis=0), alpha=0.3)
+    axes.plot(million_steps, errors.mean(axis=0), color="black", label=f"ours, {len(files)} seeds")
+    axes.fill_between(million_steps, errors.min(axis=0), errors.max(axis=0), alpha=0.3)
     axes.set(xlabel="environment steps [million]", ylabel="velocity error [m/s]", yscale="log")
     axes.legend()
     figure.savefig(options.folder / "seeds.svg", metadata={"Date": None})

@@ -8,7 +8,7 @@ plant's equations. `identification.fitting` makes nets from logs.
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +18,7 @@ from brokk_min.machine import Array, Machine, estimate_velocity, limit_command, 
 REST_AFTER = {"closed": 0.5, "dither": 0.1, "open": math.inf}  # s of a zero goal, assumed, tuned
 DITHER = 0.03  # opening of valves that alternate at rest, tuned: 0.02 is too little
 STANDSTILL = 0.002  # rad or m, assumed: little more than one step of a 12-bit encoder
+Valves = Literal["closed", "dither", "open"]  # what they do while the tool rests
 MU = 50.0  # assumed: the mu law is about linear below 1/50 of full opening
 
 # --- the analytic plant ---------------------------------------------------------------------------

@@ -30,7 +30,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -60,7 +60,7 @@ class TaskConfig:
     noise: float = machine.number("1", 0, 1000, 0.05)  # Of sensors, in deviations (paper: 5 %).
     valve_cost: float = machine.number("1", 0, 1000, 0.05)  # Of a full change of all (paper: 0).
     integral_cost: float = machine.number("1/m", 0, 1000, 1.0)  # Of the error integral (paper: 0).
-    valves: Literal["closed", "dither", "open"] = "closed"  # At rest: `actuator.command_at_rest`.
+    valves: actuator.Valves = "closed"  # While the tool rests: `actuator.command_at_rest`.
     redraw_ground: bool = True  # Redraw start poses in the ground; the paper ends the episode.
     paper: bool = False  # The paper's agent: observation, action, reward, start and end, see above.
     __post_init__ = machine.check_numbers  # type: ignore[misc]

@@ -25,7 +25,7 @@ from brokk_min.identification import excitation, validation
 from brokk_min.identification.files import SHIPPED
 from brokk_min.identification.logs import Recording
 from brokk_min.kinematics import forward_kinematics, tool_position
-from brokk_min.learning.policy import POLICIES, PolicyController, load_policy
+from brokk_min.learning.policy import POLICIES, load_policy, policy_controllers
 
 DOCS = Path(__file__).parent
 NUMBERS = DOCS / "annotated.json"
@@ -47,7 +47,7 @@ def controllers() -> tuple[dict[str, Any], dict[str, Any]]:
     policies = {name: load_policy(FILES / file, BROKK_170) for name, file in POLICIES.items()}
     nets = {"ours": policies["rl"].net, "paper": policies["rl_paper"].net}
     pids = baselines.read_gains(FILES / "gains.json", BROKK_170, nets["ours"])
-    rl = {name: PolicyController(BROKK_170, policy) for name, policy in policies.items()}
+    rl: dict[str, Any] = {**policy_controllers(BROKK_170, policies)}
     return rl | {name: pids[name] for name in PIDS}, nets
 
 

@@ -21,7 +21,7 @@ from brokk_min.evaluation.rollout import TITLES, Controller
 from brokk_min.identification.files import SHIPPED, located, write_json
 from brokk_min.identification.net_file import load_net
 from brokk_min.jacobian import JacobianController
-from brokk_min.learning.policy import POLICIES, Policy, PolicyController, load_policy
+from brokk_min.learning.policy import POLICIES, Policy, load_policy, policy_controllers
 from brokk_min.machine import Machine, number
 
 
@@ -103,11 +103,11 @@ class Evaluate(Command):
         tuned: dict[str, JacobianController],
         net: ActuatorNet | None,
     ) -> dict[str, Controller]:
-        controllers: dict[str, Controller] = {"rl": PolicyController(machine, policy)}
-        for name, file in POLICIES.items():
-            path = SHIPPED / machine.name / file
-            if not self.policy and name != "rl" and path.exists():
-                controllers[name] = PolicyController(machine, load_policy(path, machine))
+        policies = {"rl": policy}
+        path = SHIPPED / machine.name / POLICIES["rl_paper"]
+        if not self.policy and path.exists():
+            policies["rl_paper"] = load_policy(path, machine)
+        controllers: dict[str, Controller] = {**policy_controllers(machine, policies)}
         if tuned:
             return controllers | tuned
         budget = (baselines.TUNING_RUNS, baselines.GENERATIONS, self.seed)

@@ -2,7 +2,7 @@
 
 import shutil
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -10,6 +10,7 @@ import numpy as np
 from tyro.conf import Positional
 
 from brokk_min import hw
+from brokk_min.actuator import Valves
 from brokk_min.can import diagnosis, drive_log
 from brokk_min.can.canopen import used_ids
 from brokk_min.can.connection import has_real_time_priority, lock_memory, open_bus
@@ -61,6 +62,7 @@ class Drive(Command):
     joint: str = ""  # Joint that jogs, forward and backward with x; by default the first driven.
     counts: int = number("counts", 0, 127, 0)  # Its command, of 127; 0: 3 beyond the dead zone.
     gains: Path | None = None  # Tuned gains; by default gains.json in the folder of POLICY.
+    valves: Valves | None = None  # While the tool rests, instead of the controller's rule.
     axes: tuple[int, int, int] = (1, 0, 4)  # Axes of the joystick for x, y and z.
     button: int = 5  # Button of the joystick that must be held.
     log: Path | None = None  # Also log every frame here, candump format.
@@ -101,9 +103,10 @@ class Drive(Command):
             raise WrongUse("--policy: expected a policy that `train` wrote, got none")
         policy = load_policy(self.policy, machine)
         if self.controller == "rl":
-            return PolicyController(machine, policy)
+            return PolicyController(machine, replace(policy, valves=self.valves or policy.valves))
         gains = self.gains or self.policy.with_name("gains.json")
-        return baselines.read_gains(gains, machine, policy.net)["jacobian_pid_k0.1"]
+        pid = baselines.read_gains(gains, machine, policy.net)["jacobian_pid_k0.1"]
+        return replace(pid, valves=self.valves or pid.valves)
 
     def _operator(self, machine: Machine) -> Joystick | Script:
         if self.command == "joystick":
@@ -154,12 +157,14 @@ class Diagnose(Command):
 
     log: Positional[Path]  # Log that `drive --log` wrote.
     policy: Path  # Policy that drove.
+    valves: Valves | None = None  # As in `drive`.
     json: Path | None = None  # Also write all terms here.
     figure: Path | None = None  # Also draw commands and velocities with the expected ones, .png.
 
     def __call__(self) -> None:
         machine = self.check(json="diagnosis", figure="picture")
         policy = load_policy(self.policy, machine)
+        policy = replace(policy, valves=self.valves or policy.valves)
         with located(self.log):
             ticks = diagnosis.read_ticks(machine, read_frames(self.log))
         terms = diagnosis.diagnose(machine, policy, ticks)

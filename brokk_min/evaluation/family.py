@@ -13,7 +13,7 @@ logs, the policies trained on; baselines tuned on the member itself. `family.jso
     summary: {policy: median and largest of its `ratios` over the members}
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -33,12 +33,17 @@ from brokk_min.identification.formats import FAMILY_MEMBER, check_fields
 from brokk_min.identification.logs import Log
 from brokk_min.identification.net_file import select_nets
 from brokk_min.identification.physics import draw_machine
-from brokk_min.learning.policy import POLICIES, Policy, PolicyController, load_policy
+from brokk_min.learning.policy import (
+    POLICIES,
+    Policy,
+    PolicyController,
+    load_policy,
+    policy_controllers,
+)
 from brokk_min.machine import Machine
 
-Policies = dict[str, Policy]
 LATENTS = 4  # that the nets share
-VALVES = {"rl": "closed", "rl_dither": "dither"}  # our policies, and their classes at rest
+VALVES = {"rl": "closed", "rl_dither": "dither"}  # our policy, and its valves at rest
 PAYLOAD = 50.0  # kg at the tool that no log has, assumed: half of a link
 # Small enough for 15 minutes a member on two cores.
 FAMILY = Budget(fit_steps=12_000, train_steps=2_000_000, starts=16)
@@ -74,21 +79,18 @@ def run_member(base: Machine, seed: int, out: Path, budget: Budget) -> dict[str,
     log = collect(machine, budget.hours, "joint", np.random.default_rng(seed))
     test = task_log(machine, 20, 40.0, np.random.default_rng(seed + 1))
     first = replace(budget, fit_steps=budget.fit_steps // 2, train_steps=budget.train_steps // 2)
-    _, jobs = trainings(machine, out / "first", log, first, seed)
-    begun = dict(zip(VALVES, reproduce.side_by_side(jobs, {}), strict=True))
-    drivers = [PolicyController(machine, policy) for policy in begun.values()]
+    _, training = fit_and_train(machine, out / "first", log, first, seed)
+    begun = training()
+    drivers = [*policy_controllers(machine, {"rl": begun}).values()]
     own = own_drives(machine, drivers, budget.hours, seed)
     log = log._replace(recordings=log.recordings + own.recordings)
-    every, jobs = trainings(machine, out, log, budget, seed, begun)
+    every, training = fit_and_train(machine, out, log, budget, seed, begun)
     net = select_nets(machine, every)
     settings = budget.tuning_runs, budget.generations, seed, None, None, budget.short_s
-    jobs["tune"] = partial(baselines.tune_baselines, machine, net, *settings)
-    *trained, (pids, _) = reproduce.side_by_side(jobs, {})
+    tune = partial(baselines.tune_baselines, machine, net, *settings)
+    trained, (pids, _) = reproduce.side_by_side({"train": training, "tune": tune}, {})
     baselines.write_gains(out / "gains.json", pids, baselines.gains_metadata(machine, net))
-    policies = {
-        name: PolicyController(machine, policy)
-        for name, policy in zip(VALVES, trained, strict=True)
-    }
+    policies = policy_controllers(machine, {"rl": trained})
     errors = mean_errors(base, machine, {**policies, **pids}, budget)
     scores = validation.score(every, test)
     driven = [base.names[i] for i in base.driven]
@@ -110,20 +112,15 @@ def run_member(base: Machine, seed: int, out: Path, budget: Budget) -> dict[str,
     return row
 
 
-def trainings(
-    machine: Machine, out: Path, log: Log, budget: Budget, seed: int, start: Policies | None = None
-) -> tuple[ActuatorNet, dict[str, Any]]:
-    """Nets of all joints, fitted to a log, and calls that train our policies on them."""
+def fit_and_train(
+    machine: Machine, out: Path, log: Log, budget: Budget, seed: int, start: Policy | None = None
+) -> tuple[ActuatorNet, Callable[[], Policy]]:
+    """Nets of all joints, fitted to a log, and a call that trains our policy on them."""
     out.mkdir(parents=True, exist_ok=True)
     logs.write_log(out / "log.npz", log)
     every = reproduce.fit_net(machine, out / "net.npz", log, budget, {"shared": LATENTS}, seed)
     net = select_nets(machine, every)
-    begin = start or dict.fromkeys(VALVES)
-    calls: dict[str, Any] = {
-        name: partial(reproduce.train, machine, out, name, net, budget, seed, begin[name])
-        for name in VALVES
-    }
-    return every, calls
+    return every, partial(reproduce.train, machine, out, "rl", net, budget, seed, start)
 
 
 def with_payload(machine: Machine) -> Machine:

@@ -33,7 +33,7 @@ from brokk_min.identification.net_file import save_net, select_nets
 from brokk_min.jacobian import JacobianController
 from brokk_min.learning.checkpoint import train_policy
 from brokk_min.learning.episodes import GRADIENT_LEARNER, PAPER_TASK
-from brokk_min.learning.policy import POLICIES, Policy, PolicyController, save_policy
+from brokk_min.learning.policy import POLICIES, Policy, policy_controllers, save_policy
 from brokk_min.machine import Machine
 from brokk_min.ppo import PPOConfig
 
@@ -80,7 +80,7 @@ def reproduce(
             driven = select_nets(machine, net)
             training_seeds = seeds_of(machine, driven, seeds) if seeds else {}
         with stage("train and tune"):
-            nets = {"rl_paper": select_nets(machine, paper_net), "rl_dither": driven, "rl": driven}
+            nets = {"rl_paper": select_nets(machine, paper_net), "rl": driven}
             jobs: dict[str, Any] = {}
             for name, own in nets.items():
                 jobs[f"train {name}"] = partial(train, machine, out, name, own, budget, seed)
@@ -88,8 +88,8 @@ def reproduce(
             for name in baselines.TUNED:
                 tune = partial(baselines.tune_baselines, machine, driven, *settings)
                 jobs[f"tune {name}"] = partial(tune, name)
-            paper, opened, rl, *tuned = side_by_side(jobs, clock)
-            policies = {"rl": rl, "rl_dither": opened, "rl_paper": paper}
+            paper, rl, *tuned = side_by_side(jobs, clock)
+            policies = {"rl": rl, "rl_paper": paper}
             pids, tuning = (dict(ChainMap(*both[::-1])) for both in zip(*tuned, strict=True))
         with stage("evaluate"):
             results, shown = measure(machine, net, test, policies, pids, budget, seed, clock)
@@ -186,11 +186,10 @@ def net_errors(machine: Machine, net: ActuatorNet, test: logs.Log, seed: int) ->
 
 
 def settings(name: str, budget: Budget) -> tuple[TaskConfig, PPOConfig]:
-    """Task and learner of one of `POLICIES`: ours, ours with dither at rest, or the paper's."""
+    """Task and learner of one of `POLICIES`: ours, or the paper's."""
     if name == "rl_paper":
         return TaskConfig(paper=True, **PAPER_TASK), PPOConfig(budget.paper_steps)
-    task = TaskConfig(valves="dither" if name == "rl_dither" else "closed")
-    return task, PPOConfig(**GRADIENT_LEARNER | {"total_steps": budget.train_steps})
+    return TaskConfig(), PPOConfig(**GRADIENT_LEARNER | {"total_steps": budget.train_steps})
 
 
 def train(
@@ -219,7 +218,7 @@ def measure(
     clock: dict[str, float],
 ) -> tuple[dict[str, Any], report.Shown]:
     """All measurements of nets, policies and baselines, for JSON and for the figures."""
-    controllers = {name: PolicyController(machine, policy) for name, policy in policies.items()}
+    controllers = policy_controllers(machine, policies)
     compared, task, singular = compare(machine, controllers, pids, budget, seed, clock)
     starts = np.array(compared["starts"])[np.array(compared["start_kinds"]) == "workspace"]
     axes = sequences.axis_sequences(machine)

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from brokk_min.machine import Array, Machine
 
 FORMAT = 3  # of policy files
 # Files of `reproduce`: our policy with valves closed or open while the tool rests, and the paper's.
-POLICIES = {"rl": "policy.npz", "rl_dither": "policy_dither.npz", "rl_paper": "policy_paper.npz"}
+POLICIES = {"rl": "policy.npz", "rl_paper": "policy_paper.npz"}
 
 
 @dataclass(frozen=True)
@@ -79,6 +79,17 @@ class PolicyController:
         u = action_to_pwm(machine, action, paper)
         u, _, ticks = command_at_rest(machine, self.policy.valves, u, measured.v_goal, ticks)
         return u, ticks
+
+
+def policy_controllers(
+    machine: Machine, policies: Mapping[str, Policy]
+) -> dict[str, PolicyController]:
+    """Controllers of `POLICIES` by name; "rl_dither" is "rl" with another rule for valves at rest.
+
+    Training with that rule brings 1 % (docs/log.md), so one policy serves both classes.
+    """
+    both = {"rl": policies["rl"], "rl_dither": replace(policies["rl"], valves="dither")}
+    return {name: PolicyController(machine, one) for name, one in {**both, **policies}.items()}
 
 
 def contract(machine: Machine, paper: bool = False) -> dict[str, Any]:

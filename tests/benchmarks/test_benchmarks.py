@@ -39,7 +39,7 @@ def test_race__trains_each_learner_and_notes_the_levels_it_reached(learner):
         pytest.importorskip("rl_games")
     options = peers.Options(runs=1, num_envs=16)
     targets = {"any": 9.0, "none": 0.0}
-    shipped = load_policy(peers.SHIPPED, BROKK_170)
+    shipped = load_policy(peers.POLICY, BROKK_170)
     row = peers.race(learner, shipped, (1e-3, 1024), 0, targets, options)
     assert (row["learner"], row["updates"], row["seed"]) == (learner, 2, 0)
     epochs = 2 if learner in ("ours", "critic") else peers.EPOCHS
@@ -72,7 +72,7 @@ def test_seeds__score_what_the_folder_has(tmp_path, capsys, monkeypatch):
         copyfile(SHIPPED / "brokk170/policy.npz", tmp_path / "seed_0" / name)
     seeds.main(seeds.Options(tmp_path, 1, ("rl",), quick=True))
     rows = json.loads((tmp_path / "seeds.json").read_text())
-    assert [row["seed"] for row in rows] == [0, *[None] * 5]
+    assert [row["seed"] for row in rows] == [0, 0, *[None] * 5]
     assert all(0.005 < row["error"] < 0.03 and row["jerk"] > 1 for row in rows)
     assert "jacobian_pid_ff_integral" in capsys.readouterr().out
 

@@ -85,7 +85,7 @@ def test_evaluate__writes_what_it_used(folder, capsys):
         for option, file in (files | {"gains": "gains.json"}).items():
             assert meta[option] == str(folder / file)
         assert (meta["plant"], meta["machine"], meta["seed"]) == (plant, "brokk170", 0)
-        assert [run["controller"] for run in written["runs"]] == ["rl", *names]
+        assert [run["controller"] for run in written["runs"]] == ["rl", "rl_dither", *names]
         assert {(run["sequence"], run["start"]) for run in written["runs"]} == {("up", 0)}
     assert run(f"evaluate {line} --perfect-model --json", out) == 0
     runs = json.loads(out.read_text())["runs"]
@@ -140,7 +140,7 @@ def test_shipped_policy__beats_the_papers_controllers(tmp_path):
     before = training["velocity_error_mean"]
     assert (training["command"], training["seed"]) == ("brokk-min reproduce --seed 0", 0)
     gains = json.loads(SHIPPED_GAINS.read_text())
-    assert {*gains["gains"], *POLICIES} == set(before)
+    assert {*gains["gains"], *POLICIES, "rl_dither"} == set(before)
     assert gains["meta"]["seed"] == 0
     up = "z,0,0,0,0.1\nz,2,0,0,-0.1\nz,4,0,0,0\nz,6,0,0,0\n"
     side = "y,0,0,0.1,0\ny,2,0,-0.1,0\ny,4,0,0,0\ny,6,0,0,0\n"

@@ -82,7 +82,7 @@ def test_styles__tell_controllers_apart_without_colour():
     for marks in (figures.MARKERS, figures.HATCHES):
         assert len({marks[name] for name in controllers}) == len(controllers) == 8
     dashes = {str(figures.STYLES[name].get("linestyle")) for name in ("goal", *controllers)}
-    assert len(dashes) == 10
+    assert len(dashes) == 9
 
 
 def test_plot_starts__draws_arms_from_the_side_and_from_above():
