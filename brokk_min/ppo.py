@@ -240,7 +240,7 @@ def collect(env: VectorEnv[Any, Any, Any], learner: Learner, config: PPOConfig) 
         learner.obs = torch.as_tensor(next_obs, dtype=torch.float32)
         last_obs = learner.obs.clone()
         if done.any():
-            last_obs[torch.as_tensor(done)] = torch.as_tensor(np.stack(info["final_obs"][done]))
+            last_obs[done] = torch.as_tensor(np.stack(info["final_obs"][done])).float()
         rewards = check_finite("reward", torch.as_tensor(reward), learner.global_step).float()
         flags = torch.as_tensor(terminated), torch.as_tensor(done)
         ticks.append((obs, action, mean, logprob, rewards, *flags, last_obs))

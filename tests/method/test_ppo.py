@@ -63,7 +63,7 @@ class Tape(VectorEnv):
         if done.any():
             info["final_obs"] = np.array([None] * self.num_envs, dtype=object)
             for i in np.flatnonzero(done):
-                info["final_obs"][i] = self.last_obs[t, i]
+                info["final_obs"][i] = self.last_obs[t, i].astype(float)
         obs = self.obs[t + 1].astype(float)
         return obs, self.rewards[t], self.terminated[t], self.truncated[t], info
 
