@@ -70,7 +70,7 @@ def simulate(machine: Machine, net: ActuatorNet, ticks: int) -> Ticks:
     names = ("q", "true_history", "v_goal", "error_integral")
     arrays = [np.stack([getattr(s, name) for s in states[12:]]) for name in names]
     u = np.array(commands[12:])
-    return Ticks(*arrays, u, np.ones_like(u), np.zeros(u.shape[:2], bool))
+    return Ticks(*arrays, u, np.ones_like(u[..., :1]), np.zeros(u.shape[:2], bool))
 
 
 def our_gradients(machine: Machine, net: ActuatorNet, ticks: Ticks, gamma: float) -> Array:

@@ -405,7 +405,7 @@ def gradient() -> Symptom:
     for what, end in (("", T), (", episode ends with tick 3", 3)):
         done = np.zeros((T, 1), bool)
         done[end - 1] = True
-        ticks = simulation_gradient.Ticks(*arrays, u, np.ones_like(u), done)
+        ticks = simulation_gradient.Ticks(*arrays, u, np.ones_like(u[..., :1]), done)
         config = TaskConfig(valve_cost=0.05, integral_cost=0.0)
         gradients = simulation_gradient.action_gradients(BROKK, net, ticks, gamma, config)
         gradients = gradients / simulation_gradient.compensation_derivative(BROKK, u)
