@@ -117,6 +117,16 @@ def test_plant_step__delays_commands_by_the_delay():
 # --- the plant's equations ------------------------------------------------------------------------
 
 
+def test_plant_step__holds_at_a_stop_and_lets_go():
+    for sign, stop in ((1, BROKK_170.column("q_max")), (-1, BROKK_170.column("q_min"))):
+        state, _, _ = record(BROKK_170, stop - sign * 0.02, np.full((60, 5), sign * 1.0))
+        np.testing.assert_array_equal(state.q, stop)
+        np.testing.assert_array_equal(state.v, 0.0)
+        for _ in range(40):
+            state = plant_step(BROKK_170, state, np.full(5, -sign * LIMIT))
+        assert np.all(sign * (stop - state.q) > 0.02)
+
+
 def slow_plant(machine: Machine, q: list[float], commands: np.ndarray) -> list[dict[str, float]]:
     """The equations read line by line: one joint, one 5 ms step, one number at a time."""
     m, dt = machine, machine.plant_dt
@@ -190,6 +200,21 @@ def test_lever_arm__is_the_derivative_of_the_cylinder_length(case):
 
 
 # --- histories ------------------------------------------------------------------------------------
+
+
+def test_lever_arm__of_q5_at_an_acute_angle():
+    # sides 0.6 and 0.2 under 60 degrees: third side sqrt(0.28)
+    arm = lever_arm(BROKK_170, np.full(5, np.pi / 3 - 0.4))
+    assert arm[Q5] == pytest.approx(0.19640, abs=1e-5)
+
+
+def test_plant_step__first_moves_at_eleven_counts():
+    """8.9 counts of dead zone; the next 1.2 open the spool by less than 1 %."""
+    for sign in (1, -1):
+        _, velocities, _ = record(BROKK_170, MIDDLE, np.full((100, 5), sign * 10 / 127))
+        assert not velocities.any()
+        _, velocities, _ = record(BROKK_170, MIDDLE, np.full((100, 5), sign * 11 / 127))
+        assert np.all(sign * velocities[-1] > 1e-4)
 
 
 def test_append_sample__and_append_command_by_hand():

@@ -17,6 +17,7 @@ from brokk_min.jacobian import (
     Gains,
     JacobianController,
     PIDState,
+    dls,
     limit_gradient,
     limit_weights,
     manipulability,
@@ -34,6 +35,16 @@ J = jacobian(forward_kinematics(BROKK_170, POSE))[:, DRIVEN]
 
 
 # --- least squares, limits, singularities ---------------------------------------------------------
+
+
+def test_dls__by_hand():
+    """Three joints, each along one axis: every axis is W^-1 j / (j^2 W^-1 + lambda^2) by itself."""
+    diagonal, W = np.diag([1.0, 2.0, 0.0]), np.array([1.0, 4.0, 9.0])
+    np.testing.assert_allclose(
+        dls(diagonal, W, 0.5), np.diag([1 / 1.5, 0.5 / 1.5, 0.0]), atol=1e-12
+    )
+    printed = dls(diagonal, W, 0.5, as_printed=True)  # j W^-1 / (j^2 W + lambda^2)
+    np.testing.assert_allclose(printed, np.diag([1 / 1.5, 0.5 / 16.5, 0.0]), atol=1e-12)
 
 
 @given(posed(shapes=[(3,)]))

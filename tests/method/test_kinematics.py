@@ -38,6 +38,22 @@ def test_jacobian__of_the_arm_stretched_out():
     np.testing.assert_allclose(J, expected, atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("bend", "lowest"),
+    [
+        ([0, 0, 0, 0, 0], 0.95),  # all flat
+        ([0, 0, 0, 0, -np.pi / 2], 0.95 - 1.2),  # tool down
+        ([0, 0, 0, -np.pi / 2, np.pi], 0.95 - 1.15),  # a V: its corner is lowest, not the tool
+        ([0, 0, -np.pi / 2, np.pi / 2, 0], 0.95 - 1.25),
+        ([0, -np.pi / 2, np.pi, 0, 0], 0.95 - 1.15),
+        ([0, np.pi / 2, 0, 0, 0], 0.95),  # upright: the pivot is lowest
+    ],
+)
+def test_lowest_point__by_hand(bend, lowest):
+    frames = forward_kinematics(BROKK_170, STRAIGHT + bend)
+    assert lowest_point(frames) == pytest.approx(lowest, abs=1e-12)
+
+
 def test_to_heading__by_hand():
     """The tool at 90 degrees: outward is y, sideways is -x. On the axis nothing turns."""
     v = np.array([1.0, 2.0, 3.0])

@@ -312,6 +312,12 @@ def test_encoders_report_the_nearest_count(machine_and_pose):
     assert read_encoder(machine, q.astype(np.float32)).dtype == np.float32
 
 
+def test_encoder_by_hand():
+    # 1 rad = 651.9 counts of 1.53398 mrad
+    q = read_encoder(BROKK_170, [1.0, -0.0007, -0.0008, 0.0, 0.0])
+    np.testing.assert_allclose(q, [652 * 2 * np.pi / 4096, 0, -0.00153398, 0, 0], rtol=1e-5)
+
+
 @given(
     st.integers(2, 8).flatmap(
         lambda samples: st.tuples(
@@ -330,6 +336,15 @@ def test_velocity_is_the_least_squares_slope_and_forgets_what_is_older(case):
     other[:, :4] = 1e6
     np.testing.assert_array_equal(estimate_velocity(other, samples, 0.05), velocity)
     assert estimate_velocity(q.astype(np.float32), samples, 0.05).dtype == np.float32
+
+
+def test_velocity_by_hand():
+    # newest of four samples moved one count: 1.5 / 5 counts a tick; two samples: one count a tick
+    step = BROKK_170.encoder_step[0]
+    q = np.array([0.0, 0.0, 0.0, step])
+    assert estimate_velocity(q, 4, 0.05) == pytest.approx(0.3 * step / 0.05)
+    assert estimate_velocity(q, 2, 0.05) == pytest.approx(0.0307, abs=1e-4)
+    assert estimate_velocity(q.astype(np.float32), 4, 0.05).dtype == np.float32
 
 
 @pytest.mark.parametrize(("samples", "length"), [(4, 3), (1, 5), (0, 5), (2, 1)])

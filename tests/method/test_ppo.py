@@ -1,5 +1,6 @@
 """PPO: formulas by hand and against torch, a training written once more, refusals, Pendulum."""
 
+import math
 from dataclasses import replace
 
 import gymnasium
@@ -119,6 +120,29 @@ def test_agent__has_the_nets_of_the_paper():
 
 
 # --- formulas -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("action", "mean", "log_std", "expected"),
+    [
+        ([1.0, 3.0], [1.0, 1.0], [0.0, 0.0], -2.0 - math.log(2 * math.pi)),
+        ([2.0], [1.0], [math.log(0.5)], -2.0 + math.log(2) - 0.5 * math.log(2 * math.pi)),
+    ],
+)
+def test_log_probability__by_hand(action, mean, log_std, expected):
+    tensors = (torch.tensor(numbers) for numbers in (action, mean, log_std))
+    assert float(ppo.log_probability(*tensors)) == pytest.approx(expected)
+
+
+def test_gae__by_hand():
+    """Three ticks, gamma = lambda = 0.5: one goes on, one is truncated, one terminates."""
+    rewards = torch.tensor([[1.0] * 3, [2.0] * 3, [4.0] * 3])
+    values = torch.tensor([[2.0] * 3, [1.0] * 3, [3.0] * 3])
+    next_values = torch.tensor([[1.0, 1.0, 1.0], [3.0, 6.0, 0.0], [2.0, 2.0, 2.0]])
+    dones = torch.tensor([[0.0, 0.0, 0.0], [0.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
+    # delta: -0.5; 2.5, 4, 1; 2.  A_t = delta_t + 0.25 (1 - done_t) A_{t+1}
+    expected = [[0.25, 0.5, -0.25], [3.0, 4.0, 1.0], [2.0, 2.0, 2.0]]
+    assert ppo.gae(rewards, values, next_values, dones, 0.5, 0.5).tolist() == expected
 
 
 @pytest.mark.parametrize(
