@@ -6,14 +6,15 @@ it: the term after whose change the log fits best is the one to look at first.
 """
 
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from functools import partial
 from itertools import combinations
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min.actuator import command_at_rest, initial_history
+from brokk_min.actuator import Valves, command_at_rest, initial_history
 from brokk_min.can import canopen
 from brokk_min.can.canopen import Frame
 from brokk_min.can.drive_log import TelemetryReader
@@ -91,6 +92,9 @@ def diagnose(machine: Machine, policy: Policy, ticks: Ticks) -> list[Term]:
         for name, change in command_changes(machine):
             error = command_error(machine, policy, ticks, history, change)
             terms.append(Term("commands", name, error, base))
+        for valves in get_args(Valves):
+            error = command_error(machine, replace(policy, valves=valves), ticks, history)
+            terms.append(Term("commands", f"valves at rest: {valves}", error, base))
     base = motion_error(machine, policy, ticks.u, ticks.q)
     for name, change in command_changes(machine):
         error = motion_error(machine, policy, change(ticks.u), ticks.q)
@@ -129,7 +133,7 @@ def expected_commands(machine: Machine, policy: Policy, ticks: Ticks, history: A
     u = action_to_pwm(machine, np.clip(action, -2, 2), policy.paper)
     rest = np.zeros((), np.int64)
     for t in range(len(u)):
-        rest = rest * ticks.driving[t]
+        rest = rest * (ticks.driving[t] and ticks.driving[max(t - 1, 0)])  # as `hw.Drive` restarts
         u[t], _, rest = command_at_rest(machine, policy.valves, u[t], v_goal[t], rest)
     return np.asarray(u)
 

@@ -144,15 +144,16 @@ def print_table(runs: list[dict[str, Any]], sequences: int, keys: Iterable[str])
 
 
 def print_answer(runs: list[dict[str, Any]]) -> None:
-    """By how much the policy is better than the paper's PID and than the best of each class."""
+    """By how much the policy is better than the paper's PID, and than the best of each class."""
     summary = metrics.summary([run for run in runs if run["kind"] == runs[0]["kind"]])
     error = {name: rows["all"]["velocity_error_mean"] or math.nan for name, rows in summary.items()}
     pids = sorted((name for name in error if "jacobian" in name), key=error.__getitem__)
     best = {name.endswith("_dither"): name for name in reversed(pids)}  # dither, or closed
     for name in dict.fromkeys(["jacobian_pid_k0.1", *best.values()]):
-        less = 1 - error["rl"] / error[name]
+        policy = "rl_dither" if name.endswith("_dither") else "rl"
+        less = 1 - error[policy] / error[name]
         side = "less" if less > 0 else "more"
-        print(f"rl has {abs(less):.0%} {side} error than {name}: {TITLES[name]}")
+        print(f"{policy} has {abs(less):.0%} {side} error than {name}: {TITLES[name]}")
     print("rl_paper: the paper's learner; _dither: valves stay open while the tool rests")
 
 

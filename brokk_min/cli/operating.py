@@ -93,6 +93,8 @@ class Drive(Command):
 
     def _controller(self, machine: Machine) -> Controller:
         if self.controller == "jog":
+            if self.valves:
+                raise WrongUse(f"--valves: expected none with --controller jog, got {self.valves}")
             driven = [machine.names[i] for i in machine.driven]
             joint = self.joint or driven[0]
             if joint not in driven:
@@ -171,11 +173,17 @@ class Diagnose(Command):
         print(f"{self.log}: {len(ticks.time)} ticks; error that is left if a term was so:")
         for term in terms[:5]:
             print(f"  {term.side}: {term.name} ({term.error / term.before:.0%})")
-        if not terms:
+        history = diagnosis.measured_history(machine, ticks)
+        error = diagnosis.command_error(machine, policy, ticks, history)
+        if error > diagnosis.COMMAND_ERROR and not any(t.side == "commands" for t in terms):
+            cause = "no term explains it: another policy, controller or --valves?"
+            print(f"  commands are off by {error:.1%} of full command, {cause}")
+        elif not terms:
             print("  commands and motion are as the policy and its nets have them")
         if self.json:
-            meta = {"log": str(self.log), "policy": str(self.policy)}
-            write_json(self.json, {"meta": meta, "terms": [term._asdict() for term in terms]})
+            meta = {"log": str(self.log), "policy": str(self.policy), "valves": policy.valves}
+            report = {"meta": meta, "command_error": error}
+            write_json(self.json, {**report, "terms": [term._asdict() for term in terms]})
         if self.figure:
             from brokk_min.evaluation import figures
 

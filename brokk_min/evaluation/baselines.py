@@ -22,7 +22,7 @@ from brokk_min.jacobian import Gains, JacobianController, manipulability_thresho
 from brokk_min.machine import Array, Machine
 
 PAPER_BASELINES = ("jacobian_pid_k0.1", "jacobian_pid_k0.05")
-STRONGEST = ("jacobian_pid_ff_integral", "jacobian_pid_ff_integral_dither")  # valves closed, or not
+STRONGEST = ("jacobian_pid_ff_integral", "jacobian_pid_ff_integral_dither")  # valves closed; dither
 TUNED = ("jacobian_pid_k0.1", "jacobian_pid_ff", *STRONGEST)  # each by itself
 # Stronger than the paper's: its claims are tested against these, too.
 STRONGER = ("jacobian_pid_ff", "jacobian_pid_ff_integral")

@@ -24,6 +24,7 @@ ZONES = np.arange(0, LARGEST_ZONE, 0.005)
 TAUS = (0.05, 0.1, 0.2, 0.4)  # s, assumed
 LATEST = 0.4  # s, assumed: longest delay
 SAMPLES = 20_000  # of a joint that are used
+MOVED = 0.2  # of the usual gain, assumed: a ramp with less ended within the dead zone
 SLOW = 0.12  # of full command in a second, assumed: ramps change by less
 LEVELS = 8  # of commands from 0 to the largest, by direction
 # What a log must have for its score to hold in other driving, all assumed.
@@ -107,15 +108,17 @@ def is_ramp(u: Array, rate: float) -> bool:
 
 
 def joint_model(recordings: list[Recording], j: int, rate: float) -> dict[str, Any]:
-    """Fields of `JointReport` by the model above; dead zones by slow ramps, if both moved it."""
+    """Fields of `JointReport` by the model above; dead zones by slow ramps that moved it."""
     ramps = [one for one in recordings if is_ramp(one.u[:, j], rate)]
     if not 0 < len(ramps) < len(recordings):
         return fit_model(recordings, j, rate)
-    by_ramps = fit_model(ramps, j, rate)
-    moved = by_ramps["gain_up"] * by_ramps["gain_down"] > 0
-    zones = [by_ramps["dead_zone_up"], by_ramps["dead_zone_down"]]
     others = [one for one in recordings if not is_ramp(one.u[:, j], rate)]
-    return fit_model(others, j, rate, zones if moved else None)
+    usual, by_ramps = fit_model(others, j, rate), fit_model(ramps, j, rate)
+    zones = []
+    for side in ("up", "down"):  # a ramp that ends within the dead zone has no gain
+        moved = by_ramps[f"gain_{side}"] / (usual[f"gain_{side}"] or np.inf) > MOVED
+        zones.append((by_ramps if moved else usual)[f"dead_zone_{side}"])
+    return fit_model(others, j, rate, zones)
 
 
 def fit_model(

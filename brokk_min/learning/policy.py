@@ -17,7 +17,7 @@ from brokk_min.identification.net_file import LARGEST_NET, net_arrays, net_from_
 from brokk_min.machine import Array, Machine
 
 FORMAT = 3  # of policy files
-# Files of `reproduce`: our policy with valves closed or open while the tool rests, and the paper's.
+# Files of `reproduce`: our policy and the paper's.
 POLICIES = {"rl": "policy.npz", "rl_paper": "policy_paper.npz"}
 
 
@@ -60,7 +60,7 @@ class Policy:
 class PolicyController:
     """A policy as an `evaluation.rollout.Controller`.
 
-    While the tool rests the rule of `actuator.command_at_rest` holds that it was trained with.
+    While the tool rests the rule of `actuator.command_at_rest` for its `valves` holds.
     """
 
     machine: Machine
@@ -88,8 +88,11 @@ def policy_controllers(
 
     Training with that rule brings 1 % (docs/log.md), so one policy serves both classes.
     """
-    both = {"rl": policies["rl"], "rl_dither": replace(policies["rl"], valves="dither")}
-    return {name: PolicyController(machine, one) for name, one in {**both, **policies}.items()}
+    rl = policies["rl"]
+    both = {"rl": replace(rl, valves="closed") if rl.valves == "dither" else rl}
+    both |= {"rl_dither": replace(rl, valves="dither")}
+    every = {**both, **{name: one for name, one in policies.items() if name != "rl"}}
+    return {name: PolicyController(machine, one) for name, one in every.items()}
 
 
 def contract(machine: Machine, paper: bool = False) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from helpers_bus import HoldingOperator, World
 from helpers_cli import run
 
 from brokk_min.actuator import initial_history, plant_reset, plant_step
-from brokk_min.can.diagnosis import Ticks, diagnose
+from brokk_min.can.diagnosis import COMMAND_ERROR, Ticks, diagnose
 from brokk_min.env import measure, update_history
 from brokk_min.evaluation.sequences import axis_sequences
 from brokk_min.identification.files import SHIPPED
@@ -113,18 +113,38 @@ class Reversed(PolicyController):
         return super().__call__(measured._replace(history=measured.history[..., ::-1]), ticks)
 
 
-def test_command__prints_terms_and_draws_them(tmp_path, capsys):
+def write_drive(log, controller):
+    """A log of 5 s on the simulated bus: a rest, up and forward, back."""
     operator = HoldingOperator()
-    log = tmp_path / "run.log"
     writer = can.CanutilsLogWriter(log, channel="can0")
-    world = World(Reversed(M, POLICY), operator, log=writer)
+    world = World(controller, operator, log=writer)
     world.drive.begin()
-    world.run(0.3)
+    operator.v = (0.0, 0.0, 0.0)
+    world.run(1.0)
     operator.v = (0.0, 0.15, 0.1)
     world.run(2.0)
     operator.v = (0.0, -0.15, -0.1)
-    world.run(2.5)
+    world.run(2.0)
     world.bus.close()
+
+
+def test_command__compares_with_the_valves_that_drove(tmp_path, capsys):
+    log = tmp_path / "run.log"
+    write_drive(log, PolicyController(M, DITHER))
+    command = f"diagnose '{log}' --policy '{SHIPPED / 'brokk170' / 'policy.npz'}'"
+    assert run(f"{command} --valves dither --json '{tmp_path}/d.json'") == 0
+    assert "commands and motion are as the policy" in capsys.readouterr().out
+    assert json.loads((tmp_path / "d.json").read_text())["command_error"] < COMMAND_ERROR
+    assert run(command) == 0
+    assert "commands: valves at rest: dither (" in capsys.readouterr().out.splitlines()[1]
+    write_drive(log, PolicyController(M, PAPER))
+    assert run(f"{command}") == 0
+    assert "another policy, controller or --valves?" in capsys.readouterr().out
+
+
+def test_command__prints_terms_and_draws_them(tmp_path, capsys):
+    log = tmp_path / "run.log"
+    write_drive(log, Reversed(M, POLICY))
     files = f"--figure '{tmp_path}/d.png' --json '{tmp_path}/d.json'"
     policy = SHIPPED / "brokk170" / "policy.npz"
     assert run(f"diagnose '{log}' --policy '{policy}' {files}") == 0

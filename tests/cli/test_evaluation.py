@@ -122,7 +122,7 @@ def test_evaluate__tunes_baselines_without_gains(folder, tmp_path, capsys, monke
 
 
 def test_print_answer__names_the_best_of_each_class(capsys):
-    errors = {"rl": 0.03, "jacobian_pid_k0.1": 0.04, "jacobian_pid_ff": 0.02}
+    errors = {"rl": 0.03, "rl_dither": 0.01, "jacobian_pid_k0.1": 0.04, "jacobian_pid_ff": 0.02}
     errors |= {"other_jacobian_dither": 0.06, "jacobian_pid_ff_integral_dither": 0.05}
     common = {"sequence": "x", "kind": "workspace", "start": 0}
     print_answer([common | {"controller": k, "velocity_error_mean": v} for k, v in errors.items()])
@@ -130,7 +130,7 @@ def test_print_answer__names_the_best_of_each_class(capsys):
     assert printed[0].startswith("rl has 25% less error than jacobian_pid_k0.1")
     assert {line.partition(": ")[0] for line in printed[1:3]} == {
         "rl has 50% more error than jacobian_pid_ff",
-        "rl has 40% less error than jacobian_pid_ff_integral_dither",
+        "rl_dither has 80% less error than jacobian_pid_ff_integral_dither",
     }
 
 

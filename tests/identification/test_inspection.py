@@ -118,6 +118,9 @@ def test_inspect__takes_dead_zones_from_slow_ramps_where_the_pump_bends_the_curv
     assert zones(usual, slow) == zones(slow) == pytest.approx(TRUE["boom"][:2], abs=0.01)
     within = starved("boom", ramps(0.1))  # nothing moved
     assert zones(usual, within) == zones(usual)
+    upwards = starved("boom", np.maximum(ramps(0.3), -0.05))  # down within the dead zone
+    assert zones(usual, upwards)[0] == pytest.approx(TRUE["boom"][0], abs=0.01)
+    assert zones(usual, upwards)[1] == zones(usual)[1]
 
 
 @pytest.mark.parametrize(
