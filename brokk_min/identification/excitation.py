@@ -19,8 +19,8 @@ from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, read_encod
 
 Indices = NDArray[np.intp]
 # Probabilities of the parts of rich excitation, assumed.
-MIX = {"sine": 0.17, "step": 0.1, "holds": 0.17, "start": 0.21, "dither": 0.35}
-BARELY_OPEN = 0.049  # of full command beyond the dead zone, assumed: largest dither
+MIX = {"sine": 0.17, "step": 0.1, "holds": 0.17, "start": 0.21, "barely open": 0.35}
+BARELY_OPEN = 0.049  # of full command beyond the dead zone, assumed: the largest of these levels
 MAX_SEGMENT = 30.0  # s, assumed: longest motion that is recorded in one piece
 MAX_RETURN = 300.0  # s, assumed: a longer return to the start is stopped
 RAMP = 7.5  # s, assumed: from 0 to the peak of a slow ramp
@@ -41,7 +41,7 @@ def sine_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Arra
 
 
 def rich_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Array:
-    """Sines over a wide band, steps, random holds, starts after pauses, and dither, (ticks,).
+    """Sines over a wide band, steps, random holds, starts after pauses and from barely open valves.
 
     Steps last up to 10 s, so that joints also reach their stops. Levels are drawn up to a third
     above the limit: after the cut a quarter of them is at the limit, as in a policy's commands.
@@ -61,7 +61,7 @@ def rich_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Arra
             hold = int(rng.integers(1, 8))
             part = np.repeat(rng.uniform(-limit, limit, length // hold + 1), hold)[:length]
         else:
-            part = _starts(rng, machine, length, limit, _pause if kind == "start" else _dither)
+            part = _starts(rng, machine, length, limit, _pause if kind == "start" else _barely_open)
         if kind in ("sine", "step", "holds") and rng.random() < 0.5:
             part = part + rng.uniform(0, 0.08) * rng.standard_normal(length)
         parts.append(part)
@@ -100,7 +100,7 @@ def _pause(rng: np.random.Generator, machine: Machine, noise: float) -> Array:
     return noise * rng.uniform(-1, 1, int(seconds / machine.dt))
 
 
-def _dither(rng: np.random.Generator, machine: Machine, _: float) -> Array:
+def _barely_open(rng: np.random.Generator, machine: Machine, _: float) -> Array:
     """A valve at its minimum opening, to one side or alternating."""
     ticks = int(rng.uniform(0.2, 2.0) / machine.dt)
     alternations = np.arange(ticks) // rng.choice([1, 2, 3, 4, 6, ticks])
