@@ -22,7 +22,7 @@ POLICY = load_policy(SHIPPED / "brokk170" / "policy.npz", M)
 DITHER = replace(POLICY, valves="dither")
 PAPER = load_policy(SHIPPED / "brokk170" / "policy_paper.npz", M)
 START = np.array([[0.0, 0.5, 0.58, 1.71, 1.24]])
-SECONDS = 8
+SECONDS = 14
 
 
 def drive(observe=lambda h: h, send=lambda u: u, read=lambda q: q, ticks_of_plant=1, policy=POLICY):

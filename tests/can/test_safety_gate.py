@@ -8,6 +8,7 @@ import pytest
 
 from brokk_min.can.canopen import checksum
 from brokk_min.can.safety_gate import (
+    Fault,
     GateInputs,
     GateState,
     expected_motion,
@@ -23,10 +24,16 @@ DRIVEN = np.array([joint.driven for joint in BROKK_170.joints])
 
 
 def test_fault_name__gives_node_and_text():
-    names = [fault_name(BROKK_170, code) for code in (0, 1, 25, 31, 36, 75, 85)]
-    assert names[:4] == ["", "error", "operator's device lost", "q1: never seen"]
-    assert names[4] == "valve controller: never seen"
-    assert names[5:] == ["q3: frozen, or the joint does not move", "stop asked for"]
+    names = [fault_name(BROKK_170, code) for code in range(len(Fault) * 6 + 1)]
+    assert names[0] == ""
+    assert names[1] == "error"
+    assert names[1 + 1 * 6] == "bus flooded"
+    assert names[1 + 4 * 6] == "operator's device lost"
+    assert names[1 + 5 * 6] == "q1: never seen"
+    assert names[1 + 5 * 6 + 5] == "valve controller: never seen"
+    assert names[1 + 12 * 6 + 2] == "q3: frozen, or the joint does not move"
+    assert names[1 + 13 * 6 + 4] == "q5: no valid command"
+    assert names[1 + 14 * 6] == "stop asked for"
 
 
 @pytest.mark.parametrize(

@@ -64,6 +64,20 @@ def test_fit__takes_a_foreign_log_and_beats_persistence_and_a_linear_model(tmp_p
     assert (tmp_path / "f.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_fit__has_the_papers_recipe_as_one_option(tmp_path):
+    foreign_log(tmp_path / "log.csv", 0, 2)
+    files = [tmp_path / "log.csv", "--out", tmp_path / "n.npz", "--json", tmp_path / "f.json"]
+    assert run("fit --steps 3 --paper", *files) == 0
+    settings = load_net(tmp_path / "n.npz").settings
+    assert (settings["noise"], settings["rollout"], settings["steps"]) == (0, 1, 3)
+    assert set(json.loads((tmp_path / "f.json").read_text())) == {
+        "meta",
+        "joints",
+        "tool",
+        "warnings",
+    }
+
+
 @pytest.mark.parametrize(
     ("joints", "options", "machine", "dead_zone"),
     [

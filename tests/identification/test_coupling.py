@@ -7,6 +7,16 @@ from brokk_min.identification import coupling
 from brokk_min.identification.logs import Log, Recording, join_recordings, velocity_of
 
 
+def test_explained__is_judged_on_the_rows_that_were_not_fitted():
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal((4000, 2))
+    noise = rng.standard_normal(4000)
+    y = x @ [1.0, 2.0]
+    assert coupling.explained(x, y) == pytest.approx(1.0)
+    assert coupling.explained(x, y + 5**0.5 * noise) == pytest.approx(0.5, abs=0.1)
+    assert coupling.explained(x, noise) < 0.05
+
+
 @pytest.mark.parametrize("late", [4, 9])
 def test_response_delays__of_a_pure_delay(late):
     rng = np.random.default_rng(1)

@@ -154,6 +154,14 @@ def test_read_log__has_the_requested_rate_and_refuses_slower_logs(tmp_path, rate
 # --- which recordings, which joints ---------------------------------------------------------------
 
 
+def test_velocity_of__is_causal_and_right_by_hand():
+    q = np.array([[0.0, 1.0], [0.1, 1.0], [0.3, 0.0]])
+    # two samples: plain differences at 20 Hz, at rest before the first
+    np.testing.assert_allclose(velocity_of(q, 2), [[0, 0], [2, 0], [4, -20]], atol=1e-12)
+    # three samples: slope (newest - oldest) / 2 ticks
+    np.testing.assert_allclose(velocity_of(q, 3), [[0, 0], [1, 0], [3, -10]], atol=1e-12)
+
+
 def test_read_log__drops_returns(tmp_path):
     time = np.arange(30) / 20
     returned = both(table("q1_00_return", time, 2), table("q1_01", time, 3))

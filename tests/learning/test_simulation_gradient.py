@@ -188,6 +188,19 @@ def test_action_gradients__include_the_cost_of_valve_travel(machine, seed):
     np.testing.assert_allclose(costly - free, expected, rtol=1e-3, atol=1e-5 * np.abs(free).max())
 
 
+def test_action_gradients__lose_little_by_a_constant_jacobian():
+    """What is left out, the turn of the arm within the horizon, on the machine of the paper."""
+    net, start, commands = moving_case(BROKK_170, 1)
+    ticks = ticks_of(simulate(BROKK_170, net, start, commands), commands)
+    gradient = action_gradients(BROKK_170, net, ticks, 0.9, costs())
+
+    def true_rewards(machine, states, _):
+        return rewards_of(machine, states, states)
+
+    difference = finite_differences(BROKK_170, net, start, commands, 0.9, true_rewards)
+    assert np.linalg.norm(gradient - difference) < 0.05 * np.linalg.norm(difference)
+
+
 def test_action_gradients__stop_at_the_end_of_an_episode():
     machine = BROKK_170
     net, start, commands = moving_case(machine, 2)

@@ -364,7 +364,7 @@ def test_latents__are_of_all_joints_by_hand():
     shifted = alone.weights[1] + np.einsum("l,jlh->jh", np.tanh(z[1]), net.weights[7])
     same = replace(alone, weights=(alone.weights[0], shifted, *alone.weights[2:]))
     np.testing.assert_allclose(
-        net.forward(history[1:2])[0], same.forward(history[1:2])[0], atol=1e-5
+        net.forward(history[1:2])[0], same.forward(history[1:2])[0], atol=1e-6
     )
 
 

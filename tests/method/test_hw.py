@@ -1,13 +1,13 @@
 """The 20 Hz loop against the plant, on a virtual bus with an injected clock."""
 
 import os
-import re
 import signal
 import subprocess
 import sys
 from itertools import pairwise
 from pathlib import Path
 
+import can
 import numpy as np
 import pytest
 from helpers_bus import (
@@ -97,9 +97,9 @@ def test_import__loads_no_library_that_is_not_needed(modules, heavy):
 @pytest.mark.parametrize(("axis", "name"), [(1, "rl"), (2, "jacobian"), (0, "rl_paper")])
 def test_run__earns_over_the_bus_the_reward_of_evaluate(axis, name):
     """Within 0.2 %, with 2 ms of bus and machine between SYNC and valve frame."""
-    goals = axis_sequences(BROKK_170)[axis].goals[:300]
+    sequence = axis_sequences(BROKK_170)[axis]
     controller = {"rl": policy, "rl_paper": paper_policy}.get(name, lambda: BASELINE)()
-    script = Script(BROKK_170, goals)
+    script = Script(BROKK_170, sequence.goals)
     world = World(controller, script)
 
     def operator(driving, ready):
@@ -110,14 +110,14 @@ def test_run__earns_over_the_bus_the_reward_of_evaluate(axis, name):
     world.drive.begin()
     world.drive.run()
     assert script.done
-    begins = np.array(world.syncs[-len(goals) - 1 :])
+    begins = np.array(world.syncs[-len(sequence.goals) - 1 :])
     times, _ = world.commands
     q = np.array([row[2] for row in world.record])[np.searchsorted(times, begins + 1e-9) - 1]
     v = tool_velocity(forward_kinematics(BROKK_170, q[1:]), np.diff(q, axis=0) * 20)
     noiseless, rng = TaskConfig(noise=0.0), np.random.default_rng(0)
-    trace = rollout(BROKK_170, controller, [START], goals[:, None], noiseless, rng)
-    assert reward(goals, v).mean() == pytest.approx(trace.reward.mean(), abs=0.002)
-    turned = np.diff(goals, axis=0, prepend=0).any(axis=1)
+    trace = rollout(BROKK_170, controller, [START], sequence.goals[:, None], noiseless, rng)
+    assert reward(sequence.goals, v).mean() == pytest.approx(trace.reward.mean(), abs=0.002)
+    turned = np.diff(sequence.goals, axis=0, prepend=0).any(axis=1)
     half_second = np.convolve(turned, np.ones(10))[: len(turned)] > 0
     assert trace.reward[half_second].mean() < 0.99  # there was something to lose
 
@@ -183,8 +183,7 @@ def test_tick__does_not_arm_while_the_stick_is_not_centred(controller, operator)
 # --- faults --------------------------------------------------------------------------------------
 
 
-# Of the joints the first, the locked and the last: the gate's own test has all.
-@pytest.mark.parametrize("name", [name for name in FAULTS if not re.match("q[34]", name)])
+@pytest.mark.parametrize("name", FAULTS)
 def test_tick__ends_neutral_and_latched_within_175_ms_of_every_fault(name):
     """By the plant's own record, whenever in a tick it comes, though the operator holds on.
 
@@ -216,7 +215,8 @@ def closes_within(world, begun, seconds):
 
 
 @pytest.mark.parametrize(
-    ("node", "counts", "bound"), [(1, 80, 0.175), (4, -40, 0.175), (5, 20, 0.45), (3, 16, 0.85)]
+    ("node", "counts", "bound"),
+    [(1, 80, 0.175), (3, 40, 0.175), (4, -40, 0.175), (5, 20, 0.45), (1, 16, 0.85), (3, 16, 0.85)],
 )
 def test_tick__finds_a_frozen_encoder_at_small_commands_too(
     node, counts, bound, world, controller, operator
@@ -242,9 +242,22 @@ def test_tick__takes_nothing_for_frozen_that_is_not(world, controller):
             controller.m = rng.choice([-80.0, -40, -20, 0, 0, 20, 40, 80], 5) * (np.arange(5) != 1)
 
     controller.act = change
-    world.run(15.0)
+    world.run(30.0)
     assert world.drive.reason == "" and world.drive.gate.driving
     assert np.abs(np.diff(world.commands[1], axis=0)).sum() > 1000
+
+
+def test_watchdog__closes_the_valves_of_a_program_that_is_killed(world):
+    """SIGKILL: no more ticks; a resumed frame does not open the valves again."""
+    world.run(1.2)
+    killed = world.t
+    assert world.commands[1][-1].any()
+    world.sleep(1.0)
+    counter = int(world.drive.gate.counter) + 1
+    data = valve_frame(COMMAND, counter, 1).tobytes()
+    world.send(can.Message(arbitration_id=0x210, data=data))
+    world.sleep(0.1)
+    assert closes_within(world, killed, 0.155)
 
 
 def test_tick__opens_no_valve_again_on_frames_of_any_identifier_and_length(
@@ -253,8 +266,8 @@ def test_tick__opens_no_valve_again_on_frames_of_any_identifier_and_length(
     world.run(1.2)
     begun = world.t
     assert world.commands[1][-1].any()
-    seen, pairs = flood(Fault(world, operator, controller), rate=10_000)
-    world.run(1.9)
+    seen, pairs = flood(Fault(world, operator, controller))
+    world.run(9.3)
     assert len(seen) == pairs == 2048 * 9
     assert closes_within(world, begun, 0.175)
 
@@ -276,7 +289,10 @@ def test_tick__leaves_a_fault_by_a_new_edge_only(world, operator):
     assert world.commands[1][-1].tolist() == list(COMMAND)
 
 
-@pytest.mark.parametrize(("low", "high", "found"), [(15, 15, 0), (25, 25, 1), (0, 60, 1)])
+@pytest.mark.parametrize(
+    ("low", "high", "found"),
+    [(5, 5, 0), (15, 15, 0), (25, 25, 1), (45, 45, 1), (0, 15, 0), (0, 60, 1)],
+)
 def test_tick__finds_positions_later_than_20_ms(low, high, found, world, controller, operator):
     """Constantly, or by chance between two bounds [ms]."""
     rng = np.random.default_rng(0)
@@ -286,6 +302,26 @@ def test_tick__finds_positions_later_than_20_ms(low, high, found, world, control
     world.run(1.0)
     assert world.drive.reason == found * "fault: q3: silent"
     assert closes_within(world, begun, 0.175) == bool(found)
+
+
+def test_tick__finds_a_delay_of_a_whole_tick_only_when_it_begins(world, operator):
+    """A position has neither time nor number: the limit of what can be found, see docs."""
+    held = []
+
+    def hold(data):
+        held.append(data)
+        return held[-2:-1]
+
+    world.run(0.8)
+    begun = world.t
+    world.upward = only(0x183, hold)
+    world.run(0.3)
+    assert world.drive.reason == "fault: q3: silent" and closes_within(world, begun, 0.175)
+    operator.enable = False
+    world.run(0.1)
+    operator.enable = None
+    world.run(0.2)
+    assert world.drive.gate.driving
 
 
 def test_tick__starts_nodes_that_fell_back_once_the_switch_is_released(world, operator):

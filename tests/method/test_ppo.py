@@ -255,6 +255,20 @@ def test_collect__records_what_happened():
 
 
 @pytest.mark.parametrize(
+    ("step", "lr", "log_std"),
+    [(0, 1e-3, -1.0), (24, 7.5e-4, -1.5), (96, 0.0, -3.0), (120, 0, -3.5)],
+)
+def test_anneal__is_linear_in_the_steps(step, lr, log_std):
+    config = replace(SMALL, log_std=-1.0, log_std_end=-3.0)
+    learner = ppo.make_learner(Tape(), config, 0, critic=False)
+    learner.global_step = step
+    learner.learning_rate = 1e-3
+    ppo.anneal(learner, config)
+    assert learner.optimizer.param_groups[0]["lr"] == pytest.approx(lr)
+    assert learner.agent.log_std.tolist() == pytest.approx([log_std] * 3)
+
+
+@pytest.mark.parametrize(
     ("kl", "before", "after"),
     [
         (0.16, 1.2e-3, 1e-3),

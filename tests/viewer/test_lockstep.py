@@ -5,11 +5,13 @@ from multiprocessing import Pipe
 
 import numpy as np
 import pytest
-from helpers_bus import START, ConstantCommand
+from helpers_bus import BASELINE, START, ConstantCommand
 
+from brokk_min.actuator import plant_reset, plant_step
+from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer.control_process import Request, receive_telemetry, send_request
-from brokk_min.viewer.lockstep import Lockstep
+from brokk_min.viewer.lockstep import Comparison, Lockstep, follow
 
 NEUTRAL = Request(0.0, 0, False, True, np.zeros(3), np.zeros(4))
 
@@ -50,3 +52,31 @@ def test_advance__gives_the_same_motion_however_slow_the_window_is():
         np.testing.assert_array_equal(a.u, b.u)
         np.testing.assert_array_equal(a.q, b.q)
     assert quick[-1].q[0] > START[0] + 0.2
+
+
+def test_follow__moves_the_plant_as_the_commands_of_the_loop_do():
+    """A constant command, through bus and gate: the plant's own steps give the same angles."""
+    goals = np.tile([0.1, 0.0, 0.0], (40, 1))
+    q = np.array(list(follow(BROKK_170, ConstantCommand(30, 0, 0, 0, 0), START, goals)))
+    moving = np.flatnonzero(q[:, 0] > START[0])
+    plant = plant_reset(BROKK_170, np.array(START))
+    alone = []
+    for _ in range(30):
+        plant = plant_step(BROKK_170, plant, np.array([30, 0, 0, 0, 0]) / 127)
+        alone.append(plant.q[0])
+    first = np.flatnonzero(np.array(alone) > START[0])[0]
+    np.testing.assert_allclose(
+        q[moving[0] + 2 : moving[0] + 20, 0], alone[first + 2 : first + 20], atol=0.01
+    )
+
+
+def test_comparison__stands_still_at_the_end_of_the_line():
+    p = tool_position(forward_kinematics(BROKK_170, np.array(START)))
+    line = p + np.array([[0.0, 0, 0], [0, 0.15, 0]])
+    comparison = Comparison(BROKK_170, {"jacobian": BASELINE}, np.array(START), line)
+    for _ in range(90):
+        comparison.update()
+    trace = np.array(comparison.traces["jacobian"])
+    assert len(trace) == 90
+    np.testing.assert_allclose(trace[-1], line[-1], atol=0.05)
+    np.testing.assert_array_equal(trace[-1], trace[-10])
