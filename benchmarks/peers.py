@@ -281,9 +281,8 @@ def machine_error(controller: Controller, runs: int) -> float:
 
 def levels(shipped: Policy, options: Options) -> dict[str, float]:
     """Errors to reach [m/s]."""
-    pid = machine_error(
-        read_gains(options.gains, M, shipped.net)["jacobian_pid_k0.1"], options.runs
-    )
+    gains = read_gains(options.gains, M, shipped.net)
+    pid = machine_error(gains["jacobian_pid_k0.1"], options.runs)
     error = machine_error(PolicyController(M, shipped), options.runs)
     return {"PID": pid, "half of the PID": pid / 2, "shipped policy": error}
 
