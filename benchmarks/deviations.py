@@ -79,7 +79,7 @@ def d3() -> Figures:
     ramp = 0.1 * M.dt * np.arange(4000) + 1e-4
     q = machine.read_encoder(M, np.tile(ramp, (M.n, 1)).T)[:, 0]
     ends = range(4, len(q) + 1)
-    slopes = [machine.estimate_velocity(q[:end], M.velocity_samples, M.dt) for end in ends]
+    slopes = [kinematics.estimate_velocity(q[:end], M.velocity_samples, M.dt) for end in ends]
     return {"one tick": np.std(np.diff(q) * M.rate), "4 samples": np.std(slopes)}
 
 

@@ -22,9 +22,10 @@ from brokk_min import actuator, env, ppo
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import Bools, Measured, TaskConfig, action_to_pwm, features
 from brokk_min.evaluation import metrics, sequences
-from brokk_min.evaluation.reproduce import Budget, fit_net, side_by_side
+from brokk_min.evaluation.learn import Budget, fit_net, side_by_side
 from brokk_min.identification import logs
 from brokk_min.identification.fitting import PAPER_RECIPE
+from brokk_min.identification.muon import Muon
 from brokk_min.identification.net_file import load_net, select_nets
 from brokk_min.learning.checkpoint import export_policy, stagger_episodes
 from brokk_min.learning.episodes import GRADIENT_LEARNER, PAPER_TASK, get_obs, new_goals, reset
@@ -43,6 +44,7 @@ STEPS = {
     "costs": "costs of valve travel and error integral",
     "episodes": "starts, ends, goals; valves closed at rest",
     "gradients": "gradients of the simulation, not a critic",
+    "muon": "Muon, not Adam; twice the cost of valve travel",
 }
 RUNGS = {"the paper's learner": frozenset[str]()}
 RUNGS |= {f"alone: {text}": frozenset([name]) for name, text in STEPS.items()}
@@ -53,9 +55,10 @@ RUNGS |= {
 }
 NETS: dict[frozenset[str], tuple[str, str, dict[str, Any]]] = {  # steps -> file, log, recipe
     frozenset(): ("net_paper", "log_paper", PAPER_RECIPE),
-    frozenset(["fit"]): ("net_plain", "log", {"dead_zone": 0.0}),
+    frozenset(["fit"]): ("net_plain", "log", {"dead_zone": 0.0, "muon": 0.0}),
     frozenset(["mu_law"]): ("net_mu_law", "log_paper", PAPER_RECIPE | {"dead_zone": M.dead_zone}),
-    frozenset(["fit", "mu_law"]): ("net", "log", {}),
+    frozenset(["fit", "mu_law"]): ("net_adam", "log", {"muon": 0.0}),
+    frozenset(["fit", "mu_law", "muon"]): ("net_muon", "log", {}),
 }
 PAPER = TaskConfig(paper=True, **PAPER_TASK)
 GROUNDLESS = replace(M, ground=-1e9)
@@ -64,7 +67,9 @@ GROUNDLESS = replace(M, ground=-1e9)
 def task_of(steps: frozenset[str]) -> TaskConfig:
     """Costs and valves of our task, each only if the step is taken."""
     task = TaskConfig(valves="closed" if "episodes" in steps else "open")
-    return task if "costs" in steps else replace(task, valve_cost=0.0, integral_cost=0.0)
+    if "costs" not in steps:
+        return replace(task, valve_cost=0.0, integral_cost=0.0)
+    return task if "muon" in steps else replace(task, valve_cost=task.valve_cost / 2)
 
 
 def our_action(action: Array) -> Array:
@@ -130,7 +135,8 @@ class MixedController:
 
 def nets_of(folder: Path, steps: frozenset[str]) -> ActuatorNet:
     """Nets of the driven joints, from the folder or fitted to its log."""
-    name, log, recipe = NETS[steps & {"fit", "mu_law"}]
+    key = steps & {"fit", "mu_law", "muon"}
+    name, log, recipe = NETS[key if key in NETS else key - {"muon"}]
     file = folder / f"{name}.npz"
     if not file.exists():
         recorded = logs.read_log([folder / f"{log}.npz"], M.velocity_samples, rate=M.rate)
@@ -145,6 +151,8 @@ def train(net: ActuatorNet, steps: frozenset[str], total_steps: int, seed: int) 
     config = ppo.PPOConfig(**settings)
     task_env = MixedEnv(net, steps)
     learner = ppo.make_learner(task_env, config, seed, critic=not gradients)
+    if "muon" in steps:
+        learner.optimizer = Muon(learner.agent.parameters(), config.learning_rate)
     stagger_episodes(task_env)
     estimate, loss = None, ppo.ppo_loss
     if gradients:

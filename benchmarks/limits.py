@@ -15,6 +15,7 @@ import time
 import timeit
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ import tyro
 
 from benchmarks import write
 from brokk_min import ppo
+from brokk_min.identification.muon import Muon
 from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.learning.episodes import GRADIENT_LEARNER
 from brokk_min.learning.simulation_gradient import regression_loss
@@ -60,10 +62,12 @@ def shapes(widths: tuple[int, ...], batch: int) -> list[tuple[int, int, int]]:
     return result
 
 
-def gradient(loss_function: ppo.Loss, batch: int, options: Options) -> dict[str, Any]:
-    """One minibatch of `ppo.train`: loss, gradient, step of Adam."""
+def gradient(
+    loss_function: ppo.Loss, batch: int, optimize: Callable[..., torch.optim.Adam], options: Options
+) -> dict[str, Any]:
+    """One minibatch of `ppo.train`: loss, gradient, step. Work: the products of the gradient."""
     agent = ppo.Agent(171, 4, -1.8, critic=False)
-    optimizer = torch.optim.Adam(agent.parameters(), fused=True)
+    optimizer = optimize(agent.parameters(), 1e-3)
     mb = {"obs": torch.randn(batch, 171), "actions": torch.randn(batch, 4)}
     mb |= {"logprobs": torch.zeros(batch), "advantages": torch.randn(batch)}
     mb |= {"means": torch.randn(batch, 4), "targets": torch.randn(batch, 4)}
@@ -129,10 +133,11 @@ def main(options: Options) -> dict[str, Any]:
     torch.set_num_threads(1)
     torch.set_float32_matmul_precision("medium")  # as `ppo.make_learner`
     ours = GRADIENT_LEARNER["minibatch_size"]
+    adam = partial(torch.optim.Adam, fused=True)  # as `ppo.make_learner`
     result = {
         "load": os.getloadavg(),
-        "gradient": gradient(ppo.ppo_loss, ppo.PPOConfig.minibatch_size, options),
-        "regression": gradient(regression_loss, ours, options),
+        "gradient": gradient(ppo.ppo_loss, ppo.PPOConfig.minibatch_size, adam, options),
+        "regression": gradient(regression_loss, ours, Muon, options),
         "kinematics": kinematics(options),
     }
     write(result, options.json)

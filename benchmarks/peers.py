@@ -43,7 +43,7 @@ from brokk_min.learning.checkpoint import export_policy, stagger_episodes
 from brokk_min.learning.episodes import GRADIENT_LEARNER
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import Policy, PolicyController, load_policy
-from brokk_min.learning.simulation_gradient import improved_actions, regression_loss
+from brokk_min.learning.simulation_gradient import improved_actions, make_learner, regression_loss
 from brokk_min.machine import BROKK_170 as M
 
 C = ppo.PPOConfig  # its gamma, GAE lambda, clip, window and first deviation are the peers', too
@@ -79,7 +79,9 @@ def ours(
     options = {"learning_rate": rate, "total_steps": steps, "num_envs": env.num_envs}
     config = ppo.PPOConfig(**{**settings, **options})
     assert env.net is not None
-    learner = ppo.make_learner(env, config, seed, critic)
+    learner = (
+        ppo.make_learner(env, config, seed, True) if critic else make_learner(env, config, seed)
+    )
     stagger_episodes(env)
     estimate = None if critic else improved_actions(M, env.net, env.config)
     loss = ppo.ppo_loss if critic else regression_loss
@@ -256,7 +258,7 @@ LEARNERS = {"ours": ours, "critic": partial(ours, critic=True)}
 LEARNERS |= {"sb3": sb3, "cleanrl": cleanrl, "rl_games": rl_games}
 NAMES = {"ours": "ours: gradients of the simulation", "critic": "ours, `train --critic`: GAE"}
 NAMES |= {"sb3": "Stable-Baselines3 PPO", "cleanrl": "CleanRL's loop", "rl_games": "rl_games PPO"}
-LENGTHS = (131_072, 524_288, 1_048_576, 3_000_000)  # ours; a policy is regressed in few steps
+LENGTHS = (65_536, 262_144, 1_048_576, 2_000_000)  # ours; a policy is regressed in few steps
 SETTINGS: dict[str, list[Setting]] = {
     name: [(rate, steps) for rate in (6e-4, 1.5e-3) for steps in (300_000, 800_000)]
     for name in LEARNERS

@@ -5,8 +5,9 @@
 Each seed records, fits and trains as `brokk-min reproduce` does, on one thread; as many seeds run
 at once as there are cores. What the folder holds already is not made again. Policies and the
 package's tuned baselines are then scored on the sequences and starts of `evaluate`; the paper's
-also with valves that close while the tool rests, as the PIDs' do, ours also with dither then. All
-figures go to `seeds.json` in the folder, the learning curve of ours to `seeds.svg`.
+also with valves that close while the tool rests, as the PIDs' do, ours also with dither then. PIDs
+with feed-forward have it from the nets of each seed. All figures go to `seeds.json` in the folder,
+the learning curve of ours to `seeds.svg`.
 """
 
 from dataclasses import dataclass, replace
@@ -18,8 +19,9 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from brokk_min.evaluation import metrics, reproduce, sequences
+from brokk_min.evaluation import learn, metrics, sequences
 from brokk_min.evaluation.baselines import read_gains
+from brokk_min.evaluation.feedforward import static_map
 from brokk_min.identification import excitation, fitting, logs
 from brokk_min.identification.files import SHIPPED, write_json
 from brokk_min.identification.formats import read_table
@@ -53,7 +55,7 @@ class Options:
 
 def make(options: Options, name: str, seed: int) -> None:
     """The policy `name` of one seed, and before it the nets, unless the folder has them."""
-    budget = reproduce.QUICK if options.quick else reproduce.Budget()
+    budget = learn.QUICK if options.quick else learn.Budget()
     out = options.folder / f"seed_{seed}"
     out.mkdir(parents=True, exist_ok=True)
     nets, kind, recipe = RECIPES[name]
@@ -62,10 +64,13 @@ def make(options: Options, name: str, seed: int) -> None:
         log = excitation.collect(M, budget.hours, kind, np.random.default_rng(seed))
         logs.write_log(log_file, log)
         log = logs.read_log([log_file], M.velocity_samples, rate=M.rate)
-        reproduce.fit_net(M, out / f"{nets}.npz", log, budget, recipe, seed)
+        if name == "rl":
+            log, _ = learn.first_round(M, out / "first", log, budget, seed, recipe)
+        learn.fit_net(M, out / f"{nets}.npz", log, budget, recipe, seed)
     if not (out / POLICIES[name]).exists():
         net = select_nets(M, load_net(out / f"{nets}.npz", M))
-        reproduce.train(M, out, name, net, budget, seed)
+        start = load_policy(out / "first" / POLICIES[name], M) if name == "rl" else None
+        learn.train(M, out, name, net, budget, seed, start)
 
 
 def score(options: Options) -> list[dict[str, Any]]:
@@ -88,7 +93,12 @@ def score(options: Options) -> list[dict[str, Any]]:
     controllers: dict[Any, Any] = {k: PolicyController(M, p) for k, p in policies.items()}
     shipped = SHIPPED / M.name
     gains = read_gains(shipped / "gains.json", M, load_policy(shipped / "policy.npz", M).net)
-    controllers |= {(name, None): pid for name, pid in gains.items()}
+    controllers |= {(name, None): pid for name, pid in gains.items() if not pid.feedforward}
+    for seed in (seed for name, seed in policies if name == "rl"):
+        feedforward = static_map(M, policies["rl", seed].net).command
+        for name, pid in gains.items():
+            if pid.feedforward:
+                controllers[name, seed] = replace(pid, feedforward=feedforward)
     rows = []
     for (name, seed), controller in controllers.items():
         runs, _ = metrics.evaluate(M, {name: controller}, commands, starts[workspace], 0)
@@ -105,17 +115,24 @@ def mean(runs: list[dict[str, Any]], figure: str) -> float:
 
 
 def draw(options: Options) -> None:
-    """Velocity error on the nets while ours learn: mean of the seeds, least and largest."""
-    files = sorted(options.folder.glob(f"seed_*/{POLICIES['rl']}.csv"))
-    if not files:
+    """Velocity error on the nets while ours learn, in both rounds: mean and range of the seeds."""
+    folders = sorted(options.folder.glob("seed_*"))
+    rounds = [
+        [folder / part / f"{POLICIES['rl']}.csv" for folder in folders] for part in ("first", ".")
+    ]
+    if not rounds[1] or not all(file.exists() for file in rounds[1]):
         return
-    tables = [read_table(f, ["global_step", "charts/velocity_error"]) for f in files]
-    million_steps = tables[0]["global_step"] / 1e6
-    errors = np.array([table["charts/velocity_error"] for table in tables])
     figure = Figure(figsize=(7.0, 2.4), layout="compressed")
     axes = figure.subplots()
-    axes.plot(million_steps, errors.mean(axis=0), color="black", label=f"ours, {len(files)} seeds")
-    axes.fill_between(million_steps, errors.min(axis=0), errors.max(axis=0), alpha=0.3)
+    begin, label = 0.0, f"ours, {len(folders)} seeds"
+    for files in rounds:
+        tables = [read_table(f, ["global_step", "charts/velocity_error"]) for f in files]
+        million_steps = begin + tables[0]["global_step"] / 1e6
+        errors = np.array([table["charts/velocity_error"] for table in tables])
+        axes.plot(million_steps, errors.mean(axis=0), color="black", label=label)
+        axes.fill_between(million_steps, errors.min(axis=0), errors.max(axis=0), alpha=0.3)
+        begin, label = million_steps[-1], ""
+        axes.axvline(begin, color="grey", linestyle=":")
     axes.set(xlabel="environment steps [million]", ylabel="velocity error [m/s]", yscale="log")
     axes.legend()
     figure.savefig(options.folder / "seeds.svg", metadata={"Date": None})
@@ -125,7 +142,7 @@ def main(options: Options) -> None:
     """Make what is missing, score all and print means, and the largest less the smallest."""
     for name in options.policies:
         jobs = {str(seed): partial(make, options, name, seed) for seed in range(options.seeds)}
-        reproduce.side_by_side(jobs, {})
+        learn.side_by_side(jobs, {})
     rows = score(options)
     write_json(options.folder / "seeds.json", rows)
     draw(options)

@@ -144,6 +144,7 @@ def ratios(folder: Path, seed: int, options: list[str]) -> dict[str, list[float]
             for j in JOINTS
         ]
         for horizon in ("1", "5", "10")
+        if all(horizon in joints[j]["free_run"] for j in JOINTS)  # some recordings are short
     }
 
 

@@ -13,10 +13,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brokk_min.machine import Array, Machine, estimate_velocity, limit_command, valve_opening
+from brokk_min.kinematics import estimate_velocity
+from brokk_min.machine import Array, Machine, limit_command, valve_command, valve_opening
 
 REST_AFTER = {"closed": 0.5, "dither": 0.1, "open": math.inf}  # s of a zero goal, assumed, tuned
-DITHER = 0.03  # opening of valves that alternate at rest, tuned: 0.02 is too little
 STANDSTILL = 0.002  # rad or m, assumed: little more than one step of a 12-bit encoder
 Valves = Literal["closed", "dither", "open"]  # what they do while the tool rests
 MU = 50.0  # assumed: the mu law is about linear below 1/50 of full opening
@@ -70,7 +70,7 @@ def plant_step(machine: Machine, state: PlantState, u: ArrayLike) -> PlantState:
     steps = round(machine.dt / machine.plant_dt)
     held = np.repeat(np.asarray(u, float)[..., None], steps, axis=-1)
     commands = np.concatenate([state.delayed, held], axis=-1)  # what the valve gets, step by step
-    openings = valve_opening(commands, machine.dead_zone)
+    openings = valve_opening(commands, machine.dead_zones[:, None])
     for i in range(steps):
         state = _euler_step(machine, state, openings[..., i])
     return state._replace(delayed=commands[..., steps:])
@@ -134,7 +134,7 @@ def command_at_rest(
     """Commands u (..., n), but those of the rule for `valves` after `REST_AFTER` of a zero goal.
 
     "closed": zero. The joints stand, but the next motion begins 0.3 s later. "dither": driven
-    valves open by `DITHER`, each tick the other way; the joints stand, the valves stay open
+    valves open by `dither`, each tick the other way; the joints stand, the valves stay open
     (Merritt 1967). "open": no rule (the paper). `ticks` (...) of a zero goal (..., 3) are those
     before this one. Also: does the rule hold, (..., 1), and the ticks with this one.
     """
@@ -142,8 +142,8 @@ def command_at_rest(
     resting = (ticks > REST_AFTER[valves] * machine.rate)[..., None]
     rule = np.zeros_like(u)
     if valves == "dither":
-        size = machine.dead_zone + (1 - machine.dead_zone) * DITHER
-        rule[..., machine.driven] = (-1.0) ** ticks[..., None] * size
+        opening = (-1.0) ** ticks[..., None] * machine.dither
+        rule[..., machine.driven] = valve_command(opening, machine.dead_zones[machine.driven])
     return np.where(resting, limit_command(machine, rule), u), resting, ticks
 
 

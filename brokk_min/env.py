@@ -58,7 +58,7 @@ class TaskConfig:
     zero_goals: float = machine.number("1", 0, 1, 0.15)  # Fraction of goals of zero velocity.
     axis_goals: float = machine.number("1", 0, 1, 0.4)  # Fraction along x, y or z; others anywhere.
     noise: float = machine.number("1", 0, 1000, 0.05)  # Of sensors, in deviations (paper: 5 %).
-    valve_cost: float = machine.number("1", 0, 1000, 0.05)  # Of a full change of all (paper: 0).
+    valve_cost: float = machine.number("1", 0, 1000, 0.1)  # Of a full change of all (paper: 0).
     integral_cost: float = machine.number("1/m", 0, 1000, 1.0)  # Of the error integral (paper: 0).
     valves: actuator.Valves = "closed"  # While the tool rests: `actuator.command_at_rest`.
     redraw_ground: bool = True  # Redraw start poses in the ground; the paper ends the episode.

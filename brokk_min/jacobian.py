@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brokk_min.actuator import command_at_rest
 from brokk_min.kinematics import forward_kinematics, jacobian
-from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, valve_opening
+from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, valve_command, valve_opening
 
 if TYPE_CHECKING:
     from brokk_min.env import Measured
@@ -189,9 +189,9 @@ class JacobianController:
         opening = gains.kp * error + state.integral + gains.kd * derivative  # PID
         if self.feedforward is not None:
             u = self.feedforward(q[..., m.driven], q_dot_goal)
-            opening = opening + valve_opening(u, m.dead_zone)
-        limit = valve_opening(m.pwm_limit / PWM_MAX, m.dead_zone)
-        saturated = (np.abs(opening) >= limit) & (np.sign(opening) == np.sign(error))
+            opening = opening + valve_opening(u, m.dead_zones[m.driven])
+        limit = valve_opening(np.sign(opening) * m.pwm_limit / PWM_MAX, m.dead_zones[m.driven])
+        saturated = (np.abs(opening) >= np.abs(limit)) & (np.sign(opening) == np.sign(error))
         u = self._open_valves(opening, measured.v_goal)
         rest = measured.v_goal, state.rest_ticks
         u, resting, ticks = command_at_rest(m, self.valves, u, *rest)
@@ -205,7 +205,7 @@ class JacobianController:
         least = (moving | (self.valves != "closed")) * self.gains.min_opening
         size = np.maximum(np.abs(opening), least)
         closed = size < 0.5 / PWM_MAX  # below half a count
-        size = np.where(closed, 0.0, m.dead_zone + (1 - m.dead_zone) * size)
+        opening = np.where(closed, 0.0, np.sign(opening) * size)
         u = np.zeros((*opening.shape[:-1], m.n))
-        u[..., m.driven] = np.sign(opening) * size
+        u[..., m.driven] = valve_command(opening, m.dead_zones[m.driven])
         return limit_command(m, u)

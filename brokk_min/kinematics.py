@@ -126,3 +126,17 @@ def to_heading(p: Array, v: Array) -> Array:
     c = p[..., 0] / radius
     s = p[..., 1] / radius
     return np.stack([c * v[..., 0] + s * v[..., 1], c * v[..., 1] - s * v[..., 0], v[..., 2]], -1)
+
+
+def estimate_velocity(q: ArrayLike, samples: int, dt: float) -> Array:
+    """Causal velocity [rad/s] (...): slope of the line through the newest angles of `q` (..., T).
+
+    The one estimator of the package. A difference over one tick of a 12-bit encoder comes in steps
+    of 0.031 rad/s at 20 Hz; four samples have a third of its noise and are 1.5 ticks late.
+    """
+    q = as_floats(q)
+    if samples < 2 or q.shape[-1] < samples:
+        raise ValueError(f"q: expected at least {max(2, samples)} samples, got {q.shape}")
+    t = dt * (np.arange(samples) - (samples - 1) / 2)
+    weights = (t / (t @ t)).astype(q.dtype)  # slope = sum t_i q_i / sum t_i^2
+    return np.asarray(np.einsum("...t,t", q[..., -samples:], weights))

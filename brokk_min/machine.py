@@ -56,6 +56,8 @@ class Joint:
     kind: Literal["revolute", "prismatic"] = "revolute"
     encoder_step: float = number("m a count", 1e-9, 1, 1e-4)  # if prismatic, else `encoder_bits`
     weight: float = number("1", 1e-9, 1e9, 1.0)  # in W; if prismatic 1/L^2, L the arm's length [m]
+    dead_zone_up: float | None = number("of full command", 0, 0.99, None)  # None: the machine's
+    dead_zone_down: float | None = number("of full command", 0, 0.99, None)
 
     def __post_init__(self) -> None:
         """ValueError: a bad number, an empty range, a triangle that closes over the range."""
@@ -68,11 +70,11 @@ class Joint:
             expected = "expected the triangle of a revolute joint within (0, pi) over its range"
             raise ValueError(f"{self.name}.cylinder_angle: {expected}, got {low:.3f} to {high:.3f}")
 
-    def complete(self, opening: float, counts: int) -> Joint:
-        """With encoder step, and cylinder speeds (if 0) for q_dot_up, q_dot_down at `opening`."""
-        r = self.cylinder_rod / opening
-        up = self.speed_positive or self.q_dot_up * r
-        down = self.speed_negative or self.q_dot_down * r
+    def complete(self, zones: Array, limit: float, counts: int) -> Joint:
+        """With encoder step, and cylinder speeds (if 0) for q_dot_up, q_dot_down at the limit."""
+        r_up, r_down = self.cylinder_rod * (1 - zones) / (limit - zones)
+        up = self.speed_positive or self.q_dot_up * float(r_up)
+        down = self.speed_negative or self.q_dot_down * float(r_down)
         step = self.encoder_step if self.kind == "prismatic" else 2 * np.pi / counts
         return replace(self, speed_positive=up, speed_negative=down, encoder_step=step)
 
@@ -85,7 +87,7 @@ class Machine:
     joints: tuple[Joint, ...]
     rate: float = number("Hz", 1e-3)  # of control and logging
     pwm_limit: int = number("counts of 127", 1, PWM_MAX)  # largest command that leaves the program
-    dead_zone: float = number("of full command", 0, 0.99)
+    dead_zone: float = number("of full command", 0, 0.99)  # the least; nets and actions begin at it
     encoder_bits: int = number("bits a turn", 1, 32)  # of revolute joints
     velocity_samples: int = number("samples", 2, 100)  # window of the velocity estimator
     history: int = number("samples", 2, 1000)  # of q, q_dot and u that nets and policy get
@@ -94,6 +96,7 @@ class Machine:
     valve_frame_id: int = number("CAN id", 0, 0x7FF)
     controller_node: int = number("CANopen node id", 1, 127)  # of the valve controller
     largest_dead_zone: float = number("of full command", 0, 0.99, default=0.0)  # 0: 1.5 dead zones
+    dither: float = number("of full stroke", 0, 0.5, default=0.03)  # at rest, beyond the dead zone
     # Of the analytic plant alone; by default what is assumed of the Brokk, with any pump flow.
     delay: float = number("s", 0, default=0.040)  # until a command reaches the valve
     tau_spool: float = number("s", 1e-6, default=0.030)  # time constants: spool, cylinder speed,
@@ -116,11 +119,17 @@ class Machine:
         for what, values in (("names", [*self.names]), ("CANopen nodes", nodes)):
             if len(set(values)) != len(values):
                 raise ValueError(f"joints: expected different {what}, got {values}")
-        zone = max(self.dead_zone, self.largest_dead_zone)
-        if not zone * PWM_MAX < self.pwm_limit:  # no valve would ever open
-            raise ValueError(f"dead_zone: expected below {self.pwm_limit}/{PWM_MAX}, got {zone!r}")
-        opening = float(valve_opening(self.pwm_limit / PWM_MAX, self.dead_zone))
-        joints = tuple(joint.complete(opening, 2**self.encoder_bits) for joint in self.joints)
+        least = float(self.dead_zones.min())
+        most = max(float(self.dead_zones.max()), self.largest_dead_zone)
+        if not most * PWM_MAX < self.pwm_limit:  # no valve would ever open
+            raise ValueError(f"dead_zone: expected below {self.pwm_limit}/{PWM_MAX}, got {most!r}")
+        if least < self.dead_zone:
+            raise ValueError(
+                f"dead_zone: expected at most {least}, a joint's, got {self.dead_zone}"
+            )
+        common = self.pwm_limit / PWM_MAX, 2**self.encoder_bits
+        pairs = zip(self.joints, self.dead_zones, strict=True)
+        joints = tuple(joint.complete(zones, *common) for joint, zones in pairs)
         object.__setattr__(self, "joints", joints)
         if self.q_start and len(self.q_start) != self.n:
             raise ValueError(f"q_start: expected {self.n} angles or none, got {self.q_start}")
@@ -165,18 +174,20 @@ class Machine:
         return np.flatnonzero([not joint.driven for joint in self.joints])
 
     @property
+    @lru_cache  # noqa: B019
+    def dead_zones(self) -> NDArray[np.float64]:
+        """Dead zones of each joint up and down, of full command, (n, 2)."""
+        pairs = [(joint.dead_zone_up, joint.dead_zone_down) for joint in self.joints]
+        return np.array([[self.dead_zone if z is None else z for z in pair] for pair in pairs])
+
+    @property
     def q_dot_max(self) -> NDArray[np.float64]:
         """Fastest motion of each joint at the command limit, either way [rad/s or m/s], (n,)."""
         return np.maximum(self.column("q_dot_up"), self.column("q_dot_down"))
 
     @lru_cache(maxsize=1024)  # noqa: B019
     def column(self, field: str) -> NDArray[np.float64]:
-        """One numeric `Joint` field over all joints, shape (n,), read-only.
-
-        Example:
-            >>> BROKK_170.column("a")
-            array([0.25, 1.15, 1.25, 1.15, 1.2 ])
-        """
+        """One numeric `Joint` field over all joints, shape (n,), read-only."""
         column = np.array([getattr(joint, field) for joint in self.joints], float)
         column.setflags(write=False)
         return column
@@ -208,17 +219,32 @@ def as_floats(values: ArrayLike) -> NDArray[np.floating]:
     return array if array.dtype.kind == "f" else array.astype(float)
 
 
-def valve_opening(u: ArrayLike, dead_zone: float) -> NDArray[np.floating]:
+def valve_opening(u: ArrayLike, dead_zone: ArrayLike) -> NDArray[np.floating]:
     """Opening of a valve in [-1, 1] under a command `u`: what lies beyond the dead zone.
 
-    Shape and float type of `u`; `dead_zone` is a fraction of full command. Paper: Sec. 3.3 (7 %)
+    Shape and float type of `u`; `dead_zone` is a fraction of full command, or (..., 2): one for up
+    and one for down of each `u` (...). Paper: Sec. 3.3 (7 %)
 
     Example:
         >>> valve_opening([-1.0, 0.05, 0.535], 0.07).round(3)
         array([-1. ,  0. ,  0.5])
     """
     u = as_floats(u)
-    return np.asarray((u - np.clip(u, -dead_zone, dead_zone)) / (1 - dead_zone))
+    zone = side(u, dead_zone)
+    return np.asarray((u - np.clip(u, -zone, zone)) / (1 - zone))
+
+
+def valve_command(opening: ArrayLike, dead_zone: ArrayLike) -> NDArray[np.floating]:
+    """The command that opens a valve so far: the inverse of `valve_opening`, 0 for 0."""
+    x = as_floats(opening)
+    zone = side(x, dead_zone)
+    return np.asarray(np.sign(x) * zone + (1 - zone) * x)
+
+
+def side(u: Array, pairs: ArrayLike) -> Array:
+    """Of `pairs` (..., 2) those for up where u (...) > 0, else those for down; or one number."""
+    pairs = np.asarray(pairs, u.dtype)
+    return np.where(u > 0, pairs[..., 0], pairs[..., 1]) if pairs.ndim else pairs
 
 
 # Joints of the Brokk 170. Sources: all assumed, but the fastest motions of q5 (paper, Sec. 3.2).
@@ -260,12 +286,7 @@ BROKK_170 = Machine(
 
 
 def limit_command(machine: Machine, u: ArrayLike) -> NDArray[np.floating]:
-    """The command that reaches the valve: whole PWM counts, clipped to the limit. Paper: Sec. 3.2
-
-    Example:
-        >>> limit_command(BROKK_170, [-1.0, 0.1]) * 127
-        array([-80.,  13.])
-    """
+    """The command that reaches the valve: whole counts, clipped to the limit. Paper: Sec. 3.2"""
     u = as_floats(u)
     counts = np.clip(np.rint(u * PWM_MAX), -machine.pwm_limit, machine.pwm_limit)
     return np.asarray(counts / PWM_MAX, u.dtype)
@@ -288,12 +309,7 @@ def encode_pwm(u: ArrayLike) -> NDArray[np.uint8]:
 
 
 def decode_pwm(u_byte: ArrayLike) -> NDArray[np.float64]:
-    """Signed command in [-1, 1] for a byte (...); 0 and 255 both mean idle. Paper: Sec. 3.2
-
-    Example:
-        >>> decode_pwm([80, 175, 0, 255]) * 127
-        array([ 80., -80.,   0.,   0.])
-    """
+    """Signed command in [-1, 1] for a byte (...); 0 and 255 both mean idle. Paper: Sec. 3.2"""
     u_byte = np.asarray(u_byte).astype(int)
     wrong = (u_byte < 0) | (u_byte > 255)
     if wrong.any():
@@ -302,29 +318,6 @@ def decode_pwm(u_byte: ArrayLike) -> NDArray[np.float64]:
 
 
 def read_encoder(machine: Machine, q: ArrayLike) -> NDArray[np.floating]:
-    """What the encoders report for true angles `q` (..., n): whole counts, in the same float type.
-
-    Example:
-        >>> read_encoder(BROKK_170, [0.0, 0.001, 1.0, 0.0, 0.0]) / BROKK_170.encoder_step
-        array([  0.,   1., 652.,   0.,   0.])
-    """
+    """What encoders report for true angles `q` (..., n): whole counts, of the same float type."""
     q = as_floats(q)
     return np.asarray(np.rint(q / machine.encoder_step) * machine.encoder_step, q.dtype)
-
-
-def estimate_velocity(q: ArrayLike, samples: int, dt: float) -> NDArray[np.floating]:
-    """Causal velocity [rad/s] (...): slope of the line through the newest angles of `q` (..., T).
-
-    The one estimator of the package. A difference over one tick of a 12-bit encoder comes in steps
-    of 0.031 rad/s at 20 Hz; four samples have a third of its noise and are 1.5 ticks late.
-
-    Example:
-        >>> estimate_velocity([0.0, 0.1, 0.2, 0.3], samples=4, dt=0.05).round(6)
-        np.float64(2.0)
-    """
-    q = as_floats(q)
-    if samples < 2 or q.shape[-1] < samples:
-        raise ValueError(f"q: expected at least {max(2, samples)} samples, got {q.shape}")
-    t = dt * (np.arange(samples) - (samples - 1) / 2)
-    weights = (t / (t @ t)).astype(q.dtype)  # slope = sum t_i q_i / sum t_i^2
-    return np.asarray(np.einsum("...t,t", q[..., -samples:], weights))

@@ -17,10 +17,11 @@ import numpy as np
 from hypothesis import strategies as st
 
 from brokk_min.actuator import append_sample
-from brokk_min.machine import Array, estimate_velocity
+from brokk_min.kinematics import estimate_velocity
+from brokk_min.machine import Array
 from exercises.verdict import agree, expect
 
-SOLUTION = "brokk_min/machine.py: estimate_velocity; brokk_min/actuator.py: append_sample"
+SOLUTION = "brokk_min/kinematics.py: estimate_velocity; brokk_min/actuator.py: append_sample"
 
 
 def velocity(q: Array, samples: int, dt: float) -> float:

@@ -35,10 +35,11 @@ from brokk_min import env
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import TaskConfig
 from brokk_min.identification.files import SHIPPED
+from brokk_min.kinematics import estimate_velocity
 from brokk_min.learning import simulation_gradient
 from brokk_min.learning.policy import load_policy
 from brokk_min.learning.simulation_gradient import Ticks, local_derivatives
-from brokk_min.machine import BROKK_170, Array, Machine, estimate_velocity
+from brokk_min.machine import BROKK_170, Array, Machine
 from exercises.verdict import expect
 
 SOLUTION = "brokk_min/learning/simulation_gradient.py: action_gradients"

@@ -105,7 +105,7 @@ def estimator() -> Symptom:
     with_command = actuator.append_command(history, [0.5])
     rows["its commands, with the next one"] = with_command[0, 2]
     rows["angle from all its samples [rad]"] = actuator.smooth_angles(BROKK, history)
-    rows["noise-free velocity of a ramp at 1 rad/s"] = machine.estimate_velocity(
+    rows["noise-free velocity of a ramp at 1 rad/s"] = kinematics.estimate_velocity(
         0.05 * np.arange(13), 4, 0.05
     )
     curves = {"velocity in the history": (0.05 * np.arange(len(angles)), velocities)}

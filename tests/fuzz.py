@@ -34,7 +34,7 @@ from brokk_min.cli.options import find_machine
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation.baselines import baselines, gains_metadata, gains_table, read_gains
 from brokk_min.evaluation.family import run_member
-from brokk_min.evaluation.reproduce import QUICK
+from brokk_min.evaluation.learn import QUICK
 from brokk_min.evaluation.seeds import read_seeds, run_seed
 from brokk_min.evaluation.sequences import read_commands, read_starts, task_sequences
 from brokk_min.identification import formats
@@ -165,7 +165,7 @@ def runs(policy: Path) -> Content:
 
 def member() -> Content:
     errors = {"error": {"rl": 0.1, "pid": 0.2}, "free_run": {"q1": 0.1}}
-    numbers = {"on_nets": {"rl": 0.1}, "loaded": {"rl": 0.2}, "best": {"rl": "pid"}}
+    numbers = {"on_nets": {"rl": 0.1}, "loaded": {"rl": 0.2}, "best": {"rl": "pid"}, "dither": 0.03}
     return {"seed": 0, "budget": asdict(QUICK), **errors, **numbers}
 
 

@@ -58,14 +58,19 @@ def machines(draw: st.DrawFn, min_joints: int = 2, max_joints: int = 6) -> Machi
     n = draw(st.integers(min_joints, max_joints))
     driven = draw(st.lists(st.booleans(), min_size=n, max_size=n).filter(any))
     pwm_limit = draw(st.integers(20, 127))
+    dead_zone = draw(reals(0.0, min(0.3, 0.9 * pwm_limit / 127)))
+    widest = min(dead_zone + 0.05, 0.95 * pwm_limit / 127)
+    own_zone = st.none() | reals(dead_zone, widest)  # of a joint and direction
+    each = [draw(joints(i, drives)) for i, drives in enumerate(driven)]
+    zones = [{f"dead_zone_{side}": draw(own_zone) for side in ("up", "down")} for _ in each]
     return replace(
         BROKK_170,
         name=f"machine {next(NUMBERS)}",  # caches of the package hash names
-        joints=tuple(draw(joints(i, drives)) for i, drives in enumerate(driven)),
+        joints=tuple(replace(joint, **own) for joint, own in zip(each, zones, strict=True)),
         q_start=(),
         rate=draw(st.sampled_from([10.0, 20.0, 25.0, 50.0])),
         pwm_limit=pwm_limit,
-        dead_zone=draw(reals(0.0, min(0.3, 0.9 * pwm_limit / 127))),
+        dead_zone=dead_zone,
         delay=draw(st.sampled_from([0.0, 0.005, 0.04, 0.1, 0.13])),
         tau_spool=draw(reals(0.01, 0.1)),
         tau_cylinder=draw(reals(0.01, 0.1)),

@@ -19,8 +19,8 @@ from brokk_min.evaluation.rollout import Controller
 from brokk_min.hw import Drive
 from brokk_min.identification.files import expected, open_regular, require
 from brokk_min.identification.logs import Log, machine_log
-from brokk_min.kinematics import forward_kinematics, tool_velocity
-from brokk_min.machine import Array, Machine, estimate_velocity
+from brokk_min.kinematics import estimate_velocity, forward_kinematics, tool_velocity
+from brokk_min.machine import Array, Machine
 
 LONGEST_LINE = 1000  # bytes
 LARGEST_LOG = 2**40  # bytes: frames are read one by one

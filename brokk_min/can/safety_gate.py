@@ -166,7 +166,7 @@ def expected_motion(machine: Machine, state: GateState, counts: Array) -> Array:
     | 80, but one is -30 | same    | 0, and starts again from 0: the valve may have closed       |
     | any                | another | 0, and starts again from 0: the encoder shows motion        |
     """
-    idle = machine.largest_dead_zone or IDLE_ZONES * machine.dead_zone
+    idle = machine.largest_dead_zone or IDLE_ZONES * machine.dead_zones.max()
     limit = machine.pwm_limit / PWM_MAX
     side = np.sign(state.sent[..., -1:])
     smallest = (side * state.sent).min(axis=-1) / PWM_MAX

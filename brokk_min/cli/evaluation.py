@@ -179,7 +179,8 @@ class Reproduce(Command):
     sweep: Path | None = None  # sweep.json on these nets: intervals over its seeds in the report.
 
     def __call__(self) -> None:
-        from brokk_min.evaluation.reproduce import QUICK, Budget, reproduce
+        from brokk_min.evaluation.learn import QUICK, Budget
+        from brokk_min.evaluation.reproduce import reproduce
 
         budget = QUICK if self.quick else Budget()
         machine = self.check({self.out / name: kind for name, kind in CHAIN.items()})

@@ -297,9 +297,10 @@ def print_fields(fields: dict[str, Any], machine: Machine) -> None:
     zones = machine.dead_zone, machine.largest_dead_zone
     pairs = zip(("dead_zone", "largest_dead_zone"), zones, strict=True)
     print(", ".join(f"{field} {fields[field]:.3f} ({now:g})" for field, now in pairs))
-    for i, name in enumerate(machine.names):
-        if name in fields["q_dot_up"]:
-            up, down = (fields[field][name] for field in ("q_dot_up", "q_dot_down"))
-            now = machine.joints[i]
-            up_now, down_now = f"({now.q_dot_up:g})", f"({now.q_dot_down:g})"
-            print(f"{name}: q_dot_up {up:.2f} {up_now}, q_dot_down {down:.2f} {down_now}")
+    for joint, (zone_up, zone_down) in zip(machine.joints, machine.dead_zones, strict=True):
+        now = {"dead_zone_up": zone_up, "dead_zone_down": zone_down}
+        now |= {"q_dot_up": joint.q_dot_up, "q_dot_down": joint.q_dot_down}
+        found = {field: fields[field].get(joint.name) for field in now}
+        parts = [f"{field} {found[field]:.3f} ({now[field]:g})" for field in now if found[field]]
+        if parts:
+            print(f"{joint.name}: {', '.join(parts)}")

@@ -233,7 +233,8 @@ class Export(Command):
     out: Path  # File to write, .onnx.
 
     def __call__(self) -> None:
-        export_onnx(self.out, load_policy(self.policy, self.check(out="ONNX")))
+        machine = self.check(out="ONNX")
+        export_onnx(self.out, load_policy(self.policy, machine), machine)
         print(f"{self.out}: observation (batch, obs) in, action (batch, driven joints) out")
 
 

@@ -4,33 +4,33 @@ A member's controllers are made from its own logs, as a user's would be: an hour
 once, nets that share latents, policies; an hour of the policies' own drives, nets fitted to both
 logs, the policies trained on; baselines tuned on the member itself. `family.json` has:
 
-    members[]: seed, budget, effects, free_run {joint: error over rms speed in 10 s}, tool: errors
-    of the tool in free runs, error {controller: m/s on the machine}; for each of our policies
-    on_nets: its error on its nets [m/s], loaded: with an unknown load at the tool [m/s], best: the
-    best baseline of its class of valves at rest
+    members[]: seed, budget, effects, dither (of `Machine`), free_run {joint: error over rms speed
+    in 10 s}, tool: errors of the tool in free runs, error {controller: m/s on the machine}; for
+    each of our policies on_nets: its error on its nets [m/s], loaded: with an unknown load at the
+    tool [m/s], best: the best baseline of its class of valves at rest
     table: what `show` prints, {"member, policy": {column: number}}
     transfers[i][j]: error [m/s] of the policy "rl" of member i on member j
     summary: {policy: median and largest of its `ratios` over the members}
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from brokk_min.actuator import ActuatorNet
-from brokk_min.evaluation import baselines, metrics, reproduce, sequences
+from brokk_min.env import TaskConfig
+from brokk_min.evaluation import baselines, learn, metrics, sequences
+from brokk_min.evaluation.learn import Budget
 from brokk_min.evaluation.metrics import Controllers
-from brokk_min.evaluation.reproduce import Budget
-from brokk_min.evaluation.rollout import Controller, own_drives
+from brokk_min.evaluation.rollout import Controller, rollout
 from brokk_min.identification import logs, validation
 from brokk_min.identification.excitation import collect, task_log
 from brokk_min.identification.files import expect_same, read_json, write_json
 from brokk_min.identification.formats import FAMILY_MEMBER, check_fields
-from brokk_min.identification.logs import Log
+from brokk_min.identification.inspection import with_dead_zones
 from brokk_min.identification.net_file import select_nets
 from brokk_min.identification.physics import draw_machine
 from brokk_min.learning.policy import (
@@ -44,10 +44,13 @@ from brokk_min.machine import Machine
 
 LATENTS = 4  # that the nets share
 VALVES = {"rl": "closed", "rl_dither": "dither"}  # our policy, and its valves at rest
+RAMPS = 0.02  # h of each joint, for its dead zones
+DITHERS = (0.03, 0.04, 0.05, 0.06, 0.07)  # that each member tries
 PAYLOAD = 50.0  # kg at the tool that no log has, assumed: half of a link
 # Small enough for 15 minutes a member on two cores.
-FAMILY = Budget(fit_steps=12_000, train_steps=2_000_000, starts=16)
-QUICK = replace(reproduce.QUICK, train_steps=20_000, generations=2, tuning_runs=3, fit_steps=400)
+FAMILY = Budget(fit_steps=12_000, starts=16)
+QUICK = replace(learn.QUICK, first_train_steps=10_000, train_steps=20_000, fit_steps=400)
+QUICK = replace(QUICK, first_fit_steps=200, generations=2, tuning_runs=3)
 
 
 def run_family(base: Machine, seeds: Sequence[int], out: Path, budget: Budget) -> dict[str, Any]:
@@ -75,20 +78,20 @@ def run_member(base: Machine, seed: int, out: Path, budget: Budget) -> dict[str,
         check_fields(file, row, FAMILY_MEMBER, {})
         expect_same(file, row, {"budget": made_by})
         return row
-    machine = draw_machine(base, seed)
+    machine = known_machine(base, seed)
     log = collect(machine, budget.hours, "joint", np.random.default_rng(seed))
     test = task_log(machine, 20, 40.0, np.random.default_rng(seed + 1))
-    first = replace(budget, fit_steps=budget.fit_steps // 2, train_steps=budget.train_steps // 2)
-    _, training = fit_and_train(machine, out / "first", log, first, seed)
-    begun = training()
-    drivers = [*policy_controllers(machine, {"rl": begun}).values()]
-    own = own_drives(machine, drivers, budget.hours, seed)
-    log = log._replace(recordings=log.recordings + own.recordings)
-    every, training = fit_and_train(machine, out, log, budget, seed, begun)
+    out.mkdir(parents=True, exist_ok=True)
+    logs.write_log(out / "log.npz", log)
+    shared = {"shared": LATENTS}
+    both, begun = learn.first_round(machine, out / "first", log, budget, seed, shared)
+    machine = replace(machine, dither=best_dither(machine, begun, budget, seed))
+    every = learn.fit_net(machine, out / "net.npz", both, budget, shared, seed)
     net = select_nets(machine, every)
+    train = partial(learn.train, machine, out, "rl", net, budget, seed, begun)
     settings = budget.tuning_runs, budget.generations, seed, None, None, budget.short_s
     tune = partial(baselines.tune_baselines, machine, net, *settings)
-    trained, (pids, _) = reproduce.side_by_side({"train": training, "tune": tune}, {})
+    trained, (pids, _) = learn.side_by_side({"train": train, "tune": tune}, {})
     baselines.write_gains(out / "gains.json", pids, baselines.gains_metadata(machine, net))
     policies = policy_controllers(machine, {"rl": trained})
     errors = mean_errors(base, machine, {**policies, **pids}, budget)
@@ -98,6 +101,7 @@ def run_member(base: Machine, seed: int, out: Path, budget: Budget) -> dict[str,
         "seed": seed,
         "budget": made_by,
         "effects": {**asdict(machine.plant), "pump": machine.pump_flow / base.pump_flow},
+        "dither": machine.dither,
         "free_run": {name: scores[name]["free_run"]["10"]["relative_error"] for name in driven},
         "tool": validation.tool_errors(machine, every, test),
         "error": errors,
@@ -112,15 +116,27 @@ def run_member(base: Machine, seed: int, out: Path, budget: Budget) -> dict[str,
     return row
 
 
-def fit_and_train(
-    machine: Machine, out: Path, log: Log, budget: Budget, seed: int, start: Policy | None = None
-) -> tuple[ActuatorNet, Callable[[], Policy]]:
-    """Nets of all joints, fitted to a log, and a call that trains our policy on them."""
-    out.mkdir(parents=True, exist_ok=True)
-    logs.write_log(out / "log.npz", log)
-    every = reproduce.fit_net(machine, out / "net.npz", log, budget, {"shared": LATENTS}, seed)
-    net = select_nets(machine, every)
-    return every, partial(reproduce.train, machine, out, "rl", net, budget, seed, start)
+@lru_cache
+def known_machine(base: Machine, seed: int) -> Machine:
+    """A drawn machine as its user knows it: dead zones by joint from slow ramps of each."""
+    machine = draw_machine(base, seed)
+    log = collect(machine, RAMPS, "ramp", np.random.default_rng(seed))
+    ramps = tuple(one for one in log.recordings if not one.name.endswith(logs.RETURN))
+    return with_dead_zones(machine, log._replace(recordings=ramps))
+
+
+def best_dither(machine: Machine, policy: Policy, budget: Budget, seed: int) -> float:
+    """Of `DITHERS` the one with least error of the policy, on goals that are never scored."""
+    seconds = min(baselines.TUNING_SECONDS, budget.short_s)
+    start, goals = sequences.tuning_set(machine, budget.tuning_runs, seed, seconds)
+    errors = []
+    for dither in DITHERS:
+        own = replace(machine, dither=dither)
+        controller = PolicyController(own, replace(policy, valves="dither"))
+        rng = np.random.default_rng(seed)
+        trace = rollout(machine, controller, start, goals, TaskConfig(), rng)
+        errors.append(np.linalg.norm(goals - trace.v_tool, axis=-1).mean())
+    return DITHERS[int(np.argmin(errors))]
 
 
 def with_payload(machine: Machine) -> Machine:
@@ -145,10 +161,10 @@ def transfers(base: Machine, seeds: Sequence[int], out: Path, budget: Budget) ->
     """Errors [m/s] of the policy of each member (rows) on each member (columns)."""
     controllers: dict[str, Controller] = {}
     for seed in seeds:
-        own = draw_machine(base, seed)
+        own = known_machine(base, seed)
         policy = load_policy(out / f"member_{seed}" / POLICIES["rl"], own)
         controllers[str(seed)] = PolicyController(own, policy)
-    columns = [mean_errors(base, draw_machine(base, s), controllers, budget) for s in seeds]
+    columns = [mean_errors(base, known_machine(base, s), controllers, budget) for s in seeds]
     return [[column[str(seed)] for column in columns] for seed in seeds]
 
 

@@ -62,10 +62,10 @@ def speed_limits(machine: Machine, q: ArrayLike) -> tuple[Array, Array]:
 
     They hold at the command limit, if no other joint needs the pump. Paper: eq1
     """
-    opening = valve_opening(machine.pwm_limit / PWM_MAX, machine.dead_zone)
+    limit = np.full(machine.n, machine.pwm_limit / PWM_MAX)
     r = lever_arm(machine, q)
-    down = -opening * machine.column("speed_negative") / r
-    up = opening * machine.column("speed_positive") / r
+    down = valve_opening(-limit, machine.dead_zones) * machine.column("speed_negative") / r
+    up = valve_opening(limit, machine.dead_zones) * machine.column("speed_positive") / r
     return down, up
 
 

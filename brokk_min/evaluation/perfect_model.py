@@ -17,7 +17,7 @@ from brokk_min.env import Measured
 from brokk_min.evaluation.metrics import Run, paired_difference, summary
 from brokk_min.jacobian import dls
 from brokk_min.kinematics import forward_kinematics, jacobian, tool_velocity
-from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, valve_opening
+from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, valve_command, valve_opening
 
 BLOCKS = (1, 1, 2, 4, 6)  # ticks between changes of a plan; their sum is the horizon (assumed)
 STEPS = (1.0, 0.5, 0.2)  # fractions of a Gauss-Newton step that are tried (assumed)
@@ -74,7 +74,7 @@ class PerfectModel:
         near_zero = np.maximum(0, 1 - np.abs(opening) / (2 * self.dither + 1e-9))
         opening = opening + self.dither * sign * near_zero
         u = np.zeros((*opening.shape[:-1], m.n))
-        u[..., m.driven] = np.sign(opening) * (m.dead_zone + (1 - m.dead_zone) * np.abs(opening))
+        u[..., m.driven] = valve_command(opening, m.dead_zones[m.driven])
         return u
 
     def errors(self, plant: PlantState, u: Array, goal: Array) -> Array:
@@ -99,8 +99,9 @@ class PerfectModel:
         steady = steady_opening(m, plant.q, goal)[:, None]
         tried = [opening, *(opening + fraction * step for fraction in STEPS)]
         tried.append(np.broadcast_to(steady, opening.shape))
-        limit = valve_opening(m.pwm_limit / PWM_MAX, m.dead_zone)
-        plans = np.clip(np.stack(tried, axis=1), -limit, limit)  # (num, plans, horizon, n_driven)
+        plans = np.clip(
+            np.stack(tried, axis=1), *opening_limits(m)
+        )  # (num, plans, horizon, n_driven)
         error = np.linalg.norm(self.errors(plant, self.commands(plans, tick), goal), axis=-1)
         size = np.square(plans).mean(axis=(-1, -2))
         cost = error.mean(axis=-1) + 1e-4 * size  # of equal plans the smaller
@@ -118,8 +119,7 @@ class PerfectModel:
         basis = from_block[:, None, :, None] * np.eye(n)[:, None]  # (blocks, n, horizon, n)
         basis = basis.reshape(blocks * n, horizon, n)  # (parameters, horizon, n_driven)
         plans = opening[:, None] + PROBE * np.concatenate([np.zeros((1, horizon, n)), basis])
-        limit = valve_opening(m.pwm_limit / PWM_MAX, m.dead_zone)
-        u = self.commands(np.clip(plans, -limit, limit), tick)
+        u = self.commands(np.clip(plans, *opening_limits(m)), tick)
         error = self.errors(plant, u, goal)  # (num, 1 + parameters, horizon, 3)
         size = np.linalg.norm(error[:, :1], axis=-1, keepdims=True)
         weight = 1 / np.sqrt(size + SOFT)
@@ -140,6 +140,13 @@ class PerfectModel:
         u[:, :, 0] = limit_command(m, u[:, :, 0])
         cost = np.linalg.norm(self.errors(plant, u, goal), axis=-1).mean(axis=-1)
         return np.asarray(u[np.arange(len(u)), cost.argmin(axis=1), 0])
+
+
+def opening_limits(machine: Machine) -> tuple[Array, Array]:
+    """Openings of the driven joints' valves at the command limit, down and up (n_driven,)."""
+    limit = np.full(len(machine.driven), machine.pwm_limit / PWM_MAX)
+    zones = machine.dead_zones[machine.driven]
+    return valve_opening(-limit, zones), valve_opening(limit, zones)
 
 
 def steady_opening(machine: Machine, q: Array, goal: Array) -> Array:

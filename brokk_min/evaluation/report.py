@@ -31,7 +31,7 @@ from brokk_min.machine import Array, Machine
 
 POSITION = ("rl", "rl_paper", "jacobian_pid_k0.1")  # in the figures of position errors
 AT_REST = ("rl", "rl_dither", "jacobian_pid_ff_integral_dither")
-STAGES = ("record", "fit", "train and tune", "evaluate")  # of the clock; the others are within
+STAGES = ("record", "learn and tune", "evaluate")  # of the clock; the others are within
 Results = Mapping[str, Any]  # of `results.json`
 Rows = Mapping[str, Mapping[str, Mean]]  # by name of the row and controller
 UNITS = {

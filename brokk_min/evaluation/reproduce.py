@@ -1,96 +1,57 @@
 """The whole chain: logs, nets, policy, baselines, comparison, report."""
 
-import multiprocessing
-import os
-import sys
 import time
 from collections import ChainMap
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from dask.system import cpu_count
 from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet
-from brokk_min.env import TaskConfig
 from brokk_min.evaluation import baselines, claims, metrics, preliminary, report, sequences
+from brokk_min.evaluation.learn import Budget, learn, side_by_side
 from brokk_min.evaluation.metrics import Controllers, Run, Traces, evaluate, summary
 from brokk_min.evaluation.perfect_model import perfect_models, regret
 from brokk_min.evaluation.robustness import ROBUST, near_singularities, robustness
 from brokk_min.evaluation.rollout import Controller, Trace, log_of
 from brokk_min.evaluation.seeds import read_seeds, seeds_of
-from brokk_min.identification import fitting, logs, validation
+from brokk_min.identification import logs, validation
 from brokk_min.identification.excitation import collect, task_log
 from brokk_min.identification.files import write_json
-from brokk_min.identification.net_file import save_net, select_nets
 from brokk_min.jacobian import JacobianController
-from brokk_min.learning.checkpoint import train_policy
-from brokk_min.learning.episodes import GRADIENT_LEARNER, PAPER_TASK
 from brokk_min.learning.policy import POLICIES, Policy, policy_controllers, save_policy
 from brokk_min.machine import Machine
-from brokk_min.ppo import PPOConfig
 
 Pids = Mapping[str, JacobianController]  # baselines by name
-
-
-@dataclass(frozen=True)
-class Budget:
-    """How much each stage may spend."""
-
-    hours: float = 1.0  # driving time of each actuator that is recorded
-    fit_steps: int = fitting.FitConfig.steps
-    train_steps: int = GRADIENT_LEARNER["total_steps"]
-    paper_steps: int = PPOConfig.total_steps  # of the paper's learner
-    generations: int = baselines.GENERATIONS  # of the tuning
-    tuning_runs: int = baselines.TUNING_RUNS
-    starts: int = 64
-    bound_starts: int = 16  # of them, for the regret
-    short_s: float = 26.0  # s of a run for regret, robustness, singularities, tuning, at most
-
-
-QUICK = Budget(0.1, 700, 100_000, 200_000, 4, 4, 8, 2, 3.0)
 
 
 def reproduce(
     machine: Machine, out: Path, budget: Budget, seed: int, sweep: Path | None = None
 ) -> dict[str, Any]:
-    """Run the chain; logs, nets, policy, gains, `results.json` and `report.html` go to `out`.
+    """Run the chain; logs, nets, policies, gains, `results.json` and `report.html` go to `out`.
 
     `results.json` has no times: the same seed gives the same file on the same computer. `sweep` is
     a file of `brokk-min sweep`, whose training seeds the report shows.
     """
     seeds = read_seeds(sweep) if sweep else {}
     clock: dict[str, float] = {}
-    with tqdm(total=5, desc="stages done", unit="stage", position=1, disable=None) as bar:
+    with tqdm(total=4, desc="stages done", unit="stage", position=1, disable=None) as bar:
         stage = partial(_stage, clock, bar)
         with stage("record"):
             log, paper_log, test = record(machine, out, budget, seed)
-        with stage("fit"):
-            fit = partial(fit_net, machine, budget=budget, seed=seed)
-            ours = partial(fit, out / "net.npz", log, recipe={})
-            theirs = partial(fit, out / "net_paper.npz", paper_log, recipe=fitting.PAPER_RECIPE)
-            net, paper_net = side_by_side({"fit net": ours, "fit net_paper": theirs}, clock)
-            driven = select_nets(machine, net)
-            training_seeds = seeds_of(machine, driven, seeds) if seeds else {}
-        with stage("train and tune"):
-            nets = {"rl_paper": select_nets(machine, paper_net), "rl": driven}
-            jobs: dict[str, Any] = {}
-            for name, own in nets.items():
-                jobs[f"train {name}"] = partial(train, machine, out, name, own, budget, seed)
-            settings = budget.tuning_runs, budget.generations, seed, None, None, budget.short_s
-            for name in baselines.TUNED:
-                tune = partial(baselines.tune_baselines, machine, driven, *settings)
-                jobs[f"tune {name}"] = partial(tune, name)
-            paper, rl, *tuned = side_by_side(jobs, clock)
-            policies = {"rl": rl, "rl_paper": paper}
+        with stage("learn and tune"):
+            by_name = learn(machine, out, log, paper_log, budget, seed, clock)
+            net, paper_net = by_name["fit net"], by_name["fit net_paper"]
+            rl, paper = by_name["train rl"], by_name["train rl_paper"]
+            tuned = [by_name[f"tune {name}"] for name in baselines.TUNED]
             pids, tuning = (dict(ChainMap(*both[::-1])) for both in zip(*tuned, strict=True))
+            policies = {"rl": rl, "rl_paper": paper}
+            training_seeds = seeds_of(machine, rl.net, seeds) if seeds else {}
         with stage("evaluate"):
             results, shown = measure(machine, net, test, policies, pids, budget, seed, clock)
             results["paper_recipe"] = net_errors(machine, paper_net, test, seed)
@@ -110,41 +71,6 @@ def _stage(clock: dict[str, float], bar: Any, name: str) -> Iterator[None]:
     clock[name] = time.perf_counter() - start
     bar.set_postfix_str(name)
     bar.update()
-
-
-def side_by_side(calls: Mapping[str, Callable[[], Any]], clock: dict[str, float]) -> list[Any]:
-    """Results of independent calls, each in a process of one thread, as many at once as cores.
-
-    They begin in their order: the longest should be the first. One core runs them here, in turn.
-    `clock` gets the seconds of each. The first exception is raised.
-    """
-    cores = cpu_count()  # by affinity and cgroup, too
-    if cores == 1:
-        done = [_timed(call) for call in calls.values()]
-    else:
-        context = multiprocessing.get_context("spawn")
-        bar = tqdm(total=len(calls), unit="job", disable=None)
-        with ProcessPoolExecutor(min(cores, len(calls)), context, _one_thread) as pool, bar:
-            futures = {pool.submit(_timed, call): name for name, call in calls.items()}
-            bar.set_postfix_str(", ".join([*calls][:cores]))
-            for _ in as_completed(futures):
-                running = [name for future, name in futures.items() if not future.done()]
-                bar.set_postfix_str(", ".join(running[:cores]))
-                bar.update()
-            done = [future.result() for future in futures]
-    clock |= {name: seconds for name, (seconds, _) in zip(calls, done, strict=True)}
-    return [result for _, result in done]
-
-
-def _one_thread() -> None:
-    torch.set_num_threads(1)
-    sys.stderr = open(os.devnull, "w")  # noqa: SIM115  # bars of several processes would mix
-
-
-def _timed(call: Callable[[], Any]) -> tuple[float, Any]:
-    start = time.perf_counter()
-    result = call()
-    return time.perf_counter() - start, result
 
 
 def record(machine: Machine, out: Path, budget: Budget, seed: int) -> list[logs.Log]:
@@ -167,44 +93,11 @@ def record(machine: Machine, out: Path, budget: Budget, seed: int) -> list[logs.
     return read
 
 
-def fit_net(
-    machine: Machine, file: Path, log: logs.Log, budget: Budget, recipe: dict[str, Any], seed: int
-) -> ActuatorNet:
-    """Nets of all joints by our settings but for those of `recipe`, written to `file`."""
-    ours = {"history": machine.history, "dead_zone": machine.dead_zone}
-    config = fitting.FitConfig(budget.fit_steps, **ours | recipe)
-    net = fitting.fit(log, config, seed, machine.velocity_samples, machine.name)
-    save_net(file, net)
-    return net
-
-
 def net_errors(machine: Machine, net: ActuatorNet, test: logs.Log, seed: int) -> dict[str, Any]:
     """Scores of nets on a log, and their distance from the machine in the paper's experiment."""
     both = preliminary.simulators(machine, net)
     gap = preliminary.gap_numbers(machine, preliminary.sim_to_real(machine, both, seed))
     return {"test": validation.score(net, test), "sim_to_real": gap}
-
-
-def settings(name: str, budget: Budget) -> tuple[TaskConfig, PPOConfig]:
-    """Task and learner of one of `POLICIES`: ours, or the paper's."""
-    if name == "rl_paper":
-        return TaskConfig(paper=True, **PAPER_TASK), PPOConfig(budget.paper_steps)
-    return TaskConfig(), PPOConfig(**GRADIENT_LEARNER | {"total_steps": budget.train_steps})
-
-
-def train(
-    machine: Machine,
-    out: Path,
-    name: str,
-    net: ActuatorNet,
-    budget: Budget,
-    seed: int,
-    start: Policy | None = None,
-) -> Policy:
-    """One of `POLICIES`, by its own settings; `start` as in `train_policy`."""
-    task, learner = settings(name, budget)
-    file = out / POLICIES[name]
-    return train_policy(machine, net, task, learner, seed, file, resume=True, start=start)
 
 
 def measure(

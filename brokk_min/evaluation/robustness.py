@@ -44,6 +44,13 @@ def lossy_encoder(rng: np.random.Generator) -> Encoder:
     return read
 
 
+def with_dead_zone(machine: Machine, dead_zone: float) -> Machine:
+    """The machine with one dead zone for all joints, both ways."""
+    none = {"dead_zone_up": None, "dead_zone_down": None}
+    joints = tuple(replace(joint, **none) for joint in machine.joints)  # type: ignore[arg-type]
+    return replace(machine, joints=joints, dead_zone=dead_zone)
+
+
 def scale_valves(machine: Machine, positive: float, negative: float) -> Machine:
     """The machine with other cylinder speeds in the positive and the negative direction."""
     joints = []
@@ -63,8 +70,8 @@ def variations(machine: Machine) -> dict[str, tuple[Machine, Sensor]]:
         "valve gain -20 %": scale_valves(machine, 0.8, 0.8),
         "valve gain +20 %": scale_valves(machine, 1.2, 1.2),
         "up -15 %, down +15 %": scale_valves(machine, 0.85, 1.15),
-        "dead zone 5 %": replace(machine, dead_zone=0.05),
-        "dead zone 10 %": replace(machine, dead_zone=0.10),
+        "dead zone 5 %": with_dead_zone(machine, 0.05),
+        "dead zone 10 %": with_dead_zone(machine, 0.10),
         "delay +25 ms": replace(machine, delay=machine.delay + 0.025),
         "delay +50 ms": replace(machine, delay=machine.delay + 0.050),
     }
@@ -78,7 +85,7 @@ def variations(machine: Machine) -> dict[str, tuple[Machine, Sensor]]:
 
 def pump_flow_ratio(machine: Machine, u: Array) -> Array:
     """Flow that commands (..., n) demand, over the pump's flow, (...). Paper: Sec. 4.2"""
-    opening = valve_opening(u, machine.dead_zone)
+    opening = valve_opening(u, machine.dead_zones)
     K = np.where(opening > 0, machine.column("speed_positive"), machine.column("speed_negative"))
     flow = np.abs(machine.column("cylinder_area") * K * opening).sum(axis=-1)  # sum |A v*|
     return np.asarray(flow / machine.pump_flow)

@@ -105,7 +105,7 @@ def _barely_open(rng: np.random.Generator, machine: Machine, _: float) -> Array:
     ticks = int(rng.uniform(0.2, 2.0) / machine.dt)
     alternations = np.arange(ticks) // rng.choice([1, 2, 3, 4, 6, ticks])
     sign = rng.choice([-1, 1])
-    level = rng.uniform(0.9 * machine.dead_zone, machine.dead_zone + BARELY_OPEN)
+    level = rng.uniform(0.9 * machine.dead_zone, machine.dead_zones.max() + BARELY_OPEN)
     return np.asarray(sign * level * (-1.0) ** alternations)
 
 
@@ -115,7 +115,7 @@ def ramp_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Arra
     shape = 1 - np.abs(np.arange(1 - half, half + 1)) / half
     num = -(-ticks // len(shape))
     beyond = rng.uniform(0.05, 0.25, num)  # of full command: the dead zone may be a guess
-    peaks = max(machine.dead_zone, machine.largest_dead_zone) + beyond
+    peaks = max(machine.dead_zones.max(), machine.largest_dead_zone) + beyond
     signs = rng.choice([-1, 1]) * (-1.0) ** np.arange(num)
     return np.outer(signs * peaks, shape).ravel()[:ticks]
 

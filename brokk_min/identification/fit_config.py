@@ -12,18 +12,20 @@ from brokk_min.machine import check_numbers, number
 class FitConfig:
     """How the nets are fitted."""
 
-    steps: int = number("steps", 0, 10**12, 16000)  # Adam steps.
+    steps: int = number("steps", 0, 10**12, 16000)  # 5000 for logs of a few minutes.
     batch_size: int = number("1", 1, 10**6, 512)  # Windows per joint in each step.
-    learning_rate: float = number("1", 1e-9, 1, 4e-3)  # Of Adam; falls to zero twice, by a cosine.
-    weight_decay: float = number("1", 0, 100, 0.0)  # Of AdamW; 0.3 for logs of a few minutes.
+    learning_rate: float = number("1", 1e-9, 1, 4e-3)  # Falls to zero twice, by a cosine.
+    weight_decay: float = number("1", 0, 100, 0.0)  # 0.3 for logs of a few minutes.
     noise: float = number("1", 0, 1000, 0.1)  # Of velocity inputs, in their deviations.
     hidden: int = number("1", 1, 10**4, 32)  # Units in each of the two hidden layers (paper: 32).
     history: int = number("samples", 2, 1000, 13)  # Of angle, velocity and command (paper: 13).
     rollout: int = number("ticks", 1, 10**6, 8)  # Of the errors in the last third (paper: 1).
+    muon: float = number("1", 0, 1000, 5.0)  # Muon's step, in learning rates; 0: Adam (paper).
     shared: int = number("1", 0, 1000, 0)  # Latents of all joints' inputs: 4 for a pump and weight.
     dead_zone: float | None = number("1", 0, 0.99, None)
     """Command within which no valve opens; by default the known machine's, else 0."""
     __post_init__ = check_numbers  # type: ignore[misc]
 
 
-PAPER_RECIPE: dict[str, Any] = {"noise": 0.0, "rollout": 1, "dead_zone": 0.0}  # Sec. 3.3
+PAPER_RECIPE: dict[str, Any] = {"noise": 0.0, "rollout": 1, "dead_zone": 0.0, "muon": 0.0}
+"""Sec. 3.3"""

@@ -18,8 +18,10 @@ from tqdm import tqdm
 from brokk_min.actuator import ActuatorNet, mu_law
 from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
 from brokk_min.identification.logs import Log, join_recordings
+from brokk_min.identification.muon import Muon
 from brokk_min.identification.net_file import STATISTICS
-from brokk_min.machine import Array, estimate_velocity
+from brokk_min.kinematics import estimate_velocity
+from brokk_min.machine import Array
 
 __all__ = ["PAPER_RECIPE", "FitConfig", "fit"]
 
@@ -27,7 +29,7 @@ __all__ = ["PAPER_RECIPE", "FitConfig", "fit"]
 def fit(
     log: Log, config: FitConfig, seed: int, velocity_samples: int, machine: str = ""
 ) -> ActuatorNet:
-    """Fit one net per joint to a log. Paper: Sec. 3.3 (MSE, Adam)
+    """Fit one net per joint to a log. Paper: Sec. 3.3 (MSE; Adam, ours with Muon)
 
     `seed` repeats the nets to the bit on one computer; `velocity_samples` is the window of the
     estimator that made the velocities of `log`; `machine` is a name, for the file.
@@ -117,8 +119,13 @@ def train(data: TrainingSet, config: FitConfig, seed: int, estimator: int | None
     torch.set_num_threads(1)  # several wait in vain on busy cores
     generator = Generator().manual_seed(seed)
     weights = initial_weights(len(data.windows), config, generator)
-    decay = config.weight_decay  # 0: Adam
-    optimizer = torch.optim.AdamW(weights, lr=config.learning_rate, weight_decay=decay)
+    optimizer: torch.optim.Optimizer = torch.optim.AdamW(
+        weights, lr=config.learning_rate, weight_decay=config.weight_decay
+    )
+    if config.muon:
+        optimizer = Muon(
+            weights, config.learning_rate, config.weight_decay, config.muon, stacks=True
+        )
     multi_step = config.rollout > 1 and all(map(len, data.multi_step_windows))
     switch_step = round(0.65 * config.steps) if multi_step else config.steps
     schedule = torch.optim.lr_scheduler.LambdaLR(

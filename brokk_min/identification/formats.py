@@ -164,6 +164,7 @@ FAMILY_MEMBER: Fields = {
     "on_nets": {"*": Field("float", 0)},
     "loaded": {"*": Field("float", 0)},
     "best": {"*": Field("text", 1, 100)},
+    "dither": Field("float", 0, 0.5),
 }
 
 

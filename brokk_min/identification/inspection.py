@@ -9,7 +9,7 @@ Recordings of slow ramps (`collect --excitation ramp`), if a log has any, give t
 there the delay hardly counts, and the curve beyond, such as a pump that starves, does not.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import product
 from typing import Any
 
@@ -280,9 +280,22 @@ def fields(reports: dict[str, JointReport], machine: Machine) -> dict[str, Any]:
     return {
         "dead_zone": min(zones),
         "largest_dead_zone": max(zones),
+        "dead_zone_up": {k: r.dead_zone_up for k, r in known.items()},
+        "dead_zone_down": {k: r.dead_zone_down for k, r in known.items()},
         "q_dot_up": {k: r.gain_up * max(limit - r.dead_zone_up, 0) for k, r in known.items()},
         "q_dot_down": {k: r.gain_down * max(limit - r.dead_zone_down, 0) for k, r in known.items()},
     }
+
+
+def with_dead_zones(machine: Machine, log: Log) -> Machine:
+    """The machine with the dead zones by joint and direction that a log of it shows."""
+    found = fields(inspect(log), machine)
+    joints = []
+    for joint in machine.joints:
+        zones = {side: found[side][joint.name] for side in ("dead_zone_up", "dead_zone_down")}
+        joints.append(replace(joint, **zones))
+    least, most = found["dead_zone"], found["largest_dead_zone"] + 0.05  # see docs/porting.md
+    return replace(machine, joints=tuple(joints), dead_zone=least, largest_dead_zone=most)
 
 
 def report_json(log: Log, machine: Machine | None = None) -> dict[str, Any]:

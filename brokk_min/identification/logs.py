@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from brokk_min.identification import files
 from brokk_min.identification.files import Floats, brief
 from brokk_min.identification.formats import LOG, check_columns
-from brokk_min.machine import Array, Machine, estimate_velocity
+from brokk_min.kinematics import estimate_velocity
+from brokk_min.machine import Array, Machine
 
 RATE = 20.0  # Hz, paper: everything runs at 20 Hz; other machines have others
 MAX_GAP = 0.25  # s, or 2.5 samples, assumed: a longer gap starts a new recording

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 
 from brokk_min.actuator import lever_arm
 from brokk_min.kinematics import cross, forward_kinematics
-from brokk_min.machine import Array, Joint, Machine, check_numbers, number
+from brokk_min.machine import Array, Joint, Machine, check_numbers, number, valve_opening
 
 G = 9.81  # m/s^2
 STANDING = 1e-4  # m/s, assumed: a slower cylinder stands
@@ -101,7 +101,7 @@ def euler_step(
     m, dt, s, v = machine, machine.plant_dt, state.s, state.v
     viscous = 1 + physics.cold * (1 - state.warmth)
     play_next = play(state.play, u, physics.hysteresis)
-    opening = asymmetric_opening(play_next, dead_zones(physics, m))
+    opening = valve_opening(play_next, physics.dead_zones or m.dead_zones)
     s_next = s + dt * (opening - s) / (m.tau_spool * viscous)  # ds/dt = (x - s) / tau_s
     open_valve = np.abs(s) > m.spool_threshold
     tau = np.where(open_valve > state.z, m.tau_valve_up, m.tau_valve_down)
@@ -159,17 +159,6 @@ def load_factor(load: Array, s: Array) -> Array:
         array([1.   , 0.9  , 1.091])
     """
     return np.sqrt(np.clip(1 - np.sign(s) * load, 0.04, 2.25))
-
-
-def asymmetric_opening(u: Array, zones: Array) -> Array:
-    """`valve_opening` with dead zones up and down by joint: u (..., n), zones (n, 2)."""
-    up, down = zones.T
-    return np.asarray(np.maximum(u - up, 0) / (1 - up) - np.maximum(-u - down, 0) / (1 - down))
-
-
-def dead_zones(physics: Physics, machine: Machine) -> Array:
-    """Dead zones up and down (n, 2) of full command."""
-    return np.array(physics.dead_zones or [[machine.dead_zone] * 2] * machine.n)
 
 
 def play(behind: Array, ahead: Array, half: float) -> Array:

@@ -22,14 +22,15 @@ from brokk_min import ppo
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import State, TaskConfig, observation_scale, terminated
 from brokk_min.identification import files
+from brokk_min.identification.muon import Muon
 from brokk_min.identification.net_file import fingerprint
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import Policy, contract, save_policy
-from brokk_min.learning.simulation_gradient import improved_actions, regression_loss
+from brokk_min.learning.simulation_gradient import improved_actions, make_learner, regression_loss
 from brokk_min.machine import Machine
 from brokk_min.ppo import Agent, Learner, PPOConfig, Rollout
 
-FORMAT = 5  # of checkpoints
+FORMAT = 6  # of checkpoints
 LEARNER = ("obs", "learning_rate", "global_step", "updates")  # attributes in checkpoints
 STATE = [field.name for field in fields(State) if field.name != "plant"]
 
@@ -78,7 +79,10 @@ def train_policy(
         config = replace(config, log_std_end=None)
     about = describe_training(machine, net, task, config, critic, seed)
     env = TaskVectorEnv(config.num_envs, net, machine, task)
-    learner = ppo.make_learner(env, config, seed, critic)
+    if critic:
+        learner = ppo.make_learner(env, config, seed, critic)
+    else:
+        learner = make_learner(env, config, seed)
     if start:
         about["start"] = load_actor(learner.agent, start)
     stagger_episodes(env)
@@ -269,7 +273,8 @@ class TrainingLog:
             for i in content["optimizer"]["state"]:
                 parameter = parameters[i].detach()
                 moments[i] = {"step": torch.zeros(()), "exp_avg": parameter}
-                moments[i]["exp_avg_sq"] = parameter
+                if not (isinstance(learner.optimizer, Muon) and parameter.ndim > 1):
+                    moments[i]["exp_avg_sq"] = parameter
             like["optimizer"]["state"] = moments
             wanted = {"content": kinds(like)}
             files.expect_same(self.checkpoint, {"content": kinds(content)}, wanted)

@@ -23,7 +23,7 @@ from brokk_min.machine import Array, Machine
 PAPER_TASK: dict[str, Any] = {"hold_min_s": 2.0, "hold_max_s": 6.0}
 # Settings for gradients of the simulation that differ from `ppo.PPOConfig`; D10 has the search.
 GRADIENT_LEARNER: dict[str, Any] = {
-    "total_steps": 3_000_000,
+    "total_steps": 2_000_000,
     "minibatch_size": 512,
     "learning_rate": 4e-3,
     "target_kl": 1e9,  # keep the learning rate

@@ -7,19 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from brokk_min.actuator import DITHER, REST_AFTER
+from brokk_min.actuator import REST_AFTER
 from brokk_min.env import COMPENSATION
 from brokk_min.identification.files import require, whole_file
 from brokk_min.learning.policy import Policy
-from brokk_min.machine import Array
+from brokk_min.machine import Array, Machine
 
 
-def export_onnx(path: Path, policy: Policy) -> None:
+def export_onnx(path: Path, policy: Policy, machine: Machine) -> None:
     """Write a policy as one ONNX file: `observation` (batch, obs) in, `action` out.
 
     The other program does the rest, with the numbers in the metadata: `env.action_to_pwm`
     (`dead_zone`, `pwm_limit`, `ramp`), and after `rest_s` of a zero goal (null: never) the rule of
-    `actuator.command_at_rest`: valves alternate by `rest_opening`, 0 for closed ones.
+    `actuator.command_at_rest`: valves alternate by `rest_opening` beyond `rest_zones`, up and down
+    by joint; 0 for closed ones.
     ValueError: the package onnx is not installed.
     """
     helper = require("onnx.helper", "export")
@@ -36,7 +37,8 @@ def export_onnx(path: Path, policy: Policy) -> None:
         "scale": policy.scale.tolist(),
         "ramp": COMPENSATION,
         "rest_s": None if policy.valves == "open" else REST_AFTER[policy.valves],
-        "rest_opening": DITHER if policy.valves == "dither" else 0.0,
+        "rest_zones": machine.dead_zones.tolist(),
+        "rest_opening": machine.dither if policy.valves == "dither" else 0.0,
     }
     helper.set_model_props(model, {name: json.dumps(value) for name, value in metadata.items()})
     require("onnx.checker", "export").check_model(model, full_check=True)

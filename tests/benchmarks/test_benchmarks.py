@@ -22,7 +22,7 @@ from benchmarks import (
 )
 from brokk_min import kinematics
 from brokk_min.env import action_to_pwm
-from brokk_min.evaluation import metrics, reproduce, sequences
+from brokk_min.evaluation import learn, metrics, sequences
 from brokk_min.evaluation.sequences import hold_table
 from brokk_min.identification.files import SHIPPED
 from brokk_min.identification.logs import read_log
@@ -66,13 +66,13 @@ def test_limits__are_measured(tmp_path):
 
 def test_seeds__score_what_the_folder_has(tmp_path, capsys, monkeypatch):
     """The shipped policy as one seed, not trained again, and the baselines; in one process."""
-    monkeypatch.setattr(reproduce, "cpu_count", lambda: 1)
+    monkeypatch.setattr(learn, "cpu_count", lambda: 1)
     (tmp_path / "seed_0").mkdir()
     for name in ("net.npz", "policy.npz"):
         copyfile(SHIPPED / "brokk170/policy.npz", tmp_path / "seed_0" / name)
     seeds.main(seeds.Options(tmp_path, 1, ("rl",), quick=True))
     rows = json.loads((tmp_path / "seeds.json").read_text())
-    assert [row["seed"] for row in rows] == [0, 0, *[None] * 5]
+    assert [row["seed"] for row in rows] == [0, 0, None, None, 0, 0, 0]
     assert all(0.005 < row["error"] < 0.03 and row["jerk"] > 1 for row in rows)
     assert "jacobian_pid_ff_integral" in capsys.readouterr().out
 

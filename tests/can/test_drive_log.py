@@ -25,7 +25,8 @@ from brokk_min.can.drive_log import (
     read_frames,
     replay,
 )
-from brokk_min.machine import BROKK_170, estimate_velocity
+from brokk_min.kinematics import estimate_velocity
+from brokk_min.machine import BROKK_170
 
 STEP = BROKK_170.encoder_step[0]
 

@@ -3,22 +3,23 @@
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
-from brokk_min.evaluation import family, reproduce, sequences
+from brokk_min.evaluation import family, learn, sequences
 from brokk_min.evaluation.family import run_family, show, summary
-from brokk_min.evaluation.reproduce import Budget
+from brokk_min.evaluation.learn import Budget
 from brokk_min.machine import BROKK_170
 
 COARSE = replace(BROKK_170, rate=10.0, plant_dt=0.05)  # two Euler steps a tick: fast
-TINY = Budget(0.01, 20, 2048, 2048, 1, 1, 4, 2, 3.0)
+TINY = Budget(0.01, 20, 2048, 20, 2048, 2048, 1, 1, 4, 2, 3.0)
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("family")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(reproduce, "cpu_count", lambda: 1)  # one process: fast
+        patch.setattr(learn, "cpu_count", lambda: 1)  # one process: fast
         short = sequences.shorten(COARSE, sequences.task_sequences(COARSE), 4.0)
         patch.setattr(sequences, "task_sequences", lambda machine: short)
         return folder, run_family(COARSE, [2], folder, TINY)
@@ -35,12 +36,22 @@ def test_run_family__has_each_member_and_each_policy_on_each(made):
             own = [name for name in pids if name.endswith("_dither") == bool(ending)]
             assert row["error"][best] == min(row["error"][name] for name in own)
         assert set(row["free_run"]) == {"q1", "q3", "q4", "q5"}
+        assert row["dither"] in family.DITHERS
         assert results["transfers"][i][i] == pytest.approx(row["error"]["rl"])
         files = {path.name for path in (folder / f"member_{row['seed']}").iterdir()}
         assert {"log.npz", "net.npz", "policy.npz", "gains.json", "member.json"} <= files
     text = show(results)
     assert "rl_dither to_best: median" in text
     assert text.count("\n") == 1 + 2 + 8 + 1
+
+
+def test_known_machine__has_the_plants_dead_zones_by_its_ramps_alone():
+    """Hysteresis of 0.02, so zones come late by up to that."""
+    machine = family.known_machine(BROKK_170, 5)
+    late = machine.dead_zones - np.array(machine.plant.dead_zones)
+    assert np.abs(late).max() < 0.02
+    assert machine.largest_dead_zone == pytest.approx(machine.dead_zones.max() + 0.05)
+    assert machine.dead_zone == machine.dead_zones.min()
 
 
 def test_run_member__is_not_run_again_and_refuses_another_budget(made):

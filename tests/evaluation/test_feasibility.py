@@ -85,7 +85,7 @@ def test_speed_limits__are_where_the_plant_settles(machine, data):
     side = data.draw(st.sampled_from([0, 1]))
     u = np.zeros(machine.n)
     u[joint] = (2 * side - 1) * machine.pwm_limit / 127
-    opening = valve_opening(u, machine.dead_zone)
+    opening = valve_opening(u, machine.dead_zones)
     state = plant_reset(machine, low + (0.05 if side else 0.95) * (high - low))
     speed = np.where(side, machine.column("speed_positive"), -machine.column("speed_negative"))
     state = state._replace(z=np.ones(machine.n), s=opening, v=speed * np.abs(opening))

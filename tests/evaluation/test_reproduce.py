@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from helpers_cli import run
 
-from brokk_min.evaluation import baselines, figures, report, reproduce
+from brokk_min.evaluation import baselines, figures, learn, report, reproduce
 from brokk_min.evaluation.baselines import TUNED
 from brokk_min.evaluation.claims import VERDICTS
-from brokk_min.evaluation.reproduce import Budget
+from brokk_min.evaluation.learn import Budget
 from brokk_min.evaluation.robustness import ROBUST, variations
 from brokk_min.evaluation.sequences import task_sequences
 from brokk_min.identification.files import SHIPPED
@@ -24,7 +24,7 @@ from brokk_min.learning.policy import POLICIES, load_policy
 from brokk_min.machine import BROKK_170
 
 COARSE = replace(BROKK_170, rate=10.0, plant_dt=0.05)  # two Euler steps a tick: fast
-TINY = Budget(0.004, 20, 4096, 4096, 1, 1, 4, 2, 0.5)
+TINY = Budget(0.004, 20, 4096, 20, 4096, 4096, 1, 1, 4, 2, 0.5)
 ERROR = "velocity_error_mean"
 PIDS = ["jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff"]
 PIDS += ["jacobian_pid_ff_integral", "jacobian_pid_ff_integral_dither"]
@@ -44,7 +44,7 @@ def folder(tmp_path_factory):
     """What one run of the chain wrote, in one process."""
     out = tmp_path_factory.mktemp("a b") / "new"  # a space in the path
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(reproduce, "cpu_count", lambda: 1)
+        patch.setattr(learn, "cpu_count", lambda: 1)
         patch.setattr(figures, "png", coarse_png)
         reproduce.reproduce(COARSE, out, TINY, 3)
     return out
@@ -58,16 +58,16 @@ def results(folder):
 @pytest.mark.parametrize("name", POLICIES)
 def test_settings__made_the_shipped_policies(name):
     recorded = load_policy(SHIPPED / "brokk170" / POLICIES[name], BROKK_170).training
-    task, learner = reproduce.settings(name, Budget())
+    task, learner = learn.settings(name, Budget())
     assert recorded["task"] == asdict(task)
     assert recorded["settings"] == asdict(learner) | {"critic": name == "rl_paper"}
 
 
 def test_reproduce__gives_the_same_bits_twice(folder, tmp_path, monkeypatch, capsys):
     """The second time by its command, as `--quick`, with trainings and tunings side by side."""
-    cores = iter([1, 2])  # of the fits, of the trainings
-    monkeypatch.setattr(reproduce, "cpu_count", lambda: next(cores, 1))
-    monkeypatch.setattr(reproduce, "QUICK", TINY)
+    cores = iter([2])  # of fits, trainings and tunings
+    monkeypatch.setattr(learn, "cpu_count", lambda: next(cores, 1))
+    monkeypatch.setattr(learn, "QUICK", TINY)
     monkeypatch.setattr(report, "write_report", lambda *_: None)  # once is enough
     (tmp_path / "m.py").write_text(
         "from dataclasses import replace\nfrom brokk_min import BROKK_170\n"
@@ -79,9 +79,8 @@ def test_reproduce__gives_the_same_bits_twice(folder, tmp_path, monkeypatch, cap
     for name in ("log.npz", "net.npz", "policy.npz", "gains.json", "results.json"):
         assert (folder / name).read_bytes() == (tmp_path / name).read_bytes(), name
     clock = json.loads((folder / "timing.json").read_text())
-    trained = [f"train {name}" for name in ("rl_paper", "rl")]
-    stages = ["record", "fit net", "fit net_paper", "fit", *trained]
-    stages += [*(f"tune {name}" for name in TUNED), "train and tune"]
+    stages = ["record", "fit net_paper", "first round", "train rl_paper", "fit net", "train rl"]
+    stages += [*(f"tune {name}" for name in TUNED), "learn and tune"]
     scores = ["changed machines", "perfect_model", "perfect_model_closed"]
     stages += [f"score {name}" for name in scores]
     stages += ["score", "score for the regret", "score near singularities", "evaluate", "draw"]

@@ -15,7 +15,8 @@ import torch
 
 import exercises
 from brokk_min import actuator, env, jacobian, kinematics
-from brokk_min.machine import decode_pwm, encode_pwm, estimate_velocity
+from brokk_min.kinematics import estimate_velocity
+from brokk_min.machine import decode_pwm, encode_pwm
 from exercises.__main__ import FILES, main
 from exercises.hunt import bugs
 from exercises.verdict import judge

@@ -76,10 +76,13 @@ def test_load__slows_the_lift_and_speeds_the_fall():
     assert steady_speed(heavier, 0.4, 2) < steady_speed(loaded, 0.4, 2)
 
 
-def test_asymmetric_opening__has_a_dead_zone_for_each_direction():
-    u = np.array([[0.15, 0.55, -0.15, -0.6], [0.15, 0.55, -0.15, -0.6]])
-    opening = physics.asymmetric_opening(u.T, np.array([[0.1, 0.2], [0.0, 0.0]]))
-    np.testing.assert_allclose(opening.T, [[0.05 / 0.9, 0.5, 0, -0.5], u[1]])
+def test_dead_zones__are_the_plants_own_whatever_the_machine_says():
+    zones = ((0.1, 0.2),) * 5
+    machine = replace(BROKK_170, plant=Physics(dead_zones=zones))
+    for level, opening in ((0.15, 0.05 / 0.9), (-0.15, 0.0), (-0.6, -0.5)):
+        assert drive(machine, constant(level, 2, 40))[-1].s[2] == pytest.approx(opening, abs=1e-4)
+    known = replace(BROKK_170, plant=Physics())
+    assert drive(known, constant(0.15, 2, 40))[-1].s[2] == pytest.approx(0.08 / 0.93, abs=1e-4)
 
 
 def test_hysteresis__leaves_the_spool_open_behind_a_falling_command():

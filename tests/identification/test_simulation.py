@@ -15,7 +15,8 @@ from brokk_min.identification.simulation import (
     step_velocity,
     steps,
 )
-from brokk_min.machine import BROKK_170, estimate_velocity
+from brokk_min.kinematics import estimate_velocity
+from brokk_min.machine import BROKK_170
 
 LOW, HIGH = BROKK_170.column("q_min"), BROKK_170.column("q_max")
 

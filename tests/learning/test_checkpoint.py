@@ -266,7 +266,7 @@ def test_train_policy__wants_checkpoint_and_curve_of_this_version(broken):
     good = checkpoint.read_bytes()
     content = torch.load(checkpoint, weights_only=True)
     torch.save(content | {"header": '{"format": 0, "identity": {}}'}, checkpoint)
-    with pytest.raises(ValueError, match=r"p\.npz\.checkpoint: format: expected 5, got 0"):
+    with pytest.raises(ValueError, match=r"p\.npz\.checkpoint: format: expected 6, got 0"):
         run(broken, resume=True)
     checkpoint.write_bytes(good)
     broken.with_name("p.npz.csv").unlink()

@@ -21,7 +21,7 @@ def policy():
 @pytest.mark.parametrize("batch", [1, 256])
 def test_export_onnx__computes_the_actions_of_the_policy(batch, policy, tmp_path):
     onnxruntime = pytest.importorskip("onnxruntime")
-    export_onnx(tmp_path / "p.onnx", policy)
+    export_onnx(tmp_path / "p.onnx", policy, BROKK_170)
     session = onnxruntime.InferenceSession(tmp_path / "p.onnx", providers=["CPUExecutionProvider"])
     rng = np.random.default_rng(1)
     obs = rng.normal(0, 1.5, (batch, len(policy.mean))).astype(np.float32)
@@ -35,7 +35,7 @@ def test_export_onnx__computes_the_actions_of_the_policy(batch, policy, tmp_path
 
 def test_export_onnx__is_one_file_with_what_the_other_program_needs(policy, tmp_path):
     onnx = pytest.importorskip("onnx")
-    export_onnx(tmp_path / "p.onnx", policy)
+    export_onnx(tmp_path / "p.onnx", policy, BROKK_170)
     model = onnx.load(tmp_path / "p.onnx")
     assert not [tensor for tensor in model.graph.initializer if tensor.external_data]
     assert [node.op_type for node in model.graph.node] == ["Gemm", "Elu"] * 3 + ["Gemm"]
@@ -45,6 +45,6 @@ def test_export_onnx__is_one_file_with_what_the_other_program_needs(policy, tmp_
     for name in ("mean", "scale"):
         np.testing.assert_array_equal(np.float32(metadata.pop(name)), getattr(policy, name))
     assert (metadata.pop("ramp"), metadata.pop("rest_s")) == (COMPENSATION, REST_AFTER["closed"])
-    assert metadata.pop("rest_opening") == 0
+    assert (metadata.pop("rest_opening"), metadata.pop("rest_zones")) == (0, [[0.07, 0.07]] * 5)
     assert metadata == dict(policy.contract)
     assert metadata["driven"] == ["q1", "q3", "q4", "q5"] and metadata["rate"] == 20.0

@@ -57,11 +57,14 @@ def moving_case(machine, seed):
     """Nets in double precision, a state in motion and commands, no joint near its limits."""
     rng = np.random.default_rng(seed)
     net = small_net(machine, rng)
+    # 3/8 of the range lie before each joint, at least
+    room = (machine.column("q_max") - machine.column("q_min"))[machine.driven] / 3
+    fastest = room / ((15 + TICKS) * machine.dt)
     net = replace(
         net,
         weights=tuple(weight.astype(float) for weight in net.weights),
-        output_low=0.3 * net.output_low,
-        output_high=0.3 * net.output_high,
+        output_low=np.maximum(0.3 * net.output_low, -fastest),
+        output_high=np.minimum(0.3 * net.output_high, fastest),
         dead_zone=machine.dead_zone * (seed % 2),  # 0: commands as they are
     )
     middle = (machine.column("q_min") + machine.column("q_max")) / 2
@@ -108,7 +111,7 @@ def finite_differences(machine, net, start, commands, gamma, figure):
     states = simulate(machine, net, start, commands)
     discounts = gamma ** np.arange(TICKS)[:, None]
     result = np.zeros((*commands.shape[:2], len(machine.driven)))
-    step = 1e-5
+    step = 1e-6  # smaller than the way to most kinks of the nets
     for t in range(TICKS):
         for k, joint in enumerate(machine.driven):
             sums = []

@@ -146,7 +146,9 @@ def slow_plant(machine: Machine, q: list[float], commands: np.ndarray) -> list[d
         flow = sum(abs(j.cylinder_area * v) for j, v in zip(m.joints, goal, strict=True))
         pump = 1.0 if flow == 0 else min(1.0, m.pump_flow / flow)
         for i, (joint, x) in enumerate(zip(m.joints, joints, strict=True)):
-            us = math.copysign(max(0.0, (abs(a[i]) - m.dead_zone) / (1 - m.dead_zone)), a[i])
+            zone = joint.dead_zone_up if a[i] > 0 else joint.dead_zone_down
+            zone = m.dead_zone if zone is None else zone
+            us = math.copysign(max(0.0, (abs(a[i]) - zone) / (1 - zone)), a[i])
             zt = 1.0 if abs(x["s"]) > m.spool_threshold else 0.0
             tau = m.tau_valve_up if zt > x["z"] else m.tau_valve_down
             if joint.cylinder_base:
@@ -388,3 +390,19 @@ def test_command_at_rest__has_a_rule_for_driven_joints_until_the_next_goal(valve
     assert first[after : after + 3, 0].tolist() == rule
     assert not first[after:, 1].any()  # q2 is locked
     assert (first[:, 2:] == first[:, :1]).all()
+
+
+def test_command_at_rest__opens_each_valve_beyond_its_own_dead_zone():
+    """127 (0.12 + 0.88 x 0.05) are 21 counts up, 127 (0.07 + 0.93 x 0.05) are 15 down."""
+    last = replace(BROKK_170.joints[-1], dead_zone_up=0.12)
+    joints = (*BROKK_170.joints[:-1], last)
+    machine = replace(BROKK_170, name="own zones", joints=joints, dither=0.05)
+    for ticks, counts in ((2, -15), (3, 21)):
+        before = np.array([ticks])
+        u, *_ = command_at_rest(machine, "dither", np.zeros((1, 5)), np.zeros((1, 3)), before)
+        assert np.rint(127 * u[0]).tolist() == [
+            np.sign(counts) * 15,
+            0,
+            *[np.sign(counts) * 15] * 2,
+            counts,
+        ]

@@ -31,13 +31,14 @@ from brokk_min.env import (
     update_history,
 )
 from brokk_min.kinematics import (
+    estimate_velocity,
     forward_kinematics,
     jacobian,
     lowest_point,
     tool_position,
     tool_velocity,
 )
-from brokk_min.machine import BROKK_170, estimate_velocity, read_encoder
+from brokk_min.machine import BROKK_170, read_encoder
 
 ZERO = np.zeros(3, np.float32)
 DRIVEN = [0, 2, 3, 4]

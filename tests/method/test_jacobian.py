@@ -300,6 +300,17 @@ def test_controller__adds_the_opening_of_the_feedforward():
     np.testing.assert_array_equal(calls[0][1], state.q_dot_goal)
 
 
+def test_controller__opens_each_valve_beyond_its_own_dead_zone():
+    joints = [replace(joint, dead_zone_up=0.1, dead_zone_down=0.2) for joint in BROKK_170.joints]
+    machine = replace(BROKK_170, name="own zones", joints=tuple(joints))
+    c = controller(machine=machine, kp=1.5)
+    u, _ = c(measured(POSE, GOAL, machine=machine), c.start(1))
+    opening = 1.5 * np.linalg.pinv(J) @ GOAL
+    assert (opening > 0.01).any() and (opening < -0.01).any()
+    expected = np.where(opening > 0, 0.1 + 0.9 * opening, -0.2 + 0.8 * opening)
+    np.testing.assert_allclose(u[0, DRIVEN], np.rint(127 * expected) / 127, atol=1e-9)
+
+
 def test_controller__of_a_batch_is_that_of_its_rows():
     rng = np.random.default_rng(4)
     c = controller(w0=0.5, kp=1.0, ki=3.0, kd=0.05, feedback=0.3)

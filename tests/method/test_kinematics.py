@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 from helpers_machines import POSE, closed_form
 from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
 from scipy.linalg import expm
-from strategies import posed, poses
+from strategies import posed, poses, reals
 
 from brokk_min.kinematics import (
     cross,
+    estimate_velocity,
     forward_kinematics,
     jacobian,
     lowest_point,
@@ -132,3 +135,45 @@ def test_forward_kinematics__refuses_angles_of_another_machine(shape):
     with pytest.raises(ValueError) as caught:
         forward_kinematics(BROKK_170, np.zeros(shape))
     assert str(caught.value) == f"q: expected (..., 5), got {shape}"
+
+
+# --- velocity of joints ---------------------------------------------------------------------------
+
+
+@given(
+    st.integers(2, 8).flatmap(
+        lambda samples: st.tuples(
+            st.just(samples), npst.arrays(np.float64, (3, samples + 4), elements=reals(-3, 3))
+        )
+    )
+)
+def test_velocity_is_the_least_squares_slope_and_forgets_what_is_older(case):
+    samples, q = case
+    q.setflags(write=False)
+    velocity = estimate_velocity(q, samples, 0.05)
+    time = 0.05 * np.arange(samples)
+    fitted = [np.polyfit(time, row[-samples:], 1)[0] for row in q]
+    np.testing.assert_allclose(velocity, fitted, atol=1e-8)
+    other = q.copy()
+    other[:, :4] = 1e6
+    np.testing.assert_array_equal(estimate_velocity(other, samples, 0.05), velocity)
+    assert estimate_velocity(q.astype(np.float32), samples, 0.05).dtype == np.float32
+
+
+def test_velocity_by_hand():
+    # newest of four samples moved one count: 1.5 / 5 counts a tick; two samples: one count a tick
+    step = BROKK_170.encoder_step[0]
+    q = np.array([0.0, 0.0, 0.0, step])
+    assert estimate_velocity(q, 4, 0.05) == pytest.approx(0.3 * step / 0.05)
+    assert estimate_velocity(q, 2, 0.05) == pytest.approx(0.0307, abs=1e-4)
+    assert estimate_velocity(q.astype(np.float32), 4, 0.05).dtype == np.float32
+    slope = estimate_velocity([0, 3, 6, 9], samples=4, dt=0.07)  # whole numbers
+    assert slope == pytest.approx(3 / 0.07)
+
+
+@pytest.mark.parametrize(("samples", "length"), [(4, 3), (1, 5), (0, 5), (2, 1)])
+def test_too_few_samples_are_refused(samples, length):
+    with pytest.raises(ValueError) as caught:
+        estimate_velocity(np.zeros((2, length)), samples, 0.05)
+    expected = f"q: expected at least {max(2, samples)} samples, got (2, {length})"
+    assert str(caught.value) == expected

@@ -24,9 +24,9 @@ from brokk_min.machine import (
     Machine,
     decode_pwm,
     encode_pwm,
-    estimate_velocity,
     limit_command,
     read_encoder,
+    valve_command,
     valve_opening,
 )
 
@@ -90,6 +90,8 @@ OUTSIDE = {  # numbers beyond the ends of the range of each field
     **dict.fromkeys(POSITIVE.split(), (0.0, -0.01)),
     **dict.fromkeys(("encoder_node", "controller_node", "pwm_limit"), (0, 128)),
     **dict.fromkeys(("dead_zone", "largest_dead_zone", "valve_threshold"), (-0.01, 1.0)),
+    **dict.fromkeys(("dead_zone_up", "dead_zone_down"), (-0.01, 1.0)),
+    "dither": (-0.01, 0.51),
     "spool_threshold": (-0.1, 1.1),
     "plant_dt": (0.0, 1.1),
     "encoder_step": (0.0, 1.1),
@@ -106,7 +108,9 @@ def test_each_number__is_refused_outside_its_range_and_where_it_is_none(name):
     of_joint = name in {field.name for field in dataclasses.fields(Joint)}
     whole = dict(numeric_fields())[name].type == "int"
     kind = f"expected a {'whole' if whole else 'finite'} number"
-    no_number = (NAN, INF, -INF, "1", None, True, np.zeros(2), *[0.5] * whole)
+    no_number = [NAN, INF, -INF, "1", None, True, np.zeros(2), *[0.5] * whole]
+    if "None" in dict(numeric_fields())[name].type:
+        no_number.remove(None)
     for value, words in (*product(OUTSIDE[name], [" to "]), *product(no_number, [kind])):
         with pytest.raises(ValueError) as caught:
             changed(**with_joint(4, **{name: value}) if of_joint else {name: value})
@@ -137,7 +141,7 @@ def test_values_at_the_ends_of_the_allowed_ranges_are_machines(fields):
 def numeric_fields() -> list[tuple[str, dataclasses.Field]]:
     """By the annotation, so that a number without a unit cannot hide."""
     every = [*dataclasses.fields(Joint), *dataclasses.fields(Machine)]
-    return [(f.name, f) for f in every if f.type in ("float", "int", float, int)]
+    return [(f.name, f) for f in every if f.type in ("float", "int", "float | None")]
 
 
 def test_every_number__has_its_unit_in_the_class_and_its_source_beside_it():
@@ -284,8 +288,6 @@ def test_whole_numbers_are_commands_and_angles_too():
     np.testing.assert_array_equal(
         read_encoder(BROKK_170, [1, 2, 0, 1, 1]), read_encoder(BROKK_170, [1.0, 2.0, 0, 1, 1])
     )
-    slope = estimate_velocity([0, 3, 6, 9], samples=4, dt=0.07)
-    assert slope == pytest.approx(3 / 0.07)
 
 
 def test_valve_opening__by_hand():
@@ -293,9 +295,42 @@ def test_valve_opening__by_hand():
     np.testing.assert_allclose(opening, [-1, 0, 0, 0, 0, 0.5, 1], atol=1e-12)
     assert valve_opening(np.float32([0.5]), 0.0).dtype == np.float32
     assert valve_opening([1, -1, 0], 0.5).tolist() == [1, -1, 0]
+    pairs = [[0.1, 0.2], [0.0, 0.0]]  # up and down, of two joints
+    opening = valve_opening([[0.15, 0.55], [-0.15, -0.6], [-0.6, 0.0]], pairs)
+    np.testing.assert_allclose(opening, [[0.05 / 0.9, 0.55], [0, -0.6], [-0.5, 0]])
 
 
-# --- encoders and velocity ------------------------------------------------------------------------
+@given(machines(), st.floats(-1, 1))
+def test_valve_command__is_the_inverse_of_valve_opening(machine, x):
+    opening = np.full(machine.n, x)
+    command = valve_command(opening, machine.dead_zones)
+    np.testing.assert_allclose(valve_opening(command, machine.dead_zones), opening, atol=1e-12)
+    beyond = np.abs(command) - machine.dead_zones[:, int(x < 0)]
+    assert (beyond >= -1e-12).all() or x == 0
+    assert not valve_command(0 * opening, machine.dead_zones).any()
+
+
+def test_dead_zones__are_each_joints_own_or_the_machines():
+    joints = [replace(joint) for joint in BROKK_170.joints]
+    joints[2] = replace(joints[2], dead_zone_up=0.1)
+    machine = replace(BROKK_170, name="own zones", joints=tuple(joints))
+    expected = np.full((5, 2), 0.07)
+    expected[2, 0] = 0.1
+    np.testing.assert_array_equal(machine.dead_zones, expected)
+    r = machine.joints[2]  # its speed at full command, by that at the limit
+    slow = replace(r, speed_positive=0.0, speed_negative=0.0)
+    completed = replace(machine, joints=(*joints[:2], slow, *joints[3:])).joints[2]
+    limit = 80 / 127
+    assert completed.speed_positive == pytest.approx(r.q_dot_up * 0.30 * 0.9 / (limit - 0.1))
+    assert completed.speed_negative == pytest.approx(r.q_dot_down * 0.30 * 0.93 / (limit - 0.07))
+    joints[2] = replace(joints[2], dead_zone_down=0.05)
+    with pytest.raises(
+        ValueError, match=r"dead_zone: expected at most 0\.05, a joint's, got 0\.07"
+    ):
+        replace(machine, joints=tuple(joints))
+
+
+# --- encoders -------------------------------------------------------------------------------------
 
 
 @given(posed())
@@ -316,40 +351,3 @@ def test_encoder_by_hand():
     # 1 rad = 651.9 counts of 1.53398 mrad
     q = read_encoder(BROKK_170, [1.0, -0.0007, -0.0008, 0.0, 0.0])
     np.testing.assert_allclose(q, [652 * 2 * np.pi / 4096, 0, -0.00153398, 0, 0], rtol=1e-5)
-
-
-@given(
-    st.integers(2, 8).flatmap(
-        lambda samples: st.tuples(
-            st.just(samples), npst.arrays(np.float64, (3, samples + 4), elements=reals(-3, 3))
-        )
-    )
-)
-def test_velocity_is_the_least_squares_slope_and_forgets_what_is_older(case):
-    samples, q = case
-    q.setflags(write=False)
-    velocity = estimate_velocity(q, samples, 0.05)
-    time = 0.05 * np.arange(samples)
-    fitted = [np.polyfit(time, row[-samples:], 1)[0] for row in q]
-    np.testing.assert_allclose(velocity, fitted, atol=1e-8)
-    other = q.copy()
-    other[:, :4] = 1e6
-    np.testing.assert_array_equal(estimate_velocity(other, samples, 0.05), velocity)
-    assert estimate_velocity(q.astype(np.float32), samples, 0.05).dtype == np.float32
-
-
-def test_velocity_by_hand():
-    # newest of four samples moved one count: 1.5 / 5 counts a tick; two samples: one count a tick
-    step = BROKK_170.encoder_step[0]
-    q = np.array([0.0, 0.0, 0.0, step])
-    assert estimate_velocity(q, 4, 0.05) == pytest.approx(0.3 * step / 0.05)
-    assert estimate_velocity(q, 2, 0.05) == pytest.approx(0.0307, abs=1e-4)
-    assert estimate_velocity(q.astype(np.float32), 4, 0.05).dtype == np.float32
-
-
-@pytest.mark.parametrize(("samples", "length"), [(4, 3), (1, 5), (0, 5), (2, 1)])
-def test_too_few_samples_are_refused(samples, length):
-    with pytest.raises(ValueError) as caught:
-        estimate_velocity(np.zeros((2, length)), samples, 0.05)
-    expected = f"q: expected at least {max(2, samples)} samples, got (2, {length})"
-    assert str(caught.value) == expected

@@ -6,7 +6,7 @@ import pytest
 from torch import nn
 
 from brokk_min.env import TaskConfig
-from brokk_min.evaluation import baselines, reproduce
+from brokk_min.evaluation import baselines, learn
 from brokk_min.identification import excitation, fitting, validation
 from brokk_min.machine import BROKK_170
 from brokk_min.ppo import PPOConfig, mlp
@@ -21,7 +21,7 @@ def test_constants__are_the_papers() -> None:
     assert fitting.FitConfig().hidden == 32
     assert TaskConfig().noise == 0.05
     assert PPOConfig().num_envs == 256
-    assert reproduce.Budget().hours == 1.0
+    assert learn.Budget().hours == 1.0
     assert max(validation.HORIZONS) == 30
     layers = [layer.out_features for layer in mlp(7, 1, 1.0) if isinstance(layer, nn.Linear)]
     assert layers == [256, 128, 64, 1]
