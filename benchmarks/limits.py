@@ -131,7 +131,7 @@ def kinematics(options: Options) -> dict[str, float]:
 
 def main(options: Options) -> dict[str, Any]:
     torch.set_num_threads(1)
-    torch.set_float32_matmul_precision("medium")  # as `ppo.make_learner`
+    ppo.use_fast_float32()
     ours = GRADIENT_LEARNER["minibatch_size"]
     adam = partial(torch.optim.Adam, fused=True)  # as `ppo.make_learner`
     result = {
