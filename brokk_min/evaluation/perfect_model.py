@@ -99,9 +99,8 @@ class PerfectModel:
         steady = steady_opening(m, plant.q, goal)[:, None]
         tried = [opening, *(opening + fraction * step for fraction in STEPS)]
         tried.append(np.broadcast_to(steady, opening.shape))
-        plans = np.clip(
-            np.stack(tried, axis=1), *opening_limits(m)
-        )  # (num, plans, horizon, n_driven)
+        low, high = opening_limits(m)
+        plans = np.clip(np.stack(tried, axis=1), low, high)  # (num, plans, horizon, n_driven)
         error = np.linalg.norm(self.errors(plant, self.commands(plans, tick), goal), axis=-1)
         size = np.square(plans).mean(axis=(-1, -2))
         cost = error.mean(axis=-1) + 1e-4 * size  # of equal plans the smaller

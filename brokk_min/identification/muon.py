@@ -62,10 +62,10 @@ class Muon(torch.optim.AdamW):
 
 
 def orthogonalise(M: Tensor) -> Tensor:
-    """Towards U V^T of M = U S V^T, (..., rows, columns): singular values to 0.5 to 1.25, but
-    for tiny ones.
+    """Towards U V^T of M = U S V^T, (..., rows, columns).
 
-    X <- a X + b (X X^T) X + c (X X^T)^2 X maps each singular value s to a s + b s^3 + c s^5.
+    X <- a X + b (X X^T) X + c (X X^T)^2 X maps each singular value s to a s + b s^3 + c s^5. All
+    come to 0.5 to 1.25, but for tiny ones.
     """
     X: Tensor = M / (torch.linalg.matrix_norm(M, keepdim=True) + 1e-7)
     if M.shape[-2] > M.shape[-1]:

@@ -30,7 +30,7 @@ def test_recovery__is_close_for_the_shipped_nets():
     for name, sides in recovery(NET, FOUR).items():
         nets, plant = sides["nets"], sides["plant"]
         assert nets["dead_zone"] == pytest.approx(plant["dead_zone"], abs=0.02), name
-        assert nets["delay"] == pytest.approx(plant["delay"], abs=0.03), name  # a tick is 0.05 s
+        assert nets["delay"] == pytest.approx(plant["delay"], abs=0.02), name
         assert nets["idle"] == pytest.approx(plant["idle"], abs=0.06), name
         assert nets["speed"] == pytest.approx(plant["speed"], rel=0.1), name
     slow = recovery(NET, replace(FOUR, delay=0.2))["q5"]["plant"]

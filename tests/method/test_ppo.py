@@ -440,7 +440,7 @@ def test_train__swings_up_the_pendulum():
         learning_rate=4e-3,
         target_kl=0.3,
         gamma=0.95,
-        total_steps=40_960,
+        total_steps=57_344,
         num_envs=32,
         horizon=32,
         minibatch_size=256,
@@ -450,4 +450,4 @@ def test_train__swings_up_the_pendulum():
     )
     agent = ppo.train(pendulums(32), config, seed=0)
     assert mean_return(agent) > -400
-    assert (agent.log_std < -0.1).all()  # learned, from 0
+    assert (agent.log_std < -0.3).all()  # learned
