@@ -30,7 +30,7 @@ import tyro
 
 from benchmarks import memory, write
 from brokk_min.actuator import plant_reset, plant_step
-from brokk_min.can.drive_log import TelemetryReader, read_frames, status
+from brokk_min.can.drive_log import read_frames, read_telemetry, status
 from brokk_min.can.operator_input import Script
 from brokk_min.can.safety_gate import FROZEN_ANGLE, SLEW, expected_motion, gate_start
 from brokk_min.evaluation.sequences import task_sequences
@@ -146,8 +146,7 @@ def recorded_drives() -> Iterator[tuple[np.ndarray, np.ndarray]]:
             drive.begin()
             drive.run()
             bus.close()
-            reader = TelemetryReader(m)
-            ticks = [tick for frame in read_frames(log) if (tick := reader.update(frame))]
+            ticks = list(read_telemetry(m, read_frames(log)))
             q, u = (np.array([getattr(t, k) for t in ticks if t.driving]) for k in ("q", "u"))
             yield np.rint(q / m.encoder_step).astype(int), np.rint(u * PWM_MAX).astype(int)
 

@@ -138,6 +138,14 @@ class World:
             pass
 
     @property
+    def operator(self):
+        return self.drive.operator
+
+    @property
+    def controller(self):
+        return self.drive.controller
+
+    @property
     def commands(self):
         """Times [s] and commands in force in counts (T, n), by the plant's own record."""
         times, u, *_ = zip(*self.record, strict=True)
@@ -235,29 +243,23 @@ def own_multicast_port(monkeypatch):
 
 
 def dictionary():
-    """As much of CiA 406 as an encoder with one mapped position needs."""
+    """As much of CiA 406 as the program asks of an encoder."""
     u8, u16, u32 = datatypes.UNSIGNED8, datatypes.UNSIGNED16, datatypes.UNSIGNED32
     objects = ObjectDictionary()
-    communication = ODRecord("TPDO1", 0x1800)
-    mapping = ODArray("TPDO1 mapping", 0x1A00)
-    for owner, name, index, sub, kind, value in (
-        (objects, "device type", 0x1000, 0, u32, 406),
-        (objects, "heartbeat", 0x1017, 0, u16, 0),
-        (objects, "position", 0x6004, 0, u32, 0),
-        (objects, "units per revolution", 0x6501, 0, u32, 4096),
-        (communication, "highest", 0x1800, 0, u8, 2),
-        (communication, "identifier", 0x1800, 1, u32, 0x180),
-        (communication, "type", 0x1800, 2, u8, 254),
-        (mapping, "number", 0x1A00, 0, u8, 1),
-        (mapping, "first", 0x1A00, 1, u32, 0x60040020),
+    tpdo = ODRecord("TPDO1", 0x1800)
+    for name, index, sub, kind, value in (
+        ("device type", 0x1000, 0, u32, 406),
+        ("heartbeat", 0x1017, 0, u16, 0),
+        ("transmission type", 0x1800, 2, u8, 254),
+        ("position", 0x6004, 0, u32, 0),
+        ("units per revolution", 0x6501, 0, u32, 4096),
     ):
         entry = ODVariable(name, index, sub)
         entry.data_type = kind
         entry.default = value
-        entry.pdo_mappable = True
-        (owner.add_object if owner is objects else owner.add_member)(entry)
-    objects.add_object(communication)
-    objects.add_object(mapping)
+        (tpdo.add_member if sub else objects.add_object)(entry)
+    objects.add_object(tpdo)
+    objects.add_object(ODArray("TPDO1 mapping", 0x1A00))  # unused: the test sends the positions
     return objects
 
 

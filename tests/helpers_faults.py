@@ -5,7 +5,6 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from functools import partial
-from operator import attrgetter
 from typing import Any, NamedTuple
 
 import can
@@ -20,71 +19,68 @@ SLOW = (15, 0, 15, 15, 15)
 STEP = BROKK_170.encoder_step[0]
 
 
-class Fault:
-    """What goes wrong in a world, from now on."""
-
-    def __init__(self, world, operator, controller):
-        self.world, self.operator, self.controller = world, operator, controller
-
-
 def put(name, value):
-    """Set an attribute of something in the world."""
-    owner, _, attribute = name.rpartition(".")
-    return lambda f: setattr(attrgetter(owner)(f), attribute, value)
+    """Set an attribute of the world, or of something in it."""
+
+    def cause(world):
+        *owners, attribute = name.split(".")
+        for owner in owners:
+            world = getattr(world, owner)
+        setattr(world, attribute, value)
+
+    return cause
 
 
 def up(can_id, act):
     """Change frames of one identifier from the machine."""
-    return put("world.upward", only(can_id, act))
+    return put("upward", only(can_id, act))
 
 
 def up_once(can_id, act):
     """Change the first of them."""
-    return lambda f: up(can_id, once(act))(f)
+    return lambda world: up(can_id, once(act))(world)
 
 
 def down_once(act):
     """Change the first valve frame."""
-    return lambda f: put("world.downward", only(0x210, once(act)))(f)
+    return lambda world: put("downward", only(0x210, once(act)))(world)
 
 
 def moved(add):
     return lambda data: [struct.pack("<I", (struct.unpack("<I", data)[0] + add) % 2**26)]
 
 
-def freeze(f, node, slow=False):
-    f.controller.m[:] = SLOW if slow else f.controller.m
-    counts = np.rint(f.world.simulated.plant.q / STEP).astype(int)
+def freeze(world, node, command=None):
+    world.controller.m[:] = world.controller.m if command is None else command
+    counts = np.rint(world.simulated.plant.q / STEP).astype(int)
     data = struct.pack("<I", encoder_raw(BROKK_170, counts)[node - 1])
-    up(0x180 + node, lambda _: [data])(f)
+    up(0x180 + node, lambda _: [data])(world)
 
 
-def delay(f, node, draw):
+def due(world, held):
+    """Remove and return the frames whose time has come."""
+    frames = [frame for then, frame in held if then <= world.t]
+    held[:] = [item for item in held if item[0] > world.t]
+    return frames
+
+
+def delay(world, node, draw):
     """Positions come `draw()` seconds late."""
-    held = []
-
-    def hold(data):
-        held.append((f.world.t + draw(), data))
-        return []
-
-    def noise():
-        due = [data for then, data in held if then <= f.world.t]
-        held[:] = [item for item in held if item[0] > f.world.t]
-        return [(0x180 + node, data) for data in due]
-
-    up(0x180 + node, hold)(f)
-    f.world.noise = noise
+    tpdo, held = 0x180 + node, []
+    up(tpdo, lambda data: held.append((world.t + draw(), (tpdo, data))) or [])(world)
+    world.noise = lambda: due(world, held)
 
 
-def late(f, node):
+def late(world, node):
     """Constantly late positions, and an operator who presses again and again."""
-    delay(f, node, lambda: 0.030)
-    f.operator.act = lambda: setattr(
-        f.operator, "enable", bool(f.world.drive.gate.driving or not f.operator.enable)
+    operator = world.operator
+    delay(world, node, lambda: 0.030)
+    operator.act = lambda: setattr(
+        operator, "enable", bool(world.drive.gate.driving or not operator.enable)
     )
 
 
-def reorder(f, node):
+def reorder(world, node):
     """Every second position comes after the next one."""
     held = []
 
@@ -94,25 +90,25 @@ def reorder(f, node):
         held.append(data)
         return []
 
-    up(0x180 + node, act)(f)
+    up(0x180 + node, act)(world)
 
 
-def repeat(f, period, frame):
+def repeat(world, period, frame):
     """Somebody else sends `frame(1)`, `frame(2)`, ..., one each `period` [s]."""
-    begun, count = f.world.t, 0
+    begun, count = world.t, 0
 
     def noise():
         nonlocal count
         out = []
-        while begun + period * (count + 1) <= f.world.t:
+        while begun + period * (count + 1) <= world.t:
             count += 1
             out.append(frame(count))
         return out
 
-    f.world.noise = noise
+    world.noise = noise
 
 
-def flood(f, foreign=False, rate=2000):
+def flood(world, foreign=False, rate=2000):
     """Frames of any identifier; pairs of identifier and length that came, and how many exist."""
     rng = np.random.default_rng(0)
     nodes = (1, 2, 3, 4, 5, 16)
@@ -126,23 +122,26 @@ def flood(f, foreign=False, rate=2000):
         seen.add((can_id, len(data)))
         return can_id, data
 
-    repeat(f, 1 / rate, frame)
+    repeat(world, 1 / rate, frame)
     return seen, 9 * len(ids)
 
 
-def request(f, rate):
+def request(world, rate):
     """Somebody else reads the encoders' resolution, by SDO."""
     data = struct.pack("<BHBI", 0x40, 0x6501, 0, 0)
-    repeat(f, 1 / rate, lambda count: (0x601 + count % 5, data))
+    repeat(world, 1 / rate, lambda count: (0x601 + count % 5, data))
 
 
-def second_master(f):
+def foreign_valves(counts, counter):
+    return 0x210, valve_frame([counts, 0, 0, 0, 0], counter % 256, 1).tobytes()
+
+
+def second_master(world):
     """Somebody else sends valid valve frames of his own."""
-    act = lambda k: (0x210, valve_frame([20, 0, 0, 0, 0], k % 256, 1).tobytes())  # noqa: E731
-    repeat(f, 0.05, act)
+    repeat(world, 0.05, lambda count: foreign_valves(20, count))
 
 
-def intruder(f, after):
+def intruder(world, after):
     """Somebody else sends a well-formed frame of 77 counts after each of our frames of an id."""
     counter = 0
 
@@ -153,79 +152,76 @@ def intruder(f, after):
             counter = data[5]
         if can_id == after:
             counter += 1
-            out.append((0x210, valve_frame([77, 0, 0, 0, 0], counter % 256, 1).tobytes()))
-            f.world.put(0x210, out[-1][1])
+            out.append(foreign_valves(77, counter))
+            world.put(*out[-1])
         return out
 
-    f.world.downward = follow
+    world.downward = follow
 
 
 def foreign(can_id, data):
     """One frame of somebody else."""
 
-    def cause(f):
+    def cause(world):
         frames = [(can_id, data)]
-        f.world.noise = lambda: [frames.pop()] if frames else []
+        world.noise = lambda: [frames.pop()] if frames else []
 
     return cause
 
 
-def delay_valve_frames(f, seconds):
+def delay_valve_frames(world, seconds):
     held = []
 
-    def deliver():
-        while held and held[0][0] <= f.world.t:
-            f.world.simulated.receive(Frame(f.world.t, 0x210, held.pop(0)[1]))
+    def noise():
+        for data in due(world, held):
+            world.simulated.receive(Frame(world.t, 0x210, data))
         return []
 
-    f.world.downward = only(0x210, lambda d: held.append((f.world.t + seconds, d)) or [])
-    f.world.noise = deliver
+    world.downward = only(0x210, lambda d: held.append((world.t + seconds, d)) or [])
+    world.noise = noise
 
 
-def repeat_once(f, node, slow=False):
+def repeat_once(world, node, command=COMMAND):
     """The position of the tick before, from now on, without a gap."""
-    f.controller.m[:] = SLOW if slow else COMMAND
+    world.controller.m[:] = command
     held = []
 
     def act(data):
         held.append(data)
         return held[-2:][:1]
 
-    up(0x180 + node, act)(f)
+    up(0x180 + node, act)(world)
 
 
-def drift(f, node, speed):
+def drift(world, node, speed):
     """An encoder that gains `speed` counts a second."""
-    begun = f.world.t
-    up(0x180 + node, lambda data: moved(round(speed * (f.world.t - begun)))(data))(f)
+    begun = world.t
+    up(0x180 + node, lambda data: moved(round(speed * (world.t - begun)))(data))(world)
 
 
-def close_bus(f):
-    f.world.recv = raises(can.CanOperationError("closed"))
-    f.world.send = raises(can.CanOperationError("closed"))
+def close_bus(world):
+    world.recv = world.send = raises(can.CanOperationError("closed"))
 
 
-def send_error(f, valves_only):
-    fail = raises(can.CanOperationError("no buffer space"))
-    f.world.downward = only(0x210, fail) if valves_only else fail
+SEND_ERROR = raises(can.CanOperationError("no buffer space"))
 
 
 def stall(seconds):
-    def cause(f):
+    def cause(world):
         stalls = [seconds]
-        f.controller.act = lambda: f.world.sleep(stalls.pop()) if stalls else None
+        world.controller.act = lambda: world.sleep(stalls.pop()) if stalls else None
 
     return cause
 
 
 def command(joint, value):
-    return lambda f: f.controller.m.__setitem__(joint, value)
+    return lambda world: world.controller.m.__setitem__(joint, value)
 
 
 class Kind(NamedTuple):
     """A fault, and words of the reason that the program gives, or why it cannot find it."""
 
-    cause: Callable[[Fault], Any]
+    cause: Callable[[World], Any]
     words: str
 
 
@@ -250,28 +246,26 @@ FAULTS = {
     "foreign NMT reset of q4": Kind(foreign(0x000, b"\x81\x04"), OTHER_SENDER),
     "foreign NMT stop of the valve controller": Kind(foreign(0x000, b"\x02\x10"), OTHER_SENDER),
     "bus closed": Kind(close_bus, "error (CanOperationError: closed)"),
-    "send error of all frames": Kind(partial(send_error, valves_only=False), "(CanOperationError"),
-    "send error of valve frames": Kind(partial(send_error, valves_only=True), ""),
+    "send error of all frames": Kind(put("downward", SEND_ERROR), "(CanOperationError"),
+    "send error of valve frames": Kind(put("downward", only(0x210, SEND_ERROR)), ""),
     "valve frame lost": Kind(down_once(lambda d: []), NOT_OPERATIONAL),
     "valve frame doubled": Kind(down_once(lambda d: [d, d]), NOT_OPERATIONAL),
     "valve frame's bit flipped": Kind(
         down_once(lambda d: [bytes([d[0] ^ 4, *d[1:]])]), "valve controller"
     ),
     "valve frame cut": Kind(down_once(lambda d: [d[:7]]), NOT_OPERATIONAL),
-    "all valve frames lost": Kind(
-        put("world.downward", only(0x210, lambda d: [])), NOT_OPERATIONAL
-    ),
+    "all valve frames lost": Kind(put("downward", only(0x210, lambda d: [])), NOT_OPERATIONAL),
     "valve frames 60 ms late": Kind(partial(delay_valve_frames, seconds=0.06), NOT_OPERATIONAL),
     "valve frames 100 ms late": Kind(partial(delay_valve_frames, seconds=0.1), NOT_OPERATIONAL),
     "joystick unplugged": Kind(put("operator.alive", False), "operator's device lost"),
     "joystick raises": Kind(put("operator.act", raises(OSError("gone"))), "error (OSError: gone)"),
     "enable released": Kind(put("operator.enable", False), ""),
-    "SIGTERM": Kind(lambda f: f.world.drive.signals.append(15), "stop asked for"),
+    "SIGTERM": Kind(lambda world: world.drive.signals.append(15), "stop asked for"),
     "operator stops": Kind(put("operator.stop", True), "stop asked for"),
-    "clock stepped forward": Kind(put("world.offset", 3600.0), "tick late, or the"),
-    "clock stepped back": Kind(put("world.offset", -3600.0), "tick late, or the"),
+    "clock stepped forward": Kind(put("offset", 3600.0), "tick late, or the"),
+    "clock stepped back": Kind(put("offset", -3600.0), "tick late, or the"),
     "log cannot be written": Kind(
-        put("world.bus.flush", raises(OSError("no space"))), "error (OSError: no space)"
+        put("bus.flush", raises(OSError("no space"))), "error (OSError: no space)"
     ),
     "late tick": Kind(stall(0.08), "tick late"),
     "hang": Kind(stall(0.8), "tick late"),
@@ -283,7 +277,7 @@ FAULTS = {
         put("controller.act", raises(RuntimeError("boom"))), "error (RuntimeError: boom)"
     ),
     "encoders all silent": Kind(
-        put("world.upward", lambda i, d: [] if 0x180 < i < 0x190 else [(i, d)]), "q1: silent"
+        put("upward", lambda i, d: [] if 0x180 < i < 0x190 else [(i, d)]), "q1: silent"
     ),
 }
 for node in range(1, 6):
@@ -316,9 +310,9 @@ MOTION = "it looks like motion, which no other sensor confirms"
 NOT_FOUND = {
     "q2 frozen, the locked joint": Kind(partial(freeze, node=2), "it may stand still"),
     "slow q3 a tick late, without a gap": Kind(
-        partial(repeat_once, node=3, slow=True), "a position has neither time nor number"
+        partial(repeat_once, node=3, command=SLOW), "a position has neither time nor number"
     ),
-    "slow q3 frozen": Kind(partial(freeze, node=3, slow=True), "it takes longer, see below"),
+    "slow q3 frozen": Kind(partial(freeze, node=3, command=SLOW), "it takes longer, see below"),
     "q3 drifts by 60 counts/s": Kind(partial(drift, node=3, speed=60), MOTION),
     "q5 drifts by 400 counts/s": Kind(partial(drift, node=5, speed=-400), MOTION),
     "valve frames 30 ms late": Kind(
@@ -338,16 +332,15 @@ class Outcome(NamedTuple):
     commands: tuple[np.ndarray, np.ndarray]  # `World.commands` since the fault
 
 
-def measure(cause: Callable[[Fault], Any], phase: float, seconds: float = 0.6) -> Outcome:
+def measure(cause: Callable[[World], Any], phase: float, seconds: float = 0.6) -> Outcome:
     """Drive for a second, let it go wrong `phase` [s] after a SYNC, and go on for `seconds`."""
-    operator, controller = HoldingOperator(), ConstantCommand(*COMMAND)
-    world = World(controller, operator)
+    world = World(ConstantCommand(*COMMAND), HoldingOperator())
     world.drive.begin()
     world.run(1.0)
     world.sleep(max(0.0, world.syncs[-1] + phase - world.t))
     assert world.commands[1][-1].tolist() == list(COMMAND), "it drove"
     begun = world.t
-    cause(Fault(world, operator, controller))
+    cause(world)
     world.run(seconds)
     words = world.drive.reason
     world.sleep(max(0.0, begun + seconds + 0.3 - world.t))

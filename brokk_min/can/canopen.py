@@ -53,7 +53,7 @@ class Nodes:
     """Newest positions, heartbeats and states of encoders and valve controller (the last node)."""
 
     def __init__(self, machine: Machine) -> None:
-        nodes = [*(joint.encoder_node for joint in machine.joints), machine.controller_node]
+        nodes = node_numbers(machine)
         self.machine = machine
         self.ours = (NMT, SYNC, *valve_frame_ids(machine))  # only this program sends them
         self.received = 0  # frames of this tick
@@ -115,9 +115,8 @@ class Nodes:
 
 def check_bus(machine: Machine) -> None:
     """ValueError: valve frames without free identifiers, or ticks too long for the watchdog."""
-    ids = valve_frame_ids(machine)
     used = [*used_ids(machine), *(SDO_REQUEST + joint.encoder_node for joint in machine.joints)]
-    taken = [i for i in ids if i > 0x7FF or used.count(i) > 1]
+    taken = [i for i in valve_frame_ids(machine) if i > 0x7FF or used.count(i) > 1]
     if taken:
         got = ", ".join(f"0x{i:03X}" for i in taken)
         expected = "expected an identifier of no other frame"
@@ -135,11 +134,16 @@ def valve_frame_ids(machine: Machine) -> list[int]:
     return [machine.valve_frame_id + k for k in range(-(-machine.n // JOINTS_A_FRAME))]
 
 
+def node_numbers(machine: Machine) -> list[int]:
+    """The encoders of the joints, and the valve controller at last."""
+    return [*(joint.encoder_node for joint in machine.joints), machine.controller_node]
+
+
 def used_ids(machine: Machine) -> list[int]:
     """CAN identifiers of all frames that concern the program that drives."""
-    nodes = [*(joint.encoder_node for joint in machine.joints), machine.controller_node]
     bases = (TPDO1, SDO_ANSWER, HEARTBEAT)
-    return [NMT, SYNC, *valve_frame_ids(machine), *(base + n for n in nodes for base in bases)]
+    of_nodes = [base + node for node in node_numbers(machine) for base in bases]
+    return [NMT, SYNC, *valve_frame_ids(machine), *of_nodes]
 
 
 def set_up_nodes(bus: Any, machine: Machine) -> None:
@@ -237,7 +241,7 @@ def valve_frame(command: ArrayLike, counter: ArrayLike, enable: ArrayLike) -> Ar
     if n > JOINTS_A_FRAME:  # the sixth would overwrite the counter
         raise ValueError(f"command: expected at most {JOINTS_A_FRAME} joints, got {n}")
     frame = np.zeros((*command.shape[:-1], 8), np.uint8)
-    frame[..., : command.shape[-1]] = encode_pwm(command / PWM_MAX)
+    frame[..., :n] = encode_pwm(command / PWM_MAX)
     frame[..., 5] = counter
     frame[..., 7] = enable
     frame[..., 6] = checksum(frame[..., [0, 1, 2, 3, 4, 5, 7]])

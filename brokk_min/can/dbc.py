@@ -18,14 +18,18 @@ def dbc(machine: Machine) -> str:
     ValueError: a machine that does not fit the bus.
     """
     canopen.check_bus(machine)
-    nodes = [SENDER, *(f"encoder_{name}" for name in _names(machine)), "valve_controller"]
-    parts = [f"{HEAD}BU_: {' '.join(nodes)}", *_messages(machine), PWM]
+    nodes = " ".join([SENDER, *_nodes(machine)])
+    parts = [f"{HEAD}BU_: {nodes}", *_messages(machine), PWM]
     return "\n\n".join(parts) + "\n"
 
 
 def _names(machine: Machine) -> list[str]:
     """Names of the joints as a DBC file may have them."""
     return [re.sub(r"\W", "_", name) for name in machine.names]
+
+
+def _nodes(machine: Machine) -> list[str]:
+    return [*(f"encoder_{name}" for name in _names(machine)), "valve_controller"]
 
 
 def _messages(machine: Machine) -> Iterator[str]:
@@ -37,13 +41,12 @@ def _messages(machine: Machine) -> Iterator[str]:
         bytes_ = [_signal(f"u_{name}", 8 * i) for i, name in enumerate(names)]
         bytes_ += [_signal("counter", 40), _signal("checksum", 48), _signal("enable", 56, high=1)]
         yield _message(can_id, f"valves_{k + 1}" if k else "valves", 8, SENDER, bytes_)
-    nodes = [joint.encoder_node for joint in machine.joints]
-    sources = [(f"encoder_{name}", node) for name, node in zip(_names(machine), nodes)]
-    for name, node in sources:
-        position = _signal("position", 0, 32, 2**canopen.POSITION_BITS - 1, "counts")
+    nodes = list(zip(_nodes(machine), canopen.node_numbers(machine)))
+    position = _signal("position", 0, 32, 2**canopen.POSITION_BITS - 1, "counts")
+    for name, node in nodes[:-1]:
         yield _message(canopen.TPDO1 + node, name, 4, name, [position])
-    for name, node in (*sources, ("valve_controller", machine.controller_node)):
-        state = _signal("state", 0, high=127)
+    state = _signal("state", 0, high=127)
+    for name, node in nodes:
         yield _message(canopen.HEARTBEAT + node, f"heartbeat_{name}", 1, name, [state])
 
 

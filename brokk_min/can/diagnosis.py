@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brokk_min.actuator import Valves, command_at_rest, initial_history
-from brokk_min.can import canopen
 from brokk_min.can.canopen import Frame
-from brokk_min.can.drive_log import TelemetryReader
+from brokk_min.can.drive_log import Telemetry, read_telemetry
 from brokk_min.env import action_to_pwm, features, integrate_error, measure
 from brokk_min.identification.logs import Recording, velocity_of
 from brokk_min.identification.simulation import free_run
@@ -57,23 +56,19 @@ class Term(NamedTuple):
 
 def read_ticks(machine: Machine, frames: Iterable[Frame]) -> Ticks:
     """The longest stretch of ticks with all positions; ValueError: it is too short."""
-    reader = TelemetryReader(machine)
-    stretches: list[list[tuple[float, Array, Array, Array, bool]]] = [[]]
-    start = 0.0
-    for frame in frames:
-        tick = reader.update(frame)
-        if tick is not None and np.isfinite(tick.q).all():
-            stretches[-1].append((start, tick.q, tick.u, tick.v_goal, tick.driving))
-        elif tick is not None:
+    stretches: list[list[Telemetry]] = [[]]
+    for tick in read_telemetry(machine, frames):
+        if np.isfinite(tick.q).all():
+            stretches[-1].append(tick)
+        else:
             stretches.append([])
-        start = frame.time if frame.id == canopen.SYNC else start
     longest = max(stretches, key=len)
-    driven = sum(row[-1] for row in longest)
+    driven = sum(tick.driving for tick in longest)
     least = machine.history + 3 * round(AHEAD * machine.rate)
     if driven < least:
         expected = f"expected {least} ticks of driving in a row or more"
         raise ValueError(f"log: {expected}, got {driven}")
-    return Ticks(*(np.array(column) for column in zip(*longest, strict=True)))
+    return Ticks(*(np.array([getattr(tick, k) for tick in longest]) for k in Ticks._fields))
 
 
 def diagnose(machine: Machine, policy: Policy, ticks: Ticks) -> list[Term]:
@@ -84,25 +79,22 @@ def diagnose(machine: Machine, policy: Policy, ticks: Ticks) -> list[Term]:
         name = f"rate: {1 / step:.3g} Hz instead of {machine.rate:g} Hz"
         terms.append(Term("commands", name, 0.0, abs(step / machine.dt - 1)))
     history = measured_history(machine, ticks)
-    base = command_error(machine, policy, ticks, history)
+    error_of = partial(command_error, machine, policy, ticks)
+    base = error_of(history)
+    errors: list[tuple[str, float]] = []
     if base > COMMAND_ERROR:
-        for name, change in observation_changes(machine):
-            error = command_error(machine, policy, ticks, change(history))
-            terms.append(Term("commands", name, error, base))
-        for name, change in command_changes(machine):
-            error = command_error(machine, policy, ticks, history, change)
-            terms.append(Term("commands", name, error, base))
+        errors += [(name, error_of(f(history))) for name, f in observation_changes(machine)]
+        errors += [(name, error_of(history, f)) for name, f in command_changes(machine)]
         for valves in get_args(Valves):
             error = command_error(machine, replace(policy, valves=valves), ticks, history)
-            terms.append(Term("commands", f"valves at rest: {valves}", error, base))
-    base = motion_error(machine, policy, ticks.u, ticks.q)
-    for name, change in command_changes(machine):
-        error = motion_error(machine, policy, change(ticks.u), ticks.q)
-        terms.append(Term("motion", name, error, base))
-    for name, change in angle_changes(machine):
-        error = motion_error(machine, policy, ticks.u, change(ticks.q))
-        if error < CLEARLY_ANGLES * base:
-            terms.append(Term("motion", name, error, base))
+            errors.append((f"valves at rest: {valves}", error))
+    terms += [Term("commands", name, error, base) for name, error in errors]
+    error_of = partial(motion_error, machine, policy)
+    base = error_of(ticks.u, ticks.q)
+    errors = [(name, error_of(f(ticks.u), ticks.q)) for name, f in command_changes(machine)]
+    angles = [(name, error_of(ticks.u, f(ticks.q))) for name, f in angle_changes(machine)]
+    errors += [(name, error) for name, error in angles if error < CLEARLY_ANGLES * base]
+    terms += [Term("motion", name, error, base) for name, error in errors]
     found = [term for term in terms if term.error < CLEARLY * term.before]
     return sorted(found, key=lambda term: term.error / term.before)
 
@@ -197,6 +189,14 @@ def joint_changes(machine: Machine, axes: int = 2) -> Iterator[tuple[str, Change
         yield f"order of {names}", partial(np.take, indices=order, axis=1)
 
 
+def zeros(machine: Machine) -> Iterator[tuple[str, Array]]:
+    """Wrong zeros of each driven joint [rad or m], (n,)."""
+    for i in machine.driven:
+        for zero in ZEROS:
+            name = f"zero of {machine.names[i]}: {zero:+.2f} {UNITS[machine.joints[i].kind]}"
+            yield name, zero * (np.arange(machine.n) == i)
+
+
 def command_changes(machine: Machine) -> Iterator[tuple[str, Change]]:
     """Changes of commands (T, n): on their way, or within a machine."""
     for name, change in joint_changes(machine):
@@ -217,11 +217,8 @@ def angle_changes(machine: Machine) -> Iterator[tuple[str, Change]]:
     yield "scale of angles: 57.3", partial(np.multiply, 1 / degrees(machine))
     for factor in SCALES:
         yield f"scale of angles: {factor:.3g}", partial(np.multiply, 1 / factor)
-    for i in machine.driven:
-        for zero in ZEROS:
-            offset = -zero * (np.arange(machine.n) == i)
-            name = f"encoder zero of {machine.names[i]}: {zero:+.2f}"
-            yield f"{name} {UNITS[machine.joints[i].kind]}", partial(np.add, offset)
+    for name, zero in zeros(machine):
+        yield f"encoder {name}", partial(np.add, -zero)
 
 
 def degrees(machine: Machine) -> Array:
@@ -231,21 +228,16 @@ def degrees(machine: Machine) -> Array:
 
 def observation_changes(machine: Machine) -> Iterator[tuple[str, Change]]:
     """Changes of the history (T, n, 3, H) that a program gives its policy."""
-    both, velocity = np.array([[1.0], [1.0], [0.0]]), np.array([[0.0], [1.0], [0.0]])
+    angle, velocity = np.array([[1.0], [0.0], [0.0]]), np.array([[0.0], [1.0], [0.0]])
+    both = angle + velocity
     yield "one sample late", partial(delay, ticks=1)
     yield "order of the history", partial(np.flip, axis=-1)
-    yield (
-        "degrees instead of radians",
-        partial(np.multiply, degrees(machine)[:, None, None] ** both),
-    )
+    in_degrees = degrees(machine)[:, None, None] ** both
+    yield "degrees instead of radians", partial(np.multiply, in_degrees)
     for factor in SCALES:
         yield f"scale of angles and velocities: {factor:g}", partial(np.multiply, factor**both)
         yield f"scale of velocities (rate): {factor:g}", partial(np.multiply, factor**velocity)
     for name, change in joint_changes(machine, axes=4):
         yield f"{name} (observation)", change
-    for i in machine.driven:
-        for zero in ZEROS:
-            offset = np.zeros((machine.n, 3, 1))
-            offset[i, 0] = zero
-            name = f"zero of {machine.names[i]}: {zero:+.2f} {UNITS[machine.joints[i].kind]}"
-            yield name, partial(np.add, offset)
+    for name, zero in zeros(machine):
+        yield name, partial(np.add, zero[:, None, None] * angle)

@@ -4,11 +4,10 @@ Telemetry is the state of one tick, from the frames of a bus or of a log.
 """
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator
 from io import StringIO
 from pathlib import Path
-from typing import NamedTuple
+from typing import IO, NamedTuple
 
 import numpy as np
 
@@ -35,32 +34,38 @@ def read_frames(path: Path) -> Iterator[Frame]:
     """
     reader = require("can", "hw").CanutilsLogReader(StringIO())
     with expected(path, "a candump log"), open_regular(path, LARGEST_LOG) as file:
-        lines = iter(lambda: file.readline(LONGEST_LINE), b"")
-        reader.file = (line.decode() for line in lines if line.endswith(b"\n") or _too_long(line))
+        reader.file = _whole_lines(file)
         for m in reader:
             frame = Frame(m.timestamp, standard_id(m), bytes(m.data), not m.is_rx, str(m.channel))
             if not 0 <= frame.time < 1e12:
                 raise ValueError(f"a time of {frame.time}")
-            if frame.id == canopen.OPERATOR_INPUT and frame.channel == OPERATOR_CHANNEL:
-                canopen.unpack_operator_input(frame.data)
+            operator_input_of(frame)  # refuses a damaged one
             yield frame
 
 
-def _too_long(line: bytes) -> bool:
-    """ValueError: a line that is longer than any frame's; False: the last one is cut."""
-    if len(line) == LONGEST_LINE:
-        raise ValueError(f"a line of {LONGEST_LINE} bytes or more")
-    return False
+def _whole_lines(file: IO[bytes]) -> Iterator[str]:
+    for line in iter(lambda: file.readline(LONGEST_LINE), b""):
+        if line.endswith(b"\n"):
+            yield line.decode()
+        elif len(line) == LONGEST_LINE:
+            raise ValueError(f"a line of {LONGEST_LINE} bytes or more")
 
 
-@dataclass
+def operator_input_of(frame: Frame) -> OperatorInput | None:
+    """The operator's input that a frame of a log holds; None: it is a frame of the bus."""
+    if frame.id == canopen.OPERATOR_INPUT and frame.channel == OPERATOR_CHANNEL:
+        return canopen.unpack_operator_input(frame.data)
+    return None
+
+
 class ReplayedBus:
-    """A recorded log in place of a `Bus`: gives what was read and compares what is sent."""
+    """A recorded log in place of a `Bus`: gives what was read and notes what is sent."""
 
-    frames: deque[Frame]  # those that are to come
-    sent: list[Frame] = field(default_factory=list)
-    mismatch: str = ""
-    time: float = 0.0  # s
+    def __init__(self, frames: Iterable[Frame]) -> None:
+        self.frames = deque(frames)  # those that are to come
+        self.sent: list[tuple[Frame, bytes]] = []  # frames of the log, with the data sent now
+        self.mismatch = ""
+        self.time = 0.0  # s
 
     def now(self) -> float:
         """Time of the next frame [s]."""
@@ -81,52 +86,41 @@ class ReplayedBus:
         return self.frames.popleft()
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Keep what is sent, and go past what was sent then."""
-        self.sent.append(Frame(self.now(), can_id, data, True))
-        self._go_past(can_id)
-
-    def log_input(self, data: bytes) -> float:
-        """The time of the operator's input."""
-        now = self.now()
-        self._go_past(canopen.OPERATOR_INPUT)
-        return now
-
-    def operator(self, driving: bool, ready: bool) -> OperatorInput:
-        """The operator's next input of the log."""
-        for frame in self.frames:
-            if frame.id == canopen.OPERATOR_INPUT and frame.channel == OPERATOR_CHANNEL:
-                return canopen.unpack_operator_input(frame.data)
-        return OperatorInput(stop=True)
-
-    def _go_past(self, can_id: int) -> None:
+        """Go past what was sent then."""
         if self.frames:
             frame = self.frames.popleft()
+            self.sent.append((frame, data))
             if not frame.sent or frame.id != can_id:
                 self.mismatch = f"{can_id:03X} sent at {frame.time:.6f}, got {frame.id:03X}"
                 self.frames.clear()
 
+    def log_input(self, data: bytes) -> float:
+        """The time of the operator's input."""
+        now = self.now()
+        self.send(canopen.OPERATOR_INPUT, data)
+        return now
 
-def replay(machine: Machine, controller: Controller, frames: Sequence[Frame]) -> list[Frame]:
-    """Run the loop on a log of it; the frames that it sends now.
+    def operator(self, driving: bool, ready: bool) -> OperatorInput:
+        """The operator's next input of the log."""
+        inputs = (operator_input_of(frame) for frame in self.frames)
+        return next(filter(None, inputs), OperatorInput(stop=True))
+
+
+def replay(machine: Machine, controller: Controller, frames: Iterable[Frame]) -> tuple[int, int]:
+    """Run the loop on a log of it: how many valve frames are the same bytes, and of how many.
 
     ValueError: another program made the log.
     """
-    bus = ReplayedBus(deque(frames))
+    bus = ReplayedBus(frames)
     drive = Drive(machine, controller, bus, bus.operator)
     drive.begin()
     while bus.frames:
         drive.tick()
     if bus.mismatch:
         raise ValueError(f"log: expected {bus.mismatch}")
-    return bus.sent[: sum(frame.sent and frame.channel != OPERATOR_CHANNEL for frame in frames)]
-
-
-def compare(machine: Machine, frames: Sequence[Frame], sent: Sequence[Frame]) -> tuple[int, int]:
-    """How many valve frames of `sent` are those of the log, byte by byte, and how many it has."""
     valves = canopen.valve_frame_ids(machine)
-    old = [(frame.id, frame.data) for frame in frames if frame.sent and frame.id in valves]
-    new = [(frame.id, frame.data) for frame in sent if frame.id in valves]
-    return sum(a == b for a, b in zip(old, new)), max(len(old), len(new))
+    same = [frame.data == data for frame, data in bus.sent if frame.id in valves]
+    return sum(same), len(same)
 
 
 def log_for_fit(machine: Machine, frames: Iterable[Frame]) -> Log:
@@ -143,8 +137,8 @@ def log_for_fit(machine: Machine, frames: Iterable[Frame]) -> Log:
         last = start
     named = []
     for number, recording in enumerate(recordings):
-        if len(recording) > machine.history + 1:
-            commands, angles = map(np.array, zip(*recording))
+        commands, angles = map(np.array, zip(*recording))
+        if len(commands) > machine.history + 1:
             named.append((f"drive_{number:03d}", commands, angles))
     if not named:
         raise ValueError(
@@ -181,6 +175,7 @@ class Telemetry(NamedTuple):
     latched_fault: int = 0
     mode: int = 0  # which controller
     lateness: float = 0.0  # s
+    time: float = 0.0  # of its SYNC [s], from a bus or a log
 
 
 class TelemetryReader:
@@ -192,35 +187,44 @@ class TelemetryReader:
         self.operator_input = OperatorInput()
         self.valves = canopen.ValveFrames(machine)
         self.tick = 0
-        self.angles: list[Array] = []  # rad (n,), as many as the velocity needs
+        self.start = 0.0  # s, time of the last SYNC
+        self.angles: deque[Array] = deque(maxlen=machine.velocity_samples)  # rad (n,)
 
     def update(self, frame: Frame) -> Telemetry | None:
         """Take in one frame; at a SYNC, telemetry of the tick that it ends."""
         self.nodes.update(frame)
-        if frame.id == canopen.SYNC:
-            telemetry = self._telemetry()
-            self.nodes.start_tick()
-            self.tick += 1
-            return telemetry
-        if frame.id == canopen.OPERATOR_INPUT and frame.channel == OPERATOR_CHANNEL:
-            self.operator_input = canopen.unpack_operator_input(frame.data)
         self.valves.update(frame)
-        return None
+        self.operator_input = operator_input_of(frame) or self.operator_input
+        if frame.id != canopen.SYNC:
+            return None
+        telemetry = self._telemetry()
+        self.nodes.start_tick()
+        self.tick += 1
+        self.start = frame.time
+        return telemetry
 
     def _telemetry(self) -> Telemetry:
         m = self.machine
-        q = np.full(m.n, np.nan)
-        q_dot = q
+        q = q_dot = np.full(m.n, np.nan)
         if (self.nodes.frames == 1).all():
             q = self.nodes.counts() * m.encoder_step
-            angles = [*(self.angles or [q] * m.velocity_samples), q]
-            self.angles = angles[-m.velocity_samples :]
+            if not self.angles:
+                self.angles.extend([q] * m.velocity_samples)
+            self.angles.append(q)
             q_dot = estimate_velocity(np.stack(self.angles, axis=-1), m.velocity_samples, m.dt)
         else:
-            self.angles = []
+            self.angles.clear()
         driving = bool(self.valves.enable.all())
         v_goal = np.array(self.operator_input.v_goal) * driving
-        return Telemetry(self.tick, q, q_dot, self.valves.u.copy(), v_goal, driving)
+        u = self.valves.u.copy()
+        return Telemetry(self.tick, q, q_dot, u, v_goal, driving, time=self.start)
+
+
+def read_telemetry(machine: Machine, frames: Iterable[Frame]) -> Iterator[Telemetry]:
+    """Telemetry of the ticks of a log."""
+    reader = TelemetryReader(machine)
+    updates = (reader.update(frame) for frame in frames)
+    return (telemetry for telemetry in updates if telemetry is not None)
 
 
 def status(drive: Drive) -> str:

@@ -65,18 +65,16 @@ class SimulatedMachine:
         self.start = now
         self.steps = 0
         self.heartbeats = 0
-        self.encoders = [joint.encoder_node for joint in machine.joints]
-        self.nmt = dict.fromkeys([*self.encoders, machine.controller_node], PRE_OPERATIONAL)
-        self.objects = {
-            (joint.encoder_node, *address): value
-            for joint in machine.joints
-            for address, value in (
-                ((0x1000, 0), 406),  # device type
-                (canopen.HEARTBEAT_OBJECT, round(1e3 * canopen.HEARTBEAT_PERIOD)),
-                (canopen.SYNC_OBJECT, 1),
-                (canopen.RESOLUTION_OBJECT, canopen.encoder_resolution(joint)),
-            )
-        }
+        *self.encoders, self.controller = canopen.node_numbers(machine)
+        self.nmt = dict.fromkeys([*self.encoders, self.controller], PRE_OPERATIONAL)
+        self.objects: dict[tuple[int, int, int], int] = {}  # by node, index and subindex
+        for node, joint in zip(self.encoders, machine.joints):
+            self.objects |= {
+                (node, 0x1000, 0): 406,  # device type
+                (node, *canopen.HEARTBEAT_OBJECT): round(1e3 * canopen.HEARTBEAT_PERIOD),
+                (node, *canopen.SYNC_OBJECT): 1,
+                (node, *canopen.RESOLUTION_OBJECT): canopen.encoder_resolution(joint),
+            }
         self.received = canopen.ValveFrames(machine)
         self.valid = now  # time at which the last valid valve frames of a tick were there
         self.u: Array = np.zeros(machine.n)
@@ -88,17 +86,15 @@ class SimulatedMachine:
         """The boot-up messages of all nodes."""
         return [(canopen.HEARTBEAT + node, bytes([BOOT])) for node in self.nmt]
 
-    def wait(self, now: float) -> float:
-        """Seconds until the next plant step."""
-        return max(0.0, self._next_step() - now)
-
-    def _next_step(self) -> float:
+    @property
+    def next_step(self) -> float:
+        """Time of the next plant step [s]."""
         return self.start + (self.steps + 1) * self.machine.plant_dt
 
     def advance(self, now: float) -> Frames:
         """Move plant, watchdog and heartbeats on to `now` [s]; frames to send."""
         out: Frames = []
-        while (then := self._next_step()) <= now:
+        while (then := self.next_step) <= now:
             if self.enabled and then - self.valid >= WATCHDOG:
                 self._trip(f"no valve frame for {WATCHDOG} s")
             self.plant = plant_step(self.fine, self.plant, self.u)
@@ -128,16 +124,15 @@ class SimulatedMachine:
 
     def _positions(self) -> Frames:
         counts = np.rint(self.plant.q / self.machine.encoder_step).astype(int)
-        raw = encoder_raw(self.machine, counts).astype("<u4")
-        pairs = zip(self.encoders, raw)
-        return [(canopen.TPDO1 + i, x.tobytes()) for i, x in pairs if self.nmt[i] == OPERATIONAL]
+        raw = zip(self.encoders, encoder_raw(self.machine, counts).astype("<u4"))
+        return [(canopen.TPDO1 + i, x.tobytes()) for i, x in raw if self.nmt[i] == OPERATIONAL]
 
     def _on_nmt(self, command: int, node: int) -> Frames:
         states = {1: OPERATIONAL, 2: STOPPED} | dict.fromkeys((128, 129, 130), PRE_OPERATIONAL)
         addressed = [n for n in self.nmt if node in (0, n)] if command in states else []
         for n in addressed:
             self.nmt[n] = states[command]
-        if self.nmt[self.machine.controller_node] != OPERATIONAL or not self.enabled:
+        if self.nmt[self.controller] != OPERATIONAL or not self.enabled:
             self._close_valves()
         return [(canopen.HEARTBEAT + n, bytes([BOOT])) for n in addressed if command > 128]
 
@@ -157,7 +152,7 @@ class SimulatedMachine:
             self._trip(f"valve frame with counter {counter} after {before}")
         elif not first:
             self._trip(f"second valve frame after a SYNC, counter {counter}")
-        elif not self.missing and self.nmt[self.machine.controller_node] == OPERATIONAL:
+        elif not self.missing and self.nmt[self.controller] == OPERATIONAL:
             neutral = not self.received.u.any()
             self.enabled = bool(self.received.enable.all()) and (self.enabled or neutral)
             self.u = self.received.u * self.enabled
@@ -168,23 +163,24 @@ class SimulatedMachine:
         self.counters = {}
 
     def _trip(self, reason: str) -> None:
-        if self.nmt[self.machine.controller_node] == OPERATIONAL:
+        if self.nmt[self.controller] == OPERATIONAL:
             self.report(reason)
         self._close_valves()
-        self.nmt[self.machine.controller_node] = PRE_OPERATIONAL
+        self.nmt[self.controller] = PRE_OPERATIONAL
 
     def _on_sdo(self, node: int, data: bytes) -> bytes:
-        command, index, sub, value = struct.unpack("<BHBI", data)
-        key = (node, index, sub)
+        command, *address, value = struct.unpack("<BHBI", data)
+        key = (node, *address)
+        writable = tuple(address) in (canopen.HEARTBEAT_OBJECT, canopen.SYNC_OBJECT)
+        answer = 0x80, 0x06010000  # no such access
         if key not in self.objects:
-            return struct.pack("<BHBI", 0x80, index, sub, 0x06020000)  # no such object
-        if command == 0x40:
-            return struct.pack("<BHBI", 0x43, index, sub, self.objects[key])
-        writable = (canopen.HEARTBEAT_OBJECT, canopen.SYNC_OBJECT)
-        if command & 0xE3 == 0x23 and (index, sub) in writable:
+            answer = 0x80, 0x06020000  # no such object
+        elif command == 0x40:
+            answer = 0x43, self.objects[key]
+        elif command & 0xE3 == 0x23 and writable:
             self.objects[key] = value
-            return struct.pack("<BHBI", 0x60, index, sub, 0)
-        return struct.pack("<BHBI", 0x80, index, sub, 0x06010000)  # no such access
+            answer = 0x60, 0
+        return struct.pack("<BHBI", answer[0], *address, answer[1])
 
 
 def serve(machine: SimulatedMachine, bus: Any, running: Callable[[], bool]) -> None:
@@ -192,7 +188,7 @@ def serve(machine: SimulatedMachine, bus: Any, running: Callable[[], bool]) -> N
     for can_id, data in machine.boot():
         bus.send(can_id, data)
     while running():
-        frame = bus.recv(machine.wait(bus.now()))
+        frame = bus.recv(max(0.0, machine.next_step - bus.now()))
         answers = machine.advance(bus.now())
         if frame:
             answers += machine.receive(frame)
@@ -226,9 +222,8 @@ def simulate(
     ValueError: no such bus, or no such pose.
     """
     pose = start_pose(machine, q)
-    nodes = [joint.encoder_node for joint in machine.joints]
     ids = [canopen.NMT, canopen.SYNC, *canopen.valve_frame_ids(machine)]
-    ids += [canopen.SDO_REQUEST + node for node in nodes]
+    ids += [canopen.SDO_REQUEST + joint.encoder_node for joint in machine.joints]
     gc.freeze()  # no long garbage collection while the encoders should answer
     with ExitStack() as stack:
         bus = stack.enter_context(open_bus(interface, channel, ids=ids))

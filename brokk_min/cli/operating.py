@@ -119,10 +119,8 @@ class Drive(Command):
 
 def compare(machine: Machine, controller: Controller, log: Path) -> None:
     """Run a controller on a log; ValueError: not all its valve frames are those of the log."""
-    frames = list(read_frames(log))
     with located(log):
-        sent_now = drive_log.replay(machine, controller, frames)
-    same, sent = drive_log.compare(machine, frames, sent_now)
+        same, sent = drive_log.replay(machine, controller, read_frames(log))
     print(f"{log}: {same} of {sent} valve frames are the same")
     if same < sent:
         raise ValueError(f"{log}: expected the frames of the log, got {sent - same} others")

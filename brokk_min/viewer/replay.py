@@ -15,7 +15,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet
-from brokk_min.can.drive_log import TelemetryReader, read_frames
+from brokk_min.can.drive_log import read_frames, read_telemetry
 from brokk_min.evaluation import baselines, metrics
 from brokk_min.evaluation.rollout import TITLES, Controller
 from brokk_min.evaluation.sequences import Commands, goals_and_starts, task_sequences
@@ -76,9 +76,8 @@ def run_of_log(machine: Machine, path: Path, colour: Colour) -> Run:
 
     ValueError: no log, or one in which nothing drives.
     """
-    reader = TelemetryReader(machine)
-    updates = (reader.update(frame) for frame in read_frames(path))
-    ticks = [t for t in updates if t is not None and np.isfinite(t.q).all()]
+    telemetry = read_telemetry(machine, read_frames(path))
+    ticks = [tick for tick in telemetry if np.isfinite(tick.q).all()]
     driving = [t.driving for t in ticks]
     if not any(driving):
         raise ValueError(f"{path}: expected a log in which the valves are driven, got none")

@@ -1,7 +1,6 @@
 """Logs of drives: run again to the same bytes, read as recordings, and read as telemetry."""
 
 import struct
-from collections import deque
 from dataclasses import replace
 
 import can
@@ -17,14 +16,7 @@ from brokk_min.can.canopen import (
     encoder_raw,
     valve_frame,
 )
-from brokk_min.can.drive_log import (
-    ReplayedBus,
-    TelemetryReader,
-    compare,
-    log_for_fit,
-    read_frames,
-    replay,
-)
+from brokk_min.can.drive_log import ReplayedBus, TelemetryReader, log_for_fit, read_frames, replay
 from brokk_min.kinematics import estimate_velocity
 from brokk_min.machine import BROKK_170
 
@@ -50,10 +42,6 @@ def drive_logged(path, seconds=4.0):
     return world
 
 
-def sent(frames):
-    return [(f.id, f.data) for f in frames if f.sent and f.channel != OPERATOR_CHANNEL]
-
-
 def test_read_frames__reads_a_cut_log_up_to_its_last_whole_line(tmp_path):
     text = "(1.000000) can0 123#0102 R\n(2.000000) can0 080#AABB T\n"
     for size in range(len(text) + 1):
@@ -75,18 +63,15 @@ def test_read_frames__reads_a_plain_candump_log_too(tmp_path):
 def test_replay__of_a_recorded_log_sends_the_same_bytes(tmp_path):
     drive_logged(tmp_path / "run.log")
     frames = list(read_frames(tmp_path / "run.log"))
-    again = replay(BROKK_170, BASELINE, frames)
-    assert [(frame.id, frame.data) for frame in again] == sent(frames)
-    valves = [data for can_id, data in sent(frames) if can_id == 0x210]
+    valves = [frame.data for frame in frames if frame.id == 0x210]
     assert len(valves) > 60
     assert len({data[:5] for data in valves}) > 30
-    assert compare(BROKK_170, frames, again) == (len(valves), len(valves))
-    same, total = compare(
-        BROKK_170, frames, replay(BROKK_170, ConstantCommand(0, 0, 0, 0, 0), frames)
-    )
-    assert same < 0.5 * total
+    assert replay(BROKK_170, BASELINE, frames) == (len(valves), len(valves))
+    same, total = replay(BROKK_170, ConstantCommand(0, 0, 0, 0, 0), frames)
+    assert same < 0.5 * total == 0.5 * len(valves)
     cut = frames[: len(frames) * 2 // 3]  # as after a SIGKILL
-    assert [(frame.id, frame.data) for frame in replay(BROKK_170, BASELINE, cut)] == sent(cut)
+    num = sum(frame.id == 0x210 for frame in cut)
+    assert replay(BROKK_170, BASELINE, cut) == (num, num)
     with pytest.raises(ValueError, match=r"log: expected \w+ sent at .*, got"):
         replay(BROKK_170, BASELINE, [frame for frame in frames if frame.id != 0x210])
 
@@ -94,7 +79,7 @@ def test_replay__of_a_recorded_log_sends_the_same_bytes(tmp_path):
 @pytest.mark.parametrize("changed", [{"id": 0x210}, {"sent": False}])
 def test_replayed_bus__ends_where_another_frame_or_none_was_sent(changed):
     found = Frame(1.0, 0x080, b"", True)._replace(**changed)
-    bus = ReplayedBus(deque([found, Frame(1.1, 0x181, b"\x07")]))
+    bus = ReplayedBus([found, Frame(1.1, 0x181, b"\x07")])
     bus.send(0x080, b"")
     assert bus.mismatch == f"080 sent at 1.000000, got {found.id:03X}"
     assert not bus.frames

@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 from itertools import pairwise
-from pathlib import Path
 
 import can
 import numpy as np
@@ -23,54 +22,25 @@ from helpers_bus import (
     recording,
     unchanged,
 )
-from helpers_faults import COMMAND, FAULTS, NOT_FOUND, Fault, delay, flood, freeze, measure
+from helpers_faults import COMMAND, FAULTS, NOT_FOUND, delay, flood, freeze, measure
 
-from brokk_min import hw
 from brokk_min.can.canopen import valve_frame
 from brokk_min.can.drive_log import status
 from brokk_min.can.operator_input import Script
 from brokk_min.can.safety_gate import fault_name
-from brokk_min.env import TaskConfig, observation_scale, reward
+from brokk_min.env import TaskConfig, reward
 from brokk_min.evaluation.rollout import rollout
 from brokk_min.evaluation.sequences import axis_sequences
+from brokk_min.identification.files import SHIPPED
 from brokk_min.kinematics import forward_kinematics, tool_velocity
-from brokk_min.learning.policy import Policy, PolicyController, contract, load_policy
+from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import BROKK_170
 
-SHIPPED = Path(hw.__file__).with_name("shipped") / BROKK_170.name / "policy.npz"
-
-
-def policy():
-    return PolicyController(BROKK_170, load_policy(SHIPPED, BROKK_170))
-
-
-def paper_policy():
-    """The paper's agent with random weights, which moves all driven joints."""
-    rng = np.random.default_rng(0)
-    sizes = [163, 256, 128, 64, 4]
-    weights = []
-    for inputs, outputs in pairwise(sizes):
-        weights += [rng.normal(0, 0.6 * inputs**-0.5, (inputs, outputs)), np.zeros(outputs)]
-    weights = tuple(array.astype(np.float32) for array in weights)
-    numbers = contract(BROKK_170, paper=True), {}, *observation_scale(BROKK_170, paper=True)
-    net = load_policy(SHIPPED, BROKK_170).net
-    return PolicyController(BROKK_170, Policy(*numbers, weights, net, "open"))
-
 
 @pytest.fixture
-def operator():
-    return HoldingOperator()
-
-
-@pytest.fixture
-def controller():
-    return ConstantCommand(*COMMAND)
-
-
-@pytest.fixture
-def world(controller, operator):
+def world():
     """A constant command, an operator, and nodes that are started."""
-    world = World(controller, operator)
+    world = World(ConstantCommand(*COMMAND), HoldingOperator())
     world.drive.begin()
     return world
 
@@ -94,11 +64,14 @@ def test_import__loads_no_library_that_is_not_needed(modules, heavy):
 # --- driving -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("axis", "name"), [(1, "rl"), (2, "jacobian"), (0, "rl_paper")])
+@pytest.mark.parametrize(("axis", "name"), [(1, "policy"), (2, "jacobian"), (0, "policy_paper")])
 def test_run__earns_over_the_bus_the_reward_of_evaluate(axis, name):
     """Within 0.2 %, with 2 ms of bus and machine between SYNC and valve frame."""
     sequence = axis_sequences(BROKK_170)[axis]
-    controller = {"rl": policy, "rl_paper": paper_policy}.get(name, lambda: BASELINE)()
+    controller = BASELINE
+    if name != "jacobian":
+        policy = load_policy(SHIPPED / BROKK_170.name / f"{name}.npz", BROKK_170)
+        controller = PolicyController(BROKK_170, policy)
     script = Script(BROKK_170, sequence.goals)
     world = World(controller, script)
 
@@ -155,13 +128,13 @@ def test_control__measures_histories_and_error_integral_of_its_own_ticks():
     assert (np.rint(ticks[-1].history[0, :, 2] * 127) == 60).all()
 
 
-def test_tick__is_silent_until_armed_and_opens_valves_a_tick_later(world, operator):
-    operator.enable, out = False, Out()
+def test_tick__is_silent_until_armed_and_opens_valves_a_tick_later(world):
+    world.operator.enable, out = False, Out()
     world.downward = recording(out)
     world.run(1.0)
     assert world.drive.gate.active_fault == 0
     assert not [frame for frame in out if frame[0] == 0x210]
-    operator.enable, operator.v = True, (0.0, 0.0, 0.0)
+    world.operator.enable, world.operator.v = True, (0.0, 0.0, 0.0)
     world.drive.tick()
     world.drive.tick()
     frames = [data for can_id, data in out if can_id == 0x210]
@@ -173,9 +146,9 @@ def test_tick__is_silent_until_armed_and_opens_valves_a_tick_later(world, operat
     np.testing.assert_allclose(newest, [[0] * 5, [40, 0, 40, 40, 40]], atol=1e-5)
 
 
-def test_tick__does_not_arm_while_the_stick_is_not_centred(controller, operator):
-    world = World(controller, lambda driving, ready: operator(True, ready))
-    world.drive.begin()
+def test_tick__does_not_arm_while_the_stick_is_not_centred(world):
+    operator = world.operator
+    world.drive.operator = lambda driving, ready: operator(True, ready)
     world.run(1.0)
     assert not world.drive.gate.driving and not world.commands[1].any()
 
@@ -218,24 +191,23 @@ def closes_within(world, begun, seconds):
     ("node", "counts", "bound"),
     [(1, 80, 0.175), (3, 40, 0.175), (4, -40, 0.175), (5, 20, 0.45), (1, 16, 0.85), (3, 16, 0.85)],
 )
-def test_tick__finds_a_frozen_encoder_at_small_commands_too(
-    node, counts, bound, world, controller, operator
-):
+def test_tick__finds_a_frozen_encoder_at_small_commands_too(node, counts, bound, world):
     """The table of docs/hardware.md: the smaller the command, the longer it takes."""
-    controller.m = counts * (np.arange(1, 6) == node)
+    world.controller.m = counts * (np.arange(1, 6) == node)
     world.run(1.6)
     world.sleep(0.0215)
     begun = world.t
     assert world.commands[1][-1].any()
-    freeze(Fault(world, operator, controller), node)
+    freeze(world, node)
     world.run(1.2)
     assert closes_within(world, begun, bound)
     assert world.drive.reason == f"fault: q{node}: frozen, or the joint does not move"
 
 
-def test_tick__takes_nothing_for_frozen_that_is_not(world, controller):
+def test_tick__takes_nothing_for_frozen_that_is_not(world):
     """Reversals, stops and small commands at random are no fault."""
     rng = np.random.default_rng(3)
+    controller = world.controller
 
     def change():
         if rng.random() < 0.15:
@@ -260,29 +232,27 @@ def test_watchdog__closes_the_valves_of_a_program_that_is_killed(world):
     assert closes_within(world, killed, 0.155)
 
 
-def test_tick__opens_no_valve_again_on_frames_of_any_identifier_and_length(
-    world, controller, operator
-):
+def test_tick__opens_no_valve_again_on_frames_of_any_identifier_and_length(world):
     world.run(1.2)
     begun = world.t
     assert world.commands[1][-1].any()
-    seen, pairs = flood(Fault(world, operator, controller))
+    seen, pairs = flood(world)
     world.run(9.3)
     assert len(seen) == pairs == 2048 * 9
     assert closes_within(world, begun, 0.175)
 
 
-def test_tick__leaves_a_fault_by_a_new_edge_only(world, operator):
+def test_tick__leaves_a_fault_by_a_new_edge_only(world):
     drive = world.drive
     world.run(0.6)
     world.upward = only(0x183, once(lambda d: []))
     world.run(0.5)
     assert drive.reason == "fault: q3: silent" and not drive.gate.driving
     assert status(drive).startswith("ready   fault: q3: silent v goal ")
-    operator.enable = False
+    world.operator.enable = False
     world.run(0.2)
     assert drive.reason == "fault: q3: silent"
-    operator.enable = True
+    world.operator.enable = True
     world.run(0.4)
     assert drive.gate.driving and drive.reason == ""
     assert status(drive).startswith("driving v goal +0.10 +0.00 +0.00 measured ")
@@ -293,18 +263,18 @@ def test_tick__leaves_a_fault_by_a_new_edge_only(world, operator):
     ("low", "high", "found"),
     [(5, 5, 0), (15, 15, 0), (25, 25, 1), (45, 45, 1), (0, 15, 0), (0, 60, 1)],
 )
-def test_tick__finds_positions_later_than_20_ms(low, high, found, world, controller, operator):
+def test_tick__finds_positions_later_than_20_ms(low, high, found, world):
     """Constantly, or by chance between two bounds [ms]."""
     rng = np.random.default_rng(0)
     world.run(0.8)
     begun = world.t
-    delay(Fault(world, operator, controller), 3, lambda: rng.uniform(low, high) / 1e3)
+    delay(world, 3, lambda: rng.uniform(low, high) / 1e3)
     world.run(1.0)
     assert world.drive.reason == found * "fault: q3: silent"
     assert closes_within(world, begun, 0.175) == bool(found)
 
 
-def test_tick__finds_a_delay_of_a_whole_tick_only_when_it_begins(world, operator):
+def test_tick__finds_a_delay_of_a_whole_tick_only_when_it_begins(world):
     """A position has neither time nor number: the limit of what can be found, see docs."""
     held = []
 
@@ -317,14 +287,14 @@ def test_tick__finds_a_delay_of_a_whole_tick_only_when_it_begins(world, operator
     world.upward = only(0x183, hold)
     world.run(0.3)
     assert world.drive.reason == "fault: q3: silent" and closes_within(world, begun, 0.175)
-    operator.enable = False
+    world.operator.enable = False
     world.run(0.1)
-    operator.enable = None
+    world.operator.enable = None
     world.run(0.2)
     assert world.drive.gate.driving
 
 
-def test_tick__starts_nodes_that_fell_back_once_the_switch_is_released(world, operator):
+def test_tick__starts_nodes_that_fell_back_once_the_switch_is_released(world):
     out = Out()
     world.run(0.6)
     world.downward = recording(out)
@@ -332,7 +302,7 @@ def test_tick__starts_nodes_that_fell_back_once_the_switch_is_released(world, op
     world.run(0.4)
     assert world.drive.reason == "fault: q4: not operational" and world.drive.gate.active_fault
     assert 0x000 not in dict(out)
-    operator.enable = False
+    world.operator.enable = False
     world.run(0.2)
     assert {data for can_id, data in out if can_id == 0x000} == {b"\x01\x00"}
     assert not world.drive.gate.active_fault
@@ -354,8 +324,8 @@ def busy(world, seconds):
     return send
 
 
-def test_wait__keeps_an_absolute_grid_and_skips_missed_ticks(world, controller):
-    controller.m = np.zeros(5)
+def test_wait__keeps_an_absolute_grid_and_skips_missed_ticks(world):
+    world.controller.m = np.zeros(5)
     world.step = 0.0007  # does not divide a tick
     begun = world.t
     for k in range(120):
@@ -373,10 +343,10 @@ def test_wait__keeps_an_absolute_grid_and_skips_missed_ticks(world, controller):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_run__ends_on_a_signal_with_a_neutral_frame(number, world, operator):
+def test_run__ends_on_a_signal_with_a_neutral_frame(number, world):
     out, shown = Out(), list[tuple[int, str]]()
     world.downward = recording(out)
-    operator.act = lambda: os.kill(os.getpid(), number) if world.drive.ticks == 20 else None
+    world.operator.act = lambda: os.kill(os.getpid(), number) if world.drive.ticks == 20 else None
     handler = signal.getsignal(number)
     world.drive.run(lambda drive: shown.append((drive.ticks, status(drive))))
     assert world.drive.ticks in (20, 21) and signal.getsignal(number) is handler
