@@ -8,6 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -27,6 +28,8 @@ from brokk_min.machine import BROKK_170
 
 MULTICAST = "239.74.163.2"
 START = (0.0, 0.5, 0.58, 1.71, 1.24)
+SIXTH = replace(BROKK_170.joints[4], name="q6", encoder_node=6)
+SIX = replace(BROKK_170, name="six joints", joints=(*BROKK_170.joints, SIXTH), q_start=())
 
 
 def baseline(machine):

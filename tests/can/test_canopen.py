@@ -8,7 +8,7 @@ from dataclasses import replace
 import canopen
 import numpy as np
 import pytest
-from helpers_bus import START, ConstantCommand, HoldingOperator, World, dictionary, recording
+from helpers_bus import SIX, START, ConstantCommand, HoldingOperator, World, dictionary, recording
 
 from brokk_min import hw
 from brokk_min.can.canopen import (
@@ -21,6 +21,7 @@ from brokk_min.can.canopen import (
     encoder_raw,
     encoder_resolution,
     sdo,
+    set_up_nodes,
     unpack_operator_input,
     used_ids,
     valve_frame,
@@ -33,8 +34,7 @@ from brokk_min.can.simulated_machine import SimulatedMachine
 from brokk_min.machine import BROKK_170
 
 STEP = BROKK_170.encoder_step[0]
-SIXTH = replace(BROKK_170.joints[4], name="q6", encoder_node=6)
-SIX = replace(BROKK_170, name="six joints", joints=(*BROKK_170.joints, SIXTH), q_start=())
+SLOW = replace(BROKK_170, name="slow", rate=5.0)
 
 
 def bitwise_crc(data):
@@ -64,6 +64,8 @@ def test_valve_frame__by_hand():
     two = valve_frame([[1, -1], [0, 2]], [3, 4], [False, True])
     assert two[:, :6].tolist() == [[1, 254, 0, 0, 0, 3], [0, 2, 0, 0, 0, 4]]
     assert two[:, 7].tolist() == [0, 1]
+    with pytest.raises(ValueError, match="command: expected at most 5 joints, got 6"):
+        valve_frame([0, 0, 0, 0, 0, 77], 9, 1)  # would be the counter
 
 
 def test_encoder_counts__is_the_inverse_of_encoder_raw_however_mounted():
@@ -91,8 +93,7 @@ def test_operator_input__survives_the_log_to_a_tenth_of_a_millimetre(flags):
 
 @pytest.fixture
 def world():
-    world = World(ConstantCommand(0, 0, 0, 0, 0), HoldingOperator())
-    return world
+    return World(ConstantCommand(0, 0, 0, 0, 0), HoldingOperator())
 
 
 def test_set_up_nodes__sets_up_the_encoders_and_starts_the_nodes(world):
@@ -126,21 +127,22 @@ def test_set_up_nodes__refuses_what_does_not_fit(world):
     with pytest.raises(ValueError, match=refusal):
         world.drive.begin()
     assert world.t - begun == pytest.approx(0.5, abs=0.002)
-    machine = replace(SIX, valve_frame_id=0x185)
-    with pytest.raises(ValueError, match=r"valve_frame_id: expected .*, got 0x185, 0x186"):
-        hw.Drive(machine, ConstantCommand(*np.zeros(6)), world.bus, HoldingOperator()).begin()
-    with pytest.raises(ValueError, match="command: expected at most 5 joints, got 6"):
-        valve_frame([0, 0, 0, 0, 0, 77], 9, 1)  # would be the counter
-    slow = replace(BROKK_170, name="slow", rate=5.0)
-    with pytest.raises(ValueError, match=r"slow: expected a rate of 10 Hz or more, .* got 5 Hz"):
-        hw.Drive(slow, ConstantCommand(*np.zeros(5)), world.bus, HoldingOperator()).begin()
-    SimulatedMachine(replace(slow, rate=10.0), START, 0.0)
-    clashing = replace(BROKK_170, valve_frame_id=0x583)  # of an SDO answer
-    with pytest.raises(ValueError, match=r"valve_frame_id: .* no other frame, got 0x583"):
-        SimulatedMachine(clashing, START, 0.0)
-    for unfit in (machine, slow):
-        with pytest.raises(ValueError, match="expected"):
-            SimulatedMachine(unfit, np.zeros(unfit.n), 0.0)
+
+
+@pytest.mark.parametrize(
+    ("machine", "refusal"),
+    [
+        (replace(SIX, valve_frame_id=0x185), "valve_frame_id: expected .*, got 0x185, 0x186"),
+        (replace(BROKK_170, valve_frame_id=0x583), "valve_frame_id: .* no other frame, got 0x583"),
+        (SLOW, r"slow: expected a rate of 10 Hz or more, .* got 5 Hz"),
+    ],
+)
+def test_machines_that_do_not_fit_the_bus__are_refused_on_both_its_sides(machine, refusal):
+    with pytest.raises(ValueError, match=refusal):
+        set_up_nodes(None, machine)
+    with pytest.raises(ValueError, match=refusal):
+        SimulatedMachine(machine, np.zeros(machine.n), 0.0)
+    SimulatedMachine(replace(SLOW, rate=10.0), START, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -281,12 +283,8 @@ def test_drive__drives_five_encoders_of_the_canopen_library():
         np.testing.assert_allclose(drive.measured[0], START, atol=STEP / 1.9)
         nodes[2].nmt.stop_heartbeat()
         operator.enable = False
-
-        def active():
-            return fault_name(BROKK_170, int(drive.gate.active_fault))
-
-        end = time.monotonic() + 20
-        while (fault := active()) != "q3: heartbeat lost" and time.monotonic() < end:
+        fault, end = "", time.monotonic() + 20
+        while fault != "q3: heartbeat lost" and time.monotonic() < end:
             drive.tick()
-        assert fault == "q3: heartbeat lost"
-        assert not drive.gate.driving
+            fault = fault_name(BROKK_170, int(drive.gate.active_fault))
+        assert fault == "q3: heartbeat lost" and not drive.gate.driving

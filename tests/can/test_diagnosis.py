@@ -18,9 +18,10 @@ from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import BROKK_170 as M
 from brokk_min.machine import read_encoder
 
-POLICY = load_policy(SHIPPED / "brokk170" / "policy.npz", M)
+FILE = SHIPPED / "brokk170" / "policy.npz"
+POLICY = load_policy(FILE, M)
 DITHER = replace(POLICY, valves="dither")
-PAPER = load_policy(SHIPPED / "brokk170" / "policy_paper.npz", M)
+PAPER = load_policy(FILE.with_name("policy_paper.npz"), M)
 START = np.array([[0.0, 0.5, 0.58, 1.71, 1.24]])
 SECONDS = 14
 
@@ -47,25 +48,15 @@ def drive(observe=lambda h: h, send=lambda u: u, read=lambda q: q, ticks_of_plan
     return Ticks(*map(np.array, zip(*rows, strict=True)))
 
 
-def late():
-    """The history of the last tick."""
+def tick_late():
+    """Gives what it got at the tick before."""
     kept = []
 
-    def observe(history):
-        kept.append(history)
-        return kept[-2] if len(kept) > 1 else history
+    def act(x):
+        kept.append(x)
+        return kept[-2:][0]
 
-    return observe
-
-
-def delayed():
-    kept = [np.zeros((1, 5))]
-
-    def send(u):
-        kept.append(u)
-        return kept[-2]
-
-    return send
+    return act
 
 
 def scaled(*factors):
@@ -79,13 +70,13 @@ FAULTS = {
     "sign of q4": {"send": lambda u: u * SIGN},
     "order of q3, q5": {"send": lambda u: u[:, [0, 1, 4, 3, 2]]},
     "degrees": {"observe": scaled(180 / np.pi, 180 / np.pi, 1)},
-    "one sample late": {"observe": late()},
+    "one sample late": {"observe": tick_late()},
     "rate: 10 Hz instead of 20 Hz": {"ticks_of_plant": 2},
     "dead zone": {"send": lambda u: np.sign(u) * np.maximum(np.abs(u) - 0.05, 0)},
     "scale of commands: 0.5": {"send": lambda u: 0.55 * u},
     "order of the history": {"observe": lambda history: history[..., ::-1].copy()},
     "zero of q4": {"observe": lambda history: history + ZERO},
-    "delay: 50 ms more": {"send": delayed()},
+    "delay: 50 ms more": {"send": tick_late()},
 }
 
 
@@ -115,23 +106,19 @@ class Reversed(PolicyController):
 
 def write_drive(log, controller):
     """A log of 5 s on the simulated bus: a rest, up and forward, back."""
-    operator = HoldingOperator()
     writer = can.CanutilsLogWriter(log, channel="can0")
-    world = World(controller, operator, log=writer)
+    world = World(controller, HoldingOperator(), log=writer)
     world.drive.begin()
-    operator.v = (0.0, 0.0, 0.0)
-    world.run(1.0)
-    operator.v = (0.0, 0.15, 0.1)
-    world.run(2.0)
-    operator.v = (0.0, -0.15, -0.1)
-    world.run(2.0)
+    for seconds, side in ((1.0, 0), (2.0, 1), (2.0, -1)):
+        world.operator.v = (0.0, 0.15 * side, 0.1 * side)
+        world.run(seconds)
     world.bus.close()
 
 
 def test_command__compares_with_the_valves_that_drove(tmp_path, capsys):
     log = tmp_path / "run.log"
     write_drive(log, PolicyController(M, DITHER))
-    command = f"diagnose '{log}' --policy '{SHIPPED / 'brokk170' / 'policy.npz'}'"
+    command = f"diagnose '{log}' --policy '{FILE}'"
     assert run(f"{command} --valves dither --json '{tmp_path}/d.json'") == 0
     assert "commands and motion are as the policy" in capsys.readouterr().out
     assert json.loads((tmp_path / "d.json").read_text())["command_error"] < COMMAND_ERROR
@@ -146,8 +133,7 @@ def test_command__prints_terms_and_draws_them(tmp_path, capsys):
     log = tmp_path / "run.log"
     write_drive(log, Reversed(M, POLICY))
     files = f"--figure '{tmp_path}/d.png' --json '{tmp_path}/d.json'"
-    policy = SHIPPED / "brokk170" / "policy.npz"
-    assert run(f"diagnose '{log}' --policy '{policy}' {files}") == 0
+    assert run(f"diagnose '{log}' --policy '{FILE}' {files}") == 0
     printed = capsys.readouterr().out
     assert "commands: order of the history" in printed.splitlines()[1]
     found = json.loads((tmp_path / "d.json").read_text())
@@ -155,5 +141,5 @@ def test_command__prints_terms_and_draws_them(tmp_path, capsys):
     assert (tmp_path / "d.png").read_bytes().startswith(b"\x89PNG")
     lines = log.read_text().splitlines(keepends=True)
     log.write_text("".join(lines[: len(lines) // 9]))
-    assert run(f"diagnose '{log}' --policy '{policy}'") == 1
+    assert run(f"diagnose '{log}' --policy '{FILE}'") == 1
     assert "run.log: log: expected 73 ticks of driving in a row" in capsys.readouterr().err

@@ -23,23 +23,22 @@ from brokk_min.machine import BROKK_170
 STEP = BROKK_170.encoder_step[0]
 
 
-def drive_logged(path, seconds=4.0):
+def drive_logged(path):
     """A drive with a fault in its midst, logged."""
     operator = HoldingOperator()
     world = World(BASELINE, operator, log=can.CanutilsLogWriter(path, channel="can0"))
     world.drive.begin()
-    world.run(seconds / 2)
+    world.run(2.0)
     world.upward = only(0x185, once(lambda data: []))
     world.run(0.3)
     operator.enable = False
     world.run(0.1)
     operator.enable = True
     operator.v = (0.0, 0.1, 0.05)
-    world.run(seconds / 2)
+    world.run(2.0)
     world.drive.signals.append(2)
     world.run(1.0)
     world.bus.close()
-    return world
 
 
 def test_read_frames__reads_a_cut_log_up_to_its_last_whole_line(tmp_path):

@@ -1,6 +1,7 @@
 """The simulated machine frame by frame on a clock of its own, and as a process that serves."""
 
 import os
+import re
 import signal
 import struct
 import threading
@@ -8,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers_bus import START, eventually, recorded_rows
+from helpers_bus import SIX, START, eventually, recorded_rows
 
 from brokk_min.can.canopen import HEARTBEAT_PERIOD, WATCHDOG, Frame, valve_frame, valve_frames
 from brokk_min.can.simulated_machine import SimulatedMachine, simulate, start_pose
@@ -82,10 +83,8 @@ def test_receive__opens_valves_after_a_start_and_a_neutral_frame():
 
 def test_receive__opens_valves_when_all_frames_of_a_tick_are_there():
     """Six joints have two frames: one alone moves nothing, and a SYNC without it closes all."""
-    sixth = replace(BROKK_170.joints[4], name="q6", encoder_node=6)
-    six = replace(BROKK_170, joints=(*BROKK_170.joints, sixth), q_start=())
     reasons = []
-    machine = SimulatedMachine(six, [*START, 1.0], 0.0, report=reasons.append)
+    machine = SimulatedMachine(SIX, [*START, 1.0], 0.0, report=reasons.append)
     machine.receive(Frame(0.0, 0x000, bytes([1, 0])))
 
     def tick(counter, *counts, lost=None):
@@ -185,15 +184,11 @@ def test_start_pose__is_the_given_one_the_machines_or_the_middle():
     np.testing.assert_array_equal(start_pose(BROKK_170, ()), START)
     for pose in ([0.1, 0.5, 0.5, 1.5, 1.0], low.tolist(), high.tolist()):
         np.testing.assert_array_equal(start_pose(BROKK_170, pose), pose)
-    other = replace(BROKK_170, q_start=())
-    np.testing.assert_allclose(start_pose(other, ()), (low + high) / 2)
-
-
-@pytest.mark.parametrize("pose", [[9.0, 0.5, 0.5, 1.5, 1.0], [0.0, 0.5]])
-def test_start_pose__refuses_what_the_machine_cannot_take(pose):
-    with pytest.raises(ValueError, match=r"start: expected 5 angles within .*, got") as e:
-        start_pose(BROKK_170, pose)
-    assert str(pose) in str(e.value)
+    np.testing.assert_allclose(start_pose(replace(BROKK_170, q_start=()), ()), (low + high) / 2)
+    for pose in ([9.0, 0.5, 0.5, 1.5, 1.0], [0.0, 0.5]):
+        refusal = rf"start: expected 5 angles within .*, got {re.escape(str(pose))}"
+        with pytest.raises(ValueError, match=refusal):
+            start_pose(BROKK_170, pose)
 
 
 def test_simulate__serves_until_a_signal_and_records_every_step(tmp_path):
