@@ -202,23 +202,17 @@ def recorded_table() -> list[dict[str, float]]:
 def hours(number: float) -> dict[str, Any]:
     """Memory while a drive runs, at its start and each twelfth of it."""
 
-    class Shuttle(HoldingOperator):
+    controller, operator = ConstantCommand(30, 0, 30, 30, 30), HoldingOperator()
+
+    def turn() -> None:
         """Forward and back every two seconds, so that no joint gets to its limit."""
+        side = (-1) ** (world.drive.ticks // 40)
+        operator.v = (0.1 * side, 0.0, 0.0)
+        controller.m = side * np.abs(controller.m)
 
-        def __call__(self, driving: bool, ready: bool) -> Any:
-            self.v = (0.1 * (-1) ** (world.drive.ticks // 40), 0.0, 0.0)
-            return super().__call__(driving, ready)
-
-    class Shaking(ConstantCommand):
-        """Commands that change sign every two seconds."""
-
-        def __call__(self, measured: Any, state: None) -> Any:
-            u, state = super().__call__(measured, state)
-            return u * np.sign(measured.v_goal[..., :1]), state
-
+    operator.act = turn
     gc.disable()  # as `Drive.run` does
-    log = can.CanutilsLogWriter(os.devnull)
-    world = World(Shaking(30, 0, 30, 30, 30), Shuttle(), log=log)
+    world = World(controller, operator, log=can.CanutilsLogWriter(os.devnull))
     world.step = world.drive.machine.plant_dt
     world.drive.begin()
     world.simulated.record = lambda *row: None

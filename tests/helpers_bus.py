@@ -282,13 +282,13 @@ class Virtual:
         self.sdl.SDL_JoystickSetVirtualAxis.argtypes = [pointer, number, ctypes.c_int16]
         self.sdl.SDL_JoystickSetVirtualButton.argtypes = [pointer, number, ctypes.c_uint8]
         self.index = self.sdl.SDL_JoystickAttachVirtual(4, axes, buttons, 0)
-        self.operatorle = self.sdl.SDL_JoystickOpen(self.index)
+        self.handle = self.sdl.SDL_JoystickOpen(self.index)
 
     def axis(self, axis, value):
-        assert self.sdl.SDL_JoystickSetVirtualAxis(self.operatorle, axis, round(32767 * value)) == 0
+        assert self.sdl.SDL_JoystickSetVirtualAxis(self.handle, axis, round(32767 * value)) == 0
 
     def button(self, button, held):
-        assert self.sdl.SDL_JoystickSetVirtualButton(self.operatorle, button, held) == 0
+        assert self.sdl.SDL_JoystickSetVirtualButton(self.handle, button, held) == 0
 
     def unplug(self):
         assert self.sdl.SDL_JoystickDetachVirtual(self.index) == 0

@@ -127,9 +127,7 @@ def open_bus(
     name = channel if interface == "socketcan" else interface
     writer = can.CanutilsLogWriter(log) if log else None
     bus = Bus(raw, writer, name, echo=interface == "udp_multicast")
-    # Buses without a file descriptor (virtual, udp_multicast, Windows) raise NotImplementedError by
-    # python-can's contract. `file` stays -1 then, and `Bus.recv` waits in python-can's own recv.
-    with suppress(NotImplementedError):
+    with suppress(NotImplementedError):  # python-can's word for a bus without a descriptor
         bus.file = raw.fileno()
     try:
         yield bus

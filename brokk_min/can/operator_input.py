@@ -17,6 +17,8 @@ from brokk_min.env import Measured
 from brokk_min.identification.files import require
 from brokk_min.machine import PWM_MAX, Array, Machine
 
+PATIENCE = 5.0  # s that a script waits until the machine is ready
+
 
 class Script:
     """Velocity goals (T, 3) [m/s] one after another, as soon as the gate is ready; then the end.
@@ -24,7 +26,7 @@ class Script:
     ValueError: a goal faster than the machine's `tool_speed`.
     """
 
-    def __init__(self, machine: Machine, goals: Array, patience_s: float = 5.0) -> None:
+    def __init__(self, machine: Machine, goals: Array) -> None:
         fastest = np.linalg.norm(goals, axis=-1).max()
         if not fastest <= machine.tool_speed * (1 + 1e-9):
             raise ValueError(
@@ -33,7 +35,7 @@ class Script:
         self.goals = goals
         self.tick = 0
         self.pressed = False
-        self.patience = round(patience_s * machine.rate)  # ticks until it gives up
+        self.patience = round(PATIENCE * machine.rate)  # ticks until it gives up
 
     def __call__(self, driving: bool, ready: bool) -> OperatorInput:
         """Stops at the end, after a fault, or if the machine never gets ready."""

@@ -7,7 +7,6 @@ import gc
 import os
 import struct
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -225,10 +224,11 @@ def simulate(
     ids = [canopen.NMT, canopen.SYNC, *canopen.valve_frame_ids(machine)]
     ids += [canopen.SDO_REQUEST + joint.encoder_node for joint in machine.joints]
     gc.freeze()  # no long garbage collection while the encoders should answer
-    with ExitStack() as stack:
-        bus = stack.enter_context(open_bus(interface, channel, ids=ids))
-        file = stack.enter_context(open(record or os.devnull, "w", buffering=1))
-        signals = stack.enter_context(stop_signals())
+    with (
+        open_bus(interface, channel, ids=ids) as bus,
+        open(record or os.devnull, "w", buffering=1) as file,
+        stop_signals() as signals,
+    ):
         start = bus.now()
         names = [f"{kind}_{name}" for kind in "uq" for name in machine.names]
         print("run", "time", *names, "valid", sep=",", file=file)
