@@ -58,9 +58,9 @@ class Options:
 def groups(faults: dict[str, Any]) -> dict[str, list[Any]]:
     """Faults of one kind at several joints under one name."""
     kinds = defaultdict(list)
-    for name, kind in faults.items():
+    for name, fault in faults.items():
         joint = re.fullmatch(r"q[1-5] (.*)", name) if faults is FAULTS else None
-        kinds[f"position {joint[1]}" if joint else name].append(kind)
+        kinds[f"position {joint[1]}" if joint else name].append(fault)
     return kinds
 
 
@@ -74,11 +74,11 @@ def table(repeats: int, only: str) -> list[dict[str, Any]]:
             if not re.search(only, name):
                 continue
             phases = (np.arange(repeats) + 0.5) / repeats * 0.05
-            outcomes = [measure(kinds[k % len(kinds)].cause, phases[k]) for k in range(repeats)]
+            outcomes = [measure(kinds[k % len(kinds)][0], phases[k]) for k in range(repeats)]
             latched = sum(bool(outcome.latched) for outcome in outcomes)
             times = [1e3 * outcome.seconds for outcome in outcomes]
             said = {re.sub(r"^(fault: )?(q\d: )?| \(.*", "", outcome.words) for outcome in outcomes}
-            words = "; ".join(sorted(said - {""})) if faults is FAULTS else kinds[0].words
+            words = "; ".join(sorted(said - {""})) if faults is FAULTS else kinds[0][1]
             row = {"fault": name, "median": float(np.median(times)), "worst": max(times)}
             rows.append(row | {"latched": latched, "repeats": repeats, "words": words})
             span = f"{row['median']:.0f}, {row['worst']:.0f}" if latched else "not found"

@@ -126,6 +126,9 @@ def flood(world, foreign=False, rate=2000):
     return seen, 9 * len(ids)
 
 
+foreign_flood = partial(flood, foreign=True)
+
+
 def request(world, rate):
     """Somebody else reads the encoders' resolution, by SDO."""
     data = struct.pack("<BHBI", 0x40, 0x6501, 0, 0)
@@ -218,108 +221,101 @@ def command(joint, value):
     return lambda world: world.controller.m.__setitem__(joint, value)
 
 
-class Kind(NamedTuple):
-    """A fault, and words of the reason that the program gives, or why it cannot find it."""
-
-    cause: Callable[[World], Any]
-    words: str
-
-
+# what goes wrong, and words of the reason that the program gives, or why it cannot find it
 OTHER_SENDER = "SYNC, NMT or valve frame of another sender"
 NOT_OPERATIONAL = "valve controller: not operational"
 FAULTS = {
-    "valve controller silent": Kind(up(0x710, lambda d: []), "valve controller: heartbeat lost"),
-    "valve controller stopped": Kind(up(0x710, lambda d: [b"\x04"]), NOT_OPERATIONAL),
-    "valve controller's heartbeat malformed": Kind(up(0x710, lambda d: [d * 2]), "heartbeat lost"),
-    "flood on all identifiers": Kind(flood, ""),
-    "flood of 6,000 foreign frames a second": Kind(
-        partial(flood, foreign=True, rate=6000), "bus flooded"
+    "valve controller silent": (up(0x710, lambda d: []), "valve controller: heartbeat lost"),
+    "valve controller stopped": (up(0x710, lambda d: [b"\x04"]), NOT_OPERATIONAL),
+    "valve controller's heartbeat malformed": (up(0x710, lambda d: [d * 2]), "heartbeat lost"),
+    "flood on all identifiers": (flood, ""),
+    "flood of 6,000 foreign frames a second": (partial(foreign_flood, rate=6e3), "bus flooded"),
+    "flood of 20,000 foreign frames a second": (partial(foreign_flood, rate=2e4), "bus flooded"),
+    "second master": (second_master, OTHER_SENDER),
+    "second sender after each of our valve frames": (partial(intruder, after=0x210), ""),
+    "second sender after each SYNC": (partial(intruder, after=0x080), OTHER_SENDER),
+    "foreign SYNC": (foreign(0x080, b""), OTHER_SENDER),
+    "foreign NMT stop of all": (foreign(0x000, b"\x02\x00"), OTHER_SENDER),
+    "foreign NMT reset of q4": (foreign(0x000, b"\x81\x04"), OTHER_SENDER),
+    "foreign NMT stop of the valve controller": (foreign(0x000, b"\x02\x10"), OTHER_SENDER),
+    "bus closed": (close_bus, "error (CanOperationError: closed)"),
+    "send error of all frames": (put("downward", SEND_ERROR), "(CanOperationError"),
+    "send error of valve frames": (put("downward", only(0x210, SEND_ERROR)), ""),
+    "valve frame lost": (down_once(lambda d: []), NOT_OPERATIONAL),
+    "valve frame doubled": (down_once(lambda d: [d, d]), NOT_OPERATIONAL),
+    "valve frame's bit flipped": (
+        down_once(lambda d: [bytes([d[0] ^ 4, *d[1:]])]),
+        "valve controller",
     ),
-    "flood of 20,000 foreign frames a second": Kind(
-        partial(flood, foreign=True, rate=20_000), "bus flooded"
+    "valve frame cut": (down_once(lambda d: [d[:7]]), NOT_OPERATIONAL),
+    "all valve frames lost": (put("downward", only(0x210, lambda d: [])), NOT_OPERATIONAL),
+    "valve frames 60 ms late": (partial(delay_valve_frames, seconds=0.06), NOT_OPERATIONAL),
+    "valve frames 100 ms late": (partial(delay_valve_frames, seconds=0.1), NOT_OPERATIONAL),
+    "joystick unplugged": (put("operator.alive", False), "operator's device lost"),
+    "joystick raises": (put("operator.act", raises(OSError("gone"))), "error (OSError: gone)"),
+    "enable released": (put("operator.enable", False), ""),
+    "SIGTERM": (lambda world: world.drive.signals.append(15), "stop asked for"),
+    "operator stops": (put("operator.stop", True), "stop asked for"),
+    "clock stepped forward": (put("offset", 3600.0), "tick late, or the"),
+    "clock stepped back": (put("offset", -3600.0), "tick late, or the"),
+    "log cannot be written": (
+        put("bus.flush", raises(OSError("no space"))),
+        "error (OSError: no space)",
     ),
-    "second master": Kind(second_master, OTHER_SENDER),
-    "second sender after each of our valve frames": Kind(partial(intruder, after=0x210), ""),
-    "second sender after each SYNC": Kind(partial(intruder, after=0x080), OTHER_SENDER),
-    "foreign SYNC": Kind(foreign(0x080, b""), OTHER_SENDER),
-    "foreign NMT stop of all": Kind(foreign(0x000, b"\x02\x00"), OTHER_SENDER),
-    "foreign NMT reset of q4": Kind(foreign(0x000, b"\x81\x04"), OTHER_SENDER),
-    "foreign NMT stop of the valve controller": Kind(foreign(0x000, b"\x02\x10"), OTHER_SENDER),
-    "bus closed": Kind(close_bus, "error (CanOperationError: closed)"),
-    "send error of all frames": Kind(put("downward", SEND_ERROR), "(CanOperationError"),
-    "send error of valve frames": Kind(put("downward", only(0x210, SEND_ERROR)), ""),
-    "valve frame lost": Kind(down_once(lambda d: []), NOT_OPERATIONAL),
-    "valve frame doubled": Kind(down_once(lambda d: [d, d]), NOT_OPERATIONAL),
-    "valve frame's bit flipped": Kind(
-        down_once(lambda d: [bytes([d[0] ^ 4, *d[1:]])]), "valve controller"
+    "late tick": (stall(0.08), "tick late"),
+    "hang": (stall(0.8), "tick late"),
+    "policy returns NaN": (command(2, np.nan), "q3: no valid command"),
+    "policy returns infinity": (command(0, np.inf), "q1: no valid command"),
+    "policy beyond the limit": (command(4, 81), "q5: no valid command"),
+    "policy moves the locked joint": (command(1, 20), "q2: no valid command"),
+    "policy raises": (
+        put("controller.act", raises(RuntimeError("boom"))),
+        "error (RuntimeError: boom)",
     ),
-    "valve frame cut": Kind(down_once(lambda d: [d[:7]]), NOT_OPERATIONAL),
-    "all valve frames lost": Kind(put("downward", only(0x210, lambda d: [])), NOT_OPERATIONAL),
-    "valve frames 60 ms late": Kind(partial(delay_valve_frames, seconds=0.06), NOT_OPERATIONAL),
-    "valve frames 100 ms late": Kind(partial(delay_valve_frames, seconds=0.1), NOT_OPERATIONAL),
-    "joystick unplugged": Kind(put("operator.alive", False), "operator's device lost"),
-    "joystick raises": Kind(put("operator.act", raises(OSError("gone"))), "error (OSError: gone)"),
-    "enable released": Kind(put("operator.enable", False), ""),
-    "SIGTERM": Kind(lambda world: world.drive.signals.append(15), "stop asked for"),
-    "operator stops": Kind(put("operator.stop", True), "stop asked for"),
-    "clock stepped forward": Kind(put("offset", 3600.0), "tick late, or the"),
-    "clock stepped back": Kind(put("offset", -3600.0), "tick late, or the"),
-    "log cannot be written": Kind(
-        put("bus.flush", raises(OSError("no space"))), "error (OSError: no space)"
-    ),
-    "late tick": Kind(stall(0.08), "tick late"),
-    "hang": Kind(stall(0.8), "tick late"),
-    "policy returns NaN": Kind(command(2, np.nan), "q3: no valid command"),
-    "policy returns infinity": Kind(command(0, np.inf), "q1: no valid command"),
-    "policy beyond the limit": Kind(command(4, 81), "q5: no valid command"),
-    "policy moves the locked joint": Kind(command(1, 20), "q2: no valid command"),
-    "policy raises": Kind(
-        put("controller.act", raises(RuntimeError("boom"))), "error (RuntimeError: boom)"
-    ),
-    "encoders all silent": Kind(
-        put("upward", lambda i, d: [] if 0x180 < i < 0x190 else [(i, d)]), "q1: silent"
+    "encoders all silent": (
+        put("upward", lambda i, d: [] if 0x180 < i < 0x190 else [(i, d)]),
+        "q1: silent",
     ),
 }
 for node in range(1, 6):
-    name, tpdo, heartbeat = f"q{node}", 0x180 + node, 0x700 + node
-    doubled = f"{name}: doubled or malformed"
-    FAULTS |= {
-        f"{name} dropped": Kind(up(tpdo, lambda d: []), f"{name}: silent"),
-        f"{name} dropped once": Kind(up_once(tpdo, lambda d: []), f"{name}: silent"),
-        f"{name} jumps": Kind(up(tpdo, moved(90)), f"{name}: jumped"),
-        f"{name} jumps by half a turn": Kind(up(tpdo, moved(2048)), f"{name}: out of range"),
-        f"{name} jumps by a turn": Kind(up(tpdo, moved(4096)), doubled),
-        f"{name} says FFFFFFFF": Kind(up(tpdo, lambda d: [b"\xff" * 4]), doubled),
-        f"{name} doubled": Kind(up(tpdo, lambda d: [d, d]), doubled),
-        f"{name} reordered": Kind(partial(reorder, node=node), f"{name}: silent"),
-        f"{name} malformed": Kind(up(tpdo, lambda d: [d[:3]]), doubled),
-        f"{name} heartbeat lost": Kind(up(heartbeat, lambda d: []), f"{name}: heartbeat lost"),
-        f"{name} rebooted": Kind(up(heartbeat, lambda d: [b"\x00"]), f"{name}: not operational"),
+    tpdo, heartbeat, doubled = 0x180 + node, 0x700 + node, "doubled or malformed"
+    of_joint = {
+        "dropped": (up(tpdo, lambda d: []), "silent"),
+        "dropped once": (up_once(tpdo, lambda d: []), "silent"),
+        "jumps": (up(tpdo, moved(90)), "jumped"),
+        "jumps by half a turn": (up(tpdo, moved(2048)), "out of range"),
+        "jumps by a turn": (up(tpdo, moved(4096)), doubled),
+        "says FFFFFFFF": (up(tpdo, lambda d: [b"\xff" * 4]), doubled),
+        "doubled": (up(tpdo, lambda d: [d, d]), doubled),
+        "reordered": (partial(reorder, node=node), "silent"),
+        "malformed": (up(tpdo, lambda d: [d[:3]]), doubled),
+        "heartbeat lost": (up(heartbeat, lambda d: []), "heartbeat lost"),
+        "rebooted": (up(heartbeat, lambda d: [b"\x00"]), "not operational"),
     }
     if node != 2:  # the operator moves q2, no command of ours
-        FAULTS |= {
-            f"{name} late by 30 ms, after re-arm too": Kind(
-                partial(late, node=node), f"{name}: silent"
-            ),
-            f"{name} frozen": Kind(partial(freeze, node=node), f"{name}: frozen"),
-            f"{name} a tick late, without a gap": Kind(
-                partial(repeat_once, node=node), f"{name}: frozen"
-            ),
+        of_joint |= {
+            "late by 30 ms, after re-arm too": (partial(late, node=node), "silent"),
+            "frozen": (partial(freeze, node=node), "frozen"),
+            "a tick late, without a gap": (partial(repeat_once, node=node), "frozen"),
         }
+    for name, (cause, words) in of_joint.items():
+        FAULTS[f"q{node} {name}"] = (cause, f"q{node}: {words}")
 MOTION = "it looks like motion, which no other sensor confirms"
 NOT_FOUND = {
-    "q2 frozen, the locked joint": Kind(partial(freeze, node=2), "it may stand still"),
-    "slow q3 a tick late, without a gap": Kind(
-        partial(repeat_once, node=3, command=SLOW), "a position has neither time nor number"
+    "q2 frozen, the locked joint": (partial(freeze, node=2), "it may stand still"),
+    "slow q3 a tick late, without a gap": (
+        partial(repeat_once, node=3, command=SLOW),
+        "a position has neither time nor number",
     ),
-    "slow q3 frozen": Kind(partial(freeze, node=3, command=SLOW), "it takes longer, see below"),
-    "q3 drifts by 60 counts/s": Kind(partial(drift, node=3, speed=60), MOTION),
-    "q5 drifts by 400 counts/s": Kind(partial(drift, node=5, speed=-400), MOTION),
-    "valve frames 30 ms late": Kind(
-        partial(delay_valve_frames, seconds=0.03), "within the tick; the machine follows later"
+    "slow q3 frozen": (partial(freeze, node=3, command=SLOW), "it takes longer, see below"),
+    "q3 drifts by 60 counts/s": (partial(drift, node=3, speed=60), MOTION),
+    "q5 drifts by 400 counts/s": (partial(drift, node=5, speed=-400), MOTION),
+    "valve frames 30 ms late": (
+        partial(delay_valve_frames, seconds=0.03),
+        "within the tick; the machine follows later",
     ),
-    "4,500 foreign frames a second": Kind(partial(flood, foreign=True, rate=4500), "harmless"),
-    "2,000 SDO requests a second": Kind(partial(request, rate=2000), "harmless"),
+    "4,500 foreign frames a second": (partial(foreign_flood, rate=4500), "harmless"),
+    "2,000 SDO requests a second": (partial(request, rate=2000), "harmless"),
 }
 
 

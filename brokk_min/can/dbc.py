@@ -18,8 +18,8 @@ def dbc(machine: Machine) -> str:
     ValueError: a machine that does not fit the bus.
     """
     canopen.check_bus(machine)
-    nodes = " ".join([SENDER, *_nodes(machine)])
-    parts = [f"{HEAD}BU_: {nodes}", *_messages(machine), PWM]
+    nodes = [*(f"encoder_{name}" for name in _names(machine)), "valve_controller"]
+    parts = [f"{HEAD}BU_: {' '.join([SENDER, *nodes])}", *_messages(machine, nodes), PWM]
     return "\n\n".join(parts) + "\n"
 
 
@@ -28,11 +28,7 @@ def _names(machine: Machine) -> list[str]:
     return [re.sub(r"\W", "_", name) for name in machine.names]
 
 
-def _nodes(machine: Machine) -> list[str]:
-    return [*(f"encoder_{name}" for name in _names(machine)), "valve_controller"]
-
-
-def _messages(machine: Machine) -> Iterator[str]:
+def _messages(machine: Machine, nodes: list[str]) -> Iterator[str]:
     yield _message(canopen.NMT, "NMT", 2, SENDER, [_signal("command", 0), _signal("node", 8)])
     yield _message(canopen.SYNC, "SYNC", 0, SENDER, [])
     for k, can_id in enumerate(canopen.valve_frame_ids(machine)):
@@ -41,12 +37,12 @@ def _messages(machine: Machine) -> Iterator[str]:
         bytes_ = [_signal(f"u_{name}", 8 * i) for i, name in enumerate(names)]
         bytes_ += [_signal("counter", 40), _signal("checksum", 48), _signal("enable", 56, high=1)]
         yield _message(can_id, f"valves_{k + 1}" if k else "valves", 8, SENDER, bytes_)
-    nodes = list(zip(_nodes(machine), canopen.node_numbers(machine)))
+    numbered = list(zip(nodes, canopen.node_numbers(machine)))
     position = _signal("position", 0, 32, 2**canopen.POSITION_BITS - 1, "counts")
-    for name, node in nodes[:-1]:
+    for name, node in numbered[:-1]:
         yield _message(canopen.TPDO1 + node, name, 4, name, [position])
     state = _signal("state", 0, high=127)
-    for name, node in nodes:
+    for name, node in numbered:
         yield _message(canopen.HEARTBEAT + node, f"heartbeat_{name}", 1, name, [state])
 
 

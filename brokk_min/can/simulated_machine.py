@@ -36,13 +36,9 @@ class SimulatedMachine:
     between, and after `WATCHDOG` without them. They stay closed until an NMT start and neutral
     frames.
 
-    Args:
-        machine: what moves.
-        q: angles at the start [rad], (n,).
-        now: s.
-        record: called every plant step with time [s], command in force and true angles [rad] (n,),
-            and the time of the last valid valve frame [s].
-        report: called with the reason when the valve controller stops.
+    It starts at the angles `q` [rad] (n,) and the time `now` [s]. `record` gets each plant step:
+    time [s], command in force and true angles [rad] (n,), time of the last valid valve frame [s].
+    `report` gets the reason when the valve controller stops.
 
     ValueError: a machine that does not fit the bus, see `check_bus`.
     """
