@@ -24,7 +24,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import can
 import numpy as np
 import tyro
 
@@ -212,7 +211,7 @@ def hours(number: float) -> dict[str, Any]:
 
     operator.act = turn
     gc.disable()  # as `Drive.run` does
-    world = World(controller, operator, log=can.CanutilsLogWriter(os.devnull))
+    world = World(controller, operator, log=Path(os.devnull))
     world.step = world.drive.machine.plant_dt
     world.drive.begin()
     world.simulated.record = lambda *row: None

@@ -5,26 +5,25 @@ import json
 import os
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import can
 import numpy as np
 import pytest
 from canopen.objectdictionary import ObjectDictionary, ODArray, ODRecord, ODVariable, datatypes
 
 from brokk_min.can.canopen import Frame, OperatorInput
-from brokk_min.can.connection import Bus, open_bus
+from brokk_min.can.connection import open_bus
 from brokk_min.can.operator_input import Script
 from brokk_min.can.simulated_machine import SimulatedMachine, serve
 from brokk_min.hw import Drive
 from brokk_min.jacobian import Gains, JacobianController, manipulability_threshold
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
+from brokk_min.viewer.lockstep import SimulatedBus
 
 MULTICAST = "239.74.163.2"
 START = (0.0, 0.5, 0.58, 1.71, 1.24)
@@ -73,16 +72,14 @@ def raises(error):
     return act
 
 
-class World:
-    """A simulated machine and a `Drive`; time passes while the program waits.
+class World(SimulatedBus):
+    """A simulated machine and a `Drive`, in steps of a millisecond.
 
-    The bus of the program is this object: it lets the machine live while `recv` waits, and `upward`
-    and `downward` may tamper with what machine and program send.
+    `upward` and `downward` may tamper with what machine and program send.
     """
 
     def __init__(self, controller, operator, machine=BROKK_170, log=None, start=START):
-        self.inbox = deque()  # messages for the program
-        self.t = 0.0  # s
+        super().__init__(machine, start)
         self.step = 0.001  # s
         self.offset = 0.0  # s, of the program's clock
         self.upward = unchanged
@@ -90,54 +87,40 @@ class World:
         self.noise = list  # foreign frames of the next millisecond
         self.record = []
         self.syncs = []
-        self.simulated = SimulatedMachine(machine, start, 0.0, lambda *row: self.record.append(row))
-        self.bus = Bus(self, log, clock=lambda: self.t + self.offset, sleep=self.sleep)
+        self.simulated.record = lambda *row: self.record.append(row)
+        self.simulated.start = self.simulated.valid = 0.0
+        self.bus = self.open(log)
+        self.bus.clock = lambda: self.time + self.offset
         self.bus.start = 1.8e9  # s; a fixed time of day, so that roundings repeat themselves
         self.drive = Drive(machine, controller, self.bus, operator)
-        self.say(self.simulated.boot())
 
     def send(self, message, timeout=None):
         frames = self.downward(message.arbitration_id, bytes(message.data))
         self.live()
         for can_id, data in frames:
-            self.syncs += [self.t] * (can_id == 0x080)
-            self.say(self.simulated.receive(Frame(self.t, can_id, data)))
-
-    def recv(self, timeout):
-        end = self.t + timeout
-        while not self.inbox and self.t < end:
-            self.t = min(end, self.t + self.step)
-            self.live()
-        return self.inbox.popleft() if self.inbox else None
-
-    def shutdown(self):
-        """Nothing is open."""
+            self.syncs += [self.time] * (can_id == 0x080)
+            self.say(self.simulated.receive(Frame(self.time, can_id, data)))
 
     def sleep(self, seconds):
-        end = self.t + seconds
-        while self.t < end:
-            self.t = min(end, self.t + self.step)
+        end = self.time + seconds
+        while self.time < end:
+            self.time = min(end, self.time + self.step)
             self.live()
 
     def live(self):
         """The machine's side up to now."""
-        self.say(self.simulated.advance(self.t))
+        self.say(self.simulated.advance(self.time))
         for can_id, data in self.noise():
-            self.put(can_id, data)
-            self.say(self.simulated.receive(Frame(self.t, can_id, data)))
+            self.answers.append((can_id, data))
+            self.say(self.simulated.receive(Frame(self.time, can_id, data)))
 
     def say(self, frames):
         for frame in frames:
-            for can_id, data in self.upward(*frame):
-                self.put(can_id, data)
-
-    def put(self, can_id, data):
-        """Bring a frame to the program."""
-        self.inbox.append(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+            self.answers += self.upward(*frame)
 
     def run(self, seconds):
-        end = self.t + seconds
-        while self.t < end and self.drive.tick():
+        end = self.time + seconds
+        while self.time < end and self.drive.tick():
             pass
 
     @property

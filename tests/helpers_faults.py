@@ -59,15 +59,15 @@ def freeze(world, node, command=None):
 
 def due(world, held):
     """Remove and return the frames whose time has come."""
-    frames = [frame for then, frame in held if then <= world.t]
-    held[:] = [item for item in held if item[0] > world.t]
+    frames = [frame for then, frame in held if then <= world.time]
+    held[:] = [item for item in held if item[0] > world.time]
     return frames
 
 
 def delay(world, node, draw):
     """Positions come `draw()` seconds late."""
     tpdo, held = 0x180 + node, []
-    up(tpdo, lambda data: held.append((world.t + draw(), (tpdo, data))) or [])(world)
+    up(tpdo, lambda data: held.append((world.time + draw(), (tpdo, data))) or [])(world)
     world.noise = lambda: due(world, held)
 
 
@@ -95,12 +95,12 @@ def reorder(world, node):
 
 def repeat(world, period, frame):
     """Somebody else sends `frame(1)`, `frame(2)`, ..., one each `period` [s]."""
-    begun, count = world.t, 0
+    begun, count = world.time, 0
 
     def noise():
         nonlocal count
         out = []
-        while begun + period * (count + 1) <= world.t:
+        while begun + period * (count + 1) <= world.time:
             count += 1
             out.append(frame(count))
         return out
@@ -156,7 +156,7 @@ def intruder(world, after):
         if can_id == after:
             counter += 1
             out.append(foreign_valves(77, counter))
-            world.put(*out[-1])
+            world.answers.append(out[-1])
         return out
 
     world.downward = follow
@@ -177,10 +177,10 @@ def delay_valve_frames(world, seconds):
 
     def noise():
         for data in due(world, held):
-            world.simulated.receive(Frame(world.t, 0x210, data))
+            world.simulated.receive(Frame(world.time, 0x210, data))
         return []
 
-    world.downward = only(0x210, lambda d: held.append((world.t + seconds, d)) or [])
+    world.downward = only(0x210, lambda d: held.append((world.time + seconds, d)) or [])
     world.noise = noise
 
 
@@ -198,8 +198,8 @@ def repeat_once(world, node, command=COMMAND):
 
 def drift(world, node, speed):
     """An encoder that gains `speed` counts a second."""
-    begun = world.t
-    up(0x180 + node, lambda data: moved(round(speed * (world.t - begun)))(data))(world)
+    begun = world.time
+    up(0x180 + node, lambda data: moved(round(speed * (world.time - begun)))(data))(world)
 
 
 def close_bus(world):
@@ -333,13 +333,13 @@ def measure(cause: Callable[[World], Any], phase: float, seconds: float = 0.6) -
     world = World(ConstantCommand(*COMMAND), HoldingOperator())
     world.drive.begin()
     world.run(1.0)
-    world.sleep(max(0.0, world.syncs[-1] + phase - world.t))
+    world.sleep(max(0.0, world.syncs[-1] + phase - world.time))
     assert world.commands[1][-1].tolist() == list(COMMAND), "it drove"
-    begun = world.t
+    begun = world.time
     cause(world)
     world.run(seconds)
     words = world.drive.reason
-    world.sleep(max(0.0, begun + seconds + 0.3 - world.t))
+    world.sleep(max(0.0, begun + seconds + 0.3 - world.time))
     times, m = world.commands
     times, m = times[times > begun], m[times > begun]
     is_open = m.any(axis=1)

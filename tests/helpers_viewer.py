@@ -70,7 +70,7 @@ class PipedLoop:
     def __init__(self, *controllers, log=None):
         self.connection, there = multiprocessing.Pipe()
         self.world = World(ConstantCommand(), lambda driving, ready: None, log=log)
-        operator = WindowOperator(BROKK_170, there, lambda: self.world.t)
+        operator = WindowOperator(BROKK_170, there, lambda: self.world.time)
         selected = SelectedController(BROKK_170, controllers, operator)
         self.world.drive = WindowDrive(BROKK_170, selected, self.world.bus, operator)
         self.ticks = []
@@ -78,13 +78,13 @@ class PipedLoop:
         self.world.drive.begin()
 
     def request(self, enable, v=(0, 0, 0), mode=0, levers=(0, 0, 0, 0)):
-        request = Request(self.world.t, mode, enable, True, np.array(v), np.array(levers))
+        request = Request(self.world.time, mode, enable, True, np.array(v), np.array(levers))
         self.connection.send(request)
 
     def go(self, seconds, enable, v=(0, 0, 0), **more):
         """Send requests and receive telemetry for some seconds."""
-        end = self.world.t + seconds
-        while self.world.t < end - 1e-9:
+        end = self.world.time + seconds
+        while self.world.time < end - 1e-9:
             self.request(enable, v, **more)
             self.world.run(0.04)
             self.ticks += receive_telemetry(self.connection)

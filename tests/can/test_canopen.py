@@ -122,11 +122,11 @@ def test_set_up_nodes__refuses_what_does_not_fit(world):
     with pytest.raises(ValueError, match=r"node 4: object 0x6501:00: .*abort 0x06020000"):
         world.drive.begin()
     world.upward = lambda can_id, data: []
-    begun = world.t
+    begun = world.time
     refusal = r"node 1: object 0x6501:00: expected an answer within 0.5 s, got none"
     with pytest.raises(ValueError, match=refusal):
         world.drive.begin()
-    assert world.t - begun == pytest.approx(0.5, abs=0.002)
+    assert world.time - begun == pytest.approx(0.5, abs=0.002)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 
-import can
 import numpy as np
 import pytest
 from helpers_bus import HoldingOperator, World
@@ -106,8 +105,7 @@ class Reversed(PolicyController):
 
 def write_drive(log, controller):
     """A log of 5 s on the simulated bus: a rest, up and forward, back."""
-    writer = can.CanutilsLogWriter(log, channel="can0")
-    world = World(controller, HoldingOperator(), log=writer)
+    world = World(controller, HoldingOperator(), log=log)
     world.drive.begin()
     for seconds, side in ((1.0, 0), (2.0, 1), (2.0, -1)):
         world.operator.v = (0.0, 0.15 * side, 0.1 * side)

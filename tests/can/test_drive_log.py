@@ -3,7 +3,6 @@
 import struct
 from dataclasses import replace
 
-import can
 import numpy as np
 import pytest
 from helpers_bus import BASELINE, ConstantCommand, HoldingOperator, World, once, only
@@ -26,7 +25,7 @@ STEP = BROKK_170.encoder_step[0]
 def drive_logged(path):
     """A drive with a fault in its midst, logged."""
     operator = HoldingOperator()
-    world = World(BASELINE, operator, log=can.CanutilsLogWriter(path, channel="can0"))
+    world = World(BASELINE, operator, log=path)
     world.drive.begin()
     world.run(2.0)
     world.upward = only(0x185, once(lambda data: []))

@@ -1,6 +1,5 @@
 """The commands at a machine: logs that are compared and converted, the window, films."""
 
-import can
 import numpy as np
 import pygame
 import pytest
@@ -24,11 +23,10 @@ GAINS = SHIPPED / "brokk170" / "gains.json"
 def log(tmp_path_factory):
     """Joint q4 jogs for two seconds, on a simulated machine and an injected clock."""
     path = tmp_path_factory.mktemp("drive") / "run.log"
-    writer = can.CanutilsLogWriter(path, channel="can0")
-    world = World(JointJog(BROKK_170, "q4", 30), HoldingOperator(), log=writer)
+    world = World(JointJog(BROKK_170, "q4", 30), HoldingOperator(), log=path)
     world.drive.begin()
     world.run(2.0)
-    writer.stop()
+    world.bus.close()
     return path
 
 

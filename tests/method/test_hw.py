@@ -197,7 +197,7 @@ def test_tick__finds_a_frozen_encoder_at_small_commands_too(node, counts, bound,
     world.controller.m = counts * (np.arange(1, 6) == node)
     world.run(1.6)
     world.sleep(0.0215)
-    begun = world.t
+    begun = world.time
     assert world.commands[1][-1].any()
     freeze(world, node)
     world.run(1.2)
@@ -223,7 +223,7 @@ def test_tick__takes_nothing_for_frozen_that_is_not(world):
 def test_watchdog__closes_the_valves_of_a_program_that_is_killed(world):
     """SIGKILL: no more ticks; a resumed frame does not open the valves again."""
     world.run(1.2)
-    killed = world.t
+    killed = world.time
     assert world.commands[1][-1].any()
     world.sleep(1.0)
     counter = int(world.drive.gate.counter) + 1
@@ -235,7 +235,7 @@ def test_watchdog__closes_the_valves_of_a_program_that_is_killed(world):
 
 def test_tick__opens_no_valve_again_on_frames_of_any_identifier_and_length(world):
     world.run(1.2)
-    begun = world.t
+    begun = world.time
     assert world.commands[1][-1].any()
     seen, pairs = flood(world)
     world.run(9.3)
@@ -268,7 +268,7 @@ def test_tick__finds_positions_later_than_20_ms(low, high, found, world):
     """Constantly, or by chance between two bounds [ms]."""
     rng = np.random.default_rng(0)
     world.run(0.8)
-    begun = world.t
+    begun = world.time
     delay(world, 3, lambda: rng.uniform(low, high) / 1e3)
     world.run(1.0)
     assert world.drive.reason == found * "fault: q3: silent"
@@ -284,7 +284,7 @@ def test_tick__finds_a_delay_of_a_whole_tick_only_when_it_begins(world):
         return held[-2:-1]
 
     world.run(0.8)
-    begun = world.t
+    begun = world.time
     world.upward = only(0x183, hold)
     world.run(0.3)
     assert world.drive.reason == "fault: q3: silent" and closes_within(world, begun, 0.175)
@@ -328,7 +328,7 @@ def busy(world, seconds):
 def test_wait__keeps_an_absolute_grid_and_skips_missed_ticks(world):
     world.controller.m = np.zeros(5)
     world.step = 0.0007  # does not divide a tick
-    begun = world.t
+    begun = world.time
     for k in range(120):
         world.downward = busy(world, {40: 0.13, 80: 0.052, 90: 0.26}.get(k, 0.004))
         world.drive.tick()

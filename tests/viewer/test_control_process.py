@@ -67,7 +67,7 @@ def test_loop__closes_the_valves_and_sends_nothing_while_the_window_is_silent():
     loop.go(0.5, False)
     loop.go(0.4, True)
     assert loop.ticks[-1].driving
-    last = loop.world.t
+    last = loop.world.time
     loop.world.run(15.0)  # more than a pipe holds
     silent = list(receive_telemetry(loop.connection))
     assert 1 <= len(silent) <= 4

@@ -3,7 +3,6 @@
 import json
 import os
 
-import can
 import numpy as np
 import pygame
 import pytest
@@ -34,7 +33,7 @@ def run_of(ticks, title="a", path=drawing.NO_POINTS):
 
 def recorded_log(path, controller, seconds, v):
     """A loop that has stood for 0.5 s and driven for some more, with a log of it."""
-    loop = PipedLoop(controller, log=can.CanutilsLogWriter(path))
+    loop = PipedLoop(controller, log=path)
     loop.go(0.5, False)
     loop.go(0.2, True)
     loop.go(seconds, True, v)
