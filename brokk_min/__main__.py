@@ -108,16 +108,12 @@ def main(arguments: list[str] | None = None) -> int:
     named = {name: training.with_defaults(one, arguments) for name, one in learners.items()}
     try:
         parse(arguments, COMMANDS | named)()
-    except WrongUse as error:
-        print(one_line(f"brokk-min: {error}"), file=sys.stderr)
-        return 2
-    except OSError as error:
-        place = f"{error.filename}: " if error.filename else ""
-        print(one_line(f"brokk-min: {place}{reason(error)}"), file=sys.stderr)
-        return 1
-    except (ValueError, MemoryError) as error:
-        print(one_line(f"brokk-min: {error or 'out of memory'}"), file=sys.stderr)
-        return 1
+    except (ValueError, OSError, MemoryError) as error:
+        place = f"{error.filename}: " if isinstance(error, OSError) and error.filename else ""
+        out_of_memory = isinstance(error, MemoryError) and not str(error)
+        text = "out of memory" if out_of_memory else reason(error)
+        print(one_line(f"brokk-min: {place}{text}"), file=sys.stderr)
+        return 2 if isinstance(error, WrongUse) else 1
     except KeyboardInterrupt as stop:
         print(f"brokk-min: stopped{stop}", file=sys.stderr)
         return 1

@@ -60,9 +60,8 @@ class Evaluate(Command):
     def __call__(self) -> None:
         machine = self.check(json="runs", save_gains="gains")
         if self.perfect_model and self.plant != "analytic":
-            raise WrongUse(
-                f"--perfect-model: expected --plant analytic, its model, got {self.plant}"
-            )
+            wanted = "expected --plant analytic, its model"
+            raise WrongUse(f"--perfect-model: {wanted}, got {self.plant}")
         path, gains = default_policy(machine, self.policy, self.gains)
         if self.noise != TaskConfig.noise:
             gains = self.gains  # others were tuned with more noise
@@ -74,19 +73,24 @@ class Evaluate(Command):
         tuned = baselines.read_gains(gains, machine, policy.net) if gains else {}
         inputs = (self.commands, self.starts, self.num_starts, self.seed)
         commands, starts = sequences.goals_and_starts(machine, *inputs)
-        controllers = self._controllers(machine, policy, tuned, net)
+        config = TaskConfig(noise=self.noise)
+        controllers = self._policies(machine, policy)
+        controllers |= tuned or self._tune(machine, policy, config, net)
         print(f"gains of the baselines: {gains or 'tuned now'}", file=sys.stderr)
         if self.perfect_model:
             controllers |= perfect_model.perfect_models(machine, starts)
-        config = TaskConfig(noise=self.noise)
-        runs, _ = metrics.evaluate(
-            machine, controllers, commands, starts, self.seed, net, config=config
-        )
+        task = (commands, starts, self.seed, net)
+        runs, _ = metrics.evaluate(machine, controllers, *task, config=config)
         if self.json:
-            meta = metrics.metadata(machine, self.seed)
-            meta |= {"policy": str(path), "gains": str(gains or "tuned now"), "plant": self.plant}
-            meta["commands"] = str(self.commands or ", ".join(one.name for one in commands))
-            meta |= {"starts": str(self.starts or self.num_starts), "noise": self.noise}
+            meta = {
+                **metrics.metadata(machine, self.seed),
+                "policy": str(path),
+                "gains": str(gains or "tuned now"),
+                "plant": self.plant,
+                "commands": str(self.commands or ", ".join(one.name for one in commands)),
+                "starts": str(self.starts or self.num_starts),
+                "noise": self.noise,
+            }
             write_json(self.json, {"meta": meta, "runs": runs})
         runs.sort(key=lambda run: sequences.KINDS.index(run["kind"]))  # those that count first
         print_table(runs, len(commands), COLUMNS)
@@ -96,27 +100,22 @@ class Evaluate(Command):
             if of_kind:
                 print_table(of_kind, len(commands), [k for k in runs[0] if k not in metrics.LABELS])
 
-    def _controllers(
-        self,
-        machine: Machine,
-        policy: Policy,
-        tuned: dict[str, JacobianController],
-        net: ActuatorNet | None,
-    ) -> dict[str, Controller]:
+    def _policies(self, machine: Machine, policy: Policy) -> dict[str, Controller]:
         policies = {"rl": policy}
         path = SHIPPED / machine.name / POLICIES["rl_paper"]
         if not self.policy and path.exists():
             policies["rl_paper"] = load_policy(path, machine)
-        controllers: dict[str, Controller] = {**policy_controllers(machine, policies)}
-        if tuned:
-            return controllers | tuned
+        return {**policy_controllers(machine, policies)}
+
+    def _tune(
+        self, machine: Machine, policy: Policy, config: TaskConfig, net: ActuatorNet | None
+    ) -> dict[str, JacobianController]:
         budget = (baselines.TUNING_RUNS, baselines.GENERATIONS, self.seed)
-        config = TaskConfig(noise=self.noise)
         tuned, _ = baselines.tune_baselines(machine, policy.net, *budget, config, net)
         if self.save_gains:
             meta = baselines.gains_metadata(machine, policy.net)
             baselines.write_gains(self.save_gains, tuned, meta)
-        return controllers | tuned
+        return tuned
 
 
 COLUMNS = {  # of the table: head, format
@@ -133,14 +132,13 @@ def print_table(runs: list[dict[str, Any]], sequences: int, keys: Iterable[str])
     num = len({run["start"] for run in runs})
     print(f"means over {sequences} sequences from {num} {runs[0]['kind']} starts")
     columns = {key: COLUMNS.get(key, (key, "{:.4f}")) for key in keys}
-    print(f"{'controller':30} " + " ".join(head for head, _ in columns.values()))
+    print(f"{'controller':30}", *(head for head, _ in columns.values()))
     for name, rows in metrics.summary(runs).items():
         cells = []
         for key, (head, form) in columns.items():
             mean = rows["all"][key]
-            text = "none" if mean is None else form.format(mean)
-            cells.append(text.rjust(len(head)))
-        print(f"{name:30} " + " ".join(cells))
+            cells.append(("none" if mean is None else form.format(mean)).rjust(len(head)))
+        print(f"{name:30}", *cells)
 
 
 def print_answer(runs: list[dict[str, Any]]) -> None:
@@ -191,8 +189,7 @@ class Reproduce(Command):
         for claim in results["claims"]:
             ours = VERDICTS[claim["ours"]["holds"]]
             print(f"{VERDICTS[claim['holds']]} (of our policy: {ours}): {claim['paper']}")
-        print(self.out / "report.html")
-        print(self.out / "results.json")
+        print(self.out / "report.html", self.out / "results.json", sep="\n")
 
 
 @dataclass(kw_only=True)
@@ -210,14 +207,12 @@ class Preliminary(Command):
             measured = preliminary.run(machine, load_net(self.actuator), self.seed)
         numbers = preliminary.numbers(machine, measured)
         self.out.mkdir(parents=True, exist_ok=True)
-        plots = {"preliminary": figures.plot_tests(machine, measured.tests)}
-        plots["sim_to_real"] = figures.plot_gap(machine, measured.gap)
-        for name, figure in plots.items():
-            figures.save(self.out / f"{name}.png", figure)
-            print(self.out / f"{name}.png")
+        tests, gap = self.out / "preliminary.png", self.out / "sim_to_real.png"
+        figures.save(tests, figures.plot_tests(machine, measured.tests))
+        figures.save(gap, figures.plot_gap(machine, measured.gap))
         meta = metrics.metadata(machine, self.seed) | {"actuator": str(self.actuator)}
         write_json(self.out / "preliminary.json", {"meta": meta, **numbers})
-        print(self.out / "preliminary.json")
+        print(tests, gap, self.out / "preliminary.json", sep="\n")
         distance = numbers["sim_to_real"]["tool"]["position_error_mean"]
         print(f"mean distance of the tools of nets and machine over 30 s: {distance:.4f} m")
 
@@ -236,5 +231,4 @@ class Family(Command):
         machine = self.check({self.out / "family.json": "family"})
         seeds = range(self.seed, self.seed + self.members)
         results = run_family(machine, seeds, self.out, QUICK if self.quick else FAMILY)
-        print(show(results))
-        print(self.out / "family.json")
+        print(show(results), self.out / "family.json", sep="\n")

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from tyro.conf import OmitArgPrefixes, Positional
 
+from brokk_min.actuator import ActuatorNet
 from brokk_min.cli.options import Command, MachineName, PlantName, WrongUse, checked, with_plant
 from brokk_min.evaluation.rollout import own_drives
 from brokk_min.identification import excitation, inspection, validation
@@ -97,7 +98,6 @@ class Fit(Command):
     settings: OmitArgPrefixes[FitSettings] = field(default_factory=FitSettings)
 
     def __call__(self) -> None:
-        from brokk_min.evaluation import figures
         from brokk_min.identification.fitting import fit
 
         self.figure = self.figure or self.out.with_suffix(".png")
@@ -110,7 +110,11 @@ class Fit(Command):
         if self.plant and not known:
             raise WrongUse("--plant: expected LOGS with the joints of --machine")
         recorded = with_plant(machine, self.plant, ["analytic", ""])
-        log, test = self.parts(log, samples)
+        if self.test:
+            test = read_log(self.test, samples, log.joints, log.rate)
+        else:
+            with located(*self.logs):
+                log, test = split(log)
         history = machine.history if known else history_of(log, machine.history)
         config = self.config(known, history)
         reports = inspection.inspect(log)
@@ -136,8 +140,7 @@ class Fit(Command):
             meta: dict[str, Any] = {name: getattr(net, name) for name in names}
             meta |= {"logs": list(map(str, self.logs)), "test": list(map(str, self.test))}
             write_json(self.json, {"meta": meta, **scores})
-        if any("one_step_rmse" in joint for joint in scores["joints"].values()):
-            figures.save(self.figure, figures.plot_worst_and_median(net, test, known))
+        save_figure(self.figure, scores, net, test, known)
         name = net.machine or "no known machine"
         print(f"nets of {name}, dead zone {net.dead_zone} of full command")
         seconds = net.history / net.rate
@@ -153,13 +156,6 @@ class Fit(Command):
             settings["dead_zone"] = known.dead_zone
         return checked(FitConfig, **settings)
 
-    def parts(self, log: Log, samples: int) -> tuple[Log, Log]:
-        """Recordings to fit to and to score on."""
-        if self.test:
-            return log, read_log(self.test, samples, log.joints, log.rate)
-        with located(*self.logs):
-            return split(log)
-
 
 def read_known(
     logs: Sequence[Path], machine: Machine, samples: int, name: str
@@ -174,6 +170,16 @@ def read_known(
         expected = f"expected those of --machine {name}"
         raise ValueError(f"{logs[0]}: joints: {expected}, got {brief(log.joints)}")
     return log, known
+
+
+def save_figure(
+    path: Path, scores: dict[str, Any], net: ActuatorNet, log: Log, machine: Machine | None
+) -> None:
+    """Free runs of the worst and the median recording, if any joint has a score."""
+    if any("one_step_rmse" in joint for joint in scores["joints"].values()):
+        from brokk_min.evaluation import figures
+
+        figures.save(path, figures.plot_worst_and_median(net, log, machine))
 
 
 def curve_point(log: Log, joints: dict[str, Any]) -> dict[str, Any]:
@@ -248,11 +254,8 @@ class Score(Command):
         if self.json:
             meta = {"net": str(self.net), "logs": list(map(str, self.logs))}
             write_json(self.json, {"meta": meta, **scores})
-        if any("one_step_rmse" in joint for joint in scores["joints"].values()):
-            from brokk_min.evaluation import figures
-
-            drawn = machine if machine.names == net.joints else None
-            figures.save(self.figure, figures.plot_worst_and_median(net, log, drawn))
+        known = machine if machine.names == net.joints else None
+        save_figure(self.figure, scores, net, log, known)
         print_scores(scores)
 
 

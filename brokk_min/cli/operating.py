@@ -4,7 +4,7 @@ import shutil
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from tyro.conf import Positional
@@ -29,9 +29,6 @@ from brokk_min.learning.onnx import export_onnx
 from brokk_min.learning.policy import Policy, PolicyController, load_policy
 from brokk_min.machine import PWM_MAX, Machine, number
 from brokk_min.viewer import control_process, drawing, play, replay, rerun_log
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 @dataclass(kw_only=True)
@@ -113,8 +110,8 @@ class Drive(Command):
     def _operator(self, machine: Machine) -> Joystick | Script:
         if self.command == "joystick":
             return Joystick(machine, self.axes, self.button)
-        sequences = read_commands(Path(self.command), machine)
-        return Script(machine, np.concatenate([sequence.goals for sequence in sequences]))
+        goals = [sequence.goals for sequence in read_commands(Path(self.command), machine)]
+        return Script(machine, np.concatenate(goals))
 
 
 def compare(machine: Machine, controller: Controller, log: Path) -> None:
@@ -180,15 +177,13 @@ class Diagnose(Command):
             print("  commands and motion are as the policy and its nets have them")
         if self.json:
             meta = {"log": str(self.log), "policy": str(self.policy), "valves": policy.valves}
-            report = {"meta": meta, "command_error": error}
-            write_json(self.json, {**report, "terms": [term._asdict() for term in terms]})
+            rows = [term._asdict() for term in terms]
+            write_json(self.json, {"meta": meta, "command_error": error, "terms": rows})
         if self.figure:
-            from brokk_min.evaluation import figures
-
-            figures.save(self.figure, plot_drive(machine, policy, ticks))
+            draw_drive(self.figure, machine, policy, ticks)
 
 
-def plot_drive(machine: Machine, policy: Policy, ticks: diagnosis.Ticks) -> "Figure":
+def draw_drive(path: Path, machine: Machine, policy: Policy, ticks: diagnosis.Ticks) -> None:
     """Of each driven joint: sent and expected command, measured and simulated velocity."""
     from brokk_min.evaluation import figures
 
@@ -196,18 +191,17 @@ def plot_drive(machine: Machine, policy: Policy, ticks: diagnosis.Ticks) -> "Fig
     expected = diagnosis.expected_commands(machine, policy, ticks, history)
     simulated, measured = diagnosis.net_velocities(machine, policy, ticks.u, ticks.q)
     time = ticks.time - ticks.time[0]
-    ahead, runs, _ = simulated.shape
-    later = time[machine.history + 1 : machine.history + 1 + ahead * runs]
+    later = time[machine.history + 1 :][: simulated[..., 0].size]
     rows = []
     for k, j in enumerate(machine.driven):
-        name = machine.names[j]
+        joint = machine.joints[j]
         u = {"measured": (time, ticks.u[:, j]), "expected": (time, expected[:, j])}
         values = {"measured": measured, "expected": simulated}
         q_dot = {label: (later, x[..., k].T.ravel()) for label, x in values.items()}
-        left = figures.Panel("", "time [s]", f"command of {name} [1]", u)
-        label = f"{name} [{UNITS[machine.joints[j].kind]}/s]"
-        rows.append([left, figures.Panel("", "time [s]", label, q_dot)])
-    return figures.plot_panels(rows)
+        command = figures.Panel("", "time [s]", f"command of {joint.name} [1]", u)
+        label = f"{joint.name} [{UNITS[joint.kind]}/s]"
+        rows.append([command, figures.Panel("", "time [s]", label, q_dot)])
+    figures.save(path, figures.plot_panels(rows))
 
 
 @dataclass(kw_only=True)
@@ -265,13 +259,11 @@ class Play(Command):
         if not self.policy and not path.exists():
             return {}
         policy = load_policy(path, machine)
+        known = baselines.baselines(machine, policy.net)
         if gains:
             known = baselines.read_gains(gains, machine, policy.net)
-        else:
-            known = baselines.baselines(machine, policy.net)
         print(f"gains of the Jacobian controller: {gains or 'set by hand'}")
-        rl = PolicyController(machine, policy)
-        return {"rl": rl, "jacobian": known["jacobian_pid_k0.1"]}
+        return {"rl": PolicyController(machine, policy), "jacobian": known["jacobian_pid_k0.1"]}
 
 
 @dataclass(kw_only=True)
@@ -291,7 +283,12 @@ class Replay(Command):
         machine = self.check(out="film", rerun="rerun")
         if not 1 <= len(self.logs) <= 2:
             raise WrongUse(f"LOGS: expected one or two, got {len(self.logs)}")
-        self._check_size()
+        arms = sum(len(self.controllers) if log.suffix == ".json" else 1 for log in self.logs)
+        width, height = self.size
+        if not arms or not 320 * arms <= width <= 4000 or not 320 <= height <= 4000:
+            expected = f"expected some and {320 * arms} 320 to 4000 4000"
+            got = f"got {arms} and {width} {height}"
+            raise WrongUse(f"--controllers, --size: {expected}, {got}")
         runs: list[replay.Run] = []
         for log, colour in zip(self.logs, drawing.COLOURS.values(), strict=False):
             if log.suffix == ".json":
@@ -305,23 +302,14 @@ class Replay(Command):
         elif not self.rerun:
             replay.show_film(machine, runs, self.size)
 
-    def _check_size(self) -> None:
-        arms = sum(len(self.controllers) if log.suffix == ".json" else 1 for log in self.logs)
-        width, height = self.size
-        if not arms or not 320 * arms <= width <= 4000 or not 320 <= height <= 4000:
-            expected = f"expected some and {320 * arms} 320 to 4000 4000"
-            got = f"got {arms} and {width} {height}"
-            raise WrongUse(f"--controllers, --size: {expected}, {got}")
-
     def _simulate_again(self, machine: Machine, path: Path) -> list[replay.Run]:
         results = replay.read_results(machine, path, self.controllers)
         sequences = list(results.sequences)
         known = list(results.controllers)
-        num = len(results.starts)
         sequence = self.sequence or sequences[0]
         unknown = sequence not in sequences or not set(self.controllers) <= set(known)
-        if unknown or not 0 <= self.start < num:
-            expected = f"expected some of {sequences}, of {known} and below {num}"
+        if unknown or not 0 <= self.start < len(results.starts):
+            expected = f"expected some of {sequences}, of {known} and below {len(results.starts)}"
             got = f"got {self.sequence}, {list(self.controllers)}, {self.start}"
             raise WrongUse(f"--sequence, --controllers, --start: {expected}, {got}")
         return replay.simulate_again(machine, results, self.controllers, sequence, self.start)

@@ -91,9 +91,9 @@ class Command:
         for path, kind in (files | existing).items():
             if path:
                 check_output(path, CONTENTS.get(kind) or set(machine.names), kind, self.force)
-                for one in inputs:
-                    if path.exists() and one.exists() and path.samefile(one):
-                        raise WrongUse(f"{path}: expected another file than an input to write")
+                same = (path.exists() and one.exists() and path.samefile(one) for one in inputs)
+                if any(same):
+                    raise WrongUse(f"{path}: expected another file than an input to write")
         return machine
 
 

@@ -22,7 +22,6 @@ from brokk_min import ppo
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import State, TaskConfig, observation_scale, terminated
 from brokk_min.identification import files
-from brokk_min.identification.muon import Muon
 from brokk_min.identification.net_file import fingerprint
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import Policy, contract, save_policy
@@ -74,22 +73,20 @@ def train_policy(
     ValueError: settings that do not fit, a checkpoint of another training, or a number that is not
     finite. OSError: a file that cannot be written. The last checkpoint stays.
     """
-    critic = critic or task.paper
-    if critic:
-        config = replace(config, log_std_end=None)
     about = describe_training(machine, net, task, config, critic, seed)
     env = TaskVectorEnv(config.num_envs, net, machine, task)
-    if critic:
-        learner = ppo.make_learner(env, config, seed, critic)
+    if about["settings"]["critic"]:
+        config = replace(config, log_std_end=None)
+        learner = ppo.make_learner(env, config, seed, critic=True)
+        estimate, loss = None, ppo.ppo_loss
     else:
         learner = make_learner(env, config, seed)
+        estimate, loss = improved_actions(machine, net, task), regression_loss
     if start:
         about["start"] = load_actor(learner.agent, start)
     stagger_episodes(env)
     log = TrainingLog(env, config, out, about, tensorboard)
     log.begin(learner, resume)
-    estimate = None if critic else improved_actions(machine, net, task)
-    loss = ppo.ppo_loss if critic else regression_loss
     with log.bar, closing(log):
         agent = ppo.train(env, config, seed, log.on_update, estimate, loss, learner)
     files.write_csv(log.curve, log.rows[0], [row.values() for row in log.rows])
@@ -111,9 +108,14 @@ def stagger_episodes(env: TaskVectorEnv) -> None:
     env.state = replace(env.state, ticks=ticks)
 
 
+def linear_layers(agent: Agent) -> list[nn.Linear]:
+    """Those of the actor."""
+    return [layer for layer in agent.actor if isinstance(layer, nn.Linear)]
+
+
 def load_actor(agent: Agent, policy: Policy) -> str:
     """Give the actor the weights of a policy; their hash. ValueError: the other kind of agent."""
-    layers = [layer for layer in agent.actor if isinstance(layer, nn.Linear)]
+    layers = linear_layers(agent)
     if policy.weights[0].shape[0] != layers[0].in_features:
         raise ValueError("start: expected a policy of the same kind of agent (--paper or not)")
     with torch.no_grad():
@@ -128,13 +130,11 @@ def export_policy(
 ) -> Policy:
     """The actor as it stands."""
     weights = []
-    for layer in agent.actor:
-        if isinstance(layer, nn.Linear):
-            weights += [layer.weight.T.detach().numpy().copy(), layer.bias.detach().numpy().copy()]
-    about_task = contract(machine, task.paper)
+    for layer in linear_layers(agent):
+        weights += [layer.weight.T.detach().numpy().copy(), layer.bias.detach().numpy().copy()]
     scale = observation_scale(machine, task.paper)
     valves = "open" if task.paper else task.valves
-    return Policy(about_task, about, *scale, tuple(weights), net, valves)
+    return Policy(contract(machine, task.paper), about, *scale, tuple(weights), net, valves)
 
 
 class TrainingLog:
@@ -266,17 +266,11 @@ class TrainingLog:
             identity = dict(header["identity"])
         files.expect_same(self.checkpoint, header, {"format": FORMAT})
         files.expect_same(self.checkpoint, identity, self.about)
-        like = self.content(learner)
+        for parameter in learner.agent.parameters():
+            parameter.grad = torch.zeros_like(parameter) if parameter.requires_grad else None
+        learner.optimizer.step()  # changes no weight; then it has the state of a used one
         with files.expected(self.checkpoint, "a complete checkpoint"):
-            moments = {}
-            parameters = learner.optimizer.param_groups[0]["params"]
-            for i in content["optimizer"]["state"]:
-                parameter = parameters[i].detach()
-                moments[i] = {"step": torch.zeros(()), "exp_avg": parameter}
-                if not (isinstance(learner.optimizer, Muon) and parameter.ndim > 1):
-                    moments[i]["exp_avg_sq"] = parameter
-            like["optimizer"]["state"] = moments
-            wanted = {"content": kinds(like)}
+            wanted = {"content": kinds(self.content(learner))}
             files.expect_same(self.checkpoint, {"content": kinds(content)}, wanted)
             learner.agent.load_state_dict(content["agent"])
             learner.optimizer.load_state_dict(content["optimizer"])

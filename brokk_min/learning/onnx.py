@@ -53,13 +53,12 @@ def layers(weights: Sequence[Array]) -> tuple[list[Any], list[Any]]:
     nodes = []
     arrays = []
     source = "observation"
-    last = len(weights) // 2 - 1
-    for i in range(last + 1):
-        arrays.append(from_array(weights[2 * i].astype(np.float32), f"w{i}"))
-        arrays.append(from_array(weights[2 * i + 1].astype(np.float32), f"b{i}"))
-        target = "action" if i == last else f"x{i}"
-        nodes.append(make_node("Gemm", [source, f"w{i}", f"b{i}"], [target]))
-        if i < last:
-            source = f"y{i}"
-            nodes.append(make_node("Elu", [target], [source]))
+    for i, (w, b) in enumerate(zip(weights[::2], weights[1::2], strict=True)):
+        arrays += [from_array(w.astype(np.float32), f"w{i}")]
+        arrays += [from_array(b.astype(np.float32), f"b{i}")]
+        nodes.append(make_node("Gemm", [source, f"w{i}", f"b{i}"], [f"x{i}"]))
+        nodes.append(make_node("Elu", [f"x{i}"], [f"y{i}"]))
+        source = f"y{i}"
+    nodes.pop()  # no ELU after the last layer
+    nodes[-1].output[0] = "action"
     return nodes, arrays

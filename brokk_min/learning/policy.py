@@ -89,9 +89,9 @@ def policy_controllers(
     Training with that rule brings 1 % (docs/log.md), so one policy serves both classes.
     """
     rl = policies["rl"]
-    both = {"rl": replace(rl, valves="closed") if rl.valves == "dither" else rl}
-    both |= {"rl_dither": replace(rl, valves="dither")}
-    every = {**both, **{name: one for name, one in policies.items() if name != "rl"}}
+    closed = replace(rl, valves="closed") if rl.valves == "dither" else rl
+    every = {"rl": closed, "rl_dither": replace(rl, valves="dither")}
+    every |= {name: one for name, one in policies.items() if name != "rl"}
     return {name: PolicyController(machine, one) for name, one in every.items()}
 
 

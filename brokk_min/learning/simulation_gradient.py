@@ -18,16 +18,12 @@ actions so improved,
 There is no likelihood ratio, no clip and no critic. With Adam, to the same error, it takes 45 s of
 CPU where PPO's clip around the same gradient takes 312 s (docs/deviations.md, D10). Muon takes half
 of the time of Adam (D17). It is open loop: later actions count as given. No value stands at the end
-of the window, so its last actions, which move the tool after it, get little credit. None of this is
-new:
+of the window, so its last actions get little credit. None of this is new:
 
-- PODS (Mora et al., 2021) is this method: actions improved along the gradient of the return in a
-  differentiable simulator, a policy regressed to them. There the policy is deterministic.
+- PODS (Mora et al., 2021) is this method, with a deterministic policy.
 - SVG (Heess et al., 2015, arXiv 1510.09142): backpropagation through learned dynamics, policy too.
-- Q-Prop (Gu et al., 2017, arXiv 1611.02247): the same Taylor expansion of the advantage, but of a
-  learned critic, as a control variate of sampled returns.
-- SHAC (Xu et al., 2022, arXiv 2204.07137): short windows of a differentiable simulation, through
-  the policy, with a critic's value at their end.
+- Q-Prop (Gu et al., 2017, arXiv 1611.02247): the same Taylor expansion, of a learned critic.
+- SHAC (Xu et al., 2022, arXiv 2204.07137): short windows, a critic's value at their end.
 - GI-PPO (Son et al., 2023, arXiv 2312.08710): PPO with analytic gradients, weighted.
 - RPO (Zhong et al., 2025, arXiv 2508.06214): PPO's clip and its epochs for pathwise gradients.
 
@@ -91,19 +87,13 @@ def improved_actions(machine: Machine, net: ActuatorNet, task: TaskConfig) -> pp
     ) -> dict[str, Tensor]:
         """Means of the actions, and means moved along the gradient."""
         states = [info["state"] for info in rollout.infos]
-        v_goal = np.stack([state.v_goal for state in states])
-        rest_ticks = np.stack([state.rest_ticks for state in states])
+        names = ("q", "true_history", "v_goal", "error_integral", "rest_ticks")
+        before = (np.stack([getattr(state, name) for state in states]) for name in names)
+        q, true_history, v_goal, integral, rest_ticks = before
         u = action_to_pwm(machine, rollout.actions.numpy(), task.paper)
         u, resting, _ = command_at_rest(machine, task.valves, u, v_goal, rest_ticks)
-        ticks = Ticks(
-            q=np.stack([state.q for state in states]),
-            true_history=np.stack([state.true_history for state in states]),
-            v_goal=v_goal,
-            error_integral=np.stack([state.error_integral for state in states]),
-            u=u,
-            follows=(~resting).astype(np.float32),
-            done=rollout.dones.numpy(),
-        )
+        follows = (~resting).astype(np.float32)
+        ticks = Ticks(q, true_history, v_goal, integral, u, follows, rollout.dones.numpy())
         gradient = torch.from_numpy(action_gradients(machine, net, ticks, config.gamma, task))
         step = STEP * agent.log_std.exp() * saturate(gradient)
         targets = (rollout.means.clamp(-1, 1) + step).clamp(-1, 1)

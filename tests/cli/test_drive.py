@@ -8,8 +8,8 @@ import time
 import numpy as np
 import pytest
 from helpers_bus import MULTICAST, START, eventually, own_multicast_port, recorded_rows
+from helpers_cli import run
 
-from brokk_min.__main__ import main
 from brokk_min.can.drive_log import read_frames
 from brokk_min.identification.files import SHIPPED
 from brokk_min.identification.logs import read_log
@@ -23,10 +23,6 @@ def commands(tmp_path):
     path = tmp_path / "c.csv"
     path.write_text("\n".join(["sequence,time,vx,vy,vz", *rows, ""]))
     return path
-
-
-def run(*arguments):
-    return main([str(argument) for argument in arguments])
 
 
 def process(*arguments):

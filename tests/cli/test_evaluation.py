@@ -20,8 +20,6 @@ from brokk_min.ppo import PPOConfig
 
 SHIPPED_POLICY = SHIPPED / "brokk170" / "policy.npz"
 SHIPPED_GAINS = SHIPPED / "brokk170" / "gains.json"
-
-
 SMALL = "--total-steps 512 --num-envs 16 --horizon 16 --minibatch-size 128"
 
 
@@ -165,11 +163,9 @@ def test_starts__are_drawn_into_a_file_that_reads_back(tmp_path):
 def test_preliminary__writes_figures_and_numbers(tmp_path):
     net = load_policy(SHIPPED / "brokk170" / "policy.npz", BROKK_170).net
     save_net(tmp_path / "net.npz", net)
-    assert (
-        run("preliminary", "--actuator", tmp_path / "net.npz", "--out", tmp_path / "a" / "b") == 0
-    )
-    found = json.loads((tmp_path / "a" / "b" / "preliminary.json").read_text())
+    out = tmp_path / "a" / "b"
+    assert run("preliminary --actuator", tmp_path / "net.npz", "--out", out) == 0
+    found = json.loads((out / "preliminary.json").read_text())
     assert found["meta"]["actuator"] == str(tmp_path / "net.npz")
     assert found["sim_to_real"]["tool"]["position_error_mean"] == pytest.approx(0.030, abs=0.001)
-    figures = {path.name for path in (tmp_path / "a" / "b").glob("*.png")}
-    assert figures == {"preliminary.png", "sim_to_real.png"}
+    assert {path.name for path in out.glob("*.png")} == {"preliminary.png", "sim_to_real.png"}

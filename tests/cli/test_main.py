@@ -80,6 +80,16 @@ def test_version__is_that_of_the_project_and_of_its_citation(capsys):
 
 DRIVE = "drive --interface virtual --channel 0"
 TRAIN = "train --actuator missing.npz --out p.npz"
+OUTPUTS = (  # refused before any work
+    "collect --out",
+    "fit l.csv --out n.npz --json",
+    "train --actuator n.npz --out",
+    "machine --interface virtual --channel c --record",
+    "drive --interface virtual --channel c --controller jog --log",
+    "play --attempts",
+    "replay l.log --out",
+)
+UNWRITABLE = "brokk-min: no/x.csv: expected a file in an existing, writable directory"
 
 
 @pytest.mark.parametrize(
@@ -129,6 +139,7 @@ TRAIN = "train --actuator missing.npz --out p.npz"
         ("replay a.log b.log c.log", 2, "LOGS: expected one or two, got 3"),
         ("replay a.log b.log --size 639 540", 2, "expected some and 640 320 to 4000 4000, got 2 "),
         ("replay a.json --controllers rl --size 4001 540", 2, "got 1 and 4001 540"),
+        *((f"{line} no/x.csv", 2, UNWRITABLE) for line in OUTPUTS),
     ],
 )
 def test_wrong_use__is_refused_in_one_line(line, status, message, capsys, tmp_path, monkeypatch):
@@ -141,25 +152,6 @@ def test_wrong_use__is_refused_in_one_line(line, status, message, capsys, tmp_pa
     assert not re.search("Traceback|Error|Errno", printed.err)
     assert status == 1 or (printed.out, printed.err) == ("", f"{refusal}\n")
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    "line",
-    [
-        "collect --out",
-        "fit l.csv --out n.npz --json",
-        "train --actuator n.npz --out",
-        "machine --interface virtual --channel c --record",
-        "drive --interface virtual --channel c --controller jog --log",
-        "play --attempts",
-        "replay l.log --out",
-    ],
-)
-def test_outputs__that_cannot_be_written_are_refused_before_any_work(line, tmp_path, capsys):
-    path = tmp_path / "missing" / "x.csv"
-    assert run(line, path) == 2
-    expected = f"brokk-min: {path}: expected a file in an existing, writable directory\n"
-    assert capsys.readouterr().err == expected
 
 
 def test_interrupt__is_one_line(monkeypatch, capsys):

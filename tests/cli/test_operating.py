@@ -41,14 +41,6 @@ def test_drive__sends_the_frames_of_a_log_again(log, capsys):
     assert "expected the frames of the log, got " in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("options", ["", "--controller jacobian", f"--gains '{GAINS}'"])
-def test_drive__compares_policy_and_baseline_too(options, log, tmp_path, capsys):
-    policy = tmp_path / "policy.npz" if "gains" in options else POLICY
-    policy.write_bytes(POLICY.read_bytes()) if policy != POLICY else None
-    assert run(f"drive --policy '{policy}' {options} --replay", log) == 1
-    assert capsys.readouterr().err.endswith(" others\n")
-
-
 def test_convert__makes_a_log_for_fit(log, tmp_path, capsys):
     out = tmp_path / "log.csv"
     assert run(f"convert '{log}' --out", out) == 0
@@ -76,11 +68,9 @@ def test_play__has_policy_and_tuned_baseline(tmp_path, capsys):
         (Play(policy=copy, gains=GAINS), GAINS),
     ):
         controllers = command.controllers(BROKK_170)
-        rl = controllers["rl"]
         jacobian = controllers["jacobian"]
-        assert isinstance(rl, PolicyController)
-        assert isinstance(jacobian, JacobianController)
-        assert jacobian.k == 0.1
+        assert isinstance(controllers["rl"], PolicyController)
+        assert isinstance(jacobian, JacobianController) and jacobian.k == 0.1
         assert np.array_equal(jacobian.gains.kp, tuned.gains.kp) == (gains is not None)
         expected = f"gains of the Jacobian controller: {gains or 'set by hand'}\n"
         assert capsys.readouterr().out == expected
