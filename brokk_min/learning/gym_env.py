@@ -180,10 +180,9 @@ class TaskEnv(gymnasium.Env[Array, Array]):
 
 def load_actuator(machine: Machine, actuator: ActuatorNet | Path | str) -> ActuatorNet | None:
     """Nets of the driven joints, or None for the plant."""
-    if isinstance(actuator, str) and actuator == "analytic":
-        return None
-    net = actuator if isinstance(actuator, ActuatorNet) else load_net(Path(actuator))
-    return select_nets(machine, net)
+    if isinstance(actuator, ActuatorNet):
+        return select_nets(machine, actuator)
+    return None if actuator == "analytic" else load_net(Path(actuator), machine)
 
 
 gymnasium.register(

@@ -37,17 +37,6 @@ def folder(tmp_path_factory):
     return folder
 
 
-def write_gains(folder):
-    """Gains for the nets of the policy in `folder`; the names of the controllers."""
-    row = {key: [0.5] * 4 for key in ("kp", "ki", "kd")} | {"feedback": [0.1], "ready": [0.01]}
-    net = load_policy(folder / "policy.npz", BROKK_170).net
-    names = list(baselines.baselines(BROKK_170, net))
-    meta = baselines.gains_metadata(BROKK_170, net)
-    table = {"meta": meta, "gains": dict.fromkeys(names, row)}
-    (folder / "gains.json").write_text(json.dumps(table))
-    return names
-
-
 def test_train__writes_policy_and_curve(folder):
     assert read_log([folder / "log.csv"], 4).joints == ("q1", "q2", "q3", "q4", "q5")
     assert (folder / "policy.npz.csv").read_text().startswith("global_step,charts/")
@@ -72,7 +61,10 @@ def test_train__can_use_a_critic(option, folder, tmp_path):
 
 
 def test_evaluate__writes_what_it_used(folder, capsys):
-    names = write_gains(folder)
+    net = load_policy(folder / "policy.npz", BROKK_170).net
+    known = baselines.baselines(BROKK_170, net)
+    meta = baselines.gains_metadata(BROKK_170, net)
+    baselines.write_gains(folder / "gains.json", known, meta)
     files = {"policy": "policy.npz", "commands": "c.csv", "starts": "s.csv"}
     line = " ".join(f"--{option} '{folder}/{file}'" for option, file in files.items())
     out = folder / "e.json"
@@ -83,7 +75,7 @@ def test_evaluate__writes_what_it_used(folder, capsys):
         for option, file in (files | {"gains": "gains.json"}).items():
             assert meta[option] == str(folder / file)
         assert (meta["plant"], meta["machine"], meta["seed"]) == (plant, "brokk170", 0)
-        assert [run["controller"] for run in written["runs"]] == ["rl", "rl_dither", *names]
+        assert [run["controller"] for run in written["runs"]] == ["rl", "rl_dither", *known]
         assert {(run["sequence"], run["start"]) for run in written["runs"]} == {("up", 0)}
     assert run(f"evaluate {line} --perfect-model --json", out) == 0
     runs = json.loads(out.read_text())["runs"]

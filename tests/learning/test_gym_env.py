@@ -28,41 +28,32 @@ def rows_of(state, rows):
 
 
 @pytest.mark.parametrize("net", ["analytic", obedient_net(LOW)], ids=["plant", "nets"])
-def test_step__final_obs_is_the_last_of_the_old_episode(net):
+def test_step__resets_only_the_rows_that_ended_and_gives_their_last_observation(net):
     """A twin with longer episodes goes on: its observation is the other one's `final_obs`."""
     short = TaskVectorEnv(4, net, LOW, TaskConfig(episode_s=1.0))
     long = TaskVectorEnv(4, net, LOW, TaskConfig(episode_s=9.0))
     obs, _ = short.reset(seed=5)
     twin_obs, _ = long.reset(seed=5)
+    short.state = replace(short.state, ticks=np.array([3, 0, 3, 0]))
     rng = np.random.default_rng(18)
-    for tick in range(1, 21):
+    for tick in range(1, 18):
         assert np.array_equal(obs, twin_obs)
         action = rng.uniform(-1, 1, (4, 4)).astype(np.float32)
+        before = short.state
         obs, reward, terminated, truncated, info = short.step(action)
         twin_obs, twin_reward, *_, twin_info = long.step(action)
         assert np.array_equal(reward, twin_reward)  # the last tick is rewarded as any other
         assert np.array_equal(info["velocity_error"], twin_info["velocity_error"])
+        assert info["state"] is before
         assert not terminated.any()
-        assert truncated.all() == (tick == 20)
-        assert ("final_obs" in info) == (tick == 20)
-    assert info["_final_obs"].tolist() == [True] * 4
+        assert truncated.tolist() == [tick == 17, False] * 2
+        assert ("final_obs" in info) == (tick == 17)
+    assert info["_final_obs"].tolist() == [True, False] * 2
     assert np.array_equal(info["final_obs"], twin_obs)
-    assert np.abs(obs - info["final_obs"]).max(axis=1).min() > 1e-3
-    assert short.state.ticks.tolist() == [0] * 4
-
-
-def test_step__resets_only_the_rows_that_ended():
-    env = TaskVectorEnv(3, NET, LOW, SHORT)
-    env.reset(seed=6)
-    env.state = replace(env.state, ticks=np.array([0, 19, 5]))
-    before = env.state
-    obs, _, _, truncated, info = env.step(np.ones((3, 4), np.float32))
-    assert truncated.tolist() == info["_final_obs"].tolist() == [False, True, False]
-    assert env.state.ticks.tolist() == [1, 0, 6]
-    assert info["state"] is before
-    assert np.array_equal(obs[[0, 2]], info["final_obs"][[0, 2]])
-    assert not np.array_equal(obs[1], info["final_obs"][1])
-    np.testing.assert_allclose(env.state.q[[0, 2]], before.q[[0, 2]], atol=0.05)
+    assert np.array_equal(obs[[1, 3]], twin_obs[[1, 3]])
+    assert np.abs(obs - twin_obs)[[0, 2]].max(axis=1).min() > 1e-3
+    assert short.state.ticks.tolist() == [0, 17] * 2
+    np.testing.assert_array_equal(short.state.q[[1, 3]], long.state.q[[1, 3]])
 
 
 def test_step__leaks_nothing_between_rows():
@@ -145,12 +136,10 @@ def test_step__refuses_to_begin_without_a_reset(make):
 
 
 def test_task_vector_env__takes_a_file_and_selects_driven_joints(tmp_path):
-    names = BROKK_170.names
-    net = small_net(BROKK_170, np.random.default_rng(0), joints=names)
+    net = small_net(BROKK_170, np.random.default_rng(0), joints=BROKK_170.names)
     save_net(tmp_path / "net.npz", net)
-    env = TaskVectorEnv(1, tmp_path / "net.npz")
-    assert env.net.joints == ("q1", "q3", "q4", "q5")
-    assert TaskVectorEnv(1, str(tmp_path / "net.npz")).net.joints == env.net.joints
+    for file in (tmp_path / "net.npz", str(tmp_path / "net.npz")):
+        assert TaskVectorEnv(1, file).net.joints == ("q1", "q3", "q4", "q5")
     assert TaskVectorEnv(1).net is None
 
 

@@ -74,35 +74,23 @@ def measured(v_goal):
     return measure(BROKK_170, state.history, state.v_goal, state.error_integral)
 
 
-def test_controller__sends_the_actions_of_the_policy(policy):
-    controller = PolicyController(BROKK_170, policy)
-    v_goal = np.random.default_rng(1).normal(0, 0.2, (5, 3))
-    u, ticks = controller(measured(v_goal), controller.start(5))
-    action = policy.act(features(BROKK_170, measured(v_goal)))
-    assert np.array_equal(u, action_to_pwm(BROKK_170, action))
-    assert ticks.tolist() == [0] * 5
-    assert len(np.unique(u[:, 0])) > 1
-
-
 @pytest.mark.parametrize(("valves", "after"), [("closed", 10), ("dither", 2), ("open", 100)])
-def test_controller__has_a_rule_for_valves_after_some_ticks_of_rest(policy, valves, after):
-    """Goals of both machines are zero but for one tick of the first."""
+def test_controller__sends_the_policys_actions_or_has_a_rule_for_valves_at_rest(
+    policy, valves, after
+):
+    """The first machine rests but for one tick, the second moves."""
     controller = PolicyController(BROKK_170, replace(policy, valves=valves))
     ticks = controller.start(2)
-    sent = []
     for tick in range(100):
-        v_goal = np.zeros((2, 3))
-        v_goal[0, 2] = 0.1 * (tick == 30)
-        u, ticks = controller(measured(v_goal), ticks)
-        sent.append(u[:, BROKK_170.driven])
-    action = policy.act(features(BROKK_170, measured(np.zeros((2, 3)))))
-    free = action_to_pwm(BROKK_170, action)[:, BROKK_170.driven]
-    first, second = np.array(sent).swapaxes(0, 1)
-    assert (second[:after] == free[1]).all()
-    assert (first[31 : 31 + after] == free[0]).all()
-    size = 12 / 127 if valves == "dither" else 0.0
-    for rest in (second[after:], first[31 + after :]):
-        np.testing.assert_allclose(np.abs(rest), size, atol=1e-7)
+        seen = measured([[0, 0, 0.1 * (tick == 30)], [0.1, 0, 0.2]])
+        u, ticks = controller(seen, ticks)
+        free = action_to_pwm(BROKK_170, policy.act(features(BROKK_170, seen)))
+        assert np.array_equal(u[1], free[1]) and not np.array_equal(free[0], free[1])
+        if (tick if tick < 30 else tick - 31) < after:
+            assert np.array_equal(u[0], free[0])
+        else:
+            size = 12 / 127 if valves == "dither" else 0.0
+            np.testing.assert_allclose(np.abs(u[0, BROKK_170.driven]), size, atol=1e-7)
 
 
 def test_controller__of_the_papers_agent_takes_its_observation_and_sends_plain_actions():
