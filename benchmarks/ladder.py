@@ -161,7 +161,7 @@ def train(net: ActuatorNet, steps: frozenset[str], total_steps: int, seed: int) 
     agent = ppo.train(
         task_env, config, seed, estimate=estimate, loss_function=loss, learner=learner
     )
-    return export_policy(M, net, agent, task_env.config, {})
+    return export_policy(net, agent, task_env.config, {})
 
 
 def climb(folder: Path, name: str, total_steps: int, seed: int) -> list[float]:

@@ -315,7 +315,7 @@ def race(
         done = row["updates"] * C.horizon * env.num_envs
         if row["updates"] >= check or done >= steps:
             check = 1 + int(1.2 * row["updates"])
-            policy = export_policy(M, shipped.net, SimpleNamespace(actor=actor), env.config, {})  # type: ignore[arg-type]
+            policy = export_policy(shipped.net, SimpleNamespace(actor=actor), env.config, {})  # type: ignore[arg-type]
             row["best"] = min(row["best"], machine_error(PolicyController(M, policy), options.runs))
             now = [row["cpu_s"], row["wall_s"], done, gradient_steps]
             for level, target in targets.items():

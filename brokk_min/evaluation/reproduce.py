@@ -57,7 +57,7 @@ def reproduce(
             results["paper_recipe"] = net_errors(machine, paper_net, test, seed)
         with stage("draw"):
             results |= {"tuning": tuning, "training_seeds": training_seeds}
-            write(out, results, policies, pids)
+            write(machine, out, results, policies, pids)
             report.write_report(machine, out, results, shown, clock)
     write_json(out / "timing.json", clock)
     return results
@@ -209,7 +209,11 @@ def tables(runs: Sequence[Run], scored: Sequence[Run]) -> dict[str, Any]:
 
 
 def write(
-    out: Path, results: Mapping[str, Any], policies: Mapping[str, Policy], pids: Pids
+    machine: Machine,
+    out: Path,
+    results: Mapping[str, Any],
+    policies: Mapping[str, Policy],
+    pids: Pids,
 ) -> None:
     """Write what other commands read: results, gains, policies with the errors as metadata."""
     write_json(out / "results.json", results)
@@ -219,4 +223,5 @@ def write(
     command = f"brokk-min reproduce --seed {results['meta']['seed']}"
     made = {"command": command, "velocity_error_mean": errors}
     for name, policy in policies.items():
-        save_policy(out / POLICIES[name], replace(policy, training={**policy.training, **made}))
+        complete = replace(policy, training={**policy.training, **made})
+        save_policy(out / POLICIES[name], complete, machine)

@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from brokk_min import ppo
 from brokk_min.actuator import ActuatorNet
-from brokk_min.env import State, TaskConfig, observation_scale, terminated
+from brokk_min.env import State, TaskConfig, terminated
 from brokk_min.identification import files
 from brokk_min.identification.net_file import fingerprint
 from brokk_min.learning.gym_env import TaskVectorEnv
@@ -90,8 +90,8 @@ def train_policy(
     with log.bar, closing(log):
         agent = ppo.train(env, config, seed, log.on_update, estimate, loss, learner)
     files.write_csv(log.curve, log.rows[0], [row.values() for row in log.rows])
-    policy = export_policy(machine, net, agent, task, about)
-    save_policy(out, policy)
+    policy = export_policy(net, agent, task, about)
+    save_policy(out, policy, machine)
     log.checkpoint.unlink(missing_ok=True)
     return policy
 
@@ -126,15 +126,14 @@ def load_actor(agent: Agent, policy: Policy) -> str:
 
 
 def export_policy(
-    machine: Machine, net: ActuatorNet, agent: Agent, task: TaskConfig, about: dict[str, Any]
+    net: ActuatorNet, agent: Agent, task: TaskConfig, about: dict[str, Any]
 ) -> Policy:
     """The actor as it stands."""
     weights = []
     for layer in linear_layers(agent):
         weights += [layer.weight.T.detach().numpy().copy(), layer.bias.detach().numpy().copy()]
-    scale = observation_scale(machine, task.paper)
     valves = "open" if task.paper else task.valves
-    return Policy(contract(machine, task.paper), about, *scale, tuple(weights), net, valves)
+    return Policy(about, tuple(weights), net, task.paper, valves)
 
 
 class TrainingLog:

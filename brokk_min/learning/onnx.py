@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from brokk_min.actuator import REST_AFTER
-from brokk_min.env import COMPENSATION
+from brokk_min.env import COMPENSATION, observation_scale
 from brokk_min.identification.files import require, whole_file
-from brokk_min.learning.policy import Policy
+from brokk_min.learning.policy import Policy, contract
 from brokk_min.machine import Array, Machine
 
 
@@ -26,15 +26,16 @@ def export_onnx(path: Path, policy: Policy, machine: Machine) -> None:
     helper = require("onnx.helper", "export")
     info = helper.make_tensor_value_info
     float32 = require("onnx", "export").TensorProto.FLOAT
-    obs = info("observation", float32, ["batch", len(policy.mean)])
+    obs = info("observation", float32, ["batch", len(policy.weights[0])])
     action = info("action", float32, ["batch", len(policy.weights[-1])])
     nodes, arrays = layers(policy.weights)
     graph = helper.make_graph(nodes, "policy", [obs], [action], arrays)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    mean, scale = observation_scale(machine, policy.paper)
     metadata = {
-        **policy.contract,
-        "mean": policy.mean.tolist(),
-        "scale": policy.scale.tolist(),
+        **contract(machine, policy.paper),
+        "mean": mean.tolist(),
+        "scale": scale.tolist(),
         "ramp": COMPENSATION,
         "rest_s": None if policy.valves == "open" else REST_AFTER[policy.valves],
         "rest_zones": machine.dead_zones.tolist(),

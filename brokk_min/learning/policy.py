@@ -25,18 +25,11 @@ POLICIES = {"rl": "policy.npz", "rl_paper": "policy_paper.npz"}
 class Policy:
     """The actor: standardised observation in, mean action out. Paper: Sec. 3.4 (256-128-64, ELU)"""
 
-    contract: Mapping[str, Any]  # what training and machine must agree on, see `contract`
     training: Mapping[str, Any]  # seed and settings that made it
-    mean: Array  # (obs,) normalisation that `env.features` applied
-    scale: Array  # (obs,)
     weights: tuple[Array, ...]  # w, b of each layer, w (inputs, outputs)
     net: ActuatorNet  # the simulation it was trained in, kept with it
+    paper: bool = False  # does it take observation and actions of the paper's agent?
     valves: str = "closed"  # at rest, or "dither", "open": see `actuator.command_at_rest`
-
-    @property
-    def paper(self) -> bool:
-        """Does it take the observation and the actions of the paper's agent?"""
-        return bool(self.contract.get("paper", False))
 
     def act(self, observation: Array) -> Array:
         """Actions (..., n_driven), not clipped, for observations (..., obs) of `env.features`.
@@ -44,8 +37,9 @@ class Policy:
         ValueError: a wrong shape, or an observation that is not finite.
         """
         x: Array = np.asarray(observation, np.float32)
-        if x.shape[-1:] != self.mean.shape:
-            raise ValueError(f"observation: expected (..., {len(self.mean)}), got {x.shape}")
+        size = len(self.weights[0])
+        if x.shape[-1:] != (size,):
+            raise ValueError(f"observation: expected (..., {size}), got {x.shape}")
         if not np.isfinite(x).all():
             raise ValueError("observation: expected finite numbers, got nan or inf")
         layers = list(zip(self.weights[::2], self.weights[1::2], strict=True))
@@ -95,7 +89,7 @@ def policy_controllers(
     return {name: PolicyController(machine, one) for name, one in every.items()}
 
 
-def contract(machine: Machine, paper: bool = False) -> dict[str, Any]:
+def contract(machine: Machine, paper: bool) -> dict[str, Any]:
     """What training and deployment must agree on; kept in the file and checked by `load_policy`."""
     return {
         "paper": paper,
@@ -114,16 +108,17 @@ def contract(machine: Machine, paper: bool = False) -> dict[str, Any]:
     }
 
 
-def save_policy(path: Path, policy: Policy) -> None:
+def save_policy(path: Path, policy: Policy, machine: Machine) -> None:
     """Write a policy as one `.npz`: weights, normalisation and its nets, plus a JSON header."""
     header = {
         "format": FORMAT,
         "kind": "policy",
-        "contract": dict(policy.contract),
+        "contract": contract(machine, policy.paper),
         "training": dict(policy.training),
         "valves": policy.valves,
     }
-    arrays = {"header": np.array(json.dumps(header)), "mean": policy.mean, "scale": policy.scale}
+    mean, scale = observation_scale(machine, policy.paper)
+    arrays = {"header": np.array(json.dumps(header)), "mean": mean, "scale": scale}
     arrays |= {f"weight_{i}": weight for i, weight in enumerate(policy.weights)}
     arrays |= {f"net_{name}": array for name, array in net_arrays(policy.net).items()}
     with files.whole_file(path) as file:
@@ -142,20 +137,17 @@ def load_policy(path: Path, machine: Machine) -> Policy:
     recorded = {"paper": False, **header["contract"]}
     paper = recorded["paper"]
     files.expect_same(path, recorded, contract(machine, paper))
-    scales = dict(zip(("mean", "scale"), observation_scale(machine, paper), strict=True))
-    sizes = {"obs": len(scales["mean"]), "driven": len(machine.driven)}
-    check_fields(path, arrays, POLICY_ARRAYS, sizes)
-    for name, value in scales.items():
+    mean, scale = observation_scale(machine, paper)
+    check_fields(path, arrays, POLICY_ARRAYS, {"obs": len(mean), "driven": len(machine.driven)})
+    for name, value in {"mean": mean, "scale": scale}.items():
         if not np.array_equal(arrays[name], value):
             raise ValueError(f"{path}: {name}: expected the machine's normalisation, got another")
     net = {name[4:]: array for name, array in arrays.items() if name.startswith("net_")}
     with files.located(path):
         return Policy(
-            contract=recorded,
             training=header["training"],
-            mean=arrays["mean"],
-            scale=arrays["scale"],
             weights=tuple(arrays[f"weight_{i}"] for i in range(8)),
             net=select_nets(machine, net_from_arrays(path, net, "net_")),
+            paper=paper,
             valves=header.get("valves", "closed"),
         )

@@ -115,7 +115,7 @@ def test_export_policy__is_the_actor_of_the_papers_agent_through_a_file(tmp_path
     env = TaskVectorEnv(8, NET, BROKK_170, task)
     agent = make_learner(env, TINY, 0, critic=True).agent
     agent.actor[-1].weight.data *= 100
-    save_policy(tmp_path / "p.npz", export_policy(BROKK_170, NET, agent, task, {}))
+    save_policy(tmp_path / "p.npz", export_policy(NET, agent, task, {}), BROKK_170)
     policy = load_policy(tmp_path / "p.npz", BROKK_170)
     obs = get_obs(BROKK_170, task, env.state, np.random.default_rng(7))
     expected = agent.actor(torch.from_numpy(obs)).detach().numpy()

@@ -29,12 +29,12 @@ def agent():
 
 @pytest.fixture(scope="module")
 def policy(agent):
-    return export_policy(BROKK_170, NET, agent, TaskConfig(), {"seed": 0, "gamma": 0.5})
+    return export_policy(NET, agent, TaskConfig(), {"seed": 0, "gamma": 0.5})
 
 
 @pytest.fixture
 def saved(policy, tmp_path):
-    save_policy(tmp_path / "policy.npz", policy)
+    save_policy(tmp_path / "policy.npz", policy, BROKK_170)
     return tmp_path / "policy.npz"
 
 
@@ -46,7 +46,7 @@ def test_act__by_hand():
         np.array([[3.0], [10.0]]),
         np.array([0.25]),
     )
-    policy = Policy({}, {}, np.zeros(2), np.ones(2), weights, NET)
+    policy = Policy({}, weights, NET)
     # units: 0.5 + 0.5 = 1 and 2 x 0.5 - 2 = -1; ELU gives 1 and 1/e - 1
     expected = 3 + 10 * (np.exp(-1) - 1) + 0.25
     np.testing.assert_allclose(policy.act(np.array([0.5, 0.5])), [expected], rtol=1e-6)
@@ -96,7 +96,7 @@ def test_controller__sends_the_policys_actions_or_has_a_rule_for_valves_at_rest(
 def test_controller__of_the_papers_agent_takes_its_observation_and_sends_plain_actions():
     agent = Agent(163, 4, -1.0, critic=True)
     agent.actor[-1].weight.data *= 100
-    paper = export_policy(BROKK_170, NET, agent, TaskConfig(paper=True), {})
+    paper = export_policy(NET, agent, TaskConfig(paper=True), {})
     controller = PolicyController(BROKK_170, paper)
     v_goal = np.random.default_rng(1).normal(0, 0.2, (5, 3))
     v_goal[0] = 0
@@ -108,14 +108,13 @@ def test_controller__of_the_papers_agent_takes_its_observation_and_sends_plain_a
 
 def test_load_policy__keeps_every_bit(policy, saved, tmp_path):
     again = load_policy(saved, BROKK_170)
-    assert dict(again.contract) == dict(policy.contract)
     assert dict(again.training) == {"seed": 0, "gamma": 0.5}
     assert len(again.weights) == 8
     for one, two in zip(again.weights, policy.weights, strict=True):
         assert one.tobytes() == np.ascontiguousarray(two).tobytes()
     history = np.random.default_rng(0).normal(size=(2, 4, 3, 13)).astype(np.float32)
     assert np.array_equal(again.net.predict(history), policy.net.predict(history))
-    save_policy(tmp_path / "other.npz", again)
+    save_policy(tmp_path / "other.npz", again, BROKK_170)
     assert saved.read_bytes() == (tmp_path / "other.npz").read_bytes()
 
 

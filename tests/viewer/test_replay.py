@@ -67,7 +67,7 @@ def results(tmp_path_factory):
     """What `evaluate` writes, of a policy and gains that nobody tuned."""
     folder = tmp_path_factory.mktemp("results")
     policy = load_policy(POLICY, BROKK_170)
-    save_policy(folder / "policy.npz", policy)
+    save_policy(folder / "policy.npz", policy, BROKK_170)
     about = baselines.gains_metadata(BROKK_170, policy.net)
     baselines.write_gains(folder / "gains.json", baselines.baselines(BROKK_170, policy.net), about)
     rows = "side,0,0,0.2,0\nside,1.5,0,0,0\nside,2,0,0,0\n"
