@@ -156,11 +156,8 @@ def print_answer(runs: list[dict[str, Any]]) -> None:
 
 
 CHAIN = {  # files of `reproduce`
-    "log.npz": "log",
-    "log_test.npz": "log",
-    "net.npz": "nets",
-    "log_paper.npz": "log",
-    "net_paper.npz": "nets",
+    **dict.fromkeys(("log.npz", "log_test.npz", "log_paper.npz"), "log"),
+    **dict.fromkeys(("net.npz", "net_paper.npz"), "nets"),
     **dict.fromkeys(POLICIES.values(), "policy"),
     **{f"{name}.csv": "curve" for name in POLICIES.values()},
     "gains.json": "gains",

@@ -297,9 +297,8 @@ def print_report(log: Log, report: dict[str, Any], machine: Machine) -> None:
 def print_fields(fields: dict[str, Any], machine: Machine) -> None:
     """`inspection.fields`, and in brackets what the machine has."""
     print(f"fields of {machine.name} by this log (now):")
-    zones = machine.dead_zone, machine.largest_dead_zone
-    pairs = zip(("dead_zone", "largest_dead_zone"), zones, strict=True)
-    print(", ".join(f"{field} {fields[field]:.3f} ({now:g})" for field, now in pairs))
+    zones = {name: getattr(machine, name) for name in ("dead_zone", "largest_dead_zone")}
+    print(", ".join(f"{name} {fields[name]:.3f} ({now:g})" for name, now in zones.items()))
     for joint, (zone_up, zone_down) in zip(machine.joints, machine.dead_zones, strict=True):
         now = {"dead_zone_up": zone_up, "dead_zone_down": zone_down}
         now |= {"q_dot_up": joint.q_dot_up, "q_dot_down": joint.q_dot_down}

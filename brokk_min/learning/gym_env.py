@@ -25,6 +25,7 @@ from brokk_min.learning.episodes import get_obs, new_goals, replace_rows, reset
 from brokk_min.machine import BROKK_170, Array, Machine
 
 Frame = NDArray[np.uint8]  # (height, width, 3)
+Step = tuple[Array, Array, Bools, Bools, dict[str, Any]]  # of a vector: obs, reward, ends, info
 
 
 class Renderer(Protocol):
@@ -86,7 +87,7 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         self._draw(range(self.num_envs))
         return get_obs(self.machine, self.config, self.state, self.np_random), {}
 
-    def step(self, actions: Array) -> tuple[Array, Array, Bools, Bools, dict[str, Any]]:
+    def step(self, actions: Array) -> Step:
         """One tick of all machines under actions (num_envs, n_driven)."""
         obs, reward, terminated, truncated, info = self.step_without_reset(actions)
         done = terminated | truncated
@@ -100,9 +101,7 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         self._draw(rows)
         return obs, reward, terminated, truncated, info
 
-    def step_without_reset(
-        self, actions: Array
-    ) -> tuple[Array, Array, Bools, Bools, dict[str, Any]]:
+    def step_without_reset(self, actions: Array) -> Step:
         """`step` for those who reset ended episodes themselves; draws nothing."""
         if self.state is None:
             raise ValueError("step: expected a reset before the first step, got none")
