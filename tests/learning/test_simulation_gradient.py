@@ -57,9 +57,9 @@ def moving_case(machine, seed):
     """Nets in double precision, a state in motion and commands, no joint near its limits."""
     rng = np.random.default_rng(seed)
     net = small_net(machine, rng)
+    low, high = machine.column("q_min"), machine.column("q_max")
     # 3/8 of the range lie before each joint, at least
-    room = (machine.column("q_max") - machine.column("q_min"))[machine.driven] / 3
-    fastest = room / ((15 + TICKS) * machine.dt)
+    fastest = (high - low)[machine.driven] / 3 / ((15 + TICKS) * machine.dt)
     net = replace(
         net,
         weights=tuple(weight.astype(float) for weight in net.weights),
@@ -67,9 +67,7 @@ def moving_case(machine, seed):
         output_high=np.minimum(0.3 * net.output_high, fastest),
         dead_zone=machine.dead_zone * (seed % 2),  # 0: commands as they are
     )
-    middle = (machine.column("q_min") + machine.column("q_max")) / 2
-    quarter = (machine.column("q_max") - machine.column("q_min")) / 4
-    q = middle + quarter * rng.uniform(-0.5, 0.5, (NUM, machine.n))
+    q = (low + high) / 2 + (high - low) / 4 * rng.uniform(-0.5, 0.5, (NUM, machine.n))
     state = env.initial_state(machine, q, rng.standard_normal((NUM, 3)), plant=False)
     state = replace(
         state,
