@@ -24,7 +24,7 @@ from brokk_min.evaluation.baselines import read_gains
 from brokk_min.evaluation.feedforward import static_map
 from brokk_min.identification import excitation, fitting, logs
 from brokk_min.identification.files import SHIPPED, write_json
-from brokk_min.identification.formats import read_table
+from brokk_min.identification.formats import NUMBERS, read_table
 from brokk_min.identification.net_file import load_net, select_nets
 from brokk_min.learning.policy import POLICIES, PolicyController, load_policy
 from brokk_min.machine import BROKK_170 as M
@@ -126,7 +126,8 @@ def draw(options: Options) -> None:
     axes = figure.subplots()
     begin, label = 0.0, f"ours, {len(folders)} seeds"
     for files in rounds:
-        tables = [read_table(f, ["global_step", "charts/velocity_error"]) for f in files]
+        columns = dict.fromkeys(("global_step", "charts/velocity_error"), NUMBERS)
+        tables = [read_table(file, columns) for file in files]
         million_steps = begin + tables[0]["global_step"] / 1e6
         errors = np.array([table["charts/velocity_error"] for table in tables])
         axes.plot(million_steps, errors.mean(axis=0), color="black", label=label)

@@ -20,7 +20,7 @@ from brokk_min.evaluation.preliminary import Motion, SimulatorTests
 from brokk_min.evaluation.rollout import TITLES
 from brokk_min.evaluation.sequences import AXES, Commands, hold_table
 from brokk_min.identification.files import whole_file
-from brokk_min.identification.formats import read_table
+from brokk_min.identification.formats import NUMBERS, read_table
 from brokk_min.identification.logs import Log, Recording
 from brokk_min.identification.simulation import free_run
 from brokk_min.identification.validation import recording_errors
@@ -187,7 +187,7 @@ def _free_run(
 def plot_learning(curve: Path) -> Figure:
     """Mean reward and velocity error of the exploring policy over environment steps."""
     labels = {"charts/reward": "reward per step", "charts/velocity_error": "velocity error [m/s]"}
-    table = read_table(curve, ["global_step", *labels])
+    table = read_table(curve, dict.fromkeys(["global_step", *labels], NUMBERS))
     steps = table["global_step"] / 1e6
     xlabel = "environment steps [million]"
     panels = [Panel("", xlabel, label, {"rl": (steps, table[k])}) for k, label in labels.items()]

@@ -5,8 +5,6 @@ once where joints are not alone (one pump, weight). They are validated on `task_
 joints move together, as under a policy.
 """
 
-from collections.abc import Callable
-from enum import IntEnum
 from itertools import chain
 
 import numpy as np
@@ -61,7 +59,7 @@ def rich_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Arra
             hold = int(rng.integers(1, 8))
             part = np.repeat(rng.uniform(-limit, limit, length // hold + 1), hold)[:length]
         else:
-            part = _starts(rng, machine, length, limit, _pause if kind == "start" else _barely_open)
+            part = _starts(rng, machine, length, limit, kind == "start")
         if kind in ("sine", "step", "holds") and rng.random() < 0.5:
             part = part + rng.uniform(0, 0.08) * rng.standard_normal(length)
         parts.append(part)
@@ -77,18 +75,14 @@ def _wide_sine(rng: np.random.Generator, amplitude: float, limit: float, time: A
 
 
 def _starts(
-    rng: np.random.Generator,
-    machine: Machine,
-    length: int,
-    limit: float,
-    wait: Callable[[np.random.Generator, Machine, float], Array],
+    rng: np.random.Generator, machine: Machine, length: int, limit: float, pauses: bool
 ) -> Array:
-    """Levels up to `limit` for 0.1 to 1 s, each after a `wait`, (length,)."""
+    """Levels up to `limit` for 0.1 to 1 s, each after a pause or a valve barely open, (length,)."""
     parts: list[Array] = []
     noise = rng.choice([0, 1]) * rng.uniform(0, machine.dead_zone)  # of an operator's hand
     while sum(map(len, parts)) < length:
         ticks = int(rng.uniform(0.1, 1.0) / machine.dt)
-        parts.append(wait(rng, machine, noise))
+        parts.append(_pause(rng, machine, noise) if pauses else _barely_open(rng, machine))
         parts.append(np.full(ticks, rng.uniform(-limit, limit)))
     return np.concatenate(parts)[:length]
 
@@ -100,7 +94,7 @@ def _pause(rng: np.random.Generator, machine: Machine, noise: float) -> Array:
     return noise * rng.uniform(-1, 1, int(seconds / machine.dt))
 
 
-def _barely_open(rng: np.random.Generator, machine: Machine, _: float) -> Array:
+def _barely_open(rng: np.random.Generator, machine: Machine) -> Array:
     """A valve at its minimum opening, to one side or alternating."""
     ticks = int(rng.uniform(0.2, 2.0) / machine.dt)
     alternations = np.arange(ticks) // rng.choice([1, 2, 3, 4, 6, ticks])
@@ -141,13 +135,6 @@ class _Recorder:
         self.q.append(read_encoder(self.machine, angle))
 
 
-class _Phase(IntEnum):
-    SEGMENT = 0  # under the excitation
-    RETURN = 1  # back to the start at a constant command
-    PAUSE = 2  # without a command, until the valve is idle
-    DONE = 3
-
-
 def collect(machine: Machine, hours: float, excitation: str, rng: np.random.Generator) -> Log:
     """Record the analytic plant, one actuator at a time, `hours` for each without the returns.
 
@@ -170,47 +157,78 @@ def collect(machine: Machine, hours: float, excitation: str, rng: np.random.Gene
     with tqdm(total=goal * machine.n, desc=title, unit="sample", disable=None) as bar:
         while count.min() < goal:
             joint = np.repeat(np.flatnonzero(count < goal), rows)
-            phase, u, q = _drive_segments(machine, joint, excitation, rng)
+            u, q, ended, idle = _drive_segments(machine, joint, excitation, rng)
             for row, j in enumerate(joint):
-                segment = (phase[:, row] == _Phase.SEGMENT).nonzero()[0][: goal - count[j]]
-                back = np.isin(phase[:, row], [_Phase.RETURN, _Phase.PAUSE])
-                if len(segment):
+                num = min(ended[row], goal - count[j])
+                if num:
                     name = f"{machine.names[j]}_{len(recordings[j]) // 2:03d}"
-                    recordings[j].append((name, u[segment, row], q[segment, row]))
+                    back = slice(ended[row], idle[row])
+                    recordings[j].append((name, u[:num, row], q[:num, row]))
                     recordings[j].append((name + RETURN, u[back, row], q[back, row]))
-                    count[j] += len(segment)
-                    bar.update(len(segment))
+                    count[j] += num
+                    bar.update(num)
     return machine_log(machine, chain(*recordings))
+
+
+def _at_limit(machine: Machine, q: Array) -> NDArray[np.bool_]:
+    """Which angles `q` [rad] (..., n) are within two counts of a limit."""
+    near = 2 * machine.encoder_step
+    return (q < machine.column("q_min") + near) | (q > machine.column("q_max") - near)
 
 
 def _drive_segments(
     machine: Machine, joint: Indices, excitation: str, rng: np.random.Generator
-) -> tuple[Array, Array, Array]:
-    """Phases (T, rows), commands and angles (T, rows, n) while joint `joint[k]` of row k moves."""
+) -> tuple[Array, Array, Indices, Indices]:
+    """Commands and angles (T, rows, n) while joint `joint[k]` of row k moves; two ticks (rows,).
+
+    At the first the segment ends: after its commands, or at a limit, but not within a second. Then
+    the joint returns to its start at a constant command. At the second its valve is idle there.
+    """
+    q, commands = _plan_segments(machine, joint, excitation, rng)
     rows = np.arange(len(joint))
-    q = _start_angles(machine, joint, excitation, rng)
     start = q[rows, joint]
-    ticks = round(MAX_SEGMENT * machine.rate)
-    commands = np.zeros((len(joint), machine.history + ticks))
-    for row in rows:
-        commands[row, machine.history :] = EXCITATIONS[excitation](rng, machine, ticks)
-    push = machine.rate if excitation == "rich" else 0.0
+    arrival = np.maximum(0.06, 2 * machine.encoder_step[joint])  # rad or m
+    push = machine.rate if excitation == "rich" else 0.0  # ticks at a limit
     return_level = (machine.dead_zone + machine.pwm_limit / PWM_MAX) / 2
-    driver = _SegmentPhases(machine, joint, start, commands.shape[1], push)
+    pause = round(5 * machine.tau_valve_down * machine.rate)
+    ended = np.full(len(joint), machine.history + round(MAX_SEGMENT * machine.rate))
+    arrived = np.full(len(joint), len(commands))
+    ticks_at_limit = np.zeros(len(joint), int)
     recorder = _Recorder(machine, q)
-    phases = []
-    for tick in range(commands.shape[1] + round(MAX_RETURN * machine.rate)):
+    for tick, excite in enumerate(commands):
         angle = recorder.q[-1][rows, joint]
-        phase = driver.update(tick, angle)
-        if (phase == _Phase.DONE).all():
+        at_limit = _at_limit(machine, recorder.q[-1])[rows, joint]
+        ticks_at_limit += at_limit
+        pushed = at_limit & (ticks_at_limit > push) & (tick > machine.history + machine.rate)
+        ended[pushed & (tick < ended)] = tick
+        arrived[(ended <= tick) & (tick < arrived) & (np.abs(angle - start) < arrival)] = tick
+        if (tick >= arrived + pause).all():
             break
-        excite = commands[:, min(tick, commands.shape[1] - 1)]
         homeward = return_level * np.sign(start - angle)
         u = np.zeros_like(q)
-        u[rows, joint] = np.choose(phase, [excite, homeward, 0.0, 0.0])
+        u[rows, joint] = np.select([tick < ended, tick < arrived], [excite, homeward])
         recorder.step(u)
-        phases.append(phase)
-    return np.array(phases), np.array(recorder.u), np.array(recorder.q[: len(phases)])
+    return np.array(recorder.u), np.array(recorder.q[:-1]), ended, arrived + pause
+
+
+def _plan_segments(
+    machine: Machine, joint: Indices, excitation: str, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Angles (rows, n) at the start of segments, and commands (T, rows) with time to return.
+
+    Segments start at mid range; if rich, at random angles of `joint[k]`, a tenth at either limit.
+    """
+    low, high = machine.column("q_min"), machine.column("q_max")
+    q = np.tile((low + high) / 2, (len(joint), 1))
+    if excitation == "rich":
+        low, high = low[joint], high[joint]
+        beyond = (high - low) / 8
+        angles = np.clip(rng.uniform(low - beyond, high + beyond), low, high)
+        q[np.arange(len(joint)), joint] = angles
+    ticks = round(MAX_SEGMENT * machine.rate)
+    commands = [EXCITATIONS[excitation](rng, machine, ticks) for _ in joint]
+    around = (machine.history, round(MAX_RETURN * machine.rate))
+    return q, np.pad(commands, ((0, 0), around)).T
 
 
 def _drive_together(machine: Machine, goal: int, rng: np.random.Generator) -> Log:
@@ -222,73 +240,21 @@ def _drive_together(machine: Machine, goal: int, rng: np.random.Generator) -> Lo
     """
     ticks = min(goal, round(MAX_SEGMENT * machine.rate))
     shape = (rows := -(-goal // ticks), machine.n)
-    low, high = machine.column("q_min"), machine.column("q_max")
-    recorder = _Recorder(machine, rng.uniform(low, high, shape))
+    q = rng.uniform(machine.column("q_min"), machine.column("q_max"), shape)
+    recorder = _Recorder(machine, q)
     commands = np.array([rich_command(rng, machine, ticks) for _ in range(rows * machine.n)])
     moves = np.isin(np.arange(machine.n), machine.driven) | (np.arange(rows) % 5 == 0)[:, None]
     moves &= (rng.random(shape) < 0.7) | (np.arange(rows) == 0)[:, None]
     commands = commands.reshape(*shape, ticks) * moves[..., None]
     commands[..., : machine.history] = 0.0
-    sign, at_limit, near = np.ones(shape), np.zeros(shape), 2 * machine.encoder_step
+    sign, at_limit = np.ones(shape), np.zeros(shape)
     for tick in tqdm(range(ticks), desc="record (joint)", unit="tick", disable=None):
-        stopped = (recorder.q[-1] < low + near) | (recorder.q[-1] > high - near)
-        at_limit = (at_limit + 1) * stopped
+        at_limit = (at_limit + 1) * _at_limit(machine, recorder.q[-1])
         sign = np.where(at_limit >= TURN_AFTER * machine.rate, -sign, sign)
         at_limit = at_limit * (at_limit < TURN_AFTER * machine.rate)
         recorder.step(sign * commands[..., tick])
     u, q = np.stack(recorder.u, axis=1), np.stack(recorder.q[:-1], axis=1)
     return machine_log(machine, [(f"joint_{i:03d}", u[i], q[i]) for i in range(rows)])
-
-
-class _SegmentPhases:
-    """State machine of each row: SEGMENT -> RETURN -> PAUSE -> DONE.
-
-    A segment ends after `length` ticks, or at a limit after `push` ticks there, and not within its
-    first second.
-    """
-
-    def __init__(
-        self, machine: Machine, joint: Indices, start: Array, length: int, push: float
-    ) -> None:
-        near = 2 * machine.encoder_step[joint]
-        self.low = machine.column("q_min")[joint] + near
-        self.high = machine.column("q_max")[joint] - near
-        self.start = start
-        self.arrival = np.maximum(0.06, near)  # rad or m
-        self.length = length
-        self.push = push
-        self.earliest = machine.history + machine.rate
-        self.pause = round(5 * machine.tau_valve_down * machine.rate)
-        self.phase = np.full(len(joint), _Phase.SEGMENT)
-        self.ticks_at_limit = np.zeros(len(joint), int)
-        self.ticks_paused = np.zeros(len(joint), int)
-
-    def update(self, tick: int, angle: Array) -> Indices:
-        """Phases (rows,) of this tick; `angle` [rad] (rows,) was just measured."""
-        at_limit = (angle < self.low) | (angle > self.high)
-        self.ticks_at_limit += at_limit
-        pushed = at_limit & (self.ticks_at_limit > self.push) & (tick > self.earliest)
-        ended = pushed | (tick == self.length)
-        self.phase[(self.phase == _Phase.SEGMENT) & ended] = _Phase.RETURN
-        arrived = np.abs(angle - self.start) < self.arrival
-        self.phase[(self.phase == _Phase.RETURN) & arrived] = _Phase.PAUSE
-        self.ticks_paused += self.phase == _Phase.PAUSE
-        self.phase[self.ticks_paused > self.pause] = _Phase.DONE
-        return self.phase.copy()
-
-
-def _start_angles(
-    machine: Machine, joint: Indices, excitation: str, rng: np.random.Generator
-) -> Array:
-    """Angles (rows, n) at the start of segments: mid range; if rich, random for `joint[k]`."""
-    low, high = machine.column("q_min"), machine.column("q_max")
-    q = np.tile((low + high) / 2, (len(joint), 1))
-    if excitation == "rich":  # a tenth of the segments starts at either limit
-        low, high = low[joint], high[joint]
-        beyond = (high - low) / 8
-        angles = np.clip(rng.uniform(low - beyond, high + beyond), low, high)
-        q[np.arange(len(joint)), joint] = angles
-    return q
 
 
 def task_log(

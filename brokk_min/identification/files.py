@@ -7,7 +7,6 @@ anything is read. `formats` says what the fields of a file must be.
 
 import csv
 import json
-import math
 import os
 import reprlib
 import stat
@@ -34,8 +33,6 @@ LARGEST_JSON = 2**27  # bytes
 LONGEST_LINE = 2**20  # bytes of a CSV
 DEEPEST = 32  # levels of JSON
 MEMBERS = 4096  # of an archive
-HEADER_SIZE = 10_000  # characters of the header of an array
-READ_HEADER = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 
 
 def require(package: str, extra: str) -> Any:
@@ -206,14 +203,11 @@ def read_json(path: Path, what: str) -> Any:
         return parse_json(file.read(LARGEST_JSON))
 
 
-def load_arrays(
-    path: Path, names: Iterable[str] | None = None, largest: int = LARGEST
-) -> dict[str, NDArray[Any]]:
-    """All arrays of an `.npz` file, or some; nothing in it is executed.
+def load_arrays(path: Path, largest: int = LARGEST) -> dict[str, NDArray[Any]]:
+    """All arrays of an `.npz` file; nothing in it is executed.
 
-    Types and sizes of all of them are checked by their headers before any is read.
     ValueError: not there, not an `.npz`, damaged, with pickled objects, or compressed so far that
-    its size does not justify the memory.
+    its size does not justify the memory; the sizes are checked before any array is read.
     """
     with (
         expected(path, "a readable .npz file"),
@@ -224,33 +218,16 @@ def load_arrays(
         arrays = [member.filename.removesuffix(".npy") for member in members]
         if len(members) > MEMBERS or len(set(arrays)) < len(arrays):
             raise ValueError(f"{len(members)} members, some of the same name or too many")
-        unpacked = sum(_checked_size(archive, member) for member in members)
+        unpacked = sum(member.file_size for member in members)
         allowed = min(largest, max(UNPACKED_MIN, UNPACKED_RATIO * os.path.getsize(path)))
         if unpacked > allowed:
             raise ValueError(f"{unpacked} bytes unpacked, more than {allowed}")
         result = {}
         for name, member in zip(arrays, members, strict=True):
-            if names is None or name in names:
-                with archive.open(member) as content:
-                    result[name] = npy.read_array(content, allow_pickle=False)
+            what = f"a readable .npz file with an array of numbers or text in {brief(name)}"
+            with expected(path, what), archive.open(member) as content:
+                result[name] = npy.read_array(content, allow_pickle=False)
         return result
-
-
-def _checked_size(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> int:
-    """Unpacked bytes of a member; ValueError: no array of numbers or text, or of another size."""
-    packed = member.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-    if not member.filename.endswith(".npy") or not packed:
-        raise ValueError(f"member {brief(member.filename)} that is no array")
-    with archive.open(member) as content:
-        read = READ_HEADER[npy.read_magic(content)]
-        shape, _, dtype = read(content, max_header_size=HEADER_SIZE)
-        size = dtype.itemsize * math.prod(shape)
-        got = member.file_size - content.tell()
-        if dtype.kind not in "biufcU" or min(shape, default=0) < 0:
-            raise ValueError(f"member {brief(member.filename)} of {dtype}, e.g. pickled objects")
-        if size != got:
-            raise ValueError(f"member {brief(member.filename)} of {got} bytes instead of {size}")
-    return int(member.file_size)
 
 
 def load_header(path: Path, arrays: dict[str, Any], kind: str, version: int) -> dict[str, Any]:

@@ -3,8 +3,9 @@
 Sizes are numbers or names; a name stands for the same number in all fields of a file.
 """
 
-from collections.abc import Mapping, MutableMapping, Sequence
+from collections.abc import Mapping, MutableMapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,6 @@ KINDS: dict[str, tuple[str, tuple[type, ...]]] = {  # type codes of arrays, type
     "truth value": ("b", (bool,)),
     "object": ("", (dict,)),
 }
-NUMBERS = ("float", "number")
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,9 @@ class Field:
 
     def wanted(self, sizes: Mapping[str, int]) -> str:
         """The field in words."""
-        words = "different " * self.unique + "finite " * (self.kind in NUMBERS) + self.kind
+        words = (
+            "different " * self.unique + "finite " * (self.kind in ("float", "number")) + self.kind
+        )
         if self.kind == "text" and not self.among:
             words += f" of {self.low:g} to {self.high:g} characters"
         elif self.low > -np.inf or self.high < np.inf:
@@ -54,22 +56,30 @@ class Field:
 
 # `Field`, the fields of an object within, or those of a list of objects; "*": of all other names
 Fields = Mapping[str, Any]
-JOINTS = Field("text", 1, 100, ("n",), unique=True)
+NAME = Field("text", 1, 200)
+SEED = Field("whole number", 0, 2**63)
 SAMPLES = Field("whole number", 2, 1000)
-DEAD_ZONE = Field("float", 0, 0.99, required=False)  # of full command
 
 NET_HEADER: Fields = {
-    "joints": JOINTS,
+    "joints": Field("text", 1, 100, ("n",), unique=True),
     "history": SAMPLES,
     "rate": Field("float", 1e-3, 1e6, unit="Hz"),
     "velocity_samples": SAMPLES,
     "velocity_logged": Field("truth value"),
     "machine": Field("text", 0, 200),
-    "seed": Field("whole number", 0, 2**63),
+    "seed": SEED,
     "settings": {"*": Field("float", -1e15, 1e15)},
-    "dead_zone": DEAD_ZONE,
+    "dead_zone": Field("float", 0, 0.99, required=False),  # of full command
 }
 LARGE = 1e6  # of a weight or a statistic: far beyond what a training gives
+
+
+def _layers(first: tuple[str, ...], *units: int | str) -> dict[str, Field]:
+    """Weights and biases from one layer to the next, with a first axis (n,) or none."""
+    shapes = [first + ends for pair in pairwise(units) for ends in (pair, pair[1:])]
+    return {f"weight_{i}": Field("float", -LARGE, LARGE, s) for i, s in enumerate(shapes)}
+
+
 NET_ARRAYS: dict[str, Field] = {
     "input_mean": Field("float", -LARGE, LARGE, ("n", "3 history")),
     "input_scale": Field("float", 1e-9, LARGE, ("n", "3 history")),
@@ -77,12 +87,7 @@ NET_ARRAYS: dict[str, Field] = {
     "output_high": Field("float", -LARGE, LARGE, ("n",), "rad/s"),
     "q_low": Field("float", -LARGE, LARGE, ("n",), "rad"),
     "q_high": Field("float", -LARGE, LARGE, ("n",), "rad"),
-    "weight_0": Field("float", -LARGE, LARGE, ("n", "3 history", "hidden")),
-    "weight_1": Field("float", -LARGE, LARGE, ("n", "hidden")),
-    "weight_2": Field("float", -LARGE, LARGE, ("n", "hidden", "hidden")),
-    "weight_3": Field("float", -LARGE, LARGE, ("n", "hidden")),
-    "weight_4": Field("float", -LARGE, LARGE, ("n", "hidden", 1)),
-    "weight_5": Field("float", -LARGE, LARGE, ("n", 1)),
+    **_layers(("n",), "3 history", "hidden", "hidden", 1),
     "weight_6": Field("float", -LARGE, LARGE, ("n", "6 history", "latents"), required=False),
     "weight_7": Field("float", -LARGE, LARGE, ("n", "latents", "hidden"), required=False),
 }
@@ -94,14 +99,7 @@ POLICY_HEADER: Fields = {
 POLICY_ARRAYS: dict[str, Field] = {
     "mean": Field("float", -LARGE, LARGE, ("obs",)),
     "scale": Field("float", 1e-9, LARGE, ("obs",)),
-    "weight_0": Field("float", -LARGE, LARGE, ("obs", "hidden 1")),
-    "weight_1": Field("float", -LARGE, LARGE, ("hidden 1",)),
-    "weight_2": Field("float", -LARGE, LARGE, ("hidden 1", "hidden 2")),
-    "weight_3": Field("float", -LARGE, LARGE, ("hidden 2",)),
-    "weight_4": Field("float", -LARGE, LARGE, ("hidden 2", "hidden 3")),
-    "weight_5": Field("float", -LARGE, LARGE, ("hidden 3",)),
-    "weight_6": Field("float", -LARGE, LARGE, ("hidden 3", "driven")),
-    "weight_7": Field("float", -LARGE, LARGE, ("driven",)),
+    **_layers((), "obs", "hidden 1", "hidden 2", "hidden 3", "driven"),
 }
 LOG: dict[str, Field] = {  # columns, or what their names begin with; q: ten turns, assumed
     "run": Field("text", 1, 200, ("rows",)),
@@ -110,59 +108,52 @@ LOG: dict[str, Field] = {  # columns, or what their names begin with; q: ten tur
     "q_": Field("number", -62.8, 62.8, ("rows",), "rad or m, not degrees"),
     "q_dot_": Field("number", -62.8, 62.8, ("rows",), "rad/s or m/s, not degrees/s"),
 }
-VELOCITY = Field("number", -100, 100, ("rows",), "m/s")
+NUMBERS = Field("number", shape=("rows",))  # a column
+TEXTS = Field("text", 0, 200, ("rows",))
 COMMANDS: dict[str, Field] = {
-    "sequence": Field("text", 1, 200, ("rows",)),
-    "time": Field("number", -1e12, 1e12, ("rows",), "s"),
-    "vx": VELOCITY,
-    "vy": VELOCITY,
-    "vz": VELOCITY,
+    "sequence": LOG["run"],
+    "time": LOG["time"],
+    **dict.fromkeys(("vx", "vy", "vz"), Field("number", -100, 100, ("rows",), "m/s")),
 }
-META: Fields = {"machine": Field("text", 1, 200), "actuator": Field("text", 1, 200)}
-GAIN = Field("float", 0, 1e6, ("driven",))
+META: Fields = {"machine": NAME, "actuator": NAME}
 GAINS: Fields = {  # of one controller
-    "kp": GAIN,
-    "ki": GAIN,
-    "kd": GAIN,
+    **dict.fromkeys(("kp", "ki", "kd"), Field("float", 0, 1e6, ("driven",))),
     "feedback": Field("float", 0, 1e6, (1,)),
     "min_opening": Field("float", 0, 1, (1,)),
     "integral_feedback": Field("float", 0, 1e6, (1,), required=False),
 }
-MEAN: Fields = {
-    "mean": Field("float"),
-    "low": Field("float", none=True),
-    "high": Field("float", none=True),
-}
-FIGURES: Fields = {"velocity_error_all": MEAN, "off_axis_drift_max": MEAN, "valve_travel": MEAN}
-SWEEP: Fields = {"meta": META, "table": {"rl": {**FIGURES, "*": MEAN}, "*": {**FIGURES, "*": MEAN}}}
+NOT_NEGATIVE = Field("float", 0)
+ANY = Field("float", none=True)
+MEAN: Fields = {"mean": Field("float"), "low": ANY, "high": ANY}
+ROW = dict.fromkeys(("velocity_error_all", "off_axis_drift_max", "valve_travel", "*"), MEAN)
+SWEEP: Fields = {"meta": META, "table": {"rl": ROW, "*": ROW}}
 
 NAMED = Field("text", 0, 4096, required=False)
 RESULTS: Fields = {  # of `evaluate` and `reproduce`
     "meta": {
-        "machine": Field("text", 1, 200),
-        "seed": Field("whole number", 0, 2**63),
+        "machine": NAME,
+        "seed": SEED,
         **dict.fromkeys(("plant", "commands", "starts", "policy", "gains"), NAMED),
     },
     "starts": Field("number", -62.8, 62.8, ("starts", "n"), "rad", required=False),
 }
 RUN: Fields = {
-    "controller": Field("text", 1, 200),
-    "sequence": Field("text", 1, 200),
+    "controller": NAME,
+    "sequence": NAME,
     "start": Field("whole number", 0, 1e6),
-    "kind": Field("text", 1, 200),
-    "velocity_rmse": Field("float", 0),
-    "velocity_error_mean": Field("float", 0),
-    **dict.fromkeys(("off_axis_drift_max", "jerk_rms", "valve_travel"), Field("float", none=True)),
+    "kind": NAME,
+    **dict.fromkeys(("velocity_rmse", "velocity_error_mean"), NOT_NEGATIVE),
+    **dict.fromkeys(("off_axis_drift_max", "jerk_rms", "valve_travel"), ANY),
 }
 RUNS: Fields = {"runs": [RUN]}
 
 FAMILY_MEMBER: Fields = {
-    "seed": Field("whole number", 0, 2**63),
+    "seed": SEED,
     "budget": {"*": Field("number")},
-    "free_run": {"*": Field("float", none=True)},
-    "error": {"rl": Field("float", 0), "*": Field("float", 0)},
-    "on_nets": {"*": Field("float", 0)},
-    "loaded": {"*": Field("float", 0)},
+    "free_run": {"*": ANY},
+    "error": {"rl": NOT_NEGATIVE, "*": NOT_NEGATIVE},
+    "on_nets": {"*": NOT_NEGATIVE},
+    "loaded": {"*": NOT_NEGATIVE},
     "best": {"*": Field("text", 1, 100)},
     "dither": Field("float", 0, 0.5),
 }
@@ -194,14 +185,14 @@ def check(
     wanted = field.wanted(sizes)
     array = value if isinstance(value, np.ndarray) else np.array(value, dtype=object)
     codes, types = KINDS[field.kind]
-    same_type = array.dtype.kind in codes
+    fits = array.dtype.kind in codes
     if array.dtype == object:
-        same_type = all(type(x) in types for x in array.flat)
-    shape = [sizes.get(s, 0) if isinstance(s, str) else s for s in field.shape]
-    if same_type and len(shape) == array.ndim:
-        for i, size in enumerate(field.shape):
-            shape[i] = sizes.setdefault(size, array.shape[i]) if isinstance(size, str) else size
-    if not same_type or array.shape != tuple(shape):
+        fits = all(type(x) in types for x in array.flat)
+    if fits := fits and array.ndim == len(field.shape):
+        pairs = zip(field.shape, array.shape, strict=True)
+        shape = [sizes.setdefault(k, size) if isinstance(k, str) else k for k, size in pairs]
+        fits = array.shape == tuple(shape)
+    if not fits:
         got = brief(value) if array.dtype == object else f"{array.dtype}, shape {array.shape}"
         raise ValueError(f"{path}: {name}: expected {wanted}, got {got}")
     if field.kind == "object":
@@ -231,14 +222,14 @@ def check_fields(
     path: Path, content: Any, fields: Fields, sizes: MutableMapping[str, int], within: str = ""
 ) -> None:
     """`check` of all fields of an object, also of objects within; others are not looked at."""
+    names = [name for name in fields if name != "*"]
     if not isinstance(content, Mapping):
         place = within.removesuffix(".") or "content"
-        wanted = [name for name in fields if name != "*"]
-        what = f"names {wanted}" if wanted else "an object"
+        what = f"names {names}" if names else "an object"
         raise ValueError(f"{path}: {place}: expected {what}, got {brief(content)}")
     others = [name for name in content if name not in fields] if "*" in fields else []
-    named = {name: field for name, field in fields.items() if name != "*"}
-    for name, field in (named | dict.fromkeys(others, fields.get("*"))).items():
+    for name in [*names, *others]:
+        field = fields.get(name, fields.get("*"))
         place = f"{within}{name}"
         if isinstance(field, Field):
             if name in content:
@@ -250,7 +241,7 @@ def check_fields(
             for i, row in enumerate(content[name]):
                 check_fields(path, row, field[0], sizes, f"{place}[{i}].")
         else:
-            check_fields(path, content.get(name), field or {}, sizes, f"{place}.")
+            check_fields(path, content.get(name), field, sizes, f"{place}.")
 
 
 def check_columns(path: Path, table: Mapping[str, Any], fields: Mapping[str, Field]) -> None:
@@ -266,16 +257,8 @@ def check_columns(path: Path, table: Mapping[str, Any], fields: Mapping[str, Fie
         raise ValueError(f"{path}: expected at least one row, got none")
 
 
-def _column(text: bool) -> Field:
-    return Field("text", 0, 200, ("rows",)) if text else Field("number", shape=("rows",))
-
-
-def read_table(
-    path: Path, columns: Sequence[str] | Mapping[str, Field], text: Sequence[str] = ()
-) -> dict[str, NDArray[Any]]:
-    """Columns of a CSV by their fields, or by name: those of `text`, else finite numbers."""
-    if not isinstance(columns, Mapping):
-        columns = {name: _column(name in text) for name in columns}
+def read_table(path: Path, columns: Mapping[str, Field]) -> dict[str, NDArray[Any]]:
+    """Columns of a CSV by their fields."""
     text = [name for name, field in columns.items() if field.kind == "text"]
     table = read_csv(Path(path), text)
     check_columns(path, table, columns)

@@ -10,6 +10,7 @@ there the delay hardly counts, and the curve beyond, such as a pump that starves
 """
 
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import product
 from typing import Any
 
@@ -146,34 +147,31 @@ def best_model(
     u: Array, velocity: Array, rate: float, sign: int, given: list[float] | None = None
 ) -> dict[str, float]:
     """The model with gains of one sign, by turns of a grid of delays and lags, and dead zones."""
+    fit = partial(fit_gains, u, velocity, rate, sign)
     zones = given or [0.05, 0.05]
     for _ in range(2):
         grid = product(range(round(LATEST * rate) + 1), TAUS)
-        delay, tau = min(grid, key=lambda one: residual(u, velocity, rate, sign, *one, *zones)[0])
+        delay, tau = min(grid, key=lambda lag: fit(lag[0], lag[1], zones)[0])
         for side in () if given else (0, 1, 0, 1):
             trials = [[*zones[:side], zone, *zones[side + 1 :]] for zone in ZONES]
-            zones = min(trials, key=lambda z: residual(u, velocity, rate, sign, delay, tau, *z)[0])
-    error, gains = residual(u, velocity, rate, sign, delay, tau, *zones)
+            zones = min(trials, key=lambda trial: fit(delay, tau, trial)[0])
+    error, gains = fit(delay, tau, zones)
     return {
-        **{"error": error, "delay": delay / rate, "tau": tau},
-        **{"dead_zone_up": float(zones[0]), "dead_zone_down": float(zones[1])},
-        **{"gain_up": float(gains[0]), "gain_down": float(gains[1])},
+        "error": error,
+        "delay": delay / rate,
+        "tau": tau,
+        **dict(zip(("dead_zone_up", "dead_zone_down"), map(float, zones), strict=True)),
+        **dict(zip(("gain_up", "gain_down"), gains.tolist(), strict=True)),
     }
 
 
-def residual(
-    u: Array,
-    velocity: Array,
-    rate: float,
-    sign: int,
-    delay: int,
-    tau: float,
-    up: float,
-    down: float,
+def fit_gains(
+    u: Array, velocity: Array, rate: float, sign: int, delay: int, tau: float, zones: list[float]
 ) -> tuple[float, Array]:
     """Sum of the squared errors of the model with the best gains of a sign; and these gains."""
     from scipy.signal import lfilter  # slow to import
 
+    up, down = zones
     late = np.concatenate([np.zeros(delay), u[: len(u) - delay]])
     openings = np.stack([np.maximum(late - up, 0), -np.maximum(-late - down, 0)])
     a = np.exp(-1 / (rate * tau))

@@ -124,11 +124,8 @@ def split(log: Log) -> tuple[Log, Log]:
     if not held_out:
         expected = "expected two or more that drive the same joints, or --test, to score on"
         raise ValueError(f"recordings: {expected}, got {len(log.recordings)}")
-    parts: tuple[list[Recording], list[Recording]] = ([], [])
-    for i, recording in enumerate(log.recordings):
-        parts[i in held_out].append(recording)
-    kept, test = (log._replace(recordings=tuple(part)) for part in parts)
-    return kept, test
+    kept = set(range(len(log.recordings))) - held_out
+    return _some(log, kept), _some(log, held_out)
 
 
 def same_joints(log: Log) -> list[list[int]]:
@@ -141,8 +138,12 @@ def same_joints(log: Log) -> list[list[int]]:
 
 def part_of(log: Log, part: float) -> Log:
     """The first recordings of each joint, a `part` of them and at least one."""
-    kept = [i for group in same_joints(log) for i in group[: math.ceil(part * len(group))]]
-    return log._replace(recordings=tuple(log.recordings[i] for i in sorted(kept)))
+    groups = same_joints(log)
+    return _some(log, (i for group in groups for i in group[: math.ceil(part * len(group))]))
+
+
+def _some(log: Log, indices: Iterable[int]) -> Log:
+    return log._replace(recordings=tuple(log.recordings[i] for i in sorted(indices)))
 
 
 def write_log(path: Path, log: Log) -> None:
@@ -188,8 +189,8 @@ def read_log(
     recordings: list[Recording] = []
     logged: set[bool] = set()
     for path in map(Path, paths):
-        table: Columns = files.read_csv(path, ["run"]) if path.suffix.lower() == ".csv" else {}
-        table = table or _read_npz(path)
+        is_csv = path.suffix.lower() == ".csv"
+        table = files.read_csv(path, ["run"]) if is_csv else files.load_arrays(path)
         got = names if joints else _joints(path, table)
         names = names or got
         if set(got) != set(names):
@@ -202,15 +203,6 @@ def read_log(
     if not recordings:
         raise ValueError(f"{', '.join(map(str, paths))}: expected at least one recording, got none")
     return Log(names, tuple(recordings), True in logged, rate)
-
-
-def _read_npz(path: Path) -> Columns:
-    """Columns of an `.npz`, once run and time are those of a log: they justify the others."""
-    narrow = files.load_arrays(path, ["run", "time"])
-    check_columns(path, narrow, {name: LOG[name] for name in ("run", "time")})
-    _runs(path, narrow["run"].tolist(), narrow["time"])
-    table: dict[str, Any] = files.load_arrays(path)
-    return table | {"run": table["run"].tolist()}
 
 
 def _joints(path: Path, table: Columns) -> tuple[str, ...]:
@@ -236,7 +228,10 @@ def _recordings(
     fields |= {kind + joint: LOG[kind] for kind in kinds for joint in joints}
     check_columns(path, table, fields)
     time = np.asarray(table["time"], float)
-    for run, rows in _runs(path, table["run"], time).items():
+    names = table["run"]
+    for run, rows in _runs(
+        path, names if isinstance(names, list) else names.tolist(), time
+    ).items():
         gaps = _gaps(path, run, rows, time[rows], rate)
         pieces = [] if run.endswith(RETURN) else np.split(rows, gaps)
         for part, piece in enumerate(pieces):

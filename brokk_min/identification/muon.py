@@ -8,8 +8,7 @@ same error, for nets and for policies (docs/deviations.md, D17). Jordan et al., 
 descent under the spectral norm.
 """
 
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor
@@ -40,10 +39,8 @@ class Muon(torch.optim.AdamW):
         self.dimensions = 3 if stacks else 2  # of matrices
 
     @torch.no_grad()
-    def step(self, closure: Callable[[], float] | None = None) -> Any:
+    def step(self) -> None:  # type: ignore[override]
         """One step by the gradients `grad`; those of matrices are used up."""
-        with torch.enable_grad():
-            loss = closure() if closure else None
         for group in self.param_groups:
             for weight in group["params"]:
                 if weight.ndim < self.dimensions or weight.grad is None:
@@ -58,7 +55,6 @@ class Muon(torch.optim.AdamW):
                 weight.sub_(self.muon * group["lr"] * orthogonalise(ahead))
                 weight.grad = None  # nothing is left for AdamW
         super().step()
-        return loss
 
 
 def orthogonalise(M: Tensor) -> Tensor:

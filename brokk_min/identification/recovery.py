@@ -5,15 +5,7 @@ from typing import Any
 import numpy as np
 
 from brokk_min.actuator import ActuatorNet
-from brokk_min.identification.simulation import (
-    Simulator,
-    net_simulator,
-    plant_simulator,
-    response_times,
-    step_commands,
-    step_velocity,
-    steps,
-)
+from brokk_min.identification.simulation import Simulator, response_times, step_tests, step_velocity
 from brokk_min.machine import PWM_MAX, Array, Machine
 
 SECONDS = 2.0  # assumed: for which a command is held
@@ -28,12 +20,10 @@ def recovery(net: ActuatorNet, machine: Machine) -> dict[str, dict[str, Any]]:
     time from rest to 63 % of its velocity [s]; `speed` [rad/s or m/s] at the command limit.
     """
     level = np.full(machine.n, machine.pwm_limit / PWM_MAX)
-    wait = max(round(SECONDS * net.rate), 2 * net.history)
-    simulators = {"nets": net_simulator(net), "plant": plant_simulator(machine)}
-    before = step_commands(simulators["nets"], net.q_low, net.q_high, level, wait)
     result: dict[str, dict[str, Any]] = {name: {} for name in net.joints}
-    for side, simulate in simulators.items():
-        angles = steps(simulate, net.q_low, net.q_high, level, before, wait)
+    tests = step_tests(net, machine, level, SECONDS)
+    for side, (simulate, angles) in zip(("nets", "plant"), tests, strict=True):
+        wait = len(angles) // 2
         numbers = {
             "dead_zone": dead_zones(simulate, net, machine.pwm_limit, wait),
             "delay": response_times(angles, net.rate, BEGINS)[1],

@@ -145,6 +145,17 @@ def step_commands(
     return np.asarray((fractions[np.argmax(moves, axis=0)] + 1) / 2 * level)
 
 
+def step_tests(
+    net: ActuatorNet, machine: Machine | None, level: Array, seconds: float
+) -> list[tuple[Simulator, Array]]:
+    """The nets, then a known machine, and their `steps` to `level` (n,), held for `seconds`."""
+    simulators = [net_simulator(net)] + ([plant_simulator(machine)] if machine else [])
+    low, high = net.q_low, net.q_high
+    wait = max(round(seconds * net.rate), 2 * net.history)
+    before = step_commands(simulators[0], low, high, level, wait)
+    return [(simulate, steps(simulate, low, high, level, before, wait)) for simulate in simulators]
+
+
 def named_times(times: Array, joints: Sequence[str]) -> dict[str, Any]:
     """Response times for JSON: {joint: {"idle": {"up", "down"}, "moving": {...}}} [s or None]."""
     result: dict[str, Any] = {}
@@ -161,14 +172,6 @@ def log_response_times(
 ) -> dict[str, dict[str, Any]]:
     """`named_times` to the largest command of a log, of the nets and of a known machine."""
     level = np.abs(np.concatenate([recording.u for recording in log.recordings])).max(axis=0)
-    wait = max(round(1.5 * net.rate), 2 * net.history)
-    simulators = {"response_time": net_simulator(net)}
-    if machine:
-        simulators["machine_response_time"] = plant_simulator(machine)
-    low, high = net.q_low, net.q_high
-    before = step_commands(simulators["response_time"], low, high, level, wait)
-    result = {}
-    for name, simulate in simulators.items():
-        angles = steps(simulate, low, high, level, before, wait)
-        result[name] = named_times(response_times(angles, net.rate), net.joints)
-    return result
+    tests = step_tests(net, machine, level, 1.5)
+    times = [named_times(response_times(angles, net.rate), net.joints) for _, angles in tests]
+    return dict(zip(("response_time", "machine_response_time"), times, strict=False))

@@ -11,7 +11,7 @@ import numpy as np
 
 from brokk_min.can.drive_log import Telemetry
 from brokk_min.identification import files
-from brokk_min.identification.formats import read_table
+from brokk_min.identification.formats import NUMBERS, TEXTS, read_table
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
 from brokk_min.viewer.camera import extent
@@ -105,7 +105,8 @@ def read_attempts(path: Path) -> list[Attempt]:
     """Attempts in a file, none if there is no file; ValueError: another kind of file."""
     if not path.exists():
         return []
-    table = read_table(path, Attempt._fields, text=("when", "task", "mode"))
+    texts = dict.fromkeys(("when", "task", "mode"), TEXTS)
+    table = read_table(path, dict.fromkeys(Attempt._fields, NUMBERS) | texts)
     columns = [table[name].tolist() for name in Attempt._fields]
     return [Attempt(*row) for row in zip(*columns, strict=True)]
 

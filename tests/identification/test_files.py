@@ -14,14 +14,14 @@ from brokk_min.identification.files import (
     write_csv,
     write_json,
 )
-from brokk_min.identification.formats import read_table
+from brokk_min.identification.formats import NUMBERS, TEXTS, read_table
 
 
 def test_write_csv__reads_back(tmp_path):
     rows = [["a", 0.1, 1e-17], ["b, c", -2.0, 1 / 3]]
     write_csv(tmp_path / "a.csv", ["name", "x", "y"], rows)
     assert (tmp_path / "a.csv").read_text() == f'name,x,y\na,0.1,1e-17\n"b, c",-2.0,{1 / 3}\n'
-    back = read_table(tmp_path / "a.csv", ["name", "x", "y"], text=["name"])
+    back = read_table(tmp_path / "a.csv", {"name": TEXTS, "x": NUMBERS, "y": NUMBERS})
     assert [list(row) for row in zip(*back.values(), strict=True)] == rows
 
 

@@ -61,18 +61,6 @@ def test_step__of_stacks_leaves_each_joint_alone():
         assert not torch.equal(one[1], other[1])
 
 
-def test_step__evaluates_a_closure_first():
-    weight = torch.eye(2).requires_grad_()
-
-    def closure():
-        loss = (weight**2).sum()
-        loss.backward()
-        return loss.item()
-
-    assert Muon([weight], lr=0.01).step(closure) == 2.0
-    assert weight.grad is None and float(weight.detach().diagonal().max()) < 1.0
-
-
 def test_step__goes_on_from_a_state_to_the_same_bits():
     def optimised(steps, weight, state):
         optimizer = Muon([weight], lr=0.01)
