@@ -20,7 +20,7 @@ from brokk_min.identification.files import brief, located, write_json
 from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
 from brokk_min.identification.logs import RETURN, Log, part_of, read_log, split, write_log
 from brokk_min.identification.net_file import load_net, save_net
-from brokk_min.identification.recovery import recovery
+from brokk_min.identification.simulation import recovery
 from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import Machine, number
 

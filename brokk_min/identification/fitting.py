@@ -84,8 +84,9 @@ def training_set(log: Log, config: FitConfig) -> TrainingSet:
     high = np.array([target.max() for target in targets])
     margin = 0.05 * (high - low) + 1e-6  # rad/s
     multi_step_windows = samples.windows(config.history, config.rollout)
-    if config.shared:  # the same windows for all joints
-        windows, multi_step_windows = map(same_windows, (windows, multi_step_windows))
+    if config.shared:  # for all joints the windows in which any joint moves
+        windows = [np.unique(np.concatenate(windows))] * len(windows)
+        multi_step_windows = [np.unique(np.concatenate(multi_step_windows))] * len(windows)
     return TrainingSet(
         signals=torch.tensor(signals).float(),
         target=torch.tensor(samples.target).float(),
@@ -99,11 +100,6 @@ def training_set(log: Log, config: FitConfig) -> TrainingSet:
         q_high=torch.tensor(q.max(axis=0)).float(),
         rate=log.rate,
     )
-
-
-def same_windows(windows: list[NDArray[np.intp]]) -> list[NDArray[np.intp]]:
-    """For each joint the windows in which any joint moves."""
-    return [np.unique(np.concatenate(windows))] * len(windows)
 
 
 def _check_targets(log: Log, targets: list[Array], history: int) -> None:
