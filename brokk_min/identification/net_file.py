@@ -15,16 +15,14 @@ from brokk_min.identification.files import expected, load_arrays, load_header, l
 from brokk_min.identification.formats import NET_ARRAYS, NET_HEADER, check_fields
 from brokk_min.machine import Machine
 
-FORMAT = 1
-SHARED_FORMAT = 2  # of nets with `ActuatorNet.latents`
+FORMATS = {6: 1, 8: 2}  # by the number of weights: 8 with `ActuatorNet.latents`
 LARGEST_NET = 2**26  # bytes of a file
 STATISTICS = [name for name in NET_ARRAYS if not name.startswith("weight_")]
 
 
 def net_arrays(net: ActuatorNet) -> dict[str, Any]:
     """Nets as named arrays, as in the file; one of them is the JSON header."""
-    version = SHARED_FORMAT if len(net.weights) > 6 else FORMAT
-    header: dict[str, Any] = {"format": version, "kind": "actuator net"}
+    header: dict[str, Any] = {"format": FORMATS[len(net.weights)], "kind": "actuator net"}
     for field in fields(net):
         if field.name not in (*STATISTICS, "weights"):
             header[field.name] = getattr(net, field.name)
@@ -47,8 +45,7 @@ def net_from_arrays(path: Path, arrays: dict[str, NDArray[Any]], prefix: str = "
     `prefix` is that of the names of the arrays in the file.
     """
     number = 8 if "weight_6" in arrays else 6
-    version = SHARED_FORMAT if number > 6 else FORMAT
-    header = load_header(path, arrays, "actuator net", version)
+    header = load_header(path, arrays, "actuator net", FORMATS[number])
     sizes: dict[str, int] = {}
     check_fields(path, header, NET_HEADER, sizes, prefix)
     sizes |= {"3 history": 3 * header["history"], "6 history": 6 * header["history"]}
