@@ -188,7 +188,8 @@ def check(
     fits = array.dtype.kind in codes
     if array.dtype == object:
         fits = all(type(x) in types for x in array.flat)
-    if fits := fits and array.ndim == len(field.shape):
+    fits = fits and array.ndim == len(field.shape)
+    if fits:
         pairs = zip(field.shape, array.shape, strict=True)
         shape = [sizes.setdefault(k, size) if isinstance(k, str) else k for k, size in pairs]
         fits = array.shape == tuple(shape)
