@@ -28,9 +28,8 @@ VERDICTS = {True: "holds", False: "does not hold", None: "not measured"}
 
 
 def name_of(node: ast.AST) -> str | None:
-    """The name that a statement defines."""
-    if isinstance(node, ast.Assign):
-        node = node.targets[0]
+    """The name that a statement defines: a function, class, field or constant."""
+    node = node.targets[0] if isinstance(node, ast.Assign) else getattr(node, "target", node)
     return getattr(node, "name", None) or getattr(node, "id", None)
 
 

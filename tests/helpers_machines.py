@@ -21,62 +21,6 @@ class Idle:
         return np.zeros(measured.q.shape), None
 
 
-def small_net(machine, rng, joints=()):
-    """Nets with random weights for `joints` (none: the driven ones): all inputs matter."""
-    joints = joints or tuple(machine.names[i] for i in machine.driven)
-    index = [machine.names.index(name) for name in joints]
-    n, inputs = len(joints), 3 * machine.history
-    middle = (machine.column("q_min") + machine.column("q_max"))[index] / 2
-    fastest = machine.q_dot_max[index]
-    mean, scale = np.zeros((n, 3, machine.history)), np.ones((n, 3, machine.history))
-    mean[:, 0], scale[:, 0] = middle[:, None], 0.5
-    scale[:, 1], scale[:, 2] = 0.2, 0.4
-    weights = (
-        rng.standard_normal((n, inputs, 32)) / inputs**0.5,
-        0.1 * rng.standard_normal((n, 32)),
-        rng.standard_normal((n, 32, 32)) / 32**0.5,
-        0.1 * rng.standard_normal((n, 32)),
-        rng.standard_normal((n, 32, 1)) / 4,
-        0.1 * rng.standard_normal((n, 1)),
-    )
-    return ActuatorNet(
-        joints=joints,
-        history=machine.history,
-        rate=machine.rate,
-        velocity_samples=machine.velocity_samples,
-        velocity_logged=False,
-        machine=machine.name,
-        seed=0,
-        settings={},
-        input_mean=mean.reshape(n, inputs).astype(np.float32),
-        input_scale=scale.reshape(n, inputs).astype(np.float32),
-        output_low=(-1.1 * fastest).astype(np.float32),
-        output_high=(1.2 * fastest).astype(np.float32),
-        q_low=machine.column("q_min")[index].astype(np.float32),
-        q_high=machine.column("q_max")[index].astype(np.float32),
-        weights=tuple(weight.astype(np.float32) for weight in weights),
-    )
-
-
-def obedient_net(machine):
-    """Nets whose velocity depends on the newest command alone, see `obedient_velocity`."""
-    net = small_net(machine, np.random.default_rng(0))
-    weights = [np.zeros_like(weight) for weight in net.weights]
-    weights[0][:, -1, 0], weights[1][:, 0] = 1.0, 2.0  # u + 2, never cut by the ReLU
-    weights[2][:, 0, 0] = 1.0
-    weights[4][:, 0, 0], weights[5][:, 0] = GAIN, -2.0 * GAIN
-    scale, mean = np.ones_like(net.input_scale), np.zeros_like(net.input_mean)
-    return replace(
-        net, weights=tuple(weights), input_mean=mean, input_scale=scale, output_low=-net.output_high
-    )
-
-
-def obedient_velocity(machine, u):
-    """What `obedient_net` says for commands `u` (..., n_driven), worked out by hand."""
-    fastest = 1.2 * machine.q_dot_max[machine.driven]
-    return fastest * (2 / (1 + np.exp(-GAIN * np.asarray(u, float))) - 1)
-
-
 def random_net(seed=0, n=3, history=13, hidden=32):
     rng = np.random.default_rng(seed)
     inputs = 3 * history
@@ -104,6 +48,52 @@ def random_net(seed=0, n=3, history=13, hidden=32):
             draw(n, hidden, 1), draw(n, 1),
         ),
     )  # fmt: skip
+
+
+def small_net(machine, rng, joints=()):
+    """`random_net` of `joints` of a machine (none: the driven ones): all inputs matter."""
+    joints = joints or tuple(machine.names[i] for i in machine.driven)
+    index = [machine.names.index(name) for name in joints]
+    low, high = (machine.column(name)[index].astype(np.float32) for name in ("q_min", "q_max"))
+    fastest = machine.q_dot_max[index].astype(np.float32)
+    net = random_net(rng, len(joints), machine.history)
+    mean, scale = np.zeros((2, len(joints), 3, machine.history), np.float32)
+    mean[:, 0] = (low + high)[:, None] / 2
+    scale[:] = [[0.5], [0.2], [0.4]]
+    return replace(
+        net,
+        joints=joints,
+        rate=machine.rate,
+        velocity_samples=machine.velocity_samples,
+        machine=machine.name,
+        seed=0,
+        settings={},
+        input_mean=mean.reshape(net.input_mean.shape),
+        input_scale=scale.reshape(net.input_scale.shape),
+        output_low=np.float32(-1.1) * fastest,
+        output_high=np.float32(1.2) * fastest,
+        q_low=low,
+        q_high=high,
+    )
+
+
+def obedient_net(machine):
+    """Nets whose velocity depends on the newest command alone, see `obedient_velocity`."""
+    net = small_net(machine, np.random.default_rng(0))
+    weights = [np.zeros_like(weight) for weight in net.weights]
+    weights[0][:, -1, 0], weights[1][:, 0] = 1.0, 2.0  # u + 2, never cut by the ReLU
+    weights[2][:, 0, 0] = 1.0
+    weights[4][:, 0, 0], weights[5][:, 0] = GAIN, -2.0 * GAIN
+    scale, mean = np.ones_like(net.input_scale), np.zeros_like(net.input_mean)
+    return replace(
+        net, weights=tuple(weights), input_mean=mean, input_scale=scale, output_low=-net.output_high
+    )
+
+
+def obedient_velocity(machine, u):
+    """What `obedient_net` says for commands `u` (..., n_driven), worked out by hand."""
+    fastest = 1.2 * machine.q_dot_max[machine.driven]
+    return fastest * (2 / (1 + np.exp(-GAIN * np.asarray(u, float))) - 1)
 
 
 def shared_net(latents=2):

@@ -1,4 +1,4 @@
-"""The layout of the package: sizes, imports that run one way, words that are no names."""
+"""The layout of the package: sizes, imports that run one way."""
 
 from __future__ import annotations
 
@@ -18,30 +18,6 @@ BYTES = {"can.canopen", "can.connection", "can.safety_gate"}  # what hw.py may i
 MODULES = sorted(PACKAGE.rglob("*.py"))
 TREES = {path: ast.parse(path.read_text()) for path in MODULES}
 
-# Names of the first edition that mean nothing outside it.
-PRIVATE = set(
-    re.findall(
-        r"\S+",
-        """
-        way ways bends tilts rises joint_rates damped_rates push_lag told sensed look RAMP
-        Outcome rest_state fitting_nets push_measured push_motion valve_scale FINE STILL STAND
-        far far_ends LEG Tape hover by_tool by_velocity tails out_of_step identity_of SteadyMap
-        winding Mover judge trust apart said Effort supply_demand whole_counts wishes Wish Jog
-        Hands Line hear note spoken wrong pace KEPT PUSH held_back _rehearse asked Known looks
-        weakest Mailbox MOODS need
-        """,
-    )
-)
-PRIVATE_MODULES = set(
-    re.findall(
-        r"\S+",
-        """
-        plant observation extras scores trust environments adjoint mpc chain gate bus wishes
-        simulator blackbox ticks looks view remote variations experiments
-        """,
-    )
-)
-
 
 def name_of(path: Path) -> str:
     return ".".join(path.relative_to(PACKAGE).with_suffix("").parts)
@@ -56,14 +32,8 @@ def imports(path: Path) -> set[str]:
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
-            names = {f"{node.module}.{alias.name}" for alias in node.names}
-            found |= names if node.module.count(".") < 2 else {node.module}
-    parts = (name.removeprefix("brokk_min.") for name in found if name.startswith("brokk_min."))
-    return {part for part in parts if (PACKAGE / f"{part.replace('.', '/')}.py").exists()} | {
-        part.rpartition(".")[0]
-        for part in parts
-        if (PACKAGE / f"{part.rpartition('.')[0].replace('.', '/')}.py").exists()
-    }
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return found & {f"brokk_min.{name_of(module)}" for module in MODULES}
 
 
 @pytest.mark.parametrize("path", MODULES, ids=name_of)
@@ -71,12 +41,11 @@ def test_imports__run_one_way(path):
     """Method files know one another, hw.py the bytes and the gate, wings the wings above them."""
     wing = path.parent.name if path.parent != PACKAGE else ""
     for module in imports(path):
+        module = module.removeprefix("brokk_min.")
         other = module.split(".")[0]
         if wing:
             assert other not in WINGS or WINGS.index(other) <= WINGS.index(wing), module
-        elif path.stem == "__main__":
-            continue
-        else:
+        elif path.stem != "__main__":
             assert other in METHOD or (path.stem == "hw" and module in BYTES), module
 
 
@@ -112,15 +81,6 @@ def test_functions__of_the_method_have_at_most_25_lines_of_code(name):
             body = range(node.body[0].lineno, (node.end_lineno or 0) + 1)
             size = len(code & set(body))
             assert size <= 25, f"{name}.{node.name}: {size}"
-
-
-@pytest.mark.parametrize("path", MODULES, ids=name_of)
-def test_names__are_words_of_the_field(path):
-    defined = [n for n in ast.walk(TREES[path]) if isinstance(n, ast.FunctionDef | ast.ClassDef)]
-    assert not {node.name for node in defined} & PRIVATE
-    assert path.stem not in PRIVATE_MODULES
-    arguments = [n.arg for n in ast.walk(TREES[path]) if isinstance(n, ast.arg)]
-    assert not set(arguments) & PRIVATE
 
 
 def test_glossary__has_at_most_25_entries():

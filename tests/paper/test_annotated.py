@@ -58,15 +58,3 @@ def test_formulas__survive_markdown() -> None:
         assert not re.search(r"\\[^A-Za-z ]|\*", formula), formula
         MathTextParser("path").parse(f"${formula}$")  # ValueError: no formula
     assert not re.search(r"[^\n]\n\$\$|\$\$\n[^\n]", PAGE)  # a paragraph of its own
-
-
-@pytest.mark.parametrize(
-    "page", [*sorted(DOCS.glob("*.md")), ROOT / "README.md"], ids=lambda p: p.name
-)
-def test_anchors__are_headings_of_their_page(page: Path) -> None:
-    """As GitHub makes them: lower case, without punctuation, hyphens for spaces."""
-    for target, anchor in re.findall(r"\]\(([\w./]*\.md)?#([^)]+)\)", page.read_text()):
-        text = (page.parent / target).read_text() if target else page.read_text()
-        headings = re.findall(r"^#+ (.*)$", text, re.M)
-        slugs = [re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings]
-        assert slugs.count(anchor) == 1, (target, anchor)

@@ -60,12 +60,20 @@ def test_pages__have_lines_of_at_most_100_columns(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_links__resolve(name: str) -> None:
+    """Anchors are as GitHub makes them: lower case, without punctuation, hyphens for spaces."""
     page = ROOT / name
     text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.M | re.S)
-    targets = re.findall(r"\]\(([^)#\s]+)[^)]*\)", text)
-    targets += re.findall(r"^\[[^]]+\]: ([^#\s]+)", text, re.M)
-    missing = [t for t in targets if "://" not in t and not (page.parent / t).exists()]
-    assert not missing
+    targets = re.findall(r"\]\(([^)#\s]*)#?([^)\s]*)\)", text)
+    targets += re.findall(r"^\[[^]]+\]: ([^#\s]+)()", text, re.M)
+    for target, anchor in targets:
+        if "://" in target:
+            continue
+        path = page.parent / target if target else page
+        assert path.exists(), target
+        if anchor and path.suffix == ".md":
+            headings = re.findall(r"^#+ (.*)$", path.read_text(), re.M)
+            slugs = [re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings]
+            assert slugs.count(anchor) == 1, (target, anchor)
 
 
 def test_readme__examples_run() -> None:

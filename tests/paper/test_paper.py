@@ -8,6 +8,7 @@ from __future__ import annotations
 import ast
 import inspect
 import re
+import runpy
 from collections.abc import Iterator
 from functools import cache
 from itertools import pairwise
@@ -16,6 +17,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
+MAKER = runpy.run_path(str(ROOT / "docs" / "annotated.py"))
+definition, name_of = MAKER["definition"], MAKER["name_of"]
 PAGE = ROOT / "PAPER.md"
 PAPER, LINKS = PAGE.read_text().split(
     "<!-- links: written by `python tests/paper/test_paper.py` -->\n"
@@ -58,58 +61,32 @@ def parsed(path: Path) -> ast.Module:
     return ast.parse(path.read_text())
 
 
-def name_of(node: ast.stmt) -> str | None:
-    """The name that a statement defines: a function, class, field or constant."""
-    if isinstance(node, ast.FunctionDef | ast.ClassDef):
-        return node.name
-    target = node.targets[0] if isinstance(node, ast.Assign) else getattr(node, "target", None)
-    return target.id if isinstance(target, ast.Name) else None
-
-
-def place_of_code(symbol: str) -> str:
-    """`path#L12` of a symbol `module` or `module.name.name` of the package."""
-    module, *names = symbol.split(".")
-    paths = list((ROOT / "brokk_min").rglob(f"{module}.py"))
-    if len(paths) != 1:
-        raise ValueError(f"{symbol}: expected one module {module}, got {paths}")
-    node: ast.Module | ast.ClassDef = parsed(paths[0])
-    place = paths[0].relative_to(ROOT).as_posix()
-    for name in names:
-        found = [part for part in node.body if name_of(part) == name]
-        if not found:
-            raise ValueError(f"{symbol}: expected {name} in {place}, got none")
-        node = found[-1]  # type: ignore[assignment]
-    return f"{place}#L{node.lineno if names else 1}"  # a module: its docstring
-
-
 @cache
-def all_tests() -> dict[str, list[Path]]:
-    """Files of each test function of the suite."""
-    found: dict[str, list[Path]] = {}
+def all_tests() -> dict[str, list[tuple[Path, int]]]:
+    """Files and lines of each test function of the suite."""
+    found: dict[str, list[tuple[Path, int]]] = {}
     for path in sorted((ROOT / "tests").rglob("test_*.py")):
         for node in parsed(path).body:
             if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
-                found.setdefault(node.name, []).append(path)
+                found.setdefault(node.name, []).append((path, node.lineno))
     return found
 
 
-def file_of_test(name: str) -> Path:
-    paths = all_tests().get(name, [])
-    if len(paths) != 1:
-        raise ValueError(f"{name}: expected one test of this name, got {paths}")
-    return paths[0]
-
-
-def place_of_test(name: str) -> str:
-    path = file_of_test(name)
-    line = next(node.lineno for node in parsed(path).body if name_of(node) == name)
-    return f"{path.relative_to(ROOT).as_posix()}#L{line}"
+def place_of(label: str) -> tuple[Path, int]:
+    """File and line of a test, or of `module` or `module.name.name` of the package."""
+    if not label.startswith("test_"):
+        path, node = definition(label)
+        return path, getattr(node, "lineno", 1)  # a module: its docstring
+    places = all_tests().get(label, [])
+    if len(places) != 1:
+        raise ValueError(f"{label}: expected one test of this name, got {places}")
+    return places[0]
 
 
 def link(label: str) -> str:
     """The definition of a link of the page."""
-    place = place_of_test(label) if label.startswith("test_") else place_of_code(label)
-    return f"[`{label}`]: {place}"
+    path, line = place_of(label)
+    return f"[`{label}`]: {path.relative_to(ROOT).as_posix()}#L{line}"
 
 
 LABELS = sorted(set(labels(PAPER)))
@@ -251,7 +228,7 @@ def names_used(path: Path, test: str) -> set[str]:
 
 @pytest.mark.parametrize(("code", "test"), [row[:2] for row in ROWS if labels(row[1])])
 def test_tests__use_the_code_of_their_row(code: str, test: str) -> None:
-    used = set().union(*(names_used(file_of_test(name), name) for name in labels(test)))
+    used = set().union(*(names_used(place_of(name)[0], name) for name in labels(test)))
     missing = {symbol for symbol in labels(code) if symbol.rpartition(".")[2] not in used}
     assert not missing, f"{test} do not use {missing}"
 
