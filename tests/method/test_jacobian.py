@@ -139,9 +139,10 @@ def controller(w0=1e-6, k=0.1, machine: Machine = BROKK_170, **gains) -> Jacobia
     return JacobianController(machine, Gains(**arrays), k, w0)
 
 
-def opened(opening: np.ndarray) -> np.ndarray:
+def opened(opening: np.ndarray, up: float = 0.07, down: float = 0.07) -> np.ndarray:
     """Commands by hand: dead zone, then the opening, in whole counts; below half a count closed."""
-    counts = np.rint(127 * np.sign(opening) * (0.07 + 0.93 * np.abs(opening)))
+    zone = np.where(opening > 0, up, down)
+    counts = np.rint(127 * np.sign(opening) * (zone + (1 - zone) * np.abs(opening)))
     return np.where(np.abs(opening) < 0.5 / 127, 0, counts) / 127
 
 
@@ -306,9 +307,8 @@ def test_controller__opens_each_valve_beyond_its_own_dead_zone():
     c = controller(machine=machine, kp=1.5)
     u, _ = c(measured(POSE, GOAL, machine=machine), c.start(1))
     opening = 1.5 * np.linalg.pinv(J) @ GOAL
-    assert (opening > 0.01).any() and (opening < -0.01).any()
-    expected = np.where(opening > 0, 0.1 + 0.9 * opening, -0.2 + 0.8 * opening)
-    np.testing.assert_allclose(u[0, DRIVEN], np.rint(127 * expected) / 127, atol=1e-9)
+    assert opening.min() < -0.01 < 0.01 < opening.max()
+    np.testing.assert_allclose(u[0, DRIVEN], opened(opening, 0.1, 0.2), atol=1e-9)
 
 
 def test_controller__of_a_batch_is_that_of_its_rows():

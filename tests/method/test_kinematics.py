@@ -14,7 +14,6 @@ from scipy.linalg import expm
 from strategies import posed, poses, reals
 
 from brokk_min.kinematics import (
-    cross,
     estimate_velocity,
     forward_kinematics,
     jacobian,
@@ -63,11 +62,6 @@ def test_to_heading__by_hand():
     np.testing.assert_allclose(to_heading(np.array([0.0, 2.0, 1.0]), v), [2, -1, 3], atol=1e-12)
     np.testing.assert_allclose(to_heading(np.array([-3.0, 0, 0]), v), [-1, -2, 3], atol=1e-12)
     assert np.isfinite(to_heading(np.zeros(3), v)).all()
-
-
-def test_cross__is_numpys():
-    a, b = np.random.default_rng(0).normal(size=(2, 4, 5, 3))
-    np.testing.assert_allclose(cross(a, b), np.cross(a, b), atol=1e-14)
 
 
 @given(poses(BROKK_170, (20,)))
@@ -140,15 +134,8 @@ def test_forward_kinematics__refuses_angles_of_another_machine(shape):
 # --- velocity of joints ---------------------------------------------------------------------------
 
 
-@given(
-    st.integers(2, 8).flatmap(
-        lambda samples: st.tuples(
-            st.just(samples), npst.arrays(np.float64, (3, samples + 4), elements=reals(-3, 3))
-        )
-    )
-)
-def test_velocity_is_the_least_squares_slope_and_forgets_what_is_older(case):
-    samples, q = case
+@given(st.integers(2, 8), npst.arrays(np.float64, (3, 12), elements=reals(-3, 3)))
+def test_velocity_is_the_least_squares_slope_and_forgets_what_is_older(samples, q):
     q.setflags(write=False)
     velocity = estimate_velocity(q, samples, 0.05)
     time = 0.05 * np.arange(samples)
