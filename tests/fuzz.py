@@ -54,6 +54,7 @@ MEMORY = 2**30  # bytes
 SECONDS = 10
 REMOVED = object()
 NESTED = "nested a thousand deep"
+NUMBERS = ("float", "number", "whole number")  # kinds of fields
 SHIPPED_POLICY = SHIPPED / "brokk170" / "policy.npz"
 Content = dict[str, Any]
 Place = tuple[Any, ...]
@@ -98,7 +99,7 @@ def encode_csv(content: Content) -> bytes:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(content)
-    writer.writerows(zip(*(np.ravel(column).tolist() for column in content.values())))
+    writer.writerows(zip(*(np.array(column, object).tolist() for column in content.values())))
     return text.getvalue().encode()
 
 
@@ -132,41 +133,15 @@ def places(table: Any, content: Any, within: Place = ()) -> dict[Place, Field]:
     return found
 
 
-def columns(rows: int) -> Content:
-    rng = np.random.default_rng(0)
-    numbers = {name: rng.uniform(-0.5, 0.5, rows) for name in ("u_a", "q_a", "q_dot_a")}
-    return {"run": np.array(["x"] * rows), "time": np.arange(rows) / 20, **numbers}
-
-
-def column_fields(content: Content) -> dict[Place, Field]:
-    prefixes = ("run", "time", "u_", "q_dot_", "q_")
-    found = {(n,): next(formats.LOG[p] for p in prefixes if n.startswith(p)) for n in content}
-    return found | {("q_dot_a",): replace(formats.LOG["q_dot_"], required=False)}
-
-
-def gains(net: Any) -> Content:
-    known = baselines(BROKK_170, net)
-    return {"meta": gains_metadata(BROKK_170, net), "gains": gains_table(known)}
-
-
-def sweep() -> Content:
-    mean = {"mean": 0.1, "low": 0.05, "high": 0.15}
-    row = {"velocity_error_all": mean, "off_axis_drift_max": mean, "valve_travel": mean}
-    return {"meta": {"machine": "m", "actuator": "a"}, "table": {"rl": row, "pid": row}}
-
-
-def runs(policy: Path) -> Content:
-    numbers = dict.fromkeys(("velocity_rmse", "velocity_error_mean", "jerk_rms"), 0.1)
-    numbers |= dict.fromkeys(("off_axis_drift_max", "valve_travel"), 0.2)
-    row = {"controller": "rl", "sequence": "x", "start": 0, "kind": "workspace", **numbers}
-    meta = {"machine": "brokk170", "seed": 0, "plant": "analytic", "starts": "2"}
-    return {"meta": meta | {"policy": str(policy)}, "starts": [BROKK_170.q_start], "runs": [row]}
-
-
-def member() -> Content:
-    errors = {"error": {"rl": 0.1, "pid": 0.2}, "free_run": {"q1": 0.1}}
-    numbers = {"on_nets": {"rl": 0.1}, "loaded": {"rl": 0.2}, "best": {"rl": "pid"}, "dither": 0.03}
-    return {"seed": 0, "budget": asdict(QUICK), **errors, **numbers}
+def described(
+    name: str,
+    content: Content,
+    encode: Callable[[Content], bytes],
+    read: Callable[[Path], object],
+    table: Any,
+) -> Format:
+    """A format whose fields a table describes."""
+    return Format(name, content, encode, read, places(table, content))
 
 
 def checkpoint(folder: Path) -> tuple[Content, Callable[[Path], object]]:
@@ -208,68 +183,86 @@ def encode_machine(content: Content) -> bytes:
     return f"{MACHINE}M = replace(BROKK_170, {values.replace(repr(NESTED), '[3]')})\n".encode()
 
 
+def nets_and_policies() -> Iterator[Format]:
+    """Files of weights."""
+    table: dict[str, Any] = {"header": formats.NET_HEADER, **formats.NET_ARRAYS}
+    for name, net in {"net.npz": random_net(), "shared.npz": shared_net()}.items():
+        arrays = net_arrays(net)
+        arrays["header"] = json.loads(str(arrays["header"]))
+        yield described(name, arrays, encode_npz, load_net, table)
+    table = {"header": formats.POLICY_HEADER, **formats.POLICY_ARRAYS}
+    table |= {f"net_{name}": field for name, field in formats.NET_ARRAYS.items() if field.required}
+    read = partial(load_policy, machine=BROKK_170)
+    yield described("policy.npz", decode_npz(SHIPPED_POLICY), encode_npz, read, table)
+
+
+def tables() -> Iterator[Format]:
+    """Files of columns."""
+    rng = np.random.default_rng(0)
+    log = {"run": np.array(["x"] * 30), "time": np.arange(30) / 20}
+    log |= {name: rng.uniform(-0.5, 0.5, 30) for name in ("u_a", "q_a", "q_dot_a")}
+    table = {name: formats.LOG[name.removesuffix("a")] for name in log}
+    table["q_dot_a"] = replace(table["q_dot_a"], required=False)
+    for name, encode in {"log.csv": encode_csv, "log.npz": encode_npz}.items():
+        yield described(name, log, encode, lambda path: read_log([path], 4), table)
+    goals = {"sequence": ["up"] * 3, "time": [0.0, 1.0, 2.0]} | {f"v{x}": [0.1] * 3 for x in "xyz"}
+    read = partial(read_commands, machine=BROKK_170)
+    yield described("c.csv", goals, encode_csv, read, formats.COMMANDS)
+    poses = {name: [q] * 3 for name, q in zip(BROKK_170.names, BROKK_170.q_start, strict=True)}
+    read = partial(read_starts, machine=BROKK_170)
+    yield described("s.csv", poses, encode_csv, read, formats.starts_of(BROKK_170))
+    texts = {"when": ["now"] * 3, "task": ["box"] * 3, "mode": ["rl"] * 3}
+    tried = texts | {name: [1.0, 2.0, 3.0] for name in Attempt._fields[3:]}
+    kinds = {name: "text" if name in texts else "number" for name in tried}
+    table = {name: Field(kind, shape=("rows",)) for name, kind in kinds.items()}
+    yield described("attempts.csv", tried, encode_csv, read_attempts, table)
+
+
+def results() -> Iterator[Format]:
+    """Files of JSON."""
+    net = load_policy(SHIPPED_POLICY, BROKK_170).net
+    known = baselines(BROKK_170, net)
+    gains = {"meta": gains_metadata(BROKK_170, net), "gains": gains_table(known)}
+    table: Any = {"meta": formats.META, "gains": {"*": formats.GAINS}}
+    read: Any = partial(read_gains, machine=BROKK_170, net=net)
+    yield described("gains.json", gains, encode_json, read, table)
+    mean = {"mean": 0.1, "low": 0.05, "high": 0.15}
+    row: Any = dict.fromkeys(("velocity_error_all", "off_axis_drift_max", "valve_travel"), mean)
+    sweep = {"meta": {"machine": "m", "actuator": "a"}, "table": {"rl": row, "pid": row}}
+    yield described("sweep.json", sweep, encode_json, read_seeds, formats.SWEEP)
+    row = {"controller": "rl", "sequence": "x", "start": 0, "kind": "workspace"}
+    row |= dict.fromkeys(("velocity_rmse", "velocity_error_mean", "jerk_rms"), 0.1)
+    row |= dict.fromkeys(("off_axis_drift_max", "valve_travel"), 0.2)
+    meta = {"machine": "brokk170", "seed": 0, "plant": "analytic", "starts": "2"}
+    meta["policy"] = str(SHIPPED_POLICY)
+    runs = {"meta": meta, "starts": [BROKK_170.q_start], "runs": [row]}
+    read = partial(read_results, BROKK_170, controllers=["rl"])
+    yield described("runs.json", runs, encode_json, read, formats.RESULTS)
+    task = (BROKK_170, net, TaskConfig(), PPOConfig())
+    scored = {"starts": 2, "sequences": [one.name for one in task_sequences(BROKK_170)]}
+    seed = {"identity": describe_training(*task, False, 0) | scored, "runs": [row]}
+    read = lambda path: run_seed(*task, False, path.parent, 2, 0)  # noqa: E731
+    yield described("seed_0.json", seed, encode_json, read, formats.RUNS)
+    member = {"seed": 0, "budget": asdict(QUICK), "free_run": {"q1": 0.1}, "dither": 0.03}
+    member |= {"error": {"rl": 0.1, "pid": 0.2}, "best": {"rl": "pid"}}
+    member |= {"on_nets": {"rl": 0.1}, "loaded": {"rl": 0.2}}
+    read = lambda path: run_member(BROKK_170, 0, path.parent, QUICK)  # noqa: E731
+    yield described("member.json", member, encode_json, read, formats.FAMILY_MEMBER)
+
+
 def all_formats(folder: Path) -> Iterator[Format]:
     """Every format with a good content."""
-    net = load_policy(SHIPPED_POLICY, BROKK_170).net
-    for name, made in {"net.npz": random_net(), "shared.npz": shared_net()}.items():
-        arrays = net_arrays(made)
-        arrays["header"] = json.loads(str(arrays["header"]))
-        found = places({"header": formats.NET_HEADER, **formats.NET_ARRAYS}, arrays)
-        yield Format(name, arrays, encode_npz, load_net, found)
-    policy = decode_npz(SHIPPED_POLICY)
-    found = places({"header": formats.POLICY_HEADER, **formats.POLICY_ARRAYS}, policy)
-    required = {name: field for name, field in formats.NET_ARRAYS.items() if field.required}
-    found |= {(f"net_{name}",): field for name, field in required.items()}
-    yield Format("policy.npz", policy, encode_npz, partial(load_policy, machine=BROKK_170), found)
-    read = lambda path: read_log([path], 4, ["a"] if "q_dot" in path.name else None)  # noqa: E731
-    log = columns(30)
-    yield Format("log.csv", log, encode_csv, read, column_fields(log))
-    yield Format("log.npz", log, encode_npz, read, column_fields(log))
-    table = gains(net)
-    read = partial(read_gains, machine=BROKK_170, net=net)
-    yield Format(
-        "gains.json",
-        table,
-        encode_json,
-        read,
-        places({"meta": formats.META, "gains": {"*": formats.GAINS}}, table),
-    )
-    yield Format("sweep.json", sweep(), encode_json, read_seeds, places(formats.SWEEP, sweep()))
-    goals = {"sequence": ["up"] * 3, "time": [0.0, 1.0, 2.0]} | {f"v{x}": [0.1] * 3 for x in "xyz"}
-    commands = partial(read_commands, machine=BROKK_170)
-    yield Format("c.csv", goals, encode_csv, commands, places(formats.COMMANDS, goals))
-    poses = {name: [q] * 3 for name, q in zip(BROKK_170.names, BROKK_170.q_start, strict=True)}
-    starts = formats.starts_of(BROKK_170)
-    read = partial(read_starts, machine=BROKK_170)
-    yield Format("s.csv", poses, encode_csv, read, places(starts, poses))
-    tried = {"when": ["now"] * 3, "task": ["box"] * 3, "mode": ["rl"] * 3}
-    tried |= {name: [1.0, 2.0, 3.0] for name in Attempt._fields[3:]}
-    text, number = (Field(kind, shape=("rows",)) for kind in ("text", "number"))
-    found = {(name,): text if name in ("when", "task", "mode") else number for name in tried}
-    yield Format("attempts.csv", tried, encode_csv, read_attempts, found)
-    results = runs(SHIPPED_POLICY)
-    read = partial(read_results, BROKK_170, controllers=["rl"])
-    yield Format("runs.json", results, encode_json, read, places(formats.RESULTS, results))
-    known = (BROKK_170, net, TaskConfig(), PPOConfig())
-    scored = {"starts": 2, "sequences": [one.name for one in task_sequences(BROKK_170)]}
-    identity = describe_training(*known, False, 0) | scored
-    seed = {"identity": identity, "runs": results["runs"]}
-    read = lambda path: run_seed(*known, False, path.parent, 2, 0)  # noqa: E731
-    yield Format("seed_0.json", seed, encode_json, read, places(formats.RUNS, seed))
-    made = member()
-    read = lambda path: run_member(BROKK_170, 0, path.parent, QUICK)  # noqa: E731
-    yield Format("member.json", made, encode_json, read, places(formats.FAMILY_MEMBER, made))
+    yield from (*nets_and_policies(), *tables(), *results())
     content, load = checkpoint(folder)
     yield Format("policy.npz.checkpoint", content, encode_torch, load, leaves(content))
     frames = {str(i): f"({i}.5) can0 18{i}#0001020304" for i in range(1, 9)}
-    drive = lambda path: list(read_frames(path))  # noqa: E731
     encode = lambda content: "".join(f"{line}\n" for line in content.values()).encode()  # noqa: E731
-    yield Format("drive.log", frames, encode, drive, {})
+    yield Format("drive.log", frames, encode, lambda path: list(read_frames(path)), {})
     numbers = [f for f in fields(Machine) if "unit" in f.metadata]
-    found = {(f.name,): Field("float", f.metadata["low"], f.metadata["high"]) for f in numbers}
+    table = {f.name: Field("float", f.metadata["low"], f.metadata["high"]) for f in numbers}
     values = {f.name: getattr(BROKK_170, f.name) for f in numbers}
     find = lambda path: find_machine(f"{path}:M")  # noqa: E731
-    yield Format("machine.py", values, encode_machine, find, found)
+    yield described("machine.py", values, encode_machine, find, table)
 
 
 # --- changes --------------------------------------------------------------------------------------
@@ -288,74 +281,77 @@ def with_value(content: Content, place: Place, value: Any) -> Content:
     return result
 
 
+def bad_numbers(
+    array: np.ndarray, field: Field, rng: np.random.Generator
+) -> Iterator[tuple[str, np.ndarray]]:
+    """Arrays with one number that is not finite or out of the range."""
+    low, high = float(field.low), float(field.high)
+    for bad in (np.nan, np.inf, -np.inf, low - 1, high + 1 + abs(high)):
+        if not np.isfinite(bad) or np.isfinite([low, high]).all():
+            changed = array.astype(float)
+            changed[tuple(rng.integers(array.shape))] = bad
+            yield f"set to {bad}", changed
+
+
+def bad_columns(column: Any, field: Field, rng: np.random.Generator) -> Iterator[tuple[str, Any]]:
+    """Columns of a CSV, whose cells are all text."""
+    *first, last = np.array(column).tolist()
+    if field.kind in NUMBERS:
+        yield "retyped to text", [*first, "a"]
+        yield "retyped to complex", np.zeros(len(column), complex)
+        yield from bad_numbers(np.array(column), field, rng)
+    if field.kind in NUMBERS or field.low > 0:
+        yield "cut", [*first, ""]
+    if field.unique:
+        yield "repeated", [last, *first[1:], last]
+
+
+def bad_arrays(array: Any, field: Field, rng: np.random.Generator) -> Iterator[tuple[str, Any]]:
+    """Arrays of NumPy."""
+    other = np.zeros(array.shape) if field.kind == "text" else array.astype(str)
+    yield "retyped to text", other
+    yield "retyped to complex", np.zeros(array.shape, complex)
+    yield "retyped to objects", array.astype(object)
+    yield "reshaped", array[None]
+    yield "cut", array[:-1]
+    if field.kind in NUMBERS:
+        yield from bad_numbers(array, field, rng)
+
+
+def bad_tensors(value: Any, field: Field, rng: np.random.Generator) -> Iterator[tuple[str, Any]]:
+    """Tensors of a checkpoint."""
+    yield from {"retyped": "a", "reshaped": value[None], "nested": [[[]]]}.items()
+    if field.kind == "float":
+        yield "infinite", torch.full_like(value, rng.choice([np.nan, np.inf, -np.inf]))
+
+
 def bad_values(value: Any, field: Field, rng: np.random.Generator) -> Iterator[tuple[str, Any]]:
-    """Values that the field must not have, by kind of change."""
-    if field.required:
-        yield "removed", REMOVED
-    if isinstance(value, torch.Tensor):
-        yield from {"retyped": "a", "reshaped": value[None], "nested": [[[]]]}.items()
-        if field.kind == "float":
-            yield "infinite", torch.full_like(value, rng.choice([np.nan, np.inf, -np.inf]))
-        return
-    array = np.array(value)
-    if isinstance(value, np.ndarray):
-        yield (
-            "retyped to text",
-            np.zeros(array.shape) if field.kind == "text" else array.astype(str),
-        )
-        yield "retyped to complex", np.zeros(array.shape, complex)
-        yield "retyped to objects", array.astype(object)
-        yield "reshaped", array[None]
-        yield "cut", array[:-1]
-    else:
-        other = (
-            "a"
-            if field.kind in ("float", "number", "whole number") or type(value) in (int, float)
-            else 3
-        )
-        yield "retyped", [other] * len(array) if field.shape == ("rows",) else other
-        if field.shape != ("rows",):
-            yield "nested", NESTED
-            yield "reshaped", [value]
-    if field.kind in ("float", "number", "whole number"):
-        low, high = float(field.low), float(field.high)
-        for bad in (np.nan, np.inf, -np.inf, low - 1, high + 1 + abs(high)):
-            if not np.isfinite(bad) or np.isfinite([low, high]).all():
-                changed = array.astype(float)
-                changed[tuple(rng.integers(array.shape))] = bad
-                yield (
-                    f"set to {bad}",
-                    changed if isinstance(value, np.ndarray) else changed.tolist(),
-                )
+    """Values of JSON and of Python."""
+    yield "retyped", "a" if field.kind in NUMBERS or type(value) in (int, float) else 3
+    yield "nested", NESTED
+    yield "reshaped", [value]
+    if field.kind in NUMBERS:
+        yield from ((label, x.tolist()) for label, x in bad_numbers(np.array(value), field, rng))
     if field.unique:
         yield "repeated", [value[0], *value[:-1]]
 
 
 def field_changes(form: Format, rng: np.random.Generator) -> Iterator[Change]:
     """Every field, changed in every way."""
+    kinds = {np.ndarray: bad_arrays, torch.Tensor: bad_tensors}
     for place, field in form.fields.items():
         value: Any = form.content
         for name in place:
             value = value[name]
-        if form.encode is encode_csv:
-            value = np.array(value)
-        for label, bad in bad_values(value, field, rng):
-            if form.encode is encode_csv and label in ("reshaped", "retyped to objects"):
-                continue
-            if form.encode is encode_csv and field.kind == "text" and "retyped" in label:
-                continue  # all cells of a CSV are text
-            if (field.kind, label) == ("text", "cut") and field.low <= 0:
-                continue  # it may be empty
-            if form.encode is encode_csv and label == "retyped to text":
-                bad = np.array([*value[:-1].tolist(), "a"], object)
+        bad = bad_columns if form.encode is encode_csv else kinds.get(type(value), bad_values)
+        changes = [*[("removed", REMOVED)] * field.required, *bad(value, field, rng)]
+        for label, other in changes:
             if form.encode is encode_machine and label in ("removed", "reshaped"):
                 continue
-            if form.encode is encode_csv and label == "cut":
-                bad = np.array([*value[:-1].tolist(), ""], object)
             word = place[-1][:2] if label == "removed" else place[-1]  # of a log: u_<joint>
             if label in ("cut", "reshaped", "nested") or form.encode is encode_torch:
                 word = ""
-            encode = partial(form.encode, with_value(form.content, place, bad))
+            encode = partial(form.encode, with_value(form.content, place, other))
             yield Change(f"{'.'.join(map(str, place))} {label}", encode, word)
 
 
