@@ -146,6 +146,18 @@ def opened(opening: np.ndarray, up: float = 0.07, down: float = 0.07) -> np.ndar
     return np.where(np.abs(opening) < 0.5 / 127, 0, counts) / 127
 
 
+def drive(
+    c: JacobianController, inputs: list[Measured], state: PIDState | None = None
+) -> tuple[np.ndarray, list[PIDState]]:
+    """Commands (ticks, n) of one controller, and its states, under one measurement a tick."""
+    sent, states = [], [state or c.start(1)]
+    for one in inputs:
+        u, state = c(one, states[-1])
+        sent.append(u[0])
+        states.append(state)
+    return np.array(sent), states[1:]
+
+
 def test_desired_velocities__are_eq3():
     """v_d + K (v_d - v_ee) by weighted least squares: an optimiser finds the same."""
     v_tool = np.array([0.01, 0.02, -0.03])
@@ -207,44 +219,31 @@ def test_controller__integral_and_derivative_by_hand():
     """Constant error e: the opening grows by ki e dt a tick; the derivative fades by 0.7 a tick."""
     still = measured(POSE, 0.3 * GOAL)
     e = np.linalg.pinv(J) @ (0.3 * GOAL)
-    c = controller(ki=2.0)
-    state = c.start(1)
-    for tick in range(6):
-        u, state = c(still, state)
-        np.testing.assert_allclose(state.integral[0], (tick + 1) * 2.0 * e * 0.05, rtol=2e-2)
-        assert tick or not u.any()  # nothing has been integrated before the first tick
-    c = controller(kd=0.1)
-    state = c.start(1)
-    derivatives = []
-    for _ in range(3):
-        u, state = c(still, state)
-        derivatives.append(state.derivative[0])
-        np.testing.assert_allclose(u[0, DRIVEN], opened(0.1 * derivatives[-1]), atol=1e-9)
+    u, states = drive(controller(ki=2.0), [still] * 6)
+    assert not u[0].any()  # nothing has been integrated before the first tick
+    for count, state in enumerate(states, 1):
+        np.testing.assert_allclose(state.integral[0], count * 2.0 * e * 0.05, rtol=2e-2)
+    u, states = drive(controller(kd=0.1), [still] * 3)
+    derivatives = np.array([state.derivative[0] for state in states])
+    np.testing.assert_allclose(u[:, DRIVEN], opened(0.1 * derivatives), atol=1e-9)
     np.testing.assert_allclose(derivatives[0], 0.3 * e * 20, rtol=1e-2)
     np.testing.assert_allclose(derivatives[2], 0.49 * derivatives[0], rtol=5e-2, atol=1e-3)
 
 
 def test_controller__integral_stops_while_the_valve_is_fully_open():
     """Anti-windup: with kp at once; without, once the integral fills the valve."""
-    c = controller(kp=40.0, ki=10.0)
-    state = c.start(1)
-    for _ in range(20):
-        u, state = c(measured(POSE, 5 * GOAL), state)
-    full = np.abs(u[0, DRIVEN]) > 79.5 / 127
-    assert full.any() and (state.integral[0, full] == 0).all()
+    fast = measured(POSE, 5 * GOAL)
+    u, states = drive(controller(kp=40.0, ki=10.0), [fast] * 20)
+    full = np.abs(u[-1, DRIVEN]) > 79.5 / 127
+    assert full.any() and (states[-1].integral[0, full] == 0).all()
     c = controller(ki=10.0)
-    state = c.start(1)
-    sizes = []
-    for _ in range(200):
-        _, state = c(measured(POSE, 5 * GOAL), state)
-        sizes.append(np.abs(state.integral).max())
+    _, states = drive(c, [fast] * 200)
+    sizes = [np.abs(state.integral).max() for state in states]
     limit = (80 / 127 - 0.07) / 0.93
     assert sizes[-1] == sizes[-50]
     assert limit <= sizes[-1] <= limit + 10 * 0.47 * 0.05
-    back = state
-    for _ in range(10):
-        _, back = c(measured(POSE, -5 * GOAL), back)
-    assert (np.abs(back.integral) < np.abs(state.integral)).all()
+    _, back = drive(c, [measured(POSE, -5 * GOAL)] * 10, states[-1])
+    assert (np.abs(back[-1].integral) < np.abs(states[-1].integral)).all()
 
 
 def test_controller__least_opening_while_the_tool_is_to_move():
@@ -267,20 +266,17 @@ def test_controller__least_opening_while_the_tool_is_to_move():
 
 def test_controller__closes_its_valves_half_a_second_after_the_stop():
     """The arm still moves: the PID brakes for ten ticks, then its integral stands."""
-    c = controller(kp=2.0, ki=5.0)
     drift = [0.05, 0.0, -0.05, 0.05, 0.05]
-    state = {valves: c.start(1) for valves in ("closed", "dither", "open")}
-    sent = {valves: [] for valves in state}
-    for v_goal in [GOAL, *[0 * GOAL] * 14]:
-        for valves, last in state.items():
-            of_class = replace(c, valves=valves)
-            u, state[valves] = of_class(measured(POSE, v_goal, drift), last)
-            sent[valves].append(u[0])
-    assert np.array(sent["closed"]).any(axis=1).tolist() == [True] * 11 + [False] * 4
-    assert np.array(sent["open"]).any(axis=1).all()
-    turning = np.rint(127 * np.array(sent["dither"])[3:, DRIVEN])  # counts: from 0.1 s on
-    assert (turning == 12 * (-1.0) ** np.arange(3, 15)[:, None]).all()
-    grown = np.abs(state["open"].integral - state["closed"].integral)
+    inputs = [measured(POSE, v_goal, drift) for v_goal in (GOAL, *[0 * GOAL] * 14)]
+    c = controller(kp=2.0, ki=5.0)
+    closed, of_closed = drive(c, inputs)
+    always, of_open = drive(replace(c, valves="open"), inputs)
+    turning, _ = drive(replace(c, valves="dither"), inputs)
+    assert closed.any(axis=1).tolist() == [True] * 11 + [False] * 4
+    assert always.any(axis=1).all()
+    counts = np.rint(127 * turning[3:, DRIVEN])  # from 0.1 s on
+    assert (counts == 12 * (-1.0) ** np.arange(3, 15)[:, None]).all()
+    grown = np.abs(of_open[-1].integral - of_closed[-1].integral)
     np.testing.assert_allclose(grown[0], 4 * 5.0 * 0.05 * 0.05, rtol=1e-2)
 
 
