@@ -9,21 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from benchmarks import (
-    deviations,
-    faults,
-    ladder,
-    limits,
-    neighbours,
-    peers,
-    rests,
-    seeds,
-    step_logs,
-)
+from benchmarks import deviations, faults, ladder, limits, neighbours, peers, rests, seeds
+from benchmarks.step_logs import DUTIES, make_logs
 from brokk_min import kinematics
 from brokk_min.env import action_to_pwm
 from brokk_min.evaluation import learn, metrics, sequences
-from brokk_min.evaluation.sequences import hold_table
 from brokk_min.identification.files import SHIPPED
 from brokk_min.identification.logs import read_log
 from brokk_min.identification.net_file import save_net
@@ -32,6 +22,8 @@ from brokk_min.learning.policy import load_policy
 from brokk_min.machine import BROKK_170
 from examples import gradients
 
+POLICY = load_policy(SHIPPED / BROKK_170.name / "policy.npz", BROKK_170)
+
 
 @pytest.mark.parametrize("learner", list(peers.LEARNERS))
 def test_race__trains_each_learner_and_notes_the_levels_it_reached(learner):
@@ -39,8 +31,7 @@ def test_race__trains_each_learner_and_notes_the_levels_it_reached(learner):
         pytest.importorskip("rl_games")
     options = peers.Options(runs=1, num_envs=16)
     targets = {"any": 9.0, "none": 0.0}
-    shipped = load_policy(peers.POLICY, BROKK_170)
-    row = peers.race(learner, shipped, (1e-3, 1024), 0, targets, options)
+    row = peers.race(learner, POLICY, (1e-3, 1024), 0, targets, options)
     assert (row["learner"], row["updates"], row["seed"]) == (learner, 2, 0)
     epochs = 2 if learner in ("ours", "critic") else peers.EPOCHS
     assert 0 < row["best"] < 1 and row["gradient_steps"] == 2 * epochs
@@ -120,8 +111,7 @@ def test_climb__trains_and_scores_a_policy(tmp_path, monkeypatch):
     """One step of the paper's agent; scored on the first 6 s of each sequence."""
     axes = sequences.shorten(BROKK_170, sequences.axis_sequences(BROKK_170), 6.0)
     monkeypatch.setattr(sequences, "axis_sequences", lambda machine: axes)
-    net = load_policy(SHIPPED / BROKK_170.name / "policy.npz", BROKK_170).net
-    save_net(tmp_path / "net_paper.npz", net)
+    save_net(tmp_path / "net_paper.npz", POLICY.net)
     name = "alone: gradients of the simulation, not a critic"
     error, drift, travel, jerk, closed = ladder.climb(tmp_path, name, 1, 0)
     assert 0.05 < error < 0.3 and 0 <= drift < 2 and travel >= 0 and jerk >= 0
@@ -137,9 +127,8 @@ def test_our_action__gives_the_command_of_a_linear_one(action):
 @pytest.mark.parametrize(("name", "paper"), [(LAST, False), (FIRST, True)])
 def test_mixed_env__is_the_task_of_the_package_at_both_ends(name, paper):
     """Same seed, same actions: observations, rewards and ends agree."""
-    net = load_policy(SHIPPED / BROKK_170.name / "policy.npz", BROKK_170).net
-    mixed = ladder.MixedEnv(net, ladder.RUNGS[name], 8)
-    whole = TaskVectorEnv(8, net, BROKK_170, ladder.PAPER if paper else None)
+    mixed = ladder.MixedEnv(POLICY.net, ladder.RUNGS[name], 8)
+    whole = TaskVectorEnv(8, POLICY.net, BROKK_170, ladder.PAPER if paper else None)
     rng = np.random.default_rng(0)
     assert mixed.reset(seed=1)[0] == pytest.approx(whole.reset(seed=1)[0])
     for _ in range(100):
@@ -149,10 +138,10 @@ def test_mixed_env__is_the_task_of_the_package_at_both_ends(name, paper):
 
 
 def test_step_logs__have_steps_of_one_joint_and_late_answers(tmp_path):
-    logs = [read_log([path], 4, rate=100.0) for path in step_logs.make_logs(tmp_path, 3)]
+    logs = [read_log([path], 4, rate=100.0) for path in make_logs(tmp_path, 3)]
     duties = [{float(abs(one.u).max()) for one in log.recordings} for log in logs]
     assert [len(duty) for duty in duties] == [5, 2]
-    assert set.union(*duties) == set(step_logs.DUTIES)
+    assert set.union(*duties) == set(DUTIES)
     for one in logs[1].recordings:
         (j,) = np.flatnonzero(one.u.any(axis=0))
         first = np.flatnonzero(one.u[:, j])[0]
@@ -169,8 +158,8 @@ def test_faults__find_a_frozen_encoder_of_a_moving_joint_in_the_log_of_a_drive()
 
 def test_with_rests__keeps_the_moves():
     (x, *_) = sequences.axis_sequences(BROKK_170)
-    rows = hold_table(BROKK_170, rests.with_rests(BROKK_170, x, 2.5).goals)
-    before = hold_table(BROKK_170, x.goals)
+    rows = sequences.hold_table(BROKK_170, rests.with_rests(BROKK_170, x, 2.5).goals)
+    before = sequences.hold_table(BROKK_170, x.goals)
     moves = before[:, 1:].any(axis=1)
     np.testing.assert_allclose(rows[moves], before[moves])
     np.testing.assert_allclose(rows[~moves], [[2.5, 0, 0, 0]] * (~moves).sum())

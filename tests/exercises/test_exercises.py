@@ -32,8 +32,7 @@ def fit_net(inputs, targets):
     nn = torch.nn
     layers = nn.Linear(39, 32), nn.ReLU(), nn.Linear(32, 32), nn.ReLU(), nn.Linear(32, 1)
     net = nn.Sequential(*layers)
-    x = torch.tensor((inputs - mean) / std).float()
-    y = torch.tensor(targets).float()
+    x, y = torch.tensor((inputs - mean) / std).float(), torch.tensor(targets).float()
     optimizer = torch.optim.Adam(net.parameters(), lr=3e-3)
     for _ in range(400):
         rows = torch.randint(len(x), (512,))
@@ -41,12 +40,7 @@ def fit_net(inputs, targets):
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-
-    def predict(inputs):
-        with torch.no_grad():
-            return net(torch.tensor((inputs - mean) / std).float())[:, 0].numpy()
-
-    return predict
+    return lambda x: net(torch.tensor((x - mean) / std).float())[:, 0].detach().numpy()
 
 
 def free_run(predict, history, q, commands):
@@ -69,6 +63,14 @@ def damping(J, w0, k):
     return jacobian.nakamura_damping(jacobian.manipulability(J), w0, k)
 
 
+def damped_velocities(J, v, w0, k):
+    return jacobian.dls(J, np.ones(J.shape[1]), damping(J, w0, k) + 1e-12) @ v
+
+
+def append(history, u, q, samples, dt):
+    return actuator.append_sample(history[None], [u], np.array([q]), samples, dt)[0]
+
+
 def tool_position(rows, q):
     return kinematics.tool_position(MODULES[2].our_frames(rows, q))
 
@@ -80,13 +82,10 @@ def lever_arm(a, b, gamma):
     return float(actuator.lever_arm(machine, gamma))
 
 
-def shifted_jacobian(frames):
+def shifted_jacobian(rows, q):
     """With the axes of the frames behind the joints."""
+    frames = MODULES[2].our_frames(rows, q)
     return kinematics.jacobian(frames._replace(z=np.roll(frames.z, -1, axis=0)))
-
-
-def pid(machine):
-    return MODULES[12].opponents()["PID, k = 0.1"]
 
 
 SOLUTIONS = {
@@ -106,57 +105,39 @@ SOLUTIONS = {
         "half_gradient": lambda J, W, d, v, q_dot: J.T @ (J @ q_dot - v) + d * W * q_dot,
         "minimiser": lambda J, W, d, v: jacobian.dls(J, W, d) @ v,
     },
-    5: {
-        "damping": damping,
-        "damped_velocities": lambda J, v, w0, k: (
-            jacobian.dls(J, np.ones(J.shape[1]), damping(J, w0, k) + 1e-12) @ v
-        ),
-    },
-    6: {
-        "velocity": estimate_velocity,
-        "append": lambda history, u, q, samples, dt: actuator.append_sample(
-            history[None], [u], np.array([q]), samples, dt
-        )[0],
-    },
+    5: {"damping": damping, "damped_velocities": damped_velocities},
+    6: {"velocity": estimate_velocity, "append": append},
     7: {"fit": fit_net, "free_run": free_run},
     8: {"reward": env.reward, "gradient": reward_gradient},
     9: {"gae": MODULES[9].ours},
     10: {"loss": MODULES[10].our_loss, "counts": MODULES[10].our_counts},
     11: {"command_gradients": MODULES[11].our_gradients},
-    12: {"Mine": pid},
+    12: {"Mine": lambda machine: MODULES[12].opponents()["PID, k = 0.1"]},
     13: {"drives": MODULES[13].our_drives, "limit": MODULES[13].our_limit},
 }
 
 
-WRONG = {
-    1: ({"encode": lambda counts: counts % 256}, "two's complement"),
-    2: (
-        {"jacobian": lambda rows, q: shifted_jacobian(MODULES[2].our_frames(rows, q))},
-        "z_0 x (p_4 - p_0)",
-    ),
-    3: ({"joint_velocity": lambda v, a, b, gamma: v * lever_arm(a, b, gamma)}, "v / r"),
-    4: ({"minimiser": lambda J, W, d, v: jacobian.dls(J, W, d, as_printed=True) @ v}, "1/24"),
-    5: ({"damping": lambda J, w0, k: k}, "w is 0.5"),
-    6: ({"velocity": lambda q, samples, dt: (q[-1] - q[-2]) / dt}, "By hand"),
-    7: ({"fit": lambda x, y: lambda x: np.full(len(x), y.mean())}, "one step"),
-    8: ({"gradient": lambda v_goal, v_tool: v_tool - v_goal}, "towards the goal"),
+def clipped_alone(ratio, a, eps):
+    return -np.mean(np.clip(ratio, 1 - eps, 1 + eps) * a)
+
+
+WRONG = {  # a function, a typical wrong answer, words of the verdict
+    1: ("encode", lambda counts: counts % 256, "two's complement"),
+    2: ("jacobian", shifted_jacobian, "z_0 x (p_4 - p_0)"),
+    3: ("joint_velocity", lambda v, a, b, gamma: v * lever_arm(a, b, gamma), "v / r"),
+    4: ("minimiser", lambda J, W, d, v: jacobian.dls(J, W, d, as_printed=True) @ v, "1/24"),
+    5: ("damping", lambda J, w0, k: k, "w is 0.5"),
+    6: ("velocity", lambda q, samples, dt: (q[-1] - q[-2]) / dt, "By hand"),
+    7: ("fit", lambda x, y: lambda x: np.full(len(x), y.mean()), "one step"),
+    8: ("gradient", lambda v_goal, v_tool: v_tool - v_goal, "towards the goal"),
     9: (
-        {"gae": lambda r, v, v1, end, cut, *c: MODULES[9].ours(r, v, v1, end + cut, cut, *c)},
+        "gae",
+        lambda r, v, v1, end, cut, *c: MODULES[9].ours(r, v, v1, end + cut, cut, *c),
         "time limit",
     ),
-    10: (
-        {"loss": lambda ratio, a, eps: -np.mean(np.clip(ratio, 1 - eps, 1 + eps) * a)},
-        "The smaller of the two",
-    ),
-    11: (
-        {
-            "command_gradients": lambda m, net, ticks, g: (
-                1.5 * MODULES[11].our_gradients(m, net, ticks, g)
-            )
-        },
-        "1 ticks",
-    ),
-    13: ({"drives": lambda driving, enable, *others: enable}, "no edge"),
+    10: ("loss", clipped_alone, "The smaller of the two"),
+    11: ("command_gradients", lambda *case: 1.5 * MODULES[11].our_gradients(*case), "1 ticks"),
+    13: ("drives", lambda driving, enable, *others: enable, "no edge"),
 }
 
 
@@ -187,8 +168,8 @@ def test_exercise__as_handed_out_says_what_to_fill_in(
 
 @pytest.mark.parametrize("number", sorted(WRONG))
 def test_exercise__says_why_a_typical_answer_is_wrong(number: int) -> None:
-    wrong, word = WRONG[number]
-    assert word in judge(MODULES[number], SOLUTIONS[number] | wrong)
+    name, wrong, words = WRONG[number]
+    assert words in judge(MODULES[number], SOLUTIONS[number] | {name: wrong})
 
 
 @pytest.mark.parametrize("words", [["check"], ["format", "--check"]])
@@ -199,10 +180,7 @@ def test_exercises__as_handed_out_pass_the_linter(words: list[str]) -> None:
 
 
 def test_judge__says_where_an_answer_raised() -> None:
-    def encode(counts):
-        return [][counts]
-
-    message = judge(MODULES[1], SOLUTIONS[1] | {"encode": encode})
+    message = judge(MODULES[1], SOLUTIONS[1] | {"encode": lambda counts: [][counts]})
     assert "IndexError" in message
 
 

@@ -104,13 +104,11 @@ def test_action_to_pwm__refuses_wrong_shapes_and_what_is_not_finite():
 
 def numbered_history() -> np.ndarray:
     """A history (5, 3, 13) of the Brokk in which every number differs."""
-    history = np.zeros((5, 3, 13), np.float32)
-    lag = np.arange(13)
-    for joint in range(5):
-        history[joint, 0] = POSE[joint] + 0.01 * (lag - 12)
-        history[joint, 1] = 0.02 * joint + 0.001 * lag
-        history[joint, 2] = -0.1 * joint + 0.002 * lag
-    return history
+    joint, lag = np.arange(5)[:, None], np.arange(13)
+    q = POSE[:, None] + 0.01 * (lag - 12)
+    q_dot = 0.02 * joint + 0.001 * lag
+    u = -0.1 * joint + 0.002 * lag
+    return np.stack([q, q_dot, u], axis=1).astype(np.float32)
 
 
 def test_features__by_hand():
@@ -255,26 +253,24 @@ def test_update_history__measures_the_tool_by_the_newest_samples():
 # --- one tick -------------------------------------------------------------------------------------
 
 
-def test_initial_state__is_at_rest_at_the_measured_pose():
-    state = initial_state(BROKK_170, np.stack([POSE, POSE]), [0.1, 0.0, 0.2], plant=True)
+@pytest.mark.parametrize("shape", [(), (2,), (2, 3)])
+def test_initial_state__is_at_rest_at_the_measured_pose(shape):
+    q = np.broadcast_to(POSE, (*shape, 5))
+    state = initial_state(BROKK_170, q, [0.1, 0.0, 0.2], plant=True)
     assert state.q.dtype == np.float64 and state.history.dtype == np.float32
-    counts = state.history[:, :, 0] / BROKK_170.encoder_step[:, None]
+    counts = state.history[..., 0, :] / BROKK_170.encoder_step[:, None]
     np.testing.assert_allclose(counts, np.rint(counts), atol=1e-3)
-    np.testing.assert_allclose(state.true_history[0, :, 0, -1], POSE[DRIVEN], rtol=1e-6)
-    assert not state.history[:, :, 1:].any() and not state.true_history[:, :, 1:].any()
-    still = state.q_dot, state.error_integral, state.v_tool
-    assert not any(array.any() for array in still)
+    angles = state.true_history[..., 0, -1]
+    np.testing.assert_allclose(angles, q[..., DRIVEN], rtol=1e-6)
+    for still in (state.history[..., 1:, :], state.true_history[..., 1:, :], state.q_dot):
+        assert not still.any()
+    np.testing.assert_array_equal([state.error_integral, state.v_tool], np.zeros((2, *shape, 3)))
     np.testing.assert_allclose(state.lowest, closed_form(state.q)[1], atol=1e-12)
-    np.testing.assert_allclose(state.v_goal, [[0.1, 0, 0.2]] * 2, rtol=1e-6)
-    assert state.ticks.tolist() == [0, 0] and (state.goal_ticks > 1e9).all()
-
-
-@pytest.mark.parametrize("shape", [(), (2, 3)])
-def test_initial_state__takes_whole_numbers_and_any_leading_axes(shape):
-    state = initial_state(BROKK_170, np.full((*shape, 5), 1), ZERO, plant=True)
-    assert state.q.dtype == state.plant.q.dtype == float
-    assert state.v_goal.shape == state.error_integral.shape == (*shape, 3)
+    np.testing.assert_allclose(state.v_goal, np.full((*shape, 3), [0.1, 0, 0.2]), rtol=1e-6)
     assert state.ticks.shape == state.goal_ticks.shape == state.lowest.shape == shape
+    assert not state.ticks.any() and (state.goal_ticks > 1e9).all()
+    whole = initial_state(BROKK_170, [1, 1, 1, 1, 1], ZERO, plant=True)
+    assert whole.q.dtype == whole.plant.q.dtype == float
 
 
 def test_transition__on_nets_by_hand():
