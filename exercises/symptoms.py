@@ -75,20 +75,17 @@ def bus() -> Symptom:
     counts = np.array([80, -80, 50, -50, 0])
     frame = canopen.valve_frame(counts, 7, 1)
     raw = np.array([8192 - 100, 400, 16384 - 300, 300])
-    return Symptom(
-        {
-            "commands [counts]": counts,
-            "their bytes in the valve frame": frame[:5],
-            "commands of the bytes 80, 127, 128, 175, 255": machine.decode_pwm(
-                [80, 127, 128, 175, 255]
-            )
-            * PWM_MAX,
-            "largest command that passes [counts]": machine.limit_command(BROKK, [1, -1]) * 127,
-            "a command of 20.7 counts": machine.limit_command(BROKK, 20.7 / 127) * 127,
-            "raw encoders of the excavator": raw,
-            "their joint angles [counts]": canopen.encoder_counts(MINI_EXCAVATOR, raw),
-        }
-    )
+    decoded = machine.decode_pwm([80, 127, 128, 175, 255])
+    rows = {
+        "commands [counts]": counts,
+        "their bytes in the valve frame": frame[:5],
+        "commands of the bytes 80, 127, 128, 175, 255": decoded * PWM_MAX,
+        "largest command that passes [counts]": machine.limit_command(BROKK, [1, -1]) * 127,
+        "a command of 20.7 counts": machine.limit_command(BROKK, 20.7 / 127) * 127,
+        "raw encoders of the excavator": raw,
+        "their joint angles [counts]": canopen.encoder_counts(MINI_EXCAVATOR, raw),
+    }
+    return Symptom(rows)
 
 
 def estimator() -> Symptom:
@@ -105,9 +102,8 @@ def estimator() -> Symptom:
     with_command = actuator.append_command(history, [0.5])
     rows["its commands, with the next one"] = with_command[0, 2]
     rows["angle from all its samples [rad]"] = actuator.smooth_angles(BROKK, history)
-    rows["noise-free velocity of a ramp at 1 rad/s"] = kinematics.estimate_velocity(
-        0.05 * np.arange(13), 4, 0.05
-    )
+    slope = kinematics.estimate_velocity(0.05 * np.arange(13), 4, 0.05)
+    rows["noise-free velocity of a ramp at 1 rad/s"] = slope
     curves = {"velocity in the history": (0.05 * np.arange(len(angles)), velocities)}
     return Symptom(rows, curves, ("time [s]", "velocity [rad/s]"))
 
@@ -158,11 +154,10 @@ def nets() -> Symptom:
         still = env.transition(BROKK, net, still, np.full((1, 5), 5 / 127))
     swapped = joint_nets(net, ["q5", "q1"])
     last = np.array([side[-1] for side in sides]).T
+    distance = np.abs(sides[1] - sides[0]).max(axis=0)
     rows = {f"{name}: end on plant, nets [rad]": ends for name, ends in zip(DRIVEN, last)}
     rows |= {
-        "largest distance of the nets from the plant [rad]": np.abs(sides[1] - sides[0]).max(
-            axis=0
-        ),
+        "largest distance of the nets from the plant [rad]": distance,
         "q5 on the plant, 0.2 s to 0.7 s [rad]": sides[0][3:14:2, 3],
         "q5 on the nets": sides[1][3:14:2, 3],
         "creep under 5 counts in 2 s [rad]": (still.q[0] - START)[BROKK.driven],
@@ -249,34 +244,29 @@ def task() -> Symptom:
         state, reward, terminated, truncated, _ = env.step(BROKK, config, None, state, actions)
         rewards.append(reward)
         ends.append(terminated + 2 * truncated)
-    measured = env.measure(BROKK, state.history, state.v_goal, state.error_integral, 0.1)
+    inputs = BROKK, state.history, state.v_goal, state.error_integral
+    measured = env.measure(*inputs, 0.1)
+    noise = measured.v_tool - env.measure(*inputs).v_tool
     obs = env.features(BROKK, measured)
     ground = np.array([-0.01, 0.0, 0.01])
-    return Symptom(
-        {
-            "rewards of arm 1": np.array(rewards)[:, 0],
-            "rewards of arm 2, which began in the ground": np.array(rewards)[:6, 1],
-            "ends of arm 1 (1 terminated, 2 truncated)": np.array(ends)[:, 0],
-            "ends of arm 2": np.array(ends)[:, 1],
-            "reward at an error of 0, 0.1, 1, 5 m/s": env.reward(
-                np.outer([0, 0.1, 1, 5], [0.6, 0, 0.8]), np.zeros(3)
-            ),
-            "terminated at -1, 0, 1 cm": env.terminated(BROKK, ground),
-            "error integral of arm 1 [m]": state.error_integral[0],
-            "joint velocities of arm 1 [rad/s]": state.q_dot[0],
-            "noise of 0.1 on the tool velocity [m/s]": (
-                measured.v_tool
-                - env.measure(BROKK, state.history, state.v_goal, state.error_integral).v_tool
-            )[0],
-            "observation of arm 1, numbers 0 to 6": obs[0, :7],
-            "mean and deviation of its history": [obs[0, 7:163].mean(), obs[0, 7:163].std()],
-            "observation of arm 1, last eight": obs[0, -8:],
-            "commands of the actions 1, 0.5, 0.005, 0 [counts]": env.action_to_pwm(
-                BROKK, [1, 0.5, 0.005, 0]
-            )
-            * 127,
-        }
-    )
+    errors = np.outer([0, 0.1, 1, 5], [0.6, 0, 0.8])
+    u = env.action_to_pwm(BROKK, [1, 0.5, 0.005, 0])
+    rows = {
+        "rewards of arm 1": np.array(rewards)[:, 0],
+        "rewards of arm 2, which began in the ground": np.array(rewards)[:6, 1],
+        "ends of arm 1 (1 terminated, 2 truncated)": np.array(ends)[:, 0],
+        "ends of arm 2": np.array(ends)[:, 1],
+        "reward at an error of 0, 0.1, 1, 5 m/s": env.reward(errors, np.zeros(3)),
+        "terminated at -1, 0, 1 cm": env.terminated(BROKK, ground),
+        "error integral of arm 1 [m]": state.error_integral[0],
+        "joint velocities of arm 1 [rad/s]": state.q_dot[0],
+        "noise of 0.1 on the tool velocity [m/s]": noise[0],
+        "observation of arm 1, numbers 0 to 6": obs[0, :7],
+        "mean and deviation of its history": [obs[0, 7:163].mean(), obs[0, 7:163].std()],
+        "observation of arm 1, last eight": obs[0, -8:],
+        "commands of the actions 1, 0.5, 0.005, 0 [counts]": u * 127,
+    }
+    return Symptom(rows)
 
 
 def advantages() -> Symptom:
@@ -288,15 +278,14 @@ def advantages() -> Symptom:
     ratio, advantage = torch.tensor([0.5, 1.5, 0.5, 1.5]), torch.tensor([1.0, 1, -1, -1])
     losses = [ppo.policy_loss(r[None], a[None], 0.2) for r, a in zip(ratio, advantage)]
     density = ppo.log_probability(torch.zeros(2), torch.zeros(2), torch.full((2,), -1.0))
-    return Symptom(
-        {
-            "no end, exact critic": ppo.gae(one, exact, exact, nothing, 0.9, 0.5)[:, 0],
-            "terminated, exact critic": ended[:, 0],
-            "truncated, critic of zero": ppo.gae(one, nothing, nothing, done, 0.9, 0.5)[:, 0],
-            "losses at ratio 0.5, 1.5; advantage 1, -1": torch.stack(losses),
-            "log-density of the mean, two actions, deviation 1/e": density,
-        }
-    )
+    rows = {
+        "no end, exact critic": ppo.gae(one, exact, exact, nothing, 0.9, 0.5)[:, 0],
+        "terminated, exact critic": ended[:, 0],
+        "truncated, critic of zero": ppo.gae(one, nothing, nothing, done, 0.9, 0.5)[:, 0],
+        "losses at ratio 0.5, 1.5; advantage 1, -1": torch.stack(losses),
+        "log-density of the mean, two actions, deviation 1/e": density,
+    }
+    return Symptom(rows)
 
 
 class Line(VectorEnv[Array, Array, Any]):
@@ -347,8 +336,6 @@ def learning() -> Symptom:
         target_kl=0.05,
         gamma=0.9,
         log_std=-1.0,
-        log_std_end=None,
-        threads=1,
     )
     curve: list[float] = []
     losses: list[float] = []

@@ -141,12 +141,6 @@ WRONG = {  # a function, a typical wrong answer, words of the verdict
 }
 
 
-def test_exercises__are_thirteen_with_a_page_each() -> None:
-    assert sorted(FILES) == list(range(1, 14)) == sorted(SOLUTIONS)
-    for number, module in MODULES.items():
-        assert 8 <= len((module.__doc__ or "").splitlines()) <= 40, number
-
-
 @pytest.mark.parametrize("number", sorted(FILES))
 def test_exercise__passes_with_its_solution(number: int) -> None:
     assert judge(MODULES[number], SOLUTIONS[number]) == ""
@@ -206,11 +200,12 @@ def test_main__lists_the_exercises_and_refuses_others(capsys: pytest.CaptureFixt
 def test_page__has_every_exercise_with_its_minutes_and_every_bug() -> None:
     page = (ROOT / "exercises" / "README.md").read_text()
     rows = re.findall(r"^\| (\d+) \| .* \| \[(\w+\.py)\]\(\2\) \| (\d+) \|$", page, re.M)
-    assert [(int(number), file) for number, file, _ in rows] == [
-        (number, FILES[number].name) for number in sorted(FILES)
-    ]
+    assert {int(number): file for number, file, _ in rows} == {n: f.name for n, f in FILES.items()}
+    assert [int(number) for number, *_ in rows] == list(range(1, 14)) == sorted(SOLUTIONS)
     for number, _, minutes in rows:
-        assert f"({minutes} minutes)" in (MODULES[int(number)].__doc__ or "")
+        text = MODULES[int(number)].__doc__ or ""
+        assert f"({minutes} minutes)" in text
+        assert 8 <= len(text.splitlines()) <= 40
     assert "Sixty errors" in page
     assert len(bugs()) == 60
     assert max(len(line) for line in page.splitlines() if line[:1] != "|") <= 100

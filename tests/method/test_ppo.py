@@ -78,23 +78,23 @@ class FirstNumber(nn.Module):
         return obs[..., :1]
 
 
-def lambda_return_advantages(tape, values, last_values, config):
+def lambda_return_advantages(rewards, terminated, truncated, values, last_values, config):
     """All n-step returns under the weights (1 - lambda) lambda^(n-1), minus the value."""
-    ticks, gamma, lam = config.horizon, config.gamma, config.gae_lambda
-    result = np.zeros((ticks, tape.num_envs))
+    gamma, lam = config.gamma, config.gae_lambda
+    result = np.zeros(rewards.shape)
     for t, i in np.ndindex(result.shape):
         collected, weight = 0.0, 1.0
-        for n, k in enumerate(range(t, ticks), 1):
-            collected += gamma ** (n - 1) * tape.rewards[k, i]
-            bootstrap = last_values[k, i] if tape.truncated[k, i] else values[k + 1, i]
-            bootstrap = 0.0 if tape.terminated[k, i] else bootstrap
+        for n, k in enumerate(range(t, len(rewards)), 1):
+            collected += gamma ** (n - 1) * rewards[k, i]
+            bootstrap = last_values[k, i] if truncated[k, i] else values[k + 1, i]
+            bootstrap = 0.0 if terminated[k, i] else bootstrap
             n_step = collected + gamma**n * bootstrap
-            if tape.terminated[k, i] or tape.truncated[k, i] or k == ticks - 1:
+            if terminated[k, i] or truncated[k, i] or k == len(rewards) - 1:
                 result[t, i] += weight * n_step
                 break
             result[t, i] += (1 - lam) * weight * n_step
             weight *= lam
-    return result - values[:ticks]
+    return result - values[: len(rewards)]
 
 
 # --- nets -----------------------------------------------------------------------------------------
@@ -159,9 +159,9 @@ def test_critic_advantages__are_means_of_n_step_returns(gamma, lam, seed):
     learner = ppo.make_learner(tape, config, 0, critic=True)
     learner.agent.critic = FirstNumber()
     batch = ppo.critic_advantages(learner.agent, ppo.collect(tape, learner, config), config)
-    tape.rewards = (1 - gamma) * tape.rewards  # values are in units of the reward
-    values, last_values = tape.obs[..., 0], tape.last_obs[..., 0]
-    expected = lambda_return_advantages(tape, values, last_values, config)
+    rewards = (1 - gamma) * tape.rewards[:8]  # values are in units of the reward
+    ends, values = (tape.terminated, tape.truncated), tape.obs[..., 0]
+    expected = lambda_return_advantages(rewards, *ends, values, tape.last_obs[..., 0], config)
     np.testing.assert_allclose(batch["advantages"], expected, atol=1e-5)
     np.testing.assert_allclose(batch["returns"], expected + values[:8], atol=1e-5)
 
@@ -304,12 +304,10 @@ def reference_update(tape, config, agent, optimizer, generator, update, learning
         logprobs = Normal(agent.actor(obs), agent.log_std.exp()).log_prob(actions).sum(-1)
         values = mean + std * agent.critic(torch.from_numpy(tape.obs))[..., 0].numpy()
         last_values = mean + std * agent.critic(torch.from_numpy(tape.last_obs))[..., 0].numpy()
-    values = values[ticks.start : ticks.stop + 1]
-    part = Tape()
-    part.rewards = (1 - config.gamma) * tape.rewards[ticks]
-    part.terminated = tape.terminated[ticks]
-    part.truncated = tape.truncated[ticks]
-    found = lambda_return_advantages(part, values, last_values[ticks], config)
+    values, last_values = values[ticks.start : ticks.stop + 1], last_values[ticks]
+    rewards = (1 - config.gamma) * tape.rewards[ticks]
+    ends = tape.terminated[ticks], tape.truncated[ticks]
+    found = lambda_return_advantages(rewards, *ends, values, last_values, config)
     seen.append(found + values[:-1])
     mean, std = scale_of(seen)
     returns = (seen[-1] - mean) / std
