@@ -8,9 +8,9 @@ who imported it runs the wrong code.
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import inspect
 import itertools
+import runpy
 import sys
 import types
 import warnings
@@ -91,23 +91,21 @@ def planted(name: str, right: str, wrong: str) -> Iterator[None]:
 
 
 @cache
+def copies(path: Path) -> dict[str, Any]:
+    """What a test file defines, run once more; its properties stop at the first failure."""
+    loaded = settings.get_current_profile_name()
+    settings.register_profile("planted", settings.default, phases=[Phase.generate])
+    settings.load_profile("planted")
+    try:
+        return runpy.run_path(str(path))
+    finally:
+        settings.load_profile(loaded)
+
+
 def copy_of(test: str) -> Any:
-    """A test function, from its file imported once more; a property stops at the first failure."""
+    """A test function of such a copy."""
     (path,) = [path for path in FILES if f"\ndef {test}(" in path.read_text()]
-    name = f"copy_of_{path.parent.name}_{path.stem}"
-    if name not in sys.modules:
-        spec = importlib.util.spec_from_file_location(name, path)
-        assert spec
-        assert spec.loader
-        sys.modules[name] = importlib.util.module_from_spec(spec)
-        loaded = settings.get_current_profile_name()
-        settings.register_profile("planted", settings.default, phases=[Phase.generate])
-        settings.load_profile("planted")
-        try:
-            spec.loader.exec_module(sys.modules[name])
-        finally:
-            settings.load_profile(loaded)
-    return getattr(sys.modules[name], test)
+    return copies(path)[test]
 
 
 def cases(test: Any) -> Iterator[dict[str, object]]:
