@@ -1,4 +1,4 @@
-"""The layout of the package: sizes, imports that run one way."""
+"""The layout of the package: sizes, imports that run one way, words that are no names."""
 
 from __future__ import annotations
 
@@ -17,6 +17,20 @@ WINGS = ("identification", "learning", "evaluation", "can", "viewer", "cli")
 BYTES = {"can.canopen", "can.connection", "can.safety_gate"}  # what hw.py may import as well
 MODULES = sorted(PACKAGE.rglob("*.py"))
 TREES = {path: ast.parse(path.read_text()) for path in MODULES}
+
+# Names of the first edition that mean nothing outside it.
+PRIVATE = """
+    way ways bends tilts rises joint_rates damped_rates push_lag told sensed look RAMP
+    Outcome rest_state fitting_nets push_measured push_motion valve_scale FINE STILL STAND
+    far far_ends LEG Tape hover by_tool by_velocity tails out_of_step identity_of SteadyMap
+    winding Mover judge trust apart said Effort supply_demand whole_counts wishes Wish Jog
+    Hands Line hear note spoken wrong pace KEPT PUSH held_back _rehearse asked Known looks
+    weakest Mailbox MOODS need
+""".split()
+PRIVATE_MODULES = """
+    plant observation extras scores trust environments adjoint mpc chain gate bus wishes
+    simulator blackbox ticks looks view remote variations experiments
+""".split()
 
 
 def name_of(path: Path) -> str:
@@ -81,6 +95,15 @@ def test_functions__of_the_method_have_at_most_25_lines_of_code(name):
             body = range(node.body[0].lineno, (node.end_lineno or 0) + 1)
             size = len(code & set(body))
             assert size <= 25, f"{name}.{node.name}: {size}"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=name_of)
+def test_names__are_words_of_the_field(path):
+    nodes = list(ast.walk(TREES[path]))
+    defined = {n.name for n in nodes if isinstance(n, ast.FunctionDef | ast.ClassDef)}
+    arguments = {n.arg for n in nodes if isinstance(n, ast.arg)}
+    assert not (defined | arguments) & set(PRIVATE)
+    assert path.stem not in PRIVATE_MODULES
 
 
 def test_glossary__has_at_most_25_entries():

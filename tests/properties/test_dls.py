@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import scipy.linalg
 from hypothesis import given
@@ -68,6 +70,20 @@ def test_dls__the_printed_form_agrees_for_unit_weights_only(problem):
     W_inv_Jt = (J / W).T
     printed = W_inv_Jt @ np.linalg.inv((J * W) @ J.T + damping * np.eye(3))
     np.testing.assert_allclose(dls(J, W, damping, as_printed=True), printed, atol=1e-7, rtol=1e-6)
+
+
+@given(posed(shapes=[()]), dampings, velocities, reals(-3, 3))
+def test_dls__turns_with_the_base(case, damping, v, angle):
+    """Turning tool velocity and arm together about z leaves the joint velocities as they were."""
+    machine, q = case
+    c, s = np.cos(angle), np.sin(angle)
+    Rz = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    W = np.ones(machine.n)
+    still = dls(jacobian(forward_kinematics(machine, q)), W, damping) @ v
+    first, *others = machine.joints
+    base = replace(machine, joints=(replace(first, theta=first.theta + angle), *others))
+    turned = jacobian(forward_kinematics(base, q))
+    np.testing.assert_allclose(dls(turned, W, damping) @ (Rz @ v), still, atol=1e-8)
 
 
 @given(st.integers(0, 10_000), st.integers(3, 6))

@@ -39,6 +39,26 @@ def test_tool_velocity__is_the_derivative_along_the_motion(case):
     np.testing.assert_allclose(velocity, (ahead - behind) / (2 * STEP), atol=1e-7)
 
 
+@given(posed())
+def test_forward_kinematics__neighbouring_frames_are_one_dh_row_apart(case):
+    """|p_i - p_{i-1}|^2 = a^2 + d^2; the axes enclose alpha; the offset along the old axis is d.
+
+    q is added to d where a joint is prismatic.
+    """
+    machine, q = case
+    p, z, prismatic = forward_kinematics(machine, q)
+    link = p[..., 1:, :] - p[..., :-1, :]
+    slides = np.array([joint.kind == "prismatic" for joint in machine.joints])
+    assert prismatic == np.flatnonzero(slides).tolist()
+    a, d = machine.column("a"), machine.column("d") + slides * q
+    np.testing.assert_allclose(np.sum(link**2, -1), a**2 + d**2, atol=1e-11)
+    np.testing.assert_allclose(np.sum(link * z[..., :-1, :], -1), d, atol=1e-12)
+    cosine = np.sum(z[..., 1:, :] * z[..., :-1, :], -1)
+    alpha = np.broadcast_to(machine.column("alpha"), q.shape)
+    np.testing.assert_allclose(cosine, np.cos(alpha), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(z, axis=-1), 1, atol=1e-12)
+
+
 @given(posed(), reals(-3, 3))
 def test_forward_kinematics__turns_with_the_first_joint(case, angle):
     """Turning the base turns the tool about z and leaves heights and headings alone."""
