@@ -5,18 +5,15 @@ drives, then nets fitted to both logs and the policy trained on. The field calls
 (DAgger for models: Ross and Bagnell, ICML 2012).
 """
 
-import multiprocessing
-import os
-import sys
+import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
 from dask.system import cpu_count
 from tqdm import tqdm
 
@@ -115,43 +112,32 @@ def learn(
     clock: dict[str, float],
 ) -> dict[str, Any]:
     """Results of all fits, trainings and tunings, by the names of the jobs."""
+
+    def fit_again(first: tuple[logs.Log, Policy]) -> ActuatorNet:
+        return fit_net(machine, out / "net.npz", first[0], budget, {}, seed)
+
+    def train_again(net: ActuatorNet, first: tuple[logs.Log, Policy]) -> Policy:
+        return train(machine, out, "rl", net, budget, seed, first[1])
+
+    def tune(name: str, net: ActuatorNet) -> Any:
+        return baselines.tune_baselines(machine, select_nets(machine, net), *tuning, only=name)
+
+    tuning = budget.tuning_runs, budget.generations, seed, None, None, budget.short_s
     common: dict[str, Any] = {"budget": budget, "seed": seed}
     recipe: dict[str, Any] = {"recipe": fitting.PAPER_RECIPE, **common}
     jobs: dict[str, Callable[..., Any]] = {
         "fit net_paper": partial(fit_net, machine, out / "net_paper.npz", paper_log, **recipe),
         "first round": partial(first_round, machine, out / "first", log, recipe={}, **common),
         "train rl_paper": partial(train, machine, out, "rl_paper", **common),
-        "fit net": partial(_fit_again, machine, out, budget, seed),
-        "train rl": partial(_train_again, machine, out, budget, seed),
+        "fit net": fit_again,
+        "train rl": train_again,
     }
     needs = {"train rl_paper": ["fit net_paper"], "fit net": ["first round"]}
     needs["train rl"] = ["fit net", "first round"]
     for name in baselines.TUNED:
-        jobs[f"tune {name}"] = partial(_tune, machine, name, budget, seed)
+        jobs[f"tune {name}"] = partial(tune, name)
         needs[f"tune {name}"] = ["fit net"]
     return dict(zip(jobs, side_by_side(jobs, clock, needs), strict=True))
-
-
-def _fit_again(
-    machine: Machine, out: Path, budget: Budget, seed: int, first: tuple[logs.Log, Policy]
-) -> ActuatorNet:
-    return fit_net(machine, out / "net.npz", first[0], budget, {}, seed)
-
-
-def _train_again(
-    machine: Machine,
-    out: Path,
-    budget: Budget,
-    seed: int,
-    net: ActuatorNet,
-    first: tuple[logs.Log, Policy],
-) -> Policy:
-    return train(machine, out, "rl", net, budget, seed, first[1])
-
-
-def _tune(machine: Machine, name: str, budget: Budget, seed: int, net: ActuatorNet) -> Any:
-    settings = budget.tuning_runs, budget.generations, seed, None, None, budget.short_s, name
-    return baselines.tune_baselines(machine, select_nets(machine, net), *settings)
 
 
 def side_by_side(
@@ -165,36 +151,54 @@ def side_by_side(
     their order: the longest should be the first. One core runs them here, in turn. `clock` gets the
     seconds of each. The first exception is raised.
     """
+    from distributed import as_completed  # slow to import
+
     needed = {name: (needs or {}).get(name, ()) for name in calls}
     done: dict[str, tuple[float, Any]] = {}
     cores = cpu_count()  # by affinity and cgroup, too
     if cores == 1:
         for name, call in calls.items():
-            done[name] = _timed(call, *(done[other][1] for other in needed[name]))
+            done[name] = _timed(call, *(done[other] for other in needed[name]))
     else:
-        context = multiprocessing.get_context("spawn")
-        bar = tqdm(total=len(calls), unit="job", disable=None)
-        with ProcessPoolExecutor(min(cores, len(calls)), context, _one_thread) as pool, bar:
-            waiting = dict(calls)
-            running: dict[Future[tuple[float, Any]], str] = {}
-            while waiting or running:
-                for name in [one for one in waiting if set(needed[one]) <= done.keys()]:
-                    results = [done[other][1] for other in needed[name]]
-                    running[pool.submit(_timed, waiting.pop(name), *results)] = name
-                bar.set_postfix_str(", ".join([*running.values()][:cores]))
-                for future in wait(running, return_when=FIRST_COMPLETED).done:
-                    done[running.pop(future)] = future.result()
-                    bar.update()
+        with connect(n_workers=min(cores, len(calls))) as client:
+            jobs: dict[str, Any] = {}
+            for name, call in calls.items():
+                options = {"key": name, "priority": -len(jobs)}
+                results = (jobs[other] for other in needed[name])
+                jobs[name] = client.submit(_timed, call, *results, **options)
+            ended = as_completed(jobs.values())  # type: ignore[no-untyped-call]
+            bar = tqdm(ended, total=len(jobs), unit="job", disable=None)
+            for job in bar:
+                done[job.key] = job.result()
+                bar.set_postfix_str(f"last: {job.key}")
     clock |= {name: done[name][0] for name in calls}
     return [done[name][1] for name in calls]
 
 
-def _one_thread() -> None:
-    torch.set_num_threads(1)
-    sys.stderr = open(os.devnull, "w")  # noqa: SIM115  # bars of several processes would mix
-
-
-def _timed(call: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
+def _timed(call: Callable[..., Any], *needed: tuple[float, Any]) -> tuple[float, Any]:
     start = time.perf_counter()
-    result = call(*arguments)
+    result = call(*(result for _, result in needed))
     return time.perf_counter() - start, result
+
+
+@contextmanager
+def connect(scheduler: str | None = None, **cluster: Any) -> Iterator[Any]:
+    """A dask client of the scheduler at an address, or of one process per core of this machine.
+
+    `cluster` are options of dask's LocalCluster.
+    """
+    import dask
+    from distributed import Client  # slow to import
+
+    options: dict[str, Any] = {"address": scheduler, "timeout": 10}
+    if scheduler is None:
+        options = {"threads_per_worker": 1, "memory_limit": None, "dashboard_address": ":0"}
+        options |= {"silence_logs": logging.CRITICAL, **cluster}
+    environ = "distributed.nanny.pre-spawn-environ"  # of the processes that run the jobs
+    settings = {
+        f"{environ}.TQDM_DISABLE": 1,  # bars of several processes would mix
+        f"{environ}.MALLOC_TRIM_THRESHOLD_": 2**30,  # with dask's 64 kB a training takes 1.4 times
+        "distributed.admin.large-graph-warning-threshold": "1TB",  # of logs
+    }
+    with dask.config.set(settings), Client(**options) as client:  # type: ignore[no-untyped-call]
+        yield client

@@ -5,7 +5,6 @@ They run on this machine's cores, or on a cluster, through dask.distributed. Eac
 On a cluster all workers must have the folder, and run one seed at a time.
 """
 
-import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -19,6 +18,7 @@ from brokk_min.actuator import ActuatorNet
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation import metrics
 from brokk_min.evaluation.baselines import gains_metadata, read_gains
+from brokk_min.evaluation.learn import connect
 from brokk_min.evaluation.metrics import Controllers, Rows, by_start, mean_interval
 from brokk_min.evaluation.sequences import AXES, evaluation_starts, task_sequences
 from brokk_min.identification.files import brief, expect_same, read_json, write_json
@@ -129,24 +129,6 @@ def run_seeds(
             else:
                 failed[seed] = str(future.exception())
     return results, failed
-
-
-def connect(scheduler: str | None) -> Any:
-    """A dask client of the scheduler at an address, or of one process per core of this machine."""
-    import dask
-    from distributed import Client
-
-    options: dict[str, Any] = {"address": scheduler, "timeout": 10}
-    if scheduler is None:
-        options = {"threads_per_worker": 1, "memory_limit": None, "dashboard_address": ":0"}
-        options["silence_logs"] = logging.ERROR
-    environ = "distributed.nanny.pre-spawn-environ"  # of the processes that run the jobs
-    settings = {
-        f"{environ}.TQDM_DISABLE": 1,
-        f"{environ}.MALLOC_TRIM_THRESHOLD_": 2**30,  # with dask's 64 kB a training takes 1.4 times
-    }
-    with dask.config.set(settings):
-        return Client(**options)  # type: ignore[no-untyped-call]
 
 
 def run_scored(machine: Machine, controllers: Controllers, starts: int) -> Rows:
