@@ -22,7 +22,7 @@ from brokk_min import actuator, env, ppo
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import Bools, Measured, TaskConfig, action_to_pwm, features
 from brokk_min.evaluation import metrics, sequences
-from brokk_min.evaluation.learn import Budget, fit_net, side_by_side
+from brokk_min.evaluation.learn import Budget, Chain, fit_net, side_by_side
 from brokk_min.identification import logs
 from brokk_min.identification.fitting import PAPER_RECIPE
 from brokk_min.identification.muon import Muon
@@ -140,7 +140,7 @@ def nets_of(folder: Path, steps: frozenset[str]) -> ActuatorNet:
     file = folder / f"{name}.npz"
     if not file.exists():
         recorded = logs.read_log([folder / f"{log}.npz"], M.velocity_samples, rate=M.rate)
-        fit_net(M, file, recorded, Budget(), recipe, 0)
+        fit_net(Chain(M, folder, Budget(), 0), name, recorded, recipe)
     return select_nets(M, load_net(file, M))
 
 

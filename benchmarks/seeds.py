@@ -58,6 +58,7 @@ def make(options: Options, name: str, seed: int) -> None:
     budget = learn.QUICK if options.quick else learn.Budget()
     out = options.folder / f"seed_{seed}"
     out.mkdir(parents=True, exist_ok=True)
+    chain = learn.Chain(M, out, budget, seed)
     nets, kind, recipe = RECIPES[name]
     if not (out / f"{nets}.npz").exists():
         log_file = out / f"log_{nets}.npz"
@@ -65,12 +66,12 @@ def make(options: Options, name: str, seed: int) -> None:
         logs.write_log(log_file, log)
         log = logs.read_log([log_file], M.velocity_samples, rate=M.rate)
         if name == "rl":
-            log, _ = learn.first_round(M, out / "first", log, budget, seed, recipe)
-        learn.fit_net(M, out / f"{nets}.npz", log, budget, recipe, seed)
+            log, _ = learn.first_round(chain, log, recipe)
+        learn.fit_net(chain, nets, log, recipe)
     if not (out / POLICIES[name]).exists():
         net = select_nets(M, load_net(out / f"{nets}.npz", M))
         start = load_policy(out / "first" / POLICIES[name], M) if name == "rl" else None
-        learn.train(M, out, name, net, budget, seed, start)
+        learn.train(chain, name, net, start)
 
 
 def score(options: Options) -> list[dict[str, Any]]:

@@ -18,7 +18,7 @@ from brokk_min.env import TaskConfig
 from brokk_min.evaluation import baselines, metrics, perfect_model, sequences
 from brokk_min.evaluation.claims import VERDICTS
 from brokk_min.evaluation.rollout import TITLES, Controller
-from brokk_min.identification.files import SHIPPED, located, write_json
+from brokk_min.identification.files import SHIPPED, located, write_csv, write_json
 from brokk_min.identification.net_file import load_net
 from brokk_min.jacobian import JacobianController
 from brokk_min.learning.policy import POLICIES, Policy, load_policy, policy_controllers
@@ -37,7 +37,7 @@ class Starts(Command):
         machine = self.check(out="starts")
         rng = np.random.default_rng(self.seed)
         poses = sequences.draw_starts(machine, sequences.task_sequences(machine), self.num, rng)
-        sequences.write_starts(self.out, machine, poses)
+        write_csv(self.out, machine.names, poses.tolist())
         print(f"{self.out}: {self.num} start poses")
 
 

@@ -212,17 +212,19 @@ def tune(
     spread = SPREAD * searched
     first = np.random.default_rng(seed).normal(start, spread, (CANDIDATES, len(start)))
     first[0] = start
+    first = np.clip(first, 0, 1)[:, searched]
     costs: list[float] = []
 
-    def gains(x: Array) -> Gains:
-        """Gains at fractions (..., 3 n_driven + 3); those not searched stay 0."""
-        return split_vector(np.where(searched, gains_vector(gains_of(machine, x)), 0.0))
+    def at(x: Array) -> JacobianController:
+        """The controller with gains at fractions (..., searched gains); the others stay 0."""
+        gains = np.zeros((*x.shape[:-1], len(start)))
+        gains[..., searched] = x
+        gains = np.where(searched, gains_vector(gains_of(machine, gains)), 0.0)
+        return replace(controller, gains=split_vector(gains))
 
     def objective(x: Array) -> Any:
         """The cost (candidates,) of fractions (searched gains, candidates)."""
-        every = np.zeros((x.shape[1], len(start)))
-        every[:, searched] = x.T
-        return cost(replace(controller, gains=gains(every)))
+        return cost(at(x.T))
 
     with tqdm(total=generations, desc=f"tune {label}", unit="generation", disable=None) as bar:
 
@@ -231,21 +233,16 @@ def tune(
             costs.append(float(intermediate_result.fun))
             bar.update()
 
-        first = np.clip(first, 0, 1)[:, searched]
         options = SEARCH | {"init": first, "maxiter": generations, "rng": seed}
         bounds = Bounds(np.zeros(first.shape[1]), np.ones(first.shape[1]))
         result = differential_evolution(objective, bounds, callback=record, **options)
-    x = np.zeros(len(start))
-    x[searched] = result.x
-    return replace(controller, gains=gains(x)), costs
+    return at(result.x), costs
 
 
 def gains_table(controllers: Mapping[str, JacobianController]) -> dict[str, dict[str, list[float]]]:
     """Gains of each baseline by name, for JSON."""
-    table = {}
-    for name, controller in controllers.items():
-        table[name] = {key: array.tolist() for key, array in asdict(controller.gains).items()}
-    return table
+    every = {name: asdict(controller.gains) for name, controller in controllers.items()}
+    return {name: {k: array.tolist() for k, array in of.items()} for name, of in every.items()}
 
 
 def gains_metadata(machine: Machine, net: ActuatorNet) -> dict[str, str]:

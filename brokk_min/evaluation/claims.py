@@ -7,8 +7,9 @@ Paper: Sec. 3.2, 3.4, 4.1, 4.2, 5
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,6 +23,7 @@ from brokk_min.evaluation.metrics import (
     by_start,
     interval,
     mean_interval,
+    paired_difference,
     ticks_since_change,
 )
 from brokk_min.evaluation.rollout import Controller, Trace
@@ -151,24 +153,20 @@ def task_claims(
     [m/s] (T, num, 3), `singular` is of `singular_claims`. Paper: Sec. 4.2, Fig. 6
     """
 
-    def direction(names: Sequence[str]) -> Claim:
-        """Of the first baseline."""
-        return direction_claim(machine, pids[names[0]], along_x[names[0]], goals)
+    def of_baselines(names: Sequence[str]) -> list[Claim]:
+        """All claims on some baselines; that on directions is of the first one."""
+        along_z = ["velocity_error_mean", "off_axis_drift_max"]
+        return [
+            drift_claim(runs, policy, names),
+            direction_claim(machine, pids[names[0]], along_x[names[0]], goals),
+            less_claim("tracking", runs, policy, names, "xyz"),
+            less_claim("along z", runs, policy, names, "z", along_z),
+            less_claim("outperforms", runs, policy, names, ["all"]),
+        ]
 
-    def of_baselines(claim: Callable[[Sequence[str]], Claim]) -> Claim:
-        """A claim on the paper's baselines, with that on a stronger one."""
-        return claim(PAPER_BASELINES)._replace(stronger=claim(STRONGER))
-
-    along_z = ["velocity_error_mean", "off_axis_drift_max"]
-    return [
-        still_claim(runs, policy),
-        of_baselines(lambda names: drift_claim(runs, policy, names)),
-        of_baselines(direction),
-        *singular,
-        of_baselines(lambda names: less_claim("tracking", runs, policy, names, "xyz")),
-        of_baselines(lambda names: less_claim("along z", runs, policy, names, "z", along_z)),
-        of_baselines(lambda names: less_claim("outperforms", runs, policy, names, ["all"])),
-    ]
+    papers, stronger = of_baselines(PAPER_BASELINES), of_baselines(STRONGER)
+    both = [a._replace(stronger=b) for a, b in zip(papers, stronger, strict=True)]
+    return [still_claim(runs, policy), *both[:2], *singular, *both[2:]]
 
 
 def still_claim(runs: Sequence[Run], policy: str) -> Claim:
@@ -179,10 +177,9 @@ def still_claim(runs: Sequence[Run], policy: str) -> Claim:
 
 def drift_claim(runs: Sequence[Run], policy: str, baselines: Sequence[str]) -> Claim:
     """Do y and z move while baselines move the tool along x? Paper: Fig. 6b"""
-    own = by_start(runs, policy, "x", "off_axis_drift_max")
-    drift = {c: by_start(runs, c, "x", "off_axis_drift_max") for c in baselines}
-    means = {c: mean_interval(values) for c, values in drift.items()}
-    more = {f"{c} less {policy}": mean_interval(values - own) for c, values in drift.items()}
+    key = "off_axis_drift_max"
+    means = {c: mean_interval(by_start(runs, c, "x", key)) for c in baselines}
+    more = {f"{c} less {policy}": paired_difference(runs, c, policy, key)["x"] for c in baselines}
     holds = _both(_above(_limit("drift"), *means.values()), _above(0.0, *more.values()))
     return Claim("drift", means | more, holds)
 
@@ -236,13 +233,10 @@ def less_claim(
 ) -> Claim:
     """Are figures of the policy less than those of all baselines? Paper: Fig. 6c, 6f, 6h, Sec. 5"""
     labels = {"velocity_error_mean": "error", "off_axis_drift_max": "drift"}
-    numbers = {}
-    for key in keys:
-        for s in sequences:
-            own = by_start(runs, policy, s, key)
-            for c in baselines:
-                less = mean_interval(own - by_start(runs, c, s, key))
-                numbers[f"{labels[key]} {s}, less {c}"] = less
+    numbers = {
+        f"{labels[key]} {s}, less {c}": paired_difference(runs, policy, c, key)[s]
+        for key, s, c in product(keys, sequences, baselines)
+    }
     return Claim(name, numbers, _below(0.0, *numbers.values()))
 
 
@@ -277,8 +271,9 @@ def singular_claims(policy: str, runs: Sequence[Run], speed: Mapping[str, Array]
     jerkier = mean_interval(jerk[WEAK] - jerk[STRONG])
     faster = mean_interval(speed[policy] - speed[WEAK])
     smoother = mean_interval(jerk[policy] - jerk[STRONG])
-    speeds = {"k 0.1": mean_interval(speed[STRONG]), "k 0.05": mean_interval(speed[WEAK])}
-    jerks = {"k 0.1": mean_interval(jerk[STRONG]), "k 0.05": mean_interval(jerk[WEAK])}
+    damping = {"k 0.1": STRONG, "k 0.05": WEAK}
+    speeds = {k: mean_interval(speed[name]) for k, name in damping.items()}
+    jerks = {k: mean_interval(jerk[name]) for k, name in damping.items()}
     own = {f"{policy} speed": mean_interval(speed[policy]), "speed less k 0.05": faster}
     own |= {f"{policy} jerk": mean_interval(jerk[policy]), "jerk less k 0.1": smoother}
     return [

@@ -23,7 +23,7 @@ import numpy as np
 
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation import baselines, learn, metrics, sequences
-from brokk_min.evaluation.learn import Budget
+from brokk_min.evaluation.learn import Budget, Chain
 from brokk_min.evaluation.metrics import Controllers
 from brokk_min.evaluation.rollout import Controller, rollout
 from brokk_min.identification import logs, validation
@@ -79,22 +79,24 @@ def run_member(base: Machine, seed: int, out: Path, budget: Budget) -> dict[str,
         expect_same(file, row, {"budget": made_by})
         return row
     machine = known_machine(base, seed)
+    chain = Chain(machine, out, budget, seed)
     log = collect(machine, budget.hours, "joint", np.random.default_rng(seed))
     test = task_log(machine, 20, 40.0, np.random.default_rng(seed + 1))
     out.mkdir(parents=True, exist_ok=True)
     logs.write_log(out / "log.npz", log)
     shared = {"shared": LATENTS}
-    both, begun = learn.first_round(machine, out / "first", log, budget, seed, shared)
-    machine = replace(machine, dither=best_dither(machine, begun, budget, seed))
-    every = learn.fit_net(machine, out / "net.npz", both, budget, shared, seed)
+    both, begun = learn.first_round(chain, log, shared)
+    machine = replace(machine, dither=best_dither(chain, begun))
+    chain = replace(chain, machine=machine)
+    every = learn.fit_net(chain, "net", both, shared)
     net = select_nets(machine, every)
-    train = partial(learn.train, machine, out, "rl", net, budget, seed, begun)
-    settings = budget.tuning_runs, budget.generations, seed, None, None, budget.short_s
-    tune = partial(baselines.tune_baselines, machine, net, *settings)
-    trained, (pids, _) = learn.side_by_side({"train": train, "tune": tune}, {})
+    jobs = {"train": partial(learn.train, chain, "rl", net, begun)}
+    jobs["tune"] = partial(learn.tune, chain, net)
+    trained, (pids, _) = learn.side_by_side(jobs, {})
     baselines.write_gains(out / "gains.json", pids, baselines.gains_metadata(machine, net))
     policies = policy_controllers(machine, {"rl": trained})
     errors = mean_errors(base, machine, {**policies, **pids}, budget)
+    loaded = replace(machine, plant=replace(machine.plant, payload=PAYLOAD))
     scores = validation.score(every, test)
     driven = [base.names[i] for i in base.driven]
     row = {
@@ -106,7 +108,7 @@ def run_member(base: Machine, seed: int, out: Path, budget: Budget) -> dict[str,
         "tool": validation.tool_errors(machine, every, test),
         "error": errors,
         "on_nets": mean_errors(base, machine, {**policies}, budget, net),
-        "loaded": mean_errors(base, with_payload(machine), {**policies}, budget),
+        "loaded": mean_errors(base, loaded, {**policies}, budget),
         "best": {
             name: min((p for p in pids if pids[p].valves == valves), key=errors.__getitem__)
             for name, valves in VALVES.items()
@@ -125,23 +127,18 @@ def known_machine(base: Machine, seed: int) -> Machine:
     return with_dead_zones(machine, log._replace(recordings=ramps))
 
 
-def best_dither(machine: Machine, policy: Policy, budget: Budget, seed: int) -> float:
+def best_dither(chain: Chain, policy: Policy) -> float:
     """Of `DITHERS` the one with least error of the policy, on goals that are never scored."""
-    seconds = min(baselines.TUNING_SECONDS, budget.short_s)
-    start, goals = sequences.tuning_set(machine, budget.tuning_runs, seed, seconds)
+    machine = chain.machine
+    start, goals = learn.tuning_set(chain)
     errors = []
     for dither in DITHERS:
         own = replace(machine, dither=dither)
         controller = PolicyController(own, replace(policy, valves="dither"))
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(chain.seed)
         trace = rollout(machine, controller, start, goals, TaskConfig(), rng)
         errors.append(np.linalg.norm(goals - trace.v_tool, axis=-1).mean())
     return DITHERS[int(np.argmin(errors))]
-
-
-def with_payload(machine: Machine) -> Machine:
-    """The member with a load at its tool."""
-    return replace(machine, plant=replace(machine.plant, payload=PAYLOAD))
 
 
 def mean_errors(
@@ -181,14 +178,12 @@ def ratios(row: dict[str, Any], policy: str) -> dict[str, float]:
 
 def summary(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
     """Median and largest of the `ratios` over the members, of each policy."""
-    result = {}
+    result: dict[str, dict[str, dict[str, float]]] = {}
     for policy in VALVES:
-        found = [ratios(row, policy) for row in rows]
-        table = {key: [one[key] for one in found] for key in found[0]}
-        medians = {
-            key: {"median": float(np.median(x)), "worst": max(x)} for key, x in table.items()
-        }
-        result[policy] = medians
+        result[policy] = {}
+        for key in ratios(rows[0], policy):
+            values = [ratios(row, policy)[key] for row in rows]
+            result[policy][key] = {"median": float(np.median(values)), "worst": max(values)}
     return result
 
 

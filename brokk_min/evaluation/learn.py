@@ -19,14 +19,14 @@ from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import TaskConfig
-from brokk_min.evaluation import baselines
+from brokk_min.evaluation import baselines, sequences
 from brokk_min.evaluation.rollout import own_drives
 from brokk_min.identification import fitting, logs
 from brokk_min.identification.net_file import save_net, select_nets
 from brokk_min.learning.checkpoint import train_policy
 from brokk_min.learning.episodes import GRADIENT_LEARNER, PAPER_TASK
 from brokk_min.learning.policy import POLICIES, Policy, policy_controllers
-from brokk_min.machine import Machine
+from brokk_min.machine import Array, Machine
 from brokk_min.ppo import PPOConfig
 
 
@@ -50,14 +50,23 @@ class Budget:
 QUICK = Budget(0.1, 300, 40_000, 700, 60_000, 200_000, 4, 4, 8, 2, 3.0)
 
 
-def fit_net(
-    machine: Machine, file: Path, log: logs.Log, budget: Budget, recipe: dict[str, Any], seed: int
-) -> ActuatorNet:
-    """Nets of all joints by our settings but for those of `recipe`, written to `file`."""
-    ours = {"history": machine.history, "dead_zone": machine.dead_zone}
-    config = fitting.FitConfig(budget.fit_steps, **ours | recipe)
-    net = fitting.fit(log, config, seed, machine.velocity_samples, machine.name)
-    save_net(file, net)
+@dataclass(frozen=True)
+class Chain:
+    """What all stages of one chain share."""
+
+    machine: Machine
+    out: Path  # folder of its files
+    budget: Budget
+    seed: int
+
+
+def fit_net(chain: Chain, name: str, log: logs.Log, recipe: Mapping[str, Any]) -> ActuatorNet:
+    """Nets of all joints by our settings but for those of `recipe`, written to `name`.npz."""
+    m = chain.machine
+    ours: dict[str, Any] = {"history": m.history, "dead_zone": m.dead_zone}
+    config = fitting.FitConfig(chain.budget.fit_steps, **{**ours, **recipe})
+    net = fitting.fit(log, config, chain.seed, m.velocity_samples, m.name)
+    save_net(chain.out / f"{name}.npz", net)
     return net
 
 
@@ -68,74 +77,60 @@ def settings(name: str, budget: Budget) -> tuple[TaskConfig, PPOConfig]:
     return TaskConfig(), PPOConfig(**GRADIENT_LEARNER | {"total_steps": budget.train_steps})
 
 
-def train(
-    machine: Machine,
-    out: Path,
-    name: str,
-    net: ActuatorNet,
-    budget: Budget,
-    seed: int,
-    start: Policy | None = None,
-) -> Policy:
+def train(chain: Chain, name: str, net: ActuatorNet, start: Policy | None = None) -> Policy:
     """One of `POLICIES`, by its own settings; `start` as in `train_policy`."""
-    task, learner = settings(name, budget)
-    driven = select_nets(machine, net)
-    file = out / POLICIES[name]
-    return train_policy(machine, driven, task, learner, seed, file, resume=True, start=start)
+    task, learner = settings(name, chain.budget)
+    m, file = chain.machine, chain.out / POLICIES[name]
+    driven = select_nets(m, net)
+    return train_policy(m, driven, task, learner, chain.seed, file, resume=True, start=start)
 
 
-def first_round(
-    machine: Machine, out: Path, log: logs.Log, budget: Budget, seed: int, recipe: dict[str, Any]
-) -> tuple[logs.Log, Policy]:
+def first_round(chain: Chain, log: logs.Log, recipe: Mapping[str, Any]) -> tuple[logs.Log, Policy]:
     """The log with the own drives of a policy that was trained for short, and this policy.
 
-    Files go to `out`: nets, policy, and the own drives.
+    Nets, policy and own drives go to the folder `first` of the chain.
     """
-    out.mkdir(parents=True, exist_ok=True)
+    m, budget = chain.machine, chain.budget
     short = {"fit_steps": budget.first_fit_steps, "train_steps": budget.first_train_steps}
-    first = replace(budget, **short)
-    net = fit_net(machine, out / "net.npz", log, first, recipe, seed)
-    policy = train(machine, out, "rl", net, first, seed)
-    controllers = policy_controllers(machine, {"rl": policy})
-    own = own_drives(machine, [*controllers.values()], budget.hours, seed)
-    logs.write_log(out / "log_own.npz", own)
+    first = replace(chain, out=chain.out / "first", budget=replace(budget, **short))
+    first.out.mkdir(parents=True, exist_ok=True)
+    policy = train(first, "rl", fit_net(first, "net", log, recipe))
+    controllers = policy_controllers(m, {"rl": policy})
+    own = own_drives(m, [*controllers.values()], budget.hours, chain.seed)
+    logs.write_log(first.out / "log_own.npz", own)
     return log._replace(recordings=log.recordings + own.recordings), policy
 
 
+def tuning_set(chain: Chain) -> tuple[Array, Array]:
+    """Starts and goals of `sequences.tuning_set` on which the baselines of a chain are tuned."""
+    seconds = min(baselines.TUNING_SECONDS, chain.budget.short_s)
+    return sequences.tuning_set(chain.machine, chain.budget.tuning_runs, chain.seed, seconds)
+
+
+def tune(chain: Chain, net: ActuatorNet, name: str = "") -> Any:
+    """The baseline `name`, or all, tuned as by `tune_baselines`."""
+    budget = chain.budget
+    effort = budget.tuning_runs, budget.generations, chain.seed
+    limits: dict[str, Any] = {"longest": budget.short_s, "only": name}
+    nets = select_nets(chain.machine, net)
+    return baselines.tune_baselines(chain.machine, nets, *effort, **limits)
+
+
 def learn(
-    machine: Machine,
-    out: Path,
-    log: logs.Log,
-    paper_log: logs.Log,
-    budget: Budget,
-    seed: int,
-    clock: dict[str, float],
+    chain: Chain, log: logs.Log, paper_log: logs.Log, clock: dict[str, float]
 ) -> dict[str, Any]:
     """Results of all fits, trainings and tunings, by the names of the jobs."""
-
-    def fit_again(first: tuple[logs.Log, Policy]) -> ActuatorNet:
-        return fit_net(machine, out / "net.npz", first[0], budget, {}, seed)
-
-    def train_again(net: ActuatorNet, first: tuple[logs.Log, Policy]) -> Policy:
-        return train(machine, out, "rl", net, budget, seed, first[1])
-
-    def tune(name: str, net: ActuatorNet) -> Any:
-        return baselines.tune_baselines(machine, select_nets(machine, net), *tuning, only=name)
-
-    tuning = budget.tuning_runs, budget.generations, seed, None, None, budget.short_s
-    common: dict[str, Any] = {"budget": budget, "seed": seed}
-    recipe: dict[str, Any] = {"recipe": fitting.PAPER_RECIPE, **common}
     jobs: dict[str, Callable[..., Any]] = {
-        "fit net_paper": partial(fit_net, machine, out / "net_paper.npz", paper_log, **recipe),
-        "first round": partial(first_round, machine, out / "first", log, recipe={}, **common),
-        "train rl_paper": partial(train, machine, out, "rl_paper", **common),
-        "fit net": fit_again,
-        "train rl": train_again,
+        "fit net_paper": partial(fit_net, chain, "net_paper", paper_log, fitting.PAPER_RECIPE),
+        "first round": partial(first_round, chain, log, {}),
+        "train rl_paper": partial(train, chain, "rl_paper"),
+        "fit net": lambda first: fit_net(chain, "net", first[0], {}),
+        "train rl": lambda net, first: train(chain, "rl", net, first[1]),
     }
     needs = {"train rl_paper": ["fit net_paper"], "fit net": ["first round"]}
     needs["train rl"] = ["fit net", "first round"]
     for name in baselines.TUNED:
-        jobs[f"tune {name}"] = partial(tune, name)
+        jobs[f"tune {name}"] = partial(tune, chain, name=name)
         needs[f"tune {name}"] = ["fit net"]
     return dict(zip(jobs, side_by_side(jobs, clock, needs), strict=True))
 

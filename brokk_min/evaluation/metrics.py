@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from itertools import chain, product
+from itertools import product
 from typing import Any, TypeVar
 
 import numpy as np
@@ -53,10 +53,10 @@ def metrics(machine: Machine, trace: Trace, goals: Array, start: Array) -> dict[
     return {
         "velocity_rmse": np.sqrt(np.mean(error**2, axis=0)),
         "velocity_error_mean": error.mean(axis=0),
-        "velocity_error_transient": _mean(error, transient),
-        "velocity_error_steady": _mean(error, ~transient),
-        "velocity_error_moves": _mean(error, moving),
-        "velocity_error_rests": _mean(error, ~moving),
+        "velocity_error_transient": mean_where(transient, error),
+        "velocity_error_steady": mean_where(~transient, error),
+        "velocity_error_moves": mean_where(moving, error),
+        "velocity_error_rests": mean_where(~moving, error),
         "settling_time": settling_time(machine, error, goals),
         "off_axis_drift_max": drift.max(axis=0),
         "off_axis_drift_mean": drift.mean(axis=0),
@@ -82,9 +82,9 @@ def motion_at_rest(machine: Machine, goals: Array, x: Array, order: float) -> tu
     for run in range(x.shape[1]):
         moving = goals[:, run].any(axis=-1)
         change = np.diff(moving.astype(int), prepend=0, append=1)
-        stops = np.flatnonzero(change == -1)
-        ends = [t + np.flatnonzero(change[t + 1 :] == 1)[0] + 1 for t in stops]
-        rests = [x[t + settle - 1 : end, run] for t, end in zip(stops, ends, strict=True)]
+        stops, starts = np.flatnonzero(change == -1), np.flatnonzero(change == 1)
+        ends = zip(stops, starts[1:], strict=True)  # of the rests
+        rests = [x[stop + settle - 1 : end, run] for stop, end in ends]
         far = [norm(rest - rest[0], order, axis=-1).max() for rest in rests if len(rest) > 1]
         if far:
             result[:, run] = np.mean(far), np.max(far)
@@ -147,14 +147,9 @@ def settling_time(machine: Machine, error: Array, goals: Array) -> Array:
     return np.where(changes > 0, mean, np.nan)
 
 
-def _mean(values: Array, where: NDArray[np.bool_]) -> Array:
-    """Mean over the ticks of (T, num) at which `where` holds, (num,); NaN: nowhere."""
+def mean_where(where: NDArray[np.bool_], values: Array) -> Array:
+    """Mean over the first axis of (T, num) where `where` holds, (num,); NaN: nowhere."""
     return np.asarray(np.ma.array(values, mask=~where).mean(axis=0).filled(np.nan))
-
-
-def row_mean(values: Array) -> Array:
-    """Mean of each row of (rows, n) without its NaN, (rows,); NaN: no other value."""
-    return _mean(values.T, np.isfinite(values).T)
 
 
 def evaluate(
@@ -196,7 +191,7 @@ def evaluate(
             traces[pair] = Trace(*(array[:, part] for array in trace))
             rows[pair] = _rows(pair, kinds, {key: v[part] for key, v in figures.items()})
     order = product(controllers, [sequence.name for sequence in sequences])
-    return list(chain.from_iterable(rows[pair] for pair in order)), traces
+    return [row for pair in order for row in rows[pair]], traces
 
 
 def _rows(pair: tuple[str, str], kinds: Sequence[str], figures: Mapping[str, Array]) -> Rows:
@@ -284,10 +279,10 @@ def intervals(runs: Sequence[Run]) -> dict[str, dict[str, dict[str, list[float |
 
 def paired_difference(runs: Sequence[Run], one: str, other: str, key: str) -> dict[str, Mean]:
     """A figure of one controller less another's on the same starts: mean, interval, by sequence."""
-    result = {}
-    for s in [*_names(runs, "sequence"), "all"]:
-        result[s] = mean_interval(by_start(runs, one, s, key) - by_start(runs, other, s, key))
-    return result
+    return {
+        s: mean_interval(by_start(runs, one, s, key) - by_start(runs, other, s, key))
+        for s in [*_names(runs, "sequence"), "all"]
+    }
 
 
 def paired_differences(runs: Sequence[Run], one: str) -> dict[str, dict[str, dict[str, Mean]]]:

@@ -14,12 +14,12 @@ from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet
 from brokk_min.evaluation import baselines, claims, metrics, preliminary, report, sequences
-from brokk_min.evaluation.learn import Budget, learn, side_by_side
+from brokk_min.evaluation.learn import Budget, Chain, learn, side_by_side, tuning_set
 from brokk_min.evaluation.metrics import Controllers, Run, Traces, evaluate, summary
 from brokk_min.evaluation.perfect_model import perfect_models, regret
 from brokk_min.evaluation.robustness import ROBUST, near_singularities, robustness
 from brokk_min.evaluation.rollout import Controller, Trace, log_of
-from brokk_min.evaluation.seeds import read_seeds, seeds_of
+from brokk_min.evaluation.seeds import read_seeds
 from brokk_min.identification import logs, validation
 from brokk_min.identification.excitation import collect, task_log
 from brokk_min.identification.files import write_json
@@ -38,25 +38,27 @@ def reproduce(
     `results.json` has no times: the same seed gives the same file on the same computer. `sweep` is
     a file of `brokk-min sweep`, whose training seeds the report shows.
     """
-    seeds = read_seeds(sweep) if sweep else {}
+    seeds = read_seeds(sweep) if sweep else {}  # before all work
+    chain = Chain(machine, out, budget, seed)
     clock: dict[str, float] = {}
     with tqdm(total=4, desc="stages done", unit="stage", position=1, disable=None) as bar:
         stage = partial(_stage, clock, bar)
         with stage("record"):
-            log, paper_log, test = record(machine, out, budget, seed)
+            log, paper_log, test = record(chain)
         with stage("learn and tune"):
-            by_name = learn(machine, out, log, paper_log, budget, seed, clock)
+            by_name = learn(chain, log, paper_log, clock)
             net, paper_net = by_name["fit net"], by_name["fit net_paper"]
             rl, paper = by_name["train rl"], by_name["train rl_paper"]
             tuned = [by_name[f"tune {name}"] for name in baselines.TUNED]
             pids, tuning = (dict(ChainMap(*both[::-1])) for both in zip(*tuned, strict=True))
             policies = {"rl": rl, "rl_paper": paper}
-            training_seeds = seeds_of(machine, rl.net, seeds) if seeds else {}
+            if sweep:
+                seeds = read_seeds(sweep, baselines.gains_metadata(machine, rl.net))
         with stage("evaluate"):
-            results, shown = measure(machine, net, test, policies, pids, budget, seed, clock)
+            results, shown = measure(chain, net, test, policies, pids, clock)
             results["paper_recipe"] = net_errors(machine, paper_net, test, seed)
         with stage("draw"):
-            results |= {"tuning": tuning, "training_seeds": training_seeds}
+            results |= {"tuning": tuning, "training_seeds": seeds}
             write(machine, out, results, policies, pids)
             report.write_report(machine, out, results, shown, clock)
     write_json(out / "timing.json", clock)
@@ -73,21 +75,22 @@ def _stage(clock: dict[str, float], bar: Any, name: str) -> Iterator[None]:
     bar.update()
 
 
-def record(machine: Machine, out: Path, budget: Budget, seed: int) -> list[logs.Log]:
+def record(chain: Chain) -> list[logs.Log]:
     """Logs to fit nets to, rich ones and the paper's sines, and to score them on.
 
     They are written and read back as a user's.
     """
-    out.mkdir(parents=True, exist_ok=True)
+    chain.out.mkdir(parents=True, exist_ok=True)
+    machine, hours, seed = chain.machine, chain.budget.hours, chain.seed
     rng = np.random.default_rng
     recorded = {
-        "log": collect(machine, budget.hours, "rich", rng(seed)),
-        "log_paper": collect(machine, budget.hours, "sine", rng(seed)),
+        "log": collect(machine, hours, "rich", rng(seed)),
+        "log_paper": collect(machine, hours, "sine", rng(seed)),
         "log_test": task_log(machine, 20, 40.0, rng(seed + 1)),
     }
     read = []
     for name, log in recorded.items():
-        file = out / f"{name}.npz"
+        file = chain.out / f"{name}.npz"
         logs.write_log(file, log)
         read.append(logs.read_log([file], machine.velocity_samples, rate=machine.rate))
     return read
@@ -101,18 +104,17 @@ def net_errors(machine: Machine, net: ActuatorNet, test: logs.Log, seed: int) ->
 
 
 def measure(
-    machine: Machine,
+    chain: Chain,
     net: ActuatorNet,
     test: logs.Log,
     policies: Mapping[str, Policy],
     pids: Pids,
-    budget: Budget,
-    seed: int,
     clock: dict[str, float],
 ) -> tuple[dict[str, Any], report.Shown]:
     """All measurements of nets, policies and baselines, for JSON and for the figures."""
+    machine, seed = chain.machine, chain.seed
     controllers = policy_controllers(machine, policies)
-    compared, task, singular = compare(machine, controllers, pids, budget, seed, clock)
+    compared, task, singular = compare(chain, controllers, pids, clock)
     starts = np.array(compared["starts"])[np.array(compared["start_kinds"]) == "workspace"]
     axes = sequences.axis_sequences(machine)
     rl = {"rl": controllers["rl"]}
@@ -121,11 +123,10 @@ def measure(
     own = log_of(machine, {s: trace for (c, s), trace in task.items() if c == "rl"}, 16)
     measured = preliminary.run(machine, net, seed)
     numbers = preliminary.numbers(machine, measured)
-    seconds = min(baselines.TUNING_SECONDS, budget.short_s)
-    tuned_on = sequences.tuning_set(machine, budget.tuning_runs, seed, seconds)
+    tuned_on, goals = tuning_set(chain)
     meta = metrics.metadata(machine, seed) | baselines.gains_metadata(machine, policies["rl"].net)
     results = {
-        "meta": meta | {"effort": asdict(budget)},
+        "meta": meta | {"effort": asdict(chain.budget)},
         "actuator": {
             "test": validation.score(net, test),
             "driven_by_policy": validation.score(net, own),
@@ -135,24 +136,20 @@ def measure(
         "gains": baselines.gains_table(pids),
         "tuning_runs": [
             {"start": q.tolist(), "goals": sequences.hold_table(machine, v_goal).tolist()}
-            for q, v_goal in zip(tuned_on[0], tuned_on[1].swapaxes(0, 1), strict=True)
+            for q, v_goal in zip(tuned_on, goals.swapaxes(0, 1), strict=True)
         ],
     }
     return results | compared, report.Shown(net, test, measured, task, singular)
 
 
 def compare(
-    machine: Machine,
-    policies: Mapping[str, Controller],
-    pids: Pids,
-    budget: Budget,
-    seed: int,
-    clock: dict[str, float],
+    chain: Chain, policies: Mapping[str, Controller], pids: Pids, clock: dict[str, float]
 ) -> tuple[dict[str, Any], Traces, Traces]:
     """The paper's experiment, regret and robustness: JSON, all traces, those near singularities.
 
     Means, intervals and verdicts are over "workspace" starts: they can follow all sequences.
     """
+    machine, budget, seed = chain.machine, chain.budget, chain.seed
     controllers: Controllers = {**policies, **pids}
     commands = sequences.task_sequences(machine)
     starts = sequences.evaluation_starts(machine, budget.starts, commands, seed + 2)

@@ -55,8 +55,7 @@ def scale_valves(machine: Machine, positive: float, negative: float) -> Machine:
     """The machine with other cylinder speeds in the positive and the negative direction."""
     joints = []
     for joint in machine.joints:
-        up = positive * joint.speed_positive
-        down = negative * joint.speed_negative
+        up, down = positive * joint.speed_positive, negative * joint.speed_negative
         joints.append(replace(joint, speed_positive=up, speed_negative=down))
     return replace(machine, joints=tuple(joints))
 
@@ -75,12 +74,11 @@ def variations(machine: Machine) -> dict[str, tuple[Machine, Sensor]]:
         "delay +25 ms": replace(machine, delay=machine.delay + 0.025),
         "delay +50 ms": replace(machine, delay=machine.delay + 0.050),
     }
-    result: dict[str, tuple[Machine, Sensor]] = {}
-    for name, varied in machines.items():
-        result[name] = (varied, lambda rng: read_encoder)
-    result["encoder noise of a count"] = (machine, noisy_encoder)
-    result["one sample in 20 lost"] = (machine, lossy_encoder)
-    return result
+    return {
+        **{name: (varied, lambda rng: read_encoder) for name, varied in machines.items()},
+        "encoder noise of a count": (machine, noisy_encoder),
+        "one sample in 20 lost": (machine, lossy_encoder),
+    }
 
 
 def pump_flow_ratio(machine: Machine, u: Array) -> Array:
@@ -136,17 +134,15 @@ def near_singularities(
     runs, traces = metrics.evaluate(machine, controllers, commands, starts, seed)
     w0 = manipulability_threshold(machine)
     J = jacobian(forward_kinematics(machine, starts))[..., machine.driven]
+    goals = {s.name: s.for_starts(machine, starts) for s in commands}
     speed = {}
     for name in controllers:
-        fractions = [
-            claims.speed_fraction(machine, w0, traces[name, s.name], s.for_starts(machine, starts))
-            for s in commands
-        ]
-        speed[name] = metrics.row_mean(np.stack(fractions, axis=1))
-    singular: dict[str, list[claims.Claim]] = {}
-    for name in ("rl", "rl_paper"):
-        if name in speed:
-            singular[name] = claims.singular_claims(name, runs, speed)
+        fractions = np.array(
+            [claims.speed_fraction(machine, w0, traces[name, s], goals[s]) for s in goals]
+        )
+        speed[name] = metrics.mean_where(np.isfinite(fractions), fractions)
+    policies: list[str] = [name for name in ("rl", "rl_paper") if name in speed]
+    singular = {name: claims.singular_claims(name, runs, speed) for name in policies}
     results = {
         "summary": metrics.summary(runs),
         "claims": {name: [c.to_json() for c in every] for name, every in singular.items()},

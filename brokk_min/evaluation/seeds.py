@@ -167,24 +167,19 @@ def table(seeds: Sequence[Rows], baselines: Rows) -> Table:
     }
 
 
-def read_seeds(path: Path) -> dict[str, Any]:
-    """The `sweep.json` of a sweep; its "table" is that of `table`. ValueError: another file."""
+def read_seeds(path: Path, required: Mapping[str, str] | None = None) -> Table:
+    """The table of a `sweep.json`; `required` are `gains_metadata` of the machine and its nets.
+
+    ValueError: another file, or one of another machine or of other nets.
+    """
     content: dict[str, Any] = read_json(path, "the sweep.json of a sweep")
     check_fields(path, content, SWEEP, {})
+    expect_same(path, content["meta"], required or {})
     for name, row in content["table"].items():
         if row.keys() != content["table"]["rl"].keys():
             wanted = brief(list(content["table"]["rl"]))
             raise ValueError(f"{path}: table.{name}: expected {wanted}, got {brief(list(row))}")
-    return content
-
-
-def seeds_of(machine: Machine, net: ActuatorNet, sweep: Mapping[str, Any]) -> Table:
-    """The table of a sweep of `read_seeds`; ValueError: one of another machine or of other nets."""
-    expected_meta = gains_metadata(machine, net)
-    recorded = {name: sweep["meta"].get(name) for name in expected_meta}
-    if recorded != expected_meta:
-        raise ValueError(f"sweep: expected one with {expected_meta}, got {recorded}")
-    return dict(sweep["table"])
+    return dict(content["table"])
 
 
 def show(figures: Mapping[str, Mapping[str, Any]]) -> str:

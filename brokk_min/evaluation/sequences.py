@@ -191,11 +191,6 @@ def read_starts(path: Path, machine: Machine) -> Array:
     return starts
 
 
-def write_starts(path: Path, machine: Machine, starts: Array) -> None:
-    """Write poses [rad] (starts, n) as `read_starts` reads them."""
-    files.write_csv(path, machine.names, starts.tolist())
-
-
 def goals_and_starts(
     machine: Machine, commands: Path | None, starts: Path | None, num: int, seed: int
 ) -> tuple[list[Commands], Array]:

@@ -80,13 +80,6 @@ def test_preliminary_tests__of_the_plant_have_the_papers_response_times(of_plant
     assert together < 0.002  # "marginal and neglectable"
 
 
-def test_sim_to_real__of_a_machine_to_itself_is_zero():
-    gap = preliminary.sim_to_real(
-        COARSE, dict.fromkeys(("machine", "nets"), plant_simulator(COARSE)), 0
-    )
-    assert not any(array.any() for array in gap)
-
-
 @pytest.mark.parametrize("machine", [COARSE, replace(COARSE, q_start=())])
 def test_sim_to_real__is_between_tools_where_the_arms_end(machine):
     """Nets that stand still: the gap is what the machine moved, from its own start pose."""

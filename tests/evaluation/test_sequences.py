@@ -151,14 +151,6 @@ def test_read_commands__refuses_what_is_no_sequence(tmp_path, rows, message):
     assert str(path) in str(error.value)
 
 
-def test_read_starts__reads_what_write_starts_wrote(tmp_path):
-    path = tmp_path / "s.csv"
-    starts = np.array([[0.5, 0.5, 0.58, 1.71, 1.24], [-0.25, 0.5, 0.1, 2.0, 1.0]])
-    s.write_starts(path, BROKK_170, starts)
-    assert path.read_text() == "q1,q2,q3,q4,q5\n0.5,0.5,0.58,1.71,1.24\n-0.25,0.5,0.1,2.0,1.0\n"
-    np.testing.assert_array_equal(s.read_starts(path, BROKK_170), starts)
-
-
 @pytest.mark.parametrize(
     ("row", "message"),
     [
@@ -267,8 +259,3 @@ def test_tuning_set__refuses_a_machine_that_can_follow_nothing():
     message = r"brokk170: expected 99999 feasible runs to tune on, got \d+; .* above Machine.ground"
     with pytest.raises(ValueError, match=message):
         s.tuning_set(machine, 99999, 0, 0.1)
-
-
-def test_shorten__keeps_the_first_seconds():
-    short = s.shorten(BROKK_170, s.axis_sequences(BROKK_170), 3.0)
-    assert [(one.name, len(one.goals)) for one in short] == [("x", 60), ("y", 60), ("z", 60)]
