@@ -157,8 +157,7 @@ def levels() -> Figures:
 
 def stand() -> Figures:
     """Path [m] from 0.5 to 2 s after a stop with open valves; dead zone as known, and smaller."""
-    starts = sequences.evaluation_starts(M, 64, sequences.task_sequences(M), 2)
-    starts = starts[np.array(sequences.start_kinds(M, starts)) == "workspace"]
+    starts = sequences.workspace_starts(M, 64)
     shipped = replace(policy.load_policy(POLICY, M), valves="open")
     controller = policy.PolicyController(M, shipped)
     result = {}
@@ -190,8 +189,7 @@ def dither() -> Figures:
             controllers[f"{name}, {valves}"] = driver
         for name in ("jacobian_pid_k0.1", "jacobian_pid_ff_integral_dither"):
             controllers[f"{name}, {valves}"] = replace(gains[name], valves=valves)
-    starts = sequences.evaluation_starts(M, 64, sequences.task_sequences(M), 2)
-    starts = starts[np.array(sequences.start_kinds(M, starts)) == "workspace"]
+    starts = sequences.workspace_starts(M, 64)
     runs, _ = metrics.evaluate(M, controllers, sequences.axis_sequences(M), starts, 0)
     keys = ("velocity_error_mean", "velocity_rmse", "velocity_error_moves", "velocity_error_rests")
     keys += ("off_axis_drift_max", "jerk_rms", "valve_travel", "joint_motion_at_rest")
@@ -363,8 +361,7 @@ def quiet() -> Figures:
         controllers[name] = gains[name]
         tuned, _ = baselines.tune(by_hand[name], cost, 0, baselines.GENERATIONS, name)
         controllers[f"{name}, tuned so"] = tuned
-    starts = sequences.evaluation_starts(M, 64, sequences.task_sequences(M), 2)
-    starts = starts[np.array(sequences.start_kinds(M, starts)) == "workspace"]
+    starts = sequences.workspace_starts(M, 64)
     axes = sequences.axis_sequences(M)
     runs, _ = metrics.evaluate(M, controllers, axes, starts, 0, config=config)
     return {

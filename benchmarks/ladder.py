@@ -169,8 +169,7 @@ def climb(folder: Path, name: str, total_steps: int, seed: int) -> list[float]:
     steps = RUNGS[name]
     policy = train(nets_of(folder, steps), steps, total_steps, seed)
     axes = sequences.axis_sequences(M)
-    starts = sequences.evaluation_starts(M, 64, sequences.task_sequences(M), 2)
-    starts = starts[np.array(sequences.start_kinds(M, starts)) == "workspace"]
+    starts = sequences.workspace_starts(M, 64)
     both = {v: MixedController(policy, steps, v) for v in (task_of(steps).valves, "closed")}
     runs, _ = metrics.evaluate(M, both, axes, starts, 0)
     table = metrics.summary(runs)

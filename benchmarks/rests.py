@@ -37,8 +37,7 @@ def main() -> None:
         **baselines.read_gains(folder / "gains.json", m, policies["rl"].net),
     }
     axes = sequences.axis_sequences(m)
-    starts = sequences.evaluation_starts(m, 32, sequences.task_sequences(m), 2)
-    starts = starts[np.array(sequences.start_kinds(m, starts)) == "workspace"][:16]
+    starts = sequences.workspace_starts(m, 32)
     columns = []
     for seconds in RESTS:
         commands = [with_rests(m, one, seconds) for one in axes]

@@ -44,11 +44,7 @@ RANGES = {  # that `tune` searches (assumed); each driven joint has its own kp, 
 
 
 def baselines(machine: Machine, net: ActuatorNet) -> dict[str, JacobianController]:
-    """The paper's two baselines and three with feed-forward, with gains by hand. Paper: Sec. 4.2
-
-    Two also have the policy's integral of the tool's velocity error; of these one has dither while
-    the tool rests.
-    """
+    """The paper's two baselines and three with feed-forward, with gains by hand. Paper: Sec. 4.2"""
     w0 = manipulability_threshold(machine)
     pid = make_gains(machine, kp=1.0, ki=8.0, kd=0.05, feedback=0.4, min_opening=0.015)
     mild = make_gains(machine, kp=0.2, ki=0.5, kd=0.02, feedback=0.1, min_opening=0.015)

@@ -145,10 +145,8 @@ def mean_errors(
     base: Machine, machine: Machine, controllers: Controllers, budget: Budget, net: Any = None
 ) -> dict[str, float]:
     """Mean |v_goal - v_tool| [m/s] of controllers on a member (or nets) over the base's starts."""
-    commands = sequences.task_sequences(base)
-    starts = sequences.evaluation_starts(base, budget.starts, commands, 2)
-    starts = starts[np.array(sequences.start_kinds(base, starts)) == "workspace"]
-    short = sequences.shorten(machine, commands, budget.short_s)
+    starts = sequences.workspace_starts(base, budget.starts)
+    short = sequences.shorten(machine, sequences.task_sequences(base), budget.short_s)
     runs, _ = metrics.evaluate(machine, controllers, short, starts, 0, net)
     rows = {c: [run for run in runs if run["controller"] == c] for c in controllers}
     return {c: float(np.mean([row["velocity_error_mean"] for row in rows[c]])) for c in rows}

@@ -86,10 +86,8 @@ def draw(machine: Machine, results: Results, shown: Shown, curve: Path) -> dict[
     run = kinds.index("workspace")
     scored = np.array(kinds) == "workspace"
     task = {k: Trace(*(array[:, scored] for array in trace)) for k, trace in shown.task.items()}
-    error, drift = (
-        transpose(with_intervals(results, key))
-        for key in ("velocity_error_mean", "off_axis_drift_max")
-    )
+    error = transpose(with_intervals(results, "velocity_error_mean"))
+    drift = transpose(with_intervals(results, "off_axis_drift_max"))
     regret = transpose(results["regret"]["less_perfect_model"])
     axes = axis_sequences(machine)
     drawn = {
@@ -139,10 +137,8 @@ def shipped_seeds(path: Path) -> list[dict[str, Any]]:
         return []
     names = ["controller", "seed", *(name for name, *_ in FIRST.values())]
     with expected(path, f"rows with {', '.join(names)}"):
-        content = read_json(path, "JSON")
-        rows = content["rows"] if isinstance(content, dict) else content
-        every = [{name: row[name] for name in names} for row in rows]
-        return [row for row in every if row["seed"] is not None]
+        rows = [{name: row[name] for name in names} for row in read_json(path, "JSON")]
+        return [row for row in rows if row["seed"] is not None]
 
 
 def shipped_family(path: Path) -> dict[str, dict[str, float]]:
@@ -174,9 +170,7 @@ def render(
     page.filters.update(label=label, transpose=transpose, with_intervals=with_intervals)
     training = training_claim(clock["train rl_paper"], results["meta"]["effort"]["paper_steps"])
     rows = next(iter(first_panels(machine, results).values()))
-    sequences = {}
-    for sequence in task_sequences(machine):
-        sequences[sequence.name] = path_row(hold_table(machine, sequence.goals))
+    paths = {s.name: path_row(hold_table(machine, s.goals)) for s in task_sequences(machine)}
     return page.get_template("report.html.j2").render(
         results=results,
         compared=compare(results),
@@ -193,7 +187,7 @@ def render(
         verdicts=VERDICTS,
         intervals="95 % intervals over starts in brackets",
         joints=list(machine.names),
-        sequences=sequences,
+        sequences=paths,
         tuning_paths=[path_row(np.array(run["goals"])) for run in results["tuning_runs"]],
     )
 

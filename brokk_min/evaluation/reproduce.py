@@ -159,25 +159,26 @@ def compare(
     short = sequences.shorten(machine, sequences.axis_sequences(machine), budget.short_s)
     bound_starts, extended = reachable[: budget.bound_starts], starts[kinds == "extended"]
     few = claims.singular_controllers(policies, pids)
-    near = partial(near_singularities, machine)
-    every = machine, controllers
     robust = {name: controllers[name] for name in ROBUST}
+    score, near = partial(evaluate, machine), partial(near_singularities, machine)
     jobs: dict[str, Callable[[], Any]] = {}
-    changed_machines = machine, robust, short, reachable[:16], seed
-    jobs["score changed machines"] = partial(robustness, *changed_machines)
+    jobs["score changed machines"] = partial(
+        robustness, machine, robust, short, reachable[:16], seed
+    )
     for name, bound in perfect_models(machine, bound_starts).items():
-        jobs[f"score {name}"] = partial(evaluate, machine, {name: bound}, short, bound_starts, seed)
-    jobs["score"] = partial(evaluate, *every, commands, starts, seed)
-    jobs["score for the regret"] = partial(evaluate, *every, short, bound_starts, seed)
+        jobs[f"score {name}"] = partial(score, {name: bound}, short, bound_starts, seed)
+    jobs["score"] = partial(score, controllers, commands, starts, seed)
+    jobs["score for the regret"] = partial(score, controllers, short, bound_starts, seed)
     jobs["score near singularities"] = partial(near, few, extended, budget.short_s, seed)
     changed, *bounds, (runs, traces), (on_short, _), singularities = side_by_side(jobs, clock)
     singular, verdicts, near_traces = singularities
     scored = [run for run in runs if run["kind"] == "workspace"]
     along_x = {c: Trace(*(array[:, workspace] for array in traces[c, "x"])) for c in pids}
     goals = commands[0].for_starts(machine, reachable)
-    claim = partial(claims.task_claims, machine)
-    theirs = claim("rl_paper", pids, scored, along_x, goals, verdicts.get("rl_paper", []))
-    ours = claim("rl", pids, scored, along_x, goals, verdicts.get("rl", []))
+    theirs, ours = (
+        claims.task_claims(machine, name, pids, scored, along_x, goals, verdicts.get(name, []))
+        for name in ("rl_paper", "rl")
+    )
     results = {
         "task_space": tables(runs, scored),
         "regret": regret([*on_short, *(run for rows, _ in bounds for run in rows)]),

@@ -219,6 +219,12 @@ def evaluation_starts(
     return starts[:num]
 
 
+def workspace_starts(machine: Machine, num: int) -> Array:
+    """The "workspace" poses, of which means are taken, among `num` of `evaluation_starts`."""
+    starts = evaluation_starts(machine, num, task_sequences(machine), 2)
+    return np.asarray(starts[np.array(start_kinds(machine, starts)) == "workspace"])
+
+
 def start_kinds(machine: Machine, starts: Array) -> list[str]:
     """Kind of each start (num, n): "extended", "limits" or "workspace"; numbers assumed.
 
