@@ -9,13 +9,7 @@ from helpers_bus import START, ConstantCommand, World
 from brokk_min.can.drive_log import Telemetry
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
-from brokk_min.viewer.control_process import (
-    Request,
-    SelectedController,
-    WindowDrive,
-    WindowOperator,
-    receive_telemetry,
-)
+from brokk_min.viewer.control_process import Request, WindowDrive, WindowInput, receive_telemetry
 from brokk_min.viewer.input_handler import InputHandler
 
 MODES = ["rl", "jacobian", "levers"]
@@ -70,9 +64,8 @@ class PipedLoop:
     def __init__(self, *controllers, log=None):
         self.connection, there = multiprocessing.Pipe()
         self.world = World(ConstantCommand(), lambda driving, ready: None, log=log)
-        operator = WindowOperator(BROKK_170, there, lambda: self.world.time)
-        selected = SelectedController(BROKK_170, controllers, operator)
-        self.world.drive = WindowDrive(BROKK_170, selected, self.world.bus, operator)
+        window = WindowInput(BROKK_170, controllers, there, lambda: self.world.time)
+        self.world.drive = WindowDrive(window, self.world.bus)
         self.ticks = []
         self.request(False)
         self.world.drive.begin()

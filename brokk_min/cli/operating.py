@@ -248,10 +248,9 @@ class Play(Command):
         if bool(self.interface) != bool(self.channel) or (self.drive and not self.interface):
             raise WrongUse("--interface, --channel: expected both or, without --drive, none")
         bus = control_process.BusOptions(self.interface, self.channel, self.log, self.start)
-        if self.interface and not self.drive:
-            play.watch(machine, bus)
-        else:
-            play.play(machine, self.controllers(machine), bus, self.attempts)
+        watching = self.interface and not self.drive
+        controllers = None if watching else self.controllers(machine)
+        play.play(machine, controllers, bus, self.attempts)
 
     def controllers(self, machine: Machine) -> dict[str, Controller]:
         """The policy and the paper's PID; none if no policy is given and none is shipped."""

@@ -47,15 +47,18 @@ class Request(NamedTuple):
     levers: Array  # actions of the driven joints, in [-1, 1]
 
 
-class WindowOperator:
-    """The operator of the loop: the newest request; a closed pipe stops the loop."""
+@dataclass
+class WindowInput:
+    """What the window asks of the loop by its newest request: goals, and which controller."""
 
-    def __init__(
-        self, machine: Machine, connection: Any, clock: Callable[[], float] = time.monotonic
-    ) -> None:
-        self.connection = connection
-        self.clock = clock
-        none = np.zeros(len(machine.driven))
+    machine: Machine
+    controllers: Sequence[Controller]  # by mode; the last mode is the levers
+    connection: Any  # to the window; once it is closed, the loop stops
+    clock: Callable[[], float] = time.monotonic  # of the requests [s]
+
+    def __post_init__(self) -> None:
+        """Begin without a request."""
+        none = np.zeros(len(self.machine.driven))
         self.request = Request(-np.inf, 0, False, False, np.zeros(3), none)
 
     @property
@@ -63,7 +66,7 @@ class WindowOperator:
         """Has there been no request for `SILENCE`?"""
         return self.clock() - self.request.time > SILENCE
 
-    def __call__(self, driving: bool, ready: bool) -> OperatorInput:
+    def operator(self, driving: bool, ready: bool) -> OperatorInput:
         """The operator's input in this tick."""
         try:
             while self.connection.poll():
@@ -75,56 +78,46 @@ class WindowOperator:
         x, y, z = self.request.v_goal.tolist()
         return OperatorInput((x, y, z), self.request.enable, self.request.alive)
 
-
-class SelectedController:
-    """The controller that the operator selects, at rest when it takes over; the last is levers."""
-
-    def __init__(
-        self, machine: Machine, controllers: Sequence[Controller], operator: WindowOperator
-    ) -> None:
-        self.machine = machine
-        self.controllers = controllers
-        self.operator = operator
-
     def start(self, num: int) -> tuple[int, Any]:
-        """Mode, and the state of its controller."""
-        mode = self.operator.request.mode
+        """Mode, and the state of its controller at rest."""
+        mode = self.request.mode
         levers = mode == len(self.controllers)
         return mode, None if levers else self.controllers[mode].start(num)
 
     def __call__(self, measured: Measured, state: tuple[int, Any]) -> tuple[Array, tuple[int, Any]]:
-        """Commands u (num, n), and the state of the next tick."""
-        request = self.operator.request
+        """Commands u (num, n) of the selected controller, and the state of the next tick."""
         num = len(measured.q)
-        mode, inner = state if state[0] == request.mode else self.start(num)
+        mode, inner = state if state[0] == self.request.mode else self.start(num)
         if mode == len(self.controllers):
-            u = np.tile(action_to_pwm(self.machine, request.levers), (num, 1))
+            u = np.tile(action_to_pwm(self.machine, self.request.levers), (num, 1))
         else:
             u, inner = self.controllers[mode](measured, inner)
         return u, (mode, inner)
 
 
 class WindowDrive(Drive):
-    """The 20 Hz loop, which sends telemetry to the window after each tick."""
+    """The 20 Hz loop under a window, to which telemetry goes after each tick."""
 
-    operator: WindowOperator
+    def __init__(self, window: WindowInput, bus: Any) -> None:
+        super().__init__(window.machine, window, bus, window.operator)
+        self.window = window
 
     def tick(self) -> bool:
         """One tick; a window that is silent gets nothing, because a full pipe would block."""
         more = super().tick()
         with self.catch_errors():
-            if more and not self.operator.silent:
-                self.operator.connection.send(self.telemetry())
+            if more and not self.window.silent:
+                self.window.connection.send(self.telemetry())
         return more
 
     def telemetry(self) -> Telemetry:
         """State after a tick."""
         q, q_dot = self.measured
-        u = self.gate.sent[..., -1] / PWM_MAX
-        v_goal = np.array(self.operator_input.v_goal)
         gate = self.gate
+        u = gate.sent[..., -1] / PWM_MAX
+        v_goal = np.array(self.operator_input.v_goal)
         flags = (bool(gate.driving), int(gate.active_fault), int(gate.latched_fault))
-        mode = self.operator.request.mode
+        mode = self.window.request.mode
         return Telemetry(self.ticks, q, q_dot, u, v_goal, *flags, mode, self.lateness)
 
 
@@ -136,9 +129,7 @@ def control(
     where = (options.interface, options.channel, options.log, used_ids(machine))
     try:
         with open_bus(*where) as bus:
-            operator = WindowOperator(machine, connection)
-            selected = SelectedController(machine, controllers, operator)
-            drive = WindowDrive(machine, selected, bus, operator)
+            drive = WindowDrive(WindowInput(machine, controllers, connection), bus)
             drive.begin()
             connection.send(drive.telemetry())  # from now on the window sends requests
             drive.run()

@@ -7,6 +7,7 @@ than life, and nothing depends on timing.
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from multiprocessing import Pipe
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +15,14 @@ import numpy as np
 
 from brokk_min.can.canopen import Frame
 from brokk_min.can.connection import Bus
+from brokk_min.can.drive_log import Telemetry
 from brokk_min.can.operator_input import Script
 from brokk_min.can.simulated_machine import SimulatedMachine
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.hw import Drive
 from brokk_min.identification.files import require
-from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
-from brokk_min.viewer.control_process import SelectedController, WindowDrive, WindowOperator
+from brokk_min.viewer.control_process import WindowDrive, WindowInput, receive_telemetry
 
 MOST_TICKS = 2  # for one picture; a window with fewer pictures a second than 10 is in slow motion
 START = 0.2  # s that the machine was on before: its nodes have been heard (assumed)
@@ -69,13 +70,12 @@ class SimulatedBus:
 
 
 class Lockstep:
-    """The loop of a window that drives a simulated machine; `advance` makes the ticks that are due.
+    """A window's loop and a simulated machine: `receive` makes the ticks that are due.
 
     Args:
         machine: what moves.
-        controllers: see `SelectedController`.
+        controllers: see `WindowInput`.
         start: first angles [rad] (n,).
-        connection: to the window, as of `control_process.control`.
         log: of all frames, or None.
         clock: of the window [s].
     """
@@ -85,24 +85,22 @@ class Lockstep:
         machine: Machine,
         controllers: Sequence[Controller],
         start: Array,
-        connection: Any,
         log: Path | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.clock = clock
-        self.bus = SimulatedBus(machine, start).open(log)
-        operator = WindowOperator(machine, connection, clock=lambda: -np.inf)  # never silent
-        selected = SelectedController(machine, controllers, operator)
-        self.drive = WindowDrive(machine, selected, self.bus, operator)
+        self.connection, loop_end = Pipe()
+        window = WindowInput(machine, controllers, loop_end, clock=lambda: -np.inf)  # never silent
+        self.drive = WindowDrive(window, SimulatedBus(machine, start).open(log))
         self.drive.begin()
-        operator.request = operator.request._replace(alive=True)
+        window.request = window.request._replace(alive=True)
         for _ in range(round(START * machine.rate)):
             self.drive.tick()
         self.due = clock()  # s, of the next tick
         self.late = 0.0  # s behind the window's clock
 
-    def advance(self) -> float:
-        """Ticks that are due, `MOST_TICKS` at most; how late the machine is in all [s]."""
+    def receive(self) -> Iterator[Telemetry]:
+        """Telemetry of the ticks that were due, `MOST_TICKS` at most, with how late they are."""
         for _ in range(MOST_TICKS):
             if self.clock() >= self.due:
                 self.due += self.drive.machine.dt
@@ -110,12 +108,14 @@ class Lockstep:
         lost = max(0.0, self.clock() - self.due)
         self.late += lost
         self.due += lost
-        return self.late
+        for telemetry in receive_telemetry(self.connection):
+            yield telemetry._replace(lateness=self.late)
 
     def close(self) -> None:
-        """A last tick, with closed valves: the window has closed its end of the connection."""
+        """A last tick, with closed valves."""
+        self.connection.close()
         self.drive.tick()
-        self.bus.close()
+        self.drive.bus.close()
 
 
 def line_goals(machine: Machine, line: Array) -> Array:
@@ -140,29 +140,16 @@ def follow(machine: Machine, controller: Controller, q: Array, goals: Array) -> 
         yield raw.simulated.plant.q
 
 
-class Comparison:
-    """Each controller traces the same line from the same pose, tick by tick; nobody steers.
+def compare(
+    machine: Machine, controllers: Mapping[str, Controller], q: Array, line: Array
+) -> Iterator[dict[str, Array]]:
+    """True angles [rad] (n,) under each controller, tick by tick without end; nobody steers.
 
-    Args:
-        machine: what moves, once for each controller.
-        controllers: by name.
-        q: first angles [rad] (n,).
-        line: points of the line from the tool on [m] (K, 3).
+    From the pose `q` [rad] all trace the line through points [m] (K, 3), then they stand still.
     """
-
-    def __init__(
-        self, machine: Machine, controllers: Mapping[str, Controller], q: Array, line: Array
-    ) -> None:
-        self.machine = machine
-        self.line = line
-        goals = line_goals(machine, line)
-        self.runs = {name: follow(machine, c, q, goals) for name, c in controllers.items()}
-        self.q = dict.fromkeys(controllers, q)
-        self.traces: dict[str, list[Array]] = {name: [] for name in controllers}
-
-    def update(self) -> None:
-        """One tick; at the end of the line nothing moves."""
-        for name, run in self.runs.items():
-            self.q[name] = next(run, self.q[name])
-            p_tool = tool_position(forward_kinematics(self.machine, self.q[name]))
-            self.traces[name].append(p_tool)
+    goals = line_goals(machine, line)
+    runs = {name: follow(machine, c, q, goals) for name, c in controllers.items()}
+    poses = dict.fromkeys(controllers, q)
+    while True:
+        poses = {name: next(run, poses[name]) for name, run in runs.items()}
+        yield poses

@@ -5,12 +5,10 @@ The window sends requests to the loop (`control_process`) and shows the telemetr
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from functools import partial
 from itertools import cycle
-from multiprocessing import Pipe
-from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
@@ -21,14 +19,15 @@ from brokk_min.can.simulated_machine import start_pose
 from brokk_min.evaluation.rollout import TITLES, Controller
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
-from brokk_min.viewer import control_process, drawing, tracing
-from brokk_min.viewer.control_process import BusOptions, Request
+from brokk_min.viewer import control_process, drawing, lockstep, tracing
+from brokk_min.viewer.control_process import BusOptions, Request, receive_telemetry, send_request
+from brokk_min.viewer.drawing import NO_POINTS
 from brokk_min.viewer.faults import fault_in_words
 from brokk_min.viewer.input_handler import LEVER_KEYS, PAD_SWITCH, InputHandler
-from brokk_min.viewer.lockstep import Comparison, Lockstep
 from brokk_min.viewer.window import Canvas, Colour, Window
 
 SIZE = (1120, 680)  # of the window at first [px]
+FPS = 60.0  # pictures a second, at most
 STALE = 0.5  # s without telemetry, then the pose is an old one (assumed)
 SLOW = 0.95  # of real time: a slower motion is shown (assumed)
 TRAIL = 600  # tool positions
@@ -40,7 +39,7 @@ class Session:
     Args:
         machine: what is shown.
         controllers: by mode; the levers are the last mode. None: the window only watches.
-        file: of the attempts, or None.
+        file: of the attempts.
         simulated: may the controllers be compared on simulated machines?
     """
 
@@ -48,27 +47,28 @@ class Session:
         self,
         machine: Machine,
         controllers: Mapping[str, Controller] | None,
-        file: Path | None,
+        file: Path,
         simulated: bool = False,
     ) -> None:
         self.machine = machine
         self.modes = [] if controllers is None else [*controllers, "levers"]
         self.compared = dict(controllers or {}) if simulated else {}
         self.file = file
-        self.attempts = tracing.read_attempts(file) if file else []
+        self.attempts = tracing.read_attempts(file) if self.modes else []
         self.lines = tracing.task_lines(machine)
         self.names = cycle(self.lines)
         self.task = ""
-        self.path: Array = drawing.NO_POINTS  # of the last line [m]
-        self.in_view: Array = drawing.NO_POINTS  # while and after a line is traced
+        self.path: Array = NO_POINTS  # of the last line [m]
+        self.in_view: Array = NO_POINTS  # while and after a line is traced
         self.tracing: tracing.Tracing | None = None
         self.finished: tracing.Attempt | None = None
-        self.comparison: Comparison | None = None
+        self.comparison: Iterator[dict[str, Array]] | None = None
+        self.compared_q: list[dict[str, Array]] = []  # of each tick, by controller [rad] (n,)
         self.previous: Telemetry | None = None
         self.telemetry: Telemetry | None = None
         self.pose: Array = np.full(machine.n, np.nan)  # the last known one [rad]
         self.arrivals = deque[float](maxlen=round(machine.rate) + 1)  # s, of a second's ticks
-        self.trail = list[Array]()
+        self.trail: Array = NO_POINTS  # past tool positions [m] (T, 3)
 
     def update(self, telemetry: Telemetry, now: float) -> None:
         """A new tick."""
@@ -79,7 +79,7 @@ class Session:
             return
         self.pose = telemetry.q
         p_tool = tool_position(forward_kinematics(self.machine, telemetry.q))
-        self.trail = [*self.trail, p_tool][-TRAIL:]
+        self.trail = np.vstack([self.trail, p_tool])[-TRAIL:]
         mode_changed = self.previous is not None and self.previous.mode != telemetry.mode
         if mode_changed and self.tracing and self.tracing.p:
             self.next_task("again")
@@ -87,16 +87,15 @@ class Session:
             self.finished = self.tracing.attempt(self.modes[telemetry.mode])
             self.tracing = None
             self.attempts.append(self.finished)
-            if self.file:
-                tracing.write_attempts(self.file, self.attempts)
-        if self.comparison and telemetry.driving:
+            tracing.write_attempts(self.file, self.attempts)
+        if telemetry.driving:
             self.comparison = None
         if self.comparison:
-            self.comparison.update()
+            self.compared_q.append(next(self.comparison))
 
     def next_task(self, which: str = "next") -> None:
         """The next line, the same one "again" from where the tool is, or by all: "compare"."""
-        if not self.trail:
+        if not len(self.trail):
             return
         if which == "next" or not self.task:
             self.task = next(self.names)
@@ -104,7 +103,9 @@ class Session:
         self.trail = self.trail[-1:]
         self.finished = self.comparison = self.tracing = None
         if which == "compare" and self.compared:
-            self.comparison = Comparison(self.machine, self.compared, self.pose, self.path)
+            line = (self.machine, self.compared, self.pose, self.path)
+            self.comparison = lockstep.compare(*line)
+            self.compared_q = [next(self.comparison)]
         else:
             self.tracing = tracing.Tracing(self.machine, self.task, self.path)
 
@@ -136,7 +137,7 @@ class Session:
             telemetry.q_dot if known else zero,
             telemetry.u,
             telemetry.v_goal,
-            trail=np.array(self.trail).reshape(-1, 3),
+            trail=self.trail,
             path=self.path,
             title=TITLES.get(mode, self.machine.name),
             status=status,
@@ -150,24 +151,21 @@ class Session:
     def _with_line(self, scene: drawing.Scene) -> drawing.Scene:
         """The scene near the line, which stays so until the next line."""
         runs = []
-        if self.comparison:
-            for name, q in self.comparison.q.items():
-                trace = np.array(self.comparison.traces[name]).reshape(-1, 3)
-                text = distances(self.path, trace).replace(" from the line", "")
-                text = f"{TITLES.get(name, name)}: {text}"
-                runs.append(drawing.Trace(q, trace, drawing.COLOURS[name], text))
-            scene = scene._replace(
-                q=runs[0].q, q_dot=0 * scene.q, traces=runs, trail=scene.path[:0]
-            )
+        for name in self.compared if self.comparison else ():
+            q = np.array([poses[name] for poses in self.compared_q])
+            trail = tool_position(forward_kinematics(self.machine, q))
+            text = f"{TITLES.get(name, name)}: {distances(self.path, trail)}"
+            runs.append(drawing.Trace(q[-1], trail, drawing.COLOURS[name], text))
+        if runs:
+            scene = scene._replace(q=runs[0].q, q_dot=0 * scene.q, traces=runs, trail=NO_POINTS)
+        else:
+            scene = scene._replace(headline=distances(self.path, scene.trail, " from the line"))
         poses = np.array([scene.q, *(run.q for run in runs)])
         p_tool = tool_position(forward_kinematics(self.machine, poses))
         points = np.vstack([self.in_view, p_tool])
         self.in_view = np.vstack([self.path, points.min(axis=0), points.max(axis=0)])
-        headline = distances(self.path, scene.trail)
-        target = self.path[:0]
-        if self.tracing:
-            target = self.path[self.tracing.passed : self.tracing.passed + 1]
-        return scene._replace(target=target, in_view=self.in_view, headline=headline)
+        passed = self.tracing.passed if self.tracing else len(self.path)
+        return scene._replace(target=self.path[passed : passed + 1], in_view=self.in_view)
 
     def _interpolate(self, q: Array, now: float) -> Array:
         if self.previous is None or not np.isfinite(self.previous.q).all():
@@ -200,12 +198,10 @@ class Session:
         return notes + tracing.attempts_table(self.attempts, self.task)
 
 
-def distances(line: Array, trail: Array) -> str:
+def distances(line: Array, trail: Array, where: str = "") -> str:
     """Distance of the tool from a line now, and the largest one, as text."""
-    if not len(trail):
-        return ""
     millimetres = 1e3 * tracing.distance(line, trail)
-    return f"{millimetres[-1]:.0f} mm from the line, at most {millimetres.max():.0f} mm"
+    return f"{millimetres[-1]:.0f} mm{where}, at most {millimetres.max():.0f} mm"
 
 
 def gate_status(telemetry: Telemetry, hint: str) -> tuple[str, Colour]:
@@ -231,17 +227,14 @@ def next_step(session: Session, handler: InputHandler) -> str:
 
 
 FrameHook = Callable[[Session, InputHandler], bool]  # called each frame; False closes the window
+Receive = Callable[[], Iterable[Telemetry]]
+Send = Callable[[Request], object]
 
 
 def show(
-    window: Window,
-    session: Session,
-    receive: Callable[[], Iterable[Telemetry]],
-    send: Callable[[Request], object],
-    each_frame: FrameHook = lambda session, handler: True,
-    fps: float = 60.0,
+    window: Window, session: Session, receive: Receive, send: Send, each_frame: FrameHook
 ) -> None:
-    """The window until it is closed: input, telemetry, one picture, `fps` times a second.
+    """The window until it is closed: input, telemetry, one picture, `FPS` times a second.
 
     Without modes it only watches. Requests are sent once there is telemetry.
     """
@@ -262,18 +255,19 @@ def show(
         canvas = Canvas(window.size)
         scene = session.scene(now, modes[handler.mode], next_step(session, handler))
         drawing.draw(canvas, session.machine, [scene])
-        window.show(canvas, fps)
+        window.show(canvas, FPS)
 
 
 def play(
     machine: Machine,
-    controllers: Mapping[str, Controller],
+    controllers: Mapping[str, Controller] | None,
     options: BusOptions,
     attempts: Path,
     each_frame: FrameHook = lambda session, handler: True,
 ) -> None:
     """Drive with keyboard or gamepad: the simulated machine, or the one on a bus.
 
+    Without controllers (None) it only shows the machine on a bus, and nothing is sent.
     The window opens first: nothing may reach a bus if nobody can see it.
 
     ValueError: no window, no bus, or a loop that ended by itself.
@@ -281,47 +275,29 @@ def play(
     session = Session(machine, controllers, attempts, not options.interface)
     with (
         closing(Window(SIZE, f"brokk_min: {machine.name}")) as window,
-        connect(machine, list(controllers.values()), options) as (connection, advance),
+        connect(machine, controllers, options) as (receive, send),
     ):
-
-        def receive() -> Iterator[Telemetry]:
-            """What the loop sent since the last picture, with how late it is."""
-            late = advance()
-            for telemetry in control_process.receive_telemetry(connection):
-                yield telemetry if late is None else telemetry._replace(lateness=late)
-
-        send = partial(control_process.send_request, connection)
         show(window, session, receive, send, each_frame)
 
 
 @contextmanager
 def connect(
-    machine: Machine, controllers: Sequence[Controller], options: BusOptions
-) -> Iterator[tuple[Connection, Callable[[], float | None]]]:
-    """The pipe to a loop, and what lets its time pass: a process with a bus has its own time."""
+    machine: Machine, controllers: Mapping[str, Controller] | None, options: BusOptions
+) -> Iterator[tuple[Receive, Send]]:
+    """What gives telemetry and what takes requests: a bus, a loop on it, or one in lockstep."""
+    if controllers is None:
+        update = TelemetryReader(machine).update
+        with open_bus(options.interface, options.channel, options.log) as bus:
+            yield (
+                lambda: filter(None, map(update, iter(lambda: bus.recv(0), None))),
+                lambda request: None,
+            )
+        return
+    known = list(controllers.values())
     if options.interface:
-        with control_process.start(machine, controllers, options) as connection:
-            yield connection, lambda: None
+        with control_process.start(machine, known, options) as pipe:
+            yield partial(receive_telemetry, pipe), partial(send_request, pipe)
         return
     start = start_pose(machine, options.start)
-    window_end, loop_end = Pipe()
-    with closing(Lockstep(machine, controllers, start, loop_end, options.log)) as loop, window_end:
-        yield window_end, loop.advance
-
-
-def watch(
-    machine: Machine, options: BusOptions, each_frame: FrameHook = lambda session, handler: True
-) -> None:
-    """Show a machine on a bus; nothing is sent."""
-    session = Session(machine, None, None)
-    reader = TelemetryReader(machine)
-    with (
-        closing(Window(SIZE, f"brokk_min: {machine.name}")) as window,
-        open_bus(options.interface, options.channel, options.log) as bus,
-    ):
-
-        def receive() -> Iterable[Telemetry]:
-            """Telemetry from the frames that wait on the bus."""
-            return filter(None, map(reader.update, iter(lambda: bus.recv(0), None)))
-
-        show(window, session, receive, lambda request: None, each_frame)
+    with closing(lockstep.Lockstep(machine, known, start, options.log)) as loop:
+        yield loop.receive, partial(send_request, loop.connection)

@@ -14,7 +14,7 @@ from brokk_min.viewer import control_process
 from brokk_min.viewer.control_process import (
     BusOptions,
     Request,
-    WindowOperator,
+    WindowInput,
     control,
     receive_telemetry,
     send_request,
@@ -27,7 +27,7 @@ REQUEST = Request(10.0, 0, True, True, np.array([0.1, 0.0, 0.0]), np.zeros(4))
 def test_operator__gives_the_newest_request_until_it_is_too_old():
     here, there = multiprocessing.Pipe()
     now = 10.0
-    operator = WindowOperator(BROKK_170, there, lambda: now)
+    operator = WindowInput(BROKK_170, [], there, lambda: now).operator
     assert operator(False, True) == OperatorInput(alive=False)  # no request yet
     here.send(REQUEST._replace(v_goal=np.ones(3)))
     here.send(REQUEST)

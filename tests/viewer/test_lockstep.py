@@ -1,7 +1,7 @@
 """Loop and simulated machine on a clock that stands still while anything computes."""
 
+import itertools
 from contextlib import closing
-from multiprocessing import Pipe
 
 import numpy as np
 import pytest
@@ -10,43 +10,41 @@ from helpers_bus import BASELINE, START, ConstantCommand
 from brokk_min.actuator import plant_reset, plant_step
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
-from brokk_min.viewer.control_process import Request, receive_telemetry, send_request
-from brokk_min.viewer.lockstep import Comparison, Lockstep, follow
+from brokk_min.viewer.control_process import Request
+from brokk_min.viewer.lockstep import Lockstep, compare, follow
 
 NEUTRAL = Request(0.0, 0, False, True, np.zeros(3), np.zeros(4))
 
 
 def driven(seconds_a_picture, pictures):
-    """Telemetry of a window that draws slowly, while the operator holds the switch; lateness."""
+    """Telemetry of a window that draws slowly, while the operator holds the switch."""
     now = 100.0
-    here, there = Pipe()
     slew = ConstantCommand(60, 0, 0, 0, 0)
     ticks = []
-    with closing(Lockstep(BROKK_170, [slew], START, there, None, lambda: now)) as loop, here:
+    with closing(Lockstep(BROKK_170, [slew], START, None, lambda: now)) as loop:
         for _ in range(pictures):
             ready = bool(ticks) and not ticks[-1].active_fault
-            send_request(here, NEUTRAL._replace(enable=ready))
-            late = loop.advance()
-            ticks += receive_telemetry(here)
+            loop.connection.send(NEUTRAL._replace(enable=ready))
+            ticks += loop.receive()
             now += seconds_a_picture
     assert not loop.drive.gate.sent[..., -1].any()  # the last tick, after the window was closed
-    return ticks, late
+    return ticks
 
 
 @pytest.mark.parametrize(("period", "late"), [(1 / 60, 0.0), (0.1, 0.0), (0.5, 0.4)])
-def test_advance__makes_due_ticks_and_loses_the_time_of_more_than_two_a_picture(period, late):
-    ticks, lateness = driven(period, 30)
+def test_receive__makes_due_ticks_and_loses_the_time_of_more_than_two_a_picture(period, late):
+    ticks = driven(period, 30)
     assert [t.tick for t in ticks] == list(range(1, len(ticks) + 1))
     assert not ticks[3].active_fault  # the machine was on before the window opened
     expected = 4 + min(2, period / 0.05) * 29
     assert abs(len(ticks) - expected) <= 2
-    assert lateness == pytest.approx(29 * late, abs=0.11)
+    assert ticks[-1].lateness == pytest.approx(29 * late, abs=0.11)
     assert not [t for t in ticks if t.driving and t.active_fault]
 
 
-def test_advance__gives_the_same_motion_however_slow_the_window_is():
-    quick = [t for t in driven(0.05, 60)[0] if t.driving]
-    slow = [t for t in driven(1.0, 30)[0] if t.driving]
+def test_receive__gives_the_same_motion_however_slow_the_window_is():
+    quick = [t for t in driven(0.05, 60) if t.driving]
+    slow = [t for t in driven(1.0, 30) if t.driving]
     assert len(slow) > 40
     for a, b in zip(quick, slow, strict=False):
         np.testing.assert_array_equal(a.u, b.u)
@@ -70,13 +68,11 @@ def test_follow__moves_the_plant_as_the_commands_of_the_loop_do():
     )
 
 
-def test_comparison__stands_still_at_the_end_of_the_line():
+def test_compare__stands_still_at_the_end_of_the_line():
     p = tool_position(forward_kinematics(BROKK_170, np.array(START)))
     line = p + np.array([[0.0, 0, 0], [0, 0.15, 0]])
-    comparison = Comparison(BROKK_170, {"jacobian": BASELINE}, np.array(START), line)
-    for _ in range(90):
-        comparison.update()
-    trace = np.array(comparison.traces["jacobian"])
-    assert len(trace) == 90
+    poses = compare(BROKK_170, {"jacobian": BASELINE}, np.array(START), line)
+    q = [pose["jacobian"] for pose in itertools.islice(poses, 90)]
+    trace = tool_position(forward_kinematics(BROKK_170, np.array(q)))
     np.testing.assert_allclose(trace[-1], line[-1], atol=0.05)
     np.testing.assert_array_equal(trace[-1], trace[-10])

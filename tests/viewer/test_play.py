@@ -20,8 +20,12 @@ from brokk_min.viewer.window import Window
 CONTROLLERS = {"rl": ConstantCommand(), "jacobian": ConstantCommand()}
 
 
-def test_scene__interpolates_between_two_ticks_and_keeps_the_last_pose():
-    session = Session(BROKK_170, CONTROLLERS, None)
+@pytest.fixture
+def session(tmp_path):
+    return Session(BROKK_170, CONTROLLERS, tmp_path / "attempts.csv")
+
+
+def test_scene__interpolates_between_two_ticks_and_keeps_the_last_pose(session):
     q = np.array(START)
     scene = session.scene(0.0, "rl", "starting")
     assert np.isnan(scene.q).all()
@@ -50,8 +54,7 @@ def test_scene__interpolates_between_two_ticks_and_keeps_the_last_pose():
     assert late.banner == "No telemetry: the pose is the last known one."
 
 
-def test_scene__greys_the_last_pose_and_says_why_a_position_is_missing():
-    session = Session(BROKK_170, CONTROLLERS, None)
+def test_scene__greys_the_last_pose_and_says_why_a_position_is_missing(session):
     session.update(telemetry(0), 1.0)
     malformed = 1 + Fault.MALFORMED * 6  # of q1, among five joints and the valve controller
     lost = telemetry(1, np.full(5, np.nan), active_fault=malformed, driving=False)
@@ -66,8 +69,7 @@ def test_scene__greys_the_last_pose_and_says_why_a_position_is_missing():
     assert scene.banner.endswith("Over now: release SPACE, then press it again.")
 
 
-def test_scene__keeps_its_zoom_and_the_distance_from_the_line_until_the_next_line():
-    session = Session(BROKK_170, CONTROLLERS, None)
+def test_scene__keeps_its_zoom_and_the_distance_from_the_line_until_the_next_line(session):
     session.update(telemetry(), 0.0)
     assert not len(session.scene(0.0, "rl", "").in_view)
     session.lines["rectangle"] = np.array([[0.0, 0, 0], [0, 0.05, 0]])
@@ -89,8 +91,7 @@ def test_scene__keeps_its_zoom_and_the_distance_from_the_line_until_the_next_lin
     np.testing.assert_allclose(session.scene(0.21, "rl", "").in_view, wider)  # it does not shrink
 
 
-def test_compare__lays_the_traces_of_all_controllers_over_each_other():
-    session = Session(BROKK_170, {"jacobian": BASELINE, "rl": ConstantCommand(0, 0, 0, 0, 0)}, None)
+def test_compare__lays_the_traces_of_all_controllers_over_each_other(session):
     session.update(telemetry(driving=False), 0.0)
     session.next_task("compare")
     assert session.comparison is None  # on a bus the window shows the machine alone
@@ -99,8 +100,7 @@ def test_compare__lays_the_traces_of_all_controllers_over_each_other():
     session.next_task("compare")
     for tick in range(120):
         session.update(telemetry(tick, driving=False), 0.05 * tick)
-    scene = session.scene(5.96, "rl", "ready")
-    moved, stood = scene.traces
+    moved, stood = session.scene(5.96, "rl", "ready").traces
     assert moved.trail[-1][1] == pytest.approx(0.3, abs=0.05)
     np.testing.assert_array_equal(moved.trail[-1], moved.trail[-10])  # it has arrived
     np.testing.assert_allclose(stood.trail, np.tile(tool(START), (len(stood.trail), 1)), atol=1e-9)
@@ -110,8 +110,7 @@ def test_compare__lays_the_traces_of_all_controllers_over_each_other():
     assert session.comparison is None  # who drives sees the machine
 
 
-def test_session__begins_a_line_again_when_the_mode_changes_on_the_way():
-    session = Session(BROKK_170, CONTROLLERS, None)
+def test_session__begins_a_line_again_when_the_mode_changes_on_the_way(session):
     session.update(telemetry(), 0.0)
     session.next_task("again")
     first = session.tracing
@@ -130,8 +129,7 @@ def test_session__begins_a_line_again_when_the_mode_changes_on_the_way():
     assert session.task == "circle"
 
 
-def test_show__sends_requests_once_there_is_telemetry_and_takes_keys_frame_by_frame():
-    session = Session(BROKK_170, CONTROLLERS, None)
+def test_show__sends_requests_once_there_is_telemetry_and_takes_keys_frame_by_frame(session):
     frames = [[], [telemetry(0)], [telemetry(1)], [telemetry(2), telemetry(3)], [telemetry(4)]]
     presses = [[], [], ["return"], ["return"], ["backspace", "tab"], ["escape"]]
     sent = []
@@ -145,7 +143,7 @@ def test_show__sends_requests_once_there_is_telemetry_and_takes_keys_frame_by_fr
         return bool(presses)
 
     with closing(Window(play.SIZE, "test")) as window:
-        play.show(window, session, lambda: frames.pop(0), sent.append, each_frame, fps=500.0)
+        play.show(window, session, lambda: frames.pop(0), sent.append, each_frame)
     assert [task for task, _ in tasks] == ["", "", "", "rectangle", "circle", "circle"]
     assert tasks[5][1] is not tasks[4][1]  # begun again
     assert [request.mode for request in sent] == [0, 0, 0, 1]  # not in the first frame
@@ -191,7 +189,7 @@ def test_play__reaches_no_bus_without_a_window(interface, monkeypatch, tmp_path)
     with pytest.raises(ValueError, match="window: expected a display"):
         play.play(BROKK_170, {}, options, tmp_path / "none")
     with pytest.raises(ValueError, match="window: expected a display"):
-        play.watch(BROKK_170, options)
+        play.play(BROKK_170, None, options, tmp_path / "none")
     assert not list(tmp_path.iterdir())
 
 
@@ -201,7 +199,7 @@ def test_play__ends_with_the_reason_of_a_loop_that_cannot_begin(tmp_path):
         play.play(BROKK_170, {}, options, tmp_path / "attempts.csv")
 
 
-def test_watch__shows_another_programs_drive_and_sends_nothing():
+def test_watch__shows_another_programs_drive_and_sends_nothing(tmp_path):
     def operator(driving, ready):
         return OperatorInput((0.1, 0, 0) if driving else (0, 0, 0), ready)
 
@@ -223,7 +221,7 @@ def test_watch__shows_another_programs_drive_and_sends_nothing():
         post_key("space")
         return more
 
-    play.watch(BROKK_170, BusOptions("virtual", "watched"), each_frame)
+    play.play(BROKK_170, None, BusOptions("virtual", "watched"), tmp_path / "none", each_frame)
     assert peer.recv(0.1) is None
     peer.shutdown()
     assert seen[-1].driving
