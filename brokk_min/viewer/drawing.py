@@ -74,7 +74,7 @@ def draw(canvas: Canvas, machine: Machine, scenes: Sequence[Scene]) -> None:
     height = float(canvas.size[1])
     for i, scene in enumerate(scenes):
         _panel(canvas, machine, scene, (i * width, 0.0, width, height))
-        if i > 0:
+        if i:
             canvas.line(np.array([[i * width, 12], [i * width, height - 12]]), TRACK, 2)
 
 
@@ -209,7 +209,7 @@ def _base(canvas: Canvas, machine: Machine, camera: Camera, scene: Scene) -> Non
     """Tracks, outriggers, and the turret over them."""
     parts = [(part, STEEL) for part in shapes.undercarriage(machine)]
     for part, colour in [*parts, (shapes.turret(machine, scene.q), _pale(scene.colour, -0.3))]:
-        near, far = camera.project(part.near), camera.project(part.far)
+        near, far = camera.project(part)
         for k in range(len(near)):
             canvas.polygon(np.array([near[k - 1], near[k], far[k], far[k - 1]]), colour)
         canvas.polygon(near, colour)
@@ -243,13 +243,11 @@ def _arm(canvas: Canvas, machine: Machine, camera: Camera, scene: Scene, red: se
 
 def _tool(canvas: Canvas, machine: Machine, camera: Camera, scene: Scene) -> None:
     """Path, trail, next target, tool tip, and its velocities."""
-    if len(scene.path) > 1:
-        canvas.line(camera.project(scene.path), PATH, 3)
-    if len(scene.trail) > 1:
-        canvas.line(camera.project(scene.trail), scene.colour, 2)
-    for trace in scene.traces:
-        if len(trace.trail) > 1:
-            canvas.line(camera.project(trace.trail), trace.colour, 2)
+    lines = [(scene.path, PATH, 3), (scene.trail, scene.colour, 2)]
+    lines += [(trace.trail, trace.colour, 2) for trace in scene.traces]
+    for points, colour, width in lines:
+        if len(points) > 1:
+            canvas.line(camera.project(points), colour, width)
     for p in scene.target:
         canvas.circle(camera.project(p), 10.5, PATH, 3)
     frames = forward_kinematics(machine, scene.q)

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,22 +21,20 @@ PAD_BUTTONS = {3: "mode", 0: "next", 1: "again"}
 KEYS = {"escape": "close", "tab": "mode", "return": "next", "backspace": "again", "c": "compare"}
 
 
+@dataclass
 class InputHandler:
     """Keyboard and gamepad as one operator.
 
     The dead-man switch (space, or the gamepad's button) counts only if it is pressed with nothing
     deflected. It must be released first after a loss of focus or gamepad and a change of mode.
-
-    Args:
-        machine: its driven joints have a lever each.
-        pygame: the module, with a window.
-        modes: names of the controllers, the last one "levers".
     """
 
-    def __init__(self, machine: Machine, pygame: Any, modes: Sequence[str]) -> None:
-        self.machine = machine
-        self.pygame = pygame
-        self.modes = modes
+    machine: Machine  # its driven joints have a lever each
+    pygame: Any  # the module, with a window
+    modes: Sequence[str]  # names of the controllers, the last one "levers"
+
+    def __post_init__(self) -> None:
+        """Begin with nothing pressed."""
         self.mode = 0
         self.time = time.monotonic()  # of the last request [s]
         self.held = set[str]()  # keys
@@ -46,8 +45,9 @@ class InputHandler:
         self.closed = False
         self.task = ""  # "next", "again" or "compare"
         self.deflection: Array = np.zeros(3)
-        pygame.joystick.init()
-        self.pad: Any = pygame.joystick.Joystick(0) if pygame.joystick.get_count() else None
+        joystick = self.pygame.joystick
+        joystick.init()
+        self.pad: Any = joystick.Joystick(0) if joystick.get_count() else None
 
     @property
     def by_joint(self) -> bool:
@@ -77,9 +77,10 @@ class InputHandler:
                 self._press(PAD_BUTTONS.get(event.button, ""))
             case pg.JOYDEVICEADDED if self.pad is None:
                 self._change_pad(pg.joystick.Joystick(event.device_index))
-            case pg.JOYDEVICEREMOVED:
-                if self.pad and event.instance_id == self.pad.get_instance_id():
-                    self._change_pad(None)
+            case pg.JOYDEVICEREMOVED if (
+                self.pad and event.instance_id == self.pad.get_instance_id()
+            ):
+                self._change_pad(None)
 
     def _press(self, meaning: str) -> None:
         """A key or button that means something besides motion."""
@@ -107,14 +108,12 @@ class InputHandler:
         ramp = last + np.clip(target - last, -step, step)
         self.deflection = np.where(target == 0, 0.0, ramp)  # released: neutral at once
         self._update_switch(bool(target.any()))
-        v_goal: Array = np.zeros(3)
-        levers: Array = np.zeros(len(self.machine.driven))
+        no_levers = np.zeros(len(self.machine.driven))
+        request = Request(now, self.mode, self.enable, not self.lost, np.zeros(3), no_levers)
         if self.by_joint:
-            levers = self.deflection
-        else:
-            length = float(np.linalg.norm(self.deflection))
-            v_goal = self.machine.tool_speed * self.deflection / max(1.0, length)
-        return Request(now, self.mode, self.enable, not self.lost, v_goal, levers)
+            return request._replace(levers=self.deflection)
+        length = float(np.linalg.norm(self.deflection))
+        return request._replace(v_goal=self.machine.tool_speed * self.deflection / max(1.0, length))
 
     def _target(self) -> Array:
         """Deflections of stick or levers in [-1, 1]; keys give a third of it with shift."""

@@ -7,6 +7,7 @@ than life, and nothing depends on timing.
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from multiprocessing import Pipe
 from pathlib import Path
 from typing import Any
@@ -69,41 +70,35 @@ class SimulatedBus:
         """Nothing to close."""
 
 
+@dataclass
 class Lockstep:
-    """A window's loop and a simulated machine: `receive` makes the ticks that are due.
+    """A window's loop and a simulated machine: `receive` makes the ticks that are due."""
 
-    Args:
-        machine: what moves.
-        controllers: see `WindowInput`.
-        start: first angles [rad] (n,).
-        log: of all frames, or None.
-        clock: of the window [s].
-    """
+    machine: Machine
+    controllers: Sequence[Controller]  # see `WindowInput`
+    start: Array  # first angles [rad] (n,)
+    log: Path | None = None  # of all frames
+    clock: Callable[[], float] = time.monotonic  # of the window [s]
 
-    def __init__(
-        self,
-        machine: Machine,
-        controllers: Sequence[Controller],
-        start: Array,
-        log: Path | None = None,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self.clock = clock
+    def __post_init__(self) -> None:
+        """Begin with a machine that is on and has been heard."""
         self.connection, loop_end = Pipe()
-        window = WindowInput(machine, controllers, loop_end, clock=lambda: -np.inf)  # never silent
-        self.drive = WindowDrive(window, SimulatedBus(machine, start).open(log))
+        window = WindowInput(
+            self.machine, self.controllers, loop_end, lambda: -np.inf
+        )  # no silence
+        self.drive = WindowDrive(window, SimulatedBus(self.machine, self.start).open(self.log))
         self.drive.begin()
         window.request = window.request._replace(alive=True)
-        for _ in range(round(START * machine.rate)):
+        for _ in range(round(START * self.machine.rate)):
             self.drive.tick()
-        self.due = clock()  # s, of the next tick
+        self.due = self.clock()  # s, of the next tick
         self.late = 0.0  # s behind the window's clock
 
     def receive(self) -> Iterator[Telemetry]:
         """Telemetry of the ticks that were due, `MOST_TICKS` at most, with how late they are."""
         for _ in range(MOST_TICKS):
             if self.clock() >= self.due:
-                self.due += self.drive.machine.dt
+                self.due += self.machine.dt
                 self.drive.tick()
         lost = max(0.0, self.clock() - self.due)
         self.late += lost
@@ -143,13 +138,14 @@ def follow(machine: Machine, controller: Controller, q: Array, goals: Array) -> 
 def compare(
     machine: Machine, controllers: Mapping[str, Controller], q: Array, line: Array
 ) -> Iterator[dict[str, Array]]:
-    """True angles [rad] (n,) under each controller, tick by tick without end; nobody steers.
+    """True angles [rad] (n,) by controller, from the start on and tick by tick without end.
 
-    From the pose `q` [rad] all trace the line through points [m] (K, 3), then they stand still.
+    From the pose `q` [rad] all trace the line through points [m] (K, 3), and nobody steers; then
+    they stand still.
     """
     goals = line_goals(machine, line)
     runs = {name: follow(machine, c, q, goals) for name, c in controllers.items()}
     poses = dict.fromkeys(controllers, q)
     while True:
-        poses = {name: next(run, poses[name]) for name, run in runs.items()}
         yield poses
+        poses = {name: next(run, poses[name]) for name, run in runs.items()}

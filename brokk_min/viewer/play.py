@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from functools import partial
 from itertools import cycle
 from pathlib import Path
@@ -33,29 +34,20 @@ SLOW = 0.95  # of real time: a slower motion is shown (assumed)
 TRAIL = 600  # tool positions
 
 
+@dataclass
 class Session:
-    """What the window shows: telemetry, trail of the tool, the line being traced, attempts.
+    """What the window shows: telemetry, trail of the tool, the line being traced, attempts."""
 
-    Args:
-        machine: what is shown.
-        controllers: by mode; the levers are the last mode. None: the window only watches.
-        file: of the attempts.
-        simulated: may the controllers be compared on simulated machines?
-    """
+    machine: Machine
+    controllers: Mapping[str, Controller] | None  # a mode each; None: the window only watches
+    file: Path  # of the attempts
+    simulated: bool = False  # may the controllers be compared on simulated machines?
 
-    def __init__(
-        self,
-        machine: Machine,
-        controllers: Mapping[str, Controller] | None,
-        file: Path,
-        simulated: bool = False,
-    ) -> None:
-        self.machine = machine
-        self.modes = [] if controllers is None else [*controllers, "levers"]
-        self.compared = dict(controllers or {}) if simulated else {}
-        self.file = file
-        self.attempts = tracing.read_attempts(file) if self.modes else []
-        self.lines = tracing.task_lines(machine)
+    def __post_init__(self) -> None:
+        """Begin without telemetry and without a line."""
+        self.modes = [] if self.controllers is None else [*self.controllers, "levers"]
+        self.attempts = tracing.read_attempts(self.file) if self.modes else []
+        self.lines = tracing.task_lines(self.machine)
         self.names = cycle(self.lines)
         self.task = ""
         self.path: Array = NO_POINTS  # of the last line [m]
@@ -66,8 +58,8 @@ class Session:
         self.compared_q: list[dict[str, Array]] = []  # of each tick, by controller [rad] (n,)
         self.previous: Telemetry | None = None
         self.telemetry: Telemetry | None = None
-        self.pose: Array = np.full(machine.n, np.nan)  # the last known one [rad]
-        self.arrivals = deque[float](maxlen=round(machine.rate) + 1)  # s, of a second's ticks
+        self.pose: Array = np.full(self.machine.n, np.nan)  # the last known one [rad]
+        self.arrivals = deque[float](maxlen=round(self.machine.rate) + 1)  # s, of a second's ticks
         self.trail: Array = NO_POINTS  # past tool positions [m] (T, 3)
 
     def update(self, telemetry: Telemetry, now: float) -> None:
@@ -102,8 +94,8 @@ class Session:
         self.path = self.in_view = self.trail[-1] + self.lines[self.task]
         self.trail = self.trail[-1:]
         self.finished = self.comparison = self.tracing = None
-        if which == "compare" and self.compared:
-            line = (self.machine, self.compared, self.pose, self.path)
+        if which == "compare" and self.controllers and self.simulated:
+            line = (self.machine, self.controllers, self.pose, self.path)
             self.comparison = lockstep.compare(*line)
             self.compared_q = [next(self.comparison)]
         else:
@@ -151,7 +143,7 @@ class Session:
     def _with_line(self, scene: drawing.Scene) -> drawing.Scene:
         """The scene near the line, which stays so until the next line."""
         runs = []
-        for name in self.compared if self.comparison else ():
+        for name in self.compared_q[0] if self.comparison else ():
             q = np.array([poses[name] for poses in self.compared_q])
             trail = tool_position(forward_kinematics(self.machine, q))
             text = f"{TITLES.get(name, name)}: {distances(self.path, trail)}"
@@ -186,7 +178,7 @@ class Session:
             f"hold SPACE to drive    {keys}",
             "SHIFT: slow  TAB: next controller  ENTER: next line  BACKSPACE: again  ESC: end",
         ]
-        if self.compared:
+        if self.controllers and self.simulated:
             notes.append("C: the same line by all controllers, simulated, nobody steers")
         done = self.finished
         if self.tracing:

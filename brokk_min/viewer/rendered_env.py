@@ -32,8 +32,7 @@ class FrameRenderer:
 
     def update(self, state: State, started: Iterable[int]) -> None:
         """Extend the trails to a state; those of the rows `started` begin with it."""
-        for row in started:
-            self.trails[int(row)] = []
+        self.trails |= {int(row): [] for row in started}
         for row, p_tool in enumerate(tool_position(forward_kinematics(self.machine, state.q))):
             self.trails[row].append(p_tool)
         if self.mode == "human":
@@ -43,8 +42,7 @@ class FrameRenderer:
         """A frame (600, 960, 3) of each row; none for "human", which shows the first row."""
         if self.mode != "human":
             return [self._draw(state, row).image() for row in self.trails]
-        if self.window is None:
-            self.window = Window(SIZE, self.machine.name)
+        self.window = self.window or Window(SIZE, self.machine.name)
         self.window.pygame.event.pump()
         self.window.show(self._draw(state, 0), self.machine.rate)
         return []

@@ -1,11 +1,10 @@
 """Shapes of a machine from its geometry alone, and what is wrong with a pose.
 
 Any `Machine` gets tracks, outriggers and a turret. Only joints and links are where the machine has
-them; all sizes here are assumed.
+them; all sizes here are assumed. A prism has two equal faces: corners [m] (2, K, 3).
 """
 
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,19 +21,11 @@ BREAKER = np.array([[0, 0.6], [0.1, 1.3], [0.6, 1.3], [0.66, 0.5]])  # of the la
 CHISEL = np.array([[0.6, 0.45], [0.93, 0.35], [1, 0.05]])  # its point is the tool
 
 
-class Prism(NamedTuple):
-    """A solid between two equal faces."""
-
-    near: Array  # corners [m] (K, 3)
-    far: Array  # corners [m] (K, 3)
-
-
-def _box(low: Array, high: Array) -> Prism:
-    """An upright box."""
+def _box(low: Array, high: Array) -> Array:
+    """An upright box, as a prism."""
     x = [low[0], high[0], high[0], low[0]]
     y = [low[1], low[1], high[1], high[1]]
-    faces = (np.stack([x, y, np.full(4, z)], axis=1) for z in (low[2], high[2]))
-    return Prism(*faces)
+    return np.array([np.stack([x, y, np.full(4, z)], axis=1) for z in (low[2], high[2])])
 
 
 def unit(machine: Machine) -> float:
@@ -44,40 +35,35 @@ def unit(machine: Machine) -> float:
 
 
 @lru_cache(maxsize=8)
-def undercarriage(machine: Machine) -> list[Prism]:
-    """Two tracks along x, and four outriggers."""
+def undercarriage(machine: Machine) -> list[Array]:
+    """Two tracks along x, and four outriggers: prisms."""
     around = np.linspace(0, 2 * np.pi, 16, endpoint=False)
     along = 0.115 * np.sign(np.cos(around)) + 0.035 * np.cos(around)
-    parts = []
-    for y in (-0.075, 0.075):
-        faces = (
-            np.stack([along, 0 * around + y + side, 0.035 + 0.035 * np.sin(around)], axis=1)
-            for side in (-0.02, 0.02)
-        )
-        parts.append(Prism(*faces))
+    track = np.stack([along, 0 * around, 0.035 + 0.035 * np.sin(around)], axis=1)
+    parts = [
+        np.array([track + np.array([0, y + side, 0]) for side in (-0.02, 0.02)])
+        for y in (-0.075, 0.075)
+    ]
     for x, y in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
         leg = np.array([[0.08 * x, 0.05 * y, 0.06], [0.17 * x, 0.16 * y, 0.065]])
         foot = np.array([0.17 * x, 0.16 * y, 0.0])
         slope = np.vstack([leg, leg[::-1] + np.array([0, 0, 0.025])])
-        parts.append(Prism(slope, slope + np.array([0, 0.015 * y, 0])))
+        parts.append(np.array([slope, slope + np.array([0, 0.015 * y, 0])]))
         for width, height in ((0.006, 0.085), (0.025, 0.01)):
             corner = np.array([width, width, height])
             parts.append(_box(foot - corner * (1, 1, 0), foot + corner))
-    return [Prism(unit(machine) * part.near, unit(machine) * part.far) for part in parts]
+    return [unit(machine) * part for part in parts]
 
 
-def turret(machine: Machine, q: Array) -> Prism:
-    """The part that slews, from above the tracks to the second joint."""
+def turret(machine: Machine, q: Array) -> Array:
+    """The part that slews, from above the tracks to the second joint: a prism."""
     first = machine.joints[0]
     size = unit(machine)
-    top = max(first.d, 0.1 * size)
-    box = _box(
-        np.array([-0.12 * size, -0.055 * size, 0.06 * size]),
-        np.array([max(first.a, 0.03 * size), 0.055 * size, top]),
-    )
+    low = np.array([-0.12 * size, -0.055 * size, 0.06 * size])
+    high = np.array([max(first.a, 0.03 * size), 0.055 * size, max(first.d, 0.1 * size)])
     c, s = np.cos(q[0] + first.theta), np.sin(q[0] + first.theta)
     turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-    return Prism(box.near @ turn, box.far @ turn)
+    return np.asarray(_box(low, high) @ turn)
 
 
 def half_widths(machine: Machine) -> Array:

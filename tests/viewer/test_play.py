@@ -95,7 +95,8 @@ def test_compare__lays_the_traces_of_all_controllers_over_each_other(session):
     session.update(telemetry(driving=False), 0.0)
     session.next_task("compare")
     assert session.comparison is None  # on a bus the window shows the machine alone
-    session.compared = {"jacobian": BASELINE, "rl": ConstantCommand(0, 0, 0, 0, 0)}
+    session.simulated = True
+    session.controllers = {"jacobian": BASELINE, "rl": ConstantCommand(0, 0, 0, 0, 0)}
     session.lines["rectangle"] = np.array([[0.0, 0, 0], [0, 0.3, 0]])
     session.next_task("compare")
     for tick in range(120):
