@@ -13,23 +13,17 @@ class Shape(NamedTuple):
     points: np.ndarray  # px (k, 2)
     colour: Colour
     width: float = 0.0  # of a line or ring; 0: filled
-    radius: float = 0.0
 
 
 class Recorder(Canvas):
-    """Lines, polygons (bars too), circles, clips; text, colour and box of each word."""
+    """Lines, polygons (bars too), circles; text and box of each word."""
 
     def __init__(self, size):
         super().__init__(size)
         self.lines = []
         self.polygons = []
         self.circles = []
-        self.clips = []
         self.words = []
-
-    def clip(self, box):
-        super().clip(box)
-        self.clips += [] if box is None else [box]
 
     def line(self, points, colour, width=1):
         super().line(points, colour, width)
@@ -41,19 +35,19 @@ class Recorder(Canvas):
 
     def circle(self, centre, radius, colour, width=0):
         super().circle(centre, radius, colour, width)
-        self.circles.append(Shape(centre, colour, width, radius))
+        self.circles.append(Shape(centre, colour, width))
 
     def bar(self, x0, x1, y, half, colour):
         super().bar(x0, x1, y, half, colour)
         corners = [[x0, y - half], [x1, y - half], [x1, y + half], [x0, y + half]]
         self.polygons.append(Shape(np.array(corners), colour))
 
-    def text(self, x, y, text, size, *more):
-        super().text(x, y, text, size, *more)
+    def text(self, x, y, text, *more):
+        super().text(x, y, text, *more)
         word, (left, upper) = self.texts[-1]
         box = np.array([left, upper, left + word.get_width(), upper + word.get_height()])
-        self.words.append((text, more[0] if more else (33, 37, 43), box))
+        self.words.append((text, box))
 
     @property
     def texts_drawn(self):
-        return [text for text, _, _ in self.words]
+        return [text for text, _ in self.words]

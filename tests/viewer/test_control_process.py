@@ -101,19 +101,12 @@ def test_control__drives_a_machine_on_a_bus_until_the_window_closes_the_pipe(tmp
     assert (tmp_path / "run.log").stat().st_size > 0
 
 
-@pytest.mark.parametrize(
-    ("machine", "options", "message"),
-    [
-        (BROKK_170, BusOptions("nonsense", "bus"), "got nonsense bus: expected a CAN bus"),
-        (BROKK_170, BusOptions("virtual", "empty"), "got node 1: object 0x6501"),
-    ],
-)
-def test_receive_telemetry__says_why_the_loop_ended(machine, options, message):
+def test_receive_telemetry__says_why_the_loop_ended():
     here, there = multiprocessing.Pipe()
-    control(machine, [], options, there)
+    control(BROKK_170, [], BusOptions("nonsense", "bus"), there)
     there.close()
     send_request(here, REQUEST)  # no error: the next line reports it
-    with pytest.raises(ValueError, match=f"^play: expected a loop that runs, {message}"):
+    with pytest.raises(ValueError, match=r"^play: .* runs, got nonsense bus: expected a CAN bus"):
         list(receive_telemetry(here))
     with pytest.raises(ValueError, match=r"^play: .* runs, got its sudden end"):
         list(receive_telemetry(here))

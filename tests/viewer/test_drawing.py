@@ -6,11 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers_canvas import Recorder
+from helpers_viewer import tool
 from hypothesis import given
 from hypothesis import strategies as st
 from strategies import moving
 
-from brokk_min.kinematics import forward_kinematics, jacobian, tool_position
+from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer import drawing
 from brokk_min.viewer.camera import cameras
@@ -31,12 +32,19 @@ def drawn(*scenes, machine=BROKK_170, size=SIZE):
     return canvas
 
 
-def views(machine, q, in_view=NO_POINTS):
-    """The cameras of a picture of one arm."""
-    side_box, top_box, *_ = drawing._layout((0.0, 0.0, *map(float, SIZE)), machine.n, 0)
-    p_tool = tool_position(forward_kinematics(machine, q))
-    side, top = cameras(machine, p_tool, side_box, top_box, in_view)
-    return side, top
+def test_cameras__see_the_brokk_as_worked_out_by_hand():
+    boxes = ((10.0, 20.0, 400.0, 200.0), (0.0, 0.0, 100.0, 100.0))  # side, top [px]
+    stretched = np.array([0.0, 0.0, 0.0, np.pi, 3 * np.pi / 4])  # all links horizontal
+    side, _ = cameras(BROKK_170, tool(stretched), *boxes, NO_POINTS)
+    flat = np.array([[0, 0], [0.25, 0.95], [1.4, 0.95], [2.65, 0.95], [3.8, 0.95], [5.0, 0.95]])
+    p = forward_kinematics(BROKK_170, stretched).p
+    np.testing.assert_allclose(side.project(p), side.origin + side.scale * flat * (1, -1))
+    p_tool = tool(stretched + np.array([np.pi / 2, 0, 0, 0, 0]))  # it points to the left
+    side, top = cameras(BROKK_170, p_tool, *boxes, NO_POINTS)
+    moved = top.project(p_tool) - top.origin
+    np.testing.assert_allclose(moved, [-5.0 * top.scale, 0.0], atol=1e-9)
+    expected = side.origin + side.scale * np.array([5.0, -0.95])
+    np.testing.assert_allclose(side.project(p_tool), expected)
 
 
 @given(moving([()]), st.sampled_from([(960, 600), (480, 560), (1500, 300)]))
@@ -68,9 +76,11 @@ def test_draw__points_arrows_along_goal_and_measured_velocity():
     v_tool = jacobian(forward_kinematics(BROKK_170, Q)) @ q_dot
     goal = np.array([0.1, 0.05, 0.15])
     canvas = drawn(scene(q_dot=q_dot, v_goal=goal))
+    side_box, top_box, *_ = drawing._layout((0.0, 0.0, 960.0, 600.0), 5, 0)
+    views = cameras(BROKK_170, tool(Q), side_box, top_box, NO_POINTS)
     for v, colour in ((v_tool, drawing.MEASURED), (goal, drawing.GOAL)):
         shafts = [s.points for s in canvas.lines if s.colour == colour and s.width == 3]
-        for camera, shaft in zip(views(BROKK_170, Q), shafts, strict=True):
+        for camera, shaft in zip(views, shafts, strict=True):
             along = shaft[1] - shaft[0]
             flat = camera.axes @ v * (1, -1)
             np.testing.assert_allclose(along / np.hypot(*along), flat / np.hypot(*flat), atol=1e-6)
@@ -104,7 +114,7 @@ def test_joint_rows__have_valve_bars_as_long_as_the_command(counts, fraction):
     u = np.zeros(5)
     u[3] = counts / 127
     canvas = drawn(scene(u=u))
-    box = next(box for text, _, box in canvas.words if text == "q4")
+    box = next(box for text, box in canvas.words if text == "q4")
     row = [p for p in canvas.polygons if abs(p.points[:, 1].mean() - box[[1, 3]].mean()) < 1]
     track = max(
         (p.points for p in row if p.colour == drawing.TRACK and np.ptp(p.points[:, 1]) > 6),
@@ -135,7 +145,7 @@ def test_draw__cuts_off_no_text_and_puts_none_on_another(n, arms, size):
     canvas = drawn(*[at_limits] * arms, machine=machine, size=size)
     warnings = sum("near its limit" in text for text in canvas.texts_drawn)
     assert warnings == arms * len(machine.driven)
-    boxes = [box for text, _, box in canvas.words if text]
+    boxes = [box for text, box in canvas.words if text]
     for box in boxes:
         assert (box >= 0).all()
         assert (box[2:] <= size).all()

@@ -16,9 +16,6 @@ def test_fault_in_words__says_what_is_wrong_and_what_to_do(fault):
     assert len(text) > len(fault.text) + 20
     assert len(text) <= 130  # one line of a window
     assert fault_in_words(BROKK_170, telemetry(active_fault=code)) == ""  # it drives
+    assert fault_in_words(BROKK_170, telemetry(driving=False)) == ""
     latched = fault_in_words(BROKK_170, telemetry(latched_fault=code, driving=False))
     assert latched == f"{text} Over now: release SPACE, then press it again."
-
-
-def test_fault_in_words__is_empty_without_a_fault():
-    assert fault_in_words(BROKK_170, telemetry(driving=False)) == ""

@@ -1,17 +1,15 @@
 """Loop and simulated machine on a clock that stands still while anything computes."""
 
-import itertools
 from contextlib import closing
 
 import numpy as np
 import pytest
-from helpers_bus import BASELINE, START, ConstantCommand
+from helpers_bus import START, ConstantCommand
 
 from brokk_min.actuator import plant_reset, plant_step
-from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer.control_process import Request
-from brokk_min.viewer.lockstep import Lockstep, compare, follow
+from brokk_min.viewer.lockstep import Lockstep, follow
 
 NEUTRAL = Request(0.0, 0, False, True, np.zeros(3), np.zeros(4))
 
@@ -66,13 +64,3 @@ def test_follow__moves_the_plant_as_the_commands_of_the_loop_do():
     np.testing.assert_allclose(
         q[moving[0] + 2 : moving[0] + 20, 0], alone[first + 2 : first + 20], atol=0.01
     )
-
-
-def test_compare__stands_still_at_the_end_of_the_line():
-    p = tool_position(forward_kinematics(BROKK_170, np.array(START)))
-    line = p + np.array([[0.0, 0, 0], [0, 0.15, 0]])
-    poses = compare(BROKK_170, {"jacobian": BASELINE}, np.array(START), line)
-    q = [pose["jacobian"] for pose in itertools.islice(poses, 90)]
-    trace = tool_position(forward_kinematics(BROKK_170, np.array(q)))
-    np.testing.assert_allclose(trace[-1], line[-1], atol=0.05)
-    np.testing.assert_array_equal(trace[-1], trace[-10])
