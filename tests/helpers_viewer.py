@@ -10,7 +10,9 @@ from brokk_min.can.drive_log import Telemetry
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer.control_process import Request, WindowDrive, WindowInput, receive_telemetry
+from brokk_min.viewer.drawing import NO_POINTS
 from brokk_min.viewer.input_handler import InputHandler
+from brokk_min.viewer.replay import Run
 
 MODES = ["rl", "jacobian", "levers"]
 
@@ -31,6 +33,14 @@ def telemetry(tick=0, q=START, **more):
     """A machine at rest that is driven with closed valves."""
     zero = np.zeros(len(q))
     return Telemetry(tick, np.array(q), zero, zero, np.zeros(3), True)._replace(**more)
+
+
+def run_of(ticks, path=NO_POINTS):
+    """The cabin turns; each array has other numbers in each tick."""
+    q = np.array(START) + 0.01 * np.arange(ticks)[:, None] * np.eye(5)[0]
+    u = np.linspace(-1, 1, 5 * ticks).reshape(ticks, 5)
+    v_goal = np.linspace(0, 0.3, 3 * ticks).reshape(ticks, 3)
+    return Run(BROKK_170, "rl", (1, 2, 3), q, 0.1 * u, u, v_goal, path)
 
 
 class Operator:

@@ -7,7 +7,7 @@ import numpy as np
 import pygame
 import pytest
 from helpers_bus import BASELINE, START
-from helpers_viewer import PipedLoop, post_key
+from helpers_viewer import PipedLoop, post_key, run_of
 from PIL import Image, ImageSequence
 
 from benchmarks import POLICY
@@ -18,17 +18,8 @@ from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.learning.policy import load_policy, save_policy
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer import drawing, replay
-from brokk_min.viewer.replay import Run
 
 COLOUR = (1, 2, 3)
-
-
-def run_of(ticks, title="a", path=drawing.NO_POINTS):
-    """The cabin turns at 0.1 rad/s; the goal is 0.1 m/s to the left and 0.05 m/s upward."""
-    q = np.array(START) + 0.005 * np.arange(ticks)[:, None] * np.eye(5)[0]
-    q_dot = np.tile([0.1, 0, 0, 0, 0], (ticks, 1))
-    v_goal = np.tile([0, 0.1, 0.05], (ticks, 1))
-    return Run(BROKK_170, title, COLOUR, q, q_dot, np.full((ticks, 5), 0.3), v_goal, path)
 
 
 def recorded_log(path, controller, seconds, v):

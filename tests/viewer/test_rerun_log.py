@@ -2,22 +2,13 @@
 
 import numpy as np
 import pytest
-from helpers_bus import START
+from helpers_viewer import run_of
 
 from brokk_min.machine import BROKK_170
-from brokk_min.viewer import drawing, rerun_log
+from brokk_min.viewer import rerun_log
 from brokk_min.viewer.camera import skeleton
-from brokk_min.viewer.replay import Run
 
 chunk = pytest.importorskip("rerun.chunk", reason="extra `rerun`")
-
-
-def run_of(ticks, path):
-    """The cabin turns; each array has other numbers in each tick."""
-    q = np.array(START) + 0.01 * np.arange(ticks)[:, None] * np.eye(5)[0]
-    u = np.linspace(-1, 1, 5 * ticks).reshape(ticks, 5)
-    v_goal = np.linspace(0, 0.3, 3 * ticks).reshape(ticks, 3)
-    return Run(BROKK_170, "rl", (1, 2, 3), q, 0.1 * u, u, v_goal, path)
 
 
 def read(path):
@@ -36,7 +27,7 @@ def read(path):
 def test_write_rerun__has_poses_commands_errors_and_goals_at_their_times(tmp_path):
     line = np.array([[3.0, -1, 1], [3, 1, 1]])
     run = run_of(7, line)
-    other = run_of(4, drawing.NO_POINTS)
+    other = run_of(4)
     rerun_log.write_rerun(tmp_path / "runs.rrd", [run, other])
     columns, times = read(tmp_path / "runs.rrd")
     arms = np.array(columns["/0_rl/arm", "strips"])[:, 0]
@@ -56,4 +47,4 @@ def test_write_rerun__has_poses_commands_errors_and_goals_at_their_times(tmp_pat
 
 def test_write_rerun__keeps_a_file_if_it_cannot_write(tmp_path):
     with pytest.raises(ValueError, match="expected an existing directory"):
-        rerun_log.write_rerun(tmp_path / "none" / "runs.rrd", [run_of(3, drawing.NO_POINTS)])
+        rerun_log.write_rerun(tmp_path / "none" / "runs.rrd", [run_of(3)])
