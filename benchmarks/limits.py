@@ -66,9 +66,9 @@ def gradient(
     loss_function: ppo.Loss, batch: int, optimize: Callable[..., torch.optim.Adam], options: Options
 ) -> dict[str, Any]:
     """One minibatch of `ppo.train`: loss, gradient, step. Work: the products of the gradient."""
-    agent = ppo.Agent(171, 4, -1.8, critic=False)
+    agent = ppo.Agent(223, 4, -1.8, critic=False)
     optimizer = optimize(agent.parameters(), 1e-3)
-    mb = {"obs": torch.randn(batch, 171), "actions": torch.randn(batch, 4)}
+    mb = {"obs": torch.randn(batch, 223), "actions": torch.randn(batch, 4)}
     mb |= {"logprobs": torch.zeros(batch), "advantages": torch.randn(batch)}
     mb |= {"means": torch.randn(batch, 4), "targets": torch.randn(batch, 4)}
 
@@ -79,7 +79,7 @@ def gradient(
         torch.nn.utils.clip_grad_norm_(agent.parameters(), 1.0)
         optimizer.step()
 
-    sizes = shapes((171, 256, 128, 64, 4), batch)
+    sizes = shapes((223, 256, 128, 64, 4), batch)
     rng = np.random.default_rng(0)
     arrays = []
     for m, k, n in sizes:

@@ -20,6 +20,7 @@ REST_AFTER = {"closed": 0.5, "dither": 0.1, "open": math.inf}  # s of a zero goa
 STANDSTILL = 0.002  # rad or m, assumed: little more than one step of a 12-bit encoder
 Valves = Literal["closed", "dither", "open"]  # what they do while the tool rests
 MU = 50.0  # assumed: the mu law is about linear below 1/50 of full opening
+BARELY = 0.02  # of full opening, assumed: a command that opens a valve so far counts as 3/4 open
 
 # --- the analytic plant ---------------------------------------------------------------------------
 
@@ -167,18 +168,12 @@ def smooth_angles(machine: Machine, history: Array) -> Array:
     moved on by the velocities since. As slopes, they come l = window / 2 - 1 ticks later than the
     mean velocity of their tick. The mean has 0.28 of the training noise of the newest angle.
     """
-    weights = smoothing_weights(machine).astype(history.dtype)
-    return np.asarray(np.einsum("...kh,kh->...", history[..., :2, :], weights))
-
-
-@lru_cache
-def smoothing_weights(machine: Machine) -> Array:
-    """Weights (2, H) of angles and velocities in the mean of `smooth_angles`."""
     H = machine.history
     late = machine.velocity_samples / 2 - 1
     count = np.arange(H) - late  # column j, from 0, stands in j of the H sums
     count[-1] += H * late
-    return np.stack([np.ones(H), machine.dt * count]) / H
+    weights = np.stack([np.ones(H), machine.dt * count], dtype=history.dtype) / H
+    return np.asarray(np.einsum("...kh,kh->...", history[..., :2, :], weights))
 
 
 # --- the nets -------------------------------------------------------------------------------------
@@ -201,13 +196,35 @@ def mu_law(u: ArrayLike, dead_zone: float) -> Array:
     return np.asarray(np.copysign(np.log1p(MU * np.abs(x)) / math.log1p(MU), x))
 
 
+def open_indicator(u: ArrayLike, dead_zone: float) -> Array:
+    """Does a command open the valve? 0 within the dead zone, else tanh(|x| / 0.02), below 1.
+
+    x is the opening beyond the dead zone. A valve that was closed answers late: when it does
+    depends on how long commands have opened it, not on how far. Paper: Sec. 3.2 (past movement)
+
+    Example:
+        >>> open_indicator([-1.0, 0.07, 0.08, 0.1], 0.07).round(2)
+        array([1.  , 0.  , 0.49, 0.92])
+    """
+    return np.asarray(np.tanh(np.abs(valve_opening(u, dead_zone)) / BARELY))
+
+
+def input_rows(q: Array, q_dot: Array, u: Array, dead_zone: float, indicator: bool) -> list[Array]:
+    """What nets read of samples: q, q_dot, `mu_law` and, not in the paper, `open_indicator`."""
+    rows = [q, q_dot, mu_law(u, dead_zone)]
+    if indicator:
+        rows.append(open_indicator(u, dead_zone))
+    return rows
+
+
 @dataclass(frozen=True, eq=False)
 class ActuatorNet:
     """One small net per joint: history in, mean velocity over the coming tick out.
 
-    Weights, joint by joint: (n, 3 H, 32), (n, 32), (n, 32, 32), (n, 32), (n, 32, 1) and (n, 1).
-    Paper: Table 1 and Sec. 3.3 (39 inputs, two hidden layers of 32, ReLU, sigmoid output)
-    Not in the paper: two more, (n, 6 H, L) and (n, L, 32), where joints are not alone, `latents`.
+    Weights, joint by joint: (n, I, 32), (n, 32), (n, 32, 32), (n, 32), (n, 32, 1) and (n, 1).
+    Paper: Table 1 and Sec. 3.3 (I = 3 H = 39, two hidden layers of 32, ReLU, sigmoid output)
+    Not in the paper: I = 4 H, see `input_rows`; two more weights, (n, 2 I, L) and (n, L, 32), where
+    joints are not alone, see `latents`.
     """
 
     joints: tuple[str, ...]
@@ -218,14 +235,19 @@ class ActuatorNet:
     machine: str  # name of the machine, or of the log
     seed: int
     settings: dict[str, float]
-    input_mean: Array  # (n, 3 H)
-    input_scale: Array  # (n, 3 H)
+    input_mean: Array  # (n, I)
+    input_scale: Array  # (n, I)
     output_low: Array  # (n,) rad/s
     output_high: Array  # (n,) rad/s
     q_low: Array  # (n,) rad, smallest angle of the training log
     q_high: Array  # (n,) rad
     weights: tuple[Array, ...]
     dead_zone: float = 0.0  # of full command: commands pass `mu_law`
+
+    @property
+    def indicator(self) -> bool:
+        """Do the nets read `open_indicator`, I = 4 H?"""
+        return bool(self.input_mean.shape[-1] > 3 * self.history)
 
     def predict(self, history: Array) -> Array:
         """Velocity over the coming tick [rad/s] (..., n): q(t + dt) = q(t) + dt * velocity.
@@ -239,7 +261,7 @@ class ActuatorNet:
         return velocity
 
     def inputs(self, history: Array) -> Array:
-        """Histories (..., n, 3, H) as the first layer reads them, (..., n, 3 H).
+        """Histories (..., n, 3, H) as the first layer reads them, (..., n, I).
 
         ValueError: a history of another shape.
         """
@@ -247,12 +269,12 @@ class ActuatorNet:
         if history.shape[-3:] != (n, 3, self.history):
             expected = f"expected (..., {n}, 3, {self.history})"
             raise ValueError(f"history: {expected}, got {history.shape}")
-        x = history.copy()
-        x[..., 2, :] = mu_law(x[..., 2, :].copy(), self.dead_zone)  # contiguous: half the time
-        return x.reshape(*x.shape[:-2], 3 * self.history)
+        q, q_dot, u = np.ascontiguousarray(np.moveaxis(history, -2, 0))
+        rows = input_rows(q, q_dot, u, self.dead_zone, self.indicator)
+        return np.concatenate(rows, axis=-1)
 
     def latents(self, x: Array) -> Array:
-        """Latents (batch, L) of all joints' inputs (batch, n, 3 H), such as pump flow and load.
+        """Latents (batch, L) of all joints' inputs (batch, n, I), such as pump flow and load.
 
         z = tanh(sum_j S_j^T [x_j, |x_j|]) of standardised inputs x.
         """

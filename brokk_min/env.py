@@ -2,7 +2,7 @@
 
 On the nets these functions are the simulation, on the plant the machine. `learning.episodes` draws
 starts and goals. The numbers below are of the Brokk 170: 4 driven joints, 1 locked joint, H = 13.
-Observation: Box, float32, (171,), (x - mean) / deviation * weight of these blocks:
+Observation: Box, float32, (223,), (x - mean) / deviation * weight of these blocks:
 
 | Num     | Observation                                          | Deviation   | Weight | Noise |
 |---------|------------------------------------------------------|-------------|--------|-------|
@@ -11,8 +11,9 @@ Observation: Box, float32, (171,), (x - mean) / deviation * weight of these bloc
 | 6       | angle of the locked joint                            | 0.404 rad   | 1.4    | yes   |
 | 7-110   | 13 angles, 13 velocities of each driven joint        | uniform     | 0.277  | yes   |
 | 111-162 | 13 commands of each driven joint                     | 0.364       | 0.277  | no    |
-| 163-166 | resolved velocities of the goal (`jacobian.dls`)     | uniform     | 4.2    | no    |
-| 167-170 | resolved velocities of the error integral            | 0.1 uniform | 4.2    | no    |
+| 163-214 | do these commands open valves (`open_indicator`)?    | 0.5         | 0.277  | no    |
+| 215-218 | resolved velocities of the goal (`jacobian.dls`)     | uniform     | 4.2    | no    |
+| 219-222 | resolved velocities of the error integral            | 0.1 uniform | 4.2    | no    |
 
 "Uniform": over its range. The newest sample is last. Heading frame: x from slew axis to tool.
 
@@ -115,6 +116,7 @@ def observation_blocks(machine: Machine, paper: bool = False) -> tuple[Block, ..
     if paper:
         return tuple(block._replace(weight=1.0) for block in blocks)
     blocks += [
+        Block("open", 0.5, np.full_like(u_std, 0.5), H**-0.5, False),
         Block("resolved v_goal", 0.0, q_dot_std[machine.driven], 4.2, False),
         Block("resolved error_integral", 0.0, 0.1 * q_dot_std[machine.driven], 4.2, False),
     ]
@@ -160,10 +162,7 @@ def measure(
 
 
 def features(machine: Machine, measured: Measured, paper: bool = False) -> Array:
-    """The observation of the table above, ours or the paper's. Paper: Sec. 3.4, Fig. 3
-
-    Resolved velocities (ours): `dls` with lambda = 6 % of the links' lengths (assumed).
-    """
+    """The observation of the table above, ours or the paper's. Paper: Sec. 3.4, Fig. 3"""
     signals = measured.history[..., :2, :].reshape(*measured.q.shape[:-1], -1)
     commands = measured.history[..., 2, :].reshape(*measured.q.shape[:-1], -1)
     numbers = [measured.v_goal, measured.v_tool, measured.q[..., machine.locked], signals, commands]
@@ -171,7 +170,9 @@ def features(machine: Machine, measured: Measured, paper: bool = False) -> Array
         numbers[:2] = [kinematics.to_heading(measured.p_tool, v) for v in numbers[:2]]
         J, integral = measured.J[..., machine.driven], measured.error_integral
         arm = np.hypot(machine.column("a"), machine.column("d")).sum()
-        J_inv = dls(J, machine.column("weight")[machine.driven], (0.06 * arm) ** 2 + 1e-6)
+        damping = (0.06 * arm) ** 2 + 1e-6  # lambda = 6 % of the links' lengths, assumed
+        J_inv = dls(J, machine.column("weight")[machine.driven], damping)
+        numbers.append(actuator.open_indicator(commands, machine.dead_zone))
         numbers += [(J_inv @ v[..., None])[..., 0] for v in (measured.v_goal, integral)]
     mean, scale = observation_scale(machine, paper)
     return (np.concatenate(numbers, axis=-1, dtype=np.float32) - mean) / scale
@@ -221,9 +222,8 @@ def action_to_pwm(machine: Machine, action: ArrayLike, paper: bool = False) -> A
         raise ValueError(f"action: expected finite numbers, got {a[~np.isfinite(a)][0]}")
     limit = machine.pwm_limit / PWM_MAX
     dead_zone = 0.0 if paper else machine.dead_zone
-    crossing = np.clip(a / COMPENSATION, -1.0, 1.0)
     u = np.zeros((*a.shape[:-1], machine.n), a.dtype)
-    u[..., machine.driven] = dead_zone * crossing + (limit - dead_zone) * a
+    u[..., machine.driven] = dead_zone * np.clip(a / COMPENSATION, -1, 1) + (limit - dead_zone) * a
     return limit_command(machine, u)
 
 

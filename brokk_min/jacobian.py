@@ -39,19 +39,8 @@ def dls(J: ArrayLike, W: ArrayLike, damping: ArrayLike, as_printed: bool = False
     inner = W if as_printed else 1 / W
     A = np.einsum("...ik,...jk->...ij", J * inner[..., None, :], J)  # J W^-1 J^T
     A = A + np.asarray(damping)[..., None, None] * np.eye(3)  # + lambda^2 I, in float64
-    transposed = solve(A, J / W[..., None, :])  # A = A^T: (A^-1 J W^-1)^T = W^-1 J^T A^-1
+    transposed = np.linalg.solve(A, J / W[..., None, :])  # A = A^T: (A^-1 J W^-1)^T = W^-1 J^T A^-1
     return np.swapaxes(transposed, -1, -2).astype(J.dtype)
-
-
-def solve(A: Array, B: Array) -> Array:
-    """X of A X = B for many positive definite A (..., m, m), all at once: Gauss-Jordan."""
-    rows = np.concatenate([A, B], axis=-1)
-    rows = np.ascontiguousarray(np.moveaxis(rows, (-2, -1), (0, 1)))
-    for i in range(len(rows)):
-        pivot = rows[i] / rows[i, i]
-        rows -= rows[:, i, None] * pivot  # 0 in column i
-        rows[i] = pivot
-    return np.moveaxis(rows[:, len(rows) :], (0, 1), (-2, -1))
 
 
 def limit_gradient(machine: Machine, q: ArrayLike) -> Array:

@@ -75,22 +75,10 @@ def jacobian(frames: Frames) -> Array:
 
     J_i = z_{i-1} x (p_n - p_{i-1}), i = 1 .. n; J_i = z_{i-1} of a prismatic joint.
     """
-    J = cross(frames.z[..., :-1, :], frames.p[..., -1:, :] - frames.p[..., :-1, :])
+    J = np.cross(frames.z[..., :-1, :], frames.p[..., -1:, :] - frames.p[..., :-1, :])
     for i in frames.prismatic:
         J[..., i, :] = frames.z[..., i, :]  # J_i = z_{i-1}
     return np.swapaxes(J, -1, -2)
-
-
-def cross(a: Array, b: Array) -> Array:
-    """Cross products a x b of vectors (..., 3).
-
-    Example:
-        >>> cross(np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]))
-        array([0., 0., 1.])
-    """
-    yzx = [1, 2, 0]
-    zxy = [2, 0, 1]
-    return a[..., yzx] * b[..., zxy] - a[..., zxy] * b[..., yzx]
 
 
 def tool_velocity(frames: Frames, q_dot: ArrayLike) -> Array:

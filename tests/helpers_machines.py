@@ -21,9 +21,9 @@ class Idle:
         return np.zeros(measured.q.shape), None
 
 
-def random_net(seed=0, n=3, history=13, hidden=32):
+def random_net(seed=0, n=3, history=13, hidden=32, rows=3):
     rng = np.random.default_rng(seed)
-    inputs = 3 * history
+    inputs = rows * history
 
     def draw(*shape):
         return (rng.standard_normal(shape) / shape[1] ** 0.5).astype(np.float32)
@@ -50,16 +50,16 @@ def random_net(seed=0, n=3, history=13, hidden=32):
     )  # fmt: skip
 
 
-def small_net(machine, rng, joints=()):
+def small_net(machine, rng, joints=(), rows=3):
     """`random_net` of `joints` of a machine (none: the driven ones): all inputs matter."""
     joints = joints or tuple(machine.names[i] for i in machine.driven)
     index = [machine.names.index(name) for name in joints]
     low, high = (machine.column(name)[index].astype(np.float32) for name in ("q_min", "q_max"))
     fastest = machine.q_dot_max[index].astype(np.float32)
-    net = random_net(rng, len(joints), machine.history)
-    mean, scale = np.zeros((2, len(joints), 3, machine.history), np.float32)
+    net = random_net(rng, len(joints), machine.history, rows=rows)
+    mean, scale = np.zeros((2, len(joints), rows, machine.history), np.float32)
     mean[:, 0] = (low + high)[:, None] / 2
-    scale[:] = [[0.5], [0.2], [0.4]]
+    scale[:] = np.array([[0.5], [0.2], [0.4], [0.5]])[:rows]
     return replace(
         net,
         joints=joints,

@@ -26,6 +26,11 @@ class FitConfig:
     """Command within which no valve opens; by default the known machine's, else 0."""
     __post_init__ = check_numbers  # type: ignore[misc]
 
+    @property
+    def indicator(self) -> bool:
+        """Do the nets read `actuator.open_indicator`? The paper's, without a dead zone, do not."""
+        return bool(self.dead_zone)
+
 
 PAPER_RECIPE: dict[str, Any] = {"noise": 0.0, "rollout": 1, "dead_zone": 0.0, "muon": 0.0}
 """Sec. 3.3"""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Generator, Tensor
 from tqdm import tqdm
 
-from brokk_min.actuator import ActuatorNet, mu_law
+from brokk_min.actuator import ActuatorNet, input_rows
 from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
 from brokk_min.identification.logs import Log, join_recordings
 from brokk_min.identification.muon import Muon
@@ -56,12 +56,12 @@ def fit(
 class TrainingSet(NamedTuple):
     """Windows of H samples of each joint and their statistics, float32."""
 
-    signals: Tensor  # (3, n, N): angle, velocity and `mu_law` of commands, recordings joined
+    signals: Tensor  # (3 or 4, n, N): `actuator.input_rows`, recordings joined
     target: Tensor  # (N, n) rad/s, see `join_recordings`
     windows: list[NDArray[np.intp]]  # newest samples of each joint's windows
     multi_step_windows: list[NDArray[np.intp]]  # those with `rollout` samples after them
-    input_mean: Tensor  # (n, 3 H)
-    input_scale: Tensor  # (n, 3 H)
+    input_mean: Tensor  # (n, I)
+    input_scale: Tensor  # (n, I)
     output_low: Tensor  # (n,) rad/s
     output_high: Tensor  # (n,) rad/s
     q_low: Tensor  # (n,) rad
@@ -76,7 +76,8 @@ def training_set(log: Log, config: FitConfig) -> TrainingSet:
     windows = samples.windows(config.history, 1)
     targets = [samples.target[window, j] for j, window in enumerate(windows)]
     _check_targets(log, targets, config.history)
-    signals = np.stack([q.T, q_dot.T, mu_law(u, config.dead_zone or 0.0).T])
+    rows = input_rows(q, q_dot, u, config.dead_zone or 0.0, config.indicator)
+    signals = np.stack(rows).swapaxes(1, 2)
     mean = np.array([signals[:, j, window].mean(axis=1) for j, window in enumerate(windows)])
     std = np.array([signals[:, j, window].std(axis=1) for j, window in enumerate(windows)])
     std = np.where(std > 1e-9, std, 1.0)  # a signal that never changes
@@ -155,7 +156,8 @@ def initial_weights(n: int, config: FitConfig, generator: Generator) -> list[Ten
         """Weights (n, rows, columns) within +-`bound`."""
         return (torch.rand(n, rows, columns, generator=generator) * 2 - 1) * bound
 
-    inputs, hidden, latents = 3 * config.history, config.hidden, config.shared
+    inputs = (3 + config.indicator) * config.history
+    hidden, latents = config.hidden, config.shared
     weights = []
     for rows, columns in [(inputs, hidden), (hidden, hidden), (hidden, 1)]:
         weights += [uniform(rows, columns, math.sqrt(6 / rows)), torch.zeros(n, columns)]
@@ -227,16 +229,16 @@ def input_windows(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Angles and noisy velocities (n, batch, H) of windows that end `at`, and their commands.
 
-    Commands are (n, batch, H + ticks - 1). Noise has a part per sample and a part per window.
+    Commands are (n, batch, 1 or 2, H + ticks - 1). Noise has a part per sample and one per window.
     """
     (n, batch), history = at.shape, config.history
     signals = data.signals.unfold(-1, history + ticks - 1, 1)
-    q, q_dot, u = signals[:, torch.arange(n)[:, None], at - (history - 1)]
-    q, q_dot = q[..., :history], q_dot[..., :history]
+    q, q_dot, *commands = signals[:, torch.arange(n)[:, None], at - (history - 1)]
+    q, q_dot, u = q[..., :history], q_dot[..., :history], torch.stack(commands, dim=2)
     if config.noise:
         noise = torch.randn(n, batch, history, generator=generator)
         noise = noise + torch.randn(n, batch, 1, generator=generator)
-        std = data.input_scale.reshape(n, 1, 3, history)[:, :, 1]
+        std = data.input_scale.reshape(n, 1, -1, history)[:, :, 1]
         q_dot = q_dot + config.noise * std * noise
     return q, q_dot, u
 
@@ -244,9 +246,12 @@ def input_windows(
 def predict(
     data: TrainingSet, weights: list[Tensor], q: Tensor, q_dot: Tensor, u: Tensor
 ) -> Tensor:
-    """Velocities [rad/s] (n, batch) for windows (n, batch, H); none passes a stop in one tick."""
+    """Velocities [rad/s] (n, batch) for windows (n, batch, H); none passes a stop in one tick.
+
+    `u` are the rows of the commands, (n, batch, 1 or 2, H).
+    """
     w1, b1, w2, b2, w3, b3 = weights[:6]
-    x = torch.cat([q, q_dot, u], dim=-1)
+    x = torch.cat([q, q_dot, u.flatten(2)], dim=-1)
     x = (x - data.input_mean[:, None]) / data.input_scale[:, None]
     bias = b1[:, None]
     if len(weights) > 6:  # as `ActuatorNet.latents`

@@ -81,14 +81,14 @@ def _layers(first: tuple[str, ...], *units: int | str) -> dict[str, Field]:
 
 
 NET_ARRAYS: dict[str, Field] = {
-    "input_mean": Field("float", -LARGE, LARGE, ("n", "3 history")),
-    "input_scale": Field("float", 1e-9, LARGE, ("n", "3 history")),
+    "input_mean": Field("float", -LARGE, LARGE, ("n", "inputs")),
+    "input_scale": Field("float", 1e-9, LARGE, ("n", "inputs")),
     "output_low": Field("float", -LARGE, LARGE, ("n",), "rad/s"),
     "output_high": Field("float", -LARGE, LARGE, ("n",), "rad/s"),
     "q_low": Field("float", -LARGE, LARGE, ("n",), "rad"),
     "q_high": Field("float", -LARGE, LARGE, ("n",), "rad"),
-    **_layers(("n",), "3 history", "hidden", "hidden", 1),
-    "weight_6": Field("float", -LARGE, LARGE, ("n", "6 history", "latents"), required=False),
+    **_layers(("n",), "inputs", "hidden", "hidden", 1),
+    "weight_6": Field("float", -LARGE, LARGE, ("n", "2 inputs", "latents"), required=False),
     "weight_7": Field("float", -LARGE, LARGE, ("n", "latents", "hidden"), required=False),
 }
 POLICY_HEADER: Fields = {

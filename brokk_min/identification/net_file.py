@@ -48,7 +48,9 @@ def net_from_arrays(path: Path, arrays: dict[str, NDArray[Any]], prefix: str = "
     header = load_header(path, arrays, "actuator net", FORMATS[number])
     sizes: dict[str, int] = {}
     check_fields(path, header, NET_HEADER, sizes, prefix)
-    sizes |= {"3 history": 3 * header["history"], "6 history": 6 * header["history"]}
+    found, H = arrays.get("input_mean", np.empty(0)), header["history"]
+    inputs = 4 * H if found.shape[-1:] == (4 * H,) else 3 * H
+    sizes |= {"inputs": inputs, "2 inputs": 2 * inputs}
     check_fields(path, arrays, NET_ARRAYS, sizes, prefix)
     for name in ("output", "q"):
         if not (arrays[f"{name}_low"] < arrays[f"{name}_high"]).all():

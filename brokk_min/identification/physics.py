@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from brokk_min.actuator import lever_arm
-from brokk_min.kinematics import cross, forward_kinematics
+from brokk_min.kinematics import forward_kinematics
 from brokk_min.machine import Array, Joint, Machine, check_numbers, number, valve_opening
 
 G = 9.81  # m/s^2
@@ -145,7 +145,7 @@ def gravity_torque(
     moment = link_mass * (np.cumsum(middle[..., ::-1, :], -2)[..., ::-1, :])
     moment = moment - link_mass * links * frames.p[..., :-1, :]
     moment = moment + payload * (frames.p[..., -1:, :] - frames.p[..., :-1, :])
-    torque = cross(frames.z[..., :-1, :], moment) @ up
+    torque = np.cross(frames.z[..., :-1, :], moment) @ up
     for i in frames.prismatic:  # the force along its axis
         torque[..., i] = (link_mass * (machine.n - i - 0.5) + payload) * (frames.z[..., i, :] @ up)
     return G * np.asarray(torque)

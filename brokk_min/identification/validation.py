@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from brokk_min.actuator import ActuatorNet, mu_law
+from brokk_min.actuator import ActuatorNet, input_rows
 from brokk_min.identification.coupling import coupling, response_delays
 from brokk_min.identification.logs import Log, Samples, driven, join_recordings
 from brokk_min.identification.simulation import creep, free_run, log_response_times
@@ -206,7 +206,7 @@ def tool_errors(machine: Machine, net: ActuatorNet, test: Log) -> dict[str, floa
 class LinearNet(ActuatorNet):
     """A linear model x w + b of the standardised inputs x; its output has the nets' range."""
 
-    slopes: Array  # w, (n, 3 H)
+    slopes: Array  # w, (n, I)
     offsets: Array  # b, (n,)
 
     def predict(self, history: Array) -> Array:
@@ -219,9 +219,8 @@ class LinearNet(ActuatorNet):
 def fit_linear(net: ActuatorNet, log: Log, penalty: float = 1e-3) -> LinearNet:
     """The reference that nets must beat: min mean |x w + b - target|^2 + penalty |w|^2."""
     samples = join_recordings(log)
-    signals = np.stack(
-        [samples.joined.q, samples.joined.q_dot, mu_law(samples.joined.u, net.dead_zone)]
-    )
+    q, q_dot, u = samples.joined.q, samples.joined.q_dot, samples.joined.u
+    signals = np.stack(input_rows(q, q_dot, u, net.dead_zone, net.indicator))
     slopes, offsets = [], []
     for j, ends in enumerate(samples.windows(net.history, 1)):
         windows = signals[:, ends[:, None] + np.arange(1 - net.history, 1), j]

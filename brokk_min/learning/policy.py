@@ -16,7 +16,7 @@ from brokk_min.identification.formats import POLICY_ARRAYS, POLICY_HEADER, check
 from brokk_min.identification.net_file import LARGEST_NET, net_arrays, net_from_arrays, select_nets
 from brokk_min.machine import Array, Machine
 
-FORMAT = 3  # of policy files
+FORMAT = 4  # of policy files
 # Files of `reproduce`: our policy and the paper's.
 POLICIES = {"rl": "policy.npz", "rl_paper": "policy_paper.npz"}
 

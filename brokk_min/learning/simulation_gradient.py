@@ -43,7 +43,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from brokk_min import ppo
-from brokk_min.actuator import MU, ActuatorNet, append_command, command_at_rest, folded_weights
+from brokk_min.actuator import (
+    BARELY,
+    MU,
+    ActuatorNet,
+    append_command,
+    command_at_rest,
+    folded_weights,
+    open_indicator,
+)
 from brokk_min.env import (
     COMPENSATION,
     INTEGRAL_LIMIT,
@@ -226,9 +234,14 @@ def input_gradient(net: ActuatorNet, history: Array) -> tuple[Array, Array]:
     gradient = (net.output_high - net.output_low)[:, None, None] * y * (1 - y)  # sigmoid
     gradient = gradient @ w3.swapaxes(1, 2) * (hidden2 > 0)  # ReLU
     gradient = gradient @ w2.swapaxes(1, 2) * (hidden1 > 0)
-    gradient = (gradient @ w1.swapaxes(1, 2)).swapaxes(0, 1).reshape(history.shape)
-    gradient[..., 2, :] *= mu_law_derivative(history[..., 2, :], net.dead_zone)
-    return velocity, gradient
+    gradient = (gradient @ w1.swapaxes(1, 2)).swapaxes(0, 1)
+    rows = gradient.reshape(*history.shape[:-2], -1, net.history)  # by `input_rows`
+    u = history[..., 2, :]
+    by_history = rows[..., :3, :]
+    by_history[..., 2, :] *= mu_law_derivative(u, net.dead_zone)
+    if net.indicator:
+        by_history[..., 2, :] += rows[..., 3, :] * open_indicator_derivative(u, net.dead_zone)
+    return velocity, by_history
 
 
 def mu_law_derivative(u: Array, dead_zone: float) -> Array:
@@ -238,6 +251,13 @@ def mu_law_derivative(u: Array, dead_zone: float) -> Array:
     x = np.abs(valve_opening(u, dead_zone))
     slope: Array = MU / ((1 + MU * x) * np.log1p(MU) * (1 - dead_zone))
     return np.asarray((x > 0) * slope, u.dtype)
+
+
+def open_indicator_derivative(u: Array, dead_zone: float) -> Array:
+    """Derivative of `actuator.open_indicator` by `u`, same shape; 0 within the dead zone."""
+    x = valve_opening(u, dead_zone)
+    slope = (1 - open_indicator(u, dead_zone) ** 2) / (BARELY * (1 - dead_zone))
+    return np.asarray(np.sign(x) * slope, u.dtype)
 
 
 def compensation_derivative(machine: Machine, u: Array, paper: bool = False) -> Array:

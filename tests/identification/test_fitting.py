@@ -7,7 +7,7 @@ import pytest
 import torch
 from helpers_machines import line
 
-from brokk_min.actuator import initial_history, mu_law
+from brokk_min.actuator import initial_history, mu_law, open_indicator
 from brokk_min.identification import fitting
 from brokk_min.identification.fitting import FitConfig, fit, training_set
 from brokk_min.identification.logs import Log, Recording, join_recordings, velocity_of
@@ -78,10 +78,14 @@ def test_fit__states_how_the_nets_were_fitted():
     assert (net.seed, net.dead_zone, net.settings) == (7, 0.25, vars(config))
     u = np.concatenate([mu_law(r.u, 0.25)[4:-1] for r in log.recordings])
     mean = np.tile(u.mean(axis=0)[:, None], 5)
-    np.testing.assert_allclose(net.input_mean[:, 10:], mean, rtol=1e-6)
+    np.testing.assert_allclose(net.input_mean[:, 10:15], mean, rtol=1e-6)
     np.testing.assert_allclose(net.input_scale[:, 14], u.std(axis=0), rtol=1e-6)
+    opens = np.concatenate([open_indicator(r.u, 0.25)[4:-1] for r in log.recordings])
+    np.testing.assert_allclose(net.input_mean[:, 15], opens.mean(axis=0), rtol=1e-6)
+    assert net.input_mean.shape == (2, 20)
     plain = fit(log, FitConfig(steps=0), 7, 3)
     assert (plain.machine, plain.dead_zone, plain.settings["dead_zone"]) == ("", 0.0, 0.0)
+    assert plain.input_mean.shape == (2, 39)  # as in the paper
     assert fit(log._replace(rate=50.0), FitConfig(steps=0), 7, 3).rate == 50.0
 
 
@@ -180,7 +184,7 @@ def test_input_windows__have_noise_per_sample_and_per_window_in_units_of_the_vel
     _, noisy, _ = fitting.input_windows(data, FitConfig(noise=0.1), at, 8, rng)
     np.testing.assert_array_equal(q[0, 0], data.signals[0, 0, 8:21])
     np.testing.assert_array_equal(exact[1, 0], data.signals[1, 1, 18:31])
-    np.testing.assert_array_equal(u[0, 0], data.signals[2, 0, 8:28])
+    np.testing.assert_array_equal(u[0, 0, 0], data.signals[2, 0, 8:28])
     noise = ((noisy - exact) / data.input_scale[:, None, 13:14]).numpy()
     assert noise.std() == pytest.approx(0.1 * 2**0.5, rel=0.02)
     assert noise.mean(axis=-1).std() == pytest.approx(0.1 * (1 + 1 / 13) ** 0.5, rel=0.02)

@@ -152,7 +152,7 @@ def test_make__gives_an_environment_that_gymnasium_and_stable_baselines_accept()
         warnings.filterwarnings("ignore", message=".*Box observation space.*infinity.*")
         check_env(env.unwrapped, skip_render_check=True)
     check_sb3(env.unwrapped)
-    assert env.observation_space.shape == (171,)
+    assert env.observation_space.shape == (223,)
     assert env.action_space == gymnasium.spaces.Box(-1, 1, (4,), np.float32)
 
 

@@ -24,12 +24,12 @@ def test_export_onnx__computes_the_actions_of_the_policy(batch, policy, tmp_path
     export_onnx(tmp_path / "p.onnx", policy, BROKK_170)
     session = onnxruntime.InferenceSession(tmp_path / "p.onnx", providers=["CPUExecutionProvider"])
     rng = np.random.default_rng(1)
-    obs = rng.normal(0, 1.5, (batch, 171)).astype(np.float32)
+    obs = rng.normal(0, 1.5, (batch, 223)).astype(np.float32)
     (action,) = session.run(None, {"observation": obs})
     assert np.abs(action - policy.act(obs)).max() < 1e-5
     assert np.abs(action).max() > 0.3
     ends = [(e.name, e.shape, e.type) for e in (*session.get_inputs(), *session.get_outputs())]
-    sizes = {"observation": 171, "action": 4}
+    sizes = {"observation": 223, "action": 4}
     assert ends == [(name, ["batch", size], "tensor(float)") for name, size in sizes.items()]
 
 

@@ -20,7 +20,7 @@ NET = small_net(BROKK_170, np.random.default_rng(0))
 def agent():
     """An actor whose weights, biases included, are far from their start."""
     generator = torch.Generator().manual_seed(0)
-    agent = Agent(171, 4, -1.0, critic=False)
+    agent = Agent(223, 4, -1.0, critic=False)
     with torch.no_grad():
         for parameter in agent.parameters():
             parameter += 0.1 * torch.randn(parameter.shape, generator=generator)
@@ -53,20 +53,20 @@ def test_act__by_hand():
 
 
 def test_act__equals_the_actor_of_torch(agent, policy):
-    obs = np.random.default_rng(0).normal(0, 2, (3, 7, 171)).astype(np.float32)
+    obs = np.random.default_rng(0).normal(0, 2, (3, 7, 223)).astype(np.float32)
     expected = agent.actor(torch.from_numpy(obs)).detach().numpy()
     assert expected.std() > 0.05
     np.testing.assert_allclose(policy.act(obs), expected, atol=1e-5 * np.abs(expected).max())
-    assert np.isfinite(policy.act(np.array([[1e4], [-1e4]]) * np.ones(171))).all()
+    assert np.isfinite(policy.act(np.array([[1e4], [-1e4]]) * np.ones(223))).all()
 
 
 def test_act__refuses_wrong_shapes_and_what_is_not_finite(policy):
-    for shape in ((), (170,), (171, 1), (3, 172)):
-        with pytest.raises(ValueError, match=r"observation: expected \(\.\.\., 171\), got \("):
+    for shape in ((), (222,), (223, 1), (3, 224)):
+        with pytest.raises(ValueError, match=r"observation: expected \(\.\.\., 223\), got \("):
             policy.act(np.zeros(shape))
     for bad in (np.nan, np.inf, -np.inf):
         with pytest.raises(ValueError, match="observation: expected finite numbers, got"):
-            policy.act(np.where(np.arange(171) == 40, bad, np.zeros((2, 171))))
+            policy.act(np.where(np.arange(223) == 40, bad, np.zeros((2, 223))))
 
 
 def measured(v_goal):

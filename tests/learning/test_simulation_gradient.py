@@ -56,7 +56,7 @@ def ticks_of(states, commands, done=None):
 def moving_case(machine, seed):
     """Nets in double precision, a state in motion and commands, no joint near its limits."""
     rng = np.random.default_rng(seed)
-    net = small_net(machine, rng)
+    net = small_net(machine, rng, rows=3 + seed % 2)
     low, high = machine.column("q_min"), machine.column("q_max")
     # 3/8 of the range lie before each joint, at least
     fastest = (high - low)[machine.driven] / 3 / ((15 + TICKS) * machine.dt)
@@ -65,7 +65,7 @@ def moving_case(machine, seed):
         weights=tuple(weight.astype(float) for weight in net.weights),
         output_low=np.maximum(0.3 * net.output_low, -fastest),
         output_high=np.minimum(0.3 * net.output_high, fastest),
-        dead_zone=machine.dead_zone * (seed % 2),  # 0: commands as they are
+        dead_zone=machine.dead_zone * (seed % 2),  # 0: commands as they are, as in the paper
     )
     q = (low + high) / 2 + (high - low) / 4 * rng.uniform(-0.5, 0.5, (NUM, machine.n))
     state = env.initial_state(machine, q, rng.standard_normal((NUM, 3)), plant=False)

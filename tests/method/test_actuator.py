@@ -31,6 +31,7 @@ from brokk_min.actuator import (
     lever_arm,
     mu_law,
     net_step,
+    open_indicator,
     plant_reset,
     plant_step,
     smooth_angles,
@@ -236,9 +237,13 @@ def test_append_sample__and_append_command_by_hand():
 
 def slow_forward(net: ActuatorNet, history: np.ndarray) -> np.ndarray:
     """Velocities (n,) of one history (n, 3, H): the equations, one joint at a time."""
-    rows = history.astype(float)  # q, q_dot, u
-    rows[:, 2] = mu_law(rows[:, 2], net.dead_zone)
-    x = [np.concatenate(list(row)) for row in rows]
+    x = []
+    for q, q_dot, u in history.astype(float):
+        rows = [q, q_dot, mu_law(u, net.dead_zone)]
+        if net.input_mean.shape[1] == 4 * net.history:
+            opening = np.maximum(0, np.abs(u) - net.dead_zone) / (1 - net.dead_zone)
+            rows.append(np.tanh(opening / 0.02))
+        x.append(np.concatenate(rows))
     x = [(x[j] - net.input_mean[j]) / net.input_scale[j] for j in range(len(x))]
     weights = [w.astype(float) for w in net.weights]
     z, result = 0.0, []
@@ -254,11 +259,13 @@ def slow_forward(net: ActuatorNet, history: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("leading", [(), (1,), (7,), (2, 3)])
-@pytest.mark.parametrize("kind", ["alone", "dead zone", "shared"])
+@pytest.mark.parametrize("kind", ["alone", "dead zone", "indicator", "shared"])
 def test_forward__is_a_loop_in_double_precision(leading, kind):
-    """Of nets alone, of nets that read companded commands, and of joints that share latents."""
-    net = shared_net() if kind == "shared" else random_net(len(leading), history=5, hidden=8)
-    net = replace(net, dead_zone=0.1 * (kind == "dead zone"))
+    """Of the paper's nets, with companded commands, with indicators, of joints with latents."""
+    rows = 4 if kind == "indicator" else 3
+    net = random_net(len(leading), history=5, hidden=8, rows=rows)
+    net = shared_net() if kind == "shared" else net
+    net = replace(net, dead_zone=0.1 * (kind in ("dead zone", "indicator")))
     rng = np.random.default_rng(9)
     history = rng.uniform(-1, 1, (*leading, 3, 3, net.history)).astype(np.float32)
     history.setflags(write=False)
@@ -278,6 +285,14 @@ def test_mu_law__by_hand():
     np.testing.assert_allclose(mu_law(u, 0.2), expected, atol=1e-12)
     np.testing.assert_array_equal(mu_law(u, 0.0), u)
     assert mu_law(np.float32([0.3]), 0.2).dtype == np.float32
+
+
+def test_open_indicator__by_hand():
+    """tanh(0.5) = 0.462 at 1 % of opening: 0.07 + 0.0093; tanh(1) = 0.762 at 2 %."""
+    u = [0.0, 0.05, 0.07, 0.0793, -0.0793, 0.0886, -1.0]
+    expected = [0, 0, 0, 0.46212, 0.46212, 0.76159, 1]
+    np.testing.assert_allclose(open_indicator(u, 0.07), expected, atol=1e-5)
+    assert open_indicator(np.float32(u), 0.07).dtype == np.float32
 
 
 @pytest.mark.parametrize("shape", [(4, 2, 3, 13), (3, 3, 12)])

@@ -116,7 +116,7 @@ def test_features__by_hand():
     v_goal, integral = np.array([[0.3, -0.1, -0.15], [0.02, -0.01, 0.03]], np.float32)
     measured = measure(BROKK_170, numbered_history(), v_goal, integral)
     obs = features(BROKK_170, measured)
-    assert obs.shape == (171,) and obs.dtype == np.float32
+    assert obs.shape == (223,) and obs.dtype == np.float32
     x, y, _ = tool_position(forward_kinematics(BROKK_170, measured.q.astype(float)))
     heading = np.array([x, y]) / np.hypot(x, y)
     across = np.array([-heading[1], heading[0]])
@@ -138,12 +138,15 @@ def test_features__by_hand():
     for place, joint in ((111, 0), (124, 2), (137, 3), (150, 4)):
         u = (-0.1 * joint + 0.002 * lag) * 127 * 3**0.5 / 80
         np.testing.assert_allclose(obs[place : place + 13], weight * u, rtol=1e-5, atol=1e-6)
+        beyond = np.maximum(0, np.abs(-0.1 * joint + 0.002 * lag) - 0.07) / 0.93
+        opens = weight * (np.tanh(beyond / 0.02) - 0.5) / 0.5
+        np.testing.assert_allclose(obs[place + 52 : place + 65], opens, rtol=1e-4, atol=1e-6)
     J = jacobian(forward_kinematics(BROKK_170, measured.q.astype(float)))[:, DRIVEN]
     damping = (0.06 * (np.hypot(0.25, 0.95) + 1.15 + 1.25 + 1.15 + 1.2)) ** 2
     solution = np.linalg.solve(J.T @ J + damping * np.eye(4), J.T)
     nominal = np.array([0.20, 0.28, 0.38, 0.47]) / 3**0.5 / 4.2
-    np.testing.assert_allclose(obs[163:167], solution @ v_goal / nominal, rtol=1e-4)
-    np.testing.assert_allclose(obs[167:], solution @ integral / (0.1 * nominal), rtol=1e-4)
+    np.testing.assert_allclose(obs[215:219], solution @ v_goal / nominal, rtol=1e-4)
+    np.testing.assert_allclose(obs[219:], solution @ integral / (0.1 * nominal), rtol=1e-4)
     paper = features(BROKK_170, measured, paper=True)
     assert paper.shape == (163,) and paper.dtype == np.float32
     np.testing.assert_allclose(paper[:3], v_goal * 3**0.5 / 0.3, rtol=1e-5)  # base frame
@@ -170,7 +173,7 @@ def test_measure__is_in_physical_units_of_the_base_frame(machine, seed):
     np.testing.assert_allclose(measured.J, jacobian(frames), atol=1e-12)
     velocity = tool_velocity(frames, history[..., 1, -1])  # the locked joints count as well
     np.testing.assert_allclose(measured.v_tool, velocity, atol=1e-12)
-    size = 6 + len(machine.locked) + (3 * machine.history + 2) * len(machine.driven)
+    size = 6 + len(machine.locked) + (4 * machine.history + 2) * len(machine.driven)
     assert features(machine, measured).shape == (4, size)
     assert sum(block.std.size for block in observation_blocks(machine)) == size
     assert (observation_scale(machine)[1] > 0).all()
@@ -201,7 +204,7 @@ def test_the_table_of_the_docstring__is_true():
         r"^\| (\d+)(?:-(\d+))? +\| .+? +\| (.+?) +\| ([\d.]+) +\| (\w+) +\|", task.__doc__, re.M
     )
     blocks = observation_blocks(BROKK_170)
-    cuts = [0, 1, 2, 3, 11, 12, 13, 14]  # a row holds the blocks of all joints
+    cuts = [0, 1, 2, 3, 11, 12, 13, 14, 15]  # a row holds the blocks of all joints
     groups = [blocks[i:j] for i, j in pairwise(cuts)]
     assert len(rows) == len(groups)
     place = 0
@@ -213,7 +216,7 @@ def test_the_table_of_the_docstring__is_true():
         assert (noise == "yes") == group[0].noisy
         number = re.match(r"0\.\d{3}", deviation)
         assert not number or float(number[0]) == pytest.approx(group[0].std[0], abs=5e-4)
-    assert place == 171 and "(171,)" in task.__doc__ and "Box(-1, 1, (4,))" in task.__doc__
+    assert place == 223 and "(223,)" in task.__doc__ and "Box(-1, 1, (4,))" in task.__doc__
     for word in ("Observation:", "Action:", "Reward:", "Start:", "End:", "truncated after 20 s"):
         assert word in task.__doc__
     assert TaskConfig().episode_s == 20

@@ -101,18 +101,18 @@ def lambda_return_advantages(rewards, terminated, truncated, values, last_values
 
 
 def test_agent__has_the_nets_of_the_paper():
-    agent = Agent(171, 4, -0.5, critic=True)
+    agent = Agent(223, 4, -0.5, critic=True)
     for net, outputs, gain in ((agent.actor, 4, 0.01), (agent.critic, 1, 1.0)):
         assert [type(layer) for layer in net] == [nn.Linear, nn.ELU] * 3 + [nn.Linear]
         sizes = [(layer.in_features, layer.out_features) for layer in net[::2]]
-        assert sizes == [(171, 256), (256, 128), (128, 64), (64, outputs)]
+        assert sizes == [(223, 256), (256, 128), (128, 64), (64, outputs)]
         assert not any(layer.bias.any() for layer in net[::2])
         first, last = net[0].weight.detach(), net[-1].weight.detach()
-        torch.testing.assert_close(first.T @ first, 2 * torch.eye(171), atol=1e-4, rtol=0)
+        torch.testing.assert_close(first.T @ first, 2 * torch.eye(223), atol=1e-4, rtol=0)
         torch.testing.assert_close(last @ last.T, gain**2 * torch.eye(outputs))
         assert agent.log_std.tolist() == [-0.5] * 4
     assert "log_std" in dict(agent.named_parameters())
-    obs = torch.randn(3, 5, 171)
+    obs = torch.randn(3, 5, 223)
     torch.testing.assert_close(agent.value(obs), agent.critic(obs).squeeze(-1))
     assert Agent(2, 1, 0.0, critic=False).critic is None
 
