@@ -20,7 +20,7 @@ REST_AFTER = {"closed": 0.5, "dither": 0.1, "open": math.inf}  # s of a zero goa
 STANDSTILL = 0.002  # rad or m, assumed: little more than one step of a 12-bit encoder
 Valves = Literal["closed", "dither", "open"]  # what they do while the tool rests
 MU = 50.0  # assumed: the mu law is about linear below 1/50 of full opening
-BARELY = 0.02  # of full opening, assumed: a command that opens a valve so far counts as 3/4 open
+INDICATOR_SCALE = 0.02  # of full opening, assumed: 3 counts of 127 beyond a dead zone of 7 %
 
 # --- the analytic plant ---------------------------------------------------------------------------
 
@@ -196,17 +196,17 @@ def mu_law(u: ArrayLike, dead_zone: float) -> Array:
     return np.asarray(np.copysign(np.log1p(MU * np.abs(x)) / math.log1p(MU), x))
 
 
-def open_indicator(u: ArrayLike, dead_zone: float) -> Array:
-    """Does a command open the valve? 0 within the dead zone, else tanh(|x| / 0.02), below 1.
+def open_indicator(u: ArrayLike, dead_zone: ArrayLike) -> Array:
+    """Does a command open the valve? tanh(|x| / 0.02) of the opening x, as in `valve_opening`.
 
-    x is the opening beyond the dead zone. A valve that was closed answers late: when it does
-    depends on how long commands have opened it, not on how far. Paper: Sec. 3.2 (past movement)
+    0 within the dead zone, near 1 from some counts on. A closed valve answers late; when it does
+    depends on how long it has had commands, hardly on how large they are. Paper: Table 1 (u)
 
     Example:
         >>> open_indicator([-1.0, 0.07, 0.08, 0.1], 0.07).round(2)
         array([1.  , 0.  , 0.49, 0.92])
     """
-    return np.asarray(np.tanh(np.abs(valve_opening(u, dead_zone)) / BARELY))
+    return np.asarray(np.tanh(np.abs(valve_opening(u, dead_zone)) / INDICATOR_SCALE))
 
 
 def input_rows(q: Array, q_dot: Array, u: Array, dead_zone: float, indicator: bool) -> list[Array]:

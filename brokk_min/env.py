@@ -45,7 +45,6 @@ from brokk_min.machine import PWM_MAX, Array, Machine, as_floats, limit_command,
 INTEGRAL_TIME = 2.0  # s, tuned: time constant of the error integral's leak
 INTEGRAL_LIMIT = 0.07  # of tool_speed, tuned: velocity errors count up to here
 COMPENSATION = 0.01  # of an action, assumed: over this a command crosses the dead zone
-Bools = NDArray[np.bool_]
 Encoder = Callable[[Machine, Array], Array]  # machine, true angles -> measured angles
 
 
@@ -94,8 +93,8 @@ class Block(NamedTuple):
 def observation_blocks(machine: Machine, paper: bool = False) -> tuple[Block, ...]:
     """The observation, ours or the paper's, in its order. Paper: Sec. 3.4 (normalisation)
 
-    Means and deviations are those of uniform distributions over the ranges. H samples (H^-0.5 each)
-    weigh as much as one number; resolved velocities most: a net learns first what is large.
+    Means and deviations: of uniform distributions over the ranges; of indicators 0.5. H samples
+    (H^-0.5 each) weigh as one number, resolved velocities most: nets learn first what is large.
     """
     H = machine.history
     q_mean = (machine.column("q_min") + machine.column("q_max")) / 2
@@ -163,16 +162,17 @@ def measure(
 
 def features(machine: Machine, measured: Measured, paper: bool = False) -> Array:
     """The observation of the table above, ours or the paper's. Paper: Sec. 3.4, Fig. 3"""
-    signals = measured.history[..., :2, :].reshape(*measured.q.shape[:-1], -1)
-    commands = measured.history[..., 2, :].reshape(*measured.q.shape[:-1], -1)
-    numbers = [measured.v_goal, measured.v_tool, measured.q[..., machine.locked], signals, commands]
+    shape = (*measured.q.shape[:-1], -1)
+    u = measured.history[..., 2, :]
+    numbers = [measured.v_goal, measured.v_tool, measured.q[..., machine.locked]]
+    numbers += [measured.history[..., :2, :].reshape(shape), u.reshape(shape)]
     if not paper:
         numbers[:2] = [kinematics.to_heading(measured.p_tool, v) for v in numbers[:2]]
+        opens = actuator.open_indicator(u, machine.dead_zones[machine.driven, None])
+        numbers.append(opens.reshape(shape))
         J, integral = measured.J[..., machine.driven], measured.error_integral
-        arm = np.hypot(machine.column("a"), machine.column("d")).sum()
-        damping = (0.06 * arm) ** 2 + 1e-6  # lambda = 6 % of the links' lengths, assumed
-        J_inv = dls(J, machine.column("weight")[machine.driven], damping)
-        numbers.append(actuator.open_indicator(commands, machine.dead_zone))
+        arm = np.hypot(machine.column("a"), machine.column("d")).sum()  # lambda: 6 % of it, assumed
+        J_inv = dls(J, machine.column("weight")[machine.driven], (0.06 * arm) ** 2 + 1e-6)
         numbers += [(J_inv @ v[..., None])[..., 0] for v in (measured.v_goal, integral)]
     mean, scale = observation_scale(machine, paper)
     return (np.concatenate(numbers, axis=-1, dtype=np.float32) - mean) / scale
@@ -302,14 +302,14 @@ def reward(v_goal: Array, v_tool: Array) -> Array:
     return np.asarray(1 / (1 + np.linalg.norm(v_goal - v_tool, axis=-1)))
 
 
-def terminated(machine: Machine, lowest: Array) -> Bools:
+def terminated(machine: Machine, lowest: Array) -> NDArray[np.bool_]:
     """Is a link in the ground? `lowest` [m] (...) is `kinematics.lowest_point`. Paper: Sec. 3.4"""
     return np.asarray(lowest < machine.ground)
 
 
 def step(
     machine: Machine, config: TaskConfig, net: ActuatorNet | None, state: State, action: ArrayLike
-) -> tuple[State, Array, Bools, Bools, Array]:
+) -> tuple[State, Array, NDArray[np.bool_], NDArray[np.bool_], Array]:
     """One tick under actions (num, n_driven) of `num` machines, without new goals or resets.
 
     The next state; reward, terminated, truncated and |v_goal - v_tool| [m/s], (num,) each.

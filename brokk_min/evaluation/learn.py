@@ -6,6 +6,8 @@ drives, then nets fitted to both logs and the policy trained on. The field calls
 """
 
 import logging
+import os
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -191,9 +193,15 @@ def connect(scheduler: str | None = None, **cluster: Any) -> Iterator[Any]:
         options |= {"silence_logs": logging.CRITICAL, **cluster}
     environ = "distributed.nanny.pre-spawn-environ"  # of the processes that run the jobs
     settings = {
-        f"{environ}.TQDM_DISABLE": 1,  # bars of several processes would mix
         f"{environ}.MALLOC_TRIM_THRESHOLD_": 2**30,  # with dask's 64 kB a training takes 1.4 times
         "distributed.admin.large-graph-warning-threshold": "1TB",  # of logs
     }
     with dask.config.set(settings), Client(**options) as client:  # type: ignore[no-untyped-call]
+        if scheduler is None:
+            client.run(_hide_bars)
         yield client
+
+
+def _hide_bars() -> None:
+    """No output to stderr: bars of several processes would mix."""
+    sys.stderr = open(os.devnull, "w")  # noqa: SIM115

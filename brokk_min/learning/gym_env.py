@@ -19,12 +19,13 @@ from numpy.typing import NDArray
 
 from brokk_min import env
 from brokk_min.actuator import ActuatorNet
-from brokk_min.env import Bools, State, TaskConfig, observation_scale
+from brokk_min.env import State, TaskConfig, observation_scale
 from brokk_min.identification.net_file import load_net, select_nets
 from brokk_min.learning.episodes import get_obs, new_goals, replace_rows, reset
 from brokk_min.machine import BROKK_170, Array, Machine
 
 Frame = NDArray[np.uint8]  # (height, width, 3)
+Bools = NDArray[np.bool_]
 Step = tuple[Array, Array, Bools, Bools, dict[str, Any]]  # of a vector: obs, reward, ends, info
 
 

@@ -44,7 +44,7 @@ from torch import Tensor
 
 from brokk_min import ppo
 from brokk_min.actuator import (
-    BARELY,
+    INDICATOR_SCALE,
     MU,
     ActuatorNet,
     append_command,
@@ -237,11 +237,10 @@ def input_gradient(net: ActuatorNet, history: Array) -> tuple[Array, Array]:
     gradient = (gradient @ w1.swapaxes(1, 2)).swapaxes(0, 1)
     rows = gradient.reshape(*history.shape[:-2], -1, net.history)  # by `input_rows`
     u = history[..., 2, :]
-    by_history = rows[..., :3, :]
-    by_history[..., 2, :] *= mu_law_derivative(u, net.dead_zone)
+    by_u = rows[..., 2, :] * mu_law_derivative(u, net.dead_zone)  # the chain rule: both rows
     if net.indicator:
-        by_history[..., 2, :] += rows[..., 3, :] * open_indicator_derivative(u, net.dead_zone)
-    return velocity, by_history
+        by_u += rows[..., 3, :] * open_indicator_derivative(u, net.dead_zone)
+    return velocity, np.concatenate([rows[..., :2, :], by_u[..., None, :]], axis=-2)
 
 
 def mu_law_derivative(u: Array, dead_zone: float) -> Array:
@@ -256,7 +255,7 @@ def mu_law_derivative(u: Array, dead_zone: float) -> Array:
 def open_indicator_derivative(u: Array, dead_zone: float) -> Array:
     """Derivative of `actuator.open_indicator` by `u`, same shape; 0 within the dead zone."""
     x = valve_opening(u, dead_zone)
-    slope = (1 - open_indicator(u, dead_zone) ** 2) / (BARELY * (1 - dead_zone))
+    slope = (1 - open_indicator(u, dead_zone) ** 2) / (INDICATOR_SCALE * (1 - dead_zone))
     return np.asarray(np.sign(x) * slope, u.dtype)
 
 

@@ -56,7 +56,7 @@ def ticks_of(states, commands, done=None):
 def moving_case(machine, seed):
     """Nets in double precision, a state in motion and commands, no joint near its limits."""
     rng = np.random.default_rng(seed)
-    net = small_net(machine, rng, rows=3 + seed % 2)
+    net = small_net(machine, rng, rows=3 + seed // 2 % 2)
     low, high = machine.column("q_min"), machine.column("q_max")
     # 3/8 of the range lie before each joint, at least
     fastest = (high - low)[machine.driven] / 3 / ((15 + TICKS) * machine.dt)
