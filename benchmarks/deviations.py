@@ -398,7 +398,7 @@ def start_rule() -> Figures:
     for name in baselines.STRONGEST:
         by_hand = WithStartRule(**vars(baselines.baselines(M, shipped.net)[name]))
         found = [
-            baselines.tune(by_hand, cost, seed, baselines.GENERATIONS, name) for seed in (1, 2)
+            baselines.tune(by_hand, cost, seed, 2 * baselines.GENERATIONS, name) for seed in (1, 2)
         ]
         controllers[name] = min(found, key=lambda one: one[1][-1])[0]
     starts = sequences.workspace_starts(M, 64)
