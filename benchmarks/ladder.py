@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from brokk_min import actuator, env, ppo
 from brokk_min.actuator import ActuatorNet
-from brokk_min.env import Bools, Measured, TaskConfig, action_to_pwm, features
+from brokk_min.env import Measured, TaskConfig, action_to_pwm, features
 from brokk_min.evaluation import metrics, sequences
 from brokk_min.evaluation.learn import Budget, Chain, fit_net, side_by_side
 from brokk_min.identification import logs
@@ -29,7 +29,7 @@ from brokk_min.identification.muon import Muon
 from brokk_min.identification.net_file import load_net, select_nets
 from brokk_min.learning.checkpoint import export_policy, stagger_episodes
 from brokk_min.learning.episodes import GRADIENT_LEARNER, PAPER_TASK, get_obs, new_goals, reset
-from brokk_min.learning.gym_env import TaskVectorEnv
+from brokk_min.learning.gym_env import Step, TaskVectorEnv
 from brokk_min.learning.policy import Policy
 from brokk_min.learning.simulation_gradient import improved_actions, regression_loss
 from brokk_min.machine import BROKK_170 as M
@@ -89,9 +89,7 @@ class MixedEnv(TaskVectorEnv):
         self.steps = steps
         self.episodes = TaskConfig() if "episodes" in steps else PAPER
 
-    def step_without_reset(
-        self, actions: Array
-    ) -> tuple[Array, Array, Bools, Bools, dict[str, Any]]:
+    def step_without_reset(self, actions: Array) -> Step:
         """One tick; the paper's episodes end in the ground in their first tick only."""
         before = self.state
         assert before is not None

@@ -223,7 +223,7 @@ class ActuatorNet:
 
     Weights, joint by joint: (n, I, 32), (n, 32), (n, 32, 32), (n, 32), (n, 32, 1) and (n, 1).
     Paper: Table 1 and Sec. 3.3 (I = 3 H = 39, two hidden layers of 32, ReLU, sigmoid output)
-    Not in the paper: I = 4 H, see `input_rows`; two more weights, (n, 2 I, L) and (n, L, 32), where
+    Not in the paper: I = 4 H, see `input_rows`; two more weights, (n, 6 H, L) and (n, L, 32), where
     joints are not alone, see `latents`.
     """
 
@@ -276,9 +276,10 @@ class ActuatorNet:
     def latents(self, x: Array) -> Array:
         """Latents (batch, L) of all joints' inputs (batch, n, I), such as pump flow and load.
 
-        z = tanh(sum_j S_j^T [x_j, |x_j|]) of standardised inputs x.
+        z = tanh(sum_j S_j^T [x_j, |x_j|]) of standardised inputs x, without indicators: what joints
+        take from a pump depends on how far valves open.
         """
-        x = (x - self.input_mean) / self.input_scale
+        x = ((x - self.input_mean) / self.input_scale)[..., : 3 * self.history]
         x = np.concatenate([x, np.abs(x)], axis=-1)
         return np.tanh(x.reshape(len(x), -1) @ np.concatenate(self.weights[6]))
 

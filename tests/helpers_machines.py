@@ -96,9 +96,9 @@ def obedient_velocity(machine, u):
     return fastest * (2 / (1 + np.exp(-GAIN * np.asarray(u, float))) - 1)
 
 
-def shared_net(latents=2):
+def shared_net(latents=2, rows=3):
     """`random_net` whose joints share latents."""
-    net, rng = random_net(), np.random.default_rng(1)
+    net, rng = random_net(rows=rows), np.random.default_rng(1)
     shapes = (len(net.joints), 6 * net.history, latents), (len(net.joints), latents, 32)
     more = tuple(0.1 * rng.standard_normal(shape).astype(np.float32) for shape in shapes)
     return replace(net, weights=net.weights + more)

@@ -162,7 +162,8 @@ def initial_weights(n: int, config: FitConfig, generator: Generator) -> list[Ten
     for rows, columns in [(inputs, hidden), (hidden, hidden), (hidden, 1)]:
         weights += [uniform(rows, columns, math.sqrt(6 / rows)), torch.zeros(n, columns)]
     if latents:
-        weights.append(uniform(2 * inputs, latents, math.sqrt(1 / (2 * n * inputs))))
+        read = 6 * config.history
+        weights.append(uniform(read, latents, math.sqrt(1 / (n * read))))
         weights.append(uniform(latents, hidden, math.sqrt(6 / inputs)))
     return [weight.requires_grad_() for weight in weights]
 
@@ -255,7 +256,8 @@ def predict(
     x = (x - data.input_mean[:, None]) / data.input_scale[:, None]
     bias = b1[:, None]
     if len(weights) > 6:  # as `ActuatorNet.latents`
-        both = torch.cat([x, x.abs()], dim=-1)
+        both = x[..., : 3 * q.shape[-1]]
+        both = torch.cat([both, both.abs()], dim=-1)
         bias = bias + torch.tanh((both @ weights[6]).sum(dim=0)) @ weights[7]
     x = torch.relu(torch.baddbmm(bias, x, w1))
     x = torch.relu(torch.baddbmm(b2[:, None], x, w2))

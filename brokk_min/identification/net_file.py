@@ -50,7 +50,7 @@ def net_from_arrays(path: Path, arrays: dict[str, NDArray[Any]], prefix: str = "
     check_fields(path, header, NET_HEADER, sizes, prefix)
     found, H = arrays.get("input_mean", np.empty(0)), header["history"]
     inputs = 4 * H if found.shape[-1:] == (4 * H,) else 3 * H
-    sizes |= {"inputs": inputs, "2 inputs": 2 * inputs}
+    sizes |= {"inputs": inputs, "6 history": 6 * H}
     check_fields(path, arrays, NET_ARRAYS, sizes, prefix)
     for name in ("output", "q"):
         if not (arrays[f"{name}_low"] < arrays[f"{name}_high"]).all():

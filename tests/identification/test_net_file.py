@@ -34,7 +34,7 @@ def saved(path, entries=None, **changes):
 
 
 @pytest.mark.parametrize(
-    "net", [random_net(rows=4), replace(random_net(), dead_zone=0.1), shared_net()]
+    "net", [random_net(rows=4), replace(random_net(), dead_zone=0.1), shared_net(rows=4)]
 )
 def test_load_net__gives_the_net_that_was_saved(tmp_path, net):
     history = np.random.default_rng(2).uniform(-1, 1, (6, 3, 3, 13)).astype(np.float32)
