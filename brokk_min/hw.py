@@ -64,7 +64,7 @@ class Drive:
         self.start_time = self.bus.now()
 
     def run(self, show: Callable[["Drive"], object] = lambda drive: None) -> None:
-        """Tick until the operator, SIGINT or SIGTERM stops it; the last frame is always neutral."""
+        """Tick until the operator or a signal stops it; the last frame is neutral. Paper: Sec. 2"""
         gc.disable()  # no garbage collection in the middle of a tick
         try:
             with stop_signals() as self.signals:
