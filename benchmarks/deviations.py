@@ -12,7 +12,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -370,53 +370,9 @@ def quiet() -> Figures:
     }
 
 
-@dataclass(frozen=True)
-class WithStartRule(jacobian.JacobianController):
-    """A PID that opens a closed valve three times as wide just before it answers (D7)."""
-
-    ticks: tuple[int, ...] = (3, 4, 5)  # of commands so far
-    factor: float = 3.0  # of 1.5, 2 and 3 the best on tuning goals, as are these ticks of five
-
-    def __call__(
-        self, measured: env.Measured, state: jacobian.PIDState
-    ) -> tuple[Array, jacobian.PIDState]:
-        """Commands u (..., n), and the state of the next tick."""
-        u, state = super().__call__(measured, state)
-        idle = np.abs(measured.history[..., 2, :]) <= M.dead_zone
-        count = np.where(idle.any(axis=-1), np.argmax(idle[..., ::-1], axis=-1), M.history)
-        opening = machine.valve_opening(u, M.dead_zones)
-        opening[..., M.driven] *= np.where(np.isin(count, self.ticks), self.factor, 1.0)
-        return machine.limit_command(M, machine.valve_command(opening, M.dead_zones)), state
-
-
-def start_rule() -> Figures:
-    """The strongest PIDs with a rule for starts, tuned as the shipped ones: error, drift, jerk."""
-    shipped = policy.load_policy(POLICY, M)
-    start, goals = sequences.tuning_set(M, baselines.TUNING_RUNS, 1)
-    cost = partial(baselines.tuning_cost, start=start, goals=goals, seed=1, config=TaskConfig())
-    controllers: dict[str, Any] = {}
-    for name in baselines.STRONGEST:
-        by_hand = WithStartRule(**vars(baselines.baselines(M, shipped.net)[name]))
-        found = [
-            baselines.tune(by_hand, cost, seed, 2 * baselines.GENERATIONS, name) for seed in (1, 2)
-        ]
-        controllers[name] = min(found, key=lambda one: one[1][-1])[0]
-    starts = sequences.workspace_starts(M, 64)
-    runs, _ = metrics.evaluate(M, controllers, sequences.task_sequences(M), starts, 0)
-    result = {}
-    for name in controllers:
-        own = [run for run in runs if run["controller"] == name]
-        axes = [run["velocity_error_mean"] for run in own if run["sequence"] in sequences.AXES]
-        result[f"{name}, x, y, z"] = float(np.mean(axes))
-        for key in ("velocity_error_mean", "off_axis_drift_max", "jerk_rms", "valve_travel"):
-            result[f"{name}, {key}"] = float(np.mean([run[key] for run in own]))
-    return result
-
-
 MEASURED: tuple[Callable[[], Figures], ...] = (a1, d1, d3, d6, a6, a7, a9, a11)
 MEASURED += (levels, stand, dither)
 TRAINED: tuple[Callable[[], Figures], ...] = (d4, a4, d5, d7, d10, d11, d12, d13, d14, a5, quiet)
-TRAINED += (start_rule,)
 
 
 def main(words: list[str]) -> None:

@@ -7,7 +7,7 @@ Read in the order of the computation: `dls`, its weights and its damping give jo
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -107,8 +107,9 @@ class Gains:
     kd: Array  # valve opening per rad/s^2, (..., n_driven)
     feedback: Array  # K = feedback * I of eq3 [1], (..., 1)
     min_opening: Array  # least valve opening while the tool is to move [1], (..., 1)
-    # K_I of the error integral, which eq3 does not have [1/s], (..., 1):
-    integral_feedback: Array = field(default_factory=lambda: np.zeros(1))
+    integral_feedback: Array  # K_I of the error integral, which eq3 does not have [1/s], (..., 1)
+    start_boost: Array  # a valve that was closed opens 1 + start_boost times as wide [1], (..., 1)
+    start_time: Array  # for this time after its first command [s], (..., 1)
 
 
 class PIDState(NamedTuple):
@@ -127,8 +128,8 @@ class JacobianController:
 
     The PID gives the valve opening; the dead zone is added afterwards. While the tool
     is to move, no valve goes below the opening `min_opening`: one that has closed answers late
-    (paper Sec. 3.2). At rest `command_at_rest` has a rule, unless `valves` are "open".
-    Paper: eq3, Sec. 4.2
+    (paper Sec. 3.2), and opens wider at first (near: Hagglund 2002). At rest `command_at_rest` has
+    a rule, unless `valves` are "open". Paper: eq3, Sec. 4.2
     """
 
     machine: Machine
@@ -181,17 +182,20 @@ class JacobianController:
             opening = opening + valve_opening(u, m.dead_zones[m.driven])
         limit = valve_opening(np.sign(opening) * m.pwm_limit / PWM_MAX, m.dead_zones[m.driven])
         saturated = (np.abs(opening) >= np.abs(limit)) & (np.sign(opening) == np.sign(error))
-        u = self._open_valves(opening, measured.v_goal)
-        rest = measured.v_goal, state.rest_ticks
-        u, resting, ticks = command_at_rest(m, self.valves, u, *rest)
+        u = self._open_valves(opening, measured)
+        u, resting, ticks = command_at_rest(m, self.valves, u, measured.v_goal, state.rest_ticks)
         increase = np.where(saturated | resting, 0.0, gains.ki * error * m.dt)  # anti-windup
         return u, PIDState(state.integral + increase, error, derivative, q_dot_goal, ticks)
 
-    def _open_valves(self, opening: Array, v_goal: Array) -> Array:
+    def _open_valves(self, opening: Array, measured: Measured) -> Array:
         """Commands u (..., n) of valve openings beyond the dead zone (..., n_driven)."""
-        m = self.machine
-        moving = np.linalg.norm(v_goal, axis=-1, keepdims=True) > 1e-6
-        least = (moving | (self.valves != "closed")) * self.gains.min_opening
+        m, gains = self.machine, self.gains
+        idle = valve_opening(measured.history[..., 2, :], m.dead_zones[m.driven, None]) == 0
+        ticks = np.argmax(idle[..., ::-1], axis=-1)  # since a valve was closed; 0: now or long ago
+        start = (ticks > 0) & (ticks * m.dt < gains.start_time)
+        opening = opening * np.where(start, 1 + gains.start_boost, 1.0)
+        moving = np.linalg.norm(measured.v_goal, axis=-1, keepdims=True) > 1e-6
+        least = (moving | (self.valves != "closed")) * gains.min_opening
         size = np.maximum(np.abs(opening), least)
         closed = size < 0.5 / PWM_MAX  # below half a count
         opening = np.where(closed, 0.0, np.sign(opening) * size)

@@ -124,9 +124,7 @@ class Machine:
         if not most * PWM_MAX < self.pwm_limit:  # no valve would ever open
             raise ValueError(f"dead_zone: expected below {self.pwm_limit}/{PWM_MAX}, got {most!r}")
         if least < self.dead_zone:
-            raise ValueError(
-                f"dead_zone: expected at most {least}, a joint's, got {self.dead_zone}"
-            )
+            raise ValueError(f"dead_zone: expected at most a joint's {least}, got {self.dead_zone}")
         common = self.pwm_limit / PWM_MAX, 2**self.encoder_bits
         pairs = zip(self.joints, self.dead_zones, strict=True)
         joints = tuple(joint.complete(zones, *common) for joint, zones in pairs)

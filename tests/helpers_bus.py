@@ -34,7 +34,7 @@ SIX = replace(BROKK_170, name="six joints", joints=(*BROKK_170.joints, SIXTH), q
 def baseline(machine):
     """A PI controller that nobody tuned."""
     one = np.ones(len(machine.driven))
-    gains = Gains(one, 3 * one, 0 * one, np.array([0.3]), np.zeros(1))
+    gains = Gains(one, 3 * one, 0 * one, np.full(1, 0.3), *[np.zeros(1)] * 4)
     return JacobianController(machine, gains, 0.1, manipulability_threshold(machine))
 
 

@@ -40,7 +40,10 @@ RANGES = {  # that `tune` searches (assumed); each driven joint has its own kp, 
     "feedback": (0.01, 1.0),  # K = feedback * I of eq3, positive definite
     "min_opening": (0.0, 0.06),  # least valve opening
     "integral_feedback": (0.0, 3.0),  # K_I of the error integral [1/s]
+    "start_boost": (0.0, 4.0),  # of openings of valves that were closed
+    "start_time": (0.0, 0.5),  # for which they are wider [s]
 }
+OF_ALL = tuple(RANGES)[3:]  # one number for all joints
 
 
 def baselines(machine: Machine, net: ActuatorNet) -> dict[str, JacobianController]:
@@ -50,7 +53,9 @@ def baselines(machine: Machine, net: ActuatorNet) -> dict[str, JacobianControlle
     mild = make_gains(machine, kp=0.2, ki=0.5, kd=0.02, feedback=0.1, min_opening=0.015)
     feedforward = static_map(machine, net).command
     with_feedforward = JacobianController(machine, mild, 0.1, w0, feedforward)
-    with_integral = replace(with_feedforward, gains=replace(mild, integral_feedback=np.ones(1)))
+    more = {"integral_feedback": 1.0, "start_boost": 2.0, "start_time": 0.26}
+    gains = replace(mild, **{name: np.full(1, value) for name, value in more.items()})
+    with_integral = replace(with_feedforward, gains=gains)
     return {
         "jacobian_pid_k0.1": JacobianController(machine, pid, 0.1, w0),
         "jacobian_pid_k0.05": JacobianController(machine, pid, 0.05, w0),
@@ -75,24 +80,25 @@ def make_gains(machine: Machine, **gains: ArrayLike) -> Gains:
 
 
 def gains_vector(gains: Gains) -> Array:
-    """Gains as one vector (..., 3 n_driven + 3), in the order of `RANGES`."""
+    """Gains as one vector (..., 3 n_driven + 5), in the order of `RANGES`."""
     return np.concatenate([getattr(gains, name) for name in RANGES], axis=-1)
 
 
 def split_vector(vector: Array) -> Gains:
     """The inverse of `gains_vector`."""
-    n = (vector.shape[-1] - 3) // 3
-    return Gains(*np.split(vector, [n, 2 * n, 3 * n, 3 * n + 1, 3 * n + 2], axis=-1))
+    n = (vector.shape[-1] - len(OF_ALL)) // 3
+    ends = np.cumsum([n] * 3 + [1] * len(OF_ALL))
+    return Gains(*np.split(vector, ends[:-1], axis=-1))
 
 
 def gain_bounds(machine: Machine) -> Array:
-    """Smallest and largest gains of `RANGES` as vectors, (2, 3 n_driven + 3)."""
+    """Smallest and largest gains of `RANGES` as vectors, (2, 3 n_driven + 5)."""
     ranges = np.array(list(RANGES.values()))
-    return np.repeat(ranges, [len(machine.driven)] * 3 + [1] * 3, axis=0).T
+    return np.repeat(ranges, [len(machine.driven)] * 3 + [1] * len(OF_ALL), axis=0).T
 
 
 def gains_of(machine: Machine, x: Array) -> Gains:
-    """Gains at the fractions x [0, 1] (..., 3 n_driven + 3) of the roots of their ranges.
+    """Gains at the fractions x [0, 1] (..., 3 n_driven + 5) of the roots of their ranges.
 
     gain = low + x^2 (high - low): small gains of a wide range are searched as finely as large ones.
     """
@@ -110,7 +116,7 @@ def gains_at_bound(controller: JacobianController) -> list[str]:
     """Names of gains other than 0 by the ends of their range: there it decided, not the cost."""
     m = controller.machine
     names = [f"{kind} {m.names[i]}" for kind in ("kp", "ki", "kd") for i in m.driven]
-    names += ["feedback", "min_opening", "integral_feedback"]
+    names += OF_ALL
     values = gains_vector(controller.gains)
     x = fractions_of(m, controller.gains)
     numbers = zip(names, values, x, strict=True)
@@ -134,8 +140,9 @@ def tune_baselines(
     trained on nets alone. Each is tuned twice, with `seed` and the next: "cost" and "second_cost"
     agree if the search has converged; the better gains are kept. The least of many noisy costs is
     too good, so "cost_anew" is the mean of 16 more of these. `config` has the noise. No run is
-    longer than `longest` [s]; `only` one baseline, or "" for all. The paper's second one gets the
-    gains of its first: their damping differs near singularities alone, where no run goes.
+    longer than `longest` [s]; `only` one baseline, or "" for all. `STRONGEST` have more gains, and
+    twice the generations. The paper's second one gets the gains of its first: their damping differs
+    near singularities alone, where no run goes.
     """
     start, goals = tuning_set(machine, runs, seed, min(TUNING_SECONDS, longest))
     config = config or TaskConfig()
@@ -145,8 +152,9 @@ def tune_baselines(
     every = baselines(machine, net)
     for name in [only] if only else TUNED:
         controller = every[name]
-        first, costs = tune(controller, cost, seed, generations, name)
-        second, second_costs = tune(controller, cost, seed + 1, generations, name)
+        steps = generations * (2 if name in STRONGEST else 1)
+        first, costs = tune(controller, cost, seed, steps, name)
+        second, second_costs = tune(controller, cost, seed + 1, steps, name)
         tuned[name] = first if costs[-1] <= second_costs[-1] else second
         copies = np.tile(gains_vector(tuned[name].gains), (16, 1))
         record[name] = {

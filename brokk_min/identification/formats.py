@@ -121,6 +121,8 @@ GAINS: Fields = {  # of one controller
     "feedback": Field("float", 0, 1e6, (1,)),
     "min_opening": Field("float", 0, 1, (1,)),
     "integral_feedback": Field("float", 0, 1e6, (1,), required=False),
+    "start_boost": Field("float", 0, 1e6, (1,), required=False),
+    "start_time": Field("float", 0, 1e6, (1,), required=False),
 }
 NOT_NEGATIVE = Field("float", 0)
 ANY = Field("float", none=True)

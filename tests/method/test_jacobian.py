@@ -131,7 +131,7 @@ def measured(q, v_goal, q_dot=0.0, machine: Machine = BROKK_170) -> Measured:
 
 def controller(w0=1e-6, k=0.1, machine: Machine = BROKK_170, **gains) -> JacobianController:
     sizes = dict.fromkeys(("kp", "ki", "kd"), len(machine.driven))
-    sizes |= {"feedback": 1, "min_opening": 1}
+    sizes |= dict.fromkeys(Gains.__dataclass_fields__.keys() - sizes.keys(), 1)
     arrays = {name: np.full(size, gains.get(name, 0.0)) for name, size in sizes.items()}
     return JacobianController(machine, Gains(**arrays), k, w0)
 
@@ -259,6 +259,25 @@ def test_controller__least_opening_while_the_tool_is_to_move():
     same, _ = controller(kp=1.5)(measured(POSE, GOAL), c.start(1))
     beyond = np.abs(same) > least / 127
     assert beyond.any() and (more[beyond] == same[beyond]).all()  # a least opening, not one more
+
+
+def test_controller__opens_a_closed_valve_wider_for_a_while():
+    """Three times as wide from the tick after the first command on, for 0.12 s; then as without.
+
+    The first command is not yet wider. A valve that has been open for long has no start.
+    """
+    c = controller(kp=1.0, start_boost=2.0, start_time=0.12)
+    opening = np.linalg.pinv(J) @ GOAL
+    sent: list[np.ndarray] = []
+    for _ in range(6):
+        now = measured(POSE, GOAL)
+        for back, u in enumerate(reversed(sent), 1):
+            now.history[0, :, 2, -back] = u
+        sent.append(c(now, c.start(1))[0][0, DRIVEN])
+    factors = [1, 3, 3, 1, 1, 1]
+    np.testing.assert_allclose(sent, [opened(f * opening) for f in factors], atol=1e-9)
+    now.history[0, :, 2] = sent[0][:, None]
+    np.testing.assert_allclose(c(now, c.start(1))[0][0, DRIVEN], sent[0], atol=1e-9)
 
 
 def test_controller__closes_its_valves_half_a_second_after_the_stop():

@@ -307,7 +307,7 @@ def test_dead_zones__are_each_joints_own_or_the_machines():
     limit = 80 / 127
     assert r.speed_positive == pytest.approx(r.q_dot_up * 0.30 * 0.9 / (limit - 0.1))
     assert r.speed_negative == pytest.approx(r.q_dot_down * 0.30 * 0.93 / (limit - 0.07))
-    expected = r"dead_zone: expected at most 0\.05, a joint's, got 0\.07"
+    expected = r"dead_zone: expected at most a joint's 0\.05, got 0\.07"
     with pytest.raises(ValueError, match=expected):
         changed(2, dead_zone_down=0.05)
 
