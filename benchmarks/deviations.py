@@ -357,7 +357,7 @@ def quiet() -> Figures:
     cost = partial(baselines.tuning_cost, start=start, goals=goals, seed=0, config=config)
     gains = baselines.read_gains(shipped / "gains.json", M, net)
     by_hand = baselines.baselines(M, net)
-    for name in ("jacobian_pid_k0.1", *baselines.STRONGEST):
+    for name in ("jacobian_pid_k0.1", *baselines.WITH_INTEGRAL):
         controllers[name] = gains[name]
         tuned, _ = baselines.tune(by_hand[name], cost, 0, baselines.GENERATIONS, name)
         controllers[f"{name}, tuned so"] = tuned

@@ -258,7 +258,7 @@ LEARNERS = {"ours": ours, "critic": partial(ours, critic=True)}
 LEARNERS |= {"sb3": sb3, "cleanrl": cleanrl, "rl_games": rl_games}
 NAMES = {"ours": "ours: gradients of the simulation", "critic": "ours, `train --critic`: GAE"}
 NAMES |= {"sb3": "Stable-Baselines3 PPO", "cleanrl": "CleanRL's loop", "rl_games": "rl_games PPO"}
-LENGTHS = (65_536, 262_144, 1_048_576, 2_000_000)  # ours; a policy is regressed in few steps
+LENGTHS = (262_144, 458_752, 1_048_576, 2_000_000)  # ours; a policy is regressed in few steps
 SETTINGS: dict[str, list[Setting]] = {
     name: [(rate, steps) for rate in (6e-4, 1.5e-3) for steps in (300_000, 800_000)]
     for name in LEARNERS

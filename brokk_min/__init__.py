@@ -10,13 +10,13 @@ Conventions: SI units and radians; base frame with z up; joints in the order of 
 the last axis of an array runs over joints or x, y, z, leading axes are batches (...).
 
 Glossary:
-    tick          one control period, 1/20 s
+    tick          one control period, 1/rate (of the Brokk 1/20 s)
     q, q_dot      joint angle [rad], joint velocity [rad/s]; of a prismatic joint [m], [m/s]
     u             command in [-1, 1] of full valve opening; `encode_pwm` makes its byte on the bus
     p, v          position [m] and velocity [m/s] of the tool tip
     v_goal        velocity that the tool should have [m/s]
     J, W          Jacobian of the tool position; weights of the damped least squares
-    k, w0         Nakamura's damping constant; manipulability below which damping sets in
+    k, w0         Nakamura's damping constant [m^2]; manipulability [m^3] below which it acts
     H             samples of history: 13, now and the last 0.6 s
     driven        moved by the controller; the other joints are locked, set by the operator
     plant         the analytic equations that play the machine

@@ -20,7 +20,7 @@ REST_AFTER = {"closed": 0.5, "dither": 0.1, "open": math.inf}  # s of a zero goa
 STANDSTILL = 0.002  # rad or m, assumed: little more than one step of a 12-bit encoder
 Valves = Literal["closed", "dither", "open"]  # what they do while the tool rests
 MU = 50.0  # assumed: the mu law is about linear below 1/50 of full opening
-INDICATOR_SCALE = 0.02  # of full opening, assumed: 3 counts of 127 beyond a dead zone of 7 %
+INDICATOR_SCALE = 0.02  # of full opening, assumed: 2.4 counts of 127 at a dead zone of 7 %
 
 # --- the analytic plant ---------------------------------------------------------------------------
 
@@ -87,8 +87,8 @@ def _euler_step(machine: Machine, state: PlantState, opening: Array) -> PlantSta
     z_next = z + dt * (open_valve - z) / tau  # dz/dt = (open - z) / tau
     x = np.clip((z - m.valve_threshold) / (1 - m.valve_threshold), 0.0, 1.0)
     g = np.sqrt(x * x * (3 - 2 * x))  # g = sqrt(smoothstep(x))
-    K = np.where(s > 0, m.column("speed_positive"), m.column("speed_negative"))
-    v_steady = K * s * g  # of the cylinder, were it alone
+    speed = np.where(s > 0, m.column("speed_positive"), m.column("speed_negative"))
+    v_steady = speed * s * g  # of the cylinder, were it alone
     flow = np.sum(np.abs(m.column("cylinder_area") * v_steady), axis=-1, keepdims=True)
     pump = np.minimum(1.0, m.pump_flow / np.maximum(flow, 1e-12))  # min(1, Q / sum |A v_steady|)
     q_next = q + dt * v / lever_arm(m, q)  # dq/dt = v / r(q)
@@ -136,8 +136,8 @@ def command_at_rest(
 
     "closed": zero. The joints stand, but the next motion begins 0.3 s later. "dither": driven
     valves open by `dither`, each tick the other way; the joints stand, the valves stay open
-    (Merritt 1967). "open": no rule (the paper). `ticks` (...) of a zero goal (..., 3) are those
-    before this one. Also: does the rule hold, (..., 1), and the ticks with this one.
+    (Merritt 1967). "open": no rule (the paper). `ticks` (...) are those of a zero goal (..., 3)
+    before this one. Returns commands, does the rule hold (..., 1), and the ticks with this one.
     """
     ticks = np.where(v_goal.any(axis=-1), 0, ticks + 1)
     resting = (ticks > REST_AFTER[valves] * machine.rate)[..., None]
@@ -164,13 +164,13 @@ def append_sample(history: Array, u: ArrayLike, q: Array, window: int, dt: float
 def smooth_angles(machine: Machine, history: Array) -> Array:
     """Present angles [rad] (..., n), from all samples of a history (..., n, 3, H).
 
-    Mean over j of q_j + dt (q_dot_{j+1} + ... + q_dot_H) + dt l (q_dot_H - q_dot_j): each sample,
-    moved on by the velocities since. As slopes, they come l = window / 2 - 1 ticks later than the
-    mean velocity of their tick. The mean has 0.28 of the training noise of the newest angle.
+    Mean over j = 1 .. H of q_j + dt (q_dot_{j+1} + ... + q_dot_H) + dt l (q_dot_H - q_dot_j): each
+    sample, moved on by the velocities since. As slopes, they come l = window / 2 - 1 ticks later
+    than the mean velocity of their tick. The mean has 0.28 of the newest angle's training noise.
     """
     H = machine.history
     late = machine.velocity_samples / 2 - 1
-    count = np.arange(H) - late  # column j, from 0, stands in j of the H sums
+    count = np.arange(H) - late  # q_dot_{j+1}, with j from 0, stands in j of the H sums
     count[-1] += H * late
     weights = np.stack([np.ones(H), machine.dt * count], dtype=history.dtype) / H
     return np.asarray(np.einsum("...kh,kh->...", history[..., :2, :], weights))
@@ -199,7 +199,7 @@ def mu_law(u: ArrayLike, dead_zone: float) -> Array:
 def open_indicator(u: ArrayLike, dead_zone: ArrayLike) -> Array:
     """Does a command open the valve? tanh(|x| / 0.02) of the opening x, as in `valve_opening`.
 
-    0 within the dead zone, near 1 from some counts on. A closed valve answers late; when it does
+    0 within the dead zone, 0.76 at 2.4 counts beyond 7 %. A closed valve answers late; when it does
     depends on how long it has had commands, hardly on how large they are. Paper: Table 1 (u)
 
     Example:
@@ -237,10 +237,10 @@ class ActuatorNet:
     settings: dict[str, float]
     input_mean: Array  # (n, I)
     input_scale: Array  # (n, I)
-    output_low: Array  # (n,) rad/s
-    output_high: Array  # (n,) rad/s
-    q_low: Array  # (n,) rad, smallest angle of the training log
-    q_high: Array  # (n,) rad
+    output_low: Array  # (n,) rad/s or m/s
+    output_high: Array  # (n,) rad/s or m/s
+    q_low: Array  # (n,) rad or m, smallest angle of the training log
+    q_high: Array  # (n,) rad or m
     weights: tuple[Array, ...]
     dead_zone: float = 0.0  # of full command: commands pass `mu_law`
 
@@ -253,7 +253,7 @@ class ActuatorNet:
         """Velocity over the coming tick [rad/s] (..., n): q(t + dt) = q(t) + dt * velocity.
 
         `history` is of `append_command`, (..., n, 3, H). A joint without a command beyond the dead
-        zone that moved less than `STANDSTILL` in it stands still; the net alone would creep.
+        zone, within `STANDSTILL` of its oldest angle, stands still; the net alone would creep.
         """
         velocity = self.forward(history)[0]
         still = np.abs(history[..., 0, -1] - history[..., 0, 0]) < STANDSTILL

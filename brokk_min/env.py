@@ -13,7 +13,7 @@ Observation: Box, float32, (223,), (x - mean) / deviation * weight of these bloc
 | 111-162 | 13 commands of each driven joint                     | 0.364       | 0.277  | no    |
 | 163-214 | do these commands open valves (`open_indicator`)?    | 0.5         | 0.277  | no    |
 | 215-218 | resolved velocities of the goal (`jacobian.dls`)     | uniform     | 4.2    | no    |
-| 219-222 | resolved velocities of the error integral            | 0.1 uniform | 4.2    | no    |
+| 219-222 | joint motions that undo the error integral [rad]     | 0.1 uniform | 4.2    | no    |
 
 "Uniform": over its range. The newest sample is last. Heading frame: x from slew axis to tool.
 
@@ -57,7 +57,7 @@ class TaskConfig:
     hold_max_s: float = machine.number("s", "hold_min_s", 1e6, 3.0)  # Longest time of a goal [s].
     zero_goals: float = machine.number("1", 0, 1, 0.15)  # Fraction of goals of zero velocity.
     axis_goals: float = machine.number("1", 0, 1, 0.4)  # Fraction along x, y or z; others anywhere.
-    noise: float = machine.number("1", 0, 1000, 0.05)  # Of sensors, in deviations (paper: 5 %).
+    noise: float = machine.number("1", 0, 1000, 0.05)  # Uniform, up to +- deviations (paper: 5 %).
     valve_cost: float = machine.number("1", 0, 1000, 0.1)  # Of a full change of all (paper: 0).
     integral_cost: float = machine.number("1/m", 0, 1000, 1.0)  # Of the error integral (paper: 0).
     valves: actuator.Valves = "closed"  # While the tool rests: `actuator.command_at_rest`.
@@ -156,7 +156,7 @@ def measure(
     frames = forward_kinematics(machine, q)
     p_tool = kinematics.tool_position(frames)
     J = jacobian(frames)
-    v_tool = (J @ q_dot[..., None])[..., 0] + v_error  # v = J q_dot
+    v_tool = (J @ q_dot[..., None])[..., 0] + v_error  # v = J q_dot, with noise of its own
     return Measured(v_goal, v_tool, q, history[..., 1, -1], history, integral, p_tool, J)
 
 
@@ -206,8 +206,8 @@ def update_history(
 def action_to_pwm(machine: Machine, action: ArrayLike, paper: bool = False) -> Array:
     """Commands u (..., n) of full command from actions of the driven joints (..., n_driven).
 
-    u = dead_zone clip(a / 0.01, -1, 1) + (limit - dead_zone) a: dead-zone compensation, as the PIDs
-    have it. The paper's agent has none: u = limit a. Paper: Sec. 3.3, Sec. 3.4
+    u = dead_zone clip(a / 0.01, -1, 1) + (limit - dead_zone) a: the least dead zone is compensated;
+    the PIDs compensate each joint's. The paper's agent: u = limit a. Paper: Sec. 3.3, Sec. 3.4
     ValueError: a wrong shape, a number that is not finite.
 
     Example:

@@ -1,4 +1,4 @@
-"""The 20 Hz loop that drives a machine on a CAN bus. Paper: Sec. 2
+"""The loop that drives a machine on a CAN bus, at 20 Hz for the Brokk. Paper: Sec. 2
 
 One tick: the operator's goal, SYNC, encoder positions, measurements, controller, gate, valve frame.
 Each encoder answers the frame SYNC with its position; `canopen.Nodes` keeps the newest position,
@@ -84,7 +84,7 @@ class Drive:
         with self.catch_errors():
             entered = self.operator(bool(self.gate.driving), bool(self.gate.active_fault == 0))
             self.operator_input = canopen.unpack_operator_input(entered.pack())  # as in the log
-        self.nodes.frames *= 2  # a position that came before SYNC is a fault, as two of a tick
+        self.nodes.frames *= 2  # a position from before SYNC then counts twice: a fault
         with self.catch_errors():
             self.bus.send(canopen.SYNC, b"")
             answer_by = self.bus.now() + ANSWER_TIME * self.machine.dt
@@ -185,7 +185,7 @@ class Drive:
             self.deadline_number = 0
         missed = max(0, int(lateness // self.machine.dt))
         if missed:
-            self.history = None  # its samples are a tick apart
+            self.history = None  # its samples must be a tick apart
         self.lateness = lateness
         self.skipped += missed
         self.deadline_number += 1 + missed

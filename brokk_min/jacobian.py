@@ -31,7 +31,7 @@ def dls(J: ArrayLike, W: ArrayLike, damping: ArrayLike, as_printed: bool = False
     Args:
         J: Jacobian [m/rad], (..., 3, n).
         W: diagonal of the weight matrix, (..., n), positive.
-        damping: lambda^2, (...).
+        damping: lambda^2 [m^2], (...); above 0 where J W^-1 J^T is singular.
         as_printed: use the paper's printed form.
     """
     J = np.asarray(J)
@@ -46,19 +46,19 @@ def dls(J: ArrayLike, W: ArrayLike, damping: ArrayLike, as_printed: bool = False
 def limit_gradient(machine: Machine, q: ArrayLike) -> Array:
     """Gradient of the joint-limit function of Chan and Dubey (1995) at angles `q` [rad], (..., n).
 
-    H(q) = sum over joints of (q_max - q_min)^2 / (4 (q_max - q) (q - q_min)).
+    h(q) = sum over joints of (q_max - q_min)^2 / (4 (q_max - q) (q - q_min)).
     """
     low = machine.column("q_min")
     high = machine.column("q_max")
     margin = 1e-3 * (high - low)  # finite at the limits and beyond
     q = np.clip(q, low + margin, high - margin)
-    # dH/dq = (q_max - q_min)^2 (2 q - q_max - q_min) / (4 (q_max - q)^2 (q - q_min)^2)
+    # dh/dq = (q_max - q_min)^2 (2 q - q_max - q_min) / (4 (q_max - q)^2 (q - q_min)^2)
     gradient: Array = (high - low) ** 2 * (2 * q - high - low) / (4 * ((high - q) * (q - low)) ** 2)
     return gradient
 
 
 def limit_weights(machine: Machine, q: ArrayLike, q_dot: ArrayLike) -> Array:
-    """Diagonal of W for all joints, (..., n): 1 + |dH/dq| towards a limit, otherwise 1.
+    """Diagonal of W for all joints, (..., n): 1 + |dh/dq| towards a limit, otherwise 1.
 
     All times `Joint.weight`: metres and radians are not alike. `q` are angles [rad], `q_dot`
     velocities whose sign gives the direction. Paper: Sec. 4.2 (W)
@@ -108,8 +108,8 @@ class Gains:
     feedback: Array  # K = feedback * I of eq3 [1], (..., 1)
     min_opening: Array  # least valve opening while the tool is to move [1], (..., 1)
     integral_feedback: Array  # K_I of the error integral, which eq3 does not have [1/s], (..., 1)
-    start_boost: Array  # a valve that was closed opens 1 + start_boost times as wide [1], (..., 1)
-    start_time: Array  # for this time after its first command [s], (..., 1)
+    start_boost: Array  # a valve closed lately opens 1 + start_boost times as wide [1], (..., 1)
+    start_time: Array  # from the tick after its first command until then [s], (..., 1)
 
 
 class PIDState(NamedTuple):
@@ -128,8 +128,8 @@ class JacobianController:
 
     The PID gives the valve opening; the dead zone is added afterwards. While the tool
     is to move, no valve goes below the opening `min_opening`: one that has closed answers late
-    (paper Sec. 3.2), and opens wider at first (near: Hagglund 2002). At rest `command_at_rest` has
-    a rule, unless `valves` are "open". Paper: eq3, Sec. 4.2
+    (paper Sec. 3.2); it soon opens wider for a while (near: Hagglund 2002). At rest
+    `command_at_rest` has a rule, unless `valves` are "open". Paper: eq3, Sec. 4.2
     """
 
     machine: Machine
@@ -158,7 +158,7 @@ class JacobianController:
         direction[..., driven] = last
         J = jacobian(forward_kinematics(m, q))[..., driven]
         W = limit_weights(m, q, direction)[..., driven]
-        J_inv = dls(J, W, nakamura_damping(manipulability(J), self.w0, self.k))
+        J_inv = dls(J, W, nakamura_damping(manipulability(J), self.w0, self.k) + 1e-9)  # rank < 3
         v = v_goal + self.gains.feedback * (v_goal - v_tool)
         v = v + self.gains.integral_feedback * integral  # v_d + K (v_d - v_ee) + K_I integral
         q_dot = (J_inv @ v[..., None])[..., 0]
@@ -175,14 +175,14 @@ class JacobianController:
             *velocities, q, state.q_dot_goal, measured.error_integral
         )
         error = q_dot_goal - measured.q_dot
-        derivative = 0.7 * state.derivative + 0.3 * (error - state.error) / m.dt  # filtered
+        derivative = 0.7 * state.derivative + 0.3 * (error - state.error) / m.dt  # over 2.8 ticks
         opening = gains.kp * error + state.integral + gains.kd * derivative  # PID
         if self.feedforward is not None:
             u = self.feedforward(q[..., m.driven], q_dot_goal)
             opening = opening + valve_opening(u, m.dead_zones[m.driven])
-        limit = valve_opening(np.sign(opening) * m.pwm_limit / PWM_MAX, m.dead_zones[m.driven])
-        saturated = (np.abs(opening) >= np.abs(limit)) & (np.sign(opening) == np.sign(error))
         u = self._open_valves(opening, measured)
+        full = np.abs(np.rint(u[..., m.driven] * PWM_MAX)) >= m.pwm_limit
+        saturated = full & (np.sign(opening) == np.sign(error))
         u, resting, ticks = command_at_rest(m, self.valves, u, measured.v_goal, state.rest_ticks)
         increase = np.where(saturated | resting, 0.0, gains.ki * error * m.dt)  # anti-windup
         return u, PIDState(state.integral + increase, error, derivative, q_dot_goal, ticks)

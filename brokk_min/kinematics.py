@@ -109,7 +109,7 @@ def lowest_point(frames: Frames) -> Array:
 
 
 def to_heading(p: Array, v: Array) -> Array:
-    """Vector `v` (..., 3) in the heading frame of the tool at `p` [m]: x outward to it, z up."""
+    """Vector `v` (..., 3) in the heading frame of the tool at `p` [m]; on the axis x, y = 0."""
     radius = np.maximum(np.hypot(p[..., 0], p[..., 1]), 1e-6)
     c = p[..., 0] / radius
     s = p[..., 1] / radius

@@ -31,7 +31,7 @@ class Joint:
 
     Its variable q is added to theta [rad], or to d [m] of a prismatic joint. A cylinder (of the
     plant) spans a triangle: sides `cylinder_base` and `cylinder_rod` meet under `cylinder_angle`
-    + q. A base of 0 means a constant lever arm `cylinder_rod`; 1: q is the cylinder's own travel.
+    + q. A base of 0: a constant lever arm `cylinder_rod`; if that is 1, q is the cylinder's travel.
     """
 
     name: str
@@ -42,15 +42,15 @@ class Joint:
     theta: float = number("rad")
     q_min: float = number("rad or m")
     q_max: float = number("rad or m")
-    q_dot_up: float = number("rad/s or m/s", 1e-9)  # fastest positive motion at the command limit
-    q_dot_down: float = number("rad/s or m/s", 1e-9)  # fastest negative motion, a positive number
+    q_dot_up: float = number("rad/s or m/s", 1e-9)  # fastest positive motion, nominal: at
+    q_dot_down: float = number("rad/s or m/s", 1e-9)  # the command limit; negative motion, > 0
     encoder_node: int = number("CANopen node id", 1, 127)
     cylinder_base: float = number("m", 0, default=0.0)
     cylinder_rod: float = number("m", 1e-6, default=1.0)
     cylinder_angle: float = number("rad", default=0.0)
     cylinder_area: float = number("m^2", 1e-9, default=0.005)
-    speed_positive: float = number("m/s", 0, default=0.0)  # of the cylinder at full command; 0:
-    speed_negative: float = number("m/s", 0, default=0.0)  # by lever arm cylinder_rod
+    speed_positive: float = number("m/s", 0, default=0.0)  # of the cylinder at full command
+    speed_negative: float = number("m/s", 0, default=0.0)  # 0: of q_dot_* at arm cylinder_rod
     encoder_zero: int = number("counts", default=0)  # the reading at q = 0
     encoder_sign: Literal[-1, 1] = 1  # -1: it counts down while q rises
     kind: Literal["revolute", "prismatic"] = "revolute"
@@ -90,7 +90,7 @@ class Machine:
     dead_zone: float = number("of full command", 0, 0.99)  # the least; nets and actions begin at it
     encoder_bits: int = number("bits a turn", 1, 32)  # of revolute joints
     velocity_samples: int = number("samples", 2, 100)  # window of the velocity estimator
-    history: int = number("samples", 2, 1000)  # of q, q_dot and u that nets and policy get
+    history: int = number("samples", "velocity_samples", 1000)  # of q, q_dot and u: nets, policy
     tool_speed: float = number("m/s", 1e-9)  # largest goal velocity of the tool
     ground: float = number("m")  # height of the ground in the base frame
     valve_frame_id: int = number("CAN id", 0, 0x7FF)
@@ -98,15 +98,15 @@ class Machine:
     largest_dead_zone: float = number("of full command", 0, 0.99, default=0.0)  # 0: 1.5 dead zones
     dither: float = number("of full stroke", 0, 0.5, default=0.03)  # at rest, beyond the dead zone
     # Of the analytic plant alone; by default what is assumed of the Brokk, with any pump flow.
-    delay: float = number("s", 0, default=0.040)  # until a command reaches the valve
-    tau_spool: float = number("s", 1e-6, default=0.030)  # time constants: spool, cylinder speed,
-    tau_cylinder: float = number("s", 1e-6, default=0.030)
-    tau_valve_up: float = number("s", 1e-6, default=0.15)  # activation (paper: 400 ms from idle)
-    tau_valve_down: float = number("s", 1e-6, default=0.40)
+    delay: float = number("s", 0, default=0.040)  # to the valve, in whole plant_dt
+    plant_dt: float = number("s", 1e-6, 1, 0.005)  # step of explicit Euler, at most each tau
+    tau_spool: float = number("s", "plant_dt", default=0.030)  # times: spool, cylinder speed,
+    tau_cylinder: float = number("s", "plant_dt", default=0.030)
+    tau_valve_up: float = number("s", "plant_dt", default=0.15)  # activation (400 ms from idle)
+    tau_valve_down: float = number("s", "plant_dt", default=0.40)
     valve_threshold: float = number("1", 0, 0.999, 0.80)  # a valve of less activation is closed
     spool_threshold: float = number("of full stroke", 0, 1, 0.01)  # above it a valve activates
     pump_flow: float = number("m^3/s", 1e-9, default=1.0)
-    plant_dt: float = number("s", 1e-6, 1, 0.005)  # step of explicit Euler
     q_start: tuple[float, ...] = ()  # where experiments start; empty: the middle of the ranges
     plant: Any = None  # reset(machine, q) and step(machine, state, u); None: that of `actuator`
 

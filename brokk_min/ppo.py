@@ -65,8 +65,8 @@ def mlp(inputs: int, outputs: int, std: float) -> nn.Sequential:
 class Agent(nn.Module):
     """Actor, logarithm of the actions' standard deviation and, if advantages need one, critic.
 
-    The critic's output is in deviations of the returns so far from their mean, as in rl_games
-    (`normalize_value`; compare PopArt, van Hasselt et al., 2016).
+    The critic's output is in mean deviations within a batch, from the returns' mean so far; near
+    rl_games' `normalize_value`, which pools them (compare PopArt, van Hasselt et al., 2016).
     """
 
     def __init__(self, obs: int, actions: int, log_std: float, critic: bool) -> None:
@@ -155,7 +155,7 @@ def ppo_loss(agent: Agent, mb: dict[str, Tensor], config: PPOConfig) -> tuple[Te
     logratio = newlogprob - mb["logprobs"]
     ratio = logratio.exp()
     advantages = mb["advantages"]
-    advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+    advantages = (advantages - advantages.mean()) / (advantages.std(correction=0) + 1e-8)
     pg_loss = policy_loss(ratio, advantages, config.clip)
     v_loss = torch.zeros(())
     if "returns" in mb:

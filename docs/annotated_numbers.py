@@ -30,7 +30,7 @@ from brokk_min.learning.policy import POLICIES, load_policy, policy_controllers
 DOCS = Path(__file__).parent
 NUMBERS = DOCS / "annotated.json"
 FILES = SHIPPED / BROKK_170.name
-PIDS = (*claims.PAPER_BASELINES, *claims.STRONGER)
+PIDS = (*claims.PAPER_BASELINES, *claims.WITH_FEEDFORWARD)
 SHOWN = ("rl", "rl_paper", "jacobian_pid_k0.1")  # in the figure of motion along x
 KEYS = ("velocity_error_mean", "off_axis_drift_max", "jerk_rms", "valve_travel")
 STARTS, SEED = 64, 0  # as `brokk-min evaluate --num-starts 64`

@@ -229,7 +229,9 @@ def results() -> Iterator[Format]:
     mean = {"mean": 0.1, "low": 0.05, "high": 0.15}
     row: Any = dict.fromkeys(("velocity_error_all", "off_axis_drift_max", "valve_travel"), mean)
     sweep = {"meta": {"machine": "m", "actuator": "a"}, "table": {"rl": row, "pid": row}}
-    yield described("sweep.json", sweep, encode_json, read_seeds, formats.SWEEP)
+    yield described(
+        "sweep.json", sweep, encode_json, partial(read_seeds, required={}), formats.SWEEP
+    )
     row = {"controller": "rl", "sequence": "x", "start": 0, "kind": "workspace"}
     row |= dict.fromkeys(("velocity_rmse", "velocity_error_mean", "jerk_rms"), 0.1)
     row |= dict.fromkeys(("off_axis_drift_max", "valve_travel"), 0.2)
@@ -259,8 +261,9 @@ def all_formats(folder: Path) -> Iterator[Format]:
     encode = lambda content: "".join(f"{line}\n" for line in content.values()).encode()  # noqa: E731
     yield Format("drive.log", frames, encode, lambda path: list(read_frames(path)), {})
     numbers = [f for f in fields(Machine) if "unit" in f.metadata]
-    table = {f.name: Field("float", f.metadata["low"], f.metadata["high"]) for f in numbers}
     values = {f.name: getattr(BROKK_170, f.name) for f in numbers}
+    low = {f.name: values.get(f.metadata["low"], f.metadata["low"]) for f in numbers}
+    table = {f.name: Field("float", low[f.name], f.metadata["high"]) for f in numbers}
     find = lambda path: find_machine(f"{path}:M")  # noqa: E731
     yield described("machine.py", values, encode_machine, find, table)
 

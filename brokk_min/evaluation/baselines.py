@@ -22,10 +22,13 @@ from brokk_min.jacobian import Gains, JacobianController, manipulability_thresho
 from brokk_min.machine import Array, Machine
 
 PAPER_BASELINES = ("jacobian_pid_k0.1", "jacobian_pid_k0.05")
-STRONGEST = ("jacobian_pid_ff_integral", "jacobian_pid_ff_integral_dither")  # valves closed; dither
-TUNED = ("jacobian_pid_k0.1", "jacobian_pid_ff", *STRONGEST)  # each by itself
+WITH_INTEGRAL = (
+    "jacobian_pid_ff_integral",
+    "jacobian_pid_ff_integral_dither",
+)  # valves closed; dither
+TUNED = ("jacobian_pid_k0.1", "jacobian_pid_ff", *WITH_INTEGRAL)  # each by itself
 # Stronger than the paper's: its claims are tested against these, too.
-STRONGER = ("jacobian_pid_ff", "jacobian_pid_ff_integral")
+WITH_FEEDFORWARD = ("jacobian_pid_ff", "jacobian_pid_ff_integral")
 TUNING_RUNS = 10  # of the whole chain and of `evaluate`, assumed
 TUNING_SECONDS = 20.0  # of each run
 GENERATIONS = 10
@@ -140,9 +143,9 @@ def tune_baselines(
     trained on nets alone. Each is tuned twice, with `seed` and the next: "cost" and "second_cost"
     agree if the search has converged; the better gains are kept. The least of many noisy costs is
     too good, so "cost_anew" is the mean of 16 more of these. `config` has the noise. No run is
-    longer than `longest` [s]; `only` one baseline, or "" for all. `STRONGEST` have more gains, and
-    twice the generations. The paper's second one gets the gains of its first: their damping differs
-    near singularities alone, where no run goes.
+    longer than `longest` [s]; `only` one baseline, or "" for all. `WITH_INTEGRAL` have more gains,
+    and twice the generations. The paper's second one gets the gains of its first: their damping
+    differs near singularities alone, where no run goes.
     """
     start, goals = tuning_set(machine, runs, seed, min(TUNING_SECONDS, longest))
     config = config or TaskConfig()
@@ -152,7 +155,7 @@ def tune_baselines(
     every = baselines(machine, net)
     for name in [only] if only else TUNED:
         controller = every[name]
-        steps = generations * (2 if name in STRONGEST else 1)
+        steps = generations * (2 if name in WITH_INTEGRAL else 1)
         first, costs = tune(controller, cost, seed, steps, name)
         second, second_costs = tune(controller, cost, seed + 1, steps, name)
         tuned[name] = first if costs[-1] <= second_costs[-1] else second

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from brokk_min.evaluation.baselines import PAPER_BASELINES, STRONGER
+from brokk_min.evaluation.baselines import PAPER_BASELINES, WITH_FEEDFORWARD
 from brokk_min.evaluation.metrics import (
     TRANSIENT,
     Mean,
@@ -164,7 +164,7 @@ def task_claims(
             less_claim("outperforms", runs, policy, names, ["all"]),
         ]
 
-    papers, stronger = of_baselines(PAPER_BASELINES), of_baselines(STRONGER)
+    papers, stronger = of_baselines(PAPER_BASELINES), of_baselines(WITH_FEEDFORWARD)
     both = [a._replace(stronger=b) for a, b in zip(papers, stronger, strict=True)]
     return [still_claim(runs, policy), *both[:2], *singular, *both[2:]]
 

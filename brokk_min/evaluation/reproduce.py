@@ -38,7 +38,7 @@ def reproduce(
     `results.json` has no times: the same seed gives the same file on the same computer. `sweep` is
     a file of `brokk-min sweep`, whose training seeds the report shows.
     """
-    seeds = read_seeds(sweep) if sweep else {}  # before all work
+    seeds = read_seeds(sweep, {}) if sweep else {}  # before all work
     chain = Chain(machine, out, budget, seed)
     clock: dict[str, float] = {}
     with tqdm(total=4, desc="stages done", unit="stage", position=1, disable=None) as bar:

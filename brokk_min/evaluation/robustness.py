@@ -14,7 +14,7 @@ from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.machine import Array, Machine, read_encoder, valve_opening
 
 # Who drives changed machines.
-ROBUST = ("rl", "rl_dither", "rl_paper", "jacobian_pid_k0.1", *baselines.STRONGEST)
+ROBUST = ("rl", "rl_dither", "rl_paper", "jacobian_pid_k0.1", *baselines.WITH_INTEGRAL)
 Sensor = Callable[[np.random.Generator], Encoder]  # makes the encoders of one rollout
 
 

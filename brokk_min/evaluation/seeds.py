@@ -167,14 +167,14 @@ def table(seeds: Sequence[Rows], baselines: Rows) -> Table:
     }
 
 
-def read_seeds(path: Path, required: Mapping[str, str] | None = None) -> Table:
-    """The table of a `sweep.json`; `required` are `gains_metadata` of the machine and its nets.
+def read_seeds(path: Path, required: Mapping[str, str]) -> Table:
+    """The table of a `sweep.json`; `required` of its metadata, as `gains_metadata` has it, or none.
 
     ValueError: another file, or one of another machine or of other nets.
     """
     content: dict[str, Any] = read_json(path, "the sweep.json of a sweep")
     check_fields(path, content, SWEEP, {})
-    expect_same(path, content["meta"], required or {})
+    expect_same(path, content["meta"], required)
     for name, row in content["table"].items():
         if row.keys() != content["table"]["rl"].keys():
             wanted = brief(list(content["table"]["rl"]))

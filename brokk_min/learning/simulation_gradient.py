@@ -34,6 +34,7 @@ count as given; a tick into the ground counts as any other; nothing counts after
 episode, not even where it only ran out of time.
 """
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -75,7 +76,7 @@ class Ticks(NamedTuple):
     v_goal: Array  # goal velocity [m/s], 3
     error_integral: Array  # of `env.integrate_error` [m], 3
     u: Array  # command, n
-    follows: Array  # 1, or 0 at rest, where the command does not depend on the action, 1
+    follows: Array  # (T, num, 1): 0 at rest, where the action does not count, else 1
     done: NDArray[np.bool_]  # did the episode end with the tick?
 
 
@@ -88,6 +89,8 @@ def make_learner(env: VectorEnv[Any, Any, Any], config: ppo.PPOConfig, seed: int
 
 def improved_actions(machine: Machine, net: ActuatorNet, task: TaskConfig) -> ppo.Estimate:
     """The estimate that `ppo.train` takes, for rollouts of `gym_env.TaskVectorEnv` on `net`."""
+    if task.paper:  # as in `env.step`
+        task = replace(task, valves="open", valve_cost=0.0, integral_cost=0.0)
 
     @torch.no_grad()
     def estimate(

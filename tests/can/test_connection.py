@@ -23,6 +23,14 @@ def buses():
     there.shutdown()
 
 
+def test_open_bus__takes_an_equal_frame_of_another_sender_for_no_echo():
+    with open_bus("virtual", "echo") as here, open_bus("virtual", "echo") as there:
+        here.send(0x5A5, b"\x01")
+        there.send(0x5A5, b"\x01")
+        frame = here.recv(1.0)
+        assert frame and frame.id == 0x5A5
+
+
 def test_bus__marks_foreign_frames_and_echoes_and_logs_all_but_echoes(buses):
     text = io.StringIO()
     bus = Bus(buses[0], can.CanutilsLogWriter(text), "can0", echo=True, clock=lambda: 1.0)

@@ -6,13 +6,14 @@ import signal
 import struct
 import threading
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers_bus import SIX, START, eventually, recorded_rows
 
 from brokk_min.can.canopen import HEARTBEAT_PERIOD, WATCHDOG, Frame, valve_frame, valve_frames
-from brokk_min.can.simulated_machine import SimulatedMachine, simulate, start_pose
+from brokk_min.can.simulated_machine import SimulatedMachine, serve, simulate, start_pose
 from brokk_min.identification.logs import read_log
 from brokk_min.machine import BROKK_170
 
@@ -50,6 +51,13 @@ def driving():
     machine.valves(7)
     assert machine.valves(8, 80, 0, -40) == [80, 0, -40, 0, 0]
     return machine
+
+
+def test_serve__waits_for_the_next_plant_step_and_not_for_one_that_is_due():
+    waits = []
+    bus = SimpleNamespace(send=lambda *frame: None, now=lambda: 1.0, recv=waits.append)
+    serve(SimulatedMachine(BROKK_170, START, 0.0), bus, iter([True, True, False]).__next__)
+    assert waits == pytest.approx([0.0, 0.005])
 
 
 def test_advance__moves_and_beats_by_its_own_clock():

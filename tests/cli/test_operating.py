@@ -7,7 +7,7 @@ from helpers_bus import HoldingOperator, World
 from helpers_cli import run
 
 from brokk_min.can.operator_input import JointJog
-from brokk_min.cli.operating import Play
+from brokk_min.cli.operating import Drive, Play
 from brokk_min.evaluation import baselines
 from brokk_min.identification.files import SHIPPED
 from brokk_min.identification.logs import read_log
@@ -28,6 +28,17 @@ def log(tmp_path_factory):
     world.run(2.0)
     world.bus.close()
     return path
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("rl", PolicyController), ("jacobian", JacobianController), ("jog", JointJog)],
+)
+def test_drive__has_the_controller_that_is_named(name, kind, tmp_path):
+    copy = tmp_path / "p.npz"  # without gains beside it
+    copy.write_bytes(POLICY.read_bytes())
+    controller = Drive(policy=copy, controller=name, gains=GAINS)._controller(BROKK_170)
+    assert isinstance(controller, kind) and getattr(controller, "k", 0.1) == 0.1
 
 
 def test_drive__sends_the_frames_of_a_log_again(log, capsys):

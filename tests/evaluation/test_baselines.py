@@ -1,5 +1,6 @@
 """The classical controllers: their gains as vectors and files, and their tuning."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -129,7 +130,7 @@ def test_tune_baselines__lowers_each_cost_and_records_it():
 
     by_hand = baselines.baselines(machine, net)
     for name, of in record.items():
-        generations = 2 if name in baselines.STRONGEST else 1
+        generations = 2 if name in baselines.WITH_INTEGRAL else 1
         assert of["seed"] == 3 and len(of["cost"]) == len(of["second_cost"]) == generations
         best = min(of["cost"][-1], of["second_cost"][-1])
         assert best == pytest.approx(cost(tuned[name]), rel=1e-6)  # no noise: one value
@@ -157,6 +158,7 @@ def test_read_gains__reads_the_files_of_the_package_and_their_older_names(tmp_pa
     net = load_policy(folder / "policy.npz", BROKK_170).net
     expected = baselines.gains_table(baselines.read_gains(folder / "gains.json", BROKK_170, net))
     text = (folder / "gains.json").read_text()
+    assert json.loads(text)["gains"] == expected
     old, new = ("ready", "min_opening") if '"ready"' in text else ("min_opening", "ready")
     path = tmp_path / "gains.json"
     path.write_text(text.replace(f'"{old}"', f'"{new}"'))

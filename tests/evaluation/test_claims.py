@@ -12,7 +12,7 @@ from brokk_min.evaluation.rollout import Trace
 from brokk_min.machine import BROKK_170
 
 HIGH, LOW = baselines.PAPER_BASELINES  # damping
-STRONGER = baselines.STRONGER
+WITH_FEEDFORWARD = baselines.WITH_FEEDFORWARD
 POSE = np.array(BROKK_170.q_start)
 
 
@@ -22,7 +22,7 @@ def verdicts(result):
 
 def runs_with(key, sequence="x", **values):
     """Six starts with a figure around a value by controller."""
-    names = {"rl": ["rl"], "high": [HIGH], "low": [LOW], "stronger": STRONGER}
+    names = {"rl": ["rl"], "high": [HIGH], "low": [LOW], "stronger": WITH_FEEDFORWARD}
     rows = []
     for name, value in values.items():
         for controller, i in product(names[name], range(6)):
@@ -183,7 +183,7 @@ def test_task_claims__are_in_the_papers_order_and_of_a_stronger_baseline_too():
     assert verdicts(result) == [True, True, None, None, True, True, True, True]
     stronger = [claim.stronger for claim in result if claim.stronger]
     assert verdicts(stronger) == [False, None, False, False, False]
-    assert list(stronger[-1].numbers) == [f"error all, less {name}" for name in STRONGER]
+    assert list(stronger[-1].numbers) == [f"error all, less {name}" for name in WITH_FEEDFORWARD]
 
 
 def test_speed_fraction__is_of_goals_that_last_near_singularities():

@@ -11,7 +11,7 @@ from brokk_min.evaluation.family import run_family, show, summary
 from brokk_min.evaluation.learn import Budget
 from brokk_min.machine import BROKK_170
 
-COARSE = replace(BROKK_170, rate=10.0, plant_dt=0.05)  # two Euler steps a tick: fast
+COARSE = replace(BROKK_170, rate=10.0, plant_dt=0.025)  # four Euler steps a tick: fast
 TINY = Budget(0.01, 20, 2048, 20, 2048, 2048, 1, 1, 4, 2, 3.0)
 
 

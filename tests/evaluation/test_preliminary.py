@@ -15,7 +15,7 @@ from brokk_min.machine import BROKK_170
 from examples.mini_excavator import MINI_EXCAVATOR
 
 LOW, HIGH = BROKK_170.column("q_min"), BROKK_170.column("q_max")
-COARSE = replace(BROKK_170, plant_dt=0.05)  # one Euler step a tick: fast
+COARSE = replace(BROKK_170, plant_dt=0.025)  # two Euler steps a tick: fast
 
 
 def two_speeds(up, down):
@@ -104,7 +104,7 @@ def test_sim_to_real__is_between_tools_where_the_arms_end(machine):
 
 
 def test_numbers__of_another_machine_are_json():
-    machine = replace(MINI_EXCAVATOR, plant_dt=0.04)  # one Euler step a tick: fast
+    machine = replace(MINI_EXCAVATOR, plant_dt=0.02)  # two Euler steps a tick: fast
     net = small_net(machine, np.random.default_rng(0), machine.names)
     measured = preliminary.run(machine, net, 0)
     result = preliminary.numbers(machine, measured)

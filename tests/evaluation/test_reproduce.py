@@ -23,7 +23,7 @@ from brokk_min.identification.net_file import load_net
 from brokk_min.learning.policy import POLICIES, load_policy
 from brokk_min.machine import BROKK_170
 
-COARSE = replace(BROKK_170, rate=10.0, plant_dt=0.05)  # two Euler steps a tick: fast
+COARSE = replace(BROKK_170, rate=10.0, plant_dt=0.025)  # four Euler steps a tick: fast
 TINY = Budget(0.004, 20, 4096, 20, 4096, 4096, 1, 1, 4, 2, 0.5)
 ERROR = "velocity_error_mean"
 PIDS = ["jacobian_pid_k0.1", "jacobian_pid_k0.05", "jacobian_pid_ff"]
@@ -71,7 +71,7 @@ def test_reproduce__gives_the_same_bits_twice(folder, tmp_path, monkeypatch, cap
     monkeypatch.setattr(report, "write_report", lambda *_: None)  # once is enough
     (tmp_path / "m.py").write_text(
         "from dataclasses import replace\nfrom brokk_min import BROKK_170\n"
-        "COARSE = replace(BROKK_170, rate=10.0, plant_dt=0.05)\n"
+        "COARSE = replace(BROKK_170, rate=10.0, plant_dt=0.025)\n"
     )
     assert (
         run(f"reproduce --quick --machine '{tmp_path}/m.py:COARSE' --seed 3 --out", tmp_path) == 0

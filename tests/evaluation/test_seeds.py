@@ -93,7 +93,7 @@ def test_read_seeds__reads_what_a_sweep_wrote(tmp_path):
     figures = seeds.table([rows(1.0), rows(3.0)], [])
     meta = gains_metadata(BROKK_170, NET)
     path.write_text(json.dumps({"meta": meta, "table": figures}))
-    assert seeds.read_seeds(path, meta) == seeds.read_seeds(path) == figures
+    assert seeds.read_seeds(path, meta) == seeds.read_seeds(path, {}) == figures
     with pytest.raises(ValueError, match=r"sweep.json: actuator: expected 'other', got '"):
         seeds.read_seeds(path, meta | {"actuator": "other"})
 

@@ -226,10 +226,14 @@ def test_action_gradients__are_zero_for_a_joint_pushed_into_its_limit(limit, u_q
     assert gradient[:, 2].all()
 
 
-def test_improved_actions__are_means_and_a_saturated_step_along_the_gradient():
-    """Means count within [-1, 1], as do targets; episodes end within the rollout."""
+@pytest.mark.parametrize("paper", [False, True])
+def test_improved_actions__are_means_and_a_saturated_step_along_the_gradient(paper):
+    """Means count within [-1, 1], as do targets; episodes end within the rollout.
+
+    The paper's agent has no costs and no rule for valves at rest, whatever the task says.
+    """
     net = small_net(BROKK_170, np.random.default_rng(0))
-    task = TaskConfig(episode_s=0.6, valve_cost=0.02)
+    task = TaskConfig(episode_s=0.6, valve_cost=0.02, paper=paper)
     config = PPOConfig(num_envs=8, horizon=13, log_std=-2.5, threads=1)
     vector = TaskVectorEnv(8, net, BROKK_170, task)
     learner = make_learner(vector, config, 1, critic=False)
@@ -238,8 +242,10 @@ def test_improved_actions__are_means_and_a_saturated_step_along_the_gradient():
     batch = improved_actions(BROKK_170, net, task)(learner.agent, rollout, config)
     means = rollout.means.numpy().clip(-1, 1)
     states = [info["state"] for info in rollout.infos]
-    commands = env.action_to_pwm(BROKK_170, rollout.actions.numpy())
+    commands = env.action_to_pwm(BROKK_170, rollout.actions.numpy(), paper)
     ticks = ticks_of([*states, states[-1]], commands, rollout.dones.numpy())
+    if paper:
+        task = replace(task, valves="open", valve_cost=0.0, integral_cost=0.0)
     gradient = action_gradients(BROKK_170, net, ticks, config.gamma, task)
     norm = np.linalg.norm(gradient, axis=-1, keepdims=True)
     largest = np.maximum(norm, np.sort(norm, axis=None)[(norm.size - 1) // 2])

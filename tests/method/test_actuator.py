@@ -304,12 +304,12 @@ def test_predict__refuses_another_shape(shape):
 
 
 def test_smooth_angles__by_hand():
-    """Weights: angles 1/H; velocity j, dt (j - l) / H with l = 2, the newest dt l more."""
-    machine = replace(BROKK_170, history=3, velocity_samples=6)
+    """Weights: angles 1/H; velocity j, dt (j - l) / H with l = 0.5, the newest dt l more."""
+    machine = replace(BROKK_170, history=3, velocity_samples=3)
     history = np.zeros((1, 3, 3))
     history[0, 0] = [0.3, 0.6, 0.9]
     history[0, 1] = [1.0, 2.0, 4.0]
-    expected = 0.6 + 0.05 * (-2 * 1.0 - 1 * 2.0 + (0 + 3 * 2) * 4.0) / 3
+    expected = 0.6 + 0.05 * (-0.5 * 1.0 + 0.5 * 2.0 + (1.5 + 3 * 0.5) * 4.0) / 3
     np.testing.assert_allclose(smooth_angles(machine, history), [expected], atol=1e-12)
 
 

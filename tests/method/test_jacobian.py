@@ -243,6 +243,31 @@ def test_controller__integral_stops_while_the_valve_is_fully_open():
     assert (np.abs(back[-1].integral) < np.abs(states[-1].integral)).all()
 
 
+def test_controller__integral_stops_while_a_wider_start_fills_the_valve():
+    """An opening of kp e alone would leave room; three times as wide it is cut at 80 counts."""
+    c = controller(kp=3.0, ki=10.0, start_boost=2.0, start_time=9.0)
+    now = measured(POSE, 3 * GOAL)
+    now.history[0, :, 2, -1] = 20 / 127
+    u, state = c(now, c.start(1))
+    full = np.abs(np.rint(127 * u[0, DRIVEN])) == 80
+    assert full.any() and not full.all()
+    assert (state.integral[0] != 0).tolist() == (~full).tolist()
+    alone, _ = controller(kp=3.0)(now, c.start(1))
+    assert (np.abs(np.rint(127 * alone[0, DRIVEN])) < 80).all()
+
+
+def test_controller__of_joints_that_cannot_move_the_tool_along_x_y_and_z():
+    """Two joints: J W^-1 J^T is singular in all poses; the velocities stay within what they can."""
+    joints = [replace(one, driven=one.name in ("q3", "q4")) for one in BROKK_170.joints]
+    machine = replace(BROKK_170, name="two joints", joints=tuple(joints))
+    c = controller(manipulability_threshold(machine), machine=machine, kp=1.0)
+    poses = np.random.default_rng(0).uniform(LOW, HIGH, (3000, 5))
+    u, state = c(measured(poses, GOAL, machine=machine), c.start(3000))
+    assert np.isfinite(u).all()
+    fastest = machine.q_dot_max[[2, 3]] * (1 + 1e-9)
+    assert (np.abs(state.q_dot_goal) <= fastest).all() and state.q_dot_goal.any(axis=1).all()
+
+
 def test_controller__least_opening_while_the_tool_is_to_move():
     """Moving along z, the slew valve is held at `min_opening`; without a goal all valves close."""
     c = controller(kp=1e-3, min_opening=0.03)

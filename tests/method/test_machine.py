@@ -62,7 +62,9 @@ BAD = [
     ({"dead_zone": 0.125, "pwm_limit": 10}, ["dead_zone", "below 10/127", "got 0.125"]),
     ({"largest_dead_zone": 0.63}, ["dead_zone", "below 80/127", "got 0.63"]),
     ({"plant_dt": 0.03}, ["plant_dt", "a part of 0.05 s", "got 0.03"]),
-    ({"plant_dt": 1.0, "rate": 1e7}, ["plant_dt", "a part of 1e-07 s", "got 1.0"]),
+    ({"plant_dt": 0.02, "rate": 1e7}, ["plant_dt", "a part of 1e-07 s", "got 0.02"]),
+    ({"plant_dt": 0.05}, ["tau_spool", "expected 0.05 to inf", "got 0.03"]),
+    ({"history": 3}, ["history", "expected 4 to 1000", "got 3"]),
     ({"q_start": (0.0, 1.0)}, ["q_start", "5 angles or none", "(0.0, 1.0)"]),
     ({"controller_node": 3}, ["joints", "different CANopen nodes", "[1, 2, 3, 4, 5, 3]"]),
 ]
@@ -125,7 +127,7 @@ def test_each_number__is_refused_outside_its_range_and_where_it_is_none(name):
         {"pwm_limit": 10, "dead_zone": 0.078},
         {"pwm_limit": 1, "dead_zone": 0.0, "delay": 0.0, "velocity_samples": 2, "history": 2},
         {"pwm_limit": 127, "valve_frame_id": 0x7FF, "valve_threshold": 0.0, "encoder_bits": 32},
-        {"plant_dt": 0.05},
+        {"plant_dt": 0.05, "tau_spool": 0.05, "tau_cylinder": 0.05},
     ],
 )
 def test_values_at_the_ends_of_the_allowed_ranges_are_machines(fields):

@@ -336,7 +336,7 @@ def reference_step(config, agent, optimizer, minibatch):
     obs, actions, logprobs, advantages, returns = minibatch
     normal = Normal(agent.actor(obs), agent.log_std.exp())
     ratio = (normal.log_prob(actions).sum(-1) - logprobs).exp()
-    a = (advantages - advantages.mean()) / advantages.std()
+    a = (advantages - advantages.mean()) / advantages.std(correction=0)
     clipped = torch.where(a > 0, ratio.clamp(max=1 + config.clip), ratio.clamp(min=1 - config.clip))
     pg_loss = -(clipped * a).mean()
     v_loss = nn.functional.mse_loss(agent.critic(obs)[:, 0], returns)
@@ -398,6 +398,12 @@ def test_train__takes_another_estimate_and_goes_on_with_a_learner():
     assert "losses/explained_variance" not in logged[0]
     assert agent.log_std.tolist() == pytest.approx([-0.3 - 1.7 * 0.75] * 3)
     assert ppo.train(Tape(), config, 0, estimate=rewards_as_advantages).critic is None
+
+
+def test_train__takes_a_last_minibatch_of_one_step():
+    config = replace(SMALL, minibatch_size=47)  # of 48
+    agent = ppo.train(Tape(), config, 0)
+    assert all(torch.isfinite(parameter).all() for parameter in agent.parameters())
 
 
 # --- an environment of Gymnasium ------------------------------------------------------------------
