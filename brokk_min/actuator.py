@@ -223,8 +223,8 @@ class ActuatorNet:
 
     Weights, joint by joint: (n, I, 32), (n, 32), (n, 32, 32), (n, 32), (n, 32, 1) and (n, 1).
     Paper: Table 1 and Sec. 3.3 (I = 3 H = 39, two hidden layers of 32, ReLU, sigmoid output)
-    Not in the paper: I = 4 H, see `input_rows`; two more weights, (n, 6 H, L) and (n, L, 32), where
-    joints are not alone, see `latents`.
+    Not in the paper: I = 4 H, see `input_rows`; more weights, (n, 2 I, L), (n, L, 32) and (n, L),
+    where joints are not alone, see `latents`.
     """
 
     joints: tuple[str, ...]
@@ -276,12 +276,12 @@ class ActuatorNet:
     def latents(self, x: Array) -> Array:
         """Latents (batch, L) of all joints' inputs (batch, n, I), such as pump flow and load.
 
-        z = tanh(sum_j S_j^T [x_j, |x_j|]) of standardised inputs x, without indicators: what joints
-        take from a pump depends on how far valves open.
+        z = tanh(sum_j (S_j^T [x_j, |x_j|] + c_j)) of standardised inputs x.
         """
-        x = ((x - self.input_mean) / self.input_scale)[..., : 3 * self.history]
+        x = (x - self.input_mean) / self.input_scale
         x = np.concatenate([x, np.abs(x)], axis=-1)
-        return np.tanh(x.reshape(len(x), -1) @ np.concatenate(self.weights[6]))
+        z = x.reshape(len(x), -1) @ np.concatenate(self.weights[6])
+        return np.asarray(np.tanh(z + self.weights[8].sum(axis=0)))
 
     def forward(self, history: Array) -> tuple[Array, Array, Array, Array]:
         """Velocities [rad/s] (..., n); sigmoid output, hidden layers 2 and 1 (n, batch, units)."""

@@ -99,7 +99,8 @@ def obedient_velocity(machine, u):
 def shared_net(latents=2, rows=3):
     """`random_net` whose joints share latents."""
     net, rng = random_net(rows=rows), np.random.default_rng(1)
-    shapes = (len(net.joints), 6 * net.history, latents), (len(net.joints), latents, 32)
+    n, inputs = net.input_mean.shape
+    shapes = (n, 2 * inputs, latents), (n, latents, 32), (n, latents)
     more = tuple(0.1 * rng.standard_normal(shape).astype(np.float32) for shape in shapes)
     return replace(net, weights=net.weights + more)
 

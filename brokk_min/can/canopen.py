@@ -114,13 +114,20 @@ class Nodes:
 
 
 def check_bus(machine: Machine) -> None:
-    """ValueError: valve frames without free identifiers, or ticks too long for the watchdog."""
+    """ValueError: valve frames without free identifiers, ticks too long for the watchdog, a range
+    of more than a turn: positions count from the middle of the range.
+    """
     used = [*used_ids(machine), *(SDO_REQUEST + joint.encoder_node for joint in machine.joints)]
     taken = [i for i in valve_frame_ids(machine) if i > 0x7FF or used.count(i) > 1]
     if taken:
         got = ", ".join(f"0x{i:03X}" for i in taken)
         expected = "expected an identifier of no other frame"
         raise ValueError(f"{machine.name}: valve_frame_id: {expected}, got {got}")
+    for joint in machine.joints:
+        width = joint.q_max - joint.q_min
+        if joint.kind == "revolute" and width > 2 * np.pi - 0.1:
+            expected = "expected a range of less than a turn by 0.1 rad"
+            raise ValueError(f"{machine.name}: {joint.name}.q_max: {expected}, got {width:.2f} rad")
     slowest = 1.5 / WATCHDOG  # Hz: a tick may be late by half
     if machine.rate < slowest:
         raise ValueError(

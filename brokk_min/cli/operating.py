@@ -96,7 +96,8 @@ class Drive(Command):
             joint = self.joint or driven[0]
             if joint not in driven:
                 raise WrongUse(f"--joint: expected a driven one of {driven}, got {joint}")
-            counts = self.counts or int(np.ceil(machine.dead_zone * PWM_MAX)) + 3
+            dead_zone = machine.dead_zones[machine.names.index(joint)].max()
+            counts = self.counts or int(np.ceil(dead_zone * PWM_MAX)) + 3
             return JointJog(machine, joint, counts)
         if not self.policy:
             raise WrongUse("--policy: expected a policy that `train` wrote, got none")

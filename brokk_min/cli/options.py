@@ -1,6 +1,7 @@
 """Common to the commands: checks of options, the machine, default policy and gains."""
 
 import os
+import re
 import runpy
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
@@ -83,9 +84,14 @@ class Command:
         for name in vars(self).keys() - outputs.keys():
             value = getattr(self, name)
             values = value if isinstance(value, tuple) else (value,)
-            inputs += [Path(word) for word in values if word and isinstance(word, Path | str)]
+            words = [str(word) for word in values if word and isinstance(word, Path | str)]
+            inputs += [Path(re.sub(r"\.py:\w+$", ".py", word)) for word in words]  # FILE.py:NAME
+        read = [path.resolve() for name in ("logs", "test") for path in vars(self).get(name, ())]
+        if "test" in vars(self) and len(set(read)) < len(read):
+            raise WrongUse("LOGS, --test: expected different files, got one twice")
         files = {getattr(self, name): kind for name, kind in outputs.items()}
-        if len(files) < len(outputs) and None not in files:
+        given = [path.resolve() for path in (getattr(self, name) for name in outputs) if path]
+        if len(set(given)) < len(given):
             raise WrongUse(f"--{', --'.join(outputs)}: expected different files, got the same")
         existing = {path: kind for path, kind in (others or {}).items() if path.exists()}
         for path, kind in (files | existing).items():
@@ -103,6 +109,8 @@ def check_output(path: Path, names: set[str], kind: str, force: bool) -> None:
         raise WrongUse(f"{path}: expected a file in an existing, writable directory")
     if not path.exists() or (path.is_file() and (force or not path.stat().st_size)):
         return
+    if kind == "drive log":
+        raise WrongUse(f"{path}: expected no file, for no drive can be repeated (--force), got one")
     if not path.is_file() or not names <= names_in(path):
         got = "it has " + brief(sorted(names_in(path))) if path.is_file() else "no regular file"
         expected = f"expected no file, or one of kind {kind} (--force writes over others)"

@@ -162,9 +162,9 @@ def initial_weights(n: int, config: FitConfig, generator: Generator) -> list[Ten
     for rows, columns in [(inputs, hidden), (hidden, hidden), (hidden, 1)]:
         weights += [uniform(rows, columns, math.sqrt(6 / rows)), torch.zeros(n, columns)]
     if latents:
-        read = 6 * config.history
-        weights.append(uniform(read, latents, math.sqrt(1 / (n * read))))
+        weights.append(uniform(2 * inputs, latents, math.sqrt(1 / (2 * n * inputs))))
         weights.append(uniform(latents, hidden, math.sqrt(6 / inputs)))
+        weights.append(torch.zeros(n, latents))
     return [weight.requires_grad_() for weight in weights]
 
 
@@ -256,9 +256,9 @@ def predict(
     x = (x - data.input_mean[:, None]) / data.input_scale[:, None]
     bias = b1[:, None]
     if len(weights) > 6:  # as `ActuatorNet.latents`
-        both = x[..., : 3 * q.shape[-1]]
-        both = torch.cat([both, both.abs()], dim=-1)
-        bias = bias + torch.tanh((both @ weights[6]).sum(dim=0)) @ weights[7]
+        both = torch.cat([x, x.abs()], dim=-1)
+        z = (both @ weights[6] + weights[8][:, None]).sum(dim=0)
+        bias = bias + torch.tanh(z) @ weights[7]
     x = torch.relu(torch.baddbmm(bias, x, w1))
     x = torch.relu(torch.baddbmm(b2[:, None], x, w2))
     y = torch.sigmoid(torch.baddbmm(b3[:, None], x, w3))[..., 0]

@@ -88,8 +88,9 @@ NET_ARRAYS: dict[str, Field] = {
     "q_low": Field("float", -LARGE, LARGE, ("n",), "rad"),
     "q_high": Field("float", -LARGE, LARGE, ("n",), "rad"),
     **_layers(("n",), "inputs", "hidden", "hidden", 1),
-    "weight_6": Field("float", -LARGE, LARGE, ("n", "6 history", "latents"), required=False),
+    "weight_6": Field("float", -LARGE, LARGE, ("n", "2 inputs", "latents"), required=False),
     "weight_7": Field("float", -LARGE, LARGE, ("n", "latents", "hidden"), required=False),
+    "weight_8": Field("float", -LARGE, LARGE, ("n", "latents"), required=False),
 }
 POLICY_HEADER: Fields = {
     "contract": {"paper": Field("truth value", required=False)},  # see `policy.contract`

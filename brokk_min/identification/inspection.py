@@ -214,7 +214,9 @@ def reaction(recordings: list[Recording], j: int) -> float:
         for k, x in enumerate((own, np.hstack([own, motion]))):
             w = np.linalg.lstsq(x[fitted], changes[fitted], rcond=None)[0]
             error[k] += np.square(changes[scored] - x[scored] @ w).sum()
-    return float(1 - error[1] / max(error[0], 1e-12))
+    if error[0] < 1e-12 * len(changes):  # held commands: their past tells all
+        return 0.0
+    return float(1 - error[1] / error[0])
 
 
 def _small_changes(recording: Recording, j: int) -> tuple[Array, Array, Array]:

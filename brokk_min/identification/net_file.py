@@ -15,7 +15,7 @@ from brokk_min.identification.files import expected, load_arrays, load_header, l
 from brokk_min.identification.formats import NET_ARRAYS, NET_HEADER, check_fields
 from brokk_min.machine import Machine
 
-FORMATS = {6: 1, 8: 2}  # by the number of weights: 8 with `ActuatorNet.latents`
+FORMATS = {6: 1, 9: 3}  # by the number of weights: 9 with `ActuatorNet.latents`
 LARGEST_NET = 2**26  # bytes of a file
 STATISTICS = [name for name in NET_ARRAYS if not name.startswith("weight_")]
 
@@ -44,13 +44,13 @@ def net_from_arrays(path: Path, arrays: dict[str, NDArray[Any]], prefix: str = "
 
     `prefix` is that of the names of the arrays in the file.
     """
-    number = 8 if "weight_6" in arrays else 6
+    number = 9 if "weight_6" in arrays else 6
     header = load_header(path, arrays, "actuator net", FORMATS[number])
     sizes: dict[str, int] = {}
     check_fields(path, header, NET_HEADER, sizes, prefix)
     found, H = arrays.get("input_mean", np.empty(0)), header["history"]
     inputs = 4 * H if found.shape[-1:] == (4 * H,) else 3 * H
-    sizes |= {"inputs": inputs, "6 history": 6 * H}
+    sizes |= {"inputs": inputs, "2 inputs": 2 * inputs}
     check_fields(path, arrays, NET_ARRAYS, sizes, prefix)
     for name in ("output", "q"):
         if not (arrays[f"{name}_low"] < arrays[f"{name}_high"]).all():
@@ -78,12 +78,20 @@ def select_nets(machine: Machine, net: ActuatorNet) -> ActuatorNet:
 
 
 def joint_nets(net: ActuatorNet, joints: Sequence[str]) -> ActuatorNet:
-    """The nets of some joints, in the order given; ValueError: a joint without a net."""
+    """The nets of some joints, in the order given; ValueError: a joint without a net.
+
+    For shared latents the other joints count as at rest in the middle of their log.
+    """
     if not set(joints) <= set(net.joints):
         raise ValueError(f"joints: expected nets for {list(joints)}, got {list(net.joints)}")
     index = [net.joints.index(name) for name in joints]
     arrays = {name: getattr(net, name)[index] for name in STATISTICS}
     weights = tuple(weight[index] for weight in net.weights)
+    if len(weights) > 6:
+        rest = -net.input_mean / net.input_scale  # standardised zeros
+        rest[:, : net.history] = 0.0  # the mean angle
+        z = np.einsum("ni,nil->nl", np.hstack([rest, np.abs(rest)]), net.weights[6])
+        weights[8][0] += np.delete(z + net.weights[8], index, axis=0).sum(axis=0)
     return replace(net, joints=tuple(joints), weights=weights, **arrays)
 
 

@@ -35,6 +35,8 @@ from brokk_min.machine import BROKK_170
 
 STEP = BROKK_170.encoder_step[0]
 SLOW = replace(BROKK_170, name="slow", rate=5.0)
+SLEW = replace(BROKK_170.joints[0], q_min=-3.1, q_max=3.1)
+WIDE = replace(BROKK_170, name="wide", joints=(SLEW, *BROKK_170.joints[1:]))
 
 
 def bitwise_crc(data):
@@ -135,6 +137,7 @@ def test_set_up_nodes__refuses_what_does_not_fit(world):
         (replace(SIX, valve_frame_id=0x185), "valve_frame_id: expected .*, got 0x185, 0x186"),
         (replace(BROKK_170, valve_frame_id=0x583), "valve_frame_id: .* no other frame, got 0x583"),
         (SLOW, r"slow: expected a rate of 10 Hz or more, .* got 5 Hz"),
+        (WIDE, r"q1\.q_max: expected a range of less than a turn by 0.1 rad, got 6.20 rad"),
     ],
 )
 def test_machines_that_do_not_fit_the_bus__are_refused_on_both_its_sides(machine, refusal):

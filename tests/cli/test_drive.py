@@ -38,7 +38,7 @@ def test_drive__replays_converts_and_survives_a_kill_as_a_process_of_its_own(
     where = ["--interface", "udp_multicast", "--channel", MULTICAST]
     jacobian = ["drive", "--policy", POLICY, "--controller", "jacobian"]
     log, plant = tmp_path / "run.log", tmp_path / "plant.csv"
-    drive = [*jacobian, *where, "--command", commands, "--log", log]
+    drive = [*jacobian, *where, "--command", commands, "--log", log, "--force"]
     machine = process("machine", *where, "--start", *START, "--record", plant)
     try:
         eventually(lambda: len(recorded_rows(plant)) > 10, 60)

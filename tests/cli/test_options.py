@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from helpers_cli import MINI
 
+from brokk_min.cli.identification import Fit
 from brokk_min.cli.options import Command, WrongUse, find_machine, names_in
 from brokk_min.machine import BROKK_170, number
 
@@ -45,6 +46,7 @@ class Convert(Command):
     logs: tuple[Path, ...] = (Path("in.csv"),)
     out: Path
     json: Path | None = None
+    figure: Path | None = None
 
 
 def test_check__gives_the_machine_if_outputs_can_be_written(tmp_path):
@@ -75,6 +77,28 @@ def test_check__writes_over_no_input_and_over_no_other_kind(tmp_path):
             Convert(logs=(table, log), out=path, force=True).check(out="log")
     with pytest.raises(WrongUse, match="--out, --json: expected different files"):
         Convert(out=log, json=log).check(out="log", json="scores")
+    with pytest.raises(WrongUse, match="--out, --json, --figure: expected different files"):
+        Convert(out=log, figure=log).check(out="log", json="scores", figure="picture")
+    module = tmp_path / "mine.py"
+    module.write_text("from brokk_min.machine import BROKK_170 as MINE\n")
+    with pytest.raises(WrongUse, match=r"mine\.py: expected another file than an input to write"):
+        Convert(machine=f"{module}:MINE", out=module, force=True).check(out="log")
+    drive = tmp_path / "drive.log"
+    drive.write_text("(1.5) can0 181#00\n")
+    with pytest.raises(
+        WrongUse, match=r"drive\.log: expected no file, for no drive can be repeated"
+    ):
+        Convert(out=drive).check(out="drive log")
+    Convert(out=drive, force=True).check(out="drive log")
+
+
+def test_check__takes_no_log_twice(tmp_path):
+    log = tmp_path / "log.csv"
+    log.write_text("run,time,u_a,q_a\n")
+    for logs, test in (((log, log), ()), ((log,), (tmp_path / "." / "log.csv",))):
+        with pytest.raises(WrongUse, match="LOGS, --test: expected different files"):
+            Fit(logs=logs, test=test, out=tmp_path / "net.npz").check(out="nets")
+    Fit(logs=(log,), out=tmp_path / "net.npz").check(out="nets")
 
 
 def test_find_machine__runs_a_file(tmp_path):

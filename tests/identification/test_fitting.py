@@ -208,7 +208,7 @@ def test_fit__with_latents_learns_what_joints_share():
     for latents, steps in ((0, 200), (4, 1000)):  # more steps do not help nets that are alone
         config = FitConfig(steps, batch_size=128, rollout=1, noise=0.0, shared=latents)
         net = fit(log, config, seed=0, velocity_samples=4)
-        assert len(net.weights) == (8 if latents else 6)
+        assert len(net.weights) == (9 if latents else 6)
         scores = score(net, unseen)
         error[latents] = np.mean([scores[j]["free_run"]["1"]["velocity_rmse"] for j in log.joints])
     assert error[4] < 0.6 * error[0]

@@ -202,6 +202,8 @@ def test_reaction__tells_a_controller_with_random_goals_from_an_excitation():
     assert reaction([closed], 0) > 0.1 > REACTS
     noisy = holds(rng) + 0.005 * rng.standard_normal(4000)
     assert reaction([record("boom", noisy)], 0) < REACTS
+    held = closed._replace(u=np.repeat(np.resize([0.3, -0.3], (90, 1)), 40, axis=0))
+    assert reaction([held], 0) == 0.0  # all small changes are none
     two = Recording("", *(np.tile(x, 2) for x in closed[1:]))
     log = Log(tuple(TRUE), (two,))
     assert "commands follow the measured motion (7" in warnings(log, inspect(log))[-1]

@@ -92,13 +92,29 @@ def test_select_nets__refuses_nets_of_another_machine_rate_or_estimator():
         select_nets(BROKK_170, joint_nets(net, ["q1", "q3"]))
 
 
+@pytest.mark.parametrize("joints", [["j2", "j0"], ["j1"], ["j0", "j1", "j2"]])
+def test_joint_nets__count_the_others_as_at_rest_for_what_joints_share(joints):
+    """As all nets together, while the others stand at their mean angles, without commands."""
+    net = shared_net(rows=4)
+    index = [net.joints.index(name) for name in joints]
+    rng = np.random.default_rng(4)
+    history = np.zeros((20, 3, 3, net.history), np.float32)
+    history[..., 0, :] = net.input_mean[:, : net.history]
+    history[:, index] = rng.uniform(-1, 1, (20, len(index), 3, net.history))
+    few = joint_nets(net, joints)
+    together = net.forward(history)[0][:, index]
+    np.testing.assert_allclose(few.forward(history[:, index])[0], together, atol=1e-6)
+    again = joint_nets(joint_nets(net, [*joints, *set(net.joints) - set(joints)]), joints)
+    np.testing.assert_allclose(again.weights[8], few.weights[8], atol=1e-6)
+
+
 def test_load_net__wants_all_weights_of_nets_that_share_latents(tmp_path):
     save_net(tmp_path / "net.npz", shared_net())
-    assert len(joint_nets(load_net(tmp_path / "net.npz"), ["j0", "j2"]).weights) == 8
+    assert len(joint_nets(load_net(tmp_path / "net.npz"), ["j0", "j2"]).weights) == 9
     with np.load(tmp_path / "net.npz") as file:
         arrays = dict(file)
-    assert json.loads(str(arrays["header"]))["format"] == 2  # older programs refuse it
-    for name in ("weight_6", "weight_7"):
+    assert json.loads(str(arrays["header"]))["format"] == 3  # older programs refuse it
+    for name in ("weight_6", "weight_7", "weight_8"):
         np.savez(tmp_path / "part.npz", **{key: arrays[key] for key in arrays if key != name})
         with pytest.raises(ValueError, match=r"expected .*actuator net"):
             load_net(tmp_path / "part.npz")

@@ -248,8 +248,8 @@ def slow_forward(net: ActuatorNet, history: np.ndarray) -> np.ndarray:
     weights = [w.astype(float) for w in net.weights]
     z, result = 0.0, []
     if len(weights) > 6:
-        read = [one[: 3 * net.history] for one in x]  # no indicators
-        z = np.tanh(sum(np.concatenate([r, abs(r)]) @ S for r, S in zip(read, weights[6])))
+        z = sum(np.concatenate([r, abs(r)]) @ S for r, S in zip(x, weights[6]))
+        z = np.tanh(z + sum(weights[8]))
     for j in range(len(x)):
         w1, b1, w2, b2, w3, b3, *more = (w[j] for w in weights)
         hidden = np.maximum(x[j] @ w1 + b1 + (z @ more[1] if more else 0.0), 0)
