@@ -31,6 +31,7 @@ LEVELS = 8  # of commands from 0 to the largest, by direction
 # What a log must have for its score to hold in other driving, all assumed.
 LEAST_MINUTES = 10.0
 LEAST_RANGE = 0.7  # of a joint's range
+LEAST_EXPLAINED = 0.1  # of a joint's motion by its commands
 LEAST_LEVELS = 6  # with 1 % of the commands or more
 LEAST_CHANGES = 0.05  # of the ticks: commands that change by more than a tenth of the largest
 CLOSED_LOOP = -0.42  # `feedback`: excitations give -0.4 to 0, going between places -0.6 to -0.5
@@ -261,6 +262,14 @@ def warnings(
             joint = machine.joints[machine.names.index(name)]
             part = (r.high - r.low) / (joint.q_max - joint.q_min)
             checks[f"{part:.0%} of the range"] = part < LEAST_RANGE
+            beyond = 0.05 * (joint.q_max - joint.q_min)
+            if r.low < joint.q_min - beyond or r.high > joint.q_max + beyond:
+                wanted = f"expected angles of {joint.q_min:g} to {joint.q_max:g}"
+                got = f"got {r.low:.2f} to {r.high:.2f}: another unit, zero or joint?"
+                result.append(f"{name}: {wanted}, {got}")
+        if r.explained < LEAST_EXPLAINED:
+            what = f"its commands explain {r.explained:.0%} of its motion"
+            result.append(f"{name}: {what}: are they those of another joint?")
         found = [text for text, bad in checks.items() if bad]
         if found:
             result.append(f"{name}: {', '.join(found)}: scores hold for such driving alone")

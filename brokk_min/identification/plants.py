@@ -32,8 +32,14 @@ class CheckedPlant:
         return self._call("reset", self.plant.reset, np.shape(q), machine, np.array(q, float))
 
     def step(self, machine: Machine, state: Any, u: Array) -> Any:
-        """As `Plant.step`."""
-        return self._call("step", self.plant.step, np.shape(u), machine, state, np.array(u, float))
+        """As `Plant.step`. ValueError, too: it changes the array of angles that it was given."""
+        old: Any = getattr(state, "q", None)
+        before = np.array(old)
+        u = np.array(u, float)
+        result = self._call("step", self.plant.step, u.shape, machine, state, u)
+        if not np.array_equal(old, before):
+            raise ValueError(f"{self.name}.step: expected a new array q, got the old one, changed")
+        return result
 
     def _call(
         self, name: str, function: Callable[..., Any], shape: tuple[int, ...], *arguments: Any

@@ -215,6 +215,11 @@ def test_warnings__know_the_range_of_a_machine():
     reports["q1"] = replace(reports["q1"], low=-1.0, high=1.0)
     about, _ = warnings(log, reports, BROKK_170)
     assert about == "q1: 47% of the range: scores hold for such driving alone"
+    reports["q1"] = replace(reports["q1"], low=-2.2, high=2.6, explained=0.05)
+    beyond, unexplained, _ = warnings(log, reports, BROKK_170)
+    wanted = "q1: expected angles of -2.14 to 2.14, got -2.20 to 2.60: another unit, zero or joint?"
+    assert beyond == wanted
+    assert unexplained.startswith("q1: its commands explain 5% of its motion")
 
 
 def test_fields__are_those_of_the_machine():

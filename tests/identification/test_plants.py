@@ -35,6 +35,20 @@ def test_checked_plant__is_a_plant_as_any_object_of_two_functions():
     np.testing.assert_allclose(state.q, 1.005)
 
 
+def test_checked_plant__refuses_angles_changed_in_place():
+    """Velocities are differences of old and new angles: they would all be 0."""
+
+    class InPlace(Obedient):
+        def step(self, machine, state, u):
+            self.q += 0.2 * machine.dt * u
+            return self
+
+    plant = CheckedPlant("OWN", InPlace())
+    state = plant.reset(BROKK_170, np.ones((2, 5)))
+    with pytest.raises(ValueError, match=r"^OWN.step: expected a new array q, got the old one"):
+        plant.step(BROKK_170, state, np.full((2, 5), 0.5))
+
+
 @pytest.mark.parametrize(
     ("answer", "got"),
     [(lambda u: u[:, :2], r"array\("), (lambda u: u + np.nan, "nan"), (lambda u: 1 / 0, "zero")],
