@@ -13,7 +13,7 @@ import tempfile
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -353,14 +353,12 @@ def quiet() -> Figures:
     files = {name: policy.load_policy(shipped / file, M) for name, file in policy.POLICIES.items()}
     controllers: dict[str, Any] = {**policy.policy_controllers(M, files)}
     net = files["rl"].net
-    start, goals = sequences.tuning_set(M, baselines.TUNING_RUNS, 0)
-    cost = partial(baselines.tuning_cost, start=start, goals=goals, seed=0, config=config)
+    effort = baselines.TUNING_RUNS, baselines.GENERATIONS, 0
     gains = baselines.read_gains(shipped / "gains.json", M, net)
-    by_hand = baselines.baselines(M, net)
     for name in ("jacobian_pid_k0.1", *baselines.WITH_INTEGRAL):
         controllers[name] = gains[name]
-        tuned, _ = baselines.tune(by_hand[name], cost, 0, baselines.GENERATIONS, name)
-        controllers[f"{name}, tuned so"] = tuned
+        tuned, _ = baselines.tune_baselines(M, net, *effort, config, only=name)
+        controllers[f"{name}, tuned so"] = tuned[name]
     starts = sequences.workspace_starts(M, 64)
     axes = sequences.axis_sequences(M)
     runs, _ = metrics.evaluate(M, controllers, axes, starts, 0, config=config)
