@@ -48,8 +48,7 @@ def limit_gradient(machine: Machine, q: ArrayLike) -> Array:
 
     h(q) = sum over joints of (q_max - q_min)^2 / (4 (q_max - q) (q - q_min)).
     """
-    low = machine.column("q_min")
-    high = machine.column("q_max")
+    low, high = machine.column("q_min"), machine.column("q_max")
     margin = 1e-3 * (high - low)  # finite at the limits and beyond
     q = np.clip(q, low + margin, high - margin)
     # dh/dq = (q_max - q_min)^2 (2 q - q_max - q_min) / (4 (q_max - q)^2 (q - q_min)^2)
@@ -75,9 +74,7 @@ def manipulability(J: ArrayLike) -> Array:
 
 
 def nakamura_damping(w: ArrayLike, w0: float, k: float) -> Array:
-    """lambda^2 = k (1 - w/w0)^2 for w < w0, otherwise 0. Paper: Sec. 4.2 (lambda)
-
-    Nakamura and Hanafusa (1986).
+    """lambda^2 = k (1 - w/w0)^2 for w < w0, else 0 (Nakamura, Hanafusa, 1986). Paper: Sec. 4.2
 
     Example:
         >>> nakamura_damping([0.0, 0.5, 1.0, 2.0], 1.0, 0.1)
@@ -170,9 +167,8 @@ class JacobianController:
         """Commands u [-1, 1] (..., n), and the state of the next tick."""
         m, gains = self.machine, self.gains
         q = measured.q.astype(float)
-        velocities = measured.v_goal, measured.v_tool
         q_dot_goal = self.desired_velocities(
-            *velocities, q, state.q_dot_goal, measured.error_integral
+            measured.v_goal, measured.v_tool, q, state.q_dot_goal, measured.error_integral
         )
         error = q_dot_goal - measured.q_dot
         derivative = 0.7 * state.derivative + 0.3 * (error - state.error) / m.dt  # over 2.8 ticks

@@ -119,18 +119,21 @@ class Machine:
         for what, values in (("names", [*self.names]), ("CANopen nodes", nodes)):
             if len(set(values)) != len(values):
                 raise ValueError(f"joints: expected different {what}, got {values}")
-        least = float(self.dead_zones.min())
-        most = max(float(self.dead_zones.max()), self.largest_dead_zone)
-        if not most * PWM_MAX < self.pwm_limit:  # no valve would ever open
-            raise ValueError(f"dead_zone: expected below {self.pwm_limit}/{PWM_MAX}, got {most!r}")
+        least, most = self.dead_zones.min(), self.dead_zones.max()
+        largest = self.largest_dead_zone or most
         if least < self.dead_zone:
             raise ValueError(f"dead_zone: expected at most a joint's {least}, got {self.dead_zone}")
+        if largest < most:
+            raise ValueError(f"largest_dead_zone: expected {most} or more, got {largest}")
+        if not largest * PWM_MAX < self.pwm_limit:  # no valve would ever open
+            raise ValueError(f"dead_zone: expected below {self.pwm_limit}/{PWM_MAX}, got {largest}")
         common = self.pwm_limit / PWM_MAX, 2**self.encoder_bits
         pairs = zip(self.joints, self.dead_zones, strict=True)
         joints = tuple(joint.complete(zones, *common) for joint, zones in pairs)
         object.__setattr__(self, "joints", joints)
-        if self.q_start and len(self.q_start) != self.n:
-            raise ValueError(f"q_start: expected {self.n} angles or none, got {self.q_start}")
+        inside = [j.q_min <= q <= j.q_max for j, q in zip(joints, self.q_start, strict=False)]
+        if self.q_start and not (len(self.q_start) == self.n and all(inside)):
+            raise ValueError(f"q_start: expected {self.n} angles within ranges, got {self.q_start}")
         steps = self.dt / self.plant_dt
         if abs(steps - round(steps)) > 1e-6 or steps < 0.5:
             raise ValueError(f"plant_dt: expected a part of {self.dt} s, got {self.plant_dt}")

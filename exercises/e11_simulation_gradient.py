@@ -48,12 +48,12 @@ SOLUTION = "brokk_min/learning/simulation_gradient.py: action_gradients"
 def command_gradients(machine: Machine, net: ActuatorNet, ticks: Ticks, gamma: float) -> Array:
     """dR_t/du_t (T, num, n_driven): discounted rewards to come by each command. No costs, no stops.
 
-    `dr_dq_dot` is (T, num, n_driven), `dq_dot_dh` (T, num, n_driven, 3, H).
+    `by.dr_dq_dot` is (T, num, n_driven), `by.dq_dot_dh` (T, num, n_driven, 3, H). No latents.
     """
-    dr_dq_dot, dq_dot_dh, _ = local_derivatives(machine, net, ticks, gamma, integral_cost=0.0)
+    by = local_derivatives(machine, net, ticks, gamma, integral_cost=0.0)
     window = machine.velocity_samples
     slope = estimate_velocity(np.eye(window), window, machine.dt)  # of h's newest velocity by q
-    raise NotImplementedError(dr_dq_dot.shape, dq_dot_dh.shape, slope.shape)
+    raise NotImplementedError(by.dr_dq_dot.shape, by.dq_dot_dh.shape, slope.shape)
 
 
 def simulate(machine: Machine, net: ActuatorNet, ticks: int) -> Ticks:

@@ -98,6 +98,8 @@ class Drive(Command):
                 raise WrongUse(f"--joint: expected a driven one of {driven}, got {joint}")
             dead_zone = machine.dead_zones[machine.names.index(joint)].max()
             counts = self.counts or int(np.ceil(dead_zone * PWM_MAX)) + 3
+            if counts > machine.pwm_limit:
+                raise WrongUse(f"--counts: expected at most {machine.pwm_limit}, got {counts}")
             return JointJog(machine, joint, counts)
         if not self.policy:
             raise WrongUse("--policy: expected a policy that `train` wrote, got none")

@@ -233,7 +233,8 @@ def start_kinds(machine: Machine, starts: Array) -> list[str]:
     """
     frames = forward_kinematics(machine, starts)
     reach = np.linalg.norm(frames.p[:, -1] - frames.p[:, 1], axis=-1)
-    length = np.hypot(machine.column("a"), machine.column("d"))[1:].sum()
+    slide = [joint.q_max * (joint.kind == "prismatic") for joint in machine.joints]
+    length = np.hypot(machine.column("a"), machine.column("d") + slide)[1:].sum()
     w = manipulability(jacobian(frames)[..., machine.driven])
     extended = (reach > 0.9 * length) & (w < manipulability_threshold(machine))
     margin = np.minimum(starts - machine.column("q_min"), machine.column("q_max") - starts)

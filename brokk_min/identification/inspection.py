@@ -282,13 +282,16 @@ def warnings(
 
 
 def fields(reports: dict[str, JointReport], machine: Machine) -> dict[str, Any]:
-    """Fields of a machine by a log of it: dead zones, and fastest motions at the command limit."""
+    """Fields of a machine by a log of it: dead zones, and fastest motions at the command limit.
+
+    The largest dead zone is 0.05 wider than found: one that is too small stops drives.
+    """
     known = {name: reports[name] for name in machine.names if name in reports}
     limit = machine.pwm_limit / PWM_MAX
     zones = [zone for r in known.values() for zone in (r.dead_zone_up, r.dead_zone_down)]
     return {
         "dead_zone": min(zones),
-        "largest_dead_zone": max(zones),
+        "largest_dead_zone": min(max(zones) + 0.05, 0.99 * limit),
         "dead_zone_up": {k: r.dead_zone_up for k, r in known.items()},
         "dead_zone_down": {k: r.dead_zone_down for k, r in known.items()},
         "q_dot_up": {k: r.gain_up * max(limit - r.dead_zone_up, 0) for k, r in known.items()},
@@ -303,8 +306,8 @@ def with_dead_zones(machine: Machine, log: Log) -> Machine:
     for joint in machine.joints:
         zones = {side: found[side][joint.name] for side in ("dead_zone_up", "dead_zone_down")}
         joints.append(replace(joint, **zones))
-    least, most = found["dead_zone"], found["largest_dead_zone"] + 0.05  # see docs/porting.md
-    return replace(machine, joints=tuple(joints), dead_zone=least, largest_dead_zone=most)
+    common = {key: found[key] for key in ("dead_zone", "largest_dead_zone")}
+    return replace(machine, joints=tuple(joints), **common)
 
 
 def report_json(log: Log, machine: Machine | None = None) -> dict[str, Any]:

@@ -29,9 +29,8 @@ of the window, so its last actions get little credit. None of this is new:
 
 Simplifications: angles and commands count as exact, not rounded, and actions not as clipped; the
 error integral takes the true velocity of the tick; Jacobians count as constant, for in one second a
-joint turns little; joints at rest count without the standstill rule; latents that the nets share
-count as given; a tick into the ground counts as any other; nothing counts after the end of an
-episode, not even where it only ran out of time.
+joint turns little; joints at rest count without the standstill rule; a tick into the ground counts
+as any other; nothing counts after the end of an episode, not even where it only ran out of time.
 """
 
 from dataclasses import replace
@@ -78,6 +77,16 @@ class Ticks(NamedTuple):
     u: Array  # command, n
     follows: Array  # (T, num, 1): 0 at rest, where the action does not count, else 1
     done: NDArray[np.bool_]  # did the episode end with the tick?
+
+
+class Derivatives(NamedTuple):
+    """Of one tick, by the history h that the nets read and the latents z that they share."""
+
+    dr_dq_dot: Array  # (T, num, n_driven)
+    dq_dot_dh: Array  # by each joint's own history, (T, num, n_driven, 3, H)
+    dq_dot_dz: Array  # (T, num, n_driven, L); L = 0: nets without latents
+    dz_dh: Array  # (T, num, L, n_driven, 3, H)
+    free: Array  # (T, num, n_driven): 0 at a limit of the joint, else 1
 
 
 def make_learner(env: VectorEnv[Any, Any, Any], config: ppo.PPOConfig, seed: int) -> ppo.Learner:
@@ -146,23 +155,25 @@ def action_gradients(
     not count. Of `task` the costs of valve travel and of the error integral hold. Returns
     (T, num, n_driven), float32, by actions as `env.action_to_pwm` takes them.
     """
-    dr_dq_dot, dq_dot_dh, free = local_derivatives(machine, net, ticks, gamma, task.integral_cost)
+    by = local_derivatives(machine, net, ticks, gamma, task.integral_cost)
     dc_du = valve_cost_gradient(machine, ticks, task.valve_cost)
     window = machine.velocity_samples
     slope = estimate_velocity(np.eye(window), window, machine.dt).astype(np.float32)  # dq_dot/dq
-    dR_du = np.empty_like(dr_dq_dot)
+    dR_du = np.empty_like(by.dr_dq_dot)
     # costates: derivatives of the rewards to come by the state after the tick
-    dR_dh = np.zeros_like(dq_dot_dh[0])  # history, (num, n_driven, 3, H)
+    dR_dh = np.zeros_like(by.dq_dot_dh[0])  # history, (num, n_driven, 3, H)
     dR_dq = np.zeros_like(dc_du[0])  # angle, (num, n_driven)
     dR_dlast = np.zeros_like(dc_du[0])  # command of the tick, by the next tick's valve travel
     for t in reversed(range(len(dR_du))):
         discount = np.float32(gamma) * ~ticks.done[t, :, None]
         dR_dh = discount[..., None, None] * dR_dh
         dR_dh[..., 0, -window:] += dR_dh[..., 1, -1:] * slope  # the newest q_dot is a slope of q
-        dR_dq = free[t] * (discount * dR_dq + dR_dh[..., 0, -1])  # none at a limit
-        dR_dq_dot = np.float32(machine.dt) * dR_dq + dr_dq_dot[t]  # q_{t+1} = q_t + dt q_dot
+        dR_dq = by.free[t] * (discount * dR_dq + dR_dh[..., 0, -1])  # none at a limit
+        dR_dq_dot = np.float32(machine.dt) * dR_dq + by.dr_dq_dot[t]  # q_{t+1} = q_t + dt q_dot
         # by what the net read: the history before the tick, its command row with u_t already in it
-        before = dR_dq_dot[..., None, None] * dq_dot_dh[t]
+        before = dR_dq_dot[..., None, None] * by.dq_dot_dh[t]
+        dR_dz = np.einsum("bn,bnl->bl", dR_dq_dot, by.dq_dot_dz[t])
+        before += np.einsum("bl,blnch->bnch", dR_dz, by.dz_dh[t])
         before[..., :2, 1:] += dR_dh[..., :2, :-1]  # the shift of the history, backwards
         before[..., 2, :] += dR_dh[..., 2, :]  # the net reads commands already shifted
         dR_du[t] = before[..., 2, -1] + discount * dR_dlast - dc_du[t]
@@ -183,15 +194,12 @@ def valve_cost_gradient(machine: Machine, ticks: Ticks, valve_cost: float) -> Ar
 
 def local_derivatives(
     machine: Machine, net: ActuatorNet, ticks: Ticks, gamma: float, integral_cost: float
-) -> tuple[Array, Array, Array]:
-    """Derivatives within each tick, (T, num, n_driven, ...), and 1 where no limit holds.
-
-    dr/dq_dot; dq_dot/dh (3, H) for the history h with the command of the tick in it.
-    """
+) -> Derivatives:
+    """Derivatives within each tick; the history h has the command of the tick in it."""
     driven = machine.driven
     low, high = machine.column("q_min")[driven], machine.column("q_max")[driven]
     history = append_command(ticks.true_history, ticks.u[..., driven])
-    velocity, dq_dot_dh = input_gradient(net, history)
+    velocity, dq_dot_dh, dq_dot_dz, dz_dh = input_gradient(net, history)
     q_next = ticks.q[..., driven] + velocity * machine.dt
     free = (low <= q_next) & (q_next <= high)
     q = ticks.q.copy()
@@ -203,7 +211,7 @@ def local_derivatives(
     dr_dv = error / (np.maximum(size, 1e-6) * (1 + size) ** 2)
     dr_dv += integral_gradient(machine, ticks, error, gamma, integral_cost)
     dr_dq_dot = (dr_dv[..., None, :] @ J)[..., 0, :] * free  # v_tool = J q_dot
-    return dr_dq_dot, dq_dot_dh, free.astype(np.float32)
+    return Derivatives(dr_dq_dot, dq_dot_dh, dq_dot_dz, dz_dh, free.astype(np.float32))
 
 
 def integral_gradient(
@@ -230,20 +238,48 @@ def integral_gradient(
     return np.asarray(result)
 
 
-def input_gradient(net: ActuatorNet, history: Array) -> tuple[Array, Array]:
-    """Velocity of the nets and its derivative by the history (..., n, 3, H), by backpropagation."""
+def input_gradient(net: ActuatorNet, history: Array) -> tuple[Array, Array, Array, Array]:
+    """Velocity of the nets (..., n) and its derivatives, by backpropagation.
+
+    dq_dot/dh (..., n, 3, H) by each joint's own history, dq_dot/dz (..., n, L) by the latents, and
+    their dz/dh (..., L, n, 3, H).
+    """
     velocity, y, hidden2, hidden1 = net.forward(history)
     w1, _, w2, _, w3, _ = folded_weights(net)
     gradient = (net.output_high - net.output_low)[:, None, None] * y * (1 - y)  # sigmoid
     gradient = gradient @ w3.swapaxes(1, 2) * (hidden2 > 0)  # ReLU
     gradient = gradient @ w2.swapaxes(1, 2) * (hidden1 > 0)
-    gradient = (gradient @ w1.swapaxes(1, 2)).swapaxes(0, 1)
-    rows = gradient.reshape(*history.shape[:-2], -1, net.history)  # by `input_rows`
+    by_inputs = (gradient @ w1.swapaxes(1, 2)).swapaxes(0, 1)  # (batch, n, I)
+    dq_dot_dh = by_history(net, history, by_inputs.reshape(*history.shape[:-2], -1))
+    if len(net.weights) == 6:
+        *batch, n, rows, samples = history.shape
+        none = np.zeros((*batch, n, 0), np.float32)
+        return velocity, dq_dot_dh, none, np.zeros((*batch, 0, n, rows, samples), np.float32)
+    by_latents = (gradient @ net.weights[7].swapaxes(1, 2)).swapaxes(0, 1)  # (batch, n, L)
+    dq_dot_dz = by_latents.reshape(*history.shape[:-2], -1)
+    return velocity, dq_dot_dh, dq_dot_dz, latent_gradient(net, history)
+
+
+def latent_gradient(net: ActuatorNet, history: Array) -> Array:
+    """dz/dh (..., L, n, 3, H) of `ActuatorNet.latents`, z = tanh(sum_j (S_j^T [x_j, |x_j|] + c_j)).
+
+    dz/dx = (1 - z^2) (S + sign(x) S'), with S' the rows that weigh |x|.
+    """
+    x = net.inputs(history)[..., None, :, :]  # (..., 1, n, I)
+    z = net.latents(x.reshape(-1, *x.shape[-2:])).reshape(*history.shape[:-3], -1, 1, 1)
+    S, S_abs = np.split(np.moveaxis(net.weights[6], -1, 0), 2, axis=-1)  # (L, n, I) each
+    dz_dx = (1 - z**2) * (S + np.sign(x - net.input_mean) * S_abs) / net.input_scale
+    return by_history(net, history[..., None, :, :, :], dz_dx)
+
+
+def by_history(net: ActuatorNet, history: Array, by_inputs: Array) -> Array:
+    """Derivatives by what the nets read (..., n, I) as such by the history (..., n, 3, H)."""
+    rows = by_inputs.reshape(*by_inputs.shape[:-1], -1, net.history)  # by `input_rows`
     u = history[..., 2, :]
     by_u = rows[..., 2, :] * mu_law_derivative(u, net.dead_zone)  # the chain rule: both rows
     if net.indicator:
         by_u += rows[..., 3, :] * open_indicator_derivative(u, net.dead_zone)
-    return velocity, np.concatenate([rows[..., :2, :], by_u[..., None, :]], axis=-2)
+    return np.concatenate([rows[..., :2, :], by_u[..., None, :]], axis=-2)
 
 
 def mu_law_derivative(u: Array, dead_zone: float) -> Array:

@@ -128,6 +128,7 @@ UNWRITABLE = "brokk-min: no/x.csv: expected a file in an existing, writable dire
         (f"{DRIVE} --policy missing.npz", 1, "missing.npz"),
         (DRIVE, 2, "--policy: expected a policy that `train` wrote, got none"),
         (f"{DRIVE} --controller jog --joint q9", 2, "['q1', 'q3', 'q4', 'q5'], got q9"),
+        (f"{DRIVE} --controller jog --counts 81", 2, "--counts: expected at most 80, got 81"),
         (f"{DRIVE} --controller jog --valves dither", 2, "expected none with --controller jog"),
         (f"{DRIVE} --controller jog --command c.csv", 1, "c.csv"),
         ("convert missing.log --out log.csv", 1, "missing.log"),

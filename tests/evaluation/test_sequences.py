@@ -2,12 +2,14 @@
 
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from brokk_min.cli.options import find_machine
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation import sequences as s
 from brokk_min.evaluation.feasibility import feasible
@@ -15,6 +17,7 @@ from brokk_min.kinematics import forward_kinematics, jacobian, lowest_point
 from brokk_min.learning.episodes import draw_pose
 from brokk_min.machine import BROKK_170
 
+EXAMPLES = Path(__file__).parents[2] / "examples"
 START = np.array(BROKK_170.q_start)
 UPRIGHT = [0.0, 1.139, 0.97, 2.804, 1.948]  # tool 0.1 m from the slew axis
 
@@ -231,6 +234,15 @@ def test_draw_starts__refuses_a_machine_that_can_follow_nothing(monkeypatch):
 )
 def test_start_kinds__by_hand(pose, kind):
     assert s.start_kinds(BROKK_170, np.array([pose])) == [kind]
+
+
+def test_start_kinds__count_the_travel_of_a_telescope():
+    """Its boom is 3 m long, drawn out 4.8 m; it stands so steep that the slew moves it little."""
+    crane = find_machine(f"{EXAMPLES}/telescopic_crane.py:TELESCOPIC_CRANE")
+    slew, lift, telescope = crane.joints
+    steep = replace(crane, joints=(slew, replace(lift, q_max=1.5), telescope))
+    poses = np.array([[0.0, 1.3, 0.2], [0.0, 1.3, 1.6]])
+    assert s.start_kinds(steep, poses) == ["workspace", "extended"]
 
 
 # --- tuning ---------------------------------------------------------------------------------------

@@ -227,7 +227,7 @@ def test_fields__are_those_of_the_machine():
     report = replace(inspected("boom")["boom"], dead_zone_up=0.12, dead_zone_down=0.2)
     report = replace(report, gain_up=0.5, gain_down=0.3)
     found = fields({"q1": report, "q3": replace(report, dead_zone_up=0.05)}, BROKK_170)
-    assert (found["dead_zone"], found["largest_dead_zone"]) == (0.05, 0.2)
+    assert (found["dead_zone"], found["largest_dead_zone"]) == (0.05, 0.25)
     assert (found["dead_zone_up"], found["dead_zone_down"]["q3"]) == ({"q1": 0.12, "q3": 0.05}, 0.2)
     assert found["q_dot_up"]["q1"] == pytest.approx(0.255, abs=1e-3)
     assert found["q_dot_down"]["q1"] == pytest.approx(0.129, abs=1e-3)

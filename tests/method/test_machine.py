@@ -61,11 +61,13 @@ BAD = [
     ({"dead_zone": 80 / 127}, ["dead_zone", "below 80/127", "got 0.629"]),
     ({"dead_zone": 0.125, "pwm_limit": 10}, ["dead_zone", "below 10/127", "got 0.125"]),
     ({"largest_dead_zone": 0.63}, ["dead_zone", "below 80/127", "got 0.63"]),
+    ({"largest_dead_zone": 0.06}, ["largest_dead_zone", "0.07 or more", "got 0.06"]),
     ({"plant_dt": 0.03}, ["plant_dt", "a part of 0.05 s", "got 0.03"]),
     ({"plant_dt": 0.02, "rate": 1e7}, ["plant_dt", "a part of 1e-07 s", "got 0.02"]),
     ({"plant_dt": 0.05}, ["tau_spool", "expected 0.05 to inf", "got 0.03"]),
     ({"history": 3}, ["history", "expected 4 to 1000", "got 3"]),
-    ({"q_start": (0.0, 1.0)}, ["q_start", "5 angles or none", "(0.0, 1.0)"]),
+    ({"q_start": (0.0, 1.0)}, ["q_start", "5 angles within ranges", "(0.0, 1.0)"]),
+    ({"q_start": (1.5, 0.5, 0.58, 1.71, 2.24)}, ["q_start", "within ranges", "2.24)"]),
     ({"controller_node": 3}, ["joints", "different CANopen nodes", "[1, 2, 3, 4, 5, 3]"]),
 ]
 
