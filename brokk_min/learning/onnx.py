@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from brokk_min.actuator import REST_AFTER
+from brokk_min.actuator import INDICATOR_SCALE, REST_AFTER
 from brokk_min.env import COMPENSATION, observation_scale
 from brokk_min.identification.files import require, whole_file
 from brokk_min.learning.policy import Policy, contract
@@ -17,8 +17,9 @@ from brokk_min.machine import Array, Machine
 def export_onnx(path: Path, policy: Policy, machine: Machine) -> None:
     """Write a policy as one ONNX file: `observation` (batch, obs) in, `action` out.
 
-    The other program does the rest, with the numbers in the metadata: `env.action_to_pwm`
-    (`dead_zone`, `pwm_limit`, `ramp`), and after `rest_s` of a zero goal (null: never) the rule of
+    The other program does the rest, with the numbers in the metadata: `env.features`, whose open
+    indicator is tanh(|opening| / `indicator_scale`), `env.action_to_pwm` (`dead_zone`,
+    `pwm_limit`, `ramp`), and after `rest_s` of a zero goal (null: never) the rule of
     `actuator.command_at_rest`: valves alternate by `rest_opening` beyond `rest_zones`, up and down
     by joint; 0 for closed ones.
     ValueError: the package onnx is not installed.
@@ -36,6 +37,7 @@ def export_onnx(path: Path, policy: Policy, machine: Machine) -> None:
         **contract(machine, policy.paper),
         "mean": mean.tolist(),
         "scale": scale.tolist(),
+        "indicator_scale": INDICATOR_SCALE,
         "ramp": COMPENSATION,
         "rest_s": None if policy.valves == "open" else REST_AFTER[policy.valves],
         "rest_zones": machine.dead_zones.tolist(),

@@ -91,11 +91,16 @@ def policy_controllers(
 
 def contract(machine: Machine, paper: bool) -> dict[str, Any]:
     """What training and deployment must agree on; kept in the file and checked by `load_policy`."""
+    driven = machine.driven
+    observed = {  # by our observation alone, beside what all have
+        "dead_zones": machine.dead_zones[driven].tolist(),
+        "weights": machine.column("weight")[driven].tolist(),
+    }
     return {
         "paper": paper,
         "machine": machine.name,
         "joints": list(machine.names),
-        "driven": [machine.names[i] for i in machine.driven],
+        "driven": [machine.names[i] for i in driven],
         "history": machine.history,
         "rate": machine.rate,
         "velocity_samples": machine.velocity_samples,
@@ -105,6 +110,7 @@ def contract(machine: Machine, paper: bool) -> dict[str, Any]:
             [j.a, j.alpha, j.d, j.theta, j.q_min, j.q_max] + [j.kind] * (j.kind == "prismatic")
             for j in machine.joints
         ],
+        **({} if paper else observed),
     }
 
 
@@ -136,7 +142,9 @@ def load_policy(path: Path, machine: Machine) -> Policy:
     check_fields(path, header, POLICY_HEADER, {})
     recorded = {"paper": False, **header["contract"]}
     paper = recorded["paper"]
-    files.expect_same(path, recorded, contract(machine, paper))
+    wanted = contract(machine, paper)
+    older = {name: wanted.get(name) for name in ("dead_zones", "weights")}  # files without them
+    files.expect_same(path, {**older, **recorded}, wanted)
     mean, scale = observation_scale(machine, paper)
     check_fields(path, arrays, POLICY_ARRAYS, {"obs": len(mean), "driven": len(machine.driven)})
     for name, value in {"mean": mean, "scale": scale}.items():

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from brokk_min.actuator import REST_AFTER
+from brokk_min.actuator import INDICATOR_SCALE, REST_AFTER
 from brokk_min.env import COMPENSATION, observation_scale
 from brokk_min.identification.files import SHIPPED
 from brokk_min.learning.onnx import export_onnx
@@ -44,6 +44,7 @@ def test_export_onnx__is_one_file_with_what_the_other_program_needs(policy, tmp_
     metadata = {prop.key: json.loads(prop.value) for prop in model.metadata_props}
     scales = [np.float32(metadata.pop(name)) for name in ("mean", "scale")]
     np.testing.assert_array_equal(scales, observation_scale(BROKK_170))
+    assert metadata.pop("indicator_scale") == INDICATOR_SCALE
     assert (metadata.pop("ramp"), metadata.pop("rest_s")) == (COMPENSATION, REST_AFTER["closed"])
     assert (metadata.pop("rest_opening"), metadata.pop("rest_zones")) == (0, [[0.07, 0.07]] * 5)
     assert metadata == contract(BROKK_170, paper=False)

@@ -1,5 +1,6 @@
 """The policy's file and function: by hand, against torch, bit for bit through a file, refusals."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -106,6 +107,17 @@ def test_controller__of_the_papers_agent_takes_its_observation_and_sends_plain_a
     assert np.abs(u[0]).max() > 0.1  # valves stay as the policy has them
 
 
+def test_load_policy__takes_files_that_do_not_tell_the_dead_zones_of_joints(policy, tmp_path):
+    """As those written before 24 November 2026."""
+    save_policy(tmp_path / "policy.npz", policy, BROKK_170)
+    arrays = dict(np.load(tmp_path / "policy.npz"))
+    header = json.loads(str(arrays["header"]))
+    del header["contract"]["dead_zones"], header["contract"]["weights"]
+    arrays["header"] = np.array(json.dumps(header))
+    np.savez(tmp_path / "older.npz", **arrays)
+    assert load_policy(tmp_path / "older.npz", BROKK_170).training == policy.training
+
+
 def test_load_policy__keeps_every_bit(policy, saved, tmp_path):
     again = load_policy(saved, BROKK_170)
     assert dict(again.training) == {"seed": 0, "gamma": 0.5}
@@ -118,7 +130,7 @@ def test_load_policy__keeps_every_bit(policy, saved, tmp_path):
     assert saved.read_bytes() == (tmp_path / "other.npz").read_bytes()
 
 
-REORDERED = replace(BROKK_170, joints=(*BROKK_170.joints[1:], BROKK_170.joints[0]))
+REORDERED = (*BROKK_170.joints[1:], BROKK_170.joints[0])
 
 
 def change_joint(index, **changes):
@@ -131,10 +143,15 @@ def change_joint(index, **changes):
     ("machine", "message"),
     [
         (replace(BROKK_170, name="brokk500"), r"machine: expected 'brokk500', got 'brokk170'"),
-        (REORDERED, r"joints: expected \['q2', 'q3', 'q4', 'q5', 'q1'\], got \['q1', 'q2'"),
+        (
+            replace(BROKK_170, joints=REORDERED, q_start=()),
+            r"joints: expected \['q2', 'q3', 'q4', 'q5', 'q1'\], got \['q1', 'q2'",
+        ),
         (change_joint(1, driven=True), r"driven: expected \['q1', 'q2'.*got \['q1', 'q3'"),
         (replace(BROKK_170, pwm_limit=60), r"pwm_limit: expected 60, got 80"),
         (change_joint(2, a=1.5), r"geometry\[2\]\[0\]: expected 1\.5, got 1\.25"),
+        (change_joint(2, dead_zone_up=0.1), r"dead_zones\[1\]: expected \[0.1, 0.07\], got \[0.07"),
+        (change_joint(2, weight=2.0), r"weights: expected \[1.0, 2.0, 1.0, 1.0\], got \[1.0, 1.0"),
         (change_joint(2, q_dot_down=0.5), r"scale: expected the machine's normalisation, got"),
         (replace(BROKK_170, tool_speed=0.4), r"scale: expected the machine's normalisation, got"),
     ],
