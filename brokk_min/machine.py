@@ -134,9 +134,9 @@ class Machine:
         inside = [j.q_min <= q <= j.q_max for j, q in zip(joints, self.q_start, strict=False)]
         if self.q_start and not (len(self.q_start) == self.n and all(inside)):
             raise ValueError(f"q_start: expected {self.n} angles within ranges, got {self.q_start}")
-        steps = self.dt / self.plant_dt
-        if abs(steps - round(steps)) > 1e-6 or steps < 0.5:
-            raise ValueError(f"plant_dt: expected a part of {self.dt} s, got {self.plant_dt}")
+        k = max(1, np.ceil(self.dt / self.plant_dt - 1e-6))
+        if abs(self.dt / self.plant_dt - k) > 1e-6:
+            raise ValueError(f"plant_dt: expected {self.dt / k}, a part of dt, got {self.plant_dt}")
 
     def __hash__(self) -> int:
         """By name: fast, for what `lru_cache` keeps per machine."""
