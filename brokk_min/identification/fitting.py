@@ -7,7 +7,7 @@ joints are trained at once, each on the recordings in which its joint moves.
 
 import math
 from dataclasses import asdict, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -116,13 +116,14 @@ def train(data: TrainingSet, config: FitConfig, seed: int, estimator: int | None
     torch.set_num_threads(1)  # several wait in vain on busy cores
     generator = Generator().manual_seed(seed)
     weights = initial_weights(len(data.windows), config, generator)
-    optimizer: torch.optim.Optimizer = torch.optim.AdamW(
-        weights, lr=config.learning_rate, weight_decay=config.weight_decay
-    )
+    rate, decay = config.learning_rate, config.weight_decay
+    groups: list[dict[str, Any]] = [{"params": weights[:6] + weights[7:8]}]
+    if config.shared:  # latents sum over all inputs: by steps as for one they would saturate
+        slower = rate / math.sqrt(data.input_mean.numel())
+        groups.append({"params": [weights[6], weights[8]], "lr": slower})
+    optimizer: torch.optim.Optimizer = torch.optim.AdamW(groups, rate, weight_decay=decay)
     if config.muon:
-        optimizer = Muon(
-            weights, config.learning_rate, config.weight_decay, config.muon, stacks=True
-        )
+        optimizer = Muon(groups, rate, decay, config.muon, stacks=True)
     multi_step = config.rollout > 1 and all(map(len, data.multi_step_windows))
     switch_step = round(0.65 * config.steps) if multi_step else config.steps
     schedule = torch.optim.lr_scheduler.LambdaLR(

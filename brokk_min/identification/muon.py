@@ -8,10 +8,9 @@ same error, for nets and for policies (docs/deviations.md, D17). Jordan et al., 
 descent under the spectral norm.
 """
 
-from collections.abc import Iterable
-
 import torch
 from torch import Tensor
+from torch.optim.optimizer import ParamsT
 
 MOMENTUM = 0.95
 ITERATIONS = 3  # of Newton-Schulz; Jordan has 5
@@ -28,7 +27,7 @@ class Muon(torch.optim.AdamW):
 
     def __init__(
         self,
-        params: Iterable[Tensor],
+        params: ParamsT,
         lr: float,
         weight_decay: float = 0.0,
         muon: float = 5.0,
