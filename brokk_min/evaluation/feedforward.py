@@ -40,7 +40,8 @@ class StaticMap:
 def static_map(machine: Machine, net: ActuatorNet) -> StaticMap:
     """Velocity at which each driven joint moves steadily, by its net, at each angle and command.
 
-    It moves alone, the others rest: nets that share latents know the pump that joints share.
+    It moves alone, the others rest in the middle of their ranges: nets that share latents know
+    the pump and the weight that joints share.
     It is the fixed point v = net(history that moves at v). A history at rest would not do: nets
     may take its joint for one that stands at its stop.
     """
@@ -57,7 +58,8 @@ def static_map(machine: Machine, net: ActuatorNet) -> StaticMap:
     history = np.zeros((*v.shape, 3, net.history), np.float32)
     history[..., 2, :] = (alone * u)[..., None]
     for _ in range(60):
-        history[..., 0, :] = q[..., None] + v[..., None] * time
+        at = np.where(alone, q, (low + high) / 2)
+        history[..., 0, :] = at[..., None] + v[..., None] * time
         history[..., 1, :] = v[..., None]
         v = alone * (0.5 * v + 0.5 * net.predict(history))
     rising = np.maximum.accumulate(v.sum(axis=-1), axis=-1)

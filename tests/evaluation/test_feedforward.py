@@ -64,3 +64,27 @@ def test_static_map__is_the_fixed_point_of_steady_motion():
         rising = np.maximum.accumulate(speeds, axis=0).T
         np.testing.assert_allclose(steady.velocity[:, angle], rising, atol=1e-5)
         assert (rising[:, -1] - rising[:, 0] > 0.1).all()
+
+
+def test_static_map__has_the_other_joints_at_rest_in_the_middle():
+    """A latent reads q1, and drives q5."""
+    net = obedient_net(BROKK_170)
+    n, inputs = net.input_mean.shape
+    read = np.zeros((n, 2 * inputs, 1), np.float32)
+    read[0, 12] = 0.5  # the newest angle of q1
+    drive = np.zeros((n, 1, net.weights[1].shape[1]), np.float32)
+    drive[3] = 0.3
+    net = replace(net, weights=(*net.weights, read, drive, np.zeros((n, 1), np.float32)))
+    steady = static_map(BROKK_170, net)
+    low, high = BROKK_170.column("q_min"), BROKK_170.column("q_max")
+    middle = ((low + high) / 2)[BROKK_170.driven]
+    for c, u in enumerate(steady.u):
+        v = 0.0
+        history = np.zeros((1, 4, 3, 13), np.float32)
+        history[0, :, 0] = middle[:, None]
+        history[0, 3, 2] = u
+        for _ in range(200):
+            history[0, 3, 0] = steady.q[3, 8] + v * np.arange(-12, 1) / 20
+            history[0, 3, 1] = v
+            v = 0.5 * v + 0.5 * net.predict(history)[0, 3]
+        assert steady.velocity[3, 8, c] == pytest.approx(v, abs=1e-5)
