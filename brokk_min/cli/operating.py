@@ -49,7 +49,7 @@ class Simulate(Command):
 
 @dataclass(kw_only=True)
 class Drive(Command):
-    """Drive a machine on a CAN bus at 20 Hz; not a safety function, see docs/hardware.md."""
+    """Drive a machine on a CAN bus at its rate; not a safety function, see docs/hardware.md."""
 
     policy: Path | None = None  # Policy that `train` wrote.
     interface: str = ""  # python-can's name of the bus: socketcan, udp_multicast, ...

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 from tyro.conf import OmitArgPrefixes, arg
 
 from brokk_min.actuator import ActuatorNet
-from brokk_min.cli.options import Command, checked
+from brokk_min.cli.options import Command, WrongUse, checked
 from brokk_min.env import TaskConfig
 from brokk_min.identification.net_file import load_net
 from brokk_min.learning.episodes import GRADIENT_LEARNER, PAPER_TASK
@@ -84,6 +84,9 @@ class Train(Training):
         from brokk_min.learning.checkpoint import train_policy
 
         machine = self.check({Path(f"{self.out}.csv"): "curve"}, out="policy")
+        checkpoint = Path(f"{self.out}.checkpoint")
+        if self.resume and self.out.exists() and not checkpoint.exists():
+            raise WrongUse(f"--resume: expected {checkpoint}, got none: {self.out} is finished")
         net, task, config = self.prepare(machine)
         start = load_policy(self.start, machine) if self.start else None
         files = (self.out, self.critic, self.resume, self.tensorboard, start)

@@ -9,6 +9,7 @@ Recordings of slow ramps (`collect --excitation ramp`), if a log has any, give t
 there the delay hardly counts, and the curve beyond, such as a pump that starves, does not.
 """
 
+import math
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import product
@@ -102,9 +103,9 @@ def inspect_joint(log: Log, recordings: list[Recording], j: int) -> JointReport:
 
 
 def is_ramp(u: Array, rate: float) -> bool:
-    """Whether commands (T,) change slowly, from 0 on or to 0: no step, no constant command."""
+    """Whether commands (T,) change slowly, from 0 on or to 0: no step, no constant one."""
     second = round(rate)
-    if len(u) < second or np.abs(u).min() > COMMANDED:
+    if len(u) < second or np.ptp(u) < COMMANDED or np.abs(u).min() > COMMANDED:
         return False
     return bool(np.ptp(sliding_window_view(u, second), axis=-1).max() < SLOW)
 
@@ -127,6 +128,8 @@ def fit_model(
     recordings: list[Recording], j: int, rate: float, zones: list[float] | None = None
 ) -> dict[str, Any]:
     """Fields of the model: the best of a grid, then of the dead zones unless they are given."""
+    length = sum(len(one.u) for one in recordings)
+    recordings = recordings[:: math.ceil(length / SAMPLES)]  # of all parts of a long log
     u = np.concatenate([one.u[:, j] for one in recordings])[:SAMPLES]
     q = np.concatenate([one.q[:, j] for one in recordings])[:SAMPLES]
     velocity = np.diff(q, append=q[-1]) * rate

@@ -46,6 +46,14 @@ def test_train__writes_policy_and_curve(folder):
     assert training["settings"]["critic"] is False
 
 
+def test_train__does_not_go_on_from_a_finished_training(folder, capsys):
+    policy = folder / "policy.npz"
+    before = policy.read_bytes()
+    assert run(f"train --actuator '{folder}/net.npz' --resume {SMALL} --out", policy) == 2
+    assert "policy.npz.checkpoint, got none: " in capsys.readouterr().err
+    assert policy.read_bytes() == before
+
+
 @pytest.mark.parametrize("option", ["--critic", "--paper"])
 def test_train__can_use_a_critic(option, folder, tmp_path):
     out = tmp_path / "p.npz"

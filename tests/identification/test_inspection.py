@@ -116,6 +116,9 @@ def test_inspect__takes_dead_zones_from_slow_ramps_where_the_pump_bends_the_curv
     assert max(np.abs(np.subtract(zones(usual), TRUE["boom"][:2]))) > 0.04
     slow = starved("boom", ramps(0.3))
     assert zones(usual, slow) == zones(slow) == pytest.approx(TRUE["boom"][:2], abs=0.01)
+    still = starved("boom", 0 * ramps(0.3))  # another joint moved, and shook this one
+    shaken = still._replace(q=still.q + 0.06 * np.sin(np.arange(len(still.q)) / 9)[:, None])
+    assert zones(usual, slow, shaken) == zones(slow)
     within = starved("boom", ramps(0.1))  # nothing moved
     assert zones(usual, within) == zones(usual)
     upwards = starved("boom", np.maximum(ramps(0.3), -0.05))  # down within the dead zone
