@@ -134,7 +134,7 @@ class Machine:
         inside = [j.q_min <= q <= j.q_max for j, q in zip(joints, self.q_start, strict=False)]
         if self.q_start and not (len(self.q_start) == self.n and all(inside)):
             raise ValueError(f"q_start: expected {self.n} angles within ranges, got {self.q_start}")
-        k = max(1, np.ceil(self.dt / self.plant_dt - 1e-6))
+        k = max(1, np.ceil(self.dt / self.plant_dt - 1e-6))  # Euler steps a tick
         if abs(self.dt / self.plant_dt - k) > 1e-6:
             raise ValueError(f"plant_dt: expected {self.dt / k}, a part of dt, got {self.plant_dt}")
 

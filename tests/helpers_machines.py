@@ -98,11 +98,15 @@ def obedient_velocity(machine, u):
 
 def shared_net(latents=2, rows=3):
     """`random_net` whose joints share latents."""
-    net, rng = random_net(rows=rows), np.random.default_rng(1)
+    return with_latents(random_net(rows=rows), np.random.default_rng(1), latents)
+
+
+def with_latents(net, rng, latents=2, size=0.1):
+    """The nets with random latents that they share."""
     n, inputs = net.input_mean.shape
-    shapes = (n, 2 * inputs, latents), (n, latents, 32), (n, latents)
-    more = tuple(0.1 * rng.standard_normal(shape).astype(np.float32) for shape in shapes)
-    return replace(net, weights=net.weights + more)
+    shapes = (n, 2 * inputs, latents), (n, latents, net.weights[1].shape[1]), (n, latents)
+    more = tuple(size * rng.standard_normal(shape).astype(np.float32) for shape in shapes)
+    return replace(net, weights=(*net.weights, *more))
 
 
 def constant_net(velocity, logged, joints):

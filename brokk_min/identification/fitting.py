@@ -118,8 +118,8 @@ def train(data: TrainingSet, config: FitConfig, seed: int, estimator: int | None
     weights = initial_weights(len(data.windows), config, generator)
     rate, decay = config.learning_rate, config.weight_decay
     groups: list[dict[str, Any]] = [{"params": weights[:6] + weights[7:8]}]
-    if config.shared:  # latents sum over all inputs: by steps as for one they would saturate
-        slower = rate / math.sqrt(data.input_mean.numel())
+    if config.shared:  # a latent sums over all inputs: with steps as of the others it saturates
+        slower = rate / math.sqrt(data.input_mean.numel())  # see Yang et al., arXiv 2310.17813
         groups.append({"params": [weights[6], weights[8]], "lr": slower})
     optimizer: torch.optim.Optimizer = torch.optim.AdamW(groups, rate, weight_decay=decay)
     if config.muon:

@@ -128,13 +128,12 @@ def fit_model(
     recordings: list[Recording], j: int, rate: float, zones: list[float] | None = None
 ) -> dict[str, Any]:
     """Fields of the model: the best of a grid, then of the dead zones unless they are given."""
-    length = sum(len(one.u) for one in recordings)
-    recordings = recordings[:: math.ceil(length / SAMPLES)]  # of all parts of a long log
-    u = np.concatenate([one.u[:, j] for one in recordings])[:SAMPLES]
-    q = np.concatenate([one.q[:, j] for one in recordings])[:SAMPLES]
+    share = min(1.0, SAMPLES / sum(len(one.u) for one in recordings))  # of each, of a long log
+    lengths = [math.ceil(share * len(one.u)) for one in recordings]
+    u = np.concatenate([one.u[:k, j] for one, k in zip(recordings, lengths, strict=True)])
+    q = np.concatenate([one.q[:k, j] for one, k in zip(recordings, lengths, strict=True)])
     velocity = np.diff(q, append=q[-1]) * rate
-    seams = np.cumsum([len(one.q) for one in recordings])
-    velocity[seams[seams <= len(q)] - 1] = 0.0  # no velocity from one recording to the next
+    velocity[np.cumsum(lengths) - 1] = 0.0  # no velocity from one recording to the next
     power = max(float(velocity @ velocity), 1e-12)
     models = {sign: best_model(u, velocity, rate, sign, zones) for sign in (1, -1)}
     explained = {sign: 1 - model["error"] / power for sign, model in models.items()}

@@ -80,7 +80,7 @@ class Ticks(NamedTuple):
 
 
 class Derivatives(NamedTuple):
-    """Of one tick, by the history h that the nets read and the latents z that they share."""
+    """Of each tick, by the history h that the nets read and the latents z that they share."""
 
     dr_dq_dot: Array  # (T, num, n_driven)
     dq_dot_dh: Array  # by each joint's own history, (T, num, n_driven, 3, H)

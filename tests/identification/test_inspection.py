@@ -93,6 +93,14 @@ def test_inspect__finds_what_is_true():
         assert report.alone == 1 and report.levels == (8, 8)
 
 
+def test_inspect__takes_a_part_of_each_recording_of_a_long_log():
+    """The first 20,000 samples have commands within the dead zone alone."""
+    within = tuple(record("boom", 0.1 * np.sin(np.arange(4000) / 9)) for _ in range(5))
+    report = inspect(Log(tuple(TRUE), within + excited("boom").recordings))["boom"]
+    assert (report.dead_zone_up, report.dead_zone_down) == pytest.approx((0.12, 0.20), abs=0.02)
+    assert (report.gain_up, report.gain_down) == pytest.approx((0.5, 0.3), rel=0.1)
+
+
 def starved(name, commands):
     """The same with a pump that gives no more flow beyond a command of 0.3."""
     u = np.zeros((len(commands), len(TRUE)))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import strategies
 import torch
-from helpers_machines import obedient_net, small_net
+from helpers_machines import obedient_net, small_net, with_latents
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -53,14 +53,6 @@ def ticks_of(states, commands, done=None):
     return Ticks(*arrays, commands, np.ones((*commands.shape[:-1], 1)), done)
 
 
-def with_latents(net, rng):
-    """The nets with two latents that they share."""
-    n, inputs = net.input_mean.shape
-    shapes = (n, 2 * inputs, 2), (n, 2, net.weights[1].shape[1]), (n, 2)
-    weights = tuple(0.3 * rng.standard_normal(shape) for shape in shapes)
-    return replace(net, weights=(*net.weights, *weights))
-
-
 def moving_case(machine, seed):
     """Nets in double precision, a state in motion and commands, no joint near its limits."""
     rng = np.random.default_rng(seed)
@@ -69,7 +61,7 @@ def moving_case(machine, seed):
     # 3/8 of the range lie before each joint, at least
     fastest = (high - low)[machine.driven] / 3 / ((15 + TICKS) * machine.dt)
     if seed % 3 == 2:  # joints that are not alone
-        net = with_latents(net, rng)
+        net = with_latents(net, rng, size=0.3)
     net = replace(
         net,
         weights=tuple(weight.astype(float) for weight in net.weights),
