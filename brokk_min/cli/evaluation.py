@@ -123,22 +123,24 @@ COLUMNS = {  # of the table: head, format
     "off_axis_drift_max": ("drift [m]", "{:.4f}"),
     "jerk_rms": ("jerk [m/s^3]", "{:.1f}"),
     "valve_travel": ("travel [1]", "{:.0f}"),
+    "time_at_limits": ("at a stop [s]", "{:.1f}"),
 }
 
 
 def print_table(runs: list[dict[str, Any]], sequences: int, keys: Iterable[str]) -> None:
-    """Means of some metrics by controller, over the starts of the first run's kind."""
+    """Means of some metrics by controller, over the starts of the first run's kind; worst error."""
     runs = [run for run in runs if run["kind"] == runs[0]["kind"]]
     num = len({run["start"] for run in runs})
     print(f"means over {sequences} sequences from {num} {runs[0]['kind']} starts")
     columns = {key: COLUMNS.get(key, (key, "{:.4f}")) for key in keys}
-    print(f"{'controller':30}", *(head for head, _ in columns.values()))
+    print(f"{'controller':30}", *(head for head, _ in columns.values()), "worst run [m/s]")
     for name, rows in metrics.summary(runs).items():
         cells = []
         for key, (head, form) in columns.items():
             mean = rows["all"][key]
             cells.append(("none" if mean is None else form.format(mean)).rjust(len(head)))
-        print(f"{name:30}", *cells)
+        errors = [run["velocity_error_mean"] for run in runs if run["controller"] == name]
+        print(f"{name:30}", *cells, f"{max(errors):.4f}".rjust(len("worst run [m/s]")))
 
 
 def print_answer(runs: list[dict[str, Any]]) -> None:

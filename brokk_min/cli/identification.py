@@ -51,7 +51,7 @@ class Collect(Command):
     plant: PlantName = "analytic"  # What moves: the analytic plant, or an object of your file.
 
     def __call__(self) -> None:
-        machine = self.check(out="log")
+        machine = self.check(out="recording")
         if self.out.suffix not in (".csv", ".npz"):
             raise WrongUse(f"--out: expected a name ending in .csv or .npz, got {self.out}")
         if self.policy and self.excitation != "auto":
@@ -119,7 +119,8 @@ class Fit(Command):
         config = self.config(known, history)
         reports = inspection.inspect(log)
         with located(*self.logs):
-            inspection.check_signs(reports)
+            for wrong in inspection.wrong_signs(reports):
+                raise ValueError(wrong)
             net = fit(log, config, self.seed, samples, known.name if known else "")
         with located(*self.test, *self.logs):
             scores = validation.validate(net, log, test, known)
@@ -248,7 +249,8 @@ class Score(Command):
         net = load_net(self.net)
         log = read_log(self.logs, net.velocity_samples, net.joints, net.rate)
         with located(*self.logs):
-            scores: dict[str, Any] = {"joints": validation.score(net, log)}
+            joints = validation.score(net, log)
+        scores: dict[str, Any] = {"joints": joints, "warnings": validation.large_errors(joints)}
         if self.machine and machine.names == net.joints:
             scores["tool"] = validation.tool_errors(machine, net, log)
         if self.json:

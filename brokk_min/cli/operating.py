@@ -144,7 +144,7 @@ class Convert(Command):
     out: Path  # Log to write, .csv or .npz.
 
     def __call__(self) -> None:
-        machine = self.check(out="log")
+        machine = self.check(out="recording")
         with located(self.log):
             log = drive_log.log_for_fit(machine, read_frames(self.log))
         write_log(self.out, log)
@@ -287,10 +287,11 @@ class Replay(Command):
             raise WrongUse(f"LOGS: expected one or two, got {len(self.logs)}")
         arms = sum(len(self.controllers) if log.suffix == ".json" else 1 for log in self.logs)
         width, height = self.size
-        if not arms or not 320 * arms <= width <= 4000 or not 320 <= height <= 4000:
-            expected = f"expected some and {320 * arms} 320 to 4000 4000"
-            got = f"got {arms} and {width} {height}"
-            raise WrongUse(f"--controllers, --size: {expected}, {got}")
+        if not arms:
+            raise WrongUse("--controllers: expected at least one, got none")
+        if not 320 * arms <= width <= 4000 or not 320 <= height <= 4000:
+            expected = f"expected {320 * arms} 320 to 4000 4000 for {arms} arms"
+            raise WrongUse(f"--size: {expected}, got {width} {height}")
         runs: list[replay.Run] = []
         for log, colour in zip(self.logs, drawing.COLOURS.values(), strict=False):
             if log.suffix == ".json":

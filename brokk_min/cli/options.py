@@ -12,7 +12,7 @@ from typing import Annotated, Any, TypeVar
 import tyro
 
 from brokk_min.identification.files import SHIPPED, brief, open_regular, read_json
-from brokk_min.identification.plants import CheckedPlant, Plant
+from brokk_min.identification.plants import CheckedPlant, Plant, check_motion
 from brokk_min.machine import BROKK_170, Machine, check_numbers, number
 
 T = TypeVar("T")
@@ -36,7 +36,7 @@ def checked(make: Callable[..., T], **options: Any) -> T:
 
 # What a file of each kind that commands write holds: columns, arrays, keys, or see `names_in`.
 CONTENTS = {
-    "log": {"run", "time"},
+    "log": {"run", "time"},  # of `reproduce`, which records anew
     "nets": {"header", "input_mean"},
     "policy": {"header", "net_header"},
     "curve": {"global_step"},
@@ -109,8 +109,9 @@ def check_output(path: Path, names: set[str], kind: str, force: bool) -> None:
         raise WrongUse(f"{path}: expected a file in an existing, writable directory")
     if not path.exists() or (path.is_file() and (force or not path.stat().st_size)):
         return
-    if kind == "drive log":
-        raise WrongUse(f"{path}: expected no file, for no drive can be repeated (--force), got one")
+    if kind in ("recording", "drive log"):
+        again = "no drive or recording can be repeated (--force)"
+        raise WrongUse(f"{path}: expected no file, for {again}, got one")
     if not path.is_file() or not names <= names_in(path):
         got = "it has " + brief(sorted(names_in(path))) if path.is_file() else "no regular file"
         expected = f"expected no file, or one of kind {kind} (--force writes over others)"
@@ -166,7 +167,9 @@ def with_plant(machine: Machine, name: str, known: Sequence[str]) -> Machine:
     if name in known:
         return machine
     own = find_object("--plant", name, dict.fromkeys(known), Plant, "an object with reset and step")
-    return replace(machine, plant=CheckedPlant(name.rpartition(":")[2], own))
+    machine = replace(machine, plant=CheckedPlant(name.rpartition(":")[2], own))
+    check_motion(machine)
+    return machine
 
 
 def default_policy(

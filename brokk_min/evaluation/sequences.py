@@ -196,11 +196,10 @@ def goals_and_starts(
 ) -> tuple[list[Commands], Array]:
     """Velocity sequences and start poses of files, or the machine's own where there is no file."""
     own = task_sequences(machine)
+    goals = read_commands(commands, machine) if commands else own
     if starts:
-        poses = read_starts(starts, machine)
-    else:
-        poses = evaluation_starts(machine, num, own, seed + 2)
-    return read_commands(commands, machine) if commands else own, poses
+        return goals, read_starts(starts, machine)
+    return goals, evaluation_starts(machine, num, own, seed + 2)
 
 
 def evaluation_starts(

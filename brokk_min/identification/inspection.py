@@ -26,6 +26,10 @@ ZONES = np.arange(0, LARGEST_ZONE, 0.005)
 TAUS = (0.05, 0.1, 0.2, 0.4)  # s, assumed
 LATEST = 0.4  # s, assumed: longest delay
 SAMPLES = 20_000  # of a joint that are used
+NEAR_LIMIT = 0.15  # of the command limit, assumed: commands of so much less or more are at it,
+HELD = 0.5  # s, assumed: after so long a joint has its speed
+FASTEST = 0.95  # quantile of the speeds at the command limit, assumed
+LEAST_HELD = 20  # samples at the command limit, assumed: else the model gives the fastest motion
 MOVED = 0.2  # of the usual gain, assumed: a ramp with less ended within the dead zone
 SLOW = 0.12  # of full command in a second, assumed: ramps change by less
 LEVELS = 8  # of commands from 0 to the largest, by direction
@@ -46,7 +50,7 @@ CLEAR_SIGN = 0.2  # of the velocities' variance: fast sines fit as well reversed
 class JointReport:
     """One joint of a log; velocities in rad/s, commands of full command."""
 
-    minutes: float  # in recordings in which it is driven
+    minutes: float  # in recordings in which it has commands
     alone: float  # part of its commanded time without commands of other joints
     together: dict[str, float]  # part with commands of each other joint
     low: float  # rad, smallest angle
@@ -89,7 +93,7 @@ def inspect_joint(log: Log, recordings: list[Recording], j: int) -> JointReport:
     levels = [int((count > 0.01 * max(count.sum(), 1)).sum()) for count in counts]
     changes = [np.abs(np.diff(one.u[:, j])) > 0.1 * largest for one in recordings]
     return JointReport(
-        minutes=len(u) / log.rate / 60,
+        minutes=sum(len(r.u) for r in recordings if np.ptp(r.u[:, j]) > COMMANDED) / log.rate / 60,
         alone=float(1 - own[:, others].any(axis=1).mean()) if len(own) else 1.0,
         together={log.joints[i]: float(own[:, i].mean()) if len(own) else 0.0 for i in others},
         low=float(q.min()),
@@ -233,20 +237,21 @@ def _small_changes(recording: Recording, j: int) -> tuple[Array, Array, Array]:
     return own[small], motion[small], change[small, 0]
 
 
-def check_signs(reports: dict[str, JointReport]) -> None:
-    """ValueError: a joint whose angle falls under positive commands."""
-    for name, report in reports.items():
-        if report.sign < 0:
-            expected = f"expected positive commands to raise q_{name}"
-            got = f"got {report.gain_up:.2f} rad/s per full opening: change the sign of one column"
-            raise ValueError(f"u_{name}: {expected}, {got}")
+def wrong_signs(reports: dict[str, JointReport]) -> list[str]:
+    """Joints whose angle falls under positive commands, in words."""
+    expected = "expected positive commands to raise q_{}, got {:.2f} rad/s per full opening"
+    return [
+        f"u_{name}: {expected.format(name, report.gain_up)}: change the sign of one column"
+        for name, report in reports.items()
+        if report.sign < 0
+    ]
 
 
 def warnings(
     log: Log, reports: dict[str, JointReport], machine: Machine | None = None
 ) -> list[str]:
     """Where the log is an operator's work rather than an excitation: its score is of such work."""
-    result = []
+    result = wrong_signs(reports)
     for name in log.joints:
         if name not in reports:
             result.append(f"{name}: never driven in the log")
@@ -283,12 +288,37 @@ def warnings(
     return result
 
 
-def fields(reports: dict[str, JointReport], machine: Machine) -> dict[str, Any]:
+def fastest(log: Log, name: str, report: JointReport, limit: float, side: str) -> float:
+    """Fastest motion [rad/s] of a joint "up" or "down" at the command `limit`.
+
+    It is a high quantile of the velocities after `HELD` at the limit, for single ones have noise;
+    where there are too few of them, what the model gives.
+    """
+    j, sign = log.joints.index(name), 1 if side == "up" else -1
+    held = round(HELD * log.rate) + 1
+    speeds = [np.empty(0)]
+    for recording in log.recordings:
+        if len(recording.u) >= held:
+            commands = sliding_window_view(sign * recording.u[:, j], held)
+            at_limit = (np.abs(commands / limit - 1) < NEAR_LIMIT).all(axis=-1)
+            speeds.append(sign * recording.q_dot[held - 1 :, j][at_limit])
+    found = np.concatenate(speeds)
+    if len(found) >= LEAST_HELD:
+        return float(np.quantile(found, FASTEST))
+    gain, zone = getattr(report, f"gain_{side}"), getattr(report, f"dead_zone_{side}")
+    return float(gain * max(limit - zone, 0))
+
+
+def fields(log: Log, reports: dict[str, JointReport], machine: Machine) -> dict[str, Any]:
     """Fields of a machine by a log of it: dead zones, and fastest motions at the command limit.
 
-    The largest dead zone is 0.05 wider than found: one that is too small stops drives.
+    The largest dead zone is 0.05 wider than found: one that is too small stops drives. Joints that
+    do not obey their commands in the log are left out; an empty result: all of them.
     """
-    known = {name: reports[name] for name in machine.names if name in reports}
+    obeys = [k for k, r in reports.items() if r.explained >= LEAST_EXPLAINED and r.sign >= 0]
+    known = {name: reports[name] for name in machine.names if name in obeys}
+    if not known:
+        return {}
     limit = machine.pwm_limit / PWM_MAX
     zones = [zone for r in known.values() for zone in (r.dead_zone_up, r.dead_zone_down)]
     return {
@@ -296,17 +326,20 @@ def fields(reports: dict[str, JointReport], machine: Machine) -> dict[str, Any]:
         "largest_dead_zone": min(max(zones) + 0.05, 0.99 * limit),
         "dead_zone_up": {k: r.dead_zone_up for k, r in known.items()},
         "dead_zone_down": {k: r.dead_zone_down for k, r in known.items()},
-        "q_dot_up": {k: r.gain_up * max(limit - r.dead_zone_up, 0) for k, r in known.items()},
-        "q_dot_down": {k: r.gain_down * max(limit - r.dead_zone_down, 0) for k, r in known.items()},
+        "q_dot_up": {k: fastest(log, k, r, limit, "up") for k, r in known.items()},
+        "q_dot_down": {k: fastest(log, k, r, limit, "down") for k, r in known.items()},
     }
 
 
 def with_dead_zones(machine: Machine, log: Log) -> Machine:
     """The machine with the dead zones by joint and direction that a log of it shows."""
-    found = fields(inspect(log), machine)
+    found = fields(log, inspect(log), machine)
+    if not found:
+        return machine
+    sides = ("dead_zone_up", "dead_zone_down")
     joints = []
     for joint in machine.joints:
-        zones = {side: found[side][joint.name] for side in ("dead_zone_up", "dead_zone_down")}
+        zones = {side: found[side].get(joint.name, getattr(joint, side)) for side in sides}
         joints.append(replace(joint, **zones))
     common = {key: found[key] for key in ("dead_zone", "largest_dead_zone")}
     return replace(machine, joints=tuple(joints), **common)
@@ -316,7 +349,7 @@ def report_json(log: Log, machine: Machine | None = None) -> dict[str, Any]:
     """All reports of a log, its warnings and its gaps, for JSON."""
     reports = inspect(log)
     gaps = sum("#" in recording.name for recording in log.recordings)
-    known = {"fields": fields(reports, machine)} if machine and reports else {}
+    found = fields(log, reports, machine) if machine else {}
     return {
         "rate": log.rate,
         "recordings": len(log.recordings),
@@ -324,5 +357,5 @@ def report_json(log: Log, machine: Machine | None = None) -> dict[str, Any]:
         "velocity_logged": log.velocity_logged,
         "joints": {name: asdict(report) for name, report in reports.items()},
         "warnings": warnings(log, reports, machine),
-        **known,
+        **({"fields": found} if found else {}),
     }

@@ -138,8 +138,12 @@ UNWRITABLE = "brokk-min: no/x.csv: expected a file in an existing, writable dire
         ("play --drive --interface nonsense --channel 0 --log a.log", 1, "nonsense 0: expected a"),
         (f"play --machine '{MINI}' --start 9 9 9 9", 1, "start: expected 4 angles"),
         ("replay a.log b.log c.log", 2, "LOGS: expected one or two, got 3"),
-        ("replay a.log b.log --size 639 540", 2, "expected some and 640 320 to 4000 4000, got 2 "),
-        ("replay a.json --controllers rl --size 4001 540", 2, "got 1 and 4001 540"),
+        (
+            "replay a.log b.log --size 639 540",
+            2,
+            "expected 640 320 to 4000 4000 for 2 arms, got 639 ",
+        ),
+        ("replay a.json --controllers rl --size 4001 540", 2, "for 1 arms, got 4001 540"),
         *((f"{line} no/x.csv", 2, UNWRITABLE) for line in OUTPUTS),
     ],
 )

@@ -85,9 +85,10 @@ def test_check__writes_over_no_input_and_over_no_other_kind(tmp_path):
         Convert(machine=f"{module}:MINE", out=module, force=True).check(out="log")
     drive = tmp_path / "drive.log"
     drive.write_text("(1.5) can0 181#00\n")
-    with pytest.raises(
-        WrongUse, match=r"drive\.log: expected no file, for no drive can be repeated"
-    ):
+    wanted = r": expected no file, for no drive or recording can be repeated"
+    with pytest.raises(WrongUse, match=f"log.csv{wanted}"):
+        Convert(out=log).check(out="recording")
+    with pytest.raises(WrongUse, match=f"drive.log{wanted}"):
         Convert(out=drive).check(out="drive log")
     Convert(out=drive, force=True).check(out="drive log")
 

@@ -12,13 +12,13 @@ from helpers_cli import run
 from brokk_min.identification.inspection import (
     CLOSED_LOOP,
     REACTS,
-    check_signs,
     feedback,
     fields,
     inspect,
     is_ramp,
     reaction,
     warnings,
+    wrong_signs,
 )
 from brokk_min.identification.logs import Log, Recording, velocity_of, write_log
 from brokk_min.machine import BROKK_170
@@ -159,23 +159,25 @@ def test_inspect__tells_which_joints_are_driven_together():
     rng = np.random.default_rng(1)
     boom, arm = (record(name, holds(rng, 400)) for name in TRUE)
     both = Recording("both", boom.u + arm.u, boom.q + arm.q, boom.q_dot + arm.q_dot)
-    report = inspect(Log(tuple(TRUE), (both, boom)))["boom"]
+    reports = inspect(Log(tuple(TRUE), (both, boom)))
+    report = reports["boom"]
+    assert (report.minutes, reports["arm"].minutes) == pytest.approx((2 / 3, 1 / 3))
+    pushed = boom._replace(q=boom.q + arm.q, q_dot=boom.q_dot + arm.q_dot)  # without a command
+    assert inspect(Log(tuple(TRUE), (both, pushed)))["arm"].minutes == pytest.approx(1 / 3)
     assert report.alone == pytest.approx(0.5, abs=0.05)
     assert report.together["arm"] == pytest.approx(0.5, abs=0.05)
 
 
-def test_check_signs__refuses_a_reversed_command():
-    reports = inspected()
-    check_signs({"boom": reports["boom"]})
-    with pytest.raises(ValueError, match=r"^u_arm: expected positive commands to raise q_arm, got"):
-        check_signs(reports)
+def test_wrong_signs__names_a_reversed_command_and_warnings_too():
+    (wrong,) = wrong_signs(inspected())
+    assert wrong.startswith("u_arm: expected positive commands to raise q_arm, got -0.")
+    assert wrong in warnings(excited(), inspected())
 
 
-def test_check_signs__lets_a_fast_sine_pass_that_fits_as_well_reversed_and_later():
+def test_wrong_signs__lets_a_fast_sine_pass_that_fits_as_well_reversed_and_later():
     sine = 0.5 * np.sin(2 * np.pi * 2.5 * np.arange(600) / 20)
     reports = inspect(Log(tuple(TRUE), (record("boom", sine), record("arm", sine))))
-    check_signs(reports)
-    assert reports["boom"].sign >= 0
+    assert not wrong_signs(reports) and reports["boom"].sign >= 0
 
 
 def test_warnings__know_an_operators_work_from_an_excitation():
@@ -237,10 +239,23 @@ def test_fields__are_those_of_the_machine():
     """A gain of 0.5 from a dead zone of 0.12 on: 0.5 * (80 / 127 - 0.12) rad/s at the limit."""
     report = replace(inspected("boom")["boom"], dead_zone_up=0.12, dead_zone_down=0.2)
     report = replace(report, gain_up=0.5, gain_down=0.3)
-    found = fields({"q1": report, "q3": replace(report, dead_zone_up=0.05)}, BROKK_170)
+    reports = {"q1": report, "q3": replace(report, dead_zone_up=0.05)}
+    reports["q4"] = replace(report, dead_zone_up=0.01, sign=-1)  # left out
+    reports["q5"] = replace(report, dead_zone_up=0.01, explained=0.05)  # left out
+    names = ("q1", "q3", "q4", "q5")
+    holds = [np.full(400, 80 / 127), np.full(400, 0.9)]  # at the limit, beyond it
+    rest = np.zeros((400, 4))
+    moving = np.tile(np.repeat([0.2, 0.3, 0.9], [185, 25, 190])[:, None], 4)
+    log = Log(names, tuple(Recording("", rest + u[:, None], rest, moving) for u in holds))
+    assert fields(log, {"q4": reports["q4"]}, BROKK_170) == {}
+    found = fields(log._replace(recordings=log.recordings[1:]), reports, BROKK_170)
     assert (found["dead_zone"], found["largest_dead_zone"]) == (0.05, 0.25)
     assert (found["dead_zone_up"], found["dead_zone_down"]["q3"]) == ({"q1": 0.12, "q3": 0.05}, 0.2)
     assert found["q_dot_up"]["q1"] == pytest.approx(0.255, abs=1e-3)
+    assert found["q_dot_down"]["q1"] == pytest.approx(0.129, abs=1e-3)
+    short = Recording("", rest[:210] + 80 / 127, rest[:210], moving[:210])  # 210 of 400 ticks
+    found = fields(log._replace(recordings=(short, log.recordings[1])), reports, BROKK_170)
+    assert found["q_dot_up"] == {"q1": 0.3, "q3": 0.3}  # held for half a second: 25 of 200 ticks
     assert found["q_dot_down"]["q1"] == pytest.approx(0.129, abs=1e-3)
 
 
@@ -272,6 +287,7 @@ def test_score__scores_nets_on_other_logs_and_fit_has_a_learning_curve(tmp_path,
     printed = capsys.readouterr().out
     assert printed.count("fitted to ") == 4 and "minutes" in printed
     assert run(f"score '{tmp_path}/n.npz' '{tmp_path}/test.npz' --json '{tmp_path}/s.json'") == 0
+    assert "warnings for boom:\n  free runs of 10 s are off by " in capsys.readouterr().out
     assert (tmp_path / "n.png").read_bytes().startswith(b"\x89PNG")
     again = json.loads((tmp_path / "s.json").read_text())
     for key in ("one_step_rmse", "persistence_rmse", "free_run"):

@@ -10,7 +10,7 @@ from helpers_cli import MINI, run
 
 from brokk_min import BROKK_170
 from brokk_min.actuator import plant_reset, plant_step
-from brokk_min.identification.plants import CheckedPlant, Plant
+from brokk_min.identification.plants import CheckedPlant, Plant, check_motion
 
 OWN = Path(__file__).parents[2] / "examples" / "own_plant.py"
 
@@ -47,6 +47,29 @@ def test_checked_plant__refuses_angles_changed_in_place():
     state = plant.reset(BROKK_170, np.ones((2, 5)))
     with pytest.raises(ValueError, match=r"^OWN.step: expected a new array q, got the old one"):
         plant.step(BROKK_170, state, np.full((2, 5), 0.5))
+
+
+@pytest.mark.parametrize(
+    ("unit", "speed", "wanted"),
+    [
+        (57.3, 0.2, r"OWN.reset: expected angles 0.700 .rad or m. as given, got 40.110"),
+        (1.0, 0.0, "q1: expected motion under the largest command, got .0.000 and .0.000"),
+        (1.0, -0.2, "q1: expected positive commands to raise q_q1, got -0.252 and .0.252"),
+        (1.0, 11.5, "q1: expected angles within its range, got .14.* and -14.*degrees"),
+    ],
+)
+def test_check_motion__refuses_degrees_a_wrong_sign_and_no_motion(unit, speed, wanted):
+    class Wrong(Obedient):
+        def reset(self, machine, q):
+            return super().reset(machine, unit * q)
+
+        def step(self, machine, state, u):
+            return super().step(machine, state, speed / 0.2 * u)
+
+    machine = replace(BROKK_170, plant=CheckedPlant("OWN", Wrong()))
+    with pytest.raises(ValueError, match=wanted):
+        check_motion(machine)
+    check_motion(replace(BROKK_170, plant=CheckedPlant("OWN", Obedient())))
 
 
 @pytest.mark.parametrize(
