@@ -41,7 +41,7 @@ from brokk_min.ppo import PPOConfig
 M = BROKK_170
 LOW = M.column("q_min")
 HIGH = M.column("q_max")
-STEPS = 2_000_000  # of each training here, a third of the default
+STEPS = 2_000_000  # of each training here
 Figures = dict[str, float]
 
 
@@ -354,10 +354,11 @@ def quiet() -> Figures:
     controllers: dict[str, Any] = {**policy.policy_controllers(M, files)}
     net = files["rl"].net
     effort = baselines.TUNING_RUNS, baselines.GENERATIONS, 0
+    names = ("jacobian_pid_k0.1", *baselines.WITH_INTEGRAL)
     gains = baselines.read_gains(shipped / "gains.json", M, net)
-    for name in ("jacobian_pid_k0.1", *baselines.WITH_INTEGRAL):
+    tuned, _ = baselines.tune_baselines(M, net, *effort, config, only=names)
+    for name in names:
         controllers[name] = gains[name]
-        tuned, _ = baselines.tune_baselines(M, net, *effort, config, only=name)
         controllers[f"{name}, tuned so"] = tuned[name]
     starts = sequences.workspace_starts(M, 64)
     axes = sequences.axis_sequences(M)

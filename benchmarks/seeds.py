@@ -106,6 +106,7 @@ def score(options: Options) -> list[dict[str, Any]]:
         axes = [run for run in runs if run["sequence"] in sequences.AXES]
         row = {key: mean(runs, figure) for key, figure in FIGURES.items()}
         row["error_xyz"] = mean(axes, "velocity_error_mean")
+        row["drift_xyz"] = mean(axes, "off_axis_drift_max")
         rows.append({"controller": NAMES.get(name, name), "seed": seed} | row)
     return rows
 

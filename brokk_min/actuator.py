@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brokk_min.kinematics import estimate_velocity
-from brokk_min.machine import Array, Machine, limit_command, valve_command, valve_opening
+from brokk_min.machine import Array, Machine, as_floats, limit_command, valve_command, valve_opening
 
 REST_AFTER = {"closed": 0.5, "dither": 0.1, "open": math.inf}  # s of a zero goal, assumed, tuned
 STANDSTILL = 0.002  # rad or m, assumed: little more than one step of a 12-bit encoder
@@ -115,7 +115,7 @@ def initial_history(q: ArrayLike, samples: int) -> Array:
                [0., 0., 0.],
                [0., 0., 0.]])
     """
-    q = np.asarray(q)
+    q = as_floats(q)
     history = np.zeros((*q.shape, 3, samples), q.dtype)
     history[..., 0, :] = q[..., None]
     return history

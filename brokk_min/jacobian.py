@@ -34,7 +34,7 @@ def dls(J: ArrayLike, W: ArrayLike, damping: ArrayLike, as_printed: bool = False
         damping: lambda^2 [m^2], (...); above 0 where J W^-1 J^T is singular.
         as_printed: use the paper's printed form.
     """
-    J = np.asarray(J)
+    J = 1.0 * np.asarray(J)  # floats, even of whole numbers
     W = np.asarray(W, J.dtype)
     inner = W if as_printed else 1 / W
     A = np.einsum("...ik,...jk->...ij", J * inner[..., None, :], J)  # J W^-1 J^T

@@ -192,10 +192,11 @@ def active_fault(
     faults[..., Fault.ERROR, 0] = inputs.error
     faults[..., Fault.FLOODED, 0] = inputs.flooded
     faults[..., Fault.OTHER_SENDER, 0] = inputs.other_sender
-    faults[..., Fault.LATE, 0] = np.abs(now - state.time - machine.dt) > machine.dt / 2
+    faults[..., Fault.LATE, 0] = ~(np.abs(now - state.time - machine.dt) <= machine.dt / 2)
     faults[..., Fault.OPERATOR_LOST, 0] = ~inputs.alive
     faults[..., Fault.NEVER_SEEN, :] = np.isneginf(inputs.heartbeat)
-    faults[..., Fault.HEARTBEAT_LOST, :] = now[..., None] - inputs.heartbeat > HEARTBEAT_TIMEOUT
+    age = now[..., None] - inputs.heartbeat  # below 0: nan and what is to come count as lost
+    faults[..., Fault.HEARTBEAT_LOST, :] = ~((age >= -machine.dt) & (age <= HEARTBEAT_TIMEOUT))
     faults[..., Fault.NOT_OPERATIONAL, :] = inputs.nmt != OPERATIONAL
     faults[..., Fault.SILENT, :n] = inputs.frames < 1
     faults[..., Fault.MALFORMED, :n] = inputs.frames > 1

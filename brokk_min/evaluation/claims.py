@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from brokk_min.env import integrate_error
 from brokk_min.evaluation.baselines import PAPER_BASELINES, WITH_FEEDFORWARD
 from brokk_min.evaluation.metrics import (
     TRANSIENT,
@@ -192,7 +193,7 @@ def direction_claim(
     `trace` has the runs of one sequence with these `goals` [m/s] (T, num, 3).
     """
     q_dot = trace.q_dot[..., machine.driven]
-    desired = controller.desired_velocities(goals, trace.v_tool, trace.q, q_dot)
+    desired = desired_velocities(machine, controller, trace, goals)
     numbers: dict[str, Mean] = {}
     verdicts = []
     for i, joint in enumerate(machine.driven):
@@ -203,6 +204,25 @@ def direction_claim(
         verdicts.append(_differ(up, down))
     measured = [verdict for verdict in verdicts if verdict is not None]
     return Claim("direction", numbers, any(measured) if measured else None)
+
+
+def desired_velocities(
+    machine: Machine, controller: JacobianController, trace: Trace, goals: Array
+) -> Array:
+    """What the PID wanted of the driven joints in each tick [rad/s], (T, num, n_driven).
+
+    Tick by tick as `JacobianController` does, from the encoders' angles and the true velocity of
+    the tool at the end of the tick before.
+    """
+    last = np.zeros_like(trace.q_dot[0][..., machine.driven])
+    v_tool, integral = np.zeros_like(trace.v_tool[0]), np.zeros_like(trace.v_tool[0])
+    result = []
+    for t, goal in enumerate(goals):
+        last = controller.desired_velocities(goal, v_tool, trace.q_measured[t], last, integral)
+        result.append(last)
+        v_tool = trace.v_tool[t]
+        integral = integrate_error(machine, goal, v_tool, integral)
+    return np.array(result)
 
 
 def _relative_error(q_dot: Array, desired: Array) -> Array:

@@ -109,11 +109,11 @@ def tuning_set(chain: Chain) -> tuple[Array, Array]:
     return sequences.tuning_set(chain.machine, chain.budget.tuning_runs, chain.seed, seconds)
 
 
-def tune(chain: Chain, net: ActuatorNet, name: str = "") -> Any:
-    """The baseline `name`, or all, tuned as by `tune_baselines`."""
+def tune(chain: Chain, net: ActuatorNet, names: Sequence[str] = baselines.TUNED) -> Any:
+    """Baselines, tuned as by `tune_baselines`."""
     budget = chain.budget
     effort = budget.tuning_runs, budget.generations, chain.seed
-    limits: dict[str, Any] = {"longest": budget.short_s, "only": name}
+    limits: dict[str, Any] = {"longest": budget.short_s, "only": names}
     nets = select_nets(chain.machine, net)
     return baselines.tune_baselines(chain.machine, nets, *effort, **limits)
 
@@ -131,9 +131,9 @@ def learn(
     }
     needs = {"train rl_paper": ["fit net_paper"], "fit net": ["first round"]}
     needs["train rl"] = ["fit net", "first round"]
-    for name in baselines.TUNED:
-        jobs[f"tune {name}"] = partial(tune, chain, name=name)
-        needs[f"tune {name}"] = ["fit net"]
+    for group in baselines.GROUPS:
+        jobs[f"tune {group[0]}"] = partial(tune, chain, names=group)
+        needs[f"tune {group[0]}"] = ["fit net"]
     return dict(zip(jobs, side_by_side(jobs, clock, needs), strict=True))
 
 

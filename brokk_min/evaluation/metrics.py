@@ -167,9 +167,14 @@ def evaluate(
     `starts` are angles [rad] (starts, n); all starts and all sequences of one length are a batch.
     `net` has the nets of the driven joints (None: the analytic plant), `sensor` makes the encoders
     of each rollout, `config` has the noise. Returns one row per controller, sequence and start,
-    see `metrics`; and traces.
+    see `metrics`; and traces. ValueError: two sequences of one name, a start out of range.
     """
     num = len(starts)
+    names = [sequence.name for sequence in sequences]
+    if len(set(names)) < len(names):
+        raise ValueError(f"sequences: expected each name once, got {names}")
+    if not ((starts >= machine.column("q_min")) & (starts <= machine.column("q_max"))).all():
+        raise ValueError("starts: expected angles within the joints' ranges, got others")
     config = config or TaskConfig()
     kinds = start_kinds(machine, starts)
     traces: dict[tuple[str, str], Trace] = {}

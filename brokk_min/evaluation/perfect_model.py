@@ -24,6 +24,7 @@ STEPS = (1.0, 0.5, 0.2)  # fractions of a Gauss-Newton step that are tried (assu
 PROBE = 0.03  # valve opening of the finite differences (assumed)
 SOFT = 0.01  # m/s: smaller errors weigh as squares, larger ones by their size (assumed)
 ROUNDING = 5  # ticks over which roundings to whole counts are compared (assumed)
+ELSEWHERE = 0.2  # rad or m: more than noise of the measured angles
 
 
 class Plan(NamedTuple):
@@ -59,7 +60,10 @@ class PerfectModel:
         return Plan(plant_reset(self.machine, q), closed, 0, np.zeros(num, np.int64))
 
     def __call__(self, measured: Measured, plan: Plan) -> tuple[Array, Plan]:
-        """Commands u (num, n), and the plan for the next tick."""
+        """Commands u (num, n), and the plan; ValueError: the machine begins at another pose."""
+        off = np.abs(measured.q - plan.plant.q)[..., self.machine.driven].max()
+        if plan.tick == 0 and off > ELSEWHERE:
+            raise ValueError(f"poses: expected those that the machines start at, {off:.2f} rad off")
         goal = measured.v_goal.astype(float)
         shifted = np.concatenate([plan.opening[:, 1:], plan.opening[:, -1:]], axis=1)
         opening = self.improve(plan.plant, shifted, goal, plan.tick)

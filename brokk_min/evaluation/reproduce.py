@@ -49,7 +49,7 @@ def reproduce(
             by_name = learn(chain, log, paper_log, clock)
             net, paper_net = by_name["fit net"], by_name["fit net_paper"]
             rl, paper = by_name["train rl"], by_name["train rl_paper"]
-            tuned = [by_name[f"tune {name}"] for name in baselines.TUNED]
+            tuned = [by_name[f"tune {group[0]}"] for group in baselines.GROUPS]
             pids, tuning = (dict(ChainMap(*both[::-1])) for both in zip(*tuned, strict=True))
             policies = {"rl": rl, "rl_paper": paper}
             if sweep:

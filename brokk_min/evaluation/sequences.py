@@ -152,8 +152,8 @@ def hold_table(machine: Machine, goals: Array) -> Array:
 def read_commands(path: Path, machine: Machine) -> list[Commands]:
     """Sequences of a CSV `sequence,time,vx,vy,vz` [s, m/s]; values hold until the next row.
 
-    The last row of a sequence marks its end. ValueError: no such table, times that do not rise,
-    less than a tick, or the name "all".
+    The last row of a sequence marks its end. ValueError: no such table, rows less than a tick
+    apart, or the name "all".
     """
     table = read_table(path, COMMANDS)
     velocity = np.stack([table["vx"], table["vy"], table["vz"]], axis=1)
@@ -162,12 +162,12 @@ def read_commands(path: Path, machine: Machine) -> list[Commands]:
         rows = table["sequence"] == name
         time = table["time"][rows] - table["time"][rows][0]
         ticks = round(time[-1] * machine.rate)
-        if len(time) < 2 or not (np.diff(time) > 0).all():
+        if len(time) < 2 or not (np.diff(time) > 0.99 * machine.dt).all():
             got = f"got {files.brief(time.tolist())}"
-            expected = "expected two or more rows with rising time"
+            expected = "expected two or more rows, each a tick or more after the one before"
             raise ValueError(f"{path}: sequence {name}: {expected}, {got}")
-        if not 1 <= ticks <= LONGEST * machine.rate or name == "all":
-            expected = f"expected a tick to {LONGEST:g} s and another name than all"
+        if not ticks <= LONGEST * machine.rate or name == "all":
+            expected = f"expected at most {LONGEST:g} s and another name than all"
             raise ValueError(f"{path}: sequence {name}: {expected}, got {time[-1]:g} s")
         row = np.searchsorted(time, np.arange(ticks) / machine.rate + 1e-6, "right") - 1
         result.append(Commands(str(name), velocity[rows][row]))

@@ -133,12 +133,13 @@ def gravity_torque(
     """Torque [N m], force [N] of prismatic joints (..., n), that holds the arm: > 0 where +q lifts.
 
     tau_i = g sum_k m_k e . (z_{i-1} x (c_k - p_{i-1})), links k = i .. n with their middles c_k and
-    the payload at the tool; e is up, seen from the tilted base. 0 without masses.
+    the payload at the tool; e is up, seen from a base that is turned by `tilt` about its y axis.
+    0 without masses.
     """
     if not link_mass and not payload:
         return np.zeros_like(q)
     frames = forward_kinematics(machine, q)
-    up = np.array([math.sin(tilt), 0.0, math.cos(tilt)])
+    up = np.array([-math.sin(tilt), 0.0, math.cos(tilt)])
     middle = (frames.p[..., :-1, :] + frames.p[..., 1:, :]) / 2
     # sum over the links behind joint i of m (c - p_{i-1})
     links = np.arange(machine.n, 0, -1)[:, None]

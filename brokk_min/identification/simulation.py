@@ -45,7 +45,10 @@ def free_run(
     """Angles [rad] and velocities [rad/s] (ticks, s, n) of nets on their own outputs.
 
     Each run has the recorded commands and begins at one of the samples `starts` (s,).
+    ValueError: one with less than a history before it.
     """
+    if len(starts) and starts.min() < net.history:
+        raise ValueError(f"starts: expected {net.history} or more, got {starts.min()}")
     rows = starts[:, None] + np.arange(1 - net.history, 1)
     history = np.stack([recording.q[rows], recording.q_dot[rows], recording.u[rows - 1]])
     history = history.transpose(1, 3, 0, 2).astype(np.float32)  # (s, n, 3, H)

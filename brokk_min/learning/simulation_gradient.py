@@ -24,7 +24,8 @@ of the window, so its last actions get little credit. None of this is new:
 - SVG (Heess et al., 2015, arXiv 1510.09142): backpropagation through learned dynamics, policy too.
 - Q-Prop (Gu et al., 2017, arXiv 1611.02247): the same Taylor expansion, of a learned critic.
 - SHAC (Xu et al., 2022, arXiv 2204.07137): short windows, a critic's value at their end.
-- GI-PPO (Son et al., 2023, arXiv 2312.08710): PPO with analytic gradients, weighted.
+- GI-PPO (Son et al., 2023, arXiv 2312.08710): the same regression (its alpha policy), along the
+  gradient of GAE's advantage, with a critic; then PPO.
 - RPO (Zhong et al., 2025, arXiv 2508.06214): PPO's clip and its epochs for pathwise gradients.
 
 Simplifications: angles and commands count as exact, not rounded, and actions not as clipped; the

@@ -146,7 +146,7 @@ def plain_fault(machine, s, i, now):
     }
     for node in range(6):
         faults[5, node] = i.heartbeat[node] == -np.inf
-        faults[6, node] = now - i.heartbeat[node] > 0.110
+        faults[6, node] = not -DT <= now - i.heartbeat[node] <= 0.110
         faults[7, node] = i.nmt[node] != 5
     for j, joint in enumerate(machine.joints):
         c, old = int(i.counts[j]), int(s.counts[j])
@@ -233,7 +233,7 @@ class Cases:
             command=self.put(m, 0.01, np.nan, np.inf, -np.inf, 81, -81, 80.5, 1, -1),
             counts=np.where(self.some(0.3, n), near, middle).astype(int),
             frames=self.put(np.ones((num, n), int), 0.01, 0, 2, 3),
-            heartbeat=self.put(heartbeat, 0.01, -0.110, -0.110 - 1e-9, -0.2, -np.inf, 1.0),
+            heartbeat=self.put(heartbeat, 0.01, -0.110, -0.110 - 1e-9, -np.inf, 0.049, 1.0, np.nan),
             nmt=self.put(np.full((num, n + 1), 5), 0.01, 0, 4, 6, 127),
             enable=self.some(0.8),
             centred=self.some(0.7),
@@ -257,7 +257,7 @@ class Cases:
         )
         pushed = np.arange(9, 0, -1) <= rng.choice([0, 7, 8, 9], (num, n, 1))
         sent = np.where(pushed, push, rng.integers(-80, 81, (num, n, 9)))
-        late = (0.5 * DT, 0.5 * DT - 1e-9, 1.5 * DT + 1e-9, 0.074, 0.026, np.inf, -1.0)
+        late = (0.5 * DT, 0.5 * DT - 1e-9, 1.5 * DT + 1e-9, 0.074, 0.026, np.inf, np.nan, -1.0)
         state = GateState(
             driving=self.some(0.6),
             armed_once=self.some(0.5),

@@ -1,14 +1,17 @@
 """Verdicts follow from the numbers: made-up runs for which they are known."""
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 import pytest
 from helpers_machines import obedient_net
 
+from brokk_min.env import TaskConfig
 from brokk_min.evaluation import baselines, claims
 from brokk_min.evaluation.claims import Claim
-from brokk_min.evaluation.rollout import Trace
+from brokk_min.evaluation.rollout import Trace, rollout
+from brokk_min.jacobian import JacobianController
 from brokk_min.machine import BROKK_170
 
 HIGH, LOW = baselines.PAPER_BASELINES  # damping
@@ -152,16 +155,38 @@ def test_direction_claim__compares_both_directions(down, holds):
     trace = trace_of(POSE + 0.02 * np.arange(4)[:, None], goals, np.zeros(5), 40)
     fraction = np.where(goals[..., :1] > 0, 0.9, np.reshape(down, (-1, 1)))
     driven = BROKK_170.driven
-    for _ in range(30):  # weights depend on the direction of motion: find the fixed point
-        q_dot = trace.q_dot[..., driven]
-        desired = pid.desired_velocities(trace.v_tool, trace.v_tool, trace.q, q_dot)
-        trace.q_dot[..., driven] = fraction * desired
+    trace.q_measured[:] = trace.q
+    desired = np.zeros((4, 4))
+    for tick, goal in enumerate(goals):  # weights depend on the direction of motion
+        v_tool = trace.v_tool[tick - 1] if tick else np.zeros((4, 3))
+        desired = pid.desired_velocities(goal, v_tool, trace.q[tick], desired)
+        trace.q_dot[tick][:, driven] = fraction[tick] * desired
     claim = claims.direction_claim(BROKK_170, pid, trace, goals)
     assert claim.holds is holds
     means = {round(n["mean"], 2) for n in claim.numbers.values() if n["mean"] is not None}
     assert means == {0.1, round(1 - float(np.mean(down)), 2)}
     first = Trace(*(array[:, :1] for array in trace))
     assert claims.direction_claim(BROKK_170, pid, first, goals[:, :1]).holds is None
+
+
+def test_desired_velocities__are_what_the_pid_wanted_in_a_drive():
+    wanted = []
+
+    class Watched(JacobianController):
+        def desired_velocities(self, *inputs):
+            wanted.append(super().desired_velocities(*inputs))
+            return wanted[-1]
+
+    net = obedient_net(BROKK_170)
+    pid = baselines.baselines(BROKK_170, net)["jacobian_pid_ff_integral"]
+    pid = Watched(**vars(pid) | {"gains": replace(pid.gains, integral_feedback=np.array([2.0]))})
+    goals = np.repeat([[[0.2, 0.0, 0.0]], [[0.0, 0.1, -0.1]]], 30, axis=0)
+    rng, exact = np.random.default_rng(0), TaskConfig(noise=0.0)
+    trace = rollout(BROKK_170, pid, POSE[None], goals, exact, rng, net)
+    found = claims.desired_velocities(BROKK_170, pid, trace, goals)
+    off = np.abs(found - wanted[: len(goals)])  # the PID has the velocity of the tool as measured
+    late = np.abs(found[1:] - wanted[: len(goals) - 1])
+    assert off.max() < 0.02 < late.max()
 
 
 def test_task_claims__are_in_the_papers_order_and_of_a_stronger_baseline_too():

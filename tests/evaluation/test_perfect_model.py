@@ -103,6 +103,10 @@ def test_perfect_model__leaves_less_error_than_a_pid():
     goals[32:, :, 1] = -0.1
     pid = baselines(BROKK_170, obedient_net(BROKK_170))["jacobian_pid_k0.1"]
     controllers = {**perfect_models(BROKK_170, POSES), "pid": pid}
+    with pytest.raises(ValueError, match=r"^poses: expected those .*, 0\.30 rad off"):
+        elsewhere = POSES - [0, 0, 0.3, 0, 0]
+        model = controllers["perfect_model"]
+        rollout(BROKK_170, model, elsewhere, goals, TaskConfig(), np.random.default_rng(0))
     errors = {}
     for name, controller in controllers.items():
         rng = np.random.default_rng(0)

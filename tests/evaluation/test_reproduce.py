@@ -12,7 +12,7 @@ import pytest
 from helpers_cli import run
 
 from brokk_min.evaluation import baselines, figures, learn, report, reproduce
-from brokk_min.evaluation.baselines import TUNED
+from brokk_min.evaluation.baselines import GROUPS
 from brokk_min.evaluation.claims import VERDICTS
 from brokk_min.evaluation.learn import Budget
 from brokk_min.evaluation.robustness import ROBUST, variations
@@ -80,7 +80,7 @@ def test_reproduce__gives_the_same_bits_twice(folder, tmp_path, monkeypatch, cap
         assert (folder / name).read_bytes() == (tmp_path / name).read_bytes(), name
     clock = json.loads((folder / "timing.json").read_text())
     stages = ["record", "fit net_paper", "first round", "train rl_paper", "fit net", "train rl"]
-    stages += [*(f"tune {name}" for name in TUNED), "learn and tune"]
+    stages += [*(f"tune {group[0]}" for group in GROUPS), "learn and tune"]
     scores = ["changed machines", "perfect_model", "perfect_model_closed"]
     stages += [f"score {name}" for name in scores]
     stages += ["score", "score for the regret", "score near singularities", "evaluate", "draw"]

@@ -142,7 +142,9 @@ def test_read_commands__holds_values_until_the_next_row(tmp_path):
         ("a,1,0,0,0\na,0,0,0,0\n", "sequence a: expected two or more rows"),
         ("a,1,0,0,0\na,1,1,0,0\na,2,0,0,0\n", "a: expected two or more row"),
         ("a,1,0,0,0\n", "sequence a: expected two or more rows"),
-        ("a,1,0,0,0\na,1.01,0,0,0\n", "sequence a: expected a tick to 3600 s"),
+        ("a,1,0,0,0\na,1.01,0,0,0\n", "a tick or more after the one before, got .0.0, 0.01"),
+        ("a,1,0,0,0\na,1.02,1,0,0\na,2,0,0,0\n", "sequence a: expected two or more rows, each a"),
+        ("a,1,0,0,0\na,4000,0,0,0\n", "sequence a: expected at most 3600 s"),
         ("all,1,0,0,0\nall,2,0,0,0\n", "another name than all"),
     ],
 )

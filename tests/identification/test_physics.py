@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hypothesis import given
+from scipy.spatial.transform import Rotation
 from strategies import posed
 
 from brokk_min.actuator import lever_arm, plant_reset, plant_step
@@ -50,10 +51,11 @@ def test_physics__without_effects_is_the_papers_plant_to_the_bit():
 @given(posed())
 def test_gravity_torque__is_the_derivative_of_the_potential_energy(drawn):
     machine, q = drawn
+    e = Rotation.from_euler("y", 0.1).inv().apply([0.0, 0.0, 1.0])  # the rear is lifted
+    assert e[0] < 0  # what is at the front is lower
 
     def energy(q):
         p = forward_kinematics(machine, q).p
-        e = np.array([np.sin(0.1), 0.0, np.cos(0.1)])
         middle = (p[..., 1:, :] + p[..., :-1, :]) / 2
         return physics.G * (20 * (middle @ e).sum(-1) + 7 * p[..., -1, :] @ e)
 
