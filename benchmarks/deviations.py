@@ -37,7 +37,9 @@ from brokk_min.learning.episodes import GRADIENT_LEARNER, PAPER_TASK, draw_pose
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.machine import BROKK_170, PWM_MAX, Array
 from brokk_min.ppo import PPOConfig
+from brokk_min.viewer import tracing
 
+DOCS = Path(__file__).parents[1] / "docs"
 M = BROKK_170
 LOW = M.column("q_min")
 HIGH = M.column("q_max")
@@ -195,6 +197,27 @@ def dither() -> Figures:
     keys += ("off_axis_drift_max", "jerk_rms", "valve_travel", "joint_motion_at_rest")
     means = {name: rows["all"] for name, rows in metrics.summary(runs).items()}
     return {f"{name}, {key}": means[name][key] or 0.0 for name in means for key in keys}
+
+
+def film() -> Figures:
+    """Largest distance [mm] from the rectangle of README's film, least and most of eight runs."""
+    shipped = policy.load_policy(POLICY, M)
+    pids = baselines.read_gains(POLICY.with_name("gains.json"), M, shipped.net)
+    names = ("jacobian_pid_k0.1", "jacobian_pid_ff_integral")
+    controllers = {"rl": policy.PolicyController(M, shipped)} | {n: pids[n] for n in names}
+    (commands,) = sequences.read_commands(DOCS / "rectangle.csv", M)
+    starts = sequences.read_starts(DOCS / "rectangle_start.csv", M)
+    start = kinematics.tool_position(forward_kinematics(M, starts))
+    line = np.concatenate([start, start + np.cumsum(commands.goals, axis=0) * M.dt])
+    result = {}
+    for name, controller in controllers.items():
+        distances = []
+        for seed in range(8):
+            _, traces = metrics.evaluate(M, {name: controller}, [commands], starts, seed)
+            p_tool = traces[name, commands.name].p_tool[:, 0]
+            distances.append(1e3 * tracing.distance(line, p_tool).max())
+        result |= {f"{name}, least": min(distances), f"{name}, most": max(distances)}
+    return result
 
 
 # --- by fitting and training ----------------------------------------------------------------------
@@ -370,7 +393,7 @@ def quiet() -> Figures:
 
 
 MEASURED: tuple[Callable[[], Figures], ...] = (a1, d1, d3, d6, a6, a7, a9, a11)
-MEASURED += (levels, stand, dither)
+MEASURED += (levels, stand, dither, film)
 TRAINED: tuple[Callable[[], Figures], ...] = (d4, a4, d5, d7, d10, d11, d12, d13, d14, a5, quiet)
 
 

@@ -9,6 +9,7 @@ import ast
 import contextlib
 import doctest
 import io
+import json
 import re
 import shlex
 import subprocess
@@ -20,6 +21,7 @@ import pytest
 from gymnasium.spaces import Box
 
 from brokk_min.__main__ import COMMANDS, main
+from brokk_min.identification.files import SHIPPED
 from brokk_min.learning.gym_env import TaskVectorEnv
 
 ROOT = Path(__file__).parents[2]
@@ -43,6 +45,30 @@ def test_readme__lists_the_files_of_the_method_with_their_lines() -> None:
 def test_readme__lists_the_wings() -> None:
     wings = {path.parent.name for path in (ROOT / "brokk_min").glob("*/__init__.py")}
     assert set(re.findall(r"^- `(\w+)/`: ", README.read_text(), re.M)) == wings
+
+
+SCORED = {  # rows of the README's table: controller of seeds.json
+    "the paper's learner, on its nets | open": "paper",
+    "ours | closed": "ours closed",
+    "PID (the paper's), k = 0.1 and 0.05 | closed": "jacobian_pid_k0.1",
+    "PID, feed-forward, integral, starts | closed": "jacobian_pid_ff_integral",
+    "ours, the same policy | dither": "ours dither",
+    "PID, feed-forward, integral, starts | dither": "jacobian_pid_ff_integral_dither",
+}
+
+
+@pytest.mark.parametrize("row", SCORED)
+def test_readme__has_the_figures_of_ten_seeds(row: str) -> None:
+    rows = json.loads((SHIPPED / "brokk170" / "seeds.json").read_text())
+    found = [one for one in rows if one["controller"] == SCORED[row]]
+    cells = []
+    for key in ("error_xyz", "error"):
+        values = np.array([one[key] for one in found])
+        spread = f" ({np.ptp(values):.4f})" if len(values) > 1 else ""
+        cells.append(f"{values.mean():.4f}{spread}")
+    for key, digits in {"drift": 3, "jerk": 1, "valve_travel": 0}.items():
+        cells.append(f"{np.mean([one[key] for one in found]):.{digits}f}")
+    assert f"| {row} | {' | '.join(cells)} |\n" in README.read_text()
 
 
 def test_readme__is_short() -> None:
