@@ -46,10 +46,10 @@ def run_of(ticks, path=NO_POINTS):
 class Operator:
     """Presses keys of an `InputHandler` through pygame's queue; its clock stands at `now`."""
 
-    def __init__(self, modes=MODES):
+    def __init__(self, modes=MODES, machine=BROKK_170):
         pygame.display.set_mode((10, 10))
         pygame.event.clear()
-        self.handler = InputHandler(BROKK_170, pygame, modes)
+        self.handler = InputHandler(machine, pygame, modes)
         self.handler.time = self.now = 0.0
         self.look()
 

@@ -40,9 +40,12 @@ def name_of(path: Path) -> str:
 def imports(path: Path) -> set[str]:
     """Modules of the package that a module imports, without `TYPE_CHECKING` blocks."""
     found = set()
-    for node in ast.walk(TREES[path]):
-        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
-            node.body = []
+    nodes = list(ast.walk(TREES[path]))
+    types = [n for n in nodes if isinstance(n, ast.If) and "TYPE_CHECKING" in ast.dump(n.test)]
+    for_types = {id(inner) for node in types for inner in ast.walk(node)}
+    for node in nodes:
+        if id(node) in for_types:
+            continue
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:

@@ -30,7 +30,6 @@ class Bus:
     sleep: Callable[[float], object] = time.sleep
 
     def __post_init__(self) -> None:
-        """Begin with nothing sent and nothing to log."""
         self.start = time.time() - self.clock()  # the log has the time of day, but it may be set
         self.echoes: deque[tuple[int, bytes]] = deque(maxlen=64 if self.echo else 0)
         self.unwritten: deque[Any] = deque()  # messages for the log

@@ -130,11 +130,12 @@ def log_for_fit(machine: Machine, frames: Iterable[Frame]) -> Log:
     """
     recordings: list[list[tuple[Array, Array]]] = []
     last = -np.inf
-    for start, u, q in _driven_ticks(machine, frames):
-        if not 0.5 < (start - last) * machine.rate < 1.5:
-            recordings.append([])
-        recordings[-1].append((u, q))
-        last = start
+    for tick in read_telemetry(machine, frames):
+        if tick.driving and np.isfinite(tick.q).all():
+            if not 0.5 < (tick.time - last) * machine.rate < 1.5:
+                recordings.append([])
+            recordings[-1].append((tick.u, tick.q))
+            last = tick.time
     named = []
     for number, recording in enumerate(recordings):
         commands, angles = map(np.array, zip(*recording))
@@ -145,21 +146,6 @@ def log_for_fit(machine: Machine, frames: Iterable[Frame]) -> Log:
             f"log: expected more than {machine.history + 1} ticks of driving in a row, got none"
         )
     return machine_log(machine, named)
-
-
-def _driven_ticks(
-    machine: Machine, frames: Iterable[Frame]
-) -> Iterator[tuple[float, Array, Array]]:
-    """Start [s], commands u (n,) and angles [rad] (n,) of ticks with all positions."""
-    nodes, valves = Nodes(machine), canopen.ValveFrames(machine)
-    start = 0.0
-    for frame in frames:
-        nodes.update(frame)
-        if frame.id == canopen.SYNC:
-            nodes.start_tick()
-            start = frame.time
-        elif valves.update(frame) and valves.enable.all() and (nodes.frames == 1).all():
-            yield start, valves.u.copy(), nodes.counts() * machine.encoder_step
 
 
 class Telemetry(NamedTuple):

@@ -230,12 +230,10 @@ def simulate(
         print("run", "time", *names, "valid", sep=",", file=file)
 
         def write(now: float, u: Array, q: Array, valid: float) -> None:
-            """One row of `record`."""
             numbers = [*(f"{x:.7g}" for x in (*u, *q)), f"{valid - start:.6f}"]
             print("plant", f"{now - start:.3f}", *numbers, sep=",", file=file)
 
         def report(reason: str) -> None:
-            """Print when and why the valve controller stops."""
             print(f"{bus.now() - start:.3f} s, valve controller stops: {reason}", flush=True)
 
         serve(SimulatedMachine(machine, pose, start, write, report), bus, lambda: not signals)

@@ -247,11 +247,14 @@ class Score(Command):
         self.figure = self.figure or self.net.with_suffix(".png")
         machine = self.check(json="scores", figure="picture")
         net = load_net(self.net)
+        if self.machine and machine.names != net.joints:
+            expected = f"expected those of --machine {self.machine}"
+            raise ValueError(f"{self.net}: joints: {expected}, got {brief(net.joints)}")
         log = read_log(self.logs, net.velocity_samples, net.joints, net.rate)
         with located(*self.logs):
             joints = validation.score(net, log)
         scores: dict[str, Any] = {"joints": joints, "warnings": validation.large_errors(joints)}
-        if self.machine and machine.names == net.joints:
+        if self.machine:
             scores["tool"] = validation.tool_errors(machine, net, log)
         if self.json:
             meta = {"net": str(self.net), "logs": list(map(str, self.logs))}

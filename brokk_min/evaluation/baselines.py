@@ -231,20 +231,17 @@ def tune(
     costs: list[float] = []
 
     def at(x: Array) -> JacobianController:
-        """The controller with gains at fractions (..., searched gains); the others stay 0."""
         gains = np.zeros((*x.shape[:-1], len(start)))
         gains[..., searched] = x
         gains = np.where(searched, gains_vector(gains_of(machine, gains)), 0.0)
         return replace(controller, gains=split_vector(gains))
 
     def objective(x: Array) -> Any:
-        """The cost (candidates,) of fractions (searched gains, candidates)."""
         return cost(at(x.T))
 
     with tqdm(total=generations, desc=f"tune {label}", unit="generation", disable=None) as bar:
 
         def record(intermediate_result: Any) -> None:
-            """Keep the least cost of a generation."""
             costs.append(float(intermediate_result.fun))
             bar.update()
 

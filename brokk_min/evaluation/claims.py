@@ -113,7 +113,7 @@ def net_claims(numbers: Mapping[str, Any]) -> list[Claim]:
         for start, of_start in numbers["response_time"][kind][numbers["joint"]].items():
             times[f"{kind}, {start}"] = of_start["up"]
     slower = None
-    if all(times.values()):
+    if all(time is not None for time in times.values()):
         limit = _limit("idle")
         slower = all(times[f"{k}, idle"] >= limit * times[f"{k}, moving"] for k in kinds)
     coupling = numbers["coupling_rms"]
@@ -155,7 +155,6 @@ def task_claims(
     """
 
     def of_baselines(names: Sequence[str]) -> list[Claim]:
-        """All claims on some baselines; that on directions is of the first one."""
         along_z = ["velocity_error_mean", "off_axis_drift_max"]
         return [
             drift_claim(runs, policy, names),

@@ -52,12 +52,18 @@ class PerfectModel:
     dither: float = 0.04  # valve opening (tuned)
 
     def start(self, num: int) -> Plan:
-        """The plant at rest at `poses`, valves closed; ValueError: no multiple of their number."""
+        """The plant at rest at `poses`, valves closed.
+
+        ValueError: no multiple of their number, or a plant whose states are no tuples of arrays.
+        """
         if num % len(self.poses):
             raise ValueError(f"poses: expected {num} or a part of it, got {len(self.poses)}")
         q = np.tile(self.poses, (num // len(self.poses), 1))
         closed = np.zeros((num, sum(BLOCKS), len(self.machine.driven)))
-        return Plan(plant_reset(self.machine, q), closed, 0, np.zeros(num, np.int64))
+        plant = plant_reset(self.machine, q)
+        if not isinstance(plant, tuple):
+            raise ValueError(f"plant: expected states that are tuples, got {type(plant).__name__}")
+        return Plan(plant, closed, 0, np.zeros(num, np.int64))
 
     def __call__(self, measured: Measured, plan: Plan) -> tuple[Array, Plan]:
         """Commands u (num, n), and the plan; ValueError: the machine begins at another pose."""
@@ -85,7 +91,7 @@ class PerfectModel:
         """Velocity errors [m/s] (num, plans, T, 3) under commands (num, plans, T, n)."""
         m = self.machine
         num, plans, ticks, n = u.shape
-        state = PlantState(*(np.repeat(array, plans, axis=0) for array in plant))
+        state = type(plant)(*(np.repeat(array, plans, axis=0) for array in plant))
         angles = [state.q]
         for t in range(ticks):
             state = plant_step(m, state, u[:, :, t].reshape(num * plans, n))

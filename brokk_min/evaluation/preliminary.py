@@ -66,7 +66,6 @@ def simulators(machine: Machine, net: ActuatorNet) -> dict[str, simulation.Simul
     simulate = simulation.net_simulator(select_nets(machine, net))
 
     def nets(q: Array, u: Array) -> Array:
-        """Angles of all joints; locked ones stand."""
         angles = np.repeat(q[None], len(u) + 1, axis=0)
         angles[..., driven] = simulate(q[..., driven], u[..., driven])
         return angles

@@ -25,7 +25,7 @@ from brokk_min.evaluation.sequences import (
     singular_sequences,
     task_sequences,
 )
-from brokk_min.identification.files import SHIPPED, expected, read_json, whole_file
+from brokk_min.identification.files import SHIPPED, read_json, whole_file
 from brokk_min.identification.logs import Log
 from brokk_min.machine import Array, Machine
 
@@ -114,7 +114,7 @@ def draw(machine: Machine, results: Results, shown: Shown, curve: Path) -> dict[
 
 def first_panels(machine: Machine, results: Results) -> dict[str, Rows]:
     """Rows of the first figure: seeds that the package has or that were swept, then this run."""
-    seeds = shipped_seeds(SHIPPED / machine.name / "seeds.json")
+    seeds = [row for row in shipped(machine, "seeds.json") or () if row["seed"] is not None]
     panels: dict[str, Rows] = {}
     for label, (name, key, key_swept) in FIRST.items():
         rows: dict[str, dict[str, Mean]] = {}
@@ -131,23 +131,10 @@ def first_panels(machine: Machine, results: Results) -> dict[str, Rows]:
     return panels
 
 
-def shipped_seeds(path: Path) -> list[dict[str, Any]]:
-    """Rows of `benchmarks.seeds` that have a seed, see `FIRST`; none without the file."""
-    if not path.exists():
-        return []
-    names = ["controller", "seed", *(name for name, *_ in FIRST.values())]
-    with expected(path, f"rows with {', '.join(names)}"):
-        rows = [{name: row[name] for name in names} for row in read_json(path, "JSON")]
-        return [row for row in rows if row["seed"] is not None]
-
-
-def shipped_family(path: Path) -> dict[str, dict[str, float]]:
-    """Table of the members by `brokk-min family`; empty without the file."""
-    if not path.exists():
-        return {}
-    with expected(path, "a table of `brokk-min family`"):
-        rows = dict(read_json(path, "JSON")["table"])
-        return {name: {key: float(x) for key, x in row.items()} for name, row in rows.items()}
+def shipped(machine: Machine, name: str) -> Any:
+    """Content of a JSON file that the package has for the machine; None: it has none."""
+    path = SHIPPED / machine.name / name
+    return read_json(path, "JSON") if path.exists() else None
 
 
 def _draw_singular(machine: Machine, results: Results, traces: Traces) -> Figure:
@@ -177,7 +164,7 @@ def render(
         titles=TITLES,
         less=less_than(results["task_space"]["summary"], PID),
         seeds=[row for row in rows if "seeds" in row],
-        family=shipped_family(SHIPPED / machine.name / "family.json"),
+        family=(shipped(machine, "family.json") or {"table": {}})["table"],
         minutes=sum(clock.get(stage, 0) for stage in STAGES) / 60,
         date=date.today().isoformat(),
         computer=f"{platform.machine()}, {os.cpu_count()} cores",

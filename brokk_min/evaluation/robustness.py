@@ -22,7 +22,6 @@ def noisy_encoder(rng: np.random.Generator) -> Encoder:
     """Encoders with normal noise of one count."""
 
     def read(machine: Machine, q: Array) -> Array:
-        """Whole counts of noisy angles."""
         noise = machine.encoder_step * rng.standard_normal(q.shape)
         return read_encoder(machine, q + noise)
 
@@ -34,7 +33,6 @@ def lossy_encoder(rng: np.random.Generator) -> Encoder:
     last: Array | None = None
 
     def read(machine: Machine, q: Array) -> Array:
-        """New angles, or the last ones where the sample is lost."""
         nonlocal last
         lost = rng.random((*q.shape[:-1], 1)) < 0.05
         angles = read_encoder(machine, q)
@@ -48,7 +46,7 @@ def with_dead_zone(machine: Machine, dead_zone: float) -> Machine:
     """The machine with one dead zone for all joints, both ways."""
     none = {"dead_zone_up": None, "dead_zone_down": None}
     joints = tuple(replace(joint, **none) for joint in machine.joints)  # type: ignore[arg-type]
-    return replace(machine, joints=joints, dead_zone=dead_zone)
+    return replace(machine, joints=joints, dead_zone=dead_zone, largest_dead_zone=0.0)
 
 
 def scale_valves(machine: Machine, positive: float, negative: float) -> Machine:

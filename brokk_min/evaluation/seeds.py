@@ -150,7 +150,6 @@ def table(seeds: Sequence[Rows], baselines: Rows) -> Table:
     columns |= {name: ("all", name) for name in ("off_axis_drift_max", "jerk_rms", "valve_travel")}
 
     def means(runs: Rows, controller: str) -> Array:
-        """One number a column, over the workspace starts."""
         scored = [run for run in runs if run["kind"] == "workspace"]
         return np.array([by_start(scored, controller, *what).mean() for what in columns.values()])
 

@@ -56,14 +56,15 @@ def whole_file(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
     if path.exists() and not path.is_file():
         raise ValueError(f"{path}: expected a regular file to replace, got another kind")
     newline = None if "b" in mode else ""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name[:100]}.")
+    target = path.resolve()  # of a link
+    handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{path.name[:100]}.")
     try:
         with os.fdopen(handle, mode, newline=newline) as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
+        os.chmod(temporary, stat.S_IMODE(path.stat().st_mode) if path.exists() else 0o644)
+        os.replace(temporary, target)
     except BaseException as error:
         os.unlink(temporary)
         if isinstance(error, OSError) and error.filename is None:

@@ -154,7 +154,6 @@ def initial_weights(n: int, config: FitConfig, generator: Generator) -> list[Ten
     """
 
     def uniform(rows: int, columns: int, bound: float) -> Tensor:
-        """Weights (n, rows, columns) within +-`bound`."""
         return (torch.rand(n, rows, columns, generator=generator) * 2 - 1) * bound
 
     inputs = (3 + config.indicator) * config.history

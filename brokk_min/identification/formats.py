@@ -137,6 +137,7 @@ RESULTS: Fields = {  # of `evaluate` and `reproduce`
         "machine": NAME,
         "seed": SEED,
         **dict.fromkeys(("plant", "commands", "starts", "policy", "gains"), NAMED),
+        "noise": Field("number", 0, 1, required=False),
     },
     "starts": Field("number", -62.8, 62.8, ("starts", "n"), "rad", required=False),
 }

@@ -179,7 +179,7 @@ def fit_gains(
     from scipy.signal import lfilter  # slow to import
 
     up, down = zones
-    late = np.concatenate([np.zeros(delay), u[: len(u) - delay]])
+    late = np.concatenate([np.zeros(delay), u])[: len(u)]
     openings = np.stack([np.maximum(late - up, 0), -np.maximum(-late - down, 0)])
     a = np.exp(-1 / (rate * tau))
     x = lfilter([1 - a], [1, -a], openings)

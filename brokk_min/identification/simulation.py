@@ -65,7 +65,6 @@ def plant_simulator(machine: Machine) -> Simulator:
     """The analytic plant, from rest."""
 
     def simulate(q: Array, u: Array) -> Array:
-        """Angles (T + 1, ..., n) under commands (T, ..., n)."""
         state = plant_reset(machine, q)
         angles = [state.q]
         for command in u:
@@ -80,7 +79,6 @@ def net_simulator(net: ActuatorNet) -> Simulator:
     """The nets, from rest."""
 
     def simulate(q: Array, u: Array) -> Array:
-        """Angles (T + 1, ..., n) under commands (T, ..., n)."""
         history = initial_history(q, net.history).astype(np.float32)
         angles = [q]
         for command in u:

@@ -104,7 +104,7 @@ def run_errors(
     net: ActuatorNet, samples: Samples, starts: NDArray[np.intp], ticks: int
 ) -> tuple[Array, Array]:
     """Errors of angle [rad] and velocity [rad/s] (ticks, s, n) in free runs from `starts` (s,)."""
-    chunks = np.array_split(starts, math.ceil(len(starts) / 8192))  # bounds the memory
+    chunks = np.array_split(starts, max(1, math.ceil(len(starts) / 8192)))  # bounds the memory
     runs = [free_run(net, samples.joined, chunk, ticks) for chunk in chunks]
     q = np.concatenate([angles for angles, _ in runs], axis=1)
     q_dot = np.concatenate([velocities for _, velocities in runs], axis=1)

@@ -259,6 +259,8 @@ class TrainingLog:
             with files.open_regular(self.checkpoint) as file, zipfile.ZipFile(file) as archive:
                 if any(member.compress_size != member.file_size for member in archive.infolist()):
                     raise ValueError("compressed members")
+                if damaged := archive.testzip():  # torch checks no sums
+                    raise ValueError(f"other bytes than were written in {damaged}")
                 file.seek(0)
                 content = torch.load(file, weights_only=True)  # executes nothing
             header = files.parse_json(content["header"])

@@ -111,14 +111,19 @@ def get_obs(machine: Machine, config: TaskConfig, state: State, rng: np.random.G
 
 
 def replace_rows(state: State, rows: NDArray[np.intp], fresh: State) -> State:
-    """`state` with its rows `rows` replaced by the states `fresh`, one each."""
+    """`state` with its rows `rows` replaced by the states `fresh`, one each.
+
+    ValueError: a plant of another kind than tuples of arrays.
+    """
 
     def put(old: Any, new: Any) -> Any:
-        """A copy of an array, or a tuple of arrays, with new rows."""
         if old is None:
             return None
         if isinstance(old, tuple):  # the state of a plant
             return type(old)(*map(put, old, new))
+        if not isinstance(old, np.ndarray):
+            expected = "expected states that are tuples of arrays"
+            raise ValueError(f"plant: {expected}, got {type(old).__name__}")
         result = old.copy()
         result[rows] = new
         return result

@@ -8,7 +8,7 @@ Importing this module registers them, and Gymnasium can import it by the name of
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -29,28 +29,13 @@ Bools = NDArray[np.bool_]
 Step = tuple[Array, Array, Bools, Bools, dict[str, Any]]  # of a vector: obs, reward, ends, info
 
 
-class Renderer(Protocol):
-    """Draws states of environments; `viewer.rendered_env.FrameRenderer` is one."""
-
-    mode: str  # Gymnasium's render_mode
-
-    def update(self, state: State, started: Iterable[int]) -> None:
-        """Follow the machines to their next state; episodes of the rows `started` begin with it."""
-
-    def render(self, state: State) -> list[Frame]:
-        """A frame of each machine; none where they are shown in a window."""
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-
-
 class TaskVectorEnv(VectorEnv[Array, Array, Any]):
     """Many machines that follow random tool velocities; ended episodes reset in the same step.
 
     `info["final_obs"]` holds the last observation of an episode where `info["_final_obs"]` is set,
     `info["velocity_error"]` |v_goal - v_tool| [m/s], `info["state"]` the state before the step.
     `actuator` are nets (object or file) or "analytic" for the plant, `config` is what an episode
-    is, `renderer` what draws the machines (None: nothing does). Paper: Fig. 4
+    is. `viewer.rendered_env` has one that draws. Paper: Fig. 4
     """
 
     def __init__(
@@ -59,7 +44,6 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         actuator: ActuatorNet | Path | str = "analytic",
         machine: Machine = BROKK_170,
         config: TaskConfig | None = None,
-        renderer: Renderer | None = None,
     ) -> None:
         self.metadata = {
             "render_modes": ["rgb_array"],
@@ -70,8 +54,6 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         self.machine = machine
         self.config = config or TaskConfig()
         self.net = load_actuator(machine, actuator)
-        self.renderer = renderer
-        self.render_mode = renderer.mode if renderer else None
         size = len(observation_scale(machine, self.config.paper)[0])
         self.single_observation_space = Box(-np.inf, np.inf, (size,), np.float32)
         self.single_action_space = Box(-1.0, 1.0, (len(machine.driven),), np.float32)
@@ -85,7 +67,7 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         """Draw new episodes for all machines."""
         super().reset(seed=seed)
         self.state = self._new_episodes(self.num_envs)
-        self._draw(range(self.num_envs))
+        self.follow(range(self.num_envs))
         return get_obs(self.machine, self.config, self.state, self.np_random), {}
 
     def step(self, actions: Array) -> Step:
@@ -99,7 +81,7 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
             info |= {"final_obs": obs, "_final_obs": done}
             obs = obs.copy()
             obs[rows] = get_obs(self.machine, self.config, fresh, self.np_random)
-        self._draw(rows)
+        self.follow(rows)
         return obs, reward, terminated, truncated, info
 
     def step_without_reset(self, actions: Array) -> Step:
@@ -114,39 +96,23 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         self.state = new_goals(m, config, state, rng)
         return get_obs(m, config, self.state, rng), reward, terminated, truncated, info
 
-    def render(self) -> tuple[Frame, ...]:
-        """A frame of each machine."""
-        if self.renderer is None or self.state is None:
-            raise ValueError("render: expected a render_mode and a reset before, got none")
-        return tuple(self.renderer.render(self.state))
-
-    def close_extras(self, **kwargs: Any) -> None:
-        """Close the window, if there is one."""
-        if self.renderer is not None:
-            self.renderer.close()
-
     def _new_episodes(self, num: int) -> State:
         return reset(self.machine, self.config, self.np_random, num, plant=self.net is None)
 
-    def _draw(self, started: Iterable[int]) -> None:
-        if self.renderer is not None and self.state is not None:
-            self.renderer.update(self.state, started)
+    def follow(self, started: Iterable[int]) -> None:
+        """For those that draw: a new state; episodes of the rows `started` begin with it."""
 
 
 class TaskEnv(gymnasium.Env[Array, Array]):
-    """One machine: a `TaskVectorEnv` of one whose episodes the caller resets."""
+    """One machine: a `TaskVectorEnv` of one, by its options, whose episodes the caller resets."""
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 20}  # noqa: RUF012
 
-    def __init__(
-        self,
-        actuator: ActuatorNet | Path | str = "analytic",
-        machine: Machine = BROKK_170,
-        config: TaskConfig | None = None,
-        renderer: Renderer | None = None,
-    ) -> None:
-        self.metadata = TaskEnv.metadata | {"render_fps": round(machine.rate)}
-        self.vector = TaskVectorEnv(1, actuator, machine, config, renderer)
+    vector_class: type[TaskVectorEnv] = TaskVectorEnv
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        self.vector = self.vector_class(1, *arguments, **options)
+        self.metadata = TaskEnv.metadata | {"render_fps": self.vector.metadata["render_fps"]}
         self.render_mode = self.vector.render_mode
         self.observation_space = self.vector.single_observation_space
         self.action_space = self.vector.single_action_space
@@ -165,13 +131,14 @@ class TaskEnv(gymnasium.Env[Array, Array]):
         obs, reward, terminated, truncated, info = self.vector.step_without_reset(
             np.asarray(action)[None]
         )
-        self.vector._draw([])
+        self.vector.follow([])
         info = {"velocity_error": float(info["velocity_error"][0])}
         return obs[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
 
     def render(self) -> Frame | None:
         """The present frame, or None: it is in the window."""
-        return next(iter(self.vector.render()), None)
+        frames: Any = self.vector.render()
+        return next(iter(frames), None)
 
     def close(self) -> None:
         """Close the window, if there is one."""

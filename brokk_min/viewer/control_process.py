@@ -57,7 +57,6 @@ class WindowInput:
     clock: Callable[[], float] = time.monotonic  # of the requests [s]
 
     def __post_init__(self) -> None:
-        """Begin without a request."""
         none = np.zeros(len(self.machine.driven))
         self.request = Request(-np.inf, 0, False, False, np.zeros(3), none)
 

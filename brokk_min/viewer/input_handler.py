@@ -34,7 +34,6 @@ class InputHandler:
     modes: Sequence[str]  # names of the controllers, the last one "levers"
 
     def __post_init__(self) -> None:
-        """Begin with nothing pressed."""
         self.mode = 0
         self.time = time.monotonic()  # of the last request [s]
         self.held = set[str]()  # keys
@@ -118,7 +117,8 @@ class InputHandler:
     def _target(self) -> Array:
         """Deflections of stick or levers in [-1, 1]; keys give a third of it with shift."""
         pairs = LEVER_KEYS[: len(self.machine.driven)] if self.by_joint else VELOCITY_KEYS
-        target = np.array([float(p in self.held) - float(m in self.held) for p, m in pairs])
+        target = np.zeros(len(self.machine.driven) if self.by_joint else 3)
+        target[: len(pairs)] = [float(p in self.held) - float(m in self.held) for p, m in pairs]
         if not self.focus:
             return np.zeros_like(target)
         if self.held & {"left shift", "right shift"}:

@@ -81,7 +81,6 @@ class Lockstep:
     clock: Callable[[], float] = time.monotonic  # of the window [s]
 
     def __post_init__(self) -> None:
-        """Begin with a machine that is on and has been heard."""
         self.connection, loop_end = Pipe()
         window = WindowInput(
             self.machine, self.controllers, loop_end, lambda: -np.inf

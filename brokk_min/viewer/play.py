@@ -44,7 +44,6 @@ class Session:
     simulated: bool = False  # may the controllers be compared on simulated machines?
 
     def __post_init__(self) -> None:
-        """Begin without telemetry and without a line."""
         self.modes = [] if self.controllers is None else [*self.controllers, "levers"]
         self.attempts = tracing.read_attempts(self.file) if self.modes else []
         self.lines = tracing.task_lines(self.machine)

@@ -16,6 +16,7 @@ from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet
 from brokk_min.can.drive_log import read_frames, read_telemetry
+from brokk_min.env import TaskConfig
 from brokk_min.evaluation import baselines, metrics
 from brokk_min.evaluation.rollout import TITLES, Controller
 from brokk_min.evaluation.sequences import Commands, goals_and_starts, task_sequences
@@ -99,6 +100,7 @@ class Results(NamedTuple):
     controllers: dict[str, Controller]
     net: ActuatorNet | None  # what moved; None: the plant
     seed: int
+    noise: float
 
 
 def read_results(machine: Machine, path: Path, controllers: Sequence[str]) -> Results:
@@ -108,7 +110,8 @@ def read_results(machine: Machine, path: Path, controllers: Sequence[str]) -> Re
     """
     file = read_json(path, "results of `evaluate`")
     check_fields(path, file, {"meta": RESULTS["meta"]}, {})
-    meta = {"plant": "analytic", "commands": "", "starts": "", **file["meta"]}
+    meta: dict[str, Any] = {"plant": "analytic", "commands": "", "starts": ""}
+    meta |= {"noise": TaskConfig.noise} | file["meta"]
     if meta["machine"] != machine.name:
         raise ValueError(f"{path}: expected --machine {meta['machine']}, got {machine.name}")
     check_fields(path, file, RESULTS, {"n": machine.n})
@@ -124,11 +127,17 @@ def read_results(machine: Machine, path: Path, controllers: Sequence[str]) -> Re
         named: dict[str, Controller] = {"rl": PolicyController(machine, policy)}
         if set(controllers) - {"rl"}:
             gains = Path(meta.get("gains", path.with_name("gains.json")))
+            if gains.name == "tuned now":
+                raise ValueError("gains: expected those of a file (--save-gains), got none")
             named |= baselines.read_gains(gains, machine, policy.net)
     starts = np.array(file.get("starts", drawn), float)
+    if meta["plant"] not in ("analytic", "net"):
+        expected = "expected runs of the analytic plant or of nets"
+        raise ValueError(f"{path}: plant: {expected}, got {meta['plant']}")
     net = policy.net if meta["plant"] == "net" else None
     by_name = {s.name: s for s in sequences}
-    return Results(path, content["runs"], by_name, starts, named, net, meta["seed"])
+    made_by = meta["seed"], meta["noise"]
+    return Results(path, content["runs"], by_name, starts, named, net, *made_by)
 
 
 def simulate_again(
@@ -137,9 +146,9 @@ def simulate_again(
     """One run of each controller; ValueError: it is not the run of the file."""
     chosen = {name: results.controllers[name] for name in controllers}
     sequences = list(results.sequences.values())
-    rows, traces = metrics.evaluate(
-        machine, chosen, sequences, results.starts, results.seed, results.net
-    )
+    task = (sequences, results.starts, results.seed, results.net)
+    config = TaskConfig(noise=results.noise)
+    rows, traces = metrics.evaluate(machine, chosen, *task, config=config)
     for row in rows:
         if row["start"] == start and row["sequence"] == sequence:
             _check_row(results, row)

@@ -1,6 +1,8 @@
 """The bound: it simulates the plant exactly, plans with it, and leaves less error than the PIDs."""
 
 import itertools
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from brokk_min.evaluation.perfect_model import (
     steady_opening,
 )
 from brokk_min.evaluation.rollout import rollout
+from brokk_min.identification.physics import Physics
 from brokk_min.kinematics import forward_kinematics, tool_velocity
 from brokk_min.machine import BROKK_170, limit_command
 
@@ -32,6 +35,16 @@ def plant_in_motion(rng):
         u = limit_command(BROKK_170, rng.uniform(0.2, 0.6, (2, 5)))
         plant = plant_step(BROKK_170, plant, u)
     return plant
+
+
+def test_start__takes_any_plant_whose_states_are_tuples():
+    physics = replace(BROKK_170, plant=Physics(jitter=0.02))
+    model = replace(BOUND, machine=physics)
+    errors = model.errors(model.start(2).plant, np.zeros((2, 3, 2, 5)), np.zeros((2, 3)))
+    np.testing.assert_allclose(errors, 0, atol=1e-9)
+    own = SimpleNamespace(reset=lambda machine, q: SimpleNamespace(q=q), step=None)
+    with pytest.raises(ValueError, match=r"^plant: expected states that are tuples, got Simple"):
+        replace(BOUND, machine=replace(BROKK_170, plant=own)).start(2)
 
 
 def test_errors__are_those_that_the_plant_then_has():

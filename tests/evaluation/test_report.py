@@ -47,36 +47,12 @@ def test_less_than__has_fractions_of_the_others_figures():
     assert report.less_than(summary, "pid") == dict.fromkeys(report.FIRST, 0.25)
 
 
-def test_shipped_seeds__are_rows_of_a_file_that_need_not_be_there(tmp_path):
-    path = tmp_path / "seeds.json"
-    assert report.shipped_seeds(path) == []
-    row = {"controller": "rl", "seed": 0, "error": 0.1, "drift": 0.2, "jerk": 3.0}
-    row["valve_travel"] = 4.0
-    rows = [row | {"more": 1}, row | {"controller": "pid", "seed": None}]
-    path.write_text(json.dumps(rows))
-    assert report.shipped_seeds(path) == [row]
-    path.write_text(json.dumps([{"seed": 0}]))
-    with pytest.raises(ValueError, match=r"seeds.json: expected rows with controller, seed, .* no"):
-        report.shipped_seeds(path)
-
-
-def test_shipped_family__is_a_table_that_need_not_be_there(tmp_path):
-    path = tmp_path / "family.json"
-    assert report.shipped_family(path) == {}
-    path.write_text(json.dumps({"table": {"0, rl": {"to_nets": 1}}, "members": []}))
-    assert report.shipped_family(path) == {"0, rl": {"to_nets": 1.0}}
-    for content in ({"members": []}, {"table": {"0, rl": {"to_nets": "a"}}}):
-        path.write_text(json.dumps(content))
-        with pytest.raises(ValueError, match=r"family.json: expected a table of"):
-            report.shipped_family(path)
-
-
 def test_first_panels__are_seeds_before_this_run(tmp_path, monkeypatch):
     folder = tmp_path / BROKK_170.name
     folder.mkdir()
     row = {"controller": "ours dither", "seed": 0, "error": 1, "drift": 0, "jerk": 1}
     row["valve_travel"] = 2
-    rows = [row, row | {"seed": 1, "error": 3}]
+    rows = [row, row | {"seed": 1, "error": 3}, row | {"controller": "pid", "seed": None}]
     (folder / "seeds.json").write_text(json.dumps(rows))
     monkeypatch.setattr(report, "SHIPPED", tmp_path)
     keys = ("velocity_error_mean", "off_axis_drift_max", "jerk_rms", "valve_travel")

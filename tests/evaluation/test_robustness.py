@@ -46,6 +46,7 @@ def test_lossy_encoder__repeats_one_sample_in_20_of_all_joints_of_a_machine():
 
 
 def test_variations__change_one_thing_each():
+    assert len(variations(replace(BROKK_170, largest_dead_zone=0.09))) == 12  # 10 % is more
     result = variations(BROKK_170)
     assert len(result) == 12 and result["nominal"][0] is BROKK_170
     rng = np.random.default_rng(0)

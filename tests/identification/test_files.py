@@ -62,6 +62,15 @@ def test_whole_file__refuses_a_missing_folder_and_a_device(tmp_path, name, messa
         write_json(tmp_path / name, 1)
 
 
+def test_whole_file__keeps_links_and_permissions(tmp_path):
+    kept = tmp_path / "kept.json"
+    kept.touch(0o600)
+    (tmp_path / "link").symlink_to(kept)
+    write_json(tmp_path / "link", 1)
+    assert (tmp_path / "link").is_symlink() and kept.read_text() == "1\n"
+    assert kept.stat().st_mode & 0o777 == 0o600
+
+
 class Bomb:
     def __reduce__(self):
         return os.mkdir, (os.environ["BOMB"],)

@@ -155,6 +155,13 @@ def test_inspect__leaves_out_joints_that_are_never_driven():
     assert warnings(excited("boom"), reports) == ["arm: never driven in the log"]
 
 
+def test_inspect__takes_recordings_that_are_shorter_than_a_delay():
+    short = record("boom", holds(np.random.default_rng(0), 40))
+    short = Recording("", *(x[5:9] for x in short[1:]))  # 0.2 s, a change of command
+    report = inspect(Log(tuple(TRUE), (short,)))
+    assert np.isfinite(report["boom"].gain_up)
+
+
 def test_inspect__tells_which_joints_are_driven_together():
     rng = np.random.default_rng(1)
     boom, arm = (record(name, holds(rng, 400)) for name in TRUE)

@@ -149,6 +149,9 @@ def test_validate__warns_of_nets_no_better_than_linear_and_of_tests_outside_the_
         "response_time", "coupling", "delay",
     }  # fmt: skip
     assert any(w.startswith("a: the error of a free run of 1 s is") for w in result["warnings"])
+    short = tuple(Recording(r.name, *(x[:20] for x in r[1:])) for r in test.recordings)
+    runs = validate(blank_net(log), log, Log(("a",), short))["joints"]["a"]["free_run"]
+    assert runs == {}  # none lasts a second
     still = tuple(r._replace(u=0 * r.u, q=0 * r.q, q_dot=0 * r.q_dot) for r in test.recordings)
     assert validate(blank_net(log), log, Log(("a",), still))["warnings"] == []
     jumps = tuple(r._replace(u=-np.abs(r.u) - 0.2) for r in test.recordings)

@@ -257,6 +257,10 @@ def test_train_policy__wants_resume_and_checkpoint_and_curve_of_this_version(bro
     torch.save(content | {"header": '{"format": 0, "identity": {}}'}, checkpoint)
     with pytest.raises(ValueError, match=r"p\.npz\.checkpoint: format: expected 6, got 0"):
         run(broken, resume=True)
+    weights = len(good) // 2
+    checkpoint.write_bytes(good[:weights] + bytes([good[weights] ^ 1]) + good[weights + 1 :])
+    with pytest.raises(ValueError, match=r"p\.npz\.checkpoint: expected a readable checkpoint"):
+        run(broken, resume=True)
     checkpoint.write_bytes(good)
     broken.with_name("p.npz.csv").unlink()
     with pytest.raises(ValueError, match=r"p\.npz\.csv: expected the curve of the checkpoint, got"):

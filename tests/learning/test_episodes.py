@@ -105,6 +105,10 @@ def test_replace_rows__replaces_whole_rows_and_nothing_else(plant):
             assert np.array_equal(after[[0, 2, 3]], before[[0, 2, 3]])
             assert np.array_equal(after[[4, 1]], fresh)
     assert not np.array_equal(old.q, state.q)
+    if plant:
+        own = replace(old, plant=object())
+        with pytest.raises(ValueError, match=r"^plant: expected states that are tuples of"):
+            episodes.replace_rows(own, np.array([4, 1]), new)
 
 
 def test_get_obs__noise_is_uniform_and_only_on_what_sensors_measure():

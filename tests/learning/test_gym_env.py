@@ -131,8 +131,6 @@ def test_task_env__is_one_row_of_the_vector():
 def test_step__refuses_to_begin_without_a_reset(make):
     with pytest.raises(ValueError, match="step: expected a reset before the first step, got none"):
         make().step(np.zeros((2, 4), np.float32))
-    with pytest.raises(ValueError, match="render: expected a render_mode and a reset before"):
-        make().render()
 
 
 def test_task_vector_env__takes_a_file_and_selects_driven_joints(tmp_path):

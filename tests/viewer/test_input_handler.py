@@ -66,6 +66,12 @@ def test_request__has_a_lever_for_each_driven_joint_and_modes_go_round():
         np.testing.assert_array_equal(operator.key(minus).levers, -np.eye(4)[i])
         operator.key(minus, False)
     assert operator.key("tab").mode == 0
+    six = tuple(replace(joint, driven=True) for joint in BROKK_170.joints)
+    more = replace(six[4], name="q6", encoder_node=6), replace(six[4], name="q7", encoder_node=7)
+    operator = Operator(machine=replace(BROKK_170, joints=six + more, q_start=()))
+    operator.key("tab")
+    operator.key("tab")
+    assert operator.key("y").levers.tolist() == [0, 0, 0, 0, 0, 1, 0]  # the last has no key
 
 
 def test_switch__counts_only_if_pressed_with_nothing_deflected():

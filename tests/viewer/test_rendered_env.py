@@ -13,15 +13,15 @@ from brokk_min.env import TaskConfig
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer.drawing import COLOURS, Scene, draw
-from brokk_min.viewer.rendered_env import SIZE, FrameRenderer, RenderedEnv
+from brokk_min.viewer.rendered_env import SIZE, RenderedEnv, RenderedVectorEnv
 from brokk_min.viewer.window import Canvas
 
 NAME = "brokk_min/Brokk170-v0"
 
 
 def renderer_of(env):
-    renderer = env.vector.renderer
-    assert isinstance(renderer, FrameRenderer)
+    renderer = env.vector
+    assert isinstance(renderer, RenderedVectorEnv)
     return renderer
 
 
@@ -75,7 +75,7 @@ def test_rendered_vector_env__gives_a_frame_of_each_machine():
     assert isinstance(frames, tuple)
     assert [frame.shape for frame in frames] == [(600, 960, 3)] * 2
     assert (frames[0] != frames[1]).any()
-    trails = envs.unwrapped.renderer.trails
+    trails = envs.unwrapped.trails
     assert [len(trail) for trail in trails.values()] == [3, 3]  # of the reset in step 4, then two
     envs.close()
 

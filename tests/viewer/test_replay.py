@@ -94,6 +94,9 @@ def test_simulate_again__gives_the_runs_of_the_file_along_the_goals(results):
         (lambda f: f["meta"].update(machine="mini"), "--machine mini, got brokk170"),
         (lambda f: f["meta"].update(policy="missing.npz"), "missing.npz"),
         (lambda f: f["meta"].update(plant="net"), "expected the run"),
+        (lambda f: f["meta"].update(noise=0.0), "expected the run"),
+        (lambda f: f["meta"].update(plant="own.py:PLANT"), "of nets, got own.py:PLANT"),
+        (lambda f: f["meta"].update(gains="tuned now"), "gains: expected those of a file"),
     ],
 )
 def test_results__that_are_not_those_of_the_file_are_refused(change, message, results, tmp_path):
@@ -102,7 +105,7 @@ def test_results__that_are_not_those_of_the_file_are_refused(change, message, re
     wrong = tmp_path / "wrong.json"
     wrong.write_text(json.dumps(file))
     with pytest.raises(ValueError, match=message):
-        read = replay.read_results(BROKK_170, wrong, ["rl"])
+        read = replay.read_results(BROKK_170, wrong, ["rl", "jacobian_pid_k0.1"])
         replay.simulate_again(BROKK_170, read, ["rl"], "side", 1)
 
 
