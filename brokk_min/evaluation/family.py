@@ -2,7 +2,8 @@
 
 A member's controllers are made from its own logs, as a user's would be: an hour of all joints at
 once, nets that share latents, policies; an hour of the policies' own drives, nets fitted to both
-logs, the policies trained on; baselines tuned on the member itself. `family.json` has:
+logs, the policies trained on; this once more; baselines tuned on the member itself. `family.json`
+has:
 
     members[]: seed, budget, effects, dither (of `Machine`), free_run {joint: error over rms speed
     in 10 s}, tool: errors of the tool in free runs, error {controller: m/s on the machine}; for
@@ -44,6 +45,7 @@ from brokk_min.machine import Machine
 
 LATENTS = 4  # that the nets share
 VALVES = {"rl": "closed", "rl_dither": "dither"}  # our policy, and its valves at rest
+SECOND = 50  # added to the seed of the goals of the second policy's own drives
 RAMPS = 0.02  # h of each joint, for its dead zones
 DITHERS = (0.03, 0.04, 0.05, 0.06, 0.07)  # that each member tries
 PAYLOAD = 50.0  # kg at the tool that no log has, assumed: half of a link
@@ -88,6 +90,8 @@ def run_member(base: Machine, seed: int, out: Path, budget: Budget) -> dict[str,
     both, begun = learn.first_round(chain, log, shared)
     machine = replace(machine, dither=best_dither(chain, begun))
     chain = replace(chain, machine=machine)
+    second = replace(chain, out=out / "second")
+    both, begun = learn.next_round(second, both, shared, begun, seed + SECOND)
     every = learn.fit_net(chain, "net", both, shared)
     net = select_nets(machine, every)
     jobs = {"train": partial(learn.train, chain, "rl", net, begun)}

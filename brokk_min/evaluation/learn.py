@@ -88,18 +88,27 @@ def train(chain: Chain, name: str, net: ActuatorNet, start: Policy | None = None
 
 
 def first_round(chain: Chain, log: logs.Log, recipe: Mapping[str, Any]) -> tuple[logs.Log, Policy]:
-    """The log with the own drives of a policy that was trained for short, and this policy.
-
-    Nets, policy and own drives go to the folder `first` of the chain.
-    """
-    m, budget = chain.machine, chain.budget
+    """`next_round` of a short fit and training, in the folder `first` of the chain."""
+    budget = chain.budget
     short = {"fit_steps": budget.first_fit_steps, "train_steps": budget.first_train_steps}
     first = replace(chain, out=chain.out / "first", budget=replace(budget, **short))
-    first.out.mkdir(parents=True, exist_ok=True)
-    policy = train(first, "rl", fit_net(first, "net", log, recipe))
+    return next_round(first, log, recipe, None, chain.seed)
+
+
+def next_round(
+    chain: Chain, log: logs.Log, recipe: Mapping[str, Any], start: Policy | None, seed: int
+) -> tuple[logs.Log, Policy]:
+    """The log with the own drives of a policy that was trained for it, and this policy.
+
+    `start` as in `train`, `seed` of the goals of the drives. Nets, policy and own drives go to the
+    folder of the chain.
+    """
+    m = chain.machine
+    chain.out.mkdir(parents=True, exist_ok=True)
+    policy = train(chain, "rl", fit_net(chain, "net", log, recipe), start)
     controllers = policy_controllers(m, {"rl": policy})
-    own = own_drives(m, [*controllers.values()], budget.hours, chain.seed)
-    logs.write_log(first.out / "log_own.npz", own)
+    own = own_drives(m, [*controllers.values()], chain.budget.hours, seed)
+    logs.write_log(chain.out / "log_own.npz", own)
     return log._replace(recordings=log.recordings + own.recordings), policy
 
 
