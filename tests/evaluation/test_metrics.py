@@ -175,6 +175,10 @@ def test_evaluate__gives_rows_in_order_with_their_figures():
             np.testing.assert_array_equal(figure, values[row["start"]], err_msg=key)
     error = m.summary(rows)
     assert error["pid"]["all"]["velocity_error_mean"] < error["idle"]["all"]["velocity_error_mean"]
+    with pytest.raises(ValueError, match=r"^sequences: expected each name once, got \['x', 'x'\]"):
+        m.evaluate(BROKK_170, controllers, shortened(50)[:1] * 2, STARTS, 0)
+    with pytest.raises(ValueError, match=r"^starts: expected angles within the joints' ranges"):
+        m.evaluate(BROKK_170, controllers, shortened(50), np.add(STARTS, [0, 0, 2, 0, 0]), 0)
 
 
 def test_evaluate__gives_each_length_of_sequences_the_same_noise():

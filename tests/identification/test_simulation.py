@@ -42,6 +42,8 @@ def test_free_run__has_the_history_of_the_log_and_then_its_own():
     rng = np.random.default_rng(0)
     u, q = rng.uniform(-0.6, 0.6, (40, 2)), np.cumsum(rng.uniform(-0.02, 0.02, (40, 2)), axis=0)
     recording = Recording("x", u, q, velocity_of(q, 3))
+    with pytest.raises(ValueError, match=r"^starts: expected 5 or more, got 4"):
+        free_run(net, recording, np.array([7, 4]), 6)
     angles, velocities = free_run(net, recording, np.array([7, 20]), 6)
     assert angles.shape == velocities.shape == (6, 2, 2)
     for s, start in enumerate((7, 20)):
