@@ -2,8 +2,8 @@
 
     python -m benchmarks.deviations [d4 ...] [--train]
 
-Each function returns the figures of one entry. D4, D5, D7, D10 to D14, A4 and A5 fit nets and train
-policies: `--train`, some 25 minutes. The name of an entry prints that entry alone.
+Each function returns the figures of one entry. D4, D5, D7, D10 to D14, D18, A4 and A5 fit nets and
+train policies: `--train`, some 25 minutes. The name of an entry prints that entry alone.
 """
 
 from __future__ import annotations
@@ -247,7 +247,7 @@ def fit_scores(kind: str, seed: int, **settings: Any) -> Figures:
 
 
 def train(task: TaskConfig, critic: bool = False, net: Any = None) -> Figures:
-    """Error [m/s], drift [m], travel of a new policy along x, y, z, on nets and plant."""
+    """Error [m/s], drift [m], travel, time at stops [s] of a new policy along x, y, z."""
     net = net or policy.load_policy(POLICY, M).net
     settings = {} if critic else GRADIENT_LEARNER
     config = PPOConfig(**{**settings, "total_steps": STEPS, "threads": 1})
@@ -259,7 +259,7 @@ def train(task: TaskConfig, critic: bool = False, net: Any = None) -> Figures:
     for name, moves in (("nets", net), ("plant", None)):
         axes = sequences.axis_sequences(M)
         runs, _ = metrics.evaluate(M, controllers, axes, starts, 0, moves)
-        for key in ("velocity_error_mean", "off_axis_drift_max", "valve_travel"):
+        for key in ("velocity_error_mean", "off_axis_drift_max", "valve_travel", "time_at_limits"):
             result[f"{name}, {key}"] = float(np.mean([run[key] for run in runs]))
     return result
 
@@ -362,6 +362,11 @@ def d14() -> Figures:
     return compare(encoder_angles=encoder_angles, ours=default_training())
 
 
+def d18() -> Figures:
+    """A policy that pays for joints close to their limits."""
+    return compare(ours=default_training(), cost=train(TaskConfig(limit_cost=0.3)))
+
+
 def a5() -> Figures:
     """A policy that observes velocities in the base frame, not along the tool's heading."""
     with mock.patch.object(kinematics, "to_heading", lambda p_tool, v: v):
@@ -394,7 +399,8 @@ def quiet() -> Figures:
 
 MEASURED: tuple[Callable[[], Figures], ...] = (a1, d1, d3, d6, a6, a7, a9, a11)
 MEASURED += (levels, stand, dither, film)
-TRAINED: tuple[Callable[[], Figures], ...] = (d4, a4, d5, d7, d10, d11, d12, d13, d14, a5, quiet)
+TRAINED: tuple[Callable[[], Figures], ...] = (d4, a4, d5, d7, d10, d11, d12, d13, d14, d18, a5)
+TRAINED += (quiet,)
 
 
 def main(words: list[str]) -> None:

@@ -27,7 +27,7 @@ from brokk_min.identification import logs
 from brokk_min.identification.fitting import PAPER_RECIPE
 from brokk_min.identification.muon import Muon
 from brokk_min.identification.net_file import load_net, select_nets
-from brokk_min.learning.checkpoint import export_policy, stagger_episodes
+from brokk_min.learning.checkpoint import export_policy, stagger_episodes, use_fast_float32
 from brokk_min.learning.episodes import GRADIENT_LEARNER, PAPER_TASK, get_obs, new_goals, reset
 from brokk_min.learning.gym_env import Step, TaskVectorEnv
 from brokk_min.learning.policy import Policy
@@ -147,6 +147,7 @@ def train(net: ActuatorNet, steps: frozenset[str], total_steps: int, seed: int) 
     gradients = "gradients" in steps
     settings = {**(GRADIENT_LEARNER if gradients else {}), "total_steps": total_steps}
     config = ppo.PPOConfig(**settings)
+    use_fast_float32()
     task_env = MixedEnv(net, steps)
     learner = ppo.make_learner(task_env, config, seed, critic=not gradients)
     if "muon" in steps:

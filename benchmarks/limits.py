@@ -29,6 +29,7 @@ from benchmarks import write
 from brokk_min import ppo
 from brokk_min.identification.muon import Muon
 from brokk_min.kinematics import forward_kinematics, jacobian
+from brokk_min.learning.checkpoint import use_fast_float32
 from brokk_min.learning.episodes import GRADIENT_LEARNER
 from brokk_min.learning.simulation_gradient import regression_loss
 from brokk_min.machine import BROKK_170
@@ -131,7 +132,7 @@ def kinematics(options: Options) -> dict[str, float]:
 
 def main(options: Options) -> dict[str, Any]:
     torch.set_num_threads(1)
-    ppo.use_fast_float32()
+    use_fast_float32()
     ours = GRADIENT_LEARNER["minibatch_size"]
     adam = partial(torch.optim.Adam, fused=True)  # as `ppo.make_learner`
     result = {

@@ -39,7 +39,7 @@ from brokk_min.env import TaskConfig
 from brokk_min.evaluation.baselines import read_gains
 from brokk_min.evaluation.rollout import Controller, rollout
 from brokk_min.evaluation.sequences import tuning_set
-from brokk_min.learning.checkpoint import export_policy, stagger_episodes
+from brokk_min.learning.checkpoint import export_policy, stagger_episodes, use_fast_float32
 from brokk_min.learning.episodes import GRADIENT_LEARNER
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import Policy, PolicyController, load_policy
@@ -299,6 +299,7 @@ def race(
 ) -> dict[str, Any]:
     """One run: `reached` has CPU and wall seconds, environment and gradient steps of each level."""
     torch.set_num_threads(1)
+    use_fast_float32()  # for all learners
     env = TaskVectorEnv(options.num_envs, shipped.net, M, TaskConfig(valves="dither"))
     rate, steps = setting[0], round(setting[1] * options.longest)
     row: dict[str, Any] = {"learner": name, "setting": setting, "seed": seed, "best": np.inf}

@@ -18,7 +18,7 @@ Observation: Box, float32, (223,), (x - mean) / deviation * weight of these bloc
 "Uniform": over its range. The newest sample is last. Heading frame: x from slew axis to tool.
 
 Action: Box(-1, 1, (4,)), of the largest command of each driven joint, see `action_to_pwm`.
-Reward: 1 / (1 + |v_goal - v_tool|) (eq2), minus costs of valve travel and of the error integral.
+Reward: 1 / (1 + |v_goal - v_tool|) (eq2), less costs of valve travel, error integral and limits.
 Start: at rest in a random pose above the ground, with a random goal that changes now and then.
 End: terminated, without reward, with a link in the ground; truncated after 20 s.
 
@@ -38,7 +38,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brokk_min import actuator, kinematics, machine
 from brokk_min.actuator import ActuatorNet, PlantState, append_sample, initial_history
-from brokk_min.jacobian import dls
+from brokk_min.jacobian import dls, limit_penalty
 from brokk_min.kinematics import forward_kinematics, jacobian, tool_velocity
 from brokk_min.machine import PWM_MAX, Array, Machine, as_floats, limit_command, read_encoder
 
@@ -60,6 +60,7 @@ class TaskConfig:
     noise: float = machine.number("1", 0, 1000, 0.05)  # Uniform, up to +- deviations (paper: 5 %).
     valve_cost: float = machine.number("1", 0, 1000, 0.1)  # Of a full change of all (paper: 0).
     integral_cost: float = machine.number("1/m", 0, 1000, 1.0)  # Of the error integral (paper: 0).
+    limit_cost: float = machine.number("1", 0, 1000, 0.0)  # Of each joint at a limit; try 0.3.
     valves: actuator.Valves = "closed"  # While the tool rests: `actuator.command_at_rest`.
     redraw_ground: bool = True  # Redraw start poses in the ground; the paper ends the episode.
     paper: bool = False  # The paper's agent: observation, action, reward, start and end, see above.
@@ -108,9 +109,8 @@ def observation_blocks(machine: Machine, paper: bool = False) -> tuple[Block, ..
         Block("q locked", q_mean[machine.locked], q_std[machine.locked], 1.4, True),
     ]
     for j in machine.driven:
-        name = machine.names[j]
-        blocks.append(Block(f"q {name}", q_mean[j], np.full(H, q_std[j]), H**-0.5, True))
-        blocks.append(Block(f"q_dot {name}", 0.0, np.full(H, q_dot_std[j]), H**-0.5, True))
+        blocks.append(Block(f"q {j}", q_mean[j], np.full(H, q_std[j]), H**-0.5, True))
+        blocks.append(Block(f"q_dot {j}", 0.0, np.full(H, q_dot_std[j]), H**-0.5, True))
     blocks.append(Block("u", 0.0, u_std, H**-0.5, False))
     if paper:
         return tuple(block._replace(weight=1.0) for block in blocks)
@@ -198,8 +198,7 @@ def update_history(
     `u` (..., n) was sent for `v_goal` [m/s] (..., 3), then the encoders gave `q` [rad] (..., n).
     """
     history = append_sample(history, u, q, machine.velocity_samples, machine.dt)
-    frames = forward_kinematics(machine, history[..., 0, -1])
-    v_tool = tool_velocity(frames, history[..., 1, -1])
+    v_tool = tool_velocity(forward_kinematics(machine, history[..., 0, -1]), history[..., 1, -1])
     return history, integrate_error(machine, v_goal, v_tool, integral)
 
 
@@ -321,10 +320,11 @@ def step(
     rewards = reward(state.v_goal, state.v_tool)
     error = np.linalg.norm(state.v_goal - state.v_tool, axis=-1)
     if not config.paper:
-        change = np.abs(u - state.history[..., 2, -2])
-        limit = len(machine.driven) * machine.pwm_limit / PWM_MAX
-        rewards = rewards - config.valve_cost * change.sum(axis=-1) / limit
+        change = np.abs(u - state.history[..., 2, -2]) * PWM_MAX / machine.pwm_limit
+        rewards = rewards - config.valve_cost * change[..., machine.driven].mean(axis=-1)
         rewards = rewards - config.integral_cost * np.linalg.norm(state.error_integral, axis=-1)
+        penalty = limit_penalty(machine, state.q)[0][..., machine.driven]
+        rewards = rewards - config.limit_cost * penalty.sum(axis=-1)
     end = terminated(machine, state.lowest) & ((state.ticks == 1) | (not config.paper))
     truncated = (state.ticks >= round(config.episode_s * machine.rate)) & ~end
     return state, np.where(end, 0.0, rewards), end, truncated, error

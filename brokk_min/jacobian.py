@@ -56,6 +56,17 @@ def limit_gradient(machine: Machine, q: ArrayLike) -> Array:
     return gradient
 
 
+def limit_penalty(machine: Machine, q: Array) -> tuple[Array, Array]:
+    """x^2 (..., n), a cost of `env.step`, and its derivative by `q` [rad]: x = +-1 at a limit.
+
+    0 but in the outer 5 % (tuned) of a range. Near legged_gym's `dof_pos_limits`, a linear one.
+    """
+    low, high = machine.column("q_min"), machine.column("q_max")
+    margin = 0.05 * (high - low)
+    x = (q - np.clip(q, low + margin, high - margin)) / margin
+    return x**2, 2 * x / margin
+
+
 def limit_weights(machine: Machine, q: ArrayLike, q_dot: ArrayLike) -> Array:
     """Diagonal of W for all joints, (..., n): 1 + |dh/dq| towards a limit, otherwise 1.
 
@@ -90,9 +101,6 @@ def manipulability_threshold(machine: Machine) -> float:
     poses = np.random.default_rng(0).uniform(low, high, (2000, machine.n))
     J = jacobian(forward_kinematics(machine, poses))[..., machine.driven]
     return 0.25 * float(manipulability(J).max()) + 1e-9
-
-
-# --- from joint velocities to valves --------------------------------------------------------------
 
 
 @dataclass(frozen=True)

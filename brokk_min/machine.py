@@ -204,9 +204,9 @@ def check_numbers(owner: Any, label: str = "") -> None:
             raise ValueError(f"{label}{field.name}: expected one of {values}, got {value!r}")
         if "unit" not in field.metadata or (value is None and type(None) in values):
             continue
-        types: Any = (int, np.integer) if hint is int else (int, float, np.integer, np.floating)
+        kind = "whole" if int in (hint, *values) else "finite"
+        types: Any = (int, np.integer) if kind == "whole" else (int, float, np.integer, np.floating)
         if isinstance(value, bool) or not isinstance(value, types) or not abs(value) < np.inf:
-            kind = "whole" if hint is int else "finite"
             raise ValueError(f"{label}{field.name}: expected a {kind} number, got {value!r}")
         low, high = field.metadata["low"], field.metadata["high"]
         low = getattr(owner, low) if isinstance(low, str) else low

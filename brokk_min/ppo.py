@@ -194,12 +194,6 @@ class Learner:
 OnUpdate = Callable[[Learner, Rollout, dict[str, float]], None]
 
 
-def use_fast_float32() -> None:
-    """OneDNN's products: on AMD twice as fast as MKL's. With AMX they would be bfloat16's."""
-    amx = torch.cpu.get_capabilities().get("amx_bf16", False)
-    torch.set_float32_matmul_precision("highest" if amx else "medium")
-
-
 def make_learner(
     env: VectorEnv[Any, Any, Any], config: PPOConfig, seed: int, critic: bool
 ) -> Learner:
@@ -208,7 +202,6 @@ def make_learner(
     if mode != AutoresetMode.SAME_STEP:
         raise ValueError(f"env: expected autoreset mode {AutoresetMode.SAME_STEP}, got {mode}")
     torch.set_num_threads(config.threads)
-    use_fast_float32()
     obs_size = math.prod(env.single_observation_space.shape or ())
     action_size = math.prod(env.single_action_space.shape or ())
     with torch.random.fork_rng():

@@ -42,6 +42,7 @@ from brokk_min.learning.simulation_gradient import Ticks, local_derivatives
 from brokk_min.machine import BROKK_170, Array, Machine
 from exercises.verdict import expect
 
+TASK = TaskConfig(valve_cost=0.0, integral_cost=0.0)
 SOLUTION = "brokk_min/learning/simulation_gradient.py: action_gradients"
 
 
@@ -50,7 +51,7 @@ def command_gradients(machine: Machine, net: ActuatorNet, ticks: Ticks, gamma: f
 
     `by.dr_dq_dot` is (T, num, n_driven), `by.dq_dot_dh` (T, num, n_driven, 3, H). No latents.
     """
-    by = local_derivatives(machine, net, ticks, gamma, integral_cost=0.0)
+    by = local_derivatives(machine, net, ticks, gamma, TASK)
     window = machine.velocity_samples
     slope = estimate_velocity(np.eye(window), window, machine.dt)  # of h's newest velocity by q
     raise NotImplementedError(by.dr_dq_dot.shape, by.dq_dot_dh.shape, slope.shape)
@@ -76,8 +77,7 @@ def simulate(machine: Machine, net: ActuatorNet, ticks: int) -> Ticks:
 
 def our_gradients(machine: Machine, net: ActuatorNet, ticks: Ticks, gamma: float) -> Array:
     """The package's answer: its gradient by actions, without the derivative of `action_to_pwm`."""
-    task = TaskConfig(valve_cost=0.0, integral_cost=0.0)
-    by_action = simulation_gradient.action_gradients(machine, net, ticks, gamma, task)
+    by_action = simulation_gradient.action_gradients(machine, net, ticks, gamma, TASK)
     return by_action / simulation_gradient.compensation_derivative(machine, ticks.u)
 
 

@@ -17,7 +17,7 @@ from brokk_min.evaluation.rollout import own_drives
 from brokk_min.identification import excitation, inspection, validation
 from brokk_min.identification.coupling import history_of
 from brokk_min.identification.files import brief, located, write_json
-from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
+from brokk_min.identification.fit_config import PAPER_RECIPE, STEP_RECIPE, FitConfig
 from brokk_min.identification.logs import RETURN, Log, part_of, read_log, split, write_log
 from brokk_min.identification.net_file import load_net, save_net
 from brokk_min.identification.simulation import recovery
@@ -75,6 +75,14 @@ class FitSettings(FitConfig):
 
     history: int | None = None  # type: ignore[assignment]
     """Samples of angle, velocity and command (paper: 13); by default the machine's."""
+    steps: int | None = None  # type: ignore[assignment]
+    """By default 16000, though 5000 do for a few minutes; 3000 for step responses."""
+    weight_decay: float | None = None  # type: ignore[assignment]
+    """By default 0, though 0.3 may help with a few minutes; 0.3 for step responses."""
+    noise: float | None = None  # type: ignore[assignment]
+    """Of velocity inputs, in their deviations; by default 0.1, 1 for step responses."""
+    output_lags: int | None = None
+    """Newest velocities and angles that nets read; by default all, 1 for step responses."""
 
     def __post_init__(self) -> None:
         """Leave the check to `Fit`."""
@@ -116,8 +124,9 @@ class Fit(Command):
             with located(*self.logs):
                 log, test = split(log)
         history = machine.history if known else history_of(log, machine.history)
-        config = self.config(known, history)
         reports = inspection.inspect(log)
+        steps_alone = inspection.has_steps_alone(reports)
+        config = self.config(known, history, steps_alone)
         with located(*self.logs):
             for wrong in inspection.wrong_signs(reports):
                 raise ValueError(wrong)
@@ -140,21 +149,28 @@ class Fit(Command):
             names = ("seed", "rate", "history", "machine", "dead_zone")
             meta: dict[str, Any] = {name: getattr(net, name) for name in names}
             meta |= {"logs": list(map(str, self.logs)), "test": list(map(str, self.test))}
+            meta["settings"] = net.settings
             write_json(self.json, {"meta": meta, **scores})
         save_figure(self.figure, scores, net, test, known)
         name = net.machine or "no known machine"
         print(f"nets of {name}, dead zone {net.dead_zone} of full command")
         seconds = net.history / net.rate
         print(f"history: {net.history} samples at {net.rate:g} Hz, {seconds:.2f} s")
+        if steps_alone and not self.paper:
+            defaults = ", ".join(f"{name} {value}" for name, value in STEP_RECIPE.items())
+            print(f"step responses, held commands of few levels: by default {defaults}")
         print_scores(scores)
 
-    def config(self, known: Machine | None, history: int) -> FitConfig:
-        """The settings, by default with the machine's history and dead zone; or the paper's."""
-        settings = vars(self.settings) | {"history": self.settings.history or history}
+    def config(self, known: Machine | None, history: int, steps_alone: bool = False) -> FitConfig:
+        """The settings, or the paper's; what is not given is by the machine and the log."""
+        settings: dict[str, Any] = {"history": history}
+        if known:
+            settings["dead_zone"] = known.dead_zone
+        if steps_alone and not self.paper:
+            settings |= STEP_RECIPE
+        settings |= {name: x for name, x in vars(self.settings).items() if x is not None}
         if self.paper:
             settings |= PAPER_RECIPE
-        elif known and settings["dead_zone"] is None:
-            settings["dead_zone"] = known.dead_zone
         return checked(FitConfig, **settings)
 
 

@@ -24,6 +24,8 @@ class FitConfig:
     shared: int = number("1", 0, 1000, 0)  # Latents of all joints' inputs: 4 for a pump and weight.
     dead_zone: float | None = number("1", 0, 0.99, None)
     """Command within which no valve opens; by default the known machine's, else 0."""
+    output_lags: int | None = number("samples", 0, 1000, None)
+    """Newest velocities and angles that nets read (paper: all); 0: the newest angle alone."""
     __post_init__ = check_numbers  # type: ignore[misc]
 
     @property
@@ -33,4 +35,7 @@ class FitConfig:
 
 
 PAPER_RECIPE: dict[str, Any] = {"noise": 0.0, "rollout": 1, "dead_zone": 0.0, "muon": 0.0}
+PAPER_RECIPE |= {"output_lags": None}
 """Sec. 3.3"""
+STEP_RECIPE: dict[str, Any] = {"steps": 3000, "weight_decay": 0.3, "noise": 1.0, "output_lags": 1}
+"""Tuned for logs of step responses, see `inspection.has_steps_alone`: docs/deviations.md, D19."""

@@ -3,6 +3,11 @@
 Training minimises errors of one step first, then the errors that add up over several steps of the
 nets on their own outputs: there a bias adds up and the noise of encoders does not. The nets of all
 joints are trained at once, each on the recordings in which its joint moves.
+
+A net that reads past velocities may learn to go on as they say, whatever the command: it then runs
+away in a free run (NARX: Leontaritis and Billings, 1985). One that reads commands and the newest
+angle has to find all in the commands (NFIR but for the angle: Nelles, Nonlinear System
+Identification, 2001). `FitConfig.output_lags` chooses.
 """
 
 import math
@@ -35,7 +40,8 @@ def fit(
     estimator that made the velocities of `log`; `machine` is a name, for the file.
     ValueError: a joint that never moves long enough, or weights that are not finite at the end.
     """
-    config = replace(config, dead_zone=config.dead_zone or 0.0)
+    lags = config.history if config.output_lags is None else config.output_lags
+    config = replace(config, dead_zone=config.dead_zone or 0.0, output_lags=lags)
     data = training_set(log, config)
     weights = train(data, config, seed, None if log.velocity_logged else velocity_samples)
     return ActuatorNet(
@@ -62,6 +68,7 @@ class TrainingSet(NamedTuple):
     multi_step_windows: list[NDArray[np.intp]]  # those with `rollout` samples after them
     input_mean: Tensor  # (n, I)
     input_scale: Tensor  # (n, I)
+    reads: Tensor  # (I,): `inputs_read`
     output_low: Tensor  # (n,) rad/s
     output_high: Tensor  # (n,) rad/s
     q_low: Tensor  # (n,) rad
@@ -95,12 +102,22 @@ def training_set(log: Log, config: FitConfig) -> TrainingSet:
         multi_step_windows=multi_step_windows,
         input_mean=torch.tensor(np.repeat(mean, config.history, axis=1)).float(),
         input_scale=torch.tensor(np.repeat(std, config.history, axis=1)).float(),
+        reads=inputs_read(config),
         output_low=torch.tensor(low - margin).float(),
         output_high=torch.tensor(high + margin).float(),
         q_low=torch.tensor(q.min(axis=0)).float(),
         q_high=torch.tensor(q.max(axis=0)).float(),
         rate=log.rate,
     )
+
+
+def inputs_read(config: FitConfig) -> Tensor:
+    """1 for inputs that the nets read, 0 for older angles and velocities: (I,)."""
+    H = config.history
+    lags = H if config.output_lags is None else config.output_lags
+    newest = torch.arange(H, 0, -1)  # 1: the newest sample
+    commands = torch.ones((1 + config.indicator) * H)
+    return torch.cat([newest <= max(lags, 1), newest <= lags, commands]).float()
 
 
 def _check_targets(log: Log, targets: list[Array], history: int) -> None:
@@ -150,19 +167,23 @@ def train(data: TrainingSet, config: FitConfig, seed: int, estimator: int | None
 def initial_weights(n: int, config: FitConfig, generator: Generator) -> list[Tensor]:
     """Weights, by He's uniform initialisation for ReLU, and zero biases of `n` nets.
 
-    Those of latents, if any, begin small: the nets begin nearly alone.
+    Those of latents, if any, begin small: the nets begin nearly alone. Those of inputs that nets
+    do not read are zero, and stay so.
     """
 
     def uniform(rows: int, columns: int, bound: float) -> Tensor:
         return (torch.rand(n, rows, columns, generator=generator) * 2 - 1) * bound
 
-    inputs = (3 + config.indicator) * config.history
-    hidden, latents = config.hidden, config.shared
+    reads = inputs_read(config)
+    inputs, hidden, latents = int(reads.sum()), config.hidden, config.shared
     weights = []
-    for rows, columns in [(inputs, hidden), (hidden, hidden), (hidden, 1)]:
-        weights += [uniform(rows, columns, math.sqrt(6 / rows)), torch.zeros(n, columns)]
+    shapes = [(len(reads), hidden, inputs), (hidden, hidden, hidden), (hidden, 1, hidden)]
+    for rows, columns, fan_in in shapes:
+        weights += [uniform(rows, columns, math.sqrt(6 / fan_in)), torch.zeros(n, columns)]
+    weights[0] *= reads[:, None]
     if latents:
-        weights.append(uniform(2 * inputs, latents, math.sqrt(1 / (2 * n * inputs))))
+        shared = uniform(2 * len(reads), latents, math.sqrt(1 / (2 * n * inputs)))
+        weights.append(shared * reads.tile(2)[:, None])
         weights.append(uniform(latents, hidden, math.sqrt(6 / inputs)))
         weights.append(torch.zeros(n, latents))
     return [weight.requires_grad_() for weight in weights]
@@ -253,7 +274,7 @@ def predict(
     """
     w1, b1, w2, b2, w3, b3 = weights[:6]
     x = torch.cat([q, q_dot, u.flatten(2)], dim=-1)
-    x = (x - data.input_mean[:, None]) / data.input_scale[:, None]
+    x = data.reads * (x - data.input_mean[:, None]) / data.input_scale[:, None]
     bias = b1[:, None]
     if len(weights) > 6:  # as `ActuatorNet.latents`
         both = torch.cat([x, x.abs()], dim=-1)

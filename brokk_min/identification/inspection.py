@@ -38,6 +38,7 @@ LEAST_MINUTES = 10.0
 LEAST_RANGE = 0.7  # of a joint's range
 LEAST_EXPLAINED = 0.1  # of a joint's motion by its commands
 LEAST_LEVELS = 6  # with 1 % of the commands or more
+STEPPED = 0.9  # `held` of step responses, at least
 LEAST_CHANGES = 0.05  # of the ticks: commands that change by more than a tenth of the largest
 CLOSED_LOOP = -0.42  # `feedback`: excitations give -0.4 to 0, going between places -0.6 to -0.5
 SMALL = 0.02  # of full command: larger changes are of goals, or of an excitation
@@ -56,6 +57,7 @@ class JointReport:
     low: float  # rad, smallest angle
     high: float  # rad
     levels: tuple[int, int]  # of `LEVELS` commands up and down that the log has
+    held: float  # part of the ticks with a command at which it stays as it was
     changes: float  # part of the ticks at which the command changes fast
     feedback: float  # correlation of commands with the angle a second before
     reaction: float  # part of the small changes of the command that measured motion explains
@@ -92,6 +94,7 @@ def inspect_joint(log: Log, recordings: list[Recording], j: int) -> JointReport:
     counts = [np.bincount(side.astype(int), minlength=LEVELS) for side in sides]
     levels = [int((count > 0.01 * max(count.sum(), 1)).sum()) for count in counts]
     changes = [np.abs(np.diff(one.u[:, j])) > 0.1 * largest for one in recordings]
+    stays = np.abs(np.diff(u[:, j]))[moving[1:, j]] < 0.01 * largest
     return JointReport(
         minutes=sum(len(r.u) for r in recordings if np.ptp(r.u[:, j]) > COMMANDED) / log.rate / 60,
         alone=float(1 - own[:, others].any(axis=1).mean()) if len(own) else 1.0,
@@ -99,6 +102,7 @@ def inspect_joint(log: Log, recordings: list[Recording], j: int) -> JointReport:
         low=float(q.min()),
         high=float(q.max()),
         levels=(levels[0], levels[1]),
+        held=float(stays.mean()) if len(stays) else 0.0,
         changes=float(np.concatenate(changes).mean()),
         feedback=feedback(recordings, j, log.rate),
         reaction=reaction(recordings, j),
@@ -286,6 +290,13 @@ def warnings(
         of_changes = f"commands follow the measured motion ({parts} of their small changes)"
         result.append(f"{of_changes}: a controller drove; scores hold for such driving alone")
     return result
+
+
+def has_steps_alone(reports: dict[str, JointReport]) -> bool:
+    """Whether each joint with commands has held ones of few levels, as in step responses."""
+    commanded = [report for report in reports.values() if max(report.levels)]
+    few = (max(r.levels) < LEAST_LEVELS and r.held > STEPPED for r in commanded)
+    return bool(commanded) and all(few)
 
 
 def fastest(log: Log, name: str, report: JointReport, limit: float, side: str) -> float:

@@ -74,6 +74,7 @@ def train_policy(
     finite. OSError: a file that cannot be written. The last checkpoint stays.
     """
     about = describe_training(machine, net, task, config, critic, seed)
+    use_fast_float32()
     env = TaskVectorEnv(config.num_envs, net, machine, task)
     if about["settings"]["critic"]:
         config = replace(config, log_std_end=None)
@@ -94,6 +95,12 @@ def train_policy(
     save_policy(out, policy, machine)
     log.checkpoint.unlink(missing_ok=True)
     return policy
+
+
+def use_fast_float32() -> None:
+    """OneDNN's products: on AMD twice as fast as MKL's. With AMX they would be bfloat16's."""
+    amx = torch.cpu.get_capabilities().get("amx_bf16", False)
+    torch.set_float32_matmul_precision("highest" if amx else "medium")
 
 
 def stagger_episodes(env: TaskVectorEnv) -> None:
@@ -265,6 +272,8 @@ class TrainingLog:
                 content = torch.load(file, weights_only=True)  # executes nothing
             header = files.parse_json(content["header"])
             identity = dict(header["identity"])
+            task = dict(identity.get("task", {}))
+            identity["task"] = asdict(TaskConfig()) | task  # options since then have no effect
         files.expect_same(self.checkpoint, header, {"format": FORMAT})
         files.expect_same(self.checkpoint, identity, self.about)
         for parameter in learner.agent.parameters():

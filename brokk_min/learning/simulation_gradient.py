@@ -62,6 +62,7 @@ from brokk_min.env import (
     integrate_error,
 )
 from brokk_min.identification.muon import Muon
+from brokk_min.jacobian import limit_penalty
 from brokk_min.kinematics import estimate_velocity, forward_kinematics, jacobian
 from brokk_min.machine import PWM_MAX, Array, Machine, valve_opening
 
@@ -83,6 +84,7 @@ class Ticks(NamedTuple):
 class Derivatives(NamedTuple):
     """Of each tick, by the history h that the nets read and the latents z that they share."""
 
+    dr_dq: Array  # by the angle after the tick, (T, num, n_driven): costs of limits
     dr_dq_dot: Array  # (T, num, n_driven)
     dq_dot_dh: Array  # by each joint's own history, (T, num, n_driven, 3, H)
     dq_dot_dz: Array  # (T, num, n_driven, L); L = 0: nets without latents
@@ -100,7 +102,7 @@ def make_learner(env: VectorEnv[Any, Any, Any], config: ppo.PPOConfig, seed: int
 def improved_actions(machine: Machine, net: ActuatorNet, task: TaskConfig) -> ppo.Estimate:
     """The estimate that `ppo.train` takes, for rollouts of `gym_env.TaskVectorEnv` on `net`."""
     if task.paper:  # as in `env.step`
-        task = replace(task, valves="open", valve_cost=0.0, integral_cost=0.0)
+        task = replace(task, valves="open", valve_cost=0.0, integral_cost=0.0, limit_cost=0.0)
 
     @torch.no_grad()
     def estimate(
@@ -153,10 +155,10 @@ def action_gradients(
     """dR_t/da_t: derivative of the discounted rewards to come by each action.
 
     `net` are the nets of the driven joints, which made the rollout. Rewards after the last tick do
-    not count. Of `task` the costs of valve travel and of the error integral hold. Returns
-    (T, num, n_driven), float32, by actions as `env.action_to_pwm` takes them.
+    not count. `task` has the costs. Returns (T, num, n_driven), float32, by actions as
+    `env.action_to_pwm` takes them.
     """
-    by = local_derivatives(machine, net, ticks, gamma, task.integral_cost)
+    by = local_derivatives(machine, net, ticks, gamma, task)
     dc_du = valve_cost_gradient(machine, ticks, task.valve_cost)
     window = machine.velocity_samples
     slope = estimate_velocity(np.eye(window), window, machine.dt).astype(np.float32)  # dq_dot/dq
@@ -169,7 +171,8 @@ def action_gradients(
         discount = np.float32(gamma) * ~ticks.done[t, :, None]
         dR_dh = discount[..., None, None] * dR_dh
         dR_dh[..., 0, -window:] += dR_dh[..., 1, -1:] * slope  # the newest q_dot is a slope of q
-        dR_dq = by.free[t] * (discount * dR_dq + dR_dh[..., 0, -1])  # none at a limit
+        dR_dq = discount * dR_dq + dR_dh[..., 0, -1] + by.dr_dq[t]
+        dR_dq = by.free[t] * dR_dq  # none at a limit
         dR_dq_dot = np.float32(machine.dt) * dR_dq + by.dr_dq_dot[t]  # q_{t+1} = q_t + dt q_dot
         # by what the net read: the history before the tick, its command row with u_t already in it
         before = dR_dq_dot[..., None, None] * by.dq_dot_dh[t]
@@ -194,7 +197,7 @@ def valve_cost_gradient(machine: Machine, ticks: Ticks, valve_cost: float) -> Ar
 
 
 def local_derivatives(
-    machine: Machine, net: ActuatorNet, ticks: Ticks, gamma: float, integral_cost: float
+    machine: Machine, net: ActuatorNet, ticks: Ticks, gamma: float, task: TaskConfig
 ) -> Derivatives:
     """Derivatives within each tick; the history h has the command of the tick in it."""
     driven = machine.driven
@@ -210,9 +213,11 @@ def local_derivatives(
     size = np.linalg.norm(error, axis=-1, keepdims=True)
     # d/dv_tool of 1 / (1 + |e|), e = v_goal - v_tool: e / (|e| (1 + |e|)^2) (eq2)
     dr_dv = error / (np.maximum(size, 1e-6) * (1 + size) ** 2)
-    dr_dv += integral_gradient(machine, ticks, error, gamma, integral_cost)
+    dr_dv += integral_gradient(machine, ticks, error, gamma, task.integral_cost)
     dr_dq_dot = (dr_dv[..., None, :] @ J)[..., 0, :] * free  # v_tool = J q_dot
-    return Derivatives(dr_dq_dot, dq_dot_dh, dq_dot_dz, dz_dh, free.astype(np.float32))
+    dr_dq = (-task.limit_cost * limit_penalty(machine, q)[1][..., driven]).astype(np.float32)
+    by_h_and_z = dq_dot_dh, dq_dot_dz, dz_dh
+    return Derivatives(dr_dq, dr_dq_dot, *by_h_and_z, free.astype(np.float32))
 
 
 def integral_gradient(

@@ -15,8 +15,11 @@ from brokk_min import kinematics
 from brokk_min.env import action_to_pwm
 from brokk_min.evaluation import learn, metrics, sequences
 from brokk_min.identification.files import SHIPPED
-from brokk_min.identification.logs import read_log
+from brokk_min.identification.fit_config import STEP_RECIPE
+from brokk_min.identification.fitting import FitConfig, fit
+from brokk_min.identification.logs import Recording, read_log
 from brokk_min.identification.net_file import save_net
+from brokk_min.identification.validation import score
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import load_policy
 from brokk_min.machine import BROKK_170
@@ -91,16 +94,16 @@ def test_deviations__train_and_compare(entry, monkeypatch):
     """One update of 64 ticks; what the policy does is not tested. All is as before afterwards."""
 
     def evaluate(*_):
-        row = {"velocity_error_mean": 0.1, "off_axis_drift_max": 0.02, "valve_travel": 20.0}
-        return [row], None
+        names = ("velocity_error_mean", "off_axis_drift_max", "valve_travel", "time_at_limits")
+        return [dict(zip(names, (0.1, 0.02, 20.0, 0.5), strict=True))], None
 
     monkeypatch.setattr(deviations, "STEPS", 1)
     monkeypatch.setattr(metrics, "evaluate", evaluate)
     monkeypatch.setattr(deviations, "default_training", dict)
     to_heading = kinematics.to_heading
     table = entry()
-    assert len(table) in (6, 12)
-    assert set(table.values()) == {0.1, 0.02, 20.0}
+    assert len(table) in (8, 16)
+    assert set(table.values()) == {0.1, 0.02, 20.0, 0.5}
     assert kinematics.to_heading is to_heading
 
 
@@ -147,6 +150,22 @@ def test_step_logs__have_steps_of_one_joint_and_late_answers(tmp_path):
         first = np.flatnonzero(one.u[:, j])[0]
         assert np.ptp(one.q[: first + 20, j]) < 0.03  # rad of noise, 0.2 s after the command
         assert np.ptp(one.q[:, j]) > 0.1
+
+
+def test_step_logs__are_followed_by_nets_of_their_recipe(tmp_path):
+    """Others run away from the speed of duties that are not in the log."""
+    train, test = (read_log([path], 4, rate=20.0) for path in make_logs(tmp_path, 1))
+    parts = []
+    for log in (train, test):
+        steps = (one for one in log.recordings if one.u[:, 1].any())
+        arms = (Recording(one.name, *(x[:, 1:2] for x in one[1:])) for one in steps)
+        parts.append(log._replace(joints=("arm",), recordings=tuple(arms)))
+    error = {}
+    for name, recipe in (("ours", {}), ("steps", STEP_RECIPE)):
+        config = FitConfig(**{**recipe, "history": 19, "steps": 600})
+        net = fit(parts[0], config, seed=0, velocity_samples=4)
+        error[name] = score(net, parts[1])["arm"]["free_run"]["5"]["velocity_rmse"]
+    assert error["steps"] < 0.6 * error["ours"], error
 
 
 def test_faults__find_a_frozen_encoder_of_a_moving_joint_in_the_log_of_a_drive():

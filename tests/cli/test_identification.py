@@ -45,6 +45,7 @@ def test_fit__takes_a_foreign_log_and_beats_persistence_and_a_linear_model(tmp_p
     assert run(f"fit '{tmp_path}/log.csv' --steps 400 --out", tmp_path / "n.npz", *files) == 0
     written = json.loads((tmp_path / "f.json").read_text())
     assert set(written) == {"meta", "joints", "tool", "warnings"}
+    assert written["meta"].pop("settings")["steps"] == 400
     assert written["meta"] == {
         "seed": 0,
         "rate": 20.0,
@@ -103,6 +104,32 @@ def test_fit__takes_rate_history_and_velocity_window_of_the_machine(tmp_path):
         assert run(line + options) == 0
         net = load_net(tmp_path / "n.npz")
         assert (net.machine, net.rate, net.velocity_samples, net.history) == expected
+
+
+@pytest.mark.parametrize(
+    ("levels", "options", "expected"),
+    [
+        (8, "--steps 1", (1, 0.0, 0.1, 13)),
+        (5, "--steps 1", (1, 0.3, 1.0, 1)),
+        (5, "--steps 1 --output-lags 20 --noise 0.5", (1, 0.3, 0.5, 20)),
+        (5, "--steps 1 --paper", (1, 0.0, 0.0, 13)),
+    ],
+)
+def test_fit__has_a_recipe_for_step_responses(levels, options, expected, tmp_path, capsys):
+    """Held commands of so many levels, up and down, and angles that follow them."""
+    held = np.tile(np.arange(1, levels + 1) / levels, 10)
+    u = np.repeat(np.stack([held, -held], axis=1).ravel(), 20)[:, None]
+    q = np.cumsum(0.3 * u, axis=0) / 20
+    recordings = [Recording(name, u, q, u) for name in ("one", "two")]
+    write_log(tmp_path / "log.npz", Log(("a",), tuple(recordings)))
+    files = ["--out", tmp_path / "n.npz", "--json", tmp_path / "n.json"]
+    assert run(f"fit {options} --batch-size 8", tmp_path / "log.npz", *files) == 0
+    settings = load_net(tmp_path / "n.npz").settings
+    names = ("steps", "weight_decay", "noise", "output_lags")
+    assert tuple(settings[name] for name in names) == expected
+    assert json.loads((tmp_path / "n.json").read_text())["meta"]["settings"] == settings
+    recipe = "by default steps 3000, weight_decay 0.3, noise 1.0, output_lags 1\n"
+    assert (recipe in capsys.readouterr().out) == (levels == 5 and "paper" not in options)
 
 
 def test_fit__refuses_the_log_of_another_machine(tmp_path, capsys):

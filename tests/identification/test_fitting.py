@@ -75,7 +75,8 @@ def test_fit__states_how_the_nets_were_fitted():
     net = fit(log, config, 7, 3, "toy")
     assert (net.joints, net.history, net.rate) == (("boom", "stick"), 5, 20.0)
     assert (net.velocity_samples, net.velocity_logged, net.machine) == (3, False, "toy")
-    assert (net.seed, net.dead_zone, net.settings) == (7, 0.25, vars(config))
+    settings = vars(config) | {"output_lags": 5}
+    assert (net.seed, net.dead_zone, net.settings) == (7, 0.25, settings)
     u = np.concatenate([mu_law(r.u, 0.25)[4:-1] for r in log.recordings])
     mean = np.tile(u.mean(axis=0)[:, None], 5)
     np.testing.assert_allclose(net.input_mean[:, 10:15], mean, rtol=1e-6)
@@ -114,6 +115,22 @@ def test_fit__uses_one_step_errors_where_recordings_are_too_short_for_more():
     config = FitConfig(steps=5, batch_size=8, rollout=8)
     one_step = fit(log, replace(config, rollout=1), seed=0, velocity_samples=4)
     assert same_weights(one_step, fit(log, config, seed=0, velocity_samples=4))
+
+
+@pytest.mark.parametrize(("lags", "shared"), [(0, 0), (3, 0), (1, 2), (13, 0)])
+def test_fit__has_nets_that_read_the_newest_outputs_and_all_commands(lags, shared):
+    """No other sample changes what they predict, before the fit and after; each of these does."""
+    for steps in (0, 10):
+        config = FitConfig(steps, batch_size=16, shared=shared, output_lags=lags)
+        net = fit(simple_system(0, 3, 60), config, seed=0, velocity_samples=4)
+        history = np.random.default_rng(0).uniform(-1, 1, (200, 2, 3, 13)).astype(np.float32)
+        before = net.forward(history)[0]
+        for row, newest in enumerate((max(lags, 1), lags, 13)):
+            for sample in range(13):
+                other = history.copy()
+                other[..., row, sample] += 0.5
+                changed = (net.forward(other)[0] != before).any()
+                assert changed == (sample >= 13 - newest), (row, sample)
 
 
 @pytest.mark.filterwarnings("ignore")

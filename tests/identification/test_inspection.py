@@ -14,6 +14,7 @@ from brokk_min.identification.inspection import (
     REACTS,
     feedback,
     fields,
+    has_steps_alone,
     inspect,
     is_ramp,
     reaction,
@@ -194,6 +195,42 @@ def test_warnings__know_an_operators_work_from_an_excitation():
     assert about.startswith("boom: ") and "fast changes of command in " in about
     assert about.endswith("scores hold for such driving alone")
     assert len(warnings(excited("boom"), inspected("boom"))) == 1  # the arm alone
+
+
+def duties(*levels, ticks=60):
+    """Commands held for some ticks each, with pauses as long, up and down."""
+    steps = np.stack([levels, np.zeros(len(levels)), -np.array(levels), np.zeros(len(levels))])
+    return np.repeat(np.tile(steps.T.ravel(), 20), ticks)
+
+
+TIME = np.arange(4000) / 20
+BUMP = (np.abs(TIME - 100) < 0.25) * 0.5  # s; one short full command
+
+
+@pytest.mark.parametrize(
+    ("commands", "expected"),
+    [
+        ([duties(0.4, 0.5, 0.6, 0.8, 1.0)], True),
+        ([duties(0.4, 1.0), 0 * TIME], True),  # the other one moves without commands
+        ([np.full(200, x) for x in (0.4, 0.5, -0.5, 1.0)], True),  # a recording for each step
+        ([duties(0.4, 1.0), 0.9 * np.sin(TIME)], False),
+        ([duties(0.1, 0.2, 0.4, 0.5, 0.7, 0.8, 1.0)], False),
+        ([duties(0.5, 1.0, ticks=3)], False),  # fast switching
+        ([0.5 * np.sin(TIME) + BUMP], False),
+        ([np.abs(np.sin(TIME))], False),  # one way
+        ([0 * TIME], False),
+    ],
+)
+def test_has_steps_alone__knows_step_responses_from_driving(commands, expected):
+    """Of one joint, or of one after the other."""
+    recordings = []
+    for i, u in enumerate(commands):
+        column = int(i > 0 and len(commands) == 2)
+        both = np.zeros((len(u), 2))
+        both[:, column] = u
+        q = np.cumsum(0.01 + 0.3 * both, axis=0) / 20
+        recordings.append(Recording(f"r{i}", both, q, velocity_of(q, 4)))
+    assert has_steps_alone(inspect(Log(("boom", "arm"), tuple(recordings)))) == expected
 
 
 def test_feedback__tells_who_goes_between_places_from_an_excitation():

@@ -1,6 +1,7 @@
 """Training with files: the same bits after an interruption, curves, refusals, a full disk."""
 
 import csv
+import json
 import os
 import signal
 from dataclasses import replace
@@ -12,7 +13,13 @@ import torch
 from helpers_machines import obedient_net, small_net
 
 from brokk_min.env import TaskConfig
-from brokk_min.learning.checkpoint import TrainingLog, export_policy, stagger_episodes, train_policy
+from brokk_min.learning.checkpoint import (
+    TrainingLog,
+    export_policy,
+    stagger_episodes,
+    train_policy,
+    use_fast_float32,
+)
 from brokk_min.learning.episodes import GRADIENT_LEARNER, PAPER_TASK, get_obs
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import load_policy, save_policy
@@ -145,6 +152,12 @@ def test_train_policy__learns_a_little(tmp_path):
     assert np.mean(errors[-4:]) < 0.85 * np.mean(errors[:2]), errors
 
 
+def test_use_fast_float32__keeps_the_digits_of_float32():
+    use_fast_float32()  # an Intel processor with AMX would otherwise have three digits
+    a = torch.randn(256, 256, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close((a @ a).double(), a.double() @ a.double(), atol=1e-3, rtol=0)
+
+
 def test_stagger_episodes__ends_them_one_after_the_other():
     env = TaskVectorEnv(8, NET, BROKK_170, TaskConfig(episode_s=2.0))
     env.reset(seed=0)
@@ -244,6 +257,16 @@ def test_train_policy__refuses_the_checkpoint_of_another_training(broken, change
     with pytest.raises(ValueError, match=r"p\.npz\.checkpoint: " + message):
         run(broken, resume=True, **change)
     assert checkpoint.read_bytes() == data
+
+
+def test_train_policy__resumes_a_checkpoint_from_before_an_option(broken, straight):
+    checkpoint = broken.with_name("p.npz.checkpoint")
+    content = torch.load(checkpoint, weights_only=True)
+    header = json.loads(content["header"])
+    del header["identity"]["task"]["limit_cost"]
+    torch.save(content | {"header": json.dumps(header)}, checkpoint)
+    run(broken, resume=True)
+    assert read_curve(broken) == read_curve(straight)
 
 
 def test_train_policy__wants_resume_and_checkpoint_and_curve_of_this_version(broken):

@@ -34,8 +34,8 @@ def exact(machine, q):
     return q
 
 
-def costs(valve=0.0, integral=0.0):
-    return TaskConfig(valve_cost=valve, integral_cost=integral)
+def costs(valve=0.0, integral=0.0, limit=0.0):
+    return TaskConfig(valve_cost=valve, integral_cost=integral, limit_cost=limit)
 
 
 def simulate(machine, net, state, commands):
@@ -165,6 +165,33 @@ def test_action_gradients__include_the_cost_of_the_error_integral(machine, seed,
     np.testing.assert_allclose(costly - free, difference, rtol=5e-3, atol=1e-3 * size + 1e-5)
 
 
+@settings(max_examples=5)
+@given(strategies.machines(2, 5), st.integers(0, 999))
+def test_action_gradients__include_the_cost_of_limits(machine, seed):
+    """Ranges end close to where joints are; the cost is that of a twentieth of a range, by hand."""
+    net, start, commands = moving_case(machine, seed)
+    q = np.stack([state.q for state in simulate(machine, net, start, commands)])
+    room = 0.02 * np.ptp(q, axis=(0, 1)) + 1e-6
+    low, high = q.min(axis=(0, 1)) - room, q.max(axis=(0, 1)) + room
+    ranges = zip(machine.joints, low, high, strict=True)
+    joints = tuple(replace(joint, q_min=a, q_max=b) for joint, a, b in ranges)
+    machine = replace(machine, joints=joints, q_start=())
+
+    def penalties(machine, states, _):
+        q = np.stack([state.q for state in states[1:]])[..., machine.driven]
+        a, b = low[machine.driven], high[machine.driven]
+        inside = np.minimum(q - a, b - q) / (b - a)  # 0 at a limit, 0.5 in the middle
+        return (np.maximum(0, 1 - 20 * inside) ** 2).sum(axis=-1)
+
+    ticks = ticks_of(simulate(machine, net, start, commands), commands)
+    free = action_gradients(machine, net, ticks, 0.8, costs())
+    costly = action_gradients(machine, net, ticks, 0.8, costs(limit=3.0))
+    difference = -3 * finite_differences(machine, net, start, commands, 0.8, penalties)
+    size = np.abs(difference).max()
+    assert size > 0
+    np.testing.assert_allclose(costly - free, difference, rtol=5e-3, atol=1e-3 * size + 1e-5)
+
+
 @given(strategies.machines(), st.integers(0, 999))
 def test_action_gradients__include_the_cost_of_valve_travel(machine, seed):
     """A command is moved to (now) and away from (one tick later, discounted)."""
@@ -202,7 +229,7 @@ def test_action_gradients__stop_at_the_end_of_an_episode():
     done[4, 1] = True
 
     def gradients(ticks):
-        return action_gradients(machine, net, ticks, 0.9, costs(0.01, 2.0))
+        return action_gradients(machine, net, ticks, 0.9, costs(0.01, 2.0, 0.3))
 
     whole = gradients(ticks_of(states, commands))
     cut = gradients(ticks_of(states, commands, done))
@@ -247,7 +274,7 @@ def test_improved_actions__are_means_and_a_saturated_step_along_the_gradient(pap
     commands = env.action_to_pwm(BROKK_170, rollout.actions.numpy(), paper)
     ticks = ticks_of([*states, states[-1]], commands, rollout.dones.numpy())
     if paper:
-        task = replace(task, valves="open", valve_cost=0.0, integral_cost=0.0)
+        task = replace(task, valves="open", valve_cost=0.0, integral_cost=0.0, limit_cost=0.0)
     gradient = action_gradients(BROKK_170, net, ticks, config.gamma, task)
     norm = np.linalg.norm(gradient, axis=-1, keepdims=True)
     largest = np.maximum(norm, np.sort(norm, axis=None)[(norm.size - 1) // 2])

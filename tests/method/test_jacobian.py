@@ -19,6 +19,7 @@ from brokk_min.jacobian import (
     PIDState,
     dls,
     limit_gradient,
+    limit_penalty,
     limit_weights,
     manipulability,
     manipulability_threshold,
@@ -83,6 +84,15 @@ def test_limit_weights__act_towards_a_limit_only(machine, seed):
     towards = ((fraction > 0.5) & (q_dot > 0)) | ((fraction < 0.5) & (q_dot < 0))
     np.testing.assert_allclose(W[towards], 1 + np.abs(limit_gradient(machine, q))[towards])
     np.testing.assert_allclose(W[~towards], 1)
+
+
+def test_limit_penalty__by_hand():
+    """In fortieths of the range: the first is half of the margin; in between there is none."""
+    width = HIGH - LOW
+    for fortieths, x in ((0, -1), (1, -0.5), (2, 0), (20, 0), (38, 0), (39, 0.5), (40, 1)):
+        value, derivative = limit_penalty(BROKK_170, LOW + fortieths / 40 * width)
+        np.testing.assert_allclose(value, np.full(5, x**2), atol=1e-12)
+        np.testing.assert_allclose(derivative * width, np.full(5, 40 * x), atol=1e-9)
 
 
 def test_limit_weights__stop_a_joint_at_its_limit():

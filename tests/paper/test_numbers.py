@@ -16,7 +16,8 @@ def test_constants__are_the_papers() -> None:
     machine = BROKK_170
     assert machine.n == 5
     assert machine.q_start == (1.5, 0.5, 0.58, 1.71, 1.24)
-    assert (machine.history, fitting.FitConfig().history) == (13, 13)
+    fit = fitting.FitConfig()
+    assert (machine.history, fit.history, fit.output_lags) == (13, 13, None)  # None: all
     assert (machine.history - 1) * machine.dt == pytest.approx(0.6)
     assert fitting.FitConfig().hidden == 32
     assert TaskConfig().noise == 0.05

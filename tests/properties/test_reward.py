@@ -53,16 +53,22 @@ def plants_and_actions(draw: st.DrawFn) -> tuple[Machine, np.ndarray, np.ndarray
     return machine, low + fraction * (high - low), goals, action
 
 
-@given(plants_and_actions(), reals(0, 1), reals(0, 5))
-def test_step__subtracts_its_costs_from_eq2(case, valve_cost, integral_cost):
-    """r = 1 / (1 + |e|) - c_v mean |du| / limit - c_i |integral|; 0 in the ground."""
+@given(plants_and_actions(), reals(0, 1), reals(0, 5), reals(0, 2))
+def test_step__subtracts_its_costs_from_eq2(case, valve_cost, integral_cost, limit_cost):
+    """r = 1 / (1 + |e|) - c_v mean |du| / limit - c_i |integral| - c_l sum x^2; 0 in the ground.
+
+    x goes from 0 to 1 in the outer twentieths of a joint's range.
+    """
     machine, q, goals, action = case
-    config = TaskConfig(valve_cost=valve_cost, integral_cost=integral_cost)
+    config = TaskConfig(valve_cost=valve_cost, integral_cost=integral_cost, limit_cost=limit_cost)
     state = initial_state(machine, q, goals, plant=True)
     after, r, terminated_, truncated, error = step(machine, config, None, state, action)
     change = np.abs(after.history[..., 2, -1] - state.history[..., 2, -1])[:, machine.driven]
     cost = valve_cost * change.mean(-1) / (machine.pwm_limit / 127)
     cost = cost + integral_cost * np.linalg.norm(after.error_integral, axis=-1)
+    low, high = machine.column("q_min"), machine.column("q_max")
+    inside = (np.minimum(after.q - low, high - after.q) / (high - low))[:, machine.driven]
+    cost = cost + limit_cost * np.sum(np.maximum(0, 1 - 20 * inside) ** 2, axis=-1)
     np.testing.assert_allclose(error, np.linalg.norm(goals - after.v_tool, axis=-1), atol=1e-6)
     expected = np.where(terminated_, 0.0, reward(goals, after.v_tool) - cost)
     np.testing.assert_allclose(r, expected, atol=1e-5)
