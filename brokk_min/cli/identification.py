@@ -82,7 +82,8 @@ class FitSettings(FitConfig):
     noise: float | None = None  # type: ignore[assignment]
     """Of velocity inputs, in their deviations; by default 0.1, 1 for step responses."""
     output_lags: int | None = None
-    """Newest velocities and angles that nets read; by default all, 1 for step responses."""
+    """Newest velocities and angles that nets read; by default all (--history or more), 1 for step
+    responses."""
 
     def __post_init__(self) -> None:
         """Leave the check to `Fit`."""
@@ -127,6 +128,9 @@ class Fit(Command):
         reports = inspection.inspect(log)
         steps_alone = inspection.has_steps_alone(reports)
         config = self.config(known, history, steps_alone)
+        if steps_alone and not self.paper:
+            values = ", ".join(f"{name} {getattr(config, name)}" for name in STEP_RECIPE)
+            print(f"step responses, held commands of few levels: {values}")
         with located(*self.logs):
             for wrong in inspection.wrong_signs(reports):
                 raise ValueError(wrong)
@@ -155,10 +159,8 @@ class Fit(Command):
         name = net.machine or "no known machine"
         print(f"nets of {name}, dead zone {net.dead_zone} of full command")
         seconds = net.history / net.rate
+        print(f"scored on: {brief([recording.name for recording in test.recordings])}")
         print(f"history: {net.history} samples at {net.rate:g} Hz, {seconds:.2f} s")
-        if steps_alone and not self.paper:
-            defaults = ", ".join(f"{name} {value}" for name, value in STEP_RECIPE.items())
-            print(f"step responses, held commands of few levels: by default {defaults}")
         print_scores(scores)
 
     def config(self, known: Machine | None, history: int, steps_alone: bool = False) -> FitConfig:

@@ -38,7 +38,8 @@ LEAST_MINUTES = 10.0
 LEAST_RANGE = 0.7  # of a joint's range
 LEAST_EXPLAINED = 0.1  # of a joint's motion by its commands
 LEAST_LEVELS = 6  # with 1 % of the commands or more
-STEPPED = 0.9  # `held` of step responses, at least
+STEPPED = 0.8  # `held` of step responses, at least; excitations have 0.7 or less
+MANY_LEVELS = 7  # that step responses do not have
 LEAST_CHANGES = 0.05  # of the ticks: commands that change by more than a tenth of the largest
 CLOSED_LOOP = -0.42  # `feedback`: excitations give -0.4 to 0, going between places -0.6 to -0.5
 SMALL = 0.02  # of full command: larger changes are of goals, or of an excitation
@@ -58,6 +59,7 @@ class JointReport:
     high: float  # rad
     levels: tuple[int, int]  # of `LEVELS` commands up and down that the log has
     held: float  # part of the ticks with a command at which it stays as it was
+    held_levels: int  # of `LEVELS`, at these ticks, in the direction that has more
     changes: float  # part of the ticks at which the command changes fast
     feedback: float  # correlation of commands with the angle a second before
     reaction: float  # part of the small changes of the command that measured motion explains
@@ -91,10 +93,10 @@ def inspect_joint(log: Log, recordings: list[Recording], j: int) -> JointReport:
     largest = max(np.abs(u[:, j]).max(), 1e-9)
     level = np.floor(LEVELS * np.abs(u[:, j]) / largest).clip(0, LEVELS - 1)
     sides = [level[side * u[:, j] > COMMANDED] for side in (1, -1)]
-    counts = [np.bincount(side.astype(int), minlength=LEVELS) for side in sides]
-    levels = [int((count > 0.01 * max(count.sum(), 1)).sum()) for count in counts]
+    levels = [count_levels(side) for side in sides]
     changes = [np.abs(np.diff(one.u[:, j])) > 0.1 * largest for one in recordings]
-    stays = np.abs(np.diff(u[:, j]))[moving[1:, j]] < 0.01 * largest
+    stays = np.abs(np.diff(u[:, j], prepend=np.inf)) < 0.01 * largest
+    held = [level[stays & (side * u[:, j] > COMMANDED)] for side in (1, -1)]
     return JointReport(
         minutes=sum(len(r.u) for r in recordings if np.ptp(r.u[:, j]) > COMMANDED) / log.rate / 60,
         alone=float(1 - own[:, others].any(axis=1).mean()) if len(own) else 1.0,
@@ -102,12 +104,19 @@ def inspect_joint(log: Log, recordings: list[Recording], j: int) -> JointReport:
         low=float(q.min()),
         high=float(q.max()),
         levels=(levels[0], levels[1]),
-        held=float(stays.mean()) if len(stays) else 0.0,
+        held=float(stays[moving[:, j]].mean()) if moving[:, j].any() else 0.0,
+        held_levels=max(map(count_levels, held)),
         changes=float(np.concatenate(changes).mean()),
         feedback=feedback(recordings, j, log.rate),
         reaction=reaction(recordings, j),
         **joint_model(recordings, j, log.rate),
     )
+
+
+def count_levels(level: Array) -> int:
+    """How many levels have more than 1 % of these commands (samples,)."""
+    count = np.bincount(level.astype(int), minlength=LEVELS)
+    return int((count > 0.01 * max(count.sum(), 1)).sum())
 
 
 def is_ramp(u: Array, rate: float) -> bool:
@@ -256,6 +265,7 @@ def warnings(
 ) -> list[str]:
     """Where the log is an operator's work rather than an excitation: its score is of such work."""
     result = wrong_signs(reports)
+    steps_alone = has_steps_alone(reports)
     for name in log.joints:
         if name not in reports:
             result.append(f"{name}: never driven in the log")
@@ -267,7 +277,9 @@ def warnings(
                 min(r.levels) < LEAST_LEVELS
             ),
             f"fast changes of command in {r.changes:.1%} of the ticks": r.changes < LEAST_CHANGES,
-            f"commands that follow the angle ({r.feedback:.2f})": r.feedback < CLOSED_LOOP,
+            f"commands that follow the angle ({r.feedback:.2f})": (
+                r.feedback < CLOSED_LOOP and not steps_alone  # steps up and down seem to
+            ),
         }
         if machine:
             joint = machine.joints[machine.names.index(name)]
@@ -295,8 +307,8 @@ def warnings(
 def has_steps_alone(reports: dict[str, JointReport]) -> bool:
     """Whether each joint with commands has held ones of few levels, as in step responses."""
     commanded = [report for report in reports.values() if max(report.levels)]
-    few = (max(r.levels) < LEAST_LEVELS and r.held > STEPPED for r in commanded)
-    return bool(commanded) and all(few)
+    steps = (r.held > STEPPED and r.held_levels < MANY_LEVELS for r in commanded)
+    return bool(commanded) and all(steps)
 
 
 def fastest(log: Log, name: str, report: JointReport, limit: float, side: str) -> float:

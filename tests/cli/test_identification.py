@@ -128,8 +128,12 @@ def test_fit__has_a_recipe_for_step_responses(levels, options, expected, tmp_pat
     names = ("steps", "weight_decay", "noise", "output_lags")
     assert tuple(settings[name] for name in names) == expected
     assert json.loads((tmp_path / "n.json").read_text())["meta"]["settings"] == settings
-    recipe = "by default steps 3000, weight_decay 0.3, noise 1.0, output_lags 1\n"
-    assert (recipe in capsys.readouterr().out) == (levels == 5 and "paper" not in options)
+    printed = capsys.readouterr().out
+    values = ", ".join(map("{} {}".format, names, expected))
+    is_recipe = levels == 5 and "paper" not in options
+    recipe = f"step responses, held commands of few levels: {values}\n"
+    assert (recipe in printed, "step responses" in printed) == (is_recipe, is_recipe)
+    assert "scored on: ['two']\n" in printed
 
 
 def test_fit__refuses_the_log_of_another_machine(tmp_path, capsys):
