@@ -118,11 +118,9 @@ def join_recordings(log: Log) -> Samples:
 def split(log: Log) -> tuple[Log, Log]:
     """Recordings to fit to, and to score on: every tenth of those that drive the same joints.
 
-    Of less than ten it is the middle one: the first may have the least commands. ValueError: no
-    two recordings drive the same joints.
+    ValueError: no two recordings drive the same joints.
     """
-    groups = [group for group in same_joints(log) if len(group) > 1]
-    held_out = {i for group in groups for i in group[(len(group) < 10) * len(group) // 2 :: 10]}
+    held_out = {i for group in same_joints(log) if len(group) > 1 for i in group[::10]}
     if not held_out:
         expected = "expected two or more that drive the same joints, or --test, to score on"
         raise ValueError(f"recordings: {expected}, got {len(log.recordings)}")

@@ -133,7 +133,7 @@ def test_fit__has_a_recipe_for_step_responses(levels, options, expected, tmp_pat
     is_recipe = levels == 5 and "paper" not in options
     recipe = f"step responses, held commands of few levels: {values}\n"
     assert (recipe in printed, "step responses" in printed) == (is_recipe, is_recipe)
-    assert "scored on: ['two']\n" in printed
+    assert "scored on: ['one']\n" in printed
 
 
 def test_fit__refuses_the_log_of_another_machine(tmp_path, capsys):
