@@ -5,8 +5,10 @@ dead zone of each direction, times a gain of each direction, through a first-ord
 
     q_dot' = (g_up max(u(t - d) - z_up, 0) - g_down max(-u(t - d) - z_down, 0) - q_dot) / tau
 
-Recordings of slow ramps (`collect --excitation ramp`), if a log has any, give the dead zones:
-there the delay hardly counts, and the curve beyond, such as a pump that starves, does not.
+Samples at which a joint is pushed on at an end of its range do not count, if much more is explained
+so: it rests at its stop. Recordings of slow ramps (`collect --excitation ramp`), if a log has any,
+give the dead zones: there the delay hardly counts, and the curve beyond, such as a pump that
+starves, does not.
 """
 
 import math
@@ -21,6 +23,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from brokk_min.identification.logs import COMMANDED, Log, Recording, driven
 from brokk_min.machine import PWM_MAX, Array, Machine
 
+AT_STOP = 0.01  # of the range of a log's angles, assumed: so near an end a joint may be at a stop
+STOPS = 0.02  # of the motion, assumed: without stops the model explains 0.01 more at most
 LARGEST_ZONE = 0.4  # of full command, assumed
 ZONES = np.arange(0, LARGEST_ZONE, 0.005)
 TAUS = (0.05, 0.1, 0.2, 0.4)  # s, assumed
@@ -149,10 +153,22 @@ def fit_model(
     lengths = [math.ceil(share * len(one.u)) for one in recordings]
     u = np.concatenate([one.u[:k, j] for one, k in zip(recordings, lengths, strict=True)])
     q = np.concatenate([one.q[:k, j] for one, k in zip(recordings, lengths, strict=True)])
-    velocity = np.diff(q, append=q[-1]) * rate
+    q_next = np.append(q[1:], q[-1])
+    velocity = (q_next - q) * rate
     velocity[np.cumsum(lengths) - 1] = 0.0  # no velocity from one recording to the next
+    margin = AT_STOP * np.ptp(q)
+    end = 1 * (q_next > q.max() - margin) - (q_next < q.min() + margin)
+    whole = signed_model(u, velocity, 0 * end, rate, zones)
+    model = signed_model(u, velocity, end, rate, zones)
+    return model if model["explained"] - whole["explained"] > STOPS else whole
+
+
+def signed_model(
+    u: Array, velocity: Array, end: Array, rate: float, zones: list[float] | None
+) -> dict[str, Any]:
+    """Fields of the model with gains of the better sign."""
     power = max(float(velocity @ velocity), 1e-12)
-    models = {sign: best_model(u, velocity, rate, sign, zones) for sign in (1, -1)}
+    models = {sign: best_model(u, velocity, end, rate, sign, zones) for sign in (1, -1)}
     explained = {sign: 1 - model["error"] / power for sign, model in models.items()}
     better = explained[1] - explained[-1]
     model = models[1 if better > -CLEAR_SIGN else -1]
@@ -164,10 +180,13 @@ def fit_model(
 
 
 def best_model(
-    u: Array, velocity: Array, rate: float, sign: int, given: list[float] | None = None
+    u: Array, velocity: Array, end: Array, rate: float, sign: int, given: list[float] | None = None
 ) -> dict[str, float]:
-    """The model with gains of one sign, by turns of a grid of delays and lags, and dead zones."""
-    fit = partial(fit_gains, u, velocity, rate, sign)
+    """The model with gains of one sign, by turns of a grid of delays and lags, and dead zones.
+
+    `end` (T,) is 1 where the joint comes to its greatest angle, -1 to its least, else 0.
+    """
+    fit = partial(fit_gains, u, velocity, end, rate, sign)
     zones = given or [0.05, 0.05]
     for _ in range(2):
         grid = product(range(round(LATEST * rate) + 1), TAUS)
@@ -186,7 +205,14 @@ def best_model(
 
 
 def fit_gains(
-    u: Array, velocity: Array, rate: float, sign: int, delay: int, tau: float, zones: list[float]
+    u: Array,
+    velocity: Array,
+    end: Array,
+    rate: float,
+    sign: int,
+    delay: int,
+    tau: float,
+    zones: list[float],
 ) -> tuple[float, Array]:
     """Sum of the squared errors of the model with the best gains of a sign; and these gains."""
     from scipy.signal import lfilter  # slow to import
@@ -195,10 +221,11 @@ def fit_gains(
     late = np.concatenate([np.zeros(delay), u])[: len(u)]
     openings = np.stack([np.maximum(late - up, 0), -np.maximum(-late - down, 0)])
     a = np.exp(-1 / (rate * tau))
-    x = lfilter([1 - a], [1, -a], openings)
-    gains = np.linalg.lstsq(x @ x.T + 1e-9 * np.eye(2), x @ velocity, rcond=None)[0]
+    free = sign * late * end <= 0  # not pushed on at an end of its range
+    x = lfilter([1 - a], [1, -a], openings)[:, free]
+    gains = np.linalg.lstsq(x @ x.T + 1e-9 * np.eye(2), x @ velocity[free], rcond=None)[0]
     gains = sign * np.maximum(sign * gains, 0)
-    error = velocity - gains @ x
+    error = velocity[free] - gains @ x
     return float(error @ error), gains
 
 

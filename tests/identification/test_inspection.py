@@ -31,7 +31,7 @@ TRUE = {  # dead zones, gains [rad/s per full opening], delay [ticks of 0.05 s],
 NUMBERS = count()
 
 
-def respond(name, u):
+def respond(name, u, stop=np.inf):
     """Angles [rad] of a joint of `TRUE` under the commands u (T,), in counts of 14 bits."""
     up, down, gain_up, gain_down, delay, tau = TRUE[name]
     late = np.concatenate([np.zeros(delay), u])[: len(u)]
@@ -41,16 +41,16 @@ def respond(name, u):
     for v in wanted:
         angles.append(q)
         q_dot += (1 - np.exp(-0.05 / tau)) * (v - q_dot)
-        q += 0.05 * q_dot
+        q = np.clip(q + 0.05 * q_dot, -stop, stop)
     step = 2 * np.pi / 2**14
     return np.rint(np.array(angles) / step) * step
 
 
-def record(name, commands):
+def record(name, commands, stop=np.inf):
     """A recording in which one joint of `TRUE` is driven."""
     j = list(TRUE).index(name)
     u, q = np.zeros((2, len(commands), len(TRUE)))
-    u[:, j], q[:, j] = commands, respond(name, commands)
+    u[:, j], q[:, j] = commands, respond(name, commands, stop)
     return Recording(f"{name} {next(NUMBERS)}", u, q, velocity_of(q, 4))
 
 
@@ -92,6 +92,18 @@ def test_inspect__finds_what_is_true():
         assert report.tau == pytest.approx(tau, abs=0.1)
         assert report.minutes == pytest.approx(4 * 4000 / 20 / 60)
         assert report.alone == 1 and report.levels == (8, 8)
+
+
+def test_inspect__does_not_count_joints_that_are_pushed_against_their_stops():
+    commands = np.repeat(np.random.default_rng(0).uniform(-0.8, 0.8, 200), 40)  # 2 s each
+    for name, (up, down, gain_up, gain_down, *_) in TRUE.items():
+        recording = record(name, commands, stop=0.3)
+        j = list(TRUE).index(name)
+        assert (np.abs(recording.q[:, j]) > 0.299).mean() > 0.4
+        report = inspect(Log(tuple(TRUE), (recording,)))[name]
+        assert (report.dead_zone_up, report.dead_zone_down) == pytest.approx((up, down), abs=0.011)
+        assert (report.gain_up, report.gain_down) == pytest.approx((gain_up, gain_down), rel=0.1)
+        assert report.sign == np.sign(gain_up)
 
 
 def test_inspect__takes_a_part_of_each_recording_of_a_long_log():
