@@ -12,7 +12,7 @@ the last axis of an array runs over joints or x, y, z, leading axes are batches 
 Glossary:
     tick          one control period, 1/rate (of the Brokk 1/20 s)
     q, q_dot      joint angle [rad], joint velocity [rad/s]; of a prismatic joint [m], [m/s]
-    u             command in [-1, 1] of full valve opening; `encode_pwm` makes its byte on the bus
+    u             command, -1 to 1 of the full one; `encode_pwm` makes its byte on the bus
     p, v          position [m] and velocity [m/s] of the tool tip
     v_goal        velocity that the tool should have [m/s]
     J, W          Jacobian of the tool position; weights of the damped least squares

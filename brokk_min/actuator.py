@@ -6,6 +6,7 @@ plant's equations. `identification.fitting` makes nets from logs.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal, NamedTuple
@@ -19,6 +20,7 @@ from brokk_min.machine import Array, Machine, as_floats, limit_command, valve_co
 REST_AFTER = {"closed": 0.5, "dither": 0.1, "open": math.inf}  # s of a zero goal, assumed, tuned
 STANDSTILL = 0.002  # rad or m, assumed: little more than one step of a 12-bit encoder
 Valves = Literal["closed", "dither", "open"]  # what they do while the tool rests
+Encoder = Callable[[Machine, Array], Array]  # machine, true angles -> measured angles
 MU = 50.0  # assumed: the mu law is about linear below 1/50 of full opening
 INDICATOR_SCALE = 0.02  # of full opening, assumed: 2.4 counts of 127 at a dead zone of 7 %
 
@@ -122,7 +124,7 @@ def initial_history(q: ArrayLike, samples: int) -> Array:
 
 
 def append_command(history: Array, u: ArrayLike) -> Array:
-    """History (..., n, 3, H) with the command `u` (..., n) of this tick: the nets' input."""
+    """The nets' input: (..., n, 3, H) with the command `u` (..., n); angles, velocities stay."""
     result = history.copy()
     result[..., 2, :-1] = history[..., 2, 1:]
     result[..., 2, -1] = u
@@ -136,8 +138,8 @@ def command_at_rest(
 
     "closed": zero. The joints stand, but the next motion begins 0.3 s later. "dither": driven
     valves open by `dither`, each tick the other way; the joints stand, the valves stay open
-    (Merritt 1967). "open": no rule (the paper). `ticks` (...) are those of a zero goal (..., 3)
-    before this one. Returns commands, does the rule hold (..., 1), and the ticks with this one.
+    (Merritt 1967). "open": no rule (the paper). `ticks` (...): for how long `v_goal` [m/s] (..., 3)
+    was zero before. Returns commands, does the rule hold (..., 1), and the ticks with this one.
     """
     ticks = np.where(v_goal.any(axis=-1), 0, ticks + 1)
     resting = (ticks > REST_AFTER[valves] * machine.rate)[..., None]
@@ -256,9 +258,9 @@ class ActuatorNet:
         zone, within `STANDSTILL` of its oldest angle, stands still; the net alone would creep.
         """
         velocity = self.forward(history)[0]
-        still = np.abs(history[..., 0, -1] - history[..., 0, 0]) < STANDSTILL
-        velocity[still] *= (np.abs(history[still][:, 2]) > self.dead_zone).any(axis=-1)
-        return velocity
+        moved = np.abs(history[..., 0, -1] - history[..., 0, 0]) >= STANDSTILL
+        opened = (np.abs(history[..., 2, :]) > self.dead_zone).any(axis=-1)
+        return np.asarray(velocity * (moved | opened))
 
     def inputs(self, history: Array) -> Array:
         """Histories (..., n, 3, H) as the first layer reads them, (..., n, I).

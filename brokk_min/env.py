@@ -18,7 +18,7 @@ Observation: Box, float32, (223,), (x - mean) / deviation * weight of these bloc
 "Uniform": over its range. The newest sample is last. Heading frame: x from slew axis to tool.
 
 Action: Box(-1, 1, (4,)), of the largest command of each driven joint, see `action_to_pwm`.
-Reward: 1 / (1 + |v_goal - v_tool|) (eq2), less costs of valve travel, error integral and limits.
+Reward: 1 / (1 + |v_goal - v_tool|) (eq2), less costs of valve travel, error integral (and limits).
 Start: at rest in a random pose above the ground, with a random goal that changes now and then.
 End: terminated, without reward, with a link in the ground; truncated after 20 s.
 
@@ -28,7 +28,6 @@ are linear, its reward is eq2 alone. Only a start in the ground terminates. No r
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple
@@ -37,15 +36,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brokk_min import actuator, kinematics, machine
-from brokk_min.actuator import ActuatorNet, PlantState, append_sample, initial_history
+from brokk_min.actuator import ActuatorNet, Encoder, PlantState, append_sample, initial_history
 from brokk_min.jacobian import dls, limit_penalty
 from brokk_min.kinematics import forward_kinematics, jacobian, tool_velocity
 from brokk_min.machine import PWM_MAX, Array, Machine, as_floats, limit_command, read_encoder
 
 INTEGRAL_TIME = 2.0  # s, tuned: time constant of the error integral's leak
 INTEGRAL_LIMIT = 0.07  # of tool_speed, tuned: velocity errors count up to here
-COMPENSATION = 0.01  # of an action, assumed: over this a command crosses the dead zone
-Encoder = Callable[[Machine, Array], Array]  # machine, true angles -> measured angles
+COMPENSATION = 0.01  # of an action, assumed: up to here a command rises to the dead zone
 
 
 @dataclass(frozen=True)
@@ -58,7 +56,7 @@ class TaskConfig:
     zero_goals: float = machine.number("1", 0, 1, 0.15)  # Fraction of goals of zero velocity.
     axis_goals: float = machine.number("1", 0, 1, 0.4)  # Fraction along x, y or z; others anywhere.
     noise: float = machine.number("1", 0, 1000, 0.05)  # Uniform, up to +- deviations (paper: 5 %).
-    valve_cost: float = machine.number("1", 0, 1000, 0.1)  # Of a full change of all (paper: 0).
+    valve_cost: float = machine.number("1", 0, 1000, 0.1)  # If all change by the limit (paper: 0).
     integral_cost: float = machine.number("1/m", 0, 1000, 1.0)  # Of the error integral (paper: 0).
     limit_cost: float = machine.number("1", 0, 1000, 0.0)  # Of each joint at a limit; try 0.3.
     valves: actuator.Valves = "closed"  # While the tool rests: `actuator.command_at_rest`.
@@ -146,18 +144,17 @@ def measure(
     (..., 3), both in the base frame; `noise` of what sensors measure, in deviations (..., noisy).
     """
     q = history[..., 0, -1].copy()
-    q_dot = history[..., 1, -1]
-    history = history.take(machine.driven, axis=-3)
+    driven = history.take(machine.driven, axis=-3)
     error = np.asarray(noise * sensor_std(machine))
     v_error, q_error, history_error = np.split(error, [3, 3 + len(machine.locked)], axis=-1)
     q[..., machine.locked] += q_error
-    history[..., :2, :] += history_error.reshape(*error.shape[:-1], -1, 2, machine.history)
-    q[..., machine.driven] = actuator.smooth_angles(machine, history)
+    driven[..., :2, :] += history_error.reshape(*error.shape[:-1], -1, 2, machine.history)
+    q[..., machine.driven] = actuator.smooth_angles(machine, driven)
     frames = forward_kinematics(machine, q)
     p_tool = kinematics.tool_position(frames)
     J = jacobian(frames)
-    v_tool = (J @ q_dot[..., None])[..., 0] + v_error  # v = J q_dot, with noise of its own
-    return Measured(v_goal, v_tool, q, history[..., 1, -1], history, integral, p_tool, J)
+    v_tool = (J @ history[..., 1, -1, None])[..., 0] + v_error  # v = J q_dot, noise of its own
+    return Measured(v_goal, v_tool, q, driven[..., 1, -1], driven, integral, p_tool, J)
 
 
 def features(machine: Machine, measured: Measured, paper: bool = False) -> Array:
@@ -247,20 +244,22 @@ class State:
 def initial_state(machine: Machine, q: ArrayLike, v_goal: ArrayLike, plant: bool) -> State:
     """Machines at rest at angles `q` [rad] (..., n) with goals (..., 3) [m/s] that never change."""
     q = np.array(q, float)
+    plant_state = actuator.plant_reset(machine, q) if plant else None
+    encoder = read_encoder(machine, getattr(plant_state, "encoder", q)).astype(np.float32)
     goal = np.broadcast_to(np.asarray(v_goal, np.float32), (*q.shape[:-1], 3))
     return State(
         q=q,
         q_dot=np.zeros_like(q),
         v_tool=np.zeros_like(goal),
         lowest=kinematics.lowest_point(forward_kinematics(machine, q.astype(np.float32))),
-        history=initial_history(read_encoder(machine, q).astype(np.float32), machine.history),
+        history=initial_history(encoder, machine.history),
         true_history=initial_history(q[..., machine.driven].astype(np.float32), machine.history),
         v_goal=goal,
         goal_ticks=np.full(q.shape[:-1], np.iinfo(np.int64).max),
         ticks=np.zeros(q.shape[:-1], np.int64),
         rest_ticks=np.zeros(q.shape[:-1], np.int64),
         error_integral=np.zeros_like(goal),
-        plant=actuator.plant_reset(machine, q) if plant else None,
+        plant=plant_state,
     )
 
 
@@ -269,7 +268,7 @@ def transition(
 ) -> State:
     """One tick under the command `u` (..., n), by the plant if the state has one, else by the nets.
 
-    `read` gives encoder angles, of q or a state's own `encoder`; nets get true q. Paper: Sec. 3.4
+    `read` gives encoder angles, of q or a plant's own `encoder`; nets get true q. Paper: Sec. 3.4
     """
     plant = state.plant and actuator.plant_step(machine, state.plant, u)
     q = plant.q if plant else actuator.net_step(machine, net, state.true_history, state.q, u)

@@ -55,7 +55,7 @@ class Drive:
         self.start_time = 0.0  # s; deadlines are at whole ticks after it
         self.deadline_number = 0
         self.ticks = 0
-        self.skipped = 0
+        self.skipped = 0  # ticks
         self.lateness = 0.0  # s
 
     def begin(self) -> None:
@@ -84,7 +84,7 @@ class Drive:
         with self.catch_errors():
             entered = self.operator(bool(self.gate.driving), bool(self.gate.active_fault == 0))
             self.operator_input = canopen.unpack_operator_input(entered.pack())  # as in the log
-        self.nodes.frames *= 2  # a position from before SYNC then counts twice: a fault
+        self.nodes.frames *= 2  # 1 is sound: a position that came before SYNC becomes 2, a fault
         with self.catch_errors():
             self.bus.send(canopen.SYNC, b"")
             answer_by = self.bus.now() + ANSWER_TIME * self.machine.dt

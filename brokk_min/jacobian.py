@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def dls(J: ArrayLike, W: ArrayLike, damping: ArrayLike, as_printed: bool = False) -> Array:
-    """Weighted damped least-squares inverse W^-1 J^T (J W^-1 J^T + lambda^2 I)^-1, (..., n, 3).
+    """Weighted damped least squares W^-1 J^T (J W^-1 J^T + lambda^2 I)^-1 [rad/m], (..., n, 3).
 
     q_dot = dls(J, W, damping) @ v minimises |J q_dot - v|^2 + lambda^2 q_dot^T W q_dot. The paper
     prints J W J^T in the bracket. That is the minimiser only for W = I. Paper: eq4
@@ -44,7 +44,7 @@ def dls(J: ArrayLike, W: ArrayLike, damping: ArrayLike, as_printed: bool = False
 
 
 def limit_gradient(machine: Machine, q: ArrayLike) -> Array:
-    """Gradient of the joint-limit function of Chan and Dubey (1995) at angles `q` [rad], (..., n).
+    """Gradient [1/rad] of Chan and Dubey's (1995) joint-limit function at angles `q`, (..., n).
 
     h(q) = sum over joints of (q_max - q_min)^2 / (4 (q_max - q) (q - q_min)).
     """
@@ -54,17 +54,6 @@ def limit_gradient(machine: Machine, q: ArrayLike) -> Array:
     # dh/dq = (q_max - q_min)^2 (2 q - q_max - q_min) / (4 (q_max - q)^2 (q - q_min)^2)
     gradient: Array = (high - low) ** 2 * (2 * q - high - low) / (4 * ((high - q) * (q - low)) ** 2)
     return gradient
-
-
-def limit_penalty(machine: Machine, q: Array) -> tuple[Array, Array]:
-    """x^2 (..., n), a cost of `env.step`, and its derivative by `q` [rad]: x = +-1 at a limit.
-
-    0 but in the outer 5 % (tuned) of a range. Near legged_gym's `dof_pos_limits`, a linear one.
-    """
-    low, high = machine.column("q_min"), machine.column("q_max")
-    margin = 0.05 * (high - low)
-    x = (q - np.clip(q, low + margin, high - margin)) / margin
-    return x**2, 2 * x / margin
 
 
 def limit_weights(machine: Machine, q: ArrayLike, q_dot: ArrayLike) -> Array:
@@ -79,13 +68,13 @@ def limit_weights(machine: Machine, q: ArrayLike, q_dot: ArrayLike) -> Array:
 
 
 def manipulability(J: ArrayLike) -> Array:
-    """w = sqrt(det(J J^T)) of Jacobians (..., 3, n), (...); 0 at a singularity. Yoshikawa (1985)"""
+    """w = sqrt(det(J J^T)) [m^3] of Jacobians (..., 3, n), (...); 0: singular. Yoshikawa (1985)"""
     J = np.asarray(J)
     return np.asarray(np.sqrt(np.maximum(np.linalg.det(J @ np.swapaxes(J, -1, -2)), 0.0)))
 
 
 def nakamura_damping(w: ArrayLike, w0: float, k: float) -> Array:
-    """lambda^2 = k (1 - w/w0)^2 for w < w0, else 0 (Nakamura, Hanafusa, 1986). Paper: Sec. 4.2
+    """lambda^2 = k (1 - w/w0)^2 [m^2] for w < w0, else 0 (Nakamura, 1986). Paper: Sec. 4.2
 
     Example:
         >>> nakamura_damping([0.0, 0.5, 1.0, 2.0], 1.0, 0.1)
@@ -131,16 +120,16 @@ class PIDState(NamedTuple):
 class JacobianController:
     """Resolved rates by damped least squares (eq3), then one PID per driven joint.
 
-    The PID gives the valve opening; the dead zone is added afterwards. While the tool
-    is to move, no valve goes below the opening `min_opening`: one that has closed answers late
-    (paper Sec. 3.2); it soon opens wider for a while (near: Hagglund 2002). At rest
+    The PID gives the valve opening; the dead zone is added afterwards. While the tool is to move, a
+    valve that opens at all opens by `min_opening` or more: one that has closed answers late (paper
+    Sec. 3.2), so it opens wider at first (`start_boost`; near: Hagglund 2002). At rest
     `command_at_rest` has a rule, unless `valves` are "open". Paper: eq3, Sec. 4.2
     """
 
     machine: Machine
     gains: Gains
-    k: float  # of Nakamura's damping
-    w0: float  # manipulability below which damping sets in
+    k: float  # of Nakamura's damping [m^2]
+    w0: float  # manipulability below which damping sets in [m^3]
     feedforward: Callable[[Array, Array], Array] | None = None  # q, q_dot (..., n_driven) -> u
     valves: str = "closed"  # or, at rest, "dither", or "open": no rule, and `min_opening` holds
 
@@ -163,7 +152,7 @@ class JacobianController:
         direction[..., driven] = last
         J = jacobian(forward_kinematics(m, q))[..., driven]
         W = limit_weights(m, q, direction)[..., driven]
-        J_inv = dls(J, W, nakamura_damping(manipulability(J), self.w0, self.k) + 1e-9)  # rank < 3
+        J_inv = dls(J, W, nakamura_damping(manipulability(J), self.w0, self.k) + 1e-9)  # singular
         v = v_goal + self.gains.feedback * (v_goal - v_tool)
         v = v + self.gains.integral_feedback * integral  # v_d + K (v_d - v_ee) + K_I integral
         q_dot = (J_inv @ v[..., None])[..., 0]
@@ -206,3 +195,14 @@ class JacobianController:
         u = np.zeros((*opening.shape[:-1], m.n))
         u[..., m.driven] = valve_command(opening, m.dead_zones[m.driven])
         return limit_command(m, u)
+
+
+def limit_penalty(machine: Machine, q: Array) -> tuple[Array, Array]:
+    """x^2 (..., n), a cost of `env.step`, and its derivative by `q` [rad]: x = +-1 at a limit.
+
+    0 but in the outer 5 % (tuned) of a range. Near legged_gym's `dof_pos_limits`, a linear one.
+    """
+    low, high = machine.column("q_min"), machine.column("q_max")
+    margin = 0.05 * (high - low)
+    x = (q - np.clip(q, low + margin, high - margin)) / margin
+    return x**2, 2 * x / margin

@@ -1,7 +1,7 @@
 """Hand-written Denavit-Hartenberg kinematics: frames, tool position, Jacobian, tool velocity.
 
 One forward kinematics gives the frames of a pose; all else is worked out from these frames. The
-base frame has z up and its origin on the ground under the first axis. Paper: Fig. 1
+base frame has z up and its origin on the first axis, of the Brokk on the ground. Paper: Fig. 1
 
 Example:
     >>> from brokk_min.machine import BROKK_170
@@ -39,7 +39,7 @@ def forward_kinematics(machine: Machine, q: ArrayLike) -> Frames:
     ValueError: `q` has another number of joints.
     """
     q = as_floats(q)
-    if q.ndim < 1 or q.shape[-1] != machine.n:
+    if q.shape[-1:] != (machine.n,):
         raise ValueError(f"q: expected (..., {machine.n}), got {q.shape}")
     # in here all axes are reversed, vectors are (3, ...): c * x scales x at each pose of a batch
     q = np.ascontiguousarray(q.T)
@@ -51,9 +51,7 @@ def forward_kinematics(machine: Machine, q: ArrayLike) -> Frames:
     for i, joint in enumerate(machine.joints):
         theta, d = (joint.theta, joint.d + q[i]) if slides[i] else (joint.theta + q[i], joint.d)
         x, y = rotate(x, y, np.cos(theta), np.sin(theta))  # Rz(theta)
-        p[:, i + 1] = p[:, i] + joint.a * x  # Tx(a)
-        if joint.d or slides[i]:
-            p[:, i + 1] += d * z  # Tz(d)
+        p[:, i + 1] = p[:, i] + d * z + joint.a * x  # Tz(d) Tx(a)
         if joint.alpha:
             y, z = rotate(y, z, math.cos(joint.alpha), math.sin(joint.alpha))  # Rx(alpha)
         axes[:, i + 1] = z
@@ -104,16 +102,14 @@ def lowest_point(frames: Frames) -> Array:
         >>> round(float(lowest_point(frames)), 2)
         0.95
     """
-    heights = frames.p[..., 1:, 2]
-    return np.asarray(heights.min(axis=-1))
+    return np.asarray(frames.p[..., 1:, 2].min(axis=-1))
 
 
 def to_heading(p: Array, v: Array) -> Array:
-    """Vector `v` (..., 3) in the heading frame of the tool at `p` [m]; on the axis x, y = 0."""
+    """Vector `v` (..., 3) in the heading frame of a tool at `p` [m]; on the axis without x, y."""
     radius = np.maximum(np.hypot(p[..., 0], p[..., 1]), 1e-6)
-    c = p[..., 0] / radius
-    s = p[..., 1] / radius
-    return np.stack([c * v[..., 0] + s * v[..., 1], c * v[..., 1] - s * v[..., 0], v[..., 2]], -1)
+    x, y = rotate(v[..., 0], v[..., 1], p[..., 0] / radius, p[..., 1] / radius)
+    return np.stack([x, y, v[..., 2]], axis=-1)
 
 
 def estimate_velocity(q: ArrayLike, samples: int, dt: float) -> Array:
@@ -121,6 +117,7 @@ def estimate_velocity(q: ArrayLike, samples: int, dt: float) -> Array:
 
     The one estimator of the package. A difference over one tick of a 12-bit encoder comes in steps
     of 0.031 rad/s at 20 Hz; four samples have a third of its noise and are 1.5 ticks late.
+    ValueError: `samples` below 2, or fewer angles.
     """
     q = as_floats(q)
     if samples < 2 or q.shape[-1] < samples:

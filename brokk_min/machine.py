@@ -42,20 +42,20 @@ class Joint:
     theta: float = number("rad")
     q_min: float = number("rad or m")
     q_max: float = number("rad or m")
-    q_dot_up: float = number("rad/s or m/s", 1e-9)  # fastest positive motion, nominal: at
-    q_dot_down: float = number("rad/s or m/s", 1e-9)  # the command limit; negative motion, > 0
+    q_dot_up: float = number("rad/s or m/s", 1e-9)  # fastest motion at the command limit, nominal:
+    q_dot_down: float = number("rad/s or m/s", 1e-9)  # up, and down; both are positive
     encoder_node: int = number("CANopen node id", 1, 127)
     cylinder_base: float = number("m", 0, default=0.0)
     cylinder_rod: float = number("m", 1e-6, default=1.0)
     cylinder_angle: float = number("rad", default=0.0)
     cylinder_area: float = number("m^2", 1e-9, default=0.005)
-    speed_positive: float = number("m/s", 0, default=0.0)  # of the cylinder at full command
-    speed_negative: float = number("m/s", 0, default=0.0)  # 0: of q_dot_* at arm cylinder_rod
+    speed_positive: float = number("m/s", 0, default=0.0)  # of the cylinder at full command, up
+    speed_negative: float = number("m/s", 0, default=0.0)  # and down; 0: worked out in `complete`
     encoder_zero: int = number("counts", default=0)  # the reading at q = 0
     encoder_sign: Literal[-1, 1] = 1  # -1: it counts down while q rises
     kind: Literal["revolute", "prismatic"] = "revolute"
     encoder_step: float = number("m a count", 1e-9, 1, 1e-4)  # if prismatic, else `encoder_bits`
-    weight: float = number("1", 1e-9, 1e9, 1.0)  # in W; if prismatic 1/L^2, L the arm's length [m]
+    weight: float = number("1 or 1/m^2", 1e-9, 1e9, 1.0)  # in W; if prismatic 1/L^2, L of the arm
     dead_zone_up: float | None = number("of full command", 0, 0.99, None)  # None: the machine's
     dead_zone_down: float | None = number("of full command", 0, 0.99, None)
 
@@ -71,10 +71,10 @@ class Joint:
             raise ValueError(f"{self.name}.cylinder_angle: {expected}, got {low:.3f} to {high:.3f}")
 
     def complete(self, zones: Array, limit: float, counts: int) -> Joint:
-        """With encoder step, and cylinder speeds (if 0) for q_dot_up, q_dot_down at the limit."""
-        r_up, r_down = self.cylinder_rod * (1 - zones) / (limit - zones)
-        up = self.speed_positive or self.q_dot_up * float(r_up)
-        down = self.speed_negative or self.q_dot_down * float(r_down)
+        """With encoder step and, where 0, the cylinder speeds that give q_dot_up and q_dot_down."""
+        full_up, full_down = self.cylinder_rod * (1 - zones) / (limit - zones)  # arm / opening
+        up = self.speed_positive or self.q_dot_up * float(full_up)
+        down = self.speed_negative or self.q_dot_down * float(full_down)
         step = self.encoder_step if self.kind == "prismatic" else 2 * np.pi / counts
         return replace(self, speed_positive=up, speed_negative=down, encoder_step=step)
 
@@ -95,15 +95,15 @@ class Machine:
     ground: float = number("m")  # height of the ground in the base frame
     valve_frame_id: int = number("CAN id", 0, 0x7FF)
     controller_node: int = number("CANopen node id", 1, 127)  # of the valve controller
-    largest_dead_zone: float = number("of full command", 0, 0.99, default=0.0)  # 0: 1.5 dead zones
+    largest_dead_zone: float = number("of full command", 0, 0.99, default=0.0)  # gate; 0: 1.5 zones
     dither: float = number("of full stroke", 0, 0.5, default=0.03)  # at rest, beyond the dead zone
     # Of the analytic plant alone; by default what is assumed of the Brokk, with any pump flow.
     delay: float = number("s", 0, default=0.040)  # to the valve, in whole plant_dt
     plant_dt: float = number("s", 1e-6, 1, 0.005)  # step of explicit Euler, at most each tau
-    tau_spool: float = number("s", "plant_dt", default=0.030)  # times: spool, cylinder speed,
-    tau_cylinder: float = number("s", "plant_dt", default=0.030)
-    tau_valve_up: float = number("s", "plant_dt", default=0.15)  # activation (400 ms from idle)
-    tau_valve_down: float = number("s", "plant_dt", default=0.40)
+    tau_spool: float = number("s", "plant_dt", default=0.030)  # time constant of the spool
+    tau_cylinder: float = number("s", "plant_dt", default=0.030)  # of the cylinder's speed
+    tau_valve_up: float = number("s", "plant_dt", default=0.15)  # of a valve's activation, rising
+    tau_valve_down: float = number("s", "plant_dt", default=0.40)  # and falling
     valve_threshold: float = number("1", 0, 0.999, 0.80)  # a valve of less activation is closed
     spool_threshold: float = number("of full stroke", 0, 1, 0.01)  # above it a valve activates
     pump_flow: float = number("m^3/s", 1e-9, default=1.0)
@@ -195,7 +195,7 @@ class Machine:
 
 
 def check_numbers(owner: Any, label: str = "") -> None:
-    """ValueError: a number that is not finite, not whole where it must be, or out of its range."""
+    """ValueError: a number not finite, not whole or out of its range; a choice not offered."""
     hints = get_type_hints(type(owner))
     for field in dataclasses.fields(owner):
         value, hint = getattr(owner, field.name), hints[field.name]
@@ -310,7 +310,7 @@ def encode_pwm(u: ArrayLike) -> NDArray[np.uint8]:
 
 
 def decode_pwm(u_byte: ArrayLike) -> NDArray[np.float64]:
-    """Signed command in [-1, 1] for a byte (...); 0 and 255 both mean idle. Paper: Sec. 3.2"""
+    """Command in [-1, 1] for a byte (...); 0 and 255: idle. ValueError: no byte. Paper: Sec. 3.2"""
     u_byte = np.asarray(u_byte).astype(int)
     wrong = (u_byte < 0) | (u_byte > 255)
     if wrong.any():

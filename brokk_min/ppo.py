@@ -3,7 +3,7 @@
 It trains on any Gymnasium vector environment that resets in the same step. A truncated episode did
 not fail: its return goes on with the value of its own last observation. At a termination it stops.
 Advantages come from a critic, as in the paper; `train` takes another estimate and loss as well.
-Names are CleanRL's, but horizon is num_steps, target_kl steers the learning rate. Paper: Sec. 3.4
+Names are CleanRL's, but num_steps is horizon; target_kl steers the learning rate. Paper: Sec. 3.4
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from brokk_min.machine import check_numbers, number
 
 @dataclass(frozen=True)
 class PPOConfig:
-    """Settings; those that the paper names are marked, others searched (docs/deviations.md, D7)."""
+    """Of PPO with a critic, the paper's marked (D7). Ours: `episodes.GRADIENT_LEARNER` (D10)."""
 
     total_steps: int = number("steps", 1, 10**12, 6_000_000)  # Environment steps in all.
     num_envs: int = number("1", 1, 10**6, 256)  # Environments side by side (paper: 256).
@@ -65,8 +65,8 @@ def mlp(inputs: int, outputs: int, std: float) -> nn.Sequential:
 class Agent(nn.Module):
     """Actor, logarithm of the actions' standard deviation and, if advantages need one, critic.
 
-    The critic's output is in mean deviations within a batch, from the returns' mean so far; near
-    rl_games' `normalize_value`, which pools them (compare PopArt, van Hasselt et al., 2016).
+    value = mean + sqrt(var) critic(obs), by the mean and variance of the returns in each batch so
+    far; rl_games' `normalize_value` pools them (compare PopArt, van Hasselt et al., 2016).
     """
 
     def __init__(self, obs: int, actions: int, log_std: float, critic: bool) -> None:
@@ -74,7 +74,7 @@ class Agent(nn.Module):
         self.actor = mlp(obs, actions, 0.01)
         self.log_std = nn.Parameter(torch.full((actions,), log_std))
         self.critic = mlp(obs, 1, 1.0) if critic else None
-        self.returns: Any = nn.BatchNorm1d(1, momentum=None, affine=False)  # running statistics
+        self.returns: Any = nn.BatchNorm1d(1, momentum=None, affine=False)  # means of all batches
 
     def value(self, obs: Tensor) -> Tensor:
         """Value (...) of observations (..., obs), in units of the reward: (1 - gamma) * return."""

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from brokk_min import __version__
-from brokk_min.actuator import ActuatorNet
-from brokk_min.env import Encoder, TaskConfig
+from brokk_min.actuator import ActuatorNet, Encoder
+from brokk_min.env import TaskConfig
 from brokk_min.evaluation.rollout import Controller, Trace, rollout
 from brokk_min.evaluation.sequences import Commands, start_kinds
 from brokk_min.kinematics import forward_kinematics, tool_position

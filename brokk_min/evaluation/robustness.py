@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from brokk_min.env import Encoder
+from brokk_min.actuator import Encoder
 from brokk_min.evaluation import baselines, claims, metrics
 from brokk_min.evaluation.sequences import Commands, shorten, singular_sequences
 from brokk_min.jacobian import manipulability, manipulability_threshold

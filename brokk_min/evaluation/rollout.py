@@ -7,8 +7,8 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brokk_min.actuator import ActuatorNet
-from brokk_min.env import Encoder, Measured, TaskConfig, initial_state, measure, reward, transition
+from brokk_min.actuator import ActuatorNet, Encoder
+from brokk_min.env import Measured, TaskConfig, initial_state, measure, reward, transition
 from brokk_min.evaluation.sequences import tuning_set
 from brokk_min.identification.logs import Log, machine_log
 from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocity

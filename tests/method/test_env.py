@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -297,6 +298,23 @@ def test_transition__on_nets_by_hand():
     np.testing.assert_allclose(after.v_tool, tool_velocity_by_hand(after.q, move), atol=1e-5)
     assert after.lowest == pytest.approx(closed_form(after.q)[1], abs=1e-5)
     assert after.ticks == 1 and after.goal_ticks == state.goal_ticks - 1
+
+
+def test_initial_state__reads_the_encoders_of_a_plant_that_has_its_own():
+    """They stand 0.02 rad off: a joint at rest has no velocity."""
+
+    class Offset:
+        def reset(self, machine, q):
+            return SimpleNamespace(q=q, encoder=q + 0.02)
+
+        def step(self, machine, state, u):
+            return state
+
+    machine = replace(BROKK_170, plant=Offset())
+    state = initial_state(machine, POSE, ZERO, plant=True)
+    after = transition(machine, None, state, np.zeros(5))
+    np.testing.assert_array_equal(after.history, state.history)
+    np.testing.assert_allclose(after.history[:, 0, 0], POSE + 0.02, atol=1e-3)
 
 
 def test_transition__moves_no_simulated_arm_by_what_encoders_say():
