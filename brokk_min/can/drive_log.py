@@ -16,7 +16,7 @@ from brokk_min.can.canopen import OPERATOR_CHANNEL, Frame, Nodes, OperatorInput
 from brokk_min.can.connection import standard_id
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.hw import Drive
-from brokk_min.identification.files import expected, open_regular, require
+from brokk_min.identification.files import brief, expected, open_regular, require
 from brokk_min.identification.logs import Log, machine_log
 from brokk_min.kinematics import estimate_velocity, forward_kinematics, tool_velocity
 from brokk_min.machine import Array, Machine
@@ -44,7 +44,9 @@ def read_frames(path: Path) -> Iterator[Frame]:
 
 
 def _whole_lines(file: IO[bytes]) -> Iterator[str]:
-    for line in iter(lambda: file.readline(LONGEST_LINE), b""):
+    for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE), b""), 1):
+        if line.strip() and not line.startswith(b"("):
+            raise ValueError(f"row {number}: {brief(line.decode(errors='replace').strip())}")
         if line.endswith(b"\n"):
             yield line.decode()
         elif len(line) == LONGEST_LINE:

@@ -62,6 +62,8 @@ class Evaluate(Command):
         if self.perfect_model and self.plant != "analytic":
             wanted = "expected --plant analytic, its model"
             raise WrongUse(f"--perfect-model: {wanted}, got {self.plant}")
+        if self.starts and self.num_starts != Evaluate.num_starts:
+            raise WrongUse(f"--num-starts: expected none with --starts, got {self.num_starts}")
         path, gains = default_policy(machine, self.policy, self.gains)
         if self.noise != TaskConfig.noise:
             gains = self.gains  # others were tuned with more noise

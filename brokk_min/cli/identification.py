@@ -18,7 +18,7 @@ from brokk_min.identification import excitation, inspection, validation
 from brokk_min.identification.coupling import history_of
 from brokk_min.identification.files import brief, located, write_json
 from brokk_min.identification.fit_config import PAPER_RECIPE, STEP_RECIPE, FitConfig
-from brokk_min.identification.logs import RETURN, Log, part_of, read_log, split, write_log
+from brokk_min.identification.logs import RETURN, Log, in_order, part_of, read_log, split, write_log
 from brokk_min.identification.net_file import load_net, save_net
 from brokk_min.identification.simulation import recovery
 from brokk_min.learning.policy import PolicyController, load_policy
@@ -109,12 +109,16 @@ class Fit(Command):
     def __call__(self) -> None:
         from brokk_min.identification.fitting import fit
 
+        if self.out.suffix != ".npz":
+            raise WrongUse(f"--out: expected a name ending in .npz, got {self.out}")
         self.figure = self.figure or self.out.with_suffix(".png")
         machine = self.check(out="nets", json="scores", figure="picture")
         self.config(None, machine.history)  # before the logs are read
         samples = self.velocity_samples or machine.velocity_samples
-        if samples > (self.settings.history or machine.history):
-            raise WrongUse(f"--velocity-samples: expected at most --history, got {samples}")
+        history = self.settings.history or machine.history
+        if samples > history:
+            wanted = f"expected --history of that or more, got {history}"
+            raise WrongUse(f"--velocity-samples {samples}: {wanted}")
         log, known = read_known(self.logs, machine, samples, self.machine)
         if self.plant and not known:
             raise WrongUse("--plant: expected LOGS with the joints of --machine")
@@ -172,6 +176,12 @@ class Fit(Command):
             settings |= STEP_RECIPE
         settings |= {name: x for name, x in vars(self.settings).items() if x is not None}
         if self.paper:
+            for name in PAPER_RECIPE:
+                value = getattr(self.settings, name)
+                if value not in (None, getattr(FitSettings, name), PAPER_RECIPE[name]):
+                    raise WrongUse(
+                        f"--{name.replace('_', '-')}: expected none with --paper, got {value}"
+                    )
             settings |= PAPER_RECIPE
         return checked(FitConfig, **settings)
 
@@ -179,14 +189,17 @@ class Fit(Command):
 def read_known(
     logs: Sequence[Path], machine: Machine, samples: int, name: str
 ) -> tuple[Log, Machine | None]:
-    """Logs at the machine's rate, and the machine if it has their joints.
+    """Logs at the machine's rate; and the machine if it has their joints, with these in its order.
 
     ValueError: it was given by its `name` and has others.
     """
     log = read_log(logs, samples, rate=machine.rate)
-    known = machine if machine.names == log.joints else None
+    known = None
+    if set(machine.names) == set(log.joints):
+        log = in_order(log, machine.names)
+        known = machine
     if name and not known:
-        expected = f"expected those of --machine {name}"
+        expected = f"expected {brief(machine.names)} of --machine {name}"
         raise ValueError(f"{logs[0]}: joints: {expected}, got {brief(log.joints)}")
     return log, known
 
@@ -217,8 +230,8 @@ def print_recovery(joints: dict[str, dict[str, Any]]) -> None:
         print(row.format("joint", "", "dead zone", "delay [s]", "from idle [s]", "speed"))
     for name, sides in joints.items():
         for side, numbers in sides.items():
-            pairs = [[np.nan if x is None else x for x in pair] for pair in numbers.values()]
-            print(row.format(name, side, *(f"{up:.3f}, {down:.3f}" for up, down in pairs)))
+            cells = [["-" if x is None else f"{x:.3f}" for x in pair] for pair in numbers.values()]
+            print(row.format(name, side, *map(", ".join, cells)))
 
 
 def print_scores(scores: dict[str, Any]) -> None:
@@ -326,6 +339,10 @@ def print_fields(fields: dict[str, Any], machine: Machine) -> None:
         now = {"dead_zone_up": zone_up, "dead_zone_down": zone_down}
         now |= {"q_dot_up": joint.q_dot_up, "q_dot_down": joint.q_dot_down}
         found = {field: fields[field].get(joint.name) for field in now}
-        parts = [f"{field} {found[field]:.3f} ({now[field]:g})" for field in now if found[field]]
+        parts = [
+            f"{field} {found[field]:.3f} ({now[field]:g})"
+            for field in now
+            if found[field] is not None
+        ]
         if parts:
             print(f"{joint.name}: {', '.join(parts)}")

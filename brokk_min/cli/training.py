@@ -67,6 +67,10 @@ class Training(Command):
         from brokk_min.ppo import PPOConfig
 
         task = checked(TaskConfig, **vars(self.task))
+        for name in ("valves", "valve_cost", "integral_cost", "limit_cost") if task.paper else ():
+            if getattr(task, name) != getattr(TaskConfig, name):
+                option = f"--{name.replace('_', '-')}"
+                raise WrongUse(f"{option}: expected none with --paper, got {getattr(task, name)}")
         config = checked(PPOConfig, **vars(self.settings))
         return load_net(self.actuator, machine), task, config
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import TaskConfig
@@ -18,6 +17,7 @@ from brokk_min.evaluation.sequences import tuning_set
 from brokk_min.identification.files import brief, expect_same, read_json, write_json
 from brokk_min.identification.formats import GAINS, META, Field, check_fields
 from brokk_min.identification.net_file import fingerprint
+from brokk_min.identification.progress import progress
 from brokk_min.jacobian import Gains, JacobianController, manipulability_threshold
 from brokk_min.machine import Array, Machine
 
@@ -239,7 +239,7 @@ def tune(
     def objective(x: Array) -> Any:
         return cost(at(x.T))
 
-    with tqdm(total=generations, desc=f"tune {label}", unit="generation", disable=None) as bar:
+    with progress(total=generations, desc=f"tune {label}", unit="generation") as bar:
 
         def record(intermediate_result: Any) -> None:
             costs.append(float(intermediate_result.fun))

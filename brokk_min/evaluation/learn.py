@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 from dask.system import cpu_count
-from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import TaskConfig
@@ -25,6 +24,7 @@ from brokk_min.evaluation import baselines, sequences
 from brokk_min.evaluation.rollout import own_drives
 from brokk_min.identification import fitting, logs
 from brokk_min.identification.net_file import save_net, select_nets
+from brokk_min.identification.progress import progress
 from brokk_min.learning.checkpoint import train_policy
 from brokk_min.learning.episodes import GRADIENT_LEARNER, PAPER_TASK
 from brokk_min.learning.policy import POLICIES, Policy, policy_controllers
@@ -173,7 +173,7 @@ def side_by_side(
                 results = (jobs[other] for other in needed[name])
                 jobs[name] = client.submit(_timed, call, *results, **options)
             ended = as_completed(jobs.values())  # type: ignore[no-untyped-call]
-            bar = tqdm(ended, total=len(jobs), unit="job", disable=None)
+            bar = progress(ended, total=len(jobs), unit="job")
             for job in bar:
                 done[job.key] = job.result()
                 bar.set_postfix_str(f"last: {job.key}")

@@ -8,13 +8,13 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.linalg import norm
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from brokk_min import __version__
 from brokk_min.actuator import ActuatorNet, Encoder
 from brokk_min.env import TaskConfig
 from brokk_min.evaluation.rollout import Controller, Trace, rollout
 from brokk_min.evaluation.sequences import Commands, start_kinds
+from brokk_min.identification.progress import progress
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine, read_encoder
 
@@ -182,7 +182,7 @@ def evaluate(
     lengths = dict.fromkeys(len(sequence.goals) for sequence in sequences)
     batches = [[s for s in sequences if len(s.goals) == length] for length in lengths]
     pairs = list(product(controllers, batches))
-    for name, batch in tqdm(pairs, desc="evaluate", unit="batch", disable=None):
+    for name, batch in progress(pairs, desc="evaluate", unit="batch"):
         goals = np.concatenate([sequence.for_starts(machine, starts) for sequence in batch], axis=1)
         q = np.tile(starts, (len(batch), 1))
         rng = np.random.default_rng(seed)

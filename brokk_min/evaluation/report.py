@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib.figure import Figure
-from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet
 from brokk_min.evaluation import figures
@@ -27,6 +26,7 @@ from brokk_min.evaluation.sequences import (
 )
 from brokk_min.identification.files import SHIPPED, read_json, whole_file
 from brokk_min.identification.logs import Log
+from brokk_min.identification.progress import progress
 from brokk_min.machine import Array, Machine
 
 POSITION = ("rl", "rl_paper", "jacobian_pid_k0.1")  # in the figures of position errors
@@ -74,7 +74,7 @@ def write_report(
     """Write `report.html` to the folder `out` of the learning curve; `clock` [s] by stage."""
     images = {}
     drawn = draw(machine, results, shown, out / "policy.npz.csv")
-    for name, figure in tqdm(drawn.items(), desc="draw", unit="figure", disable=None):
+    for name, figure in progress(drawn.items(), desc="draw", unit="figure"):
         images[name] = base64.b64encode(figures.png(figure)).decode()
     with whole_file(out / "report.html", "w") as file:
         file.write(render(machine, results, images, clock))

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet
 from brokk_min.evaluation import baselines, claims, metrics, preliminary, report, sequences
@@ -23,6 +22,7 @@ from brokk_min.evaluation.seeds import read_seeds
 from brokk_min.identification import logs, validation
 from brokk_min.identification.excitation import collect, task_log
 from brokk_min.identification.files import write_json
+from brokk_min.identification.progress import progress
 from brokk_min.jacobian import JacobianController
 from brokk_min.learning.policy import POLICIES, Policy, policy_controllers, save_policy
 from brokk_min.machine import Machine
@@ -41,7 +41,7 @@ def reproduce(
     seeds = read_seeds(sweep, {}) if sweep else {}  # before all work
     chain = Chain(machine, out, budget, seed)
     clock: dict[str, float] = {}
-    with tqdm(total=4, desc="stages done", unit="stage", position=1, disable=None) as bar:
+    with progress(total=4, desc="stages done", unit="stage", position=1) as bar:
         stage = partial(_stage, clock, bar)
         with stage("record"):
             log, paper_log, test = record(chain)

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet
 from brokk_min.env import TaskConfig
@@ -23,6 +22,7 @@ from brokk_min.evaluation.metrics import Controllers, Rows, by_start, mean_inter
 from brokk_min.evaluation.sequences import AXES, evaluation_starts, task_sequences
 from brokk_min.identification.files import brief, expect_same, read_json, write_json
 from brokk_min.identification.formats import RUNS, SWEEP, Field, check_fields
+from brokk_min.identification.progress import progress
 from brokk_min.learning.checkpoint import describe_training, train_policy
 from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import Array, Machine
@@ -122,7 +122,7 @@ def run_seeds(
             raise ValueError(f"{scheduler}: expected workers with --nthreads 1, got {got}")
         futures = {client.submit(job, seed, pure=False): seed for seed in seeds}
         done = as_completed(futures)  # type: ignore[no-untyped-call]
-        for future in tqdm(done, total=len(futures), desc="sweep", unit="seed", disable=None):
+        for future in progress(done, total=len(futures), desc="sweep", unit="seed"):
             seed = futures[future]
             if future.status == "finished":
                 results[seed] = future.result()

@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from tqdm import tqdm
 
 from brokk_min.env import TaskConfig, terminated
 from brokk_min.evaluation.feasibility import feasible, first_failure, most_frequent
 from brokk_min.identification import files
 from brokk_min.identification.formats import COMMANDS, read_table, starts_of
+from brokk_min.identification.progress import progress
 from brokk_min.jacobian import manipulability, manipulability_threshold
 from brokk_min.kinematics import forward_kinematics, jacobian, lowest_point, tool_position
 from brokk_min.learning.episodes import draw_pose, reset
@@ -254,7 +254,7 @@ def draw_starts(
     order = [("workspace", "limits", "workspace", "extended")[i % 4] for i in range(num)]
     kept: dict[str, list[Array]] = {kind: [] for kind in KINDS}
     failures: list[NDArray[np.int64]] = []
-    with tqdm(total=num, desc="draw starts", unit="start", disable=None) as bar:
+    with progress(total=num, desc="draw starts", unit="start") as bar:
         for draw in range(200):
             poses = draw_pose(machine, TaskConfig(), rng, 4000).round(4)
             for kind, poses_of_kind in _select(machine, poses, sequences, failures).items():

@@ -9,10 +9,10 @@ from itertools import chain
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from tqdm import tqdm
 
 from brokk_min.actuator import plant_reset, plant_step
 from brokk_min.identification.logs import RETURN, Log, machine_log
+from brokk_min.identification.progress import progress
 from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, read_encoder
 
 Indices = NDArray[np.intp]
@@ -154,7 +154,7 @@ def collect(machine: Machine, hours: float, excitation: str, rng: np.random.Gene
     count = np.zeros(machine.n, int)
     recordings: list[list[tuple[str, Array, Array]]] = [[] for _ in machine.joints]
     title = f"record ({excitation})"
-    with tqdm(total=goal * machine.n, desc=title, unit="sample", disable=None) as bar:
+    with progress(total=goal * machine.n, desc=title, unit="sample") as bar:
         while count.min() < goal:
             joint = np.repeat(np.flatnonzero(count < goal), rows)
             u, q, ended, idle = _drive_segments(machine, joint, excitation, rng)
@@ -248,7 +248,7 @@ def _drive_together(machine: Machine, goal: int, rng: np.random.Generator) -> Lo
     commands = commands.reshape(*shape, ticks) * moves[..., None]
     commands[..., : machine.history] = 0.0
     sign, at_limit = np.ones(shape), np.zeros(shape)
-    for tick in tqdm(range(ticks), desc="record (joint)", unit="tick", disable=None):
+    for tick in progress(range(ticks), desc="record (joint)", unit="tick"):
         at_limit = (at_limit + 1) * _at_limit(machine, recorder.q[-1])
         sign = np.where(at_limit >= TURN_AFTER * machine.rate, -sign, sign)
         at_limit = at_limit * (at_limit < TURN_AFTER * machine.rate)

@@ -255,6 +255,9 @@ def read_csv(path: Path, text: Sequence[str] = ()) -> Table:
     with expected(path, "a readable CSV table"), open_regular(path) as file:
         reader = csv.reader(_lines(path, file), strict=True)
         header = [name.strip() for name in next(reader, [])]
+        if len(header) == 1 and set(";\t#") & set(header[0]):
+            wanted = "expected names of columns with commas between them, numbers with points"
+            raise ValueError(f"{path}: row 1: {wanted}, got {brief(header[0])}")
         repeated = sorted({name for name in header if header.count(name) > 1})
         if repeated:
             raise ValueError(f"{path}: row 1: expected each column once, got {brief(repeated)}")

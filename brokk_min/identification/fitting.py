@@ -18,13 +18,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Generator, Tensor
-from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet, input_rows
 from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
 from brokk_min.identification.logs import Log, join_recordings
 from brokk_min.identification.muon import Muon
 from brokk_min.identification.net_file import STATISTICS
+from brokk_min.identification.progress import progress
 from brokk_min.kinematics import estimate_velocity
 from brokk_min.machine import Array
 
@@ -146,7 +146,7 @@ def train(data: TrainingSet, config: FitConfig, seed: int, estimator: int | None
     schedule = torch.optim.lr_scheduler.LambdaLR(
         optimizer, lambda step: cosine_decay(step, switch_step, config.steps)
     )
-    for step in tqdm(range(config.steps), desc="fit nets", unit="step", disable=None):
+    for step in progress(range(config.steps), desc="fit nets", unit="step"):
         if step < switch_step:
             settings = replace(config, rollout=1)
             windows, batch = data.windows, config.batch_size

@@ -1,41 +1,24 @@
 """What a log tells of its machine, and what it cannot tell: joint by joint, before any fit.
 
-A small model of each joint is fitted by a search over a grid: its command, later by a delay, less a
-dead zone of each direction, times a gain of each direction, through a first-order lag.
-
-    q_dot' = (g_up max(u(t - d) - z_up, 0) - g_down max(-u(t - d) - z_down, 0) - q_dot) / tau
-
-Samples at which a joint is pushed on at an end of its range do not count, if much more is explained
-so: it rests at its stop. Recordings of slow ramps (`collect --excitation ramp`), if a log has any,
-give the dead zones: there the delay hardly counts, and the curve beyond, such as a pump that
-starves, does not.
+`identification.joint_model` has what it tells of delays, dead zones and speeds.
 """
 
-import math
 from dataclasses import asdict, dataclass, replace
-from functools import partial
-from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from brokk_min.identification.joint_model import joint_model
 from brokk_min.identification.logs import COMMANDED, Log, Recording, driven
 from brokk_min.machine import PWM_MAX, Array, Machine
 
-AT_STOP = 0.01  # of the range of a log's angles, assumed: so near an end a joint may be at a stop
-STOPS = 0.02  # of the motion, assumed: without stops the model explains 0.01 more at most
-LARGEST_ZONE = 0.4  # of full command, assumed
-ZONES = np.arange(0, LARGEST_ZONE, 0.005)
-TAUS = (0.05, 0.1, 0.2, 0.4)  # s, assumed
-LATEST = 0.4  # s, assumed: longest delay
-SAMPLES = 20_000  # of a joint that are used
 NEAR_LIMIT = 0.15  # of the command limit, assumed: commands of so much less or more are at it,
 HELD = 0.5  # s, assumed: after so long a joint has its speed
 FASTEST = 0.95  # quantile of the speeds at the command limit, assumed
 LEAST_HELD = 20  # samples at the command limit, assumed: else the model gives the fastest motion
-MOVED = 0.2  # of the usual gain, assumed: a ramp with less ended within the dead zone
-SLOW = 0.12  # of full command in a second, assumed: ramps change by less
+WIDER = 0.03  # of full command, assumed: the model's error of the least dead zone is smaller
+FASTER = 5.0  # times as fast as the machine, assumed: more is another unit
 LEVELS = 8  # of commands from 0 to the largest, by direction
 # What a log must have for its score to hold in other driving, all assumed.
 LEAST_MINUTES = 10.0
@@ -49,7 +32,6 @@ CLOSED_LOOP = -0.42  # `feedback`: excitations give -0.4 to 0, going between pla
 SMALL = 0.02  # of full command: larger changes are of goals, or of an excitation
 LEAST_SMALL = 400  # small changes of a command, else nothing is said of its `reaction`
 REACTS = 0.01  # least `reaction` of all joints: excitations have 0 or less, a policy has 0.03
-CLEAR_SIGN = 0.2  # of the velocities' variance: fast sines fit as well reversed and later
 
 
 @dataclass(frozen=True)
@@ -121,112 +103,6 @@ def count_levels(level: Array) -> int:
     """How many levels have more than 1 % of these commands (samples,)."""
     count = np.bincount(level.astype(int), minlength=LEVELS)
     return int((count > 0.01 * max(count.sum(), 1)).sum())
-
-
-def is_ramp(u: Array, rate: float) -> bool:
-    """Whether commands (T,) change slowly, from 0 on or to 0: no step, no constant one."""
-    second = round(rate)
-    if len(u) < second or np.ptp(u) < COMMANDED or np.abs(u).min() > COMMANDED:
-        return False
-    return bool(np.ptp(sliding_window_view(u, second), axis=-1).max() < SLOW)
-
-
-def joint_model(recordings: list[Recording], j: int, rate: float) -> dict[str, Any]:
-    """Fields of `JointReport` by the model above; dead zones by slow ramps that moved it."""
-    ramps = [one for one in recordings if is_ramp(one.u[:, j], rate)]
-    if not 0 < len(ramps) < len(recordings):
-        return fit_model(recordings, j, rate)
-    others = [one for one in recordings if not is_ramp(one.u[:, j], rate)]
-    usual, by_ramps = fit_model(others, j, rate), fit_model(ramps, j, rate)
-    zones = []
-    for side in ("up", "down"):  # a ramp that ends within the dead zone has no gain
-        moved = by_ramps[f"gain_{side}"] / (usual[f"gain_{side}"] or np.inf) > MOVED
-        zones.append((by_ramps if moved else usual)[f"dead_zone_{side}"])
-    return fit_model(others, j, rate, zones)
-
-
-def fit_model(
-    recordings: list[Recording], j: int, rate: float, zones: list[float] | None = None
-) -> dict[str, Any]:
-    """Fields of the model: the best of a grid, then of the dead zones unless they are given."""
-    share = min(1.0, SAMPLES / sum(len(one.u) for one in recordings))  # of each, of a long log
-    lengths = [math.ceil(share * len(one.u)) for one in recordings]
-    u = np.concatenate([one.u[:k, j] for one, k in zip(recordings, lengths, strict=True)])
-    q = np.concatenate([one.q[:k, j] for one, k in zip(recordings, lengths, strict=True)])
-    q_next = np.append(q[1:], q[-1])
-    velocity = (q_next - q) * rate
-    velocity[np.cumsum(lengths) - 1] = 0.0  # no velocity from one recording to the next
-    margin = AT_STOP * np.ptp(q)
-    end = 1 * (q_next > q.max() - margin) - (q_next < q.min() + margin)
-    whole = signed_model(u, velocity, 0 * end, rate, zones)
-    model = signed_model(u, velocity, end, rate, zones)
-    return model if model["explained"] - whole["explained"] > STOPS else whole
-
-
-def signed_model(
-    u: Array, velocity: Array, end: Array, rate: float, zones: list[float] | None
-) -> dict[str, Any]:
-    """Fields of the model with gains of the better sign."""
-    power = max(float(velocity @ velocity), 1e-12)
-    models = {sign: best_model(u, velocity, end, rate, sign, zones) for sign in (1, -1)}
-    explained = {sign: 1 - model["error"] / power for sign, model in models.items()}
-    better = explained[1] - explained[-1]
-    model = models[1 if better > -CLEAR_SIGN else -1]
-    return {
-        "explained": 1 - model.pop("error") / power,
-        "sign": int(np.sign(better)) * int(abs(better) > CLEAR_SIGN),
-        **model,
-    }
-
-
-def best_model(
-    u: Array, velocity: Array, end: Array, rate: float, sign: int, given: list[float] | None = None
-) -> dict[str, float]:
-    """The model with gains of one sign, by turns of a grid of delays and lags, and dead zones.
-
-    `end` (T,) is 1 where the joint comes to its greatest angle, -1 to its least, else 0.
-    """
-    fit = partial(fit_gains, u, velocity, end, rate, sign)
-    zones = given or [0.05, 0.05]
-    for _ in range(2):
-        grid = product(range(round(LATEST * rate) + 1), TAUS)
-        delay, tau = min(grid, key=lambda lag: fit(lag[0], lag[1], zones)[0])
-        for side in () if given else (0, 1, 0, 1):
-            trials = [[*zones[:side], zone, *zones[side + 1 :]] for zone in ZONES]
-            zones = min(trials, key=lambda trial: fit(delay, tau, trial)[0])
-    error, gains = fit(delay, tau, zones)
-    return {
-        "error": error,
-        "delay": delay / rate,
-        "tau": tau,
-        **dict(zip(("dead_zone_up", "dead_zone_down"), map(float, zones), strict=True)),
-        **dict(zip(("gain_up", "gain_down"), gains.tolist(), strict=True)),
-    }
-
-
-def fit_gains(
-    u: Array,
-    velocity: Array,
-    end: Array,
-    rate: float,
-    sign: int,
-    delay: int,
-    tau: float,
-    zones: list[float],
-) -> tuple[float, Array]:
-    """Sum of the squared errors of the model with the best gains of a sign; and these gains."""
-    from scipy.signal import lfilter  # slow to import
-
-    up, down = zones
-    late = np.concatenate([np.zeros(delay), u])[: len(u)]
-    openings = np.stack([np.maximum(late - up, 0), -np.maximum(-late - down, 0)])
-    a = np.exp(-1 / (rate * tau))
-    free = sign * late * end <= 0  # not pushed on at an end of its range
-    x = lfilter([1 - a], [1, -a], openings)[:, free]
-    gains = np.linalg.lstsq(x @ x.T + 1e-9 * np.eye(2), x @ velocity[free], rcond=None)[0]
-    gains = sign * np.maximum(sign * gains, 0)
-    error = velocity[free] - gains @ x
-    return float(error @ error), gains
 
 
 def feedback(recordings: list[Recording], j: int, rate: float) -> float:
@@ -317,6 +193,7 @@ def warnings(
                 wanted = f"expected angles of {joint.q_min:g} to {joint.q_max:g}"
                 got = f"got {r.low:.2f} to {r.high:.2f}: another unit, zero or joint?"
                 result.append(f"{name}: {wanted}, {got}")
+            result += wrong_numbers(log, name, r, machine)
         if r.explained < LEAST_EXPLAINED:
             what = f"its commands explain {r.explained:.0%} of its motion"
             result.append(f"{name}: {what}: are they those of another joint?")
@@ -328,6 +205,24 @@ def warnings(
         parts = ", ".join(f"{reaction:.0%}" for reaction in reactions)
         of_changes = f"commands follow the measured motion ({parts} of their small changes)"
         result.append(f"{of_changes}: a controller drove; scores hold for such driving alone")
+    return result
+
+
+def wrong_numbers(log: Log, name: str, report: JointReport, machine: Machine) -> list[str]:
+    """Fields of a machine that the log of a joint contradicts, in words."""
+    joint = machine.joints[machine.names.index(name)]
+    found = fields(log, {name: report}, machine)
+    if not found:
+        return []
+    result = []
+    if machine.dead_zone > found["dead_zone"] + WIDER:
+        wanted = f"expected at most {found['dead_zone']:.3f} by this log"
+        result.append(f"{name}: dead_zone: {wanted}, got {machine.dead_zone:g}: nets read no less")
+    for side in ("q_dot_up", "q_dot_down"):
+        now, fastest = getattr(joint, side), found[side].get(name)
+        if fastest and not 1 / FASTER < fastest / now < FASTER:
+            units = "time in s, angles in rad?"
+            result.append(f"{name}: {side}: {fastest:.3g} by this log, {now:g} now: {units}")
     return result
 
 
@@ -363,22 +258,23 @@ def fields(log: Log, reports: dict[str, JointReport], machine: Machine) -> dict[
     """Fields of a machine by a log of it: dead zones, and fastest motions at the command limit.
 
     The largest dead zone is 0.05 wider than found: one that is too small stops drives. Joints that
-    do not obey their commands in the log are left out; an empty result: all of them.
+    do not obey their commands in the log are left out, and directions in which they did not move;
+    an empty result: all of them.
     """
     obeys = [k for k, r in reports.items() if r.explained >= LEAST_EXPLAINED and r.sign >= 0]
     known = {name: reports[name] for name in machine.names if name in obeys}
-    if not known:
-        return {}
     limit = machine.pwm_limit / PWM_MAX
-    zones = [zone for r in known.values() for zone in (r.dead_zone_up, r.dead_zone_down)]
-    return {
-        "dead_zone": min(zones),
-        "largest_dead_zone": min(max(zones) + 0.05, 0.99 * limit),
-        "dead_zone_up": {k: r.dead_zone_up for k, r in known.items()},
-        "dead_zone_down": {k: r.dead_zone_down for k, r in known.items()},
-        "q_dot_up": {k: fastest(log, k, r, limit, "up") for k, r in known.items()},
-        "q_dot_down": {k: fastest(log, k, r, limit, "down") for k, r in known.items()},
-    }
+    result: dict[str, Any] = {}
+    for side in ("up", "down"):
+        moved = {k: r for k, r in known.items() if getattr(r, f"gain_{side}")}
+        result[f"dead_zone_{side}"] = {k: getattr(r, f"dead_zone_{side}") for k, r in moved.items()}
+        result[f"q_dot_{side}"] = {k: fastest(log, k, r, limit, side) for k, r in moved.items()}
+    zones = [*result["dead_zone_up"].values(), *result["dead_zone_down"].values()]
+    if not zones:
+        return {}
+    result["dead_zone"] = min(zones)
+    result["largest_dead_zone"] = min(max(zones) + 0.05, 0.99 * limit)
+    return result
 
 
 def with_dead_zones(machine: Machine, log: Log) -> Machine:

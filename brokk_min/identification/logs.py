@@ -122,7 +122,9 @@ def split(log: Log) -> tuple[Log, Log]:
     """
     held_out = {i for group in same_joints(log) if len(group) > 1 for i in group[::10]}
     if not held_out:
-        expected = "expected two or more that drive the same joints, or --test, to score on"
+        expected = (
+            "expected two or more (column run) that drive the same joints, or --test, to score"
+        )
         raise ValueError(f"recordings: {expected}, got {len(log.recordings)}")
     kept = set(range(len(log.recordings))) - held_out
     return _some(log, kept), _some(log, held_out)
@@ -134,6 +136,13 @@ def same_joints(log: Log) -> list[list[int]]:
     for i, recording in enumerate(log.recordings):
         groups.setdefault(tuple(driven(recording).tolist()), []).append(i)
     return list(groups.values())
+
+
+def in_order(log: Log, joints: Sequence[str]) -> Log:
+    """A log whose arrays have the joints in this order."""
+    order = [log.joints.index(name) for name in joints]
+    recordings = (Recording(one.name, *(x[:, order] for x in one[1:])) for one in log.recordings)
+    return log._replace(joints=tuple(joints), recordings=tuple(recordings))
 
 
 def part_of(log: Log, part: float) -> Log:
@@ -189,6 +198,8 @@ def read_log(
     recordings: list[Recording] = []
     logged: set[bool] = set()
     for path in map(Path, paths):
+        if path.suffix.lower() not in (".csv", ".npz"):
+            raise ValueError(f"{path}: expected a name ending in .csv or .npz, got {path.suffix!r}")
         is_csv = path.suffix.lower() == ".csv"
         table = files.read_csv(path, ["run"]) if is_csv else files.load_arrays(path)
         got = names if joints else _joints(path, table)
@@ -269,7 +280,8 @@ def _gaps(
     """Where to cut a recording; ValueError: time stamps that rise too slowly."""
     step = np.diff(time)
     if len(step) and np.median(step) > 1.05 / rate:
-        expected = f"expected {rate:g} Hz, the machine's rate (--machine), or more in {brief(run)}"
+        wanted = f"expected s, at {rate:g} Hz, the machine's rate (--machine), or more"
+        expected = f"{wanted}, in {brief(run)}"
         got = f"got {1 / np.median(step):.3g} Hz"
         raise ValueError(f"{path}: row {rows[0] + 2}, column time: {expected}, {got}")
     return np.flatnonzero(step > max(MAX_GAP, 2.5 / rate)) + 1

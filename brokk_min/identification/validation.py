@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet, input_rows
 from brokk_min.identification.coupling import coupling, response_delays
 from brokk_min.identification.logs import Log, Samples, driven, join_recordings
+from brokk_min.identification.progress import progress
 from brokk_min.identification.simulation import creep, free_run, log_response_times
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
@@ -142,7 +142,7 @@ def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
     samples = join_recordings(log)
     result = _one_step_scores(net, samples)
     runs = free_runs(net, samples)
-    bar = tqdm(runs, desc="score nets", total=len(HORIZONS), unit="horizon", disable=None)
+    bar = progress(runs, desc="score nets", total=len(HORIZONS), unit="horizon")
     for horizon, starts, q_error, v_error in bar:
         after = starts + np.arange(1, len(q_error) + 1)[:, None]
         for j, name in enumerate(log.joints):

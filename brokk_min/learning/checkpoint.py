@@ -23,6 +23,7 @@ from brokk_min.actuator import ActuatorNet
 from brokk_min.env import State, TaskConfig, terminated
 from brokk_min.identification import files
 from brokk_min.identification.net_file import fingerprint
+from brokk_min.identification.progress import progress
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import Policy, contract, save_policy
 from brokk_min.learning.simulation_gradient import improved_actions, make_learner, regression_loss
@@ -187,9 +188,7 @@ class TrainingLog:
         if threading.current_thread() is threading.main_thread():  # others get no signals
             signal.signal(signal.SIGINT, self.interrupt)
         total = self.config.total_steps
-        self.bar = tqdm(
-            total=total, initial=self.first_step, desc="train", unit="step", disable=None
-        )
+        self.bar = progress(total=total, initial=self.first_step, desc="train", unit="step")
 
     def on_update(self, learner: Learner, rollout: Rollout, metrics: dict[str, float]) -> None:
         """Add a row to the curve; every `checkpoint_every` updates write a checkpoint."""

@@ -12,7 +12,6 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet
 from brokk_min.can.drive_log import read_frames, read_telemetry
@@ -22,6 +21,7 @@ from brokk_min.evaluation.rollout import TITLES, Controller
 from brokk_min.evaluation.sequences import Commands, goals_and_starts, task_sequences
 from brokk_min.identification.files import located, read_json, whole_file
 from brokk_min.identification.formats import RESULTS, RUNS, check_fields
+from brokk_min.identification.progress import progress
 from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocity
 from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import Array, Machine
@@ -222,7 +222,7 @@ def write_film(
         raise ValueError(f"{path}: expected a name ending in .gif or .mp4, got {path.suffix!r}")
     step = max(1, round(machine.rate / fps))
     last = max(len(run.q) for run in runs) - 1
-    bar = tqdm([*range(0, last, step), last], desc="draw", unit="frame", disable=None)
+    bar = progress([*range(0, last, step), last], desc="draw", unit="frame")
     images = (film(runs, tick, size).image() for tick in bar)
     with whole_file(path) as file:
         if path.suffix == ".mp4":

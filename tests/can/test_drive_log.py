@@ -58,6 +58,12 @@ def test_read_frames__reads_a_plain_candump_log_too(tmp_path):
     ]
 
 
+def test_read_frames__names_the_row_that_is_no_frame(tmp_path):
+    (tmp_path / "log.csv").write_text("(1.0) can0 123#0102\n\nrun,time,u_a,q_a\n")
+    with pytest.raises(ValueError, match=r"expected a candump log, got row 3: 'run,time,u_a,q_a'"):
+        list(read_frames(tmp_path / "log.csv"))
+
+
 def test_replay__of_a_recorded_log_sends_the_same_bytes(tmp_path):
     drive_logged(tmp_path / "run.log")
     frames = list(read_frames(tmp_path / "run.log"))

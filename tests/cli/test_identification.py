@@ -139,7 +139,7 @@ def test_fit__has_a_recipe_for_step_responses(levels, options, expected, tmp_pat
 def test_fit__refuses_the_log_of_another_machine(tmp_path, capsys):
     write_log(tmp_path / "log.csv", steady_log(("a", "b"), 2))
     assert run(f"fit '{tmp_path}/log.csv' --machine brokk170 --out '{tmp_path}/n.npz'") == 1
-    refusal = "log.csv: joints: expected those of --machine brokk170, got ('a', 'b')"
+    refusal = "log.csv: joints: expected ('q1', 'q2', 'q3', 'q4', 'q5') of --machine brokk170, got"
     assert refusal in capsys.readouterr().err
 
 

@@ -16,11 +16,11 @@ from brokk_min.identification.inspection import (
     fields,
     has_steps_alone,
     inspect,
-    is_ramp,
     reaction,
     warnings,
     wrong_signs,
 )
+from brokk_min.identification.joint_model import is_ramp
 from brokk_min.identification.logs import Log, Recording, velocity_of, write_log
 from brokk_min.machine import BROKK_170
 
@@ -104,6 +104,36 @@ def test_inspect__does_not_count_joints_that_are_pushed_against_their_stops():
         assert (report.dead_zone_up, report.dead_zone_down) == pytest.approx((up, down), abs=0.011)
         assert (report.gain_up, report.gain_down) == pytest.approx((gain_up, gain_down), rel=0.1)
         assert report.sign == np.sign(gain_up)
+
+
+def test_inspect__finds_wide_dead_zones_and_takes_pieces_after_gaps_and_many_recordings():
+    """A pilot valve opens from 0.5 on; a piece after a gap does not begin at rest."""
+    u = holds(np.random.default_rng(0))
+    wide = record("boom", u)._replace(u=np.repeat([[0.0, 0.0]], len(u), axis=0))
+    wide.u[:, 0] = np.sign(u) * (0.5 + 0.5 * np.abs(u))  # 0.56 up, 0.60 down, gains doubled
+    report = inspect(Log(tuple(TRUE), (wide,)))["boom"]
+    assert (report.dead_zone_up, report.dead_zone_down) == pytest.approx((0.56, 0.60), abs=0.01)
+    assert (report.gain_up, report.gain_down) == pytest.approx((1.0, 0.6), rel=0.1)
+    whole = record("arm", u)
+    edges = np.arange(0, len(u), 40)  # 2 s each
+    parts = [Recording(f"a#{i}", *(x[i : i + 40] for x in whole[1:])) for i in edges]
+    report = inspect(Log(tuple(TRUE), tuple(parts)))["arm"]
+    assert (report.dead_zone_up, report.dead_zone_down) == pytest.approx(TRUE["arm"][:2], abs=0.01)
+    assert (report.delay, report.tau) == pytest.approx((0.25, 0.2), abs=0.051)
+    assert report.explained > 0.95
+
+
+def test_inspect__says_nothing_of_a_joint_that_stands_still_or_has_one_direction():
+    recordings = excited().recordings
+    still = [one._replace(q=0 * one.q, q_dot=0 * one.q) for one in recordings]
+    reports = inspect(Log(("q1", "q3"), tuple(still)))
+    assert [(r.explained, r.sign) for r in reports.values()] == [(0.0, 0)] * 2
+    assert fields(Log(("q1", "q3"), tuple(still)), reports, BROKK_170) == {}
+    upwards = [record("boom", np.abs(one.u[:, 0])) for one in recordings[:4]]
+    log = Log(("q1", "q3"), tuple(upwards))
+    found = fields(log, inspect(log), BROKK_170)
+    assert found["dead_zone_down"] == found["q_dot_down"] == {}
+    assert found["dead_zone"] == found["dead_zone_up"]["q1"] == pytest.approx(0.12, abs=0.01)
 
 
 def test_inspect__takes_a_part_of_each_recording_of_a_long_log():
@@ -300,6 +330,26 @@ def test_warnings__know_the_range_of_a_machine():
     wanted = "q1: expected angles of -2.14 to 2.14, got -2.20 to 2.60: another unit, zero or joint?"
     assert beyond == wanted
     assert unexplained.startswith("q1: its commands explain 5% of its motion")
+
+
+def test_warnings__know_numbers_of_a_machine_that_the_log_contradicts():
+    """The least dead zone is 0.12; at the limit the joint moves at 0.5 * (80 / 127 - 0.12)."""
+    log = excited("boom")._replace(joints=("q1", "q3"))
+    reports = inspect(log)
+
+    def found(**changes):
+        joints = tuple(replace(joint, q_dot_up=0.26) for joint in BROKK_170.joints)
+        machine = replace(BROKK_170, joints=joints, **changes)
+        return [text for text in warnings(log, reports, machine) if " by this log" in text]
+
+    assert found() == []
+    wide = "".join(found(dead_zone=0.2))
+    assert wide.startswith("q1: dead_zone: expected at most 0.1") and "by this log, got 0.2" in wide
+    minutes = [one._replace(q=60 * one.q, q_dot=60 * one.q_dot) for one in log.recordings]
+    log = log._replace(recordings=tuple(minutes))
+    reports = inspect(log)
+    assert [text[:14] for text in found()] == ["q1: q_dot_up: ", "q1: q_dot_down"]
+    assert found()[0].endswith(" by this log, 0.26 now: time in s, angles in rad?")
 
 
 def test_fields__are_those_of_the_machine():
