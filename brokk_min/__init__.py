@@ -21,6 +21,8 @@ Glossary:
     driven        moved by the controller; the other joints are locked, set by the operator
     plant         the analytic equations that play the machine
     actuator net  one small net per joint: history in, velocity out
+    counts        of a command: 127 are full; of an encoder: `encoder_step` each
+    spool         slides in a valve and opens it, up or down: position -1..1
     activation    0..1, state of a valve: it closes when idle and answers late from there
     dead zone     commands too small to open a valve
     opening       what a command opens a valve beyond the dead zone, [-1, 1]

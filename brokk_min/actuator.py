@@ -132,7 +132,7 @@ def append_command(history: Array, u: ArrayLike) -> Array:
 
 
 def command_at_rest(
-    machine: Machine, valves: str, u: Array, v_goal: Array, ticks: NDArray[np.int64]
+    machine: Machine, valves: Valves, u: Array, v_goal: Array, ticks: NDArray[np.int64]
 ) -> tuple[Array, NDArray[np.bool_], NDArray[np.int64]]:
     """Commands u (..., n), but those of the rule for `valves` after `REST_AFTER` of a zero goal.
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brokk_min.actuator import command_at_rest
+from brokk_min.actuator import Valves, command_at_rest
 from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, valve_command, valve_opening
 
@@ -131,7 +131,7 @@ class JacobianController:
     k: float  # of Nakamura's damping [m^2]
     w0: float  # manipulability below which damping sets in [m^3]
     feedforward: Callable[[Array, Array], Array] | None = None  # q, q_dot (..., n_driven) -> u
-    valves: str = "closed"  # or, at rest, "dither", or "open": no rule, and `min_opening` holds
+    valves: Valves = "closed"  # or, at rest, "dither", or "open": no rule, and `min_opening` holds
 
     def start(self, num: int) -> PIDState:
         """State of `num` controllers at rest."""

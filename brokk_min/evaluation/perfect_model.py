@@ -12,7 +12,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min.actuator import PlantState, command_at_rest, lever_arm, plant_reset, plant_step
+from brokk_min.actuator import (
+    PlantState,
+    Valves,
+    command_at_rest,
+    lever_arm,
+    plant_reset,
+    plant_step,
+)
 from brokk_min.env import Measured
 from brokk_min.evaluation.metrics import Run, paired_difference, summary
 from brokk_min.jacobian import dls
@@ -48,7 +55,7 @@ class PerfectModel:
 
     machine: Machine
     poses: Array  # start angles [rad] (k, n); a batch is these, repeated
-    valves: str = "closed"  # or "open", while the tool rests
+    valves: Valves = "closed"  # or "open", while the tool rests
     dither: float = 0.04  # valve opening (tuned)
 
     def start(self, num: int) -> Plan:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min.actuator import ActuatorNet, command_at_rest
+from brokk_min.actuator import ActuatorNet, Valves, command_at_rest
 from brokk_min.env import Measured, action_to_pwm, features, observation_scale
 from brokk_min.identification import files
 from brokk_min.identification.formats import POLICY_ARRAYS, POLICY_HEADER, check_fields
@@ -29,7 +29,7 @@ class Policy:
     weights: tuple[Array, ...]  # w, b of each layer, w (inputs, outputs)
     net: ActuatorNet  # the simulation it was trained in, kept with it
     paper: bool = False  # does it take observation and actions of the paper's agent?
-    valves: str = "closed"  # at rest, or "dither", "open": see `actuator.command_at_rest`
+    valves: Valves = "closed"  # at rest, or "dither", "open": see `actuator.command_at_rest`
 
     def act(self, observation: Array) -> Array:
         """Actions (..., n_driven), not clipped, for observations (..., obs) of `env.features`.
