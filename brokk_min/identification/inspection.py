@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from brokk_min.identification.joint_model import joint_model
+from brokk_min.identification.joint_model import LATEST, joint_model
 from brokk_min.identification.logs import COMMANDED, Log, Recording, driven
 from brokk_min.machine import PWM_MAX, Array, Machine
 
@@ -197,6 +197,9 @@ def warnings(
         if r.explained < LEAST_EXPLAINED:
             what = f"its commands explain {r.explained:.0%} of its motion"
             result.append(f"{name}: {what}: are they those of another joint?")
+        if r.delay > LATEST - 1 / log.rate:
+            wanted = f"expected below {LATEST:g} s, the longest that is searched"
+            result.append(f"{name}: delay: {wanted}, got {r.delay:.2f} s, perhaps more")
         found = [text for text, bad in checks.items() if bad]
         if found:
             result.append(f"{name}: {', '.join(found)}: scores hold for such driving alone")

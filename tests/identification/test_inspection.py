@@ -237,6 +237,8 @@ def test_warnings__know_an_operators_work_from_an_excitation():
     assert about.startswith("boom: ") and "fast changes of command in " in about
     assert about.endswith("scores hold for such driving alone")
     assert len(warnings(excited("boom"), inspected("boom"))) == 1  # the arm alone
+    late = replace(inspected("boom")["boom"], delay=0.4)
+    assert warnings(excited("boom"), {"boom": late})[0].endswith("got 0.40 s, perhaps more")
 
 
 def duties(*levels, ticks=60):
