@@ -1,11 +1,11 @@
-"""How far from what the computer can do: gradients of both learners, and kinematics.
+"""How far from what the computer can do: updates of both learners, and kinematics.
 
     python -m benchmarks.limits [--json F]
 
-Updates, PPO's and ours: operations per second of the matrix products in a gradient, compared with
-the better rate of torch and NumPy on the same shapes. Kinematics: compared with a loop over
-pinocchio. For the environment see `benchmarks.rollout`. Times are of CPU, of one thread, so that
-other work counts little.
+Updates, PPO's and ours: operations per second of all products of matrices in an update, those of
+the gradient and those of Muon, compared with the better rate of torch and NumPy on the same shapes.
+Kinematics: compared with a loop over pinocchio. For the environment see `benchmarks.rollout`. Times
+are of CPU, of one thread, so that other work counts little.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import tyro
 
 from benchmarks import write
 from brokk_min import ppo
-from brokk_min.identification.muon import Muon
+from brokk_min.identification.muon import ITERATIONS, Muon
 from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.learning.checkpoint import use_fast_float32
 from brokk_min.learning.episodes import GRADIENT_LEARNER
@@ -63,10 +63,19 @@ def shapes(widths: tuple[int, ...], batch: int) -> list[tuple[int, int, int]]:
     return result
 
 
-def gradient(
+def muon_shapes(widths: tuple[int, ...]) -> list[tuple[int, int, int]]:
+    """(m, k, n) of all products in a step of Muon: three for each matrix and iteration."""
+    result = []
+    for pair in pairwise(widths):
+        a, b = sorted(pair)
+        result += ITERATIONS * [(a, b, a), (a, a, a), (a, a, b)]
+    return result
+
+
+def update(
     loss_function: ppo.Loss, batch: int, optimize: Callable[..., torch.optim.Adam], options: Options
 ) -> dict[str, Any]:
-    """One minibatch of `ppo.train`: loss, gradient, step. Work: the products of the gradient."""
+    """One minibatch of `ppo.train`: loss, gradient, step. Work: all its products of matrices."""
     agent = ppo.Agent(223, 4, -1.8, critic=False)
     optimizer = optimize(agent.parameters(), 1e-3)
     mb = {"obs": torch.randn(batch, 223), "actions": torch.randn(batch, 4)}
@@ -80,7 +89,8 @@ def gradient(
         torch.nn.utils.clip_grad_norm_(agent.parameters(), 1.0)
         optimizer.step()
 
-    sizes = shapes((223, 256, 128, 64, 4), batch)
+    widths = (223, 256, 128, 64, 4)
+    sizes = shapes(widths, batch) + (muon_shapes(widths) if optimize is Muon else [])
     rng = np.random.default_rng(0)
     arrays = []
     for m, k, n in sizes:
@@ -89,7 +99,7 @@ def gradient(
         arrays.append((a, b))
     tensors = [(torch.from_numpy(a), torch.from_numpy(b)) for a, b in arrays]
     calls = {
-        "gradient": step,
+        "update": step,
         "torch": lambda: [a @ b for a, b in tensors],
         "numpy": lambda: [a @ b for a, b in arrays],
     }
@@ -98,8 +108,8 @@ def gradient(
     rates = {name: work / time for name, time in times.items()}
     return {
         "gflops": rates,
-        "seconds": times["gradient"],
-        "fraction_of_best": rates["gradient"] / max(rates["torch"], rates["numpy"]),
+        "seconds": times["update"],
+        "fraction_of_best": rates["update"] / max(rates["torch"], rates["numpy"]),
     }
 
 
@@ -137,8 +147,9 @@ def main(options: Options) -> dict[str, Any]:
     adam = partial(torch.optim.Adam, fused=True)  # as `ppo.make_learner`
     result = {
         "load": os.getloadavg(),
-        "gradient": gradient(ppo.ppo_loss, ppo.PPOConfig.minibatch_size, adam, options),
-        "regression": gradient(regression_loss, ours, Muon, options),
+        "ppo": update(ppo.ppo_loss, ppo.PPOConfig.minibatch_size, adam, options),
+        "ours": update(regression_loss, ours, Muon, options),
+        "ours_with_adam": update(regression_loss, ours, adam, options),
         "kinematics": kinematics(options),
     }
     write(result, options.json)
