@@ -14,6 +14,7 @@ Array = NDArray[Any]  # counts and flags, too
 # CAN identifiers of CANopen; from TPDO1 on the node's number is added
 NMT = 0x000
 SYNC = 0x080
+EMERGENCY = 0x080  # with the node's number
 TPDO1 = 0x180
 SDO_ANSWER = 0x580
 SDO_REQUEST = 0x600
@@ -34,6 +35,7 @@ JOINTS_A_FRAME = 5  # in a valve frame; joints 6 to 10 are in the frame of the n
 # the operator's input is logged as frames that are never on the bus
 OPERATOR_CHANNEL = "operator"
 OPERATOR_INPUT = 0x7FF
+FASTEST_GOAL = 3.2767  # m/s, in 16 bits of 0.1 mm/s
 
 
 class Frame(NamedTuple):
@@ -114,15 +116,21 @@ class Nodes:
 
 
 def check_bus(machine: Machine) -> None:
-    """ValueError: valve frames without free identifiers, ticks too long for the watchdog, a range
-    of more than a turn: positions count from the middle of the range.
+    """ValueError: valve frames without free identifiers, ticks too long for the watchdog, more bits
+    than positions have, goals too fast for the log, a range of more than a turn: positions count
+    from the middle of the range.
     """
     used = [*used_ids(machine), *(SDO_REQUEST + joint.encoder_node for joint in machine.joints)]
+    used += [OPERATOR_INPUT, *(EMERGENCY + node for node in node_numbers(machine))]
     taken = [i for i in valve_frame_ids(machine) if i > 0x7FF or used.count(i) > 1]
     if taken:
         got = ", ".join(f"0x{i:03X}" for i in taken)
         expected = "expected an identifier of no other frame"
         raise ValueError(f"{machine.name}: valve_frame_id: {expected}, got {got}")
+    fields = (("encoder_bits", POSITION_BITS), ("tool_speed", FASTEST_GOAL))
+    for name, most in fields:
+        if (got := getattr(machine, name)) > most:
+            raise ValueError(f"{machine.name}: {name}: expected at most {most}, got {got}")
     for joint in machine.joints:
         width = joint.q_max - joint.q_min
         if joint.kind == "revolute" and width > 2 * np.pi - 0.1:

@@ -8,7 +8,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -92,11 +92,13 @@ class Bus:
             self.unwritten.append(message)
 
     def close(self) -> None:
-        """Close bus and log."""
-        self.bus.shutdown()
-        if self.writer is not None:
-            self.flush()
-            self.writer.stop()
+        """Close bus and log, the log even if the bus fails."""
+        try:
+            self.bus.shutdown()
+        finally:
+            if self.writer is not None:
+                self.flush()
+                self.writer.stop()
 
 
 def standard_id(message: Any) -> int:
@@ -129,18 +131,21 @@ def open_bus(
     with suppress(NotImplementedError):  # python-can's word for a bus without a descriptor
         bus.file = raw.fileno()
     try:
-        yield bus
+        with closing(bus):
+            yield bus
     except can.CanError as error:
         raise ValueError(f"{where} that works, got {reason(error)}") from error
-    finally:
-        bus.close()
+    except OSError as error:
+        error.filename = error.filename or (log and str(log))  # a full disk
+        raise
 
 
 @contextmanager
 def stop_signals() -> Iterator[list[int]]:
-    """A list to which SIGINT and SIGTERM are appended, instead of ending the program."""
+    """A list to which SIGINT, SIGTERM and SIGHUP are appended, instead of ending the program."""
     received: list[int] = []
-    numbers = (signal.SIGINT, signal.SIGTERM)
+    names = ("SIGINT", "SIGTERM", "SIGHUP")  # the last: a terminal was closed; not on Windows
+    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
     handlers = [signal.signal(n, lambda number, _: received.append(number)) for n in numbers]
     try:
         yield received

@@ -14,6 +14,7 @@ import numpy as np
 from brokk_min.can import canopen
 from brokk_min.can.canopen import OPERATOR_CHANNEL, Frame, Nodes, OperatorInput
 from brokk_min.can.connection import standard_id
+from brokk_min.can.safety_gate import fault_name
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.hw import Drive
 from brokk_min.identification.files import brief, expected, open_regular, require
@@ -30,12 +31,16 @@ def read_frames(path: Path) -> Iterator[Frame]:
 
     A last line without its newline is left out: the program that wrote it was killed.
 
-    ValueError: no such log, or a line that is no frame.
+    ValueError: no such log, a line that is no frame, or frames of two buses.
     """
     reader = require("can", "hw").CanutilsLogReader(StringIO())
+    buses: dict[str, None] = {}
     with expected(path, "a candump log"), open_regular(path, LARGEST_LOG) as file:
         reader.file = _whole_lines(file)
         for m in reader:
+            buses |= {str(m.channel): None} if m.channel != OPERATOR_CHANNEL else {}
+            if len(buses) > 1:
+                raise ValueError(f"frames of {' and '.join(buses)}: keep those of one bus")
             frame = Frame(m.timestamp, standard_id(m), bytes(m.data), not m.is_rx, str(m.channel))
             if not 0 <= frame.time < 1e12:
                 raise ValueError(f"a time of {frame.time}")
@@ -132,7 +137,9 @@ def log_for_fit(machine: Machine, frames: Iterable[Frame]) -> Log:
     """
     recordings: list[list[tuple[Array, Array]]] = []
     last = -np.inf
+    ticks = 0
     for tick in read_telemetry(machine, frames):
+        ticks += 1
         if tick.driving and np.isfinite(tick.q).all():
             if not 0.5 < (tick.time - last) * machine.rate < 1.5:
                 recordings.append([])
@@ -144,9 +151,10 @@ def log_for_fit(machine: Machine, frames: Iterable[Frame]) -> Log:
         if len(commands) > machine.history + 1:
             named.append((f"drive_{number:03d}", commands, angles))
     if not named:
-        raise ValueError(
-            f"log: expected more than {machine.history + 1} ticks of driving in a row, got none"
-        )
+        wanted = f"expected more than {machine.history + 1} ticks of driving in a row"
+        longest = max(map(len, recordings), default=0)
+        got = f"{longest} at most, of {ticks} ticks at {machine.rate:g} Hz (--machine)"
+        raise ValueError(f"log: {wanted}, got {got}")
     return machine_log(machine, named)
 
 
@@ -187,6 +195,7 @@ class TelemetryReader:
             return None
         telemetry = self._telemetry()
         self.nodes.start_tick()
+        self.valves.enable[:] = False  # no frame, no command
         self.tick += 1
         self.start = frame.time
         return telemetry
@@ -220,6 +229,8 @@ def status(drive: Drive) -> str:
     state = "waiting" if drive.gate.active_fault else "ready  "
     state = "driving" if drive.gate.driving else state
     reason = f" {drive.reason}" if drive.reason else ""
+    active = fault_name(drive.machine, int(drive.gate.active_fault))
+    reason += f", now {active}" if active not in drive.reason else ""  # what is in the way
     q, q_dot = drive.measured
     v = tool_velocity(forward_kinematics(drive.machine, q), q_dot)
     vectors = (drive.operator_input.v_goal, v, q)

@@ -22,6 +22,8 @@ JUMP_FACTOR = 2.0  # times the fastest motion,
 JUMP_ANGLE = 0.0045  # rad or m, plus this and one count: a larger step is a jump
 # an encoder is frozen if it stands still while the joint must have turned by this, or by one count
 FROZEN_ANGLE = 0.0015  # rad or m
+# and if it flickers by as much, or by one count, while the joint must have turned by this
+FLICKER_ANGLE = 0.03  # rad or m
 OPENING_TIME = 0.45  # s of commands to one side, after which a joint moves even from rest
 IDLE_ZONES = 1.5  # dead zones: the default of `Machine.largest_dead_zone`
 SLOWEST = 0.4  # of the fastest motion: long lever arm, weak pump
@@ -69,6 +71,8 @@ class GateState(NamedTuple):
     counts: Array  # newest angles [encoder counts], (..., n)
     sent: Array  # commands of `OPENING_TIME`, newest last [counts of 127], (..., n, ticks)
     expected_motion: Array  # at least, since the count last changed [rad], (..., n)
+    near: Array  # counts from which the angle has hardly gone away since then, (..., n)
+    motion_near: Array  # as `expected_motion`, since it came near them [rad], (..., n)
 
 
 class GateInputs(NamedTuple):
@@ -103,6 +107,8 @@ def gate_start(machine: Machine, shape: tuple[int, ...] = ()) -> GateState:
         counts=np.zeros((*shape, machine.n), int),
         sent=np.zeros((*shape, machine.n, int(np.ceil(OPENING_TIME * machine.rate))), int),
         expected_motion=np.zeros((*shape, machine.n)),
+        near=np.zeros((*shape, machine.n), int),
+        motion_near=np.zeros((*shape, machine.n)),
     )
 
 
@@ -117,7 +123,8 @@ def gate(
     """
     now = np.asarray(now)
     expected = expected_motion(machine, state, inputs.counts)
-    fault = active_fault(machine, state, inputs, expected, now)
+    near, motion = near_motion(machine, state, inputs.counts)
+    fault = active_fault(machine, state, inputs, expected, motion, now)
     edge = inputs.enable & ~state.enable & inputs.centred
     driving = inputs.enable & (state.driving | edge) & (fault == 0)
     latched = np.where(driving, 0, np.where(state.driving, fault, state.latched_fault))
@@ -136,6 +143,8 @@ def gate(
         counts=inputs.counts,
         sent=np.concatenate([state.sent[..., 1:], command[..., None]], axis=-1),
         expected_motion=expected,
+        near=near,
+        motion_near=motion,
     )
     return state, valve_frames(command, counter, driving)
 
@@ -166,6 +175,23 @@ def expected_motion(machine: Machine, state: GateState, counts: Array) -> Array:
     | 80, but one is -30 | same    | 0, and starts again from 0: the valve may have closed       |
     | any                | another | 0, and starts again from 0: the encoder shows motion        |
     """
+    least = least_motion(machine, state)
+    still = (least > 0) & (counts == state.counts)
+    return np.where(still, state.expected_motion + least, 0.0)
+
+
+def near_motion(machine: Machine, state: GateState, counts: Array) -> tuple[Array, Array]:
+    """`near` and `motion_near` of the next state, (..., n): as `expected_motion`, but an angle that
+    changes by `FROZEN_ANGLE` or one count alone, to and fro, shows no motion.
+    """
+    least = least_motion(machine, state)
+    away = np.abs(counts - state.near)
+    stays = (least > 0) & (away <= np.maximum(1, FROZEN_ANGLE // machine.encoder_step))
+    return np.where(stays, state.near, counts), np.where(stays, state.motion_near + least, 0.0)
+
+
+def least_motion(machine: Machine, state: GateState) -> Array:
+    """Angle [rad] (..., n) by which each joint must turn in this tick, see `expected_motion`."""
     idle = machine.largest_dead_zone or IDLE_ZONES * machine.dead_zones.max()
     limit = machine.pwm_limit / PWM_MAX
     side = np.sign(state.sent[..., -1:])
@@ -173,12 +199,16 @@ def expected_motion(machine: Machine, state: GateState, counts: Array) -> Array:
     opening = np.maximum(smallest - idle, 0.0) / max(limit - idle, 1 / PWM_MAX)
     slower = np.minimum(machine.column("q_dot_up"), machine.column("q_dot_down"))
     q_dot = SLOWEST * slower * opening
-    still = (q_dot > 0) & (counts == state.counts)
-    return np.where(still, state.expected_motion + machine.dt * q_dot, 0.0)
+    return np.asarray(machine.dt * q_dot)
 
 
 def active_fault(
-    machine: Machine, state: GateState, inputs: GateInputs, expected: Array, now: Array
+    machine: Machine,
+    state: GateState,
+    inputs: GateInputs,
+    expected: Array,
+    motion_near: Array,
+    now: Array,
 ) -> Array:
     """Code (...) of the first fault, 1 + fault * (n + 1) + node, or 0 for none."""
     n = machine.n
@@ -202,7 +232,8 @@ def active_fault(
     faults[..., Fault.MALFORMED, :n] = inputs.frames > 1
     faults[..., Fault.OUT_OF_RANGE, :n] = (q < low) | (q > high)
     faults[..., Fault.JUMPED, :n] = np.abs(q - state.counts * machine.encoder_step) > jump
-    faults[..., Fault.FROZEN, :n] = expected > np.maximum(FROZEN_ANGLE, machine.encoder_step)
+    frozen = expected > np.maximum(FROZEN_ANGLE, machine.encoder_step)
+    faults[..., Fault.FROZEN, :n] = frozen | (motion_near > FLICKER_ANGLE)
     faults[..., Fault.NO_COMMAND, :n] = ~(np.abs(inputs.command) <= limit)  # nan, too
     faults[..., Fault.STOP, 0] = inputs.stop
     faults = faults.reshape(*now.shape, -1)

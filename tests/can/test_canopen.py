@@ -136,6 +136,10 @@ def test_set_up_nodes__refuses_what_does_not_fit(world):
     [
         (replace(SIX, valve_frame_id=0x185), "valve_frame_id: expected .*, got 0x185, 0x186"),
         (replace(BROKK_170, valve_frame_id=0x583), "valve_frame_id: .* no other frame, got 0x583"),
+        (replace(BROKK_170, valve_frame_id=0x081), "no other frame, got 0x081"),  # EMCY of node 1
+        (replace(BROKK_170, valve_frame_id=0x7FF), "no other frame, got 0x7FF"),  # in the log
+        (replace(BROKK_170, encoder_bits=27), "encoder_bits: expected at most 26, got 27"),
+        (replace(BROKK_170, tool_speed=3.3), "tool_speed: expected at most 3.2767, got 3.3"),
         (SLOW, r"slow: expected a rate of 10 Hz or more, .* got 5 Hz"),
         (WIDE, r"q1\.q_max: expected a range of less than a turn by 0.1 rad, got 6.20 rad"),
     ],

@@ -108,6 +108,23 @@ def test_open_bus__refuses_a_bus_that_is_not_there_or_fails():
         raise can.CanOperationError("full")
 
 
+def test_open_bus__keeps_its_log_and_words_where_the_adapter_fails_or_the_disk_is_full(tmp_path):
+    """An adapter that was pulled out fails at the shutdown, too."""
+
+    def fails():
+        raise can.CanOperationError("gone")
+
+    refusal = r"virtual v: expected a CAN bus that works, got gone$"
+    with pytest.raises(ValueError, match=refusal), open_bus("virtual", "v", tmp_path / "l") as bus:
+        bus.send(0x080, b"")
+        bus.bus.shutdown, shutdown = fails, bus.bus.shutdown
+    shutdown()
+    assert (tmp_path / "l").read_text().endswith(" virtual 080# T\n")
+    with pytest.raises(OSError) as caught, open_bus("virtual", "v", tmp_path / "l"):
+        raise OSError(28, "no space left on device")
+    assert caught.value.filename == str(tmp_path / "l")
+
+
 def test_open_bus__gives_socketcan_filters_that_take_its_identifiers_alone(tmp_path):
     """A frame passes if id & mask are those of one filter (CAN_RAW_FILTER of Linux)."""
     ids = used_ids(BROKK_170)

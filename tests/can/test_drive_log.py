@@ -15,7 +15,14 @@ from brokk_min.can.canopen import (
     encoder_raw,
     valve_frame,
 )
-from brokk_min.can.drive_log import ReplayedBus, TelemetryReader, log_for_fit, read_frames, replay
+from brokk_min.can.drive_log import (
+    ReplayedBus,
+    TelemetryReader,
+    log_for_fit,
+    read_frames,
+    replay,
+    status,
+)
 from brokk_min.kinematics import estimate_velocity
 from brokk_min.machine import BROKK_170
 
@@ -64,6 +71,27 @@ def test_read_frames__names_the_row_that_is_no_frame(tmp_path):
         list(read_frames(tmp_path / "log.csv"))
 
 
+def test_read_frames__refuses_frames_of_two_buses(tmp_path):
+    lines = ["(1.0) can0 123#0102\n", "(1.1) operator 7FF#00000000000000\n", "(2.0) can1 080#\n"]
+    (tmp_path / "can.log").write_text("".join(lines))
+    with pytest.raises(ValueError, match="got frames of can0 and can1: keep those of one bus"):
+        list(read_frames(tmp_path / "can.log"))
+
+
+def test_status__says_what_stopped_it_and_what_is_in_the_way():
+    operator = HoldingOperator()
+    world = World(BASELINE, operator)
+    world.drive.begin()
+    world.run(1.0)
+    world.upward = only(0x185, once(lambda data: []))
+    world.run(0.2)
+    assert "fault: q5: silent" in status(world.drive)
+    assert ", now " not in status(world.drive)
+    world.upward = only(0x703, lambda data: [])
+    world.run(0.5)
+    assert "fault: q5: silent, now q3: heartbeat lost v goal" in status(world.drive)
+
+
 def test_replay__of_a_recorded_log_sends_the_same_bytes(tmp_path):
     drive_logged(tmp_path / "run.log")
     frames = list(read_frames(tmp_path / "run.log"))
@@ -110,7 +138,8 @@ def test_log_for_fit__by_hand():
         np.testing.assert_allclose(recording.q, counts * STEP, atol=1e-12)
         np.testing.assert_allclose(recording.q_dot[4:], 10 * STEP, atol=1e-12)
         np.testing.assert_allclose(recording.u * 127, len(ticks) * [[80, 0, -80, 1, 0]], atol=1e-9)
-    with pytest.raises(ValueError, match="expected more than 14 ticks of driving in a row"):
+    refusal = "more than 14 ticks of driving in a row, got 11 at most, of 12 ticks at 10 Hz"
+    with pytest.raises(ValueError, match=refusal):
         log_for_fit(machine, frames[:100])
 
 
@@ -134,6 +163,9 @@ def test_telemetry_reader__gives_at_each_sync_the_tick_before():
     np.testing.assert_allclose(telemetry.q_dot, estimate_velocity(newest, 4, 0.05))
     np.testing.assert_allclose(telemetry.u * 127, [50, 0, -80, 0, 0])
     np.testing.assert_allclose(telemetry.v_goal, [0.1, 0.0, -0.2])
+    assert reader.update(Frame(0.0, 0x080, b"")).driving
+    assert not reader.update(Frame(0.0, 0x080, b"")).driving  # a tick without a valve frame
+    reader.tick -= 2
     reader.update(Frame(0.0, 0x210, valve_frame([0, 0, 0, 0, 0], 7, 0).tobytes()))
     reader.update(Frame(0.0, 0x080, b""))
     reader.update(Frame(0.0, 0x181, struct.pack("<I", 3)))  # the others are missing

@@ -14,6 +14,7 @@ from brokk_min.can.safety_gate import (
     fault_name,
     gate,
     gate_start,
+    near_motion,
 )
 from brokk_min.machine import BROKK_170, decode_pwm
 
@@ -85,6 +86,25 @@ def test_gate__finds_a_frozen_encoder_in_radians_and_seconds(bits, rate):
     assert 0.45 <= ticks / rate <= 0.45 + 0.05 + 1.5 / rate
 
 
+@pytest.mark.parametrize(("bits", "flicker", "seconds"), [(12, 1, 0.85), (18, 40, 0.85)])
+def test_gate__finds_an_encoder_that_flickers_around_one_place(bits, flicker, seconds):
+    """At 80 counts q1 turns by 4 mrad a tick at least: after 0.45 s by 0.03 rad in eight ticks."""
+    machine = replace(BROKK_170, name="other", encoder_bits=bits)
+    state = gate_start(machine)
+    for tick in range(30):
+        state.sent[0, -min(tick, state.sent.shape[-1]) :] = 80 if tick else 0
+        counts = np.array([flicker * (tick % 2), 0, 0, 0, 0])
+        near, motion = near_motion(machine, state, counts)
+        assert not expected_motion(machine, state, counts)[0] > 0.0015
+        state = state._replace(counts=counts, near=near, motion_near=motion)
+        if motion[0] > 0.03:
+            break
+    assert tick * machine.dt == pytest.approx(seconds, abs=0.051)
+    moved = counts + np.array([2 * flicker, 0, 0, 0, 0])
+    near, motion = near_motion(machine, state, moved)
+    assert (near[0], motion[0]) == (moved[0], 0.0)
+
+
 # --- a plain rewriting ---------------------------------------------------------------------------
 
 
@@ -123,15 +143,28 @@ def tight_machine():
 
 def plain_expected_motion(machine, s, count, j):
     """Motion [rad] that is expected at least of joint `j`."""
+    least = plain_least_motion(machine, s, j)
+    return float(s.expected_motion[j]) + least if least and count == s.counts[j] else 0.0
+
+
+def plain_least_motion(machine, s, j):
+    """That of one tick; 0: a command may have done nothing."""
     joint = machine.joints[j]
     sent = s.sent[j].tolist()
     idle = 1.5 * machine.dead_zone
     smallest = min(sent) / 127 if sent[-1] > 0 else -max(sent) / 127
-    if smallest <= idle or count != s.counts[j]:  # a command may have done nothing, or it moved
+    if smallest <= idle:
         return 0.0
     opening = (smallest - idle) / (80 / 127 - idle)
-    q_dot = 0.4 * min(joint.q_dot_up, joint.q_dot_down) * opening
-    return float(s.expected_motion[j]) + DT * q_dot
+    return DT * (0.4 * min(joint.q_dot_up, joint.q_dot_down) * opening)
+
+
+def plain_near(machine, s, count, j):
+    """Where joint `j` has hardly gone away from, and the motion expected since [rad]."""
+    least = plain_least_motion(machine, s, j)
+    if least and abs(int(count) - int(s.near[j])) <= 1:  # a count of 12 bits is above 1.5 mrad
+        return int(s.near[j]), float(s.motion_near[j]) + least
+    return int(count), 0.0
 
 
 def plain_fault(machine, s, i, now):
@@ -157,6 +190,7 @@ def plain_fault(machine, s, i, now):
         faults[10, j] = not joint.q_min - 0.05 <= c * STEP <= joint.q_max + 0.05
         faults[11, j] = abs(c * STEP - old * STEP) > jump
         faults[12, j] = plain_expected_motion(machine, s, c, j) > max(0.0015, STEP)
+        faults[12, j] |= plain_near(machine, s, c, j)[1] > 0.03
         faults[13, j] = not -limit <= i.command[j] <= limit
     return min((1 + kind * 6 + node for (kind, node), found in faults.items() if found), default=0)
 
@@ -176,6 +210,7 @@ def plain_gate(machine, s, i, now):
     trusted = i.alive and not i.error
     counter = 0 if s.counter == 255 else int(s.counter) + 1
     motion = [plain_expected_motion(machine, s, int(c), j) for j, c in enumerate(i.counts)]
+    near = [plain_near(machine, s, c, j) for j, c in enumerate(i.counts)]
     state = GateState(
         driving=driving,
         armed_once=bool(s.armed_once) or driving,
@@ -187,6 +222,8 @@ def plain_gate(machine, s, i, now):
         counts=i.counts,
         sent=[[*old[1:], new] for old, new in zip(s.sent, m, strict=True)],
         expected_motion=motion,
+        near=[place for place, _ in near],
+        motion_near=[angle for _, angle in near],
     )
     return state, [*(x if x >= 0 else 255 + x for x in m), counter, int(driving)]
 
@@ -269,6 +306,8 @@ class Cases:
             counts=last,
             sent=np.where(self.some(0.02, n, 9), -sent, sent),
             expected_motion=STEP * rng.choice([0.0, 0.5, 0.9], (num, n), p=[0.7, 0.2, 0.1]),
+            near=self.inputs.counts + rng.integers(-2, 3, (num, n)),
+            motion_near=rng.choice([0.0, 0.01, 0.0299], (num, n), p=[0.6, 0.395, 0.005]),
         )
         # now and then as much motion as may be expected, to the bit, or a bit more
         due = np.zeros((num, n))

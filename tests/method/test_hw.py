@@ -343,7 +343,7 @@ def test_wait__keeps_an_absolute_grid_and_skips_missed_ticks(world):
 # --- endings -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_run__ends_on_a_signal_with_a_neutral_frame(number, world):
     out, shown = Out(), list[tuple[int, str]]()
     world.downward = recording(out)
