@@ -31,7 +31,14 @@ from benchmarks import memory, write
 from brokk_min.actuator import plant_reset, plant_step
 from brokk_min.can.drive_log import read_frames, read_telemetry, status
 from brokk_min.can.operator_input import Script
-from brokk_min.can.safety_gate import FROZEN_ANGLE, SLEW, expected_motion, gate_start
+from brokk_min.can.safety_gate import (
+    FLICKER_ANGLE,
+    FROZEN_ANGLE,
+    SLEW,
+    expected_motion,
+    gate_start,
+    near_motion,
+)
 from brokk_min.evaluation.sequences import task_sequences
 from brokk_min.hw import Drive
 from brokk_min.identification.files import SHIPPED
@@ -160,11 +167,13 @@ def frozen_on_drive(counts: np.ndarray, sent: np.ndarray, most: int = 60) -> np.
     before = np.concatenate([np.zeros_like(start.sent.T), sent])
     windows = np.lib.stride_tricks.sliding_window_view(before, start.sent.shape[-1], axis=0)
     sound = np.zeros(counts.shape)
+    near, motion = start.near, start.motion_near
+    limit = np.maximum(FROZEN_ANGLE, m.encoder_step)
     for t in range(1, len(counts)):
         state = start._replace(counts=counts[t - 1], sent=windows[t], expected_motion=sound[t - 1])
         sound[t] = expected_motion(m, state, counts[t])
-    limit = np.maximum(FROZEN_ANGLE, m.encoder_step)
-    assert (sound <= limit).all(), "false alarm"
+        near, motion = near_motion(m, state._replace(near=near, motion_near=motion), counts[t])
+        assert (sound[t] <= limit).all() and (motion <= FLICKER_ANGLE).all(), "false alarm"
     at = np.arange(4, len(counts) - most)
     frozen, expected = counts[at], sound[at]
     ticks = np.full(frozen.shape, most)

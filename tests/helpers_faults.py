@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from functools import partial
+from itertools import cycle
 from typing import Any, NamedTuple
 
 import can
@@ -55,6 +56,13 @@ def freeze(world, node, command=None):
     counts = np.rint(world.simulated.plant.q / STEP).astype(int)
     data = struct.pack("<I", encoder_raw(BROKK_170, counts)[node - 1])
     up(0x180 + node, lambda _: [data])(world)
+
+
+def flicker(world, node):
+    """A loose encoder: one place, to and fro by one count."""
+    counts = np.rint(world.simulated.plant.q / STEP).astype(int)
+    places = cycle(encoder_raw(BROKK_170, counts + k)[node - 1] for k in (0, 1))
+    up(0x180 + node, lambda _: [struct.pack("<I", next(places))])(world)
 
 
 def due(world, held):
@@ -308,6 +316,7 @@ NOT_FOUND = {
         "a position has neither time nor number",
     ),
     "slow q3 frozen": (partial(freeze, node=3, command=SLOW), "it takes longer, see below"),
+    "q3 flickers by one count": (partial(flicker, node=3), "it takes longer, see below"),
     "q3 drifts by 60 counts/s": (partial(drift, node=3, speed=60), MOTION),
     "q5 drifts by 400 counts/s": (partial(drift, node=5, speed=-400), MOTION),
     "valve frames 30 ms late": (

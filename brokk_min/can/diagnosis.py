@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from brokk_min.actuator import Valves, command_at_rest, initial_history
 from brokk_min.can.canopen import Frame
-from brokk_min.can.drive_log import Telemetry, read_telemetry
+from brokk_min.can.drive_log import Telemetry, read_telemetry, with_operator
 from brokk_min.env import action_to_pwm, features, integrate_error, measure
 from brokk_min.identification.logs import Recording, velocity_of
 from brokk_min.identification.simulation import free_run
@@ -55,9 +55,12 @@ class Term(NamedTuple):
 
 
 def read_ticks(machine: Machine, frames: Iterable[Frame]) -> Ticks:
-    """The longest stretch of ticks with all positions; ValueError: it is too short."""
+    """The longest stretch of ticks with all positions.
+
+    ValueError: it is too short, or the log does not say what the operator wanted.
+    """
     stretches: list[list[Telemetry]] = [[]]
-    for tick in read_telemetry(machine, frames):
+    for tick in read_telemetry(machine, with_operator(frames)):
         if np.isfinite(tick.q).all():
             stretches[-1].append(tick)
         else:

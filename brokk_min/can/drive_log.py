@@ -3,11 +3,12 @@
 Telemetry is the state of one tick, from the frames of a bus or of a log.
 """
 
+import struct
 from collections import deque
 from collections.abc import Iterable, Iterator
 from io import StringIO
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 
@@ -35,27 +36,36 @@ def read_frames(path: Path) -> Iterator[Frame]:
     """
     reader = require("can", "hw").CanutilsLogReader(StringIO())
     buses: dict[str, None] = {}
+    row = [0]  # of the file, from 1
     with expected(path, "a candump log"), open_regular(path, LARGEST_LOG) as file:
-        reader.file = _whole_lines(file)
-        for m in reader:
-            buses |= {str(m.channel): None} if m.channel != OPERATOR_CHANNEL else {}
-            if len(buses) > 1:
-                raise ValueError(f"frames of {' and '.join(buses)}: keep those of one bus")
-            frame = Frame(m.timestamp, standard_id(m), bytes(m.data), not m.is_rx, str(m.channel))
-            if not 0 <= frame.time < 1e12:
-                raise ValueError(f"a time of {frame.time}")
-            operator_input_of(frame)  # refuses a damaged one
-            yield frame
+        reader.file = _whole_lines(file, row)
+        try:
+            for m in reader:
+                buses |= {str(m.channel): None} if m.channel != OPERATOR_CHANNEL else {}
+                if len(buses) > 1:
+                    raise ValueError(f"frames of {' and '.join(buses)}: keep those of one bus")
+                yield _frame(m)
+        except (ValueError, IndexError, struct.error) as error:
+            raise ValueError(f"row {row[0]}: {error}") from error
 
 
-def _whole_lines(file: IO[bytes]) -> Iterator[str]:
-    for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE), b""), 1):
+def _whole_lines(file: IO[bytes], row: list[int]) -> Iterator[str]:
+    for row[0], line in enumerate(iter(lambda: file.readline(LONGEST_LINE), b""), 1):
         if line.strip() and not line.startswith(b"("):
-            raise ValueError(f"row {number}: {brief(line.decode(errors='replace').strip())}")
+            raise ValueError(brief(line.decode(errors="replace").strip()))
         if line.endswith(b"\n"):
             yield line.decode()
         elif len(line) == LONGEST_LINE:
-            raise ValueError(f"a line of {LONGEST_LINE} bytes or more")
+            raise ValueError(f"{LONGEST_LINE} bytes or more")
+
+
+def _frame(m: Any) -> Frame:
+    # Of a message of python-can.
+    frame = Frame(m.timestamp, standard_id(m), bytes(m.data), not m.is_rx, str(m.channel))
+    if not 0 <= frame.time < 1e12:
+        raise ValueError(f"a time of {frame.time}")
+    operator_input_of(frame)  # refuses a damaged one
+    return frame
 
 
 def operator_input_of(frame: Frame) -> OperatorInput | None:
@@ -63,6 +73,16 @@ def operator_input_of(frame: Frame) -> OperatorInput | None:
     if frame.id == canopen.OPERATOR_INPUT and frame.channel == OPERATOR_CHANNEL:
         return canopen.unpack_operator_input(frame.data)
     return None
+
+
+def with_operator(frames: Iterable[Frame]) -> Iterator[Frame]:
+    """The frames of a log; ValueError, at its end: none of them is the operator's."""
+    found = False
+    for frame in frames:
+        found |= operator_input_of(frame) is not None
+        yield frame
+    if not found:
+        raise ValueError("log: expected the operator's frames, of `drive --log`, got none")
 
 
 class ReplayedBus:
@@ -116,9 +136,9 @@ class ReplayedBus:
 def replay(machine: Machine, controller: Controller, frames: Iterable[Frame]) -> tuple[int, int]:
     """Run the loop on a log of it: how many valve frames are the same bytes, and of how many.
 
-    ValueError: another program made the log.
+    ValueError: another program made the log, or its bus failed.
     """
-    bus = ReplayedBus(frames)
+    bus = ReplayedBus(with_operator(frames))
     drive = Drive(machine, controller, bus, bus.operator)
     drive.begin()
     while bus.frames:

@@ -22,6 +22,7 @@ from brokk_min.can.drive_log import (
     read_frames,
     replay,
     status,
+    with_operator,
 )
 from brokk_min.kinematics import estimate_velocity
 from brokk_min.machine import BROKK_170
@@ -69,12 +70,15 @@ def test_read_frames__names_the_row_that_is_no_frame(tmp_path):
     (tmp_path / "log.csv").write_text("(1.0) can0 123#0102\n\nrun,time,u_a,q_a\n")
     with pytest.raises(ValueError, match=r"expected a candump log, got row 3: 'run,time,u_a,q_a'"):
         list(read_frames(tmp_path / "log.csv"))
+    (tmp_path / "log.csv").write_text("(1.0) can0 123#0102\n(2.0) can0 123##F00\n")
+    with pytest.raises(ValueError, match=r"got row 2: invalid literal"):
+        list(read_frames(tmp_path / "log.csv"))
 
 
 def test_read_frames__refuses_frames_of_two_buses(tmp_path):
     lines = ["(1.0) can0 123#0102\n", "(1.1) operator 7FF#00000000000000\n", "(2.0) can1 080#\n"]
     (tmp_path / "can.log").write_text("".join(lines))
-    with pytest.raises(ValueError, match="got frames of can0 and can1: keep those of one bus"):
+    with pytest.raises(ValueError, match="row 3: frames of can0 and can1: keep those of one bus"):
         list(read_frames(tmp_path / "can.log"))
 
 
@@ -104,6 +108,9 @@ def test_replay__of_a_recorded_log_sends_the_same_bytes(tmp_path):
     cut = frames[: len(frames) * 2 // 3]  # as after a SIGKILL
     num = sum(frame.id == 0x210 for frame in cut)
     assert replay(BROKK_170, BASELINE, cut) == (num, num)
+    bus_alone = [frame for frame in frames if frame.channel != OPERATOR_CHANNEL]
+    with pytest.raises(ValueError, match="expected the operator's frames, of `drive --log`"):
+        list(with_operator(bus_alone))
     with pytest.raises(ValueError, match=r"log: expected \w+ sent at .*, got"):
         replay(BROKK_170, BASELINE, [frame for frame in frames if frame.id != 0x210])
 

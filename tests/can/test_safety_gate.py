@@ -307,7 +307,7 @@ class Cases:
             sent=np.where(self.some(0.02, n, 9), -sent, sent),
             expected_motion=STEP * rng.choice([0.0, 0.5, 0.9], (num, n), p=[0.7, 0.2, 0.1]),
             near=self.inputs.counts + rng.integers(-2, 3, (num, n)),
-            motion_near=rng.choice([0.0, 0.01, 0.0299], (num, n), p=[0.6, 0.395, 0.005]),
+            motion_near=rng.choice([0.0, 0.01, 0.0299], (num, n), p=[0.6, 0.38, 0.02]),
         )
         # now and then as much motion as may be expected, to the bit, or a bit more
         due = np.zeros((num, n))
