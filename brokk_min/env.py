@@ -310,7 +310,7 @@ def step(
 ) -> tuple[State, Array, NDArray[np.bool_], NDArray[np.bool_], Array]:
     """One tick under actions (num, n_driven) of `num` machines, without new goals or resets.
 
-    The next state; reward, terminated, truncated and |v_goal - v_tool| [m/s], (num,) each.
+    Next state; reward, terminated, truncated, |v_goal - v_tool| [m/s] (num,). ValueError: actions.
     """
     u = action_to_pwm(machine, action, config.paper)
     valves = "open" if config.paper else config.valves

@@ -46,7 +46,7 @@ class Drive:
         self.gate = gate_start(machine)
         self.history: Array | None = None  # None after a gap
         self.v_goal: Array = np.zeros((1, 3), np.float32)  # m/s, of the last tick
-        self.error_integral: Array = np.zeros((1, 3), np.float32)
+        self.error_integral: Array = np.zeros((1, 3), np.float32)  # m
         self.controller_state = controller.start(1)
         self.exception = ""  # of this tick
         self.last_exception = ""  # since it drove
