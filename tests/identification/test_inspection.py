@@ -244,16 +244,16 @@ def test_warnings__know_an_operators_work_from_an_excitation():
 def duties(*levels, ticks=60):
     """Commands held for some ticks each, with pauses as long, up and down."""
     steps = np.stack([levels, np.zeros(len(levels)), -np.array(levels), np.zeros(len(levels))])
-    return np.repeat(np.tile(steps.T.ravel(), 20), ticks)
+    return np.repeat(np.tile(steps.T.ravel(), 6), ticks)
 
 
 def ramped(u):
     return np.convolve(u, np.full(4, 1 / 4))
 
 
-NOISE = np.random.default_rng(0).uniform(-0.002, 0.002, 8000)  # of full command
-TIME = np.arange(4000) / 20
-BUMP = (np.abs(TIME - 100) < 0.25) * 0.5  # s; one short full command
+NOISE = np.random.default_rng(0).uniform(-0.002, 0.002, 2400)  # of full command
+TIME = np.arange(1200) / 20
+BUMP = (np.abs(TIME - 30) < 0.25) * 0.5  # s; one short full command
 
 
 @pytest.mark.parametrize(
