@@ -152,7 +152,7 @@ class JacobianController:
         direction[..., driven] = last
         J = jacobian(forward_kinematics(m, q))[..., driven]
         W = limit_weights(m, q, direction)[..., driven]
-        J_inv = dls(J, W, nakamura_damping(manipulability(J), self.w0, self.k) + 1e-9)  # singular
+        J_inv = dls(J, W, nakamura_damping(manipulability(J), self.w0, self.k) + 1e-9)  # above 0
         v = v_goal + self.gains.feedback * (v_goal - v_tool)
         v = v + self.gains.integral_feedback * integral  # v_d + K (v_d - v_ee) + K_I integral
         q_dot = (J_inv @ v[..., None])[..., 0]

@@ -106,7 +106,7 @@ def lowest_point(frames: Frames) -> Array:
 
 
 def to_heading(p: Array, v: Array) -> Array:
-    """Vector `v` (..., 3) in the heading frame of a tool at `p` [m]; on the axis without x, y."""
+    """Vector `v` (..., 3) in the heading frame of a tool at `p` [m]; at the axis x, y are 0."""
     radius = np.maximum(np.hypot(p[..., 0], p[..., 1]), 1e-6)
     x, y = rotate(v[..., 0], v[..., 1], p[..., 0] / radius, p[..., 1] / radius)
     return np.stack([x, y, v[..., 2]], axis=-1)

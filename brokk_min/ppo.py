@@ -24,7 +24,7 @@ from brokk_min.machine import check_numbers, number
 
 @dataclass(frozen=True)
 class PPOConfig:
-    """Of PPO with a critic, the paper's marked (D7). Ours: `episodes.GRADIENT_LEARNER` (D10)."""
+    """Settings of PPO with a critic, the paper's marked (D7). Ours: `episodes.GRADIENT_LEARNER`."""
 
     total_steps: int = number("steps", 1, 10**12, 6_000_000)  # Environment steps in all.
     num_envs: int = number("1", 1, 10**6, 256)  # Environments side by side (paper: 256).

@@ -75,11 +75,16 @@ class Bus:
         return now
 
     def flush(self) -> None:
-        """Write the log on, so that it survives the program's sudden end."""
-        while self.unwritten:
-            self.writer.on_message_received(self.unwritten.popleft())
-        if self.writer is not None:
+        """Write the log on, so that it survives the program's sudden end. OSError: a full disk."""
+        if self.writer is None:
+            return
+        try:
+            while self.unwritten:
+                self.writer.on_message_received(self.unwritten.popleft())
             self.writer.file.flush()
+        except OSError as error:
+            error.filename = self.writer.file.name
+            raise
 
     def _message(self, can_id: int, data: bytes) -> Any:
         return self.message(arbitration_id=can_id, data=data, is_extended_id=False, is_rx=False)
@@ -135,9 +140,6 @@ def open_bus(
             yield bus
     except can.CanError as error:
         raise ValueError(f"{where} that works, got {reason(error)}") from error
-    except OSError as error:
-        error.filename = error.filename or (log and str(log))  # a full disk
-        raise
 
 
 @contextmanager

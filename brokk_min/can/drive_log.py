@@ -60,7 +60,7 @@ def _whole_lines(file: IO[bytes], row: list[int]) -> Iterator[str]:
 
 
 def _frame(m: Any) -> Frame:
-    # Of a message of python-can.
+    """The frame of a message of python-can."""
     frame = Frame(m.timestamp, standard_id(m), bytes(m.data), not m.is_rx, str(m.channel))
     if not 0 <= frame.time < 1e12:
         raise ValueError(f"a time of {frame.time}")

@@ -4,6 +4,7 @@ import io
 import os
 import re
 import struct
+from pathlib import Path
 
 import can
 import pytest
@@ -120,9 +121,12 @@ def test_open_bus__keeps_its_log_and_words_where_the_adapter_fails_or_the_disk_i
         bus.bus.shutdown, shutdown = fails, bus.bus.shutdown
     shutdown()
     assert (tmp_path / "l").read_text().endswith(" virtual 080# T\n")
-    with pytest.raises(OSError) as caught, open_bus("virtual", "v", tmp_path / "l"):
-        raise OSError(28, "no space left on device")
-    assert caught.value.filename == str(tmp_path / "l")
+    with pytest.raises(OSError) as caught, open_bus("virtual", "v", Path("/dev/full")) as bus:
+        bus.send(0x080, b"")
+    assert caught.value.filename == "/dev/full"
+    with pytest.raises(BrokenPipeError) as caught, open_bus("virtual", "v", tmp_path / "l"):
+        raise BrokenPipeError(32, "of the status line")
+    assert caught.value.filename is None
 
 
 def test_open_bus__gives_socketcan_filters_that_take_its_identifiers_alone(tmp_path):
