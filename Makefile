@@ -36,7 +36,6 @@ docs: .venv/installed-dev
 	.venv/bin/python tests/paper/test_docs.py
 	.venv/bin/python tests/paper/test_paper.py
 	.venv/bin/python tests/paper/test_walkthrough.py
-	.venv/bin/python docs/annotated_numbers.py --if-changed
 	.venv/bin/python docs/annotated.py
 
 .venv/bin/python:

@@ -1,14 +1,16 @@
-"""Speed, each script one JSON; run as `python -m benchmarks.<name>` from the project's root."""
+"""Speed and ablations; run them as `python -m benchmarks.<name>` from the project's root."""
 
 import json
+import os
 import re
 from pathlib import Path
 
-import brokk_min  # noqa: F401, before NumPy: it settles how many threads that takes
-from brokk_min.identification.files import SHIPPED
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: small products wait for threads
+
+from brokk_min._files import SHIPPED
 from brokk_min.machine import BROKK_170
 
-POLICY = SHIPPED / BROKK_170.name / "policy.npz"  # of ours; it holds the nets of the driven joints
+POLICY = SHIPPED / BROKK_170.name / "policy.npz"  # ours; it holds the nets of the driven joints
 
 
 def write(result: object, path: Path | None) -> None:

@@ -7,7 +7,7 @@
 
 Machine, bus and `hw.Drive` run in one process on one clock. A fault of an encoder is repeated over
 the joints. `--frozen` prints instead how long a frozen encoder takes at each command, `--recorded`
-how long in logs of drives of the shipped policy, frozen there at each tick. `--hours` drives
+how long in drives of the shipped policy, frozen there at each tick. `--hours` drives
 instead for that long of simulated time, and prints the memory.
 """
 
@@ -17,7 +17,6 @@ import gc
 import os
 import re
 import sys
-import tempfile
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -27,24 +26,14 @@ from typing import Any
 import numpy as np
 import tyro
 
-from benchmarks import memory, write
-from brokk_min.actuator import plant_reset, plant_step
-from brokk_min.can.drive_log import read_frames, read_telemetry, status
-from brokk_min.can.operator_input import Script
-from brokk_min.can.safety_gate import (
-    FLICKER_ANGLE,
-    FROZEN_ANGLE,
-    SLEW,
-    expected_motion,
-    gate_start,
-    near_motion,
-)
+from benchmarks import POLICY, memory, write
+from brokk_min.actuator import PLANT
+from brokk_min.can.safety_gate import SLEW, expected_motion, gate_start, still_counts
+from brokk_min.cli.operating import status
+from brokk_min.evaluation.rollout import rollout
 from brokk_min.evaluation.sequences import task_sequences
-from brokk_min.hw import Drive
-from brokk_min.identification.files import SHIPPED
 from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import BROKK_170, PWM_MAX
-from brokk_min.viewer.lockstep import SimulatedBus
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from helpers_bus import ConstantCommand, HoldingOperator, World
@@ -56,7 +45,7 @@ class Options:
     repeats: int = 20  # Of each fault, at other moments between two SYNCs.
     only: str = ""  # Kinds of faults whose names match this regular expression.
     frozen: bool = False  # Times of frozen encoders by command instead.
-    recorded: bool = False  # Times of frozen encoders in logs of drives instead.
+    recorded: bool = False  # Times of frozen encoders in drives of the policy instead.
     hours: float = 0.0  # Drive for this long of simulated time, and print the memory.
     json: Path | None = None  # Also write the figures here.
 
@@ -102,21 +91,21 @@ def frozen_times(counts: int, moving: bool, rng: np.random.Generator) -> np.ndar
     joint, up = rng.choice(m.driven, num), rng.choice([-1, 1], num)
     low, high = m.column("q_min"), m.column("q_max")
     fraction = np.where(up > 0, rng.uniform(0.1, 0.4, num), rng.uniform(0.6, 0.9, num))
-    plant = plant_reset(m, low + (high - low) * fraction[:, None])
+    plant = PLANT.reset(m, low + (high - low) * fraction[:, None])
     moment = rng.uniform(0, 1, num)  # of tick `first`
-    gate = gate_start(m, (num,))._replace(counts=np.rint(plant.q / m.encoder_step).astype(int))
-    frozen, found = gate.counts, np.full(num, np.inf)
-    for tick in range(first + 40):
+    frozen = np.rint(plant.q / m.encoder_step).astype(int)
+    gate, found = gate_start(m, (num,))._replace(place=frozen), np.full(num, np.inf)
+    for tick in range(first + 60):
         q = plant.q
-        expected = expected_motion(m, gate, frozen)
-        fault = (expected > np.maximum(FROZEN_ANGLE, m.encoder_step)).any(axis=-1)
+        place, motion = expected_motion(m, gate, frozen)
+        fault = (motion > 3 * still_counts(m) * m.encoder_step).any(axis=-1)
         found = np.where(fault & np.isinf(found), tick, found)
         sent = np.zeros((num, m.n), int)
         before = np.abs(gate.sent[range(num), joint, -1])
         sent[range(num), joint] = up * np.minimum(before + SLEW, counts)
         history = np.concatenate([gate.sent[..., 1:], sent[..., None]], axis=-1)
-        gate = gate._replace(counts=frozen, sent=history, expected_motion=expected)
-        plant = plant_step(m, plant, sent / PWM_MAX)
+        gate = gate._replace(sent=history, place=place, motion=motion)
+        plant = PLANT.step(m, plant, sent / PWM_MAX)
         if tick < first:
             frozen = np.rint(plant.q / m.encoder_step).astype(int)
         elif tick == first:
@@ -140,21 +129,14 @@ def frozen_table() -> list[dict[str, float]]:
 
 
 def recorded_drives() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Angles [encoder counts] and commands [counts of 127] (T, n) of logs of the shipped policy."""
-    m = BROKK_170
-    policy = PolicyController(m, load_policy(SHIPPED / m.name / "policy.npz", m))
-    start = np.array(m.q_start)
-    with tempfile.TemporaryDirectory() as folder:
-        for sequence in task_sequences(m):
-            log = Path(folder) / f"{sequence.name}.log"
-            bus = SimulatedBus(m, start).open(log)
-            drive = Drive(m, policy, bus, Script(m, sequence.for_starts(m, start[None])[:, 0]))
-            drive.begin()
-            drive.run()
-            bus.close()
-            ticks = list(read_telemetry(m, read_frames(log)))
-            q, u = (np.array([getattr(t, k) for t in ticks if t.driving]) for k in ("q", "u"))
-            yield np.rint(q / m.encoder_step).astype(int), np.rint(u * PWM_MAX).astype(int)
+    """Angles [encoder counts] and commands [counts of 127] (T, n) of drives of the policy."""
+    m, rng = BROKK_170, np.random.default_rng(0)
+    policy = PolicyController(m, load_policy(POLICY, m))
+    start = np.array([m.q_start])
+    for sequence in task_sequences(m):
+        trace = rollout(m, policy, start, sequence.for_starts(m, start), 0.0, rng)
+        q, u = trace.q_measured[:, 0], trace.u[:, 0]
+        yield np.rint(q / m.encoder_step).astype(int), np.rint(u * PWM_MAX).astype(int)
 
 
 def frozen_on_drive(counts: np.ndarray, sent: np.ndarray, most: int = 60) -> np.ndarray:
@@ -163,24 +145,23 @@ def frozen_on_drive(counts: np.ndarray, sent: np.ndarray, most: int = 60) -> np.
     One row for each driven joint and each tick at which its encoder freezes. The commands stay as
     they were recorded. A false alarm without any fault is an AssertionError.
     """
-    m, start = BROKK_170, gate_start(BROKK_170)
-    before = np.concatenate([np.zeros_like(start.sent.T), sent])
-    windows = np.lib.stride_tricks.sliding_window_view(before, start.sent.shape[-1], axis=0)
-    sound = np.zeros(counts.shape)
-    near, motion = start.near, start.motion_near
-    limit = np.maximum(FROZEN_ANGLE, m.encoder_step)
+    m, state = BROKK_170, gate_start(BROKK_170)
+    before = np.concatenate([np.zeros_like(state.sent.T), sent])
+    windows = np.lib.stride_tricks.sliding_window_view(before, state.sent.shape[-1], axis=0)
+    limit = 3 * still_counts(m) * m.encoder_step
+    places, motions = counts.astype(float), np.zeros(counts.shape)
     for t in range(1, len(counts)):
-        state = start._replace(counts=counts[t - 1], sent=windows[t], expected_motion=sound[t - 1])
-        sound[t] = expected_motion(m, state, counts[t])
-        near, motion = near_motion(m, state._replace(near=near, motion_near=motion), counts[t])
-        assert (sound[t] <= limit).all() and (motion <= FLICKER_ANGLE).all(), "false alarm"
+        state = state._replace(sent=windows[t], place=places[t - 1], motion=motions[t - 1])
+        places[t], motions[t] = expected_motion(m, state, counts[t])
+        assert (motions[t] <= limit).all(), "false alarm"
     at = np.arange(4, len(counts) - most)
-    frozen, expected = counts[at], sound[at]
+    frozen = counts[at]
+    state = state._replace(place=places[at], motion=motions[at])
     ticks = np.full(frozen.shape, most)
     for k in range(1, most):
-        state = start._replace(counts=frozen, sent=windows[at + k], expected_motion=expected)
-        expected = expected_motion(m, state, frozen)
-        ticks = np.where(expected > limit, np.minimum(ticks, k), ticks)
+        place, motion = expected_motion(m, state._replace(sent=windows[at + k]), frozen)
+        state = state._replace(place=place, motion=motion)
+        ticks = np.where(motion > limit, np.minimum(ticks, k), ticks)
     later = np.take_along_axis(counts, at[:, None] + ticks, axis=0)
     speed = np.abs(frozen - counts[at - 4]) * m.encoder_step / (4 * m.dt)
     seconds = np.where(ticks < most, ticks * m.dt, np.inf)
@@ -223,12 +204,12 @@ def hours(number: float) -> dict[str, Any]:
     world = World(controller, operator, log=Path(os.devnull))
     world.step = world.drive.machine.plant_dt
     world.drive.begin()
-    world.simulated.record = lambda *row: None
     ticks = round(3600 * number * world.drive.machine.rate)
     used = []
     for k in range(ticks):
         world.drive.tick()
-        world.syncs.clear()
+        for rows in (world.syncs, world.recorder.u, world.recorder.q):
+            rows.clear()
         if k % max(1, ticks // 12) == max(1, ticks // 12) // 2:
             used.append(memory())
             print(f"{k} ticks: {used[-1]:.1f} MB, {status(world.drive)}", flush=True)

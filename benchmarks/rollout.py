@@ -8,6 +8,7 @@ The speed of nets does not depend on what they learned: without NET they are the
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +16,7 @@ import numpy as np
 import tyro
 
 from benchmarks import POLICY, write
+from brokk_min.identification.net_file import load_net, select_nets
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import load_policy
 from brokk_min.machine import BROKK_170
@@ -29,28 +31,29 @@ class Options:
 
 
 def main(options: Options) -> None:
-    actuator = options.actuator or load_policy(POLICY, BROKK_170).net
-    env = TaskVectorEnv(options.num_envs, actuator)
+    if options.actuator:
+        net = select_nets(BROKK_170, load_net(options.actuator, BROKK_170))
+    else:
+        net = load_policy(POLICY, BROKK_170).net
+    env = TaskVectorEnv(options.num_envs, net)
     env.reset(seed=0)
-    assert env.state is not None and env.net is not None
-    actions = np.random.default_rng(0).uniform(-1, 1, (32, options.num_envs, 4)).astype(np.float32)
-    history = env.state.history[:, env.machine.driven]
-    steps = []
-    products = []
-    for _ in range(5):
-        start = time.process_time()
-        for k in range(options.ticks):
-            env.step(actions[k % 32])
-        steps.append(options.ticks * options.num_envs / (time.process_time() - start))
+    assert env.state is not None
+    history = env.state.plant.history
+    actions = np.random.default_rng(0).uniform(-1, 1, (options.num_envs, 4)).astype(np.float32)
+
+    def rate(call: Callable[[], object]) -> float:
         start = time.process_time()
         for _ in range(options.ticks):
-            env.net.predict(history)
-        products.append(options.ticks * options.num_envs / (time.process_time() - start))
+            call()
+        return options.ticks * options.num_envs / (time.process_time() - start)
+
+    runs = [(rate(lambda: env.step(actions)), rate(lambda: net.predict(history))) for _ in range(5)]
+    steps, products = np.median(runs, axis=0)
     result = {
         "num_envs": options.num_envs,
-        "steps_per_second": {"median": float(np.median(steps)), "runs": steps},
-        "net_products_per_second": float(np.median(products)),
-        "step_over_products": float(np.median(products) / np.median(steps)),
+        "steps_per_second": {"median": float(steps), "runs": [run[0] for run in runs]},
+        "net_products_per_second": float(products),
+        "step_over_products": float(products / steps),
     }
     write(result, options.json)
 

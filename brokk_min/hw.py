@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from brokk_min.actuator import initial_history
+from brokk_min.actuator import append_sample, initial_history
 from brokk_min.can import canopen
 from brokk_min.can.canopen import Array, Operator, OperatorInput
-from brokk_min.can.connection import stop_signals
+from brokk_min.can.connection import Bus, stop_signals
 from brokk_min.can.safety_gate import GateInputs, fault_name, gate, gate_start
-from brokk_min.env import measure, update_history
-from brokk_min.machine import PWM_MAX, Machine
+from brokk_min.env import measure
+from brokk_min.machine import PWM_MAX, Machine, Measured
 
 BUSY_WAIT = 0.002  # s before and after SYNC in which the loop does not sleep (tuned)
 ANSWER_TIME = 0.4  # of a tick after SYNC, in which the encoders must answer (assumed)
@@ -29,33 +29,24 @@ ANSWER_TIME = 0.4  # of a tick after SYNC, in which the encoders must answer (as
 class Drive:
     """From the operator's velocity goals, through a controller and the gate, to the valves.
 
-    Args:
-        machine: its encoders and its valve controller are on the bus.
-        controller: a policy or a baseline, `evaluation.rollout.Controller`.
-        bus: `connection.Bus`, or a `drive_log.ReplayedBus`.
-        operator: called with (gate drives, no fault is active); returns an `OperatorInput`.
+    `controller` is a policy or a baseline, with `start` and a call as `JacobianController` has.
     """
 
-    def __init__(self, machine: Machine, controller: Any, bus: Any, operator: Operator) -> None:
-        self.machine = machine
-        self.controller = controller
-        self.bus = bus
-        self.operator = operator
+    def __init__(self, machine: Machine, controller: Any, bus: Bus, operator: Operator) -> None:
+        self.machine, self.controller = machine, controller
+        self.bus, self.operator = bus, operator
         self.operator_input = OperatorInput()
         self.nodes = canopen.Nodes(machine)
         self.gate = gate_start(machine)
         self.history: Array | None = None  # None after a gap
-        self.v_goal: Array = np.zeros((1, 3), np.float32)  # m/s, of the last tick
-        self.error_integral: Array = np.zeros((1, 3), np.float32)  # m
         self.controller_state = controller.start(1)
         self.exception = ""  # of this tick
         self.last_exception = ""  # since it drove
         self.reason = ""  # why it does not drive
         self.signals: list[int] = []
-        self.start_time = 0.0  # s; deadlines are at whole ticks after it
-        self.deadline_number = 0
-        self.ticks = 0
-        self.skipped = 0  # ticks
+        self.start_time = 0.0  # s
+        self.deadline_number = 0  # ticks from the start to the next deadline
+        self.ticks = self.skipped = 0
         self.lateness = 0.0  # s
 
     def begin(self) -> None:
@@ -93,10 +84,8 @@ class Drive:
         command = np.zeros(self.machine.n)
         with self.catch_errors():
             command = self.control(counts)
-        self.operator_input = self.operator_input._replace(
-            stop=self.operator_input.stop or bool(self.signals),
-            error=self.operator_input.error or bool(self.exception),
-        )
+        stop = self.operator_input.stop or bool(self.signals)
+        self.operator_input = self.operator_input._replace(stop=stop)
         now = self.bus.log_input(self.operator_input.pack())
         self.send_command(command, counts, now)
         self.nodes.start_tick()
@@ -118,15 +107,10 @@ class Drive:
             self.history = initial_history(q, m.history)
         else:
             u = self.gate.sent[..., -1] / PWM_MAX
-            self.history, self.error_integral = update_history(
-                m, self.history, u, q, self.v_goal, self.error_integral
-            )
+            self.history = append_sample(self.history, u, q, m.velocity_samples, m.dt)
         if not self.gate.driving:
-            self.error_integral = np.zeros((1, 3), np.float32)
             self.controller_state = self.controller.start(1)
-        self.v_goal = np.array([self.operator_input.v_goal], np.float32)
-        measured = measure(m, self.history, self.v_goal, self.error_integral)
-        u, self.controller_state = self.controller(measured, self.controller_state)
+        u, self.controller_state = self.controller(self.measured, self.controller_state)
         return np.asarray(np.rint(u[0] * PWM_MAX), float)
 
     def send_command(self, command: Array, counts: Array, now: float) -> None:
@@ -142,7 +126,7 @@ class Drive:
             centred=np.array(not any(entered.v_goal)),
             alive=np.array(entered.alive),
             stop=np.array(entered.stop),
-            error=np.array(entered.error or bool(self.exception)),
+            error=np.array(bool(self.exception)),
             flooded=np.array(self.nodes.received >= canopen.MAX_FRAMES),
             other_sender=np.array(self.nodes.others > 0),
         )
@@ -169,10 +153,8 @@ class Drive:
         end = min(deadline, self.bus.now() + self.machine.dt)  # the clock may have gone backwards
         with self.catch_errors():
             self.nodes.listen(self.bus, end - BUSY_WAIT)
-            self.bus.sleep(max(0.0, end - BUSY_WAIT - self.bus.now()))
             # warm-up: caches are cold after sleep, and the first computation takes longer
-            if self.history is not None and self.bus.now() < end:
-                measured = measure(self.machine, self.history, self.v_goal, self.error_integral)
+            if self.bus.now() < end and (measured := self.measured):
                 self.controller(measured, self.controller_state)
             self.nodes.listen(self.bus, end, BUSY_WAIT)
         self.bus.sleep(max(0.0, end - self.bus.now()))  # a broken bus does not wait
@@ -200,8 +182,9 @@ class Drive:
             self.exception = f"{type(error).__name__}: {error}"
 
     @property
-    def measured(self) -> Array:
-        """Newest angles [rad] and velocities [rad/s], (2, n); nan: unknown."""
+    def measured(self) -> Measured | None:
+        """Newest measurements of the machine, arrays (1, ...); None after a gap."""
         if self.history is None:
-            return np.full((2, self.machine.n), np.nan)
-        return self.history[0, :, :2, -1].T
+            return None
+        v_goal = np.array([self.operator_input.v_goal], np.float32)
+        return measure(self.machine, self.history, v_goal)

@@ -1,13 +1,12 @@
 """Write docs/annotated.md: `python docs/annotated.py`.
 
-The text is in annotated.md.j2. Code comes from the package by name, deviations from PAPER.md,
-numbers from annotated.json, which `python docs/annotated_numbers.py` measures.
+The text is in annotated.md.j2. The code on the page comes from the package by name, and the
+deviations come from PAPER.md.
 """
 
 from __future__ import annotations
 
 import ast
-import json
 import re
 import textwrap
 from functools import cache
@@ -16,15 +15,11 @@ from typing import Any
 
 import jinja2
 
-from brokk_min import BROKK_170
-from brokk_min.env import observation_scale
-
 DOCS = Path(__file__).parent
 ROOT = DOCS.parent
 PAGE = DOCS / "annotated.md"
 PAPER = (ROOT / "PAPER.md").read_text()
 HEADINGS = re.findall(r"^### ((\w+)\. .*)$", (DOCS / "deviations.md").read_text(), re.M)
-VERDICTS = {True: "holds", False: "does not hold", None: "not measured"}
 
 
 def name_of(node: ast.AST) -> str | None:
@@ -96,13 +91,13 @@ def link(name: str) -> str:
 
 
 def deviation(*names: str) -> str:
-    """One line for each deviation: what is here instead, and its effect."""
+    """One paragraph for each deviation: what is here instead, and why."""
     lines = []
     for name in names:
-        _, _, here, _, flag, effect, _ = row(name)
-        undo = f"; {flag} undoes it" if flag else ""
+        _, _, here, why, undo, _ = row(name)
         here = here[0].upper() + here[1:]
-        lines.append(f"> **Deviation {link(name)}.** {here}{undo}. Effect: {effect}.")
+        end = f" {undo} does without it." if undo else ""
+        lines.append(f"> **Deviation {link(name)}.** {here}, because {why}.{end}")
     return "\n\n".join(lines)
 
 
@@ -122,22 +117,14 @@ def wrap(page: str) -> str:
     return "".join(result).strip("\n") + "\n"
 
 
-def interval(number: dict[str, float]) -> str:
-    """A mean and its 95 % interval."""
-    return f"{number['mean']:.3g} ({number['low']:.3g} to {number['high']:.3g})"
-
-
 def render() -> str:
     """The page."""
     loader = jinja2.FileSystemLoader(DOCS)
     environment = jinja2.Environment(
         loader=loader, undefined=jinja2.StrictUndefined, trim_blocks=True, autoescape=False
     )
-    environment.filters |= {"f": lambda x, digits: f"{x:.{digits}f}", "interval": interval}
-    environment.globals |= {"code": code, "deviation": deviation, "A": link, "verdict": VERDICTS}
-    environment.globals["sizes"] = [len(observation_scale(BROKK_170, p)[0]) for p in (False, True)]
-    numbers = json.loads((DOCS / "annotated.json").read_text())
-    return wrap(environment.get_template("annotated.md.j2").render(m=numbers))
+    environment.globals |= {"code": code, "deviation": deviation, "A": link}
+    return wrap(environment.get_template("annotated.md.j2").render())
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
-"""A plant of one's own in the place of the analytic one: two functions, by SciPy's integrators.
+"""A plant of one's own in the place of the analytic one: `reset` and `step`, by SciPy's integrator.
 
-It plays the machine of mini_excavator.py by other equations: dead zones by joint and direction, and
-joints of second order, whose speed falls towards the end of the range. All numbers are assumed.
+It plays the machine of mini_excavator.py by other equations. The dead zones differ by joint and
+direction, and the joints are of second order and slower towards the ends of their range. All
+numbers are assumed.
 
     brokk-min collect --machine mini_excavator.py:MINI_EXCAVATOR --plant own_plant.py:PLANT --out log.npz
 """  # noqa: E501

@@ -4,7 +4,7 @@ Slew, four links in one plane, a swing of the tool to the side, and a roll of th
 operator sets. Commands of the first five joints are in the frame `valve_frame_id`, of the other two
 in the frame of the next identifier.
 
-    brokk-min dbc --machine seven_joints.py:SEVEN_JOINTS --out bus.dbc
+    brokk-min collect --machine seven_joints.py:SEVEN_JOINTS --out log.npz
 """
 
 import numpy as np
@@ -37,12 +37,12 @@ SEVEN_JOINTS = Machine(
             q_dot_down=down,
             encoder_node=0x21 + i,
             cylinder_rod=0.2,
+            dead_zone=(0.08, 0.08),  # up, down, of full command
         )
         for i, (name, driven, a, alpha, d, q_min, q_max, up, down) in enumerate(ROWS)
     ),
     rate=100.0,  # Hz
     pwm_limit=90,
-    dead_zone=0.08,
     encoder_bits=14,
     velocity_samples=10,
     history=40,  # samples: 0.39 s

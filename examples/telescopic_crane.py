@@ -2,7 +2,7 @@
 
 The telescope is a prismatic joint: its q is in metres and is added to d, along the z axis that the
 row before it turned into the boom. At q = 0 the boom is level and retracted, 3 m from the lift's
-pivot. Metres count as radians at L = 4 m, about the boom's length: weight = 1 / L^2.
+pivot.
 
     brokk-min collect --machine telescopic_crane.py:TELESCOPIC_CRANE --out log.npz
 """
@@ -10,6 +10,8 @@ pivot. Metres count as radians at L = 4 m, about the boom's length: weight = 1 /
 import numpy as np
 
 from brokk_min.machine import Joint, Machine
+
+ZONE = (0.10, 0.10)  # dead zone of every valve up and down, of full command
 
 # fmt: off
 SLEW = Joint(
@@ -19,6 +21,7 @@ SLEW = Joint(
     q_dot_up=0.25, q_dot_down=0.25,  # rad/s at the command limit
     encoder_node=0x31,
     cylinder_rod=0.20,
+    dead_zone=ZONE,
 )
 LIFT = Joint(
     name="lift", driven=True,
@@ -27,6 +30,7 @@ LIFT = Joint(
     q_dot_up=0.15, q_dot_down=0.22,
     encoder_node=0x32,
     cylinder_base=1.0, cylinder_rod=0.4, cylinder_angle=0.6, cylinder_area=0.008,
+    dead_zone=ZONE,
 )
 TELESCOPE = Joint(
     name="telescope", driven=True, kind="prismatic",
@@ -35,14 +39,13 @@ TELESCOPE = Joint(
     q_dot_up=0.25, q_dot_down=0.30,  # m/s
     encoder_node=0x33, encoder_zero=5000, encoder_sign=-1,
     encoder_step=2e-4,  # m a count, of a linear encoder
-    weight=1 / 4.0**2,
+    dead_zone=ZONE,
 )
 TELESCOPIC_CRANE = Machine(
     name="telescopic_crane",
     joints=(SLEW, LIFT, TELESCOPE),
     rate=10.0,  # Hz
     pwm_limit=100,
-    dead_zone=0.10,
     encoder_bits=14,
     velocity_samples=3,
     history=7,  # samples: 0.6 s

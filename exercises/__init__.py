@@ -2,8 +2,6 @@
 
 from importlib.util import find_spec
 
-import brokk_min  # noqa: F401, before NumPy: it settles how many threads that takes
-
 for name in ("hypothesis", "pytest"):
     if find_spec(name) is None:
         raise SystemExit(f"exercises: expected {name}, got none: pip install {name}")

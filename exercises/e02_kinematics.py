@@ -9,8 +9,9 @@ z_{i-1}, the z axis of the frame before it. So it moves the tool along the colum
 
     J_i = z_{i-1} x (p_n - p_{i-1})
 
-of the Jacobian. Two errors are common. An axis or an origin of frame i instead of i - 1 is one; the
-tool is still where it should be. An angle that counts the other way is the other.
+of the Jacobian. Two errors are common. The first takes an axis or an origin of frame i
+instead of i - 1, and the tool is still where it should be. The second counts an angle the
+other way.
 
 The arm is the small excavator of examples/mini_excavator.py. Its boom counts positive downward,
 because alpha_1 is -90 degrees. Read brokk_min/kinematics.py only afterwards.

@@ -55,5 +55,5 @@ def check(lever_arm: Callable[..., float], joint_velocity: Callable[..., float])
         wanted = actuator.lever_arm(BROKK_170, np.full(5, q))[4]
         got = lever_arm(joint.cylinder_base, joint.cylinder_rod, gamma)
         expect(f"lever arm of q5 at {q} rad", got, wanted)
-        v = joint.speed_positive * (80 / 127 - 0.07) / 0.93  # at the command limit
+        v = joint.cylinder_speed[0] * (80 / 127 - 0.07) / 0.93  # at the command limit
         print(f"q5 at {q:.1f} rad: r = {got:.3f} m, at 80 counts {v / got:.2f} rad/s")

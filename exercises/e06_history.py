@@ -2,13 +2,14 @@
 
 An encoder of 12 bits has steps of 1.5 mrad. Divided by 50 ms that is 0.03 rad/s, a sixth of the
 slew's fastest motion. So the velocity is the slope of a straight line through the newest angles, by
-least squares. It must be causal: it may use no angle that is still to come. Its price is delay: of
-`samples` angles the slope belongs to the middle of them.
+least squares. It must be causal, so it may use no angle that is still to come. It pays with delay,
+because the slope of `samples` angles belongs to the middle of them.
 
 A history of one joint is an array (3, H) with rows angle, velocity, command; the newest sample is
 last. After each tick the command u was sent first, then the angle q was measured. Both become the
-newest sample. A history whose commands stand one sample off still trains, and fits worse: nobody
-notices until the machine shakes. Some published environments push an observation twice in a tick.
+newest sample. A history whose commands stand one sample off still trains, but it fits worse, and
+nobody notices until the machine shakes. Some published environments push an
+observation twice in a tick.
 """
 
 from collections.abc import Callable
@@ -16,12 +17,11 @@ from collections.abc import Callable
 import numpy as np
 from hypothesis import strategies as st
 
-from brokk_min.actuator import append_sample
-from brokk_min.kinematics import estimate_velocity
+from brokk_min.actuator import append_sample, estimate_velocity
 from brokk_min.machine import Array
 from exercises.verdict import agree, expect
 
-SOLUTION = "brokk_min/kinematics.py: estimate_velocity; brokk_min/actuator.py: append_sample"
+SOLUTION = "brokk_min/actuator.py: estimate_velocity, append_sample"
 
 
 def velocity(q: Array, samples: int, dt: float) -> float:

@@ -15,21 +15,22 @@ joint q5 of the plant, fits your net twice, once without its history, and prints
 
 from collections.abc import Callable
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
 from brokk_min.actuator import (
+    PLANT,
+    ActuatorNet,
+    NetState,
     append_command,
     append_sample,
     initial_history,
-    plant_reset,
-    plant_step,
 )
-from brokk_min.identification.simulation import free_run_step
 from brokk_min.machine import BROKK_170, Array, read_encoder
 from exercises.verdict import WrongAnswer, expect
 
-SOLUTION = "brokk_min/identification/fitting.py: train; simulation.py: free_run_step"
+SOLUTION = "brokk_min/identification/fitting.py: fit; brokk_min/actuator.py: ActuatorNet"
 H, DT, WINDOW = BROKK_170.history, BROKK_170.dt, BROKK_170.velocity_samples
 Predict = Callable[[Array], Array]  # inputs (N, 39) -> velocities [rad/s] (N,)
 
@@ -56,7 +57,7 @@ def record(seed: int, ticks: int = 300, runs: int = 16) -> tuple[Array, Array, A
     rng = np.random.default_rng(seed)
     poses = np.tile([0.0, 0.5, 0.5, 1.7, 1.0], (runs, 1))
     poses[:, 4] = rng.uniform(0.3, 1.7, runs)
-    state = plant_reset(BROKK_170, poses)
+    state = PLANT.reset(BROKK_170, poses)
     angles = [read_encoder(BROKK_170, state.q)[:, 4]]
     history = initial_history(angles[0], H)
     commands, inputs = [], []
@@ -64,7 +65,7 @@ def record(seed: int, ticks: int = 300, runs: int = 16) -> tuple[Array, Array, A
         if t % 10 == 0:
             u = rng.uniform(0.1, 0.63, runs) * np.sign(1 - angles[-1]) * (rng.random(runs) > 0.4)
         inputs.append(append_command(history, u).reshape(runs, -1))
-        state = plant_step(BROKK_170, state, u[:, None] * np.eye(5)[4])
+        state = PLANT.step(BROKK_170, state, u[:, None] * np.eye(5)[4])
         angles.append(read_encoder(BROKK_170, state.q)[:, 4])
         history = append_sample(history, u, angles[-1], WINDOW, DT)
         commands.append(u)
@@ -89,19 +90,17 @@ def check_free_run(free_run: Callable[..., Array]) -> None:
     why = "The model must read the command of the tick itself, not the one before."
     expect("free run at the newest command", angles, q + DT * np.cumsum(commands, axis=0), why)
     weights = rng.normal(0, 0.2, 3 * H)
-    net = SimpleNamespace(
-        predict=lambda h: h.reshape(len(h), -1) @ weights,
-        q_low=-np.inf,
-        q_high=np.inf,
-        rate=1 / DT,
-        velocity_samples=WINDOW,
-        velocity_logged=False,
-    )
-    wanted, here = [], q
+    net: Any = SimpleNamespace(velocity_samples=WINDOW)  # a linear model of the driven joints
+    net.predict = lambda h: h.reshape(len(h), -1) @ weights
+    driven, pose = BROKK_170.driven, np.array([0.0, 0.7, 0.7, 1.7, 1.0])
+    first = initial_history(pose[driven], H)
+    state, wanted = NetState(pose, first), []
+    commands = np.zeros((5, BROKK_170.n))
+    commands[:, driven] = rng.uniform(-0.3, 0.3, (5, 4))
     for u in commands:
-        history, here = free_run_step(net, history, here, u)  # type: ignore[arg-type]
-        wanted.append(here)
-    angles = free_run(lambda x: x @ weights, initial_history(q, H), q, commands)
+        state = ActuatorNet.step(net, BROKK_170, state, u)
+        wanted.append(state.q[driven])
+    angles = free_run(lambda x: x @ weights, first, pose[driven], commands[:, driven])
     expect("free run of a linear model", angles, np.array(wanted))
 
 

@@ -1,17 +1,21 @@
-"""Advantages: a time limit is no failure (60 minutes).
+"""Advantages: a time limit is no failure, and a baseline is no bias (75 minutes).
 
 Generalised advantage estimation (Schulman et al., 2016) sums the surprises of a critic V:
 
     delta_t = r_t + gamma V(s_{t+1}) - V(s_t)
     A_t = delta_t + gamma lambda A_{t+1}
 
-An episode ends in one of two ways. It terminated: there is no s_{t+1}, its value is 0. Or it was
-truncated by a time limit: the machine could have gone on, so the value of its own last observation
+An episode ends in one of two ways. If it terminated, there is no s_{t+1}, and its value is 0. If a
+time limit truncated it, the machine could have gone on, so the value of its own last observation
 counts. In both cases the next row belongs to a new episode, and its advantage must not leak in.
 
 Who treats a time limit as a termination teaches the critic that the world ends after 20 s, at a
 moment that the observation does not show (Pardo et al., 2018, arXiv 1712.00378). Widely used
-learners had this error, and its reverse, the leak; skrl has had both (its issue 449).
+learners had this error, or the leak; skrl has had both (its issue 449).
+
+A critic is one baseline; the mean of other rollouts from the same state is another. It leaves the
+mean of the policy gradient as it is only if it does not depend on the action that it judges. So a
+rollout is compared with the mean of the *others* of its group (leave one out).
 """
 
 from collections.abc import Callable
@@ -45,6 +49,11 @@ def gae(
     raise NotImplementedError
 
 
+def group(returns: Array) -> Array:
+    """Advantages (groups, members): each return less the mean of the others of its group."""
+    raise NotImplementedError
+
+
 def ours(*case: Any) -> Array:
     """The package's answer to the arguments of `gae`."""
     rewards, values, next_values, terminated, truncated, gamma, lam = case
@@ -54,7 +63,20 @@ def ours(*case: Any) -> Array:
     return ppo.gae(*arrays, gamma, lam)[:, 0].numpy()
 
 
-def check(gae: Callable[..., Array]) -> None:
+def check_group(group: Callable[[Array], Array]) -> None:
+    """By hand; then the gradient by mu of E[100 + a], a from N(mu, 1), which is 1."""
+    got = group(np.array([[1.0, 2.0, 6.0], [5.0, 5.0, 5.0]]))
+    why = "The others of 1 are 2 and 6, of mean 4."
+    expect("group([[1, 2, 6], [5, 5, 5]])", got, [[-3.0, -1.5, 4.5], [0, 0, 0]], why)
+    noise = np.random.default_rng(0).standard_normal((20_000, 4))  # a - mu, the score
+    for name, advantages in (("no baseline", 100 + noise), ("yours", group(100 + noise))):
+        gradients = (advantages * noise).mean(axis=-1)
+        print(f"{name:12} gradient {gradients.mean():5.2f}, deviation {gradients.std():6.2f}")
+    why = "The mean of the gradients is 1, whatever the baseline."
+    expect("mean gradient, by groups of four", round(float(gradients.mean()), 1), 1.0, why)
+
+
+def check(gae: Callable[..., Array], group: Callable[[Array], Array]) -> None:
     """A reward of 1 a tick for ever, worth 10 at gamma 0.9; then anything."""
     one, no = np.ones(3), np.zeros(3)
     end = np.array([0.0, 1.0, 0.0])  # the second tick ends an episode
@@ -80,3 +102,4 @@ def check(gae: Callable[..., Array]) -> None:
         )
     )
     agree("gae", gae, ours, cases)
+    check_group(group)

@@ -2,10 +2,10 @@
 
 import os
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy, for the whole run
+
 import pytest
 from hypothesis import HealthCheck, settings
-
-import brokk_min  # noqa: F401, before NumPy: it settles how many threads that takes
 
 SLOW = [HealthCheck.too_slow, HealthCheck.data_too_large]
 

@@ -3,27 +3,27 @@
 import ctypes
 import json
 import os
-import threading
 import time
-from collections.abc import Callable
-from contextlib import contextmanager
+from collections import deque
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
+import can
 import numpy as np
 import pytest
 from canopen.objectdictionary import ObjectDictionary, ODArray, ODRecord, ODVariable, datatypes
+from helpers_machines import obedient_net
 
+from brokk_min.actuator import PLANT
 from brokk_min.can.canopen import Frame, OperatorInput
-from brokk_min.can.connection import open_bus
-from brokk_min.can.operator_input import Script
-from brokk_min.can.simulated_machine import SimulatedMachine, serve
+from brokk_min.can.connection import Bus, open_bus
+from brokk_min.can.simulated_machine import SimulatedMachine
 from brokk_min.hw import Drive
 from brokk_min.jacobian import Gains, JacobianController, manipulability_threshold
-from brokk_min.kinematics import forward_kinematics, tool_position
+from brokk_min.learning.policy import INTERFACES, Policy
 from brokk_min.machine import BROKK_170
-from brokk_min.viewer.lockstep import SimulatedBus
 
 MULTICAST = "239.74.163.2"
 START = (0.0, 0.5, 0.58, 1.71, 1.24)
@@ -34,13 +34,22 @@ SIX = replace(BROKK_170, name="six joints", joints=(*BROKK_170.joints, SIXTH), q
 def baseline(machine):
     """A PI controller that nobody tuned."""
     one = np.ones(len(machine.driven))
-    gains = Gains(one, 3 * one, 0 * one, np.full(1, 0.3), *[np.zeros(1)] * 4)
+    gains = Gains(one, 3 * one, 0 * one, np.full(1, 0.3))
     return JacobianController(machine, gains, 0.1, manipulability_threshold(machine))
 
 
 BASELINE = baseline(BROKK_170)
-Out = list[tuple[int, bytes]]
-Change = Callable[[int, bytes], Out]
+
+
+def random_policy(interface):
+    """A policy that nobody trained: it sends all kinds of commands."""
+    rng = np.random.default_rng(0)
+    sizes = [len(INTERFACES[interface].scale(BROKK_170)[0]), 64, 64, 64, 4]
+    weights = []
+    for inputs, outputs in pairwise(sizes):
+        weights.append((1.5 * rng.standard_normal((inputs, outputs)) / inputs**0.5).astype("f4"))
+        weights.append(np.zeros(outputs, np.float32))
+    return Policy({}, tuple(weights), obedient_net(BROKK_170), interface)
 
 
 def unchanged(can_id, data):
@@ -72,27 +81,47 @@ def raises(error):
     return act
 
 
-class World(SimulatedBus):
-    """A simulated machine and a `Drive`, in steps of a millisecond.
+class Recorder:
+    """The analytic plant; it keeps the command and the angles of each step."""
+
+    def __init__(self):
+        self.u, self.q = [], []
+
+    def reset(self, machine, q):
+        return PLANT.reset(machine, q)
+
+    def step(self, machine, state, u):
+        state = PLANT.step(machine, state, u)
+        self.u.append(u)
+        self.q.append(state.q)
+        return state
+
+
+class World:
+    """A simulated machine and a `Drive`, in steps of a millisecond; it is python-can's bus, too.
 
     `upward` and `downward` may tamper with what machine and program send.
     """
 
+    step = 0.001  # s
+    offset = 0.0  # s, of the program's clock
+
     def __init__(self, controller, operator, machine=BROKK_170, log=None, start=START):
-        super().__init__(machine, start)
-        self.step = 0.001  # s
-        self.offset = 0.0  # s, of the program's clock
-        self.upward = unchanged
-        self.downward = unchanged
+        self.time = 0.0  # s
+        self.recorder = Recorder()
+        self.simulated = SimulatedMachine(machine, start, 0.0, self.recorder)
+        self.answers = deque(self.simulated.boot())
+        self.upward = self.downward = unchanged
         self.noise = list  # foreign frames of the next millisecond
-        self.record = []
         self.syncs = []
-        self.simulated.record = lambda *row: self.record.append(row)
-        self.simulated.start = self.simulated.valid = 0.0
-        self.bus = self.open(log)
-        self.bus.clock = lambda: self.time + self.offset
+        writer = can.CanutilsLogWriter(log) if log else None
+        self.bus = Bus(self, writer, "virtual", clock=self.clock, sleep=self.sleep)
         self.bus.start = 1.8e9  # s; a fixed time of day, so that roundings repeat themselves
         self.drive = Drive(machine, controller, self.bus, operator)
+        self.controller, self.operator = controller, operator
+
+    def clock(self):
+        return self.time + self.offset
 
     def send(self, message, timeout=None):
         frames = self.downward(message.arbitration_id, bytes(message.data))
@@ -100,6 +129,15 @@ class World(SimulatedBus):
         for can_id, data in frames:
             self.syncs += [self.time] * (can_id == 0x080)
             self.say(self.simulated.receive(Frame(self.time, can_id, data)))
+
+    def recv(self, timeout):
+        end = self.time + timeout
+        while not self.answers and self.time < end:
+            self.sleep(min(0.005, end - self.time))
+        if not self.answers:
+            return None
+        can_id, data = self.answers.popleft()
+        return can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
 
     def sleep(self, seconds):
         end = self.time + seconds
@@ -118,24 +156,19 @@ class World(SimulatedBus):
         for frame in frames:
             self.answers += self.upward(*frame)
 
+    def shutdown(self):
+        pass
+
     def run(self, seconds):
         end = self.time + seconds
         while self.time < end and self.drive.tick():
             pass
 
     @property
-    def operator(self):
-        return self.drive.operator
-
-    @property
-    def controller(self):
-        return self.drive.controller
-
-    @property
     def commands(self):
         """Times [s] and commands in force in counts (T, n), by the plant's own record."""
-        times, u, *_ = zip(*self.record, strict=True)
-        return np.array(times), np.rint(np.array(u) * 127).astype(int)
+        u = np.array(self.recorder.u)
+        return 0.005 * np.arange(1, len(u) + 1), np.rint(u * 127).astype(int)
 
 
 class ConstantCommand:
@@ -172,46 +205,11 @@ class HoldingOperator:
         return OperatorInput(v, enable and self.alive, self.alive, self.stop)
 
 
-def tool_moved(machine, start, goals, log=None):
-    """The tool's way [m] under goals (T, 3), by a `baseline` over the simulated bus."""
-    script = Script(machine, goals)
-    world = World(baseline(machine), script, machine, log, start)
-    world.drive.begin()
-    while world.drive.tick():
-        pass
-    world.bus.close()
-    assert script.done, world.drive.reason
-    q = np.array([start, world.simulated.plant.q])
-    return np.diff(tool_position(forward_kinematics(machine, q)), axis=0)[0]
-
-
 def eventually(condition, seconds=20.0):
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "not within the time"
         time.sleep(0.01)
-
-
-def recorded_rows(path):
-    """Complete rows of a record that is being written: time, commands, last valid frame's time."""
-    lines = path.read_text().splitlines()[1:-1] if path.exists() else []
-    cells = [line.split(",") for line in lines]
-    return np.array([[float(x) for x in (*row[1:7], row[12])] for row in cells]).reshape(-1, 7)
-
-
-@contextmanager
-def served(channel):
-    """Our simulated machine in a thread on a virtual bus."""
-    end = threading.Event()
-    with open_bus("virtual", channel) as bus:
-        machine = SimulatedMachine(BROKK_170, START, bus.now())
-        thread = threading.Thread(target=serve, args=(machine, bus, lambda: not end.is_set()))
-        thread.start()
-        try:
-            yield machine
-        finally:
-            end.set()
-            thread.join()
 
 
 def own_multicast_port(monkeypatch):

@@ -1,12 +1,9 @@
 """What can go wrong on a bus: causes in a `World`, words that name each, and what came of it."""
 
-from __future__ import annotations
-
 import struct
-from collections.abc import Callable
 from functools import partial
 from itertools import cycle
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import can
 import numpy as np
@@ -16,7 +13,6 @@ from brokk_min.can.canopen import Frame, encoder_raw, valve_frame
 from brokk_min.machine import BROKK_170
 
 COMMAND = (60, 0, 60, 60, 60)
-SLOW = (15, 0, 15, 15, 15)
 STEP = BROKK_170.encoder_step[0]
 
 
@@ -37,12 +33,7 @@ def up(can_id, act):
     return put("upward", only(can_id, act))
 
 
-def up_once(can_id, act):
-    """Change the first of them."""
-    return lambda world: up(can_id, once(act))(world)
-
-
-def down_once(act):
+def valves(act):
     """Change the first valve frame."""
     return lambda world: put("downward", only(0x210, once(act)))(world)
 
@@ -51,17 +42,11 @@ def moved(add):
     return lambda data: [struct.pack("<I", (struct.unpack("<I", data)[0] + add) % 2**26)]
 
 
-def freeze(world, node, command=None):
+def freeze(world, node, command=None, flicker=0):
+    """An encoder stays at one place, or goes to and fro by some counts."""
     world.controller.m[:] = world.controller.m if command is None else command
-    counts = np.rint(world.simulated.plant.q / STEP).astype(int)
-    data = struct.pack("<I", encoder_raw(BROKK_170, counts)[node - 1])
-    up(0x180 + node, lambda _: [data])(world)
-
-
-def flicker(world, node):
-    """A loose encoder: one place, to and fro by one count."""
-    counts = np.rint(world.simulated.plant.q / STEP).astype(int)
-    places = cycle(encoder_raw(BROKK_170, counts + k)[node - 1] for k in (0, 1))
+    counts = np.rint(world.simulated.state.q / STEP).astype(int)
+    places = cycle(encoder_raw(BROKK_170, counts + k)[node - 1] for k in (0, flicker))
     up(0x180 + node, lambda _: [struct.pack("<I", next(places))])(world)
 
 
@@ -79,26 +64,16 @@ def delay(world, node, draw):
     world.noise = lambda: due(world, held)
 
 
-def late(world, node):
-    """Constantly late positions, and an operator who presses again and again."""
-    operator = world.operator
-    delay(world, node, lambda: 0.030)
-    operator.act = lambda: setattr(
-        operator, "enable", bool(world.drive.gate.driving or not operator.enable)
-    )
-
-
-def reorder(world, node):
-    """Every second position comes after the next one."""
+def delay_valve_frames(world, seconds):
     held = []
 
-    def act(data):
-        if held:
-            return [data, held.pop()]
-        held.append(data)
+    def noise():
+        for data in due(world, held):
+            world.simulated.receive(Frame(world.time, 0x210, data))
         return []
 
-    up(0x180 + node, act)(world)
+    world.downward = only(0x210, lambda d: held.append((world.time + seconds, d)) or [])
+    world.noise = noise
 
 
 def repeat(world, period, frame):
@@ -120,8 +95,8 @@ def flood(world, foreign=False, rate=2000):
     """Frames of any identifier; pairs of identifier and length that came, and how many exist."""
     rng = np.random.default_rng(0)
     nodes = (1, 2, 3, 4, 5, 16)
-    ours = {0, 0x80, 0x210, *(base + n for base in (0x180, 0x580, 0x600, 0x700) for n in nodes)}
-    ids = rng.permutation([i for i in range(2048) if not foreign or i not in ours])
+    known = {0, 0x80, 0x210, *(base + n for base in (0x180, 0x580, 0x600, 0x700) for n in nodes)}
+    ids = rng.permutation([i for i in range(2048) if not foreign or i not in known])
     assert len(ids) % 3  # no factor in common with the nine lengths: each pair has its turn
     seen = set()
 
@@ -137,19 +112,8 @@ def flood(world, foreign=False, rate=2000):
 foreign_flood = partial(flood, foreign=True)
 
 
-def request(world, rate):
-    """Somebody else reads the encoders' resolution, by SDO."""
-    data = struct.pack("<BHBI", 0x40, 0x6501, 0, 0)
-    repeat(world, 1 / rate, lambda count: (0x601 + count % 5, data))
-
-
 def foreign_valves(counts, counter):
     return 0x210, valve_frame([counts, 0, 0, 0, 0], counter % 256, 1).tobytes()
-
-
-def second_master(world):
-    """Somebody else sends valid valve frames of his own."""
-    repeat(world, 0.05, lambda count: foreign_valves(20, count))
 
 
 def intruder(world, after):
@@ -159,8 +123,7 @@ def intruder(world, after):
     def follow(can_id, data):
         nonlocal counter
         out = [(can_id, data)]
-        if can_id == 0x210:
-            counter = data[5]
+        counter = data[5] if can_id == 0x210 else counter
         if can_id == after:
             counter += 1
             out.append(foreign_valves(77, counter))
@@ -180,28 +143,10 @@ def foreign(can_id, data):
     return cause
 
 
-def delay_valve_frames(world, seconds):
-    held = []
-
-    def noise():
-        for data in due(world, held):
-            world.simulated.receive(Frame(world.time, 0x210, data))
-        return []
-
-    world.downward = only(0x210, lambda d: held.append((world.time + seconds, d)) or [])
-    world.noise = noise
-
-
-def repeat_once(world, node, command=COMMAND):
+def repeat_once(world, node):
     """The position of the tick before, from now on, without a gap."""
-    world.controller.m[:] = command
     held = []
-
-    def act(data):
-        held.append(data)
-        return held[-2:][:1]
-
-    up(0x180 + node, act)(world)
+    up(0x180 + node, lambda data: held.append(data) or held[-2:][:1])(world)
 
 
 def drift(world, node, speed):
@@ -212,9 +157,6 @@ def drift(world, node, speed):
 
 def close_bus(world):
     world.recv = world.send = raises(can.CanOperationError("closed"))
-
-
-SEND_ERROR = raises(can.CanOperationError("no buffer space"))
 
 
 def stall(seconds):
@@ -230,101 +172,61 @@ def command(joint, value):
 
 
 # what goes wrong, and words of the reason that the program gives, or why it cannot find it
+SEND_ERROR = raises(can.CanOperationError("no buffer space"))
 OTHER_SENDER = "SYNC, NMT or valve frame of another sender"
 NOT_OPERATIONAL = "valve controller: not operational"
+DOUBLED = "doubled or malformed"
 FAULTS = {
     "valve controller silent": (up(0x710, lambda d: []), "valve controller: heartbeat lost"),
     "valve controller stopped": (up(0x710, lambda d: [b"\x04"]), NOT_OPERATIONAL),
-    "valve controller's heartbeat malformed": (up(0x710, lambda d: [d * 2]), "heartbeat lost"),
     "flood on all identifiers": (flood, ""),
     "flood of 6,000 foreign frames a second": (partial(foreign_flood, rate=6e3), "bus flooded"),
-    "flood of 20,000 foreign frames a second": (partial(foreign_flood, rate=2e4), "bus flooded"),
-    "second master": (second_master, OTHER_SENDER),
     "second sender after each of our valve frames": (partial(intruder, after=0x210), ""),
     "second sender after each SYNC": (partial(intruder, after=0x080), OTHER_SENDER),
     "foreign SYNC": (foreign(0x080, b""), OTHER_SENDER),
-    "foreign NMT stop of all": (foreign(0x000, b"\x02\x00"), OTHER_SENDER),
-    "foreign NMT reset of q4": (foreign(0x000, b"\x81\x04"), OTHER_SENDER),
-    "foreign NMT stop of the valve controller": (foreign(0x000, b"\x02\x10"), OTHER_SENDER),
     "bus closed": (close_bus, "error (CanOperationError: closed)"),
     "send error of all frames": (put("downward", SEND_ERROR), "(CanOperationError"),
-    "send error of valve frames": (put("downward", only(0x210, SEND_ERROR)), ""),
-    "valve frame lost": (down_once(lambda d: []), NOT_OPERATIONAL),
-    "valve frame doubled": (down_once(lambda d: [d, d]), NOT_OPERATIONAL),
-    "valve frame's bit flipped": (
-        down_once(lambda d: [bytes([d[0] ^ 4, *d[1:]])]),
-        "valve controller",
-    ),
-    "valve frame cut": (down_once(lambda d: [d[:7]]), NOT_OPERATIONAL),
-    "all valve frames lost": (put("downward", only(0x210, lambda d: [])), NOT_OPERATIONAL),
+    "valve frame lost": (valves(lambda d: []), NOT_OPERATIONAL),
+    "valve frame doubled": (valves(lambda d: [d, d]), NOT_OPERATIONAL),
+    "valve frame's bit flipped": (valves(lambda d: [bytes([d[0] ^ 4, *d[1:]])]), NOT_OPERATIONAL),
     "valve frames 60 ms late": (partial(delay_valve_frames, seconds=0.06), NOT_OPERATIONAL),
-    "valve frames 100 ms late": (partial(delay_valve_frames, seconds=0.1), NOT_OPERATIONAL),
     "joystick unplugged": (put("operator.alive", False), "operator's device lost"),
     "joystick raises": (put("operator.act", raises(OSError("gone"))), "error (OSError: gone)"),
     "enable released": (put("operator.enable", False), ""),
     "SIGTERM": (lambda world: world.drive.signals.append(15), "stop asked for"),
-    "operator stops": (put("operator.stop", True), "stop asked for"),
     "clock stepped forward": (put("offset", 3600.0), "tick late, or the"),
     "clock stepped back": (put("offset", -3600.0), "tick late, or the"),
-    "log cannot be written": (
-        put("bus.flush", raises(OSError("no space"))),
-        "error (OSError: no space)",
-    ),
+    "log cannot be written": (put("bus.flush", raises(OSError("full"))), "error (OSError: full)"),
     "late tick": (stall(0.08), "tick late"),
-    "hang": (stall(0.8), "tick late"),
     "policy returns NaN": (command(2, np.nan), "q3: no valid command"),
-    "policy returns infinity": (command(0, np.inf), "q1: no valid command"),
     "policy beyond the limit": (command(4, 81), "q5: no valid command"),
     "policy moves the locked joint": (command(1, 20), "q2: no valid command"),
-    "policy raises": (
-        put("controller.act", raises(RuntimeError("boom"))),
-        "error (RuntimeError: boom)",
-    ),
-    "encoders all silent": (
-        put("upward", lambda i, d: [] if 0x180 < i < 0x190 else [(i, d)]),
-        "q1: silent",
-    ),
+    "policy raises": (put("controller.act", raises(RuntimeError("no"))), "error (RuntimeError"),
 }
 for node in range(1, 6):
-    tpdo, heartbeat, doubled = 0x180 + node, 0x700 + node, "doubled or malformed"
+    tpdo, heartbeat = 0x180 + node, 0x700 + node
     of_joint = {
         "dropped": (up(tpdo, lambda d: []), "silent"),
-        "dropped once": (up_once(tpdo, lambda d: []), "silent"),
         "jumps": (up(tpdo, moved(90)), "jumped"),
         "jumps by half a turn": (up(tpdo, moved(2048)), "out of range"),
-        "jumps by a turn": (up(tpdo, moved(4096)), doubled),
-        "says FFFFFFFF": (up(tpdo, lambda d: [b"\xff" * 4]), doubled),
-        "doubled": (up(tpdo, lambda d: [d, d]), doubled),
-        "reordered": (partial(reorder, node=node), "silent"),
-        "malformed": (up(tpdo, lambda d: [d[:3]]), doubled),
+        "jumps by a turn": (up(tpdo, moved(4096)), DOUBLED),
+        "says FFFFFFFF": (up(tpdo, lambda d: [b"\xff" * 4]), DOUBLED),
+        "doubled": (up(tpdo, lambda d: [d, d]), DOUBLED),
+        "malformed": (up(tpdo, lambda d: [d[:3]]), DOUBLED),
         "heartbeat lost": (up(heartbeat, lambda d: []), "heartbeat lost"),
         "rebooted": (up(heartbeat, lambda d: [b"\x00"]), "not operational"),
     }
     if node != 2:  # the operator moves q2, no command of ours
-        of_joint |= {
-            "late by 30 ms, after re-arm too": (partial(late, node=node), "silent"),
-            "frozen": (partial(freeze, node=node), "frozen"),
-            "a tick late, without a gap": (partial(repeat_once, node=node), "frozen"),
-        }
+        of_joint["frozen"] = partial(freeze, node=node), "frozen"
     for name, (cause, words) in of_joint.items():
         FAULTS[f"q{node} {name}"] = (cause, f"q{node}: {words}")
-MOTION = "it looks like motion, which no other sensor confirms"
 NOT_FOUND = {
     "q2 frozen, the locked joint": (partial(freeze, node=2), "it may stand still"),
-    "slow q3 a tick late, without a gap": (
-        partial(repeat_once, node=3, command=SLOW),
-        "a position has neither time nor number",
-    ),
-    "slow q3 frozen": (partial(freeze, node=3, command=SLOW), "it takes longer, see below"),
-    "q3 flickers by one count": (partial(flicker, node=3), "it takes longer, see below"),
-    "q3 drifts by 60 counts/s": (partial(drift, node=3, speed=60), MOTION),
-    "q5 drifts by 400 counts/s": (partial(drift, node=5, speed=-400), MOTION),
-    "valve frames 30 ms late": (
-        partial(delay_valve_frames, seconds=0.03),
-        "within the tick; the machine follows later",
-    ),
+    "q3 a tick late, without a gap": (partial(repeat_once, node=3), "no time, no number"),
+    "slow q3 frozen": (partial(freeze, node=3, command=(15, 0, 15, 15, 15)), "it takes longer"),
+    "q3 drifts by 60 counts/s": (partial(drift, node=3, speed=60), "it looks like motion"),
+    "valve frames 30 ms late": (partial(delay_valve_frames, seconds=0.03), "within the tick"),
     "4,500 foreign frames a second": (partial(foreign_flood, rate=4500), "harmless"),
-    "2,000 SDO requests a second": (partial(request, rate=2000), "harmless"),
 }
 
 
@@ -337,7 +239,7 @@ class Outcome(NamedTuple):
     commands: tuple[np.ndarray, np.ndarray]  # `World.commands` since the fault
 
 
-def measure(cause: Callable[[World], Any], phase: float, seconds: float = 0.6) -> Outcome:
+def measure(cause, phase, seconds=0.6):
     """Drive for a second, let it go wrong `phase` [s] after a SYNC, and go on for `seconds`."""
     world = World(ConstantCommand(*COMMAND), HoldingOperator())
     world.drive.begin()

@@ -35,8 +35,7 @@ def random_net(seed=0, n=3, history=13, hidden=32, rows=3):
         velocity_samples=4,
         velocity_logged=False,
         machine="some",
-        seed=seed,
-        settings={"steps": 5},
+        training={"seed": seed},
         input_mean=rng.uniform(-1, 1, (n, inputs)).astype(np.float32),
         input_scale=rng.uniform(0.1, 2, (n, inputs)).astype(np.float32),
         output_low=rng.uniform(-0.6, -0.1, n).astype(np.float32),
@@ -66,8 +65,7 @@ def small_net(machine, rng, joints=(), rows=3):
         rate=machine.rate,
         velocity_samples=machine.velocity_samples,
         machine=machine.name,
-        seed=0,
-        settings={},
+        training={},
         input_mean=mean.reshape(net.input_mean.shape),
         input_scale=scale.reshape(net.input_scale.shape),
         output_low=np.float32(-1.1) * fastest,
@@ -94,19 +92,6 @@ def obedient_velocity(machine, u):
     """What `obedient_net` says for commands `u` (..., n_driven), worked out by hand."""
     fastest = 1.2 * machine.q_dot_max[machine.driven]
     return fastest * (2 / (1 + np.exp(-GAIN * np.asarray(u, float))) - 1)
-
-
-def shared_net(latents=2, rows=3):
-    """`random_net` whose joints share latents."""
-    return with_latents(random_net(rows=rows), np.random.default_rng(1), latents)
-
-
-def with_latents(net, rng, latents=2, size=0.1):
-    """The nets with random latents that they share."""
-    n, inputs = net.input_mean.shape
-    shapes = (n, 2 * inputs, latents), (n, latents, net.weights[1].shape[1]), (n, latents)
-    more = tuple(size * rng.standard_normal(shape).astype(np.float32) for shape in shapes)
-    return replace(net, weights=(*net.weights, *more))
 
 
 def constant_net(velocity, logged, joints):

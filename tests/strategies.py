@@ -21,8 +21,12 @@ def reals(low: float, high: float) -> st.SearchStrategy[float]:
 
 
 @st.composite
-def joints(draw: st.DrawFn, index: int, driven: bool) -> Joint:
-    """Any DH row and range; prismatic, a slew drive, or a triangle that closes over the range."""
+def joints(draw: st.DrawFn, index: int, driven: bool, limit: float) -> Joint:
+    """Any DH row and range; prismatic, a slew drive, or a triangle that closes over the range.
+
+    Its dead zones are smaller than the largest command, `limit`.
+    """
+    zones, speeds = reals(0.0, min(0.3, 0.9 * limit)), reals(0.01, 0.2)
     q_min = draw(reals(-2.5, 1.5))
     width = draw(reals(0.3, 2.2))
     kind = draw(st.sampled_from(["revolute", "revolute", "prismatic"]))
@@ -41,14 +45,13 @@ def joints(draw: st.DrawFn, index: int, driven: bool) -> Joint:
         cylinder_rod=draw(reals(0.1, 0.4)),
         cylinder_angle=0.0 if slew else start - q_min,
         cylinder_area=draw(reals(0.002, 0.02)),
-        speed_positive=draw(reals(0.01, 0.2)),
-        speed_negative=draw(reals(0.01, 0.2)),
+        cylinder_speed=(draw(speeds), draw(speeds)),
+        dead_zone=(draw(zones), draw(zones)),
         q_dot_up=draw(reals(0.1, 1.0)),
         q_dot_down=draw(reals(0.1, 1.0)),
         encoder_node=index + 1,
         kind=kind,
         encoder_step=draw(reals(1e-5, 2e-3)),
-        weight=draw(reals(0.02, 1.0)) if kind == "prismatic" else 1.0,
     )
 
 
@@ -58,19 +61,14 @@ def machines(draw: st.DrawFn, min_joints: int = 2, max_joints: int = 6) -> Machi
     n = draw(st.integers(min_joints, max_joints))
     driven = draw(st.lists(st.booleans(), min_size=n, max_size=n).filter(any))
     pwm_limit = draw(st.integers(20, 127))
-    dead_zone = draw(reals(0.0, min(0.3, 0.9 * pwm_limit / 127)))
-    widest = min(dead_zone + 0.05, 0.95 * pwm_limit / 127)
-    own_zone = st.none() | reals(dead_zone, widest)  # of a joint and direction
-    each = [draw(joints(i, drives)) for i, drives in enumerate(driven)]
-    zones = [{f"dead_zone_{side}": draw(own_zone) for side in ("up", "down")} for _ in each]
     return replace(
         BROKK_170,
         name=f"machine {next(NUMBERS)}",  # caches of the package hash names
-        joints=tuple(replace(joint, **own) for joint, own in zip(each, zones, strict=True)),
+        joints=tuple(draw(joints(i, own, pwm_limit / 127)) for i, own in enumerate(driven)),
         q_start=(),
         rate=draw(st.sampled_from([10.0, 20.0, 25.0, 50.0])),
         pwm_limit=pwm_limit,
-        dead_zone=dead_zone,
+        ground=draw(reals(-1.0, 1.0)),
         delay=draw(st.sampled_from([0.0, 0.005, 0.04, 0.1, 0.13])),
         tau_spool=draw(reals(0.01, 0.1)),
         tau_cylinder=draw(reals(0.01, 0.1)),

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brokk_min.machine import PWM_MAX, Joint, Machine, decode_pwm, encode_pwm
+from brokk_min.machine import PWM_MAX, Machine, decode_pwm, encode_pwm, require
 
 Array = NDArray[Any]  # counts and flags, too
 
@@ -48,18 +48,14 @@ class Frame(NamedTuple):
     channel: str = ""
 
 
-# --- encoders ------------------------------------------------------------------------------------
-
-
 class Nodes:
     """Newest positions, heartbeats and states of encoders and valve controller (the last node)."""
 
     def __init__(self, machine: Machine) -> None:
         nodes = node_numbers(machine)
         self.machine = machine
-        self.ours = (NMT, SYNC, *valve_frame_ids(machine))  # only this program sends them
-        self.received = 0  # frames of this tick
-        self.others = 0  # of them, frames that only this program may send
+        self.own_ids = (NMT, SYNC, *valve_frame_ids(machine))  # only this program sends them
+        self.received = self.others = 0  # frames of this tick; of them in `own_ids`, not sent
         self.position_index = {TPDO1 + node: i for i, node in enumerate(nodes[:-1])}
         self.heartbeat_index = {HEARTBEAT + node: i for i, node in enumerate(nodes)}
         self.raw = np.full(machine.n, -1)  # -1: none yet
@@ -80,14 +76,13 @@ class Nodes:
     def start_tick(self) -> None:
         """Forget how many frames came."""
         self.frames[:] = 0
-        self.received = 0
-        self.others = 0
+        self.received = self.others = 0
 
     def update(self, frame: Frame) -> None:
         """Take in one frame; those of others change nothing."""
         size = len(frame.data)
         self.received += 1
-        self.others += frame.id in self.ours and not frame.sent
+        self.others += frame.id in self.own_ids and not frame.sent
         if frame.id in self.position_index:
             i = self.position_index[frame.id]
             raw = int.from_bytes(frame.data, "little")
@@ -116,32 +111,26 @@ class Nodes:
 
 
 def check_bus(machine: Machine) -> None:
-    """ValueError: valve frames without free identifiers, ticks too long for the watchdog, more bits
-    than positions have, goals too fast for the log, a range of more than a turn: positions count
-    from the middle of the range.
+    """ValueError: what the bus or its log cannot carry.
+
+    Valve frames need identifiers of their own; ticks must be shorter than the watchdog; positions
+    have 26 bits and count from the middle of the range, so a range is less than a turn.
     """
-    used = [*used_ids(machine), *(SDO_REQUEST + joint.encoder_node for joint in machine.joints)]
-    used += [OPERATOR_INPUT, *(EMERGENCY + node for node in node_numbers(machine))]
-    taken = [i for i in valve_frame_ids(machine) if i > 0x7FF or used.count(i) > 1]
-    if taken:
-        got = ", ".join(f"0x{i:03X}" for i in taken)
-        expected = "expected an identifier of no other frame"
-        raise ValueError(f"{machine.name}: valve_frame_id: {expected}, got {got}")
-    fields = (("encoder_bits", POSITION_BITS), ("tool_speed", FASTEST_GOAL))
-    for name, most in fields:
-        if (got := getattr(machine, name)) > most:
-            raise ValueError(f"{machine.name}: {name}: expected at most {most}, got {got}")
+    nodes, ids = node_numbers(machine), valve_frame_ids(machine)
+    bases = (EMERGENCY, TPDO1, SDO_ANSWER, SDO_REQUEST, HEARTBEAT)
+    others = {NMT, SYNC, OPERATOR_INPUT, *(base + node for base in bases for node in nodes)}
+    got = ", ".join(f"0x{i:03X}" for i in ids)
+    free = ids[-1] <= 0x7FF and not others & {*ids}
+    require(free, "valve_frame_id", "identifiers of no other frame", got)
+    for name, most in (("encoder_bits", POSITION_BITS), ("tool_speed", FASTEST_GOAL)):
+        value = getattr(machine, name)
+        require(value <= most, name, f"at most {most}", value)
     for joint in machine.joints:
         width = joint.q_max - joint.q_min
-        if joint.kind == "revolute" and width > 2 * np.pi - 0.1:
-            expected = "expected a range of less than a turn by 0.1 rad"
-            raise ValueError(f"{machine.name}: {joint.name}.q_max: {expected}, got {width:.2f} rad")
-    slowest = 1.5 / WATCHDOG  # Hz: a tick may be late by half
-    if machine.rate < slowest:
-        raise ValueError(
-            f"{machine.name}: expected a rate of {slowest:g} Hz or more, for the valve "
-            f"controller's watchdog of {WATCHDOG} s, got {machine.rate:g} Hz"
-        )
+        fits = joint.kind == "prismatic" or width <= 2 * np.pi - 0.1
+        require(fits, f"{joint.name}.q_max", "a range 0.1 rad below a turn", f"{width:.2f} rad")
+    slowest = 1.5 / WATCHDOG  # Hz, because a tick may be late by half
+    require(machine.rate >= slowest, "rate", f"{slowest:g} Hz or more (watchdog)", machine.rate)
 
 
 def valve_frame_ids(machine: Machine) -> list[int]:
@@ -157,23 +146,22 @@ def node_numbers(machine: Machine) -> list[int]:
 def used_ids(machine: Machine) -> list[int]:
     """CAN identifiers of all frames that concern the program that drives."""
     bases = (TPDO1, SDO_ANSWER, HEARTBEAT)
-    of_nodes = [base + node for node in node_numbers(machine) for base in bases]
-    return [NMT, SYNC, *valve_frame_ids(machine), *of_nodes]
+    nodes = [base + node for node in node_numbers(machine) for base in bases]
+    return [NMT, SYNC, *valve_frame_ids(machine), *nodes]
 
 
 def set_up_nodes(bus: Any, machine: Machine) -> None:
     """Check the encoders, set their heartbeats, let them answer each SYNC, and start all nodes.
 
-    ValueError: an encoder that does not answer or has another resolution, see `check_bus`, too.
+    ValueError: an encoder that does not answer or has another resolution; see also `check_bus`.
     """
     check_bus(machine)
-    for joint in machine.joints:
+    for joint, resolution in zip(machine.joints, encoder_resolutions(machine)):
         node = joint.encoder_node
-        resolution, found = encoder_resolution(joint), sdo(bus, node, RESOLUTION_OBJECT)
-        if found != resolution:
-            unit = "counts a turn" if joint.kind == "revolute" else "nm a count"
-            expected = f"expected {resolution} {unit} of encoder node {node} (object 0x6501)"
-            raise ValueError(f"{joint.name}: {expected}, got {found}")
+        found = sdo(bus, node, RESOLUTION_OBJECT)
+        unit = "counts a turn" if joint.kind == "revolute" else "nm a count"
+        wanted = f"{resolution} {unit} of encoder node {node} (object 0x6501)"
+        require(found == resolution, joint.name, wanted, found)
         sdo(bus, node, HEARTBEAT_OBJECT, round(1e3 * HEARTBEAT_PERIOD), size=2)
         sdo(bus, node, SYNC_OBJECT, 1, size=1)
     bus.send(NMT, START_ALL)
@@ -184,7 +172,7 @@ def sdo(
 ) -> int:
     """Read an object of a node by its index and subindex, or write `value` of `size` bytes to it.
 
-    ValueError: the node refuses or does not answer.
+    ValueError: the node refuses, or does not answer.
     """
     command = 0x40 if value is None else 0x23 | (4 - size) << 2
     request = struct.pack("<BHBI", command, *address, value or 0)
@@ -203,10 +191,10 @@ def sdo(
     raise ValueError(f"{where} within {SDO_TIMEOUT} s, got none")
 
 
-def encoder_resolution(joint: Joint) -> int:
-    """Object 0x6501 of a joint's encoder: counts a turn; of a prismatic joint nm a count."""
-    step = joint.encoder_step
-    return round(2 * np.pi / step if joint.kind == "revolute" else 1e9 * step)
+def encoder_resolutions(machine: Machine) -> list[int]:
+    """Object 0x6501 of each joint's encoder: counts a turn; of a prismatic joint nm a count."""
+    steps = [(joint.kind == "prismatic", joint.encoder_step) for joint in machine.joints]
+    return [round(1e9 * step) if slides else 2**machine.encoder_bits for slides, step in steps]
 
 
 def encoder_turns(machine: Machine) -> Array:
@@ -231,8 +219,6 @@ def encoder_raw(machine: Machine, counts: ArrayLike) -> Array:
     return np.asarray((sign * np.asarray(counts) + zero) % 2**POSITION_BITS)
 
 
-# --- valve frame and operator input --------------------------------------------------------------
-
 CRC_TABLE = np.arange(256)  # CRC-8 of each byte, polynomial 0x1D
 for _ in range(8):
     CRC_TABLE = (CRC_TABLE << 1 ^ np.where(CRC_TABLE & 0x80, 0x1D, 0)) & 0xFF
@@ -240,7 +226,7 @@ for _ in range(8):
 
 def checksum(frame: ArrayLike) -> Array:
     """CRC-8 SAE J1850 of bytes (..., k), (...): polynomial 0x1D, start and final XOR 0xFF."""
-    crc: Array = np.array(0xFF)
+    crc = np.array(0xFF)
     for byte in np.moveaxis(np.asarray(frame, np.uint8), -1, 0):
         crc = CRC_TABLE[crc ^ byte]
     return crc ^ 0xFF
@@ -253,8 +239,7 @@ def valve_frame(command: ArrayLike, counter: ArrayLike, enable: ArrayLike) -> Ar
     """
     command = np.asarray(command)
     n = command.shape[-1]
-    if n > JOINTS_A_FRAME:  # the sixth would overwrite the counter
-        raise ValueError(f"command: expected at most {JOINTS_A_FRAME} joints, got {n}")
+    require(n <= JOINTS_A_FRAME, "command", f"at most {JOINTS_A_FRAME} joints", n)
     frame = np.zeros((*command.shape[:-1], 8), np.uint8)
     frame[..., :n] = encode_pwm(command / PWM_MAX)
     frame[..., 5] = counter
@@ -296,11 +281,10 @@ class OperatorInput(NamedTuple):
     enable: bool = False  # dead-man switch
     alive: bool = True  # is the device there?
     stop: bool = False  # end the program
-    error: bool = False  # set by the loop, for a replay of the log
 
     def pack(self) -> bytes:
         """Seven bytes for the log: three velocities in 0.1 mm/s, flags."""
-        flags = self.enable | self.alive << 1 | self.stop << 2 | self.error << 3
+        flags = self.enable | self.alive << 1 | self.stop << 2
         return struct.pack("<hhhB", *(round(1e4 * v) for v in self.v_goal), flags)
 
 
@@ -310,4 +294,4 @@ Operator = Callable[[bool, bool], OperatorInput]  # does the gate drive, is it r
 def unpack_operator_input(data: bytes) -> OperatorInput:
     """The inverse of `OperatorInput.pack`."""
     x, y, z, flags = struct.unpack("<hhhB", data)
-    return OperatorInput((x / 1e4, y / 1e4, z / 1e4), *(bool(flags & 1 << i) for i in range(4)))
+    return OperatorInput((x / 1e4, y / 1e4, z / 1e4), *(bool(flags & 1 << i) for i in range(3)))

@@ -1,10 +1,7 @@
 """The CAN bus through python-can, and its log; python-can is imported when a bus is opened."""
 
-import ctypes
-import os
 import select
 import signal
-import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -13,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from brokk_min._files import brief, require_package
 from brokk_min.can.canopen import OPERATOR_CHANNEL, OPERATOR_INPUT, Frame
-from brokk_min.identification.files import reason, require
 
 
 @dataclass
@@ -32,8 +29,8 @@ class Bus:
     def __post_init__(self) -> None:
         self.start = time.time() - self.clock()  # the log has the time of day, but it may be set
         self.echoes: deque[tuple[int, bytes]] = deque(maxlen=64 if self.echo else 0)
-        self.unwritten: deque[Any] = deque()  # messages for the log
-        self.message = require("can", "hw").Message
+        self.unwritten: deque[Any] = deque()  # messages for the log, see `flush`
+        self.message = require_package("can", "hw").Message
 
     def now(self) -> float:
         """Time of day at the start plus monotonic time since [s], in whole microseconds."""
@@ -41,20 +38,15 @@ class Bus:
 
     def recv(self, timeout: float, busy_wait: float = 0.0) -> Frame | None:
         """The next frame within `timeout` [s], or None; it sleeps only after `busy_wait` [s]."""
-        start = self.clock()
-        elapsed = 0.0
-        message = None
-        while self.file >= 0 and elapsed < timeout:  # python-can's timeout follows the time of day
-            wait = timeout - elapsed if elapsed >= busy_wait else 0.0
-            if select.select([self.file], [], [], wait)[0] and (message := self.bus.recv(0.0)):
-                break
-            elapsed = self.clock() - start
-        else:
-            message = self.bus.recv(timeout if self.file < 0 else 0.0)
+        end = self.clock() + timeout
+        message = self.bus.recv(timeout if self.file < 0 else 0.0)
+        # python-can's own timeout follows the time of day, so we wait for the descriptor
+        while message is None and self.file >= 0 and (left := end - self.clock()) > 0:
+            if select.select([self.file], [], [], left if left <= timeout - busy_wait else 0.0)[0]:
+                message = self.bus.recv(0.0)
         if message is None:
             return None
-        now = self.now()
-        data = bytes(message.data)
+        now, data = self.now(), bytes(message.data)
         if (message.arbitration_id, data) in self.echoes:
             self.echoes.remove((message.arbitration_id, data))
             return Frame(now, -1, data)
@@ -62,7 +54,7 @@ class Bus:
         return Frame(now, standard_id(message), data)
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Send one frame, once; never periodically: the kernel would go on after a hang."""
+        """Send one frame, once; never periodically, because the kernel would go on after a hang."""
         message = self._message(can_id, data)
         self.bus.send(message, timeout=0.01)
         self.echoes.append((can_id, data))
@@ -90,10 +82,8 @@ class Bus:
         return self.message(arbitration_id=can_id, data=data, is_extended_id=False, is_rx=False)
 
     def _log(self, message: Any, now: float, channel: str) -> None:
-        """Keep for `flush`: writing waits until there is time."""
         if self.writer is not None:
-            message.timestamp = now
-            message.channel = channel
+            message.timestamp, message.channel = now, channel
             self.unwritten.append(message)
 
     def close(self) -> None:
@@ -119,17 +109,16 @@ def open_bus(
     """A bus by python-can's names, closed at the end of the block; `log` grows while it runs.
 
     Kernel or adapter keep away frames of other identifiers than `ids`; empty: all frames come.
-
     ValueError: python-can is not installed, finds no such bus, or fails in the block.
     """
-    can = require("can", "hw")
+    can = require_package("can", "hw")
     can.log.setLevel("ERROR")  # it also warns of a bus that it could not open
     where = f"{interface} {channel}: expected a CAN bus"
     filters = [{"can_id": i, "can_mask": 0x7FF, "extended": False} for i in ids]
     try:
         raw = can.Bus(interface=interface, channel=channel, can_filters=filters or None)
     except Exception as error:  # each interface has its own
-        raise ValueError(f"{where}, got {reason(error)}") from error
+        raise ValueError(f"{where}, got {brief(error)}") from error
     name = channel if interface == "socketcan" else interface
     writer = can.CanutilsLogWriter(log) if log else None
     bus = Bus(raw, writer, name, echo=interface == "udp_multicast")
@@ -139,7 +128,7 @@ def open_bus(
         with closing(bus):
             yield bus
     except can.CanError as error:
-        raise ValueError(f"{where} that works, got {reason(error)}") from error
+        raise ValueError(f"{where} that works, got {brief(error)}") from error
 
 
 @contextmanager
@@ -154,15 +143,3 @@ def stop_signals() -> Iterator[list[int]]:
     finally:
         for number, handler in zip(numbers, handlers, strict=True):
             signal.signal(number, handler)
-
-
-def lock_memory() -> bool:
-    """Keep the pages of this process in memory from when they are used; False: not allowed."""
-    flags = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT of Linux
-    return sys.platform == "linux" and bool(ctypes.CDLL(None).mlockall(flags) == 0)
-
-
-def has_real_time_priority() -> bool:
-    """Does the system prefer this process to all ordinary ones? (Linux)"""
-    real_time = [getattr(os, name, None) for name in ("SCHED_FIFO", "SCHED_RR")]
-    return sys.platform == "linux" and os.sched_getscheduler(0) in real_time

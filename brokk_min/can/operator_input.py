@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from brokk_min._files import require_package
 from brokk_min.can.canopen import OperatorInput
-from brokk_min.env import Measured
-from brokk_min.identification.files import require
-from brokk_min.machine import PWM_MAX, Array, Machine
+from brokk_min.machine import PWM_MAX, Array, Machine, Measured, require
 
 PATIENCE = 5.0  # s that a script waits until the machine is ready
 
@@ -27,11 +26,9 @@ class Script:
     """
 
     def __init__(self, machine: Machine, goals: Array) -> None:
-        fastest = np.linalg.norm(goals, axis=-1).max()
-        if not fastest <= machine.tool_speed * (1 + 1e-9):
-            raise ValueError(
-                f"command: expected at most {machine.tool_speed} m/s, got {fastest:.3g} m/s"
-            )
+        fastest = float(np.linalg.norm(goals, axis=-1).max())
+        slow = fastest <= machine.tool_speed * (1 + 1e-9)
+        require(slow, "command", f"at most {machine.tool_speed} m/s", f"{fastest:.3g} m/s")
         self.goals = goals
         self.tick = 0
         self.pressed = False
@@ -70,20 +67,17 @@ class Joystick:
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # events need a window, or this
         os.environ.setdefault("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")
-        self.pygame = require("pygame", "play")
+        self.pygame = require_package("pygame", "play")
         self.pygame.display.init()
         self.pygame.joystick.init()
-        if not self.pygame.joystick.get_count():
-            raise ValueError("joystick: expected one, or --command FILE.csv, got none")
-        self.speed = machine.tool_speed
-        self.axes = axes
-        self.button = button
+        found = self.pygame.joystick.get_count() > 0
+        require(found, "joystick", "one, or --command FILE.csv", "none")
+        self.speed, self.axes, self.button = machine.tool_speed, axes, button
         self.stick: Any = self.pygame.joystick.Joystick(0)
-        num_axes = self.stick.get_numaxes()
-        num_buttons = self.stick.get_numbuttons()
-        if max(axes) >= num_axes or button >= num_buttons:
-            expected = f"expected axes {list(axes)} and button {button}"
-            raise ValueError(f"joystick: {expected}, got {num_axes} and {num_buttons}")
+        num_axes, num_buttons = self.stick.get_numaxes(), self.stick.get_numbuttons()
+        fits = max(axes) < num_axes and button < num_buttons
+        wanted = f"axes {list(axes)} and button {button}"
+        require(fits, "joystick", wanted, f"{num_axes} axes and {num_buttons} buttons")
 
     def __call__(self, driving: bool, ready: bool) -> OperatorInput:
         """Velocity and switch; a device that is gone reads zero, so its removal is an event."""

@@ -4,21 +4,18 @@ It plays the part of a real Brokk on the bus; the program that drives it cannot 
 """
 
 import gc
-import os
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brokk_min.actuator import plant_reset, plant_step
+from brokk_min.actuator import PLANT, Plant
 from brokk_min.can import canopen
 from brokk_min.can.canopen import OPERATIONAL, WATCHDOG, Array, Frame, checksum, encoder_raw
-from brokk_min.can.connection import open_bus, stop_signals
-from brokk_min.machine import Machine
+from brokk_min.can.connection import Bus, open_bus, stop_signals
+from brokk_min.machine import Machine, require
 
 # NMT states besides OPERATIONAL
 BOOT = 0
@@ -28,19 +25,19 @@ Frames = list[tuple[int, bytes]]  # identifiers and data
 
 
 class SimulatedMachine:
-    """CiA 406 encoders and a valve controller on one bus, the machine's plant behind them.
+    """CiA 406 encoders and a valve controller on one bus, and a plant behind them.
 
-    The plant moves by its own clock. A valve frame is refused if its counter, checksum or length is
-    wrong, or if it is not the first since a SYNC. With more than five joints the valves follow once
-    all frames of the tick are there. They close on a refused frame, on two SYNCs without all frames
-    between, and after `WATCHDOG` without them. They stay closed until an NMT start and neutral
-    frames.
+    A valve frame is refused if its counter, checksum or length is wrong, or if it is not the first
+    since a SYNC. With more than five joints the valves follow once all frames of the tick are
+    there. They close on a refused frame, on two SYNCs without all frames between, and after
+    `WATCHDOG` without them. They stay closed until an NMT start and neutral frames.
 
-    It starts at the angles `q` [rad] (n,) and the time `now` [s]. `record` gets each plant step:
-    time [s], command in force and true angles [rad] (n,), time of the last valid valve frame [s].
-    `report` gets the reason when the valve controller stops.
-
-    ValueError: a machine that does not fit the bus, see `check_bus`.
+    Args:
+        machine: ValueError, if it does not fit the bus, see `canopen.check_bus`.
+        q: angles at the start [rad], (n,).
+        now: time at the start [s].
+        plant: what moves, in steps of `machine.plant_dt`, by the clock of this machine.
+        report: gets the reason when the valve controller stops.
     """
 
     def __init__(
@@ -48,27 +45,24 @@ class SimulatedMachine:
         machine: Machine,
         q: ArrayLike,
         now: float,
-        record: Callable[[float, Array, Array, float], object] = lambda *_: None,
+        plant: Plant = PLANT,
         report: Callable[[str], object] = lambda reason: None,
     ) -> None:
         canopen.check_bus(machine)
-        self.machine = machine
-        self.record = record
-        self.report = report
-        self.fine = replace(machine, rate=1 / machine.plant_dt)  # a tick is one Euler step
-        self.plant = plant_reset(self.fine, q)
+        self.machine, self.plant, self.report = machine, plant, report
+        self.fine = replace(machine, rate=1 / machine.plant_dt)  # of which a tick is one step
+        self.state = plant.reset(self.fine, np.array(q, float))
         self.start = now
-        self.steps = 0
-        self.heartbeats = 0
+        self.steps = self.heartbeats = 0
         *self.encoders, self.controller = canopen.node_numbers(machine)
         self.nmt = dict.fromkeys([*self.encoders, self.controller], PRE_OPERATIONAL)
         self.objects: dict[tuple[int, int, int], int] = {}  # by node, index and subindex
-        for node, joint in zip(self.encoders, machine.joints):
+        for node, resolution in zip(self.encoders, canopen.encoder_resolutions(machine)):
             self.objects |= {
                 (node, 0x1000, 0): 406,  # device type
                 (node, *canopen.HEARTBEAT_OBJECT): round(1e3 * canopen.HEARTBEAT_PERIOD),
                 (node, *canopen.SYNC_OBJECT): 1,
-                (node, *canopen.RESOLUTION_OBJECT): canopen.encoder_resolution(joint),
+                (node, *canopen.RESOLUTION_OBJECT): resolution,
             }
         self.received = canopen.ValveFrames(machine)
         self.valid = now  # time at which the last valid valve frames of a tick were there
@@ -92,9 +86,8 @@ class SimulatedMachine:
         while (then := self.next_step) <= now:
             if self.enabled and then - self.valid >= WATCHDOG:
                 self._trip(f"no valve frame for {WATCHDOG} s")
-            self.plant = plant_step(self.fine, self.plant, self.u)
+            self.state = self.plant.step(self.fine, self.state, self.u)
             self.steps += 1
-            self.record(then, self.u, self.plant.q, self.valid)
             if then >= self.start + (self.heartbeats + 1) * canopen.HEARTBEAT_PERIOD:
                 self.heartbeats += 1
                 states = self.nmt.items()
@@ -118,7 +111,7 @@ class SimulatedMachine:
         return []
 
     def _positions(self) -> Frames:
-        counts = np.rint(self.plant.q / self.machine.encoder_step).astype(int)
+        counts = np.rint(np.asarray(self.state.q) / self.machine.encoder_step).astype(int)
         raw = zip(self.encoders, encoder_raw(self.machine, counts).astype("<u4"))
         return [(canopen.TPDO1 + i, x.tobytes()) for i, x in raw if self.nmt[i] == OPERATIONAL]
 
@@ -178,8 +171,8 @@ class SimulatedMachine:
         return struct.pack("<BHBI", answer[0], *address, answer[1])
 
 
-def serve(machine: SimulatedMachine, bus: Any, running: Callable[[], bool]) -> None:
-    """Keep a simulated machine on a `Bus` while `running`."""
+def serve(machine: SimulatedMachine, bus: Bus, running: Callable[[], bool]) -> None:
+    """Keep a simulated machine on a bus while `running`."""
     for can_id, data in machine.boot():
         bus.send(can_id, data)
     while running():
@@ -196,44 +189,31 @@ def start_pose(machine: Machine, q: Sequence[float]) -> Array:
 
     Without `q_start`, the default is the middle of the ranges. ValueError: no pose of the machine.
     """
-    low = machine.column("q_min")
-    high = machine.column("q_max")
+    low, high = machine.column("q_min"), machine.column("q_max")
     default = (0.0, *machine.q_start[1:]) if machine.q_start else (low + high) / 2
     pose = np.array(q or default, float)
-    if pose.shape != (machine.n,) or not ((low <= pose) & (pose <= high)).all():
-        raise ValueError(
-            f"start: expected {machine.n} angles within the joints' ranges, got {pose.tolist()}"
-        )
+    fits = pose.shape == (machine.n,) and bool(((low <= pose) & (pose <= high)).all())
+    require(fits, "start", f"{machine.n} angles within the joints' ranges", pose.tolist())
     return pose
 
 
 def simulate(
-    machine: Machine, q: Sequence[float], interface: str, channel: str, record: Path | None = None
+    machine: Machine, q: Sequence[float], interface: str, channel: str, plant: Plant = PLANT
 ) -> None:
-    """Run a simulated machine on a bus until SIGINT or SIGTERM; `record` logs all its Euler steps.
+    """Run a simulated machine on a bus until SIGINT or SIGTERM.
 
     It starts at `start_pose(machine, q)` and prints why its valve controller stops.
-
     ValueError: no such bus, or no such pose.
     """
     pose = start_pose(machine, q)
     ids = [canopen.NMT, canopen.SYNC, *canopen.valve_frame_ids(machine)]
     ids += [canopen.SDO_REQUEST + joint.encoder_node for joint in machine.joints]
     gc.freeze()  # no long garbage collection while the encoders should answer
-    with (
-        open_bus(interface, channel, ids=ids) as bus,
-        open(record or os.devnull, "w", buffering=1) as file,
-        stop_signals() as signals,
-    ):
+    with open_bus(interface, channel, ids=ids) as bus, stop_signals() as signals:
         start = bus.now()
-        names = [f"{kind}_{name}" for kind in "uq" for name in machine.names]
-        print("run", "time", *names, "valid", sep=",", file=file)
-
-        def write(now: float, u: Array, q: Array, valid: float) -> None:
-            numbers = [*(f"{x:.7g}" for x in (*u, *q)), f"{valid - start:.6f}"]
-            print("plant", f"{now - start:.3f}", *numbers, sep=",", file=file)
 
         def report(reason: str) -> None:
             print(f"{bus.now() - start:.3f} s, valve controller stops: {reason}", flush=True)
 
-        serve(SimulatedMachine(machine, pose, start, write, report), bus, lambda: not signals)
+        simulated = SimulatedMachine(machine, pose, start, plant, report)
+        serve(simulated, bus, lambda: not signals)

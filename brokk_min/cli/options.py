@@ -1,175 +1,108 @@
-"""Common to the commands: checks of options, the machine, default policy and gains."""
+"""Common to the commands: the machine, plants, outputs, wrong use."""
 
 import os
-import re
 import runpy
-import zipfile
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+import sys
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
+import numpy as np
 import tyro
 
-from brokk_min.identification.files import SHIPPED, brief, open_regular, read_json
-from brokk_min.identification.plants import CheckedPlant, Plant, check_motion
-from brokk_min.machine import BROKK_170, Machine, check_numbers, number
+from brokk_min._files import SHIPPED, brief
+from brokk_min.actuator import PLANT, Plant
+from brokk_min.machine import BROKK_170, PWM_MAX, Machine
 
-T = TypeVar("T")
 MACHINES = {BROKK_170.name: BROKK_170}
 MachineName = Annotated[str, tyro.conf.arg(metavar="{" + ",".join(MACHINES) + "}|FILE.py:NAME")]
 PlantName = Annotated[str, tyro.conf.arg(metavar="{analytic,net}|FILE.py:NAME")]
+TRIED = 2.0  # s of full command in which each joint of a plant must move
 
 
 class WrongUse(ValueError):
     """Options that make no sense; exit status 2."""
 
 
-def checked(make: Callable[..., T], **options: Any) -> T:
-    """What `make` gives for values of options; WrongUse: one that it refuses."""
-    try:
-        return make(**options)
-    except ValueError as error:
-        name, _, text = str(error).partition(": ")
-        raise WrongUse(f"--{name.replace('_', '-')}: {text}") from error
-
-
-# What a file of each kind that commands write holds: columns, arrays, keys, or see `names_in`.
-CONTENTS = {
-    "log": {"run", "time"},  # of `reproduce`, which records anew
-    "nets": {"header", "input_mean"},
-    "policy": {"header", "net_header"},
-    "curve": {"global_step"},
-    "scores": {"meta", "joints"},
-    "inspection": {"meta", "recordings"},
-    "diagnosis": {"meta", "terms"},
-    "DBC": {'VERSION ""'},
-    "runs": {"meta", "runs"},
-    "gains": {"meta", "gains"},
-    "sweep": {"meta", "table"},
-    "family": {"meta", "members"},
-    "results": {"meta", "task_space"},
-    "preliminary": {"meta", "sim_to_real"},
-    "attempts": {"when", "task", "mode"},
-    "plant record": {"time", "valid"},
-    "drive log": {"candump"},
-    "picture": {"PNG"},
-    "film": {"film"},
-    "rerun": {"rerun"},
-    "ONNX": {"ONNX"},
-}
-# What files of some kinds begin with, and what `names_in` calls them.
-SIGNS = {b"\x89PNG": "PNG", b"GIF8": "film", b"(": "candump", b"\x08": "ONNX", b"RRF": "rerun"}
+def check(fact: bool, option: str, wanted: str, got: Any) -> None:
+    """WrongUse "option: expected wanted, got got" unless `fact` holds."""
+    if not fact:
+        raise WrongUse(f"{option}: expected {wanted}, got {got}")
 
 
 @dataclass(kw_only=True)
 class Command:
     """Options of every command."""
 
-    machine: MachineName = BROKK_170.name  # Which one; FILE.py:NAME runs a file that you trust.
-    seed: int = number("1", 0, 2**31 - 1, 0)  # Of everything random.
-    force: bool = False  # Write over files of another kind, too; never over an input.
+    machine: MachineName = BROKK_170.name  # Which machine; FILE.py:NAME runs a file that you trust.
+    force: bool = False  # Write over files that exist.
 
-    def check(self, others: Mapping[Path, str] | None = None, /, **outputs: str) -> Machine:
-        """The machine; WrongUse: an option out of range or an output that must not be written.
+    @classmethod
+    def variant(cls, arguments: list[str]) -> "type[Command]":
+        """The class of the options, if some arguments change them."""
+        return cls
 
-        `outputs` are the kinds, as in `CONTENTS`, of options that name files to write; `others`
-        those of files that are written without an option of their own.
-        """
-        checked(check_numbers, owner=self)
-        if not getattr(self, "logs", True):
-            raise WrongUse("LOGS: expected at least one log, got none")
-        machine = find_machine(self.machine or BROKK_170.name)
-        inputs = []
-        for name in vars(self).keys() - outputs.keys():
-            value = getattr(self, name)
-            values = value if isinstance(value, tuple) else (value,)
-            words = [str(word) for word in values if word and isinstance(word, Path | str)]
-            inputs += [Path(re.sub(r"\.py:\w+$", ".py", word)) for word in words]  # FILE.py:NAME
-        read = [path.resolve() for name in ("logs", "test") for path in vars(self).get(name, ())]
-        if "test" in vars(self) and len(set(read)) < len(read):
-            raise WrongUse("LOGS, --test: expected different files, got one twice")
-        files = {getattr(self, name): kind for name, kind in outputs.items()}
-        given = [path.resolve() for path in (getattr(self, name) for name in outputs) if path]
-        if len(set(given)) < len(given):
-            raise WrongUse(f"--{', --'.join(outputs)}: expected different files, got the same")
-        existing = {path: kind for path, kind in (others or {}).items() if path.exists()}
-        for path, kind in (files | existing).items():
-            if path:
-                check_output(path, CONTENTS.get(kind) or set(machine.names), kind, self.force)
-                same = (path.exists() and one.exists() and path.samefile(one) for one in inputs)
-                if any(same):
-                    raise WrongUse(f"{path}: expected another file than an input to write")
-        return machine
+    def find_machine(self) -> Machine:
+        """The machine by its name, or of a file."""
+        if self.machine in MACHINES:
+            return MACHINES[self.machine]
+        machine = load_object("--machine", self.machine)
+        check(isinstance(machine, Machine), "--machine", "a Machine", brief(machine))
+        return machine  # type: ignore[no-any-return]
+
+    def writes(self, *paths: Path | None) -> None:
+        """WrongUse: a file that cannot be written, or that exists without --force."""
+        for path in filter(None, paths):
+            folder = path.parent
+            fits = folder.is_dir() and os.access(folder, os.W_OK) and not path.is_dir()
+            check(fits, str(path), "a file in an existing, writable folder", "none")
+            check(self.force or not path.exists(), str(path), "no file (or --force)", "one")
 
 
-def check_output(path: Path, names: set[str], kind: str, force: bool) -> None:
-    """WrongUse: a file that cannot be written, or, without `force`, one of another kind."""
-    if path.is_dir() or not os.access(path.parent, os.W_OK):
-        raise WrongUse(f"{path}: expected a file in an existing, writable directory")
-    if not path.exists() or (path.is_file() and (force or not path.stat().st_size)):
-        return
-    if kind in ("recording", "drive log"):
-        again = "no drive or recording can be repeated (--force)"
-        raise WrongUse(f"{path}: expected no file, for {again}, got one")
-    if not path.is_file() or not names <= names_in(path):
-        got = "it has " + brief(sorted(names_in(path))) if path.is_file() else "no regular file"
-        expected = f"expected no file, or one of kind {kind} (--force writes over others)"
-        raise WrongUse(f"{path}: {expected}, got another: {got}")
-
-
-def names_in(path: Path) -> set[str]:
-    """Columns of a CSV, keys of JSON, arrays of an archive; PNG, ONNX, film or candump; or none."""
-    try:
-        with open_regular(path) as file:
-            begin = file.read(2**16)
-        if begin.startswith(b"PK"):
-            with zipfile.ZipFile(path) as archive:
-                return {name.removesuffix(".npy") for name in archive.namelist()}
-        if begin.startswith(b"{"):
-            return set(read_json(path, "JSON"))
-        found = {kind for sign, kind in SIGNS.items() if begin.startswith(sign)}
-        found |= {"film"} if begin[4:8] == b"ftyp" else set()
-        header = begin.decode("utf-8-sig").split("\n")[0] if not found else ""
-        return found or {name.strip() for name in header.split(",")}
-    except Exception:  # whatever it is
-        return set()
-
-
-def find_object(option: str, name: str, known: Mapping[str, Any], kind: type, what: str) -> Any:
-    """A known object by its name, or `FILE.py:NAME`: that file is run, as `python FILE.py` would.
-
-    WrongUse: `option` names no file, or one without a NAME that is `what`, an object of a `kind`.
-    """
-    if name in known:
-        return known[name]
+def load_object(option: str, name: str) -> Any:
+    """The object NAME of `FILE.py:NAME`; the file is run, as `python FILE.py` would."""
     path, _, symbol = name.rpartition(":")
-    if not path.endswith(".py"):
-        raise WrongUse(f"{option}: expected one of {list(known)} or FILE.py:NAME, got {name}")
+    known = "analytic, net" if option == "--plant" else ", ".join(MACHINES)
+    check(path.endswith(".py"), option, f"{known} or FILE.py:NAME", name)
+    folder = str(Path(path).resolve().parent)
+    sys.path.insert(0, folder)  # files beside it can be imported
     try:
-        with open_regular(Path(path), 2**20):
-            found = runpy.run_path(path).get(symbol)
+        found = runpy.run_path(path)
     except (Exception, SystemExit) as error:  # whatever the file does
         raise ValueError(f"{option}: expected {path} to run, got {brief(error)}") from error
-    if not isinstance(found, kind) or isinstance(found, type):
-        raise WrongUse(f"{option}: expected {what} {symbol} in {path}, got {brief(found)}")
-    return found
+    finally:
+        sys.path.remove(folder)
+    check(symbol in found, option, f"an object {symbol} in {path}", "none")
+    return found[symbol]
 
 
-def find_machine(name: str) -> Machine:
-    """A machine by its name, or of a file, see `find_object`."""
-    machine: Machine = find_object("--machine", name, MACHINES, Machine, "a Machine")
-    return machine
+def find_plant(name: str, machine: Machine) -> Plant:
+    """The analytic plant, or one of a file, after a try of each joint.
 
-
-def with_plant(machine: Machine, name: str, known: Sequence[str]) -> Machine:
-    """The machine with the plant of a file, see `find_object`, or as it is for a `known` name."""
-    if name in known:
-        return machine
-    own = find_object("--plant", name, dict.fromkeys(known), Plant, "an object with reset and step")
-    machine = replace(machine, plant=CheckedPlant(name.rpartition(":")[2], own))
-    check_motion(machine)
-    return machine
+    ValueError: no `reset` and `step`, angles that are not finite, or a joint that does not obey.
+    """
+    if name == "analytic":
+        return PLANT
+    plant = load_object("--plant", name)
+    fits = hasattr(plant, "reset") and hasattr(plant, "step")
+    check(fits, "--plant", "an object with reset and step", brief(plant))
+    middle = np.tile((machine.column("q_min") + machine.column("q_max")) / 2, (2 * machine.n, 1))
+    u = machine.pwm_limit / PWM_MAX * np.concatenate([np.eye(machine.n), -np.eye(machine.n)])
+    try:
+        state = plant.reset(machine, middle.copy())
+        for _ in range(round(TRIED * machine.rate)):
+            state = plant.step(machine, state, u.copy())
+        q = np.asarray(state.q, float)
+    except Exception as error:  # whatever the file does
+        raise ValueError(f"{name}: expected states with angles q, got {brief(error)}") from error
+    if q.shape != middle.shape or not np.isfinite(q).all():
+        raise ValueError(f"{name}: expected finite angles q {middle.shape}, got {brief(q)}")
+    up, down = (np.diag(moved) for moved in np.split(q - middle, 2))
+    for i, joint in enumerate(machine.joints):
+        if not up[i] - down[i] > 0.01 or up[i] - down[i] > 3 * (joint.q_max - joint.q_min):
+            got = f"{up[i]:+.3f} and {down[i]:+.3f} rad after {TRIED:g} s up and down"
+            raise ValueError(f"{name}: {joint.name}: expected motion up, then down, got {got}")
+    return plant  # type: ignore[no-any-return]
 
 
 def default_policy(

@@ -1,84 +1,87 @@
-"""The whole chain: logs, nets, policy, baselines, comparison, report."""
+"""The whole chain: logs, nets, policies, tuned baselines, comparison, report."""
 
 import time
-from collections import ChainMap
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, replace
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from brokk_min._files import write_json
 from brokk_min.actuator import ActuatorNet
 from brokk_min.evaluation import baselines, claims, metrics, preliminary, report, sequences
-from brokk_min.evaluation.learn import Budget, Chain, learn, side_by_side, tuning_set
-from brokk_min.evaluation.metrics import Controllers, Run, Traces, evaluate, summary
-from brokk_min.evaluation.perfect_model import perfect_models, regret
-from brokk_min.evaluation.robustness import ROBUST, near_singularities, robustness
-from brokk_min.evaluation.rollout import Controller, Trace, log_of
-from brokk_min.evaluation.seeds import read_seeds
-from brokk_min.identification import logs, validation
+from brokk_min.evaluation.metrics import Traces, evaluate
+from brokk_min.evaluation.robustness import near_singularities, robustness
+from brokk_min.identification import fitting, logs, validation
 from brokk_min.identification.excitation import collect, task_log
-from brokk_min.identification.files import write_json
-from brokk_min.identification.progress import progress
+from brokk_min.identification.net_file import save_net, select_nets
 from brokk_min.jacobian import JacobianController
-from brokk_min.learning.policy import POLICIES, Policy, policy_controllers, save_policy
+from brokk_min.learning.checkpoint import train_policy
+from brokk_min.learning.jobs import side_by_side
+from brokk_min.learning.policy import POLICIES, Policy, PolicyController
+from brokk_min.learning.recipes import Recipe, paper_recipe
 from brokk_min.machine import Machine
 
-Pids = Mapping[str, JacobianController]  # baselines by name
+
+@dataclass(frozen=True)
+class Budget:
+    """How much each stage may spend."""
+
+    hours: float = 1.0  # driving time of each actuator that is recorded (paper: 1 h)
+    fit_steps: int = fitting.FitConfig.steps
+    train_steps: int | None = None  # None: as many as the recipe has
+    generations: int = baselines.GENERATIONS  # of the tuning
+    tuning_runs: int = baselines.TUNING_RUNS
+    starts: int = 64
+    short_s: float = 26.0  # s, longest run of tuning, robustness and singularities
 
 
-def reproduce(
-    machine: Machine, out: Path, budget: Budget, seed: int, sweep: Path | None = None
-) -> dict[str, Any]:
+QUICK = Budget(0.1, 700, 100_000, 4, 4, 8, 3.0)
+
+
+@dataclass(frozen=True)
+class Chain:
+    """What all stages of one chain share."""
+
+    machine: Machine
+    out: Path  # folder of its files
+    budget: Budget
+    seed: int
+
+
+class Learned(NamedTuple):
+    """Nets, policies and baselines of a chain."""
+
+    nets: Mapping[str, ActuatorNet]  # "net" and "net_paper"
+    policies: Mapping[str, Policy]  # by the names of `POLICIES`
+    pids: Mapping[str, JacobianController]
+    tuning: Mapping[str, Any]  # record of the tuning, for JSON
+
+
+def reproduce(machine: Machine, out: Path, budget: Budget, seed: int) -> dict[str, Any]:
     """Run the chain; logs, nets, policies, gains, `results.json` and `report.html` go to `out`.
 
-    `results.json` has no times: the same seed gives the same file on the same computer. `sweep` is
-    a file of `brokk-min sweep`, whose training seeds the report shows.
+    `results.json` has no times, so the same seed gives the same file on the same computer.
     """
-    seeds = read_seeds(sweep, {}) if sweep else {}  # before all work
+    began = time.perf_counter()
     chain = Chain(machine, out, budget, seed)
     clock: dict[str, float] = {}
-    with progress(total=4, desc="stages done", unit="stage", position=1) as bar:
-        stage = partial(_stage, clock, bar)
-        with stage("record"):
-            log, paper_log, test = record(chain)
-        with stage("learn and tune"):
-            by_name = learn(chain, log, paper_log, clock)
-            net, paper_net = by_name["fit net"], by_name["fit net_paper"]
-            rl, paper = by_name["train rl"], by_name["train rl_paper"]
-            tuned = [by_name[f"tune {group[0]}"] for group in baselines.GROUPS]
-            pids, tuning = (dict(ChainMap(*both[::-1])) for both in zip(*tuned, strict=True))
-            policies = {"rl": rl, "rl_paper": paper}
-            if sweep:
-                seeds = read_seeds(sweep, baselines.gains_metadata(machine, rl.net))
-        with stage("evaluate"):
-            results, shown = measure(chain, net, test, policies, pids, clock)
-            results["paper_recipe"] = net_errors(machine, paper_net, test, seed)
-        with stage("draw"):
-            results |= {"tuning": tuning, "training_seeds": seeds}
-            write(machine, out, results, policies, pids)
-            report.write_report(machine, out, results, shown, clock)
+    log, paper_log, test = record(chain)
+    learned = learn(chain, log, paper_log, clock)
+    results, shown = measure(chain, learned, test, clock)
+    write_json(out / "results.json", results)
+    baselines.write_gains(out / "gains.json", learned.pids, results["meta"])
+    report.write_report(machine, out, results, shown, (time.perf_counter() - began) / 60)
     write_json(out / "timing.json", clock)
     return results
 
 
-@contextmanager
-def _stage(clock: dict[str, float], bar: Any, name: str) -> Iterator[None]:
-    """Measure the seconds of a stage."""
-    start = time.perf_counter()
-    yield
-    clock[name] = time.perf_counter() - start
-    bar.set_postfix_str(name)
-    bar.update()
-
-
 def record(chain: Chain) -> list[logs.Log]:
-    """Logs to fit nets to, rich ones and the paper's sines, and to score them on.
+    """Logs to fit nets to, our rich ones and the paper's sines, and one to score the nets on.
 
-    They are written and read back as a user's.
+    They are written and read back as a user's would be.
     """
     chain.out.mkdir(parents=True, exist_ok=True)
     machine, hours, seed = chain.machine, chain.budget.hours, chain.seed
@@ -96,130 +99,107 @@ def record(chain: Chain) -> list[logs.Log]:
     return read
 
 
-def net_errors(machine: Machine, net: ActuatorNet, test: logs.Log, seed: int) -> dict[str, Any]:
-    """Scores of nets on a log, and their distance from the machine in the paper's experiment."""
-    both = preliminary.simulators(machine, net)
-    gap = preliminary.gap_numbers(machine, preliminary.sim_to_real(machine, both, seed))
-    return {"test": validation.score(net, test), "sim_to_real": gap}
+def fit_net(chain: Chain, name: str, log: logs.Log, recipe: Mapping[str, Any]) -> ActuatorNet:
+    """Nets of all joints by our settings but for those of `recipe`, written to `name`.npz."""
+    m = chain.machine
+    config = fitting.FitConfig(**{"steps": chain.budget.fit_steps, **recipe})
+    net = fitting.fit(log, config, chain.seed, m, m.name)
+    save_net(chain.out / f"{name}.npz", net)
+    return net
+
+
+def train(chain: Chain, name: str, net: ActuatorNet) -> Policy:
+    """One of `POLICIES`, by its own recipe."""
+    recipe = paper_recipe() if name == "rl_paper" else Recipe()
+    if chain.budget.train_steps:
+        learner = replace(recipe.learner, total_steps=chain.budget.train_steps)
+        recipe = replace(recipe, learner=learner)
+    driven = select_nets(chain.machine, net)
+    file = chain.out / POLICIES[name]
+    resume = Path(f"{file}.checkpoint").exists()
+    return train_policy(chain.machine, driven, recipe, chain.seed, file, resume)
+
+
+def tune(chain: Chain, net: ActuatorNet, name: str) -> Any:
+    """One baseline with tuned gains, and the record of its tuning."""
+    budget, nets = chain.budget, select_nets(chain.machine, net)
+    effort = budget.tuning_runs, budget.generations, chain.seed
+    longest = budget.short_s
+    return baselines.tune_baselines(chain.machine, nets, *effort, longest=longest, only=[name])
+
+
+def learn(chain: Chain, log: logs.Log, paper_log: logs.Log, clock: dict[str, float]) -> Learned:
+    """All fits, trainings and tunings, side by side."""
+    jobs: dict[str, Callable[..., Any]] = {
+        "fit net": partial(fit_net, chain, "net", log, {}),
+        "fit net_paper": partial(fit_net, chain, "net_paper", paper_log, fitting.PAPER_RECIPE),
+        "train rl": partial(train, chain, "rl"),
+        "train rl_paper": partial(train, chain, "rl_paper"),
+    }
+    needs = {"train rl": ["fit net"], "train rl_paper": ["fit net_paper"]}
+    for name in baselines.TUNED:
+        jobs[f"tune {name}"] = partial(tune, chain, name=name)
+        needs[f"tune {name}"] = ["fit net"]
+    net, paper_net, rl, rl_paper, *tuned = side_by_side(jobs, clock, needs)
+    pids = {name: pid for found, _ in tuned for name, pid in found.items()}
+    tuning = {name: row for _, rows in tuned for name, row in rows.items()}
+    policies = {"rl": rl, "rl_paper": rl_paper}
+    return Learned({"net": net, "net_paper": paper_net}, policies, pids, tuning)
 
 
 def measure(
-    chain: Chain,
-    net: ActuatorNet,
-    test: logs.Log,
-    policies: Mapping[str, Policy],
-    pids: Pids,
-    clock: dict[str, float],
+    chain: Chain, learned: Learned, test: logs.Log, clock: dict[str, float]
 ) -> tuple[dict[str, Any], report.Shown]:
-    """All measurements of nets, policies and baselines, for JSON and for the figures."""
+    """All measurements, for `results.json` and for the figures."""
     machine, seed = chain.machine, chain.seed
-    controllers = policy_controllers(machine, policies)
-    compared, task, singular = compare(chain, controllers, pids, clock)
-    starts = np.array(compared["starts"])[np.array(compared["start_kinds"]) == "workspace"]
-    axes = sequences.axis_sequences(machine)
-    rl = {"rl": controllers["rl"]}
-    on_nets, _ = evaluate(machine, rl, axes, starts, seed, policies["rl"].net)
-    compared["task_space"]["rl_on_nets"] = summary(on_nets)["rl"]
-    own = log_of(machine, {s: trace for (c, s), trace in task.items() if c == "rl"}, 16)
-    measured = preliminary.run(machine, net, seed)
-    numbers = preliminary.numbers(machine, measured)
-    tuned_on, goals = tuning_set(chain)
-    meta = metrics.metadata(machine, seed) | baselines.gains_metadata(machine, policies["rl"].net)
+    ran = {name: preliminary.run(machine, net, seed) for name, net in learned.nets.items()}
+    numbers = {name: preliminary.numbers(machine, of) for name, of in ran.items()}
+    compared, traces = compare(chain, learned, clock)
+    meta = metrics.metadata(machine, seed)
+    meta |= baselines.gains_metadata(machine, learned.policies["rl"].net)
     results = {
         "meta": meta | {"effort": asdict(chain.budget)},
-        "actuator": {
-            "test": validation.score(net, test),
-            "driven_by_policy": validation.score(net, own),
+        "nets": {
+            name: {"test": validation.score(net, test), "sim_to_real": numbers[name]["sim_to_real"]}
+            for name, net in learned.nets.items()
         },
-        "preliminary": numbers,
-        "net_claims": [claim.to_json() for claim in claims.net_claims(numbers)],
-        "gains": baselines.gains_table(pids),
-        "tuning_runs": [
-            {"start": q.tolist(), "goals": sequences.hold_table(machine, v_goal).tolist()}
-            for q, v_goal in zip(tuned_on, goals.swapaxes(0, 1), strict=True)
-        ],
+        "preliminary": numbers["net"],
+        "tuning": learned.tuning,
     }
-    return results | compared, report.Shown(net, test, measured, task, singular)
+    of_nets = [claim.to_json() for claim in claims.net_claims(numbers["net"])]
+    compared["claims"] = of_nets + compared["claims"]
+    return results | compared, report.Shown(ran["net"], traces)
 
 
 def compare(
-    chain: Chain, policies: Mapping[str, Controller], pids: Pids, clock: dict[str, float]
-) -> tuple[dict[str, Any], Traces, Traces]:
-    """The paper's experiment, regret and robustness: JSON, all traces, those near singularities.
+    chain: Chain, learned: Learned, clock: dict[str, float]
+) -> tuple[dict[str, Any], Traces]:
+    """The paper's experiment, robustness and motion near singularities: JSON, and all traces.
 
-    Means, intervals and verdicts are over "workspace" starts: they can follow all sequences.
+    Means, intervals and verdicts are over the "workspace" starts, which can follow all sequences.
     """
     machine, budget, seed = chain.machine, chain.budget, chain.seed
-    controllers: Controllers = {**policies, **pids}
+    policies = {n: PolicyController(machine, policy) for n, policy in learned.policies.items()}
+    controllers: metrics.Controllers = {**policies, **learned.pids}
     commands = sequences.task_sequences(machine)
     starts = sequences.evaluation_starts(machine, budget.starts, commands, seed + 2)
     kinds = np.array(sequences.start_kinds(machine, starts))
-    workspace = kinds == "workspace"
-    reachable = starts[workspace]
-    short = sequences.shorten(machine, sequences.axis_sequences(machine), budget.short_s)
-    bound_starts, extended = reachable[: budget.bound_starts], starts[kinds == "extended"]
-    few = claims.singular_controllers(policies, pids)
-    robust = {name: controllers[name] for name in ROBUST}
-    score, near = partial(evaluate, machine), partial(near_singularities, machine)
-    jobs: dict[str, Callable[[], Any]] = {}
-    jobs["score changed machines"] = partial(
-        robustness, machine, robust, short, reachable[:16], seed
-    )
-    for name, bound in perfect_models(machine, bound_starts).items():
-        jobs[f"score {name}"] = partial(score, {name: bound}, short, bound_starts, seed)
-    jobs["score"] = partial(score, controllers, commands, starts, seed)
-    jobs["score for the regret"] = partial(score, controllers, short, bound_starts, seed)
-    jobs["score near singularities"] = partial(near, few, extended, budget.short_s, seed)
-    changed, *bounds, (runs, traces), (on_short, _), singularities = side_by_side(jobs, clock)
-    singular, verdicts, near_traces = singularities
+    workspace, extended = starts[kinds == "workspace"], starts[kinds == "extended"]
+    short = sequences.shorten(machine, commands[:3], budget.short_s)
+    near = partial(near_singularities, machine, policies, learned.pids)
+    jobs: dict[str, Callable[[], Any]] = {
+        "score changed": partial(robustness, machine, controllers, short, workspace[:16], seed),
+        "score": partial(evaluate, machine, controllers, commands, starts, seed),
+        "score near singularities": partial(near, extended, budget.short_s, seed),
+    }
+    changed, (runs, traces), singular = side_by_side(jobs, clock)
     scored = [run for run in runs if run["kind"] == "workspace"]
-    along_x = {c: Trace(*(array[:, workspace] for array in traces[c, "x"])) for c in pids}
-    goals = commands[0].for_starts(machine, reachable)
-    theirs, ours = (
-        claims.task_claims(machine, name, pids, scored, along_x, goals, verdicts.get(name, []))
-        for name in ("rl_paper", "rl")
-    )
     results = {
-        "task_space": tables(runs, scored),
-        "regret": regret([*on_short, *(run for rows, _ in bounds for run in rows)]),
+        "task_space": {"runs": runs, "means": metrics.means(scored)},
         "robustness": changed,
         "singular": singular,
-        "claims": [a.to_json() | {"ours": b.to_json()} for a, b in zip(theirs, ours, strict=True)],
+        "claims": [claim.to_json() for claim in claims.task_claims(scored, singular)],
         "starts": starts.tolist(),
         "start_kinds": kinds.tolist(),
     }
-    return results, traces, near_traces
-
-
-def tables(runs: Sequence[Run], scored: Sequence[Run]) -> dict[str, Any]:
-    """All runs, and means and intervals of those that count, RL less each baseline."""
-    by_kind = {}
-    for kind in dict.fromkeys(run["kind"] for run in runs):
-        means = summary([run for run in runs if run["kind"] == kind])
-        by_kind[kind] = {controller: rows["all"] for controller, rows in means.items()}
-    return {
-        "runs": runs,
-        "summary": summary(scored),
-        "intervals": metrics.intervals(scored),
-        "by_kind": by_kind,
-        "rl_less": metrics.paired_differences(scored, "rl"),
-    }
-
-
-def write(
-    machine: Machine,
-    out: Path,
-    results: Mapping[str, Any],
-    policies: Mapping[str, Policy],
-    pids: Pids,
-) -> None:
-    """Write what other commands read: results, gains, policies with the errors as metadata."""
-    write_json(out / "results.json", results)
-    baselines.write_gains(out / "gains.json", pids, results["meta"])
-    means = results["task_space"]["summary"]
-    errors = {controller: rows["all"]["velocity_error_mean"] for controller, rows in means.items()}
-    command = f"brokk-min reproduce --seed {results['meta']['seed']}"
-    made = {"command": command, "velocity_error_mean": errors}
-    for name, policy in policies.items():
-        complete = replace(policy, training={**policy.training, **made})
-        save_policy(out / POLICIES[name], complete, machine)
+    return results, traces

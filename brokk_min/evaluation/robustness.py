@@ -1,29 +1,36 @@
 """Robustness: other machines and encoders, and motion near singularities."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from brokk_min.actuator import Encoder
-from brokk_min.evaluation import baselines, claims, metrics
-from brokk_min.evaluation.sequences import Commands, shorten, singular_sequences
-from brokk_min.jacobian import manipulability, manipulability_threshold
+from brokk_min.env import Encoder
+from brokk_min.evaluation.baselines import PAPER_BASELINES
+from brokk_min.evaluation.metrics import (
+    Controllers,
+    Mean,
+    by_start,
+    evaluate,
+    finite,
+    mean_interval,
+)
+from brokk_min.evaluation.rollout import Trace
+from brokk_min.evaluation.sequences import Commands, along, goals_of, shorten
+from brokk_min.jacobian import JacobianController, manipulability, manipulability_threshold
 from brokk_min.kinematics import forward_kinematics, jacobian
-from brokk_min.machine import Array, Machine, read_encoder, valve_opening
+from brokk_min.machine import Array, Machine, read_encoder
 
-# Who drives changed machines.
-ROBUST = ("rl", "rl_dither", "rl_paper", "jacobian_pid_k0.1", *baselines.WITH_INTEGRAL)
 Sensor = Callable[[np.random.Generator], Encoder]  # makes the encoders of one rollout
+STEADY = 0.6  # s after a change of goal, assumed: as long as the policy's history
 
 
 def noisy_encoder(rng: np.random.Generator) -> Encoder:
     """Encoders with normal noise of one count."""
 
     def read(machine: Machine, q: Array) -> Array:
-        noise = machine.encoder_step * rng.standard_normal(q.shape)
-        return read_encoder(machine, q + noise)
+        return read_encoder(machine, q + machine.encoder_step * rng.standard_normal(q.shape))
 
     return read
 
@@ -42,20 +49,17 @@ def lossy_encoder(rng: np.random.Generator) -> Encoder:
     return read
 
 
-def with_dead_zone(machine: Machine, dead_zone: float) -> Machine:
+def scale_valves(machine: Machine, up: float, down: float) -> Machine:
+    """The machine with other cylinder speeds up and down."""
+    speeds = machine.cylinder_speeds * [up, down]
+    pairs = zip(machine.joints, speeds.tolist(), strict=True)
+    return replace(machine, joints=tuple(replace(j, cylinder_speed=tuple(s)) for j, s in pairs))
+
+
+def with_dead_zone(machine: Machine, zone: float) -> Machine:
     """The machine with one dead zone for all joints, both ways."""
-    none = {"dead_zone_up": None, "dead_zone_down": None}
-    joints = tuple(replace(joint, **none) for joint in machine.joints)  # type: ignore[arg-type]
-    return replace(machine, joints=joints, dead_zone=dead_zone, largest_dead_zone=0.0)
-
-
-def scale_valves(machine: Machine, positive: float, negative: float) -> Machine:
-    """The machine with other cylinder speeds in the positive and the negative direction."""
-    joints = []
-    for joint in machine.joints:
-        up, down = positive * joint.speed_positive, negative * joint.speed_negative
-        joints.append(replace(joint, speed_positive=up, speed_negative=down))
-    return replace(machine, joints=tuple(joints))
+    joints = tuple(replace(joint, dead_zone=(zone, zone)) for joint in machine.joints)
+    return replace(machine, joints=joints)
 
 
 def variations(machine: Machine) -> dict[str, tuple[Machine, Sensor]]:
@@ -79,73 +83,77 @@ def variations(machine: Machine) -> dict[str, tuple[Machine, Sensor]]:
     }
 
 
-def pump_flow_ratio(machine: Machine, u: Array) -> Array:
-    """Flow that commands (..., n) demand, over the pump's flow, (...). Paper: Sec. 4.2"""
-    opening = valve_opening(u, machine.dead_zones)
-    K = np.where(opening > 0, machine.column("speed_positive"), machine.column("speed_negative"))
-    flow = np.abs(machine.column("cylinder_area") * K * opening).sum(axis=-1)  # sum |A v*|
-    return np.asarray(flow / machine.pump_flow)
-
-
 def robustness(
     machine: Machine,
-    controllers: metrics.Controllers,
+    controllers: Controllers,
     sequences: Sequence[Commands],
     starts: Array,
     seed: int,
-) -> dict[str, dict[str, dict[str, Any]]]:
-    """Mean velocity error [m/s] with its interval, by variation and controller. Paper: Sec. 4.2
-
-    Also "supply_demand", the largest `pump_flow_ratio`; "supply_limits", the fraction of ticks
-    at which it is above 1; "rl_less", the policy's error less a baseline's on the same starts.
-    """
-    error = "velocity_error_mean"
-    result: dict[str, dict[str, dict[str, Any]]] = {}
-    for name, (plant, sensor) in variations(machine).items():
-        runs, traces = metrics.evaluate(plant, controllers, sequences, starts, seed, sensor=sensor)
-        result[name] = {}
-        for controller in controllers:
-            u = np.array([traces[controller, sequence.name].u for sequence in sequences])
-            ratio = pump_flow_ratio(plant, u)
-            row: dict[str, Any] = dict(
-                metrics.mean_interval(metrics.by_start(runs, controller, "all", error))
-            )
-            row["supply_demand"] = float(ratio.max())
-            row["supply_limits"] = float((ratio > 1).mean())
-            if "rl" in controllers and controller != "rl":
-                row["rl_less"] = metrics.paired_difference(runs, "rl", controller, error)["all"]
-            result[name][controller] = row
+) -> dict[str, dict[str, Mean]]:
+    """Mean velocity error [m/s] with its interval, by variation and controller. Paper: Sec. 4.2"""
+    result: dict[str, dict[str, Mean]] = {}
+    for name, (varied, sensor) in variations(machine).items():
+        runs, _ = evaluate(varied, controllers, sequences, starts, seed, sensor=sensor)
+        errors = {c: by_start(runs, c, "all", "velocity_error_mean") for c in controllers}
+        result[name] = {c: mean_interval(error) for c, error in errors.items()}
     return result
 
 
-def near_singularities(
-    machine: Machine, controllers: metrics.Controllers, starts: Array, seconds: float, seed: int
-) -> tuple[dict[str, Any], dict[str, list[claims.Claim]], metrics.Traces]:
-    """Runs of `claims.singular_controllers` from extended starts: JSON, claims and traces.
+def singular_sequence(machine: Machine, starts: Array) -> Commands:
+    """The axis pattern along the direction in which the tool at each start can hardly move.
 
-    The JSON has the "manipulability" and the "least" singular value [m/rad] at each start. All are
-    empty without starts. Paper: Fig. 6a, 6e, 6f
+    It is the left singular vector of the Jacobian's least singular value, its largest component
+    positive. Goals are half of the pattern's (assumed): at full speed the joints' own speed limits
+    the tool near a singularity, and not damping. Paper: Fig. 6e, Fig. 6f
+    """
+    J = jacobian(forward_kinematics(machine, starts))[..., machine.driven]
+    direction = np.linalg.svd(J).U[..., -1]  # (starts, 3)
+    largest = np.abs(direction).argmax(axis=-1)[:, None]
+    direction = direction * np.sign(np.take_along_axis(direction, largest, axis=-1))
+    goals = np.stack([goals_of(machine, along(0.5 * vector)) for vector in direction], axis=1)
+    return Commands("hardest", goals)
+
+
+def near_singularities(
+    machine: Machine,
+    policies: Controllers,
+    pids: Mapping[str, JacobianController],
+    starts: Array,
+    seconds: float,
+    seed: int,
+) -> dict[str, Any]:
+    """Speed and jerk of policies and of the paper's two PIDs from extended starts, for JSON.
+
+    By controller and start: "speed" is `speed_fraction`, "jerk" [m/s^3]. Empty without starts. The
+    PIDs have the same gains, and damping with k = 0.1 and 0.05. Paper: Fig. 6a, 6e, 6f
     """
     if not len(starts):
-        return {"summary": {}, "claims": {}}, {}, {}
-    commands = shorten(machine, singular_sequences(machine, starts), seconds)
-    runs, traces = metrics.evaluate(machine, controllers, commands, starts, seed)
-    w0 = manipulability_threshold(machine)
-    J = jacobian(forward_kinematics(machine, starts))[..., machine.driven]
-    goals = {s.name: s.for_starts(machine, starts) for s in commands}
-    speed = {}
+        return {}
+    controllers = {**policies, **{name: pids[name] for name in PAPER_BASELINES}}
+    (commands,) = shorten(machine, [singular_sequence(machine, starts)], seconds)
+    runs, traces = evaluate(machine, controllers, [commands], starts, seed)
+    speed, jerk = {}, {}
     for name in controllers:
-        fractions = np.array(
-            [claims.speed_fraction(machine, w0, traces[name, s], goals[s]) for s in goals]
-        )
-        speed[name] = metrics.mean_where(np.isfinite(fractions), fractions)
-    policies: list[str] = [name for name in ("rl", "rl_paper") if name in speed]
-    singular = {name: claims.singular_claims(name, runs, speed) for name in policies}
-    results = {
-        "summary": metrics.summary(runs),
-        "claims": {name: [c.to_json() for c in every] for name, every in singular.items()},
-        "w0": w0,
-        "manipulability": manipulability(J).tolist(),
-        "least": np.linalg.svd(J, compute_uv=False)[:, -1].tolist(),
-    }
-    return results, singular, traces
+        fraction = speed_fraction(machine, traces[name, commands.name], commands.goals)
+        speed[name] = [finite(x) for x in fraction]
+        jerk[name] = by_start(runs, name, "all", "jerk_rms").tolist()
+    return {"starts": starts.tolist(), "speed": speed, "jerk": jerk}
+
+
+def speed_fraction(machine: Machine, trace: Trace, goals: Array) -> Array:
+    """Speed along the goal over the goal's near singularities, (num,); NaN: never there.
+
+    Of ticks at which Nakamura's damping acts and the goal [m/s] (T, num, 3) held for `STEADY`.
+    """
+    ticks = round(STEADY * machine.rate)
+    changed = np.any(np.diff(goals, axis=0, prepend=0 * goals[:1]), axis=-1)
+    since = [changed[max(0, t - ticks + 1) : t + 1].any(axis=0) for t in range(len(goals))]
+    J = jacobian(forward_kinematics(machine, trace.q))[..., machine.driven]
+    near = (
+        ~np.array(since)
+        & (manipulability(J) < manipulability_threshold(machine))
+        & goals.any(axis=-1)
+    )
+    along_goal = np.sum(np.sum(trace.v_tool * goals, axis=-1) * near, axis=0)
+    square = np.sum(np.sum(goals * goals, axis=-1) * near, axis=0)
+    return np.where(near.any(axis=0), along_goal / np.maximum(square, 1e-12), np.nan)

@@ -1,19 +1,18 @@
 """Excitation of the machine: commands, and the recordings of encoder angles under them.
 
-Nets are fitted to recordings of `collect`: one actuator at a time over its whole range, or all at
-once where joints are not alone (one pump, weight). They are validated on `task_log`, where the
-joints move together, as under a policy.
+Nets are fitted to recordings of `collect`, which drives one actuator at a time over its range. They
+are validated on `task_log`, where the joints move together, as under a policy.
 """
 
 from itertools import chain
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from tqdm import tqdm
 
-from brokk_min.actuator import plant_reset, plant_step
+from brokk_min.actuator import PLANT, Plant
 from brokk_min.identification.logs import RETURN, Log, machine_log
-from brokk_min.identification.progress import progress
-from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, read_encoder
+from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, read_encoder, require
 
 Indices = NDArray[np.intp]
 # Probabilities of the parts of rich excitation, assumed.
@@ -21,8 +20,6 @@ MIX = {"sine": 0.17, "step": 0.1, "holds": 0.17, "start": 0.21, "barely open": 0
 BARELY_OPEN = 0.049  # of full command beyond the dead zone, assumed: the largest of these levels
 MAX_SEGMENT = 30.0  # s, assumed: longest motion that is recorded in one piece
 MAX_RETURN = 300.0  # s, assumed: a longer return to the start is stopped
-RAMP = 7.5  # s, assumed: from 0 to the peak of a slow ramp
-TURN_AFTER = 0.5  # s at a limit, assumed: then a joint that moves with others turns back
 
 
 def sine_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Array:
@@ -31,7 +28,7 @@ def sine_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Arra
     The paper prints no frequencies. These, 0.05 to 5 Hz, are as fast as a policy's commands: on
     nets from slower sines policies learn to shake the valves.
     """
-    amplitude = rng.uniform(machine.dead_zone, machine.pwm_limit / PWM_MAX)
+    amplitude = rng.uniform(machine.dead_zones.min(), machine.pwm_limit / PWM_MAX)
     frequency = np.exp(rng.uniform(np.log(0.05), np.log(5.0)))
     phase = rng.uniform(0, 2 * np.pi)
     time = machine.dt * np.arange(ticks)
@@ -50,7 +47,7 @@ def rich_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Arra
         kind = rng.choice(list(MIX), p=list(MIX.values()))
         longest = 4.0 if kind in ("sine", "holds") else 10.0
         length = int(rng.uniform(0.5, longest) / machine.dt)
-        amplitude = rng.uniform(machine.dead_zone, limit)
+        amplitude = rng.uniform(machine.dead_zones.min(), limit)
         if kind == "sine":
             part = _wide_sine(rng, amplitude, limit, machine.dt * np.arange(length))
         elif kind == "step":
@@ -79,7 +76,7 @@ def _starts(
 ) -> Array:
     """Levels up to `limit` for 0.1 to 1 s, each after a pause or a valve barely open, (length,)."""
     parts: list[Array] = []
-    noise = rng.choice([0, 1]) * rng.uniform(0, machine.dead_zone)  # of an operator's hand
+    noise = rng.choice([0, 1]) * rng.uniform(0, machine.dead_zones.min())  # of an operator's hand
     while sum(map(len, parts)) < length:
         ticks = int(rng.uniform(0.1, 1.0) / machine.dt)
         parts.append(_pause(rng, machine, noise) if pauses else _barely_open(rng, machine))
@@ -99,65 +96,53 @@ def _barely_open(rng: np.random.Generator, machine: Machine) -> Array:
     ticks = int(rng.uniform(0.2, 2.0) / machine.dt)
     alternations = np.arange(ticks) // rng.choice([1, 2, 3, 4, 6, ticks])
     sign = rng.choice([-1, 1])
-    level = rng.uniform(0.9 * machine.dead_zone, machine.dead_zones.max() + BARELY_OPEN)
+    level = rng.uniform(0.9 * machine.dead_zones.min(), machine.dead_zones.max() + BARELY_OPEN)
     return np.asarray(sign * level * (-1.0) ** alternations)
 
 
-def ramp_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Array:
-    """Slow ramps from 0 to beyond the dead zone and back, up and down in turns, (ticks,)."""
-    half = round(RAMP * machine.rate)
-    shape = 1 - np.abs(np.arange(1 - half, half + 1)) / half
-    num = -(-ticks // len(shape))
-    beyond = rng.uniform(0.05, 0.25, num)  # of full command: the dead zone may be a guess
-    peaks = max(machine.dead_zones.max(), machine.largest_dead_zone) + beyond
-    signs = rng.choice([-1, 1]) * (-1.0) ** np.arange(num)
-    return np.outer(signs * peaks, shape).ravel()[:ticks]
-
-
-EXCITATIONS = {"sine": sine_command, "rich": rich_command, "ramp": ramp_command}
+EXCITATIONS = {"sine": sine_command, "rich": rich_command}
 
 
 class _Recorder:
-    """The analytic plant with a logger: commands and encoder angles (rows, n) of each tick."""
+    """A plant with a logger: commands and encoder angles (rows, n) of each tick."""
 
-    def __init__(self, machine: Machine, q: Array) -> None:
+    def __init__(self, machine: Machine, plant: Plant, q: Array) -> None:
         self.machine = machine
-        self.state = plant_reset(machine, q)
+        self.plant = plant
+        self.state = plant.reset(machine, q)
         self.u: list[Array] = []
         self.q = [read_encoder(machine, q)]  # one more than commands
 
     def step(self, u: Array) -> None:
         """One tick under the command `u`, limited."""
         u = limit_command(self.machine, u)
-        self.state = plant_step(self.machine, self.state, u)
+        self.state = self.plant.step(self.machine, self.state, u)
         self.u.append(u)
-        angle = getattr(self.state, "encoder", self.state.q)
-        self.q.append(read_encoder(self.machine, angle))
+        self.q.append(read_encoder(self.machine, self.state.q))
 
 
-def collect(machine: Machine, hours: float, excitation: str, rng: np.random.Generator) -> Log:
-    """Record the analytic plant, one actuator at a time, `hours` for each without the returns.
+def collect(
+    machine: Machine, hours: float, excitation: str, rng: np.random.Generator, plant: Plant = PLANT
+) -> Log:
+    """Record a plant, one actuator at a time, `hours` for each without the returns.
 
     A segment begins with `history` samples of an idle valve. The return to its start is recorded as
     `..._return`; `read_log` drops it. Sines start at mid range, as in the paper, rich excitation at
-    random angles. Under "joint" excitation all joints move at once, `hours` in all. Paper: Sec. 3.3
+    random angles. Paper: Sec. 3.3
     ValueError: another excitation, or hours that are not positive.
     """
-    if excitation not in (kinds := [*EXCITATIONS, "joint"]):
-        raise ValueError(f"excitation: expected one of {kinds}, got {excitation!r}")
-    if not 0 < hours < np.inf:
-        raise ValueError(f"hours: expected above 0, got {hours}")
+    kinds = ", ".join(EXCITATIONS)
+    require(excitation in EXCITATIONS, "excitation", f"one of {kinds}", excitation)
+    require(0 < hours < np.inf, "hours", "a positive number", hours)
     goal = max(machine.history + 2, round(hours * 3600 * machine.rate))  # samples per joint
-    if excitation == "joint":
-        return _drive_together(machine, goal, rng)
     rows = int(np.clip(goal // 300, 1, 100))  # segments of a joint that are simulated at once
     count = np.zeros(machine.n, int)
     recordings: list[list[tuple[str, Array, Array]]] = [[] for _ in machine.joints]
     title = f"record ({excitation})"
-    with progress(total=goal * machine.n, desc=title, unit="sample") as bar:
+    with tqdm(total=goal * machine.n, desc=title, unit="sample", disable=None) as bar:
         while count.min() < goal:
             joint = np.repeat(np.flatnonzero(count < goal), rows)
-            u, q, ended, idle = _drive_segments(machine, joint, excitation, rng)
+            u, q, ended, idle = _drive_segments(machine, plant, joint, excitation, rng)
             for row, j in enumerate(joint):
                 num = min(ended[row], goal - count[j])
                 if num:
@@ -177,7 +162,7 @@ def _at_limit(machine: Machine, q: Array) -> NDArray[np.bool_]:
 
 
 def _drive_segments(
-    machine: Machine, joint: Indices, excitation: str, rng: np.random.Generator
+    machine: Machine, plant: Plant, joint: Indices, excitation: str, rng: np.random.Generator
 ) -> tuple[Array, Array, Indices, Indices]:
     """Commands and angles (T, rows, n) while joint `joint[k]` of row k moves; two ticks (rows,).
 
@@ -189,12 +174,12 @@ def _drive_segments(
     start = q[rows, joint]
     arrival = np.maximum(0.06, 2 * machine.encoder_step[joint])  # rad or m
     push = machine.rate if excitation == "rich" else 0.0  # ticks at a limit
-    return_level = (machine.dead_zone + machine.pwm_limit / PWM_MAX) / 2
+    return_level = (machine.dead_zones.max() + machine.pwm_limit / PWM_MAX) / 2
     pause = round(5 * machine.tau_valve_down * machine.rate)
     ended = np.full(len(joint), machine.history + round(MAX_SEGMENT * machine.rate))
     arrived = np.full(len(joint), len(commands))
     ticks_at_limit = np.zeros(len(joint), int)
-    recorder = _Recorder(machine, q)
+    recorder = _Recorder(machine, plant, q)
     for tick, excite in enumerate(commands):
         angle = recorder.q[-1][rows, joint]
         at_limit = _at_limit(machine, recorder.q[-1])[rows, joint]
@@ -231,38 +216,13 @@ def _plan_segments(
     return q, np.pad(commands, ((0, 0), around)).T
 
 
-def _drive_together(machine: Machine, goal: int, rng: np.random.Generator) -> Log:
-    """`goal` samples or more in segments in which all driven joints move, from random poses.
-
-    Each joint has rich commands of its own and rests in three of ten segments, but not in the
-    first. In every fifth the locked joints move, too. A joint that was at a limit for `TURN_AFTER`
-    gets its commands reversed.
-    """
-    ticks = min(goal, round(MAX_SEGMENT * machine.rate))
-    shape = (rows := -(-goal // ticks), machine.n)
-    q = rng.uniform(machine.column("q_min"), machine.column("q_max"), shape)
-    recorder = _Recorder(machine, q)
-    commands = np.array([rich_command(rng, machine, ticks) for _ in range(rows * machine.n)])
-    moves = np.isin(np.arange(machine.n), machine.driven) | (np.arange(rows) % 5 == 0)[:, None]
-    moves &= (rng.random(shape) < 0.7) | (np.arange(rows) == 0)[:, None]
-    commands = commands.reshape(*shape, ticks) * moves[..., None]
-    commands[..., : machine.history] = 0.0
-    sign, at_limit = np.ones(shape), np.zeros(shape)
-    for tick in progress(range(ticks), desc="record (joint)", unit="tick"):
-        at_limit = (at_limit + 1) * _at_limit(machine, recorder.q[-1])
-        sign = np.where(at_limit >= TURN_AFTER * machine.rate, -sign, sign)
-        at_limit = at_limit * (at_limit < TURN_AFTER * machine.rate)
-        recorder.step(sign * commands[..., tick])
-    u, q = np.stack(recorder.u, axis=1), np.stack(recorder.q[:-1], axis=1)
-    return machine_log(machine, [(f"joint_{i:03d}", u[i], q[i]) for i in range(rows)])
-
-
 def task_log(
     machine: Machine,
     recordings: int,
     seconds: float,
     rng: np.random.Generator,
     start: ArrayLike | None = None,
+    plant: Plant = PLANT,
 ) -> Log:
     """Recordings under commands like a policy's: driven joints together, small corrections.
 
@@ -281,7 +241,7 @@ def task_log(
     noise = rng.uniform(0, 0.06, shape)
     move_locked = (np.arange(recordings) % 5 == 4)[:, None]
     moving = np.isin(np.arange(machine.n), machine.locked) == move_locked
-    recorder = _Recorder(machine, q)
+    recorder = _Recorder(machine, plant, q)
     for _ in range(round(seconds * machine.rate)):
         fraction = (recorder.q[-1] - q_min) / (q_max - q_min)
         up = rng.random(shape) > np.clip(1.5 * fraction - 0.25, 0, 1)

@@ -1,289 +1,229 @@
 """Fitting one actuator net per joint to a log.
 
-Training minimises errors of one step first, then the errors that add up over several steps of the
-nets on their own outputs: there a bias adds up and the noise of encoders does not. The nets of all
-joints are trained at once, each on the recordings in which its joint moves.
+The fit minimises the error of one step first, and then the errors that add up over several steps of
+the nets on their own outputs, because there a bias adds up and the noise of encoders does not. The
+nets of all joints are trained at once, each on the recordings in which its joint moves.
 
-A net that reads past velocities may learn to go on as they say, whatever the command: it then runs
+A net that reads past velocities may learn to go on as they say, whatever the command; it then runs
 away in a free run (NARX: Leontaritis and Billings, 1985). One that reads commands and the newest
-angle has to find all in the commands (NFIR but for the angle: Nelles, Nonlinear System
-Identification, 2001). `FitConfig.output_lags` chooses.
+sample alone has to find all in the commands. `FitConfig.newest_only` chooses.
 """
 
 import math
-from dataclasses import asdict, replace
-from typing import Any, NamedTuple
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Generator, Tensor
+from tqdm import tqdm
 
-from brokk_min.actuator import ActuatorNet, input_rows
+from brokk_min.actuator import ActuatorNet
+from brokk_min.beyond.valve_nets import ValveNet, valve_inputs
 from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
 from brokk_min.identification.logs import Log, join_recordings
-from brokk_min.identification.muon import Muon
-from brokk_min.identification.net_file import STATISTICS
-from brokk_min.identification.progress import progress
-from brokk_min.kinematics import estimate_velocity
-from brokk_min.machine import Array
+from brokk_min.machine import Array, Machine
 
 __all__ = ["PAPER_RECIPE", "FitConfig", "fit"]
 
 
-def fit(
-    log: Log, config: FitConfig, seed: int, velocity_samples: int, machine: str = ""
-) -> ActuatorNet:
-    """Fit one net per joint to a log. Paper: Sec. 3.3 (MSE; Adam, ours with Muon)
+def fit(log: Log, config: FitConfig, seed: int, machine: Machine, name: str = "") -> ActuatorNet:
+    """Fit one net per joint to a log. Paper: Sec. 3.3 (MSE, Adam)
 
-    `seed` repeats the nets to the bit on one computer; `velocity_samples` is the window of the
-    estimator that made the velocities of `log`; `machine` is a name, for the file.
+    `seed` repeats the nets to the bit on one computer. `machine` has the history, the window of the
+    estimator that made the velocities of `log`, and the dead zones. `name` is its name in the file;
+    it is empty for a log with other joints, whose nets read the commands as they are.
     ValueError: a joint that never moves long enough, or weights that are not finite at the end.
     """
-    lags = config.history if config.output_lags is None else config.output_lags
-    config = replace(config, dead_zone=config.dead_zone or 0.0, output_lags=lags)
-    data = training_set(log, config)
-    weights = train(data, config, seed, None if log.velocity_logged else velocity_samples)
-    return ActuatorNet(
-        joints=log.joints,
-        history=config.history,
-        rate=log.rate,
-        velocity_samples=velocity_samples,
-        velocity_logged=log.velocity_logged,
-        machine=machine,
-        seed=seed,
-        settings=asdict(config),
-        weights=tuple(weight.detach().numpy() for weight in weights),
-        dead_zone=config.dead_zone or 0.0,
-        **{name: getattr(data, name).numpy() for name in STATISTICS},
-    )
+    config = replace(config, valve=config.valve and bool(name))
+    index = [machine.names.index(joint) for joint in log.joints] if name else []
+    data = training_set(log, config, machine, machine.dead_zones[index].astype(np.float32))
+    weights = train(data, config, seed)
+    fields: dict[str, Any] = {
+        "joints": log.joints,
+        "history": machine.history,
+        "rate": log.rate,
+        "velocity_samples": machine.velocity_samples,
+        "velocity_logged": log.velocity_logged,
+        "machine": name,
+        "training": {"seed": seed, "settings": asdict(config)},
+        "weights": tuple(weight.detach().numpy() for weight in weights),
+        **{key: getattr(data, key).numpy() for key in ARRAYS},
+    }
+    if config.valve:
+        return ValveNet(**fields, dead_zones=data.zones.numpy())
+    return ActuatorNet(**fields)
 
 
-class TrainingSet(NamedTuple):
-    """Windows of H samples of each joint and their statistics, float32."""
+ARRAYS = ("input_mean", "input_scale", "output_low", "output_high", "q_low", "q_high")
 
-    signals: Tensor  # (3 or 4, n, N): `actuator.input_rows`, recordings joined
-    target: Tensor  # (N, n) rad/s, see `join_recordings`
+
+@dataclass(frozen=True)
+class TrainingSet:
+    """Samples of each joint, windows of them and their statistics, float32."""
+
+    samples: Tensor  # angle, velocity, command, recordings joined: (n, 3, N)
+    target: Tensor  # velocity that the nets should say at each sample [rad/s], (n, N)
     windows: list[NDArray[np.intp]]  # newest samples of each joint's windows
-    multi_step_windows: list[NDArray[np.intp]]  # those with `rollout` samples after them
+    long_windows: list[NDArray[np.intp]]  # those with `rollout` samples after them
+    zones: Tensor  # dead zones of nets that read what a command opens, (n, 2)
+    history: int  # samples of a window
+    estimator: Tensor | None  # weights of the velocity estimator; None: logged velocities
     input_mean: Tensor  # (n, I)
     input_scale: Tensor  # (n, I)
-    reads: Tensor  # (I,): `inputs_read`
-    output_low: Tensor  # (n,) rad/s
-    output_high: Tensor  # (n,) rad/s
-    q_low: Tensor  # (n,) rad
-    q_high: Tensor  # (n,) rad
+    reads: Tensor  # 1 for inputs that the nets read, (I,)
+    output_low: Tensor  # rad/s, (n,)
+    output_high: Tensor  # rad/s, (n,)
+    q_low: Tensor  # rad, (n,)
+    q_high: Tensor  # rad, (n,)
     rate: float  # of the samples [Hz]
 
+    def inputs(self, history: Tensor, valve: bool) -> Tensor:
+        """What the nets read of histories (batch, n, 3, H): (batch, n, I)."""
+        if valve:
+            return valve_inputs(history, self.zones, torch)  # type: ignore[no-any-return]
+        return history.flatten(-2)
 
-def training_set(log: Log, config: FitConfig) -> TrainingSet:
+
+def training_set(log: Log, config: FitConfig, machine: Machine, zones: Array) -> TrainingSet:
     """Windows in which a joint moves, and their statistics; ValueError: one that never moves."""
-    samples = join_recordings(log)
-    q, q_dot, u = samples.joined.q, samples.joined.q_dot, samples.joined.u
-    windows = samples.windows(config.history, 1)
-    targets = [samples.target[window, j] for j, window in enumerate(windows)]
-    _check_targets(log, targets, config.history)
-    rows = input_rows(q, q_dot, u, config.dead_zone or 0.0, config.indicator)
-    signals = np.stack(rows).swapaxes(1, 2)
-    mean = np.array([signals[:, j, window].mean(axis=1) for j, window in enumerate(windows)])
-    std = np.array([signals[:, j, window].std(axis=1) for j, window in enumerate(windows)])
-    std = np.where(std > 1e-9, std, 1.0)  # a signal that never changes
-    low = np.array([target.min() for target in targets])
-    high = np.array([target.max() for target in targets])
+    H = machine.history
+    joined = join_recordings(log)
+    windows = joined.windows(H, 1)
+    for name, j_windows, target in zip(log.joints, windows, joined.target.T, strict=True):
+        if not len(j_windows) or np.ptp(target[j_windows]) == 0:
+            wanted = f"expected a recording of {H + 1} samples or more in which it moves"
+            raise ValueError(f"joint {name}: {wanted}, got none")
+    signals = np.stack([joined.joined.q, joined.joined.q_dot, joined.joined.u], dtype=np.float32)
+    rows = signals[..., None].transpose(1, 2, 0, 3)  # each sample as a history of one: (N, n, 3, 1)
+    read = valve_inputs(rows, zones) if config.valve else rows[..., 0]  # (N, n, rows)
+    moments = [(read[at, j].mean(axis=0), read[at, j].std(axis=0)) for j, at in enumerate(windows)]
+    mean, std = (np.repeat(np.array(part), H, axis=1) for part in zip(*moments, strict=True))
+    targets = [joined.target[at, j] for j, at in enumerate(windows)]
+    low, high = (np.array([f(target) for target in targets]) for f in (np.min, np.max))
     margin = 0.05 * (high - low) + 1e-6  # rad/s
-    multi_step_windows = samples.windows(config.history, config.rollout)
-    if config.shared:  # for all joints the windows in which any joint moves
-        windows = [np.unique(np.concatenate(windows))] * len(windows)
-        multi_step_windows = [np.unique(np.concatenate(multi_step_windows))] * len(windows)
+    q = joined.joined.q
+    t = (np.arange(machine.velocity_samples) - (machine.velocity_samples - 1) / 2) / log.rate
+    reads = np.ones((read.shape[-1], H))
+    if config.newest_only:
+        reads[:2, :-1] = 0
+    arrays = (mean, np.where(std > 1e-9, std, 1.0), reads.ravel(), low - margin, high + margin)
+    tensors = (torch.tensor(x).float() for x in (*arrays, q.min(axis=0), q.max(axis=0)))
+    names = ("input_mean", "input_scale", "reads", "output_low", "output_high", "q_low", "q_high")
     return TrainingSet(
-        signals=torch.tensor(signals).float(),
-        target=torch.tensor(samples.target).float(),
+        samples=torch.tensor(signals.transpose(2, 0, 1)),
+        target=torch.tensor(joined.target.T).float(),
         windows=windows,
-        multi_step_windows=multi_step_windows,
-        input_mean=torch.tensor(np.repeat(mean, config.history, axis=1)).float(),
-        input_scale=torch.tensor(np.repeat(std, config.history, axis=1)).float(),
-        reads=inputs_read(config),
-        output_low=torch.tensor(low - margin).float(),
-        output_high=torch.tensor(high + margin).float(),
-        q_low=torch.tensor(q.min(axis=0)).float(),
-        q_high=torch.tensor(q.max(axis=0)).float(),
+        long_windows=joined.windows(H, config.rollout),
+        zones=torch.tensor(zones),
+        history=H,
+        estimator=None if log.velocity_logged else torch.tensor(t / (t @ t)).float(),
         rate=log.rate,
+        **dict(zip(names, tensors, strict=True)),
     )
 
 
-def inputs_read(config: FitConfig) -> Tensor:
-    """1 for inputs that the nets read, 0 for older angles and velocities: (I,)."""
-    H = config.history
-    lags = H if config.output_lags is None else config.output_lags
-    newest = torch.arange(H, 0, -1)  # 1: the newest sample
-    commands = torch.ones((1 + config.indicator) * H)
-    return torch.cat([newest <= max(lags, 1), newest <= lags, commands]).float()
-
-
-def _check_targets(log: Log, targets: list[Array], history: int) -> None:
-    for name, target in zip(log.joints, targets, strict=True):
-        if not len(target) or np.ptp(target) == 0:
-            expected = f"expected a recording of {history + 1} samples or more in which it moves"
-            raise ValueError(f"joint {name}: {expected}, got none")
-
-
-def train(data: TrainingSet, config: FitConfig, seed: int, estimator: int | None) -> list[Tensor]:
-    """Weights of all nets, as in `ActuatorNet.weights`; `estimator` as in `multi_step_loss`."""
-    torch.set_float32_matmul_precision("highest")  # a training of policies may have lowered it
+def train(data: TrainingSet, config: FitConfig, seed: int) -> list[Tensor]:
+    """Weights of all nets, as in `ActuatorNet.weights`."""
     torch.set_num_threads(1)  # several wait in vain on busy cores
     generator = Generator().manual_seed(seed)
-    weights = initial_weights(len(data.windows), config, generator)
-    rate, decay = config.learning_rate, config.weight_decay
-    groups: list[dict[str, Any]] = [{"params": weights[:6] + weights[7:8]}]
-    if config.shared:  # a latent sums over all inputs: with steps as of the others it saturates
-        slower = rate / math.sqrt(data.input_mean.numel())  # see Yang et al., arXiv 2310.17813
-        groups.append({"params": [weights[6], weights[8]], "lr": slower})
-    optimizer: torch.optim.Optimizer = torch.optim.AdamW(groups, rate, weight_decay=decay)
-    if config.muon:
-        optimizer = Muon(groups, rate, decay, config.muon, stacks=True)
-    multi_step = config.rollout > 1 and all(map(len, data.multi_step_windows))
-    switch_step = round(0.65 * config.steps) if multi_step else config.steps
-    schedule = torch.optim.lr_scheduler.LambdaLR(
-        optimizer, lambda step: cosine_decay(step, switch_step, config.steps)
+    weights = initial_weights(data, config, generator)
+    optimizer = torch.optim.AdamW(
+        weights, config.learning_rate, weight_decay=config.weight_decay, fused=True
     )
-    for step in progress(range(config.steps), desc="fit nets", unit="step"):
-        if step < switch_step:
-            settings = replace(config, rollout=1)
-            windows, batch = data.windows, config.batch_size
+    several = config.rollout > 1 and all(map(len, data.long_windows))
+    one_step = round(0.65 * config.steps) if several else config.steps
+    for step in tqdm(range(config.steps), desc="fit nets", unit="step", disable=None):
+        optimizer.param_groups[0]["lr"] = config.learning_rate * decay(step, one_step, config.steps)
+        if step < one_step:
+            at = draw_windows(data.windows, config.batch_size, generator)
+            loss = accumulated_loss(data, weights, at, 1, config.valve)
         else:
-            settings = config
-            windows, batch = data.multi_step_windows, math.ceil(config.batch_size / 4)
-        at = draw_windows(windows, batch, generator, together=config.shared > 0)
-        loss = multi_step_loss(data, settings, weights, at, estimator, generator)
+            at = draw_windows(data.long_windows, math.ceil(config.batch_size / 4), generator)
+            loss = accumulated_loss(data, weights, at, config.rollout, config.valve)
         optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
-        schedule.step()
-    if not all(torch.isfinite(weight).all() for weight in weights):
+    if not all(bool(torch.isfinite(weight).all()) for weight in weights):
         raise ValueError("weights: expected finite numbers at the end of the fit, got nan or inf")
     return weights
 
 
-def initial_weights(n: int, config: FitConfig, generator: Generator) -> list[Tensor]:
-    """Weights, by He's uniform initialisation for ReLU, and zero biases of `n` nets.
+def initial_weights(data: TrainingSet, config: FitConfig, generator: Generator) -> list[Tensor]:
+    """Weights, by He's uniform initialisation for ReLU, and zero biases of all nets.
 
-    Those of latents, if any, begin small: the nets begin nearly alone. Those of inputs that nets
-    do not read are zero, and stay so.
+    Those of inputs that the nets do not read are zero, and stay so.
     """
-
-    def uniform(rows: int, columns: int, bound: float) -> Tensor:
-        return (torch.rand(n, rows, columns, generator=generator) * 2 - 1) * bound
-
-    reads = inputs_read(config)
-    inputs, hidden, latents = int(reads.sum()), config.hidden, config.shared
+    n, inputs = data.input_mean.shape
+    fan_in = (int(data.reads.sum()), config.hidden, config.hidden)
+    shapes = ((inputs, config.hidden), (config.hidden, config.hidden), (config.hidden, 1))
     weights = []
-    shapes = [(len(reads), hidden, inputs), (hidden, hidden, hidden), (hidden, 1, hidden)]
-    for rows, columns, fan_in in shapes:
-        weights += [uniform(rows, columns, math.sqrt(6 / fan_in)), torch.zeros(n, columns)]
-    weights[0] *= reads[:, None]
-    if latents:
-        shared = uniform(2 * len(reads), latents, math.sqrt(1 / (2 * n * inputs)))
-        weights.append(shared * reads.tile(2)[:, None])
-        weights.append(uniform(latents, hidden, math.sqrt(6 / inputs)))
-        weights.append(torch.zeros(n, latents))
+    for (rows, columns), size in zip(shapes, fan_in, strict=True):
+        bound = math.sqrt(6 / size)
+        w = (torch.rand(n, rows, columns, generator=generator) * 2 - 1) * bound
+        weights += [w, torch.zeros(n, columns)]
+    weights[0] *= data.reads[:, None]
     return [weight.requires_grad_() for weight in weights]
 
 
-def cosine_decay(step: int, switch_step: int, steps: int) -> float:
-    """Factor of the learning rate: from 1 to 0 by `switch_step`, then from 1/4 to 0."""
-    if step < switch_step:
-        return 0.5 * (1 + math.cos(math.pi * step / switch_step))
-    fraction = (step - switch_step) / max(steps - switch_step, 1)
+def decay(step: int, one_step: int, steps: int) -> float:
+    """Factor of the learning rate: from 1 to 0 until `one_step`, then from 1/4 to 0."""
+    if step < one_step:
+        return 0.5 * (1 + math.cos(math.pi * step / one_step))
+    fraction = (step - one_step) / max(steps - one_step, 1)
     return 0.125 * (1 + math.cos(math.pi * fraction))
 
 
-def draw_windows(
-    windows: list[NDArray[np.intp]], batch: int, generator: Generator, together: bool = False
-) -> Tensor:
-    """Newest samples (n, batch) of random windows of each joint, or of all joints `together`."""
-    if together:
-        pick = torch.randint(len(windows[0]), (batch,), generator=generator)
-        return torch.tensor(windows[0][pick]).expand(len(windows), batch)
+def draw_windows(windows: list[NDArray[np.intp]], batch: int, generator: Generator) -> Tensor:
+    """Newest samples (batch, n) of random windows of each joint."""
     picks = [torch.randint(len(window), (batch,), generator=generator) for window in windows]
     drawn = [window[pick] for window, pick in zip(windows, picks, strict=True)]
-    return torch.tensor(np.stack(drawn))
+    return torch.tensor(np.stack(drawn, axis=1))
 
 
-def multi_step_loss(
-    data: TrainingSet,
-    config: FitConfig,
-    weights: list[Tensor],
-    at: Tensor,
-    estimator: int | None,
-    generator: Generator,
+def accumulated_loss(
+    data: TrainingSet, weights: list[Tensor], at: Tensor, ticks: int, valve: bool
 ) -> Tensor:
-    """Mean square of the accumulated error over `rollout` ticks of the nets on their own outputs.
+    """Mean square of the accumulated error over `ticks` of the nets on their own outputs.
 
     L = 1/K sum_k |sum_{i<=k} (velocity_i - target_i) / range|^2, for windows that end `at`
-    (n, batch); summed over joints. A `rollout` of 1 is the paper's error of one step. `estimator`:
-    samples of the velocity estimator; None: velocities are the outputs.
+    (batch, n); summed over joints. With one tick it is the paper's error of one step.
     """
-    ticks, history = config.rollout, config.history
-    q, q_dot, u = input_windows(data, config, at, ticks, generator)
-    samples = estimator or 2
-    slope = torch.tensor(estimate_velocity(np.eye(samples), samples, 1 / data.rate)).float()
-    accumulated_error, loss = torch.zeros(()), torch.zeros(())
+    joint = torch.arange(at.shape[1])
+    time = at[..., None] + torch.arange(
+        1 - data.history, 1
+    )  # samples of the windows, (batch, n, H)
+    history = data.samples[joint[:, None], :, time].movedim(-1, -2)  # (batch, n, 3, H)
+    error, loss = torch.zeros(at.shape), torch.zeros(())
     for k in range(ticks):
-        velocity = predict(data, weights, q, q_dot, u[..., k : k + history])
-        accumulated_error = accumulated_error + normalised_error(data, velocity, at + k)
-        loss = loss + (accumulated_error**2).mean(dim=1).sum() / ticks
-        q_next = q[..., -1] + velocity / data.rate  # q' = q + dt q_dot
-        q = torch.cat([q[..., 1:], q_next[..., None]], dim=-1)
-        if estimator:
-            velocity = (q[..., -samples:] * slope).sum(dim=-1)
-        q_dot = torch.cat([q_dot[..., 1:], velocity[..., None]], dim=-1)
+        velocity = predict(data, weights, history, valve)
+        target = data.target[joint, at + k]
+        error = error + (velocity - target) / (data.output_high - data.output_low)
+        loss = loss + error.square().mean(dim=0).sum() / ticks
+        if k + 1 < ticks:
+            u = data.samples[joint, 2, at + k + 1]
+            history = advance(data, history, velocity, u)
     return loss
 
 
-def normalised_error(data: TrainingSet, velocity: Tensor, at: Tensor) -> Tensor:
-    """(velocity - target) / (output range) of the samples `at` (n, batch)."""
-    target = data.target[at, torch.arange(len(at))[:, None]]
-    return (velocity - target) / (data.output_high - data.output_low)[:, None]
-
-
-def input_windows(
-    data: TrainingSet, config: FitConfig, at: Tensor, ticks: int, generator: Generator
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Angles and noisy velocities (n, batch, H) of windows that end `at`, and their commands.
-
-    Commands are (n, batch, 1 or 2, H + ticks - 1). Noise has a part per sample and one per window.
-    """
-    (n, batch), history = at.shape, config.history
-    signals = data.signals.unfold(-1, history + ticks - 1, 1)
-    q, q_dot, *commands = signals[:, torch.arange(n)[:, None], at - (history - 1)]
-    q, q_dot, u = q[..., :history], q_dot[..., :history], torch.stack(commands, dim=2)
-    if config.noise:
-        noise = torch.randn(n, batch, history, generator=generator)
-        noise = noise + torch.randn(n, batch, 1, generator=generator)
-        std = data.input_scale.reshape(n, 1, -1, history)[:, :, 1]
-        q_dot = q_dot + config.noise * std * noise
-    return q, q_dot, u
-
-
-def predict(
-    data: TrainingSet, weights: list[Tensor], q: Tensor, q_dot: Tensor, u: Tensor
-) -> Tensor:
-    """Velocities [rad/s] (n, batch) for windows (n, batch, H); none passes a stop in one tick.
-
-    `u` are the rows of the commands, (n, batch, 1 or 2, H).
-    """
-    w1, b1, w2, b2, w3, b3 = weights[:6]
-    x = torch.cat([q, q_dot, u.flatten(2)], dim=-1)
-    x = data.reads * (x - data.input_mean[:, None]) / data.input_scale[:, None]
-    bias = b1[:, None]
-    if len(weights) > 6:  # as `ActuatorNet.latents`
-        both = torch.cat([x, x.abs()], dim=-1)
-        z = (both @ weights[6] + weights[8][:, None]).sum(dim=0)
-        bias = bias + torch.tanh(z) @ weights[7]
-    x = torch.relu(torch.baddbmm(bias, x, w1))
+def predict(data: TrainingSet, weights: list[Tensor], history: Tensor, valve: bool) -> Tensor:
+    """Velocities [rad/s] (batch, n) for histories (batch, n, 3, H); none passes a stop."""
+    w1, b1, w2, b2, w3, b3 = weights
+    x = data.reads * (data.inputs(history, valve) - data.input_mean) / data.input_scale
+    x = torch.relu(torch.baddbmm(b1[:, None], x.transpose(0, 1), w1))
     x = torch.relu(torch.baddbmm(b2[:, None], x, w2))
-    y = torch.sigmoid(torch.baddbmm(b3[:, None], x, w3))[..., 0]
-    low, high = data.output_low[:, None], data.output_high[:, None]
-    lowest = (data.q_low[:, None] - q[..., -1]) * data.rate
-    highest = (data.q_high[:, None] - q[..., -1]) * data.rate
-    return torch.clamp(low + (high - low) * y, lowest, highest)
+    y = torch.sigmoid(torch.baddbmm(b3[:, None], x, w3))[..., 0].T
+    velocity = data.output_low + (data.output_high - data.output_low) * y
+    q = history[..., 0, -1]
+    return torch.clamp(velocity, (data.q_low - q) * data.rate, (data.q_high - q) * data.rate)
+
+
+def advance(data: TrainingSet, history: Tensor, velocity: Tensor, u: Tensor) -> Tensor:
+    """Histories (batch, n, 3, H) one tick on: q' = q + dt velocity; then the command `u`."""
+    q = history[..., 0, -1] + velocity / data.rate
+    angles = torch.cat([history[..., 0, 1:], q[..., None]], dim=-1)
+    if data.estimator is not None:
+        velocity = angles[..., -len(data.estimator) :] @ data.estimator
+    newest = torch.stack([q, velocity, u], dim=-1)
+    return torch.cat([history[..., 1:], newest[..., None]], dim=-1)

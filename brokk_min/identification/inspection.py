@@ -1,310 +1,256 @@
-"""What a log tells of its machine, and what it cannot tell: joint by joint, before any fit.
+"""What a log tells of its machine before any fit, joint by joint, and where it is not enough.
 
-`identification.joint_model` has what it tells of delays, dead zones and speeds.
+A small model explains the velocity of a joint: its command, later by a delay, less the dead zone,
+times a gain, through a first-order lag:
+
+    q_dot' = (g_up max(u(t - d) - z_up, 0) - g_down max(-u(t - d) - z_down, 0) - q_dot) / tau
+
+A grid gives delay, lag and dead zones, and least squares give the gains. Samples at the ends of the
+recorded range do not count, because a joint that is pushed against its stop stands still.
 """
 
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from itertools import product
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+from scipy.signal import lfilter
 
-from brokk_min.identification.joint_model import LATEST, joint_model
 from brokk_min.identification.logs import COMMANDED, Log, Recording, driven
-from brokk_min.machine import PWM_MAX, Array, Machine
+from brokk_min.machine import Array, Joint, Machine
 
-NEAR_LIMIT = 0.15  # of the command limit, assumed: commands of so much less or more are at it,
-HELD = 0.5  # s, assumed: after so long a joint has its speed
-FASTEST = 0.95  # quantile of the speeds at the command limit, assumed
-LEAST_HELD = 20  # samples at the command limit, assumed: else the model gives the fastest motion
-WIDER = 0.03  # of full command, assumed: the model's error of the least dead zone is smaller
-FASTER = 5.0  # times as fast as the machine, assumed: more is another unit
-LEVELS = 8  # of commands from 0 to the largest, by direction
-# What a log must have for its score to hold in other driving, all assumed.
+# What the model searches, all assumed.
+LATEST = 0.4  # s, longest delay
+TAUS = (0.05, 0.1, 0.2, 0.4)  # s
+COARSE = 0.02 * np.arange(36)  # dead zones, of full command
+FINE = 0.005 * np.arange(-3, 4)  # around the best of these
+AT_STOP = 0.01  # of the recorded range: so near its end a joint may be at a stop
+PAUSE = 2.0  # s, after so long a joint without commands is at rest
+SETTLED = 0.7  # s after a gap, because what was commanded in the gap is not known
+SAMPLES = 20_000  # of a joint that are used
+CLEAR_SIGN = 0.2  # of the velocities' power: fast sines fit as well if reversed and later
+# The fastest motion, all assumed.
+NEAR_LIMIT = 0.15  # commands that are so much less or more than the limit are at it
+HELD = 0.5  # s, after so long a joint has its speed
+FASTEST = 0.95  # quantile of the speeds, because the single ones have noise
+LEAST_HELD = 20  # samples at the limit; with fewer, the model gives the fastest motion
+# What a log must have, all assumed.
 LEAST_MINUTES = 10.0
 LEAST_RANGE = 0.7  # of a joint's range
 LEAST_EXPLAINED = 0.1  # of a joint's motion by its commands
-LEAST_LEVELS = 6  # with 1 % of the commands or more
-STEPPED = 0.8  # `held` of step responses, at least; excitations have 0.7 or less
-MANY_LEVELS = 7  # that step responses do not have
-LEAST_CHANGES = 0.05  # of the ticks: commands that change by more than a tenth of the largest
-CLOSED_LOOP = -0.42  # `feedback`: excitations give -0.4 to 0, going between places -0.6 to -0.5
-SMALL = 0.02  # of full command: larger changes are of goals, or of an excitation
-LEAST_SMALL = 400  # small changes of a command, else nothing is said of its `reaction`
-REACTS = 0.01  # least `reaction` of all joints: excitations have 0 or less, a policy has 0.03
+WIDER = 0.03  # of full command, above the error of the model's dead zones
+BEYOND = 0.05  # of a joint's range, outside of it
+FASTER = 5.0  # times as fast as the machine: probably in another unit
 
 
 @dataclass(frozen=True)
 class JointReport:
-    """One joint of a log; velocities in rad/s, commands of full command."""
+    """One joint of a log; pairs are up and down, commands of full command."""
 
     minutes: float  # in recordings in which it has commands
-    alone: float  # part of its commanded time without commands of other joints
-    together: dict[str, float]  # part with commands of each other joint
     low: float  # rad, smallest angle
     high: float  # rad
-    levels: tuple[int, int]  # of `LEVELS` commands up and down that the log has
-    held: float  # part of the ticks with a command at which it stays as it was
-    held_levels: int  # of `LEVELS`, at these ticks, in the direction that has more
-    changes: float  # part of the ticks at which the command changes fast
-    feedback: float  # correlation of commands with the angle a second before
-    reaction: float  # part of the small changes of the command that measured motion explains
-    explained: float  # part of the velocities' variance that the model explains
-    sign: int  # of velocity under a positive command; 0: not clear
+    explained: float  # part of the velocities' power that the model explains
+    sign: int  # of the velocity under a positive command; 0: not clear
     delay: float  # s
     tau: float  # s
-    dead_zone_up: float
-    dead_zone_down: float
-    gain_up: float  # rad/s per command beyond the dead zone
-    gain_down: float
+    dead_zone: tuple[float, float]
+    gain: tuple[float, float]  # rad/s per command beyond the dead zone; 0: it never moved so
+    fastest: tuple[float, float]  # rad/s at the command limit
 
 
-def inspect(log: Log) -> dict[str, JointReport]:
-    """A report of each joint that is driven in a log, at the log's rate."""
+def inspect(log: Log, limit: float = 1.0) -> dict[str, JointReport]:
+    """A report of each joint that is driven in a log; `limit` is that of its commands, to 1."""
     reports = {}
     for j, name in enumerate(log.joints):
         recordings = [one for one in log.recordings if driven(one)[j]]
         if recordings:
-            reports[name] = inspect_joint(log, recordings, j)
+            ticks = sum(len(one.u) for one in recordings if np.ptp(one.u[:, j]) > COMMANDED)
+            q = np.concatenate([one.q[:, j] for one in recordings])
+            motion = motion_of(recordings, j, log.rate)
+            model = fit_model(motion)
+            reports[name] = JointReport(
+                minutes=ticks / log.rate / 60,
+                low=float(q.min()),
+                high=float(q.max()),
+                fastest=fastest(motion, limit, model),
+                **model,
+            )
     return reports
 
 
-def inspect_joint(log: Log, recordings: list[Recording], j: int) -> JointReport:
-    """The report of joint `j` from the recordings that drive it."""
-    u = np.concatenate([recording.u for recording in recordings])
-    q = np.concatenate([recording.q[:, j] for recording in recordings])
-    moving = np.abs(u) > COMMANDED
-    own = moving[moving[:, j]]
-    others = [i for i in range(len(log.joints)) if i != j]
-    largest = max(np.abs(u[:, j]).max(), 1e-9)
-    level = np.floor(LEVELS * np.abs(u[:, j]) / largest).clip(0, LEVELS - 1)
-    sides = [level[side * u[:, j] > COMMANDED] for side in (1, -1)]
-    levels = [count_levels(side) for side in sides]
-    changes = [np.abs(np.diff(one.u[:, j])) > 0.1 * largest for one in recordings]
-    stays = np.abs(np.diff(u[:, j], prepend=np.inf)) < 0.01 * largest
-    held = [level[stays & (side * u[:, j] > COMMANDED)] for side in (1, -1)]
-    return JointReport(
-        minutes=sum(len(r.u) for r in recordings if np.ptp(r.u[:, j]) > COMMANDED) / log.rate / 60,
-        alone=float(1 - own[:, others].any(axis=1).mean()) if len(own) else 1.0,
-        together={log.joints[i]: float(own[:, i].mean()) if len(own) else 0.0 for i in others},
-        low=float(q.min()),
-        high=float(q.max()),
-        levels=(levels[0], levels[1]),
-        held=float(stays[moving[:, j]].mean()) if moving[:, j].any() else 0.0,
-        held_levels=max(map(count_levels, held)),
-        changes=float(np.concatenate(changes).mean()),
-        feedback=feedback(recordings, j, log.rate),
-        reaction=reaction(recordings, j),
-        **joint_model(recordings, j, log.rate),
-    )
+def fastest(motion: "Motion", limit: float, model: Mapping[str, Any]) -> Any:
+    """Fastest motion [rad/s] up and down, after commands held at the limit.
 
-
-def count_levels(level: Array) -> int:
-    """How many levels have more than 1 % of these commands (samples,)."""
-    count = np.bincount(level.astype(int), minlength=LEVELS)
-    return int((count > 0.01 * max(count.sum(), 1)).sum())
-
-
-def feedback(recordings: list[Recording], j: int, rate: float) -> float:
-    """Correlation of the command with the angle a second before it; 0: no command changes.
-
-    A controller or an operator brings a joint back to where it is to be: below `CLOSED_LOOP`. An
-    excitation does not look at the angle.
+    Where too few commands are held there, it is what the model gives.
     """
-    late = round(rate)
-    u = np.concatenate([one.u[late:, j] for one in recordings])
-    q = np.concatenate([one.q[: max(0, len(one.q) - late), j] for one in recordings])
-    if len(u) < 2 or not np.ptp(u) or not np.ptp(q):
-        return 0.0
-    return float(np.corrcoef(q, u)[0, 1])
+    held = round(HELD * motion.rate) + 1
+    commands = sliding_window_view(motion.u, held)
+    result = []
+    for sign, zone, gain in zip((1, -1), model["dead_zone"], model["gain"], strict=True):
+        at_limit = (np.abs(sign * commands / limit - 1) < NEAR_LIMIT).all(axis=-1)
+        speeds = sign * motion.q_dot[held - 1 :][at_limit]
+        measured = len(speeds) >= LEAST_HELD
+        result.append(np.quantile(speeds, FASTEST) if measured else gain * max(limit - zone, 0))
+    return tuple(map(float, result))
 
 
-def reaction(recordings: list[Recording], j: int) -> float:
-    """Part of the small changes of a command that the joint's motion explains; 0: too few of them.
+# --- the model ------------------------------------------------------------------------------------
 
-    As Granger (1969) has it: beyond what the command's own past explains, by linear models that are
-    fitted to one half of the changes and scored on the other. Commands of an excitation change
-    whatever the joint does; those of a controller follow its velocity.
+
+class Motion(NamedTuple):
+    """Samples of one joint, recordings one after the other, with a rest in between."""
+
+    u: Array  # (T,)
+    q_dot: Array  # of the log [rad/s], (T,)
+    velocity: Array  # over the coming sample [rad/s], (T,)
+    counts: NDArray[np.bool_]  # not in a rest, nor after a gap, nor at an end of the range, (T,)
+    rate: float  # Hz
+
+
+def motion_of(recordings: list[Recording], j: int, rate: float) -> Motion:
+    """Joint `j` of recordings that begin at rest or after a gap; of a long log the first part."""
+    share = min(1.0, SAMPLES / sum(len(one.u) for one in recordings))
+    rest = (0, round(PAUSE * rate))
+    parts = []
+    for one in recordings:
+        num = int(np.ceil(share * len(one.u)))
+        counts = np.arange(num) >= (SETTLED * rate if "#" in one.name else 0)
+        u, q, q_dot = (x[:num, j] for x in one[1:])
+        padded = (np.pad(x, rest) for x in (u, q_dot, counts))
+        parts.append((np.pad(q, rest, "edge"), *padded))
+    q, u, q_dot, counts = map(np.concatenate, zip(*parts, strict=True))
+    q_next, margin = np.append(q[1:], q[-1]), AT_STOP * np.ptp(q)
+    counts &= (q_next > q.min() + margin) & (q_next < q.max() - margin)
+    return Motion(u, q_dot, (q_next - q) * rate, counts, rate)
+
+
+def fit_model(motion: Motion) -> dict[str, Any]:
+    """The model's fields of `JointReport`, with gains of the sign that explains more.
+
+    A log explains little if its joint hardly moves; then the sign is 0.
     """
-    own, motion, changes = map(
-        np.concatenate, zip(*(_small_changes(one, j) for one in recordings), strict=True)
-    )
-    if len(changes) < LEAST_SMALL:
-        return 0.0
-    halves = np.array_split(np.arange(len(changes)), 2)
-    error = np.zeros(2)
-    for fitted, scored in (halves, halves[::-1]):
-        for k, x in enumerate((own, np.hstack([own, motion]))):
-            w = np.linalg.lstsq(x[fitted], changes[fitted], rcond=None)[0]
-            error[k] += np.square(changes[scored] - x[scored] @ w).sum()
-    if error[0] < 1e-12 * len(changes):  # held commands: their past tells all
-        return 0.0
-    return float(1 - error[1] / error[0])
+    power = float(np.square(motion.velocity[motion.counts]).sum())
+    models = {sign: best_model(motion, sign) for sign in (1, -1)}
+    errors = {sign: model.pop("error") for sign, model in models.items()}
+    better = (errors[-1] - errors[1]) / max(power, 1e-12)
+    sign = 1 if better > -CLEAR_SIGN else -1
+    explained = 1 - errors[sign] / power if power else 0.0
+    clear = int(np.sign(better)) if abs(better) > CLEAR_SIGN else 0
+    return {"explained": explained, "sign": clear, **models[sign]}
 
 
-def _small_changes(recording: Recording, j: int) -> tuple[Array, Array, Array]:
-    """Of each small change of a command: its past, the joint's motion until then, the change."""
-    u, q, q_dot = recording.u[:, j], recording.q[:, j], recording.q_dot[:, j]
-    t = np.arange(6, len(u))
-    change = np.stack([u[t - k] - u[t - k - 1] for k in range(5)], axis=-1)  # newest first
-    small = (np.abs(change[:, :3]) < SMALL).all(axis=-1) & (u[t] != 0) & (u[t - 1] != 0)
-    own = np.column_stack([np.ones(len(t)), change[:, 1:], u[t - 1]])
-    motion = np.column_stack([*(q_dot[t - k] for k in (0, 1, 2, 4)), q[t]])
-    return own[small], motion[small], change[small, 0]
+def best_model(motion: Motion, sign: int) -> dict[str, Any]:
+    """The model with gains of one sign: a grid of delays and lags, and dead zones, in turns."""
+    lags = list(product(range(round(LATEST * motion.rate) + 1), TAUS))
+    zones = np.array([0.05, 0.05])
+    for _ in range(2):
+        delay, tau = min(lags, key=lambda lag: fit_gains(motion, sign, lag[0], lag[1], zones)[0])
+        zones = best_zones(partial(fit_gains, motion, sign, delay, tau), zones)
+    error, gains = fit_gains(motion, sign, delay, tau, zones)
+    pairs = {"dead_zone": tuple(zones.round(3).tolist()), "gain": tuple(gains.tolist())}
+    return {"error": error, "delay": delay / motion.rate, "tau": tau, **pairs}
 
 
-def wrong_signs(reports: dict[str, JointReport]) -> list[str]:
+def best_zones(fit: Callable[[Array], tuple[float, Array]], zones: Array) -> Array:
+    """Dead zones (2,), in turns: each of a coarse grid, then of a fine one around its best."""
+    for side in (0, 1, 0, 1):
+        for around, steps in ((0, COARSE), (1, FINE)):
+            values = np.maximum(around * zones[side] + steps, 0)
+            trials = [np.where(np.arange(2) == side, value, zones) for value in values]
+            zones = min(trials, key=lambda trial: fit(trial)[0])
+    return zones
+
+
+def fit_gains(
+    motion: Motion, sign: int, delay: int, tau: float, zones: Array
+) -> tuple[float, Array]:
+    """Sum of the squared errors of the model with the best gains (2,) of a sign; these gains."""
+    up, down = zones
+    late = np.concatenate([np.zeros(delay), motion.u])[: len(motion.u)]
+    openings = np.stack([np.maximum(late - up, 0), -np.maximum(-late - down, 0)])
+    a = np.exp(-1 / (motion.rate * tau))
+    x = lfilter([1 - a], [1, -a], openings)[:, motion.counts]
+    velocity = motion.velocity[motion.counts]
+    gains = np.linalg.solve(x @ x.T + 1e-9 * np.eye(2), x @ velocity)
+    gains = sign * np.maximum(sign * gains, 0)
+    error = velocity - gains @ x
+    return float(error @ error), gains
+
+
+# --- what to make of it ---------------------------------------------------------------------------
+
+
+def wrong_signs(reports: Mapping[str, JointReport]) -> list[str]:
     """Joints whose angle falls under positive commands, in words."""
-    expected = "expected positive commands to raise q_{}, got {:.2f} rad/s per full opening"
+    wanted = "expected positive commands to raise"
     return [
-        f"u_{name}: {expected.format(name, report.gain_up)}: change the sign of one column"
+        f"u_{name}: {wanted} q_{name}, got {report.gain[0]:.2f} rad/s per full opening"
         for name, report in reports.items()
         if report.sign < 0
     ]
 
 
-def warnings(
-    log: Log, reports: dict[str, JointReport], machine: Machine | None = None
-) -> list[str]:
-    """Where the log is an operator's work rather than an excitation: its score is of such work."""
+def warnings(log: Log, reports: Mapping[str, JointReport], machine: Machine | None) -> list[str]:
+    """What a log lacks, and where it contradicts the machine that it should be of."""
     result = wrong_signs(reports)
-    steps_alone = has_steps_alone(reports)
     for name in log.joints:
         if name not in reports:
-            result.append(f"{name}: never driven in the log")
+            result.append(f"{name}: expected commands in the log, got none")
             continue
         r = reports[name]
-        checks = {
-            f"{r.minutes:.1f} of {LEAST_MINUTES:g} minutes": r.minutes < LEAST_MINUTES,
-            f"commands of {r.levels[0]} of {LEVELS} levels up, {r.levels[1]} down": (
-                min(r.levels) < LEAST_LEVELS
-            ),
-            f"fast changes of command in {r.changes:.1%} of the ticks": r.changes < LEAST_CHANGES,
-            f"commands that follow the angle ({r.feedback:.2f})": (
-                r.feedback < CLOSED_LOOP and not steps_alone  # steps up and down seem to
-            ),
-        }
+        if r.minutes < LEAST_MINUTES:
+            result.append(f"{name}: expected {LEAST_MINUTES:g} minutes, got {r.minutes:.1f}")
+        if r.explained < LEAST_EXPLAINED:
+            got = f"{r.explained:.0%}: are they those of another joint?"
+            result.append(f"{name}: expected commands that explain its motion, got {got}")
+        if r.delay > LATEST - 1 / log.rate:
+            wanted = f"below {LATEST:g} s, the longest that is searched"
+            result.append(f"{name}: delay: expected {wanted}, got {r.delay:.2f} s or more")
         if machine:
             joint = machine.joints[machine.names.index(name)]
-            part = (r.high - r.low) / (joint.q_max - joint.q_min)
-            checks[f"{part:.0%} of the range"] = part < LEAST_RANGE
-            beyond = 0.05 * (joint.q_max - joint.q_min)
-            if r.low < joint.q_min - beyond or r.high > joint.q_max + beyond:
-                wanted = f"expected angles of {joint.q_min:g} to {joint.q_max:g}"
-                got = f"got {r.low:.2f} to {r.high:.2f}: another unit, zero or joint?"
-                result.append(f"{name}: {wanted}, {got}")
-            result += wrong_numbers(log, name, r, machine)
-        if r.explained < LEAST_EXPLAINED:
-            what = f"its commands explain {r.explained:.0%} of its motion"
-            result.append(f"{name}: {what}: are they those of another joint?")
-        if r.delay > LATEST - 1 / log.rate:
-            wanted = f"expected below {LATEST:g} s, the longest that is searched"
-            result.append(f"{name}: delay: {wanted}, got {r.delay:.2f} s, perhaps more")
-        found = [text for text, bad in checks.items() if bad]
-        if found:
-            result.append(f"{name}: {', '.join(found)}: scores hold for such driving alone")
-    reactions = [r.reaction for r in reports.values() if r.reaction]
-    if len(reactions) > 1 and min(reactions) > REACTS:
-        parts = ", ".join(f"{reaction:.0%}" for reaction in reactions)
-        of_changes = f"commands follow the measured motion ({parts} of their small changes)"
-        result.append(f"{of_changes}: a controller drove; scores hold for such driving alone")
+            result += [f"{name}: {text}" for text in contradictions(r, joint)]
     return result
 
 
-def wrong_numbers(log: Log, name: str, report: JointReport, machine: Machine) -> list[str]:
-    """Fields of a machine that the log of a joint contradicts, in words."""
-    joint = machine.joints[machine.names.index(name)]
-    found = fields(log, {name: report}, machine)
-    if not found:
-        return []
-    result = []
-    if machine.dead_zone > found["dead_zone"] + WIDER:
-        wanted = f"expected at most {found['dead_zone']:.3f} by this log"
-        result.append(f"{name}: dead_zone: {wanted}, got {machine.dead_zone:g}: nets read no less")
-    for side in ("q_dot_up", "q_dot_down"):
-        now, fastest = getattr(joint, side), found[side].get(name)
-        if fastest and not 1 / FASTER < fastest / now < FASTER:
-            units = "time in s, angles in rad?"
-            result.append(f"{name}: {side}: {fastest:.3g} by this log, {now:g} now: {units}")
-    return result
+def contradictions(report: JointReport, joint: Joint) -> Iterator[str]:
+    """Fields of a joint that its log contradicts, in words."""
+    whole = joint.q_max - joint.q_min
+    beyond = max(joint.q_min - report.low, report.high - joint.q_max) / whole
+    part = (report.high - report.low) / whole
+    if beyond > BEYOND:
+        wanted, got = (
+            f"{joint.q_min:g} to {joint.q_max:g}",
+            f"{report.low:.2f} to {report.high:.2f}",
+        )
+        yield f"expected angles of {wanted}, got {got}: another unit, zero or joint?"
+    elif part < LEAST_RANGE:
+        yield f"expected {LEAST_RANGE:.0%} of its range or more, got {part:.0%}"
+    if report.explained < LEAST_EXPLAINED or report.sign < 0:
+        return
+    for i, (side, nominal) in enumerate((("up", joint.q_dot_up), ("down", joint.q_dot_down))):
+        zone, now = report.dead_zone[i], joint.dead_zone[i]
+        if report.gain[i] and now > zone + WIDER:
+            yield f"dead_zone {side}: expected about {zone:.3f} by this log, got {now:g}"
+        if report.gain[i] and not 1 / FASTER < report.fastest[i] / nominal < FASTER:
+            wanted = f"expected about {report.fastest[i]:.3g} by this log"
+            yield f"q_dot_{side}: {wanted}, got {nominal:g}: time in s, angles in rad?"
 
 
-def has_steps_alone(reports: dict[str, JointReport]) -> bool:
-    """Whether each joint with commands has held ones of few levels, as in step responses."""
-    commanded = [report for report in reports.values() if max(report.levels)]
-    steps = (r.held > STEPPED and r.held_levels < MANY_LEVELS for r in commanded)
-    return bool(commanded) and all(steps)
-
-
-def fastest(log: Log, name: str, report: JointReport, limit: float, side: str) -> float:
-    """Fastest motion [rad/s] of a joint "up" or "down" at the command `limit`.
-
-    It is a high quantile of the velocities after `HELD` at the limit, for single ones have noise;
-    where there are too few of them, what the model gives.
-    """
-    j, sign = log.joints.index(name), 1 if side == "up" else -1
-    held = round(HELD * log.rate) + 1
-    speeds = [np.empty(0)]
-    for recording in log.recordings:
-        if len(recording.u) >= held:
-            commands = sliding_window_view(sign * recording.u[:, j], held)
-            at_limit = (np.abs(commands / limit - 1) < NEAR_LIMIT).all(axis=-1)
-            speeds.append(sign * recording.q_dot[held - 1 :, j][at_limit])
-    found = np.concatenate(speeds)
-    if len(found) >= LEAST_HELD:
-        return float(np.quantile(found, FASTEST))
-    gain, zone = getattr(report, f"gain_{side}"), getattr(report, f"dead_zone_{side}")
-    return float(gain * max(limit - zone, 0))
-
-
-def fields(log: Log, reports: dict[str, JointReport], machine: Machine) -> dict[str, Any]:
-    """Fields of a machine by a log of it: dead zones, and fastest motions at the command limit.
-
-    The largest dead zone is 0.05 wider than found: one that is too small stops drives. Joints that
-    do not obey their commands in the log are left out, and directions in which they did not move;
-    an empty result: all of them.
-    """
-    obeys = [k for k, r in reports.items() if r.explained >= LEAST_EXPLAINED and r.sign >= 0]
-    known = {name: reports[name] for name in machine.names if name in obeys}
-    limit = machine.pwm_limit / PWM_MAX
-    result: dict[str, Any] = {}
-    for side in ("up", "down"):
-        moved = {k: r for k, r in known.items() if getattr(r, f"gain_{side}")}
-        result[f"dead_zone_{side}"] = {k: getattr(r, f"dead_zone_{side}") for k, r in moved.items()}
-        result[f"q_dot_{side}"] = {k: fastest(log, k, r, limit, side) for k, r in moved.items()}
-    zones = [*result["dead_zone_up"].values(), *result["dead_zone_down"].values()]
-    if not zones:
-        return {}
-    result["dead_zone"] = min(zones)
-    result["largest_dead_zone"] = min(max(zones) + 0.05, 0.99 * limit)
-    return result
-
-
-def with_dead_zones(machine: Machine, log: Log) -> Machine:
-    """The machine with the dead zones by joint and direction that a log of it shows."""
-    found = fields(log, inspect(log), machine)
-    if not found:
-        return machine
-    sides = ("dead_zone_up", "dead_zone_down")
-    joints = []
-    for joint in machine.joints:
-        zones = {side: found[side].get(joint.name, getattr(joint, side)) for side in sides}
-        joints.append(replace(joint, **zones))
-    common = {key: found[key] for key in ("dead_zone", "largest_dead_zone")}
-    return replace(machine, joints=tuple(joints), **common)
-
-
-def report_json(log: Log, machine: Machine | None = None) -> dict[str, Any]:
-    """All reports of a log, its warnings and its gaps, for JSON."""
-    reports = inspect(log)
-    gaps = sum("#" in recording.name for recording in log.recordings)
-    found = fields(log, reports, machine) if machine else {}
-    return {
-        "rate": log.rate,
-        "recordings": len(log.recordings),
-        "gaps": gaps,
-        "velocity_logged": log.velocity_logged,
-        "joints": {name: asdict(report) for name, report in reports.items()},
-        "warnings": warnings(log, reports, machine),
-        **({"fields": found} if found else {}),
-    }
+def table(reports: Mapping[str, JointReport]) -> list[str]:
+    """Lines of what a log tells, and fields of `Joint` by it, to copy into a machine."""
+    row = "{:12} {:>7} {:>4} {:>9} {:>9}  {:8} {}"
+    lines = [row.format("joint", "minutes", "sign", "explained", "delay [s]", "gain up", "down")]
+    for name, r in reports.items():
+        numbers = (f"{r.minutes:.1f}", f"{r.sign:+d}", f"{r.explained:.0%}", f"{r.delay:.2f}")
+        lines.append(row.format(name, *numbers, *(f"{gain:.3f}" for gain in r.gain)))
+    for name, r in reports.items():
+        limits = f"q_min={r.low:.3f}, q_max={r.high:.3f}"
+        speeds = "q_dot_up={:.3f}, q_dot_down={:.3f}".format(*r.fastest)
+        zones = "dead_zone=({:.3f}, {:.3f})".format(*r.dead_zone)
+        lines.append(f'Joint("{name}", {limits}, {speeds}, {zones}, ...)')
+    return lines

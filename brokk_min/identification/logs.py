@@ -3,11 +3,10 @@
 Columns `run,time,u_<joint>...,q_<joint>...[,q_dot_<joint>...]`, one row per sample; `.csv`, or
 `.npz` with the same columns as arrays. `run` is the name of the recording, time is in s, u in
 [-1, 1] of full command (held until the next row), q in rad (m of prismatic joints), q_dot in q/s.
-Any joints, any rate not below the machine's, jitter allowed. Recordings whose name ends in
-`_return` are dropped.
+Joints may have any names. The rate must not be below the machine's, and it may jitter. Recordings
+whose name ends in `_return` are dropped.
 """
 
-import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,19 +14,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min.identification import files
-from brokk_min.identification.files import Floats, brief
-from brokk_min.identification.formats import LOG, check_columns
-from brokk_min.kinematics import estimate_velocity
-from brokk_min.machine import Array, Machine
+from brokk_min._files import brief, load_arrays, located, read_csv, whole_file, write_csv
+from brokk_min.actuator import estimate_velocity
+from brokk_min.machine import Array, Machine, require
 
 RATE = 20.0  # Hz, paper: everything runs at 20 Hz; other machines have others
 MAX_GAP = 0.25  # s, or 2.5 samples, assumed: a longer gap starts a new recording
 COMMANDED = 0.02  # of full command, assumed: more than a stick at rest gives
 MOVED = 0.01  # rad or m, assumed: more than a parked joint creeps
 MEAN_OF = 10  # values in a tick, of logs that are faster
+LARGEST = 1e12  # of numbers in a log, assumed: any time, angle or velocity
 RETURN = "_return"
-Columns = Mapping[str, Any]
+Rows = NDArray[np.intp]
 
 
 class Recording(NamedTuple):
@@ -55,7 +53,7 @@ def machine_log(machine: Machine, recordings: Iterable[tuple[str, Array, Array]]
     return Log(machine.names, tuple(result), rate=rate)
 
 
-def velocity_of(q: Array, samples: int, rate: float = RATE) -> Floats:
+def velocity_of(q: Array, samples: int, rate: float = RATE) -> Array:
     """Causal velocity [rad/s] at each row of a recording `q` [rad] (T, n), at rest before it.
 
     `samples` is the window of `estimate_velocity`, `rate` [Hz] that of the rows.
@@ -66,7 +64,7 @@ def velocity_of(q: Array, samples: int, rate: float = RATE) -> Floats:
     """
     padded = np.concatenate([np.repeat(q[:1], samples - 1, axis=0), q])
     windows = np.lib.stride_tricks.sliding_window_view(padded, samples, axis=0)
-    return np.asarray(estimate_velocity(windows, samples, 1 / rate), float)
+    return estimate_velocity(windows, samples, 1 / rate)
 
 
 class Samples(NamedTuple):
@@ -77,7 +75,7 @@ class Samples(NamedTuple):
     moves: NDArray[np.bool_]  # (N, n): the joint is `driven` in this recording
     lengths: list[int]  # of the recordings
 
-    def starts(self, before: int, after: int, step: int) -> NDArray[np.intp]:
+    def starts(self, before: int, after: int, step: int) -> Rows:
         """Every `step`-th sample with `before` and `after` samples around it in its recording."""
         result = []
         seam = 0
@@ -86,7 +84,7 @@ class Samples(NamedTuple):
             seam += length
         return np.concatenate(result)
 
-    def windows(self, history: int, ticks: int) -> list[NDArray[np.intp]]:
+    def windows(self, history: int, ticks: int) -> list[Rows]:
         """Newest samples of windows of `history` samples, `ticks` before an end, of each joint."""
         ends = self.starts(history - 1, ticks, 1)
         return [ends[moves] for moves in self.moves[ends].T]
@@ -104,9 +102,7 @@ def join_recordings(log: Log) -> Samples:
     The target is the mean velocity of the coming tick, (q(t+dt) - q(t)) / dt; for logged velocities
     it is q_dot(t+dt). The last sample of a recording has none.
     """
-    u = np.concatenate([recording.u for recording in log.recordings])
-    q = np.concatenate([recording.q for recording in log.recordings])
-    q_dot = np.concatenate([recording.q_dot for recording in log.recordings])
+    u, q, q_dot = map(np.concatenate, list(zip(*log.recordings, strict=True))[1:])
     target = np.diff(q, axis=0, append=0) * log.rate
     if log.velocity_logged:
         target = np.roll(q_dot, -1, axis=0)
@@ -120,46 +116,47 @@ def split(log: Log) -> tuple[Log, Log]:
 
     ValueError: no two recordings drive the same joints.
     """
-    held_out = {i for group in same_joints(log) if len(group) > 1 for i in group[::10]}
-    if not held_out:
-        expected = (
-            "expected two or more (column run) that drive the same joints, or --test, to score"
-        )
-        raise ValueError(f"recordings: {expected}, got {len(log.recordings)}")
-    kept = set(range(len(log.recordings))) - held_out
-    return _some(log, kept), _some(log, held_out)
-
-
-def same_joints(log: Log) -> list[list[int]]:
-    """Indices of recordings that drive the same joints, group by group."""
     groups: dict[tuple[bool, ...], list[int]] = {}
     for i, recording in enumerate(log.recordings):
         groups.setdefault(tuple(driven(recording).tolist()), []).append(i)
-    return list(groups.values())
+    held_out = {i for group in groups.values() if len(group) > 1 for i in group[::10]}
+    wanted = "two or more (column run) that drive the same joints, or --test"
+    require(len(held_out) > 0, "recordings", wanted, len(log.recordings))
+    kept = (one for i, one in enumerate(log.recordings) if i not in held_out)
+    scored = (log.recordings[i] for i in sorted(held_out))
+    return log._replace(recordings=tuple(kept)), log._replace(recordings=tuple(scored))
 
 
 def in_order(log: Log, joints: Sequence[str]) -> Log:
-    """A log whose arrays have the joints in this order."""
+    """A log whose arrays have the joints in this order. ValueError: it has other joints."""
+    require(set(log.joints) == set(joints), "joints", brief(list(joints)), brief(list(log.joints)))
     order = [log.joints.index(name) for name in joints]
     recordings = (Recording(one.name, *(x[:, order] for x in one[1:])) for one in log.recordings)
     return log._replace(joints=tuple(joints), recordings=tuple(recordings))
 
 
-def part_of(log: Log, part: float) -> Log:
-    """The first recordings of each joint, a `part` of them and at least one."""
-    groups = same_joints(log)
-    return _some(log, (i for group in groups for i in group[: math.ceil(part * len(group))]))
+def join_logs(logs: Mapping[Path, Log]) -> Log:
+    """One log of several, by their files, with the joints in the order of the first one.
 
-
-def _some(log: Log, indices: Iterable[int]) -> Log:
-    return log._replace(recordings=tuple(log.recordings[i] for i in sorted(indices)))
+    ValueError: they have other joints, some have logged velocities and others not, or all are
+    empty.
+    """
+    first = next(iter(logs.values()))
+    recordings: list[Recording] = []
+    for path, log in logs.items():
+        with located(path):
+            same = log.velocity_logged == first.velocity_logged
+            require(same, "columns", "q_dot in all files or in none", "a mixture")
+            recordings += in_order(log, first.joints).recordings
+    require(len(recordings) > 0, ", ".join(map(str, logs)), "at least one recording", "none")
+    return first._replace(recordings=tuple(recordings))
 
 
 def write_log(path: Path, log: Log) -> None:
     """Write recordings as one table, `.csv` or `.npz` by the name; read it with `read_log`."""
     path = Path(path)
-    if not log.recordings:
-        raise ValueError(f"{path}: expected at least one recording to write, got none")
+    require(path.suffix in (".csv", ".npz"), str(path), "a name in .csv or .npz", path.suffix)
+    require(len(log.recordings) > 0, str(path), "at least one recording to write", "none")
     names = [recording.name for recording in log.recordings]
     lengths = [len(recording.u) for recording in log.recordings]
     time = np.concatenate([np.arange(length) / log.rate for length in lengths])
@@ -167,14 +164,12 @@ def write_log(path: Path, log: Log) -> None:
     for kind in ("u", "q", "q_dot") if log.velocity_logged else ("u", "q"):
         values = np.concatenate([getattr(recording, kind) for recording in log.recordings])
         columns |= {f"{kind}_{name}": values[:, i] for i, name in enumerate(log.joints)}
-    if path.suffix == ".npz":
-        with files.whole_file(path) as file:
-            np.savez_compressed(file, **columns)
-    elif path.suffix == ".csv":
+    if path.suffix == ".csv":
         numbers = [np.char.mod("%.7g", column) for column in list(columns.values())[1:]]
-        files.write_csv(path, columns, zip(columns["run"], *numbers, strict=True))
-    else:
-        raise ValueError(f"{path}: expected a name ending in .csv or .npz, got {path.suffix!r}")
+        write_csv(path, columns, zip(columns["run"], *numbers, strict=True))
+        return
+    with whole_file(path) as file:
+        np.savez_compressed(file, **columns)
 
 
 def read_log(
@@ -186,71 +181,40 @@ def read_log(
     """Read and check tables of one machine and resample them at `rate` [Hz].
 
     The command is held, the angle interpolated; of faster logs they are means. A gap longer than
-    `MAX_GAP` and 2.5 samples cuts a recording.
-    Without q_dot columns velocities are estimated: a recording starts at rest; after a gap, the
-    rows that would need samples of the gap are left out.
-
-    `velocity_samples` is the window of `estimate_velocity`; `joints` are the names and order of the
-    joints (None: all, in the order of the first file).
-    ValueError: with file, row (1 is the header) and column of the first error.
+    `MAX_GAP` and 2.5 samples cuts a recording. Without q_dot columns velocities are estimated: a
+    recording starts at rest, and after a gap the rows that would need samples of the gap are left
+    out. `velocity_samples` is the window of `estimate_velocity`; `joints` are the names and order
+    of the joints (None: all, in the order of the first file).
+    ValueError: the file, and the row (1 is the header) or the column of the first error.
     """
-    names = tuple(joints or ())
-    recordings: list[Recording] = []
-    logged: set[bool] = set()
+    logs = {}
     for path in map(Path, paths):
-        if path.suffix.lower() not in (".csv", ".npz"):
-            raise ValueError(f"{path}: expected a name ending in .csv or .npz, got {path.suffix!r}")
-        is_csv = path.suffix.lower() == ".csv"
-        table = files.read_csv(path, ["run"]) if is_csv else files.load_arrays(path)
-        got = names if joints else _joints(path, table)
-        names = names or got
-        if set(got) != set(names):
-            wanted = f"expected joints {brief(list(names))}"
-            raise ValueError(f"{path}: row 1: {wanted}, got {brief(list(got))}")
-        logged.add(any(f"q_dot_{joint}" in table for joint in names))
-        if len(logged) > 1:
-            raise ValueError(f"{path}: expected q_dot columns in all files or none, got a mixture")
-        recordings += _recordings(path, table, names, True in logged, velocity_samples, rate)
-    if not recordings:
-        raise ValueError(f"{', '.join(map(str, paths))}: expected at least one recording, got none")
-    return Log(names, tuple(recordings), True in logged, rate)
-
-
-def _joints(path: Path, table: Columns) -> tuple[str, ...]:
-    """Joints of a table by its u columns; ValueError: an angle or a velocity without a command."""
-    joints = tuple(name[2:] for name in table if name.startswith("u_"))
-    if not joints:
-        raise ValueError(f"{path}: row 1: expected columns u_<joint>, got {brief(list(table))}")
-    known = {kind + joint for kind in ("q_", "q_dot_") for joint in joints}
-    for name in table:
-        if name.startswith("q_") and name not in known:
-            missing = "u_" + name.removeprefix("q_").removeprefix("dot_")
-            expected = f"expected a column {missing} for {name}"
-            raise ValueError(f"{path}: row 1: {expected}, got {brief(list(table))}")
-    return joints
+        suffix = path.suffix.lower()
+        require(suffix in (".csv", ".npz"), str(path), "a name in .csv or .npz", path.suffix)
+        table = read_csv(path, "run", "time") if suffix == ".csv" else load_arrays(path)[1]
+        with located(path):
+            found = [name[2:] for name in table if name.startswith("u_")]
+            names = tuple(joints or found)
+            require(len(names) > 0, "columns", "u_<joint>", brief(list(table)))
+            logged = any(f"q_dot_{joint}" in table for joint in names)
+            recordings = tuple(_recordings(table, names, logged, velocity_samples, rate))
+            logs[path] = Log(names, recordings, logged, rate)
+    return join_logs(logs)
 
 
 def _recordings(
-    path: Path, table: Columns, joints: Sequence[str], logged: bool, samples: int, rate: float
+    table: Mapping[str, Any], joints: Sequence[str], logged: bool, samples: int, rate: float
 ) -> Iterator[Recording]:
     """The checked recordings of one table at `rate`, in the order in which they begin."""
-    kinds = ("u_", "q_", "q_dot_") if logged else ("u_", "q_")
-    fields = {name: LOG[name] for name in ("run", "time")}
-    fields |= {kind + joint: LOG[kind] for kind in kinds for joint in joints}
-    check_columns(path, table, fields)
-    time = np.asarray(table["time"], float)
-    names = table["run"]
-    for run, rows in _runs(
-        path, names if isinstance(names, list) else names.tolist(), time
-    ).items():
-        gaps = _gaps(path, run, rows, time[rows], rate)
+    limits = {"u": 1.0, "q": LARGEST} | ({"q_dot": LARGEST} if logged else {})
+    time = _numbers(table, ["time"], LARGEST)[:, 0]
+    values = {k: _numbers(table, [f"{k}_{one}" for one in joints], limits[k]) for k in limits}
+    for run, rows in _runs(table["run"]):
+        _check_run(run, time[rows], values["q"][rows], rate)
+        gaps = np.flatnonzero(np.diff(time[rows]) > max(MAX_GAP, 2.5 / rate)) + 1
         pieces = [] if run.endswith(RETURN) else np.split(rows, gaps)
         for part, piece in enumerate(pieces):
-            columns = {}
-            for kind in kinds:
-                numbers = [np.asarray(table[kind + joint])[piece] for joint in joints]
-                columns[kind] = np.stack(numbers, axis=1, dtype=float)
-            _check_turns(path, joints, piece, columns["q_"])
+            columns = {kind: x[piece] for kind, x in values.items()}
             u, q, q_dot = _resample(time[piece], columns, samples, rate)
             first = samples - 1 if part and not logged else 0  # rows before it need the gap
             if len(u) > first:
@@ -258,47 +222,48 @@ def _recordings(
                 yield Recording(name, u[first:], q[first:], q_dot[first:])
 
 
-def _runs(path: Path, names: Sequence[str], time: Floats) -> dict[str, NDArray[np.intp]]:
-    """Rows of each recording; ValueError: time stamps that do not rise in one of them."""
-    numbers: dict[str, int] = {}
-    number = np.array([numbers.setdefault(name, len(numbers)) for name in names], np.intp)
-    order = np.argsort(number, kind="stable")
-    rows = np.split(order, np.flatnonzero(np.diff(number[order])) + 1)
-    for one in rows:
-        falls = np.flatnonzero(~(np.diff(time[one]) > 0))
-        if len(falls):
-            at, later = one[falls[0]], one[falls[0] + 1]
-            expected = f"expected later than {time[at]} within run {brief(names[at])}"
-            place = f"{path}: row {later + 2}, column time"
-            raise ValueError(f"{place}: {expected}, got {time[later]}")
-    return dict(zip(numbers, rows, strict=True))
+def _numbers(table: Mapping[str, Any], names: Sequence[str], limit: float) -> Array:
+    """Columns (rows, names); ValueError: one that is not there, or a value that cannot be."""
+    missing = [name for name in ("run", *names) if name not in table]
+    require(not missing, "columns", brief(missing), brief(list(table)))
+    for name in names:
+        column = np.asarray(table[name])
+        fits = column.dtype.kind in "fiu" and column.shape == np.shape(table["run"])
+        require(fits, f"column {name}", "a number in each row", f"{column.dtype} {column.shape}")
+    values = np.stack([table[name] for name in names], axis=1, dtype=float)
+    wrong = np.argwhere(~(np.abs(values) <= limit))  # also where it is nan
+    if len(wrong):
+        (row, column), wanted = wrong[0], f"-{limit:g} to {limit:g}"
+        got = values[row, column]
+        raise ValueError(f"row {row + 2}, column {names[column]}: expected {wanted}, got {got}")
+    return values
 
 
-def _gaps(
-    path: Path, run: str, rows: NDArray[np.intp], time: Floats, rate: float
-) -> NDArray[np.intp]:
-    """Where to cut a recording; ValueError: time stamps that rise too slowly."""
-    step = np.diff(time)
-    if len(step) and np.median(step) > 1.05 / rate:
-        wanted = f"expected s, at {rate:g} Hz, the machine's rate (--machine), or more"
-        expected = f"{wanted}, in {brief(run)}"
-        got = f"got {1 / np.median(step):.3g} Hz"
-        raise ValueError(f"{path}: row {rows[0] + 2}, column time: {expected}, {got}")
-    return np.flatnonzero(step > max(MAX_GAP, 2.5 / rate)) + 1
+def _runs(names: Any) -> Iterator[tuple[str, Rows]]:
+    """Name and rows of each recording, in the order in which they begin."""
+    found, first, number = np.unique(names, return_index=True, return_inverse=True)
+    rows = np.split(np.argsort(number, kind="stable"), np.cumsum(np.bincount(number))[:-1])
+    for i in np.argsort(first):
+        yield str(found[i]), rows[i]
 
 
-def _check_turns(path: Path, joints: Sequence[str], rows: NDArray[np.intp], q: Floats) -> None:
-    """ValueError: an angle that starts again after a turn, as from pi to -pi."""
-    jumps = np.argwhere(np.abs(np.diff(q, axis=0)) > 1.5 * np.pi)
-    for at, joint in jumps[:1]:
-        place = f"{path}: row {rows[at + 1] + 2}, column q_{joints[joint]}"
-        expected = "expected an angle that does not start again after a turn (numpy.unwrap)"
-        raise ValueError(f"{place}: {expected}, got {q[at + 1, joint]:g} after {q[at, joint]:g}")
+def _check_run(run: str, time: Array, q: Array, rate: float) -> None:
+    """ValueError: time that does not rise or has too few samples, or an angle that jumps a turn."""
+    if len(time) < 2:
+        return
+    step, jump = np.diff(time), np.abs(np.diff(q, axis=0)).max()
+    got = f"a step of {step.min():.6g} at {time[step.argmin()]:.6g}"
+    require(step.min() > 0, f"run {run}, column time", "stamps that rise", got)
+    wanted = f"s, at {rate:g} Hz, the machine's rate (--machine), or more"
+    median = float(np.median(step))
+    require(median <= 1.05 / rate, f"run {run}, column time", wanted, f"{1 / median:.3g} Hz")
+    wanted = "angles that do not start again after a turn (numpy.unwrap)"
+    require(jump < 1.5 * np.pi, f"run {run}", wanted, f"a jump of {jump:.2f} rad")
 
 
 def _resample(
-    time: Floats, columns: dict[str, Floats], samples: int, rate: float
-) -> tuple[Floats, Floats, Floats]:
+    time: Array, columns: dict[str, Array], samples: int, rate: float
+) -> tuple[Array, Array, Array]:
     """u held, q and q_dot interpolated at `rate`; q_dot estimated where the log has none.
 
     Of two samples per tick or more means are taken: of u over the tick, of q and q_dot over half a
@@ -310,13 +275,11 @@ def _resample(
     held = np.searchsorted(time, grid + parts / len(parts) / rate + 1e-6, side="right") - 1
     half = np.minimum(0.5 / rate, np.minimum(grid - time[0], time[-1] - grid)) * fast
     around = grid + half * ((2 * parts + 1) / len(parts) - 1)
-    q = _interpolate(around, time, columns["q_"]).mean(axis=0)
-    if "q_dot_" in columns:
-        q_dot = _interpolate(around, time, columns["q_dot_"]).mean(axis=0)
-    else:
-        q_dot = velocity_of(q, samples, rate)
-    return columns["u_"][held].mean(axis=0), q, q_dot
 
+    def mean(values: Array) -> Array:
+        columns = [np.interp(around, time, column).mean(axis=0) for column in values.T]
+        return np.stack(columns, axis=-1)
 
-def _interpolate(at: Floats, time: Floats, values: Floats) -> Floats:
-    return np.stack([np.interp(at, time, column) for column in values.T], axis=-1)
+    q = mean(columns["q"])
+    q_dot = mean(columns["q_dot"]) if "q_dot" in columns else velocity_of(q, samples, rate)
+    return columns["u"][held].mean(axis=0), q, q_dot

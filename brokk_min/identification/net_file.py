@@ -2,64 +2,57 @@
 
 import hashlib
 import json
-from collections.abc import Sequence
-from dataclasses import fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from brokk_min._files import expected, load_arrays, located, save_arrays
 from brokk_min.actuator import ActuatorNet
-from brokk_min.identification.files import expected, load_arrays, load_header, located, whole_file
-from brokk_min.identification.formats import NET_ARRAYS, NET_HEADER, check_fields
-from brokk_min.machine import Machine
+from brokk_min.beyond.valve_nets import ValveNet
+from brokk_min.machine import Array, Machine
 
-FORMATS = {6: 1, 9: 3}  # by the number of weights: 9 with `ActuatorNet.latents`
-LARGEST_NET = 2**26  # bytes of a file
-STATISTICS = [name for name in NET_ARRAYS if not name.startswith("weight_")]
+KIND = "actuator net 4"
+HEADER = ("joints", "history", "rate", "velocity_samples", "velocity_logged", "machine", "training")
+ARRAYS = ("input_mean", "input_scale", "output_low", "output_high", "q_low", "q_high")
+CLASSES = {"paper": ActuatorNet, "valve": ValveNet}  # the names of what nets read, in files
 
 
-def net_arrays(net: ActuatorNet) -> dict[str, Any]:
-    """Nets as named arrays, as in the file; one of them is the JSON header."""
-    header: dict[str, Any] = {"format": FORMATS[len(net.weights)], "kind": "actuator net"}
-    for field in fields(net):
-        if field.name not in (*STATISTICS, "weights"):
-            header[field.name] = getattr(net, field.name)
-    arrays = {"header": np.array(json.dumps(header))}
-    arrays |= {name: getattr(net, name) for name in STATISTICS}
-    return arrays | {f"weight_{i}": weight for i, weight in enumerate(net.weights)}
+def net_arrays(net: ActuatorNet) -> tuple[dict[str, Any], dict[str, Array]]:
+    """Header and arrays of nets, as in their file."""
+    header = {name: getattr(net, name) for name in HEADER}
+    header["training"] = dict(net.training)
+    header["reads"] = "valve" if isinstance(net, ValveNet) else "paper"
+    arrays = {name: getattr(net, name) for name in ARRAYS}
+    arrays |= {f"weight_{i}": weight for i, weight in enumerate(net.weights)}
+    if isinstance(net, ValveNet):
+        arrays["dead_zones"] = net.dead_zones
+    return header, arrays
+
+
+def net_from_arrays(path: Path, header: Mapping[str, Any], arrays: Mapping[str, Any]) -> Any:
+    """Nets from `net_arrays`; ValueError, with `path`, for what is no net."""
+    with expected(path, "a complete actuator net"):
+        fields = {name: header[name] for name in HEADER}
+        fields |= {name: arrays[name] for name in ARRAYS}
+        fields["joints"] = tuple(header["joints"])
+        fields["weights"] = tuple(arrays[f"weight_{i}"] for i in range(6))
+        if header["reads"] == "valve":
+            fields["dead_zones"] = arrays["dead_zones"]
+        net = CLASSES[header["reads"]](**fields)
+        net.predict(np.zeros((1, len(net.joints), 3, net.history), np.float32))  # do shapes fit?
+        return net
 
 
 def fingerprint(net: ActuatorNet) -> str:
-    """Hash of header and arrays of the nets; files of policies and gains hold it."""
-    digest = hashlib.sha256()
-    for name, array in net_arrays(net).items():
+    """Hash of header and arrays of the nets; files of gains hold it."""
+    header, arrays = net_arrays(net)
+    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
+    for name, array in arrays.items():
         digest.update(name.encode() + np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()[:16]
-
-
-def net_from_arrays(path: Path, arrays: dict[str, NDArray[Any]], prefix: str = "") -> ActuatorNet:
-    """Nets from `net_arrays`; ValueError, with `path` and field, for what is no net.
-
-    `prefix` is that of the names of the arrays in the file.
-    """
-    number = 9 if "weight_6" in arrays else 6
-    header = load_header(path, arrays, "actuator net", FORMATS[number])
-    sizes: dict[str, int] = {}
-    check_fields(path, header, NET_HEADER, sizes, prefix)
-    found, H = arrays.get("input_mean", np.empty(0)), header["history"]
-    inputs = 4 * H if found.shape[-1:] == (4 * H,) else 3 * H
-    sizes |= {"inputs": inputs, "2 inputs": 2 * inputs}
-    check_fields(path, arrays, NET_ARRAYS, sizes, prefix)
-    for name in ("output", "q"):
-        if not (arrays[f"{name}_low"] < arrays[f"{name}_high"]).all():
-            low, high = (arrays[f"{name}_{end}"].tolist() for end in ("low", "high"))
-            raise ValueError(f"{path}: {prefix}{name}_high: expected above {low}, got {high}")
-    with expected(path, "a complete actuator net"):
-        header["joints"] = tuple(header["joints"])
-        header |= {name: arrays[name] for name in STATISTICS}
-        return ActuatorNet(**header, weights=tuple(arrays[f"weight_{i}"] for i in range(number)))
 
 
 def select_nets(machine: Machine, net: ActuatorNet) -> ActuatorNet:
@@ -78,27 +71,20 @@ def select_nets(machine: Machine, net: ActuatorNet) -> ActuatorNet:
 
 
 def joint_nets(net: ActuatorNet, joints: Sequence[str]) -> ActuatorNet:
-    """The nets of some joints, in the order given; ValueError: a joint without a net.
-
-    For shared latents the other joints count as at rest in the middle of their log.
-    """
+    """The nets of some joints, in the order given; ValueError: a joint without a net."""
     if not set(joints) <= set(net.joints):
         raise ValueError(f"joints: expected nets for {list(joints)}, got {list(net.joints)}")
     index = [net.joints.index(name) for name in joints]
-    arrays = {name: getattr(net, name)[index] for name in STATISTICS}
+    names = (*ARRAYS, "dead_zones") if isinstance(net, ValveNet) else ARRAYS
+    arrays = {name: getattr(net, name)[index] for name in names}
     weights = tuple(weight[index] for weight in net.weights)
-    if len(weights) > 6:
-        rest = -net.input_mean / net.input_scale  # standardised zeros
-        rest[:, : net.history] = 0.0  # the mean angle
-        z = np.einsum("ni,nil->nl", np.hstack([rest, np.abs(rest)]), net.weights[6])
-        weights[8][0] += np.delete(z + net.weights[8], index, axis=0).sum(axis=0)
     return replace(net, joints=tuple(joints), weights=weights, **arrays)
 
 
 def save_net(path: Path, net: ActuatorNet) -> None:
     """Write nets as one `.npz`: weights plus a JSON header."""
-    with whole_file(path) as file:
-        np.savez(file, **net_arrays(net))
+    header, arrays = net_arrays(net)
+    save_arrays(path, KIND, header, **arrays)
 
 
 def load_net(path: Path, machine: Machine | None = None) -> ActuatorNet:
@@ -107,5 +93,5 @@ def load_net(path: Path, machine: Machine | None = None) -> ActuatorNet:
     ValueError as in `net_from_arrays`, or nets that are not for the machine.
     """
     with located(path):
-        net = net_from_arrays(path, load_arrays(path, largest=LARGEST_NET))
+        net: ActuatorNet = net_from_arrays(path, *load_arrays(path, KIND))
         return select_nets(machine, net) if machine else net

@@ -6,50 +6,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min.env import (
-    State,
-    TaskConfig,
-    features,
-    initial_state,
-    measure,
-    sensor_std,
-    terminated,
-)
-from brokk_min.kinematics import forward_kinematics, lowest_point
+from brokk_min.actuator import PLANT, Plant
+from brokk_min.env import State, initial_state, sensor_std
 from brokk_min.machine import Array, Machine
+from brokk_min.settings import TaskConfig
 
-# Settings of `train --paper` that differ from `TaskConfig`, assumed: goals that hold longer leave
-# less noise in a critic's advantages.
-PAPER_TASK: dict[str, Any] = {"hold_min_s": 2.0, "hold_max_s": 6.0}
-# Settings for gradients of the simulation that differ from `ppo.PPOConfig`; D10 has the search.
-GRADIENT_LEARNER: dict[str, Any] = {
-    "total_steps": 2_000_000,
-    "minibatch_size": 512,
-    "learning_rate": 4e-3,
-    "target_kl": 1e9,  # keep the learning rate
-    "gamma": 0.95,
-    "log_std": -2.5,
-    "log_std_end": -4.5,
-}
 AXES = np.vstack([np.eye(3), -np.eye(3)])
-GROUND_MARGIN = 0.3  # m above the ground below which no goal points down, assumed
 
 
-def draw_pose(machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int) -> Array:
-    """Random angles within the joints' ranges [rad] (num, n), above the ground if so configured.
-
-    ValueError: a machine whose arm is in the ground in every pose drawn.
-    """
-    low, high = machine.column("q_min"), machine.column("q_max")
-    q = rng.uniform(low, high, (num, machine.n))
-    if config.paper or not config.redraw_ground:
-        return q
-    for _ in range(1000):
-        below = terminated(machine, lowest_point(forward_kinematics(machine, q)))
-        if not below.any():
-            return q
-        q[below] = rng.uniform(low, high, (int(below.sum()), machine.n))
-    raise ValueError(f"{machine.name}: expected a pose above the ground, got none in 1000 draws")
+def draw_pose(machine: Machine, rng: np.random.Generator, num: int) -> Array:
+    """Random angles within the joints' ranges [rad] (num, n); some have a link in the ground."""
+    return rng.uniform(machine.column("q_min"), machine.column("q_max"), (num, machine.n))
 
 
 def draw_goal(machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int) -> Array:
@@ -72,10 +39,10 @@ def draw_hold(
 
 
 def reset(
-    machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int, plant: bool
+    machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int, plant: Plant = PLANT
 ) -> State:
     """`num` machines at rest in random poses with random goals; leading shape (num,)."""
-    pose = draw_pose(machine, config, rng, num)
+    pose = draw_pose(machine, rng, num)
     goal = draw_goal(machine, config, rng, num)
     state = initial_state(machine, pose, goal, plant)
     return replace(state, goal_ticks=draw_hold(machine, config, rng, num))
@@ -84,48 +51,36 @@ def reset(
 def new_goals(
     machine: Machine, config: TaskConfig, state: State, rng: np.random.Generator
 ) -> State:
-    """New goals where the time of a goal is over, or (ours) it points down close to the ground."""
-    low = (state.lowest < machine.ground + GROUND_MARGIN) & (not config.paper)
-    rows = np.flatnonzero((state.goal_ticks <= 0) | (low & (state.v_goal[..., 2] < 0)))
+    """New goals where the time of a goal is over."""
+    rows = np.flatnonzero(state.goal_ticks <= 0)
     if not len(rows):
         return state
-    v_goal = state.v_goal.copy()
-    goal_ticks = state.goal_ticks.copy()
+    v_goal, goal_ticks = state.v_goal.copy(), state.goal_ticks.copy()
     v_goal[rows] = draw_goal(machine, config, rng, len(rows))
-    v_goal[rows, 2] = np.where(low[rows], np.abs(v_goal[rows, 2]), v_goal[rows, 2])
     goal_ticks[rows] = draw_hold(machine, config, rng, len(rows))
     return replace(state, v_goal=v_goal, goal_ticks=goal_ticks)
 
 
 def draw_noise(machine: Machine, largest: float, num: int, rng: np.random.Generator) -> Array:
-    """Uniform noise of `env.measure`, in deviations, float32 (num, noisy)."""
-    steps = rng.integers(-(2**15), 2**15, (num, len(sensor_std(machine))), np.int16)
-    return steps * np.float32(largest / 2**15)
+    """Uniform noise of `env.measure`, up to +- `largest` deviations, float32 (num, noisy)."""
+    noise = 2 * rng.random((num, len(sensor_std(machine))), np.float32) - 1
+    return np.float32(largest) * noise
 
 
-def get_obs(machine: Machine, config: TaskConfig, state: State, rng: np.random.Generator) -> Array:
-    """The observation of a state, (..., obs), with fresh noise. Paper: Sec. 3.4 (5 %)"""
-    noise = draw_noise(machine, config.noise, len(state.q), rng)
-    measured = measure(machine, state.history, state.v_goal, state.error_integral, noise)
-    return features(machine, measured, config.paper)
+def replace_rows(values: Any, rows: NDArray[np.intp], fresh: Any) -> Any:
+    """`values` with its rows `rows` replaced by `fresh`, one each.
 
-
-def replace_rows(state: State, rows: NDArray[np.intp], fresh: State) -> State:
-    """`state` with its rows `rows` replaced by the states `fresh`, one each.
-
-    ValueError: a plant of another kind than tuples of arrays.
+    Values are arrays, or a `State`, a memory or a plant's state: tuples of arrays.
     """
-
-    def put(old: Any, new: Any) -> Any:
-        if old is None:
-            return None
-        if isinstance(old, tuple):  # the state of a plant
-            return type(old)(*map(put, old, new))
-        if not isinstance(old, np.ndarray):
-            expected = "expected states that are tuples of arrays"
-            raise ValueError(f"plant: {expected}, got {type(old).__name__}")
-        result = old.copy()
-        result[rows] = new
-        return result
-
-    return State(*(put(getattr(state, f.name), getattr(fresh, f.name)) for f in fields(State)))
+    if values is None:
+        return None
+    if isinstance(values, State):
+        names = [field.name for field in fields(State)]
+        old, new = (tuple(getattr(one, name) for name in names) for one in (values, fresh))
+        return State(*(replace_rows(a, rows, b) for a, b in zip(old, new, strict=True)))
+    if isinstance(values, tuple):
+        pairs = zip(values, fresh, strict=True)
+        return type(values)(*(replace_rows(a, rows, b) for a, b in pairs))
+    result = np.array(values)
+    result[rows] = fresh
+    return result

@@ -1,1 +1,1 @@
-"""To see the machine and to drive it: drawings, window, play, replay, tracing."""
+"""To see the machine and to drive it: pictures, a window to play in, films of runs."""

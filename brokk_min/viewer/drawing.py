@@ -1,311 +1,300 @@
-"""Pictures of arms from the side and from above, with velocities, angles, valves and warnings.
+"""Pictures of a machine: two views, angles and valves of its joints, goal and measured velocity.
 
-`draw` uses nothing but kinematics; any `Machine` can be drawn. Lengths are in pixels, y down.
+Nothing but kinematics is used, so any `Machine` can be drawn. Joints and links are where the
+machine has them; tracks, outriggers, turret and the widths of links are generic. Lengths in
+pictures are pixels, and y points down.
 """
 
-from __future__ import annotations
-
+import os
 from collections.abc import Sequence
-from textwrap import wrap
-from typing import NamedTuple
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib import get_data_path
+from numpy.typing import ArrayLike, NDArray
 
-from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocity
+from brokk_min._files import require_package
+from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import PWM_MAX, Array, Machine
-from brokk_min.viewer import shapes
-from brokk_min.viewer.camera import Camera, cameras, close_up, skeleton
-from brokk_min.viewer.window import BACKGROUND, INK, Box, Canvas, Colour
 
-# all assumed
-ARROW = 0.2  # of a view's smaller side: an arrow of the machine's tool speed
-HEAD = 48.0  # px above the views
-FOOT = 44.0  # px below a close-up
-
+Colour = tuple[int, int, int]
+BACKGROUND, INK, MUTED = (250, 250, 247), (33, 37, 43), (120, 128, 138)
+GRID, SLOT, SOIL, STEEL = (228, 230, 232), (212, 216, 221), (214, 203, 186), (74, 80, 88)
+WARNING, MEASURED, PATH = (208, 28, 28), (0, 158, 115), (230, 159, 0)
+BLUE, ORANGE = (0, 114, 178), (213, 94, 0)  # of the machine under the policy, under the PID
+HEAD, ROW = 36.0, 20.0  # heights of the title and of a joint's row
+NEAR_LIMIT = 0.05  # of its range: a joint nearer to an end is red
 NO_POINTS = np.zeros((0, 3))
-MUTED = (120, 128, 138)
-GRID = (228, 230, 232)
-TRACK = (212, 216, 221)
-SOIL = (214, 203, 186)
-STEEL = (74, 80, 88)
-WARNING = (208, 28, 28)
-DRIVING = (0, 130, 90)
-READY = (0, 100, 170)
-GOAL = INK
-MEASURED = (0, 158, 115)
-PATH = (230, 159, 0)
-COLOURS = {"rl": (0, 114, 178), "jacobian": (213, 94, 0), "levers": (124, 87, 148)}
-
-
-class Trace(NamedTuple):
-    """The run of another controller, laid over a scene."""
-
-    q: Array  # angles [rad] (n,)
-    trail: Array  # past tool positions [m] (T, 3)
-    colour: Colour
-    text: str
+ABOVE = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])  # right and up of the top view
+# Outlines of links: how far along the link, and half the width there.
+BOOM = np.array([[0, 1.0], [0.3, 1.2], [1, 0.7]])
+BREAKER = np.array([[0, 0.6], [0.1, 1.3], [0.6, 1.3], [0.66, 0.5]])  # of the last link
+CHISEL = np.array([[0.6, 0.45], [0.93, 0.35], [1, 0.05]])  # its point is the tool
+CIRCLE = np.exp(2j * np.pi * np.arange(24)[:, None] / 24).view(float)  # corners (x, y)
+# The undercarriage, in reaches of the arm: (x, y, z) of the outlines of a track and of a leg.
+TRACK = np.insert(0.035 * CIRCLE, 1, 0.0, axis=1) + 0.035 * np.eye(3)[2]
+TRACK[:, 0] += 0.115 * np.sign(CIRCLE[:, 0])
+LEG = np.array([[0.08, 0.05, 0.06], [0.17, 0.16, 0], [0.2, 0.16, 0], [0.08, 0.05, 0.09]])
 
 
 class Scene(NamedTuple):
-    """What a picture shows of one arm, base frame."""
+    """What a picture shows; vectors are in the base frame."""
 
-    q: Array  # angles [rad] (n,); nan: unknown
-    q_dot: Array  # joint velocities [rad/s] (n,)
-    u: Array  # commands in [-1, 1] (n,)
-    v_goal: Array  # goal velocity of the tool [m/s] (3,)
-    trail: Array = NO_POINTS  # past tool positions [m] (T, 3)
-    path: Array = NO_POINTS  # line that the tool should follow [m] (K, 3)
-    target: Array = NO_POINTS  # its next point [m], (1, 3) or none
+    q: Array  # angles [rad], (n,)
+    u: Array  # commands [-1, 1], (n,)
+    v_goal: Array  # goal velocity of the tool [m/s], (3,)
+    v_tool: Array  # measured velocity of the tool [m/s], (3,)
+    trail: Array = NO_POINTS  # past tool positions [m], (T, 3)
+    path: Array = NO_POINTS  # line that the tool should follow [m], (K, 3)
     title: str = ""
     status: str = ""
-    status_colour: Colour = MUTED
-    colour: Colour = COLOURS["rl"]
+    colour: Colour = BLUE
     notes: Sequence[str] = ()
-    in_view: Array = NO_POINTS  # points that the views show [m] (K, 3); none: the whole reach
-    banner: str = ""  # what keeps the machine from moving, in words
-    traces: Sequence[Trace] = ()  # other runs over this one
-    close_up: Array = NO_POINTS  # these points [m] (K, 3) fill a view, instead of top view and rows
-    headline: str = ""  # the one figure that decides
 
 
-def draw(canvas: Canvas, machine: Machine, scenes: Sequence[Scene]) -> None:
-    """Draw one or more arms side by side."""
-    width = canvas.size[0] / len(scenes)
-    height = float(canvas.size[1])
-    for i, scene in enumerate(scenes):
-        _panel(canvas, machine, scene, (i * width, 0.0, width, height))
-        if i:
-            canvas.line(np.array([[i * width, 12], [i * width, height - 12]]), TRACK, 2)
+def picture(
+    machine: Machine,
+    q: Array,
+    u: Array,
+    v_goal: Array,
+    v_tool: Array,
+    size: tuple[int, int] = (640, 360),
+) -> NDArray[np.uint8]:
+    """A machine as an image (height, width, 3); the arguments are those of `Scene`."""
+    return image(draw(machine, Scene(q, u, v_goal, v_tool, title=machine.name), size))
 
 
-# --- layout ---------------------------------------------------------------------------------------
+def image(surface: Any) -> NDArray[np.uint8]:
+    """A pygame surface as an image (height, width, 3)."""
+    pixels: NDArray[np.uint8] = load_pygame().surfarray.array3d(surface)
+    return np.ascontiguousarray(pixels.swapaxes(0, 1))
 
 
-def _layout(box: Box, joints: int, notes: int) -> tuple[Box, Box, Box, tuple[float, float]]:
-    """Boxes of side view, top view and joint rows, and the corner of the notes [px].
-
-    Wide: both views above the rows. Tall: the side view above, top view and rows below.
-    """
-    left, _, width, height = box
-    foot = 26.0 + 22 * joints
-    if width > 1.3 * height:
-        foot = max(foot, 6.0 + 18 * notes)
-        upper = height - foot
-        side = (left, HEAD, 0.6 * width, upper - HEAD)
-        top = (left + 0.6 * width, HEAD, 0.4 * width, upper - HEAD)
-        rows = (left + 16, upper + 6, 0.52 * width, foot)
-        return side, top, rows, (left + 0.52 * width + 36, upper + 14)
-    foot = max(foot, 0.4 * height)
-    upper = height - foot
-    side = (left, HEAD, width, upper - HEAD)
-    top = (left, upper, 0.38 * width, foot)
-    rows = (left + 0.38 * width + 8, upper + 6, 0.62 * width - 16, foot)
-    return side, top, rows, (left + 16, HEAD + 34)
+def draw(machine: Machine, scene: Scene, size: tuple[int, int]) -> Any:
+    """The scene as a pygame surface of this width and height, without a display."""
+    canvas = Canvas(size)
+    for view in views(machine, scene.q, size):
+        canvas.large.set_clip([round(2 * edge) for edge in view.box])
+        _backdrop(canvas, machine, view)
+        _base(canvas, machine, view, scene)
+        _arm(canvas, machine, view, scene)
+        _tool(canvas, machine, view, scene)
+    canvas.large.set_clip(None)
+    _captions(canvas, machine, scene)
+    for i in range(machine.n):
+        _joint_row(canvas, machine, scene, i)
+    return canvas.pygame.transform.smoothscale(canvas.large, size)
 
 
-# --- a panel for each arm -------------------------------------------------------------------------
+def load_pygame() -> Any:
+    """The module pygame; ValueError: it is not installed."""
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    return require_package("pygame", "play")
 
 
-def _panel(canvas: Canvas, machine: Machine, scene: Scene, box: Box) -> None:
-    """One arm: title and status, both views, a row for each joint, notes."""
-    left, upper, width, height = box
-    room = 0.48 * width - 44 if width > 1.3 * height else width - 32
-    notes = [line for note in scene.notes for line in wrap(note, int(room / 7))]
-    side, top, rows, (x_notes, y_notes) = _layout(box, machine.n, len(notes))
-    if len(scene.close_up):
-        half = (height - HEAD) / 2
-        side = (left, HEAD, width, half)
-        top = (left, HEAD + half, width, half - FOOT)
-        x_notes, y_notes = left + 16, HEAD + 34
-    room = width - 60 - 9 * len(scene.status)  # px that the status leaves for the title
-    title_size = int(np.clip(room / (0.7 * max(1, len(scene.title))), 8, 18))
-    canvas.circle(np.array([left + 22.0, 21.0]), 7, scene.colour)
-    canvas.text(left + 36, 21, scene.title, title_size)
-    canvas.text(left + width - 16, 21, scene.status, 14, scene.status_colour, 1.0)
-    if np.isfinite(scene.q).all():
-        _views(canvas, machine, scene, side, top)
-    if scene.banner:
-        size = int(np.clip(width / (0.62 * len(scene.banner)), 8, 14))
-        canvas.text(left + width / 2, HEAD - 6, scene.banner, size, WARNING, 0.5)
-    if len(scene.close_up):
-        canvas.text(left + width / 2, upper + height - FOOT / 2, scene.headline, 17, INK, 0.5)
-    else:
-        x, y = side[0] + side[2] / 2, side[1] + side[3] - 34
-        canvas.text(x, y, scene.headline, 15, INK, 0.5)
-        _joint_rows(canvas, machine, scene, rows)
-    for i, note in enumerate(notes):
-        canvas.text(x_notes, y_notes + 18 * i, note, 12)
+class Canvas:
+    """A surface of twice the size, which is scaled down in the end so that edges are smooth."""
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        self.size = size
+        self.pygame = load_pygame()
+        self.large = self.pygame.Surface((2 * size[0], 2 * size[1]), depth=32)
+        self.large.fill(BACKGROUND)
+
+    def polygon(self, points: Array, colour: Colour) -> None:
+        """A filled polygon with corners (K, 2)."""
+        self.pygame.draw.polygon(self.large, colour, (2 * points).tolist())
+
+    def line(self, points: Array, colour: Colour, width: float) -> None:
+        """A line through points (K, 2)."""
+        self.pygame.draw.lines(self.large, colour, False, (2 * points).tolist(), round(2 * width))
+
+    def bar(self, left: float, top: float, width: float, height: float, colour: Colour) -> None:
+        """A filled rectangle."""
+        edges = np.rint([2 * left, 2 * top, 2 * (left + width), 2 * (top + height)])
+        self.large.fill(colour, (*edges[:2], *(edges[2:] - edges[:2])))
+
+    def text(
+        self, x: float, y: float, text: str, size: int, colour: Colour = INK, anchor: float = 0.0
+    ) -> None:
+        """Text at half its height; `anchor` 0 puts its left end at x, 1 its right end."""
+        word = _font(2 * size).render(text, True, colour)
+        self.large.blit(word, (2 * x - anchor * word.get_width(), 2 * y - word.get_height() / 2))
 
 
-def _views(canvas: Canvas, machine: Machine, scene: Scene, side: Box, top: Box) -> None:
-    """The arm from both sides; goal and measured speed, warnings."""
-    frames = forward_kinematics(machine, scene.q)
-    p_tool = tool_position(frames)
-    touching = shapes.contacts(machine, scene.q)
-    views = cameras(machine, p_tool, side, top, scene.in_view)
-    if len(scene.close_up):
-        views = [views[0], close_up(scene.close_up, top)]
-    for camera in views:
-        canvas.clip(camera.box)
-        _backdrop(canvas, machine, camera)
-        _base(canvas, machine, camera, scene)
-        for trace in scene.traces[1:]:
-            other = scene._replace(q=trace.q, colour=_pale(trace.colour, 0.4))
-            _arm(canvas, machine, camera, other, set())
-        _arm(canvas, machine, camera, scene, set().union(*touching.values()))
-        _tool(canvas, machine, camera, scene)
-    canvas.clip(None)
-    legend = [
-        (f"goal {np.linalg.norm(scene.v_goal):.2f} m/s", GOAL),
-        (f"measured {np.linalg.norm(tool_velocity(frames, scene.q_dot)):.2f} m/s", MEASURED),
-    ]
-    warned = np.flatnonzero(shapes.near_limit(machine, scene.q))
-    legend += [(f"{machine.names[i]} near its limit", WARNING) for i in warned]
-    if shapes.near_singular(machine, scene.q):
-        legend.append(("near a singularity", WARNING))
-    legend += [(text, WARNING) for text in touching]
-    legend += [(trace.text, trace.colour) for trace in scene.traces]
-    for i, (text, ink) in enumerate(legend):
-        canvas.text(side[0] + side[2] - 14, HEAD + 14 + 18 * i, text, 12, ink, 1.0)
+@lru_cache
+def _font(size: int) -> Any:
+    """The typeface that matplotlib brings, which is the same everywhere."""
+    load_pygame().font.init()
+    return load_pygame().font.Font(f"{get_data_path()}/fonts/ttf/DejaVuSans.ttf", size)
 
 
-def _backdrop(canvas: Canvas, machine: Machine, camera: Camera) -> None:
-    """The ground, a grid of 1 m (or a power of ten that fits) with its numbers, the axes' names."""
-    left, upper, width, height = camera.box
-    right = left + width
-    lower = upper + height
-    x0, y0 = camera.origin
-    metres = next(m for m in 10.0 ** np.arange(-1, 20) if m * camera.scale > 12)
-    step = camera.scale * metres
-    ground = lower
-    if camera.label == "side" and y0 - camera.scale * machine.ground < lower:
-        ground = y0 - camera.scale * machine.ground
-        canvas.bar(left, right, (ground + lower) / 2, (lower - ground) / 2, SOIL)
-    columns = np.arange(np.ceil((left - x0) / step), (right - x0) // step + 1)
-    rows = np.arange(np.ceil((y0 - lower) / step), (y0 - upper) // step + 1)
-    every = np.ceil(34 / step)  # grid lines from one number to the next
-    sign = -1 if camera.label == "top" else 1
-    for k in columns:
-        x = x0 + step * k
-        canvas.bar(x, x + 1, (upper + ground) / 2, (ground - upper) / 2, GRID)
-        if k % every == 0 and left + 40 < x < right - 60:
-            canvas.text(x, lower - 9, f"{sign * k * metres + 0.0:g}", 10, MUTED, 0.5)
-    for k in rows:
-        y = y0 - step * k
-        if y < ground:
-            canvas.bar(left, right, y, 0.5, GRID)
-        if k % every == 0 and upper + 0.3 * height < y < lower - 40:
-            canvas.text(left + 6, y, f"{k * metres + 0.0:g}", 10, MUTED)
-    if y0 < ground < lower:  # the machine stands at the height 0
-        foot = 0.25 * shapes.unit(machine) * camera.scale
-        canvas.bar(x0 - foot, x0 + foot, (y0 + ground) / 2, (ground - y0) / 2, SOIL)
-    across, up = ("out", "z") if camera.label == "side" else ("y", "x")
-    canvas.text(right - 8, lower - 9, f"{across} [m]", 10, MUTED, 1.0)
-    canvas.text(left + 6, lower - 26, f"{up} [m]", 10, MUTED)
-    canvas.text(left + 14, upper + 14, f"{camera.label} view", 11, MUTED)
+class View(NamedTuple):
+    """An orthographic view of the machine."""
+
+    label: str
+    box: tuple[float, float, float, float]  # its part of the picture: left, top, width, height
+    origin: Array  # pixel of the base frame's origin, (2,)
+    scale: float  # pixels a metre
+    axes: Array  # directions right and up, (2, 3)
+
+    def project(self, p: ArrayLike) -> Array:
+        """Pixels (..., 2) of points (..., 3) [m]."""
+        return np.asarray(self.origin + self.scale * (np.asarray(p) @ self.axes.T) * (1, -1))
 
 
-def _base(canvas: Canvas, machine: Machine, camera: Camera, scene: Scene) -> None:
-    """Tracks, outriggers, and the turret over them."""
-    parts = [(part, STEEL) for part in shapes.undercarriage(machine)]
-    for part, colour in [*parts, (shapes.turret(machine, scene.q), _pale(scene.colour, -0.3))]:
-        near, far = camera.project(part)
+def views(machine: Machine, q: Array, size: tuple[int, int]) -> list[View]:
+    """From the side, in the vertical plane of the tool, and from above, with x up and y left."""
+    reach, low, high = extent(machine)
+    width, height = 0.6 * size[0], size[1] - HEAD - foot(machine)
+    x, y, _ = tool_position(forward_kinematics(machine, q))
+    heading = np.arctan2(y, x)
+    out_and_up = np.array([[np.cos(heading), np.sin(heading), 0.0], [0.0, 0.0, 1.0]])
+    scale = min(0.7 * width / reach, 0.85 * height / (high - low))
+    origin = np.array([0.25 * width, HEAD + 0.92 * height + scale * low])
+    side = View("side view", (0.0, HEAD, width, height), origin, scale, out_and_up)
+    scale = min(size[0] - width, height) / (2.1 * reach)
+    middle = np.array([(size[0] + width) / 2, HEAD + height / 2])
+    return [side, View("top view", (width, HEAD, size[0] - width, height), middle, scale, ABOVE)]
+
+
+def foot(machine: Machine) -> float:
+    """Height of the rows of all joints, and of five notes, below the views."""
+    return ROW * (max(machine.n, 5) + 0.7)
+
+
+@lru_cache
+def extent(machine: Machine) -> tuple[float, float, float]:
+    """Largest distance from the slew axis, and least (on the ground) and largest height [m]."""
+    low, high = machine.column("q_min"), machine.column("q_max")
+    q = np.random.default_rng(0).uniform(low, high, (2000, machine.n))
+    x, y, z = np.moveaxis(forward_kinematics(machine, q).p, -1, 0)
+    reach, lowest = float(np.hypot(x, y).max()) + 1e-3, max(float(z.min()), machine.ground)
+    return reach, lowest, max(float(z.max()), lowest + 0.2 * reach)
+
+
+def _backdrop(canvas: Canvas, machine: Machine, view: View) -> None:
+    """A grid of 1 m, or of the power of ten that fits, and the ground in the side view."""
+    left, top, width, height = view.box
+    metres = next(m for m in 10.0 ** np.arange(-3, 20) if m * view.scale > 12)
+    step = view.scale * metres
+    x0, y0 = view.origin
+    for x in np.arange(left + (x0 - left) % step, left + width, step):
+        canvas.bar(x, top, 1, height, GRID)
+    for y in np.arange(top + (y0 - top) % step, top + height, step):
+        canvas.bar(left, y, width, 1, GRID)
+    if view.axes is not ABOVE:
+        canvas.bar(left, y0 - view.scale * machine.ground, width, height, SOIL)
+    canvas.text(left + 8, top + 10, f"{view.label}, grid of {metres:g} m", 11, MUTED)
+
+
+def _base(canvas: Canvas, machine: Machine, view: View, scene: Scene) -> None:
+    """Tracks along x, four legs, and over them the turret, which turns with q_1."""
+    first, reach = machine.joints[0], extent(machine)[0]
+    ground = machine.ground / reach
+    low, front, high = ground + 0.06, max(first.a / reach, 0.03), max(first.d / reach, 0.1)
+    turret = np.array([[-0.12, 0, low], [front, 0, low], [front, 0, high], [-0.12, 0, high]])
+    c, s = np.cos(scene.q[0] + first.theta), np.sin(scene.q[0] + first.theta)
+    turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+    track, leg = TRACK + np.array([0, 0, ground]), LEG + np.array([0, 0, ground])
+    prisms = [(track + np.array([0, y, 0]), 0.02, np.eye(3), STEEL) for y in (-0.075, 0.075)]
+    prisms += [(leg, 0.01, np.diag([x, y, 1]), STEEL) for x in (-1, 1) for y in (-1, 1)]
+    prisms += [(turret, 0.055, turn, shade(scene.colour, -0.3))]
+    for outline, half, matrix, colour in prisms:
+        faces = outline + half * np.array([[[0, -1, 0]], [[0, 1, 0]]])
+        near, far = view.project(reach * faces @ matrix)
         for k in range(len(near)):
             canvas.polygon(np.array([near[k - 1], near[k], far[k], far[k - 1]]), colour)
         canvas.polygon(near, colour)
         canvas.polygon(far, colour)
 
 
-def _arm(canvas: Canvas, machine: Machine, camera: Camera, scene: Scene, red: set[int]) -> None:
-    """Links, the last one a breaker, and joints; red near a limit and where the arm touches."""
-    corners = camera.project(skeleton(machine, scene.q))
-    warned = shapes.near_limit(machine, scene.q)
-    sizes = np.maximum(shapes.half_widths(machine) * camera.scale, 1.5)
-    lengths = np.linalg.norm(np.diff(corners, axis=0), axis=-1)
-    links = [i for i in range(2, 2 * machine.n) if lengths[i] > 0.5]
-    for i in links:
-        colour = WARNING if i in red else _pale(scene.colour, 0.2 * (i // 2 % 2))
-        along = (corners[i + 1] - corners[i]) / lengths[i]
-        across = along[::-1] * (-1, 1)
-        parts = [shapes.BREAKER, shapes.CHISEL] if i == 2 * machine.n - 1 else [shapes.BOOM]
-        for part, ink in zip(parts, (colour, STEEL)):
-            middle = corners[i] + lengths[i] * part[:, :1] * along
-            wide = sizes[i] * part[:, 1:] * across
+def _arm(canvas: Canvas, machine: Machine, view: View, scene: Scene) -> None:
+    """Links, of which the last one is a breaker, and joints, red near a limit."""
+    ends = view.project(forward_kinematics(machine, scene.q).p)
+    sizes = 0.03 * extent(machine)[0] * view.scale * np.linspace(1.0, 0.5, machine.n)
+    dark = shade(scene.colour, -0.3)
+    for i in range(1, machine.n):
+        colour = shade(scene.colour, 0.2 * (i % 2))
+        along = ends[i + 1] - ends[i]
+        across = sizes[i] * along[::-1] * (-1, 1) / max(float(np.hypot(*along)), 1e-9)
+        last = i == machine.n - 1
+        for part, ink in [(BREAKER, colour), (CHISEL, STEEL)] if last else [(BOOM, colour)]:
+            middle, wide = ends[i] + part[:, :1] * along, part[:, 1:] * across
             outline = np.vstack([middle + wide, (middle - wide)[::-1]])
             canvas.polygon(outline, ink)
-            canvas.line(np.vstack([outline, outline[:1]]), _pale(ink, -0.3))
-    for i in range(1, machine.n):
-        size = max(3.0, 0.6 * float(sizes[2 * i]))
-        radius, colour = (1.8, WARNING) if warned[i] else (1.0, _pale(scene.colour, -0.3))
-        canvas.circle(corners[2 * i], radius * size, colour)
-        canvas.circle(corners[2 * i], 0.5 * size, BACKGROUND)
+            canvas.line(np.vstack([outline, outline[:1]]), dark, 0.5)
+        radius, warned = max(3.0, 0.6 * float(sizes[i])), near_limit(machine, scene.q)[i]
+        canvas.polygon(ends[i] + 1.2 * radius * CIRCLE, WARNING if warned else dark)
+        canvas.polygon(ends[i] + 0.5 * radius * CIRCLE, BACKGROUND)
 
 
-def _tool(canvas: Canvas, machine: Machine, camera: Camera, scene: Scene) -> None:
-    """Path, trail, next target, tool tip, and its velocities."""
-    lines = [(scene.path, PATH, 3), (scene.trail, scene.colour, 2)]
-    lines += [(trace.trail, trace.colour, 2) for trace in scene.traces]
-    for points, colour, width in lines:
+def _tool(canvas: Canvas, machine: Machine, view: View, scene: Scene) -> None:
+    """The line to follow, the trail of the tool, and the arrows of its velocities."""
+    tip = view.project(tool_position(forward_kinematics(machine, scene.q)))
+    for points, colour in ((scene.path, PATH), (scene.trail, scene.colour)):
         if len(points) > 1:
-            canvas.line(camera.project(points), colour, width)
-    for p in scene.target:
-        canvas.circle(camera.project(p), 10.5, PATH, 3)
-    frames = forward_kinematics(machine, scene.q)
-    tip = camera.project(tool_position(frames))
-    canvas.circle(tip, 4.0, INK)
-    if shapes.near_singular(machine, scene.q):
-        canvas.circle(tip, 16.0, WARNING, 2)
-    scale = ARROW * min(camera.box[2:]) / machine.tool_speed
-    for v, colour in ((tool_velocity(frames, scene.q_dot), MEASURED), (scene.v_goal, GOAL)):
-        _arrow(canvas, tip, scale * (camera.axes @ v) * (1, -1), colour)
+            canvas.line(view.project(points), colour, 2.5)
+    canvas.polygon(tip + 4 * CIRCLE, INK)
+    scale = 0.2 * min(view.box[2:]) / machine.tool_speed
+    for v, colour in ((scene.v_tool, MEASURED), (scene.v_goal, INK)):
+        along = scale * (view.axes @ v) * (1, -1)
+        if (length := float(np.hypot(*along))) > 4:
+            head = min(11.0, 0.7 * length) * along / length
+            barb = 0.45 * head[::-1] * (-1, 1)
+            neck = tip + along - head
+            canvas.line(np.array([tip, neck]), colour, 3)
+            canvas.polygon(np.array([tip + along, neck + barb, neck - barb]), colour)
 
 
-def _arrow(canvas: Canvas, start: Array, along: Array, colour: Colour) -> None:
-    """An arrow; none if it is shorter than its head is wide."""
-    length = float(np.hypot(*along))
-    if length > 4:
-        direction = along / length
-        head = min(11.0, 0.7 * length)
-        neck = start + (length - head) * direction
-        barb = 0.45 * head * direction[::-1] * (-1, 1)
-        canvas.line(np.array([start, neck]), colour, 3)
-        canvas.polygon(np.array([start + along, neck + barb, neck - barb]), colour)
+def near_limit(machine: Machine, q: Array) -> NDArray[np.bool_]:
+    """Is each driven joint within `NEAR_LIMIT` of an end of its range? (n,)"""
+    low, high = machine.column("q_min"), machine.column("q_max")
+    driven = np.isin(np.arange(machine.n), machine.driven)
+    fraction = (q - low) / (high - low)
+    return np.asarray(((fraction < NEAR_LIMIT) | (fraction > 1 - NEAR_LIMIT)) & driven)
 
 
-def _pale(colour: Colour, fraction: float) -> Colour:
+def shade(colour: Colour, fraction: float) -> Colour:
     """A colour mixed with a fraction of the background, or of ink if it is negative."""
     other = BACKGROUND if fraction > 0 else INK
     r, g, b = (round(c + abs(fraction) * (w - c)) for c, w in zip(colour, other, strict=True))
     return r, g, b
 
 
-def _joint_rows(canvas: Canvas, machine: Machine, scene: Scene, box: Box) -> None:
-    """A row for each joint: name, angle within its range, command within the limit."""
-    left, upper, width, _ = box
-    angle = left + max(46.0, 9.0 * max(map(len, machine.names)))  # left end of the angle bars
-    length = (left + width - angle - 58 - 40) / 2  # 58 px for digits of the angle, 40 of the valve
-    valve = angle + length + 58
-    canvas.text(angle, upper + 6, "angle [rad]", 11, MUTED)
-    header = f"valve of {machine.pwm_limit}"
-    canvas.text(min(valve, left + width - 66), upper + 6, header, 11, MUTED)
-    warned = shapes.near_limit(machine, scene.q)
-    for i, joint in enumerate(machine.joints):
-        y = upper + 26 + 22 * i
-        colour = WARNING if warned[i] else INK if joint.driven else MUTED
-        canvas.text(left, y, joint.name, 13, colour)
-        canvas.bar(angle, angle + length, y, 2, TRACK)
-        if np.isfinite(scene.q[i]):
-            x = angle + length * (scene.q[i] - joint.q_min) / (joint.q_max - joint.q_min)
-            canvas.bar(x - 3, x + 3, y, 8, colour)
-            unit = " m" if joint.kind == "prismatic" else ""
-            canvas.text(angle + length + 8, y, f"{scene.q[i]:+z.2f}{unit}", 12, colour)
-        if joint.driven:
-            counts = float(scene.u[i]) * PWM_MAX
-            zero = valve + length / 2
-            end = zero + counts / machine.pwm_limit * length / 2
-            canvas.bar(valve, valve + length, y, 6, TRACK)
-            canvas.bar(zero, end, y, 6, scene.colour)
-            canvas.bar(zero - 1, zero + 1, y, 8, INK)
-            canvas.text(left + width, y, f"{round(counts):+d}", 12, INK, 1.0)
-        else:
-            canvas.text(valve, y, "locked", 12, MUTED)
+def _captions(canvas: Canvas, machine: Machine, scene: Scene) -> None:
+    """Title, status, the meaning of the arrows, and notes beside the rows of the joints."""
+    width, height = canvas.size
+    canvas.polygon((18, HEAD / 2) + 6 * CIRCLE, scene.colour)
+    canvas.text(30, HEAD / 2, scene.title, 15)
+    canvas.text(width - 14, HEAD / 2, scene.status, 13, MUTED, 1.0)
+    for y, name, v in ((10, "goal", scene.v_goal), (26, "measured", scene.v_tool)):
+        text, colour = f"{name} {np.linalg.norm(v):.2f} m/s", MEASURED if y > 10 else INK
+        canvas.text(0.6 * width - 10, HEAD + y, text, 12, colour, 1.0)
+    for i, note in enumerate(scene.notes):
+        canvas.text(0.58 * width, height - foot(machine) + ROW * (0.75 + i), note, 12)
+
+
+def _joint_row(canvas: Canvas, machine: Machine, scene: Scene, i: int) -> None:
+    """The angle of joint i within its range, and its command within the limit."""
+    joint, q = machine.joints[i], float(scene.q[i])
+    y = canvas.size[1] - foot(machine) + ROW * (i + 0.75)
+    left = 20.0 + 9 * max(map(len, machine.names))
+    length = (0.54 * canvas.size[0] - left - 160) / 2  # of a bar, beside the digits
+    colour = WARNING if near_limit(machine, scene.q)[i] else INK if joint.driven else MUTED
+    unit = "rad" if joint.kind == "revolute" else "m"
+    canvas.text(14, y, joint.name, 12, colour)
+    at = left + length * (q - joint.q_min) / (joint.q_max - joint.q_min)
+    canvas.bar(left, y - 2, length, 4, SLOT)
+    canvas.bar(at - 3, y - 7, 6, 14, colour)
+    canvas.text(left + length + 8, y, f"{q:+z.2f} {unit}", 12, colour)
+    valve, counts = left + length + 80, float(scene.u[i]) * PWM_MAX
+    if not joint.driven:
+        canvas.text(valve, y, "locked", 12, MUTED)
+        return
+    middle, end = valve + length / 2, counts / machine.pwm_limit * length / 2
+    canvas.bar(valve, y - 6, length, 12, SLOT)
+    canvas.bar(middle + min(0, end), y - 6, abs(end), 12, scene.colour)
+    canvas.bar(middle - 1, y - 8, 2, 16, INK)
+    canvas.text(valve + length + 8, y, f"{round(counts):+d} of {machine.pwm_limit}", 12)

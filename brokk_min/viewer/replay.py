@@ -1,277 +1,184 @@
-"""Recorded runs side by side, of logs or of results simulated again: in a window or as a film."""
+"""Recorded runs side by side, in a window or as a film: drive logs, or runs of `evaluate`.
 
-import subprocess
-from collections.abc import Iterable, Sequence
-from contextlib import closing
-from dataclasses import dataclass
-from functools import cached_property
+A file of `evaluate` holds no motion, so its runs are simulated again.
+"""
+
+from collections.abc import Sequence
 from pathlib import Path
-from tempfile import TemporaryFile
-from typing import IO, Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+from tqdm import tqdm
 
-from brokk_min.actuator import ActuatorNet
+from brokk_min._files import expected, read_json, require_package, whole_file
+from brokk_min.actuator import PLANT, Plant
 from brokk_min.can.drive_log import read_frames, read_telemetry
-from brokk_min.env import TaskConfig
-from brokk_min.evaluation import baselines, metrics
+from brokk_min.evaluation.baselines import read_gains
+from brokk_min.evaluation.metrics import LABELS, evaluate
 from brokk_min.evaluation.rollout import TITLES, Controller
-from brokk_min.evaluation.sequences import Commands, goals_and_starts, task_sequences
-from brokk_min.identification.files import located, read_json, whole_file
-from brokk_min.identification.formats import RESULTS, RUNS, check_fields
-from brokk_min.identification.progress import progress
+from brokk_min.evaluation.sequences import (
+    Commands,
+    evaluation_starts,
+    read_commands,
+    read_starts,
+    task_sequences,
+)
 from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocity
 from brokk_min.learning.policy import PolicyController, load_policy
-from brokk_min.machine import Array, Machine
-from brokk_min.viewer import camera, drawing, tracing
-from brokk_min.viewer.window import Canvas, Colour, Window
+from brokk_min.machine import Array, Machine, require
+from brokk_min.viewer.drawing import BLUE, NO_POINTS, ORANGE, WARNING, Scene, draw, image
+from brokk_min.viewer.play import distance, show, window
 
-FFMPEG = (  # raw pictures in, MP4 of even width and height out
-    "ffmpeg -loglevel error -f rawvideo -pix_fmt rgb24 -s {0}x{1} -r {2} -i - -pix_fmt yuv420p "
-    "-vf crop=trunc(iw/2)*2:trunc(ih/2)*2 -f mp4 -movflags frag_keyframe+empty_moov pipe:1"
-)
-LAST_FRAME = 3000  # ms for which a GIF holds it, then it begins again
-Images = Iterable[NDArray[np.uint8]]  # (height, width, 3)
+PANEL = (560, 400)  # px, of a run in a film
+PID = "jacobian_pid_k0.1"  # whose runs of a file of `evaluate` are shown beside the policy's
+Run = list[Scene]  # one for each tick
 
 
-@dataclass
-class Run:
-    """A recorded run of T ticks."""
+def film(
+    paths: Sequence[Path],
+    machine: Machine,
+    out: Path | None,
+    fps: float,
+    sequence: str = "",
+    start: int = 0,
+) -> None:
+    """Show drive logs (candump) and results (.json) in a window, or write them as a film `out`.
 
-    machine: Machine
-    title: str
-    colour: Colour
-    q: Array  # rad (T, n)
-    q_dot: Array  # rad/s (T, n)
-    u: Array  # in [-1, 1] (T, n)
-    v_goal: Array  # m/s (T, 3)
-    path: Array  # line that the tool should follow [m] (K, 3), or no points
-
-    @cached_property
-    def p_tool(self) -> Array:
-        """Tool positions [m], (T, 3)."""
-        return tool_position(forward_kinematics(self.machine, self.q))
-
-    @cached_property
-    def error(self) -> Array:
-        """Velocity error |v_goal - v_tool| [m/s], (T,)."""
-        v_tool = tool_velocity(forward_kinematics(self.machine, self.q), self.q_dot)
-        return np.asarray(np.linalg.norm(self.v_goal - v_tool, axis=-1))
-
-    @cached_property
-    def distance(self) -> Array:
-        """Distance of the tool from the path [m], (T,)."""
-        return tracing.distance(self.path, self.p_tool)
-
-    @cached_property
-    def in_view(self) -> Array:
-        """Points that a picture must show [m], (K, 3): the path, and the arm twice a second."""
-        corners = camera.skeleton(self.machine, self.q[::10]).reshape(-1, 3)
-        return np.vstack([corners, self.path])
+    Of results, `sequence` (by default the first) and `start` say which run. A run that is over
+    stands still. ValueError: no such run, or a film other than .gif and .mp4.
+    """
+    if out:
+        require(out.suffix in (".gif", ".mp4"), str(out), "a name in .gif or .mp4", out.suffix)
+    runs: list[Run] = []
+    for path in paths:
+        if path.suffix == ".json":
+            runs += runs_of_results(machine, path, sequence, start)
+        else:
+            runs.append(run_of_log(machine, path))
+    step = max(1, round(machine.rate / fps))
+    ticks = range(0, max(map(len, runs)) + step - 1, step)  # the last one is there, too
+    frames = [[run[min(tick, len(run) - 1)] for run in runs] for tick in ticks]
+    if out:
+        write_film(out, machine, frames, machine.rate / step)
+    else:
+        show_film(machine, frames, machine.rate / step)
 
 
-def run_of_log(machine: Machine, path: Path, colour: Colour) -> Run:
-    """Ticks of a candump log from the first driven one; ticks without all positions are left out.
+def run_of(
+    machine: Machine, title: str, q: Array, u: Array, v_goal: Array, v_tool: Array, path: Array
+) -> Run:
+    """The pictures of T ticks: q and u are (T, n), v_goal and v_tool (T, 3), `path` (K, 3)."""
+    p = tool_position(forward_kinematics(machine, q))
+    error = np.linalg.norm(v_goal - v_tool, axis=-1)
+    off = 1e3 * distance(path, p) if len(path) else np.zeros(len(p))
+    colour = ORANGE if title.startswith("jacobian") else BLUE
+    run = []
+    for t in range(len(q)):
+        notes = [f"velocity error {error[t]:.3f} m/s", f"its mean {error[: t + 1].mean():.3f} m/s"]
+        if len(path):
+            notes.append(f"at most {off[: t + 1].max():.0f} mm from the line")
+        tool = v_goal[t], v_tool[t], p[: t + 1], path, TITLES.get(title, title)
+        run.append(Scene(q[t], u[t], *tool, f"{t * machine.dt:.1f} s", colour, notes))
+    return run
+
+
+def run_of_log(machine: Machine, path: Path) -> Run:
+    """The ticks of a candump log from the first driven one on, but for those without all angles.
 
     ValueError: no log, or one in which nothing drives.
     """
-    telemetry = read_telemetry(machine, read_frames(path))
-    ticks = [tick for tick in telemetry if np.isfinite(tick.q).all()]
+    ticks = [t for t in read_telemetry(machine, read_frames(path)) if np.isfinite(t.q).all()]
     driving = [t.driving for t in ticks]
-    if not any(driving):
-        raise ValueError(f"{path}: expected a log in which the valves are driven, got none")
-    ticks = ticks[driving.index(True) :]
-    columns = {k: np.array([getattr(t, k) for t in ticks]) for k in ("q", "q_dot", "u", "v_goal")}
-    return Run(machine, path.name, colour, **columns, path=drawing.NO_POINTS)
+    require(any(driving), str(path), "a log in which the machine is driven", "another one")
+    rows = [(t.q, t.q_dot, t.u, t.v_goal) for t in ticks[driving.index(True) :]]
+    q, q_dot, u, v_goal = (np.array(column) for column in zip(*rows, strict=True))
+    v_tool = tool_velocity(forward_kinematics(machine, q), q_dot)
+    return run_of(machine, path.name, q, u, v_goal, v_tool, NO_POINTS)
 
 
-# --- results --------------------------------------------------------------------------------------
+def runs_of_results(machine: Machine, path: Path, sequence: str, start: int) -> list[Run]:
+    """The policy's run and the PID's in a file of `evaluate`, simulated again as it says.
 
-
-class Results(NamedTuple):
-    """A file of results, and what it takes to simulate its runs again."""
-
-    path: Path
-    rows: list[dict[str, Any]]
-    sequences: dict[str, Commands]
-    starts: Array  # rad (starts, n)
-    controllers: dict[str, Controller]
-    net: ActuatorNet | None  # what moved; None: the plant
-    seed: int
-    noise: float
-
-
-def read_results(machine: Machine, path: Path, controllers: Sequence[str]) -> Results:
-    """A JSON file of `evaluate` or `reproduce`; `controllers` are needed from its gains file.
-
-    ValueError: no results, or of another machine, or the files named in it are wrong.
+    ValueError: no such run, or one that does not come out as in the file.
     """
     file = read_json(path, "results of `evaluate`")
-    check_fields(path, file, {"meta": RESULTS["meta"]}, {})
-    meta: dict[str, Any] = {"plant": "analytic", "commands": "", "starts": ""}
-    meta |= {"noise": TaskConfig.noise} | file["meta"]
-    if meta["machine"] != machine.name:
-        raise ValueError(f"{path}: expected --machine {meta['machine']}, got {machine.name}")
-    check_fields(path, file, RESULTS, {"n": machine.n})
-    content = file.get("task_space", file)
-    check_fields(path, content, RUNS, {})
-    num = int(meta["starts"]) if meta["starts"].isdecimal() else 0
-    own = ", ".join(sequence.name for sequence in task_sequences(machine))
-    commands = None if meta["commands"] in ("", own) else Path(meta["commands"])
-    poses = None if num or not meta["starts"] else Path(meta["starts"])
-    with located(path):
-        sequences, drawn = goals_and_starts(machine, commands, poses, num, meta["seed"])
-        policy = load_policy(Path(meta.get("policy", path.with_name("policy.npz"))), machine)
-        named: dict[str, Controller] = {"rl": PolicyController(machine, policy)}
-        if set(controllers) - {"rl"}:
-            gains = Path(meta.get("gains", path.with_name("gains.json")))
-            if gains.name == "tuned now":
-                raise ValueError("gains: expected those of a file (--save-gains), got none")
-            named |= baselines.read_gains(gains, machine, policy.net)
-    starts = np.array(file.get("starts", drawn), float)
-    if meta["plant"] not in ("analytic", "net"):
-        expected = "expected runs of the analytic plant or of nets"
-        raise ValueError(f"{path}: plant: {expected}, got {meta['plant']}")
-    net = policy.net if meta["plant"] == "net" else None
-    by_name = {s.name: s for s in sequences}
-    made_by = meta["seed"], meta["noise"]
-    return Results(path, content["runs"], by_name, starts, named, net, *made_by)
+    with expected(
+        path, f"results of `evaluate` with start {start} of sequence {sequence or 'any'}"
+    ):
+        meta = file["meta"]
+        known, plant = controllers_of(machine, meta)
+        commands, starts = commands_of(machine, meta)
+        command = {c.name: c for c in commands}[sequence or commands[0].name]
+        task = machine, known, [command], starts, meta["seed"], plant
+        rows, traces = evaluate(*task, noise=meta["noise"])
+        errors = {tuple(row[k] for k in LABELS): row["velocity_error_mean"] for row in file["runs"]}
+        for row in rows:
+            got, wanted = row["velocity_error_mean"], errors[tuple(row[k] for k in LABELS)]
+            require(np.isclose(got, wanted, rtol=1e-3), "velocity_error_mean", wanted, got)
+        v_goal = command.for_starts(machine, starts)[:, start]
+        p_start = tool_position(forward_kinematics(machine, starts[start]))
+        line = np.vstack([p_start, p_start + machine.dt * np.cumsum(v_goal, axis=0)])
+        runs = []
+        for (name, _), trace in traces.items():
+            q, u, v_tool = (array[:, start] for array in (trace.q, trace.u, trace.v_tool))
+            runs.append(run_of(machine, name, q, u, v_goal, v_tool, line))
+        return runs
 
 
-def simulate_again(
-    machine: Machine, results: Results, controllers: Sequence[str], sequence: str, start: int
-) -> list[Run]:
-    """One run of each controller; ValueError: it is not the run of the file."""
-    chosen = {name: results.controllers[name] for name in controllers}
-    sequences = list(results.sequences.values())
-    task = (sequences, results.starts, results.seed, results.net)
-    config = TaskConfig(noise=results.noise)
-    rows, traces = metrics.evaluate(machine, chosen, *task, config=config)
-    for row in rows:
-        if row["start"] == start and row["sequence"] == sequence:
-            _check_row(results, row)
-    goals = results.sequences[sequence].for_starts(machine, results.starts)[:, start]
-    p_start = tool_position(forward_kinematics(machine, results.starts[start]))
-    path = p_start + np.vstack([np.zeros(3), np.cumsum(goals, axis=0)]) * machine.dt
-    runs = []
-    for name in chosen:
-        q, q_dot, u = (getattr(traces[name, sequence], k)[:, start] for k in ("q", "q_dot", "u"))
-        colour = drawing.COLOURS.get(name.split("_")[0], drawing.STEEL)
-        runs.append(Run(machine, name, colour, q, q_dot, u, goals, path))
-    return runs
+def controllers_of(machine: Machine, meta: dict[str, Any]) -> tuple[dict[str, Controller], Plant]:
+    """Policy and PID of a file of `evaluate`, and the plant that moved the machine in it."""
+    require(meta["machine"] == machine.name, "--machine", meta["machine"], machine.name)
+    require(meta["plant"] in ("analytic", "net"), "plant", "analytic or net", meta["plant"])
+    policy = load_policy(Path(meta["policy"]), machine)
+    pids = read_gains(Path(meta["gains"]), machine, policy.net)
+    plant = policy.net if meta["plant"] == "net" else PLANT
+    return {"rl": PolicyController(machine, policy), PID: pids[PID]}, plant
 
 
-def _check_row(results: Results, row: dict[str, Any]) -> None:
-    """Refuse a simulated row that differs from the file's."""
-    keys = ("controller", "sequence", "start")
-    same = [other for other in results.rows if all(other[key] == row[key] for key in keys)]
-    if not same or not np.isclose(same[0]["velocity_rmse"], row["velocity_rmse"], rtol=1e-3):
-        got = f"{same or 'none'}: another program?"
-        raise ValueError(f"{results.path}: expected the run {row}, got {got}")
+def commands_of(machine: Machine, meta: dict[str, Any]) -> tuple[list[Commands], Array]:
+    """Sequences and start poses [rad] (starts, n) of a file of `evaluate`."""
+    commands, starts = task_sequences(machine), meta["starts"]
+    if starts.isdecimal():
+        poses = evaluation_starts(machine, int(starts), commands, meta["seed"] + 2)
+    else:
+        poses = read_starts(Path(starts), machine)
+    if meta["commands"] != "own":
+        commands = read_commands(Path(meta["commands"]), machine)
+    return commands, poses
 
 
-# --- films ----------------------------------------------------------------------------------------
-
-
-def film(runs: Sequence[Run], tick: int, size: tuple[int, int]) -> Canvas:
-    """The picture of one tick of all runs; a run that is over stands still."""
-    in_view = np.vstack([run.in_view for run in runs])
-    traced = [p for run in runs if len(run.path) for p in (run.path, run.p_tool)]
-    close_up = np.vstack(traced) if len(traced) == 2 * len(runs) else drawing.NO_POINTS
-    canvas = Canvas(size)
-    scenes = [_scene(run, tick, in_view, close_up) for run in runs]
-    drawing.draw(canvas, runs[0].machine, scenes)
-    return canvas
-
-
-def _scene(run: Run, tick: int, in_view: Array, close_up: Array) -> drawing.Scene:
-    at = min(tick, len(run.q) - 1)
-    headline = ""
-    if len(close_up):
-        headline = f"largest distance from the line: {1e3 * run.distance[: at + 1].max():.0f} mm"
-    return drawing.Scene(
-        run.q[at],
-        run.q_dot[at],
-        run.u[at],
-        run.v_goal[at],
-        trail=run.p_tool[: at + 1],
-        path=run.path,
-        title=TITLES.get(run.title, run.title),
-        status=f"{at * run.machine.dt:.1f} s",
-        colour=run.colour,
-        notes=[
-            f"velocity error {run.error[at]:.3f} m/s",
-            f"mean so far {run.error[: at + 1].mean():.3f} m/s",
-        ],
-        in_view=in_view,
-        close_up=close_up,
-        headline=headline,
-    )
-
-
-def write_film(
-    path: Path, machine: Machine, runs: Sequence[Run], size: tuple[int, int], fps: float
-) -> None:
-    """All runs as a GIF, or as MP4 where ffmpeg is installed.
-
-    ValueError: another kind of file, or no ffmpeg that writes it.
-    """
-    if path.suffix not in (".gif", ".mp4"):
-        raise ValueError(f"{path}: expected a name ending in .gif or .mp4, got {path.suffix!r}")
-    step = max(1, round(machine.rate / fps))
-    last = max(len(run.q) for run in runs) - 1
-    bar = progress([*range(0, last, step), last], desc="draw", unit="frame")
-    images = (film(runs, tick, size).image() for tick in bar)
-    with whole_file(path) as file:
-        if path.suffix == ".mp4":
-            _write_mp4(file, images, size, machine.rate / step)
-        else:
-            samples = [film(runs, tick, size).image() for tick in (0, last // 2, last)]
-            _write_gif(file, images, samples, machine.rate / step)
-
-
-def _write_gif(file: IO[bytes], images: Images, samples: Sequence[Any], fps: float) -> None:
-    """A GIF with the colours of some samples of the pictures, and of what may be short."""
-    rare = [np.full_like(samples[0][:40], c) for c in (drawing.WARNING, drawing.MEASURED)]
-    palette = Image.fromarray(np.vstack([*samples, *rare])).quantize(48)
-    none = Image.Dither.NONE
-    frames = [Image.fromarray(image).quantize(palette=palette, dither=none) for image in images]
-    times = [round(1000 / fps)] * (len(frames) - 1) + [LAST_FRAME]
-    more = {"append_images": frames[1:], "duration": times, "loop": 0}
-    frames[0].save(file, "GIF", save_all=True, **more)
-
-
-def _write_mp4(file: IO[bytes], images: Images, size: tuple[int, int], fps: float) -> None:
-    with TemporaryFile() as raw:
-        raw.writelines(image.tobytes() for image in images)
-        raw.seek(0)
-        try:
-            done = subprocess.run(FFMPEG.format(*size, fps).split(), stdin=raw, stdout=file)
-        except FileNotFoundError as error:
-            message = "film: expected ffmpeg for .mp4, or a name in .gif, got none"
-            raise ValueError(message) from error
-    if done.returncode:
-        raise ValueError(f"film: expected ffmpeg to write it, got its status {done.returncode}")
-
-
-def show_film(machine: Machine, runs: Sequence[Run], size: tuple[int, int]) -> None:
-    """All runs in a window, in real time; space halts, left and right move by a second."""
-    last = max(len(run.q) for run in runs) - 1
-    second = round(machine.rate)
-    tick = 0
-    playing = True
-    with closing(Window(size, "brokk_min replay")) as window:
-        pg = window.pygame
-        steps = {pg.K_RIGHT: second, pg.K_LEFT: -second}
+def show_film(machine: Machine, frames: Sequence[Run], fps: float) -> None:
+    """The frames in a window, again and again, until it is closed."""
+    with window("brokk_min replay") as pygame:
+        clock, at = pygame.time.Clock(), 0
         while True:
-            for event in pg.event.get():
-                key = event.key if event.type == pg.KEYDOWN else None
-                if event.type == pg.QUIT or key == pg.K_ESCAPE:
+            for event in pygame.event.get():
+                escape = event.type == pygame.KEYDOWN and event.key == pygame.K_ESCAPE
+                if escape or event.type == pygame.QUIT:
                     return
-                playing ^= key == pg.K_SPACE
-                tick += steps.get(key, 0)
-            tick = min(max(tick, 0), last)
-            window.show(film(runs, tick, size), machine.rate)
-            tick += playing
+            show(pygame, machine, frames[at])
+            at = (at + 1) % len(frames)
+            clock.tick(fps)
+
+
+def write_film(out: Path, machine: Machine, frames: Sequence[Run], fps: float) -> None:
+    """The frames as a GIF, or as an MP4 by imageio, which brings ffmpeg."""
+
+    def picture(frame: Run) -> NDArray[np.uint8]:
+        return np.hstack([image(draw(machine, scene, PANEL)) for scene in frame])
+
+    bar = tqdm(frames, desc="draw", unit="frame", disable=None)
+    with whole_file(out) as file:
+        if out.suffix == ".mp4":
+            imageio = require_package("imageio.v3", "play")
+            imageio.imwrite(file, np.array([*map(picture, bar)]), extension=".mp4", fps=fps)
+            return
+        samples = [picture(frames[at]) for at in (0, len(frames) // 2, -1)]
+        samples.append(np.full_like(samples[0][:40], WARNING))  # red may be in none of them
+        palette = Image.fromarray(np.vstack(samples)).quantize(64)
+        none, duration = Image.Dither.NONE, round(1e3 / fps)
+        pictures = (Image.fromarray(picture(frame)) for frame in bar)
+        first, *rest = (one.quantize(palette=palette, dither=none) for one in pictures)
+        first.save(file, "GIF", save_all=True, append_images=rest, duration=duration, loop=0)

@@ -1,7 +1,6 @@
-"""The bus through python-can: waiting, echoes, filters, the log, and what a process may ask for."""
+"""The bus through python-can: waiting, echoes, filters, and the log."""
 
 import io
-import os
 import re
 import struct
 from pathlib import Path
@@ -12,7 +11,7 @@ from can.interfaces.socketcan.constants import CAN_EFF_FLAG
 from can.interfaces.socketcan.socketcan import pack_filters
 
 from brokk_min.can.canopen import Frame, used_ids
-from brokk_min.can.connection import Bus, has_real_time_priority, lock_memory, open_bus
+from brokk_min.can.connection import Bus, open_bus
 from brokk_min.machine import BROKK_170
 
 
@@ -22,14 +21,6 @@ def buses():
     yield here, there
     here.shutdown()
     there.shutdown()
-
-
-def test_open_bus__takes_an_equal_frame_of_another_sender_for_no_echo():
-    with open_bus("virtual", "echo") as here, open_bus("virtual", "echo") as there:
-        here.send(0x5A5, b"\x01")
-        there.send(0x5A5, b"\x01")
-        frame = here.recv(1.0)
-        assert frame and frame.id == 0x5A5
 
 
 def test_bus__marks_foreign_frames_and_echoes_and_logs_all_but_echoes(buses):
@@ -143,20 +134,3 @@ def test_open_bus__gives_socketcan_filters_that_take_its_identifiers_alone(tmp_p
 
     assert [can_id for can_id in range(2048) if passes(can_id)] == sorted(ids)
     assert not any(passes(can_id | CAN_EFF_FLAG) for can_id in ids)  # 29 bits
-
-
-def test_has_real_time_priority__is_what_the_kernel_says():
-    """Field 41 of /proc/self/stat is the policy: 1 and 2 are FIFO and round robin."""
-    with open("/proc/self/stat") as stat:
-        policy = int(stat.read().rpartition(")")[2].split()[38])
-    assert has_real_time_priority() == (policy in (1, 2))
-
-
-def test_lock_memory__locks_what_is_used_or_says_that_it_must_not():
-    child = os.fork()
-    if not child:  # a child, so that the tests' own memory stays as it is
-        locked = lock_memory()
-        with open("/proc/self/status") as status:
-            kilobytes = int(re.findall(r"VmLck:\s+(\d+)", status.read())[0])
-        os._exit(0 if locked == (kilobytes > 0) else 1)
-    assert os.waitpid(child, 0)[1] == 0

@@ -1,24 +1,19 @@
-"""The DBC file, read by cantools: what it decodes is what the program means."""
+"""The DBC file of `examples/dbc.py`, as cantools decodes it, is what the program means."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import cantools
 import numpy as np
 import pytest
-from helpers_cli import MINI, run
 
-from brokk_min import BROKK_170
 from brokk_min.can import canopen
 from brokk_min.can.canopen import encoder_raw, used_ids, valve_frames
-from brokk_min.can.dbc import dbc
-from brokk_min.cli.options import find_machine
-
-EXAMPLES = str(Path(__file__).parents[2] / "examples")
-SEVEN = find_machine(f"{EXAMPLES}/seven_joints.py:SEVEN_JOINTS")
+from brokk_min.machine import BROKK_170
+from examples.dbc import dbc, main
+from examples.seven_joints import SEVEN_JOINTS
 
 
-@pytest.mark.parametrize("machine", [BROKK_170, find_machine(MINI), SEVEN], ids=lambda m: m.name)
+@pytest.mark.parametrize("machine", [BROKK_170, SEVEN_JOINTS], ids=lambda m: m.name)
 def test_dbc__describes_the_frames_that_the_program_uses(machine):
     database = cantools.database.load_string(dbc(machine), "dbc", strict=True)
     unused = {canopen.SDO_ANSWER + node for node in range(128)}
@@ -40,15 +35,10 @@ def test_dbc__describes_the_frames_that_the_program_uses(machine):
     assert database.decode_message(heartbeat, b"\x05") == {"state": 5}
 
 
-def test_dbc__takes_any_name_of_a_joint():
+def test_main__writes_a_file_for_joints_of_any_name(tmp_path):
     joints = [replace(joint, name=f"{joint.name} (left)") for joint in BROKK_170.joints]
-    text = dbc(replace(BROKK_170, joints=tuple(joints)))
+    text = dbc(replace(BROKK_170, name="named", joints=tuple(joints)))
     database = cantools.database.load_string(text, "dbc")
-    assert "u_q1__left_" in database.get_message_by_name("valves").signal_tree
-
-
-def test_command__writes_a_file_that_cantools_reads(tmp_path, capsys):
-    path = tmp_path / "bus.dbc"
-    assert run(f"dbc --machine '{MINI}' --out '{path}'") == 0 == run(f"dbc --out '{path}'")
-    assert "bus.dbc: 14 messages" in capsys.readouterr().out
-    assert len(cantools.database.load_file(path).messages) == 14
+    assert "u_q1__left_" in database.get_message_by_name("valves_1").signal_tree
+    main(str(tmp_path / "bus.dbc"))
+    assert len(cantools.database.load_file(tmp_path / "bus.dbc").messages) == 14

@@ -90,7 +90,7 @@ def test_joystick__refuses_a_device_without_its_axes_or_button():
     with pytest.raises(ValueError, match="joystick: expected one, or --command"):
         Joystick(BROKK_170)
     device = Virtual()
-    refusal = r"joystick: expected axes \[1, 0, 6\] and button 5, got 6 and 8"
+    refusal = r"joystick: expected axes \[1, 0, 6\] and button 5, got 6 axes and 8 buttons"
     with pytest.raises(ValueError, match=refusal):
         Joystick(BROKK_170, axes=(1, 0, 6))
     with pytest.raises(ValueError, match="button 8"):
@@ -104,7 +104,7 @@ def test_joint_jog__moves_one_joint_with_the_sign_of_x():
     world.drive.begin()
     world.run(1.5)
     assert world.commands[1][-1].tolist() == [0, 0, 0, 14, 0]
-    assert world.simulated.plant.q[3] > START[3] + 0.003
+    assert world.simulated.state.q[3] > START[3] + 0.003
     for v, command in (((-0.2, 0.1, 0.1), -14), ((0.02, 0.2, -0.2), 0)):
         operator.v = v
         world.run(0.2)

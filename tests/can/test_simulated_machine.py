@@ -6,15 +6,15 @@ import signal
 import struct
 import threading
 from dataclasses import replace
-from types import SimpleNamespace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
-from helpers_bus import SIX, START, eventually, recorded_rows
+from helpers_bus import SIX, START, Recorder
 
 from brokk_min.can.canopen import HEARTBEAT_PERIOD, WATCHDOG, Frame, valve_frame, valve_frames
-from brokk_min.can.simulated_machine import SimulatedMachine, serve, simulate, start_pose
-from brokk_min.identification.logs import read_log
+from brokk_min.can.connection import open_bus
+from brokk_min.can.simulated_machine import SimulatedMachine, simulate, start_pose
 from brokk_min.machine import BROKK_170
 
 NODES = [1, 2, 3, 4, 5, 16]
@@ -22,13 +22,11 @@ CONTROLLER = 16
 
 
 class Machine(SimulatedMachine):
-    """It begins at 100 s and keeps what it records."""
+    """It begins at 100 s and keeps the reasons why it stops."""
 
     def __init__(self):
-        self.rows = []
         self.reasons = []
-        record = lambda *row: self.rows.append(row)  # noqa: E731
-        super().__init__(BROKK_170, START, 100.0, record, self.reasons.append)
+        super().__init__(BROKK_170, START, 100.0, Recorder(), self.reasons.append)
 
     def take(self, can_id, data=b"", now=100.0):
         return self.receive(Frame(now, can_id, data))
@@ -53,13 +51,6 @@ def driving():
     return machine
 
 
-def test_serve__waits_for_the_next_plant_step_and_not_for_one_that_is_due():
-    waits = []
-    bus = SimpleNamespace(send=lambda *frame: None, now=lambda: 1.0, recv=waits.append)
-    serve(SimulatedMachine(BROKK_170, START, 0.0), bus, iter([True, True, False]).__next__)
-    assert waits == pytest.approx([0.0, 0.005])
-
-
 def test_advance__moves_and_beats_by_its_own_clock():
     machine = Machine()
     assert machine.boot() == [(0x700 + node, b"\x00") for node in NODES]
@@ -70,9 +61,28 @@ def test_advance__moves_and_beats_by_its_own_clock():
     machine.nmt_(1, NODES[1])
     beats = machine.advance(100.0 + 3 * HEARTBEAT_PERIOD + 1e-6)
     assert beats == 2 * [first[0], (0x702, bytes([5])), *first[2:]]
-    times, commands, angles, valid = zip(*machine.rows, strict=True)
-    np.testing.assert_allclose(times, 100.0 + 0.005 * np.arange(1, 31))
-    assert not np.any(commands) and set(valid) == {100.0} and np.allclose(angles, START)
+    assert machine.steps == len(machine.plant.u) == 30 and not np.any(machine.plant.u)
+    np.testing.assert_allclose(machine.plant.q, [START] * 30)
+
+
+class Linear(NamedTuple):
+    """A plant of one's own: each joint turns at 0.1 rad/s at full command."""
+
+    q: np.ndarray = np.zeros(5)
+
+    def reset(self, machine, q):
+        return Linear(q)
+
+    def step(self, machine, state, u):
+        return Linear(state.q + 0.1 * u * machine.dt)
+
+
+def test_advance__moves_any_plant_in_its_own_steps():
+    machine = SimulatedMachine(BROKK_170, START, 0.0, Linear())
+    machine.u = np.array([1.0, 0.0, -1.0, 0.0, 0.0])
+    machine.enabled, machine.valid = True, 9.9
+    machine.advance(10.0 + 1e-9)
+    np.testing.assert_allclose(machine.state.q - START, machine.u)
 
 
 def test_receive__opens_valves_after_a_start_and_a_neutral_frame():
@@ -199,17 +209,18 @@ def test_start_pose__is_the_given_one_the_machines_or_the_middle():
             start_pose(BROKK_170, pose)
 
 
-def test_simulate__serves_until_a_signal_and_records_every_step(tmp_path):
-    def end():
-        eventually(lambda: len(recorded_rows(tmp_path / "plant.csv")) > 60, 60)
+def test_simulate__serves_until_a_signal(capsys):
+    def listen():
+        with open_bus("virtual", "served") as bus:
+            frames = (bus.recv(60.0) for _ in range(12))  # they boot, and their hearts beat once
+            heard.extend(frame.id for frame in frames if frame)
         os.kill(os.getpid(), signal.SIGTERM)
 
-    thread = threading.Thread(target=end)
-    thread.start()
-    simulate(BROKK_170, START, "virtual", "recorded", tmp_path / "plant.csv")
-    thread.join()
-    (recording,) = read_log([tmp_path / "plant.csv"], 4).recordings
-    assert not recording.u.any()
-    np.testing.assert_allclose(recording.q, np.tile(START, (len(recording.q), 1)))
-    times = recorded_rows(tmp_path / "plant.csv")[:, 0]
-    np.testing.assert_allclose(times, 0.005 * np.arange(1, len(times) + 1), atol=0.0006)
+    heard = []
+    with open_bus("virtual", "served"):  # the channel is there before anybody sends
+        thread = threading.Thread(target=listen)
+        thread.start()
+        simulate(BROKK_170, START, "virtual", "served")
+        thread.join()
+    assert heard == 2 * [0x700 + node for node in NODES]
+    assert capsys.readouterr().out == ""

@@ -1,171 +1,134 @@
-"""The commands that train and compare, on small files: what they write and what they print."""
+"""The commands that compare, on small files: what they write, print and refuse."""
 
 import json
 
+import numpy as np
 import pytest
 from helpers_cli import run
+from helpers_machines import obedient_net
 
-from brokk_min.cli.evaluation import print_answer
-from brokk_min.env import TaskConfig
-from brokk_min.evaluation import baselines
-from brokk_min.evaluation.metrics import summary
-from brokk_min.evaluation.sequences import read_starts, start_kinds
-from brokk_min.identification.files import SHIPPED
-from brokk_min.identification.logs import read_log
-from brokk_min.identification.net_file import save_net
-from brokk_min.learning.episodes import PAPER_TASK
-from brokk_min.learning.policy import POLICIES, load_policy
+from brokk_min.cli.evaluation import table
+from brokk_min.env import observation_scale
+from brokk_min.evaluation import baselines, sequences
+from brokk_min.learning.policy import Policy, save_policy
 from brokk_min.machine import BROKK_170
-from brokk_min.ppo import PPOConfig
 
-SHIPPED_POLICY = SHIPPED / "brokk170" / "policy.npz"
-SHIPPED_GAINS = SHIPPED / "brokk170" / "gains.json"
-SMALL = "--total-steps 512 --num-envs 16 --horizon 16 --minibatch-size 128"
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """A log, nets and a policy of the Brokk, made by the commands."""
-    folder = tmp_path_factory.mktemp("chain")
-    net = folder / "net.npz"
-    assert run(f"collect --hours 0.02 --excitation sine --out '{folder}/log.csv'") == 0
-    assert run(f"fit '{folder}/log.csv' --steps 20 --batch-size 256 --out", net) == 0
-    options = f"--resume --valve-cost 0.01 {SMALL}"
-    assert run(f"train --actuator '{net}' {options} --out", folder / "policy.npz") == 0
-    (folder / "c.csv").write_text("sequence,time,vx,vy,vz\nup,0,0,0,0.1\nup,1,0,0,0\n")
-    (folder / "s.csv").write_text("q1,q2,q3,q4,q5\n0,0.5,0.58,1.71,1.24\n")
-    return folder
+NET = obedient_net(BROKK_170)
+OBEDIENT = """
+from typing import Any, NamedTuple
+class State(NamedTuple):
+    q: Any
+class Plant:
+    def reset(self, machine, q):
+        return State(q)
+    def step(self, machine, state, u):
+        return State(state.q + 0.4 * machine.dt * u)
+PLANT = Plant()
+"""
 
 
-def test_train__writes_policy_and_curve(folder):
-    assert read_log([folder / "log.csv"], 4).joints == ("q1", "q2", "q3", "q4", "q5")
-    assert (folder / "policy.npz.csv").read_text().startswith("global_step,charts/")
-    training = load_policy(folder / "policy.npz", BROKK_170).training
-    assert training["task"]["valve_cost"] == 0.01
-    assert training["settings"]["total_steps"] == 512
-    assert training["settings"]["critic"] is False
+@pytest.fixture
+def folder(tmp_path):
+    """A policy, gains, a sequence of a second and a start; the policy does nothing."""
+    size = len(observation_scale(BROKK_170)[0])
+    sizes = [size, 256, 128, 64, 4]
+    weights = []
+    for i in range(4):
+        weights += [np.zeros(sizes[i : i + 2], np.float32), np.zeros(sizes[i + 1], np.float32)]
+    save_policy(tmp_path / "policy.npz", Policy({}, tuple(weights), NET, "paper"), BROKK_170)
+    known = baselines.baselines(BROKK_170, NET)
+    meta = baselines.gains_metadata(BROKK_170, NET)
+    baselines.write_gains(tmp_path / "gains.json", known, meta)
+    (tmp_path / "plant.py").write_text(OBEDIENT)
+    (tmp_path / "c.csv").write_text("sequence,time,vx,vy,vz\nup,0,0,0,0.1\nup,1,0,0,0\n")
+    (tmp_path / "s.csv").write_text("q1,q2,q3,q4,q5\n0,0.5,0.58,1.71,1.24\n")
+    return tmp_path
 
 
-def test_train__does_not_go_on_from_a_finished_training(folder, capsys):
-    policy = folder / "policy.npz"
-    before = policy.read_bytes()
-    assert run(f"train --actuator '{folder}/net.npz' --resume {SMALL} --out", policy) == 2
-    assert "policy.npz.checkpoint, got none: " in capsys.readouterr().err
-    assert policy.read_bytes() == before
+def evaluate(folder, options="", starts="s.csv"):
+    files = f"--policy {folder}/policy.npz --commands {folder}/c.csv --starts {folder}/{starts}"
+    return run(f"evaluate {files} --noise 0.05 {options}")
 
 
-@pytest.mark.parametrize("option", ["--critic", "--paper"])
-def test_train__can_use_a_critic(option, folder, tmp_path):
-    out = tmp_path / "p.npz"
-    assert run(f"train --actuator '{folder}/net.npz' {option} {SMALL} --seed 5 --out", out) == 0
-    training = load_policy(out, BROKK_170).training
-    assert training["settings"]["critic"] is True
-    assert training["settings"]["log_std_end"] is None
-    assert training["seed"] == 5
-    assert training["settings"]["total_steps"] == 512  # options given count
-    assert training["settings"]["gamma"] == PPOConfig().gamma
-    hold = PAPER_TASK["hold_min_s"] if option == "--paper" else TaskConfig().hold_min_s
-    assert training["task"]["hold_min_s"] == hold
-
-
-def test_evaluate__writes_what_it_used(folder, capsys):
-    net = load_policy(folder / "policy.npz", BROKK_170).net
-    known = baselines.baselines(BROKK_170, net)
-    meta = baselines.gains_metadata(BROKK_170, net)
-    baselines.write_gains(folder / "gains.json", known, meta)
-    files = {"policy": "policy.npz", "commands": "c.csv", "starts": "s.csv"}
-    line = " ".join(f"--{option} '{folder}/{file}'" for option, file in files.items())
+def test_evaluate__writes_what_it_used_and_prints_means(folder, capsys):
     out = folder / "e.json"
-    for plant in ("analytic", "net"):
-        assert run(f"evaluate {line} --plant {plant} --json", out) == 0
+    errors = {}
+    for plant in ("analytic", "net", f"{folder}/plant.py:PLANT"):
+        assert evaluate(folder, f"--plant {plant} --json {out} --force") == 0
         written = json.loads(out.read_text())
-        meta = written["meta"]
-        for option, file in (files | {"gains": "gains.json"}).items():
-            assert meta[option] == str(folder / file)
-        assert (meta["plant"], meta["machine"], meta["seed"]) == (plant, "brokk170", 0)
-        assert [run["controller"] for run in written["runs"]] == ["rl", "rl_dither", *known]
-        assert {(run["sequence"], run["start"]) for run in written["runs"]} == {("up", 0)}
-    assert run(f"evaluate {line} --perfect-model --json", out) == 0
-    runs = json.loads(out.read_text())["runs"]
-    best = sorted(runs, key=lambda run: run["velocity_error_mean"])[:2]
-    assert [run["controller"] for run in best] == ["perfect_model", "perfect_model_closed"]
-    capsys.readouterr()
-    assert run(f"evaluate {line} --gains", SHIPPED_GAINS) == 1  # gains for other nets
-    assert "gains.json: actuator: expected" in capsys.readouterr().err
+        used = {"policy": "policy.npz", "commands": "c.csv", "starts": "s.csv"}
+        used["gains"] = "gains.json"
+        assert {key: written["meta"][key] for key in used} == {
+            key: str(folder / file) for key, file in used.items()
+        }
+        assert (written["meta"]["plant"], written["meta"]["machine"]) == (plant, "brokk170")
+        names = ["rl", *baselines.baselines(BROKK_170, NET)]
+        assert [row["controller"] for row in written["runs"]] == names
+        assert {(row["sequence"], row["start"]) for row in written["runs"]} == {("up", 0)}
+        errors[plant] = [row["velocity_error_mean"] for row in written["runs"]]
+        assert errors[plant][0] == pytest.approx(0.1, rel=1e-6)  # the policy stands still
+        printed = capsys.readouterr().out
+        assert "means over 1 sequences from 1 workspace starts" in printed
+        assert f"{'the strongest PID':26}{errors[plant][-1]:15.4g}" in printed
+    assert len({row[1] for row in errors.values()}) == 3
+
+
+@pytest.mark.parametrize(
+    ("options", "status", "message"),
+    [
+        ("--json {0}/gains.json", 2, "gains.json: expected no file (or --force), got one"),
+        ("--json {0}/none/e.json", 2, "e.json: expected a file in an existing, writable folder"),
+        ("--save-gains {0}/new.json", 2, "--save-gains: expected gains to tune, got tuned ones in"),
+        ("--noise 1.5", 2, "--noise: expected 0 to 1, got 1.5"),
+        ("--num-starts 0", 2, "--num-starts: expected 1 or more, got 0"),
+        ("--policy {0}/gains.json", 1, "gains.json: expected a readable .npz file of a policy"),
+        ("--gains {0}/other.json", 1, "other.json: actuator: expected"),
+        ("--starts {0}/low.csv", 1, "low.csv: expected arms above 0.0 m, got -"),
+        ("--commands {0}/s.csv", 1, "s.csv: expected columns ['sequence', 'time', 'vx', 'vy',"),
+    ],
+)
+def test_evaluate__refuses(folder, capsys, options, status, message):
+    known = baselines.baselines(BROKK_170, NET)
+    other = {"machine": "brokk170", "actuator": "0123"}
+    baselines.write_gains(folder / "other.json", known, other)
     (folder / "low.csv").write_text("q1,q2,q3,q4,q5\n0,0,-0.3,2.5,1.2\n")
-    assert run(f"evaluate --starts '{folder}/low.csv'") == 1
-    assert "low.csv: row 2: expected the whole arm above" in capsys.readouterr().err
-    assert run("evaluate --policy", folder / "net.npz") == 1
-    assert "policy" in capsys.readouterr().err
+    assert evaluate(folder, options.format(folder)) == status
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert error.startswith("brokk-min: ") and message in error
 
 
-def test_evaluate__tunes_baselines_without_gains(folder, tmp_path, capsys, monkeypatch):
+def test_evaluate__tunes_baselines_without_gains(folder, capsys, monkeypatch):
     monkeypatch.setattr(baselines, "TUNING_RUNS", 1)
     monkeypatch.setattr(baselines, "TUNING_SECONDS", 1.0)
     monkeypatch.setattr(baselines, "GENERATIONS", 1)
-    (tmp_path / "p.npz").write_bytes(SHIPPED_POLICY.read_bytes())
-    out = tmp_path / "e.json"
-    files = f"--policy '{tmp_path}/p.npz' --commands '{folder}/c.csv'"
-    tuned = tmp_path / "pid.json"
-    assert run(f"evaluate {files} --num-starts 1 --save-gains '{tuned}' --json", out) == 0
+    monkeypatch.setattr(baselines, "CANDIDATES", 6)
+    (folder / "gains.json").unlink()
+    first, again, gains = (folder / name for name in ("1.json", "2.json", "pid.json"))
+    assert evaluate(folder, f"--json {first} --save-gains {gains}") == 0
     assert "gains of the baselines: tuned now" in capsys.readouterr().err
-    first = json.loads(out.read_text())
-    assert (first["meta"]["gains"], first["meta"]["starts"]) == ("tuned now", "1")
-    files += f" --gains '{tuned}' --num-starts 1"
-    assert run(f"evaluate {files} --json", out) == 0
-    again = json.loads(out.read_text())
-    assert again["meta"]["gains"] == str(tuned) and again["runs"] == first["runs"]
-    assert run(f"evaluate {files} --save-gains", tmp_path / "other.json") == 2
-    assert "--save-gains: expected gains to tune, got tuned ones in" in capsys.readouterr().err
+    assert evaluate(folder, f"--json {again} --gains {gains}") == 0
+    first, again = (json.loads(file.read_text()) for file in (first, again))
+    assert (first["meta"]["gains"], again["meta"]["gains"]) == ("tuned now", str(gains))
+    assert again["runs"] == first["runs"]
 
 
-def test_print_answer__names_the_best_of_each_class(capsys):
-    errors = {"rl": 0.03, "rl_dither": 0.01, "jacobian_pid_k0.1": 0.04, "jacobian_pid_ff": 0.02}
-    errors |= {"other_jacobian_dither": 0.06, "jacobian_pid_ff_integral_dither": 0.05}
-    common = {"sequence": "x", "kind": "workspace", "start": 0}
-    print_answer([common | {"controller": k, "velocity_error_mean": v} for k, v in errors.items()])
-    printed = capsys.readouterr().out.splitlines()
-    assert printed[0].startswith("rl has 25% less error than jacobian_pid_k0.1")
-    assert {line.partition(": ")[0] for line in printed[1:3]} == {
-        "rl has 50% more error than jacobian_pid_ff",
-        "rl_dither has 80% less error than jacobian_pid_ff_integral_dither",
-    }
+def test_table__is_of_workspace_starts_if_there_are_any():
+    figures = dict.fromkeys(("off_axis_drift_max", "jerk_rms", "valve_travel", "time_at_limits"), 2)
+    errors = [("extended", 0, 7.0), ("workspace", 1, 0.1), ("workspace", 2, 0.3)]
+    runs = [
+        figures | {"controller": "rl", "sequence": "x", "start": i, "kind": kind}
+        | {"velocity_error_mean": error}
+        for kind, i, error in errors
+    ]  # fmt: skip
+    head, _, row = table(runs).splitlines()
+    assert head == "means over 1 sequences from 2 workspace starts"
+    assert row.split("learner")[1].split() == ["0.2", "2", "2", "2", "2"]
+    assert "from 1 extended starts" in table(runs[:1])
+    assert sequences.KINDS[0] == "workspace"
 
 
-def test_shipped_policy__beats_the_papers_controllers(tmp_path):
-    """Its file holds what made it and how good it was; on the plant it is so again."""
-    training = load_policy(SHIPPED_POLICY, BROKK_170).training
-    before = training["velocity_error_mean"]
-    assert (training["command"], training["seed"]) == ("brokk-min reproduce --seed 1", 1)
-    gains = json.loads(SHIPPED_GAINS.read_text())
-    assert {*gains["gains"], *POLICIES, "rl_dither"} == set(before)
-    assert gains["meta"]["seed"] == 0
-    up = "z,0,0,0,0.1\nz,2,0,0,-0.1\nz,4,0,0,0\nz,6,0,0,0\n"
-    side = "y,0,0,0.1,0\ny,2,0,-0.1,0\ny,4,0,0,0\ny,6,0,0,0\n"
-    (tmp_path / "c.csv").write_text(f"sequence,time,vx,vy,vz\n{up}{side}")
-    files = f"--commands '{tmp_path}/c.csv' --json '{tmp_path}/e.json'"
-    assert run(f"evaluate --num-starts 4 {files}") == 0
-    rows = summary(json.loads((tmp_path / "e.json").read_text())["runs"])
-    now = {name: row["all"]["velocity_error_mean"] for name, row in rows.items()}
-    assert set(before) == set(now)
-    for errors in (before, now):
-        assert 0 < errors["rl"] < min(errors["jacobian_pid_k0.1"], errors["jacobian_pid_k0.05"])
-
-
-def test_starts__are_drawn_into_a_file_that_reads_back(tmp_path):
-    imports = "from dataclasses import replace\nfrom brokk_min import BROKK_170\n"
-    (tmp_path / "m.py").write_text(f"{imports}SLOW = replace(BROKK_170, rate=5.0)\n")  # fewer ticks
-    assert run(f"starts --num 4 --machine '{tmp_path}/m.py:SLOW' --out", tmp_path / "s.csv") == 0
-    starts = read_starts(tmp_path / "s.csv", BROKK_170)
-    assert start_kinds(BROKK_170, starts) == ["workspace", "limits", "workspace", "extended"]
-
-
-def test_preliminary__writes_figures_and_numbers(tmp_path):
-    net = load_policy(SHIPPED / "brokk170" / "policy.npz", BROKK_170).net
-    save_net(tmp_path / "net.npz", net)
-    out = tmp_path / "a" / "b"
-    assert run("preliminary --actuator", tmp_path / "net.npz", "--out", out) == 0
-    found = json.loads((out / "preliminary.json").read_text())
-    assert found["meta"]["actuator"] == str(tmp_path / "net.npz")
-    assert found["sim_to_real"]["tool"]["position_error_mean"] == pytest.approx(0.013, abs=0.001)
-    assert {path.name for path in out.glob("*.png")} == {"preliminary.png", "sim_to_real.png"}
+def test_reproduce__does_not_write_over_results(tmp_path, capsys):
+    (tmp_path / "results.json").write_text("{}")
+    assert run(f"reproduce --quick --out {tmp_path}") == 2
+    assert "results.json: expected no file (or --force), got one" in capsys.readouterr().err
+    assert (tmp_path / "results.json").read_text() == "{}"

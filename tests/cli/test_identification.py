@@ -1,4 +1,4 @@
-"""The commands for logs and nets on small files: what they write."""
+"""The commands for logs and nets on small files: what they write, print and refuse."""
 
 import json
 
@@ -6,147 +6,160 @@ import numpy as np
 import pytest
 from helpers_cli import run
 
+from brokk_min.beyond.valve_nets import ValveNet
+from brokk_min.can.canopen import encoder_raw, valve_frame
 from brokk_min.identification.logs import Log, Recording, read_log, write_log
 from brokk_min.identification.net_file import load_net
 from brokk_min.machine import BROKK_170
 
+TINY = "--steps 1 --batch-size 8"
 
-def foreign_log(path, seed, runs):
+
+def foreign_log(path, seed, runs, sign=1):
     """Another machine at 100 Hz with jitter: first-order joints, a dead zone, angles only."""
     rng = np.random.default_rng(seed)
     lines = ["run,time,u_boom,u_arm,q_boom,q_arm"]
     for r in range(runs):
-        t = 10.0 * r
-        q = np.array([0.3, -0.2])
-        v = np.zeros(2)
+        t, q, v = 10.0 * r, np.array([0.3, -0.2]), np.zeros(2)
         for k in range(2500):
             if k % 60 == 0:
                 u = rng.uniform(-1, 1, 2)
                 opening = np.sign(u) * np.maximum(0, np.abs(u) - 0.3)
             step = 0.01 + rng.uniform(-0.003, 0.003)
-            v += step * (np.array([0.6, 1.0]) * opening - v) / 0.15
+            v += step * (np.array([0.6, sign]) * opening - v) / 0.15
             q = q + step * v
             lines.append(f"take {r},{t:.4f},{u[0]:.3f},{u[1]:.3f},{q[0]:.5f},{q[1]:.5f}")
             t += step
     path.write_text("\n".join(lines) + "\n")
+    return path
 
 
-def steady_log(joints, recordings):
+def steady_log(path, joints, recordings=3):
     """Angles that go up by 0.01 rad a tick."""
     q = np.cumsum(np.full((40, len(joints)), 0.01), axis=0)
-    return Log(joints, tuple(Recording(str(i), 0 * q, q, 0 * q) for i in range(recordings)))
+    names = [f"run {i}" for i in range(recordings)]
+    write_log(path, Log(joints, tuple(Recording(name, 0 * q, q, 0 * q) for name in names)))
+    return path
 
 
-def test_fit__takes_a_foreign_log_and_beats_persistence_and_a_linear_model(tmp_path):
-    foreign_log(tmp_path / "log.csv", 0, 16)
-    foreign_log(tmp_path / "test.csv", 1, 2)
-    files = ["--test", tmp_path / "test.csv", "--json", tmp_path / "f.json"]
-    files += ["--figure", tmp_path / "f.png"]
-    assert run(f"fit '{tmp_path}/log.csv' --steps 400 --out", tmp_path / "n.npz", *files) == 0
+def test_fit__takes_a_foreign_log_and_beats_persistence_and_a_linear_model(tmp_path, capsys):
+    """And `inspect --net` finds the same errors again."""
+    log, test = foreign_log(tmp_path / "log.csv", 0, 16), foreign_log(tmp_path / "test.csv", 1, 2)
+    files = ["--out", tmp_path / "n.npz", "--json", tmp_path / "f.json"]
+    assert run("fit --steps 400", log, "--test", test, *files) == 0
     written = json.loads((tmp_path / "f.json").read_text())
     assert set(written) == {"meta", "joints", "tool", "warnings"}
-    assert written["meta"].pop("settings")["steps"] == 400
-    assert written["meta"] == {
-        "seed": 0,
-        "rate": 20.0,
-        "history": 13,
-        "machine": "",
-        "dead_zone": 0.0,
-        "logs": [str(tmp_path / "log.csv")],
-        "test": [str(tmp_path / "test.csv")],
-    }
-    assert list(written["joints"]) == ["boom", "arm"]
+    meta = written["meta"]
+    assert (meta["machine"], meta["rate"], meta["history"], meta["seed"]) == ("", 20.0, 13, 0)
+    assert (meta["logs"], meta["test"]) == ([str(log)], [str(test)])
+    assert meta["settings"]["steps"] == 400
     for joint in written["joints"].values():
         assert joint["one_step_rmse"] < joint["persistence_rmse"]
         assert set(joint["free_run"]) == {"1", "5", "10"}  # 25 s recordings hold no 30 s run
         linear = joint["linear"]["free_run"]["5"]["velocity_rmse"]
         assert joint["free_run"]["5"]["velocity_rmse"] < 0.9 * linear
-        assert joint["creep"] < 5e-4
     assert not [warning for warning in written["warnings"] if "linear" in warning]
-    assert (tmp_path / "f.png").read_bytes().startswith(b"\x89PNG")
+    capsys.readouterr()
+    assert run("inspect", test, "--net", tmp_path / "n.npz", "--json", tmp_path / "i.json") == 0
+    report = json.loads((tmp_path / "i.json").read_text())
+    for name, scores in report["scores"].items():
+        joint = written["joints"][name]
+        assert scores == {key: joint[key] for key in scores}
+        assert report["joints"][name]["dead_zone"] == pytest.approx([0.3, 0.3], abs=0.03)
+    printed = capsys.readouterr().out
+    assert "2 recordings, 0 of them begin after a gap" in printed
+    assert f"{report['scores']['boom']['one_step_rmse']:.4f}" in printed
+    assert 'Joint("boom", q_min=' in printed
+    assert "warning: boom: expected 10 minutes, got 0.8" in printed
 
 
-@pytest.mark.parametrize(
-    ("joints", "options", "machine", "dead_zone"),
-    [
-        (BROKK_170.names, "", "brokk170", 0.07),
-        (BROKK_170.names, "--dead-zone 0", "brokk170", 0.0),
-        (BROKK_170.names, "--paper", "brokk170", 0.0),
-        (("boom", "stick"), "", "", 0.0),
-        (("boom", "stick"), "--dead-zone 0.1", "", 0.1),
-    ],
-)
-def test_fit__uses_the_dead_zone_of_a_known_machine_or_the_one_given(
-    joints, options, machine, dead_zone, tmp_path, capsys
-):
-    write_log(tmp_path / "log.csv", steady_log(joints, 3))
+def test_fit__refuses_reversed_commands_and_inspect_tells_them(tmp_path, capsys):
+    log = foreign_log(tmp_path / "log.csv", 0, 2, sign=-1)
+    assert run(f"fit {TINY}", log, "--out", tmp_path / "n.npz") == 1
+    reversed_one = "u_arm: expected positive commands to raise q_arm"
+    assert f"log.csv: {reversed_one}" in capsys.readouterr().err
+    assert not (tmp_path / "n.npz").exists()
+    assert run("inspect", log) == 0
+    assert f"warning: {reversed_one}" in capsys.readouterr().out
+
+
+def test_fit__knows_the_machine_of_a_log_and_the_papers_recipe(tmp_path, capsys):
+    own, other = (
+        steady_log(tmp_path / f"{name}.csv", joints)
+        for name, joints in (("own", BROKK_170.names[::-1]), ("other", ("boom", "stick")))
+    )
     out = tmp_path / "n.npz"
-    assert run(f"fit {options} --steps 1 --batch-size 8", tmp_path / "log.csv", "--out", out) == 0
-    net = load_net(out)
-    assert (net.machine, net.dead_zone) == (machine, dead_zone)
-    assert ((net.settings["noise"], net.settings["rollout"]) == (0, 1)) == ("paper" in options)
-    expected = f"nets of {machine or 'no known machine'}, dead zone {dead_zone} of full command\n"
-    assert capsys.readouterr().out.startswith(expected)
-
-
-def test_fit__takes_rate_history_and_velocity_window_of_the_machine(tmp_path):
-    write_log(tmp_path / "log.csv", steady_log(BROKK_170.names, 4))
-    (tmp_path / "slow.py").write_text(
+    for log, options, machine, valve in (
+        (own, "", "brokk170", True),
+        (own, "--paper", "brokk170", False),
+        (other, "--no-valve", "", False),
+    ):
+        assert run(f"fit --force {TINY} {options}", log, "--out", out) == 0
+        net = load_net(out)
+        assert (net.machine, isinstance(net, ValveNet)) == (machine, valve)
+        assert net.training["settings"]["rollout"] == (1 if "paper" in options else 8)
+        assert "scored on ['run 0']" in capsys.readouterr().out
+        assert log == other or net.joints == BROKK_170.names  # in the order of the machine
+    slow = tmp_path / "slow.py"
+    slow.write_text(
         "from dataclasses import replace\nfrom brokk_min.machine import BROKK_170\n"
         "SLOW = replace(BROKK_170, name='slow', rate=10.0, velocity_samples=3, history=6)\n"
     )
-    line = f"fit '{tmp_path}/log.csv' --steps 1 --rollout 1 --out '{tmp_path}/n.npz' "
-    slow = f"--machine '{tmp_path}/slow.py:SLOW'"
-    for options, expected in (
-        (slow, ("slow", 10.0, 3, 6)),
-        ("--history 5 --velocity-samples 5", ("brokk170", 20.0, 5, 5)),
-    ):
-        assert run(line + options) == 0
-        net = load_net(tmp_path / "n.npz")
-        assert (net.machine, net.rate, net.velocity_samples, net.history) == expected
-
-
-@pytest.mark.parametrize(
-    ("levels", "options", "expected"),
-    [
-        (8, "--steps 1", (1, 0.0, 0.1, 13)),
-        (5, "--steps 1", (1, 0.3, 1.0, 1)),
-        (5, "--steps 1 --output-lags 20 --noise 0.5", (1, 0.3, 0.5, 20)),
-        (5, "--steps 1 --paper", (1, 0.0, 0.0, 13)),
-    ],
-)
-def test_fit__has_a_recipe_for_step_responses(levels, options, expected, tmp_path, capsys):
-    """Held commands of so many levels, up and down, and angles that follow them."""
-    held = np.tile(np.arange(1, levels + 1) / levels, 10)
-    u = np.repeat(np.stack([held, -held], axis=1).ravel(), 20)[:, None]
-    q = np.cumsum(0.3 * u, axis=0) / 20
-    recordings = [Recording(name, u, q, u) for name in ("one", "two")]
-    write_log(tmp_path / "log.npz", Log(("a",), tuple(recordings)))
-    files = ["--out", tmp_path / "n.npz", "--json", tmp_path / "n.json"]
-    assert run(f"fit {options} --batch-size 8", tmp_path / "log.npz", *files) == 0
-    settings = load_net(tmp_path / "n.npz").settings
-    names = ("steps", "weight_decay", "noise", "output_lags")
-    assert tuple(settings[name] for name in names) == expected
-    assert json.loads((tmp_path / "n.json").read_text())["meta"]["settings"] == settings
-    printed = capsys.readouterr().out
-    values = ", ".join(map("{} {}".format, names, expected))
-    is_recipe = levels == 5 and "paper" not in options
-    recipe = f"step responses, held commands of few levels: {values}\n"
-    assert (recipe in printed, "step responses" in printed) == (is_recipe, is_recipe)
-    assert "scored on: ['one']\n" in printed
-
-
-def test_fit__refuses_the_log_of_another_machine(tmp_path, capsys):
-    write_log(tmp_path / "log.csv", steady_log(("a", "b"), 2))
-    assert run(f"fit '{tmp_path}/log.csv' --machine brokk170 --out '{tmp_path}/n.npz'") == 1
-    refusal = "log.csv: joints: expected ('q1', 'q2', 'q3', 'q4', 'q5') of --machine brokk170, got"
+    assert run(f"fit --force {TINY} --rollout 1 --machine {slow}:SLOW", own, "--out", out) == 0
+    net = load_net(out)
+    expected = ("slow", 10.0, 3, 6)
+    assert (net.machine, net.rate, net.velocity_samples, net.history) == expected
+    assert run("inspect --net", out, own) == 1  # as a log of the default machine
+    assert "n.npz: velocity_samples: expected 4 of --machine, got 3" in capsys.readouterr().err
+    assert run(f"inspect --machine {slow}:SLOW", other) == 1
+    refusal = "other.csv: joints: expected ['q1', 'q2', 'q3', 'q4', 'q5'], got ['boom', 'stick']"
     assert refusal in capsys.readouterr().err
 
 
-def test_collect__has_a_policy_or_an_excitation(tmp_path, capsys):
+def test_collect__records_what_read_log_reads(tmp_path, capsys):
     out = tmp_path / "log.npz"
-    assert run(f"collect --policy p.npz --excitation rich --out '{out}'") == 2
-    assert "--excitation: expected none with --policy, got rich" in capsys.readouterr().err
-    assert run(f"collect --hours 0.0002 --out '{out}'") == 0
-    recordings = len(read_log([out], 4).recordings)  # without returns to the start
-    assert f"log.npz: {recordings} recordings of q1, q2, " in capsys.readouterr().out
+    assert run("collect --hours 0.0002 --excitation sine --out", out) == 0
+    log = read_log([out], 4)  # without returns to the start
+    num = len(log.recordings)
+    assert log.joints == BROKK_170.names
+    assert capsys.readouterr().out == f"{out}: {num} recordings of q1, q2, q3, q4, q5\n"
+    assert run("collect --hours 0.0002 --excitation sine --seed 1 --force --out", out) == 0
+    assert not np.array_equal(read_log([out], 4).recordings[0].u, log.recordings[0].u)
+
+
+def test_inspect__reads_drives_and_tables_together(tmp_path, capsys):
+    """Three seconds of the bus in which q5 goes up by ten counts a tick under a held command."""
+    lines = []
+    for tick in range(60):
+        at = f"({0.05 * tick:.6f}) can0 "
+        raw = encoder_raw(BROKK_170, [100, 100, 100, 1000, 10 * tick])
+        lines.append(at + "080# T")
+        lines += [
+            f"{at}{0x181 + i:03X}#{int(x).to_bytes(4, 'little').hex()}" for i, x in enumerate(raw)
+        ]
+        lines.append(f"{at}210#{valve_frame([0, 0, 0, 0, 60], tick, 1).tobytes().hex()} T")
+    (tmp_path / "drive.log").write_text("\n".join([*lines, "(3.000000) can0 080# T", ""]))
+    table = steady_log(tmp_path / "log.csv", BROKK_170.names, 1)
+    out = tmp_path / "i.json"
+    assert run("inspect", tmp_path / "drive.log", table, "--json", out) == 0
+    assert "2 recordings, 0 of them begin after a gap" in capsys.readouterr().out
+    q5 = json.loads(out.read_text())["joints"]["q5"]
+    assert (q5["low"], q5["high"]) == pytest.approx((0.0, 590 * 2 * np.pi / 4096), abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("line", "status", "message"),
+    [
+        ("inspect", 2, "LOGS: expected one file or more, got none"),
+        ("collect --out l.csv --hours 0", 2, "--hours: expected above 0, to 100, got 0.0"),
+        ("collect --out l.csv --excitation joint", 2, ""),
+        ("fit l.csv --out n.txt", 2, "--out: expected a name in .npz, got n.txt"),
+        ("fit l.csv --out n.npz --batch-size 0", 2, "--batch-size: expected 1 or more, got 0"),
+        ("inspect drive.log", 1, "drive.log: expected a candump log, got row 1: expected"),
+    ],
+)
+def test_wrong_use__is_refused(line, status, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "drive.log").write_text("not a frame\n")
+    assert run(line) == status
+    assert message in capsys.readouterr().err

@@ -7,41 +7,34 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from helpers_cli import MINI, run
+from helpers_cli import run
 
 import brokk_min
 from brokk_min.__main__ import COMMANDS
 
 ROOT = Path(__file__).parents[2]
-OPTIONS = {
-    "collect": "--out --hours --excitation --machine --plant",
-    "fit": "--out --test --json --figure --velocity-samples --history --dead-zone --paper --curve",
-    "score": "--machine --json --figure",
-    "inspect": "--machine --json",
-    "preliminary": "--actuator --out",
-    "train": "--actuator --out --total-steps --num-envs --resume --paper --critic --lag-cost",
-    "sweep": "--critic --actuator --out --seeds --poses --scheduler --gains --total-steps --paper",
-    "starts": "--out --num",
-    "evaluate": "--policy --commands --starts --num-starts --perfect-model --plant --json --gains",
-    "reproduce": "--out --quick --sweep",
-    "family": "--out --members --quick",
-    "machine": "--interface --channel --start --record --plant",
-    "drive": "--policy --interface --channel --command --controller --counts --log --replay",
-    "convert": "--out",
-    "diagnose": "--policy --json --figure",
-    "dbc": "--out --machine",
+OPTIONS = {  # those that the README and the pages name
+    "collect": "--out --hours --excitation --machine --plant --seed",
+    "inspect": "--net --machine --json",
+    "fit": "--out --test --json --paper --seed",
+    "train": "--actuator --out --total-steps --resume --paper --gamma --hold-min-s --seed",
+    "evaluate": "--policy --commands --starts --plant --json --gains --seed",
+    "reproduce": "--out --quick --seed",
+    "sweep": "--actuator --out --seeds --scheduler --total-steps --paper",
+    "machine": "--interface --channel --plant",
+    "drive": "--policy --interface --channel --command --controller --log",
+    "play": "--policy",
+    "replay": "--out",
     "export": "--policy --out",
-    "play": "--policy --gains --interface --channel --drive --attempts --log --start",
-    "replay": "--out --rerun --fps --size --controllers --sequence --start",
 }
 
 
-def test_help__names_all_commands(capsys):
+def test_help__names_all_commands_and_what_they_do(capsys):
     assert run("--help") == 0
     printed = capsys.readouterr().out
-    assert "Exits 0 done, 1 failed, 2 wrong use." in printed
-    assert all(f"• {command} " in printed for command in OPTIONS)
     assert list(COMMANDS) == list(OPTIONS)
+    for name, (_, _, text) in COMMANDS.items():
+        assert re.search(rf"^  {name} +{re.escape(text)}$", printed, re.M)
 
 
 @pytest.mark.parametrize("command", list(COMMANDS))
@@ -49,8 +42,15 @@ def test_help__names_all_options(command, capsys):
     assert run(f"{command} --help") == 0
     printed = capsys.readouterr().out
     assert printed.startswith(f"usage: brokk-min {command} ")
-    assert set(f"--seed {OPTIONS[command]}".split()) <= set(re.findall(r"--[\w-]+", printed))
-    assert "--no-resume" not in printed
+    assert set(OPTIONS[command].split()) <= set(re.findall(r"--[\w-]+", printed))
+
+
+def test_help__of_the_papers_agent_has_the_settings_of_ppo(capsys):
+    assert run("train --paper --help") == 0
+    printed = capsys.readouterr().out
+    assert {"--clip", "--gae-lambda", "--entropy"} <= set(re.findall(r"--[\w-]+", printed))
+    assert run("train --help") == 0
+    assert "--clip" not in capsys.readouterr().out
 
 
 HELP = """
@@ -60,7 +60,7 @@ for words in (["--version"], ["--help"], *([command, "--help"] for command in CO
     with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()) as printed:
         main(words)
     assert printed.getvalue(), words
-print({"torch", "scipy", "matplotlib", "gymnasium"} & set(sys.modules))
+print({"torch", "scipy", "matplotlib", "distributed"} & set(sys.modules))
 """
 
 
@@ -74,101 +74,54 @@ def test_version__is_that_of_the_project_and_of_its_citation(capsys):
     assert capsys.readouterr().out == f"brokk_min {brokk_min.__version__}\n"
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert project["version"] == brokk_min.__version__
-    citation = (ROOT / "CITATION.cff").read_text()
-    assert f"\nversion: {brokk_min.__version__}\n" in citation
+    assert f"\nversion: {brokk_min.__version__}\n" in (ROOT / "CITATION.cff").read_text()
 
 
-DRIVE = "drive --interface virtual --channel 0"
 TRAIN = "train --actuator missing.npz --out p.npz"
-OUTPUTS = (  # refused before any work
-    "collect --out",
-    "fit l.csv --out n.npz --json",
-    "train --actuator n.npz --out",
-    "machine --interface virtual --channel c --record",
-    "drive --interface virtual --channel c --controller jog --log",
-    "play --attempts",
-    "replay l.log --out",
-)
-UNWRITABLE = "brokk-min: no/x.csv: expected a file in an existing, writable directory"
 
 
 @pytest.mark.parametrize(
     ("line", "status", "message"),
     [
-        ("", 2, "COMMAND: expected one of collect, fit, score, inspect, preliminary, train, sweep"),
-        ("nonsense", 2, "play, replay, got nonsense; see brokk-min --help"),
-        ("collect", 2, "--out: expected a value, got none; see brokk-min collect --help"),
-        ("collect --out x.csv --hours a", 2, "--hours: expected FLOAT, got 'a'"),
-        ("collect --out x.csv --hurs 3", 2, "expected options such as --hours, got --hurs, 3"),
-        ("collect --out x.csv more", 2, "expected no further words, got more"),
-        ("collect --out x.csv --excitation noise", 2, "'ramp', 'joint', got noise"),
-        (f"collect --out x.csv --o {'a' * 999}", 2, "got --o, aaa"),
-        ("replay a.log --size 3", 2, "--size: expected 2 values, got fewer"),
-        ("replay a.log --size 3 x", 2, "--size: expected INT INT, got ['3', 'x']"),
-        (f"{TRAIN} --log-std-end a", 2, "--log-std-end: expected {None}|FLOAT, got ['a']"),
-        ("collect --out x.csv --hours 0", 2, "--hours: expected 0.0001 to 100, got 0.0"),
-        ("collect --out x.txt", 2, "--out: expected a name ending in .csv or .npz, got x.txt"),
-        ("collect --out x.csv --machine digger", 2, "brokk170"),
-        ("fit --out n.npz", 2, "LOGS: expected at least one log, got none"),
-        ("fit missing.csv --out n.npz", 1, "missing.csv: expected a readable CSV table, got no su"),
-        ("fit missing.csv --out n.npz --dead-zone 1.5", 2, "--dead-zone: expected 0 to 0.99"),
-        ("fit a.csv --out n.npz --velocity-samples 20", 2, "--history of that or more, got 13"),
-        ("fit a.csv --out n.csv", 2, "--out: expected a name ending in .npz, got n.csv"),
-        ("fit a.csv --out n.npz --paper --noise 0.5", 2, "expected none with --paper, got 0.5"),
-        ("fit log.mat --out n.npz", 1, "log.mat: expected a name ending in .csv or .npz"),
-        (f"{TRAIN} --paper --valves dither", 2, "--valves: expected none with --paper, got dither"),
-        (f"{TRAIN} --paper --limit-cost 1", 2, "--limit-cost: expected none with --paper, got 1.0"),
-        (TRAIN, 1, "missing.npz"),
-        (f"{TRAIN} --num-envs 0", 2, "--num-envs: expected 1 to 1000000, got 0"),
-        (f"{TRAIN} --hold-min-s 9", 2, "--hold-max-s: expected 9.0 to 1000000.0, got 3.0"),
+        ("", 2, "expected one of collect, inspect, fit, train, evaluate, reproduce, sweep"),
+        ("nonsense", 2, "replay, export, got 'nonsense'"),
+        ("collect --out x.txt", 2, "x.txt"),
+        ("collect --out no/x.csv", 2, "no/x.csv: expected a file in an existing, writable folder"),
+        ("collect --out x.csv --machine digger", 2, "--machine: expected brokk170 or FILE.py:NAME"),
+        ("collect --out x.csv --machine digger.py:X", 1, "--machine: expected digger.py to run"),
+        ("fit missing.csv --out n.npz", 1, "missing.csv"),
+        (TRAIN, 1, "missing.npz: no such file or directory"),
+        (f"{TRAIN} --total-steps 0", 2, "--total-steps: expected 1 or more, got 0"),
+        (f"{TRAIN} --gamma 1", 2, "--gamma: expected 0 to below 1, got 1.0"),
+        (f"{TRAIN} --hold-min-s 9", 2, "--hold-max-s: expected 9.0 or more, got 3.0"),
+        ("train --actuator n.npz --out no/p.npz", 2, "no/p.npz: expected a file in an existing"),
         ("sweep --actuator missing.npz --out s", 1, "missing.npz"),
+        ("sweep --actuator missing.npz --out s --seeds 0", 2, "--seeds: expected 1 or more, got 0"),
         ("evaluate --policy missing.npz", 1, "missing.npz"),
-        ("evaluate --starts s.csv --num-starts 2", 2, "expected none with --starts, got 2"),
-        ("evaluate --policy missing.npz --plant net --perfect-model", 2, "--perfect-model"),
-        (f"evaluate --machine '{MINI}'", 1, "policy.npz"),
-        ("preliminary --actuator missing.npz", 1, "missing.npz"),
         ("machine --interface nonsense --channel 0", 1, "nonsense"),
-        ("machine --interface virtual --channel 0 --start 9 9", 1, "start"),
-        ("drive --policy missing.npz", 2, "--interface, --channel: expected a CAN bus"),
-        ("drive --controller jog --channel can0", 2, "--interface, --channel: expected a CAN bus"),
-        (f"{DRIVE} --policy missing.npz", 1, "missing.npz"),
-        (DRIVE, 2, "--policy: expected a policy that `train` wrote, got none"),
-        (f"{DRIVE} --controller jog --joint q9", 2, "['q1', 'q3', 'q4', 'q5'], got q9"),
-        (f"{DRIVE} --controller jog --counts 81", 2, "--counts: expected at most 80, got 81"),
-        (f"{DRIVE} --controller jog --valves dither", 2, "expected none with --controller jog"),
-        (f"{DRIVE} --controller jog --command c.csv", 1, "c.csv"),
-        ("convert missing.log --out log.csv", 1, "missing.log"),
+        ("drive --interface virtual --channel 0 --policy missing.npz", 1, "missing.npz"),
         ("export --policy missing.npz --out p.onnx", 1, "missing.npz"),
-        ("play --drive", 2, "--interface, --channel: expected both"),
-        ("play --interface nonsense --channel 0", 1, "nonsense 0: expected a CAN bus"),
-        ("play --drive --interface nonsense --channel 0 --log a.log", 1, "nonsense 0: expected a"),
-        (f"play --machine '{MINI}' --start 9 9 9 9", 1, "start: expected 4 angles"),
-        ("replay a.log b.log c.log", 2, "LOGS: expected one or two, got 3"),
-        (
-            "replay a.log b.log --size 639 540",
-            2,
-            "expected 640 320 to 4000 4000 for 2 arms, got 639 ",
-        ),
-        ("replay a.json --controllers rl --size 4001 540", 2, "for 1 arms, got 4001 540"),
-        *((f"{line} no/x.csv", 2, UNWRITABLE) for line in OUTPUTS),
     ],
 )
 def test_wrong_use__is_refused_in_one_line(line, status, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     assert run(line) == status
     printed = capsys.readouterr()
     refusal = printed.err.splitlines()[-1]
-    assert refusal.startswith("brokk-min: ") and message in refusal and len(refusal) <= 300
-    assert not re.search("Traceback|Error|Errno", printed.err)
-    assert status == 1 or (printed.out, printed.err) == ("", f"{refusal}\n")
+    assert refusal.startswith("brokk-min: ") and message in refusal and len(refusal) <= 330
+    assert not re.search("Traceback|Errno", printed.err)
     assert not list(tmp_path.iterdir())
 
 
-def test_interrupt__is_one_line(monkeypatch, capsys):
-    def interrupt(command):
-        raise KeyboardInterrupt
+@pytest.mark.parametrize("line", ["collect", "collect --out x.csv --hours a", "train --hurs 3"])
+def test_wrong_options__are_explained_and_leave_with_status_2(line, capsys):
+    assert run(line) == 2
+    assert "Traceback" not in capsys.readouterr().err
 
-    monkeypatch.setattr(COMMANDS["starts"], "__call__", interrupt)
-    assert run("starts --out s.csv") == 1
-    assert capsys.readouterr().err == "brokk-min: stopped\n"
+
+def test_an_existing_file__is_kept_without_force(tmp_path, capsys):
+    path = tmp_path / "p.npz"
+    path.write_text("mine")
+    assert run("train --actuator n.npz --out", path) == 2
+    assert "expected no file (or --force), got one" in capsys.readouterr().err
+    assert path.read_text() == "mine"

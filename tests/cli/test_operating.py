@@ -1,113 +1,122 @@
-"""The commands at a machine: logs that are compared and converted, the window, films."""
+"""The commands at a machine: controllers, the window, films, ONNX."""
+
+import json
 
 import numpy as np
-import pygame
+import onnxruntime
 import pytest
-from helpers_bus import HoldingOperator, World
+from helpers_bus import BASELINE, HoldingOperator, World, only, random_policy
 from helpers_cli import run
 
 from brokk_min.can.operator_input import JointJog
-from brokk_min.cli.operating import Drive, Play
+from brokk_min.cli import operating
+from brokk_min.cli.operating import Drive, Play, status
+from brokk_min.cli.options import WrongUse
 from brokk_min.evaluation import baselines
-from brokk_min.identification.files import SHIPPED
-from brokk_min.identification.logs import read_log
-from brokk_min.jacobian import JacobianController
-from brokk_min.learning.policy import PolicyController, load_policy
+from brokk_min.learning.policy import PolicyController, load_policy, save_policy
 from brokk_min.machine import BROKK_170
-
-POLICY = SHIPPED / "brokk170" / "policy.npz"
-GAINS = SHIPPED / "brokk170" / "gains.json"
 
 
 @pytest.fixture(scope="module")
-def log(tmp_path_factory):
-    """Joint q4 jogs for two seconds, on a simulated machine and an injected clock."""
-    path = tmp_path_factory.mktemp("drive") / "run.log"
-    world = World(JointJog(BROKK_170, "q4", 30), HoldingOperator(), log=path)
-    world.drive.begin()
-    world.run(2.0)
-    world.bus.close()
+def folder(tmp_path_factory):
+    """A policy that nobody trained, and gains beside it that nobody tuned."""
+    path = tmp_path_factory.mktemp("policy")
+    policy = random_policy("paper")
+    save_policy(path / "policy.npz", policy, BROKK_170)
+    known = baselines.baselines(BROKK_170, policy.net)
+    known["jacobian_pid_k0.1"].gains.kp[:] = 7.0
+    meta = baselines.gains_metadata(BROKK_170, policy.net)
+    baselines.write_gains(path / "gains.json", known, meta)
     return path
 
 
-@pytest.mark.parametrize(
-    ("name", "kind"),
-    [("rl", PolicyController), ("jacobian", JacobianController), ("jog", JointJog)],
-)
-def test_drive__has_the_controller_that_is_named(name, kind, tmp_path):
+def test_drive__has_the_controller_that_is_named(folder, tmp_path, capsys):
+    where = {"interface": "virtual", "channel": "v", "policy": folder / "policy.npz"}
+    controllers = {
+        name: Drive(**where, controller=name).find_controller(BROKK_170)
+        for name in ("rl", "jacobian", "jog")
+    }
+    assert isinstance(controllers["rl"], PolicyController)
+    assert controllers["jog"] == JointJog(BROKK_170, "q1", 12)  # 0.07 * 127 = 8.9, and 3 more
+    assert (controllers["jacobian"].gains.kp == 7.0).all() and controllers["jacobian"].k == 0.1
+    assert capsys.readouterr().out.endswith("gains.json\n")
     copy = tmp_path / "p.npz"  # without gains beside it
-    copy.write_bytes(POLICY.read_bytes())
-    controller = Drive(policy=copy, controller=name, gains=GAINS)._controller(BROKK_170)
-    assert isinstance(controller, kind) and getattr(controller, "k", 0.1) == 0.1
+    copy.write_bytes((folder / "policy.npz").read_bytes())
+    by_hand = Drive(**where | {"policy": copy}, controller="jacobian").find_controller(BROKK_170)
+    assert (by_hand.gains.kp == 1.0).all()
+    assert capsys.readouterr().out == "gains of the Jacobian controller: set by hand\n"
 
 
-def test_drive__sends_the_frames_of_a_log_again(log, capsys):
-    jog = "drive --controller jog --joint q4 --counts"
-    assert run(f"{jog} 30 --replay", log) == 0
-    printed = capsys.readouterr().out
-    same, of, sent = printed.removeprefix(f"{log}: ").split()[:3]
-    assert (same, of) == (sent, "of")
-    assert int(sent) > 30
-    assert run(f"{jog} 31 --replay", log) == 1
-    assert "expected the frames of the log, got " in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("options", "refusal"),
+    [
+        ({"joint": "q2"}, r"--joint: expected a driven one of .*'q1', 'q3'.*, got q2"),
+        ({"counts": 81}, "--counts: expected 1 to 80, got 81"),
+        ({"counts": -5}, "--counts: expected 1 to 80, got -5"),
+    ],
+)
+def test_drive__refuses_to_jog_what_is_not_driven(options, refusal):
+    drive = Drive(interface="virtual", channel="v", controller="jog", **options)
+    with pytest.raises(WrongUse, match=refusal):
+        drive.find_controller(BROKK_170)
 
 
-def test_convert__makes_a_log_for_fit(log, tmp_path, capsys):
-    out = tmp_path / "log.csv"
-    assert run(f"convert '{log}' --out", out) == 0
-    (recording,) = read_log([out], 4).recordings
-    assert np.abs(recording.u[:, 3]).max() == pytest.approx(30 / 127)
-    assert not recording.u[:, :3].any()
-    assert capsys.readouterr().out == f"{out}: 1 recordings of q1, q2, q3, q4, q5\n"
+def test_status__says_what_stopped_it_and_what_is_in_the_way():
+    world = World(BASELINE, HoldingOperator())
+    world.drive.begin()
+    world.run(1.0)
+    text = status(world.drive)
+    assert text.startswith("driving v goal +0.10 +0.00 +0.00 measured ")
+    assert text.endswith("late 0.0 ms, skipped 0") and " q +0.0" in text
+    world.upward = only(0x185, lambda data: [])
+    world.run(0.2)
+    assert status(world.drive).startswith("waiting fault: q5: silent v goal ")
+    world.upward = only(0x703, lambda data: [])
+    world.run(0.5)
+    assert "fault: q5: silent, now q3: heartbeat lost v goal" in status(world.drive)
 
 
-def test_export__writes_an_onnx_file(tmp_path, capsys):
+def test_play__opens_the_window_with_policy_and_tuned_pid(folder, monkeypatch):
+    shown = []
+    monkeypatch.setattr("brokk_min.viewer.play.play", lambda *given: shown.append(given))
+    Play(policy=folder / "policy.npz", start=(0.0, 0.5, 0.6, 1.7, 1.2))()
+    machine, controllers, start, plant = shown[0]
+    assert machine is BROKK_170 and start == (0.0, 0.5, 0.6, 1.7, 1.2) and hasattr(plant, "step")
+    policy, pid = controllers.values()
+    assert isinstance(policy, PolicyController) and (pid.gains.kp == 7.0).all()
+
+
+def test_replay__makes_a_film_of_the_log_of_a_drive(tmp_path, capsys):
+    log = tmp_path / "run.log"
+    world = World(JointJog(BROKK_170, "q4", 30), HoldingOperator(), log=log)
+    world.drive.begin()
+    world.run(1.0)
+    world.bus.close()
+    assert run(f"replay '{log}' --fps 2 --out '{tmp_path}/a.gif'") == 0
+    assert (tmp_path / "a.gif").read_bytes().startswith(b"GIF8")
+    assert run(f"replay '{log}' '{log}' '{log}'") == 2
+    assert "LOGS: expected one or two, got 3" in capsys.readouterr().err
+
+
+def test_export__gives_the_policys_actions_and_what_it_must_agree_on(folder, tmp_path, capsys):
+    pytest.importorskip("onnxscript")
     out = tmp_path / "p.onnx"
-    assert run(f"export --policy '{POLICY}' --out", out) == 0
-    assert b"observation" in out.read_bytes()
+    assert run(f"export --policy '{folder}/policy.npz' --out", out) == 0
     assert capsys.readouterr().out.startswith(f"{out}: observation (batch, obs) in")
+    session = onnxruntime.InferenceSession(out)
+    policy = load_policy(folder / "policy.npz", BROKK_170)
+    observation = np.random.default_rng(0).standard_normal((7, 163), np.float32)
+    (action,) = session.run(["action"], {"observation": observation})
+    np.testing.assert_allclose(action, policy.act(observation), atol=1e-5)
+    told = {k: json.loads(v) for k, v in session.get_modelmeta().custom_metadata_map.items()}
+    assert told["driven"] == ["q1", "q3", "q4", "q5"] and told["interface"] == "paper"
+    assert len(told["mean"]) == len(told["scale"]) == 163 and told["rate"] == 20.0
 
 
-def test_play__has_policy_and_tuned_baseline(tmp_path, capsys):
-    net = load_policy(POLICY, BROKK_170).net
-    tuned = baselines.read_gains(GAINS, BROKK_170, net)["jacobian_pid_k0.1"]
-    copy = tmp_path / "p.npz"
-    copy.write_bytes(POLICY.read_bytes())
-    for command, gains in (
-        (Play(), GAINS),
-        (Play(policy=copy), None),
-        (Play(policy=copy, gains=GAINS), GAINS),
-    ):
-        controllers = command.controllers(BROKK_170)
-        jacobian = controllers["jacobian"]
-        assert isinstance(controllers["rl"], PolicyController)
-        assert isinstance(jacobian, JacobianController) and jacobian.k == 0.1
-        assert np.array_equal(jacobian.gains.kp, tuned.gains.kp) == (gains is not None)
-        expected = f"gains of the Jacobian controller: {gains or 'set by hand'}\n"
-        assert capsys.readouterr().out == expected
-
-
-@pytest.fixture(scope="module")
-def results(tmp_path_factory):
-    """Half a second of the package's policy and gains, from one of the machine's own starts."""
-    folder = tmp_path_factory.mktemp("runs")
-    (folder / "c.csv").write_text("sequence,time,vx,vy,vz\nup,0,0,0,0.1\nup,0.5,0,0,0\n")
-    out = folder / "runs.json"
-    assert run(f"evaluate --commands '{folder}/c.csv' --num-starts 1 --json", out) == 0
-    return out
-
-
-def test_replay__shows_results_and_logs(results, log, monkeypatch):
-    """A window that is closed at once."""
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    for shown in (f"'{results}'", f"'{results}' '{log}' --size 800 600"):
-        pygame.display.init()
-        pygame.event.post(pygame.event.Event(pygame.QUIT))
-        assert run(f"replay {shown} --controllers rl") == 0
-    assert not pygame.display.get_init()
-
-
-def test_replay__refuses_runs_that_the_results_do_not_have(results, capsys):
-    for wrong in ("--sequence down", "--start 1", "--start -1"):
-        assert run(f"replay '{results}' --controllers rl {wrong}") == 2
-        assert "expected some of ['up'], of ['rl'] and below 1, got " in capsys.readouterr().err
+def test_show_status__prints_lines_where_there_is_no_terminal(capsys):
+    world = World(BASELINE, HoldingOperator())
+    operating.show_status(world.drive)
+    assert (
+        capsys.readouterr().out
+        == "waiting, now error v goal +0.00 +0.00 +0.00 late 0.0 ms, skipped 0\n"
+    )

@@ -1,52 +1,39 @@
-"""The options of fits, trainings and tasks are the settings of those."""
+"""`train` from the command line, for both agents."""
 
-from dataclasses import fields
-from typing import get_type_hints
-
+import numpy as np
 import pytest
-import tyro
+from helpers_cli import run
+from helpers_machines import small_net
 
-from brokk_min.cli.identification import FitSettings
-from brokk_min.cli.options import checked
-from brokk_min.cli.training import LearnerSettings, TaskSettings
-from brokk_min.env import TaskConfig
-from brokk_min.identification.fitting import FitConfig
-from brokk_min.ppo import PPOConfig
+from brokk_min.identification.net_file import save_net
+from brokk_min.learning.policy import load_policy
+from brokk_min.machine import BROKK_170
 
-PAIRS = [(FitSettings, FitConfig), (LearnerSettings, PPOConfig), (TaskSettings, TaskConfig)]
-FIELDS = [(config, field) for _, config in PAIRS for field in fields(config)]
+SMALL = "--num-envs 8 --horizon 8 --minibatch-size 32 --total-steps 128"
 
 
-@pytest.mark.parametrize(("settings", "config"), PAIRS)
-def test_settings__have_the_fields_types_and_defaults_of_the_config(settings, config):
-    same = {}
-    if settings is FitSettings:  # by default by the machine and the log, else:
-        same = {"history": 13, "steps": 16000, "weight_decay": 0.0, "noise": 0.1}
-    assert get_type_hints(settings).keys() == get_type_hints(config).keys()
-    for name, hint in get_type_hints(config).items():
-        assert get_type_hints(settings)[name] in (hint, hint | None if name in same else hint)
-    assert vars(settings()) | same == vars(config())
-    assert checked(config, **vars(settings()) | same) == config()
+@pytest.mark.parametrize(
+    ("options", "interface", "learner"),
+    [
+        ("--gamma 0.8", "beyond", {"gamma": 0.8, "total_steps": 128, "num_envs": 8}),
+        ("--paper --clip 0.1 --entropy 0.01", "paper", {"clip": 0.1, "entropy": 0.01}),
+    ],
+)
+def test_train__has_its_settings_from_the_line(tmp_path, capsys, options, interface, learner):
+    save_net(tmp_path / "net.npz", small_net(BROKK_170, np.random.default_rng(0)))
+    files = f"--actuator {tmp_path}/net.npz --out {tmp_path}/p.npz"
+    assert run(f"train {files} {SMALL} {options} --hold-max-s 9 --seed 4") == 0
+    assert "trained for 128 steps" in capsys.readouterr().out
+    policy = load_policy(tmp_path / "p.npz", BROKK_170)
+    assert policy.interface == interface
+    recipe = policy.training["recipe"]
+    assert recipe["task"]["hold_max_s"] == 9 and policy.training["seed"] == 4
+    assert learner.items() <= recipe["learner"].items()
 
 
-@pytest.mark.parametrize(("config", "field"), FIELDS, ids=lambda x: getattr(x, "name", ""))
-def test_configs__refuse_what_no_setting_can_be(config, field):
-    """Each field: text, nan and infinity; below, at and above the ends of its range."""
-    bad = ["a", float("nan"), float("inf"), 10**400, [1], 1j]
-    if field.metadata:
-        low, high = field.metadata["low"], field.metadata["high"]
-        low = 0.5 if low == "hold_min_s" else low  # the default of that field
-        bad += [True, low - 1e-3 if field.type == "float" else low - 1, 1.01 * high + 1]
-        bad += [low + 0.5] if field.type.startswith("int") else []
-        ends = (low, high) if field.name != "hold_min_s" else (low, 3.0)
-        assert [getattr(config(**{field.name: end}), field.name) for end in ends] == [*ends]
-    bad += [] if "None" in field.type else [None]
-    for value in bad:
-        with pytest.raises(ValueError, match=f"^{field.name}: expected .*, got "):
-            config(**{field.name: value})
-
-
-@pytest.mark.parametrize("option", ["--integral-cost", "--lag-cost"])
-def test_task_settings__keep_the_old_name_of_an_option(option):
-    settings = tyro.cli(TaskSettings, args=[option, "2.5"])
-    assert checked(TaskConfig, **vars(settings)) == TaskConfig(integral_cost=2.5)
+def test_train__the_same_line_gives_the_same_bits(tmp_path):
+    save_net(tmp_path / "net.npz", small_net(BROKK_170, np.random.default_rng(0)))
+    for name in "ab":
+        assert run(f"train --actuator {tmp_path}/net.npz --out {tmp_path}/{name}.npz {SMALL}") == 0
+    first, second = (load_policy(tmp_path / f"{name}.npz", BROKK_170).weights for name in "ab")
+    assert all(map(np.array_equal, first, second))

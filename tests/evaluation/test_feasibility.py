@@ -1,17 +1,13 @@
-"""Which paths ideal actuators can follow, by hand; speeds of the joints by the plant."""
+"""Which paths ideal actuators can follow, by hand."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from strategies import machines
 
-from brokk_min.actuator import plant_reset, plant_step
 from brokk_min.evaluation import feasibility
 from brokk_min.kinematics import forward_kinematics, lowest_point, tool_position
-from brokk_min.machine import BROKK_170, valve_opening
+from brokk_min.machine import BROKK_170
 
 START = np.array(BROKK_170.q_start)
 STILL = np.zeros((2, 1, 3))
@@ -74,24 +70,5 @@ def test_first_failure__names_the_criterion():
         feasibility.first_failure(BROKK_170, start, fast),
     ]
     assert np.concatenate(found).tolist() == [0, 2, 3, 4]
-
-
-@given(machines(), st.data())
-def test_speed_limits__are_where_the_plant_settles(machine, data):
-    """One joint alone at the command limit, with a pump that suffices."""
-    machine = replace(machine, pump_flow=1.0)
-    low, high = machine.column("q_min"), machine.column("q_max")
-    joint = data.draw(st.sampled_from(range(machine.n)))
-    side = data.draw(st.sampled_from([0, 1]))
-    u = np.zeros(machine.n)
-    u[joint] = (2 * side - 1) * machine.pwm_limit / 127
-    opening = valve_opening(u, machine.dead_zones)
-    state = plant_reset(machine, low + (0.05 if side else 0.95) * (high - low))
-    speed = np.where(side, machine.column("speed_positive"), -machine.column("speed_negative"))
-    state = state._replace(z=np.ones(machine.n), s=opening, v=speed * np.abs(opening))
-    state = state._replace(delayed=np.repeat(u[:, None], state.delayed.shape[-1], axis=1))
-    after = plant_step(machine, state, u)
-    result = feasibility.speed_limits(machine, np.stack([state.q, after.q]))[side][:, joint]
-    q_dot = (after.q - state.q)[joint] * machine.rate
-    if low[joint] < after.q[joint] < high[joint]:
-        assert min(result) - 1e-3 * abs(q_dot) <= q_dot <= max(result) + 1e-3 * abs(q_dot)
+    text = feasibility.most_frequent([*found, found[-1]])
+    assert text == f"2 of 4 others fail: {feasibility.CRITERIA[3]}"

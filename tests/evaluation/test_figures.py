@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from brokk_min.evaluation import figures
 from brokk_min.evaluation.preliminary import Motion, SimulatorTests, Sweep
@@ -10,7 +11,7 @@ from brokk_min.evaluation.sequences import axis_sequences
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
 
-POSE = list(BROKK_170.q_start)
+POSE = np.array(BROKK_170.q_start)
 RNG = np.random.default_rng(0)
 
 
@@ -22,6 +23,14 @@ def ylabels(figure):
     return [ax.get_ylabel() for ax in figure.axes]
 
 
+def test_plot_panels__draw_the_median_of_many_runs_between_10_and_90_percent():
+    x, y = np.arange(3.0), np.arange(33.0).reshape(3, 11)  # eleven runs: 0 to 10, 11 to 21, ...
+    ax = figures.plot_panels([[figures.Panel("", "x [m]", "y [m]", {"all": (x, y)})]]).axes[0]
+    np.testing.assert_array_equal(curves(ax)["all"], [x, [5, 16, 27]])
+    band = ax.collections[0].get_paths()[0].vertices
+    assert (band[:, 1].min(), band[:, 1].max()) == (1, 31)
+
+
 def test_plot_tests__shows_machine_above_nets():
     x = np.arange(3.0)
     rows = {}
@@ -30,10 +39,9 @@ def test_plot_tests__shows_machine_above_nets():
         rows[kind] = SimulatorTests(sweeps, coupling, {"from idle": (x, k + x)}, {})
     figure = figures.plot_tests(BROKK_170, rows)
     assert ylabels(figure) == ["velocity q5 [rad/s]"] * 6
-    assert [ax.get_xlabel() for ax in figure.axes[:3]] == [
-        "q5 [rad]", "q5 [rad]", "time after the step [s]"
-    ]  # fmt: skip
-    titles = [ax.get_legend().get_title().get_text() for ax in figure.axes[2:4]]
+    labels = ["q5 [rad]", "q5 [rad]", "time after the step [s]"]
+    assert [ax.get_xlabel() for ax in figure.axes[:3]] == labels
+    titles = [ax.get_title() for ax in figure.axes[2:4]]
     assert titles == ["machine: past movement", "nets: range and direction"]
     np.testing.assert_array_equal(curves(figure.axes[3])["u = 50"], [x, 2 * x])
     np.testing.assert_array_equal(curves(figure.axes[4])["alone"], [x, -2 * x])
@@ -48,9 +56,6 @@ def test_plot_gap__has_a_row_for_the_tool_and_for_each_driven_joint():
     time = [0.05, 0.1, 0.15, 0.2]
     distance = 1000 * np.linalg.norm(gap.p_tool, axis=-1)
     np.testing.assert_allclose(curves(figure.axes[1])["first run"], [time, distance[:, 0]])
-    median = curves(figure.axes[1])["median of all runs"]
-    np.testing.assert_allclose(median, [time, distance.mean(axis=1)])
-    np.testing.assert_allclose(curves(figure.axes[4])["first run"], [time, gap.q_dot[:, 0, 2]])
     np.testing.assert_allclose(curves(figure.axes[9])["first run"], [time, 1000 * gap.q[:, 0, 4]])
 
 
@@ -59,36 +64,26 @@ def test_plot_sequence__is_relative_to_where_the_tool_began():
     sizes = {"p_tool": 3, "v_tool": 3, "q_dot": 5}
     trace = SimpleNamespace(**{name: RNG.normal(size=(520, 2, n)) for name, n in sizes.items()})
     traces = {("rl", "x"): trace, ("pid", "y"): None}
-    figure = figures.plot_sequence(BROKK_170, traces, sequence, np.array(POSE), 1)
-    goals = sequence.for_starts(BROKK_170, np.tile(POSE, (2, 1)))[:, 1]
+    figure = figures.plot_sequence(BROKK_170, traces, sequence, POSE, 1)
+    goals = sequence.for_starts(BROKK_170, POSE[None])[:, 0]
     time = 0.05 * np.arange(1, 521)
     positions = [f"{axis} - {axis}(0) [m]" for axis in "xyz"]
     assert ylabels(figure) == positions + [f"velocity {axis} [m/s]" for axis in "xyz"]
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["goal", "RL policy"]
+    (goal, policy) = (text.get_text() for text in figure.legends[0].get_texts())
     p_start = tool_position(forward_kinematics(BROKK_170, POSE))
     for i in range(3):
         above, below = curves(figure.axes[i]), curves(figure.axes[3 + i])
-        np.testing.assert_allclose(above["RL policy"], [time, trace.p_tool[:, 1, i] - p_start[i]])
-        np.testing.assert_allclose(above["goal"], [time, 0.05 * np.cumsum(goals[:, i])])
-        np.testing.assert_allclose(below["RL policy"], [time, trace.v_tool[:, 1, i]])
-        np.testing.assert_allclose(below["goal"], [time, goals[:, i]])
+        np.testing.assert_allclose(above[policy], [time, trace.p_tool[:, 1, i] - p_start[i]])
+        np.testing.assert_allclose(above[goal], [time, 0.05 * np.cumsum(goals[:, i])])
+        np.testing.assert_allclose(below[policy], [time, trace.v_tool[:, 1, i]])
     joints = figures.plot_joint_velocities(BROKK_170, traces, "x", 1)
     assert ylabels(joints) == [f"velocity q{i} [rad/s]" for i in (1, 3, 4, 5)]
-    np.testing.assert_array_equal(curves(joints.axes[2])["RL policy"], [time, trace.q_dot[:, 1, 3]])
-
-
-def test_styles__tell_controllers_apart_without_colour():
-    controllers = [name for name in figures.STYLES if name.startswith(("rl", "jacobian"))]
-    for marks in (figures.MARKERS, figures.HATCHES):
-        assert len({marks[name] for name in controllers}) == len(controllers) == 8
-    dashes = {str(figures.STYLES[name].get("linestyle")) for name in ("goal", *controllers)}
-    assert len(dashes) == 9
+    np.testing.assert_array_equal(curves(joints.axes[2])[policy], [time, trace.q_dot[:, 1, 3]])
 
 
 def test_plot_starts__draws_arms_from_the_side_and_from_above():
     starts = np.array([[0.5 * np.pi, *POSE[1:]], [0.0, *POSE[1:]], POSE])
-    kinds = ["limits", "workspace", "limits"]
-    figure = figures.plot_starts(BROKK_170, starts, kinds)
+    figure = figures.plot_starts(BROKK_170, starts, ["limits", "workspace", "limits"])
     side, top = ([np.array(arm.get_data()) for arm in ax.get_lines()] for ax in figure.axes)
     for arm in side[:3]:
         np.testing.assert_allclose(arm, side[0], atol=1e-9)  # turned arms look the same
@@ -98,6 +93,13 @@ def test_plot_starts__draws_arms_from_the_side_and_from_above():
     for arm, end in zip(top, ends, strict=True):
         np.testing.assert_allclose(arm[:, -1], end, atol=0.01)
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["limits", "workspace"]
-    assert [ax.get_aspect() for ax in figure.axes] == [1.0, 1.0]
-    colors = [arm.get_color() for arm in figure.axes[1].get_lines()]
-    assert colors == [figures.STYLES[kind]["color"] for kind in kinds]
+
+
+def test_plot_intervals__has_a_mark_and_a_bar_for_each_controller():
+    numbers = {"rl": {"mean": 2.0, "low": 1.5, "high": 3.0}}
+    numbers["pid"] = {"mean": 4.0, "low": None, "high": None}  # one start: no interval
+    ax = figures.plot_intervals({"error [m/s]": numbers}).axes[0]
+    assert [tuple(mark.get_xdata()) for mark in ax.get_lines()] == [(2.0,), (4.0,)]
+    ((left, right),) = ax.collections[0].get_segments()
+    assert (left[0], right[0]) == pytest.approx((1.5, 3.0)) and left[1] == 0
+    assert ax.get_xlabel() == "error [m/s]"

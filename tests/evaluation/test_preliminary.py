@@ -2,14 +2,15 @@
 
 import json
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 from helpers_machines import small_net
 
+from brokk_min.actuator import PLANT
 from brokk_min.evaluation import preliminary
 from brokk_min.evaluation.preliminary import Motion, Sweep
-from brokk_min.identification.simulation import plant_simulator
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
 from examples.mini_excavator import MINI_EXCAVATOR
@@ -18,23 +19,31 @@ LOW, HIGH = BROKK_170.column("q_min"), BROKK_170.column("q_max")
 COARSE = replace(BROKK_170, plant_dt=0.025)  # two Euler steps a tick: fast
 
 
-def two_speeds(up, down):
-    """Joints that move at one speed in each direction, whatever the command."""
-
-    def simulate(q, u):
-        speed = np.where(u > 0, up, np.where(u < 0, -down, 0.0))
-        return np.concatenate([q[None], q + np.cumsum(speed, axis=0) / 20])
-
-    return simulate
+class Angles(NamedTuple):
+    q: np.ndarray
 
 
-def standing(q, u):
-    return np.repeat(q[None], len(u) + 1, axis=0)
+class TwoSpeeds:
+    """Joints that move at one speed in each direction, whatever the command; keeps its inputs."""
+
+    def __init__(self, up, down):
+        self.up, self.down = up, down
+        self.starts, self.commands = [], []
+
+    def reset(self, machine, q):
+        self.starts.append(q)
+        self.commands.append([])
+        return Angles(q)
+
+    def step(self, machine, state, u):
+        self.commands[-1].append(u)
+        speed = np.where(u > 0, self.up, np.where(u < 0, -self.down, 0.0))
+        return Angles(state.q + speed * machine.dt)
 
 
 @pytest.fixture(scope="module")
 def of_plant():
-    return preliminary.preliminary_tests(BROKK_170, plant_simulator(BROKK_170))
+    return preliminary.preliminary_tests(BROKK_170, PLANT)
 
 
 def test_sweeps__go_from_stop_to_stop_at_the_papers_speeds(of_plant):
@@ -47,14 +56,9 @@ def test_sweeps__go_from_stop_to_stop_at_the_papers_speeds(of_plant):
 
 
 def test_preliminary_tests__move_the_last_driven_joint_at_two_levels():
-    calls = []
-
-    def simulate(q, u):
-        calls.append((q, u))
-        return two_speeds(0.25, 0.5)(q, u)
-
-    tests = preliminary.preliminary_tests(BROKK_170, simulate)
-    q, u = calls[0]
+    plant = TwoSpeeds(0.25, 0.5)
+    tests = preliminary.preliminary_tests(BROKK_170, plant)
+    q, u = plant.starts[0], np.array(plant.commands[0])
     counts = [[0, 0, 0, 0, c] for c in (50, 80, -80, -50)] + [[-80, 0, -80, 80, 80]]
     assert (u == u[0]).all() and u.shape == (800, 5, 5)
     np.testing.assert_allclose(u[0] * 127, counts)
@@ -72,6 +76,33 @@ def test_preliminary_tests__move_the_last_driven_joint_at_two_levels():
     assert list(tests.response_time) == ["q1", "q3", "q4", "q5"]
 
 
+def test_step_velocities__steps_each_driven_joint_alone_from_behind():
+    plant = TwoSpeeds(0.25, 0.5)
+    velocity = preliminary.step_velocities(BROKK_170, plant)
+    assert velocity.shape == (60, 2, 2, 4)
+    np.testing.assert_allclose(velocity[30:, :, 0], 0.25)
+    np.testing.assert_allclose(velocity[30:, :, 1], 0.5)
+    assert not velocity[:30, 0].any() and velocity[:30, 1].all()
+    q, u = plant.starts[0], np.array(plant.commands[0])
+    assert q[0, 0, 3, 4] == pytest.approx(0.2) and q[1, 1, 3, 4] == pytest.approx(1.8)
+    assert q[0, 1, 2, 4] == pytest.approx(1.0)  # another one steps
+    half = (80 / 127 + 0.07) / 2
+    for i, joint in enumerate(BROKK_170.driven):
+        assert not np.delete(u[:, :, :, i], joint, axis=-1).any()
+        np.testing.assert_allclose(u[[0, 30], 1, 1, i, joint], [-half, -80 / 127])
+
+
+def test_response_times__by_hand():
+    """63 % of 0.1 rad/s is reached between the middles of the first two ticks after the step."""
+    velocity = np.zeros((6, 2, 2, 1))
+    velocity[3:, 0, 0, 0] = [0.05, 0.09, 0.1]
+    velocity[3:, 1, 0, 0] = 0.1  # at once: between the middles of the ticks around the step
+    times = preliminary.response_times(velocity, 20.0)
+    assert times[0, 0, 0] == pytest.approx(0.05 * (0.5 + (0.063 - 0.05) / 0.04))
+    assert times[1, 0, 0] == pytest.approx(0.05 * (0.63 - 0.5))
+    assert np.isnan(times[:, 1]).all()
+
+
 def test_preliminary_tests__of_the_plant_have_the_papers_response_times(of_plant):
     for joint in of_plant.response_time.values():
         assert joint["idle"]["up"] == pytest.approx(0.40, abs=0.01)
@@ -83,15 +114,20 @@ def test_preliminary_tests__of_the_plant_have_the_papers_response_times(of_plant
 @pytest.mark.parametrize("machine", [COARSE, replace(COARSE, q_start=())])
 def test_sim_to_real__is_between_tools_where_the_arms_end(machine):
     """Nets that stand still: the gap is what the machine moved, from its own start pose."""
-    calls = {}
 
-    def plant(q, u):
-        calls["u"] = u
-        calls["q"] = plant_simulator(COARSE)(q, u)
-        return calls["q"]
+    class Watched(TwoSpeeds):
+        def step(self, machine, state, u):
+            self.commands[-1].append(u)
+            return PLANT.step(machine, state, u)
 
-    gap = preliminary.sim_to_real(machine, {"machine": plant, "nets": standing}, 7)
-    q, u = calls["q"], calls["u"]
+        def reset(self, machine, q):
+            super().reset(machine, q)
+            return PLANT.reset(machine, q)
+
+    plant = Watched(0, 0)
+    gap = preliminary.sim_to_real(machine, {"machine": plant, "nets": TwoSpeeds(0.0, 0.0)}, 7)
+    u = np.array(plant.commands[0])
+    q = preliminary.simulate(machine, PLANT, plant.starts[0], u)
     assert u.shape == (600, 20, 5) and not u[..., 1].any()
     assert np.all((np.abs(u) > 0.07).sum(axis=-1).max(axis=0) > 1)  # several joints at once
     start = machine.q_start or (LOW + HIGH) / 2
@@ -115,14 +151,16 @@ def test_numbers__of_another_machine_are_json():
     assert set(result["response_time"]) == set(result["coupling_rms"]) == {"machine", "nets"}
     assert measured.gap.q.shape == (30 * machine.rate, 20, machine.n)
     assert not measured.gap.q[..., machine.locked].any()
+    for u, row in result["sweep"].items():
+        peaks = [np.abs(measured.tests[k].sweeps[u].q_dot).max() for k in ("machine", "nets")]
+        assert [row["machine_peak"], row["nets_peak"]] == peaks
 
 
-def test_sweep_numbers__are_peaks_and_a_difference_without_the_outer_twentieths():
+def test_sweep_rms__is_of_the_same_angles_without_the_outer_twentieths():
     q = np.linspace(0.0, 1.0, 201)
     ends = np.where((q < 0.03) | (q > 0.97), 7.0, 0.3)
-    result = preliminary.sweep_numbers(Sweep(q[::-1], -0.5 + 0 * q), Sweep(q, ends))
-    difference = pytest.approx(0.8)
-    assert result == {"machine_peak": 0.5, "nets_peak": 7.0, "difference_rms": difference}
+    sweeps = Sweep(q[::-1], -0.5 + 0 * q), Sweep(q, ends)
+    assert preliminary.sweep_rms(*sweeps) == pytest.approx(0.8)
     wider = np.where(np.abs(q - 0.5) < 0.4251, 0.3, 7.0)  # differs at 0.06 and 0.94
     assert preliminary.sweep_rms(Sweep(q, 0.3 + 0 * q), Sweep(q, wider)) > 0.1
 

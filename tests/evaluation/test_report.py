@@ -1,70 +1,89 @@
-"""Texts and tables of the report; the page itself is drawn in test_reproduce.py."""
+"""The page says in its first sentence what was measured, and has each sentence of the paper."""
 
-import json
+import html
+import re
+from collections import defaultdict
 
 import numpy as np
 import pytest
 
-from brokk_min.evaluation import report
-from brokk_min.machine import BROKK_170
+from brokk_min.evaluation import metrics, report
+from brokk_min.evaluation.claims import TEXTS, net_claims, task_claims
+
+ERRORS = {"rl": 0.0101, "rl_paper": 0.0303, "jacobian_pid_k0.1": 0.0202}
+ERRORS |= {"jacobian_pid_k0.05": 0.0204, "jacobian_pid_ff_integral": 0.0105}
+RNG = np.random.default_rng(0)
 
 
-def number(mean, low=None, high=None):
-    return {"mean": mean, "low": low, "high": high}
+def run(controller, sequence, start):
+    figures = {key: 10 * ERRORS[controller] + RNG.normal(0, 1e-5) for key in report.COLUMNS}
+    figures["velocity_error_mean"] = ERRORS[controller] + (start - 0.5) * 2e-4
+    labels = zip(metrics.LABELS, (controller, sequence, start, "workspace"), strict=True)
+    return dict(labels) | figures
+
+
+@pytest.fixture(scope="module")
+def results():
+    """As `reproduce` has them, of made-up runs from two starts."""
+    runs = [run(c, s, start) for c in ERRORS for s in "xyz" for start in (0, 1)]
+    one = {"one_step_rmse": 0.01, "free_run": {"10": {"velocity_rmse": 0.0234}}}
+    recipe = {"test": {"q1": one, "q5": {"one_step_rmse": 0.02, "free_run": {}}}}
+    peaks = {name: {"nets_peak": peak} for name, peak in zip("abc", (0.1, 0.24, 0.45))}
+    gap = {"tool": {"position_error_mean": 0.02}}
+    gap["tool_position_error_mean_of_runs"] = {"median": 0.03}
+    times = {"idle": {"up": 0.4}, "moving": {"up": 0.1}}
+    numbers = {"sweep": peaks, "joint": "q5", "response_time": {"nets": {"q5": times}}}
+    damped = {name: [0.5, 0.6, 0.55] for name in ERRORS}
+    singular = {"speed": damped, "jerk": damped}
+    claims = [*net_claims(numbers | {"sim_to_real": gap}), *task_claims(runs, singular)]
+    return {
+        "meta": {"machine": "digger <1>", "seed": 3, "effort": {"hours": 0.1}},
+        "nets": {"net": recipe, "net_paper": recipe},
+        "task_space": {"means": metrics.means(runs)},
+        "robustness": {"nominal": {"rl": {"mean": 0.01, "low": 0.009, "high": 0.012}}},
+        "claims": [claim.to_json() for claim in claims],
+        "start_kinds": ["workspace", "limits", "workspace"],
+    }
+
+
+@pytest.fixture(scope="module")
+def page(results):
+    return report.render(results, defaultdict(lambda: "QUJD"), 12.4)
+
+
+def test_render__begins_with_one_sentence_one_figure_and_a_table(page):
+    first = page.split("<h2>")[0]
+    sentence, _, rest = first.partition("<img")
+    numbers = re.findall(r"[\d.]+ m/s", sentence.split("<p>")[1])
+    assert numbers == ["0.0101 m/s", "0.0303 m/s", "0.0202 m/s", "0.0105 m/s"]
+    rows = re.findall(r"<tr><td>(.*?)</td><td>(.*?)</td>", rest)
+    assert len(rows) == len(ERRORS) and rest.count("<table>") == 1
+    # two starts, 0.0100 and 0.0102: half an interval is 12.7062 x 0.0002 / sqrt(2) / sqrt(2)
+    assert rows[0][1] == "0.0101 (0.0088 to 0.0114)"
+    assert "over 2 start poses" in rest and "12 minutes on a small budget" in rest
+
+
+def test_render__has_each_sentence_of_the_paper_below_its_figure(page):
+    assert page.count("<blockquote>") == len(TEXTS)
+    places = dict(re.findall(r"<h2>(.*?)</h2>(.*?)(?=<h2>|</body>)", page, re.S))
+    for figure in ("Fig. 2", "Fig. 5", "Fig. 6a", "Fig. 6b-d", "Fig. 6e, f", "Fig. 6g, h"):
+        (section,) = (text for title, text in places.items() if title.startswith(f"{figure}:"))
+        wanted = [t["paper"] for t in TEXTS.values() if t["figure"].startswith(figure)]
+        found = re.findall("&ldquo;(.*?)&rdquo; We measured", section)
+        assert [html.unescape(quote) for quote in found] == wanted
+        assert "<img" in section
+
+
+def test_render__escapes_names_and_loads_nothing(page):
+    assert "digger &lt;1&gt;" in page
+    text = re.sub('base64,[^"]*', "", page)
+    assert not re.findall(r'(?:src|href)="(?!data:|#)', text) and "http" not in text
 
 
 @pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (number(41.267, 40.0, 42.5), "41.27 (40 to 42.5)"),
-        (number(0.5), "0.5000"),
-        (number(None), ""),
-    ],
+    ("number", "text"),
+    [((41.267, 40.0, 42.5), "41.27 (40 to 42.5)"), ((0.5, None, None), "0.5000")],
 )
-def test_interval_text__has_digits_that_tell_it(value, text):
-    assert report.interval_text(value) == text
-
-
-def test_path_row__lists_the_goals_that_hold():
-    row = report.path_row(np.array([[1.0, 0.0, 0.0, 0.0], [0.85, -0.0, -0.2, 0.0]]))
-    *numbers, goals = row.values()
-    assert numbers == pytest.approx([1.85, 1, 0.2, 0.17])
-    assert goals == "1 s (0, 0, 0); 0.85 s (0, -0.2, 0)"
-    assert report.path_row(np.ones((60, 4)))["held for, vx, vy, vz [m/s]"] == "new at every tick"
-
-
-def test_compare__has_the_sides_of_the_intervals():
-    less = {"a": number(-1.0, -2.0, -0.1), "b": number(1.0, 0.1, 2.0), "c": number(0.0, -1.0, 1.0)}
-    less["d"] = number(-1.0)
-    rows = {"velocity_error_mean": {name: {"all": value} for name, value in less.items()}}
-    sides = {"lower than": ["a"], "higher than": ["b"], "not told apart from": ["c", "d"]}
-    assert report.compare({"task_space": {"rl_less": rows}}) == sides
-
-
-def test_less_than__has_fractions_of_the_others_figures():
-    keys = [key for _, key, _ in report.FIRST.values()]
-    summary = {"rl": {"all": dict.fromkeys(keys, 3.0)}, "pid": {"all": dict.fromkeys(keys, 4.0)}}
-    assert report.less_than(summary, "pid") == dict.fromkeys(report.FIRST, 0.25)
-
-
-def test_first_panels__are_seeds_before_this_run(tmp_path, monkeypatch):
-    folder = tmp_path / BROKK_170.name
-    folder.mkdir()
-    row = {"controller": "ours dither", "seed": 0, "error": 1, "drift": 0, "jerk": 1}
-    row["valve_travel"] = 2
-    rows = [row, row | {"seed": 1, "error": 3}, row | {"controller": "pid", "seed": None}]
-    (folder / "seeds.json").write_text(json.dumps(rows))
-    monkeypatch.setattr(report, "SHIPPED", tmp_path)
-    keys = ("velocity_error_mean", "off_axis_drift_max", "jerk_rms", "valve_travel")
-    summary = {"rl": {"all": dict.fromkeys(keys, 5.0)}}
-    intervals = {"rl": {"all": {key: [4.0, 6.0] for key in keys}}}
-    swept = {"rl": {"velocity_error_all": number(7.0, 6.0, 8.0)}}
-    task = {"summary": summary, "intervals": intervals}
-    panels = report.first_panels(BROKK_170, {"training_seeds": swept, "task_space": task})
-    assert list(panels) == list(report.FIRST)
-    error = panels["error [m/s]"]
-    assert list(error) == ["RL policy (dither), 2 seeds", "rl, swept seeds", "rl"]
-    assert error["RL policy (dither), 2 seeds"]["rl_dither"]["mean"] == 2.0
-    assert error["rl, swept seeds"]["rl"] == number(7.0, 6.0, 8.0)
-    assert error["rl"]["rl"] == number(5.0, 4.0, 6.0)
-    assert panels["jerk [m/s^3]"]["rl, swept seeds"]["rl"] == number(None)  # of older sweeps
+def test_interval_text__has_digits_that_tell_it(number, text):
+    keys = ("mean", "low", "high")
+    assert report.interval_text(dict(zip(keys, number, strict=True))) == text

@@ -1,5 +1,8 @@
 """Logs: what is written reads back, any rate becomes the machine's, and errors have a place."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,8 +13,8 @@ from brokk_min.identification.logs import (
     Recording,
     driven,
     in_order,
+    join_logs,
     join_recordings,
-    part_of,
     read_log,
     split,
     velocity_of,
@@ -64,7 +67,7 @@ def some_log(velocity_logged, lengths=(30, 1, 7)):
     recordings = []
     for i, length in enumerate(lengths):
         u, q, q_dot = rng.integers(-80, 81, (length, 3)) / 127, *rng.uniform(-2, 2, (2, length, 3))
-        recordings.append(Recording(f'run {i}, "wet"', u, q, q_dot))
+        recordings.append(Recording(f"run {i} wet", u, q, q_dot))
     return Log(("boom", "stick", "q_dot_like"), tuple(recordings), velocity_logged)
 
 
@@ -85,11 +88,9 @@ def test_write_log__reads_back(tmp_path, suffix, velocity_logged):
         np.testing.assert_allclose(got.q_dot, q_dot, atol=max(tolerance, 1e-12) * 30)
 
 
-@pytest.mark.parametrize("name", ["log.txt", "log", "log.npz.gz"])
-def test_write_log__refuses_another_suffix_and_an_empty_log(tmp_path, name):
-    with pytest.raises(ValueError, match=r"\.csv or \.npz") as caught:
-        write_log(tmp_path / name, some_log(False))
-    assert str(tmp_path / name) in str(caught.value)
+def test_write_log__refuses_another_suffix_and_an_empty_log(tmp_path):
+    with pytest.raises(ValueError, match=r"log\.txt: expected a name in \.csv or \.npz, got \.txt"):
+        write_log(tmp_path / "log.txt", some_log(False))
     with pytest.raises(ValueError, match="at least one recording to write"):
         write_log(tmp_path / "log.csv", some_log(False, ()))
     assert not list(tmp_path.iterdir())
@@ -148,7 +149,7 @@ def test_read_log__has_the_requested_rate_and_refuses_slower_logs(tmp_path, rate
     again = read_log([tmp_path / "again.csv"], 4, rate=rate)
     assert again.rate == log.rate == rate
     np.testing.assert_allclose(again.recordings[0].q, log.recordings[0].q, atol=1e-6)
-    with pytest.raises(ValueError, match=r"expected s, at 200 Hz, .*more, in 'a', got 100 Hz"):
+    with pytest.raises(ValueError, match=r"expected s, at 200 Hz, .*or more, got 100 Hz"):
         read_log([tmp_path / "log.csv"], 4, rate=200.0)
 
 
@@ -171,9 +172,8 @@ def test_read_log__drops_returns(tmp_path):
     assert [r.name for r in log.recordings] == ["q1_00", "q1_01"]
     np.testing.assert_allclose(log.recordings[1].q[:, 0], table("", time, 3)["q_a"], atol=1e-9)
     path = write(tmp_path / "log.csv", table("x_return", time))
-    for paths in ([path], []):
-        with pytest.raises(ValueError, match="expected at least one recording, got none"):
-            read_log(paths, 4)
+    with pytest.raises(ValueError, match=r"log\.csv: expected at least one recording, got none"):
+        read_log([path], 4)
 
 
 def test_read_log__cuts_a_recording_at_gaps(tmp_path):
@@ -238,8 +238,10 @@ def test_read_log__has_the_requested_joints_in_the_requested_order(tmp_path):
     again = in_order(read_log([path], 4), ["stick", "boom", "swing"])
     np.testing.assert_array_equal(again.recordings[0].q[:, [0, 2]], log.recordings[0].q)
     np.testing.assert_array_equal(again.recordings[0].u[:, [0, 2]], log.recordings[0].u)
-    with pytest.raises(ValueError, match=r"log\.csv: .*expected a column u_bucket"):
+    with pytest.raises(ValueError, match=r"log\.csv: columns: expected \['u_bucket'\], got"):
         read_log([path], 4, joints=["swing", "bucket"])
+    with pytest.raises(ValueError, match=r"joints: expected \['a'\], got \['swing', "):
+        in_order(read_log([path], 4), ["a"])
 
 
 def test_read_log__joins_files_of_the_same_joints_only(tmp_path):
@@ -253,22 +255,14 @@ def test_read_log__joins_files_of_the_same_joints_only(tmp_path):
     with_velocity = write(
         tmp_path / "3.csv", first | {"q_dot_a": np.zeros(30), "q_dot_b": np.zeros(30)}
     )
-    with pytest.raises(ValueError, match=r"3\.csv: expected q_dot columns in all files or none"):
+    with pytest.raises(ValueError, match=r"3\.csv: columns: expected q_dot in all files"):
         read_log([*paths, with_velocity], 4)
     more = write(tmp_path / "4.csv", table("x", time, 0, ("a", "b", "c")))
-    with pytest.raises(ValueError, match=r"4\.csv: .*joints \['a', 'b'\], got \['a', 'b', 'c'\]"):
+    with pytest.raises(
+        ValueError, match=r"4\.csv: joints: expected \['a', 'b'\], got \['a', 'b', 'c'\]"
+    ):
         read_log([*paths, more], 4)
     assert read_log([*paths, more], 4, joints=["a"]).joints == ("a",)
-
-
-@pytest.mark.parametrize("kind", ["q", "q_dot"])
-def test_read_log__refuses_an_angle_without_a_command_unless_joints_are_given(tmp_path, kind):
-    columns = table("x", np.arange(30) / 20) | {"q_dot_a": np.zeros(30), "q_dot_b": np.zeros(30)}
-    path = write(tmp_path / "log.npz", columns | {f"{kind}_boom": np.zeros(30)})
-    with pytest.raises(ValueError, match=f"a column u_boom for {kind}_boom") as caught:
-        read_log([path], 4)
-    assert str(path) in str(caught.value)
-    assert read_log([path], 4, joints=["b"]).joints == ("b",)
 
 
 # --- joined recordings ----------------------------------------------------------------------------
@@ -303,47 +297,56 @@ x,0.05,0.2,1.1
 x,0.10,0.3,1.2
 x,0.15,0.4,1.3
 """
-BAD_CSV = {
-    "empty file": ("", "header and at least one row, got 0 rows"),
-    "decimal comma": (GOOD.replace("1.2", "1,2"), "row 4: expected 4 cells, got 5"),
-    "blank line": (GOOD.replace("x,0.10", "\nx,0.10"), "row 4: expected 4 cells, got 0"),
-    "repeated time": (GOOD.replace("0.10", "0.05"), "row 4, column time: expected later than 0.05"),
-    "wrong delimiter": (GOOD.replace(",", ";"), "row 1: expected names of columns with commas"),
-    "column twice": (GOOD.replace("q_a", "u_a", 1), "expected each column once, got ['u_a']"),
+REFUSALS = {
+    "nothing": ("", "expected a CSV table with columns run, time, got "),
+    "decimal comma": (GOOD.replace("1.2", "1,2"), "row 4: expected 4 cells, got another number"),
+    "semicolons": (GOOD.replace(",", ";"), "expected columns ['run', 'time'], got "),
+    "no joint": ("run,time,q_a\nx,0,0\n", "columns: expected u_<joint>, got "),
+    "no angle": ("run,time,u_a\nx,0,0\n", "columns: expected ['q_a'], got "),
     "half the velocities": ("run,time,u_a,u_b,q_a,q_b,q_dot_a\nx,0,0,0,0,0,0\n",
-        "row 1: expected a column q_dot_b"),
-    "no name": (GOOD.replace("x,0.10", " ,0.10"), "row 4, column run: expected text of 1 to 200"),
+        "columns: expected ['q_dot_b'], got "),
+    "text": (GOOD.replace("1.2", "open"), "row 4, column q_a: expected a number, got 'open'"),
+    "no number": (GOOD.replace("1.2", ""), "row 4, column q_a: expected a number, got ''"),
+    "per cent": (GOOD.replace("0.3", "30"), "row 4, column u_a: expected -1 to 1, got 30.0"),
+    "repeated time": (GOOD.replace("0.10", "0.05"),
+        "run x, column time: expected stamps that rise, got a step of 0 at 0.05"),
     "earlier in its own recording": (
         "run,time,u_a,q_a\nx,1.00,0,0\ny,7.00,0,0\nx,1.05,0,0\ny,7.05,0,0\nx,1.02,0,0\n",
-        "row 6, column time: expected later than 1.05 within run 'x', got 1.02"),
+        "run x, column time: expected stamps that rise, got a step of -0.03 at 1.05"),
+    "milliseconds": (re.sub(r"x,0\.(\d\d)", r"x,\g<1>0", GOOD), "run x, column time: expected s, "
+        "at 20 Hz, the machine's rate (--machine), or more, got 0.02 Hz"),
     "an angle that wraps": (GOOD.replace("1.1", "3.1").replace("1.2", "-3.1"),
-        "row 4, column q_a: expected an angle that does not start again after a turn "
-        "(numpy.unwrap), got -3.1 after 3.1"),
-    "fewer digits": (GOOD[:-2], "expected a newline at its end, got a cut row: 'x,0.15,0.4,1.'"),
-    "endless line": ("run,time," + 2**20 * "a", "row 1: expected shorter lines, got 1048576 bytes"),
+        "run x: expected angles that do not start again after a turn (numpy.unwrap), "
+        "got a jump of 6.20 rad"),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", BAD_CSV)
-def test_read_log__names_file_and_place_of_a_bad_csv(tmp_path, case):
-    text, message = BAD_CSV[case]
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("case", REFUSALS)
+def test_read_log__names_file_and_place_of_what_is_wrong(tmp_path, case):
+    text, message = REFUSALS[case]
     (tmp_path / "bad.csv").write_text(text)
     with pytest.raises(ValueError) as caught:
         read_log([tmp_path / "bad.csv"], 4)
-    assert str(caught.value).startswith(f"{tmp_path / 'bad.csv'}: ")
-    assert message in str(caught.value)
+    assert str(caught.value).startswith(f"{tmp_path / 'bad.csv'}: {message}")
 
 
-def test_read_log__accepts_the_table_above_also_with_spaces_blank_lines_and_a_byte_order_mark(
-    tmp_path,
-):
-    content = (
-        b"\xef\xbb\xbf" + GOOD.replace(",u_a,", ", u_a, ").replace("\n", "\r\n").encode() + b"\r\n"
-    )
-    for text in (GOOD.encode(), content):
+def test_read_log__refuses_columns_of_different_lengths_and_other_kinds_of_files(tmp_path):
+    columns = table("x", np.arange(30) / 20)
+    path = write(tmp_path / "log.npz", columns | {"q_b": np.zeros(29)})
+    with pytest.raises(ValueError, match=r"log\.npz: column q_b: .*got float64 \(29,\)"):
+        read_log([path], 4)
+    with pytest.raises(ValueError, match=r"log\.txt: expected a name in \.csv or \.npz, got \.txt"):
+        read_log([tmp_path / "log.txt"], 4)
+
+
+def test_read_log__accepts_numbers_as_names_spaces_and_a_byte_order_mark(tmp_path):
+    content = b"\xef\xbb\xbf" + GOOD.replace(",u_a,", ", u_a, ").replace("\n", "\r\n").encode()
+    for text, name in ((content, "x"), (GOOD.replace("x,", "7,").encode(), "7")):
         (tmp_path / "good.csv").write_bytes(text)
         (recording,) = read_log([tmp_path / "good.csv"], 4).recordings
         np.testing.assert_allclose(recording.u[:, 0], [0.1, 0.2, 0.3, 0.4])
+        assert recording.name == name
 
 
 def test_driven__is_no_joint_that_creeps_a_count_under_a_stick_at_rest():
@@ -371,8 +374,17 @@ def test_split__holds_out_every_tenth_recording_that_drives_the_same_joints():
     kept, held_out = split(log)
     assert [recording.name for recording in held_out.recordings] == ["0", "10", "20", "21"]
     assert len(kept.recordings) == 19
-    assert [recording.name for recording in part_of(log, 0.25).recordings] == [*"012345", "21"]
-    with pytest.raises(
-        ValueError, match=r"^recordings: expected two or more .* that .*, or --test"
-    ):
+    with pytest.raises(ValueError, match=r"^recordings: expected two or more .*, or --test, got 1"):
         split(log._replace(recordings=log.recordings[:1]))
+
+
+def test_join_logs__wants_the_same_joints_in_any_order():
+    log = some_log(False)
+    turned = in_order(log, log.joints[::-1])
+    joined = join_logs({Path("a"): log, Path("b"): turned})
+    assert joined.joints == log.joints and len(joined.recordings) == 6
+    np.testing.assert_array_equal(joined.recordings[3].q, log.recordings[0].q)
+    with pytest.raises(ValueError, match=r"^b: columns: expected q_dot in all files or in none"):
+        join_logs({Path("a"): log, Path("b"): some_log(True)})
+    with pytest.raises(ValueError, match=r"^b: joints: expected \['boom', "):
+        join_logs({Path("a"): log, Path("b"): log._replace(joints=("a", "b", "c"))})

@@ -7,10 +7,8 @@ import pytest
 from helpers_machines import closed_form
 from scipy import stats
 
-from brokk_min import env
 from brokk_min.actuator import PlantState
-from brokk_min.env import TaskConfig
-from brokk_min.kinematics import forward_kinematics, lowest_point
+from brokk_min.env import State, TaskConfig, sensor_std
 from brokk_min.learning import episodes
 from brokk_min.machine import BROKK_170
 
@@ -19,22 +17,12 @@ def generator(seed=0):
     return np.random.default_rng(seed)
 
 
-@pytest.mark.parametrize("config", [TaskConfig(redraw_ground=False), TaskConfig(paper=True)])
-def test_draw_pose__is_uniform_or_above_the_ground(config):
+def test_draw_pose__is_uniform_and_sometimes_in_the_ground():
     low, high = BROKK_170.column("q_min"), BROKK_170.column("q_max")
-    anywhere = episodes.draw_pose(BROKK_170, config, generator(), 2000)
-    for fraction in ((anywhere - low) / (high - low)).T:
+    poses = episodes.draw_pose(BROKK_170, generator(), 2000)
+    for fraction in ((poses - low) / (high - low)).T:
         assert stats.kstest(fraction, "uniform").pvalue > 1e-3
-    assert (closed_form(anywhere)[1] < 0).mean() > 0.02
-    free = episodes.draw_pose(BROKK_170, TaskConfig(), generator(), 2000)
-    assert (closed_form(free)[1] >= 0).all()
-    assert ((low <= free) & (free <= high)).all()
-
-
-def test_draw_pose__refuses_a_machine_that_is_always_in_the_ground():
-    machine = replace(BROKK_170, ground=50.0)
-    with pytest.raises(ValueError, match="brokk170: expected a pose above the ground, got none"):
-        episodes.draw_pose(machine, TaskConfig(), generator(), 3)
+    assert 0.02 < (closed_form(poses)[1] < 0).mean() < 0.98
 
 
 def test_draw_goal__has_the_configured_fractions_speeds_and_directions():
@@ -50,7 +38,6 @@ def test_draw_goal__has_the_configured_fractions_speeds_and_directions():
     for axis in (*np.eye(3), *-np.eye(3)):
         assert np.mean((along == axis).all(-1)) == pytest.approx(1 / 6, abs=0.02)
     directions = goals[components == 3] / speed[components == 3, None]
-    np.testing.assert_allclose(directions.mean(axis=0), 0, atol=0.03)
     np.testing.assert_allclose(
         directions.T @ directions / len(directions), np.eye(3) / 3, atol=0.03
     )
@@ -64,62 +51,31 @@ def test_draw_hold__is_whole_ticks_and_at_least_one(seconds, ticks):
     assert episodes.draw_hold(BROKK_170, config, generator(), 3).tolist() == [ticks] * 3
 
 
-@pytest.mark.parametrize(
-    ("margin", "goal_z", "changes"), [(0.9, -0.2, True), (1.1, -0.2, False), (0.9, 0.0, False)]
-)
-def test_new_goals__none_points_down_close_to_the_ground(margin, goal_z, changes):
-    pose = np.array([[0.3, 0.2, 0.3, 1.4, 1.1]])
-    height = float(lowest_point(forward_kinematics(BROKK_170, pose))[0])
-    machine = replace(BROKK_170, ground=height - margin * episodes.GROUND_MARGIN)
-    config = TaskConfig(hold_min_s=5.0, hold_max_s=5.0)
-    state = env.initial_state(machine, pose, [[0.1, 0.0, goal_z]], plant=True)
-    for seed in range(20):
-        after = episodes.new_goals(machine, config, state, generator(seed))
-        assert (after.v_goal != state.v_goal).any() == changes
-        assert (after.v_goal[0, 2] >= 0) == (margin < 1)
-        assert not changes or after.goal_ticks[0] == 100
-        paper = replace(config, paper=True)
-        assert episodes.new_goals(machine, paper, state, generator(seed)) is state
-
-
 def test_new_goals__change_where_their_time_is_over():
-    state = episodes.reset(BROKK_170, TaskConfig(), generator(), 3, plant=False)
-    upward = np.abs(state.v_goal) + 0.01
-    state = replace(state, v_goal=upward, goal_ticks=np.array([1, 0, 2]))
+    state = episodes.reset(BROKK_170, TaskConfig(), generator(), 3)
+    state = replace(state, v_goal=np.abs(state.v_goal) + 0.01, goal_ticks=np.array([1, 0, 2]))
     after = episodes.new_goals(BROKK_170, TaskConfig(), state, generator())
     assert (after.v_goal != state.v_goal).any(axis=1).tolist() == [False, True, False]
     assert after.goal_ticks[[0, 2]].tolist() == [1, 2]
-    assert 10 <= after.goal_ticks[1] <= 60
+    assert 40 <= after.goal_ticks[1] <= 120  # 2 to 6 s
 
 
-@pytest.mark.parametrize("plant", [True, False])
-def test_replace_rows__replaces_whole_rows_and_nothing_else(plant):
-    old = episodes.reset(BROKK_170, TaskConfig(), generator(1), 5, plant)
-    new = episodes.reset(BROKK_170, TaskConfig(), generator(2), 2, plant)
+def test_replace_rows__replaces_whole_rows_and_nothing_else():
+    old = episodes.reset(BROKK_170, TaskConfig(), generator(1), 5)
+    new = episodes.reset(BROKK_170, TaskConfig(), generator(2), 2)
     state = episodes.replace_rows(old, np.array([4, 1]), new)
-    for field in fields(env.State):
-        before, fresh, after = (getattr(s, field.name) for s in (old, new, state))
-        if isinstance(before, PlantState):
-            before, fresh, after = before.q, fresh.q, after.q
-        if before is not None:
+    for field in fields(State):
+        values = [getattr(one, field.name) for one in (old, new, state)]
+        pairs = zip(*values) if isinstance(values[0], PlantState) else [values]
+        for before, fresh, after in pairs:
             assert np.array_equal(after[[0, 2, 3]], before[[0, 2, 3]])
             assert np.array_equal(after[[4, 1]], fresh)
     assert not np.array_equal(old.q, state.q)
-    if plant:
-        own = replace(old, plant=object())
-        with pytest.raises(ValueError, match=r"^plant: expected states that are tuples of"):
-            episodes.replace_rows(own, np.array([4, 1]), new)
+    assert episodes.replace_rows(None, np.array([1]), None) is None
 
 
-def test_get_obs__noise_is_uniform_and_only_on_what_sensors_measure():
-    state = episodes.reset(BROKK_170, TaskConfig(), generator(), 400, plant=False)
-    quiet = episodes.get_obs(BROKK_170, TaskConfig(noise=0.0), state, generator())
-    noisy = episodes.get_obs(BROKK_170, TaskConfig(noise=0.05), state, generator())
-    difference = noisy - quiet
-    assert not difference[:, 111:163].any()  # commands
-    assert not difference[:, 2].any()  # height of the goal; x and y turn with the slew angle
-    history = difference[:, 7:111] / 0.05 * 13**0.5
-    assert np.abs(history).max() <= 1 + 1e-3
-    assert stats.kstest((history[:, 5] + 1) / 2, "uniform").pvalue > 1e-3
-    paper = episodes.get_obs(BROKK_170, TaskConfig(paper=True), state, generator())
-    np.testing.assert_allclose(paper[:, 7:111], noisy[:, 7:111] * 13**0.5, rtol=1e-5)
+def test_draw_noise__is_uniform_up_to_the_largest():
+    noise = episodes.draw_noise(BROKK_170, 0.05, 400, generator())
+    assert noise.dtype == np.float32 and noise.shape == (400, len(sensor_std(BROKK_170)))
+    assert np.abs(noise).max() <= 0.05
+    assert stats.kstest(noise[:, 7] / 0.1 + 0.5, "uniform").pvalue > 1e-3

@@ -1,6 +1,5 @@
 """The policy's file and function: by hand, against torch, bit for bit through a file, refusals."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -8,35 +7,30 @@ import pytest
 import torch
 from helpers_machines import POSE, small_net
 
-from brokk_min.env import TaskConfig, action_to_pwm, features, initial_state, measure
-from brokk_min.learning.checkpoint import export_policy
+from brokk_min import env
+from brokk_min.beyond import interface
+from brokk_min.beyond.valve_nets import ValveNet
+from brokk_min.learning.checkpoint import actor_weights
 from brokk_min.learning.policy import Policy, PolicyController, load_policy, save_policy
 from brokk_min.machine import BROKK_170
 from brokk_min.ppo import Agent
 
 NET = small_net(BROKK_170, np.random.default_rng(0))
+SIZES = {"paper": 163, "beyond": 223}
 
 
-@pytest.fixture(scope="module")
-def agent():
+def agent(size):
     """An actor whose weights, biases included, are far from their start."""
     generator = torch.Generator().manual_seed(0)
-    agent = Agent(223, 4, -1.0, critic=False)
+    agent = Agent(size, 4, -1.0)
     with torch.no_grad():
         for parameter in agent.parameters():
             parameter += 0.1 * torch.randn(parameter.shape, generator=generator)
     return agent
 
 
-@pytest.fixture(scope="module")
-def policy(agent):
-    return export_policy(NET, agent, TaskConfig(), {"seed": 0, "gamma": 0.5})
-
-
-@pytest.fixture
-def saved(policy, tmp_path):
-    save_policy(tmp_path / "policy.npz", policy, BROKK_170)
-    return tmp_path / "policy.npz"
+def policy(kind):
+    return Policy({"seed": 0}, actor_weights(agent(SIZES[kind])), NET, kind)
 
 
 def test_act__by_hand():
@@ -47,116 +41,92 @@ def test_act__by_hand():
         np.array([[3.0], [10.0]]),
         np.array([0.25]),
     )
-    policy = Policy({}, weights, NET)
     # units: 0.5 + 0.5 = 1 and 2 x 0.5 - 2 = -1; ELU gives 1 and 1/e - 1
     expected = 3 + 10 * (np.exp(-1) - 1) + 0.25
-    np.testing.assert_allclose(policy.act(np.array([0.5, 0.5])), [expected], rtol=1e-6)
+    action = Policy({}, weights, NET, "paper").act(np.array([0.5, 0.5]))
+    np.testing.assert_allclose(action, [expected], rtol=1e-6)
 
 
-def test_act__equals_the_actor_of_torch(agent, policy):
+def test_act__equals_the_actor_of_torch():
     obs = np.random.default_rng(0).normal(0, 2, (3, 7, 223)).astype(np.float32)
-    expected = agent.actor(torch.from_numpy(obs)).detach().numpy()
+    actor = agent(223)
+    expected = actor.actor(torch.from_numpy(obs)).detach().numpy()
     assert expected.std() > 0.05
-    np.testing.assert_allclose(policy.act(obs), expected, atol=1e-5 * np.abs(expected).max())
-    assert np.isfinite(policy.act(np.array([[1e4], [-1e4]]) * np.ones(223))).all()
+    found = Policy({}, actor_weights(actor), NET, "beyond").act(obs)
+    np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
 
 
-def test_act__refuses_wrong_shapes_and_what_is_not_finite(policy):
-    for shape in ((), (222,), (223, 1), (3, 224)):
-        with pytest.raises(ValueError, match=r"observation: expected \(\.\.\., 223\), got \("):
-            policy.act(np.zeros(shape))
-    for bad in (np.nan, np.inf, -np.inf):
-        with pytest.raises(ValueError, match="observation: expected finite numbers, got"):
-            policy.act(np.where(np.arange(223) == 40, bad, np.zeros((2, 223))))
+def test_act__refuses_wrong_shapes_and_what_is_not_finite():
+    for bad in (np.zeros(222), np.zeros((223, 1)), np.full(223, np.nan), np.full((2, 223), np.inf)):
+        with pytest.raises(ValueError, match=r"observation: expected finite \(\.\.\., 223\), got"):
+            policy("beyond").act(bad)
 
 
-def measured(v_goal):
-    state = initial_state(BROKK_170, np.tile(POSE, (len(v_goal), 1)), v_goal, plant=True)
-    return measure(BROKK_170, state.history, state.v_goal, state.error_integral)
+@pytest.mark.parametrize("kind", ["paper", "beyond"])
+def test_controller__is_its_interface_around_the_actor(kind):
+    """Valves of our agent close after half a second of a zero goal; the paper's go on."""
+    one = policy(kind)
+    controller = PolicyController(BROKK_170, one)
+    plug = {"paper": env.PAPER, "beyond": interface.INTERFACE}[kind]
+    memory, oracle = controller.start(2), None
+    goals = np.array([[0.1, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    state = env.initial_state(BROKK_170, np.tile(POSE, (2, 1)), goals)
+    for tick in range(15):
+        measured = env.measure(BROKK_170, state.history, state.v_goal)
+        u, memory = controller(measured, memory)
+        oracle = plug.remember(BROKK_170, oracle, measured)
+        action = one.act(plug.observe(BROKK_170, measured, oracle))
+        np.testing.assert_array_equal(u, plug.command(BROKK_170, action, oracle))
+        assert u[0].any()
+        assert u[1].any() == (kind == "paper" or tick < 10)
 
 
-@pytest.mark.parametrize(("valves", "after"), [("closed", 10), ("dither", 2), ("open", 100)])
-def test_controller__sends_the_policys_actions_or_has_a_rule_for_valves_at_rest(
-    policy, valves, after
-):
-    """The first machine rests but for one tick, the second moves."""
-    controller = PolicyController(BROKK_170, replace(policy, valves=valves))
-    ticks = controller.start(2)
-    for tick in range(100):
-        seen = measured([[0, 0, 0.1 * (tick == 30)], [0.1, 0, 0.2]])
-        u, ticks = controller(seen, ticks)
-        free = action_to_pwm(BROKK_170, policy.act(features(BROKK_170, seen)))
-        assert np.array_equal(u[1], free[1]) and not np.array_equal(free[0], free[1])
-        if (tick if tick < 30 else tick - 31) < after:
-            assert np.array_equal(u[0], free[0])
-        else:
-            size = 12 / 127 if valves == "dither" else 0.0
-            np.testing.assert_allclose(np.abs(u[0, BROKK_170.driven]), size, atol=1e-7)
-
-
-def test_controller__of_the_papers_agent_takes_its_observation_and_sends_plain_actions():
-    agent = Agent(163, 4, -1.0, critic=True)
-    agent.actor[-1].weight.data *= 100
-    paper = export_policy(NET, agent, TaskConfig(paper=True), {})
-    controller = PolicyController(BROKK_170, paper)
-    v_goal = np.random.default_rng(1).normal(0, 0.2, (5, 3))
-    v_goal[0] = 0
-    u, _ = controller(measured(v_goal), controller.start(5) + 1000)
-    action = paper.act(features(BROKK_170, measured(v_goal), paper=True))
-    assert np.array_equal(u, action_to_pwm(BROKK_170, action, paper=True))
-    assert np.abs(u[0]).max() > 0.1  # valves stay as the policy has them
-
-
-def test_load_policy__takes_files_that_do_not_tell_the_dead_zones_of_joints(policy, tmp_path):
-    """As those written before 24 November 2026."""
-    save_policy(tmp_path / "policy.npz", policy, BROKK_170)
-    arrays = dict(np.load(tmp_path / "policy.npz"))
-    header = json.loads(str(arrays["header"]))
-    del header["contract"]["dead_zones"], header["contract"]["weights"]
-    arrays["header"] = np.array(json.dumps(header))
-    np.savez(tmp_path / "older.npz", **arrays)
-    assert load_policy(tmp_path / "older.npz", BROKK_170).training == policy.training
-
-
-def test_load_policy__keeps_every_bit(policy, saved, tmp_path):
-    again = load_policy(saved, BROKK_170)
-    assert dict(again.training) == {"seed": 0, "gamma": 0.5}
-    assert len(again.weights) == 8
-    for one, two in zip(again.weights, policy.weights, strict=True):
-        assert one.tobytes() == np.ascontiguousarray(two).tobytes()
-    history = np.random.default_rng(0).normal(size=(2, 4, 3, 13)).astype(np.float32)
-    assert np.array_equal(again.net.predict(history), policy.net.predict(history))
-    save_policy(tmp_path / "other.npz", again, BROKK_170)
-    assert saved.read_bytes() == (tmp_path / "other.npz").read_bytes()
-
-
-REORDERED = (*BROKK_170.joints[1:], BROKK_170.joints[0])
-
-
-def change_joint(index, **changes):
-    joints = list(BROKK_170.joints)
-    joints[index] = replace(joints[index], **changes)
-    return replace(BROKK_170, joints=tuple(joints))
+@pytest.mark.parametrize("kind", ["paper", "beyond"])
+def test_file__gives_the_same_bits_back(tmp_path, kind):
+    zones = BROKK_170.dead_zones[BROKK_170.driven].astype(np.float32)
+    net = small_net(BROKK_170, np.random.default_rng(0), rows=4)
+    valve = ValveNet(**vars(net), dead_zones=zones)
+    before = replace(policy(kind), net=valve if kind == "beyond" else NET)
+    save_policy(tmp_path / "p.npz", before, BROKK_170)
+    after = load_policy(tmp_path / "p.npz", BROKK_170)
+    assert all(map(np.array_equal, before.weights, after.weights))
+    assert (after.interface, after.training) == (kind, {"seed": 0})
+    assert type(after.net) is type(before.net)
+    history = np.random.default_rng(1).uniform(-0.5, 0.5, (3, 4, 3, 13)).astype(np.float32)
+    np.testing.assert_array_equal(after.net.predict(history), before.net.predict(history))
 
 
 @pytest.mark.parametrize(
-    ("machine", "message"),
+    ("change", "message"),
     [
-        (replace(BROKK_170, name="brokk500"), r"machine: expected 'brokk500', got 'brokk170'"),
-        (
-            replace(BROKK_170, joints=REORDERED, q_start=()),
-            r"joints: expected \['q2', 'q3', 'q4', 'q5', 'q1'\], got \['q1', 'q2'",
-        ),
-        (change_joint(1, driven=True), r"driven: expected \['q1', 'q2'.*got \['q1', 'q3'"),
-        (replace(BROKK_170, pwm_limit=60), r"pwm_limit: expected 60, got 80"),
-        (change_joint(2, a=1.5), r"geometry\[2\]\[0\]: expected 1\.5, got 1\.25"),
-        (change_joint(2, dead_zone_up=0.1), r"dead_zones\[1\]: expected \[0.1, 0.07\], got \[0.07"),
-        (change_joint(2, weight=2.0), r"weights: expected \[1.0, 2.0, 1.0, 1.0\], got \[1.0, 1.0"),
-        (change_joint(2, q_dot_down=0.5), r"scale: expected the machine's normalisation, got"),
-        (replace(BROKK_170, tool_speed=0.4), r"scale: expected the machine's normalisation, got"),
+        ({"rate": 40.0}, "rate: expected 40.0, got 20.0"),
+        ({"name": "other"}, "machine: expected 'other', got 'brokk170'"),
+        ({"pwm_limit": 70}, "pwm_limit: expected 70, got 80"),
+        ({"joints": BROKK_170.joints[::-1]}, "joints: expected"),
+        ({"tool_speed": 0.2}, "mean|scale: expected the machine's normalisation"),
     ],
-    ids=lambda value: value.split(":")[0] if isinstance(value, str) else "",
 )
-def test_load_policy__refuses_one_for_something_else(saved, machine, message):
-    with pytest.raises(ValueError, match=r"policy\.npz: " + message):
-        load_policy(saved, machine)
+def test_load_policy__refuses_one_for_another_machine(tmp_path, change, message):
+    save_policy(tmp_path / "p.npz", policy("paper"), BROKK_170)
+    name = {"name": f"m {change}"} if "tool_speed" in change else {}  # caches go by the name
+    machine = replace(BROKK_170, q_start=(), **change, **dict.fromkeys(name, "brokk170"))
+    env.observation_scale.cache_clear()
+    with pytest.raises(ValueError, match=message):
+        load_policy(tmp_path / "p.npz", machine)
+    env.observation_scale.cache_clear()
+
+
+def test_load_policy__refuses_what_is_no_policy(tmp_path):
+    path = tmp_path / "p.npz"
+    for content in (b"", b"PK nonsense", b"x" * 1000):
+        path.write_bytes(content)
+        with pytest.raises(
+            ValueError, match=rf"^{path}: expected a readable .npz file of a policy"
+        ):
+            load_policy(path, BROKK_170)
+    np.savez(path, header=np.array('{"kind": "policy 4"}'))
+    with pytest.raises(ValueError, match="expected a policy 5, got a file of another version"):
+        load_policy(path, BROKK_170)
+    np.savez(path, header=np.array('{"kind": "policy 5", "contract": {}}'))
+    with pytest.raises(ValueError, match=f"^{path}: "):
+        load_policy(path, BROKK_170)

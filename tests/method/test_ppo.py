@@ -1,5 +1,6 @@
 """PPO: formulas by hand and against torch, a training written once more, refusals, Pendulum."""
 
+import copy
 import math
 from dataclasses import replace
 
@@ -12,7 +13,8 @@ from torch import nn
 from torch.distributions import Normal
 
 from brokk_min import ppo
-from brokk_min.ppo import Agent, PPOConfig
+from brokk_min.ppo import Agent
+from brokk_min.settings import PPOConfig
 
 SMALL = PPOConfig(
     total_steps=96,
@@ -67,10 +69,6 @@ class Tape(VectorEnv):
         return obs, self.rewards[t], self.terminated[t], self.truncated[t], info
 
 
-def rewards_as_advantages(agent, rollout, config):
-    return {"advantages": rollout.rewards}
-
-
 class FirstNumber(nn.Module):
     """A critic whose value is the first number of the observation."""
 
@@ -101,20 +99,22 @@ def lambda_return_advantages(rewards, terminated, truncated, values, last_values
 
 
 def test_agent__has_the_nets_of_the_paper():
-    agent = Agent(223, 4, -0.5, critic=True)
+    agent = Agent(163, 4, -0.5)
     for net, outputs, gain in ((agent.actor, 4, 0.01), (agent.critic, 1, 1.0)):
         assert [type(layer) for layer in net] == [nn.Linear, nn.ELU] * 3 + [nn.Linear]
         sizes = [(layer.in_features, layer.out_features) for layer in net[::2]]
-        assert sizes == [(223, 256), (256, 128), (128, 64), (64, outputs)]
+        assert sizes == [(163, 256), (256, 128), (128, 64), (64, outputs)]
         assert not any(layer.bias.any() for layer in net[::2])
         first, last = net[0].weight.detach(), net[-1].weight.detach()
-        torch.testing.assert_close(first.T @ first, 2 * torch.eye(223), atol=1e-4, rtol=0)
+        torch.testing.assert_close(first.T @ first, 2 * torch.eye(163), atol=1e-4, rtol=0)
         torch.testing.assert_close(last @ last.T, gain**2 * torch.eye(outputs))
-        assert agent.log_std.tolist() == [-0.5] * 4
+    assert agent.log_std.tolist() == [-0.5] * 4
     assert "log_std" in dict(agent.named_parameters())
-    obs = torch.randn(3, 5, 223)
+    obs = torch.randn(3, 5, 163)
     torch.testing.assert_close(agent.value(obs), agent.critic(obs).squeeze(-1))
-    assert Agent(2, 1, 0.0, critic=False).critic is None
+    agent.return_mean += 2.0
+    agent.return_var += 8.0
+    torch.testing.assert_close(agent.value(obs), 2 + 3 * agent.critic(obs).squeeze(-1))
 
 
 # --- formulas -------------------------------------------------------------------------------------
@@ -150,14 +150,15 @@ def test_critic_advantages__are_means_of_n_step_returns(gamma, lam, seed):
     """Truncations go on with the value of their own last observation, terminations with none."""
     config = replace(SMALL, gamma=gamma, gae_lambda=lam)
     tape = Tape(seed)
-    learner = ppo.make_learner(tape, config, 0, critic=True)
-    learner.agent.critic = FirstNumber()
-    batch = ppo.critic_advantages(learner.agent, ppo.collect(tape, learner, config), config)
+    agent, _, obs, *_ = ppo.begin(tape, config, 0)
+    agent.critic = FirstNumber()
+    rollout, _ = ppo.collect(tape, agent, obs, config.horizon)
+    advantages, returns = ppo.critic_advantages(agent, rollout, config)
     rewards = (1 - gamma) * tape.rewards[:8]  # values are in units of the reward
     ends, values = (tape.terminated, tape.truncated), tape.obs[..., 0]
     expected = lambda_return_advantages(rewards, *ends, values, tape.last_obs[..., 0], config)
-    np.testing.assert_allclose(batch["advantages"], expected, atol=1e-5)
-    np.testing.assert_allclose(batch["returns"], expected + values[:8], atol=1e-5)
+    np.testing.assert_allclose(advantages, expected, atol=1e-5)
+    np.testing.assert_allclose(returns, expected + values[:8], atol=1e-5)
 
 
 def test_policy_loss__by_hand():
@@ -173,17 +174,17 @@ def test_policy_loss__by_hand():
 
 
 @pytest.mark.parametrize(
-    ("name", "index", "value", "message"),
+    ("name", "index", "value", "step"),
     [
-        ("obs", (9, 5, 1), np.nan, r"obs\[5, 1\]: expected a finite number at step 54, got nan"),
-        ("rewards", (9, 5), -np.inf, r"reward\[5\]: expected a finite .* at step 54, got -inf"),
-        ("last_obs", ..., np.nan, r"losses/policy_loss: expected a finite .* at step 48, got nan"),
+        ("obs", (9, 5, 1), np.nan, 96),
+        ("rewards", (9, 5), -np.inf, 96),
+        ("last_obs", ..., np.nan, 48),
     ],
 )
-def test_train__refuses_what_is_not_finite(name, index, value, message):
+def test_train__refuses_what_is_not_finite(name, index, value, step):
     tape = Tape()
     getattr(tape, name)[index] = value
-    with pytest.raises(ValueError, match=f"^{message}$"):
+    with pytest.raises(ValueError, match=f"^loss: expected finite numbers at step {step}, got "):
         ppo.train(tape, SMALL, 0)
 
 
@@ -195,42 +196,21 @@ def test_train__refuses_another_autoreset_mode(mode):
     assert str(caught.value) == message
 
 
-# --- the steps of a training ----------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("log_std_end", [None, -2.0])
-def test_make_learner__starts_from_the_seed_alone(log_std_end):
-    config = replace(SMALL, log_std_end=log_std_end)
-    tape = Tape()
-    before = torch.get_rng_state()
-    torch.set_num_threads(2)  # nets of another number of threads differ in the last bits
-    first = ppo.make_learner(tape, config, 5, critic=True)
-    assert torch.get_num_threads() == 1
-    assert torch.equal(torch.get_rng_state(), before)  # of torch's own generator
-    torch.rand(1)
-    second = ppo.make_learner(tape, config, 5, critic=True)
-    pairs = zip(first.agent.parameters(), second.agent.parameters(), strict=True)
-    assert all(torch.equal(*pair) for pair in pairs)
-    assert first.generator.initial_seed() == tape.reset_seed == 5
-    assert first.agent.log_std.requires_grad == (log_std_end is None)
-    assert first.optimizer.param_groups[0]["lr"] == first.learning_rate == 3e-3
-    assert (first.global_step, first.updates) == (0, 0)
-    np.testing.assert_array_equal(first.obs, tape.obs[0])
-    assert ppo.make_learner(tape, config, 6, critic=False).agent.critic is None
+# --- a training -----------------------------------------------------------------------------------
 
 
 def test_collect__records_what_happened():
     tape = Tape()
-    learner = ppo.make_learner(tape, SMALL, 0, critic=True)
+    agent, _, obs, *_ = ppo.begin(tape, SMALL, 5)
+    assert tape.reset_seed == 5
     with torch.no_grad():
-        learner.agent.log_std[:] = torch.tensor([-1.0, 0.0, 0.5])
-    learner.global_step = 100
-    generator = torch.Generator().manual_seed(0)
-    noise = torch.stack([torch.randn(6, 3, generator=generator) for _ in range(8)])
-    rollout = ppo.collect(tape, learner, SMALL)
-    assert learner.global_step == 100 + 48
+        agent.log_std[:] = torch.tensor([-1.0, 0.0, 0.5])
+    torch.manual_seed(0)
+    noise = torch.stack([torch.randn(6, 3) for _ in range(8)])
+    torch.manual_seed(0)
+    rollout, following = ppo.collect(tape, agent, obs, 8)
     np.testing.assert_array_equal(rollout.obs, tape.obs[:8])
-    np.testing.assert_array_equal(learner.obs, tape.obs[8])
+    np.testing.assert_array_equal(following, tape.obs[8])
     np.testing.assert_allclose(rollout.rewards, tape.rewards[:8], rtol=1e-6)
     assert rollout.rewards.dtype == torch.float32
     np.testing.assert_array_equal(rollout.terminated, tape.terminated[:8])
@@ -240,9 +220,8 @@ def test_collect__records_what_happened():
     np.testing.assert_array_equal(rollout.next_obs, next_obs)
     assert [info["tick"] for info in rollout.infos] == list(range(8))
     with torch.no_grad():
-        mean = learner.agent.actor(rollout.obs)
+        mean = agent.actor(rollout.obs)
     std = torch.tensor([-1.0, 0.0, 0.5]).exp()
-    torch.testing.assert_close(rollout.means, mean)
     torch.testing.assert_close(rollout.actions, mean + std * noise)
     torch.testing.assert_close(
         rollout.logprobs, Normal(mean, std).log_prob(rollout.actions).sum(-1)
@@ -251,39 +230,7 @@ def test_collect__records_what_happened():
     assert not rollout.logprobs.requires_grad
 
 
-@pytest.mark.parametrize(
-    ("step", "lr", "log_std"),
-    [(0, 1e-3, -1.0), (24, 7.5e-4, -1.5), (96, 0.0, -3.0), (120, 0, -3.5)],
-)
-def test_anneal__is_linear_in_the_steps(step, lr, log_std):
-    config = replace(SMALL, log_std=-1.0, log_std_end=-3.0)
-    learner = ppo.make_learner(Tape(), config, 0, critic=False)
-    learner.global_step = step
-    learner.learning_rate = 1e-3
-    ppo.anneal(learner, config)
-    assert learner.optimizer.param_groups[0]["lr"] == pytest.approx(lr)
-    assert learner.agent.log_std.tolist() == pytest.approx([log_std] * 3)
-
-
-@pytest.mark.parametrize(
-    ("kl", "before", "after"),
-    [
-        (0.16, 1.2e-3, 1e-3),
-        (0.15, 1.2e-3, 1.2e-3),
-        (0.07, 1.2e-3, 1.2e-3),
-        (0.06, 1.2e-3, 1.44e-3),
-        (0.06, 2.9e-3, 3e-3),  # never above the largest
-    ],
-)
-def test_adapt_learning_rate__follows_the_change_of_the_policy(kl, before, after):
-    config = replace(SMALL, target_kl=0.1)
-    learner = ppo.make_learner(Tape(), config, 0, critic=False)
-    learner.learning_rate = before
-    ppo.adapt_learning_rate(learner, config, kl)
-    assert learner.learning_rate == pytest.approx(after)
-
-
-def reference_update(tape, config, agent, optimizer, generator, update, learning_rate, seen):
+def reference_update(tape, config, agent, optimizer, update, learning_rate, seen):
     """One update, written once more with torch's own normal distribution.
 
     `seen` are returns of the updates before: the critic's unit is the mean of their means and the
@@ -293,7 +240,7 @@ def reference_update(tape, config, agent, optimizer, generator, update, learning
     ticks = slice(config.horizon * update, config.horizon * (update + 1))
     obs = torch.from_numpy(tape.obs[ticks])
     with torch.no_grad():
-        noise = torch.stack([torch.randn(6, 3, generator=generator) for _ in range(config.horizon)])
+        noise = torch.stack([torch.randn(6, 3) for _ in range(config.horizon)])
         actions = agent.actor(obs) + agent.log_std.exp() * noise
         logprobs = Normal(agent.actor(obs), agent.log_std.exp()).log_prob(actions).sum(-1)
         values = mean + std * agent.critic(torch.from_numpy(tape.obs))[..., 0].numpy()
@@ -310,11 +257,10 @@ def reference_update(tape, config, agent, optimizer, generator, update, learning
     optimizer.param_groups[0]["lr"] = learning_rate * (1 - ticks.start * 6 / config.total_steps)
     parts = []
     for _ in range(config.epochs):
-        for rows in torch.split(torch.randperm(48, generator=generator), config.minibatch_size):
+        for rows in torch.split(torch.randperm(48), config.minibatch_size):
             parts.append(reference_step(config, agent, optimizer, [x[rows] for x in batch]))
     names = ["policy_loss", "value_loss", "entropy", "approx_kl", "clipfrac"]
     metrics = {f"losses/{name}": x for name, x in zip(names, np.mean(parts, axis=0), strict=True)}
-    metrics["losses/explained_variance"] = 1 - np.var(found) / np.var(seen[-1])
     metrics["charts/reward"] = tape.rewards[ticks].mean()
     metrics["charts/learning_rate"] = optimizer.param_groups[0]["lr"]
     return metrics
@@ -344,54 +290,81 @@ def reference_step(config, agent, optimizer, minibatch):
     return [float(x.detach()) for x in (pg_loss, v_loss, entropy, kl, clipfrac)]
 
 
-def test_train__is_the_algorithm_of_the_paper():
-    """Two updates, each number of the log and each weight; a small clip, so that it matters."""
-    config = replace(SMALL, clip=0.02, target_kl=1e-4)
+@pytest.mark.parametrize(
+    ("target_kl", "rates"), [(1e-4, [1e-3, 1e-3 / 1.2]), (10.0, [1e-3, 1.2e-3]), (None, [3e-3] * 2)]
+)
+def test_train__is_the_algorithm_of_the_paper(target_kl, rates):
+    """Two updates, each number of the log and each weight; a small clip, so that it matters.
+
+    The learning rate falls after a large change of the policy, and grows after a small one, but
+    never above the one of the configuration.
+    """
+    config = replace(SMALL, clip=0.02, target_kl=target_kl or 10.0)
     tape = Tape()
+    start = ppo.begin(tape, config, 7)
+    start.optimizer.param_groups[0]["initial_lr"] = rates[0]
     found = []
 
-    def on_update(learner, rollout, metrics):
-        found.append((learner.updates, learner.global_step, learner.learning_rate, metrics))
+    def on_update(now, rollout, metrics):
+        found.append((now.update, now.global_step, metrics))
         assert torch.equal(rollout.obs, torch.from_numpy(tape.obs[tape.tick - 8 : tape.tick]))
 
-    agent = ppo.train(tape, config, 7, on_update)
+    agent = ppo.train(tape, config, 7, on_update=on_update, start=start)
     torch.manual_seed(7)
-    twin = Agent(2, 3, config.log_std, critic=True)
+    twin = Agent(2, 3, config.log_std)
     optimizer = torch.optim.Adam(twin.parameters(), lr=1.0)
-    generator = torch.Generator().manual_seed(7)
-    learning_rate = config.learning_rate
     seen = []
     for update in range(2):
-        learned = twin, optimizer, generator
-        metrics = reference_update(tape, config, *learned, update, learning_rate, seen)
-        learning_rate /= 1.2
-        *counts, rate, logged = found[update]
+        metrics = reference_update(tape, config, twin, optimizer, update, rates[update], seen)
+        *counts, logged = found[update]
         assert counts == [update + 1, 48 * (update + 1)]
-        assert rate == pytest.approx(learning_rate)
         assert logged == pytest.approx(metrics, rel=1e-3, abs=1e-5)
     assert len(found) == 2
     for ours, theirs in zip(agent.parameters(), twin.parameters(), strict=True):
         torch.testing.assert_close(ours, theirs, atol=2e-5, rtol=0)
+    assert (agent.return_mean.item(), agent.return_var.item() ** 0.5) == pytest.approx(
+        scale_of(seen), rel=1e-4
+    )
 
 
-def test_train__takes_another_estimate_and_goes_on_with_a_learner():
-    config = replace(SMALL, log_std_end=-2.0, horizon=4)
-    logged = []
+def test_train__goes_on_from_a_checkpoint_as_if_it_had_not_stopped():
+    kept = []
+
+    def on_update(now, rollout, metrics):
+        kept.append((copy.deepcopy(now), torch.get_rng_state(), metrics))
+
+    whole = ppo.train(Tape(), SMALL, 3, on_update=on_update)
+    (first, random_numbers, _), (_, _, expected) = kept
     tape = Tape()
-    learner = ppo.make_learner(tape, config, 0, critic=False)
-    learner.global_step = 48
+    tape.reset()
+    tape.tick = SMALL.horizon
+    torch.set_rng_state(random_numbers)
+    again = ppo.train(tape, SMALL, 99, on_update=on_update, start=first)
+    assert len(kept) == 3 and kept[-1][2] == expected
+    pairs = zip(whole.state_dict().values(), again.state_dict().values(), strict=True)
+    assert all(torch.equal(*pair) for pair in pairs)
 
-    def on_update(learner, rollout, metrics):
-        assert rollout.rewards.shape == (4, 6)
-        logged.append(metrics)
 
-    agent = ppo.train(tape, config, 0, on_update, rewards_as_advantages, learner=learner)
-    assert agent is learner.agent
-    assert learner.global_step == 96
+def test_train__takes_other_advantages_without_a_critic():
+    """The actor follows them; the critic keeps its weights and its scale."""
+    logged = []
+
+    def rewards_as_advantages(agent, rollout, config):
+        return rollout.rewards, None
+
+    agent = ppo.train(
+        Tape(),
+        SMALL,
+        0,
+        rewards_as_advantages,
+        lambda now, rollout, metrics: logged.append(metrics),
+    )
+    fresh = ppo.begin(Tape(), SMALL, 0).agent
     assert [metrics["losses/value_loss"] for metrics in logged] == [0.0, 0.0]
-    assert "losses/explained_variance" not in logged[0]
-    assert agent.log_std.tolist() == pytest.approx([-0.3 - 1.7 * 0.75] * 3)
-    assert ppo.train(Tape(), config, 0, estimate=rewards_as_advantages).critic is None
+    assert (agent.return_mean, agent.return_var) == (0, 1)
+    for part, equal in (("critic", True), ("actor", False)):
+        pairs = zip(getattr(agent, part).parameters(), getattr(fresh, part).parameters())
+        assert all(torch.equal(*pair) for pair in pairs) == equal
 
 
 def test_train__takes_a_last_minibatch_of_one_step():

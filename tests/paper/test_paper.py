@@ -3,15 +3,12 @@
 `python tests/paper/test_paper.py` writes the links to lines at the end of PAPER.md.
 """
 
-from __future__ import annotations
-
 import ast
 import inspect
 import re
 import runpy
 from collections.abc import Iterator
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -51,6 +48,34 @@ def labels(cell: str) -> list[str]:
 NAMED = table("Equations, tables, figures") + table("Sections")
 CONSTANT = table("Constants")
 ROWS = [row[-3:] for row in NAMED + CONSTANT]  # code, test, status
+LABELS = sorted(set(labels(PAPER)))
+
+
+def test_rows__are_all_that_the_paper_numbers_in_its_order() -> None:
+    ids = [row[0] for row in table("Equations, tables, figures")]
+    assert list(dict.fromkeys(ids)) == NUMBERED
+    assert {row[0] for row in table("Sections")} == SECTIONS
+    assert [row[0] for row in CONSTANT] == re.split(r";\s", CONSTANTS)
+    assert {row[1] for row in CONSTANT} <= SECTIONS | set(NUMBERED)
+
+
+def test_rows__have_code_and_one_or_two_tests_unless_not_yet_there() -> None:
+    for code, test, status in ROWS:
+        kind = re.match(r"printed|(corrected|changed), [DS]\d|assumed.*, A\d|not yet", status)
+        assert kind, status
+        assert bool(labels(code)) == bool(labels(test)) == (kind[0] != "not yet"), (code, status)
+        assert len(labels(test)) <= 2, test
+
+
+def test_deviations__are_named_by_rows_and_explained() -> None:
+    stories = (ROOT / "docs" / "deviations.md").read_text()
+    statuses = " ".join(status for *_, status in ROWS)
+    for heading, letter in (("Deviations", "D"), ("Assumptions", "A"), ("Slips of the paper", "S")):
+        listed = [row[0] for row in table(heading)]
+        assert set(re.findall(rf"\b{letter}\d+\b", PAPER)) == set(listed)
+        if letter != "S":
+            assert re.findall(rf"^### ({letter}\d+)\.", stories, re.M) == listed
+    assert {row[0] for row in table("Deviations")} == set(re.findall(r"\bD\d+\b", statuses))
 
 
 # --- places ---------------------------------------------------------------------------------------
@@ -89,71 +114,12 @@ def link(label: str) -> str:
     return f"[`{label}`]: {path.relative_to(ROOT).as_posix()}#L{line}"
 
 
-LABELS = sorted(set(labels(PAPER)))
-
-
-def test_rows__link_to_code_unless_not_yet_there() -> None:
-    headings = re.findall(r"^## (.*)$", PAPER, re.M)
-    rows = [row for heading in headings for row in table(heading)]
-    assert [row[0] for row in rows if not labels(" ".join(row))] == ["Fig. 5a"]
-
-
-@pytest.mark.parametrize("label", LABELS)
-def test_links__point_at_the_line(label: str) -> None:
-    assert link(label) in LINKS.splitlines(), "run `python tests/paper/test_paper.py`"
-
-
-# --- rows -----------------------------------------------------------------------------------------
-
-
-def test_rows__are_all_that_the_paper_numbers_in_its_order() -> None:
-    assert [row[0] for row in table("Equations, tables, figures")] == NUMBERED
-    assert {row[0] for row in table("Sections")} == SECTIONS
-    assert [row[0] for row in CONSTANT] == re.split(r";\s", CONSTANTS)
-    assert {row[1] for row in CONSTANT} <= SECTIONS | set(NUMBERED)
-
-
-def test_rows__have_code_and_test_unless_not_yet_there() -> None:
-    for code, test, status in ROWS:
-        kind = re.match(r"printed|(corrected|changed), [DS]\d|assumed.*, A\d|not yet", status)
-        assert kind, status
-        assert bool(labels(code)) == bool(labels(test)) == (kind[0] != "not yet"), (code, status)
-
-
-def test_deviations__are_numbered_named_by_rows_and_explained() -> None:
-    stories = (ROOT / "docs" / "deviations.md").read_text()
-    statuses = " ".join(status for *_, status in ROWS)
-    for heading, letter in (("Deviations", "D"), ("Assumptions", "A"), ("Slips of the paper", "S")):
-        listed = [row[0] for row in table(heading)]
-        assert listed == [f"{letter}{i + 1}" for i in range(len(listed))]
-        assert set(re.findall(rf"\b{letter}\d+\b", PAPER)) <= set(listed)
-        if letter != "S":
-            assert re.findall(rf"^### ({letter}\d+)\.", stories, re.M) == listed
-    assert {row[0] for row in table("Deviations")} == set(re.findall(r"\bD\d+\b", statuses))
-
-
-def test_fields_that_name_the_paper__have_a_row() -> None:
-    """Fields say `(paper: 256)`, numbers of the machine `paper: Table 1`."""
-    mapped = {symbol for code, _, _ in ROWS for symbol in labels(code)}
-    values = re.findall(
-        r"^    (\w+)=.*; paper: ", (ROOT / "brokk_min/machine.py").read_text(), re.M
-    )
-    found = {f"machine.Machine.{field}" for field in values}
-    for path in set((ROOT / "brokk_min").rglob("*.py")) - set((ROOT / "brokk_min/cli").iterdir()):
-        lines = path.read_text().splitlines()
-        for owner in (node for node in parsed(path).body if isinstance(node, ast.ClassDef)):
-            for field, note in pairwise([*owner.body, ast.Pass()]):
-                last = note if isinstance(note, ast.Expr) else field  # a comment or a docstring
-                text = "".join(lines[field.lineno - 1 : last.end_lineno])
-                if isinstance(field, ast.AnnAssign) and "(paper: " in text:
-                    found.add(f"{path.stem}.{owner.name}.{name_of(field)}")
-    assert len(found) >= 10 and found <= mapped, found - mapped
+def test_links__point_at_the_line() -> None:
+    lines = [link(label) for label in LABELS]
+    assert LINKS.split("\n")[1:-1] == lines, "run `python tests/paper/test_paper.py`"
 
 
 # --- docstrings -----------------------------------------------------------------------------------
-
-
-SEVERAL = r"(Fig\.|Sec\.) ((?:\d[\d.a-h]*(?:, | and )?)+)"
 
 
 def documented() -> Iterator[tuple[str, str]]:
@@ -161,6 +127,7 @@ def documented() -> Iterator[tuple[str, str]]:
 
     A tag stands behind "Paper:", up to the end of the paragraph.
     """
+    several = r"(Fig\.|Sec\.) ((?:\d[\d.a-h]*(?:, | and )?)+)"
     for path in sorted((ROOT / "brokk_min").rglob("*.py")):
         nodes: list[tuple[str, ast.Module | ast.FunctionDef | ast.ClassDef]] = [
             (path.stem, parsed(path))
@@ -170,29 +137,24 @@ def documented() -> Iterator[tuple[str, str]]:
             for tagged in re.findall(r"Paper: (.*?)(?:\n\s*\n|$)", text, re.S):
                 for tag in re.findall(r"eq\d|Table \d", tagged):
                     yield symbol, tag
-                for kind, numbers in re.findall(SEVERAL, tagged):
+                for kind, numbers in re.findall(several, tagged):
                     for number in re.findall(r"\d[a-h]?(?:\.\d)?", numbers):
                         yield symbol, f"{kind} {number}"
             parts = [part for part in node.body if isinstance(part, ast.FunctionDef | ast.ClassDef)]
             nodes += [(f"{symbol}.{part.name}", part) for part in parts]
 
 
-DOCUMENTED = sorted(set(documented()))
-IN_ROWS = {(row[0], symbol) for row in NAMED for symbol in labels(row[-3])}
-IN_CONSTANTS = {(row[1], symbol) for row in CONSTANT for symbol in labels(row[-3])}
-
-
-@pytest.mark.parametrize(("symbol", "tag"), DOCUMENTED)
-def test_tags_of_docstrings__have_a_row(symbol: str, tag: str) -> None:
-    """The tag of a module stands for one of its functions."""
-    named = {name for row, name in IN_ROWS | IN_CONSTANTS if row.startswith(tag)}
-    assert symbol in named or ("." not in symbol and f"{symbol}." in " ".join(named))
-
-
-@pytest.mark.parametrize(("row", "symbol"), sorted(IN_ROWS))
-def test_rows__have_a_tag_in_the_docstring(row: str, symbol: str) -> None:
-    """A tag `Fig. 6` stands for all its panels; constants need no tag."""
-    assert any(name == symbol and row.startswith(tag) for name, tag in DOCUMENTED)
+def test_docstrings_and_rows__name_each_other() -> None:
+    """A tag `Fig. 6` stands for all its panels, and one of a module's tags for its definitions."""
+    tags = {(symbol.partition(".")[0], tag) for symbol, tag in documented()}
+    named = {(s.partition(".")[0], row[0]) for row in NAMED for s in labels(row[-3])}
+    constants = {(s.partition(".")[0], row[1]) for row in CONSTANT for s in labels(row[-3])}
+    for module, tag in tags:
+        rows = {row for other, row in named | constants if other == module}
+        assert any(row.startswith(tag) for row in rows), f"no row of {tag} has code of {module}"
+    for module, row in named:
+        of_module = {tag for other, tag in tags if other == module}
+        assert any(row.startswith(tag) for tag in of_module), f"{module} does not name {row}"
 
 
 # --- tests use the code of their row --------------------------------------------------------------

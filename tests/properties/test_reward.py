@@ -1,7 +1,8 @@
-"""The reward of eq2 and the costs that `step` subtracts, for any machine and velocity."""
+"""The reward of eq2, the ground, the time limit and what agents remember, for any machine."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -9,15 +10,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from scipy.spatial.transform import Rotation
-from strategies import machines, reals
+from strategies import machines, posed, reals
 
-from brokk_min.env import TaskConfig, initial_state, reward, step, terminated
-from brokk_min.machine import Machine
+from brokk_min.actuator import PLANT
+from brokk_min.beyond.interface import INTERFACE
+from brokk_min.env import PAPER, initial_state, reward, step, terminated
+from brokk_min.kinematics import forward_kinematics, lowest_point
+from brokk_min.machine import Machine, Measured, limit_command
+from brokk_min.settings import TaskConfig
 
 velocities = npst.arrays(
     np.float64, st.sampled_from([(3,), (4, 3), (2, 3, 3)]), elements=reals(-2, 2)
 )
 vectors = npst.arrays(np.float64, 3, elements=reals(-2, 2))
+
+
+# --- eq2 ------------------------------------------------------------------------------------------
 
 
 @given(velocities, vectors)
@@ -30,7 +38,7 @@ def test_reward__is_one_at_the_goal_and_within_0_and_1(v, goal):
 
 @given(vectors, vectors)
 def test_reward__is_eq2(goal, v):
-    error = float(np.sqrt(sum((a - b) ** 2 for a, b in zip(goal, v, strict=True))))
+    error = math.sqrt(sum((a - b) ** 2 for a, b in zip(goal, v, strict=True)))
     np.testing.assert_allclose(reward(goal, v), 1 / (1 + error), rtol=1e-12)
 
 
@@ -42,55 +50,123 @@ def test_reward__depends_on_the_length_of_the_error_alone(goal, v, shift, seed):
         np.testing.assert_allclose(reward(a, b), reward(goal, v), atol=1e-12)
 
 
+# --- one tick -------------------------------------------------------------------------------------
+
+
 @st.composite
-def plants_and_actions(draw: st.DrawFn) -> tuple[Machine, np.ndarray, np.ndarray, np.ndarray]:
-    """A machine, angles (3, n), goals (3, 3) and actions (3, n_driven)."""
+def ticks(draw: st.DrawFn) -> tuple[Machine, np.ndarray, np.ndarray, np.ndarray]:
+    """A machine, angles (3, n), goals (3, 3) and commands (3, n)."""
     machine = draw(machines())
     low, high = machine.column("q_min"), machine.column("q_max")
     fraction = draw(npst.arrays(np.float64, (3, machine.n), elements=reals(0, 1)))
     goals = draw(npst.arrays(np.float32, (3, 3), elements=st.floats(-0.5, 0.5, width=32)))
-    action = draw(npst.arrays(np.float64, (3, len(machine.driven)), elements=reals(-1.5, 1.5)))
-    return machine, low + fraction * (high - low), goals, action
+    u = draw(npst.arrays(np.float64, (3, machine.n), elements=reals(-1.5, 1.5)))
+    return machine, low + fraction * (high - low), goals, limit_command(machine, u)
 
 
-@given(plants_and_actions(), reals(0, 1), reals(0, 5), reals(0, 2))
-def test_step__subtracts_its_costs_from_eq2(case, valve_cost, integral_cost, limit_cost):
-    """r = 1 / (1 + |e|) - c_v mean |du| / limit - c_i |integral| - c_l sum x^2; 0 in the ground.
-
-    x goes from 0 to 1 in the outer twentieths of a joint's range.
-    """
-    machine, q, goals, action = case
-    config = TaskConfig(valve_cost=valve_cost, integral_cost=integral_cost, limit_cost=limit_cost)
-    state = initial_state(machine, q, goals, plant=True)
-    after, r, terminated_, truncated, error = step(machine, config, None, state, action)
-    change = np.abs(after.history[..., 2, -1] - state.history[..., 2, -1])[:, machine.driven]
-    cost = valve_cost * change.mean(-1) / (machine.pwm_limit / 127)
-    cost = cost + integral_cost * np.linalg.norm(after.error_integral, axis=-1)
-    low, high = machine.column("q_min"), machine.column("q_max")
-    inside = (np.minimum(after.q - low, high - after.q) / (high - low))[:, machine.driven]
-    cost = cost + limit_cost * np.sum(np.maximum(0, 1 - 20 * inside) ** 2, axis=-1)
-    np.testing.assert_allclose(error, np.linalg.norm(goals - after.v_tool, axis=-1), atol=1e-6)
-    expected = np.where(terminated_, 0.0, reward(goals, after.v_tool) - cost)
-    np.testing.assert_allclose(r, expected, atol=1e-5)
-    np.testing.assert_array_equal(terminated_, terminated(machine, after.lowest))
+@given(ticks())
+def test_step__pays_eq2_of_the_true_velocity_and_nothing_in_the_ground(case):
+    """The velocity is that of differences of the pose over the tick, whatever the encoders say."""
+    machine, q, goals, u = case
+    state = initial_state(machine, q, goals)
+    state = replace(state, plant=state.plant._replace(v=np.ones_like(q)))  # in full motion
+    after, r, end, truncated = step(machine, TaskConfig(noise=0.0), PLANT, state, u)
+    q_dot = (after.q - q) * machine.rate
+    tools = [forward_kinematics(machine, after.q + s * 1e-6 * q_dot).p[:, -1] for s in (1, -1)]
+    error = np.linalg.norm(goals - (tools[0] - tools[1]) / 2e-6, axis=-1)
+    np.testing.assert_allclose(r, np.where(end, 0.0, 1 / (1 + error)), atol=1e-4)
     assert not truncated.any()
 
 
-@given(plants_and_actions())
-def test_step__of_the_paper_has_eq2_alone(case):
-    machine, q, goals, action = case
-    state = initial_state(machine, q, goals, plant=True)
-    after, r, end, _, _ = step(machine, TaskConfig(paper=True), None, state, action)
-    np.testing.assert_array_equal(r, np.where(end, 0.0, reward(goals, after.v_tool)))
+@given(posed(shapes=[(5,)]), reals(-2, 2))
+def test_terminated__where_any_link_end_is_below_the_ground(case, ground):
+    machine, q = case
+    machine = replace(machine, ground=ground)
+    frames = forward_kinematics(machine, q)
+    below = [any(p[2] < ground for p in arm[1:]) for arm in frames.p]
+    assert terminated(machine, lowest_point(frames)).tolist() == below
 
 
-@given(plants_and_actions())
-def test_step__ends_where_a_link_is_in_the_ground_and_truncates_at_the_time_limit(case):
-    machine, q, goals, action = case
-    config = TaskConfig(episode_s=1.0)
-    state = initial_state(machine, q, goals, plant=True)
-    state = replace(state, ticks=np.array([0, round(machine.rate) - 1, round(machine.rate)]))
-    _, r, end, truncated, _ = step(machine, config, None, state, action)
-    assert not np.any(end & truncated)
-    np.testing.assert_array_equal(truncated, ~end & np.array([False, True, True]))
-    assert np.all(r[end] == 0)
+@given(ticks())
+def test_step__ends_a_start_in_the_ground_and_truncates_at_the_time_limit(case):
+    """Only an episode that begins in the ground ends there; later the arm may dig."""
+    machine, q, goals, u = case
+    second = round(machine.rate)
+    state = initial_state(machine, q, goals)
+    for before, limit in ((0, 1), (0, second), (1, second), (second - 1, second), (second, second)):
+        config = TaskConfig(episode_s=limit / machine.rate)
+        now = replace(state, ticks=np.full(3, before))
+        after, r, end, truncated = step(machine, config, PLANT, now, u)
+        ground = forward_kinematics(machine, after.q).p[:, 1:, 2].min(axis=-1) - machine.ground
+        sure = np.abs(ground) > 1e-5  # single precision
+        assert np.array_equal(end[sure], (ground < 0)[sure] & (before == 0))
+        assert np.array_equal(truncated, ~end & (before + 1 >= limit))
+        assert np.all((r == 0) == end)
+
+
+# --- what agents remember -------------------------------------------------------------------------
+
+
+@st.composite
+def heard(draw: st.DrawFn) -> tuple[Machine, np.ndarray, np.ndarray]:
+    """A machine, goals and measured velocities (T, 2, 3); zero goals are frequent."""
+    machine = draw(machines())
+    shape = (draw(st.integers(1, 12)), 2, 3)
+    speed = st.sampled_from([0.0, 0.005, 0.3]).flatmap(lambda most: reals(-most, most))
+    goals = draw(npst.arrays(np.float64, shape, elements=speed))
+    rests = draw(npst.arrays(np.bool_, shape[:2]))
+    v_tool = draw(npst.arrays(np.float64, shape, elements=speed))
+    return machine, goals * ~rests[..., None], v_tool
+
+
+def measured(machine: Machine, v_goal: np.ndarray, v_tool: np.ndarray) -> Measured:
+    """Measurements of two machines at rest in mid-range that hear `v_goal`, see `v_tool`."""
+    q = np.tile((machine.column("q_min") + machine.column("q_max")) / 2, (2, 1))
+    driven = q[:, machine.driven]
+    history = np.zeros((*driven.shape, 3, machine.history))
+    history[..., 0, :] = driven[..., None]
+    return Measured(v_goal, v_tool, q, 0 * driven, history)
+
+
+@given(heard())
+def test_memory__of_our_agent_is_a_sum_of_cut_errors_that_fade_in_two_seconds(case):
+    """I_t = sum_k exp(-(t - k) dt / 2 s) dt cut(v_goal of k - v_tool of k + 1), one by one."""
+    machine, goals, v_tool = case
+    memory = None
+    for t in range(len(goals)):
+        memory = INTERFACE.remember(machine, memory, measured(machine, goals[t], v_tool[t]))
+        for i in range(2):
+            expected, limit = np.zeros(3), 0.07 * machine.tool_speed
+            for k in range(t):
+                e = goals[k, i] - v_tool[k + 1, i]
+                size = math.sqrt(float(e @ e))
+                e = e * limit / size if size > limit else e
+                expected += math.exp(-(t - k) / machine.rate / 2.0) / machine.rate * e
+            np.testing.assert_allclose(memory.error_integral[i], expected, atol=1e-8)
+            ticks = 0  # without a goal, up to now
+            while ticks <= t and not any(goals[t - ticks, i]):
+                ticks += 1
+            assert memory.rest_ticks[i] == ticks
+        np.testing.assert_array_equal(memory.v_goal, goals[t])
+
+
+@given(heard(), st.integers(0, 1000))
+def test_cost__of_our_agent_is_a_tenth_of_the_valve_travel_and_the_error_integral(case, seed):
+    machine, goals, v_tool = case
+    memory = None
+    for goal, v in zip(goals, v_tool, strict=True):
+        memory = INTERFACE.remember(machine, memory, measured(machine, goal, v))
+    u, before = np.random.default_rng(seed).uniform(-1, 1, (2, 2, machine.n))
+    found = INTERFACE.cost(machine, u, before, memory)
+    for i in range(2):
+        changes = [abs(u[i, j] - before[i, j]) * 127 / machine.pwm_limit for j in machine.driven]
+        travel = 0.1 * sum(changes) / len(changes)
+        integral = math.sqrt(sum(float(x) ** 2 for x in memory.error_integral[i]))
+        np.testing.assert_allclose(found[i], travel + integral, atol=1e-7)
+    assert PAPER.cost(machine, u, before, None) == 0
+
+
+@given(heard())
+def test_memory__of_the_papers_agent_is_none(case):
+    machine, goals, v_tool = case
+    assert PAPER.remember(machine, None, measured(machine, goals[0], v_tool[0])) is None

@@ -1,139 +1,110 @@
-"""Pictures: shapes where kinematics put them, pixels of what they show, warnings on and off."""
+"""Pictures: joints where kinematics put them, arrows, bars and text of the right size and place."""
 
 import itertools
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 import pytest
-from helpers_viewer import tool
 from hypothesis import given
 from hypothesis import strategies as st
 from strategies import moving
 
-from brokk_min.kinematics import forward_kinematics, jacobian
+from brokk_min.kinematics import forward_kinematics, jacobian, tool_position
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer import drawing
-from brokk_min.viewer.camera import cameras
-from brokk_min.viewer.drawing import NO_POINTS, Scene
-from brokk_min.viewer.window import Canvas, Colour
+from brokk_min.viewer.drawing import Canvas, Scene
 
 Q = np.array([0.4, 0.5, 0.58, 1.71, 1.24])
 SIZE = (960, 600)
-
-
-class Shape(NamedTuple):
-    points: np.ndarray  # px (k, 2)
-    colour: Colour
-    width: float = 0.0  # of a line or ring; 0: filled
+STRETCHED = np.array([0.0, 0.0, 0.0, np.pi, 3 * np.pi / 4])  # all links of the Brokk are level
 
 
 class Recorder(Canvas):
-    """Lines, polygons (bars too), circles; text and box of each word."""
+    """Keeps (points, colour) of lines, polygons and bars, and (text, box) of words."""
 
     def __init__(self, size):
         super().__init__(size)
-        self.lines = []
-        self.polygons = []
-        self.circles = []
-        self.words = []
+        self.lines, self.polygons, self.bars, self.words = [], [], [], []
 
-    def line(self, points, colour, width=1):
+    def line(self, points, colour, width):
         super().line(points, colour, width)
-        self.lines.append(Shape(points, colour, width))
+        self.lines.append((points, colour, width))
 
     def polygon(self, points, colour):
         super().polygon(points, colour)
-        self.polygons.append(Shape(points, colour))
+        self.polygons.append((points, colour))
 
-    def circle(self, centre, radius, colour, width=0):
-        super().circle(centre, radius, colour, width)
-        self.circles.append(Shape(centre, colour, width))
+    def bar(self, left, top, width, height, colour):
+        super().bar(left, top, width, height, colour)
+        self.bars.append(((left, top, width, height), colour))
 
-    def bar(self, x0, x1, y, half, colour):
-        super().bar(x0, x1, y, half, colour)
-        corners = [[x0, y - half], [x1, y - half], [x1, y + half], [x0, y + half]]
-        self.polygons.append(Shape(np.array(corners), colour))
+    def text(self, x, y, text, size, colour=drawing.INK, anchor=0.0):
+        super().text(x, y, text, size, colour, anchor)
+        width, height = np.array(drawing._font(2 * size).size(text)) / 2
+        left, top = x - anchor * width, y - height / 2
+        self.words.append((text, np.array([left, top, left + width, top + height])))
 
-    def text(self, x, y, text, *more):
-        super().text(x, y, text, *more)
-        word, (left, upper) = self.texts[-1]
-        box = np.array([left, upper, left + word.get_width(), upper + word.get_height()])
-        self.words.append((text, box))
 
-    @property
-    def texts_drawn(self):
-        return [text for text, _ in self.words]
+@pytest.fixture
+def drawn(monkeypatch):
+    """A function that draws a scene and returns what was painted."""
+    made = []
+    monkeypatch.setattr(drawing, "Canvas", lambda size: made.append(Recorder(size)) or made[-1])
+
+    def draw(scene, machine=BROKK_170, size=SIZE):
+        drawing.draw(machine, scene, size)
+        return made[-1]
+
+    return draw
 
 
 def scene(q=Q, **more):
     still = np.zeros(len(q))
-    return Scene(q, still, still, np.zeros(3))._replace(**more)
+    return Scene(q, still, np.zeros(3), np.zeros(3))._replace(**more)
 
 
-def drawn(*scenes, machine=BROKK_170, size=SIZE):
-    canvas = Recorder(size)
-    drawing.draw(canvas, machine, scenes)
-    return canvas
+def tool(q):
+    return tool_position(forward_kinematics(BROKK_170, q))
 
 
-def test_cameras__see_the_brokk_as_worked_out_by_hand():
-    boxes = ((10.0, 20.0, 400.0, 200.0), (0.0, 0.0, 100.0, 100.0))  # side, top [px]
-    stretched = np.array([0.0, 0.0, 0.0, np.pi, 3 * np.pi / 4])  # all links horizontal
-    side, _ = cameras(BROKK_170, tool(stretched), *boxes, NO_POINTS)
+def test_views__see_the_brokk_as_worked_out_by_hand():
+    side, _ = drawing.views(BROKK_170, STRETCHED, SIZE)
     flat = np.array([[0, 0], [0.25, 0.95], [1.4, 0.95], [2.65, 0.95], [3.8, 0.95], [5.0, 0.95]])
-    p = forward_kinematics(BROKK_170, stretched).p
+    p = forward_kinematics(BROKK_170, STRETCHED).p
     np.testing.assert_allclose(side.project(p), side.origin + side.scale * flat * (1, -1))
-    p_tool = tool(stretched + np.array([np.pi / 2, 0, 0, 0, 0]))  # it points to the left
-    side, top = cameras(BROKK_170, p_tool, *boxes, NO_POINTS)
-    moved = top.project(p_tool) - top.origin
-    np.testing.assert_allclose(moved, [-5.0 * top.scale, 0.0], atol=1e-9)
+    p_tool = tool(STRETCHED + np.array([np.pi / 2, 0, 0, 0, 0]))  # it points to the left
+    side, top = drawing.views(BROKK_170, STRETCHED + np.array([np.pi / 2, 0, 0, 0, 0]), SIZE)
+    np.testing.assert_allclose(top.project(p_tool) - top.origin, [-5 * top.scale, 0], atol=1e-9)
     expected = side.origin + side.scale * np.array([5.0, -0.95])
     np.testing.assert_allclose(side.project(p_tool), expected)
 
 
-@given(moving([()]), st.sampled_from([(960, 600), (480, 560), (1500, 300)]))
-def test_draw__puts_the_joints_of_any_machine_where_kinematics_say(machine_moving, size):
-    machine, q, q_dot = machine_moving
-    goal = np.array([0.1, -0.2, 0.05])
-    canvas = drawn(scene(q, q_dot=q_dot, v_goal=goal), machine=machine, size=size)
-    for shape in canvas.lines + canvas.polygons:
-        assert np.isfinite(shape.points).all()
-        assert shape.points.shape[1] == 2
-    p = forward_kinematics(machine, q).p[1:]
-    heading = np.arctan2(p[-1, 1], p[-1, 0])
-    outward = p[:, 0] * np.cos(heading) + p[:, 1] * np.sin(heading)
-    side = np.stack([outward, -p[:, 2]], axis=1)
-    top = np.stack([-p[:, 1], -p[:, 0]], axis=1)
-    filled = [shape.points for shape in canvas.circles if not shape.width]
-    for flat, dots in zip((side, top), np.split(np.array(filled[1:]), 2), strict=True):
-        found = np.vstack([dots[:-1:2], dots[-1]])  # two circles a joint, one for the tool
-        moved = found - found[0]
-        expected = flat - flat[0]
-        scale = np.sum(moved * expected) / max(np.sum(expected**2), 1e-12)
-        if np.sum(expected**2) > 1e-9:  # else all joints are at one place
-            np.testing.assert_allclose(moved, scale * expected, atol=1e-6)
-            assert scale > 1
+@given(moving([()]), st.sampled_from([(960, 600), (640, 360), (1500, 500)]))
+def test_views__show_all_of_any_machine(machine_moving, size):
+    machine, q, _ = machine_moving
+    p = forward_kinematics(machine, q).p
+    _, low, high = drawing.extent(machine)
+    for view in drawing.views(machine, q, size):
+        left, top, width, height = view.box
+        x, y = view.project(p).T
+        shown = (p[:, 2] >= low) & (p[:, 2] <= high) if view.label == "side view" else ...
+        assert ((y[shown] >= top) & (y[shown] <= top + height)).all()
+        tip = x[-1]  # the side view has the tool to the right, links may be to the left
+        assert left <= tip <= left + width
+        assert view.scale > 1
 
 
-def test_draw__points_arrows_along_goal_and_measured_velocity():
-    q_dot = np.array([0.1, 0.0, 0.05, -0.1, 0.2])
-    v_tool = jacobian(forward_kinematics(BROKK_170, Q)) @ q_dot
+def test_draw__points_arrows_along_goal_and_measured_velocity(drawn):
+    v_tool = jacobian(forward_kinematics(BROKK_170, Q)) @ np.array([0.1, 0, 0.05, -0.1, 0.2])
     goal = np.array([0.1, 0.05, 0.15])
-    canvas = drawn(scene(q_dot=q_dot, v_goal=goal))
-    side_box, top_box, *_ = drawing._layout((0.0, 0.0, 960.0, 600.0), 5, 0)
-    views = cameras(BROKK_170, tool(Q), side_box, top_box, NO_POINTS)
-    for v, colour in ((v_tool, drawing.MEASURED), (goal, drawing.GOAL)):
-        shafts = [s.points for s in canvas.lines if s.colour == colour and s.width == 3]
-        for camera, shaft in zip(views, shafts, strict=True):
-            along = shaft[1] - shaft[0]
-            flat = camera.axes @ v * (1, -1)
+    canvas = drawn(scene(v_goal=goal, v_tool=v_tool))
+    for v, colour in ((v_tool, drawing.MEASURED), (goal, drawing.INK)):
+        shafts = [points for points, ink, width in canvas.lines if (ink, width) == (colour, 3)]
+        for view, shaft in zip(drawing.views(BROKK_170, Q, SIZE), shafts, strict=True):
+            along, flat = shaft[1] - shaft[0], view.axes @ v * (1, -1)
             np.testing.assert_allclose(along / np.hypot(*along), flat / np.hypot(*flat), atol=1e-6)
-    assert not [line for line in drawn(scene()).lines if line.width == 3]
-
-
-def red_pixels(canvas):
-    return int((np.abs(canvas.image().astype(int) - drawing.WARNING).sum(axis=-1) < 30).sum())
+            np.testing.assert_allclose(shaft[0], view.project(tool(Q)))
+    assert not [line for line in drawn(scene()).lines if line[2] == 3]
 
 
 @pytest.mark.parametrize(
@@ -145,57 +116,56 @@ def red_pixels(canvas):
         (1, 1.4, False),  # at its limit, but locked
     ],
 )
-def test_draw__warns_in_red_of_a_driven_joint_near_its_limit(joint, angle, warned):
+def test_draw__marks_a_driven_joint_near_its_limit_in_red(joint, angle, warned):
     q = Q.copy()
     q[joint] = angle
-    canvas = drawn(scene(q, status="driving", status_colour=drawing.DRIVING))
-    expected = [f"{BROKK_170.names[joint]} near its limit"] * warned
-    assert [text for text in canvas.texts_drawn if "limit" in text] == expected
-    assert (red_pixels(canvas) > 50) == warned
+    picture = drawing.image(drawing.draw(BROKK_170, scene(q), SIZE))
+    red = (np.abs(picture.astype(int) - drawing.WARNING).sum(axis=-1) < 30).sum()
+    assert (red > 30) == warned
 
 
 @pytest.mark.parametrize(("counts", "fraction"), [(80, 1.0), (-40, -0.5), (0, 0.0)])
-def test_joint_rows__have_valve_bars_as_long_as_the_command(counts, fraction):
+def test_joint_rows__have_valve_bars_as_long_as_the_command(counts, fraction, drawn):
     u = np.zeros(5)
     u[3] = counts / 127
     canvas = drawn(scene(u=u))
-    box = next(box for text, box in canvas.words if text == "q4")
-    row = [p for p in canvas.polygons if abs(p.points[:, 1].mean() - box[[1, 3]].mean()) < 1]
-    track = max(
-        (p.points for p in row if p.colour == drawing.TRACK and np.ptp(p.points[:, 1]) > 6),
-        key=lambda points: float(np.ptp(points[:, 0])),
-    )
-    (bar,) = (p.points for p in row if p.colour == drawing.COLOURS["rl"])
-    assert bar[1, 0] - bar[0, 0] == pytest.approx(fraction * np.ptp(track[:, 0]) / 2)
-    assert f"{counts:+d}" in canvas.texts_drawn
-    assert "locked" in canvas.texts_drawn
+    middle = next(box[[1, 3]].mean() for text, box in canvas.words if text == "q4")
+    row = [bar for bar in canvas.bars if abs(bar[0][1] + bar[0][3] / 2 - middle) < 1]
+    (slot,) = (box for box, colour in row if colour == drawing.SLOT and box[3] == 12)
+    (valve,) = (box for box, colour in row if colour == drawing.BLUE)
+    assert valve[2] == pytest.approx(abs(fraction) * slot[2] / 2)
+    assert valve[0] + valve[2] * (fraction < 0) == pytest.approx(slot[0] + slot[2] / 2)
+    texts = [text for text, _ in canvas.words]
+    assert f"{counts:+d} of 80" in texts
+    assert texts.count("locked") == 1
 
 
-@pytest.mark.parametrize(
-    ("arms", "size"), [(1, (1120, 680)), (1, SIZE), (2, (900, 480)), (3, (960, 540))]
-)
+@pytest.mark.parametrize("size", [(1120, 680), (640, 360)])
 @pytest.mark.parametrize("n", [2, 5])
-def test_draw__cuts_off_no_text_and_puts_none_on_another(n, arms, size):
-    name = "bucke" if arms > 1 else "cylinder_"
-    joints = [replace(joint, name=f"{name}{i}") for i, joint in enumerate(BROKK_170.joints[:n])]
-    machine = replace(BROKK_170, joints=tuple(joints), q_start=())
-    at_limits = scene(
-        machine.column("q_max"),
-        title="drive_of_the_long_name_2026-11-21.log",
-        status="12.3 s",
-        notes=[f"note {i} " + 9 * "of some length " * (arms == 1) for i in range(3)],
-        banner="q1: silent. It sent no position.",
-        headline="3 mm",
+def test_draw__cuts_off_no_text_and_puts_none_on_another(n, size, drawn):
+    joints = [replace(joint, name=f"boom_{i}") for i, joint in enumerate(BROKK_170.joints[:n])]
+    machine = replace(BROKK_170, name=f"short {n}", joints=tuple(joints), q_start=())
+    notes = [f"note {i} of some length" for i in range(5)]
+    canvas = drawn(
+        scene(machine.column("q_max"), title="RL policy", status="12.3 s", notes=notes),
+        machine,
+        size,
     )
-    canvas = drawn(*[at_limits] * arms, machine=machine, size=size)
-    warnings = sum("near its limit" in text for text in canvas.texts_drawn)
-    assert warnings == arms * len(machine.driven)
     boxes = [box for text, box in canvas.words if text]
+    assert len(boxes) == 6 + 5 + 3 * n
     for box in boxes:
         assert (box >= 0).all()
         assert (box[2:] <= size).all()
-    assert sum("length" in text for text in canvas.texts_drawn) >= 3 * (arms == 1)
     for one, other in itertools.combinations(boxes, 2):
         assert (one[:2] >= other[2:]).any() or (other[:2] >= one[2:]).any()
-    tracks = [p.points for p in canvas.polygons if p.colour == drawing.TRACK]
-    assert min(np.ptp(track[:, 0]) for track in tracks) > 10
+
+
+def test_picture__is_an_image_of_the_wanted_size_that_changes_with_its_arguments():
+    goal, v_tool = np.array([0.2, 0.0, 0.1]), np.zeros(3)
+    arguments = [Q, np.zeros(5), goal, v_tool]
+    picture = drawing.picture(BROKK_170, *arguments)
+    assert (picture.shape, picture.dtype) == ((360, 640, 3), np.uint8)
+    for i, other in enumerate((Q + 0.1, np.full(5, 0.3), -goal, goal)):
+        changed = drawing.picture(BROKK_170, *arguments[:i], other, *arguments[i + 1 :])
+        assert (picture != changed).any(axis=-1).sum() > 100
+    assert drawing.picture(BROKK_170, *arguments, (400, 300)).shape == (300, 400, 3)

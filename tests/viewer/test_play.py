@@ -1,230 +1,170 @@
-"""The window without a display: what it shows, whom it hears, and the whole of it in real time."""
+"""The window without a display: keys and gamepad become goals, and a simulated machine follows."""
 
-from contextlib import closing
-
-import can
 import numpy as np
 import pygame
 import pytest
-from helpers_bus import BASELINE, START, ConstantCommand, World, recording
-from helpers_viewer import post, post_key, telemetry, tool
+from helpers_bus import BASELINE, START, Virtual
 
-from brokk_min.can.canopen import OperatorInput
-from brokk_min.can.safety_gate import Fault
+from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
-from brokk_min.viewer import drawing, play, replay
-from brokk_min.viewer.control_process import BusOptions
-from brokk_min.viewer.play import Session
-from brokk_min.viewer.window import Window
-
-CONTROLLERS = {"rl": ConstantCommand(), "jacobian": ConstantCommand()}
+from brokk_min.viewer import drawing, play
+from brokk_min.viewer.play import Operator, Session
 
 
 @pytest.fixture
-def session(tmp_path):
-    return Session(BROKK_170, CONTROLLERS, tmp_path / "attempts.csv")
+def operator(monkeypatch):
+    monkeypatch.setenv("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")  # unseen: never has the focus
+    pygame.display.set_mode((10, 10))
+    pygame.joystick.quit()
+    pygame.event.clear()
+    return Operator(BROKK_170, pygame)
 
 
-def test_scene__interpolates_between_two_ticks_and_keeps_the_last_pose(session):
-    q = np.array(START)
-    scene = session.scene(0.0, "rl", "starting")
-    assert np.isnan(scene.q).all()
-    assert not scene.q_dot.any()
-    assert not scene.u.any()
-    assert (scene.banner, scene.status_colour) == ("starting", drawing.WARNING)
-    assert scene.path.shape == scene.trail.shape == (0, 3)
-    session.update(telemetry(0, q), 1.0)
-    np.testing.assert_array_equal(session.scene(1.02, "rl", "").q, q)
-    u = np.full(5, 0.1)
-    v = np.array([0.1, 0.0, 0.2])
-    session.update(telemetry(1, q + 0.02, q_dot=0 * q + 0.4, u=u, v_goal=v), 1.05)
-    for now, fraction in ((1.05, 0.0), (1.075, 0.5), (1.1, 1.0), (1.54, 1.0)):
-        scene = session.scene(now, "rl", "")
-        np.testing.assert_allclose(scene.q, q + fraction * 0.02)
-        assert (scene.q_dot == 0.4).all()
-        assert scene.u is u
-        assert scene.v_goal is v
-        assert (scene.status, scene.status_colour) == ("driving", drawing.DRIVING)
-        assert scene.colour == drawing.COLOURS["rl"]
-    np.testing.assert_allclose(scene.trail, [tool(q), tool(q + 0.02)])
-    late = session.scene(1.56, "rl", "")
-    np.testing.assert_array_equal(late.q, q + 0.02)
-    assert not late.q_dot.any()
-    assert (late.colour, late.status) == (drawing.TRACK, "no telemetry")
-    assert late.banner == "No telemetry: the pose is the last known one."
+def look(operator, ticks=5):
+    """Take in the events, and return the goal velocity some ticks later."""
+    actions = [operator.handle(event) for event in pygame.event.get()]
+    operator.actions = [action for action in actions if action]
+    return [operator.velocity() for _ in range(ticks)][-1]
 
 
-def test_scene__greys_the_last_pose_and_says_why_a_position_is_missing(session):
-    session.update(telemetry(0), 1.0)
-    malformed = 1 + Fault.MALFORMED * 6  # of q1, among five joints and the valve controller
-    lost = telemetry(1, np.full(5, np.nan), active_fault=malformed, driving=False)
-    session.update(lost, 1.05)
-    scene = session.scene(1.06, "rl", "ready")
-    np.testing.assert_array_equal(scene.q, START)
-    assert (scene.colour, scene.status) == (drawing.TRACK, "waiting")
-    assert scene.banner.startswith("q1: doubled or malformed position. It sent two positions")
-    session.update(telemetry(2, latched_fault=malformed, driving=False), 1.1)
-    scene = session.scene(1.11, "rl", "ready")
-    assert (scene.colour, scene.status) == (drawing.COLOURS["rl"], "stopped")
-    assert scene.banner.endswith("Over now: release SPACE, then press it again.")
+def key(name, down=True):
+    kind = pygame.KEYDOWN if down else pygame.KEYUP
+    pygame.event.post(pygame.event.Event(kind, key=pygame.key.key_code(name)))
 
 
-def test_scene__keeps_its_zoom_and_the_distance_from_the_line_until_the_next_line(session):
-    session.update(telemetry(), 0.0)
-    assert not len(session.scene(0.0, "rl", "").in_view)
-    session.lines["rectangle"] = np.array([[0.0, 0, 0], [0, 0.05, 0]])
-    session.next_task()
-    radius = np.hypot(*tool(START)[:2])
-    for tick, y in enumerate((0.0, 0.05)):
-        q = (np.arcsin(y / radius), *START[1:])
-        session.update(telemetry(tick, q, u=np.full(5, 0.5)), 0.05 * tick)
-    assert session.finished
-    scene = session.scene(0.06, "rl", "")
-    np.testing.assert_allclose(scene.in_view.min(axis=0)[1], 0.0, atol=1e-9)
-    np.testing.assert_allclose(scene.in_view.max(axis=0)[1], 0.05)
-    off = radius - np.sqrt(radius**2 - 0.05**2)  # the tool moves on a circle
-    assert scene.headline == f"{1e3 * off:.0f} mm from the line, at most {1e3 * off:.0f} mm"
-    session.update(telemetry(2, (0.5, *START[1:])), 0.1)
-    wider = session.scene(0.16, "rl", "").in_view
-    assert wider[:, 1].max() == pytest.approx(tool((0.5, *START[1:]))[1])
-    session.update(telemetry(3), 0.15)
-    np.testing.assert_allclose(session.scene(0.21, "rl", "").in_view, wider)  # it does not shrink
+@pytest.mark.parametrize(
+    ("keys", "direction"),
+    [
+        ("up", (1, 0, 0)),
+        ("down", (-1, 0, 0)),
+        ("left", (0, 1, 0)),
+        ("right", (0, -1, 0)),
+        ("w", (0, 0, 1)),
+        ("s", (0, 0, -1)),
+        ("up left", (0.5**0.5, 0.5**0.5, 0)),
+        ("w s", (0, 0, 0)),
+    ],
+)
+def test_velocity__is_at_most_the_tool_speed_and_zero_once_released(operator, keys, direction):
+    for name in keys.split():
+        key(name)
+    np.testing.assert_allclose(look(operator), 0.3 * np.array(direction), atol=1e-12)
+    for name in keys.split():
+        key(name, down=False)
+    assert not look(operator, 1).any()
 
 
-def test_compare__lays_the_traces_of_all_controllers_over_each_other(session):
-    session.update(telemetry(driving=False), 0.0)
-    session.next_task("compare")
-    assert session.comparison is None  # on a bus the window shows the machine alone
-    session.simulated = True
-    session.controllers = {"jacobian": BASELINE, "rl": ConstantCommand(0, 0, 0, 0, 0)}
-    session.lines["rectangle"] = np.array([[0.0, 0, 0], [0, 0.3, 0]])
-    session.next_task("compare")
-    for tick in range(120):
-        session.update(telemetry(tick, driving=False), 0.05 * tick)
-    moved, stood = session.scene(5.96, "rl", "ready").traces
-    assert moved.trail[-1][1] == pytest.approx(0.3, abs=0.05)
-    np.testing.assert_array_equal(moved.trail[-1], moved.trail[-10])  # it has arrived
-    np.testing.assert_allclose(stood.trail, np.tile(tool(START), (len(stood.trail), 1)), atol=1e-9)
-    assert moved.text.startswith("PID with DLS (the paper's): ")
-    assert stood.text == "RL policy: 0 mm, at most 0 mm"
-    session.update(telemetry(121), 6.0)
-    assert session.comparison is None  # who drives sees the machine
+def test_velocity__ramps_over_a_quarter_of_a_second_and_shift_gives_a_third(operator):
+    key("up")
+    speeds = [look(operator, 1)[0] for _ in range(6)]
+    np.testing.assert_allclose(speeds, 0.3 * np.array([0.2, 0.4, 0.6, 0.8, 1, 1]))
+    key("left shift")
+    assert look(operator)[0] == pytest.approx(0.1)
+    key("left shift", False)
+    key("up", False)
+    key("down")
+    assert look(operator, 1)[0] == pytest.approx(-0.3 * 0.2)  # from zero on, not from 0.1
 
 
-def test_session__begins_a_line_again_when_the_mode_changes_on_the_way(session):
-    session.update(telemetry(), 0.0)
-    session.next_task("again")
-    first = session.tracing
-    assert session.task == "rectangle"  # there was nothing to repeat
-    session.update(telemetry(mode=1), 0.0)
-    assert session.tracing is first  # before the first opened valve nothing changes
-    opened = np.full(5, 0.5)
-    session.update(telemetry(mode=1, u=opened), 0.0)
-    session.update(telemetry(mode=2, u=opened), 0.0)
-    assert session.tracing is not first
-    assert session.task == "rectangle"
-    assert session.tracing is not None
-    assert len(session.tracing.p) == 1
-    session.update(telemetry(mode=2), 0.0)
-    session.next_task()
-    assert session.task == "circle"
+def test_handle__forgets_held_keys_when_the_window_loses_its_focus(operator):
+    key("up")
+    assert look(operator)[0] > 0
+    pygame.event.post(pygame.event.Event(pygame.WINDOWFOCUSLOST))
+    assert not look(operator, 1).any()
 
 
-def test_show__sends_requests_once_there_is_telemetry_and_takes_keys_frame_by_frame(session):
-    frames = [[], [telemetry(0)], [telemetry(1)], [telemetry(2), telemetry(3)], [telemetry(4)]]
-    presses = [[], [], ["return"], ["return"], ["backspace", "tab"], ["escape"]]
-    sent = []
-    tasks = []
-
-    def each_frame(seen, handler):
-        assert seen is session
-        tasks.append((session.task, session.tracing))
-        for name in presses.pop(0):
-            post_key(name)
-        return bool(presses)
-
-    with closing(Window(play.SIZE, "test")) as window:
-        play.show(window, session, lambda: frames.pop(0), sent.append, each_frame)
-    assert [task for task, _ in tasks] == ["", "", "", "rectangle", "circle", "circle"]
-    assert tasks[5][1] is not tasks[4][1]  # begun again
-    assert [request.mode for request in sent] == [0, 0, 0, 1]  # not in the first frame
-    assert session.previous is not None
-    assert session.previous.tick == 3
+def test_gamepad__drives_until_it_is_unplugged(operator):
+    device = Virtual()
+    look(operator)
+    device.axis(1, -1.0)  # forward
+    device.axis(4, 1.0)  # down
+    expected = 0.3 * np.array([1, 0, -1]) / 2**0.5
+    np.testing.assert_allclose(look(operator), expected, atol=1e-6)
+    device.button(3, True)
+    look(operator)
+    assert operator.actions == ["controller"]
+    device.unplug()
+    assert not look(operator, 1).any()
+    assert operator.pad is None
 
 
-def test_play__drives_a_simulated_machine_in_lockstep(tmp_path):
-    """Keys, the loop, the plant behind its bus; then loss of focus, and closing."""
-    seen = []
-    steps = [
-        (lambda t: t.active_fault == 0, pygame.KEYDOWN, {"key": pygame.K_SPACE}),
-        (lambda t: t.driving, pygame.KEYDOWN, {"key": pygame.K_q}),
-        (lambda t: bool(t.q_dot[0] > 0.1), pygame.WINDOWFOCUSLOST, {}),
-        (lambda t: not t.driving and not t.u.any(), pygame.WINDOWFOCUSGAINED, {}),
-        (lambda t: True, pygame.QUIT, {}),
-    ]
+class Counting:
+    """A controller that closes all valves, counts its ticks and keeps the goals."""
 
-    def each_frame(session, handler):
-        if session.telemetry is not None and steps:
-            seen.append(session.telemetry)
-            condition, kind, event = steps[0]
-            if condition(session.telemetry):
-                post(kind, **event)
-                steps.pop(0)
-        return len(seen) < 3600
+    def __init__(self):
+        self.goals = []
 
-    options = BusOptions(log=tmp_path / "run.log")
-    play.play(BROKK_170, {}, options, tmp_path / "attempts.csv", each_frame)
-    assert not steps
-    assert seen[-1].q[0] > 0.01
+    def start(self, num):
+        return 0
+
+    def __call__(self, measured, ticks):
+        self.goals.append(measured.v_goal[0])
+        return np.zeros((1, 5)), ticks + 1
+
+
+def session():
+    return Session(BROKK_170, {"PID": BASELINE, "counting": Counting()}, np.array(START))
+
+
+def test_session__follows_the_goal_and_goes_back_to_its_start():
+    run = session()
+    for _ in range(60):
+        run.tick(np.array([0.0, 0.2, 0.0]))
+    assert run.state.v_tool[0] == pytest.approx([0, 0.2, 0], abs=0.05)
+    np.testing.assert_allclose(run.trail[0], tool_position(forward_kinematics(BROKK_170, START)))
+    scene = run.scene()
+    np.testing.assert_array_equal(scene.q, run.state.q[0])
+    np.testing.assert_array_equal(scene.u, run.state.history[0, :, 2, -1])
+    assert (scene.title, scene.status, scene.colour) == ("PID", "3.0 s", drawing.BLUE)
+    run.controller()
+    run.tick(np.zeros(3))
+    assert (run.memory, run.scene().title, run.scene().colour) == (1, "counting", drawing.ORANGE)
+    run.restart()
+    assert (run.memory, len(run.trail)) == (0, 1)
+    np.testing.assert_array_equal(run.state.q[0], START)
+
+
+def test_rectangle__starts_at_the_tool_and_tells_the_distance_from_it():
+    run = session()
+    run.rectangle()
+    np.testing.assert_allclose(run.path[[0, -1]], [run.tool, run.tool])
+    assert np.ptp(run.path[:, 2]) == 0  # level
+    assert run.scene().status.startswith("0 mm from the rectangle, at most 0 mm")
+    run.trail = run.path[0] + np.array([[0, 0, 0], [0.0, 0.1, 0.05], [0.0, 0.1, 0.02]])
+    assert run.scene().status.startswith("20 mm from the rectangle, at most 50 mm")
+
+
+def test_distance__by_hand():
+    corner = [[0, 0, 0], [1, 0, 0], [1, 1, 0]]
+    points = np.array([[0.5, 0.2, 0], [1.3, 0.4, 0.4], [-3.0, 4.0, 0], [1, 2, 0]])
+    np.testing.assert_allclose(play.distance(corner, points), [0.2, 0.5, 5.0, 1.0])
+
+
+def test_play__moves_the_machine_by_keys_until_the_window_is_closed(monkeypatch):
+    """Through pygame's queue, in real time: arrow key, the other controller, and closing."""
+    scenes, counting, show = [], Counting(), play.show
+
+    def each_picture(pg, machine, shown):
+        show(pg, machine, shown)
+        scenes.append(shown[0])
+        for at, name in ((1, "left"), (20, "tab"), (22, "escape")):
+            if len(scenes) == at:
+                key(name)
+
+    monkeypatch.setattr(play, "show", each_picture)
+    play.play(BROKK_170, {"PID": BASELINE, "counting": counting}, START)
+    assert [scene.title for scene in scenes] == ["PID"] * 20 + ["counting"] * 2
+    assert scenes[19].v_tool[1] > 0.1
+    np.testing.assert_allclose(counting.goals, 2 * [[0, 0.3, 0]], atol=1e-6)
     assert not pygame.display.get_init()
-    run = replay.run_of_log(BROKK_170, tmp_path / "run.log", (1, 2, 3))
-    assert not run.u[-1].any()  # the last frame was neutral
-    assert run.u[:, 0].max() >= 40 / 127
 
 
-@pytest.mark.parametrize("interface", ["", "virtual"])
-def test_play__reaches_no_bus_without_a_window(interface, monkeypatch, tmp_path):
+def test_play__needs_a_display_a_controller_and_a_start_within_the_ranges(monkeypatch):
+    with pytest.raises(ValueError, match="controllers: expected at least one, got none"):
+        play.play(BROKK_170, {})
+    with pytest.raises(ValueError, match=r"start: expected 5 angles within their ranges, got \[9"):
+        play.play(BROKK_170, {"PID": BASELINE}, (9.0, 0.5, 0.6, 1.7, 1.2))
     pygame.display.quit()
     monkeypatch.setenv("SDL_VIDEODRIVER", "nonsense")
-    options = BusOptions(interface, "empty", log=tmp_path / "run.log")
-    with pytest.raises(ValueError, match="window: expected a display"):
-        play.play(BROKK_170, {}, options, tmp_path / "none")
-    with pytest.raises(ValueError, match="window: expected a display"):
-        play.play(BROKK_170, None, options, tmp_path / "none")
-    assert not list(tmp_path.iterdir())
-
-
-def test_play__ends_with_the_reason_of_a_loop_that_cannot_begin(tmp_path):
-    options = BusOptions("virtual", "empty")  # nobody answers
-    with pytest.raises(ValueError, match="got node 1: object 0x6501"):
-        play.play(BROKK_170, {}, options, tmp_path / "attempts.csv")
-
-
-def test_watch__shows_another_programs_drive_and_sends_nothing(tmp_path):
-    def operator(driving, ready):
-        return OperatorInput((0.1, 0, 0) if driving else (0, 0, 0), ready)
-
-    world = World(ConstantCommand(60, 0, 60, 60, 60), operator)
-    frames = []
-    world.upward = world.downward = recording(frames)
-    world.drive.begin()
-    world.run(1.5)
-    peer = can.Bus("watched", interface="virtual")
-    seen = []
-
-    def each_frame(session, handler):
-        for can_id, data in frames[:40]:
-            peer.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
-        if session.telemetry is not None:
-            seen.append(session.telemetry)
-        more = bool(frames)
-        del frames[:40]
-        post_key("space")
-        return more
-
-    play.play(BROKK_170, None, BusOptions("virtual", "watched"), tmp_path / "none", each_frame)
-    assert peer.recv(0.1) is None
-    peer.shutdown()
-    assert seen[-1].driving
-    assert seen[-1].q_dot[0] > 0.05
-    np.testing.assert_allclose(seen[-1].u[0] * 127, 60)
+    with pytest.raises(ValueError, match=r"window: expected a display .*, got nonsense"):
+        play.play(BROKK_170, {"PID": BASELINE})

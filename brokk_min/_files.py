@@ -1,0 +1,184 @@
+"""Files of the project: whole or not at all, and never executed.
+
+Arrays with a JSON header (`.npz`), JSON, CSV. A new file replaces the old one only once it is
+complete. What a file should hold and does not is a ValueError of one line: file, wanted, got.
+"""
+
+import csv
+import json
+import os
+import reprlib
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from importlib import import_module
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+# a folder for each machine: policies, gains and start poses of `make reproduce`
+SHIPPED = Path(__file__).parent / "shipped"
+TEXT = ("run", "sequence")  # columns of tables that are names
+
+
+def require_package(package: str, extra: str) -> Any:
+    """Import a package of an extra of pyproject.toml; ValueError: it is not installed."""
+    try:
+        return import_module(package)
+    except ImportError as error:
+        expectation = f"expected the extra brokk_min[{extra}]"
+        raise ValueError(f"{package}: {expectation}, got {error}") from error
+
+
+@contextmanager
+def whole_file(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
+    """A temporary file, text in UTF-8, that replaces `path` if the block ends without an error."""
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise ValueError(f"{path}: expected an existing directory, got {path.parent}")
+    if path.exists() and not path.is_file():
+        raise ValueError(f"{path}: expected a regular file to replace, got another kind")
+    text = {} if "b" in mode else {"newline": "", "encoding": "utf-8"}
+    target = path.resolve()  # of a link
+    handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{path.name[:100]}.")
+    try:
+        with os.fdopen(handle, mode, **text) as file:  # type: ignore[call-overload]
+            yield file
+            file.flush()
+            with suppress(OSError):  # a share may refuse it
+                os.fsync(file.fileno())
+        with suppress(OSError):
+            os.umask(umask := os.umask(0))
+            os.chmod(temporary, target.stat().st_mode if target.exists() else 0o666 & ~umask)
+        os.replace(temporary, target)
+    except BaseException as error:
+        os.unlink(temporary)
+        if isinstance(error, OSError):
+            error.filename = str(path)  # the one that the user knows
+        raise
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write JSON with all digits; ValueError for nan and inf."""
+    with whole_file(path, "w") as file:
+        json.dump(value, file, indent=1, allow_nan=False)
+        file.write("\n")
+
+
+def write_csv(path: Path, columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
+    """Write a header and rows, as `read_csv` reads them."""
+    with whole_file(path, "w") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(rows)
+
+
+def brief(value: Any) -> str:
+    """A value as text of at most some eighty characters."""
+    short = reprlib.Repr()
+    short.maxlist = short.maxdict = short.maxtuple = 6
+    short.maxstring = short.maxother = 60
+    text = str(value) if isinstance(value, Exception) else short.repr(value)
+    if isinstance(value, OSError) and value.strerror:
+        text = value.strerror.lower()
+    text = " ".join(text.split())
+    return text if len(text) <= 110 else f"{text[:70]} ... {text[-30:]}"
+
+
+@contextmanager
+def expected(path: Path, what: str) -> Iterator[None]:
+    """Turn any error of the block into a ValueError: `path` is not `what`.
+
+    Errors that name `path` already stay as they are, and so do those of the operating system.
+    """
+    try:
+        yield
+    except OSError:
+        raise
+    except Exception as error:  # zipfile, zlib, json and NumPy raise anything on damaged files
+        if isinstance(error, ValueError) and str(error).startswith(f"{path}: "):
+            raise
+        raise ValueError(f"{path}: expected {what}, got {brief(error)}") from error
+
+
+@contextmanager
+def located(*paths: Path) -> Iterator[None]:
+    """Put the first of these files in front of a ValueError of the block that names none."""
+    try:
+        yield
+    except ValueError as error:
+        if str(error).startswith(tuple(f"{path}: " for path in paths)):
+            raise
+        raise ValueError(f"{paths[0]}: {error}") from error
+
+
+def expect_same(path: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    """ValueError for the first entry of `wanted` that `found` has otherwise."""
+    for name, value in wanted.items():
+        if found.get(name) != value:
+            got = brief(found.get(name))
+            raise ValueError(f"{path}: {name}: expected {brief(value)}, got {got}")
+
+
+def read_json(path: Path, what: str) -> Any:
+    """The content of a JSON file; ValueError: it is not `what`."""
+    with expected(path, what):
+        return json.loads(Path(path).read_text(encoding="utf-8"))
+
+
+def read_csv(path: Path, *columns: str) -> dict[str, NDArray[Any]]:
+    """A CSV by column: text in `TEXT`, numbers elsewhere.
+
+    ValueError: no such columns, or, with its row, a cell that is missing or no number.
+    """
+    with expected(path, f"a CSV table with columns {', '.join(columns)}"):
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            header, *rows = csv.reader(file, strict=True)
+        names = [name.strip() for name in header]
+        if missing := [name for name in columns if name not in names]:
+            raise ValueError(f"{path}: expected columns {missing}, got {brief(names)}")
+        wrong = [i for i, row in enumerate(rows, 2) if len(row) != len(names)]
+        if wrong or not rows:
+            row = (wrong or [2])[0]
+            raise ValueError(f"{path}: row {row}: expected {len(names)} cells, got another number")
+        return {name: _column(path, name, cells) for name, cells in zip(names, zip(*rows))}
+
+
+def _column(path: Path, name: str, cells: Sequence[str]) -> NDArray[Any]:
+    if name in TEXT:
+        return np.array(cells)
+    with suppress(ValueError):
+        return np.array(cells, float)
+    for row, cell in enumerate(cells, 2):
+        try:
+            float(cell)
+        except ValueError:
+            place = f"{path}: row {row}, column {name}"
+            raise ValueError(f"{place}: expected a number, got {brief(cell)}") from None
+    raise AssertionError
+
+
+def save_arrays(path: Path, kind: str, header: Mapping[str, Any], **arrays: Any) -> None:
+    """Write arrays and a JSON header as one `.npz`; `kind` says what it is, as "policy 5"."""
+    text = np.array(json.dumps({"kind": kind, **header}))
+    with whole_file(path) as file:
+        np.savez_compressed(file, header=text, **arrays)
+
+
+def load_arrays(path: Path, kind: str = "") -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Header and arrays of an `.npz`; nothing in it is executed.
+
+    ValueError: no readable `.npz`, or not of this `kind`; without a kind it may have no header.
+    """
+    with expected(path, f"a readable .npz file of a {kind}" if kind else "a readable .npz file"):
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = dict(archive)
+        header = json.loads(str(arrays.pop("header", "{}")))
+        got = header.pop("kind", None)
+        if kind and got != kind:
+            made = "a file of another version (train or fit again)"
+            got = made if kind.split()[0] in str(got) else brief(got)
+            raise ValueError(f"{path}: expected a {kind}, got {got}")
+        return header, arrays

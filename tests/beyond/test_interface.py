@@ -1,0 +1,131 @@
+"""Our agent's observation, action and closed valves by hand.
+
+tests/properties/test_reward.py has its memory and its costs.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import machines
+
+from brokk_min import env
+from brokk_min.beyond import interface
+from brokk_min.beyond.interface import Memory, command, observation_scale, observe, smooth_angles
+from brokk_min.env import Measured, measure
+from brokk_min.kinematics import forward_kinematics, jacobian
+from brokk_min.machine import BROKK_170
+
+POSE = np.array([1.5, 0.5, 0.58, 1.71, 1.24])  # the paper's q_s
+DRIVEN = [0, 2, 3, 4]
+
+
+def memory(rest_ticks: int | list[int] = 0, integral: tuple[float, ...] = (0.0,) * 3) -> Memory:
+    return Memory(np.zeros(3), np.array(integral), np.array(rest_ticks))
+
+
+def numbered() -> Measured:
+    """Measurements of the Brokk in which every number differs."""
+    joint, lag = np.arange(5)[:, None], np.arange(13)
+    q, q_dot = POSE[:, None] + 0.001 * (lag - 12), 0.02 * joint + 0.001 * lag
+    history = np.stack([q, q_dot, -0.1 * joint + 0.002 * lag], axis=1).astype(np.float32)
+    return measure(BROKK_170, history, np.array([0.3, -0.1, -0.15], np.float32))
+
+
+def test_smooth_angles__by_hand():
+    """Three samples of velocities 1, 2, 4 rad/s, which lag by half a tick of a window of three.
+
+    The oldest sample moves on by (2 + 4) dt, and its velocity was (4 - 1) / 2 dt behind; the next
+    by 4 dt, and (4 - 2) / 2 dt; the newest stays.
+    """
+    machine = replace(BROKK_170, history=3, velocity_samples=3)
+    history = np.zeros((1, 3, 3))
+    history[0, 0] = [0.3, 0.6, 0.9]
+    history[0, 1] = [1.0, 2.0, 4.0]
+    expected = np.mean([0.3 + 0.05 * (6 + 1.5), 0.6 + 0.05 * (4 + 1.0), 0.9])
+    np.testing.assert_allclose(smooth_angles(machine, history), [expected], atol=1e-12)
+
+
+@given(machines(), st.integers(0, 1000))
+def test_smooth_angles__are_the_angles_of_steady_motion_and_of_constant_acceleration(machine, seed):
+    """Whatever the pose; velocities are late by half their window, as those of the estimator."""
+    q, q_dot, q_ddot = np.random.default_rng(seed).normal(size=(3, len(machine.driven), 1))
+    t = machine.dt * np.arange(1 - machine.history, 1)
+    late = t - machine.dt * (machine.velocity_samples - 1) / 2
+    angles = q + q_dot * t + q_ddot * t**2 / 2
+    history = np.stack([angles, q_dot + q_ddot * late, 0 * angles], axis=1)
+    np.testing.assert_allclose(smooth_angles(machine, history), angles[:, -1], atol=1e-9)
+
+
+def test_observe__by_hand():
+    """The paper's numbers by their weights, then the three blocks of ours."""
+    measured, integral = numbered(), (0.02, -0.01, 0.03)
+    obs = observe(BROKK_170, measured, memory(0, integral))
+    assert obs.shape == (223,) and obs.dtype == np.float32
+    paper = env.features(BROKK_170, measured)
+    np.testing.assert_allclose(obs[:7], 1.4 * paper[:7], rtol=1e-5)
+    np.testing.assert_allclose(obs[7:163], paper[7:] / 13**0.5, rtol=1e-5, atol=1e-6)
+    for place, joint in ((163, 0), (176, 2), (189, 3), (202, 4)):
+        opening = np.maximum(0, np.abs(-0.1 * joint + 0.002 * np.arange(13)) - 0.07) / 0.93
+        expected = (np.tanh(opening / 0.02) - 0.5) / 0.5 / 13**0.5
+        np.testing.assert_allclose(obs[place : place + 13], expected, rtol=1e-4, atol=1e-6)
+    q = measured.q.astype(float)
+    q[DRIVEN] = smooth_angles(BROKK_170, measured.history)
+    J = jacobian(forward_kinematics(BROKK_170, q))[:, DRIVEN]
+    damping = (0.06 * (np.hypot(0.25, 0.95) + 1.15 + 1.25 + 1.15 + 1.2)) ** 2
+    solution = np.linalg.solve(J.T @ J + damping * np.eye(4), J.T)
+    nominal = np.array([0.20, 0.28, 0.38, 0.47]) / 3**0.5 / 4.2
+    np.testing.assert_allclose(obs[215:219], solution @ measured.v_goal / nominal, rtol=1e-4)
+    np.testing.assert_allclose(obs[219:], solution @ integral / (0.1 * nominal), rtol=1e-4)
+
+
+def test_the_table_of_the_docstring__is_true():
+    """Numbers and weights of the table are those of the scale."""
+    rows = re.findall(r"^\| (\d+)-(\d+) +\| .+? +\| .+? +\| ([\d.]+) +\|", interface.__doc__, re.M)
+    _, scale = observation_scale(BROKK_170)
+    _, std = env.observation_scale(BROKK_170)
+    uniform = BROKK_170.q_dot_max[DRIVEN] / 3**0.5
+    deviations = np.concatenate([std, np.full(52, 0.5), uniform, 0.1 * uniform])
+    assert [int(last) + 1 for _, last, _ in rows] == [7, 163, 215, 219, 223] and len(scale) == 223
+    assert all(int(one[1]) + 1 == int(next_[0]) for one, next_ in pairwise(rows))
+    for first, last, weight in rows:
+        place = slice(int(first), int(last) + 1)
+        np.testing.assert_allclose(deviations[place] / scale[place], float(weight), atol=5e-4)
+
+
+def test_command__by_hand():
+    """The dead zone has 8.89 counts, 71.11 are beyond: 8.89 + 35.56; clipped to -80."""
+    for action, counts in (
+        ([0.5, -3.0, -0.01, 0.005], [44, 0, -80, -10, 5]),
+        ([0, 0, 0, 0], [0, 0, 0, 0, 0]),
+        ([1, 0, -1, 0], [80, 0, 0, -80, 0]),
+    ):
+        u = command(BROKK_170, np.array(action, float), memory())
+        np.testing.assert_allclose(u * 127, counts, atol=1e-9)
+
+
+@given(machines(), st.floats(-2, 2))
+def test_command__is_piecewise_linear_beyond_each_valves_own_dead_zone(machine, a):
+    u = command(machine, np.full(len(machine.driven), a), memory()) * 127
+    for j, joint in enumerate(machine.joints):
+        dead = 127 * joint.dead_zone[0 if a > 0 else 1]
+        knee = dead + 0.01 * (machine.pwm_limit - dead)
+        exact = np.sign(a) * np.interp(abs(a), [0, 0.01, 1], [0, knee, machine.pwm_limit])
+        assert u[j] == pytest.approx(exact if joint.driven else 0, abs=0.5 + 1e-6)
+        assert u[j] == round(u[j], 9)
+
+
+def test_command__closes_the_valves_after_half_a_second_without_a_goal():
+    """Of a batch of machines each by its own rest; 0.5 s are ten ticks."""
+    u = command(BROKK_170, np.full((4, 4), 0.5), memory([0, 10, 11, 1000]))
+    assert u[:, DRIVEN].all(axis=1).tolist() == [True, True, False, False]
+    assert u.any(axis=1).tolist() == [True, True, False, False]
+    slow = replace(BROKK_170, name="slow", rate=10.0)  # five ticks
+    assert command(slow, np.full(4, 0.5), memory(5)).any()
+    assert not command(slow, np.full(4, 0.5), memory(6)).any()

@@ -1,0 +1,85 @@
+"""Nets that read what commands open: their inputs by hand, by torch, and joints that are held."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from brokk_min.actuator import initial_history
+from brokk_min.beyond.valve_nets import ValveNet, mu_law, open_indicator, opening, valve_inputs
+from brokk_min.machine import valve_opening
+
+ZONES = np.array([[0.07, 0.07], [0.2, 0.1], [0.0, 0.3]])
+
+
+def constant_net(velocity: float, n: int = 4, H: int = 13) -> ValveNet:
+    """Nets that say `velocity` whatever they read: no weights, sigmoid(0) = 1/2, the middle."""
+    sizes = [(4 * H, 8), (8,), (8, 8), (8,), (8, 1), (1,)]
+    middle, limits = np.full(n, velocity, np.float32), np.full(n, 9.0, np.float32)
+    return ValveNet(
+        joints=tuple("abcd"[:n]),
+        history=H,
+        rate=20.0,
+        velocity_samples=4,
+        velocity_logged=False,
+        machine="some",
+        input_mean=np.zeros((n, 4 * H), np.float32),
+        input_scale=np.ones((n, 4 * H), np.float32),
+        output_low=middle - 1,
+        output_high=middle + 1,
+        q_low=-limits,
+        q_high=limits,
+        weights=tuple(np.zeros((n, *size), np.float32) for size in sizes),
+        training={},
+        dead_zones=np.full((n, 2), 0.07),
+    )
+
+
+def test_mu_law__by_hand():
+    """Openings 0.01 and 0.5: ln(1.5) and ln(26) of ln(51)."""
+    expected = [-1, -np.log(1.5) / np.log(51), 0, np.log(26) / np.log(51), 1]
+    np.testing.assert_allclose(mu_law(np.array([-1.0, -0.01, 0.0, 0.5, 1.0])), expected, atol=1e-12)
+
+
+def test_open_indicator__by_hand():
+    """tanh(0.5) = 0.462 at 1 % of opening, tanh(1) = 0.762 at 2 %, either way."""
+    found = open_indicator(np.array([0.0, 0.01, -0.01, 0.02, -1.0]))
+    np.testing.assert_allclose(found, [0, 0.46212, 0.46212, 0.76159, 1], atol=1e-5)
+
+
+@given(st.integers(0, 1000))
+def test_valve_inputs__are_the_same_by_numpy_torch_and_a_loop(seed):
+    history = np.random.default_rng(seed).uniform(-1, 1, (2, 3, 3, 5)).astype(np.float32)
+    found = valve_inputs(history, ZONES.astype(np.float32))
+    assert found.shape == (2, 3, 20) and found.dtype == np.float32
+    by_torch = valve_inputs(torch.from_numpy(history), torch.from_numpy(ZONES).float(), torch)
+    np.testing.assert_allclose(by_torch, found, atol=1e-6)
+    for i, j in np.ndindex(2, 3):
+        q, q_dot, u = history[i, j]
+        x = valve_opening(u, ZONES[j])
+        np.testing.assert_allclose(opening(history[i, :, 2], ZONES)[j], x, atol=1e-7)
+        expected = np.concatenate([q, q_dot, mu_law(x), np.tanh(np.abs(x) / 0.02)])
+        np.testing.assert_allclose(found[i, j], expected, atol=1e-6)
+
+
+def test_inputs__are_what_a_net_of_its_own_dead_zones_reads():
+    net, history = constant_net(0.2), np.zeros((4, 3, 13), np.float32)
+    history[:, 2] = 0.3
+    np.testing.assert_allclose(
+        net.inputs(history), valve_inputs(history, net.dead_zones), rtol=1e-6
+    )
+    np.testing.assert_allclose(net.inputs(history)[:, 26:39], mu_law(0.23 / 0.93), rtol=1e-5)
+
+
+@pytest.mark.parametrize("counts", [0, 8])
+def test_predict__holds_a_joint_whose_valve_was_closed_and_that_stood_still(counts):
+    """8 counts are within the dead zone of 8.9, 9 are not; 3 mrad are a motion, 1 mrad is none."""
+    history = initial_history(np.full(4, 0.5, np.float32), 13)
+    history[:, 2] = np.float32([[counts], [-counts], [counts], [-counts]]) / np.float32(127)
+    history[1, 2, 3] = -9 / 127
+    history[2, 0, -1] = 0.503
+    history[3, 0, -1] = 0.501
+    np.testing.assert_allclose(constant_net(0.2).predict(history), [0, 0.2, 0.2, 0], atol=1e-6)

@@ -1,0 +1,101 @@
+"""Ten faults planted in a drive of a policy on its nets: `examples/diagnose.py` names them."""
+
+import numpy as np
+import pytest
+from helpers_bus import HoldingOperator, World, random_policy
+
+from brokk_min.actuator import append_sample, initial_history
+from brokk_min.can.drive_log import Telemetry
+from brokk_min.env import measure
+from brokk_min.evaluation.sequences import axis_sequences
+from brokk_min.learning.policy import PolicyController, save_policy
+from brokk_min.machine import BROKK_170 as M
+from brokk_min.machine import read_encoder
+from examples.diagnose import diagnose, main
+
+START = np.array([[0.0, 0.5, 0.58, 1.71, 1.24]])
+
+
+POLICIES = {name: random_policy(name) for name in ("paper", "beyond")}
+
+
+def drive(observe=lambda h: h, send=lambda u: u, read=lambda q: q, ticks_of_plant=1, name="paper"):
+    """A drive with a fault: in what the policy gets, the valves get, or the encoders give."""
+    policy = POLICIES[name]
+    controller, net = PolicyController(M, policy), policy.net
+    goals = np.concatenate([sequence.goals[20:120] for sequence in axis_sequences(M)])
+    state, memory, history, u, ticks = net.reset(M, START), None, None, np.zeros((1, 5)), []
+    for t, goal in enumerate(goals):
+        q = read_encoder(M, read(state.q))
+        if history is None:
+            history = initial_history(q.astype(np.float32), M.history)
+        else:
+            history = append_sample(history, u, q, M.velocity_samples, M.dt)
+        v_goal = goal[None].astype(np.float32)
+        u, memory = controller(measure(M, observe(history.copy()), v_goal), memory)
+        time = t * ticks_of_plant / 20
+        ticks.append(Telemetry(time, q[0], q[0], u[0].astype(float), goal, True))
+        for _ in range(ticks_of_plant):
+            state = net.step(M, state, send(u))
+    return ticks
+
+
+def tick_late():
+    """Gives what it got at the tick before."""
+    kept = []
+    return lambda x: kept.append(x) or kept[-2:][0]
+
+
+def scaled(*factors):
+    return lambda history: history * np.array(factors, np.float32)[:, None]
+
+
+SIGN = np.array([1, 1, 1, -1, 1])
+ZERO = np.zeros((5, 3, 1), np.float32)
+ZERO[3, 0] = 0.2  # rad
+FAULTS = {
+    "sign of q4": {"send": lambda u: u * SIGN},
+    "order of q3, q5": {"send": lambda u: u[:, [0, 1, 4, 3, 2]]},
+    "scale of angles and velocities: 57.3": {"observe": scaled(180 / np.pi, 180 / np.pi, 1)},
+    "one sample late": {"observe": tick_late()},
+    "rate: 10 Hz instead of 20 Hz": {"ticks_of_plant": 2},
+    "dead zone": {"send": lambda u: np.sign(u) * np.maximum(np.abs(u) - 0.06, 0)},
+    "scale of commands: 0.5": {"send": lambda u: 0.5 * u},
+    "order of the history": {"observe": lambda history: history[..., ::-1].copy()},
+    "zero of q4": {"observe": lambda history: history + ZERO},
+    "delay: 50 ms more": {"send": tick_late()},
+}
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_diagnose__finds_nothing_in_a_sound_drive(name):
+    assert diagnose(M, POLICIES[name], drive(name=name)) == []
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_diagnose__names_a_planted_fault(name):
+    terms = diagnose(M, POLICIES["paper"], drive(**FAULTS[name]))
+    assert any(name in term.name for term in terms[:3]), terms[:6]
+
+
+def test_main__reads_a_log_and_prints_what_explains_it(tmp_path, capsys):
+    class Reversed(PolicyController):
+        def __call__(self, measured, memory):
+            u, memory = super().__call__(measured, memory)
+            return u * SIGN, memory
+
+    log, file = str(tmp_path / "run.log"), str(tmp_path / "policy.npz")
+    save_policy(file, POLICIES["beyond"], M)
+    world = World(Reversed(M, POLICIES["beyond"]), HoldingOperator(), log=log)
+    world.drive.begin()
+    for side in (0, 1, -1):
+        world.operator.v = (0.0, 0.15 * side, 0.1 * side)
+        world.run(2.0)
+    world.bus.close()
+    main(log, file)
+    assert "commands: sign of q4 (command)" in capsys.readouterr().out
+    with open(log) as lines:
+        cut = lines.readlines()
+    (tmp_path / "cut.log").write_text("".join(cut[: len(cut) // 9]))
+    with pytest.raises(ValueError, match="log: expected 73 ticks of driving in a row"):
+        main(str(tmp_path / "cut.log"), file)

@@ -1,0 +1,79 @@
+"""Many seeds: nothing is done twice, a failure costs one seed; their table."""
+
+import json
+
+import numpy as np
+import pytest
+from helpers_machines import POSE, small_net
+
+from brokk_min.evaluation import metrics, sweep
+from brokk_min.evaluation.sequences import axis_sequences
+from brokk_min.learning import jobs
+from brokk_min.learning.checkpoint import train_policy
+from brokk_min.learning.policy import PolicyController
+from brokk_min.learning.recipes import Recipe
+from brokk_min.machine import BROKK_170
+from brokk_min.settings import PPOConfig, TaskConfig
+
+TINY = PPOConfig(num_envs=4, horizon=4, epochs=1, minibatch_size=16, total_steps=32)
+RECIPE = Recipe("paper", TaskConfig(episode_s=0.6), TINY)
+NET = small_net(BROKK_170, np.random.default_rng(0))
+POSES = POSE + 0.1 * np.random.default_rng(0).random((2, 5))
+SEQUENCES = [s._replace(goals=s.goals[s.goals.any(axis=1)][:10]) for s in axis_sequences(BROKK_170)]
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch):
+    """One core, and sequences of half a second from poses that need no search."""
+    monkeypatch.setattr(jobs, "cpu_count", lambda: 1)
+    monkeypatch.setattr(sweep, "evaluation_starts", lambda machine, num, *_: POSES[:num])
+    monkeypatch.setattr(sweep, "task_sequences", lambda machine: SEQUENCES)
+
+
+def test_run_seed__trains_as_train_policy_and_scores_its_policy(tmp_path):
+    rows = sweep.run_seed(BROKK_170, NET, RECIPE, tmp_path, 2, 4)
+    policy = train_policy(BROKK_170, NET, RECIPE, 4, tmp_path / "alone.npz")
+    assert (tmp_path / "seed_4.npz").read_bytes() == (tmp_path / "alone.npz").read_bytes()
+    controllers = {"rl": PolicyController(BROKK_170, policy)}
+    assert rows == metrics.evaluate(BROKK_170, controllers, SEQUENCES, POSES, 0)[0]
+
+
+def test_run_seed__refuses_results_of_another_training(tmp_path):
+    sweep.run_seed(BROKK_170, NET, RECIPE, tmp_path, 2, 4)
+    with pytest.raises(ValueError, match=r"seed_4\.json: starts: expected 1, got 2"):
+        sweep.run_seed(BROKK_170, NET, RECIPE, tmp_path, 1, 4)
+
+
+def rows(error):
+    """Two sequences from three starts, of which two count."""
+    starts = (("workspace", error), ("limits", 99.0), ("workspace", error + 1))
+    return [
+        {"controller": "rl", "sequence": s, "start": i, "kind": kind} | dict.fromkeys(sweep.KEYS, e)
+        for s in "xy"
+        for i, (kind, e) in enumerate(starts)
+    ]
+
+
+def test_over_seeds__counts_a_seed_once():
+    table = sweep.over_seeds([rows(1.0), rows(3.0)])
+    # two seeds, 1.5 and 3.5: half of 12.7062 x sqrt(2) / sqrt(2) x 2
+    expected = {"mean": 2.5, "low": -10.2062, "high": 15.2062}
+    assert list(table) == ["velocity_error x", "velocity_error y", *sweep.KEYS]
+    assert all(number == pytest.approx(expected, abs=1e-4) for number in table.values())
+    assert "velocity_error x         2.5000 (-10.2062 to 15.2062)" in sweep.show(table)
+
+
+def test_sweep__does_nothing_twice_and_a_failure_costs_one_seed(tmp_path):
+    arguments = (BROKK_170, NET, RECIPE, [3, 4], tmp_path / "new", 2)
+    table = sweep.sweep(*arguments)
+    names = [f"seed_{n}.{end}" for n in (3, 4) for end in ("json", "npz", "npz.csv")]
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == [*names, "sweep.json"]
+    times = [(tmp_path / "new" / name).stat().st_mtime_ns for name in names]
+    assert sweep.sweep(*arguments) == table
+    assert [(tmp_path / "new" / name).stat().st_mtime_ns for name in names] == times
+    (tmp_path / "new" / "seed_3.json").write_text("{")
+    with pytest.raises(ValueError, match=r"^seed 3: .*seed_3.json: expected the result of a seed"):
+        sweep.sweep(*arguments)
+    written = json.loads((tmp_path / "new" / "sweep.json").read_text())
+    assert list(written["failed"]) == ["3"]
+    assert {row["seed"] for row in written["runs"]} == {4} and len(written["runs"]) == 3 * 2

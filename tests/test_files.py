@@ -1,0 +1,173 @@
+"""Files: written and read again; any bytes are read or refused in one line; whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import stat
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers_machines import small_net
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+
+from brokk_min import _files
+from brokk_min._files import load_arrays, read_csv, read_json, save_arrays, whole_file, write_csv
+from brokk_min.learning.policy import KIND, Policy, load_policy, save_policy
+from brokk_min.machine import BROKK_170
+
+names = st.text("abcdefghij_0", min_size=1, max_size=8).filter(str.isidentifier)
+READERS = {
+    "x.npz": lambda path: load_arrays(path, "policy 5"),
+    "x.json": lambda path: read_json(path, "results"),
+    "x.csv": lambda path: read_csv(path, "time", "u"),
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("files")
+
+
+def write_good(path: Path) -> bytes:
+    """A good file of each kind; its bytes."""
+    if path.suffix == ".npz":
+        save_arrays(path, "policy 5", {"joints": ["q1"]}, w=np.arange(6.0).reshape(2, 3))
+    elif path.suffix == ".json":
+        _files.write_json(path, {"runs": [{"sequence": "x", "reward": 0.5}]})
+    else:
+        write_csv(path, ["run", "time", "u"], [["a", 0.0, 0.25], ["a", 0.05, -1.0]])
+    return path.read_bytes()
+
+
+def reads_or_refuses(path: Path) -> bool:
+    """Is the file refused? Then by a ValueError of one short line that begins with its path."""
+    try:
+        READERS[path.name](path)
+    except ValueError as error:
+        message = str(error)
+        assert message.startswith(f"{path}: ") and "expected " in message and ", got " in message
+        assert "\n" not in message and len(message) < 300 + len(str(path))
+        return True
+    return False
+
+
+# --- any bytes ------------------------------------------------------------------------------------
+
+
+@given(st.sampled_from([*READERS]), st.binary(max_size=200))
+def test_any_bytes__are_refused_in_one_line_or_read(folder, name, data):
+    path = folder / name
+    path.write_bytes(data)
+    refused = reads_or_refuses(path)
+    assert refused or name == "x.json"  # by chance, JSON: a digit is
+
+
+@given(st.sampled_from([*READERS]), st.data())
+def test_damaged_bytes__are_refused_in_one_line_or_read(folder, name, data):
+    """One cut, or up to three changed bytes, of a good file."""
+    path = folder / name
+    good = bytearray(write_good(path))
+    assert not reads_or_refuses(path)
+    if data.draw(st.booleans()):
+        del good[data.draw(st.integers(0, len(good) - 1)) :]
+    for _ in range(data.draw(st.integers(0, 3)) if good else 0):
+        good[data.draw(st.integers(0, len(good) - 1))] = data.draw(st.integers(0, 255))
+    path.write_bytes(good)
+    reads_or_refuses(path)
+
+
+@pytest.mark.parametrize("column", ["time", "u"])
+def test_read_csv__refuses_a_dropped_column_by_name(tmp_path, column):
+    path = tmp_path / "x.csv"
+    write_csv(path, [{"time": "u", "u": "time"}[column], "other"], [[1, 2]])
+    with pytest.raises(ValueError, match=rf"x\.csv: expected columns \['{column}'\], got "):
+        read_csv(path, "time", "u")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("time,u\n0,1\n1,\n", "row 3, column u: expected a number, got ''"),  # and not -1
+        ("time,u\n0,x\n", "row 2, column u: expected a number, got 'x'"),
+        ("time,u\n0,1\n1\n", "row 3: expected 2 cells, got another number"),
+        ("time,u\n", "row 2: expected 2 cells, got another number"),
+    ],
+)
+def test_read_csv__refuses_cells_that_are_missing_or_no_numbers(tmp_path, text, message):
+    path = tmp_path / "x.csv"
+    path.write_text(text)
+    with pytest.raises(ValueError) as caught:
+        read_csv(path, "time", "u")
+    assert str(caught.value) == f"{path}: {message}"
+
+
+def test_load_arrays__refuses_other_kinds_other_versions_and_pickles(tmp_path):
+    path = tmp_path / "x.npz"
+    for kind, got in (("net 3", "'net 3'"), ("policy 4", "a file of another version")):
+        save_arrays(path, kind, {})
+        with pytest.raises(ValueError, match=f"x.npz: expected a policy 5, got {got}"):
+            load_arrays(path, "policy 5")
+    np.savez(path, x=np.array([{}], object), allow_pickle=True)
+    with pytest.raises(ValueError, match=r"x\.npz: expected a readable \.npz file, got .*pickle"):
+        load_arrays(path)
+
+
+def test_load_policy__refuses_a_file_without_any_one_of_its_fields(tmp_path):
+    """Of its header, of the header of its nets inside, and of its arrays."""
+    path = tmp_path / "p.npz"
+    net = small_net(BROKK_170, np.random.default_rng(0))
+    sizes = [(163, 8), (8,), (8, 8), (8,), (8, 8), (8,), (8, 4), (4,)]
+    weights = tuple(np.zeros(size, np.float32) for size in sizes)
+    save_policy(path, Policy({"seed": 0}, weights, net, "paper"), BROKK_170)
+    assert load_policy(path, BROKK_170).interface == "paper"
+    header, arrays = load_arrays(path, KIND)
+    for place in (header, header["net"], arrays):
+        for name in [*place]:
+            value = place.pop(name)
+            save_arrays(path, KIND, header, **arrays)
+            with pytest.raises(ValueError, match=r"^\S+p\.npz: expected [^\n]+, got .*" + name):
+                load_policy(path, BROKK_170)
+            place[name] = value
+
+
+# --- what was written -----------------------------------------------------------------------------
+
+
+@given(st.lists(names, unique=True, max_size=3), st.text())
+def test_save_arrays__are_loaded_bit_for_bit(folder, keys, text):
+    arrays = {f"w_{key}": np.arange(6, dtype=np.float32).reshape(2, 3) / 7 for key in keys}
+    save_arrays(folder / "y.npz", "net 1", {"text": text}, **arrays)
+    header, loaded = load_arrays(folder / "y.npz", "net 1")
+    assert header == {"text": text} and loaded.keys() == arrays.keys()
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(loaded[name], array)
+        assert loaded[name].dtype == array.dtype
+
+
+@given(npst.arrays(np.float64, (4, 2), elements=st.floats(allow_infinity=False, allow_nan=False)))
+def test_write_csv__is_read_bit_for_bit(folder, numbers):
+    write_csv(
+        folder / "y.csv", ["run", "x", "y"], ([f"r{i}", *row] for i, row in enumerate(numbers))
+    )
+    table = read_csv(folder / "y.csv", "run", "x", "y")
+    assert table["run"].tolist() == ["r0", "r1", "r2", "r3"]
+    np.testing.assert_array_equal(np.stack([table["x"], table["y"]], axis=1), numbers)
+
+
+def test_whole_file__leaves_the_old_file_and_no_other_if_writing_fails(tmp_path):
+    path = tmp_path / "y.json"
+    path.write_text("old")
+    path.chmod(0o640)
+    with pytest.raises(ValueError, match="JSON"):
+        _files.write_json(path, {"x": float("nan")})
+    with pytest.raises(ZeroDivisionError), whole_file(path, "w") as file:
+        file.write("half" + str(1 / 0))
+    assert path.read_text() == "old" and [*tmp_path.iterdir()] == [path]
+    _files.write_json(path, {"x": 0.1})
+    assert json.loads(path.read_text()) == {"x": 0.1}
+    assert stat.S_IMODE(path.stat().st_mode) == 0o640
+    with pytest.raises(ValueError, match="expected an existing directory, got"):
+        _files.write_json(tmp_path / "none" / "y.json", {})
