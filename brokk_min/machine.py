@@ -61,10 +61,19 @@ class Joint:
         """ValueError: a field that is no number, an empty range, a triangle that does not close."""
         positive = ("q_dot_up", "q_dot_down", "cylinder_rod", "cylinder_area", "encoder_step")
         for name, value in vars(self).items():
+            field = f"{self.name}.{name}"
             if name not in ("name", "driven", "kind"):
-                require(bool(np.isfinite(value).all()), f"{self.name}.{name}", "a number", value)
+                number = isinstance(value, int | float | tuple | np.number)
+                require(number and bool(np.isfinite(value).all()), field, "a number", value)
             if name in positive:
-                require(value > 0, f"{self.name}.{name}", "a positive number", value)
+                require(value > 0, field, "a positive number", value)
+            if name in ("dead_zone", "cylinder_speed"):
+                require(np.shape(value) == (2,), field, "a pair, up and down", value)
+        kinds = ("revolute", "prismatic")
+        require(self.kind in kinds, f"{self.name}.kind", " or ".join(kinds), self.kind)
+        require(
+            abs(self.encoder_sign) == 1, f"{self.name}.encoder_sign", "1 or -1", self.encoder_sign
+        )
         require(self.q_min < self.q_max, f"{self.name}.q_max", f"above {self.q_min}", self.q_max)
         low, high = self.cylinder_angle + self.q_min, self.cylinder_angle + self.q_max
         closes = self.cylinder_base == 0 or 0 < low < high < np.pi
@@ -108,6 +117,7 @@ class Machine:
         for name in ("rate", "tool_speed", "pump_flow", "encoder_bits", "plant_dt"):
             value = getattr(self, name)
             require(0 < value < np.inf, name, "a positive number", value)
+        require(self.valve_threshold < 1, "valve_threshold", "below 1", self.valve_threshold)
         limit, zones, samples = self.pwm_limit, self.dead_zones, self.velocity_samples
         require(1 <= limit <= PWM_MAX, "pwm_limit", "1 to 127", limit)
         opens = bool(((zones >= 0) & (zones < limit / PWM_MAX)).all())  # else no valve ever does

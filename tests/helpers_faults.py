@@ -209,7 +209,6 @@ for node in range(1, 6):
         "dropped": (up(tpdo, lambda d: []), "silent"),
         "jumps": (up(tpdo, moved(90)), "jumped"),
         "jumps by half a turn": (up(tpdo, moved(2048)), "out of range"),
-        "jumps by a turn": (up(tpdo, moved(4096)), DOUBLED),
         "says FFFFFFFF": (up(tpdo, lambda d: [b"\xff" * 4]), DOUBLED),
         "doubled": (up(tpdo, lambda d: [d, d]), DOUBLED),
         "malformed": (up(tpdo, lambda d: [d[:3]]), DOUBLED),

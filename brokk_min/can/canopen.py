@@ -22,7 +22,7 @@ HEARTBEAT = 0x700
 # objects of an encoder: index, subindex
 HEARTBEAT_OBJECT = (0x1017, 0)  # period [ms]
 SYNC_OBJECT = (0x1800, 2)  # after how many SYNCs a position is sent
-RESOLUTION_OBJECT = (0x6501, 0)  # counts per turn; measuring step [nm] of a linear encoder
+RESOLUTION_OBJECT = (0x6501, 0)  # counts per turn
 OPERATIONAL = 5  # NMT state
 START_ALL = bytes([1, 0])  # NMT command
 POSITION_BITS = 26  # of the encoders that we simulate
@@ -86,7 +86,7 @@ class Nodes:
         if frame.id in self.position_index:
             i = self.position_index[frame.id]
             raw = int.from_bytes(frame.data, "little")
-            sound = size == 4 and raw != NO_POSITION and not self._skips_turns(i, raw)
+            sound = size == 4 and raw != NO_POSITION
             self.frames[i] += 1 if sound else 2
             if size == 4:
                 self.raw[i] = raw
@@ -94,16 +94,6 @@ class Nodes:
             i = self.heartbeat_index[frame.id]
             self.heartbeat[i] = frame.time
             self.nmt[i] = frame.data[0] & 0x7F
-
-    def _skips_turns(self, i: int, raw: int) -> bool:
-        """Are there whole turns between two positions, other than where an encoder starts again?
-
-        Of 12 bits: 5 -> 4101 skips one; 4095 -> 0 of a single turn and 2**26 - 1 -> 0 do not.
-        """
-        last = int(self.raw[i])
-        turn = int(encoder_turns(self.machine)[i])
-        step = (raw - last + turn // 2) % turn - turn // 2
-        return last >= 0 and 0 < abs(raw - last - step) <= max(raw, last)
 
     def counts(self) -> Array:
         """Newest joint angles [counts], (n,)."""
@@ -122,12 +112,13 @@ def check_bus(machine: Machine) -> None:
     got = ", ".join(f"0x{i:03X}" for i in ids)
     free = ids[-1] <= 0x7FF and not others & {*ids}
     require(free, "valve_frame_id", "identifiers of no other frame", got)
-    for name, most in (("encoder_bits", POSITION_BITS), ("tool_speed", FASTEST_GOAL)):
-        value = getattr(machine, name)
-        require(value <= most, name, f"at most {most}", value)
+    bits, speed = machine.encoder_bits, machine.tool_speed
+    require(bits <= POSITION_BITS, "encoder_bits", f"at most {POSITION_BITS}", bits)
+    require(speed <= FASTEST_GOAL, "tool_speed", f"at most {FASTEST_GOAL}", speed)
     for joint in machine.joints:
+        require(joint.kind == "revolute", f"{joint.name}.kind", "revolute on a bus", joint.kind)
         width = joint.q_max - joint.q_min
-        fits = joint.kind == "prismatic" or width <= 2 * np.pi - 0.1
+        fits = width <= 2 * np.pi - 0.1
         require(fits, f"{joint.name}.q_max", "a range 0.1 rad below a turn", f"{width:.2f} rad")
     slowest = 1.5 / WATCHDOG  # Hz, because a tick may be late by half
     require(machine.rate >= slowest, "rate", f"{slowest:g} Hz or more (watchdog)", machine.rate)
@@ -145,8 +136,7 @@ def node_numbers(machine: Machine) -> list[int]:
 
 def used_ids(machine: Machine) -> list[int]:
     """CAN identifiers of all frames that concern the program that drives."""
-    bases = (TPDO1, SDO_ANSWER, HEARTBEAT)
-    nodes = [base + node for node in node_numbers(machine) for base in bases]
+    nodes = [b + n for n in node_numbers(machine) for b in (TPDO1, SDO_ANSWER, HEARTBEAT)]
     return [NMT, SYNC, *valve_frame_ids(machine), *nodes]
 
 
@@ -156,12 +146,12 @@ def set_up_nodes(bus: Any, machine: Machine) -> None:
     ValueError: an encoder that does not answer or has another resolution; see also `check_bus`.
     """
     check_bus(machine)
-    for joint, resolution in zip(machine.joints, encoder_resolutions(machine)):
+    turn = 2**machine.encoder_bits
+    for joint in machine.joints:
         node = joint.encoder_node
         found = sdo(bus, node, RESOLUTION_OBJECT)
-        unit = "counts a turn" if joint.kind == "revolute" else "nm a count"
-        wanted = f"{resolution} {unit} of encoder node {node} (object 0x6501)"
-        require(found == resolution, joint.name, wanted, found)
+        wanted = f"{turn} counts a turn of encoder node {node} (object 0x6501)"
+        require(found == turn, joint.name, wanted, found)
         sdo(bus, node, HEARTBEAT_OBJECT, round(1e3 * HEARTBEAT_PERIOD), size=2)
         sdo(bus, node, SYNC_OBJECT, 1, size=1)
     bus.send(NMT, START_ALL)
@@ -191,21 +181,9 @@ def sdo(
     raise ValueError(f"{where} within {SDO_TIMEOUT} s, got none")
 
 
-def encoder_resolutions(machine: Machine) -> list[int]:
-    """Object 0x6501 of each joint's encoder: counts a turn; of a prismatic joint nm a count."""
-    steps = [(joint.kind == "prismatic", joint.encoder_step) for joint in machine.joints]
-    return [round(1e9 * step) if slides else 2**machine.encoder_bits for slides, step in steps]
-
-
-def encoder_turns(machine: Machine) -> Array:
-    """Counts (n,) after which positions repeat: a turn, all bits of prismatic joints' encoders."""
-    slides = [joint.kind == "prismatic" for joint in machine.joints]
-    return np.asarray(np.where(slides, 2**POSITION_BITS, 2**machine.encoder_bits))
-
-
 def encoder_counts(machine: Machine, raw: ArrayLike) -> Array:
     """Joint angles [counts] of raw positions (..., n): zeroed, unwrapped at mid range."""
-    turn = encoder_turns(machine)
+    turn = 2**machine.encoder_bits
     zero, sign = (machine.column(name).astype(int) for name in ("encoder_zero", "encoder_sign"))
     middle = (machine.column("q_min") + machine.column("q_max")) / 2
     lowest = np.rint(middle / machine.encoder_step).astype(int) - turn // 2

@@ -51,7 +51,8 @@ class Bus:
             self.echoes.remove((message.arbitration_id, data))
             return Frame(now, -1, data)
         self._log(message, now, self.name)
-        return Frame(now, standard_id(message), data)
+        other = message.is_remote_frame or message.is_error_frame or message.is_fd
+        return Frame(now, -1 if other or message.is_extended_id else message.arbitration_id, data)
 
     def send(self, can_id: int, data: bytes) -> None:
         """Send one frame, once; never periodically, because the kernel would go on after a hang."""
@@ -68,15 +69,10 @@ class Bus:
 
     def flush(self) -> None:
         """Write the log on, so that it survives the program's sudden end. OSError: a full disk."""
-        if self.writer is None:
-            return
-        try:
-            while self.unwritten:
-                self.writer.on_message_received(self.unwritten.popleft())
+        while self.unwritten:
+            self.writer.on_message_received(self.unwritten.popleft())
+        if self.writer is not None:
             self.writer.file.flush()
-        except OSError as error:
-            error.filename = self.writer.file.name
-            raise
 
     def _message(self, can_id: int, data: bytes) -> Any:
         return self.message(arbitration_id=can_id, data=data, is_extended_id=False, is_rx=False)
@@ -94,12 +90,6 @@ class Bus:
             if self.writer is not None:
                 self.flush()
                 self.writer.stop()
-
-
-def standard_id(message: Any) -> int:
-    """Identifier of a data frame with 11 bits; -1 for any other frame."""
-    flags = message.is_extended_id, message.is_remote_frame, message.is_error_frame, message.is_fd
-    return -1 if any(flags) else int(message.arbitration_id)
 
 
 @contextmanager

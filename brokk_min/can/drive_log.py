@@ -62,51 +62,35 @@ class Telemetry(NamedTuple):
     driving: bool
 
 
-class TelemetryReader:
-    """Turns the frames of a bus or a log, one after another, into telemetry."""
-
-    def __init__(self, machine: Machine) -> None:
-        self.machine = machine
-        self.nodes = Nodes(machine)
-        self.operator_input = OperatorInput()
-        self.valves = canopen.ValveFrames(machine)
-        self.start = 0.0  # s, time of the last SYNC
-        self.angles: deque[Array] = deque(maxlen=machine.velocity_samples)  # rad (n,)
-
-    def update(self, frame: Frame) -> Telemetry | None:
-        """Take in one frame; at a SYNC, telemetry of the tick that it ends."""
-        self.nodes.update(frame)
-        self.valves.update(frame)
-        self.operator_input = operator_input_of(frame) or self.operator_input
-        if frame.id != canopen.SYNC:
-            return None
-        telemetry = self._telemetry()
-        self.nodes.start_tick()
-        self.valves.enable[:] = False  # no frame, no command
-        self.start = frame.time
-        return telemetry
-
-    def _telemetry(self) -> Telemetry:
-        m = self.machine
-        q = q_dot = np.full(m.n, np.nan)
-        if (self.nodes.frames == 1).all():
-            q = self.nodes.counts() * m.encoder_step
-            if not self.angles:
-                self.angles.extend([q] * m.velocity_samples)
-            self.angles.append(q)
-            q_dot = estimate_velocity(np.stack(self.angles, axis=-1), m.velocity_samples, m.dt)
-        else:
-            self.angles.clear()
-        driving = bool(self.valves.enable.all())
-        v_goal = np.array(self.operator_input.v_goal) * driving
-        return Telemetry(self.start, q, q_dot, self.valves.u.copy(), v_goal, driving)
-
-
 def read_telemetry(machine: Machine, frames: Iterable[Frame]) -> Iterator[Telemetry]:
-    """Telemetry of the ticks of a log."""
-    reader = TelemetryReader(machine)
-    updates = (reader.update(frame) for frame in frames)
-    return (telemetry for telemetry in updates if telemetry is not None)
+    """Telemetry of the ticks of a log; each ends with the SYNC of the next."""
+    nodes, valves, operator = Nodes(machine), canopen.ValveFrames(machine), OperatorInput()
+    start = 0.0  # s, time of the last SYNC
+    angles: deque[Array] = deque(maxlen=machine.velocity_samples)  # rad (n,)
+    for frame in frames:
+        nodes.update(frame)
+        valves.update(frame)
+        operator = operator_input_of(frame) or operator
+        if frame.id != canopen.SYNC:
+            continue
+        q, q_dot = _motion(machine, nodes, angles)
+        driving = bool(valves.enable.all())
+        v_goal = np.array(operator.v_goal) * driving
+        yield Telemetry(start, q, q_dot, valves.u.copy(), v_goal, driving)
+        nodes.start_tick()
+        valves.enable[:] = False  # no frame, no command
+        start = frame.time
+
+
+def _motion(machine: Machine, nodes: Nodes, angles: deque[Array]) -> tuple[Array, Array]:
+    """Angles and velocities (n,) of this tick, nan if an angle is missing; `angles` grows."""
+    if not (nodes.frames == 1).all():
+        angles.clear()
+        return np.full(machine.n, np.nan), np.full(machine.n, np.nan)
+    q = nodes.counts() * machine.encoder_step
+    angles.extend([q] * (1 if angles else machine.velocity_samples))
+    window = np.stack(angles, axis=-1)
+    return q, estimate_velocity(window, machine.velocity_samples, machine.dt)
 
 
 def log_for_fit(machine: Machine, frames: Iterable[Frame]) -> Log:
@@ -125,9 +109,9 @@ def log_for_fit(machine: Machine, frames: Iterable[Frame]) -> Log:
     longest, least = max(map(len, recordings)), machine.history + 2
     wanted = f"{least} ticks of driving in a row at {machine.rate:g} Hz (--machine)"
     require(longest >= least, "log", wanted, f"{longest} at most")
-    named = []
-    for number, recording in enumerate(recordings):
-        if len(recording) >= least:
-            u, q = (np.array([getattr(tick, name) for tick in recording]) for name in ("u", "q"))
-            named.append((f"drive_{number:03d}", u, q))
+    named = [
+        (f"drive_{k:03d}", np.array([t.u for t in ticks]), np.array([t.q for t in ticks]))
+        for k, ticks in enumerate(recordings)
+        if len(ticks) >= least
+    ]
     return machine_log(machine, named)

@@ -55,12 +55,8 @@ class Script:
 class Joystick:
     """A joystick through pygame: a button is the dead-man switch, three axes the tool velocity.
 
-    Args:
-        machine: full deflection is its `tool_speed`.
-        axes: of the stick, for x, y and z; each counts negative forward, left and up.
-        button: dead-man switch.
-
-    ValueError: no pygame, no joystick, or one without these axes and button.
+    Full deflection is the machine's `tool_speed`; the axes, for x, y and z, count negative
+    forward, left and up. ValueError: no pygame, no joystick, or one without axes and button.
     """
 
     def __init__(self, machine: Machine, axes: Sequence[int] = (1, 0, 4), button: int = 5) -> None:
@@ -74,6 +70,7 @@ class Joystick:
         require(found, "joystick", "one, or --command FILE.csv", "none")
         self.speed, self.axes, self.button = machine.tool_speed, axes, button
         self.stick: Any = self.pygame.joystick.Joystick(0)
+        self.alive = True
         num_axes, num_buttons = self.stick.get_numaxes(), self.stick.get_numbuttons()
         fits = max(axes) < num_axes and button < num_buttons
         wanted = f"axes {list(axes)} and button {button}"
@@ -81,13 +78,10 @@ class Joystick:
 
     def __call__(self, driving: bool, ready: bool) -> OperatorInput:
         """Velocity and switch; a device that is gone reads zero, so its removal is an event."""
-        for event in self.pygame.event.get():
-            if event.type == self.pygame.JOYDEVICEADDED and not self.stick:
-                self.stick = self.pygame.joystick.Joystick(event.device_index)
-            removed = event.type == self.pygame.JOYDEVICEREMOVED
-            if removed and self.stick and event.instance_id == self.stick.get_instance_id():
-                self.stick = None
-        if not self.stick:
+        gone = self.pygame.event.get(self.pygame.JOYDEVICEREMOVED)
+        number = self.stick.get_instance_id()
+        self.alive = self.alive and all(event.instance_id != number for event in gone)
+        if not self.alive:
             return OperatorInput(alive=False)
         deflection = -shape_axis([self.stick.get_axis(i) for i in self.axes])
         length = max(1.0, float(np.linalg.norm(deflection)))

@@ -160,18 +160,8 @@ def expected_motion(machine: Machine, state: GateState, counts: Array) -> tuple[
     """`place` and `motion` [rad] of the next state, (..., n).
 
     Once all commands of `OPENING_TIME` went to one side beyond the largest dead zone, the joint
-    turns at least at `SLOWEST` of its fastest motion, in proportion to the smallest command. With
-    1.5 dead zones of the Brokk (13.3 counts of 127) and joint q1 (0.20 rad/s):
-
-    | commands of 0.45 s | the encoder | the joint turns in this tick at least by                 |
-    | ------------------ | ----------- | -------------------------------------------------------- |
-    | all 80             | stays       | 0.4 * 0.20 * 0.05 = 4.0 mrad                             |
-    | 80, but one is 30  | stays       | 0.4 * 0.20 * 0.05 * (30 - 13.3) / (80 - 13.3) = 1.0 mrad |
-    | 80, but one is 13  | stays       | 0, and starts again from 0: the valve may have closed    |
-    | 80, but one is -30 | stays       | 0, and starts again from 0: the valve may have closed    |
-    | any                | leaves      | 0, and starts again from 0: the encoder shows motion     |
-
-    An encoder that flickers by one count stays where it is.
+    turns at least at `SLOWEST` of its fastest motion, in proportion to the smallest command. An
+    encoder that flickers by one count stays where it is.
     """
     idle, limit = IDLE_ZONES * machine.dead_zones.max(), machine.pwm_limit / PWM_MAX
     direction = np.sign(state.sent[..., -1:])

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from brokk_min.actuator import PLANT, Plant
 from brokk_min.can import canopen
 from brokk_min.can.canopen import OPERATIONAL, WATCHDOG, Array, Frame, checksum, encoder_raw
-from brokk_min.can.connection import Bus, open_bus, stop_signals
+from brokk_min.can.connection import open_bus, stop_signals
 from brokk_min.machine import Machine, require
 
 # NMT states besides OPERATIONAL
@@ -31,13 +31,9 @@ class SimulatedMachine:
     since a SYNC. With more than five joints the valves follow once all frames of the tick are
     there. They close on a refused frame, on two SYNCs without all frames between, and after
     `WATCHDOG` without them. They stay closed until an NMT start and neutral frames.
-
-    Args:
-        machine: ValueError, if it does not fit the bus, see `canopen.check_bus`.
-        q: angles at the start [rad], (n,).
-        now: time at the start [s].
-        plant: what moves, in steps of `machine.plant_dt`, by the clock of this machine.
-        report: gets the reason when the valve controller stops.
+    It starts at angles `q` [rad] (n,) at the time `now` [s]. The plant moves in steps of
+    `machine.plant_dt`, by the clock of this machine. `report` gets the reason when the valve
+    controller stops. ValueError: the machine does not fit the bus, see `canopen.check_bus`.
     """
 
     def __init__(
@@ -57,12 +53,11 @@ class SimulatedMachine:
         *self.encoders, self.controller = canopen.node_numbers(machine)
         self.nmt = dict.fromkeys([*self.encoders, self.controller], PRE_OPERATIONAL)
         self.objects: dict[tuple[int, int, int], int] = {}  # by node, index and subindex
-        for node, resolution in zip(self.encoders, canopen.encoder_resolutions(machine)):
+        for node in self.encoders:
             self.objects |= {
-                (node, 0x1000, 0): 406,  # device type
                 (node, *canopen.HEARTBEAT_OBJECT): round(1e3 * canopen.HEARTBEAT_PERIOD),
                 (node, *canopen.SYNC_OBJECT): 1,
-                (node, *canopen.RESOLUTION_OBJECT): resolution,
+                (node, *canopen.RESOLUTION_OBJECT): 2**machine.encoder_bits,
             }
         self.received = canopen.ValveFrames(machine)
         self.valid = now  # time at which the last valid valve frames of a tick were there
@@ -159,29 +154,13 @@ class SimulatedMachine:
     def _on_sdo(self, node: int, data: bytes) -> bytes:
         command, *address, value = struct.unpack("<BHBI", data)
         key = (node, *address)
-        writable = tuple(address) in (canopen.HEARTBEAT_OBJECT, canopen.SYNC_OBJECT)
-        answer = 0x80, 0x06010000  # no such access
-        if key not in self.objects:
-            answer = 0x80, 0x06020000  # no such object
-        elif command == 0x40:
+        answer = 0x80, 0x06020000  # no such object
+        if key in self.objects and command == 0x40:
             answer = 0x43, self.objects[key]
-        elif command & 0xE3 == 0x23 and writable:
+        elif key in self.objects and command & 0xE3 == 0x23:
             self.objects[key] = value
             answer = 0x60, 0
         return struct.pack("<BHBI", answer[0], *address, answer[1])
-
-
-def serve(machine: SimulatedMachine, bus: Bus, running: Callable[[], bool]) -> None:
-    """Keep a simulated machine on a bus while `running`."""
-    for can_id, data in machine.boot():
-        bus.send(can_id, data)
-    while running():
-        frame = bus.recv(max(0.0, machine.next_step - bus.now()))
-        answers = machine.advance(bus.now())
-        if frame:
-            answers += machine.receive(frame)
-        for can_id, data in answers:
-            bus.send(can_id, data)
 
 
 def start_pose(machine: Machine, q: Sequence[float]) -> Array:
@@ -216,4 +195,10 @@ def simulate(
             print(f"{bus.now() - start:.3f} s, valve controller stops: {reason}", flush=True)
 
         simulated = SimulatedMachine(machine, pose, start, plant, report)
-        serve(simulated, bus, lambda: not signals)
+        answers = simulated.boot()
+        while not signals:
+            for can_id, data in answers:
+                bus.send(can_id, data)
+            frame = bus.recv(max(0.0, simulated.next_step - bus.now()))
+            answers = simulated.advance(bus.now())
+            answers += simulated.receive(frame) if frame else []

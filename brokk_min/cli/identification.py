@@ -40,8 +40,7 @@ class Collect(Command):
         rng, plant = np.random.default_rng(self.seed), find_plant(self.plant, machine)
         log = excitation.collect(machine, self.hours, self.excitation, rng, plant)
         logs.write_log(self.out, log)
-        num = sum(not one.name.endswith(logs.RETURN) for one in log.recordings)
-        print(f"{self.out}: {num} recordings of {', '.join(log.joints)}")
+        print(f"{self.out}: {len(log.recordings)} recordings of {', '.join(log.joints)}")
 
 
 def read_logs(paths: Sequence[Path], machine: Machine) -> tuple[logs.Log, Machine | None]:
@@ -91,8 +90,7 @@ class Inspect(Command):
             joints = {name: asdict(report) for name, report in reports.items()}
             report = {"meta": meta, "joints": joints, "scores": scores, "warnings": warnings}
             write_json(self.json, report)
-        pieces = sum("#" in recording.name for recording in log.recordings)
-        print(f"{len(log.recordings)} recordings, {pieces} of them begin after a gap")
+        print(f"{len(log.recordings)} recordings")
         print("\n".join(inspection.table(reports)))
         print_scores(scores, warnings)
 
@@ -112,7 +110,12 @@ class Fit(Command):
     def __call__(self) -> None:
         from brokk_min.identification import fitting, inspection, validation
 
-        machine, config = self.find_machine(), self.config()
+        machine = self.find_machine()
+        check(self.out.suffix == ".npz", "--out", "a name in .npz", self.out)
+        for name in ("steps", "batch_size", "hidden", "rollout"):
+            value = getattr(self.settings, name)
+            check(value > 0, f"--{name.replace('_', '-')}", "1 or more", value)
+        config = replace(self.settings, **PAPER_RECIPE) if self.paper else self.settings
         self.writes(self.out, self.json)
         log, known = read_logs(self.logs, machine)
         tested = read_logs(self.test, machine)[0] if self.test else None
@@ -123,7 +126,7 @@ class Fit(Command):
                 raise ValueError(wrong)
             net = fitting.fit(log, config, self.seed, machine, known.name if known else "")
         with located(*self.test, *self.logs):
-            scores = validation.validate(net, log, logs.in_order(test, log.joints), known)
+            scores = validation.validate(net, logs.in_order(test, log.joints), known)
         scores["warnings"] += inspection.warnings(log, reports, known)
         save_net(self.out, net)
         if self.json:
@@ -134,26 +137,14 @@ class Fit(Command):
         print(f"{self.out}: nets of {net.machine or 'an unknown machine'}, scored on {tried}")
         print_scores(scores["joints"], scores["warnings"])
 
-    def config(self) -> FitConfig:
-        """The settings, or the paper's; WrongUse: one that cannot be."""
-        check(self.out.suffix == ".npz", "--out", "a name in .npz", self.out)
-        for name in ("steps", "batch_size", "hidden", "rollout"):
-            value = getattr(self.settings, name)
-            check(value > 0, f"--{name.replace('_', '-')}", "1 or more", value)
-        return replace(self.settings, **PAPER_RECIPE) if self.paper else self.settings
-
 
 def print_scores(scores: Mapping[str, Any], warnings: Sequence[str]) -> None:
-    """The errors of nets, and of a linear model if there is one; a line for each warning."""
-    row = "{:12} {:>9} {:>13}  {}"
+    """The errors of nets; a line for each warning."""
     if scores:
-        print("Errors of one step, of the last velocity again, of free runs of 1, 5, 10, 30 s:")
-        print(row.format("joint", "one step", "same as last", "free runs [rad/s]"))
+        print("joint: error of one step, of the last velocity again; of free runs [rad/s]:")
     for name, net in scores.items():
-        for label, model in {name: net, "  linear": net.get("linear")}.items():
-            if model:
-                errors = [model.get(f"{kind}_rmse", np.nan) for kind in ("one_step", "persistence")]
-                runs = [f"{run['velocity_rmse']:.4f}" for run in model["free_run"].values()]
-                print(row.format(label, *(f"{error:.4f}" for error in errors), ", ".join(runs)))
+        errors = [net.get(f"{kind}_rmse", np.nan) for kind in ("one_step", "persistence")]
+        runs = [f"{k} s {run['velocity_rmse']:.4f}" for k, run in net["free_run"].items()]
+        print("{}: {:.4f}, {:.4f};".format(name, *errors), ", ".join(runs))
     for warning in warnings:
         print(f"warning: {warning}")

@@ -1,7 +1,5 @@
 """The commands at a machine, simulated or real, and for what was recorded there."""
 
-import shutil
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -16,11 +14,11 @@ from brokk_min.can.operator_input import JointJog, Joystick, Script
 from brokk_min.can.safety_gate import fault_name
 from brokk_min.can.simulated_machine import simulate
 from brokk_min.cli.options import Command, check, default_policy, find_plant
-from brokk_min.evaluation import baselines
+from brokk_min.evaluation.baselines import baselines, read_gains
 from brokk_min.evaluation.rollout import TITLES, Controller
 from brokk_min.evaluation.sequences import read_commands
-from brokk_min.learning.policy import Policy, PolicyController, load_policy
-from brokk_min.machine import PWM_MAX, Machine, require
+from brokk_min.learning.policy import PolicyController, load_policy
+from brokk_min.machine import Machine, require
 
 PID = "jacobian_pid_k0.1"  # the paper's, among the baselines
 
@@ -36,8 +34,8 @@ class Simulate(Command):
 
     def __call__(self) -> None:
         machine = self.find_machine()
-        print(f"{self.machine} on {self.interface} {self.channel}; Ctrl-C ends it", flush=True)
         plant = find_plant(self.plant, machine)
+        print(f"{self.machine} on {self.interface} {self.channel}; Ctrl-C ends it", flush=True)
         simulate(machine, self.start, self.interface, self.channel, plant)
 
 
@@ -51,7 +49,7 @@ class Drive(Command):
     command: str = "joystick"  # Or velocity sequences, CSV: sequence,time,vx,vy,vz [s, m/s].
     controller: Literal["rl", "jacobian", "jog"] = "rl"  # Policy, the paper's PID, one joint.
     joint: str = ""  # Joint that jogs, forward and backward with x; by default the first driven.
-    counts: int = 0  # Its command, of 127; 0: 3 beyond the dead zone.
+    counts: int = 12  # Its command, of 127; a little beyond the dead zone.
     gains: Path | None = None  # Tuned gains; by default gains.json in the folder of POLICY.
     axes: tuple[int, int, int] = (1, 0, 4)  # Axes of the joystick for x, y and z.
     button: int = 5  # Button of the joystick that must be held.
@@ -64,32 +62,20 @@ class Drive(Command):
         with open_bus(self.interface, self.channel, self.log, used_ids(machine)) as bus:
             drive = hw.Drive(machine, controller, bus, operator)
             drive.begin()
-            try:
-                drive.run(show_status)
-            finally:
-                print(end="\n" if sys.stdout.isatty() else "")
+            drive.run(lambda drive: print(status(drive), flush=True))
         played = not isinstance(operator, Script) or operator.done
         require(played, "drive", "to play all sequences", drive.reason or "a stop")
 
     def find_controller(self, machine: Machine) -> Controller:
         """The controller that is named."""
         if self.controller == "jog":
-            return self.find_jog(machine)
-        path, gains = default_policy(machine, self.policy, self.gains)
-        policy = load_policy(path, machine)
-        if self.controller == "rl":
-            return PolicyController(machine, policy)
-        return find_pid(machine, policy, gains)
-
-    def find_jog(self, machine: Machine) -> JointJog:
-        """The controller of one joint."""
-        driven = [machine.names[i] for i in machine.driven]
-        joint = self.joint or driven[0]
-        check(joint in driven, "--joint", f"a driven one of {driven}", joint)
-        dead_zone = max(machine.joints[machine.names.index(joint)].dead_zone)
-        counts = self.counts or int(np.ceil(dead_zone * PWM_MAX)) + 3
-        check(0 < counts <= machine.pwm_limit, "--counts", f"1 to {machine.pwm_limit}", counts)
-        return JointJog(machine, joint, counts)
+            driven = [machine.names[i] for i in machine.driven]
+            joint, most = self.joint or driven[0], machine.pwm_limit
+            check(joint in driven, "--joint", f"a driven one of {driven}", joint)
+            check(0 < self.counts <= most, "--counts", f"1 to {most}", self.counts)
+            return JointJog(machine, joint, self.counts)
+        rl, pid = find_controllers(machine, self.policy, self.gains)
+        return rl if self.controller == "rl" else pid
 
     def find_operator(self, machine: Machine) -> Joystick | Script:
         """The joystick, or the script of a file."""
@@ -99,19 +85,20 @@ class Drive(Command):
         return Script(machine, np.concatenate(goals))
 
 
-def find_pid(machine: Machine, policy: Policy, gains: Path | None) -> Controller:
-    """The paper's PID with tuned gains, or without a file with those set by hand."""
+def find_controllers(
+    machine: Machine, policy: Path | None, gains: Path | None
+) -> tuple[Controller, Controller]:
+    """The policy, and the paper's PID with tuned gains, or without a file with those by hand."""
+    path, gains = default_policy(machine, policy, gains)
+    found = load_policy(path, machine)
     print(f"gains of the Jacobian controller: {gains or 'set by hand'}")
-    net = policy.net
-    known = (
-        baselines.read_gains(gains, machine, net) if gains else baselines.baselines(machine, net)
-    )
-    return known[PID]
+    known = read_gains(gains, machine, found.net) if gains else baselines(machine, found.net)
+    return PolicyController(machine, found), known[PID]
 
 
 def status(drive: hw.Drive) -> str:
     """One line: state, faults, goal and measured tool velocity [m/s], angles [rad], lateness."""
-    state = "waiting" if drive.gate.active_fault else "ready  "
+    state = "waiting" if drive.gate.active_fault else "ready"
     state = "driving" if drive.gate.driving else state
     reason = f" {drive.reason}" if drive.reason else ""
     active = fault_name(drive.machine, int(drive.gate.active_fault))
@@ -122,13 +109,6 @@ def status(drive: hw.Drive) -> str:
     texts = (f"{name} {' '.join(f'{x:+.2f}' for x in row)}" for name, row in vectors.items())
     late = f"late {1e3 * drive.lateness:.1f} ms, skipped {drive.skipped}"
     return f"{state}{reason} {' '.join(texts)} {late}"
-
-
-def show_status(drive: hw.Drive) -> None:
-    """Rewrite one line of a terminal, cut to its width; elsewhere print a line each time."""
-    terminal, text = sys.stdout.isatty(), status(drive)
-    line = f"\r{text[: shutil.get_terminal_size().columns - 1]}\033[K"
-    print(line if terminal else text, end="" if terminal else "\n", flush=True)
 
 
 @dataclass(kw_only=True)
@@ -144,35 +124,27 @@ class Play(Command):
         from brokk_min.viewer.play import play
 
         machine = self.find_machine()
-        controllers = self.find_controllers(machine)
+        rl, pid = find_controllers(machine, self.policy, self.gains)
+        controllers = {TITLES["rl"]: rl, TITLES[PID]: pid}
         play(machine, controllers, self.start, find_plant(self.plant, machine))
-
-    def find_controllers(self, machine: Machine) -> dict[str, Controller]:
-        """The policy and the paper's PID, by the names that the window shows."""
-        path, gains = default_policy(machine, self.policy, self.gains)
-        policy = load_policy(path, machine)
-        pid = find_pid(machine, policy, gains)
-        return {TITLES["rl"]: PolicyController(machine, policy), TITLES[PID]: pid}
 
 
 @dataclass(kw_only=True)
 class Replay(Command):
-    """Watch recorded runs at once: logs of `drive --log`, or results of `evaluate --json`."""
+    """Make a film of a drive from its log."""
 
-    logs: Positional[tuple[Path, ...]]  # One or two of them.
-    out: Path | None = None  # Write a film, .gif or .mp4, instead of opening a window.
-    fps: float = 10.0  # Pictures per second of the film.
-    sequence: str = ""  # Which sequence of the results; by default the first.
-    start: int = 0  # Which start of the results.
+    log: Positional[Path]  # That `drive --log` wrote.
+    out: Path  # File to write, .gif.
+    fps: float = 10.0  # Pictures per second.
 
     def __call__(self) -> None:
         from brokk_min.viewer.replay import film
 
         machine = self.find_machine()
         self.writes(self.out)
-        check(1 <= len(self.logs) <= 2, "LOGS", "one or two", len(self.logs))
+        check(self.out.suffix == ".gif", "--out", "a name in .gif", self.out)
         check(0.1 <= self.fps <= 100, "--fps", "0.1 to 100", self.fps)
-        film(self.logs, machine, self.out, self.fps, self.sequence, self.start)
+        film(self.log, machine, self.out, self.fps)
 
 
 @dataclass(kw_only=True)

@@ -179,12 +179,6 @@ def tune_baselines(
     return {name: tuned[name] for name in every if name in tuned}, record
 
 
-def gains_table(controllers: Mapping[str, JacobianController]) -> dict[str, dict[str, list[float]]]:
-    """Gains of each baseline by name, for JSON."""
-    every = {name: asdict(controller.gains) for name, controller in controllers.items()}
-    return {name: {k: array.tolist() for k, array in of.items()} for name, of in every.items()}
-
-
 def gains_metadata(machine: Machine, net: ActuatorNet) -> dict[str, str]:
     """Machine and nets to which gains belong: its name, and the nets' fingerprint."""
     return {"machine": machine.name, "actuator": fingerprint(net)}
@@ -194,7 +188,9 @@ def write_gains(
     path: Path, controllers: Mapping[str, JacobianController], meta: Mapping[str, Any]
 ) -> None:
     """Write gains as `read_gains` reads them; `meta` includes `gains_metadata`."""
-    write_json(path, {"meta": meta, "gains": gains_table(controllers)})
+    every = {name: asdict(controller.gains) for name, controller in controllers.items()}
+    gains = {name: {k: array.tolist() for k, array in of.items()} for name, of in every.items()}
+    write_json(path, {"meta": meta, "gains": gains})
 
 
 def read_gains(path: Path, machine: Machine, net: ActuatorNet) -> dict[str, JacobianController]:

@@ -10,12 +10,9 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from brokk_min.evaluation.baselines import PAPER_BASELINES
-from brokk_min.evaluation.metrics import Mean, Run, by_start, column, mean_interval
+from brokk_min.evaluation.metrics import Mean, Run, by_start, column, interval_text, mean_interval
 from brokk_min.evaluation.rollout import TITLES
-from brokk_min.machine import Array
 
 TEXTS: dict[str, dict[str, Any]] = tomllib.loads(
     Path(__file__).with_suffix(".toml").read_text("utf-8")
@@ -48,7 +45,7 @@ class Claim(NamedTuple):
         """The claim as in `results.json`."""
         text, holds = TEXTS[self.name], self.holds()
         labelled = [pair for row in self.numbers.values() for pair in row.items()]
-        measured = "; ".join(f"{label} {number_text(number)}" for label, number in labelled)
+        measured = "; ".join(f"{label} {interval_text(number)}" for label, number in labelled)
         limit = next(f"{side} {text[side]:g}" for side in ("above", "below") if side in text)
         verdicts = [f"{VERDICTS[h]} for {TITLES.get(who, who)}" for who, h in holds.items()]
         return {
@@ -62,19 +59,6 @@ class Claim(NamedTuple):
         }
 
 
-def number_text(number: Mean) -> str:
-    """A mean with its interval.
-
-    Example:
-        >>> number_text({"mean": 1.0, "low": 0.5, "high": 1.5})
-        '1 (0.5 to 1.5)'
-    """
-    mean, low, high = (
-        "none" if number[key] is None else f"{number[key]:.3g}" for key in ("mean", "low", "high")
-    )
-    return mean if low == high else f"{mean} ({low} to {high})"
-
-
 def net_claims(numbers: Mapping[str, Any]) -> list[Claim]:
     """Do the nets behave as the paper's machine? `numbers` is of `preliminary.numbers`.
 
@@ -82,8 +66,8 @@ def net_claims(numbers: Mapping[str, Any]) -> list[Claim]:
     tests, so they have no interval. Paper: Sec. 3.2 and 4.1, Fig. 2 and 5
     """
     up, down = list(numbers["sweep"].values())[1:3]  # at the limit
-    times = numbers["response_time"]["nets"][numbers["joint"]]
-    idle, moving = times["idle"]["up"], times["moving"]["up"]
+    times = numbers["response_time"]["nets"]
+    idle, moving = times["idle"], times["moving"]
     gap = numbers["sim_to_real"]
     of_runs = gap["tool_position_error_mean_of_runs"]["median"]
     table: dict[str, dict[str, float | None]] = {
@@ -91,17 +75,17 @@ def net_claims(numbers: Mapping[str, Any]) -> list[Claim]:
         "idle": {"idle over moving": idle / moving if idle and moving else None},
         "gap": {"in the figure": gap["tool"]["position_error_mean"], "median of runs": of_runs},
     }
+    ends = ("mean", "low", "high")
     return [
-        Claim(name, {"nets": {label: {"mean": x, "low": x, "high": x} for label, x in row.items()}})
+        Claim(name, {"nets": {label: dict.fromkeys(ends, x) for label, x in row.items()}})
         for name, row in table.items()
     ]
 
 
-def task_claims(runs: Sequence[Run], singular: Mapping[str, Any]) -> list[Claim]:
+def task_claims(runs: Sequence[Run]) -> list[Claim]:
     """The claims on task-space control, of each policy in `runs`, in the paper's order.
 
-    `runs` are those that count, `singular` is of `robustness.near_singularities`: without it no
-    claim is made on singularities. Paper: Sec. 4.2 and 5, Fig. 6
+    `runs` are those that count. Paper: Sec. 4.2 and 5, Fig. 6
     """
     policies = [name for name in POLICIES if name in column(runs, "controller")]
 
@@ -119,28 +103,7 @@ def task_claims(runs: Sequence[Run], singular: Mapping[str, Any]) -> list[Claim]
     return [
         Claim("still", {policy: drift(policy) for policy in policies}),
         Claim("drift", {"the paper's PIDs": drift(STRONG) | drift(WEAK)}),
-        *(singular_claims(policies, singular) if singular else []),
         Claim("tracking", {policy: less(policy, "xyz") for policy in policies}),
         Claim("along_z", {policy: less(policy, "z", (ERROR, DRIFT)) for policy in policies}),
         Claim("outperforms", {policy: less(policy, ["all"]) for policy in policies}),
     ]
-
-
-def singular_claims(policies: Sequence[str], singular: Mapping[str, Any]) -> list[Claim]:
-    """Does damping slow the tool near singularities, and does little damping jerk? Paper: Fig. 6"""
-    speed: dict[str, Array]
-    speed, jerk = (
-        {name: np.array(of, float) for name, of in singular[key].items()}
-        for key in ("speed", "jerk")
-    )
-    slowed = {"k = 0.1 less k = 0.05": mean_interval(speed[STRONG] - speed[WEAK])}
-    jerky = {"k = 0.05 less k = 0.1": mean_interval(jerk[WEAK] - jerk[STRONG])}
-    robust = {
-        policy: {
-            f"speed of {policy} less k = 0.05": mean_interval(speed[policy] - speed[WEAK]),
-            f"jerk of k = 0.1 less {policy}": mean_interval(jerk[STRONG] - jerk[policy]),
-        }
-        for policy in policies
-    }
-    pids = "the paper's PIDs"
-    return [Claim("slowed", {pids: slowed}), Claim("jerky", {pids: jerky}), Claim("robust", robust)]

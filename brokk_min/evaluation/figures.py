@@ -1,48 +1,31 @@
-"""The paper's figures, and one that compares all controllers; units on every axis.
+"""The paper's figures, with units on every axis.
 
 Controllers differ in colour and in dashes, so that the colour-blind tell them apart, too.
 """
 
 import io
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.linalg import norm
 
-from brokk_min.evaluation.metrics import Mean, Traces
+from brokk_min.evaluation.metrics import Traces
 from brokk_min.evaluation.preliminary import Motion, SimulatorTests
 from brokk_min.evaluation.rollout import TITLES
-from brokk_min.evaluation.sequences import AXES, Commands
+from brokk_min.evaluation.sequences import AXES, KINDS, Commands
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
 
 WIDTH = 10.0  # inch, of every figure, so that letters have one size in the report
-STYLES: dict[str, dict[str, Any]] = {
-    "goal": {"color": "black", "linestyle": ":"},
-    "rl": {"color": "#08306b"},
-    "rl_paper": {"color": "#b2182b", "linestyle": (0, (1, 1))},
-    "jacobian_pid_k0.1": {"color": "#d9661a", "linestyle": "-."},
-    "jacobian_pid_k0.05": {"color": "#f0b84a", "linestyle": "--"},
-    "workspace": {"color": "#08306b"},
-    "limits": {"color": "#d9661a"},
-    "extended": {"color": "#f0b84a"},
-}
-OTHER_STYLES: list[dict[str, Any]] = [
-    {"color": "#08306b"},
-    {"color": "#d9661a", "linestyle": "--"},
-    {"color": "#00886a", "linestyle": "-."},
-    {"color": "#7a4fa3", "linestyle": (0, (4, 1, 1, 1, 1, 1))},
-]
+LINES = ("-", "--", "-.", ":")
 SAMPLE = ("rl", "rl_paper", "jacobian_pid_k0.1", "jacobian_pid_k0.05")  # drawn in Fig. 6
 
 
 class Panel(NamedTuple):
-    """One plot: title, labels of the axes with units, and curves (x, y) by label.
-
-    If y is (T, runs), the median of the runs is drawn with a band from 10 to 90 % of them.
-    """
+    """One plot: title, labels of the axes with units, and curves (x, y) by label."""
 
     title: str
     xlabel: str
@@ -53,35 +36,24 @@ class Panel(NamedTuple):
 def plot_panels(
     rows: Sequence[Sequence[Panel]], sharey: Literal["none", "row", "col"] = "none"
 ) -> Figure:
-    """Rows of panels, under one legend if all have the same curves, otherwise each with its own."""
+    """Rows of panels, each with a legend unless it has the same curves as the panel before."""
     figure = Figure(figsize=(WIDTH, 2.6 * len(rows) + 0.3), layout="constrained")
     grid = figure.subplots(len(rows), len(rows[0]), squeeze=False, sharey=sharey)
-    panels = [panel for row in rows for panel in row]
-    one_legend = len({tuple(panel.curves) for panel in panels}) == 1
-    for ax, panel in zip(grid.flat, panels, strict=True):
+    known: list[str] = []
+    for ax, panel in zip(grid.flat, chain(*rows), strict=True):
         for i, (label, (x, y)) in enumerate(panel.curves.items()):
-            style = STYLES.get(label, OTHER_STYLES[i % len(OTHER_STYLES)])
-            if y.ndim == 2:
-                low, y, high = np.percentile(y, [10, 50, 90], axis=1)
-                ax.fill_between(x, low, high, color=style["color"], alpha=0.2, linewidth=0)
-            ax.plot(x, y, label=TITLES.get(label, label), linewidth=1.1, **style)
+            line = LINES[i % len(LINES)]
+            ax.plot(x, y, line, color=f"C{i}", label=TITLES.get(label, label), linewidth=1.1)
         ax.set(title=panel.title, xlabel=panel.xlabel, ylabel=panel.ylabel)
         ax.grid(alpha=0.3)
-        if not one_legend:
+        if list(panel.curves) != known:
             ax.legend(fontsize="small")
-    if one_legend:
-        _one_legend(figure)
+            known = list(panel.curves)
     return figure
 
 
-def _one_legend(figure: Figure) -> None:
-    handles, labels = figure.axes[0].get_legend_handles_labels()
-    by_label = dict(zip(labels, handles, strict=True))
-    figure.legend(by_label.values(), by_label.keys(), loc="outside upper center", ncol=4)
-
-
 def _over_time(dt: float, labels: Sequence[str], curves: Mapping[str, Array]) -> list[Panel]:
-    """One panel for each label: columns of curves (T, labels) or (T, labels, runs) over time."""
+    """One panel for each label: columns of curves (T, labels) over time."""
     panels = []
     for i, label in enumerate(labels):
         columns = {name: (dt * np.arange(1, len(y) + 1), y[:, i]) for name, y in curves.items()}
@@ -112,8 +84,8 @@ def plot_gap(machine: Machine, gap: Motion) -> Figure:
     panels = []
     for name, (unit, velocity, position) in rows.items():
         labels = [f"{name} [{unit}/s]", f"{name} [m{unit}]"]
-        values = np.stack([velocity, 1000 * position], axis=1)
-        curves = {"median of all runs": values, "first run": values[..., 0]}
+        values = np.stack([velocity, 1000 * position], axis=1)  # (T, 2, runs)
+        curves = {"median of all runs": np.median(values, axis=-1), "first run": values[..., 0]}
         panels.append(_over_time(machine.dt, labels, curves))
     return plot_panels(panels)
 
@@ -127,13 +99,15 @@ def plot_starts(machine: Machine, starts: Array, kinds: Sequence[str]) -> Figure
     outward = tool / np.maximum(norm(tool, axis=-1, keepdims=True), 1e-9)
     r = np.einsum("pjk,pk->pj", points[..., :2], outward)
     for i, kind in enumerate(kinds):
-        style = STYLES[kind] | {"linewidth": 1.0, "marker": "o", "markersize": 2, "alpha": 0.6}
-        side.plot(r[i], points[i, :, 2], label=kind, **style)
-        top.plot(points[i, :, 0], points[i, :, 1], **style)
+        color = f"C{KINDS.index(kind)}"
+        side.plot(r[i], points[i, :, 2], label=kind, color=color, alpha=0.6)
+        top.plot(points[i, :, 0], points[i, :, 1], color=color, alpha=0.6)
     side.axhline(machine.ground, color="black", linewidth=0.8)
     side.set(xlabel="outward from the slew axis [m]", ylabel="z [m]", aspect="equal")
     top.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    _one_legend(figure)
+    handles, labels = side.get_legend_handles_labels()
+    by_kind = dict(zip(labels, handles, strict=True))
+    side.legend(by_kind.values(), by_kind.keys())
     return figure
 
 
@@ -161,22 +135,6 @@ def plot_joint_velocities(machine: Machine, traces: Traces, sequence: str, run: 
         if name == sequence and controller in SAMPLE:
             curves[controller] = trace.q_dot[:, run, machine.driven]
     return plot_panels([_over_time(machine.dt, labels, curves)], sharey="row")
-
-
-def plot_intervals(panels: Mapping[str, Mapping[str, Mean]]) -> Figure:
-    """Means with their 95 % intervals, one panel for each label and one row for each controller."""
-    rows = list(next(iter(panels.values())))
-    figure = Figure(figsize=(WIDTH, 0.35 * len(rows) + 1.0), layout="constrained")
-    grid = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
-    for ax, (xlabel, numbers) in zip(grid, panels.items(), strict=True):
-        for y, name in enumerate(rows):
-            mean, low, high = (np.array(numbers[name][k], float) for k in ("mean", "low", "high"))
-            color = STYLES.get(name, {"color": "#00886a"})["color"]
-            ax.errorbar(mean, y, xerr=[[mean - low], [high - mean]], fmt="o", color=color)
-        ax.set_yticks(range(len(rows)), [TITLES.get(row, row) for row in rows])
-        ax.set(xlabel=xlabel, xlim=(0, None), ylim=(len(rows) - 0.5, -0.5))
-        ax.grid(alpha=0.3)
-    return figure
 
 
 def png(figure: Figure) -> bytes:

@@ -1,7 +1,7 @@
 """Figures of merit: their definitions, runs of all controllers, means and intervals over starts."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import product
 from typing import Any
 
@@ -11,11 +11,10 @@ from tqdm import tqdm
 
 from brokk_min import __version__
 from brokk_min.actuator import PLANT, Plant
-from brokk_min.env import Encoder
 from brokk_min.evaluation.rollout import Controller, Trace, rollout
 from brokk_min.evaluation.sequences import Commands, start_kinds
 from brokk_min.kinematics import forward_kinematics, tool_position
-from brokk_min.machine import Array, Machine, read_encoder
+from brokk_min.machine import Array, Machine
 from brokk_min.settings import TaskConfig
 
 Controllers = Mapping[str, Controller]  # by name
@@ -28,7 +27,7 @@ AT_LIMIT = 0.01  # rad, assumed: a joint so near an end of its range is at its l
 
 
 def metrics(machine: Machine, trace: Trace, goals: Array, start: Array) -> dict[str, Array]:
-    """Figures of each run as in the evaluate JSON, (num,) each; NaN where nothing can be averaged.
+    """Figures of each run as in the evaluate JSON, (num,) each.
 
     m, m/s, m/s^3, s; valve travel in full strokes; reward 1. `goals` [m/s] (T, num, 3), `start`
     tool positions before the first tick [m] (num, 3).
@@ -36,14 +35,11 @@ def metrics(machine: Machine, trace: Trace, goals: Array, start: Array) -> dict[
     error = norm(goals - trace.v_tool, axis=-1)
     drift = line_distance(trace.p_tool, goals, start)
     jerk = np.diff(trace.v_tool, n=2, axis=0) * machine.rate**2
-    moving = np.asarray(goals.any(axis=-1))
     margin = np.minimum(trace.q - machine.column("q_min"), machine.column("q_max") - trace.q)
     at_limit = margin[..., machine.driven].min(axis=-1) < AT_LIMIT
     return {
         "velocity_rmse": np.sqrt(np.mean(error**2, axis=0)),
         "velocity_error_mean": error.mean(axis=0),
-        "velocity_error_moves": np.ma.array(error, mask=~moving).mean(axis=0).filled(np.nan),
-        "velocity_error_rests": np.ma.array(error, mask=moving).mean(axis=0).filled(np.nan),
         "off_axis_drift_max": drift.max(axis=0),
         "off_axis_drift_mean": drift.mean(axis=0),
         "jerk_rms": np.sqrt(np.sum(jerk**2, axis=-1).sum(axis=0) / max(1, len(jerk))),
@@ -84,14 +80,13 @@ def evaluate(
     starts: Array,
     seed: int,
     plant: Plant = PLANT,
-    sensor: Callable[[np.random.Generator], Encoder] = lambda rng: read_encoder,
     noise: float = TaskConfig.noise,
 ) -> tuple[Rows, Traces]:
     """Run every controller on the same sequences, starts and noise. Paper: Sec. 4.2, Fig. 6
 
     `starts` are angles [rad] (starts, n); all starts and all sequences of one length are a batch.
-    `sensor` makes the encoders of each batch, `noise` is as in `rollout`. Returns one row per
-    controller, sequence and start, see `metrics`; and traces.
+    `noise` is as in `rollout`. Returns one row per controller, sequence and start, see `metrics`;
+    and traces.
 
     ValueError: two sequences of one name, a start out of range.
     """
@@ -108,8 +103,8 @@ def evaluate(
     for name, batch in tqdm(pairs, desc="evaluate", unit="batch", disable=None):
         goals = np.concatenate([sequence.for_starts(machine, starts) for sequence in batch], axis=1)
         q = np.tile(starts, (len(batch), 1))
-        rng, read = np.random.default_rng(seed), sensor(np.random.default_rng(seed + 1))
-        trace = rollout(machine, controllers[name], q, goals, noise, rng, plant, read)
+        rng = np.random.default_rng(seed)
+        trace = rollout(machine, controllers[name], q, goals, noise, rng, plant)
         for i, sequence in enumerate(batch):
             part = slice(i * len(starts), (i + 1) * len(starts))
             of_sequence = Trace(*(array[:, part] for array in trace))
@@ -122,18 +117,13 @@ def evaluate(
 
 
 def figures(machine: Machine, trace: Trace, goals: Array, starts: Array) -> Rows:
-    """Of each start (starts, n) its number, its kind and the figures of `metrics`; None for NaN."""
+    """Of each start (starts, n) its number, its kind and the figures of `metrics`."""
     p_start = tool_position(forward_kinematics(machine, starts))
     columns = metrics(machine, trace, goals, p_start)
     return [
-        {"start": i, "kind": kind} | {key: finite(of[i]) for key, of in columns.items()}
+        {"start": i, "kind": kind} | {key: float(of[i]) for key, of in columns.items()}
         for i, kind in enumerate(start_kinds(machine, starts))
     ]
-
-
-def finite(value: float) -> float | None:
-    """A number for JSON; None: not finite."""
-    return float(value) if np.isfinite(value) else None
 
 
 def metadata(machine: Machine, seed: int) -> dict[str, Any]:
@@ -143,20 +133,16 @@ def metadata(machine: Machine, seed: int) -> dict[str, Any]:
 
 
 def by_start(runs: Sequence[Run], controller: str, sequence: str, key: str) -> Array:
-    """One figure for each start (starts,), mean of its runs; `sequence` may be "all". NaN: none."""
+    """One figure for each start (starts,), mean of its runs; `sequence` may be "all"."""
     values: dict[int, list[float]] = {}
     for run in runs:
         if run["controller"] == controller and sequence in (run["sequence"], "all"):
-            of_start = values.setdefault(run["start"], [])
-            if run[key] is not None:
-                of_start.append(run[key])
-    return np.array([np.mean(v) if v else np.nan for _, v in sorted(values.items())])
+            values.setdefault(run["start"], []).append(run[key])
+    return np.array([np.mean(of) for _, of in sorted(values.items())])
 
 
 def mean_interval(values: Array) -> Mean:
-    """Mean of the finite values, and the 95 % confidence interval of it by Student's t.
-
-    None: too few values.
+    """Mean, and its 95 % confidence interval by Student's t; without two values that is None.
 
     Example:
         >>> {key: round(x, 3) for key, x in mean_interval(np.array([1.0, 2.0, 3.0])).items()}
@@ -164,12 +150,23 @@ def mean_interval(values: Array) -> Mean:
     """
     from scipy.special import stdtrit  # Student's t quantile; slow to import
 
-    values = values[np.isfinite(values)]
-    mean = float(values.mean()) if len(values) else None
-    if mean is None or len(values) == 1:
+    mean = float(values.mean())
+    if len(values) == 1:
         return {"mean": mean, "low": None, "high": None}
     half = stdtrit(len(values) - 1, 0.975) * values.std(ddof=1) / math.sqrt(len(values))
     return {"mean": mean, "low": float(mean - half), "high": float(mean + half)}
+
+
+def interval_text(number: Mean) -> str:
+    """A mean with its interval.
+
+    Example:
+        >>> interval_text({"mean": 0.01234, "low": -0.5, "high": 41.267})
+        '0.0123 (-0.5000 to 41.27)'
+    """
+    numbers = [number[key] for key in ("mean", "low", "high")]
+    texts = [f"{x:.4f}" if abs(x) < 1 else f"{x:.4g}" for x in numbers if x is not None]
+    return f"{texts[0]} ({texts[1]} to {texts[2]})" if len(texts) == 3 else "".join(texts)
 
 
 def column(runs: Sequence[Run], label: str) -> list[str]:
@@ -186,18 +183,3 @@ def means(runs: Sequence[Run]) -> dict[str, dict[str, dict[str, Mean]]]:
         of = {s: {k: mean_interval(by_start(runs, c, s, k)) for k in keys} for s in sequences}
         table[c] = of
     return table
-
-
-def paired_difference(runs: Sequence[Run], one: str, other: str, key: str) -> dict[str, Mean]:
-    """A figure of one controller less another's on the same starts: mean, interval, by sequence."""
-    return {
-        s: mean_interval(by_start(runs, one, s, key) - by_start(runs, other, s, key))
-        for s in [*column(runs, "sequence"), "all"]
-    }
-
-
-def paired_differences(runs: Sequence[Run], one: str) -> dict[str, dict[str, dict[str, Mean]]]:
-    """`paired_difference` of a controller to each other one, by figure and other controller."""
-    others = [c for c in column(runs, "controller") if c != one]
-    keys = [key for key in runs[0] if key not in LABELS]
-    return {key: {c: paired_difference(runs, one, c, key) for c in others} for key in keys}

@@ -34,7 +34,7 @@ class SimulatorTests(NamedTuple):
     sweeps: dict[str, Sweep]  # by PWM byte
     coupling: dict[str, Sweep]  # at the command limit, alone and with the other joints
     past_movement: dict[str, tuple[Array, Array]]  # time [s] and velocity [rad/s] around a step
-    response_time: dict[str, Any]  # s, of all driven joints, see `named_times`
+    response_time: dict[str, float | None]  # s, from idle and while moving
 
 
 class Motion(NamedTuple):
@@ -77,28 +77,20 @@ def preliminary_tests(machine: Machine, plant: Plant) -> SimulatorTests:
     slow = round(SLOW * machine.pwm_limit) / PWM_MAX
     u = np.zeros((5, machine.n))
     u[:, joint] = [slow, limit, -limit, -slow, limit]
-    u[4] += other_commands(machine, joint)
+    others = machine.driven[:-1]  # the last of them up, all others down, as in the paper
+    u[4, others] = -limit
+    u[4, others[-1:]] = limit
     *alone, together = sweeps(machine, plant, joint, u)
     names = [f"u = {encode_pwm(level)}" for level in u[:4, joint]]
-    velocity = step_velocities(machine, plant)
-    wait = len(velocity) // 2
-    from_idle, moving = velocity[:, :, 0, -1].T
-    time = (np.arange(2 * wait) + 0.5 - wait) * machine.dt
+    steps = dict(zip(("idle", "moving"), step_velocities(machine, plant, joint).T, strict=True))
+    ticks = len(steps["idle"])
+    time = (np.arange(ticks) + 0.5 - ticks // 2) * machine.dt
     return SimulatorTests(
         dict(zip(names, alone, strict=True)),
         {"alone": alone[1], "with the others": together},
-        {"from idle": (time, from_idle), "while moving": (time, moving)},
-        named_times(machine, response_times(velocity, machine.rate)),
+        {name: (time, velocity) for name, velocity in steps.items()},
+        {name: response_time(velocity, machine.rate) for name, velocity in steps.items()},
     )
-
-
-def other_commands(machine: Machine, joint: int) -> Array:
-    """The other driven joints at the limit (n,): the last up, all others down, as in the paper."""
-    u = np.zeros(machine.n)
-    others = machine.driven[machine.driven != joint]
-    u[others[:-1]] = -machine.pwm_limit / PWM_MAX
-    u[others[-1:]] = machine.pwm_limit / PWM_MAX
-    return u
 
 
 def sweeps(machine: Machine, plant: Plant, joint: int, u: Array) -> list[Sweep]:
@@ -119,51 +111,37 @@ def sweeps(machine: Machine, plant: Plant, joint: int, u: Array) -> list[Sweep]:
     return result
 
 
-def step_velocities(machine: Machine, plant: Plant) -> Array:
-    """Velocities (T, 2, 2, n_driven) of each driven joint around a step to the command limit.
+def step_velocities(machine: Machine, plant: Plant, joint: int) -> Array:
+    """Velocities [rad/s] (T, 2) of a joint around a step up to the limit after T / 2 ticks.
 
-    Axes: tick; from idle, or out of a motion at half the limit's opening; up, down; joint, which
-    steps alone from a tenth of its range. The step comes after T / 2 ticks; velocities are means
-    over a tick in the direction of the step [rad/s]. Paper: Sec. 3.2 (past movement)
+    Columns: from idle, and out of a motion at half the limit's opening. They are means over a
+    tick. The joint begins at a tenth of its range. Paper: Sec. 3.2 (past movement)
     """
     low, high = machine.column("q_min"), machine.column("q_max")
     wait = max(round(1.5 * machine.rate), 2 * machine.history)
-    own = np.eye(machine.n, dtype=bool)[machine.driven]  # (n_driven, n): who steps
-    sign = np.array([1, -1])[:, None, None]
-    behind = np.where(sign > 0, 0.9 * low + 0.1 * high, 0.1 * low + 0.9 * high)
-    q = np.tile(np.where(own, behind, (low + high) / 2), (2, 1, 1, 1))
+    q = np.tile((low + high) / 2, (2, 1))
+    q[:, joint] = 0.9 * low[joint] + 0.1 * high[joint]
     limit = machine.pwm_limit / PWM_MAX
-    half = (limit + machine.dead_zones.T[:, None]) / 2  # (2, 1, n)
     u = np.zeros((2 * wait, *q.shape))
-    u[:wait, 1] = sign * own * half
-    u[wait:] = sign * own * limit
-    angles = simulate(machine, plant, q, u)[..., np.arange(len(own)), machine.driven]
-    return np.asarray(np.diff(angles, axis=0) * machine.rate * np.array([[1], [-1]]))
+    u[:wait, 1, joint] = (limit + machine.dead_zones[joint, 0]) / 2
+    u[wait:, :, joint] = limit
+    return np.diff(simulate(machine, plant, q, u)[..., joint], axis=0) * machine.rate
 
 
-def response_times(velocity: Array, rate: float, rise: float = RISE) -> Array:
-    """Time [s] (2, 2, n) from the step to `rise` of the change of velocity; nan: no change.
+def response_time(velocity: Array, rate: float) -> float | None:
+    """Time [s] from the step to `RISE` of the change of velocity (T,); None: no change.
 
-    `velocity` is of `step_velocities`: means over a tick, taken at its middle, with lines between
-    them. No time is below 0.
+    `velocity` is a column of `step_velocities`: means over a tick, taken at its middle, with lines
+    between them. No time is below 0.
     """
     after = velocity[len(velocity) // 2 - 1 :]
-    change = after.max(axis=0) - after[0]
-    part = (after - after[0]) / np.where(change > 1e-3, change, np.nan)
-    at = np.maximum(np.argmax(part >= rise, axis=0), 1)  # row k: the tick k - 1 after the step
-    high = np.take_along_axis(part, at[None], axis=0)[0]
-    low = np.take_along_axis(part, at[None] - 1, axis=0)[0]
-    return np.asarray(np.maximum(at - 0.5 - (high - rise) / (high - low), 0) / rate)
-
-
-def named_times(machine: Machine, times: Array) -> dict[str, Any]:
-    """Response times for JSON: {joint: {"idle": {"up", "down"}, "moving": {...}}} [s or None]."""
-    result: dict[str, Any] = {}
-    for i, joint in enumerate(machine.driven):
-        up_down = [[None if np.isnan(t) else float(t) for t in row] for row in times[..., i]]
-        pairs = [dict(zip(("up", "down"), row, strict=True)) for row in up_down]
-        result[machine.names[joint]] = dict(zip(("idle", "moving"), pairs, strict=True))
-    return result
+    change = after.max() - after[0]
+    if change < 1e-3:
+        return None
+    part = (after - after[0]) / change
+    at = int(np.argmax(part >= RISE))  # row k: the tick k - 1 after the step
+    back = (part[at] - RISE) / (part[at] - part[at - 1])
+    return float(max(at - 0.5 - back, 0) / rate)
 
 
 def sim_to_real(machine: Machine, both: Mapping[str, Plant], seed: int) -> Motion:
@@ -188,51 +166,26 @@ def motion(machine: Machine, q: Array) -> Motion:
 
 
 def numbers(machine: Machine, measured: Preliminary) -> dict[str, Any]:
-    """Numbers of both figures, for JSON [rad/s, s, rad, m, m/s]."""
-    plant, nets = measured.tests["machine"], measured.tests["nets"]
-    sweep = {
-        u: {
-            "machine_peak": float(np.abs(plant.sweeps[u].q_dot).max()),
-            "nets_peak": float(np.abs(nets.sweeps[u].q_dot).max()),
-            "difference_rms": sweep_rms(plant.sweeps[u], nets.sweeps[u]),
-        }
-        for u in plant.sweeps
-    }
+    """Numbers of both figures, for JSON [rad/s, s, m, m/s]."""
     tests = measured.tests.items()
+    sweep: dict[str, dict[str, float]] = {}
+    for name, of in tests:
+        for u, one in of.sweeps.items():
+            sweep.setdefault(u, {})[f"{name}_peak"] = float(np.abs(one.q_dot).max())
     return {
         "joint": machine.names[machine.driven[-1]],
         "sweep": sweep,
-        "coupling_rms": {name: sweep_rms(*of.coupling.values()) for name, of in tests},
         "response_time": {name: of.response_time for name, of in tests},
-        "sim_to_real": gap_numbers(machine, measured.gap),
+        "sim_to_real": gap_numbers(measured.gap),
     }
 
 
-def sweep_rms(one: Sweep, other: Sweep) -> float:
-    """RMS difference of two velocities at the same angles, without the outer twentieths."""
-    q = np.linspace(one.q.min(), one.q.max(), 102)[6:-6]
-    velocities = []
-    for sweep in (one, other):
-        order = np.argsort(sweep.q, kind="stable")
-        velocities.append(np.interp(q, sweep.q[order], sweep.q_dot[order]))
-    return float(np.sqrt(np.mean(np.square(velocities[0] - velocities[1]))))
-
-
-def gap_numbers(machine: Machine, gap: Motion) -> dict[str, Any]:
-    """Errors of the first run, as in the figure, and of the tool over all runs."""
+def gap_numbers(gap: Motion) -> dict[str, Any]:
+    """Errors of the tool in the first run, as in the figure, and over all runs."""
     p_error = np.linalg.norm(gap.p_tool, axis=-1).mean(axis=0)  # m, of each run
     v_error = np.sqrt(np.mean(np.sum(gap.v_tool**2, axis=-1), axis=0))
-    joints = {}
-    for j in machine.driven:
-        q_error = np.abs(gap.q[:, 0, j])
-        joints[machine.names[j]] = {
-            "velocity_rmse": float(np.sqrt(np.mean(gap.q_dot[:, 0, j] ** 2))),
-            "position_error_mean": float(q_error.mean()),
-            "position_error_max": float(q_error.max()),
-        }
     runs = {"median": float(np.median(p_error)), "max": float(p_error.max()), "runs": len(p_error)}
     return {
         "tool": {"position_error_mean": float(p_error[0]), "velocity_rmse": float(v_error[0])},
-        "joints": joints,
         "tool_position_error_mean_of_runs": runs,
     }

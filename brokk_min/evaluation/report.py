@@ -3,7 +3,7 @@
 import base64
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from brokk_min._files import whole_file
 from brokk_min.evaluation import figures
-from brokk_min.evaluation.metrics import Mean, Traces
+from brokk_min.evaluation.metrics import Mean, Traces, interval_text
 from brokk_min.evaluation.preliminary import Preliminary
 from brokk_min.evaluation.rollout import TITLES
 from brokk_min.evaluation.sequences import axis_sequences
@@ -27,38 +27,29 @@ COLUMNS = {  # of the first table: figure of merit and its head
 }
 
 
-class Shown(NamedTuple):
-    """What the figures show beside the results."""
-
-    preliminary: Preliminary
-    traces: Traces  # of the nine sequences
-
-
-def write_report(
-    machine: Machine, out: Path, results: Results, shown: Shown, minutes: float
-) -> None:
+def write_report(out: Path, results: Results, drawn: Mapping[str, Figure], minutes: float) -> None:
     """Write `report.html` to the folder `out`; `minutes` is what the chain took so far."""
     images = {}
-    for name, figure in tqdm(draw(machine, results, shown).items(), desc="draw", disable=None):
+    for name, figure in tqdm(drawn.items(), desc="draw", disable=None):
         images[name] = base64.b64encode(figures.png(figure)).decode()
     with whole_file(out / "report.html", "w") as file:
         file.write(render(results, images, minutes))
 
 
-def draw(machine: Machine, results: Results, shown: Shown) -> dict[str, Figure]:
+def draw(
+    machine: Machine, results: Results, tested: Preliminary, traces: Traces
+) -> dict[str, Figure]:
     """All figures of the page by name."""
     starts, kinds = np.array(results["starts"]), results["start_kinds"]
     run = kinds.index("workspace")  # the first from which all sequences can be followed
-    first = {COLUMNS[key]: of_all(results, key) for key in list(COLUMNS)[:2]}
     drawn = {
-        "first": figures.plot_intervals(first),
-        "tests": figures.plot_tests(machine, shown.preliminary.tests),
-        "gap": figures.plot_gap(machine, shown.preliminary.gap),
+        "tests": figures.plot_tests(machine, tested.tests),
+        "gap": figures.plot_gap(machine, tested.gap),
         "starts": figures.plot_starts(machine, starts, kinds),
-        "joints": figures.plot_joint_velocities(machine, shown.traces, "x", run),
+        "joints": figures.plot_joint_velocities(machine, traces, "x", run),
     }
     for sequence in axis_sequences(machine):
-        of_axis = figures.plot_sequence(machine, shown.traces, sequence, starts[run], run)
+        of_axis = figures.plot_sequence(machine, traces, sequence, starts[run], run)
         drawn[sequence.name] = of_axis
     return drawn
 
@@ -77,15 +68,3 @@ def render(results: Results, images: Mapping[str, str], minutes: float) -> str:
 def of_all(results: Results, key: str) -> dict[str, Mean]:
     """A figure of merit over all sequences, with its interval over starts, by controller."""
     return {name: of["all"][key] for name, of in results["task_space"]["means"].items()}
-
-
-def interval_text(number: Mean) -> str:
-    """A mean with its interval.
-
-    Example:
-        >>> interval_text({"mean": 0.01234, "low": -0.5, "high": 41.267})
-        '0.0123 (-0.5000 to 41.27)'
-    """
-    numbers = [number[key] for key in ("mean", "low", "high")]
-    texts = [f"{x:.4f}" if abs(x) < 1 else f"{x:.4g}" for x in numbers if x is not None]
-    return f"{texts[0]} ({texts[1]} to {texts[2]})" if len(texts) == 3 else "".join(texts)

@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from brokk_min._files import write_json
 from brokk_min.actuator import ActuatorNet
 from brokk_min.evaluation import baselines, claims, metrics, preliminary, report, sequences
 from brokk_min.evaluation.metrics import Traces, evaluate
-from brokk_min.evaluation.robustness import near_singularities, robustness
+from brokk_min.evaluation.robustness import robustness
 from brokk_min.identification import fitting, logs, validation
 from brokk_min.identification.excitation import collect, task_log
 from brokk_min.identification.net_file import save_net, select_nets
@@ -35,7 +36,7 @@ class Budget:
     generations: int = baselines.GENERATIONS  # of the tuning
     tuning_runs: int = baselines.TUNING_RUNS
     starts: int = 64
-    short_s: float = 26.0  # s, longest run of tuning, robustness and singularities
+    short_s: float = 26.0  # s, longest run of tuning and robustness
 
 
 QUICK = Budget(0.1, 700, 100_000, 4, 4, 8, 3.0)
@@ -70,10 +71,10 @@ def reproduce(machine: Machine, out: Path, budget: Budget, seed: int) -> dict[st
     clock: dict[str, float] = {}
     log, paper_log, test = record(chain)
     learned = learn(chain, log, paper_log, clock)
-    results, shown = measure(chain, learned, test, clock)
+    results, drawn = measure(chain, learned, test, clock)
     write_json(out / "results.json", results)
     baselines.write_gains(out / "gains.json", learned.pids, results["meta"])
-    report.write_report(machine, out, results, shown, (time.perf_counter() - began) / 60)
+    report.write_report(out, results, drawn, (time.perf_counter() - began) / 60)
     write_json(out / "timing.json", clock)
     return results
 
@@ -149,8 +150,8 @@ def learn(chain: Chain, log: logs.Log, paper_log: logs.Log, clock: dict[str, flo
 
 def measure(
     chain: Chain, learned: Learned, test: logs.Log, clock: dict[str, float]
-) -> tuple[dict[str, Any], report.Shown]:
-    """All measurements, for `results.json` and for the figures."""
+) -> tuple[dict[str, Any], dict[str, Figure]]:
+    """All measurements for `results.json`, and the figures."""
     machine, seed = chain.machine, chain.seed
     ran = {name: preliminary.run(machine, net, seed) for name, net in learned.nets.items()}
     numbers = {name: preliminary.numbers(machine, of) for name, of in ran.items()}
@@ -168,13 +169,14 @@ def measure(
     }
     of_nets = [claim.to_json() for claim in claims.net_claims(numbers["net"])]
     compared["claims"] = of_nets + compared["claims"]
-    return results | compared, report.Shown(ran["net"], traces)
+    results |= compared
+    return results, report.draw(machine, results, ran["net"], traces)
 
 
 def compare(
     chain: Chain, learned: Learned, clock: dict[str, float]
 ) -> tuple[dict[str, Any], Traces]:
-    """The paper's experiment, robustness and motion near singularities: JSON, and all traces.
+    """The paper's experiment and robustness: JSON, and all traces.
 
     Means, intervals and verdicts are over the "workspace" starts, which can follow all sequences.
     """
@@ -184,21 +186,18 @@ def compare(
     commands = sequences.task_sequences(machine)
     starts = sequences.evaluation_starts(machine, budget.starts, commands, seed + 2)
     kinds = np.array(sequences.start_kinds(machine, starts))
-    workspace, extended = starts[kinds == "workspace"], starts[kinds == "extended"]
+    workspace = starts[kinds == "workspace"]
     short = sequences.shorten(machine, commands[:3], budget.short_s)
-    near = partial(near_singularities, machine, policies, learned.pids)
     jobs: dict[str, Callable[[], Any]] = {
         "score changed": partial(robustness, machine, controllers, short, workspace[:16], seed),
         "score": partial(evaluate, machine, controllers, commands, starts, seed),
-        "score near singularities": partial(near, extended, budget.short_s, seed),
     }
-    changed, (runs, traces), singular = side_by_side(jobs, clock)
+    changed, (runs, traces) = side_by_side(jobs, clock)
     scored = [run for run in runs if run["kind"] == "workspace"]
     results = {
         "task_space": {"runs": runs, "means": metrics.means(scored)},
         "robustness": changed,
-        "singular": singular,
-        "claims": [claim.to_json() for claim in claims.task_claims(scored, singular)],
+        "claims": [claim.to_json() for claim in claims.task_claims(scored)],
         "starts": starts.tolist(),
         "start_kinds": kinds.tolist(),
     }

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from brokk_min.actuator import PLANT, Plant
-from brokk_min.env import Encoder, initial_state, measure, reward, transition
+from brokk_min.env import initial_state, measure, reward, transition
 from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocity
 from brokk_min.learning.episodes import draw_noise
-from brokk_min.machine import Array, Machine, Measured, read_encoder
+from brokk_min.machine import Array, Machine, Measured
 
 TITLES = {  # of controllers in tables, figures and windows, by their names in files
     "rl": "our learner",
@@ -52,13 +52,11 @@ def rollout(
     noise: float,
     rng: np.random.Generator,
     plant: Plant = PLANT,
-    read: Encoder = read_encoder,
 ) -> Trace:
     """Let one controller follow given goals from rest. Paper: Fig. 3
 
     `start` are angles [rad] (num, n), `goals` tool velocities during each tick [m/s] (T, num, 3),
-    `noise` the largest of the sensors [deviations]. `read` is that of `env.transition`. No episode
-    ends.
+    `noise` the largest of the sensors [deviations]. No episode ends.
     """
     state = initial_state(machine, start, goals[0], plant)
     controller_state = controller.start(len(state.q))
@@ -69,7 +67,7 @@ def rollout(
         measured = measure(machine, state.history, v_goal, error)
         u, controller_state = controller(measured, controller_state)
         q_measured = state.history[..., 0, -1]
-        state = transition(machine, plant, replace(state, v_goal=v_goal), u, read)
+        state = transition(machine, plant, replace(state, v_goal=v_goal), u)
         frames = forward_kinematics(machine, state.q)
         v_tool, p_tool = tool_velocity(frames, state.q_dot), tool_position(frames)
         rewards = reward(goal, v_tool)

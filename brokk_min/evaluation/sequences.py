@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brokk_min._files import SHIPPED, brief, read_csv
 from brokk_min.env import terminated
-from brokk_min.evaluation.feasibility import first_failure, most_frequent
+from brokk_min.evaluation.feasibility import MARGINS, feasible
 from brokk_min.jacobian import manipulability, manipulability_threshold
 from brokk_min.kinematics import forward_kinematics, jacobian, lowest_point, tool_position
 from brokk_min.learning.episodes import draw_goal, draw_hold, draw_pose
@@ -43,7 +43,7 @@ class Commands(NamedTuple):
     """A named sequence of goal velocities of the tool [m/s], one per tick."""
 
     name: str
-    goals: Array  # (T, 3), or (T, starts, 3) if each start has its own
+    goals: Array  # (T, 3)
     inward: bool = False  # +x and +y mean towards the slew axis, see `for_starts`
 
     def for_starts(self, machine: Machine, starts: Array) -> Array:
@@ -52,8 +52,7 @@ class Commands(NamedTuple):
         Inward ones have x, y reversed where the tool starts at positive x, y. Otherwise the first
         moves along +x and +y fit into the arm's reach only from one side of the slew range.
         """
-        num, each = len(starts), self.goals.ndim == 3
-        goals = self.goals[:, :num] if each else np.repeat(self.goals[:, None], num, axis=1)
+        goals = np.repeat(self.goals[:, None], len(starts), axis=1)
         if not self.inward:
             return goals
         sign = np.where(tool_position(forward_kinematics(machine, starts)) > 0, -1.0, 1.0)
@@ -213,18 +212,15 @@ def draw_starts(
 ) -> Array:
     """Random "workspace" poses [rad] (num, n) from which ideal actuators follow all sequences."""
     starts: list[Array] = []
-    failures: list[NDArray[np.int64]] = []
     for _ in range(DRAWS):
         poses = draw_pose(machine, rng, 400).round(4)
         poses = poses[np.array(start_kinds(machine, poses)) == "workspace"]
         for sequence in sequences:
-            failures.append(first_failure(machine, poses, sequence.for_starts(machine, poses)))
-            poses = poses[failures[-1] == 0]
+            poses = poses[feasible(machine, poses, sequence.for_starts(machine, poses))]
         starts.extend(poses)
         if len(starts) >= num:
             return np.array(starts[:num])
-    got = f"{len(starts)}; {most_frequent(failures)}"
-    raise ValueError(f"{machine.name}: expected {num} feasible starts, got {got}")
+    raise ValueError(f"{machine.name}: expected {num} starts with {MARGINS}, got {len(starts)}")
 
 
 def tuning_set(machine: Machine, num: int, seed: int, seconds: float = 20.0) -> tuple[Array, Array]:
@@ -237,7 +233,6 @@ def tuning_set(machine: Machine, num: int, seed: int, seconds: float = 20.0) -> 
     shape = 400, int(np.ceil(seconds / TUNING.hold_min_s))  # poses, and goals of each: enough
     starts: list[Array] = []
     goals: list[Array] = []
-    failures: list[NDArray[np.int64]] = []
     for _ in range(DRAWS):
         poses = draw_pose(machine, rng, shape[0])
         v_goal = draw_goal(machine, TUNING, rng, shape[0] * shape[1]).reshape(*shape, 3)
@@ -246,10 +241,9 @@ def tuning_set(machine: Machine, num: int, seed: int, seconds: float = 20.0) -> 
         ticks = np.where(v_goal.any(axis=-1), holds, rests)
         drawn = [np.repeat(*of, axis=0) for of in zip(v_goal, ticks, strict=True)]
         runs = np.array([run[: round(seconds * machine.rate)] for run in drawn])  # (400, T, 3)
-        failures.append(first_failure(machine, poses, runs.swapaxes(0, 1)))
-        starts.extend(poses[failures[-1] == 0])
-        goals.extend(runs[failures[-1] == 0])
+        follows = feasible(machine, poses, runs.swapaxes(0, 1))
+        starts.extend(poses[follows])
+        goals.extend(runs[follows])
         if len(starts) >= num:
             return np.array(starts[:num]), np.stack(goals[:num], axis=1)
-    got = f"{len(starts)}; {most_frequent(failures)}"
-    raise ValueError(f"{machine.name}: expected {num} feasible runs to tune on, got {got}")
+    raise ValueError(f"{machine.name}: expected {num} runs with {MARGINS}, got {len(starts)}")

@@ -9,12 +9,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from brokk_min._files import expect_same, read_json, write_json
 from brokk_min.actuator import ActuatorNet
 from brokk_min.evaluation import metrics
-from brokk_min.evaluation.metrics import Mean, Rows, by_start, mean_interval
+from brokk_min.evaluation.metrics import Mean, Rows, interval_text
 from brokk_min.evaluation.sequences import evaluation_starts, task_sequences
 from brokk_min.identification.net_file import fingerprint
 from brokk_min.learning.checkpoint import train_policy
@@ -34,35 +32,21 @@ def sweep(
     out: Path,
     starts: int,
     scheduler: str | None = None,
-) -> dict[str, Mean]:
+) -> dict[str, dict[str, Mean]]:
     """Train and evaluate `seeds`; all runs, and the means over seeds, go to `sweep.json`.
 
     `net` and `recipe` are those of `train_policy`, `out` is the folder of all files, `starts` the
     number of start poses, `scheduler` the address of a dask scheduler (None: this machine).
-    ValueError: with the seeds that failed and why, after all others are written.
     """
     out.mkdir(parents=True, exist_ok=True)
     job = partial(run_seed, machine, net, recipe, out.resolve(), starts)
-    jobs = {f"seed {seed}": partial(_attempt, job, seed) for seed in seeds}
-    done = dict(zip(seeds, side_by_side(jobs, {}, scheduler=scheduler), strict=True))
-    failed = {seed: text for seed, text in done.items() if isinstance(text, str)}
-    results = {seed: rows for seed, rows in done.items() if seed not in failed}
-    table = over_seeds(list(results.values())) if results else {}
+    jobs = {f"seed {seed}": partial(job, seed) for seed in seeds}
+    results = dict(zip(seeds, side_by_side(jobs, {}, scheduler=scheduler), strict=True))
+    table = over_seeds(results)
     meta = metrics.metadata(machine, min(seeds)) | {"actuator": fingerprint(net)}
     rows = [{"seed": seed} | row for seed, of in results.items() for row in of]
-    write_json(out / "sweep.json", {"meta": meta, "failed": failed, "table": table, "runs": rows})
-    if failed:
-        raise ValueError("; ".join(f"seed {seed}: {text}" for seed, text in failed.items()))
+    write_json(out / "sweep.json", {"meta": meta, "table": table, "runs": rows})
     return table
-
-
-def _attempt(job: Any, seed: int) -> Rows | str:
-    """Rows of a seed, or why it failed: the other seeds go on."""
-    try:
-        rows: Rows = job(seed)
-        return rows
-    except Exception as error:
-        return str(error) or type(error).__name__
 
 
 def run_seed(
@@ -89,26 +73,16 @@ def run_seed(
     return rows
 
 
-def over_seeds(seeds: Sequence[Rows]) -> dict[str, Mean]:
-    """Means over seeds with their 95 % intervals, of each sequence's error and of all `KEYS`.
+def over_seeds(seeds: Mapping[int, Rows]) -> dict[str, dict[str, Mean]]:
+    """Means over seeds with intervals, by sequence (also "all") and figure.
 
     A seed counts once, with its mean over the workspace starts.
     """
-    names = list(dict.fromkeys(run["sequence"] for run in seeds[0]))
-    columns = {f"velocity_error {name}": (name, KEYS[0]) for name in names}
-    columns |= {key: ("all", key) for key in KEYS}
-    scored = [[run for run in rows if run["kind"] == "workspace"] for rows in seeds]
-    return {
-        label: mean_interval(np.array([by_start(rows, "rl", *of).mean() for rows in scored]))
-        for label, of in columns.items()
-    }
+    rows = [run | {"start": seed} for seed, of in seeds.items() for run in of]
+    return metrics.means([run for run in rows if run["kind"] == "workspace"])["rl"]
 
 
-def show(table: Mapping[str, Mean]) -> str:
-    """The table of `over_seeds` as text, one line a figure."""
-    lines = [f"{'':24} mean over seeds (95 % interval)"]
-    for label, number in table.items():
-        low, high = number["low"], number["high"]
-        interval = "" if low is None else f" ({low:.4f} to {high:.4f})"
-        lines.append(f"{label:24} {number['mean']:.4f}{interval}")
-    return "\n".join(lines)
+def show(table: Mapping[str, Mapping[str, Mean]]) -> str:
+    """The figures of all sequences as text, one a line."""
+    lines = [f"{key:24} {interval_text(table['all'][key])}" for key in KEYS]
+    return "\n".join([f"{'':24} mean over seeds (95 % interval)", *lines])

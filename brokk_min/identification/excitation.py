@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
 from brokk_min.actuator import PLANT, Plant
-from brokk_min.identification.logs import RETURN, Log, machine_log
+from brokk_min.identification.logs import Log, machine_log
 from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, read_encoder, require
 
 Indices = NDArray[np.intp]
@@ -19,7 +19,6 @@ Indices = NDArray[np.intp]
 MIX = {"sine": 0.17, "step": 0.1, "holds": 0.17, "start": 0.21, "barely open": 0.35}
 BARELY_OPEN = 0.049  # of full command beyond the dead zone, assumed: the largest of these levels
 MAX_SEGMENT = 30.0  # s, assumed: longest motion that is recorded in one piece
-MAX_RETURN = 300.0  # s, assumed: a longer return to the start is stopped
 
 
 def sine_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Array:
@@ -103,32 +102,13 @@ def _barely_open(rng: np.random.Generator, machine: Machine) -> Array:
 EXCITATIONS = {"sine": sine_command, "rich": rich_command}
 
 
-class _Recorder:
-    """A plant with a logger: commands and encoder angles (rows, n) of each tick."""
-
-    def __init__(self, machine: Machine, plant: Plant, q: Array) -> None:
-        self.machine = machine
-        self.plant = plant
-        self.state = plant.reset(machine, q)
-        self.u: list[Array] = []
-        self.q = [read_encoder(machine, q)]  # one more than commands
-
-    def step(self, u: Array) -> None:
-        """One tick under the command `u`, limited."""
-        u = limit_command(self.machine, u)
-        self.state = self.plant.step(self.machine, self.state, u)
-        self.u.append(u)
-        self.q.append(read_encoder(self.machine, self.state.q))
-
-
 def collect(
     machine: Machine, hours: float, excitation: str, rng: np.random.Generator, plant: Plant = PLANT
 ) -> Log:
-    """Record a plant, one actuator at a time, `hours` for each without the returns.
+    """Record a plant, one actuator at a time, `hours` for each.
 
-    A segment begins with `history` samples of an idle valve. The return to its start is recorded as
-    `..._return`; `read_log` drops it. Sines start at mid range, as in the paper, rich excitation at
-    random angles. Paper: Sec. 3.3
+    A segment begins with `history` samples of an idle valve and ends before the joint returns.
+    Sines start at mid range, as in the paper, rich excitation at random angles. Paper: Sec. 3.3
     ValueError: another excitation, or hours that are not positive.
     """
     kinds = ", ".join(EXCITATIONS)
@@ -142,64 +122,51 @@ def collect(
     with tqdm(total=goal * machine.n, desc=title, unit="sample", disable=None) as bar:
         while count.min() < goal:
             joint = np.repeat(np.flatnonzero(count < goal), rows)
-            u, q, ended, idle = _drive_segments(machine, plant, joint, excitation, rng)
+            u, q, ended = _drive_segments(machine, plant, joint, excitation, rng)
             for row, j in enumerate(joint):
-                num = min(ended[row], goal - count[j])
-                if num:
-                    name = f"{machine.names[j]}_{len(recordings[j]) // 2:03d}"
-                    back = slice(ended[row], idle[row])
+                if num := min(ended[row], goal - count[j]):
+                    name = f"{machine.names[j]}_{len(recordings[j]):03d}"
                     recordings[j].append((name, u[:num, row], q[:num, row]))
-                    recordings[j].append((name + RETURN, u[back, row], q[back, row]))
                     count[j] += num
                     bar.update(num)
     return machine_log(machine, chain(*recordings))
 
 
-def _at_limit(machine: Machine, q: Array) -> NDArray[np.bool_]:
-    """Which angles `q` [rad] (..., n) are within two counts of a limit."""
-    near = 2 * machine.encoder_step
-    return (q < machine.column("q_min") + near) | (q > machine.column("q_max") - near)
-
-
 def _drive_segments(
     machine: Machine, plant: Plant, joint: Indices, excitation: str, rng: np.random.Generator
-) -> tuple[Array, Array, Indices, Indices]:
-    """Commands and angles (T, rows, n) while joint `joint[k]` of row k moves; two ticks (rows,).
+) -> tuple[Array, Array, Indices]:
+    """Commands and angles (T, rows, n) while joint `joint[k]` of row k moves, and its last ticks.
 
-    At the first the segment ends: after its commands, or at a limit, but not within a second. Then
-    the joint returns to its start at a constant command. At the second its valve is idle there.
+    A segment ends after its commands, or within two counts of a limit, but not within a second.
+    Rich excitation pushes for a second first.
     """
     q, commands = _plan_segments(machine, joint, excitation, rng)
-    rows = np.arange(len(joint))
-    start = q[rows, joint]
-    arrival = np.maximum(0.06, 2 * machine.encoder_step[joint])  # rad or m
+    rows, near = np.arange(len(joint)), 2 * machine.encoder_step[joint]
+    low, high = machine.column("q_min")[joint] + near, machine.column("q_max")[joint] - near
     push = machine.rate if excitation == "rich" else 0.0  # ticks at a limit
-    return_level = (machine.dead_zones.max() + machine.pwm_limit / PWM_MAX) / 2
-    pause = round(5 * machine.tau_valve_down * machine.rate)
-    ended = np.full(len(joint), machine.history + round(MAX_SEGMENT * machine.rate))
-    arrived = np.full(len(joint), len(commands))
+    ended = np.full(len(joint), len(commands))
     ticks_at_limit = np.zeros(len(joint), int)
-    recorder = _Recorder(machine, plant, q)
+    state, u_log, q_log = plant.reset(machine, q), [], []
     for tick, excite in enumerate(commands):
-        angle = recorder.q[-1][rows, joint]
-        at_limit = _at_limit(machine, recorder.q[-1])[rows, joint]
+        q_log.append(read_encoder(machine, state.q))
+        angle = q_log[-1][rows, joint]
+        at_limit = (angle < low) | (angle > high)
         ticks_at_limit += at_limit
         pushed = at_limit & (ticks_at_limit > push) & (tick > machine.history + machine.rate)
         ended[pushed & (tick < ended)] = tick
-        arrived[(ended <= tick) & (tick < arrived) & (np.abs(angle - start) < arrival)] = tick
-        if (tick >= arrived + pause).all():
-            break
-        homeward = return_level * np.sign(start - angle)
         u = np.zeros_like(q)
-        u[rows, joint] = np.select([tick < ended, tick < arrived], [excite, homeward])
-        recorder.step(u)
-    return np.array(recorder.u), np.array(recorder.q[:-1]), ended, arrived + pause
+        u[rows, joint] = np.where(tick < ended, excite, 0.0)
+        u_log.append(limit_command(machine, u))
+        state = plant.step(machine, state, u_log[-1])
+        if (tick >= ended).all():
+            break
+    return np.array(u_log), np.array(q_log), ended
 
 
 def _plan_segments(
     machine: Machine, joint: Indices, excitation: str, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Angles (rows, n) at the start of segments, and commands (T, rows) with time to return.
+    """Angles (rows, n) at the start of segments, and commands (T, rows).
 
     Segments start at mid range; if rich, at random angles of `joint[k]`, a tenth at either limit.
     """
@@ -212,8 +179,7 @@ def _plan_segments(
         q[np.arange(len(joint)), joint] = angles
     ticks = round(MAX_SEGMENT * machine.rate)
     commands = [EXCITATIONS[excitation](rng, machine, ticks) for _ in joint]
-    around = (machine.history, round(MAX_RETURN * machine.rate))
-    return q, np.pad(commands, ((0, 0), around)).T
+    return q, np.pad(commands, ((0, 0), (machine.history, 0))).T
 
 
 def task_log(
@@ -241,15 +207,17 @@ def task_log(
     noise = rng.uniform(0, 0.06, shape)
     move_locked = (np.arange(recordings) % 5 == 4)[:, None]
     moving = np.isin(np.arange(machine.n), machine.locked) == move_locked
-    recorder = _Recorder(machine, plant, q)
+    state, u_log, q_log = plant.reset(machine, q), [], []
     for _ in range(round(seconds * machine.rate)):
-        fraction = (recorder.q[-1] - q_min) / (q_max - q_min)
+        q_log.append(read_encoder(machine, state.q))
+        fraction = (q_log[-1] - q_min) / (q_max - q_min)
         up = rng.random(shape) > np.clip(1.5 * fraction - 0.25, 0, 1)
         drawn = np.where(up, 1, -1) * rng.uniform(0, limit, shape) * (rng.random(shape) < 0.85)
         level = np.where(remaining <= 0, drawn, level)
         remaining = np.where(remaining <= 0, rng.uniform(0.5, 5.0, shape), remaining) - machine.dt
         command = command + smoothing * (level - command)
         jitter = noise * rng.standard_normal(shape) * (level != 0)
-        recorder.step(moving * (command + jitter))
-    u, q = np.stack(recorder.u, axis=1), np.stack(recorder.q[:-1], axis=1)
+        u_log.append(limit_command(machine, moving * (command + jitter)))
+        state = plant.step(machine, state, u_log[-1])
+    u, q = np.stack(u_log, axis=1), np.stack(q_log, axis=1)
     return machine_log(machine, [(f"task_{i:02d}", u[i], q[i]) for i in range(recordings)])

@@ -9,42 +9,31 @@ A grid gives delay, lag and dead zones, and least squares give the gains. Sample
 recorded range do not count, because a joint that is pushed against its stop stands still.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from brokk_min.identification.logs import COMMANDED, Log, Recording, driven
-from brokk_min.machine import Array, Joint, Machine
+from brokk_min.machine import Array, Machine
 
 # What the model searches, all assumed.
 LATEST = 0.4  # s, longest delay
 TAUS = (0.05, 0.1, 0.2, 0.4)  # s
-COARSE = 0.02 * np.arange(36)  # dead zones, of full command
-FINE = 0.005 * np.arange(-3, 4)  # around the best of these
+ZONES = 0.01 * np.arange(71)  # dead zones, of full command
 AT_STOP = 0.01  # of the recorded range: so near its end a joint may be at a stop
 PAUSE = 2.0  # s, after so long a joint without commands is at rest
-SETTLED = 0.7  # s after a gap, because what was commanded in the gap is not known
 SAMPLES = 20_000  # of a joint that are used
 CLEAR_SIGN = 0.2  # of the velocities' power: fast sines fit as well if reversed and later
-# The fastest motion, all assumed.
-NEAR_LIMIT = 0.15  # commands that are so much less or more than the limit are at it
-HELD = 0.5  # s, after so long a joint has its speed
-FASTEST = 0.95  # quantile of the speeds, because the single ones have noise
-LEAST_HELD = 20  # samples at the limit; with fewer, the model gives the fastest motion
 # What a log must have, all assumed.
 LEAST_MINUTES = 10.0
 LEAST_RANGE = 0.7  # of a joint's range
 LEAST_EXPLAINED = 0.1  # of a joint's motion by its commands
-WIDER = 0.03  # of full command, above the error of the model's dead zones
 BEYOND = 0.05  # of a joint's range, outside of it
-FASTER = 5.0  # times as fast as the machine: probably in another unit
 
 
 @dataclass(frozen=True)
@@ -60,7 +49,7 @@ class JointReport:
     tau: float  # s
     dead_zone: tuple[float, float]
     gain: tuple[float, float]  # rad/s per command beyond the dead zone; 0: it never moved so
-    fastest: tuple[float, float]  # rad/s at the command limit
+    fastest: tuple[float, float]  # rad/s at the command limit, by the model
 
 
 def inspect(log: Log, limit: float = 1.0) -> dict[str, JointReport]:
@@ -71,62 +60,38 @@ def inspect(log: Log, limit: float = 1.0) -> dict[str, JointReport]:
         if recordings:
             ticks = sum(len(one.u) for one in recordings if np.ptp(one.u[:, j]) > COMMANDED)
             q = np.concatenate([one.q[:, j] for one in recordings])
-            motion = motion_of(recordings, j, log.rate)
-            model = fit_model(motion)
+            model = fit_model(motion_of(recordings, j, log.rate))
+            up, down = np.multiply(model["gain"], np.maximum(limit - model["dead_zone"], 0))
             reports[name] = JointReport(
                 minutes=ticks / log.rate / 60,
                 low=float(q.min()),
                 high=float(q.max()),
-                fastest=fastest(motion, limit, model),
-                **model,
+                fastest=(float(up), float(down)),
+                **model | {"dead_zone": tuple(model["dead_zone"].tolist())},
             )
     return reports
-
-
-def fastest(motion: "Motion", limit: float, model: Mapping[str, Any]) -> Any:
-    """Fastest motion [rad/s] up and down, after commands held at the limit.
-
-    Where too few commands are held there, it is what the model gives.
-    """
-    held = round(HELD * motion.rate) + 1
-    commands = sliding_window_view(motion.u, held)
-    result = []
-    for sign, zone, gain in zip((1, -1), model["dead_zone"], model["gain"], strict=True):
-        at_limit = (np.abs(sign * commands / limit - 1) < NEAR_LIMIT).all(axis=-1)
-        speeds = sign * motion.q_dot[held - 1 :][at_limit]
-        measured = len(speeds) >= LEAST_HELD
-        result.append(np.quantile(speeds, FASTEST) if measured else gain * max(limit - zone, 0))
-    return tuple(map(float, result))
-
-
-# --- the model ------------------------------------------------------------------------------------
 
 
 class Motion(NamedTuple):
     """Samples of one joint, recordings one after the other, with a rest in between."""
 
     u: Array  # (T,)
-    q_dot: Array  # of the log [rad/s], (T,)
     velocity: Array  # over the coming sample [rad/s], (T,)
-    counts: NDArray[np.bool_]  # not in a rest, nor after a gap, nor at an end of the range, (T,)
+    counts: NDArray[np.bool_]  # not in a rest, nor at an end of the range, (T,)
     rate: float  # Hz
 
 
 def motion_of(recordings: list[Recording], j: int, rate: float) -> Motion:
-    """Joint `j` of recordings that begin at rest or after a gap; of a long log the first part."""
+    """Joint `j` of recordings that begin at rest; of a long log the first part of each."""
     share = min(1.0, SAMPLES / sum(len(one.u) for one in recordings))
-    rest = (0, round(PAUSE * rate))
-    parts = []
-    for one in recordings:
-        num = int(np.ceil(share * len(one.u)))
-        counts = np.arange(num) >= (SETTLED * rate if "#" in one.name else 0)
-        u, q, q_dot = (x[:num, j] for x in one[1:])
-        padded = (np.pad(x, rest) for x in (u, q_dot, counts))
-        parts.append((np.pad(q, rest, "edge"), *padded))
-    q, u, q_dot, counts = map(np.concatenate, zip(*parts, strict=True))
+    lengths = [int(np.ceil(share * len(one.u))) for one in recordings]
+    rest, cut = (0, round(PAUSE * rate)), list(zip(recordings, lengths, strict=True))
+    u = np.concatenate([np.pad(one.u[:num, j], rest) for one, num in cut])
+    q = np.concatenate([np.pad(one.q[:num, j], rest, "edge") for one, num in cut])
+    counts = np.concatenate([np.pad(np.ones(num, bool), rest) for num in lengths])
     q_next, margin = np.append(q[1:], q[-1]), AT_STOP * np.ptp(q)
     counts &= (q_next > q.min() + margin) & (q_next < q.max() - margin)
-    return Motion(u, q_dot, (q_next - q) * rate, counts, rate)
+    return Motion(u, (q_next - q) * rate, counts, rate)
 
 
 def fit_model(motion: Motion) -> dict[str, Any]:
@@ -145,32 +110,24 @@ def fit_model(motion: Motion) -> dict[str, Any]:
 
 
 def best_model(motion: Motion, sign: int) -> dict[str, Any]:
-    """The model with gains of one sign: a grid of delays and lags, and dead zones, in turns."""
+    """The model with gains of one sign: a grid of delays and lags, and of dead zones, in turns."""
     lags = list(product(range(round(LATEST * motion.rate) + 1), TAUS))
     zones = np.array([0.05, 0.05])
     for _ in range(2):
-        delay, tau = min(lags, key=lambda lag: fit_gains(motion, sign, lag[0], lag[1], zones)[0])
-        zones = best_zones(partial(fit_gains, motion, sign, delay, tau), zones)
-    error, gains = fit_gains(motion, sign, delay, tau, zones)
-    pairs = {"dead_zone": tuple(zones.round(3).tolist()), "gain": tuple(gains.tolist())}
-    return {"error": error, "delay": delay / motion.rate, "tau": tau, **pairs}
-
-
-def best_zones(fit: Callable[[Array], tuple[float, Array]], zones: Array) -> Array:
-    """Dead zones (2,), in turns: each of a coarse grid, then of a fine one around its best."""
-    for side in (0, 1, 0, 1):
-        for around, steps in ((0, COARSE), (1, FINE)):
-            values = np.maximum(around * zones[side] + steps, 0)
-            trials = [np.where(np.arange(2) == side, value, zones) for value in values]
-            zones = min(trials, key=lambda trial: fit(trial)[0])
-    return zones
+        lag = min(lags, key=lambda lag: fit_gains(motion, sign, lag, zones)[0])
+        for side in (0, 1, 0, 1):
+            trials = [np.where(np.arange(2) == side, zone, zones) for zone in ZONES]
+            zones = min(trials, key=lambda trial: fit_gains(motion, sign, lag, trial)[0])
+    error, gains = fit_gains(motion, sign, lag, zones)
+    pairs = {"dead_zone": zones.round(3), "gain": tuple(gains.tolist())}
+    return {"error": error, "delay": lag[0] / motion.rate, "tau": lag[1], **pairs}
 
 
 def fit_gains(
-    motion: Motion, sign: int, delay: int, tau: float, zones: Array
+    motion: Motion, sign: int, lag: tuple[int, float], zones: Array
 ) -> tuple[float, Array]:
     """Sum of the squared errors of the model with the best gains (2,) of a sign; these gains."""
-    up, down = zones
+    (delay, tau), (up, down) = lag, zones
     late = np.concatenate([np.zeros(delay), motion.u])[: len(motion.u)]
     openings = np.stack([np.maximum(late - up, 0), -np.maximum(-late - down, 0)])
     a = np.exp(-1 / (motion.rate * tau))
@@ -180,9 +137,6 @@ def fit_gains(
     gains = sign * np.maximum(sign * gains, 0)
     error = velocity - gains @ x
     return float(error @ error), gains
-
-
-# --- what to make of it ---------------------------------------------------------------------------
 
 
 def wrong_signs(reports: Mapping[str, JointReport]) -> list[str]:
@@ -196,7 +150,7 @@ def wrong_signs(reports: Mapping[str, JointReport]) -> list[str]:
 
 
 def warnings(log: Log, reports: Mapping[str, JointReport], machine: Machine | None) -> list[str]:
-    """What a log lacks, and where it contradicts the machine that it should be of."""
+    """What a log lacks, and where it contradicts the range of the machine that it should be of."""
     result = wrong_signs(reports)
     for name in log.joints:
         if name not in reports:
@@ -208,37 +162,18 @@ def warnings(log: Log, reports: Mapping[str, JointReport], machine: Machine | No
         if r.explained < LEAST_EXPLAINED:
             got = f"{r.explained:.0%}: are they those of another joint?"
             result.append(f"{name}: expected commands that explain its motion, got {got}")
-        if r.delay > LATEST - 1 / log.rate:
-            wanted = f"below {LATEST:g} s, the longest that is searched"
-            result.append(f"{name}: delay: expected {wanted}, got {r.delay:.2f} s or more")
-        if machine:
-            joint = machine.joints[machine.names.index(name)]
-            result += [f"{name}: {text}" for text in contradictions(r, joint)]
+        if not machine:
+            continue
+        joint = machine.joints[machine.names.index(name)]
+        whole, part = joint.q_max - joint.q_min, r.high - r.low
+        if max(joint.q_min - r.low, r.high - joint.q_max) > BEYOND * whole:
+            wanted = f"{name}: expected angles of {joint.q_min:g} to {joint.q_max:g}"
+            got = f"{r.low:.2f} to {r.high:.2f}"
+            result.append(f"{wanted}, got {got}: another unit, zero or joint?")
+        elif part < LEAST_RANGE * whole:
+            wanted = f"{LEAST_RANGE:.0%} of its range or more"
+            result.append(f"{name}: expected {wanted}, got {part / whole:.0%}")
     return result
-
-
-def contradictions(report: JointReport, joint: Joint) -> Iterator[str]:
-    """Fields of a joint that its log contradicts, in words."""
-    whole = joint.q_max - joint.q_min
-    beyond = max(joint.q_min - report.low, report.high - joint.q_max) / whole
-    part = (report.high - report.low) / whole
-    if beyond > BEYOND:
-        wanted, got = (
-            f"{joint.q_min:g} to {joint.q_max:g}",
-            f"{report.low:.2f} to {report.high:.2f}",
-        )
-        yield f"expected angles of {wanted}, got {got}: another unit, zero or joint?"
-    elif part < LEAST_RANGE:
-        yield f"expected {LEAST_RANGE:.0%} of its range or more, got {part:.0%}"
-    if report.explained < LEAST_EXPLAINED or report.sign < 0:
-        return
-    for i, (side, nominal) in enumerate((("up", joint.q_dot_up), ("down", joint.q_dot_down))):
-        zone, now = report.dead_zone[i], joint.dead_zone[i]
-        if report.gain[i] and now > zone + WIDER:
-            yield f"dead_zone {side}: expected about {zone:.3f} by this log, got {now:g}"
-        if report.gain[i] and not 1 / FASTER < report.fastest[i] / nominal < FASTER:
-            wanted = f"expected about {report.fastest[i]:.3g} by this log"
-            yield f"q_dot_{side}: {wanted}, got {nominal:g}: time in s, angles in rad?"
 
 
 def table(reports: Mapping[str, JointReport]) -> list[str]:

@@ -14,15 +14,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min._files import brief, load_arrays, located, read_csv, whole_file, write_csv
+from brokk_min._files import brief, expected, load_arrays, located, read_csv, whole_file, write_csv
 from brokk_min.actuator import estimate_velocity
 from brokk_min.machine import Array, Machine, require
 
 RATE = 20.0  # Hz, paper: everything runs at 20 Hz; other machines have others
-MAX_GAP = 0.25  # s, or 2.5 samples, assumed: a longer gap starts a new recording
+MAX_GAP = 0.25  # s, or 2.5 samples, assumed: longer gaps cut a recording
 COMMANDED = 0.02  # of full command, assumed: more than a stick at rest gives
 MOVED = 0.01  # rad or m, assumed: more than a parked joint creeps
-MEAN_OF = 10  # values in a tick, of logs that are faster
+MEAN_OF = 10  # values of a command in a tick, of logs that are faster
 LARGEST = 1e12  # of numbers in a log, assumed: any time, angle or velocity
 RETURN = "_return"
 Rows = NDArray[np.intp]
@@ -57,10 +57,6 @@ def velocity_of(q: Array, samples: int, rate: float = RATE) -> Array:
     """Causal velocity [rad/s] at each row of a recording `q` [rad] (T, n), at rest before it.
 
     `samples` is the window of `estimate_velocity`, `rate` [Hz] that of the rows.
-
-    Example:
-        >>> velocity_of(np.array([[0.0], [0.0], [0.25], [0.5]]), samples=2).round(6).ravel()
-        array([0., 0., 5., 5.])
     """
     padded = np.concatenate([np.repeat(q[:1], samples - 1, axis=0), q])
     windows = np.lib.stride_tricks.sliding_window_view(padded, samples, axis=0)
@@ -154,8 +150,6 @@ def join_logs(logs: Mapping[Path, Log]) -> Log:
 
 def write_log(path: Path, log: Log) -> None:
     """Write recordings as one table, `.csv` or `.npz` by the name; read it with `read_log`."""
-    path = Path(path)
-    require(path.suffix in (".csv", ".npz"), str(path), "a name in .csv or .npz", path.suffix)
     require(len(log.recordings) > 0, str(path), "at least one recording to write", "none")
     names = [recording.name for recording in log.recordings]
     lengths = [len(recording.u) for recording in log.recordings]
@@ -164,7 +158,7 @@ def write_log(path: Path, log: Log) -> None:
     for kind in ("u", "q", "q_dot") if log.velocity_logged else ("u", "q"):
         values = np.concatenate([getattr(recording, kind) for recording in log.recordings])
         columns |= {f"{kind}_{name}": values[:, i] for i, name in enumerate(log.joints)}
-    if path.suffix == ".csv":
+    if Path(path).suffix == ".csv":
         numbers = [np.char.mod("%.7g", column) for column in list(columns.values())[1:]]
         write_csv(path, columns, zip(columns["run"], *numbers, strict=True))
         return
@@ -172,33 +166,25 @@ def write_log(path: Path, log: Log) -> None:
         np.savez_compressed(file, **columns)
 
 
-def read_log(
-    paths: Sequence[Path],
-    velocity_samples: int,
-    joints: Sequence[str] | None = None,
-    rate: float = RATE,
-) -> Log:
+def read_log(paths: Sequence[Path], velocity_samples: int, rate: float = RATE) -> Log:
     """Read and check tables of one machine and resample them at `rate` [Hz].
 
-    The command is held, the angle interpolated; of faster logs they are means. A gap longer than
-    `MAX_GAP` and 2.5 samples cuts a recording. Without q_dot columns velocities are estimated: a
-    recording starts at rest, and after a gap the rows that would need samples of the gap are left
-    out. `velocity_samples` is the window of `estimate_velocity`; `joints` are the names and order
-    of the joints (None: all, in the order of the first file).
-    ValueError: the file, and the row (1 is the header) or the column of the first error.
+    The command is held (of faster logs it is the mean over a tick), the angle interpolated. A gap
+    longer than `MAX_GAP` and 2.5 samples cuts a recording. Without q_dot columns velocities are
+    estimated over `velocity_samples`: a recording starts at rest, and after a gap the rows that
+    would need samples of the gap are left out.
+    ValueError: the file, and the row (1 is the header), the column or the run of the first error.
     """
     logs = {}
     for path in map(Path, paths):
-        suffix = path.suffix.lower()
-        require(suffix in (".csv", ".npz"), str(path), "a name in .csv or .npz", path.suffix)
-        table = read_csv(path, "run", "time") if suffix == ".csv" else load_arrays(path)[1]
-        with located(path):
-            found = [name[2:] for name in table if name.startswith("u_")]
-            names = tuple(joints or found)
-            require(len(names) > 0, "columns", "u_<joint>", brief(list(table)))
-            logged = any(f"q_dot_{joint}" in table for joint in names)
-            recordings = tuple(_recordings(table, names, logged, velocity_samples, rate))
-            logs[path] = Log(names, recordings, logged, rate)
+        csv = path.suffix.lower() == ".csv"
+        table = read_csv(path, "run", "time") if csv else load_arrays(path)[1]
+        with expected(path, "a log"), located(path):
+            joints = tuple(name[2:] for name in table if name.startswith("u_"))
+            require(len(joints) > 0, "columns", "u_<joint>", brief(list(table)))
+            logged = any(name.startswith("q_dot_") for name in table)
+            recordings = tuple(_recordings(table, joints, logged, velocity_samples, rate))
+            logs[path] = Log(joints, recordings, logged, rate)
     return join_logs(logs)
 
 
@@ -209,7 +195,9 @@ def _recordings(
     limits = {"u": 1.0, "q": LARGEST} | ({"q_dot": LARGEST} if logged else {})
     time = _numbers(table, ["time"], LARGEST)[:, 0]
     values = {k: _numbers(table, [f"{k}_{one}" for one in joints], limits[k]) for k in limits}
-    for run, rows in _runs(table["run"]):
+    names, begins, number = np.unique(table["run"], return_index=True, return_inverse=True)
+    for i in np.argsort(begins):
+        run, rows = str(names[i]), np.flatnonzero(number == i)
         _check_run(run, time[rows], values["q"][rows], rate)
         gaps = np.flatnonzero(np.diff(time[rows]) > max(MAX_GAP, 2.5 / rate)) + 1
         pieces = [] if run.endswith(RETURN) else np.split(rows, gaps)
@@ -227,24 +215,13 @@ def _numbers(table: Mapping[str, Any], names: Sequence[str], limit: float) -> Ar
     missing = [name for name in ("run", *names) if name not in table]
     require(not missing, "columns", brief(missing), brief(list(table)))
     for name in names:
-        column = np.asarray(table[name])
-        fits = column.dtype.kind in "fiu" and column.shape == np.shape(table["run"])
-        require(fits, f"column {name}", "a number in each row", f"{column.dtype} {column.shape}")
-    values = np.stack([table[name] for name in names], axis=1, dtype=float)
-    wrong = np.argwhere(~(np.abs(values) <= limit))  # also where it is nan
-    if len(wrong):
-        (row, column), wanted = wrong[0], f"-{limit:g} to {limit:g}"
-        got = values[row, column]
-        raise ValueError(f"row {row + 2}, column {names[column]}: expected {wanted}, got {got}")
+        wanted, got = (np.shape(table[key]) for key in ("run", name))
+        require(got == wanted, f"column {name}", f"{wanted} numbers", got)
+    values = np.array([table[name] for name in names], float).T
+    for row, column in np.argwhere(~(np.abs(values) <= limit)):  # also where it is nan
+        place, got = f"row {row + 2}, column {names[column]}", values[row, column]
+        raise ValueError(f"{place}: expected -{limit:g} to {limit:g}, got {got}")
     return values
-
-
-def _runs(names: Any) -> Iterator[tuple[str, Rows]]:
-    """Name and rows of each recording, in the order in which they begin."""
-    found, first, number = np.unique(names, return_index=True, return_inverse=True)
-    rows = np.split(np.argsort(number, kind="stable"), np.cumsum(np.bincount(number))[:-1])
-    for i in np.argsort(first):
-        yield str(found[i]), rows[i]
 
 
 def _check_run(run: str, time: Array, q: Array, rate: float) -> None:
@@ -254,8 +231,8 @@ def _check_run(run: str, time: Array, q: Array, rate: float) -> None:
     step, jump = np.diff(time), np.abs(np.diff(q, axis=0)).max()
     got = f"a step of {step.min():.6g} at {time[step.argmin()]:.6g}"
     require(step.min() > 0, f"run {run}, column time", "stamps that rise", got)
-    wanted = f"s, at {rate:g} Hz, the machine's rate (--machine), or more"
     median = float(np.median(step))
+    wanted = f"s, at {rate:g} Hz, the machine's rate (--machine), or more"
     require(median <= 1.05 / rate, f"run {run}, column time", wanted, f"{1 / median:.3g} Hz")
     wanted = "angles that do not start again after a turn (numpy.unwrap)"
     require(jump < 1.5 * np.pi, f"run {run}", wanted, f"a jump of {jump:.2f} rad")
@@ -264,22 +241,15 @@ def _check_run(run: str, time: Array, q: Array, rate: float) -> None:
 def _resample(
     time: Array, columns: dict[str, Array], samples: int, rate: float
 ) -> tuple[Array, Array, Array]:
-    """u held, q and q_dot interpolated at `rate`; q_dot estimated where the log has none.
-
-    Of two samples per tick or more means are taken: of u over the tick, of q and q_dot over half a
-    tick on both sides. A step has its moment then, and noise is less.
-    """
+    """u held, q and q_dot interpolated at `rate`; q_dot estimated where the log has none."""
     grid = time[0] + np.arange(int((time[-1] - time[0]) * rate + 1e-6) + 1) / rate
     fast = len(time) > 1 and np.median(np.diff(time)) < 0.501 / rate
-    parts = np.arange(MEAN_OF if fast else 1)[:, None]
-    held = np.searchsorted(time, grid + parts / len(parts) / rate + 1e-6, side="right") - 1
-    half = np.minimum(0.5 / rate, np.minimum(grid - time[0], time[-1] - grid)) * fast
-    around = grid + half * ((2 * parts + 1) / len(parts) - 1)
-
-    def mean(values: Array) -> Array:
-        columns = [np.interp(around, time, column).mean(axis=0) for column in values.T]
-        return np.stack(columns, axis=-1)
-
-    q = mean(columns["q"])
-    q_dot = mean(columns["q_dot"]) if "q_dot" in columns else velocity_of(q, samples, rate)
-    return columns["u"][held].mean(axis=0), q, q_dot
+    parts = np.linspace(0, 1 / rate, MEAN_OF if fast else 1, endpoint=False)[:, None]
+    held = np.searchsorted(time, grid + parts + 1e-6, side="right") - 1
+    measured = {
+        kind: np.stack([np.interp(grid, time, column) for column in x.T], axis=-1)
+        for kind, x in columns.items()
+        if kind != "u"
+    }
+    q_dot = measured["q_dot"] if "q_dot" in measured else velocity_of(measured["q"], samples, rate)
+    return columns["u"][held].mean(axis=0), measured["q"], q_dot

@@ -1,8 +1,8 @@
 """Pictures of a machine: two views, angles and valves of its joints, goal and measured velocity.
 
 Nothing but kinematics is used, so any `Machine` can be drawn. Joints and links are where the
-machine has them; tracks, outriggers, turret and the widths of links are generic. Lengths in
-pictures are pixels, and y points down.
+machine has them; tracks, turret and the widths of links are generic. Lengths in pictures are
+pixels, and y points down.
 """
 
 import os
@@ -27,15 +27,13 @@ HEAD, ROW = 36.0, 20.0  # heights of the title and of a joint's row
 NEAR_LIMIT = 0.05  # of its range: a joint nearer to an end is red
 NO_POINTS = np.zeros((0, 3))
 ABOVE = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])  # right and up of the top view
-# Outlines of links: how far along the link, and half the width there.
+# Outlines of links: how far along the link, and half the width there. The last is the breaker.
 BOOM = np.array([[0, 1.0], [0.3, 1.2], [1, 0.7]])
-BREAKER = np.array([[0, 0.6], [0.1, 1.3], [0.6, 1.3], [0.66, 0.5]])  # of the last link
-CHISEL = np.array([[0.6, 0.45], [0.93, 0.35], [1, 0.05]])  # its point is the tool
+BREAKER = np.array([[0, 0.6], [0.1, 1.3], [0.6, 1.3], [0.66, 0.5], [0.93, 0.35], [1, 0.05]])
 CIRCLE = np.exp(2j * np.pi * np.arange(24)[:, None] / 24).view(float)  # corners (x, y)
-# The undercarriage, in reaches of the arm: (x, y, z) of the outlines of a track and of a leg.
+# The outline (x, y, z) of a track, in reaches of the arm.
 TRACK = np.insert(0.035 * CIRCLE, 1, 0.0, axis=1) + 0.035 * np.eye(3)[2]
 TRACK[:, 0] += 0.115 * np.sign(CIRCLE[:, 0])
-LEG = np.array([[0.08, 0.05, 0.06], [0.17, 0.16, 0], [0.2, 0.16, 0], [0.08, 0.05, 0.09]])
 
 
 class Scene(NamedTuple):
@@ -190,17 +188,16 @@ def _backdrop(canvas: Canvas, machine: Machine, view: View) -> None:
 
 
 def _base(canvas: Canvas, machine: Machine, view: View, scene: Scene) -> None:
-    """Tracks along x, four legs, and over them the turret, which turns with q_1."""
+    """Tracks along x, and over them the turret, which turns with q_1."""
     first, reach = machine.joints[0], extent(machine)[0]
     ground = machine.ground / reach
     low, front, high = ground + 0.06, max(first.a / reach, 0.03), max(first.d / reach, 0.1)
     turret = np.array([[-0.12, 0, low], [front, 0, low], [front, 0, high], [-0.12, 0, high]])
     c, s = np.cos(scene.q[0] + first.theta), np.sin(scene.q[0] + first.theta)
     turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-    track, leg = TRACK + np.array([0, 0, ground]), LEG + np.array([0, 0, ground])
-    prisms = [(track + np.array([0, y, 0]), 0.02, np.eye(3), STEEL) for y in (-0.075, 0.075)]
-    prisms += [(leg, 0.01, np.diag([x, y, 1]), STEEL) for x in (-1, 1) for y in (-1, 1)]
-    prisms += [(turret, 0.055, turn, shade(scene.colour, -0.3))]
+    tracks = [TRACK + np.array([0, y, ground]) for y in (-0.075, 0.075)]
+    prisms = [(track, 0.02, np.eye(3), STEEL) for track in tracks]
+    prisms += [(turret, 0.055, turn, INK)]
     for outline, half, matrix, colour in prisms:
         faces = outline + half * np.array([[[0, -1, 0]], [[0, 1, 0]]])
         near, far = view.project(reach * faces @ matrix)
@@ -214,19 +211,16 @@ def _arm(canvas: Canvas, machine: Machine, view: View, scene: Scene) -> None:
     """Links, of which the last one is a breaker, and joints, red near a limit."""
     ends = view.project(forward_kinematics(machine, scene.q).p)
     sizes = 0.03 * extent(machine)[0] * view.scale * np.linspace(1.0, 0.5, machine.n)
-    dark = shade(scene.colour, -0.3)
     for i in range(1, machine.n):
-        colour = shade(scene.colour, 0.2 * (i % 2))
         along = ends[i + 1] - ends[i]
         across = sizes[i] * along[::-1] * (-1, 1) / max(float(np.hypot(*along)), 1e-9)
-        last = i == machine.n - 1
-        for part, ink in [(BREAKER, colour), (CHISEL, STEEL)] if last else [(BOOM, colour)]:
-            middle, wide = ends[i] + part[:, :1] * along, part[:, 1:] * across
-            outline = np.vstack([middle + wide, (middle - wide)[::-1]])
-            canvas.polygon(outline, ink)
-            canvas.line(np.vstack([outline, outline[:1]]), dark, 0.5)
+        part = BREAKER if i == machine.n - 1 else BOOM
+        middle, wide = ends[i] + part[:, :1] * along, part[:, 1:] * across
+        outline = np.vstack([middle + wide, (middle - wide)[::-1]])
+        canvas.polygon(outline, scene.colour)
+        canvas.line(np.vstack([outline, outline[:1]]), INK, 0.5)
         radius, warned = max(3.0, 0.6 * float(sizes[i])), near_limit(machine, scene.q)[i]
-        canvas.polygon(ends[i] + 1.2 * radius * CIRCLE, WARNING if warned else dark)
+        canvas.polygon(ends[i] + 1.2 * radius * CIRCLE, WARNING if warned else INK)
         canvas.polygon(ends[i] + 0.5 * radius * CIRCLE, BACKGROUND)
 
 
@@ -254,13 +248,6 @@ def near_limit(machine: Machine, q: Array) -> NDArray[np.bool_]:
     driven = np.isin(np.arange(machine.n), machine.driven)
     fraction = (q - low) / (high - low)
     return np.asarray(((fraction < NEAR_LIMIT) | (fraction > 1 - NEAR_LIMIT)) & driven)
-
-
-def shade(colour: Colour, fraction: float) -> Colour:
-    """A colour mixed with a fraction of the background, or of ink if it is negative."""
-    other = BACKGROUND if fraction > 0 else INK
-    r, g, b = (round(c + abs(fraction) * (w - c)) for c, w in zip(colour, other, strict=True))
-    return r, g, b
 
 
 def _captions(canvas: Canvas, machine: Machine, scene: Scene) -> None:

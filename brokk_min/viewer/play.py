@@ -6,7 +6,7 @@ depends on timing.
 """
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -16,10 +16,11 @@ from numpy.typing import ArrayLike
 
 from brokk_min.actuator import PLANT, Plant
 from brokk_min.can.operator_input import shape_axis
+from brokk_min.can.simulated_machine import start_pose
 from brokk_min.env import initial_state, measure, transition
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.kinematics import forward_kinematics, tool_position
-from brokk_min.machine import Array, Machine, require
+from brokk_min.machine import Array, Machine
 from brokk_min.viewer.drawing import BLUE, NO_POINTS, ORANGE, Scene, draw, extent, load_pygame
 
 SIZE, SMALLEST = (1120, 680), (640, 360)  # px, of the window at first and of a picture
@@ -67,8 +68,8 @@ class Operator:
             return BUTTONS.get(event.button, "")
         elif event.type == pg.JOYDEVICEADDED and self.pad is None:
             self.pad = pg.joystick.Joystick(event.device_index)
-        elif event.type == pg.JOYDEVICEREMOVED and self.pad:
-            self.pad = None if event.instance_id == self.pad.get_instance_id() else self.pad
+        elif event.type == pg.JOYDEVICEREMOVED:
+            self.pad = None
         return ""
 
     def velocity(self) -> Array:
@@ -80,7 +81,7 @@ class Operator:
         if self.held & {"left shift", "right shift"}:
             target /= 3
         if self.pad is not None and self.focus:
-            axes = [self.pad.get_axis(i) if i < self.pad.get_numaxes() else 0.0 for i in AXES]
+            axes = [self.pad.get_axis(i) for i in AXES]  # one that it lacks reads 0
             target = np.clip(target - shape_axis(axes), -1, 1)
         step = self.machine.dt / RISE
         last = np.where(target * self.deflection > 0, self.deflection, 0.0)
@@ -169,15 +170,10 @@ def play(
 ) -> None:
     """Drive a simulated machine in a window, until it is closed.
 
-    The window shows the names of the `controllers`; `start` are angles [rad], by default the
-    machine's own start or the middle of its ranges. ValueError: no controller, a start outside the
-    ranges, no pygame, or no display.
+    The window shows the names of the `controllers`; `start` are angles [rad], see `start_pose`.
+    ValueError: a start outside the ranges, no pygame, or no display.
     """
-    low, high = machine.column("q_min"), machine.column("q_max")
-    q = np.array(start or machine.q_start or (low + high) / 2)
-    fits = q.shape == low.shape and bool(((low <= q) & (q <= high)).all())
-    require(fits, "start", f"{machine.n} angles within their ranges", q.tolist())
-    require(len(controllers) > 0, "controllers", "at least one", "none")
+    q = start_pose(machine, start)
     with window(f"brokk_min: {machine.name}") as pygame:
         session, operator = Session(machine, controllers, q, plant), Operator(machine, pygame)
         clock = pygame.time.Clock()
@@ -189,7 +185,7 @@ def play(
                 if action:
                     getattr(session, action)()
             session.tick(operator.velocity())
-            show(pygame, machine, [session.scene()])
+            show(pygame, machine, session.scene())
             clock.tick(machine.rate)
 
 
@@ -198,7 +194,6 @@ def window(title: str) -> Iterator[Any]:
     """An open window, as the module pygame.
 
     Without a display SDL would draw unseen; that is refused unless SDL_VIDEODRIVER asks for it.
-    ValueError: no pygame, or no display.
     """
     pygame = load_pygame()
     try:
@@ -216,10 +211,8 @@ def window(title: str) -> Iterator[Any]:
         pygame.display.quit()
 
 
-def show(pygame: Any, machine: Machine, scenes: Sequence[Scene]) -> None:
-    """Fill the window with scenes side by side."""
-    width, height = np.maximum(pygame.display.get_window_size(), SMALLEST)
-    size = int(width) // len(scenes), int(height)
-    for i, scene in enumerate(scenes):
-        pygame.display.get_surface().blit(draw(machine, scene, size), (i * size[0], 0))
+def show(pygame: Any, machine: Machine, scene: Scene) -> None:
+    """Fill the window with a scene."""
+    width, height = np.maximum(pygame.display.get_window_size(), SMALLEST).tolist()
+    pygame.display.get_surface().blit(draw(machine, scene, (width, height)), (0, 0))
     pygame.display.flip()

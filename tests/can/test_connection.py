@@ -3,7 +3,6 @@
 import io
 import re
 import struct
-from pathlib import Path
 
 import can
 import pytest
@@ -50,47 +49,6 @@ def test_bus__marks_foreign_frames_and_echoes_and_logs_all_but_echoes(buses):
     assert re.fullmatch(r"\(\d+\.\d{6}\) operator 7FF#09 T", lines[-1])
 
 
-class SelectBus:
-    """A silent bus; a wait on it takes as long as the wait says, or a millisecond."""
-
-    def __init__(self):
-        self.t = 7.0
-        self.waits = []
-        self.ready = []
-        self.messages = []
-
-    def recv(self, timeout):
-        assert timeout == 0.0  # python-can's own timeout follows the time of day
-        return self.messages.pop() if self.messages else None  # None: the filter took it
-
-    def send(self, message, timeout):
-        assert 0 < timeout <= 0.02  # a full buffer must not hold up the tick
-
-    def shutdown(self):
-        self.t = -1.0
-
-    def select(self, read, *rest):
-        assert read == [7]
-        self.waits.append(rest[-1])
-        self.t += rest[-1] + 1e-6 if rest[-1] and not self.ready else 0.001
-        return self.ready, [], []
-
-
-@pytest.mark.parametrize(("busy", "slept"), [(0.0, [0.019]), (0.004, [0.016]), (0.020, [])])
-def test_recv__sleeps_only_after_its_busy_wait(busy, slept, monkeypatch):
-    silent = SelectBus()
-    bus = Bus(silent, file=7, clock=lambda: silent.t)
-    monkeypatch.setattr("select.select", silent.select)
-    assert bus.recv(0.020, busy) is None
-    assert [wait for wait in silent.waits if wait] == pytest.approx(slept, abs=1.1e-3)
-    assert 0.020 <= silent.t - 7.0 < 0.0225
-    silent.t = 7.0
-    silent.ready = [7]
-    silent.messages = [can.Message(arbitration_id=0x181, is_extended_id=False), None, None]
-    assert bus.recv(0.020, busy).id == 0x181
-    assert silent.t < 7.004  # what is there is read at once, and frames that a filter took
-
-
 def test_open_bus__refuses_a_bus_that_is_not_there_or_fails():
     refusal = r"socketcan nosuch0: expected a CAN bus, got"
     with pytest.raises(ValueError, match=refusal), open_bus("socketcan", "nosuch0"):
@@ -100,7 +58,7 @@ def test_open_bus__refuses_a_bus_that_is_not_there_or_fails():
         raise can.CanOperationError("full")
 
 
-def test_open_bus__keeps_its_log_and_words_where_the_adapter_fails_or_the_disk_is_full(tmp_path):
+def test_open_bus__keeps_its_log_where_the_adapter_fails(tmp_path):
     """An adapter that was pulled out fails at the shutdown, too."""
 
     def fails():
@@ -112,12 +70,6 @@ def test_open_bus__keeps_its_log_and_words_where_the_adapter_fails_or_the_disk_i
         bus.bus.shutdown, shutdown = fails, bus.bus.shutdown
     shutdown()
     assert (tmp_path / "l").read_text().endswith(" virtual 080# T\n")
-    with pytest.raises(OSError) as caught, open_bus("virtual", "v", Path("/dev/full")) as bus:
-        bus.send(0x080, b"")
-    assert caught.value.filename == "/dev/full"
-    with pytest.raises(BrokenPipeError) as caught, open_bus("virtual", "v", tmp_path / "l"):
-        raise BrokenPipeError(32, "of the status line")
-    assert caught.value.filename is None
 
 
 def test_open_bus__gives_socketcan_filters_that_take_its_identifiers_alone(tmp_path):

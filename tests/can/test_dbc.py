@@ -1,7 +1,5 @@
 """The DBC file of `examples/dbc.py`, as cantools decodes it, is what the program means."""
 
-from dataclasses import replace
-
 import cantools
 import numpy as np
 import pytest
@@ -9,7 +7,7 @@ import pytest
 from brokk_min.can import canopen
 from brokk_min.can.canopen import encoder_raw, used_ids, valve_frames
 from brokk_min.machine import BROKK_170
-from examples.dbc import dbc, main
+from examples.dbc import dbc
 from examples.seven_joints import SEVEN_JOINTS
 
 
@@ -33,12 +31,3 @@ def test_dbc__describes_the_frames_that_the_program_uses(machine):
     assert position == {"position": raw}
     heartbeat = canopen.HEARTBEAT + machine.controller_node
     assert database.decode_message(heartbeat, b"\x05") == {"state": 5}
-
-
-def test_main__writes_a_file_for_joints_of_any_name(tmp_path):
-    joints = [replace(joint, name=f"{joint.name} (left)") for joint in BROKK_170.joints]
-    text = dbc(replace(BROKK_170, name="named", joints=tuple(joints)))
-    database = cantools.database.load_string(text, "dbc")
-    assert "u_q1__left_" in database.get_message_by_name("valves_1").signal_tree
-    main(str(tmp_path / "bus.dbc"))
-    assert len(cantools.database.load_file(tmp_path / "bus.dbc").messages) == 14

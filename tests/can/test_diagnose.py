@@ -2,16 +2,16 @@
 
 import numpy as np
 import pytest
-from helpers_bus import HoldingOperator, World, random_policy
+from helpers_bus import random_policy
 
 from brokk_min.actuator import append_sample, initial_history
 from brokk_min.can.drive_log import Telemetry
 from brokk_min.env import measure
 from brokk_min.evaluation.sequences import axis_sequences
-from brokk_min.learning.policy import PolicyController, save_policy
+from brokk_min.learning.policy import PolicyController
 from brokk_min.machine import BROKK_170 as M
 from brokk_min.machine import read_encoder
-from examples.diagnose import diagnose, main
+from examples.diagnose import diagnose
 
 START = np.array([[0.0, 0.5, 0.58, 1.71, 1.24]])
 
@@ -76,26 +76,3 @@ def test_diagnose__finds_nothing_in_a_sound_drive(name):
 def test_diagnose__names_a_planted_fault(name):
     terms = diagnose(M, POLICIES["paper"], drive(**FAULTS[name]))
     assert any(name in term.name for term in terms[:3]), terms[:6]
-
-
-def test_main__reads_a_log_and_prints_what_explains_it(tmp_path, capsys):
-    class Reversed(PolicyController):
-        def __call__(self, measured, memory):
-            u, memory = super().__call__(measured, memory)
-            return u * SIGN, memory
-
-    log, file = str(tmp_path / "run.log"), str(tmp_path / "policy.npz")
-    save_policy(file, POLICIES["beyond"], M)
-    world = World(Reversed(M, POLICIES["beyond"]), HoldingOperator(), log=log)
-    world.drive.begin()
-    for side in (0, 1, -1):
-        world.operator.v = (0.0, 0.15 * side, 0.1 * side)
-        world.run(2.0)
-    world.bus.close()
-    main(log, file)
-    assert "commands: sign of q4 (command)" in capsys.readouterr().out
-    with open(log) as lines:
-        cut = lines.readlines()
-    (tmp_path / "cut.log").write_text("".join(cut[: len(cut) // 9]))
-    with pytest.raises(ValueError, match="log: expected 73 ticks of driving in a row"):
-        main(str(tmp_path / "cut.log"), file)

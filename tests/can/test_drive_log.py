@@ -17,7 +17,7 @@ from brokk_min.can.canopen import (
     encoder_raw,
     valve_frame,
 )
-from brokk_min.can.drive_log import TelemetryReader, log_for_fit, operator_input_of, read_frames
+from brokk_min.can.drive_log import log_for_fit, operator_input_of, read_frames, read_telemetry
 from brokk_min.hw import Drive
 from brokk_min.machine import BROKK_170
 
@@ -165,32 +165,26 @@ def test_log_for_fit__by_hand():
         log_for_fit(machine, frames[:100])
 
 
-def test_telemetry_reader__gives_at_each_sync_the_tick_before():
-    reader = TelemetryReader(BROKK_170)
+def test_read_telemetry__gives_at_each_sync_the_tick_before():
     goal = OperatorInput((0.1, 0.0, -0.2), enable=True).pack()
     q = np.array([0.0, 0.5, 0.6, 1.7, 1.2])
-    measured = []
+    frames, measured = [], []
     for k in range(6):
         counts = np.rint((q + 0.01 * k) / STEP).astype(int)
         measured.append(counts * STEP)
-        telemetry = reader.update(Frame(0.0, 0x080, b""))
+        frames.append(Frame(0.05 * k, 0x080, b""))
         for node, raw in enumerate(encoder_raw(BROKK_170, counts).tolist(), 1):
-            assert reader.update(Frame(0.0, 0x180 + node, struct.pack("<I", raw))) is None
-        reader.update(Frame(0.0, OPERATOR_INPUT, goal, channel=OPERATOR_CHANNEL))
-        reader.update(Frame(0.0, OPERATOR_INPUT, bytes(7), channel="can0"))  # somebody else's
-        reader.update(Frame(0.0, 0x210, valve_frame([50, 0, -80, 0, 0], k, k > 0).tobytes()))
-    assert telemetry is not None and telemetry.driving
-    np.testing.assert_array_equal(telemetry.q, measured[4])
+            frames.append(Frame(0.0, 0x180 + node, struct.pack("<I", raw)))
+        frames.append(Frame(0.0, OPERATOR_INPUT, goal, channel=OPERATOR_CHANNEL))
+        frames.append(Frame(0.0, OPERATOR_INPUT, bytes(7), channel="can0"))  # somebody else's
+        frames.append(Frame(0.0, 0x210, valve_frame([50, 0, -80, 0, 0], k, k > 0).tobytes()))
+    frames += [Frame(0.3, 0x080, b""), Frame(0.35, 0x181, struct.pack("<I", 3))]  # a gap
+    *_, before, last, gap = read_telemetry(BROKK_170, [*frames, Frame(0.4, 0x080, b"")])
+    assert before.driving and last.driving and before.time == 0.2
+    np.testing.assert_array_equal(before.q, measured[4])
     newest = np.stack(measured[1:5], axis=-1)
-    np.testing.assert_allclose(telemetry.q_dot, estimate_velocity(newest, 4, 0.05))
-    np.testing.assert_allclose(telemetry.u * 127, [50, 0, -80, 0, 0])
-    np.testing.assert_allclose(telemetry.v_goal, [0.1, 0.0, -0.2])
-    assert reader.update(Frame(0.0, 0x080, b"")).driving
-    assert not reader.update(Frame(0.0, 0x080, b"")).driving  # a tick without a valve frame
-    reader.update(Frame(0.0, 0x210, valve_frame([0, 0, 0, 0, 0], 7, 0).tobytes()))
-    reader.update(Frame(0.0, 0x080, b""))
-    reader.update(Frame(0.0, 0x181, struct.pack("<I", 3)))  # the others are missing
-    gap = reader.update(Frame(0.0, 0x080, b""))
-    assert gap is not None and not gap.driving
+    np.testing.assert_allclose(before.q_dot, estimate_velocity(newest, 4, 0.05))
+    np.testing.assert_allclose(before.u * 127, [50, 0, -80, 0, 0])
+    np.testing.assert_allclose(before.v_goal, [0.1, 0.0, -0.2])
+    assert not gap.driving and not gap.v_goal.any()
     assert np.isnan(gap.q).all() and np.isnan(gap.q_dot).all()
-    assert not gap.v_goal.any()

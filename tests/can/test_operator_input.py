@@ -5,7 +5,7 @@ import pytest
 from helpers_bus import START, HoldingOperator, Virtual, World
 
 from brokk_min.can.canopen import OperatorInput
-from brokk_min.can.operator_input import JointJog, Joystick, Script, shape_axis
+from brokk_min.can.operator_input import JointJog, Joystick, Script
 from brokk_min.machine import BROKK_170
 
 TWO_GOALS = np.array([[0.1, 0, 0], [0, 0.2, 0]])
@@ -65,25 +65,7 @@ def test_joystick__gives_switch_and_velocity_of_a_virtual_device():
     device.button(5, False)
     assert not stick(True, True).enable
     device.unplug()
-
-
-def test_joystick__notices_that_its_device_goes_and_another_comes():
-    device = Virtual()
-    stick = Joystick(BROKK_170)
-    device.button(5, True)
-    device.unplug()
-    assert stick(True, True) == OperatorInput(alive=False)
-    assert stick(True, True) == OperatorInput(alive=False)
-    again = Virtual()
-    again.button(5, True)
-    assert stick(False, True) == OperatorInput(enable=True)
-    other = Virtual()
-    again.axis(1, -1.0)
-    assert stick(True, True).v_goal[0] > 0.299  # one more device changes nothing
-    other.unplug()
-    assert stick(True, True).alive
-    again.unplug()
-    assert stick(True, True) == OperatorInput(alive=False)
+    assert stick(True, True) == stick(True, True) == OperatorInput(alive=False)
 
 
 def test_joystick__refuses_a_device_without_its_axes_or_button():
@@ -109,13 +91,3 @@ def test_joint_jog__moves_one_joint_with_the_sign_of_x():
         operator.v = v
         world.run(0.2)
         assert world.commands[1][-1].tolist() == [0, 0, 0, command, 0]
-
-
-def test_shape_axis__is_odd_rising_and_flat_near_the_middle():
-    axis = np.linspace(-1, 1, 201)
-    shaped = shape_axis(axis)
-    np.testing.assert_allclose(shaped, -shaped[::-1], atol=1e-12)
-    assert (np.diff(shaped) >= 0).all()
-    assert not shaped[np.abs(axis) < 0.12].any()
-    assert shaped.max() == 1.0
-    assert shaped[150] < 0.5 * axis[150]

@@ -9,7 +9,6 @@ from helpers_bus import BASELINE, HoldingOperator, World, only, random_policy
 from helpers_cli import run
 
 from brokk_min.can.operator_input import JointJog
-from brokk_min.cli import operating
 from brokk_min.cli.operating import Drive, Play, status
 from brokk_min.cli.options import WrongUse
 from brokk_min.evaluation import baselines
@@ -30,21 +29,16 @@ def folder(tmp_path_factory):
     return path
 
 
-def test_drive__has_the_controller_that_is_named(folder, tmp_path, capsys):
+def test_drive__has_the_controller_that_is_named(folder, capsys):
     where = {"interface": "virtual", "channel": "v", "policy": folder / "policy.npz"}
     controllers = {
         name: Drive(**where, controller=name).find_controller(BROKK_170)
         for name in ("rl", "jacobian", "jog")
     }
     assert isinstance(controllers["rl"], PolicyController)
-    assert controllers["jog"] == JointJog(BROKK_170, "q1", 12)  # 0.07 * 127 = 8.9, and 3 more
+    assert controllers["jog"] == JointJog(BROKK_170, "q1", 12)
     assert (controllers["jacobian"].gains.kp == 7.0).all() and controllers["jacobian"].k == 0.1
     assert capsys.readouterr().out.endswith("gains.json\n")
-    copy = tmp_path / "p.npz"  # without gains beside it
-    copy.write_bytes((folder / "policy.npz").read_bytes())
-    by_hand = Drive(**where | {"policy": copy}, controller="jacobian").find_controller(BROKK_170)
-    assert (by_hand.gains.kp == 1.0).all()
-    assert capsys.readouterr().out == "gains of the Jacobian controller: set by hand\n"
 
 
 @pytest.mark.parametrize(
@@ -94,8 +88,8 @@ def test_replay__makes_a_film_of_the_log_of_a_drive(tmp_path, capsys):
     world.bus.close()
     assert run(f"replay '{log}' --fps 2 --out '{tmp_path}/a.gif'") == 0
     assert (tmp_path / "a.gif").read_bytes().startswith(b"GIF8")
-    assert run(f"replay '{log}' '{log}' '{log}'") == 2
-    assert "LOGS: expected one or two, got 3" in capsys.readouterr().err
+    assert run(f"replay '{log}' --out '{tmp_path}/a.mp4'") == 2
+    assert "--out: expected a name in .gif, got" in capsys.readouterr().err
 
 
 def test_export__gives_the_policys_actions_and_what_it_must_agree_on(folder, tmp_path, capsys):
@@ -111,12 +105,3 @@ def test_export__gives_the_policys_actions_and_what_it_must_agree_on(folder, tmp
     told = {k: json.loads(v) for k, v in session.get_modelmeta().custom_metadata_map.items()}
     assert told["driven"] == ["q1", "q3", "q4", "q5"] and told["interface"] == "paper"
     assert len(told["mean"]) == len(told["scale"]) == 163 and told["rate"] == 20.0
-
-
-def test_show_status__prints_lines_where_there_is_no_terminal(capsys):
-    world = World(BASELINE, HoldingOperator())
-    operating.show_status(world.drive)
-    assert (
-        capsys.readouterr().out
-        == "waiting, now error v goal +0.00 +0.00 +0.00 late 0.0 ms, skipped 0\n"
-    )

@@ -23,12 +23,10 @@ def test_baselines__are_the_papers_two_and_two_stronger_ones():
     assert list(HAND) == NAMES
     assert [c.k for c in HAND.values()] == [0.1, 0.05, 0.1, 0.1]
     assert [type(c) for c in HAND.values()] == [*[JacobianController] * 2, *[StrongPID] * 2]
-    table = baselines.gains_table(HAND)
-    assert table[NAMES[0]] == table[NAMES[1]] == {
-        "kp": [1.0] * 4, "ki": [8.0] * 4, "kd": [0.05] * 4, "feedback": [0.4]
-    }  # fmt: skip
-    assert set(table[NAMES[2]]) == set(baselines.RANGES)
-    assert [table[NAMES[2]][name][0] for name in ("kp", "integral_feedback")] == [0.2, 0.0]
+    assert HAND[NAMES[0]].gains is HAND[NAMES[1]].gains
+    first, third = (baselines.gains_vector(HAND[NAMES[i]].gains) for i in (0, 2))
+    np.testing.assert_array_equal(first, [*[1.0] * 4, *[8.0] * 4, *[0.05] * 4, 0.4])
+    assert set(vars(HAND[NAMES[2]].gains)) == set(baselines.RANGES) and third[0] == 0.2
 
 
 @given(st.integers(1, 6), st.integers(0, 3), st.booleans(), st.integers(0, 2**31))
@@ -108,7 +106,9 @@ def test_write_gains__reads_back(tmp_path):
     }
     baselines.write_gains(tmp_path / "gains.json", other, meta)
     read = baselines.read_gains(tmp_path / "gains.json", BROKK_170, NET)
-    assert baselines.gains_table(read) == baselines.gains_table(other)
+    for name, of in read.items():
+        vectors = (baselines.gains_vector(c.gains) for c in (of, other[name]))
+        np.testing.assert_array_equal(*vectors)
     assert [c.k for c in read.values()] == [c.k for c in HAND.values()]
 
 

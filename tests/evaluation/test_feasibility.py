@@ -56,19 +56,3 @@ def test_feasible__compares_tool_and_path_at_the_same_tick(rate):
     machine = replace(BROKK_170, rate=rate)
     sideways = np.tile([0.0, 0.3, 0.0], (3, 1, 1))
     assert feasible(np.array([0.0, *START[1:]]), sideways, machine)
-
-
-def test_first_failure__names_the_criterion():
-    start = np.array([[0.0, *START[1:]]])
-    lowest = float(lowest_point(forward_kinematics(BROKK_170, start))[0])
-    fast = np.tile([0.0, 2.0, 0.0], (2, 1, 1))
-    at_end = np.array([[0.0, *START[1:3], 2.88, START[4]]])
-    found = [
-        feasibility.first_failure(BROKK_170, start, STILL),
-        feasibility.first_failure(replace(BROKK_170, ground=lowest), start, STILL),
-        feasibility.first_failure(BROKK_170, at_end, STILL),
-        feasibility.first_failure(BROKK_170, start, fast),
-    ]
-    assert np.concatenate(found).tolist() == [0, 2, 3, 4]
-    text = feasibility.most_frequent([*found, found[-1]])
-    assert text == f"2 of 4 others fail: {feasibility.CRITERIA[3]}"

@@ -3,7 +3,6 @@
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 
 from brokk_min.evaluation import figures
 from brokk_min.evaluation.preliminary import Motion, SimulatorTests, Sweep
@@ -21,14 +20,6 @@ def curves(ax):
 
 def ylabels(figure):
     return [ax.get_ylabel() for ax in figure.axes]
-
-
-def test_plot_panels__draw_the_median_of_many_runs_between_10_and_90_percent():
-    x, y = np.arange(3.0), np.arange(33.0).reshape(3, 11)  # eleven runs: 0 to 10, 11 to 21, ...
-    ax = figures.plot_panels([[figures.Panel("", "x [m]", "y [m]", {"all": (x, y)})]]).axes[0]
-    np.testing.assert_array_equal(curves(ax)["all"], [x, [5, 16, 27]])
-    band = ax.collections[0].get_paths()[0].vertices
-    assert (band[:, 1].min(), band[:, 1].max()) == (1, 31)
 
 
 def test_plot_tests__shows_machine_above_nets():
@@ -69,7 +60,7 @@ def test_plot_sequence__is_relative_to_where_the_tool_began():
     time = 0.05 * np.arange(1, 521)
     positions = [f"{axis} - {axis}(0) [m]" for axis in "xyz"]
     assert ylabels(figure) == positions + [f"velocity {axis} [m/s]" for axis in "xyz"]
-    (goal, policy) = (text.get_text() for text in figure.legends[0].get_texts())
+    (goal, policy) = (text.get_text() for text in figure.axes[0].get_legend().get_texts())
     p_start = tool_position(forward_kinematics(BROKK_170, POSE))
     for i in range(3):
         above, below = curves(figure.axes[i]), curves(figure.axes[3 + i])
@@ -92,14 +83,7 @@ def test_plot_starts__draws_arms_from_the_side_and_from_above():
     ends = [(0, 3.05), (3.05, 0), (3.05 * np.cos(1.5), 3.05 * np.sin(1.5))]
     for arm, end in zip(top, ends, strict=True):
         np.testing.assert_allclose(arm[:, -1], end, atol=0.01)
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["limits", "workspace"]
-
-
-def test_plot_intervals__has_a_mark_and_a_bar_for_each_controller():
-    numbers = {"rl": {"mean": 2.0, "low": 1.5, "high": 3.0}}
-    numbers["pid"] = {"mean": 4.0, "low": None, "high": None}  # one start: no interval
-    ax = figures.plot_intervals({"error [m/s]": numbers}).axes[0]
-    assert [tuple(mark.get_xdata()) for mark in ax.get_lines()] == [(2.0,), (4.0,)]
-    ((left, right),) = ax.collections[0].get_segments()
-    assert (left[0], right[0]) == pytest.approx((1.5, 3.0)) and left[1] == 0
-    assert ax.get_xlabel() == "error [m/s]"
+    assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == [
+        "limits",
+        "workspace",
+    ]

@@ -8,7 +8,7 @@ from scipy import stats
 from brokk_min.evaluation import metrics as m
 from brokk_min.evaluation.baselines import baselines
 from brokk_min.evaluation.rollout import Trace
-from brokk_min.evaluation.sequences import Commands, task_sequences
+from brokk_min.evaluation.sequences import task_sequences
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
 
@@ -84,19 +84,6 @@ def test_metrics__of_a_batch_are_those_of_its_runs():
     np.testing.assert_allclose(batch["jerk_rms"] ** 2, (jerk**2).sum(axis=(0, 2)) / 28)
 
 
-def test_metrics__errors_of_moves_and_rests():
-    """At rest an error of 0.05 m/s, then at 0.2 m/s one of 0.1 and of 0.01 m/s."""
-    goals = np.zeros((40, 3))
-    goals[10:, 0] = 0.2
-    v = goals.copy()
-    v[:10, 1] = 0.05
-    v[10:22, 0] = 0.1
-    v[22:, 0] = 0.19
-    row = figures(v, goals)
-    assert row["velocity_error_rests"] == pytest.approx(0.05)
-    assert row["velocity_error_moves"] == pytest.approx((12 * 0.1 + 18 * 0.01) / 30)
-
-
 def test_metrics__time_at_limits_is_of_driven_joints():
     low, high = BROKK_170.column("q_min"), BROKK_170.column("q_max")
     q = np.tile(MIDDLE, (8, 1))
@@ -153,46 +140,30 @@ def test_evaluate__gives_each_length_of_sequences_the_same_noise():
     assert traces["pid", "z"].v_tool.shape == (40, 2, 3)
 
 
-def test_evaluate__has_none_for_figures_without_a_value():
-    rest = [Commands("rest", np.zeros((5, 3)))]
-    rows, _ = m.evaluate(BROKK_170, {"idle": Idle()}, rest, STARTS, 0, obedient_net(BROKK_170))
-    assert [row["velocity_error_moves"] for row in rows] == [None, None]
-    assert [row["velocity_error_mean"] for row in rows] == [0.0, 0.0]
-
-
-def run(controller, sequence, start, error):
-    labels = {"controller": controller, "sequence": sequence, "start": start, "kind": "workspace"}
-    return labels | {"error": error}
-
-
 def test_mean_interval__is_students():
     values = np.random.default_rng(1).normal(2.0, 0.3, 12)
     expected = stats.ttest_1samp(values, 0).confidence_interval(0.95)
-    result = m.mean_interval(np.append(values, np.nan))
+    result = m.mean_interval(values)
     np.testing.assert_allclose([result["low"], result["high"]], expected)
     assert result["mean"] == pytest.approx(values.mean())
-    none = {"low": None, "high": None}
-    assert m.mean_interval(np.array([1.0, np.nan])) == {"mean": 1.0, **none}
-    assert m.mean_interval(np.array([np.nan])) == {"mean": None, **none}
+    assert m.mean_interval(np.array([1.0])) == {"mean": 1.0, "low": None, "high": None}
 
 
-def test_paired_difference__is_of_the_same_starts():
-    """Starts differ far more than controllers: the paired interval is narrow."""
-    error = {0: 1.0, 1: 5.0, 2: 9.0}
-    runs = [run("a", s, i, e + 0.1 * i) for s in "xy" for i, e in reversed(error.items())]
-    runs += [run("b", "x", i, e + 0.2) for i, e in error.items()]
-    runs += [run("b", "y", i, e + 0.4) for i, e in error.items()]
-    result = m.paired_difference(runs, "b", "a", "error")
-    assert result["x"]["mean"] == pytest.approx(0.1) and result["y"]["mean"] == pytest.approx(0.3)
-    assert result["all"]["mean"] == pytest.approx(0.2)
-    assert result["x"] == pytest.approx(m.mean_interval(np.array([0.2, 0.1, 0.0])))
-    table = m.paired_differences(runs, "b")
-    assert table == {"error": {"a": result}}
+@pytest.mark.parametrize(
+    ("number", "text"),
+    [((41.267, 40.0, 42.5), "41.27 (40 to 42.5)"), ((0.5, None, None), "0.5000")],
+)
+def test_interval_text__has_digits_that_tell_it(number, text):
+    assert m.interval_text(dict(zip(("mean", "low", "high"), number, strict=True))) == text
 
 
-def test_means__leave_out_what_was_not_measured():
-    runs = [run("a", "x", i, e) for i, e in ((0, 1.0), (1, 3.0))]
-    runs += [run("a", "y", i, None) for i in (0, 1)]
+def test_means__are_over_starts_of_the_means_of_their_runs():
+    errors = {"x": [1.0, 3.0], "y": [2.0, 6.0]}
+    runs = [
+        {"controller": "a", "sequence": s, "start": i, "kind": "workspace", "error": e}
+        for s, of in errors.items()
+        for i, e in enumerate(of)
+    ]
     result = m.means(runs)["a"]
-    assert {s: result[s]["error"]["mean"] for s in result} == {"x": 2.0, "y": None, "all": 2.0}
-    assert result["x"]["error"] == m.mean_interval(np.array([1.0, 3.0]))
+    assert {s: result[s]["error"]["mean"] for s in result} == {"x": 2.0, "y": 4.0, "all": 3.0}
+    assert result["all"]["error"] == m.mean_interval(np.array([1.5, 4.5]))

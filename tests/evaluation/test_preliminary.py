@@ -10,7 +10,7 @@ from helpers_machines import small_net
 
 from brokk_min.actuator import PLANT
 from brokk_min.evaluation import preliminary
-from brokk_min.evaluation.preliminary import Motion, Sweep
+from brokk_min.evaluation.preliminary import Motion
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
 from examples.mini_excavator import MINI_EXCAVATOR
@@ -69,46 +69,43 @@ def test_preliminary_tests__move_the_last_driven_joint_at_two_levels():
     assert speeds == pytest.approx([0.25, 0.25, -0.5, -0.5])
     assert list(tests.coupling) == ["alone", "with the others"]
     assert tests.coupling["alone"] is tests.sweeps["u = 80"]
-    time, velocity = tests.past_movement["from idle"]
+    time, velocity = tests.past_movement["idle"]
     np.testing.assert_allclose(time, 0.05 * (np.arange(60) - 29.5))
     np.testing.assert_allclose(velocity, np.where(time < 0, 0, 0.25), atol=1e-9)
-    np.testing.assert_allclose(tests.past_movement["while moving"][1], 0.25)
-    assert list(tests.response_time) == ["q1", "q3", "q4", "q5"]
+    np.testing.assert_allclose(tests.past_movement["moving"][1], 0.25)
+    assert list(tests.response_time) == ["idle", "moving"]
 
 
-def test_step_velocities__steps_each_driven_joint_alone_from_behind():
+def test_step_velocities__steps_the_joint_alone_from_behind():
     plant = TwoSpeeds(0.25, 0.5)
-    velocity = preliminary.step_velocities(BROKK_170, plant)
-    assert velocity.shape == (60, 2, 2, 4)
-    np.testing.assert_allclose(velocity[30:, :, 0], 0.25)
-    np.testing.assert_allclose(velocity[30:, :, 1], 0.5)
+    velocity = preliminary.step_velocities(BROKK_170, plant, 4)
+    assert velocity.shape == (60, 2)
+    np.testing.assert_allclose(velocity[30:], 0.25)
     assert not velocity[:30, 0].any() and velocity[:30, 1].all()
     q, u = plant.starts[0], np.array(plant.commands[0])
-    assert q[0, 0, 3, 4] == pytest.approx(0.2) and q[1, 1, 3, 4] == pytest.approx(1.8)
-    assert q[0, 1, 2, 4] == pytest.approx(1.0)  # another one steps
-    half = (80 / 127 + 0.07) / 2
-    for i, joint in enumerate(BROKK_170.driven):
-        assert not np.delete(u[:, :, :, i], joint, axis=-1).any()
-        np.testing.assert_allclose(u[[0, 30], 1, 1, i, joint], [-half, -80 / 127])
+    np.testing.assert_allclose(q, np.tile([*((LOW + HIGH) / 2)[:4], 0.2], (2, 1)))
+    assert not u[..., :4].any()
+    np.testing.assert_allclose(u[[0, 30], :, 4], [[0, (80 / 127 + 0.07) / 2], [80 / 127] * 2])
 
 
-def test_response_times__by_hand():
-    """63 % of 0.1 rad/s is reached between the middles of the first two ticks after the step."""
-    velocity = np.zeros((6, 2, 2, 1))
-    velocity[3:, 0, 0, 0] = [0.05, 0.09, 0.1]
-    velocity[3:, 1, 0, 0] = 0.1  # at once: between the middles of the ticks around the step
-    times = preliminary.response_times(velocity, 20.0)
-    assert times[0, 0, 0] == pytest.approx(0.05 * (0.5 + (0.063 - 0.05) / 0.04))
-    assert times[1, 0, 0] == pytest.approx(0.05 * (0.63 - 0.5))
-    assert np.isnan(times[:, 1]).all()
+@pytest.mark.parametrize(
+    ("velocity", "expected"),
+    [
+        # 63 % is reached between the middles of the first two ticks after the step
+        ([0, 0, 0, 0.05, 0.09, 0.1], 0.05 * (0.5 + (0.063 - 0.05) / 0.04)),
+        ([0, 0, 0, 0.1, 0.1, 0.1], 0.05 * (0.63 - 0.5)),  # at once, between two middles
+        ([0.1] * 6, None),
+    ],
+)
+def test_response_time__by_hand(velocity, expected):
+    assert preliminary.response_time(np.array(velocity), 20.0) == pytest.approx(expected)
 
 
 def test_preliminary_tests__of_the_plant_have_the_papers_response_times(of_plant):
-    for joint in of_plant.response_time.values():
-        assert joint["idle"]["up"] == pytest.approx(0.40, abs=0.01)
-        assert joint["moving"]["up"] == pytest.approx(0.105, abs=0.01)
-    together = preliminary.sweep_rms(*of_plant.coupling.values())
-    assert together < 0.002  # "marginal and neglectable"
+    assert of_plant.response_time["idle"] == pytest.approx(0.40, abs=0.01)
+    assert of_plant.response_time["moving"] == pytest.approx(0.105, abs=0.01)
+    alone, together = (sweep.q_dot[:40] for sweep in of_plant.coupling.values())
+    np.testing.assert_allclose(together, alone, atol=0.002)  # "marginal and neglectable"
 
 
 @pytest.mark.parametrize("machine", [COARSE, replace(COARSE, q_start=())])
@@ -145,10 +142,8 @@ def test_numbers__of_another_machine_are_json():
     measured = preliminary.run(machine, net, 0)
     result = preliminary.numbers(machine, measured)
     json.dumps(result, allow_nan=False)
-    driven = [machine.names[i] for i in machine.driven]
-    assert result["joint"] == driven[-1] and len(result["sweep"]) == 4
-    assert list(result["sim_to_real"]["joints"]) == driven
-    assert set(result["response_time"]) == set(result["coupling_rms"]) == {"machine", "nets"}
+    assert result["joint"] == machine.names[machine.driven[-1]] and len(result["sweep"]) == 4
+    assert set(result["response_time"]) == {"machine", "nets"}
     assert measured.gap.q.shape == (30 * machine.rate, 20, machine.n)
     assert not measured.gap.q[..., machine.locked].any()
     for u, row in result["sweep"].items():
@@ -156,30 +151,14 @@ def test_numbers__of_another_machine_are_json():
         assert [row["machine_peak"], row["nets_peak"]] == peaks
 
 
-def test_sweep_rms__is_of_the_same_angles_without_the_outer_twentieths():
-    q = np.linspace(0.0, 1.0, 201)
-    ends = np.where((q < 0.03) | (q > 0.97), 7.0, 0.3)
-    sweeps = Sweep(q[::-1], -0.5 + 0 * q), Sweep(q, ends)
-    assert preliminary.sweep_rms(*sweeps) == pytest.approx(0.8)
-    wider = np.where(np.abs(q - 0.5) < 0.4251, 0.3, 7.0)  # differs at 0.06 and 0.94
-    assert preliminary.sweep_rms(Sweep(q, 0.3 + 0 * q), Sweep(q, wider)) > 0.1
-
-
 def test_gap_numbers__by_hand():
-    """Two ticks, three runs; run k is off by k + 1 as much, and the first counts for joints."""
+    """Two ticks, three runs; run k is off by k + 1 as much, and the first is in the figure."""
     size = np.arange(1, 4)[:, None]
-    q = np.array([0.1, -0.3])[:, None, None] * size * np.array([1.0, 9, 2, 3, 4])
     p = np.array([0.3, 0.5])[:, None, None] * size * np.array([0.6, 0.8, 0.0])
-    result = preliminary.gap_numbers(BROKK_170, Motion(q, 2 * q, p, 2 * p))
+    result = preliminary.gap_numbers(Motion(p, p, p, 2 * p))
     assert result["tool"] == {
         "position_error_mean": pytest.approx(0.4),
         "velocity_rmse": pytest.approx(2 * np.sqrt((0.09 + 0.25) / 2)),
     }
     spread = {"median": pytest.approx(0.8), "max": pytest.approx(1.2), "runs": 3}
     assert result["tool_position_error_mean_of_runs"] == spread
-    assert list(result["joints"]) == ["q1", "q3", "q4", "q5"]
-    assert result["joints"]["q4"] == {
-        "velocity_rmse": pytest.approx(2 * 3 * np.sqrt((0.01 + 0.09) / 2)),
-        "position_error_mean": pytest.approx(3 * 0.2),
-        "position_error_max": pytest.approx(3 * 0.3),
-    }

@@ -64,19 +64,16 @@ def test_rollout__has_noise_of_the_sensors_in_deviations():
     assert 0.045 * 0.3 / 3**0.5 < max(off) <= 0.05 * 0.3 / 3**0.5 + 1e-7
 
 
-def test_rollout__moves_by_nets_and_reads_the_given_encoders():
+def test_rollout__moves_by_nets():
     rng = np.random.default_rng(20)
     net = small_net(BROKK_170, rng)
     controller = Playback(random_commands(rng, 8))
     goals = np.zeros((8, 2, 3))
 
-    def shifted(machine, q):
-        return read_encoder(machine, q + 0.01)
-
-    trace = rollout(BROKK_170, controller, START, goals, 0.0, rng, net, shifted)
+    trace = rollout(BROKK_170, controller, START, goals, 0.0, rng, net)
     state = initial_state(BROKK_170, START, goals[0], net)
     for t in range(8):
         np.testing.assert_array_equal(trace.q_measured[t], state.history[..., 0, -1])
-        state = transition(BROKK_170, net, state, controller.commands[t], shifted)
+        state = transition(BROKK_170, net, state, controller.commands[t])
         np.testing.assert_array_equal(trace.q[t], state.q)
     assert np.abs(trace.q[-1] - START).max() > 0.01

@@ -82,14 +82,6 @@ def test_inspect__does_not_count_joints_that_are_pushed_against_their_stops():
         is_as_true(inspect(log_of(recording))[name], name)
 
 
-def test_inspect__takes_pieces_after_gaps_that_do_not_begin_at_rest():
-    whole = record("arm", holds())
-    parts = [Recording(f"a#{i}", *(x[i : i + 40] for x in whole[1:])) for i in range(0, 4000, 40)]
-    report = inspect(log_of(*parts))["arm"]
-    is_as_true(report, "arm")
-    assert (report.delay, report.tau) == pytest.approx((0.25, 0.2), abs=0.051)
-
-
 def test_inspect__takes_a_part_of_each_recording_of_a_long_log():
     """The first 20,000 samples have commands within the dead zone alone."""
     within = [record("boom", 0.1 * np.sin(np.arange(4000) / 9)) for _ in range(5)]
@@ -116,12 +108,10 @@ def test_inspect__lets_a_fast_sine_pass_that_fits_as_well_reversed_and_later():
     assert not wrong_signs(reports) and reports["boom"].sign >= 0
 
 
-@pytest.mark.parametrize(("long", "up"), [(60, 0.5 * (0.6 - 0.12)), (5, 0.5 * (0.6 - 0.12))])
-def test_fastest__is_measured_where_commands_are_held_at_the_limit_or_by_the_model(long, up):
-    """A gain of 0.5 from a dead zone of 0.12 on; the limit is 0.6."""
-    held = np.tile(np.repeat([0.6, 0.0, -0.6, 0.0], long), 4000 // (4 * long))
-    report = inspect(log_of(record("boom", held), record("boom", holds())), 0.6)["boom"]
-    assert report.fastest == pytest.approx((up, 0.3 * (0.6 - 0.2)), rel=0.1)
+def test_fastest__is_that_of_the_model_at_the_limit():
+    """Gains of 0.5 and 0.3 from dead zones of 0.12 and 0.2 on; the limit is 0.6."""
+    report = inspect(log_of(record("boom", holds())), 0.6)["boom"]
+    assert report.fastest == pytest.approx((0.5 * (0.6 - 0.12), 0.3 * (0.6 - 0.2)), rel=0.1)
 
 
 GOOD = JointReport(20.0, -2.1, 2.1, 0.9, 1, 0.1, 0.1, (0.07, 0.07), (0.3, 0.3), (0.2, 0.2))
@@ -135,27 +125,13 @@ GOOD = JointReport(20.0, -2.1, 2.1, 0.9, 1, 0.1, 0.1, (0.07, 0.07), (0.3, 0.3), 
         ({"low": -0.5}, ["q1: expected 70% of its range or more, got 61%"]),
         ({"high": 120.0}, ["q1: expected angles of -2.14 to 2.14, got -2.10 to 120.00: another"]),
         ({"explained": 0.05}, ["q1: expected commands that explain its motion, got 5%: are they"]),
-        ({"delay": 0.4}, ["q1: delay: expected below 0.4 s, the longest that is searched, got 0."]),
-        (
-            {"dead_zone": (0.07, 0.03)},
-            ["q1: dead_zone down: expected about 0.030 by this log, got 0.07"],
-        ),
-        (
-            {"fastest": (12.0, 0.2)},
-            ["q1: q_dot_up: expected about 12 by this log, got 0.2: time in s, angles in rad?"],
-        ),
-        ({"dead_zone": (0.0, 0.0), "gain": (0.0, 0.0), "fastest": (0.0, 0.0)}, []),
-        ({"sign": -1, "fastest": (12.0, 0.2)}, ["u_q1: expected positive commands to raise q_q1"]),
+        ({"sign": -1}, ["u_q1: expected positive commands to raise q_q1"]),
     ],
 )
 def test_warnings__know_what_a_log_lacks_and_where_it_contradicts_its_machine(changes, expected):
-    machine = replace(BROKK_170, joints=tuple(replace(j, dead_zone=(0.07, 0.07)) for j in JOINTS))
-    found = warnings(Log(("q1",), ()), {"q1": replace(GOOD, **changes)}, machine)
+    found = warnings(Log(("q1",), ()), {"q1": replace(GOOD, **changes)}, BROKK_170)
     assert len(found) == len(expected)
     assert all(text.startswith(start) for text, start in zip(found, expected, strict=True))
-
-
-JOINTS = BROKK_170.joints
 
 
 def test_table__has_fields_of_a_joint_that_python_reads():
@@ -163,5 +139,5 @@ def test_table__has_fields_of_a_joint_that_python_reads():
     last = table({"q1": GOOD})[-1]
     assert last.endswith(", ...)")
     fields = eval(last.replace('Joint("q1", ', "dict(").replace(", ...)", ")"))
-    assert isinstance(replace(JOINTS[0], **fields), Joint)
+    assert isinstance(replace(BROKK_170.joints[0], **fields), Joint)
     assert fields["dead_zone"] == (0.07, 0.07) and fields["q_min"] == -2.1

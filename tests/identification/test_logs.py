@@ -88,9 +88,7 @@ def test_write_log__reads_back(tmp_path, suffix, velocity_logged):
         np.testing.assert_allclose(got.q_dot, q_dot, atol=max(tolerance, 1e-12) * 30)
 
 
-def test_write_log__refuses_another_suffix_and_an_empty_log(tmp_path):
-    with pytest.raises(ValueError, match=r"log\.txt: expected a name in \.csv or \.npz, got \.txt"):
-        write_log(tmp_path / "log.txt", some_log(False))
+def test_write_log__refuses_an_empty_log(tmp_path):
     with pytest.raises(ValueError, match="at least one recording to write"):
         write_log(tmp_path / "log.csv", some_log(False, ()))
     assert not list(tmp_path.iterdir())
@@ -122,17 +120,14 @@ def test_read_log__resamples_as_a_loop_does(tmp_path_factory, steps, seed, start
     np.testing.assert_allclose(recording.q_dot[:, 0], q_dot, atol=tolerance)
 
 
-def test_read_log__takes_means_of_fast_logs_by_hand(tmp_path):
-    """100 Hz: a step between two ticks has its moment; angles and velocities lose their noise."""
+def test_read_log__takes_means_of_fast_commands_by_hand(tmp_path):
+    """100 Hz: a step of the command between two ticks keeps its moment."""
     time = np.arange(41) / 100
-    noise = 0.1 * (-1.0) ** np.arange(41)
     columns = {"run": np.repeat("x", 41), "time": time, "u_a": (time > 0.175).astype(float)}
-    columns |= {"q_a": time + noise, "q_dot_a": 1 + noise}
+    columns |= {"q_a": time}
     (recording,) = read_log([write(tmp_path / "fast.npz", columns)], 4).recordings
     np.testing.assert_allclose(recording.u[:, 0], [0, 0, 0, 0.4, 1, 1, 1, 1, 1])
-    np.testing.assert_allclose(recording.q[1:-1, 0], 0.05 * np.arange(1, 8), atol=0.021)
-    np.testing.assert_allclose(recording.q_dot[1:-1, 0], 1, atol=0.021)
-    np.testing.assert_allclose(recording.q[[0, -1], 0], [0.1, 0.5])  # nothing beyond the ends
+    np.testing.assert_allclose(recording.q[:, 0], 0.05 * np.arange(9), atol=1e-9)
 
 
 @pytest.mark.parametrize("rate", [10.0, 25.0, 50.0])
@@ -227,23 +222,6 @@ def test_read_log__separates_interleaved_recordings(tmp_path, suffix):
             np.testing.assert_allclose(recording.q[:, i], q, atol=1e-9)
 
 
-def test_read_log__has_the_requested_joints_in_the_requested_order(tmp_path):
-    columns = table("x", np.arange(30) / 20, 0, ("swing", "boom", "stick"))
-    path = write(tmp_path / "log.csv", columns)
-    assert read_log([path], 4).joints == ("swing", "boom", "stick")
-    log = read_log([path], 4, joints=["stick", "swing"])
-    assert log.joints == ("stick", "swing")
-    np.testing.assert_allclose(log.recordings[0].q[:, 0], columns["q_stick"], atol=1e-9)
-    np.testing.assert_allclose(log.recordings[0].u[:, 1], columns["u_swing"], atol=1e-12)
-    again = in_order(read_log([path], 4), ["stick", "boom", "swing"])
-    np.testing.assert_array_equal(again.recordings[0].q[:, [0, 2]], log.recordings[0].q)
-    np.testing.assert_array_equal(again.recordings[0].u[:, [0, 2]], log.recordings[0].u)
-    with pytest.raises(ValueError, match=r"log\.csv: columns: expected \['u_bucket'\], got"):
-        read_log([path], 4, joints=["swing", "bucket"])
-    with pytest.raises(ValueError, match=r"joints: expected \['a'\], got \['swing', "):
-        in_order(read_log([path], 4), ["a"])
-
-
 def test_read_log__joins_files_of_the_same_joints_only(tmp_path):
     time = np.arange(30) / 20
     first, second = table("x", time, 1), table("z", time, 2)
@@ -262,7 +240,6 @@ def test_read_log__joins_files_of_the_same_joints_only(tmp_path):
         ValueError, match=r"4\.csv: joints: expected \['a', 'b'\], got \['a', 'b', 'c'\]"
     ):
         read_log([*paths, more], 4)
-    assert read_log([*paths, more], 4, joints=["a"]).joints == ("a",)
 
 
 # --- joined recordings ----------------------------------------------------------------------------
@@ -289,7 +266,7 @@ def test_starts__keeps_the_required_samples_around_within_one_recording(lengths,
     assert join_recordings(log).starts(before, after, 1).tolist() == expected
 
 
-# --- bad logs: `tests/fuzz.py` makes more, from the description of the columns --------------------
+# --- bad logs -------------------------------------------------------------------------------------
 
 GOOD = """run,time,u_a,q_a
 x,0.00,0.1,1.0
@@ -331,13 +308,18 @@ def test_read_log__names_file_and_place_of_what_is_wrong(tmp_path, case):
     assert str(caught.value).startswith(f"{tmp_path / 'bad.csv'}: {message}")
 
 
-def test_read_log__refuses_columns_of_different_lengths_and_other_kinds_of_files(tmp_path):
+def test_read_log__refuses_columns_of_different_lengths_and_kinds(tmp_path):
     columns = table("x", np.arange(30) / 20)
     path = write(tmp_path / "log.npz", columns | {"q_b": np.zeros(29)})
-    with pytest.raises(ValueError, match=r"log\.npz: column q_b: .*got float64 \(29,\)"):
+    with pytest.raises(
+        ValueError, match=r"log\.npz: column q_b:  expected \(30,\) numbers, got \(29,\)"
+    ):
         read_log([path], 4)
-    with pytest.raises(ValueError, match=r"log\.txt: expected a name in \.csv or \.npz, got \.txt"):
-        read_log([tmp_path / "log.txt"], 4)
+    with pytest.raises(ValueError, match=r"log\.npz: expected a log, got could not convert"):
+        read_log([write(path, columns | {"q_b": np.repeat("up", 30)})], 4)
+    path.write_bytes(b"PK")
+    with pytest.raises(ValueError, match=r"log\.npz: expected a readable \.npz file"):
+        read_log([path], 4)
 
 
 def test_read_log__accepts_numbers_as_names_spaces_and_a_byte_order_mark(tmp_path):

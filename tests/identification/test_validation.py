@@ -1,4 +1,4 @@
-"""Validation by hand: one step, free runs, the linear reference."""
+"""Validation by hand: one step and free runs."""
 
 from dataclasses import replace
 
@@ -7,12 +7,9 @@ import pytest
 from helpers_machines import constant_net, line
 
 from brokk_min.identification import validation
-from brokk_min.identification.fitting import FitConfig, fit
 from brokk_min.identification.logs import Log, Recording, velocity_of
-from brokk_min.identification.validation import fit_linear, free_run, score, validate
+from brokk_min.identification.validation import free_run, score, validate
 from brokk_min.machine import BROKK_170
-
-LOW, HIGH = BROKK_170.column("q_min"), BROKK_170.column("q_max")
 
 
 def test_score__compares_one_step_with_the_target_of_the_fit_by_hand():
@@ -84,53 +81,14 @@ def test_tool_errors__by_hand():
     assert errors == {"1": pytest.approx(0.0305, abs=2e-4), "5": pytest.approx(0.1525, abs=1e-3)}
 
 
-def linear_log(seed, runs=12, scale=1.0):
-    """A joint whose next velocity is 0.8 times the newest difference plus 0.1 u, exactly."""
-    rng, recordings = np.random.default_rng(seed), []
-    for run in range(runs):
-        u = scale * np.repeat(rng.uniform(-1, 1, 20), 5)[:, None]
-        q = np.zeros((100, 1))
-        for k in range(1, 99):
-            q[k + 1] = q[k] + (0.8 * (q[k] - q[k - 1]) * 20 + 0.1 * u[k]) / 20
-        recordings.append(Recording(f"r{run}", u, q, velocity_of(q, 2)))
-    return Log(("a",), tuple(recordings))
-
-
-def blank_net(log, history=5):
-    machine = replace(BROKK_170, history=history, velocity_samples=2)
-    return fit(log, FitConfig(steps=1, batch_size=8, valve=False), 0, machine)
-
-
-def test_fit_linear__solves_the_normal_equations_of_ridge_regression():
-    log, history = linear_log(0, 3), 4
-    net = blank_net(log, history)
-    predict = fit_linear(net, log, penalty=0.01).predict
-    windows, targets = [], []
-    for r in log.recordings:
-        for k in range(history - 1, len(r.q) - 1):
-            window = slice(k - history + 1, k + 1)
-            windows.append([r.q[window, 0], r.q_dot[window, 0], r.u[window, 0]])
-            targets.append((r.q[k + 1, 0] - r.q[k, 0]) * 20)
-    x = (np.array(windows).reshape(len(windows), -1) - net.input_mean) / net.input_scale
-    x = np.column_stack([x, np.ones(len(x))])
-    ridge = 0.01 * len(x) * np.diag(np.append(np.ones(3 * history), 0.0))
-    w = np.linalg.solve(x.T @ x + ridge, x.T @ np.array(targets))
-    inputs = np.float32(windows)[:, None]
-    expected = np.clip(x @ w, net.output_low, net.output_high)
-    np.testing.assert_allclose(predict(inputs)[:, 0], expected, atol=1e-5)
-    assert predict(inputs[:1] * 1e4) in (net.output_low, net.output_high)  # the nets' range
-
-
-def test_validate__warns_of_nets_no_better_than_linear():
-    log, test = linear_log(0), linear_log(1)
-    result = validate(blank_net(log), log, test)
+def test_validate__warns_of_nets_no_better_than_the_last_velocity():
+    test = Log(("a",), (line("x", 0.0, 0.1, 40),), True)
+    assert validate(constant_net([0.1], True, ("a",)), test)["warnings"] == []
+    result = validate(constant_net([0.2], True, ("a",)), test)
     assert result["tool"] == {} and set(result["joints"]) == {"a"}
-    keys = {"one_step_rmse", "persistence_rmse", "free_run", "linear"}
-    assert set(result["joints"]["a"]) == keys
-    assert any(w.startswith("a: free runs of 1 s are off by") for w in result["warnings"])
-    short = tuple(Recording(r.name, *(x[:20] for x in r[1:])) for r in test.recordings)
-    runs = validate(blank_net(log), log, Log(("a",), short))["joints"]["a"]["free_run"]
-    assert runs == {}  # none lasts a second
+    assert set(result["joints"]["a"]) == {"one_step_rmse", "persistence_rmse", "free_run"}
+    (warning,) = result["warnings"]
+    assert warning.startswith("a: expected an error of one step below 0.0") and "0.1" in warning
 
 
 @pytest.mark.parametrize("logged", [False, True])

@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 
-import can
 import numpy as np
 import pytest
 from helpers_bus import (
@@ -95,39 +94,6 @@ def test_run__earns_over_the_bus_the_reward_of_evaluate(axis, name):
     assert trace.reward[half_second].mean() < 0.99  # there was something to lose
 
 
-class Counting(ConstantCommand):
-    """Keeps what is measured, and counts in its state the ticks since its start."""
-
-    def __init__(self):
-        super().__init__(*COMMAND)
-        self.calls = []
-
-    def start(self, num):
-        return 0
-
-    def __call__(self, measured, state):
-        self.calls.append((state, measured))
-        return super().__call__(measured, state)[0], state + 1
-
-
-def test_control__keeps_the_controllers_state_while_it_drives_and_history_in_one_piece():
-    """The warm-up in `wait` repeats the tick before and leaves the state as it is."""
-    world = World(Counting(), HoldingOperator())
-    world.drive.begin()
-    world.run(1.0)
-    drives = [(state, measured) for state, measured in world.controller.calls if state]
-    states = [state for state, _ in drives]
-    assert states[-1] > 10 and sorted({*states}) == list(range(1, states[-1] + 1))
-    newest = dict(drives)
-    for state in range(2, states[-1]):
-        before, now = newest[state].history, newest[state + 1].history
-        np.testing.assert_array_equal(now[..., :2, :-1], before[..., :2, 1:])
-    assert (np.rint(newest[states[-1]].history[0, :, 2, -3:] * 127) == 60).all()
-    world.operator.enable = False
-    world.run(0.2)
-    assert world.controller.calls[-1][0] in (0, 1)  # it starts again
-
-
 def test_tick__is_silent_until_armed_and_opens_valves_a_tick_later(world):
     world.operator.enable, out = False, []
     world.downward = recording(out)
@@ -169,21 +135,13 @@ def test_tick__cannot_find_what_the_documents_say_it_cannot(name):
     assert not measure(NOT_FOUND[name][0], 0.0215).latched
 
 
-def test_tick__lets_no_command_of_a_second_sender_through_for_more_than_its_own_delay():
-    """The valve controller refuses a second frame after a SYNC."""
-    for name in ("second sender after each of our valve frames", "second sender after each SYNC"):
-        _, m = measure(FAULTS[name][0], 0.0215).commands
-        assert (m[:, 0] == 77).sum() <= ("SYNC" in name), name
-
-
 def closes_within(world, begun, seconds):
     times, m = world.commands
     return not m[times > begun + seconds].any()
 
 
 @pytest.mark.parametrize(
-    ("node", "counts", "bound"),
-    [(1, 80, 0.14), (3, 40, 0.19), (4, -40, 0.14), (5, 20, 0.5), (1, 16, 1.4), (3, 16, 1.6)],
+    ("node", "counts", "bound"), [(1, 80, 0.14), (3, 40, 0.19), (4, -40, 0.14), (3, 16, 1.6)]
 )
 def test_tick__finds_a_frozen_encoder_at_small_commands_too(node, counts, bound, world):
     """The table of docs/hardware.md: the smaller the command, the longer it takes."""
@@ -196,15 +154,6 @@ def test_tick__finds_a_frozen_encoder_at_small_commands_too(node, counts, bound,
     world.run(2.0)
     assert closes_within(world, begun, bound)
     assert world.drive.reason == f"fault: q{node}: frozen, or the joint does not move"
-
-
-def test_tick__finds_an_encoder_that_flickers_by_one_count_to_and_fro(world):
-    world.run(1.0)
-    begun = world.time
-    freeze(world, 3, flicker=1)
-    world.run(0.4)
-    assert closes_within(world, begun, 0.2)
-    assert world.drive.reason == "fault: q3: frozen, or the joint does not move"
 
 
 def test_tick__takes_nothing_for_frozen_that_is_not(world):
@@ -220,19 +169,6 @@ def test_tick__takes_nothing_for_frozen_that_is_not(world):
     world.run(30.0)
     assert world.drive.reason == "" and world.drive.gate.driving
     assert np.abs(np.diff(world.commands[1], axis=0)).sum() > 1000
-
-
-def test_watchdog__closes_the_valves_of_a_program_that_is_killed(world):
-    """SIGKILL: no more ticks; a resumed frame does not open the valves again."""
-    world.run(1.2)
-    killed = world.time
-    assert world.commands[1][-1].any()
-    world.sleep(1.0)
-    counter = int(world.drive.gate.counter) + 1
-    data = valve_frame(COMMAND, counter, 1).tobytes()
-    world.send(can.Message(arbitration_id=0x210, data=data))
-    world.sleep(0.1)
-    assert closes_within(world, killed, 0.155)
 
 
 def test_tick__opens_no_valve_again_on_frames_of_any_identifier_and_length(world):
@@ -261,8 +197,7 @@ def test_tick__leaves_a_fault_by_a_new_edge_only(world):
 
 
 @pytest.mark.parametrize(
-    ("low", "high", "found"),
-    [(5, 5, 0), (15, 15, 0), (25, 25, 1), (45, 45, 1), (0, 15, 0), (0, 60, 1)],
+    ("low", "high", "found"), [(15, 15, 0), (25, 25, 1), (45, 45, 1), (0, 60, 1)]
 )
 def test_tick__finds_positions_later_than_20_ms(low, high, found, world):
     """Constantly, or by chance between two bounds [ms]."""
@@ -348,12 +283,3 @@ def test_run__ends_neutral_on_an_error_of_the_program_itself(world):
     world.downward = unchanged
     world.sleep(0.01)
     assert not world.commands[1][-1].any()
-
-
-def test_run__stays_silent_on_an_error_before_it_was_armed(world):
-    out = []
-    world.downward = recording(out)
-    world.bus.log_input = raises(OSError("disk full"))
-    with pytest.raises(OSError, match="disk full"):
-        world.drive.run()
-    assert 0x210 not in dict(out)

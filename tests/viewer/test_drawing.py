@@ -1,8 +1,5 @@
 """Pictures: joints where kinematics put them, arrows, bars and text of the right size and place."""
 
-import itertools
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -20,29 +17,15 @@ STRETCHED = np.array([0.0, 0.0, 0.0, np.pi, 3 * np.pi / 4])  # all links of the 
 
 
 class Recorder(Canvas):
-    """Keeps (points, colour) of lines, polygons and bars, and (text, box) of words."""
+    """Keeps (points, colour, width) of lines."""
 
     def __init__(self, size):
         super().__init__(size)
-        self.lines, self.polygons, self.bars, self.words = [], [], [], []
+        self.lines = []
 
     def line(self, points, colour, width):
         super().line(points, colour, width)
         self.lines.append((points, colour, width))
-
-    def polygon(self, points, colour):
-        super().polygon(points, colour)
-        self.polygons.append((points, colour))
-
-    def bar(self, left, top, width, height, colour):
-        super().bar(left, top, width, height, colour)
-        self.bars.append(((left, top, width, height), colour))
-
-    def text(self, x, y, text, size, colour=drawing.INK, anchor=0.0):
-        super().text(x, y, text, size, colour, anchor)
-        width, height = np.array(drawing._font(2 * size).size(text)) / 2
-        left, top = x - anchor * width, y - height / 2
-        self.words.append((text, np.array([left, top, left + width, top + height])))
 
 
 @pytest.fixture
@@ -122,42 +105,6 @@ def test_draw__marks_a_driven_joint_near_its_limit_in_red(joint, angle, warned):
     picture = drawing.image(drawing.draw(BROKK_170, scene(q), SIZE))
     red = (np.abs(picture.astype(int) - drawing.WARNING).sum(axis=-1) < 30).sum()
     assert (red > 30) == warned
-
-
-@pytest.mark.parametrize(("counts", "fraction"), [(80, 1.0), (-40, -0.5), (0, 0.0)])
-def test_joint_rows__have_valve_bars_as_long_as_the_command(counts, fraction, drawn):
-    u = np.zeros(5)
-    u[3] = counts / 127
-    canvas = drawn(scene(u=u))
-    middle = next(box[[1, 3]].mean() for text, box in canvas.words if text == "q4")
-    row = [bar for bar in canvas.bars if abs(bar[0][1] + bar[0][3] / 2 - middle) < 1]
-    (slot,) = (box for box, colour in row if colour == drawing.SLOT and box[3] == 12)
-    (valve,) = (box for box, colour in row if colour == drawing.BLUE)
-    assert valve[2] == pytest.approx(abs(fraction) * slot[2] / 2)
-    assert valve[0] + valve[2] * (fraction < 0) == pytest.approx(slot[0] + slot[2] / 2)
-    texts = [text for text, _ in canvas.words]
-    assert f"{counts:+d} of 80" in texts
-    assert texts.count("locked") == 1
-
-
-@pytest.mark.parametrize("size", [(1120, 680), (640, 360)])
-@pytest.mark.parametrize("n", [2, 5])
-def test_draw__cuts_off_no_text_and_puts_none_on_another(n, size, drawn):
-    joints = [replace(joint, name=f"boom_{i}") for i, joint in enumerate(BROKK_170.joints[:n])]
-    machine = replace(BROKK_170, name=f"short {n}", joints=tuple(joints), q_start=())
-    notes = [f"note {i} of some length" for i in range(5)]
-    canvas = drawn(
-        scene(machine.column("q_max"), title="RL policy", status="12.3 s", notes=notes),
-        machine,
-        size,
-    )
-    boxes = [box for text, box in canvas.words if text]
-    assert len(boxes) == 6 + 5 + 3 * n
-    for box in boxes:
-        assert (box >= 0).all()
-        assert (box[2:] <= size).all()
-    for one, other in itertools.combinations(boxes, 2):
-        assert (one[:2] >= other[2:]).any() or (other[:2] >= one[2:]).any()
 
 
 def test_picture__is_an_image_of_the_wanted_size_that_changes_with_its_arguments():
