@@ -22,7 +22,7 @@ COMMANDS = {  # module and class in `cli`, and what the command does
     "machine": ("operating", "Simulate", "a simulated machine on a CAN bus"),
     "drive": ("operating", "Drive", "drive a machine on a CAN bus"),
     "play": ("operating", "Play", "drive with keyboard or gamepad in a window"),
-    "replay": ("operating", "Replay", "watch recorded runs, or write them as a film"),
+    "replay": ("operating", "Replay", "make a film of a drive from its log"),
     "export": ("operating", "Export", "write a policy as ONNX"),
 }
 

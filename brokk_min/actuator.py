@@ -125,7 +125,7 @@ def initial_history(q: ArrayLike, samples: int) -> Array:
 
 
 def append_command(history: Array, u: ArrayLike) -> Array:
-    """The nets' input: (..., n, 3, H) with the command `u` (..., n); angles, velocities stay."""
+    """The nets' input (..., n, 3, H): a history and the command `u` (..., n) of the coming tick."""
     result = history.copy()
     result[..., 2, :-1] = history[..., 2, 1:]
     result[..., 2, -1] = u

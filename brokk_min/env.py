@@ -39,13 +39,10 @@ from brokk_min.kinematics import forward_kinematics, lowest_point, tool_velocity
 from brokk_min.machine import PWM_MAX, Array, Machine, Measured, limit_command, read_encoder
 from brokk_min.settings import TaskConfig
 
-Encoder = Callable[[Machine, Array], Array]  # machine, true angles -> measured angles
-
 
 class Block(NamedTuple):
     """Numbers of the observation that belong together."""
 
-    name: str
     mean: ArrayLike  # in physical units, a number or (size,)
     std: Array  # (size,)
     noisy: bool  # do sensors measure it?
@@ -64,14 +61,14 @@ def observation_blocks(machine: Machine) -> tuple[Block, ...]:
     v_std = np.full(3, machine.tool_speed / 3**0.5)
     u_std = np.full(H * len(machine.driven), machine.pwm_limit / PWM_MAX / 3**0.5)
     blocks = [
-        Block("v_goal", 0.0, v_std, False),
-        Block("v_tool", 0.0, v_std, True),
-        Block("q locked", q_mean[machine.locked], q_std[machine.locked], True),
+        Block(0.0, v_std, False),
+        Block(0.0, v_std, True),
+        Block(q_mean[machine.locked], q_std[machine.locked], True),
     ]
     for j in machine.driven:
-        blocks.append(Block(f"q {j}", q_mean[j], np.full(H, q_std[j]), True))
-        blocks.append(Block(f"q_dot {j}", 0.0, np.full(H, q_dot_std[j]), True))
-    blocks.append(Block("u", 0.0, u_std, False))
+        blocks.append(Block(q_mean[j], np.full(H, q_std[j]), True))
+        blocks.append(Block(0.0, np.full(H, q_dot_std[j]), True))
+    blocks.append(Block(0.0, u_std, False))
     return tuple(blocks)
 
 
@@ -95,8 +92,9 @@ def measure(
 ) -> Measured:
     """Measurements for training, evaluation and the machine. Paper: Sec. 3.4, Fig. 3
 
-    From the measured history (..., n, 3, H) and the goal velocity [m/s] (..., 3); `noise` of what
-    sensors measure, in deviations (..., noisy).
+    From the measured history (..., n, 3, H) and the goal velocity [m/s] (..., 3). `noise` of what
+    sensors measure is in deviations (..., noisy). It is new at each tick for all samples of the
+    history, and the tool's velocity has noise of its own.
     """
     q = history[..., 0, -1].copy()
     driven = history.take(machine.driven, axis=-3)
@@ -144,6 +142,8 @@ class Interface:
 
     `memory` is what the agent keeps from tick to tick. At the start of an episode it is None; the
     paper's agent keeps nothing. `remember` is called once a tick, before `observe` and `command`.
+    The reward is eq2 less `cost`, which gets the memory after the tick. `learning.gym_env` calls
+    all five.
     """
 
     scale: Callable[[Machine], tuple[Array, Array]] = observation_scale  # mean, deviation
@@ -195,13 +195,8 @@ def initial_state(machine: Machine, q: ArrayLike, v_goal: ArrayLike, plant: Plan
     )
 
 
-def transition(
-    machine: Machine, plant: Plant, state: State, u: Array, read: Encoder = read_encoder
-) -> State:
-    """One tick of the plant under the command `u` (..., n). Paper: Sec. 3.4
-
-    `read` gives the angles that the encoders report of true ones.
-    """
+def transition(machine: Machine, plant: Plant, state: State, u: Array) -> State:
+    """One tick of the plant under the command `u` (..., n). Paper: Sec. 3.4"""
     after = plant.step(machine, state.plant, u)
     q = np.asarray(after.q, float)
     q_dot = (q - state.q) / machine.dt
@@ -214,7 +209,7 @@ def transition(
         q_dot=q_dot,
         v_tool=tool_velocity(frames, q_dot.astype(np.float32)),
         lowest=lowest_point(frames),
-        history=append_sample(state.history, u, read(machine, q), *window),
+        history=append_sample(state.history, u, read_encoder(machine, q), *window),
         goal_ticks=state.goal_ticks - 1,
         ticks=state.ticks + 1,
     )

@@ -30,7 +30,7 @@ def dls(J: ArrayLike, W: ArrayLike, damping: ArrayLike, as_printed: bool = False
     J, W = np.asarray(J, float), np.asarray(W, float)
     W_inv = 1 / W[..., None, :]
     inner = W[..., None, :] if as_printed else W_inv
-    A = (J * inner) @ J.swapaxes(-1, -2)  # J W^-1 J^T
+    A = (J * inner) @ J.swapaxes(-1, -2)  # J W^-1 J^T, or J W J^T as printed
     A = A + np.asarray(damping)[..., None, None] * np.eye(3)  # + lambda^2 I
     return (J * W_inv).swapaxes(-1, -2) @ np.linalg.inv(A)
 
@@ -142,7 +142,7 @@ class JacobianController:
         v = measured.v_goal + gains.feedback * e  # x_goal + K e
         q_dot_goal = self.joint_velocities(v, measured.q.astype(float), state.q_dot_goal)
         error = q_dot_goal - measured.q_dot
-        derivative = 0.7 * state.derivative + 0.3 * (error - state.error) / m.dt  # over 2.8 ticks
+        derivative = 0.7 * state.derivative + 0.3 * (error - state.error) / m.dt  # low-pass
         opening = gains.kp * error + state.integral + gains.kd * derivative  # PID
         u = self.command(opening)
         full = np.abs(np.rint(u[..., m.driven] * PWM_MAX)) >= m.pwm_limit

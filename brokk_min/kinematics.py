@@ -1,7 +1,7 @@
 """Hand-written Denavit-Hartenberg kinematics: frames, tool position, Jacobian, tool velocity.
 
 One forward kinematics gives the frames of a pose; all else is worked out from these frames. The
-base frame has z up and its origin on the first axis, of the Brokk on the ground. Paper: Fig. 1
+base frame has z up; its origin lies on the first axis, for the Brokk at ground level. Paper: Fig. 1
 
 Example:
     >>> from brokk_min.machine import BROKK_170

@@ -43,14 +43,14 @@ class Joint:
     theta: float  # rad
     q_min: float  # rad
     q_max: float  # rad
-    q_dot_up: float  # rad/s, fastest positive motion at the command limit (nominal)
-    q_dot_down: float  # rad/s, fastest negative motion, a positive number
+    q_dot_up: float  # rad/s, nominal speed upwards at the command limit
+    q_dot_down: float  # rad/s, nominal speed downwards, a positive number
     encoder_node: int  # CANopen node id
     cylinder_base: float = 0.0  # m
     cylinder_rod: float = 1.0  # m
     cylinder_angle: float = 0.0  # rad
     cylinder_area: float = 0.005  # m^2
-    cylinder_speed: tuple[float, float] = (0.0, 0.0)  # m/s up, down at full command; 0: by q_dot_*
+    cylinder_speed: tuple[float, float] = (0.0, 0.0)  # m/s up, down at full command; 0: see below
     dead_zone: tuple[float, float] = (0.07, 0.07)  # up, down, of full command; paper: Sec. 3.3
     encoder_zero: int = 0  # reading of the encoder at q = 0 [counts]
     encoder_sign: Literal[-1, 1] = 1  # -1: the encoder counts down while q rises
@@ -97,7 +97,7 @@ class Machine:
     valve_frame_id: int  # CAN identifier of the valve frame
     controller_node: int  # CANopen node id of the valve controller
     q_start: tuple[float, ...] = ()  # rad, where experiments start; empty: mid-range
-    # Of the analytic plant alone. By default what is assumed of the Brokk, with any pump flow.
+    # The fields below concern the analytic plant only; the defaults are assumed of the Brokk.
     pump_flow: float = 1.0  # m^3/s
     delay: float = 0.040  # s, from command to valve
     plant_dt: float = 0.005  # s, step of explicit Euler
@@ -131,7 +131,7 @@ class Machine:
         require(fits, "plant_dt", "a whole part of 1/rate, below tau_spool", self.plant_dt)
 
     def __hash__(self) -> int:
-        """By name: fast, for what `lru_cache` keeps of a machine."""
+        """By name, because `lru_cache` hashes a machine at each call."""
         return hash(self.name)
 
     @property
@@ -166,7 +166,10 @@ class Machine:
 
     @cached_property
     def cylinder_speeds(self) -> NDArray[np.float64]:
-        """Speeds of each cylinder at full command up and down [m/s], (n, 2)."""
+        """Speeds of each cylinder at full command up and down [m/s], (n, 2).
+
+        By default those that give q_dot_up and q_dot_down at the largest lever arm.
+        """
         given = np.array([joint.cylinder_speed for joint in self.joints])
         fastest = np.array([(joint.q_dot_up, joint.q_dot_down) for joint in self.joints])
         opening = (self.pwm_limit / PWM_MAX - self.dead_zones) / (1 - self.dead_zones)
@@ -181,7 +184,7 @@ class Machine:
 
     @property
     def q_dot_max(self) -> NDArray[np.float64]:
-        """Fastest motion of each joint at the command limit, either way [rad/s], (n,)."""
+        """Nominal speed of each joint at the command limit, of both ways the faster, (n,)."""
         return np.maximum(self.column("q_dot_up"), self.column("q_dot_down"))
 
     @lru_cache(maxsize=1024)  # noqa: B019

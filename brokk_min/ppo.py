@@ -2,7 +2,7 @@
 
 It trains on any Gymnasium vector environment that resets in the same step. A truncated episode did
 not fail: its return goes on with the value of its own last observation. At a termination it stops.
-Advantages come from a critic, as in the paper; `train` takes another function for them as well.
+Advantages come from a critic, as in the paper; `train` also accepts another advantage function.
 Names are CleanRL's, but num_steps is horizon; target_kl steers the learning rate. Paper: Sec. 3.4
 """
 
@@ -38,8 +38,8 @@ def mlp(inputs: int, outputs: int, std: float) -> nn.Sequential:
 class Agent(nn.Module):
     """Actor, logarithm of the actions' standard deviation, and critic.
 
-    value = mean + sqrt(var) critic(obs), by the mean and variance of the returns in each batch so
-    far; rl_games' `normalize_value` pools them (compare PopArt, van Hasselt et al., 2016).
+    The critic's output is scaled by running averages of the batch means and batch variances of the
+    returns: value = mean + sqrt(var) critic(obs) (compare PopArt, van Hasselt et al., 2016).
     """
 
     return_mean: Tensor
@@ -244,7 +244,8 @@ def train(
         metrics = {f"losses/{name}": mean for name, mean in zip(names, means, strict=True)}
         metrics["charts/reward"] = float(rollout.rewards.mean())
         metrics["charts/learning_rate"] = group["lr"]
-        # less after a large change of the policy, more after a small one (as rl_games)
+        # lower the rate after a large change of the policy, raise it after a small one, as the
+        # rule of rl_games, with smaller steps
         if metrics["losses/approx_kl"] > 1.5 * config.target_kl:
             group["initial_lr"] /= 1.2
         elif metrics["losses/approx_kl"] < 0.7 * config.target_kl:

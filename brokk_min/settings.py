@@ -1,4 +1,4 @@
-"""Settings of the task and of PPO, apart from what uses them: help reads them without torch."""
+"""Settings of the task and of PPO; they are separate so that `--help` need not import torch."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ class TaskConfig:
 
 @dataclass(frozen=True)
 class PPOConfig:
-    """Settings of PPO; the paper prints the number of environments alone."""
+    """Settings of PPO; the paper prints the number of environments only."""
 
     total_steps: int = 6_000_000  # environment steps in all
     num_envs: int = 256  # environments side by side (paper: 256)

@@ -110,7 +110,7 @@ class World:
         self.time = 0.0  # s
         self.recorder = Recorder()
         self.simulated = SimulatedMachine(machine, start, 0.0, self.recorder)
-        self.answers = deque(self.simulated.boot())
+        self.answers = deque(self.simulated.receive(Frame(0.0, 0x000, b"\x81\x00")))
         self.upward = self.downward = unchanged
         self.noise = list  # foreign frames of the next millisecond
         self.syncs = []

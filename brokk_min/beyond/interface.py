@@ -84,8 +84,9 @@ def smooth_angles(machine: Machine, history: Array) -> Array:
     """Present angles [rad] (..., n), from all samples of a history (..., n, 3, H).
 
     Each old sample is extrapolated to now with the velocities measured since, and the results are
-    averaged. The velocities are slopes over a window, so they lag by half a window. The mean has
-    0.28 of the newest angle's noise in training.
+    averaged. A slope over w angles is (w - 1) / 2 ticks old and the mean velocity of the last tick
+    half a tick, so the slope lags it by w / 2 - 1 ticks. The mean has 0.28 of the newest angle's
+    noise in training.
     """
     q, q_dot = history[..., 0, :], history[..., 1, :]
     since = q_dot.sum(axis=-1, keepdims=True) - q_dot.cumsum(axis=-1)
@@ -131,7 +132,7 @@ def observe(machine: Machine, measured: Measured, memory: Memory) -> Array:
 def command(machine: Machine, action: ArrayLike, memory: Memory) -> Array:
     """u = zone clip(a / 0.01, -1, 1) + (limit - zone) a; 0 once the goal was 0 for 0.5 s.
 
-    So an action near 0 opens a valve barely, and valves close at rest. Paper: Sec. 3.3 (7 %)
+    An action near 0 therefore opens a valve slightly, and valves close at rest. Paper: Sec. 3.3
     """
     a = np.asarray(action)
     zone = side(a, machine.dead_zones[machine.driven])
@@ -142,7 +143,7 @@ def command(machine: Machine, action: ArrayLike, memory: Memory) -> Array:
 
 
 def cost(machine: Machine, u: Array, u_before: Array, memory: Memory) -> Array:
-    """A tenth of the mean change of commands, of the limit, and the error integral [m], (...)."""
+    """A tenth of the mean change of commands, of the limit, plus the integral's length, (...)."""
     change = np.abs(u - u_before)[..., machine.driven].mean(axis=-1) * PWM_MAX / machine.pwm_limit
     return np.asarray(TRAVEL_COST * change + np.linalg.norm(memory.error_integral, axis=-1))
 

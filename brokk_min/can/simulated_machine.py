@@ -21,6 +21,7 @@ from brokk_min.machine import Machine, require
 BOOT = 0
 STOPPED = 4
 PRE_OPERATIONAL = 127
+RESET = 129  # NMT command, which each node answers as after its start
 Frames = list[tuple[int, bytes]]  # identifiers and data
 
 
@@ -66,10 +67,6 @@ class SimulatedMachine:
         self.counters: dict[int, int] = {}  # of the last valve frames; without one any may come
         self.missing: set[int] = set()  # valve frames that did not yet come since the last SYNC
 
-    def boot(self) -> Frames:
-        """The boot-up messages of all nodes."""
-        return [(canopen.HEARTBEAT + node, bytes([BOOT])) for node in self.nmt]
-
     @property
     def next_step(self) -> float:
         """Time of the next plant step [s]."""
@@ -113,8 +110,7 @@ class SimulatedMachine:
     def _on_nmt(self, command: int, node: int) -> Frames:
         states = {1: OPERATIONAL, 2: STOPPED} | dict.fromkeys((128, 129, 130), PRE_OPERATIONAL)
         addressed = [n for n in self.nmt if node in (0, n)] if command in states else []
-        for n in addressed:
-            self.nmt[n] = states[command]
+        self.nmt |= dict.fromkeys(addressed, states.get(command, BOOT))
         if self.nmt[self.controller] != OPERATIONAL or not self.enabled:
             self._close_valves()
         return [(canopen.HEARTBEAT + n, bytes([BOOT])) for n in addressed if command > 128]
@@ -195,7 +191,7 @@ def simulate(
             print(f"{bus.now() - start:.3f} s, valve controller stops: {reason}", flush=True)
 
         simulated = SimulatedMachine(machine, pose, start, plant, report)
-        answers = simulated.boot()
+        answers = simulated.receive(Frame(start, canopen.NMT, bytes([RESET, 0])))
         while not signals:
             for can_id, data in answers:
                 bus.send(can_id, data)

@@ -86,10 +86,8 @@ class Inspect(Command):
                 require(same, "velocity_samples", f"{window} of --machine", net.velocity_samples)
                 scores = validation.score(net, logs.in_order(log, net.joints))
         if self.json:
-            meta = {"logs": list(map(str, self.logs)), "net": str(self.net or "")}
             joints = {name: asdict(report) for name, report in reports.items()}
-            report = {"meta": meta, "joints": joints, "scores": scores, "warnings": warnings}
-            write_json(self.json, report)
+            write_json(self.json, {"joints": joints, "scores": scores, "warnings": warnings})
         print(f"{len(log.recordings)} recordings")
         print("\n".join(inspection.table(reports)))
         print_scores(scores, warnings)

@@ -6,7 +6,7 @@ Controllers differ in colour and in dashes, so that the colour-blind tell them a
 import io
 from collections.abc import Mapping, Sequence
 from itertools import chain
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure

@@ -15,6 +15,7 @@ from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
@@ -24,11 +25,15 @@ from brokk_min.machine import Array, Machine
 # What the model searches, all assumed.
 LATEST = 0.4  # s, longest delay
 TAUS = (0.05, 0.1, 0.2, 0.4)  # s
-ZONES = 0.01 * np.arange(71)  # dead zones, of full command
+ZONES = 0.01 * np.arange(61)  # dead zones, of full command
 AT_STOP = 0.01  # of the recorded range: so near its end a joint may be at a stop
 PAUSE = 2.0  # s, after so long a joint without commands is at rest
 SAMPLES = 20_000  # of a joint that are used
 CLEAR_SIGN = 0.2  # of the velocities' power: fast sines fit as well if reversed and later
+# The fastest motion, all assumed.
+NEAR_LIMIT = 0.15  # commands that are so much less or more than the limit are at it
+HELD = 0.5  # s, after so long a joint has its speed
+FASTEST = 0.95  # quantile of the speeds, because the single ones have noise
 # What a log must have, all assumed.
 LEAST_MINUTES = 10.0
 LEAST_RANGE = 0.7  # of a joint's range
@@ -49,7 +54,7 @@ class JointReport:
     tau: float  # s
     dead_zone: tuple[float, float]
     gain: tuple[float, float]  # rad/s per command beyond the dead zone; 0: it never moved so
-    fastest: tuple[float, float]  # rad/s at the command limit, by the model
+    fastest: tuple[float, float]  # rad/s at the command limit; by the model if none was held there
 
 
 def inspect(log: Log, limit: float = 1.0) -> dict[str, JointReport]:
@@ -61,15 +66,29 @@ def inspect(log: Log, limit: float = 1.0) -> dict[str, JointReport]:
             ticks = sum(len(one.u) for one in recordings if np.ptp(one.u[:, j]) > COMMANDED)
             q = np.concatenate([one.q[:, j] for one in recordings])
             model = fit_model(motion_of(recordings, j, log.rate))
+            speeds = [fastest(recordings, j, sign * limit, log.rate) for sign in (1, -1)]
             up, down = np.multiply(model["gain"], np.maximum(limit - model["dead_zone"], 0))
             reports[name] = JointReport(
                 minutes=ticks / log.rate / 60,
                 low=float(q.min()),
                 high=float(q.max()),
-                fastest=(float(up), float(down)),
+                fastest=(speeds[0] or float(up), speeds[1] or float(down)),
                 **model | {"dead_zone": tuple(model["dead_zone"].tolist())},
             )
     return reports
+
+
+def fastest(recordings: list[Recording], j: int, command: float, rate: float) -> float:
+    """Fastest motion [rad/s] after `HELD` near a command, of the sign of it; 0: never held."""
+    held = round(HELD * rate) + 1
+    speeds = [
+        one.q_dot[held - 1 :, j][(np.abs(u / command - 1) < NEAR_LIMIT).all(axis=-1)]
+        for one in recordings
+        if len(one.u) >= held
+        for u in [sliding_window_view(one.u[:, j], held)]
+    ]
+    found = np.concatenate([np.zeros(0), *speeds])
+    return float(np.quantile(np.sign(command) * found, FASTEST)) if len(found) else 0.0
 
 
 class Motion(NamedTuple):
@@ -115,7 +134,7 @@ def best_model(motion: Motion, sign: int) -> dict[str, Any]:
     zones = np.array([0.05, 0.05])
     for _ in range(2):
         lag = min(lags, key=lambda lag: fit_gains(motion, sign, lag, zones)[0])
-        for side in (0, 1, 0, 1):
+        for side in (0, 1):
             trials = [np.where(np.arange(2) == side, zone, zones) for zone in ZONES]
             zones = min(trials, key=lambda trial: fit_gains(motion, sign, lag, trial)[0])
     error, gains = fit_gains(motion, sign, lag, zones)

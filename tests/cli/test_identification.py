@@ -1,6 +1,7 @@
 """The commands for logs and nets on small files: what they write, print and refuse."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -60,13 +61,14 @@ def test_fit__takes_a_foreign_log_and_beats_persistence(tmp_path, capsys):
     capsys.readouterr()
     assert run("inspect", test, "--net", tmp_path / "n.npz", "--json", tmp_path / "i.json") == 0
     report = json.loads((tmp_path / "i.json").read_text())
-    for name, scores in report["scores"].items():
-        joint = written["joints"][name]
-        assert scores == {key: joint[key] for key in scores}
-        assert report["joints"][name]["dead_zone"] == pytest.approx([0.3, 0.3], abs=0.03)
+    assert report["scores"] == written["joints"]
     printed = capsys.readouterr().out
     assert "2 recordings" in printed
-    assert f"{report['scores']['boom']['one_step_rmse']:.4f}" in printed
+    for name, joint in written["joints"].items():
+        assert (
+            f"{name}: {joint['one_step_rmse']:.4f}, {joint['persistence_rmse']:.4f}; 1" in printed
+        )
+        assert report["joints"][name]["dead_zone"] == pytest.approx([0.3, 0.3], abs=0.03)
     assert 'Joint("boom", q_min=' in printed
     assert "warning: boom: expected 10 minutes, got 0.8" in printed
 
@@ -138,11 +140,12 @@ def test_inspect__reads_drives_and_tables_together(tmp_path, capsys):
         lines.append(f"{at}210#{valve_frame([0, 0, 0, 0, 60], tick, 1).tobytes().hex()} T")
     (tmp_path / "drive.log").write_text("\n".join([*lines, "(3.000000) can0 080# T", ""]))
     table = steady_log(tmp_path / "log.csv", BROKK_170.names, 1)
-    out = tmp_path / "i.json"
-    assert run("inspect", tmp_path / "drive.log", table, "--json", out) == 0
-    assert "2 recordings" in capsys.readouterr().out
-    q5 = json.loads(out.read_text())["joints"]["q5"]
-    assert (q5["low"], q5["high"]) == pytest.approx((0.0, 590 * 2 * np.pi / 4096), abs=0.02)
+    assert run("inspect", tmp_path / "drive.log", table) == 0
+    printed = capsys.readouterr().out
+    assert "2 recordings" in printed
+    low, high = re.search(r'Joint\("q5", q_min=(.*), q_max=(.*), q_dot_up', printed).groups()
+    assert float(low) == pytest.approx(0.0, abs=0.02)
+    assert float(high) == pytest.approx(590 * 2 * np.pi / 4096, abs=0.02)
 
 
 @pytest.mark.parametrize(

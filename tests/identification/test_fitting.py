@@ -66,13 +66,6 @@ def test_fit__repeats_itself_to_the_bit():
     assert not same_weights(one, fit(log, CONFIG, 6, BROKK_170))
 
 
-def test_fit__has_smaller_weights_with_weight_decay():
-    log = simple_system(0, 3)
-    plain = fit(log, CONFIG, 5, BROKK_170)
-    decayed = fit(log, replace(CONFIG, weight_decay=5.0), 5, BROKK_170)
-    assert (decayed.weights[0] ** 2).mean() < 0.7 * (plain.weights[0] ** 2).mean()
-
-
 def test_fit__states_how_the_nets_were_fitted():
     log = simple_system(0, 2, 40)._replace(joints=("q4", "q1"))
     zones = [replace(joint, dead_zone=(0.25, 0.1)) for joint in BROKK_170.joints]

@@ -6,7 +6,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from brokk_min.identification.inspection import JointReport, inspect, table, warnings, wrong_signs
+from brokk_min.identification.inspection import (
+    JointReport,
+    fastest,
+    inspect,
+    table,
+    warnings,
+    wrong_signs,
+)
 from brokk_min.identification.logs import Log, Recording, velocity_of
 from brokk_min.machine import BROKK_170, Joint
 
@@ -108,8 +115,11 @@ def test_inspect__lets_a_fast_sine_pass_that_fits_as_well_reversed_and_later():
     assert not wrong_signs(reports) and reports["boom"].sign >= 0
 
 
-def test_fastest__is_that_of_the_model_at_the_limit():
+def test_fastest__is_measured_after_held_commands_or_by_the_model():
     """Gains of 0.5 and 0.3 from dead zones of 0.12 and 0.2 on; the limit is 0.6."""
+    held = np.tile(np.repeat([0.6, 0.0, -0.6, 0.0], 60), 16)
+    assert fastest([record("boom", held)], 0, -0.6, 20.0) == pytest.approx(0.3 * 0.4, rel=0.1)
+    assert fastest([record("boom", holds(largest=0.4))], 0, 0.6, 20.0) == 0.0
     report = inspect(log_of(record("boom", holds())), 0.6)["boom"]
     assert report.fastest == pytest.approx((0.5 * (0.6 - 0.12), 0.3 * (0.6 - 0.2)), rel=0.1)
 

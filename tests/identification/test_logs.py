@@ -1,7 +1,6 @@
 """Logs: what is written reads back, any rate becomes the machine's, and errors have a place."""
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +11,6 @@ from brokk_min.identification.logs import (
     Log,
     Recording,
     driven,
-    in_order,
-    join_logs,
     join_recordings,
     read_log,
     split,
@@ -151,14 +148,6 @@ def test_read_log__has_the_requested_rate_and_refuses_slower_logs(tmp_path, rate
 # --- which recordings, which joints ---------------------------------------------------------------
 
 
-def test_velocity_of__is_causal_and_right_by_hand():
-    q = np.array([[0.0, 1.0], [0.1, 1.0], [0.3, 0.0]])
-    # two samples: plain differences at 20 Hz, at rest before the first
-    np.testing.assert_allclose(velocity_of(q, 2), [[0, 0], [2, 0], [4, -20]], atol=1e-12)
-    # three samples: slope (newest - oldest) / 2 ticks
-    np.testing.assert_allclose(velocity_of(q, 3), [[0, 0], [1, 0], [3, -10]], atol=1e-12)
-
-
 def test_read_log__drops_returns(tmp_path):
     time = np.arange(30) / 20
     returned = both(table("q1_00_return", time, 2), table("q1_01", time, 3))
@@ -197,23 +186,13 @@ def test_read_log__does_not_assume_rest_after_a_gap(tmp_path, samples):
     assert len(whole.q) == 30  # nothing is unknown
 
 
-def test_read_log__leaves_out_pieces_between_gaps_that_are_too_short(tmp_path):
-    time = np.arange(40) / 20
-    time[20:] += 1.0
-    time[23:] += 1.0
-    path = write(tmp_path / "log.csv", table("x", time))
-    assert [(r.name, len(r.q)) for r in read_log([path], 4).recordings] == [("x", 20), ("x#3", 14)]
-    assert [len(r.q) for r in read_log([path], 3).recordings] == [20, 1, 15]
-
-
-@pytest.mark.parametrize("suffix", [".csv", ".npz"])
-def test_read_log__separates_interleaved_recordings(tmp_path, suffix):
+def test_read_log__separates_interleaved_recordings(tmp_path):
     rng = np.random.default_rng(3)
     stamps = (np.arange(40) + rng.uniform(-0.2, 0.2, (2, 40))) / 33
     first, second = table("y", 100 + stamps[0], 1), table("x", 3 + stamps[1], 2)
     order = np.argsort(np.tile(np.arange(40), 2), kind="stable")
     mixed = {name: column[order] for name, column in both(first, second).items()}
-    log = read_log([write(tmp_path / f"log{suffix}", mixed)], 4)
+    log = read_log([write(tmp_path / "log.csv", mixed)], 4)
     assert [r.name for r in log.recordings] == ["y", "x"]
     for recording, columns in zip(log.recordings, (first, second), strict=True):
         for i, joint in enumerate(log.joints):
@@ -311,11 +290,9 @@ def test_read_log__names_file_and_place_of_what_is_wrong(tmp_path, case):
 def test_read_log__refuses_columns_of_different_lengths_and_kinds(tmp_path):
     columns = table("x", np.arange(30) / 20)
     path = write(tmp_path / "log.npz", columns | {"q_b": np.zeros(29)})
-    with pytest.raises(
-        ValueError, match=r"log\.npz: column q_b:  expected \(30,\) numbers, got \(29,\)"
-    ):
+    with pytest.raises(ValueError, match=r"npz: column q_b: expected \(30,\) numbers, got \(29,\)"):
         read_log([path], 4)
-    with pytest.raises(ValueError, match=r"log\.npz: expected a log, got could not convert"):
+    with pytest.raises(ValueError, match=r"log\.npz: could not convert string to float"):
         read_log([write(path, columns | {"q_b": np.repeat("up", 30)})], 4)
     path.write_bytes(b"PK")
     with pytest.raises(ValueError, match=r"log\.npz: expected a readable \.npz file"):
@@ -339,14 +316,6 @@ def test_driven__is_no_joint_that_creeps_a_count_under_a_stick_at_rest():
     assert driven(Recording("x", u, q, q)).tolist() == [True, False, True]
 
 
-@pytest.mark.parametrize("rate", [4.0, 8.0])
-def test_read_log__cuts_slow_logs_at_gaps_of_more_than_two_samples(tmp_path, rate):
-    time = np.delete(np.arange(40), [10, 20, 21, 22]) / rate
-    columns = table("x", time) | {"u_a": np.zeros(36), "q_a": np.zeros(36)}
-    log = read_log([write(tmp_path / "log.npz", columns)], 4, rate=rate)
-    assert [recording.name for recording in log.recordings] == ["x", "x#2"]
-
-
 def test_split__holds_out_every_tenth_recording_that_drives_the_same_joints():
     time = np.arange(40)[:, None]
     drives = {"a": np.sin(time * [1, 0]), "b": np.sin(time * [0, 1])}
@@ -358,15 +327,3 @@ def test_split__holds_out_every_tenth_recording_that_drives_the_same_joints():
     assert len(kept.recordings) == 19
     with pytest.raises(ValueError, match=r"^recordings: expected two or more .*, or --test, got 1"):
         split(log._replace(recordings=log.recordings[:1]))
-
-
-def test_join_logs__wants_the_same_joints_in_any_order():
-    log = some_log(False)
-    turned = in_order(log, log.joints[::-1])
-    joined = join_logs({Path("a"): log, Path("b"): turned})
-    assert joined.joints == log.joints and len(joined.recordings) == 6
-    np.testing.assert_array_equal(joined.recordings[3].q, log.recordings[0].q)
-    with pytest.raises(ValueError, match=r"^b: columns: expected q_dot in all files or in none"):
-        join_logs({Path("a"): log, Path("b"): some_log(True)})
-    with pytest.raises(ValueError, match=r"^b: joints: expected \['boom', "):
-        join_logs({Path("a"): log, Path("b"): log._replace(joints=("a", "b", "c"))})

@@ -82,13 +82,15 @@ def test_tool_errors__by_hand():
 
 
 def test_validate__warns_of_nets_no_better_than_the_last_velocity():
-    test = Log(("a",), (line("x", 0.0, 0.1, 40),), True)
-    assert validate(constant_net([0.1], True, ("a",)), test)["warnings"] == []
-    result = validate(constant_net([0.2], True, ("a",)), test)
+    """The velocity alternates between -0.1 and 0.1 rad/s: the last one again is off by 0.2."""
+    q_dot = 0.1 * (-1.0) ** np.arange(40)[:, None]
+    test = Log(("a",), (Recording("x", q_dot, np.cumsum(q_dot, axis=0) / 20, q_dot),), True)
+    assert validate(constant_net([0.0], True, ("a",)), test)["warnings"] == []
+    result = validate(constant_net([0.4], True, ("a",)), test)
     assert result["tool"] == {} and set(result["joints"]) == {"a"}
     assert set(result["joints"]["a"]) == {"one_step_rmse", "persistence_rmse", "free_run"}
     (warning,) = result["warnings"]
-    assert warning.startswith("a: expected an error of one step below 0.0") and "0.1" in warning
+    assert warning.startswith("a: expected an error of one step below 0.2000, got 0.4")
 
 
 @pytest.mark.parametrize("logged", [False, True])

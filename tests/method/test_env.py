@@ -252,21 +252,6 @@ def test_transition__on_a_plant_of_ones_own_by_hand():
     assert after.ticks == 1 and after.goal_ticks == state.goal_ticks - 1
 
 
-def test_transition__moves_no_arm_by_what_encoders_say():
-    """`read` is what is measured, not what is."""
-    rng = np.random.default_rng(6)
-    right = wrong = initial_state(BROKK_170, POSE, ZERO)
-    for _ in range(20):
-        u = action_to_pwm(BROKK_170, rng.uniform(-1, 1, 4))
-        right = transition(BROKK_170, PLANT, right, u)
-        wrong = transition(BROKK_170, PLANT, wrong, u, lambda _, q: q + 0.1)
-        np.testing.assert_array_equal(wrong.q, right.q)
-        np.testing.assert_array_equal(wrong.v_tool, right.v_tool)
-    off = wrong.history[:, 0, -1] - right.history[:, 0, -1]
-    np.testing.assert_allclose(off, 0.1, atol=1e-3)
-    assert np.abs(right.q - POSE).max() > 0.01
-
-
 @given(machines(), st.integers(0, 1000))
 def test_transition__is_the_plant_measured_by_encoders(machine, seed):
     """History of the encoder angles; velocity and lowest point of the true pose."""
