@@ -22,6 +22,9 @@ Who was first: this is PODS (Mora et al., 2021) with noise on its actions. SVG (
 backpropagates through learned dynamics, too; SHAC (Xu et al., 2022) adds a critic's value at the
 end of a window; GI-PPO (Son et al., 2023) has the same regression, along a gradient with a critic.
 
+Whoever changes what the agent of `beyond.interface` remembers, does or pays has to change `Replay`,
+which computes the same in torch.
+
 Simplifications: it is open loop, so later actions count as given. Angles and commands count as
 exact, not rounded; the error integral takes the true velocity of the tick; Jacobians count as
 constant, because in a second a joint turns little; nothing counts after the end of the window or of
@@ -43,7 +46,7 @@ from brokk_min.beyond import interface
 from brokk_min.beyond.gradient_config import GradientConfig
 from brokk_min.beyond.valve_nets import ValveNet, valve_inputs
 from brokk_min.kinematics import forward_kinematics, jacobian
-from brokk_min.machine import PWM_MAX, Array, Machine, side
+from brokk_min.machine import PWM_MAX, Array, Machine, require, side
 
 STEP = 4.0  # deviations of the actions by which targets differ from means, at most
 
@@ -52,6 +55,8 @@ def net_velocities(net: ActuatorNet, history: Tensor) -> Tensor:
     """`ActuatorNet.predict` in torch: [rad/s] (num, n) from histories (num, n, 3, H)."""
     w1, b1, w2, b2, w3, b3 = map(torch.as_tensor, net.weights)
     inputs = history.flatten(-2)
+    known = (ActuatorNet, ValveNet)
+    require(type(net) in known, "net", "an ActuatorNet or a ValveNet", type(net).__name__)
     if isinstance(net, ValveNet):
         zones = torch.as_tensor(net.dead_zones, dtype=history.dtype)
         inputs = valve_inputs(history, zones, torch)
@@ -180,6 +185,10 @@ def train(
     The same seed gives the same bits on the same machine. ValueError: a loss that is not finite.
     """
     machine, net = env.unwrapped.machine, env.unwrapped.plant  # type: ignore[attr-defined]
+    ours = env.unwrapped.interface is interface.INTERFACE  # type: ignore[attr-defined]
+    require(
+        ours, "interface", "beyond.interface.INTERFACE, whose costs are derived here", "another"
+    )
     agent, optimizer, obs, global_step, update = start or ppo.begin(env, config, seed)
     agent.log_std.requires_grad_(False)
     while global_step < config.total_steps:

@@ -12,19 +12,22 @@ import numpy as np
 from brokk_min._files import expected, load_arrays, located, save_arrays
 from brokk_min.actuator import ActuatorNet
 from brokk_min.beyond.valve_nets import ValveNet
-from brokk_min.machine import Array, Machine
+from brokk_min.machine import Array, Machine, require
 
 KIND = "actuator net 4"
 HEADER = ("joints", "history", "rate", "velocity_samples", "velocity_logged", "machine", "training")
 ARRAYS = ("input_mean", "input_scale", "output_low", "output_high", "q_low", "q_high")
 CLASSES = {"paper": ActuatorNet, "valve": ValveNet}  # the names of what nets read, in files
+NAMES = {kind: name for name, kind in CLASSES.items()}
 
 
 def net_arrays(net: ActuatorNet) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Header and arrays of nets, as in their file."""
+    """Header and arrays of nets, as in their file; ValueError: a class that is not in `CLASSES`."""
+    known = ", ".join(kind.__name__ for kind in NAMES)
+    require(type(net) in NAMES, "net", f"one of {known}", type(net).__name__)
     header = {name: getattr(net, name) for name in HEADER}
     header["training"] = dict(net.training)
-    header["reads"] = "valve" if isinstance(net, ValveNet) else "paper"
+    header["reads"] = NAMES[type(net)]
     arrays = {name: getattr(net, name) for name in ARRAYS}
     arrays |= {f"weight_{i}": weight for i, weight in enumerate(net.weights)}
     if isinstance(net, ValveNet):

@@ -83,10 +83,10 @@ def test_encoder_counts__is_the_inverse_of_encoder_raw_however_mounted():
 
 @pytest.mark.parametrize("flags", range(8))
 def test_operator_input__survives_the_log_to_a_tenth_of_a_millimetre(flags):
-    given = OperatorInput((0.3, -0.12345, 3.2), *(bool(flags & 1 << i) for i in range(3)))
+    given = OperatorInput((0.3, -0.12346, 3.2), *(bool(flags & 1 << i) for i in range(3)))
     data = given.pack()
-    assert data == struct.pack("<hhhB", 3000, -1234, 32000, flags)
-    assert unpack_operator_input(data) == given._replace(v_goal=(0.3, -0.1234, 3.2))
+    assert data == struct.pack("<hhhB", 3000, -1235, 32000, flags)
+    assert unpack_operator_input(data) == given._replace(v_goal=(0.3, -0.1235, 3.2))
 
 
 @pytest.fixture

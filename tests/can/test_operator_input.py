@@ -5,7 +5,7 @@ import pytest
 from helpers_bus import START, HoldingOperator, Virtual, World
 
 from brokk_min.can.canopen import OperatorInput
-from brokk_min.can.operator_input import JointJog, Joystick, Script
+from brokk_min.can.operator_input import JointJog, Joystick, Script, shape_axis
 from brokk_min.machine import BROKK_170
 
 TWO_GOALS = np.array([[0.1, 0, 0], [0, 0.2, 0]])
@@ -91,3 +91,9 @@ def test_joint_jog__moves_one_joint_with_the_sign_of_x():
         operator.v = v
         world.run(0.2)
         assert world.commands[1][-1].tolist() == [0, 0, 0, command, 0]
+
+
+def test_shape_axis__is_odd_flat_near_the_middle_and_full_at_the_ends():
+    """Beyond the dead zone of 12 % half a deflection is 0.4 x 0.5 + 0.6 x 0.125 = 0.275."""
+    np.testing.assert_array_equal(shape_axis([0.0, 0.12, -0.12]), 0.0)
+    np.testing.assert_allclose(shape_axis([1.0, -1.0, 0.56, -0.56]), [1.0, -1.0, 0.275, -0.275])

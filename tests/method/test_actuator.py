@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from scipy.special import expit
@@ -164,7 +164,12 @@ def driven_machines(draw: st.DrawFn) -> tuple[Machine, np.ndarray, np.ndarray]:
     return machine, draw(poses(machine)), np.repeat(u, 2, axis=0)
 
 
+TO_THE_STOPS = np.full((30, 5), 0.6)  # commands; from 0.02 rad before the stops
+
+
 @given(driven_machines())
+@example((BROKK_170, BROKK_170.column("q_max") - 0.02, TO_THE_STOPS))
+@example((BROKK_170, BROKK_170.column("q_min") + 0.02, -TO_THE_STOPS))
 def test_plant_step__is_its_equations(case):
     machine, q, u = case
     state, velocities, _ = record(machine, q, u)
