@@ -33,7 +33,7 @@ from brokk_min.identification import excitation, logs
 from brokk_min.kinematics import forward_kinematics
 from brokk_min.learning import policy
 from brokk_min.learning.checkpoint import train_policy
-from brokk_min.learning.recipes import Recipe
+from brokk_min.learning.recipes import find_recipe
 from brokk_min.machine import BROKK_170, PWM_MAX
 
 M = BROKK_170
@@ -93,7 +93,7 @@ def a9() -> Figures:
 
 
 def a6() -> Figures:
-    """Velocity error [m/s] of the paper's PID, with gains by hand, with and without the noise."""
+    """Velocity error [m/s] of the PID with gains by hand, with and without the noise."""
     pid = baselines(M, policy.load_policy(POLICY, M).net)["jacobian_pid_k0.1"]
     start, goals = sequences.tuning_set(M, 16, seed=2)
     errors = {}
@@ -122,7 +122,7 @@ def levels() -> Figures:
 def train(steps: int) -> Figures:
     """Error [m/s], drift [m], travel, time at stops [s] of a new policy along x, y, z."""
     net = policy.load_policy(POLICY, M).net
-    recipe = Recipe()
+    recipe = find_recipe()
     recipe = replace(recipe, learner=replace(recipe.learner, total_steps=steps))
     with TemporaryDirectory() as folder:
         trained = train_policy(M, net, recipe, 0, Path(folder) / "policy.npz")

@@ -1,12 +1,11 @@
-"""From the paper's learner to ours: what each step buys on the machine, alone and in order.
+"""From the paper's agent to ours: what each step buys on the machine, alone and in order.
 
     python -m benchmarks.ladder [FOLDER] [STEPS] [SEEDS]
 
-"Alone" is the paper's learner with one of `STEPS`; "in order" has the steps of all rows above it,
-too. Gradients of the simulation need all that stands before them. FOLDER is one of `brokk-min
-reproduce`, by default results; its nets are those that the policies learn on. By default three
-seeds of one million environment steps each. Figures are means over x, y, z and the workspace
-starts.
+"Alone" is the paper's agent with a critic and one of `STEPS`; "in order" has the steps of all rows
+above it, too. FOLDER is one of `brokk-min reproduce`, by default results; its nets are those that
+the policies learn on. By default three seeds of one million environment steps each. Figures are
+means over x, y, z and the workspace starts.
 """
 
 import sys
@@ -26,7 +25,7 @@ from brokk_min.identification.net_file import load_net, select_nets
 from brokk_min.learning.checkpoint import train_policy
 from brokk_min.learning.jobs import side_by_side
 from brokk_min.learning.policy import INTERFACES, PolicyController
-from brokk_min.learning.recipes import Recipe, paper_recipe
+from brokk_min.learning.recipes import find_recipe
 from brokk_min.machine import BROKK_170 as M
 
 FIGURES = ("velocity_error_mean", "off_axis_drift_max", "valve_travel", "jerk_rms")
@@ -35,10 +34,10 @@ STEPS = {
     "observation": "error integral, resolved rates, open valves",
     "command": "actions from the dead zone on, closed valves at rest",
     "cost": "costs of valve travel and error integral",
-    "gradients": "gradients of the simulation, not a critic",
+    "groups": "groups of rollouts, not a critic",
 }
-RUNGS = {"the paper's learner": frozenset[str]()}
-RUNGS |= {f"alone: {text}": frozenset([k]) for k, text in STEPS.items() if k != "gradients"}
+RUNGS = {"the paper's agent": frozenset[str]()}
+RUNGS |= {f"alone: {text}": frozenset([k]) for k, text in STEPS.items()}
 RUNGS |= {
     f"in order: {text}": frozenset(list(STEPS)[: i + 1])
     for i, text in enumerate(STEPS.values())
@@ -61,9 +60,7 @@ def climb(name: str, nets: dict[str, ActuatorNet], total_steps: int, seed: int) 
     """`FIGURES` of one new policy on the machine."""
     steps = RUNGS[name]
     INTERFACES[name] = interface_of(steps)
-    recipe = Recipe() if "gradients" in steps else paper_recipe()
-    if "gradients" not in steps:
-        recipe = replace(recipe, interface=name)
+    recipe = replace(find_recipe(paper=True, critic="groups" not in steps), interface=name)
     recipe = replace(recipe, learner=replace(recipe.learner, total_steps=total_steps))
     net = nets["net" if "nets" in steps else "net_paper"]
     with TemporaryDirectory() as folder:
@@ -85,7 +82,9 @@ def main(folder: str = "results", steps: str = "1000000", seeds: str = "3") -> N
         for rung in RUNGS
         for seed in range(int(seeds))
     }
-    results = np.array(side_by_side(jobs, {})).reshape(len(RUNGS), int(seeds), len(FIGURES))
+    results = np.array(list(side_by_side(jobs).values())).reshape(
+        len(RUNGS), int(seeds), len(FIGURES)
+    )
     print(f"{'means of seeds (largest less smallest)':76}", *(f"{key:>22}" for key in FIGURES))
     for rung, figures in zip(RUNGS, results, strict=True):
         pairs = zip(figures.mean(axis=0), np.ptp(figures, axis=0), strict=True)

@@ -1,6 +1,6 @@
 """Ten chains, each with its own logs, nets and policies: means over seeds and their spread.
 
-    python -m benchmarks.seeds [--folder results-seeds] [--seeds 10] [--policies rl rl_paper]
+    python -m benchmarks.seeds [--folder results-seeds] [--seeds 10] [--policies rl ...]
 
 Each seed records, fits and trains as `brokk-min reproduce` does, on one thread, and as many seeds
 run at once as there are cores. What the folder holds already is not made again. Policies and the
@@ -36,6 +36,7 @@ FIGURES = {  # name in the file -> figure of `metrics`
 RECIPES: dict[str, tuple[str, str, dict[str, Any]]] = {  # policy -> nets, excitation, recipe
     "rl": ("net", "rich", {}),
     "rl_paper": ("net_paper", "sine", fitting.PAPER_RECIPE),
+    "rl_critic": ("net_paper", "sine", fitting.PAPER_RECIPE),
 }
 
 
@@ -105,7 +106,7 @@ def main(options: Options) -> None:
     """Make what is missing, score all and print means, and the largest less the smallest."""
     for name in options.policies:
         jobs = {str(seed): partial(make, options, name, seed) for seed in range(options.seeds)}
-        side_by_side(jobs, {})
+        side_by_side(jobs)
     rows = score(options)
     write_json(options.folder / "seeds.json", rows)
     columns = [key for key in rows[0] if key not in ("controller", "seed")]

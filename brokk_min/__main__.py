@@ -34,13 +34,11 @@ def help_text() -> str:
 
 
 def one_line(error: BaseException) -> str:
-    """What went wrong, in one line of at most 300 printable characters."""
-    text = str(error) or type(error).__name__
+    """What went wrong, in one line."""
     if isinstance(error, OSError) and error.strerror:
         place = f"{error.filename}: " if error.filename else ""
-        text = f"{place}{error.strerror[:1].lower()}{error.strerror[1:]}"
-    text = "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
-    return text if len(text) <= 300 else f"{text[:195]} ... {text[-100:]}"
+        return f"{place}{error.strerror.lower()}"
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 def main(arguments: list[str] | None = None) -> int:

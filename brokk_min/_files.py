@@ -7,16 +7,16 @@ complete. What a file should hold and does not is a ValueError of one line: file
 import csv
 import json
 import os
-import reprlib
-import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from brokk_min.machine import require
 
 # a folder for each machine: policies, gains and start poses of `make reproduce`
 SHIPPED = Path(__file__).parent / "shipped"
@@ -36,28 +36,17 @@ def require_package(package: str, extra: str) -> Any:
 def whole_file(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
     """A temporary file, text in UTF-8, that replaces `path` if the block ends without an error."""
     path = Path(path)
-    if not path.parent.is_dir():
-        raise ValueError(f"{path}: expected an existing directory, got {path.parent}")
-    if path.exists() and not path.is_file():
-        raise ValueError(f"{path}: expected a regular file to replace, got another kind")
-    text = {} if "b" in mode else {"newline": "", "encoding": "utf-8"}
+    fits = path.parent.is_dir() and (path.is_file() or not path.exists())
+    require(fits, str(path), "a regular file in an existing directory", "none")
     target = path.resolve()  # of a link
-    handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{path.name[:100]}.")
+    temporary = target.with_name(f".{target.name[:100]}.{os.getpid()}")
+    text = {} if "b" in mode else {"newline": "", "encoding": "utf-8"}
     try:
-        with os.fdopen(handle, mode, **text) as file:  # type: ignore[call-overload]
+        with open(temporary, mode, **text) as file:  # type: ignore[call-overload]
             yield file
-            file.flush()
-            with suppress(OSError):  # a share may refuse it
-                os.fsync(file.fileno())
-        with suppress(OSError):
-            os.umask(umask := os.umask(0))
-            os.chmod(temporary, target.stat().st_mode if target.exists() else 0o666 & ~umask)
         os.replace(temporary, target)
-    except BaseException as error:
-        os.unlink(temporary)
-        if isinstance(error, OSError):
-            error.filename = str(path)  # the one that the user knows
-        raise
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -76,11 +65,8 @@ def write_csv(path: Path, columns: Iterable[str], rows: Iterable[Iterable[Any]])
 
 
 def brief(value: Any) -> str:
-    """A value as text of at most some eighty characters."""
-    short = reprlib.Repr()
-    short.maxlist = short.maxdict = short.maxtuple = 6
-    short.maxstring = short.maxother = 60
-    text = str(value) if isinstance(value, Exception) else short.repr(value)
+    """A value as text of one line and at most some hundred characters."""
+    text = str(value) if isinstance(value, Exception) else repr(value)
     if isinstance(value, OSError) and value.strerror:
         text = value.strerror.lower()
     text = " ".join(text.split())
@@ -117,9 +103,8 @@ def located(*paths: Path) -> Iterator[None]:
 def expect_same(path: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
     """ValueError for the first entry of `wanted` that `found` has otherwise."""
     for name, value in wanted.items():
-        if found.get(name) != value:
-            got = brief(found.get(name))
-            raise ValueError(f"{path}: {name}: expected {brief(value)}, got {got}")
+        same = found.get(name) == value
+        require(same, f"{path}: {name}", brief(value), brief(found.get(name)))
 
 
 def read_json(path: Path, what: str) -> Any:
@@ -137,27 +122,25 @@ def read_csv(path: Path, *columns: str) -> dict[str, NDArray[Any]]:
         with open(path, newline="", encoding="utf-8-sig") as file:
             header, *rows = csv.reader(file, strict=True)
         names = [name.strip() for name in header]
-        if missing := [name for name in columns if name not in names]:
-            raise ValueError(f"{path}: expected columns {missing}, got {brief(names)}")
-        wrong = [i for i, row in enumerate(rows, 2) if len(row) != len(names)]
-        if wrong or not rows:
-            row = (wrong or [2])[0]
-            raise ValueError(f"{path}: row {row}: expected {len(names)} cells, got another number")
+        missing = [name for name in columns if name not in names]
+        require(not missing, str(path), f"columns {missing}", brief(names))
+        require(len(rows) > 0, str(path), "rows", "none")
+        for i, row in enumerate(rows, 2):
+            require(len(row) == len(names), f"{path}: row {i}", f"{len(names)} cells", len(row))
         return {name: _column(path, name, cells) for name, cells in zip(names, zip(*rows))}
 
 
 def _column(path: Path, name: str, cells: Sequence[str]) -> NDArray[Any]:
     if name in TEXT:
         return np.array(cells)
-    with suppress(ValueError):
-        return np.array(cells, float)
+    numbers = []
     for row, cell in enumerate(cells, 2):
         try:
-            float(cell)
+            numbers.append(float(cell))
         except ValueError:
             place = f"{path}: row {row}, column {name}"
             raise ValueError(f"{place}: expected a number, got {brief(cell)}") from None
-    raise AssertionError
+    return np.array(numbers)
 
 
 def save_arrays(path: Path, kind: str, header: Mapping[str, Any], **arrays: Any) -> None:
@@ -176,9 +159,9 @@ def load_arrays(path: Path, kind: str = "") -> tuple[dict[str, Any], dict[str, N
         with np.load(path, allow_pickle=False) as archive:
             arrays = dict(archive)
         header = json.loads(str(arrays.pop("header", "{}")))
-        got = header.pop("kind", None)
-        if kind and got != kind:
-            made = "a file of another version (train or fit again)"
-            got = made if kind.split()[0] in str(got) else brief(got)
-            raise ValueError(f"{path}: expected a {kind}, got {got}")
+        got = str(header.pop("kind", None))
+        fits = got == kind or not kind
+        older = not fits and kind.split()[0] in got
+        made = "a file of another version (train or fit again)" if older else brief(got)
+        require(fits, str(path), f"a {kind}", made)
         return header, arrays

@@ -6,14 +6,14 @@ driven joints and 1 locked joint; its history has H = 13 samples.
 
 | Num     | Observation                                          | Deviation   | Noise |
 |---------|------------------------------------------------------|-------------|-------|
-| 0-2     | goal velocity of the tool                            | 0.173 m/s   | no    |
-| 3-5     | measured velocity of the tool                        | 0.173 m/s   | yes   |
+| 0-2     | goal velocity of the tool                            | 0.093 m/s   | no    |
+| 3-5     | measured velocity of the tool                        | 0.093 m/s   | yes   |
 | 6       | angle of the locked joint                            | 0.404 rad   | yes   |
-| 7-110   | 13 angles, 13 velocities of each driven joint        | uniform     | yes   |
-| 111-162 | 13 commands of each driven joint                     | 0.364       | no    |
+| 7-110   | 13 angles, 13 velocities of each driven joint        | of the task | yes   |
+| 111-162 | 13 commands of each driven joint                     | 0.252       | no    |
 
-Observation: Box, float32, (163,): each number less its mean, over its deviation; "uniform" is that
-of a uniform distribution over the range. The newest sample is last. Vectors are in the base frame.
+Observation: Box, float32, (163,): each number less its mean, over its deviation in the task, see
+`velocity_deviations`. The newest sample is last. Vectors are in the base frame.
 
 Action: Box(-1, 1, (4,)), of the largest command of each driven joint.
 Reward: 1 / (1 + |v_goal - v_tool|) (eq2).
@@ -35,9 +35,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brokk_min.actuator import PLANT, Plant, append_sample, initial_history
-from brokk_min.kinematics import forward_kinematics, lowest_point, tool_velocity
+from brokk_min.kinematics import forward_kinematics, jacobian, lowest_point, tool_velocity
 from brokk_min.machine import PWM_MAX, Array, Machine, Measured, limit_command, read_encoder
 from brokk_min.settings import TaskConfig
+
+DRAWS = 4096  # poses and goals on which deviations are measured
+COMMAND_STD = 0.4  # of the largest command, measured: PID and policies have 0.30 to 0.43
 
 
 class Block(NamedTuple):
@@ -48,18 +51,35 @@ class Block(NamedTuple):
     noisy: bool  # do sensors measure it?
 
 
+def velocity_deviations(machine: Machine) -> tuple[Array, Array]:
+    """Deviations in the task of tool [m/s] (3,) and joint velocities [rad/s] (n,), measured.
+
+    Goals and poses are drawn as in training. The joint velocities are the smallest that give the
+    goal, J^+ v, cut at each joint's fastest motion; at least 5 % of that, if a joint gives none.
+    """
+    rng = np.random.default_rng(0)
+    q = rng.uniform(machine.column("q_min"), machine.column("q_max"), (DRAWS, machine.n))
+    direction = rng.standard_normal((DRAWS, 3))
+    speed = rng.uniform(0, machine.tool_speed, DRAWS) * (rng.random(DRAWS) >= TaskConfig.zero_goals)
+    v = direction * (speed / np.linalg.norm(direction, axis=-1))[:, None]
+    J = jacobian(forward_kinematics(machine, q))[..., machine.driven]
+    q_dot = np.zeros_like(q)
+    q_dot[:, machine.driven] = (np.linalg.pinv(J) @ v[..., None])[..., 0]
+    q_dot = np.clip(q_dot, -machine.q_dot_max, machine.q_dot_max)
+    return np.full(3, v.std()), np.maximum(q_dot.std(axis=0), 0.05 * machine.q_dot_max)
+
+
 @lru_cache
 def observation_blocks(machine: Machine) -> tuple[Block, ...]:
-    """The observation in its order, with the mean and deviation of uniform distributions.
+    """The observation in its order, with the mean and deviation of its numbers in the task.
 
-    Paper: Sec. 3.4 (normalisation)
+    Angles are uniform over their range. Paper: Sec. 3.4 (normalisation)
     """
     H = machine.history
     q_mean = (machine.column("q_min") + machine.column("q_max")) / 2
     q_std = (machine.column("q_max") - machine.column("q_min")) / 12**0.5
-    q_dot_std = machine.q_dot_max / 3**0.5
-    v_std = np.full(3, machine.tool_speed / 3**0.5)
-    u_std = np.full(H * len(machine.driven), machine.pwm_limit / PWM_MAX / 3**0.5)
+    v_std, q_dot_std = velocity_deviations(machine)
+    u_std = np.full(H * len(machine.driven), COMMAND_STD * machine.pwm_limit / PWM_MAX)
     blocks = [
         Block(0.0, v_std, False),
         Block(0.0, v_std, True),

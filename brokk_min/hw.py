@@ -22,7 +22,7 @@ from brokk_min.can.safety_gate import GateInputs, fault_name, gate, gate_start
 from brokk_min.env import measure
 from brokk_min.machine import PWM_MAX, Machine, Measured
 
-BUSY_WAIT = 0.002  # s before and after SYNC in which the loop does not sleep (tuned)
+WARM_UP = 0.002  # s before SYNC, when the controller computes once to no purpose (tuned)
 ANSWER_TIME = 0.4  # of a tick after SYNC, in which the encoders must answer (assumed)
 
 
@@ -79,7 +79,7 @@ class Drive:
         with self.catch_errors():
             self.bus.send(canopen.SYNC, b"")
             answer_by = self.bus.now() + ANSWER_TIME * self.machine.dt
-            self.nodes.listen(self.bus, answer_by, BUSY_WAIT, until_complete=True)
+            self.nodes.listen(self.bus, answer_by, until_complete=True)
         counts = self.nodes.counts()
         command = np.zeros(self.machine.n)
         with self.catch_errors():
@@ -130,13 +130,12 @@ class Drive:
             flooded=np.array(self.nodes.received >= canopen.MAX_FRAMES),
             other_sender=np.array(self.nodes.others > 0),
         )
-        self.gate, frames = gate(self.machine, self.gate, inputs, now)
+        self.gate, frame = gate(self.machine, self.gate, inputs, now)
         self.explain()
         self.exception = ""  # one while sending is a fault of the next tick
         with self.catch_errors():
             if self.gate.armed_once:
-                for can_id, frame in zip(canopen.valve_frame_ids(self.machine), frames):
-                    self.bus.send(can_id, frame.tobytes())
+                self.bus.send(self.machine.valve_frame_id, frame.tobytes())
 
     def explain(self) -> None:
         """Set `reason` from the gate's faults and from exceptions."""
@@ -148,15 +147,15 @@ class Drive:
             self.reason += f" ({self.last_exception})"
 
     def wait(self) -> None:
-        """Listen until the deadline; without sleep just before it."""
+        """Listen until the deadline."""
         deadline = self.start_time + self.deadline_number * self.machine.dt  # no sum: no drift
         end = min(deadline, self.bus.now() + self.machine.dt)  # the clock may have gone backwards
         with self.catch_errors():
-            self.nodes.listen(self.bus, end - BUSY_WAIT)
+            self.nodes.listen(self.bus, end - WARM_UP)
             # warm-up: caches are cold after sleep, and the first computation takes longer
             if self.bus.now() < end and (measured := self.measured):
                 self.controller(measured, self.controller_state)
-            self.nodes.listen(self.bus, end, BUSY_WAIT)
+            self.nodes.listen(self.bus, end)
         self.bus.sleep(max(0.0, end - self.bus.now()))  # a broken bus does not wait
         self.count_tick(self.bus.now() - deadline)
 

@@ -1,12 +1,12 @@
 """A machine as one frozen value: geometry, limits, valves, cylinders, encoders, CAN identifiers.
 
-To port the project means to write another `Machine`; nothing else knows a Brokk. Comments give the
-units of fields and where the numbers of `BROKK_170` come from: the paper, or assumed (not the
-maker's data), or tuned (by runs of this project).
+To port the project means to write another `Machine`; nothing else knows a Brokk. The numbers of
+`BROKK_170` come from the paper, or are assumed (not the maker's data), or tuned (by our runs).
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, Literal, NamedTuple
@@ -16,6 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.floating[Any]]  # of any shape, float32 or float64
 PWM_MAX = 127  # counts of full command; paper: [0,127] is positive, [255,128] negative
+POSITIVE = {"q_dot_up", "q_dot_down", "cylinder_rod", "encoder_step", "encoder_bits", "plant_dt"}
+POSITIVE |= {"rate", "tool_speed", "pump_flow", "tau_cylinder", "tau_valve_up", "tau_valve_down"}
 
 
 def require(fact: bool, field: str, wanted: str, got: Any) -> None:
@@ -24,15 +26,23 @@ def require(fact: bool, field: str, wanted: str, got: Any) -> None:
         raise ValueError(f"{field}: expected {wanted}, got {got}")
 
 
+def require_numbers(fields: Mapping[str, Any], owner: str = "") -> None:
+    """ValueError: a field of a joint or a machine that is no number, or not as large as it must."""
+    for name, value in fields.items():
+        if name not in ("name", "driven", "kind", "joints", "q_start"):
+            require(bool(np.isfinite(value).all()), f"{owner}{name}", "a number", value)
+        if name in POSITIVE:
+            require(value > 0, f"{owner}{name}", "a positive number", value)
+
+
 @dataclass(frozen=True)
 class Joint:
     """One joint: a row of standard Denavit-Hartenberg parameters, its range, its drive.
 
     T = Rz(theta) Tz(d) Tx(a) Rx(alpha). The joint variable q is added to theta [rad], or to d [m]
     if the joint is prismatic; "rad" below means rad or m. The cylinder is the third side of a
-    triangle whose other sides are `cylinder_base` and `cylinder_rod`; they meet at the angle
-    `cylinder_angle` + q. Set `cylinder_base` to 0 for a joint whose lever arm is always
-    `cylinder_rod`.
+    triangle whose other sides, `cylinder_base` and `cylinder_rod`, meet at the angle
+    `cylinder_angle` + q. If `cylinder_base` is 0, the lever arm is always `cylinder_rod`.
     """
 
     name: str
@@ -59,26 +69,17 @@ class Joint:
 
     def __post_init__(self) -> None:
         """ValueError: a field that is no number, an empty range, a triangle that does not close."""
-        positive = ("q_dot_up", "q_dot_down", "cylinder_rod", "cylinder_area", "encoder_step")
-        for name, value in vars(self).items():
-            field = f"{self.name}.{name}"
-            if name not in ("name", "driven", "kind"):
-                number = isinstance(value, int | float | tuple | np.number)
-                require(number and bool(np.isfinite(value).all()), field, "a number", value)
-            if name in positive:
-                require(value > 0, field, "a positive number", value)
-            if name in ("dead_zone", "cylinder_speed"):
-                require(np.shape(value) == (2,), field, "a pair, up and down", value)
-        kinds = ("revolute", "prismatic")
-        require(self.kind in kinds, f"{self.name}.kind", " or ".join(kinds), self.kind)
-        require(
-            abs(self.encoder_sign) == 1, f"{self.name}.encoder_sign", "1 or -1", self.encoder_sign
-        )
-        require(self.q_min < self.q_max, f"{self.name}.q_max", f"above {self.q_min}", self.q_max)
+        own = f"{self.name}."
+        require_numbers(vars(self), own)
+        pairs = np.shape(self.dead_zone) == np.shape(self.cylinder_speed) == (2,)
+        require(pairs, f"{own}dead_zone, cylinder_speed", "pairs, up and down", "others")
+        known = self.kind in ("revolute", "prismatic")
+        require(known, f"{own}kind", "revolute or prismatic", self.kind)
+        require(abs(self.encoder_sign) == 1, f"{own}encoder_sign", "1 or -1", self.encoder_sign)
+        require(self.q_min < self.q_max, f"{own}q_max", f"above {self.q_min}", self.q_max)
         low, high = self.cylinder_angle + self.q_min, self.cylinder_angle + self.q_max
         closes = self.cylinder_base == 0 or 0 < low < high < np.pi
-        wanted = "a triangle with angles within (0, pi) over the range"
-        require(closes, f"{self.name}.cylinder_angle", wanted, f"{low:.3f} to {high:.3f}")
+        require(closes, f"{own}cylinder_angle", "angles in (0, pi)", f"{low:.3f} to {high:.3f}")
 
 
 @dataclass(frozen=True)
@@ -110,21 +111,18 @@ class Machine:
 
     def __post_init__(self) -> None:
         """ValueError: what cannot be a machine, with the field, what is wanted and what it got."""
-        require(len(self.driven) > 0, "joints", "at least one driven joint", "none")
         nodes = [*(joint.encoder_node for joint in self.joints), self.controller_node]
         for what, values in (("names", [*self.names]), ("CANopen nodes", nodes)):
             require(len(set(values)) == len(values), "joints", f"different {what}", values)
-        for name in ("rate", "tool_speed", "pump_flow", "encoder_bits", "plant_dt"):
-            value = getattr(self, name)
-            require(0 < value < np.inf, name, "a positive number", value)
-        require(self.valve_threshold < 1, "valve_threshold", "below 1", self.valve_threshold)
+        require_numbers(vars(self))
+        require(self.delay >= 0, "delay", "0 or more", self.delay)
         limit, zones, samples = self.pwm_limit, self.dead_zones, self.velocity_samples
         require(1 <= limit <= PWM_MAX, "pwm_limit", "1 to 127", limit)
         opens = bool(((zones >= 0) & (zones < limit / PWM_MAX)).all())  # else no valve ever does
         require(opens, "dead_zone", f"0 to {limit}/{PWM_MAX}", zones.tolist())
         require(2 <= samples <= self.history, "velocity_samples", "2 to history", samples)
         inside = [j.q_min <= q <= j.q_max for j, q in zip(self.joints, self.q_start)]
-        fits = not self.q_start or (len(self.q_start) == self.n and all(inside))
+        fits = len(self.q_start) in (0, self.n) and all(inside)
         require(fits, "q_start", f"{self.n} angles within their ranges", self.q_start)
         steps = self.dt / self.plant_dt
         fits = abs(steps - round(steps)) < 1e-6 and self.plant_dt <= self.tau_spool
@@ -162,19 +160,15 @@ class Machine:
     @cached_property
     def dead_zones(self) -> NDArray[np.float64]:
         """Dead zones of each joint up and down, of full command, (n, 2)."""
-        return np.array([joint.dead_zone for joint in self.joints], float)
+        return self.column("dead_zone")
 
     @cached_property
     def cylinder_speeds(self) -> NDArray[np.float64]:
-        """Speeds of each cylinder at full command up and down [m/s], (n, 2).
-
-        By default those that give q_dot_up and q_dot_down at the largest lever arm.
-        """
-        given = np.array([joint.cylinder_speed for joint in self.joints])
-        fastest = np.array([(joint.q_dot_up, joint.q_dot_down) for joint in self.joints])
+        """Speeds at full command [m/s], (n, 2); by default they give q_dot_up and q_dot_down."""
+        given = self.column("cylinder_speed")
+        fastest = np.stack([self.column("q_dot_up"), self.column("q_dot_down")], axis=-1)
         opening = (self.pwm_limit / PWM_MAX - self.dead_zones) / (1 - self.dead_zones)
-        by_q_dot = fastest * self.column("cylinder_rod")[:, None] / opening
-        return np.where(given > 0, given, by_q_dot)
+        return np.where(given > 0, given, fastest * self.column("cylinder_rod")[:, None] / opening)
 
     @cached_property
     def encoder_step(self) -> NDArray[np.float64]:
@@ -189,7 +183,7 @@ class Machine:
 
     @lru_cache(maxsize=1024)  # noqa: B019
     def column(self, field: str) -> NDArray[np.float64]:
-        """One numeric `Joint` field over all joints, (n,), read-only."""
+        """One numeric field of all joints, (n,), or (n, 2) of pairs; read-only."""
         column = np.array([getattr(joint, field) for joint in self.joints], float)
         column.setflags(write=False)
         return column
@@ -218,13 +212,9 @@ def side(u: Array, pairs: ArrayLike) -> Array:
 
 
 def valve_opening(u: ArrayLike, dead_zones: ArrayLike) -> NDArray[np.floating]:
-    """Opening of valves in [-1, 1] under commands `u` (...): what lies beyond the dead zone.
+    """Opening of valves in [-1, 1], sign(u) max(0, (|u| - zone) / (1 - zone)) of commands u (...).
 
     `dead_zones` (..., 2) are up and down of each command. Paper: Sec. 3.3 (7 %)
-
-    Example:
-        >>> valve_opening([-1.0, 0.05, 0.535], (0.07, 0.07)).round(3)
-        array([-1. ,  0. ,  0.5])
     """
     u = as_floats(u)
     zone = side(u, dead_zones)
@@ -285,25 +275,21 @@ def limit_command(machine: Machine, u: ArrayLike) -> NDArray[np.floating]:
 def encode_pwm(u: ArrayLike) -> NDArray[np.uint8]:
     """Byte on the bus for a command `u` in [-1, 1] (...): m >= 0 -> m, m < 0 -> 255 - |m|.
 
-    ValueError: `u` outside [-1, 1]. Paper: Sec. 3.2 (the pairs 80/175 and 50/205 sum to 255)
+    Paper: Sec. 3.2 (the pairs 80/175 and 50/205 sum to 255). ValueError: `u` outside [-1, 1].
 
     Example:
         >>> encode_pwm(np.array([80, -80, 50, -50, 0]) / 127).tolist()
         [80, 175, 50, 205, 0]
     """
     u = np.asarray(u, float)
-    if not np.all(np.abs(u) <= 1):
-        raise ValueError(f"u: expected within [-1, 1], got {u[~(np.abs(u) <= 1)].flat[0]}")
+    require(bool((np.abs(u) <= 1).all()), "u", "within [-1, 1]", u.tolist())
     counts = np.rint(u * PWM_MAX).astype(int)
     return np.asarray(np.where(counts < 0, 255 + counts, counts), np.uint8)
 
 
 def decode_pwm(u_byte: ArrayLike) -> NDArray[np.float64]:
-    """Command in [-1, 1] for a byte (...); 0 and 255: idle. ValueError: no byte. Paper: Sec. 3.2"""
+    """Command in [-1, 1] for a byte (...); 0 and 255: idle. Paper: Sec. 3.2"""
     u_byte = np.asarray(u_byte).astype(int)
-    wrong = (u_byte < 0) | (u_byte > 255)
-    if wrong.any():
-        raise ValueError(f"u_byte: expected 0 to 255, got {u_byte[wrong].flat[0]}")
     return np.asarray(np.where(u_byte > PWM_MAX, u_byte - 255, u_byte) / PWM_MAX)
 
 

@@ -160,7 +160,7 @@ def policy_loss(ratio: Tensor, advantages: Tensor, clip: float) -> Tensor:
 
 
 def ppo_loss(agent: Agent, mb: dict[str, Tensor], config: PPOConfig) -> tuple[Tensor, Tensor]:
-    """Loss of a minibatch, and (5,) for the log: policy, value, entropy, KL, clip fraction."""
+    """Loss of a minibatch, and (4,) for the log: policy, value, KL, clip fraction."""
     newlogprob = log_probability(mb["actions"], agent.actor(mb["obs"]), agent.log_std)
     logratio = newlogprob - mb["logprobs"]
     ratio = logratio.exp()
@@ -170,15 +170,14 @@ def ppo_loss(agent: Agent, mb: dict[str, Tensor], config: PPOConfig) -> tuple[Te
     v_loss = torch.zeros(())
     if "returns" in mb:
         v_loss = ((agent.value(mb["obs"]) - mb["returns"]) ** 2 / agent.return_var).mean()
-    entropy = (agent.log_std + 0.5 * math.log(2 * math.pi * math.e)).sum()
-    loss = pg_loss + v_loss - config.entropy * entropy
+    loss = pg_loss + v_loss
     with torch.no_grad():
         approx_kl = ((ratio - 1) - logratio).mean()  # http://joschu.net/blog/kl-approx.html
         clipfrac = ((ratio - 1).abs() > config.clip).float().mean()
-    return loss, torch.stack([pg_loss, v_loss, entropy, approx_kl, clipfrac]).detach()
+    return loss, torch.stack([pg_loss, v_loss, approx_kl, clipfrac]).detach()
 
 
-def begin(env: VectorEnv[Any, Any, Any], config: Any, seed: int) -> Checkpoint:
+def begin(env: VectorEnv[Any, Any, Any], config: PPOConfig, seed: int) -> Checkpoint:
     """A new agent, its optimiser, and the first observations of the environment.
 
     ValueError: an environment that does not reset in the same step.
@@ -188,6 +187,7 @@ def begin(env: VectorEnv[Any, Any, Any], config: Any, seed: int) -> Checkpoint:
     torch.manual_seed(seed)
     obs_size = math.prod(env.single_observation_space.shape or ())
     agent = Agent(obs_size, math.prod(env.single_action_space.shape or ()), config.log_std)
+    agent.log_std.requires_grad_(config.log_std_end is None)
     optimizer = torch.optim.Adam(agent.parameters(), lr=config.learning_rate, fused=True)
     optimizer.param_groups[0]["initial_lr"] = config.learning_rate
     obs = torch.as_tensor(env.reset(seed=seed)[0], dtype=torch.float32)
@@ -211,7 +211,10 @@ def train(
     agent, optimizer, obs, global_step, update = start or begin(env, config, seed)
     group = optimizer.param_groups[0]
     while global_step < config.total_steps:
-        group["lr"] = group["initial_lr"] * (1 - global_step / config.total_steps)
+        done = global_step / config.total_steps
+        group["lr"] = group["initial_lr"] * (1 - done)
+        if config.log_std_end is not None:
+            agent.log_std.data.fill_(config.log_std + (config.log_std_end - config.log_std) * done)
         rollout, obs = collect(env, agent, obs, config.horizon)
         global_step += config.horizon * env.num_envs
         update += 1
@@ -237,7 +240,7 @@ def train(
                 optimizer.step()
                 parts.append(part)
 
-        names = ("policy_loss", "value_loss", "entropy", "approx_kl", "clipfrac")
+        names = ("policy_loss", "value_loss", "approx_kl", "clipfrac")
         means = torch.stack(parts).mean(dim=0).tolist()
         if not math.isfinite(sum(means)):
             raise ValueError(f"loss: expected finite numbers at step {global_step}, got {means}")

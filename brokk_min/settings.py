@@ -29,6 +29,6 @@ class PPOConfig:
     gamma: float = 0.9  # discount a tick: 0.9 looks 10 ticks ahead
     gae_lambda: float = 0.95  # weight of longer returns in the advantage
     clip: float = 0.2  # largest rewarded change of a probability ratio
-    entropy: float = 0.0  # coefficient of the entropy bonus
     max_grad_norm: float = 1.0  # gradients are scaled down to this norm
     log_std: float = -1.2  # log of the actions' deviation at the start
+    log_std_end: float | None = None  # at the end, linear in between; None: it is learned

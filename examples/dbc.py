@@ -24,18 +24,16 @@ def signal(name: str, start: int, length: int = 8, unit: str | None = None) -> S
 
 
 def dbc(machine: Machine) -> str:
-    """The text of a DBC file: valve frames, SYNC, NMT, positions and heartbeats."""
+    """The text of a DBC file: valve frame, SYNC, NMT, positions and heartbeats."""
     canopen.check_bus(machine)
     nodes = [*(re.sub(r"\W", "_", f"encoder_{name}") for name in machine.names), "valve_controller"]
+    valves = [signal(f"u_{name}", 8 * i) for i, name in enumerate(machine.names)]  # PWM bytes
+    valves += [signal("counter", 40), signal("checksum", 48), signal("enable", 56)]
     messages = [
         Message(canopen.NMT, "NMT", 2, [signal("command", 0), signal("node", 8)]),
         Message(canopen.SYNC, "SYNC", 0, []),
+        Message(machine.valve_frame_id, "valves", 8, valves, senders=["brokk_min"]),
     ]
-    for k, can_id in enumerate(canopen.valve_frame_ids(machine)):
-        names = machine.names[k * canopen.JOINTS_A_FRAME :][: canopen.JOINTS_A_FRAME]
-        signals = [signal(f"u_{name}", 8 * i) for i, name in enumerate(names)]  # m, or 255 - |m|
-        signals += [signal("counter", 40), signal("checksum", 48), signal("enable", 56)]
-        messages.append(Message(can_id, f"valves_{k + 1}", 8, signals, senders=["brokk_min"]))
     for name, node in zip(nodes, canopen.node_numbers(machine)):
         position, state = signal("position", 0, 32, "counts"), signal("state", 0)
         if name != nodes[-1]:

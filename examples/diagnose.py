@@ -7,7 +7,7 @@ are asked again with one term changed. Look first at the term after whose change
 """
 
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import combinations, groupby, product
 from pathlib import Path
@@ -16,16 +16,14 @@ from typing import NamedTuple
 import numpy as np
 
 from brokk_min.actuator import NetState, append_sample, initial_history
-from brokk_min.can.canopen import Frame
 from brokk_min.can.drive_log import Telemetry, read_frames, read_telemetry
 from brokk_min.cli.options import Command
 from brokk_min.env import measure
 from brokk_min.learning.policy import Policy, PolicyController, load_policy
-from brokk_min.machine import PWM_MAX, Array, Machine, require
+from brokk_min.machine import PWM_MAX, Array, Machine
 
 # Thresholds between sound drives and planted faults; all are assumed.
 CLEARLY = 0.89  # of the error that is left: then a changed term explains something
-CLEARLY_ANGLES = 0.7  # the same of changed angles, which also hide errors of inexact nets
 COMMAND_ERROR = 0.003  # of full command: smaller ones are the gate's and of rounding
 MOTION_ERROR = 0.05  # of the deviations of the velocities: smaller ones are of rounding
 AHEAD = 1.0  # s of a free run of the nets
@@ -43,14 +41,11 @@ class Term(NamedTuple):
     before: float  # error without the change
 
 
-def read_ticks(machine: Machine, frames: Iterable[Frame]) -> list[Telemetry]:
-    """The longest stretch of ticks with all positions. ValueError: it is too short."""
-    groups = groupby(read_telemetry(machine, frames), lambda tick: np.isfinite(tick.q).all())
-    longest = max((list(ticks) for complete, ticks in groups if complete), key=len, default=[])
-    least = machine.history + 3 * round(AHEAD * machine.rate)
-    driven = sum(tick.driving for tick in longest)
-    require(driven >= least, "log", f"{least} ticks of driving in a row", driven)
-    return longest
+def read_ticks(machine: Machine, log: Path) -> list[Telemetry]:
+    """The longest stretch of ticks with all positions."""
+    ticks = read_telemetry(machine, read_frames(log))
+    groups = groupby(ticks, lambda tick: np.isfinite(tick.q).all())
+    return max((list(ticks) for complete, ticks in groups if complete), key=len)
 
 
 def diagnose(machine: Machine, policy: Policy, ticks: list[Telemetry]) -> list[Term]:
@@ -64,19 +59,14 @@ def diagnose(machine: Machine, policy: Policy, ticks: list[Telemetry]) -> list[T
     history = measured_history(machine, q, u)
     names, changes = zip(("", np.array), *observation_changes(machine), strict=True)
     expected = expected_commands(machine, policy, ticks, [change(history) for change in changes])
-    error = partial(command_error, machine, ticks)
-    before, *errors = (error(commands) for commands in expected)
+    before, *errors = (command_error(machine, ticks, commands) for commands in expected)
     if before > COMMAND_ERROR:
-        rows = [*zip(names[1:], errors)]
-        rows += [(name, error(change(expected[0]))) for name, change in command_changes(machine)]
-        terms += [Term("commands", *row, before) for row in rows]
+        terms += [Term("commands", *row, before) for row in zip(names[1:], errors)]
     before = motion_error(machine, policy, q, u)
     if before > MOTION_ERROR:
-        error = partial(motion_error, machine, policy)
-        rows = [(name, error(q, change(u))) for name, change in command_changes(machine)]
-        angles = [(name, error(change(q), u)) for name, change in angle_changes(machine)]
-        rows += [row for row in angles if row[1] < CLEARLY_ANGLES * before]
-        terms += [Term("motion", *row, before) for row in rows]
+        for name, change in command_changes(machine):
+            error = motion_error(machine, policy, q, change(u))
+            terms.append(Term("motion", name, error, before))
     terms.sort(key=lambda term: term.error / term.before)
     return [term for term in terms if term.error < CLEARLY * term.before]
 
@@ -130,45 +120,31 @@ def delay(x: Array, ticks: int) -> Array:
     return np.concatenate([x[:1].repeat(ticks, axis=0), x[:-ticks]])
 
 
-def widen_zone(u: Array, more: float) -> Array:
-    """Commands as valves get them whose dead zone is wider by `more`."""
-    return np.asarray(np.sign(u) * np.maximum(np.abs(u) - more * (u != 0), 0))
-
-
 def joint_changes(machine: Machine, axes: int = 2) -> Changes:
     """Signs and orders of the driven joints: changes of arrays (T, n, ...) of some axes."""
     for i in machine.driven:
         sign = 1.0 - 2.0 * (np.arange(machine.n) == i)
-        yield (
-            f"sign of {machine.names[i]}",
-            partial(np.multiply, sign.reshape(-1, *[1] * (axes - 2))),
-        )
+        sign = sign.reshape(-1, *[1] * (axes - 2))
+        yield f"sign of {machine.names[i]}", partial(np.multiply, sign)
     for i, j in combinations(machine.driven, 2):
         order = np.arange(machine.n)
         order[[i, j]] = j, i
-        names = f"{machine.names[i]}, {machine.names[j]}"
-        yield f"order of {names}", partial(np.take, indices=order, axis=1)
+        name = f"order of {machine.names[i]}, {machine.names[j]}"
+        yield name, partial(np.take, indices=order, axis=1)
 
 
 def command_changes(machine: Machine) -> Changes:
     """Changes of commands (T, n): on their way, or within a machine."""
-    for name, change in joint_changes(machine):
-        yield f"{name} (command)", change
+    yield from joint_changes(machine)
     for factor in SCALES:
         yield f"scale of commands: {factor:g}", partial(np.multiply, factor)
     for ticks in (1, 2):
         yield f"delay: {1e3 * ticks * machine.dt:.0f} ms more", partial(delay, ticks=ticks)
     for more in (0.03, 0.06, -0.03):
-        yield f"dead zone: {more:+.2f}", partial(widen_zone, more=more)
-
-
-def angle_changes(machine: Machine) -> Changes:
-    """Changes of measured angles (T, n) back to what the nets know."""
-    middle = (machine.column("q_min") + machine.column("q_max")) / 2
-    for name, change in joint_changes(machine):
-        yield f"{name} (angle)", lambda q, change=change: middle + change(q - middle)
-    for factor in (*SCALES, 180 / np.pi):
-        yield f"scale of angles: {factor:.3g}", partial(np.multiply, 1 / factor)
+        yield (
+            f"dead zone: {more:+.2f}",
+            lambda u, more=more: np.sign(u) * np.maximum(np.abs(u) - more * (u != 0), 0),
+        )
 
 
 def observation_changes(machine: Machine) -> Changes:
@@ -180,8 +156,7 @@ def observation_changes(machine: Machine) -> Changes:
         both = np.float32(factor) ** (angle + velocity)
         yield f"scale of angles and velocities: {factor:.3g}", partial(np.multiply, both)
         yield f"scale of velocities (rate): {factor:.3g}", partial(np.multiply, factor**velocity)
-    for name, change in joint_changes(machine, axes=4):
-        yield f"{name} (observation)", change
+    yield from joint_changes(machine, axes=4)
     for i, zero in product(machine.driven, ZEROS):
         change = np.multiply.outer(zero * (np.arange(machine.n) == i), angle)
         yield f"zero of {machine.names[i]}: {zero:+.2f}", partial(np.add, change)
@@ -190,7 +165,7 @@ def observation_changes(machine: Machine) -> Changes:
 def main(log: str, policy: str, name: str = "brokk170") -> None:
     """Print the terms that explain most."""
     machine = Command(machine=name).find_machine()
-    ticks = read_ticks(machine, read_frames(Path(log)))
+    ticks = read_ticks(machine, Path(log))
     terms = diagnose(machine, load_policy(Path(policy), machine), ticks)
     print(f"{log}: {len(ticks)} ticks, {len(terms)} terms explain something")
     for term in terms[:5]:

@@ -1,8 +1,7 @@
-"""A demolition arm of seven joints at 100 Hz: its commands need two valve frames. Numbers assumed.
+"""A demolition arm of seven joints at 100 Hz. Numbers assumed.
 
 Slew, four links in one plane, a swing of the tool to the side, and a roll of the tool that the
-operator sets. Commands of the first five joints are in the frame `valve_frame_id`, of the other two
-in the frame of the next identifier.
+operator sets. Our valve frame has five joints, so `drive` needs another one for this machine.
 
     brokk-min collect --machine seven_joints.py:SEVEN_JOINTS --out log.npz
 """

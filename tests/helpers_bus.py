@@ -5,7 +5,6 @@ import json
 import os
 import time
 from collections import deque
-from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -27,8 +26,6 @@ from brokk_min.machine import BROKK_170
 
 MULTICAST = "239.74.163.2"
 START = (0.0, 0.5, 0.58, 1.71, 1.24)
-SIXTH = replace(BROKK_170.joints[4], name="q6", encoder_node=6)
-SIX = replace(BROKK_170, name="six joints", joints=(*BROKK_170.joints, SIXTH), q_start=())
 
 
 def baseline(machine):
@@ -110,7 +107,7 @@ class World:
         self.time = 0.0  # s
         self.recorder = Recorder()
         self.simulated = SimulatedMachine(machine, start, 0.0, self.recorder)
-        self.answers = deque(self.simulated.receive(Frame(0.0, 0x000, b"\x81\x00")))
+        self.answers = deque()
         self.upward = self.downward = unchanged
         self.noise = list  # foreign frames of the next millisecond
         self.syncs = []

@@ -5,7 +5,10 @@ from dataclasses import replace
 import numpy as np
 
 from brokk_min.actuator import ActuatorNet
+from brokk_min.beyond.strong_pid import StrongGains
+from brokk_min.evaluation import baselines
 from brokk_min.identification.logs import Recording, velocity_of
+from brokk_min.jacobian import Gains
 
 GAIN = 3.0  # of `obedient_net`
 POSE = np.array([1.5, 0.5, 0.58, 1.71, 1.24])  # the paper's q_s
@@ -76,7 +79,7 @@ def small_net(machine, rng, joints=(), rows=3):
 
 
 def obedient_net(machine):
-    """Nets whose velocity depends on the newest command alone, see `obedient_velocity`."""
+    """Nets whose velocity depends on the newest command u alone, a sigmoid of 3 u."""
     net = small_net(machine, np.random.default_rng(0))
     weights = [np.zeros_like(weight) for weight in net.weights]
     weights[0][:, -1, 0], weights[1][:, 0] = 1.0, 2.0  # u + 2, never cut by the ReLU
@@ -86,12 +89,6 @@ def obedient_net(machine):
     return replace(
         net, weights=tuple(weights), input_mean=mean, input_scale=scale, output_low=-net.output_high
     )
-
-
-def obedient_velocity(machine, u):
-    """What `obedient_net` says for commands `u` (..., n_driven), worked out by hand."""
-    fastest = 1.2 * machine.q_dot_max[machine.driven]
-    return fastest * (2 / (1 + np.exp(-GAIN * np.asarray(u, float))) - 1)
 
 
 def constant_net(velocity, logged, joints):
@@ -126,3 +123,23 @@ def closed_form(q):
         r, z = r + length * np.cos(e), z + length * np.sin(e)
         heights.append(z)
     return np.stack([r * np.cos(q1), r * np.sin(q1), z], -1), np.min(heights, axis=0)
+
+
+def pids(machine, net):
+    """All baselines with gains that take no trials."""
+    one, n = np.ones(1), np.ones(len(machine.driven))
+    pid = Gains(1.0 * n, 8.0 * n, 0.05 * n, 0.4 * one)
+    names = (baselines.RAW, baselines.BY_HAND, *baselines.PAPER_BASELINES)
+    more = 0.015 * one, 1.0 * one, 2.0 * one, 0.26 * one
+    strong = StrongGains(0.2 * n, 0.5 * n, 0.02 * n, 0.1 * one, *more)
+    return baselines.baselines(
+        machine, net, dict.fromkeys(names, pid) | {baselines.STRONGEST: strong}
+    )
+
+
+def one_by_one(calls, needs=None, scheduler=None):
+    """`jobs.side_by_side` in this process."""
+    done = {}
+    for name, call in calls.items():
+        done[name] = call(*(done[other] for other in (needs or {}).get(name, ())))
+    return done

@@ -17,6 +17,7 @@ WINGS = ["_files", "beyond", "identification", "learning", "evaluation", "can", 
 ORDER = [*METHOD, "hw", *WINGS, "__main__"]  # of the README: a module imports what stands before it
 BESIDE = {
     "hw": {"can.canopen", "can.connection", "can.safety_gate"},
+    "beyond.group_advantages": {"learning.episodes", "learning.gym_env"},  # its environment
     "learning.gym_env": {"viewer.drawing"},  # of `render`
 }
 MODULES = {".".join(p.relative_to(PACKAGE).with_suffix("").parts): p for p in PACKAGE.rglob("*.py")}

@@ -23,11 +23,12 @@ It plugs into `env.Interface`. Observation, with the mean and deviation of each 
 
 | Num     | Observation                                          | Deviation   | Weight |
 |---------|------------------------------------------------------|-------------|--------|
-| 0-6     | goal and measured velocity, angle of the locked joint | as in `env` | 1.4    |
-| 7-162   | angles, velocities, commands of the driven joints    | as in `env` | 0.277  |
+| 0-6     | goal and measured velocity, angle of the locked joint | as in `env` | 0.75   |
+| 7-110   | 13 angles, 13 velocities (a third) of each driven joint | as in `env` | 0.277 |
+| 111-162 | 13 commands of each driven joint                     | as in `env` | 0.277  |
 | 163-214 | `valve_nets.open_indicator` of these commands        | 0.5         | 0.277  |
-| 215-218 | joint velocities that give the goal (`jacobian.dls`) | uniform     | 4.2    |
-| 219-222 | joint motions that undo the error integral [rad]     | 0.1 uniform | 4.2    |
+| 215-218 | joint velocities that give the goal (`jacobian.dls`) | as in `env` | 1.5    |
+| 219-222 | joint motions that undo the error integral [rad]     | 0.1 of them | 1.5    |
 """
 
 from functools import lru_cache
@@ -97,16 +98,19 @@ def smooth_angles(machine: Machine, history: Array) -> Array:
 def observation_scale(machine: Machine) -> tuple[Array, Array]:
     """Mean and deviation / weight of the observation, float32 (obs,) both.
 
-    Each of H samples has the weight H^-0.5, so together they weigh as one number; the resolved
-    velocities weigh most, because nets learn first what is large.
+    Each of H samples has the weight H^-0.5, so together they weigh as one number, and velocities
+    have a third of that; the resolved velocities weigh most, because nets learn first what is
+    large.
     """
+    n, H, first = len(machine.driven), machine.history, 6 + len(machine.locked)
     mean, std = env.observation_scale(machine)
-    q_dot_std = (machine.q_dot_max / 3**0.5)[machine.driven]
-    opens = np.full(machine.history * len(machine.driven), 0.5)
-    first = 6 + len(machine.locked)
-    std = np.concatenate([std[:first] / 1.4, std[first:] * machine.history**0.5])
-    scale = [std, opens * machine.history**0.5, q_dot_std / 4.2, 0.1 * q_dot_std / 4.2]
-    mean = np.concatenate([mean, opens, 0 * q_dot_std, 0 * q_dot_std])
+    q_dot_std = env.velocity_deviations(machine)[1][machine.driven]
+    opens = np.full(n * H, 0.5)
+    weights = np.full(len(std), H**-0.5)
+    weights[:first] = 0.75
+    weights[first : first + 2 * n * H].reshape(n, 2, H)[:, 1] /= 3
+    scale = [std / weights, opens * H**0.5, q_dot_std / 1.5, 0.1 * q_dot_std / 1.5]
+    mean = np.concatenate([mean, opens, np.zeros(2 * n)])
     return mean.astype(np.float32), np.concatenate(scale, dtype=np.float32)
 
 

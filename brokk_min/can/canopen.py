@@ -31,11 +31,8 @@ HEARTBEAT_PERIOD = 0.050  # s, set in the encoders (assumed)
 SDO_TIMEOUT = 0.5  # s (assumed)
 MAX_FRAMES = 256  # read in a tick; with more the bus is flooded
 WATCHDOG = 0.150  # s without valid valve frame, then the controller closes the valves (assumed)
-JOINTS_A_FRAME = 5  # in a valve frame; joints 6 to 10 are in the frame of the next identifier
-# the operator's input is logged as frames that are never on the bus
-OPERATOR_CHANNEL = "operator"
-OPERATOR_INPUT = 0x7FF
-FASTEST_GOAL = 3.2767  # m/s, in 16 bits of 0.1 mm/s
+MOST_JOINTS = 5  # in a valve frame
+OPERATOR_INPUT = 0x7FF  # of the operator's input, which is in the log and never on the bus
 
 
 class Frame(NamedTuple):
@@ -45,7 +42,6 @@ class Frame(NamedTuple):
     id: int
     data: bytes
     sent: bool = False
-    channel: str = ""
 
 
 class Nodes:
@@ -54,7 +50,7 @@ class Nodes:
     def __init__(self, machine: Machine) -> None:
         nodes = node_numbers(machine)
         self.machine = machine
-        self.own_ids = (NMT, SYNC, *valve_frame_ids(machine))  # only this program sends them
+        self.own_ids = (NMT, SYNC, machine.valve_frame_id)  # only this program sends them
         self.received = self.others = 0  # frames of this tick; of them in `own_ids`, not sent
         self.position_index = {TPDO1 + node: i for i, node in enumerate(nodes[:-1])}
         self.heartbeat_index = {HEARTBEAT + node: i for i, node in enumerate(nodes)}
@@ -63,12 +59,10 @@ class Nodes:
         self.heartbeat = np.full(machine.n + 1, -np.inf)  # s, -inf: never
         self.nmt = np.zeros(machine.n + 1, int)
 
-    def listen(
-        self, bus: Any, end: float, busy_wait: float = 0.0, until_complete: bool = False
-    ) -> None:
+    def listen(self, bus: Any, end: float, until_complete: bool = False) -> None:
         """Read until `end` [s] and the bus is empty, or until every encoder has answered."""
         while self.received < MAX_FRAMES and not (until_complete and (self.frames > 0).all()):
-            frame = bus.recv(max(0.0, end - bus.now()), busy_wait)
+            frame = bus.recv(max(0.0, end - bus.now()))
             if frame is None:
                 return
             self.update(frame)
@@ -101,20 +95,17 @@ class Nodes:
 
 
 def check_bus(machine: Machine) -> None:
-    """ValueError: what the bus or its log cannot carry.
+    """ValueError: a machine that does not fit the bus.
 
-    Valve frames need identifiers of their own; ticks must be shorter than the watchdog; positions
-    have 26 bits and count from the middle of the range, so a range is less than a turn.
+    The valve frame has five joints and an identifier of its own; ticks must be shorter than the
+    watchdog; positions count from the middle of the range, so a range is less than a turn.
     """
-    nodes, ids = node_numbers(machine), valve_frame_ids(machine)
+    require(machine.n <= MOST_JOINTS, "joints", f"at most {MOST_JOINTS} on a bus", machine.n)
+    nodes, valves = node_numbers(machine), machine.valve_frame_id
     bases = (EMERGENCY, TPDO1, SDO_ANSWER, SDO_REQUEST, HEARTBEAT)
     others = {NMT, SYNC, OPERATOR_INPUT, *(base + node for base in bases for node in nodes)}
-    got = ", ".join(f"0x{i:03X}" for i in ids)
-    free = ids[-1] <= 0x7FF and not others & {*ids}
-    require(free, "valve_frame_id", "identifiers of no other frame", got)
-    bits, speed = machine.encoder_bits, machine.tool_speed
-    require(bits <= POSITION_BITS, "encoder_bits", f"at most {POSITION_BITS}", bits)
-    require(speed <= FASTEST_GOAL, "tool_speed", f"at most {FASTEST_GOAL}", speed)
+    free = valves < OPERATOR_INPUT and valves not in others
+    require(free, "valve_frame_id", "an identifier of no other frame", f"0x{valves:03X}")
     for joint in machine.joints:
         require(joint.kind == "revolute", f"{joint.name}.kind", "revolute on a bus", joint.kind)
         width = joint.q_max - joint.q_min
@@ -124,20 +115,9 @@ def check_bus(machine: Machine) -> None:
     require(machine.rate >= slowest, "rate", f"{slowest:g} Hz or more (watchdog)", machine.rate)
 
 
-def valve_frame_ids(machine: Machine) -> list[int]:
-    """CAN identifiers of the valve frames, one after another, each with up to five joints."""
-    return [machine.valve_frame_id + k for k in range(-(-machine.n // JOINTS_A_FRAME))]
-
-
 def node_numbers(machine: Machine) -> list[int]:
     """The encoders of the joints, and the valve controller at last."""
     return [*(joint.encoder_node for joint in machine.joints), machine.controller_node]
-
-
-def used_ids(machine: Machine) -> list[int]:
-    """CAN identifiers of all frames that concern the program that drives."""
-    nodes = [b + n for n in node_numbers(machine) for b in (TPDO1, SDO_ANSWER, HEARTBEAT)]
-    return [NMT, SYNC, *valve_frame_ids(machine), *nodes]
 
 
 def set_up_nodes(bus: Any, machine: Machine) -> None:
@@ -162,23 +142,21 @@ def sdo(
 ) -> int:
     """Read an object of a node by its index and subindex, or write `value` of `size` bytes to it.
 
-    ValueError: the node refuses, or does not answer.
+    ValueError: the node does not answer, or refuses.
     """
     command = 0x40 if value is None else 0x23 | (4 - size) << 2
     request = struct.pack("<BHBI", command, *address, value or 0)
-    where = "node {}: object 0x{:04X}:{:02X}: expected an answer".format(node, *address)
     bus.send(SDO_REQUEST + node, request)
-    end = bus.now() + SDO_TIMEOUT
-    while bus.now() < end and (frame := bus.recv(max(0.0, end - bus.now()))):
-        other = frame.id != SDO_ANSWER + node or frame.data[1:4] != request[1:4]
-        if other or len(frame.data) != 8:
-            continue
-        command, answer = struct.unpack("<B3xI", frame.data)
-        if command == 0x80:
-            raise ValueError(f"{where}, got SDO abort 0x{answer:08X}")
-        unused = command >> 2 & 3  # of four bytes
-        return int(answer & (1 << 8 * (4 - unused)) - 1)
-    raise ValueError(f"{where} within {SDO_TIMEOUT} s, got none")
+    got, end = "none", bus.now() + SDO_TIMEOUT
+    while got == "none" and bus.now() < end and (frame := bus.recv(max(0.0, end - bus.now()))):
+        own = frame.id == SDO_ANSWER + node and frame.data[1:4] == request[1:4]
+        if own and len(frame.data) == 8:
+            command, answer = struct.unpack("<B3xI", frame.data)
+            if command != 0x80:
+                return int(answer)
+            got = f"SDO abort 0x{answer:08X}"
+    what = "node {}: object 0x{:04X}:{:02X}".format(node, *address)
+    raise ValueError(f"{what}: expected an answer within {SDO_TIMEOUT} s, got {got}")
 
 
 def encoder_counts(machine: Machine, raw: ArrayLike) -> Array:
@@ -213,43 +191,20 @@ def checksum(frame: ArrayLike) -> Array:
 def valve_frame(command: ArrayLike, counter: ArrayLike, enable: ArrayLike) -> Array:
     """Bytes (..., 8): five PWM bytes, counter, checksum, enable.
 
-    `command` [counts of 127] is (..., n). ValueError: n > 5. Paper: Sec. 3.2 (PWM bytes)
+    `command` [counts of 127] is (..., n) with n at most 5. Paper: Sec. 3.2 (PWM bytes)
     """
     command = np.asarray(command)
-    n = command.shape[-1]
-    require(n <= JOINTS_A_FRAME, "command", f"at most {JOINTS_A_FRAME} joints", n)
     frame = np.zeros((*command.shape[:-1], 8), np.uint8)
-    frame[..., :n] = encode_pwm(command / PWM_MAX)
+    frame[..., : command.shape[-1]] = encode_pwm(command / PWM_MAX)
     frame[..., 5] = counter
     frame[..., 7] = enable
     frame[..., 6] = checksum(frame[..., [0, 1, 2, 3, 4, 5, 7]])
     return frame
 
 
-def valve_frames(command: ArrayLike, counter: ArrayLike, enable: ArrayLike) -> Array:
-    """The valve frames (..., frames, 8) of a tick, each with five of the commands (..., n)."""
-    command = np.asarray(command)
-    parts = np.split(command, range(JOINTS_A_FRAME, command.shape[-1], JOINTS_A_FRAME), axis=-1)
-    return np.stack([valve_frame(part, counter, enable) for part in parts], axis=-2)
-
-
-class ValveFrames:
-    """What the newest valve frames say: commands u (n,), and the enable byte of each frame."""
-
-    def __init__(self, machine: Machine) -> None:
-        self.ids = valve_frame_ids(machine)
-        self.u = np.zeros(machine.n)
-        self.enable = np.zeros(len(self.ids), bool)
-
-    def update(self, frame: Frame) -> bool:
-        """Take in one frame; was it the last valve frame of a tick?"""
-        if frame.id not in self.ids or len(frame.data) != 8:
-            return False
-        k = self.ids.index(frame.id)
-        part = self.u[k * JOINTS_A_FRAME : (k + 1) * JOINTS_A_FRAME]
-        part[:] = decode_pwm(list(frame.data[: len(part)]))
-        self.enable[k] = frame.data[7] == 1
-        return frame.id == self.ids[-1]
+def read_valve_frame(machine: Machine, data: bytes) -> tuple[Array, bool]:
+    """Commands u (n,) in [-1, 1] and enable of the eight bytes of a valve frame."""
+    return decode_pwm(list(data[: machine.n])), data[7] == 1
 
 
 class OperatorInput(NamedTuple):

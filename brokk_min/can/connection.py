@@ -1,17 +1,16 @@
 """The CAN bus through python-can, and its log; python-can is imported when a bus is opened."""
 
-import select
 import signal
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from brokk_min._files import brief, require_package
-from brokk_min.can.canopen import OPERATOR_CHANNEL, OPERATOR_INPUT, Frame
+from brokk_min.can.canopen import OPERATOR_INPUT, Frame
 
 
 @dataclass
@@ -22,7 +21,6 @@ class Bus:
     writer: Any = None  # python-can's candump writer
     name: str = "can"  # of the bus in the log
     echo: bool = False  # does the bus give back what we send?
-    file: int = -1  # descriptor to wait on; -1: `bus` waits itself
     clock: Callable[[], float] = time.monotonic  # s
     sleep: Callable[[float], object] = time.sleep
 
@@ -36,14 +34,9 @@ class Bus:
         """Time of day at the start plus monotonic time since [s], in whole microseconds."""
         return round(self.start + self.clock(), 6)
 
-    def recv(self, timeout: float, busy_wait: float = 0.0) -> Frame | None:
-        """The next frame within `timeout` [s], or None; it sleeps only after `busy_wait` [s]."""
-        end = self.clock() + timeout
-        message = self.bus.recv(timeout if self.file < 0 else 0.0)
-        # python-can's own timeout follows the time of day, so we wait for the descriptor
-        while message is None and self.file >= 0 and (left := end - self.clock()) > 0:
-            if select.select([self.file], [], [], left if left <= timeout - busy_wait else 0.0)[0]:
-                message = self.bus.recv(0.0)
+    def recv(self, timeout: float) -> Frame | None:
+        """The next frame within `timeout` [s], or None."""
+        message = self.bus.recv(timeout)
         if message is None:
             return None
         now, data = self.now(), bytes(message.data)
@@ -64,7 +57,7 @@ class Bus:
     def log_input(self, data: bytes) -> float:
         """Log the operator's input, which is not on the bus; the time of it [s]."""
         now = self.now()
-        self._log(self._message(OPERATOR_INPUT, data), now, OPERATOR_CHANNEL)
+        self._log(self._message(OPERATOR_INPUT, data), now, "operator")
         return now
 
     def flush(self) -> None:
@@ -93,29 +86,22 @@ class Bus:
 
 
 @contextmanager
-def open_bus(
-    interface: str, channel: str, log: Path | None = None, ids: Sequence[int] = ()
-) -> Iterator[Bus]:
+def open_bus(interface: str, channel: str, log: Path | None = None) -> Iterator[Bus]:
     """A bus by python-can's names, closed at the end of the block; `log` grows while it runs.
 
-    Kernel or adapter keep away frames of other identifiers than `ids`; empty: all frames come.
     ValueError: python-can is not installed, finds no such bus, or fails in the block.
     """
     can = require_package("can", "hw")
     can.log.setLevel("ERROR")  # it also warns of a bus that it could not open
     where = f"{interface} {channel}: expected a CAN bus"
-    filters = [{"can_id": i, "can_mask": 0x7FF, "extended": False} for i in ids]
     try:
-        raw = can.Bus(interface=interface, channel=channel, can_filters=filters or None)
+        raw = can.Bus(interface=interface, channel=channel)
     except Exception as error:  # each interface has its own
         raise ValueError(f"{where}, got {brief(error)}") from error
     name = channel if interface == "socketcan" else interface
     writer = can.CanutilsLogWriter(log) if log else None
-    bus = Bus(raw, writer, name, echo=interface == "udp_multicast")
-    with suppress(NotImplementedError):  # python-can's word for a bus without a descriptor
-        bus.file = raw.fileno()
     try:
-        with closing(bus):
+        with closing(Bus(raw, writer, name, echo=interface == "udp_multicast")) as bus:
             yield bus
     except can.CanError as error:
         raise ValueError(f"{where} that works, got {brief(error)}") from error

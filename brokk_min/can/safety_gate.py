@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brokk_min.can.canopen import OPERATIONAL, Array, valve_frames
+from brokk_min.can.canopen import OPERATIONAL, Array, valve_frame
 from brokk_min.machine import PWM_MAX, Machine
 
 # all assumed
@@ -113,7 +113,7 @@ def gate_start(machine: Machine, shape: tuple[int, ...] = ()) -> GateState:
 def gate(
     machine: Machine, state: GateState, inputs: GateInputs, now: ArrayLike
 ) -> tuple[GateState, Array]:
-    """Next state, and valve frames (..., k, 8) to send if it was `armed_once`. Paper: Sec. 2
+    """Next state, and the valve frame (..., 8) to send if it was `armed_once`. Paper: Sec. 2
 
     A rising edge of the dead-man switch at zero goal, without any fault, arms the gate. Any fault,
     or the switch released, closes the valves until the next such edge. `now` [s] (...) is on the
@@ -142,7 +142,7 @@ def gate(
         place=place,
         motion=motion,
     )
-    return state, valve_frames(command, counter, driving)
+    return state, valve_frame(command, counter, driving)
 
 
 def limit_slew(machine: Machine, state: GateState, inputs: GateInputs) -> Array:

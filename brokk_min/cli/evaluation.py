@@ -6,21 +6,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from brokk_min._files import SHIPPED, write_json
+from brokk_min._files import write_json
 from brokk_min.actuator import ActuatorNet, Plant
 from brokk_min.cli.options import Command, PlantName, check, default_policy, find_plant
 from brokk_min.evaluation import baselines, metrics, sequences
-from brokk_min.evaluation.rollout import TITLES
+from brokk_min.evaluation.rollout import TITLES, valves_at_rest
 from brokk_min.learning.policy import POLICIES, PolicyController, load_policy
 from brokk_min.machine import Array, Machine
-from brokk_min.settings import TaskConfig
 
 COLUMNS = {  # of the table, with their heads
     "velocity_error_mean": "error [m/s]",
     "off_axis_drift_max": "drift [m]",
     "jerk_rms": "jerk [m/s^3]",
     "valve_travel": "travel [1]",
-    "time_at_limits": "at a stop [s]",
 }
 
 
@@ -33,34 +31,29 @@ class Evaluate(Command):
     starts: Path | None = None  # Start poses, CSV: one column per joint [rad].
     plant: PlantName = "analytic"  # What moves: analytic, net, or an object of your file.
     json: Path | None = None  # Also write all runs here.
-    gains: Path | None = None  # Tuned gains; by default gains.json in the folder of POLICY.
-    save_gains: Path | None = None  # Write the gains that are tuned now, for --gains and `drive`.
+    gains: Path | None = None  # Gains; by default gains.json in the folder of POLICY, or tuned now.
+    save_gains: Path | None = None  # Tune the PIDs anew, and write their gains here.
     num_starts: int = 16  # Without --starts: how many of the machine's.
-    noise: float = TaskConfig.noise  # Sensor noise [deviations]; 0: encoders only.
     seed: int = 0  # Of the noise, and of what is drawn and tuned.
 
     def __call__(self) -> None:
         machine = self.find_machine()
         self.writes(self.json, self.save_gains)
         check(self.num_starts > 0, "--num-starts", "1 or more", self.num_starts)
-        check(0 <= self.noise <= 1, "--noise", "0 to 1", self.noise)
+        check(not (self.gains and self.save_gains), "--save-gains", "no --gains", self.gains)
         path, gains = default_policy(machine, self.policy, self.gains)
-        if self.noise != TaskConfig.noise:
-            gains = self.gains  # others were tuned with more noise
-        fits = not (gains and self.save_gains)
-        check(fits, "--save-gains", "gains to tune", f"tuned ones in {gains}")
-        controllers = self.policies(machine, path)
-        net = controllers["rl"].policy.net
+        gains = None if self.save_gains else gains
+        policies = self.policies(machine, path)
+        net = policies["rl"].policy.net
         plant = net if self.plant == "net" else find_plant(self.plant, machine)
-        pids = self.pids(machine, net, plant, gains)
-        runs, _ = metrics.evaluate(
-            machine, controllers | pids, *self.task(machine), self.seed, plant, noise=self.noise
-        )
+        controllers = policies | self.pids(machine, net, plant, gains)
+        task = self.task(machine)
+        runs, _ = metrics.evaluate(machine, controllers, *task, self.seed, plant)
         if self.json:
-            used: dict[str, Any] = {"policy": path, "plant": self.plant}
-            used["gains"] = gains or "tuned now"
+            used: dict[str, Any] = {"policy": path, "gains": gains or "tuned now"}
             used |= {"commands": self.commands or "own", "starts": self.starts or self.num_starts}
-            meta = {key: str(value) for key, value in used.items()} | {"noise": self.noise}
+            used["plant"] = self.plant
+            meta = {key: str(value) for key, value in used.items()}
             meta |= metrics.metadata(machine, self.seed)
             write_json(self.json, {"meta": meta, "runs": runs})
         print(table(runs))
@@ -75,12 +68,15 @@ class Evaluate(Command):
         return commands, starts
 
     def policies(self, machine: Machine, path: Path) -> dict[str, Any]:
-        """The policy of a file, and the package's paper policy beside the package's own one."""
-        paths = {"rl": path}
-        other = SHIPPED / machine.name / POLICIES["rl_paper"]
-        if not self.policy and other.exists():
-            paths["rl_paper"] = other
-        return {n: PolicyController(machine, load_policy(p, machine)) for n, p in paths.items()}
+        """The policy of a file, and by default those of the paper's agent beside it."""
+        files = {"rl": path}
+        if not self.policy:
+            files |= {name: path.with_name(file) for name, file in POLICIES.items()}
+        return {
+            name: PolicyController(machine, load_policy(file, machine))
+            for name, file in files.items()
+            if file.exists() or name == "rl"
+        }
 
     def pids(
         self, machine: Machine, net: ActuatorNet, plant: Plant, gains: Path | None
@@ -89,10 +85,16 @@ class Evaluate(Command):
         print(f"gains of the baselines: {gains or 'tuned now'}", file=sys.stderr)
         if gains:
             return {**baselines.read_gains(gains, machine, net)}
-        budget = (baselines.TUNING_RUNS, baselines.GENERATIONS, self.seed)
-        tuned, _ = baselines.tune_baselines(machine, net, *budget, self.noise, plant)
+        effort = baselines.GENERATIONS, baselines.TUNING_RUNS, baselines.TUNING_SECONDS
+        how: Any = {"effort": effort, "seed": self.seed}
+        gains_of = baselines.first_gains(machine, plant)
+        first = baselines.baselines(machine, net, gains_of)
+        for name in baselines.TUNED:
+            gains_of[name], _ = baselines.tune_baseline(first[name], plant=plant, **how)
+        tuned = baselines.baselines(machine, net, gains_of)
         if self.save_gains:
-            baselines.write_gains(self.save_gains, tuned, baselines.gains_metadata(machine, net))
+            meta = how | {"plant": self.plant} | baselines.gains_metadata(machine, net)
+            baselines.write_gains(self.save_gains, tuned, meta)
         return {**tuned}
 
 
@@ -102,10 +104,10 @@ def table(runs: Sequence[metrics.Run]) -> str:
     runs = [run for run in runs if run["kind"] == kind]
     num, motions = (len(metrics.column(runs, label)) for label in ("start", "sequence"))
     lines = [f"means over {motions} sequences from {num} {kind} starts"]
-    lines.append(f"{'':26}" + "".join(f"{head:>15}" for head in COLUMNS.values()))
+    lines.append(f"{'':26}{'valves at rest':>15}" + "".join(f"{c:>15}" for c in COLUMNS.values()))
     for name, rows in metrics.means(runs).items():
         cells = (f"{rows['all'][key]['mean']:15.4g}" for key in COLUMNS)
-        lines.append(f"{TITLES[name]:26}" + "".join(cells))
+        lines.append(f"{TITLES[name]:26}{valves_at_rest(name):>15}" + "".join(cells))
     return "\n".join(lines)
 
 

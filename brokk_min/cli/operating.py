@@ -8,7 +8,6 @@ import numpy as np
 from tyro.conf import Positional
 
 from brokk_min import hw
-from brokk_min.can.canopen import used_ids
 from brokk_min.can.connection import open_bus
 from brokk_min.can.operator_input import JointJog, Joystick, Script
 from brokk_min.can.safety_gate import fault_name
@@ -45,12 +44,11 @@ class Drive(Command):
 
     interface: str  # python-can's name of the bus: socketcan, udp_multicast, ...
     channel: str  # Channel of the interface: can0, 239.74.163.2, ...
-    policy: Path | None = None  # Policy that `train` wrote; by default the package's.
+    policy: Path | None = None  # Policy that `train` wrote, with gains.json beside it.
     command: str = "joystick"  # Or velocity sequences, CSV: sequence,time,vx,vy,vz [s, m/s].
-    controller: Literal["rl", "jacobian", "jog"] = "rl"  # Policy, the paper's PID, one joint.
-    joint: str = ""  # Joint that jogs, forward and backward with x; by default the first driven.
+    controller: Literal["rl", "jacobian", "jog"] = "rl"  # Policy, optimised PID, one joint.
+    joint: str = ""  # Joint that jogs, forward and backward with x.
     counts: int = 12  # Its command, of 127; a little beyond the dead zone.
-    gains: Path | None = None  # Tuned gains; by default gains.json in the folder of POLICY.
     axes: tuple[int, int, int] = (1, 0, 4)  # Axes of the joystick for x, y and z.
     button: int = 5  # Button of the joystick that must be held.
     log: Path | None = None  # Also log every frame here, candump format.
@@ -59,7 +57,7 @@ class Drive(Command):
         machine = self.find_machine()
         self.writes(self.log)
         controller, operator = self.find_controller(machine), self.find_operator(machine)
-        with open_bus(self.interface, self.channel, self.log, used_ids(machine)) as bus:
+        with open_bus(self.interface, self.channel, self.log) as bus:
             drive = hw.Drive(machine, controller, bus, operator)
             drive.begin()
             drive.run(lambda drive: print(status(drive), flush=True))
@@ -70,11 +68,9 @@ class Drive(Command):
         """The controller that is named."""
         if self.controller == "jog":
             driven = [machine.names[i] for i in machine.driven]
-            joint, most = self.joint or driven[0], machine.pwm_limit
-            check(joint in driven, "--joint", f"a driven one of {driven}", joint)
-            check(0 < self.counts <= most, "--counts", f"1 to {most}", self.counts)
-            return JointJog(machine, joint, self.counts)
-        rl, pid = find_controllers(machine, self.policy, self.gains)
+            check(self.joint in driven, "--joint", f"one of {driven}", self.joint)
+            return JointJog(machine, self.joint, self.counts)
+        rl, pid = find_controllers(machine, self.policy)
         return rl if self.controller == "rl" else pid
 
     def find_operator(self, machine: Machine) -> Joystick | Script:
@@ -85,11 +81,9 @@ class Drive(Command):
         return Script(machine, np.concatenate(goals))
 
 
-def find_controllers(
-    machine: Machine, policy: Path | None, gains: Path | None
-) -> tuple[Controller, Controller]:
-    """The policy, and the paper's PID with tuned gains, or without a file with those by hand."""
-    path, gains = default_policy(machine, policy, gains)
+def find_controllers(machine: Machine, policy: Path | None) -> tuple[Controller, Controller]:
+    """The policy, and the optimised PID, or without a file of gains that by hand."""
+    path, gains = default_policy(machine, policy, None)
     found = load_policy(path, machine)
     print(f"gains of the Jacobian controller: {gains or 'set by hand'}")
     known = read_gains(gains, machine, found.net) if gains else baselines(machine, found.net)
@@ -98,35 +92,31 @@ def find_controllers(
 
 def status(drive: hw.Drive) -> str:
     """One line: state, faults, goal and measured tool velocity [m/s], angles [rad], lateness."""
-    state = "waiting" if drive.gate.active_fault else "ready"
-    state = "driving" if drive.gate.driving else state
-    reason = f" {drive.reason}" if drive.reason else ""
     active = fault_name(drive.machine, int(drive.gate.active_fault))
-    reason += f", now {active}" if active not in drive.reason else ""  # what is in the way
+    words = ["driving" if drive.gate.driving else "waiting" if active else "ready", drive.reason]
+    words += [f"now {active}"] if active not in drive.reason else []  # what is in the way
     vectors = {"v goal": drive.operator_input.v_goal}
     if measured := drive.measured:
         vectors |= {"measured": measured.v_tool[0], "q": measured.q[0]}
-    texts = (f"{name} {' '.join(f'{x:+.2f}' for x in row)}" for name, row in vectors.items())
-    late = f"late {1e3 * drive.lateness:.1f} ms, skipped {drive.skipped}"
-    return f"{state}{reason} {' '.join(texts)} {late}"
+    words += [f"{name} {' '.join(f'{x:+.2f}' for x in row)}" for name, row in vectors.items()]
+    words += [f"late {1e3 * drive.lateness:.1f} ms, skipped {drive.skipped}"]
+    return ", ".join(filter(None, words))
 
 
 @dataclass(kw_only=True)
 class Play(Command):
     """Drive a simulated machine with keyboard or gamepad in a window; see docs/play.md."""
 
-    policy: Path | None = None  # Policy that `train` wrote; by default the package's.
-    gains: Path | None = None  # Tuned gains; by default gains.json in the folder of POLICY.
-    start: tuple[float, ...] = ()  # First angles [rad]; by default the paper's, or mid-range.
+    policy: Path | None = None  # Policy that `train` wrote, with gains.json beside it.
     plant: str = "analytic"  # What moves, or FILE.py:NAME.
 
     def __call__(self) -> None:
         from brokk_min.viewer.play import play
 
         machine = self.find_machine()
-        rl, pid = find_controllers(machine, self.policy, self.gains)
+        rl, pid = find_controllers(machine, self.policy)
         controllers = {TITLES["rl"]: rl, TITLES[PID]: pid}
-        play(machine, controllers, self.start, find_plant(self.plant, machine))
+        play(machine, controllers, find_plant(self.plant, machine))
 
 
 @dataclass(kw_only=True)

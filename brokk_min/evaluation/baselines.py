@@ -1,7 +1,7 @@
 """The classical controllers that the policy is compared with: gains, tuning, and files of gains."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, fields, replace
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,18 +19,18 @@ from brokk_min.jacobian import Gains, JacobianController, manipulability_thresho
 from brokk_min.machine import Array, Machine
 from brokk_min.settings import TaskConfig
 
-PAPER_BASELINES = ("jacobian_pid_k0.1", "jacobian_pid_k0.05")
+BY_HAND, RAW = "pid_by_hand", "pid_by_hand_raw"
+OPTIMISED = "jacobian_pid_k0.1"
+PAPER_BASELINES = (OPTIMISED, "jacobian_pid_k0.05")
 STRONGEST = "jacobian_pid_ff_integral"
-TUNED = ("jacobian_pid_k0.1", "jacobian_pid_ff", STRONGEST)  # the second gets the first one's gains
-TUNING_RUNS = 10  # of the whole chain and of `evaluate`, assumed
-TUNING_SECONDS = 20.0  # of each run
-FRESH_RUNS = 4  # times as many, on which the better of the gains found are chosen
-GENERATIONS = 10
-CANDIDATES = 24
+TUNED = (OPTIMISED, STRONGEST)  # by `tune`
+GENERATIONS, TUNING_RUNS, TUNING_SECONDS = 40, 10, 20.0  # effort of tuning, assumed
+CANDIDATES = 24  # of each generation
 SPREAD = 0.12  # of the first candidates, as a fraction of the roots of the ranges, assumed
+OVERSHOOT = 0.2  # of a step of velocity, that tuning by hand allows
 RANGES = {  # that `tune` searches (assumed); each driven joint has its own kp, ki and kd
     "kp": (0.0, 4.0),  # valve opening per rad/s
-    "ki": (0.0, 12.0),  # valve opening per rad
+    "ki": (0.0, 30.0),  # valve opening per rad
     "kd": (0.0, 0.3),  # valve opening per rad/s^2
     "feedback": (0.01, 1.0),  # K = feedback * I of eq3, positive definite
     "min_opening": (0.0, 0.06),  # least valve opening
@@ -40,20 +40,96 @@ RANGES = {  # that `tune` searches (assumed); each driven joint has its own kp, 
 }
 
 
-def baselines(machine: Machine, net: ActuatorNet) -> dict[str, JacobianController]:
-    """The paper's two baselines and two stronger ones, with gains by hand. Paper: Sec. 4.2"""
+def baselines(
+    machine: Machine, net: ActuatorNet, gains: Mapping[str, Any] | None = None
+) -> dict[str, JacobianController]:
+    """PIDs with the paper's structure, and the strongest, by default with `first_gains`.
+
+    The raw one does not compensate the dead zone, of which the paper says nothing. The paper's two
+    have the same gains, because their damping k differs near singularities alone. Paper: Sec. 4.2
+    """
     w0 = manipulability_threshold(machine)
-    one, n = np.ones(1), np.ones(len(machine.driven))
-    pid = Gains(1.0 * n, 8.0 * n, 0.05 * n, 0.4 * one)
-    mild = StrongGains(0.2 * n, 0.5 * n, 0.02 * n, 0.1 * one, 0.015 * one, *[0.0 * one] * 3)
-    more = {"integral_feedback": 1.0 * one, "start_boost": 2.0 * one, "start_time": 0.26 * one}
-    feedforward = static_map(machine, net)
+    gains = gains or first_gains(machine)
     return {
-        "jacobian_pid_k0.1": JacobianController(machine, pid, 0.1, w0),
-        "jacobian_pid_k0.05": JacobianController(machine, pid, 0.05, w0),
-        "jacobian_pid_ff": StrongPID(machine, mild, 0.1, w0, feedforward),
-        STRONGEST: StrongPID(machine, replace(mild, **more), 0.1, w0, feedforward),
+        RAW: JacobianController(with_dead_zone(machine, 0), gains[RAW], 0.1, w0),
+        BY_HAND: JacobianController(machine, gains[BY_HAND], 0.1, w0),
+        OPTIMISED: JacobianController(machine, gains[OPTIMISED], 0.1, w0),
+        PAPER_BASELINES[1]: JacobianController(machine, gains[OPTIMISED], 0.05, w0),
+        STRONGEST: StrongPID(machine, gains[STRONGEST], 0.1, w0, static_map(machine, net)),
     }
+
+
+def first_gains(machine: Machine, plant: Plant = PLANT) -> dict[str, Any]:
+    """Gains by hand, and those from which `tune` begins."""
+    one, n = np.ones(1), np.ones(len(machine.driven))
+    pid = gains_by_hand(machine, machine, plant)
+    few = {"kp": 0.2 * n, "ki": 0.5 * n, "kd": 0.02 * n, "feedback": 0.1 * one}
+    few |= {"min_opening": 0.015 * one, "integral_feedback": 1.0 * one}
+    return {
+        RAW: gains_by_hand(machine, with_dead_zone(machine, 0), plant),
+        BY_HAND: pid,
+        OPTIMISED: replace(pid, kd=0.05 * n),
+        STRONGEST: StrongGains(**few, start_boost=2.0 * one, start_time=0.26 * one),
+    }
+
+
+def with_dead_zone(machine: Machine, zone: float) -> Machine:
+    """The machine with one dead zone for all joints, both ways."""
+    joints = tuple(replace(joint, dead_zone=(zone, zone)) for joint in machine.joints)
+    return replace(machine, joints=joints)
+
+
+@dataclass(frozen=True)
+class JointStep(JacobianController):
+    """The PIDs of the joints in a step trial: a joint is to move, and then to stand."""
+
+    q_dot_goal: Array  # of the driven joints [rad/s], (num, n_driven)
+
+    def joint_velocities(self, v: Array, q: Array, last: Array) -> Array:
+        """The joint's velocity while the goal of the tool `v` is not zero."""
+        return self.q_dot_goal * v.any(axis=-1, keepdims=True)
+
+
+def gains_by_hand(machine: Machine, known: Machine, plant: Plant = PLANT) -> Gains:
+    """Gains by one rule of thumb, joint by joint, from step trials on the plant.
+
+    A step goes from rest amid all ranges to a third of the joint's fastest motion up, or down, for
+    2 s, and back to rest. P is raised until a velocity overshoots by 20 %, and halved; then I is
+    raised as long as none overshoots by more. There is no D. `known` is what the controller takes
+    for the machine.
+    """
+    trial = partial(overshoots, machine, known, plant)
+    n = len(machine.driven)
+    tried = np.tile(np.geomspace(0.05, 50, 70)[:, None], n)  # 10 % apart
+    kp = largest(tried, trial(tried, 0 * tried)) / 2
+    ki = largest(tried, trial(0 * tried + kp, tried))
+    return Gains(kp, ki, 0 * kp, np.full(1, 0.4))
+
+
+def largest(gains: Array, over: Array) -> Array:
+    """Of rising gains (rows, n) the last before one overshoots by more than allowed, (n,)."""
+    fits = np.cumsum(over > OVERSHOOT, axis=0) == 0
+    return np.asarray(np.max(np.where(fits, gains, gains[0]), axis=0))
+
+
+def overshoots(machine: Machine, known: Machine, plant: Plant, kp: Array, ki: Array) -> Array:
+    """Overshoot of a step of each joint alone, as a fraction of it, by gains (rows, n_driven)."""
+    driven, rows = machine.driven, len(kp)
+    one = np.eye(len(driven))[:, None]  # the joint that moves
+    fastest = np.stack([machine.column("q_dot_up"), -machine.column("q_dot_down")])[:, driven]
+    goal = fastest[..., None, None] / 3 * np.broadcast_to(one, (len(driven), rows, len(driven)))
+    num = goal[..., 0].size
+    p, i, d = (np.broadcast_to(x * one, goal.shape).reshape(num, -1) for x in (kp, ki, 0 * kp))
+    gains = Gains(p, i, d, np.zeros((num, 1)))
+    step = JointStep(known, gains, 0.0, 1.0, goal.reshape(num, -1))
+    middle = np.tile((machine.column("q_min") + machine.column("q_max")) / 2, (num, 1))
+    ticks = round(2 * machine.rate)
+    goals = np.repeat([1.0, 0.0], ticks)[:, None, None] * np.ones((num, 3))  # move, stand
+    trace = rollout(machine, step, middle, goals, 0.0, np.random.default_rng(0), plant)
+    moved = trace.q_dot[..., driven].reshape(-1, *goal.shape)
+    velocity = np.einsum("tdjrj->tdrj", moved) / (fastest[:, None] / 3)
+    over = np.maximum(velocity.max(axis=0) - 1, -velocity[ticks:].min(axis=0))
+    return np.asarray(over.max(axis=0))
 
 
 def gains_vector(gains: Gains) -> Array:
@@ -75,11 +151,10 @@ def gain_bounds(gains: Gains) -> Array:
 
 def tuning_cost(
     controller: JacobianController,
-    vectors: Array,
     runs: tuple[Array, Array],
     seed: int,
-    noise: float,
-    plant: Plant = PLANT,
+    plant: Plant,
+    vectors: Array,
 ) -> Array:
     """Mean |v_goal - v_tool| [m/s] with each row of gains, `vectors` (rows, size): (rows,).
 
@@ -91,7 +166,7 @@ def tuning_cost(
     start, goals = np.tile(start, (rows, 1)), np.tile(goals, (1, rows, 1))
     rng = np.random.default_rng(seed)
     batch = replace(controller, gains=every)
-    trace = rollout(controller.machine, batch, start, goals, noise, rng, plant)
+    trace = rollout(controller.machine, batch, start, goals, TaskConfig.noise, rng, plant)
     error = np.linalg.norm(goals - trace.v_tool, axis=-1)  # (T, rows * num)
     return np.asarray(error.mean(axis=0).reshape(rows, num).mean(axis=1))
 
@@ -103,22 +178,18 @@ def tune(
 
     SciPy's differential evolution over fractions x of the roots of the ranges, so that small gains
     of a wide range are searched as finely as large ones: gain = low + x^2 (high - low). The first
-    candidates are near `gains`; gains that are 0 stay so. `cost` is that (rows,) of rows of gains.
+    candidates are near `gains`. `cost` is that (rows,) of rows of gains.
     """
     from scipy.optimize import Bounds, differential_evolution  # slow to import
 
     low, high = gain_bounds(gains)
-    given = gains_vector(gains)
-    searched = given > 0
-    start = np.sqrt(np.clip((given - low) / (high - low), 0, 1))[searched]
+    start = np.sqrt(np.clip((gains_vector(gains) - low) / (high - low), 0, 1))
     rng = np.random.default_rng(seed)
     first = np.clip(rng.normal(start, SPREAD, (CANDIDATES, len(start))), 0, 1)
     first[0] = start
 
     def at(x: Array) -> Array:
-        vectors = np.zeros((*x.shape[:-1], len(given)))
-        vectors[..., searched] = low[searched] + x**2 * (high - low)[searched]
-        return vectors
+        return np.asarray(low + x**2 * (high - low))
 
     def objective(x: Any) -> Any:
         return cost(at(x.T))
@@ -138,45 +209,22 @@ def tune(
     return at(result.x), costs
 
 
-def tune_baselines(
-    machine: Machine,
-    net: ActuatorNet,
-    runs: int,
-    generations: int,
-    seed: int,
-    noise: float = TaskConfig.noise,
-    plant: Plant = PLANT,
-    longest: float = TUNING_SECONDS,
-    only: Sequence[str] = TUNED,
-) -> tuple[dict[str, JacobianController], dict[str, dict[str, Any]]]:
-    """The baselines of `only`, tuned on the `plant` itself; and a record of it for JSON.
+def tune_baseline(
+    controller: JacobianController, effort: tuple[int, int, float], seed: int, plant: Plant = PLANT
+) -> tuple[Gains, list[float]]:
+    """Tuned gains of one of the `baselines`, beginning with its own, and costs by generation.
 
-    That favours the baselines, because the policy is trained on nets alone. Each is tuned twice,
-    with `seed` and the next, and the gains with the lower cost on other goals are kept; the costs
-    of both agree if the search has converged. No run is longer than `longest` [s]. The strongest
-    has more gains, so it gets twice the generations. The paper's second one gets the gains of its
-    first: their damping differs near singularities alone, where no run goes.
+    `effort` has the generations, the runs of each candidate, and their length [s]. The runs are on
+    the `plant` itself, which favours the baselines, because the policy is trained on nets alone.
+    The strongest has more gains, so it gets twice the generations.
     """
-    seconds = min(TUNING_SECONDS, longest)
-    tuning = tuning_set(machine, runs, seed, seconds)
-    fresh = tuning_set(machine, FRESH_RUNS * runs, seed + 2, seconds)
-    every = baselines(machine, net)
-    tuned, record = {}, {}
-    for name in only:
-        controller, steps = every[name], generations * (2 if name == STRONGEST else 1)
-        cost = partial(tuning_cost, controller, runs=tuning, seed=seed, noise=noise, plant=plant)
-        seeds = (seed, seed + 1)
-        vectors, costs = zip(
-            *(tune(controller.gains, cost, one, steps, name) for one in seeds), strict=True
-        )
-        fresh_cost = tuning_cost(controller, np.array(vectors), fresh, seed + 2, noise, plant)
-        gains = gains_of(controller.gains, vectors[int(np.argmin(fresh_cost))])
-        tuned[name] = replace(controller, gains=gains)
-        record[name] = {"seeds": seeds, "costs": costs, "fresh_costs": fresh_cost.tolist()}
-    if PAPER_BASELINES[0] in tuned:
-        gains = tuned[PAPER_BASELINES[0]].gains
-        tuned[PAPER_BASELINES[1]] = replace(every[PAPER_BASELINES[1]], gains=gains)
-    return {name: tuned[name] for name in every if name in tuned}, record
+    generations, num, seconds = effort
+    runs = tuning_set(controller.machine, num, seed, seconds)
+    cost = partial(tuning_cost, controller, runs, seed, plant)
+    strong = isinstance(controller, StrongPID)
+    generations *= 2 if strong else 1
+    vector, costs = tune(controller.gains, cost, seed, generations, "strong" if strong else "PID")
+    return gains_of(controller.gains, vector), costs
 
 
 def gains_metadata(machine: Machine, net: ActuatorNet) -> dict[str, str]:
@@ -201,12 +249,12 @@ def read_gains(path: Path, machine: Machine, net: ActuatorNet) -> dict[str, Jaco
     with expected(path, "gains of `reproduce` or `evaluate --save-gains`"):
         file = read_json(path, "JSON")
         expect_same(path, file["meta"], gains_metadata(machine, net))
-        read = {}
-        for name, controller in baselines(machine, net).items():
-            row = {key: np.array(values, float) for key, values in file["gains"][name].items()}
-            gains = type(controller.gains)(**row)
-            shape = gains_vector(controller.gains).shape
-            if gains_vector(gains).shape != shape or not np.isfinite(gains_vector(gains)).all():
-                raise ValueError(f"{path}: {name}: expected {shape[0]} finite gains, got {row}")
-            read[name] = replace(controller, gains=gains)
-        return read
+        gains = {}
+        for name, row in file["gains"].items():
+            kind = StrongGains if name == STRONGEST else Gains
+            gains[name] = kind(**{key: np.array(values, float) for key, values in row.items()})
+            vector = gains_vector(gains[name])
+            size = 3 * len(machine.driven) + len(fields(kind)) - 3
+            if vector.shape != (size,) or not np.isfinite(vector).all():
+                raise ValueError(f"{path}: {name}: expected {size} finite gains, got {row}")
+        return baselines(machine, net, gains)

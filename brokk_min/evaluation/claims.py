@@ -10,52 +10,70 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from brokk_min.evaluation.baselines import PAPER_BASELINES
+from brokk_min.evaluation.baselines import BY_HAND, OPTIMISED, RAW
 from brokk_min.evaluation.metrics import Mean, Run, by_start, column, interval_text, mean_interval
 from brokk_min.evaluation.rollout import TITLES
 
 TEXTS: dict[str, dict[str, Any]] = tomllib.loads(
     Path(__file__).with_suffix(".toml").read_text("utf-8")
 )
-STRONG, WEAK = PAPER_BASELINES  # damping
-POLICIES = ("rl_paper", "rl")
+POLICIES = ("rl_paper", "rl_critic")  # the paper's agent
+PIDS = (RAW, BY_HAND, OPTIMISED)  # with the paper's structure: by hand, as in the paper, first
 VERDICTS = {True: "holds here", False: "does not hold here", None: "was not measured"}
 ERROR, DRIFT = "velocity_error_mean", "off_axis_drift_max"
+
+Numbers = Mapping[str, Mean]  # by what they are of
 
 
 class Claim(NamedTuple):
     """A sentence of the paper, and what was measured of it."""
 
     name: str  # in `claims.toml`
-    numbers: Mapping[str, Mapping[str, Mean]]  # by what is judged (a policy, "nets"), and by label
+    numbers: Mapping[str, Mapping[str, Numbers]]  # by what is judged, and by the PID ("": none)
 
-    def holds(self) -> dict[str, bool | None]:
-        """Are all numbers of each, with their intervals, beyond the limit? None: one is missing."""
-        text = TEXTS[self.name]
-        above = "above" in text
-        result: dict[str, bool | None] = {}
-        for judged, row in self.numbers.items():
-            ends = [number["low" if above else "high"] for number in row.values()]
-            known = [end for end in ends if end is not None]
-            beyond = [end > text["above"] if above else end < text["below"] for end in known]
-            result[judged] = all(beyond) if len(known) == len(ends) else None
+    def holds(self) -> dict[str, dict[str, bool | None]]:
+        """Are all numbers of each beyond the limit? With their intervals; None: one has none."""
+        above = "above" in TEXTS[self.name]
+        limit = TEXTS[self.name]["above" if above else "below"]
+        result: dict[str, dict[str, bool | None]] = {}
+        for judged, of in self.numbers.items():
+            for pid, row in of.items():
+                ends = [number["low" if above else "high"] for number in row.values()]
+                known = [end for end in ends if end is not None]
+                beyond = [end > limit if above else end < limit for end in known]
+                result.setdefault(judged, {})[pid] = None if len(known) < len(ends) else all(beyond)
         return result
+
+    def verdict(self) -> str:
+        """What `holds` says; where PIDs differ, the verdict depends on how they are tuned."""
+        parts = []
+        for judged, of in self.holds().items():
+            by_verdict: dict[str, list[str]] = {}
+            for pid, held in of.items():
+                by_verdict.setdefault(VERDICTS[held], []).append(pid)
+            if len(by_verdict) == 1:
+                parts.append(f"{next(iter(by_verdict))} for {judged}")
+                continue
+            texts = [f"{text} with {' and '.join(pids)}" for text, pids in by_verdict.items()]
+            parts.append(f"depends on the tuning for {judged}: it {', '.join(texts)}")
+        return "; ".join(parts)
 
     def to_json(self) -> dict[str, Any]:
         """The claim as in `results.json`."""
-        text, holds = TEXTS[self.name], self.holds()
-        labelled = [pair for row in self.numbers.values() for pair in row.items()]
-        measured = "; ".join(f"{label} {interval_text(number)}" for label, number in labelled)
+        text = TEXTS[self.name]
+        measured = [
+            f"{label} of {' and '.join(filter(None, (judged, pid)))} {interval_text(number)}"
+            for judged, of in self.numbers.items()
+            for pid, row in of.items()
+            for label, number in row.items()
+        ]
         limit = next(f"{side} {text[side]:g}" for side in ("above", "below") if side in text)
-        verdicts = [f"{VERDICTS[h]} for {TITLES.get(who, who)}" for who, h in holds.items()]
         return {
-            "figure": text["figure"],
-            "paper": text["paper"],
-            "measured": f"{text['measure']}, to be {limit}: {measured} [{text['unit']}]",
+            **{key: text[key] for key in ("figure", "paper", "unit")},
+            "measured": f"{text['measure']}, to be {limit} {text['unit']}: {'; '.join(measured)}",
             "numbers": self.numbers,
-            "unit": text["unit"],
-            "holds": holds,
-            "verdict": " and ".join(verdicts),
+            "holds": self.holds(),
+            "verdict": self.verdict(),
         }
 
 
@@ -76,34 +94,37 @@ def net_claims(numbers: Mapping[str, Any]) -> list[Claim]:
         "gap": {"in the figure": gap["tool"]["position_error_mean"], "median of runs": of_runs},
     }
     ends = ("mean", "low", "high")
-    return [
-        Claim(name, {"nets": {label: dict.fromkeys(ends, x) for label, x in row.items()}})
-        for name, row in table.items()
-    ]
+    claims = []
+    for name, row in table.items():
+        numbers = {label: dict.fromkeys(ends, x) for label, x in row.items()}
+        claims.append(Claim(name, {"nets": {"": numbers}}))
+    return claims
 
 
 def task_claims(runs: Sequence[Run]) -> list[Claim]:
-    """The claims on task-space control, of each policy in `runs`, in the paper's order.
+    """The claims on task-space control, of the paper's agent and each PID.
 
     `runs` are those that count. Paper: Sec. 4.2 and 5, Fig. 6
     """
     policies = [name for name in POLICIES if name in column(runs, "controller")]
+    drift = {
+        name: {"along x": mean_interval(by_start(runs, name, "x", DRIFT))}
+        for name in (*policies, *PIDS)
+    }
 
-    def less(policy: str, sequences: Sequence[str], keys: Sequence[str] = (ERROR,)) -> Any:
-        return {
-            f"{key} of {policy} along {s} less {c}": mean_interval(
-                by_start(runs, policy, s, key) - by_start(runs, c, s, key)
-            )
-            for key, s, c in product(keys, sequences, PAPER_BASELINES)
-        }
-
-    def drift(name: str) -> dict[str, Mean]:
-        return {name: mean_interval(by_start(runs, name, "x", DRIFT))}
+    def less(sequences: Sequence[str], keys: Sequence[str] = (ERROR,)) -> Any:
+        """Figures of each policy less those of each PID: negative where the policy is better."""
+        numbers: dict[str, dict[str, dict[str, Mean]]] = {}
+        for policy, pid, key, s in product(policies, PIDS, keys, sequences):
+            difference = by_start(runs, policy, s, key) - by_start(runs, pid, s, key)
+            row = numbers.setdefault(TITLES[policy], {}).setdefault(TITLES[pid], {})
+            row[f"{key} along {s}"] = mean_interval(difference)
+        return numbers
 
     return [
-        Claim("still", {policy: drift(policy) for policy in policies}),
-        Claim("drift", {"the paper's PIDs": drift(STRONG) | drift(WEAK)}),
-        Claim("tracking", {policy: less(policy, "xyz") for policy in policies}),
-        Claim("along_z", {policy: less(policy, "z", (ERROR, DRIFT)) for policy in policies}),
-        Claim("outperforms", {policy: less(policy, ["all"]) for policy in policies}),
+        Claim("still", {TITLES[name]: {"": drift[name]} for name in policies}),
+        Claim("drift", {"the Jacobian-based method": {TITLES[name]: drift[name] for name in PIDS}}),
+        Claim("tracking", less("xyz")),
+        Claim("along_z", less("z", (ERROR, DRIFT))),
+        Claim("outperforms", less(["all"])),
     ]

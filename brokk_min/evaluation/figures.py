@@ -14,14 +14,14 @@ from numpy.linalg import norm
 
 from brokk_min.evaluation.metrics import Traces
 from brokk_min.evaluation.preliminary import Motion, SimulatorTests
-from brokk_min.evaluation.rollout import TITLES
+from brokk_min.evaluation.rollout import TITLES, Trace
 from brokk_min.evaluation.sequences import AXES, KINDS, Commands
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
 
 WIDTH = 10.0  # inch, of every figure, so that letters have one size in the report
 LINES = ("-", "--", "-.", ":")
-SAMPLE = ("rl", "rl_paper", "jacobian_pid_k0.1", "jacobian_pid_k0.05")  # drawn in Fig. 6
+SAMPLE = ("rl_paper", "rl_critic", "pid_by_hand", "jacobian_pid_k0.1")  # drawn in Fig. 6
 
 
 class Panel(NamedTuple):
@@ -65,15 +65,14 @@ def plot_tests(machine: Machine, tests: Mapping[str, SimulatorTests]) -> Figure:
     """Range and direction, coupling, and past movement; machine above nets. Paper: Fig. 2"""
     name = machine.names[machine.driven[-1]]
     angle, velocity = f"{name} [rad]", f"velocity {name} [rad/s]"
-    rows = []
-    for kind, of_kind in tests.items():
-        movement = of_kind.past_movement
-        row = [
-            Panel(f"{kind}: range and direction", angle, velocity, of_kind.sweeps),
-            Panel(f"{kind}: coupling", angle, velocity, of_kind.coupling),
-            Panel(f"{kind}: past movement", "time after the step [s]", velocity, movement),
+    rows = [
+        [
+            Panel(f"{kind}: range and direction", angle, velocity, of.sweeps),
+            Panel(f"{kind}: coupling", angle, velocity, of.coupling),
+            Panel(f"{kind}: past movement", "time after the step [s]", velocity, of.past_movement),
         ]
-        rows.append(row)
+        for kind, of in tests.items()
+    ]
     return plot_panels(rows, sharey="col")
 
 
@@ -94,21 +93,26 @@ def plot_starts(machine: Machine, starts: Array, kinds: Sequence[str]) -> Figure
     """Start configurations drawn as arms, from the side and from above. Paper: Fig. 6a"""
     figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
     side, top = figure.subplots(1, 2)
-    points = forward_kinematics(machine, starts).p
+    points = forward_kinematics(machine, starts).p  # (starts, points, 3)
     tool = points[:, -1, :2]
     outward = tool / np.maximum(norm(tool, axis=-1, keepdims=True), 1e-9)
     r = np.einsum("pjk,pk->pj", points[..., :2], outward)
-    for i, kind in enumerate(kinds):
-        color = f"C{KINDS.index(kind)}"
-        side.plot(r[i], points[i, :, 2], label=kind, color=color, alpha=0.6)
-        top.plot(points[i, :, 0], points[i, :, 1], color=color, alpha=0.6)
+    for i, kind in enumerate(KINDS):
+        of = np.array(kinds) == kind
+        arms = side.plot(r[of].T, points[of, :, 2].T, color=f"C{i}", alpha=0.6)
+        top.plot(points[of, :, 0].T, points[of, :, 1].T, color=f"C{i}", alpha=0.6)
+        for arm in arms[:1]:
+            arm.set_label(kind)
     side.axhline(machine.ground, color="black", linewidth=0.8)
     side.set(xlabel="outward from the slew axis [m]", ylabel="z [m]", aspect="equal")
     top.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    handles, labels = side.get_legend_handles_labels()
-    by_kind = dict(zip(labels, handles, strict=True))
-    side.legend(by_kind.values(), by_kind.keys())
+    side.legend()
     return figure
+
+
+def of_sample(traces: Traces, sequence: str) -> dict[str, Trace]:
+    """Traces of the controllers of `SAMPLE` along one sequence."""
+    return {c: trace for (c, name), trace in traces.items() if name == sequence and c in SAMPLE}
 
 
 def plot_sequence(
@@ -118,10 +122,9 @@ def plot_sequence(
     goals = sequence.for_starts(machine, start[None])[:, 0]
     p_start = tool_position(forward_kinematics(machine, start))
     positions, velocities = {"goal": machine.dt * np.cumsum(goals, axis=0)}, {"goal": goals}
-    for (controller, name), trace in traces.items():
-        if name == sequence.name and controller in SAMPLE:
-            positions[controller] = trace.p_tool[:, run] - p_start
-            velocities[controller] = trace.v_tool[:, run]
+    for controller, trace in of_sample(traces, sequence.name).items():
+        positions[controller] = trace.p_tool[:, run] - p_start
+        velocities[controller] = trace.v_tool[:, run]
     above = _over_time(machine.dt, [f"{axis} - {axis}(0) [m]" for axis in AXES], positions)
     below = _over_time(machine.dt, [f"velocity {axis} [m/s]" for axis in AXES], velocities)
     return plot_panels([above, below], sharey="row")
@@ -130,10 +133,8 @@ def plot_sequence(
 def plot_joint_velocities(machine: Machine, traces: Traces, sequence: str, run: int) -> Figure:
     """Velocity of the driven joints of `SAMPLE` in one run. Paper: Fig. 6d"""
     labels = [f"velocity {machine.names[i]} [rad/s]" for i in machine.driven]
-    curves = {}
-    for (controller, name), trace in traces.items():
-        if name == sequence and controller in SAMPLE:
-            curves[controller] = trace.q_dot[:, run, machine.driven]
+    sample = of_sample(traces, sequence)
+    curves = {name: trace.q_dot[:, run, machine.driven] for name, trace in sample.items()}
     return plot_panels([_over_time(machine.dt, labels, curves)], sharey="row")
 
 

@@ -23,20 +23,17 @@ Run = Mapping[str, Any]  # controller, sequence, start, kind, then the figures o
 Rows = list[dict[str, Any]]  # of one `Run` each
 Mean = Mapping[str, float | None]  # "mean", and its interval "low" to "high"
 LABELS = ("controller", "sequence", "start", "kind")
-AT_LIMIT = 0.01  # rad, assumed: a joint so near an end of its range is at its limit
 
 
 def metrics(machine: Machine, trace: Trace, goals: Array, start: Array) -> dict[str, Array]:
     """Figures of each run as in the evaluate JSON, (num,) each.
 
-    m, m/s, m/s^3, s; valve travel in full strokes; reward 1. `goals` [m/s] (T, num, 3), `start`
+    m, m/s, m/s^3; valve travel in full strokes; reward 1. `goals` [m/s] (T, num, 3), `start`
     tool positions before the first tick [m] (num, 3).
     """
     error = norm(goals - trace.v_tool, axis=-1)
     drift = line_distance(trace.p_tool, goals, start)
     jerk = np.diff(trace.v_tool, n=2, axis=0) * machine.rate**2
-    margin = np.minimum(trace.q - machine.column("q_min"), machine.column("q_max") - trace.q)
-    at_limit = margin[..., machine.driven].min(axis=-1) < AT_LIMIT
     return {
         "velocity_rmse": np.sqrt(np.mean(error**2, axis=0)),
         "velocity_error_mean": error.mean(axis=0),
@@ -44,7 +41,6 @@ def metrics(machine: Machine, trace: Trace, goals: Array, start: Array) -> dict[
         "off_axis_drift_mean": drift.mean(axis=0),
         "jerk_rms": np.sqrt(np.sum(jerk**2, axis=-1).sum(axis=0) / max(1, len(jerk))),
         "valve_travel": np.abs(np.diff(trace.u, axis=0, prepend=0 * trace.u[:1])).sum(axis=(0, 2)),
-        "time_at_limits": at_limit.sum(axis=0) * machine.dt,
         "reward_mean": trace.reward.mean(axis=0),
     }
 
@@ -80,50 +76,36 @@ def evaluate(
     starts: Array,
     seed: int,
     plant: Plant = PLANT,
-    noise: float = TaskConfig.noise,
 ) -> tuple[Rows, Traces]:
     """Run every controller on the same sequences, starts and noise. Paper: Sec. 4.2, Fig. 6
 
     `starts` are angles [rad] (starts, n); all starts and all sequences of one length are a batch.
-    `noise` is as in `rollout`. Returns one row per controller, sequence and start, see `metrics`;
-    and traces.
-
-    ValueError: two sequences of one name, a start out of range.
+    The sensors have the noise of training. Returns one row per controller, sequence and start, see
+    `metrics`; and traces.
     """
-    names = [sequence.name for sequence in sequences]
-    if len(set(names)) < len(names):
-        raise ValueError(f"sequences: expected each name once, got {names}")
-    if not ((starts >= machine.column("q_min")) & (starts <= machine.column("q_max"))).all():
-        raise ValueError("starts: expected angles within the joints' ranges, got others")
+    kinds = start_kinds(machine, starts)
+    p_start = tool_position(forward_kinematics(machine, starts))
     lengths = dict.fromkeys(len(sequence.goals) for sequence in sequences)
     batches = [[s for s in sequences if len(s.goals) == length] for length in lengths]
     rows: dict[tuple[str, str], Rows] = {}
     traces: dict[tuple[str, str], Trace] = {}
     pairs = list(product(controllers, batches))
     for name, batch in tqdm(pairs, desc="evaluate", unit="batch", disable=None):
-        goals = np.concatenate([sequence.for_starts(machine, starts) for sequence in batch], axis=1)
-        q = np.tile(starts, (len(batch), 1))
+        goals = [sequence.for_starts(machine, starts) for sequence in batch]
+        q, all_goals = np.tile(starts, (len(batch), 1)), np.concatenate(goals, axis=1)
         rng = np.random.default_rng(seed)
-        trace = rollout(machine, controllers[name], q, goals, noise, rng, plant)
+        trace = rollout(machine, controllers[name], q, all_goals, TaskConfig.noise, rng, plant)
         for i, sequence in enumerate(batch):
             part = slice(i * len(starts), (i + 1) * len(starts))
-            of_sequence = Trace(*(array[:, part] for array in trace))
-            traces[name, sequence.name] = of_sequence
+            of = traces[name, sequence.name] = Trace(*(array[:, part] for array in trace))
+            columns = metrics(machine, of, goals[i], p_start)
             rows[name, sequence.name] = [
-                {"controller": name, "sequence": sequence.name, **row}
-                for row in figures(machine, of_sequence, goals[:, part], starts)
+                dict(zip(LABELS, (name, sequence.name, start, kind), strict=True))
+                | {key: float(column[start]) for key, column in columns.items()}
+                for start, kind in enumerate(kinds)
             ]
-    return [row for pair in product(controllers, names) for row in rows[pair]], traces
-
-
-def figures(machine: Machine, trace: Trace, goals: Array, starts: Array) -> Rows:
-    """Of each start (starts, n) its number, its kind and the figures of `metrics`."""
-    p_start = tool_position(forward_kinematics(machine, starts))
-    columns = metrics(machine, trace, goals, p_start)
-    return [
-        {"start": i, "kind": kind} | {key: float(of[i]) for key, of in columns.items()}
-        for i, kind in enumerate(start_kinds(machine, starts))
-    ]
+    ordered = product(controllers, [sequence.name for sequence in sequences])
+    return [row for pair in ordered for row in rows[pair]], traces
 
 
 def metadata(machine: Machine, seed: int) -> dict[str, Any]:
@@ -178,8 +160,7 @@ def means(runs: Sequence[Run]) -> dict[str, dict[str, dict[str, Mean]]]:
     """Means over starts with intervals, by controller, sequence (also "all") and figure."""
     sequences = [*column(runs, "sequence"), "all"]
     keys = [key for key in runs[0] if key not in LABELS]
-    table: dict[str, dict[str, dict[str, Mean]]] = {}
-    for c in column(runs, "controller"):
-        of = {s: {k: mean_interval(by_start(runs, c, s, k)) for k in keys} for s in sequences}
-        table[c] = of
-    return table
+    return {
+        c: {s: {k: mean_interval(by_start(runs, c, s, k)) for k in keys} for s in sequences}
+        for c in column(runs, "controller")
+    }

@@ -38,7 +38,7 @@ class SimulatorTests(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Motion of a machine, or the difference of two, (T, runs, ...)."""
+    """The difference of two motions, (T, runs, ...)."""
 
     q: Array  # rad, (..., n)
     q_dot: Array  # rad/s
@@ -46,18 +46,11 @@ class Motion(NamedTuple):
     v_tool: Array  # m/s
 
 
-class Preliminary(NamedTuple):
-    """All preliminary measurements."""
-
-    tests: dict[str, SimulatorTests]  # of machine and nets
-    gap: Motion  # nets less machine
-
-
-def run(machine: Machine, net: ActuatorNet, seed: int) -> Preliminary:
-    """Test the machine and its nets, and compare them. Paper: Sec. 3.2 and 4.1"""
+def run(machine: Machine, net: ActuatorNet, seed: int) -> tuple[dict[str, SimulatorTests], Motion]:
+    """Tests of the machine and of its nets, and nets less machine. Paper: Sec. 3.2 and 4.1"""
     both: dict[str, Plant] = {"machine": PLANT, "nets": select_nets(machine, net)}
     tests = {name: preliminary_tests(machine, plant) for name, plant in both.items()}
-    return Preliminary(tests, sim_to_real(machine, both, seed))
+    return tests, sim_to_real(machine, both, seed)
 
 
 def simulate(machine: Machine, plant: Plant, q: Array, u: Array) -> Array:
@@ -152,40 +145,33 @@ def sim_to_real(machine: Machine, both: Mapping[str, Plant], seed: int) -> Motio
     driven = [r.u for r in log.recordings if r.u[:, machine.driven].any()]
     u = np.stack(driven[:GAP_RUNS], axis=1)
     q = np.tile(start, (GAP_RUNS, 1))
-    real, simulated = (
-        motion(machine, simulate(machine, both[name], q, u)) for name in ("machine", "nets")
-    )
-    return Motion(*(one - other for one, other in zip(simulated, real, strict=True)))
+    angles = {name: simulate(machine, plant, q, u) for name, plant in both.items()}
+    tools = {name: tool_position(forward_kinematics(machine, of)) for name, of in angles.items()}
+    q, p = (of["nets"] - of["machine"] for of in (angles, tools))  # (T + 1, runs, ...)
+    q_dot, v = (np.diff(x, axis=0) * machine.rate for x in (q, p))
+    return Motion(q[1:], q_dot, p[1:], v)
 
 
-def motion(machine: Machine, q: Array) -> Motion:
-    """Motion at the ends of all ticks, from angles (T + 1, runs, n)."""
-    p = tool_position(forward_kinematics(machine, q))
-    velocities = (np.diff(x, axis=0) * machine.rate for x in (q, p))
-    return Motion(q[1:], next(velocities), p[1:], next(velocities))
+def numbers(machine: Machine, tests: Mapping[str, SimulatorTests], gap: Motion) -> dict[str, Any]:
+    """Numbers of both figures, for JSON [rad/s, s, m, m/s].
 
-
-def numbers(machine: Machine, measured: Preliminary) -> dict[str, Any]:
-    """Numbers of both figures, for JSON [rad/s, s, m, m/s]."""
-    tests = measured.tests.items()
-    sweep: dict[str, dict[str, float]] = {}
-    for name, of in tests:
-        for u, one in of.sweeps.items():
-            sweep.setdefault(u, {})[f"{name}_peak"] = float(np.abs(one.q_dot).max())
-    return {
-        "joint": machine.names[machine.driven[-1]],
-        "sweep": sweep,
-        "response_time": {name: of.response_time for name, of in tests},
-        "sim_to_real": gap_numbers(measured.gap),
-    }
-
-
-def gap_numbers(gap: Motion) -> dict[str, Any]:
-    """Errors of the tool in the first run, as in the figure, and over all runs."""
+    Of the gap these are the tool's errors in the first run, as in the figure, and over all runs.
+    """
     p_error = np.linalg.norm(gap.p_tool, axis=-1).mean(axis=0)  # m, of each run
     v_error = np.sqrt(np.mean(np.sum(gap.v_tool**2, axis=-1), axis=0))
     runs = {"median": float(np.median(p_error)), "max": float(p_error.max()), "runs": len(p_error)}
     return {
-        "tool": {"position_error_mean": float(p_error[0]), "velocity_rmse": float(v_error[0])},
-        "tool_position_error_mean_of_runs": runs,
+        "joint": machine.names[machine.driven[-1]],
+        "sweep": {
+            u: {
+                f"{name}_peak": float(np.abs(of.sweeps[u].q_dot).max())
+                for name, of in tests.items()
+            }
+            for u in tests["nets"].sweeps
+        },
+        "response_time": {name: of.response_time for name, of in tests.items()},
+        "sim_to_real": {
+            "tool": {"position_error_mean": float(p_error[0]), "velocity_rmse": float(v_error[0])},
+            "tool_position_error_mean_of_runs": runs,
+        },
     }

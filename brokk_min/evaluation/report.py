@@ -12,9 +12,9 @@ from tqdm import tqdm
 
 from brokk_min._files import whole_file
 from brokk_min.evaluation import figures
-from brokk_min.evaluation.metrics import Mean, Traces, interval_text
-from brokk_min.evaluation.preliminary import Preliminary
-from brokk_min.evaluation.rollout import TITLES
+from brokk_min.evaluation.metrics import Traces, interval_text
+from brokk_min.evaluation.preliminary import Motion, SimulatorTests
+from brokk_min.evaluation.rollout import TITLES, valves_at_rest
 from brokk_min.evaluation.sequences import axis_sequences
 from brokk_min.machine import Machine
 
@@ -37,20 +37,23 @@ def write_report(out: Path, results: Results, drawn: Mapping[str, Figure], minut
 
 
 def draw(
-    machine: Machine, results: Results, tested: Preliminary, traces: Traces
+    machine: Machine,
+    results: Results,
+    tests: Mapping[str, SimulatorTests],
+    gap: Motion,
+    traces: Traces,
 ) -> dict[str, Figure]:
     """All figures of the page by name."""
     starts, kinds = np.array(results["starts"]), results["start_kinds"]
     run = kinds.index("workspace")  # the first from which all sequences can be followed
     drawn = {
-        "tests": figures.plot_tests(machine, tested.tests),
-        "gap": figures.plot_gap(machine, tested.gap),
+        "tests": figures.plot_tests(machine, tests),
+        "gap": figures.plot_gap(machine, gap),
         "starts": figures.plot_starts(machine, starts, kinds),
         "joints": figures.plot_joint_velocities(machine, traces, "x", run),
     }
-    for sequence in axis_sequences(machine):
-        of_axis = figures.plot_sequence(machine, traces, sequence, starts[run], run)
-        drawn[sequence.name] = of_axis
+    for axis in axis_sequences(machine):
+        drawn[axis.name] = figures.plot_sequence(machine, traces, axis, starts[run], run)
     return drawn
 
 
@@ -59,12 +62,6 @@ def render(results: Results, images: Mapping[str, str], minutes: float) -> str:
     folder = Path(__file__).parent
     page = Environment(loader=FileSystemLoader(folder), autoescape=True, undefined=StrictUndefined)
     page.filters["interval"] = interval_text
-    columns = {head: of_all(results, key) for key, head in COLUMNS.items()}
-    return page.get_template("report.html.j2").render(
-        results=results, images=images, minutes=minutes, titles=TITLES, columns=columns
-    )
-
-
-def of_all(results: Results, key: str) -> dict[str, Mean]:
-    """A figure of merit over all sequences, with its interval over starts, by controller."""
-    return {name: of["all"][key] for name, of in results["task_space"]["means"].items()}
+    values = {"results": results, "images": images, "minutes": minutes, "columns": COLUMNS}
+    template = page.get_template("report.html.j2")
+    return template.render(titles=TITLES, rest=valves_at_rest, **values)

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -14,15 +14,15 @@ from brokk_min._files import write_json
 from brokk_min.actuator import ActuatorNet
 from brokk_min.evaluation import baselines, claims, metrics, preliminary, report, sequences
 from brokk_min.evaluation.metrics import Traces, evaluate
-from brokk_min.evaluation.robustness import robustness
+from brokk_min.evaluation.robustness import leads, robustness
 from brokk_min.identification import fitting, logs, validation
 from brokk_min.identification.excitation import collect, task_log
 from brokk_min.identification.net_file import save_net, select_nets
-from brokk_min.jacobian import JacobianController
+from brokk_min.jacobian import Gains, JacobianController
 from brokk_min.learning.checkpoint import train_policy
 from brokk_min.learning.jobs import side_by_side
 from brokk_min.learning.policy import POLICIES, Policy, PolicyController
-from brokk_min.learning.recipes import Recipe, paper_recipe
+from brokk_min.learning.recipes import find_recipe
 from brokk_min.machine import Machine
 
 
@@ -52,15 +52,6 @@ class Chain:
     seed: int
 
 
-class Learned(NamedTuple):
-    """Nets, policies and baselines of a chain."""
-
-    nets: Mapping[str, ActuatorNet]  # "net" and "net_paper"
-    policies: Mapping[str, Policy]  # by the names of `POLICIES`
-    pids: Mapping[str, JacobianController]
-    tuning: Mapping[str, Any]  # record of the tuning, for JSON
-
-
 def reproduce(machine: Machine, out: Path, budget: Budget, seed: int) -> dict[str, Any]:
     """Run the chain; logs, nets, policies, gains, `results.json` and `report.html` go to `out`.
 
@@ -68,14 +59,15 @@ def reproduce(machine: Machine, out: Path, budget: Budget, seed: int) -> dict[st
     """
     began = time.perf_counter()
     chain = Chain(machine, out, budget, seed)
-    clock: dict[str, float] = {}
     log, paper_log, test = record(chain)
-    learned = learn(chain, log, paper_log, clock)
-    results, drawn = measure(chain, learned, test, clock)
+    first = baselines.first_gains(machine)
+    done = learn(chain, log, paper_log, first)
+    gains = first | {name: done[name][0] for name in baselines.TUNED}
+    pids = baselines.baselines(machine, select_nets(machine, done["net"]), gains)
+    results, drawn = measure(chain, done, pids, test)
     write_json(out / "results.json", results)
-    baselines.write_gains(out / "gains.json", learned.pids, results["meta"])
+    baselines.write_gains(out / "gains.json", pids, results["meta"])
     report.write_report(out, results, drawn, (time.perf_counter() - began) / 60)
-    write_json(out / "timing.json", clock)
     return results
 
 
@@ -111,7 +103,7 @@ def fit_net(chain: Chain, name: str, log: logs.Log, recipe: Mapping[str, Any]) -
 
 def train(chain: Chain, name: str, net: ActuatorNet) -> Policy:
     """One of `POLICIES`, by its own recipe."""
-    recipe = paper_recipe() if name == "rl_paper" else Recipe()
+    recipe = find_recipe(paper=name != "rl", critic=name == "rl_critic")
     if chain.budget.train_steps:
         learner = replace(recipe.learner, total_steps=chain.budget.train_steps)
         recipe = replace(recipe, learner=learner)
@@ -121,84 +113,82 @@ def train(chain: Chain, name: str, net: ActuatorNet) -> Policy:
     return train_policy(chain.machine, driven, recipe, chain.seed, file, resume)
 
 
-def tune(chain: Chain, net: ActuatorNet, name: str) -> Any:
-    """One baseline with tuned gains, and the record of its tuning."""
-    budget, nets = chain.budget, select_nets(chain.machine, net)
-    effort = budget.tuning_runs, budget.generations, chain.seed
-    longest = budget.short_s
-    return baselines.tune_baselines(chain.machine, nets, *effort, longest=longest, only=[name])
+def tune(
+    chain: Chain, first: Mapping[str, Gains], name: str, net: ActuatorNet
+) -> tuple[Gains, list[float]]:
+    """Gains of one of `baselines.TUNED`, from the `first` gains on, and costs by generation."""
+    budget = chain.budget
+    seconds = min(baselines.TUNING_SECONDS, budget.short_s)
+    pids = baselines.baselines(chain.machine, select_nets(chain.machine, net), first)
+    effort = budget.generations, budget.tuning_runs, seconds
+    return baselines.tune_baseline(pids[name], effort, chain.seed)
 
 
-def learn(chain: Chain, log: logs.Log, paper_log: logs.Log, clock: dict[str, float]) -> Learned:
-    """All fits, trainings and tunings, side by side."""
+def learn(
+    chain: Chain, log: logs.Log, paper_log: logs.Log, first: Mapping[str, Gains]
+) -> dict[str, Any]:
+    """All fits, trainings and tunings, side by side; nets, policies and gains by their names."""
     jobs: dict[str, Callable[..., Any]] = {
-        "fit net": partial(fit_net, chain, "net", log, {}),
-        "fit net_paper": partial(fit_net, chain, "net_paper", paper_log, fitting.PAPER_RECIPE),
-        "train rl": partial(train, chain, "rl"),
-        "train rl_paper": partial(train, chain, "rl_paper"),
+        "net": partial(fit_net, chain, "net", log, {}),
+        "net_paper": partial(fit_net, chain, "net_paper", paper_log, fitting.PAPER_RECIPE),
     }
-    needs = {"train rl": ["fit net"], "train rl_paper": ["fit net_paper"]}
+    needs = {}
+    for name in sorted(POLICIES, reverse=True):  # the longest first
+        jobs[name] = partial(train, chain, name)
+        needs[name] = ["net" if name == "rl" else "net_paper"]
     for name in baselines.TUNED:
-        jobs[f"tune {name}"] = partial(tune, chain, name=name)
-        needs[f"tune {name}"] = ["fit net"]
-    net, paper_net, rl, rl_paper, *tuned = side_by_side(jobs, clock, needs)
-    pids = {name: pid for found, _ in tuned for name, pid in found.items()}
-    tuning = {name: row for _, rows in tuned for name, row in rows.items()}
-    policies = {"rl": rl, "rl_paper": rl_paper}
-    return Learned({"net": net, "net_paper": paper_net}, policies, pids, tuning)
+        jobs[name] = partial(tune, chain, first, name)
+        needs[name] = ["net"]
+    return side_by_side(jobs, needs)
 
 
 def measure(
-    chain: Chain, learned: Learned, test: logs.Log, clock: dict[str, float]
+    chain: Chain, done: Mapping[str, Any], pids: Mapping[str, JacobianController], test: logs.Log
 ) -> tuple[dict[str, Any], dict[str, Figure]]:
-    """All measurements for `results.json`, and the figures."""
+    """All measurements for `results.json`, and the figures. `done` is of `learn`."""
     machine, seed = chain.machine, chain.seed
-    ran = {name: preliminary.run(machine, net, seed) for name, net in learned.nets.items()}
-    numbers = {name: preliminary.numbers(machine, of) for name, of in ran.items()}
-    compared, traces = compare(chain, learned, clock)
-    meta = metrics.metadata(machine, seed)
-    meta |= baselines.gains_metadata(machine, learned.policies["rl"].net)
+    net = select_nets(machine, done["net"])
+    policies = {name: PolicyController(machine, done[name]) for name in POLICIES}
+    tests, gap = preliminary.run(machine, net, seed)
+    numbers = preliminary.numbers(machine, tests, gap)
+    compared, traces = compare(chain, {**policies, **pids})
+    meta = metrics.metadata(machine, seed) | baselines.gains_metadata(machine, net)
+    of_nets = [claim.to_json() for claim in claims.net_claims(numbers)]
     results = {
         "meta": meta | {"effort": asdict(chain.budget)},
-        "nets": {
-            name: {"test": validation.score(net, test), "sim_to_real": numbers[name]["sim_to_real"]}
-            for name, net in learned.nets.items()
-        },
-        "preliminary": numbers["net"],
-        "tuning": learned.tuning,
+        "nets": {name: validation.score(done[name], test) for name in ("net", "net_paper")},
+        "preliminary": numbers,
+        "tuning": {name: done[name][1] for name in baselines.TUNED},
+        **compared,
+        "claims": of_nets + compared["claims"],
     }
-    of_nets = [claim.to_json() for claim in claims.net_claims(numbers["net"])]
-    compared["claims"] = of_nets + compared["claims"]
-    results |= compared
-    return results, report.draw(machine, results, ran["net"], traces)
+    return results, report.draw(machine, results, tests, gap, traces)
 
 
-def compare(
-    chain: Chain, learned: Learned, clock: dict[str, float]
-) -> tuple[dict[str, Any], Traces]:
+def compare(chain: Chain, controllers: metrics.Controllers) -> tuple[dict[str, Any], Traces]:
     """The paper's experiment and robustness: JSON, and all traces.
 
     Means, intervals and verdicts are over the "workspace" starts, which can follow all sequences.
     """
     machine, budget, seed = chain.machine, chain.budget, chain.seed
-    policies = {n: PolicyController(machine, policy) for n, policy in learned.policies.items()}
-    controllers: metrics.Controllers = {**policies, **learned.pids}
     commands = sequences.task_sequences(machine)
     starts = sequences.evaluation_starts(machine, budget.starts, commands, seed + 2)
-    kinds = np.array(sequences.start_kinds(machine, starts))
-    workspace = starts[kinds == "workspace"]
+    kinds = sequences.start_kinds(machine, starts)
+    workspace = starts[np.array(kinds) == "workspace"]
     short = sequences.shorten(machine, commands[:3], budget.short_s)
     jobs: dict[str, Callable[[], Any]] = {
-        "score changed": partial(robustness, machine, controllers, short, workspace[:16], seed),
-        "score": partial(evaluate, machine, controllers, commands, starts, seed),
+        "robustness": partial(robustness, machine, controllers, short, workspace[:16], seed),
+        "runs": partial(evaluate, machine, controllers, commands, starts, seed),
     }
-    changed, (runs, traces) = side_by_side(jobs, clock)
+    done = side_by_side(jobs)
+    runs, traces = done["runs"]
     scored = [run for run in runs if run["kind"] == "workspace"]
     results = {
         "task_space": {"runs": runs, "means": metrics.means(scored)},
-        "robustness": changed,
+        "robustness": done["robustness"],
+        "leads": leads(done["robustness"]),
         "claims": [claim.to_json() for claim in claims.task_claims(scored)],
         "starts": starts.tolist(),
-        "start_kinds": kinds.tolist(),
+        "start_kinds": kinds,
     }
     return results, traces

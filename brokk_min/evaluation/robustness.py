@@ -3,9 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
+from brokk_min.evaluation.baselines import BY_HAND, OPTIMISED, STRONGEST, with_dead_zone
 from brokk_min.evaluation.metrics import Controllers, Mean, by_start, evaluate, mean_interval
+from brokk_min.evaluation.rollout import TITLES
 from brokk_min.evaluation.sequences import Commands
 from brokk_min.machine import Array, Machine
+
+PAIRS = (("rl_paper", BY_HAND), ("rl_paper", OPTIMISED), ("rl", STRONGEST))  # within a class
 
 
 def scale_valves(machine: Machine, up: float, down: float) -> Machine:
@@ -13,12 +17,6 @@ def scale_valves(machine: Machine, up: float, down: float) -> Machine:
     speeds = machine.cylinder_speeds * [up, down]
     pairs = zip(machine.joints, speeds.tolist(), strict=True)
     return replace(machine, joints=tuple(replace(j, cylinder_speed=tuple(s)) for j, s in pairs))
-
-
-def with_dead_zone(machine: Machine, zone: float) -> Machine:
-    """The machine with one dead zone for all joints, both ways."""
-    joints = tuple(replace(joint, dead_zone=(zone, zone)) for joint in machine.joints)
-    return replace(machine, joints=joints)
 
 
 def variations(machine: Machine) -> dict[str, Machine]:
@@ -49,3 +47,14 @@ def robustness(
         errors = {c: by_start(runs, c, "all", "velocity_error_mean") for c in controllers}
         result[name] = {c: mean_interval(error) for c, error in errors.items()}
     return result
+
+
+def leads(errors: dict[str, dict[str, Mean]]) -> dict[str, dict[str, float]]:
+    """By variation and pair of one class: how much less the policy's error is, as a fraction."""
+    return {
+        name: {
+            f"{TITLES[policy]} over {TITLES[pid]}": 1 - row[policy]["mean"] / row[pid]["mean"]  # type: ignore[operator]
+            for policy, pid in PAIRS
+        }
+        for name, row in errors.items()
+    }

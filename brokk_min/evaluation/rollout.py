@@ -13,13 +13,20 @@ from brokk_min.learning.episodes import draw_noise
 from brokk_min.machine import Array, Machine, Measured
 
 TITLES = {  # of controllers in tables, figures and windows, by their names in files
-    "rl": "our learner",
-    "rl_paper": "the paper's learner",
-    "jacobian_pid_k0.1": "the paper's PID, k = 0.1",
-    "jacobian_pid_k0.05": "the paper's PID, k = 0.05",
-    "jacobian_pid_ff": "PID with feed-forward",
-    "jacobian_pid_ff_integral": "the strongest PID",
+    "pid_by_hand_raw": "PID by hand, raw",
+    "pid_by_hand": "PID by hand",
+    "jacobian_pid_k0.1": "PID optimised, k = 0.1",
+    "jacobian_pid_k0.05": "PID optimised, k = 0.05",
+    "rl_critic": "PPO as printed, critic",
+    "rl_paper": "PPO, the paper's agent",
+    "rl": "PPO, our interface",
+    "jacobian_pid_ff_integral": "strongest PID",
 }
+
+
+def valves_at_rest(name: str) -> str:
+    """The class of a controller: "closed" valves while the tool rests, or "open" ones."""
+    return "closed" if name in ("rl", "jacobian_pid_ff_integral") else "open"
 
 
 class Controller(Protocol):

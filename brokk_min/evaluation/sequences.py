@@ -4,9 +4,9 @@ Tuning never opens what is scored: only `task_sequences` has the seed of the sco
 `evaluation_starts` opens the file of scored starts, and `tuning_set` draws other starts and goals.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,12 +22,10 @@ from brokk_min.settings import TaskConfig
 
 AXES = "xyz"
 KINDS = ("workspace", "limits", "extended")  # of starts, see `start_kinds`
-LONGEST = 3600.0  # s of a sequence of a file, assumed
-MOST_STARTS = 1000  # of a file
 REST_SEED = 2026  # of the scored rests; nothing else draws from it
 SECONDS = 26.0  # of a scored sequence, assumed
 SHORTEST_REST, LONGEST_REST = 0.5, 10.0  # s, assumed
-DRAWS = 30  # of 400 poses each; after these there are too few feasible ones (assumed)
+DRAWS, POSES = 30, 400  # so often so many poses are drawn, to find feasible ones (assumed)
 TUNING = TaskConfig(zero_goals=0.3, hold_min_s=0.5, hold_max_s=3.0)  # assumed
 # Rows of seconds and velocity in fractions of tool_speed (assumed).
 # On one axis, as in the paper, with changes of direction:
@@ -83,21 +81,18 @@ def task_sequences(machine: Machine) -> list[Commands]:
         "slow": np.array(SLOW),
     }
     rng = np.random.default_rng(REST_SEED)
-    return [
-        Commands(name, goals_of(machine, _with_rests(rows, rng)), inward=True)
-        for name, rows in moves.items()
-    ]
+    result = []
+    for name, rows in moves.items():
+        seconds, *velocity = _with_rests(rows, rng).T
+        ticks = np.rint(seconds * machine.rate).astype(int)
+        goals = np.repeat(machine.tool_speed * np.stack(velocity, axis=1), ticks, axis=0)
+        result.append(Commands(name, goals, inward=True))
+    return result
 
 
 def along(direction: ArrayLike) -> Array:
     """Rows of the pattern `AXIS` along a unit vector (3,)."""
     return np.array([(t, *(v * np.asarray(direction, float))) for t, v in AXIS])
-
-
-def goals_of(machine: Machine, rows: Array) -> Array:
-    """Goals [m/s] (T, 3) of rows of seconds and fractions of tool_speed along x, y, z."""
-    ticks = np.rint(rows[:, 0] * machine.rate).astype(int)
-    return np.repeat(machine.tool_speed * rows[:, 1:], ticks, axis=0)
 
 
 def _with_rests(rows: Array, rng: np.random.Generator) -> Array:
@@ -127,43 +122,30 @@ def shorten(machine: Machine, commands: Sequence[Commands], seconds: float) -> l
 def read_commands(path: Path, machine: Machine) -> list[Commands]:
     """Sequences of a CSV `sequence,time,vx,vy,vz` [s, m/s]; values hold until the next row.
 
-    The last row of a sequence marks its end. ValueError: no such table, rows less than a tick
-    apart, a sequence longer than an hour, or the name "all".
+    The last row of a sequence marks its end. ValueError: no such table, or rows less than a tick
+    apart.
     """
     table = read_csv(path, "sequence", "time", "vx", "vy", "vz")
-    columns = [numbers(path, table[name], name) for name in ("time", "vx", "vy", "vz")]
-    time, velocity = columns[0], np.stack(columns[1:], axis=1)
-    names, result = table["sequence"].astype(str), []
-    for name in dict.fromkeys(names.tolist()):
-        where = f"{path}: sequence {name}"
-        rows = names == name
-        t = time[rows] - time[rows][0]
-        apart = len(t) > 1 and bool((np.diff(t) > 0.99 * machine.dt).all())
+    columns = finite(path, table, "time", "vx", "vy", "vz")
+    result = []
+    for name in dict.fromkeys(table["sequence"].tolist()):
+        rows = columns[table["sequence"] == name]
+        time, velocity = rows[:, 0] - rows[0, 0], rows[:, 1:]
+        apart = len(time) > 1 and bool((np.diff(time) > 0.99 * machine.dt).all())
         wanted = "two or more rows, each a tick or more after the one before"
-        require(apart, where, wanted, brief(t.tolist()))
-        fits = t[-1] <= LONGEST and name != "all"
-        require(fits, where, f"at most {LONGEST:g} s and another name than all", f"{t[-1]:g} s")
-        tick = np.arange(round(t[-1] * machine.rate))
-        row = np.searchsorted(t, tick / machine.rate + 1e-6, "right") - 1
-        result.append(Commands(name, velocity[rows][row]))
+        require(apart, f"{path}: sequence {name}", wanted, brief(time.tolist()))
+        tick = np.arange(round(time[-1] * machine.rate))
+        row = np.searchsorted(time, tick / machine.rate + 1e-6, "right") - 1
+        result.append(Commands(name, velocity[row]))
     return result
-
-
-def numbers(path: Path, values: NDArray[np.generic], name: str) -> NDArray[np.float64]:
-    """A column of a table as floats; ValueError: something else is in it."""
-    fits = values.dtype.kind in "fiu" and bool(np.isfinite(values).all())
-    require(fits, f"{path}: {name}", "finite numbers", brief(values.tolist()))
-    return values.astype(float)
 
 
 def read_starts(path: Path, machine: Machine) -> Array:
     """Start poses [rad] (starts, n) of a CSV with one column per joint.
 
-    ValueError: an angle outside its joint's range, a pose in the ground, or too many poses.
+    ValueError: an angle outside its joint's range, or a pose in the ground.
     """
-    table = read_csv(path, *machine.names)
-    starts = np.stack([numbers(path, table[name], name) for name in machine.names], axis=1)
-    require(len(starts) <= MOST_STARTS, str(path), f"at most {MOST_STARTS} poses", len(starts))
+    starts = finite(path, read_csv(path, *machine.names), *machine.names)
     for joint, q in zip(machine.joints, starts.T, strict=True):
         wrong = np.flatnonzero((q < joint.q_min) | (q > joint.q_max))
         where, wanted = f"{path}: {joint.name}", f"{joint.q_min:g} to {joint.q_max:g}"
@@ -172,6 +154,14 @@ def read_starts(path: Path, machine: Machine) -> Array:
     wanted = f"arms above {machine.ground} m"
     require(not terminated(machine, lowest).any(), str(path), wanted, f"{lowest.min():.3f} m")
     return starts
+
+
+def finite(path: Path, table: Mapping[str, NDArray[Any]], *names: str) -> Array:
+    """Columns of a table side by side, (rows, names); ValueError: a nan or inf is in one."""
+    for name in names:
+        fits = bool(np.isfinite(table[name]).all())
+        require(fits, f"{path}: {name}", "finite numbers", brief(table[name].tolist()))
+    return np.stack([table[name] for name in names], axis=1)
 
 
 def evaluation_starts(
@@ -211,16 +201,15 @@ def draw_starts(
     machine: Machine, num: int, sequences: Sequence[Commands], rng: np.random.Generator
 ) -> Array:
     """Random "workspace" poses [rad] (num, n) from which ideal actuators follow all sequences."""
-    starts: list[Array] = []
-    for _ in range(DRAWS):
-        poses = draw_pose(machine, rng, 400).round(4)
+
+    def draw() -> tuple[Array]:
+        poses = draw_pose(machine, rng, POSES).round(4)
         poses = poses[np.array(start_kinds(machine, poses)) == "workspace"]
         for sequence in sequences:
             poses = poses[feasible(machine, poses, sequence.for_starts(machine, poses))]
-        starts.extend(poses)
-        if len(starts) >= num:
-            return np.array(starts[:num])
-    raise ValueError(f"{machine.name}: expected {num} starts with {MARGINS}, got {len(starts)}")
+        return (poses,)
+
+    return collected(machine, num, draw)[0]
 
 
 def tuning_set(machine: Machine, num: int, seed: int, seconds: float = 20.0) -> tuple[Array, Array]:
@@ -230,20 +219,29 @@ def tuning_set(machine: Machine, num: int, seed: int, seconds: float = 20.0) -> 
     scored ones. ValueError: too few.
     """
     rng = np.random.default_rng(seed + 1000)
-    shape = 400, int(np.ceil(seconds / TUNING.hold_min_s))  # poses, and goals of each: enough
-    starts: list[Array] = []
-    goals: list[Array] = []
-    for _ in range(DRAWS):
-        poses = draw_pose(machine, rng, shape[0])
+    shape = POSES, int(np.ceil(seconds / TUNING.hold_min_s))  # poses, and goals of each: enough
+
+    def draw() -> tuple[Array, Array]:
+        poses = draw_pose(machine, rng, POSES)
         v_goal = draw_goal(machine, TUNING, rng, shape[0] * shape[1]).reshape(*shape, 3)
         rests = np.rint(_log_uniform(rng, shape) * machine.rate).astype(int)
         holds = draw_hold(machine, TUNING, rng, shape[0] * shape[1]).reshape(shape)
         ticks = np.where(v_goal.any(axis=-1), holds, rests)
         drawn = [np.repeat(*of, axis=0) for of in zip(v_goal, ticks, strict=True)]
-        runs = np.array([run[: round(seconds * machine.rate)] for run in drawn])  # (400, T, 3)
+        runs = np.array([run[: round(seconds * machine.rate)] for run in drawn])  # (POSES, T, 3)
         follows = feasible(machine, poses, runs.swapaxes(0, 1))
-        starts.extend(poses[follows])
-        goals.extend(runs[follows])
-        if len(starts) >= num:
-            return np.array(starts[:num]), np.stack(goals[:num], axis=1)
-    raise ValueError(f"{machine.name}: expected {num} runs with {MARGINS}, got {len(starts)}")
+        return poses[follows], runs[follows]
+
+    starts, goals = collected(machine, num, draw)
+    return starts, goals.swapaxes(0, 1)
+
+
+def collected(machine: Machine, num: int, draw: Callable[[], tuple[Array, ...]]) -> list[Array]:
+    """The first `num` rows of arrays that are drawn again and again; ValueError: too few."""
+    drawn: list[tuple[Array, ...]] = []
+    for _ in range(DRAWS):
+        drawn.append(draw())
+        found = sum(len(rows[0]) for rows in drawn)
+        if found >= num:
+            return [np.concatenate(of)[:num] for of in zip(*drawn, strict=True)]
+    raise ValueError(f"{machine.name}: expected {num} starts with {MARGINS}, got {found}")

@@ -40,8 +40,8 @@ def sweep(
     """
     out.mkdir(parents=True, exist_ok=True)
     job = partial(run_seed, machine, net, recipe, out.resolve(), starts)
-    jobs = {f"seed {seed}": partial(job, seed) for seed in seeds}
-    results = dict(zip(seeds, side_by_side(jobs, {}, scheduler=scheduler), strict=True))
+    done = side_by_side({str(seed): partial(job, seed) for seed in seeds}, None, scheduler)
+    results = {seed: done[str(seed)] for seed in seeds}
     table = over_seeds(results)
     meta = metrics.metadata(machine, min(seeds)) | {"actuator": fingerprint(net)}
     rows = [{"seed": seed} | row for seed, of in results.items() for row in of]

@@ -1,1 +1,1 @@
-"""Around PPO: environments, policy files, checkpoints, simulation gradients, sweeps."""
+"""Around PPO: environments, policy files, checkpoints, sweeps."""

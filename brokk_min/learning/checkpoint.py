@@ -2,13 +2,9 @@
 
 import io
 import json
-import signal
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +16,9 @@ from tqdm import tqdm
 from brokk_min import ppo
 from brokk_min._files import expect_same, expected, whole_file, write_csv
 from brokk_min.actuator import ActuatorNet
-from brokk_min.beyond import simulation_gradient
-from brokk_min.beyond.gradient_config import GradientConfig
-from brokk_min.env import State
+from brokk_min.beyond.group_advantages import GroupVectorEnv, group_advantages
 from brokk_min.identification.net_file import fingerprint
+from brokk_min.learning.episodes import map_arrays
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import INTERFACES, Policy, contract, save_policy
 from brokk_min.learning.recipes import Recipe
@@ -51,16 +46,24 @@ def train_policy(
         "recipe": json.loads(json.dumps(asdict(recipe))),
     }
     torch.set_num_threads(1)  # several wait in vain on busy cores
-    interface = INTERFACES[recipe.interface]
-    env = TaskVectorEnv(recipe.learner.num_envs, net, machine, recipe.task, interface)
-    log = TrainingLog(env, recipe.learner, out, about)
+    config = recipe.learner
+    env: TaskVectorEnv
+    advantages: ppo.Advantages
+    simulation = (config.num_envs, net, machine, recipe.task, INTERFACES[recipe.interface])
+    if recipe.critic:
+        env, advantages = TaskVectorEnv(*simulation), ppo.critic_advantages
+    else:
+        env, advantages = GroupVectorEnv(*simulation, horizon=config.horizon), group_advantages
+    log = TrainingLog(env, config, out, about)
     start = log.begin(seed, resume)
-    with log.stop_after_update():
-        if isinstance(recipe.learner, PPOConfig):
-            agent = ppo.train(env, recipe.learner, seed, on_update=log.on_update, start=start)
-        else:
-            train = simulation_gradient.train
-            agent = train(env, recipe.learner, seed, on_update=log.on_update, start=start)
+    try:
+        agent = ppo.train(env, config, seed, advantages, log.on_update, start)
+    except KeyboardInterrupt as stop:
+        saved = log.checkpoint.exists()
+        text = f"; go on from {log.checkpoint} with --resume" if saved else ""
+        raise KeyboardInterrupt(text) from stop
+    finally:
+        log.bar.close()
     log.write_curve()
     policy = Policy(about, actor_weights(agent), net, recipe.interface)
     save_policy(out, policy, machine)
@@ -88,17 +91,12 @@ class TrainingLog:
     """Curve, progress bar and checkpoints of one training."""
 
     def __init__(
-        self,
-        env: TaskVectorEnv,
-        config: GradientConfig | PPOConfig,
-        out: Path,
-        about: dict[str, Any],
+        self, env: TaskVectorEnv, config: PPOConfig, out: Path, about: dict[str, Any]
     ) -> None:
         self.env, self.config, self.about = env, config, about
         self.checkpoint = Path(f"{out}.checkpoint")
         self.curve = Path(f"{out}.csv")
         self.rows: list[dict[str, float]] = []
-        self.interrupted = False
 
     def begin(self, seed: int, resume: bool) -> Checkpoint:
         """A new training, or that of the checkpoint; ValueError: it exists, but not to resume."""
@@ -128,34 +126,13 @@ class TrainingLog:
         self.rows.append({"global_step": now.global_step, **row})
         self.bar.update(now.global_step - self.bar.n)
         self.bar.set_postfix_str(f"error {error:.3f} m/s")
-        if self.interrupted or now.update % EVERY == 0:
+        if now.update % EVERY == 0:
             self.write_curve()
             self.save(now)
-        if self.interrupted:
-            raise KeyboardInterrupt(f"; {self.checkpoint} is saved, go on with --resume")
 
     def write_curve(self) -> None:
         """Write all rows so far."""
         write_csv(self.curve, self.rows[0], [row.values() for row in self.rows])
-
-    @contextmanager
-    def stop_after_update(self) -> Iterator[None]:
-        """Ctrl-C stops after the present update; a second one stops at once."""
-        if threading.current_thread() is not threading.main_thread():  # others get no signals
-            yield
-            return
-        before = signal.getsignal(signal.SIGINT)
-
-        def interrupt(*_: object) -> None:
-            self.interrupted = True
-            signal.signal(signal.SIGINT, before)
-
-        signal.signal(signal.SIGINT, interrupt)
-        try:
-            yield
-        finally:
-            signal.signal(signal.SIGINT, before)
-            self.bar.close()
 
     def save(self, now: Checkpoint) -> None:
         """Write a checkpoint from which a training continues to the same bits."""
@@ -167,8 +144,7 @@ class TrainingLog:
             "steps": [now.global_step, now.update],
             "torch_random": torch.get_rng_state(),
             "numpy_random": self.env.np_random.bit_generator.state,
-            "state": tensors(vars(self.env.state)),
-            "memory": tensors(self.env.memory),
+            "arrays": leaves((self.env.state, self.env.memory)),
             "rows": self.rows,
         }
         buffer = io.BytesIO()
@@ -186,29 +162,22 @@ class TrainingLog:
             expect_same(self.checkpoint, json.loads(content["about"]), self.about)
             fresh.agent.load_state_dict(content["agent"])
             fresh.optimizer.load_state_dict(content["optimizer"])
-            names = [field.name for field in fields(State)]
-            present = tuple(getattr(self.env.state, name) for name in names)
-            saved = tuple(content["state"][name] for name in names)
-            self.env.state = State(*arrays_like(present, saved))
-            self.env.memory = arrays_like(self.env.memory, content["memory"])
+            saved = iter(content["arrays"])
+            present = self.env.state, self.env.memory
+            self.env.state, self.env.memory = map_arrays(lambda _: next(saved).numpy(), present)
             self.env.np_random.bit_generator.state = content["numpy_random"]
             torch.set_rng_state(content["torch_random"])
             self.rows = content["rows"]
             return Checkpoint(fresh.agent, fresh.optimizer, content["obs"], *content["steps"])
 
 
-def tensors(value: Any) -> Any:
-    """Arrays within dictionaries and tuples as tensors, tuples as lists."""
-    if isinstance(value, dict):
-        return {name: tensors(inner) for name, inner in value.items()}
-    if isinstance(value, tuple):
-        return [tensors(inner) for inner in value]
-    return value if value is None else torch.tensor(value)
+def leaves(values: Any) -> list[torch.Tensor]:
+    """Copies of all arrays in `values`, in the order of `map_arrays`."""
+    found: list[torch.Tensor] = []
 
+    def keep(array: np.ndarray) -> np.ndarray:
+        found.append(torch.tensor(array))
+        return array
 
-def arrays_like(present: Any, saved: Any) -> Any:
-    """The inverse of `tensors`, with tuples of the kinds that `present` has."""
-    if isinstance(present, tuple):
-        make: Callable[..., Any] = getattr(present, "_make", tuple)
-        return make([arrays_like(a, b) for a, b in zip(present, saved, strict=True)])
-    return saved if saved is None else saved.numpy()
+    map_arrays(keep, values)
+    return found

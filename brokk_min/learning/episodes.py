@@ -1,5 +1,6 @@
 """Episodes of training: random starts and goals, noisy observations. Paper: Sec. 3.4"""
 
+from collections.abc import Callable
 from dataclasses import fields, replace
 from typing import Any
 
@@ -67,20 +68,26 @@ def draw_noise(machine: Machine, largest: float, num: int, rng: np.random.Genera
     return np.float32(largest) * noise
 
 
-def replace_rows(values: Any, rows: NDArray[np.intp], fresh: Any) -> Any:
-    """`values` with its rows `rows` replaced by `fresh`, one each.
-
-    Values are arrays, or a `State`, a memory or a plant's state: tuples of arrays.
-    """
-    if values is None:
+def map_arrays(function: Callable[..., Array], first: Any, *others: Any) -> Any:
+    """`function` of all arrays in a `State`, a memory or a plant's state: tuples of arrays."""
+    if first is None:
         return None
-    if isinstance(values, State):
+    if isinstance(first, State):
         names = [field.name for field in fields(State)]
-        old, new = (tuple(getattr(one, name) for name in names) for one in (values, fresh))
-        return State(*(replace_rows(a, rows, b) for a, b in zip(old, new, strict=True)))
-    if isinstance(values, tuple):
-        pairs = zip(values, fresh, strict=True)
-        return type(values)(*(replace_rows(a, rows, b) for a, b in pairs))
-    result = np.array(values)
-    result[rows] = fresh
-    return result
+        parts = (tuple(getattr(one, name) for name in names) for one in (first, *others))
+        return State(*map_arrays(function, *parts))
+    if isinstance(first, tuple):
+        values = [map_arrays(function, *row) for row in zip(first, *others, strict=True)]
+        return first._make(values) if hasattr(first, "_make") else tuple(values)
+    return function(first, *others)
+
+
+def replace_rows(values: Any, rows: NDArray[np.intp], fresh: Any) -> Any:
+    """`values` with its rows `rows` replaced by `fresh`, one each; values as for `map_arrays`."""
+
+    def replaced(old: Array, new: Array) -> Array:
+        result = np.array(old)
+        result[rows] = new
+        return result
+
+    return map_arrays(replaced, values, fresh)

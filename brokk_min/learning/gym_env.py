@@ -77,15 +77,26 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
     ) -> tuple[Array, dict[str, Any]]:
         """Draw new episodes for all machines."""
         super().reset(seed=seed)
-        self.state = reset(self.machine, self.config, self.np_random, self.num_envs, self.plant)
+        self.state = self.draw_episodes(self.num_envs)
         obs, self.memory = self.observe(self.state, None)
         return obs, {}
+
+    def draw_episodes(self, num: int) -> State:
+        """`num` machines at the start of an episode."""
+        return reset(self.machine, self.config, self.np_random, num, self.plant)
+
+    def draw_noise(self, num: int) -> Array:
+        """Noise of `env.measure` for `num` machines."""
+        return draw_noise(self.machine, self.config.noise, num, self.np_random)
+
+    def new_goals(self, state: State) -> State:
+        """New goals where the time of a goal is over."""
+        return new_goals(self.machine, self.config, state, self.np_random)
 
     def observe(self, state: State, memory: Any) -> tuple[Array, Any]:
         """Observation with fresh noise (5 % in the paper), and the agent's memory with it."""
         m = self.machine
-        noise = draw_noise(m, self.config.noise, len(state.q), self.np_random)
-        measured = measure(m, state.history, state.v_goal, noise)
+        measured = measure(m, state.history, state.v_goal, self.draw_noise(len(state.q)))
         memory = self.interface.remember(m, memory, measured)
         return self.interface.observe(m, measured, memory), memory
 
@@ -95,7 +106,7 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         done = terminated | truncated
         rows = np.flatnonzero(done)
         if len(rows):
-            fresh = reset(self.machine, self.config, self.np_random, len(rows), self.plant)
+            fresh = self.draw_episodes(len(rows))
             first, memory = self.observe(fresh, None)
             self.state = replace_rows(self.state, rows, fresh)
             self.memory = replace_rows(self.memory, rows, memory)
@@ -111,7 +122,7 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         u = self.interface.command(m, np.asarray(actions), memory)
         state, reward, terminated, truncated = env.step(m, self.config, self.plant, before, u)
         error = np.linalg.norm(state.v_goal - state.v_tool, axis=-1)
-        self.state = new_goals(m, self.config, state, self.np_random)
+        self.state = self.new_goals(state)
         obs, self.memory = self.observe(self.state, memory)
         cost = self.interface.cost(m, u, before.history[..., 2, -1], self.memory)
         reward = np.where(terminated, 0.0, reward - cost)

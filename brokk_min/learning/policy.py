@@ -16,7 +16,11 @@ from brokk_min.machine import Array, Machine, Measured
 
 KIND = "policy 5"
 INTERFACES = {"paper": PAPER, "beyond": INTERFACE}  # by their names in files
-POLICIES = {"rl": "policy.npz", "rl_paper": "policy_paper.npz"}  # files of `reproduce`
+POLICIES = {  # files of `reproduce`: our agent, the paper's, and the paper's as printed
+    "rl": "policy.npz",
+    "rl_paper": "policy_paper.npz",
+    "rl_critic": "policy_critic.npz",
+}
 
 
 @dataclass(frozen=True)

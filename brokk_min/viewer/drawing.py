@@ -21,7 +21,7 @@ from brokk_min.machine import PWM_MAX, Array, Machine
 Colour = tuple[int, int, int]
 BACKGROUND, INK, MUTED = (250, 250, 247), (33, 37, 43), (120, 128, 138)
 GRID, SLOT, SOIL, STEEL = (228, 230, 232), (212, 216, 221), (214, 203, 186), (74, 80, 88)
-WARNING, MEASURED, PATH = (208, 28, 28), (0, 158, 115), (230, 159, 0)
+WARNING, MEASURED = (208, 28, 28), (0, 158, 115)
 BLUE, ORANGE = (0, 114, 178), (213, 94, 0)  # of the machine under the policy, under the PID
 HEAD, ROW = 36.0, 20.0  # heights of the title and of a joint's row
 NEAR_LIMIT = 0.05  # of its range: a joint nearer to an end is red
@@ -44,7 +44,6 @@ class Scene(NamedTuple):
     v_goal: Array  # goal velocity of the tool [m/s], (3,)
     v_tool: Array  # measured velocity of the tool [m/s], (3,)
     trail: Array = NO_POINTS  # past tool positions [m], (T, 3)
-    path: Array = NO_POINTS  # line that the tool should follow [m], (K, 3)
     title: str = ""
     status: str = ""
     colour: Colour = BLUE
@@ -158,7 +157,7 @@ def views(machine: Machine, q: Array, size: tuple[int, int]) -> list[View]:
 
 
 def foot(machine: Machine) -> float:
-    """Height of the rows of all joints, and of five notes, below the views."""
+    """Height of the rows of all joints, or of five notes, below the views."""
     return ROW * (max(machine.n, 5) + 0.7)
 
 
@@ -173,18 +172,16 @@ def extent(machine: Machine) -> tuple[float, float, float]:
 
 
 def _backdrop(canvas: Canvas, machine: Machine, view: View) -> None:
-    """A grid of 1 m, or of the power of ten that fits, and the ground in the side view."""
+    """A grid of 1 m, and the ground in the side view."""
     left, top, width, height = view.box
-    metres = next(m for m in 10.0 ** np.arange(-3, 20) if m * view.scale > 12)
-    step = view.scale * metres
     x0, y0 = view.origin
-    for x in np.arange(left + (x0 - left) % step, left + width, step):
+    for x in np.arange(left + (x0 - left) % view.scale, left + width, view.scale):
         canvas.bar(x, top, 1, height, GRID)
-    for y in np.arange(top + (y0 - top) % step, top + height, step):
+    for y in np.arange(top + (y0 - top) % view.scale, top + height, view.scale):
         canvas.bar(left, y, width, 1, GRID)
     if view.axes is not ABOVE:
         canvas.bar(left, y0 - view.scale * machine.ground, width, height, SOIL)
-    canvas.text(left + 8, top + 10, f"{view.label}, grid of {metres:g} m", 11, MUTED)
+    canvas.text(left + 8, top + 10, f"{view.label}, grid of 1 m", 11, MUTED)
 
 
 def _base(canvas: Canvas, machine: Machine, view: View, scene: Scene) -> None:
@@ -225,11 +222,10 @@ def _arm(canvas: Canvas, machine: Machine, view: View, scene: Scene) -> None:
 
 
 def _tool(canvas: Canvas, machine: Machine, view: View, scene: Scene) -> None:
-    """The line to follow, the trail of the tool, and the arrows of its velocities."""
+    """The trail of the tool, and the arrows of its velocities."""
     tip = view.project(tool_position(forward_kinematics(machine, scene.q)))
-    for points, colour in ((scene.path, PATH), (scene.trail, scene.colour)):
-        if len(points) > 1:
-            canvas.line(view.project(points), colour, 2.5)
+    if len(scene.trail) > 1:
+        canvas.line(view.project(scene.trail), scene.colour, 2.5)
     canvas.polygon(tip + 4 * CIRCLE, INK)
     scale = 0.2 * min(view.box[2:]) / machine.tool_speed
     for v, colour in ((scene.v_tool, MEASURED), (scene.v_goal, INK)):

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from brokk_min.actuator import PLANT, Plant
 from brokk_min.can.operator_input import shape_axis
@@ -21,7 +20,7 @@ from brokk_min.env import initial_state, measure, transition
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
-from brokk_min.viewer.drawing import BLUE, NO_POINTS, ORANGE, Scene, draw, extent, load_pygame
+from brokk_min.viewer.drawing import BLUE, ORANGE, Scene, draw, load_pygame
 
 SIZE, SMALLEST = (1120, 680), (640, 360)  # px, of the window at first and of a picture
 RISE = 0.25  # s from a key's press to full deflection (assumed)
@@ -29,27 +28,26 @@ TRAIL = 600  # positions of the tool that are shown
 # Keys for and against x, y and z, as the top view shows them, and the gamepad's axes for them.
 KEYS = (("up", "down"), ("left", "right"), ("w", "s"))
 AXES = (1, 0, 4)  # 2 and 5 are triggers, which do not rest in the middle
-ACTIONS = {"escape": "close", "tab": "controller", "return": "rectangle", "r": "restart"}
-BUTTONS = {3: "controller", 0: "rectangle", 1: "restart"}
+ACTIONS = {"escape": "close", "tab": "controller", "r": "restart"}
+BUTTONS = {3: "controller", 1: "restart"}
 NOTES = (
     "arrows: x (up, down) and y (left, right)",
     "W, S: z (up, down)    SHIFT: slowly",
-    "TAB: the other controller    R: back to the start",
-    "ENTER: a rectangle to follow    ESC: end",
-    "gamepad: both sticks; buttons 3, 0 and 1 are TAB, ENTER and R",
+    "TAB: the other controller",
+    "R: back to the start    ESC: end",
+    "gamepad: both sticks; buttons 3 and 1 are TAB and R",
 )
 
 
 class Operator:
-    """Keyboard and gamepad as one operator; without the window's focus both are at rest."""
+    """Keyboard and gamepad as one operator."""
 
     def __init__(self, machine: Machine, pygame: Any) -> None:
         self.machine, self.pygame = machine, pygame
         self.held: set[str] = set()  # keys
-        self.focus = True
         self.deflection: Array = np.zeros(3)
-        pygame.joystick.init()
-        self.pad: Any = pygame.joystick.Joystick(0) if pygame.joystick.get_count() else None
+        self.pad: Any = None
+        pygame.joystick.init()  # a gamepad that is there is an event, too
 
     def handle(self, event: Any) -> str:
         """Take in an event of pygame, and say which of `ACTIONS` it asks for, if any."""
@@ -61,12 +59,11 @@ class Operator:
             return ACTIONS.get(pg.key.name(event.key), "")
         if event.type == pg.KEYUP:
             self.held.discard(pg.key.name(event.key))
-        elif event.type in (pg.WINDOWFOCUSLOST, pg.WINDOWFOCUSGAINED):
-            self.focus = event.type == pg.WINDOWFOCUSGAINED
+        elif event.type == pg.WINDOWFOCUSLOST:
             self.held.clear()
         elif event.type == pg.JOYBUTTONDOWN:
             return BUTTONS.get(event.button, "")
-        elif event.type == pg.JOYDEVICEADDED and self.pad is None:
+        elif event.type == pg.JOYDEVICEADDED:
             self.pad = pg.joystick.Joystick(event.device_index)
         elif event.type == pg.JOYDEVICEREMOVED:
             self.pad = None
@@ -80,7 +77,7 @@ class Operator:
         target = np.array([float(p in self.held) - float(m in self.held) for p, m in KEYS])
         if self.held & {"left shift", "right shift"}:
             target /= 3
-        if self.pad is not None and self.focus:
+        if self.pad is not None:
             axes = [self.pad.get_axis(i) for i in AXES]  # one that it lacks reads 0
             target = np.clip(target - shape_axis(axes), -1, 1)
         step = self.machine.dt / RISE
@@ -92,7 +89,7 @@ class Operator:
 
 @dataclass
 class Session:
-    """A simulated machine, the controller that drives it now, and the line to follow."""
+    """A simulated machine, and the controller that drives it now."""
 
     machine: Machine
     controllers: dict[str, Controller]
@@ -101,7 +98,6 @@ class Session:
 
     def __post_init__(self) -> None:
         self.name = next(iter(self.controllers))
-        self.path: Array = NO_POINTS
         self.restart()
 
     def restart(self) -> None:
@@ -115,12 +111,6 @@ class Session:
         names = list(self.controllers)
         self.name = names[(names.index(self.name) + 1) % len(names)]
         self.memory = self.controllers[self.name].start(1)
-
-    def rectangle(self) -> None:
-        """A new level rectangle that starts at the tool, in a size that suits the machine."""
-        corners = np.array([[0, 0, 0], [0, 0.16, 0], [0.1, 0.16, 0], [0.1, 0, 0], [0, 0, 0]])
-        self.path = self.tool + extent(self.machine)[0] * corners
-        self.trail = self.tool[None]
 
     @property
     def tool(self) -> Array:
@@ -139,41 +129,17 @@ class Session:
         """What the window shows now."""
         s = self.state
         status = f"{s.ticks[0] * self.machine.dt:.1f} s"
-        if len(self.path):
-            now, *_ = off = 1e3 * distance(self.path, self.trail[::-1])
-            status = f"{now:.0f} mm from the rectangle, at most {off.max():.0f} mm    {status}"
         colour = ORANGE if list(self.controllers).index(self.name) % 2 else BLUE
-        tool = s.v_goal[0], s.v_tool[0], self.trail, self.path
+        tool = s.v_goal[0], s.v_tool[0], self.trail
         return Scene(s.q[0], s.history[0, :, 2, -1], *tool, self.name, status, colour, NOTES)
 
 
-def distance(line: ArrayLike, p: Array) -> Array:
-    """Distances [m] (T,) of points (T, 3) from a line through points (K, 3).
-
-    Example:
-        >>> distance([[0, 0, 0], [1, 0, 0]], np.array([[0.5, 0.2, 0], [1.3, 0.4, 0]])).round(3)
-        array([0.2, 0.5])
-    """
-    line = np.asarray(line, float)
-    along = np.diff(line, axis=0)
-    offset = p[:, None] - line[:-1]
-    fraction = np.sum(offset * along, axis=-1) / np.maximum(np.sum(along**2, axis=-1), 1e-12)
-    nearest = np.clip(fraction, 0, 1)[..., None] * along
-    return np.asarray(np.linalg.norm(offset - nearest, axis=-1).min(axis=1))
-
-
-def play(
-    machine: Machine,
-    controllers: dict[str, Controller],
-    start: tuple[float, ...] = (),
-    plant: Plant = PLANT,
-) -> None:
+def play(machine: Machine, controllers: dict[str, Controller], plant: Plant = PLANT) -> None:
     """Drive a simulated machine in a window, until it is closed.
 
-    The window shows the names of the `controllers`; `start` are angles [rad], see `start_pose`.
-    ValueError: a start outside the ranges, no pygame, or no display.
+    The window shows the names of the `controllers`. ValueError: no pygame, or no display.
     """
-    q = start_pose(machine, start)
+    q = start_pose(machine, ())
     with window(f"brokk_min: {machine.name}") as pygame:
         session, operator = Session(machine, controllers, q, plant), Operator(machine, pygame)
         clock = pygame.time.Clock()

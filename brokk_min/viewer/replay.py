@@ -7,6 +7,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from brokk_min._files import whole_file
+from brokk_min.actuator import estimate_velocity
 from brokk_min.can.drive_log import read_frames, read_telemetry
 from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocity
 from brokk_min.machine import Machine, require
@@ -33,11 +34,13 @@ def scenes(machine: Machine, path: Path) -> list[Scene]:
     driving = [t.driving for t in ticks]
     require(any(driving), str(path), "a log in which the machine is driven", "another one")
     ticks = ticks[driving.index(True) :]
-    fk = forward_kinematics(machine, np.array([t.q for t in ticks]))
-    p, v = tool_position(fk), tool_velocity(fk, np.array([t.q_dot for t in ticks]))
-    return [
-        Scene(
-            t.q, t.u, t.v_goal, v[k], p[: k + 1], title=path.name, status=f"{k * machine.dt:.1f} s"
-        )
-        for k, t in enumerate(ticks)
-    ]
+    q, samples = np.array([t.q for t in ticks]), machine.velocity_samples
+    padded = np.concatenate([q[:1].repeat(samples - 1, axis=0), q])  # at rest before
+    windows = np.lib.stride_tricks.sliding_window_view(padded, samples, axis=0)
+    fk = forward_kinematics(machine, q)
+    p, v = tool_position(fk), tool_velocity(fk, estimate_velocity(windows, samples, machine.dt))
+    run = []
+    for k, t in enumerate(ticks):
+        status = f"{k * machine.dt:.1f} s"
+        run.append(Scene(t.q, t.u, t.v_goal, v[k], p[: k + 1], path.name, status))
+    return run

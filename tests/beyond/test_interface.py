@@ -69,8 +69,10 @@ def test_observe__by_hand():
     obs = observe(BROKK_170, measured, memory(0, integral))
     assert obs.shape == (223,) and obs.dtype == np.float32
     paper = env.features(BROKK_170, measured)
-    np.testing.assert_allclose(obs[:7], 1.4 * paper[:7], rtol=1e-5)
-    np.testing.assert_allclose(obs[7:163], paper[7:] / 13**0.5, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(obs[:7], 0.75 * paper[:7], rtol=1e-5)
+    expected = paper[7:] / 13**0.5
+    expected[:104].reshape(4, 2, 13)[:, 1] /= 3  # velocities
+    np.testing.assert_allclose(obs[7:163], expected, rtol=1e-5, atol=1e-6)
     for place, joint in ((163, 0), (176, 2), (189, 3), (202, 4)):
         opening = np.maximum(0, np.abs(-0.1 * joint + 0.002 * np.arange(13)) - 0.07) / 0.93
         expected = (np.tanh(opening / 0.02) - 0.5) / 0.5 / 13**0.5
@@ -80,7 +82,7 @@ def test_observe__by_hand():
     J = jacobian(forward_kinematics(BROKK_170, q))[:, DRIVEN]
     damping = (0.06 * (np.hypot(0.25, 0.95) + 1.15 + 1.25 + 1.15 + 1.2)) ** 2
     solution = np.linalg.solve(J.T @ J + damping * np.eye(4), J.T)
-    nominal = np.array([0.20, 0.28, 0.38, 0.47]) / 3**0.5 / 4.2
+    nominal = env.velocity_deviations(BROKK_170)[1][DRIVEN] / 1.5
     np.testing.assert_allclose(obs[215:219], solution @ measured.v_goal / nominal, rtol=1e-4)
     np.testing.assert_allclose(obs[219:], solution @ integral / (0.1 * nominal), rtol=1e-4)
 
@@ -89,10 +91,13 @@ def test_the_table_of_the_docstring__is_true():
     """Numbers and weights of the table are those of the scale."""
     rows = re.findall(r"^\| (\d+)-(\d+) +\| .+? +\| .+? +\| ([\d.]+) +\|", interface.__doc__, re.M)
     _, scale = observation_scale(BROKK_170)
-    _, std = env.observation_scale(BROKK_170)
-    uniform = BROKK_170.q_dot_max[DRIVEN] / 3**0.5
-    deviations = np.concatenate([std, np.full(52, 0.5), uniform, 0.1 * uniform])
-    assert [int(last) + 1 for _, last, _ in rows] == [7, 163, 215, 219, 223] and len(scale) == 223
+    std = env.observation_scale(BROKK_170)[1].copy()
+    q_dot = env.velocity_deviations(BROKK_170)[1][DRIVEN]
+    std[7:111].reshape(4, 2, 13)[:, 1] *= 3
+    deviations = np.concatenate([std, np.full(52, 0.5), q_dot, 0.1 * q_dot])
+    assert [int(last) + 1 for _, last, _ in rows] == [7, 111, 163, 215, 219, 223] and len(
+        scale
+    ) == 223
     assert all(int(one[1]) + 1 == int(next_[0]) for one, next_ in pairwise(rows))
     for first, last, weight in rows:
         place = slice(int(first), int(last) + 1)

@@ -2,32 +2,25 @@
 
 import cantools
 import numpy as np
-import pytest
 
 from brokk_min.can import canopen
-from brokk_min.can.canopen import encoder_raw, used_ids, valve_frames
+from brokk_min.can.canopen import encoder_raw, node_numbers, valve_frame
 from brokk_min.machine import BROKK_170
 from examples.dbc import dbc
-from examples.seven_joints import SEVEN_JOINTS
 
 
-@pytest.mark.parametrize("machine", [BROKK_170, SEVEN_JOINTS], ids=lambda m: m.name)
-def test_dbc__describes_the_frames_that_the_program_uses(machine):
-    database = cantools.database.load_string(dbc(machine), "dbc", strict=True)
-    unused = {canopen.SDO_ANSWER + node for node in range(128)}
-    unused.add(canopen.TPDO1 + machine.controller_node)
-    assert {message.frame_id for message in database.messages} == set(used_ids(machine)) - unused
-    command = np.arange(machine.n) * 20 - 60
-    expected = {f"u_{n}": m if m >= 0 else 255 + m for n, m in zip(machine.names, command)}
-    for k, frame in enumerate(valve_frames(command, 7, 1)):
-        decoded = database.decode_message(machine.valve_frame_id + k, frame.tobytes())
-        assert (decoded.pop("counter"), decoded.pop("enable")) == (7, 1)
-        assert decoded.pop("checksum") == frame[6]
-        assert decoded == {u: expected.pop(u) for u in decoded}
-    assert not expected
-    raw = int(encoder_raw(machine, np.full(machine.n, -5))[1])
-    node = machine.joints[1].encoder_node
-    position = database.decode_message(canopen.TPDO1 + node, raw.to_bytes(4, "little"))
-    assert position == {"position": raw}
-    heartbeat = canopen.HEARTBEAT + machine.controller_node
+def test_dbc__describes_the_frames_that_the_program_uses():
+    database = cantools.database.load_string(dbc(BROKK_170), "dbc", strict=True)
+    *encoders, controller = node_numbers(BROKK_170)
+    beats = {0x700 + node for node in (*encoders, controller)}
+    used = {0x000, 0x080, 0x210, *beats, *(0x180 + node for node in encoders)}
+    assert {message.frame_id for message in database.messages} == used
+    frame = valve_frame([80, 0, -80, 20, -60], 7, 1)
+    decoded = database.decode_message(0x210, frame.tobytes())
+    assert decoded.pop("checksum") == frame[6]
+    commands = {"u_q1": 80, "u_q2": 0, "u_q3": 175, "u_q4": 20, "u_q5": 195}
+    assert decoded == commands | {"counter": 7, "enable": 1}
+    raw = int(encoder_raw(BROKK_170, np.full(5, -5))[1])
+    assert database.decode_message(0x182, raw.to_bytes(4, "little")) == {"position": raw}
+    heartbeat = canopen.HEARTBEAT + controller
     assert database.decode_message(heartbeat, b"\x05") == {"state": 5}

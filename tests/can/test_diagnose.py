@@ -34,7 +34,7 @@ def drive(observe=lambda h: h, send=lambda u: u, read=lambda q: q, ticks_of_plan
         v_goal = goal[None].astype(np.float32)
         u, memory = controller(measure(M, observe(history.copy()), v_goal), memory)
         time = t * ticks_of_plant / 20
-        ticks.append(Telemetry(time, q[0], q[0], u[0].astype(float), goal, True))
+        ticks.append(Telemetry(time, q[0], u[0].astype(float), goal, True))
         for _ in range(ticks_of_plant):
             state = net.step(M, state, send(u))
     return ticks

@@ -6,15 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from brokk_min.actuator import estimate_velocity
-from brokk_min.can.canopen import (
-    OPERATOR_CHANNEL,
-    OPERATOR_INPUT,
-    Frame,
-    OperatorInput,
-    encoder_raw,
-    valve_frame,
-)
+from brokk_min.can.canopen import OPERATOR_INPUT, Frame, OperatorInput, encoder_raw, valve_frame
 from brokk_min.can.drive_log import log_for_fit, read_frames, read_telemetry
 from brokk_min.machine import BROKK_170
 
@@ -30,35 +22,21 @@ def test_read_frames__reads_a_cut_log_up_to_its_last_whole_line(tmp_path):
 
 
 def test_read_frames__reads_a_plain_candump_log_too(tmp_path):
-    lines = ["(1.0) can0 123#0102\n", "(2.0) can0 12345678#\n", "(3.0) can0 080# T\n"]
+    extended, fd, remote = "(2.0) can0 12345678#\n", "(2.0) can0 123##F00\n", "(2.0) can0 123#R\n"
+    lines = ["(1.0) can0 123#0102\n", extended, fd, remote, "(3.0) can0 080# T\n"]
     (tmp_path / "can.log").write_text("".join(lines))
-    assert list(read_frames(tmp_path / "can.log")) == [
-        Frame(1.0, 0x123, b"\x01\x02", False, "can0"),
-        Frame(2.0, -1, b"", False, "can0"),
-        Frame(3.0, 0x80, b"", True, "can0"),
-    ]
+    found = list(read_frames(tmp_path / "can.log"))
+    assert found == [Frame(1.0, 0x123, b"\x01\x02"), Frame(3.0, 0x80, b"", True)]
 
 
 def test_read_frames__names_the_row_that_is_no_frame(tmp_path):
-    (tmp_path / "log.csv").write_text(
-        "(1.0) can0 123#0102\n(2.0) can0 123##F00\nrun,time,u_a,q_a\n"
-    )
-    with pytest.raises(
-        ValueError, match=r"log.csv: expected a candump log, got row 3: expected .time. bus"
-    ):
+    (tmp_path / "log.csv").write_text("(1.0) can0 123#0102\nrun,time,u_a,q_a\n")
+    refusal = r"log.csv: expected a candump log, got row 2: expected .time. bus"
+    with pytest.raises(ValueError, match=refusal):
         list(read_frames(tmp_path / "log.csv"))
     (tmp_path / "log.csv").write_bytes(bytes(range(256)))
     with pytest.raises(ValueError, match=r"log\.csv: expected a candump log, got"):
         list(read_frames(tmp_path / "log.csv"))
-
-
-def test_read_frames__refuses_frames_of_two_buses(tmp_path):
-    lines = ["(1.0) can0 123#0102\n", "(1.1) operator 7FF#00000000000000\n", "(2.0) can1 080#\n"]
-    (tmp_path / "can.log").write_text("".join(lines))
-    with pytest.raises(
-        ValueError, match=r"row 3: expected frames of one bus, got \['can0', 'can1'\]"
-    ):
-        list(read_frames(tmp_path / "can.log"))
 
 
 def test_log_for_fit__by_hand():
@@ -80,7 +58,6 @@ def test_log_for_fit__by_hand():
     for recording, ticks in zip(log.recordings, parts, strict=False):
         counts = 100 * np.arange(1, 6) + np.array(ticks)[:, None]
         np.testing.assert_allclose(recording.q, counts * STEP, atol=1e-12)
-        np.testing.assert_allclose(recording.q_dot[4:], 10 * STEP, atol=1e-12)
         np.testing.assert_allclose(recording.u * 127, len(ticks) * [[80, 0, -80, 1, 0]], atol=1e-9)
     refusal = r"15 ticks of driving in a row at 10 Hz \(--machine\), got 11 at most"
     with pytest.raises(ValueError, match=refusal):
@@ -97,16 +74,14 @@ def test_read_telemetry__gives_at_each_sync_the_tick_before():
         frames.append(Frame(0.05 * k, 0x080, b""))
         for node, raw in enumerate(encoder_raw(BROKK_170, counts).tolist(), 1):
             frames.append(Frame(0.0, 0x180 + node, struct.pack("<I", raw)))
-        frames.append(Frame(0.0, OPERATOR_INPUT, goal, channel=OPERATOR_CHANNEL))
-        frames.append(Frame(0.0, OPERATOR_INPUT, bytes(7), channel="can0"))  # somebody else's
+        frames.append(Frame(0.0, OPERATOR_INPUT, goal, True))
+        frames.append(Frame(0.0, OPERATOR_INPUT, bytes(7)))  # somebody else's
         frames.append(Frame(0.0, 0x210, valve_frame([50, 0, -80, 0, 0], k, k > 0).tobytes()))
     frames += [Frame(0.3, 0x080, b""), Frame(0.35, 0x181, struct.pack("<I", 3))]  # a gap
     *_, before, last, gap = read_telemetry(BROKK_170, [*frames, Frame(0.4, 0x080, b"")])
     assert before.driving and last.driving and before.time == 0.2
     np.testing.assert_array_equal(before.q, measured[4])
-    newest = np.stack(measured[1:5], axis=-1)
-    np.testing.assert_allclose(before.q_dot, estimate_velocity(newest, 4, 0.05))
     np.testing.assert_allclose(before.u * 127, [50, 0, -80, 0, 0])
     np.testing.assert_allclose(before.v_goal, [0.1, 0.0, -0.2])
     assert not gap.driving and not gap.v_goal.any()
-    assert np.isnan(gap.q).all() and np.isnan(gap.q_dot).all()
+    assert np.isnan(gap.q).all()

@@ -36,11 +36,10 @@ def test_script__stops_if_the_machine_never_gets_ready():
     assert [script(False, False).stop for _ in range(101)] == [False] * 100 + [True]
 
 
-@pytest.mark.parametrize("goal", [(0.3, 0.4, 0.0), (np.nan, 0.0, 0.0)])
-def test_script__refuses_goals_that_are_too_fast(goal):
+def test_script__refuses_goals_that_are_too_fast():
     Script(BROKK_170, np.array([[0.0, 0.0, 0.3]]))
-    with pytest.raises(ValueError, match=r"command: expected at most 0.3 m/s, got (0.5|nan) m/s"):
-        Script(BROKK_170, np.array([goal]))
+    with pytest.raises(ValueError, match=r"command: expected at most 0.3 m/s, got 0.5 m/s"):
+        Script(BROKK_170, np.array([[0.3, 0.4, 0.0]]))
 
 
 def test_joystick__gives_switch_and_velocity_of_a_virtual_device():
@@ -75,8 +74,6 @@ def test_joystick__refuses_a_device_without_its_axes_or_button():
     refusal = r"joystick: expected axes \[1, 0, 6\] and button 5, got 6 axes and 8 buttons"
     with pytest.raises(ValueError, match=refusal):
         Joystick(BROKK_170, axes=(1, 0, 6))
-    with pytest.raises(ValueError, match="button 8"):
-        Joystick(BROKK_170, button=8)
     device.unplug()
 
 

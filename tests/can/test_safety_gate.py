@@ -6,36 +6,12 @@ import numpy as np
 import pytest
 
 from brokk_min.can.canopen import checksum
-from brokk_min.can.safety_gate import (
-    Fault,
-    GateInputs,
-    GateState,
-    expected_motion,
-    fault_name,
-    gate,
-    gate_start,
-)
+from brokk_min.can.safety_gate import GateInputs, GateState, expected_motion, gate, gate_start
 from brokk_min.machine import BROKK_170, decode_pwm
 
 STEP = BROKK_170.encoder_step[0]
 DT = 0.05
 DRIVEN = np.array([joint.driven for joint in BROKK_170.joints])
-
-
-def test_fault_name__gives_node_and_text():
-    names = [fault_name(BROKK_170, number) for number in range(len(Fault) * 6)]
-    expected = {
-        0: "",
-        1 * 6: "error",
-        2 * 6: "bus flooded",
-        5 * 6: "operator's device lost",
-        6 * 6: "q1: never seen",
-        6 * 6 + 5: "valve controller: never seen",
-        13 * 6 + 2: "q3: frozen, or the joint does not move",
-        14 * 6 + 4: "q5: no valid command",
-        15 * 6: "stop asked for",
-    }
-    assert {number: names[number] for number in expected} == expected
 
 
 @pytest.mark.parametrize(
@@ -284,8 +260,7 @@ def test_gate__is_what_its_promises_say_in_any_leading_shape(machine, seed):
             type(part)(*(np.reshape(field, (*shape, *np.shape(field)[1:])) for field in part))
             for part in (cases.state, cases.inputs)
         ]
-        state, frames = gate(machine, *given, cases.now.reshape(shape))
-        frame = frames[..., 0, :]
+        state, frame = gate(machine, *given, cases.now.reshape(shape))
         assert frame.dtype == np.uint8 and frame.shape == (*shape, 8)
         frame = frame.reshape(3000, 8)
         np.testing.assert_array_equal(np.delete(frame, 6, axis=1), [f for _, f in cases.expected])
@@ -318,7 +293,7 @@ def test_gate__never_raises_and_closes_the_valves_on_nonsense():
         state = GateState(*map(spoil, cases.state))
         state = state._replace(counter=rng.integers(0, 256, 2000), sent=cases.state.sent)
         with np.errstate(all="ignore"):
-            frame = gate(BROKK_170, state, inputs, spoil(cases.now))[1][:, 0]
+            frame = gate(BROKK_170, state, inputs, spoil(cases.now))[1]
         assert frame.dtype == np.uint8 and frame.shape == (2000, 8)
         m = np.rint(decode_pwm(frame[:, :5]) * 127)
         assert (np.abs(m) <= 80 * DRIVEN).all()

@@ -1,15 +1,14 @@
-"""The simulated machine frame by frame on a clock of its own, and as a process that serves."""
+"""The simulated machine frame by frame on a clock of its own."""
 
 import re
-import struct
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import pytest
-from helpers_bus import SIX, START, Recorder
+from helpers_bus import START, Recorder
 
-from brokk_min.can.canopen import HEARTBEAT_PERIOD, WATCHDOG, Frame, valve_frame, valve_frames
+from brokk_min.can.canopen import HEARTBEAT_PERIOD, WATCHDOG, Frame, valve_frame
 from brokk_min.can.simulated_machine import SimulatedMachine, start_pose
 from brokk_min.machine import BROKK_170
 
@@ -49,7 +48,6 @@ def driving():
 
 def test_advance__moves_and_beats_by_its_own_clock():
     machine = Machine()
-    assert machine.nmt_(129) == [(0x700 + node, b"\x00") for node in NODES]
     assert machine.next_step == pytest.approx(100.005)
     assert machine.advance(100.0 + 0.9 * HEARTBEAT_PERIOD) == []
     first = machine.advance(100.0 + HEARTBEAT_PERIOD + 1e-6)
@@ -95,27 +93,6 @@ def test_receive__opens_valves_after_a_start_and_a_neutral_frame():
     assert machine.u.any() and machine.valves(6, 30)[0] == 30
 
 
-def test_receive__opens_valves_when_all_frames_of_a_tick_are_there():
-    """Six joints have two frames: one alone moves nothing, and a SYNC without it closes all."""
-    reasons = []
-    machine = SimulatedMachine(SIX, [*START, 1.0], 0.0, report=reasons.append)
-    machine.receive(Frame(0.0, 0x000, bytes([1, 0])))
-
-    def tick(counter, *counts, lost=None):
-        machine.receive(Frame(0.0, 0x080, b""))
-        for k, frame in enumerate(valve_frames(counts, counter, 1)):
-            if k != lost:
-                machine.receive(Frame(0.0, 0x210 + k, frame.tobytes()))
-        return np.rint(127 * machine.u).astype(int).tolist()
-
-    rest = [0] * 6
-    assert tick(7, *rest) == rest and machine.enabled
-    assert tick(8, 50, 0, 0, 0, -60, 70) == [50, 0, 0, 0, -60, 70]
-    assert tick(9, 20, 0, 0, 0, 0, 0, lost=1) == [50, 0, 0, 0, -60, 70]
-    assert tick(10, 20, 0, 0, 0, 0, 0) == rest
-    assert reasons == ["no valve frame between two SYNCs"]
-
-
 def watchdog(machine):
     machine.valves(9, 80, now=100.01)
     machine.advance(100.01 + WATCHDOG - 0.001)
@@ -128,66 +105,53 @@ MALFORMED = "valve frame with a wrong length or checksum"
 
 
 @pytest.mark.parametrize(
-    ("act", "state", "reason"),
+    ("act", "reason"),
     [
-        (lambda m: m.valves(10, 80), 127, "valve frame with counter 10 after 8"),
-        (lambda m: m.take(0x210, FRAME[:6] + b"\x00\x01"), 127, MALFORMED),
-        (lambda m: m.take(0x210, FRAME[:7]), 127, MALFORMED),
-        (lambda m: m.valves(9, 77, sync=False), 127, "second valve frame after a SYNC, counter 9"),
-        (lambda m: m.take(0x080) + m.take(0x080), 127, "no valve frame between two SYNCs"),
-        (lambda m: m.nmt_(2, CONTROLLER), 4, None),
-        (watchdog, 127, "no valve frame for 0.15 s"),
+        (lambda m: m.valves(10, 80), "valve frame with counter 10 after 8"),
+        (lambda m: m.take(0x210, FRAME[:6] + b"\x00\x01"), MALFORMED),
+        (lambda m: m.take(0x210, FRAME[:7]), MALFORMED),
+        (lambda m: m.valves(9, 77, sync=False), "second valve frame after a SYNC, counter 9"),
+        (lambda m: m.take(0x080) + m.take(0x080), "no valve frame between two SYNCs"),
+        (lambda m: m.nmt_(2, CONTROLLER), None),
+        (watchdog, "no valve frame for 0.15 s"),
     ],
     ids=["counter", "checksum", "short", "second", "missing", "stopped", "watchdog"],
 )
-def test_receive__closes_valves_until_a_start_and_a_neutral_frame(act, state, reason):
+def test_receive__closes_valves_until_a_start_and_a_neutral_frame(act, reason):
     machine = driving()
     act(machine)
     assert machine.reasons == [reason] * (reason is not None)
     assert not machine.u.any() and not machine.enabled
-    assert machine.nmt[CONTROLLER] == state
+    assert machine.nmt[CONTROLLER] == 127
     assert not any(machine.valves(77)) and not any(machine.valves(78, 80))  # nobody started it
     machine.nmt_(1, CONTROLLER)
     assert not any(machine.valves(200, 80)) and not any(machine.valves(201))  # any counter begins
     assert any(machine.valves(202, 80))
 
 
-@pytest.mark.parametrize(
-    ("command", "state", "boots"), [(2, 4, 0), (128, 127, 0), (129, 127, 1), (130, 127, 1)]
-)
-def test_receive__changes_states_of_nodes_alone_or_together(command, state, boots):
+def test_receive__changes_states_of_nodes_alone_or_together():
     machine = Machine()
     assert machine.nmt_(1) == [] and set(machine.nmt.values()) == {5}
-    assert machine.nmt_(command, 3) == boots * [(0x703, b"\x00")]
-    assert machine.nmt == dict.fromkeys(NODES, 5) | {3: state}
-    assert machine.nmt_(7) == [] and machine.nmt[1] == 5  # no command
-    assert machine.receive(Frame(100.0, 0x000, b"\x02")) == [] and machine.nmt[1] == 5
-    assert machine.nmt_(command) == [(0x700 + node, b"\x00") for node in boots * NODES]
+    machine.nmt_(2, 3)
+    assert machine.nmt == dict.fromkeys(NODES, 5) | {3: 127}
+    machine.take(0x000, b"\x02")  # no command
+    assert machine.nmt[1] == 5
+    machine.nmt_(129)
+    assert set(machine.nmt.values()) == {127}
 
 
 @pytest.mark.parametrize(
-    ("command", "address", "value", "answer"),
+    ("request_", "answer"),
     [
-        (0x40, (0x1017, 0), 0, (0x43, 50)),
-        (0x40, (0x6501, 0), 0, (0x43, 4096)),
-        (0x40, (0x2000, 1), 0, (0x80, 0x06020000)),
-        (0x23, (0x2000, 1), 3, (0x80, 0x06020000)),
-        (0x23, (0x1017, 0), 1234, (0x60, 0)),  # four bytes
-        (0x2B, (0x1017, 0), 77, (0x60, 0)),  # two
-        (0x2F, (0x1800, 2), 9, (0x60, 0)),  # one
-        (0x60, (0x1017, 0), 0, (0x80, 0x06020000)),
+        ("40 01 65 00 00 00 00 00", "43 01 65 00 00 10 00 00"),  # 4,096 counts a turn
+        ("2b 17 10 00 32 00 00 00", "60 17 10 00 00 00 00 00"),
     ],
 )
-def test_receive__reads_and_writes_objects(command, address, value, answer):
+def test_receive__answers_sdo_requests_of_encoders(request_, answer):
     machine = Machine()
-    before = dict(machine.objects)
-    request = struct.pack("<BHBI", command, *address, value)
-    data = struct.pack("<BHBI", answer[0], *address, answer[1])
-    assert machine.receive(Frame(0.0, 0x602, request)) == [(0x582, data)]
-    written = {(2, *address): value} if answer[0] == 0x60 else {}
-    assert machine.objects == before | written  # of this node alone
-    assert machine.receive(Frame(0.0, 0x602, bytes(7))) == []
-    assert machine.receive(Frame(0.0, 0x600 + CONTROLLER, bytes(8))) == []
+    assert machine.take(0x602, bytes.fromhex(request_)) == [(0x582, bytes.fromhex(answer))]
+    assert machine.take(0x602, bytes(7)) == []
+    assert machine.take(0x600 + CONTROLLER, bytes(8)) == []
 
 
 def test_start_pose__is_the_given_one_the_machines_or_the_middle():

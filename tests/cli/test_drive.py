@@ -47,7 +47,7 @@ def test_drive__leaves_a_log_for_fit_and_closed_valves_if_it_is_killed(
         while (code := run("", *drive)) and time.monotonic() < end:
             pass
         assert code == 0, capsys.readouterr().err
-        assert "driving v goal +0.20 +0.00 +0.00" in capsys.readouterr().out
+        assert "driving, v goal +0.20 +0.00 +0.00" in capsys.readouterr().out
         assert len(log_for_fit(BROKK_170, read_frames(log)).recordings[0].u) >= 25
         log.unlink()
         while not drives(log) and time.monotonic() < end:

@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 from helpers_cli import run
-from helpers_machines import obedient_net
+from helpers_machines import obedient_net, pids
 
 from brokk_min.cli.evaluation import table
 from brokk_min.env import observation_scale
-from brokk_min.evaluation import baselines, sequences
+from brokk_min.evaluation import baselines
 from brokk_min.learning.policy import Policy, save_policy
 from brokk_min.machine import BROKK_170
 
@@ -36,7 +36,7 @@ def folder(tmp_path):
     for i in range(4):
         weights += [np.zeros(sizes[i : i + 2], np.float32), np.zeros(sizes[i + 1], np.float32)]
     save_policy(tmp_path / "policy.npz", Policy({}, tuple(weights), NET, "paper"), BROKK_170)
-    known = baselines.baselines(BROKK_170, NET)
+    known = pids(BROKK_170, NET)
     meta = baselines.gains_metadata(BROKK_170, NET)
     baselines.write_gains(tmp_path / "gains.json", known, meta)
     (tmp_path / "plant.py").write_text(OBEDIENT)
@@ -47,7 +47,7 @@ def folder(tmp_path):
 
 def evaluate(folder, options="", starts="s.csv"):
     files = f"--policy {folder}/policy.npz --commands {folder}/c.csv --starts {folder}/{starts}"
-    return run(f"evaluate {files} --noise 0.05 {options}")
+    return run(f"evaluate {files} {options}")
 
 
 def test_evaluate__writes_what_it_used_and_prints_means(folder, capsys):
@@ -62,14 +62,14 @@ def test_evaluate__writes_what_it_used_and_prints_means(folder, capsys):
             key: str(folder / file) for key, file in used.items()
         }
         assert (written["meta"]["plant"], written["meta"]["machine"]) == (plant, "brokk170")
-        names = ["rl", *baselines.baselines(BROKK_170, NET)]
+        names = ["rl", *pids(BROKK_170, NET)]
         assert [row["controller"] for row in written["runs"]] == names
         assert {(row["sequence"], row["start"]) for row in written["runs"]} == {("up", 0)}
         errors[plant] = [row["velocity_error_mean"] for row in written["runs"]]
         assert errors[plant][0] == pytest.approx(0.1, rel=1e-6)  # the policy stands still
         printed = capsys.readouterr().out
         assert "means over 1 sequences from 1 workspace starts" in printed
-        assert f"{'the strongest PID':26}{errors[plant][-1]:15.4g}" in printed
+        assert f"{'strongest PID':26}{'closed':>15}{errors[plant][-1]:15.4g}" in printed
     assert len({row[1] for row in errors.values()}) == 3
 
 
@@ -78,53 +78,51 @@ def test_evaluate__writes_what_it_used_and_prints_means(folder, capsys):
     [
         ("--json {0}/gains.json", 2, "gains.json: expected no file (or --force), got one"),
         ("--json {0}/none/e.json", 2, "e.json: expected a file in an existing, writable folder"),
-        ("--save-gains {0}/new.json", 2, "--save-gains: expected gains to tune, got tuned ones in"),
-        ("--noise 1.5", 2, "--noise: expected 0 to 1, got 1.5"),
+        ("--save-gains {0}/a.json --gains {0}/gains.json", 2, "--save-gains: expected no --gains"),
         ("--num-starts 0", 2, "--num-starts: expected 1 or more, got 0"),
         ("--policy {0}/gains.json", 1, "gains.json: expected a readable .npz file of a policy"),
-        ("--gains {0}/other.json", 1, "other.json: actuator: expected"),
+        ("--gains {0}/c.csv", 1, "c.csv: expected JSON"),
         ("--starts {0}/low.csv", 1, "low.csv: expected arms above 0.0 m, got -"),
         ("--commands {0}/s.csv", 1, "s.csv: expected columns ['sequence', 'time', 'vx', 'vy',"),
     ],
 )
 def test_evaluate__refuses(folder, capsys, options, status, message):
-    known = baselines.baselines(BROKK_170, NET)
-    other = {"machine": "brokk170", "actuator": "0123"}
-    baselines.write_gains(folder / "other.json", known, other)
     (folder / "low.csv").write_text("q1,q2,q3,q4,q5\n0,0,-0.3,2.5,1.2\n")
     assert evaluate(folder, options.format(folder)) == status
     error = capsys.readouterr().err.splitlines()[-1]
     assert error.startswith("brokk-min: ") and message in error
 
 
-def test_evaluate__tunes_baselines_without_gains(folder, capsys, monkeypatch):
+def test_evaluate__tunes_pids_anew_and_again_by_what_the_file_says(folder, capsys, monkeypatch):
     monkeypatch.setattr(baselines, "TUNING_RUNS", 1)
     monkeypatch.setattr(baselines, "TUNING_SECONDS", 1.0)
     monkeypatch.setattr(baselines, "GENERATIONS", 1)
     monkeypatch.setattr(baselines, "CANDIDATES", 6)
-    (folder / "gains.json").unlink()
+    untuned = {name: pid.gains for name, pid in pids(BROKK_170, NET).items()}
+    monkeypatch.setattr(baselines, "first_gains", lambda *_: dict(untuned))
     first, again, gains = (folder / name for name in ("1.json", "2.json", "pid.json"))
-    assert evaluate(folder, f"--json {first} --save-gains {gains}") == 0
+    assert evaluate(folder, f"--json {first} --save-gains {gains} --seed 3") == 0
     assert "gains of the baselines: tuned now" in capsys.readouterr().err
-    assert evaluate(folder, f"--json {again} --gains {gains}") == 0
+    meta = json.loads(gains.read_text())["meta"]
+    assert (meta["seed"], meta["plant"], meta["effort"]) == (3, "analytic", [1, 1, 1.0])
+    (folder / "gains.json").unlink()  # without, PIDs are tuned, too
+    assert evaluate(folder, f"--json {again} --seed {meta['seed']}") == 0
     first, again = (json.loads(file.read_text()) for file in (first, again))
-    assert (first["meta"]["gains"], again["meta"]["gains"]) == ("tuned now", str(gains))
+    assert first["meta"]["gains"] == again["meta"]["gains"] == "tuned now"
     assert again["runs"] == first["runs"]
 
 
 def test_table__is_of_workspace_starts_if_there_are_any():
-    figures = dict.fromkeys(("off_axis_drift_max", "jerk_rms", "valve_travel", "time_at_limits"), 2)
+    figures = dict.fromkeys(("off_axis_drift_max", "jerk_rms", "valve_travel"), 2)
     errors = [("extended", 0, 7.0), ("workspace", 1, 0.1), ("workspace", 2, 0.3)]
-    runs = [
-        figures | {"controller": "rl", "sequence": "x", "start": i, "kind": kind}
-        | {"velocity_error_mean": error}
-        for kind, i, error in errors
-    ]  # fmt: skip
+    runs = []
+    for kind, i, error in errors:
+        labels = {"controller": "rl", "sequence": "x", "start": i, "kind": kind}
+        runs.append(labels | figures | {"velocity_error_mean": error})
     head, _, row = table(runs).splitlines()
     assert head == "means over 1 sequences from 2 workspace starts"
-    assert row.split("learner")[1].split() == ["0.2", "2", "2", "2", "2"]
+    assert row.split("interface")[1].split() == ["closed", "0.2", "2", "2", "2"]
     assert "from 1 extended starts" in table(runs[:1])
-    assert sequences.KINDS[0] == "workspace"
 
 
 def test_reproduce__does_not_write_over_results(tmp_path, capsys):

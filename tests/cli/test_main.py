@@ -45,12 +45,14 @@ def test_help__names_all_options(command, capsys):
     assert set(OPTIONS[command].split()) <= set(re.findall(r"--[\w-]+", printed))
 
 
-def test_help__of_the_papers_agent_has_the_settings_of_ppo(capsys):
-    assert run("train --paper --help") == 0
-    printed = capsys.readouterr().out
-    assert {"--clip", "--gae-lambda", "--entropy"} <= set(re.findall(r"--[\w-]+", printed))
-    assert run("train --help") == 0
-    assert "--clip" not in capsys.readouterr().out
+def test_help__shows_the_defaults_of_the_agent_that_is_named(capsys):
+    for words, steps in (
+        ("", 12_000_000),
+        ("--paper", 30_000_000),
+        ("--paper --critic", 6_000_000),
+    ):
+        assert run(f"train {words} --help") == 0
+        assert f"(default: {steps})" in " ".join(capsys.readouterr().out.split())
 
 
 HELP = """

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from brokk_min.actuator import PLANT
-from brokk_min.cli.options import Command, WrongUse, check, default_policy, find_plant
+from brokk_min.cli.options import Command, WrongUse, default_policy, find_plant
 from brokk_min.machine import BROKK_170
 
 FILE = """
@@ -84,12 +84,6 @@ def test_writes__refuses_folders_that_are_missing_and_files_that_exist(tmp_path)
     }.items():
         with pytest.raises(WrongUse, match=message):
             Command().writes(bad)
-
-
-def test_check__names_option_wanted_and_got():
-    check(True, "--hours", "more", 0)
-    with pytest.raises(WrongUse, match=r"^--hours: expected more, got 0$"):
-        check(False, "--hours", "more", 0)
 
 
 def test_default_policy__has_its_gains_beside_it(tmp_path):

@@ -16,14 +16,14 @@ SMALL = "--num-envs 8 --horizon 8 --minibatch-size 32 --total-steps 128"
     ("options", "interface", "learner"),
     [
         ("--gamma 0.8", "beyond", {"gamma": 0.8, "total_steps": 128, "num_envs": 8}),
-        ("--paper --clip 0.1 --entropy 0.01", "paper", {"clip": 0.1, "entropy": 0.01}),
+        ("--paper --critic --clip 0.1", "paper", {"clip": 0.1, "gae_lambda": 0.95}),
     ],
 )
 def test_train__has_its_settings_from_the_line(tmp_path, capsys, options, interface, learner):
     save_net(tmp_path / "net.npz", small_net(BROKK_170, np.random.default_rng(0)))
     files = f"--actuator {tmp_path}/net.npz --out {tmp_path}/p.npz"
     assert run(f"train {files} {SMALL} {options} --hold-max-s 9 --seed 4") == 0
-    assert "trained for 128 steps" in capsys.readouterr().out
+    assert "trained; curve in" in capsys.readouterr().out
     policy = load_policy(tmp_path / "p.npz", BROKK_170)
     assert policy.interface == interface
     recipe = policy.training["recipe"]

@@ -54,7 +54,7 @@ def test_plot_sequence__is_relative_to_where_the_tool_began():
     sequence = axis_sequences(BROKK_170)[0]
     sizes = {"p_tool": 3, "v_tool": 3, "q_dot": 5}
     trace = SimpleNamespace(**{name: RNG.normal(size=(520, 2, n)) for name, n in sizes.items()})
-    traces = {("rl", "x"): trace, ("pid", "y"): None}
+    traces = {("rl_paper", "x"): trace, ("pid", "y"): None}
     figure = figures.plot_sequence(BROKK_170, traces, sequence, POSE, 1)
     goals = sequence.for_starts(BROKK_170, POSE[None])[:, 0]
     time = 0.05 * np.arange(1, 521)
@@ -80,10 +80,8 @@ def test_plot_starts__draws_arms_from_the_side_and_from_above():
         np.testing.assert_allclose(arm, side[0], atol=1e-9)  # turned arms look the same
         np.testing.assert_allclose(arm[:, -1], [3.05, 1.01], atol=0.01)
     assert side[3][1].tolist() == [0, 0]  # the ground
-    ends = [(0, 3.05), (3.05, 0), (3.05 * np.cos(1.5), 3.05 * np.sin(1.5))]
+    ends = [(3.05, 0), (0, 3.05), (3.05 * np.cos(1.5), 3.05 * np.sin(1.5))]  # by kind
     for arm, end in zip(top, ends, strict=True):
         np.testing.assert_allclose(arm[:, -1], end, atol=0.01)
-    assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == [
-        "limits",
-        "workspace",
-    ]
+    legend = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    assert legend == ["workspace", "limits"]

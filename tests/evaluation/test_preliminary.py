@@ -139,26 +139,26 @@ def test_sim_to_real__is_between_tools_where_the_arms_end(machine):
 def test_numbers__of_another_machine_are_json():
     machine = replace(MINI_EXCAVATOR, plant_dt=0.02)  # two Euler steps a tick: fast
     net = small_net(machine, np.random.default_rng(0), machine.names)
-    measured = preliminary.run(machine, net, 0)
-    result = preliminary.numbers(machine, measured)
+    tests, gap = preliminary.run(machine, net, 0)
+    result = preliminary.numbers(machine, tests, gap)
     json.dumps(result, allow_nan=False)
     assert result["joint"] == machine.names[machine.driven[-1]] and len(result["sweep"]) == 4
     assert set(result["response_time"]) == {"machine", "nets"}
-    assert measured.gap.q.shape == (30 * machine.rate, 20, machine.n)
-    assert not measured.gap.q[..., machine.locked].any()
+    assert gap.q.shape == (30 * machine.rate, 20, machine.n)
+    assert not gap.q[..., machine.locked].any()
     for u, row in result["sweep"].items():
-        peaks = [np.abs(measured.tests[k].sweeps[u].q_dot).max() for k in ("machine", "nets")]
+        peaks = [np.abs(tests[k].sweeps[u].q_dot).max() for k in ("machine", "nets")]
         assert [row["machine_peak"], row["nets_peak"]] == peaks
 
 
-def test_gap_numbers__by_hand():
+def test_numbers__of_the_gap_by_hand(of_plant):
     """Two ticks, three runs; run k is off by k + 1 as much, and the first is in the figure."""
     size = np.arange(1, 4)[:, None]
     p = np.array([0.3, 0.5])[:, None, None] * size * np.array([0.6, 0.8, 0.0])
-    result = preliminary.gap_numbers(Motion(p, p, p, 2 * p))
-    assert result["tool"] == {
+    result = preliminary.numbers(BROKK_170, {"nets": of_plant}, Motion(p, p, p, 2 * p))
+    assert result["sim_to_real"]["tool"] == {
         "position_error_mean": pytest.approx(0.4),
         "velocity_rmse": pytest.approx(2 * np.sqrt((0.09 + 0.25) / 2)),
     }
     spread = {"median": pytest.approx(0.8), "max": pytest.approx(1.2), "runs": 3}
-    assert result["tool_position_error_mean_of_runs"] == spread
+    assert result["sim_to_real"]["tool_position_error_mean_of_runs"] == spread

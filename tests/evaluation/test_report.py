@@ -10,8 +10,8 @@ import pytest
 from brokk_min.evaluation import metrics, report
 from brokk_min.evaluation.claims import TEXTS, net_claims, task_claims
 
-ERRORS = {"rl": 0.0101, "rl_paper": 0.0303, "jacobian_pid_k0.1": 0.0202}
-ERRORS |= {"jacobian_pid_k0.05": 0.0204, "jacobian_pid_ff_integral": 0.0105}
+ERRORS = {"rl": 0.0101, "rl_paper": 0.0303, "pid_by_hand": 0.0404, "jacobian_pid_k0.1": 0.0202}
+ERRORS |= {"pid_by_hand_raw": 0.0505, "jacobian_pid_ff_integral": 0.0105}
 RNG = np.random.default_rng(0)
 
 
@@ -27,7 +27,7 @@ def results():
     """As `reproduce` has them, of made-up runs from two starts."""
     runs = [run(c, s, start) for c in ERRORS for s in "xyz" for start in (0, 1)]
     one = {"one_step_rmse": 0.01, "free_run": {"10": {"velocity_rmse": 0.0234}}}
-    recipe = {"test": {"q1": one, "q5": {"one_step_rmse": 0.02, "free_run": {}}}}
+    recipe = {"q1": one, "q5": {"one_step_rmse": 0.02, "free_run": {}}}
     peaks = {name: {"nets_peak": peak} for name, peak in zip("abc", (0.1, 0.24, 0.45))}
     gap = {"tool": {"position_error_mean": 0.02}}
     gap["tool_position_error_mean_of_runs"] = {"median": 0.03}
@@ -39,6 +39,7 @@ def results():
         "nets": {"net": recipe, "net_paper": recipe},
         "task_space": {"means": metrics.means(runs)},
         "robustness": {"nominal": {"rl": {"mean": 0.01, "low": 0.009, "high": 0.012}}},
+        "leads": {"nominal": {"rl over another": 0.25}},
         "claims": [claim.to_json() for claim in claims],
         "start_kinds": ["workspace", "limits", "workspace"],
     }
@@ -53,11 +54,11 @@ def test_render__begins_with_one_sentence_and_a_table(page):
     first = page.split("<h2>")[0]
     sentence, _, rest = first.partition("<table")
     numbers = re.findall(r"[\d.]+ m/s", sentence.split("<p>")[1])
-    assert numbers == ["0.0101 m/s", "0.0303 m/s", "0.0202 m/s", "0.0105 m/s"]
-    rows = re.findall(r"<tr><td>(.*?)</td><td>(.*?)</td>", rest)
+    assert numbers == [f"{n} m/s" for n in ("0.0303", "0.0404", "0.0202", "0.0101", "0.0105")]
+    rows = re.findall(r"<tr><td>(.*?)</td><td>(.*?)</td><td>(.*?)</td>", rest)
     assert len(rows) == len(ERRORS) and first.count("<table>") == 1
     # two starts, 0.0100 and 0.0102: half an interval is 12.7062 x 0.0002 / sqrt(2) / sqrt(2)
-    assert rows[0][1] == "0.0101 (0.0088 to 0.0114)"
+    assert rows[0][1:] == ("closed", "0.0101 (0.0088 to 0.0114)")
     assert "over 2 start poses" in rest and "12 minutes on a small budget" in rest
 
 

@@ -27,12 +27,6 @@ def goals_by_name(machine):
     return {sequence.name: sequence.goals for sequence in s.task_sequences(machine)}
 
 
-def rests_of(goals):
-    """Seconds of each rest."""
-    table = hold_table(goals)
-    return table[~table[:, 1:].any(axis=1), 0]
-
-
 # --- sequences ------------------------------------------------------------------------------------
 
 
@@ -53,7 +47,8 @@ def test_task_sequences__last_26_seconds_and_end_at_rest_where_they_began():
         assert goals.shape == (520, 3), name
         np.testing.assert_allclose(goals.sum(axis=0), 0, atol=1e-9)
         assert np.linalg.norm(goals, axis=-1).max() <= BROKK_170.tool_speed
-        rests = rests_of(goals)
+        table = hold_table(goals)
+        rests = table[~table[:, 1:].any(axis=1), 0]
         assert min(rests) >= 0.5 and max(rests) <= 10 and not goals[:10].any()
         every.extend(rests)
     below = [np.sum(np.array(every) < seconds) for seconds in (1, 2, 4, 11)]
@@ -115,10 +110,8 @@ def test_read_commands__holds_values_until_the_next_row(tmp_path):
         ("a,1,0,0,0\n", "sequence a: expected two or more rows"),
         ("a,1,0,0,0\na,1.01,0,0,0\n", "a tick or more after the one before, got .0.0, 0.01"),
         ("a,1,0,0,0\na,1.02,1,0,0\na,2,0,0,0\n", "sequence a: expected two or more rows, each a"),
-        ("a,1,0,0,0\na,4000,0,0,0\n", "sequence a: expected at most 3600 s"),
         ("a,1,0,0,fast\na,2,0,0,0\n", "c.csv: row 2, column vz: expected a number, got 'fast'"),
-        ("", "c.csv: row 2: expected 5 cells, got another number"),
-        ("all,1,0,0,0\nall,2,0,0,0\n", "another name than all"),
+        ("", "c.csv: expected rows, got none"),
     ],
 )
 def test_read_commands__refuses_what_is_no_sequence(tmp_path, rows, message):
@@ -134,8 +127,7 @@ def test_read_commands__refuses_what_is_no_sequence(tmp_path, rows, message):
     [
         ("0,0.5,0.5,1.7,2.2", r"s.csv: q5: expected 0 to 2, got .2.2"),
         ("0,0.5,0.5,high,1.2", r"s.csv: row 3, column q4: expected a number, got 'high'"),
-        ("0,0.5,0.5,nan,1.2", r"s.csv: q4: expected finite numbers, got .1.7, nan"),
-        ("0,0.5,0.5,1.7,1.2\n" * 1000, r"s.csv: expected at most 1000 poses, got 1001"),
+        ("0,0.5,0.5,nan,1.2", r"s.csv: q4: expected finite numbers, got \[1.7, nan"),
         ("0,0,-0.3,2.5,1.2", r"s.csv: expected arms above 0.0 m, got -"),
     ],
 )
@@ -226,11 +218,3 @@ def test_tuning_set__is_feasible_and_rests_for_long():
     again = s.tuning_set(BROKK_170, 8, 7)
     np.testing.assert_array_equal(starts, again[0])
     np.testing.assert_array_equal(goals, again[1])
-
-
-def test_tuning_set__refuses_a_machine_that_can_follow_nothing(monkeypatch):
-    monkeypatch.setattr(s, "DRAWS", 2)
-    machine = replace(BROKK_170, ground=0.9)  # most arms are too low
-    message = r"brokk170: expected 9999 runs with the tool within 20 mm of its path, .*, got \d+$"
-    with pytest.raises(ValueError, match=message):
-        s.tuning_set(machine, 9999, 0, 0.1)

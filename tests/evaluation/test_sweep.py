@@ -4,11 +4,10 @@ import json
 
 import numpy as np
 import pytest
-from helpers_machines import POSE, small_net
+from helpers_machines import POSE, one_by_one, small_net
 
 from brokk_min.evaluation import metrics, sweep
 from brokk_min.evaluation.sequences import axis_sequences
-from brokk_min.learning import jobs
 from brokk_min.learning.checkpoint import train_policy
 from brokk_min.learning.policy import PolicyController
 from brokk_min.learning.recipes import Recipe
@@ -16,7 +15,7 @@ from brokk_min.machine import BROKK_170
 from brokk_min.settings import PPOConfig, TaskConfig
 
 TINY = PPOConfig(num_envs=4, horizon=4, epochs=1, minibatch_size=16, total_steps=32)
-RECIPE = Recipe("paper", TaskConfig(episode_s=0.6), TINY)
+RECIPE = Recipe("paper", True, TaskConfig(episode_s=0.6), TINY)
 NET = small_net(BROKK_170, np.random.default_rng(0))
 POSES = POSE + 0.1 * np.random.default_rng(0).random((2, 5))
 SEQUENCES = [s._replace(goals=s.goals[s.goals.any(axis=1)][:10]) for s in axis_sequences(BROKK_170)]
@@ -24,8 +23,8 @@ SEQUENCES = [s._replace(goals=s.goals[s.goals.any(axis=1)][:10]) for s in axis_s
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
-    """One core, and sequences of half a second from poses that need no search."""
-    monkeypatch.setattr(jobs, "cpu_count", lambda: 1)
+    """One process, and sequences of half a second from poses that need no search."""
+    monkeypatch.setattr(sweep, "side_by_side", one_by_one)
     monkeypatch.setattr(sweep, "evaluation_starts", lambda machine, num, *_: POSES[:num])
     monkeypatch.setattr(sweep, "task_sequences", lambda machine: SEQUENCES)
 

@@ -255,7 +255,7 @@ x,0.15,0.4,1.3
 """
 REFUSALS = {
     "nothing": ("", "expected a CSV table with columns run, time, got "),
-    "decimal comma": (GOOD.replace("1.2", "1,2"), "row 4: expected 4 cells, got another number"),
+    "decimal comma": (GOOD.replace("1.2", "1,2"), "row 4: expected 4 cells, got 5"),
     "semicolons": (GOOD.replace(",", ";"), "expected columns ['run', 'time'], got "),
     "no joint": ("run,time,q_a\nx,0,0\n", "columns: expected u_<joint>, got "),
     "no angle": ("run,time,u_a\nx,0,0\n", "columns: expected ['q_a'], got "),

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from helpers_machines import pids, small_net
 from hypothesis import given
 from hypothesis import strategies as st
 from strategies import machines
@@ -16,7 +17,6 @@ from strategies import machines
 from brokk_min import env as task
 from brokk_min.actuator import PLANT, append_sample, estimate_velocity
 from brokk_min.env import (
-    PAPER,
     action_to_pwm,
     features,
     initial_state,
@@ -27,8 +27,10 @@ from brokk_min.env import (
     step,
     terminated,
     transition,
+    velocity_deviations,
 )
 from brokk_min.kinematics import forward_kinematics, lowest_point, tool_position, tool_velocity
+from brokk_min.learning.episodes import new_goals, reset
 from brokk_min.machine import BROKK_170, read_encoder
 from brokk_min.settings import TaskConfig
 
@@ -69,15 +71,6 @@ def test_action_to_pwm__by_hand():
     np.testing.assert_allclose(u * 127, [[40, 0, -80, -1, 2], [80, 0, 0, -80, 0]], atol=1e-9)
 
 
-@given(machines(), st.floats(-2, 2))
-def test_action_to_pwm__is_linear_up_to_the_limit_in_whole_counts(machine, a):
-    counts = action_to_pwm(machine, a * np.ones((2, len(machine.driven)))) * 127
-    exact = np.clip(a, -1, 1) * machine.pwm_limit
-    assert np.abs(counts[:, machine.driven] - exact).max() <= 0.5 + 1e-9
-    np.testing.assert_allclose(counts, np.rint(counts), atol=1e-9)
-    assert not counts[:, machine.locked].any()
-
-
 @pytest.mark.parametrize("action", [0.0, np.zeros(3), np.zeros((4, 1)), [0, np.nan, 0, np.inf]])
 def test_action_to_pwm__refuses_wrong_shapes_and_what_is_not_finite(action):
     with pytest.raises(ValueError, match=re.escape("action: expected finite (..., 4), got ")):
@@ -102,19 +95,20 @@ def test_features__by_hand():
     measured = measure(BROKK_170, numbered_history(), v_goal)
     obs = features(BROKK_170, measured)
     assert obs.shape == (163,) and obs.dtype == np.float32
-    np.testing.assert_allclose(obs[:3], v_goal * 3**0.5 / 0.3, rtol=1e-5)
-    np.testing.assert_allclose(obs[3:6], measured.v_tool * 3**0.5 / 0.3, rtol=1e-5)
+    v_std, q_dot_std = velocity_deviations(BROKK_170)
+    np.testing.assert_allclose(obs[:3], v_goal / v_std, rtol=1e-5)
+    np.testing.assert_allclose(obs[3:6], measured.v_tool / v_std, rtol=1e-5)
     assert obs[6] == pytest.approx((0.5 - 0.7) * 12**0.5 / 1.4, rel=1e-6)  # q2: 0 .. 1.4
     lag = np.arange(13)
     q1 = (1.5 + 0.01 * (lag - 12)) * 12**0.5 / 4.28
     np.testing.assert_allclose(obs[7:20], q1, rtol=1e-5)
-    np.testing.assert_allclose(obs[20:33], 0.001 * lag * 3**0.5 / 0.20, rtol=1e-5)
+    np.testing.assert_allclose(obs[20:33], 0.001 * lag / q_dot_std[0], rtol=1e-5)
     q3 = (0.58 + 0.01 * (lag - 12) - 0.65) * 12**0.5 / 1.9
     np.testing.assert_allclose(obs[33:46], q3, rtol=1e-4, atol=1e-6)
-    q5_dot = (0.08 + 0.001 * lag) * 3**0.5 / 0.47
+    q5_dot = (0.08 + 0.001 * lag) / q_dot_std[4]
     np.testing.assert_allclose(obs[98:111], q5_dot, rtol=1e-5)
     for place, joint in ((111, 0), (124, 2), (137, 3), (150, 4)):
-        u = (-0.1 * joint + 0.002 * lag) * 127 * 3**0.5 / 80
+        u = (-0.1 * joint + 0.002 * lag) * 127 / 80 / 0.4
         np.testing.assert_allclose(obs[place : place + 13], u, rtol=1e-5, atol=1e-6)
 
 
@@ -142,8 +136,30 @@ def test_measure__is_in_physical_units_of_the_base_frame(machine, seed):
     assert mean.shape == std.shape == (size,) and (std > 0).all()
 
 
+def test_velocity_deviations__are_those_of_the_task():
+    """Goals by hand: directions have a third of the square, speeds a third, 85 % are not zero.
+
+    Tool and joints as in training: driven by the paper's PID on the plant.
+    """
+    v_std, q_dot_std = velocity_deviations(BROKK_170)
+    np.testing.assert_allclose(v_std, 0.3 * (0.85 / 9) ** 0.5, rtol=0.02)
+    pid = pids(BROKK_170, small_net(BROKK_170, np.random.default_rng(0)))["jacobian_pid_k0.1"]
+    rng, config = np.random.default_rng(0), TaskConfig()
+    state, memory = reset(BROKK_170, config, rng, 64), pid.start(64)
+    seen = []
+    for _ in range(300):
+        u, memory = pid(measure(BROKK_170, state.history, state.v_goal), memory)
+        state = transition(BROKK_170, PLANT, state, u)
+        state = new_goals(BROKK_170, config, state, rng)
+        seen.append(np.concatenate([state.v_tool, state.q_dot, u], axis=-1))
+    found = np.std(seen, axis=(0, 1))
+    np.testing.assert_allclose(found[:3], v_std, rtol=0.2)
+    np.testing.assert_allclose(found[[3, 5, 6, 7]], q_dot_std[BROKK_170.driven], rtol=0.3)
+    np.testing.assert_allclose(found[[8, 10, 11, 12]] * 127 / 80, 0.4, rtol=0.3)
+
+
 def test_measure__adds_noise_to_what_sensors_measure_in_deviations():
-    """0.1 deviations: 0.0173 m/s, 0.1 / sqrt(12) of each range, 0.1 / sqrt(3) of each velocity."""
+    """0.1 deviations, of angles 0.1 / sqrt(12) of each range."""
     history = numbered_history()
     clean = measure(BROKK_170, history, ZERO)
     kept = history.copy()
@@ -152,12 +168,14 @@ def test_measure__adds_noise_to_what_sensors_measure_in_deviations():
     np.testing.assert_array_equal(history, kept)
     error = noisy.history - clean.history
     np.testing.assert_allclose(error[0, 0], 0.1 * 4.28 / 12**0.5, rtol=1e-4)
-    np.testing.assert_allclose(error[3, 1], 0.1 * 0.47 / 3**0.5, rtol=1e-4)
+    np.testing.assert_allclose(error[3, 1], 0.1 * velocity_deviations(BROKK_170)[1][4], rtol=1e-4)
     assert not error[:, 2].any()  # commands are known
     assert noisy.q[1] - clean.q[1] == pytest.approx(0.1 * 1.4 / 12**0.5, rel=1e-5)
     frames = forward_kinematics(BROKK_170, noisy.q)
     exact = tool_velocity(frames, history[:, 1, -1])
-    np.testing.assert_allclose(noisy.v_tool - exact, 0.1 * 0.3 / 3**0.5, atol=1e-6)
+    np.testing.assert_allclose(
+        noisy.v_tool - exact, 0.1 * velocity_deviations(BROKK_170)[0], atol=1e-6
+    )
     assert np.abs(noisy.q[0] - clean.q[0]) > 0.05  # the arm is where the noisy angles say
 
 
@@ -195,18 +213,6 @@ def test_the_table_of_the_docstring__is_true():
         assert not number or float(number[0]) == pytest.approx(group[0].std[0], abs=5e-4)
     assert place == 163 and "(163,)" in task.__doc__ and "Box(-1, 1, (4,))" in task.__doc__
     assert TaskConfig().episode_s == 20 and "20 s" in task.__doc__
-
-
-def test_the_papers_interface__is_the_table_the_linear_action_and_no_cost():
-    measured = measure(BROKK_170, numbered_history(), ZERO)
-    action = np.array([0.5, -3.0, -0.01, 0.02])
-    memory = PAPER.remember(BROKK_170, None, measured)
-    observed = PAPER.observe(BROKK_170, measured, memory)
-    np.testing.assert_array_equal(observed, features(BROKK_170, measured))
-    np.testing.assert_array_equal(PAPER.scale(BROKK_170), observation_scale(BROKK_170))
-    u = PAPER.command(BROKK_170, action, memory)
-    np.testing.assert_array_equal(u, action_to_pwm(BROKK_170, action))
-    assert PAPER.cost(BROKK_170, u, 0 * u, memory) == 0
 
 
 # --- one tick -------------------------------------------------------------------------------------

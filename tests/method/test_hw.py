@@ -20,14 +20,14 @@ from helpers_bus import (
     unchanged,
 )
 from helpers_faults import COMMAND, FAULTS, NOT_FOUND, delay, flood, freeze, measure
-from helpers_machines import obedient_net
+from helpers_machines import obedient_net, pids
 
 from brokk_min._files import SHIPPED
 from brokk_min.can.canopen import valve_frame
 from brokk_min.can.operator_input import Script
 from brokk_min.can.safety_gate import fault_name
 from brokk_min.env import reward
-from brokk_min.evaluation.baselines import STRONGEST, baselines
+from brokk_min.evaluation.baselines import STRONGEST
 from brokk_min.evaluation.rollout import rollout
 from brokk_min.evaluation.sequences import axis_sequences
 from brokk_min.kinematics import forward_kinematics, tool_velocity
@@ -59,7 +59,7 @@ def controller_of(name):
     if name == "jacobian":
         return BASELINE
     if name == "strong":  # it has a memory, as our agent
-        return baselines(BROKK_170, obedient_net(BROKK_170))[STRONGEST]
+        return pids(BROKK_170, obedient_net(BROKK_170))[STRONGEST]
     path = SHIPPED / BROKK_170.name / POLICIES[name]
     return PolicyController(BROKK_170, load_policy(path, BROKK_170))
 

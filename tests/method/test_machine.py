@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
-from strategies import machines, posed, reals
+from strategies import machines, posed
 
 from brokk_min.actuator import PLANT
 from brokk_min.machine import (
@@ -39,43 +39,43 @@ def changed(joint: int | None = None, **fields: Any) -> Machine:
 
 
 NAN, INF = float("nan"), float("inf")
-LOCKED = tuple(replace(joint, driven=False) for joint in BROKK_170.joints)
 BAD = [
-    ({"joints": ()}, ["joints", "at least one driven", "none"]),
-    ({"joints": LOCKED}, ["joints", "at least one driven", "none"]),
-    ({"joint": 1, "name": "q1"}, ["joints", "different names", "['q1', 'q1', 'q3', 'q4', 'q5']"]),
-    ({"joint": 1, "encoder_node": 1}, ["joints", "different CANopen nodes", "[1, 1, 3, 4, 5, 16]"]),
-    ({"controller_node": 3}, ["joints", "different CANopen nodes", "[1, 2, 3, 4, 5, 3]"]),
-    ({"joint": 3, "q_max": 0.6}, ["q4.q_max", "above 0.6", "got 0.6"]),
-    ({"joint": 3, "a": NAN}, ["q4.a", "a number", "got nan"]),
-    ({"joint": 3, "dead_zone": (0.1, INF)}, ["q4.dead_zone", "a number", "inf"]),
-    ({"joint": 2, "q_dot_up": 0.0}, ["q3.q_dot_up", "a positive number", "got 0.0"]),
-    ({"joint": 2, "cylinder_rod": -0.1}, ["q3.cylinder_rod", "a positive number", "got -0.1"]),
-    ({"joint": 4, "cylinder_angle": 0.0}, ["q5.cylinder_angle", "(0, pi)", "0.000 to 2.000"]),
-    ({"joint": 4, "q_max": np.pi - 0.4}, ["q5.cylinder_angle", "(0, pi)", "0.400 to 3.142"]),
-    ({"joint": 4, "dead_zone": (0.07, 80 / 127)}, ["dead_zone", "0 to 80/127", "0.629"]),
-    ({"joint": 4, "dead_zone": (-0.01, 0.07)}, ["dead_zone", "0 to 80/127", "-0.01"]),
-    ({"pwm_limit": 8}, ["dead_zone", "0 to 8/127", "0.07"]),
-    ({"pwm_limit": 128}, ["pwm_limit", "1 to 127", "got 128"]),
-    ({"rate": NAN}, ["rate", "a positive number", "got nan"]),
-    ({"tool_speed": 0.0}, ["tool_speed", "a positive number", "got 0.0"]),
-    ({"plant_dt": 0.03}, ["plant_dt", "a whole part of 1/rate", "got 0.03"]),
-    ({"rate": 30.0}, ["plant_dt", "a whole part of 1/rate", "got 0.005"]),
-    ({"plant_dt": 0.05}, ["plant_dt", "below tau_spool", "got 0.05"]),
-    ({"history": 3}, ["velocity_samples", "2 to history", "got 4"]),
-    ({"velocity_samples": 1}, ["velocity_samples", "2 to history", "got 1"]),
-    ({"q_start": (0.0, 1.0)}, ["q_start", "5 angles within their ranges", "(0.0, 1.0)"]),
-    ({"q_start": (1.5, 0.5, 0.58, 1.71, 2.24)}, ["q_start", "within their ranges", "2.24)"]),
+    ({"joint": 1, "name": "q1"}, "joints: expected different names, got ['q1', 'q1', 'q3'"),
+    ({"joint": 1, "encoder_node": 1}, "joints: expected different CANopen nodes, got [1, 1, 3"),
+    ({"controller_node": 3}, "joints: expected different CANopen nodes, got [1, 2, 3, 4, 5, 3]"),
+    ({"joint": 3, "q_max": 0.6}, "q4.q_max: expected above 0.6, got 0.6"),
+    ({"joint": 3, "a": NAN}, "q4.a: expected a number, got nan"),
+    ({"joint": 3, "dead_zone": (0.1, INF)}, "q4.dead_zone: expected a number, got (0.1, inf)"),
+    ({"joint": 3, "dead_zone": 0.1}, "q4.dead_zone, cylinder_speed: expected pairs, up and down"),
+    ({"joint": 3, "kind": "screw"}, "q4.kind: expected revolute or prismatic, got screw"),
+    ({"joint": 3, "encoder_sign": 2}, "q4.encoder_sign: expected 1 or -1, got 2"),
+    ({"joint": 2, "q_dot_up": 0.0}, "q3.q_dot_up: expected a positive number, got 0.0"),
+    ({"joint": 2, "cylinder_rod": -0.1}, "q3.cylinder_rod: expected a positive number, got -0.1"),
+    ({"joint": 4, "cylinder_angle": 0.0}, "q5.cylinder_angle: expected angles in (0, pi), got 0.0"),
+    ({"joint": 4, "q_max": np.pi - 0.4}, "q5.cylinder_angle: expected angles in (0, pi), got 0.4"),
+    ({"joint": 4, "dead_zone": (0.07, 80 / 127)}, "dead_zone: expected 0 to 80/127, got [[0.07"),
+    ({"joint": 4, "dead_zone": (-0.01, 0.07)}, "dead_zone: expected 0 to 80/127, got [[0.07"),
+    ({"pwm_limit": 8}, "dead_zone: expected 0 to 8/127, got [[0.07"),
+    ({"pwm_limit": 128}, "pwm_limit: expected 1 to 127, got 128"),
+    ({"rate": NAN}, "rate: expected a number, got nan"),
+    ({"ground": NAN}, "ground: expected a number, got nan"),
+    ({"delay": -0.01}, "delay: expected 0 or more, got -0.01"),
+    ({"tool_speed": 0.0}, "tool_speed: expected a positive number, got 0.0"),
+    ({"plant_dt": 0.03}, "plant_dt: expected a whole part of 1/rate, below tau_spool, got 0.03"),
+    ({"rate": 30.0}, "plant_dt: expected a whole part of 1/rate, below tau_spool, got 0.005"),
+    ({"plant_dt": 0.05}, "plant_dt: expected a whole part of 1/rate, below tau_spool, got 0.05"),
+    ({"history": 3}, "velocity_samples: expected 2 to history, got 4"),
+    ({"velocity_samples": 1}, "velocity_samples: expected 2 to history, got 1"),
+    ({"q_start": (0.0, 1.0)}, "q_start: expected 5 angles within their ranges, got (0.0, 1.0)"),
+    ({"q_start": (1.5, 0.5, 0.58, 1.71, 2.24)}, "q_start: expected 5 angles within their ranges"),
 ]
 
 
-@pytest.mark.parametrize(("changes", "words"), BAD, ids=[words[0] for _, words in BAD])
-def test_a_bad_field__is_refused_by_name_with_wanted_and_got(changes, words):
+@pytest.mark.parametrize(("changes", "message"), BAD)
+def test_a_bad_field__is_refused_by_name_with_wanted_and_got(changes, message):
     with pytest.raises(ValueError) as caught:
         changed(**changes)
-    message = str(caught.value)
-    assert message.startswith(words[0] + ": expected ") and "got" in message
-    assert all(word in message for word in words), message
+    assert str(caught.value).startswith(message)
 
 
 @pytest.mark.parametrize(
@@ -84,6 +84,8 @@ def test_a_bad_field__is_refused_by_name_with_wanted_and_got(changes, words):
         {"pwm_limit": 9},
         {"pwm_limit": 127, "valve_threshold": 0.0, "delay": 0.0},
         {"velocity_samples": 2, "history": 2},
+        {"q_start": (-2.14, 0.0, -0.3, 0.6, 0.0)},
+        {"q_start": (2.14, 1.4, 1.6, 2.9, 2.0)},
         {"plant_dt": 0.05, "tau_spool": 0.05, "tau_cylinder": 0.05},
     ],
 )
@@ -120,18 +122,6 @@ def test_the_brokk__has_the_numbers_of_the_paper_and_the_design():
     assert m.encoder_step[0] * m.rate == pytest.approx(0.031, abs=5e-4)  # one count over one tick
 
 
-@given(machines())
-def test_columns__follow_the_joints_and_cannot_be_written(machine):
-    for field in ("a", "q_min", "cylinder_area", "encoder_node"):
-        column = machine.column(field)
-        assert column.tolist() == [getattr(joint, field) for joint in machine.joints]
-        with pytest.raises(ValueError, match="read-only"):
-            column[0] = 1.0
-    both = np.concatenate([machine.driven, machine.locked])
-    assert sorted(both.tolist()) == list(range(machine.n))
-    assert all(machine.joints[i].driven for i in machine.driven)
-
-
 def test_a_replaced_machine__has_columns_and_joints_of_its_own():
     """Machines are values: those of one name and one hash are told apart by their numbers."""
     with pytest.raises(dataclasses.FrozenInstanceError):
@@ -140,6 +130,7 @@ def test_a_replaced_machine__has_columns_and_joints_of_its_own():
     machine = changed(1, a=9.0, driven=True, dead_zone=(0.1, 0.2))
     assert hash(machine) == hash(BROKK_170) and machine != BROKK_170
     assert BROKK_170.column("a")[1] == 1.15 and machine.column("a")[1] == 9.0
+    assert not BROKK_170.column("a").flags.writeable
     assert machine.driven.tolist() == [0, 1, 2, 3, 4] and machine.locked.tolist() == []
     assert machine.dead_zones[1].tolist() == [0.1, 0.2]
     assert machine.q_dot_max.tolist() == [0.20, 0.22, 0.28, 0.38, 0.47]
@@ -167,23 +158,10 @@ def test_decode_pwm__of_every_byte_is_the_rule_of_the_paper():
     assert again.tolist() == [0 if u_byte == 255 else u_byte for u_byte in range(256)]
 
 
-@given(npst.arrays(np.float64, npst.array_shapes(max_dims=3), elements=reals(-1.0, 1.0)))
-def test_the_code__is_off_by_half_a_count_at_most(u):
-    assert np.all(np.abs(decode_pwm(encode_pwm(u)) - u) <= 0.5 / 127 + 1e-12)
-
-
-@pytest.mark.parametrize("u", [1.01, -1.01, NAN, INF, -INF, 80.0])
+@pytest.mark.parametrize("u", [1.01, -1.01, NAN, INF])
 def test_encode_pwm__refuses_commands_that_no_byte_can_carry(u):
-    with pytest.raises(ValueError) as caught:
+    with pytest.raises(ValueError, match=r"^u: expected within \[-1, 1\], got \[-1\.0, 1\.0, "):
         encode_pwm([-1.0, 1.0, u])
-    assert str(caught.value) == f"u: expected within [-1, 1], got {u}"
-
-
-@pytest.mark.parametrize("u_byte", [-1, 256, 300])
-def test_decode_pwm__refuses_what_is_no_byte(u_byte):
-    with pytest.raises(ValueError) as caught:
-        decode_pwm([0, u_byte])
-    assert str(caught.value) == f"u_byte: expected 0 to 255, got {u_byte}"
 
 
 # --- the limit and the dead zone ------------------------------------------------------------------
@@ -207,12 +185,10 @@ def test_limit_command__sends_whole_counts_within_the_limit(machine, u):
     u.setflags(write=False)
     limited = limit_command(machine, u)
     assert limited.dtype == u.dtype and limited.shape == u.shape
-    counts = limited.astype(float) * 127
-    np.testing.assert_allclose(counts, np.rint(counts), atol=1e-4)
-    assert np.all(np.abs(np.rint(counts)) <= machine.pwm_limit)
-    inside = np.abs(u) * 127 <= machine.pwm_limit
-    assert np.all(np.abs(counts - u * 127.0)[inside] <= 0.5 + 1e-4)
-    assert np.all(np.rint(counts)[~inside] == machine.pwm_limit * np.sign(u[~inside]))
+    counts = np.rint(limited.astype(float) * 127)
+    np.testing.assert_allclose(limited.astype(float) * 127, counts, atol=1e-4)
+    nearest = np.clip(u * 127.0, -machine.pwm_limit, machine.pwm_limit)
+    assert np.all(np.abs(counts - nearest) <= 0.5 + 1e-4)
     np.testing.assert_array_equal(limit_command(machine, -u), -limited)
     np.testing.assert_array_equal(limit_command(machine, limited), limited)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import scipy.linalg
@@ -81,22 +79,6 @@ def test_dls__costs_no_more_than_the_optimum_where_the_controller_runs(problem):
 
 
 @given(problems())
-def test_dls__bounds_the_joint_velocities_for_unit_weights(problem):
-    """|q_dot| <= |v| / (2 lambda), however near a singularity."""
-    J, W, damping, v = problem
-    q_dot = dls(J, np.ones_like(W), damping) @ v
-    assert np.linalg.norm(q_dot) <= np.linalg.norm(v) / (2 * np.sqrt(damping)) + 1e-9
-
-
-@given(problems())
-def test_dls__never_moves_the_tool_against_the_goal_or_beyond_it(problem):
-    J, W, damping, v = problem
-    v_tool = J @ dls(J, W, damping) @ v
-    assert v_tool @ v >= -1e-9
-    assert np.linalg.norm(v_tool) <= np.linalg.norm(v) + 1e-9
-
-
-@given(problems())
 def test_dls__the_printed_form_agrees_for_unit_weights_only(problem):
     """eq4 prints J W J^T in the bracket."""
     J, W, damping, _v = problem
@@ -106,35 +88,6 @@ def test_dls__the_printed_form_agrees_for_unit_weights_only(problem):
     W_inv_Jt = (J / W).T
     printed = W_inv_Jt @ np.linalg.inv((J * W) @ J.T + damping * np.eye(3))
     np.testing.assert_allclose(dls(J, W, damping, as_printed=True), printed, atol=1e-7, rtol=1e-6)
-
-
-@given(posed(shapes=[()]), dampings, velocities, reals(-3, 3))
-def test_dls__turns_with_the_base(case, damping, v, angle):
-    """Turning tool velocity and arm together about z leaves the joint velocities as they were."""
-    machine, q = case
-    c, s = np.cos(angle), np.sin(angle)
-    Rz = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    W = np.ones(machine.n)
-    still = dls(jacobian(forward_kinematics(machine, q)), W, damping) @ v
-    first, *others = machine.joints
-    base = replace(machine, joints=(replace(first, theta=first.theta + angle), *others))
-    turned = jacobian(forward_kinematics(base, q))
-    np.testing.assert_allclose(dls(turned, W, damping) @ (Rz @ v), still, atol=1e-8)
-
-
-@given(st.integers(0, 10_000), st.integers(3, 6))
-def test_dls__tends_to_the_least_norm_solution_as_damping_vanishes(seed, n):
-    """scipy.linalg.lstsq has the solution of least norm where J has full rank."""
-    rng = np.random.default_rng(seed)
-    left, right = (scipy.linalg.qr(rng.normal(size=(size, size)))[0] for size in (3, n))
-    J = left @ np.diag(rng.uniform(0.5, 2, 3)) @ right[:3]
-    v = rng.normal(size=3)
-    expected = scipy.linalg.lstsq(J, v)[0]
-    errors = [np.abs(dls(J, np.ones(n), d) @ v - expected).max() for d in (1e-2, 1e-5, 1e-9)]
-    assert errors[2] < 1e-6
-    assert errors[2] <= errors[0]
-    much = dls(J, np.ones(n), 1e6) @ v
-    np.testing.assert_allclose(much, J.T @ v / 1e6, rtol=1e-4, atol=2e-10)  # lambda -> infinity
 
 
 # --- weights --------------------------------------------------------------------------------------
@@ -210,6 +163,8 @@ def test_joint_velocities__are_eq4_no_faster_than_the_joints(case, v, w0):
     gains = Gains(*np.zeros((3, len(driven))), np.zeros(1))
     c = JacobianController(machine, gains, 0.1, w0 + 0.01)
     found = c.joint_velocities(v, q, last[:, driven])
+    alone = c.joint_velocities(v[0], q[0], last[0, driven])
+    np.testing.assert_allclose(alone, found[0], rtol=1e-9, atol=1e-12)
     for i in range(4):
         J = jacobian(forward_kinematics(machine, q[i]))[:, driven]
         W = limit_weights(machine, q[i], last[i])[driven]

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from hypothesis import given
 from scipy.linalg import expm
-from strategies import moving, posed, reals
+from strategies import moving, posed
 
 from brokk_min.kinematics import (
     forward_kinematics,
@@ -83,40 +81,6 @@ def test_tool_velocity__is_the_derivative_along_the_motion(case):
     behind = tool_position(forward_kinematics(machine, q - STEP * q_dot))
     velocity = tool_velocity(forward_kinematics(machine, q), q_dot)
     np.testing.assert_allclose(velocity, (ahead - behind) / (2 * STEP), atol=1e-7)
-
-
-@given(posed())
-def test_forward_kinematics__neighbouring_frames_are_one_dh_row_apart(case):
-    """|p_i - p_{i-1}|^2 = a^2 + d^2; the axes enclose alpha; the offset along the old axis is d.
-
-    q is added to d where a joint is prismatic.
-    """
-    machine, q = case
-    p, z, _ = forward_kinematics(machine, q)
-    link = p[..., 1:, :] - p[..., :-1, :]
-    slides = np.array([joint.kind == "prismatic" for joint in machine.joints])
-    a, d = machine.column("a"), machine.column("d") + slides * q
-    np.testing.assert_allclose(np.sum(link**2, -1), a**2 + d**2, atol=1e-11)
-    np.testing.assert_allclose(np.sum(link * z[..., :-1, :], -1), d, atol=1e-12)
-    cosine = np.sum(z[..., 1:, :] * z[..., :-1, :], -1)
-    alpha = np.broadcast_to(machine.column("alpha"), q.shape)
-    np.testing.assert_allclose(cosine, np.cos(alpha), atol=1e-12)
-    np.testing.assert_allclose(np.linalg.norm(z, axis=-1), 1, atol=1e-12)
-
-
-@given(posed(), reals(-3, 3))
-def test_forward_kinematics__turns_with_the_first_joint(case, angle):
-    """A turn of the base turns the tool about z and leaves all heights as they were."""
-    machine, q = case
-    first, *others = machine.joints
-    base = replace(machine, joints=(replace(first, theta=first.theta + angle), *others))
-    turned = forward_kinematics(base, q)
-    still = forward_kinematics(machine, q)
-    c, s = np.cos(angle), np.sin(angle)
-    Rz = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    np.testing.assert_allclose(turned.p, still.p @ Rz.T, atol=1e-12)
-    np.testing.assert_allclose(jacobian(turned), Rz @ jacobian(still), atol=1e-12)
-    np.testing.assert_allclose(lowest_point(turned), lowest_point(still), atol=1e-12)
 
 
 @given(moving(shapes=[(1,), (4,), (2, 3)]))

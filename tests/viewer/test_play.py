@@ -114,16 +114,6 @@ def test_session__follows_the_goal_and_goes_back_to_its_start():
     np.testing.assert_array_equal(run.state.q[0], START)
 
 
-def test_rectangle__starts_at_the_tool_and_tells_the_distance_from_it():
-    run = session()
-    run.rectangle()
-    np.testing.assert_allclose(run.path[[0, -1]], [run.tool, run.tool])
-    assert np.ptp(run.path[:, 2]) == 0  # level
-    assert run.scene().status.startswith("0 mm from the rectangle, at most 0 mm")
-    run.trail = run.path[0] + np.array([[0, 0, 0], [0.0, 0.1, 0.05], [0.0, 0.1, 0.02]])
-    assert run.scene().status.startswith("20 mm from the rectangle, at most 50 mm")
-
-
 def test_play__moves_the_machine_by_keys_until_the_window_is_closed(monkeypatch):
     """Through pygame's queue, in real time: arrow key, the other controller, and closing."""
     scenes, counting, show = [], Counting(), play.show
@@ -136,16 +126,14 @@ def test_play__moves_the_machine_by_keys_until_the_window_is_closed(monkeypatch)
                 key(name)
 
     monkeypatch.setattr(play, "show", each_picture)
-    play.play(BROKK_170, {"PID": BASELINE, "counting": counting}, START)
+    play.play(BROKK_170, {"PID": BASELINE, "counting": counting})
     assert [scene.title for scene in scenes] == ["PID"] * 20 + ["counting"] * 2
     assert scenes[19].v_tool[1] > 0.1
     np.testing.assert_allclose(counting.goals, 2 * [[0, 0.3, 0]], atol=1e-6)
     assert not pygame.display.get_init()
 
 
-def test_play__needs_a_display_and_a_start_within_the_ranges(monkeypatch):
-    with pytest.raises(ValueError, match=r"start: expected 5 angles within the joints' .*got \[9"):
-        play.play(BROKK_170, {"PID": BASELINE}, (9.0, 0.5, 0.6, 1.7, 1.2))
+def test_play__needs_a_display(monkeypatch):
     pygame.display.quit()
     monkeypatch.setenv("SDL_VIDEODRIVER", "nonsense")
     with pytest.raises(ValueError, match=r"window: expected a display .*, got nonsense"):

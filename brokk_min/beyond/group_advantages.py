@@ -1,0 +1,108 @@
+"""Advantages from groups of rollouts, instead of a critic.
+
+What it changes: machines stand in groups of four. They begin each window of `horizon` ticks in the
+same state, with the same goals and the same sensor noise to come. Only the noise of their actions
+differs, so what one's return is above the mean of its group, its own actions did:
+
+    A_t = R_t - mean of R_t in the group,   R_t = r_t + gamma R_{t+1},
+
+where R ends with the window and with the goal. At the end of a window all four go on from the state
+of one of them. It needs a simulation whose states can be copied, as ours.
+
+What it buys, as mean velocity error of the tool along x, y and z with one seed: the paper's agent
+has 0.0232 m/s after 30 million steps and 20 minutes of one core, and by a critic 0.0373 m/s after 6
+million. With `beyond.interface` PPO has 0.0125 m/s after 12 million steps and 10 minutes.
+
+Who was first: the vine of TRPO (Schulman et al., 2015) branches rollouts from one state with common
+random numbers; RLOO (Kool et al., 2019) and GRPO (Shao et al., 2024) take a group's mean as the
+baseline.
+
+It plugs into `ppo.train` as its advantage function.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from brokk_min import ppo
+from brokk_min.env import State
+from brokk_min.learning.episodes import map_arrays
+from brokk_min.learning.gym_env import Step, TaskVectorEnv
+from brokk_min.machine import Array
+from brokk_min.settings import PPOConfig
+
+COPIES = 4  # machines in a group; neighbours in each array
+LARGEST = 4.0  # deviations of all advantages, to which they are cut
+
+
+def repeat(values: Any) -> Any:
+    """Each row of a state or an array `COPIES` times."""
+    return map_arrays(lambda rows: np.repeat(rows, COPIES, axis=0), values)
+
+
+class GroupVectorEnv(TaskVectorEnv):
+    """A `TaskVectorEnv` of groups; its windows of `horizon` ticks end truncated.
+
+    Their own last observations are in `info["final_obs"]`.
+    """
+
+    def __init__(self, num_envs: int, *options: Any, horizon: int, **more: Any) -> None:
+        super().__init__(num_envs, *options, **more)
+        self.horizon, self.ticks = horizon, 0
+
+    def draw_episodes(self, num: int) -> State:
+        """One start for each group."""
+        state: State = repeat(super().draw_episodes(num // COPIES))
+        return state
+
+    def draw_noise(self, num: int) -> Array:
+        """The same noise for all of a group."""
+        noise: Array = repeat(super().draw_noise(num // COPIES))
+        return noise
+
+    def new_goals(self, state: State) -> State:
+        """New goals for groups; their machines change goals at the same ticks."""
+        first = super().new_goals(map_arrays(lambda rows: rows[::COPIES], state))
+        return replace(state, v_goal=repeat(first.v_goal), goal_ticks=repeat(first.goal_ticks))
+
+    def step_without_reset(self, actions: Array) -> Step:
+        """The episode of a group ends where that of one of its machines does."""
+        obs, reward, terminated, truncated, info = super().step_without_reset(actions)
+        terminated, truncated = (
+            np.repeat(ends.reshape(-1, COPIES).any(axis=1), COPIES)
+            for ends in (terminated, truncated)
+        )
+        return obs, np.where(terminated, 0.0, reward), terminated, truncated & ~terminated, info
+
+    def step(self, actions: Array) -> Step:
+        """One tick; after the last of a window all of a group go on from one of them."""
+        obs, reward, terminated, truncated, info = super().step(actions)
+        self.ticks += 1
+        if self.ticks % self.horizon == 0:
+            groups = np.arange(0, self.num_envs, COPIES)
+            rows = repeat(groups + self.np_random.integers(0, COPIES, len(groups)))
+            info |= {"final_obs": info.get("final_obs", obs), "_final_obs": ~terminated}
+            truncated = ~terminated
+            self.state, self.memory, obs = map_arrays(
+                lambda values: values[rows], (self.state, self.memory, obs)
+            )
+        return obs, reward, terminated, truncated, info
+
+
+def group_advantages(
+    agent: ppo.Agent, rollout: ppo.Rollout, config: PPOConfig
+) -> tuple[Tensor, None]:
+    """Advantages (T, num) of a rollout of `GroupVectorEnv`; nothing for a critic to learn."""
+    changed = torch.from_numpy(
+        np.stack([info["before"][0].goal_ticks <= 1 for info in rollout.infos])
+    )
+    zero = torch.zeros_like(rollout.rewards)
+    ends = (rollout.dones | changed).float()  # a new goal is no result of earlier actions
+    returns = ppo.gae(rollout.rewards, zero, zero, ends, config.gamma, config.gae_lambda)
+    groups = returns.reshape(len(returns), -1, COPIES)
+    advantages = (groups - groups.mean(dim=-1, keepdim=True)).flatten(1)
+    limit = LARGEST * advantages.std()
+    return advantages.clamp(-limit, limit), None

@@ -1,0 +1,107 @@
+"""`examples/run_onnx.py` sends what `PolicyController` sends, without this package."""
+
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers_bus import random_policy
+from helpers_machines import obedient_net
+
+from brokk_min._files import SHIPPED
+from brokk_min.actuator import append_sample, initial_history
+from brokk_min.env import PAPER, measure, observation_blocks
+from brokk_min.learning.onnx import export_onnx, named_blocks
+from brokk_min.learning.policy import Policy, PolicyController, load_policy
+from brokk_min.machine import BROKK_170, read_encoder
+from examples.telescopic_crane import TELESCOPIC_CRANE
+
+pytest.importorskip("onnxscript")
+pytest.importorskip("onnxruntime")
+from examples import run_onnx
+
+PROGRAM = Path(run_onnx.__file__)
+
+
+def policy_of(machine):
+    """Shipped for the Brokk; for another machine one that nobody trained."""
+    if machine is BROKK_170:
+        return load_policy(SHIPPED / machine.name / "policy_paper.npz", machine)
+    rng, n = np.random.default_rng(0), len(machine.driven)
+    sizes = [len(PAPER.scale(machine)[0]), 16, 16, 16, n]
+    weights = []
+    for inputs, outputs in pairwise(sizes):
+        weights.append((rng.standard_normal((inputs, outputs)) / inputs**0.5).astype(np.float32))
+        weights.append(np.zeros(outputs, np.float32))
+    return Policy({}, tuple(weights), obedient_net(machine), "paper")
+
+
+@pytest.mark.parametrize("machine", [BROKK_170, TELESCOPIC_CRANE], ids=lambda m: m.name)
+def test_commands__are_those_of_the_controller(machine, tmp_path):
+    """While the goal changes, the joints obey, and those that are locked move by themselves."""
+    policy = policy_of(machine)
+    export_onnx(tmp_path / "p.onnx", policy, machine)
+    net, told = run_onnx.load(tmp_path / "p.onnx")
+    controller, rng = PolicyController(machine, policy), np.random.default_rng(0)
+    q = (machine.column("q_min") + machine.column("q_max")) / 2
+    u, memory, sent = np.zeros(machine.n), controller.start(1), []
+    history = initial_history(np.float32(read_encoder(machine, q))[None], machine.history)
+    h = history[0]
+    window = machine.velocity_samples, machine.dt
+    for v_goal in rng.uniform(-0.2, 0.2, (4, 3)).repeat(15, axis=0):
+        history = append_sample(history, u, read_encoder(machine, q)[None], *window)
+        expected, memory = controller(measure(machine, history, v_goal[None]), memory)
+        h, u = run_onnx.tick(net, told, h, read_encoder(machine, q), u, v_goal)
+        np.testing.assert_allclose(u, expected[0], atol=1e-6)
+        q = q + machine.dt * np.where(np.isin(range(machine.n), machine.driven), 0.4 * u, 0.05)
+        sent.append(u)
+    assert np.std(sent, axis=0)[machine.driven].min() > 0.005
+
+
+def test_blocks__are_those_of_the_observation():
+    for machine in (BROKK_170, replace(TELESCOPIC_CRANE, history=9)):
+        sizes = [size for *_, size in named_blocks(machine)]
+        assert sum(sizes) == sum(len(block.std) for block in observation_blocks(machine))
+    units = {name: unit for name, unit, _ in named_blocks(TELESCOPIC_CRANE)}
+    assert [units[f"{what} telescope"] for what in ("q", "q_dot", "u")] == [
+        "m",
+        "m/s",
+        "of full command",
+    ]
+
+
+def test_our_agent__is_refused_in_one_line(tmp_path):
+    """It reads what it computes from memory, so NumPy alone would need its whole interface."""
+    path = tmp_path / "p.onnx"
+    export_onnx(path, random_policy("beyond"), BROKK_170)
+    with pytest.raises(SystemExit, match=f"^{path}: expected interface paper, got beyond$"):
+        run_onnx.load(path)
+
+
+def test_program__imports_numpy_and_onnxruntime_alone(tmp_path):
+    """It runs where this package cannot be imported, and prints a line each tick."""
+    lines = PROGRAM.read_text().splitlines()
+    assert len(lines) <= 60
+    found = {word for line in lines for word in re.findall(r"^(?:import|from) (\w+)", line)}
+    assert found == {"json", "sys", "time", "numpy", "onnxruntime"}
+    export_onnx(tmp_path / "p.onnx", policy_of(BROKK_170), BROKK_170)
+    command = [sys.executable, "-c", BLOCKED, PROGRAM, tmp_path / "p.onnx"]
+    started = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=tmp_path)
+    try:
+        printed = [started.stdout.readline() for _ in range(5)]
+    finally:
+        started.kill()
+        started.communicate()
+    assert all(re.fullmatch(r"u \[.*\] of full command, q \[.*\] rad\n", line) for line in printed)
+
+
+BLOCKED = """
+import runpy, sys
+sys.modules.update(brokk_min=None, torch=None)
+sys.argv = sys.argv[1:]
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
