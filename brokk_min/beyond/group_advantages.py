@@ -10,7 +10,7 @@ where R ends with the window and with the goal. At the end of a window all four 
 of one of them. It needs a simulation whose states can be copied, as ours.
 
 What it buys, as mean velocity error of the tool along x, y and z with one seed: the paper's agent
-has 0.0232 m/s after 30 million steps and 20 minutes of one core, and by a critic 0.0373 m/s after 6
+has 0.0232 m/s after 30 million steps and 20 minutes of one core, and by a critic 0.0376 m/s after 6
 million. With `beyond.interface` PPO has 0.0125 m/s after 12 million steps and 10 minutes.
 
 Who was first: the vine of TRPO (Schulman et al., 2015) branches rollouts from one state with common
