@@ -1,0 +1,179 @@
+"""The whole chain on a machine in MuJoCo: weight, inertia and loads that no net was told of.
+
+    python -m benchmarks.mujoco [--folder results-mujoco] [--quick]
+
+It records the machine of `examples/mujoco_brokk.py`, fits nets to the recordings, trains policies
+on the nets, and tunes the PIDs on the machine itself. Then it scores all of them on the nets, on
+the machine, and on the machine with a load, on a slope and with a weaker pump, of which neither
+nets nor gains know. What the folder holds already is not made again. `mujoco.md` in the folder is
+the page, `mujoco.json` has all runs.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+
+import benchmarks  # noqa: F401, before NumPy computes: one thread
+from brokk_min._files import write_json
+from brokk_min.actuator import ActuatorNet
+from brokk_min.evaluation import baselines, metrics, sequences
+from brokk_min.evaluation.reproduce import QUICK, Budget, Chain, fit_net, train
+from brokk_min.evaluation.rollout import TITLES
+from brokk_min.identification import inspection, logs, validation
+from brokk_min.identification.excitation import collect, task_log
+from brokk_min.identification.net_file import load_net, select_nets
+from brokk_min.jacobian import Gains
+from brokk_min.learning.jobs import side_by_side
+from brokk_min.learning.policy import POLICIES, PolicyController, load_policy
+from brokk_min.machine import BROKK_170 as M
+from brokk_min.machine import PWM_MAX
+from examples.mujoco_brokk import PLANT, MujocoBrokk
+
+PLANTS = {
+    "machine": PLANT,
+    "with 300 kg": MujocoBrokk(load=300.0),
+    "on a slope of 5 degrees": MujocoBrokk(slope=5.0),
+    "pump of two thirds": MujocoBrokk(pump=2 / 3),
+}
+PIDS = (baselines.BY_HAND, baselines.OPTIMISED, baselines.STRONGEST)
+AFTER = 10  # s, of the free runs that are printed
+PAGE = """\
+Mean velocity error [m/s] and largest drift off the commanded line [m] on the machine of
+`examples/mujoco_brokk.py`, over {sequences} sequences from {starts} workspace starts. The policies
+learned on nets of that machine, and the PIDs were tuned on the machine itself. In free runs of
+{after} s the nets' velocities are off by {free_runs} of the joints' rms speed.
+
+{table}
+"""
+
+
+@dataclass
+class Options:
+    folder: Path = Path("results-mujoco")  # Logs, nets, policies, gains, figures, table.
+    policies: tuple[str, ...] = ("rl", "rl_paper")  # Which are trained, all on the same nets.
+    steps: int | None = None  # Of each training; by default as many as its recipe has.
+    starts: int = 32  # Start poses, of which those in the workspace count.
+    seed: int = 0  # Of everything that is random.
+    quick: bool = False  # Tiny fits, trainings and tunings: only to show that it runs.
+
+
+def record(chain: Chain) -> tuple[logs.Log, logs.Log]:
+    """The log that nets are fitted to, one joint at a time, and that of a task to score them."""
+    rng, read = np.random.default_rng, []
+    recorders: dict[str, Callable[[], logs.Log]] = {
+        "log": lambda: collect(M, chain.budget.hours, "rich", rng(chain.seed), PLANT),
+        "log_test": lambda: task_log(M, 20, 40.0, rng(chain.seed + 1), plant=PLANT),
+    }
+    for name, recorder in recorders.items():
+        file = chain.out / f"{name}.npz"
+        if not file.exists():
+            logs.write_log(file, recorder())
+        read.append(logs.read_log([file], M.velocity_samples, rate=M.rate))
+    return read[0], read[1]
+
+
+def nets(chain: Chain, log: logs.Log) -> ActuatorNet:
+    """The nets of all joints."""
+    file = chain.out / "net.npz"
+    return load_net(file) if file.exists() else fit_net(chain, "net", log, {})
+
+
+def tune(chain: Chain, name: str, net: ActuatorNet, first: Mapping[str, Any]) -> Gains:
+    """Gains of one of `baselines.TUNED`, tuned on the machine itself from the `first` ones."""
+    budget = chain.budget
+    seconds = min(baselines.TUNING_SECONDS, budget.short_s)
+    effort = budget.generations, budget.tuning_runs, seconds
+    pid = baselines.baselines(M, net, first)[name]
+    return baselines.tune_baseline(pid, effort, chain.seed, plant=PLANT)[0]
+
+
+def make(options: Options, chain: Chain, net: ActuatorNet) -> None:
+    """The policies and the gains that the folder lacks, side by side."""
+    gains, driven = chain.out / "gains.json", select_nets(M, net)
+    lacking = [name for name in options.policies if not (chain.out / POLICIES[name]).exists()]
+    jobs: dict[str, Callable[..., Any]] = {n: partial(train, chain, n, net) for n in lacking}
+    if not gains.exists():
+        jobs["by hand"] = partial(baselines.first_gains, M, PLANT)
+        jobs |= {name: partial(tune, chain, name, driven) for name in baselines.TUNED}
+    needs = {name: ["by hand"] for name in baselines.TUNED}
+    done = side_by_side(jobs, needs) if jobs else {}
+    if not gains.exists():
+        tuned = done["by hand"] | {name: done[name] for name in baselines.TUNED}
+        meta = baselines.gains_metadata(M, driven)
+        baselines.write_gains(gains, baselines.baselines(M, driven, tuned), meta)
+
+
+def controllers(options: Options, chain: Chain, net: ActuatorNet) -> dict[str, Any]:
+    """The policies and the PIDs of the folder by name."""
+    files = {name: chain.out / POLICIES[name] for name in options.policies}
+    policies = {name: PolicyController(M, load_policy(file, M)) for name, file in files.items()}
+    pids = baselines.read_gains(chain.out / "gains.json", M, select_nets(M, net))
+    return policies | {name: pids[name] for name in PIDS}
+
+
+def score(options: Options, net: ActuatorNet, rivals: Mapping[str, Any]) -> dict[str, Any]:
+    """Runs of all controllers, by what moves: the nets, and each of `PLANTS`."""
+    commands = sequences.task_sequences(M)
+    starts = sequences.evaluation_starts(M, options.starts, commands, options.seed + 2)
+    starts = starts[np.array(sequences.start_kinds(M, starts)) == "workspace"]
+    if options.quick:
+        commands, starts = sequences.shorten(M, commands[:3], 8.0), starts[:4]
+    of_each = partial(metrics.evaluate, M, rivals, commands, starts, options.seed)
+    plants = {"nets": select_nets(M, net), **PLANTS}
+    done = side_by_side({name: partial(of_each, plant=plant) for name, plant in plants.items()})
+    return {name: runs for name, (runs, _) in done.items()}
+
+
+def table(runs: Mapping[str, Any]) -> str:
+    """Error and drift by controller and plant, and the error on the machine by that on the nets."""
+    lines = ["| | " + " | ".join([*runs, "machine by nets"]) + " |"]
+    lines.append("|---" * (len(runs) + 2) + "|")
+    means = {plant: metrics.means(rows) for plant, rows in runs.items()}
+    for name in means["nets"]:
+        figures = [of[name]["all"] for of in means.values()]
+        errors = [figure["velocity_error_mean"]["mean"] for figure in figures]
+        drifts = [figure["off_axis_drift_max"]["mean"] for figure in figures]
+        cells = [f"{error:.4f}, {drift:.3f}" for error, drift in zip(errors, drifts, strict=True)]
+        cells.append(f"{errors[1] / errors[0]:.2f}")
+        lines.append(f"| {TITLES[name]} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def free_runs(net: ActuatorNet, test: logs.Log) -> dict[str, float]:
+    """Error of each driven joint's velocity in free runs of `AFTER` s, by its rms speed."""
+    scores = validation.score(net, logs.in_order(test, net.joints))
+    runs = {M.names[i]: scores[M.names[i]]["free_run"][str(AFTER)] for i in M.driven}
+    return {name: run["relative_error"] for name, run in runs.items()}
+
+
+def main(options: Options) -> None:
+    """Make what is missing, score all, and write and print the page."""
+    budget = QUICK if options.quick else Budget(train_steps=options.steps)
+    chain = Chain(M, options.folder, budget, options.seed)
+    chain.out.mkdir(parents=True, exist_ok=True)
+    log, test = record(chain)
+    print("\n".join(inspection.table(inspection.inspect(log, M.pwm_limit / PWM_MAX))))
+    net = nets(chain, log)
+    make(options, chain, net)
+    runs = score(options, net, controllers(options, chain, net))
+    errors = free_runs(net, test)
+    rows = runs["nets"]
+    page = PAGE.format(
+        sequences=len(metrics.column(rows, "sequence")),
+        starts=len(metrics.column(rows, "start")),
+        after=AFTER,
+        free_runs=", ".join(f"{error:.0%} ({name})" for name, error in errors.items()),
+        table=table(runs),
+    )
+    write_json(chain.out / "mujoco.json", {"free_runs": errors, "runs": runs})
+    (chain.out / "mujoco.md").write_text(page)
+    print(page)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

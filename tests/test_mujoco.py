@@ -1,0 +1,90 @@
+"""The machine in MuJoCo has our geometry, obeys, feels its load, and goes through the chain."""
+
+import json
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+mujoco = pytest.importorskip("mujoco")
+
+from brokk_min.__main__ import main  # noqa: E402
+from brokk_min.actuator import lever_arm  # noqa: E402
+from brokk_min.cli.options import find_plant  # noqa: E402
+from brokk_min.kinematics import forward_kinematics, tool_position  # noqa: E402
+from brokk_min.machine import BROKK_170 as M  # noqa: E402
+from brokk_min.machine import PWM_MAX  # noqa: E402
+from examples.mujoco_brokk import PLANT, MujocoBrokk, build  # noqa: E402
+
+EXAMPLE = Path(__file__).parents[1] / "examples" / "mujoco_brokk.py"
+LOW, HIGH = M.column("q_min"), M.column("q_max")
+POSES = [M.q_start, *np.random.default_rng(0).uniform(LOW, HIGH, (20, M.n))]
+
+
+def length(model, data, q):
+    """Lengths of the cylinders [m] at angles `q` [rad], of the slew that of a rope on its drum."""
+    data.qpos[:] = q
+    mujoco.mj_forward(model, data)
+    return data.actuator_length.copy()
+
+
+def speeds(plant):
+    """Velocity [rad/s] (2, n) of each joint alone, up and down, in the last tick."""
+    u = M.pwm_limit / PWM_MAX * np.concatenate([np.eye(M.n), -np.eye(M.n)])
+    q = run(plant, np.tile(M.q_start, (2 * M.n, 1)), u, 30)
+    return np.stack([np.diag(of) for of in np.split((q[-1] - q[-2]) / M.dt, 2)])
+
+
+def run(plant, q, u, ticks):
+    """Angles [rad] (ticks, num, n) under held commands `u` (num, n)."""
+    state, angles = plant.reset(M, np.array(q)), []
+    for _ in range(ticks):
+        state = plant.step(M, state, u)
+        angles.append(state.q)
+    return np.array(angles)
+
+
+def test_geometry__is_that_of_the_machine():
+    """At 21 poses: the tool, and lever arms as derivatives of lengths."""
+    model, data = build(M, 0.0, 0.0)
+    for q in POSES:
+        step = 1e-5 * np.eye(M.n)
+        arms = [length(model, data, q + d) - length(model, data, q - d) for d in step]
+        np.testing.assert_allclose(np.array(arms) / 2e-5, np.diag(lever_arm(M, q)), atol=1e-6)
+        length(model, data, q)
+        tool = tool_position(forward_kinematics(M, np.array(q)))
+        np.testing.assert_allclose(data.site("tool").xpos, tool, atol=1e-9)
+
+
+def test_joints__obey_and_300_kg_slow_what_they_lift_by_a_few_percent():
+    find_plant(f"{EXAMPLE}:PLANT", M)  # raises what it finds wrong
+    up, down = speeds(PLANT)
+    nominal = M.column("q_dot_up"), M.column("q_dot_down")
+    assert (up > 0.4 * nominal[0]).all() and (down < -0.4 * nominal[1]).all()
+    slowed = 1 - speeds(MujocoBrokk(load=300.0))[0] / up
+    assert (slowed[1:] > 0.005).all() and (slowed[1:] < 0.08).all(), slowed
+
+
+def test_closed_valves__hold_the_machine_with_its_load():
+    q = run(MujocoBrokk(load=300.0), [M.q_start], np.zeros((1, M.n)), 100)
+    np.testing.assert_allclose(q[-1], [M.q_start], atol=1e-4)
+
+
+def test_one_pump__slows_joints_that_move_together():
+    down, middle = np.full((1, M.n), -M.pwm_limit / PWM_MAX), (HIGH + LOW) / 2
+    moved = [run(MujocoBrokk(pump=p), [middle], down, 30)[-1] - middle for p in (1.0, 0.5)]
+    assert (moved[1] < 0).all() and (moved[1] > 0.8 * moved[0]).all()
+
+
+def test_chain__runs_on_the_machine_in_mujoco(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    commands = (
+        f"collect --plant {EXAMPLE}:PLANT --hours 0.02 --out log.npz",
+        "inspect log.npz --json inspected.json",
+        "fit log.npz --out net.npz --steps 30 --batch-size 64",
+    )
+    for line in commands:
+        assert main(shlex.split(line)) == 0, line
+    joints = json.loads(Path("inspected.json").read_text())["joints"]
+    assert {name: joint["sign"] for name, joint in joints.items()} == dict.fromkeys(M.names, 1)
