@@ -63,7 +63,7 @@ def connect(scheduler: str | None, workers: int) -> Iterator[Any]:
     environ = "distributed.nanny.pre-spawn-environ"  # of the processes that run the calls
     settings = {
         f"{environ}.MALLOC_TRIM_THRESHOLD_": 2**30,  # with dask's 64 kB a training takes 1.4 times
-        f"{environ}.MALLOC_MMAP_THRESHOLD_": 2**30,  # and once that is set, arrays map new pages
+        f"{environ}.MALLOC_MMAP_THRESHOLD_": 2**30,  # glibc adapts it no more then
         "distributed.admin.large-graph-warning-threshold": "1TB",  # of logs
     }
     with dask.config.set(settings), Client(**options) as client:  # type: ignore[no-untyped-call]
