@@ -94,7 +94,7 @@ def a9() -> Figures:
 
 def a6() -> Figures:
     """Velocity error [m/s] of the PID with gains by hand, with and without the noise."""
-    pid = baselines(M, policy.load_policy(POLICY, M).net)["jacobian_pid_k0.1"]
+    pid = baselines(M, policy.load_policy(POLICY, M).net)["pid_by_hand"]
     start, goals = sequences.tuning_set(M, 16, seed=2)
     errors = {}
     for name, noise in (("5 %", 0.05), ("none", 0.0)):

@@ -22,7 +22,7 @@ from brokk_min.can.safety_gate import GateInputs, fault_name, gate, gate_start
 from brokk_min.env import measure
 from brokk_min.machine import PWM_MAX, Machine, Measured
 
-WARM_UP = 0.002  # s before SYNC, when the controller computes once to no purpose (tuned)
+BUSY_WAIT = 0.002  # s before and after SYNC in which the loop does not sleep (tuned)
 ANSWER_TIME = 0.4  # of a tick after SYNC, in which the encoders must answer (assumed)
 
 
@@ -79,7 +79,7 @@ class Drive:
         with self.catch_errors():
             self.bus.send(canopen.SYNC, b"")
             answer_by = self.bus.now() + ANSWER_TIME * self.machine.dt
-            self.nodes.listen(self.bus, answer_by, until_complete=True)
+            self.nodes.listen(self.bus, answer_by, BUSY_WAIT, until_complete=True)
         counts = self.nodes.counts()
         command = np.zeros(self.machine.n)
         with self.catch_errors():
@@ -147,15 +147,15 @@ class Drive:
             self.reason += f" ({self.last_exception})"
 
     def wait(self) -> None:
-        """Listen until the deadline."""
+        """Listen until the deadline; without sleep just before it."""
         deadline = self.start_time + self.deadline_number * self.machine.dt  # no sum: no drift
         end = min(deadline, self.bus.now() + self.machine.dt)  # the clock may have gone backwards
         with self.catch_errors():
-            self.nodes.listen(self.bus, end - WARM_UP)
+            self.nodes.listen(self.bus, end - BUSY_WAIT)
             # warm-up: caches are cold after sleep, and the first computation takes longer
             if self.bus.now() < end and (measured := self.measured):
                 self.controller(measured, self.controller_state)
-            self.nodes.listen(self.bus, end)
+            self.nodes.listen(self.bus, end, BUSY_WAIT)
         self.bus.sleep(max(0.0, end - self.bus.now()))  # a broken bus does not wait
         self.count_tick(self.bus.now() - deadline)
 

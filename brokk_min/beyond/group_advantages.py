@@ -31,7 +31,7 @@ from brokk_min import ppo
 from brokk_min.env import State
 from brokk_min.learning.episodes import map_arrays
 from brokk_min.learning.gym_env import Step, TaskVectorEnv
-from brokk_min.machine import Array
+from brokk_min.machine import Array, require
 from brokk_min.settings import PPOConfig
 
 COPIES = 4  # machines in a group; neighbours in each array
@@ -46,10 +46,12 @@ def repeat(values: Any) -> Any:
 class GroupVectorEnv(TaskVectorEnv):
     """A `TaskVectorEnv` of groups; its windows of `horizon` ticks end truncated.
 
-    Their own last observations are in `info["final_obs"]`.
+    Their own last observations are in `info["final_obs"]`. ValueError: `num_envs` is no multiple
+    of `COPIES`.
     """
 
     def __init__(self, num_envs: int, *options: Any, horizon: int, **more: Any) -> None:
+        require(num_envs % COPIES == 0, "num_envs", f"a multiple of {COPIES}", num_envs)
         super().__init__(num_envs, *options, **more)
         self.horizon, self.ticks = horizon, 0
 

@@ -6,7 +6,8 @@ so far. Its actions begin beyond the dead zone, its valves close while the tool 
 for valve travel and for error that lasts.
 
 What it buys, as measured at commit a861755 with one seed over nine motions (mean velocity error
-of the tool; the first two rows are of PPO with a critic, the others of the gradient learner):
+of the tool; the first two rows are of PPO with a critic, the others of one that differentiated
+the simulation):
 
 | Part | With it | Without it |
 |---|---|---|

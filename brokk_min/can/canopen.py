@@ -59,10 +59,12 @@ class Nodes:
         self.heartbeat = np.full(machine.n + 1, -np.inf)  # s, -inf: never
         self.nmt = np.zeros(machine.n + 1, int)
 
-    def listen(self, bus: Any, end: float, until_complete: bool = False) -> None:
+    def listen(
+        self, bus: Any, end: float, busy_wait: float = 0.0, until_complete: bool = False
+    ) -> None:
         """Read until `end` [s] and the bus is empty, or until every encoder has answered."""
         while self.received < MAX_FRAMES and not (until_complete and (self.frames > 0).all()):
-            frame = bus.recv(max(0.0, end - bus.now()))
+            frame = bus.recv(max(0.0, end - bus.now()), busy_wait)
             if frame is None:
                 return
             self.update(frame)

@@ -1,10 +1,11 @@
 """The CAN bus through python-can, and its log; python-can is imported when a bus is opened."""
 
+import select
 import signal
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ class Bus:
     writer: Any = None  # python-can's candump writer
     name: str = "can"  # of the bus in the log
     echo: bool = False  # does the bus give back what we send?
+    file: int = -1  # descriptor to wait on; -1: `bus` waits itself
     clock: Callable[[], float] = time.monotonic  # s
     sleep: Callable[[float], object] = time.sleep
 
@@ -34,9 +36,14 @@ class Bus:
         """Time of day at the start plus monotonic time since [s], in whole microseconds."""
         return round(self.start + self.clock(), 6)
 
-    def recv(self, timeout: float) -> Frame | None:
-        """The next frame within `timeout` [s], or None."""
-        message = self.bus.recv(timeout)
+    def recv(self, timeout: float, busy_wait: float = 0.0) -> Frame | None:
+        """The next frame within `timeout` [s], or None; it sleeps only after `busy_wait` [s]."""
+        end = self.clock() + timeout
+        message = self.bus.recv(timeout if self.file < 0 else 0.0)
+        # python-can's own timeout follows the time of day, so we wait for the descriptor
+        while message is None and self.file >= 0 and (left := end - self.clock()) > 0:
+            if select.select([self.file], [], [], left if left <= timeout - busy_wait else 0.0)[0]:
+                message = self.bus.recv(0.0)
         if message is None:
             return None
         now, data = self.now(), bytes(message.data)
@@ -100,8 +107,11 @@ def open_bus(interface: str, channel: str, log: Path | None = None) -> Iterator[
         raise ValueError(f"{where}, got {brief(error)}") from error
     name = channel if interface == "socketcan" else interface
     writer = can.CanutilsLogWriter(log) if log else None
+    bus = Bus(raw, writer, name, echo=interface == "udp_multicast")
+    with suppress(NotImplementedError):  # python-can's word for a bus without a descriptor
+        bus.file = raw.fileno()
     try:
-        with closing(Bus(raw, writer, name, echo=interface == "udp_multicast")) as bus:
+        with closing(bus):
             yield bus
     except can.CanError as error:
         raise ValueError(f"{where} that works, got {brief(error)}") from error

@@ -40,8 +40,6 @@ class Training(Command):
         learner, task = options.learner, options.task
         check(learner.total_steps > 0, "--total-steps", "1 or more", learner.total_steps)
         check(0 <= learner.gamma < 1, "--gamma", "0 to below 1", learner.gamma)
-        groups = learner.num_envs % 4 == 0 and learner.num_envs > 0
-        check(self.critic or groups, "--num-envs", "a multiple of 4", learner.num_envs)
         fits = 0 < task.hold_min_s <= task.hold_max_s
         check(fits, "--hold-max-s", f"{task.hold_min_s} or more", task.hold_max_s)
         return Recipe("paper" if self.paper else "beyond", self.critic, task, learner)

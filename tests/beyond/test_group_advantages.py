@@ -95,6 +95,11 @@ def test_starts_in_the_ground__end_the_whole_group_without_reward():
     assert not reward[terminated].any() and reward[~terminated].all() and not truncated.any()
 
 
+def test_groups__are_whole():
+    with pytest.raises(ValueError, match=r"^num_envs: expected a multiple of 4, got 6$"):
+        make(num=6)
+
+
 def rollout_of(rewards, goal_ticks, dones=None):
     """A rollout whose only contents are rewards (T, N), ticks until a new goal, and ends."""
     rewards = torch.tensor(rewards)

@@ -1,7 +1,11 @@
-"""The bus through python-can: echoes, refusals, and the log."""
+"""The bus through python-can: waiting, echoes, refusals, and the log."""
 
 import io
+import os
 import re
+import select
+import threading
+import time
 
 import can
 import pytest
@@ -63,3 +67,29 @@ def test_open_bus__keeps_its_log_where_the_adapter_fails(tmp_path):
         bus.bus.shutdown, shutdown = fails, bus.bus.shutdown
     shutdown()
     assert (tmp_path / "l").read_text().endswith(" virtual 080# T\n")
+
+
+class Piped:
+    """A bus of python-can with a descriptor; one frame comes with the byte of a pipe."""
+
+    def __init__(self):
+        self.reader, self.writer = os.pipe()
+
+    def recv(self, timeout):
+        assert timeout == 0.0  # else python-can would wait by the time of day
+        if not select.select([self.reader], [], [], 0)[0]:
+            return None
+        os.read(self.reader, 1)
+        return can.Message(arbitration_id=0x181, data=b"1234", is_extended_id=False)
+
+
+@pytest.mark.parametrize("busy_wait", [0.0, 1.0])
+def test_recv__waits_for_the_descriptor_by_its_own_clock(busy_wait):
+    raw = Piped()
+    bus = Bus(raw, file=raw.reader)
+    start = time.monotonic()
+    assert bus.recv(0.05, busy_wait) is None and 0.05 <= time.monotonic() - start < 1.0
+    threading.Timer(0.02, os.write, (raw.writer, b"x")).start()
+    frame = bus.recv(5.0, busy_wait)
+    assert (frame.id, frame.data) == (0x181, b"1234") and time.monotonic() - start < 2.0
+    os.close(raw.reader), os.close(raw.writer)

@@ -121,6 +121,20 @@ def drive(
     return np.array(sent), states[1:]
 
 
+@pytest.mark.parametrize("pose", [POSE, STRETCHED], ids=["paper", "stretched"])
+def test_joint_velocities__beyond_the_fastest_motion_slow_down_in_the_same_direction(pose):
+    c = controller(w0=0.5, k=0.05)
+    small = c.joint_velocities(0.01 * GOAL, pose, np.zeros(4))
+    up, down = BROKK_170.column("q_dot_up")[DRIVEN], BROKK_170.column("q_dot_down")[DRIVEN]
+    fastest = np.where(small > 0, up, down)
+    assert (np.abs(small) < fastest).all()
+    for scale in (0.02, 0.5, 5.0, 500.0):
+        free = small * scale / 0.01
+        excess = np.max(np.abs(free) / fastest)
+        found = c.joint_velocities(scale * GOAL, pose, np.zeros(4))
+        np.testing.assert_allclose(found, free / max(1, excess), rtol=1e-6, atol=1e-9)
+
+
 def test_controller__wants_the_joint_velocities_of_eq3():
     """v_goal + K (v_goal - v_tool) by weighted least squares: an optimiser finds the same."""
     q_dot, w0, last = np.array([0.01, 0.0, -0.02, 0.03, 0.01]), 100.0, [0.1, 0.1, -0.1, 0.0]

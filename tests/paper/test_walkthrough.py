@@ -1,4 +1,4 @@
-"""The walkthrough is true: its blocks run in order, are short, and print what stands below.
+"""The walkthrough is true: its blocks run in order, are short, print and draw what stands below.
 
 `python tests/paper/test_walkthrough.py` writes what the blocks print, and their figures.
 """
@@ -12,6 +12,7 @@ from pathlib import Path
 from unittest import mock
 
 import matplotlib
+import numpy as np
 import pytest
 
 matplotlib.use("Agg")
@@ -20,6 +21,7 @@ FIGURES = PAGE.parent / "figures"
 BLOCK = re.compile(r"^```python\n(.*?)^```\n(?:^```\n(.*?)^```\n)?", re.M | re.S)
 SVG = {"svg.hashsalt": "walkthrough", "svg.fonttype": "none"}  # the same bytes, letters as text
 Ran = tuple[list[str], dict[str, str]]  # what blocks print, and files that they write by name
+CURVE = re.compile(r'<path d="([^"]+)" clip-path="[^"]+" style="fill: none')
 
 
 def run(codes: list[str]) -> Ran:
@@ -41,6 +43,15 @@ def ran() -> Ran:
     return run([code for code, _ in BLOCK.findall(PAGE.read_text())])
 
 
+def corners(figure: str) -> list[list[float]]:
+    """Extent and end of each curve of an SVG, in points."""
+    result = []
+    for path in CURVE.findall(figure):
+        points = np.array(re.findall(r"-?[\d.]+", path), float).reshape(-1, 2)
+        result.append([*points.min(axis=0), *points.max(axis=0), *points[-1]])
+    return result
+
+
 def test_blocks__are_short_and_the_page_takes_half_an_hour() -> None:
     text = PAGE.read_text()
     blocks = BLOCK.findall(text)
@@ -52,6 +63,15 @@ def test_blocks__are_short_and_the_page_takes_half_an_hour() -> None:
 def test_blocks__print_what_stands_below(ran: Ran) -> None:
     below = [output for _, output in BLOCK.findall(PAGE.read_text())]
     assert ran[0] == below, "run `make docs`"
+
+
+def test_figures__are_those_of_the_blocks(ran: Ran) -> None:
+    shown = re.findall(r"^!\[.{30,}\]\(figures/(.*?)\)$", PAGE.read_text(), re.M)
+    assert sorted(ran[1]) == sorted(shown)
+    for name, figure in ran[1].items():
+        wanted, got = corners(figure), corners((FIGURES / name).read_text())
+        assert len(wanted) >= 2
+        np.testing.assert_allclose(got, wanted, atol=2, err_msg=f"{name}: run `make docs`")
 
 
 def write() -> None:
