@@ -12,11 +12,11 @@ from pathlib import Path
 import can
 import numpy as np
 import pytest
-from canopen.objectdictionary import ObjectDictionary, ODArray, ODRecord, ODVariable, datatypes
+from canopen.objectdictionary import ObjectDictionary, ODRecord, ODVariable, datatypes
 from helpers_machines import obedient_net
 
 from brokk_min.actuator import PLANT
-from brokk_min.can.canopen import Frame, OperatorInput
+from brokk_min.can.canopen import Frame, OperatorInput, valve_frame
 from brokk_min.can.connection import Bus, open_bus
 from brokk_min.can.simulated_machine import SimulatedMachine
 from brokk_min.hw import Drive
@@ -168,6 +168,31 @@ class World:
         return 0.005 * np.arange(1, len(u) + 1), np.rint(u * 127).astype(int)
 
 
+class RemoteControl:
+    """The machine's own: SYNC each `period` [s], and valve frames with `command(tick)` after it.
+
+    Put it in the place of `World.noise`. Without `period` it sends no SYNC.
+    """
+
+    delay = 0.004  # s, of the valve frames
+
+    def __init__(self, world, command, period=0.05):
+        self.world, self.command, self.period = world, command, period
+        self.count = self.syncs = 0
+        world.simulated.receive(Frame(0.0, 0x000, b"\x01\x00"))
+
+    def __call__(self):
+        out = []
+        if self.period and self.world.time >= (self.syncs + 1) * self.period:
+            self.syncs += 1
+            out.append((0x080, b""))
+        if self.world.time >= (self.count + 1) * 0.05 + self.delay:
+            self.count += 1
+            data = valve_frame(self.command(self.count), self.count % 256, 1)
+            out.append((0x210, data.tobytes()))
+        return out
+
+
 class ConstantCommand:
     """A controller that gives constant commands [counts of 127]."""
 
@@ -227,20 +252,23 @@ def dictionary():
     """As much of CiA 406 as the program asks of an encoder."""
     u8, u16, u32 = datatypes.UNSIGNED8, datatypes.UNSIGNED16, datatypes.UNSIGNED32
     objects = ObjectDictionary()
-    tpdo = ODRecord("TPDO1", 0x1800)
+    records = {0x1800: ODRecord("TPDO1", 0x1800), 0x1A00: ODRecord("TPDO1 mapping", 0x1A00)}
     for name, index, sub, kind, value in (
         ("device type", 0x1000, 0, u32, 406),
         ("heartbeat", 0x1017, 0, u16, 0),
+        ("identifier", 0x1800, 1, u32, 0),
         ("transmission type", 0x1800, 2, u8, 254),
+        ("number of entries", 0x1A00, 0, u8, 1),
+        ("first entry", 0x1A00, 1, u32, 0x60040020),
         ("position", 0x6004, 0, u32, 0),
         ("units per revolution", 0x6501, 0, u32, 4096),
     ):
         entry = ODVariable(name, index, sub)
         entry.data_type = kind
         entry.default = value
-        (tpdo.add_member if sub else objects.add_object)(entry)
-    objects.add_object(tpdo)
-    objects.add_object(ODArray("TPDO1 mapping", 0x1A00))  # unused: the test sends the positions
+        (records[index].add_member if index in records else objects.add_object)(entry)
+    for record in records.values():
+        objects.add_object(record)
     return objects
 
 

@@ -219,6 +219,7 @@ for node in range(1, 6):
         of_joint["frozen"] = partial(freeze, node=node), "frozen"
     for name, (cause, words) in of_joint.items():
         FAULTS[f"q{node} {name}"] = (cause, f"q{node}: {words}")
+FAULTS["position of q5 before SYNC as well"] = (foreign(0x185, bytes(4)), f"q5: {DOUBLED}")
 NOT_FOUND = {
     "q2 frozen, the locked joint": (partial(freeze, node=2), "it may stand still"),
     "q3 a tick late, without a gap": (partial(repeat_once, node=3), "no time, no number"),

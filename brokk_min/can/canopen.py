@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brokk_min.machine import PWM_MAX, Machine, decode_pwm, encode_pwm, require
+from brokk_min.machine import PWM_MAX, Joint, Machine, decode_pwm, encode_pwm, require
 
 Array = NDArray[Any]  # counts and flags, too
 
@@ -21,10 +21,14 @@ SDO_REQUEST = 0x600
 HEARTBEAT = 0x700
 # objects of an encoder: index, subindex
 HEARTBEAT_OBJECT = (0x1017, 0)  # period [ms]
+TPDO1_OBJECT = (0x1800, 1)  # identifier; bit 31: switched off
 SYNC_OBJECT = (0x1800, 2)  # after how many SYNCs a position is sent
+MAPPING_OBJECT = 0x1A00  # of TPDO1: subindex 0 has the number of entries, which follow
+POSITION_ENTRY = 0x6004_00_20  # in the mapping: index, subindex, number of bits
 RESOLUTION_OBJECT = (0x6501, 0)  # counts per turn
 OPERATIONAL = 5  # NMT state
 START_ALL = bytes([1, 0])  # NMT command
+PRE_OPERATIONAL_ALL = bytes([128, 0])  # in this state every encoder takes settings
 POSITION_BITS = 26  # of the encoders that we simulate
 NO_POSITION = 0xFFFFFFFF  # what many encoders send when they fail
 HEARTBEAT_PERIOD = 0.050  # s, set in the encoders (assumed)
@@ -32,7 +36,8 @@ SDO_TIMEOUT = 0.5  # s (assumed)
 MAX_FRAMES = 256  # read in a tick; with more the bus is flooded
 WATCHDOG = 0.150  # s without valid valve frame, then the controller closes the valves (assumed)
 MOST_JOINTS = 5  # in a valve frame
-OPERATOR_INPUT = 0x7FF  # of the operator's input, which is in the log and never on the bus
+WOULD_SEND = 0x7FE  # of valve frames of `shadow`; these two are in the log, never on the bus
+OPERATOR_INPUT = 0x7FF  # of the operator's input
 
 
 class Frame(NamedTuple):
@@ -55,6 +60,7 @@ class Nodes:
         self.position_index = {TPDO1 + node: i for i, node in enumerate(nodes[:-1])}
         self.heartbeat_index = {HEARTBEAT + node: i for i, node in enumerate(nodes)}
         self.raw = np.full(machine.n, -1)  # -1: none yet
+        self.size = np.zeros(machine.n, int)  # bytes of the newest positions
         self.frames = np.zeros(machine.n, int)  # positions of this tick; a malformed one counts 2
         self.heartbeat = np.full(machine.n + 1, -np.inf)  # s, -inf: never
         self.nmt = np.zeros(machine.n + 1, int)
@@ -84,6 +90,7 @@ class Nodes:
             raw = int.from_bytes(frame.data, "little")
             sound = size == 4 and raw != NO_POSITION
             self.frames[i] += 1 if sound else 2
+            self.size[i] = size
             if size == 4:
                 self.raw[i] = raw
         elif frame.id in self.heartbeat_index and size == 1:
@@ -105,8 +112,8 @@ def check_bus(machine: Machine) -> None:
     require(machine.n <= MOST_JOINTS, "joints", f"at most {MOST_JOINTS} on a bus", machine.n)
     nodes, valves = node_numbers(machine), machine.valve_frame_id
     bases = (EMERGENCY, TPDO1, SDO_ANSWER, SDO_REQUEST, HEARTBEAT)
-    others = {NMT, SYNC, OPERATOR_INPUT, *(base + node for base in bases for node in nodes)}
-    free = valves < OPERATOR_INPUT and valves not in others
+    others = {NMT, SYNC, *(base + node for base in bases for node in nodes)}
+    free = valves < WOULD_SEND and valves not in others
     require(free, "valve_frame_id", "an identifier of no other frame", f"0x{valves:03X}")
     for joint in machine.joints:
         require(joint.kind == "revolute", f"{joint.name}.kind", "revolute on a bus", joint.kind)
@@ -125,18 +132,52 @@ def node_numbers(machine: Machine) -> list[int]:
 def set_up_nodes(bus: Any, machine: Machine) -> None:
     """Check the encoders, set their heartbeats, let them answer each SYNC, and start all nodes.
 
-    ValueError: an encoder that does not answer or has another resolution; see also `check_bus`.
+    ValueError: an encoder that does not answer, or not as the machine says; see also `check_bus`.
     """
     check_bus(machine)
-    turn = 2**machine.encoder_bits
     for joint in machine.joints:
-        node = joint.encoder_node
-        found = sdo(bus, node, RESOLUTION_OBJECT)
-        wanted = f"{turn} counts a turn of encoder node {node} (object 0x6501)"
-        require(found == turn, joint.name, wanted, found)
-        sdo(bus, node, HEARTBEAT_OBJECT, round(1e3 * HEARTBEAT_PERIOD), size=2)
-        sdo(bus, node, SYNC_OBJECT, 1, size=1)
+        check_encoder(bus, machine, joint)
+    bus.send(NMT, PRE_OPERATIONAL_ALL)
+    for joint in machine.joints:
+        sdo(bus, joint.encoder_node, HEARTBEAT_OBJECT, round(1e3 * HEARTBEAT_PERIOD), size=2)
+        sdo(bus, joint.encoder_node, SYNC_OBJECT, 1, size=1)
     bus.send(NMT, START_ALL)
+    check_positions(bus, machine)
+
+
+def check_encoder(bus: Any, machine: Machine, joint: Joint) -> None:
+    """ValueError: an encoder with another resolution, or whose TPDO1 is not its position alone."""
+    node, turn = joint.encoder_node, 2**machine.encoder_bits
+    found = sdo(bus, node, RESOLUTION_OBJECT)
+    wanted = f"{turn} counts a turn of encoder node {node} (object 0x6501)"
+    require(found == turn, joint.name, wanted, found)
+    found = sdo(bus, node, TPDO1_OBJECT)
+    off = f"TPDO1 of node {node} is switched off (0x1800:01 bit 31)"
+    require(not found >> 31, joint.name, "an encoder that sends its position", off)
+    wanted = f"TPDO1 of node {node} with identifier 0x{TPDO1 + node:X} (0x1800:01)"
+    require(found & 0x7FF == TPDO1 + node, joint.name, wanted, f"0x{found & 0x7FF:X}")
+    number = sdo(bus, node, (MAPPING_OBJECT, 0))
+    entries = [sdo(bus, node, (MAPPING_OBJECT, i + 1)) for i in range(number)]
+    size = sum(entry & 0xFF for entry in entries) // 8
+    objects = ", ".join(f"0x{entry >> 16:04X}" for entry in entries)
+    wanted = f"TPDO1 of node {node} with the 4 bytes of object 0x6004 (0x1A00)"
+    got = f"one that has {size} bytes, of {objects}"
+    require(entries == [POSITION_ENTRY], joint.name, wanted, got)
+
+
+def check_positions(bus: Any, machine: Machine) -> None:
+    """ValueError: an encoder that does not answer SYNC with the four bytes of a position."""
+    nodes = Nodes(machine)
+    for _ in range(round(SDO_TIMEOUT / machine.dt)):  # a node may take some time to start
+        nodes.start_tick()
+        bus.send(SYNC, b"")
+        nodes.listen(bus, bus.now() + machine.dt, until_complete=True)
+        if (nodes.frames > 0).all():
+            break
+    for joint, came, size in zip(machine.joints, nodes.frames, nodes.size):
+        wanted = f"TPDO1 of node {joint.encoder_node} with 4 bytes after SYNC"
+        got = f"one that has {size} bytes" if came else "none"
+        require(came and size == 4, joint.name, wanted, got)
 
 
 def sdo(

@@ -4,14 +4,14 @@ import select
 import signal
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from brokk_min._files import brief, require_package
-from brokk_min.can.canopen import OPERATOR_INPUT, Frame
+from brokk_min.can.canopen import OPERATOR_INPUT, WOULD_SEND, Frame
 
 
 @dataclass
@@ -25,6 +25,7 @@ class Bus:
     file: int = -1  # descriptor to wait on; -1: `bus` waits itself
     clock: Callable[[], float] = time.monotonic  # s
     sleep: Callable[[float], object] = time.sleep
+    allowed: Container[int] = range(0x800)  # identifiers of frames that it sends
 
     def __post_init__(self) -> None:
         self.start = time.time() - self.clock()  # the log has the time of day, but it may be set
@@ -55,7 +56,13 @@ class Bus:
         return Frame(now, -1 if other or message.is_extended_id else message.arbitration_id, data)
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Send one frame, once; never periodically, because the kernel would go on after a hang."""
+        """Send one frame, once; never periodically, because the kernel would go on after a hang.
+
+        A frame that is not `allowed` is in the log alone, with the identifier `WOULD_SEND`.
+        """
+        if can_id not in self.allowed:
+            self._log(self._message(WOULD_SEND, data), self.now(), "shadow")
+            return
         message = self._message(can_id, data)
         self.bus.send(message, timeout=0.01)
         self.echoes.append((can_id, data))

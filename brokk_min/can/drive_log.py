@@ -1,6 +1,6 @@
 """The log of a drive: its frames, what they say of each tick, and recordings for `fit`.
 
-Logs are those of candump, so those of other tools can be read, too.
+Logs are those of candump, and those of other tools that python-can reads (ASC, BLF, TRC, gzip).
 """
 
 import re
@@ -10,29 +10,48 @@ from typing import NamedTuple
 
 import numpy as np
 
-from brokk_min._files import brief, expected
+from brokk_min._files import brief, expected, require_package
 from brokk_min.can import canopen
 from brokk_min.can.canopen import Frame, Nodes, OperatorInput
 from brokk_min.identification.logs import Log, machine_log
+from brokk_min.identification.readings import FASTER, NOISE
 from brokk_min.machine import Array, Machine, require
 
-# (time) bus identifier#data direction, of a data frame with 11 bits; T: the program sent it
-LINE = re.compile(r"\((\d+\.\d+)\) \S+ ([0-9A-Fa-f]{3})#((?:[0-9A-Fa-f]{2}){0,8})(?: ([RT]))?\n")
+# (time) bus identifier#data direction, of a data frame with 11 bits; T: the program sent it. On a
+# terminal candump prints (time)  bus  identifier   [length]  data.
+LINE = re.compile(
+    r" ?\((\d+\.\d+)\) +\S+ +([0-9A-Fa-f]{3})(?:#| +\[\d\] *)((?:[0-9A-Fa-f]{2} ?){0,8})"
+    r"(?: ([RT]))?\n"
+)
+OTHERS = (".asc", ".blf", ".trc", ".gz")  # that python-can reads
 
 
 def read_frames(path: Path) -> Iterator[Frame]:
-    """The frames of a candump log, one by one, because a day of driving has millions.
+    """The data frames of a log with 11 bits, one by one, because a day of driving has millions.
 
-    Extended and remote frames are left out, and a last line without its newline: the program that
-    wrote it was killed. ValueError: no such log, or a line without a time.
+    Other frames are left out, and a last line without its newline: the program that wrote it was
+    killed. ValueError: no such log, or a line without a time.
     """
+    if Path(path).suffix.lower() in OTHERS:
+        yield from other_frames(path)
+        return
     with expected(path, "a candump log"), open(path, encoding="ascii") as file:
         for row, line in enumerate(file, 1):
-            require(line.startswith("("), f"row {row}", "(time) bus identifier#data", brief(line))
+            wanted = "(time) bus identifier#data, as candump -l writes"
+            require(line.lstrip().startswith("("), f"row {row}", wanted, brief(line))
             if match := LINE.fullmatch(line):
                 time, can_id, data, direction = match.groups()
                 content = bytes.fromhex(data)
                 yield Frame(float(time), int(can_id, 16), content, direction == "T")
+
+
+def other_frames(path: Path) -> Iterator[Frame]:
+    """The data frames with 11 bits of a log that python-can reads; ValueError: it is none."""
+    reader = require_package("can", "hw").LogReader
+    with expected(path, "a log that python-can reads"), reader(path) as messages:
+        for one in messages:
+            if not (one.is_extended_id or one.is_remote_frame or one.is_error_frame or one.is_fd):
+                yield Frame(one.timestamp, one.arbitration_id, bytes(one.data), not one.is_rx)
 
 
 class Telemetry(NamedTuple):
@@ -65,16 +84,18 @@ def read_telemetry(machine: Machine, frames: Iterable[Frame]) -> Iterator[Teleme
 
 
 def log_for_fit(machine: Machine, frames: Iterable[Frame]) -> Log:
-    """Commands and angles while driving, as recordings for `fit`; a gap starts a new one.
+    """Commands and angles while driving, as recordings for `fit`; a gap or jump starts a new one.
 
     ValueError: nothing was driven for long enough.
     """
     recordings: list[list[Telemetry]] = [[]]
+    reach = FASTER * machine.q_dot_max * machine.dt + NOISE  # of an angle in a tick
     for tick in read_telemetry(machine, frames):
         if not (tick.driving and np.isfinite(tick.q).all()):
             continue
-        last = recordings[-1][-1].time if recordings[-1] else tick.time - machine.dt
-        if not 0.5 < (tick.time - last) * machine.rate < 1.5:
+        last = recordings[-1][-1] if recordings[-1] else tick._replace(time=tick.time - machine.dt)
+        on_time = 0.5 < (tick.time - last.time) * machine.rate < 1.5
+        if not on_time or (np.abs(tick.q - last.q) > reach).any():
             recordings.append([])
         recordings[-1].append(tick)
     longest, least = max(map(len, recordings)), machine.history + 2

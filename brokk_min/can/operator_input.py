@@ -72,7 +72,7 @@ class Joystick:
         self.stick: Any = self.pygame.joystick.Joystick(0)
         self.alive = True
         num_axes, num_buttons = self.stick.get_numaxes(), self.stick.get_numbuttons()
-        fits = max(axes) < num_axes and button < num_buttons
+        fits = 0 <= min(axes) <= max(axes) < num_axes and 0 <= button < num_buttons
         wanted = f"axes {list(axes)} and button {button}"
         require(fits, "joystick", wanted, f"{num_axes} axes and {num_buttons} buttons")
 

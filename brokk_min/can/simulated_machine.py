@@ -86,7 +86,7 @@ class SimulatedMachine:
         elif frame.id == self.machine.valve_frame_id:
             self._on_valve_frame(frame)
         elif node in self.encoders and len(frame.data) == 8:
-            return [(canopen.SDO_ANSWER + node, self._on_sdo(frame.data))]
+            return [(canopen.SDO_ANSWER + node, self._on_sdo(node, frame.data))]
         return []
 
     def _positions(self) -> Frames:
@@ -128,10 +128,16 @@ class SimulatedMachine:
         self._close_valves()
         self.nmt[self.controller] = PRE_OPERATIONAL
 
-    def _on_sdo(self, data: bytes) -> bytes:
-        """The resolution is read; what is written has its fixed value already."""
+    def _on_sdo(self, node: int, data: bytes) -> bytes:
+        """Objects are read; what is written has its fixed value already."""
         command, *address, _ = struct.unpack("<BHBI", data)
-        answer = (0x43, 2**self.machine.encoder_bits) if command == 0x40 else (0x60, 0)
+        values = {
+            canopen.RESOLUTION_OBJECT: 2**self.machine.encoder_bits,
+            canopen.TPDO1_OBJECT: canopen.TPDO1 + node,
+            (canopen.MAPPING_OBJECT, 0): 1,
+            (canopen.MAPPING_OBJECT, 1): canopen.POSITION_ENTRY,
+        }
+        answer = (0x43, values.get((*address,), 0)) if command == 0x40 else (0x60, 0)
         return struct.pack("<BHBI", answer[0], *address, answer[1])
 
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from tyro.conf import Positional
@@ -11,13 +11,14 @@ from brokk_min import hw
 from brokk_min.can.connection import open_bus
 from brokk_min.can.operator_input import JointJog, Joystick, Script
 from brokk_min.can.safety_gate import fault_name
+from brokk_min.can.shadow import Shadow
 from brokk_min.can.simulated_machine import simulate
 from brokk_min.cli.options import Command, check, default_policy, find_plant
 from brokk_min.evaluation.baselines import baselines, read_gains
 from brokk_min.evaluation.rollout import TITLES, Controller
 from brokk_min.evaluation.sequences import read_commands
 from brokk_min.learning.policy import PolicyController, load_policy
-from brokk_min.machine import Machine, require
+from brokk_min.machine import PWM_MAX, Machine, require
 
 PID = "jacobian_pid_k0.1"  # the paper's, among the baselines
 
@@ -45,7 +46,9 @@ class Drive(Command):
     interface: str  # python-can's name of the bus: socketcan, udp_multicast, ...
     channel: str  # Channel of the interface: can0, 239.74.163.2, ...
     policy: Path | None = None  # Policy that `train` wrote, with gains.json beside it.
-    command: str = "joystick"  # Or velocity sequences, CSV: sequence,time,vx,vy,vz [s, m/s].
+    command: str = ""  # joystick, the default, or a CSV: sequence,time,vx,vy,vz [s, m/s].
+    shadow: bool = False  # Send nothing: show what would be sent beside what others send.
+    sync: bool = False  # With --shadow, send SYNC and start the nodes all the same.
     controller: Literal["rl", "jacobian", "jog"] = "rl"  # Policy, optimised PID, one joint.
     joint: str = ""  # Joint that jogs, forward and backward with x.
     counts: int = 12  # Its command, of 127; a little beyond the dead zone.
@@ -58,9 +61,14 @@ class Drive(Command):
         self.writes(self.log)
         controller, operator = self.find_controller(machine), self.find_operator(machine)
         with open_bus(self.interface, self.channel, self.log) as bus:
-            drive = hw.Drive(machine, controller, bus, operator)
+            if self.shadow or operator is None:
+                drive: hw.Drive = Shadow(machine, controller, bus, operator, self.sync)
+            else:
+                drive = hw.Drive(machine, controller, bus, operator)
             drive.begin()
             drive.run(lambda drive: print(status(drive), flush=True))
+        if isinstance(drive, Shadow):
+            print(drive.report())
         played = not isinstance(operator, Script) or operator.done
         require(played, "drive", "to play all sequences", drive.reason or "a stop")
 
@@ -73,9 +81,11 @@ class Drive(Command):
         rl, pid = find_controllers(machine, self.policy)
         return rl if self.controller == "rl" else pid
 
-    def find_operator(self, machine: Machine) -> Joystick | Script:
-        """The joystick, or the script of a file."""
-        if self.command == "joystick":
+    def find_operator(self, machine: Machine) -> Joystick | Script | None:
+        """The joystick, or the script of a file; a shadow needs none."""
+        if not self.command and self.shadow:
+            return None
+        if self.command in ("", "joystick"):
             return Joystick(machine, self.axes, self.button)
         goals = [sequence.goals for sequence in read_commands(Path(self.command), machine)]
         return Script(machine, np.concatenate(goals))
@@ -95,9 +105,15 @@ def status(drive: hw.Drive) -> str:
     active = fault_name(drive.machine, int(drive.gate.active_fault))
     words = ["driving" if drive.gate.driving else "waiting" if active else "ready", drive.reason]
     words += [f"now {active}"] if active not in drive.reason else []  # what is in the way
-    vectors = {"v goal": drive.operator_input.v_goal}
+    vectors: dict[str, Any] = {"v goal": drive.operator_input.v_goal}
+    if not drive.gate.driving and isinstance(drive.operator, Joystick):
+        axes = [str(axis) for axis, v in zip(drive.operator.axes, drive.operator_input.v_goal) if v]
+        words += ["the stick is not centred: axis " + " and ".join(axes)] if axes else []
     if measured := drive.measured:
         vectors |= {"measured": measured.v_tool[0], "q": measured.q[0]}
+    if isinstance(drive, Shadow) and drive.pairs:
+        would_send, sent = drive.pairs[-1]
+        vectors |= {"would send": would_send / PWM_MAX, "sent": sent / PWM_MAX}
     words += [f"{name} {' '.join(f'{x:+.2f}' for x in row)}" for name, row in vectors.items()]
     words += [f"late {1e3 * drive.lateness:.1f} ms, skipped {drive.skipped}"]
     return ", ".join(filter(None, words))

@@ -98,12 +98,83 @@ def test_set_up_nodes__sets_up_the_encoders_and_starts_the_nodes(world):
     world.drive.begin()
     assert [data.hex(" ") for can_id, data in out if can_id == 0x603] == [
         "40 01 65 00 00 00 00 00",  # read the resolution
+        "40 00 18 01 00 00 00 00",  # the identifier of TPDO1,
+        "40 00 1a 00 00 00 00 00",  # how many objects it has,
+        "40 00 1a 01 00 00 00 00",  # and the first
         "2b 17 10 00 32 00 00 00",  # two bytes: a heartbeat every 50 ms
         "2f 00 18 02 01 00 00 00",  # one byte: a position at every SYNC
     ]
-    assert out[-1] == (0x000, b"\x01\x00")
-    world.sleep(0.01)
+    told = [frame for frame in out if frame[0] < 0x600]
+    assert told == [(0x000, b"\x80\x00"), (0x000, b"\x01\x00"), (0x080, b"")]
+    first_setting = [data[:1] for _, data in out].index(b"\x2b")
+    assert out.index(told[0]) < first_setting < out.index(told[1])
     assert set(world.simulated.nmt.values()) == {5}
+
+
+def test_set_up_nodes__sets_up_encoders_that_run_and_refuse_settings_then(world):
+    """Many take settings in the state "pre-operational" only."""
+    answer = world.simulated._on_sdo
+
+    def strict(node, data):
+        if data[0] != 0x40 and world.simulated.nmt[node] == 5:
+            return b"\x80" + data[1:4] + struct.pack("<I", 0x08000022)
+        return answer(node, data)
+
+    world.simulated._on_sdo = strict
+    world.drive.begin()
+    world.drive.begin()
+    assert strict(3, b"\x2b" + bytes(7))[0] == 0x80
+
+
+def changed(index, sub, value):
+    """Node 4 answers with another value of one object."""
+    address = struct.pack("<HB", index, sub)
+    value = struct.pack("<I", value)
+    return only(0x584, lambda data: [data[:4] + value if data[1:4] == address else data])
+
+
+SPEED = 0x6030_01_10
+
+
+@pytest.mark.parametrize(
+    ("upward", "refusal"),
+    [
+        (changed(0x1800, 1, 0x80000184), r"got TPDO1 of node 4 is switched off \(0x1800:01 bit 31"),
+        (changed(0x1800, 1, 0x284), r"TPDO1 of node 4 with identifier 0x184 .*, got 0x284"),
+        (
+            changed(0x1A00, 1, SPEED),
+            r"node 4 with the 4 bytes of object 0x6004 .*has 2 bytes, of 0x6030",
+        ),
+        (changed(0x1A00, 0, 0), r"4 bytes of object 0x6004 .* one that has 0 bytes"),
+        (only(0x184, lambda data: [data + b"12"]), "node 4 with 4 bytes .* one that has 6 bytes"),
+        (only(0x184, lambda data: []), "TPDO1 of node 4 with 4 bytes after SYNC, got none"),
+    ],
+)
+def test_set_up_nodes__refuses_an_encoder_that_would_not_send_its_position_alone(
+    upward, refusal, world
+):
+    world.upward = upward
+    with pytest.raises(ValueError, match=f"^q4: expected .*{refusal}"):
+        world.drive.begin()
+
+
+def test_set_up_nodes__names_all_that_an_encoder_sends(world):
+    """Position and speed, as it reads them from the mapping."""
+    mapping = {0: 2, 1: 0x6004_00_20, 2: SPEED}
+
+    def both(data):
+        entry = mapping.get(data[3]) if data[1:3] == b"\x00\x1a" else None
+        return [data if entry is None else data[:4] + struct.pack("<I", entry)]
+
+    world.upward = only(0x581, both)
+    with pytest.raises(ValueError, match=r"^q1: .* one that has 6 bytes, of 0x6004, 0x6030$"):
+        world.drive.begin()
+
+
+def test_set_up_nodes__waits_for_an_encoder_that_starts_slowly(world):
+    world.upward = lambda can_id, data: [(can_id, data)] * (can_id != 0x182 or world.time > 0.2)
+    world.drive.begin()
+    assert 0.2 < world.time < 0.3
 
 
 def test_set_up_nodes__refuses_what_does_not_fit(world):
@@ -127,7 +198,7 @@ def test_set_up_nodes__refuses_what_does_not_fit(world):
         (SIX, "joints: expected at most 5 on a bus, got 6"),
         (replace(BROKK_170, valve_frame_id=0x583), "valve_frame_id: .* no other frame, got 0x583"),
         (replace(BROKK_170, valve_frame_id=0x081), "no other frame, got 0x081"),  # EMCY of node 1
-        (replace(BROKK_170, valve_frame_id=0x7FF), "no other frame, got 0x7FF"),  # in the log
+        (replace(BROKK_170, valve_frame_id=0x7FE), "no other frame, got 0x7FE"),  # in the log
         (SLOW, r"rate: expected 10 Hz or more \(watchdog\), got 5"),
         (SLIDE, "q4.kind: expected revolute on a bus, got prismatic"),
         (WIDE, r"q1\.q_max: expected a range 0.1 rad below a turn, got 6.20 rad"),
@@ -152,6 +223,7 @@ def canopen_encoders(channel):
         network.add_node(node)
         node.nmt.state = "INITIALISING"
         node.nmt.state = "PRE-OPERATIONAL"
+        node.set_data(0x1800, 1, struct.pack("<I", 0x180 + node.id))
         node.set_data(0x6004, 0, struct.pack("<I", position))
 
     def on_sync(can_id, data, timestamp):

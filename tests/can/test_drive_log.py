@@ -29,6 +29,44 @@ def test_read_frames__reads_a_plain_candump_log_too(tmp_path):
     assert found == [Frame(1.0, 0x123, b"\x01\x02"), Frame(3.0, 0x80, b"", True)]
 
 
+def test_read_frames__reads_what_candump_prints_on_a_terminal(tmp_path):
+    text = " (1.000000)  can0  123   [2]  01 02\n (2.000000)  can0  080   [0]  \n"
+    fd = " (3.000000)  can0  123  [12]  " + "00 " * 12 + "\n"
+    (tmp_path / "terminal.txt").write_text(text + fd)
+    found = list(read_frames(tmp_path / "terminal.txt"))
+    assert found == [Frame(1.0, 0x123, b"\x01\x02"), Frame(2.0, 0x80, b"")]
+    (tmp_path / "terminal.txt").write_text("  can0  123   [2]  01 02\n")
+    with pytest.raises(ValueError, match=r"row 1: expected .time. bus .*, as candump -l writes"):
+        list(read_frames(tmp_path / "terminal.txt"))
+
+
+def test_read_frames__leaves_out_frames_with_a_length_code_above_eight(tmp_path):
+    foreign = "(1.5) can0 321#1122334455667788_B\n"
+    (tmp_path / "raw.log").write_text(f"(1.0) can0 123#0102\n{foreign}(2.0) can0 080#\n")
+    assert [frame.id for frame in read_frames(tmp_path / "raw.log")] == [0x123, 0x80]
+
+
+@pytest.mark.parametrize("name", ["drive.asc", "drive.blf", "drive.trc", "drive.log.gz"])
+def test_read_frames__reads_the_logs_of_other_tools(tmp_path, name):
+    can = pytest.importorskip("can")
+    frames = [Frame(10.0 + k / 20, 0x181, bytes([k, 1, 2, 3]), k % 2 == 1) for k in range(20)]
+    with can.Logger(tmp_path / name) as logger:
+        for time, can_id, data, sent in frames:
+            message = {"arbitration_id": can_id, "data": data, "is_extended_id": False}
+            logger(can.Message(timestamp=time, is_rx=not sent, **message))
+        logger(can.Message(timestamp=11.0, arbitration_id=0x123, is_extended_id=True))
+    found = list(read_frames(tmp_path / name))
+    assert [(frame.id, frame.data) for frame in found] == [(0x181, one.data) for one in frames]
+    times = np.array([frame.time for frame in found])
+    np.testing.assert_allclose(times - times[0], np.arange(20) / 20, atol=1e-3)
+    if name != "drive.trc":  # python-can writes all of its frames as received
+        assert [frame.sent for frame in found] == [one.sent for one in frames]
+    if name == "drive.blf":
+        (tmp_path / name).write_bytes(b"no log at all")
+        with pytest.raises(ValueError, match=r"blf: expected a log that python-can reads, got"):
+            list(read_frames(tmp_path / name))
+
+
 def test_read_frames__names_the_row_that_is_no_frame(tmp_path):
     (tmp_path / "log.csv").write_text("(1.0) can0 123#0102\nrun,time,u_a,q_a\n")
     refusal = r"log.csv: expected a candump log, got row 2: expected .time. bus"
@@ -37,6 +75,10 @@ def test_read_frames__names_the_row_that_is_no_frame(tmp_path):
     (tmp_path / "log.csv").write_bytes(bytes(range(256)))
     with pytest.raises(ValueError, match=r"log\.csv: expected a candump log, got"):
         list(read_frames(tmp_path / "log.csv"))
+
+
+def replace_data(frame, counts):
+    return frame._replace(data=struct.pack("<I", counts))
 
 
 def test_log_for_fit__by_hand():
@@ -59,6 +101,12 @@ def test_log_for_fit__by_hand():
         counts = 100 * np.arange(1, 6) + np.array(ticks)[:, None]
         np.testing.assert_allclose(recording.q, counts * STEP, atol=1e-12)
         np.testing.assert_allclose(recording.u * 127, len(ticks) * [[80, 0, -80, 1, 0]], atol=1e-9)
+    q = [k for k, frame in enumerate(frames) if frame.id == 0x181]
+    unread = frames.copy()
+    unread[q[0]], unread[q[18]] = (replace_data(frames[q[k]], 3000) for k in (0, 18))
+    log = log_for_fit(machine, unread)  # 16 ticks after the second one, 14 before it
+    assert [len(recording.q) for recording in log.recordings] == [16]
+    np.testing.assert_allclose(log.recordings[0].q[0], (np.arange(100, 600, 100) + 20) * STEP)
     refusal = r"15 ticks of driving in a row at 10 Hz \(--machine\), got 11 at most"
     with pytest.raises(ValueError, match=refusal):
         log_for_fit(machine, frames[:100])

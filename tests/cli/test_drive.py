@@ -49,14 +49,17 @@ def test_drive__leaves_a_log_for_fit_and_closed_valves_if_it_is_killed(
         assert code == 0, capsys.readouterr().err
         assert "driving, v goal +0.20 +0.00 +0.00" in capsys.readouterr().out
         assert len(log_for_fit(BROKK_170, read_frames(log)).recordings[0].u) >= 25
-        log.unlink()
-        while not drives(log) and time.monotonic() < end:
+        killed = False  # while it drove
+        while not killed and time.monotonic() < end:
+            log.unlink()
             driver = process(*drive)
+            eventually(log.exists)
             while not drives(log) and driver.poll() is None:
                 time.sleep(0.1)
+            killed = driver.poll() is None
             driver.send_signal(signal.SIGKILL)
             driver.communicate()
-        eventually(lambda: drives(log))
+        assert killed and drives(log)
         time.sleep(1.0)
         machine.send_signal(signal.SIGTERM)
         said, _ = machine.communicate(timeout=60)

@@ -5,11 +5,11 @@ import json
 import numpy as np
 import onnxruntime
 import pytest
-from helpers_bus import BASELINE, HoldingOperator, World, only, random_policy
+from helpers_bus import BASELINE, HoldingOperator, Virtual, World, only, random_policy
 from helpers_cli import run
 from helpers_machines import pids
 
-from brokk_min.can.operator_input import JointJog
+from brokk_min.can.operator_input import JointJog, Joystick
 from brokk_min.cli.operating import Drive, Play, status
 from brokk_min.cli.options import WrongUse
 from brokk_min.evaluation import baselines
@@ -61,6 +61,29 @@ def test_status__says_what_stopped_it_and_what_is_in_the_way():
     world.upward = only(0x703, lambda data: [])
     world.run(0.5)
     assert "fault: q5: silent, now q3: heartbeat lost, v goal" in status(world.drive)
+
+
+def test_status__names_the_axis_of_a_stick_that_is_not_centred():
+    """Axis 4 of some gamepads is a trigger, which rests at its end: the gate never gets armed."""
+    device = Virtual()
+    world = World(BASELINE, Joystick(BROKK_170))
+    world.drive.begin()
+    device.axis(4, -1.0)
+    world.run(0.5)
+    device.button(5, True)
+    world.run(0.2)
+    assert status(world.drive).startswith("ready, the stick is not centred: axis 4, v goal +0.00")
+    device.axis(1, 1.0)
+    world.run(0.2)
+    assert "the stick is not centred: axis 1 and 4, v goal -" in status(world.drive)
+    for axis in (1, 4):
+        device.axis(axis, 0.0)
+    device.button(5, False)
+    world.run(0.2)
+    device.button(5, True)
+    world.run(0.2)
+    assert status(world.drive).startswith("driving, v goal +0.00 +0.00 +0.00, measured")
+    device.unplug()
 
 
 def test_play__opens_the_window_with_policy_and_tuned_pid(folder, monkeypatch):

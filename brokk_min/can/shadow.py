@@ -1,0 +1,116 @@
+"""A drive that only listens: what a controller would send, beside what somebody else sends.
+
+It reads the valve frames of the machine's remote control, and the positions that the encoders send
+by themselves or after somebody else's SYNC. Without an operator of its own, the goal is the
+velocity that the tool has: a controller that fits the machine then asks for the same motion.
+"""
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+
+from brokk_min import hw
+from brokk_min.can import canopen
+from brokk_min.can.canopen import Array, Frame, Operator, OperatorInput
+from brokk_min.can.connection import Bus
+from brokk_min.can.safety_gate import fault_name
+from brokk_min.machine import PWM_MAX, Machine
+
+EARLY = 0.15  # of a tick, by which positions may come early (assumed)
+
+
+class ListeningNodes(canopen.Nodes):
+    """The nodes and the newest command of somebody else, whose frames are no fault here."""
+
+    def __init__(self, machine: Machine) -> None:
+        super().__init__(machine)
+        self.heard = np.zeros(machine.n + 1, bool)  # heartbeats of each node
+        self.command: Array = np.zeros(machine.n)  # counts of 127
+        self.command_time = -np.inf  # s
+
+    def update(self, frame: Frame) -> None:
+        """Take in one frame."""
+        super().update(frame._replace(sent=True))
+        if frame.id in self.heartbeat_index:
+            self.heard[self.heartbeat_index[frame.id]] = True
+        elif frame.id == self.machine.valve_frame_id and len(frame.data) == 8:
+            u, enable = canopen.read_valve_frame(self.machine, frame.data)
+            self.command, self.command_time = np.rint(PWM_MAX * u * enable), frame.time
+
+
+class Shadow(hw.Drive):
+    """A `Drive` that sends nothing, or with `sync` SYNC and the start of the nodes alone."""
+
+    nodes: ListeningNodes
+
+    def __init__(
+        self, machine: Machine, controller: Any, bus: Bus, operator: Operator | None, sync: bool
+    ) -> None:
+        super().__init__(machine, controller, bus, operator or self.follow)
+        bus.allowed = (canopen.NMT, canopen.SYNC) if sync else ()
+        self.nodes, self.sync = ListeningNodes(machine), sync
+        self.would_send: Array = np.zeros(machine.n)  # counts of 127
+        self.pairs: list[tuple[Array, Array]] = []  # it and what was sent, while it would drive
+        self.faults: Counter[str] = Counter()  # ticks with each
+
+    def begin(self) -> None:
+        """Start the clock, and nodes if it may. ValueError: see `canopen.check_bus`."""
+        canopen.check_bus(self.machine)
+        self.bus.send(canopen.NMT, canopen.START_ALL)
+        self.start_time = self.positions_time = self.bus.now()
+
+    def follow(self, driving: bool, ready: bool) -> OperatorInput:
+        """The operator without a device: it presses when the gate is ready, then wants `v_tool`."""
+        if not driving or self.measured is None:
+            return OperatorInput(enable=ready and not self.operator_input.enable)
+        v, fastest = self.measured.v_tool[0], self.machine.tool_speed
+        x, y, z = (v * fastest / max(fastest, float(np.linalg.norm(v)))).tolist()
+        return OperatorInput((x, y, z), enable=True)
+
+    def wait(self) -> None:
+        """Wait until positions are due, a tick after the last; then the tick before is over."""
+        if not self.sync:
+            due = self.positions_time + (1 - EARLY) * self.machine.dt
+            self.start_time = due - self.deadline_number * self.machine.dt
+        super().wait()
+        nodes, now = self.nodes, self.bus.now()
+        nodes.frames[:] = 0  # somebody else may ask more often
+        nodes.heartbeat[~nodes.heard] = now  # nobody has set up their heartbeats
+        nodes.nmt[~nodes.heard] = canopen.OPERATIONAL
+        recent = now - nodes.command_time < canopen.WATCHDOG
+        sent = nodes.command if recent else np.zeros(self.machine.n)
+        if self.gate.driving:
+            self.pairs.append((self.would_send, sent))
+        moved_by = self.gate.sent.copy()  # history and gate go on from what was sent
+        moved_by[:, -1] = sent
+        self.gate = self.gate._replace(sent=moved_by)
+
+    def control(self, counts: Array) -> Array:
+        """The controller's command [counts of 127] (n,)."""
+        self.positions_time = self.bus.now()
+        return super().control(counts)
+
+    def send_command(self, command: Array, counts: Array, now: float) -> None:
+        """Pass the gate, and keep what it says."""
+        super().send_command(command, counts, now)
+        self.would_send = self.gate.sent[:, -1]
+        if self.gate.active_fault and self.ticks > 1:  # the first tick always counts as late
+            self.faults[fault_name(self.machine, int(self.gate.active_fault))] += 1
+
+    def report(self) -> str:
+        """Both commands compared joint by joint, and what the gate would have stopped."""
+        m, heard = self.machine, self.nodes.heard
+        would, sent = np.array(self.pairs, float).reshape(-1, 2, m.n).swapaxes(0, 1)
+        lines = [f"compared in {len(would)} of {self.ticks} ticks, in counts of {PWM_MAX}:"]
+        for i in m.driven if len(would) else ():
+            a, b = would[:, i], sent[:, i]
+            r = f"{np.corrcoef(a, b)[0, 1]:+.2f}" if np.ptp(a) and np.ptp(b) else "none"
+            lines.append(f"  {m.names[i]}: correlation {r}, mean difference {np.mean(a - b):+.1f}")
+        if np.isinf(self.nodes.command_time):
+            lines.append(f"no valve frame with identifier 0x{m.valve_frame_id:X} came")
+        if not heard.all():
+            names = np.array([*m.names, "valve controller"])[~heard]
+            lines.append(f"no heartbeat came from {', '.join(names)}")
+        lines += [f"the gate would have stopped {k} ticks: {f}" for f, k in self.faults.items()]
+        return "\n".join(lines)

@@ -1,0 +1,202 @@
+"""A drive that only listens, beside a remote control: no frame leaves, and what it tells."""
+
+import threading
+import time
+from dataclasses import replace
+
+import can
+import numpy as np
+import pytest
+from helpers_bus import START, ConstantCommand, HoldingOperator, RemoteControl, World, only
+from helpers_cli import run
+
+from brokk_min._files import SHIPPED
+from brokk_min.can.canopen import Frame, valve_frame
+from brokk_min.can.drive_log import log_for_fit, read_frames
+from brokk_min.can.shadow import Shadow
+from brokk_min.can.simulated_machine import SimulatedMachine
+from brokk_min.cli.operating import status
+from brokk_min.learning.policy import POLICIES, PolicyController, load_policy
+from brokk_min.machine import BROKK_170
+
+Q4 = 3
+
+
+def to_and_fro(tick):
+    """Somebody moves q4 with the remote control, [counts of 127]."""
+    return np.array([0, 0, 0, 40 * ((tick > 20) - 2 * (tick > 50) + (tick > 90)), 0])
+
+
+def shadowed(machine=BROKK_170, controller=None, operator=None, log=None, sync=False, period=0.05):
+    """A world with a remote control and a shadow, and the frames that leave the shadow."""
+    if controller is None:
+        path = SHIPPED / BROKK_170.name / POLICIES["rl"]
+        controller = PolicyController(BROKK_170, load_policy(path, BROKK_170))
+    world, left = World(controller, operator, log=log), []
+    world.noise = RemoteControl(world, to_and_fro, period)
+    world.downward = lambda can_id, data: left.append((can_id, data)) or [(can_id, data)]
+    world.drive = Shadow(machine, controller, world.bus, operator, sync)
+    world.drive.begin()
+    return world, left
+
+
+def correlation(drive):
+    would, sent = np.array(drive.pairs)[:, :, Q4].T
+    return np.corrcoef(would, sent)[0, 1]
+
+
+def test_shadow__compares_and_logs_what_it_would_send_and_sends_nothing(tmp_path):
+    world, left = shadowed(log=tmp_path / "run.log")
+    world.run(6.0)
+    world.bus.close()
+    drive = world.drive
+    assert left == [] and world.simulated.enabled
+    assert len(drive.pairs) > 100 and drive.ticks == pytest.approx(120, abs=3)
+    assert correlation(drive) > 0.6
+    _, sent = np.array(drive.pairs).swapaxes(0, 1)
+    assert {40.0, 0.0, -40.0} == set(sent[:, Q4]) and not np.delete(sent, Q4, axis=1).any()
+    frames = list(read_frames(tmp_path / "run.log"))
+    ids = [frame.id for frame in frames]
+    assert ids.count(0x210) == world.noise.count  # those of the remote control alone
+    logged = [frame.data for frame in frames if frame.id == 0x7FE and frame.data[7:] == b"\x01"]
+    would = [would for would, _ in drive.pairs]
+    expected = [valve_frame(m, 0, 1).tobytes()[:5] for m in would]
+    assert [data[:5] for data in logged][: len(would)] == expected
+    (recording,) = log_for_fit(BROKK_170, frames).recordings  # the shadow as a record for `fit`
+    assert set(np.rint(127 * recording.u[:, Q4])) == {40, 0, -40}
+    report = drive.report().splitlines()
+    assert report[0] == f"compared in {len(would)} of {drive.ticks} ticks, in counts of 127:"
+    assert report[1].startswith("  q1: correlation none, mean difference ")
+    assert report[3].startswith(f"  q4: correlation {correlation(drive):+.2f}, mean difference ")
+    assert f"would send {' '.join(f'{x / 127:+.2f}' for x in would[-1])}, sent +0.00 +0.00 " in (
+        status(drive)
+    )
+
+
+def test_shadow__tells_an_encoder_of_the_wrong_sign():
+    """Its goal is the measured motion, so the policy disagrees with what causes the motion."""
+    q4 = replace(BROKK_170.joints[Q4], encoder_sign=-1, encoder_zero=round(2 * 1.71 * 4096 / 6.283))
+    joints = (*BROKK_170.joints[:Q4], q4, BROKK_170.joints[4])
+    world, left = shadowed(replace(BROKK_170, joints=joints))
+    world.run(6.0)
+    assert left == [] and correlation(world.drive) < 0.3
+
+
+def test_report__by_hand():
+    world, _ = shadowed(controller=ConstantCommand(0, 0, 0, 10, 0))
+    world.drive.pairs = [
+        (np.array([0, 0, 0, m, 5]), np.array([0, 0, 9, n, 5])) for m, n in ((1, 4), (2, 2), (3, 3))
+    ]
+    world.drive.faults["q3: jumped"] = 2
+    world.drive.ticks = 9
+    assert world.drive.report().splitlines() == [
+        "compared in 3 of 9 ticks, in counts of 127:",
+        "  q1: correlation none, mean difference +0.0",
+        "  q3: correlation none, mean difference -9.0",
+        "  q4: correlation -0.50, mean difference -1.0",
+        "  q5: correlation none, mean difference +0.0",
+        "no valve frame with identifier 0x210 came",
+        "no heartbeat came from q1, q2, q3, q4, q5, valve controller",
+        "the gate would have stopped 2 ticks: q3: jumped",
+    ]
+
+
+@pytest.mark.parametrize("period", [0.01, 0.025, 0.05])
+def test_shadow__follows_the_positions_that_somebody_else_asks_for(period):
+    """Without heartbeats, too: nobody has set them up."""
+    world, left = shadowed(controller=ConstantCommand(0, 0, 0, 10, 0), period=period)
+    world.noise.command = lambda tick: np.zeros(5)
+    world.upward = lambda can_id, data: [(can_id, data)] * (can_id < 0x700)
+    world.run(4.0)
+    assert left == [] and len(world.drive.pairs) == pytest.approx(80, abs=5)
+    assert world.drive.faults.total() <= 2  # until it has found the first positions
+    assert "no heartbeat came from q1, q2, q3, q4, q5, valve controller" in world.drive.report()
+
+
+def test_shadow__agrees_with_somebody_who_sends_what_it_would():
+    """A command is compared with the one that is sent in the same tick, not in the next."""
+    controller = ConstantCommand(0, 0, 0, 0, 0)
+    controller.act = lambda: controller.m.__setitem__(Q4, 40 * np.sin(7 * world.time))
+    world, left = shadowed(controller=controller)
+    world.noise.delay = 0.02
+    world.noise.command = lambda tick: world.drive.would_send
+    world.run(3.0)
+    assert left == [] and len(world.drive.pairs) > 50
+    assert "q4: correlation +1.00, mean difference +0.0" in world.drive.report()
+    would, sent = np.array(world.drive.pairs).swapaxes(0, 1)
+    np.testing.assert_array_equal(would[2:], sent[2:])
+
+
+def test_shadow__finds_the_faults_of_the_gate_and_goes_on():
+    world, left = shadowed(controller=ConstantCommand(0, 0, 0, 10, 0))
+    world.run(1.5)
+    assert world.drive.history[0, Q4, 2, -1] * 127 == pytest.approx(40)  # what was sent
+    compared = len(world.drive.pairs)
+    world.upward = only(0x183, lambda data: [])
+    world.run(0.5)
+    world.upward = lambda can_id, data: [(can_id, data)]
+    world.run(1.0)
+    silent = world.drive.faults["q3: silent"]
+    assert left == [] and 5 <= silent <= 12
+    assert f"the gate would have stopped {silent} ticks: q3: silent" in world.drive.report()
+    assert len(world.drive.pairs) > compared + 10
+
+
+def test_shadow__sends_sync_and_starts_nodes_if_it_is_asked_to():
+    operator = HoldingOperator()
+    operator.v = (0.0, 0.1, 0.0)
+    world, left = shadowed(
+        controller=ConstantCommand(0, 0, 0, 10, 0), operator=operator, sync=True, period=None
+    )
+    world.run(2.0)
+    assert {can_id for can_id, _ in left} == {0x000, 0x080}
+    assert left[0] == (0x000, b"\x01\x00") and len(left) == pytest.approx(41, abs=2)
+    assert len(world.drive.pairs) > 30 and world.drive.operator_input.v_goal == (0.0, 0.1, 0.0)
+
+
+def test_shadow__says_that_no_positions_came():
+    world, left = shadowed(controller=ConstantCommand(0, 0, 0, 10, 0))
+    world.upward = lambda can_id, data: [(can_id, data)] * (can_id >= 0x700)
+    world.run(1.0)
+    assert left == [] and not world.drive.pairs
+    assert world.drive.report().splitlines()[0].startswith("compared in 0 of ")
+    assert world.drive.faults["q1: silent"] > 10
+
+
+def live(bus, ended):
+    """A machine and its remote control in real time, on a bus of python-can."""
+    machine = SimulatedMachine(BROKK_170, START, time.monotonic())
+    machine.receive(Frame(0.0, 0x000, b"\x01\x00"))
+    count = 0
+    while not ended.is_set():
+        count += 1
+        valves = valve_frame([0, 0, 0, 30, 0], count % 256, 1).tobytes()
+        answers = machine.receive(Frame(time.monotonic(), 0x080, b""))
+        for can_id, data in [*answers, *machine.advance(time.monotonic()), (0x210, valves)]:
+            bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+        time.sleep(0.05)
+
+
+def test_drive_shadow__lets_no_frame_onto_a_bus_on_which_others_listen(tmp_path, capsys):
+    """With the policy's file and a log, to the end of a file of goals."""
+    goals = tmp_path / "c.csv"
+    goals.write_text("sequence,time,vx,vy,vz\na,0,0.1,0,0\na,0.5,0,0,0\n")
+    with (
+        can.Bus("shadowed", interface="virtual") as others,
+        can.Bus("shadowed", interface="virtual") as listener,
+    ):
+        ended = threading.Event()
+        thread = threading.Thread(target=live, args=(others, ended))
+        thread.start()
+        where = "--interface virtual --channel shadowed"
+        run(f"drive --shadow {where} --command '{goals}' --log '{tmp_path}/run.log'")
+        ended.set()
+        thread.join()
+        sent_by_us = 0
+        while others.recv(0.0) is not None:
+            sent_by_us += 1
+        heard = 0
+        while listener.recv(0.0) is not None:
+            heard += 1
+    assert sent_by_us == 0 and heard > 20
+    assert "ticks, in counts of 127:" in capsys.readouterr().out
