@@ -1,11 +1,14 @@
 """The command line: `brokk-min COMMAND --help`. Exits 0 done, 1 failed, 2 wrong use."""
 
+import io
 import os
 import sys
 from importlib import import_module
+from typing import Any
 
 # Before NumPy is imported: its BLAS threads, waiting for work, would take the cores from torch's.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ["MPLBACKEND"] = "agg"  # we draw into files; a notebook's would be refused
 
 import tyro
 
@@ -25,12 +28,34 @@ COMMANDS = {  # module and class in `cli`, and what the command does
     "replay": ("operating", "Replay", "make a film of a drive from its log"),
     "export": ("operating", "Export", "write a policy as ONNX"),
 }
+LINES = "\n".join(f"  {name:10} {text}" for name, (_, _, text) in COMMANDS.items())
+HELP = f"{__doc__}\n{LINES}\n\n`--version` prints the version."
 
 
-def help_text() -> str:
-    """All commands, a line each."""
-    rows = (f"  {name:10} {text}" for name, (_, _, text) in COMMANDS.items())
-    return "\n".join([__doc__ or "", *rows, "", "`--version` prints the version."])
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command; errors are one line on stderr."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # an encoding that lacks a sign of ours
+    arguments = sys.argv[1:] if arguments is None else arguments
+    name = arguments[0] if arguments else ""
+    if name in ("-h", "--help", "--version"):
+        print(f"brokk_min {__version__}" if name == "--version" else HELP)
+        return 0
+    if name not in COMMANDS:
+        print(f"brokk-min: expected one of {', '.join(COMMANDS)}, got {name!r}", file=sys.stderr)
+        return 2
+    module, function, _ = COMMANDS[name]
+    options: Any = {"prog": f"brokk-min {name}", "config": (tyro.conf.FlagCreatePairsOff,)}
+    try:
+        command = getattr(import_module(f"brokk_min.cli.{module}"), function)
+        tyro.cli(command, args=arguments[1:], default=command.defaults(arguments), **options)()
+    except (ValueError, OSError, MemoryError, ImportError) as error:
+        print(f"brokk-min: {one_line(error)}", file=sys.stderr)
+        return 2 if type(error).__name__ == "WrongUse" else 1
+    except KeyboardInterrupt:
+        print("brokk-min: stopped", file=sys.stderr)
+        return 1
+    return 0
 
 
 def one_line(error: BaseException) -> str:
@@ -39,30 +64,6 @@ def one_line(error: BaseException) -> str:
         place = f"{error.filename}: " if error.filename else ""
         return f"{place}{error.strerror.lower()}"
     return " ".join(str(error).split()) or type(error).__name__
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run one command; errors are one line on stderr."""
-    arguments = sys.argv[1:] if arguments is None else arguments
-    name = arguments[0] if arguments else ""
-    if name in ("-h", "--help", "--version"):
-        print(f"brokk_min {__version__}" if name == "--version" else help_text())
-        return 0
-    if name not in COMMANDS:
-        print(f"brokk-min: expected one of {', '.join(COMMANDS)}, got {name!r}", file=sys.stderr)
-        return 2
-    module, command, _ = COMMANDS[name]
-    try:
-        options = getattr(import_module(f"brokk_min.cli.{module}"), command).variant(arguments)
-        flags = (tyro.conf.FlagCreatePairsOff,)
-        tyro.cli(options, prog=f"brokk-min {name}", args=arguments[1:], config=flags)()
-    except (ValueError, OSError, MemoryError) as error:
-        print(f"brokk-min: {one_line(error)}", file=sys.stderr)
-        return 2 if type(error).__name__ == "WrongUse" else 1
-    except KeyboardInterrupt as stop:
-        print(f"brokk-min: stopped{stop}", file=sys.stderr)
-        return 1
-    return 0
 
 
 if __name__ == "__main__":

@@ -7,8 +7,9 @@ complete. What a file should hold and does not is a ValueError of one line: file
 import csv
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+import shutil
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
 from typing import IO, Any
@@ -18,9 +19,8 @@ from numpy.typing import NDArray
 
 from brokk_min.machine import require
 
-# a folder for each machine: policies, gains and start poses of `make reproduce`
+# a folder for each machine: policies, gains and table of `make reproduce`, and start poses
 SHIPPED = Path(__file__).parent / "shipped"
-TEXT = ("run", "sequence")  # columns of tables that are names
 
 
 def require_package(package: str, extra: str) -> Any:
@@ -34,7 +34,10 @@ def require_package(package: str, extra: str) -> Any:
 
 @contextmanager
 def whole_file(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
-    """A temporary file, text in UTF-8, that replaces `path` if the block ends without an error."""
+    """A temporary file, text in UTF-8, that replaces `path` if the block ends without an error.
+
+    It has the mode of the file that it replaces. OSError: it cannot be written.
+    """
     path = Path(path)
     fits = path.parent.is_dir() and (path.is_file() or not path.exists())
     require(fits, str(path), "a regular file in an existing directory", "none")
@@ -43,8 +46,12 @@ def whole_file(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
     text = {} if "b" in mode else {"newline": "", "encoding": "utf-8"}
     try:
         with open(temporary, mode, **text) as file:  # type: ignore[call-overload]
+            with suppress(OSError):  # no file is there yet, or a disk without modes
+                shutil.copymode(target, temporary)
             yield file
         os.replace(temporary, target)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -113,12 +120,10 @@ def read_json(path: Path, what: str) -> Any:
         return json.loads(Path(path).read_text(encoding="utf-8"))
 
 
-def read_csv(path: Path, *columns: str) -> dict[str, NDArray[Any]]:
-    """A CSV by column: text in `TEXT`, numbers elsewhere.
-
-    ValueError: no such columns, or, with its row, a cell that is missing or no number.
-    """
-    with expected(path, f"a CSV table with columns {', '.join(columns)}"):
+def read_csv(path: Path, *columns: str) -> dict[str, NDArray[np.str_]]:
+    """The cells of a CSV by column, see `numbers`; ValueError: no such columns, or a short row."""
+    what = f"a CSV table with columns {', '.join(columns)}" if columns else "a CSV table"
+    with expected(path, what):
         with open(path, newline="", encoding="utf-8-sig") as file:
             header, *rows = csv.reader(file, strict=True)
         names = [name.strip() for name in header]
@@ -127,20 +132,19 @@ def read_csv(path: Path, *columns: str) -> dict[str, NDArray[Any]]:
         require(len(rows) > 0, str(path), "rows", "none")
         for i, row in enumerate(rows, 2):
             require(len(row) == len(names), f"{path}: row {i}", f"{len(names)} cells", len(row))
-        return {name: _column(path, name, cells) for name, cells in zip(names, zip(*rows))}
+        return {name: np.array(cells) for name, cells in zip(names, zip(*rows))}
 
 
-def _column(path: Path, name: str, cells: Sequence[str]) -> NDArray[Any]:
-    if name in TEXT:
-        return np.array(cells)
-    numbers = []
+def numbers(path: Path, name: str, cells: Iterable[str]) -> NDArray[Any]:
+    """Cells of a column as numbers; ValueError: the row of one that is none."""
+    result = []
     for row, cell in enumerate(cells, 2):
         try:
-            numbers.append(float(cell))
+            result.append(float(cell))
         except ValueError:
             place = f"{path}: row {row}, column {name}"
-            raise ValueError(f"{place}: expected a number, got {brief(cell)}") from None
-    return np.array(numbers)
+            raise ValueError(f"{place}: expected a number, got {brief(str(cell))}") from None
+    return np.array(result)
 
 
 def save_arrays(path: Path, kind: str, header: Mapping[str, Any], **arrays: Any) -> None:
@@ -160,8 +164,7 @@ def load_arrays(path: Path, kind: str = "") -> tuple[dict[str, Any], dict[str, N
             arrays = dict(archive)
         header = json.loads(str(arrays.pop("header", "{}")))
         got = str(header.pop("kind", None))
-        fits = got == kind or not kind
-        older = not fits and kind.split()[0] in got
+        older = kind.split(" ")[0] in got
         made = "a file of another version (train or fit again)" if older else brief(got)
-        require(fits, str(path), f"a {kind}", made)
+        require(kind in ("", got), str(path), f"a {kind}", made)
         return header, arrays

@@ -15,7 +15,7 @@ def load(path):
     """The net of a file and what the file tells of it."""
     net = onnxruntime.InferenceSession(path)
     told = {k: json.loads(text) for k, text in net.get_modelmeta().custom_metadata_map.items()}
-    if "observation" not in told:
+    if told.get("interface") != "paper":
         sys.exit(f"{path}: expected interface paper, got {told.get('interface')}")
     return net, told
 
@@ -38,14 +38,13 @@ def tick(net, told, h, q, u, v_goal):
     t = np.arange(samples := told["velocity_samples"]) / told["rate"]
     h[:, 1, -1] = np.polyfit(t, h[:, 0, -samples:].T, 1)[0]  # slope of the newest angles
     v_tool = tool_position(told["geometry"], q + 1e-20j * h[:, 1, -1]).imag / 1e-20  # J q_dot
-    numbers = {"v_goal": v_goal, "v_tool": v_tool}
-    for name, rows in zip(told["joints"], h):
-        numbers |= {f"{what} {name}": row for what, row in zip(("q", "q_dot", "u"), rows)}
-    x = np.concatenate([numbers[name][-size:] for name, _, size in told["observation"]])
+    driven = np.isin(told["joints"], told["driven"])
+    x = np.concatenate([v_goal, v_tool, q[~driven], h[driven, :2].ravel(), h[driven, 2].ravel()])
     x = np.float32((x - told["mean"]) / told["scale"])
     action = net.run(None, {"observation": x[None]})[0][0].clip(-1, 1)
-    u = dict(zip(told["driven"], np.rint(told["pwm_limit"] * action) / 127))
-    return h, np.array([u.get(name, 0.0) for name in told["joints"]])  # locked joints have 0
+    u = np.zeros(len(q))  # locked joints have 0
+    u[driven] = np.rint(told["pwm_limit"] * action) / 127
+    return h, u
 
 
 if __name__ == "__main__":

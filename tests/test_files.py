@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,15 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 from brokk_min import _files
-from brokk_min._files import load_arrays, read_csv, read_json, save_arrays, whole_file, write_csv
+from brokk_min._files import (
+    load_arrays,
+    numbers,
+    read_csv,
+    read_json,
+    save_arrays,
+    whole_file,
+    write_csv,
+)
 from brokk_min.learning.policy import KIND, Policy, load_policy, save_policy
 from brokk_min.machine import BROKK_170
 
@@ -21,7 +31,7 @@ names = st.text("abcdefghij_0", min_size=1, max_size=8).filter(str.isidentifier)
 READERS = {
     "x.npz": lambda path: load_arrays(path, "policy 5"),
     "x.json": lambda path: read_json(path, "results"),
-    "x.csv": lambda path: read_csv(path, "time", "u"),
+    "x.csv": lambda path: numbers(path, "u", read_csv(path, "time", "u")["u"]),
 }
 
 
@@ -99,7 +109,7 @@ def test_read_csv__refuses_cells_that_are_missing_or_no_numbers(tmp_path, text, 
     path = tmp_path / "x.csv"
     path.write_text(text)
     with pytest.raises(ValueError) as caught:
-        read_csv(path, "time", "u")
+        numbers(path, "u", read_csv(path, "time", "u")["u"])
     assert str(caught.value) == f"{path}: {message}"
 
 
@@ -147,13 +157,14 @@ def test_save_arrays__are_loaded_bit_for_bit(folder, keys, text):
 
 
 @given(npst.arrays(np.float64, (4, 2), elements=st.floats(allow_infinity=False, allow_nan=False)))
-def test_write_csv__is_read_bit_for_bit(folder, numbers):
+def test_write_csv__is_read_bit_for_bit(folder, values):
     write_csv(
-        folder / "y.csv", ["run", "x", "y"], ([f"r{i}", *row] for i, row in enumerate(numbers))
+        folder / "y.csv", ["run", "x", "y"], ([f"r{i}", *row] for i, row in enumerate(values))
     )
     table = read_csv(folder / "y.csv", "run", "x", "y")
     assert table["run"].tolist() == ["r0", "r1", "r2", "r3"]
-    np.testing.assert_array_equal(np.stack([table["x"], table["y"]], axis=1), numbers)
+    for name, column in zip("xy", values.T, strict=True):
+        np.testing.assert_array_equal(numbers(folder / "y.csv", name, table[name]), column)
 
 
 def test_whole_file__leaves_the_old_file_and_no_other_if_writing_fails(tmp_path):
@@ -168,3 +179,38 @@ def test_whole_file__leaves_the_old_file_and_no_other_if_writing_fails(tmp_path)
     assert json.loads(path.read_text()) == {"x": 0.1}
     with pytest.raises(ValueError, match="expected a regular file in an existing directory, got"):
         _files.write_json(tmp_path / "none" / "y.json", {})
+
+
+def test_whole_file__has_the_mode_of_the_umask_or_of_the_file_that_it_replaces(tmp_path):
+    path, modes = tmp_path / "y.json", []
+    before = os.umask(0o027)
+    try:
+        _files.write_json(path, {})
+        modes.append(path.stat().st_mode & 0o777)
+        path.chmod(0o604)
+        _files.write_json(path, {})
+        modes.append(path.stat().st_mode & 0o777)
+    finally:
+        os.umask(before)
+    assert modes == [0o640, 0o604]
+
+
+def test_whole_file__is_written_where_modes_are_refused(tmp_path, monkeypatch):
+    """As on a network share or a mounted disk of Windows."""
+
+    def refuse(path, *arguments, **options):
+        raise PermissionError(errno.EPERM, "Operation not permitted", str(path))
+
+    for name in ("chmod", "fsync", "utime"):
+        monkeypatch.setattr(os, name, refuse)
+    for value in (1, 2):
+        _files.write_json(tmp_path / "y.json", value)
+        assert read_json(tmp_path / "y.json", "a number") == value
+
+
+def test_whole_file__names_the_file_if_the_disk_is_full(tmp_path):
+    path = tmp_path / "y.json"
+    with pytest.raises(OSError) as caught, whole_file(path):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert (caught.value.errno, caught.value.filename) == (errno.ENOSPC, str(path))
+    assert not [*tmp_path.iterdir()]

@@ -3,7 +3,6 @@
 import re
 import subprocess
 import sys
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -14,8 +13,8 @@ from helpers_machines import obedient_net
 
 from brokk_min._files import SHIPPED
 from brokk_min.actuator import append_sample, initial_history
-from brokk_min.env import PAPER, measure, observation_blocks
-from brokk_min.learning.onnx import export_onnx, named_blocks
+from brokk_min.env import PAPER, measure
+from brokk_min.learning.onnx import export_onnx
 from brokk_min.learning.policy import Policy, PolicyController, load_policy
 from brokk_min.machine import BROKK_170, read_encoder
 from examples.telescopic_crane import TELESCOPIC_CRANE
@@ -60,18 +59,6 @@ def test_commands__are_those_of_the_controller(machine, tmp_path):
         q = q + machine.dt * np.where(np.isin(range(machine.n), machine.driven), 0.4 * u, 0.05)
         sent.append(u)
     assert np.std(sent, axis=0)[machine.driven].min() > 0.005
-
-
-def test_blocks__are_those_of_the_observation():
-    for machine in (BROKK_170, replace(TELESCOPIC_CRANE, history=9)):
-        sizes = [size for *_, size in named_blocks(machine)]
-        assert sum(sizes) == sum(len(block.std) for block in observation_blocks(machine))
-    units = {name: unit for name, unit, _ in named_blocks(TELESCOPIC_CRANE)}
-    assert [units[f"{what} telescope"] for what in ("q", "q_dot", "u")] == [
-        "m",
-        "m/s",
-        "of full command",
-    ]
 
 
 def test_our_agent__is_refused_in_one_line(tmp_path):

@@ -98,9 +98,7 @@ def group_advantages(
     agent: ppo.Agent, rollout: ppo.Rollout, config: PPOConfig
 ) -> tuple[Tensor, None]:
     """Advantages (T, num) of a rollout of `GroupVectorEnv`; nothing for a critic to learn."""
-    changed = torch.from_numpy(
-        np.stack([info["before"][0].goal_ticks <= 1 for info in rollout.infos])
-    )
+    changed = torch.from_numpy(np.stack([info["new_goal"] for info in rollout.infos]))
     zero = torch.zeros_like(rollout.rewards)
     ends = (rollout.dones | changed).float()  # a new goal is no result of earlier actions
     returns = ppo.gae(rollout.rewards, zero, zero, ends, config.gamma, config.gae_lambda)

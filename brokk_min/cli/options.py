@@ -10,9 +10,9 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from brokk_min._files import SHIPPED, brief
+from brokk_min._files import SHIPPED, brief, expected
 from brokk_min.actuator import PLANT, Plant
-from brokk_min.machine import BROKK_170, PWM_MAX, Machine
+from brokk_min.machine import BROKK_170, PWM_MAX, Machine, require
 
 MACHINES = {BROKK_170.name: BROKK_170}
 MachineName = Annotated[str, tyro.conf.arg(metavar="{" + ",".join(MACHINES) + "}|FILE.py:NAME")]
@@ -38,9 +38,9 @@ class Command:
     force: bool = False  # Write over files that exist.
 
     @classmethod
-    def variant(cls, arguments: list[str]) -> "type[Command]":
-        """The class of the options, if some arguments change them."""
-        return cls
+    def defaults(cls, arguments: list[str]) -> Any:
+        """The defaults, if some arguments change them."""
+        return tyro.MISSING_NONPROP
 
     def find_machine(self) -> Machine:
         """The machine by its name, or of a file."""
@@ -72,6 +72,7 @@ def load_object(option: str, name: str) -> Any:
         raise ValueError(f"{option}: expected {path} to run, got {brief(error)}") from error
     finally:
         sys.path.remove(folder)
+        sys.path.append(folder)  # also later, but in place of no package
     check(symbol in found, option, f"an object {symbol} in {path}", "none")
     return found[symbol]
 
@@ -79,30 +80,26 @@ def load_object(option: str, name: str) -> Any:
 def find_plant(name: str, machine: Machine) -> Plant:
     """The analytic plant, or one of a file, after a try of each joint.
 
-    ValueError: no `reset` and `step`, angles that are not finite, or a joint that does not obey.
+    ValueError: no plant, angles that are not finite, or a joint that does not obey.
     """
     if name == "analytic":
         return PLANT
-    plant = load_object("--plant", name)
-    fits = hasattr(plant, "reset") and hasattr(plant, "step")
-    check(fits, "--plant", "an object with reset and step", brief(plant))
+    plant: Plant = load_object("--plant", name)
     middle = np.tile((machine.column("q_min") + machine.column("q_max")) / 2, (2 * machine.n, 1))
     u = machine.pwm_limit / PWM_MAX * np.concatenate([np.eye(machine.n), -np.eye(machine.n)])
-    try:
+    with expected(Path(name), "states with angles q"):  # whatever the file does
         state = plant.reset(machine, middle.copy())
         for _ in range(round(TRIED * machine.rate)):
             state = plant.step(machine, state, u.copy())
         q = np.asarray(state.q, float)
-    except Exception as error:  # whatever the file does
-        raise ValueError(f"{name}: expected states with angles q, got {brief(error)}") from error
-    if q.shape != middle.shape or not np.isfinite(q).all():
-        raise ValueError(f"{name}: expected finite angles q {middle.shape}, got {brief(q)}")
+    fits = q.shape == middle.shape and bool(np.isfinite(q).all())
+    require(fits, name, f"finite angles q {middle.shape}", brief(q))
     up, down = (np.diag(moved) for moved in np.split(q - middle, 2))
     for i, joint in enumerate(machine.joints):
-        if not up[i] - down[i] > 0.01 or up[i] - down[i] > 3 * (joint.q_max - joint.q_min):
-            got = f"{up[i]:+.3f} and {down[i]:+.3f} rad after {TRIED:g} s up and down"
-            raise ValueError(f"{name}: {joint.name}: expected motion up, then down, got {got}")
-    return plant  # type: ignore[no-any-return]
+        fits = 0.01 < up[i] - down[i] < 3 * (joint.q_max - joint.q_min)
+        got = f"{up[i]:+.3f} and {down[i]:+.3f} rad after {TRIED:g} s up and down"
+        require(fits, f"{name}: {joint.name}", "motion up, then down", got)
+    return plant
 
 
 def default_policy(

@@ -1,14 +1,16 @@
 """The commands that train."""
 
-from dataclasses import dataclass, field, make_dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import tyro
 from tyro.conf import OmitArgPrefixes
 
 from brokk_min.cli.options import Command, check
 from brokk_min.identification.net_file import load_net
 from brokk_min.learning.recipes import Recipe, find_recipe
+from brokk_min.settings import PPOConfig, TaskConfig
 
 
 @dataclass(kw_only=True)
@@ -20,24 +22,19 @@ class Training(Command):
     paper: bool = False  # The paper's agent: its observation, actions and reward.
     critic: bool = False  # Advantages by a critic, as in the paper, not by groups of rollouts.
     seed: int = 0  # Of the weights, episodes and noise.
+    learner: OmitArgPrefixes[PPOConfig]
+    task: OmitArgPrefixes[TaskConfig]
 
     @classmethod
-    def variant(cls, arguments: list[str]) -> type[Command]:
-        """The command with the settings of the agent that its arguments name."""
+    def defaults(cls, arguments: list[str]) -> Any:
+        """The settings of the agent that the arguments name."""
         recipe = find_recipe("--paper" in arguments, "--critic" in arguments)
-        settings: Any = [
-            (name, OmitArgPrefixes[type(value)], field(default=value))  # type: ignore[misc]
-            for name, value in {"learner": recipe.learner, "task": recipe.task}.items()
-        ]
-        namespace = {"__doc__": cls.__doc__, "__module__": __name__}
-        return make_dataclass(
-            cls.__name__, settings, bases=(cls,), namespace=namespace, kw_only=True
-        )
+        required: Any = tyro.MISSING
+        return cls(actuator=required, out=required, learner=recipe.learner, task=recipe.task)
 
     def recipe(self) -> Recipe:
         """The agent and its learner."""
-        options: Any = self
-        learner, task = options.learner, options.task
+        learner, task = self.learner, self.task
         check(learner.total_steps > 0, "--total-steps", "1 or more", learner.total_steps)
         check(0 <= learner.gamma < 1, "--gamma", "0 to below 1", learner.gamma)
         fits = 0 < task.hold_min_s <= task.hold_max_s

@@ -2,8 +2,6 @@
 
 import io
 import json
-import sys
-import time
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -22,9 +20,8 @@ from brokk_min.learning.episodes import map_arrays
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import INTERFACES, Policy, contract, save_policy
 from brokk_min.learning.recipes import Recipe
-from brokk_min.machine import Machine
+from brokk_min.machine import Machine, require
 from brokk_min.ppo import Agent, Checkpoint, Rollout
-from brokk_min.settings import PPOConfig
 
 EVERY = 50  # updates between two checkpoints
 
@@ -43,32 +40,38 @@ def train_policy(
         "contract": contract(machine),
         "actuator": fingerprint(net),
         "seed": seed,
-        "recipe": json.loads(json.dumps(asdict(recipe))),
+        "recipe": asdict(recipe),
     }
     torch.set_num_threads(1)  # several wait in vain on busy cores
     config = recipe.learner
-    env: TaskVectorEnv
-    advantages: ppo.Advantages
-    simulation = (config.num_envs, net, machine, recipe.task, INTERFACES[recipe.interface])
-    if recipe.critic:
-        env, advantages = TaskVectorEnv(*simulation), ppo.critic_advantages
-    else:
-        env, advantages = GroupVectorEnv(*simulation, horizon=config.horizon), group_advantages
-    log = TrainingLog(env, config, out, about)
-    start = log.begin(seed, resume)
-    try:
+    env, advantages = make_env(machine, net, recipe)
+    log = TrainingLog(env, out, about)
+    exists = log.checkpoint.exists()
+    wanted = "--resume or no checkpoint"
+    require(resume or not exists, str(log.checkpoint), wanted, "one of a broken training")
+    start = ppo.begin(env, config, seed)
+    stagger_episodes(env)
+    if exists:
+        start = log.load(start)
+    options: dict[str, Any] = {"initial": start.global_step, "unit_scale": True, "disable": None}
+    with tqdm(desc="train", total=config.total_steps, unit="step", **options) as log.bar:
         agent = ppo.train(env, config, seed, advantages, log.on_update, start)
-    except KeyboardInterrupt as stop:
-        saved = log.checkpoint.exists()
-        text = f"; go on from {log.checkpoint} with --resume" if saved else ""
-        raise KeyboardInterrupt(text) from stop
-    finally:
-        log.bar.close()
     log.write_curve()
     policy = Policy(about, actor_weights(agent), net, recipe.interface)
     save_policy(out, policy, machine)
     log.checkpoint.unlink(missing_ok=True)
     return policy
+
+
+def make_env(
+    machine: Machine, net: ActuatorNet, recipe: Recipe
+) -> tuple[TaskVectorEnv, ppo.Advantages]:
+    """The environments of a recipe, and its advantages."""
+    config, interface = recipe.learner, INTERFACES[recipe.interface]
+    simulation = (config.num_envs, net, machine, recipe.task, interface)
+    if recipe.critic:
+        return TaskVectorEnv(*simulation), ppo.critic_advantages
+    return GroupVectorEnv(*simulation, horizon=config.horizon), group_advantages
 
 
 def actor_weights(agent: Agent) -> tuple[np.ndarray, ...]:
@@ -90,40 +93,19 @@ def stagger_episodes(env: TaskVectorEnv) -> None:
 class TrainingLog:
     """Curve, progress bar and checkpoints of one training."""
 
-    def __init__(
-        self, env: TaskVectorEnv, config: PPOConfig, out: Path, about: dict[str, Any]
-    ) -> None:
-        self.env, self.config, self.about = env, config, about
+    bar: "tqdm[Any]"
+
+    def __init__(self, env: TaskVectorEnv, out: Path, about: dict[str, Any]) -> None:
+        self.env, self.about = env, about
         self.checkpoint = Path(f"{out}.checkpoint")
         self.curve = Path(f"{out}.csv")
         self.rows: list[dict[str, float]] = []
 
-    def begin(self, seed: int, resume: bool) -> Checkpoint:
-        """A new training, or that of the checkpoint; ValueError: it exists, but not to resume."""
-        exists = self.checkpoint.exists()
-        if exists and not resume:
-            expectation = "expected --resume or no checkpoint"
-            raise ValueError(f"{self.checkpoint}: {expectation}, got one of a broken training")
-        if resume and not exists:
-            text = "no checkpoint, training starts from the beginning"
-            tqdm.write(f"{self.checkpoint}: {text}", file=sys.stderr)
-        start = ppo.begin(self.env, self.config, seed)
-        stagger_episodes(self.env)
-        if exists:
-            start = self.load(start)
-        self.first_step, self.start_time = start.global_step, time.perf_counter()
-        total = self.config.total_steps
-        options: dict[str, Any] = {"initial": start.global_step, "unit": "step", "disable": None}
-        self.bar = tqdm(total=total, desc="train", unit_scale=True, **options)
-        return start
-
     def on_update(self, now: Checkpoint, rollout: Rollout, metrics: dict[str, float]) -> None:
         """Add a row to the curve; every `EVERY` updates write a checkpoint."""
         error = float(np.mean([info["velocity_error"].mean() for info in rollout.infos]))
-        seconds = time.perf_counter() - self.start_time
-        speed = round((now.global_step - self.first_step) / seconds)
-        row = {**metrics, "charts/velocity_error": error, "charts/SPS": speed}
-        self.rows.append({"global_step": now.global_step, **row})
+        row = {"global_step": now.global_step, **metrics, "charts/velocity_error": error}
+        self.rows.append(row)
         self.bar.update(now.global_step - self.bar.n)
         self.bar.set_postfix_str(f"error {error:.3f} m/s")
         if now.update % EVERY == 0:
@@ -136,6 +118,9 @@ class TrainingLog:
 
     def save(self, now: Checkpoint) -> None:
         """Write a checkpoint from which a training continues to the same bits."""
+        arrays: list[torch.Tensor] = []
+        simulation = self.env.state, self.env.memory
+        map_arrays(lambda array: arrays.append(torch.tensor(array)), simulation)
         content = {
             "about": json.dumps(self.about),
             "agent": now.agent.state_dict(),
@@ -144,7 +129,7 @@ class TrainingLog:
             "steps": [now.global_step, now.update],
             "torch_random": torch.get_rng_state(),
             "numpy_random": self.env.np_random.bit_generator.state,
-            "arrays": leaves((self.env.state, self.env.memory)),
+            "arrays": arrays,
             "rows": self.rows,
         }
         buffer = io.BytesIO()
@@ -162,22 +147,10 @@ class TrainingLog:
             expect_same(self.checkpoint, json.loads(content["about"]), self.about)
             fresh.agent.load_state_dict(content["agent"])
             fresh.optimizer.load_state_dict(content["optimizer"])
-            saved = iter(content["arrays"])
-            present = self.env.state, self.env.memory
-            self.env.state, self.env.memory = map_arrays(lambda _: next(saved).numpy(), present)
+            arrays = iter(content["arrays"])
+            simulation = self.env.state, self.env.memory
+            self.env.state, self.env.memory = map_arrays(lambda _: next(arrays).numpy(), simulation)
             self.env.np_random.bit_generator.state = content["numpy_random"]
             torch.set_rng_state(content["torch_random"])
             self.rows = content["rows"]
             return Checkpoint(fresh.agent, fresh.optimizer, content["obs"], *content["steps"])
-
-
-def leaves(values: Any) -> list[torch.Tensor]:
-    """Copies of all arrays in `values`, in the order of `map_arrays`."""
-    found: list[torch.Tensor] = []
-
-    def keep(array: np.ndarray) -> np.ndarray:
-        found.append(torch.tensor(array))
-        return array
-
-    map_arrays(keep, values)
-    return found

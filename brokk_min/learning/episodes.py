@@ -1,7 +1,7 @@
 """Episodes of training: random starts and goals, noisy observations. Paper: Sec. 3.4"""
 
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -68,13 +68,12 @@ def draw_noise(machine: Machine, largest: float, num: int, rng: np.random.Genera
     return np.float32(largest) * noise
 
 
-def map_arrays(function: Callable[..., Array], first: Any, *others: Any) -> Any:
+def map_arrays(function: Callable[..., Any], first: Any, *others: Any) -> Any:
     """`function` of all arrays in a `State`, a memory or a plant's state: tuples of arrays."""
     if first is None:
         return None
     if isinstance(first, State):
-        names = [field.name for field in fields(State)]
-        parts = (tuple(getattr(one, name) for name in names) for one in (first, *others))
+        parts = (tuple(vars(one).values()) for one in (first, *others))
         return State(*map_arrays(function, *parts))
     if isinstance(first, tuple):
         values = [map_arrays(function, *row) for row in zip(first, *others, strict=True)]

@@ -6,6 +6,8 @@ Importing this module registers them, and Gymnasium can import it by the name of
     gymnasium.make_vec("brokk_min.learning.gym_env:brokk_min/Brokk170-v0", num_envs=256)
 """
 
+from dataclasses import replace
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -17,23 +19,33 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from brokk_min import env
+from brokk_min._files import brief
 from brokk_min.actuator import PLANT, Plant
 from brokk_min.env import PAPER, Interface, State, measure
 from brokk_min.identification.net_file import load_net
 from brokk_min.learning.episodes import draw_noise, new_goals, replace_rows, reset
-from brokk_min.machine import BROKK_170, Array, Machine
+from brokk_min.machine import BROKK_170, Array, Machine, require
 from brokk_min.settings import TaskConfig
 
 Bools = NDArray[np.bool_]
 Step = tuple[Array, Array, Bools, Bools, dict[str, Any]]  # of a vector: obs, reward, ends, info
 
 
-class TaskVectorEnv(VectorEnv[Array, Array, Any]):
-    """Many machines that follow random tool velocities; ended episodes reset in the same step.
+KINDS = {"num_envs": Integral, "machine": Machine, "config": TaskConfig, "interface": Interface}
 
-    `info["final_obs"]` holds the last observation of an episode where `info["_final_obs"]` is set,
-    `info["velocity_error"]` is |v_goal - v_tool| [m/s], `info["before"]` has the state and the
-    agent's memory before the step, and the command. Paper: Fig. 4
+
+def check_kinds(**arguments: Any) -> None:
+    """ValueError for the first argument that is not of its kind in `KINDS`, by its name."""
+    for name, value in arguments.items():
+        require(isinstance(value, KINDS[name]), name, KINDS[name].__name__, brief(value))
+
+
+class TaskVectorEnv(VectorEnv[Array, Array, Any]):
+    """Many machines that follow random tool velocities. Paper: Fig. 4
+
+    `info["velocity_error"]` is |v_goal - v_tool| [m/s], and `info["new_goal"]` says where the goal
+    has changed since. If ended episodes reset in the same step, `info["final_obs"]` holds the last
+    observation of an episode where `info["_final_obs"]` is set.
 
     Args:
         num_envs: number of machines.
@@ -42,6 +54,11 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         config: what an episode is.
         interface: what the agent reads, does and is paid for.
         render_mode: None or "rgb_array" (the first machine).
+        autoreset_mode: when an ended episode resets, see Gymnasium's `AutoresetMode`; its vector
+            wrappers of observations accept NEXT_STEP.
+        max_episode_steps: ticks of an episode, instead of the seconds of `config`.
+
+    ValueError: an argument of another kind, by its name.
     """
 
     def __init__(
@@ -52,18 +69,21 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         config: TaskConfig | None = None,
         interface: Interface = PAPER,
         render_mode: str | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        max_episode_steps: int | None = None,
     ) -> None:
-        self.metadata = {
-            "render_modes": ["rgb_array"],
-            "render_fps": round(machine.rate),
-            "autoreset_mode": AutoresetMode.SAME_STEP,
-        }
-        self.num_envs = num_envs
-        self.machine = machine
-        self.config = config or TaskConfig()
+        config = TaskConfig() if config is None else config
+        check_kinds(num_envs=num_envs, machine=machine, config=config, interface=interface)
+        require(num_envs > 0, "num_envs", "1 or more", num_envs)
+        require(render_mode in (None, "rgb_array"), "render_mode", "rgb_array", render_mode)
+        if max_episode_steps is not None:
+            config = replace(config, episode_s=max_episode_steps / machine.rate)
+        rate, mode = round(machine.rate), AutoresetMode(autoreset_mode)
+        self.metadata = TaskEnv.metadata | {"render_fps": rate, "autoreset_mode": mode}
+        self.num_envs, self.machine, self.config = num_envs, machine, config
         self.plant = load_net(Path(plant), machine) if isinstance(plant, str | Path) else plant
-        self.interface = interface
-        self.render_mode = render_mode
+        require(hasattr(self.plant, "step"), "plant", "reset and step", brief(plant))
+        self.interface, self.render_mode = interface, render_mode
         size = len(interface.scale(machine)[0])
         self.single_observation_space = Box(-np.inf, np.inf, (size,), np.float32)
         self.single_action_space = Box(-1.0, 1.0, (len(machine.driven),), np.float32)
@@ -75,11 +95,31 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """Draw new episodes for all machines."""
+        """Draw new episodes for all machines, or where the option `reset_mask` is true.
+
+        ValueError: a mask of another shape or type.
+        """
         super().reset(seed=seed)
-        self.state = self.draw_episodes(self.num_envs)
-        obs, self.memory = self.observe(self.state, None)
-        return obs, {}
+        mask = (options or {}).get("reset_mask")
+        if mask is None or self.state is None:
+            self.state = self.draw_episodes(self.num_envs)
+            self.obs, self.memory = self.observe(self.state, None)
+            self.ended = np.zeros(self.num_envs, bool)
+        else:
+            fits = np.shape(mask) == (self.num_envs,) and np.asarray(mask).dtype == bool
+            require(fits, "reset_mask", f"{self.num_envs} booleans", brief(mask))
+            self.begin_episodes(mask)
+            self.ended = self.ended & ~mask
+        return self.obs, {}
+
+    def begin_episodes(self, mask: Bools) -> None:
+        """Draw new episodes where `mask` is true; others go on."""
+        rows = np.flatnonzero(mask)
+        fresh = self.draw_episodes(len(rows))
+        obs, memory = self.observe(fresh, None)
+        self.state = replace_rows(self.state, rows, fresh)
+        self.memory = replace_rows(self.memory, rows, memory)
+        self.obs = replace_rows(self.obs, rows, obs)
 
     def draw_episodes(self, num: int) -> State:
         """`num` machines at the start of an episode."""
@@ -103,31 +143,31 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
     def step(self, actions: Array) -> Step:
         """One tick of all machines under actions (num_envs, n_driven)."""
         obs, reward, terminated, truncated, info = self.step_without_reset(actions)
-        done = terminated | truncated
-        rows = np.flatnonzero(done)
-        if len(rows):
-            fresh = self.draw_episodes(len(rows))
-            first, memory = self.observe(fresh, None)
-            self.state = replace_rows(self.state, rows, fresh)
-            self.memory = replace_rows(self.memory, rows, memory)
-            info |= {"final_obs": obs, "_final_obs": done}
-            obs = replace_rows(obs, rows, first)
-        return obs, reward, terminated, truncated, info
+        mode, begin = self.metadata["autoreset_mode"], self.ended
+        if mode == AutoresetMode.NEXT_STEP and begin.any():
+            self.begin_episodes(begin)
+            reward = np.where(begin, 0.0, reward)
+            terminated, truncated = terminated & ~begin, truncated & ~begin
+        self.ended = terminated | truncated
+        if mode == AutoresetMode.SAME_STEP and self.ended.any():
+            info |= {"final_obs": obs, "_final_obs": self.ended}
+            self.begin_episodes(self.ended)
+        return self.obs, reward, terminated, truncated, info
 
     def step_without_reset(self, actions: Array) -> Step:
-        """`step` for those who reset ended episodes themselves."""
+        """`step` in which ended episodes go on."""
         if self.state is None:
             raise ValueError("step: expected a reset before the first step, got none")
-        m, before, memory = self.machine, self.state, self.memory
+        m, memory, u_before = self.machine, self.memory, self.state.history[..., 2, -1]
         u = self.interface.command(m, np.asarray(actions), memory)
-        state, reward, terminated, truncated = env.step(m, self.config, self.plant, before, u)
+        state, reward, terminated, truncated = env.step(m, self.config, self.plant, self.state, u)
         error = np.linalg.norm(state.v_goal - state.v_tool, axis=-1)
+        info = {"velocity_error": error, "new_goal": state.goal_ticks <= 0}
         self.state = self.new_goals(state)
-        obs, self.memory = self.observe(self.state, memory)
-        cost = self.interface.cost(m, u, before.history[..., 2, -1], self.memory)
+        self.obs, self.memory = self.observe(self.state, memory)
+        cost = self.interface.cost(m, u, u_before, self.memory)
         reward = np.where(terminated, 0.0, reward - cost)
-        info = {"velocity_error": error, "before": (before, memory, u)}
-        return obs, reward, terminated, truncated, info
+        return self.obs, reward, terminated, truncated, info
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """A picture of the first machine (height, width, 3), with goal and tool velocity."""
@@ -164,7 +204,7 @@ class TaskEnv(gymnasium.Env[Array, Array]):
         """One tick under the action (n_driven,)."""
         actions = np.asarray(action)[None]
         obs, reward, terminated, truncated, info = self.vector.step_without_reset(actions)
-        info = {"velocity_error": float(info["velocity_error"][0])}
+        info = {name: value[0] for name, value in info.items()}
         return obs[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
 
     def render(self) -> Any:

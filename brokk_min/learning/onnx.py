@@ -9,31 +9,18 @@ from brokk_min._files import require_package, whole_file
 from brokk_min.learning.policy import INTERFACES, Policy, contract
 from brokk_min.machine import Machine
 
-
-def named_blocks(machine: Machine) -> list[tuple[str, str, int]]:
-    """Name, unit and size of what `env.features` reads, in its order; the newest sample is last.
-
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> named_blocks(BROKK_170)[1:4]
-        [('v_tool', 'm/s', 3), ('q q2', 'rad', 1), ('q q1', 'rad', 13)]
-    """
-    H = machine.history
-    unit = {joint.name: "rad" if joint.kind == "revolute" else "m" for joint in machine.joints}
-    driven, locked = ([machine.names[i] for i in part] for part in (machine.driven, machine.locked))
-    blocks = [("v_goal", "m/s", 3), ("v_tool", "m/s", 3)]
-    blocks += [(f"q {name}", unit[name], 1) for name in locked]
-    for name in driven:
-        blocks += [(f"q {name}", unit[name], H), (f"q_dot {name}", f"{unit[name]}/s", H)]
-    return blocks + [(f"u {name}", "of full command", H) for name in driven]
+OBSERVATION = (
+    "goal and measured velocity of the tool [m/s], angles of locked joints [rad or m], history of "
+    "angles and of velocities of each driven joint, history of its command for each driven joint "
+    "[of full command], newest sample last; less mean, over scale; interface beyond: and more"
+)
 
 
 def export_onnx(path: Path, policy: Policy, machine: Machine) -> None:
     """Write a policy as one ONNX file: `observation` (batch, obs) in, `action` (batch, driven) out.
 
     The other program makes the observation and the command, as the policy's `env.Interface` does;
-    see examples/run_onnx.py. The machine, mean and deviation that it must agree with are in the
-    metadata, as JSON; so are the blocks of the paper's observation.
+    see examples/run_onnx.py. What it must agree with is in the metadata, as JSON by name.
     ValueError: the package onnxscript is not installed.
     """
     require_package("onnxscript", "export")
@@ -51,18 +38,11 @@ def export_onnx(path: Path, policy: Policy, machine: Machine) -> None:
         verbose=False,
     )
     assert program is not None
-    program.model.metadata_props.update(metadata(policy, machine))
-    with whole_file(path) as file:
-        file.write(program.model_proto.SerializeToString())
-
-
-def metadata(policy: Policy, machine: Machine) -> dict[str, str]:
-    """What the other program must agree on, as JSON by name."""
     mean, scale = INTERFACES[policy.interface].scale(machine)
     told = contract(machine) | {"interface": policy.interface}
-    told |= {"mean": mean.tolist(), "scale": scale.tolist()}
+    told |= {"mean": mean.tolist(), "scale": scale.tolist(), "observation": OBSERVATION}
     told["action"] = "of pwm_limit / 127 of each driven joint, cut at 1 and rounded to counts"
     told["geometry_columns"] = ["a", "alpha", "d", "theta", "q_min", "q_max", "kind"]  # m and rad
-    if policy.interface == "paper":
-        told["observation"] = named_blocks(machine)
-    return {name: json.dumps(value) for name, value in told.items()}
+    program.model.metadata_props.update({name: json.dumps(value) for name, value in told.items()})
+    with whole_file(path) as file:
+        file.write(program.model_proto.SerializeToString())

@@ -12,7 +12,7 @@ from brokk_min.actuator import ActuatorNet
 from brokk_min.beyond.interface import INTERFACE
 from brokk_min.env import PAPER
 from brokk_min.identification.net_file import net_arrays, net_from_arrays, select_nets
-from brokk_min.machine import Array, Machine, Measured
+from brokk_min.machine import Array, Machine, Measured, require
 
 KIND = "policy 5"
 INTERFACES = {"paper": PAPER, "beyond": INTERFACE}  # by their names in files
@@ -39,8 +39,8 @@ class Policy:
         """
         x: Array = np.asarray(observation, np.float32)
         size = len(self.weights[0])
-        if x.shape[-1:] != (size,) or not np.isfinite(x).all():
-            raise ValueError(f"observation: expected finite (..., {size}), got {x.shape}")
+        fits = x.shape[-1:] == (size,) and bool(np.isfinite(x).all())
+        require(fits, "observation", f"finite (..., {size})", x.shape)
         layers = list(zip(self.weights[::2], self.weights[1::2], strict=True))
         for w, b in layers[:-1]:
             x = x @ w + b
@@ -106,9 +106,8 @@ def load_policy(path: Path, machine: Machine) -> Policy:
     with expected(path, "a complete policy"):
         expect_same(path, header["contract"], contract(machine))
         mean, scale = INTERFACES[header["interface"]].scale(machine)
-        for name, value in {"mean": mean, "scale": scale}.items():
-            if not np.array_equal(arrays[name], value):
-                raise ValueError(f"{path}: {name}: expected the machine's normalisation")
+        fits = np.array_equal(arrays["mean"], mean) and np.array_equal(arrays["scale"], scale)
+        require(fits, str(path), "the machine's normalisation", "another")
         weights = tuple(arrays[f"layer_{i}"] for i in range(8))
         net = select_nets(machine, net_from_arrays(path, header["net"], arrays))
         policy = Policy(header["training"], weights, net, header["interface"])

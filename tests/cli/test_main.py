@@ -1,5 +1,7 @@
 """The command line as a user meets it: help, version, refusals in one line, exit statuses."""
 
+import json
+import os
 import re
 import subprocess
 import sys
@@ -71,12 +73,64 @@ def test_help__imports_nothing_slow():
     assert (done.stdout, done.stderr) == ("set()\n", "")
 
 
+@pytest.mark.parametrize("encoding", ["cp850", "cp437", "cp932", "latin-1", "ascii"])
+def test_help__is_printed_in_any_encoding(encoding):
+    code = "import sys; from brokk_min.__main__ import main; sys.exit(main(['train', '--help']))"
+    options = {"env": os.environ | {"PYTHONIOENCODING": encoding}, "encoding": encoding}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, **options)
+    assert "--gamma" in done.stdout and (done.returncode, done.stderr) == (0, "")
+
+
+GERMAN = """
+from dataclasses import replace
+from brokk_min import BROKK_170
+*arm, bucket = BROKK_170.joints
+GERMAN = replace(BROKK_170, name="bagger", joints=(*arm, replace(bucket, name="Löffel")))
+"""
+
+
+def test_files__are_utf_8_in_any_locale(tmp_path):
+    """Written and read with names of joints that the locale cannot write."""
+    (tmp_path / "names.py").write_text(GERMAN, encoding="utf-8")
+    locale = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    for line in ("collect --out g.csv --hours 0.001", "inspect g.csv --json g.json"):
+        words = [*line.split(), "--machine", "names.py:GERMAN"]
+        command = [sys.executable, "-c", f"from brokk_min.__main__ import main; main({words})"]
+        environment = os.environ | locale | {"PYTHONPATH": str(ROOT)}
+        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True)
+        assert (done.returncode, done.stderr) == (0, b"") and b"L?ffel" in done.stdout
+    assert "q_Löffel" in (tmp_path / "g.csv").read_text(encoding="utf-8")
+    assert "Löffel" in json.loads((tmp_path / "g.json").read_text(encoding="utf-8"))["joints"]
+
+
+def test_drawing__needs_no_backend_of_a_notebook():
+    environment = os.environ | {"MPLBACKEND": "module://matplotlib_inline.backend_inline"}
+    code = "import brokk_min.__main__, matplotlib; print(matplotlib.get_backend())"
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("agg\n", "")
+
+
+def test_completion__for_a_shell_that_is_not_supported_is_one_line(capsys):
+    assert run("train --tyro-print-completion tcsh") == 1
+    assert capsys.readouterr().err.startswith("brokk-min: shtab is required for completion")
+
+
 def test_version__is_that_of_the_project_and_of_its_citation(capsys):
     assert run("--version") == 0
     assert capsys.readouterr().out == f"brokk_min {brokk_min.__version__}\n"
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert project["version"] == brokk_min.__version__
     assert f"\nversion: {brokk_min.__version__}\n" in (ROOT / "CITATION.cff").read_text()
+
+
+def test_ctrl_c__ends_a_command_in_one_line(monkeypatch, capsys):
+    def interrupt(self):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("brokk_min.cli.identification.Collect.__call__", interrupt)
+    assert run("collect --out x.csv") == 1
+    assert capsys.readouterr().err == "brokk-min: stopped\n"
 
 
 TRAIN = "train --actuator missing.npz --out p.npz"

@@ -11,11 +11,16 @@ from brokk_min.machine import BROKK_170
 
 FILE = """
 from dataclasses import replace
-from sizes import NAME
+from beside_it import NAME
 from brokk_min import BROKK_170
 from brokk_min.actuator import PLANT, AnalyticPlant
 DIGGER = replace(BROKK_170, name=NAME)
 NUMBER = 3
+
+class Late(AnalyticPlant):
+    def step(self, machine, state, u):
+        import beside_it_late
+        return super().step(machine, state, u)
 
 class Reversed(AnalyticPlant):
     def step(self, machine, state, u):
@@ -34,13 +39,15 @@ class Small(AnalyticPlant):
         return state._replace(q=state.q[:, 1:])
 
 SOUND, REVERSED, SILENT, BROKEN, SMALL = AnalyticPlant(), Reversed(), Silent(), Broken(), Small()
+LATE = Late()
 """
 
 
 @pytest.fixture
 def file(tmp_path):
-    """A file that imports another one beside it."""
-    (tmp_path / "sizes.py").write_text("NAME = 'digger'\n")
+    """A file that imports others beside it, one of them late."""
+    (tmp_path / "beside_it.py").write_text("NAME = 'digger'\n")
+    (tmp_path / "beside_it_late.py").touch()
     (tmp_path / "own.py").write_text(FILE)
     return tmp_path / "own.py"
 
@@ -60,9 +67,10 @@ def test_find_machine__takes_a_name_or_an_object_of_a_file(file):
 def test_find_plant__tries_each_joint(file):
     assert find_plant("analytic", BROKK_170) is PLANT
     q = BROKK_170.q_start
-    assert np.array_equal(find_plant(f"{file}:SOUND", BROKK_170).reset(BROKK_170, q).q, q)
+    for name in ("SOUND", "LATE"):
+        assert np.array_equal(find_plant(f"{file}:{name}", BROKK_170).reset(BROKK_170, q).q, q)
     for name, message in {
-        "NUMBER": "--plant: expected an object with reset and step, got 3",
+        "NUMBER": "expected states with angles q, got 'int' object has no attribute 'reset'",
         "REVERSED": "q1: expected motion up, then down, got -",
         "SILENT": r"q1: expected motion up, then down, got \+0.000 and \+0.000 rad",
         "BROKEN": r"expected finite angles q \(10, 5\)",

@@ -1,5 +1,9 @@
 """`train` from the command line, for both agents."""
 
+import re
+from dataclasses import fields
+from pathlib import Path
+
 import numpy as np
 import pytest
 from helpers_cli import run
@@ -8,7 +12,9 @@ from helpers_machines import small_net
 from brokk_min.identification.net_file import save_net
 from brokk_min.learning.policy import load_policy
 from brokk_min.machine import BROKK_170
+from brokk_min.settings import PPOConfig
 
+ROOT = Path(__file__).parents[2]
 SMALL = "--num-envs 8 --horizon 8 --minibatch-size 32 --total-steps 128"
 
 
@@ -37,3 +43,11 @@ def test_train__the_same_line_gives_the_same_bits(tmp_path):
         assert run(f"train --actuator {tmp_path}/net.npz --out {tmp_path}/{name}.npz {SMALL}") == 0
     first, second = (load_policy(tmp_path / f"{name}.npz", BROKK_170).weights for name in "ab")
     assert all(map(np.array_equal, first, second))
+
+
+def test_porting_page__names_all_settings_and_no_others():
+    """In the first column of its table of names."""
+    page = (ROOT / "docs" / "porting.md").read_text(encoding="utf-8")
+    table = page.partition("## Names of settings elsewhere")[2]
+    named = re.findall(r"^\| `(\w+)`", table, re.M)
+    assert named == [field.name for field in fields(PPOConfig)]

@@ -96,13 +96,108 @@ def test_step__subtracts_the_costs_of_the_interface_from_eq2():
     rng = np.random.default_rng(2)
     u_before = np.zeros((5, 5))
     for _ in range(3):
-        _, rewards, _, _, info = env.step(rng.uniform(-1, 1, (5, 4)))
-        before, _, u = info["before"]
+        v_goal = env.state.v_goal
+        _, rewards, *_ = env.step(rng.uniform(-1, 1, (5, 4)))
+        u = env.state.history[..., 2, -1]
         travel = np.abs(u - u_before)[:, LOW.driven].mean(axis=-1) / (80 / 127)
-        tracking = reward(before.v_goal, env.state.v_tool)
+        tracking = reward(v_goal, env.state.v_tool)
         integral = np.linalg.norm(env.memory.error_integral, axis=-1)
         np.testing.assert_allclose(rewards, tracking - 0.1 * travel - integral, atol=1e-6)
         u_before = u
+
+
+def test_next_step__ended_episodes_begin_in_the_step_after_theirs():
+    """That step has no reward and no action; Gymnasium's wrappers of observations need it."""
+    mode = AutoresetMode.NEXT_STEP
+    env = TaskVectorEnv(3, NET, LOW, SHORT, autoreset_mode=mode, max_episode_steps=6)
+    env.reset(seed=0)
+    env.state = replace(env.state, ticks=np.array([4, 0, 0]))
+    seen = [env.step(np.ones((3, 4))) for _ in range(4)]
+    assert [ends.tolist() for *_, ends, _ in seen] == [[i == 1, False, False] for i in range(4)]
+    assert [rewards[0] > 0 for _, rewards, *_ in seen] == [True, True, False, True]
+    assert all((rewards[1:] > 0).all() for _, rewards, *_ in seen)
+    assert not any("final_obs" in info for *_, info in seen)
+    commands = [obs[:, 111:].any(axis=1).tolist() for obs, *_ in seen]
+    assert commands == [[True, True, True]] * 2 + [[False, True, True], [True, True, True]]
+    assert env.state.ticks.tolist() == [1, 4, 4]
+    env.step(np.ones((3, 4)))
+    assert env.step(np.ones((3, 4)))[3].tolist() == [False, True, True]
+    env.reset(options={"reset_mask": np.array([False, True, False])})
+    env.step(np.ones((3, 4)))
+    assert env.state.ticks.tolist() == [4, 1, 0]  # what the caller reset does not begin again
+
+
+def test_reset_mask__begins_its_rows_anew_and_lets_the_others_go_on():
+    options = {"autoreset_mode": AutoresetMode.DISABLED, "max_episode_steps": 5}
+    env = TaskVectorEnv(4, NET, LOW, interface=INTERFACE, **options)
+    env.reset(seed=0)
+    for _ in range(6):
+        before, _, _, truncated, _ = env.step(np.full((4, 4), 0.5))
+    assert truncated.all() and (env.state.ticks == 6).all()
+    mask = np.array([True, False, False, True])
+    after, _ = env.reset(options={"reset_mask": mask})
+    assert np.array_equal(after[~mask], before[~mask])
+    assert (after[mask] != before[mask]).any(axis=1).all()
+    assert env.state.ticks.tolist() == [0, 6, 6, 0]
+    assert env.memory.error_integral.any(axis=1).tolist() == [False, True, True, False]
+    assert env.step(np.zeros((4, 4)))[3].tolist() == [False, True, True, False]
+    for bad in ([True], [1, 0, 0, 1]):
+        with pytest.raises(ValueError, match="reset_mask: expected 4 booleans, got"):
+            env.reset(options={"reset_mask": bad})
+
+
+def test_step__says_where_the_goal_is_a_new_one():
+    env = TaskVectorEnv(50, NET, LOW, TaskConfig(hold_min_s=0.1, hold_max_s=0.4, zero_goals=0))
+    env.reset(seed=0)
+    changes = []
+    for _ in range(10):
+        before = env.state.v_goal
+        info = env.step(np.zeros((50, 4)))[4]
+        assert np.array_equal(info["new_goal"], (env.state.v_goal != before).any(axis=1))
+        changes.append(info["new_goal"].mean())
+    assert 0.1 < np.mean(changes) < 0.4
+
+
+@pytest.mark.parametrize(
+    "wrapper", ["NormalizeObservation", "DictInfoToList", "RecordEpisodeStatistics"]
+)
+def test_wrappers__of_gymnasium_accept_the_vector(wrapper):
+    mode = AutoresetMode.NEXT_STEP
+    env = gymnasium.make_vec(ID, num_envs=3, autoreset_mode=mode, max_episode_steps=2)
+    env = getattr(gymnasium.wrappers.vector, wrapper)(env)
+    env.reset(seed=0)
+    for _ in range(3):
+        *_, infos = env.step(env.action_space.sample())
+    info = infos[0] if wrapper == "DictInfoToList" else {n: v[0] for n, v in infos.items()}
+    assert 0 <= info["velocity_error"] < 1
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"machine": "brokk170"}, "machine: expected Machine, got 'brokk170'"),
+        ({"config": {"episode_s": 5.0}}, "config: expected TaskConfig, got {'episode_s': 5.0}"),
+        ({"interface": "paper"}, "interface: expected Interface, got 'paper'"),
+        ({"plant": 3}, "plant: expected reset and step, got 3"),
+        ({"num_envs": 0}, "num_envs: expected 1 or more, got 0"),
+        ({"num_envs": 2.5}, "num_envs: expected Integral, got 2.5"),
+        ({"render_mode": "human"}, "render_mode: expected rgb_array, got human"),
+        ({"autoreset_mode": "never"}, "'never' is not a valid AutoresetMode"),
+    ],
+)
+def test_make_vec__refuses_wrong_arguments_by_name(options, message):
+    with pytest.raises(ValueError, match=f"^{message}"):
+        gymnasium.make_vec(ID, **({"num_envs": 2} | options))
+
+
+def test_make__takes_the_ticks_of_an_episode():
+    one = gymnasium.make(ID, max_episode_steps=4)
+    many = gymnasium.make_vec(ID, num_envs=1, max_episode_steps=4, machine=LOW)
+    one.reset(seed=1)
+    many.reset(seed=1)
+    for tick in range(1, 5):
+        assert one.step(np.zeros(4))[3] == (tick == 4)
+        assert many.step(np.zeros((1, 4)))[3] == (tick == 4)
 
 
 def test_task_env__is_one_row_of_the_vector():
@@ -116,7 +211,7 @@ def test_task_env__is_one_row_of_the_vector():
         assert np.array_equal(obs, rows[0])
         assert results == [vector[0] for vector in vectors]
         assert [type(result) for result in results] == [float, bool, bool]
-        assert info == {"velocity_error": infos["velocity_error"][0]}
+        assert info == {name: values[0] for name, values in infos.items()}
     for _ in range(2):  # the caller resets
         *_, truncated, _ = one.step(np.full(4, 0.3))
         assert truncated
@@ -172,3 +267,4 @@ def test_render__is_a_picture_of_the_first_machine():
     for _ in range(20):
         env.step(np.ones(4))
     assert (env.render() != first).any()
+    assert TaskEnv().render() is None

@@ -103,7 +103,7 @@ def test_file__gives_the_same_bits_back(tmp_path, kind):
         ({"name": "other"}, "machine: expected 'other', got 'brokk170'"),
         ({"pwm_limit": 70}, "pwm_limit: expected 70, got 80"),
         ({"joints": BROKK_170.joints[::-1]}, "joints: expected"),
-        ({"tool_speed": 0.2}, "mean|scale: expected the machine's normalisation"),
+        ({"tool_speed": 0.2}, "expected the machine's normalisation, got another"),
     ],
 )
 def test_load_policy__refuses_one_for_another_machine(tmp_path, change, message):
