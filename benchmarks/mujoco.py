@@ -31,7 +31,6 @@ from brokk_min.jacobian import Gains
 from brokk_min.learning.jobs import side_by_side
 from brokk_min.learning.policy import POLICIES, PolicyController, load_policy
 from brokk_min.machine import BROKK_170 as M
-from brokk_min.machine import PWM_MAX
 from examples.mujoco_brokk import PLANT, MujocoBrokk
 
 PLANTS = {
@@ -85,11 +84,8 @@ def nets(chain: Chain, log: logs.Log) -> ActuatorNet:
 
 def tune(chain: Chain, name: str, net: ActuatorNet, first: Mapping[str, Any]) -> Gains:
     """Gains of one of `baselines.TUNED`, tuned on the machine itself from the `first` ones."""
-    budget = chain.budget
-    seconds = min(baselines.TUNING_SECONDS, budget.short_s)
-    effort = budget.generations, budget.tuning_runs, seconds
     pid = baselines.baselines(M, net, first)[name]
-    return baselines.tune_baseline(pid, effort, chain.seed, plant=PLANT)[0]
+    return baselines.tune_baseline(pid, chain.budget.tuning, chain.seed, plant=PLANT)
 
 
 def make(options: Options, chain: Chain, net: ActuatorNet) -> None:
@@ -157,7 +153,7 @@ def main(options: Options) -> None:
     chain = Chain(M, options.folder, budget, options.seed)
     chain.out.mkdir(parents=True, exist_ok=True)
     log, test = record(chain)
-    print("\n".join(inspection.table(inspection.inspect(log, M.pwm_limit / PWM_MAX))))
+    print("\n".join(inspection.table(inspection.inspect(log))))
     net = nets(chain, log)
     make(options, chain, net)
     runs = score(options, net, controllers(options, chain, net))

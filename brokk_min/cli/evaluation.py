@@ -4,22 +4,15 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from brokk_min._files import write_json
 from brokk_min.actuator import ActuatorNet, Plant
 from brokk_min.cli.options import Command, PlantName, check, default_policy, find_plant
 from brokk_min.evaluation import baselines, metrics, sequences
-from brokk_min.evaluation.rollout import TITLES, valves_at_rest
+from brokk_min.evaluation.rollout import TITLES, Controller, valves_at_rest
+from brokk_min.jacobian import JacobianController
 from brokk_min.learning.policy import POLICIES, PolicyController, load_policy
 from brokk_min.machine import Array, Machine
-
-COLUMNS = {  # of the table, with their heads
-    "velocity_error_mean": "error [m/s]",
-    "off_axis_drift_max": "drift [m]",
-    "jerk_rms": "jerk [m/s^3]",
-    "valve_travel": "travel [1]",
-}
 
 
 @dataclass(kw_only=True)
@@ -40,20 +33,23 @@ class Evaluate(Command):
         machine = self.find_machine()
         self.writes(self.json, self.save_gains)
         check(self.num_starts > 0, "--num-starts", "1 or more", self.num_starts)
-        check(not (self.gains and self.save_gains), "--save-gains", "no --gains", self.gains)
         path, gains = default_policy(machine, self.policy, self.gains)
         gains = None if self.save_gains else gains
-        policies = self.policies(machine, path)
-        net = policies["rl"].policy.net
+        files = {} if self.policy else {k: path.with_name(file) for k, file in POLICIES.items()}
+        policies = {"rl": load_policy(path, machine)}
+        policies |= {k: load_policy(file, machine) for k, file in files.items() if file.exists()}
+        net = policies["rl"].net
         plant = net if self.plant == "net" else find_plant(self.plant, machine)
-        controllers = policies | self.pids(machine, net, plant, gains)
+        controllers: dict[str, Controller] = {
+            name: PolicyController(machine, policy) for name, policy in policies.items()
+        }
+        controllers |= self.pids(machine, net, plant, gains)
         task = self.task(machine)
         runs, _ = metrics.evaluate(machine, controllers, *task, self.seed, plant)
         if self.json:
-            used: dict[str, Any] = {"policy": path, "gains": gains or "tuned now"}
-            used |= {"commands": self.commands or "own", "starts": self.starts or self.num_starts}
-            used["plant"] = self.plant
-            meta = {key: str(value) for key, value in used.items()}
+            meta = {"policy": str(path), "gains": str(gains or "tuned now"), "plant": self.plant}
+            meta["commands"] = str(self.commands or "own")
+            meta["starts"] = str(self.starts or self.num_starts)
             meta |= metrics.metadata(machine, self.seed)
             write_json(self.json, {"meta": meta, "runs": runs})
         print(table(runs))
@@ -67,46 +63,31 @@ class Evaluate(Command):
         starts = sequences.evaluation_starts(machine, self.num_starts, own, self.seed + 2)
         return commands, starts
 
-    def policies(self, machine: Machine, path: Path) -> dict[str, Any]:
-        """The policy of a file, and by default those of the paper's agent beside it."""
-        files = {"rl": path}
-        if not self.policy:
-            files |= {name: path.with_name(file) for name, file in POLICIES.items()}
-        return {
-            name: PolicyController(machine, load_policy(file, machine))
-            for name, file in files.items()
-            if file.exists() or name == "rl"
-        }
-
     def pids(
-        self, machine: Machine, net: ActuatorNet, plant: Plant, gains: Path | None
-    ) -> dict[str, Any]:
+        self, machine: Machine, net: ActuatorNet, plant: Plant, path: Path | None
+    ) -> dict[str, JacobianController]:
         """The baselines with the gains of a file, or with gains that are tuned now."""
-        print(f"gains of the baselines: {gains or 'tuned now'}", file=sys.stderr)
-        if gains:
-            return {**baselines.read_gains(gains, machine, net)}
-        effort = baselines.GENERATIONS, baselines.TUNING_RUNS, baselines.TUNING_SECONDS
-        how: Any = {"effort": effort, "seed": self.seed}
-        gains_of = baselines.first_gains(machine, plant)
-        first = baselines.baselines(machine, net, gains_of)
-        for name in baselines.TUNED:
-            gains_of[name], _ = baselines.tune_baseline(first[name], plant=plant, **how)
-        tuned = baselines.baselines(machine, net, gains_of)
+        print(f"gains of the baselines: {path or 'tuned now'}", file=sys.stderr)
+        if path:
+            return baselines.read_gains(path, machine, net)
+        tuned = baselines.tuned_baselines(machine, net, baselines.EFFORT, self.seed, plant)
         if self.save_gains:
-            meta = how | {"plant": self.plant} | baselines.gains_metadata(machine, net)
+            meta = {"effort": baselines.EFFORT, "seed": self.seed, "plant": self.plant}
+            meta |= baselines.gains_metadata(machine, net)
             baselines.write_gains(self.save_gains, tuned, meta)
-        return {**tuned}
+        return tuned
 
 
 def table(runs: Sequence[metrics.Run]) -> str:
-    """Means by controller, over the workspace starts (if there is none: over those of one kind)."""
-    kind = min((run["kind"] for run in runs), key=sequences.KINDS.index)
-    runs = [run for run in runs if run["kind"] == kind]
+    """Means by controller, over the workspace starts, or over all if there is none of them."""
+    runs = [run for run in runs if run["kind"] == "workspace"] or runs
     num, motions = (len(metrics.column(runs, label)) for label in ("start", "sequence"))
-    lines = [f"means over {motions} sequences from {num} {kind} starts"]
-    lines.append(f"{'':26}{'valves at rest':>15}" + "".join(f"{c:>15}" for c in COLUMNS.values()))
+    kinds = " and ".join(metrics.column(runs, "kind"))
+    lines = [f"means over {motions} sequences from {num} {kinds} starts"]
+    heads = ("valves at rest", *metrics.COLUMNS.values())
+    lines.append(f"{'':26}" + "".join(f"{head:>15}" for head in heads))
     for name, rows in metrics.means(runs).items():
-        cells = (f"{rows['all'][key]['mean']:15.4g}" for key in COLUMNS)
+        cells = (f"{rows['all'][key]['mean']:15.4g}" for key in metrics.COLUMNS)
         lines.append(f"{TITLES[name]:26}{valves_at_rest(name):>15}" + "".join(cells))
     return "\n".join(lines)
 

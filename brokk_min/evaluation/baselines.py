@@ -24,7 +24,7 @@ OPTIMISED = "jacobian_pid_k0.1"
 PAPER_BASELINES = (OPTIMISED, "jacobian_pid_k0.05")
 STRONGEST = "jacobian_pid_ff_integral"
 TUNED = (OPTIMISED, STRONGEST)  # by `tune`
-GENERATIONS, TUNING_RUNS, TUNING_SECONDS = 40, 10, 20.0  # effort of tuning, assumed
+EFFORT = (40, 10, 20.0)  # of tuning, assumed: generations, runs of a candidate, their length [s]
 CANDIDATES = 24  # of each generation
 SPREAD = 0.12  # of the first candidates, as a fraction of the roots of the ranges, assumed
 OVERSHOOT = 0.2  # of a step of velocity, that tuning by hand allows
@@ -171,10 +171,8 @@ def tuning_cost(
     return np.asarray(error.mean(axis=0).reshape(rows, num).mean(axis=1))
 
 
-def tune(
-    gains: Gains, cost: Callable[[Array], Array], seed: int, generations: int, label: str
-) -> tuple[Array, list[float]]:
-    """The vector of gains of least cost, and the least cost after each generation.
+def tune(gains: Gains, cost: Callable[[Array], Array], seed: int, generations: int) -> Array:
+    """The vector of gains of least cost.
 
     SciPy's differential evolution over fractions x of the roots of the ranges, so that small gains
     of a wide range are searched as finely as large ones: gain = low + x^2 (high - low). The first
@@ -191,40 +189,50 @@ def tune(
     def at(x: Array) -> Array:
         return np.asarray(low + x**2 * (high - low))
 
-    def objective(x: Any) -> Any:
-        return cost(at(x.T))
+    with tqdm(total=generations + 1, desc="tune", unit="generation", disable=None) as bar:
 
-    costs: list[float] = []
-    with tqdm(total=generations, desc=f"tune {label}", unit="generation", disable=None) as bar:
-
-        def record(intermediate_result: Any) -> None:
-            costs.append(float(intermediate_result.fun))
+        def objective(x: Any) -> Any:
             bar.update()
+            return cost(at(x.T))
 
         result = differential_evolution(
             objective, Bounds(0 * start, 0 * start + 1), init=first, rng=seed,
-            maxiter=generations, mutation=(0.4, 0.9), tol=0, polish=False, callback=record,
+            maxiter=generations, mutation=(0.4, 0.9), tol=0, polish=False,
             vectorized=True, updating="deferred",
         )  # fmt: skip
-    return at(result.x), costs
+    return at(result.x)
 
 
 def tune_baseline(
     controller: JacobianController, effort: tuple[int, int, float], seed: int, plant: Plant = PLANT
-) -> tuple[Gains, list[float]]:
-    """Tuned gains of one of the `baselines`, beginning with its own, and costs by generation.
+) -> Gains:
+    """Tuned gains of one of the `baselines`, beginning with its own; for `effort` see `EFFORT`.
 
-    `effort` has the generations, the runs of each candidate, and their length [s]. The runs are on
-    the `plant` itself, which favours the baselines, because the policy is trained on nets alone.
-    The strongest has more gains, so it gets twice the generations.
+    The runs are on the `plant` itself, which favours the baselines, because the policy is trained
+    on nets alone. The strongest has more gains, so it gets twice the generations.
     """
     generations, num, seconds = effort
+    if isinstance(controller, StrongPID):
+        generations *= 2
     runs = tuning_set(controller.machine, num, seed, seconds)
     cost = partial(tuning_cost, controller, runs, seed, plant)
-    strong = isinstance(controller, StrongPID)
-    generations *= 2 if strong else 1
-    vector, costs = tune(controller.gains, cost, seed, generations, "strong" if strong else "PID")
-    return gains_of(controller.gains, vector), costs
+    vector = tune(controller.gains, cost, seed, generations)
+    return gains_of(controller.gains, vector)  # type: ignore[no-any-return]
+
+
+def tuned_baselines(
+    machine: Machine,
+    net: ActuatorNet,
+    effort: tuple[int, int, float],
+    seed: int,
+    plant: Plant = PLANT,
+) -> dict[str, JacobianController]:
+    """The `baselines` with gains by hand, and with tuned ones, see `tune_baseline`."""
+    gains = first_gains(machine, plant)
+    first = baselines(machine, net, gains)
+    for name in TUNED:
+        gains[name] = tune_baseline(first[name], effort, seed, plant)
+    return baselines(machine, net, gains)
 
 
 def gains_metadata(machine: Machine, net: ActuatorNet) -> dict[str, str]:
@@ -244,7 +252,7 @@ def write_gains(
 def read_gains(path: Path, machine: Machine, net: ActuatorNet) -> dict[str, JacobianController]:
     """The baselines with gains that `write_gains` wrote.
 
-    ValueError: no such file, gains of another machine or of other nets, or not finite ones.
+    ValueError: no such file, or gains of another machine or of other nets.
     """
     with expected(path, "gains of `reproduce` or `evaluate --save-gains`"):
         file = read_json(path, "JSON")
@@ -253,8 +261,4 @@ def read_gains(path: Path, machine: Machine, net: ActuatorNet) -> dict[str, Jaco
         for name, row in file["gains"].items():
             kind = StrongGains if name == STRONGEST else Gains
             gains[name] = kind(**{key: np.array(values, float) for key, values in row.items()})
-            vector = gains_vector(gains[name])
-            size = 3 * len(machine.driven) + len(fields(kind)) - 3
-            if vector.shape != (size,) or not np.isfinite(vector).all():
-                raise ValueError(f"{path}: {name}: expected {size} finite gains, got {row}")
         return baselines(machine, net, gains)

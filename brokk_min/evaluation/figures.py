@@ -3,7 +3,6 @@
 Controllers differ in colour and in dashes, so that the colour-blind tell them apart, too.
 """
 
-import io
 from collections.abc import Mapping, Sequence
 from itertools import chain
 from typing import Literal, NamedTuple
@@ -12,10 +11,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.linalg import norm
 
-from brokk_min.evaluation.metrics import Traces
+from brokk_min.evaluation.metrics import Mean, Traces
 from brokk_min.evaluation.preliminary import Motion, SimulatorTests
 from brokk_min.evaluation.rollout import TITLES, Trace
-from brokk_min.evaluation.sequences import AXES, KINDS, Commands
+from brokk_min.evaluation.sequences import AXES, Commands
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
 
@@ -89,7 +88,20 @@ def plot_gap(machine: Machine, gap: Motion) -> Figure:
     return plot_panels(panels)
 
 
-def plot_starts(machine: Machine, starts: Array, kinds: Sequence[str]) -> Figure:
+def plot_errors(errors: Mapping[str, Mean]) -> Figure:
+    """Mean velocity errors [m/s] with their intervals, a row for each controller."""
+    figure = Figure(figsize=(WIDTH, 0.5 + 0.4 * len(errors)), layout="constrained")
+    ax = figure.subplots()
+    ends = [[error[key] for key in ("low", "mean", "high")] for error in errors.values()]
+    low, mean, high = np.array(ends, float).T
+    ax.errorbar(mean, range(len(errors)), xerr=[mean - low, high - mean], fmt="o", capsize=4)
+    ax.set_yticks(range(len(errors)), [TITLES[name] for name in errors])
+    ax.set(xlabel="mean velocity error [m/s]", xlim=(0, None), ylim=(len(errors) - 0.5, -0.5))
+    ax.grid(alpha=0.3)
+    return figure
+
+
+def plot_starts(machine: Machine, starts: Array) -> Figure:
     """Start configurations drawn as arms, from the side and from above. Paper: Fig. 6a"""
     figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
     side, top = figure.subplots(1, 2)
@@ -97,16 +109,11 @@ def plot_starts(machine: Machine, starts: Array, kinds: Sequence[str]) -> Figure
     tool = points[:, -1, :2]
     outward = tool / np.maximum(norm(tool, axis=-1, keepdims=True), 1e-9)
     r = np.einsum("pjk,pk->pj", points[..., :2], outward)
-    for i, kind in enumerate(KINDS):
-        of = np.array(kinds) == kind
-        arms = side.plot(r[of].T, points[of, :, 2].T, color=f"C{i}", alpha=0.6)
-        top.plot(points[of, :, 0].T, points[of, :, 1].T, color=f"C{i}", alpha=0.6)
-        for arm in arms[:1]:
-            arm.set_label(kind)
+    side.plot(r.T, points[..., 2].T, alpha=0.6)
+    top.plot(points[..., 0].T, points[..., 1].T, alpha=0.6)
     side.axhline(machine.ground, color="black", linewidth=0.8)
     side.set(xlabel="outward from the slew axis [m]", ylabel="z [m]", aspect="equal")
     top.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    side.legend()
     return figure
 
 
@@ -136,10 +143,3 @@ def plot_joint_velocities(machine: Machine, traces: Traces, sequence: str, run: 
     sample = of_sample(traces, sequence)
     curves = {name: trace.q_dot[:, run, machine.driven] for name, trace in sample.items()}
     return plot_panels([_over_time(machine.dt, labels, curves)], sharey="row")
-
-
-def png(figure: Figure) -> bytes:
-    """A figure as PNG, the same bytes for the same figure."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=150, metadata={"Software": None})
-    return buffer.getvalue()

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,13 @@ Traces = Mapping[tuple[str, str], Trace]  # by controller and sequence, starts a
 Run = Mapping[str, Any]  # controller, sequence, start, kind, then the figures of `metrics`
 Rows = list[dict[str, Any]]  # of one `Run` each
 Mean = Mapping[str, float | None]  # "mean", and its interval "low" to "high"
-LABELS = ("controller", "sequence", "start", "kind")
+LABELS = ("controller", "sequence", "start", "kind")  # of a row; "seed" is of a sweep
+COLUMNS = {  # of tables, with their heads
+    "velocity_error_mean": "error [m/s]",
+    "off_axis_drift_max": "drift [m]",
+    "jerk_rms": "jerk [m/s^3]",
+    "valve_travel": "travel [1]",
+}
 
 
 def metrics(machine: Machine, trace: Trace, goals: Array, start: Array) -> dict[str, Array]:
@@ -48,10 +53,8 @@ def metrics(machine: Machine, trace: Trace, goals: Array, start: Array) -> dict[
 def line_distance(p_tool: Array, goals: Array, start: Array) -> Array:
     """Distance of the tool from the commanded line [m], (T, num).
 
-    The line starts where the tool was when the goal's direction last changed (to stop or to go
-    back along the line is no change). On a curve the direction changes at every tick.
-    `p_tool` are positions at the end of each tick [m] (T, num, 3), `goals` as in `metrics`, `start`
-    positions before the first tick [m] (num, 3).
+    The line starts where the tool was when the goal's direction last changed; to stop or to go back
+    is no change. `p_tool` are positions at the end of each tick [m] (T, num, 3), others as above.
     """
     origin = start  # of the line
     direction = np.zeros_like(start)  # of the line; 0 before the first motion
@@ -79,33 +82,30 @@ def evaluate(
 ) -> tuple[Rows, Traces]:
     """Run every controller on the same sequences, starts and noise. Paper: Sec. 4.2, Fig. 6
 
-    `starts` are angles [rad] (starts, n); all starts and all sequences of one length are a batch.
-    The sensors have the noise of training. Returns one row per controller, sequence and start, see
-    `metrics`; and traces.
+    `starts` are angles [rad] (starts, n). The sensors have the noise of training. Returns one row
+    per controller, sequence and start, see `metrics`; and traces.
     """
     kinds = start_kinds(machine, starts)
     p_start = tool_position(forward_kinematics(machine, starts))
-    lengths = dict.fromkeys(len(sequence.goals) for sequence in sequences)
-    batches = [[s for s in sequences if len(s.goals) == length] for length in lengths]
-    rows: dict[tuple[str, str], Rows] = {}
+    goals = {s.name: s.for_starts(machine, starts) for s in sequences}  # all are one batch
+    ticks = max(len(of) for of in goals.values())
+    padded = [np.pad(of, ((0, ticks - len(of)), (0, 0), (0, 0))) for of in goals.values()]
+    q, batch = np.tile(starts, (len(goals), 1)), np.concatenate(padded, axis=1)
+    rows: Rows = []
     traces: dict[tuple[str, str], Trace] = {}
-    pairs = list(product(controllers, batches))
-    for name, batch in tqdm(pairs, desc="evaluate", unit="batch", disable=None):
-        goals = [sequence.for_starts(machine, starts) for sequence in batch]
-        q, all_goals = np.tile(starts, (len(batch), 1)), np.concatenate(goals, axis=1)
+    for name, controller in tqdm(controllers.items(), "evaluate", unit="controller", disable=None):
         rng = np.random.default_rng(seed)
-        trace = rollout(machine, controllers[name], q, all_goals, TaskConfig.noise, rng, plant)
-        for i, sequence in enumerate(batch):
+        every = rollout(machine, controller, q, batch, TaskConfig.noise, rng, plant)
+        for i, (sequence, goal) in enumerate(goals.items()):
             part = slice(i * len(starts), (i + 1) * len(starts))
-            of = traces[name, sequence.name] = Trace(*(array[:, part] for array in trace))
-            columns = metrics(machine, of, goals[i], p_start)
-            rows[name, sequence.name] = [
-                dict(zip(LABELS, (name, sequence.name, start, kind), strict=True))
-                | {key: float(column[start]) for key, column in columns.items()}
-                for start, kind in enumerate(kinds)
-            ]
-    ordered = product(controllers, [sequence.name for sequence in sequences])
-    return [row for pair in ordered for row in rows[pair]], traces
+            trace = Trace(*(array[: len(goal), part] for array in every))
+            columns = metrics(machine, trace, goal, p_start)
+            for start, kind in enumerate(kinds):
+                labels = zip(LABELS, (name, sequence, start, kind), strict=True)
+                figures = {key: float(column[start]) for key, column in columns.items()}
+                rows.append(dict(labels) | figures)
+            traces[name, sequence] = trace
+    return rows, traces
 
 
 def metadata(machine: Machine, seed: int) -> dict[str, Any]:
@@ -140,7 +140,7 @@ def mean_interval(values: Array) -> Mean:
 
 
 def interval_text(number: Mean) -> str:
-    """A mean with its interval.
+    """A mean with its interval, if it has one.
 
     Example:
         >>> interval_text({"mean": 0.01234, "low": -0.5, "high": 41.267})
@@ -148,7 +148,8 @@ def interval_text(number: Mean) -> str:
     """
     numbers = [number[key] for key in ("mean", "low", "high")]
     texts = [f"{x:.4f}" if abs(x) < 1 else f"{x:.4g}" for x in numbers if x is not None]
-    return f"{texts[0]} ({texts[1]} to {texts[2]})" if len(texts) == 3 else "".join(texts)
+    alone = number["low"] in (None, number["mean"])
+    return "".join(texts[:1]) if alone else f"{texts[0]} ({texts[1]} to {texts[2]})"
 
 
 def column(runs: Sequence[Run], label: str) -> list[str]:
@@ -159,7 +160,7 @@ def column(runs: Sequence[Run], label: str) -> list[str]:
 def means(runs: Sequence[Run]) -> dict[str, dict[str, dict[str, Mean]]]:
     """Means over starts with intervals, by controller, sequence (also "all") and figure."""
     sequences = [*column(runs, "sequence"), "all"]
-    keys = [key for key in runs[0] if key not in LABELS]
+    keys = [key for key in runs[0] if key not in (*LABELS, "seed")]
     return {
         c: {s: {k: mean_interval(by_start(runs, c, s, k)) for k in keys} for s in sequences}
         for c in column(runs, "controller")

@@ -4,7 +4,7 @@ Angles are exact and velocities are means over a tick: encoders and estimators p
 """
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,21 +20,15 @@ RISE = 0.63  # paper's response times: 0.4 s and 0.1 s, read as the time to 63 %
 GAP_S = 30.0  # s, paper
 GAP_RUNS = 20  # assumed
 
-
-class Sweep(NamedTuple):
-    """A joint from stop to stop, (T,) each."""
-
-    q: Array  # rad
-    q_dot: Array  # rad/s
+Curves = Mapping[str, tuple[Array, Array]]  # x and y, (T,) each
 
 
 class SimulatorTests(NamedTuple):
     """The preliminary tests of one simulator with its last driven joint."""
 
-    sweeps: dict[str, Sweep]  # by PWM byte
-    coupling: dict[str, Sweep]  # at the command limit, alone and with the other joints
-    past_movement: dict[str, tuple[Array, Array]]  # time [s] and velocity [rad/s] around a step
-    response_time: dict[str, float | None]  # s, from idle and while moving
+    sweeps: Curves  # velocity [rad/s] over angle [rad], by PWM byte
+    coupling: Curves  # at the command limit, alone and with the other joints
+    past_movement: Curves  # velocity [rad/s] over time [s] around a step, from idle and moving
 
 
 class Motion(NamedTuple):
@@ -75,19 +69,17 @@ def preliminary_tests(machine: Machine, plant: Plant) -> SimulatorTests:
     u[4, others[-1:]] = limit
     *alone, together = sweeps(machine, plant, joint, u)
     names = [f"u = {encode_pwm(level)}" for level in u[:4, joint]]
-    steps = dict(zip(("idle", "moving"), step_velocities(machine, plant, joint).T, strict=True))
-    ticks = len(steps["idle"])
-    time = (np.arange(ticks) + 0.5 - ticks // 2) * machine.dt
+    steps = step_velocities(machine, plant, joint)
+    time = (np.arange(len(steps)) + 0.5 - len(steps) // 2) * machine.dt
     return SimulatorTests(
         dict(zip(names, alone, strict=True)),
         {"alone": alone[1], "with the others": together},
-        {name: (time, velocity) for name, velocity in steps.items()},
-        {name: response_time(velocity, machine.rate) for name, velocity in steps.items()},
+        {"idle": (time, steps[:, 0]), "moving": (time, steps[:, 1])},
     )
 
 
-def sweeps(machine: Machine, plant: Plant, joint: int, u: Array) -> list[Sweep]:
-    """A joint from stop to stop under each row of constant commands `u` (k, n).
+def sweeps(machine: Machine, plant: Plant, joint: int, u: Array) -> list[tuple[Array, Array]]:
+    """Angle and velocity of a joint from stop to stop under each row of constant commands `u`.
 
     The others begin amid their ranges. A sweep ends when the joint stands. Paper: Sec. 3.2
     """
@@ -97,11 +89,8 @@ def sweeps(machine: Machine, plant: Plant, joint: int, u: Array) -> list[Sweep]:
     ticks = round(SWEEP_S * machine.rate)
     angles = simulate(machine, plant, q, np.tile(u, (ticks, 1, 1)))[..., joint]
     velocities = np.diff(angles, axis=0) * machine.rate
-    result = []
-    for q_joint, q_dot in zip(angles[1:].T, velocities.T, strict=True):
-        end = 1 + np.max(np.flatnonzero(q_dot), initial=0)
-        result.append(Sweep(q_joint[:end], q_dot[:end]))
-    return result
+    ends = [1 + np.max(np.flatnonzero(q_dot), initial=0) for q_dot in velocities.T]
+    return [(angles[1 : end + 1, i], velocities[:end, i]) for i, end in enumerate(ends)]
 
 
 def step_velocities(machine: Machine, plant: Plant, joint: int) -> Array:
@@ -121,20 +110,18 @@ def step_velocities(machine: Machine, plant: Plant, joint: int) -> Array:
     return np.diff(simulate(machine, plant, q, u)[..., joint], axis=0) * machine.rate
 
 
-def response_time(velocity: Array, rate: float) -> float | None:
-    """Time [s] from the step to `RISE` of the change of velocity (T,); None: no change.
+def response_time(time: Array, velocity: Array) -> float | None:
+    """Time [s] from the step at 0 to `RISE` of the change of velocity; None: no change.
 
-    `velocity` is a column of `step_velocities`: means over a tick, taken at its middle, with lines
-    between them. No time is below 0.
+    Velocities are means over a tick, taken at its middle, with lines between them.
     """
-    after = velocity[len(velocity) // 2 - 1 :]
-    change = after.max() - after[0]
-    if change < 1e-3:
+    first = np.flatnonzero(time < 0)[-1]
+    time, change = time[first:], velocity[first:] - velocity[first]
+    if change.max() < 1e-3:
         return None
-    part = (after - after[0]) / change
-    at = int(np.argmax(part >= RISE))  # row k: the tick k - 1 after the step
-    back = (part[at] - RISE) / (part[at] - part[at - 1])
-    return float(max(at - 0.5 - back, 0) / rate)
+    at = int(np.argmax(change >= RISE * change.max()))
+    pair = slice(at - 1, at + 1)
+    return max(float(np.interp(RISE * change.max(), change[pair], time[pair])), 0.0)
 
 
 def sim_to_real(machine: Machine, both: Mapping[str, Plant], seed: int) -> Motion:
@@ -150,28 +137,3 @@ def sim_to_real(machine: Machine, both: Mapping[str, Plant], seed: int) -> Motio
     q, p = (of["nets"] - of["machine"] for of in (angles, tools))  # (T + 1, runs, ...)
     q_dot, v = (np.diff(x, axis=0) * machine.rate for x in (q, p))
     return Motion(q[1:], q_dot, p[1:], v)
-
-
-def numbers(machine: Machine, tests: Mapping[str, SimulatorTests], gap: Motion) -> dict[str, Any]:
-    """Numbers of both figures, for JSON [rad/s, s, m, m/s].
-
-    Of the gap these are the tool's errors in the first run, as in the figure, and over all runs.
-    """
-    p_error = np.linalg.norm(gap.p_tool, axis=-1).mean(axis=0)  # m, of each run
-    v_error = np.sqrt(np.mean(np.sum(gap.v_tool**2, axis=-1), axis=0))
-    runs = {"median": float(np.median(p_error)), "max": float(p_error.max()), "runs": len(p_error)}
-    return {
-        "joint": machine.names[machine.driven[-1]],
-        "sweep": {
-            u: {
-                f"{name}_peak": float(np.abs(of.sweeps[u].q_dot).max())
-                for name, of in tests.items()
-            }
-            for u in tests["nets"].sweeps
-        },
-        "response_time": {name: of.response_time for name, of in tests.items()},
-        "sim_to_real": {
-            "tool": {"position_error_mean": float(p_error[0]), "velocity_rmse": float(v_error[0])},
-            "tool_position_error_mean_of_runs": runs,
-        },
-    }

@@ -1,67 +1,80 @@
 """The report: one HTML page with the paper's figures. The page itself is in `report.html.j2`."""
 
 import base64
+import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from matplotlib import style
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
-from brokk_min._files import whole_file
+from brokk_min._files import SHIPPED, read_json, whole_file
 from brokk_min.evaluation import figures
-from brokk_min.evaluation.metrics import Traces, interval_text
+from brokk_min.evaluation.baselines import BY_HAND, OPTIMISED, STRONGEST
+from brokk_min.evaluation.metrics import COLUMNS, Traces, interval_text
 from brokk_min.evaluation.preliminary import Motion, SimulatorTests
 from brokk_min.evaluation.rollout import TITLES, valves_at_rest
 from brokk_min.evaluation.sequences import axis_sequences
-from brokk_min.machine import Machine
+from brokk_min.machine import BROKK_170, Machine
 
 Results = Mapping[str, Any]  # of `results.json`
-COLUMNS = {  # of the first table: figure of merit and its head
-    "velocity_error_mean": "velocity error [m/s]",
-    "off_axis_drift_max": "largest drift [m]",
-    "jerk_rms": "jerk [m/s³]",
-    "valve_travel": "valve travel [full strokes]",
-}
+Tests = Mapping[str, SimulatorTests]
+PAIRS = (("rl_paper", BY_HAND), ("rl_paper", OPTIMISED), ("rl", STRONGEST))  # within a class
+ROWS = (BY_HAND, OPTIMISED, "rl_paper", "rl", STRONGEST)
+BOUND = 0.0098  # m/s, of `benchmarks/perfect_model.py`, which knows the plant of the Brokk 170
 
 
-def write_report(out: Path, results: Results, drawn: Mapping[str, Figure], minutes: float) -> None:
-    """Write `report.html` to the folder `out`; `minutes` is what the chain took so far."""
-    images = {}
-    for name, figure in tqdm(drawn.items(), desc="draw", disable=None):
-        images[name] = base64.b64encode(figures.png(figure)).decode()
-    with whole_file(out / "report.html", "w") as file:
-        file.write(render(results, images, minutes))
-
-
-def draw(
-    machine: Machine,
-    results: Results,
-    tests: Mapping[str, SimulatorTests],
-    gap: Motion,
-    traces: Traces,
-) -> dict[str, Figure]:
-    """All figures of the page by name."""
+@style.context("default")  # not the settings of the owner for his own pictures
+def write_report(
+    out: Path, machine: Machine, results: Results, measured: tuple[Tests, Motion, Traces]
+) -> None:
+    """Write `report.html` to the folder `out`; `measured` is what the paper's figures show."""
+    tests, gap, traces = measured
     starts, kinds = np.array(results["starts"]), results["start_kinds"]
     run = kinds.index("workspace")  # the first from which all sequences can be followed
+    table = first_table(results)
     drawn = {
+        "errors": figures.plot_errors({c: table[c]["velocity_error_mean"] for c in ROWS}),
         "tests": figures.plot_tests(machine, tests),
         "gap": figures.plot_gap(machine, gap),
-        "starts": figures.plot_starts(machine, starts, kinds),
+        "starts": figures.plot_starts(machine, starts[np.array(kinds) == "workspace"]),
         "joints": figures.plot_joint_velocities(machine, traces, "x", run),
     }
     for axis in axis_sequences(machine):
         drawn[axis.name] = figures.plot_sequence(machine, traces, axis, starts[run], run)
-    return drawn
+    images = {name: png(figure) for name, figure in tqdm(drawn.items(), "draw", disable=None)}
+    with whole_file(out / "report.html", "w") as file:
+        file.write(render(results, images))
 
 
-def render(results: Results, images: Mapping[str, str], minutes: float) -> str:
+def png(figure: Figure) -> str:
+    """A figure as PNG in base64, the same text for the same figure."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=150, metadata={"Software": None})
+    return base64.b64encode(buffer.getvalue()).decode()
+
+
+def first_table(results: Results) -> Results:
+    """Means along x, y and z by controller: of these results, or of shipped ones for a trial."""
+    meta = results["meta"]
+    shipped = SHIPPED / meta["machine"] / "table.json"
+    trial = meta["effort"]["hours"] < 1 and shipped.exists()
+    table: Results = read_json(shipped, "JSON") if trial else results
+    return table["table"]  # type: ignore[no-any-return]
+
+
+def render(results: Results, images: Mapping[str, str]) -> str:
     """The page, with PNG `images` in base64 by name."""
     folder = Path(__file__).parent
     page = Environment(loader=FileSystemLoader(folder), autoescape=True, undefined=StrictUndefined)
     page.filters["interval"] = interval_text
-    values = {"results": results, "images": images, "minutes": minutes, "columns": COLUMNS}
-    template = page.get_template("report.html.j2")
-    return template.render(titles=TITLES, rest=valves_at_rest, **values)
+    page.globals.update(rows=ROWS, pairs=PAIRS, columns=COLUMNS, titles=TITLES, rest=valves_at_rest)
+    table = first_table(results)
+    bound = BOUND if results["meta"]["machine"] == BROKK_170.name else None
+    shipped = table is not results["table"]
+    values = {"results": results, "images": images, "table": table, "bound": bound}
+    return page.get_template("report.html.j2").render(shipped=shipped, **values)

@@ -3,13 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-from brokk_min.evaluation.baselines import BY_HAND, OPTIMISED, STRONGEST, with_dead_zone
-from brokk_min.evaluation.metrics import Controllers, Mean, by_start, evaluate, mean_interval
-from brokk_min.evaluation.rollout import TITLES
+from brokk_min.evaluation.baselines import with_dead_zone
+from brokk_min.evaluation.metrics import Controllers, Mean, evaluate, means
 from brokk_min.evaluation.sequences import Commands
 from brokk_min.machine import Array, Machine
-
-PAIRS = (("rl_paper", BY_HAND), ("rl_paper", OPTIMISED), ("rl", STRONGEST))  # within a class
 
 
 def scale_valves(machine: Machine, up: float, down: float) -> Machine:
@@ -44,17 +41,5 @@ def robustness(
     result: dict[str, dict[str, Mean]] = {}
     for name, varied in variations(machine).items():
         runs, _ = evaluate(varied, controllers, sequences, starts, seed)
-        errors = {c: by_start(runs, c, "all", "velocity_error_mean") for c in controllers}
-        result[name] = {c: mean_interval(error) for c, error in errors.items()}
+        result[name] = {c: of["all"]["velocity_error_mean"] for c, of in means(runs).items()}
     return result
-
-
-def leads(errors: dict[str, dict[str, Mean]]) -> dict[str, dict[str, float]]:
-    """By variation and pair of one class: how much less the policy's error is, as a fraction."""
-    return {
-        name: {
-            f"{TITLES[policy]} over {TITLES[pid]}": 1 - row[policy]["mean"] / row[pid]["mean"]  # type: ignore[operator]
-            for policy, pid in PAIRS
-        }
-        for name, row in errors.items()
-    }

@@ -4,14 +4,14 @@ Tuning never opens what is scored: only `task_sequences` has the seed of the sco
 `evaluation_starts` opens the file of scored starts, and `tuning_set` draws other starts and goals.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from brokk_min._files import SHIPPED, brief, read_csv
+from brokk_min._files import SHIPPED, brief, numbers, read_csv
 from brokk_min.env import terminated
 from brokk_min.evaluation.feasibility import MARGINS, feasible
 from brokk_min.jacobian import manipulability, manipulability_threshold
@@ -21,7 +21,6 @@ from brokk_min.machine import Array, Machine, require
 from brokk_min.settings import TaskConfig
 
 AXES = "xyz"
-KINDS = ("workspace", "limits", "extended")  # of starts, see `start_kinds`
 REST_SEED = 2026  # of the scored rests; nothing else draws from it
 SECONDS = 26.0  # of a scored sequence, assumed
 SHORTEST_REST, LONGEST_REST = 0.5, 10.0  # s, assumed
@@ -47,8 +46,8 @@ class Commands(NamedTuple):
     def for_starts(self, machine: Machine, starts: Array) -> Array:
         """Goals [m/s] (T, num, 3) from the starts [rad] (num, n).
 
-        Inward ones have x, y reversed where the tool starts at positive x, y. Otherwise the first
-        moves along +x and +y fit into the arm's reach only from one side of the slew range.
+        Inward ones have x, y reversed where the tool starts at positive x, y, because the first
+        moves along +x and +y would fit into the arm's reach from one side of the slew range only.
         """
         goals = np.repeat(self.goals[:, None], len(starts), axis=1)
         if not self.inward:
@@ -122,18 +121,18 @@ def shorten(machine: Machine, commands: Sequence[Commands], seconds: float) -> l
 def read_commands(path: Path, machine: Machine) -> list[Commands]:
     """Sequences of a CSV `sequence,time,vx,vy,vz` [s, m/s]; values hold until the next row.
 
-    The last row of a sequence marks its end. ValueError: no such table, or rows less than a tick
-    apart.
+    The last row of a sequence is its end. ValueError: no such table, or rows below a tick apart.
     """
     table = read_csv(path, "sequence", "time", "vx", "vy", "vz")
-    columns = finite(path, table, "time", "vx", "vy", "vz")
+    names = ("time", "vx", "vy", "vz")
+    columns = np.stack([numbers(path, name, table[name]) for name in names], axis=1)
     result = []
     for name in dict.fromkeys(table["sequence"].tolist()):
         rows = columns[table["sequence"] == name]
         time, velocity = rows[:, 0] - rows[0, 0], rows[:, 1:]
-        apart = len(time) > 1 and bool((np.diff(time) > 0.99 * machine.dt).all())
-        wanted = "two or more rows, each a tick or more after the one before"
-        require(apart, f"{path}: sequence {name}", wanted, brief(time.tolist()))
+        fits = len(time) > 1 and (np.diff(time) > 0.99 * machine.dt).all() and np.isfinite(rows)
+        wanted = "two or more rows of finite numbers, each a tick or more after the one before"
+        require(bool(np.all(fits)), f"{path}: sequence {name}", wanted, brief(time.tolist()))
         tick = np.arange(round(time[-1] * machine.rate))
         row = np.searchsorted(time, tick / machine.rate + 1e-6, "right") - 1
         result.append(Commands(name, velocity[row]))
@@ -145,38 +144,41 @@ def read_starts(path: Path, machine: Machine) -> Array:
 
     ValueError: an angle outside its joint's range, or a pose in the ground.
     """
-    starts = finite(path, read_csv(path, *machine.names), *machine.names)
+    table = read_csv(path, *machine.names)
+    starts = np.stack([numbers(path, name, table[name]) for name in machine.names], axis=1)
     for joint, q in zip(machine.joints, starts.T, strict=True):
-        wrong = np.flatnonzero((q < joint.q_min) | (q > joint.q_max))
-        where, wanted = f"{path}: {joint.name}", f"{joint.q_min:g} to {joint.q_max:g}"
-        require(not len(wrong), where, wanted, q[wrong[:1]])
+        wrong = q[~((q >= joint.q_min) & (q <= joint.q_max))]  # nan is, too
+        wanted = f"{joint.q_min:g} to {joint.q_max:g}"
+        require(not len(wrong), f"{path}: {joint.name}", wanted, wrong[:1])
     lowest = lowest_point(forward_kinematics(machine, starts))
     wanted = f"arms above {machine.ground} m"
     require(not terminated(machine, lowest).any(), str(path), wanted, f"{lowest.min():.3f} m")
     return starts
 
 
-def finite(path: Path, table: Mapping[str, NDArray[Any]], *names: str) -> Array:
-    """Columns of a table side by side, (rows, names); ValueError: a nan or inf is in one."""
-    for name in names:
-        fits = bool(np.isfinite(table[name]).all())
-        require(fits, f"{path}: {name}", "finite numbers", brief(table[name].tolist()))
-    return np.stack([table[name] for name in names], axis=1)
-
-
 def evaluation_starts(
     machine: Machine, num: int, sequences: Sequence[Commands], seed: int
 ) -> Array:
-    """The first `num` starts of the file that the package has for the machine, else drawn ones.
+    """Start poses [rad] (num, n): the first of the file that the package has for the machine.
 
-    ValueError: more starts than the file has, or too few that can follow the sequences.
+    Without a file they are random "workspace" poses from which ideal actuators follow all
+    sequences. ValueError: more starts than the file has, or too few that can follow.
     """
     path = SHIPPED / machine.name / "starts.csv"
-    if not path.exists():
-        return draw_starts(machine, num, sequences, np.random.default_rng(seed))
-    starts = read_starts(path, machine)
-    require(num <= len(starts), path.name, f"at most {len(starts)} starts", num)
-    return starts[:num]
+    if path.exists():
+        starts = read_starts(path, machine)
+        require(num <= len(starts), path.name, f"at most {len(starts)} starts", num)
+        return starts[:num]
+    rng = np.random.default_rng(seed)
+
+    def draw() -> tuple[Array]:
+        poses = draw_pose(machine, rng, POSES).round(4)
+        poses = poses[np.array(start_kinds(machine, poses)) == "workspace"]
+        for sequence in sequences:
+            poses = poses[feasible(machine, poses, sequence.for_starts(machine, poses))]
+        return (poses,)
+
+    return collected(machine, num, draw)[0]
 
 
 def start_kinds(machine: Machine, starts: Array) -> list[str]:
@@ -195,21 +197,6 @@ def start_kinds(machine: Machine, starts: Array) -> list[str]:
     at_limit = margin[:, machine.driven].min(axis=-1) < 0.15
     kinds: list[str] = np.select([extended, at_limit], ["extended", "limits"], "workspace").tolist()
     return kinds
-
-
-def draw_starts(
-    machine: Machine, num: int, sequences: Sequence[Commands], rng: np.random.Generator
-) -> Array:
-    """Random "workspace" poses [rad] (num, n) from which ideal actuators follow all sequences."""
-
-    def draw() -> tuple[Array]:
-        poses = draw_pose(machine, rng, POSES).round(4)
-        poses = poses[np.array(start_kinds(machine, poses)) == "workspace"]
-        for sequence in sequences:
-            poses = poses[feasible(machine, poses, sequence.for_starts(machine, poses))]
-        return (poses,)
-
-    return collected(machine, num, draw)[0]
 
 
 def tuning_set(machine: Machine, num: int, seed: int, seconds: float = 20.0) -> tuple[Array, Array]:

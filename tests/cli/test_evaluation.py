@@ -36,17 +36,16 @@ def folder(tmp_path):
     for i in range(4):
         weights += [np.zeros(sizes[i : i + 2], np.float32), np.zeros(sizes[i + 1], np.float32)]
     save_policy(tmp_path / "policy.npz", Policy({}, tuple(weights), NET, "paper"), BROKK_170)
-    known = pids(BROKK_170, NET)
     meta = baselines.gains_metadata(BROKK_170, NET)
-    baselines.write_gains(tmp_path / "gains.json", known, meta)
+    baselines.write_gains(tmp_path / "gains.json", pids(BROKK_170, NET), meta)
     (tmp_path / "plant.py").write_text(OBEDIENT)
     (tmp_path / "c.csv").write_text("sequence,time,vx,vy,vz\nup,0,0,0,0.1\nup,1,0,0,0\n")
     (tmp_path / "s.csv").write_text("q1,q2,q3,q4,q5\n0,0.5,0.58,1.71,1.24\n")
     return tmp_path
 
 
-def evaluate(folder, options="", starts="s.csv"):
-    files = f"--policy {folder}/policy.npz --commands {folder}/c.csv --starts {folder}/{starts}"
+def evaluate(folder, options=""):
+    files = f"--policy {folder}/policy.npz --commands {folder}/c.csv --starts {folder}/s.csv"
     return run(f"evaluate {files} {options}")
 
 
@@ -57,10 +56,8 @@ def test_evaluate__writes_what_it_used_and_prints_means(folder, capsys):
         assert evaluate(folder, f"--plant {plant} --json {out} --force") == 0
         written = json.loads(out.read_text())
         used = {"policy": "policy.npz", "commands": "c.csv", "starts": "s.csv"}
-        used["gains"] = "gains.json"
-        assert {key: written["meta"][key] for key in used} == {
-            key: str(folder / file) for key, file in used.items()
-        }
+        for key, file in (used | {"gains": "gains.json"}).items():
+            assert written["meta"][key] == str(folder / file)
         assert (written["meta"]["plant"], written["meta"]["machine"]) == (plant, "brokk170")
         names = ["rl", *pids(BROKK_170, NET)]
         assert [row["controller"] for row in written["runs"]] == names
@@ -78,7 +75,6 @@ def test_evaluate__writes_what_it_used_and_prints_means(folder, capsys):
     [
         ("--json {0}/gains.json", 2, "gains.json: expected no file (or --force), got one"),
         ("--json {0}/none/e.json", 2, "e.json: expected a file in an existing, writable folder"),
-        ("--save-gains {0}/a.json --gains {0}/gains.json", 2, "--save-gains: expected no --gains"),
         ("--num-starts 0", 2, "--num-starts: expected 1 or more, got 0"),
         ("--policy {0}/gains.json", 1, "gains.json: expected a readable .npz file of a policy"),
         ("--gains {0}/c.csv", 1, "c.csv: expected JSON"),
@@ -94,9 +90,7 @@ def test_evaluate__refuses(folder, capsys, options, status, message):
 
 
 def test_evaluate__tunes_pids_anew_and_again_by_what_the_file_says(folder, capsys, monkeypatch):
-    monkeypatch.setattr(baselines, "TUNING_RUNS", 1)
-    monkeypatch.setattr(baselines, "TUNING_SECONDS", 1.0)
-    monkeypatch.setattr(baselines, "GENERATIONS", 1)
+    monkeypatch.setattr(baselines, "EFFORT", (1, 1, 1.0))
     monkeypatch.setattr(baselines, "CANDIDATES", 6)
     untuned = {name: pid.gains for name, pid in pids(BROKK_170, NET).items()}
     monkeypatch.setattr(baselines, "first_gains", lambda *_: dict(untuned))
@@ -110,6 +104,12 @@ def test_evaluate__tunes_pids_anew_and_again_by_what_the_file_says(folder, capsy
     first, again = (json.loads(file.read_text()) for file in (first, again))
     assert first["meta"]["gains"] == again["meta"]["gains"] == "tuned now"
     assert again["runs"] == first["runs"]
+
+
+def test_evaluate__begins_at_poses_of_the_package(folder, capsys):
+    files = f"--policy {folder}/policy.npz --commands {folder}/c.csv"
+    assert run(f"evaluate {files} --num-starts 3") == 0
+    assert "means over 1 sequences from 2 workspace starts" in capsys.readouterr().out
 
 
 def test_table__is_of_workspace_starts_if_there_are_any():

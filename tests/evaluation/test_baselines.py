@@ -1,6 +1,7 @@
 """The classical controllers: their gains as vectors and files, and their tuning."""
 
 from dataclasses import replace
+from functools import partial
 from itertools import product
 from types import SimpleNamespace
 
@@ -106,14 +107,12 @@ def test_tune__finds_the_minimum_of_a_bowl_and_repeats_itself():
         x = np.sqrt((vectors - low) / (high - low))
         return np.sum((x - np.sqrt((goal - low) / (high - low))) ** 2, axis=-1)
 
-    result, costs = baselines.tune(start, bowl, 0, 60, "bowl")
-    assert bowl(result) == pytest.approx(costs[-1]) and costs[-1] < 1e-3 < costs[0]
+    result = baselines.tune(start, bowl, 0, 60)
+    assert bowl(result) < 1e-3 < bowl(baselines.tune(start, bowl, 0, 1))
     np.testing.assert_allclose(result, goal, atol=0.3)
     assert ((low <= result) & (result <= high)).all()
-    assert len(costs) == 60 and (np.diff(costs) <= 0).all()
-    again, _ = baselines.tune(start, bowl, 0, 60, "bowl")
-    np.testing.assert_array_equal(result, again)
-    assert not np.array_equal(result, baselines.tune(start, bowl, 1, 60, "bowl")[0])
+    np.testing.assert_array_equal(result, baselines.tune(start, bowl, 0, 60))
+    assert not np.array_equal(result, baselines.tune(start, bowl, 1, 60))
 
 
 def test_tuning_cost__is_the_mean_error_of_each_row_of_gains():
@@ -135,12 +134,12 @@ def test_tuning_cost__is_the_mean_error_of_each_row_of_gains():
 def test_tune_baseline__lowers_the_cost_on_its_own_runs(name):
     machine = replace(BROKK_170, rate=5.0, plant_dt=0.02)  # faster to simulate
     first = pids(machine, obedient_net(machine))[name]
-    gains, costs = baselines.tune_baseline(first, (1, 2, 2.0), 4)
-    assert len(costs) == 1 + (name == baselines.STRONGEST)
-    vectors = np.stack([baselines.gains_vector(of) for of in (first.gains, gains)])
-    cost = baselines.tuning_cost(first, tuning_set(machine, 2, 4, 2.0), 4, PLANT, vectors)
-    assert cost[1] == pytest.approx(costs[-1], rel=0.1)  # each candidate has noise of its own
-    assert cost[1] <= cost[0]
+    gains = baselines.gains_vector(baselines.tune_baseline(first, (1, 2, 2.0), 4))
+    cost = partial(baselines.tuning_cost, first, tuning_set(machine, 2, 4, 2.0), 4, PLANT)
+    generations = 1 + (name == baselines.STRONGEST)
+    np.testing.assert_array_equal(gains, baselines.tune(first.gains, cost, 4, generations))
+    before, after = cost(np.stack([baselines.gains_vector(first.gains), gains]))
+    assert after <= before
 
 
 def test_write_gains__reads_back(tmp_path):
@@ -162,8 +161,7 @@ def test_write_gains__reads_back(tmp_path):
     [
         ('"machine": "brokk170"', '"machine": "digger"', "machine: expected 'brokk170', got 'dig"),
         ('"actuator": "', '"actuator": "0', r"actuator: expected '\w+', got '0\w+'"),
-        ("0.4", "NaN", "pid_by_hand_raw: expected 13 finite gains, got"),
-        ('"feedback": [\n    0.4\n   ]', '"feedback": []', "pid_by_hand_raw: expected 13 finite"),
+        ('"kp"', '"kq"', "expected gains of"),
         ('"gains"', '"none"', "expected gains of"),
         ("{", "", "expected JSON"),
     ],

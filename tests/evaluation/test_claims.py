@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 
 from brokk_min.evaluation import claims
+from brokk_min.evaluation.preliminary import Motion, SimulatorTests
 from brokk_min.evaluation.rollout import TITLES
 
 HIGH, LOW, RAW = "jacobian_pid_k0.1", "pid_by_hand", "pid_by_hand_raw"
 PPO = "rl_paper"
 NEAR_ZERO = 0.001 * np.array([0, 1, 2, 0, 1, 2])  # spread over the starts
+TIME = 0.05 * (np.arange(60) - 29.5)
+TRUE, FALSE, UNKNOWN = "holds here", "does not hold here", "was not measured"
 
 
 def runs_with(error=None, drift=None):
@@ -26,87 +29,83 @@ def runs_with(error=None, drift=None):
     return rows
 
 
-def holds(result, pid, judged=TITLES[PPO]):
-    """Verdicts of the claims on what is judged, by their names."""
-    every = {claim.name: claim.holds().get(judged, {}) for claim in result}
-    return {name: of[pid] for name, of in every.items() if pid in of}
+def verdict(claim, controller):
+    """The part of a claim's verdict that is about one controller, or about one PID."""
+    parts = [part.partition(" for ") for part in claim["verdict"].split("; ")]
+    title = TITLES[controller]
+    (found,) = [text for text, _, of in parts if any(n.endswith(title) for n in of.split(" and "))]
+    return found
 
 
-def preliminary_numbers(up=0.24, down=0.45, idle=0.4, figure=0.03, median=0.02):
-    """Numbers of nets that behave as the paper's machine."""
-    times = {"idle": idle, "moving": 0.1}
-    peaks = {"u = 50": 0.1, "u = 80": up, "u = 175": down, "u = 205": 0.3}
-    return {
-        "joint": "q5",
-        "sweep": {u: {"machine_peak": 9.0, "nets_peak": v} for u, v in peaks.items()},
-        "response_time": {"nets": times},
-        "sim_to_real": {
-            "tool": {"position_error_mean": figure},
-            "tool_position_error_mean_of_runs": {"median": median},
-        },
-    }
+def step(seconds):
+    """A velocity that rises to 63 % in that time, if at all."""
+    return TIME, np.clip(0.63 * TIME / seconds, 0, 1) if seconds else 0 * TIME
 
 
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        ({}, [True, True, True]),
-        ({"down": 0.2}, [False, True, True]),
-        ({"idle": 0.15}, [True, False, True]),
-        ({"idle": None}, [True, None, True]),
-        ({"median": 0.06}, [True, True, False]),
-        ({"figure": 0.06}, [True, True, False]),
+        ({}, [TRUE, TRUE, TRUE]),
+        ({"down": 0.2}, [FALSE, TRUE, TRUE]),
+        ({"idle": 0.15}, [TRUE, FALSE, TRUE]),
+        ({"idle": None}, [TRUE, UNKNOWN, TRUE]),
+        ({"median": 0.06}, [TRUE, TRUE, FALSE]),
+        ({"figure": 0.06}, [TRUE, TRUE, FALSE]),
     ],
 )
 def test_net_claims__hold_where_nets_behave_as_the_papers_machine(change, expected):
-    result = claims.net_claims(preliminary_numbers(**change))
-    assert list(holds(result, "", "nets").values()) == expected
-    written = [claim.to_json() for claim in result]
-    assert [row["figure"] for row in written] == ["Fig. 2", "Fig. 2", "Fig. 5"]
-    texts = {True: "holds here", False: "does not hold here", None: "was not measured"}
-    assert written[1]["verdict"] == f"{texts[expected[1]]} for nets"
+    like = {"up": 0.24, "down": 0.45, "idle": 0.4, "figure": 0.03, "median": 0.02} | change
+    peaks = {"u = 50": 0.1, "u = 80": like["up"], "u = 175": -like["down"], "u = 205": -0.3}
+    sweeps = {u: (TIME, np.array([0.0, peak])) for u, peak in peaks.items()}
+    nets = SimulatorTests(sweeps, {}, {"idle": step(like["idle"]), "moving": step(0.1)})
+    distances = np.array([like["figure"], like["median"], like["median"]])
+    p = np.array([0.5, 1.5])[:, None, None] * distances[:, None] * [0.6, 0.8, 0.0]
+    result = claims.net_claims(nets, Motion(p, p, p, p))
+    assert [claim["verdict"] for claim in result] == [f"{text} for nets" for text in expected]
+    assert [claim["figure"] for claim in result] == ["Fig. 2", "Fig. 2", "Fig. 5"]
+    means = [n["mean"] for claim in result for n in claim["numbers"]["nets"].values()]
+    times = like["idle"] and pytest.approx(like["idle"] / 0.1)
+    ratio = pytest.approx(like["down"] / like["up"])
+    assert means == [ratio, times, *map(pytest.approx, distances[:2])]
 
 
 def test_task_claims__on_drift_along_x_are_of_each_controller():
     drift = {PPO: 0.02, HIGH: 0.03, LOW: 0.20, RAW: 0.3}
     still, fails, *_ = claims.task_claims(runs_with(drift=drift))
-    assert still.holds() == {TITLES[PPO]: {"": True}}
-    (of_pids,) = fails.holds().values()
-    assert of_pids == {TITLES[RAW]: True, TITLES[LOW]: True, TITLES[HIGH]: False}
-    assert still.numbers[TITLES[PPO]][""]["along x"]["mean"] == pytest.approx(0.021)
+    assert verdict(still, PPO) == TRUE
+    assert [verdict(fails, pid) for pid in (RAW, LOW, HIGH)] == [TRUE, TRUE, FALSE]
+    assert still["numbers"][TITLES[PPO]]["drift"]["mean"] == pytest.approx(0.021)
     drift[PPO] = 0.09
-    assert claims.task_claims(runs_with(drift=drift))[0].holds() == {TITLES[PPO]: {"": False}}
+    assert verdict(claims.task_claims(runs_with(drift=drift))[0], PPO) == FALSE
 
 
 @pytest.mark.parametrize(
     ("x", "z", "drift", "expected"),
     [
-        (0.01, 0.01, 0.1, [True, True, True]),
-        (0.01, 0.01, 0.3, [True, False, True]),  # drifts more along z
-        (0.03, 0.01, 0.1, [False, True, True]),  # worse along x, better along y and z
-        (0.01, 0.03, 0.1, [False, False, True]),
-        (0.04, 0.03, 0.1, [False, False, False]),
+        (0.01, 0.01, 0.1, [TRUE, TRUE, TRUE]),
+        (0.01, 0.01, 0.3, [TRUE, FALSE, TRUE]),  # drifts more along z
+        (0.03, 0.01, 0.1, [FALSE, TRUE, TRUE]),  # worse along x, better along y and z
+        (0.01, 0.03, 0.1, [FALSE, FALSE, TRUE]),
+        (0.04, 0.03, 0.1, [FALSE, FALSE, FALSE]),
     ],
 )
 def test_task_claims__on_error_are_of_each_sequence_and_figure(x, z, drift, expected):
     errors = {("x", PPO): x, ("z", PPO): z, PPO: 0.01, HIGH: 0.02, LOW: 0.05, RAW: 0.06}
     runs = runs_with(errors, {PPO: drift, HIGH: 0.2, LOW: 0.4, RAW: 0.4})
-    result = claims.task_claims(runs)
-    assert list(holds(result, TITLES[HIGH])) == ["tracking", "along_z", "outperforms"]
-    assert list(holds(result, TITLES[HIGH]).values()) == expected
-    assert set(holds(result, TITLES[LOW]).values()) == {True}
-    number = result[3].numbers[TITLES[PPO]][TITLES[HIGH]]["off_axis_drift_max along z"]
-    assert number["mean"] == pytest.approx(drift - 0.2)
-    one_start = claims.task_claims([run for run in runs if run["start"] == 0])
-    assert set(holds(one_start, TITLES[LOW]).values()) == {None}
+    result = claims.task_claims(runs)[2:]  # tracking, along z, all in all
+    assert [verdict(claim, HIGH) for claim in result] == expected
+    assert {verdict(claim, LOW) for claim in result} == {TRUE}
+    numbers = result[1]["numbers"][f"{TITLES[PPO]} against {TITLES[HIGH]}"]
+    assert numbers["off_axis_drift_max along z"]["mean"] == pytest.approx(drift - 0.2)
+    one_start = claims.task_claims([run for run in runs if run["start"] == 0])[2:]
+    assert {verdict(claim, LOW) for claim in one_start} == {UNKNOWN}
 
 
-def test_to_json__says_that_a_verdict_depends_on_the_tuning():
+def test_task_claims__say_by_hand_first_and_then_optimised():
     claim = claims.task_claims(runs_with({PPO: 0.03, HIGH: 0.02, LOW: 0.04, RAW: 0.05}))[-1]
-    written = claim.to_json()
-    assert written["verdict"] == (
-        "depends on the tuning for PPO, the paper's agent: it holds here with PID by hand, raw and "
-        "PID by hand, does not hold here with PID optimised, k = 0.1"
+    assert claim["verdict"] == (
+        "holds here for PPO, the paper's agent against PID by hand, raw and PID by hand; "
+        "does not hold here for PPO, the paper's agent against PID optimised, k = 0.1"
     )
-    measured = "to be below 0 m/s: velocity_error_mean along all of PPO, the paper's agent and PID"
-    assert measured in written["measured"]
+    measured = "to be below 0: velocity_error_mean along all of PPO, the paper's agent against PID"
+    assert measured in claim["measured"]

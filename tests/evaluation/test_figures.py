@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from brokk_min.evaluation import figures
-from brokk_min.evaluation.preliminary import Motion, SimulatorTests, Sweep
+from brokk_min.evaluation.preliminary import Motion, SimulatorTests
 from brokk_min.evaluation.sequences import axis_sequences
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
@@ -26,8 +26,8 @@ def test_plot_tests__shows_machine_above_nets():
     x = np.arange(3.0)
     rows = {}
     for k, kind in enumerate(("machine", "nets"), 1):
-        sweeps, coupling = {"u = 50": Sweep(x, k * x)}, {"alone": Sweep(x, -k * x)}
-        rows[kind] = SimulatorTests(sweeps, coupling, {"from idle": (x, k + x)}, {})
+        sweeps, coupling = {"u = 50": (x, k * x)}, {"alone": (x, -k * x)}
+        rows[kind] = SimulatorTests(sweeps, coupling, {"from idle": (x, k + x)})
     figure = figures.plot_tests(BROKK_170, rows)
     assert ylabels(figure) == ["velocity q5 [rad/s]"] * 6
     labels = ["q5 [rad]", "q5 [rad]", "time after the step [s]"]
@@ -74,14 +74,27 @@ def test_plot_sequence__is_relative_to_where_the_tool_began():
 
 def test_plot_starts__draws_arms_from_the_side_and_from_above():
     starts = np.array([[0.5 * np.pi, *POSE[1:]], [0.0, *POSE[1:]], POSE])
-    figure = figures.plot_starts(BROKK_170, starts, ["limits", "workspace", "limits"])
+    figure = figures.plot_starts(BROKK_170, starts)
     side, top = ([np.array(arm.get_data()) for arm in ax.get_lines()] for ax in figure.axes)
     for arm in side[:3]:
         np.testing.assert_allclose(arm, side[0], atol=1e-9)  # turned arms look the same
         np.testing.assert_allclose(arm[:, -1], [3.05, 1.01], atol=0.01)
     assert side[3][1].tolist() == [0, 0]  # the ground
-    ends = [(3.05, 0), (0, 3.05), (3.05 * np.cos(1.5), 3.05 * np.sin(1.5))]  # by kind
+    ends = [(0, 3.05), (3.05, 0), (3.05 * np.cos(1.5), 3.05 * np.sin(1.5))]
     for arm, end in zip(top, ends, strict=True):
         np.testing.assert_allclose(arm[:, -1], end, atol=0.01)
-    legend = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
-    assert legend == ["workspace", "limits"]
+
+
+def test_plot_errors__has_a_row_with_an_interval_for_each_controller():
+    errors = {"rl": {"mean": 2.0, "low": 1.0, "high": 3.0}}
+    errors["pid_by_hand"] = {"mean": 5.0, "low": 4.0, "high": 6.0}
+    (ax,) = figures.plot_errors(errors).axes
+    assert [text.get_text() for text in ax.get_yticklabels()] == [
+        "PPO, our interface",
+        "PID by hand",
+    ]
+    (container,) = ax.containers
+    (mean, _, (bars,)) = container
+    assert np.array(mean.get_data()).tolist() == [[2, 5], [0, 1]]
+    ends = [segment[:, 0].tolist() for segment in bars.get_segments()]
+    assert ends == [[1, 3], [4, 6]]

@@ -97,18 +97,22 @@ def test_evaluate__gives_rows_in_order_with_their_figures():
     assert pid < idle
 
 
-def test_evaluate__gives_each_length_of_sequences_the_same_noise():
-    """One batch per length: rows stay with their names."""
+def test_evaluate__ends_each_sequence_at_its_own_length():
+    """All are one batch with the same noise, whatever the length of others."""
     mixed = shortened(40)
     mixed[1] = shortened(30)[1]
     rows, traces = m.evaluate(BROKK_170, {"pid": PID}, mixed, STARTS, 0)
-    assert [row["sequence"] for row in rows] == ["x", "x", "y", "y", "z", "z"]
-    alone, trace = m.evaluate(BROKK_170, {"pid": PID}, mixed[1:2], STARTS, 0)
-    assert [row["velocity_error_mean"] for row in alone] == [
-        row["velocity_error_mean"] for row in rows[2:4]
-    ]
-    np.testing.assert_array_equal(trace["pid", "y"].q, traces["pid", "y"].q)
-    assert traces["pid", "z"].v_tool.shape == (40, 2, 3)
+    longer, same = m.evaluate(BROKK_170, {"pid": PID}, shortened(40), STARTS, 0)
+    for axis in "xz":
+        np.testing.assert_array_equal(traces["pid", axis].q, same["pid", axis].q)
+    assert rows[4:] == longer[4:]
+    assert traces["pid", "y"].v_tool.shape == (30, 2, 3)
+    np.testing.assert_array_equal(traces["pid", "y"].u, same["pid", "y"].u[:30])
+    expected = np.linalg.norm(
+        mixed[1].for_starts(BROKK_170, STARTS) - traces["pid", "y"].v_tool, axis=-1
+    )
+    errors = [row["velocity_error_mean"] for row in rows[2:4]]
+    np.testing.assert_allclose(errors, expected.mean(axis=0))
 
 
 def test_mean_interval__is_students():
@@ -117,7 +121,9 @@ def test_mean_interval__is_students():
     result = m.mean_interval(values)
     np.testing.assert_allclose([result["low"], result["high"]], expected)
     assert result["mean"] == pytest.approx(values.mean())
-    assert m.mean_interval(np.array([1.0])) == {"mean": 1.0, "low": None, "high": None}
+    one = m.mean_interval(np.array([1.0]))
+    assert one == {"mean": 1.0, "low": None, "high": None} and m.interval_text(one) == "1"
+    assert m.interval_text({"mean": 0.5, "low": 0.5, "high": 0.5}) == "0.5000"
 
 
 def test_means__are_over_starts_of_the_means_of_their_runs():

@@ -1,6 +1,5 @@
 """Preliminary tests and the sim-to-real gap, by hand, on the plant, and on any machine."""
 
-import json
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -10,7 +9,6 @@ from helpers_machines import small_net
 
 from brokk_min.actuator import PLANT
 from brokk_min.evaluation import preliminary
-from brokk_min.evaluation.preliminary import Motion
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
 from examples.mini_excavator import MINI_EXCAVATOR
@@ -48,11 +46,11 @@ def of_plant():
 
 def test_sweeps__go_from_stop_to_stop_at_the_papers_speeds(of_plant):
     for command, end, peak in (("u = 80", HIGH, 0.24), ("u = 175", LOW, -0.45)):
-        sweep = of_plant.sweeps[command]
-        assert sweep.q[-1] == end[4] and sweep.q_dot[-1] != 0
-        assert np.all(sweep.q_dot * peak >= 0)
-        assert np.abs(sweep.q_dot).max() == pytest.approx(abs(peak), rel=0.04)
-        np.testing.assert_allclose(np.diff(sweep.q) * 20, sweep.q_dot[1:], atol=1e-9)
+        q, q_dot = of_plant.sweeps[command]
+        assert q[-1] == end[4] and q_dot[-1] != 0
+        assert np.all(q_dot * peak >= 0)
+        assert np.abs(q_dot).max() == pytest.approx(abs(peak), rel=0.04)
+        np.testing.assert_allclose(np.diff(q) * 20, q_dot[1:], atol=1e-9)
 
 
 def test_preliminary_tests__move_the_last_driven_joint_at_two_levels():
@@ -65,7 +63,7 @@ def test_preliminary_tests__move_the_last_driven_joint_at_two_levels():
     np.testing.assert_array_equal(q[:, 4], [LOW[4], LOW[4], HIGH[4], HIGH[4], LOW[4]])
     np.testing.assert_allclose(q[:, :4], np.tile(((LOW + HIGH) / 2)[:4], (5, 1)))
     assert list(tests.sweeps) == ["u = 50", "u = 80", "u = 175", "u = 205"]
-    speeds = [sweep.q_dot[0] for sweep in tests.sweeps.values()]
+    speeds = [q_dot[0] for _, q_dot in tests.sweeps.values()]
     assert speeds == pytest.approx([0.25, 0.25, -0.5, -0.5])
     assert list(tests.coupling) == ["alone", "with the others"]
     assert tests.coupling["alone"] is tests.sweeps["u = 80"]
@@ -73,7 +71,6 @@ def test_preliminary_tests__move_the_last_driven_joint_at_two_levels():
     np.testing.assert_allclose(time, 0.05 * (np.arange(60) - 29.5))
     np.testing.assert_allclose(velocity, np.where(time < 0, 0, 0.25), atol=1e-9)
     np.testing.assert_allclose(tests.past_movement["moving"][1], 0.25)
-    assert list(tests.response_time) == ["idle", "moving"]
 
 
 def test_step_velocities__steps_the_joint_alone_from_behind():
@@ -89,7 +86,7 @@ def test_step_velocities__steps_the_joint_alone_from_behind():
 
 
 @pytest.mark.parametrize(
-    ("velocity", "expected"),
+    ("velocity", "expected"),  # six ticks, of which three are after the step
     [
         # 63 % is reached between the middles of the first two ticks after the step
         ([0, 0, 0, 0.05, 0.09, 0.1], 0.05 * (0.5 + (0.063 - 0.05) / 0.04)),
@@ -98,13 +95,16 @@ def test_step_velocities__steps_the_joint_alone_from_behind():
     ],
 )
 def test_response_time__by_hand(velocity, expected):
-    assert preliminary.response_time(np.array(velocity), 20.0) == pytest.approx(expected)
+    time = 0.05 * (np.arange(6) - 2.5)
+    found = preliminary.response_time(time, np.array(velocity))
+    assert found == (expected and pytest.approx(expected))
 
 
 def test_preliminary_tests__of_the_plant_have_the_papers_response_times(of_plant):
-    assert of_plant.response_time["idle"] == pytest.approx(0.40, abs=0.01)
-    assert of_plant.response_time["moving"] == pytest.approx(0.105, abs=0.01)
-    alone, together = (sweep.q_dot[:40] for sweep in of_plant.coupling.values())
+    times = {n: preliminary.response_time(*of) for n, of in of_plant.past_movement.items()}
+    assert times["idle"] == pytest.approx(0.40, abs=0.01)
+    assert times["moving"] == pytest.approx(0.105, abs=0.01)
+    alone, together = (q_dot[:40] for _, q_dot in of_plant.coupling.values())
     np.testing.assert_allclose(together, alone, atol=0.002)  # "marginal and neglectable"
 
 
@@ -136,29 +136,10 @@ def test_sim_to_real__is_between_tools_where_the_arms_end(machine):
     np.testing.assert_allclose(gap.v_tool, -20 * np.diff(p, axis=0), atol=1e-12)
 
 
-def test_numbers__of_another_machine_are_json():
+def test_run__of_another_machine():
     machine = replace(MINI_EXCAVATOR, plant_dt=0.02)  # two Euler steps a tick: fast
     net = small_net(machine, np.random.default_rng(0), machine.names)
     tests, gap = preliminary.run(machine, net, 0)
-    result = preliminary.numbers(machine, tests, gap)
-    json.dumps(result, allow_nan=False)
-    assert result["joint"] == machine.names[machine.driven[-1]] and len(result["sweep"]) == 4
-    assert set(result["response_time"]) == {"machine", "nets"}
+    assert list(tests) == ["machine", "nets"] and len(tests["nets"].sweeps) == 4
     assert gap.q.shape == (30 * machine.rate, 20, machine.n)
     assert not gap.q[..., machine.locked].any()
-    for u, row in result["sweep"].items():
-        peaks = [np.abs(tests[k].sweeps[u].q_dot).max() for k in ("machine", "nets")]
-        assert [row["machine_peak"], row["nets_peak"]] == peaks
-
-
-def test_numbers__of_the_gap_by_hand(of_plant):
-    """Two ticks, three runs; run k is off by k + 1 as much, and the first is in the figure."""
-    size = np.arange(1, 4)[:, None]
-    p = np.array([0.3, 0.5])[:, None, None] * size * np.array([0.6, 0.8, 0.0])
-    result = preliminary.numbers(BROKK_170, {"nets": of_plant}, Motion(p, p, p, 2 * p))
-    assert result["sim_to_real"]["tool"] == {
-        "position_error_mean": pytest.approx(0.4),
-        "velocity_rmse": pytest.approx(2 * np.sqrt((0.09 + 0.25) / 2)),
-    }
-    spread = {"median": pytest.approx(0.8), "max": pytest.approx(1.2), "runs": 3}
-    assert result["sim_to_real"]["tool_position_error_mean_of_runs"] == spread

@@ -1,6 +1,5 @@
 """The chain, small but whole: the same bits twice, every run with its numbers, one page."""
 
-import io
 import json
 import re
 from dataclasses import replace
@@ -10,7 +9,7 @@ import pytest
 from helpers_cli import run
 from helpers_machines import one_by_one
 
-from brokk_min.evaluation import baselines, figures, report, reproduce
+from brokk_min.evaluation import baselines, report, reproduce
 from brokk_min.evaluation.claims import TEXTS
 from brokk_min.evaluation.reproduce import Budget
 from brokk_min.evaluation.robustness import variations
@@ -21,18 +20,18 @@ from brokk_min.learning.policy import POLICIES, load_policy
 from brokk_min.machine import BROKK_170
 
 COARSE = replace(BROKK_170, rate=10.0, plant_dt=0.025)  # four Euler steps a tick: fast
-TINY = Budget(0.004, 20, 8192, 1, 1, 4, 2.5)
+TINY = Budget(0.004, 20, 8192, (1, 1, 2.5), 4, 2.5)
 ERROR = "velocity_error_mean"
 PIDS = ["pid_by_hand_raw", "pid_by_hand", "jacobian_pid_k0.1", "jacobian_pid_k0.05"]
 PIDS.append("jacobian_pid_ff_integral")
+PNG = report.png
 
 
 def coarse_png(figure):
     """Drawn once, without a layout that needs a second time: fast."""
     figure.set_layout_engine("none")
     figure.set_dpi(20)
-    figure.savefig(buffer := io.BytesIO(), format="png")
-    return buffer.getvalue()
+    return PNG(figure)
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +40,7 @@ def folder(tmp_path_factory):
     out = tmp_path_factory.mktemp("a b") / "new"  # a space in the path
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(reproduce, "side_by_side", one_by_one)
-        patch.setattr(figures, "png", coarse_png)
+        patch.setattr(report, "png", coarse_png)
         reproduce.reproduce(COARSE, out, TINY, 3)
     return out
 
@@ -61,7 +60,7 @@ def test_reproduce__gives_the_same_results_twice(folder, tmp_path, monkeypatch, 
     )
     out = tmp_path / "results"
     assert run(f"reproduce --quick --machine '{tmp_path}/m.py:COARSE' --seed 3 --out", out) == 0
-    for name in ("log.npz", "net.npz", "policy.npz", "gains.json", "results.json"):
+    for name in ("log.npz", "net.npz", "policy.npz", "gains.json", "results.json", "table.json"):
         assert (folder / name).read_bytes() == (out / name).read_bytes(), name
     assert capsys.readouterr().out.endswith(f"{out / 'results.json'}\n")
 
@@ -94,13 +93,13 @@ def test_reproduce__results_hold_every_run_with_its_figures(results):
     mean = results["task_space"]["means"]["rl"]["all"][ERROR]["mean"]
     assert mean == pytest.approx(np.mean([run[ERROR] for run in scored]))
     assert set(results["robustness"]) == set(variations(BROKK_170))
-    assert list(results["leads"]) == list(results["robustness"])
-    assert set(results["nets"]) == {"net", "net_paper"}
+    along = [run[ERROR] for run in scored if run["sequence"] in "xyz"]
+    assert results["table"]["rl"][ERROR]["mean"] == pytest.approx(np.mean(along))
 
 
 def test_reproduce__answers_each_sentence_of_the_paper_on_one_page(folder, results):
     sentences = [claim["paper"] for claim in results["claims"]]
     assert sentences == [text["paper"] for text in TEXTS.values()]
     page = (folder / "report.html").read_text()
-    assert len(re.findall(r'src="data:image/png;base64,iVBOR', page)) == 7
+    assert len(re.findall(r'src="data:image/png;base64,iVBOR', page)) == 8
     assert page.count("<blockquote>") == len(TEXTS)

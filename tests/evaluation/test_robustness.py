@@ -1,11 +1,10 @@
 """Robustness: machines that differ in one thing each, and the table over them."""
 
 import numpy as np
-import pytest
 from helpers_machines import Idle, obedient_net, pids
 
 from brokk_min.evaluation.metrics import by_start, evaluate, mean_interval
-from brokk_min.evaluation.robustness import leads, robustness, variations
+from brokk_min.evaluation.robustness import robustness, variations
 from brokk_min.evaluation.sequences import task_sequences
 from brokk_min.machine import BROKK_170
 
@@ -48,12 +47,3 @@ def test_robustness__has_a_row_for_each_variation_and_controller():
     errors = {name: row["pid"]["mean"] for name, row in table.items()}
     assert errors["nominal"] < min(errors["delay +50 ms"], errors["dead zone 10 %"])
     assert table["delay +50 ms"]["idle"] == table["nominal"]["idle"]
-
-
-def test_leads__are_of_errors_within_a_class():
-    errors = {"rl": 0.9, "rl_paper": 1.5, "pid_by_hand": 3.0, "jacobian_pid_k0.1": 2.0}
-    errors["jacobian_pid_ff_integral"] = 1.0
-    row = {name: {"mean": mean} for name, mean in errors.items()}
-    found = leads({"nominal": row})["nominal"]
-    assert list(found.values()) == pytest.approx([0.5, 0.25, 0.1])
-    assert list(found)[2] == "PPO, our interface over strongest PID"

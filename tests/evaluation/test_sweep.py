@@ -1,6 +1,7 @@
 """Many seeds: nothing is done twice; their table."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -29,32 +30,26 @@ def short(monkeypatch):
     monkeypatch.setattr(sweep, "task_sequences", lambda machine: SEQUENCES)
 
 
-def test_run_seed__trains_as_train_policy_and_scores_its_policy(tmp_path):
-    rows = sweep.run_seed(BROKK_170, NET, RECIPE, tmp_path, 2, 4)
-    policy = train_policy(BROKK_170, NET, RECIPE, 4, tmp_path / "alone.npz")
-    assert (tmp_path / "seed_4.npz").read_bytes() == (tmp_path / "alone.npz").read_bytes()
-    controllers = {"rl": PolicyController(BROKK_170, policy)}
-    assert rows == metrics.evaluate(BROKK_170, controllers, SEQUENCES, POSES, 0)[0]
-
-
-def test_run_seed__refuses_results_of_another_training(tmp_path):
+def test_run_seed__refuses_policies_of_another_training(tmp_path):
     sweep.run_seed(BROKK_170, NET, RECIPE, tmp_path, 2, 4)
-    with pytest.raises(ValueError, match=r"seed_4\.json: starts: expected 1, got 2"):
-        sweep.run_seed(BROKK_170, NET, RECIPE, tmp_path, 1, 4)
+    other = replace(RECIPE, task=TaskConfig(episode_s=0.8))
+    with pytest.raises(ValueError, match=r"seed_4\.npz: recipe: expected .*0\.8.*, got .*0\.6"):
+        sweep.run_seed(BROKK_170, NET, other, tmp_path, 2, 4)
 
 
-def rows(error):
+def rows(seed, error):
     """Two sequences from three starts, of which two count."""
     starts = (("workspace", error), ("limits", 99.0), ("workspace", error + 1))
     return [
-        {"controller": "rl", "sequence": s, "start": i, "kind": kind} | dict.fromkeys(sweep.KEYS, e)
+        {"controller": "rl", "sequence": s, "start": i, "kind": kind, "seed": seed}
+        | dict.fromkeys(metrics.COLUMNS, e)
         for s in "xy"
         for i, (kind, e) in enumerate(starts)
     ]
 
 
 def test_over_seeds__counts_a_seed_once():
-    table = sweep.over_seeds({0: rows(1.0), 7: rows(3.0)})
+    table = sweep.over_seeds(rows(0, 1.0) + rows(7, 3.0))
     # two seeds, 1.5 and 3.5: half of 12.7062 x sqrt(2) / sqrt(2) x 2
     expected = {"mean": 2.5, "low": -10.2062, "high": 15.2062}
     assert list(table) == ["x", "y", "all"]
@@ -62,13 +57,18 @@ def test_over_seeds__counts_a_seed_once():
     assert "velocity_error_mean      2.5 (-10.21 to 15.21)" in sweep.show(table)
 
 
-def test_sweep__does_nothing_twice(tmp_path):
+def test_sweep__trains_and_scores_each_seed_once(tmp_path):
     arguments = (BROKK_170, NET, RECIPE, [3, 4], tmp_path / "new", 2)
     table = sweep.sweep(*arguments)
-    names = [f"seed_{n}.{end}" for n in (3, 4) for end in ("json", "npz", "npz.csv")]
+    names = [f"seed_{n}.{end}" for n in (3, 4) for end in ("npz", "npz.csv")]
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == [*names, "sweep.json"]
     times = [(tmp_path / "new" / name).stat().st_mtime_ns for name in names]
     assert sweep.sweep(*arguments) == table
     assert [(tmp_path / "new" / name).stat().st_mtime_ns for name in names] == times
-    written = json.loads((tmp_path / "new" / "sweep.json").read_text())
-    assert [row["seed"] for row in written["runs"]] == [3] * 6 + [4] * 6
+    policy = train_policy(BROKK_170, NET, RECIPE, 4, tmp_path / "alone.npz")
+    assert (tmp_path / "new/seed_4.npz").read_bytes() == (tmp_path / "alone.npz").read_bytes()
+    controllers = {"rl": PolicyController(BROKK_170, policy)}
+    alone, _ = metrics.evaluate(BROKK_170, controllers, SEQUENCES, POSES, 0)
+    written = json.loads((tmp_path / "new" / "sweep.json").read_text())["runs"]
+    assert [row["seed"] for row in written] == [3] * 6 + [4] * 6
+    assert written[6:] == [{"seed": 4} | row for row in alone]
