@@ -28,6 +28,16 @@ STIFFNESS = 6e6  # N per m/s by which a cylinder is slower than the flow into it
 LOAD_SHARE = 0.3  # of a load's effect on the flow, which the pressure compensators leave
 TAU = 0.05  # s, time constant of the flow into a cylinder
 WHOLE = mujoco.mjtState.mjSTATE_FULLPHYSICS
+SCENE = """
+  <visual><headlight ambient=".6 .6 .6"/></visual>
+  <asset><texture type="skybox" builtin="flat" rgb1="1 1 1" width="8" height="8"/></asset>
+  <worldbody>
+    <light pos="4 -4 8" dir="-4 4 -8"/>
+    <geom type="plane" size="9 9 1" rgba=".8 .76 .68 1"/>
+    <geom type="box" pos="0 0 .5" size=".5 .4 .3" rgba=".2 .2 .22 1"/>
+  </worldbody>"""
+TENDON = """
+  <spatial name="{0}" width=".04"><site site="foot_{0}"/><site site="rod_{0}"/></spatial>"""
 
 
 class State(NamedTuple):
@@ -106,7 +116,6 @@ def build(machine: Machine, load: float, slope: float) -> tuple[mujoco.MjModel, 
     for i in reversed(range(machine.n)):  # each link holds the next one
         links = link(machine, i, links)
     of_tendons = [joint.name for joint in joints if joint.cylinder_base]
-    sites = '<spatial name="{0}"><site site="foot_{0}"/><site site="rod_{0}"/></spatial>'
     model = mujoco.MjModel.from_xml_string(f"""
         <mujoco>
           <compiler angle="radian"/>
@@ -114,8 +123,9 @@ def build(machine: Machine, load: float, slope: float) -> tuple[mujoco.MjModel, 
             gravity="{9.81 * np.sin(tilt)} 0 {-9.81 * np.cos(tilt)}">
             <flag contact="disable"/>
           </option>
-          <worldbody><light pos="3 -3 6"/>{links}</worldbody>
-          <tendon>{"".join(sites.format(name) for name in of_tendons)}</tendon>
+          {SCENE}
+          <worldbody>{links}</worldbody>
+          <tendon>{"".join(TENDON.format(name) for name in of_tendons)}</tendon>
           <actuator>{"".join(cylinder(machine, joint) for joint in joints)}</actuator>
           <sensor>{"".join(f'<actuatorfrc actuator="{name}"/>' for name in machine.names)}</sensor>
         </mujoco>""")
@@ -137,7 +147,8 @@ def link(machine: Machine, i: int, rest: str) -> str:
           <site name="foot_{j.name}" pos="{feet}"/>
           <body name="{j.name}">
             <joint name="{j.name}" axis="0 0 1" range="{j.q_min} {j.q_max}"/>
-            <geom type="capsule" size="0.1" fromto="0 0 0 {j.a} 0 {j.d}" mass="{MASSES[i]}"/>
+            <geom type="capsule" size="0.1" fromto="0 0 0 {j.a} 0 {j.d}" mass="{MASSES[i]}"
+              rgba=".85 .45 .1 1"/>
             <site name="rod_{j.name}" pos="{rods}"/>{rest}
           </body>
         </frame>"""

@@ -1,6 +1,7 @@
 """The walkthrough is true: its blocks run in order, are short, print and draw what stands below.
 
-`python tests/paper/test_walkthrough.py` writes what the blocks print, and their figures.
+`python tests/paper/test_walkthrough.py` writes what the blocks print, their figures, and the page
+as a notebook.
 """
 
 import io
@@ -11,6 +12,7 @@ from contextlib import chdir, redirect_stdout
 from pathlib import Path
 from unittest import mock
 
+import jupytext
 import matplotlib
 import numpy as np
 import pytest
@@ -74,6 +76,20 @@ def test_figures__are_those_of_the_blocks(ran: Ran) -> None:
         np.testing.assert_allclose(got, wanted, atol=2, err_msg=f"{name}: run `make docs`")
 
 
+def test_notebook__has_the_text_and_the_blocks_of_the_page() -> None:
+    assert PAGE.with_suffix(".ipynb").read_text() == notebook(), "run `make docs`"
+
+
+def notebook() -> str:
+    """The page as a notebook, by jupytext."""
+    page = jupytext.reads(PAGE.read_text(), "md")
+    page.metadata = {"kernelspec": {"name": "python3", "display_name": "Python 3"}}
+    for number, cell in enumerate(page.cells):
+        cell["id"] = f"cell-{number}"  # not a random one
+    text: str = jupytext.writes(page, "ipynb")
+    return text
+
+
 def write() -> None:
     """Put what the blocks print below them, and what they draw into figures/."""
     printed, figures = run([code for code, _ in BLOCK.findall(PAGE.read_text())])
@@ -87,6 +103,7 @@ def write() -> None:
     FIGURES.mkdir(exist_ok=True)
     for name, figure in figures.items():
         (FIGURES / name).write_text(figure)
+    PAGE.with_suffix(".ipynb").write_text(notebook())
 
 
 if __name__ == "__main__":
