@@ -14,10 +14,10 @@ from tyro.conf import OmitArgPrefixes, Positional
 from brokk_min._files import brief, located, write_json
 from brokk_min.can.drive_log import log_for_fit, read_frames
 from brokk_min.cli.options import Command, PlantName, check, find_plant
-from brokk_min.identification import excitation, logs
+from brokk_min.identification import columns, excitation, logs
 from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
 from brokk_min.identification.net_file import load_net, save_net
-from brokk_min.machine import BROKK_170, PWM_MAX, Machine, require
+from brokk_min.machine import BROKK_170, Machine, require
 
 TABLES = (".csv", ".npz")
 
@@ -43,44 +43,67 @@ class Collect(Command):
         print(f"{self.out}: {len(log.recordings)} recordings of {', '.join(log.joints)}")
 
 
-def read_logs(paths: Sequence[Path], machine: Machine) -> tuple[logs.Log, Machine | None]:
-    """One log of tables and drives; the machine if the log has its joints, which it orders.
+@dataclass(kw_only=True)
+class ReadsLogs(Command):
+    """Options of commands that read logs."""
 
-    ValueError: other joints than those of a machine that is not the default one.
-    """
-    check(len(paths) > 0, "LOGS", "one file or more", "none")
-    found = {}
-    for path in paths:
-        with located(path):
-            if path.suffix.lower() in TABLES:
-                found[path] = logs.read_log([path], machine.velocity_samples, rate=machine.rate)
-            else:
-                found[path] = log_for_fit(machine, read_frames(path))
-    log = logs.join_logs(found)
-    if machine == BROKK_170 and set(log.joints) != set(machine.names):
-        return log, None
-    with located(*paths):
-        return logs.in_order(log, machine.names), machine
+    map: str = ""  # Columns and units, as boom=Boom_ang:deg,u_boom=Lever:percent,time=Zeit:ms.
+    topics: tuple[str, str] = ("/joint_states", "/commands")  # Angles and commands, of ROS.
+
+    def read_logs(self, paths: Sequence[Path]) -> tuple[logs.Log, Machine | None]:
+        """One log of tables and drives; the machine if the log has its joints, which it orders.
+
+        ValueError: other joints than those of a machine that is not the default one.
+        """
+        check(len(paths) > 0, "LOGS", "one file or more", "none")
+        machine = self.find_machine()
+        fastest = dict(zip(machine.names, machine.q_dot_max.tolist(), strict=True))
+        found = {}
+        for path in paths:
+            with located(path):
+                if is_ros(path) or path.suffix.lower() in TABLES:
+                    window, rate = machine.velocity_samples, machine.rate
+                    found[path] = logs.read_log([path], window, rate, fastest, self.read_table)
+                else:
+                    found[path] = log_for_fit(machine, read_frames(path))
+        log = logs.join_logs(found)
+        if machine == BROKK_170 and set(log.joints) != set(machine.names):
+            return log, None
+        with located(*paths):
+            return logs.in_order(log, machine.names), machine
+
+    def read_table(self, path: Path) -> dict[str, Any]:
+        """The columns of a table or of a recording of ROS."""
+        mapped = columns.parse_map(self.map)
+        if not is_ros(path):
+            return columns.load_table(path, mapped)
+        from brokk_min.identification.ros_logs import read_ros
+
+        return columns.to_columns(path, read_ros(path, *self.topics), mapped)
+
+
+def is_ros(path: Path) -> bool:
+    """Is this a folder or a file of ROS, by its name?"""
+    return path.is_dir() or path.suffix.lower() in (".mcap", ".db3", ".bag")
 
 
 @dataclass(kw_only=True)
-class Inspect(Command):
+class Inspect(ReadsLogs):
     """What logs tell of their machine, and what they lack; with nets, the errors of these."""
 
-    logs: Positional[tuple[Path, ...]]  # Of one machine: .csv, .npz, or candump logs of `drive`.
+    logs: Positional[tuple[Path, ...]]  # Of one machine: .csv, .npz, of ROS, or of a CAN bus.
     net: Path | None = None  # Also score these nets on the logs.
     json: Path | None = None  # Also write the report here.
 
     def __call__(self) -> None:
         from brokk_min.identification import inspection, validation
 
-        machine = self.find_machine()
         self.writes(self.json)
-        log, known = read_logs(self.logs, machine)
-        reports = inspection.inspect(log, known.pwm_limit / PWM_MAX if known else 1.0)
+        log, known = self.read_logs(self.logs)
+        reports = inspection.inspect(log)
         warnings, scores = inspection.warnings(log, reports, known), {}
         if self.net:
-            net, window = load_net(self.net), machine.velocity_samples
+            net, window = load_net(self.net), self.find_machine().velocity_samples
             with located(self.net):
                 same = net.velocity_samples == window
                 require(same, "velocity_samples", f"{window} of --machine", net.velocity_samples)
@@ -94,10 +117,10 @@ class Inspect(Command):
 
 
 @dataclass(kw_only=True)
-class Fit(Command):
+class Fit(ReadsLogs):
     """Fit one net per joint to logs of any machine; score them on other recordings."""
 
-    logs: Positional[tuple[Path, ...]]  # Of one machine: .csv, .npz, or candump logs of `drive`.
+    logs: Positional[tuple[Path, ...]]  # Of one machine: .csv, .npz, of ROS, or of a CAN bus.
     out: Path  # Nets to write, .npz.
     test: tuple[Path, ...] = ()  # Logs to score on; by default every tenth recording of LOGS.
     json: Path | None = None  # Also write the scores here.
@@ -108,17 +131,14 @@ class Fit(Command):
     def __call__(self) -> None:
         from brokk_min.identification import fitting, inspection, validation
 
-        machine = self.find_machine()
+        machine, config = self.find_machine(), self.find_config()
         check(self.out.suffix == ".npz", "--out", "a name in .npz", self.out)
-        for name in ("steps", "batch_size", "hidden", "rollout"):
-            value = getattr(self.settings, name)
-            check(value > 0, f"--{name.replace('_', '-')}", "1 or more", value)
-        config = replace(self.settings, **PAPER_RECIPE) if self.paper else self.settings
         self.writes(self.out, self.json)
-        log, known = read_logs(self.logs, machine)
-        tested = read_logs(self.test, machine)[0] if self.test else None
+        log, known = self.read_logs(self.logs)
+        test = self.read_logs(self.test)[0] if self.test else None
         with located(*self.logs):
-            log, test = (log, tested) if tested else logs.split(log)
+            if test is None:
+                log, test = logs.split(log)
             reports = inspection.inspect(log)
             for wrong in inspection.wrong_signs(reports):
                 raise ValueError(wrong)
@@ -134,6 +154,13 @@ class Fit(Command):
         tried = brief([recording.name for recording in test.recordings])
         print(f"{self.out}: nets of {net.machine or 'an unknown machine'}, scored on {tried}")
         print_scores(scores["joints"], scores["warnings"])
+
+    def find_config(self) -> FitConfig:
+        """The settings, and the paper's over them if they are wanted."""
+        for name in ("steps", "batch_size", "hidden", "rollout"):
+            value = getattr(self.settings, name)
+            check(value > 0, f"--{name.replace('_', '-')}", "1 or more", value)
+        return replace(self.settings, **PAPER_RECIPE) if self.paper else self.settings
 
 
 def print_scores(scores: Mapping[str, Any], warnings: Sequence[str]) -> None:

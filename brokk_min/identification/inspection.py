@@ -15,35 +15,34 @@ from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.signal import lfilter
+from tqdm import tqdm
 
+from brokk_min._files import brief
 from brokk_min.identification.logs import COMMANDED, Log, Recording, driven
 from brokk_min.machine import Array, Machine
 
-# What the model searches, all assumed.
+# What is searched, all assumed.
 LATEST = 0.4  # s, longest delay
 TAUS = (0.05, 0.1, 0.2, 0.4)  # s
 ZONES = 0.01 * np.arange(61)  # dead zones, of full command
 AT_STOP = 0.01  # of the recorded range: so near its end a joint may be at a stop
 PAUSE = 2.0  # s, after so long a joint without commands is at rest
-SAMPLES = 20_000  # of a joint that are used
-CLEAR_SIGN = 0.2  # of the velocities' power: fast sines fit as well if reversed and later
-# The fastest motion, all assumed.
-NEAR_LIMIT = 0.15  # commands that are so much less or more than the limit are at it
-HELD = 0.5  # s, after so long a joint has its speed
-FASTEST = 0.95  # quantile of the speeds, because the single ones have noise
+CLEAR_SIGN = 0.1  # least correlation that has a clear sign
+OPPOSITE = 0.4  # least correlation of a recording with the other sign
+FASTEST = 0.999  # quantile of the speeds, because the single ones have noise
 # What a log must have, all assumed.
 LEAST_MINUTES = 10.0
 LEAST_RANGE = 0.7  # of a joint's range
 LEAST_EXPLAINED = 0.1  # of a joint's motion by its commands
 BEYOND = 0.05  # of a joint's range, outside of it
+FOLLOWS = 0.8  # of a joint's motion without commands, that another joint explains
 
 
 @dataclass(frozen=True)
 class JointReport:
-    """One joint of a log; pairs are up and down, commands of full command."""
+    """One joint of a log; pairs are up and down."""
 
     minutes: float  # in recordings in which it has commands
     low: float  # rad, smallest angle
@@ -52,125 +51,154 @@ class JointReport:
     sign: int  # of the velocity under a positive command; 0: not clear
     delay: float  # s
     tau: float  # s
-    dead_zone: tuple[float, float]
+    dead_zone: tuple[float, float]  # of full command
     gain: tuple[float, float]  # rad/s per command beyond the dead zone; 0: it never moved so
-    fastest: tuple[float, float]  # rad/s at the command limit; by the model if none was held there
+    fastest: tuple[float, float]  # rad/s, of the velocities in the log
+    opposite: tuple[str, ...]  # recordings in which the velocity has the other sign
+    follows: dict[str, float]  # rad/s per rad/s of joints with which it moves without commands
 
 
-def inspect(log: Log, limit: float = 1.0) -> dict[str, JointReport]:
-    """A report of each joint that is driven in a log; `limit` is that of its commands, to 1."""
+def inspect(log: Log) -> dict[str, JointReport]:
+    """A report of each joint that is driven in a log."""
     reports = {}
-    for j, name in enumerate(log.joints):
+    for j, name in enumerate(tqdm(log.joints, desc="inspect", unit="joint", disable=None)):
         recordings = [one for one in log.recordings if driven(one)[j]]
         if recordings:
             ticks = sum(len(one.u) for one in recordings if np.ptp(one.u[:, j]) > COMMANDED)
             q = np.concatenate([one.q[:, j] for one in recordings])
+            q_dot = np.concatenate([one.q_dot[:, j] for one in recordings])
             model = fit_model(motion_of(recordings, j, log.rate))
-            speeds = [fastest(recordings, j, sign * limit, log.rate) for sign in (1, -1)]
-            up, down = np.multiply(model["gain"], np.maximum(limit - model["dead_zone"], 0))
             reports[name] = JointReport(
                 minutes=ticks / log.rate / 60,
                 low=float(q.min()),
                 high=float(q.max()),
-                fastest=(speeds[0] or float(up), speeds[1] or float(down)),
-                **model | {"dead_zone": tuple(model["dead_zone"].tolist())},
+                fastest=(float(np.quantile(q_dot, FASTEST)), float(np.quantile(-q_dot, FASTEST))),
+                opposite=opposite_recordings(recordings, j, log.rate, model),
+                follows=followed_joints(log, j),
+                **model,
             )
     return reports
 
 
-def fastest(recordings: list[Recording], j: int, command: float, rate: float) -> float:
-    """Fastest motion [rad/s] after `HELD` near a command, of the sign of it; 0: never held."""
-    held = round(HELD * rate) + 1
-    speeds = [
-        one.q_dot[held - 1 :, j][(np.abs(u / command - 1) < NEAR_LIMIT).all(axis=-1)]
-        for one in recordings
-        if len(one.u) >= held
-        for u in [sliding_window_view(one.u[:, j], held)]
-    ]
-    found = np.concatenate([np.zeros(0), *speeds])
-    return float(np.quantile(np.sign(command) * found, FASTEST)) if len(found) else 0.0
-
-
 class Motion(NamedTuple):
-    """Samples of one joint, recordings one after the other, with a rest in between."""
+    """Samples of one joint, recordings one after the other, with a rest in between, (T,)."""
 
-    u: Array  # (T,)
-    velocity: Array  # over the coming sample [rad/s], (T,)
-    counts: NDArray[np.bool_]  # not in a rest, nor at an end of the range, (T,)
+    u: Array
+    velocity: Array  # over the coming sample [rad/s]
+    counts: NDArray[np.bool_]  # not in a rest, nor at an end of the range
     rate: float  # Hz
 
 
 def motion_of(recordings: list[Recording], j: int, rate: float) -> Motion:
-    """Joint `j` of recordings that begin at rest; of a long log the first part of each."""
-    share = min(1.0, SAMPLES / sum(len(one.u) for one in recordings))
-    lengths = [int(np.ceil(share * len(one.u))) for one in recordings]
-    rest, cut = (0, round(PAUSE * rate)), list(zip(recordings, lengths, strict=True))
-    u = np.concatenate([np.pad(one.u[:num, j], rest) for one, num in cut])
-    q = np.concatenate([np.pad(one.q[:num, j], rest, "edge") for one, num in cut])
-    counts = np.concatenate([np.pad(np.ones(num, bool), rest) for num in lengths])
+    """Joint `j` of recordings that begin at rest."""
+    rest = (0, round(PAUSE * rate))
+    u = np.concatenate([np.pad(one.u[:, j], rest) for one in recordings])
+    q = np.concatenate([np.pad(one.q[:, j], rest, "edge") for one in recordings])
+    counts = np.concatenate([np.pad(np.ones(len(one.u), bool), rest) for one in recordings])
     q_next, margin = np.append(q[1:], q[-1]), AT_STOP * np.ptp(q)
     counts &= (q_next > q.min() + margin) & (q_next < q.max() - margin)
-    return Motion(u, (q_next - q) * rate, counts, rate)
+    return Motion(u, (q_next - q) * rate * counts, counts, rate)
+
+
+def correlation(motion: Motion) -> float:
+    """That of commands and velocities over a second, because fast sines fit reversed as well."""
+    second = np.ones(round(motion.rate)) / round(motion.rate)
+    u, velocity = (np.convolve(x, second, "same") for x in (motion.u, motion.velocity))
+    size = np.linalg.norm(motion.u) * np.linalg.norm(motion.velocity)
+    return float(u @ velocity / max(size, 1e-12))
+
+
+def opposite_recordings(
+    recordings: list[Recording], j: int, rate: float, model: Mapping[str, Any]
+) -> tuple[str, ...]:
+    """Names of the recordings in which joint `j` moves against the model of all of them."""
+    names = []
+    for one in recordings:
+        motion = motion_of([one], j, rate)
+        lag = (round(model["delay"] * rate), model["tau"])
+        expected = model["gain"] @ responses(motion, lag, model["dead_zone"])
+        size = np.linalg.norm(expected) * np.linalg.norm(motion.velocity)
+        if expected @ motion.velocity < -OPPOSITE * size:
+            names.append(one.name)
+    return tuple(names)
+
+
+def followed_joints(log: Log, j: int) -> dict[str, float]:
+    """Joints with which joint `j` moves at their speed while it has no commands, and the slopes."""
+    idle, still = [], round(log.rate)  # a second without commands
+    for one in log.recordings:
+        recent = np.convolve(np.abs(one.u[:, j]) > COMMANDED, np.ones(still))[: len(one.u)]
+        idle.append(np.where(recent[:, None] == 0, one.q_dot, 0.0))
+    q_dot = np.concatenate(idle)
+    result = {}
+    for i, name in enumerate(log.joints):
+        power = float(q_dot[:, i] @ q_dot[:, i])
+        slope = float(q_dot[:, i] @ q_dot[:, j]) / max(power, 1e-12)
+        moves = q_dot[:, i] != 0
+        error = q_dot[moves, j] - slope * q_dot[moves, i]
+        follows = error @ error < (1 - FOLLOWS) * slope**2 * power
+        if i != j and abs(slope) > FOLLOWS and follows:
+            result[name] = slope
+    return result
 
 
 def fit_model(motion: Motion) -> dict[str, Any]:
-    """The model's fields of `JointReport`, with gains of the sign that explains more.
-
-    A log explains little if its joint hardly moves; then the sign is 0.
-    """
-    power = float(np.square(motion.velocity[motion.counts]).sum())
-    models = {sign: best_model(motion, sign) for sign in (1, -1)}
-    errors = {sign: model.pop("error") for sign, model in models.items()}
-    better = (errors[-1] - errors[1]) / max(power, 1e-12)
-    sign = 1 if better > -CLEAR_SIGN else -1
-    explained = 1 - errors[sign] / power if power else 0.0
-    clear = int(np.sign(better)) if abs(better) > CLEAR_SIGN else 0
-    return {"explained": explained, "sign": clear, **models[sign]}
-
-
-def best_model(motion: Motion, sign: int) -> dict[str, Any]:
-    """The model with gains of one sign: a grid of delays and lags, and of dead zones, in turns."""
+    """The model's fields of `JointReport`: a grid of delays and lags, then one of dead zones."""
     lags = list(product(range(round(LATEST * motion.rate) + 1), TAUS))
     zones = np.array([0.05, 0.05])
     for _ in range(2):
-        lag = min(lags, key=lambda lag: fit_gains(motion, sign, lag, zones)[0])
+        lag = min(lags, key=lambda lag: fit_gains(motion, lag, zones)[0])
         for side in (0, 1):
             trials = [np.where(np.arange(2) == side, zone, zones) for zone in ZONES]
-            zones = min(trials, key=lambda trial: fit_gains(motion, sign, lag, trial)[0])
-    error, gains = fit_gains(motion, sign, lag, zones)
-    pairs = {"dead_zone": zones.round(3), "gain": tuple(gains.tolist())}
-    return {"error": error, "delay": lag[0] / motion.rate, "tau": lag[1], **pairs}
+            zones = min(trials, key=lambda trial: fit_gains(motion, lag, trial)[0])
+    error, gains = fit_gains(motion, lag, zones)
+    power = float(np.square(motion.velocity[motion.counts]).sum())
+    clear = correlation(motion)
+    return {
+        "explained": 1 - error / power if power else 0.0,
+        "sign": int(np.sign(clear)) if abs(clear) > CLEAR_SIGN else 0,
+        "delay": lag[0] / motion.rate,
+        "tau": lag[1],
+        "dead_zone": tuple(zones.round(3).tolist()),
+        "gain": tuple(gains.tolist()),
+    }
 
 
-def fit_gains(
-    motion: Motion, sign: int, lag: tuple[int, float], zones: Array
-) -> tuple[float, Array]:
-    """Sum of the squared errors of the model with the best gains (2,) of a sign; these gains."""
-    (delay, tau), (up, down) = lag, zones
-    late = np.concatenate([np.zeros(delay), motion.u])[: len(motion.u)]
-    openings = np.stack([np.maximum(late - up, 0), -np.maximum(-late - down, 0)])
-    a = np.exp(-1 / (motion.rate * tau))
-    x = lfilter([1 - a], [1, -a], openings)[:, motion.counts]
+def fit_gains(motion: Motion, lag: tuple[int, float], zones: Array) -> tuple[float, Array]:
+    """Sum of the squared errors of the model with the best gains (2,), and these gains."""
+    x = responses(motion, lag, zones)[:, motion.counts]
     velocity = motion.velocity[motion.counts]
     gains = np.linalg.solve(x @ x.T + 1e-9 * np.eye(2), x @ velocity)
-    gains = sign * np.maximum(sign * gains, 0)
     error = velocity - gains @ x
     return float(error @ error), gains
 
 
+def responses(motion: Motion, lag: tuple[int, float], zones: ArrayLike) -> Array:
+    """Velocities (2, T) upwards and downwards if the gains are 1."""
+    (delay, tau), (up, down) = lag, np.asarray(zones)
+    late = np.concatenate([np.zeros(delay), motion.u])[: len(motion.u)]
+    openings = np.stack([np.maximum(late - up, 0), -np.maximum(-late - down, 0)])
+    a = np.exp(-1 / (motion.rate * tau))
+    return np.asarray(lfilter([1 - a], [1, -a], openings))
+
+
 def wrong_signs(reports: Mapping[str, JointReport]) -> list[str]:
-    """Joints whose angle falls under positive commands, in words."""
-    wanted = "expected positive commands to raise"
-    return [
-        f"u_{name}: {wanted} q_{name}, got {report.gain[0]:.2f} rad/s per full opening"
-        for name, report in reports.items()
-        if report.sign < 0
-    ]
+    """Joints whose angle falls under positive commands in all recordings or in some, in words."""
+    result = []
+    for name, report in reports.items():
+        wanted, change = f"positive commands to raise q_{name}", f"(--map {name}=COLUMN:-1)"
+        if report.sign < 0:
+            got = f"{report.gain[0]:.2f} rad/s per full opening {change}"
+            result.append(f"u_{name}: expected {wanted}, got {got}")
+        if report.opposite:
+            got = f"the other sign in {brief(list(report.opposite))}"
+            result.append(f"u_{name}: expected one sign in all recordings, got {got} {change}")
+    return result
 
 
 def warnings(log: Log, reports: Mapping[str, JointReport], machine: Machine | None) -> list[str]:
     """What a log lacks, and where it contradicts the range of the machine that it should be of."""
-    result = wrong_signs(reports)
+    result = [*log.warnings, *wrong_signs(reports)]
     for name in log.joints:
         if name not in reports:
             result.append(f"{name}: expected commands in the log, got none")
@@ -178,20 +206,24 @@ def warnings(log: Log, reports: Mapping[str, JointReport], machine: Machine | No
         r = reports[name]
         if r.minutes < LEAST_MINUTES:
             result.append(f"{name}: expected {LEAST_MINUTES:g} minutes, got {r.minutes:.1f}")
-        if r.explained < LEAST_EXPLAINED:
+        if r.follows:
+            slopes = ", ".join(f"{slope:+.2f} times with {one}" for one, slope in r.follows.items())
+            doubt = "is it an angle to the ground? Then take differences of both angles"
+            result.append(f"q_{name}: expected rest without commands, got motion {slopes}: {doubt}")
+        elif r.explained < LEAST_EXPLAINED:
             got = f"{r.explained:.0%}: are they those of another joint?"
             result.append(f"{name}: expected commands that explain its motion, got {got}")
-        if not machine:
-            continue
-        joint = machine.joints[machine.names.index(name)]
-        whole, part = joint.q_max - joint.q_min, r.high - r.low
-        if max(joint.q_min - r.low, r.high - joint.q_max) > BEYOND * whole:
-            wanted = f"{name}: expected angles of {joint.q_min:g} to {joint.q_max:g}"
-            got = f"{r.low:.2f} to {r.high:.2f}"
-            result.append(f"{wanted}, got {got}: another unit, zero or joint?")
-        elif part < LEAST_RANGE * whole:
-            wanted = f"{LEAST_RANGE:.0%} of its range or more"
-            result.append(f"{name}: expected {wanted}, got {part / whole:.0%}")
+        if machine:
+            joint = machine.joints[machine.names.index(name)]
+            whole, part = joint.q_max - joint.q_min, r.high - r.low
+            if max(joint.q_min - r.low, r.high - joint.q_max) > BEYOND * whole:
+                wanted = f"{name}: expected angles of {joint.q_min:g} to {joint.q_max:g}"
+                got = f"{r.low:.2f} to {r.high:.2f}"
+                unit = f"another unit (--map {name}=COLUMN:deg), zero or joint?"
+                result.append(f"{wanted}, got {got}: {unit}")
+            elif part < LEAST_RANGE * whole:
+                wanted = f"{LEAST_RANGE:.0%} of its range or more"
+                result.append(f"{name}: expected {wanted}, got {part / whole:.0%}")
     return result
 
 

@@ -7,19 +7,20 @@ Joints may have any names. The rate must not be below the machine's, and it may 
 whose name ends in `_return` are dropped.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min._files import brief, expected, load_arrays, located, read_csv, whole_file, write_csv
+from brokk_min._files import brief, expected, located, whole_file, write_csv
 from brokk_min.actuator import estimate_velocity
+from brokk_min.identification.columns import load_table
+from brokk_min.identification.readings import MAX_GAP, check_run, left_out, unread
 from brokk_min.machine import Array, Machine, require
 
 RATE = 20.0  # Hz, paper: everything runs at 20 Hz; other machines have others
-MAX_GAP = 0.25  # s, or 2.5 samples, assumed: longer gaps cut a recording
 COMMANDED = 0.02  # of full command, assumed: more than a stick at rest gives
 MOVED = 0.01  # rad or m, assumed: more than a parked joint creeps
 MEAN_OF = 10  # values of a command in a tick, of logs that are faster
@@ -44,6 +45,7 @@ class Log(NamedTuple):
     recordings: tuple[Recording, ...]
     velocity_logged: bool = False
     rate: float = RATE  # Hz
+    warnings: tuple[str, ...] = ()  # of what was left out
 
 
 def machine_log(machine: Machine, recordings: Iterable[tuple[str, Array, Array]]) -> Log:
@@ -139,13 +141,15 @@ def join_logs(logs: Mapping[Path, Log]) -> Log:
     """
     first = next(iter(logs.values()))
     recordings: list[Recording] = []
+    warnings: list[str] = []
     for path, log in logs.items():
         with located(path):
             same = log.velocity_logged == first.velocity_logged
             require(same, "columns", "q_dot in all files or in none", "a mixture")
             recordings += in_order(log, first.joints).recordings
+            warnings += log.warnings
     require(len(recordings) > 0, ", ".join(map(str, logs)), "at least one recording", "none")
-    return first._replace(recordings=tuple(recordings))
+    return first._replace(recordings=tuple(recordings), warnings=tuple(warnings))
 
 
 def write_log(path: Path, log: Log) -> None:
@@ -166,88 +170,93 @@ def write_log(path: Path, log: Log) -> None:
         np.savez_compressed(file, **columns)
 
 
-def read_log(paths: Sequence[Path], velocity_samples: int, rate: float = RATE) -> Log:
-    """Read and check tables of one machine and resample them at `rate` [Hz].
+def read_log(
+    paths: Sequence[Path],
+    velocity_samples: int,
+    rate: float = RATE,
+    fastest: Mapping[str, float] | None = None,
+    read: Callable[[Path], Mapping[str, Any]] = load_table,
+) -> Log:
+    """Check tables of one machine that `read` reads, and resample them at `rate` [Hz].
 
     The command is held (of faster logs it is the mean over a tick), the angle interpolated. A gap
     longer than `MAX_GAP` and 2.5 samples cuts a recording. Without q_dot columns velocities are
     estimated over `velocity_samples`: a recording starts at rest, and after a gap the rows that
-    would need samples of the gap are left out.
+    would need samples of the gap are left out. Rows in which a joint was not read count as a gap;
+    `fastest` [rad/s] of the joints of a known machine helps to tell them.
     ValueError: the file, and the row (1 is the header), the column or the run of the first error.
     """
     logs = {}
     for path in map(Path, paths):
-        csv = path.suffix.lower() == ".csv"
-        table = read_csv(path, "run", "time") if csv else load_arrays(path)[1]
+        table = read(path)
         with expected(path, "a log"), located(path):
             joints = tuple(name[2:] for name in table if name.startswith("u_"))
-            require(len(joints) > 0, "columns", "u_<joint>", brief(list(table)))
+            wanted = "u_<joint> (--map u_NAME=COLUMN:UNIT)"
+            require(len(joints) > 0, "columns", wanted, brief(list(table)))
             logged = any(name.startswith("q_dot_") for name in table)
-            recordings = tuple(_recordings(table, joints, logged, velocity_samples, rate))
-            logs[path] = Log(joints, recordings, logged, rate)
+            speeds = np.array([(fastest or {}).get(name, 0.0) for name in joints])
+            empty = Log(joints, (), logged, rate)
+            log = _with_recordings(empty, table, speeds, velocity_samples)
+            logs[path] = log._replace(warnings=tuple(f"{path}: {one}" for one in log.warnings))
     return join_logs(logs)
 
 
-def _recordings(
-    table: Mapping[str, Any], joints: Sequence[str], logged: bool, samples: int, rate: float
-) -> Iterator[Recording]:
-    """The checked recordings of one table at `rate`, in the order in which they begin."""
-    limits = {"u": 1.0, "q": LARGEST} | ({"q_dot": LARGEST} if logged else {})
+def _with_recordings(log: Log, table: Mapping[str, Any], fastest: Array, samples: int) -> Log:
+    """A log with the checked recordings of a table, in the order in which they begin."""
+    limits = {"u": 1.0, "q": LARGEST} | ({"q_dot": LARGEST} if log.velocity_logged else {})
     time = _numbers(table, ["time"], LARGEST)[:, 0]
-    values = {k: _numbers(table, [f"{k}_{one}" for one in joints], limits[k]) for k in limits}
+    values = {k: _numbers(table, [f"{k}_{one}" for one in log.joints], limits[k]) for k in limits}
     names, begins, number = np.unique(table["run"], return_index=True, return_inverse=True)
+    wrong, speed = np.zeros(values["q"].shape, bool), np.zeros(values["q"].shape)
+    recordings: list[Recording] = []
     for i in np.argsort(begins):
         run, rows = str(names[i]), np.flatnonzero(number == i)
-        _check_run(run, time[rows], values["q"][rows], rate)
-        gaps = np.flatnonzero(np.diff(time[rows]) > max(MAX_GAP, 2.5 / rate)) + 1
-        pieces = [] if run.endswith(RETURN) else np.split(rows, gaps)
-        for part, piece in enumerate(pieces):
-            columns = {kind: x[piece] for kind, x in values.items()}
-            u, q, q_dot = _resample(time[piece], columns, samples, rate)
-            first = samples - 1 if part and not logged else 0  # rows before it need the gap
+        t, columns = time[rows], {kind: x[rows] for kind, x in values.items()}
+        repeats = check_run(run, t, columns["q"], log.rate, log.joints)
+        bad, cuts = unread(t, columns["q"], fastest, repeats)
+        wrong[rows] = bad | cuts
+        speed[rows[1:]] = np.abs(np.diff(columns["q"], axis=0) / np.diff(t)[:, None])
+        good = np.flatnonzero(~bad.any(axis=1))
+        cut = np.diff(t[good]) > max(MAX_GAP, 2.5 / log.rate)
+        cut |= np.diff(np.cumsum(cuts.any(axis=1))[good]) > 0
+        pieces = np.split(good, np.flatnonzero(cut) + 1)
+        for part, piece in enumerate(pieces if len(good) and not run.endswith(RETURN) else []):
+            u, q, q_dot = _resample(t, columns, piece, samples, log.rate)
+            first = samples - 1 if part and not log.velocity_logged else 0  # these need the gap
             if len(u) > first:
                 name = f"{run}#{part + 1}" if part else run
-                yield Recording(name, u[first:], q[first:], q_dot[first:])
+                recordings.append(Recording(name, u[first:], q[first:], q_dot[first:]))
+    warnings = left_out(wrong, speed, log.joints)
+    return log._replace(recordings=tuple(recordings), warnings=tuple(warnings))
 
 
 def _numbers(table: Mapping[str, Any], names: Sequence[str], limit: float) -> Array:
     """Columns (rows, names); ValueError: one that is not there, or a value that cannot be."""
-    missing = [name for name in ("run", *names) if name not in table]
-    require(not missing, "columns", brief(missing), brief(list(table)))
+    missing = [name for name in names if name not in table]
+    wanted = f"{brief(missing)} (--map {missing[0]}=COLUMN:UNIT)" if missing else ""
+    require(not missing, "columns", wanted, brief(list(table)))
     for name in names:
         wanted, got = (np.shape(table[key]) for key in ("run", name))
         require(got == wanted, f"column {name}", f"{wanted} numbers", got)
     values = np.array([table[name] for name in names], float).T
     for row, column in np.argwhere(~(np.abs(values) <= limit)):  # also where it is nan
         place, got = f"row {row + 2}, column {names[column]}", values[row, column]
-        raise ValueError(f"{place}: expected -{limit:g} to {limit:g}, got {got}")
+        unit = f" (per cent: --map {names[column]}=COLUMN:percent)" if limit == 1.0 else ""
+        raise ValueError(f"{place}: expected -{limit:g} to {limit:g}{unit}, got {got}")
     return values
 
 
-def _check_run(run: str, time: Array, q: Array, rate: float) -> None:
-    """ValueError: time that does not rise or has too few samples, or an angle that jumps a turn."""
-    if len(time) < 2:
-        return
-    step, jump = np.diff(time), np.abs(np.diff(q, axis=0)).max()
-    got = f"a step of {step.min():.6g} at {time[step.argmin()]:.6g}"
-    require(step.min() > 0, f"run {run}, column time", "stamps that rise", got)
-    median = float(np.median(step))
-    wanted = f"s, at {rate:g} Hz, the machine's rate (--machine), or more"
-    require(median <= 1.05 / rate, f"run {run}, column time", wanted, f"{1 / median:.3g} Hz")
-    wanted = "angles that do not start again after a turn (numpy.unwrap)"
-    require(jump < 1.5 * np.pi, f"run {run}", wanted, f"a jump of {jump:.2f} rad")
-
-
 def _resample(
-    time: Array, columns: dict[str, Array], samples: int, rate: float
+    time: Array, columns: dict[str, Array], rows: Rows, samples: int, rate: float
 ) -> tuple[Array, Array, Array]:
-    """u held, q and q_dot interpolated at `rate`; q_dot estimated where the log has none."""
-    grid = time[0] + np.arange(int((time[-1] - time[0]) * rate + 1e-6) + 1) / rate
+    """u held, q and q_dot of `rows` interpolated at `rate`; q_dot estimated if there is none."""
+    t = time[rows]
+    grid = t[0] + np.arange(int((t[-1] - t[0]) * rate + 1e-6) + 1) / rate
     fast = len(time) > 1 and np.median(np.diff(time)) < 0.501 / rate
     parts = np.linspace(0, 1 / rate, MEAN_OF if fast else 1, endpoint=False)[:, None]
     held = np.searchsorted(time, grid + parts + 1e-6, side="right") - 1
     measured = {
-        kind: np.stack([np.interp(grid, time, column) for column in x.T], axis=-1)
+        kind: np.stack([np.interp(grid, t, column) for column in x[rows].T], axis=-1)
         for kind, x in columns.items()
         if kind != "u"
     }

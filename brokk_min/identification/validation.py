@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet, append_command, append_sample
-from brokk_min.identification.logs import Log, Recording, Samples, join_recordings
+from brokk_min.identification.logs import Log, Samples, join_recordings
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
 
@@ -49,43 +49,34 @@ def free_run_step(net: ActuatorNet, history: Array, q: Array, u: Array) -> tuple
 
 
 def free_run(
-    net: ActuatorNet, recording: Recording, starts: NDArray[np.intp], ticks: int
-) -> tuple[Array, Array]:
-    """Angles [rad] and velocities [rad/s] (ticks, s, n) of nets on their own outputs.
-
-    Each run has the recorded commands and begins at one of the samples `starts` (s,).
-    ValueError: one with less than a history before it.
-    """
-    if len(starts) and starts.min() < net.history:
-        raise ValueError(f"starts: expected {net.history} or more, got {starts.min()}")
-    rows = starts[:, None] + np.arange(1 - net.history, 1)
-    history = np.stack([recording.q[rows], recording.q_dot[rows], recording.u[rows - 1]])
-    history = history.transpose(1, 3, 0, 2).astype(np.float32)  # (s, n, 3, H)
-    q: Array = recording.q[starts]
-    angles, velocities = [], []
-    for k in range(ticks):
-        history, q = free_run_step(net, history, q, recording.u[starts + k])
-        angles.append(q)
-        velocities.append(history[..., 1, -1])
-    return np.array(angles), np.array(velocities)
-
-
-def run_errors(
     net: ActuatorNet, samples: Samples, starts: NDArray[np.intp], ticks: int
 ) -> tuple[Array, Array]:
-    """Errors of angle [rad] and velocity [rad/s] (ticks, s, n) in free runs from `starts` (s,)."""
-    chunks = np.array_split(starts, max(1, math.ceil(len(starts) / 8192)))  # bounds the memory
-    runs = [free_run(net, samples.joined, chunk, ticks) for chunk in chunks]
-    q = np.concatenate([angles for angles, _ in runs], axis=1)
-    q_dot = np.concatenate([velocities for _, velocities in runs], axis=1)
-    after = starts + np.arange(1, ticks + 1)[:, None]
-    return q - samples.joined.q[after], q_dot - samples.joined.q_dot[after]
+    """Errors of angle [rad] and velocity [rad/s] (ticks, s, n) of nets on their own outputs.
+
+    Each run has the recorded commands and begins at one of the samples `starts` (s,), which have a
+    history before them.
+    """
+    recorded = samples.joined
+    errors = []
+    for chunk in np.array_split(starts, max(1, math.ceil(len(starts) / 8192))):  # bounds the memory
+        rows = chunk[:, None] + np.arange(1 - net.history, 1)
+        history = np.stack([recorded.q[rows], recorded.q_dot[rows], recorded.u[rows - 1]])
+        history = history.transpose(1, 3, 0, 2).astype(np.float32)  # (s, n, 3, H)
+        q: Array = recorded.q[chunk]
+        runs = []
+        for at in range(ticks):
+            history, q = free_run_step(net, history, q, recorded.u[chunk + at])
+            after = chunk + at + 1
+            runs.append((q - recorded.q[after], history[..., 1, -1] - recorded.q_dot[after]))
+        errors.append(np.array(runs))  # (ticks, 2, s, n)
+    joined = np.concatenate(errors, axis=2)
+    return joined[:, 0].copy(), joined[:, 1].copy()
 
 
 def free_runs(
     net: ActuatorNet, samples: Samples
 ) -> Iterator[tuple[int, NDArray[np.intp], Array, Array]]:
-    """Of each of `HORIZONS` [s]: first samples (s,) of free runs one after the other, `run_errors`.
+    """Of each of `HORIZONS` [s]: first samples (s,) of free runs one after the other, errors.
 
     A horizon that is longer than all recordings, and longer ones, are left out.
     """
@@ -94,7 +85,7 @@ def free_runs(
         starts = samples.starts(net.history, ticks, ticks)
         if not len(starts):
             return
-        yield horizon, starts, *run_errors(net, samples, starts, ticks)
+        yield horizon, starts, *free_run(net, samples, starts, ticks)
 
 
 def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
@@ -132,7 +123,7 @@ def _one_step_scores(net: ActuatorNet, samples: Samples) -> dict[str, Any]:
     if not len(starts):
         got = samples.lengths[:9]
         raise ValueError(f"log: expected a recording above {net.history + 1} samples, got {got}")
-    q_error, v_error = run_errors(net, samples, starts, 1)
+    q_error, v_error = free_run(net, samples, starts, 1)
     error = v_error[0] if net.velocity_logged else q_error[0] * net.rate
     persistence = samples.joined.q_dot[starts] - samples.target[starts]
     result: dict[str, Any] = {}

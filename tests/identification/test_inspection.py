@@ -6,14 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from brokk_min.identification.inspection import (
-    JointReport,
-    fastest,
-    inspect,
-    table,
-    warnings,
-    wrong_signs,
-)
+from brokk_min.identification.inspection import JointReport, inspect, table, warnings, wrong_signs
 from brokk_min.identification.logs import Log, Recording, velocity_of
 from brokk_min.machine import BROKK_170, Joint
 
@@ -89,7 +82,7 @@ def test_inspect__does_not_count_joints_that_are_pushed_against_their_stops():
         is_as_true(inspect(log_of(recording))[name], name)
 
 
-def test_inspect__takes_a_part_of_each_recording_of_a_long_log():
+def test_inspect__finds_dead_zones_below_many_small_commands():
     """The first 20,000 samples have commands within the dead zone alone."""
     within = [record("boom", 0.1 * np.sin(np.arange(4000) / 9)) for _ in range(5)]
     excited = [record("boom", holds(seed)) for seed in range(4)]
@@ -115,16 +108,51 @@ def test_inspect__lets_a_fast_sine_pass_that_fits_as_well_reversed_and_later():
     assert not wrong_signs(reports) and reports["boom"].sign >= 0
 
 
-def test_fastest__is_measured_after_held_commands_or_by_the_model():
-    """Gains of 0.5 and 0.3 from dead zones of 0.12 and 0.2 on; the limit is 0.6."""
+def test_inspect__has_the_fastest_motions_of_the_log():
+    """Gains of 0.5 and 0.3 from dead zones of 0.12 and 0.2 on; commands of 0.6 held for 3 s."""
     held = np.tile(np.repeat([0.6, 0.0, -0.6, 0.0], 60), 16)
-    assert fastest([record("boom", held)], 0, -0.6, 20.0) == pytest.approx(0.3 * 0.4, rel=0.1)
-    assert fastest([record("boom", holds(largest=0.4))], 0, 0.6, 20.0) == 0.0
-    report = inspect(log_of(record("boom", holds())), 0.6)["boom"]
-    assert report.fastest == pytest.approx((0.5 * (0.6 - 0.12), 0.3 * (0.6 - 0.2)), rel=0.1)
+    report = inspect(log_of(record("boom", held)))["boom"]
+    assert report.fastest == pytest.approx((0.5 * (0.6 - 0.12), 0.3 * (0.6 - 0.2)), rel=0.03)
 
 
-GOOD = JointReport(20.0, -2.1, 2.1, 0.9, 1, 0.1, 0.1, (0.07, 0.07), (0.3, 0.3), (0.2, 0.2))
+def test_inspect__names_recordings_in_which_the_sign_is_opposite():
+    """Of six recordings, one at its stop; fast sines and short ones are not named."""
+    boom = [
+        record("boom", holds(seed, 800), stop=0.3)._replace(name=f"{seed}") for seed in range(5)
+    ]
+    sine = record("boom", 0.5 * np.sin(2 * np.pi * 2.5 * np.arange(100) / 20))
+    for reversed_ones in ((), (1, 4)):
+        signs = [-1 if k in reversed_ones else 1 for k in range(5)]
+        recordings = [
+            one._replace(q=sign * one.q, q_dot=sign * one.q_dot)
+            for sign, one in zip(signs, boom, strict=True)
+        ]
+        reports = inspect(log_of(*recordings, sine))
+        assert reports["boom"].opposite == tuple(map(str, reversed_ones))
+        assert len(wrong_signs(reports)) == bool(reversed_ones)
+    assert (
+        "expected one sign in all recordings, got the other sign in ['1', '4']"
+        in (wrong_signs(reports)[0])
+    )
+
+
+@pytest.mark.parametrize("slope", [1.0, -1.0, 0.5])
+def test_inspect__sees_an_angle_to_the_ground(slope):
+    """The arm's angle to the ground has that of the boom in it; half of it is a coupling."""
+    recordings = [
+        one._replace(q=one.q @ [[1, slope], [0, 1]], q_dot=one.q_dot @ [[1, slope], [0, 1]])
+        for name in TRUE
+        for one in (record(name, holds(hold=40)),)
+    ]
+    reports = inspect(log_of(*recordings))
+    assert reports["boom"].follows == {}
+    expected = {} if slope == 0.5 else {"boom": pytest.approx(slope, abs=1e-6)}
+    assert reports["arm"].follows == expected
+    told = [text for text in warnings(log_of(), reports, None) if "angle to the ground" in text]
+    assert len(told) == len(expected)
+
+
+GOOD = JointReport(20.0, -2.1, 2.1, 0.9, 1, 0.1, 0.1, (0.07, 0.07), (0.3, 0.3), (0.2, 0.2), (), {})
 
 
 @pytest.mark.parametrize(
@@ -136,6 +164,11 @@ GOOD = JointReport(20.0, -2.1, 2.1, 0.9, 1, 0.1, 0.1, (0.07, 0.07), (0.3, 0.3), 
         ({"high": 120.0}, ["q1: expected angles of -2.14 to 2.14, got -2.10 to 120.00: another"]),
         ({"explained": 0.05}, ["q1: expected commands that explain its motion, got 5%: are they"]),
         ({"sign": -1}, ["u_q1: expected positive commands to raise q_q1"]),
+        ({"opposite": ("x",)}, ["u_q1: expected one sign in all recordings, got the other sign"]),
+        (
+            {"follows": {"q2": 1.0}},
+            ["q_q1: expected rest without commands, got motion +1.00 times"],
+        ),
     ],
 )
 def test_warnings__know_what_a_log_lacks_and_where_it_contradicts_its_machine(changes, expected):

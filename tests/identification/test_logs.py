@@ -34,7 +34,9 @@ def table(run, time, seed=0, joints=("a", "b")):
     rng = np.random.default_rng(seed)
     columns = {"run": np.array([run] * len(time)), "time": np.asarray(time, float)}
     columns |= {f"u_{joint}": rng.uniform(-1, 1, len(time)) for joint in joints}
-    return columns | {f"q_{j}": np.cumsum(rng.uniform(-0.1, 0.1, len(time))) for j in joints}
+    swings = [(rng.uniform(0.02, 0.1), rng.uniform(0, 6)) for _ in joints]  # no reading jumps
+    q = [np.sin(fast * np.arange(len(time)) + phase) for fast, phase in swings]
+    return columns | {f"q_{joint}": angle for joint, angle in zip(joints, q, strict=True)}
 
 
 def both(first, second):
@@ -63,7 +65,8 @@ def some_log(velocity_logged, lengths=(30, 1, 7)):
     rng = np.random.default_rng(5)
     recordings = []
     for i, length in enumerate(lengths):
-        u, q, q_dot = rng.integers(-80, 81, (length, 3)) / 127, *rng.uniform(-2, 2, (2, length, 3))
+        u, q_dot = rng.integers(-80, 81, (length, 3)) / 127, rng.uniform(-2, 2, (length, 3))
+        q = rng.uniform(-2, 2, 3) + np.cumsum(rng.uniform(0.05, 0.06, (length, 3)), axis=0)
         recordings.append(Recording(f"run {i} wet", u, q, q_dot))
     return Log(("boom", "stick", "q_dot_like"), tuple(recordings), velocity_logged)
 
@@ -221,6 +224,95 @@ def test_read_log__joins_files_of_the_same_joints_only(tmp_path):
         read_log([*paths, more], 4)
 
 
+# --- readings that are no measurements -----------------------------------------------------------
+
+
+def swinging(rate=20.0, seconds=20.0):
+    """Two joints of at most 0.5 and 0.2 rad/s, with counts of 14 bits; the second one is parked."""
+    time = np.arange(round(seconds * rate)) / rate
+    q = np.stack([0.9 + 0.5 * np.sin(time), np.full(len(time), -0.4)])
+    step = 2 * np.pi / 2**14
+    noise = np.random.default_rng(0).integers(-1, 2, q.shape)
+    q = (np.rint(q / step) + noise) * step
+    columns = {"run": np.repeat("x", len(time)), "time": time, "u_a": np.cos(time)}
+    return columns | {"u_b": 0 * time, "q_a": q[0], "q_b": q[1]}
+
+
+def read_columns(tmp_path, columns, **options):
+    return read_log([write(tmp_path / "log.npz", columns)], 4, **options)
+
+
+def speed_of(log):
+    return np.abs(np.concatenate([one.q_dot for one in log.recordings])).max(axis=0)
+
+
+@pytest.mark.parametrize("wrong", [0.0, -1.0, 9999.0])
+@pytest.mark.parametrize("fastest", [{}, {"a": 0.5, "b": 0.2}, {"a": 0.05, "b": 0.02}])
+def test_read_log__leaves_out_readings_that_no_motion_explains(tmp_path, wrong, fastest):
+    """Single ones, two in a row, the first and the last one, of a moving and of a parked joint.
+
+    With the machine's speeds, without, and with speeds that are guessed ten times too low.
+    """
+    columns = swinging()
+    sound = read_columns(tmp_path, columns, fastest=fastest)
+    assert sound.warnings == () and len(sound.recordings) == 1
+    rows = {"q_a": [0, 40, 150, 151], "q_b": [60, 399]}
+    broken = columns | {name: columns[name].copy() for name in rows}
+    for name, where in rows.items():
+        broken[name][where] = wrong
+    log = read_columns(tmp_path, broken, fastest=fastest)
+    assert len(log.recordings) == 1  # the gaps are short
+    np.testing.assert_allclose(log.recordings[0].q, sound.recordings[0].q[1:-1], atol=5e-3)
+    assert (speed_of(log) < speed_of(sound) + 0.05).all()
+    assert len(log.warnings) == 2
+    assert "log.npz: row 2: expected q_a at 0.5" in log.warnings[0]
+    assert log.warnings[0].endswith(
+        "not read in 4 of the rows, which are left out or begin a new recording"
+    )
+    assert "log.npz: row 62: expected q_b at 0.0" in log.warnings[1]
+
+
+def test_read_log__keeps_the_commands_of_rows_that_were_not_read(tmp_path):
+    columns = swinging()
+    columns["q_a"][100] = 0.0
+    (one,) = read_columns(tmp_path, columns).recordings
+    np.testing.assert_array_equal(one.u[:, 0], columns["u_a"])
+
+
+@pytest.mark.parametrize("rate", [20.0, 100.0])
+def test_read_log__keeps_the_readings_of_a_noisy_sensor(tmp_path, rate):
+    """A potentiometer, whose noise of 0.01 rad is several rad/s from row to row at 100 Hz."""
+    columns = swinging(rate=rate, seconds=100.0)
+    noise = np.random.default_rng(1).normal(0, 0.01, (2, len(columns["time"])))
+    columns |= {"q_a": columns["q_a"] + noise[0], "q_b": columns["q_b"] + noise[1]}
+    assert read_columns(tmp_path, columns).warnings == ()
+
+
+def test_read_log__cuts_where_the_zero_of_an_angle_changes(tmp_path):
+    columns = swinging()
+    columns["q_a"][200:] += 0.6
+    log = read_columns(tmp_path, columns)
+    assert [len(one.q) for one in log.recordings] == [200, 200 - 3]
+    assert "row 202: expected q_a at 0.5" in log.warnings[0]
+    assert (speed_of(log) < 0.6).all()
+
+
+@pytest.mark.parametrize("every", [2, 3, 4, 5])
+def test_read_log__refuses_a_sensor_that_is_slower_than_the_rows(tmp_path, every):
+    """Only the moving joint's values repeat; a parked joint repeats its value anyway."""
+    columns = swinging()
+    columns["q_a"] = columns["q_a"][np.arange(400) // every * every]
+    refusal = (
+        rf"run x, q of \['a'\]: expected new angles at 20 Hz .*, got a new one every {every} rows"
+    )
+    with pytest.raises(ValueError, match=refusal):
+        read_columns(tmp_path, columns)
+    fast = swinging(rate=20.0 * every)
+    fast["q_a"] = fast["q_a"][np.arange(len(fast["time"])) // every * every]
+    log = read_columns(tmp_path, fast)  # 20 Hz are enough
+    assert log.warnings == () and (speed_of(log) < 0.6).all()
+
+
 # --- joined recordings ----------------------------------------------------------------------------
 
 
@@ -254,16 +346,22 @@ x,0.10,0.3,1.2
 x,0.15,0.4,1.3
 """
 REFUSALS = {
-    "nothing": ("", "expected a CSV table with columns run, time, got "),
+    "nothing": ("", "expected a CSV table, got "),
     "decimal comma": (GOOD.replace("1.2", "1,2"), "row 4: expected 4 cells, got 5"),
-    "semicolons": (GOOD.replace(",", ";"), "expected columns ['run', 'time'], got "),
-    "no joint": ("run,time,q_a\nx,0,0\n", "columns: expected u_<joint>, got "),
-    "no angle": ("run,time,u_a\nx,0,0\n", "columns: expected ['q_a'], got "),
+    "semicolons": (GOOD.replace(",", ";"),
+        "columns: expected u_<joint> (--map u_NAME=COLUMN:UNIT), got "),
+    "no joint": ("run,time,q_a\nx,0,0\n",
+        "columns: expected u_<joint> (--map u_NAME=COLUMN:UNIT), got "),
+    "no time": ("run,u_a,q_a\nx,0,0\n",
+        "columns: expected ['time'] (--map time=COLUMN:UNIT), got ['run', 'u_a', 'q_a']"),
+    "no angle": ("run,time,u_a\nx,0,0\n",
+        "columns: expected ['q_a'] (--map q_a=COLUMN:UNIT), got "),
     "half the velocities": ("run,time,u_a,u_b,q_a,q_b,q_dot_a\nx,0,0,0,0,0,0\n",
-        "columns: expected ['q_dot_b'], got "),
+        "columns: expected ['q_dot_b'] (--map q_dot_b=COLUMN:UNIT), got "),
     "text": (GOOD.replace("1.2", "open"), "row 4, column q_a: expected a number, got 'open'"),
     "no number": (GOOD.replace("1.2", ""), "row 4, column q_a: expected a number, got ''"),
-    "per cent": (GOOD.replace("0.3", "30"), "row 4, column u_a: expected -1 to 1, got 30.0"),
+    "per cent": (GOOD.replace("0.3", "30"), "row 4, column u_a: expected -1 to 1 "
+        "(per cent: --map u_a=COLUMN:percent), got 30.0"),
     "repeated time": (GOOD.replace("0.10", "0.05"),
         "run x, column time: expected stamps that rise, got a step of 0 at 0.05"),
     "earlier in its own recording": (
@@ -292,7 +390,7 @@ def test_read_log__refuses_columns_of_different_lengths_and_kinds(tmp_path):
     path = write(tmp_path / "log.npz", columns | {"q_b": np.zeros(29)})
     with pytest.raises(ValueError, match=r"npz: column q_b: expected \(30,\) numbers, got \(29,\)"):
         read_log([path], 4)
-    with pytest.raises(ValueError, match=r"log\.npz: could not convert string to float"):
+    with pytest.raises(ValueError, match=r"npz: row 2, column q_b: expected a number, got 'up'"):
         read_log([write(path, columns | {"q_b": np.repeat("up", 30)})], 4)
     path.write_bytes(b"PK")
     with pytest.raises(ValueError, match=r"log\.npz: expected a readable \.npz file"):

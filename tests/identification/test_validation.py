@@ -7,7 +7,7 @@ import pytest
 from helpers_machines import constant_net, line
 
 from brokk_min.identification import validation
-from brokk_min.identification.logs import Log, Recording, velocity_of
+from brokk_min.identification.logs import Log, Recording, join_recordings, velocity_of
 from brokk_min.identification.validation import free_run, score, validate
 from brokk_min.machine import BROKK_170
 
@@ -98,10 +98,10 @@ def test_free_run__goes_on_from_its_own_angles_by_hand(logged):
     """0.2 rad/s from the sample 13, whatever was recorded; never beyond the training's range."""
     net = replace(constant_net([0.2], logged, ("a",)), q_high=np.array([0.12]))
     recording = line("", 0.0, -0.1, 30)
-    angles, velocities = free_run(net, recording, np.array([13]), 4)
-    start = recording.q[13, 0]
-    expected = np.minimum(start + 0.01 * np.arange(1, 5), 0.12)
-    np.testing.assert_allclose(angles[:, 0, 0], expected, atol=1e-6)
-    assert velocities[-1, 0, 0] == pytest.approx(0.2 if logged else 0.173, abs=0.03)
-    with pytest.raises(ValueError, match="starts: expected 13 or more, got 12"):
-        free_run(net, recording, np.array([12]), 4)
+    samples, ticks = join_recordings(Log(("a",), (recording,), logged)), np.arange(1, 5)
+    errors, velocity_errors = free_run(net, samples, np.array([13]), 4)
+    angles = recording.q[13, 0] - 0.005 * ticks + errors[:, 0, 0]
+    expected = np.minimum(recording.q[13, 0] + 0.01 * ticks, 0.12)
+    np.testing.assert_allclose(angles, expected, atol=1e-6)
+    velocity = -0.1 + velocity_errors[-1, 0, 0]
+    assert velocity == pytest.approx(0.2 if logged else 0.173, abs=0.03)

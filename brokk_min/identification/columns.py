@@ -1,0 +1,90 @@
+"""Tables of other people's loggers: which column is what, in which unit.
+
+A mapping says `boom=Boom_ang:deg,u_boom=Lever:percent,time=Zeit:ms`: column of a log = column of
+the file : unit. A unit may also be a number, by which the column is multiplied; a negative one
+changes its sign.
+"""
+
+import math
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from brokk_min._files import brief, load_arrays, numbers, read_csv
+from brokk_min.machine import Array, require
+
+UNITS = {"deg": math.pi / 180, "mrad": 1e-3, "mm": 1e-3, "percent": 1e-2, "permille": 1e-3}
+UNITS |= {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+KINDS = ("u_", "q_")  # of columns that are numbers, as time is
+Mapped = dict[str, tuple[str, float]]  # column of the log: that of the file, and its factor
+
+
+def parse_map(text: str) -> Mapped:
+    """A mapping from the command line; ValueError: a part that is none, or an unknown unit."""
+    result = {}
+    for part in filter(None, text.split(",")):
+        name, _, source = map(str.strip, part.partition("="))
+        column, _, unit = source.rpartition(":") if ":" in source else (source, "", "1")
+        factor = UNITS.get(unit) or _number(unit)
+        wanted = f"NAME=COLUMN or NAME=COLUMN:UNIT, a unit of {', '.join(UNITS)}, or a number"
+        require(bool(name and column and factor), "--map", wanted, repr(part))
+        known = name in ("run", "time") or name.startswith(KINDS)
+        result[name if known else f"q_{name}"] = (column, factor)
+    return result
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return 0.0
+
+
+def load_table(path: Path, mapped: Mapped | None = None) -> dict[str, Any]:
+    """Columns of a `.csv` or `.npz`; ValueError: no such file, or no number where one must be."""
+    csv = path.suffix.lower() == ".csv"
+    table = read_csv(path) if csv else load_arrays(path)[1]
+    return to_columns(path, table, mapped or {})
+
+
+def to_columns(path: Path, table: Mapping[str, Any], mapped: Mapped) -> dict[str, Any]:
+    """The columns of a log: those of the file that have their names already, and mapped ones.
+
+    Time is in seconds. A table without `run` is one recording, by the name of its file.
+    """
+    named = {name: (name, 1.0) for name in table if name == "time" or name.startswith(KINDS)}
+    named |= {"run": ("run", 1.0)} if "run" in table else {}
+    result = {"run": np.repeat(path.stem, len(next(iter(table.values()), [])))}
+    for name, (column, factor) in (named | mapped).items():
+        wanted = f"a column for {name} (--map {name}=COLUMN:UNIT)"
+        require(column in table, f"{path}: column {column}", wanted, brief(list(table)))
+        values = np.asarray(table[column])
+        if name == "time":
+            values = _seconds(path, column, values)
+            values = values if factor == 1 else values - values[0]  # keeps its digits
+        elif name != "run" and values.dtype.kind in "US":
+            values = numbers(path, column, values)
+        result[name] = values.astype(str) if name == "run" else values * factor
+    return result
+
+
+def _seconds(path: Path, column: str, stamps: Any) -> Array:
+    """Numbers as they are; datetime64 and ISO stamps as seconds since the first one."""
+    if stamps.dtype.kind == "M":
+        return np.asarray((stamps - stamps[0]) / np.timedelta64(1, "s"))
+    if stamps.dtype.kind not in "US":
+        return np.asarray(stamps)
+    if ":" not in str(stamps[0]):
+        return numbers(path, column, stamps)
+    times = []
+    for row, stamp in enumerate(stamps, 2):
+        try:
+            time = datetime.fromisoformat(str(stamp).strip())
+        except ValueError:
+            place = f"{path}: row {row}, column {column}"
+            raise ValueError(f"{place}: expected an ISO stamp, got {brief(str(stamp))}") from None
+        times.append(time if time.tzinfo else time.replace(tzinfo=UTC))
+    return np.array([(time - times[0]).total_seconds() for time in times])

@@ -1,0 +1,78 @@
+"""Tables of other loggers: names, units and stamps by a mapping, and what is said of the rest."""
+
+import numpy as np
+import pytest
+
+from brokk_min.identification.columns import load_table, parse_map
+from brokk_min.identification.logs import read_log
+
+THEIRS = """Zeit;x,Drive,Boom [deg],Lever,Note
+{0},A,10.0,25,start
+{1},A,11.0,-50,
+{2},A,12.0,100,stop
+"""
+
+
+def theirs(tmp_path, stamps):
+    path = tmp_path / "theirs.csv"
+    path.write_text(THEIRS.replace(";x", "").format(*stamps))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("stamps", "unit"),
+    [
+        (("1000", "1050", "1100"), ":ms"),
+        (("1.7e15", "1.70000000005e15", "1.7000000001e15"), ":us"),
+        (("1.00", "1.05", "1.10"), ""),
+        (("2026-01-02T03:04:05.10", "2026-01-02T03:04:05.15", "2026-01-02T03:04:05.20"), ""),
+        (("2026-01-02 23:59:59.95+01:00", "2026-01-02 23:00:00Z", "2026-01-02 23:00:00.05Z"), ""),
+    ],
+)
+def test_read_log__takes_names_units_and_stamps_from_a_mapping(tmp_path, stamps, unit):
+    mapped = parse_map(f"boom=Boom [deg]:deg, u_boom=Lever:percent,run=Drive,time=Zeit{unit}")
+    path = theirs(tmp_path, stamps)
+    (one,) = read_log([path], 2, read=lambda path: load_table(path, mapped)).recordings
+    assert one.name == "A"
+    np.testing.assert_allclose(one.q[:, 0], np.deg2rad([10, 11, 12]), atol=1e-6)
+    np.testing.assert_allclose(one.u[:, 0], [0.25, -0.5, 1.0])
+
+
+def test_parse_map__has_units_and_factors_of_any_sign():
+    mapped = parse_map("arm=Arm:-0.5,u_arm=Spool:permille,q_dot_arm=Rate,q_x=Hub:mm")
+    expected = {"q_arm": ("Arm", -0.5), "u_arm": ("Spool", 0.001), "q_dot_arm": ("Rate", 1.0)}
+    assert mapped == expected | {"q_x": ("Hub", 0.001)}
+
+
+@pytest.mark.parametrize("part", ["boom", "boom=", "=Boom", "boom=Boom:inch", "boom=Boom:0"])
+def test_parse_map__refuses_what_is_no_mapping(part):
+    with pytest.raises(ValueError, match=r"^--map: expected NAME=COLUMN or .*, got '" + part):
+        parse_map(f"u_boom=Lever,{part}")
+
+
+@pytest.mark.parametrize(
+    ("mapping", "message"),
+    [
+        ("boom=Stick", r"column Stick: expected a column for q_boom \(--map q_boom=COLUMN:UNIT\)"),
+        ("boom=Note", "row 2, column Note: expected a number, got 'start'"),
+        ("time=Drive", "row 2, column Drive: expected a number, got 'A'"),
+    ],
+)
+def test_load_table__says_which_column_and_how_to_map_it(tmp_path, mapping, message):
+    path = theirs(tmp_path, (0, 1, 2))
+    with pytest.raises(ValueError, match=rf"theirs\.csv: {message}"):
+        load_table(path, parse_map("time=Zeit," + mapping))
+    path = theirs(tmp_path, ("03:04:05", "2026-01-02 03:04", "x"))
+    with pytest.raises(ValueError, match=r"row 2, column Zeit: expected an ISO stamp, got '03:"):
+        load_table(path, parse_map("time=Zeit"))
+
+
+@pytest.mark.parametrize("run", [np.array([3, 3, 3]), np.array([b"3"] * 3), None])
+def test_read_log__takes_numbers_as_names_and_datetimes_as_time(tmp_path, run):
+    """And a table without `run` as one recording by the name of its file."""
+    start, tick = np.datetime64("2026-01-02T03:04:05"), np.timedelta64(50, "ms")
+    columns = {"time": start + np.arange(3) * tick, "u_a": np.zeros(3), "q_a": np.arange(3) / 20}
+    np.savez(tmp_path / "3.npz", **columns | ({} if run is None else {"run": run}))
+    (one,) = read_log([tmp_path / "3.npz"], 2).recordings
+    assert one.name == "3"
+    np.testing.assert_allclose(one.q_dot[1:, 0], 1.0)
