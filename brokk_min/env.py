@@ -151,7 +151,7 @@ def action_to_pwm(machine: Machine, action: ArrayLike) -> Array:
     a = np.asarray(action)
     if a.shape[-1:] != machine.driven.shape or not np.isfinite(a).all():
         raise ValueError(f"action: expected finite (..., {len(machine.driven)}), got {a}")
-    u = np.zeros((*a.shape[:-1], machine.n), a.dtype)
+    u = np.zeros((*a.shape[:-1], machine.n), np.result_type(a, np.float32))
     u[..., machine.driven] = machine.pwm_limit / PWM_MAX * a
     return limit_command(machine, u)
 

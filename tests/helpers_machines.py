@@ -6,12 +6,15 @@ import numpy as np
 
 from brokk_min.actuator import ActuatorNet
 from brokk_min.beyond.strong_pid import StrongGains
+from brokk_min.env import Measured, measure
 from brokk_min.evaluation import baselines
 from brokk_min.identification.logs import Recording, velocity_of
 from brokk_min.jacobian import Gains
+from brokk_min.machine import BROKK_170, Machine
 
 GAIN = 3.0  # of `obedient_net`
 POSE = np.array([1.5, 0.5, 0.58, 1.71, 1.24])  # the paper's q_s
+DRIVEN = [0, 2, 3, 4]  # joints of the Brokk
 
 
 class Idle:
@@ -91,10 +94,10 @@ def obedient_net(machine):
     )
 
 
-def constant_net(velocity, logged, joints):
+def constant_net(velocity, logged, joints, rows=3):
     """Nets that say `velocity` whatever they see: no weights, sigmoid(0) = 1/2, the middle."""
     middle = np.array(velocity, np.float32)
-    net = random_net(n=len(velocity))
+    net = random_net(n=len(velocity), rows=rows)
     return replace(
         net,
         joints=joints,
@@ -105,6 +108,33 @@ def constant_net(velocity, logged, joints):
         q_low=np.full(len(velocity), -1e3, np.float32),
         q_high=np.full(len(velocity), 1e3, np.float32),
     )
+
+
+def numbered_history() -> np.ndarray:
+    """A history (5, 3, 13) of the Brokk in which every number differs."""
+    joint, lag = np.arange(5)[:, None], np.arange(13)
+    q = POSE[:, None] + 0.01 * (lag - 12)
+    q_dot = 0.02 * joint + 0.001 * lag
+    u = -0.1 * joint + 0.002 * lag
+    return np.stack([q, q_dot, u], axis=1).astype(np.float32)
+
+
+def steady(q, v_goal, q_dot=0.0, u=0.0, machine: Machine = BROKK_170) -> Measured:
+    """Measurements without noise of machines (num, n) in steady motion at `q_dot`."""
+    q = np.atleast_2d(np.asarray(q, float))
+    history = np.zeros((*q.shape, 3, machine.history))
+    history[..., 1, :] = np.broadcast_to(q_dot, q.shape)[..., None]
+    ticks = np.arange(1 - machine.history, 1)
+    history[..., 0, :] = q[..., None] + history[..., 1, :] * machine.dt * ticks
+    history[..., 2, :] = u
+    return measure(machine, history, np.broadcast_to(np.asarray(v_goal, float), (len(q), 3)))
+
+
+def opened(opening: np.ndarray, up: float = 0.07, down: float = 0.07) -> np.ndarray:
+    """Counts by hand: dead zone, then the opening, in whole counts up to 80."""
+    zone = np.where(opening > 0, up, down)
+    counts = np.rint(127 * np.sign(opening) * (zone + (1 - zone) * np.abs(opening)))
+    return np.clip(counts, -80, 80)
 
 
 def line(name, start, slope, ticks, u=0.5):

@@ -11,6 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from helpers_machines import DRIVEN, numbered_history
 from hypothesis import given
 from hypothesis import strategies as st
 from strategies import machines
@@ -18,24 +19,13 @@ from strategies import machines
 from brokk_min import env
 from brokk_min.beyond import interface
 from brokk_min.beyond.interface import Memory, command, observation_scale, observe, smooth_angles
-from brokk_min.env import Measured, measure
+from brokk_min.env import measure
 from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.machine import BROKK_170
-
-POSE = np.array([1.5, 0.5, 0.58, 1.71, 1.24])  # the paper's q_s
-DRIVEN = [0, 2, 3, 4]
 
 
 def memory(rest_ticks: int | list[int] = 0, integral: tuple[float, ...] = (0.0,) * 3) -> Memory:
     return Memory(np.zeros(3), np.array(integral), np.array(rest_ticks))
-
-
-def numbered() -> Measured:
-    """Measurements of the Brokk in which every number differs."""
-    joint, lag = np.arange(5)[:, None], np.arange(13)
-    q, q_dot = POSE[:, None] + 0.001 * (lag - 12), 0.02 * joint + 0.001 * lag
-    history = np.stack([q, q_dot, -0.1 * joint + 0.002 * lag], axis=1).astype(np.float32)
-    return measure(BROKK_170, history, np.array([0.3, -0.1, -0.15], np.float32))
 
 
 def test_smooth_angles__by_hand():
@@ -65,7 +55,9 @@ def test_smooth_angles__are_the_angles_of_steady_motion_and_of_constant_accelera
 
 def test_observe__by_hand():
     """The paper's numbers by their weights, then the three blocks of ours."""
-    measured, integral = numbered(), (0.02, -0.01, 0.03)
+    integral = (0.02, -0.01, 0.03)
+    v_goal = np.array([0.3, -0.1, -0.15], np.float32)
+    measured = measure(BROKK_170, numbered_history(), v_goal)
     obs = observe(BROKK_170, measured, memory(0, integral))
     assert obs.shape == (223,) and obs.dtype == np.float32
     paper = env.features(BROKK_170, measured)

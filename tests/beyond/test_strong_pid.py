@@ -2,30 +2,23 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
+from helpers_machines import DRIVEN, POSE, opened, steady
 
 from brokk_min.beyond.strong_pid import StaticMap, StrongGains, StrongPID, StrongState, static_map
-from brokk_min.env import Measured, measure
+from brokk_min.env import Measured
 from brokk_min.jacobian import Gains, JacobianController
 from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.machine import BROKK_170
 
-POSE = np.array([1.5, 0.5, 0.58, 1.71, 1.24])  # the paper's q_s
-DRIVEN = [0, 2, 3, 4]
 GOAL = np.array([0.04, -0.03, 0.05])
 J = jacobian(forward_kinematics(BROKK_170, POSE))[:, DRIVEN]
 NO_HELP = StaticMap(
     np.tile([0.0, 1.0], (4, 1)), np.array([-1e-9, 1e-9]), np.tile([-9.0, 9.0], (4, 2, 1))
 )  # within the dead zone, whatever the velocity
-
-
-def measured(v_goal: np.ndarray, q_dot: float = 0.0, u: np.ndarray | float = 0.0) -> Measured:
-    """Measurements at the paper's pose, at velocities `q_dot`, after commands `u` (..., H)."""
-    history = np.zeros((1, 5, 3, 13))
-    history[..., 0, :] = POSE[:, None] + q_dot * 0.05 * np.arange(-12, 1)
-    history[..., 1, :] = q_dot
-    history[..., 2, :] = u
-    return measure(BROKK_170, history, np.array([v_goal], float))
+measured = partial(steady, POSE)
 
 
 def controller(feedforward: StaticMap = NO_HELP, **gains: float) -> StrongPID:
@@ -39,11 +32,6 @@ def counts(c: StrongPID, now: Measured, state: StrongState | None = None) -> np.
     u, _ = c(now, state or c.start(1))
     assert u[0, 1] == 0
     return np.rint(127 * u[0, DRIVEN])
-
-
-def opened(opening: np.ndarray) -> np.ndarray:
-    """Counts by hand: the dead zone of 7 %, then the opening, up to 80."""
-    return np.clip(np.rint(127 * np.sign(opening) * (0.07 + 0.93 * np.abs(opening))), -80, 80)
 
 
 def test_without_its_additions__it_is_the_papers_controller():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from helpers_machines import constant_net
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -15,27 +16,10 @@ from brokk_min.machine import valve_opening
 ZONES = np.array([[0.07, 0.07], [0.2, 0.1], [0.0, 0.3]])
 
 
-def constant_net(velocity: float, n: int = 4, H: int = 13) -> ValveNet:
-    """Nets that say `velocity` whatever they read: no weights, sigmoid(0) = 1/2, the middle."""
-    sizes = [(4 * H, 8), (8,), (8, 8), (8,), (8, 1), (1,)]
-    middle, limits = np.full(n, velocity, np.float32), np.full(n, 9.0, np.float32)
-    return ValveNet(
-        joints=tuple("abcd"[:n]),
-        history=H,
-        rate=20.0,
-        velocity_samples=4,
-        velocity_logged=False,
-        machine="some",
-        input_mean=np.zeros((n, 4 * H), np.float32),
-        input_scale=np.ones((n, 4 * H), np.float32),
-        output_low=middle - 1,
-        output_high=middle + 1,
-        q_low=-limits,
-        q_high=limits,
-        weights=tuple(np.zeros((n, *size), np.float32) for size in sizes),
-        training={},
-        dead_zones=np.full((n, 2), 0.07),
-    )
+def valve_net(velocity: float) -> ValveNet:
+    """Nets of four joints that say `velocity` whatever they read."""
+    net = constant_net([velocity] * 4, False, tuple("abcd"), rows=4)
+    return ValveNet(**vars(net), dead_zones=np.full((4, 2), 0.07))
 
 
 def test_mu_law__by_hand():
@@ -66,7 +50,7 @@ def test_valve_inputs__are_the_same_by_numpy_torch_and_a_loop(seed):
 
 
 def test_inputs__are_what_a_net_of_its_own_dead_zones_reads():
-    net, history = constant_net(0.2), np.zeros((4, 3, 13), np.float32)
+    net, history = valve_net(0.2), np.zeros((4, 3, 13), np.float32)
     history[:, 2] = 0.3
     np.testing.assert_allclose(
         net.inputs(history), valve_inputs(history, net.dead_zones), rtol=1e-6
@@ -82,4 +66,4 @@ def test_predict__holds_a_joint_whose_valve_was_closed_and_that_stood_still(coun
     history[1, 2, 3] = -9 / 127
     history[2, 0, -1] = 0.503
     history[3, 0, -1] = 0.501
-    np.testing.assert_allclose(constant_net(0.2).predict(history), [0, 0.2, 0.2, 0], atol=1e-6)
+    np.testing.assert_allclose(valve_net(0.2).predict(history), [0, 0.2, 0.2, 0], atol=1e-6)

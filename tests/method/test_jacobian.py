@@ -9,12 +9,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers_machines import DRIVEN, POSE, opened, steady
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 from strategies import machines
 
-from brokk_min.env import Measured, measure
+from brokk_min.env import Measured
 from brokk_min.jacobian import (
     Gains,
     JacobianController,
@@ -29,9 +30,7 @@ from brokk_min.jacobian import (
 from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.machine import BROKK_170, Machine
 
-POSE = np.array([1.5, 0.5, 0.58, 1.71, 1.24])  # the paper's q_s
 STRETCHED = np.array([0.3, 0.5, 0.1, np.pi, 3 * np.pi / 4])  # all links in one line
-DRIVEN = [0, 2, 3, 4]
 GOAL = np.array([0.04, -0.03, 0.05])
 LOW, HIGH = BROKK_170.column("q_min"), BROKK_170.column("q_max")
 J = jacobian(forward_kinematics(BROKK_170, POSE))[:, DRIVEN]
@@ -42,7 +41,7 @@ J = jacobian(forward_kinematics(BROKK_170, POSE))[:, DRIVEN]
 
 def test_dls__by_hand():
     """Three joints, each along one axis: every axis is W^-1 j / (j^2 W^-1 + lambda^2) by itself."""
-    diagonal, W = np.diag([1.0, 2.0, 0.0]), np.array([1.0, 4.0, 9.0])
+    diagonal, W = np.diag([1, 2, 0]).tolist(), [1, 4, 9]
     expected = np.diag([1 / 1.5, 0.5 / 1.5, 0.0])
     np.testing.assert_allclose(dls(diagonal, W, 0.5), expected, atol=1e-12)
     printed = dls(diagonal, W, 0.5, as_printed=True)  # j W^-1 / (j^2 W + lambda^2)
@@ -85,28 +84,11 @@ def test_manipulability_threshold__is_a_quarter_of_the_largest():
 # --- the controller -------------------------------------------------------------------------------
 
 
-def measured(q, v_goal, q_dot=0.0, machine: Machine = BROKK_170) -> Measured:
-    """Measurements without noise of machines (num, n) in steady motion at `q_dot`."""
-    q = np.atleast_2d(np.asarray(q, float))
-    history = np.zeros((*q.shape, 3, machine.history))
-    history[..., 1, :] = np.broadcast_to(q_dot, q.shape)[..., None]
-    ticks = np.arange(1 - machine.history, 1)
-    history[..., 0, :] = q[..., None] + history[..., 1, :] * machine.dt * ticks
-    return measure(machine, history, np.broadcast_to(np.asarray(v_goal, float), (len(q), 3)))
-
-
 def controller(w0=1e-6, k=0.1, machine: Machine = BROKK_170, **gains) -> JacobianController:
     n = len(machine.driven)
     arrays = {name: np.full(n, gains.get(name, 0.0)) for name in ("kp", "ki", "kd")}
     feedback = np.full(1, gains.get("feedback", 0.0))
     return JacobianController(machine, Gains(**arrays, feedback=feedback), k, w0)
-
-
-def opened(opening: np.ndarray, up: float = 0.07, down: float = 0.07) -> np.ndarray:
-    """Commands by hand: dead zone, then the opening, in whole counts up to 80."""
-    zone = np.where(opening > 0, up, down)
-    counts = np.rint(127 * np.sign(opening) * (zone + (1 - zone) * np.abs(opening)))
-    return np.clip(counts, -80, 80) / 127
 
 
 def drive(
@@ -138,7 +120,7 @@ def test_joint_velocities__beyond_the_fastest_motion_slow_down_in_the_same_direc
 def test_controller__wants_the_joint_velocities_of_eq3():
     """v_goal + K (v_goal - v_tool) by weighted least squares: an optimiser finds the same."""
     q_dot, w0, last = np.array([0.01, 0.0, -0.02, 0.03, 0.01]), 100.0, [0.1, 0.1, -0.1, 0.0]
-    now = measured(POSE, GOAL, q_dot)
+    now = steady(POSE, GOAL, q_dot)
     damping = 0.1 * (1 - np.sqrt(np.linalg.det(J @ J.T)) / w0) ** 2
     W = limit_weights(BROKK_170, POSE, np.array([0.1, 0.0, 0.1, -0.1, 0.0]))[DRIVEN]
     v = GOAL + 0.3 * (GOAL - J @ q_dot[DRIVEN])
@@ -158,21 +140,21 @@ def test_controller__wants_the_joint_velocities_of_eq3():
 def test_controller__first_tick_of_a_p_controller_by_hand():
     c = controller(kp=1.5)
     q_dot = np.linalg.pinv(J) @ GOAL  # at rest all weights are 1
-    u, state = c(measured(POSE, GOAL), c.start(1))
-    np.testing.assert_allclose(u[0, DRIVEN], opened(1.5 * q_dot), atol=1e-9)
+    u, state = c(steady(POSE, GOAL), c.start(1))
+    np.testing.assert_allclose(127 * u[0, DRIVEN], opened(1.5 * q_dot), atol=1e-9)
     assert u[0, 1] == 0
     assert (np.abs(u[0, DRIVEN]) * 127 >= 9).all()  # beyond the dead zone of 8.9 counts
     np.testing.assert_allclose(state.q_dot_goal[0], q_dot, atol=1e-6)
     np.testing.assert_allclose(state.error[0], q_dot, atol=1e-6)
     assert not state.integral.any()  # ki is 0
     moving = np.array([0.02, 0.0, -0.03, 0.01, 0.04])
-    _, state = c(measured(POSE, GOAL, moving), c.start(1))
+    _, state = c(steady(POSE, GOAL, moving), c.start(1))
     np.testing.assert_allclose(state.error[0], q_dot - moving[DRIVEN], atol=1e-6)
 
 
 def test_controller__integral_and_derivative_by_hand():
     """Constant error e: the opening grows by ki e dt a tick; the derivative fades by 0.7 a tick."""
-    still = measured(POSE, 0.3 * GOAL)
+    still = steady(POSE, 0.3 * GOAL)
     e = np.linalg.pinv(J) @ (0.3 * GOAL)
     u, states = drive(controller(ki=2.0), [still] * 6)
     assert not u[0].any()  # nothing has been integrated before the first tick
@@ -180,14 +162,14 @@ def test_controller__integral_and_derivative_by_hand():
         np.testing.assert_allclose(state.integral[0], count * 2.0 * e * 0.05, rtol=2e-2)
     u, states = drive(controller(kd=0.1), [still] * 3)
     derivatives = np.array([state.derivative[0] for state in states])
-    np.testing.assert_allclose(u[:, DRIVEN], opened(0.1 * derivatives), atol=1e-9)
+    np.testing.assert_allclose(127 * u[:, DRIVEN], opened(0.1 * derivatives), atol=1e-9)
     np.testing.assert_allclose(derivatives[0], 0.3 * e * 20, rtol=1e-2)
     np.testing.assert_allclose(derivatives[2], 0.49 * derivatives[0], rtol=5e-2, atol=1e-3)
 
 
 def test_controller__integral_stops_while_the_valve_is_fully_open():
     """Anti-windup: with kp at once; without, once the integral fills the valve."""
-    fast = measured(POSE, 5 * GOAL)
+    fast = steady(POSE, 5 * GOAL)
     u, states = drive(controller(kp=40.0, ki=10.0), [fast] * 20)
     full = np.abs(u[-1, DRIVEN]) > 79.5 / 127
     assert full.any() and (states[-1].integral[0, full] == 0).all()
@@ -197,7 +179,7 @@ def test_controller__integral_stops_while_the_valve_is_fully_open():
     limit = (80 / 127 - 0.07) / 0.93
     assert sizes[-1] == sizes[-50]
     assert limit <= sizes[-1] <= limit + 10 * 0.47 * 0.05
-    _, back = drive(c, [measured(POSE, -5 * GOAL)] * 10, states[-1])
+    _, back = drive(c, [steady(POSE, -5 * GOAL)] * 10, states[-1])
     assert (np.abs(back[-1].integral) < np.abs(states[-1].integral)).all()
 
 
@@ -205,10 +187,10 @@ def test_controller__opens_each_valve_beyond_its_own_dead_zone():
     joints = [replace(joint, dead_zone=(0.1, 0.2)) for joint in BROKK_170.joints]
     machine = replace(BROKK_170, name="own zones", joints=tuple(joints))
     c = controller(machine=machine, kp=1.5)
-    u, _ = c(measured(POSE, GOAL, machine=machine), c.start(1))
+    u, _ = c(steady(POSE, GOAL, machine=machine), c.start(1))
     opening = 1.5 * np.linalg.pinv(J) @ GOAL
     assert opening.min() < -0.01 < 0.01 < opening.max()
-    np.testing.assert_allclose(u[0, DRIVEN], opened(opening, 0.1, 0.2), atol=1e-9)
+    np.testing.assert_allclose(127 * u[0, DRIVEN], opened(opening, 0.1, 0.2), atol=1e-9)
 
 
 def test_controller__of_a_batch_is_that_of_its_rows():
@@ -222,9 +204,9 @@ def test_controller__of_a_batch_is_that_of_its_rows():
     together, alone = c.start(4), [c.start(1) for c in rows]
     for _ in range(6):
         goals = rng.uniform(-0.2, 0.2, (4, 3))
-        u, together = c(measured(poses, goals), together)
+        u, together = c(steady(poses, goals), together)
         for i in range(4):
-            single, alone[i] = rows[i](measured(poses[i], goals[i]), alone[i])
+            single, alone[i] = rows[i](steady(poses[i], goals[i]), alone[i])
             np.testing.assert_allclose(single[0], u[i], atol=1e-9)
 
 
@@ -236,7 +218,7 @@ def test_controller__sends_whole_counts_within_the_limit(machine, seed):
     q = np.where(rng.random((5, machine.n)) < 0.3, high, rng.uniform(low, high, (5, machine.n)))
     state = c.start(5)
     for _ in range(3):
-        u, state = c(measured(q, rng.normal(0, 1, (5, 3)), machine=machine), state)
+        u, state = c(steady(q, rng.normal(0, 1, (5, 3)), machine=machine), state)
         counts = u * 127
         assert np.isfinite(u).all()
         assert np.abs(counts).max() <= machine.pwm_limit + 1e-9

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers_machines import closed_form
+from helpers_machines import POSE, closed_form
 from hypothesis import given
 from strategies import poses
 
@@ -19,7 +19,6 @@ from brokk_min.kinematics import (
 )
 from brokk_min.machine import BROKK_170
 
-POSE = np.array([1.5, 0.5, 0.58, 1.71, 1.24])  # the paper's q_s
 STRAIGHT = np.array([0.0, 0.0, 0.0, np.pi, 3 * np.pi / 4])  # all links in one level line
 
 
