@@ -1,11 +1,11 @@
-"""Task-space control of a hydraulic machine, learned from its logs: the paper as readable NumPy.
+"""Task-space control of a hydraulic machine, learned from its logs: the paper in NumPy.
 
 The chain goes from a machine to logs, to actuator nets, to a policy, and to a comparison on the
-machine. "Simulation" is the learned nets, "machine" the analytic plant (or a real machine on the
-bus), which the learner never sees. Nothing in this package is a safety function.
+machine. "Simulation" is the learned nets, "machine" the analytic plant or a real machine on the
+bus. The learner sees neither of these, only logs. Nothing in this package is a safety function.
 
-Read the files of this folder in the order machine, kinematics, actuator, jacobian, env, ppo, hw.
-They hold the paper's method. `beyond` holds our improvements, one file each.
+Read the files of this folder in the order machine, kinematics, actuator, jacobian, settings, env,
+ppo, hw. They hold the paper's method. `beyond` holds our improvements, one file each.
 
 Conventions: SI units and radians; the base frame has z up; joints are in the order of
 `Machine.joints`; the last axis of an array runs over joints or x, y, z, leading axes are batches.

@@ -40,7 +40,7 @@ from brokk_min.machine import PWM_MAX, Array, Machine, Measured, limit_command, 
 from brokk_min.settings import TaskConfig
 
 DRAWS = 4096  # poses and goals on which deviations are measured
-COMMAND_STD = 0.4  # of the largest command, measured: PID and policies have 0.30 to 0.43
+COMMAND_STD = 0.4  # of the largest command; runs of PIDs and policies had 0.30 to 0.43
 
 
 class Block(NamedTuple):
@@ -54,8 +54,9 @@ class Block(NamedTuple):
 def velocity_deviations(machine: Machine) -> tuple[Array, Array]:
     """Deviations in the task of tool [m/s] (3,) and joint velocities [rad/s] (n,), measured.
 
-    Goals and poses are drawn as in training. The joint velocities are the smallest that give the
-    goal, J^+ v, cut at each joint's fastest motion; at least 5 % of that, if a joint gives none.
+    Poses and speeds of goals are drawn as in training, in all directions. The joint velocities are
+    the smallest that give the goal, pinv(J) v, cut at each joint's fastest motion; at least 5 % of
+    that, if a joint gives none.
     """
     rng = np.random.default_rng(0)
     q = rng.uniform(machine.column("q_min"), machine.column("q_max"), (DRAWS, machine.n))
@@ -114,7 +115,7 @@ def measure(
 
     From the measured history (..., n, 3, H) and the goal velocity [m/s] (..., 3). `noise` of what
     sensors measure is in deviations (..., noisy). It is new at each tick for all samples of the
-    history, and the tool's velocity has noise of its own.
+    history, old ones too. The tool's velocity has noise of its own beside that of the angles in J.
     """
     q = history[..., 0, -1].copy()
     driven = history.take(machine.driven, axis=-3)
@@ -161,9 +162,8 @@ class Interface:
     """What an agent reads, does and is paid for; the defaults are the paper's.
 
     `memory` is what the agent keeps from tick to tick. At the start of an episode it is None; the
-    paper's agent keeps nothing. `remember` is called once a tick, before `observe` and `command`.
-    The reward is eq2 less `cost`, which gets the memory after the tick. `learning.gym_env` calls
-    all five.
+    paper's agent keeps nothing. In each tick come `remember`, `observe`, `command`, the transition,
+    and `cost`, which gets the memory after it; `learning.gym_env` takes the cost off eq2.
     """
 
     scale: Callable[[Machine], tuple[Array, Array]] = observation_scale  # mean, deviation

@@ -74,7 +74,7 @@ def jacobian(frames: Frames) -> Array:
     """
     J = np.cross(frames.z[..., :-1, :], frames.p[..., -1:, :] - frames.p[..., :-1, :])
     for i in frames.prismatic:
-        J[..., i, :] = frames.z[..., i, :]  # J_i = z_{i-1}
+        J[..., i, :] = frames.z[..., i, :]  # J_i = z_{i-1}; `i` counts from 0
     return np.swapaxes(J, -1, -2)
 
 

@@ -84,7 +84,7 @@ class Machine:
     valve_frame_id: int  # CAN identifier of the valve frame
     controller_node: int  # CANopen node id of the valve controller
     q_start: tuple[float, ...] = ()  # rad, where experiments start; empty: mid-range
-    # The fields below concern the analytic plant only; the defaults are assumed of the Brokk.
+    # The fields below are of the analytic plant alone; defaults are tuned to the paper's Fig. 2.
     pump_flow: float = 1.0  # m^3/s
     delay: float = 0.040  # s, from command to valve
     plant_dt: float = 0.005  # s, step of explicit Euler
@@ -149,7 +149,7 @@ class Machine:
 
     @cached_property
     def cylinder_speeds(self) -> NDArray[np.float64]:
-        """Speeds at full command [m/s], (n, 2); by default they give q_dot_up and q_dot_down."""
+        """Speeds at full command [m/s], (n, 2); by default q_dot_up and _down at most."""
         given = self.column("cylinder_speed")
         fastest = np.stack([self.column("q_dot_up"), self.column("q_dot_down")], axis=-1)
         opening = (self.pwm_limit / PWM_MAX - self.dead_zones) / (1 - self.dead_zones)

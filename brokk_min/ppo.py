@@ -1,9 +1,10 @@
 """Proximal Policy Optimization (Schulman et al., 2017) in one file, to be read from top to bottom.
 
-It trains on any Gymnasium vector environment that resets in the same step. A truncated episode did
-not fail: its return goes on with the value of its own last observation. At a termination it stops.
-Advantages come from a critic, as in the paper; `train` also accepts another advantage function.
-Names are CleanRL's, but num_steps is horizon; target_kl steers the learning rate. Paper: Sec. 3.4
+It trains on a Gymnasium vector environment of boxes that resets in the same step. A truncated
+episode did not fail: its return goes on with the value of its own last observation. At a
+termination it stops. Advantages come from a critic, as in the paper; `train` also accepts another
+advantage function.
+Names follow CleanRL's where they can; target_kl steers the learning rate. Paper: Sec. 3.4
 """
 
 from __future__ import annotations
@@ -147,7 +148,7 @@ def critic_advantages(agent: Agent, rollout: Rollout, config: PPOConfig) -> tupl
     """Advantages by the critic, and the returns (T, N) that it learns from. Paper: Sec. 3.4"""
     values = agent.value(rollout.obs)
     next_values = agent.value(rollout.next_obs) * ~rollout.terminated
-    rewards = rollout.rewards * (1 - config.gamma)
+    rewards = rollout.rewards * (1 - config.gamma)  # so that a return is as large as a reward
     dones = rollout.dones.float()
     advantages = gae(rewards, values, next_values, dones, config.gamma, config.gae_lambda)
     return advantages, advantages + values
@@ -189,7 +190,7 @@ def begin(env: VectorEnv[Any, Any, Any], config: PPOConfig, seed: int) -> Checkp
     agent = Agent(obs_size, math.prod(env.single_action_space.shape or ()), config.log_std)
     agent.log_std.requires_grad_(config.log_std_end is None)
     optimizer = torch.optim.Adam(agent.parameters(), lr=config.learning_rate, fused=True)
-    optimizer.param_groups[0]["initial_lr"] = config.learning_rate
+    optimizer.param_groups[0]["peak_lr"] = config.learning_rate
     obs = torch.as_tensor(env.reset(seed=seed)[0], dtype=torch.float32)
     return Checkpoint(agent, optimizer, obs, 0, 0)
 
@@ -212,7 +213,7 @@ def train(
     group = optimizer.param_groups[0]
     while global_step < config.total_steps:
         done = global_step / config.total_steps
-        group["lr"] = group["initial_lr"] * (1 - done)
+        group["lr"] = group["peak_lr"] * (1 - done)
         if config.log_std_end is not None:
             agent.log_std.data.fill_(config.log_std + (config.log_std_end - config.log_std) * done)
         rollout, obs = collect(env, agent, obs, config.horizon)
@@ -247,11 +248,11 @@ def train(
         metrics = {f"losses/{name}": mean for name, mean in zip(names, means, strict=True)}
         metrics["charts/reward"] = float(rollout.rewards.mean())
         metrics["charts/learning_rate"] = group["lr"]
-        # lower the rate after a large change of the policy, raise it after a small one, as the
-        # rule of rl_games, with smaller steps
+        # lower the rate after a large change of the policy, raise it after a small one, as
+        # rl_games does with other thresholds
         if metrics["losses/approx_kl"] > 1.5 * config.target_kl:
-            group["initial_lr"] /= 1.2
+            group["peak_lr"] /= 1.2
         elif metrics["losses/approx_kl"] < 0.7 * config.target_kl:
-            group["initial_lr"] = min(1.2 * group["initial_lr"], config.learning_rate)
+            group["peak_lr"] = min(1.2 * group["peak_lr"], config.learning_rate)
         on_update(Checkpoint(agent, optimizer, obs, global_step, update), rollout, metrics)
     return agent

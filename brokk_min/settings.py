@@ -1,4 +1,4 @@
-"""Settings of the task and of PPO; they are separate so that `--help` need not import torch."""
+"""Settings of the task and of PPO."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,10 @@ class TaskConfig:
 
 @dataclass(frozen=True)
 class PPOConfig:
-    """Settings of PPO; the paper prints the number of environments only."""
+    """Settings of PPO with a critic, tuned; the paper prints the number of environments only.
+
+    `learning.recipes` has those of agents that learn otherwise.
+    """
 
     total_steps: int = 6_000_000  # environment steps in all
     num_envs: int = 256  # environments side by side (paper: 256)
