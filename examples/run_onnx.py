@@ -1,6 +1,7 @@
 """A policy without this package: NumPy and onnxruntime alone drive a toy plant at 20 Hz.
 
-Run it as `python run_onnx.py FILE.onnx`, with what `brokk-min export` made of a paper's agent.
+Run it as `python run_onnx.py FILE.onnx`, with what `brokk-min export` made of a policy of
+`brokk-min train --paper`. It drives until Ctrl-C.
 """
 
 import json
@@ -16,7 +17,7 @@ def load(path):
     net = onnxruntime.InferenceSession(path)
     told = {k: json.loads(text) for k, text in net.get_modelmeta().custom_metadata_map.items()}
     if told.get("interface") != "paper":
-        sys.exit(f"{path}: expected interface paper, got {told.get('interface')}")
+        sys.exit(f"{path}: expected a policy of train --paper, got {told.get('interface')}")
     return net, told
 
 

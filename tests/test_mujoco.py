@@ -4,18 +4,17 @@ import json
 import shlex
 from pathlib import Path
 
+import mujoco
 import numpy as np
-import pytest
 
-mujoco = pytest.importorskip("mujoco")
-
-from brokk_min.__main__ import main  # noqa: E402
-from brokk_min.actuator import lever_arm  # noqa: E402
-from brokk_min.cli.options import find_plant  # noqa: E402
-from brokk_min.kinematics import forward_kinematics, tool_position  # noqa: E402
-from brokk_min.machine import BROKK_170 as M  # noqa: E402
-from brokk_min.machine import PWM_MAX  # noqa: E402
-from examples.mujoco_brokk import PLANT, MujocoBrokk, build  # noqa: E402
+from brokk_min.__main__ import main
+from brokk_min.actuator import lever_arm
+from brokk_min.cli.options import find_plant
+from brokk_min.evaluation import baselines
+from brokk_min.kinematics import forward_kinematics, tool_position
+from brokk_min.machine import BROKK_170 as M
+from brokk_min.machine import PWM_MAX
+from examples.mujoco_brokk import PLANT, MujocoBrokk, build
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "mujoco_brokk.py"
 LOW, HIGH = M.column("q_min"), M.column("q_max")
@@ -79,12 +78,19 @@ def test_one_pump__slows_joints_that_move_together():
 
 def test_chain__runs_on_the_machine_in_mujoco(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(baselines, "EFFORT", (1, 1, 1.0))
+    Path("up.csv").write_text("sequence,time,vx,vy,vz\nup,0,0,0,0.1\nup,1,0,0,0\nup,2,0,0,0\n")
     commands = (
         f"collect --plant {EXAMPLE}:PLANT --hours 0.02 --out log.npz",
         "inspect log.npz --json inspected.json",
         "fit log.npz --out net.npz --steps 30 --batch-size 64",
+        "train --actuator net.npz --out policy.npz --total-steps 8192",
+        f"evaluate --policy policy.npz --plant {EXAMPLE}:PLANT --commands up.csv --num-starts 1 "
+        "--json runs.json",
     )
     for line in commands:
         assert main(shlex.split(line)) == 0, line
     joints = json.loads(Path("inspected.json").read_text())["joints"]
     assert {name: joint["sign"] for name, joint in joints.items()} == dict.fromkeys(M.names, 1)
+    runs = json.loads(Path("runs.json").read_text())["runs"]
+    assert all(0 < run["velocity_error_mean"] < 0.5 for run in runs) and len(runs) > 3

@@ -57,7 +57,8 @@ def to_columns(path: Path, table: Mapping[str, Any], mapped: Mapped) -> dict[str
     """
     named = {name: (name, 1.0) for name in table if name == "time" or name.startswith(KINDS)}
     named |= {"run": ("run", 1.0)} if "run" in table else {}
-    result = {"run": np.repeat(path.stem, len(next(iter(table.values()), [])))}
+    one_run = np.repeat(path.stem, len(next(iter(table.values()), [])))
+    result: dict[str, Any] = {"run": one_run, **table}  # other columns, for messages
     for name, (column, factor) in (named | mapped).items():
         wanted = f"a column for {name} (--map {name}=COLUMN:UNIT)"
         require(column in table, f"{path}: column {column}", wanted, brief(list(table)))

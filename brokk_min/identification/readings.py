@@ -93,7 +93,7 @@ def check_run(run: str, time: Array, q: Array, rate: float, joints: Sequence[str
     wanted = f"s, at {rate:g} Hz, the machine's rate (--machine), or more"
     got = f"{1 / median:.3g} Hz (if it is in ms: --map time=COLUMN:ms)"
     require(median <= 1.05 / rate, f"run {run}, column time", wanted, got)
-    wanted = "angles that do not start again after a turn (numpy.unwrap)"
+    wanted = "one drive, and angles that do not start again after a turn (numpy.unwrap)"
     turned = 1.5 * np.pi < jump < 2.5 * np.pi
     require(not turned, f"run {run}", wanted, f"a jump of {jump:.2f} rad")
     repeats = rows_per_value(q)

@@ -14,6 +14,8 @@ from pathlib import Path
 import pytest
 
 from brokk_min.__main__ import COMMANDS, main
+from brokk_min._files import SHIPPED, read_json
+from brokk_min.evaluation.report import BOUND
 
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
@@ -29,6 +31,21 @@ def test_readme__lists_the_files_of_the_method_with_their_lines() -> None:
     listed = ["__init__", "machine", "kinematics", "actuator", "jacobian"]
     listed += ["settings", "env", "ppo", "hw"]
     assert [name for name, _ in rows] == listed
+
+
+RESULT = re.compile(r"^\| .*?(PID|PPO|bound).*? \| ([\d.]+) \| ?([\d.]*) \| ?(.*) ?\|$", re.M)
+SHOWN = ("pid_by_hand", "jacobian_pid_k0.1", "rl_paper", "rl", "jacobian_pid_ff_integral")
+
+
+def test_readme__results_are_those_of_the_shipped_files() -> None:
+    """`reproduce` writes table.json; the bound is of `benchmarks.perfect_model`."""
+    table = read_json(SHIPPED / "brokk170" / "table.json", "a table")["table"]
+    rows = RESULT.findall(README.read_text())
+    assert len(rows) == 6
+    for name, (_, error, drift, _) in zip(SHOWN, rows, strict=False):
+        assert f"{table[name]['velocity_error_mean']['mean']:.4f}" == error
+        assert f"{table[name]['off_axis_drift_max']['mean']:.3f}" == drift
+    assert rows[5][:2] == ("bound", f"{BOUND:.4f}")
 
 
 def test_readme__lists_the_wings() -> None:
