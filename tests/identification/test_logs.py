@@ -370,8 +370,8 @@ REFUSALS = {
     "milliseconds": (re.sub(r"x,0\.(\d\d)", r"x,\g<1>0", GOOD), "run x, column time: expected s, "
         "at 20 Hz, the machine's rate (--machine), or more, got 0.02 Hz"),
     "an angle that wraps": (GOOD.replace("1.1", "3.1").replace("1.2", "-3.1"),
-        "run x: expected one drive, and angles that do not start again after a turn (numpy.unwrap), "
-        "got a jump of 6.20 rad"),
+        "run x: expected one drive, and angles that do not start again after a turn "
+        "(numpy.unwrap), got a jump of 6.20 rad"),
 }  # fmt: skip
 
 
