@@ -10,11 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 import tyro
 from PIL import Image
 from tqdm import tqdm
+
+try:
+    import mujoco
+except Exception as error:  # of PyOpenGL, if MUJOCO_GL names a library that is not there
+    raise SystemExit(f"MUJOCO_GL: expected an OpenGL library that is there, got {error}") from None
 
 from brokk_min.evaluation.rollout import rollout
 from brokk_min.evaluation.sequences import read_commands

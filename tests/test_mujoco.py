@@ -1,13 +1,18 @@
 """The machine in MuJoCo has our geometry, obeys, feels its load, and goes through the chain."""
 
 import json
+import os
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import mujoco
 import numpy as np
+from PIL import Image
 
 from brokk_min.__main__ import main
+from brokk_min._files import SHIPPED
 from brokk_min.actuator import lever_arm
 from brokk_min.cli.options import find_plant
 from brokk_min.evaluation import baselines
@@ -94,3 +99,19 @@ def test_chain__runs_on_the_machine_in_mujoco(tmp_path, monkeypatch):
     assert {name: joint["sign"] for name, joint in joints.items()} == dict.fromkeys(M.names, 1)
     runs = json.loads(Path("runs.json").read_text())["runs"]
     assert all(0 < run["velocity_error_mean"] < 0.5 for run in runs) and len(runs) > 3
+
+
+def test_film__is_written_or_says_that_there_is_no_opengl(tmp_path):
+    commands, out = tmp_path / "up.csv", tmp_path / "up.gif"
+    commands.write_text("sequence,time,vx,vy,vz\nup,0,0,0,0.1\nup,1,0,0,0\n")
+    policy = SHIPPED / M.name / "policy.npz"
+    film = [sys.executable, EXAMPLE.with_name("mujoco_film.py"), "--policy", policy, "--out", out]
+    environment = os.environ | {"MUJOCO_GL": "egl", "PYTHONPATH": str(EXAMPLE.parents[1])}
+    done = subprocess.run(
+        [*film, "--commands", commands], env=environment, capture_output=True, text=True
+    )
+    if done.returncode:
+        assert "OpenGL" in done.stderr.splitlines()[-1]
+    else:
+        with Image.open(out) as pictures:
+            assert pictures.size == (960, 360) and pictures.n_frames > 4
