@@ -86,11 +86,11 @@ def test_chain__runs_on_the_machine_in_mujoco(tmp_path, monkeypatch):
     monkeypatch.setattr(baselines, "EFFORT", (1, 1, 1.0))
     Path("up.csv").write_text("sequence,time,vx,vy,vz\nup,0,0,0,0.1\nup,1,0,0,0\nup,2,0,0,0\n")
     commands = (
-        f"collect --plant {EXAMPLE}:PLANT --hours 0.02 --out log.npz",
+        f"collect --plant '{EXAMPLE}:PLANT' --hours 0.02 --out log.npz",
         "inspect log.npz --json inspected.json",
         "fit log.npz --out net.npz --steps 30 --batch-size 64",
         "train --actuator net.npz --out policy.npz --total-steps 8192",
-        f"evaluate --policy policy.npz --plant {EXAMPLE}:PLANT --commands up.csv --num-starts 1 "
+        f"evaluate --policy policy.npz --plant '{EXAMPLE}:PLANT' --commands up.csv --num-starts 1 "
         "--json runs.json",
     )
     for line in commands:
