@@ -59,7 +59,7 @@ def listed(judged: Sequence[str]) -> str:
         against.setdefault(first, []).extend(other)
     names = []
     for first, others in against.items():
-        names.append(f"{first} against {' and '.join(others)}" if others else first)
+        names.append(f"{first} (against {' / '.join(others)})" if others else first)
     return " and ".join(names)
 
 

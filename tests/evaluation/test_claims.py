@@ -104,8 +104,8 @@ def test_task_claims__on_error_are_of_each_sequence_and_figure(x, z, drift, expe
 def test_task_claims__say_by_hand_first_and_then_optimised():
     claim = claims.task_claims(runs_with({PPO: 0.03, HIGH: 0.02, LOW: 0.04, RAW: 0.05}))[-1]
     assert claim["verdict"] == (
-        "holds here for PPO, the paper's agent against PID by hand, raw and PID by hand; "
-        "does not hold here for PPO, the paper's agent against PID optimised, k = 0.1"
+        "holds here for PPO, the paper's agent (against PID by hand, raw / PID by hand); "
+        "does not hold here for PPO, the paper's agent (against PID optimised, k = 0.1)"
     )
     measured = "to be below 0: velocity_error_mean along all of PPO, the paper's agent against PID"
     assert measured in claim["measured"]
