@@ -1,4 +1,5 @@
-"""Verdicts follow from the numbers: made-up runs for which they are known."""
+"""Verdicts follow import re
+from the numbers: made-up runs for which they are known."""
 
 from itertools import product
 
@@ -33,7 +34,8 @@ def verdict(claim, controller):
     """The part of a claim's verdict that is about one controller, or about one PID."""
     parts = [part.partition(" for ") for part in claim["verdict"].split("; ")]
     title = TITLES[controller]
-    (found,) = [text for text, _, of in parts if any(n.endswith(title) for n in of.split(" and "))]
+    names = {text: re.split(r" \(against | / | and |\)", of) for text, _, of in parts}
+    (found,) = [text for text, of in names.items() if title in of]
     return found
 
 
