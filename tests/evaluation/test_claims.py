@@ -1,6 +1,6 @@
-"""Verdicts follow import re
-from the numbers: made-up runs for which they are known."""
+"""Verdicts follow from the numbers: made-up runs for which they are known."""
 
+import re
 from itertools import product
 
 import numpy as np
