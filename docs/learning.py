@@ -26,7 +26,7 @@ def main(folder: Path) -> None:
         curve = np.genfromtxt(folder / f"{file}.csv", delimiter=",", names=True, deletechars="")
         window = np.ones(max(1, round(PART * len(curve)))) / max(1, round(PART * len(curve)))
         columns = curve["global_step"] / 1e6, curve["charts/velocity_error"]
-        steps, error = (np.convolve(column, window, "valid") for column in columns)
+        steps, error = (np.convolve(x, window, "valid")[:: len(window)] for x in columns)
         axes.plot(steps, error, label=TITLES[name])
     axes.set(xscale="log", yscale="log", ylim=(0.02, 0.2))
     axes.set(xlabel="million steps", ylabel="velocity error in training [m/s]")

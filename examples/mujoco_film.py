@@ -1,6 +1,6 @@
 """A film of the machine in MuJoCo while a policy drives it: beside the window's drawing, in 3-D.
 
-    python examples/mujoco_film.py --policy policy.npz --out film.gif
+    python -m examples.mujoco_film --policy policy.npz --out film.gif
 
 The policy follows the goals of a commands CSV. MuJoCo's renderer needs OpenGL; on a computer
 without a screen set MUJOCO_GL=egl.

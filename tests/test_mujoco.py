@@ -105,10 +105,13 @@ def test_film__is_written_or_says_that_there_is_no_opengl(tmp_path):
     commands, out = tmp_path / "up.csv", tmp_path / "up.gif"
     commands.write_text("sequence,time,vx,vy,vz\nup,0,0,0,0.1\nup,1,0,0,0\n")
     policy = SHIPPED / M.name / "policy.npz"
-    film = [sys.executable, EXAMPLE.with_name("mujoco_film.py"), "--policy", policy, "--out", out]
-    environment = os.environ | {"MUJOCO_GL": "egl", "PYTHONPATH": str(EXAMPLE.parents[1])}
+    program = [sys.executable, "-m", "examples.mujoco_film", "--commands", commands]
     done = subprocess.run(
-        [*film, "--commands", commands], env=environment, capture_output=True, text=True
+        [*program, "--policy", policy, "--out", out],
+        cwd=EXAMPLE.parents[1],
+        env=os.environ | {"MUJOCO_GL": "egl"},
+        capture_output=True,
+        text=True,
     )
     if done.returncode:
         assert "OpenGL" in done.stderr.splitlines()[-1]
