@@ -1,5 +1,7 @@
 """The commands at a machine, simulated or real, and for what was recorded there."""
 
+import logging
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -165,5 +167,7 @@ class Export(Command):
 
         machine = self.find_machine()
         self.writes(self.out)
+        logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # not on what is not needed here
+        warnings.filterwarnings("ignore", category=FutureWarning, module="copyreg")  # torch's own
         export_onnx(self.out, load_policy(self.policy, machine), machine)
         print(f"{self.out}: observation (batch, obs) in, action (batch, driven joints) out")

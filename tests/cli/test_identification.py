@@ -211,6 +211,7 @@ def test_inspect__reads_recordings_of_ros(tmp_path, capsys):
         ("fit l.csv --out n.txt", 2, "--out: expected a name in .npz, got n.txt"),
         ("fit l.csv --out n.npz --batch-size 0", 2, "--batch-size: expected 1 or more, got 0"),
         ("inspect drive.log", 1, "drive.log: expected a candump log, got row 1: expected"),
+        ("inspect drive.log --map q1=boom:deg", 1, "--map: expected a table or a recording"),
     ],
 )
 def test_wrong_use__is_refused(line, status, message, tmp_path, monkeypatch, capsys):

@@ -112,7 +112,8 @@ def test_export__gives_the_policys_actions_and_what_it_must_agree_on(folder, tmp
     pytest.importorskip("onnxscript")
     out = tmp_path / "p.onnx"
     assert run(f"export --policy '{folder}/policy.npz' --out", out) == 0
-    assert capsys.readouterr().out.startswith(f"{out}: observation (batch, obs) in")
+    printed = capsys.readouterr()
+    assert printed.out.startswith(f"{out}: observation (batch, obs) in") and not printed.err
     session = onnxruntime.InferenceSession(out)
     policy = load_policy(folder / "policy.npz", BROKK_170)
     observation = np.random.default_rng(0).standard_normal((7, 163), np.float32)

@@ -1,0 +1,102 @@
+"""Errors on the machine while agents learn, against hours: a critic, and groups of rollouts.
+
+    python -m benchmarks.curves [FOLDER] [SEED]
+
+FOLDER is one of `brokk-min reproduce`, by default results; all agents learn on its net.npz. Now and
+then, off the clock, the policy without its exploration drives the machine on goals that are never
+scored. The curves go to curves.json in FOLDER, where finished ones are not made again, and the
+picture to docs/figures/learning.svg. It has the 2.5 hours of the paper as a line.
+"""
+
+import json
+import sys
+import time
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from matplotlib import pyplot as plt
+
+import benchmarks  # noqa: F401, before NumPy computes: one thread
+from benchmarks.peers import machine_error
+from brokk_min import ppo
+from brokk_min._files import write_json
+from brokk_min.identification.net_file import load_net
+from brokk_min.learning.checkpoint import actor_weights, make_env, save_policy, stagger_episodes
+from brokk_min.learning.jobs import side_by_side
+from brokk_min.learning.policy import Policy, PolicyController
+from brokk_min.learning.recipes import find_recipe
+from brokk_min.machine import BROKK_170 as M
+
+LONG = 30_000_000  # steps of the critic, as many as of groups with the same observation
+AGENTS = {
+    "critic, the paper's observation": replace(
+        find_recipe(paper=True, critic=True),
+        learner=replace(find_recipe(paper=True, critic=True).learner, total_steps=LONG),
+    ),
+    "groups, the paper's observation": find_recipe(paper=True),
+    "groups, our observation": find_recipe(),
+}
+POINTS = 50  # of a curve
+RUNS = 32  # of 20 s, for each point
+PAPER_HOURS = 2.5
+
+
+def learn(name: str, folder: Path, seed: int) -> list[dict[str, float]]:
+    """One training: steps, hours of CPU, and the error on the machine [m/s], point by point."""
+    torch.set_num_threads(1)
+    recipe, net = AGENTS[name], load_net(folder / "net.npz", M)
+    env, advantages = make_env(M, net, recipe)
+    start = ppo.begin(env, recipe.learner, seed)
+    stagger_episodes(env)
+    updates = recipe.learner.total_steps // (recipe.learner.num_envs * recipe.learner.horizon)
+    rows: list[dict[str, float]] = []
+    began = time.process_time()
+
+    def on_update(now: ppo.Checkpoint, *_: Any) -> None:
+        nonlocal began
+        if now.update % max(1, updates // POINTS) == 0 or now.update == updates:
+            hours = (time.process_time() - began) / 3600
+            policy = Policy({"seed": seed}, actor_weights(now.agent), net, recipe.interface)
+            error = machine_error(PolicyController(M, policy), RUNS)
+            rows.append({"steps": now.global_step, "hours": hours, "error": error})
+            began = time.process_time() - 3600 * hours
+
+    agent = ppo.train(env, recipe.learner, seed, advantages, on_update, start)
+    policy = Policy({"seed": seed}, actor_weights(agent), net, recipe.interface)
+    save_policy(folder / f"curve of {name}, seed {seed}.npz", policy, M)
+    return rows
+
+
+def draw(curves: dict[str, list[dict[str, float]]], path: Path) -> None:
+    """Error against hours of one core, both logarithmic."""
+    plt.rcParams.update({"svg.hashsalt": "learning", "svg.fonttype": "none"})
+    figure, axes = plt.subplots(figsize=(6.4, 3.4), layout="constrained")
+    for name, rows in curves.items():
+        hours, error = ([row[key] for row in rows] for key in ("hours", "error"))
+        axes.plot(hours, error, marker=".", label=name)
+    axes.axvline(PAPER_HOURS, color="gray", linestyle=":", label="the paper's training")
+    axes.set(xscale="log", yscale="log")
+    axes.set(xlabel="hours of one core", ylabel="velocity error on the machine [m/s]")
+    axes.legend()
+    figure.savefig(path, metadata={"Date": None})
+
+
+def main(folder: str = "results", seed: str = "0") -> None:
+    file = Path(folder) / "curves.json"
+    curves = json.loads(file.read_text()) if file.exists() else {}
+    jobs = {
+        name: partial(learn, name, Path(folder), int(seed)) for name in AGENTS if name not in curves
+    }
+    if jobs:
+        curves |= side_by_side(jobs)
+        write_json(file, curves)
+    for name, rows in curves.items():
+        print(f"{name}: {rows[-1]['error']:.4f} m/s after {rows[-1]['hours']:.2f} h")
+    draw(curves, Path(__file__).parents[1] / "docs" / "figures" / "learning.svg")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
