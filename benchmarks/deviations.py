@@ -26,7 +26,7 @@ from brokk_min.actuator import PLANT, estimate_velocity
 from brokk_min.beyond import interface
 from brokk_min.env import terminated
 from brokk_min.evaluation import metrics, sequences
-from brokk_min.evaluation.baselines import baselines
+from brokk_min.evaluation.baselines import OPTIMISED, baselines, read_gains
 from brokk_min.evaluation.feasibility import feasible
 from brokk_min.evaluation.rollout import rollout
 from brokk_min.identification import excitation, logs
@@ -40,6 +40,7 @@ M = BROKK_170
 LOW = M.column("q_min")
 HIGH = M.column("q_max")
 STEPS = 2_000_000  # of each training here
+NETS_OF = ("policy.npz", "policy_critic.npz")  # shipped policies that learned on both nets
 Figures = dict[str, float]
 
 
@@ -99,6 +100,18 @@ def a6() -> Figures:
     errors = {}
     for name, noise in (("5 %", 0.05), ("none", 0.0)):
         trace = rollout(M, pid, start, goals, noise, np.random.default_rng(0))
+        errors[name] = norm(goals - trace.v_tool, axis=-1).mean()
+    return errors
+
+
+def d9() -> Figures:
+    """Velocity error [m/s] of the optimised PID on the plant, our nets, and nets as printed."""
+    ours, printed = (policy.load_policy(POLICY.with_name(name), M).net for name in NETS_OF)
+    pid = read_gains(POLICY.with_name("gains.json"), M, ours)[OPTIMISED]
+    start, goals = sequences.tuning_set(M, 16, seed=2)
+    errors = {}
+    for name, moves in (("plant", PLANT), ("our nets", ours), ("nets as printed", printed)):
+        trace = rollout(M, pid, start, goals, 0.05, np.random.default_rng(0), moves)
         errors[name] = norm(goals - trace.v_tool, axis=-1).mean()
     return errors
 
@@ -165,7 +178,7 @@ def d7() -> Figures:
     return compare(newest_angles=newest_angles, ours=default_training())
 
 
-MEASURED: tuple[Callable[[], Figures], ...] = (a1, d1, d3, a6, a9, levels)
+MEASURED: tuple[Callable[[], Figures], ...] = (a1, d1, d3, a6, a9, d9, levels)
 TRAINED: tuple[Callable[[], Figures], ...] = (d5, d7)
 
 

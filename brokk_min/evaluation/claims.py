@@ -20,7 +20,7 @@ TEXTS: dict[str, dict[str, Any]] = tomllib.loads(
     Path(__file__).with_suffix(".toml").read_text("utf-8")
 )
 POLICIES = ("rl_paper", "rl_critic")  # the paper's agent
-PIDS = (RAW, BY_HAND, OPTIMISED)  # with the paper's structure: by hand, as in the paper, first
+PIDS = (RAW, BY_HAND, OPTIMISED)  # with the paper's structure, by hand first
 VERDICTS = {True: "holds here", False: "does not hold here", None: "was not measured"}
 ERROR, DRIFT = "velocity_error_mean", "off_axis_drift_max"
 

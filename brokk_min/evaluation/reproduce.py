@@ -102,7 +102,10 @@ def tune(chain: Chain, net: ActuatorNet) -> dict[str, JacobianController]:
 
 
 def learn(chain: Chain, log: logs.Log, paper_log: logs.Log) -> dict[str, Any]:
-    """All fits, trainings and tunings, side by side; nets, policies and PIDs by their names."""
+    """All fits, trainings and tunings, side by side; nets, policies and PIDs by their names.
+
+    The policy as printed learns on nets as printed, the others on ours.
+    """
     jobs: dict[str, Callable[..., Any]] = {
         "net": partial(fit_net, chain, "net", log, {}),
         "net_paper": partial(fit_net, chain, "net_paper", paper_log, fitting.PAPER_RECIPE),
@@ -110,7 +113,7 @@ def learn(chain: Chain, log: logs.Log, paper_log: logs.Log) -> dict[str, Any]:
     needs = {"pids": ["net"]}
     for name in sorted(POLICIES, reverse=True):  # the longest first
         jobs[name] = partial(train, chain, name)
-        needs[name] = ["net" if name == "rl" else "net_paper"]
+        needs[name] = ["net_paper" if name == "rl_critic" else "net"]
     jobs["pids"] = partial(tune, chain)
     return side_by_side(jobs, needs)
 

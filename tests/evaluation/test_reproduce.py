@@ -15,7 +15,7 @@ from brokk_min.evaluation.reproduce import Budget
 from brokk_min.evaluation.robustness import variations
 from brokk_min.evaluation.sequences import task_sequences
 from brokk_min.identification.logs import read_log
-from brokk_min.identification.net_file import load_net
+from brokk_min.identification.net_file import fingerprint, load_net
 from brokk_min.learning.policy import POLICIES, load_policy
 from brokk_min.machine import BROKK_170
 
@@ -74,6 +74,10 @@ def test_reproduce__writes_files_that_the_other_commands_read(folder, results):
         "rl_paper": "paper",
         "rl_critic": "paper",
     }
+    learned_on = {name: fingerprint(policy.net) for name, policy in policies.items()}
+    ours, printed = (load_net(folder / f"{name}.npz", COARSE) for name in ("net", "net_paper"))
+    assert learned_on["rl"] == learned_on["rl_paper"] == fingerprint(ours)
+    assert learned_on["rl_critic"] == fingerprint(printed) != fingerprint(ours)
     pids = baselines.read_gains(folder / "gains.json", COARSE, policies["rl"].net)
     assert list(pids) == PIDS
     assert results["meta"]["seed"] == 3 and results["meta"]["machine"] == "brokk170"

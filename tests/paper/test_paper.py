@@ -26,7 +26,7 @@ NUMBERED = ["eq1", "eq2", "eq3", "eq4", "Table 1", "Fig. 1", "Fig. 2a", "Fig. 2b
 NUMBERED += ["Fig. 3", "Fig. 4", *(f"Fig. 5{panel}" for panel in "abcde")]
 NUMBERED += [f"Fig. 6{panel}" for panel in "abcdefgh"]
 SECTIONS = {"Sec. 2", "Sec. 3.2", "Sec. 3.3", "Sec. 3.4", "Sec. 4.1", "Sec. 4.2", "Sec. 5"}
-CONSTANTS = """rate; joints; locked joint; PWM code; 80/175; 50/205; +0.24, -0.47 rad/s;
+CONSTANTS = """rate; joints; locked joint; joystick; PWM code; 80/175; 50/205; +0.24, -0.47 rad/s;
 400 ms, 100 ms; coupling; dead zone; 0.6 s, 0.05 s; 2 x 32; errors of one step; 1 h; 0.75 h;
 2.5 h; 5 %; no penalty; 256; 256-128-64; q_s; 30 s; K; k"""
 
