@@ -65,7 +65,7 @@ class ReadsLogs(Command):
                     window, rate = machine.velocity_samples, machine.rate
                     found[path] = logs.read_log([path], window, rate, fastest, self.read_table)
                 else:
-                    require(not self.map, "--map", "a table or a recording of ROS", "a log of a bus")
+                    require(not self.map, "--map", "a table or a recording of ROS", "a CAN log")
                     found[path] = log_for_fit(machine, read_frames(path))
         log = logs.join_logs(found)
         if machine == BROKK_170 and set(log.joints) != set(machine.names):

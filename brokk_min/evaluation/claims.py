@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from brokk_min.evaluation.baselines import BY_HAND, OPTIMISED, RAW
-from brokk_min.evaluation.metrics import Mean, Run, by_start, column, interval_text, mean_interval
+from brokk_min.evaluation.metrics import Mean, Run, by_start, column, mean_interval
 from brokk_min.evaluation.preliminary import Motion, SimulatorTests, response_time
 from brokk_min.evaluation.rollout import TITLES
 
@@ -23,6 +23,7 @@ POLICIES = ("rl_paper", "rl_critic")  # the paper's agent
 PIDS = (RAW, BY_HAND, OPTIMISED)  # with the paper's structure, by hand first
 VERDICTS = {True: "holds here", False: "does not hold here", None: "was not measured"}
 ERROR, DRIFT = "velocity_error_mean", "off_axis_drift_max"
+SHORT = {ERROR: "error", DRIFT: "drift"}  # in columns
 
 
 def claim(name: str, numbers: Mapping[str, Mapping[str, Mean]]) -> dict[str, Any]:
@@ -34,18 +35,17 @@ def claim(name: str, numbers: Mapping[str, Mapping[str, Mean]]) -> dict[str, Any
     text = TEXTS[name]
     side, end = ("above", "low") if "above" in text else ("below", "high")
     limit = text[side]
-    measured, verdicts = [], dict[str, list[str]]()
+    verdicts = dict[str, list[str]]()
     for judged, row in numbers.items():
         ends = [number[end] for number in row.values()]
         known = [x for x in ends if x is not None]
         beyond = all(x > limit if side == "above" else x < limit for x in known)
         verdict = VERDICTS[beyond if len(known) == len(ends) else None]
         verdicts.setdefault(verdict, []).append(judged)
-        measured += [f"{what} of {judged} {interval_text(x)}" for what, x in row.items()]
     return {
         "figure": text["figure"],
         "paper": text["paper"],
-        "measured": f"{text['measure']}, to be {side} {limit:g}: {'; '.join(measured)}",
+        "measured": f"{text['measure']}, to be {side} {limit:g}",
         "numbers": numbers,
         "verdict": "; ".join(f"{verdict} for {listed(of)}" for verdict, of in verdicts.items()),
     }
@@ -106,7 +106,7 @@ def task_claims(runs: Sequence[Run]) -> list[dict[str, Any]]:
                     for key in keys:
                         of_pid = by_start(runs, pid, s, key)
                         difference = by_start(runs, policy, s, key) - of_pid
-                        row[f"{key} along {s}"] = mean_interval(difference)
+                        row[f"{SHORT[key]} along {s}"] = mean_interval(difference)
         return numbers
 
     return [
