@@ -11,7 +11,6 @@ picture to docs/figures/learning.svg. It has the 2.5 hours of the paper as a lin
 import json
 import sys
 import time
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,12 +29,8 @@ from brokk_min.learning.policy import Policy, PolicyController
 from brokk_min.learning.recipes import find_recipe
 from brokk_min.machine import BROKK_170 as M
 
-LONG = 30_000_000  # steps of the critic, as many as of groups with the same observation
 AGENTS = {
-    "critic, the paper's observation": replace(
-        find_recipe(paper=True, critic=True),
-        learner=replace(find_recipe(paper=True, critic=True).learner, total_steps=LONG),
-    ),
+    "critic, the paper's observation": find_recipe(paper=True, critic=True),
     "groups, the paper's observation": find_recipe(paper=True),
     "groups, our observation": find_recipe(),
 }

@@ -22,7 +22,7 @@ class PPOConfig:
     `learning.recipes` has those of agents that learn otherwise.
     """
 
-    total_steps: int = 6_000_000  # environment steps in all
+    total_steps: int = 30_000_000  # environment steps in all
     num_envs: int = 256  # environments side by side (paper: 256)
     horizon: int = 32  # ticks of each environment between two updates
     epochs: int = 2  # passes over the collected steps in each update

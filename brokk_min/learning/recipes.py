@@ -21,7 +21,7 @@ def find_recipe(paper: bool = False, critic: bool = False) -> Recipe:
     learner = PPOConfig()
     if not critic:
         learner = PPOConfig(
-            total_steps=30_000_000 if paper else 12_000_000,
+            total_steps=PPOConfig.total_steps if paper else 12_000_000,
             minibatch_size=1024,
             gamma=0.95 if paper else 0.94,
             gae_lambda=1.0,

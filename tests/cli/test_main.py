@@ -51,7 +51,7 @@ def test_help__shows_the_defaults_of_the_agent_that_is_named(capsys):
     for words, steps in (
         ("", 12_000_000),
         ("--paper", 30_000_000),
-        ("--paper --critic", 6_000_000),
+        ("--paper --critic", 30_000_000),
     ):
         assert run(f"train {words} --help") == 0
         assert f"(default: {steps})" in " ".join(capsys.readouterr().out.split())
