@@ -275,7 +275,7 @@ def dictionary():
 class Virtual:
     """SDL's virtual joystick: a device without a device."""
 
-    def __init__(self, axes=6, buttons=8):
+    def __init__(self, axes=6, buttons=8, kind=4):  # kind 1: a gamepad that SDL knows
         import pygame
 
         os.environ["SDL_VIDEODRIVER"] = "dummy"
@@ -287,7 +287,7 @@ class Virtual:
         pointer, number = ctypes.c_void_p, ctypes.c_int
         self.sdl.SDL_JoystickSetVirtualAxis.argtypes = [pointer, number, ctypes.c_int16]
         self.sdl.SDL_JoystickSetVirtualButton.argtypes = [pointer, number, ctypes.c_uint8]
-        self.index = self.sdl.SDL_JoystickAttachVirtual(4, axes, buttons, 0)
+        self.index = self.sdl.SDL_JoystickAttachVirtual(kind, axes, buttons, 0)
         self.handle = self.sdl.SDL_JoystickOpen(self.index)
 
     def axis(self, axis, value):

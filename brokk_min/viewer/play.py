@@ -9,6 +9,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -25,17 +26,18 @@ from brokk_min.viewer.drawing import BLUE, ORANGE, Scene, draw, load_pygame
 SIZE, SMALLEST = (1120, 680), (640, 360)  # px, of the window at first and of a picture
 RISE = 0.25  # s from a key's press to full deflection (assumed)
 TRAIL = 600  # positions of the tool that are shown
-# Keys for and against x, y and z, as the top view shows them, and the gamepad's axes for them.
+# Keys for and against x, y and z, as the top view shows them, and axes for them: of a gamepad that
+# SDL knows, and of another one, whose axes 2 and 5 are mostly triggers.
 KEYS = (("up", "down"), ("left", "right"), ("w", "s"))
-AXES = (1, 0, 4)  # 2 and 5 are triggers, which do not rest in the middle
+AXES, OTHER_AXES = (1, 0, 3), (1, 0, 4)
 ACTIONS = {"escape": "close", "tab": "controller", "r": "restart"}
-BUTTONS = {3: "controller", 1: "restart"}
+BUTTONS = {3: "controller", 1: "restart"}  # Y and B of an Xbox pad
 NOTES = (
     "arrows: x (up, down) and y (left, right)",
     "W, S: z (up, down)    SHIFT: slowly",
     "TAB: the other controller",
     "R: back to the start    ESC: end",
-    "gamepad: both sticks; buttons 3 and 1 are TAB and R",
+    "gamepad: both sticks; Y and B are TAB and R",
 )
 
 
@@ -47,7 +49,10 @@ class Operator:
         self.held: set[str] = set()  # keys
         self.deflection: Array = np.zeros(3)
         self.pad: Any = None
+        self.known = False  # does SDL know the gamepad?
         pygame.joystick.init()  # a gamepad that is there is an event, too
+        self.gamepads = import_module("pygame._sdl2.controller")
+        self.gamepads.init()
 
     def handle(self, event: Any) -> str:
         """Take in an event of pygame, and say which of `ACTIONS` it asks for, if any."""
@@ -61,10 +66,12 @@ class Operator:
             self.held.discard(pg.key.name(event.key))
         elif event.type == pg.WINDOWFOCUSLOST:
             self.held.clear()
-        elif event.type == pg.JOYBUTTONDOWN:
+        elif event.type == (pg.CONTROLLERBUTTONDOWN if self.known else pg.JOYBUTTONDOWN):
             return BUTTONS.get(event.button, "")
         elif event.type == pg.JOYDEVICEADDED:
-            self.pad = pg.joystick.Joystick(event.device_index)
+            self.known = self.gamepads.is_controller(event.device_index)
+            pads = self.gamepads.Controller if self.known else pg.joystick.Joystick
+            self.pad = pads(event.device_index)
         elif event.type == pg.JOYDEVICEREMOVED:
             self.pad = None
         return ""
@@ -78,7 +85,8 @@ class Operator:
         if self.held & {"left shift", "right shift"}:
             target /= 3
         if self.pad is not None:
-            axes = [self.pad.get_axis(i) for i in AXES]  # one that it lacks reads 0
+            numbers, full = (AXES, 32767) if self.known else (OTHER_AXES, 1)
+            axes = [self.pad.get_axis(i) / full for i in numbers]  # one that it lacks reads 0
             target = np.clip(target - shape_axis(axes), -1, 1)
         step = self.machine.dt / RISE
         last = np.where(target * self.deflection > 0, self.deflection, 0.0)

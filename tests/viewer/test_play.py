@@ -4,6 +4,7 @@ import numpy as np
 import pygame
 import pytest
 from helpers_bus import BASELINE, START, Virtual
+from pygame._sdl2 import controller
 
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
@@ -15,6 +16,7 @@ from brokk_min.viewer.play import Operator, Session
 def operator(monkeypatch):
     monkeypatch.setenv("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")  # unseen: never has the focus
     pygame.display.set_mode((10, 10))
+    controller.quit()
     pygame.joystick.quit()
     pygame.event.clear()
     return Operator(BROKK_170, pygame)
@@ -63,11 +65,14 @@ def test_velocity__ramps_over_a_quarter_of_a_second_and_shift_gives_a_third(oper
     assert look(operator, 1)[0] == pytest.approx(-0.3 * 0.2)  # from zero on, not from 0.1
 
 
-def test_gamepad__drives_until_it_is_unplugged(operator):
-    device = Virtual()
+@pytest.mark.parametrize(("kind", "up", "trigger"), [(1, 3, 4), (4, 4, 5)])
+def test_gamepad__drives_until_it_is_unplugged(operator, kind, up, trigger):
+    """One that SDL knows, and another one; a trigger at its end moves nothing."""
+    device = Virtual(buttons=15, kind=kind)
     look(operator)
     device.axis(1, -1.0)  # forward
-    device.axis(4, 1.0)  # down
+    device.axis(up, 1.0)  # down
+    device.axis(trigger, -1.0)
     expected = 0.3 * np.array([1, 0, -1]) / 2**0.5
     np.testing.assert_allclose(look(operator), expected, atol=1e-6)
     device.button(3, True)
