@@ -46,7 +46,7 @@ def learn(name: str, folder: Path, seed: int) -> list[dict[str, float]]:
     env, advantages = make_env(M, net, recipe)
     start = ppo.begin(env, recipe.learner, seed)
     stagger_episodes(env)
-    updates = recipe.learner.total_steps // (recipe.learner.num_envs * recipe.learner.horizon)
+    updates = -(-recipe.learner.total_steps // (recipe.learner.num_envs * recipe.learner.horizon))
     rows: list[dict[str, float]] = []
     began = time.process_time()
 
