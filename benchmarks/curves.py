@@ -4,11 +4,12 @@
 
 FOLDER is one of `brokk-min reproduce`, by default results; all agents learn on its net.npz. Now and
 then, off the clock, the policy without its exploration drives the machine on goals that are never
-scored. The curves go to curves.json in FOLDER, where finished ones are not made again, and the
-picture to docs/figures/learning.svg. It has the 2.5 hours of the paper as a line.
+scored. The curves go to curves_SEED.json in FOLDER, and are drawn from there if it exists. The
+picture is docs/figures/learning.svg; it has the 2.5 hours of the paper as a line.
 """
 
 import json
+import math
 import sys
 import time
 from functools import partial
@@ -23,7 +24,7 @@ from benchmarks.peers import machine_error
 from brokk_min import ppo
 from brokk_min._files import write_json
 from brokk_min.identification.net_file import load_net
-from brokk_min.learning.checkpoint import actor_weights, make_env, save_policy, stagger_episodes
+from brokk_min.learning.checkpoint import actor_weights, make_env, stagger_episodes
 from brokk_min.learning.jobs import side_by_side
 from brokk_min.learning.policy import Policy, PolicyController
 from brokk_min.learning.recipes import find_recipe
@@ -46,7 +47,8 @@ def learn(name: str, folder: Path, seed: int) -> list[dict[str, float]]:
     env, advantages = make_env(M, net, recipe)
     start = ppo.begin(env, recipe.learner, seed)
     stagger_episodes(env)
-    updates = -(-recipe.learner.total_steps // (recipe.learner.num_envs * recipe.learner.horizon))
+    learner = recipe.learner
+    updates = math.ceil(learner.total_steps / (learner.num_envs * learner.horizon))
     rows: list[dict[str, float]] = []
     began = time.process_time()
 
@@ -54,14 +56,12 @@ def learn(name: str, folder: Path, seed: int) -> list[dict[str, float]]:
         nonlocal began
         if now.update % max(1, updates // POINTS) == 0 or now.update == updates:
             hours = (time.process_time() - began) / 3600
-            policy = Policy({"seed": seed}, actor_weights(now.agent), net, recipe.interface)
+            policy = Policy({}, actor_weights(now.agent), net, recipe.interface)
             error = machine_error(PolicyController(M, policy), RUNS)
             rows.append({"steps": now.global_step, "hours": hours, "error": error})
             began = time.process_time() - 3600 * hours
 
-    agent = ppo.train(env, recipe.learner, seed, advantages, on_update, start)
-    policy = Policy({"seed": seed}, actor_weights(agent), net, recipe.interface)
-    save_policy(folder / f"curve of {name}, seed {seed}.npz", policy, M)
+    ppo.train(env, recipe.learner, seed, advantages, on_update, start)
     return rows
 
 
@@ -83,14 +83,11 @@ def draw(curves: dict[str, list[dict[str, float]]], path: Path) -> None:
 
 
 def main(folder: str = "results", seed: str = "0") -> None:
-    file = Path(folder) / "curves.json"
-    curves = json.loads(file.read_text()) if file.exists() else {}
-    jobs = {
-        name: partial(learn, name, Path(folder), int(seed)) for name in AGENTS if name not in curves
-    }
-    if jobs:
-        curves |= side_by_side(jobs)
-        write_json(file, curves)
+    file = Path(folder) / f"curves_{seed}.json"
+    if not file.exists():
+        jobs = {name: partial(learn, name, Path(folder), int(seed)) for name in AGENTS}
+        write_json(file, side_by_side(jobs))
+    curves = json.loads(file.read_text())
     for name, rows in curves.items():
         print(f"{name}: {rows[-1]['error']:.4f} m/s after {rows[-1]['hours']:.2f} h")
     draw(curves, Path(__file__).parents[1] / "docs" / "figures" / "learning.svg")

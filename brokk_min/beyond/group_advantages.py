@@ -12,7 +12,7 @@ has noise from what earlier actions did. At its end all four go on from the stat
 That needs a simulation whose states can be copied, as ours.
 
 What it buys, as mean velocity error of the tool along x, y and z after 30 million steps of the
-paper's agent on our nets (seed 0): 0.0168 m/s and 13 minutes of one core. With a critic and its own
+paper's agent on our nets (seed 0): 0.0169 m/s and 13 minutes of one core. With a critic and its own
 settings it is 0.0206 m/s and 22 minutes.
 
 Who was first: the vine of TRPO (Schulman et al., 2015) branches rollouts from one state with common
