@@ -25,7 +25,7 @@ from brokk_min import jacobian, kinematics, machine
 from brokk_min.actuator import PLANT, estimate_velocity
 from brokk_min.beyond import interface
 from brokk_min.env import terminated
-from brokk_min.evaluation import metrics, sequences
+from brokk_min.evaluation import metrics, preliminary, sequences
 from brokk_min.evaluation.baselines import OPTIMISED, baselines, read_gains
 from brokk_min.evaluation.feasibility import feasible
 from brokk_min.evaluation.rollout import rollout
@@ -105,7 +105,7 @@ def a6() -> Figures:
 
 
 def d9() -> Figures:
-    """Velocity error [m/s] of the optimised PID on the plant, our nets, and nets as printed."""
+    """Error [m/s] of the optimised PID on plant and nets; median gap [m] of nets after 30 s."""
     ours, printed = (policy.load_policy(POLICY.with_name(name), M).net for name in NETS_OF)
     pid = read_gains(POLICY.with_name("gains.json"), M, ours)[OPTIMISED]
     start, goals = sequences.tuning_set(M, 16, seed=2)
@@ -113,6 +113,8 @@ def d9() -> Figures:
     for name, moves in (("plant", PLANT), ("our nets", ours), ("nets as printed", printed)):
         trace = rollout(M, pid, start, goals, 0.05, np.random.default_rng(0), moves)
         errors[name] = norm(goals - trace.v_tool, axis=-1).mean()
+        gap = preliminary.sim_to_real(M, {"machine": PLANT, "nets": moves}, 0)
+        errors[f"gap of {name}"] = np.median(norm(gap.p_tool[-1], axis=-1))
     return errors
 
 

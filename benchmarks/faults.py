@@ -135,7 +135,7 @@ def recorded_drives() -> Iterator[tuple[np.ndarray, np.ndarray]]:
     start = np.array([m.q_start])
     for sequence in task_sequences(m):
         trace = rollout(m, policy, start, sequence.for_starts(m, start), 0.0, rng)
-        q, u = trace.q_measured[:, 0], trace.u[:, 0]
+        q, u = np.concatenate([start, trace.q[:-1, 0]]), trace.u[:, 0]
         yield np.rint(q / m.encoder_step).astype(int), np.rint(u * PWM_MAX).astype(int)
 
 

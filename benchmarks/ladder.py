@@ -22,19 +22,19 @@ from brokk_min.actuator import ActuatorNet
 from brokk_min.beyond.interface import INTERFACE
 from brokk_min.evaluation import metrics, sequences
 from brokk_min.identification.net_file import load_net, select_nets
+from brokk_min.learning import policy
 from brokk_min.learning.checkpoint import train_policy
 from brokk_min.learning.jobs import side_by_side
-from brokk_min.learning.policy import INTERFACES, PolicyController
 from brokk_min.learning.recipes import find_recipe
 from brokk_min.machine import BROKK_170 as M
 
 FIGURES = ("velocity_error_mean", "off_axis_drift_max", "valve_travel", "jerk_rms")
 STEPS = {
+    "groups": "groups of rollouts, not a critic",
     "nets": "rich excitation, multi-step fit, nets read what a command opens",
     "observation": "error integral, resolved rates, open valves",
     "command": "actions from the dead zone on, closed valves at rest",
     "cost": "costs of valve travel and error integral",
-    "groups": "groups of rollouts, not a critic",
 }
 RUNGS = {"the paper's agent": frozenset[str]()}
 RUNGS |= {f"alone: {text}": frozenset([k]) for k, text in STEPS.items()}
@@ -59,15 +59,15 @@ def interface_of(steps: frozenset[str]) -> env.Interface:
 def climb(name: str, nets: dict[str, ActuatorNet], total_steps: int, seed: int) -> list[float]:
     """`FIGURES` of one new policy on the machine."""
     steps = RUNGS[name]
-    INTERFACES[name] = interface_of(steps)
+    policy.INTERFACES[name] = interface_of(steps)  # of this process
     recipe = replace(find_recipe(paper=True, critic="groups" not in steps), interface=name)
     recipe = replace(recipe, learner=replace(recipe.learner, total_steps=total_steps))
     net = nets["net" if "nets" in steps else "net_paper"]
     with TemporaryDirectory() as folder:
-        policy = train_policy(M, net, recipe, seed, Path(folder) / "policy.npz")
+        trained = train_policy(M, net, recipe, seed, Path(folder) / "policy.npz")
     starts = sequences.evaluation_starts(M, 64, sequences.task_sequences(M), 2)
     starts = starts[np.array(sequences.start_kinds(M, starts)) == "workspace"]
-    controllers = {"rl": PolicyController(M, policy)}
+    controllers = {"rl": policy.PolicyController(M, trained)}
     runs, _ = metrics.evaluate(M, controllers, sequences.axis_sequences(M), starts, 0)
     return [float(np.mean([run[key] for run in runs if run[key] is not None])) for key in FIGURES]
 
