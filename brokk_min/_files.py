@@ -166,5 +166,5 @@ def load_arrays(path: Path, kind: str = "") -> tuple[dict[str, Any], dict[str, N
         got = str(header.pop("kind", None))
         older = kind.split(" ")[0] in got
         made = "a file of another version (train or fit again)" if older else brief(got)
-        require(kind in ("", got), str(path), f"a {kind}", made)
+        require(kind in ("", got), str(path), f"a file of kind {kind}", made)
         return header, arrays

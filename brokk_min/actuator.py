@@ -201,7 +201,8 @@ class ActuatorNet:
         x = x.reshape(-1, *x.shape[-2:]).swapaxes(0, 1)  # (n, batch, I): one product per joint
         x = np.maximum(x @ w1 + b1[:, None], 0)
         x = np.maximum(x @ w2 + b2[:, None], 0)
-        y = 1 / (1 + np.exp(-(x @ w3 + b3[:, None])))[..., 0].T
+        z = np.maximum(x @ w3 + b3[:, None], -80)  # exp(80) does not overflow
+        y = 1 / (1 + np.exp(-z))[..., 0].T
         velocity = self.output_low + (self.output_high - self.output_low) * y
         return np.asarray(velocity.reshape(history.shape[:-2]))
 

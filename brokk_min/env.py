@@ -29,7 +29,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -41,14 +41,6 @@ from brokk_min.settings import TaskConfig
 
 DRAWS = 4096  # poses and goals on which deviations are measured
 COMMAND_STD = 0.4  # of the largest command; runs of PIDs and policies had 0.30 to 0.43
-
-
-class Block(NamedTuple):
-    """Numbers of the observation that belong together."""
-
-    mean: ArrayLike  # in physical units, a number or (size,)
-    std: Array  # (size,)
-    noisy: bool  # do sensors measure it?
 
 
 def velocity_deviations(machine: Machine) -> tuple[Array, Array]:
@@ -71,8 +63,8 @@ def velocity_deviations(machine: Machine) -> tuple[Array, Array]:
 
 
 @lru_cache
-def observation_blocks(machine: Machine) -> tuple[Block, ...]:
-    """The observation in its order, with the mean and deviation of its numbers in the task.
+def observation_table(machine: Machine) -> Array:
+    """Mean, deviation, and do sensors measure it (0 or 1), of each number observed: (obs, 3).
 
     Angles are uniform over their range. Paper: Sec. 3.4 (normalisation)
     """
@@ -80,32 +72,26 @@ def observation_blocks(machine: Machine) -> tuple[Block, ...]:
     q_mean = (machine.column("q_min") + machine.column("q_max")) / 2
     q_std = (machine.column("q_max") - machine.column("q_min")) / 12**0.5
     v_std, q_dot_std = velocity_deviations(machine)
-    u_std = np.full(H * len(machine.driven), COMMAND_STD * machine.pwm_limit / PWM_MAX)
-    blocks = [
-        Block(0.0, v_std, False),
-        Block(0.0, v_std, True),
-        Block(q_mean[machine.locked], q_std[machine.locked], True),
-    ]
+    rows = [(0.0, std, 0.0) for std in v_std] + [(0.0, std, 1.0) for std in v_std]
+    rows += [(q_mean[j], q_std[j], 1.0) for j in machine.locked]
     for j in machine.driven:
-        blocks.append(Block(q_mean[j], np.full(H, q_std[j]), True))
-        blocks.append(Block(0.0, np.full(H, q_dot_std[j]), True))
-    blocks.append(Block(0.0, u_std, False))
-    return tuple(blocks)
+        rows += [(q_mean[j], q_std[j], 1.0)] * H + [(0.0, q_dot_std[j], 1.0)] * H
+    rows += [(0.0, COMMAND_STD * machine.pwm_limit / PWM_MAX, 0.0)] * H * len(machine.driven)
+    return np.array(rows)
 
 
 @lru_cache
 def observation_scale(machine: Machine) -> tuple[Array, Array]:
     """Mean and deviation of the observation, float32 (obs,) both."""
-    blocks = observation_blocks(machine)
-    mean = np.concatenate([np.broadcast_to(block.mean, block.std.shape) for block in blocks])
-    std = np.concatenate([block.std for block in blocks])
-    return mean.astype(np.float32), std.astype(np.float32)
+    mean, std, _ = observation_table(machine).T.astype(np.float32)
+    return mean, std
 
 
 @lru_cache
 def sensor_std(machine: Machine) -> Array:
     """Deviations of what sensors measure, the unit of its noise, float32 (noisy numbers,)."""
-    return np.concatenate([b.std for b in observation_blocks(machine) if b.noisy], dtype=np.float32)
+    _, std, noisy = observation_table(machine).T
+    return np.asarray(std[noisy == 1], np.float32)
 
 
 def measure(

@@ -17,9 +17,9 @@ class TaskConfig:
 
 @dataclass(frozen=True)
 class PPOConfig:
-    """Settings of PPO with a critic, tuned; the paper prints the number of environments only.
+    """Settings of PPO, tuned; the paper prints the number of environments only.
 
-    `learning.recipes` has those of agents that learn otherwise.
+    Defaults are of the paper's agent with a critic; `learning.recipes` has those of other agents.
     """
 
     total_steps: int = 30_000_000  # environment steps in all

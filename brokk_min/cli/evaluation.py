@@ -24,8 +24,7 @@ class Evaluate(Command):
     starts: Path | None = None  # Start poses, CSV: one column per joint [rad].
     plant: PlantName = "analytic"  # What moves: analytic, net, or an object of your file.
     json: Path | None = None  # Also write all runs here.
-    gains: Path | None = None  # Gains; by default gains.json in the folder of POLICY, or tuned now.
-    save_gains: Path | None = None  # Tune the PIDs anew, and write their gains here.
+    save_gains: Path | None = None  # Tune the PIDs though gains.json is beside POLICY; write it.
     num_starts: int = 16  # Without --starts: how many of the machine's.
     seed: int = 0  # Of the noise, and of what is drawn and tuned.
 
@@ -33,7 +32,7 @@ class Evaluate(Command):
         machine = self.find_machine()
         self.writes(self.json, self.save_gains)
         check(self.num_starts > 0, "--num-starts", "1 or more", self.num_starts)
-        path, gains = default_policy(machine, self.policy, self.gains)
+        path, gains = default_policy(machine, self.policy)
         gains = None if self.save_gains else gains
         files = {} if self.policy else {k: path.with_name(file) for k, file in POLICIES.items()}
         policies = {"rl": load_policy(path, machine)}

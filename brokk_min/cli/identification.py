@@ -4,16 +4,17 @@ What fits or searches is imported by the command that runs it, because help must
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import tyro
 from tyro.conf import OmitArgPrefixes, Positional
 
 from brokk_min._files import brief, located, write_json
 from brokk_min.can.drive_log import log_for_fit, read_frames
-from brokk_min.cli.options import Command, PlantName, check, find_plant
+from brokk_min.cli.options import Command, PlantName, check, check_settings, find_plant
 from brokk_min.identification import columns, excitation, logs
 from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
 from brokk_min.identification.net_file import load_net, save_net
@@ -53,7 +54,8 @@ class ReadsLogs(Command):
     def read_logs(self, paths: Sequence[Path]) -> tuple[logs.Log, Machine | None]:
         """One log of tables and drives; the machine if the log has its joints, which it orders.
 
-        ValueError: other joints than those of a machine that is not the default one.
+        Locked joints may be missing. ValueError: other joints than those of a machine that is not
+        the default one.
         """
         check(len(paths) > 0, "LOGS", "one file or more", "none")
         machine = self.find_machine()
@@ -68,10 +70,11 @@ class ReadsLogs(Command):
                     require(not self.map, "--map", "a table or a recording of ROS", "a CAN log")
                     found[path] = log_for_fit(machine, read_frames(path))
         log = logs.join_logs(found)
-        if machine == BROKK_170 and set(log.joints) != set(machine.names):
+        known = [j.name for j in machine.joints if j.driven or j.name in log.joints]
+        if machine == BROKK_170 and set(log.joints) != set(known):
             return log, None
         with located(*paths):
-            return logs.in_order(log, machine.names), machine
+            return logs.in_order(log, known), machine
 
     def read_table(self, path: Path) -> dict[str, Any]:
         """The columns of a table or of a recording of ROS."""
@@ -127,12 +130,20 @@ class Fit(ReadsLogs):
     json: Path | None = None  # Also write the scores here.
     paper: bool = False  # The paper's recipe: errors of one step, commands as they are.
     seed: int = 0  # Of the weights and the drawn windows.
-    settings: OmitArgPrefixes[FitConfig] = field(default_factory=FitConfig)
+    settings: OmitArgPrefixes[FitConfig]
+
+    @classmethod
+    def defaults(cls, arguments: list[str]) -> Any:
+        """Ours, or the settings of the paper's recipe."""
+        recipe, required = PAPER_RECIPE if "--paper" in arguments else {}, tyro.MISSING
+        return cls(logs=required, out=required, settings=FitConfig(**recipe))
 
     def __call__(self) -> None:
         from brokk_min.identification import fitting, inspection, validation
 
-        machine, config = self.find_machine(), self.find_config()
+        machine = self.find_machine()
+        check_settings(self.settings)
+        check(self.seed >= 0, "--seed", "0 or more", self.seed)
         check(self.out.suffix == ".npz", "--out", "a name in .npz", self.out)
         self.writes(self.out, self.json)
         log, known = self.read_logs(self.logs)
@@ -143,9 +154,9 @@ class Fit(ReadsLogs):
             reports = inspection.inspect(log)
             for wrong in inspection.wrong_signs(reports):
                 raise ValueError(wrong)
-            net = fitting.fit(log, config, self.seed, machine, known.name if known else "")
+            net = fitting.fit(log, self.settings, self.seed, machine, known.name if known else "")
         with located(*self.test, *self.logs):
-            scores = validation.validate(net, logs.in_order(test, log.joints), known)
+            scores = validation.validate(net, logs.in_order(test, log.joints))
         scores["warnings"] += inspection.warnings(log, reports, known)
         save_net(self.out, net)
         if self.json:
@@ -155,13 +166,6 @@ class Fit(ReadsLogs):
         tried = brief([recording.name for recording in test.recordings])
         print(f"{self.out}: nets of {net.machine or 'an unknown machine'}, scored on {tried}")
         print_scores(scores["joints"], scores["warnings"])
-
-    def find_config(self) -> FitConfig:
-        """The settings, and the paper's over them if they are wanted."""
-        for name in ("steps", "batch_size", "hidden", "rollout"):
-            value = getattr(self.settings, name)
-            check(value > 0, f"--{name.replace('_', '-')}", "1 or more", value)
-        return replace(self.settings, **PAPER_RECIPE) if self.paper else self.settings
 
 
 def print_scores(scores: Mapping[str, Any], warnings: Sequence[str]) -> None:

@@ -16,13 +16,11 @@ from brokk_min.can.safety_gate import fault_name
 from brokk_min.can.shadow import Shadow
 from brokk_min.can.simulated_machine import simulate
 from brokk_min.cli.options import Command, check, default_policy, find_plant
-from brokk_min.evaluation.baselines import baselines, read_gains
+from brokk_min.evaluation.baselines import OPTIMISED, baselines, read_gains
 from brokk_min.evaluation.rollout import TITLES, Controller
 from brokk_min.evaluation.sequences import read_commands
 from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import PWM_MAX, Machine, require
-
-PID = "jacobian_pid_k0.1"  # the paper's, among the baselines
 
 
 @dataclass(kw_only=True)
@@ -61,6 +59,7 @@ class Drive(Command):
     def __call__(self) -> None:
         machine = self.find_machine()
         self.writes(self.log)
+        check(self.shadow or not self.sync, "--sync", "--shadow with it", "a drive that sends SYNC")
         controller, operator = self.find_controller(machine), self.find_operator(machine)
         with open_bus(self.interface, self.channel, self.log) as bus:
             if self.shadow or operator is None:
@@ -80,8 +79,7 @@ class Drive(Command):
             driven = [machine.names[i] for i in machine.driven]
             check(self.joint in driven, "--joint", f"one of {driven}", self.joint)
             return JointJog(machine, self.joint, self.counts)
-        rl, pid = find_controllers(machine, self.policy)
-        return rl if self.controller == "rl" else pid
+        return find_controller(machine, self.policy, self.controller == "rl")
 
     def find_operator(self, machine: Machine) -> Joystick | Script | None:
         """The joystick, or the script of a file; a shadow needs none."""
@@ -93,13 +91,15 @@ class Drive(Command):
         return Script(machine, np.concatenate(goals))
 
 
-def find_controllers(machine: Machine, policy: Path | None) -> tuple[Controller, Controller]:
-    """The policy, and the optimised PID, or without a file of gains that by hand."""
-    path, gains = default_policy(machine, policy, None)
+def find_controller(machine: Machine, policy: Path | None, rl: bool) -> Controller:
+    """The policy, or the PID with the gains beside it: optimised, or without a file by hand."""
+    path, gains = default_policy(machine, policy)
     found = load_policy(path, machine)
+    if rl:
+        return PolicyController(machine, found)
     print(f"gains of the Jacobian controller: {gains or 'set by hand'}")
     known = read_gains(gains, machine, found.net) if gains else baselines(machine, found.net)
-    return PolicyController(machine, found), known[PID]
+    return known[OPTIMISED]
 
 
 def status(drive: hw.Drive) -> str:
@@ -132,8 +132,10 @@ class Play(Command):
         from brokk_min.viewer.play import play
 
         machine = self.find_machine()
-        rl, pid = find_controllers(machine, self.policy)
-        controllers = {TITLES["rl"]: rl, TITLES[PID]: pid}
+        controllers = {
+            TITLES["rl"]: find_controller(machine, self.policy, rl=True),
+            TITLES[OPTIMISED]: find_controller(machine, self.policy, rl=False),
+        }
         play(machine, controllers, find_plant(self.plant, machine))
 
 

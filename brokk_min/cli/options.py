@@ -30,6 +30,18 @@ def check(fact: bool, option: str, wanted: str, got: Any) -> None:
         raise WrongUse(f"{option}: expected {wanted}, got {got}")
 
 
+FRACTIONS = ("gamma", "gae_lambda", "zero_goals", "axis_goals", "noise", "weight_decay")
+
+
+def check_settings(settings: Any) -> None:
+    """WrongUse: a setting of a learner or a fit that is no fraction, or not positive."""
+    for name, value in vars(settings).items():
+        option, fraction = f"--{name.replace('_', '-')}", name in FRACTIONS
+        fits = 0 <= value <= 1 if fraction else name.startswith("log_std") or 0 < value < np.inf
+        wanted = "0 to 1" if fraction else "a positive number"
+        check(isinstance(value, bool) or fits, option, wanted, value)
+
+
 @dataclass(kw_only=True)
 class Command:
     """Options of every command."""
@@ -102,10 +114,13 @@ def find_plant(name: str, machine: Machine) -> Plant:
     return plant
 
 
-def default_policy(
-    machine: Machine, policy: Path | None, gains: Path | None
-) -> tuple[Path, Path | None]:
-    """Policy, by default the package's; gains, by default gains.json in its folder (or None)."""
-    policy = policy or SHIPPED / machine.name / "policy.npz"
-    tuned = policy.with_name("gains.json")
-    return policy, gains or (tuned if tuned.exists() else None)
+def default_policy(machine: Machine, policy: Path | None) -> tuple[Path, Path | None]:
+    """A policy, by default the package's, and the gains.json beside it, or None.
+
+    WrongUse: the package has no policy for the machine.
+    """
+    shipped = SHIPPED / machine.name / "policy.npz"
+    check(bool(policy) or shipped.exists(), "--policy", f"one for {machine.name}", "none")
+    policy = policy or shipped
+    gains = policy.with_name("gains.json")
+    return policy, gains if gains.exists() else None

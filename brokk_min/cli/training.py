@@ -7,7 +7,7 @@ from typing import Any
 import tyro
 from tyro.conf import OmitArgPrefixes
 
-from brokk_min.cli.options import Command, check
+from brokk_min.cli.options import Command, check, check_settings
 from brokk_min.identification.net_file import load_net
 from brokk_min.learning.recipes import Recipe, find_recipe
 from brokk_min.settings import PPOConfig, TaskConfig
@@ -35,9 +35,11 @@ class Training(Command):
     def recipe(self) -> Recipe:
         """The agent and its learner."""
         learner, task = self.learner, self.task
-        check(learner.total_steps > 0, "--total-steps", "1 or more", learner.total_steps)
-        check(0 <= learner.gamma < 1, "--gamma", "0 to below 1", learner.gamma)
-        fits = 0 < task.hold_min_s <= task.hold_max_s
+        check(self.seed >= 0, "--seed", "0 or more", self.seed)
+        check_settings(learner)
+        check_settings(task)
+        check(learner.gamma < 1, "--gamma", "below 1", learner.gamma)
+        fits = task.hold_min_s <= task.hold_max_s
         check(fits, "--hold-max-s", f"{task.hold_min_s} or more", task.hold_max_s)
         return Recipe("paper" if self.paper else "beyond", self.critic, task, learner)
 

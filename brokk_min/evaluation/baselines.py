@@ -45,8 +45,9 @@ def baselines(
 ) -> dict[str, JacobianController]:
     """PIDs with the paper's structure, and the strongest, by default with `first_gains`.
 
-    The raw one does not compensate the dead zone, of which the paper says nothing. The paper's two
-    have the same gains, because their damping k differs near singularities alone. Paper: Sec. 4.2
+    The raw one does not compensate the dead zone, of which the paper says nothing. Those with
+    the paper's two k have the same gains, because damping acts near singularities alone.
+    Paper: Sec. 4.2
     """
     w0 = manipulability_threshold(machine)
     gains = gains or first_gains(machine)

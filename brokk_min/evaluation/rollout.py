@@ -44,7 +44,6 @@ class Trace(NamedTuple):
 
     q: Array  # true angle [rad], n
     q_dot: Array  # true mean velocity over the tick [rad/s], n
-    q_measured: Array  # encoder angle when the command was computed [rad], n
     u: Array  # command during the tick, n
     p_tool: Array  # true tool position [m], 3
     v_tool: Array  # true tool velocity [m/s], 3
@@ -73,10 +72,9 @@ def rollout(
         error = draw_noise(machine, noise, len(state.q), rng)
         measured = measure(machine, state.history, v_goal, error)
         u, controller_state = controller(measured, controller_state)
-        q_measured = state.history[..., 0, -1]
         state = transition(machine, plant, replace(state, v_goal=v_goal), u)
         frames = forward_kinematics(machine, state.q)
         v_tool, p_tool = tool_velocity(frames, state.q_dot), tool_position(frames)
         rewards = reward(goal, v_tool)
-        ticks.append(Trace(state.q, state.q_dot, q_measured, u, p_tool, v_tool, rewards))
+        ticks.append(Trace(state.q, state.q_dot, u, p_tool, v_tool, rewards))
     return Trace(*(np.array(arrays) for arrays in zip(*ticks, strict=True)))

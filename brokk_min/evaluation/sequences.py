@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from tqdm import tqdm
 
 from brokk_min._files import SHIPPED, brief, numbers, read_csv
 from brokk_min.env import terminated
@@ -226,7 +227,7 @@ def tuning_set(machine: Machine, num: int, seed: int, seconds: float = 20.0) -> 
 def collected(machine: Machine, num: int, draw: Callable[[], tuple[Array, ...]]) -> list[Array]:
     """The first `num` rows of arrays that are drawn again and again; ValueError: too few."""
     drawn: list[tuple[Array, ...]] = []
-    for _ in range(DRAWS):
+    for _ in tqdm(range(DRAWS), "draw starts", leave=False, disable=None):
         drawn.append(draw())
         found = sum(len(rows[0]) for rows in drawn)
         if found >= num:

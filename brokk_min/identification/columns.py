@@ -17,30 +17,29 @@ from brokk_min._files import brief, load_arrays, numbers, read_csv
 from brokk_min.machine import Array, require
 
 UNITS = {"deg": math.pi / 180, "mrad": 1e-3, "mm": 1e-3, "percent": 1e-2, "permille": 1e-3}
-UNITS |= {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+TIMES = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 KINDS = ("u_", "q_")  # of columns that are numbers, as time is
 Mapped = dict[str, tuple[str, float]]  # column of the log: that of the file, and its factor
 
 
 def parse_map(text: str) -> Mapped:
-    """A mapping from the command line; ValueError: a part that is none, or an unknown unit."""
-    result = {}
+    """A mapping from the command line; ValueError: a part that is none, or a name given twice."""
+    result: Mapped = {}
     for part in filter(None, text.split(",")):
         name, _, source = map(str.strip, part.partition("="))
         column, _, unit = source.rpartition(":") if ":" in source else (source, "", "1")
-        factor = UNITS.get(unit) or _number(unit)
-        wanted = f"NAME=COLUMN or NAME=COLUMN:UNIT, a unit of {', '.join(UNITS)}, or a number"
-        require(bool(name and column and factor), "--map", wanted, repr(part))
+        units = TIMES if name == "time" else UNITS
+        try:
+            factor = units.get(unit) or float(unit)
+        except ValueError:
+            factor = 0.0
         known = name in ("run", "time") or name.startswith(KINDS)
-        result[name if known else f"q_{name}"] = (column, factor)
+        of_log = name if known else f"q_{name}"
+        fits = bool(name and column and factor) and of_log not in result
+        wanted = f"NAME=COLUMN or NAME=COLUMN:UNIT once, a unit of {', '.join(units)}, or a number"
+        require(fits, "--map", wanted, repr(part))
+        result[of_log] = (column, factor)
     return result
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return 0.0
 
 
 def load_table(path: Path, mapped: Mapped | None = None) -> dict[str, Any]:
@@ -57,8 +56,8 @@ def to_columns(path: Path, table: Mapping[str, Any], mapped: Mapped) -> dict[str
     """
     named = {name: (name, 1.0) for name in table if name == "time" or name.startswith(KINDS)}
     named |= {"run": ("run", 1.0)} if "run" in table else {}
-    one_run = np.repeat(path.stem, len(next(iter(table.values()), [])))
-    result: dict[str, Any] = {"run": one_run, **table}  # other columns, for messages
+    rows = max(map(np.size, table.values()), default=0)
+    result: dict[str, Any] = {"run": np.repeat(path.stem, rows), **table}  # others, for messages
     for name, (column, factor) in (named | mapped).items():
         wanted = f"a column for {name} (--map {name}=COLUMN:UNIT)"
         require(column in table, f"{path}: column {column}", wanted, brief(list(table)))
@@ -68,7 +67,14 @@ def to_columns(path: Path, table: Mapping[str, Any], mapped: Mapped) -> dict[str
             values = values if factor == 1 else values - values[0]  # keeps its digits
         elif name != "run" and values.dtype.kind in "US":
             values = numbers(path, column, values)
-        result[name] = values.astype(str) if name == "run" else values * factor
+        if name == "run":  # one for all rows, or one for each
+            result[name] = np.broadcast_to(values.astype(str), rows)
+        else:
+            result[name] = values * factor
+    for name in mapped:
+        command = "u_" + name.removeprefix("q_").removeprefix("dot_")
+        fits = not name.startswith("q_") or command in result
+        require(fits, f"{path}: --map {name}", f"a column {command}, too", brief(list(result)))
     return result
 
 

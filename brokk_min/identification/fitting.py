@@ -23,7 +23,7 @@ from brokk_min.actuator import ActuatorNet
 from brokk_min.beyond.valve_nets import ValveNet, valve_inputs
 from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
 from brokk_min.identification.logs import Log, join_recordings
-from brokk_min.machine import Array, Machine
+from brokk_min.machine import Array, Machine, require
 
 __all__ = ["PAPER_RECIPE", "FitConfig", "fit"]
 
@@ -91,16 +91,16 @@ def training_set(log: Log, config: FitConfig, machine: Machine, zones: Array) ->
     H = machine.history
     joined = join_recordings(log)
     windows = joined.windows(H, 1)
-    for name, j_windows, target in zip(log.joints, windows, joined.target.T, strict=True):
-        if not len(j_windows) or np.ptp(target[j_windows]) == 0:
-            wanted = f"expected a recording of {H + 1} samples or more in which it moves"
-            raise ValueError(f"joint {name}: {wanted}, got none")
+    targets = [target[at] for target, at in zip(joined.target.T, windows, strict=True)]
+    for name, target in zip(log.joints, targets, strict=True):
+        moves = len(target) > 0 and np.ptp(target) > 0
+        wanted = f"a recording of {H + 1} samples or more in which it moves"
+        require(bool(moves), f"joint {name}", wanted, "none")
     signals = np.stack([joined.joined.q, joined.joined.q_dot, joined.joined.u], dtype=np.float32)
     rows = signals[..., None].transpose(1, 2, 0, 3)  # each sample as a history of one: (N, n, 3, 1)
     read = valve_inputs(rows, zones) if config.valve else rows[..., 0]  # (N, n, rows)
     moments = [(read[at, j].mean(axis=0), read[at, j].std(axis=0)) for j, at in enumerate(windows)]
     mean, std = (np.repeat(np.array(part), H, axis=1) for part in zip(*moments, strict=True))
-    targets = [joined.target[at, j] for j, at in enumerate(windows)]
     low, high = (np.array([f(target) for target in targets]) for f in (np.min, np.max))
     margin = 0.05 * (high - low) + 1e-6  # rad/s
     q = joined.joined.q

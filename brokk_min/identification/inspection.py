@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from brokk_min._files import brief
 from brokk_min.identification.logs import COMMANDED, Log, Recording, driven
-from brokk_min.machine import Array, Machine
+from brokk_min.machine import Array, Joint, Machine
 
 # What is searched, all assumed.
 LATEST = 0.4  # s, longest delay
@@ -35,7 +35,7 @@ FASTEST = 0.999  # quantile of the speeds, because the single ones have noise
 # What a log must have, all assumed.
 LEAST_MINUTES = 10.0
 LEAST_RANGE = 0.7  # of a joint's range
-LEAST_EXPLAINED = 0.1  # of a joint's motion by its commands
+LEAST_EXPLAINED = 0.6  # of a joint's motion by its commands; of sound logs of ours 0.84
 BEYOND = 0.05  # of a joint's range, outside of it
 FOLLOWS = 0.8  # of a joint's motion without commands, that another joint explains
 
@@ -210,21 +210,26 @@ def warnings(log: Log, reports: Mapping[str, JointReport], machine: Machine | No
             slopes = ", ".join(f"{slope:+.2f} times with {one}" for one, slope in r.follows.items())
             doubt = "is it an angle to the ground? Then take differences of both angles"
             result.append(f"q_{name}: expected rest without commands, got motion {slopes}: {doubt}")
-        elif r.explained < LEAST_EXPLAINED:
-            got = f"{r.explained:.0%}: are they those of another joint?"
-            result.append(f"{name}: expected commands that explain its motion, got {got}")
+        elif r.explained < LEAST_EXPLAINED or r.delay > LATEST - 1e-9:
+            wanted = f"commands that explain {LEAST_EXPLAINED:.0%} of its motion, soon after them"
+            got = f"{r.explained:.0%}, {r.delay:.2f} s later: of another joint, or another clock?"
+            result.append(f"{name}: expected {wanted}, got {got}")
         if machine:
-            joint = machine.joints[machine.names.index(name)]
-            whole, part = joint.q_max - joint.q_min, r.high - r.low
-            if max(joint.q_min - r.low, r.high - joint.q_max) > BEYOND * whole:
-                wanted = f"{name}: expected angles of {joint.q_min:g} to {joint.q_max:g}"
-                got = f"{r.low:.2f} to {r.high:.2f}"
-                unit = f"another unit (--map {name}=COLUMN:deg), zero or joint?"
-                result.append(f"{wanted}, got {got}: {unit}")
-            elif part < LEAST_RANGE * whole:
-                wanted = f"{LEAST_RANGE:.0%} of its range or more"
-                result.append(f"{name}: expected {wanted}, got {part / whole:.0%}")
+            result += range_warnings(machine.joints[machine.names.index(name)], r)
     return result
+
+
+def range_warnings(joint: Joint, report: JointReport) -> list[str]:
+    """Is a joint's motion within its range, and over most of it?"""
+    whole, low, high = joint.q_max - joint.q_min, report.low, report.high
+    if max(joint.q_min - low, high - joint.q_max) > BEYOND * whole:
+        wanted = f"{joint.name}: expected angles of {joint.q_min:g} to {joint.q_max:g}"
+        unit = f"another unit (--map {joint.name}=COLUMN:deg), zero or joint?"
+        return [f"{wanted}, got {low:.2f} to {high:.2f}: {unit}"]
+    if high - low < LEAST_RANGE * whole:
+        wanted = f"{LEAST_RANGE:.0%} of its range or more"
+        return [f"{joint.name}: expected {wanted}, got {(high - low) / whole:.0%}"]
+    return []
 
 
 def table(reports: Mapping[str, JointReport]) -> list[str]:

@@ -5,6 +5,7 @@ in a `std_msgs/Float64MultiArray` in the order of the angles. A row is a message
 the commands that hold then. All times are the recorder's, so both topics have one clock.
 """
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,31 +20,37 @@ def read_ros(path: Path, angles: str, commands: str) -> dict[str, Any]:
     """
     reader_of = require_package("rosbags.highlevel", "ros").AnyReader
     types = require_package("rosbags.typesys", "ros")
-    order: list[str] = []
-    q: dict[str, float] = {}
-    u: dict[str, float] = {}
-    rows = []
     store = types.get_typestore(types.Stores.ROS2_HUMBLE)  # of bags without definitions
     with expected(path, "a recording of ROS"), reader_of([path], default_typestore=store) as bag:
         found = {topic: info.msgtype for topic, info in bag.topics.items()}
         for topic in (angles, commands):
             require(topic in found, f"{path}: --topics", f"two of {found}", brief(topic))
-        chosen = [one for one in bag.connections if one.topic in (angles, commands)]
-        for connection, stamp, data in bag.messages(chosen):
-            message = bag.deserialize(data, connection.msgtype)
-            if connection.topic == angles:
-                order = order or list(message.name)
-                q |= dict(zip(message.name, message.position, strict=True))
-                if u and u.keys() <= q.keys():
-                    rows.append((stamp / 1e9, u, q.copy()))
-            elif order:
-                u = commands_of(message, order)
+        rows = list(samples(bag, angles, commands))
     require(len(rows) > 0, str(path), f"{angles} after {commands}, of the same joints", "none")
     table: dict[str, Any] = {"time": [time for time, _, _ in rows]}
     for name in rows[0][1]:
         table[f"u_{name}"] = [u[name] for _, u, _ in rows]
         table[f"q_{name}"] = [q[name] for _, _, q in rows]
     return table
+
+
+def samples(
+    bag: Any, angles: str, commands: str
+) -> Iterator[tuple[float, dict[str, float], dict[str, float]]]:
+    """Time [s], commands and angles by joint, of each message with angles after a command."""
+    order: list[str] = []
+    q: dict[str, float] = {}
+    u: dict[str, float] = {}
+    chosen = [one for one in bag.connections if one.topic in (angles, commands)]
+    for connection, stamp, data in bag.messages(chosen):
+        message = bag.deserialize(data, connection.msgtype)
+        if connection.topic == angles:
+            order = order or list(message.name)
+            q |= dict(zip(message.name, message.position, strict=True))
+            if u and u.keys() <= q.keys():
+                yield stamp / 1e9, u, q.copy()
+        elif order:
+            u = commands_of(message, order)
 
 
 def commands_of(message: Any, order: list[str]) -> dict[str, float]:

@@ -14,17 +14,16 @@ from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet, append_command, append_sample
 from brokk_min.identification.logs import Log, Samples, join_recordings
-from brokk_min.kinematics import forward_kinematics, tool_position
-from brokk_min.machine import Array, Machine
+from brokk_min.machine import Array
 
 HORIZONS = (1, 5, 10, 30)  # s, of the free runs
 
 
-def validate(net: ActuatorNet, test: Log, machine: Machine | None = None) -> dict[str, Any]:
+def validate(net: ActuatorNet, test: Log) -> dict[str, Any]:
     """Scores of nets on unseen recordings `test`, as in the fit JSON.
 
-    `joints` has the `score` of each net, `tool` the `tool_errors` of a known machine [m],
-    `warnings` the nets that are no better than the last velocity again.
+    `joints` has the `score` of each net, `warnings` the nets that are no better than the last
+    velocity again.
     """
     joints = score(net, test)
     warnings = [
@@ -33,8 +32,7 @@ def validate(net: ActuatorNet, test: Log, machine: Machine | None = None) -> dic
         for name, one in joints.items()
         if one.get("one_step_rmse", 0.0) > one.get("persistence_rmse", 0.0)
     ]
-    tool = tool_errors(machine, net, test) if machine else {}
-    return {"joints": joints, "tool": tool, "warnings": warnings}
+    return {"joints": joints, "warnings": warnings}
 
 
 def free_run_step(net: ActuatorNet, history: Array, q: Array, u: Array) -> tuple[Array, Array]:
@@ -138,15 +136,3 @@ def _one_step_scores(net: ActuatorNet, samples: Samples) -> dict[str, Any]:
 
 def _rms(error: Array) -> float:
     return float(np.sqrt(np.mean(np.square(error))))
-
-
-def tool_errors(machine: Machine, net: ActuatorNet, test: Log) -> dict[str, float]:
-    """Median distance [m] of the tool from the recorded one at the end of free runs, by horizon."""
-    samples = join_recordings(test)
-    result = {}
-    for horizon, starts, q_error, _ in free_runs(net, samples):
-        q = samples.joined.q[starts + len(q_error)]
-        p_recorded = tool_position(forward_kinematics(machine, q))
-        p_net = tool_position(forward_kinematics(machine, q + q_error[-1]))
-        result[str(horizon)] = float(np.median(np.linalg.norm(p_net - p_recorded, axis=-1)))
-    return result

@@ -12,7 +12,8 @@ from brokk_min.machine import Machine
 OBSERVATION = (
     "goal and measured velocity of the tool [m/s], angles of locked joints [rad or m], history of "
     "angles and of velocities of each driven joint, history of its command for each driven joint "
-    "[of full command], newest sample last; less mean, over scale; interface beyond: and more"
+    "[of full command], newest sample last; less mean, over scale; interface beyond: then history "
+    "of open indicators, resolved velocities of the goal and of the error integral"
 )
 
 

@@ -7,8 +7,8 @@ from PIL import Image
 from tqdm import tqdm
 
 from brokk_min._files import whole_file
-from brokk_min.actuator import estimate_velocity
 from brokk_min.can.drive_log import read_frames, read_telemetry
+from brokk_min.identification.logs import velocity_of
 from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocity
 from brokk_min.machine import Machine, require
 from brokk_min.viewer.drawing import Scene, draw, image
@@ -34,11 +34,10 @@ def scenes(machine: Machine, path: Path) -> list[Scene]:
     driving = [t.driving for t in ticks]
     require(any(driving), str(path), "a log in which the machine is driven", "another one")
     ticks = ticks[driving.index(True) :]
-    q, samples = np.array([t.q for t in ticks]), machine.velocity_samples
-    padded = np.concatenate([q[:1].repeat(samples - 1, axis=0), q])  # at rest before
-    windows = np.lib.stride_tricks.sliding_window_view(padded, samples, axis=0)
+    q = np.array([t.q for t in ticks])
     fk = forward_kinematics(machine, q)
-    p, v = tool_position(fk), tool_velocity(fk, estimate_velocity(windows, samples, machine.dt))
+    q_dot = velocity_of(q, machine.velocity_samples, machine.rate)
+    p, v = tool_position(fk), tool_velocity(fk, q_dot)
     run = []
     for k, t in enumerate(ticks):
         status = f"{k * machine.dt:.1f} s"

@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import subprocess
 import sys
 import tomllib
@@ -12,39 +11,8 @@ import pytest
 from helpers_cli import run
 
 import brokk_min
-from brokk_min.__main__ import COMMANDS
 
 ROOT = Path(__file__).parents[2]
-OPTIONS = {  # those that the README and the pages name
-    "collect": "--out --hours --excitation --machine --plant --seed",
-    "inspect": "--net --machine --json",
-    "fit": "--out --test --json --paper --seed",
-    "train": "--actuator --out --total-steps --resume --paper --gamma --hold-min-s --seed",
-    "evaluate": "--policy --commands --starts --plant --json --gains --seed",
-    "reproduce": "--out --quick --seed",
-    "sweep": "--actuator --out --seeds --scheduler --total-steps --paper",
-    "machine": "--interface --channel --plant",
-    "drive": "--policy --interface --channel --command --controller --log",
-    "play": "--policy",
-    "replay": "--out",
-    "export": "--policy --out",
-}
-
-
-def test_help__names_all_commands_and_what_they_do(capsys):
-    assert run("--help") == 0
-    printed = capsys.readouterr().out
-    assert list(COMMANDS) == list(OPTIONS)
-    for name, (_, _, text) in COMMANDS.items():
-        assert re.search(rf"^  {name} +{re.escape(text)}$", printed, re.M)
-
-
-@pytest.mark.parametrize("command", list(COMMANDS))
-def test_help__names_all_options(command, capsys):
-    assert run(f"{command} --help") == 0
-    printed = capsys.readouterr().out
-    assert printed.startswith(f"usage: brokk-min {command} ")
-    assert set(OPTIONS[command].split()) <= set(re.findall(r"--[\w-]+", printed))
 
 
 def test_help__shows_the_defaults_of_the_agent_that_is_named(capsys):
@@ -73,14 +41,6 @@ def test_help__imports_nothing_slow():
     assert (done.stdout, done.stderr) == ("set()\n", "")
 
 
-@pytest.mark.parametrize("encoding", ["cp850", "cp437", "cp932", "latin-1", "ascii"])
-def test_help__is_printed_in_any_encoding(encoding):
-    code = "import sys; from brokk_min.__main__ import main; sys.exit(main(['train', '--help']))"
-    options = {"env": os.environ | {"PYTHONIOENCODING": encoding}, "encoding": encoding}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, **options)
-    assert "--gamma" in done.stdout and (done.returncode, done.stderr) == (0, "")
-
-
 GERMAN = """
 from dataclasses import replace
 from brokk_min import BROKK_170
@@ -103,19 +63,6 @@ def test_files__are_utf_8_in_any_locale(tmp_path):
     assert "Löffel" in json.loads((tmp_path / "g.json").read_text(encoding="utf-8"))["joints"]
 
 
-def test_drawing__needs_no_backend_of_a_notebook():
-    environment = os.environ | {"MPLBACKEND": "module://matplotlib_inline.backend_inline"}
-    code = "import brokk_min.__main__, matplotlib; print(matplotlib.get_backend())"
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True)
-    assert (done.stdout, done.stderr) == ("agg\n", "")
-
-
-def test_completion__for_a_shell_that_is_not_supported_is_one_line(capsys):
-    assert run("train --tyro-print-completion tcsh") == 1
-    assert capsys.readouterr().err.startswith("brokk-min: shtab is required for completion")
-
-
 def test_version__is_that_of_the_project_and_of_its_citation(capsys):
     assert run("--version") == 0
     assert capsys.readouterr().out == f"brokk_min {brokk_min.__version__}\n"
@@ -134,38 +81,40 @@ def test_ctrl_c__ends_a_command_in_one_line(monkeypatch, capsys):
 
 
 TRAIN = "train --actuator missing.npz --out p.npz"
+VIRTUAL = "drive --interface virtual --channel v"
 
 
 @pytest.mark.parametrize(
     ("line", "status", "message"),
     [
-        ("", 2, "expected one of collect, inspect, fit, train, evaluate, reproduce, sweep"),
         ("nonsense", 2, "replay, export, got 'nonsense'"),
-        ("collect --out x.txt", 2, "x.txt"),
-        ("collect --out no/x.csv", 2, "no/x.csv: expected a file in an existing, writable folder"),
+        ("collect --out x.txt", 2, "--out: expected a name in .csv or .npz, got x.txt"),
+        ("collect --out x.csv --hours 0", 2, "--hours: expected above 0, to 100, got 0.0"),
         ("collect --out x.csv --machine digger", 2, "--machine: expected brokk170 or FILE.py:NAME"),
-        ("collect --out x.csv --machine digger.py:X", 1, "--machine: expected digger.py to run"),
-        ("fit missing.csv --out n.npz", 1, "missing.csv"),
+        ("inspect", 2, "LOGS: expected one file or more, got none"),
+        ("inspect drive.log --map q1=boom:deg", 1, "--map: expected a table or a recording"),
+        ("fit missing.csv --out n.npz", 1, "missing.csv: no such file or directory"),
+        ("fit l.csv --out n.npz --batch-size 0", 2, "--batch-size: expected a positive number"),
         (TRAIN, 1, "missing.npz: no such file or directory"),
-        (f"{TRAIN} --total-steps 0", 2, "--total-steps: expected 1 or more, got 0"),
-        (f"{TRAIN} --gamma 1", 2, "--gamma: expected 0 to below 1, got 1.0"),
+        (f"{TRAIN} --total-steps 0", 2, "--total-steps: expected a positive number, got 0"),
+        (f"{TRAIN} --gamma 1", 2, "--gamma: expected below 1, got 1.0"),
         (f"{TRAIN} --hold-min-s 9", 2, "--hold-max-s: expected 9.0 or more, got 3.0"),
-        ("train --actuator n.npz --out no/p.npz", 2, "no/p.npz: expected a file in an existing"),
-        ("sweep --actuator missing.npz --out s", 1, "missing.npz"),
+        ("sweep --actuator missing.npz --out s", 1, "missing.npz: no such file or directory"),
         ("sweep --actuator missing.npz --out s --seeds 0", 2, "--seeds: expected 1 or more, got 0"),
-        ("evaluate --policy missing.npz", 1, "missing.npz"),
-        ("machine --interface nonsense --channel 0", 1, "nonsense"),
-        ("drive --interface virtual --channel 0 --policy missing.npz", 1, "missing.npz"),
-        ("export --policy missing.npz --out p.onnx", 1, "missing.npz"),
+        ("evaluate --policy missing.npz", 1, "missing.npz: no such file or directory"),
+        ("evaluate --num-starts 0", 2, "--num-starts: expected 1 or more, got 0"),
+        ("machine --interface nonsense --channel 0", 1, "nonsense 0: expected a CAN bus, got"),
+        (f"{VIRTUAL} --controller jog --joint q2", 2, "--joint: expected one of ['q1', 'q3',"),
+        (f"{VIRTUAL} --controller jog --joint q1", 1, "joystick: expected one, or --command FILE"),
+        ("replay run.log --out a.mp4", 2, "--out: expected a name in .gif, got a.mp4"),
+        ("export --policy missing.npz --out p.onnx", 1, "missing.npz: no such file or directory"),
     ],
 )
 def test_wrong_use__is_refused_in_one_line(line, status, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert run(line) == status
-    printed = capsys.readouterr()
-    refusal = printed.err.splitlines()[-1]
-    assert refusal.startswith("brokk-min: ") and message in refusal and len(refusal) <= 330
-    assert not re.search("Traceback|Errno", printed.err)
+    refusal = capsys.readouterr().err.splitlines()[-1]
+    assert refusal.startswith("brokk-min: ") and message in refusal
     assert not list(tmp_path.iterdir())
 
 
@@ -173,11 +122,3 @@ def test_wrong_use__is_refused_in_one_line(line, status, message, capsys, tmp_pa
 def test_wrong_options__are_explained_and_leave_with_status_2(line, capsys):
     assert run(line) == 2
     assert "Traceback" not in capsys.readouterr().err
-
-
-def test_an_existing_file__is_kept_without_force(tmp_path, capsys):
-    path = tmp_path / "p.npz"
-    path.write_text("mine")
-    assert run("train --actuator n.npz --out", path) == 2
-    assert "expected no file (or --force), got one" in capsys.readouterr().err
-    assert path.read_text() == "mine"

@@ -1,6 +1,7 @@
 """Machines and plants of files, outputs."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -26,20 +27,11 @@ class Reversed(AnalyticPlant):
     def step(self, machine, state, u):
         return super().step(machine, state, -u)
 
-class Silent(AnalyticPlant):
-    def step(self, machine, state, u):
-        return state
-
 class Broken(AnalyticPlant):
     def step(self, machine, state, u):
         return state._replace(q=state.q * float("nan"))
 
-class Small(AnalyticPlant):
-    def step(self, machine, state, u):
-        return state._replace(q=state.q[:, 1:])
-
-SOUND, REVERSED, SILENT, BROKEN, SMALL = AnalyticPlant(), Reversed(), Silent(), Broken(), Small()
-LATE = Late()
+LATE, REVERSED, BROKEN = Late(), Reversed(), Broken()
 """
 
 
@@ -67,17 +59,20 @@ def test_find_machine__takes_a_name_or_an_object_of_a_file(file):
 def test_find_plant__tries_each_joint(file):
     assert find_plant("analytic", BROKK_170) is PLANT
     q = BROKK_170.q_start
-    for name in ("SOUND", "LATE"):
-        assert np.array_equal(find_plant(f"{file}:{name}", BROKK_170).reset(BROKK_170, q).q, q)
+    assert np.array_equal(find_plant(f"{file}:LATE", BROKK_170).reset(BROKK_170, q).q, q)
     for name, message in {
         "NUMBER": "expected states with angles q, got 'int' object has no attribute 'reset'",
         "REVERSED": "q1: expected motion up, then down, got -",
-        "SILENT": r"q1: expected motion up, then down, got \+0.000 and \+0.000 rad",
         "BROKEN": r"expected finite angles q \(10, 5\)",
-        "SMALL": r"expected finite angles q \(10, 5\)",
     }.items():
         with pytest.raises(ValueError, match=message):
             find_plant(f"{file}:{name}", BROKK_170)
+
+
+def test_default_policy__is_the_packages_if_it_has_one():
+    assert all(path and path.exists() for path in default_policy(BROKK_170, None))
+    with pytest.raises(WrongUse, match="--policy: expected one for digger, got none"):
+        default_policy(replace(BROKK_170, name="digger"), None)
 
 
 def test_writes__refuses_folders_that_are_missing_and_files_that_exist(tmp_path):
@@ -92,13 +87,3 @@ def test_writes__refuses_folders_that_are_missing_and_files_that_exist(tmp_path)
     }.items():
         with pytest.raises(WrongUse, match=message):
             Command().writes(bad)
-
-
-def test_default_policy__has_its_gains_beside_it(tmp_path):
-    policy = tmp_path / "p.npz"
-    assert default_policy(BROKK_170, policy, None) == (policy, None)
-    (tmp_path / "gains.json").touch()
-    assert default_policy(BROKK_170, policy, None) == (policy, tmp_path / "gains.json")
-    assert default_policy(BROKK_170, policy, policy) == (policy, policy)
-    shipped, gains = default_policy(BROKK_170, None, None)
-    assert shipped.exists() and gains is not None

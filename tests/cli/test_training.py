@@ -37,12 +37,13 @@ def test_train__has_its_settings_from_the_line(tmp_path, capsys, options, interf
     assert learner.items() <= recipe["learner"].items()
 
 
-def test_train__the_same_line_gives_the_same_bits(tmp_path):
-    save_net(tmp_path / "net.npz", small_net(BROKK_170, np.random.default_rng(0)))
-    for name in "ab":
-        assert run(f"train --actuator {tmp_path}/net.npz --out {tmp_path}/{name}.npz {SMALL}") == 0
-    first, second = (load_policy(tmp_path / f"{name}.npz", BROKK_170).weights for name in "ab")
-    assert all(map(np.array_equal, first, second))
+@pytest.mark.parametrize(
+    "option", ["--epochs 0", "--seed -1", "--zero-goals 2.5", "--episode-s nan", "--gamma -0.5"]
+)
+def test_train__refuses_settings_that_cannot_be(option, tmp_path, capsys):
+    assert run(f"train --actuator net.npz --out {tmp_path}/p.npz {option}") == 2
+    name, value = option.split()
+    assert re.fullmatch(rf"brokk-min: {name}: expected .*, got {value}\n", capsys.readouterr().err)
 
 
 def test_porting_page__names_all_settings_and_no_others():

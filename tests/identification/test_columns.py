@@ -6,7 +6,7 @@ import pytest
 from brokk_min.identification.columns import load_table, parse_map
 from brokk_min.identification.logs import read_log
 
-THEIRS = """Zeit;x,Drive,Boom [deg],Lever,Note
+THEIRS = """Zeit,Drive,Boom [deg],Lever,Note
 {0},A,10.0,25,start
 {1},A,11.0,-50,
 {2},A,12.0,100,stop
@@ -15,7 +15,7 @@ THEIRS = """Zeit;x,Drive,Boom [deg],Lever,Note
 
 def theirs(tmp_path, stamps):
     path = tmp_path / "theirs.csv"
-    path.write_text(THEIRS.replace(";x", "").format(*stamps))
+    path.write_text(THEIRS.format(*stamps))
     return path
 
 
@@ -44,8 +44,12 @@ def test_parse_map__has_units_and_factors_of_any_sign():
     assert mapped == expected | {"q_x": ("Hub", 0.001)}
 
 
-@pytest.mark.parametrize("part", ["boom", "boom=", "=Boom", "boom=Boom:inch", "boom=Boom:0"])
+@pytest.mark.parametrize(
+    "part",
+    ["boom", "boom=", "=Boom", "boom=Boom:inch", "boom=Boom:0", "time=Zeit:deg", "u_boom=Stick"],
+)
 def test_parse_map__refuses_what_is_no_mapping(part):
+    """The last one maps a column that another has already."""
     with pytest.raises(ValueError, match=r"^--map: expected NAME=COLUMN or .*, got '" + part):
         parse_map(f"u_boom=Lever,{part}")
 
@@ -55,7 +59,7 @@ def test_parse_map__refuses_what_is_no_mapping(part):
     [
         ("boom=Stick", r"column Stick: expected a column for q_boom \(--map q_boom=COLUMN:UNIT\)"),
         ("boom=Note", "row 2, column Note: expected a number, got 'start'"),
-        ("time=Drive", "row 2, column Drive: expected a number, got 'A'"),
+        ("boom=Zeit:deg", r"--map q_boom: expected a column u_boom, too"),
     ],
 )
 def test_load_table__says_which_column_and_how_to_map_it(tmp_path, mapping, message):
@@ -67,9 +71,9 @@ def test_load_table__says_which_column_and_how_to_map_it(tmp_path, mapping, mess
         load_table(path, parse_map("time=Zeit"))
 
 
-@pytest.mark.parametrize("run", [np.array([3, 3, 3]), np.array([b"3"] * 3), None])
+@pytest.mark.parametrize("run", [np.array([3, 3, 3]), np.array([b"3"] * 3), np.array(3), None])
 def test_read_log__takes_numbers_as_names_and_datetimes_as_time(tmp_path, run):
-    """And a table without `run` as one recording by the name of its file."""
+    """A single one is for all rows; a table without `run` is one recording by its file's name."""
     start, tick = np.datetime64("2026-01-02T03:04:05"), np.timedelta64(50, "ms")
     columns = {"time": start + np.arange(3) * tick, "u_a": np.zeros(3), "q_a": np.arange(3) / 20}
     np.savez(tmp_path / "3.npz", **columns | ({} if run is None else {"run": run}))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -21,8 +20,8 @@ from brokk_min.env import (
     features,
     initial_state,
     measure,
-    observation_blocks,
     observation_scale,
+    observation_table,
     sensor_std,
     step,
     terminated,
@@ -121,7 +120,7 @@ def test_measure__is_in_physical_units_of_the_base_frame(machine, seed):
     np.testing.assert_allclose(measured.v_tool, (ahead - behind) / 2e-6, atol=1e-7)
     size = 6 + len(machine.locked) + 3 * machine.history * len(machine.driven)
     assert features(machine, measured).shape == (4, size)
-    assert sum(block.std.size for block in observation_blocks(machine)) == size
+    assert len(observation_table(machine)) == size
     mean, std = observation_scale(machine)
     assert mean.shape == std.shape == (size,) and (std > 0).all()
 
@@ -186,22 +185,24 @@ def test_measure__gives_each_number_of_each_machine_its_own_noise():
 
 
 def test_the_table_of_the_docstring__is_true():
-    """Numbers, deviations and noise of the table are those of the blocks."""
+    """Numbers, deviations and noise of the table are those of `observation_table`."""
     rows = re.findall(
         r"^\| (\d+)(?:-(\d+))? +\| .+? +\| (.+?) +\| (\w+) +\|", task.__doc__ or "", re.M
     )
-    blocks = observation_blocks(BROKK_170)
-    groups = [blocks[i:j] for i, j in pairwise([0, 1, 2, 3, 11, 12])]  # a row holds all joints
-    assert len(rows) == len(groups)
-    place = 0
-    for (first, last, deviation, noise), group in zip(rows, groups, strict=True):
+    assert len(rows) == 5
+    table, place = observation_table(BROKK_170), 0
+    for first, last, deviation, noise in rows:
         assert int(first) == place
-        place += sum(block.std.size for block in group)
-        assert int(last or first) == place - 1
-        assert {block.noisy for block in group} == {noise == "yes"}
+        place = int(last or first) + 1
+        _, std, noisy = table[int(first) : place].T
+        assert set(noisy) == {float(noise == "yes")}
         number = re.match(r"0\.\d{3}", deviation)
-        assert not number or float(number[0]) == pytest.approx(group[0].std[0], abs=5e-4)
-    assert place == 163 and "(163,)" in task.__doc__ and "Box(-1, 1, (4,))" in task.__doc__
+        assert not number or std == pytest.approx(float(number[0]), abs=5e-4)
+    assert (
+        place == len(table) == 163
+        and "(163,)" in task.__doc__
+        and "Box(-1, 1, (4,))" in task.__doc__
+    )
     assert TaskConfig().episode_s == 20 and "20 s" in task.__doc__
 
 
