@@ -12,7 +12,6 @@ from pathlib import Path
 import can
 import numpy as np
 import pytest
-from canopen.objectdictionary import ObjectDictionary, ODRecord, ODVariable, datatypes
 from helpers_machines import obedient_net
 
 from brokk_min.actuator import PLANT
@@ -30,23 +29,23 @@ START = (0.0, 0.5, 0.58, 1.71, 1.24)
 
 def baseline(machine):
     """A PI controller that nobody tuned."""
-    one = np.ones(len(machine.driven))
-    gains = Gains(one, 3 * one, 0 * one, np.full(1, 0.3))
+    one = np.ones((1, len(machine.driven)))
+    gains = Gains(one, 3 * one, 0 * one, np.full((1, 1), 0.3))
     return JacobianController(machine, gains, 0.1, manipulability_threshold(machine))
 
 
 BASELINE = baseline(BROKK_170)
 
 
-def random_policy(interface):
+def random_policy(interface, machine=BROKK_170):
     """A policy that nobody trained: it sends all kinds of commands."""
     rng = np.random.default_rng(0)
-    sizes = [len(INTERFACES[interface].scale(BROKK_170)[0]), 64, 64, 64, 4]
+    sizes = [len(INTERFACES[interface].scale(machine)[0]), 64, 64, 64, len(machine.driven)]
     weights = []
     for inputs, outputs in pairwise(sizes):
         weights.append((1.5 * rng.standard_normal((inputs, outputs)) / inputs**0.5).astype("f4"))
         weights.append(np.zeros(outputs, np.float32))
-    return Policy({}, tuple(weights), obedient_net(BROKK_170), interface)
+    return Policy({}, tuple(weights), obedient_net(machine), interface)
 
 
 def unchanged(can_id, data):
@@ -103,10 +102,10 @@ class World:
     step = 0.001  # s
     offset = 0.0  # s, of the program's clock
 
-    def __init__(self, controller, operator, machine=BROKK_170, log=None, start=START):
+    def __init__(self, controller, operator, log=None):
         self.time = 0.0  # s
         self.recorder = Recorder()
-        self.simulated = SimulatedMachine(machine, start, 0.0, self.recorder)
+        self.simulated = SimulatedMachine(BROKK_170, START, 0.0, self.recorder)
         self.answers = deque()
         self.upward = self.downward = unchanged
         self.noise = list  # foreign frames of the next millisecond
@@ -114,7 +113,7 @@ class World:
         writer = can.CanutilsLogWriter(log) if log else None
         self.bus = Bus(self, writer, "virtual", clock=self.clock, sleep=self.sleep)
         self.bus.start = 1.8e9  # s; a fixed time of day, so that roundings repeat themselves
-        self.drive = Drive(machine, controller, self.bus, operator)
+        self.drive = Drive(BROKK_170, controller, self.bus, operator)
         self.controller, self.operator = controller, operator
 
     def clock(self):
@@ -214,7 +213,6 @@ class HoldingOperator:
     def __init__(self):
         self.enable = None  # None: pressed when ready, and held from then on
         self.alive = True
-        self.stop = False
         self.v = (0.1, 0.0, 0.0)
         self.pressed = False
         self.act = lambda: None
@@ -224,7 +222,7 @@ class HoldingOperator:
         self.pressed = self.pressed or ready
         enable = self.pressed if self.enable is None else self.enable
         v = self.v if driving else (0.0, 0.0, 0.0)
-        return OperatorInput(v, enable and self.alive, self.alive, self.stop)
+        return OperatorInput(v, enable and self.alive, self.alive)
 
 
 def eventually(condition, seconds=20.0):
@@ -248,34 +246,10 @@ def own_multicast_port(monkeypatch):
     pytest.skip("no multicast route on this machine")
 
 
-def dictionary():
-    """As much of CiA 406 as the program asks of an encoder."""
-    u8, u16, u32 = datatypes.UNSIGNED8, datatypes.UNSIGNED16, datatypes.UNSIGNED32
-    objects = ObjectDictionary()
-    records = {0x1800: ODRecord("TPDO1", 0x1800), 0x1A00: ODRecord("TPDO1 mapping", 0x1A00)}
-    for name, index, sub, kind, value in (
-        ("device type", 0x1000, 0, u32, 406),
-        ("heartbeat", 0x1017, 0, u16, 0),
-        ("identifier", 0x1800, 1, u32, 0),
-        ("transmission type", 0x1800, 2, u8, 254),
-        ("number of entries", 0x1A00, 0, u8, 1),
-        ("first entry", 0x1A00, 1, u32, 0x60040020),
-        ("position", 0x6004, 0, u32, 0),
-        ("units per revolution", 0x6501, 0, u32, 4096),
-    ):
-        entry = ODVariable(name, index, sub)
-        entry.data_type = kind
-        entry.default = value
-        (records[index].add_member if index in records else objects.add_object)(entry)
-    for record in records.values():
-        objects.add_object(record)
-    return objects
-
-
 class Virtual:
     """SDL's virtual joystick: a device without a device."""
 
-    def __init__(self, axes=6, buttons=8, kind=4):  # kind 1: a gamepad that SDL knows
+    def __init__(self, buttons=8, kind=4):  # kind 1: a gamepad that SDL knows
         import pygame
 
         os.environ["SDL_VIDEODRIVER"] = "dummy"
@@ -287,7 +261,7 @@ class Virtual:
         pointer, number = ctypes.c_void_p, ctypes.c_int
         self.sdl.SDL_JoystickSetVirtualAxis.argtypes = [pointer, number, ctypes.c_int16]
         self.sdl.SDL_JoystickSetVirtualButton.argtypes = [pointer, number, ctypes.c_uint8]
-        self.index = self.sdl.SDL_JoystickAttachVirtual(kind, axes, buttons, 0)
+        self.index = self.sdl.SDL_JoystickAttachVirtual(kind, 6, buttons, 0)  # six axes
         self.handle = self.sdl.SDL_JoystickOpen(self.index)
 
     def axis(self, axis, value):

@@ -1,11 +1,8 @@
 """The command line in this process."""
 
 import shlex
-from pathlib import Path
 
 from brokk_min.__main__ import main
-
-MINI = f"{Path(__file__).parents[1] / 'examples' / 'mini_excavator.py'}:MINI_EXCAVATOR"
 
 
 def run(line, *more):

@@ -2,7 +2,6 @@
 
 import struct
 from functools import partial
-from itertools import cycle
 from typing import NamedTuple
 
 import can
@@ -42,12 +41,12 @@ def moved(add):
     return lambda data: [struct.pack("<I", (struct.unpack("<I", data)[0] + add) % 2**26)]
 
 
-def freeze(world, node, command=None, flicker=0):
-    """An encoder stays at one place, or goes to and fro by some counts."""
+def freeze(world, node, command=None):
+    """An encoder stays at one place."""
     world.controller.m[:] = world.controller.m if command is None else command
     counts = np.rint(world.simulated.state.q / STEP).astype(int)
-    places = cycle(encoder_raw(BROKK_170, counts + k)[node - 1] for k in (0, flicker))
-    up(0x180 + node, lambda _: [struct.pack("<I", next(places))])(world)
+    place = struct.pack("<I", encoder_raw(BROKK_170, counts)[node - 1])
+    up(0x180 + node, lambda _: [place])(world)
 
 
 def due(world, held):
@@ -236,11 +235,10 @@ class Outcome(NamedTuple):
     seconds: float  # from the fault until the valves were closed for good
     latched: bool  # closed long before the end, though the operator held on
     words: str  # reason that the program gave
-    commands: tuple[np.ndarray, np.ndarray]  # `World.commands` since the fault
 
 
-def measure(cause, phase, seconds=0.6):
-    """Drive for a second, let it go wrong `phase` [s] after a SYNC, and go on for `seconds`."""
+def measure(cause, phase):
+    """Drive for a second, let it go wrong `phase` [s] after a SYNC, and go on for 0.6 s."""
     world = World(ConstantCommand(*COMMAND), HoldingOperator())
     world.drive.begin()
     world.run(1.0)
@@ -248,11 +246,10 @@ def measure(cause, phase, seconds=0.6):
     assert world.commands[1][-1].tolist() == list(COMMAND), "it drove"
     begun = world.time
     cause(world)
-    world.run(seconds)
+    world.run(0.6)
     words = world.drive.reason
-    world.sleep(max(0.0, begun + seconds + 0.3 - world.time))
+    world.sleep(max(0.0, begun + 0.9 - world.time))
     times, m = world.commands
-    times, m = times[times > begun], m[times > begun]
-    is_open = m.any(axis=1)
-    last = float(times[is_open][-1]) if is_open.any() else begun
-    return Outcome(last - begun, last < begun + seconds - 0.2, words, (times, m))
+    open_times = times[(times > begun) & m.any(axis=1)]
+    last = float(open_times[-1]) if len(open_times) else begun
+    return Outcome(last - begun, last < begun + 0.4, words)

@@ -56,9 +56,9 @@ def joints(draw: st.DrawFn, index: int, driven: bool, limit: float) -> Joint:
 
 
 @st.composite
-def machines(draw: st.DrawFn, min_joints: int = 2, max_joints: int = 6) -> Machine:
+def machines(draw: st.DrawFn) -> Machine:
     """Machines of 2 to 6 joints, some of them locked, with valves and a pump of their own."""
-    n = draw(st.integers(min_joints, max_joints))
+    n = draw(st.integers(2, 6))
     driven = draw(st.lists(st.booleans(), min_size=n, max_size=n).filter(any))
     pwm_limit = draw(st.integers(20, 127))
     return replace(

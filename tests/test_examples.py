@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers_bus import baseline
 
 from brokk_min.__main__ import main
 from brokk_min.actuator import PLANT
 from brokk_min.cli.options import find_plant
 from brokk_min.env import initial_state, measure, transition
 from brokk_min.evaluation import baselines
-from brokk_min.jacobian import Gains, JacobianController, manipulability_threshold
 from brokk_min.kinematics import forward_kinematics, tool_position
 from examples.mini_excavator import MINI_EXCAVATOR
 from examples.seven_joints import SEVEN_JOINTS
@@ -69,14 +69,9 @@ def test_example__has_the_geometry_of_its_drawing(machine, tool):
 def test_example__moves_its_tool_along_each_axis(machine, plant, axis):
     """By a PI controller that nobody tuned, for 2 s (the crane's slow valves: 4 s) at 0.15 m/s."""
     plant = PLANT if plant == "analytic" else find_plant(plant, machine)
-    one = np.ones((1, len(machine.driven)))
-    gains = Gains(one, 3 * one, 0 * one, 0.3 * one[:, :1])
-    controller = JacobianController(machine, gains, 0.1, manipulability_threshold(machine))
-    start = [STARTS[machine]]
-    state, memory = (
-        initial_state(machine, start, 0.15 * np.eye(3)[axis], plant),
-        controller.start(1),
-    )
+    controller, start = baseline(machine), [STARTS[machine]]
+    state = initial_state(machine, start, 0.15 * np.eye(3)[axis], plant)
+    memory = controller.start(1)
     seconds = 4.0 if machine is TELESCOPIC_CRANE else 2.0
     for _ in range(round(seconds * machine.rate)):
         u, memory = controller(measure(machine, state.history, state.v_goal), memory)

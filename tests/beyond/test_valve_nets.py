@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brokk_min.actuator import initial_history
-from brokk_min.beyond.valve_nets import ValveNet, mu_law, open_indicator, opening, valve_inputs
+from brokk_min.beyond.valve_nets import ValveNet, mu_law, opening, valve_inputs
 from brokk_min.machine import valve_opening
 
 ZONES = np.array([[0.07, 0.07], [0.2, 0.1], [0.0, 0.3]])
@@ -28,12 +28,6 @@ def test_mu_law__by_hand():
     np.testing.assert_allclose(mu_law(np.array([-1.0, -0.01, 0.0, 0.5, 1.0])), expected, atol=1e-12)
 
 
-def test_open_indicator__by_hand():
-    """tanh(0.5) = 0.462 at 1 % of opening, tanh(1) = 0.762 at 2 %, either way."""
-    found = open_indicator(np.array([0.0, 0.01, -0.01, 0.02, -1.0]))
-    np.testing.assert_allclose(found, [0, 0.46212, 0.46212, 0.76159, 1], atol=1e-5)
-
-
 @given(st.integers(0, 1000))
 def test_valve_inputs__are_the_same_by_numpy_torch_and_a_loop(seed):
     history = np.random.default_rng(seed).uniform(-1, 1, (2, 3, 3, 5)).astype(np.float32)
@@ -47,15 +41,6 @@ def test_valve_inputs__are_the_same_by_numpy_torch_and_a_loop(seed):
         np.testing.assert_allclose(opening(history[i, :, 2], ZONES)[j], x, atol=1e-7)
         expected = np.concatenate([q, q_dot, mu_law(x), np.tanh(np.abs(x) / 0.02)])
         np.testing.assert_allclose(found[i, j], expected, atol=1e-6)
-
-
-def test_inputs__are_what_a_net_of_its_own_dead_zones_reads():
-    net, history = valve_net(0.2), np.zeros((4, 3, 13), np.float32)
-    history[:, 2] = 0.3
-    np.testing.assert_allclose(
-        net.inputs(history), valve_inputs(history, net.dead_zones), rtol=1e-6
-    )
-    np.testing.assert_allclose(net.inputs(history)[:, 26:39], mu_law(0.23 / 0.93), rtol=1e-5)
 
 
 @pytest.mark.parametrize("counts", [0, 8])

@@ -11,6 +11,7 @@ from brokk_min.can.drive_log import log_for_fit, read_frames, read_telemetry
 from brokk_min.machine import BROKK_170
 
 STEP = BROKK_170.encoder_step[0]
+OTHER_FRAMES = ("12345678#", "123##F00", "123#R", "321#1122334455667788_B")
 
 
 def test_read_frames__reads_a_cut_log_up_to_its_last_whole_line(tmp_path):
@@ -22,9 +23,9 @@ def test_read_frames__reads_a_cut_log_up_to_its_last_whole_line(tmp_path):
 
 
 def test_read_frames__reads_a_plain_candump_log_too(tmp_path):
-    extended, fd, remote = "(2.0) can0 12345678#\n", "(2.0) can0 123##F00\n", "(2.0) can0 123#R\n"
-    lines = ["(1.0) can0 123#0102\n", extended, fd, remote, "(3.0) can0 080# T\n"]
-    (tmp_path / "can.log").write_text("".join(lines))
+    """Without extended, FD and remote frames, and those of a length code above eight."""
+    others = "".join(f"(2.0) can0 {frame}\n" for frame in OTHER_FRAMES)
+    (tmp_path / "can.log").write_text(f"(1.0) can0 123#0102\n{others}(3.0) can0 080# T\n")
     found = list(read_frames(tmp_path / "can.log"))
     assert found == [Frame(1.0, 0x123, b"\x01\x02"), Frame(3.0, 0x80, b"", True)]
 
@@ -35,15 +36,6 @@ def test_read_frames__reads_what_candump_prints_on_a_terminal(tmp_path):
     (tmp_path / "terminal.txt").write_text(text + fd)
     found = list(read_frames(tmp_path / "terminal.txt"))
     assert found == [Frame(1.0, 0x123, b"\x01\x02"), Frame(2.0, 0x80, b"")]
-    (tmp_path / "terminal.txt").write_text("  can0  123   [2]  01 02\n")
-    with pytest.raises(ValueError, match=r"row 1: expected .time. bus .*, as candump -l writes"):
-        list(read_frames(tmp_path / "terminal.txt"))
-
-
-def test_read_frames__leaves_out_frames_with_a_length_code_above_eight(tmp_path):
-    foreign = "(1.5) can0 321#1122334455667788_B\n"
-    (tmp_path / "raw.log").write_text(f"(1.0) can0 123#0102\n{foreign}(2.0) can0 080#\n")
-    assert [frame.id for frame in read_frames(tmp_path / "raw.log")] == [0x123, 0x80]
 
 
 @pytest.mark.parametrize("name", ["drive.asc", "drive.blf", "drive.trc", "drive.log.gz"])
@@ -61,10 +53,6 @@ def test_read_frames__reads_the_logs_of_other_tools(tmp_path, name):
     np.testing.assert_allclose(times - times[0], np.arange(20) / 20, atol=1e-3)
     if name != "drive.trc":  # python-can writes all of its frames as received
         assert [frame.sent for frame in found] == [one.sent for one in frames]
-    if name == "drive.blf":
-        (tmp_path / name).write_bytes(b"no log at all")
-        with pytest.raises(ValueError, match=r"blf: expected a log that python-can reads, got"):
-            list(read_frames(tmp_path / name))
 
 
 def test_read_frames__names_the_row_that_is_no_frame(tmp_path):

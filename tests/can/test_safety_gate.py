@@ -55,7 +55,7 @@ def test_expected_motion__counts_from_one_and_a_half_of_the_machines_widest_dead
 
 
 def tight_machine():
-    """The Brokk with ranges and speeds such that whole counts hit the gate's borders exactly."""
+    """The Brokk with ranges such that whole counts hit the gate's borders exactly."""
 
     def edge(near, margin):
         """A limit near `near` to which adding `margin` gives a whole number of counts."""
@@ -64,27 +64,13 @@ def tight_machine():
         hits = limits[limits + margin == whole]
         return float(hits[np.argmin(np.abs(hits - near))])
 
-    def jump(speed):
-        return 2.0 * speed * DT + 0.0045 + STEP
-
-    near = (np.arange(8, 40) * STEP - 0.0045 - STEP) / (2 * DT)
-    speeds = [x * (1 + np.finfo(float).eps * k) for x in near for k in range(-8, 9)]
-    speed = next(float(x) for x in speeds if jump(x) in np.arange(8, 40) * STEP)
     margins = [(-0.05, 0.05), (-0.05, 0.05), (0.02, -0.02), (-0.05, -0.02), (0.02, 0.05)]
     joints = tuple(
         replace(
-            joint,
-            q_min=edge(joint.q_min, low),
-            q_max=edge(joint.q_max, high),
-            cylinder_base=0.0,
-            q_dot_up=speed,
-            q_dot_down=speed * (0.8 if joint.a < 1.2 else 1.0),
+            joint, q_min=edge(joint.q_min, low), q_max=edge(joint.q_max, high), cylinder_base=0.0
         )
         for joint, (low, high) in zip(BROKK_170.joints, margins, strict=True)
     )
-    zones = 12 / (1.5 * 127) * (1 + np.finfo(float).eps * np.arange(-8, 8))
-    whole = next(float(zone) for zone in zones if 1.5 * zone == 12 / 127)
-    joints = tuple(replace(joint, dead_zone=(whole, whole)) for joint in joints)
     return replace(BROKK_170, name="tight", joints=joints)
 
 
@@ -226,7 +212,7 @@ class Cases:
         pushed = np.arange(9, 0, -1) <= rng.choice([0, 7, 8, 9], (num, n, 1))
         sent = np.where(pushed, push, rng.integers(-80, 81, (num, n, 9)))
         late = (0.5 * DT, 0.5 * DT - 1e-9, 1.5 * DT + 1e-9, 0.074, 0.026, np.inf, np.nan, -1.0)
-        state = GateState(
+        return GateState(
             driving=self.some(0.6),
             armed_once=self.some(0.5),
             active_fault=rng.integers(0, 96, num),
@@ -239,20 +225,9 @@ class Cases:
             place=self.inputs.counts + rng.integers(-2, 3, (num, n)),
             motion=STEP * rng.choice([0.0, 1.5, 2.7, 3.2], (num, n), p=[0.7, 0.15, 0.1, 0.05]),
         )
-        # now and then as much motion as may be expected, to the bit, or a bit more
-        due = np.zeros((num, n))
-        for k, j in np.ndindex(num, n):
-            s = GateState(*row(state, k))
-            due[k, j] = plain_motion(self.machine, s, self.inputs.counts[k, j], j)[1]
-        rest = 3 * STEP - (due - state.motion)
-        bit = np.nextafter(rest, rng.choice([-9.0, 9.0], (num, n)))
-        border = np.where(self.some(0.5, n), rest, bit)
-        return state._replace(motion=np.where(self.some(0.9, n), state.motion, border))
 
 
-@pytest.mark.parametrize(
-    ("machine", "seed"), [(BROKK_170, 0), (tight_machine(), 1), (tight_machine(), 2)]
-)
+@pytest.mark.parametrize(("machine", "seed"), [(BROKK_170, 0), (tight_machine(), 1)])
 def test_gate__is_what_its_promises_say_in_any_leading_shape(machine, seed):
     cases = Cases(machine, 3000, seed)
     for shape in ((3000,), (4, 750), (3, 10, 100)):

@@ -1,20 +1,17 @@
 """A drive that only listens, beside a remote control: no frame leaves, and what it tells."""
 
-import threading
-import time
 from dataclasses import replace
 
 import can
 import numpy as np
 import pytest
-from helpers_bus import START, ConstantCommand, HoldingOperator, RemoteControl, World, only
+from helpers_bus import ConstantCommand, HoldingOperator, RemoteControl, World, only
 from helpers_cli import run
 
 from brokk_min._files import SHIPPED
-from brokk_min.can.canopen import Frame, valve_frame
+from brokk_min.can.canopen import valve_frame
 from brokk_min.can.drive_log import log_for_fit, read_frames
 from brokk_min.can.shadow import Shadow
-from brokk_min.can.simulated_machine import SimulatedMachine
 from brokk_min.cli.operating import status
 from brokk_min.learning.policy import POLICIES, PolicyController, load_policy
 from brokk_min.machine import BROKK_170
@@ -64,10 +61,6 @@ def test_shadow__compares_and_logs_what_it_would_send_and_sends_nothing(tmp_path
     assert [data[:5] for data in logged][: len(would)] == expected
     (recording,) = log_for_fit(BROKK_170, frames).recordings  # the shadow as a record for `fit`
     assert set(np.rint(127 * recording.u[:, Q4])) == {40, 0, -40}
-    report = drive.report().splitlines()
-    assert report[0] == f"compared in {len(would)} of {drive.ticks} ticks, in counts of 127:"
-    assert report[1].startswith("  q1: correlation none, mean difference ")
-    assert report[3].startswith(f"  q4: correlation {correlation(drive):+.2f}, mean difference ")
     assert f"would send {' '.join(f'{x / 127:+.2f}' for x in would[-1])}, sent +0.00 +0.00 " in (
         status(drive)
     )
@@ -163,40 +156,14 @@ def test_shadow__says_that_no_positions_came():
     assert world.drive.faults["q1: silent"] > 10
 
 
-def live(bus, ended):
-    """A machine and its remote control in real time, on a bus of python-can."""
-    machine = SimulatedMachine(BROKK_170, START, time.monotonic())
-    machine.receive(Frame(0.0, 0x000, b"\x01\x00"))
-    count = 0
-    while not ended.is_set():
-        count += 1
-        valves = valve_frame([0, 0, 0, 30, 0], count % 256, 1).tobytes()
-        answers = machine.receive(Frame(time.monotonic(), 0x080, b""))
-        for can_id, data in [*answers, *machine.advance(time.monotonic()), (0x210, valves)]:
-            bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
-        time.sleep(0.05)
-
-
-def test_drive_shadow__lets_no_frame_onto_a_bus_on_which_others_listen(tmp_path, capsys):
-    """With the policy's file and a log, to the end of a file of goals."""
+def test_drive_shadow__sends_nothing_until_it_gives_up(tmp_path, capsys, monkeypatch):
+    """Not even SYNC and the start of the nodes, for which it waits here in vain."""
+    monkeypatch.setattr("brokk_min.can.operator_input.PATIENCE", 0.5)
     goals = tmp_path / "c.csv"
     goals.write_text("sequence,time,vx,vy,vz\na,0,0.1,0,0\na,0.5,0,0,0\n")
-    with (
-        can.Bus("shadowed", interface="virtual") as others,
-        can.Bus("shadowed", interface="virtual") as listener,
-    ):
-        ended = threading.Event()
-        thread = threading.Thread(target=live, args=(others, ended))
-        thread.start()
+    with can.Bus("shadowed", interface="virtual") as others:
         where = "--interface virtual --channel shadowed"
-        run(f"drive --shadow {where} --command '{goals}' --log '{tmp_path}/run.log'")
-        ended.set()
-        thread.join()
-        sent_by_us = 0
-        while others.recv(0.0) is not None:
-            sent_by_us += 1
-        heard = 0
-        while listener.recv(0.0) is not None:
-            heard += 1
-    assert sent_by_us == 0 and heard > 20
-    assert "ticks, in counts of 127:" in capsys.readouterr().out
+        assert run(f"drive --shadow {where} --command '{goals}' --log '{tmp_path}/run.log'") == 1
+        assert others.recv(0.0) is None
+    assert {frame.id for frame in read_frames(tmp_path / "run.log")} == {0x7FE, 0x7FF}
+    assert "compared in 0 of " in capsys.readouterr().out

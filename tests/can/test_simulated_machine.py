@@ -1,8 +1,6 @@
 """The simulated machine frame by frame on a clock of its own."""
 
-import re
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -59,26 +57,6 @@ def test_advance__moves_and_beats_by_its_own_clock():
     np.testing.assert_allclose(machine.plant.q, [START] * 30)
 
 
-class Linear(NamedTuple):
-    """A plant of one's own: each joint turns at 0.1 rad/s at full command."""
-
-    q: np.ndarray = np.zeros(5)
-
-    def reset(self, machine, q):
-        return Linear(q)
-
-    def step(self, machine, state, u):
-        return Linear(state.q + 0.1 * u * machine.dt)
-
-
-def test_advance__moves_any_plant_in_its_own_steps():
-    machine = SimulatedMachine(BROKK_170, START, 0.0, Linear())
-    machine.u = np.array([1.0, 0.0, -1.0, 0.0, 0.0])
-    machine.enabled, machine.valid = True, 9.9
-    machine.advance(10.0 + 1e-9)
-    np.testing.assert_allclose(machine.state.q - START, machine.u)
-
-
 def test_receive__opens_valves_after_a_start_and_a_neutral_frame():
     machine = Machine()
     neutral = [0, 0, 0, 0, 0]
@@ -129,38 +107,11 @@ def test_receive__closes_valves_until_a_start_and_a_neutral_frame(act, reason):
     assert any(machine.valves(202, 80))
 
 
-def test_receive__changes_states_of_nodes_alone_or_together():
-    machine = Machine()
-    assert machine.nmt_(1) == [] and set(machine.nmt.values()) == {5}
-    machine.nmt_(2, 3)
-    assert machine.nmt == dict.fromkeys(NODES, 5) | {3: 127}
-    machine.take(0x000, b"\x02")  # no command
-    assert machine.nmt[1] == 5
-    machine.nmt_(129)
-    assert set(machine.nmt.values()) == {127}
-
-
-@pytest.mark.parametrize(
-    ("request_", "answer"),
-    [
-        ("40 01 65 00 00 00 00 00", "43 01 65 00 00 10 00 00"),  # 4,096 counts a turn
-        ("2b 17 10 00 32 00 00 00", "60 17 10 00 00 00 00 00"),
-    ],
-)
-def test_receive__answers_sdo_requests_of_encoders(request_, answer):
-    machine = Machine()
-    assert machine.take(0x602, bytes.fromhex(request_)) == [(0x582, bytes.fromhex(answer))]
-    assert machine.take(0x602, bytes(7)) == []
-    assert machine.take(0x600 + CONTROLLER, bytes(8)) == []
-
-
 def test_start_pose__is_the_given_one_the_machines_or_the_middle():
     low, high = BROKK_170.column("q_min"), BROKK_170.column("q_max")
     np.testing.assert_array_equal(start_pose(BROKK_170, ()), START)
-    for pose in ([0.1, 0.5, 0.5, 1.5, 1.0], low.tolist(), high.tolist()):
-        np.testing.assert_array_equal(start_pose(BROKK_170, pose), pose)
+    np.testing.assert_array_equal(start_pose(BROKK_170, low.tolist()), low)
     np.testing.assert_allclose(start_pose(replace(BROKK_170, q_start=()), ()), (low + high) / 2)
     for pose in ([9.0, 0.5, 0.5, 1.5, 1.0], [0.0, 0.5]):
-        refusal = rf"start: expected 5 angles within .*, got {re.escape(str(pose))}"
-        with pytest.raises(ValueError, match=refusal):
+        with pytest.raises(ValueError, match="start: expected 5 angles within"):
             start_pose(BROKK_170, pose)

@@ -101,13 +101,3 @@ def test_task_claims__on_error_are_of_each_sequence_and_figure(x, z, drift, expe
     assert numbers["drift along z"]["mean"] == pytest.approx(drift - 0.2)
     one_start = claims.task_claims([run for run in runs if run["start"] == 0])[2:]
     assert {verdict(claim, LOW) for claim in one_start} == {UNKNOWN}
-
-
-def test_task_claims__say_by_hand_first_and_then_optimised():
-    claim = claims.task_claims(runs_with({PPO: 0.03, HIGH: 0.02, LOW: 0.04, RAW: 0.05}))[-1]
-    assert claim["verdict"] == (
-        "holds here for PPO, the paper's agent (against PID by hand, raw / PID by hand); "
-        "does not hold here for PPO, the paper's agent (against PID optimised, k = 0.1)"
-    )
-    assert claim["measured"].endswith("over all motions less a PID's [m/s], to be below 0")
-    assert list(claim["numbers"]) == [f"{TITLES[PPO]} against {TITLES[pid]}" for pid in claims.PIDS]

@@ -90,7 +90,6 @@ def test_reproduce__results_hold_every_run_with_its_figures(results):
     keys = {(run["controller"], run["sequence"], run["start"]) for run in runs}
     controllers = [*POLICIES, *PIDS]
     assert keys == {(c, s, i) for c in controllers for s in names for i in range(4)}
-    assert all(run["velocity_rmse"] >= run[ERROR] > 0 for run in runs)
     assert results["start_kinds"] == ["workspace", "limits", "workspace", "extended"]
     assert all(run["kind"] == results["start_kinds"][run["start"]] for run in runs)
     scored = [run for run in runs if run["kind"] == "workspace" and run["controller"] == "rl"]

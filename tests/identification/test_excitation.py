@@ -94,32 +94,16 @@ def test_collect__begins_segments_at_idle_and_ends_them_at_a_limit_or_in_time(co
 
 
 def test_collect__records_angles_that_a_replay_of_the_commands_gives(collected):
-    for kind, log in collected.items():
-        _, first = next(pair for pair in segments(log) if pair[0] == Q5)
-        start = np.where(np.arange(5) == Q5, first.q[0], (LOW + HIGH) / 2)
-        tolerance = 2.0  # counts: the start of a random angle is known to a count
-        if kind == "sine":
-            start, tolerance = (LOW + HIGH) / 2, 0.0
-        state = PLANT.reset(BROKK_170, start)
-        for u, q in zip(first.u, first.q, strict=True):
-            counts = (read_encoder(BROKK_170, state.q) - q) / BROKK_170.encoder_step
-            assert np.abs(counts).max() <= tolerance + 1e-6
-            state = PLANT.step(BROKK_170, state, u)
+    _, first = next(pair for pair in segments(collected["sine"]) if pair[0] == Q5)
+    state = PLANT.reset(BROKK_170, (LOW + HIGH) / 2)
+    for u, q in zip(first.u, first.q, strict=True):
+        np.testing.assert_allclose(q, read_encoder(BROKK_170, state.q), atol=1e-9)
+        state = PLANT.step(BROKK_170, state, u)
 
 
-def test_collect__repeats_itself_to_the_bit_for_one_seed(collected):
-    for seed, same in ((7, True), (8, False)):
-        again = collect(BROKK_170, 0.05, "sine", np.random.default_rng(seed))
-        one, two = again.recordings[0], collected["sine"].recordings[0]
-        assert np.array_equal(one.u, two.u) == np.array_equal(one.q, two.q) == same
-
-
-@pytest.mark.parametrize("start", [None, np.array([1.0, 0.5, 0.58, 1.71, 1.24])])
-def test_task_log__moves_driven_or_locked_joints_within_the_limits(start):
-    log = task_log(BROKK_170, 5, 20.0, np.random.default_rng(0), start)
+def test_task_log__moves_driven_or_locked_joints_within_the_limits():
+    log = task_log(BROKK_170, 5, 20.0, np.random.default_rng(0))
     for i, recording in enumerate(log.recordings):
-        if start is not None:
-            np.testing.assert_array_equal(recording.q[0], read_encoder(BROKK_170, start))
         moved = np.flatnonzero(np.ptp(recording.q, axis=0) > 0.05).tolist()
         assert moved == ([1] if i == 4 else [0, 2, 3, 4])  # q2 moves only alone
         assert recording.u.shape == recording.q.shape == (400, 5)
@@ -132,19 +116,6 @@ def test_task_log__moves_driven_or_locked_joints_within_the_limits(start):
     for u in np.stack([recording.u for recording in log.recordings], axis=1):
         state = PLANT.step(BROKK_170, state, u)
     assert np.abs(state.q - q[-1]).max() < 0.02
-
-
-@pytest.mark.parametrize(
-    ("hours", "excitation", "message"),
-    [
-        (0.0, "sine", "hours: expected a positive number, got 0.0"),
-        (np.inf, "rich", "hours: expected a positive number, got inf"),
-        (1.0, "noise", "excitation: expected one of sine, rich, got noise"),
-    ],
-)
-def test_collect__refuses_hours_and_excitations_that_are_none(hours, excitation, message):
-    with pytest.raises(ValueError, match=message):
-        collect(BROKK_170, hours, excitation, np.random.default_rng(0))
 
 
 class Slow(AnalyticPlant):

@@ -7,7 +7,6 @@ import pytest
 import torch
 from helpers_machines import line
 
-from brokk_min.actuator import initial_history
 from brokk_min.beyond.valve_nets import ValveNet, mu_law, open_indicator
 from brokk_min.identification import fitting
 from brokk_min.identification.fitting import PAPER_RECIPE, FitConfig, fit, training_set
@@ -37,10 +36,6 @@ def simple_system(seed, recordings, ticks=300, logged=False):
     return Log(("boom", "stick"), tuple(result), logged)
 
 
-def same_weights(one, two):
-    return all(np.array_equal(a, b) for a, b in zip(one.weights, two.weights, strict=True))
-
-
 def test_fit__learns_a_simple_system():
     log = simple_system(0, 25, logged=True)
     net = fit(log, FitConfig(steps=500, batch_size=256), 0, BROKK_170)
@@ -55,15 +50,6 @@ def test_fit__learns_a_simple_system():
             assert run["velocity_rmse"] < 0.25 * speed, (name, horizon)
             assert run["position_error_median"] < 0.1, (name, horizon)
         assert "30" not in result[name]["free_run"]  # the recordings have 15 s
-
-
-def test_fit__repeats_itself_to_the_bit():
-    log = simple_system(0, 3)
-    torch.manual_seed(1)
-    one = fit(log, CONFIG, 5, BROKK_170)
-    torch.manual_seed(2)
-    assert same_weights(one, fit(log, CONFIG, 5, BROKK_170))
-    assert not same_weights(one, fit(log, CONFIG, 6, BROKK_170))
 
 
 def test_fit__states_how_the_nets_were_fitted():
@@ -87,47 +73,27 @@ def test_fit__states_how_the_nets_were_fitted():
     np.testing.assert_allclose(paper.input_mean[:, 30], u[8:].mean(axis=0), atol=0.1)
 
 
-def test_fit__does_not_learn_to_brake_before_a_stop():
-    """A joint that goes at 0.3 u until it hits a hard stop: the nets keep its speed up to there."""
-    rng, recordings = np.random.default_rng(0), []
-    for run in range(60):
-        u = np.repeat(rng.uniform(-1, 1, 8), 20)[:, None]
-        q = np.zeros((161, 1))
-        for k in range(160):
-            q[k + 1] = np.clip(q[k] + 0.3 * u[k] / 20, -0.2, 0.2)
-        recordings.append(Recording(f"r{run}", u, q[:160], velocity_of(q, 4)[:160]))
-    log = Log(("a",), tuple(recordings))
-    net = fit(log, FitConfig(steps=500, batch_size=256, valve=False), 0, BROKK_170)
-    history, q, angles = initial_history(np.float32([-0.2]), 13), np.array([-0.2]), []
-    for _ in range(60):
-        history, q = free_run_step(net, history, q, np.array([0.9]))
-        angles.append(q[0])
-    np.testing.assert_allclose(np.diff(angles)[:26] * 20, 0.27, atol=0.05)  # up to 0.013 rad before
-    np.testing.assert_allclose(angles[35:], 0.2, atol=1e-6)  # and there it stays
-
-
 def test_fit__uses_one_step_errors_where_recordings_are_too_short_for_more():
     log = Log(("a",), tuple(line(f"r{i}", 0.0, 0.1 * i, 15) for i in range(4)))
     config = FitConfig(steps=5, batch_size=8, rollout=8)
     one_step = fit(log, replace(config, rollout=1), 0, BROKK_170)
-    assert same_weights(one_step, fit(log, config, 0, BROKK_170))
+    same = fit(log, config, 0, BROKK_170)
+    assert all(map(np.array_equal, one_step.weights, same.weights))
 
 
 def test_fit__has_nets_that_read_the_newest_outputs_and_all_commands():
-    """No older angle or velocity changes what they predict, before the fit and after it."""
-    for steps in (0, 10):
-        config = FitConfig(steps, batch_size=16, newest_only=True, valve=False)
-        net = fit(simple_system(0, 3, 60), config, 0, BROKK_170)
-        history = np.random.default_rng(0).uniform(-1, 1, (200, 2, 3, 13)).astype(np.float32)
-        before = net.predict(history)
-        for row, sample in np.ndindex(3, 13):
-            other = history.copy()
-            other[..., row, sample] += 0.5
-            changed = (net.predict(other) != before).any()
-            assert changed == (row == 2 or sample == 12), (row, sample)
+    """No older angle or velocity changes what they predict after the fit."""
+    config = FitConfig(10, batch_size=16, newest_only=True, valve=False)
+    net = fit(simple_system(0, 3, 60), config, 0, BROKK_170)
+    history = np.random.default_rng(0).uniform(-1, 1, (200, 2, 3, 13)).astype(np.float32)
+    before = net.predict(history)
+    for row, sample in np.ndindex(3, 13):
+        other = history.copy()
+        other[..., row, sample] += 0.5
+        changed = (net.predict(other) != before).any()
+        assert changed == (row == 2 or sample == 12), (row, sample)
 
 
-@pytest.mark.filterwarnings("ignore")
 def test_fit__refuses_what_cannot_be_learned():
     short = Log(("a",), tuple(line(f"r{i}", 0.0, 0.1 * i, 13) for i in range(20)))
     with pytest.raises(ValueError, match=r"joint a: expected a recording of 14 samples.*got none"):
@@ -137,9 +103,6 @@ def test_fit__refuses_what_cannot_be_learned():
     still = Recording("x", *(np.hstack([column, np.zeros((40, 1))]) for column in columns))
     with pytest.raises(ValueError, match="joint stick"):
         fit(Log(("boom", "stick"), (still,)), FitConfig(steps=1), 0, BROKK_170)
-    with pytest.raises(ValueError, match="weights: expected finite numbers"):
-        big = still._replace(q=1e39 * moving.q, u=moving.u)  # infinite as float32
-        fit(Log(("boom", "stick"), (big,)), FitConfig(steps=4, rollout=1), 0, BROKK_170)
 
 
 def test_training_set__has_windows_that_end_before_the_seams():
@@ -162,7 +125,7 @@ def test_accumulated_loss__is_the_error_of_a_free_run(logged, valve):
     log = log._replace(joints=("q1", "q3"))
     config = FitConfig(steps=1, batch_size=4, rollout=3, valve=valve)
     net = fit(log, config, 0, BROKK_170, "brokk170")
-    net.weights[5][:] = 9.0  # fast upwards
+    net.weights[5][:] = 1.0  # upwards, by what the nets read
     zones = np.full((2, 2), 0.07, np.float32)
     data, joined = training_set(log, config, BROKK_170, zones), join_recordings(log).joined
     span = (data.output_high - data.output_low).numpy()

@@ -61,10 +61,10 @@ def resampled(columns, joint, interpolated="q"):
 # --- round trips ----------------------------------------------------------------------------------
 
 
-def some_log(velocity_logged, lengths=(30, 1, 7)):
+def some_log(velocity_logged):
     rng = np.random.default_rng(5)
     recordings = []
-    for i, length in enumerate(lengths):
+    for i, length in enumerate((30, 1, 7)):
         u, q_dot = rng.integers(-80, 81, (length, 3)) / 127, rng.uniform(-2, 2, (length, 3))
         q = rng.uniform(-2, 2, 3) + np.cumsum(rng.uniform(0.05, 0.06, (length, 3)), axis=0)
         recordings.append(Recording(f"run {i} wet", u, q, q_dot))
@@ -79,19 +79,12 @@ def test_write_log__reads_back(tmp_path, suffix, velocity_logged):
     again = read_log([tmp_path / f"log{suffix}"], velocity_samples=4)
     assert again.joints == log.joints and again.velocity_logged == velocity_logged
     assert [r.name for r in again.recordings] == [r.name for r in log.recordings]
-    assert suffix == ".npz" or b"\r" not in (tmp_path / "log.csv").read_bytes()  # on all systems
     tolerance = 1e-12 if suffix == ".npz" else 2e-6
     for got, written in zip(again.recordings, log.recordings, strict=True):
         np.testing.assert_allclose(got.u, written.u, atol=tolerance)
         np.testing.assert_allclose(got.q, written.q, atol=tolerance)
         q_dot = written.q_dot if velocity_logged else velocity_of(written.q, 4)
         np.testing.assert_allclose(got.q_dot, q_dot, atol=max(tolerance, 1e-12) * 30)
-
-
-def test_write_log__refuses_an_empty_log(tmp_path):
-    with pytest.raises(ValueError, match="at least one recording to write"):
-        write_log(tmp_path / "log.csv", some_log(False, ()))
-    assert not list(tmp_path.iterdir())
 
 
 # --- resampling -----------------------------------------------------------------------------------
@@ -158,9 +151,6 @@ def test_read_log__drops_returns(tmp_path):
     log = read_log([path], 4)
     assert [r.name for r in log.recordings] == ["q1_00", "q1_01"]
     np.testing.assert_allclose(log.recordings[1].q[:, 0], table("", time, 3)["q_a"], atol=1e-9)
-    path = write(tmp_path / "log.csv", table("x_return", time))
-    with pytest.raises(ValueError, match=r"log\.csv: expected at least one recording, got none"):
-        read_log([path], 4)
 
 
 def test_read_log__cuts_a_recording_at_gaps(tmp_path):
@@ -189,21 +179,6 @@ def test_read_log__does_not_assume_rest_after_a_gap(tmp_path, samples):
     assert len(whole.q) == 30  # nothing is unknown
 
 
-def test_read_log__separates_interleaved_recordings(tmp_path):
-    rng = np.random.default_rng(3)
-    stamps = (np.arange(40) + rng.uniform(-0.2, 0.2, (2, 40))) / 33
-    first, second = table("y", 100 + stamps[0], 1), table("x", 3 + stamps[1], 2)
-    order = np.argsort(np.tile(np.arange(40), 2), kind="stable")
-    mixed = {name: column[order] for name, column in both(first, second).items()}
-    log = read_log([write(tmp_path / "log.csv", mixed)], 4)
-    assert [r.name for r in log.recordings] == ["y", "x"]
-    for recording, columns in zip(log.recordings, (first, second), strict=True):
-        for i, joint in enumerate(log.joints):
-            u, q = resampled(columns, joint)
-            np.testing.assert_allclose(recording.u[:, i], u, atol=1e-12)
-            np.testing.assert_allclose(recording.q[:, i], q, atol=1e-9)
-
-
 def test_read_log__joins_files_of_the_same_joints_only(tmp_path):
     time = np.arange(30) / 20
     first, second = table("x", time, 1), table("z", time, 2)
@@ -217,11 +192,6 @@ def test_read_log__joins_files_of_the_same_joints_only(tmp_path):
     )
     with pytest.raises(ValueError, match=r"3\.csv: columns: expected q_dot in all files"):
         read_log([*paths, with_velocity], 4)
-    more = write(tmp_path / "4.csv", table("x", time, 0, ("a", "b", "c")))
-    with pytest.raises(
-        ValueError, match=r"4\.csv: joints: expected \['a', 'b'\], got \['a', 'b', 'c'\]"
-    ):
-        read_log([*paths, more], 4)
 
 
 # --- readings that are no measurements -----------------------------------------------------------
@@ -350,16 +320,11 @@ REFUSALS = {
     "decimal comma": (GOOD.replace("1.2", "1,2"), "row 4: expected 4 cells, got 5"),
     "semicolons": (GOOD.replace(",", ";"),
         "columns: expected u_<joint> (--map u_NAME=COLUMN:UNIT), got "),
-    "no joint": ("run,time,q_a\nx,0,0\n",
-        "columns: expected u_<joint> (--map u_NAME=COLUMN:UNIT), got "),
     "no time": ("run,u_a,q_a\nx,0,0\n",
         "columns: expected ['time'] (--map time=COLUMN:UNIT), got ['run', 'u_a', 'q_a']"),
     "no angle": ("run,time,u_a\nx,0,0\n",
         "columns: expected ['q_a'] (--map q_a=COLUMN:UNIT), got "),
-    "half the velocities": ("run,time,u_a,u_b,q_a,q_b,q_dot_a\nx,0,0,0,0,0,0\n",
-        "columns: expected ['q_dot_b'] (--map q_dot_b=COLUMN:UNIT), got "),
     "text": (GOOD.replace("1.2", "open"), "row 4, column q_a: expected a number, got 'open'"),
-    "no number": (GOOD.replace("1.2", ""), "row 4, column q_a: expected a number, got ''"),
     "per cent": (GOOD.replace("0.3", "30"), "row 4, column u_a: expected -1 to 1 "
         "(per cent: --map u_a=COLUMN:percent), got 30.0"),
     "repeated time": (GOOD.replace("0.10", "0.05"),
@@ -383,18 +348,6 @@ def test_read_log__names_file_and_place_of_what_is_wrong(tmp_path, case):
     with pytest.raises(ValueError) as caught:
         read_log([tmp_path / "bad.csv"], 4)
     assert str(caught.value).startswith(f"{tmp_path / 'bad.csv'}: {message}")
-
-
-def test_read_log__refuses_columns_of_different_lengths_and_kinds(tmp_path):
-    columns = table("x", np.arange(30) / 20)
-    path = write(tmp_path / "log.npz", columns | {"q_b": np.zeros(29)})
-    with pytest.raises(ValueError, match=r"npz: column q_b: expected \(30,\) numbers, got \(29,\)"):
-        read_log([path], 4)
-    with pytest.raises(ValueError, match=r"npz: row 2, column q_b: expected a number, got 'up'"):
-        read_log([write(path, columns | {"q_b": np.repeat("up", 30)})], 4)
-    path.write_bytes(b"PK")
-    with pytest.raises(ValueError, match=r"log\.npz: expected a readable \.npz file"):
-        read_log([path], 4)
 
 
 def test_read_log__accepts_numbers_as_names_spaces_and_a_byte_order_mark(tmp_path):

@@ -1,17 +1,18 @@
 """Files of nets: what is saved is loaded, and nothing else is."""
 
-import json
 from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 from helpers_machines import random_net, small_net
 
+from brokk_min._files import save_arrays
 from brokk_min.beyond.valve_nets import ValveNet
 from brokk_min.identification.net_file import (
     fingerprint,
     joint_nets,
     load_net,
+    net_arrays,
     save_net,
     select_nets,
 )
@@ -21,18 +22,6 @@ from brokk_min.machine import BROKK_170
 def valve_net():
     zones = np.array([[0.1, 0.2], [0.0, 0.05], [0.07, 0.07]])
     return ValveNet(**vars(random_net(rows=4)), dead_zones=zones)
-
-
-def saved(path, entries=(), **changes):
-    """A net file with some header entries and arrays changed (None: left out)."""
-    save_net(path, random_net())
-    with np.load(path) as file:
-        arrays = dict(file)
-    header = json.loads(str(arrays["header"])) | dict(entries)
-    arrays["header"] = np.array(json.dumps({k: v for k, v in header.items() if v is not None}))
-    arrays |= changes
-    np.savez(path, **{name: array for name, array in arrays.items() if array is not None})
-    return path
 
 
 @pytest.mark.parametrize("net", [random_net(), valve_net()])
@@ -51,25 +40,18 @@ def test_load_net__gives_the_net_that_was_saved(tmp_path, net):
 
 
 @pytest.mark.parametrize(
-    ("entries", "changes", "message"),
+    ("change", "message"),
     [
-        ({"kind": "policy 5"}, {}, "expected a actuator net 4, got 'policy 5'"),
-        (
-            {"kind": "actuator net 3"},
-            {},
-            "expected a actuator net 4, got a file of another version",
-        ),
-        ({"rate": None}, {}, "expected a complete actuator net, got 'rate'"),
-        ({"reads": "tea leaves"}, {}, "expected a complete actuator net, got 'tea leaves'"),
-        ({"reads": "valve"}, {}, "expected a complete actuator net, got .*dead_zones"),
-        ({}, {"weight_3": None}, "expected a complete actuator net, got .*weight_3"),
-        ({}, {"weight_0": np.zeros((3, 38, 32))}, "expected a complete actuator net, got "),
-        ({"joints": ["a", "b"]}, {}, "expected a complete actuator net, got "),
-        ({}, {"q_low": np.array([None] * 3)}, "expected a readable .npz file of a actuator net 4"),
+        ({"kind": "policy 5"}, "expected .*actuator net 4, got 'policy 5'"),
+        ({"kind": "actuator net 3"}, "expected .*actuator net 4, got a file of another version"),
+        ({"reads": "valve"}, "expected a complete actuator net, got .*dead_zones"),
+        ({"joints": ["a", "b"]}, "expected a complete actuator net, got "),
     ],
 )
-def test_load_net__names_file_and_fault(tmp_path, entries, changes, message):
-    path = saved(tmp_path / "net.npz", entries, **changes)
+def test_load_net__names_file_and_fault(tmp_path, change, message):
+    path = tmp_path / "net.npz"
+    header, arrays = net_arrays(random_net())
+    save_arrays(path, "actuator net 4", header | change, **arrays)
     with pytest.raises(ValueError, match=rf"^{path}: {message}"):
         load_net(path)
 
@@ -98,8 +80,6 @@ def test_joint_nets__predict_as_they_do_among_others(net, joints):
 def test_select_nets__refuses_nets_of_another_machine_rate_or_estimator(tmp_path):
     net = small_net(BROKK_170, np.random.default_rng(0), BROKK_170.names)
     assert select_nets(BROKK_170, net).joints == ("q1", "q3", "q4", "q5")
-    save_net(tmp_path / "net.npz", net)
-    assert load_net(tmp_path / "net.npz", BROKK_170).joints == ("q1", "q3", "q4", "q5")
     changes = {"machine": "other", "rate": 25.0, "history": 12, "velocity_samples": 3}
     for name, value in (changes | {"velocity_logged": True}).items():
         with pytest.raises(ValueError, match=f"actuator: expected nets for brokk170.*{value!r}"):

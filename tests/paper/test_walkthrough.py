@@ -54,14 +54,6 @@ def corners(figure: str) -> list[list[float]]:
     return result
 
 
-def test_blocks__are_short_and_the_page_takes_half_an_hour() -> None:
-    text = PAGE.read_text()
-    blocks = BLOCK.findall(text)
-    assert len(blocks) == text.count("```python") >= 9
-    assert all(len(re.findall(r"\S.*$", code, re.M)) <= 10 for code, _ in blocks)
-    assert len(BLOCK.sub("", text).split()) < 30 * 180 / 2  # words, at half the speed of prose
-
-
 def test_blocks__print_what_stands_below(ran: Ran) -> None:
     below = [output for _, output in BLOCK.findall(PAGE.read_text())]
     assert ran[0] == below, "run `make docs`"

@@ -4,12 +4,17 @@ import numpy as np
 import pygame
 import pytest
 from helpers_bus import BASELINE, START, Virtual
+from helpers_cli import run
 from pygame._sdl2 import controller
 
+from brokk_min.can.operator_input import JointJog
+from brokk_min.evaluation.rollout import TITLES
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer import drawing, play
 from brokk_min.viewer.play import Operator, Session
+
+JOG = JointJog(BROKK_170, "q1", 12)
 
 
 @pytest.fixture
@@ -83,45 +88,31 @@ def test_gamepad__drives_until_it_is_unplugged(operator, kind, up, trigger):
     assert operator.pad is None
 
 
-class Counting:
-    """A controller that closes all valves, counts its ticks and keeps the goals."""
-
-    def __init__(self):
-        self.goals = []
-
-    def start(self, num):
-        return 0
-
-    def __call__(self, measured, ticks):
-        self.goals.append(measured.v_goal[0])
-        return np.zeros((1, 5)), ticks + 1
-
-
-def session():
-    return Session(BROKK_170, {"PID": BASELINE, "counting": Counting()}, np.array(START))
-
-
 def test_session__follows_the_goal_and_goes_back_to_its_start():
-    run = session()
+    goal, controllers = np.array([0.0, 0.2, 0.0]), {"PID": BASELINE, "jog": JOG}
+    session, fresh = (Session(BROKK_170, controllers, np.array(START)) for _ in range(2))
     for _ in range(60):
-        run.tick(np.array([0.0, 0.2, 0.0]))
-    assert run.state.v_tool[0] == pytest.approx([0, 0.2, 0], abs=0.05)
-    np.testing.assert_allclose(run.trail[0], tool_position(forward_kinematics(BROKK_170, START)))
-    scene = run.scene()
-    np.testing.assert_array_equal(scene.q, run.state.q[0])
-    np.testing.assert_array_equal(scene.u, run.state.history[0, :, 2, -1])
+        session.tick(goal)
+    assert session.state.v_tool[0] == pytest.approx(goal, abs=0.05)
+    first = tool_position(forward_kinematics(BROKK_170, START))
+    np.testing.assert_allclose(session.trail[0], first)
+    scene = session.scene()
+    np.testing.assert_array_equal(scene.q, session.state.q[0])
+    np.testing.assert_array_equal(scene.u, session.state.history[0, :, 2, -1])
     assert (scene.title, scene.status, scene.colour) == ("PID", "3.0 s", drawing.BLUE)
-    run.controller()
-    run.tick(np.zeros(3))
-    assert (run.memory, run.scene().title, run.scene().colour) == (1, "counting", drawing.ORANGE)
-    run.restart()
-    assert (run.memory, len(run.trail)) == (0, 1)
-    np.testing.assert_array_equal(run.state.q[0], START)
+    session.controller()
+    assert (session.scene().title, session.scene().colour) == ("jog", drawing.ORANGE)
+    session.controller()
+    session.restart()
+    for one in (session, fresh):
+        one.tick(goal)
+    np.testing.assert_array_equal(session.scene().u, fresh.scene().u)
+    np.testing.assert_array_equal(session.trail, fresh.trail)
 
 
 def test_play__moves_the_machine_by_keys_until_the_window_is_closed(monkeypatch):
     """Through pygame's queue, in real time: arrow key, the other controller, and closing."""
-    scenes, counting, show = [], Counting(), play.show
+    scenes, show = [], play.show
 
     def each_picture(pg, machine, shown):
         show(pg, machine, shown)
@@ -131,10 +122,11 @@ def test_play__moves_the_machine_by_keys_until_the_window_is_closed(monkeypatch)
                 key(name)
 
     monkeypatch.setattr(play, "show", each_picture)
-    play.play(BROKK_170, {"PID": BASELINE, "counting": counting})
-    assert [scene.title for scene in scenes] == ["PID"] * 20 + ["counting"] * 2
+    assert run("play") == 0
+    titles = [TITLES["rl"]] * 20 + [TITLES["jacobian_pid_k0.1"]] * 2
+    assert [scene.title for scene in scenes] == titles
     assert scenes[19].v_tool[1] > 0.1
-    np.testing.assert_allclose(counting.goals, 2 * [[0, 0.3, 0]], atol=1e-6)
+    np.testing.assert_allclose([scene.v_goal for scene in scenes[-2:]], 2 * [[0, 0.3, 0]])
     assert not pygame.display.get_init()
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from helpers_bus import BASELINE, HoldingOperator, World
+from helpers_cli import run
 from PIL import Image, ImageSequence
 
 from brokk_min.kinematics import forward_kinematics, tool_position
@@ -23,16 +24,18 @@ def log(tmp_path_factory):
 
 def test_scenes__are_the_drive_from_its_first_driven_tick(log):
     path, world = log
-    run = replay.scenes(BROKK_170, path)
-    assert 40 <= len(run) <= 60
+    shown = replay.scenes(BROKK_170, path)
+    assert 40 <= len(shown) <= 60
     q = np.array(world.recorder.q)  # each 5 ms
-    for scene in run[::10]:
+    for scene in shown[::10]:
         assert np.abs(q - scene.q).max(axis=1).min() < 2e-3  # an encoder's count is 1.5 mrad
-    np.testing.assert_allclose([scene.v_goal for scene in run[2:]], len(run[2:]) * [[0.1, 0, 0]])
-    np.testing.assert_allclose(run[-1].v_tool, [0.1, 0, 0], atol=0.05)
-    fk = forward_kinematics(BROKK_170, np.array([scene.q for scene in run]))
-    np.testing.assert_allclose(run[-1].trail, tool_position(fk))
-    assert (run[0].title, run[10].status) == ("run.log", "0.5 s")
+    np.testing.assert_allclose(
+        [scene.v_goal for scene in shown[2:]], len(shown[2:]) * [[0.1, 0, 0]]
+    )
+    np.testing.assert_allclose(shown[-1].v_tool, [0.1, 0, 0], atol=0.05)
+    fk = forward_kinematics(BROKK_170, np.array([scene.q for scene in shown]))
+    np.testing.assert_allclose(shown[-1].trail, tool_position(fk))
+    assert (shown[0].title, shown[10].status) == ("run.log", "0.5 s")
 
 
 def test_scenes__refuses_a_log_in_which_nothing_drives(tmp_path):
@@ -43,9 +46,9 @@ def test_scenes__refuses_a_log_in_which_nothing_drives(tmp_path):
 
 
 @pytest.mark.parametrize(("fps", "duration"), [(10.0, 100), (7.0, 150), (100.0, 50)])
-def test_film__has_as_many_pictures_a_second_as_ticks_allow(fps, duration, log, tmp_path):
+def test_replay__makes_a_film_with_as_many_pictures_as_ticks_allow(fps, duration, log, tmp_path):
     out = tmp_path / "film.gif"
-    replay.film(log[0], BROKK_170, out, fps)
+    assert run(f"replay --fps {fps}", log[0], "--out", out) == 0
     film = Image.open(out)
     frames = [np.array(frame.convert("RGB")) for frame in ImageSequence.Iterator(film)]
     ticks = len(replay.scenes(BROKK_170, log[0]))
