@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "brokk_min"
-METHOD = ["settings", "machine", "kinematics", "actuator", "jacobian", "env", "ppo"]
+METHOD = ["machine", "kinematics", "actuator", "jacobian", "settings", "env", "ppo"]
 WINGS = ["_files", "beyond", "identification", "learning", "evaluation", "can", "viewer", "cli"]
 ORDER = [*METHOD, "hw", *WINGS, "__main__"]  # of the README: a module imports what stands before it
 BESIDE = {
