@@ -51,9 +51,9 @@ def fit(log: Log, config: FitConfig, seed: int, machine: Machine, name: str = ""
         "weights": tuple(weight.detach().numpy() for weight in weights),
         **{key: getattr(data, key).numpy() for key in ARRAYS},
     }
-    if config.valve:
-        return ValveNet(**fields, dead_zones=data.zones.numpy())
-    return ActuatorNet(**fields)
+    if data.zones is None:
+        return ActuatorNet(**fields)
+    return ValveNet(**fields, dead_zones=data.zones.numpy())
 
 
 ARRAYS = ("input_mean", "input_scale", "output_low", "output_high", "q_low", "q_high")
@@ -67,7 +67,7 @@ class TrainingSet:
     target: Tensor  # velocity that the nets should say at each sample [rad/s], (n, N)
     windows: list[NDArray[np.intp]]  # newest samples of each joint's windows
     long_windows: list[NDArray[np.intp]]  # those with `rollout` samples after them
-    zones: Tensor  # dead zones of nets that read what a command opens, (n, 2)
+    zones: Tensor | None  # dead zones (n, 2); None: the nets read the commands as they are
     history: int  # samples of a window
     estimator: Tensor | None  # weights of the velocity estimator; None: logged velocities
     input_mean: Tensor  # (n, I)
@@ -79,11 +79,11 @@ class TrainingSet:
     q_high: Tensor  # rad, (n,)
     rate: float  # of the samples [Hz]
 
-    def inputs(self, history: Tensor, valve: bool) -> Tensor:
+    def inputs(self, history: Tensor) -> Tensor:
         """What the nets read of histories (batch, n, 3, H): (batch, n, I)."""
-        if valve:
-            return valve_inputs(history, self.zones, torch)  # type: ignore[no-any-return]
-        return history.flatten(-2)
+        if self.zones is None:
+            return history.flatten(-2)
+        return valve_inputs(history, self.zones, torch)  # type: ignore[no-any-return]
 
 
 def training_set(log: Log, config: FitConfig, machine: Machine, zones: Array) -> TrainingSet:
@@ -116,7 +116,7 @@ def training_set(log: Log, config: FitConfig, machine: Machine, zones: Array) ->
         target=torch.tensor(joined.target.T).float(),
         windows=windows,
         long_windows=joined.windows(H, config.rollout),
-        zones=torch.tensor(zones),
+        zones=torch.tensor(zones) if config.valve else None,
         history=H,
         estimator=None if log.velocity_logged else torch.tensor(t / (t @ t)).float(),
         rate=log.rate,
@@ -138,10 +138,10 @@ def train(data: TrainingSet, config: FitConfig, seed: int) -> list[Tensor]:
         optimizer.param_groups[0]["lr"] = config.learning_rate * decay(step, one_step, config.steps)
         if step < one_step:
             at = draw_windows(data.windows, config.batch_size, generator)
-            loss = accumulated_loss(data, weights, at, 1, config.valve)
+            loss = accumulated_loss(data, weights, at, 1)
         else:
             at = draw_windows(data.long_windows, math.ceil(config.batch_size / 4), generator)
-            loss = accumulated_loss(data, weights, at, config.rollout, config.valve)
+            loss = accumulated_loss(data, weights, at, config.rollout)
         optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
@@ -182,22 +182,18 @@ def draw_windows(windows: list[NDArray[np.intp]], batch: int, generator: Generat
     return torch.tensor(np.stack(drawn, axis=1))
 
 
-def accumulated_loss(
-    data: TrainingSet, weights: list[Tensor], at: Tensor, ticks: int, valve: bool
-) -> Tensor:
+def accumulated_loss(data: TrainingSet, weights: list[Tensor], at: Tensor, ticks: int) -> Tensor:
     """Mean square of the accumulated error over `ticks` of the nets on their own outputs.
 
     L = 1/K sum_k |sum_{i<=k} (velocity_i - target_i) / range|^2, for windows that end `at`
     (batch, n); summed over joints. With one tick it is the paper's error of one step.
     """
     joint = torch.arange(at.shape[1])
-    time = at[..., None] + torch.arange(
-        1 - data.history, 1
-    )  # samples of the windows, (batch, n, H)
+    time = at[..., None] + torch.arange(1 - data.history, 1)  # of the windows, (batch, n, H)
     history = data.samples[joint[:, None], :, time].movedim(-1, -2)  # (batch, n, 3, H)
     error, loss = torch.zeros(at.shape), torch.zeros(())
     for k in range(ticks):
-        velocity = predict(data, weights, history, valve)
+        velocity = predict(data, weights, history)
         target = data.target[joint, at + k]
         error = error + (velocity - target) / (data.output_high - data.output_low)
         loss = loss + error.square().mean(dim=0).sum() / ticks
@@ -207,10 +203,10 @@ def accumulated_loss(
     return loss
 
 
-def predict(data: TrainingSet, weights: list[Tensor], history: Tensor, valve: bool) -> Tensor:
+def predict(data: TrainingSet, weights: list[Tensor], history: Tensor) -> Tensor:
     """Velocities [rad/s] (batch, n) for histories (batch, n, 3, H); none passes a stop."""
     w1, b1, w2, b2, w3, b3 = weights
-    x = data.reads * (data.inputs(history, valve) - data.input_mean) / data.input_scale
+    x = data.reads * (data.inputs(history) - data.input_mean) / data.input_scale
     x = torch.relu(torch.baddbmm(b1[:, None], x.transpose(0, 1), w1))
     x = torch.relu(torch.baddbmm(b2[:, None], x, w2))
     y = torch.sigmoid(torch.baddbmm(b3[:, None], x, w3))[..., 0].T

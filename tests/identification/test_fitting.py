@@ -144,10 +144,10 @@ def test_accumulated_loss__is_the_error_of_a_free_run(logged, valve):
             errors[j, w, k] = ((q - before)[j] * 20 - float(data.target[j, end + k])) / span[j]
     assert at_stop >= 2
     weights, places = [torch.tensor(weight) for weight in net.weights], torch.tensor(at.T)
-    loss = fitting.accumulated_loss(data, weights, places, 3, valve)
+    loss = fitting.accumulated_loss(data, weights, places, 3)
     expected = (errors.cumsum(axis=2) ** 2).mean(axis=(1, 2)).sum()
     assert float(loss) == pytest.approx(expected, rel=1e-3)
-    loss = fitting.accumulated_loss(data, weights, places, 1, valve)
+    loss = fitting.accumulated_loss(data, weights, places, 1)
     assert float(loss) == pytest.approx((errors[..., 0] ** 2).mean(axis=1).sum(), rel=1e-3)
 
 
