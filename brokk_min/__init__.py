@@ -1,8 +1,8 @@
-"""Task-space control of a hydraulic machine, learned from its logs: the paper in NumPy.
+"""Task-space control of a hydraulic machine, learned from its logs: the paper in NumPy and PyTorch.
 
 The chain goes from a machine to logs, to actuator nets, to a policy, and to a comparison on the
 machine. "Simulation" is the learned nets, "machine" the analytic plant or a real machine on the
-bus. The learner sees neither of these, only logs. Nothing in this package is a safety function.
+bus. Nets learn from logs alone, and policies on the nets. Nothing here is a safety function.
 
 Read the files of this folder in the order machine, kinematics, actuator, jacobian, settings, env,
 ppo, hw. They hold the paper's method. `beyond` holds our improvements, one file each.

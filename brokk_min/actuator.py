@@ -1,6 +1,6 @@
 """The actuators: an analytic plant that plays the hydraulics, and the nets that learn it from logs.
 
-Both are plants: they have `reset` and `step`, and either can move the machine. The learner never
+Both are plants: they have `reset` and `step`, and either can move the machine. No net and no policy
 sees the equations of the analytic one. The nets read a history, which holds angle, velocity and
 command of the last 13 samples. `identification.fitting` makes nets from logs.
 """
@@ -51,7 +51,7 @@ class AnalyticPlant:
     def step(self, machine: Machine, state: PlantState, u: ArrayLike) -> PlantState:
         """One tick under the held command `u` [-1, 1] (..., n), by explicit Euler.
 
-        Paper: eq1 and Sec. 3.2 (dead zone, delay, direction, coupling by the pump, past movement)
+        Paper: eq1, Sec. 3.2 (delay, direction, coupling by a pump, past movement), 3.3 (dead zone)
         """
         steps = round(machine.dt / machine.plant_dt)
         held = np.repeat(np.asarray(u, float)[..., None], steps, axis=-1)
@@ -165,15 +165,16 @@ class NetState(NamedTuple):
 class ActuatorNet:
     """One small net per joint: history in, mean velocity over the coming tick out.
 
-    Weights, joint by joint: (n, I, 32), (n, 32), (n, 32, 32), (n, 32), (n, 32, 1) and (n, 1).
-    Paper: Table 1 and Sec. 3.3 (I = 39, two hidden layers of 32, ReLU, sigmoid output)
+    Weights of the n `joints`: (n, I, 32), (n, 32), (n, 32, 32), (n, 32), (n, 32, 1) and (n, 1).
+    Paper: Table 1 and Sec. 3.3 (I = 39, two hidden layers of 32, ReLU, sigmoid output).
+    That the output is a mean is our reading.
     """
 
     joints: tuple[str, ...]
     history: int  # H, samples of q, q_dot and u
     rate: float  # Hz
     velocity_samples: int  # window of the velocity estimator that made the inputs
-    velocity_logged: bool  # trained on q_dot columns of a log instead
+    velocity_logged: bool  # trained on the q_dot columns of a log, not on estimates
     machine: str  # name of the machine, or of the log
     input_mean: Array  # (n, I)
     input_scale: Array  # (n, I)
@@ -187,7 +188,7 @@ class ActuatorNet:
     def inputs(self, history: Array) -> Array:
         """13 angles, 13 velocities and 13 commands of each joint, (..., n, 39). Paper: Table 1
 
-        This is the plug of the class: a subclass may read other numbers of the same history.
+        A subclass may read the same history in another way.
         """
         return history.reshape(*history.shape[:-2], -1)
 
@@ -215,13 +216,13 @@ class ActuatorNet:
     def step(self, machine: Machine, state: NetState, u: Array) -> NetState:
         """One tick, q_{t+1} = q_t + dt net(history, u), within the joints' ranges.
 
-        Nets move the driven joints; the others stand.
+        The nets are those of the driven joints; the others stand.
         """
         driven = machine.driven
         low, high = machine.column("q_min")[driven], machine.column("q_max")[driven]
         velocity = self.predict(append_command(state.history, u[..., driven]))
         q = state.q.copy()
         q[..., driven] = np.clip(q[..., driven] + machine.dt * velocity, low, high)
-        newest = u[..., driven], q[..., driven]
-        history = append_sample(state.history, *newest, self.velocity_samples, machine.dt)
-        return NetState(q, history)
+        sent, reached = u[..., driven], q[..., driven]
+        window = self.velocity_samples
+        return NetState(q, append_sample(state.history, sent, reached, window, machine.dt))

@@ -47,8 +47,8 @@ def velocity_deviations(machine: Machine) -> tuple[Array, Array]:
     """Deviations in the task of tool [m/s] (3,) and joint velocities [rad/s] (n,), measured.
 
     Poses and speeds of goals are drawn as in training, in all directions. The joint velocities are
-    the smallest that give the goal, pinv(J) v, cut at each joint's fastest motion; at least 5 % of
-    that, if a joint gives none.
+    the smallest that give the goal, pinv(J) v, cut at each joint's nominal speed, and at least 5 %
+    of that speed.
     """
     rng = np.random.default_rng(0)
     q = rng.uniform(machine.column("q_min"), machine.column("q_max"), (DRAWS, machine.n))
@@ -64,7 +64,7 @@ def velocity_deviations(machine: Machine) -> tuple[Array, Array]:
 
 @lru_cache
 def observation_table(machine: Machine) -> Array:
-    """Mean, deviation, and do sensors measure it (0 or 1), of each number observed: (obs, 3).
+    """Mean, deviation, and whether sensors measure it (0 or 1), of each number observed: (obs, 3).
 
     Angles are uniform over their range. Paper: Sec. 3.4 (normalisation)
     """
@@ -99,9 +99,10 @@ def measure(
 ) -> Measured:
     """Measurements for training, evaluation and the machine. Paper: Sec. 3.4, Fig. 3
 
-    From the measured history (..., n, 3, H) and the goal velocity [m/s] (..., 3). `noise` of what
-    sensors measure is in deviations (..., noisy). It is new at each tick for all samples of the
-    history, old ones too. The tool's velocity has noise of its own beside that of the angles in J.
+    From the measured history (..., n, 3, H) and the goal velocity [m/s] (..., 3). `noise` (...,
+    noisy) is in deviations and is added to what sensors measure. It is new at each tick for all
+    samples of the history, old ones too. The tool's velocity has noise of its own beside that of
+    the angles in J.
     """
     q = history[..., 0, -1].copy()
     driven = history.take(machine.driven, axis=-3)
@@ -148,8 +149,9 @@ class Interface:
     """What an agent reads, does and is paid for; the defaults are the paper's.
 
     `memory` is what the agent keeps from tick to tick. At the start of an episode it is None; the
-    paper's agent keeps nothing. In each tick come `remember`, `observe`, `command`, the transition,
-    and `cost`, which gets the memory after it; `learning.gym_env` takes the cost off eq2.
+    paper's agent keeps nothing. Each tick calls `remember`, `observe` and `command`; after the
+    transition `cost` gets the memory of the next tick. `learning.gym_env` takes the cost off eq2.
+    The fields are functions, not methods.
     """
 
     scale: Callable[[Machine], tuple[Array, Array]] = observation_scale  # mean, deviation

@@ -74,19 +74,19 @@ class Drive:
         self.wait()
         with self.catch_errors():
             entered = self.operator(bool(self.gate.driving), bool(self.gate.active_fault == 0))
-            self.operator_input = canopen.unpack_operator_input(entered.pack())  # as in the log
+            self.operator_input = canopen.unpack_operator_input(entered.pack())  # as it is logged
         self.nodes.frames *= 2  # 1 is sound: a position that came before SYNC becomes 2, a fault
         with self.catch_errors():
             self.bus.send(canopen.SYNC, b"")
             answer_by = self.bus.now() + ANSWER_TIME * self.machine.dt
             self.nodes.listen(self.bus, answer_by, BUSY_WAIT, until_complete=True)
-        counts = self.nodes.counts()
+        counts = self.nodes.counts()  # by the encoders' zeros and signs
         command = np.zeros(self.machine.n)
         with self.catch_errors():
             command = self.control(counts)
         stop = self.operator_input.stop or bool(self.signals)
         self.operator_input = self.operator_input._replace(stop=stop)
-        now = self.bus.log_input(self.operator_input.pack())
+        now = self.bus.log_input(self.operator_input.pack())  # its time
         self.send_command(command, counts, now)
         self.nodes.start_tick()
         with self.catch_errors():
@@ -106,7 +106,7 @@ class Drive:
         if self.history is None:
             self.history = initial_history(q, m.history)
         else:
-            u = self.gate.sent[..., -1] / PWM_MAX
+            u = self.gate.sent[..., -1] / PWM_MAX  # what the gate let pass
             self.history = append_sample(self.history, u, q, m.velocity_samples, m.dt)
         if not self.gate.driving:
             self.controller_state = self.controller.start(1)

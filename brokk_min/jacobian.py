@@ -24,7 +24,7 @@ def dls(J: ArrayLike, W: ArrayLike, damping: ArrayLike, as_printed: bool = False
     Args:
         J: Jacobian [m/rad], (..., 3, n).
         W: diagonal of the weight matrix, (..., n), positive.
-        damping: lambda^2 [m^2], (...); above 0 where J W^-1 J^T is singular.
+        damping: lambda^2 [m^2], (...); must be positive where J W^-1 J^T is singular.
         as_printed: use the paper's printed form.
     """
     J, W = np.asarray(J, float), np.asarray(W, float)
@@ -105,12 +105,13 @@ class PIDState(NamedTuple):
 class JacobianController:
     """Resolved rates by damped least squares (eq3), then one PID per driven joint.
 
-    The PID gives the valve opening; the dead zone is added afterwards. Paper: eq3, Sec. 4.2
+    The PID gives the valve opening. Ours are the cut at the joints' speeds, the filter, the
+    anti-windup, and the dead zone that is added to the opening. Paper: eq3, Sec. 4.2
     """
 
     machine: Machine
     gains: Gains
-    k: float  # of Nakamura's damping [m^2]
+    k: float  # of Nakamura's damping [m^2]; paper: 0.1 and 0.05
     w0: float  # manipulability below which damping sets in [m^3]
 
     def start(self, num: int) -> PIDState:
@@ -121,8 +122,8 @@ class JacobianController:
     def joint_velocities(self, v: Array, q: Array, last: Array) -> Array:
         """q_dot = J^+ v of the driven joints [rad/s], (..., n_driven). Paper: eq3
 
-        `v` is a tool velocity [m/s] (..., 3), `q` the angles of all joints [rad] (..., n); the
-        signs of the joint velocities of the tick before, `last`, select the joint-limit weights.
+        `v` is a tool velocity [m/s] (..., 3), `q` the angles of all joints [rad] (..., n). The
+        signs of `last`, the result of the tick before, choose the joint-limit weights.
         """
         m, driven = self.machine, self.machine.driven
         direction = np.zeros(q.shape)
@@ -142,7 +143,7 @@ class JacobianController:
         v = measured.v_goal + gains.feedback * e  # x_goal + K e
         q_dot_goal = self.joint_velocities(v, measured.q.astype(float), state.q_dot_goal)
         error = q_dot_goal - measured.q_dot
-        derivative = 0.7 * state.derivative + 0.3 * (error - state.error) / m.dt  # low-pass
+        derivative = 0.7 * state.derivative + 0.3 * (error - state.error) / m.dt  # filtered
         opening = gains.kp * error + state.integral + gains.kd * derivative  # PID
         u = self.command(opening)
         full = np.abs(np.rint(u[..., m.driven] * PWM_MAX)) >= m.pwm_limit

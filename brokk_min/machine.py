@@ -39,8 +39,8 @@ class Joint:
     theta: float  # rad
     q_min: float  # rad
     q_max: float  # rad
-    q_dot_up: float  # rad/s, nominal speed upwards at the command limit
-    q_dot_down: float  # rad/s, nominal speed downwards, a positive number
+    q_dot_up: float  # rad/s, nominal speed towards q_max at the command limit
+    q_dot_down: float  # rad/s, nominal speed towards q_min, a positive number
     encoder_node: int  # CANopen node id
     cylinder_base: float = 0.0  # m
     cylinder_rod: float = 1.0  # m
@@ -84,7 +84,7 @@ class Machine:
     valve_frame_id: int  # CAN identifier of the valve frame
     controller_node: int  # CANopen node id of the valve controller
     q_start: tuple[float, ...] = ()  # rad, where experiments start; empty: mid-range
-    # The fields below are of the analytic plant alone; defaults are tuned to the paper's Fig. 2.
+    # The fields below are of the analytic plant alone; its times are tuned to the paper's Fig. 2.
     pump_flow: float = 1.0  # m^3/s
     delay: float = 0.040  # s, from command to valve
     plant_dt: float = 0.005  # s, step of explicit Euler
@@ -149,7 +149,7 @@ class Machine:
 
     @cached_property
     def cylinder_speeds(self) -> NDArray[np.float64]:
-        """Speeds at full command [m/s], (n, 2); by default q_dot_up and _down at most."""
+        """Speeds at full command [m/s], (n, 2); by default q_dot_up and _down at least."""
         given = self.column("cylinder_speed")
         fastest = np.stack([self.column("q_dot_up"), self.column("q_dot_down")], axis=-1)
         opening = (self.pwm_limit / PWM_MAX - self.dead_zones) / (1 - self.dead_zones)
@@ -221,7 +221,9 @@ def limit_command(machine: Machine, u: ArrayLike) -> NDArray[np.floating]:
 
 
 def encode_pwm(u: ArrayLike) -> NDArray[np.uint8]:
-    """Byte on the bus for a command `u` in [-1, 1] (...): m >= 0 -> m, m < 0 -> 255 - |m|.
+    """Byte on the bus for a command `u` in [-1, 1] (...).
+
+    With m = 127 u in whole counts: m >= 0 -> m, m < 0 -> 255 - |m|.
 
     Paper: Sec. 3.2 (the pairs 80/175 and 50/205 sum to 255). ValueError: `u` outside [-1, 1].
 
@@ -247,7 +249,7 @@ def read_encoder(machine: Machine, q: ArrayLike) -> NDArray[np.floating]:
     return np.asarray(np.rint(q / machine.encoder_step) * machine.encoder_step, q.dtype)
 
 
-# Joints of the Brokk 170. Sources: all assumed, but the fastest motions of q5 (paper, Sec. 3.2).
+# Joints of the Brokk 170. Sources: all assumed, but the nominal speeds of q5 (paper, Sec. 3.2).
 # fmt: off
 _DH = [
     # name driven  a [m]  alpha [rad]  d [m]  theta [rad]    q_min, q_max [rad]

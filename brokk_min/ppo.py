@@ -1,7 +1,7 @@
 """Proximal Policy Optimization (Schulman et al., 2017) in one file, to be read from top to bottom.
 
-It trains on a Gymnasium vector environment of boxes that resets in the same step. A truncated
-episode did not fail: its return goes on with the value of its own last observation. At a
+It trains on a Gymnasium vector environment with Box spaces that resets in the same step. A
+truncated episode did not fail: its return goes on with the value of its own last observation. At a
 termination it stops. Advantages come from a critic, as in the paper; `train` also accepts another
 advantage function.
 Names follow CleanRL's where they can; target_kl steers the learning rate. Paper: Sec. 3.4
@@ -40,7 +40,8 @@ class Agent(nn.Module):
     """Actor, logarithm of the actions' standard deviation, and critic.
 
     The critic's output is scaled by running averages of the batch means and batch variances of the
-    returns: value = mean + sqrt(var) critic(obs) (compare PopArt, van Hasselt et al., 2016).
+    returns: value = mean + sqrt(var) critic(obs) (as PopArt, van Hasselt et al., 2016, but without
+    its correction of the output layer).
     """
 
     return_mean: Tensor
@@ -207,7 +208,7 @@ def train(
 
     `advantage_function` gives advantages (T, N) of a rollout, and the returns that the critic
     learns, or None. `on_update` is called after each update, with the rollout and scalars under
-    CleanRL's names. `start` is a training to go on with. ValueError: a loss that is not finite.
+    CleanRL's names. `start` is a checkpoint to go on from. ValueError: a loss that is not finite.
     """
     agent, optimizer, obs, global_step, update = start or begin(env, config, seed)
     group = optimizer.param_groups[0]
@@ -248,8 +249,8 @@ def train(
         metrics = {f"losses/{name}": mean for name, mean in zip(names, means, strict=True)}
         metrics["charts/reward"] = float(rollout.rewards.mean())
         metrics["charts/learning_rate"] = group["lr"]
-        # lower the rate after a large change of the policy, raise it after a small one, as
-        # rl_games does with other thresholds
+        # lower the rate after a large change of the policy, raise it after a small one, in the
+        # manner of rl_games
         if metrics["losses/approx_kl"] > 1.5 * config.target_kl:
             group["peak_lr"] /= 1.2
         elif metrics["losses/approx_kl"] < 0.7 * config.target_kl:

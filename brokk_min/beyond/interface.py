@@ -5,8 +5,8 @@ valves, the joint velocities that would give the goal, and those that would undo
 so far. Its actions begin beyond the dead zone, its valves close while the tool rests, and it pays
 for valve travel and for error that lasts.
 
-What it buys, in order, with groups on our nets after one million steps (means of three seeds along
-x, y and z, `benchmarks.ladder`):
+What it buys, in order, trained with `group_advantages` on our nets for one million steps (means of
+three seeds along x, y and z, `benchmarks.ladder`):
 
 | Parts | Velocity error | Drift | Valve travel |
 |---|---|---|---|
@@ -27,14 +27,14 @@ It plugs into `env.Interface`. Observation, with the mean and deviation of each 
 | 111-162 | 13 commands of each driven joint                     | as in `env` | 0.277  |
 | 163-214 | `valve_nets.open_indicator` of these commands        | 0.5         | 0.277  |
 | 215-218 | joint velocities that give the goal (`jacobian.dls`) | as in `env` | 1.5    |
-| 219-222 | joint motions that undo the error integral [rad]     | 0.1 of them | 1.5    |
+| 219-222 | joint motions that undo the error integral [rad]     | 0.1 s of it | 1.5    |
 """
 
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from brokk_min import env
 from brokk_min.beyond.valve_nets import open_indicator, opening
@@ -131,10 +131,10 @@ def observe(machine: Machine, measured: Measured, memory: Memory) -> Array:
     return (np.concatenate(numbers, axis=-1, dtype=np.float32) - mean) / scale
 
 
-def command(machine: Machine, action: ArrayLike, memory: Memory) -> Array:
+def command(machine: Machine, action: Array, memory: Memory) -> Array:
     """u = zone clip(a / 0.01, -1, 1) + (limit - zone) a; 0 once the goal was 0 for 0.5 s.
 
-    An action near 0 therefore opens a valve slightly, and valves close at rest. Paper: Sec. 3.3
+    An action of 0.01 therefore begins to open a valve, and valves close at rest. Paper: Sec. 3.3
     """
     a = np.asarray(action)
     zone = side(a, machine.dead_zones[machine.driven])
@@ -145,7 +145,7 @@ def command(machine: Machine, action: ArrayLike, memory: Memory) -> Array:
 
 
 def cost(machine: Machine, u: Array, u_before: Array, memory: Memory) -> Array:
-    """A tenth of the mean change of commands, of the limit, plus the integral's length, (...)."""
+    """A tenth of the mean change of commands, of the limit, plus the length [m] of the integral."""
     change = np.abs(u - u_before)[..., machine.driven].mean(axis=-1) * PWM_MAX / machine.pwm_limit
     return np.asarray(TRAVEL_COST * change + np.linalg.norm(memory.error_integral, axis=-1))
 

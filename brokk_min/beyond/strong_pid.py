@@ -3,7 +3,7 @@
 What it changes: `jacobian.JacobianController` is the paper's. This one adds to each valve the
 command that the nets say would hold the wanted velocity (feed-forward), feeds back the integral of
 the tool's velocity error, opens a valve wider that has just been closed, and closes all valves
-while the tool rests. So it has every input and trick that our agent has.
+while the tool rests. So it has the main inputs and tricks of our agent.
 
 What it buys: with gains by the same optimiser its mean velocity error along x, y and z is 0.0117
 m/s, where the paper's structure has 0.0196 m/s (`table.json` of `brokk-min reproduce`).
@@ -52,7 +52,7 @@ class StaticMap:
     velocity: Array  # [rad/s], rising with the command, (n_driven, angles, commands)
 
     def command(self, q: Array, q_dot: Array) -> Array:
-        """Commands that keep driven joints at `q` [rad] moving at `q_dot` [rad/s], (..., n)."""
+        """Commands that keep joints at `q` [rad] moving at `q_dot` [rad/s], all (..., n_driven)."""
         # velocity over command at the angle q, interpolated between the angles i and i + 1
         joint = np.arange(len(self.q))
         position = (q - self.q[:, 0]) / (self.q[:, 1] - self.q[:, 0])
@@ -84,7 +84,7 @@ def static_map(machine: Machine, net: ActuatorNet) -> StaticMap:
     time = np.arange(1 - net.history, 1) / net.rate
     history = np.zeros((*v.shape, 3, net.history), np.float32)
     history[..., 2, :] = u[..., None]
-    for _ in range(60):
+    for _ in range(60):  # damped, until it stands (assumed)
         history[..., 0, :] = q[..., None] + v[..., None] * time
         history[..., 1, :] = v[..., None]
         v = 0.5 * v + 0.5 * net.predict(history)
@@ -128,13 +128,13 @@ class StrongPID(JacobianController):
         return np.where(closed, 0.0, u), StrongState(pid, memory)
 
     def widen(self, opening: Array, measured: Measured) -> Array:
-        """Openings (..., n_driven) of valves that start, and none below `min_opening` in motion.
+        """Openings (..., n_driven), wider where a valve starts, at least `min_opening` in motion.
 
         A closed valve answers late (Sec. 3.2), so it opens wider in its first ticks.
         """
         m, gains = self.machine, self.gains
         idle = valve_opening(measured.history[..., 2, :], m.dead_zones[m.driven, None]) == 0
-        ticks = np.argmax(idle[..., ::-1], axis=-1)  # since it was closed; 0: now, or long ago
+        ticks = np.argmax(idle[..., ::-1], axis=-1)  # since it was closed; 0: now, or never in H
         starts = (ticks > 0) & (ticks * m.dt < gains.start_time)
         opening = opening * np.where(starts, 1 + gains.start_boost, 1.0)
         moving = np.linalg.norm(measured.v_goal, axis=-1, keepdims=True) > 1e-6

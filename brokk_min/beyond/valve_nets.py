@@ -3,7 +3,7 @@
 What it changes: the paper's nets read the commands as they are (Table 1), although within the dead
 zone all commands do the same and a few counts beyond it decide whether a valve stays open. These
 nets read the opening beyond the dead zone, companded by the mu law, and an indicator of whether the
-valve opens at all. A joint whose valve has been closed for the whole history does not creep.
+valve opens at all. A joint that was idle and still for the whole history does not creep.
 
 What it buys, as measured with a learner that commit a861755 has: policies trained on these nets had
 an error of 0.0110 m/s on the machine, and of 0.0118 m/s without the indicator. The mu law gave them

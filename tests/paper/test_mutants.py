@@ -91,7 +91,8 @@ def planted(name: str, right: str, wrong: str) -> Iterator[None]:
 def copies(path: Path) -> dict[str, Any]:
     """What a test file defines, run once more; its properties stop at the first failure."""
     loaded = settings.get_current_profile_name()
-    settings.register_profile("planted", settings.default, phases=[Phase.explicit, Phase.generate])
+    phases = [Phase.explicit, Phase.generate]
+    settings.register_profile("planted", settings.default, phases=phases, max_examples=200)
     settings.load_profile("planted")
     try:
         return runpy.run_path(str(path))
