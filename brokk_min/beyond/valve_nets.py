@@ -12,7 +12,7 @@ an error of 0.0110 m/s on the machine, and of 0.0118 m/s without the indicator. 
 Who was first: the mu law is ITU-T G.711 (1972); inverting a dead zone before identification is
 common practice (Tao and Kokotovic, Adaptive Control of Systems with Actuator Nonlinearities, 1996).
 
-It plugs into `actuator.ActuatorNet.inputs`.
+It plugs into `actuator.ActuatorNet.inputs`; `identification.fitting` trains it.
 """
 
 import math

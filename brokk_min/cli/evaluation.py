@@ -7,7 +7,7 @@ from pathlib import Path
 
 from brokk_min._files import write_json
 from brokk_min.actuator import ActuatorNet, Plant
-from brokk_min.cli.options import Command, PlantName, check, default_policy, find_plant
+from brokk_min.cli.options import Command, check, default_policy, find_plant
 from brokk_min.evaluation import baselines, metrics, sequences
 from brokk_min.evaluation.rollout import TITLES, Controller, valves_at_rest
 from brokk_min.jacobian import JacobianController
@@ -22,7 +22,7 @@ class Evaluate(Command):
     policy: Path | None = None  # Policy that `train` wrote; by default those of the package.
     commands: Path | None = None  # Velocity sequences, CSV: sequence,time,vx,vy,vz [s, m/s].
     starts: Path | None = None  # Start poses, CSV: one column per joint [rad].
-    plant: PlantName = "analytic"  # What moves: analytic, net, or an object of your file.
+    plant: str = "analytic"  # What moves: analytic, net (of the policy), or FILE.py:NAME.
     json: Path | None = None  # Also write all runs here.
     save_gains: Path | None = None  # Tune the PIDs though gains.json is beside POLICY; write it.
     num_starts: int = 16  # Without --starts: how many of the machine's.

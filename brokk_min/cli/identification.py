@@ -14,7 +14,7 @@ from tyro.conf import OmitArgPrefixes, Positional
 
 from brokk_min._files import brief, located, write_json
 from brokk_min.can.drive_log import log_for_fit, read_frames
-from brokk_min.cli.options import Command, PlantName, check, check_settings, find_plant
+from brokk_min.cli.options import Command, check, check_settings, find_plant
 from brokk_min.identification import columns, excitation, logs
 from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
 from brokk_min.identification.net_file import load_net, save_net
@@ -30,7 +30,7 @@ class Collect(Command):
     out: Path  # Log to write, .csv or .npz.
     hours: float = 1.0  # Driving time of each actuator [h].
     excitation: Literal["sine", "rich"] = "rich"  # The paper's sines; or steps and holds, too.
-    plant: PlantName = "analytic"  # What moves: the analytic plant, or an object of your file.
+    plant: str = "analytic"  # What moves: the analytic plant, or FILE.py:NAME.
     seed: int = 0  # Of the commands.
 
     def __call__(self) -> None:

@@ -16,7 +16,6 @@ from brokk_min.machine import BROKK_170, PWM_MAX, Machine, require
 
 MACHINES = {BROKK_170.name: BROKK_170}
 MachineName = Annotated[str, tyro.conf.arg(metavar="{" + ",".join(MACHINES) + "}|FILE.py:NAME")]
-PlantName = Annotated[str, tyro.conf.arg(metavar="{analytic,net}|FILE.py:NAME")]
 TRIED = 2.0  # s of full command in which each joint of a plant must move
 
 
@@ -36,10 +35,12 @@ FRACTIONS = ("gamma", "gae_lambda", "zero_goals", "axis_goals", "noise", "weight
 def check_settings(settings: Any) -> None:
     """WrongUse: a setting of a learner or a fit that is no fraction, or not positive."""
     for name, value in vars(settings).items():
-        option, fraction = f"--{name.replace('_', '-')}", name in FRACTIONS
-        fits = 0 <= value <= 1 if fraction else name.startswith("log_std") or 0 < value < np.inf
+        if isinstance(value, bool) or name.startswith("log_std"):
+            continue
+        fraction = name in FRACTIONS
+        fits = 0 <= value <= 1 if fraction else 0 < value < np.inf
         wanted = "0 to 1" if fraction else "a positive number"
-        check(isinstance(value, bool) or fits, option, wanted, value)
+        check(fits, f"--{name.replace('_', '-')}", wanted, value)
 
 
 @dataclass(kw_only=True)
@@ -74,7 +75,7 @@ class Command:
 def load_object(option: str, name: str) -> Any:
     """The object NAME of `FILE.py:NAME`; the file is run, as `python FILE.py` would."""
     path, _, symbol = name.rpartition(":")
-    known = "analytic, net" if option == "--plant" else ", ".join(MACHINES)
+    known = "analytic" if option == "--plant" else ", ".join(MACHINES)
     check(path.endswith(".py"), option, f"{known} or FILE.py:NAME", name)
     folder = str(Path(path).resolve().parent)
     sys.path.insert(0, folder)  # files beside it can be imported

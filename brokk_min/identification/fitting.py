@@ -23,6 +23,7 @@ from brokk_min.actuator import ActuatorNet
 from brokk_min.beyond.valve_nets import ValveNet, valve_inputs
 from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
 from brokk_min.identification.logs import Log, join_recordings
+from brokk_min.identification.net_file import ARRAYS
 from brokk_min.machine import Array, Machine, require
 
 __all__ = ["PAPER_RECIPE", "FitConfig", "fit"]
@@ -54,9 +55,6 @@ def fit(log: Log, config: FitConfig, seed: int, machine: Machine, name: str = ""
     if data.zones is None:
         return ActuatorNet(**fields)
     return ValveNet(**fields, dead_zones=data.zones.numpy())
-
-
-ARRAYS = ("input_mean", "input_scale", "output_low", "output_high", "q_low", "q_high")
 
 
 @dataclass(frozen=True)

@@ -107,7 +107,8 @@ def load_policy(path: Path, machine: Machine) -> Policy:
         expect_same(path, header["contract"], contract(machine))
         mean, scale = INTERFACES[header["interface"]].scale(machine)
         fits = np.array_equal(arrays["mean"], mean) and np.array_equal(arrays["scale"], scale)
-        require(fits, str(path), "the machine's normalisation", "another")
+        wanted = f"the scale of interface {header['interface']} for the machine"
+        require(fits, str(path), wanted, "another")
         weights = tuple(arrays[f"layer_{i}"] for i in range(8))
         net = select_nets(machine, net_from_arrays(path, header["net"], arrays))
         policy = Policy(header["training"], weights, net, header["interface"])

@@ -82,7 +82,7 @@ def test_file__gives_the_same_bits_back(tmp_path, kind):
         ({"rate": 40.0}, "rate: expected 40.0, got 20.0"),
         ({"name": "other"}, "machine: expected 'other', got 'brokk170'"),
         ({"joints": BROKK_170.joints[::-1]}, "joints: expected"),
-        ({"tool_speed": 0.2}, "expected the machine's normalisation, got another"),
+        ({"tool_speed": 0.2}, "expected the scale of interface paper for the machine, got another"),
     ],
 )
 def test_load_policy__refuses_one_for_another_machine(tmp_path, change, message):
