@@ -2,7 +2,7 @@
 
 What it changes: machines stand in groups of four. They begin each window of `horizon` ticks in the
 same state, with the same goals and the same sensor noise to come. Only the noise of their actions
-differs, so its return differs from the group's mean only because of its own actions:
+differs, so what a machine's return is above the mean of its group is due to its own actions:
 
     A_t = R_t - mean of R_t in the group,   R_t = r_t + gamma lambda R_{t+1},
 
@@ -12,8 +12,8 @@ has noise from what earlier actions did. At its end all four go on from the stat
 That needs a simulation whose states can be copied, as ours.
 
 What it buys, as mean velocity error of the tool along x, y and z after 30 million steps of the
-paper's agent on our nets (seed 0): 0.0169 m/s and 13 minutes of one core. With a critic and
-settings tuned for it it is 0.0206 m/s and 22 minutes.
+paper's agent on our nets (seed 0): 0.0169 m/s and 13 minutes of one core. With a critic, and
+settings tuned for it, the error is 0.0206 m/s after 22 minutes.
 
 Who was first: the vine of TRPO (Schulman et al., 2015) branches rollouts from one state with common
 random numbers; RLOO (Kool et al., 2019) takes the mean of a group's others as the baseline, and

@@ -27,7 +27,7 @@ It plugs into `env.Interface`. Observation, with the mean and deviation of each 
 | 111-162 | 13 commands of each driven joint                     | as in `env` | 0.277  |
 | 163-214 | `valve_nets.open_indicator` of these commands        | 0.5         | 0.277  |
 | 215-218 | joint velocities that give the goal (`jacobian.dls`) | as in `env` | 1.5    |
-| 219-222 | joint motions that undo the error integral [rad]     | 0.1 s of it | 1.5    |
+| 219-222 | joint motions that undo the error integral [rad]     | 0.1 s of them | 1.5  |
 """
 
 from functools import lru_cache

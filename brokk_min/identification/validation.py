@@ -5,7 +5,6 @@ prediction. A policy trains on free runs of the nets, so their error after secon
 """
 
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -71,21 +70,6 @@ def free_run(
     return joined[:, 0].copy(), joined[:, 1].copy()
 
 
-def free_runs(
-    net: ActuatorNet, samples: Samples
-) -> Iterator[tuple[int, NDArray[np.intp], Array, Array]]:
-    """Of each of `HORIZONS` [s]: first samples (s,) of free runs one after the other, errors.
-
-    A horizon that is longer than all recordings, and longer ones, are left out.
-    """
-    for horizon in HORIZONS:
-        ticks = round(horizon * net.rate)
-        starts = samples.starts(net.history, ticks, ticks)
-        if not len(starts):
-            return
-        yield horizon, starts, *free_run(net, samples, starts, ticks)
-
-
 def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
     """One-step, persistence and free-run errors on recordings, as in the fit JSON.
 
@@ -100,9 +84,12 @@ def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
             raise ValueError(f"{name}: expected {getattr(net, name)}, got {getattr(log, name)}")
     samples = join_recordings(log)
     result = _one_step_scores(net, samples)
-    runs = free_runs(net, samples)
-    bar = tqdm(runs, desc="score nets", total=len(HORIZONS), unit="horizon", disable=None)
-    for horizon, starts, q_error, v_error in bar:
+    for horizon in tqdm(HORIZONS, desc="score nets", unit="horizon", disable=None):
+        ticks = round(horizon * net.rate)
+        starts = samples.starts(net.history, ticks, ticks)
+        if not len(starts):  # longer than all recordings
+            break
+        q_error, v_error = free_run(net, samples, starts, ticks)
         after = starts + np.arange(1, len(q_error) + 1)[:, None]
         for j, name in enumerate(log.joints):
             scored = samples.moves[starts, j]
