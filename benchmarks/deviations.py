@@ -27,7 +27,6 @@ from brokk_min.beyond import interface
 from brokk_min.env import terminated
 from brokk_min.evaluation import metrics, preliminary, sequences
 from brokk_min.evaluation.baselines import OPTIMISED, baselines, read_gains
-from brokk_min.evaluation.feasibility import feasible
 from brokk_min.evaluation.rollout import rollout
 from brokk_min.identification import excitation, logs
 from brokk_min.kinematics import forward_kinematics
@@ -88,7 +87,7 @@ def a9() -> Figures:
     followed = {}
     for sequence in sequences.axis_sequences(M):
         goals = np.repeat(sequence.goals[:, None], len(q), axis=1)
-        followed[sequence.name] = feasible(M, q, goals)
+        followed[sequence.name] = sequences.feasible(M, q, goals)
     followed["all"] = np.all(list(followed.values()), axis=0)
     return {name: rows.mean() for name, rows in followed.items()}
 

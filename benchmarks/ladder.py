@@ -5,7 +5,7 @@
 "Alone" is the paper's agent with a critic and one of `STEPS`; "in order" has the steps of all rows
 above it, too. FOLDER is one of `brokk-min reproduce`, by default results; its nets are those that
 the policies learn on. By default three seeds of one million environment steps each. Figures are
-means over x, y, z and the workspace starts.
+means over x, y, z and the starts.
 """
 
 import sys
@@ -65,8 +65,7 @@ def climb(name: str, nets: dict[str, ActuatorNet], total_steps: int, seed: int) 
     net = nets["net" if "nets" in steps else "net_paper"]
     with TemporaryDirectory() as folder:
         trained = train_policy(M, net, recipe, seed, Path(folder) / "policy.npz")
-    starts = sequences.evaluation_starts(M, 64, sequences.task_sequences(M), 2)
-    starts = starts[np.array(sequences.start_kinds(M, starts)) == "workspace"]
+    starts = sequences.evaluation_starts(M, 32, sequences.task_sequences(M), 2)
     controllers = {"rl": policy.PolicyController(M, trained)}
     runs, _ = metrics.evaluate(M, controllers, sequences.axis_sequences(M), starts, 0)
     return [float(np.mean([run[key] for run in runs if run[key] is not None])) for key in FIGURES]

@@ -37,7 +37,6 @@ def main(options: Options) -> None:
         net = load_policy(POLICY, BROKK_170).net
     env = TaskVectorEnv(options.num_envs, net)
     env.reset(seed=0)
-    assert env.state is not None
     history = env.state.plant.history
     actions = np.random.default_rng(0).uniform(-1, 1, (options.num_envs, 4)).astype(np.float32)
 

@@ -13,6 +13,7 @@ os.environ["MPLBACKEND"] = "agg"  # we draw into files; a notebook's would be re
 import tyro
 
 from brokk_min import __version__
+from brokk_min._files import one_line
 
 COMMANDS = {  # module and class in `cli`, and what the command does
     "collect": ("identification", "Collect", "record a machine under excitation"),
@@ -56,14 +57,6 @@ def main(arguments: list[str] | None = None) -> int:
         print("brokk-min: stopped", file=sys.stderr)
         return 1
     return 0
-
-
-def one_line(error: BaseException) -> str:
-    """What went wrong, in one line."""
-    if isinstance(error, OSError) and error.strerror:
-        place = f"{error.filename}: " if error.filename else ""
-        return f"{place}{error.strerror.lower()}"
-    return " ".join(str(error).split()) or type(error).__name__
 
 
 if __name__ == "__main__":

@@ -28,19 +28,18 @@ def require_package(package: str, extra: str) -> Any:
     try:
         return import_module(package)
     except ImportError as error:
-        expectation = f"expected the extra brokk_min[{extra}]"
-        raise ValueError(f"{package}: {expectation}, got {error}") from error
+        raise ValueError(f"{package}: expected brokk_min[{extra}], got {error}") from error
 
 
 @contextmanager
 def whole_file(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
     """A temporary file, text in UTF-8, that replaces `path` if the block ends without an error.
 
-    It has the mode of the file that it replaces. OSError: it cannot be written.
+    It has the mode of the file that it replaces. OSError: it cannot be written. ValueError: `path`
+    is a folder or a device.
     """
     path = Path(path)
-    fits = path.parent.is_dir() and (path.is_file() or not path.exists())
-    require(fits, str(path), "a regular file in an existing directory", "none")
+    require(path.is_file() or not path.exists(), str(path), "a regular file", "another kind")
     target = path.resolve()  # of a link
     temporary = target.with_name(f".{target.name[:100]}.{os.getpid()}")
     text = {} if "b" in mode else {"newline": "", "encoding": "utf-8"}
@@ -71,12 +70,18 @@ def write_csv(path: Path, columns: Iterable[str], rows: Iterable[Iterable[Any]])
         writer.writerows(rows)
 
 
-def brief(value: Any) -> str:
-    """A value as text of one line and at most some hundred characters."""
-    text = str(value) if isinstance(value, Exception) else repr(value)
+def one_line(value: Any) -> str:
+    """A value, or what an error says, as text of one line."""
     if isinstance(value, OSError) and value.strerror:
-        text = value.strerror.lower()
-    text = " ".join(text.split())
+        place = f"{value.filename}: " if value.filename else ""
+        return f"{place}{value.strerror.lower()}"
+    text = str(value) or type(value).__name__ if isinstance(value, Exception) else repr(value)
+    return " ".join(text.split())
+
+
+def brief(value: Any) -> str:
+    """`one_line` of at most some hundred characters."""
+    text = one_line(value)
     return text if len(text) <= 110 else f"{text[:70]} ... {text[-30:]}"
 
 
@@ -163,8 +168,7 @@ def load_arrays(path: Path, kind: str = "") -> tuple[dict[str, Any], dict[str, N
         with np.load(path, allow_pickle=False) as archive:
             arrays = dict(archive)
         header = json.loads(str(arrays.pop("header", "{}")))
-        got = str(header.pop("kind", None))
-        older = kind.split(" ")[0] in got
-        made = "a file of another version (train or fit again)" if older else brief(got)
-        require(kind in ("", got), str(path), f"a file of kind {kind}", made)
+        got = header.pop("kind", None)
+        wanted = f"a file of kind {kind} (if it is older, train or fit again)"
+        require(kind in ("", got), str(path), wanted, brief(got))
         return header, arrays

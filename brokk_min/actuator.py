@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brokk_min.machine import Array, Machine, as_floats, side, valve_opening
+from brokk_min.machine import Array, Machine, side, valve_opening
 
 
 class Plant(Protocol):
@@ -112,7 +112,7 @@ def initial_history(q: ArrayLike, samples: int) -> Array:
     Rows: angle [rad], velocity [rad/s], command [-1, 1]; newest sample last. The newest command was
     sent one tick before the newest angle was measured. Paper: Table 1
     """
-    q = as_floats(q)
+    q = 1.0 * np.asarray(q)  # whole numbers become floats
     history = np.zeros((*q.shape, 3, samples), q.dtype)
     history[..., 0, :] = q[..., None]
     return history
@@ -145,7 +145,7 @@ def estimate_velocity(q: ArrayLike, samples: int, dt: float) -> Array:
     A difference over one tick of a 12-bit encoder comes in steps of 0.031 rad/s at 20 Hz; four
     samples have a third of its noise and are 1.5 ticks late.
     """
-    q = as_floats(q)
+    q = 1.0 * np.asarray(q)  # whole numbers become floats
     t = dt * (np.arange(samples) - (samples - 1) / 2)
     weights = (t / (t @ t)).astype(q.dtype)  # slope = sum t_i q_i / sum t_i^2
     return np.asarray(np.einsum("...t,t", q[..., -samples:], weights))

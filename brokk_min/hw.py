@@ -22,7 +22,6 @@ from brokk_min.can.safety_gate import GateInputs, fault_name, gate, gate_start
 from brokk_min.env import measure
 from brokk_min.machine import PWM_MAX, Machine, Measured
 
-BUSY_WAIT = 0.002  # s before and after SYNC in which the loop does not sleep (tuned)
 ANSWER_TIME = 0.4  # of a tick after SYNC, in which the encoders must answer (assumed)
 
 
@@ -42,11 +41,10 @@ class Drive:
         self.controller_state = controller.start(1)
         self.exception = ""  # of this tick
         self.last_exception = ""  # since it drove
-        self.reason = ""  # why it does not drive
         self.signals: list[int] = []
         self.start_time = 0.0  # s
         self.deadline_number = 0  # ticks from the start to the next deadline
-        self.ticks = self.skipped = 0
+        self.ticks = 0
         self.lateness = 0.0  # s
 
     def begin(self) -> None:
@@ -64,7 +62,7 @@ class Drive:
                         show(self)
         except BaseException:
             self.exception = "the loop ended"
-            self.send_command(np.zeros(self.machine.n), self.nodes.counts(), self.bus.now())
+            self.send_command(np.zeros(self.machine.n), self.nodes.counts())
             raise
         finally:
             gc.enable()
@@ -73,21 +71,23 @@ class Drive:
         """Wait for the deadline, then one tick; False if it was the last."""
         self.wait()
         with self.catch_errors():
-            entered = self.operator(bool(self.gate.driving), bool(self.gate.active_fault == 0))
+            ready = bool(self.gate.active_fault == 0)
+            entered = self.operator(bool(self.gate.driving), ready)
             self.operator_input = canopen.unpack_operator_input(entered.pack())  # as it is logged
         self.nodes.frames *= 2  # 1 is sound: a position that came before SYNC becomes 2, a fault
         with self.catch_errors():
             self.bus.send(canopen.SYNC, b"")
             answer_by = self.bus.now() + ANSWER_TIME * self.machine.dt
-            self.nodes.listen(self.bus, answer_by, BUSY_WAIT, until_complete=True)
+            self.nodes.listen(self.bus, answer_by, until_complete=True)
         counts = self.nodes.counts()  # by the encoders' zeros and signs
         command = np.zeros(self.machine.n)
         with self.catch_errors():
             command = self.control(counts)
         stop = self.operator_input.stop or bool(self.signals)
         self.operator_input = self.operator_input._replace(stop=stop)
-        now = self.bus.log_input(self.operator_input.pack())  # its time
-        self.send_command(command, counts, now)
+        with self.catch_errors():
+            self.bus.log_input(self.operator_input.pack())
+        self.send_command(command, counts)
         self.nodes.start_tick()
         with self.catch_errors():
             released = not (self.operator_input.enable or self.gate.driving)
@@ -113,10 +113,10 @@ class Drive:
         u, self.controller_state = self.controller(self.measured, self.controller_state)
         return np.asarray(np.rint(u[0] * PWM_MAX), float)
 
-    def send_command(self, command: Array, counts: Array, now: float) -> None:
-        """Pass the safety gate, and send the valve frame once the gate was armed."""
+    def inputs(self, command: Array, counts: Array) -> GateInputs:
+        """What the gate gets of this tick."""
         entered = self.operator_input
-        inputs = GateInputs(
+        return GateInputs(
             command=command,
             counts=counts,
             frames=self.nodes.frames,
@@ -130,45 +130,35 @@ class Drive:
             flooded=np.array(self.nodes.received >= canopen.MAX_FRAMES),
             other_sender=np.array(self.nodes.others > 0),
         )
-        self.gate, frame = gate(self.machine, self.gate, inputs, now)
-        self.explain()
+
+    def send_command(self, command: Array, counts: Array) -> None:
+        """Pass the safety gate, and send the valve frame once the gate was armed."""
+        inputs = self.inputs(command, counts)
+        self.gate, frame = gate(self.machine, self.gate, inputs, self.bus.now())
+        self.last_exception = "" if self.gate.driving else self.exception or self.last_exception
         self.exception = ""  # one while sending is a fault of the next tick
         with self.catch_errors():
             if self.gate.armed_once:
                 self.bus.send(self.machine.valve_frame_id, frame.tobytes())
 
-    def explain(self) -> None:
-        """Set `reason` from the gate's faults and from exceptions."""
-        latched = fault_name(self.machine, int(self.gate.latched_fault))
-        active = fault_name(self.machine, int(self.gate.active_fault))
-        self.last_exception = "" if self.gate.driving else self.exception or self.last_exception
-        self.reason = f"fault: {latched}" if latched else active
-        if self.last_exception:
-            self.reason += f" ({self.last_exception})"
+    @property
+    def reason(self) -> str:
+        """Why it does not drive: the fault that stopped it, or what is in the way."""
+        stopped = fault_name(self.machine, int(self.gate.latched_fault))
+        now = fault_name(self.machine, int(self.gate.active_fault))
+        error = f" ({self.last_exception})" if self.last_exception else ""
+        return (f"fault: {stopped}" if stopped else now) + error
 
     def wait(self) -> None:
-        """Listen until the deadline; without sleep just before it."""
+        """Listen until the deadline, then set the next one, which is in the future."""
         deadline = self.start_time + self.deadline_number * self.machine.dt  # no sum: no drift
-        end = min(deadline, self.bus.now() + self.machine.dt)  # the clock may have gone backwards
         with self.catch_errors():
-            self.nodes.listen(self.bus, end - BUSY_WAIT)
-            # warm-up: caches are cold after sleep, and the first computation takes longer
-            if self.bus.now() < end and (measured := self.measured):
-                self.controller(measured, self.controller_state)
-            self.nodes.listen(self.bus, end, BUSY_WAIT)
-        self.bus.sleep(max(0.0, end - self.bus.now()))  # a broken bus does not wait
-        self.count_tick(self.bus.now() - deadline)
-
-    def count_tick(self, lateness: float) -> None:
-        """Go to the next deadline in the future; on a new grid if the clock went backwards."""
-        if lateness < -0.5 * self.machine.dt:
-            self.start_time = self.bus.now()
-            self.deadline_number = 0
-        missed = max(0, int(lateness // self.machine.dt))
+            self.nodes.listen(self.bus, deadline)
+        self.bus.sleep(max(0.0, deadline - self.bus.now()))  # a broken bus does not wait
+        self.lateness = self.bus.now() - deadline
+        missed = max(0, int(self.lateness // self.machine.dt))
         if missed:
             self.history = None  # its samples must be a tick apart
-        self.lateness = lateness
-        self.skipped += missed
         self.deadline_number += 1 + missed
         self.ticks += 1
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brokk_min.machine import Array, Machine, as_floats
+from brokk_min.machine import Array, Machine
 
 
 class Frames(NamedTuple):
@@ -36,7 +36,7 @@ def forward_kinematics(machine: Machine, q: ArrayLike) -> Frames:
 
     ValueError: `q` has another number of joints.
     """
-    q = as_floats(q)
+    q = 1.0 * np.asarray(q)  # whole numbers become floats
     if q.shape[-1:] != (machine.n,):
         raise ValueError(f"q: expected (..., {machine.n}), got {q.shape}")
     # The arrays in here have their axes reversed, so vectors are (3, ...) and c * x scales the

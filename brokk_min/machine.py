@@ -184,12 +184,6 @@ class Measured(NamedTuple):
     history: Array  # angles, velocities, commands of the driven joints, (..., n_driven, 3, H)
 
 
-def as_floats(values: ArrayLike) -> NDArray[np.floating]:
-    """An array of floats; its float type is kept, whole numbers become float64."""
-    array = np.asarray(values)
-    return array if array.dtype.kind == "f" else array.astype(float)
-
-
 def side(u: Array, pairs: ArrayLike) -> Array:
     """Of `pairs` (..., 2), up and down, those for up where u (...) > 0, else those for down."""
     pairs = np.asarray(pairs, u.dtype)
@@ -201,21 +195,21 @@ def valve_opening(u: ArrayLike, dead_zones: ArrayLike) -> NDArray[np.floating]:
 
     `dead_zones` (..., 2) are up and down of each command. Paper: Sec. 3.3 (7 %)
     """
-    u = as_floats(u)
+    u = 1.0 * np.asarray(u)  # whole numbers become floats
     zone = side(u, dead_zones)
     return np.asarray((u - np.clip(u, -zone, zone)) / (1 - zone))
 
 
 def valve_command(opening: ArrayLike, dead_zones: ArrayLike) -> NDArray[np.floating]:
     """The command that opens a valve so far: the inverse of `valve_opening`, 0 for 0."""
-    x = as_floats(opening)
+    x = 1.0 * np.asarray(opening)
     zone = side(x, dead_zones)
     return np.asarray(np.sign(x) * zone + (1 - zone) * x)
 
 
 def limit_command(machine: Machine, u: ArrayLike) -> NDArray[np.floating]:
     """The command that reaches the valve: whole counts, clipped to the limit. Paper: Sec. 3.2"""
-    u = as_floats(u)
+    u = 1.0 * np.asarray(u)  # whole numbers become floats
     counts = np.clip(np.rint(u * PWM_MAX), -machine.pwm_limit, machine.pwm_limit)
     return np.asarray(counts / PWM_MAX, u.dtype)
 
@@ -245,7 +239,7 @@ def decode_pwm(u_byte: ArrayLike) -> NDArray[np.float64]:
 
 def read_encoder(machine: Machine, q: ArrayLike) -> NDArray[np.floating]:
     """What encoders report for true angles `q` (..., n): whole counts, of the same float type."""
-    q = as_floats(q)
+    q = 1.0 * np.asarray(q)
     return np.asarray(np.rint(q / machine.encoder_step) * machine.encoder_step, q.dtype)
 
 

@@ -15,18 +15,24 @@ from cantools.database.can import Node, Signal
 
 from brokk_min.can import canopen
 from brokk_min.cli.options import Command
-from brokk_min.machine import Machine
+from brokk_min.machine import Machine, require
+
+
+def identifier(name: str) -> str:
+    """A name in letters, digits and underscores, as DBC files have them."""
+    return re.sub(r"\W", "_", name, flags=re.ASCII)
 
 
 def signal(name: str, start: int, length: int = 8, unit: str | None = None) -> Signal:
     """An unsigned, little-endian signal."""
-    return Signal(re.sub(r"\W", "_", name), start, length, unit=unit)
+    return Signal(identifier(name), start, length, unit=unit)
 
 
 def dbc(machine: Machine) -> str:
     """The text of a DBC file: valve frame, SYNC, NMT, positions and heartbeats."""
     canopen.check_bus(machine)
-    nodes = [*(re.sub(r"\W", "_", f"encoder_{name}") for name in machine.names), "valve_controller"]
+    nodes = [*(identifier(f"encoder_{name}") for name in machine.names), "valve_controller"]
+    require(len(set(nodes)) > machine.n, "joints", "names that differ in DBC files", machine.names)
     valves = [signal(f"u_{name}", 8 * i) for i, name in enumerate(machine.names)]  # PWM bytes
     valves += [signal("counter", 40), signal("checksum", 48), signal("enable", 56)]
     messages = [

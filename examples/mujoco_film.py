@@ -25,7 +25,7 @@ from brokk_min.evaluation.sequences import read_commands
 from brokk_min.learning.policy import PolicyController, load_policy
 from brokk_min.machine import BROKK_170 as M
 from brokk_min.settings import TaskConfig
-from brokk_min.viewer.drawing import Scene, draw, image
+from brokk_min.viewer.drawing import Scene, draw
 from examples.mujoco_brokk import PLANT, build
 
 SIZE = (480, 360)  # px, of each half
@@ -69,7 +69,7 @@ def main(options: Options) -> None:
     for k in tqdm(range(0, len(goals), step), desc="draw", unit="frame", disable=None):
         path, status = trace.p_tool[: k + 1, 0], f"{k * M.dt:.1f} s"
         now = trace.q[k, 0], trace.u[k, 0], goals[k, 0], trace.v_tool[k, 0]
-        drawn = image(draw(M, Scene(*now, path, "PPO on MuJoCo", status), SIZE))
+        drawn = np.array(draw(M, Scene(*now, path, "PPO on MuJoCo", status), SIZE))
         data.qpos[:] = trace.q[k, 0]
         mujoco.mj_forward(model, data)
         eye.update_scene(data, camera)

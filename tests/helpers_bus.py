@@ -110,8 +110,7 @@ class World:
         self.upward = self.downward = unchanged
         self.noise = list  # foreign frames of the next millisecond
         self.syncs = []
-        writer = can.CanutilsLogWriter(log) if log else None
-        self.bus = Bus(self, writer, "virtual", clock=self.clock, sleep=self.sleep)
+        self.bus = Bus(self, "virtual", log, clock=self.clock, sleep=self.sleep)
         self.bus.start = 1.8e9  # s; a fixed time of day, so that roundings repeat themselves
         self.drive = Drive(BROKK_170, controller, self.bus, operator)
         self.controller, self.operator = controller, operator

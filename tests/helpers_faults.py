@@ -194,7 +194,6 @@ FAULTS = {
     "enable released": (put("operator.enable", False), ""),
     "SIGTERM": (lambda world: world.drive.signals.append(15), "stop asked for"),
     "clock stepped forward": (put("offset", 3600.0), "tick late, or the"),
-    "clock stepped back": (put("offset", -3600.0), "tick late, or the"),
     "log cannot be written": (put("bus.flush", raises(OSError("full"))), "error (OSError: full)"),
     "late tick": (stall(0.08), "tick late"),
     "policy returns NaN": (command(2, np.nan), "q3: no valid command"),

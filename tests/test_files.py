@@ -146,13 +146,17 @@ def test_whole_file__leaves_the_old_file_and_no_other_if_writing_fails(tmp_path)
     assert path.read_text() == "old" and [*tmp_path.iterdir()] == [path]
     _files.write_json(path, {"x": 0.1})
     assert json.loads(path.read_text()) == {"x": 0.1}
-    with pytest.raises(ValueError, match="expected a regular file in an existing directory, got"):
-        _files.write_json(tmp_path / "none" / "y.json", {})
+    with pytest.raises(ValueError, match="expected a regular file, got another kind"):
+        _files.write_json(tmp_path, {})
 
 
-def test_whole_file__names_the_file_if_the_disk_is_full(tmp_path):
+def test_whole_file__names_the_file_if_the_disk_is_full_or_the_folder_missing(tmp_path):
     path = tmp_path / "y.json"
     with pytest.raises(OSError) as caught, whole_file(path):
         raise OSError(errno.ENOSPC, "No space left on device")
     assert (caught.value.errno, caught.value.filename) == (errno.ENOSPC, str(path))
     assert not [*tmp_path.iterdir()]
+    missing = tmp_path / "none" / "y.json"
+    with pytest.raises(FileNotFoundError) as caught:
+        _files.write_json(missing, {})
+    assert caught.value.filename == str(missing)

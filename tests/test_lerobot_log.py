@@ -8,6 +8,7 @@ import pyarrow.parquet as parquet
 import pytest
 
 from brokk_min.identification.logs import read_log
+from brokk_min.machine import BROKK_170
 from examples.lerobot_log import main
 
 NAMES = ["boom.pos", "arm.pos"]
@@ -38,7 +39,7 @@ def test_main__writes_each_episode_as_a_recording(tmp_path, names, capsys):
     u, q = write_dataset(tmp_path / "set", names)
     main(str(tmp_path / "set"), str(tmp_path / "log.npz"))
     assert "2 episodes of boom, arm" in capsys.readouterr().out
-    log = read_log([tmp_path / "log.npz"], 4)
+    log = read_log(tmp_path / "log.npz", BROKK_170)
     assert log.joints == ("boom", "arm")
     assert [one.name for one in log.recordings] == ["episode_0", "episode_1"]
     np.testing.assert_allclose(np.concatenate([one.q for one in log.recordings]), q)

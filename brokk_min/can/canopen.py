@@ -21,7 +21,8 @@ SDO_REQUEST = 0x600
 HEARTBEAT = 0x700
 # objects of an encoder: index, subindex
 HEARTBEAT_OBJECT = (0x1017, 0)  # period [ms]
-TPDO1_OBJECT = (0x1800, 1)  # identifier; bit 31: switched off
+TPDO1_OBJECT = (0x1800, 1)  # identifier; bit 31: switched off,
+REMOTE_REFUSED = 1 << 30  # and this bit: no remote requests, which we do not send
 SYNC_OBJECT = (0x1800, 2)  # after how many SYNCs a position is sent
 MAPPING_OBJECT = 0x1A00  # of TPDO1: subindex 0 has the number of entries, which follow
 POSITION_ENTRY = 0x6004_00_20  # in the mapping: index, subindex, number of bits
@@ -50,7 +51,7 @@ class Frame(NamedTuple):
 
 
 class Nodes:
-    """Newest positions, heartbeats and states of encoders and valve controller (the last node)."""
+    """What encoders and valve controller (the last node) sent last, and the newest valve frame."""
 
     def __init__(self, machine: Machine) -> None:
         nodes = node_numbers(machine)
@@ -60,17 +61,18 @@ class Nodes:
         self.position_index = {TPDO1 + node: i for i, node in enumerate(nodes[:-1])}
         self.heartbeat_index = {HEARTBEAT + node: i for i, node in enumerate(nodes)}
         self.raw = np.full(machine.n, -1)  # -1: none yet
-        self.size = np.zeros(machine.n, int)  # bytes of the newest positions
         self.frames = np.zeros(machine.n, int)  # positions of this tick; a malformed one counts 2
         self.heartbeat = np.full(machine.n + 1, -np.inf)  # s, -inf: never
         self.nmt = np.zeros(machine.n + 1, int)
+        self.size = np.zeros(machine.n, int)  # bytes of the newest positions
+        self.u: Array = np.zeros(machine.n)  # commands of the newest valve frame
+        self.enable = False  # of it
+        self.valve_time = -np.inf  # s, of it
 
-    def listen(
-        self, bus: Any, end: float, busy_wait: float = 0.0, until_complete: bool = False
-    ) -> None:
+    def listen(self, bus: Any, end: float, until_complete: bool = False) -> None:
         """Read until `end` [s] and the bus is empty, or until every encoder has answered."""
         while self.received < MAX_FRAMES and not (until_complete and (self.frames > 0).all()):
-            frame = bus.recv(max(0.0, end - bus.now()), busy_wait)
+            frame = bus.recv(max(0.0, end - bus.now()))
             if frame is None:
                 return
             self.update(frame)
@@ -82,21 +84,24 @@ class Nodes:
 
     def update(self, frame: Frame) -> None:
         """Take in one frame; those of others change nothing."""
-        size = len(frame.data)
         self.received += 1
         self.others += frame.id in self.own_ids and not frame.sent
         if frame.id in self.position_index:
             i = self.position_index[frame.id]
             raw = int.from_bytes(frame.data, "little")
-            sound = size == 4 and raw != NO_POSITION
-            self.frames[i] += 1 if sound else 2
-            self.size[i] = size
-            if size == 4:
+            self.size[i] = len(frame.data)
+            if len(frame.data) == 4 and raw != NO_POSITION:
+                self.frames[i] += 1
                 self.raw[i] = raw
-        elif frame.id in self.heartbeat_index and size == 1:
+            else:
+                self.frames[i] += 2
+        elif frame.id in self.heartbeat_index and len(frame.data) == 1:
             i = self.heartbeat_index[frame.id]
             self.heartbeat[i] = frame.time
             self.nmt[i] = frame.data[0] & 0x7F
+        elif frame.id == self.machine.valve_frame_id and len(frame.data) == 8:
+            self.u, self.enable = read_valve_frame(self.machine, frame.data)
+            self.valve_time = frame.time
 
     def counts(self) -> Array:
         """Newest joint angles [counts], (n,)."""
@@ -145,26 +150,6 @@ def set_up_nodes(bus: Any, machine: Machine) -> None:
     check_positions(bus, machine)
 
 
-def check_encoder(bus: Any, machine: Machine, joint: Joint) -> None:
-    """ValueError: an encoder with another resolution, or whose TPDO1 is not its position alone."""
-    node, turn = joint.encoder_node, 2**machine.encoder_bits
-    found = sdo(bus, node, RESOLUTION_OBJECT)
-    wanted = f"{turn} counts a turn of encoder node {node} (object 0x6501)"
-    require(found == turn, joint.name, wanted, found)
-    found = sdo(bus, node, TPDO1_OBJECT)
-    off = f"TPDO1 of node {node} is switched off (0x1800:01 bit 31)"
-    require(not found >> 31, joint.name, "an encoder that sends its position", off)
-    wanted = f"TPDO1 of node {node} with identifier 0x{TPDO1 + node:X} (0x1800:01)"
-    require(found & 0x7FF == TPDO1 + node, joint.name, wanted, f"0x{found & 0x7FF:X}")
-    number = sdo(bus, node, (MAPPING_OBJECT, 0))
-    entries = [sdo(bus, node, (MAPPING_OBJECT, i + 1)) for i in range(number)]
-    size = sum(entry & 0xFF for entry in entries) // 8
-    objects = ", ".join(f"0x{entry >> 16:04X}" for entry in entries)
-    wanted = f"TPDO1 of node {node} with the 4 bytes of object 0x6004 (0x1A00)"
-    got = f"one that has {size} bytes, of {objects}"
-    require(entries == [POSITION_ENTRY], joint.name, wanted, got)
-
-
 def check_positions(bus: Any, machine: Machine) -> None:
     """ValueError: an encoder that does not answer SYNC with the four bytes of a position."""
     nodes = Nodes(machine)
@@ -178,6 +163,28 @@ def check_positions(bus: Any, machine: Machine) -> None:
         wanted = f"TPDO1 of node {joint.encoder_node} with 4 bytes after SYNC"
         got = f"one that has {size} bytes" if came else "none"
         require(came and size == 4, joint.name, wanted, got)
+
+
+def encoder_objects(machine: Machine, node: int) -> dict[tuple[int, int], tuple[int, str]]:
+    """Objects of an encoder that are read: by address the value that fits, and what it means."""
+    turn = 2**machine.encoder_bits
+    return {
+        RESOLUTION_OBJECT: (turn, f"{turn} counts a turn"),
+        TPDO1_OBJECT: (TPDO1 + node, f"TPDO1 with identifier 0x{TPDO1 + node:X}, switched on"),
+        (MAPPING_OBJECT, 0): (1, "one object in TPDO1"),
+        (MAPPING_OBJECT, 1): (POSITION_ENTRY, "the 4 bytes of object 0x6004 in TPDO1"),
+    }
+
+
+def check_encoder(bus: Any, machine: Machine, joint: Joint) -> None:
+    """ValueError: an encoder with another resolution, or whose TPDO1 is not its position alone."""
+    node = joint.encoder_node
+    for address, (value, meaning) in encoder_objects(machine, node).items():
+        found = sdo(bus, node, address)
+        if address == TPDO1_OBJECT:
+            found &= ~REMOTE_REFUSED
+        where = "0x{:04X}:{:02X} of node {}".format(*address, node)
+        require(found == value, joint.name, f"{meaning} ({where})", f"{found} (0x{found:X})")
 
 
 def sdo(
@@ -218,16 +225,13 @@ def encoder_raw(machine: Machine, counts: ArrayLike) -> Array:
     return np.asarray((sign * np.asarray(counts) + zero) % 2**POSITION_BITS)
 
 
-CRC_TABLE = np.arange(256)  # CRC-8 of each byte, polynomial 0x1D
-for _ in range(8):
-    CRC_TABLE = (CRC_TABLE << 1 ^ np.where(CRC_TABLE & 0x80, 0x1D, 0)) & 0xFF
-
-
 def checksum(frame: ArrayLike) -> Array:
     """CRC-8 SAE J1850 of bytes (..., k), (...): polynomial 0x1D, start and final XOR 0xFF."""
     crc = np.array(0xFF)
-    for byte in np.moveaxis(np.asarray(frame, np.uint8), -1, 0):
-        crc = CRC_TABLE[crc ^ byte]
+    for byte in np.moveaxis(np.asarray(frame, int), -1, 0):
+        crc = crc ^ byte
+        for _ in range(8):
+            crc = (crc << 1 ^ np.where(crc & 0x80, 0x1D, 0)) & 0xFF
     return crc ^ 0xFF
 
 

@@ -1,5 +1,6 @@
 """The CAN bus through python-can, and its log; python-can is imported when a bus is opened."""
 
+import os
 import select
 import signal
 import time
@@ -19,8 +20,8 @@ class Bus:
     """A CAN bus with a monotonic clock and a log of what is sent and read."""
 
     bus: Any  # of python-can
-    writer: Any = None  # python-can's candump writer
     name: str = "can"  # of the bus in the log
+    log: Any = None  # path of a log in candump's format, or a file
     echo: bool = False  # does the bus give back what we send?
     file: int = -1  # descriptor to wait on; -1: `bus` waits itself
     clock: Callable[[], float] = time.monotonic  # s
@@ -28,22 +29,23 @@ class Bus:
     allowed: Container[int] = range(0x800)  # identifiers of frames that it sends
 
     def __post_init__(self) -> None:
+        can = require_package("can", "hw")
         self.start = time.time() - self.clock()  # the log has the time of day, but it may be set
         self.echoes: deque[tuple[int, bytes]] = deque(maxlen=64 if self.echo else 0)
-        self.unwritten: deque[Any] = deque()  # messages for the log, see `flush`
-        self.message = require_package("can", "hw").Message
+        self.writer = can.CanutilsLogWriter(self.log or os.devnull)
+        self.message = can.Message
 
     def now(self) -> float:
         """Time of day at the start plus monotonic time since [s], in whole microseconds."""
         return round(self.start + self.clock(), 6)
 
-    def recv(self, timeout: float, busy_wait: float = 0.0) -> Frame | None:
-        """The next frame within `timeout` [s], or None; it sleeps only after `busy_wait` [s]."""
+    def recv(self, timeout: float) -> Frame | None:
+        """The next frame within `timeout` [s], or None."""
         end = self.clock() + timeout
         message = self.bus.recv(timeout if self.file < 0 else 0.0)
         # python-can's own timeout follows the time of day, so we wait for the descriptor
         while message is None and self.file >= 0 and (left := end - self.clock()) > 0:
-            if select.select([self.file], [], [], left if left <= timeout - busy_wait else 0.0)[0]:
+            if select.select([self.file], [], [], left)[0]:
                 message = self.bus.recv(0.0)
         if message is None:
             return None
@@ -68,35 +70,27 @@ class Bus:
         self.echoes.append((can_id, data))
         self._log(message, self.now(), self.name)
 
-    def log_input(self, data: bytes) -> float:
-        """Log the operator's input, which is not on the bus; the time of it [s]."""
-        now = self.now()
-        self._log(self._message(OPERATOR_INPUT, data), now, "operator")
-        return now
+    def log_input(self, data: bytes) -> None:
+        """Log the operator's input, which is not on the bus."""
+        self._log(self._message(OPERATOR_INPUT, data), self.now(), "operator")
 
     def flush(self) -> None:
         """Write the log on, so that it survives the program's sudden end. OSError: a full disk."""
-        while self.unwritten:
-            self.writer.on_message_received(self.unwritten.popleft())
-        if self.writer is not None:
-            self.writer.file.flush()
+        self.writer.file.flush()
 
     def _message(self, can_id: int, data: bytes) -> Any:
         return self.message(arbitration_id=can_id, data=data, is_extended_id=False, is_rx=False)
 
     def _log(self, message: Any, now: float, channel: str) -> None:
-        if self.writer is not None:
-            message.timestamp, message.channel = now, channel
-            self.unwritten.append(message)
+        message.timestamp, message.channel = now, channel
+        self.writer.on_message_received(message)
 
     def close(self) -> None:
         """Close bus and log, the log even if the bus fails."""
         try:
             self.bus.shutdown()
         finally:
-            if self.writer is not None:
-                self.flush()
-                self.writer.stop()
+            self.writer.stop()
 
 
 @contextmanager
@@ -112,9 +106,7 @@ def open_bus(interface: str, channel: str, log: Path | None = None) -> Iterator[
         raw = can.Bus(interface=interface, channel=channel)
     except Exception as error:  # each interface has its own
         raise ValueError(f"{where}, got {brief(error)}") from error
-    name = channel if interface == "socketcan" else interface
-    writer = can.CanutilsLogWriter(log) if log else None
-    bus = Bus(raw, writer, name, echo=interface == "udp_multicast")
+    bus = Bus(raw, channel, log, echo=interface == "udp_multicast")
     with suppress(NotImplementedError):  # python-can's word for a bus without a descriptor
         bus.file = raw.fileno()
     try:

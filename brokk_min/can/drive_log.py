@@ -67,19 +67,17 @@ class Telemetry(NamedTuple):
 def read_telemetry(machine: Machine, frames: Iterable[Frame]) -> Iterator[Telemetry]:
     """Telemetry of the ticks of a log; each ends with the SYNC of the next."""
     nodes, operator = Nodes(machine), OperatorInput()
-    u, driving = np.zeros(machine.n), False
     start = 0.0  # s, time of the last SYNC
     for frame in frames:
         nodes.update(frame)
         if frame.id == canopen.OPERATOR_INPUT and frame.sent:
             operator = canopen.unpack_operator_input(frame.data)
-        elif frame.id == machine.valve_frame_id and len(frame.data) == 8:
-            u, driving = canopen.read_valve_frame(machine, frame.data)
         elif frame.id == canopen.SYNC:
             q = np.where((nodes.frames == 1).all(), nodes.counts() * machine.encoder_step, np.nan)
-            yield Telemetry(start, q, u, np.array(operator.v_goal) * driving, driving)
+            v_goal = np.array(operator.v_goal) * nodes.enable
+            yield Telemetry(start, q, nodes.u, v_goal, nodes.enable)
             nodes.start_tick()
-            driving = False  # until the next valve frame
+            nodes.enable = False  # until the next valve frame
             start = frame.time
 
 

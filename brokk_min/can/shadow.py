@@ -12,44 +12,23 @@ import numpy as np
 
 from brokk_min import hw
 from brokk_min.can import canopen
-from brokk_min.can.canopen import Array, Frame, Operator, OperatorInput
+from brokk_min.can.canopen import Array, Operator, OperatorInput
 from brokk_min.can.connection import Bus
-from brokk_min.can.safety_gate import fault_name
+from brokk_min.can.safety_gate import GateInputs, fault_name
 from brokk_min.machine import PWM_MAX, Machine
 
 EARLY = 0.15  # of a tick, by which positions may come early (assumed)
 
 
-class ListeningNodes(canopen.Nodes):
-    """The nodes and the newest command of somebody else, whose frames are no fault here."""
-
-    def __init__(self, machine: Machine) -> None:
-        super().__init__(machine)
-        self.heard = np.zeros(machine.n + 1, bool)  # heartbeats of each node
-        self.command: Array = np.zeros(machine.n)  # counts of 127
-        self.command_time = -np.inf  # s
-
-    def update(self, frame: Frame) -> None:
-        """Take in one frame."""
-        super().update(frame._replace(sent=True))
-        if frame.id in self.heartbeat_index:
-            self.heard[self.heartbeat_index[frame.id]] = True
-        elif frame.id == self.machine.valve_frame_id and len(frame.data) == 8:
-            u, enable = canopen.read_valve_frame(self.machine, frame.data)
-            self.command, self.command_time = np.rint(PWM_MAX * u * enable), frame.time
-
-
 class Shadow(hw.Drive):
     """A `Drive` that sends nothing, or with `sync` SYNC and the start of the nodes alone."""
-
-    nodes: ListeningNodes
 
     def __init__(
         self, machine: Machine, controller: Any, bus: Bus, operator: Operator | None, sync: bool
     ) -> None:
         super().__init__(machine, controller, bus, operator or self.follow)
         bus.allowed = (canopen.NMT, canopen.SYNC) if sync else ()
-        self.nodes, self.sync = ListeningNodes(machine), sync
+        self.sync = sync
         self.would_send: Array = np.zeros(machine.n)  # counts of 127
         self.pairs: list[tuple[Array, Array]] = []  # it and what was sent, while it would drive
         self.faults: Counter[str] = Counter()  # ticks with each
@@ -74,43 +53,52 @@ class Shadow(hw.Drive):
             due = self.positions_time + (1 - EARLY) * self.machine.dt
             self.start_time = due - self.deadline_number * self.machine.dt
         super().wait()
-        nodes, now = self.nodes, self.bus.now()
-        nodes.frames[:] = 0  # somebody else may ask more often
-        nodes.heartbeat[~nodes.heard] = now  # nobody has set up their heartbeats
-        nodes.nmt[~nodes.heard] = canopen.OPERATIONAL
-        recent = now - nodes.command_time < canopen.WATCHDOG
-        sent = nodes.command if recent else np.zeros(self.machine.n)
+        self.nodes.frames[:] = 0  # somebody else may ask more often
+        self.nodes.nmt[self.unheard] = canopen.OPERATIONAL
+        recent = self.nodes.enable and self.bus.now() - self.nodes.valve_time < canopen.WATCHDOG
+        sent = np.rint(PWM_MAX * self.nodes.u * recent)
         if self.gate.driving:
             self.pairs.append((self.would_send, sent))
         moved_by = self.gate.sent.copy()  # history and gate go on from what was sent
         moved_by[:, -1] = sent
         self.gate = self.gate._replace(sent=moved_by)
 
+    def inputs(self, command: Array, counts: Array) -> GateInputs:
+        """What the gate gets; nobody has set up heartbeats, and frames of others are no fault."""
+        heartbeat = np.where(self.unheard, self.bus.now(), self.nodes.heartbeat)
+        inputs = super().inputs(command, counts)
+        return inputs._replace(heartbeat=heartbeat, other_sender=np.array(False))
+
+    @property
+    def unheard(self) -> Array:
+        """Nodes that never sent a heartbeat, (n + 1,)."""
+        return np.isneginf(self.nodes.heartbeat)
+
     def control(self, counts: Array) -> Array:
         """The controller's command [counts of 127] (n,)."""
         self.positions_time = self.bus.now()
         return super().control(counts)
 
-    def send_command(self, command: Array, counts: Array, now: float) -> None:
+    def send_command(self, command: Array, counts: Array) -> None:
         """Pass the gate, and keep what it says."""
-        super().send_command(command, counts, now)
+        super().send_command(command, counts)
         self.would_send = self.gate.sent[:, -1]
         if self.gate.active_fault and self.ticks > 1:  # the first tick always counts as late
             self.faults[fault_name(self.machine, int(self.gate.active_fault))] += 1
 
     def report(self) -> str:
         """Both commands compared joint by joint, and what the gate would have stopped."""
-        m, heard = self.machine, self.nodes.heard
+        m = self.machine
         would, sent = np.array(self.pairs, float).reshape(-1, 2, m.n).swapaxes(0, 1)
         lines = [f"compared in {len(would)} of {self.ticks} ticks, in counts of {PWM_MAX}:"]
         for i in m.driven if len(would) else ():
             a, b = would[:, i], sent[:, i]
             r = f"{np.corrcoef(a, b)[0, 1]:+.2f}" if np.ptp(a) and np.ptp(b) else "none"
             lines.append(f"  {m.names[i]}: correlation {r}, mean difference {np.mean(a - b):+.1f}")
-        if np.isinf(self.nodes.command_time):
+        if np.isinf(self.nodes.valve_time):
             lines.append(f"no valve frame with identifier 0x{m.valve_frame_id:X} came")
-        if not heard.all():
-            names = np.array([*m.names, "valve controller"])[~heard]
+        if self.unheard.any():
+            names = np.array([*m.names, "valve controller"])[self.unheard]
             lines.append(f"no heartbeat came from {', '.join(names)}")
         lines += [f"the gate would have stopped {k} ticks: {f}" for f, k in self.faults.items()]
         return "\n".join(lines)

@@ -5,7 +5,7 @@ It plays the part of a real Brokk on the bus; the program that drives it cannot 
 
 import gc
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +15,7 @@ from brokk_min.actuator import PLANT, Plant
 from brokk_min.can import canopen
 from brokk_min.can.canopen import OPERATIONAL, WATCHDOG, Array, Frame, checksum
 from brokk_min.can.connection import open_bus, stop_signals
-from brokk_min.machine import Machine, require
+from brokk_min.machine import Machine
 
 PRE_OPERATIONAL = 127  # NMT state after each NMT command but the start
 Frames = list[tuple[int, bytes]]  # identifiers and data
@@ -131,38 +131,24 @@ class SimulatedMachine:
     def _on_sdo(self, node: int, data: bytes) -> bytes:
         """Objects are read; what is written has its fixed value already."""
         command, *address, _ = struct.unpack("<BHBI", data)
-        values = {
-            canopen.RESOLUTION_OBJECT: 2**self.machine.encoder_bits,
-            canopen.TPDO1_OBJECT: canopen.TPDO1 + node,
-            (canopen.MAPPING_OBJECT, 0): 1,
-            (canopen.MAPPING_OBJECT, 1): canopen.POSITION_ENTRY,
-        }
-        answer = (0x43, values.get((*address,), 0)) if command == 0x40 else (0x60, 0)
+        objects = canopen.encoder_objects(self.machine, node)
+        value, _ = objects.get((*address,), (0, ""))
+        answer = (0x43, value) if command == 0x40 else (0x60, 0)
         return struct.pack("<BHBI", answer[0], *address, answer[1])
 
 
-def start_pose(machine: Machine, q: Sequence[float]) -> Array:
-    """Angles at the start [rad] (n,): `q`, or by default `q_start` with the first joint forward.
-
-    Without `q_start`, the default is the middle of the ranges. ValueError: no pose of the machine.
-    """
-    low, high = machine.column("q_min"), machine.column("q_max")
-    default = (0.0, *machine.q_start[1:]) if machine.q_start else (low + high) / 2
-    pose = np.array(q or default, float)
-    fits = pose.shape == (machine.n,) and bool(((low <= pose) & (pose <= high)).all())
-    require(fits, "start", f"{machine.n} angles within the joints' ranges", pose.tolist())
-    return pose
+def start_pose(machine: Machine) -> Array:
+    """Angles at the start [rad] (n,): `q_start` with the first joint forward, else mid-range."""
+    if machine.q_start:
+        return np.array([0.0, *machine.q_start[1:]])
+    return (machine.column("q_min") + machine.column("q_max")) / 2
 
 
-def simulate(
-    machine: Machine, q: Sequence[float], interface: str, channel: str, plant: Plant = PLANT
-) -> None:
+def simulate(machine: Machine, interface: str, channel: str, plant: Plant = PLANT) -> None:
     """Run a simulated machine on a bus until SIGINT or SIGTERM.
 
-    It starts at `start_pose(machine, q)` and prints why its valve controller stops.
-    ValueError: no such bus, or no such pose.
+    It starts at `start_pose` and prints why its valve controller stops. ValueError: no such bus.
     """
-    pose = start_pose(machine, q)
     gc.freeze()  # no long garbage collection while the encoders should answer
     with open_bus(interface, channel) as bus, stop_signals() as signals:
         start = bus.now()
@@ -170,7 +156,7 @@ def simulate(
         def report(reason: str) -> None:
             print(f"{bus.now() - start:.3f} s, valve controller stops: {reason}", flush=True)
 
-        simulated = SimulatedMachine(machine, pose, start, plant, report)
+        simulated = SimulatedMachine(machine, start_pose(machine), start, plant, report)
         answers: Frames = []
         while not signals:
             for can_id, data in answers:

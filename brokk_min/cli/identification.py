@@ -20,8 +20,6 @@ from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
 from brokk_min.identification.net_file import load_net, save_net
 from brokk_min.machine import BROKK_170, Machine, require
 
-TABLES = (".csv", ".npz")
-
 
 @dataclass(kw_only=True)
 class Collect(Command):
@@ -35,7 +33,7 @@ class Collect(Command):
 
     def __call__(self) -> None:
         machine = self.find_machine()
-        check(self.out.suffix in TABLES, "--out", "a name in .csv or .npz", self.out)
+        check(self.out.suffix in (".csv", ".npz"), "--out", "a name in .csv or .npz", self.out)
         check(0 < self.hours <= 100, "--hours", "above 0, to 100", self.hours)
         self.writes(self.out)
         rng, plant = np.random.default_rng(self.seed), find_plant(self.plant, machine)
@@ -49,7 +47,7 @@ class ReadsLogs(Command):
     """Options of commands that read logs."""
 
     map: str = ""  # Columns and units, as boom=Boom_ang:deg,u_boom=Lever:percent,time=Zeit:ms.
-    topics: tuple[str, str] = ("/joint_states", "/commands")  # Angles and commands, of ROS.
+    topics: tuple[str, str] = columns.TOPICS  # Angles and commands, of ROS.
 
     def read_logs(self, paths: Sequence[Path]) -> tuple[logs.Log, Machine | None]:
         """One log of tables and drives; the machine if the log has its joints, which it orders.
@@ -58,16 +56,14 @@ class ReadsLogs(Command):
         the default one.
         """
         check(len(paths) > 0, "LOGS", "one file or more", "none")
-        machine = self.find_machine()
-        fastest = dict(zip(machine.names, machine.q_dot_max.tolist(), strict=True))
+        machine, mapped = self.find_machine(), columns.parse_map(self.map)
         found = {}
         for path in paths:
             with located(path):
-                if is_ros(path) or path.suffix.lower() in TABLES:
-                    window, rate = machine.velocity_samples, machine.rate
-                    found[path] = logs.read_log([path], window, rate, fastest, self.read_table)
+                if columns.is_table(path):
+                    found[path] = logs.read_log(path, machine, mapped, self.topics)
                 else:
-                    require(not self.map, "--map", "a table or a recording of ROS", "a CAN log")
+                    require(not mapped, "--map", "a table or a recording of ROS", "a CAN log")
                     found[path] = log_for_fit(machine, read_frames(path))
         log = logs.join_logs(found)
         known = [j.name for j in machine.joints if j.driven or j.name in log.joints]
@@ -75,20 +71,6 @@ class ReadsLogs(Command):
             return log, None
         with located(*paths):
             return logs.in_order(log, known), machine
-
-    def read_table(self, path: Path) -> dict[str, Any]:
-        """The columns of a table or of a recording of ROS."""
-        mapped = columns.parse_map(self.map)
-        if not is_ros(path):
-            return columns.load_table(path, mapped)
-        from brokk_min.identification.ros_logs import read_ros
-
-        return columns.to_columns(path, read_ros(path, *self.topics), mapped)
-
-
-def is_ros(path: Path) -> bool:
-    """Is this a folder or a file of ROS, by its name?"""
-    return path.is_dir() or path.suffix.lower() in (".mcap", ".db3", ".bag")
 
 
 @dataclass(kw_only=True)
@@ -156,16 +138,17 @@ class Fit(ReadsLogs):
                 raise ValueError(wrong)
             net = fitting.fit(log, self.settings, self.seed, machine, known.name if known else "")
         with located(*self.test, *self.logs):
-            scores = validation.validate(net, logs.in_order(test, log.joints))
-        scores["warnings"] += inspection.warnings(log, reports, known)
+            scores = validation.score(net, logs.in_order(test, log.joints))
+        warnings = validation.warnings(scores) + inspection.warnings(log, reports, known)
         save_net(self.out, net)
         if self.json:
             files = {"logs": list(map(str, self.logs)), "test": list(map(str, self.test))}
             of_net = {"machine": net.machine, "rate": net.rate, "history": net.history}
-            write_json(self.json, {"meta": {**files, **of_net, **net.training}, **scores})
+            meta = {**files, **of_net, **net.training}
+            write_json(self.json, {"meta": meta, "joints": scores, "warnings": warnings})
         tried = brief([recording.name for recording in test.recordings])
         print(f"{self.out}: nets of {net.machine or 'an unknown machine'}, scored on {tried}")
-        print_scores(scores["joints"], scores["warnings"])
+        print_scores(scores, warnings)
 
 
 def print_scores(scores: Mapping[str, Any], warnings: Sequence[str]) -> None:

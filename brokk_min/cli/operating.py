@@ -29,14 +29,13 @@ class Simulate(Command):
 
     interface: str  # python-can's name of the bus, udp_multicast for a try without hardware.
     channel: str  # Channel of the interface, for udp_multicast 239.74.163.2.
-    start: tuple[float, ...] = ()  # First angles [rad]; by default the paper's, or mid-range.
     plant: str = "analytic"  # What moves, or FILE.py:NAME, stepped every `plant_dt`.
 
     def __call__(self) -> None:
         machine = self.find_machine()
         plant = find_plant(self.plant, machine)
         print(f"{self.machine} on {self.interface} {self.channel}; Ctrl-C ends it", flush=True)
-        simulate(machine, self.start, self.interface, self.channel, plant)
+        simulate(machine, self.interface, self.channel, plant)
 
 
 @dataclass(kw_only=True)
@@ -116,8 +115,8 @@ def status(drive: hw.Drive) -> str:
     if isinstance(drive, Shadow) and drive.pairs:
         would_send, sent = drive.pairs[-1]
         vectors |= {"would send": would_send / PWM_MAX, "sent": sent / PWM_MAX}
-    words += [f"{name} {' '.join(f'{x:+.2f}' for x in row)}" for name, row in vectors.items()]
-    words += [f"late {1e3 * drive.lateness:.1f} ms, skipped {drive.skipped}"]
+    words += [f"{name} {' '.join(f'{x:+z.2f}' for x in row)}" for name, row in vectors.items()]
+    words += [f"late {1e3 * drive.lateness:.1f} ms"]
     return ", ".join(filter(None, words))
 
 
@@ -145,7 +144,6 @@ class Replay(Command):
 
     log: Positional[Path]  # That `drive --log` wrote.
     out: Path  # File to write, .gif.
-    fps: float = 10.0  # Pictures per second.
 
     def __call__(self) -> None:
         from brokk_min.viewer.replay import film
@@ -153,8 +151,7 @@ class Replay(Command):
         machine = self.find_machine()
         self.writes(self.out)
         check(self.out.suffix == ".gif", "--out", "a name in .gif", self.out)
-        check(0.1 <= self.fps <= 100, "--fps", "0.1 to 100", self.fps)
-        film(self.log, machine, self.out, self.fps)
+        film(self.log, machine, self.out)
 
 
 @dataclass(kw_only=True)

@@ -1,6 +1,6 @@
 """The commands that train."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,14 +34,15 @@ class Training(Command):
 
     def recipe(self) -> Recipe:
         """The agent and its learner."""
-        learner, task = self.learner, self.task
         check(self.seed >= 0, "--seed", "0 or more", self.seed)
+        learner, task = self.learner, self.task
         check_settings(learner)
         check_settings(task)
         check(learner.gamma < 1, "--gamma", "below 1", learner.gamma)
         fits = task.hold_min_s <= task.hold_max_s
         check(fits, "--hold-max-s", f"{task.hold_min_s} or more", task.hold_max_s)
-        return Recipe("paper" if self.paper else "beyond", self.critic, task, learner)
+        recipe = find_recipe(self.paper, self.critic)
+        return replace(recipe, task=task, learner=learner)
 
 
 @dataclass(kw_only=True)
@@ -54,9 +55,12 @@ class Train(Training):
         from brokk_min.learning.checkpoint import train_policy
 
         machine, recipe = self.find_machine(), self.recipe()
+        checkpoint = Path(f"{self.out}.checkpoint")
         self.writes(self.out)
+        fits = self.resume or not checkpoint.exists()
+        check(fits, str(checkpoint), "--resume or no checkpoint", "one of a broken training")
         net = load_net(self.actuator, machine)
-        train_policy(machine, net, recipe, self.seed, self.out, self.resume)
+        train_policy(machine, net, recipe, self.seed, self.out)
         print(f"{self.out}: trained; curve in {self.out}.csv")
 
 
@@ -69,10 +73,13 @@ class Sweep(Training):
     num_starts: int = 16  # Start poses for each scored sequence.
 
     def __call__(self) -> None:
-        from brokk_min.evaluation.sweep import show, sweep
+        from brokk_min.evaluation.metrics import COLUMNS, interval_text
+        from brokk_min.evaluation.sweep import sweep
 
         machine, recipe = self.find_machine(), self.recipe()
         check(self.seeds > 0, "--seeds", "1 or more", self.seeds)
         seeds = range(self.seed, self.seed + self.seeds)
         net = load_net(self.actuator, machine)
-        print(show(sweep(machine, net, recipe, seeds, self.out, self.num_starts, self.scheduler)))
+        table = sweep(machine, net, recipe, seeds, self.out, self.num_starts, self.scheduler)
+        print("mean over seeds (95 % interval)")
+        print("\n".join(f"{key:24} {interval_text(table['all'][key])}" for key in COLUMNS))

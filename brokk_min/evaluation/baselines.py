@@ -1,7 +1,7 @@
 """The classical controllers that the policy is compared with: gains, tuning, and files of gains."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ BY_HAND, RAW = "pid_by_hand", "pid_by_hand_raw"
 OPTIMISED = "jacobian_pid_k0.1"
 PAPER_BASELINES = (OPTIMISED, "jacobian_pid_k0.05")
 STRONGEST = "jacobian_pid_ff_integral"
-TUNED = (OPTIMISED, STRONGEST)  # by `tune`
+TUNED = {OPTIMISED: 1, STRONGEST: 2}  # by `tune`, with so many times the generations below
 EFFORT = (40, 10, 20.0)  # of tuning, assumed: generations, runs of a candidate, their length [s]
 CANDIDATES = 24  # of each generation
 SPREAD = 0.12  # of the first candidates, as a fraction of the roots of the ranges, assumed
@@ -135,19 +135,13 @@ def overshoots(machine: Machine, known: Machine, plant: Plant, kp: Array, ki: Ar
 
 def gains_vector(gains: Gains) -> Array:
     """Gains as one vector (..., size), in the order of their fields."""
-    return np.concatenate([getattr(gains, field.name) for field in fields(gains)], axis=-1)
+    return np.concatenate(list(vars(gains).values()), axis=-1)
 
 
 def gains_of(like: Gains, vector: Array) -> Any:
     """Gains of the kind of `like` from a vector (..., size): the inverse of `gains_vector`."""
-    sizes = [getattr(like, field.name).shape[-1] for field in fields(like)]
+    sizes = [array.shape[-1] for array in vars(like).values()]
     return type(like)(*np.split(vector, np.cumsum(sizes)[:-1], axis=-1))
-
-
-def gain_bounds(gains: Gains) -> Array:
-    """Smallest and largest gains of `RANGES` as vectors, (2, size)."""
-    sizes = [getattr(gains, field.name).shape[-1] for field in fields(gains)]
-    return np.repeat([RANGES[field.name] for field in fields(gains)], sizes, axis=0).T
 
 
 def tuning_cost(
@@ -181,44 +175,24 @@ def tune(gains: Gains, cost: Callable[[Array], Array], seed: int, generations: i
     """
     from scipy.optimize import Bounds, differential_evolution  # slow to import
 
-    low, high = gain_bounds(gains)
+    sizes = [array.shape[-1] for array in vars(gains).values()]
+    low, high = np.repeat([RANGES[name] for name in vars(gains)], sizes, axis=0).T
     start = np.sqrt(np.clip((gains_vector(gains) - low) / (high - low), 0, 1))
     rng = np.random.default_rng(seed)
     first = np.clip(rng.normal(start, SPREAD, (CANDIDATES, len(start))), 0, 1)
     first[0] = start
-
-    def at(x: Array) -> Array:
-        return np.asarray(low + x**2 * (high - low))
-
     with tqdm(total=generations + 1, desc="tune", unit="generation", disable=None) as bar:
 
         def objective(x: Any) -> Any:
             bar.update()
-            return cost(at(x.T))
+            return cost(low + x.T**2 * (high - low))
 
         result = differential_evolution(
             objective, Bounds(0 * start, 0 * start + 1), init=first, rng=seed,
             maxiter=generations, mutation=(0.4, 0.9), tol=0, polish=False,
             vectorized=True, updating="deferred",
         )  # fmt: skip
-    return at(result.x)
-
-
-def tune_baseline(
-    controller: JacobianController, effort: tuple[int, int, float], seed: int, plant: Plant = PLANT
-) -> Gains:
-    """Tuned gains of one of the `baselines`, beginning with its own; for `effort` see `EFFORT`.
-
-    The runs are on the `plant` itself, which favours the baselines, because the policy is trained
-    on nets alone. The strongest has more gains, so it gets twice the generations.
-    """
-    generations, num, seconds = effort
-    if isinstance(controller, StrongPID):
-        generations *= 2
-    runs = tuning_set(controller.machine, num, seed, seconds)
-    cost = partial(tuning_cost, controller, runs, seed, plant)
-    vector = tune(controller.gains, cost, seed, generations)
-    return gains_of(controller.gains, vector)  # type: ignore[no-any-return]
+    return np.asarray(low + result.x**2 * (high - low))
 
 
 def tuned_baselines(
@@ -228,11 +202,18 @@ def tuned_baselines(
     seed: int,
     plant: Plant = PLANT,
 ) -> dict[str, JacobianController]:
-    """The `baselines` with gains by hand, and with tuned ones, see `tune_baseline`."""
+    """The `baselines` with gains by hand, and with tuned ones; for `effort` see `EFFORT`.
+
+    The runs are on the `plant` itself, which favours the baselines, because the policy is trained
+    on nets alone.
+    """
+    generations, num, seconds = effort
+    runs = tuning_set(machine, num, seed, seconds)
     gains = first_gains(machine, plant)
     first = baselines(machine, net, gains)
-    for name in TUNED:
-        gains[name] = tune_baseline(first[name], effort, seed, plant)
+    for name, factor in TUNED.items():
+        cost = partial(tuning_cost, first[name], runs, seed, plant)
+        gains[name] = gains_of(gains[name], tune(gains[name], cost, seed, factor * generations))
     return baselines(machine, net, gains)
 
 
@@ -245,7 +226,7 @@ def write_gains(
     path: Path, controllers: Mapping[str, JacobianController], meta: Mapping[str, Any]
 ) -> None:
     """Write gains as `read_gains` reads them; `meta` includes `gains_metadata`."""
-    every = {name: asdict(controller.gains) for name, controller in controllers.items()}
+    every = {name: vars(controller.gains) for name, controller in controllers.items()}
     gains = {name: {k: array.tolist() for k, array in of.items()} for name, of in every.items()}
     write_json(path, {"meta": meta, "gains": gains})
 

@@ -5,14 +5,15 @@ Paper: Sec. 3.2, 4.1, 4.2, 5
 """
 
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from brokk_min.evaluation.baselines import BY_HAND, OPTIMISED, RAW
-from brokk_min.evaluation.metrics import Mean, Run, by_start, column, mean_interval
+from brokk_min.evaluation.metrics import Mean, Run, by_start, mean_interval
 from brokk_min.evaluation.preliminary import Motion, SimulatorTests, response_time
 from brokk_min.evaluation.rollout import TITLES
 
@@ -21,46 +22,34 @@ TEXTS: dict[str, dict[str, Any]] = tomllib.loads(
 )
 POLICIES = ("rl_paper", "rl_critic")  # the paper's agent
 PIDS = (RAW, BY_HAND, OPTIMISED)  # with the paper's structure, by hand first
-VERDICTS = {True: "holds here", False: "does not hold here", None: "was not measured"}
 ERROR, DRIFT = "velocity_error_mean", "off_axis_drift_max"
 SHORT = {ERROR: "error", DRIFT: "drift"}  # in columns
 
 
 def claim(name: str, numbers: Mapping[str, Mapping[str, Mean]]) -> dict[str, Any]:
-    """A sentence of `claims.toml` with its verdict, as in `results.json`.
+    """A sentence of `claims.toml` with its verdicts, as in `results.json`.
 
-    `numbers` are by what is judged and by what they are of. The sentence holds where all numbers,
-    with their intervals, are beyond the limit. One without an interval was not measured.
+    `numbers` are by what is judged and by what they are of.
     """
     text = TEXTS[name]
-    side, end = ("above", "low") if "above" in text else ("below", "high")
-    limit = text[side]
-    verdicts = dict[str, list[str]]()
-    for judged, row in numbers.items():
-        ends = [number[end] for number in row.values()]
-        known = [x for x in ends if x is not None]
-        beyond = all(x > limit if side == "above" else x < limit for x in known)
-        verdict = VERDICTS[beyond if len(known) == len(ends) else None]
-        verdicts.setdefault(verdict, []).append(judged)
+    side = "above" if "above" in text else "below"
     return {
         "figure": text["figure"],
         "paper": text["paper"],
-        "measured": f"{text['measure']}, to be {side} {limit:g}",
+        "measured": f"{text['measure']}, to be {side} {text[side]:g}",
         "numbers": numbers,
-        "verdict": "; ".join(f"{verdict} for {listed(of)}" for verdict, of in verdicts.items()),
+        "verdicts": {judged: verdict(text, row.values()) for judged, row in numbers.items()},
     }
 
 
-def listed(judged: Sequence[str]) -> str:
-    """Names as text; a controller that is judged against several others is named once."""
-    against: dict[str, list[str]] = {}
-    for name in judged:
-        first, *other = name.split(" against ")
-        against.setdefault(first, []).extend(other)
-    names = []
-    for first, others in against.items():
-        names.append(f"{first} (against {' / '.join(others)})" if others else first)
-    return " and ".join(names)
+def verdict(text: Mapping[str, Any], numbers: Iterable[Mean]) -> str:
+    """A sentence holds where all numbers, with their intervals, are beyond its limit."""
+    ends = [number["low" if "above" in text else "high"] for number in numbers]
+    known = [end for end in ends if end is not None]
+    if len(known) < len(ends):
+        return "was not measured"
+    beyond = min(known) > text["above"] if "above" in text else max(known) < text["below"]
+    return "holds here" if beyond else "does not hold here"
 
 
 def net_claims(nets: SimulatorTests, gap: Motion) -> list[dict[str, Any]]:
@@ -87,9 +76,8 @@ def net_claims(nets: SimulatorTests, gap: Motion) -> list[dict[str, Any]]:
 def task_claims(runs: Sequence[Run]) -> list[dict[str, Any]]:
     """The claims on task-space control, of the paper's agent and each PID.
 
-    `runs` are those that count. Paper: Sec. 4.2 and 5, Fig. 6
+    Paper: Sec. 4.2 and 5, Fig. 6
     """
-    policies = [name for name in POLICIES if name in column(runs, "controller")]
 
     def drift(names: Sequence[str]) -> dict[str, dict[str, Mean]]:
         """Of each controller, along x."""
@@ -99,18 +87,15 @@ def task_claims(runs: Sequence[Run]) -> list[dict[str, Any]]:
     def less(sequences: Sequence[str], keys: Sequence[str] = (ERROR,)) -> dict[str, Any]:
         """Figures of each policy less those of each PID: negative where the policy is better."""
         numbers: dict[str, dict[str, Mean]] = {}
-        for policy in policies:
-            for pid in PIDS:
-                row = numbers.setdefault(f"{TITLES[policy]} against {TITLES[pid]}", {})
-                for s in sequences:
-                    for key in keys:
-                        of_pid = by_start(runs, pid, s, key)
-                        difference = by_start(runs, policy, s, key) - of_pid
-                        row[f"{SHORT[key]} along {s}"] = mean_interval(difference)
+        for policy, pid in product(POLICIES, PIDS):
+            row = numbers[f"{TITLES[policy]} against {TITLES[pid]}"] = {}
+            for s, key in product(sequences, keys):
+                difference = by_start(runs, policy, s, key) - by_start(runs, pid, s, key)
+                row[f"{SHORT[key]} along {s}"] = mean_interval(difference)
         return numbers
 
     return [
-        claim("still", drift(policies)),
+        claim("still", drift(POLICIES)),
         claim("drift", drift(PIDS)),
         claim("tracking", less("xyz")),
         claim("along_z", less("z", (ERROR, DRIFT))),

@@ -11,7 +11,7 @@ from tqdm import tqdm
 from brokk_min import __version__
 from brokk_min.actuator import PLANT, Plant
 from brokk_min.evaluation.rollout import Controller, Trace, rollout
-from brokk_min.evaluation.sequences import Commands, start_kinds
+from brokk_min.evaluation.sequences import Commands
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
 from brokk_min.settings import TaskConfig
@@ -21,7 +21,7 @@ Traces = Mapping[tuple[str, str], Trace]  # by controller and sequence, starts a
 Run = Mapping[str, Any]  # controller, sequence, start, kind, then the figures of `metrics`
 Rows = list[dict[str, Any]]  # of one `Run` each
 Mean = Mapping[str, float | None]  # "mean", and its interval "low" to "high"
-LABELS = ("controller", "sequence", "start", "kind")  # of a row; "seed" is of a sweep
+LABELS = ("controller", "sequence", "start", "kind", "seed")  # of a row; the seed is of a sweep
 COLUMNS = {  # of tables, with their heads
     "velocity_error_mean": "error [m/s]",
     "off_axis_drift_max": "drift [m]",
@@ -83,9 +83,10 @@ def evaluate(
     """Run every controller on the same sequences, starts and noise. Paper: Sec. 4.2, Fig. 6
 
     `starts` are angles [rad] (starts, n). The sensors have the noise of training. Returns one row
-    per controller, sequence and start, see `metrics`; and traces.
+    per controller, sequence and start, see `metrics`; and traces. The kind of the starts is
+    "workspace", because the machine's own sequences are feasible from them; the command `evaluate`
+    calls those of a user's file "file".
     """
-    kinds = start_kinds(machine, starts)
     p_start = tool_position(forward_kinematics(machine, starts))
     goals = {s.name: s.for_starts(machine, starts) for s in sequences}  # all are one batch
     ticks = max(len(of) for of in goals.values())
@@ -100,10 +101,10 @@ def evaluate(
             part = slice(i * len(starts), (i + 1) * len(starts))
             trace = Trace(*(array[: len(goal), part] for array in every))
             columns = metrics(machine, trace, goal, p_start)
-            for start, kind in enumerate(kinds):
-                labels = zip(LABELS, (name, sequence, start, kind), strict=True)
-                figures = {key: float(column[start]) for key, column in columns.items()}
-                rows.append(dict(labels) | figures)
+            for start in range(len(starts)):
+                labels = {"controller": name, "sequence": sequence, "start": start}
+                figures = {key: float(of[start]) for key, of in columns.items()}
+                rows.append(labels | {"kind": "workspace"} | figures)
             traces[name, sequence] = trace
     return rows, traces
 
@@ -146,10 +147,8 @@ def interval_text(number: Mean) -> str:
         >>> interval_text({"mean": 0.01234, "low": -0.5, "high": 41.267})
         '0.0123 (-0.5000 to 41.27)'
     """
-    numbers = [number[key] for key in ("mean", "low", "high")]
-    texts = [f"{x:.4f}" if abs(x) < 1 else f"{x:.4g}" for x in numbers if x is not None]
-    alone = number["low"] in (None, number["mean"])
-    return "".join(texts[:1]) if alone else f"{texts[0]} ({texts[1]} to {texts[2]})"
+    texts = [f"{x:.4f}" if abs(x) < 1 else f"{x:.4g}" for x in number.values() if x is not None]
+    return texts[0] if len(set(texts)) == 1 else "{} ({} to {})".format(*texts)
 
 
 def column(runs: Sequence[Run], label: str) -> list[str]:
@@ -160,7 +159,7 @@ def column(runs: Sequence[Run], label: str) -> list[str]:
 def means(runs: Sequence[Run]) -> dict[str, dict[str, dict[str, Mean]]]:
     """Means over starts with intervals, by controller, sequence (also "all") and figure."""
     sequences = [*column(runs, "sequence"), "all"]
-    keys = [key for key in runs[0] if key not in (*LABELS, "seed")]
+    keys = [key for key in runs[0] if key not in LABELS]
     return {
         c: {s: {k: mean_interval(by_start(runs, c, s, k)) for k in keys} for s in sequences}
         for c in column(runs, "controller")

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from jinja2 import StrictUndefined, Template
 from matplotlib import style
 from matplotlib.figure import Figure
 from tqdm import tqdm
@@ -23,8 +23,8 @@ from brokk_min.machine import BROKK_170, Machine
 
 Results = Mapping[str, Any]  # of `results.json`
 Tests = Mapping[str, SimulatorTests]
-PAIRS = (("rl_paper", BY_HAND), ("rl_paper", OPTIMISED), ("rl", STRONGEST))  # within a class
 ROWS = (BY_HAND, OPTIMISED, "rl_paper", "rl", STRONGEST)
+PAIRS = (("rl_paper", BY_HAND), ("rl_paper", OPTIMISED), ("rl", STRONGEST))  # within a class
 BOUND = 0.0098  # m/s, of `benchmarks/perfect_model.py`, which knows the plant of the Brokk 170
 
 
@@ -34,18 +34,16 @@ def write_report(
 ) -> None:
     """Write `report.html` to the folder `out`; `measured` is what the paper's figures show."""
     tests, gap, traces = measured
-    starts, kinds = np.array(results["starts"]), results["start_kinds"]
-    run = kinds.index("workspace")  # the first from which all sequences can be followed
-    table = first_table(results)
+    starts, table = np.array(results["starts"]), first_table(results)
     drawn = {
         "errors": figures.plot_errors({c: table[c]["velocity_error_mean"] for c in ROWS}),
         "tests": figures.plot_tests(machine, tests),
         "gap": figures.plot_gap(machine, gap),
-        "starts": figures.plot_starts(machine, starts[np.array(kinds) == "workspace"]),
-        "joints": figures.plot_joint_velocities(machine, traces, "x", run),
+        "starts": figures.plot_starts(machine, starts),
+        "joints": figures.plot_joint_velocities(machine, traces, "x"),
     }
     for axis in axis_sequences(machine):
-        drawn[axis.name] = figures.plot_sequence(machine, traces, axis, starts[run], run)
+        drawn[axis.name] = figures.plot_sequence(machine, traces, axis, starts)
     images = {name: png(figure) for name, figure in tqdm(drawn.items(), "draw", disable=None)}
     with whole_file(out / "report.html", "w") as file:
         file.write(render(results, images))
@@ -60,21 +58,16 @@ def png(figure: Figure) -> str:
 
 def first_table(results: Results) -> Results:
     """Means along x, y and z by controller: of these results, or of shipped ones for a trial."""
-    meta = results["meta"]
-    shipped = SHIPPED / meta["machine"] / "table.json"
-    trial = meta["effort"]["hours"] < 1 and shipped.exists()
-    table: Results = read_json(shipped, "JSON") if trial else results
-    return table["table"]  # type: ignore[no-any-return]
+    shipped = SHIPPED / results["meta"]["machine"] / "table.json"
+    trial = results["meta"]["effort"]["hours"] < 1 and shipped.exists()
+    return (read_json(shipped, "JSON") if trial else results)["table"]  # type: ignore[no-any-return]
 
 
 def render(results: Results, images: Mapping[str, str]) -> str:
     """The page, with PNG `images` in base64 by name."""
-    folder = Path(__file__).parent
-    page = Environment(loader=FileSystemLoader(folder), autoescape=True, undefined=StrictUndefined)
-    page.filters["interval"] = interval_text
-    page.globals.update(rows=ROWS, pairs=PAIRS, columns=COLUMNS, titles=TITLES, rest=valves_at_rest)
-    table = first_table(results)
+    text = Path(__file__).with_suffix(".html.j2").read_text("utf-8")
     bound = BOUND if results["meta"]["machine"] == BROKK_170.name else None
-    shipped = table is not results["table"]
-    values = {"results": results, "images": images, "table": table, "bound": bound}
-    return page.get_template("report.html.j2").render(shipped=shipped, **values)
+    page: Template = Template(text, autoescape=True, undefined=StrictUndefined)
+    page.globals.update(rows=ROWS, pairs=PAIRS, columns=COLUMNS, titles=TITLES)
+    page.globals.update(rest=valves_at_rest, interval=interval_text)
+    return page.render(results=results, images=images, bound=bound, table=first_table(results))

@@ -1,6 +1,6 @@
 """The whole chain: logs, nets, policies, tuned baselines, comparison, report."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -11,8 +11,6 @@ import numpy as np
 from brokk_min._files import write_json
 from brokk_min.actuator import ActuatorNet
 from brokk_min.evaluation import baselines, claims, metrics, preliminary, report, sequences
-from brokk_min.evaluation.robustness import robustness
-from brokk_min.evaluation.rollout import Controller
 from brokk_min.identification import fitting, logs
 from brokk_min.identification.excitation import collect
 from brokk_min.identification.net_file import save_net, select_nets
@@ -21,7 +19,7 @@ from brokk_min.learning.checkpoint import train_policy
 from brokk_min.learning.jobs import side_by_side
 from brokk_min.learning.policy import POLICIES, Policy, PolicyController
 from brokk_min.learning.recipes import find_recipe
-from brokk_min.machine import Machine
+from brokk_min.machine import Array, Machine
 
 
 @dataclass(frozen=True)
@@ -32,11 +30,11 @@ class Budget:
     fit_steps: int = fitting.FitConfig.steps
     train_steps: int | None = None  # None: as many as the recipe has
     tuning: tuple[int, int, float] = baselines.EFFORT
-    starts: int = 64
+    starts: int = 32
     short_s: float = 26.0  # s, longest run for robustness
 
 
-QUICK = Budget(0.1, 700, 100_000, (4, 4, 3.0), 8, 3.0)
+QUICK = Budget(0.1, 700, 100_000, (4, 4, 3.0), 4, 3.0)
 
 
 @dataclass(frozen=True)
@@ -71,7 +69,7 @@ def record(chain: Chain, excitation: str, name: str) -> logs.Log:
     machine, file = chain.machine, chain.out / f"{name}.npz"
     rng = np.random.default_rng(chain.seed)
     logs.write_log(file, collect(machine, chain.budget.hours, excitation, rng))
-    return logs.read_log([file], machine.velocity_samples, rate=machine.rate)
+    return logs.read_log(file, machine)
 
 
 def fit_net(chain: Chain, name: str, log: logs.Log, recipe: Mapping[str, Any]) -> ActuatorNet:
@@ -91,8 +89,7 @@ def train(chain: Chain, name: str, net: ActuatorNet) -> Policy:
         recipe = replace(recipe, learner=learner)
     driven = select_nets(chain.machine, net)
     file = chain.out / POLICIES[name]
-    resume = Path(f"{file}.checkpoint").exists()
-    return train_policy(chain.machine, driven, recipe, chain.seed, file, resume)
+    return train_policy(chain.machine, driven, recipe, chain.seed, file)
 
 
 def tune(chain: Chain, net: ActuatorNet) -> dict[str, JacobianController]:
@@ -121,43 +118,61 @@ def learn(chain: Chain, log: logs.Log, paper_log: logs.Log) -> dict[str, Any]:
 def measure(
     chain: Chain, done: Mapping[str, Any]
 ) -> tuple[dict[str, Any], tuple[report.Tests, preliminary.Motion, metrics.Traces]]:
-    """All measurements for `results.json`, and what the figures show. `done` is of `learn`.
-
-    Means, intervals and verdicts are over the "workspace" starts, which can follow all sequences.
-    """
+    """All measurements for `results.json`, and what the figures show. `done` is of `learn`."""
     machine, budget, seed = chain.machine, chain.budget, chain.seed
     net = select_nets(machine, done["net"])
-    policies = {name: PolicyController(machine, done[name]) for name in POLICIES}
-    controllers: dict[str, Controller] = {**policies, **done["pids"]}
+    controllers = {name: PolicyController(machine, done[name]) for name in POLICIES} | done["pids"]
     commands = sequences.task_sequences(machine)
     starts = sequences.evaluation_starts(machine, budget.starts, commands, seed + 2)
-    kinds = sequences.start_kinds(machine, starts)
-    workspace = starts[np.array(kinds) == "workspace"]
-    short = sequences.shorten(machine, commands[:3], budget.short_s)
-    jobs: dict[str, Callable[[], Any]] = {
-        "robustness": partial(robustness, machine, controllers, short, workspace[:16], seed),
-        "runs": partial(metrics.evaluate, machine, controllers, commands, starts, seed),
-    }
+    ticks = round(budget.short_s * machine.rate)
+    short = [axis._replace(goals=axis.goals[:ticks]) for axis in commands[:3]]
     tests, gap = preliminary.run(machine, net, seed)
-    of_jobs = side_by_side(jobs)
-    runs, traces = of_jobs["runs"]
+    runs, traces = metrics.evaluate(machine, controllers, commands, starts, seed)
+    along = metrics.means([run for run in runs if run["sequence"] in sequences.AXES])
     meta = metrics.metadata(machine, seed) | baselines.gains_metadata(machine, net)
     results = {
         "meta": meta | {"effort": asdict(budget)},
-        **summary(runs, claims.net_claims(tests["nets"], gap)),
-        "robustness": of_jobs["robustness"],
+        "table": {name: of["all"] for name, of in along.items()},
+        "task_space": {"runs": runs, "means": metrics.means(runs)},
+        "claims": claims.net_claims(tests["nets"], gap) + claims.task_claims(runs),
+        "robustness": robustness(machine, controllers, short, starts[:16], seed),
         "starts": starts.tolist(),
-        "start_kinds": kinds,
     }
     return results, (tests, gap, traces)
 
 
-def summary(runs: metrics.Rows, of_nets: list[dict[str, Any]]) -> dict[str, Any]:
-    """Runs, their means, and all claims; `table` has the means along x, y and z alone."""
-    scored = [run for run in runs if run["kind"] == "workspace"]
-    along = metrics.means([run for run in scored if run["sequence"] in sequences.AXES])
+def scale_valves(machine: Machine, up: float, down: float) -> Machine:
+    """The machine with other cylinder speeds up and down."""
+    speeds = machine.cylinder_speeds * [up, down]
+    pairs = zip(machine.joints, speeds.tolist(), strict=True)
+    return replace(machine, joints=tuple(replace(j, cylinder_speed=tuple(s)) for j, s in pairs))
+
+
+def variations(machine: Machine) -> dict[str, Machine]:
+    """Machines unknown to the controllers, by name; all numbers assumed."""
     return {
-        "table": {name: of["all"] for name, of in along.items()},
-        "task_space": {"runs": runs, "means": metrics.means(scored)},
-        "claims": of_nets + claims.task_claims(scored),
+        "nominal": machine,
+        "supply flow -70 %": replace(machine, pump_flow=0.3 * machine.pump_flow),
+        "valve gain -20 %": scale_valves(machine, 0.8, 0.8),
+        "valve gain +20 %": scale_valves(machine, 1.2, 1.2),
+        "up -15 %, down +15 %": scale_valves(machine, 0.85, 1.15),
+        "dead zone 5 %": baselines.with_dead_zone(machine, 0.05),
+        "dead zone 10 %": baselines.with_dead_zone(machine, 0.10),
+        "delay +50 ms": replace(machine, delay=machine.delay + 0.050),
     }
+
+
+def robustness(
+    machine: Machine,
+    controllers: metrics.Controllers,
+    commands: Sequence[sequences.Commands],
+    starts: Array,
+    seed: int,
+) -> dict[str, dict[str, metrics.Mean]]:
+    """Mean velocity error [m/s] with its interval, by variation and controller. Paper: Sec. 4.2"""
+    result: dict[str, dict[str, metrics.Mean]] = {}
+    for name, varied in variations(machine).items():
+        runs, _ = metrics.evaluate(varied, controllers, commands, starts, seed)
+        means = metrics.means(runs)
+        result[name] = {c: of["all"]["velocity_error_mean"] for c, of in means.items()}
+    return result

@@ -9,13 +9,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
 from brokk_min._files import SHIPPED, brief, numbers, read_csv
-from brokk_min.env import terminated
-from brokk_min.evaluation.feasibility import MARGINS, feasible
-from brokk_min.jacobian import manipulability, manipulability_threshold
+from brokk_min.jacobian import dls, limit_weights
 from brokk_min.kinematics import forward_kinematics, jacobian, lowest_point, tool_position
 from brokk_min.learning.episodes import draw_goal, draw_hold, draw_pose
 from brokk_min.machine import Array, Machine, require
@@ -26,6 +24,10 @@ REST_SEED = 2026  # of the scored rests; nothing else draws from it
 SECONDS = 26.0  # of a scored sequence, assumed
 SHORTEST_REST, LONGEST_REST = 0.5, 10.0  # s, assumed
 DRAWS, POSES = 30, 400  # so often so many poses are drawn, to find feasible ones (assumed)
+MARGINS = (  # of `feasible`, all assumed
+    "the tool within 20 mm of its path, the arm 0.1 m above the ground, driven joints 0.05 from "
+    "their ends and below 0.9 of their speeds"
+)
 TUNING = TaskConfig(zero_goals=0.3, hold_min_s=0.5, hold_max_s=3.0)  # assumed
 # Rows of seconds and velocity in fractions of tool_speed (assumed).
 # On one axis, as in the paper, with changes of direction:
@@ -51,11 +53,9 @@ class Commands(NamedTuple):
         moves along +x and +y would fit into the arm's reach from one side of the slew range only.
         """
         goals = np.repeat(self.goals[:, None], len(starts), axis=1)
-        if not self.inward:
-            return goals
         sign = np.where(tool_position(forward_kinematics(machine, starts)) > 0, -1.0, 1.0)
         sign[:, 2] = 1.0
-        return sign * goals
+        return sign * goals if self.inward else goals
 
 
 def axis_sequences(machine: Machine) -> list[Commands]:
@@ -113,12 +113,6 @@ def _log_uniform(rng: np.random.Generator, shape: int | tuple[int, ...]) -> Arra
     return np.exp(rng.uniform(np.log(SHORTEST_REST), np.log(LONGEST_REST), shape))
 
 
-def shorten(machine: Machine, commands: Sequence[Commands], seconds: float) -> list[Commands]:
-    """The first seconds of each sequence."""
-    ticks = round(seconds * machine.rate)
-    return [sequence._replace(goals=sequence.goals[:ticks]) for sequence in commands]
-
-
 def read_commands(path: Path, machine: Machine) -> list[Commands]:
     """Sequences of a CSV `sequence,time,vx,vy,vz` [s, m/s]; values hold until the next row.
 
@@ -147,13 +141,12 @@ def read_starts(path: Path, machine: Machine) -> Array:
     """
     table = read_csv(path, *machine.names)
     starts = np.stack([numbers(path, name, table[name]) for name in machine.names], axis=1)
-    for joint, q in zip(machine.joints, starts.T, strict=True):
-        wrong = q[~((q >= joint.q_min) & (q <= joint.q_max))]  # nan is, too
-        wanted = f"{joint.q_min:g} to {joint.q_max:g}"
-        require(not len(wrong), f"{path}: {joint.name}", wanted, wrong[:1])
+    inside = (starts >= machine.column("q_min")) & (starts <= machine.column("q_max"))  # no nan
     lowest = lowest_point(forward_kinematics(machine, starts))
-    wanted = f"arms above {machine.ground} m"
-    require(not terminated(machine, lowest).any(), str(path), wanted, f"{lowest.min():.3f} m")
+    fits = inside.all(axis=1) & (lowest >= machine.ground)
+    row = int(np.argmin(fits))
+    wanted = "angles within the joints' ranges and an arm above the ground"
+    require(bool(fits.all()), f"{path}: row {row + 2}", wanted, starts[row].tolist())
     return starts
 
 
@@ -162,8 +155,8 @@ def evaluation_starts(
 ) -> Array:
     """Start poses [rad] (num, n): the first of the file that the package has for the machine.
 
-    Without a file they are random "workspace" poses from which ideal actuators follow all
-    sequences. ValueError: more starts than the file has, or too few that can follow.
+    Without a file they are random poses from which ideal actuators follow all sequences.
+    ValueError: more starts than the file has, or too few that can follow.
     """
     path = SHIPPED / machine.name / "starts.csv"
     if path.exists():
@@ -174,7 +167,6 @@ def evaluation_starts(
 
     def draw() -> tuple[Array]:
         poses = draw_pose(machine, rng, POSES).round(4)
-        poses = poses[np.array(start_kinds(machine, poses)) == "workspace"]
         for sequence in sequences:
             poses = poses[feasible(machine, poses, sequence.for_starts(machine, poses))]
         return (poses,)
@@ -182,22 +174,31 @@ def evaluation_starts(
     return collected(machine, num, draw)[0]
 
 
-def start_kinds(machine: Machine, starts: Array) -> list[str]:
-    """Kind of each start (num, n): "extended", "limits" or "workspace"; numbers assumed.
+def feasible(machine: Machine, start: Array, goals: Array) -> NDArray[np.bool_]:
+    """Can ideal actuators follow `goals` [m/s] (T, num, 3) from `start` [rad] (num, n)? (num,).
 
-    Extended: the tool is beyond 90 % of the arm's length from the first link's end, and the
-    baselines' damping acts. Limits: a driven joint is within 0.15 rad of an end of its range.
+    Integrates resolved velocities with little damping, and asks for `MARGINS` at each tick.
+    The tool stays on its path where no singularity is crossed.
     """
-    frames = forward_kinematics(machine, starts)
-    reach = np.linalg.norm(frames.p[:, -1] - frames.p[:, 1], axis=-1)
-    slide = [joint.q_max * (joint.kind == "prismatic") for joint in machine.joints]
-    length = np.hypot(machine.column("a"), machine.column("d") + slide)[1:].sum()
-    w = manipulability(jacobian(frames)[..., machine.driven])
-    extended = (reach > 0.9 * length) & (w < manipulability_threshold(machine))
-    margin = np.minimum(starts - machine.column("q_min"), machine.column("q_max") - starts)
-    at_limit = margin[:, machine.driven].min(axis=-1) < 0.15
-    kinds: list[str] = np.select([extended, at_limit], ["extended", "limits"], "workspace").tolist()
-    return kinds
+    q, q_dot = np.array(start, float), np.zeros((len(start), machine.n))
+    p_goal = tool_position(forward_kinematics(machine, q))
+    result = np.ones(len(q), bool)
+    low, high = machine.column("q_min") + 0.05, machine.column("q_max") - 0.05
+    up, down = machine.column("q_dot_up"), machine.column("q_dot_down")
+    for v_goal in goals:
+        frames = forward_kinematics(machine, q)
+        off = p_goal - tool_position(frames)
+        J = jacobian(frames)[..., machine.driven]
+        J_inv = dls(J, limit_weights(machine, q, q_dot)[:, machine.driven], 1e-4)
+        result &= np.linalg.norm(off, axis=-1) < 0.02
+        result &= lowest_point(frames) > machine.ground + 0.1
+        v = v_goal + off  # the second term brings the tool back to its path in 1 s
+        q_dot = np.zeros_like(q)
+        q_dot[:, machine.driven] = (J_inv @ v[..., None])[..., 0]
+        q, p_goal = q + q_dot * machine.dt, p_goal + v_goal * machine.dt
+        result &= ((q > low) & (q < high))[:, machine.driven].all(axis=-1)
+        result &= ((q_dot > -0.9 * down) & (q_dot < 0.9 * up)).all(axis=-1)
+    return result
 
 
 def tuning_set(machine: Machine, num: int, seed: int, seconds: float = 20.0) -> tuple[Array, Array]:
@@ -216,9 +217,9 @@ def tuning_set(machine: Machine, num: int, seed: int, seconds: float = 20.0) -> 
         holds = draw_hold(machine, TUNING, rng, shape[0] * shape[1]).reshape(shape)
         ticks = np.where(v_goal.any(axis=-1), holds, rests)
         drawn = [np.repeat(*of, axis=0) for of in zip(v_goal, ticks, strict=True)]
-        runs = np.array([run[: round(seconds * machine.rate)] for run in drawn])  # (POSES, T, 3)
-        follows = feasible(machine, poses, runs.swapaxes(0, 1))
-        return poses[follows], runs[follows]
+        goals = np.stack([run[: round(seconds * machine.rate)] for run in drawn], axis=1)
+        follows = feasible(machine, poses, goals)
+        return poses[follows], goals.swapaxes(0, 1)[follows]
 
     starts, goals = collected(machine, num, draw)
     return starts, goals.swapaxes(0, 1)

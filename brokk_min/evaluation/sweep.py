@@ -4,15 +4,14 @@ Each seed writes `seed_<n>.npz` and its learning curve; a policy that exists is 
 On a cluster all workers must have the folder.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
 from brokk_min._files import expect_same, write_json
 from brokk_min.actuator import ActuatorNet
-from brokk_min.evaluation import metrics
-from brokk_min.evaluation.metrics import COLUMNS, Mean, Rows, interval_text
+from brokk_min.evaluation.metrics import Mean, Rows, evaluate, means, metadata
 from brokk_min.evaluation.sequences import evaluation_starts, task_sequences
 from brokk_min.identification.net_file import fingerprint
 from brokk_min.learning.checkpoint import train_policy
@@ -31,17 +30,18 @@ def sweep(
     starts: int,
     scheduler: str | None = None,
 ) -> dict[str, dict[str, Mean]]:
-    """Train and evaluate `seeds`; all runs, and the means over seeds, go to `sweep.json`.
+    """Train and evaluate `seeds`; means over seeds with intervals, by sequence and figure.
 
-    `out` is the folder of all files, `starts` the number of start poses, `scheduler` the address of
-    a dask scheduler (None: this machine).
+    They and all runs go to `sweep.json`. A seed counts once, with its mean over the starts. `out`
+    is the folder of all files, `starts` the number of start poses, `scheduler` the address of a
+    dask scheduler (None: this machine).
     """
     out.mkdir(parents=True, exist_ok=True)
     job = partial(run_seed, machine, net, recipe, out.resolve(), starts)
     done = side_by_side({str(seed): partial(job, seed) for seed in seeds}, None, scheduler)
     rows = [{"seed": int(seed)} | row for seed, of in done.items() for row in of]
-    table = over_seeds(rows)
-    meta = metrics.metadata(machine, min(seeds)) | {"actuator": fingerprint(net)}
+    table = means([row | {"start": row["seed"]} for row in rows])["rl"]
+    meta = metadata(machine, min(seeds)) | {"actuator": fingerprint(net)}
     write_json(out / "sweep.json", {"meta": meta, "table": table, "runs": rows})
     return table
 
@@ -53,30 +53,14 @@ def run_seed(
 
     ValueError: the folder `out` has a policy of this seed from another training.
     """
+    commands = task_sequences(machine)
+    poses = evaluation_starts(machine, starts, commands, 2)  # they may be too few
     file = out / f"seed_{seed}.npz"
     if file.exists():
         policy = load_policy(file, machine)
         training = {"actuator": fingerprint(net), "recipe": asdict(recipe)}
         expect_same(file, policy.training, training)
     else:
-        resume = Path(f"{file}.checkpoint").exists()
-        policy = train_policy(machine, net, recipe, seed, file, resume)
-    commands = task_sequences(machine)
-    poses = evaluation_starts(machine, starts, commands, 2)
+        policy = train_policy(machine, net, recipe, seed, file)
     controllers = {"rl": PolicyController(machine, policy)}
-    return metrics.evaluate(machine, controllers, commands, poses, 0)[0]
-
-
-def over_seeds(rows: Rows) -> dict[str, dict[str, Mean]]:
-    """Means over seeds with intervals, by sequence (also "all") and figure.
-
-    A seed counts once, with its mean over the workspace starts.
-    """
-    scored = [row | {"start": row["seed"]} for row in rows if row["kind"] == "workspace"]
-    return metrics.means(scored)["rl"]
-
-
-def show(table: Mapping[str, Mapping[str, Mean]]) -> str:
-    """The figures of all sequences as text, one a line."""
-    lines = [f"{key:24} {interval_text(table['all'][key])}" for key in COLUMNS]
-    return "\n".join([f"{'':24} mean over seeds (95 % interval)", *lines])
+    return evaluate(machine, controllers, commands, poses, 0)[0]

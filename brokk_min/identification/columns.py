@@ -14,11 +14,13 @@ from typing import Any
 import numpy as np
 
 from brokk_min._files import brief, load_arrays, numbers, read_csv
+from brokk_min.identification.ros_logs import read_ros
 from brokk_min.machine import Array, require
 
 UNITS = {"deg": math.pi / 180, "mrad": 1e-3, "mm": 1e-3, "percent": 1e-2, "permille": 1e-3}
 TIMES = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 KINDS = ("u_", "q_")  # of columns that are numbers, as time is
+TOPICS = ("/joint_states", "/commands")  # of ROS: angles and commands
 Mapped = dict[str, tuple[str, float]]  # column of the log: that of the file, and its factor
 
 
@@ -42,18 +44,25 @@ def parse_map(text: str) -> Mapped:
     return result
 
 
-def load_table(path: Path, mapped: Mapped | None = None) -> dict[str, Any]:
-    """Columns of a `.csv` or `.npz`; ValueError: no such file, or no number where one must be."""
-    csv = path.suffix.lower() == ".csv"
-    table = read_csv(path) if csv else load_arrays(path)[1]
-    return to_columns(path, table, mapped or {})
+def is_table(path: Path) -> bool:
+    """Does `load_table` read this, by its name?"""
+    return path.is_dir() or path.suffix.lower() in (".csv", ".npz", ".mcap", ".db3", ".bag")
 
 
-def to_columns(path: Path, table: Mapping[str, Any], mapped: Mapped) -> dict[str, Any]:
+def load_table(path: Path, mapped: Mapped, topics: tuple[str, str] = TOPICS) -> dict[str, Any]:
     """The columns of a log: those of the file that have their names already, and mapped ones.
 
-    Time is in seconds. A table without `run` is one recording, by the name of its file.
+    `topics` are those of a recording of ROS. Time is in seconds. A table without `run` is one
+    recording, by the name of its file.
+    ValueError: no such file or column, or no number where one must be.
     """
+    table: Mapping[str, Any]
+    if path.suffix.lower() == ".csv":
+        table = read_csv(path)
+    elif path.suffix.lower() == ".npz":
+        table = load_arrays(path)[1]
+    else:
+        table = read_ros(path, *topics)
     named = {name: (name, 1.0) for name in table if name == "time" or name.startswith(KINDS)}
     named |= {"run": ("run", 1.0)} if "run" in table else {}
     rows = max(map(np.size, table.values()), default=0)

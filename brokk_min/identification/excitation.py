@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from brokk_min.actuator import PLANT, Plant
 from brokk_min.identification.logs import Log, machine_log
-from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, read_encoder, require
+from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, read_encoder
 
 Indices = NDArray[np.intp]
 # Probabilities of the parts of rich excitation, assumed.
@@ -109,11 +109,7 @@ def collect(
 
     A segment begins with `history` samples of an idle valve and ends before the joint returns.
     Sines start at mid range, as in the paper, rich excitation at random angles. Paper: Sec. 3.3
-    ValueError: another excitation, or hours that are not positive.
     """
-    kinds = ", ".join(EXCITATIONS)
-    require(excitation in EXCITATIONS, "excitation", f"one of {kinds}", excitation)
-    require(0 < hours < np.inf, "hours", "a positive number", hours)
     goal = max(machine.history + 2, round(hours * 3600 * machine.rate))  # samples per joint
     rows = int(np.clip(goal // 300, 1, 100))  # segments of a joint that are simulated at once
     count = np.zeros(machine.n, int)
@@ -144,42 +140,35 @@ def _drive_segments(
     rows, near = np.arange(len(joint)), 2 * machine.encoder_step[joint]
     low, high = machine.column("q_min")[joint] + near, machine.column("q_max")[joint] - near
     push = machine.rate if excitation == "rich" else 0.0  # ticks at a limit
-    ended = np.full(len(joint), len(commands))
-    ticks_at_limit = np.zeros(len(joint), int)
-    state, u_log, q_log = plant.reset(machine, q), [], []
-    for tick, excite in enumerate(commands):
-        q_log.append(read_encoder(machine, state.q))
-        angle = q_log[-1][rows, joint]
-        at_limit = (angle < low) | (angle > high)
-        ticks_at_limit += at_limit
-        pushed = at_limit & (ticks_at_limit > push) & (tick > machine.history + machine.rate)
-        ended[pushed & (tick < ended)] = tick
-        u = np.zeros_like(q)
-        u[rows, joint] = np.where(tick < ended, excite, 0.0)
-        u_log.append(limit_command(machine, u))
-        state = plant.step(machine, state, u_log[-1])
-        if (tick >= ended).all():
-            break
-    return np.array(u_log), np.array(q_log), ended
+    state, angles = plant.reset(machine, q), []
+    for u in commands:
+        angles.append(read_encoder(machine, state.q))
+        state = plant.step(machine, state, u)
+    q = np.array(angles)
+    at_limit = (q[:, rows, joint] < low) | (q[:, rows, joint] > high)
+    late = np.arange(len(q)) > machine.history + machine.rate
+    pushed = at_limit & (np.cumsum(at_limit, axis=0) > push) & late[:, None]
+    return commands, q, np.where(pushed.any(axis=0), pushed.argmax(axis=0), len(q))
 
 
 def _plan_segments(
     machine: Machine, joint: Indices, excitation: str, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Angles (rows, n) at the start of segments, and commands (T, rows).
+    """Angles (rows, n) at the start of segments, and commands (T, rows, n).
 
     Segments start at mid range; if rich, at random angles of `joint[k]`, a tenth at either limit.
     """
-    low, high = machine.column("q_min"), machine.column("q_max")
+    low, high, rows = machine.column("q_min"), machine.column("q_max"), np.arange(len(joint))
     q = np.tile((low + high) / 2, (len(joint), 1))
     if excitation == "rich":
         low, high = low[joint], high[joint]
         beyond = (high - low) / 8
-        angles = np.clip(rng.uniform(low - beyond, high + beyond), low, high)
-        q[np.arange(len(joint)), joint] = angles
+        q[rows, joint] = np.clip(rng.uniform(low - beyond, high + beyond), low, high)
     ticks = round(MAX_SEGMENT * machine.rate)
-    commands = [EXCITATIONS[excitation](rng, machine, ticks) for _ in joint]
-    return q, np.pad(commands, ((0, 0), (machine.history, 0))).T
+    commands = np.zeros((machine.history + ticks, *q.shape))
+    for row in rows:
+        commands[machine.history :, row, joint[row]] = EXCITATIONS[excitation](rng, machine, ticks)
+    return q, limit_command(machine, commands)
 
 
 def task_log(

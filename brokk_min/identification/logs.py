@@ -7,7 +7,7 @@ Joints may have any names. The rate must not be below the machine's, and it may 
 whose name ends in `_return` are dropped.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from brokk_min._files import brief, expected, located, whole_file, write_csv
 from brokk_min.actuator import estimate_velocity
-from brokk_min.identification.columns import load_table
+from brokk_min.identification.columns import TOPICS, Mapped, load_table
 from brokk_min.identification.readings import MAX_GAP, check_run, left_out, unread
 from brokk_min.machine import Array, Machine, require
 
@@ -140,21 +140,20 @@ def join_logs(logs: Mapping[Path, Log]) -> Log:
     empty.
     """
     first = next(iter(logs.values()))
-    recordings: list[Recording] = []
-    warnings: list[str] = []
+    joined: list[Log] = []
     for path, log in logs.items():
         with located(path):
             same = log.velocity_logged == first.velocity_logged
             require(same, "columns", "q_dot in all files or in none", "a mixture")
-            recordings += in_order(log, first.joints).recordings
-            warnings += log.warnings
+            joined.append(in_order(log, first.joints))
+    recordings = tuple(one for log in joined for one in log.recordings)
     require(len(recordings) > 0, ", ".join(map(str, logs)), "at least one recording", "none")
-    return first._replace(recordings=tuple(recordings), warnings=tuple(warnings))
+    warnings = tuple(one for log in joined for one in log.warnings)
+    return first._replace(recordings=recordings, warnings=warnings)
 
 
 def write_log(path: Path, log: Log) -> None:
     """Write recordings as one table, `.csv` or `.npz` by the name; read it with `read_log`."""
-    require(len(log.recordings) > 0, str(path), "at least one recording to write", "none")
     names = [recording.name for recording in log.recordings]
     lengths = [len(recording.u) for recording in log.recordings]
     time = np.concatenate([np.arange(length) / log.rate for length in lengths])
@@ -171,66 +170,66 @@ def write_log(path: Path, log: Log) -> None:
 
 
 def read_log(
-    paths: Sequence[Path],
-    velocity_samples: int,
-    rate: float = RATE,
-    fastest: Mapping[str, float] | None = None,
-    read: Callable[[Path], Mapping[str, Any]] = load_table,
+    path: Path, machine: Machine, mapped: Mapped | None = None, topics: tuple[str, str] = TOPICS
 ) -> Log:
-    """Check tables of one machine that `read` reads, and resample them at `rate` [Hz].
+    """Check the table of a file, see `load_table`, and resample it at the rate of `machine`.
 
     The command is held (of faster logs it is the mean over a tick), the angle interpolated. A gap
-    longer than `MAX_GAP` and 2.5 samples cuts a recording. Without q_dot columns velocities are
-    estimated over `velocity_samples`: a recording starts at rest, and after a gap the rows that
-    would need samples of the gap are left out. Rows in which a joint was not read count as a gap;
-    `fastest` [rad/s] of the joints of a known machine helps to tell them.
+    longer than `MAX_GAP` and 2.5 samples cuts a recording, and so does an angle that jumps; rows in
+    which a joint was not read count as a gap. Without q_dot columns velocities are estimated: a
+    recording starts at rest, and after a gap the rows that would need samples of the gap are left
+    out. The joints may be others than those of the machine.
     ValueError: the file, and the row (1 is the header), the column or the run of the first error.
     """
-    logs = {}
-    for path in map(Path, paths):
-        table = read(path)
-        with expected(path, "a log"), located(path):
-            joints = tuple(name[2:] for name in table if name.startswith("u_"))
-            wanted = "u_<joint> (--map u_NAME=COLUMN:UNIT)"
-            require(len(joints) > 0, "columns", wanted, brief(list(table)))
-            logged = any(name.startswith("q_dot_") for name in table)
-            speeds = np.array([(fastest or {}).get(name, 0.0) for name in joints])
-            empty = Log(joints, (), logged, rate)
-            log = _with_recordings(empty, table, speeds, velocity_samples)
-            logs[path] = log._replace(warnings=tuple(f"{path}: {one}" for one in log.warnings))
-    return join_logs(logs)
+    table = load_table(path, mapped or {}, topics)
+    with expected(path, "a log"), located(path):
+        joints = tuple(name[2:] for name in table if name.startswith("u_"))
+        wanted = "u_<joint> (--map u_NAME=COLUMN:UNIT)"
+        require(len(joints) > 0, "columns", wanted, brief(list(table)))
+        logged = any(name.startswith("q_dot_") for name in table)
+        recordings, warnings = _recordings(joints, table, logged, machine)
+        told = tuple(f"{path}: {one}" for one in warnings)
+        return Log(joints, tuple(recordings), logged, machine.rate, told)
 
 
-def _with_recordings(log: Log, table: Mapping[str, Any], fastest: Array, samples: int) -> Log:
-    """A log with the checked recordings of a table, in the order in which they begin."""
-    limits = {"u": 1.0, "q": LARGEST} | ({"q_dot": LARGEST} if log.velocity_logged else {})
-    time = _numbers(table, ["time"], LARGEST)[:, 0]
-    values = {k: _numbers(table, [f"{k}_{one}" for one in log.joints], limits[k]) for k in limits}
-    names, begins, number = np.unique(table["run"], return_index=True, return_inverse=True)
-    wrong, speed = np.zeros(values["q"].shape, bool), np.zeros(values["q"].shape)
-    recordings: list[Recording] = []
-    for i in np.argsort(begins):
-        run, rows = str(names[i]), np.flatnonzero(number == i)
-        t, columns = time[rows], {kind: x[rows] for kind, x in values.items()}
-        repeats = check_run(run, t, columns["q"], log.rate, log.joints)
-        bad, cuts = unread(t, columns["q"], fastest, repeats)
+def _recordings(
+    joints: Sequence[str], table: Mapping[str, Any], logged: bool, machine: Machine
+) -> tuple[list[Recording], list[str]]:
+    """The recordings of a table, in the order in which they begin, and what was left out."""
+    kinds = ("u", "q", "q_dot") if logged else ("u", "q")
+    time = _numbers(table, ["time"])[:, 0]
+    columns = {kind: _numbers(table, [f"{kind}_{name}" for name in joints]) for kind in kinds}
+    runs = _runs(table["run"])
+    speeds = dict(zip(machine.names, machine.q_dot_max, strict=True))
+    fastest = np.array([speeds.get(name, 0.0) for name in joints])
+    wrong, speed = np.zeros(columns["q"].shape, bool), np.zeros(columns["q"].shape)
+    recordings = []
+    for run, rows in runs.items():
+        t, values = time[rows], {kind: x[rows] for kind, x in columns.items()}
+        repeats = check_run(run, t, values["q"], machine.rate, joints)
+        bad, cuts = unread(t, values["q"], fastest, repeats)
         wrong[rows] = bad | cuts
-        speed[rows[1:]] = np.abs(np.diff(columns["q"], axis=0) / np.diff(t)[:, None])
+        speed[rows[1:]] = np.abs(np.diff(values["q"], axis=0) / np.diff(t)[:, None])
         good = np.flatnonzero(~bad.any(axis=1))
-        cut = np.diff(t[good]) > max(MAX_GAP, 2.5 / log.rate)
+        cut = np.diff(t[good]) > max(MAX_GAP, 2.5 / machine.rate)
         cut |= np.diff(np.cumsum(cuts.any(axis=1))[good]) > 0
         pieces = np.split(good, np.flatnonzero(cut) + 1)
-        for part, piece in enumerate(pieces if len(good) and not run.endswith(RETURN) else []):
-            u, q, q_dot = _resample(t, columns, piece, samples, log.rate)
-            first = samples - 1 if part and not log.velocity_logged else 0  # these need the gap
-            if len(u) > first:
-                name = f"{run}#{part + 1}" if part else run
-                recordings.append(Recording(name, u[first:], q[first:], q_dot[first:]))
-    warnings = left_out(wrong, speed, log.joints)
-    return log._replace(recordings=tuple(recordings), warnings=tuple(warnings))
+        for part, piece in enumerate(pieces if len(good) else []):
+            skipped = machine.velocity_samples - 1 if part and not logged else 0
+            u, q, q_dot = (x[skipped:] for x in _resample(t, values, piece, machine))
+            if len(u):
+                recordings.append(Recording(f"{run}#{part + 1}" if part else run, u, q, q_dot))
+    return recordings, left_out(wrong, speed, joints)
 
 
-def _numbers(table: Mapping[str, Any], names: Sequence[str], limit: float) -> Array:
+def _runs(names: Any) -> dict[str, Rows]:
+    """Rows of each recording, in the order in which they begin, without returns."""
+    unique, first, number = np.unique(names, return_index=True, return_inverse=True)
+    rows = {str(unique[i]): np.flatnonzero(number == i) for i in np.argsort(first)}
+    return {run: of for run, of in rows.items() if len(of) > 1 and not run.endswith(RETURN)}
+
+
+def _numbers(table: Mapping[str, Any], names: Sequence[str]) -> Array:
     """Columns (rows, names); ValueError: one that is not there, or a value that cannot be."""
     missing = [name for name in names if name not in table]
     wanted = f"{brief(missing)} (--map {missing[0]}=COLUMN:UNIT)" if missing else ""
@@ -239,6 +238,7 @@ def _numbers(table: Mapping[str, Any], names: Sequence[str], limit: float) -> Ar
         wanted, got = (np.shape(table[key]) for key in ("run", name))
         require(got == wanted, f"column {name}", f"{wanted} numbers", got)
     values = np.array([table[name] for name in names], float).T
+    limit = 1.0 if names[0].startswith("u_") else LARGEST
     for row, column in np.argwhere(~(np.abs(values) <= limit)):  # also where it is nan
         place, got = f"row {row + 2}, column {names[column]}", values[row, column]
         unit = f" (per cent: --map {names[column]}=COLUMN:percent)" if limit == 1.0 else ""
@@ -247,18 +247,18 @@ def _numbers(table: Mapping[str, Any], names: Sequence[str], limit: float) -> Ar
 
 
 def _resample(
-    time: Array, columns: dict[str, Array], rows: Rows, samples: int, rate: float
+    time: Array, columns: dict[str, Array], rows: Rows, machine: Machine
 ) -> tuple[Array, Array, Array]:
-    """u held, q and q_dot of `rows` interpolated at `rate`; q_dot estimated if there is none."""
-    t = time[rows]
+    """u held, q and q_dot of `rows` interpolated at the rate; q_dot estimated if there is none."""
+    t, rate = time[rows], machine.rate
     grid = t[0] + np.arange(int((t[-1] - t[0]) * rate + 1e-6) + 1) / rate
-    fast = len(time) > 1 and np.median(np.diff(time)) < 0.501 / rate
+    fast = np.median(np.diff(time)) < 0.501 / rate
     parts = np.linspace(0, 1 / rate, MEAN_OF if fast else 1, endpoint=False)[:, None]
     held = np.searchsorted(time, grid + parts + 1e-6, side="right") - 1
-    measured = {
-        kind: np.stack([np.interp(grid, t, column) for column in x[rows].T], axis=-1)
-        for kind, x in columns.items()
+    u = columns["u"][held].mean(axis=0)
+    q, *logged = (
+        np.stack([np.interp(grid, t, column) for column in columns[kind][rows].T], axis=-1)
+        for kind in columns
         if kind != "u"
-    }
-    q_dot = measured["q_dot"] if "q_dot" in measured else velocity_of(measured["q"], samples, rate)
-    return columns["u"][held].mean(axis=0), measured["q"], q_dot
+    )
+    return u, q, logged[0] if logged else velocity_of(q, machine.velocity_samples, rate)

@@ -5,6 +5,7 @@ prediction. A policy trains on free runs of the nets, so their error after secon
 """
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -16,22 +17,6 @@ from brokk_min.identification.logs import Log, Samples, join_recordings
 from brokk_min.machine import Array
 
 HORIZONS = (1, 5, 10, 30)  # s, of the free runs
-
-
-def validate(net: ActuatorNet, test: Log) -> dict[str, Any]:
-    """Scores of nets on unseen recordings `test`, as in the fit JSON.
-
-    `joints` has the `score` of each net, `warnings` the nets that are no better than the last
-    velocity again.
-    """
-    joints = score(net, test)
-    warnings = [
-        f"{name}: expected an error of one step below {one['persistence_rmse']:.4f}, "
-        f"got {one['one_step_rmse']:.4f}"
-        for name, one in joints.items()
-        if one.get("one_step_rmse", 0.0) > one.get("persistence_rmse", 0.0)
-    ]
-    return {"joints": joints, "warnings": warnings}
 
 
 def free_run_step(net: ActuatorNet, history: Array, q: Array, u: Array) -> tuple[Array, Array]:
@@ -101,6 +86,20 @@ def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
                     "position_error_median": float(np.median(np.abs(q_error[-1, scored, j]))),
                 }
     return result
+
+
+def warnings(scores: Mapping[str, Any]) -> list[str]:
+    """A warning for each net of `score` that is no better than the last velocity again."""
+    errors = {
+        name: (one["one_step_rmse"], one["persistence_rmse"])
+        for name, one in scores.items()
+        if "one_step_rmse" in one
+    }
+    return [
+        f"{name}: expected an error of one step below {last:.4f}, got {error:.4f}"
+        for name, (error, last) in errors.items()
+        if error > last
+    ]
 
 
 def _one_step_scores(net: ActuatorNet, samples: Samples) -> dict[str, Any]:

@@ -20,21 +20,22 @@ from brokk_min.learning.episodes import map_arrays
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import INTERFACES, Policy, contract, save_policy
 from brokk_min.learning.recipes import Recipe
-from brokk_min.machine import Machine, require
+from brokk_min.machine import Machine
 from brokk_min.ppo import Agent, Checkpoint, Rollout
 
 EVERY = 50  # updates between two checkpoints
 
 
 def train_policy(
-    machine: Machine, net: ActuatorNet, recipe: Recipe, seed: int, out: Path, resume: bool = False
+    machine: Machine, net: ActuatorNet, recipe: Recipe, seed: int, out: Path
 ) -> Policy:
     """Train a policy on the nets of the driven joints and write it to `out`.
 
     The same `seed` gives the same bits on the same computer. The checkpoint `<out>.checkpoint` and
-    the curve `<out>.csv` lie next to the policy. `resume`: go on from the checkpoint; the result is
-    the same as without the break. ValueError: a checkpoint of another training, or a number that is
-    not finite. OSError: a file that cannot be written; the last checkpoint stays.
+    the curve `<out>.csv` lie next to the policy. Where a checkpoint exists, the training goes on
+    from it, and the result is the same as without the break. ValueError: a checkpoint of another
+    training, or a number that is not finite. OSError: a file that cannot be written; the last
+    checkpoint stays.
     """
     about = {
         "contract": contract(machine),
@@ -46,12 +47,9 @@ def train_policy(
     config = recipe.learner
     env, advantages = make_env(machine, net, recipe)
     log = TrainingLog(env, out, about)
-    exists = log.checkpoint.exists()
-    wanted = "--resume or no checkpoint"
-    require(resume or not exists, str(log.checkpoint), wanted, "one of a broken training")
     start = ppo.begin(env, config, seed)
     stagger_episodes(env)
-    if exists:
+    if log.checkpoint.exists():
         start = log.load(start)
     options: dict[str, Any] = {"initial": start.global_step, "unit_scale": True, "disable": None}
     with tqdm(desc="train", total=config.total_steps, unit="step", **options) as log.bar:
@@ -83,7 +81,6 @@ def actor_weights(agent: Agent) -> tuple[np.ndarray, ...]:
 
 def stagger_episodes(env: TaskVectorEnv) -> None:
     """Let the first episodes end one after the other: every batch then has some starts."""
-    assert env.state is not None
     episode_ticks = round(env.config.episode_s * env.machine.rate)
     ticks = np.arange(env.num_envs) * episode_ticks // env.num_envs
     low = env.state.lowest < env.machine.ground  # these end in their first tick, as always

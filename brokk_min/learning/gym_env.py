@@ -7,8 +7,6 @@ Importing this module registers them, and Gymnasium can import it by the name of
 """
 
 from dataclasses import replace
-from numbers import Integral
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -22,22 +20,13 @@ from brokk_min import env
 from brokk_min._files import brief
 from brokk_min.actuator import PLANT, Plant
 from brokk_min.env import PAPER, Interface, State, measure
-from brokk_min.identification.net_file import load_net
 from brokk_min.learning.episodes import draw_noise, new_goals, replace_rows, reset
 from brokk_min.machine import BROKK_170, Array, Machine, require
 from brokk_min.settings import TaskConfig
 
 Bools = NDArray[np.bool_]
 Step = tuple[Array, Array, Bools, Bools, dict[str, Any]]  # of a vector: obs, reward, ends, info
-
-
-KINDS = {"num_envs": Integral, "machine": Machine, "config": TaskConfig, "interface": Interface}
-
-
-def check_kinds(**arguments: Any) -> None:
-    """ValueError for the first argument that is not of its kind in `KINDS`, by its name."""
-    for name, value in arguments.items():
-        require(isinstance(value, KINDS[name]), name, KINDS[name].__name__, brief(value))
+TASK = TaskConfig()
 
 
 class TaskVectorEnv(VectorEnv[Array, Array, Any]):
@@ -47,50 +36,42 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
     has changed since. If ended episodes reset in the same step, `info["final_obs"]` holds the last
     observation of an episode where `info["_final_obs"]` is set.
 
-    Args:
-        num_envs: number of machines.
-        plant: what moves them; the name of a file of nets, or a plant.
-        machine: which one.
-        config: what an episode is.
-        interface: what the agent reads, does and is paid for.
-        render_mode: None or "rgb_array" (the first machine).
-        autoreset_mode: when an ended episode resets, see Gymnasium's `AutoresetMode`; its vector
-            wrappers of observations accept NEXT_STEP.
-        max_episode_steps: ticks of an episode, instead of the seconds of `config`.
-
-    ValueError: an argument of another kind, by its name.
+    Gymnasium's `AutoresetMode` explains when an ended episode resets; its vector wrappers of
+    observations accept NEXT_STEP. `max_episode_steps` counts ticks and stands for the seconds of
+    `config`. The mode "rgb_array" renders the first machine. ValueError: an argument that is wrong.
     """
+
+    state: State
+    memory: Any  # of the agent
+    obs: Array
 
     def __init__(
         self,
         num_envs: int,
-        plant: Plant | Path | str = PLANT,
+        plant: Plant = PLANT,
         machine: Machine = BROKK_170,
-        config: TaskConfig | None = None,
+        config: TaskConfig = TASK,
         interface: Interface = PAPER,
         render_mode: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         max_episode_steps: int | None = None,
     ) -> None:
-        config = TaskConfig() if config is None else config
-        check_kinds(num_envs=num_envs, machine=machine, config=config, interface=interface)
         require(num_envs > 0, "num_envs", "1 or more", num_envs)
-        require(render_mode in (None, "rgb_array"), "render_mode", "rgb_array", render_mode)
+        require(isinstance(machine, Machine), "machine", "a Machine", machine)
+        require(isinstance(config, TaskConfig), "config", "a TaskConfig", config)
+        require(hasattr(plant, "step"), "plant", "reset and step", brief(plant))
         if max_episode_steps is not None:
             config = replace(config, episode_s=max_episode_steps / machine.rate)
         rate, mode = round(machine.rate), AutoresetMode(autoreset_mode)
         self.metadata = TaskEnv.metadata | {"render_fps": rate, "autoreset_mode": mode}
-        self.num_envs, self.machine, self.config = num_envs, machine, config
-        self.plant = load_net(Path(plant), machine) if isinstance(plant, str | Path) else plant
-        require(hasattr(self.plant, "step"), "plant", "reset and step", brief(plant))
+        self.num_envs, self.plant, self.machine, self.config = num_envs, plant, machine, config
         self.interface, self.render_mode = interface, render_mode
         size = len(interface.scale(machine)[0])
         self.single_observation_space = Box(-np.inf, np.inf, (size,), np.float32)
         self.single_action_space = Box(-1.0, 1.0, (len(machine.driven),), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.state: State | None = None
-        self.memory: Any = None  # of the agent
+        self.ended = np.zeros(num_envs, bool)  # episodes that wait for their reset
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -101,25 +82,22 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         """
         super().reset(seed=seed)
         mask = (options or {}).get("reset_mask")
-        if mask is None or self.state is None:
-            self.state = self.draw_episodes(self.num_envs)
-            self.obs, self.memory = self.observe(self.state, None)
-            self.ended = np.zeros(self.num_envs, bool)
-        else:
-            fits = np.shape(mask) == (self.num_envs,) and np.asarray(mask).dtype == bool
-            require(fits, "reset_mask", f"{self.num_envs} booleans", brief(mask))
-            self.begin_episodes(mask)
-            self.ended = self.ended & ~mask
+        mask = np.ones(self.num_envs, bool) if mask is None else np.asarray(mask)
+        fits = mask.shape == (self.num_envs,) and mask.dtype == bool
+        require(fits, "reset_mask", f"{self.num_envs} booleans", brief(mask.tolist()))
+        self.begin_episodes(mask)
         return self.obs, {}
 
     def begin_episodes(self, mask: Bools) -> None:
         """Draw new episodes where `mask` is true; others go on."""
         rows = np.flatnonzero(mask)
-        fresh = self.draw_episodes(len(rows))
-        obs, memory = self.observe(fresh, None)
-        self.state = replace_rows(self.state, rows, fresh)
-        self.memory = replace_rows(self.memory, rows, memory)
-        self.obs = replace_rows(self.obs, rows, obs)
+        state = self.draw_episodes(len(rows))
+        obs, memory = self.observe(state, None)
+        fresh = state, memory, obs
+        if len(rows) < self.num_envs:
+            fresh = replace_rows((self.state, self.memory, self.obs), rows, fresh)
+        self.state, self.memory, self.obs = fresh
+        self.ended = self.ended & ~mask
 
     def draw_episodes(self, num: int) -> State:
         """`num` machines at the start of an episode."""
@@ -156,8 +134,7 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
 
     def step_without_reset(self, actions: Array) -> Step:
         """`step` in which ended episodes go on."""
-        if self.state is None:
-            raise ValueError("step: expected a reset before the first step, got none")
+        require(hasattr(self, "state"), "step", "a reset before the first step", "none")
         m, memory, u_before = self.machine, self.memory, self.state.history[..., 2, -1]
         u = self.interface.command(m, np.asarray(actions), memory)
         state, reward, terminated, truncated = env.step(m, self.config, self.plant, self.state, u)
@@ -169,14 +146,13 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         reward = np.where(terminated, 0.0, reward - cost)
         return self.obs, reward, terminated, truncated, info
 
-    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+    def render(self) -> tuple[NDArray[np.uint8], ...]:
         """A picture of the first machine (height, width, 3), with goal and tool velocity."""
-        from brokk_min.viewer.drawing import picture
+        from brokk_min.viewer.drawing import Scene, draw
 
-        if self.render_mode is None or self.state is None:
-            return None
         s, u = self.state, self.state.history[..., 2, -1]
-        return (picture(self.machine, s.q[0], u[0], s.v_goal[0], s.v_tool[0]),)
+        scene = Scene(s.q[0], u[0], s.v_goal[0], s.v_tool[0], title=self.machine.name)
+        return (np.array(draw(self.machine, scene, (640, 360))),)
 
 
 class TaskEnv(gymnasium.Env[Array, Array]):
@@ -186,8 +162,7 @@ class TaskEnv(gymnasium.Env[Array, Array]):
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         self.vector = TaskVectorEnv(1, *arguments, **options)
-        self.metadata = TaskEnv.metadata | {"render_fps": self.vector.metadata["render_fps"]}
-        self.render_mode = self.vector.render_mode
+        self.metadata, self.render_mode = self.vector.metadata, self.vector.render_mode
         self.observation_space = self.vector.single_observation_space
         self.action_space = self.vector.single_action_space
 
@@ -209,7 +184,7 @@ class TaskEnv(gymnasium.Env[Array, Array]):
 
     def render(self) -> Any:
         """The present picture (height, width, 3)."""
-        return (self.vector.render() or (None,))[0]
+        return self.vector.render()[0]
 
 
 gymnasium.register(

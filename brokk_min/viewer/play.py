@@ -6,6 +6,7 @@ depends on timing.
 """
 
 import os
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -14,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from brokk_min._files import require_package
 from brokk_min.actuator import PLANT, Plant
 from brokk_min.can.operator_input import shape_axis
 from brokk_min.can.simulated_machine import start_pose
@@ -21,78 +23,55 @@ from brokk_min.env import initial_state, measure, transition
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine
-from brokk_min.viewer.drawing import BLUE, ORANGE, Scene, draw, load_pygame
+from brokk_min.viewer.drawing import BLUE, ORANGE, Scene, draw
 
-SIZE, SMALLEST = (1120, 680), (640, 360)  # px, of the window at first and of a picture
-RISE = 0.25  # s from a key's press to full deflection (assumed)
+SIZE = (1120, 680)  # px, of the window
 TRAIL = 600  # positions of the tool that are shown
-# Keys for and against x, y and z, as the top view shows them, and axes for them: of a gamepad that
-# SDL knows, and of another one, whose axes 2 and 5 are mostly triggers.
+# keys for and against x, y and z, as the top view shows them, and axes of a gamepad for them
 KEYS = (("up", "down"), ("left", "right"), ("w", "s"))
-AXES, OTHER_AXES = (1, 0, 3), (1, 0, 4)
-ACTIONS = {"escape": "close", "tab": "controller", "r": "restart"}
-BUTTONS = {3: "controller", 1: "restart"}  # Y and B of an Xbox pad
+AXES = (1, 0, 3)
+Y_BUTTON = 3  # of an Xbox pad
 NOTES = (
     "arrows: x (up, down) and y (left, right)",
     "W, S: z (up, down)    SHIFT: slowly",
     "TAB: the other controller",
-    "R: back to the start    ESC: end",
-    "gamepad: both sticks; Y and B are TAB and R",
+    "ESC: end",
+    "gamepad: both sticks; Y is TAB",
 )
 
 
 class Operator:
-    """Keyboard and gamepad as one operator."""
+    """Keyboard, and a gamepad that SDL knows, as one operator."""
 
     def __init__(self, machine: Machine, pygame: Any) -> None:
         self.machine, self.pygame = machine, pygame
-        self.held: set[str] = set()  # keys
-        self.deflection: Array = np.zeros(3)
         self.pad: Any = None
-        self.known = False  # does SDL know the gamepad?
-        pygame.joystick.init()  # a gamepad that is there is an event, too
         self.gamepads = import_module("pygame._sdl2.controller")
-        self.gamepads.init()
+        self.gamepads.init()  # a gamepad that is there is an event, too
 
     def handle(self, event: Any) -> str:
-        """Take in an event of pygame, and say which of `ACTIONS` it asks for, if any."""
+        """Take in an event of pygame; does it ask to "close" or for the "other" controller?"""
         pg = self.pygame
-        if event.type == pg.QUIT:
+        key = pg.key.name(event.key) if event.type == pg.KEYDOWN else ""
+        if event.type == pg.QUIT or key == "escape":
             return "close"
-        if event.type == pg.KEYDOWN:
-            self.held.add(pg.key.name(event.key))
-            return ACTIONS.get(pg.key.name(event.key), "")
-        if event.type == pg.KEYUP:
-            self.held.discard(pg.key.name(event.key))
-        elif event.type == pg.WINDOWFOCUSLOST:
-            self.held.clear()
-        elif event.type == (pg.CONTROLLERBUTTONDOWN if self.known else pg.JOYBUTTONDOWN):
-            return BUTTONS.get(event.button, "")
-        elif event.type == pg.JOYDEVICEADDED:
-            self.known = self.gamepads.is_controller(event.device_index)
-            pads = self.gamepads.Controller if self.known else pg.joystick.Joystick
-            self.pad = pads(event.device_index)
-        elif event.type == pg.JOYDEVICEREMOVED:
+        if key == "tab" or (event.type == pg.CONTROLLERBUTTONDOWN and event.button == Y_BUTTON):
+            return "other"
+        if event.type == pg.CONTROLLERDEVICEADDED:
+            self.pad = self.gamepads.Controller(event.device_index)
+        elif event.type == pg.CONTROLLERDEVICEREMOVED:
             self.pad = None
         return ""
 
     def velocity(self) -> Array:
-        """Goal velocity of the tool [m/s] (3,) for the next tick.
-
-        Keys ramp up over `RISE`, and a released key is at rest at once.
-        """
-        target = np.array([float(p in self.held) - float(m in self.held) for p, m in KEYS])
-        if self.held & {"left shift", "right shift"}:
-            target /= 3
+        """Goal velocity of the tool [m/s] (3,) for the next tick."""
+        pressed, code = self.pygame.key.get_pressed(), self.pygame.key.key_code
+        keys = [float(pressed[code(p)]) - float(pressed[code(m)]) for p, m in KEYS]
+        target = np.array(keys) / (3 if pressed[code("left shift")] else 1)
         if self.pad is not None:
-            numbers, full = (AXES, 32767) if self.known else (OTHER_AXES, 1)
-            axes = [self.pad.get_axis(i) / full for i in numbers]  # one that it lacks reads 0
-            target = np.clip(target - shape_axis(axes), -1, 1)
-        step = self.machine.dt / RISE
-        last = np.where(target * self.deflection > 0, self.deflection, 0.0)
-        self.deflection = last + np.clip(target - last, -step, step) * (target != 0)
-        length = max(1.0, float(np.linalg.norm(self.deflection)))
-        return np.asarray(self.machine.tool_speed * self.deflection / length)
+            target -= shape_axis([self.pad.get_axis(i) / 32767 for i in AXES])
+        length = max(1.0, float(np.linalg.norm(target)))
+        return np.asarray(self.machine.tool_speed * target / length)
 
 
 @dataclass
@@ -101,24 +80,19 @@ class Session:
 
     machine: Machine
     controllers: dict[str, Controller]
-    q_start: Array  # rad, (n,)
     plant: Plant = PLANT
 
     def __post_init__(self) -> None:
-        self.name = next(iter(self.controllers))
-        self.restart()
-
-    def restart(self) -> None:
-        """Back to the start pose, at rest."""
-        self.state = initial_state(self.machine, self.q_start[None], np.zeros(3), self.plant)
-        self.memory = self.controllers[self.name].start(1)
+        q = start_pose(self.machine)[None]
+        self.state = initial_state(self.machine, q, np.zeros(3), self.plant)
         self.trail = self.tool[None]
+        self.names = deque(self.controllers)  # the first one drives
+        self.memory = self.controllers[self.names[0]].start(1)
 
-    def controller(self) -> None:
+    def switch(self) -> None:
         """The next controller goes on from here."""
-        names = list(self.controllers)
-        self.name = names[(names.index(self.name) + 1) % len(names)]
-        self.memory = self.controllers[self.name].start(1)
+        self.names.rotate(-1)
+        self.memory = self.controllers[self.names[0]].start(1)
 
     @property
     def tool(self) -> Array:
@@ -129,7 +103,7 @@ class Session:
         """Controller and plant go on by a tick, with this goal velocity [m/s] (3,)."""
         self.state = replace(self.state, v_goal=v_goal.astype(np.float32)[None])
         measured = measure(self.machine, self.state.history, self.state.v_goal)
-        u, self.memory = self.controllers[self.name](measured, self.memory)
+        u, self.memory = self.controllers[self.names[0]](measured, self.memory)
         self.state = transition(self.machine, self.plant, self.state, u)
         self.trail = np.vstack([self.trail, self.tool])[-TRAIL:]
 
@@ -137,9 +111,9 @@ class Session:
         """What the window shows now."""
         s = self.state
         status = f"{s.ticks[0] * self.machine.dt:.1f} s"
-        colour = ORANGE if list(self.controllers).index(self.name) % 2 else BLUE
+        colour = BLUE if self.names[0] == next(iter(self.controllers)) else ORANGE
         tool = s.v_goal[0], s.v_tool[0], self.trail
-        return Scene(s.q[0], s.history[0, :, 2, -1], *tool, self.name, status, colour, NOTES)
+        return Scene(s.q[0], s.history[0, :, 2, -1], *tool, self.names[0], status, colour, NOTES)
 
 
 def play(machine: Machine, controllers: dict[str, Controller], plant: Plant = PLANT) -> None:
@@ -147,17 +121,16 @@ def play(machine: Machine, controllers: dict[str, Controller], plant: Plant = PL
 
     The window shows the names of the `controllers`. ValueError: no pygame, or no display.
     """
-    q = start_pose(machine, ())
     with window(f"brokk_min: {machine.name}") as pygame:
-        session, operator = Session(machine, controllers, q, plant), Operator(machine, pygame)
+        session, operator = Session(machine, controllers, plant), Operator(machine, pygame)
         clock = pygame.time.Clock()
         while True:
             for event in pygame.event.get():
                 action = operator.handle(event)
                 if action == "close":
                     return
-                if action:
-                    getattr(session, action)()
+                if action == "other":
+                    session.switch()
             session.tick(operator.velocity())
             show(pygame, machine, session.scene())
             clock.tick(machine.rate)
@@ -169,10 +142,11 @@ def window(title: str) -> Iterator[Any]:
 
     Without a display SDL would draw unseen; that is refused unless SDL_VIDEODRIVER asks for it.
     """
-    pygame = load_pygame()
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    pygame = require_package("pygame", "play")
     try:
         pygame.display.init()
-        pygame.display.set_mode(SIZE, pygame.RESIZABLE)
+        pygame.display.set_mode(SIZE)
         unseen = pygame.display.get_driver() in ("offscreen", "dummy")
         if unseen and not os.environ.get("SDL_VIDEODRIVER"):
             raise pygame.error("none")
@@ -187,6 +161,6 @@ def window(title: str) -> Iterator[Any]:
 
 def show(pygame: Any, machine: Machine, scene: Scene) -> None:
     """Fill the window with a scene."""
-    width, height = np.maximum(pygame.display.get_window_size(), SMALLEST).tolist()
-    pygame.display.get_surface().blit(draw(machine, scene, (width, height)), (0, 0))
+    pixels = draw(machine, scene, SIZE).tobytes()
+    pygame.display.get_surface().blit(pygame.image.frombytes(pixels, SIZE, "RGB"), (0, 0))
     pygame.display.flip()

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 from tqdm import tqdm
 
 from brokk_min._files import whole_file
@@ -11,19 +10,19 @@ from brokk_min.can.drive_log import read_frames, read_telemetry
 from brokk_min.identification.logs import velocity_of
 from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocity
 from brokk_min.machine import Machine, require
-from brokk_min.viewer.drawing import Scene, draw, image
+from brokk_min.viewer.drawing import Scene, draw
 
 SIZE = (640, 400)  # px
+STEP = 2  # ticks a picture
 
 
-def film(path: Path, machine: Machine, out: Path, fps: float) -> None:
+def film(path: Path, machine: Machine, out: Path) -> None:
     """Write the drive of a candump log as a GIF. ValueError: no log, or nothing drives in it."""
     run = scenes(machine, path)
-    step = max(1, round(machine.rate / fps))
-    shown = [*run[:-1:step], run[-1]]
+    shown = [*run[:-1:STEP], run[-1]]
     bar = tqdm(shown, desc="draw", unit="frame", disable=None)
-    first, *rest = (Image.fromarray(image(draw(machine, scene, SIZE))) for scene in bar)
-    duration = round(1e3 * step * machine.dt)
+    first, *rest = (draw(machine, scene, SIZE) for scene in bar)
+    duration = round(1e3 * STEP * machine.dt)
     with whole_file(out) as file:
         first.save(file, "GIF", save_all=True, append_images=rest, duration=duration, loop=0)
 

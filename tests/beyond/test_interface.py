@@ -96,18 +96,7 @@ def test_the_table_of_the_docstring__is_true():
         np.testing.assert_allclose(deviations[place] / scale[place], float(weight), atol=5e-4)
 
 
-def test_command__by_hand():
-    """The dead zone has 8.89 counts, 71.11 are beyond: 8.89 + 35.56; clipped to -80."""
-    for action, counts in (
-        ([0.5, -3.0, -0.01, 0.005], [44, 0, -80, -10, 5]),
-        ([0, 0, 0, 0], [0, 0, 0, 0, 0]),
-        ([1, 0, -1, 0], [80, 0, 0, -80, 0]),
-    ):
-        u = command(BROKK_170, np.array(action, float), memory())
-        np.testing.assert_allclose(u * 127, counts, atol=1e-9)
-
-
-@given(machines(), st.floats(-2, 2))
+@given(machines(), st.floats(-0.02, 0.02) | st.floats(-2, 2))
 def test_command__is_piecewise_linear_beyond_each_valves_own_dead_zone(machine, a):
     u = command(machine, np.full(len(machine.driven), a), memory()) * 127
     for j, joint in enumerate(machine.joints):

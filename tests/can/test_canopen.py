@@ -7,7 +7,7 @@ import canopen
 import numpy as np
 import pytest
 from canopen.objectdictionary import ObjectDictionary, ODRecord, ODVariable, datatypes
-from helpers_bus import START, ConstantCommand, HoldingOperator, World, only, recording
+from helpers_bus import START, ConstantCommand, HoldingOperator, World, eventually, only, recording
 
 from brokk_min.can.canopen import (
     Nodes,
@@ -122,12 +122,13 @@ ABORT = only(0x584, lambda data: [b"\x80" + data[1:4] + struct.pack("<I", 0x0602
 @pytest.mark.parametrize(
     ("upward", "refusal"),
     [
-        (changed(0x1800, 1, 0x80000184), "q4: .* got TPDO1 of node 4 is switched off"),
-        (changed(0x1800, 1, 0x284), "q4: .* identifier 0x184 .*, got 0x284"),
-        (changed(0x1A00, 1, 0x6030_01_10), "q4: .* of object 0x6004 .*has 2 bytes, of 0x6030"),
+        (changed(0x1800, 1, 0x80000184), "q4: .* identifier 0x184, switched on .*x80000184"),
+        (changed(0x1800, 1, 0x284), "q4: .* identifier 0x184, switched on .*, got 644 .0x284"),
+        (changed(0x1A00, 0, 2), "q4: expected one object in TPDO1 .0x1A00:00 of node 4., got 2"),
+        (changed(0x1A00, 1, 0x6030_01_10), "q4: .* 4 bytes of object 0x6004 .* .0x60300110"),
         (only(0x184, lambda data: [data + b"12"]), "q4: .* with 4 bytes .* one that has 6 bytes"),
         (only(0x184, lambda data: []), "q4: .* TPDO1 of node 4 with 4 bytes after SYNC, got none"),
-        (changed(0x6501, 0, 8192), "q4: expected 4096 counts a turn .* node 4 .*got 8192"),
+        (changed(0x6501, 0, 8192), "q4: expected 4096 counts a turn .* node 4., got 8192"),
         (ABORT, "node 4: object 0x6501:00: .*abort 0x06020000"),
         (lambda *frame: [], "node 1: object 0x6501:00: .* answer within 0.5 s, got none"),
     ],
@@ -201,7 +202,7 @@ def test_set_up_nodes__sets_up_an_encoder_of_the_canopen_library():
         with open_bus("virtual", "peers") as bus:
             set_up_nodes(bus, machine)
             assert node.get_data(0x1017, 0) == b"\x32\x00" and node.get_data(0x1800, 2) == b"\x01"
-            assert node.nmt.state == "OPERATIONAL"
+            eventually(lambda: node.nmt.state == "OPERATIONAL")
             nodes = Nodes(machine)
             bus.send(0x080, b"")
             nodes.listen(bus, bus.now() + 0.3)

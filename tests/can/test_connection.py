@@ -24,7 +24,7 @@ def buses():
 
 def test_bus__marks_foreign_frames_and_echoes_and_logs_all_but_echoes(buses):
     text = io.StringIO()
-    bus = Bus(buses[0], can.CanutilsLogWriter(text), "can0", echo=True, clock=lambda: 1.0)
+    bus = Bus(buses[0], "can0", text, echo=True, clock=lambda: 1.0)
     bus.send(0x123, b"\x01\x02")
     for fields in (
         {"arbitration_id": 0x123, "data": b"\x01\x02"},  # the echo
@@ -40,8 +40,6 @@ def test_bus__marks_foreign_frames_and_echoes_and_logs_all_but_echoes(buses):
     assert frames[0] == Frame(bus.now(), -1, b"\x01\x02")
     assert bus.recv(0.0) is None
     bus.log_input(b"\x09")
-    assert not text.getvalue()  # writing waits until there is time
-    bus.flush()
     lines = text.getvalue().splitlines()
     assert len(lines) == 7
     assert re.fullmatch(r"\(\d+\.\d{6}\) can0 123#0102 T", lines[0])
@@ -66,7 +64,7 @@ def test_open_bus__keeps_its_log_where_the_adapter_fails(tmp_path):
         bus.send(0x080, b"")
         bus.bus.shutdown, shutdown = fails, bus.bus.shutdown
     shutdown()
-    assert (tmp_path / "l").read_text().endswith(" virtual 080# T\n")
+    assert (tmp_path / "l").read_text().endswith(" v 080# T\n")
 
 
 class Piped:
@@ -83,13 +81,12 @@ class Piped:
         return can.Message(arbitration_id=0x181, data=b"1234", is_extended_id=False)
 
 
-@pytest.mark.parametrize("busy_wait", [0.0, 1.0])
-def test_recv__waits_for_the_descriptor_by_its_own_clock(busy_wait):
+def test_recv__waits_for_the_descriptor_by_its_own_clock():
     raw = Piped()
     bus = Bus(raw, file=raw.reader)
     start = time.monotonic()
-    assert bus.recv(0.05, busy_wait) is None and 0.05 <= time.monotonic() - start < 1.0
+    assert bus.recv(0.05) is None and 0.05 <= time.monotonic() - start < 1.0
     threading.Timer(0.02, os.write, (raw.writer, b"x")).start()
-    frame = bus.recv(5.0, busy_wait)
+    frame = bus.recv(5.0)
     assert (frame.id, frame.data) == (0x181, b"1234") and time.monotonic() - start < 2.0
     os.close(raw.reader), os.close(raw.writer)

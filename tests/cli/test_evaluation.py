@@ -6,7 +6,6 @@ import pytest
 from helpers_cli import run
 from helpers_machines import obedient_net, pids
 
-from brokk_min.cli.evaluation import table
 from brokk_min.evaluation import baselines
 from brokk_min.machine import BROKK_170
 
@@ -30,11 +29,12 @@ def test_evaluate__writes_what_it_used_and_prints_means(folder, capsys):
         assert (written["meta"]["plant"], written["meta"]["machine"]) == (plant, "brokk170")
         names = ["rl", *pids(BROKK_170, NET)]
         assert [row["controller"] for row in written["runs"]] == names
-        assert {(row["sequence"], row["start"]) for row in written["runs"]} == {("up", 0)}
+        labels = {(row["sequence"], row["start"], row["kind"]) for row in written["runs"]}
+        assert labels == {("up", 0, "file")}
         errors[plant] = [row["velocity_error_mean"] for row in written["runs"]]
         assert errors[plant][0] == pytest.approx(0.1, rel=1e-6)  # the policy stands still
         printed = capsys.readouterr().out
-        assert "means over 1 sequences from 1 workspace starts" in printed
+        assert "means over 1 sequences from 1 starts" in printed
         assert f"{'strongest PID':26}{'closed':>15}{errors[plant][-1]:15.4g}" in printed
     assert len({row[1] for row in errors.values()}) == 3
 
@@ -74,20 +74,7 @@ def test_evaluate__tunes_pids_anew_and_again_by_what_the_file_says(folder, capsy
 def test_evaluate__begins_at_poses_of_the_package(folder, capsys):
     files = f"--policy {folder}/policy.npz --commands {folder}/c.csv"
     assert run(f"evaluate {files} --num-starts 3") == 0
-    assert "means over 1 sequences from 2 workspace starts" in capsys.readouterr().out
-
-
-def test_table__is_of_workspace_starts_if_there_are_any():
-    figures = dict.fromkeys(("off_axis_drift_max", "jerk_rms", "valve_travel"), 2)
-    errors = [("extended", 0, 7.0), ("workspace", 1, 0.1), ("workspace", 2, 0.3)]
-    runs = []
-    for kind, i, error in errors:
-        labels = {"controller": "rl", "sequence": "x", "start": i, "kind": kind}
-        runs.append(labels | figures | {"velocity_error_mean": error})
-    head, _, row = table(runs).splitlines()
-    assert head == "means over 1 sequences from 2 workspace starts"
-    assert row.split("interface")[1].split() == ["closed", "0.2", "2", "2", "2"]
-    assert "from 1 extended starts" in table(runs[:1])
+    assert "means over 1 sequences from 3 starts" in capsys.readouterr().out
 
 
 def test_reproduce__does_not_write_over_results(tmp_path, capsys):

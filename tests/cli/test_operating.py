@@ -1,8 +1,8 @@
 """The commands at a machine: their controllers, and the line that they print."""
 
-from helpers_bus import BASELINE, HoldingOperator, World, only
+from helpers_bus import BASELINE, HoldingOperator, Virtual, World, only
 
-from brokk_min.can.operator_input import JointJog
+from brokk_min.can.operator_input import JointJog, Joystick
 from brokk_min.cli.operating import Drive, status
 from brokk_min.learning.policy import PolicyController
 from brokk_min.machine import BROKK_170
@@ -32,3 +32,16 @@ def test_status__says_what_stopped_it_and_what_is_in_the_way():
     world.upward = only(0x703, lambda data: [])
     world.run(0.5)
     assert "fault: q5: silent, now q3: heartbeat lost, v goal" in status(world.drive)
+
+
+def test_status__names_the_axis_of_a_stick_that_is_not_centred():
+    """As that of a trigger, which rests at an end."""
+    device = Virtual()
+    device.axis(4, -1.0)
+    world = World(BASELINE, Joystick(BROKK_170))
+    world.drive.begin()
+    world.run(0.2)
+    assert "ready, the stick is not centred: axis 4, v goal +0.00 +0.00 +0.30" in status(
+        world.drive
+    )
+    device.unplug()

@@ -50,21 +50,21 @@ def test_plot_gap__has_a_row_for_the_tool_and_for_each_driven_joint():
 def test_plot_sequence__is_relative_to_where_the_tool_began():
     sequence = axis_sequences(BROKK_170)[0]
     sizes = {"p_tool": 3, "v_tool": 3, "q_dot": 5}
-    trace = SimpleNamespace(**{name: RNG.normal(size=(520, 2, n)) for name, n in sizes.items()})
-    traces = {("rl_paper", "x"): trace, ("pid", "y"): None}
-    figure = figures.plot_sequence(BROKK_170, traces, sequence, POSE, 1)
+    trace = SimpleNamespace(**{name: RNG.normal(size=(520, 1, n)) for name, n in sizes.items()})
+    traces = {(name, "x"): trace for name in figures.SAMPLE} | {("pid", "y"): None}
+    figure = figures.plot_sequence(BROKK_170, traces, sequence, POSE[None])
     goals = sequence.for_starts(BROKK_170, POSE[None])[:, 0]
     time = 0.05 * np.arange(1, 521)
-    (goal, policy) = (text.get_text() for text in figure.axes[0].get_legend().get_texts())
+    (goal, policy, *_) = (text.get_text() for text in figure.axes[0].get_legend().get_texts())
     p_start = tool_position(forward_kinematics(BROKK_170, POSE))
     for i in range(3):
         above, below = curves(figure.axes[i]), curves(figure.axes[3 + i])
-        np.testing.assert_allclose(above[policy], [time, trace.p_tool[:, 1, i] - p_start[i]])
+        np.testing.assert_allclose(above[policy], [time, trace.p_tool[:, 0, i] - p_start[i]])
         np.testing.assert_allclose(above[goal], [time, 0.05 * np.cumsum(goals[:, i])])
-        np.testing.assert_allclose(below[policy], [time, trace.v_tool[:, 1, i]])
-    joints = figures.plot_joint_velocities(BROKK_170, traces, "x", 1)
+        np.testing.assert_allclose(below[policy], [time, trace.v_tool[:, 0, i]])
+    joints = figures.plot_joint_velocities(BROKK_170, traces, "x")
     assert ylabels(joints) == [f"velocity q{i} [rad/s]" for i in (1, 3, 4, 5)]
-    np.testing.assert_array_equal(curves(joints.axes[2])[policy], [time, trace.q_dot[:, 1, 3]])
+    np.testing.assert_array_equal(curves(joints.axes[2])[policy], [time, trace.q_dot[:, 0, 3]])
 
 
 def test_plot_starts__draws_arms_from_the_side_and_from_above():

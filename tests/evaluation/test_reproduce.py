@@ -11,8 +11,7 @@ from helpers_machines import one_by_one
 
 from brokk_min.evaluation import baselines, report, reproduce
 from brokk_min.evaluation.claims import TEXTS
-from brokk_min.evaluation.reproduce import Budget
-from brokk_min.evaluation.robustness import variations
+from brokk_min.evaluation.reproduce import Budget, variations
 from brokk_min.evaluation.sequences import task_sequences
 from brokk_min.identification.logs import read_log
 from brokk_min.identification.net_file import fingerprint, load_net
@@ -20,7 +19,7 @@ from brokk_min.learning.policy import POLICIES, load_policy
 from brokk_min.machine import BROKK_170
 
 COARSE = replace(BROKK_170, rate=10.0, plant_dt=0.025)  # four Euler steps a tick: fast
-TINY = Budget(0.004, 20, 8192, (1, 1, 2.5), 4, 2.5)
+TINY = Budget(0.004, 20, 8192, (1, 1, 2.5), 2, 2.5)
 ERROR = "velocity_error_mean"
 PIDS = ["pid_by_hand_raw", "pid_by_hand", "jacobian_pid_k0.1", "jacobian_pid_k0.05"]
 PIDS.append("jacobian_pid_ff_integral")
@@ -66,7 +65,7 @@ def test_reproduce__gives_the_same_results_twice(folder, tmp_path, monkeypatch, 
 
 
 def test_reproduce__writes_files_that_the_other_commands_read(folder, results):
-    log = read_log([folder / "log.npz"], BROKK_170.velocity_samples, rate=COARSE.rate)
+    log = read_log(folder / "log.npz", COARSE)
     assert log.joints == load_net(folder / "net.npz").joints == BROKK_170.names
     policies = {name: load_policy(folder / file, COARSE) for name, file in POLICIES.items()}
     assert {name: policy.interface for name, policy in policies.items()} == {
@@ -89,10 +88,9 @@ def test_reproduce__results_hold_every_run_with_its_figures(results):
     names = [sequence.name for sequence in task_sequences(BROKK_170)]
     keys = {(run["controller"], run["sequence"], run["start"]) for run in runs}
     controllers = [*POLICIES, *PIDS]
-    assert keys == {(c, s, i) for c in controllers for s in names for i in range(4)}
-    assert results["start_kinds"] == ["workspace", "limits", "workspace", "extended"]
-    assert all(run["kind"] == results["start_kinds"][run["start"]] for run in runs)
-    scored = [run for run in runs if run["kind"] == "workspace" and run["controller"] == "rl"]
+    assert keys == {(c, s, i) for c in controllers for s in names for i in range(2)}
+    assert all(run["kind"] == "workspace" for run in runs)
+    scored = [run for run in runs if run["controller"] == "rl"]
     mean = results["task_space"]["means"]["rl"]["all"][ERROR]["mean"]
     assert mean == pytest.approx(np.mean([run[ERROR] for run in scored]))
     assert set(results["robustness"]) == set(variations(BROKK_170))

@@ -4,7 +4,7 @@ import numpy as np
 from helpers_machines import Idle, obedient_net, pids
 
 from brokk_min.evaluation.metrics import by_start, evaluate, mean_interval
-from brokk_min.evaluation.robustness import robustness, variations
+from brokk_min.evaluation.reproduce import robustness, variations
 from brokk_min.evaluation.sequences import task_sequences
 from brokk_min.machine import BROKK_170
 

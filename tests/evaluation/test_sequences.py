@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from brokk_min.evaluation import sequences as s
-from brokk_min.evaluation.feasibility import feasible
-from brokk_min.kinematics import forward_kinematics, lowest_point
+from brokk_min.kinematics import forward_kinematics, lowest_point, tool_position
 from brokk_min.machine import BROKK_170
 
 START = np.array(BROKK_170.q_start)
+STILL = np.zeros((2, 1, 3))
 
 
 def hold_table(goals):
@@ -116,46 +116,34 @@ def test_read_commands__refuses_what_is_no_sequence(tmp_path, rows, message):
     assert str(path) in str(error.value)
 
 
-@pytest.mark.parametrize(
-    ("row", "message"),
-    [
-        ("0,0.5,0.5,1.7,2.2", r"s.csv: q5: expected 0 to 2, got .2.2"),
-        ("0,0.5,0.5,nan,1.2", r"s.csv: q4: expected 0.6 to 2.9, got .nan"),
-        ("0,0,-0.3,2.5,1.2", r"s.csv: expected arms above 0.0 m, got -"),
-    ],
-)
-def test_read_starts__refuses_poses_out_of_range_or_in_the_ground(tmp_path, row, message):
+@pytest.mark.parametrize("row", ["0,0.5,0.5,1.7,2.2", "0,0.5,0.5,nan,1.2", "0,0,-0.3,2.5,1.2"])
+def test_read_starts__refuses_poses_out_of_range_or_in_the_ground(tmp_path, row):
     path = tmp_path / "s.csv"
     path.write_text(f"q1,q2,q3,q4,q5\n0,0.5,0.5,1.7,1.2\n{row.strip()}\n")
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=r"s.csv: row 3: expected angles within .*, got \[0.0, 0."):
         s.read_starts(path, BROKK_170)
 
 
 # --- start poses ----------------------------------------------------------------------------------
 
 
-def test_evaluation_starts__of_the_package_are_of_all_kinds():
-    starts = s.evaluation_starts(BROKK_170, 64, [], 0)
-    kinds = np.array(s.start_kinds(BROKK_170, starts))
-    assert np.unique(kinds, return_counts=True)[1].tolist() == [16, 16, 32]
-    assert (lowest_point(forward_kinematics(BROKK_170, starts)) > 0).all()
-    assert len(np.unique(starts, axis=0)) == 64
-    workspace = starts[kinds == "workspace"]
-    assert np.histogram(workspace[:, 0], [-2.14, -0.7, 0.7, 2.14])[0].min() >= 5
-    for sequence in s.axis_sequences(BROKK_170):
-        assert feasible(BROKK_170, workspace, sequence.for_starts(BROKK_170, workspace)).all(), (
-            sequence.name
-        )
-    with pytest.raises(ValueError, match=r"starts.csv: expected at most 64 starts, got 65"):
-        s.evaluation_starts(BROKK_170, 65, [], 0)
+def test_evaluation_starts__of_the_package_can_follow_all_sequences():
+    starts = s.evaluation_starts(BROKK_170, 32, [], 0)
+    assert len(np.unique(starts, axis=0)) == 32
+    assert np.histogram(starts[:, 0], [-2.14, -0.7, 0.7, 2.14])[0].min() >= 5
+    for sequence in s.task_sequences(BROKK_170):
+        goals = sequence.for_starts(BROKK_170, starts)
+        assert s.feasible(BROKK_170, starts, goals).all(), sequence.name
+    with pytest.raises(ValueError, match=r"starts.csv: expected at most 32 starts, got 33"):
+        s.evaluation_starts(BROKK_170, 33, [], 0)
 
 
 def test_evaluation_starts__of_another_machine_are_drawn():
     other = replace(BROKK_170, name="other")
     short = [s.Commands("z", s.axis_sequences(other)[2].goals[15:40])]
     starts = s.evaluation_starts(other, 5, short, 3)
-    assert starts.shape == (5, 5) and set(s.start_kinds(other, starts)) == {"workspace"}
-    assert feasible(other, starts, short[0].for_starts(other, starts)).all()
+    assert starts.shape == (5, 5)
+    assert s.feasible(other, starts, short[0].for_starts(other, starts)).all()
 
 
 def test_evaluation_starts__refuse_a_machine_that_can_follow_nothing(monkeypatch):
@@ -166,20 +154,52 @@ def test_evaluation_starts__refuse_a_machine_that_can_follow_nothing(monkeypatch
         s.evaluation_starts(replace(BROKK_170, name="other"), 2, sequences, 0)
 
 
-@pytest.mark.parametrize(
-    ("pose", "kind"),
-    [
-        (START, "workspace"),
-        ([*START[:3], 2.9 - 0.151, START[4]], "workspace"),  # q4 ends at 2.9
-        ([*START[:3], 2.9 - 0.149, START[4]], "limits"),
-        ([*START[:4], 0.151], "workspace"),  # q5 begins at 0
-        ([*START[:4], 0.149], "limits"),
-        ([1.5, 0.05, *START[2:]], "workspace"),  # q2 is not driven
-        ([0.0, 1.4, 0.5, 2.7, 1.9], "extended"),  # 4.5 of 4.75 m, 0.8 m from the slew axis
-    ],
-)
-def test_start_kinds__by_hand(pose, kind):
-    assert s.start_kinds(BROKK_170, np.array([pose])) == [kind]
+# --- feasible paths -------------------------------------------------------------------------------
+
+
+def follows(start, goals=STILL, machine=BROKK_170):
+    return bool(s.feasible(machine, start[None], goals)[0])
+
+
+def test_feasible__refuses_a_path_through_a_singularity():
+    """Stretched out straight no joint can move the tool outward: it leaves its path."""
+    wide = [replace(j, cylinder_base=0.0, q_min=-3.0, q_max=4.0) for j in BROKK_170.joints]
+    machine = replace(BROKK_170, joints=tuple(wide))
+    start = np.array([0.0, 0.5, 0.1, np.pi, 3 * np.pi / 4])
+    outward = np.array([np.cos(0.6), 0.0, np.sin(0.6)]) / 5  # along the links after q2
+    assert follows(start, np.zeros((5, 1, 3)), machine)
+    assert not follows(start, np.tile(outward, (5, 1, 1)), machine)
+
+
+@pytest.mark.parametrize("joint", BROKK_170.driven)
+@pytest.mark.parametrize("end", ["q_min", "q_max"])
+def test_feasible__keeps_a_margin_to_joint_limits(joint, end):
+    inward = 1 if end == "q_min" else -1
+    near = np.array([0.0, *START[1:]])
+    far = near.copy()
+    near[joint] = BROKK_170.column(end)[joint] + inward * 0.049
+    far[joint] = BROKK_170.column(end)[joint] + inward * 0.051
+    high_enough = lowest_point(forward_kinematics(BROKK_170, far)) > 0.1
+    assert not follows(near) and follows(far) == high_enough
+
+
+@pytest.mark.parametrize("direction", [-1, 1])
+def test_feasible__keeps_a_margin_to_the_speed_limits(direction):
+    start = np.array([0.0, *START[1:]])
+    limit = -0.20 if direction < 0 else 0.20  # of q1 [rad/s]
+    radius = np.hypot(*tool_position(forward_kinematics(BROKK_170, start))[:2])
+    machine = replace(BROKK_170, rate=100.0)
+    for fraction, expected in ((0.89, True), (0.91, False)):
+        slewing = np.tile([0.0, fraction * limit * radius, 0.0], (2, 1, 1))
+        assert follows(start, slewing, machine) == expected
+
+
+@pytest.mark.parametrize("rate", [5.0, 10.0, 20.0])
+def test_feasible__compares_tool_and_path_at_the_same_tick(rate):
+    """At 10 Hz and 0.3 m/s the path of the next tick is 30 mm ahead."""
+    machine = replace(BROKK_170, rate=rate)
+    sideways = np.tile([0.0, 0.3, 0.0], (3, 1, 1))
+    assert follows(np.array([0.0, *START[1:]]), sideways, machine)
 
 
 # --- tuning ---------------------------------------------------------------------------------------
@@ -188,7 +208,7 @@ def test_start_kinds__by_hand(pose, kind):
 def test_tuning_set__is_feasible_and_rests_for_long():
     starts, goals = s.tuning_set(BROKK_170, 8, 7)
     assert starts.shape == (8, 5) and goals.shape == (400, 8, 3)
-    assert feasible(BROKK_170, starts, goals).all()
+    assert s.feasible(BROKK_170, starts, goals).all()
     assert np.linalg.norm(goals, axis=-1).max() <= BROKK_170.tool_speed + 1e-6
     holds, rests = [], []
     for run in goals.swapaxes(0, 1):

@@ -5,10 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers_cli import run
 from helpers_machines import POSE, one_by_one, small_net
 
 from brokk_min.evaluation import metrics, sweep
 from brokk_min.evaluation.sequences import axis_sequences
+from brokk_min.identification.net_file import save_net
 from brokk_min.learning.checkpoint import train_policy
 from brokk_min.learning.policy import PolicyController
 from brokk_min.learning.recipes import Recipe
@@ -37,24 +39,28 @@ def test_run_seed__refuses_policies_of_another_training(tmp_path):
         sweep.run_seed(BROKK_170, NET, other, tmp_path, 2, 4)
 
 
-def rows(seed, error):
-    """Two sequences from three starts, of which two count."""
-    starts = (("workspace", error), ("limits", 99.0), ("workspace", error + 1))
+def rows(error):
+    """Two sequences from two starts."""
     return [
-        {"controller": "rl", "sequence": s, "start": i, "kind": kind, "seed": seed}
-        | dict.fromkeys(metrics.COLUMNS, e)
+        {"controller": "rl", "sequence": s, "start": i, "kind": "workspace"}
+        | dict.fromkeys(metrics.COLUMNS, error + i)
         for s in "xy"
-        for i, (kind, e) in enumerate(starts)
+        for i in (0, 1)
     ]
 
 
-def test_over_seeds__counts_a_seed_once():
-    table = sweep.over_seeds(rows(0, 1.0) + rows(7, 3.0))
+def test_sweep__counts_a_seed_once(tmp_path, monkeypatch, capsys):
+    """By its command, of two seeds."""
+    done = {"5": rows(1.0), "6": rows(3.0)}
+    monkeypatch.setattr(sweep, "side_by_side", lambda jobs, *_: {seed: done[seed] for seed in jobs})
+    save_net(tmp_path / "net.npz", NET)
+    assert run(f"sweep --actuator {tmp_path}/net.npz --out {tmp_path}/s --seeds 2 --seed 5") == 0
     # two seeds, 1.5 and 3.5: half of 12.7062 x sqrt(2) / sqrt(2) x 2
+    assert "velocity_error_mean      2.5 (-10.21 to 15.21)" in capsys.readouterr().out
+    table = json.loads((tmp_path / "s" / "sweep.json").read_text())["table"]
     expected = {"mean": 2.5, "low": -10.2062, "high": 15.2062}
     assert list(table) == ["x", "y", "all"]
     assert all(of[key] == pytest.approx(expected, abs=1e-4) for of in table.values() for key in of)
-    assert "velocity_error_mean      2.5 (-10.21 to 15.21)" in sweep.show(table)
 
 
 def test_sweep__trains_and_scores_each_seed_once(tmp_path):

@@ -5,6 +5,7 @@ import pytest
 
 from brokk_min.identification.columns import load_table, parse_map
 from brokk_min.identification.logs import read_log
+from brokk_min.machine import BROKK_170
 
 THEIRS = """Zeit,Drive,Boom [deg],Lever,Note
 {0},A,10.0,25,start
@@ -32,7 +33,7 @@ def theirs(tmp_path, stamps):
 def test_read_log__takes_names_units_and_stamps_from_a_mapping(tmp_path, stamps, unit):
     mapped = parse_map(f"boom=Boom [deg]:deg, u_boom=Lever:percent,run=Drive,time=Zeit{unit}")
     path = theirs(tmp_path, stamps)
-    (one,) = read_log([path], 2, read=lambda path: load_table(path, mapped)).recordings
+    (one,) = read_log(path, BROKK_170, mapped).recordings
     assert one.name == "A"
     np.testing.assert_allclose(one.q[:, 0], np.deg2rad([10, 11, 12]), atol=1e-6)
     np.testing.assert_allclose(one.u[:, 0], [0.25, -0.5, 1.0])
@@ -75,8 +76,8 @@ def test_load_table__says_which_column_and_how_to_map_it(tmp_path, mapping, mess
 def test_read_log__takes_numbers_as_names_and_datetimes_as_time(tmp_path, run):
     """A single one is for all rows; a table without `run` is one recording by its file's name."""
     start, tick = np.datetime64("2026-01-02T03:04:05"), np.timedelta64(50, "ms")
-    columns = {"time": start + np.arange(3) * tick, "u_a": np.zeros(3), "q_a": np.arange(3) / 20}
+    columns = {"time": start + np.arange(3) * tick, "u_a": np.zeros(3), "q_a": np.arange(3) / 50}
     np.savez(tmp_path / "3.npz", **columns | ({} if run is None else {"run": run}))
-    (one,) = read_log([tmp_path / "3.npz"], 2).recordings
+    (one,) = read_log(tmp_path / "3.npz", BROKK_170).recordings
     assert one.name == "3"
-    np.testing.assert_allclose(one.q_dot[1:, 0], 1.0)
+    np.testing.assert_allclose(one.q[:, 0], [0, 0.02, 0.04])

@@ -7,7 +7,7 @@ import pytest
 from helpers_machines import constant_net, line
 
 from brokk_min.identification.logs import Log, Recording, join_recordings, velocity_of
-from brokk_min.identification.validation import free_run, score, validate
+from brokk_min.identification.validation import free_run, score, warnings
 
 
 def test_score__compares_one_step_with_the_target_of_the_fit_by_hand():
@@ -66,15 +66,12 @@ def test_score__refuses_a_log_of_another_kind(log, message):
         score(constant_net([0.2], True, ("a",)), log)
 
 
-def test_validate__warns_of_nets_no_better_than_the_last_velocity():
+def test_warnings__name_nets_no_better_than_the_last_velocity():
     """The velocity alternates between -0.1 and 0.1 rad/s: the last one again is off by 0.2."""
     q_dot = 0.1 * (-1.0) ** np.arange(40)[:, None]
     test = Log(("a",), (Recording("x", q_dot, np.cumsum(q_dot, axis=0) / 20, q_dot),), True)
-    assert validate(constant_net([0.0], True, ("a",)), test)["warnings"] == []
-    result = validate(constant_net([0.4], True, ("a",)), test)
-    assert set(result["joints"]) == {"a"}
-    assert set(result["joints"]["a"]) == {"one_step_rmse", "persistence_rmse", "free_run"}
-    (warning,) = result["warnings"]
+    assert warnings(score(constant_net([0.0], True, ("a",)), test)) == []
+    (warning,) = warnings(score(constant_net([0.4], True, ("a",)), test))
     assert warning.startswith("a: expected an error of one step below 0.2000, got 0.4")
 
 

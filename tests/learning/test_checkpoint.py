@@ -31,8 +31,8 @@ def often(monkeypatch):
     monkeypatch.setattr("brokk_min.learning.checkpoint.EVERY", 2)
 
 
-def run(path, kind="ours", seed=5, net=NET, **options):
-    return train_policy(BROKK_170, net, RECIPES[kind], seed, path, **options)
+def run(path, kind="ours", seed=5, net=NET):
+    return train_policy(BROKK_170, net, RECIPES[kind], seed, path)
 
 
 def read_curve(path):
@@ -56,26 +56,20 @@ def run_until_interrupted(path, kind="ours"):
 
 
 @pytest.mark.parametrize("kind", ["ours", "paper"])
-def test_train_policy__goes_on_after_an_interruption_to_the_same_bits(tmp_path, kind):
+def test_train_policy__goes_on_after_an_interruption_to_the_same_files(tmp_path, kind):
     straight = run(tmp_path / "straight.npz", kind)
     path = tmp_path / "p.npz"
     run_until_interrupted(path, kind)
     assert os.path.exists(f"{path}.checkpoint") and not path.exists()
     torch.manual_seed(99)
-    resumed = run(path, kind, resume=True)
+    resumed = run(path, kind)
     assert all(map(np.array_equal, straight.weights, resumed.weights))
     assert read_curve(path) == read_curve(tmp_path / "straight.npz")
     assert not os.path.exists(f"{path}.checkpoint")
-
-
-@pytest.mark.parametrize("kind", ["ours", "paper"])
-def test_train_policy__writes_a_policy_and_its_curve(tmp_path, kind):
-    policy = run(tmp_path / "p.npz", kind)
-    again = load_policy(tmp_path / "p.npz", BROKK_170)
-    assert all(map(np.array_equal, policy.weights, again.weights))
-    assert again.interface == RECIPES[kind].interface
-    assert again.training["seed"] == 5
-    curve = read_curve(tmp_path / "p.npz")
+    again = load_policy(path, BROKK_170)
+    assert all(map(np.array_equal, straight.weights, again.weights))
+    assert (again.interface, again.training["seed"]) == (RECIPES[kind].interface, 5)
+    curve = read_curve(path)
     assert [row["global_step"] for row in curve] == ["64", "128", "192", "256"]
     assert {"losses/policy_loss", "charts/reward", "charts/velocity_error"} <= set(curve[0])
     assert all(np.isfinite(float(value)) for row in curve for value in row.values())
@@ -84,12 +78,10 @@ def test_train_policy__writes_a_policy_and_its_curve(tmp_path, kind):
 def test_checkpoint__is_refused_where_it_does_not_belong(tmp_path):
     path = tmp_path / "p.npz"
     run_until_interrupted(path)
-    with pytest.raises(ValueError, match="expected --resume or no checkpoint, got one of a broken"):
-        run(path)
     with pytest.raises(ValueError, match="seed: expected 6, got 5"):
-        run(path, seed=6, resume=True)
+        run(path, seed=6)
     with pytest.raises(ValueError, match="actuator: expected"):
-        run(path, net=obedient_net(BROKK_170), resume=True)
+        run(path, net=obedient_net(BROKK_170))
 
 
 def test_checkpoint__executes_nothing(tmp_path):
@@ -102,7 +94,7 @@ def test_checkpoint__executes_nothing(tmp_path):
 
     torch.save({"about": Evil()}, f"{path}.checkpoint")
     with pytest.raises(ValueError, match="expected a readable checkpoint"):
-        run(path, resume=True)
+        run(path)
     assert not (tmp_path / "created").exists()
 
 

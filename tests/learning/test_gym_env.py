@@ -13,7 +13,6 @@ from helpers_machines import obedient_net, small_net
 from brokk_min.actuator import PLANT
 from brokk_min.beyond.interface import INTERFACE
 from brokk_min.env import PAPER, TaskConfig
-from brokk_min.identification.net_file import save_net
 from brokk_min.learning.gym_env import TaskEnv, TaskVectorEnv
 from brokk_min.machine import BROKK_170
 
@@ -158,10 +157,10 @@ def test_wrappers__of_gymnasium_accept_the_vector(wrapper):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"machine": "brokk170"}, "machine: expected Machine, got 'brokk170'"),
-        ({"config": {"episode_s": 5.0}}, "config: expected TaskConfig, got {'episode_s': 5.0}"),
+        ({"machine": "brokk170"}, "machine: expected a Machine, got brokk170"),
+        ({"config": {"episode_s": 5.0}}, "config: expected a TaskConfig, got {'episode_s': 5.0}"),
+        ({"plant": "net.npz"}, "plant: expected reset and step, got 'net.npz'"),
         ({"num_envs": 0}, "num_envs: expected 1 or more, got 0"),
-        ({"render_mode": "human"}, "render_mode: expected rgb_array, got human"),
     ],
 )
 def test_make_vec__refuses_wrong_arguments_by_name(options, message):
@@ -177,12 +176,6 @@ def test_step__refuses_to_begin_without_a_reset_and_actions_that_do_not_fit():
     for bad in (np.zeros((2, 3)), np.full((2, 4), np.nan)):
         with pytest.raises(ValueError, match=r"action: expected finite \(\.\.\., 4\)"):
             env.step(bad)
-
-
-def test_task_vector_env__takes_a_file_of_nets(tmp_path):
-    net = small_net(BROKK_170, np.random.default_rng(0), joints=BROKK_170.names)
-    save_net(tmp_path / "net.npz", net)
-    assert TaskVectorEnv(1, str(tmp_path / "net.npz")).plant.joints == ("q1", "q3", "q4", "q5")
 
 
 def test_make__gives_an_environment_that_gymnasium_and_stable_baselines_accept():
