@@ -1,4 +1,4 @@
-"""Errors on the machine while agents learn, against hours: a critic, and groups of rollouts.
+"""Errors on the machine while agents learn: a critic, and groups of rollouts.
 
     python -m benchmarks.curves [FOLDER] [SEED]
 
@@ -66,19 +66,20 @@ def learn(name: str, folder: Path, seed: int) -> list[dict[str, float]]:
 
 
 def draw(curves: dict[str, list[dict[str, float]]], path: Path) -> None:
-    """Error against hours of one core, both logarithmic."""
+    """Error against steps and against hours of one core, all logarithmic."""
     plt.rcParams.update({"svg.hashsalt": "learning", "svg.fonttype": "none"})
-    figure, axes = plt.subplots(figsize=(6.4, 3.4), layout="constrained")
-    for name, rows in curves.items():
-        hours, error = ([row[key] for row in rows] for key in ("hours", "error"))
-        axes.plot(hours, error, marker=".", label=name)
+    figure, both = plt.subplots(1, 2, figsize=(8, 3.4), sharey=True, layout="constrained")
+    labels = {"steps": "environment steps", "hours": "hours of one core"}
+    for axes, (x, label) in zip(both, labels.items(), strict=True):
+        for name, rows in curves.items():
+            axes.plot([row[x] for row in rows], [row["error"] for row in rows], ".-", label=name)
+        axes.set(xscale="log", yscale="log", ylim=(0.01, None), xlabel=label)
     axes.axvline(PAPER_HOURS, color="gray", linestyle=":", label="the paper's training")
-    axes.set(xscale="log", yscale="log", ylim=(0.01, None))
     axes.xaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_formatter("{x:g}")
-    axes.set(xlabel="hours of one core", ylabel="velocity error on the machine [m/s]")
-    axes.legend()
+    both[0].set(ylabel="velocity error on the machine [m/s]")
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=2)
     figure.savefig(path, metadata={"Date": None})
 
 

@@ -6,7 +6,7 @@ the tool's velocity error, opens a valve wider that has just been closed, and cl
 while the tool rests. So it has the main inputs and tricks of our agent.
 
 What it buys: with gains by the same optimiser its mean velocity error along x, y and z is 0.0117
-m/s, where the paper's structure has 0.0196 m/s (`table.json` of `brokk-min reproduce`).
+m/s, where the paper's structure has 0.0194 m/s (`table.json` of `brokk-min reproduce`).
 
 Who was first: feed-forward by an inverted static map is Merritt's (Hydraulic Control Systems,
 1967); kicks against stiction are Hagglund's (2002).

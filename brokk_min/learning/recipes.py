@@ -21,8 +21,8 @@ def find_recipe(paper: bool = False, critic: bool = False) -> Recipe:
     learner = PPOConfig()
     if not critic:
         learner = PPOConfig(
-            total_steps=PPOConfig.total_steps if paper else 12_000_000,
-            minibatch_size=1024,
+            total_steps=80_000_000 if paper else 12_000_000,
+            minibatch_size=2048 if paper else 1024,
             gamma=0.95 if paper else 0.94,
             gae_lambda=1.0,
             log_std_end=-4.2 if paper else -4.0,
