@@ -33,7 +33,7 @@ AXES = (1, 0, 3)
 Y_BUTTON = 3  # of an Xbox pad
 NOTES = (
     "arrows: x (up, down) and y (left, right)",
-    "W, S: z (up, down)    SHIFT: slowly",
+    "W, S: z (up, down)    left SHIFT: slowly",
     "TAB: the other controller",
     "ESC: end",
     "gamepad: both sticks; Y is TAB",
