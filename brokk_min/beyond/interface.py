@@ -10,10 +10,10 @@ three seeds along x, y and z, `benchmarks.ladder`):
 
 | Parts | Velocity error | Drift | Valve travel |
 |---|---|---|---|
-| the paper's interface | 0.0357 m/s | 0.193 m | 20 |
-| the observation, too | 0.0180 m/s | 0.060 m | 27 |
-| actions beyond the dead zone, closed valves, too | 0.0160 m/s | 0.060 m | 105 |
-| costs, too | 0.0152 m/s | 0.031 m | 27 |
+| the paper's interface | 0.0357 m/s | 0.196 m | 21 |
+| the observation, too | 0.0184 m/s | 0.067 m | 26 |
+| actions beyond the dead zone, closed valves, too | 0.0161 m/s | 0.058 m | 74 |
+| costs, too | 0.0154 m/s | 0.038 m | 25 |
 
 Who was first: resolved rates (Whitney, 1969) as inputs are residual or "structured" observations of
 many papers; the integral is that of a PI controller; costs of action changes are legged_gym's.
