@@ -76,7 +76,11 @@ class Shadow(hw.Drive):
 
     def control(self, counts: Array) -> Array:
         """The controller's command [counts of 127] (n,)."""
-        self.positions_time = self.bus.now()
+        answered = self.nodes.frames > 0
+        if answered.any() and not answered.all():  # it has waited for the others
+            self.positions_time += self.machine.dt
+        else:
+            self.positions_time = self.bus.now()
         return super().control(counts)
 
     def send_command(self, command: Array, counts: Array) -> None:

@@ -226,7 +226,7 @@ def _runs(names: Any) -> dict[str, Rows]:
     """Rows of each recording, in the order in which they begin, without returns."""
     unique, first, number = np.unique(names, return_index=True, return_inverse=True)
     rows = {str(unique[i]): np.flatnonzero(number == i) for i in np.argsort(first)}
-    return {run: of for run, of in rows.items() if len(of) > 1 and not run.endswith(RETURN)}
+    return {run: of for run, of in rows.items() if not run.endswith(RETURN)}
 
 
 def _numbers(table: Mapping[str, Any], names: Sequence[str]) -> Array:
@@ -252,7 +252,7 @@ def _resample(
     """u held, q and q_dot of `rows` interpolated at the rate; q_dot estimated if there is none."""
     t, rate = time[rows], machine.rate
     grid = t[0] + np.arange(int((t[-1] - t[0]) * rate + 1e-6) + 1) / rate
-    fast = np.median(np.diff(time)) < 0.501 / rate
+    fast = len(time) > 1 and np.median(np.diff(time)) < 0.501 / rate
     parts = np.linspace(0, 1 / rate, MEAN_OF if fast else 1, endpoint=False)[:, None]
     held = np.searchsorted(time, grid + parts + 1e-6, side="right") - 1
     u = columns["u"][held].mean(axis=0)
