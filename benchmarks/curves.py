@@ -24,7 +24,7 @@ from benchmarks.peers import machine_error
 from brokk_min import ppo
 from brokk_min._files import write_json
 from brokk_min.identification.net_file import load_net
-from brokk_min.learning.checkpoint import actor_weights, make_env, stagger_episodes
+from brokk_min.learning.checkpoint import actor_weights, prepare
 from brokk_min.learning.jobs import side_by_side
 from brokk_min.learning.policy import Policy, PolicyController
 from brokk_min.learning.recipes import find_recipe
@@ -44,9 +44,7 @@ def learn(name: str, folder: Path, seed: int) -> list[dict[str, float]]:
     """One training: steps, hours of CPU, and the error on the machine [m/s], point by point."""
     torch.set_num_threads(1)
     recipe, net = AGENTS[name], load_net(folder / "net.npz", M)
-    env, advantages = make_env(M, net, recipe)
-    start = ppo.begin(env, recipe.learner, seed)
-    stagger_episodes(env)
+    env, advantages, start = prepare(M, net, recipe, seed)
     learner = recipe.learner
     updates = math.ceil(learner.total_steps / (learner.num_envs * learner.horizon))
     rows: list[dict[str, float]] = []

@@ -35,9 +35,10 @@ STEPS = {
     "observation": "error integral, resolved rates, open valves",
     "command": "actions from the dead zone on, closed valves at rest",
     "cost": "costs of valve travel and error integral",
+    "settings": "our settings of task and learner, and Muon",
 }
 RUNGS = {"the paper's agent": frozenset[str]()}
-RUNGS |= {f"alone: {text}": frozenset([k]) for k, text in STEPS.items()}
+RUNGS |= {f"alone: {text}": frozenset([k]) for k, text in STEPS.items() if k != "settings"}
 RUNGS |= {
     f"in order: {text}": frozenset(list(STEPS)[: i + 1])
     for i, text in enumerate(STEPS.values())
@@ -60,8 +61,9 @@ def climb(name: str, nets: dict[str, ActuatorNet], total_steps: int, seed: int) 
     """`FIGURES` of one new policy on the machine."""
     steps = RUNGS[name]
     policy.INTERFACES[name] = interface_of(steps)  # of this process
-    recipe = replace(find_recipe(paper=True, critic="groups" not in steps), interface=name)
-    recipe = replace(recipe, learner=replace(recipe.learner, total_steps=total_steps))
+    recipe = find_recipe(paper="settings" not in steps, critic="groups" not in steps)
+    learner = replace(recipe.learner, total_steps=total_steps)
+    recipe = replace(recipe, interface=name, learner=learner)
     net = nets["net" if "nets" in steps else "net_paper"]
     with TemporaryDirectory() as folder:
         trained = train_policy(M, net, recipe, seed, Path(folder) / "policy.npz")

@@ -191,7 +191,6 @@ def begin(env: VectorEnv[Any, Any, Any], config: PPOConfig, seed: int) -> Checkp
     agent = Agent(obs_size, math.prod(env.single_action_space.shape or ()), config.log_std)
     agent.log_std.requires_grad_(config.log_std_end is None)
     optimizer = torch.optim.Adam(agent.parameters(), lr=config.learning_rate, fused=True)
-    optimizer.param_groups[0]["peak_lr"] = config.learning_rate
     obs = torch.as_tensor(env.reset(seed=seed)[0], dtype=torch.float32)
     return Checkpoint(agent, optimizer, obs, 0, 0)
 
@@ -212,6 +211,7 @@ def train(
     """
     agent, optimizer, obs, global_step, update = start or begin(env, config, seed)
     group = optimizer.param_groups[0]
+    group.setdefault("peak_lr", config.learning_rate)
     while global_step < config.total_steps:
         done = global_step / config.total_steps
         group["lr"] = group["peak_lr"] * (1 - done)

@@ -27,7 +27,7 @@ class PPOConfig:
     horizon: int = 32  # ticks of each environment between two updates
     epochs: int = 2  # passes over the collected steps in each update
     minibatch_size: int = 2048  # steps in one gradient
-    learning_rate: float = 1.2e-3  # of Adam, at most; falls linearly to zero
+    learning_rate: float = 1.2e-3  # at most; falls linearly to zero
     target_kl: float = 0.03  # KL divergence an update, to which the learning rate is steered
     gamma: float = 0.9  # discount a tick: 0.9 looks 10 ticks ahead
     gae_lambda: float = 0.95  # weight of longer returns in the advantage

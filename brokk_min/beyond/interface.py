@@ -23,11 +23,13 @@ It plugs into `env.Interface`. Observation, with the mean and deviation of each 
 | Num     | Observation                                          | Deviation   | Weight |
 |---------|------------------------------------------------------|-------------|--------|
 | 0-6     | goal and measured velocity, angle of the locked joint | as in `env` | 0.75   |
-| 7-110   | 13 angles, 13 velocities (a third) of each driven joint | as in `env` | 0.277 |
-| 111-162 | 13 commands of each driven joint                     | as in `env` | 0.277  |
-| 163-214 | `valve_nets.open_indicator` of these commands        | 0.5         | 0.277  |
+| 7-110   | 13 angles (weight 0.277), 13 velocities of each driven joint | as in `env` | 0.795 f |
+| 111-162 | 13 commands of each driven joint                     | as in `env` | 0.795 f |
+| 163-214 | `valve_nets.open_indicator` of these commands        | 0.5         | 0.795 f |
 | 215-218 | joint velocities that give the goal (`jacobian.dls`) | as in `env` | 1.5    |
 | 219-222 | joint motions that undo the error integral [rad]     | 0.1 s of them | 1.5  |
+
+f = exp(-k / 2) of a sample k ticks old.
 """
 
 from functools import lru_cache
@@ -46,6 +48,7 @@ INTEGRAL_TIME = 2.0  # s, tuned: time constant of the error integral's leak
 INTEGRAL_LIMIT = 0.07  # of tool_speed, tuned: velocity errors count up to here
 COMPENSATION = 0.01  # of an action, assumed: up to here a command rises to the dead zone
 REST_AFTER = 0.5  # s of a zero goal, after which the valves close (assumed)
+FADES = 2.0  # ticks, tuned: e-fold of the weights of older velocities and commands
 TRAVEL_COST = 0.1  # tuned: if all commands change by the limit in a tick
 
 
@@ -97,20 +100,20 @@ def smooth_angles(machine: Machine, history: Array) -> Array:
 def observation_scale(machine: Machine) -> tuple[Array, Array]:
     """Mean and deviation / weight of the observation, float32 (obs,) both.
 
-    Each of H samples has the weight H^-0.5, so together they weigh as one number, and velocities
-    have a third of that; the resolved velocities weigh most, because nets learn first what is
-    large.
+    Nets learn first what is large, so the resolved velocities weigh most, and of velocities and
+    commands the newest samples. The H samples of a signal weigh as one number, sum w^2 = 1.
     """
-    n, H, first = len(machine.driven), machine.history, 6 + len(machine.locked)
+    n, H = len(machine.driven), machine.history
     mean, std = env.observation_scale(machine)
     q_dot_std = env.velocity_deviations(machine)[1][machine.driven]
-    opens = np.full(n * H, 0.5)
-    weights = np.full(len(std), H**-0.5)
-    weights[:first] = 0.75
-    weights[first : first + 2 * n * H].reshape(n, 2, H)[:, 1] /= 3
-    scale = [std / weights, opens * H**0.5, q_dot_std / 1.5, 0.1 * q_dot_std / 1.5]
-    mean = np.concatenate([mean, opens, np.zeros(2 * n)])
-    return mean.astype(np.float32), np.concatenate(scale, dtype=np.float32)
+    even, fading = np.ones(H), np.exp(-np.arange(H)[::-1] / FADES)
+    even, fading = (of / np.linalg.norm(of) for of in (even, fading))
+    weights = [np.full(6 + len(machine.locked), 0.75)]
+    weights += n * [even, fading] + 2 * n * [fading] + [np.full(2 * n, 1.5)]
+    mean = np.concatenate([mean, np.full(n * H, 0.5), np.zeros(2 * n)])
+    std = np.concatenate([std, np.full(n * H, 0.5), q_dot_std, 0.1 * q_dot_std])
+    scale = std / np.concatenate(weights)
+    return mean.astype(np.float32), scale.astype(np.float32)
 
 
 def observe(machine: Machine, measured: Measured, memory: Memory) -> Array:

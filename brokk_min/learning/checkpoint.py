@@ -15,6 +15,7 @@ from brokk_min import ppo
 from brokk_min._files import expect_same, expected, whole_file, write_csv
 from brokk_min.actuator import ActuatorNet
 from brokk_min.beyond.group_advantages import GroupVectorEnv, group_advantages
+from brokk_min.beyond.muon import muon
 from brokk_min.identification.net_file import fingerprint
 from brokk_min.learning.episodes import map_arrays
 from brokk_min.learning.gym_env import TaskVectorEnv
@@ -45,10 +46,8 @@ def train_policy(
     }
     torch.set_num_threads(1)  # several wait in vain on busy cores
     config = recipe.learner
-    env, advantages = make_env(machine, net, recipe)
+    env, advantages, start = prepare(machine, net, recipe, seed)
     log = TrainingLog(env, out, about)
-    start = ppo.begin(env, config, seed)
-    stagger_episodes(env)
     if log.checkpoint.exists():
         start = log.load(start)
     options: dict[str, Any] = {"initial": start.global_step, "unit_scale": True, "disable": None}
@@ -61,15 +60,21 @@ def train_policy(
     return policy
 
 
-def make_env(
-    machine: Machine, net: ActuatorNet, recipe: Recipe
-) -> tuple[TaskVectorEnv, ppo.Advantages]:
-    """The environments of a recipe, and its advantages."""
-    config, interface = recipe.learner, INTERFACES[recipe.interface]
-    simulation = (config.num_envs, net, machine, recipe.task, interface)
-    if recipe.critic:
-        return TaskVectorEnv(*simulation), ppo.critic_advantages
-    return GroupVectorEnv(*simulation, horizon=config.horizon), group_advantages
+def prepare(
+    machine: Machine, net: ActuatorNet, recipe: Recipe, seed: int
+) -> tuple[TaskVectorEnv, ppo.Advantages, Checkpoint]:
+    """The environments of a recipe, its advantages, and the beginning of its training."""
+    config = recipe.learner
+    simulation = (config.num_envs, net, machine, recipe.task, INTERFACES[recipe.interface])
+    env = TaskVectorEnv(*simulation)
+    advantages: ppo.Advantages = ppo.critic_advantages
+    if not recipe.critic:
+        env, advantages = GroupVectorEnv(*simulation, horizon=config.horizon), group_advantages
+    start = ppo.begin(env, config, seed)
+    if recipe.muon:
+        start = start._replace(optimizer=muon(start.agent, config))
+    stagger_episodes(env)
+    return env, advantages, start
 
 
 def actor_weights(agent: Agent) -> tuple[np.ndarray, ...]:

@@ -62,12 +62,16 @@ def test_observe__by_hand():
     assert obs.shape == (223,) and obs.dtype == np.float32
     paper = env.features(BROKK_170, measured)
     np.testing.assert_allclose(obs[:7], 0.75 * paper[:7], rtol=1e-5)
-    expected = paper[7:] / 13**0.5
-    expected[:104].reshape(4, 2, 13)[:, 1] /= 3  # velocities
+    fading = np.exp(-np.arange(12, -1, -1) / 2)  # of the 13 samples, newest last
+    fading /= np.sum(fading**2) ** 0.5
+    expected = paper[7:].copy()
+    expected[:104].reshape(4, 2, 13)[:, 0] /= 13**0.5  # angles
+    expected[:104].reshape(4, 2, 13)[:, 1] *= fading  # velocities
+    expected[104:].reshape(4, 13)[:] *= fading  # commands
     np.testing.assert_allclose(obs[7:163], expected, rtol=1e-5, atol=1e-6)
     for place, joint in ((163, 0), (176, 2), (189, 3), (202, 4)):
         opening = np.maximum(0, np.abs(-0.1 * joint + 0.002 * np.arange(13)) - 0.07) / 0.93
-        expected = (np.tanh(opening / 0.02) - 0.5) / 0.5 / 13**0.5
+        expected = (np.tanh(opening / 0.02) - 0.5) / 0.5 * fading
         np.testing.assert_allclose(obs[place : place + 13], expected, rtol=1e-4, atol=1e-6)
     q = measured.q.astype(float)
     q[DRIVEN] = smooth_angles(BROKK_170, measured.history)
@@ -80,20 +84,21 @@ def test_observe__by_hand():
 
 
 def test_the_table_of_the_docstring__is_true():
-    """Numbers and weights of the table are those of the scale."""
-    rows = re.findall(r"^\| (\d+)-(\d+) +\| .+? +\| .+? +\| ([\d.]+) +\|", interface.__doc__, re.M)
+    """Numbers and weights of the table are those of the scale; of samples, of the newest."""
+    rows = re.findall(r"^\| (\d+)-(\d+) +\| .+? +\| .+? +\| ([\d.]+)", interface.__doc__, re.M)
     _, scale = observation_scale(BROKK_170)
     std = env.observation_scale(BROKK_170)[1].copy()
     q_dot = env.velocity_deviations(BROKK_170)[1][DRIVEN]
-    std[7:111].reshape(4, 2, 13)[:, 1] *= 3
     deviations = np.concatenate([std, np.full(52, 0.5), q_dot, 0.1 * q_dot])
     assert [int(last) + 1 for _, last, _ in rows] == [7, 111, 163, 215, 219, 223] and len(
         scale
     ) == 223
     assert all(int(one[1]) + 1 == int(next_[0]) for one, next_ in pairwise(rows))
     for first, last, weight in rows:
-        place = slice(int(first), int(last) + 1)
+        step = 13 if int(last) - int(first) > 50 else 1
+        place = slice(int(last), int(first) - 1, -2 * step if first == "7" else -step)
         np.testing.assert_allclose(deviations[place] / scale[place], float(weight), atol=5e-4)
+    np.testing.assert_allclose(deviations[7:20] / scale[7:20], 0.277, atol=5e-4)  # angles
 
 
 @given(machines(), st.floats(-0.02, 0.02) | st.floats(-2, 2))

