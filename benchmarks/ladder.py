@@ -2,10 +2,11 @@
 
     python -m benchmarks.ladder [FOLDER] [STEPS] [SEEDS]
 
-"Alone" is the paper's agent with a critic and one of `STEPS`; "in order" has the steps of all rows
-above it, too. FOLDER is one of `brokk-min reproduce`, by default results; its nets are those that
-the policies learn on. By default three seeds of one million environment steps each. Figures are
-means over x, y, z and the starts.
+"Alone" is the paper's agent with one of `STEPS`, and with a critic unless the step is groups; "in
+order" has the steps of all rows above it, too. FOLDER is one of `brokk-min reproduce`, by default
+results; its nets are those that the policies learn on. By default three seeds of one million
+environment steps each. Figures are means over x, y, z and the starts; valve travel is the sum of
+all changes of commands, in full commands.
 """
 
 import sys

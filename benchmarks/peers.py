@@ -228,7 +228,8 @@ def run(name: str, settings: dict[str, Any], clock: Clock) -> None:
     torch.set_num_threads(1)
     groups, options = name == "groups", clock.options
     recipe = find_recipe(critic=not groups)
-    config = replace(recipe.learner, total_steps=options.steps, **settings)
+    rates = {"target_kl": PPOConfig.target_kl, **settings}  # for all the same
+    config = replace(recipe.learner, total_steps=options.steps, **rates)
     simulation = (config.num_envs, clock.net, M, recipe.task, INTERFACE)
     env = TaskVectorEnv(*simulation)
     if groups:

@@ -97,7 +97,7 @@ def log_probability(actions: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
 def collect(
     env: VectorEnv[Any, Any, Any], agent: Agent, obs: Tensor, horizon: int
 ) -> tuple[Rollout, Tensor]:
-    """`horizon` ticks of all environments from observations `obs`; and the next observations."""
+    """`horizon` ticks of all environments from observations (num_envs, obs); and the next ones."""
     space: Any = env.single_action_space
     ticks: list[tuple[Tensor, ...]] = []
     infos = []
@@ -180,7 +180,7 @@ def ppo_loss(agent: Agent, mb: dict[str, Tensor], config: PPOConfig) -> tuple[Te
 
 
 def begin(env: VectorEnv[Any, Any, Any], config: PPOConfig, seed: int) -> Checkpoint:
-    """A new agent, its optimiser, and the first observations of the environment.
+    """A new agent, Adam as its optimiser, and the first observations of the environment.
 
     ValueError: an environment that does not reset in the same step.
     """
@@ -207,7 +207,8 @@ def train(
 
     `advantage_function` gives advantages (T, N) of a rollout, and the returns that the critic
     learns, or None. `on_update` is called after each update, with the rollout and scalars under
-    CleanRL's names. `start` is a checkpoint to go on from. ValueError: a loss that is not finite.
+    CleanRL's names. `start` is a checkpoint to go on from, in place of a new agent by `seed`.
+    ValueError: a loss that is not finite.
     """
     agent, optimizer, obs, global_step, update = start or begin(env, config, seed)
     group = optimizer.param_groups[0]

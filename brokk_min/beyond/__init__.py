@@ -1,1 +1,1 @@
-"""Our improvements on the paper: one file each, which plugs into the method and can be deleted."""
+"""Our improvements on the paper, one file each; no file of the method imports them."""

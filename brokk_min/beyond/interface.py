@@ -18,7 +18,8 @@ three seeds along x, y and z, `benchmarks.ladder`):
 Who was first: resolved rates (Whitney, 1969) as inputs are residual or "structured" observations of
 many papers; the integral is that of a PI controller; costs of action changes are legged_gym's.
 
-It plugs into `env.Interface`. Observation, with the mean and deviation of each number as in `env`:
+It plugs into `env.Interface`. A number x of the observation is weight (x - mean) / deviation; means
+are those of `env`, 0.5 of the indicator, and 0 of the last two rows:
 
 | Num     | Observation                                          | Deviation   | Weight |
 |---------|------------------------------------------------------|-------------|--------|
@@ -27,7 +28,7 @@ It plugs into `env.Interface`. Observation, with the mean and deviation of each 
 | 111-162 | 13 commands of each driven joint                     | as in `env` | 0.795 f |
 | 163-214 | `valve_nets.open_indicator` of these commands        | 0.5         | 0.795 f |
 | 215-218 | joint velocities that give the goal (`jacobian.dls`) | as in `env` | 1.5    |
-| 219-222 | joint motions that undo the error integral [rad]     | 0.1 s of them | 1.5  |
+| 219-222 | joint motions that undo the error integral [rad]     | 0.1 s times those | 1.5 |
 
 f = exp(-k / 2) of a sample k ticks old.
 """
@@ -135,7 +136,9 @@ def observe(machine: Machine, measured: Measured, memory: Memory) -> Array:
 
 
 def command(machine: Machine, action: Array, memory: Memory) -> Array:
-    """u = zone clip(a / 0.01, -1, 1) + (limit - zone) a; 0 once the goal was 0 for 0.5 s.
+    """u (..., n) = zone clip(a / 0.01, -1, 1) + (limit - zone) a of actions (..., n_driven).
+
+    It is 0 once the goal was 0 for 0.5 s.
 
     An action of 0.01 therefore begins to open a valve, and valves close at rest. Paper: Sec. 3.3
     """
@@ -148,7 +151,7 @@ def command(machine: Machine, action: Array, memory: Memory) -> Array:
 
 
 def cost(machine: Machine, u: Array, u_before: Array, memory: Memory) -> Array:
-    """A tenth of the mean change of commands, of the limit, plus the length [m] of the integral."""
+    """Cost (...) of a tick: a tenth of the mean of |u - u_before| / limit, plus |integral| [m]."""
     change = np.abs(u - u_before)[..., machine.driven].mean(axis=-1) * PWM_MAX / machine.pwm_limit
     return np.asarray(TRAVEL_COST * change + np.linalg.norm(memory.error_integral, axis=-1))
 

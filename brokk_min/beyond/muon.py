@@ -21,12 +21,17 @@ It plugs into `ppo.train` as the optimiser of the checkpoint with which a traini
 import torch
 from torch import nn
 
+from brokk_min.machine import require
 from brokk_min.ppo import Agent
 from brokk_min.settings import PPOConfig
 
 
 def muon(agent: Agent, config: PPOConfig) -> torch.optim.Muon:
-    """The optimiser of the actor's matrices; its biases learn no more."""
+    """The optimiser of the actor's matrices; its biases learn no more.
+
+    ValueError: a deviation of the actions that is learned, because it is no matrix.
+    """
+    require(config.log_std_end is not None, "log_std_end", "a number with Muon", None)
     layers = [layer for layer in agent.actor if isinstance(layer, nn.Linear)]
     for layer in layers:
         layer.bias.requires_grad_(False)

@@ -112,7 +112,7 @@ class StrongPID(JacobianController):
         q = measured.q.astype(float)
         q[..., m.driven] = smooth_angles(m, measured.history)
         v = measured.v_goal + gains.feedback * (measured.v_goal - measured.v_tool)
-        v = v + gains.integral_feedback * memory.error_integral  # x_goal + K e + K_I integral(e)
+        v = v + gains.integral_feedback * memory.error_integral  # v_goal + K e + K_I integral(e)
         q_dot_goal = self.joint_velocities(v, q, before.q_dot_goal)
         error = q_dot_goal - measured.q_dot
         derivative = 0.7 * before.derivative + 0.3 * (error - before.error) / m.dt

@@ -66,9 +66,11 @@ def prepare(
     """The environments of a recipe, its advantages, and the beginning of its training."""
     config = recipe.learner
     simulation = (config.num_envs, net, machine, recipe.task, INTERFACES[recipe.interface])
-    env = TaskVectorEnv(*simulation)
-    advantages: ppo.Advantages = ppo.critic_advantages
-    if not recipe.critic:
+    env: TaskVectorEnv
+    advantages: ppo.Advantages
+    if recipe.critic:
+        env, advantages = TaskVectorEnv(*simulation), ppo.critic_advantages
+    else:
         env, advantages = GroupVectorEnv(*simulation, horizon=config.horizon), group_advantages
     start = ppo.begin(env, config, seed)
     if recipe.muon:

@@ -1,6 +1,6 @@
-"""Agents and how they learn: ours and the paper's, without torch."""
+"""Settings of our agent and of the paper's. It imports no torch, so that `--help` is quick."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from brokk_min.settings import PPOConfig, TaskConfig
 
@@ -11,19 +11,26 @@ class Recipe:
 
     interface: str  # its name in `policy.INTERFACES`
     critic: bool  # advantages by a critic, as in the paper, or by `beyond.group_advantages`
-    muon: bool  # steps of the actor by `beyond.muon`, or by Adam
     task: TaskConfig
     learner: PPOConfig
+    muon: bool = False  # steps of the actor by `beyond.muon`, not by Adam
 
 
 def find_recipe(paper: bool = False, critic: bool = False) -> Recipe:
-    """The settings of an agent: ours or the paper's, which learns by groups or by a critic."""
+    """The recipe of our agent or of the paper's, with advantages by groups or by a critic."""
     task = TaskConfig() if paper else TaskConfig(hold_min_s=0.5, hold_max_s=3.0)
-    learner = PPOConfig()
-    if not critic and paper:
+    if critic:
+        learner = PPOConfig()
+    elif paper:
         learner = PPOConfig(80_000_000, gamma=0.95, gae_lambda=1.0, log_std_end=-4.2)
-    elif not critic:
-        learner = PPOConfig(10_000_000, gamma=0.94, gae_lambda=1.0, log_std_end=-4.0)
-        learner = replace(learner, learning_rate=2e-3, target_kl=0.06)
+    else:
+        learner = PPOConfig(
+            10_000_000,
+            learning_rate=2e-3,
+            target_kl=0.06,
+            gamma=0.94,
+            gae_lambda=1.0,
+            log_std_end=-4.0,
+        )
     muon = not (paper or critic)
-    return Recipe("paper" if paper else "beyond", critic, muon, task, learner)
+    return Recipe("paper" if paper else "beyond", critic, task, learner, muon)

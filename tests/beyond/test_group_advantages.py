@@ -11,7 +11,6 @@ from brokk_min import ppo
 from brokk_min.beyond.group_advantages import COPIES, GroupVectorEnv, group_advantages
 from brokk_min.beyond.interface import INTERFACE
 from brokk_min.env import PAPER
-from brokk_min.learning.checkpoint import stagger_episodes
 from brokk_min.machine import BROKK_170
 from brokk_min.settings import PPOConfig, TaskConfig
 
@@ -39,7 +38,6 @@ def same(array):
 def test_copies__share_all_but_what_their_own_actions_change(interface):
     """They start alike in each window, meet the same goals and noise, and end alike."""
     env, rng = make(interface), np.random.default_rng(0)
-    stagger_episodes(env)
     obs, _ = env.reset(seed=4)
     ended = 0
     for tick in range(70):

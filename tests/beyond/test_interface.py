@@ -90,15 +90,25 @@ def test_the_table_of_the_docstring__is_true():
     std = env.observation_scale(BROKK_170)[1].copy()
     q_dot = env.velocity_deviations(BROKK_170)[1][DRIVEN]
     deviations = np.concatenate([std, np.full(52, 0.5), q_dot, 0.1 * q_dot])
-    assert [int(last) + 1 for _, last, _ in rows] == [7, 111, 163, 215, 219, 223] and len(
-        scale
-    ) == 223
+    assert [int(last) + 1 for _, last, _ in rows] == [7, 111, 163, 215, 219, 223]
+    assert len(scale) == 223
     assert all(int(one[1]) + 1 == int(next_[0]) for one, next_ in pairwise(rows))
     for first, last, weight in rows:
         step = 13 if int(last) - int(first) > 50 else 1
         place = slice(int(last), int(first) - 1, -2 * step if first == "7" else -step)
         np.testing.assert_allclose(deviations[place] / scale[place], float(weight), atol=5e-4)
     np.testing.assert_allclose(deviations[7:20] / scale[7:20], 0.277, atol=5e-4)  # angles
+
+
+@given(machines())
+def test_scale__of_any_machine_lets_the_samples_of_a_signal_weigh_as_one_number(machine):
+    """Angles and velocities, commands, indicators: H samples have sum w^2 = 1."""
+    n, H, first = len(machine.driven), machine.history, 6 + len(machine.locked)
+    mean, scale = observation_scale(machine)
+    std = np.append(env.observation_scale(machine)[1], np.full(n * H, 0.5))
+    assert mean.shape == scale.shape == (first + 4 * n * H + 2 * n,)
+    weights = (std / scale[: len(std)])[first:].reshape(4 * n, H)
+    np.testing.assert_allclose((weights**2).sum(axis=1), 1, rtol=1e-4)
 
 
 @given(machines(), st.floats(-0.02, 0.02) | st.floats(-2, 2))

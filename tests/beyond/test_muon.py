@@ -2,13 +2,14 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 
 from brokk_min import ppo
 from brokk_min.beyond.muon import muon
 from brokk_min.settings import PPOConfig
 
-CONFIG = replace(PPOConfig(), learning_rate=3e-3)
+CONFIG = PPOConfig(learning_rate=3e-3, log_std_end=-4.0)
 
 
 def test_muon__steps_along_all_singular_directions_alike():
@@ -32,6 +33,22 @@ def test_muon__steps_along_all_singular_directions_alike():
         along = u.T @ step @ vt.T
         assert (along.diag() - 1).abs().max() < 0.35
         assert (step - u @ along.diag().diag() @ vt).abs().max() < 0.05
+
+
+def test_muon__without_a_gradient_moves_nothing():
+    """Weights do not decay."""
+    agent = ppo.Agent(5, 2, -1.0)
+    optimizer = muon(agent, CONFIG)
+    before = [p.detach().clone() for p in agent.actor.parameters()]
+    for p in agent.actor.parameters():
+        p.grad = torch.zeros_like(p)
+    optimizer.step()
+    assert all(map(torch.equal, before, agent.actor.parameters()))
+
+
+def test_muon__refuses_a_deviation_that_is_learned():
+    with pytest.raises(ValueError, match="log_std_end: expected a number with Muon, got None"):
+        muon(ppo.Agent(5, 2, -1.0), replace(CONFIG, log_std_end=None))
 
 
 def test_muon__leaves_biases_critic_and_deviation():

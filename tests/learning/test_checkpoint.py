@@ -9,12 +9,15 @@ import pytest
 import torch
 from helpers_machines import obedient_net, small_net
 
-from brokk_min.env import TaskConfig
-from brokk_min.learning.checkpoint import stagger_episodes, train_policy
+from brokk_min.beyond.group_advantages import GroupVectorEnv, group_advantages
+from brokk_min.beyond.interface import INTERFACE
+from brokk_min.env import PAPER, TaskConfig
+from brokk_min.learning.checkpoint import prepare, stagger_episodes, train_policy
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import load_policy
 from brokk_min.learning.recipes import find_recipe
 from brokk_min.machine import BROKK_170
+from brokk_min.ppo import critic_advantages
 
 SMALL = {"num_envs": 8, "horizon": 8, "minibatch_size": 32, "total_steps": 256}
 TASK = TaskConfig(episode_s=0.6)  # 12 ticks: episodes end within the first updates
@@ -53,6 +56,24 @@ def run_until_interrupted(path, kind="ours"):
         patch.setattr(TaskVectorEnv, "step", interrupted)
         with pytest.raises(KeyboardInterrupt):
             run(path, kind)
+
+
+@pytest.mark.parametrize("critic", [False, True])
+@pytest.mark.parametrize("paper", [False, True])
+def test_prepare__begins_what_the_recipe_says(paper, critic):
+    """Our agent by groups steps by Muon, all others by Adam; episodes end one after the other."""
+    recipe = find_recipe(paper, critic)
+    env, advantages, start = prepare(BROKK_170, NET, recipe, seed=3)
+    assert env.interface is (PAPER if paper else INTERFACE)
+    assert env.config.hold_max_s == (6.0 if paper else 3.0)
+    assert type(env) is (TaskVectorEnv if critic else GroupVectorEnv)
+    assert advantages is (critic_advantages if critic else group_advantages)
+    assert recipe.learner.gae_lambda == (0.95 if critic else 1.0)
+    kind = torch.optim.Adam if paper or critic else torch.optim.Muon
+    assert isinstance(start.optimizer, kind)
+    assert start.optimizer.param_groups[0]["params"][-1].requires_grad
+    assert len(np.unique(env.state.ticks)) > 100
+    assert start.obs.shape == (256, len(env.interface.scale(BROKK_170)[0]))
 
 
 @pytest.mark.parametrize("kind", ["ours", "paper"])
