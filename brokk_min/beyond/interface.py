@@ -11,9 +11,9 @@ three seeds along x, y and z, `benchmarks.ladder`):
 | Parts | Velocity error | Drift | Valve travel |
 |---|---|---|---|
 | the paper's interface | 0.0357 m/s | 0.196 m | 21 |
-| the observation, too | 0.0184 m/s | 0.067 m | 26 |
-| actions beyond the dead zone, closed valves, too | 0.0161 m/s | 0.058 m | 74 |
-| costs, too | 0.0154 m/s | 0.038 m | 25 |
+| the observation, too | 0.0181 m/s | 0.063 m | 26 |
+| actions beyond the dead zone, closed valves, too | 0.0154 m/s | 0.051 m | 82 |
+| costs, too | 0.0153 m/s | 0.039 m | 24 |
 
 Who was first: resolved rates (Whitney, 1969) as inputs are residual or "structured" observations of
 many papers; the integral is that of a PI controller; costs of action changes are legged_gym's.
