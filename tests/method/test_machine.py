@@ -58,7 +58,10 @@ BAD = [
     ({"pwm_limit": 128}, "pwm_limit: expected 1 to 127, got 128"),
     ({"plant_dt": 0.02}, "plant_dt: expected a whole part of 1/rate, not above any tau, got 0.02"),
     ({"rate": 30.0}, "plant_dt: expected a whole part of 1/rate, not above any tau, got 0.005"),
-    ({"tau_valve_up": 0.004}, "plant_dt: expected a whole part of 1/rate, not above any tau"),
+    *(
+        ({tau: 0.004}, "plant_dt: expected a whole part of 1/rate, not above any tau")
+        for tau in ("tau_spool", "tau_cylinder", "tau_valve_up", "tau_valve_down")
+    ),
     ({"history": 3}, "velocity_samples: expected 2 to history, got 4"),
     ({"velocity_samples": 1}, "velocity_samples: expected 2 to history, got 1"),
     ({"q_start": (0.0, 1.0)}, "q_start: expected 5 angles within their ranges, got (0.0, 1.0)"),
@@ -77,6 +80,9 @@ def test_a_bad_field__is_refused_by_name_with_wanted_and_got(changes, message):
     "fields",
     [
         {"pwm_limit": 9},
+        {"velocity_samples": 2},
+        {"velocity_samples": 13},
+        {"tau_spool": 0.005},
         {"pwm_limit": 127, "valve_threshold": 0.0, "delay": 0.0},
         {"q_start": (-2.14, 0.0, -0.3, 0.6, 0.0)},
         {"q_start": (2.14, 1.4, 1.6, 2.9, 2.0)},
