@@ -21,7 +21,6 @@ from brokk_min.learning.policy import POLICIES, Policy, PolicyController
 from brokk_min.learning.recipes import find_recipe
 from brokk_min.machine import Array, Machine
 
-
 MEDIAN_SEEDS = {"rl": 1}  # of ten trainings of our agent the one of median error, at seed 0
 
 
