@@ -1,9 +1,9 @@
 """Another interface between agent and machine: what our agent reads, remembers, does and pays.
 
-What it changes: beside the paper's observation (`env`) our agent reads which commands opened
-valves, the joint velocities that would give the goal, and those that would undo the velocity error
-so far. Its actions begin beyond the dead zone, its valves close while the tool rests, and it pays
-for valve travel and for error that lasts.
+What it changes: of the paper's histories (`env`) our agent reads the newer half. It also reads
+which of these commands opened valves, the joint velocities that would give the goal, and those that
+would undo the velocity error so far. Its actions begin beyond the dead zone, its valves close while
+the tool rests, and it pays for valve travel and for error that lasts.
 
 What it buys, in order, trained with `group_advantages` on our nets for one million steps (means of
 three seeds along x, y and z, `benchmarks.ladder`):
@@ -23,18 +23,19 @@ are those of `env`, 0.5 of the indicator, and 0 of the last two rows:
 
 | Num     | Observation                                          | Deviation   | Weight |
 |---------|------------------------------------------------------|-------------|--------|
-| 0-6     | goal and measured velocity, angle of the locked joint | as in `env` | 0.75   |
-| 7-110   | 13 angles (weight 0.277), 13 velocities of each driven joint | as in `env` | 0.795 f |
-| 111-162 | 13 commands of each driven joint                     | as in `env` | 0.795 f |
-| 163-214 | `valve_nets.open_indicator` of these commands        | 0.5         | 0.795 f |
-| 215-218 | joint velocities that give the goal (`jacobian.dls`) | as in `env` | 1.5    |
-| 219-222 | joint motions that undo the error integral [rad]     | 0.1 s times those | 1.5 |
+| 0-6     | goal and measured velocity, angle of the locked joint | as in `env` | 0.75  |
+| 7-10    | angles of the driven joints, see `smooth_angles`     | as in `env` | 1      |
+| 11-34   | velocities of each driven joint, the 6 newest        | as in `env` | 0.796 f |
+| 35-58   | commands of each driven joint, the 6 newest          | as in `env` | 0.796 f |
+| 59-82   | `valve_nets.open_indicator` of these commands        | 0.5         | 0.796 f |
+| 83-86   | joint velocities that give the goal (`jacobian.dls`) | as in `env` | 1.5    |
+| 87-90   | joint motions that undo the error integral [rad]     | 0.1 s times those | 1.5 |
 
-f = exp(-k / 2) of a sample k ticks old.
+f = exp(-k / 2) of a sample k ticks old. The 6 newest are half of the history.
 """
 
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,9 +47,9 @@ from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.machine import PWM_MAX, Array, Machine, Measured, limit_command, side
 
 INTEGRAL_TIME = 2.0  # s, tuned: time constant of the error integral's leak
-INTEGRAL_LIMIT = 0.07  # of tool_speed, tuned: velocity errors count up to here
+ALONG, ACROSS = 0.02, 0.07  # of tool_speed, tuned: velocity errors count up to here
 COMPENSATION = 0.01  # of an action, assumed: up to here a command rises to the dead zone
-REST_AFTER = 0.5  # s of a zero goal, after which the valves close (assumed)
+REST_AFTER = 0.1  # s of a zero goal, after which the valves close (tuned)
 FADES = 2.0  # ticks, tuned: e-fold of the weights of older velocities and commands
 TRAVEL_COST = 0.1  # tuned: if all commands change by the limit in a tick
 
@@ -62,17 +63,24 @@ class Memory(NamedTuple):
 
 
 def remember(machine: Machine, memory: Memory | None, measured: Measured) -> Memory:
-    """I_{t+1} = exp(-dt / T) (I_t + dt e), e = v_goal - v_tool, cut to 7 % of the tool speed.
+    """I_{t+1} = exp(-dt / T) (I_t + dt e), e = v_goal - v_tool, cut along the goal and across it.
 
-    That is the I of a PI controller, with a leak. The goal is that of the tick that has ended.
+    That is the I of a PI controller, with a leak. Along the goal e counts up to 2 % of the tool
+    speed, so that the agent need not make up for a late start; across it up to 7 %. The goal is
+    that of the tick that has ended.
     """
     at_rest = np.asarray(~measured.v_goal.any(axis=-1))
     if memory is None:
         zero = np.zeros_like(measured.v_goal, np.float32)
         return Memory(measured.v_goal, zero, np.asarray(at_rest, np.int64))
     error = memory.v_goal - measured.v_tool
-    limit = INTEGRAL_LIMIT * machine.tool_speed
-    error = error * (limit / np.maximum(np.linalg.norm(error, axis=-1, keepdims=True), limit))
+    speed = np.linalg.norm(memory.v_goal, axis=-1, keepdims=True)
+    direction = memory.v_goal / np.maximum(speed, 1e-6)  # 0 for a zero goal
+    along = (error * direction).sum(axis=-1, keepdims=True)
+    across = error - along * direction
+    limit, most = ALONG * machine.tool_speed, ACROSS * machine.tool_speed
+    across = across * (most / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), most))
+    error = np.clip(along, -limit, limit) * direction + across
     integral = np.exp(-machine.dt / INTEGRAL_TIME) * (memory.error_integral + machine.dt * error)
     ticks = np.where(at_rest, memory.rest_ticks + 1, 0)
     return Memory(measured.v_goal, integral.astype(np.float32), ticks)
@@ -102,19 +110,26 @@ def observation_scale(machine: Machine) -> tuple[Array, Array]:
     """Mean and deviation / weight of the observation, float32 (obs,) both.
 
     Nets learn first what is large, so the resolved velocities weigh most, and of velocities and
-    commands the newest samples. The H samples of a signal weigh as one number, sum w^2 = 1.
+    commands the newest samples. The samples of a signal weigh as one number, sum w^2 = 1.
     """
-    n, H = len(machine.driven), machine.history
+    n, H, first = len(machine.driven), machine.history, 6 + len(machine.locked)
     mean, std = env.observation_scale(machine)
-    q_dot_std = env.velocity_deviations(machine)[1][machine.driven]
-    even, fading = np.ones(H), np.exp(-np.arange(H)[::-1] / FADES)
-    even, fading = (of / np.linalg.norm(of) for of in (even, fading))
-    weights = [np.full(6 + len(machine.locked), 0.75)]
-    weights += n * [even, fading] + 2 * n * [fading] + [np.full(2 * n, 1.5)]
-    mean = np.concatenate([mean, np.full(n * H, 0.5), np.zeros(2 * n)])
-    std = np.concatenate([std, np.full(n * H, 0.5), q_dot_std, 0.1 * q_dot_std])
-    scale = std / np.concatenate(weights)
-    return mean.astype(np.float32), scale.astype(np.float32)
+    angles = slice(first, first + 2 * n * H, 2 * H)  # one of each joint
+    q_dot_std, u_std = env.velocity_deviations(machine)[1][machine.driven], std[-1]
+    fading = np.exp(-np.arange(H // 2)[::-1] / FADES)
+    fading, ones = np.tile(fading / np.linalg.norm(fading), n), np.ones(n * (H // 2))
+    blocks: list[tuple[Any, ...]] = [  # means, deviations, weights
+        (mean[:first], std[:first], 0.75),
+        (mean[angles], std[angles], 1.0),
+        (0.0, np.repeat(q_dot_std, H // 2), fading),
+        (0.0, u_std * ones, fading),
+        (0.5, 0.5 * ones, fading),
+        (0.0, q_dot_std, 1.5),
+        (0.0, 0.1 * q_dot_std, 1.5),
+    ]
+    table = np.concatenate([np.broadcast_arrays(*block) for block in blocks], axis=1)
+    mean, std, weight = table.astype(np.float32)
+    return mean, std / weight
 
 
 def observe(machine: Machine, measured: Measured, memory: Memory) -> Array:
@@ -125,11 +140,12 @@ def observe(machine: Machine, measured: Measured, memory: Memory) -> Array:
     J = jacobian(forward_kinematics(machine, q))[..., driven]
     arm = np.hypot(machine.column("a"), machine.column("d")).sum()
     J_inv = dls(J, np.ones(len(driven)), (0.06 * arm) ** 2)  # lambda: 6 % of the arm, assumed
-    u = measured.history[..., 2, :]
+    newest = measured.history[..., -(machine.history // 2) :]
+    q_dot, u = newest[..., 1, :], newest[..., 2, :]
     opens = open_indicator(opening(u, machine.dead_zones[driven].astype(u.dtype)))
     shape = (*q.shape[:-1], -1)
-    numbers = [measured.v_goal, measured.v_tool, q[..., machine.locked]]
-    numbers += [measured.history[..., :2, :].reshape(shape), u.reshape(shape), opens.reshape(shape)]
+    numbers = [measured.v_goal, measured.v_tool, q[..., machine.locked], q[..., driven]]
+    numbers += [samples.reshape(shape) for samples in (q_dot, u, opens)]
     numbers += [(J_inv @ v[..., None])[..., 0] for v in (measured.v_goal, memory.error_integral)]
     mean, scale = observation_scale(machine)
     return (np.concatenate(numbers, axis=-1, dtype=np.float32) - mean) / scale
@@ -138,7 +154,7 @@ def observe(machine: Machine, measured: Measured, memory: Memory) -> Array:
 def command(machine: Machine, action: Array, memory: Memory) -> Array:
     """u (..., n) = zone clip(a / 0.01, -1, 1) + (limit - zone) a of actions (..., n_driven).
 
-    It is 0 once the goal was 0 for 0.5 s.
+    It is 0 once the goal was 0 for 0.1 s, in which the agent may brake.
 
     An action of 0.01 therefore begins to open a valve, and valves close at rest. Paper: Sec. 3.3
     """

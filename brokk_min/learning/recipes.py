@@ -25,7 +25,7 @@ def find_recipe(paper: bool = False, critic: bool = False) -> Recipe:
         learner = PPOConfig(80_000_000, gamma=0.95, gae_lambda=1.0, log_std_end=-4.2)
     else:
         learner = PPOConfig(
-            10_000_000,
+            11_000_000,
             learning_rate=2e-3,
             target_kl=0.06,
             gamma=0.94,

@@ -54,60 +54,66 @@ def test_smooth_angles__are_the_angles_of_steady_motion_and_of_constant_accelera
 
 
 def test_observe__by_hand():
-    """The paper's numbers by their weights, then the three blocks of ours."""
+    """Of the paper's numbers the newer half by their weights; and the blocks of ours."""
     integral = (0.02, -0.01, 0.03)
     v_goal = np.array([0.3, -0.1, -0.15], np.float32)
     measured = measure(BROKK_170, numbered_history(), v_goal)
     obs = observe(BROKK_170, measured, memory(0, integral))
-    assert obs.shape == (223,) and obs.dtype == np.float32
+    assert obs.shape == (91,) and obs.dtype == np.float32
     paper = env.features(BROKK_170, measured)
     np.testing.assert_allclose(obs[:7], 0.75 * paper[:7], rtol=1e-5)
-    fading = np.exp(-np.arange(12, -1, -1) / 2)  # of the 13 samples, newest last
-    fading /= np.sum(fading**2) ** 0.5
-    expected = paper[7:].copy()
-    expected[:104].reshape(4, 2, 13)[:, 0] /= 13**0.5  # angles
-    expected[:104].reshape(4, 2, 13)[:, 1] *= fading  # velocities
-    expected[104:].reshape(4, 13)[:] *= fading  # commands
-    np.testing.assert_allclose(obs[7:163], expected, rtol=1e-5, atol=1e-6)
-    for place, joint in ((163, 0), (176, 2), (189, 3), (202, 4)):
-        opening = np.maximum(0, np.abs(-0.1 * joint + 0.002 * np.arange(13)) - 0.07) / 0.93
-        expected = (np.tanh(opening / 0.02) - 0.5) / 0.5 * fading
-        np.testing.assert_allclose(obs[place : place + 13], expected, rtol=1e-4, atol=1e-6)
     q = measured.q.astype(float)
     q[DRIVEN] = smooth_angles(BROKK_170, measured.history)
+    low, high = (BROKK_170.column(end)[DRIVEN] for end in ("q_min", "q_max"))
+    middle, deviation = (low + high) / 2, (high - low) / 12**0.5
+    np.testing.assert_allclose(obs[7:11], (q[DRIVEN] - middle) / deviation, rtol=1e-4)
+    fading = np.exp(-np.arange(5, -1, -1) / 2)  # of the 6 newest samples, newest last
+    fading /= np.sum(fading**2) ** 0.5
+    q_dot, u = paper[7:111].reshape(4, 2, 13)[:, 1, 7:], paper[111:].reshape(4, 13)[:, 7:]
+    np.testing.assert_allclose(obs[11:35].reshape(4, 6), q_dot * fading, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(obs[35:59].reshape(4, 6), u * fading, rtol=1e-5, atol=1e-6)
+    for place, joint in ((59, 0), (65, 2), (71, 3), (77, 4)):
+        opening = np.maximum(0, np.abs(-0.1 * joint + 0.002 * np.arange(7, 13)) - 0.07) / 0.93
+        expected = (np.tanh(opening / 0.02) - 0.5) / 0.5 * fading
+        np.testing.assert_allclose(obs[place : place + 6], expected, rtol=1e-4, atol=1e-6)
     J = jacobian(forward_kinematics(BROKK_170, q))[:, DRIVEN]
     damping = (0.06 * (np.hypot(0.25, 0.95) + 1.15 + 1.25 + 1.15 + 1.2)) ** 2
     solution = np.linalg.solve(J.T @ J + damping * np.eye(4), J.T)
     nominal = env.velocity_deviations(BROKK_170)[1][DRIVEN] / 1.5
-    np.testing.assert_allclose(obs[215:219], solution @ measured.v_goal / nominal, rtol=1e-4)
-    np.testing.assert_allclose(obs[219:], solution @ integral / (0.1 * nominal), rtol=1e-4)
+    np.testing.assert_allclose(obs[83:87], solution @ measured.v_goal / nominal, rtol=1e-4)
+    np.testing.assert_allclose(obs[87:], solution @ integral / (0.1 * nominal), rtol=1e-4)
 
 
 def test_the_table_of_the_docstring__is_true():
     """Numbers and weights of the table are those of the scale; of samples, of the newest."""
     rows = re.findall(r"^\| (\d+)-(\d+) +\| .+? +\| .+? +\| ([\d.]+)", interface.__doc__, re.M)
     _, scale = observation_scale(BROKK_170)
-    std = env.observation_scale(BROKK_170)[1].copy()
+    std = env.observation_scale(BROKK_170)[1]
     q_dot = env.velocity_deviations(BROKK_170)[1][DRIVEN]
-    deviations = np.concatenate([std, np.full(52, 0.5), q_dot, 0.1 * q_dot])
-    assert [int(last) + 1 for _, last, _ in rows] == [7, 111, 163, 215, 219, 223]
-    assert len(scale) == 223
+    samples = [np.repeat(q_dot, 6), std[-24:], np.full(24, 0.5)]
+    deviations = np.concatenate([std[:7], std[7:111:26], *samples, q_dot, 0.1 * q_dot])
+    assert [int(last) + 1 for _, last, _ in rows] == [7, 11, 35, 59, 83, 87, 91] and len(
+        scale
+    ) == 91
     assert all(int(one[1]) + 1 == int(next_[0]) for one, next_ in pairwise(rows))
     for first, last, weight in rows:
-        step = 13 if int(last) - int(first) > 50 else 1
-        place = slice(int(last), int(first) - 1, -2 * step if first == "7" else -step)
+        step = 6 if int(last) - int(first) == 23 else 1
+        place = slice(int(first) + step - 1, int(last) + 1, step)
         np.testing.assert_allclose(deviations[place] / scale[place], float(weight), atol=5e-4)
-    np.testing.assert_allclose(deviations[7:20] / scale[7:20], 0.277, atol=5e-4)  # angles
 
 
 @given(machines())
 def test_scale__of_any_machine_lets_the_samples_of_a_signal_weigh_as_one_number(machine):
-    """Angles and velocities, commands, indicators: H samples have sum w^2 = 1."""
-    n, H, first = len(machine.driven), machine.history, 6 + len(machine.locked)
+    """Velocities, commands, indicators: the samples of the newer half have sum w^2 = 1."""
+    n, half, first = len(machine.driven), machine.history // 2, 6 + len(machine.locked)
     mean, scale = observation_scale(machine)
-    std = np.append(env.observation_scale(machine)[1], np.full(n * H, 0.5))
-    assert mean.shape == scale.shape == (first + 4 * n * H + 2 * n,)
-    weights = (std / scale[: len(std)])[first:].reshape(4 * n, H)
+    assert mean.shape == scale.shape == (first + n + 3 * n * half + 2 * n,)
+    q_dot, u = (
+        env.velocity_deviations(machine)[1][machine.driven],
+        env.observation_scale(machine)[1][-1],
+    )
+    std = np.repeat([*q_dot, *np.full(n, u), *np.full(n, 0.5)], half)
+    weights = (std / scale[first + n : -2 * n]).reshape(3 * n, half)
     np.testing.assert_allclose((weights**2).sum(axis=1), 1, rtol=1e-4)
 
 
@@ -122,11 +128,11 @@ def test_command__is_piecewise_linear_beyond_each_valves_own_dead_zone(machine, 
         assert u[j] == round(u[j], 9)
 
 
-def test_command__closes_the_valves_after_half_a_second_without_a_goal():
-    """Of a batch of machines each by its own rest; 0.5 s are ten ticks."""
-    u = command(BROKK_170, np.full((4, 4), 0.5), memory([0, 10, 11, 1000]))
+def test_command__closes_the_valves_after_a_tenth_of_a_second_without_a_goal():
+    """Of a batch of machines each by its own rest; 0.1 s are two ticks."""
+    u = command(BROKK_170, np.full((4, 4), 0.5), memory([0, 2, 3, 1000]))
     assert u[:, DRIVEN].all(axis=1).tolist() == [True, True, False, False]
     assert u.any(axis=1).tolist() == [True, True, False, False]
-    slow = replace(BROKK_170, name="slow", rate=10.0)  # five ticks
-    assert command(slow, np.full(4, 0.5), memory(5)).any()
-    assert not command(slow, np.full(4, 0.5), memory(6)).any()
+    slow = replace(BROKK_170, name="slow", rate=10.0)  # one tick
+    assert command(slow, np.full(4, 0.5), memory(1)).any()
+    assert not command(slow, np.full(4, 0.5), memory(2)).any()
